@@ -24,7 +24,7 @@ from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import Array
 from camera_calib.camera import Camera, pose_jacobian
 
-LEAST_INLIERS = 6
+MIN_INLIERS = 6
 
 _CUT = 4.0
 _FLOOR_PX = 1e-6
@@ -102,7 +102,7 @@ def absolute_pose(
             right: some five sigmas of the noise. The final limit comes from the data.
 
     Raises:
-        CalibrationError: fewer than `LEAST_INLIERS` observations agree, or they leave the pose open
+        CalibrationError: fewer than `MIN_INLIERS` observations agree, or they leave the pose open
             (all points on a line).
     """
     if not start_error_px > 0.0:
@@ -111,9 +111,9 @@ def absolute_pose(
         raise CalibrationError("pose: no sightings were given")
     usable = np.concatenate([_usable(sighting) for sighting in sightings])
     count = int(usable.sum())
-    if count < LEAST_INLIERS:
+    if count < MIN_INLIERS:
         raise CalibrationError(
-            f"pose: {count} of {len(usable)} observations are usable; at least {LEAST_INLIERS} are "
+            f"pose: {count} of {len(usable)} observations are usable; at least {MIN_INLIERS} are "
             f"needed"
         )
     # Far from the world's origin, numbers lose digits and the rotation couples to the place.
@@ -228,10 +228,10 @@ def _settle(
         radii = _radii(pose, sightings)
         chosen: Mask = radii < limit_px
         count = int(chosen.sum())
-        if count < LEAST_INLIERS:
+        if count < MIN_INLIERS:
             raise CalibrationError(
                 f"pose: {count} of {len(radii)} observations lie within {limit_px:.3g} px of one "
-                f"pose; at least {LEAST_INLIERS} are needed: raise start_error_px or check that "
+                f"pose; at least {MIN_INLIERS} are needed: raise start_error_px or check that "
                 f"pixels and points belong together"
             )
         if turn > 1 and np.array_equal(chosen, inliers):

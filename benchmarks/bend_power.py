@@ -106,8 +106,8 @@ def main() -> None:
 
 def _goal(sag_mm: float) -> Goal | None:
     if sag_mm == _SEEN_MM:
-        return Goal(least=_SHARE)
-    return Goal(most=_FALSE) if sag_mm == 0.0 else None
+        return Goal(minimum=_SHARE)
+    return Goal(maximum=_FALSE) if sag_mm == 0.0 else None
 
 
 def _draw(path: Path, bends_mm: tuple[float, ...], seen: dict[float, Array]) -> None:

@@ -141,7 +141,7 @@ def seconds(rig: Rig, of: Block) -> dict[str, float]:
     start, count = near_start(truth), len(truth.centres)
     problem = SurveyProblem(of.pixels, start, Prior.of_rig(rig, calibrated_parameters(rig, names)))
     found = timed(
-        "adjustment", lambda: minimise(problem, problem.start, settled=0.05, most_steps=20)
+        "adjustment", lambda: minimise(problem, problem.start, settled=0.05, max_steps=20)
     )
     if not found.is_settled:
         raise RuntimeError(f"{count} stations: the adjustment did not settle")
@@ -222,12 +222,12 @@ def main() -> None:
         ]
         whole = float(np.log(rows[-1].sum() / rows[0].sum()) / wide)
         print(f"exponent of all {whole:.2f}")
-        figures.append(Figure(name="exponent of all", value=whole, unit="", goal=Goal(most=1.3)))
+        figures.append(Figure(name="exponent of all", value=whole, unit="", goal=Goal(maximum=1.3)))
     factor, covariance = rows[-1][0], rows[-1][2]
     figures.append(
         Figure(
             name="covariance of stations over one factor",
-            value=float(covariance / factor), unit="", goal=Goal(most=20.0),
+            value=float(covariance / factor), unit="", goal=Goal(maximum=20.0),
         )
     )  # fmt: skip
     sys.exit(hand_over(options, about, Findings(figures=tuple(figures))))

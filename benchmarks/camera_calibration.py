@@ -109,7 +109,7 @@ class Mode:
             judged: whether there are trials enough for goals.
         """
         low, high = GOAL_OF_SIGMA
-        bound_goal = Goal(most=GOAL_OF_BOUND, of="ratio") if judged else None
+        bound_goal = Goal(maximum=GOAL_OF_BOUND, of="ratio") if judged else None
         errors = [
             Figure(
                 name=f"{self.known}: {p.name}, rms error", value=p.rms, unit=_unit(p.name),
@@ -121,7 +121,7 @@ class Mode:
         scores = [
             Figure(
                 name=f"{self.known}: {p.name}, error over sigma, rms", value=p.by_sigma,
-                unit="sigmas", goal=Goal(least=low, most=high) if judged else None,
+                unit="sigmas", goal=Goal(minimum=low, maximum=high) if judged else None,
             )
             for p in self.parameters
         ]  # fmt: skip

@@ -87,7 +87,7 @@ class Level:
                 Figure(
                     name=f"{what} {at}, mean error", value=mean, unit=unit,
                     peer="She et al. 2024, published", peer_value=theirs,
-                    goal=Goal(most=1.0, of="ratio"),
+                    goal=Goal(maximum=1.0, of="ratio"),
                 )
                 for (what, mean, unit), theirs in zip(means, published, strict=True)
             ]  # fmt: skip
@@ -96,7 +96,7 @@ class Level:
                 Figure(
                     name=f"{what} {at}, rms error", value=rms, unit=unit,
                     peer="Cramer-Rao bound", peer_value=bound,
-                    goal=Goal(most=GOAL_OF_BOUND, of="ratio"),
+                    goal=Goal(maximum=GOAL_OF_BOUND, of="ratio"),
                 )
                 for what, rms, unit, bound in (
                     ("rotation", self.rms_deg, "deg", self.bound_deg),

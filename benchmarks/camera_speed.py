@@ -60,7 +60,7 @@ class Row:
 
     def figures(self) -> list[Figure]:
         """On one core, and on two where the peer was measured there."""
-        goal = Goal(least=max(self.goals), of="ratio") if self.goals else None
+        goal = Goal(minimum=max(self.goals), of="ratio") if self.goals else None
         unit = "M points/s"
         found = [
             Figure(

@@ -116,7 +116,7 @@ def report_scaling(stages: Sequence[RecordedStage], network: Network) -> list[Fi
         took_s = sum(stage.times(workers, network) for stage in stages)
         share = alone_s / (workers * took_s)
         print(f"{workers:>8}{took_s / 60:12.1f}{share:12.0%}")
-        goal = Goal(least=0.7) if workers == 64 else None
+        goal = Goal(minimum=0.7) if workers == 64 else None
         figures += [
             Figure(name=f"efficiency at {workers}", value=share, unit="", goal=goal),
             Figure(name=f"time at {workers}", value=took_s / 60, unit="min"),
@@ -157,7 +157,7 @@ def main() -> None:
                 Figure(
                     name=f"time with {workers} by the model", value=modelled_s, unit="s",
                     peer="measured", peer_value=took_s,
-                    goal=Goal(least=0.9, most=1.1, of="ratio"),
+                    goal=Goal(minimum=0.9, maximum=1.1, of="ratio"),
                 )
             )  # fmt: skip
     stages = recorded(events, _STAGES)

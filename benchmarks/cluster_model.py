@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.core.cluster.engine import most_in_flight
+from alice_survey.core.cluster.engine import max_in_flight
 from alice_survey.core.frames import Array
 
 
@@ -108,7 +108,7 @@ def makespan(step: RecordedStep, workers: int, network: Network) -> float:
     free = [0.0] * workers
     waiting: deque[float] = deque()
     for task_s in step.task_s.tolist():
-        if len(waiting) >= most_in_flight(workers):
+        if len(waiting) >= max_in_flight(workers):
             here_s = max(here_s, waiting.popleft()) + taking_s
         here_s += sending_s
         end_s = max(heapq.heappop(free), here_s + network.latency_s) + task_s

@@ -43,7 +43,7 @@ OURS = ("raw", "even", "water")
 PEERS = {"grey world": grey_world, "sea-thru": sea_thru}
 CARD = "water, card"
 METHODS = (*OURS, CARD, *PEERS)
-_GOAL = Goal(most=0.5, of="ratio")
+_GOAL = Goal(maximum=0.5, of="ratio")
 _MIDDLE = 0.2
 """Median light to which a peer's pictures are brought before they are written in eight bits."""
 

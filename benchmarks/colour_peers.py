@@ -6,7 +6,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import min_squares
 
 from alice_survey.core.frames import Array
 
@@ -82,7 +82,7 @@ def sea_thru(pictures: Sequence[Array], ranges: Sequence[Array]) -> list[Array]:
 
 def _fitted(
     law: Callable[[Any, Array], Array], z: Array, value: Array, start: list[float],
-    most: list[float],
+    maximum: list[float],
 ) -> Callable[[Array], Array]:  # fmt: skip
     """A law of range through values, by least squares with Huber's weights."""
     scale = max(float(np.median(np.abs(value - np.median(value)))), 1e-4)
@@ -90,6 +90,6 @@ def _fitted(
     def misses(p: Array) -> Array:
         return law(p, z) - value
 
-    bounds = [0.0] * len(most), most
-    best = least_squares(misses, start, bounds=bounds, loss="huber", f_scale=scale)
+    bounds = [0.0] * len(maximum), maximum
+    best = min_squares(misses, start, bounds=bounds, loss="huber", f_scale=scale)
     return lambda z: law(best.x, z)

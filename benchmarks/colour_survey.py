@@ -281,7 +281,7 @@ def from_above(terrain: Terrain, north: Array, east: Array) -> tuple[Array, Floa
     return points, (corners * weights).sum(axis=-1).astype(np.float32)
 
 
-def card_rows(survey: ColourSurvey, most: int = 4) -> Sequence[tuple[str | float, ...]]:
+def card_rows(survey: ColourSurvey, maximum: int = 4) -> Sequence[tuple[str | float, ...]]:
     """Rows of `colour_reference.csv`: the card in the pictures that show it whole and nearest."""
     camera = survey.rig.cameras["left"]
     centres = card_centres(survey.card_ne)
@@ -298,6 +298,6 @@ def card_rows(survey: ColourSurvey, most: int = 4) -> Sequence[tuple[str | float
             found.append((off, name, pixels, radius))
     return [
         (name, float(x) - 0.5, float(y) - 0.5, float(radius), grey, grey, grey)
-        for _, name, pixels, radius in sorted(found, key=lambda one: one[0])[:most]
+        for _, name, pixels, radius in sorted(found, key=lambda one: one[0])[:maximum]
         for (x, y), (_, grey) in zip(pixels, CARD, strict=True)
     ]

@@ -172,15 +172,15 @@ def run_survey(survey: Survey, work: Path) -> tuple[Path, Path]:
         (workspace / "survey.toml").write_text(survey.text, encoding="utf-8")
     command = [*program, stages, "-w", str(workspace), "--threads", str(survey.workers)]
     command += ["--events", str(events), "--quiet"]
-    most_mb: dict[str, float] = {}
+    max_mb: dict[str, float] = {}
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
         while process.poll() is None:
             for folder in workspace.glob("*.partial"):
-                most_mb[folder.stem] = max(most_mb.get(folder.stem, 0.0), folder_mb(folder))
+                max_mb[folder.stem] = max(max_mb.get(folder.stem, 0.0), folder_mb(folder))
             time.sleep(_WATCH_S)
     if process.returncode:
         raise subprocess.CalledProcessError(process.returncode, command)
-    events.with_suffix(".scratch.json").write_text(json.dumps(most_mb))
+    events.with_suffix(".scratch.json").write_text(json.dumps(max_mb))
     return workspace, events
 
 

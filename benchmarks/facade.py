@@ -46,7 +46,7 @@ _LENGTH_IN = 4
 """The known length, and the picture in which its ends are picked."""
 _NEAR_PX = 3.0
 _SAMPLES = 10_000
-_LEAST_PICTURES = 3
+_MIN_PICTURES = 3
 _ALL_POINTS = 2**40
 
 
@@ -191,7 +191,7 @@ def judge(workspace: Path, cameras: list[dict[str, Any]], names: list[str]) -> d
     cloud = _scene(read_ply_points(dense / "cloud.ply", _ALL_POINTS), moved)
     sigma = read_header(dense / "cloud.ply").rows()["sigma"].astype(np.float64) * moved.scale
     samples, away = surface_samples()
-    seen = pictures_that_see(samples, away, cameras) >= _LEAST_PICTURES
+    seen = pictures_that_see(samples, away, cameras) >= _MIN_PICTURES
     gap = cKDTree(cloud).query(samples[seen], distance_upper_bound=_NEAR_PX * pixel_m)[0]
     vertices, triangles = read_mesh(workspace / "mesh")
     faces = face_points(moved.apply(vertices), triangles, _SAMPLES)
@@ -259,16 +259,16 @@ def figures(found: dict[str, Any], *, quick: bool) -> tuple[Figure, ...]:
 
     pixel = found["pixel_mm"]
     return (
-        figure("registered", found["registered"] / found["pictures"], "", Goal(least=1.0)),
-        figure("cameras, rms", found["cameras_mm"] / pixel, "px", Goal(most=2.0)),
-        figure("scale error", abs(found["scale_error"]), "", Goal(most=0.004)),
-        figure("cloud, rms", found["cloud"]["rms_mm"] / pixel, "px", Goal(most=1.0)),
+        figure("registered", found["registered"] / found["pictures"], "", Goal(minimum=1.0)),
+        figure("cameras, rms", found["cameras_mm"] / pixel, "px", Goal(maximum=2.0)),
+        figure("scale error", abs(found["scale_error"]), "", Goal(maximum=0.004)),
+        figure("cloud, rms", found["cloud"]["rms_mm"] / pixel, "px", Goal(maximum=1.0)),
         figure("cloud, error over sigma", found["cloud"]["over_sigma_rms"], "",
-               Goal(least=0.5, most=1.5)),
-        figure("cloud, complete", found["complete"], "", Goal(least=0.95)),
-        figure("mesh, rms", found["mesh"]["rms_mm"] / pixel, "px", Goal(most=2.0)),
-        figure("plane, off the wall", found["plane_off_deg"], "deg", Goal(most=5.0)),
-        figure("mosaic: shift, rms", found["mosaic"]["rms_px"], "px", Goal(most=1.5)),
+               Goal(minimum=0.5, maximum=1.5)),
+        figure("cloud, complete", found["complete"], "", Goal(minimum=0.95)),
+        figure("mesh, rms", found["mesh"]["rms_mm"] / pixel, "px", Goal(maximum=2.0)),
+        figure("plane, off the wall", found["plane_off_deg"], "deg", Goal(maximum=5.0)),
+        figure("mosaic: shift, rms", found["mosaic"]["rms_px"], "px", Goal(maximum=1.5)),
     )  # fmt: skip
 
 

@@ -57,7 +57,7 @@ def features(picture: Path, runs: int) -> list[Figure]:
 
     def ours() -> None:
         grey = normalise(read_deep(picture))
-        find_features(grey, None, scale=settings.feature_scale, most=settings.max_features)
+        find_features(grey, None, scale=settings.feature_scale, maximum=settings.max_features)
 
     with TemporaryDirectory() as folder:
         database = Path(folder) / "database.db"
@@ -80,9 +80,9 @@ def matches(first: Path, second: Path, runs: int) -> list[Figure]:
     from reconstruct.matching.refinement import affine_from_neighbours, align_coarser
     from reconstruct.pictures.normalise import normalise, read_deep
 
-    most = SurveyConfig().reconstruct.max_features
+    maximum = SurveyConfig().reconstruct.max_features
     greys = [normalise(read_deep(path)) for path in (first, second)]
-    found = [find_features(grey, None, scale=None, most=most) for grey in greys]
+    found = [find_features(grey, None, scale=None, maximum=maximum) for grey in greys]
     with TemporaryDirectory() as folder:
         files = [Path(folder) / f"{k}.npz" for k in range(2)]
         for file, row in zip(files, found, strict=True):

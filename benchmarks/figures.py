@@ -24,26 +24,26 @@ from benchmarks.machine import load
 class Goal:
     """Bounds of a figure, or of its ratio to a peer's."""
 
-    least: float | None = None
-    most: float | None = None
+    minimum: float | None = None
+    maximum: float | None = None
     of: Literal["value", "ratio"] = "value"
 
     def __post_init__(self) -> None:
-        if self.least is None and self.most is None:
+        if self.minimum is None and self.maximum is None:
             raise ValueError("a goal needs a bound")
 
     def __str__(self) -> str:
         subject = "ratio " if self.of == "ratio" else ""
-        if self.least is None:
-            return f"{subject}<= {self.most:.6g}"
-        if self.most is None:
-            return f"{subject}>= {self.least:.6g}"
-        return f"{subject}{self.least:.6g} to {self.most:.6g}"
+        if self.minimum is None:
+            return f"{subject}<= {self.maximum:.6g}"
+        if self.maximum is None:
+            return f"{subject}>= {self.minimum:.6g}"
+        return f"{subject}{self.minimum:.6g} to {self.maximum:.6g}"
 
     def is_met(self, number: float) -> bool:
         """Whether a number lies within; NaN never does."""
-        above = self.least is None or number >= self.least
-        return above and (self.most is None or number <= self.most)
+        above = self.minimum is None or number >= self.minimum
+        return above and (self.maximum is None or number <= self.maximum)
 
 
 @dataclass(frozen=True, kw_only=True)

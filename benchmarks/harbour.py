@@ -31,15 +31,15 @@ from benchmarks.machine import heading, machine
 from benchmarks.measured import measured
 
 _GOALS = {
-    "complete": Goal(least=0.97),
-    "rms in pixels": Goal(most=1.0),
-    "error over sigma": Goal(least=0.8, most=1.5),
-    "beyond 5 sigma": Goal(most=0.003),
-    "both surfaces": Goal(least=0.97),
-    "mosaic": Goal(most=1.5),
-    "masks, recall": Goal(least=0.8),
-    "masks, precision": Goal(least=0.6),
-    "masks, still": Goal(most=0.01),
+    "complete": Goal(minimum=0.97),
+    "rms in pixels": Goal(maximum=1.0),
+    "error over sigma": Goal(minimum=0.8, maximum=1.5),
+    "beyond 5 sigma": Goal(maximum=0.003),
+    "both surfaces": Goal(minimum=0.97),
+    "mosaic": Goal(maximum=1.5),
+    "masks, recall": Goal(minimum=0.8),
+    "masks, precision": Goal(minimum=0.6),
+    "masks, still": Goal(maximum=0.01),
 }
 
 

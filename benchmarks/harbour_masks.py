@@ -26,7 +26,7 @@ from benchmarks.harbour_truth import moving_distance, normals
 Mask = NDArray[np.bool_]
 _RIM_PX = 4
 """Around what moves, where a mask may end: its rim is blended, and masks have cells."""
-_FARTHEST_M = 6.0
+_MAX_M = 6.0
 _INSTANTS = 3
 """Stations that must see what is behind a fish, its own included."""
 _FISH_STEP_PX, _SHADOW_STEP_PX = 4, 2
@@ -135,7 +135,7 @@ def seen_behind(task: MaskTask, pose: RigidTransform, fish: Mask) -> Mask:
     looked = fish & _lattice(fish.shape, _FISH_STEP_PX)
     at = np.nonzero(looked.ravel())[0]
     origins, directions = _rays_of(task, pose, looked)
-    path = trace(origins, directions, np.full(len(at), _FARTHEST_M))
+    path = trace(origins, directions, np.full(len(at), _MAX_M))
     met = np.nonzero(~np.isnan(path))[0]
     points = origins[met] + path[met, None] * directions[met]
     cameras = [(one, bodies * rig.body_from_cam(name)) for name, one in rig.cameras.items()]
@@ -164,7 +164,7 @@ def _grown(mask: Mask) -> Mask:
 
 def in_shadow(origins: Array, directions: Array, lamps: Array, time_s: float) -> Mask:
     """Whether what rays meet is hidden from any lamp by fish, by weed or by the harbour, (N,)."""
-    path = trace(origins, directions, np.full(len(origins), _FARTHEST_M))
+    path = trace(origins, directions, np.full(len(origins), _MAX_M))
     met = np.nonzero(~np.isnan(path))[0]
     points = origins[met] + path[met, None] * directions[met]
     points = points + _OFF_M * normals(points)
@@ -216,7 +216,7 @@ def fish_in(name: str, scale: int, pose: RigidTransform, time_s: float) -> Mask:
     origins, directions = _rays(name, scale)
     origins, directions = pose.apply(origins), pose.rotation.apply(directions)
     nearest = fish_along(origins, directions, time_s)
-    at = np.nonzero(nearest < _FARTHEST_M)[0]
+    at = np.nonzero(nearest < _MAX_M)[0]
     hidden = ~np.isnan(trace(origins[at], directions[at], nearest[at]))
     shown = np.zeros(len(origins), bool)
     shown[at[~hidden]] = True
@@ -230,7 +230,7 @@ def weed_in(name: str, scale: int, pose: RigidTransform, time_s: float) -> Mask:
     drawn = np.zeros((camera.height_px, camera.width_px), np.uint8)
     for blade in WEEDS:
         points = pose.inv().apply(blade.line(np.linspace(0.0, 1.0, 33), time_s))
-        if points[:, 2].min() < 0.2 or points[:, 2].max() > _FARTHEST_M:
+        if points[:, 2].min() < 0.2 or points[:, 2].max() > _MAX_M:
             continue
         at = camera.project(points)
         if not (np.abs(at) < 1e4).all():

@@ -17,7 +17,7 @@ from camera_calib.camera import Camera
 
 GRAZING = 0.26
 """Cosine between ray and normal below which a surface counts as not seen: 75 degrees."""
-FARTHEST_M = 3.5
+MAX_M = 3.5
 NEAREST_M = 0.5
 _MARGIN = 0.02
 """Share of the frame along its border that is left out for what the port shifts."""
@@ -107,7 +107,7 @@ def _in_sight(
     ray = points - pose.translation
     length = np.linalg.norm(ray, axis=1)
     ray /= length[:, None]
-    good = (local[:, 2] > NEAREST_M) & (length < FARTHEST_M)
+    good = (local[:, 2] > NEAREST_M) & (length < MAX_M)
     good &= (x > edge) & (x < camera.width_px - edge)
     good &= (y > edge) & (y < camera.height_px - edge)
     good &= -(ray * away).sum(axis=1) > GRAZING

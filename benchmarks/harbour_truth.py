@@ -93,8 +93,8 @@ def clearance(points: Array) -> Array:
         close = apart < 0.05
         apart[close] = solid_distance(solid, points[close])
         np.minimum(found, apart, out=found)
-    least: Array = np.minimum(found, ladder)
-    return least
+    minimum: Array = np.minimum(found, ladder)
+    return minimum
 
 
 def solid_distance(solid: Solid, points: Array) -> Array:

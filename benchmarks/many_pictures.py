@@ -58,9 +58,9 @@ _SETTINGS = "dense_scale = 0.3\nmosaic_pixel_m = 0.025\n"
 """What costs is the number of pictures; their pixels are few."""
 _GAP_M = 0.4
 """Between copies, whose surfaces would not fit together."""
-_MOST_GIB = 8.0
-_MOST_EXPONENT = 1.25
-_STATIONS, _MOST_RMS_MM = 3, 1.0
+_MAX_GIB = 8.0
+_MAX_EXPONENT = 1.25
+_STATIONS, _MAX_RMS_MM = 3, 1.0
 _EVERY_S = 0.5
 _WALKING = 30.0
 """Time between looks at the disk over the time that one takes."""
@@ -368,9 +368,9 @@ def heights_of(lattice: Lattice, workspace: Path, pictures: int) -> list[Figure]
     print(f"{'':8}{pictures:>9}  heights {rms:.3f} mm from the tile's, {share:.2%} of cells")
     return [
         Figure(name=f"{pictures} pictures: heights against one tile's", value=rms, unit="mm",
-               goal=Goal(most=_MOST_RMS_MM)),
+               goal=Goal(maximum=_MAX_RMS_MM)),
         Figure(name=f"{pictures} pictures: cells of the tile", value=share, unit="",
-               goal=Goal(least=0.99, most=1.0)),
+               goal=Goal(minimum=0.99, maximum=1.0)),
     ]  # fmt: skip
 
 
@@ -382,14 +382,14 @@ def figures_of(rows: Sequence[StageCost], *, judged: bool) -> list[Figure]:
         found += [
             Figure(name=f"{own}, time", value=row.cpu_s, unit="s"),
             Figure(name=f"{own}, parent", value=row.parent_gib, unit="GiB",
-                   goal=Goal(most=_MOST_GIB) if judged else None),
+                   goal=Goal(maximum=_MAX_GIB) if judged else None),
             Figure(name=f"{own}, disk", value=row.disk_gib, unit="GiB"),
         ]  # fmt: skip
     if len(rows) > 1:
         first, last = rows[-2:]
         power = growth(first.cpu_s, last.cpu_s, last.pictures / first.pictures)
         found.append(Figure(name=f"{name}: exponent", value=power, unit="",
-                            goal=Goal(most=_MOST_EXPONENT) if judged else None))  # fmt: skip
+                            goal=Goal(maximum=_MAX_EXPONENT) if judged else None))  # fmt: skip
     return found
 
 

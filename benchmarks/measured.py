@@ -49,16 +49,16 @@ def measured(command: Sequence[str], log: Path, timeout_s: float = 7200.0) -> Co
     log.parent.mkdir(parents=True, exist_ok=True)
     before = os.times()
     started, peak, late = time.perf_counter(), 0.0, False
-    looked, most = -_SURELY_EVERY_S, 0.0
+    looked, maximum = -_SURELY_EVERY_S, 0.0
     with log.open("w") as file:
         process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT)
         try:
             while process.poll() is None:
                 running, now = family(process.pid), time.perf_counter() - started
                 plain = sum(map(_resident_mib, running))
-                if plain > most or now > looked + _SURELY_EVERY_S:
+                if plain > maximum or now > looked + _SURELY_EVERY_S:
                     peak = max(peak, sum(map(memory_mib, running)))
-                    looked, most = now, max(most, plain)
+                    looked, maximum = now, max(maximum, plain)
                 if late := now > timeout_s:
                     break
                 time.sleep(_EVERY_S)

@@ -70,7 +70,7 @@ class Row:
     def figure(self) -> Figure:
         """What is seen, and as its goal what is promised, unless less was said beforehand."""
         said_less = self.warned or self.expected < self.promised - _SPARE
-        goal = None if said_less else Goal(least=100.0 * (self.promised - _SPARE))
+        goal = None if said_less else Goal(minimum=100.0 * (self.promised - _SPARE))
         return Figure(
             name=f"{self.vehicle}, {self.format}, {_sea(self)}: at the requested overlap",
             value=100.0 * self.flown,

@@ -36,7 +36,7 @@ from missions.route.ways import Ways
 from missions.values.costs import time_costs
 
 _ROWS = (100, 300, 3_000, 10_000)
-_MOST_PEER_ROWS = 300
+_MAX_PEER_ROWS = 300
 _ANGLE_ROWS = 30
 _ANGLES = 3600
 _QUICK_ANGLE_ROWS, _QUICK_ANGLES = 12, 600
@@ -50,7 +50,7 @@ _GOALS_S = {
     ("marina, 44 piles", 100): 0.5,
     ("quay, 24 piles", 100): 0.3,
 }
-_LARGEST_S = (10_000, 1.0)
+_MAX_S = (10_000, 1.0)
 _HEAD = (
     "| area | rows | planner | time, ms | path, m | turns | covered | outside, m | in holes, m "
     "| time ratio | path ratio |\n" + "|---" * 11 + "|"
@@ -83,11 +83,11 @@ class Angle:
         return [
             Figure(
                 name=f"{self.area}: cost at the heading found", value=self.cost_s, unit="s",
-                peer=peer, peer_value=self.best_s, goal=Goal(most=_ANGLE_GOAL, of="ratio"),
+                peer=peer, peer_value=self.best_s, goal=Goal(maximum=_ANGLE_GOAL, of="ratio"),
             ),
             Figure(
                 name=f"{self.area}: least total width", value=self.width_m, unit="m", peer=peer,
-                peer_value=self.sampled_width_m, goal=Goal(most=self.sampled_width_m + 1e-9),
+                peer_value=self.sampled_width_m, goal=Goal(maximum=self.sampled_width_m + 1e-9),
             ),
             Figure(name=f"{self.area}: search for the heading", value=self.seconds, unit="s"),
         ]  # fmt: skip
@@ -127,7 +127,7 @@ def main() -> None:
         figures += [
             Figure(
                 name=f"{name}: growth of time", value=g, unit="exponent of rows",
-                goal=Goal(most=_N_LOG_N),
+                goal=Goal(maximum=_N_LOG_N),
             )
             for name, g in growth.items()
         ]  # fmt: skip
@@ -135,19 +135,19 @@ def main() -> None:
 
 
 def _compared(area: Any, rows: int) -> list[Measured]:
-    repeats = 5 if rows <= _MOST_PEER_ROWS else 2
-    planners = PLANNERS if rows <= _MOST_PEER_ROWS else {"alice-survey": own_plan}
+    repeats = 5 if rows <= _MAX_PEER_ROWS else 2
+    planners = PLANNERS if rows <= _MAX_PEER_ROWS else {"alice-survey": own_plan}
     return [measured(name, plan(area, repeats), area) for name, plan in planners.items()]
 
 
 def _figures(name: str, rows: int, results: list[Measured]) -> list[Figure]:
     own, where = results[0], f"{name}, {rows:,} rows"
-    limit_s = _GOALS_S.get((name, rows), _LARGEST_S[1] if rows == _LARGEST_S[0] else math.inf)
-    time_goal = Goal(most=1e3 * limit_s) if math.isfinite(limit_s) else None
-    none = Goal(most=0.0)
+    limit_s = _GOALS_S.get((name, rows), _MAX_S[1] if rows == _MAX_S[0] else math.inf)
+    time_goal = Goal(maximum=1e3 * limit_s) if math.isfinite(limit_s) else None
+    none = Goal(maximum=0.0)
     alone = [
         Figure(name=f"{where}: time", value=1e3 * own.seconds, unit="ms", goal=time_goal),
-        Figure(name=f"{where}: covered", value=own.covered, unit="1", goal=Goal(least=_COVERED)),
+        Figure(name=f"{where}: covered", value=own.covered, unit="1", goal=Goal(minimum=_COVERED)),
         Figure(name=f"{where}: way outside", value=own.outside_m, unit="m", goal=none),
         Figure(name=f"{where}: way in holes", value=own.holes_m, unit="m", goal=none),
         Figure(name=f"{where}: way", value=own.path_m, unit="m"),
@@ -162,7 +162,7 @@ def _figures(name: str, rows: int, results: list[Measured]) -> list[Figure]:
             Figure(
                 name=f"{where}: way", value=own.path_m, unit="m", peer=peer.planner,
                 peer_value=peer.path_m,
-                goal=Goal(most=1.0, of="ratio") if _as_good(peer, own) else None,
+                goal=Goal(maximum=1.0, of="ratio") if _as_good(peer, own) else None,
             ),
         ]  # fmt: skip
     return [*alone, *compared]

@@ -110,7 +110,7 @@ def own_lines(area: Area, ways: Ways) -> list[Line]:
         (home[0], home[1]),
         cross_lines=0,
         closing_line=False,
-        most_stations=_ALL,
+        max_stations=_ALL,
     )
 
 

@@ -233,7 +233,7 @@ def _gain(plain: Compared, crossed: Compared) -> Figure:
         for before, after in ((plain.rms, crossed.rms), (plain.said, crossed.said))
     )
     print(f"\ncross lines take {real:.0%} off the bend; predicted: {said:.0%}")
-    goal = Goal(least=1.0 - _GAIN_WITHIN, most=1.0 + _GAIN_WITHIN, of="ratio")
+    goal = Goal(minimum=1.0 - _GAIN_WITHIN, maximum=1.0 + _GAIN_WITHIN, of="ratio")
     return Figure(
         name="gain of cross lines", value=real, unit="", peer="predicted", peer_value=said,
         goal=goal,
@@ -248,7 +248,7 @@ def _figures(name: str, found: Compared, *, judged: bool) -> list[Figure]:
     )
     cost = f"{found.stations} stations, {found.seconds:.1f} s a survey"
     print(f"{name:<30}{cells}   {cost}", flush=True)
-    goal = Goal(least=1.0 / (1.0 + _WITHIN), most=1.0 / (1.0 - _WITHIN), of="ratio")
+    goal = Goal(minimum=1.0 / (1.0 + _WITHIN), maximum=1.0 / (1.0 - _WITHIN), of="ratio")
     return [
         Figure(
             name=f"{name}: {what.split(',')[0]}", value=float(rms), unit=what.split()[-1],

@@ -358,9 +358,9 @@ def main() -> int:
     if "growth" in parts:
         findings += run_growth(work, _GROWN_QUICK if given.quick else _GROWN, 8)
     if "hierarchical" in parts:
-        most = (_GROWN_QUICK if given.quick else _GROWN)[-1]
-        large = most if given.quick else given.large
-        findings += run_hierarchical(work, large, max(large, most), given.limit)
+        maximum = (_GROWN_QUICK if given.quick else _GROWN)[-1]
+        large = maximum if given.quick else given.large
+        findings += run_hierarchical(work, large, max(large, maximum), given.limit)
     for name, function in (("haltbrekken", run_haltbrekken), ("brighton", run_brighton)):
         if name in parts:
             if (given.data / ("brighton_beach" if name == "brighton" else name)).is_dir():

@@ -41,7 +41,7 @@ _CENTRES = [
 ]  # fmt: skip
 _WAVES = 6.0
 _WRONG_PX, _WRONG_OVER_PX = 1.0, 40.0
-_MOST_APART_PX, _FARTHEST_PX = 1e-3, 0.1
+_MAX_APART_PX, _MAX_PX = 1e-3, 0.1
 """Where rounding decides whether a window gets a second round, results differ by more."""
 _FULL_MEGAPIXELS = 3384 * 2710 / 1e6
 _PORT_VIEW_SCALE = 8
@@ -136,13 +136,13 @@ def compared(megapixels: float, runs: int) -> list[Figure]:
     return [
         Figure(name=f"{name}: a view", value=gpu_s, unit="s", peer="one core", peer_value=cpu_s),
         Figure(name=f"{name}: moved by, rms", value=float(np.sqrt(np.mean(moved_px**2))), unit="px",
-               goal=Goal(least=0.5)),
+               goal=Goal(minimum=0.5)),
         Figure(name=f"{name}: apart, of all but one in 100,000",
                value=float(np.quantile(np.abs(off_px), 1 - 1e-5)), unit="px",
-               goal=Goal(most=_MOST_APART_PX)),
+               goal=Goal(maximum=_MAX_APART_PX)),
         Figure(name=f"{name}: apart, the farthest", value=float(np.abs(off_px).max()), unit="px",
-               goal=Goal(most=_FARTHEST_PX)),
-        Figure(name=f"{name}: known in one", value=float(known), unit="", goal=Goal(most=1e-3)),
+               goal=Goal(maximum=_MAX_PX)),
+        Figure(name=f"{name}: known in one", value=float(known), unit="", goal=Goal(maximum=1e-3)),
     ]  # fmt: skip
 
 

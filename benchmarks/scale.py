@@ -27,9 +27,9 @@ from benchmarks.machine import heading, machine
 from benchmarks.scale_steps import MAKE, MAPPED, MAPPED_POINTS, PLACING, STEPS, UNMATCHED
 
 _MANY = 100_000
-_MOST_GIB = 8.0
+_MAX_GIB = 8.0
 """At that many pictures."""
-_MOST_EXPONENT = 1.25
+_MAX_EXPONENT = 1.25
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -89,9 +89,9 @@ def figures_of(rows: Sequence[StepCost], *, judged: bool) -> list[Figure]:
     return [
         *found,
         Figure(name=f"{name}: exponent", value=power, unit="",
-               goal=Goal(most=_MOST_EXPONENT) if judged else None),
+               goal=Goal(maximum=_MAX_EXPONENT) if judged else None),
         Figure(name=f"{name}: peak at {_MANY} pictures", value=peak, unit="GiB",
-               goal=Goal(most=_MOST_GIB) if judged else None),
+               goal=Goal(maximum=_MAX_GIB) if judged else None),
     ]  # fmt: skip
 
 

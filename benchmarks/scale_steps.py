@@ -62,7 +62,7 @@ _LATTICE, _WITNESSES = (28, 22), 8
 """Spots along a view's width and height, and views it is compared with."""
 MAPPED_POINTS, UNMATCHED = 100, 1000
 """Of a station where matches are mapped, and keypoints of a picture that have no point."""
-_LEAST_MATCHES = 15
+_MIN_MATCHES = 15
 _WRONG, _WRONG_PX = 0.005, 20.0
 """Share of the keypoints that are wrong, and by how much."""
 _LOOK = 8192
@@ -173,7 +173,7 @@ def _adjust(work: StepWork) -> Prepared:
         with work.executor.started() as executor:
             workers = Workers(executor=executor, folder=work.own / "parts")
             problem = SurveyProblem(near, state, prior, workers)
-            found = minimise(problem, problem.start, settled=0.05, most_steps=20)
+            found = minimise(problem, problem.start, settled=0.05, max_steps=20)
         if not found.is_settled:
             raise RuntimeError("the adjustment did not settle")
         shutil.rmtree(work.own / "parts", ignore_errors=True)
@@ -387,7 +387,7 @@ def _matched(work: StepWork) -> Observations:
     pairs = []
     for i, j in sorted(set().union(*choose_pairs(records, rig, DATUM))):
         _, *rows = np.intersect1d(points[i], points[j], assume_unique=True, return_indices=True)
-        if len(rows[0]) >= _LEAST_MATCHES:
+        if len(rows[0]) >= _MIN_MATCHES:
             matches = np.stack(rows, axis=1).astype(np.uint32)
             pairs.append((i, j, PairMatches(matches=matches, geometry=geometry)))
     warps = pinhole_warps(rig)

@@ -64,13 +64,13 @@ class Replan:
 
     def figures(self) -> list[Figure]:
         """Computing of a re-plan, next to the whole stage."""
-        most = _GOALS_S.get(self.area)
-        goal = None if most is None else Goal(most=most)
+        maximum = _GOALS_S.get(self.area)
+        goal = None if maximum is None else Goal(maximum=maximum)
         return [
             Figure(name=f"{self.area}: re-plan", value=self.cpu_s, unit="s", goal=goal),
             Figure(
                 name=f"{self.area}: re-plan over a whole plan", value=self.cpu_s, unit="s",
-                peer="stage plan", peer_value=self.whole_s, goal=Goal(most=0.5, of="ratio"),
+                peer="stage plan", peer_value=self.whole_s, goal=Goal(maximum=0.5, of="ratio"),
             ),
         ]  # fmt: skip
 
@@ -90,11 +90,11 @@ class Tiles:
     def figures(self) -> list[Figure]:
         """Computing of a tile, next to its twin."""
         return [
-            Figure(name="tile of a mosaic", value=self.cpu_ms, unit="ms", goal=Goal(most=60.0)),
+            Figure(name="tile of a mosaic", value=self.cpu_ms, unit="ms", goal=Goal(maximum=60.0)),
             Figure(
                 name="tile of a mosaic over reading and encoding it", value=self.cpu_ms, unit="ms",
                 peer="rasterio and OpenCV", peer_value=self.twin_ms,
-                goal=Goal(most=1.5, of="ratio"),
+                goal=Goal(maximum=1.5, of="ratio"),
             ),
         ]  # fmt: skip
 

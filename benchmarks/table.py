@@ -22,8 +22,8 @@ class Summary:
     repeats: int
     """That have a number."""
     median: float | None
-    least: float | None
-    most: float | None
+    minimum: float | None
+    maximum: float | None
     peer: str | None
     peer_median: float | None
     ratio: float | None
@@ -116,8 +116,8 @@ def _summary(name: str, peer: str | None, rows: Sequence[Mapping[str, Any]]) -> 
         unit=rows[0]["unit"],
         repeats=len(values),
         median=_median(values),
-        least=min(values, default=None),
-        most=max(values, default=None),
+        minimum=min(values, default=None),
+        maximum=max(values, default=None),
         peer=peer,
         peer_median=_median([row["peer_value"] for row in rows]),
         ratio=_median([row["ratio"] for row in rows]),
@@ -211,7 +211,7 @@ def _figure_row(figure: Summary) -> str:
     met = "-"
     if figure.goal is not None:
         met = f"{'yes' if figure.met == figure.judged else 'NO'}, {figure.met} of {figure.judged}"
-    spread = f"{number(figure.least)} to {number(figure.most)}"
+    spread = f"{number(figure.minimum)} to {number(figure.maximum)}"
     return _row(
         [
             _safe(figure.name),

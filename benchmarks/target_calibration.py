@@ -25,7 +25,7 @@ from camera_calib.target_shape import AS_DRAWN, TargetShape
 Array = NDArray[np.float64]
 
 GOAL_OF_SIGMA = (0.8, 1.25)
-MOST_GROWTH = 1.3
+MAX_GROWTH = 1.3
 _SIZE = (1600, 1200)
 _LENS = {
     "fx_px": 1702.0, "fy_px": 1699.0, "cx_px": 805.0, "cy_px": 593.0,
@@ -183,7 +183,7 @@ class Trials:
     def figures(self, *, judged: bool) -> list[Figure]:
         """Errors over sigmas, and what unknown shapes cost where the board is sound."""
         low, high = GOAL_OF_SIGMA
-        goal = Goal(least=low, most=high) if judged else None
+        goal = Goal(minimum=low, maximum=high) if judged else None
         ends = (("least", min(self.by_sigma)), ("most", max(self.by_sigma)))
         found = [
             Figure(
@@ -193,9 +193,9 @@ class Trials:
             for which, end in ends
         ]  # fmt: skip
         if self.name == "sound":
-            most = Goal(most=MOST_GROWTH) if judged else None
+            maximum = Goal(maximum=MAX_GROWTH) if judged else None
             name = "board sound: sigma of fx over that of a board known as flat"
-            found.append(Figure(name=name, value=self.sigma_growth, unit="1", goal=most))
+            found.append(Figure(name=name, value=self.sigma_growth, unit="1", goal=maximum))
         return found
 
 

@@ -50,9 +50,9 @@ class Level:
 
 
 LEVELS = (
-    Level(jerlov="3C", strobe_lumens=30_000, registered=Goal(least=1.0)),
-    Level(jerlov="5C", strobe_lumens=60_000, registered=Goal(least=0.9)),
-    Level(jerlov="5C", strobe_lumens=30_000, registered=Goal(least=0.8)),
+    Level(jerlov="3C", strobe_lumens=30_000, registered=Goal(minimum=1.0)),
+    Level(jerlov="5C", strobe_lumens=60_000, registered=Goal(minimum=0.9)),
+    Level(jerlov="5C", strobe_lumens=30_000, registered=Goal(minimum=0.8)),
     Level(jerlov="7C", strobe_lumens=120_000),
 )
 

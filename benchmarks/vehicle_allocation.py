@@ -166,7 +166,7 @@ def figures(rows: list[Row]) -> list[Figure]:
     alone = [
         Figure(
             name=f"exact allocation, {kind}", value=row.us, unit="us",
-            goal=None if row.goal_us is None else Goal(most=row.goal_us),
+            goal=None if row.goal_us is None else Goal(maximum=row.goal_us),
         )
         for kind, row in own.items()
     ]  # fmt: skip

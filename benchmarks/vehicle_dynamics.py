@@ -175,8 +175,8 @@ class NumpyTwin:
         force -= body.in_current @ np.concatenate([along, rotation[:2].T @ self.water[2:4]])
         out[7:STATE] = body.mass_inverse @ force
         asked = np.where(np.abs(command_rps) < t[:, propulsion.DEAD_BAND], 0.0, command_rps)
-        most = t[:, propulsion.MOST]
-        out[STATE:] = (np.clip(asked, -most, most) - rps) * t[:, propulsion.RATE]
+        maximum = t[:, propulsion.MOST]
+        out[STATE:] = (np.clip(asked, -maximum, maximum) - rps) * t[:, propulsion.RATE]
         return out
 
     def step(self, time_s: float, state: Array, command_rps: Array, load: Array) -> Array:
@@ -365,7 +365,7 @@ def figures(rows: list[Row]) -> list[Figure]:
     alone = [
         Figure(
             name=f"{row.what}: {row.case}", value=row.us, unit="us",
-            goal=None if row.goal_us is None else Goal(most=row.goal_us),
+            goal=None if row.goal_us is None else Goal(maximum=row.goal_us),
         )
         for row in own.values()
     ]  # fmt: skip

@@ -26,7 +26,7 @@ from camera_calib.rig import design_rig
 from missions.fly.simulation import flight_settings, mission_setup
 from missions.plan.planner import plan_survey
 
-_LONGEST_S = 7200.0
+_MAX_S = 7200.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +47,7 @@ class Row:
 
     def figure(self) -> Figure:
         """The factor and its goal."""
-        goal = Goal(least=self.goal)
+        goal = Goal(minimum=self.goal)
         return Figure(name=self.mission, value=self.factor, unit="times real time", goal=goal)
 
 
@@ -88,7 +88,7 @@ def measure(runs: int) -> list[Row]:
 
 def _setup(config: SurveyConfig, floor: FloorGrid) -> Setup:
     plan = plan_survey(config, design_rig(config.camera, config.water)).plan
-    return mission_setup(plan, flight_settings(config), floor, _LONGEST_S, np.random.default_rng(1))
+    return mission_setup(plan, flight_settings(config), floor, _MAX_S, np.random.default_rng(1))
 
 
 def _waves(depth_m: float) -> FloorGrid:
@@ -101,7 +101,7 @@ def _fly(name: str, setup: Setup, runs: int) -> Row:
     best = math.inf
     for _ in range(runs + 1):
         started = time.perf_counter()
-        flown = simulate(setup, np.random.default_rng(2), longest_s=_LONGEST_S, label=name)
+        flown = simulate(setup, np.random.default_rng(2), max_s=_MAX_S, label=name)
         best = min(best, time.perf_counter() - started)
     return Row(
         mission=name,
@@ -128,7 +128,7 @@ print(json.dumps([stepped - imported, time.perf_counter() - imported_all]))
 def first_tick() -> None:
     """Compile, or load, all that a mission needs."""
     setup = _setup(SurveyConfig(), level_floor(15.0))
-    simulate(setup, np.random.default_rng(2), longest_s=0.05, label="first tick")
+    simulate(setup, np.random.default_rng(2), max_s=0.05, label="first tick")
 
 
 def starts(cache: Path) -> list[Start]:

@@ -109,11 +109,11 @@ class SeaResult:
     def figures(self, must_fly: bool) -> list[Figure]:
         """Cross-track error, and the share that was complete."""
         share = self.complete / self.flights
-        goal = Goal(least=1.0) if must_fly else None
+        goal = Goal(minimum=1.0) if must_fly else None
         return [
             Figure(
                 name=f"{self.sea}: cross-track error", value=self.true_m, unit="m",
-                goal=Goal(most=self.allowed_m) if must_fly else None,
+                goal=Goal(maximum=self.allowed_m) if must_fly else None,
             ),
             Figure(name=f"{self.sea}: complete", value=share, unit="", goal=goal),
         ]  # fmt: skip

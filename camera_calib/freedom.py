@@ -126,8 +126,8 @@ def at_bound(rig: Rig, names: Sequence[str]) -> Flags:
 
     def bound(name: str) -> bool:
         camera, _, field = name.partition(".")
-        least = rig.cameras[camera].port.least(field) if camera in rig.cameras else -np.inf
-        return least > -np.inf and value(rig, name) <= least
+        minimum = rig.cameras[camera].port.minimum(field) if camera in rig.cameras else -np.inf
+        return minimum > -np.inf and value(rig, name) <= minimum
 
     return np.array([bound(name) for name in names], dtype=np.bool_)
 
@@ -144,7 +144,7 @@ def moved(rig: Rig, names: Sequence[str], step: Array) -> Rig:
         mine = {field: float(change) for (owner, _, field), change in parts if owner == name}
         turn, shift = ([mine.pop(axis, 0.0) for axis in axes] for axes in (_TURN, _SHIFT))
         changed = {
-            field: max(camera.parameter(field) + change, camera.port.least(field))
+            field: max(camera.parameter(field) + change, camera.port.minimum(field))
             for field, change in mine.items()
         }
         cameras[name] = camera.with_parameters(changed) if changed else camera

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from alice_survey.core.errors import ImageError, memory_shortage
 
-MOST_PIXELS = 104_000_000
+MAX_PIXELS = 104_000_000
 """Most pixels of a picture: 0.8 GB of 4 channels and 16 bits. A small file can state any size."""
-MOST_PIXELS_JPEG = 160_000_000
+MAX_PIXELS_JPEG = 160_000_000
 """Most pixels of a JPEG, whose pixels take half as much or less."""
 PILLOW_FAULTS = (
     OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, AttributeError,
@@ -32,7 +32,7 @@ _TIFF = (".tif", ".tiff")
 
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
-_MOST_CAMERAS = 8
+_MAX_CAMERAS = 8
 
 
 def places_of_cameras(texts: Sequence[str]) -> dict[str, str]:
@@ -51,8 +51,8 @@ def places_of_cameras(texts: Sequence[str]) -> dict[str, str]:
         if name in places:
             raise ImageError(f"--camera {text}: two cameras are called {name}")
         places[name] = place
-    if len(places) > _MOST_CAMERAS:
-        raise ImageError(f"{len(places)} cameras are given, {_MOST_CAMERAS} at most")
+    if len(places) > _MAX_CAMERAS:
+        raise ImageError(f"{len(places)} cameras are given, {_MAX_CAMERAS} at most")
     return places
 
 
@@ -67,10 +67,10 @@ def pixels_too_many(path: Path) -> int:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             with Image.open(path) as image:
-                most = MOST_PIXELS_JPEG if image.format == "JPEG" else MOST_PIXELS
-                return most if image.width * image.height > most else 0
+                maximum = MAX_PIXELS_JPEG if image.format == "JPEG" else MAX_PIXELS
+                return maximum if image.width * image.height > maximum else 0
     except Image.DecompressionBombError:  # more than Pillow opens at all
-        return MOST_PIXELS_JPEG
+        return MAX_PIXELS_JPEG
     except PILLOW_FAULTS:
         return 0
 

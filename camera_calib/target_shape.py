@@ -175,9 +175,9 @@ def marker_lines(shape: TargetShape) -> Iterator[str]:
     off_mm = 1e3 * shape.values[at].reshape(-1, 2)
     sigma_mm = 1e3 * np.array([shape.sigmas[shape.parameters[i]] for i in at]).reshape(-1, 2)
     far = np.linalg.norm(off_mm, axis=1)
-    most = int(far.argmax())
-    x, y = (with_sigma(float(off_mm[most, k]), float(sigma_mm[most, k])) for k in range(2))
+    maximum = int(far.argmax())
+    x, y = (with_sigma(float(off_mm[maximum, k]), float(sigma_mm[maximum, k])) for k in range(2))
     yield (
         f"markers: {len(far)} lie {np.sqrt(np.mean(far**2)):.2g} mm rms off their places; the "
-        f"farthest, number {most}, by {x} mm along x and {y} mm along y"
+        f"farthest, number {maximum}, by {x} mm along x and {y} mm along y"
     )

@@ -18,9 +18,9 @@ from alice_survey.core.frames import Array
 if TYPE_CHECKING:
     import laspy
 
-_MOST_NODES = 200_000
+_MAX_NODES = 200_000
 """Of 65,000 points each: 13,000 million points."""
-_MOST_POINTS = 1_000_000
+_MAX_POINTS = 1_000_000
 """Of a node; the writer's have some 100,000."""
 _DEEPEST = 30
 """Level whose keys still fit in 32 bits."""
@@ -29,7 +29,7 @@ _ENTRY = np.dtype(
 )
 _RECORDS_AT = 100
 """Where the header states the number of its records, which laspy reads one by one."""
-_MOST_RECORDS = 1000
+_MAX_RECORDS = 1000
 _PAGE = -1
 """Count of an entry that stands for a further page."""
 _COLOURED = 7
@@ -86,7 +86,7 @@ def read_nodes(path: Path) -> CopcNodes:
     try:
         with path.open("rb") as file:
             records = file.read(_RECORDS_AT + 4)[_RECORDS_AT:]
-            if int.from_bytes(records, "little") > _MOST_RECORDS:
+            if int.from_bytes(records, "little") > _MAX_RECORDS:
                 raise _damaged(path, "its header has too many records")
             end = file.seek(0, io.SEEK_END)
             file.seek(0)
@@ -99,9 +99,9 @@ def read_nodes(path: Path) -> CopcNodes:
             while pages:
                 offset, size = pages.pop()
                 count += size // _ENTRY.itemsize
-                if count > _MOST_NODES:
+                if count > _MAX_NODES:
                     raise ReconstructionError(
-                        f"{path.name} has more than {_MOST_NODES:,} nodes, too many to show: "
+                        f"{path.name} has more than {_MAX_NODES:,} nodes, too many to show: "
                         "open it in QGIS or CloudCompare"
                     )
                 if size < 1 or offset + size > end:
@@ -150,9 +150,9 @@ def read_node(nodes: CopcNodes, number: int) -> NodePoints:
 
     entry, path = nodes.entries[number], nodes.path
     count, size = int(entry["count"]), int(entry["size"])
-    if count > _MOST_POINTS:
+    if count > _MAX_POINTS:
         raise ReconstructionError(
-            f"a node of {path.name} has {count:,} points: at most {_MOST_POINTS:,} are shown"
+            f"a node of {path.name} has {count:,} points: at most {_MAX_POINTS:,} are shown"
         )
     with path.open("rb") as file:
         file.seek(int(entry["offset"]))

@@ -26,7 +26,7 @@ _TYPES = {
 }  # fmt: skip
 _NAMES = {"<f4": "float", "|u1": "uchar"}
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-_LONGEST_HEADER = 1 << 16
+_MAX_HEADER = 1 << 16
 VERTEX = np.dtype(
     [
         ("x", "<f4"), ("y", "<f4"), ("z", "<f4"),
@@ -114,14 +114,14 @@ class PlyHeader:
         return np.memmap(self.path, record, "r", offset=self.start, shape=(self.count,))
 
 
-def read_ply_points(path: Path, most: int) -> Array:
-    """Every n-th point, so that there are at most `most`, (N, 3), with the offset our files state.
+def read_ply_points(path: Path, maximum: int) -> Array:
+    """Every n-th point, at most `maximum` of them, (N, 3), with the offset our files state.
 
     Raises:
         WorkspaceError: it is not a PLY, its points do not come first, or it is cut short.
     """
     header = read_header(path)
-    step = max(1, -(-header.count // most))
+    step = max(1, -(-header.count // maximum))
     points = _coordinates(header.rows()[::step]) if header.order else _text(header, step)
     return points + header.offset
 
@@ -158,7 +158,7 @@ def read_header(path: Path) -> PlyHeader:
         OSError: the file cannot be read.
     """
     with path.open("rb") as file:
-        content = file.read(_LONGEST_HEADER)
+        content = file.read(_MAX_HEADER)
     end = content.find(b"end_header")
     start = content.find(b"\n", end) + 1
     if not content.startswith(b"ply") or end < 0 or not start:
@@ -240,9 +240,9 @@ class CloudFile:
             parts.append(part[here])
         return np.concatenate(parts)
 
-    def sample(self, most: int) -> NDArray[Any]:
-        """At most `most` records, evenly from the file."""
-        return np.array(self.header.rows()[:: max(1, -(-self.header.count // most))])
+    def sample(self, maximum: int) -> NDArray[Any]:
+        """At most `maximum` records, evenly from the file."""
+        return np.array(self.header.rows()[:: max(1, -(-self.header.count // maximum))])
 
 
 def open_cloud(path: Path) -> CloudFile:

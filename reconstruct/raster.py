@@ -302,13 +302,13 @@ def tiles_reached(
     side = size * grid.cell
     edges = np.stack([boxes[:, 0], -boxes[:, 3], boxes[:, 2], -boxes[:, 1]], axis=1)
     edges += np.array([-1.0, -1.0, 1.0, 1.0]) * margin - np.array([grid.west, -grid.north] * 2)
-    most = np.array([-(-grid.columns // size), -(-grid.rows // size)] * 2) - 1
+    maximum = np.array([-(-grid.columns // size), -(-grid.rows // size)] * 2) - 1
     spans = np.floor(edges / side)
     known = np.isfinite(spans).all(axis=1) & (spans[:, 2:] >= 0).all(axis=1)
-    known &= (spans[:, :2] <= most[:2]).all(axis=1)
+    known &= (spans[:, :2] <= maximum[:2]).all(axis=1)
     reached: dict[tuple[int, int], list[int]] = {}
     for number in np.flatnonzero(known).tolist():
-        left, top, right, bottom = np.clip(spans[number], 0, most).astype(int).tolist()
+        left, top, right, bottom = np.clip(spans[number], 0, maximum).astype(int).tolist()
         for row in range(top, bottom + 1):
             for column in range(left, right + 1):
                 reached.setdefault((row * size, column * size), []).append(number)
@@ -329,10 +329,10 @@ def hillshade(height: Array, cell: float) -> Array:
 
 
 @progress.step("draw the surface")
-def preview_dem(dem: Path, picture: Path, longest_px: int = 1600) -> None:
+def preview_dem(dem: Path, picture: Path, max_px: int = 1600) -> None:
     """Write a shaded, coloured picture of a DEM; what is unknown is white."""
     with opened_raster(dem) as raster:
-        shrink = max(1.0, max(raster.width, raster.height) / longest_px)
+        shrink = max(1.0, max(raster.width, raster.height) / max_px)
         shape = (max(2, int(raster.height / shrink)), max(2, int(raster.width / shrink)))
         resampling = rasterio.enums.Resampling.average
         height = raster.read(1, out_shape=shape, resampling=resampling).astype(np.float64)

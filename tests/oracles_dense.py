@@ -88,13 +88,13 @@ def surfaces(
         joined = [list(parts[0])]
         for n, part in enumerate(parts[1:], 1):
             below, above = parts[n - 1][-1], part[0]
-            least = 5.0 * math.hypot(sigmas[below], sigmas[above])
+            minimum = 5.0 * math.hypot(sigmas[below], sigmas[above])
             if slopes is None:
-                least += cell
+                minimum += cell
             else:
                 known = [slope for slope in (slopes[n - 1], slopes[n]) if not math.isnan(slope)]
-                least += math.sqrt(2) * cell * max(known) if known else math.inf
-            if heights[above] - heights[below] > least:
+                minimum += math.sqrt(2) * cell * max(known) if known else math.inf
+            if heights[above] - heights[below] > minimum:
                 joined.append([])
             joined[-1] += part
         return joined
@@ -140,12 +140,12 @@ def projected(grid: DemGrid, points: np.ndarray, row: int, column: int) -> dict[
         if above[0] - below[0] > gap:
             layers.append([])
         layers[-1].append(below)
-    most = max(entry[5]["stations"] for entry in entries)
+    maximum = max(entry[5]["stations"] for entry in entries)
     layers = [
         layer
         for layer in layers
         if sum(entry[4] for entry in layer) >= 0.25
-        and max(entry[5]["stations"] for entry in layer) >= min(2, most)
+        and max(entry[5]["stations"] for entry in layer) >= min(2, maximum)
     ]
     if not layers:
         return nothing

@@ -215,8 +215,8 @@ def fin_lag(fins: Sequence[Fin], angles: Array, commands: Array) -> Array:
     """Rates of the angles of fins."""
     rates = []
     for fin, angle, asked in zip(fins, angles, commands, strict=True):
-        most, fastest = np.radians(fin.most_angle_deg), np.radians(fin.most_rate_deg_s)
-        rate = (np.clip(asked, -most, most) - angle) / fin.time_constant_s
+        maximum, fastest = np.radians(fin.most_angle_deg), np.radians(fin.most_rate_deg_s)
+        rate = (np.clip(asked, -maximum, maximum) - angle) / fin.time_constant_s
         rates.append(np.clip(rate, -fastest, fastest))
     return np.array(rates)
 

@@ -61,10 +61,10 @@ def highest_within(
     step_m: float,
 ) -> float:
     """The least depth on a fine grid about a place, turned with the vehicle."""
-    least = math.inf
+    minimum = math.inf
     for ahead in np.arange(-astern_m, ahead_m + step_m / 2, step_m):
         for across in np.arange(-across_m, across_m + step_m / 2, step_m):
             north = place_ne[0] + ahead * math.cos(heading_rad) - across * math.sin(heading_rad)
             east = place_ne[1] + ahead * math.sin(heading_rad) + across * math.cos(heading_rad)
-            least = min(least, float(depth_at(np.array([[north, east]]))[0]))
-    return least
+            minimum = min(minimum, float(depth_at(np.array([[north, east]]))[0]))
+    return minimum

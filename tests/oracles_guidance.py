@@ -128,9 +128,11 @@ def follow_demand(
     return np.array([ahead, sideways, yaw]), cross
 
 
-def trapezoid(goal: float, most: float, acceleration: float, time_s: float) -> tuple[float, float]:
+def trapezoid(
+    goal: float, maximum: float, acceleration: float, time_s: float
+) -> tuple[float, float]:
     """Place and speed of a thing that goes from rest to rest as fast as it may, in closed form."""
-    top = min(most, math.sqrt(goal * acceleration))
+    top = min(maximum, math.sqrt(goal * acceleration))
     gaining_s = top / acceleration
     total_s = goal / top + gaining_s
     if time_s <= 0.0:
@@ -180,10 +182,10 @@ def standing_demand(
     off, feed, quicken = hull @ (place - point[:2]), hull @ velocity, hull @ acceleration
     angle = math.remainder(turning[0] - heading, 2 * math.pi)
 
-    def pid(axis: int, error: float, rate: float, wanted: float, most: float) -> float:
+    def pid(axis: int, error: float, rate: float, wanted: float, maximum: float) -> float:
         row = gains.axes[axis]
         inner = row[g.INNER]
-        asked = wanted + np.clip(row[g.PLACE] / inner * error, -most, most)
+        asked = wanted + np.clip(row[g.PLACE] / inner * error, -maximum, maximum)
         asked += (row[g.RATE] / inner - 1.0) * (wanted - rate)
         return float(inner * (asked - rate))
 

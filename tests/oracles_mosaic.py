@@ -52,9 +52,9 @@ def labels_energy(number: Array, share: Array, colours: Array, chosen: NDArray[n
 
 def lowest_energy(number: Array, share: Array, colours: Array) -> float:
     """The least energy of all labellings of a small grid."""
-    rows, columns, most = number.shape
-    least = math.inf
-    for labels in itertools.product(range(most), repeat=rows * columns):
+    rows, columns, maximum = number.shape
+    minimum = math.inf
+    for labels in itertools.product(range(maximum), repeat=rows * columns):
         chosen = np.array(labels).reshape(rows, columns)
-        least = min(least, labels_energy(number, share, colours, chosen))
-    return least
+        minimum = min(minimum, labels_energy(number, share, colours, chosen))
+    return minimum

@@ -36,7 +36,7 @@ class SideOverlap:
         return float(self.shares.mean())
 
     @property
-    def least(self) -> float:
+    def minimum(self) -> float:
         """Of any picture."""
         return float(self.shares.min())
 

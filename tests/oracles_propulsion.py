@@ -77,7 +77,7 @@ def wrench(
     return total
 
 
-def least_miss(matrix: Array, wanted: Array, lower: Array, upper: Array, axes: Array) -> Array:
+def min_miss(matrix: Array, wanted: Array, lower: Array, upper: Array, axes: Array) -> Array:
     """The best weighted wrench within the bounds, by scipy's BVLS; rows of weight 0 left out."""
     asked, free = axes > 0, upper > lower
     a, b = (axes[:, None] * matrix)[asked], (axes * wanted)[asked]

@@ -16,7 +16,7 @@ from missions.values.legs import Leg, Route
 from missions.values.line import Line
 
 
-def shortest_way_m(allowed: MultiPolygon, a: tuple[float, float], b: tuple[float, float]) -> float:
+def min_way_m(allowed: MultiPolygon, a: tuple[float, float], b: tuple[float, float]) -> float:
     """Dijkstra over the straights between all corners and both places that shapely finds inside."""
     wider = allowed.buffer(1e-6)
     places = np.concatenate([[a, b], np.unique(shapely.get_coordinates(allowed), axis=0)])

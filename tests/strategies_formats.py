@@ -61,9 +61,9 @@ def cameras(
         "cy_px": height / 2 + draw(_number(-30, 30)),
     }
     kind = draw(st.sampled_from(lenses))
-    most = _FISHEYE if kind == "fisheye" else {name: SMALL[name] for name in terms}
-    used = draw(st.sets(st.sampled_from(sorted(most)))) if most else set()
-    lens |= {name: draw(_number(-most[name], most[name])) for name in sorted(used)}
+    maximum = _FISHEYE if kind == "fisheye" else {name: SMALL[name] for name in terms}
+    used = draw(st.sets(st.sampled_from(sorted(maximum)))) if maximum else set()
+    lens |= {name: draw(_number(-maximum[name], maximum[name])) for name in sorted(used)}
     return Camera(
         width_px=width,
         height_px=height,
@@ -105,11 +105,11 @@ def rigs(
     *,
     lenses: tuple[str, ...] = ("opencv",),
     ports: tuple[str, ...] = ("none",),
-    most: int = 2,
+    maximum: int = 2,
     one_size: bool = False,
 ) -> Rig:
-    """A rig of up to `most` cameras."""
-    count = draw(st.integers(1, most))
+    """A rig of up to `maximum` cameras."""
+    count = draw(st.integers(1, maximum))
     names = ["left", "right", "third"][:count]
     kinds = {"lenses": lenses, "ports": ports, "size": not one_size}
     each = [draw(cameras(terms, **kinds)) for _ in names]  # type: ignore[arg-type]

@@ -32,7 +32,7 @@ class Count:
 
     name: str
     value: int
-    most: int
+    maximum: int
     """The bound; a larger value fails."""
     places: tuple[str, ...] = ()
     """Where it was counted, for those that have to be looked up."""
@@ -213,11 +213,13 @@ def counts() -> list[Count]:
     rings = circles(imports())
     names = ambiguous_classes()
     return [
-        Count(name="code lines of the packages", value=sum(map(code_lines, sources)), most=57_000),
-        Count(name="code lines of the tests", value=sum(map(code_lines, tests)), most=36_000),
-        Count(name="modules", value=len(sources), most=448),
+        Count(
+            name="code lines of the packages", value=sum(map(code_lines, sources)), maximum=57_000
+        ),
+        Count(name="code lines of the tests", value=sum(map(code_lines, tests)), maximum=36_000),
+        Count(name="modules", value=len(sources), maximum=448),
         _count("modules with a single importer", single_importer(), 178),
-        Count(name="layers of the import contract", value=len(layers()), most=8),
+        Count(name="layers of the import contract", value=len(layers()), maximum=8),
         _count("modules without a layer", without_a_layer(), 0),
         _count("circles of imports", [" <-> ".join(ring) for ring in rings], 0),
         _count("class names with two meanings", [f"{n}: {w}" for n, w in names.items()], 4),
@@ -229,15 +231,15 @@ def counts() -> list[Count]:
     ]
 
 
-def _count(name: str, places: list[str], most: int) -> Count:
-    return Count(name=name, value=len(places), most=most, places=tuple(places))
+def _count(name: str, places: list[str], maximum: int) -> Count:
+    return Count(name=name, value=len(places), maximum=maximum, places=tuple(places))
 
 
 def main(arguments: list[str]) -> None:
     """Print the counts; with `-v` also the places of those that are over their bound."""
     for count in counts():
-        state = "" if count.value <= count.most else "  over"
-        print(f"{count.name:45} {count.value:6}   at most {count.most:6}{state}")
+        state = "" if count.value <= count.maximum else "  over"
+        print(f"{count.name:45} {count.value:6}   at most {count.maximum:6}{state}")
         if "-v" in arguments and state:
             for place in count.places:
                 print(f"    {place}")

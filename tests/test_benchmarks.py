@@ -100,14 +100,14 @@ def test_parts_are_chosen_by_name_or_module_in_their_order() -> None:
 @pytest.mark.parametrize(
     ("value", "goal", "met"),
     [
-        (5.0, Goal(most=5.0), True),
-        (5.1, Goal(most=5.0), False),
-        (0.9, Goal(least=1.0), False),
-        (1.0, Goal(least=0.8, most=1.25), True),
-        (1.3, Goal(least=0.8, most=1.25), False),
-        (3.0, Goal(least=2.0, of="ratio"), False),  # 1.5 times the peer's
-        (4.0, Goal(least=2.0, of="ratio"), True),
-        (math.nan, Goal(most=5.0), False),
+        (5.0, Goal(maximum=5.0), True),
+        (5.1, Goal(maximum=5.0), False),
+        (0.9, Goal(minimum=1.0), False),
+        (1.0, Goal(minimum=0.8, maximum=1.25), True),
+        (1.3, Goal(minimum=0.8, maximum=1.25), False),
+        (3.0, Goal(minimum=2.0, of="ratio"), False),  # 1.5 times the peer's
+        (4.0, Goal(minimum=2.0, of="ratio"), True),
+        (math.nan, Goal(maximum=5.0), False),
         (9.0, None, None),
     ],
 )
@@ -124,7 +124,7 @@ def test_figures_that_make_no_sense_are_refused() -> None:
     with pytest.raises(ValueError):
         Figure(name="speed", value=1.0, unit="m/s", peer="p")
     with pytest.raises(ValueError):
-        Figure(name="speed", value=1.0, unit="m/s", goal=Goal(most=1.0, of="ratio"))
+        Figure(name="speed", value=1.0, unit="m/s", goal=Goal(maximum=1.0, of="ratio"))
 
 
 def handed_over(folder: Path, findings: Findings, **rows: Any) -> tuple[int, dict[str, Any]]:
@@ -138,8 +138,8 @@ def test_figures_are_handed_over_with_what_was_missed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     good = Figure(name="time", value=1.0, unit="s", peer="slow", peer_value=4.0,
-                  goal=Goal(most=0.5, of="ratio"))  # fmt: skip
-    bad = Figure(name="memory", value=math.inf, unit="MiB", goal=Goal(most=1536.0))
+                  goal=Goal(maximum=0.5, of="ratio"))  # fmt: skip
+    bad = Figure(name="memory", value=math.inf, unit="MiB", goal=Goal(maximum=1536.0))
 
     code, report = handed_over(tmp_path, Findings(figures=(good, bad)), rows=[{"a": math.nan}])
 
@@ -173,8 +173,8 @@ def three_runs(folder: Path) -> list[Run]:
         a_run(
             folder,
             Figure(name="time", value=time, unit="s", peer="slow | old", peer_value=peer),
-            Figure(name="time", value=time, unit="s", goal=Goal(most=9.0)),
-            Figure(name="speed", value=speed, unit="m/s", goal=Goal(least=10.0)),
+            Figure(name="time", value=time, unit="s", goal=Goal(maximum=9.0)),
+            Figure(name="speed", value=speed, unit="m/s", goal=Goal(minimum=10.0)),
             code=int(speed < 10),
         )
         for time, peer, speed in zip(times, peers, speeds, strict=True)
@@ -185,7 +185,12 @@ def test_repeats_become_median_and_spread(tmp_path: Path) -> None:
     found = table.outcome("part", "python -m part", three_runs(tmp_path))
 
     compared, alone, speed = found.figures
-    assert (compared.median, compared.least, compared.most, compared.repeats) == (3.0, 1.0, 8.0, 3)
+    assert (compared.median, compared.minimum, compared.maximum, compared.repeats) == (
+        3.0,
+        1.0,
+        8.0,
+        3,
+    )
     assert (compared.peer, compared.peer_median) == ("slow | old", 4.0)
     assert compared.ratio == 0.75  # the median of 0.75, 0.25 and 4
     assert compared.goal is None

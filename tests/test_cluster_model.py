@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.core.cluster.engine import most_in_flight
+from alice_survey.core.cluster.engine import max_in_flight
 from alice_survey.core.executor import SERIAL
 from alice_survey.core.run import progress
 from alice_survey.core.run.events import EventFile
@@ -39,10 +39,10 @@ def test_equal_tasks_run_in_rounds(workers: int) -> None:
 @pytest.mark.parametrize("workers", [1, 3, 64])
 def test_a_step_takes_no_less_than_its_bounds_and_no_more_than_grahams(workers: int) -> None:
     """Tasks given to any free worker take at most 2 - 1/W times the optimum (Graham, 1969)."""
-    times = np.random.default_rng(3).lognormal(size=most_in_flight(workers))
-    least = max(times.sum() / workers, times.max())
+    times = np.random.default_rng(3).lognormal(size=max_in_flight(workers))
+    minimum = max(times.sum() / workers, times.max())
     found = makespan(step(times), workers, FREE)
-    assert least <= found * (1 + 1e-12)
+    assert minimum <= found * (1 + 1e-12)
     assert found <= (times.sum() - times.max()) / workers + times.max() + 1e-9
 
 
@@ -57,7 +57,7 @@ def test_sending_is_serial_and_waiting_is_not() -> None:
 def test_results_that_are_taken_in_order_hold_others_back() -> None:
     """Of two workers one is long with the first task; the other gets no more than are in flight."""
     times = [1000.0] + [1.0] * 140
-    more = 140 - (most_in_flight(2) - 1)
+    more = 140 - (max_in_flight(2) - 1)
     assert makespan(step(times), 2, FREE) == pytest.approx(1000.0 + more / 2, abs=1.0)
 
 

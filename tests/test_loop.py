@@ -115,10 +115,10 @@ KILLED = tuple(
 
 
 def wait_for(
-    run: subprocess.Popen[Any], events: Path, seen: int, longest_s: float = math.inf, **facts: str
+    run: subprocess.Popen[Any], events: Path, seen: int, max_s: float = math.inf, **facts: str
 ) -> dict[str, Any] | None:
     """Wait for an event of a run, beyond the bytes seen before; None if it ends or takes longer."""
-    until = time.monotonic() + longest_s
+    until = time.monotonic() + max_s
     while run.poll() is None and time.monotonic() < until:
         if events.exists():
             with events.open("rb") as file:
@@ -171,13 +171,13 @@ LITTLE_MEMORY = 700 << 20
 
 
 def reconstruct(
-    workspace: Path, *options: str, most_bytes: int | None = None
+    workspace: Path, *options: str, max_bytes: int | None = None
 ) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "alice_survey", "reconstruct", "-w", str(workspace)]
 
     def limit() -> None:
-        if most_bytes is not None:
-            resource.setrlimit(resource.RLIMIT_DATA, (most_bytes, most_bytes))
+        if max_bytes is not None:
+            resource.setrlimit(resource.RLIMIT_DATA, (max_bytes, max_bytes))
 
     return subprocess.Popen(
         [*command, "--threads", "1", "--quiet", *options],
@@ -217,7 +217,7 @@ def test_what_goes_wrong_half_way_is_reported_in_a_line_and_nothing_is_lost(
         assert line.startswith("error: ") and "\n" not in line and last.name in line, line
         assert not [stage for stage in made if (workspace / stage).exists()]
         shutil.copy2(kept, last)
-    run = reconstruct(workspace, most_bytes=LITTLE_MEMORY)
+    run = reconstruct(workspace, max_bytes=LITTLE_MEMORY)
     line = run.communicate()[1].strip()
     assert run.returncode == 1
     assert line.startswith("error: memory ran out") and "\n" not in line, line

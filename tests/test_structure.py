@@ -17,7 +17,7 @@ HELD = (
 @pytest.mark.parametrize("name", HELD)
 def test_a_count_stays_within_its_bound(name: str) -> None:
     count = next(count for count in structure.counts() if count.name == name)
-    assert count.value <= count.most, count.places
+    assert count.value <= count.maximum, count.places
 
 
 @pytest.mark.parametrize(

@@ -130,8 +130,8 @@ def size_of(
         area_m2: area in the pictures, if known; else each place is taken to be in six of them.
         others: further fields of `SurveySize`.
     """
-    most = reconstruct.max_features
-    wanted = PIXELS_PER_FEATURE / 1e6 * most if rig_known else math.inf
+    maximum = reconstruct.max_features
+    wanted = PIXELS_PER_FEATURE / 1e6 * maximum if rig_known else math.inf
     feature_mpx = min(mpx, FEATURE_MPX, wanted)
     if reconstruct.feature_scale is not None:
         feature_mpx = mpx * reconstruct.feature_scale**2
@@ -149,7 +149,7 @@ def size_of(
         mosaic_mpx = area_m2 / (reconstruct.mosaic_pixel_m or pixel_m) ** 2 / 1e6
     return SurveySize(
         pictures=pictures, mpx=mpx, rig_known=rig_known, feature_mpx=feature_mpx,
-        features=min(most, _FOUND_PER_MPX * feature_mpx),
+        features=min(maximum, _FOUND_PER_MPX * feature_mpx),
         matched_mpx=matched_mpx, refined_mpx=refined_mpx, partners=reconstruct.dense_partners,
         cells=cells, mosaic_mpx=mosaic_mpx, pixel_m=pixel_m, cell_m=cell_m, **others,
     )  # fmt: skip

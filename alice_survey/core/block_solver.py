@@ -29,7 +29,7 @@ Indices = NDArray[np.int64]
 Guess = TypeVar("Guess")
 Normal = TypeVar("Normal", bound="Equations")
 
-_LEAST_DAMPING = 1e-14
+_MIN_DAMPING = 1e-14
 """Shared parameters can be so similar that more damping than ten times this hides it."""
 _ROUNDING = 1e-15
 
@@ -321,9 +321,9 @@ def minimise(
     start: Guess,
     *,
     settled: float,
-    most_steps: int,
+    max_steps: int,
     damping: float = 0.0,
-    least_damping: float = _LEAST_DAMPING,
+    min_damping: float = _MIN_DAMPING,
 ) -> Minimum[Guess, Normal]:
     """Minimise a robust sum of squares from a guess near its minimum.
 
@@ -331,12 +331,12 @@ def minimise(
         problem: what is adjusted.
         start: where it starts; it must not lose an observation.
         settled: length of a step and relative change of the noise at which it ends.
-        most_steps: it ends, not settled, after so many.
+        max_steps: it ends, not settled, after so many.
         damping: of the first step, as a share of the diagonal; less where steps are good.
-        least_damping: with which it may settle.
+        min_damping: with which it may settle.
     """
     guess, noise = start, problem.noise(start)
-    for _ in range(most_steps):
+    for _ in range(max_steps):
         equations, cost = problem.linearised(guess, noise), problem.cost(guess, noise)
         pinned = problem.at_bound(guess) & (equations.shared[:-1, -1] > 0)
         while True:
@@ -352,12 +352,12 @@ def minimise(
         guess = tried if drop >= 0 else guess
         before, noise = noise, problem.noise(guess)
         steady = bool(np.all(np.abs(noise / before - 1.0) < settled))
-        if short and steady and (damping <= least_damping or drop < 0):
+        if short and steady and (damping <= min_damping or drop < 0):
             break
         good = short or drop > 0.25 * step.gain
-        damping = max(damping * (0.01 if good else 0.5), _LEAST_DAMPING)
-    if damping > least_damping or drop < 0:  # damping shortens any step
-        step = equations.step(least_damping, pinned)
+        damping = max(damping * (0.01 if good else 0.5), _MIN_DAMPING)
+    if damping > min_damping or drop < 0:  # damping shortens any step
+        step = equations.step(min_damping, pinned)
     is_short = step.length < settled
     return Minimum(
         guess=guess, equations=equations, noise=noise, length=step.length,

@@ -24,7 +24,7 @@ from alice_survey.core.run.resources import user_lock
 
 BLOCK = 128
 """Points at a time: loops over a block that do not branch become vector instructions."""
-_LONGEST_WAIT_S = 120.0
+_MAX_WAIT_S = 120.0
 """For another process that compiles the same kernel."""
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
@@ -131,7 +131,7 @@ def _once_a_machine(kernel: Any) -> Callable[[Any], Any]:
         with ExitStack() as held:
             held.enter_context(global_compiler_lock)  # first: other threads may hold it
             with suppress(OSError, Timeout):  # then it is compiled once more
-                held.enter_context(user_lock(f"kernel-{name}", _LONGEST_WAIT_S))
+                held.enter_context(user_lock(f"kernel-{name}", _MAX_WAIT_S))
             return compile_it(signature)
 
     return compiled_once

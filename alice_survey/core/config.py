@@ -252,8 +252,8 @@ class PlanConfig(Config):
         """Radius of arcs: as set; with `turns = "auto"` at least what the limit of rate asks."""
         if self.turns != "auto":
             return self.turn_radius_m
-        least_m = self.speed_mps / math.radians(self.turn_rate_limit_deg_s)
-        return max(self.turn_radius_m, math.ceil(100.0 * least_m) / 100.0)
+        min_m = self.speed_mps / math.radians(self.turn_rate_limit_deg_s)
+        return max(self.turn_radius_m, math.ceil(100.0 * min_m) / 100.0)
 
 
 _INTACT = dict.fromkeys(("starboard", "port", "vertical", "bow", "stern"), 1.0)
@@ -457,7 +457,7 @@ class SurveyConfig(Config):
 
 
 _LONGEST = 1_000_000
-_MOST_FAULTS = 8
+_MAX_FAULTS = 8
 """Faults reported at once."""
 
 
@@ -662,7 +662,7 @@ def parse_health(texts: Sequence[str] | None) -> Health:
 
 def _one_line(error: ValidationError) -> str:
     faults = []
-    for fault in error.errors()[:_MOST_FAULTS]:
+    for fault in error.errors()[:_MAX_FAULTS]:
         key = shown(".".join(str(part) for part in fault["loc"])) or "settings"
         if fault["type"] == "extra_forbidden":
             faults.append(f"{key} is not a known setting{_nearest(fault['loc'])}")

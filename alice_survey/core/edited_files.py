@@ -15,15 +15,15 @@ class StaleError(AliceError):
     """What is to be changed is no longer what was seen."""
 
 
-def content_of(path: Path, most: int = _LONGEST) -> bytes | None:
+def content_of(path: Path, maximum: int = _LONGEST) -> bytes | None:
     """The content of a file; None where there is none.
 
     Raises:
         WorkspaceError: it cannot be read, or is larger than so many bytes.
     """
     try:
-        if path.stat().st_size > most:
-            raise WorkspaceError(f"{path}: is larger than {most >> 20} MiB")
+        if path.stat().st_size > maximum:
+            raise WorkspaceError(f"{path}: is larger than {maximum >> 20} MiB")
         return path.read_bytes()
     except FileNotFoundError:
         return None

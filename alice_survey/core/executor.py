@@ -99,8 +99,8 @@ class Executor:
         if total is None and isinstance(items, Sized):
             total = len(items)
         with step(label, total) as counter:
-            most = max(task_mib, self.task_mib)
-            for found in self._results(function, items, total, label, most):
+            maximum = max(task_mib, self.task_mib)
+            for found in self._results(function, items, total, label, maximum):
                 yield found.result
                 counter.advance(spent=found.spent)
 
@@ -267,7 +267,7 @@ def in_order(
     pool: Pool,
     function: Callable[[Item], Result],
     items: Iterable[Item],
-    most_queued: Callable[[], int],
+    max_queued: Callable[[], int],
 ) -> Iterator[TaskResult[Result]]:
     """Run a task for each item on a pool, and yield what they give in the order of the items.
 
@@ -275,7 +275,7 @@ def in_order(
         pool: where tasks run.
         function: a task.
         items: what to work on.
-        most_queued: how many may be in flight, now.
+        max_queued: how many may be in flight, now.
     """
     local = isinstance(pool, _Processes)
     says_notes = local and not current().is_quiet
@@ -284,7 +284,7 @@ def in_order(
     try:
         for item in items:
             waiting.append(pool.submit(task, item))
-            while len(waiting) >= most_queued():
+            while len(waiting) >= max_queued():
                 yield _result(waiting.popleft(), shown=says_notes)
         while waiting:
             yield _result(waiting.popleft(), shown=says_notes)

@@ -72,19 +72,19 @@ def n_water(
         "depth_m": np.asarray(depth_m, dtype=np.float64),
         "wavelength_nm": np.asarray(wavelength_nm, dtype=np.float64),
     }
-    for name, (least, most, unit) in _REACH.items():
-        wrong = values[name][~((values[name] >= least) & (values[name] <= most))]
+    for name, (minimum, maximum, unit) in _REACH.items():
+        wrong = values[name][~((values[name] >= minimum) & (values[name] <= maximum))]
         if wrong.size:
             raise ConfigError(
-                f"{name} = {wrong.flat[0]:g}: the index of water is known from {least:g} to "
-                f"{most:g} {unit}"
+                f"{name} = {wrong.flat[0]:g}: the index of water is known from {minimum:g} to "
+                f"{maximum:g} {unit}"
             )
-    for name, (least, most, unit) in _FIT.items():
-        beyond = values[name][(values[name] < least) | (values[name] > most)]
+    for name, (minimum, maximum, unit) in _FIT.items():
+        beyond = values[name][(values[name] < minimum) | (values[name] > maximum)]
         if beyond.size:
             warn(
-                f"{name} = {beyond.flat[0]:g} is beyond the {least:g} to {most:g} {unit} of Quan "
-                "and Fry's index of sea water: it is extrapolated, to about 1e-4"
+                f"{name} = {beyond.flat[0]:g} is beyond the {minimum:g} to {maximum:g} {unit} of "
+                "Quan and Fry's index of sea water: it is extrapolated, to about 1e-4"
             )
     t, s = values["temperature_c"], values["salinity_psu"]
     nm = values["wavelength_nm"]

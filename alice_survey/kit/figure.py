@@ -95,7 +95,7 @@ _NO_DATES: dict[str, dict[str, None]] = {
     "svg": {"Date": None, "Creator": None},
     "pdf": {"CreationDate": None, "ModDate": None, "Producer": None, "Creator": None},
 }
-_MOST_PX = 1600
+_MAX_PX = 1600
 
 
 class _Shown(Sheet):  # type: ignore[misc]  # matplotlib has no types
@@ -295,7 +295,7 @@ def plain_name(name: str) -> str:
     return name.replace("$", r"\$")
 
 
-def shrunk_png(path: Path, most_px: int = _MOST_PX) -> bytes:
+def shrunk_png(path: Path, max_px: int = _MAX_PX) -> bytes:
     """A picture that a stage has drawn, at most this many pixels wide and high; on white.
 
     Raises:
@@ -307,7 +307,7 @@ def shrunk_png(path: Path, most_px: int = _MOST_PX) -> bytes:
     if picture.ndim == 3 and picture.shape[2] == 4:
         picture = np.where(picture[..., 3:] > 0, picture[..., :3], 255).astype(picture.dtype)
     height, width = picture.shape[:2]
-    shrink = max(width, height) / most_px
+    shrink = max(width, height) / max_px
     if shrink > 1.0:
         size = (max(1, round(width / shrink)), max(1, round(height / shrink)))
         picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)

@@ -26,9 +26,9 @@ from alice_survey.kit.figure import (
 )
 from alice_survey.kit.map import map_extent
 
-_MOST_PX = 1400
+_MAX_PX = 1400
 """Pixels along the longer side of a picture in print."""
-_MOST_HEIGHT_IN = 4.1
+_MAX_HEIGHT_IN = 4.1
 """Height of the map itself, so that two fit on a page."""
 _MARGIN = 0.04
 """Margin around all that is drawn, as a share of the longer side."""
@@ -69,7 +69,7 @@ def map_figure(
     west, south, east, north = map_extent(survey_map)
     margin = _MARGIN * max(east - west, north - south)
     wide, high = east - west + 2 * margin, north - south + 2 * margin
-    sheet = new_figure(0.8 + min(_MOST_HEIGHT_IN, (WIDTH_IN - 1.6) * high / wide))
+    sheet = new_figure(0.8 + min(_MAX_HEIGHT_IN, (WIDTH_IN - 1.6) * high / wide))
     axes = sheet.subplots()
     axes.grid(visible=False)
     pictures = [layer for layer in layers if isinstance(layer, PictureLayer)]
@@ -114,14 +114,14 @@ def _paint_picture(axes: Any, layer: PictureLayer) -> None:
         colour_bar(ramp, axes, scale.label)
 
 
-def flat_picture(layer: PictureLayer, most_px: int = _MOST_PX) -> NDArray[np.uint8]:
+def flat_picture(layer: PictureLayer, max_px: int = _MAX_PX) -> NDArray[np.uint8]:
     """A layer as one picture on white, from the finest level that is small enough.
 
     Returns:
         (H, W, 3) red, green, blue.
     """
     level = layer.levels - 1
-    while level > 0 and max(layer.size(level)[:2]) > most_px:
+    while level > 0 and max(layer.size(level)[:2]) > max_px:
         level -= 1
     width, height = layer.size(level)[:2]
     sheet = np.full((height, width, 3), 255, np.uint8)

@@ -2,8 +2,8 @@
    station under the pointer, and counts of pictures. Places are metres north and east of the
    datum; Leaflet has them as latitude and longitude. */
 
-const MOST_SHOWN = 3000;  /* stations and footprints in view that are drawn one by one */
-const MOST_CHECKED = 60_000;  /* stations of lines in view, of which those in view are looked for */
+const MAX_SHOWN = 3000;  /* stations and footprints in view that are drawn one by one */
+const MAX_CHECKED = 60_000;  /* stations of lines in view, of which those in view are looked for */
 const NEAR_PX = 14;
 const FOOTPRINT = "#2e86c1";
 const HOVER = "#b7950b";
@@ -75,10 +75,10 @@ function drawStations(map, {lines, groups, stations, footprints, outline, across
     if (inView.length <= 400) inView.forEach(arrow);
     const apartPx = (line) => line.length / Math.max(1, line.stations - 1) * metrePx();
     const far = inView.filter((line) => line.stations === 1 || apartPx(line) >= 6);
-    const checked = far.reduce((sum, line) => sum + line.stations, 0) <= MOST_CHECKED ? far : [];
+    const checked = far.reduce((sum, line) => sum + line.stations, 0) <= MAX_CHECKED ? far : [];
     const places = checked.flatMap((line) => Array.from({length: line.stations}, (_, i) => [line, stationAt(line, i)]))
       .filter(([, [n, e]]) => n >= south && n <= north && e >= west && e <= east);
-    if (map.hasLayer(stations) && places.length <= MOST_SHOWN) {
+    if (map.hasLayer(stations) && places.length <= MAX_SHOWN) {
       places.forEach(([line, place]) => stations.addLayer(leaflet.circleMarker(place, {
         ...fixed, radius: Math.min(3.4, Math.max(1.3, apartPx(line) / 7)), stroke: false,
         fillColor: line.colour, fillOpacity: 1,
@@ -86,7 +86,7 @@ function drawStations(map, {lines, groups, stations, footprints, outline, across
     }
     if (!map.hasLayer(footprints)) return;
     const drawn = {...fixed, color: FOOTPRINT, weight: 0.6, opacity: 0.5, fillOpacity: 0.05};
-    if (places.length && places.length <= MOST_SHOWN && across * metrePx() > 6) {
+    if (places.length && places.length <= MAX_SHOWN && across * metrePx() > 6) {
       places.forEach(([line, place]) => footprints.addLayer(leaflet.polygon(aroundStation(line, place, outline), drawn)));
     } else {  /* the bands that they make */
       const band = {...fixed, color: FOOTPRINT, weight: across * metrePx(), opacity: 0.16, lineCap: "butt"};

@@ -21,7 +21,7 @@ from camera_calib.camera import Camera, camera_from_json
 
 _GRID = 15
 """Rays along each side of the frame."""
-_LARGEST_GROWTH = 1.5
+_MAX_GROWTH = 1.5
 """A pinhole's picture has at most this many times the width and height of the one taken: the edge
 of a lens of 120 degrees would take 1.65 times, its corners 3 times, most of it blur."""
 _HALVINGS = 40
@@ -197,7 +197,7 @@ def best_warp(
     """The pinhole whose centre the rays of the whole frame miss least, in the rms.
 
     The focal length keeps the ground resolution on the axis, and the picture holds what the frame
-    shows at the working range, up to `_LARGEST_GROWTH`.
+    shows at the working range, up to `_MAX_GROWTH`.
 
     Args:
         camera: any whose rays are straight in water.
@@ -270,8 +270,8 @@ def _fitted_to_frame(warp: PinholeWarp) -> Pinhole:
         near, far = np.where(seen, share, near), np.where(seen, far, share)
     edge = warp.to_pinhole(middle + near[:, None] * (border - middle))
     at = warp.to_pinhole(middle)
-    low = np.maximum(edge.min(axis=0), at - _LARGEST_GROWTH * middle)
-    high = np.minimum(edge.max(axis=0), at + _LARGEST_GROWTH * middle)
+    low = np.maximum(edge.min(axis=0), at - _MAX_GROWTH * middle)
+    high = np.minimum(edge.max(axis=0), at + _MAX_GROWTH * middle)
     width, height = np.ceil(high - low - 1e-6).astype(int).tolist()
     return Pinhole(
         width_px=width,

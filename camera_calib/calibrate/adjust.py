@@ -25,13 +25,13 @@ from camera_calib.target_shape import AS_DRAWN, TargetShape
 
 HUBER = 3.0
 """Length, in sigmas of a coordinate, beyond which a residual's influence is constant."""
-_LEAST_NOISE_PX = 1e-6
+_MIN_NOISE_PX = 1e-6
 """Smallest noise: below it the rounding of projections shows."""
 _STEPS = 100
 _SETTLED = 1e-4
 _DAMPING = 1e-3
 """Of the first step."""
-_LEAST_DAMPING = 1e-13
+_MIN_DAMPING = 1e-13
 """Parameters of a rig can be so similar that more damping than this hides their difference."""
 _POSE_DAMPING = 1e-6
 """Least damping of poses, whose parameters are never so similar."""
@@ -153,7 +153,7 @@ class _Solver(CalibrationProblem):
         """(1,) sigma of a coordinate from the median length of the residuals."""
         share = math.sqrt(2 * int(self.seen.sum()) / self.spare)
         sigma_px = float(np.median(guess.lengths[self.seen])) / RAYLEIGH_MEDIAN * share
-        return np.array([max(sigma_px, _LEAST_NOISE_PX)])
+        return np.array([max(sigma_px, _MIN_NOISE_PX)])
 
     def solve(self, state: State, settled: float, at_most: int | None) -> Adjustment:
         """Iterate from a guess until a step is shorter than `settled` sigmas."""
@@ -175,8 +175,8 @@ class _Solver(CalibrationProblem):
                     "start from values nearer to the truth, or choose a simpler lens"
                 )
         found = minimise(
-            self, start, settled=settled, most_steps=at_most or _STEPS, damping=_DAMPING,
-            least_damping=_LEAST_DAMPING if self.names else _POSE_DAMPING,
+            self, start, settled=settled, max_steps=at_most or _STEPS, damping=_DAMPING,
+            min_damping=_MIN_DAMPING if self.names else _POSE_DAMPING,
         )  # fmt: skip
         if found.is_settled or at_most is not None:
             return self.result(found)
@@ -230,4 +230,4 @@ class _Solver(CalibrationProblem):
         w = weights[self.seen]
         slope = float(np.mean(np.where(w < 1.0, 0.5 * w, 1.0)))
         noise_px = math.sqrt(float((pull**2).sum()) / self.spare) / slope
-        return max(noise_px, _LEAST_NOISE_PX)
+        return max(noise_px, _MIN_NOISE_PX)

@@ -28,7 +28,7 @@ _REACHES = (0.12, 0.3, 0.8)
 """Lengths over the target's diagonal at which errors in one picture may go together."""
 _AXES = (slice(0, 2), slice(2, 3))
 """Components of a place's offset with a variance of their own: in the target's plane, across it."""
-_LEAST_ALONE = 0.05
+_MIN_ALONE = 0.05
 """Least share of the noise's variance that is independent."""
 
 
@@ -101,7 +101,7 @@ def spread_of(problem: CalibrationProblem, found: Adjustment) -> ErrorBudget:
     products = _Products(rows, parts, root)
     theta = products.variances()
     pictures, places = theta[: len(parts)], theta[len(parts) :]
-    pictures[0] = max(pictures[0], _LEAST_ALONE)
+    pictures[0] = max(pictures[0], _MIN_ALONE)
     meat = np.einsum("k,kpq->pq", pictures, products.by_rig)
     shared = [
         root @ products.by_place[:, axes].reshape(-1, len(root)).T * np.sqrt(variance)

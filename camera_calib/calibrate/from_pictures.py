@@ -45,8 +45,8 @@ _WRITTEN = (
     "rig.json", "rig_carried.json", "calibration.json", "corners.csv", "report.html", "report.json",
 )  # fmt: skip
 """Files of this command; a folder with other files is not replaced."""
-_MOST_FIRST_VIEWS = 30
-_FEWEST_FITTING = 0.5
+_MAX_FIRST_VIEWS = 30
+_MIN_FITTING = 0.5
 """Share of a camera's pictures that must fit those of the others."""
 
 
@@ -158,7 +158,7 @@ def _on_one_clock(
 
 def _spread(views: Sequence[TargetView]) -> list[TargetView]:
     """Some views, evenly: enough for a first camera."""
-    chosen = np.unique(np.linspace(0, len(views) - 1, _MOST_FIRST_VIEWS).astype(int))
+    chosen = np.unique(np.linspace(0, len(views) - 1, _MAX_FIRST_VIEWS).astype(int))
     return [views[v] for v in chosen]
 
 
@@ -214,7 +214,7 @@ def _check_useful(calibration: Calibration, found: Detections, output: Path) -> 
     for name in calibration.rig.cameras:
         seen = sum(name in view.pixels for view in found.views)
         fits = sum(name in view.pixels for view in calibration.views)
-        if fits < _FEWEST_FITTING * seen:
+        if fits < _MIN_FITTING * seen:
             raise CalibrationError(
                 f"only {fits} of {seen} pictures of {name} fit those of the other cameras: are "
                 "pictures of one number, or of one place in the lists, of one moment, and did the "

@@ -98,8 +98,8 @@ def housing_lines(housing: HousingJudgement) -> list[str]:
         f"{trial.port} {trial.noise_px:.4g} px" if not trial.why else f"{trial.port}: {trial.why}"
         for trial in housing.trials
     ]
-    least = min(trial.noise_px for trial in housing.trials if not trial.why)
-    alike = [trial.port for trial in housing.trials if trial.noise_px < _ALIKE * least]
+    minimum = min(trial.noise_px for trial in housing.trials if not trial.why)
+    alike = [trial.port for trial in housing.trials if trial.noise_px < _ALIKE * minimum]
     lines = [f"housing {housing.chosen}: noise with {', '.join(shown)}"]
     if set(alike) == {NoPort.shape, DomePort.shape}:
         lines.append("a dome about the pupil and no port are the same camera: both fit alike")

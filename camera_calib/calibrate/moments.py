@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
-from scipy.optimize import least_squares
+from scipy.optimize import min_squares
 from scipy.spatial.transform import RigidTransform, Rotation, RotationSpline
 
 from alice_survey.core.errors import CalibrationError
@@ -22,18 +22,18 @@ from camera_calib.calibrate.start import poses_alone, poses_apart
 from camera_calib.calibration import TargetView
 from camera_calib.camera import Camera
 
-_LONGEST_GAP = 2.5
+_MAX_GAP = 2.5
 """Between pictures of one motion, over the usual interval of the camera."""
 _SHORTEST = 4
 """Pictures of one motion: cubics are laid through so many."""
 _FEWEST = 8
-_LEAST_SHARED = 0.25
+_MIN_SHARED = 0.25
 """Share of a camera's pictures that must fall into the motion that the other saw."""
 _CLEARER = 0.25
 """The spread of the pose between the cameras at the right offset, over that at other offsets."""
 _TRIED = 48
 """Pictures that the search over all offsets looks at."""
-_MOST_OFFSETS = 4000
+_MAX_OFFSETS = 4000
 _ODD = 3.0
 """Residuals of a picture over the middle ones, beyond which it is left out."""
 
@@ -63,7 +63,7 @@ class CameraTrack:
     def motions(self) -> list[slice]:
         """Runs of pictures without a long gap, long enough for cubics."""
         gaps = np.diff(self.time_s)
-        ends = np.flatnonzero(gaps > _LONGEST_GAP * np.median(gaps)) + 1
+        ends = np.flatnonzero(gaps > _MAX_GAP * np.median(gaps)) + 1
         bounds = [0, *ends.tolist(), len(self.time_s)]
         runs = [slice(a, b) for a, b in pairwise(bounds)]
         return [run for run in runs if run.stop - run.start >= _SHORTEST]
@@ -166,12 +166,12 @@ def clock_offset(
 
     time_s, pixels, fit = other.time_s[known], other.pixels[known], np.zeros(7)
     for _ in range(2):
-        fit = least_squares(misses, fit, args=(time_s, pixels), loss="soft_l1", x_scale="jac").x
+        fit = min_squares(misses, fit, args=(time_s, pixels), loss="soft_l1", x_scale="jac").x
         squares = misses(fit, time_s, pixels).reshape(len(time_s), -1) ** 2
         lengths = np.sqrt(squares.mean(axis=1))
         usual = lengths <= _ODD * np.median(lengths)
         time_s, pixels = time_s[usual], pixels[usual]
-    last = least_squares(misses, fit, args=(time_s, pixels), x_scale="jac")
+    last = min_squares(misses, fit, args=(time_s, pixels), x_scale="jac")
     # Points of a picture err together, with the pose that they are compared with: each picture is
     # one draw.
     slopes = np.asarray(last.jac, dtype=np.float64)
@@ -196,14 +196,14 @@ def _search(
     """The best of all offsets at which the pictures share enough, and the step between offsets."""
     chosen = np.unique(np.linspace(0, len(other.time_s) - 1, _TRIED).astype(int))
     time_s, poses, range_m = other.time_s[chosen], other.cam_from_target[chosen], _range_m(other)
-    least_s, most_s = first.time_s[0] - other.time_s[-1], first.time_s[-1] - other.time_s[0]
+    min_s, max_s = first.time_s[0] - other.time_s[-1], first.time_s[-1] - other.time_s[0]
     usual_s = min(float(np.median(np.diff(track.time_s))) for track in (first, other))
-    step_s = max(0.5 * usual_s, (most_s - least_s) / _MOST_OFFSETS)
-    offsets_s = np.arange(least_s, most_s, step_s)
+    step_s = max(0.5 * usual_s, (max_s - min_s) / _MAX_OFFSETS)
+    offsets_s = np.arange(min_s, max_s, step_s)
     spreads = np.full(len(offsets_s), np.nan)
     for i, offset_s in enumerate(offsets_s.tolist()):
         at_moments, known = motion.at(time_s + offset_s)
-        if known.sum() >= max(_FEWEST, _LEAST_SHARED * len(time_s)):
+        if known.sum() >= max(_FEWEST, _MIN_SHARED * len(time_s)):
             apart = poses_apart(poses[known] * at_moments[known].inv(), range_m)
             spreads[i] = np.median(apart, axis=1).min()
     if not np.isfinite(spreads).any():

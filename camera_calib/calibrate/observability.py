@@ -31,14 +31,14 @@ _TAKEN_FOR_GRANTED: Mapping[str, float] = {
 _MOVED = ("fx_px", "port_distance_m", "normal_x", "normal_y", "x_m")
 _NOTABLE = 0.5
 """Sigmas of its own that a parameter must move to be named."""
-_MOST_NAMED = 3
+_MAX_NAMED = 3
 FEW_VIEWS = 10
 _CELLS = (4, 3)
 """Parts of the frame along x and y."""
 _ROWS, _COLUMNS = ("top", "middle", "bottom"), ("far left", "left", "right", "far right")
-_LEAST_TILT = math.radians(8.0)
+_MIN_TILT = math.radians(8.0)
 """Root mean square lean of the target about each axis, from its mean."""
-_LEAST_RANGE_RATIO = 1.4
+_MIN_RANGE_RATIO = 1.4
 _ALIKE = 0.99
 _BADLY = 2.5
 """Ratio of a picture's residuals to those of all."""
@@ -124,7 +124,7 @@ def _line(calibration: Calibration, name: str, error: float) -> str | None:
         for parameter, slope in effect.slopes.items()
         if parameter.split(".")[1] in _MOVED
     ]
-    notable = sorted((m for m in moved if m[0] > _NOTABLE), reverse=True)[:_MOST_NAMED]
+    notable = sorted((m for m in moved if m[0] > _NOTABLE), reverse=True)[:_MAX_NAMED]
     if not notable:
         return None
     return (
@@ -203,7 +203,7 @@ def _tilts(rig_from_target: RigidTransform) -> list[str]:
     spread = np.sqrt((lean**2).mean(axis=0))
     lines = []
     for axis, tilt in (("left and right", spread[0]), ("up and down", spread[1])):
-        if tilt < _LEAST_TILT:
+        if tilt < _MIN_TILT:
             lines.append(
                 f"the target leans {axis} by only {math.degrees(tilt):.1f} deg rms: take views "
                 f"in which it faces 20 to 40 deg {axis}"
@@ -214,7 +214,7 @@ def _tilts(rig_from_target: RigidTransform) -> list[str]:
 def _ranges(rig_from_target: RigidTransform) -> list[str]:
     depths = np.asarray(rig_from_target.translation).reshape(-1, 3)[:, 2]
     near, far = np.quantile(depths, [0.1, 0.9])
-    if far > _LEAST_RANGE_RATIO * near:
+    if far > _MIN_RANGE_RATIO * near:
         return []
     return [
         f"nearly all views lie between {near:.2f} and {far:.2f} m: take some at half and some at "

@@ -110,7 +110,7 @@ class CalibrateOptions:
         """
         water = {} if self.n_water is None else {"n_water": self.n_water}
         found: dict[str, dict[str, float]] = {camera: {**water} for camera in cameras}
-        for option, text, parameter, unit, (least, most) in (
+        for option, text, parameter, unit, (minimum, maximum) in (
             ("--dome-radius", self.dome_radius_mm, "outer_radius_m", 1e3, (5.0, 1000.0)),
             ("--port-distance", self.port_distance_mm, "port_distance_m", 1e3, (0.0, 500.0)),
             ("--glass", self.glass_mm, "glass_thickness_m", 1e3, (0.0, 500.0)),
@@ -118,13 +118,13 @@ class CalibrateOptions:
         ):
             for camera, word in by_camera(text or "", cameras, option).items():
                 try:
-                    value = float(word) if word else least
+                    value = float(word) if word else minimum
                 except ValueError:
                     value = math.nan
-                if not least <= value <= most:
+                if not minimum <= value <= maximum:
                     raise CalibrationError(
-                        f"{option} {text}: {word!r} for {camera} is not a number from {least:g} to "
-                        f"{most:g}"
+                        f"{option} {text}: {word!r} for {camera} is not a number from "
+                        f"{minimum:g} to {maximum:g}"
                     )
                 if word:
                     found[camera][parameter] = value / unit

@@ -14,7 +14,7 @@ from alice_survey.core.errors import CalibrationError, warn
 from camera_calib.picture_files import time_taken
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm")
-_LEAST_PAIRED = 0.5
+_MIN_PAIRED = 0.5
 """Share of each list whose numbers must be in another for names to pair."""
 _NAMED = 3
 _MANIFEST = "manifest.csv"
@@ -69,7 +69,7 @@ def pair_pictures(lists: Mapping[str, Sequence[Path]]) -> list[PictureSet]:
     if all(numbered.values()):
         counts = Counter(number for found in numbered.values() for number in found)
         shared = {c: sum(counts[n] > 1 for n in found) for c, found in numbered.items()}
-        if all(shared[c] >= _LEAST_PAIRED * len(found) for c, found in numbered.items()):
+        if all(shared[c] >= _MIN_PAIRED * len(found) for c, found in numbered.items()):
             return _paired_by_number(numbered)
     if len({len(paths) for paths in lists.values()}) > 1:
         described = ", ".join(

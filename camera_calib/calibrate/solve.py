@@ -49,7 +49,7 @@ from camera_calib.target_shape import TargetShape, usual_shape
 
 Intrinsics = Literal["held", "prior", "free"]
 
-_FEWEST_VIEWS = 4
+_MIN_VIEWS = 4
 _OUTLIER = 6.0
 """Length of a residual, in sigmas of a coordinate, beyond which a point takes no part: of normal
 noise one in 65 million is longer."""
@@ -60,11 +60,11 @@ _BY_CHANCE = 2.0
 _DRAWN = 16.0
 """Coordinates by which a picture's noise is drawn towards that of all."""
 _SAME_BLUR = 0.1
-_LEAST_LIMIT_PX = 1e-4
+_MIN_LIMIT_PX = 1e-4
 _ROUNDS = 6
 _STEPS = 40
 """Step limit of an adjustment that may still include views which do not fit at all."""
-_FEWEST_FITTING = 0.5
+_MIN_FITTING = 0.5
 """Share of a picture's points; with fewer the whole picture is left out."""
 _ROUGHLY = 0.1
 """Convergence limit, in sigmas, of values that only serve as a start."""
@@ -304,9 +304,9 @@ def first_cameras(
     usable, _ = _usable(views, points)
     for name in blank:
         count = sum(name in view.pixels for view in usable)
-        if count < _FEWEST_VIEWS:
+        if count < _MIN_VIEWS:
             raise CalibrationError(
-                f"{count} views of the target from {name}; at least {_FEWEST_VIEWS} are "
+                f"{count} views of the target from {name}; at least {_MIN_VIEWS} are "
                 "needed: take more, nearer and at more angles"
             )
     return {
@@ -407,7 +407,7 @@ def _adjust_without_outliers(
         lengths[alive] = _lengths(adjusted, pixels[alive], points + adjusted.shape.offsets_m)
         found = np.ones_like(blur)
         found[alive] = _blur(adjusted)
-        limits = np.maximum(_OUTLIER * adjusted.noise_px * found, _LEAST_LIMIT_PX)
+        limits = np.maximum(_OUTLIER * adjusted.noise_px * found, _MIN_LIMIT_PX)
         fitting = _fitting(measured, kept, measured & (lengths <= limits[..., None]))
         same = np.array_equal(fitting, kept) and np.allclose(found, blur, rtol=_SAME_BLUR)
         if same and adjusted.is_settled:
@@ -428,9 +428,9 @@ def _fitting(measured: Flags, kept: Flags, fits: Flags) -> Flags:
     pictures of one view only the worst is left out at a time.
     """
     share = fits.sum(axis=2) / np.maximum(measured.sum(axis=2), 1)
-    fitting = np.asarray(fits & (share >= _FEWEST_FITTING)[..., None])
+    fitting = np.asarray(fits & (share >= _MIN_FITTING)[..., None])
     served = np.asarray(kept.any(axis=2))
-    for v in np.flatnonzero((served & (share < _FEWEST_FITTING)).any(axis=1)):
+    for v in np.flatnonzero((served & (share < _MIN_FITTING)).any(axis=1)):
         worst = int(np.argmin(np.where(served[v], share[v], np.inf)))
         others = served[v] & (np.arange(len(share[v])) != worst)
         fitting[v] = kept[v] & others[:, None]
@@ -506,11 +506,11 @@ def _check_enough(usable: int, given: int) -> None:
     """Refuse too few views.
 
     Raises:
-        CalibrationError: they are fewer than `_FEWEST_VIEWS`.
+        CalibrationError: they are fewer than `_MIN_VIEWS`.
     """
-    if usable < _FEWEST_VIEWS:
+    if usable < _MIN_VIEWS:
         of = f" of {given}" if given > usable else ""
         raise CalibrationError(
-            f"{usable}{of} views of the target can be used; at least {_FEWEST_VIEWS} are needed: "
+            f"{usable}{of} views of the target can be used; at least {_MIN_VIEWS} are needed: "
             "take more, nearer and at more angles"
         )

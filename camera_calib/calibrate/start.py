@@ -28,7 +28,7 @@ from camera_calib.target_shape import is_sheet
 
 Indices = NDArray[np.intp]
 
-FEWEST_POINTS = 6
+MIN_POINTS = 6
 """Fewest points that give a pose: six coordinates and some to spare."""
 _THINNEST = 0.02
 """Least width over length of the seen part of a target: points in one row give no pose."""
@@ -57,7 +57,7 @@ def locate(rig: Rig, view: TargetView, points: Array) -> RigidTransform:
     found = locate_all(rig, [view], points, settled=1e-3)[0]
     if found is None:
         raise CalibrationError(
-            f"view {view.name}: no pose; {FEWEST_POINTS} points of the target that are not in one "
+            f"view {view.name}: no pose; {MIN_POINTS} points of the target that are not in one "
             "row must be seen by one camera"
         )
     return found
@@ -119,7 +119,7 @@ def _guesses(rig: Rig, view: TargetView, points: Array) -> list[RigidTransform]:
 def spans(pixels: Array, points: Array) -> bool:
     """Whether the seen points, (N, 2) pixels of (N, 3) points, are enough for a pose."""
     seen = points[np.isfinite(pixels).all(axis=1)]
-    if len(seen) < FEWEST_POINTS:
+    if len(seen) < MIN_POINTS:
         return False
     width = np.linalg.svd(seen - seen.mean(axis=0), compute_uv=False)
     return bool(width[1] > _THINNEST * width[0])

@@ -47,7 +47,7 @@ PORTS = ("FLATPORT", "DOMEPORT")
 """Refraction models by their numbers; both have eight parameters, the last three indices."""
 _NO_REFRACTION = -1
 _PORT_PARAMETERS = 8
-_MOST_PX = 10**7
+_MAX_PX = 10**7
 _OURS = {"fx": "fx_px", "fy": "fy_px", "cx": "cx_px", "cy": "cy_px"}
 
 
@@ -253,8 +253,8 @@ def _read_text(path: Path) -> list[CameraRecord]:
             )
         except ValueError as error:
             raise CalibrationError(f"{where}: {shown(str(error))}") from None
-        if max(abs(records[-1].width_px), abs(records[-1].height_px)) > _MOST_PX:
-            raise CalibrationError(f"{where}: WIDTH or HEIGHT is over {_MOST_PX} px")
+        if max(abs(records[-1].width_px), abs(records[-1].height_px)) > _MAX_PX:
+            raise CalibrationError(f"{where}: WIDTH or HEIGHT is over {_MAX_PX} px")
     return records
 
 

@@ -20,10 +20,10 @@ from alice_survey.core.artefacts import atomic_path
 from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import Array
 
-_LARGEST_BYTES = 1 << 20
-_LARGEST_SKIPPED_BYTES = 1 << 26
+_MAX_BYTES = 1 << 20
+_MAX_SKIPPED_BYTES = 1 << 26
 """Of files with what was measured for a calibration, or poses of all pictures, next to it."""
-_MOST_PARTS = 5000
+_MAX_PARTS = 5000
 """Lists, mappings and tags. Parsers recurse: this bounds how deep (OpenCV's exhausts memory at some
 hundred thousand levels, and handles 20,000)."""
 _DEEPEST = 20
@@ -159,7 +159,7 @@ def _flat(value: Any, depth: int = 0) -> list[float] | None:
     return [number] if math.isfinite(number) else None
 
 
-def read_bytes(path: Path, largest: int = _LARGEST_BYTES) -> bytes:
+def read_bytes(path: Path, largest: int = _MAX_BYTES) -> bytes:
     """The content of a file of limited size.
 
     Raises:
@@ -205,18 +205,18 @@ def read_text(path: Path, skipped: tuple[bytes, bytes] | None = None) -> str:
         CalibrationError: no such file, too large, no UTF-8, too many parts, or a document type (XML
             entities).
     """
-    content = read_bytes(path, _LARGEST_BYTES if skipped is None else _LARGEST_SKIPPED_BYTES)
+    content = read_bytes(path, _MAX_BYTES if skipped is None else _MAX_SKIPPED_BYTES)
     if skipped is not None:
         content = _without(content, *skipped)
-        _check_size(path, content, _LARGEST_BYTES)
+        _check_size(path, content, _MAX_BYTES)
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise CalibrationError(f"{path}: is not UTF-8 text") from None
     if "\0" in text:
         raise CalibrationError(f"{path}: is not text")
-    if len(re.findall(r"[\[{]|<[A-Za-z_]", text)) > _MOST_PARTS:
-        raise CalibrationError(f"{path}: has more than {_MOST_PARTS} parts: no calibration file")
+    if len(re.findall(r"[\[{]|<[A-Za-z_]", text)) > _MAX_PARTS:
+        raise CalibrationError(f"{path}: has more than {_MAX_PARTS} parts: no calibration file")
     if re.search(r"<!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE):
         raise CalibrationError(f"{path}: declares a DOCTYPE or ENTITY, which is refused")
     return text

@@ -79,13 +79,13 @@ class PaperClaim:
     """Assumption where the paper states nothing."""
     computed: float
     unit: str
-    least: float = 0.0
-    most: float
+    minimum: float = 0.0
+    maximum: float
 
     @property
     def passed(self) -> bool:
         """The number is within its bounds."""
-        return self.least <= self.computed <= self.most
+        return self.minimum <= self.computed <= self.maximum
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,7 +162,7 @@ def _angles(angles: tuple[AngleRow, ...]) -> list[PaperClaim]:
             assumption="the angle is the diagonal's, in air (its widest)",
             computed=_row(lens_mm).diagonal_air_deg,
             unit="deg",
-            most=TRUSTED_FOV_DEG,
+            maximum=TRUSTED_FOV_DEG,
         )
         for lens_mm in (12.5, 25.0)
     ]
@@ -172,7 +172,7 @@ def _angles(angles: tuple[AngleRow, ...]) -> list[PaperClaim]:
         f"of matching; {_IN_SEA}, {_ALTITUDE_M:g} m",
         computed=at_limit.residual_rms_px,
         unit="px",
-        most=MATCH_SIGMA_PX,
+        maximum=MATCH_SIGMA_PX,
     )
     return [*lenses, distortion]
 
@@ -191,9 +191,9 @@ def _focus() -> list[PaperClaim]:
             assumption=assumption + setup,
             computed=getattr(row, field),
             unit="m",
-            least=least,
-            most=most,
+            minimum=minimum,
+            maximum=maximum,
         )
-        for claim, assumption, field, least, most in claims
+        for claim, assumption, field, minimum, maximum in claims
         for row, setup in readings
     ]

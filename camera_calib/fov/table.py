@@ -239,16 +239,18 @@ def blur_table(
     ]
 
 
-def check_range(what: str, values: Sequence[float], least: float, most: float, unit: str) -> None:
+def check_range(
+    what: str, values: Sequence[float], minimum: float, maximum: float, unit: str
+) -> None:
     """Reject numbers that are out of range or not finite.
 
     Raises:
         ConfigError: names the first of them and what is allowed.
     """
     for value in values:
-        if not least <= value <= most:
+        if not minimum <= value <= maximum:
             raise ConfigError(
-                f"{what} {value} {unit}".rstrip() + f": allowed {least:g} to {most:g}"
+                f"{what} {value} {unit}".rstrip() + f": allowed {minimum:g} to {maximum:g}"
             )
 
 

@@ -224,8 +224,8 @@ def _claims(claims: Sequence[PaperClaim]) -> TextTable:
 
 
 def _bounds(claim: PaperClaim) -> str:
-    bounds = f"at most {claim.most:g} {claim.unit}"
-    return f"{claim.least:g} to {claim.most:g} {claim.unit}" if claim.least else bounds
+    bounds = f"at most {claim.maximum:g} {claim.unit}"
+    return f"{claim.minimum:g} to {claim.maximum:g} {claim.unit}" if claim.minimum else bounds
 
 
 def _verdict(check: PaperCheck | PaperClaim) -> str:

@@ -14,7 +14,7 @@ GATE_SIGMAS = 5.0
 """Residuals longer than this many times the noise are outliers: counted, and kept out of the
 statistics. Of 2D normal errors, 4 in a million are longer."""
 PROFILE_BINS = 12
-_FEWEST_IN_BIN = 8
+_MIN_IN_BIN = 8
 COVERED_REACH = 0.75
 """A corner of the frame is covered when a point lies beyond this share of both half sides."""
 TILTED_DEG = 15.0
@@ -189,7 +189,7 @@ def profile(
     def mean(values: Array) -> Array:
         total = np.bincount(bins, weights=values, minlength=PROFILE_BINS)
         few = np.full(PROFILE_BINS, np.nan)
-        means: Array = np.divide(total, count, out=few, where=count >= _FEWEST_IN_BIN)
+        means: Array = np.divide(total, count, out=few, where=count >= _MIN_IN_BIN)
         return means
 
     return Profile(

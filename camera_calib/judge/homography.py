@@ -26,7 +26,7 @@ from camera_calib.judge.fit_quality import (
     radius_px,
 )
 
-_FEWEST_POINTS = 12
+_MIN_POINTS = 12
 """Fewest points of a view: 8 unknowns against 24 coordinates."""
 _FLAT_SHARE = 1e-6
 """A target is flat if its points leave a plane by less than this share of its size."""
@@ -83,7 +83,7 @@ def homography_test(calibration: Calibration, camera: str) -> HomographyTest | N
         for v, pose in enumerate(poses):
             bent = model.project(pose.apply(calibration.target_points))
             measured[v] -= bent - model.project(pose.apply(points))
-    usable = [v for v in range(len(poses)) if kept[v].sum() >= _FEWEST_POINTS]
+    usable = [v for v in range(len(poses)) if kept[v].sum() >= _MIN_POINTS]
     if not usable:
         return None
     depths = np.concatenate([poses[v].apply(points[kept[v]])[:, 2] for v in usable])
@@ -135,7 +135,7 @@ def _fit_view(
         )
         length = np.linalg.norm(residuals, axis=1)
         outlying = length > _OUTLYING * float(np.median(length))
-        if not outlying.any() or len(length) - outlying.sum() < _FEWEST_POINTS:
+        if not outlying.any() or len(length) - outlying.sum() < _MIN_POINTS:
             return stay, residuals, freedom
         stay[np.nonzero(stay)[0][outlying]] = False
 

@@ -295,13 +295,13 @@ def rig_parameters(rig: Rig, with_prior: Collection[str] = ()) -> tuple[Paramete
     off_diagonal = covariance.correlation - np.eye(len(covariance.parameters))
     rows = []
     for name in names:
-        sigma, most, correlation = None, "", 0.0
+        sigma, maximum, correlation = None, "", 0.0
         if name in covariance.parameters:
             at = covariance.parameters.index(name)
             sigma = covariance.sigmas[name]
             other = int(np.abs(off_diagonal[at]).argmax())
             if other != at:
-                most, correlation = covariance.parameters[other], float(off_diagonal[at, other])
+                maximum, correlation = covariance.parameters[other], float(off_diagonal[at, other])
         shown, shown_sigma, unit = _for_readers(name, value(rig, name), sigma)
         rows.append(
             Parameter(
@@ -309,7 +309,7 @@ def rig_parameters(rig: Rig, with_prior: Collection[str] = ()) -> tuple[Paramete
                 value=shown,
                 sigma=shown_sigma,
                 unit=unit,
-                most_alike=most,
+                most_alike=maximum,
                 correlation=correlation,
                 prior=name in with_prior,
             )

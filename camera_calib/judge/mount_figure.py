@@ -24,7 +24,7 @@ from camera_calib.rig import Rig
 _HEIGHT_IN, _WIDTH_IN = 4.4, 9.0
 _RAY_SHARE = 0.6
 """Length of rays over the size of what is drawn."""
-_LEAST_M = 0.3
+_MIN_M = 0.3
 _FROM_ABOVE, _FROM_STARBOARD = [1, 0], [0, 2]
 """Axes of the vehicle (forward, right, down) that each drawing has to the right and upright."""
 
@@ -59,7 +59,7 @@ def paint_mount(above: Axes, side: Axes, rig: Rig) -> None:
         raise CalibrationError("nothing is drawn: the rig's mount is unknown")
     fields = {name: _field_of_view(rig, name) for name in rig.cameras}
     places = np.stack([field[0] for field in fields.values()])
-    reach = _RAY_SHARE * max(float(np.abs(places).max()), _LEAST_M)
+    reach = _RAY_SHARE * max(float(np.abs(places).max()), _MIN_M)
     _paint(above, fields, reach, _FROM_ABOVE)
     _paint(side, fields, reach, _FROM_STARBOARD)
     above.set(title="from above", xlabel="right (m)", ylabel="forward (m)")

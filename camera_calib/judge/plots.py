@@ -35,14 +35,14 @@ _DIVERGING = LinearSegmentedColormap.from_list(
     "opposed", ["#a63c1f", "#e39b7b", "#fbfbfb", "#86b7d6", "#14548a"]
 )
 _WIDTH_IN = 10.4
-_MOST_LABELS = 45
+_MAX_LABELS = 45
 _WIDE = 5.0
 """Ratio of largest to least value from which levels are logarithmic."""
 _FINE, _COARSE, _DECADES = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0), (1.0, 2.0, 5.0), (1.0, 3.0)
-_MOST_LEVELS = 11
+_MAX_LEVELS = 11
 _CELLS = 12
 """Cells across a frame, in which residuals are averaged."""
-_FEWEST_IN_CELL = 6
+_MIN_IN_CELL = 6
 _STRONG = 3.0
 """Mean length over noise of the mean from which an arrow is in colour: 1 % of cells by chance."""
 
@@ -148,8 +148,8 @@ def _cell_means(pixels: Array, residuals: Array, width_px: int) -> tuple[Array, 
     )
     totals = np.zeros((len(cells), 4))
     np.add.at(totals, which.ravel(), np.hstack([pixels, residuals]))
-    means = (totals / count[:, None])[count >= _FEWEST_IN_CELL]
-    return means[:, :2], means[:, 2:], count[count >= _FEWEST_IN_CELL].astype(np.float64)
+    means = (totals / count[:, None])[count >= _MIN_IN_CELL]
+    return means[:, :2], means[:, 2:], count[count >= _MIN_IN_CELL].astype(np.float64)
 
 
 def plot_profiles(judged: Judgement) -> bytes:
@@ -614,9 +614,9 @@ def _frame_height(judged: Judgement, rows: int = 1) -> float:
     return rows * (min(max(shapes) * wide * 0.82, 6.0) + 0.75)
 
 
-def _short(name: str, most: int = 18) -> str:
+def _short(name: str, maximum: int = 18) -> str:
     """The end of a long name."""
-    return name if len(name) <= most else f"...{name[3 - most :]}"
+    return name if len(name) <= maximum else f"...{name[3 - maximum :]}"
 
 
 def _draw_profile(above: Axes, below: Axes, found: Profile, index: int, name: str) -> None:
@@ -667,7 +667,7 @@ def _shared_levels(maps: Sequence[Array]) -> Array:
         series = np.array([step * 10.0**d for d in decades for step in steps])
         first = max(int(np.searchsorted(series, low, side="right")) - 1, 0)
         levels = series[first : int(np.searchsorted(series, high)) + 1]
-        if len(levels) <= _MOST_LEVELS:
+        if len(levels) <= _MAX_LEVELS:
             break
     return np.asarray(levels, dtype=np.float64)
 
@@ -706,7 +706,7 @@ def _draw_map(axes: Axes, judged: Judgement, name: str, values: Array, levels: A
 
 def _label_views(axes: Axes, names: list[str]) -> None:
     """Ticks with the names of views, as many as there is room for."""
-    shown = range(0, len(names), -(-len(names) // _MOST_LABELS))
+    shown = range(0, len(names), -(-len(names) // _MAX_LABELS))
     long = max(len(name) for name in names) > 4
     axes.set_xticks(
         list(shown),

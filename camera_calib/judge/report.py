@@ -19,7 +19,7 @@ from camera_calib.judge.validation import HeldOut, LengthErrors
 from camera_calib.judge.verdicts import verdicts
 
 _FORMAT = {"format": "alice-survey calibration report", "version": 1}
-_MOST_PICTURES = 60
+_MAX_PICTURES = 60
 """Rows of the table of pictures; those that fit best are left out beyond."""
 
 
@@ -246,7 +246,7 @@ def _target_section(calibration: Calibration, noise: CornerNoise) -> Section:
 def _residuals_section(judged: Judgement) -> Section:
     """Residuals by picture, place, radius, angle and size."""
     noise = judged.calibration.noise_px
-    worst = sorted(judged.pictures, key=lambda p: -p.rms_px)[:_MOST_PICTURES]
+    worst = sorted(judged.pictures, key=lambda p: -p.rms_px)[:_MAX_PICTURES]
     shown = {(p.view, p.camera) for p in worst}
     rows = [
         (

@@ -18,11 +18,11 @@ from camera_calib.target_shape import usual_shape
 
 Cause = Literal["shape", "corners", "uneven"]
 
-_FEWEST_VIEWS = 4
+_MIN_VIEWS = 4
 _FEW = 0.05
 """Share of a target's corners that are `a few`."""
 _BY_CHANCE = 1e-3
-_MOST_OF = 0.5
+_MAX_OF = 0.5
 """Share of what returns that makes a cause the likely one."""
 
 
@@ -60,7 +60,7 @@ def target_frame(calibration: Calibration) -> TargetFrame | None:
     Returns:
         None with fewer than four views, or without the noise of the corners.
     """
-    if len(calibration.views) < _FEWEST_VIEWS or calibration.spread is None:
+    if len(calibration.views) < _MIN_VIEWS or calibration.spread is None:
         return None
     count = calibration.target_points.size
     information = calibration.spread.of_places.reshape(count, count)
@@ -133,4 +133,4 @@ def _cause(drawn: Array, squares: Array, excess: float, left: Callable[[Array], 
         modes["shape"] = shape.modes
     rest = {cause: left(some) for cause, some in modes.items()}
     cause = min(rest, key=lambda name: rest[name])
-    return cause if rest[cause] < _MOST_OF * excess else "uneven"
+    return cause if rest[cause] < _MAX_OF * excess else "uneven"

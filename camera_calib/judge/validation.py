@@ -38,7 +38,7 @@ from camera_calib.triangulate import triangulate
 
 _EVERY = 5
 """One view in this many is held out."""
-_LEAST_KNOWN = 1e-12
+_MIN_KNOWN = 1e-12
 """Least eigenvalue over the largest of a covariance scaled to unit variances; less is rounding."""
 
 Calibrate = Callable[[Sequence[TargetView]], Calibration]
@@ -217,7 +217,7 @@ def halves_agreement(halves: tuple[Calibration, Calibration]) -> HalvesAgreement
     matrix = _difference_covariance(halves)
     scale = 1.0 / np.sqrt(np.diag(matrix))
     values, vectors = np.linalg.eigh(matrix * np.outer(scale, scale))
-    known = values > _LEAST_KNOWN * values[-1]
+    known = values > _MIN_KNOWN * values[-1]
     along = vectors[:, known].T @ (scale * apart)
     return HalvesAgreement(
         chi2=float((along**2 / values[known]).sum()), parameters=int(known.sum())

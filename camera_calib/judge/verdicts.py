@@ -15,7 +15,7 @@ from camera_calib.rig import Rig
 from camera_calib.target_shape import BOW_X, BOW_Y
 
 _ODD_PICTURE = 2.0
-_MOST_OUTLIERS = 0.01
+_MAX_OUTLIERS = 0.01
 """Share of the points."""
 _HELD_LOOK, _HELD_BAD = 1.2, 2.0
 _HALVES_LOOK, _HALVES_BAD = 2.0, 3.5
@@ -26,7 +26,7 @@ _FRESH_WATER = 1.33
 _RATIO_OFF = 0.12
 """Share by which a ratio of focal lengths may miss what the port makes of it; domes are centred by
 hand, and a flat port's distance lengthens them a little."""
-_NEAREST_GLASS_M, _FARTHEST_GLASS_M = 0.002, 0.25
+_NEAREST_GLASS_M, _MAX_GLASS_M = 0.002, 0.25
 """Distances from the pupil that a flat port of a housing may have."""
 _OPEN = 0.5
 """Share of its prior's sigma above which the views do not show a bow."""
@@ -104,7 +104,7 @@ def _fit_verdicts(judged: Judgement) -> Iterator[Verdict]:
         )
     else:
         yield Verdict(level="good", text=f"all pictures fit alike (median {usual:.3f} px rms)")
-    if outliers > _MOST_OUTLIERS * points:
+    if outliers > _MAX_OUTLIERS * points:
         yield Verdict(
             level="look",
             text=f"{outliers} of {points} points are outliers; look where they lie in the pictures",
@@ -138,7 +138,7 @@ def _housing_verdicts(judged: Judgement) -> Iterator[Verdict]:
                 "where no glass can be: the pictures are through a dome, without a port, or in "
                 "air; try --port auto",
             )
-        elif distance_m - _SIGMAS * sigma_m > _FARTHEST_GLASS_M:
+        elif distance_m - _SIGMAS * sigma_m > _MAX_GLASS_M:
             yield Verdict(
                 level="bad",
                 text=f"the flat port of {name} ended {distance_m * 1e3:.0f} mm before the pupil, "
@@ -161,10 +161,11 @@ def _prior_verdicts(judged: Judgement) -> Iterator[Verdict]:
     after = np.diag(result.marginal(prior.parameters).matrix)
     spread = np.sqrt(np.where(after < _LEARNT * before, before - after, before + after))
     moved = prior.misfit(calibration.rig) / spread
-    most = int(np.abs(moved).argmax())
-    level = _graded(abs(float(moved[most])), _MOVED_LOOK, _MOVED_BAD)
+    maximum = int(np.abs(moved).argmax())
+    level = _graded(abs(float(moved[maximum])), _MOVED_LOOK, _MOVED_BAD)
     text = (
-        f"the views move {prior.parameters[most]} by {abs(moved[most]):.1f} sigmas from its prior"
+        f"the views move {prior.parameters[maximum]} by {abs(moved[maximum]):.1f} sigmas "
+        "from its prior"
     )
     if level == "good":
         yield Verdict(level=level, text=f"{text}, more than any other parameter")
@@ -188,7 +189,7 @@ def _hold_out_verdicts(judged: Judgement) -> Iterator[Verdict]:
         f"what noise and covariance promise ({score.expected_px:.3f} px); used views to "
         f"{score.used_rms_px:.3f} px",
     )
-    if score.outliers > _MOST_OUTLIERS * (score.points + score.outliers):
+    if score.outliers > _MAX_OUTLIERS * (score.points + score.outliers):
         yield Verdict(
             level="look",
             text=f"{score.outliers} of {score.points + score.outliers} held-out points are "
@@ -306,14 +307,14 @@ def _uncertainty_verdicts(judged: Judgement) -> Iterator[Verdict]:
     for name, camera in judged.cameras.items():
         median = float(np.nanmedian(camera.sigma.compensated_px))
         worst = float(np.nanmax(camera.sigma.compensated_px))
-        most = float(np.nanquantile(camera.sigma.compensated_px, 0.9))
-        level = _graded(most / noise_px, _SIGMA_LOOK, _SIGMA_BAD)
+        maximum = float(np.nanquantile(camera.sigma.compensated_px, 0.9))
+        level = _graded(maximum / noise_px, _SIGMA_LOOK, _SIGMA_BAD)
         advice = "" if level == "good" else "; more views towards the edges bring it down"
         yield Verdict(
             level=level,
             text=f"{name}: at {range_m:.3g} m the calibration lets a projection err by "
-            f"{median:.3f} px (median of the frame), {most:.3f} px (nine tenths of it stay below) "
-            f"to {worst:.3f} px (worst), best pose taken{advice}",
+            f"{median:.3f} px (median of the frame), {maximum:.3f} px (nine tenths of it stay "
+            f"below) to {worst:.3f} px (worst), best pose taken{advice}",
         )
     at_work = judged.stereo_at_work
     if at_work is not None and np.isfinite(at_work.length_sigma_m):

@@ -89,15 +89,15 @@ def fisheye_pixels(rays: Array, lens: Array, pixels: Array) -> None:
 @compiled_ieee
 def fisheye_rays(pixels: Array, lens: Array, rays: Array) -> None:
     """Unit rays in air (B, 3), to be filled in, that pixels (B, 2) see."""
-    most = lens[_LIMIT]
-    end, _ = _radius(most, lens)
+    maximum = lens[_LIMIT]
+    end, _ = _radius(maximum, lens)
     for j in range(len(pixels)):
         x, y = (pixels[j, 0] - lens[2]) / lens[0], (pixels[j, 1] - lens[3]) / lens[1]
         radius = math.sqrt(x * x + y * y)
         rays[j, 0] = rays[j, 1] = rays[j, 2] = math.nan
         if not radius < end:
             continue
-        angle = _angle_of(radius, most, lens)
+        angle = _angle_of(radius, maximum, lens)
         if not math.isfinite(angle):
             continue
         stretch = math.sin(angle) / radius if radius > 0.0 else 1.0
@@ -105,10 +105,10 @@ def fisheye_rays(pixels: Array, lens: Array, rays: Array) -> None:
 
 
 @compiled_ieee
-def _angle_of(radius: float, most: float, lens: Array) -> float:
+def _angle_of(radius: float, maximum: float, lens: Array) -> float:
     """The angle of a radius: Newton's method, kept between bounds by bisection."""
-    low, high = 0.0, most
-    angle = min(radius, 0.5 * most)
+    low, high = 0.0, maximum
+    angle = min(radius, 0.5 * maximum)
     for _ in range(_NEWTON_STEPS):
         found, slope = _radius(angle, lens)
         if found > radius:

@@ -178,18 +178,18 @@ def undistort_block(x: Array, y: Array, k: Array, fold2: float, u: Array, v: Arr
     """
     terms = k[0], k[1], k[2], k[3], k[4], k[5], k[6], k[7], k[8], k[9], k[10], k[11]
     for j in range(len(x)):
-        a, b, least, last = x[j], y[j], 1.0, 0.0
+        a, b, minimum, last = x[j], y[j], 1.0, 0.0
         for _ in range(4):
             found_x, found_y, x_u, x_v, y_u, y_v = distort_slopes(a, b, terms)
             determinant = x_u * y_v - x_v * y_u
-            least = min(least, determinant)
+            minimum = min(minimum, determinant)
             miss_x, miss_y = found_x - x[j], found_y - y[j]
             step_a = (y_v * miss_x - x_v * miss_y) / determinant
             step_b = (x_u * miss_y - y_u * miss_x) / determinant
             a -= step_a
             b -= step_b
             last = abs(step_a) + abs(step_b)
-        settled = (least > 0.0) & (last <= _SETTLED) & (a * a + b * b < fold2)
+        settled = (minimum > 0.0) & (last <= _SETTLED) & (a * a + b * b < fold2)
         u[j] = a if settled else math.nan
         v[j] = b if settled else math.nan
     for j in range(len(x)):

@@ -24,7 +24,7 @@ _NEWTON_STEPS = 60
 _SETTLED = 1e-8
 """A step this short, against the tangent, leaves an error below 1.5 times its square, as t f'' / f'
 of what Newton's method solves is 3 at most."""
-_LEAST_ROOT = 0.01
+_MIN_ROOT = 0.01
 _NORMAL = ("normal_x", "normal_y")
 
 
@@ -205,7 +205,7 @@ def air_tangent(radius: float, water: float, port: Array) -> float:
     flat = air + glass / n_glass + water / n_water
     low = radius / flat
     bend = (glass * b_glass / n_glass**3 + water * b_water / n_water**3) / flat
-    tangent: float = low / math.sqrt(max(1.0 - bend * low * low, _LEAST_ROOT))
+    tangent: float = low / math.sqrt(max(1.0 - bend * low * low, _MIN_ROOT))
     for _ in range(_NEWTON_STEPS):
         t2 = tangent * tangent
         by_glass = 1.0 / math.sqrt(a_glass + b_glass * t2)
@@ -239,7 +239,7 @@ def _air_tangents(radius: Array, water: Array, port: Array, tangent: Array, step
         flat = air + flat_glass + flat_water * water[j]
         low = radius[j] / flat
         bend = (bend_glass + bend_water * water[j]) / flat
-        t = low / math.sqrt(max(1.0 - bend * low * low, _LEAST_ROOT))
+        t = low / math.sqrt(max(1.0 - bend * low * low, _MIN_ROOT))
         last = 0.0
         for _ in range(3):
             t2 = t * t

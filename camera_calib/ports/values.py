@@ -77,11 +77,11 @@ class PortValues(ABC):
                 raise CalibrationError(f"camera: {field.name} = {value} is not finite")
             if field.name not in self.ranges:
                 continue
-            least, most = self.ranges[field.name]
-            if not least <= value <= most:
+            minimum, maximum = self.ranges[field.name]
+            if not minimum <= value <= maximum:
                 unit = " m" if field.name.endswith("_m") else ""
                 raise CalibrationError(
-                    f"camera: {field.name} = {value:g}: {least:g} to {most:g}{unit} allowed"
+                    f"camera: {field.name} = {value:g}: {minimum:g} to {maximum:g}{unit} allowed"
                 )
 
     @property
@@ -133,7 +133,7 @@ class PortValues(ABC):
         """Parameters that a calibration finds; glass and indices are known better."""
         return (*self.places, *self.tilts)
 
-    def least(self, name: str) -> float:
+    def minimum(self, name: str) -> float:
         """Least value of a parameter; minus infinity where it has none."""
         return self.ranges.get(name, (-math.inf, math.inf))[0]
 

@@ -33,7 +33,7 @@ _BLUR_PX = 0.8
 _WHITE_NOISE = 4.0 * math.pi * _BLUR_PX**2
 """Variance of white noise over its variance after the blur."""
 _STEPS = 30
-_FARTHEST_PX, _FARTHEST = 1.5, 0.1
+_MAX_PX, _FARTHEST = 1.5, 0.1
 """Largest distance of a corner from its start: the greater of this and of these squares."""
 _NARROWEST_PX, _WIDEST_PX = 0.2, 8.0
 _HALF_PX = 12
@@ -42,19 +42,19 @@ _REACH = 0.45
 _CLEAR_PX, _CLEAR = 2.0, 0.25
 """Distance kept from other edges, whose places are less well known: the lesser of this and of this
 share of the distance to them."""
-_MOST_BENT_PX = 0.1
+_MAX_BENT_PX = 0.1
 """Largest bend of an edge in the window; bends are known to a tenth or so."""
-_LEAST_PX = 1.0
-_FEWEST_PIXELS = 25
+_MIN_PX = 1.0
+_MIN_PIXELS = 25
 _WORST_MISFIT, _WORST_NOISY_MISFIT = 0.2, 0.35
 """Largest rms of what a fit leaves over the contrast: where noise does not explain it, and where it
 does."""
 _NOISES = 2.0
 """What a fit leaves is noise up to this many standard deviations of the picture's."""
-_LEAST_CONTRAST = 0.001
-_LARGEST_SIGMA_PX = 0.5
+_MIN_CONTRAST = 0.001
+_MAX_SIGMA_PX = 0.5
 """Largest standard deviation: two edges that cross outside of the window fit whatever is in it."""
-_FARTHEST_LINE_PX = _HALF_PX + 2.0
+_MAX_LINE_PX = _HALF_PX + 2.0
 """Distance from a corner at which a line still shows in its window."""
 _SHARP = 4.0
 """Distance from an edge over its blur beyond which it is black or white."""
@@ -208,7 +208,7 @@ def _fit_corners(
         best, cost, normal = _descend(window, used, places, edges, shade, best)
         count = used.sum()
         area = abs(steps[i, 0, 0] * steps[i, 1, 1] - steps[i, 0, 1] * steps[i, 1, 0])
-        farthest = max(_FARTHEST_PX, _FARTHEST * math.sqrt(area))
+        farthest = max(_MAX_PX, _FARTHEST * math.sqrt(area))
         settled = math.hypot(best[0] - x, best[1] - y) < farthest
         if not settled or not _NARROWEST_PX < best[4] < _WIDEST_PX:
             states[i] = NOT_SETTLED
@@ -216,12 +216,12 @@ def _fit_corners(
         variance = cost / (count - 9)
         contrast2 = best[5] * best[5]
         allowed = min(_WORST_MISFIT**2 * contrast2 + noise, _WORST_NOISY_MISFIT**2 * contrast2)
-        if abs(best[5]) < _LEAST_CONTRAST or variance > allowed:
+        if abs(best[5]) < _MIN_CONTRAST or variance > allowed:
             states[i] = UNLIKE_A_CORNER
             continue
         inverse = np.linalg.inv(normal + 1e-12 * np.eye(9))
         sigma = math.sqrt(0.5 * (inverse[0, 0] + inverse[1, 1]) * variance * _WHITE_NOISE)
-        if sigma > _LARGEST_SIGMA_PX:
+        if sigma > _MAX_SIGMA_PX:
             states[i] = UNLIKE_A_CORNER
             continue
         out[i, 0], out[i, 1] = column + best[0], row + best[1]
@@ -233,7 +233,7 @@ def _fit_corners(
 def _clear(distance: float, per_px: float) -> float:
     """Length of a window up to an edge at a distance, in squares."""
     kept = min(_CLEAR_PX * per_px, _CLEAR * distance)
-    return max(distance - kept, _LEAST_PX * per_px)
+    return max(distance - kept, _MIN_PX * per_px)
 
 
 @compiled
@@ -266,7 +266,7 @@ def _cut(
     u_reach, v_reach = min(_REACH, _clear(reach, u_px)), min(_REACH, _clear(reach, v_px))
     u_arm, v_arm = _clear(arm, u_px), _clear(arm, v_px)
     bend_px = max(np.abs(bends).max(), 1e-9)
-    straight = max(math.sqrt(_MOST_BENT_PX / bend_px), 4.0 * math.sqrt(u_px * v_px))
+    straight = max(math.sqrt(_MAX_BENT_PX / bend_px), 4.0 * math.sqrt(u_px * v_px))
     u_reach, v_reach = min(u_reach, straight), min(v_reach, straight)
     count = 0
     for j in range(-_HALF_PX, _HALF_PX + 1):
@@ -286,7 +286,7 @@ def _cut(
             window[j + _HALF_PX, i + _HALF_PX] = picture[row + j, column + i]
             used[j + _HALF_PX, i + _HALF_PX] = True
             count += 1
-    return FITTED if count >= _FEWEST_PIXELS else NOT_SETTLED
+    return FITTED if count >= _MIN_PIXELS else NOT_SETTLED
 
 
 @compiled
@@ -295,8 +295,8 @@ def _in_window(lines: Array, pixels_per_square: float) -> tuple[int, int]:
     low, high = 0, 0
     for k in range(lines.shape[0]):
         at = lines[k] * pixels_per_square
-        low += at < -_FARTHEST_LINE_PX
-        high += at < _FARTHEST_LINE_PX
+        low += at < -_MAX_LINE_PX
+        high += at < _MAX_LINE_PX
     return low, high
 
 

@@ -44,13 +44,13 @@ from camera_calib.targets.target import (
 
 Picture = NDArray[np.uint8] | NDArray[np.uint16]
 
-_FEWEST_POINTS, _FEWEST_AROUND = 6, 16
-_FARTHEST_OFF, _ALWAYS_NEAR, _NEAR_AT_RIM = 0.2, 0.02, 0.1
+_MIN_POINTS, _MIN_AROUND = 6, 16
+_MAX_OFF, _ALWAYS_NEAR, _NEAR_AT_RIM = 0.2, 0.02, 0.1
 """Largest distance of a point from its prediction by its neighbours, in squares; those that are
 always allowed, amidst the neighbours and where they are on one side."""
 _RIM = 0.3
 """Distance of a point from the mean of its neighbours beyond which these are on one side."""
-_FARTHEST_OVER_MIDDLE = 10.0
+_MAX_OVER_MIDDLE = 10.0
 """The same over the middle one of the picture: a lens bends all of a board."""
 _WEAKEST = 0.1
 """Contrast of a corner over the middle one of those near it: part of a target may be in shade."""
@@ -69,7 +69,7 @@ _DARK, _FLAT = 8, 4
 """Grey levels of 255 that the brightest pixels and the range of a usable picture exceed."""
 _AGREED = 0.7
 """Share of the markers that must stand where the target has them; half do in a wrong layout."""
-_LEAST_PX = 32
+_MIN_PX = 32
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -209,9 +209,9 @@ def _refined(target: Target, grey: Grey, near: Array) -> Detection:
     dropped = {reason: count for reason, count in counts.items() if count}
     board = target.points[used, :2] / target.size_m
     flat = np.linalg.matrix_rank(board - board.mean(axis=0), tol=0.1) if used.any() else 0
-    if used.sum() < _FEWEST_POINTS or flat < 2:
+    if used.sum() < _MIN_POINTS or flat < 2:
         why = "; ".join(f"{count}: {reason}" for reason, count in dropped.items())
-        needed = f"{_FEWEST_POINTS} on more than one line are needed"
+        needed = f"{_MIN_POINTS} on more than one line are needed"
         refused = f"only {int(used.sum())} of {len(used)} points, {needed}"
         return Detection(pixels=None, refused=f"{refused} ({why})" if why else refused)
     if target.kind == "chessboard" and not spans_board(used.reshape(target.shape)):
@@ -269,7 +269,7 @@ def _second_look(target: Target, grey: Grey, corners: Corners) -> Corners:
 def _last_look(target: Target, grey: Grey, corners: Corners) -> Corners:
     """Fit again, with edges as curved as the lens has them around each corner."""
     used = corners.states == FITTED
-    if used.sum() < _FEWEST_AROUND:
+    if used.sum() < _MIN_AROUND:
         return corners
     steps, bends = (np.full((len(used), 2, count), np.nan) for count in (2, 3))
     board = target.points[:, :2] / target.size_m
@@ -297,8 +297,8 @@ def _without_astray(target: Target, corners: Corners) -> Corners:
     faint = contrast < _WEAKEST * np.maximum(np.median(contrast[nearest], axis=1), 0.0)
     at_rim = np.linalg.norm(board[nearest].mean(axis=1) - board, axis=1) > _RIM
     always = np.where(at_rim, _NEAR_AT_RIM, _ALWAYS_NEAR)
-    usual = np.maximum(always, _FARTHEST_OVER_MIDDLE * float(np.median(off)))
-    astray[fitted] = (off > np.minimum(_FARTHEST_OFF, usual)) | faint
+    usual = np.maximum(always, _MAX_OVER_MIDDLE * float(np.median(off)))
+    astray[fitted] = (off > np.minimum(_MAX_OFF, usual)) | faint
     return corners.without(astray, ASTRAY)
 
 
@@ -341,15 +341,15 @@ class Reduced:
         return pixels * self.scale
 
 
-def reduced(grey: Grey, longest_px: int) -> Reduced:
+def reduced(grey: Grey, max_px: int) -> Reduced:
     """The picture, made so small that its longer side is at most this."""
-    return resized(grey, min(longest_px, max(grey.shape)))
+    return resized(grey, min(max_px, max(grey.shape)))
 
 
-def resized(grey: Grey, longest_px: int) -> Reduced:
+def resized(grey: Grey, max_px: int) -> Reduced:
     """The picture, made so small or large that its longer side is this."""
     height, width = grey.shape
-    scale = longest_px / max(height, width)
+    scale = max_px / max(height, width)
     size = (max(round(width * scale), 1), max(round(height * scale), 1))
     small: NDArray[Any] = grey
     if scale != 1.0:
@@ -363,7 +363,7 @@ def resized(grey: Grey, longest_px: int) -> Reduced:
 
 def unusable(grey: Grey) -> str | None:
     """Reason why a picture is unusable, if it is."""
-    if min(grey.shape) < _LEAST_PX:
+    if min(grey.shape) < _MIN_PX:
         return f"only {grey.shape[1]} x {grey.shape[0]} px"
     low, high = np.percentile(reduced(grey, SMALL_PX).picture, [0.1, 99.9])
     if high < _DARK:

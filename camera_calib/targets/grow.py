@@ -27,13 +27,13 @@ _BLUR_PX = 1.5
 _APART_PX = 7
 _FAINTEST = 0.02
 """Weakest saddle over the strongest."""
-_MOST_SADDLES = 600
-_MOST_STARTS = 25
+_MAX_SADDLES = 600
+_MAX_STARTS = 25
 """Saddles that squares are built from."""
-_MOST_SQUARES = 4
+_MAX_SQUARES = 4
 """Squares built from one of them."""
-_MOST_ROUNDS = 40
-_MOST_TRIES = 3
+_MAX_ROUNDS = 40
+_MAX_TRIES = 3
 _NEAR = 40
 _ALIKE = 0.15
 """Least strength of a saddle over that of the stronger one next to which it stands in a start."""
@@ -45,14 +45,14 @@ _ALIKE_NEAR = 6
 """Known corners whose contrast is compared with."""
 _FEWEST = 9
 _LONGEST = 100
-_LEAST_SHARE = 0.5
+_MIN_SHARE = 0.5
 """Share of the corners that must be fitted."""
-_LEAST_OUTER_SHARE = 0.25
+_MIN_OUTER_SHARE = 0.25
 """The same of each of the outer rows and columns, which show where the board ends."""
-_MOST_NEIGHBOURS = 24
+_MAX_NEIGHBOURS = 24
 _NEIGHBOUR_WIDTH = 1.5
 """Standard deviation of a neighbour's weight, in squares."""
-_MOST_DEGREE = 6
+_MAX_DEGREE = 6
 """Of the polynomial that describes what a lens makes of a board."""
 _STIFFNESS = 0.1
 """Weight of 'no change of slope', nor of bends, against that of a neighbour one square away."""
@@ -84,7 +84,7 @@ def spans_board(seen: NDArray[np.bool_]) -> bool:
     """Whether the corners seen, (rows, columns), determine where the board ends."""
     sides = (seen[0], seen[-1], seen[:, 0], seen[:, -1])
     outer = min(float(side.mean()) for side in sides)
-    return bool(seen.mean() >= _LEAST_SHARE and outer >= _LEAST_OUTER_SHARE)
+    return bool(seen.mean() >= _MIN_SHARE and outer >= _MIN_OUTER_SHARE)
 
 
 def chessboard_size(picture: NDArray[np.uint8]) -> tuple[int, int] | None:
@@ -168,10 +168,10 @@ def _starts(picture: NDArray[np.uint8]) -> Iterator[Places]:
                 corners = {(0, 0): c, (1, 0): right, (0, 1): below, (1, 1): d}
                 yield {place: saddles[i] for place, i in corners.items()}
                 squares += 1
-            if squares == _MOST_SQUARES:
+            if squares == _MAX_SQUARES:
                 break
         count += squares > 0
-        if count == _MOST_STARTS:
+        if count == _MAX_STARTS:
             return
 
 
@@ -186,7 +186,7 @@ def _saddles(picture: NDArray[np.uint8]) -> tuple[Array, Array, Array]:
     peak = cv2.dilate(strength, np.ones((_APART_PX, _APART_PX), dtype=np.uint8))
     floor = max(_FAINTEST * float(strength.max()), 1e-3)
     y, x = np.nonzero((strength >= peak) & (strength > floor))
-    order = np.argsort(-strength[y, x], kind="stable")[:_MOST_SADDLES]
+    order = np.argsort(-strength[y, x], kind="stable")[:_MAX_SADDLES]
     y, x = y[order], x[order]
     angles: Array = 0.5 * np.arctan2(2.0 * xy[y, x], xx[y, x] - yy[y, x]).astype(np.float64)
     return np.column_stack([x + 0.5, y + 0.5]), angles, strength[y, x].astype(np.float64)
@@ -204,7 +204,7 @@ def _grow(picture: NDArray[np.uint8], start: Places, longest: int) -> Places:
         return {}
     known: Places = dict(zip(start, np.column_stack([fits.pixels, contrast]), strict=True))
     tries: Counter[Place] = Counter()
-    for _ in range(_MOST_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         fresh = _next_to(picture, known, tries)
         grown = _knit(known | fresh)
         if grown.keys() <= known.keys() or not grown:
@@ -248,7 +248,7 @@ def _next_to(picture: NDArray[np.uint8], known: Places, tries: Counter[Place]) -
     moves = [(a, b) for a in range(-far, far + 1) for b in range(-far, far + 1)]
     moves = [(a, b) for a, b in moves if abs(a) + abs(b) <= far]
     around = {(x + a, y + b) for x, y in known for a, b in moves} - set(known)
-    worth = sorted(place for place in around if tries[place] < _MOST_TRIES)
+    worth = sorted(place for place in around if tries[place] < _MAX_TRIES)
     if not worth:
         return {}
     tries.update(worth)
@@ -291,7 +291,7 @@ def from_neighbours(
         return np.full((len(wanted), 2), np.nan), np.full((len(wanted), 2, 2), np.nan)
     predicted, slopes, _ = through(homography, wanted)
     misses = pixels - through(homography, board)[0]
-    distance, index = cKDTree(board).query(wanted, k=min(_MOST_NEIGHBOURS, len(board)))
+    distance, index = cKDTree(board).query(wanted, k=min(_MAX_NEIGHBOURS, len(board)))
     weight = np.exp(-0.5 * (distance / _NEIGHBOUR_WIDTH) ** 2)
     if others:
         weight = np.where(distance < 1e-6, 0.0, weight)
@@ -323,10 +323,10 @@ def board_map(board: Array, pixels: Array) -> tuple[Array, Array]:
     places, slopes, bends = through(homography, board)
     middle, half = (board.max(axis=0) + board.min(axis=0)) / 2.0, np.ptp(board, axis=0) / 2.0
     x, y = ((board - middle) / half).T
-    degree = max(d for d in range(_MOST_DEGREE + 1) if (d + 1) * (d + 2) <= len(board))
-    most_x, most_y = (len(np.unique(np.round(line, 6))) // 2 for line in (x, y))
+    degree = max(d for d in range(_MAX_DEGREE + 1) if (d + 1) * (d + 2) <= len(board))
+    max_x, max_y = (len(np.unique(np.round(line, 6))) // 2 for line in (x, y))
     powers = [
-        (i, j) for i in range(min(degree, most_x) + 1) for j in range(min(degree - i, most_y) + 1)
+        (i, j) for i in range(min(degree, max_x) + 1) for j in range(min(degree - i, max_y) + 1)
     ]
 
     def by(along_x: int, along_y: int) -> Array:

@@ -48,9 +48,9 @@ def surroundings(target: Target) -> Surroundings:
     around = [
         _around(rectangles - np.tile(point, 2)) for point in target.points[:, :2] / target.size_m
     ]
-    most = max(len(line) for lines, _ in around for line in lines)
-    lines = np.full((len(around), 2, most), np.inf)
-    shades = np.ones((len(around), most + 1, most + 1))
+    maximum = max(len(line) for lines, _ in around for line in lines)
+    lines = np.full((len(around), 2, maximum), np.inf)
+    shades = np.ones((len(around), maximum + 1, maximum + 1))
     for n, (places, shade) in enumerate(around):
         for axis, line in enumerate(places):
             lines[n, axis, : len(line)] = line

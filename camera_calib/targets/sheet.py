@@ -31,9 +31,9 @@ _MARGIN_MM = 8.0
 _STRIP_MM = 11.0
 """Space below the pattern, for the bar and the text."""
 _TICK_MM, _LINE_MM, _TEXT_MM = 3.0, 0.3, 2.6
-_LARGEST_PAGE_MM = 5080.0
+_MAX_PAGE_MM = 5080.0
 """A PDF page is at most 200 inches."""
-_MOST_PIXELS = 600_000_000
+_MAX_PIXELS = 600_000_000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -66,10 +66,10 @@ def lay_out(target: Target, paper: str | None = None) -> Sheet:
     margin = max(_MARGIN_MM, -0.5 * left) if paper is None else _MARGIN_MM
     needed = max(width, BAR_MM) + 2.0 * margin, height + _STRIP_MM + 2.0 * margin
     page = needed if paper is None else _on_paper(target, needed, paper)
-    if max(page) > _LARGEST_PAGE_MM:
+    if max(page) > _MAX_PAGE_MM:
         raise CalibrationError(
             f"a page of {page[0]:.0f} x {page[1]:.0f} mm; files hold at most "
-            f"{_LARGEST_PAGE_MM:.0f} mm: take fewer or smaller squares"
+            f"{_MAX_PAGE_MM:.0f} mm: take fewer or smaller squares"
         )
     x = (page[0] - width) / 2.0
     y = (page[1] - height - _STRIP_MM) / 2.0
@@ -186,7 +186,7 @@ def to_pixels(sheet: Sheet, dpi: float) -> NDArray[np.uint8]:
     """
     per_mm = dpi / 25.4
     width, height = (math.ceil(s * per_mm) for s in (sheet.width_mm, sheet.height_mm))
-    if width * height > _MOST_PIXELS:
+    if width * height > _MAX_PIXELS:
         raise CalibrationError(
             f"a picture of {width} x {height} px: lower --dpi, or write a PDF or SVG, whose lines "
             "have no pixels"

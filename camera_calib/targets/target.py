@@ -41,7 +41,7 @@ TAG_BITS, TAG_BORDER_BITS = 10, 2
 """Bits along a tag with its border, and the width of the border."""
 _DEFAULT_DICTIONARY = "DICT_5X5_1000"
 _FEWEST, _MOST = 3, 100
-_SMALLEST_M, _LARGEST_M = 1e-4, 10.0
+_MIN_M, _MAX_M = 1e-4, 10.0
 _WIDEST_SPACING = 1.0
 _NARROWEST_SPACING = 0.1
 _UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
@@ -80,16 +80,16 @@ class Target:
     def __post_init__(self) -> None:
         if self.kind not in ("chessboard", "charuco", "apriltag"):
             raise CalibrationError(f"target: no kind '{self.kind}'; {_GRAMMAR}")
-        fewest = 1 if self.kind == "apriltag" else _FEWEST
-        if not (fewest <= self.columns <= _MOST and fewest <= self.rows <= _MOST):
+        minimum = 1 if self.kind == "apriltag" else _FEWEST
+        if not (minimum <= self.columns <= _MOST and minimum <= self.rows <= _MOST):
             raise CalibrationError(
                 f"target: {self.columns}x{self.rows} {_COUNTED[self.kind]}: each count must be "
-                f"{fewest} to {_MOST}"
+                f"{minimum} to {_MOST}"
             )
-        if not _SMALLEST_M <= self.size_m <= _LARGEST_M:
+        if not _MIN_M <= self.size_m <= _MAX_M:
             raise CalibrationError(
                 f"target: {self.size_m * 1e3:g} mm for a {_SIZED[self.kind]}: it must be "
-                f"{_SMALLEST_M * 1e3:g} to {_LARGEST_M * 1e3:g} mm; check the unit"
+                f"{_MIN_M * 1e3:g} to {_MAX_M * 1e3:g} mm; check the unit"
             )
         self._check_charuco()
         self._check_apriltag()

@@ -20,7 +20,7 @@ from alice_survey.core.frames import Array, Datum
 
 Sense = Literal["auto", "heights", "depths"]
 """What a raster's values are: heights positive up, or depths positive down."""
-_MOST_CELLS = 16_000_000
+_MAX_CELLS = 16_000_000
 """Read at once: 128 MB."""
 _LOOKED_AT = 4096
 _EMPTIEST = 5
@@ -33,7 +33,7 @@ _EDGE_POINTS = 32
 _ONE_SIGN = 0.99
 """Share of cells of one sign from which a raster without a word on it is taken to be of that sign.
 """
-_MOST_SAMPLES = 1_000_000
+_MAX_SAMPLES = 1_000_000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -146,7 +146,7 @@ def mean_depth_m(bathymetry: Bathymetry, survey: MultiPolygon) -> float:
     """
     north_0, east_0, north_1, east_1 = survey.bounds
     count = (north_1 - north_0) * (east_1 - east_0) / bathymetry.cell_m**2
-    step = bathymetry.cell_m * max(1.0, math.sqrt(count / _MOST_SAMPLES))
+    step = bathymetry.cell_m * max(1.0, math.sqrt(count / _MAX_SAMPLES))
     step = min(step, max(north_1 - north_0, east_1 - east_0) / 16)
     north = np.arange(north_0 + step / 2, north_1, step)
     east = np.arange(east_0 + step / 2, east_1, step)
@@ -251,7 +251,7 @@ def _check_filled(path: Path, file: Any) -> None:
         PlanError: with the size of a part, or of the grid.
     """
     rows, columns = file.block_shapes[0]
-    if rows * columns > 4 * _MOST_CELLS:
+    if rows * columns > 4 * _MAX_CELLS:
         raise PlanError(
             f"{path}: is stored in blocks of {columns} x {rows} cells, too large to read: store it "
             "in tiles (gdal_translate -co TILED=YES)"
@@ -356,9 +356,9 @@ def _window(
             )
         window = (first_c, first_r, last_c - first_c, last_r - first_r)
     cells = window[2] * window[3]
-    if cells > _MOST_CELLS:
+    if cells > _MAX_CELLS:
         raise PlanError(
-            f"{path}: {window[2]} x {window[3]} cells are needed, more than {_MOST_CELLS:,}; "
+            f"{path}: {window[2]} x {window[3]} cells are needed, more than {_MAX_CELLS:,}; "
             "survey less at once, or coarsen the raster (gdalwarp -tr)"
         )
     return window

@@ -14,7 +14,7 @@ from missions.areas.raw import RawShapes
 
 LOCAL = "local"
 """Stands for a coordinate system: metres east (x) and north (y) of the datum."""
-FARTHEST_M = 20_000.0
+MAX_M = 20_000.0
 """Largest distance from the datum: beyond it the local frame is no longer flat."""
 _HIGHEST_LATITUDE_DEG = 85.0
 """Nearer to a pole, headings from north change within an area."""
@@ -40,7 +40,7 @@ class LocalFrame:
         """The inverse of `ne_from_latlon`, for points at the depth of the sea floor.
 
         A point of the sea floor is below the datum's horizon by the Earth's curve; three rounds
-        bring the depth to below a micrometre within `FARTHEST_M` (each leaves the square of the
+        bring the depth to below a micrometre within `MAX_M` (each leaves the square of the
         distance over the Earth's radius, 1e-5, of the error).
         """
         down_m = np.full(len(points_ne), self.seafloor_depth_m)
@@ -62,7 +62,7 @@ class LocalFrame:
         """Shapes in metres north and east of the datum.
 
         Raises:
-            PlanError: a corner is not a number, or farther than `FARTHEST_M` from the datum.
+            PlanError: a corner is not a number, or farther than `MAX_M` from the datum.
         """
 
         def change(corners: Array, name: str) -> Array:
@@ -80,7 +80,7 @@ class LocalFrame:
             far = _distance_m(corners, self.datum)
         else:
             far = np.linalg.norm(points_ne, axis=1)
-        if far.max() <= FARTHEST_M:
+        if far.max() <= MAX_M:
             return
         worst = int(far.argmax())
         datum = f"({self.datum.latitude_deg:g}, {self.datum.longitude_deg:g})"
@@ -89,8 +89,8 @@ class LocalFrame:
         )
         swapped = (
             raw.geographic
-            and far.min() > FARTHEST_M
-            and _distance_m(corners[:, ::-1], self.datum).max() <= FARTHEST_M
+            and far.min() > MAX_M
+            and _distance_m(corners[:, ::-1], self.datum).max() <= MAX_M
         )
         if swapped and self.datum_is_given:
             advice = "latitude and longitude are swapped"
@@ -107,7 +107,7 @@ class LocalFrame:
             advice = "move the datum or check the corner"
         raise PlanError(
             f"{corner_name(raw.origin, name, worst)}{where} is "
-            f"{far.max() / 1e3:.0f} km from the datum {datum}; at most {FARTHEST_M / 1e3:.0f} km: "
+            f"{far.max() / 1e3:.0f} km from the datum {datum}; at most {MAX_M / 1e3:.0f} km: "
             f"{advice}"
         )
 

@@ -17,7 +17,7 @@ from pydantic import ConfigDict, Field
 from alice_survey.core.config import AreaConfig, Config
 from alice_survey.core.errors import PlanError
 from alice_survey.core.frames import Array, Datum
-from missions.areas.crs import FARTHEST_M, LocalFrame, middle
+from missions.areas.crs import MAX_M, LocalFrame, middle
 from missions.areas.files import Role, read_area_file
 from missions.areas.raw import RawShapes
 from missions.areas.survey import GivenShapes, corridor_strip, given_shapes
@@ -36,13 +36,13 @@ _KEYS = {
     "allowed": ("allowed_ne_m", "allowed_latlon_deg", "allowed_file", "allowed_layer"),
 }  # fmt: skip
 _NEED_CRS = ("file", "wkt", "no_go_file", "allowed_file")
-_MOST_INLINE = 100
+_MAX_INLINE = 100
 """Corners of the shapes that one setting holds; a file holds more."""
 _DECIMALS, _DEGREE_DECIMALS = 4, 11
 """A tenth of a millimetre; about a micrometre."""
 _SAME_M = 6e-4
 """Corners this near are the same: what is drawn may be rounded to a millimetre."""
-_MOST_CORNERS = 200_000
+_MAX_CORNERS = 200_000
 
 Metres = Annotated[float, Field(ge=-1e6, le=1e6)]
 Place = tuple[Metres, Metres]
@@ -52,7 +52,7 @@ Open = tuple[Place, ...]
 class DrawnPolygon(Config):
     """A polygon as a page sends it, north and east of the datum, metres; its rings are open."""
 
-    outer: Open = Field(min_length=3, max_length=_MOST_CORNERS)
+    outer: Open = Field(min_length=3, max_length=_MAX_CORNERS)
     holes: tuple[Open, ...] = ()
 
     @property
@@ -270,14 +270,14 @@ def _left_out(role: str, settings: AreaConfig) -> dict[str, Any]:
 
 def _inline(polygons: Sequence[DrawnPolygon]) -> bool:
     corners = sum(len(polygon.outer) for polygon in polygons)
-    return corners <= _MOST_INLINE and not any(polygon.holes for polygon in polygons)
+    return corners <= _MAX_INLINE and not any(polygon.holes for polygon in polygons)
 
 
 def _survey(shapes: DrawnShapes, frame: LocalFrame, files: dict[str, str]) -> dict[str, Any]:
     polygons, corridors = shapes.survey, shapes.corridors
     if len(polygons) == 1 and not corridors and _inline(polygons):
         return {"polygon_ne_m": _listed(polygons[0].outer)}
-    if len(corridors) == 1 and not polygons and len(corridors[0]) <= _MOST_INLINE:
+    if len(corridors) == 1 and not polygons and len(corridors[0]) <= _MAX_INLINE:
         return {"corridor_ne_m": _listed(corridors[0])}
     name = FILES["survey"]
     files[name] = _geojson(frame, polygons, [np.array(line) for line in corridors])
@@ -335,11 +335,11 @@ def _geojson(
 
     def degrees(places: Any) -> list[list[float]]:
         array = np.asarray(places, dtype=np.float64).reshape(-1, 2)
-        far = np.flatnonzero(~(np.hypot(*array.T) <= FARTHEST_M))
+        far = np.flatnonzero(~(np.hypot(*array.T) <= MAX_M))
         if len(far):
             raise PlanError(
                 f"area: a corner at north {array[far[0], 0]:g}, east {array[far[0], 1]:g} m is "
-                f"more than {FARTHEST_M / 1e3:.0f} km from the datum: draw nearer to it, or move "
+                f"more than {MAX_M / 1e3:.0f} km from the datum: draw nearer to it, or move "
                 "the datum"
             )
         lat_lon = frame.latlon_from_ne(array)

@@ -32,7 +32,7 @@ from missions.areas.safe import (
 )
 
 Role = Literal["survey", "no_go", "allowed"]
-_MOST_CORNERS = 200_000
+_MAX_CORNERS = 200_000
 _DEEPEST = 20
 _SRID = re.compile(r"\s*SRID\s*=\s*(\d+)\s*;", re.IGNORECASE)
 _LAYER_SETTING = {"survey": "layer", "no_go": "no_go_layer", "allowed": "allowed_layer"}
@@ -281,9 +281,9 @@ def _shapes(wkb: Sequence[bytes | None], file: str, *, several: bool, layer: str
 
 
 def _refuse_corners(origin: str, count: int) -> None:
-    if count > _MOST_CORNERS:
+    if count > _MAX_CORNERS:
         raise PlanError(
-            f"area: {origin}: {count} corners; at most {_MOST_CORNERS}: simplify it, or cut "
+            f"area: {origin}: {count} corners; at most {_MAX_CORNERS}: simplify it, or cut "
             "out the part to survey"
         )
 

@@ -19,7 +19,7 @@ from missions.areas.safe import read_json
 
 LAYERS = ("mission", "inclusion", "exclusion")
 _CIRCLE_CORNERS = 64
-_LARGEST_M = 1e6
+_MAX_M = 1e6
 
 
 def read_qgc_plan(
@@ -148,7 +148,7 @@ def _corners(value: Any, origin: str, name: str) -> Array:
 
 
 def _number(value: Any, origin: str, name: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < _LARGEST_M:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < _MAX_M:
         raise PlanError(f"area: {origin}: {name} is {value!r:.60}; it must be above 0")
     return float(value)
 

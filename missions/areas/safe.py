@@ -15,9 +15,9 @@ from xml.parsers import expat
 from alice_survey.core.config import SHAPEFILE_SIDES
 from alice_survey.core.errors import PlanError
 
-LARGEST_BYTES = 100_000_000
+MAX_BYTES = 100_000_000
 """Size limit of a file, and of all that is unpacked from an archive."""
-_MOST_MEMBERS = 1000
+_MAX_MEMBERS = 1000
 _GEOJSON = frozenset(
     {
         "FeatureCollection", "Feature", "GeometryCollection", "Polygon", "MultiPolygon",
@@ -50,9 +50,9 @@ def check_file(path: Path, *, may_be_empty: bool = False) -> None:
     if not path.is_file():
         raise PlanError(f"area: {path} is not a file")
     size = path.stat().st_size
-    if size > LARGEST_BYTES:
+    if size > MAX_BYTES:
         raise PlanError(
-            f"area: {path}: {size / 1e6:.0f} MB; at most {LARGEST_BYTES / 1e6:.0f} MB: cut out the "
+            f"area: {path}: {size / 1e6:.0f} MB; at most {MAX_BYTES / 1e6:.0f} MB: cut out the "
             "part to survey"
         )
     if size == 0 and not may_be_empty:
@@ -192,10 +192,10 @@ def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
     with archive:
         members = archive.infolist()
         total = sum(member.file_size for member in members)
-        if total > LARGEST_BYTES or len(members) > _MOST_MEMBERS:
+        if total > MAX_BYTES or len(members) > _MAX_MEMBERS:
             raise PlanError(
                 f"area: {path}: {len(members)} files of {total / 1e6:.0f} MB in it; at most "
-                f"{_MOST_MEMBERS} of {LARGEST_BYTES / 1e6:.0f} MB are unpacked"
+                f"{_MAX_MEMBERS} of {MAX_BYTES / 1e6:.0f} MB are unpacked"
             )
         yield archive
 

@@ -28,9 +28,9 @@ from missions.values.footprint import footprint_size_m
 from missions.values.pattern import Pattern
 
 _CELLS_PER_FOOTPRINT = 20.0
-_LEAST_CELLS = 40_000
+_MIN_CELLS = 40_000
 """Fewest cells of a small area, so that its shares are finely resolved."""
-_MOST_CELLS = 16_000_000
+_MAX_CELLS = 16_000_000
 _SIZES = 0.005 * np.array([0, 1, -1, 2, -2, 3, -3, 4, -4, 5, -5, 6, -6])
 """Changes of a cell's size that are tried."""
 _PLACES = 300
@@ -270,7 +270,7 @@ def certificate(
     pattern: Pattern,
     *,
     cell_m: float | None = None,
-    most_cells: int | None = None,
+    max_cells: int | None = None,
     executor: Executor = SERIAL,
 ) -> Certificate:
     """Certify what pictures see of an area.
@@ -282,14 +282,14 @@ def certificate(
         pattern: the overlap requested.
         cell_m: of the grid; left out, about a twentieth of a footprint, less for a small area, and
             more where that would be over 16 million cells.
-        most_cells: of the grid where `cell_m` is left out, for a quick look. Where that makes the
+        max_cells: of the grid where `cell_m` is left out, for a quick look. Where that makes the
             cells larger, borders are traced at fewer points: to 0.2 % of a footprint's width.
         executor: where the parts of a large area are worked on.
 
     Raises:
         PlanError: `cell_m` is not positive, or would make too large a grid.
     """
-    grid = grid_over(area, _cell_m(area, rig, stations, pattern, cell_m, most_cells))
+    grid = grid_over(area, _cell_m(area, rig, stations, pattern, cell_m, max_cells))
     mask = inside(area, grid)
     if not mask.any():  # the area is a sliver between middles of cells
         raise PlanError(
@@ -297,7 +297,7 @@ def certificate(
         )
     order = np.argsort(stations.line, kind="stable")
     stations = stations.some(order)
-    coarse = most_cells is not None and grid.rows * grid.columns > _COARSE * most_cells
+    coarse = max_cells is not None and grid.rows * grid.columns > _COARSE * max_cells
     rays = border_rays_body(rig, _FEW_POINTS) if coarse else border_rays_body(rig)
     reach_m = reaches_m(rays, stations)
     blind = int(np.count_nonzero(np.isnan(reach_m)))
@@ -372,7 +372,7 @@ def _cell_m(
     stations: Stations,
     pattern: Pattern,
     asked_m: float | None,
-    most_cells: int | None,
+    max_cells: int | None,
 ) -> float:
     """The side of a cell.
 
@@ -380,31 +380,31 @@ def _cell_m(
         PlanError: the one requested is not positive or too small.
     """
     boxed_m2 = float(area.survey.oriented_envelope.area)
-    least_m = math.sqrt(boxed_m2 / _MOST_CELLS)
+    min_m = math.sqrt(boxed_m2 / _MAX_CELLS)
     if asked_m is not None:
-        if not asked_m >= least_m or math.isinf(asked_m):
+        if not asked_m >= min_m or math.isinf(asked_m):
             raise PlanError(
-                f"cells of {asked_m:g} m: choose {least_m:.3g} m or more for a grid of "
-                f"{_MOST_CELLS:.0e} cells at most"
+                f"cells of {asked_m:g} m: choose {min_m:.3g} m or more for a grid of "
+                f"{_MAX_CELLS:.0e} cells at most"
             )
         return asked_m
-    fine_m = math.sqrt(boxed_m2 / _LEAST_CELLS)
+    fine_m = math.sqrt(boxed_m2 / _MIN_CELLS)
     altitude_m = float(np.median(stations.altitude_m)) if len(stations) else 0.0
     if altitude_m > 0:
         camera = rig.cameras[rig.reference]
         fine_m = min(fine_m, min(footprint_size_m(camera, altitude_m)) / _CELLS_PER_FOOTPRINT)
-    if fine_m < least_m:
+    if fine_m < min_m:
         warn(
-            f"the certificate's grid has cells of {least_m:.3g} m instead of {fine_m:.3g} m, "
-            f"{_MOST_CELLS / 1e6:.0f} million of them: holes under {1.4 * least_m:.2g} m may be "
+            f"the certificate's grid has cells of {min_m:.3g} m instead of {fine_m:.3g} m, "
+            f"{_MAX_CELLS / 1e6:.0f} million of them: holes under {1.4 * min_m:.2g} m may be "
             "missed; certify parts of the area, or choose cell_m"
         )
-    if most_cells is not None:
-        least_m = max(least_m, math.sqrt(boxed_m2 / most_cells))
-    return _out_of_step(fine_m, (pattern.step_m, pattern.spacing_m), least_m)
+    if max_cells is not None:
+        min_m = max(min_m, math.sqrt(boxed_m2 / max_cells))
+    return _out_of_step(fine_m, (pattern.step_m, pattern.spacing_m), min_m)
 
 
-def _out_of_step(cell_m: float, periods_m: tuple[float, ...], least_m: float) -> float:
+def _out_of_step(cell_m: float, periods_m: tuple[float, ...], min_m: float) -> float:
     """A cell size near this one that is incommensurate with steps and line spacing.
 
     Where a step is a whole number of cells, all steps are looked at in the same few places, and
@@ -413,7 +413,7 @@ def _out_of_step(cell_m: float, periods_m: tuple[float, ...], least_m: float) ->
     "Random number generation and quasi-Monte Carlo methods", theorem 2.6).
     """
     sizes = cell_m * (1.0 + _SIZES)
-    sizes = np.unique(np.maximum(sizes, least_m)) if sizes.min() < least_m else sizes
+    sizes = np.unique(np.maximum(sizes, min_m)) if sizes.min() < min_m else sizes
     even = (np.arange(_PLACES) + 0.5) / _PLACES
     uneven = [
         sum(

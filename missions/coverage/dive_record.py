@@ -20,7 +20,7 @@ from alice_survey.core.frames import Array, rotation_from_attitude
 from alice_survey.core.manifest import read_manifest
 from alice_survey.core.trajectory import read_track
 from camera_calib.rig import Rig
-from missions.coverage.stations import MOST_ALTITUDES, Stations
+from missions.coverage.stations import MAX_ALTITUDES, Stations
 from missions.logs.navigation_csv import (
     POSITION,
     READINGS,
@@ -34,12 +34,12 @@ from missions.values.plan_file import Plan
 ALIKE_RAD = math.radians(45.0)
 """A vehicle that crabs or yaws by less than this still flies its line (inferred: half way to a line
 across)."""
-LEAST_RUN = 3
+MIN_RUN = 3
 """Pictures that make a straight run outside of the plan."""
 RUN_STEPS = 3.0
 """Pictures of a run are no more steps apart."""
 
-_MOST_TRIGGERS = 1_000_000
+_MAX_TRIGGERS = 1_000_000
 """More than a month of pictures every 3 s: times or intervals beyond are wrong."""
 _ELSEWHERE_M = 100.0
 """A log that stays farther from the area than this belongs to another place."""
@@ -114,9 +114,9 @@ def read_dive_record(
         when = read_triggers(triggers, nav)
     else:
         span_s = float(nav.time_s[-1] - nav.time_s[0])
-        if not span_s <= _MOST_TRIGGERS * plan.interval_s:
+        if not span_s <= _MAX_TRIGGERS * plan.interval_s:
             raise NavigationError(
-                f"{log}: spans {span_s:.3g} s, over {_MOST_TRIGGERS} pictures every "
+                f"{log}: spans {span_s:.3g} s, over {_MAX_TRIGGERS} pictures every "
                 f"{plan.interval_s:.3g} s: check its times, or give the triggers"
             )
         times = plan_triggers(nav.time_s[0], nav.time_s[-1], plan.interval_s)
@@ -208,7 +208,7 @@ def read_triggers(path: Path, nav: NavigationLog) -> Triggers:
 
 def _line_number(cell: str) -> int:
     number = int(cell)
-    if abs(number) > _MOST_TRIGGERS:
+    if abs(number) > _MAX_TRIGGERS:
         raise ValueError(f"line is {cell:.60}")
     return number
 
@@ -308,7 +308,7 @@ def _logged(path: Path, nav: NavigationLog, triggers: Triggers, plan: Plan, rig:
     if triggers.line is None:
         stations = replace(stations, line=assign_lines(stations, plan))
     on_way = high & _outside_lines(time_s, stations)
-    most_m = MOST_ALTITUDES * plan.altitude_m
+    most_m = MAX_ALTITUDES * plan.altitude_m
     _count(left_out, "at or below the sea floor, by their altitude", below)
     _count(left_out, f"higher than {most_m:.2g} m above the sea floor", high & ~on_way)
     record = DiveRecord(
@@ -372,7 +372,7 @@ def altitude_of(at: Mapping[str, Array], glass_depth_m: Array, plan: Plan) -> tu
 
 def too_high(altitude_m: Array, plan: Plan) -> NDArray[np.bool_]:
     """(S,) whether pictures from altitudes are too coarse to count."""
-    high: NDArray[np.bool_] = altitude_m > MOST_ALTITUDES * plan.altitude_m
+    high: NDArray[np.bool_] = altitude_m > MAX_ALTITUDES * plan.altitude_m
     return high
 
 
@@ -448,7 +448,7 @@ def assign_lines(stations: Stations, plan: Plan) -> NDArray[np.intp]:
     """
     line = planned_lines(stations, plan)
     runs = _runs(line, stations, RUN_STEPS * plan.station_spacing_m)
-    long = [run for run in runs if len(run) >= LEAST_RUN]
+    long = [run for run in runs if len(run) >= MIN_RUN]
     for number, run in enumerate(long, len(plan.lines)):
         line[run] = number
     return line

@@ -38,11 +38,11 @@ _AREA, _HOLE, _TRACK = "#17202a", "#c0392b", "#17202a"
 _NONE = "#f5b7b1"
 _SEEN = LinearSegmentedColormap.from_list("seen", ["#d6eaf8", "#5dade2", "#1f618d", "#0b2239"])
 _RISK = LinearSegmentedColormap.from_list("risk", ["#e8f8f5", "#f7dc6f", "#e67e22", "#78281f"])
-_LONGEST_PX = 1400
+_MAX_PX = 1400
 _NUMBERED = 12
-_WIDTH_IN, _LEAST_WIDTH_IN, _AROUND_IN = 9.0, 6.6, (1.5, 1.7)
+_WIDTH_IN, _MIN_WIDTH_IN, _AROUND_IN = 9.0, 6.6, (1.5, 1.7)
 """Width of a sheet and its least, and what labels, bar, title and legend take of its sides."""
-_LEAST_MAP_IN, _MOST_MAP_IN = 2.2, 8.2
+_MIN_MAP_IN, _MAX_MAP_IN = 2.2, 8.2
 """Height of a map."""
 _MARGIN = 0.06
 """Margin around the area, as a share of its longer side."""
@@ -143,8 +143,8 @@ def map_sheet(bounds_ne: tuple[float, float, float, float]) -> tuple[Sheet, Axes
     """
     south, west, north, east = bounds_ne
     tall = (north - south) / (east - west)
-    map_in = min(max((_WIDTH_IN - _AROUND_IN[0]) * tall, _LEAST_MAP_IN), _MOST_MAP_IN)
-    wide_in = min(max(map_in / tall + _AROUND_IN[0], _LEAST_WIDTH_IN), _WIDTH_IN)
+    map_in = min(max((_WIDTH_IN - _AROUND_IN[0]) * tall, _MIN_MAP_IN), _MAX_MAP_IN)
+    wide_in = min(max(map_in / tall + _AROUND_IN[0], _MIN_WIDTH_IN), _WIDTH_IN)
     figure = new_figure(map_in + _AROUND_IN[1], wide_in)
     axes = figure.subplots()
     axes.set(xlim=(west, east), ylim=(south, north), aspect="equal", autoscale_on=False)
@@ -165,9 +165,9 @@ def finish_map(figure: Sheet, axes: Axes, datum: Datum, title: str, text: str) -
 
 def draw_counts(axes: Axes, certificate: Certificate, opacity: float = 1.0) -> None:
     """How many pictures see each place, in steps that the eye can distinguish."""
-    most = int(np.percentile(certificate.pictures[certificate.inside], 99.5))
-    width = math.ceil(max(most, 1) / _CLASSES)
-    steps = np.arange(1, most + 2 * width, width)
+    maximum = int(np.percentile(certificate.pictures[certificate.inside], 99.5))
+    width = math.ceil(max(maximum, 1) / _CLASSES)
+    steps = np.arange(1, maximum + 2 * width, width)
     colours = [_NONE, *(_SEEN(i / max(len(steps) - 2, 1)) for i in range(len(steps) - 1))]
     colour_map = ListedColormap(colours).with_extremes(bad=(0, 0, 0, 0), over=colours[-1])
     image, extent = _north_up(certificate, certificate.pictures)
@@ -213,7 +213,7 @@ def _resampled(
 def _pixels(area: Area, cell_m: float) -> tuple[Array, tuple[float, float, float, float]]:
     """Middles of pixels, (rows, columns, 2), from the south-west corner of an area."""
     south, west, north, east = area.survey.bounds
-    pixel_m = max(cell_m / 2, max(north - south, east - west) / _LONGEST_PX)
+    pixel_m = max(cell_m / 2, max(north - south, east - west) / _MAX_PX)
     rows, columns = (
         max(1, math.ceil((high - low) / pixel_m)) for low, high in ((south, north), (west, east))
     )

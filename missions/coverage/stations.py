@@ -18,7 +18,7 @@ from missions.values.plan_file import Plan
 if TYPE_CHECKING:
     from missions.values.flight import Flight
 
-MOST_ALTITUDES = 1.5
+MAX_ALTITUDES = 1.5
 """Pictures from more planned altitudes than this do not count: their pixels on the sea floor are
 1.5 times as large, and the light is weaker by more than half (inferred: 1.5^-2 = 0.44, before any
 attenuation)."""
@@ -172,12 +172,15 @@ def sure_pattern(rig: Rig, altitude_m: float, spacing_m: float, step_m: float) -
     """
     whole = pattern(common_swath(rig, altitude_m, step_m), spacing_m, step_m)
     best = whole
-    most = 0
+    maximum = 0
     for pictures in range(whole.pictures, 0, -1):
         swath = common_swath(rig, altitude_m, pictures * step_m)
         fewer = whole.half_along_m if pictures == whole.pictures else pictures * step_m / 2
         tried = replace(whole, half_across_m=swath.half_across_m, half_along_m=fewer)
         held = tried.passes * spacing_m <= 2 * swath.half_across_m + 1e-9
-        if held and (tried.passes * pictures, tried.passes) > (most, best.passes if most else 0):
-            best, most = tried, tried.passes * pictures
+        if held and (tried.passes * pictures, tried.passes) > (
+            maximum,
+            best.passes if maximum else 0,
+        ):
+            best, maximum = tried, tried.passes * pictures
     return best

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from alice_survey.core.errors import warn
 from alice_survey.kit.words import share
-from alice_survey.sim.vehicle.pilot.ardusub import LEAST_RADIUS_M, LEAST_SPEED_MPS
+from alice_survey.sim.vehicle.pilot.ardusub import MIN_RADIUS_M, MIN_SPEED_MPS
 from alice_survey.sim.vehicle.pilot.cola2 import Cola2Settings
 from camera_calib.rig import Rig
 from missions.coverage.certificate import certificate
@@ -129,17 +129,17 @@ def _cola2(export: Export, *, chosen: bool) -> list[str]:
 
 def _ardusub(export: Export) -> list[str]:
     plan, follower = export.plan, export.options.follower
-    radius_cm = math.ceil(100.0 * max(export.tolerance_m, LEAST_RADIUS_M))
+    radius_cm = math.ceil(100.0 * max(export.tolerance_m, MIN_RADIUS_M))
     speed_cms = 100.0 * plan.speed_mps
     lines = [
         f"ArduSub 4.5 parameters: WPNAV_SPEED {speed_cms:.0f} cm/s, WPNAV_RADIUS {radius_cm} cm "
         "(files' radii are ignored), WP_YAW_BEHAVIOR 4 (the default: along the track) or 1, "
         "WPNAV_RFND_USE 1. It comes to rest at every way-point."
     ]
-    if plan.speed_mps < LEAST_SPEED_MPS:
+    if plan.speed_mps < MIN_SPEED_MPS:
         lines.append(
-            f"ArduSub takes no speed below {LEAST_SPEED_MPS:g} m/s: it flies faster than the "
-            f"plan's {plan.speed_mps:g} m/s, with more blur: plan at {LEAST_SPEED_MPS:g} m/s."
+            f"ArduSub takes no speed below {MIN_SPEED_MPS:g} m/s: it flies faster than the "
+            f"plan's {plan.speed_mps:g} m/s, with more blur: plan at {MIN_SPEED_MPS:g} m/s."
         )
     if follower is not None and not follower.sways:
         lines.append(

@@ -15,7 +15,7 @@ from alice_survey.core.config import SeaConfig, VehicleConfig
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.pilot.cola2 import circling_m, steady_drift, turn_in_m, yaw_rad_s
 from alice_survey.sim.vehicle.pilot.gains import FASTEST, SWAY, Gains, gains_for
-from alice_survey.sim.vehicle.pilot.settings import los_loop, shortest_look_ahead_m
+from alice_survey.sim.vehicle.pilot.settings import los_loop, min_look_ahead_m
 from missions.coverage.stations import Stations, stations_of_plan
 from missions.route.energy import craft_of
 from missions.values.line import Line
@@ -23,7 +23,7 @@ from missions.values.plan_file import Plan
 
 _ROUNDS = 40
 """Of an iteration that halves its error in each."""
-_LEAST_SLIP = 0.05
+_MIN_SLIP = 0.05
 """Share of the speed that a hull slips and yaws at in calm water, at the least (inferred)."""
 
 
@@ -103,7 +103,7 @@ def cola2_delta_m(gains: Gains, speed_mps: float) -> float:
 
     COLA2 steers the vehicle's reference point, so that its loop has no lever.
     """
-    return math.ceil(10.0 * shortest_look_ahead_m(gains, speed_mps, 0.0) - 1e-6) / 10.0
+    return math.ceil(10.0 * min_look_ahead_m(gains, speed_mps, 0.0) - 1e-6) / 10.0
 
 
 def path_loop(
@@ -130,7 +130,7 @@ def path_loop(
 
     if not math.isfinite(delta_m):
         return math.nan, complex(math.nan, math.nan)
-    body, sigma = gains.body, np.full(2, _LEAST_SLIP * speed_mps)
+    body, sigma = gains.body, np.full(2, _MIN_SLIP * speed_mps)
     noise = np.zeros((6, 6))
     noise[5, 5] = 2.0 * gust_n**2 / correlation_s
     loop = np.zeros((6, 6))
@@ -144,7 +144,7 @@ def path_loop(
         loop[:5, :5] = los_loop(damped, speed_mps, 0.0, delta_m)
         variance = np.asarray(solve_continuous_lyapunov(loop, -noise), np.float64)
         now = np.sqrt(np.maximum(np.diag(variance)[2:4], 0.0))
-        sigma = np.maximum(0.5 * (sigma + now), _LEAST_SLIP * speed_mps)
+        sigma = np.maximum(0.5 * (sigma + now), _MIN_SLIP * speed_mps)
     modes = np.linalg.eigvals(loop[:5, :5])
     slowest = complex(modes[np.argmax(modes.real)])
     if slowest.real >= 0.0:

@@ -10,7 +10,7 @@ from missions.exports.follower import Follower, follower_of
 from missions.values.footprint import common_swath
 from missions.values.plan_file import Plan
 
-LEAST_TOLERANCE_M = 0.12
+MIN_TOLERANCE_M = 0.12
 """The cross-track error that the paper's vehicle holds with its improved controller: a vehicle set
 to pass a place more closely turns back for it."""
 
@@ -62,4 +62,4 @@ def line_tolerance_m(plan: Plan, rig: Rig) -> float:
     stereo = common_swath(rig, plan.altitude_m, plan.station_spacing_m)
     passes = max(1, int(2 * stereo.half_across_m / plan.line_spacing_m + 1e-9))
     spare_m = (2 * stereo.half_across_m - passes * plan.line_spacing_m) / 2
-    return max(LEAST_TOLERANCE_M, min(plan.station_spacing_m / 2, spare_m))
+    return max(MIN_TOLERANCE_M, min(plan.station_spacing_m / 2, spare_m))

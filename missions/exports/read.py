@@ -8,8 +8,8 @@ from alice_survey.core.errors import PlanError, why
 from missions.exports.registry import format_named, format_names
 from missions.values.mission import Mission, MissionStep
 
-_MOST_BYTES = 64_000_000
-_MOST_LATITUDE_DEG, _MOST_LONGITUDE_DEG = 90.0, 180.0
+_MAX_BYTES = 64_000_000
+_MAX_LATITUDE_DEG, _MAX_LONGITUDE_DEG = 90.0, 180.0
 
 
 def read_mission(path: Path) -> Mission:
@@ -20,11 +20,11 @@ def read_mission(path: Path) -> Mission:
     """
     try:
         with path.open("rb") as file:
-            raw = file.read(_MOST_BYTES + 1)
+            raw = file.read(_MAX_BYTES + 1)
     except OSError as error:
         raise PlanError(f"{path}: cannot be read: {why(error)}") from None
-    if len(raw) > _MOST_BYTES:
-        raise PlanError(f"{path}: is larger than {_MOST_BYTES // 1_000_000} MB: no mission is")
+    if len(raw) > _MAX_BYTES:
+        raise PlanError(f"{path}: is larger than {_MAX_BYTES // 1_000_000} MB: no mission is")
     readable = []
     text = raw.decode("utf-8", errors="replace")
     for name in format_names():
@@ -50,7 +50,7 @@ def _check(mission: Mission) -> None:
         places = [(step.latitude_deg, step.longitude_deg)]
         places += [step.start_deg] if step.start_deg else []
         for lat, lon in places:
-            if abs(lat) > _MOST_LATITUDE_DEG or abs(lon) > _MOST_LONGITUDE_DEG:
+            if abs(lat) > _MAX_LATITUDE_DEG or abs(lon) > _MAX_LONGITUDE_DEG:
                 raise ValueError(f"step {number} is at latitude {lat:g}, longitude {lon:g}")
         if step.speed_mps <= 0.0:
             raise ValueError(f"step {number} has the speed {step.speed_mps:g} m/s")

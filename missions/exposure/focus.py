@@ -24,10 +24,10 @@ from camera_calib.water import WAVELENGTH_NM
 from missions.exposure.settings_table import Setting, settings_of
 from missions.exposure.ways_out import (
     HIGHEST_ALTITUDE_M,
-    MOST_BLUR_PX,
+    MAX_BLUR_PX,
     Way,
     conflict,
-    least_that_fits,
+    min_that_fits,
 )
 
 _GREEN_M = float(WAVELENGTH_NM[1]) * 1e-9
@@ -172,9 +172,7 @@ def _cannot_focus(
         return needed_f_number(camera, limits, changed) <= 0.99 * best
 
     def ways() -> Iterator[Way]:
-        altitude_m = least_that_fits(
-            partial(fits, "altitude_m"), plan.altitude_m, HIGHEST_ALTITUDE_M
-        )
+        altitude_m = min_that_fits(partial(fits, "altitude_m"), plan.altitude_m, HIGHEST_ALTITUDE_M)
         if altitude_m is not None:
             shown = math.ceil(100 * altitude_m) / 100
             yield Way(
@@ -183,7 +181,7 @@ def _cannot_focus(
                 cost=shown / plan.altitude_m - 1.0,
                 settings={"plan.altitude_m": shown},
             )
-        sharp_px = least_that_fits(partial(fits, "sharp_px"), plan.sharp_px, MOST_BLUR_PX)
+        sharp_px = min_that_fits(partial(fits, "sharp_px"), plan.sharp_px, MAX_BLUR_PX)
         if sharp_px is not None:
             shown = math.ceil(10 * sharp_px) / 10
             changed = plan.model_copy(update={"sharp_px": shown})
@@ -195,7 +193,7 @@ def _cannot_focus(
                 cost=shown / plan.sharp_px - 1.0,
                 settings={"plan.sharp_px": shown, "camera.f_number": f_number},
             )
-        lower_m = least_that_fits(
+        lower_m = min_that_fits(
             lambda lower_m: fits("relief_m", plan.relief_m - lower_m), 0.0, plan.relief_m
         )
         if lower_m is not None:

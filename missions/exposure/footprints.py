@@ -17,10 +17,10 @@ from camera_calib.rig import Rig
 from missions.exposure.settings_table import Setting, settings_of
 from missions.exposure.ways_out import (
     HIGHEST_ALTITUDE_M,
-    LEAST_ALTITUDE_M,
+    MIN_ALTITUDE_M,
     Way,
     conflict,
-    least_that_fits,
+    min_that_fits,
 )
 from missions.values.footprint import (
     camera_swath,
@@ -123,17 +123,17 @@ def top_altitude_m(plan: PlanConfig) -> float:
     """Altitude over the top of the relief.
 
     Raises:
-        PlanError: the relief comes nearer to the glass than `LEAST_ALTITUDE_M`.
+        PlanError: the relief comes nearer to the glass than `MIN_ALTITUDE_M`.
     """
     top_m = plan.altitude_m - plan.relief_m
-    if top_m >= LEAST_ALTITUDE_M - 1e-9:
+    if top_m >= MIN_ALTITUDE_M - 1e-9:
         return top_m
     safe_m = math.ceil(10 * (plan.relief_m + plan.least_clearance_m)) / 10
-    flat_m = math.floor(100 * (plan.altitude_m - LEAST_ALTITUDE_M) + 1e-9) / 100
+    flat_m = math.floor(100 * (plan.altitude_m - MIN_ALTITUDE_M) + 1e-9) / 100
     leaves = "runs aground" if top_m <= 0 else f"leaves {top_m:.2f} m over its top"
     raise conflict(
         f"{plan.altitude_m:g} m altitude over relief of +-{plan.relief_m:g} m {leaves}; "
-        f"{LEAST_ALTITUDE_M:g} m is the least",
+        f"{MIN_ALTITUDE_M:g} m is the least",
         ("altitude_m", "relief_m"),
         [
             Way(
@@ -245,7 +245,7 @@ def _spacing(
 def _no_common_view(rig: Rig, plan: PlanConfig, altitude_m: float, step_m: float) -> Exception:
     """The cameras' views do not meet on both sides of a line."""
     above_m = plan.altitude_m - altitude_m
-    needed_m = least_that_fits(
+    needed_m = min_that_fits(
         lambda higher_m: (
             common_swath(rig, higher_m, step_m * higher_m / altitude_m).half_across_m > 0
         ),

@@ -35,7 +35,7 @@ _ACCEPTABLE_SNR = 10.0
 """Signal to noise of an acceptable picture (ISO 12232, noise-based speed)."""
 _WHITE, _BLACK = 0.99, 0.002
 """Linear shares of full scale that count as clipped and as black."""
-_MOST_CLIPPED = 0.5
+_MAX_CLIPPED = 0.5
 _LAPLACE = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])
 _LAPLACE_GAIN = 6.0
 """Root of the sum of its squares: white noise grows so much (Immerkaer 1996)."""
@@ -267,7 +267,7 @@ def _refuse_useless(
             "brightest zone): check that the lens is uncovered and the strobe fires within the "
             "exposure (triggers.csv), then take them again with 12 dB more gain"
         )
-    if clipped > _MOST_CLIPPED or median >= _WHITE:
+    if clipped > _MAX_CLIPPED or median >= _WHITE:
         raise ImageError(
             f"{len(levels)} control pictures are white ({clipped:.0%} of the pixels are clipped): "
             "how much too bright is not known: lower the gain by 12 dB, or the exposure to a "

@@ -13,8 +13,9 @@ cos^4`.
 Assumed: no daylight; each channel takes 100 nm of the LEDs' spectrum (`missions.exposure.lamp`),
 with the water of its middle, and has the whole quantum efficiency; sand as in the simulator. The
 simulator (`alice_survey.sim.seafloor`) computes by ray, with a soft edge of the cone, an even
-spectrum and all scattered light lost but for the veil: its pictures have the light of `c` both ways, and
-lack the blur of what is scattered on the way from the floor. Tests compare the two on these terms.
+spectrum and all scattered light lost but for the veil: its pictures have the light of `c` both
+ways, and lack the blur of what is scattered on the way from the floor. Tests compare
+the two on these terms.
 """
 
 import math
@@ -39,7 +40,7 @@ LENS_TRANSMITTANCE = 0.9
 MIDDLE_GREY = 0.2
 """Share of full scale, linear, that the median is brought to; as in the simulator."""
 
-LEAST_SNR = 5.0
+MIN_SNR = 5.0
 """Below it detail of a pixel is lost in noise (Rose 1948, J. Opt. Soc. Am. 38, 196)."""
 
 _PLANCK_J_S, _LIGHT_M_S = 6.62607015e-34, 299_792_458.0
@@ -76,7 +77,7 @@ class LightBudget:
     snr_median: float
     snr_corner: tuple[float, float, float]
     needed_light: float
-    """Times the light with which the median pixel reaches `LEAST_SNR`; infinite in the dark."""
+    """Times the light with which the median pixel reaches `MIN_SNR`; infinite in the dark."""
     full_share: float
     """Brightest over full well."""
     gain_db: float
@@ -234,9 +235,9 @@ def signal_to_noise(electrons: Array, read_noise_e: float, sharp: Array | float)
 
 def too_dark(budget: LightBudget) -> str:
     """What to say where the median pixel is lost in noise; empty where it does not."""
-    if budget.snr_median >= LEAST_SNR:
+    if budget.snr_median >= MIN_SNR:
         return ""
-    return f"too dark, signal to noise {budget.snr_median:.1f} of {LEAST_SNR:g}"
+    return f"too dark, signal to noise {budget.snr_median:.1f} of {MIN_SNR:g}"
 
 
 def light_for_snr_e(snr: float, read_noise_e: float, sharp_share: float) -> float:
@@ -248,7 +249,7 @@ def light_for_snr_e(snr: float, read_noise_e: float, sharp_share: float) -> floa
 def _needed_light(median_e: float, sharp_share: float, read_noise_e: float) -> float:
     if not min(median_e, sharp_share) > 0.0:
         return math.inf
-    return light_for_snr_e(LEAST_SNR, read_noise_e, sharp_share) / median_e
+    return light_for_snr_e(MIN_SNR, read_noise_e, sharp_share) / median_e
 
 
 def _triple(values: Array) -> tuple[float, float, float]:

@@ -16,7 +16,7 @@ from missions.exposure.light import too_dark
 from missions.exposure.settings import ImagingSetup, imaging_settings
 from missions.exposure.ways_out import (
     HIGHEST_ALTITUDE_M,
-    MOST_BLUR_PX,
+    MAX_BLUR_PX,
     Way,
     conflict,
     less_overlap,
@@ -70,7 +70,7 @@ class RateOption:
     why: str
 
 
-def least_altitude_m(plan: PlanConfig) -> float:
+def min_altitude_m(plan: PlanConfig) -> float:
     """Lowest altitude that keeps `least_clearance_m` over the top of the relief."""
     return plan.relief_m + plan.least_clearance_m
 
@@ -105,11 +105,11 @@ def _lens_option(
     own = rig.cameras[rig.reference]
     altitude = math.floor(altitude_for_pixel_m(own, resolution_mm * 1e-3) * 1000) / 1000
     option = partial(LensOption, lens_mm=lens_mm, altitude_m=altitude)
-    least_m = least_altitude_m(setup.plan)
-    if not least_m <= altitude < highest_m:
+    min_m = min_altitude_m(setup.plan)
+    if not min_m <= altitude < highest_m:
         why = (
-            f"{altitude:.2f} m is under the {least_m:.2f} m of relief_m and least_clearance_m"
-            if altitude < least_m
+            f"{altitude:.2f} m is under the {min_m:.2f} m of relief_m and least_clearance_m"
+            if altitude < min_m
             else f"{altitude:.2f} m is beyond the {highest_m:g} m allowed"
         )
         return option(pixel_mm=resolution_mm, why=why)
@@ -157,13 +157,13 @@ def _no_lens(
 ) -> PlanError:
     """No lens gives the resolution within the limits: what each can, and what it would take."""
     ways = list(_lens_ways(setup, deepest, resolution_mm, options))
-    least = least_altitude_m(setup.plan)
+    minimum = min_altitude_m(setup.plan)
     lowest, highest = (f(option.altitude_m for option in options) for f in (min, max))
     reasons = "; ".join(f"{o.lens_mm:g} mm: {o.why}" for o in options)
     fault = f"no lens gives {resolution_mm:g} mm a pixel ({reasons})"
     if not ways:
         return PlanError(f"{fault}, and none fits at any altitude: change relief_m or the light")
-    if highest < least:
+    if highest < minimum:
         limit = "relief_m + least_clearance_m"
     elif lowest > deepest:
         limit = "the highest altitude"
@@ -178,7 +178,7 @@ def _lens_ways(
     setup: ImagingSetup, deepest: float, resolution_mm: float, options: list[LensOption]
 ) -> Iterator[Way]:
     """Other resolutions, blurs, lenses and clearances with which a lens would do."""
-    plan, least = setup.plan, least_altitude_m(setup.plan)
+    plan, minimum = setup.plan, min_altitude_m(setup.plan)
     for option in options:
         nearest = _nearest_that_fits(setup, deepest, option)
         if nearest is not None:
@@ -200,7 +200,7 @@ def _lens_ways(
             continue
         blur_px = math.ceil(100 * plan.allowed_blur_px * times) / 100
         blurred = setup.with_plan(allowed_blur_px=blur_px)
-        if blur_px > MOST_BLUR_PX or not fits(blurred, option.lens_mm):
+        if blur_px > MAX_BLUR_PX or not fits(blurred, option.lens_mm):
             continue
         yield Way(
             change=f"allowed_blur_px {blur_px:g} with the {option.lens_mm:g} mm lens from "
@@ -211,12 +211,12 @@ def _lens_ways(
         )
     lowest, highest = (f(option.altitude_m for option in options) for f in (min, max))
     # At no distance in front of the port there is no lens to scale.
-    if 0.0 < highest < least:
+    if 0.0 < highest < minimum:
         lens = max(option.lens_mm for option in options)
-        longer = math.ceil(10 * lens * least / highest) / 10
+        longer = math.ceil(10 * lens * minimum / highest) / 10
         if fits(setup, longer):
             yield Way(
-                change=f"a lens of about {longer:g} mm, from {least:.2f} m",
+                change=f"a lens of about {longer:g} mm, from {minimum:.2f} m",
                 price=f"a footprint and its lines are {longer / lens:.2f} times smaller than "
                 f"{lens:g} mm gives there",
                 cost=longer / lens - 1.0,
@@ -250,7 +250,7 @@ def _nearest_that_fits(
 ) -> LensOption | None:
     """The altitude nearest to an option's that its lens can be used at, to about a fiftieth."""
     own = setup.with_camera(focal_mm=option.lens_mm).rig.cameras["left"]
-    tried = np.geomspace(least_altitude_m(setup.plan), highest_m, 50)
+    tried = np.geomspace(min_altitude_m(setup.plan), highest_m, 50)
     tried = tried[np.argsort(np.abs(np.log(tried / max(option.altitude_m, 1e-3))))]
     for altitude in tried:
         pixel_mm = math.ceil(pixel_on_floor_m(own, float(altitude)) * 1e6) / 1e3
@@ -275,24 +275,24 @@ def speeds_for_rate(
 
 def _too_often(setup: ImagingSetup, rate_hz: float) -> PlanError:
     """The rate is beyond cameras or trigger: slower, or as fast with less overlap or higher."""
-    plan, most_hz = setup.plan, 1.0 / setup.camera.shortest_interval_s
-    share = most_hz / rate_hz
+    plan, max_hz = setup.plan, 1.0 / setup.camera.shortest_interval_s
+    share = max_hz / rate_hz
     own = setup.rig.cameras["left"]
     pixel_m = pixel_on_floor_m(own, plan.altitude_m)
     higher_m = math.ceil(100 * altitude_for_pixel_m(own, pixel_m / share)) / 100
     ways = [
         Way(
-            change=f"a rate of {most_hz:g} Hz",
+            change=f"a rate of {max_hz:g} Hz",
             price=f"{share:.0%} of the speed that {rate_hz:g} Hz would allow",
             cost=1.0 / share - 1.0,
             settings={},
         ),
         *less_overlap(
-            plan, 1.0 - (1.0 - plan.forward_overlap) / share, f"{most_hz:g} Hz and ",
+            plan, 1.0 - (1.0 - plan.forward_overlap) / share, f"{max_hz:g} Hz and ",
             "the same speed, ",
         ),
         Way(
-            change=f"{most_hz:g} Hz and altitude_m {higher_m:g} instead of {plan.altitude_m:g}",
+            change=f"{max_hz:g} Hz and altitude_m {higher_m:g} instead of {plan.altitude_m:g}",
             price=f"the same speed, a pixel grows {1 / share:.2f} times",
             cost=(1.0 / share) ** 2 - 1.0,
             settings={"plan.altitude_m": higher_m},
@@ -304,11 +304,10 @@ def _too_often(setup: ImagingSetup, rate_hz: float) -> PlanError:
         changes = {name.removeprefix("plan."): value for name, value in way.settings.items()}
         if changes.get("altitude_m", 0.0) > HIGHEST_ALTITUDE_M:
             return False
-        return math.isfinite(_rate_option(setup.with_plan(**changes), most_hz, lens).exposure_ms)
+        return math.isfinite(_rate_option(setup.with_plan(**changes), max_hz, lens).exposure_ms)
 
     return conflict(
-        f"{rate_hz:g} pictures a second are more than the {most_hz:g} that cameras and trigger "
-        "take",
+        f"{rate_hz:g} pictures a second are more than the {max_hz:g} that cameras and trigger take",
         ("the rate requested", "camera.shortest_interval_s"),
         filter(goes, ways),
     )

@@ -107,20 +107,20 @@ def _too_long(
     imaging: ImagingConfig, plan: PlanConfig, exposure_s: float, interval_s: float, limit: float
 ) -> PlanError:
     """The pulse is too long for the interval."""
-    pulse_s, longest_s = exposure_s + 2 * plan.strobe_lead_s, limit * interval_s
-    slower = pulse_s / longest_s
+    pulse_s, max_s = exposure_s + 2 * plan.strobe_lead_s, limit * interval_s
+    slower = pulse_s / max_s
 
     def ways() -> Iterator[Way]:
-        if longest_s > exposure_s:
-            lead_s = math.floor((longest_s - exposure_s) / 2 * 1e5) / 1e5
+        if max_s > exposure_s:
+            lead_s = math.floor((max_s - exposure_s) / 2 * 1e5) / 1e5
             yield Way(
                 change=f"strobe_lead_s {lead_s:g} instead of {plan.strobe_lead_s:g}",
                 price="the strobe has less time to reach its brightness",
                 cost=1.0 - lead_s / plan.strobe_lead_s,
                 settings={"plan.strobe_lead_s": lead_s},
             )
-        if longest_s > 2 * plan.strobe_lead_s:
-            share = (longest_s - 2 * plan.strobe_lead_s) / exposure_s
+        if max_s > 2 * plan.strobe_lead_s:
+            share = (max_s - 2 * plan.strobe_lead_s) / exposure_s
             blur_px = math.floor(100 * plan.allowed_blur_px * share) / 100
             yield Way(
                 change=f"allowed_blur_px {blur_px:g} instead of {plan.allowed_blur_px:g}",

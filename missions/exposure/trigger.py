@@ -24,11 +24,11 @@ from camera_calib.rig import Rig
 from missions.exposure.settings_table import Setting, settings_of
 from missions.exposure.ways_out import (
     HIGHEST_ALTITUDE_M,
-    LEAST_ALTITUDE_M,
+    MIN_ALTITUDE_M,
     Way,
     conflict,
-    least_that_fits,
     less_overlap,
+    min_that_fits,
 )
 from missions.values.footprint import (
     footprint_size_m,
@@ -79,11 +79,11 @@ def floor_to(value: float, step: float) -> float:
 
 def too_fast(camera: Camera, limits: CameraConfig, plan: PlanConfig, along_m: float) -> PlanError:
     """The camera cannot take pictures as fast as overlap, speed and altitude need."""
-    shortest_s = limits.shortest_interval_s
+    min_s = limits.shortest_interval_s
     needed_s = step_for_overlap(along_m, plan.forward_overlap) / plan.speed_mps
 
     def ways() -> Iterator[Way]:
-        speed = floor_to(step_for_overlap(along_m, plan.forward_overlap) / shortest_s, 1e-3)
+        speed = floor_to(step_for_overlap(along_m, plan.forward_overlap) / min_s, 1e-3)
         if speed > 0:
             yield Way(
                 change=f"speed_mps {speed:g} instead of {plan.speed_mps:g}",
@@ -91,14 +91,14 @@ def too_fast(camera: Camera, limits: CameraConfig, plan: PlanConfig, along_m: fl
                 cost=plan.speed_mps / speed - 1.0,
                 settings={"plan.speed_mps": speed},
             )
-        yield from less_overlap(plan, 1.0 - plan.speed_mps * shortest_s / along_m)
-        longer_m = shortest_s * plan.speed_mps / (1.0 - plan.forward_overlap)
-        least_m = least_that_fits(
+        yield from less_overlap(plan, 1.0 - plan.speed_mps * min_s / along_m)
+        longer_m = min_s * plan.speed_mps / (1.0 - plan.forward_overlap)
+        min_m = min_that_fits(
             lambda altitude_m: footprint_size_m(camera, altitude_m)[1] >= longer_m,
-            LEAST_ALTITUDE_M, HIGHEST_ALTITUDE_M,
+            MIN_ALTITUDE_M, HIGHEST_ALTITUDE_M,
         )  # fmt: skip
-        if least_m is not None:
-            altitude_m = math.ceil(least_m * 100) / 100
+        if min_m is not None:
+            altitude_m = math.ceil(min_m * 100) / 100
             yield Way(
                 change=f"altitude_m {altitude_m:g} instead of {plan.altitude_m:g}",
                 price=f"a pixel grows {altitude_m / plan.altitude_m:.2f} times and light falls",
@@ -109,7 +109,7 @@ def too_fast(camera: Camera, limits: CameraConfig, plan: PlanConfig, along_m: fl
     return conflict(
         f"{plan.forward_overlap:.0%} forward overlap at {plan.speed_mps:g} m/s and "
         f"{plan.altitude_m:g} m altitude needs {1 / needed_s:.3g} pictures a second (one every "
-        f"{needed_s:.3f} s), the camera takes {1 / shortest_s:.3g} (every {shortest_s:g} s)",
+        f"{needed_s:.3f} s), the camera takes {1 / min_s:.3g} (every {min_s:g} s)",
         ("forward_overlap x speed_mps / footprint", "camera.shortest_interval_s"),
         ways(),
     )

@@ -14,9 +14,9 @@ from typing import Any
 from alice_survey.core.config import PlanConfig
 from alice_survey.core.errors import AliceError, PlanError
 
-LEAST_ALTITUDE_M, HIGHEST_ALTITUDE_M = 0.3, 10.0
+MIN_ALTITUDE_M, HIGHEST_ALTITUDE_M = 0.3, 10.0
 """Altitudes of the glass over any ground that `plan.altitude_m` allows."""
-MOST_BLUR_PX = 20.0
+MAX_BLUR_PX = 20.0
 """That `plan.allowed_blur_px` and `plan.sharp_px` allow."""
 _SHOWN = 3
 
@@ -136,7 +136,7 @@ def less_overlap(plan: PlanConfig, reached: float, also: str = "", kept: str = "
     )
 
 
-def least_that_fits(fits: Callable[[float], bool], low: float, high: float) -> float | None:
+def min_that_fits(fits: Callable[[float], bool], low: float, high: float) -> float | None:
     """Least value that fits, where all above it do; None where the highest does not."""
     if not fits(high):
         return None

@@ -33,7 +33,7 @@ from missions.fly.flight_records import true_velocity
 from missions.fly.simulation import (
     FlightSettings,
     flight_of,
-    longest_mission_s,
+    max_mission_s,
     mission_setup,
     with_values,
 )
@@ -307,12 +307,12 @@ def fly_variant(
         ),
         camera=with_values(settings.camera, position_body_m=(0.0, 0.0, 0.0)),
     )  # fmt: skip
-    longest_s = longest_mission_s(plan)
+    max_s = max_mission_s(plan)
     water = np.random.default_rng([seed, _SEA])
     floor = level_floor(plan.seafloor_depth_m)
-    setup = varied(mission_setup(plan, settings, floor, longest_s, water), variant)
+    setup = varied(mission_setup(plan, settings, floor, max_s, water), variant)
     chance = np.random.default_rng([seed, _CHANCE])
-    flown = simulate(setup, chance, longest_s=longest_s, label="", sea_rng=water)
+    flown = simulate(setup, chance, max_s=max_s, label="", sea_rng=water)
     return setup, flown, flight_of(plan, settings.camera.position_body_m, setup, flown)
 
 
@@ -324,7 +324,7 @@ def varied(setup: Setup, variant: Variant) -> Setup:
         gains,
         setup.path,
         variant.controller,
-        most_depth_m=setup.guidance.limits.most_depth_m,
+        max_depth_m=setup.guidance.limits.max_depth_m,
         point_body_m=(0.0, 0.0, 0.0),
         look_ahead_m=variant.look_ahead_m,
         limits=setup.guidance.limits,

@@ -138,11 +138,11 @@ def _paper_row(name: str) -> tuple[str, ...]:
     def span(key: str) -> str:
         if key not in paper:
             return ""
-        least, most = paper[key]
+        minimum, maximum = paper[key]
         return (
-            f"{most:g}"
-            if least == most
-            else (f"< {most:g}" if not least else f"{least:g}-{most:g}")
+            f"{maximum:g}"
+            if minimum == maximum
+            else (f"< {maximum:g}" if not minimum else f"{minimum:g}-{maximum:g}")
         )
 
     return (
@@ -156,7 +156,7 @@ def _row(name: str, summary: Summary) -> tuple[str, ...]:
         mean, sd = summary[key]["mean"], summary[key].get("sd")
         return f"{mean:.{digits}f}" + (f" ±{sd:.{digits}f}" if sd is not None else "")
 
-    def most(key: str, digits: int) -> str:
+    def maximum(key: str, digits: int) -> str:
         return f"({summary[key]['most']:.{digits}f})"
 
     return (
@@ -167,9 +167,9 @@ def _row(name: str, summary: Summary) -> tuple[str, ...]:
         cell("route_believed_m", 3),
         cell("heading_rms_deg", 1),
         cell("turn_roll_peak_deg", 1),
-        most("turn_roll_worst_deg", 1),
+        maximum("turn_roll_worst_deg", 1),
         cell("turn_surge_peak_mps", 2),
-        most("turn_surge_worst_mps", 2),
+        maximum("turn_surge_worst_mps", 2),
         cell("turn_yaw_peak_deg_s", 0),
         cell("survey_energy_wh", 1),
         cell("survey_s", 0),
@@ -374,17 +374,21 @@ def _draw_bars(
     for i, (name, colour) in enumerate(colours.items()):
         printed = PAPER.get(name, PAPER[ORIGINAL] if name == EQUAL else {}).get(paper)
         if printed is not None:
-            least, most = printed
-            bottom = 0.0 if least == most else least
+            minimum, maximum = printed
+            bottom = 0.0 if minimum == maximum else minimum
             axes.bar(
-                i - 0.4 + width / 2, most - bottom, width * 0.9, bottom=bottom, color=_PAPER,
+                i - 0.4 + width / 2, maximum - bottom, width * 0.9, bottom=bottom, color=_PAPER,
                 hatch="//", edgecolor="white", lw=0, label="paper" if i == 0 else None,
             )  # fmt: skip
             text = (
-                f"{most:g}" if least == most else (f"{least:g}-{most:g}" if least else f"<{most:g}")
+                f"{maximum:g}"
+                if minimum == maximum
+                else (f"{minimum:g}-{maximum:g}" if minimum else f"<{maximum:g}")
             )
-            axes.annotate(text, (i - 0.4 + width / 2, most), ha="center", va="bottom", fontsize=7.5)
-            top = max(top, most)
+            axes.annotate(
+                text, (i - 0.4 + width / 2, maximum), ha="center", va="bottom", fontsize=7.5
+            )
+            top = max(top, maximum)
         for j, figure in enumerate(figures):
             found = result.summaries[name][figure]
             x = i - 0.4 + (j + 1.5) * width

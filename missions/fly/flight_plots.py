@@ -316,9 +316,14 @@ def _draw_speeds(axes: Axes, flight: Flight, speed: Array) -> None:
     some = thin(len(speed))
     points = flight.glass_ned[some, 1::-1]
     pieces = np.stack([points[:-1], points[1:]], axis=1)
-    most = float(np.percentile(speed, 99.5))
+    maximum = float(np.percentile(speed, 99.5))
     drawn = LineCollection(
-        pieces, array=speed[some][:-1], cmap="viridis", linewidths=1.6, zorder=4, clim=(0.0, most)
+        pieces,
+        array=speed[some][:-1],
+        cmap="viridis",
+        linewidths=1.6,
+        zorder=4,
+        clim=(0.0, maximum),
     )
     axes.add_collection(drawn)
     axes.autoscale()
@@ -360,8 +365,8 @@ def _draw_thrusters(axes: Axes, flight: Flight, names: list[str]) -> None:
     _zero(axes, "rpm")
     for end in (-limit, limit):
         axes.axhline(end, color="#c0392b", lw=0.8, ls="--")
-    most = 1.08 * limit if reached > 0.5 * limit else max(1.15 * reached, 0.05 * limit)
-    axes.set_ylim(-most, most)
+    maximum = 1.08 * limit if reached > 0.5 * limit else max(1.15 * reached, 0.05 * limit)
+    axes.set_ylim(-maximum, maximum)
     _legend(axes, f"speed of thrusters, limits ±{limit:.0f}")
 
 

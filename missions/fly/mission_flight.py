@@ -14,7 +14,7 @@ from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.floor import FloorGrid
 from alice_survey.sim.vehicle.pilot import mission as pilot
 from alice_survey.sim.vehicle.pilot import steps as column
-from alice_survey.sim.vehicle.pilot.ardusub import LEAST_SPEED_MPS, ArduSubSettings
+from alice_survey.sim.vehicle.pilot.ardusub import MIN_SPEED_MPS, ArduSubSettings
 from alice_survey.sim.vehicle.pilot.gains import gains_for
 from alice_survey.sim.vehicle.pilot.memory import ALONG, LEG
 from alice_survey.sim.vehicle.simulator import simulate
@@ -30,7 +30,7 @@ from missions.fly.simulation import (
     FlightSettings,
     ascent_s,
     flight_of,
-    longest_mission_s,
+    max_mission_s,
     mission_setup,
 )
 from missions.route.energy import sound_craft_of
@@ -132,14 +132,14 @@ def simulate_mission(
     own = settings.vehicle.model_copy(
         update={"controller": "sway" if _sways(settings.vehicle, plan.speed_mps) else "los"}
     )
-    longest_s = longest_mission_s(known.plan)
+    max_s = max_mission_s(known.plan)
     setup = mission_setup(
-        known.plan, replace(settings, vehicle=own), floor, longest_s, rng, mission=flown_by
+        known.plan, replace(settings, vehicle=own), floor, max_s, rng, mission=flown_by
     )
     flown = simulate(
         setup,
         rng,
-        longest_s=longest_s + ascent_s(plan),
+        max_s=max_s + ascent_s(plan),
         label=label,
         expected_s=known.plan.duration_s,
     )
@@ -227,7 +227,7 @@ def _rows(known: MissionOfPlan, mount: CameraMount) -> Array:
         row[column.BY_ALTITUDE] = step.heave != "depth"
         row[column.DEPTH] = step.depth_m
         row[column.ALTITUDE] = step.altitude_m - lift_m
-        row[column.SPEED] = max(step.speed_mps, LEAST_SPEED_MPS) if by_track else step.speed_mps
+        row[column.SPEED] = max(step.speed_mps, MIN_SPEED_MPS) if by_track else step.speed_mps
         row[column.TOLERANCE] = step.tolerance_m
         row[column.HOLD_S] = step.hold_s
     return rows

@@ -85,7 +85,7 @@ def refly_plan(
         run_in_m=plan.run_in_m,
         turns=settings.turns,
         usable_wh=usable_wh,
-        longest_s=settings.dive_s,
+        max_s=settings.dive_s,
         depth_m=plan.seafloor_depth_m - plan.altitude_m,
         split=settings.split_dives,
     )

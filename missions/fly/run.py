@@ -26,7 +26,7 @@ from missions.values.navigation import write_navigation
 from missions.values.plan_file import Plan, read_plan
 
 _SEED_STREAM = 20
-MOST_HEADING_DEG = 10.0
+MAX_HEADING_DEG = 10.0
 """A picture of 4 by 3 turned by so much covers a strip narrower by a tenth."""
 TRIGGER_COLUMNS = ("station", "time_s", "line")
 
@@ -128,7 +128,7 @@ def _check_pictures(flight: Flight, planned: int, sea: str) -> None:
 def _warn_of_heading(flight: Flight) -> None:
     """Warn where pictures are turned so far that they leave the strip of their line."""
     heading = np.rad2deg(flight.line_errors[1])
-    if np.isfinite(heading).any() and rms(heading) > MOST_HEADING_DEG:
+    if np.isfinite(heading).any() and rms(heading) > MAX_HEADING_DEG:
         warn(
             f"on lines the heading was off by {rms(heading):.0f} deg rms, "
             f"{np.nanmax(np.abs(heading)):.0f} at most: pictures do not lie square to their lines"

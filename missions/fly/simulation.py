@@ -132,15 +132,15 @@ def simulate_plan(
         VehicleError: a setting does not fit the vehicle, or it cannot fly the plan's sway steps.
         NavigationError: the file of the current cannot be read.
     """
-    longest_s = longest_mission_s(plan)
-    setup = mission_setup(plan, settings, floor, longest_s, rng)
+    max_s = max_mission_s(plan)
+    setup = mission_setup(plan, settings, floor, max_s, rng)
     flown = simulate(
-        setup, rng, longest_s=longest_s + ascent_s(plan), label=label, expected_s=plan.duration_s
+        setup, rng, max_s=max_s + ascent_s(plan), label=label, expected_s=plan.duration_s
     )
     return flight_of(plan, settings.camera.position_body_m, setup, flown)
 
 
-def longest_mission_s(plan: Plan) -> float:
+def max_mission_s(plan: Plan) -> float:
     """After how long a mission is aborted."""
     return _PATIENCE * (plan.duration_s + 2.0 * plan.seafloor_depth_m / _CLIMB_MPS)
 
@@ -166,14 +166,14 @@ class Piloting:
 
 
 def piloting_of(
-    plan: Plan, settings: FlightSettings, longest_s: float, mission: PilotMission = NO_MISSION
+    plan: Plan, settings: FlightSettings, max_s: float, mission: PilotMission = NO_MISSION
 ) -> Piloting:
     """Vehicle, path, gains and guidance of a survey.
 
     Args:
         plan: what to fly.
         settings: vehicle and cameras.
-        longest_s: after which the vehicle gives up.
+        max_s: after which the vehicle gives up.
         mission: of way-points of the vehicle's reference point, flown instead of the plan's route.
 
     Raises:
@@ -206,13 +206,13 @@ def piloting_of(
             gains,
             path,
             settings.vehicle.controller,
-            most_depth_m=deepest_m,
+            max_depth_m=deepest_m,
             point_body_m=followed_body_m,
             spot_rad_s=spot_rate_rad_s(settings.turn_rate_limit_deg_s),
             limits=SafetyLimits(
                 0.5 * plan.altitude_m,
                 deepest_m,
-                longest_s=longest_s,
+                max_s=max_s,
                 blind_sigma_m=settings.navigation.blind_sigma_m,
                 blind_depth_m=max(plan.seafloor_depth_m - _BLIND_ALTITUDES * plan.altitude_m, 0.0),
             ),
@@ -248,7 +248,7 @@ def mission_setup(
     plan: Plan,
     settings: FlightSettings,
     floor: FloorGrid,
-    longest_s: float,
+    max_s: float,
     rng: np.random.Generator,
     mission: PilotMission = NO_MISSION,
 ) -> Setup:
@@ -258,11 +258,11 @@ def mission_setup(
         plan: what to fly.
         settings: vehicle, sea and sensors.
         floor: the true sea floor.
-        longest_s: after which the vehicle gives up.
+        max_s: after which the vehicle gives up.
         rng: for what is drawn once a mission.
         mission: of way-points of the vehicle's reference point, flown instead of the plan's route.
     """
-    flies = piloting_of(plan, settings, longest_s, mission)
+    flies = piloting_of(plan, settings, max_s, mission)
     craft, path = flies.vehicle, flies.path
     gust, heading_rad = settings.sea.gust_n, float(path.heading_rad[0] + path.side_rad[0])
     # The vehicle is let go where its left port is above the start of the route.
@@ -276,7 +276,7 @@ def mission_setup(
         mission=mission,
         sensors=sensors_of(settings.navigation, settings.camera).pack(craft.hull),
         floor=floor,
-        current=current_of(settings.sea, plan.seafloor_depth_m, longest_s, rng),
+        current=current_of(settings.sea, plan.seafloor_depth_m, max_s, rng),
         disturbance=Disturbance(
             sigma=(*gust, 0.0, 0.0, 0.0), correlation_s=settings.sea.gust_correlation_s
         ),

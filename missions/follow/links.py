@@ -23,8 +23,8 @@ UDP_PORT = 14600
 """Where datagrams are taken by default; MAVLink's are 14550 and on."""
 WINDOW_S = 1.0
 """How long a packet is waited for that another one has overtaken."""
-_LONGEST_PACKET = 4096
-_MOST_PACKETS = 5000
+_MAX_PACKET = 4096
+_MAX_PACKETS = 5000
 """Packets that are looked at in one call: the rest waits in the socket."""
 _APART_S = 0.2
 """Attitude, range and position are of one moment when they are no farther apart (inferred)."""
@@ -69,9 +69,9 @@ class UdpSource:
     def poll(self, wall_s: float) -> list[Piece]:
         """Packets that came since and whose turn it is."""
         rows = []
-        for _ in range(_MOST_PACKETS):
+        for _ in range(_MAX_PACKETS):
             try:
-                data = self._socket.recv(_LONGEST_PACKET)
+                data = self._socket.recv(_MAX_PACKET)
             except (BlockingIOError, InterruptedError):
                 break
             except OSError:  # of a packet that this socket did not send
@@ -166,7 +166,7 @@ class MavlinkSource:
     def poll(self, wall_s: float) -> list[Piece]:
         """What was heard since."""
         rows = []
-        for _ in range(_MOST_PACKETS):
+        for _ in range(_MAX_PACKETS):
             message = self._link.recv_match(blocking=False)
             if message is None:
                 break

@@ -19,7 +19,7 @@ from alice_survey.core.frames import Array
 from camera_calib.rig import Rig
 from missions.coverage.dive_record import (
     ALIKE_RAD,
-    LEAST_RUN,
+    MIN_RUN,
     RUN_STEPS,
     altitude_of,
     attitude_of,
@@ -42,7 +42,7 @@ from missions.values.plan_file import Plan
 _COURSE = ("latitude_deg", "longitude_deg")
 _HEADING = READINGS.index("heading_deg")
 _MS = 1000.0
-_LONGEST_MS = 60_000
+_MAX_MS = 60_000
 """Intervals are counted up to a minute: a median beyond is no log to interpolate in."""
 
 
@@ -60,7 +60,7 @@ class _Intervals:
             before = time_s[0] if self._last_s is None else self._last_s
             steps = np.rint(np.diff(time_s, prepend=before) * _MS)
             steps = steps[1:] if self._last_s is None else steps
-            self._counts.update(np.minimum(steps, _LONGEST_MS).astype(int).tolist())
+            self._counts.update(np.minimum(steps, _MAX_MS).astype(int).tolist())
             self._last_s = float(time_s[-1])
             self.known += len(time_s)
 
@@ -356,7 +356,7 @@ class PictureTrack:
         run.length += 1
         run.place_ne = (float(place[0]), float(place[1]))
         run.held.append(len(found) - 1)
-        if run.length >= LEAST_RUN:
+        if run.length >= MIN_RUN:
             if run.number < 0:
                 run.number = len(self.plan.lines) + self._runs
                 self._runs += 1

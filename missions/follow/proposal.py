@@ -33,7 +33,7 @@ from missions.values.legs import Route
 from missions.values.line import Line
 from missions.values.plan_file import Dive, Plan
 
-_MOST_GROUPS = 40
+_MAX_GROUPS = 40
 """So many groups of holes, the largest, are looked at."""
 _J_PER_WH = 3600.0
 
@@ -157,12 +157,12 @@ def propose(
         0.0 if flown is None else group.area_m2 / max(flown.time_s, 1e-3)
         for group, flown in zip(groups, alone, strict=True)
     ]
-    least = 1 + expected.pattern.pictures  # fewer give no place the overlap requested
+    minimum = 1 + expected.pattern.pictures  # fewer give no place the overlap requested
     best: _OrderedLines | None = None
     taken: list[_Group] = []
     for index in np.argsort(worth, kind="stable")[::-1].tolist():
         if worth[index] > 0.0:
-            more = _with_group(flying, best, groups[index], budget, least)
+            more = _with_group(flying, best, groups[index], budget, minimum)
             if more is not None:
                 best = more
                 taken.append(groups[index])
@@ -185,7 +185,7 @@ def _groups(plan: Plan, expected: Certificate, holes: Sequence[Hole]) -> list[_G
         area_m2 = sum(hole.area_m2 for hole in inside)
         if area_m2 >= LEFT_SHARE * plan.area.survey.area:
             found.append((area_m2, to_see(plan.area, expected, inside)))
-    found = sorted(found, key=lambda pair: -pair[0])[:_MOST_GROUPS]
+    found = sorted(found, key=lambda pair: -pair[0])[:_MAX_GROUPS]
     groups = []
     for area_m2, pieces in found:
         lines = lines_over(pieces, replace(plan.area, survey=pieces), pattern)
@@ -195,7 +195,7 @@ def _groups(plan: Plan, expected: Certificate, holes: Sequence[Hole]) -> list[_G
 
 
 def _with_group(
-    flying: Flying, before: _OrderedLines | None, group: _Group, budget: Budget, least: int
+    flying: Flying, before: _OrderedLines | None, group: _Group, budget: Budget, minimum: int
 ) -> _OrderedLines | None:
     """What is flown already and a group, or what of its lines fits; None: nothing of it.
 
@@ -204,14 +204,14 @@ def _with_group(
         before: what is flown already.
         group: to add.
         budget: of all.
-        least: pictures of a line that is cut short.
+        minimum: pictures of a line that is cut short.
     """
     kept = () if before is None else before.lines
     best = _fitting(flying, (*kept, *group.lines), budget)
     if best is not None:
         return best
     # More lines, and longer ones, take longer: the most that fit are found by halving.
-    count, best = _most(
+    count, best = _maximum(
         len(group.lines), lambda n: _fitting(flying, (*kept, *group.lines[:n]), budget)
     )
     kept = (*kept, *group.lines[:count])
@@ -221,17 +221,17 @@ def _with_group(
         def part(stations: int, line: Line = line) -> _OrderedLines | None:
             return _fitting(flying, (*kept, _shortened(line, stations)), budget)
 
-        stations, flown = _most(line.stations, part, least=least)
+        stations, flown = _maximum(line.stations, part, minimum=minimum)
         if flown is not None and stations > longest:
             longest, best = stations, flown
     return best
 
 
-def _most(
-    count: int, tried: Callable[[int], _OrderedLines | None], least: int = 1
+def _maximum(
+    count: int, tried: Callable[[int], _OrderedLines | None], minimum: int = 1
 ) -> tuple[int, _OrderedLines | None]:
     """The most, under `count`, of something that fits, and what is flown then; 0 of none."""
-    low, high, best = least - 1, count, None
+    low, high, best = minimum - 1, count, None
     while high - low > 1:
         middle = (low + high) // 2
         flown = tried(middle)

@@ -21,7 +21,7 @@ from missions.logs.navigation_csv import READINGS, RowParser, find_zone
 ROW = ("time_s", *READINGS)
 """Columns of a row."""
 TIME, LATITUDE, LONGITUDE, DEPTH, ROLL, PITCH, HEADING, ALTITUDE = range(len(ROW))
-LONGEST_BREAK_S = 3600.0
+MAX_BREAK_S = 3600.0
 """After a longer break a log goes on as another one: no pictures are expected in between."""
 _SURE = 10
 """So many rows one after the other that go back, or far ahead, are another clock, and not late."""
@@ -87,7 +87,7 @@ class SteadyTimes:
         if not len(rows):
             return [Piece(rows=rows, starts=True)] if piece.starts else []
         steps = np.diff(times, prepend=times[0] - 1.0 if self._last_s is None else self._last_s)
-        if np.all((steps > 0) & (steps <= LONGEST_BREAK_S)):
+        if np.all((steps > 0) & (steps <= MAX_BREAK_S)):
             self._drop_aside()
             self._last_s = float(times[-1])
             return [Piece(rows=rows, starts=piece.starts)]
@@ -98,7 +98,7 @@ class SteadyTimes:
         for row in rows:
             time = float(row[TIME])
             step = 1.0 if self._last_s is None else time - self._last_s
-            if 0.0 < step <= LONGEST_BREAK_S:
+            if 0.0 < step <= MAX_BREAK_S:
                 self._drop_aside()
                 pieces[-1][1].append(row)
                 self._last_s = time

@@ -38,8 +38,8 @@ from missions.values.plan_file import Plan, read_plan
 
 _BUSY = 4.0
 """Holes are looked for no more often than after so many times the time that it took."""
-_LEAST_S = 1.0
-_MOST_LISTED = 200
+_MIN_S = 1.0
+_MAX_LISTED = 200
 _WINDOW_S = 1.0
 """News are late by what is waited for packets to be in order."""
 
@@ -163,7 +163,7 @@ class DiveSession:
             began = time.perf_counter()
             self._expected, self.holes = self.follower.expected()
             took_s = time.perf_counter() - began
-            self._look_wall_s = wall_s + max(_LEAST_S, _BUSY * took_s)
+            self._look_wall_s = wall_s + max(_MIN_S, _BUSY * took_s)
             self._is_current = True
 
     def propose(self) -> Proposal | None:
@@ -285,7 +285,7 @@ class DiveSession:
     def holes_json(self) -> list[dict[str, Any]]:
         """The holes with their outlines, worst first."""
         with self.lock:
-            holes = self.holes[:_MOST_LISTED]
+            holes = self.holes[:_MAX_LISTED]
         return [
             {
                 **hole.to_json(),

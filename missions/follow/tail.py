@@ -17,7 +17,7 @@ from missions.follow.rows import ROW, TIME, Piece
 from missions.logs.navigation_csv import READINGS, RowParser, find_zone
 
 _CHUNK = 1 << 20
-_LONGEST_LINE = 1 << 14
+_MAX_LINE = 1 << 14
 _HEAD = 512
 """Bytes at the beginning by which a file is known again."""
 
@@ -107,7 +107,7 @@ class NavigationTail:
     def _pieces(self, data: bytes) -> list[Piece]:
         lines = (self._half + data).split(b"\n")
         self._half = lines.pop()
-        if len(self._half) > _LONGEST_LINE:
+        if len(self._half) > _MAX_LINE:
             self.left_out["a line of more than 16 kB"] += 1
             self._half = b""
         rows = []

@@ -17,18 +17,18 @@ from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
 from missions.lines.rows import rooms
 
-LEAST_STEPS = 2
+MIN_STEPS = 2
 """Survey lines of fewer steps from picture to picture may stay uncrossed. Chosen: a line of one or
 two pictures is tied to its neighbours and does not bend the block."""
 _ROWS_APART = 2
 """A cross line goes on over one row that has no line there."""
 _EVEN = 1e-9
-_SHORTEST_M = 1e-3
+_MIN_M = 1e-3
 
 
 @compiled
 def cross_table(
-    pieces: Array, offsets: Array, allowed: Array, step: float, least_steps: int, count: int
+    pieces: Array, offsets: Array, allowed: Array, step: float, min_steps: int, count: int
 ) -> Array:
     """Lay the cross lines over the pieces of all rows.
 
@@ -37,7 +37,7 @@ def cross_table(
         offsets: (R,) v of the rows.
         allowed: (A, 4) u, v of the edges of the area where lines may be.
         step: most from picture to picture.
-        least_steps: of a line.
+        min_steps: of a line.
         count: of cross lines over each block.
 
     Returns:
@@ -54,7 +54,7 @@ def cross_table(
         members = np.flatnonzero(block == b)
         if pieces[members[0], 0] == pieces[members[-1], 0]:
             continue  # one row has nothing to be tied to
-        targets = members[pieces[members, 3] >= LEAST_STEPS]
+        targets = members[pieces[members, 3] >= MIN_STEPS]
         uncrossed = np.zeros(pieces.shape[0], np.bool_)
         uncrossed[targets] = True
         low, high = pieces[members, 1].min(), pieces[members, 2].max()
@@ -63,21 +63,21 @@ def cross_table(
         before = used
         for u in places:
             found, used = _laid(
-                found, used, u, members, pieces, offsets, edges, step, least_steps, uncrossed, False
+                found, used, u, members, pieces, offsets, edges, step, min_steps, uncrossed, False
             )
         if uncrossed.any() and groups.shape[0] <= count:
             used = before
             uncrossed[targets] = True
             for u in _moved(places, groups):
                 found, used = _laid(
-                    found, used, u, members, pieces, offsets, edges, step, least_steps, uncrossed,
+                    found, used, u, members, pieces, offsets, edges, step, min_steps, uncrossed,
                     False,
                 )  # fmt: skip
         left = targets[uncrossed[targets]]
         for group in stabs(tied[left]):
             u = (group[0] + group[1]) / 2
             found, used = _laid(
-                found, used, u, members, pieces, offsets, edges, step, least_steps, uncrossed, True
+                found, used, u, members, pieces, offsets, edges, step, min_steps, uncrossed, True
             )
     return found[:used].copy()
 
@@ -163,11 +163,11 @@ def _moved(places: Array, groups: Array) -> Array:
     moved = places.copy()
     taken = np.zeros(places.size, np.bool_)
     for g in range(groups.shape[0]):
-        nearest, least = -1, np.inf
+        nearest, minimum = -1, np.inf
         for i in range(places.size):
             away = max(groups[g, 0] - places[i], places[i] - groups[g, 1], 0.0)
-            if not taken[i] and away < least:
-                nearest, least = i, away
+            if not taken[i] and away < minimum:
+                nearest, minimum = i, away
         taken[nearest] = True
         moved[nearest] = min(max(places[nearest], groups[g, 0]), groups[g, 1])
     return np.unique(moved)
@@ -183,7 +183,7 @@ def _laid(
     offsets: Array,
     edges: Array,
     step: float,
-    least_steps: int,
+    min_steps: int,
     uncrossed: NDArray[np.bool_],
     only_uncrossed: bool,
 ) -> tuple[Array, int]:
@@ -198,7 +198,7 @@ def _laid(
         offsets: of the rows.
         edges: (A, 4) v, -u of the edges of the allowed area.
         step: most from picture to picture.
-        least_steps: of a line.
+        min_steps: of a line.
         uncrossed: (P,) whether a piece must still be crossed; changed.
         only_uncrossed: lay no more than crosses such pieces, and ties them to a neighbour.
     """
@@ -228,10 +228,10 @@ def _laid(
             first, last = max(first, begin - 1), min(last, end + 1)
         else:
             wanted = last > first
-        if wanted and high - low > _SHORTEST_M:
+        if wanted and high - low > _MIN_M:
             v_0 = offsets[int(pieces[here[first], 0])]
             v_1 = offsets[int(pieces[here[last], 0])]
-            steps = max(least_steps, math.ceil((v_1 - v_0) / step - _EVEN))
+            steps = max(min_steps, math.ceil((v_1 - v_0) / step - _EVEN))
             v_0 = max(low, v_0 - (steps * step - (v_1 - v_0)) / 2)
             v_1 = min(high, v_0 + steps * step)
             v_0 = max(low, v_1 - steps * step)

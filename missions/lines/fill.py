@@ -286,7 +286,7 @@ def _best_line(
     half_along: float,
     overhang: float,
     step: float,
-    least_steps: int,
+    min_steps: int,
 ) -> tuple[float, float, float, float, int]:
     """The line that sees most for its length.
 
@@ -300,7 +300,7 @@ def _best_line(
         half_along: what a picture sees.
         overhang: of a line over what it must see.
         step: most from picture to picture.
-        least_steps: of a line.
+        min_steps: of a line.
 
     Returns:
         Worth per metre (0: no line sees anything), offset, begin, end, steps.
@@ -333,7 +333,7 @@ def _best_line(
                     end = min(room_end, last + reach_along + overhang)
                     if end < begin:
                         begin = end = min(max((begin + end) / 2, room_begin), room_end)
-                    steps = max(least_steps, math.ceil((end - begin) / step - _TINY_M))
+                    steps = max(min_steps, math.ceil((end - begin) / step - _TINY_M))
                     lack = steps * step - (end - begin)
                     begin = max(room_begin, begin - lack / 2)
                     end = min(room_end, begin + steps * step)

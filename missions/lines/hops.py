@@ -13,7 +13,7 @@ import numpy as np
 
 from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
-from missions.route.joins import LONGEST_SWAY_M
+from missions.route.joins import MAX_SWAY_M
 from missions.values.costs import Costs, power_at
 
 NOWHERE_J = 1e15
@@ -68,7 +68,7 @@ def hop_j(costs: Costs, leave: Array, enter: Array, way_m: float) -> float:
         energy += _spot_j(costs, bearing - leave[2])
     if math.isfinite(enter[2]):
         energy += _spot_j(costs, enter[2] - bearing)
-    if between and straight_m <= LONGEST_SWAY_M and way_m < straight_m + _SAME_M:
+    if between and straight_m <= MAX_SWAY_M and way_m < straight_m + _SAME_M:
         aside = straight_m / costs.sway_mps * power_at(costs.sway_w, bearing)
         aside += costs.spot_w * costs.settle_s + _spot_j(costs, enter[2] - leave[2])
         energy = min(energy, aside)

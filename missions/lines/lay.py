@@ -26,7 +26,7 @@ from missions.values.costs import Costs
 from missions.values.line import Line, LineKind
 from missions.values.pattern import Pattern
 
-MOST_STATIONS = 2_000_000
+MAX_STATIONS = 2_000_000
 """Most stations of a plan. Chosen: days of flight, and terabytes of pictures."""
 KINDS: tuple[LineKind, ...] = ("survey", "cross", "closing", "fill")
 SURVEY, CROSS, CLOSING, FILL = range(len(KINDS))
@@ -66,7 +66,7 @@ def lay_lines(
     *,
     cross_lines: int,
     closing_line: bool,
-    most_stations: int = MOST_STATIONS,
+    max_stations: int = MAX_STATIONS,
 ) -> list[Line]:
     """Lay all lines of a survey.
 
@@ -80,7 +80,7 @@ def lay_lines(
         cross_lines: how many across the survey lines, over every block of them; more where some
             would stay uncrossed (`missions.lines.cross`); 0: none.
         closing_line: whether the start of the first line is flown again at the end.
-        most_stations: that a plan may have.
+        max_stations: that a plan may have.
 
     Returns:
         Lines in the order of flight. No line leaves the allowed area.
@@ -90,7 +90,7 @@ def lay_lines(
             allowed area between two lines.
     """
     note_planner()
-    check_size(area, pattern, most_stations)
+    check_size(area, pattern, max_stations)
     result = laid(
         Site.of(area),
         heading_rad,
@@ -102,8 +102,8 @@ def lay_lines(
         closing_line=closing_line,
     )
     stations = int(result.steps.sum()) + len(result.steps)
-    if stations > most_stations:
-        raise _too_many(area, pattern, stations, most_stations)
+    if stations > max_stations:
+        raise _too_many(area, pattern, stations, max_stations)
     return result.lines()
 
 
@@ -136,15 +136,15 @@ def note_planner() -> None:
     note_compiling(hops.flight_j, "the planner, once: this takes 40 s to a minute")
 
 
-def check_size(area: Area, pattern: Pattern, most_stations: int = MOST_STATIONS) -> None:
+def check_size(area: Area, pattern: Pattern, max_stations: int = MAX_STATIONS) -> None:
     """Refuse an area that is much too large before lines are laid.
 
     Raises:
         PlanError: it needs more than twice as many stations.
     """
     stations = area.survey.area / (pattern.spacing_m * pattern.step_m)
-    if stations > 2 * most_stations:
-        raise _too_many(area, pattern, stations, most_stations)
+    if stations > 2 * max_stations:
+        raise _too_many(area, pattern, stations, max_stations)
 
 
 def laid(
@@ -420,13 +420,13 @@ def _inserted(
         both = np.array([fill[:5], [*fill[2:4], *fill[:2], fill[4] + math.pi]])
         begins, ends = np.ascontiguousarray(both[:, [0, 1, 4]]), np.ascontiguousarray(both[:, 2:5])
         # No detour is less than one by straight ways, so the search ends early.
-        least_j = hops.hops_j(costs, leave, begins, _straights(leave, begins))
-        least_j = least_j + hops.hops_j(costs, ends, enter, _straights(ends, enter)).T
-        least_j -= over_j[:, None]
+        min_j = hops.hops_j(costs, leave, begins, _straights(leave, begins))
+        min_j = min_j + hops.hops_j(costs, ends, enter, _straights(ends, enter)).T
+        min_j -= over_j[:, None]
         best_j, best, place, best_m = np.inf, both[0], 0, np.zeros(2)
-        for index in np.argsort(least_j, axis=None, kind="stable").tolist():
+        for index in np.argsort(min_j, axis=None, kind="stable").tolist():
             i, turned = divmod(index, 2)
-            if least_j[i, turned] >= best_j:
+            if min_j[i, turned] >= best_j:
                 break
             there, then = np.stack([leave[i], ends[turned]]), np.stack([begins[turned], enter[i]])
             detour_m = ways.lengths_m(there[:, :2], then[:, :2])
@@ -446,9 +446,9 @@ def _straights(a: Array, b: Array) -> Array:
     return distances
 
 
-def _too_many(area: Area, pattern: Pattern, stations: float, most: int) -> PlanError:
+def _too_many(area: Area, pattern: Pattern, stations: float, maximum: int) -> PlanError:
     return PlanError(
         f"an area of {area.survey.area:.0f} m2 with lines {pattern.spacing_m:.3g} m apart and a "
         f"picture every {pattern.step_m:.3g} m needs about {stations:.2g} stations, more than "
-        f"{most}: split the area, fly higher or lower the overlaps"
+        f"{maximum}: split the area, fly higher or lower the overlaps"
     )

@@ -24,7 +24,7 @@ from missions.values.area import Area
 TOUCH_M = 1e-7
 """Strips are this much narrower at both sides, so that an area that only touches a strip does not
 count; and a line may run this close outside of the allowed area, so that it may follow its edge."""
-_SHORTEST_M = 1e-3
+_MIN_M = 1e-3
 """Shortest room along a line: where the vehicle has less, no line is flown."""
 _EVEN = 1e-9
 
@@ -183,8 +183,8 @@ def reaches(
     for i in range(count):
         begins[i + 1] = low_starts[i + 1] - low_starts[i] + high_starts[i + 1] - high_starts[i]
     for e in range(edges.shape[0]):
-        least, most = min(edges[e, 1], edges[e, 3]), max(edges[e, 1], edges[e, 3])
-        for i in range(np.searchsorted(high, least), np.searchsorted(low, most)):
+        minimum, maximum = min(edges[e, 1], edges[e, 3]), max(edges[e, 1], edges[e, 3])
+        for i in range(np.searchsorted(high, minimum), np.searchsorted(low, maximum)):
             begins[i + 1] += 1
     for i in range(count):
         begins[i + 1] += begins[i]
@@ -199,8 +199,8 @@ def reaches(
             filled[i] += 1
     for e in range(edges.shape[0]):
         u0, v0, u1, v1 = edges[e, 0], edges[e, 1], edges[e, 2], edges[e, 3]
-        least, most = min(v0, v1), max(v0, v1)
-        for i in range(np.searchsorted(high, least), np.searchsorted(low, most)):
+        minimum, maximum = min(v0, v1), max(v0, v1)
+        for i in range(np.searchsorted(high, minimum), np.searchsorted(low, maximum)):
             a, b = u0, u1
             if v1 != v0:
                 at_low = u0 + (low[i] - v0) / (v1 - v0) * (u1 - u0)
@@ -259,7 +259,7 @@ def lay_rows(
     half_m: float,
     overhang_m: float,
     step_m: float,
-    least_steps: int,
+    min_steps: int,
 ) -> tuple[Array, Array]:
     """Lay the pieces of all rows.
 
@@ -274,7 +274,7 @@ def lay_rows(
         half_m: half the width of the strip a row looks after.
         overhang_m: how far a line begins before the area, and ends behind it.
         step_m: most from picture to picture.
-        least_steps: of a piece.
+        min_steps: of a piece.
 
     Returns:
         (P, 4) pieces: row, begin, end, steps; by row and u. And (C, 3) stretches that should be
@@ -289,7 +289,7 @@ def lay_rows(
     pieces = np.empty((bound, 4))
     cuts = np.empty((bound + count, 3))
     laid, cut = 0, 0
-    least_m = least_steps * step_m
+    min_m = min_steps * step_m
     for i in range(count):
         first_of_row = laid
         first_wish, last_wish = reach_begins[i], reach_begins[i] + reach_counts[i]
@@ -302,7 +302,7 @@ def lay_rows(
         k = first_wish
         for r in range(room_begins[i], room_begins[i] + room_counts[i]):
             room_begin, room_end = room[r, 0], room[r, 1]
-            if room_end - room_begin < _SHORTEST_M:
+            if room_end - room_begin < _MIN_M:
                 continue
             first_of_room = laid
             while k < first_wish + wished and reach[k, 1] < room_begin:
@@ -310,10 +310,10 @@ def lay_rows(
             j = k
             while j < first_wish + wished and reach[j, 0] <= room_end:
                 begin, end = max(reach[j, 0], room_begin), min(reach[j, 1], room_end)
-                lack = least_m - (end - begin)
+                lack = min_m - (end - begin)
                 if lack > 0.0:
-                    begin = max(room_begin, min(begin - lack / 2, room_end - least_m))
-                    end = min(room_end, begin + least_m)
+                    begin = max(room_begin, min(begin - lack / 2, room_end - min_m))
+                    end = min(room_end, begin + min_m)
                 j += 1
                 if laid > first_of_room and begin - pieces[laid - 1, 2] < 2 * step_m:
                     pieces[laid - 1, 2] = max(pieces[laid - 1, 2], end)
@@ -323,7 +323,7 @@ def lay_rows(
                 laid += 1
             for p in range(first_of_room, laid):
                 begin, end = pieces[p, 1], pieces[p, 2]
-                steps = max(least_steps, math.ceil((end - begin) / step_m - _EVEN))
+                steps = max(min_steps, math.ceil((end - begin) / step_m - _EVEN))
                 lack = steps * step_m - (end - begin)
                 begin = max(room_begin, begin - lack / 2)
                 end = min(room_end, begin + steps * step_m)

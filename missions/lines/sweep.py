@@ -38,7 +38,7 @@ from missions.values.pattern import Pattern
 _ESTIMATES = 1800
 """Headings at which the cost is estimated, a tenth of a degree apart, if lines are few."""
 _FEW_ROWS = 400
-_LEAST_ESTIMATES = 360
+_MIN_ESTIMATES = 360
 _SPREAD = 45
 """Headings at which the close cost is taken whatever the estimate says."""
 _BEST = 24
@@ -99,7 +99,7 @@ def best_heading(
     note_planner()
     check_size(area, pattern)
     site, costs = Site.of(area), hops.comparable(costs)
-    width_heading, width = least_width(site.survey)
+    width_heading, width = min_width(site.survey)
     close: dict[float, float] = {}
     found: dict[float, float] = {}
     faults: list[PlanError] = []
@@ -135,19 +135,19 @@ def best_heading(
         share = min(1.0, _FEW_CELLS / _count_cells(site, float(best), pattern))
         yield from take(close, spread[:: math.ceil(1 / share)])
         yield from take(close, _best(headings, estimates, _some(_BEST, share), math.radians(0.3)))
-        for heading in _least(close, _some(_REFINED, share)):
+        for heading in _minimum(close, _some(_REFINED, share)):
             apart = np.abs((headings - heading + math.pi / 2) % math.pi - math.pi / 2)
             near = apart < _NEAR_RAD
             best = _best(headings[near], estimates[near], _REFINED, math.radians(0.05))
             yield from take(close, best)
             tenths = _TENTHS if share == 1.0 else _FEW_TENTHS
             yield from take(close, heading + math.radians(0.1) * np.array(tenths))
-        yield from take(found, np.array(_least(close, _some(_FULL, share))))
+        yield from take(found, np.array(_minimum(close, _some(_FULL, share))))
 
     _run(search())
     if not found:
         raise faults[0]
-    best = _least(found, 1)[0]
+    best = _minimum(found, 1)[0]
     return Sweep(
         heading_rad=best,
         cost_j=found[best],
@@ -164,9 +164,9 @@ def _worthwhile(
     That spares thousands of short lines across a long strip.
     """
     known_j = float(estimate_j(site, np.array([narrow]), pattern, costs, 0)[0])
-    least_j = float(costs.line_w.min()) / costs.speed_mps * site.area_m2 / pattern.spacing_m
+    min_j = float(costs.line_w.min()) / costs.speed_mps * site.area_m2 / pattern.spacing_m
     turns = widths_m(site.survey, headings) / pattern.spacing_m
-    kept = headings[least_j + turns * _turn_j(pattern, costs) <= _PROMISING * known_j]
+    kept = headings[min_j + turns * _turn_j(pattern, costs) <= _PROMISING * known_j]
     return kept if len(kept) else np.array([narrow])
 
 
@@ -187,7 +187,7 @@ def _count_cells(site: Site, heading_rad: float, pattern: Pattern) -> int:
     return max(1, len(cells.chains(cells.followers(pieces))[0]) - 1)
 
 
-def _least(costs_j: dict[float, float], count: int) -> list[float]:
+def _minimum(costs_j: dict[float, float], count: int) -> list[float]:
     """The cheapest headings."""
     return sorted(costs_j, key=lambda x: (costs_j[x], x))[:count]
 
@@ -202,7 +202,7 @@ def _run(search: Iterator[float]) -> None:
         pass
 
 
-def least_width(edges: Array) -> tuple[float, float]:
+def min_width(edges: Array) -> tuple[float, float]:
     """The direction, in [0, pi), across which all cells together are narrowest, and that width.
 
     Args:
@@ -211,8 +211,8 @@ def least_width(edges: Array) -> tuple[float, float]:
     spans = edges[:, 2:] - edges[:, :2]
     directions = np.unique(np.arctan2(spans[:, 1], spans[:, 0]) % math.pi)
     widths = widths_m(edges, directions)
-    least = int(np.argmin(np.round(widths, 9)))
-    return float(directions[least]), float(widths[least])
+    minimum = int(np.argmin(np.round(widths, 9)))
+    return float(directions[minimum]), float(widths[minimum])
 
 
 @compiled
@@ -257,7 +257,7 @@ def _estimates(
     passes: int,
     overhang: float,
     step: float,
-    least_steps: int,
+    min_steps: int,
     costs: Costs,
     turn_j: float,
     cross_lines: int,
@@ -269,7 +269,7 @@ def _estimates(
         low, high = turned[:, 1].min(), turned[:, 1].max()
         offsets = rows.row_offsets(low, high, spacing, edge, passes)
         pieces, _ = rows.lay_rows(
-            turned, room, offsets, passes * spacing / 2, overhang, step, least_steps
+            turned, room, offsets, passes * spacing / 2, overhang, step, min_steps
         )
         ahead = hops.line_j(costs, 1.0, heading)
         back = hops.line_j(costs, 1.0, heading + math.pi)
@@ -290,7 +290,7 @@ def _headings(area: Area, site: Site, pattern: Pattern) -> Array:
     north_0, east_0, north_1, east_1 = area.survey.bounds
     rows_most = math.hypot(north_1 - north_0, east_1 - east_0) / pattern.spacing_m
     effort = max(rows_most / _FEW_ROWS, len(site.survey) / _FEW_EDGES)
-    count = int(np.clip(_ESTIMATES / effort, _LEAST_ESTIMATES, _ESTIMATES))
+    count = int(np.clip(_ESTIMATES / effort, _MIN_ESTIMATES, _ESTIMATES))
     even = np.arange(count) * math.pi / count
     spans = site.survey[:, 2:] - site.survey[:, :2]
     lengths_m = np.hypot(*spans.T)
@@ -321,8 +321,8 @@ def _jumps(hull: Array, pattern: Pattern) -> Array:
         across = hull @ np.array([-math.sin(middle), math.cos(middle)])
         north, east = hull[int(np.argmax(across))] - hull[int(np.argmin(across))]
         distance, bearing = math.hypot(north, east), math.atan2(east, north)
-        least = (np.arange(1, distance / pattern.spacing_m + 2)) * pattern.spacing_m
-        sine = (least - 2 * pattern.edge_m) / max(distance, 1e-9)
+        minimum = (np.arange(1, distance / pattern.spacing_m + 2)) * pattern.spacing_m
+        sine = (minimum - 2 * pattern.edge_m) / max(distance, 1e-9)
         angle = np.arcsin(sine[(sine > 0) & (sine < 1)])
         # The width grows from 0 on at the bearing, up to a quarter turn from it, and falls again.
         for heading in (bearing + angle - _OFF_JUMP_RAD, bearing - angle + _OFF_JUMP_RAD):

@@ -40,7 +40,7 @@ from alice_survey.sim.vehicle.simulated_vehicle import TICK_S
 FIRST_S, SILENCE_S = 600.0, 60.0
 """With simulated time nothing ticks without messages: a transport ends after so long without one,
 at first (the simulator may have to compile) and later."""
-_LONGEST_STEP_S = 4.0 * TICK_S
+_MAX_STEP_S = 4.0 * TICK_S
 """The pilot's integrals and timers advance by no more in a tick."""
 _SAME_S = 1e-6
 """Ticks closer together are the same one: the clock stands still."""
@@ -48,7 +48,7 @@ _LATE = 1.5
 """A tick is late when it comes after so many times the usual interval."""
 _UNIT = 1e-2
 """How far the norm of a quaternion may be off 1."""
-_MOST_TILT_RAD = DvlSpec().most_tilt_rad
+_MAX_TILT_RAD = DvlSpec().max_tilt_rad
 """A beam farther off the vertical is not used."""
 _WATCHED_TICKS = round(WATCHED_S / TICK_S)
 
@@ -199,7 +199,7 @@ class PilotLoop:
             return
         turn = Rotation.from_quat(odometry.quaternion_xyzw)
         down = float(turn.apply([0.0, 0.0, 1.0])[2])
-        if range_m <= 0.0 or down < math.cos(_MOST_TILT_RAD):
+        if range_m <= 0.0 or down < math.cos(_MAX_TILT_RAD):
             self._refuse("altitude is not of the bottom")
             return
         depth = odometry.position_ned[2] + turn.apply(self._altimeter_body)[2] + range_m * down
@@ -225,7 +225,7 @@ class PilotLoop:
             self._why = f"the clock jumped by {moved:.2f} s"
         elif moved > _LATE * TICK_S:
             self.late_ticks += 1
-        self._last = self._command(now_s, TICK_S if jumped else min(moved, _LONGEST_STEP_S))
+        self._last = self._command(now_s, TICK_S if jumped else min(moved, _MAX_STEP_S))
         return self._last
 
     def end(self, how: str) -> None:

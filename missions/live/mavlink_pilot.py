@@ -67,16 +67,16 @@ def pilot_over_mavlink(mission: LiveMission, address: str, *, sim_time: bool) ->
     """
     link = mavlink_to(address, source_component=_ONBOARD_COMPUTER)
     pilot = MavlinkPilot(mission, link.mav, sim_time=sim_time)
-    heard, most_s = time.monotonic(), FIRST_S
+    heard, max_s = time.monotonic(), FIRST_S
     try:
         while mission.loop.state != LinkState.OVER:
             message = link.recv_match(blocking=True, timeout=_WAIT_S)
             now = time.monotonic()
             if message is not None:
                 pilot.hear(message, now)
-                heard, most_s = now, SILENCE_S
-            elif sim_time and now - heard > most_s:
-                raise VehicleError(f"no message came on {address} for {most_s:g} s")
+                heard, max_s = now, SILENCE_S
+            elif sim_time and now - heard > max_s:
+                raise VehicleError(f"no message came on {address} for {max_s:g} s")
             pilot.step(now)
     finally:
         pilot.farewell()

@@ -13,7 +13,7 @@ from alice_survey.sim.vehicle.pilot.memory import FOLLOW
 from alice_survey.sim.vehicle.simulated_vehicle import TICK_S
 from alice_survey.sim.vehicle.vehicle import Vehicle
 from missions.fly.flight_route import one_dive
-from missions.fly.simulation import FlightSettings, longest_mission_s, piloting_of
+from missions.fly.simulation import FlightSettings, max_mission_s, piloting_of
 from missions.live.loop import Command, LinkLimits, LinkState, PilotLoop
 from missions.values.plan_file import Plan, read_plan
 
@@ -131,7 +131,7 @@ def mission_of(
     Raises:
         VehicleError: a setting does not fit the vehicle, it cannot fly the plan, or has fins.
     """
-    flies = piloting_of(plan, settings, longest_mission_s(plan))
+    flies = piloting_of(plan, settings, max_mission_s(plan))
     need_thrusters_alone(flies.vehicle)
     pilot = Pilot(
         flies.vehicle, flies.path, flies.gains, flies.guidance,

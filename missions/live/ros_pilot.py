@@ -66,10 +66,10 @@ def pilot_over_ros(mission: LiveMission, topics: Topics, *, sim_time: bool) -> N
         try:
             while mission.loop.state != LinkState.OVER:
                 ros.rclpy.spin_once(node.node, timeout_sec=_WAIT_S)
-                most_s = SILENCE_S if mission.loop.ticks else FIRST_S
-                if sim_time and time.monotonic() - node.ticked > most_s:
+                max_s = SILENCE_S if mission.loop.ticks else FIRST_S
+                if sim_time and time.monotonic() - node.ticked > max_s:
                     raise VehicleError(
-                        f"/clock stood still for {most_s:g} s: start the simulator first, or "
+                        f"/clock stood still for {max_s:g} s: start the simulator first, or "
                         "fly without --sim-time"
                     )
         finally:

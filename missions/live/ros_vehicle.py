@@ -55,7 +55,7 @@ class Pace:
 
     rate: float
     """Simulated over wall time; 0 waits for the command of each tick."""
-    longest_s: float = math.inf
+    max_s: float = math.inf
     """Simulated time after which it ends."""
     patience_s: float = 600.0
     """Wall time for which it waits for a command, at rate 0."""
@@ -144,7 +144,7 @@ class VehicleNode:
     def run(self, pace: Pace) -> str:
         """Simulate tick by tick; why it ended."""
         begun, late = time.monotonic(), 0
-        while self.now_s - START_S < pace.longest_s:
+        while self.now_s - START_S < pace.max_s:
             estimate = self.vehicle.sense()
             self.track.append([self.now_s, *self.vehicle.world.now[:7].tolist()])
             if self.vehicle.touches_floor:
@@ -164,7 +164,7 @@ class VehicleNode:
                 f"{late} of {self.vehicle.tick} ticks were late: the machine does not keep the "
                 f"rate {pace.rate:g}; lower it"
             )
-        return f"{pace.longest_s:g} s are over"
+        return f"{pace.max_s:g} s are over"
 
     def _answered(self, readings: list[tuple[Any, Any]], patience_s: float) -> bool:
         """Wait for the command of this tick; whether one came, or false if none will."""
@@ -266,8 +266,8 @@ class VehicleNode:
         north, east, depth = self.vehicle.world.now[:3] + turn.apply(place)
         beam_n, beam_e, beam_d = turn.apply([0.0, 0.0, 1.0])
         reach = floor_range(
-            self.vehicle.floor, north, east, depth, beam_n, beam_e, beam_d, dvl.most_range_m
+            self.vehicle.floor, north, east, depth, beam_n, beam_e, beam_d, dvl.max_range_m
         )
         noise = math.hypot(dvl.range_noise_m, dvl.range_noise_fraction * reach)
         found = reach + noise * float(self.rng.standard_normal())
-        return found if found >= dvl.least_range_m else math.nan
+        return found if found >= dvl.min_range_m else math.nan

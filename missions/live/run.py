@@ -11,7 +11,7 @@ from alice_survey.core.errors import note
 from alice_survey.core.trajectory import write_track
 from alice_survey.sim.vehicle.simulated_vehicle import SimulatedVehicle
 from missions.fly.run import flight_noise, true_floor
-from missions.fly.simulation import flight_settings, longest_mission_s, mission_setup
+from missions.fly.simulation import flight_settings, max_mission_s, mission_setup
 from missions.live.loop import LinkLimits
 from missions.live.mission import LiveMission, mission_of, need_thrusters_alone, plan_to_fly
 from missions.live.ros_vehicle import Pace, vehicle_over_ros
@@ -95,7 +95,7 @@ def simulate_report(
     plan = plan_to_fly(workspace, survey.vehicle.dive)
     rng = flight_noise(survey.seed)
     setup = mission_setup(
-        plan, flight_settings(survey), true_floor(plan, survey), longest_mission_s(plan), rng
+        plan, flight_settings(survey), true_floor(plan, survey), max_mission_s(plan), rng
     )
     need_thrusters_alone(setup.vehicle)
     if setup.failures:

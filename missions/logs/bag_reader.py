@@ -13,7 +13,7 @@ from alice_survey.core.errors import NavigationError
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
-LARGEST_BYTES = 256 << 20
+MAX_BYTES = 256 << 20
 """Largest chunk of a bag, unpacked, since a kilobyte of bz2 or zstd can hold a gigabyte. Recorders
 close theirs after 1 to 4 MB, or after one message."""
 
@@ -77,7 +77,7 @@ def opened_bag(path: Path) -> Iterator["AnyReader"]:
 
 @contextmanager
 def _bounded_chunks() -> Iterator[None]:
-    """Meanwhile rosbags unpacks no chunk of over `LARGEST_BYTES`: it raises ValueError.
+    """Meanwhile rosbags unpacks no chunk of over `MAX_BYTES`: it raises ValueError.
 
     It has no setting for that: its tables of what unpacks a chunk are changed, and put back.
     """
@@ -100,11 +100,9 @@ def _bounded_chunks() -> Iterator[None]:
 
 def _bounded(decompressor: Callable[[], Any]) -> Callable[[bytes], bytes]:
     def unpack(data: bytes) -> bytes:
-        unpacked: bytes = decompressor().decompress(data, LARGEST_BYTES + 1)
-        if len(unpacked) > LARGEST_BYTES:
-            raise ValueError(
-                f"a chunk of {len(data)} bytes unpacks to over {LARGEST_BYTES >> 20} MiB"
-            )
+        unpacked: bytes = decompressor().decompress(data, MAX_BYTES + 1)
+        if len(unpacked) > MAX_BYTES:
+            raise ValueError(f"a chunk of {len(data)} bytes unpacks to over {MAX_BYTES >> 20} MiB")
         return unpacked
 
     return unpack

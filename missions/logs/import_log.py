@@ -22,8 +22,8 @@ from missions.values.navigation import COLUMNS, write_navigation_rows
 _NAMED = 8
 _JSON = (".json", ".jsonl", ".log", ".txt", "")
 """What files of JSON reports are called."""
-_LONGEST_S = 1e9
-_MOST_OUT_OF_WATER_M = 2.0
+_MAX_S = 1e9
+_MAX_OUT_OF_WATER_M = 2.0
 """A vehicle on deck, or a barometer that is off, seldom is higher."""
 _MICRO = 1e6
 
@@ -69,7 +69,7 @@ class ImportOptions:
         )  # fmt: skip
         if not all(math.isfinite(number) for number in numbers):
             raise NavigationError("declination, offsets and lever arm need finite numbers")
-        if abs(self.clock_offset_s) > _LONGEST_S:
+        if abs(self.clock_offset_s) > _MAX_S:
             raise NavigationError(f"--clock-offset {self.clock_offset_s:g} s is more than 30 years")
         if abs(self.declination_deg) > 180:
             raise NavigationError(
@@ -145,7 +145,7 @@ def import_log(
 
 def _warn_of_height(path: Path, depth_m: Array) -> None:
     """Warn of places that no submarine gets to."""
-    dry = depth_m < -_MOST_OUT_OF_WATER_M
+    dry = depth_m < -_MAX_OUT_OF_WATER_M
     if dry.any():
         warn(
             f"{path}: {int(dry.sum())} of {len(dry)} rows lie above the water, by "

@@ -77,7 +77,7 @@ def gap_of_interval_s(interval_s: float) -> float:
     return max(_GAP_S, _GAP_INTERVALS * interval_s)
 
 
-def _longest_gap_of(known_s: Array, time_s: Array) -> float:
+def _max_gap_of(known_s: Array, time_s: Array) -> float:
     """Seconds between known values, at times (K,) among those of all rows (T,), for the same.
 
     Positions may be rarer than depths in one log; few of them show no rate of their own.
@@ -106,7 +106,7 @@ def interpolated(time_s: Array, values: Array, at_s: Array, *, turning: bool) ->
     before = np.clip(np.searchsorted(times, at_s, side="right") - 1, 0, len(times) - 1)
     with np.errstate(invalid="ignore"):
         inside = (at_s >= times[0]) & (at_s <= times[-1])
-        inside &= times[after] - times[before] <= _longest_gap_of(times, time_s)
+        inside &= times[after] - times[before] <= _max_gap_of(times, time_s)
     smooth = np.unwrap(values, period=360.0) if turning else values
     found[inside] = np.interp(at_s[inside], times, smooth)
     return found

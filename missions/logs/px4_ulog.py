@@ -33,7 +33,7 @@ _TYPES = {
 _FIELD = re.compile(r"(\w+)(?:\[(\d+)\])? +(\w+)")
 _APPENDED = 1
 """Flag of a log that was written on later, after a crash."""
-_DEEPEST, _MOST_FIELDS = 8, 4096
+_DEEPEST, _MAX_FIELDS = 8, 4096
 _FIX_3D = 3
 _DOWN = 25
 """ROTATION_PITCH_270: a range finder that looks down."""
@@ -279,7 +279,7 @@ def _dtype(name: str, forms: Mapping[str, str]) -> np.dtype[Any] | None:
     fields = _fields(name, forms, 0)
     while fields and fields[-1][0].startswith("_padding"):
         fields.pop()
-    if not fields or any(not kind for _, kind in fields) or len(fields) > _MOST_FIELDS:
+    if not fields or any(not kind for _, kind in fields) or len(fields) > _MAX_FIELDS:
         return None
     if len({field for field, _ in fields}) < len(fields):
         return None
@@ -291,7 +291,7 @@ def _fields(name: str, forms: Mapping[str, str], depth: int) -> list[tuple[str, 
     found: list[tuple[str, str]] = []
     for text in filter(None, forms.get(name, "").split(";")):
         match = _FIELD.fullmatch(text.strip())
-        if match is None or depth > _DEEPEST or len(found) > _MOST_FIELDS:
+        if match is None or depth > _DEEPEST or len(found) > _MAX_FIELDS:
             return [(text, "")]
         kind, count, field = match[1], match[2], match[3]
         if field.startswith("_padding"):

@@ -468,8 +468,8 @@ def _imu(m: Any) -> list[float]:
 
 def _range(m: Any) -> list[float]:
     """Not finite, or outside of what the sensor measures, is no echo (REP-117)."""
-    most = m.max_range if m.max_range > 0 else math.inf
-    known = math.isfinite(m.range) and m.min_range <= m.range <= most
+    maximum = m.max_range if m.max_range > 0 else math.inf
+    known = math.isfinite(m.range) and m.min_range <= m.range <= maximum
     return [m.range if known else _NOTHING]
 
 

@@ -20,7 +20,7 @@ from alice_survey.core.errors import NavigationError
 from missions.logs.dive import DATED_AFTER_S, LoggedDive, cleaned, finite_number
 
 VELOCITY, ATTITUDE = "velocity", "position_local"
-_LONGEST_LINE = 100_000
+_MAX_LINE = 100_000
 _LOOKED_AT = 20
 """Lines at which a file is recognised: the first may be cut."""
 _MICRO, _MILLI = 1e-6, 1e-3
@@ -30,7 +30,7 @@ def is_waterlinked(path: Path) -> bool:
     """Whether a file holds such reports."""
     try:
         with path.open("rb") as file:
-            lines = [file.readline(_LONGEST_LINE) for _ in range(_LOOKED_AT)]
+            lines = [file.readline(_MAX_LINE) for _ in range(_LOOKED_AT)]
     except OSError:
         return False
     return any(
@@ -92,7 +92,7 @@ def read_waterlinked(path: Path, requested: Mapping[str, str]) -> LoggedDive:
 def _reports(path: Path, lost: Counter[str]) -> Iterator[dict[str, Any]]:
     try:
         with path.open("rb") as file:
-            while line := file.readline(_LONGEST_LINE):
+            while line := file.readline(_MAX_LINE):
                 report = _report(line)
                 if report is None and line.strip():
                     lost["lines that are no report"] += 1

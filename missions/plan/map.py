@@ -29,8 +29,8 @@ from missions.plan.page_map import COLOURS, KINDS
 from missions.plan.planner import area_bathymetry
 from missions.values.plan_file import Plan, read_plan
 
-_MOST_ARROWS = 500
-_MOST_FOOTPRINTS = 3000
+_MAX_ARROWS = 500
+_MAX_FOOTPRINTS = 3000
 """Most footprints drawn one by one; beyond, the count of pictures shows what they cover."""
 _ALLOWED_BEYOND = 0.3
 """Share of the map by which the allowed area may be larger than all else and is still shown whole.
@@ -106,7 +106,7 @@ def plan_figure(
         _bounds(np.vstack([plan.area.corners_ne[:, :2], *shapes, *ways]), plan)
     )
     draw_counts(axes, certificate, opacity=0.6)
-    if len(shapes) <= _MOST_FOOTPRINTS:
+    if len(shapes) <= _MAX_FOOTPRINTS:
         _draw_footprints(axes, shapes, rig)
     _draw_area(axes, plan)
     _draw_route(axes, plan, ways)
@@ -208,7 +208,7 @@ def _draw_lines(axes: Axes, plan: Plan) -> None:
         )
         places = np.vstack([line.stations_ne for line in lines])
         axes.scatter(places[:, 1], places[:, 0], s=size, color=colour, zorder=5, lw=0)
-    if len(plan.lines) <= _MOST_ARROWS:
+    if len(plan.lines) <= _MAX_ARROWS:
         axes.add_collection(PolyCollection(_arrows(plan), facecolors=INK, zorder=6))
 
 

@@ -37,14 +37,14 @@ _RAMP = (
 )  # fmt: skip
 _DETAIL = 1 / 5000
 _FINEST_M = 0.005
-_MOST_CELLS = 420
+_MAX_CELLS = 420
 """Most cells on a side of the picture of counts."""
-_MOST_COUNT = 254
+_MAX_COUNT = 254
 """Highest number of pictures in the picture of counts, where 255 is outside of the area."""
 _CONTOURS = 10
 _CONTOUR_POINTS = 160
 """Points on each side of the grid that contours are drawn from."""
-_LEAST_RELIEF_M = 0.01
+_MIN_RELIEF_M = 0.01
 _OPAQUE, _MISSED_OPACITY = 215, 190
 """Opacities out of 255."""
 
@@ -273,7 +273,7 @@ def contour_layer(bathymetry: Bathymetry, extent: Extent, detail_m: float) -> It
     grid = np.stack(np.meshgrid(norths, easts, indexing="ij"), axis=-1)
     depth = bathymetry.depth_at(grid)
     known = np.extract(np.isfinite(depth), depth)
-    if not len(known) or np.ptp(known) < _LEAST_RELIEF_M:
+    if not len(known) or np.ptp(known) < _MIN_RELIEF_M:
         return
     step = _round_up(float(np.ptp(known)) / _CONTOURS)
     generator = contour_generator(
@@ -305,13 +305,13 @@ def _coverage_layers(seen: Certificate) -> list[Layer]:
     rgb, corner, pixel_m = counts_picture(seen)
     pictures, met = rgb[..., 0], rgb[..., 2] > 0
     within = pictures < 255
-    most = max(1, min(int(np.percentile(seen.pictures[seen.inside], 99.0)), _MOST_COUNT))
-    steps = np.minimum((pictures / most * (len(_RAMP) - 1)).astype(int), len(_RAMP) - 1)
+    maximum = max(1, min(int(np.percentile(seen.pictures[seen.inside], 99.0)), _MAX_COUNT))
+    steps = np.minimum((pictures / maximum * (len(_RAMP) - 1)).astype(int), len(_RAMP) - 1)
     palette = np.array([[*_channels(colour), _OPAQUE] for colour in _RAMP], dtype=np.uint8)
     counts = palette[steps] * within[..., None].astype(np.uint8)
     missed = np.zeros_like(counts)
     missed[within & ~met] = [*_channels(COLOURS["missed"]), _MISSED_OPACITY]
-    scale = Scale(label="pictures that see a place", low=0, high=most, colours=_RAMP)
+    scale = Scale(label="pictures that see a place", low=0, high=maximum, colours=_RAMP)
 
     return [
         picture_layer(
@@ -358,15 +358,15 @@ def counts_picture(seen: Certificate) -> tuple[NDArray[np.uint8], tuple[float, f
         corner; and the side of a pixel, metres.
     """
     grid = seen.grid
-    block = max(1, math.ceil(max(grid.rows, grid.columns) / _MOST_CELLS))
+    block = max(1, math.ceil(max(grid.rows, grid.columns) / _MAX_CELLS))
     inside = _blocks(seen.inside, block, fill=False)
     pictures = np.where(inside, _blocks(seen.pictures, block, fill=0), 65535).min(axis=(1, 3))
     lines = np.where(inside, _blocks(seen.least_lines, block, fill=0), 65535).min(axis=(1, 3))
     met = (_blocks(seen.at_overlap, block, fill=True) | ~inside).all(axis=(1, 3))
     within = inside.any(axis=(1, 3))
     cells = np.zeros((*within.shape, 3), dtype=np.uint8)
-    cells[..., 0] = np.where(within, np.minimum(pictures, _MOST_COUNT), 255)
-    cells[..., 1] = np.where(within, np.minimum(lines, _MOST_COUNT), 0)
+    cells[..., 0] = np.where(within, np.minimum(pictures, _MAX_COUNT), 255)
+    cells[..., 1] = np.where(within, np.minimum(lines, _MAX_COUNT), 0)
     cells[..., 2] = np.where(within, met, 0)
     corners = grid.places_of(block * np.array([[0, 0], [0, 1], [1, 0], [1, 1]]) * within.shape)
     low, high = corners.min(axis=0), corners.max(axis=0)

@@ -207,7 +207,7 @@ def _plan_part(
         run_in_m=wanted.run_in_m,
         turns=wanted.turns,
         usable_wh=usable_wh,
-        longest_s=math.inf if wanted.dive_s is None else wanted.dive_s,
+        max_s=math.inf if wanted.dive_s is None else wanted.dive_s,
         depth_m=depth_m,
         split=wanted.split_dives,
         tied=wanted.tie_dives,

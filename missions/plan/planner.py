@@ -25,7 +25,7 @@ from missions.areas.bathymetry import Bathymetry, mean_depth_m, read_bathymetry
 from missions.areas.survey import survey_area
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.stations import (
-    MOST_ALTITUDES,
+    MAX_ALTITUDES,
     Stations,
     stations_of_plan,
     sure_pattern,
@@ -76,25 +76,25 @@ class Planned:
     """Every setting with its equation, source and limit."""
 
 
-def plan_survey(config: SurveyConfig, rig: Rig, *, most_cells: int | None = None) -> Planned:
+def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None) -> Planned:
     """Plan a survey.
 
     Args:
         config: the survey.
         rig: its cameras in water.
-        most_cells: of the certificate of a large area, for a quick look; all else stays the same.
+        max_cells: of the certificate of a large area, for a quick look; all else stays the same.
 
     Raises:
         PlanError: no plan meets the settings; the message names the numbers, and of ways out
             those that were tried up to where lines are laid.
     """
     try:
-        return _planned(config, rig, most_cells)
+        return _planned(config, rig, max_cells)
     except ConflictError as found:
         raise with_tried_ways(found, config, rig) from None
 
 
-def _planned(config: SurveyConfig, rig: Rig, most_cells: int | None) -> Planned:
+def _planned(config: SurveyConfig, rig: Rig, max_cells: int | None) -> Planned:
     with heard() as warnings:
         config, as_set = as_flown(config), config.plan
         wanted = config.plan
@@ -174,7 +174,7 @@ def _planned(config: SurveyConfig, rig: Rig, most_cells: int | None) -> Planned:
             details={},
         )
         stations = _stations(plan, bathymetry)
-        seen = certificate(area, rig, stations, pattern, most_cells=most_cells)
+        seen = certificate(area, rig, stations, pattern, max_cells=max_cells)
         if seen.share_at_overlap < _ENOUGH:
             warn(
                 f"{1 - seen.share_at_overlap:.2%} of the area gets less overlap than requested, "
@@ -301,11 +301,11 @@ def _stations(plan: Plan, bathymetry: Bathymetry | None) -> Stations:
     places = np.vstack([line.stations_ne for line in plan.lines])
     stations = stations_of_plan(plan, bathymetry.depth_at(places))
     # As for a dive: from too high a place, what is seen is not what was requested.
-    near = stations.altitude_m <= MOST_ALTITUDES * plan.altitude_m
+    near = stations.altitude_m <= MAX_ALTITUDES * plan.altitude_m
     if not near.all():
         warn(
             f"{np.count_nonzero(~near)} of {len(near)} pictures are taken from more than "
-            f"{MOST_ALTITUDES:g} times altitude_m, where the terrain is too steep to follow: they "
+            f"{MAX_ALTITUDES:g} times altitude_m, where the terrain is too steep to follow: they "
             "do not count as coverage; raise steepest_deg, turn the lines along the slope "
             "(line_heading_deg), or survey the steep part apart"
         )
@@ -321,10 +321,10 @@ def _check_rating(craft: Vehicle, deepest_m: float) -> None:
 
 
 def _check_smallest(area: Area, imaging: ImagingSettings) -> None:
-    least_m = min(imaging.footprint_across_m, imaging.footprint_along_m)
+    min_m = min(imaging.footprint_across_m, imaging.footprint_along_m)
     north_0, east_0, north_1, east_1 = area.survey.bounds
     diagonal_m = math.hypot(north_1 - north_0, east_1 - east_0)
-    if diagonal_m < least_m:
+    if diagonal_m < min_m:
         raise PlanError(
             f"area: {diagonal_m:.2g} m across is less than one picture of "
             f"{imaging.footprint_across_m:.2f} x {imaging.footprint_along_m:.2f} m: nothing to "

@@ -1,7 +1,7 @@
 """A plan at a glance, as JSON values for a page that plans while somebody draws.
 
 All totals are those of the plan itself. Only the certificate of a large area is counted on a
-coarser grid (`MOST_CELLS`): the shares that it gives, and the holes, are then estimates, and
+coarser grid (`MAX_CELLS`): the shares that it gives, and the holes, are then estimates, and
 `certificate.estimated` says so.
 """
 
@@ -30,9 +30,9 @@ from missions.plan.playback import depths_along
 from missions.route.energy import craft_of, usable_wh
 from missions.values.plan_file import Plan
 
-MOST_CELLS = 400_000
+MAX_CELLS = 400_000
 """Cells of the certificate of a large area."""
-_MOST_HOLES = 60
+_MAX_HOLES = 60
 _PROFILE_POINTS = 600
 _DETAIL = 1 / 5000
 """Of the plan's width: what a way may lie off its drawing."""
@@ -54,7 +54,7 @@ def preview(config: SurveyConfig) -> dict[str, Any]:
     try:
         with collected_by(lambda _, __: None):
             rig = design_rig(config.camera, config.water)
-            planned = plan_survey(config, rig, most_cells=MOST_CELLS)
+            planned = plan_survey(config, rig, max_cells=MAX_CELLS)
             found = planned_json(planned, rig, config)
     except AliceError as error:
         found = refusal_json(error)
@@ -167,50 +167,50 @@ def _totals(planned: Planned, rig: Rig, config: SurveyConfig) -> dict[str, Any]:
 def _limits(planned: Planned, config: SurveyConfig) -> Iterator[dict[str, Any]]:
     """The limits of the plan: which keep it from being better, and how far off the others are."""
     plan, imaging, wanted = planned.plan, planned.imaging, config.plan
-    most, least = _at_most, _at_least
+    maximum, minimum = _at_most, _at_least
     longest = max(plan.dives, key=lambda dive: dive.energy_wh)
-    yield most(
+    yield maximum(
         "battery", longest.energy_wh, usable_wh(config.vehicle), "Wh",
         "energy of the longest dive, of what the battery has above its reserve",
         binds=len(plan.dives) > len(plan.homes_ne_m),
     )  # fmt: skip
     if wanted.dive_s is not None:
         time_s = max(dive.duration_s for dive in plan.dives)
-        yield most("plan.dive_s", time_s, wanted.dive_s, "s", "time of the longest dive")
-    yield least(
+        yield maximum("plan.dive_s", time_s, wanted.dive_s, "s", "time of the longest dive")
+    yield minimum(
         "camera.shortest_interval_s", imaging.interval_s, imaging.shortest_interval_s, "s",
         "time between pictures, of the least that cameras and trigger take",
     )  # fmt: skip
-    yield most(
+    yield maximum(
         "plan.allowed_blur_px", imaging.blur_px, wanted.allowed_blur_px, "px",
         "motion blur: it sets how long pictures are exposed",
     )  # fmt: skip
-    yield most(
+    yield maximum(
         "plan.sharp_px", imaging.focus.blur_px, wanted.sharp_px, "px",
         "blur out of focus at the ends of the relief",
     )  # fmt: skip
-    yield most(
+    yield maximum(
         "light", imaging.light.needed_light, 1.0, "",
         "light that is needed, as a share of what strobes and water give",
     )  # fmt: skip
-    yield least(
+    yield minimum(
         "plan.least_clearance_m", wanted.altitude_m - wanted.relief_m, wanted.least_clearance_m,
         "m", "height above the top of the relief",
     )  # fmt: skip
     if planned.plan.details["stereo_swath_m"]:
-        yield most(
+        yield maximum(
             "stereo swath", plan.line_spacing_m, plan.details["stereo_swath_m"], "m",
             "distance between lines, of the width that all cameras see",
         )  # fmt: skip
-    yield most(
+    yield maximum(
         "plan.turn_rate_limit_deg_s", plan.details["turn_rate_deg_s"],
         wanted.turn_rate_limit_deg_s, "deg/s", "rate of turn in arcs",
     )  # fmt: skip
-    yield most(
+    yield maximum(
         "strobe duty", imaging.strobe.duty, imaging.strobe.duty_limit, "",
         "share of the time that LEDs are lit, of what they bear in warm water",
     )  # fmt: skip
-    yield most(
+    yield maximum(
         "one cable", 1.0 / imaging.interval_s, imaging.storage.shared_link_hz, "Hz",
         "triggers a second, of what one cable carries of all cameras",
     )  # fmt: skip
@@ -218,7 +218,9 @@ def _limits(planned: Planned, config: SurveyConfig) -> Iterator[dict[str, Any]]:
     if rating_m is not None:
         deepest = max((max(row) for row in plan.line_depths_m), default=math.nan)
         depth_m = deepest if plan.line_depths_m else plan.seafloor_depth_m - plan.altitude_m
-        yield most("depth rating", depth_m, rating_m, "m", "depth, of what the hull is built for")
+        yield maximum(
+            "depth rating", depth_m, rating_m, "m", "depth, of what the hull is built for"
+        )
 
 
 def _at_most(
@@ -247,7 +249,7 @@ def _reason(row: Setting) -> str:
 
 def _holes(seen: Certificate) -> list[dict[str, Any]]:
     found = []
-    for hole in find_holes(seen)[:_MOST_HOLES]:
+    for hole in find_holes(seen)[:_MAX_HOLES]:
         outer = max(hole.outline.geoms, key=lambda part: float(part.area)).exterior
         found.append(
             {

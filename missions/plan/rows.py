@@ -66,8 +66,8 @@ def _line_rows(plan: Plan, sweep: Sweep | None) -> Sequence[Setting]:
     if sweep is None:
         why, bound = "as set", "line_heading_deg"
     else:
-        least = math.degrees(sweep.width_heading_rad) % 180.0
-        why = f"least total width along {least:.1f} deg; then turns, ways and current are counted"
+        minimum = math.degrees(sweep.width_heading_rad) % 180.0
+        why = f"least total width along {minimum:.1f} deg; then turns, ways and current are counted"
         bound = "energy"
     return (
         _row("area", plan.area.survey.area, "m2", "as given, with margin_m", "[area]"),

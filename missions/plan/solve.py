@@ -137,15 +137,15 @@ def area_for_dive(config: SurveyConfig, dive_s: float) -> DiveArea:
         return time_s <= dive_s and energy_j <= usable_j
 
     smallest = settings.footprint_along_m
-    least_s, least_j = needs(smallest)
-    if least_s > dive_s:
+    min_s, min_j = needs(smallest)
+    if min_s > dive_s:
         raise PlanError(
             f"a dive of {dive_s:g} s is too short: {dive_down_s:.0f} s go down and up, and one "
-            f"picture's length takes {least_s:.0f} s in all: give a longer dive"
+            f"picture's length takes {min_s:.0f} s in all: give a longer dive"
         )
-    if least_j > usable_j:
+    if min_j > usable_j:
         raise PlanError(
-            f"one picture's length takes {least_j / 3600:.3g} Wh with the way down and up, the "
+            f"one picture's length takes {min_j / 3600:.3g} Wh with the way down and up, the "
             f"battery has {usable_j / 3600:.3g} above its reserve: raise vehicle.battery_wh"
         )
     low, high = smallest, 2.0 * math.sqrt(dive_s * plan.speed_mps * spacing) + smallest

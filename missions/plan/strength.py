@@ -145,21 +145,21 @@ def _waits(flown: FlightConditions, held_mps: float) -> Iterator[Way]:
     towards_deg = math.degrees(math.atan2(*flown.current_ne_mps[::-1])) % 360.0
     weaker = {"sea.current_file": None, "sea.current_towards_deg": towards_deg}
 
-    def wait(most_mps: float, also: str, more: Settings) -> Way:
+    def wait(max_mps: float, also: str, more: Settings) -> Way:
         return Way(
-            change=f"wait for a current of {most_mps:.2f} m/s (sea.current_mps){also}",
-            price=f"{1.0 - most_mps / size:.0%} less current",
-            cost=1.0 - most_mps / size,
-            settings={**weaker, "sea.current_mps": most_mps, **more},
+            change=f"wait for a current of {max_mps:.2f} m/s (sea.current_mps){also}",
+            price=f"{1.0 - max_mps / size:.0%} less current",
+            cost=1.0 - max_mps / size,
+            settings={**weaker, "sea.current_mps": max_mps, **more},
         )
 
     if held_mps > 0.0:
         yield wait(held_mps, "", {})
     if flown.line_heading_deg is not None:
-        most_mps = held_current_mps(replace(flown, line_heading_deg=None))
-        if held_mps < most_mps < size:
+        max_mps = held_current_mps(replace(flown, line_heading_deg=None))
+        if held_mps < max_mps < size:
             yield wait(
-                most_mps, " and leave plan.line_heading_deg out", {"plan.line_heading_deg": None}
+                max_mps, " and leave plan.line_heading_deg out", {"plan.line_heading_deg": None}
             )
 
 

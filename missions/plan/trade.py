@@ -231,16 +231,16 @@ def draw_trade(path: Path, flown: FlightConditions, *, imaging_w: float = 0.0) -
             0.5, 0.7, "no course can be flown\nin this current", transform=axes.transAxes,
             ha="center", bbox={"facecolor": "white", "edgecolor": "none"},
         )  # fmt: skip
-    most = float(np.max(seen[np.isfinite(seen)], initial=1.0))
-    axes.set_ylim(0.0, 1.05 * most)
+    maximum = float(np.max(seen[np.isfinite(seen)], initial=1.0))
+    axes.set_ylim(0.0, 1.05 * maximum)
     axes.set_rlabel_position((math.degrees(towards) + 45.0) % 360.0)
     if size > 0.0:
         axes.annotate(
-            "", xy=(towards, 0.45 * most), xytext=(towards + math.pi, 0.45 * most),
+            "", xy=(towards, 0.45 * maximum), xytext=(towards + math.pi, 0.45 * maximum),
             arrowprops={"arrowstyle": "-|>", "color": "0.35", "lw": 1.8}, zorder=5,
         )  # fmt: skip
         axes.text(
-            towards, 0.72 * most, f"current\n{size:.2f} m/s", color="0.35", ha="center",
+            towards, 0.72 * maximum, f"current\n{size:.2f} m/s", color="0.35", ha="center",
             va="center", bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.5},
         )  # fmt: skip
     axes.set_title(

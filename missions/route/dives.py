@@ -82,7 +82,7 @@ def split_dives(
     run_in_m: float,
     turns: Turns,
     usable_wh: float,
-    longest_s: float | None,
+    max_s: float | None,
     depth_m: float,
     split: bool,
     tied: bool = False,
@@ -98,7 +98,7 @@ def split_dives(
         run_in_m: straight before and after a line.
         turns: how to turn.
         usable_wh: of the battery.
-        longest_s: of a dive, descent and ascent included; None: as long as the battery lasts.
+        max_s: of a dive, descent and ascent included; None: as long as the battery lasts.
         depth_m: that the vehicle goes down to and comes up from, once a dive.
         split: whether there may be more than one.
         tied: whether each begins with the last line of the one before, which is not a fill line:
@@ -118,9 +118,7 @@ def split_dives(
     def routed(first: int, last: int) -> Array:
         return legs_through(table[first : last + 1], first_line=first, **way)
 
-    limits = DiveLimits(
-        energy_j=usable_wh * _J_PER_WH, time_s=math.inf if longest_s is None else longest_s
-    )
+    limits = DiveLimits(energy_j=usable_wh * _J_PER_WH, time_s=math.inf if max_s is None else max_s)
     down_and_up = costs.dive_j(depth_m), costs.dive_s(depth_m)
     whole = routed(0, len(lines) - 1)
     spent = np.stack(leg_row_costs(whole[:, 2:], costs))
@@ -132,7 +130,7 @@ def split_dives(
     sums = _sums(whole, spent, *legs_alone(table, **way), costs, depth_m)
     if not split:
         raise PlanError(_too_large(lines, sums, limits, float(energy_j), float(time_s)))
-    parted = _least_dives(sums, limits)
+    parted = _min_dives(sums, limits)
     if parted is None:
         raise PlanError(_line_too_long(lines, sums, limits, depth_m))
     if tied:
@@ -150,7 +148,7 @@ def _tied(
 ) -> list[tuple[int, int]]:
     """Dives that share a line each, or those given where these would be more or dear."""
     fill = np.array([line.kind == "fill" for line in lines])
-    joined = _least_dives(sums, limits, (np.flatnonzero(fill) + 1).tolist(), overlap=1)
+    joined = _min_dives(sums, limits, (np.flatnonzero(fill) + 1).tolist(), overlap=1)
     if joined is None or len(joined) > len(parted):
         return parted
     energy_j, apart_j = (sum(sums.of(*dive)[0] for dive in dives) for dives in (joined, parted))
@@ -214,7 +212,7 @@ def _sums(
     )
 
 
-def _least_dives(
+def _min_dives(
     sums: _Sums, limits: DiveLimits, not_at: Sequence[int] = (), overlap: int = 0
 ) -> list[tuple[int, int]] | None:
     """First and last line of each dive; None where some line fits no dive by itself.
@@ -281,17 +279,19 @@ def _parted(
             or through[1, last] - until[1, earliest] > time_s
         ):
             earliest += 1
-        least, total = np.inf, np.inf
+        minimum, total = np.inf, np.inf
         for first in range(earliest, last + 1):
             flown = max(first - overlap, 0)
             dive_j = home_to[0, flown] + (through[0, last] + back[0, last]) - until[0, flown]
             dive_s = home_to[1, flown] + (through[1, last] + back[1, last]) - until[1, flown]
             if not (may_begin[first] and dive_j <= energy_j and dive_s <= time_s):
                 continue
-            if dives[first] < least or (dives[first] == least and spent[first] + dive_j < total):
-                least, total = dives[first], spent[first] + dive_j
+            if dives[first] < minimum or (
+                dives[first] == minimum and spent[first] + dive_j < total
+            ):
+                minimum, total = dives[first], spent[first] + dive_j
                 begins[last + 1] = first
-        dives[last + 1], spent[last + 1] = least + 1.0, total
+        dives[last + 1], spent[last + 1] = minimum + 1.0, total
     return begins, dives
 
 
@@ -324,7 +324,7 @@ def _too_large(
     last = fitting[-1] if fitting else -1
     done = sum(line.length_m for line in lines[: last + 1])
     share = done / max(sum(line.length_m for line in lines), 1e-9)
-    parted = _least_dives(sums, limits)
+    parted = _min_dives(sums, limits)
     ways = []
     if parted is not None:
         ways.append(f"split_dives = true ({len(parted)} dives)")

@@ -34,7 +34,7 @@ def moved(
 
 
 @compiled_ieee
-def shortest_turn(fence: Fence, start: Array, goal: Array, radius: float) -> Array:
+def min_turn(fence: Fence, start: Array, goal: Array, radius: float) -> Array:
     """The shortest path of the six kinds that stays inside.
 
     Args:
@@ -50,10 +50,10 @@ def shortest_turn(fence: Fence, start: Array, goal: Array, radius: float) -> Arr
     best = np.full((3, 2), np.inf)
     tried = np.zeros(words.shape[0], dtype=np.bool_)
     for _ in range(words.shape[0]):
-        least, chosen = np.inf, -1
+        minimum, chosen = np.inf, -1
         for i in range(words.shape[0]):
-            if not tried[i] and words[i, 6] < least - _TINY:
-                least, chosen = words[i, 6], i
+            if not tried[i] and words[i, 6] < minimum - _TINY:
+                minimum, chosen = words[i, 6], i
         if chosen < 0:
             break
         tried[chosen] = True

@@ -35,7 +35,7 @@ from alice_survey.core.errors import PlanError, VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.files import coefficients_from_file, vehicle_to_fly
 from alice_survey.sim.vehicle.limits import STEP_MPS, spot_rate_rad_s
-from alice_survey.sim.vehicle.pilot.diving import MOST_PITCH_RAD
+from alice_survey.sim.vehicle.pilot.diving import MAX_PITCH_RAD
 from alice_survey.sim.vehicle.pilot.gains import STEADY_SHARE
 from alice_survey.sim.vehicle.steady import steady_flight
 from alice_survey.sim.vehicle.vehicle import Vehicle
@@ -68,7 +68,7 @@ class FlightConditions:
     current_ne_mps: Array
     """(2,) mean of the current that is expected."""
     turn_radius_m: float
-    most_spot_rad_s: float
+    max_spot_rad_s: float
     """Rate of turns on the spot, if the vehicle has the thrust for it."""
     glass_body_m: tuple[float, float, float]
     """The left port's outer glass, about which a vehicle with sway turns."""
@@ -104,7 +104,7 @@ def flight_conditions(config: SurveyConfig) -> FlightConditions:
         line_heading_deg=plan.line_heading_deg,
         current_ne_mps=expected_current(config.sea, config.area.seafloor_depth_m - plan.altitude_m),
         turn_radius_m=plan.arc_radius_m,
-        most_spot_rad_s=spot_rate_rad_s(plan.turn_rate_limit_deg_s),
+        max_spot_rad_s=spot_rate_rad_s(plan.turn_rate_limit_deg_s),
         glass_body_m=config.camera.position_body_m,
         hotel_w=hotel_w(config.vehicle),
         needs_arcs=plan.turns == "arcs" or bool(craft.fins),
@@ -411,12 +411,12 @@ def _spot(conditions: FlightConditions) -> tuple[float, float]:
     and is refused for it.
     """
     if conditions.craft.fins:
-        return _DEAR * _arc(conditions)[0], conditions.most_spot_rad_s
-    rates = conditions.most_spot_rad_s * np.append(_RATES, 0.0)
+        return _DEAR * _arc(conditions)[0], conditions.max_spot_rad_s
+    rates = conditions.max_spot_rad_s * np.append(_RATES, 0.0)
     power = _turning_power(conditions, np.zeros(len(rates)), rates)
     can = np.flatnonzero(np.isfinite(power[:-1]))
     if not len(can):
-        return math.inf, conditions.most_spot_rad_s
+        return math.inf, conditions.max_spot_rad_s
     rate = float(rates[can[0]])
     turning_s = math.pi / 2 / rate
     joules = power[can[0]] * turning_s + power[-1] * SETTLE_S
@@ -474,7 +474,7 @@ def _heave(conditions: FlightConditions) -> tuple[float, float]:
     """
     craft, current = conditions.craft, conditions.current_ne_mps
     if craft.fins:
-        return conditions.speed_mps * math.sin(MOST_PITCH_RAD), _arc(conditions)[0]
+        return conditions.speed_mps * math.sin(MAX_PITCH_RAD), _arc(conditions)[0]
     rates = np.concatenate([_HEAVES_MPS, -_HEAVES_MPS])
     nu = np.zeros((len(rates), 6))
     nu[:, 0], nu[:, 2] = math.hypot(*current), rates

@@ -22,7 +22,7 @@ TOUCH_M = 1e-6
 of coordinates of some kilometres."""
 _PAD_M = 4 * TOUCH_M
 _FULL = 2 * math.pi
-_MOST_CELLS = 256
+_MAX_CELLS = 256
 
 
 class Fence(NamedTuple):
@@ -62,7 +62,7 @@ def fence_of(allowed: MultiPolygon) -> Fence:
     edges = edges_of(allowed)
     edges = edges[(edges[:, 0] != edges[:, 2]) | (edges[:, 1] != edges[:, 3])]
     low, high = edges.reshape(-1, 2).min(axis=0), edges.reshape(-1, 2).max(axis=0)
-    cells = min(_MOST_CELLS, max(1, math.isqrt(len(edges))))
+    cells = min(_MAX_CELLS, max(1, math.isqrt(len(edges))))
     per_m = cells / np.maximum(high - low, 1.0)
     empty = OPEN_WATER._replace(
         edges=edges,
@@ -248,8 +248,8 @@ def straight_inside(fence: Fence, a_n: float, a_e: float, b_n: float, b_e: float
                 b_off = ((b_n - c_n) * (d_e - c_e) - (b_e - c_e) * (d_n - c_n)) / edge
                 if (a_off > 0.0) == (b_off > 0.0):
                     continue
-                least = min(min(abs(a_off), abs(b_off)), min(abs(c_off), abs(d_off)))
-                if least > TOUCH_M:
+                minimum = min(min(abs(a_off), abs(b_off)), min(abs(c_off), abs(d_off)))
+                if minimum > TOUCH_M:
                     return False
                 if filling:
                     cuts[count] = a_off / (a_off - b_off)

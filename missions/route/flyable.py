@@ -5,7 +5,7 @@ import math
 from alice_survey.core.config import PlanConfig, SurveyConfig
 from alice_survey.core.errors import PlanError
 from alice_survey.sim.vehicle.pilot.gains import STEADY_SHARE
-from alice_survey.sim.vehicle.under_way import held, least_radius_m
+from alice_survey.sim.vehicle.under_way import held, min_radius_m
 from alice_survey.sim.vehicle.vehicle import Vehicle
 from missions.route.energy import craft_of
 
@@ -46,14 +46,14 @@ def plan_as_flown(plan: PlanConfig, craft: Vehicle) -> PlanConfig:
         )
     if held(craft, plan.speed_mps, 0.0, STEADY_SHARE) is None:
         return plan
-    least_m = least_radius_m(craft, plan.speed_mps, STEADY_SHARE)
+    min_m = min_radius_m(craft, plan.speed_mps, STEADY_SHARE)
     if plan.turns == "auto":
-        radius_m = max(plan.arc_radius_m, math.ceil(10.0 * _ROOM * least_m) / 10.0)
+        radius_m = max(plan.arc_radius_m, math.ceil(10.0 * _ROOM * min_m) / 10.0)
         run_in_m = max(plan.run_in_m, radius_m)
         return plan.model_copy(update={"turn_radius_m": radius_m, "run_in_m": run_in_m})
-    if plan.turn_radius_m < least_m:
+    if plan.turn_radius_m < min_m:
         raise PlanError(
-            f"turn_radius_m {plan.turn_radius_m:g} is tighter than the {least_m:.2f} m that the "
+            f"turn_radius_m {plan.turn_radius_m:g} is tighter than the {min_m:.2f} m that the "
             f"fins of {craft.name} hold at {plan.speed_mps:g} m/s: raise it, or set turns = 'auto'"
         )
     return plan

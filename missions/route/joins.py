@@ -11,20 +11,20 @@ from numpy.typing import NDArray
 
 from alice_survey.core.compiled import compiled_ieee
 from alice_survey.core.frames import Array
-from missions.route.dubins import moved, shortest_turn
+from missions.route.dubins import min_turn, moved
 from missions.route.fence import Fence, straight_inside
 from missions.values.costs import Costs, power_at
 
 NONE, AHEAD, ARCS, SPOT, SWAY = 0, 1, 2, 3, 4
 """How two lines are joined; nothing direct, and straight on."""
 
-LONGEST_SWAY_M = 5.0
+MAX_SWAY_M = 5.0
 """Longest sway step. Chosen: some line spacings; farther the vehicle had better go ahead, since its
 lateral thrusters and its side's drag are made for correction, not for transit."""
 
 COLUMNS = 8
 """Columns of a leg: north, east, course, length, curvature, line, turn, side."""
-_MOST_LEGS = 8
+_MAX_LEGS = 8
 _TINY = 1e-9
 _SAME_M = 1e-6
 _DEAR_J = 1e15
@@ -52,7 +52,7 @@ def joined_lines(
         a way round corners should be compared.
     """
     count = lines.shape[0]
-    legs = np.empty((count * (_MOST_LEGS + 1), COLUMNS))
+    legs = np.empty((count * (_MAX_LEGS + 1), COLUMNS))
     rows = np.empty(count, dtype=np.int64)
     kinds = np.zeros(max(count - 1, 0), dtype=np.int64)
     detours = np.zeros(max(count - 1, 0), dtype=np.bool_)
@@ -99,7 +99,7 @@ def lines_alone(
         should be compared, as of `join`.
     """
     count = lines.shape[0]
-    legs = np.empty((count * (2 * _MOST_LEGS + 1), COLUMNS))
+    legs = np.empty((count * (2 * _MAX_LEGS + 1), COLUMNS))
     begins = np.zeros(2 * count + 1, dtype=np.int64)
     kinds = np.zeros(2 * count, dtype=np.int64)
     detours = np.zeros(2 * count, dtype=np.bool_)
@@ -197,7 +197,7 @@ def _by_arcs(
             place[2] = bearing
         elif not straight_inside(fence, known[0], known[1], place[0], place[1]):
             return np.inf, legs[:0]
-    pieces = shortest_turn(fence, start, arrival, radius)
+    pieces = min_turn(fence, start, arrival, radius)
     if pieces[0, 1] == np.inf:
         return np.inf, legs[:0]
     used = 0
@@ -259,7 +259,7 @@ def _sideways(
         east = goal[1] - last * math.sin(goal[2])
     corner_n, corner_e = end[0] + first * cos, end[1] + first * sin
     step = (east - corner_e) * cos - (north - corner_n) * sin
-    if abs(step) > LONGEST_SWAY_M or abs(step) < _SAME_M:
+    if abs(step) > MAX_SWAY_M or abs(step) < _SAME_M:
         return np.inf, legs[:0]
     track = ((end[0], end[1]), (corner_n, corner_e), (north, east), (goal[0], goal[1]))
     for i in range(3):

@@ -51,14 +51,14 @@ class Costs(NamedTuple):
     refused: Callable[[str], PlanError] | None = None
     """The error that says, of a leg in words, that the current forbids it, with the ways out."""
 
-    def compilable(self, most_w: float = math.inf) -> "Costs":
+    def compilable(self, max_w: float = math.inf) -> "Costs":
         """The costs for compiled code.
 
         Args:
-            most_w: powers by course are no higher; finite where totals have to be compared.
+            max_w: powers by course are no higher; finite where totals have to be compared.
         """
         bounded = {
-            name: np.minimum(getattr(self, name), most_w) for name in ("line_w", "way_w", "sway_w")
+            name: np.minimum(getattr(self, name), max_w) for name in ("line_w", "way_w", "sway_w")
         }
         return self._replace(**bounded, refused=None)
 

@@ -150,8 +150,8 @@ def camera_swath(rig: Rig, name: str, altitude_m: float, step_m: float) -> Swath
     top, starboard, bottom, port = sides_of(border)
     middle = (top[:, 0].min() + bottom[:, 0].max()) / 2
     return Swath(
-        port_m=_least_reach(port[:, 0] - middle, -port[:, 1], step_m),
-        starboard_m=_least_reach(middle - starboard[:, 0], starboard[:, 1], step_m),
+        port_m=_min_reach(port[:, 0] - middle, -port[:, 1], step_m),
+        starboard_m=_min_reach(middle - starboard[:, 0], starboard[:, 1], step_m),
         astern_m=float(-bottom[:, 0].max()),
         ahead_m=float(top[:, 0].min()),
     )
@@ -195,7 +195,7 @@ def step_for_overlap(extent_m: float, share: float) -> float:
     return extent_m * (1.0 - share)
 
 
-def _least_reach(along_m: Array, reach_m: Array, step_m: float) -> float:
+def _min_reach(along_m: Array, reach_m: Array, step_m: float) -> float:
     """Least reach of a side of the border within half a step of its middle.
 
     Args:

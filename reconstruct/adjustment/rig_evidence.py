@@ -20,7 +20,7 @@ _UNLIKELY = 1e-4
 """Probability of the whole pull, if the calibration were right, below which it is named."""
 _FAR = 2.0
 """Prior sigmas from which a parameter is named."""
-_MOST_NAMED = 4
+_MAX_NAMED = 4
 _NAMES = {
     "port_distance_m": "distance of the port",
     "normal_x": "tilt of the port",
@@ -83,7 +83,7 @@ def contradiction(
         return None
     pulls = change / sigmas
     order = np.argsort(-np.abs(pulls))
-    far = [int(k) for k in order if abs(pulls[k]) > _FAR][:_MOST_NAMED] or [int(order[0])]
+    far = [int(k) for k in order if abs(pulls[k]) > _FAR][:_MAX_NAMED] or [int(order[0])]
     return Contradiction(
         chi_square=total,
         directions=count,

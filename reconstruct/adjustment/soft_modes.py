@@ -26,7 +26,7 @@ _MODES = 32
 _MODES_TOLERANCE = 1e-4
 _ROWS = 10_000
 """Points whose motions are worked on at a time: in double precision they take much memory."""
-_LEAST_MODE = 1e-13
+_MIN_MODE = 1e-13
 """Variance of a mode over that of the softest, above rounding: where two parts of a model hardly
 hang together, one mode is kilometres large and others are millimetres."""
 
@@ -220,7 +220,7 @@ def soft_modes(
     operator: Any = LinearOperator((size, size), matvec=product, dtype=np.float64)
     start = np.random.default_rng(0).normal(size=size)  # any will do; the same modes each time
     values, vectors = eigsh(operator, k=count, which="LA", v0=start, tol=_MODES_TOLERANCE)
-    kept = np.flatnonzero(values > _LEAST_MODE * values.max())[::-1]
+    kept = np.flatnonzero(values > _MIN_MODE * values.max())[::-1]
     owns, shape, rigs, wholes = [], [], [], []
     for k in kept.tolist():
         own, step, rig = moved(vectors[:, k].reshape(stations, width))

@@ -42,7 +42,7 @@ from reconstruct.adjustment.pixel_parts import ALONE, Linearised, PixelParts, Wo
 from reconstruct.adjustment.rig_evidence import Contradiction, contradiction
 from reconstruct.adjustment.soft_modes import Motions, SoftModes
 from reconstruct.mapping.arrays import (
-    LEAST_POINTS,
+    MIN_POINTS,
     Indices,
     first_of,
     frames_of,
@@ -66,7 +66,7 @@ _RIG_SIGMAS = dict(zip(TURN_AND_SHIFT, [0.02] * 3 + [0.005] * 3, strict=True))
 _BASELINE_SIGMA_M = 1e-7
 """Sigma of an uncalibrated baseline: it is the scale, which no picture determines."""
 _STEPS = 20
-_MOST_PLACES = 100_000
+_MAX_PLACES = 100_000
 """Points whose motions by 65 parameters take 160 MB."""
 _SETTLED = 0.05
 """Length of a step of all parameters, in sigmas, at which the adjustment ends."""
@@ -202,7 +202,7 @@ def fit_survey(
     pixels, order = pixels.by_place(start.centres)
     start = replace(start, points=start.points[order])
     problem = SurveyProblem(pixels, start, free, workers)
-    found = minimise(problem, problem.start, settled=_SETTLED, most_steps=_STEPS)
+    found = minimise(problem, problem.start, settled=_SETTLED, max_steps=_STEPS)
     if not found.is_settled:
         warn(f"the last adjustment did not settle in {_STEPS} steps: trust it with care")
     equations, guess = found.equations, found.guess
@@ -237,7 +237,7 @@ def motions_of(equations: PointEquations, points: Array, covariance: Array) -> M
         points: (P, 3).
         covariance: (G, G) of the parameters.
     """
-    stations, every = equations.response, -(-len(points) // _MOST_PLACES)
+    stations, every = equations.response, -(-len(points) // _MAX_PLACES)
     return Motions(
         stations=stations,
         places=points[::every],
@@ -269,7 +269,7 @@ class SurveyProblem:
         _hold_baseline(self.information, self.fields, state.rig)
         self.left = self._spare(state) / (2 * len(pixels.station))
         seen = np.bincount(pixels.station, minlength=len(state.centres))
-        self.held = seen < LEAST_POINTS
+        self.held = seen < MIN_POINTS
         group = linked_groups(pixels.station, pixels.point, len(seen))
         self.held[first_of(group)] = True
         self.start = self._seen(state)

@@ -46,7 +46,7 @@ from reconstruct.adjustment.normal_equations import (
 from reconstruct.adjustment.pixel_parts import ALONE, Linearised, PixelParts, Workers
 from reconstruct.adjustment.soft_modes import Motions, SoftModes, no_modes, soft_modes, spread
 from reconstruct.mapping.arrays import (
-    LEAST_POINTS,
+    MIN_POINTS,
     Indices,
     frames_of,
     linked_groups,
@@ -57,7 +57,7 @@ from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.robust import cauchy_weights, sigma_of, variance_of
 from reconstruct.views.model_files import as_transform
 
-_MOST_PLACES = 2000
+_MAX_PLACES = 2000
 """Places at most at which the motions that points share are kept: they are smooth."""
 
 
@@ -260,7 +260,7 @@ def shape_of_block(
     group = linked_groups(pixels.station, pixels.point, count)
     group_of_point = np.maximum.reduceat(group[pixels.station], pixels.starts[:-1])
     gauge = Gauge(centres, _usual_reach(pixels, centres, points), scale_free, group)
-    loose = np.bincount(pixels.station, minlength=count) < LEAST_POINTS
+    loose = np.bincount(pixels.station, minlength=count) < MIN_POINTS
     equations = replace(reduce_parts(linear), free=~(gauge.held | loose[:, None]))
     blocks = gauge.shape_blocks(equations)
     blocks[loose[equations.rows] | loose[equations.columns]] = np.nan
@@ -331,14 +331,14 @@ def _shared_motions(
 
 def _spread_rows(points: Array) -> Indices:
     """Rows of some of the points (P, 3), one in each cube of space."""
-    if len(points) <= _MOST_PLACES:
+    if len(points) <= _MAX_PLACES:
         return np.arange(len(points))
     low, high = np.percentile(points, [2, 98], axis=0)
-    side = float(np.linalg.norm(high - low)) / np.sqrt(_MOST_PLACES)
+    side = float(np.linalg.norm(high - low)) / np.sqrt(_MAX_PLACES)
     while True:
         cubes = np.floor((points - low) / side)
         rows = np.sort(np.unique(cubes, axis=0, return_index=True)[1])
-        if len(rows) <= _MOST_PLACES:
+        if len(rows) <= _MAX_PLACES:
             return rows
         side *= 1.25
 

@@ -11,7 +11,7 @@ from shapely.geometry import LineString, Polygon
 from reconstruct.annotations.values import Place
 
 Ring = tuple[Place, ...]
-_MOST_TRIED = 200
+_MAX_TRIED = 200
 """Slits tried for each hole, the shortest first."""
 
 
@@ -54,7 +54,7 @@ def parted(ring: Ring) -> tuple[Ring, tuple[Ring, ...]]:
 def _slit(ring: list[Place], hole: Ring, whole: Polygon) -> tuple[int, Ring, int] | None:
     """Where a hole is joined to a ring: index in the ring, hole, index in the hole."""
     away = np.linalg.norm(np.array(ring)[:, None] - np.array(hole)[None], axis=2)
-    order = np.argsort(away, axis=None, kind="stable")[:_MOST_TRIED]
+    order = np.argsort(away, axis=None, kind="stable")[:_MAX_TRIED]
     gone = {frozenset((a, b)) for a, b in zip(ring, [*ring[1:], ring[0]], strict=True)}
     for flat in order:
         at, start = divmod(int(flat), len(hole))

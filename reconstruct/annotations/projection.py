@@ -183,12 +183,12 @@ class Projector:
             seen=seen, size_px=warp.size_px,
         )  # fmt: skip
 
-    def shown_in(self, spots: OnPlane, most: int = 12) -> list[InPicture]:
+    def shown_in(self, spots: OnPlane, maximum: int = 12) -> list[InPicture]:
         """Pictures that show most of some places, the best of their middle first.
 
         Args:
             spots: on the plane.
-            most: pictures.
+            maximum: pictures.
         """
         known = np.isfinite(spots.points).all(axis=1)
         if not known.any():
@@ -198,7 +198,7 @@ class Projector:
             here = self.to_picture(sight.image, spots)
             if here.seen[known].mean() > 0.5:
                 found.append(here)
-            if len(found) == most:
+            if len(found) == maximum:
                 break
         return found
 

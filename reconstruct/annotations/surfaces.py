@@ -19,7 +19,7 @@ from reconstruct.annotations.marks import MeasuredMark, own_covariance
 from reconstruct.measure.areas import SurfaceAreas, figures_of_all, surface_within
 from reconstruct.measure.surface import MeasuredSurface
 
-_MOST_STEPS = 4000
+_MAX_STEPS = 4000
 """Steps along a ring in which the slant is taken."""
 
 
@@ -144,7 +144,7 @@ class _Steps:
         self._count = len(ring)
         way = np.roll(ring, -1, axis=0) - ring
         length = np.linalg.norm(way, axis=1)
-        step = max(longest, float(length.sum()) / _MOST_STEPS)
+        step = max(longest, float(length.sum()) / _MAX_STEPS)
         counts = np.maximum(1, np.ceil(length / step)).astype(np.int64)
         self._edge: NDArray[np.int64] = np.repeat(np.arange(self._count), counts)
         nth = np.arange(len(self._edge)) - np.repeat(np.cumsum(counts) - counts, counts)

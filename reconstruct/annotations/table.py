@@ -27,8 +27,8 @@ from reconstruct.annotations.values import AnnotationSet, Label, area_only
 from reconstruct.measure.surface import MeasuredSurface
 from reconstruct.raster import opened_raster
 
-_LONGEST_PX = 2000
-_MOST_QUADRATS = 100_000
+_MAX_PX = 2000
+_MAX_QUADRATS = 100_000
 _OPAQUE = 128
 _WHOLE = 0.999
 """Share of a known surface from which on it counts as all."""
@@ -117,7 +117,7 @@ def ground_of(workspace: Path) -> KnownGround:
         WorkspaceError: there is no mosaic.
     """
     with opened_raster(workspace / "mosaic" / "mosaic.tif") as raster:
-        shrink = max(1.0, max(raster.width, raster.height) / _LONGEST_PX)
+        shrink = max(1.0, max(raster.width, raster.height) / _MAX_PX)
         shape = max(1, round(raster.height / shrink)), max(1, round(raster.width / shrink))
         mask = raster.dataset_mask(out_shape=shape, resampling=Resampling.average)
         t, wide, high = raster.transform, raster.width / shape[1], raster.height / shape[0]
@@ -156,10 +156,10 @@ def quadrats(
             )
         ]
     west, south, east, north = ground.bounds
-    if not side > 0 or (east - west) * (north - south) / side**2 > _MOST_QUADRATS:
+    if not side > 0 or (east - west) * (north - south) / side**2 > _MAX_QUADRATS:
         raise ConfigError(
             f"quadrats of {side:g}: over {east - west:.1f} x {north - south:.1f} these are more "
-            f"than {_MOST_QUADRATS}: give a larger side"
+            f"than {_MAX_QUADRATS}: give a larger side"
         )
     found = []
     tree = shapely.STRtree([mark.geometry for mark in marks])

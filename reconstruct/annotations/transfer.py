@@ -13,7 +13,7 @@ from reconstruct.annotations.store import change_annotations, geojson, read_anno
 from reconstruct.annotations.values import AnnotationSet
 from reconstruct.views.model import WorldFrame, read_frame
 
-MOST_BYTES = 500 << 20
+MAX_BYTES = 500 << 20
 """Of a file that is read."""
 GEOJSON = "geojson"
 """Written for a GIS, not read."""
@@ -47,8 +47,8 @@ def import_file(
         WorkspaceError: the file is not of the format, or names a picture that is not there.
     """
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise WorkspaceError(f"{path}: more than {MOST_BYTES >> 20} MiB: split it")
+        if path.stat().st_size > MAX_BYTES:
+            raise WorkspaceError(f"{path}: more than {MAX_BYTES >> 20} MiB: split it")
         data = path.read_bytes()
     except OSError as error:
         raise WorkspaceError(f"{path}: cannot be read: {why(error)}") from None

@@ -33,9 +33,9 @@ COLOURS = (
     "#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#f0e442", "#999999",
 )  # fmt: skip
 """Colours that the colour-blind tell apart (Okabe and Ito 2008)."""
-MOST_VERTICES = 100_000
+MAX_VERTICES = 100_000
 _LEAST = {"point": 1, "polyline": 2, "polygon": 3, "rectangle": 4, "circle": 1}
-_MOST = {"point": 1, "polyline": MOST_VERTICES, "polygon": MOST_VERTICES, "rectangle": 4,
+_MOST = {"point": 1, "polyline": MAX_VERTICES, "polygon": MAX_VERTICES, "rectangle": 4,
          "circle": 1}  # fmt: skip
 _CIRCLE_SIDES = 128
 _SAME = 1e-3
@@ -105,9 +105,11 @@ class DrawnShape(Config):
 
     @model_validator(mode="after")
     def _is_whole(self) -> "DrawnShape":
-        count, least, most = len(self.points), _LEAST[self.kind], _MOST[self.kind]
-        if not least <= count <= most:
-            wanted = f"{least}" if least == most else f"{least} or more, at most {most},"
+        count, minimum, maximum = len(self.points), _LEAST[self.kind], _MOST[self.kind]
+        if not minimum <= count <= maximum:
+            wanted = (
+                f"{minimum}" if minimum == maximum else f"{minimum} or more, at most {maximum},"
+            )
             raise ValueError(f"a {self.kind} of {count} points; it has {wanted}")
         if self.holes and self.kind != "polygon":
             raise ValueError(f"a {self.kind} with holes: only a polygon has them")

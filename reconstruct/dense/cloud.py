@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 VERTEX = np.dtype([*MESH_VERTEX.descr, ("sigma", "<f4")])
 """One point: x east, y north, z up from the cloud's offset, normal, colour, standard deviation."""
-_MOST_OVERVIEW_POINTS = 40_000_000
+_MAX_OVERVIEW_POINTS = 40_000_000
 """That programs without levels of detail hold at once."""
 _OVERVIEW = "overview"
 _LAS_STEP = 1e-4
@@ -72,9 +72,9 @@ def vertices_of(surface: NDArray[Any], cell: float, edge: float) -> NDArray[Any]
     return vertices
 
 
-def voxel_edge(cell: float, cells: int, most_points: int) -> float:
+def voxel_edge(cell: float, cells: int, max_points: int) -> float:
     """Edge of the cubes: a cell, or more where that many cells would give too many points."""
-    return cell * max(1.0, math.sqrt(cells / most_points))
+    return cell * max(1.0, math.sqrt(cells / max_points))
 
 
 def write_cloud(
@@ -121,7 +121,7 @@ def write_clouds(
         cell: of the surface.
         executor: runs the tiles.
     """
-    edge = voxel_edge(cell, sum(tile.count for tile in tiles), _MOST_OVERVIEW_POINTS)
+    edge = voxel_edge(cell, sum(tile.count for tile in tiles), _MAX_OVERVIEW_POINTS)
     header = las_header(offset_enu, frame)
     scratch = store.folder / "copc"
     if scratch.exists():  # of a run that was interrupted

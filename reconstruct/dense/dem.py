@@ -22,16 +22,16 @@ _STEP = 2.0
 """Slope from which two cells have a step between them."""
 STRAY_CELLS = 8
 """Reach of the square around a cell in which others must be known."""
-_LEAST_COMPANY = 0.22
+_MIN_COMPANY = 0.22
 """Share of that square that must be known: what is more isolated is a rim of a wall, mostly."""
-_LEAST_WEIGHT = 1e-3
+_MIN_WEIGHT = 1e-3
 _WALL_CELLS = 0.25
 """A wall empties cells that it is nearer to than this, along both axes."""
-_LEAST_SHARE = 0.25
+_MIN_SHARE = 0.25
 """Sum of the shares of points from which a cell's height is more than a guess at its rim."""
 _APART_SIGMAS = 5.0
 _DIAGONAL = math.sqrt(2.0)
-_LEAST_STATIONS = 2
+_MIN_STATIONS = 2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -91,7 +91,7 @@ def cells_over(grid: DemGrid, surface: NDArray[Any]) -> FusedCells:
         for right in (0, 1):
             r, c = np.floor(row) + down, np.floor(column) + right
             w = (1.0 - np.abs(row - r)) * (1.0 - np.abs(column - c))
-            taken = (w > _LEAST_WEIGHT) & (r >= 0) & (r < grid.rows) & (c >= 0) & (c < grid.columns)
+            taken = (w > _MIN_WEIGHT) & (r >= 0) & (r < grid.rows) & (c >= 0) & (c < grid.columns)
             owner.append((r * grid.columns + c)[taken].astype(np.int64))
             point.append(np.flatnonzero(taken))
             weight.append(w[taken])
@@ -180,9 +180,9 @@ def project_cells(
             spreads[k] = sigmas[i] / up
             steep[k] = math.sqrt(max(1.0 - up * up, 0.0)) / up
         ranks = sorted_ranks(heights)[::-1]
-        most = 0
+        maximum = 0
         for k in range(size):
-            most = max(most, stations[points[first + k]])
+            maximum = max(maximum, stations[points[first + k]])
         start, found = 0, 0
         while start < size:
             end = start + 1
@@ -210,7 +210,7 @@ def project_cells(
                 if weights[first + member] > weights[first + heaviest]:
                     heaviest = member
             start = end
-            if share < _LEAST_SHARE or seen < min(most, _LEAST_STATIONS):
+            if share < _MIN_SHARE or seen < min(maximum, _MIN_STATIONS):
                 continue
             mean /= total
             if found == 0:
@@ -307,4 +307,4 @@ def without_strays(height: Float32) -> NDArray[np.bool_]:
     share = cv2.boxFilter(
         known.astype(np.float32), -1, (side, side), borderType=cv2.BORDER_CONSTANT
     )
-    return np.asarray(known & (share >= _LEAST_COMPANY))
+    return np.asarray(known & (share >= _MIN_COMPANY))

@@ -28,7 +28,7 @@ _BLOCK_PX = 5
 _JUMP_PX = 1.0
 """A step of disparity between neighbours from which on both are taken to mix near and far."""
 _SPECKLE_PX = 200
-_LEAST_SLOPE = 2.0
+_MIN_SLOPE = 2.0
 """Mean change over two pixels, grey levels, around a pixel that can be matched."""
 _STEPS = 16
 """OpenCV counts disparity in sixteenths of a pixel."""
@@ -78,7 +78,7 @@ def has_texture(grey: NDArray[np.uint8]) -> NDArray[np.bool_]:
     slope = cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=1)
     side = 2 * _BLOCK_PX + 1
     mean: Float32 = cv2.boxFilter(np.abs(slope), -1, (side, side))
-    return np.asarray(mean >= _LEAST_SLOPE)
+    return np.asarray(mean >= _MIN_SLOPE)
 
 
 def unrounded(fixed: NDArray[np.int16]) -> Float32:

@@ -19,7 +19,7 @@ Float32 = NDArray[np.float32]
 
 _GATE = 3.0
 """Depths that differ by no more than this many standard deviations of their difference agree."""
-_LEAST_KNOWN = 5
+_MIN_KNOWN = 5
 """Of the nine pixels around a spot, for a view to see through it."""
 _FRAME = 1.2
 """Times half a picture up to which a port may shift what is in the frame."""
@@ -86,6 +86,6 @@ def look_at_points(
                     beyond += 1
         if here:
             found[n] = 1
-        elif known >= _LEAST_KNOWN and beyond == known:
+        elif known >= _MIN_KNOWN and beyond == known:
             through[n] = 1
     return found, through

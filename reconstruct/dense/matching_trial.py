@@ -30,7 +30,7 @@ _LOOKED_AT = 50
 _SCALES = 3
 _WORTH = 1.15
 """Half the resolution is taken where it finds this many times the depths."""
-_LEAST_COMMON = 500
+_MIN_COMMON = 500
 """Pixels that two partners must share for their difference to count."""
 _COMPARED = 3
 """Partners of a view whose depths are compared."""
@@ -184,7 +184,7 @@ def spread(depths: Sequence[PartnerDepth]) -> float:
     spreads = []
     for one, other in combinations(depths[:_COMPARED], 2):
         both = np.isfinite(one.depth) & np.isfinite(other.depth)
-        if both.sum() >= _LEAST_COMMON:
+        if both.sum() >= _MIN_COMMON:
             z, y = one.depth[both], other.depth[both]
             s, t = z * z / one.focal_baseline, y * y / other.focal_baseline
             difference = (z - y) / (np.float32(MATCH_SIGMA_PX) * np.hypot(s, t))

@@ -39,20 +39,20 @@ _SAME_DEPTH = 0.02
 """Relative difference up to which depths are those of one surface."""
 _DARKEST = 6.0
 """Grey level below which differences are noise."""
-_LEAST_CELLS = 200
+_MIN_CELLS = 200
 """Cells that a view must share with another for their light to be compared."""
 _FITTED_CELLS = 4000
 _FIT_ROUNDS = 6
-_LEAST_SIGMA = 0.02
+_MIN_SIGMA = 0.02
 """Of logarithms of light: what differs less is never told apart."""
 _SEED, _GROWN = 4.5, 2.2
 """Standard deviations from which cells differ, and to which what differs is grown."""
-_SEED_SHARE, _LEAST_AREA = 0.3, 12
+_SEED_SHARE, _MIN_AREA = 0.3, 12
 """Of the cells of a part, those that differ by far; and its cells. In other light, differences
 that fade out are many."""
 _GAP_CELLS, _RIM_CELLS = 5, 3
 """Gaps in a part that are closed; and around it, where its rim is blended with what is behind."""
-_LARGEST_SHARE = 0.5
+_MAX_SHARE = 0.5
 """A view that differs in more of what is compared differs otherwise."""
 _SHOWN, _SHOWN_ACROSS, _SHOWN_PX = 6, 3, 480
 """Pictures on the sheet, across it, and their width."""
@@ -139,11 +139,13 @@ def show_moving(workspace: Path, folder: Path, shares: Sequence[MovingShare]) ->
     rows = [(one.image, f"{one.masked:.5f}", f"{one.compared:.3f}") for one in shares]
     table, sheet_png = (folder / name for name in _ABOUT)
     write_csv(table, ("image", "masked_share", "compared_share"), rows)
-    most = sorted((one for one in shares if one.masked > 0), key=lambda one: -one.masked)[:_SHOWN]
-    if not most:
+    maximum = sorted((one for one in shares if one.masked > 0), key=lambda one: -one.masked)[
+        :_SHOWN
+    ]
+    if not maximum:
         return
     pictures, tiles = Pictures.open(workspace), []
-    for one in most:
+    for one in maximum:
         taken = pictures.taken(one.image)
         mask = read_mask(moving_path(folder / MOVING, one.image), pictures.warp(one.image).size_px)
         size = (_SHOWN_PX, round(_SHOWN_PX * taken.shape[0] / taken.shape[1]))
@@ -229,7 +231,7 @@ def moving_parts(look: Look, others: Sequence[Look]) -> tuple[Mask, float]:
     still = still_depth(look, others)
     rows, columns = np.nonzero(np.isfinite(still) & look.usable)
     nothing = np.zeros(shape, np.bool_)
-    if len(rows) < _LEAST_CELLS:
+    if len(rows) < _MIN_CELLS:
         return nothing, 0.0
     pixels: Array = np.column_stack([columns, rows]).astype(np.float64)
     pixels = (pixels + 0.5) * look.step
@@ -250,7 +252,7 @@ def moving_parts(look: Look, others: Sequence[Look]) -> tuple[Mask, float]:
             other.usable,
         )
         known = np.flatnonzero(cells >= 0)
-        if len(known) < _LEAST_CELLS:
+        if len(known) < _MIN_CELLS:
             continue
         chosen = known[:: max(1, len(known) // _FITTED_CELLS)]
         there = other.light.reshape(-1, 3, 3)[cells[chosen], 0]
@@ -270,7 +272,7 @@ def moving_parts(look: Look, others: Sequence[Look]) -> tuple[Mask, float]:
     field[rows, columns] = np.where(votes >= 2, misfit, np.nan)
     compared = np.isfinite(field)
     found = _parts(np.nan_to_num(field))
-    if found.sum() > _LARGEST_SHARE * compared.sum():
+    if found.sum() > _MAX_SHARE * compared.sum():
         found = nothing
     return found, float(compared.mean())
 
@@ -455,13 +457,13 @@ def _smooth_difference(features: Array, apart: Float32) -> tuple[Array, Array]:
     ridge[0, 0] = 0.0
     for _ in range(_FIT_ROUNDS):
         rest = b - a @ fit
-        sigma = np.maximum(MAD_TO_SIGMA * np.median(np.abs(rest), axis=0), _LEAST_SIGMA)
+        sigma = np.maximum(MAD_TO_SIGMA * np.median(np.abs(rest), axis=0), _MIN_SIGMA)
         size = np.sqrt(np.mean(np.square(rest / sigma), axis=1))
         weight = 1.0 / (1.0 + np.square(size / 2.0))
         left = a * weight[:, None]
         fit = np.linalg.solve(left.T @ a + ridge, left.T @ b)
     rest = b - a @ fit
-    return fit, np.maximum(MAD_TO_SIGMA * np.median(np.abs(rest), axis=0), _LEAST_SIGMA)
+    return fit, np.maximum(MAD_TO_SIGMA * np.median(np.abs(rest), axis=0), _MIN_SIGMA)
 
 
 @compiled
@@ -546,7 +548,7 @@ def _parts(misfit: Float32) -> Mask:
     count, label, stats, _ = cv2.connectedComponentsWithStats(near.astype(np.uint8))
     seeds = np.bincount(label[misfit > _SEED], minlength=count)
     area = stats[:, cv2.CC_STAT_AREA]
-    kept = (seeds >= _SEED_SHARE * area) & (area >= _LEAST_AREA)
+    kept = (seeds >= _SEED_SHARE * area) & (area >= _MIN_AREA)
     kept[0] = False
     found: Mask = kept[label]
     if not found.any():

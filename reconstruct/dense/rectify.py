@@ -18,7 +18,7 @@ from alice_survey.core.frames import Array
 from reconstruct.views.model import View
 from reconstruct.views.range_shift import FAST, KernelLens, between_nodes
 
-_LEAST_COSINE = 0.75
+_MIN_COSINE = 0.75
 """Least cosine of the angle by which a view may be turned."""
 _ROUNDS = 2
 """Rounds of depth and the port's shift, which depends on it."""
@@ -63,10 +63,10 @@ def rectify(reference: View, partner: View, points_world: Array) -> Rectificatio
     axes = [v.world_from_cam.rotation.apply([0.0, 0.0, 1.0]) for v in (reference, partner)]
     mean = axes[0] + axes[1]
     z_axis = mean - (mean @ x_axis) * x_axis
-    if np.linalg.norm(z_axis) < _LEAST_COSINE:
+    if np.linalg.norm(z_axis) < _MIN_COSINE:
         return None
     z_axis /= np.linalg.norm(z_axis)
-    if min(s @ z_axis for s in axes) < _LEAST_COSINE:
+    if min(s @ z_axis for s in axes) < _MIN_COSINE:
         return None
     world_from_rect = Rotation.from_matrix(np.stack([x_axis, np.cross(z_axis, x_axis), z_axis], 1))
     # a picture turned by t is stretched by cos(t)^-3 in area at its middle: undo it on average

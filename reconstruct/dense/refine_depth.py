@@ -37,7 +37,7 @@ ALL: Share = (0, 1, 0, 1)
 
 _CONTRAST_SIGMA_PX = 8.0
 """Sigma of the Gaussian window in which pictures are brought to zero mean and unit contrast."""
-_LEAST_CONTRAST = 1.5
+_MIN_CONTRAST = 1.5
 """Grey levels of noise that are not blown up to full contrast."""
 WINDOW_SIGMA_PX = 1.25
 """Sigma of the Gaussian window that is compared. Wider ones blur the surface, narrower ones are
@@ -52,7 +52,7 @@ _STEP_PX = 4.0
 _NONE = np.float32(1e6)
 _ALIKE = 0.5
 """Correlation from which two windows look alike."""
-_LEAST_SHARE = 0.4
+_MIN_SHARE = 0.4
 """Share of a window's weight that a neighbour must see."""
 _OUTLYING = 2.5
 """Deviations beyond which a pixel counts less than half."""
@@ -60,9 +60,9 @@ _BAND_PIXELS = 500_000
 """Pixels of a picture that are worked on at once: they take some 0.1 kB each."""
 _MARGIN_ROWS = 16
 """Rows around a band that its windows reach: twice 5 for sums, and 4 around what moves far."""
-_LEAST_UNSEEN = 0.005
+_MIN_UNSEEN = 0.005
 """Share of a band that no other station sees, from which its own station's pictures are asked."""
-_LONGEST_STEP_PX = 1.0
+_MAX_STEP_PX = 1.0
 """Longest step of a round, along the epipolar line of the neighbour that moves most."""
 
 
@@ -92,7 +92,7 @@ def even_contrast(grey: Float32) -> Float32:
     """A picture minus its local mean, over its local deviation."""
     mean = _blur(grey, _CONTRAST_SIGMA_PX)
     rest: Float32 = grey - mean
-    variance = _blur(rest * rest, _CONTRAST_SIGMA_PX) + np.float32(_LEAST_CONTRAST**2)
+    variance = _blur(rest * rest, _CONTRAST_SIGMA_PX) + np.float32(_MIN_CONTRAST**2)
     even: Float32 = rest * (variance ** np.float32(-0.5))
     return even
 
@@ -392,7 +392,7 @@ def _stepped(inverse: Float32, sums: _NeighbourSums) -> tuple[Float32, Float32]:
     epipolar line.
     """
     fast = np.maximum(sums.speed, np.float32(1e-6))
-    reach = _LONGEST_STEP_PX / fast
+    reach = _MAX_STEP_PX / fast
     step: Float32 = np.clip(sums.pull / (sums.curvature + fast * fast), -reach, reach)
     return inverse + step, np.abs(step) * sums.speed
 
@@ -406,7 +406,7 @@ def _sums_of(
     """What the others say, and where none of them sees a spot what the spare ones say."""
     sums = _sums(one, inverse, others)
     unseen = np.isfinite(inverse) & ~(sums.curvature > 0)
-    if not spare or unseen.mean() < _LEAST_UNSEEN:
+    if not spare or unseen.mean() < _MIN_UNSEEN:
         return sums
     alone = _sums(one, np.where(unseen, inverse, np.float32(np.nan)), spare)
     return _chosen(unseen, alone, sums)
@@ -511,7 +511,7 @@ def add(
     for row in range(share[0], height, share[1]):
         for column in range(share[2], width, share[3]):
             weight = products[0, row, column]
-            if not known[row, column] or weight < _LEAST_SHARE:
+            if not known[row, column] or weight < _MIN_SHARE:
                 continue
             r, g, rg = products[1, row, column], products[2, row, column], products[3, row, column]
             cross = rg - r * g / weight

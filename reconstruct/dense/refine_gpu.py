@@ -26,7 +26,7 @@ _BLOCK = (32, 8)
 """Threads along a row, and rows: a warp reads neighbouring pixels."""
 _PROCESS_BYTES = 3 << 29
 """Of the GPU, for a process and for the context of another that waits."""
-_MOST_AT_ONCE = 64
+_MAX_AT_ONCE = 64
 _REACH_SIGMAS = 4
 """OpenCV cuts the Gaussian of 32-bit pictures off there."""
 
@@ -59,7 +59,7 @@ def refine_on_gpu(
 def places() -> int:
     """Processes that work on the GPU at the same time: one alone leaves it idle for most of it."""
     _, total = cuda.current_context().get_memory_info()
-    return int(max(1, min(total / _PROCESS_BYTES, _MOST_AT_ONCE)))
+    return int(max(1, min(total / _PROCESS_BYTES, _MAX_AT_ONCE)))
 
 
 class _Gpu:

@@ -1,16 +1,16 @@
 """Factors by which pictures are shrunk for depth, from their size and the cells that are wanted."""
 
-LARGEST_PIXELS = 3_000_000
+MAX_PIXELS = 3_000_000
 """Depth with more pixels is matched in pictures that are halved until they have fewer."""
 CELL_PIXELS = 2.5
 """Side of a cell of the surface in mean ground pixels of views, unless depth is coarser."""
-_LEAST_SCALE = 0.05
+_MIN_SCALE = 0.05
 
 
 def matching_scale(pixels: float, finest: float = 1.0) -> float:
     """A factor, halved until a picture of so many pixels that is shrunk by it is small enough."""
     scale = finest
-    while pixels * scale * scale > LARGEST_PIXELS:
+    while pixels * scale * scale > MAX_PIXELS:
         scale /= 2.0
     return scale
 
@@ -22,4 +22,4 @@ def scale_for_cell(cell: float | None, pixel: float) -> float:
         cell: side of a cell; None for the finest that pictures give.
         pixel: side of a pixel on the ground, in the same unit.
     """
-    return 1.0 if cell is None else min(1.0, max(_LEAST_SCALE, CELL_PIXELS * pixel / cell))
+    return 1.0 if cell is None else min(1.0, max(_MIN_SCALE, CELL_PIXELS * pixel / cell))

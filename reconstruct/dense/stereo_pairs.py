@@ -18,21 +18,21 @@ from alice_survey.core.frames import Array
 from alice_survey.core.run import progress
 from reconstruct.views.model import SparseModel, View, points_of_views
 
-LEAST_POINTS = 8
+MIN_POINTS = 8
 """Sparse points that a view must see for its range of depths to be known."""
 _SAMPLE = 400
 """Points of a view at which overlap is measured."""
-_LEAST_OVERLAP = 0.15
+_MIN_OVERLAP = 0.15
 _WIDEST_ANGLE_DEG = 40.0
-_LARGEST_TILT = 0.6
+_MAX_TILT = 0.6
 """Largest sine of the angle between a line of sight and the plane square to the baseline."""
 _GOOD_RATIO = (0.15, 0.45)
 _USABLE_RATIO = (0.02, 0.8)
-_MOST_BOUNDING = 4000
+_MAX_BOUNDING = 4000
 """Points that bound the depth of a view."""
 _BEYOND = 1.2
 """Times the farthest point that a view observed: points of others may lie so far away."""
-_LEAST_GAIN = 0.03
+_MIN_GAIN = 0.03
 """Share of a view's points that another partner must newly serve to be worth its time."""
 
 
@@ -64,11 +64,11 @@ class PointsInSight:
         reach = _BEYOND * np.linalg.norm(own - centre, axis=1).max()
         near = np.sort(self._tree.query_ball_point(centre, reach))
         inside = near[in_frame(view, self._model.points_world[near])]
-        chosen: Array = self._model.points_world[inside[:: -(-len(inside) // _MOST_BOUNDING) or 1]]
+        chosen: Array = self._model.points_world[inside[:: -(-len(inside) // _MAX_BOUNDING) or 1]]
         return chosen
 
 
-def neighbours(model: SparseModel, most: int) -> list[list[int]]:
+def neighbours(model: SparseModel, maximum: int) -> list[list[int]]:
     """The other views that share most sparse points with each view, best first."""
     views = len(model.views)
     points, numbers = model.observations.T
@@ -82,7 +82,7 @@ def neighbours(model: SparseModel, most: int) -> list[list[int]]:
         part = slice(shared.indptr[view], shared.indptr[view + 1])
         others, counts = shared.indices[part], shared.data[part]
         others, counts = others[others != view], counts[others != view]
-        found.append([int(n) for n in others[np.lexsort((others, -counts))][:most]])
+        found.append([int(n) for n in others[np.lexsort((others, -counts))][:maximum]])
     return found
 
 
@@ -113,7 +113,7 @@ def choose_partners(model: SparseModel, per_view: int) -> list[list[int]]:
     chosen: list[list[int]] = []
     for index in range(len(model.views)):
         points = observed[index]
-        if len(points) < LEAST_POINTS:
+        if len(points) < MIN_POINTS:
             chosen.append([])
             continue
         points = points[:: max(1, len(points) // _SAMPLE)]
@@ -130,10 +130,10 @@ def choose_partners(model: SparseModel, per_view: int) -> list[list[int]]:
             if not _USABLE_RATIO[0] <= ratio <= _USABLE_RATIO[1]:
                 continue
             tilt = max(abs(base @ axes[i]) for i in (index, other)) / np.linalg.norm(base)
-            if tilt > _LARGEST_TILT:
+            if tilt > _MAX_TILT:
                 continue
             served = in_frame(model.views[other], points).astype(np.float64)
-            if served.mean() < _LEAST_OVERLAP:
+            if served.mean() < _MIN_OVERLAP:
                 continue
             candidates[int(other)] = served * _quality(ratio) * (1.0 - tilt * tilt)
         rig = [n for n in candidates if stations[n] == stations[index]]
@@ -141,7 +141,7 @@ def choose_partners(model: SparseModel, per_view: int) -> list[list[int]]:
     if not any(chosen):
         raise ReconstructionError(
             f"none of {len(model.views)} registered pictures has a partner with "
-            f"{_LEAST_OVERLAP:.0%} overlap to find depth with; add pictures that overlap"
+            f"{_MIN_OVERLAP:.0%} overlap to find depth with; add pictures that overlap"
         )
     return chosen
 
@@ -178,7 +178,7 @@ def _complementary(first: list[int], candidates: dict[int, Array], per_view: int
     while left and len(chosen) < per_view:
         gains = [float((missed * candidates[n]).mean()) for n in left]
         best = int(np.argmax(gains))
-        if gains[best] < _LEAST_GAIN and chosen:
+        if gains[best] < _MIN_GAIN and chosen:
             break
         chosen.append(left.pop(best))
         missed = missed * (1.0 - candidates[chosen[-1]])

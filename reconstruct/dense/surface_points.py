@@ -40,21 +40,21 @@ SURFACE_POINT = np.dtype(
 )
 """One point: east, north, up; unit normal into the water; RGB; standard deviations along it, the
 point's own and what all points around share; views and stations that it rests on (255: or more)."""
-_LEAST_ALONG = 0.4
+_MIN_ALONG = 0.4
 """Least part of a point's normal along a direction for it to be fused there."""
 _GATE = 3.0
 PART_REACH_CELLS = 16.0
 """Around a tile, points must be known so far to tell what is part of a surface."""
 _NEIGHBOUR_CELLS = 2.0
-_LEAST_PART = 300
+_MIN_PART = 300
 """Points of a part of the surface; smaller ones are mostly wrong."""
 _RIM_REACH_CELLS = 3.0
 """Within this many cells of a rim a point may be of no surface: what a window of matching spans."""
-_LEAST_ASIDE = 0.25
+_MIN_ASIDE = 0.25
 """Cells by which the neighbours of a point within a surface lie to one side by chance."""
 _STEP_CELLS = 1.0
 """Points farther than this from each other's tangent planes do not hang together."""
-_LEAST_TURN = 0.3
+_MIN_TURN = 0.3
 """Nor do those whose normals have a smaller cosine between them."""
 _SAME_SIDE = -0.2
 """Cosine between the normals of neighbours from which they are no two sides of one thing."""
@@ -140,7 +140,7 @@ def by_cell(
     at = np.empty((2, len(enu)), np.int64)
     count = 0
     for i in range(len(enu)):
-        if sign * normals[i, along] >= _LEAST_ALONG:
+        if sign * normals[i, along] >= _MIN_ALONG:
             order[count] = i
             at[0, count] = math.floor((enu[i, first] - origin[0]) / cell)
             at[1, count] = math.floor((enu[i, second] - origin[1]) / cell)
@@ -166,15 +166,15 @@ def stable_order(keys: NDArray[np.int64]) -> NDArray[np.int64]:
 
     It counts, in time and memory of N plus the range of the keys.
     """
-    least = keys.min()
-    starts = np.zeros(keys.max() - least + 2, np.int64)
+    minimum = keys.min()
+    starts = np.zeros(keys.max() - minimum + 2, np.int64)
     for key in keys:
-        starts[key - least + 1] += 1
+        starts[key - minimum + 1] += 1
     starts = np.cumsum(starts)
     order = np.empty_like(keys)
     for i, key in enumerate(keys):
-        order[starts[key - least]] = i
-        starts[key - least] += 1
+        order[starts[key - minimum]] = i
+        starts[key - minimum] += 1
     return order
 
 
@@ -216,11 +216,11 @@ def fuse_cells(
     Returns:
         Columns of `SURFACE_POINT` without what points share.
     """
-    most, count = enu.shape[0], 0
-    place, normal = np.empty((most, 3), np.float32), np.empty((most, 3), np.float32)
-    colour = np.empty((most, 3), np.uint8)
-    sigma = np.empty(most, np.float32)
-    seen, met = np.empty(most, np.uint16), np.empty(most, np.uint8)
+    maximum, count = enu.shape[0], 0
+    place, normal = np.empty((maximum, 3), np.float32), np.empty((maximum, 3), np.float32)
+    colour = np.empty((maximum, 3), np.uint8)
+    sigma = np.empty(maximum, np.float32)
+    seen, met = np.empty(maximum, np.uint16), np.empty(maximum, np.uint8)
     a, b, along = axes
     middle, mean, tint = np.empty(3), np.empty(3), np.empty(3)
     for n in range(starts.size - 1):
@@ -303,12 +303,12 @@ def settled(surface: NDArray[Any], cell: float, low: Array, high: Array) -> NDAr
     turn = np.einsum("nk,nk->n", normal[i], normal[j])
 
     joined = (np.abs(from_i) < _STEP_CELLS) & (np.abs(from_j) < _STEP_CELLS)
-    joined &= turn > _LEAST_TURN
+    joined &= turn > _MIN_TURN
     links = coo_matrix((np.ones(joined.sum(), np.int8), (i[joined], j[joined])), (count, count))
     part = connected_components(links, directed=False)[1]
     near = (place[:, :2] < low / cell + _NEIGHBOUR_CELLS).any(axis=1)
     near |= (place[:, :2] > high / cell - _NEIGHBOUR_CELLS).any(axis=1)
-    large = np.bincount(part) >= _LEAST_PART
+    large = np.bincount(part) >= _MIN_PART
     large[part[near]] = True
 
     mean = normal / variance[:, None]
@@ -339,7 +339,7 @@ def _aside(tree: cKDTree, place: Array, normal: Array) -> Array:
         normal: (N, 3) unit vectors.
     """
     i, j = tree.query_pairs(_RIM_REACH_CELLS, output_type="ndarray").T
-    same = np.einsum("nk,nk->n", normal[i], normal[j]) > _LEAST_TURN
+    same = np.einsum("nk,nk->n", normal[i], normal[j]) > _MIN_TURN
     i, j = i[same], j[same]
     apart = place[j] - place[i]
     count = len(place)
@@ -348,5 +348,5 @@ def _aside(tree: cKDTree, place: Array, normal: Array) -> Array:
         [np.bincount(i, a, count) - np.bincount(j, a, count) for a in apart.T], axis=1
     )
     away = np.linalg.norm(middle, axis=1) / near
-    found: Array = np.maximum(away - _LEAST_ASIDE, 0.0)
+    found: Array = np.maximum(away - _MIN_ASIDE, 0.0)
     return found

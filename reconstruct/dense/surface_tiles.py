@@ -148,9 +148,9 @@ def fuse_tile(setup: FuseSetup, task: FuseTask) -> SurfaceTile:
         facing = normals @ plane.normal_world >= EDGE_ON
         if facing.any():
             on_plane = plane.plane_from_world.apply(ned[facing])[:, :2]
-            least, most = on_plane.min(axis=0), on_plane.max(axis=0)
+            minimum, maximum = on_plane.min(axis=0), on_plane.max(axis=0)
             bounds[plane.name] = (
-                float(least[0]), float(least[1]), float(most[0]), float(most[1])
+                float(minimum[0]), float(minimum[1]), float(maximum[0]), float(maximum[1])
             )  # fmt: skip
     box = np.array([enu.min(axis=0), enu.max(axis=0)]) if len(enu) else np.full((2, 3), np.nan)
     corners = np.stack(np.meshgrid(*box.T, indexing="ij"), axis=-1).reshape(-1, 3)

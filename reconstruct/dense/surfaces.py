@@ -13,8 +13,8 @@ Float32 = NDArray[np.float32]
 _APART_SIGMAS = 5.0
 """Noise in a gap between heights, in standard deviations of the points on its two sides."""
 _DIAGONAL = math.sqrt(2.0)
-_LEAST_POINTS = 3
-_LEAST_STATIONS = 2
+_MIN_POINTS = 3
+_MIN_STATIONS = 2
 """A surface is seen from as many; what fewer see may be one wrong match."""
 
 
@@ -103,7 +103,7 @@ def surfaces_of(
     surface[:] = -1
     for part in range(kept - 1, -1, -1):
         members = ranks[starts[part] : starts[part + 1]]
-        if members.size < _LEAST_POINTS or _different(places, members) < _LEAST_STATIONS:
+        if members.size < _MIN_POINTS or _different(places, members) < _MIN_STATIONS:
             continue
         for member in members:
             surface[member] = found
@@ -135,5 +135,5 @@ def _different(values: NDArray[np.int64], members: NDArray[np.int64]) -> int:
     first = values[members[0]]
     for member in members:
         if values[member] != first:
-            return _LEAST_STATIONS
+            return _MIN_STATIONS
     return 1

@@ -21,7 +21,7 @@ _DEPTH_STEP = 2e-5
 """Relative: depths are rounded by 0.02 mm at most at 2 m, and span a factor of 3.7. Where those of
 a picture span more, as along a floor or past a foreground, steps are larger."""
 _DEPTH_CODES = 65535
-_MOST_RATIO = 16.0
+_MAX_RATIO = 16.0
 """Depths nearer or farther than the median by more than this are of wrong matches, and left out."""
 _SIGMA_STEP = 0.05
 _SIGMA_LEAST = 1e-6
@@ -84,9 +84,9 @@ class ViewStore:
 
     def stored_depth(self, view: int, name: str, part: Part = WHOLE) -> StoredDepth:
         """Depth (H, W) and its standard deviation as they are stored, read only where touched."""
-        least, step = self.load(view, f"{name}.scale").tolist()
+        minimum, step = self.load(view, f"{name}.scale").tolist()
         level, share = self.load(view, name)[part], self.load(view, f"{name}.sigma")[part]
-        return np.asarray(level), np.asarray(share), _depths(least, step), _shares()
+        return np.asarray(level), np.asarray(share), _depths(minimum, step), _shares()
 
     def load_depth(
         self, view: int, name: str, part: Part = WHOLE
@@ -134,8 +134,8 @@ class ViewStore:
 
 def stored(depth: NDArray[np.float32], sigma: NDArray[np.float32]) -> StoredDepth:
     """Depth (H, W) and its standard deviation as a store keeps them."""
-    level, share, (least, step) = _codes(depth, sigma)
-    return level, share, _depths(float(least), float(step)), _shares()
+    level, share, (minimum, step) = _codes(depth, sigma)
+    return level, share, _depths(float(minimum), float(step)), _shares()
 
 
 def decoded(depth: StoredDepth) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -151,24 +151,24 @@ def _codes(
     """Codes of depth and deviation, 0 where unknown; logarithm of the first depth, and its step."""
     known = np.isfinite(depth) & np.isfinite(sigma)
     middle = float(np.median(depth[known])) if known.any() else 1.0
-    known &= (depth > middle / _MOST_RATIO) & (depth < middle * _MOST_RATIO)
+    known &= (depth > middle / _MAX_RATIO) & (depth < middle * _MAX_RATIO)
     ends = np.array([depth[known].min(), depth[known].max()] if known.any() else [1.0, 1.0])
-    least, most = np.log(ends.astype(np.float64))
-    step = max(_DEPTH_STEP, float(most - least) / (_DEPTH_CODES - 1))
+    minimum, maximum = np.log(ends.astype(np.float64))
+    step = max(_DEPTH_STEP, float(maximum - minimum) / (_DEPTH_CODES - 1))
     with np.errstate(invalid="ignore", divide="ignore"):
-        level = np.rint((np.log(depth) - np.float32(least)) / np.float32(step)) + 1
+        level = np.rint((np.log(depth) - np.float32(minimum)) / np.float32(step)) + 1
         share = np.rint(np.log(sigma / depth / _SIGMA_LEAST) / _SIGMA_STEP) + 1
     return (
         np.where(known, np.clip(level, 1, _DEPTH_CODES), 0).astype(np.uint16),
         np.where(known, np.clip(share, 1, 255), 0).astype(np.uint8),
-        np.array([least, step]),
+        np.array([minimum, step]),
     )
 
 
 @lru_cache(maxsize=16)
-def _depths(least: float, step: float) -> NDArray[np.float32]:
+def _depths(minimum: float, step: float) -> NDArray[np.float32]:
     codes = np.arange(_DEPTH_CODES + 1)
-    depths = np.asarray(np.exp(least + (codes - 1) * step), np.float32)
+    depths = np.asarray(np.exp(minimum + (codes - 1) * step), np.float32)
     depths[0] = np.nan
     return depths
 

@@ -64,7 +64,7 @@ _ENOUGH_APART = 2
 _COMPARED_VIEWS = 12
 _COMPARED_STEP_PX = 7
 """Views, and pixels between the pixels of each, by which the sigma factor is measured."""
-_LEAST_PIXELS = 100
+_MIN_PIXELS = 100
 """A view with fewer pixels of confirmed depth is left out."""
 
 
@@ -290,7 +290,7 @@ def disagreement(task: ViewTask) -> float:
         parts.append((other_z - z) / np.hypot(own, other_sigma))
     apart = np.concatenate(parts) if parts else np.empty(0)
     apart = apart[np.isfinite(apart)]
-    return MAD_TO_SIGMA * float(np.median(np.abs(apart))) if len(apart) >= _LEAST_PIXELS else np.nan
+    return MAD_TO_SIGMA * float(np.median(np.abs(apart))) if len(apart) >= _MIN_PIXELS else np.nan
 
 
 def looked_at(views: Sequence[View], index: int, partners: Sequence[int]) -> list[int]:
@@ -336,7 +336,7 @@ def check_view(sigma_factor: float, task: ViewTask) -> tuple[Array, int]:
         supported += seen
         refuted += through
     kept = np.isfinite(depth) & (alike + supported >= 2) & (refuted <= supported)
-    kept &= np.count_nonzero(kept) >= _LEAST_PIXELS
+    kept &= np.count_nonzero(kept) >= _MIN_PIXELS
     store.save_mask(task.index, "kept", kept)
     nodes = at_nodes(np.asarray(store.load(task.index, "low")))
     light = as_rows(_shared_light(task, depth, kept))

@@ -32,7 +32,7 @@ _FARTHEST = 120
 """Cells it may grow by."""
 _RING_SIGMAS = 2.0
 _REGION_SIGMAS = 3.0
-_LEAST_BLOCKS = 20
+_MIN_BLOCKS = 20
 _SIDES = (1, 2, 4, 8, 16, 32)
 
 
@@ -193,15 +193,15 @@ def _noise_area(difference: Array, sigma: Array, stable: NDArray[np.bool_], cell
     """
     ratio = np.where(stable & np.isfinite(difference), difference / sigma, np.nan)
     ratio = ratio - np.nanmedian(ratio)
-    most = 1.0
+    maximum = 1.0
     for side in _SIDES:
         rows, columns = ratio.shape[0] // side, ratio.shape[1] // side
         blocks = ratio[: rows * side, : columns * side].reshape(rows, side, columns, side)
         means = blocks.mean(axis=(1, 3))
         means = means[np.isfinite(means)]
-        if len(means) >= _LEAST_BLOCKS:
-            most = max(most, float(np.mean(means**2)) * side**2)
-    return most * cell**2
+        if len(means) >= _MIN_BLOCKS:
+            maximum = max(maximum, float(np.mean(means**2)) * side**2)
+    return maximum * cell**2
 
 
 def _padded(box: tuple[slice, ...], shape: tuple[int, ...]) -> tuple[slice, slice]:

@@ -18,8 +18,8 @@ from alice_survey.core.executor import run_apart
 from alice_survey.core.frames import Array, Datum
 from reconstruct.ply import read_ply_points
 
-_MOST_POINTS = 2_000_000
-_LARGEST_BLOCK = 64_000_000
+_MAX_POINTS = 2_000_000
+_MAX_BLOCK = 64_000_000
 """Cells that are unpacked at once."""
 _LAS_HEADER = 375
 _COMPRESSED = 0x80
@@ -53,7 +53,7 @@ def read_reference(path: Path, datum: Datum | None) -> tuple[Array, bool]:
         if kind in (".laz", ".las"):
             points, crs = _apart(path) if _check_las(path) else _read_las(path)
         elif kind == ".ply":
-            points, crs = read_ply_points(path, _MOST_POINTS), None
+            points, crs = read_ply_points(path, _MAX_POINTS), None
         elif kind in (".tif", ".tiff"):
             points, crs = _read_tiff(path)
         else:
@@ -96,7 +96,7 @@ def _read_las(path: Path) -> tuple[Array, str | None]:
     try:
         with laspy.open(path) as file:
             crs = file.header.parse_crs()
-            step = -(-file.header.point_count // _MOST_POINTS)
+            step = -(-file.header.point_count // _MAX_POINTS)
             for chunk in file.chunk_iterator(1_000_000):
                 xyz = np.column_stack([chunk.x, chunk.y, chunk.z]).astype(np.float64)
                 parts.append(xyz[::step])
@@ -115,11 +115,11 @@ def _read_tiff(path: Path) -> tuple[Array, str | None]:
 
     with rasterio.open(path, driver="GTiff") as source:
         rows, columns = source.block_shapes[0]
-        if rows * columns > _LARGEST_BLOCK:
+        if rows * columns > _MAX_BLOCK:
             raise ValueError(
                 f"it is stored in blocks of {columns} x {rows} cells: store it in tiles"
             )
-        step = max(1, round(np.sqrt(source.height * source.width / _MOST_POINTS)))
+        step = max(1, round(np.sqrt(source.height * source.width / _MAX_POINTS)))
         # The nearest cell: a mean would round off what is compared
         shape = (-(-source.height // step), -(-source.width // step))
         band = source.read(1, out_shape=shape, masked=True)
@@ -206,7 +206,7 @@ def read_own_cloud(workspace: Path) -> Array:
     """
     cloud = need_stage(workspace, "dense", "reconstruct") / "cloud.ply"
     try:
-        points = read_ply_points(cloud, _MOST_POINTS)
+        points = read_ply_points(cloud, _MAX_POINTS)
     except (OSError, ValueError) as error:
         raise WorkspaceError(f"{cloud}: cannot be read: {why(error)}") from None
     points = points[np.isfinite(points).all(axis=1)]

@@ -26,7 +26,7 @@ _COVER_SPACINGS = 4.0
 _ROUNDS = 60
 _STILL = 1e-3
 """Share of the reference's spacing: motion of the cloud's rim at which the adjustment settles."""
-_LEAST_PAIRS = 200
+_MIN_PAIRS = 200
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -127,9 +127,9 @@ def _adjust(
         # Beyond the rim of the reference the nearest plane says nothing
         limit = 3 * MAD_TO_SIGMA * np.median(nearest[inside]) + spacing if inside.any() else 0.0
         paired = np.flatnonzero(inside & (nearest <= limit))
-        if len(paired) < _LEAST_PAIRS:
+        if len(paired) < _MIN_PAIRS:
             raise ReconstructionError(
-                f"{len(paired)} points of the cloud lie near the reference; {_LEAST_PAIRS} are "
+                f"{len(paired)} points of the cloud lie near the reference; {_MIN_PAIRS} are "
                 "needed: they show different places, or the georeference is far off"
             )
         points, normal = moved[paired], normals[paired]

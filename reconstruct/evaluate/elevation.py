@@ -21,11 +21,11 @@ _CELL_STEPS = 0.5
 """Steps of a ray's march over the grid, in cells."""
 _SIGHT_STEPS = 256
 """Steps of the way from a place to a camera."""
-_MOST_SAMPLES = 1_000_000
+_MAX_SAMPLES = 1_000_000
 LEVEL = 1e-3
 """A ray that descends less meets no surface."""
 _MARGIN_CELLS = 8
-_MOST_CELLS = 4_000_000
+_MAX_CELLS = 4_000_000
 _COARSE_CELLS = 256
 """Cells a side of a look at all of a DEM."""
 
@@ -135,7 +135,7 @@ class Elevation:
 
 def _parts(rows: int, steps: int) -> Iterator[slice]:
     """Parts of rays of so many samples that fit into memory together."""
-    size = max(1, _MOST_SAMPLES // steps)
+    size = max(1, _MAX_SAMPLES // steps)
     return (slice(start, start + size) for start in range(0, rows, size))
 
 
@@ -178,7 +178,7 @@ class StoredElevation:
         y = np.clip((grid.north - ends[::-1, 1]) / grid.cell, -1.0, grid.rows + 1.0)
         left, top = (int(np.floor(one[0])) - _MARGIN_CELLS for one in (x, y))
         columns, rows = (int(np.ceil(np.ptp(one))) + 2 * _MARGIN_CELLS + 1 for one in (x, y))
-        every = max(1, int(np.ceil(np.sqrt(rows * columns / _MOST_CELLS))))
+        every = max(1, int(np.ceil(np.sqrt(rows * columns / _MAX_CELLS))))
         return self._part(top, left, rows + every, columns + every, every)
 
     def met_by(self, starts: Array, ways: Array) -> tuple[Elevation, Array]:

@@ -11,9 +11,9 @@ from alice_survey.core.robust import MAD_TO_SIGMA
 
 _BLOCKS = 10
 """Blocks along the longer side over which errors are averaged before a bend is fitted."""
-_LEAST_SHARE = 0.25
+_MIN_SHARE = 0.25
 """Share of the fullest block's count that a block must hold to count."""
-_LEAST_BLOCKS = 12
+_MIN_BLOCKS = 12
 _PAIRS = 4000
 _TUKEY = 4.685
 """Tukey's constant: 95 % efficient for normal errors."""
@@ -111,7 +111,7 @@ def fit_doming(places_m: Array, errors_m: Array) -> ModelBend:
         errors_m: (N,) height errors, positive where the model is too high.
     """
     unknown = ModelBend(dome_m=math.nan, sigma_m=math.nan, bend_m=math.nan, radius_m=math.nan)
-    if len(places_m) < _LEAST_BLOCKS:
+    if len(places_m) < _MIN_BLOCKS:
         return unknown
     corner, far = places_m.min(axis=0), places_m.max(axis=0)
     side = max(float((far - corner).max()) / _BLOCKS, 1e-12)
@@ -121,8 +121,8 @@ def fit_doming(places_m: Array, errors_m: Array) -> ModelBend:
     starts = np.flatnonzero(np.diff(number[order], prepend=-1))
     parts = np.split(order, starts[1:])
     fullest = max(len(part) for part in parts)
-    parts = [part for part in parts if len(part) >= _LEAST_SHARE * fullest]
-    if len(parts) < _LEAST_BLOCKS:
+    parts = [part for part in parts if len(part) >= _MIN_SHARE * fullest]
+    if len(parts) < _MIN_BLOCKS:
         return unknown
     middles = np.array([places_m[part].mean(axis=0) for part in parts])
     centre = middles.mean(axis=0)

@@ -21,17 +21,17 @@ from reconstruct.evaluate.figures import mean_grid, tukey_weights
 _ROUNDS = 40
 _STILL = 1e-6
 """Share of a cell: motion of the block's rim at which the adjustment has settled."""
-_MOST_POINTS = 150_000
+_MAX_POINTS = 150_000
 _COARSE_CELLS = 320
 _PEAKS = 4
-_LEAST_OVERLAP = 0.3
+_MIN_OVERLAP = 0.3
 """Share of the smaller survey that must lie on the other one."""
 _CLUSTERS = 12
 """Blocks along a side whose errors are taken as independent of one another."""
-_LEAST_POINTS = 500
+_MIN_POINTS = 500
 _APART = (
-    f"the two surfaces overlap by less than {_LEAST_OVERLAP:.0%} of the smaller one (or by under "
-    f"{_LEAST_POINTS} cells): they show different places, or their georeferences are far apart"
+    f"the two surfaces overlap by less than {_MIN_OVERLAP:.0%} of the smaller one (or by under "
+    f"{_MIN_POINTS} cells): they show different places, or their georeferences are far apart"
 )
 
 
@@ -98,7 +98,7 @@ def register_heights(
 
 def _step(elevation: Elevation) -> int:
     """Step between cells that suffices."""
-    return max(1, int(np.sqrt(elevation.known.sum() / _MOST_POINTS)))
+    return max(1, int(np.sqrt(elevation.known.sum() / _MAX_POINTS)))
 
 
 def rough_shifts(
@@ -124,7 +124,7 @@ def rough_shifts(
     variance1 = fftconvolve(one**2, mask_flipped) - sum1**2 / count
     variance2 = fftconvolve(mask1, flipped**2) - sum2**2 / count
     scale = np.sqrt(np.maximum(variance1, 0) * np.maximum(variance2, 0))
-    enough = count >= _LEAST_OVERLAP * min(mask1.sum(), mask2.sum())
+    enough = count >= _MIN_OVERLAP * min(mask1.sum(), mask2.sum())
     floor = 1e-9 * max(float(scale.max()), 1e-30)
     score = np.where(enough & (scale > floor), product / np.maximum(scale, floor), -1.0)
     shifts: list[tuple[float, float]] = [(0.0, 0.0)]
@@ -172,12 +172,12 @@ def _adjust(
     centre = points.mean(axis=0)
     rim = float(np.linalg.norm(points[:, :2] - centre[:2], axis=1).max())
     area = min(fixed.known.sum() * fixed.cell**2, moving.known.sum() * moving.cell**2)
-    least = max(_LEAST_POINTS, _LEAST_OVERLAP * area / (fixed.cell * step) ** 2)
+    minimum = max(_MIN_POINTS, _MIN_OVERLAP * area / (fixed.cell * step) ** 2)
     slopes = _slopes(moving)
     pose = start
     for _ in range(_ROUNDS):
         compared = _compare(points, variance, moving, slopes, pose)
-        if compared.miss.size < least:
+        if compared.miss.size < minimum:
             return None
         jacobian = _jacobian(points[compared.index] - centre, compared.normals)
         jacobian[:, :3] /= rim  # turns as motions of the rim: all six in metres

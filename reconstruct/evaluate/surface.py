@@ -29,7 +29,7 @@ from reconstruct.evaluate.truth import surface_depth, surface_distance
 
 GOOD_M = 0.01
 """A cell counts as accurate when its distance from the true surface is below this."""
-LEAST_STATIONS = 3
+MIN_STATIONS = 3
 """Cells seen from this many stations are also scored separately."""
 
 _LATTICE = 4
@@ -60,7 +60,7 @@ class SurfaceScore:
     stations: NDArray[np.int64]
     """(N,) stations that see the true surface there."""
     cells_seen_well: int
-    """Cells in the area, filled or not, that `LEAST_STATIONS` see."""
+    """Cells in the area, filled or not, that `MIN_STATIONS` see."""
     map_m: Array
     """(rows, columns) of `height_m`; NaN where there is no cell."""
     extent_m: tuple[float, float, float, float]
@@ -76,7 +76,7 @@ class SurfaceScore:
     def to_json(self) -> dict[str, Any]:
         """Figures in millimetres and ground pixels."""
         distance, height = 1e3 * self.distance_m, 1e3 * self.height_m
-        well = self.stations >= LEAST_STATIONS
+        well = self.stations >= MIN_STATIONS
         stated = self.sigma_m > 0
         ratio = self.height_m[stated] / self.sigma_m[stated]
         return {
@@ -96,7 +96,7 @@ class SurfaceScore:
             "completeness_within_px": shares_within(
                 self.distance_m, self.ground_pixel_m, self.cells
             ),
-            f"seen_from_{LEAST_STATIONS}_stations": {
+            f"seen_from_{MIN_STATIONS}_stations": {
                 "cells": self.cells_seen_well,
                 "share": round(self.cells_seen_well / self.cells, 4),
                 "completeness": rounded(float(well.sum()) / max(self.cells_seen_well, 1), 4),
@@ -162,7 +162,7 @@ def score_surface(
         true_height_m=-depth,
         sigma_m=surface.sigma.ravel()[used],
         stations=seen[used],
-        cells_seen_well=int((seen[inside] >= LEAST_STATIONS).sum()),
+        cells_seen_well=int((seen[inside] >= MIN_STATIONS).sum()),
         map_m=misses.reshape(heights.shape),
         extent_m=(
             surface.west + shift_ne[1],

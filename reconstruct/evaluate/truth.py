@@ -20,7 +20,7 @@ from camera_calib.rig import Rig
 
 _ABOVE_M = 8.0
 """Rays start this far above the mean sea floor: far enough, and near enough for float32."""
-_MOST_RAYS = 500_000
+_MAX_RAYS = 500_000
 """Rays that are cast at once."""
 _CLEAR_M = 0.004
 """Height above the surface at which a ray to the camera starts, so as not to hit its own facet."""
@@ -154,8 +154,8 @@ def count_stations(
             rays = np.column_stack([start, ray / length[:, None]]).astype(np.float32)
             rays[:, :3] += np.float32(_CLEAR_M) * rays[:, 3:]
             hidden = np.zeros(len(near), dtype=np.bool_)
-            for first in range(0, len(near), _MOST_RAYS):
-                part = slice(first, first + _MOST_RAYS)
+            for first in range(0, len(near), _MAX_RAYS):
+                part = slice(first, first + _MAX_RAYS)
                 hits = scene.cast_rays(o3d.core.Tensor(rays[part]))["t_hit"].numpy()
                 hidden[part] = hits < length[part] - 2 * _CLEAR_M
             seen[near[~hidden]] = True

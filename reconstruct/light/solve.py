@@ -52,11 +52,11 @@ FALL_OFF_SIGMA = 4.0
 """Expected logarithm of the light lost over the middle range."""
 _SCENE_SIGMA = 0.5
 """Spread of the sea floor's own logarithmic brightness from picture to picture."""
-_FEWEST_PICTURES = 6
+_MIN_PICTURES = 6
 """Fewest pictures of a camera whose median counts."""
-_LEAST_SHOWN = 0.5
+_MIN_SHOWN = 0.5
 """Share of a picture's nodes that must be seen for its brightness to be known."""
-_LARGEST_GAIN = 8.0
+_MAX_GAIN = 8.0
 BRIGHT_PERCENT = 98.0
 """Share of a survey's spots that are no brighter than what counts as bright."""
 _WHITE_LEVEL, _GREY_LEVEL = 215.0, 128.0
@@ -101,7 +101,7 @@ class LightModel:
     def factors(self, camera: str, image: str) -> NDArray[np.float32]:
         """(rows, columns, 3) factors at the nodes that take a picture's BGR to even light."""
         log_light = self.patterns[camera] + self.gains[image]
-        lift = np.clip(np.exp(-log_light), 1.0 / _LARGEST_GAIN, _LARGEST_GAIN)
+        lift = np.clip(np.exp(-log_light), 1.0 / _MAX_GAIN, _MAX_GAIN)
         return (lift * self.white).astype(np.float32)
 
 
@@ -443,7 +443,7 @@ def _typical(nodes: Array, camera_of: NDArray[np.int64], cameras: int) -> tuple[
         relative = pictures - total / np.maximum(known.sum(axis=1, keepdims=True), 1)
         for node in range(size):
             for channel in range(3):
-                if count[node, channel] < _FEWEST_PICTURES:
+                if count[node, channel] < _MIN_PICTURES:
                     continue
                 values = relative[known[:, node, channel], node, channel]
                 weight = count[node, channel] / _SCENE_SIGMA**2
@@ -462,11 +462,11 @@ def _brightness(nodes: Array, camera_of: NDArray[np.int64], cameras: int) -> tup
     for camera in range(cameras):
         mine = np.flatnonzero(camera_of == camera)
         pictures = nodes[mine].reshape(len(mine), -1, 3)
-        usual = np.isfinite(pictures).all(axis=2).sum(axis=0) >= _FEWEST_PICTURES
+        usual = np.isfinite(pictures).all(axis=2).sum(axis=0) >= _MIN_PICTURES
         above = pictures[:, usual] - np.nanmedian(pictures[:, usual], axis=0)
         shown: NDArray[np.bool_] = np.asarray(np.isfinite(above).all(axis=2))
         count = np.count_nonzero(shown, axis=1)
-        known = np.flatnonzero(count > _LEAST_SHOWN * pictures.shape[1])
+        known = np.flatnonzero(count > _MIN_SHOWN * pictures.shape[1])
         if len(known):
             total = np.where(shown[..., None], above, 0.0).sum(axis=1)
             mean = total[known] / count[known, None]

@@ -42,7 +42,7 @@ from reconstruct.light.solve import (
     solve_symmetric,
 )
 
-LEAST_LEFT = np.float32(0.05)
+MIN_LEFT = np.float32(0.05)
 """Share of the light that stays at least when the water's is taken away."""
 GREEN = 1
 _NODES = GRID[0] * GRID[1]
@@ -64,12 +64,12 @@ _FREE_ROUNDS, _HELD_SIGMA = 4, 0.01
 """Rounds after which s is held, within its bounds: its light has the shades of slopes in it."""
 _TIE = 1e6
 """Weight with which s is the same for all channels."""
-_LARGEST_SHARE_SIGMA = 0.25
+_MAX_SHARE_SIGMA = 0.25
 """Largest sigma of the mean of u with which light is taken away."""
-_FEWEST_SAMPLES = 1000
+_MIN_SAMPLES = 1000
 """Fewer leave residuals that say too little of the noise."""
-_GAIN_SIGMA, _LEAST_GAIN_SIGMA = 1.0, 0.02
-_LEAST_NOISE = 0.003
+_GAIN_SIGMA, _MIN_GAIN_SIGMA = 1.0, 0.02
+_MIN_NOISE = 0.003
 """Least sigma of a channel's own part of a logarithm."""
 
 
@@ -114,10 +114,10 @@ def solve_water(
         cameras: of the views, by number.
     """
     known = np.full(3, np.inf)
-    if len(samples.views) >= _FEWEST_SAMPLES:
+    if len(samples.views) >= _MIN_SAMPLES:
         found = _solve(samples, dark, cameras)
         known = found.share_sigma
-        if (known <= _LARGEST_SHARE_SIGMA).all():
+        if (known <= _MAX_SHARE_SIGMA).all():
             return found
     # fall-offs are then those of all the light
     without = _solve(samples, {name: np.zeros_like(level) for name, level in dark.items()}, cameras)
@@ -158,7 +158,7 @@ def _solve(samples: LightSamples, dark: Mapping[str, Array], cameras: Sequence[s
         log_b = log_b + part * np.clip(solution[:, :count][:, _LOG_GROWTH] - log_b, -1.0, 1.0)
         if turn == _FREE_ROUNDS:
             spread = (float(np.clip(solution[GREEN, :count][_SPREAD], *_SPREADS)), _HELD_SIGMA)
-        gain_sigma = float(np.clip(solution[:, count:].std(), _LEAST_GAIN_SIGMA, _GAIN_SIGMA))
+        gain_sigma = float(np.clip(solution[:, count:].std(), _MIN_GAIN_SIGMA, _GAIN_SIGMA))
     share_sigma, fall_off_sigma, to_green = sigmas
     added = (u * level).reshape(len(names), *GRID, 3)
     return WaterLight(
@@ -201,8 +201,8 @@ def _linearised(
     for c in range(3):
         added = np.stack([side @ (level[:, c] * u[:, c]) for side in at], axis=1) * h[..., c]
         shown = light[..., c]
-        left = np.maximum(shown - added, LEAST_LEFT * shown)
-        usable &= (shown - added > LEAST_LEFT * shown).all(axis=1)
+        left = np.maximum(shown - added, MIN_LEFT * shown)
+        usable &= (shown - added > MIN_LEFT * shown).all(axis=1)
         expected = left
         if not first:
             x = solution[c]
@@ -248,7 +248,7 @@ def _noise(rest: Array, step: _PairEquations) -> Array:
         for c in (0, 2)
     ]
     parts = np.concatenate([np.abs(part[step.usable]) for part in own])
-    sigma = max(1.4826 * float(np.median(parts)), _LEAST_NOISE)
+    sigma = max(1.4826 * float(np.median(parts)), _MIN_NOISE)
     green = 1.4826 * float(np.median(np.abs(rest[step.usable, GREEN])))
     size = float(np.median(step.size[step.usable, GREEN]))
     return np.array([math.sqrt(max(green**2 - sigma**2 * size, sigma**2)), sigma])

@@ -14,7 +14,7 @@ from alice_survey.core.frames import Array
 from reconstruct.views.model_files import stored_of
 
 Indices = NDArray[np.int64]
-LEAST_POINTS = 4
+MIN_POINTS = 4
 """A station that sees fewer is not determined."""
 
 
@@ -81,7 +81,7 @@ def linked_groups(station: Indices, point: Indices, stations: int) -> Indices:
         point: (O,) its point.
         stations: F, how many there are.
     """
-    seen = np.bincount(station, minlength=stations) >= LEAST_POINTS
+    seen = np.bincount(station, minlength=stations) >= MIN_POINTS
     links = np.flatnonzero(seen[station])
     size = stations + int(point.max(initial=-1)) + 1
     ends = (station[links], stations + point[links])

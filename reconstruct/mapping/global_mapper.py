@@ -42,8 +42,8 @@ _NO_BOUND = 1e12
 """Radius of the trust region."""
 Indices = NDArray[np.int64]
 _ROUNDS = 8
-_LEAST_ANGLE_RAD = 1e-3
-_LEAST_LENGTH = 1e-3
+_MIN_ANGLE_RAD = 1e-3
+_MIN_LENGTH = 1e-3
 """Share of the links' usual length; with the angle, floors of what counts as a contradiction."""
 _MEDIANS = 2.0
 """Residuals of this many medians keep half their weight."""
@@ -281,7 +281,7 @@ def _average_rotations(
     for _ in range(_ROUNDS):
         # (relative * first).inv() * second is what is left over, about the world's axes.
         left = ((relative * turned[first]).inv() * turned[second]).as_rotvec()
-        trust = weight * _trust(np.linalg.norm(left, axis=1), _LEAST_ANGLE_RAD)
+        trust = weight * _trust(np.linalg.norm(left, axis=1), _MIN_ANGLE_RAD)
         step = _solve(len(turned), first, second, -left, trust, root)
         turned = turned * Rotation.from_rotvec(step)
         if np.abs(step).max() < 1e-8:
@@ -292,7 +292,7 @@ def _average_rotations(
 def _average_centres(
     centres: Array, first: Indices, second: Indices, steps: Array, weight: Array, root: int
 ) -> Array:
-    floor = _LEAST_LENGTH * float(np.median(np.linalg.norm(steps, axis=1)))
+    floor = _MIN_LENGTH * float(np.median(np.linalg.norm(steps, axis=1)))
     for _ in range(_ROUNDS):
         left = centres[second] - centres[first] - steps
         trust = weight * _trust(np.linalg.norm(left, axis=1), floor)

@@ -34,7 +34,7 @@ class Taken:
     mask: Path | None
     features: Path
     """Of SIFT."""
-    most: int
+    maximum: int
     turns: int
     """Quarter turns that bring its north up, see `quarter_turns`."""
 
@@ -102,7 +102,7 @@ def extract_learned(taken: Taken) -> None:
         return
     grey = normalise(read_deep(taken.picture))
     mask = None if taken.mask is None else read_mask(taken.mask, (grey.shape[1], grey.shape[0]))
-    save_features(taken.learned, find_learned(grey, mask, most=taken.most, turns=taken.turns))
+    save_features(taken.learned, find_learned(grey, mask, maximum=taken.maximum, turns=taken.turns))
 
 
 def all_pixels(features: Sequence[Path]) -> list[Array]:

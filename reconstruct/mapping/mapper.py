@@ -40,19 +40,19 @@ _FEW_MATCHES = 12
 _REPAIRS = 3
 _COLLAPSED = 0.05
 """Share of the usual depth below which a point lies in the camera."""
-_MOST_COLLAPSED = 0.1
+_MAX_COLLAPSED = 0.1
 """Share of a frame's points; the sea floor never comes so near."""
-_LEAST_ANGLE_DEG = 6.0
+_MIN_ANGLE_DEG = 6.0
 """Least angle of the first pair: nadir pictures with 60 % overlap rarely reach COLMAP's 16 degrees.
 """
 _GROWTH = 1.4
 """Growth of a model between adjustments of all of it (COLMAP: 1.1). On a known rig half the time
 goes: 17.8 to 8.4 s on 24 stations, for the same rms. Where cameras calibrate themselves none to a
 quarter goes, for the same pictures and errors: 22.2 to 16.5, 5.3 to 4.3, 60.6 to 60.0 s."""
-_MOST_LOST = 0.02
+_MAX_LOST = 0.02
 """Share of pictures lost by the global mapper from which the incremental one is tried."""
-_LARGEST_REPROJECTION_PX = 2.0
-_LARGEST_SPREAD = 0.1
+_MAX_REPROJECTION_PX = 2.0
+_MAX_SPREAD = 0.1
 """Radians, and lengths over the models' usual distance to the floor, by which shared stations may
 disagree about where the second model lies in the first."""
 
@@ -240,7 +240,7 @@ def faults_of(found: Sequence[pycolmap.Reconstruction], total: int) -> list[str]
         return ["found no model"]
     faults = unsound(found[0])
     lost = total - found[0].num_reg_images()
-    if lost > _MOST_LOST * total:
+    if lost > _MAX_LOST * total:
         faults.append(f"left {lost} of {total} pictures out of its largest model")
     return faults
 
@@ -252,7 +252,7 @@ def unsound(model: pycolmap.Reconstruction) -> list[str]:
     if collapsed:
         faults.append(f"collapsed {len(collapsed)} stations")
     error = model.compute_mean_reprojection_error()
-    if not error <= _LARGEST_REPROJECTION_PX:
+    if not error <= _MAX_REPROJECTION_PX:
         faults.append(f"left a mean reprojection error of {error:.1f} px")
     return faults
 
@@ -326,7 +326,7 @@ def _options(
     options.num_threads = options.mapper.num_threads = 1
     options.extract_colors = False
     options.min_model_size = 3
-    options.mapper.init_min_tri_angle = _LEAST_ANGLE_DEG
+    options.mapper.init_min_tri_angle = _MIN_ANGLE_DEG
     options.ba_refine_sensor_from_rig = False
     options.ba_global_frames_ratio = options.ba_global_points_ratio = _GROWTH
     options.ba_global_max_refinements = 2
@@ -429,7 +429,7 @@ def collapsed_frames(model: pycolmap.Reconstruction) -> list[int]:
     return [
         frame
         for frame, rows in depths.items()
-        if np.mean(np.concatenate(rows) < _COLLAPSED * usual) > _MOST_COLLAPSED
+        if np.mean(np.concatenate(rows) < _COLLAPSED * usual) > _MAX_COLLAPSED
     ]
 
 
@@ -511,7 +511,7 @@ def second_from_first(
     place = np.median(places, axis=0)
     away = np.median([(step.rotation * turn.inv()).magnitude() for step in steps])
     spread = np.median(np.linalg.norm(places - place, axis=1))
-    if away > _LARGEST_SPREAD or spread > _LARGEST_SPREAD * _reach(first):
+    if away > _MAX_SPREAD or spread > _MAX_SPREAD * _reach(first):
         return None
     return RigidTransform.from_components(place - turn.apply(middle), turn)
 

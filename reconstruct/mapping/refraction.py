@@ -37,10 +37,10 @@ _UNMOVED_PX = 1e-6
 """Keypoints that move less are not written again."""
 _NEAREST, _FARTHEST = 0.2, 20.0
 """Depths of spots over the working depth; beyond, a point is wrong and is left to the filter."""
-_WRONG_SIGMAS, _LEAST_WRONG_PX, _MOST_WRONG_PX = 5.0, 1.0, 4.0
+_WRONG_SIGMAS, _MIN_WRONG_PX, _MAX_WRONG_PX = 5.0, 1.0, 4.0
 """An observation that misses by this many sigmas of the usual miss is wrong; none below the first
 bound is called wrong, all beyond the second (COLMAP's) is."""
-_LEAST_ANGLE_DEG = 1.5
+_MIN_ANGLE_DEG = 1.5
 """Least angle between the rays of a point (COLMAP's)."""
 
 
@@ -319,10 +319,10 @@ def _judge_again(
     else:
         manager = pycolmap.ObservationManager(model)
     added = model.compute_num_observations() - before
-    removed = manager.filter_all_points3D(limit, _LEAST_ANGLE_DEG)
+    removed = manager.filter_all_points3D(limit, _MIN_ANGLE_DEG)
     return int(removed), int(added)
 
 
 def _wrong_px(model: pycolmap.Reconstruction) -> float:
     """Size of the miss from which an observation is wrong."""
-    return float(np.clip(_WRONG_SIGMAS * pixel_sigma(model), _LEAST_WRONG_PX, _MOST_WRONG_PX))
+    return float(np.clip(_WRONG_SIGMAS * pixel_sigma(model), _MIN_WRONG_PX, _MAX_WRONG_PX))

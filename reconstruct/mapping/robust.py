@@ -14,9 +14,9 @@ from alice_survey.core.frames import Array
 from alice_survey.core.robust import CAUCHY_TUNING, RAYLEIGH_MEDIAN
 from reconstruct.mapping.arrays import Indices, observed
 
-_LEAST_SIGMA_PX = 1e-3
+_MIN_SIGMA_PX = 1e-3
 _WELL_SEEN = 4
-_MOST_ADAPTED = 0.9
+_MAX_ADAPTED = 0.9
 
 
 def pixel_sigma(model: pycolmap.Reconstruction) -> float:
@@ -38,13 +38,13 @@ def sigma_of(misses: Array, counts: Indices, stations: int) -> float:
         stations: how many there are.
     """
     if not len(misses):
-        return _LEAST_SIGMA_PX
+        return _MIN_SIGMA_PX
     free = float((3.0 / counts).sum())  # unknowns of points
-    by_station = 1.0 - min(_MOST_ADAPTED, 6.0 * stations / max(2.0 * len(misses) - free, 1.0))
+    by_station = 1.0 - min(_MAX_ADAPTED, 6.0 * stations / max(2.0 * len(misses) - free, 1.0))
     left = (1.0 - 1.5 / counts) * by_station
     well_seen = counts >= min(_WELL_SEEN, int(np.median(counts)))
     median = float(np.median(np.linalg.norm(misses[well_seen], axis=1) / np.sqrt(left[well_seen])))
-    return max(median / RAYLEIGH_MEDIAN, _LEAST_SIGMA_PX)
+    return max(median / RAYLEIGH_MEDIAN, _MIN_SIGMA_PX)
 
 
 def loss_scale(sigma_px: float) -> float:

@@ -51,7 +51,7 @@ from reconstruct.views.model_files import colmap_pinhole
 
 RATIO = 0.8
 """Largest distance of a match over that of the second nearest descriptor."""
-_LEAST_COARSE = 10
+_MIN_COARSE = 10
 """Coarse matches from which a pair is matched fully."""
 _ALIKE = 12
 """Pictures that look most like one that navigation does not place, which get a coarse look."""
@@ -80,7 +80,7 @@ class _FeatureTask:
     mask: Path | None
     target: Path
     scale: float | None
-    most: int
+    maximum: int
     thrifty: bool
 
 
@@ -145,7 +145,9 @@ def extract(task: _FeatureTask) -> int:
         picture = read_deep(task.picture)
         grey = normalise(picture)
         mask = None if task.mask is None else read_mask(task.mask, (grey.shape[1], grey.shape[0]))
-        found = find_features(grey, mask, scale=task.scale, most=task.most, thrifty=task.thrifty)
+        found = find_features(
+            grey, mask, scale=task.scale, maximum=task.maximum, thrifty=task.thrifty
+        )
         with atomic_path(_grey_file(task.target)) as temporary, temporary.open("wb") as file:
             np.save(file, finely(even_light(picture)))
         save_features(task.target, found)
@@ -168,7 +170,7 @@ def _find_all(
             mask=inputs.images / record.mask if record.mask else None,
             target=target,
             scale=settings.feature_scale,
-            most=settings.max_features,
+            maximum=settings.max_features,
             thrifty=inputs.rig is not None,
         )
         for record, target in zip(inputs.records, targets, strict=True)
@@ -275,7 +277,7 @@ def _match_all(
     sure, maybe = choose_pairs(inputs.records, rig, inputs.datum, alike, range_m)
     looks = [PairTask(first=features[i], second=features[j], ratio=RATIO) for i, j in maybe]
     counts = executor.map(coarse_matches, looks, label="choosing pairs")
-    likely = [pair for pair, n in zip(maybe, counts, strict=True) if n >= _LEAST_COARSE]
+    likely = [pair for pair, n in zip(maybe, counts, strict=True) if n >= _MIN_COARSE]
     pairs = sorted([*sure, *likely])
     fields = {name: camera.todict() for name, camera in cameras.items()}
     names = [record.camera for record in inputs.records]
@@ -297,7 +299,7 @@ def _match_all(
                 picture=inputs.images / record.image,
                 mask=inputs.images / record.mask if record.mask else None,
                 features=file,
-                most=settings.max_features,
+                maximum=settings.max_features,
                 turns=quarter_turns(record, rig),
             )
             for record, file in zip(inputs.records, features, strict=True)

@@ -36,7 +36,7 @@ from reconstruct.views.model_files import as_transform, colmap_pinhole
 
 SIMPLE, FULL = "RADIAL", "OPENCV"
 """COLMAP's lens models while mapping and in the last adjustment."""
-_LEAST_STATIONS = 3
+_MIN_STATIONS = 3
 """Stations with a camera and the first one from which its place on the rig is taken."""
 _TOLERANCE = 1e-6
 """Relative change of the cost at which the calibration ends. Going on until the gradient vanishes
@@ -46,9 +46,9 @@ _ROUNDS = 2
 observations fit."""
 _CONTRADICTION = 1.05
 """EXIF's focal length goes when freeing it lowers the mean reprojection error by this factor."""
-_LARGEST_ASPECT, _LARGEST_TANGENTIAL = 0.03, 0.03
+_MAX_ASPECT, _MAX_TANGENTIAL = 0.03, 0.03
 """Bounds of a sane lens: difference of the two focal lengths, tangential distortion."""
-_LEAST_FULL = 8
+_MIN_FULL = 8
 """Pictures of a camera from which the full lens model is tried."""
 
 
@@ -84,7 +84,7 @@ def map_self_calibrated(
         if cam_from_rig is None:
             first, *others = seen.cameras
             notes.append(
-                f"fewer than {_LEAST_STATIONS} stations have both {first} and one of "
+                f"fewer than {_MIN_STATIONS} stations have both {first} and one of "
                 f"{', '.join(others)}: mapped without a rig"
             )
             warn(notes[0])
@@ -167,7 +167,7 @@ def rig_from_model(
     rig = {first: RigidTransform.identity()}
     for name in others:
         stations = [p for p in poses.values() if first in p and name in p]
-        if len(stations) < _LEAST_STATIONS:
+        if len(stations) < _MIN_STATIONS:
             return None
         rig[name] = _mean_pose([p[name] * p[first].inv() for p in stations])
     return rig
@@ -236,7 +236,7 @@ def _best_lens(model: pycolmap.Reconstruction, *, focal: bool) -> pycolmap.Recon
         number: sum(i.camera_id == number and i.has_pose for i in model.images.values())
         for number in model.cameras
     }
-    if min(counts.values()) < _LEAST_FULL:
+    if min(counts.values()) < _MIN_FULL:
         return simple
     full = pycolmap.Reconstruction(simple)
     for camera in full.cameras.values():
@@ -246,9 +246,7 @@ def _best_lens(model: pycolmap.Reconstruction, *, focal: bool) -> pycolmap.Recon
     _adjust(full, focal=focal)
     for camera in full.cameras.values():
         fx, fy, _, _, _, _, p1, p2 = camera.params
-        sane = (
-            abs(fx / fy - 1.0) <= _LARGEST_ASPECT and max(abs(p1), abs(p2)) <= _LARGEST_TANGENTIAL
-        )
+        sane = abs(fx / fy - 1.0) <= _MAX_ASPECT and max(abs(p1), abs(p2)) <= _MAX_TANGENTIAL
         if not sane:
             return simple
     return full

@@ -30,14 +30,14 @@ from reconstruct.mapping.working_range import ray_passes
 from reconstruct.matching.matches import Matches
 from reconstruct.views.model_files import as_transform
 
-_LARGEST_GAP_PX = 3.0
+_MAX_GAP_PX = 3.0
 """Distance by which the two rays of a stereo point may miss each other, as seen from the cameras.
 """
-_LARGEST_ERROR_PX = 12.0
+_MAX_ERROR_PX = 12.0
 """Largest error of a resection: stereo depths are noisy, and show as parallax from the next
 station."""
-_LEAST_INLIERS = 15
-_LEAST_SHARE = 0.25
+_MIN_INLIERS = 15
+_MIN_SHARE = 0.25
 _ENOUGH = 300
 """Points that a resection takes; more add time but little accuracy before the adjustment."""
 _PARTNERS = 6
@@ -140,7 +140,7 @@ def stereo_points(
         points = 0.5 * (start[0] + along[:, None] * ray[0] + start[1] + other[:, None] * ray[1])
         focal = seen.cameras[a.camera].mean_focal_length()
         with np.errstate(invalid="ignore"):
-            good = (along > 0) & (other > 0) & (gap * focal < _LARGEST_GAP_PX * along)
+            good = (along > 0) & (other > 0) & (gap * focal < _MAX_GAP_PX * along)
         for side, picture in enumerate((i, j)):
             rows = pair.matches[good, side]
             better = gap[good] < gaps[picture][rows]
@@ -213,7 +213,7 @@ def _resections(
         there = _collect(seen, points, names, rows)
         back = _collect(seen, points, names, [(j, i, m[:, ::-1]) for i, j, m in rows])
         first, second, best = (b, a, back) if len(back[0]) > len(there[0]) else (a, b, there)
-        if len(best[0]) >= _LEAST_INLIERS:
+        if len(best[0]) >= _MIN_INLIERS:
             yield _Resection(
                 first=first,
                 second=second,
@@ -278,8 +278,8 @@ def _resect_all(
     seed: int,
 ) -> list[_LinkAnswer | None]:
     ransac = pycolmap.RANSACOptions()
-    ransac.max_error = _LARGEST_ERROR_PX
-    ransac.min_inlier_ratio = _LEAST_SHARE
+    ransac.max_error = _MAX_ERROR_PX
+    ransac.min_inlier_ratio = _MIN_SHARE
     ransac.random_seed = seed
     ransac.min_num_trials, ransac.max_num_trials = 30, 1000
     ransac.confidence = 0.999
@@ -325,7 +325,7 @@ def _link(task: _Resection, found: _LinkAnswer | None) -> StationLink | None:
     quaternion, shift, inliers, covariance = found
     turns, shifts = np.trace(covariance[:3, :3]), np.trace(covariance[3:, 3:])
     known = turns > 0 and shifts > 0 and np.isfinite(turns + shifts)
-    if inliers < max(_LEAST_INLIERS, _LEAST_SHARE * len(task.points)) or not known:
+    if inliers < max(_MIN_INLIERS, _MIN_SHARE * len(task.points)) or not known:
         return None
     return StationLink(
         first=task.first,

@@ -23,16 +23,16 @@ from reconstruct.views.range_shift import range_shift
 _STATIONS = 24
 """Stations looked at, spread evenly; fewer where cameras make more pairs than there are cameras."""
 _FEATURES = 3000
-_LEAST_POINTS = 50
-_LARGEST_GAP_PX = 2.0
+_MIN_POINTS = 50
+_MAX_GAP_PX = 2.0
 """Rays of a match pass each other by at most this many pixels."""
 _NEAR, _FAR = 0.75, 1.5
 """Nearest and farthest distances over the working range, when only the range is known."""
 _ANY = "no refraction"
 """Source of distances where any would do."""
-_LARGEST_CONTRACTION = 0.5
+_MAX_CONTRACTION = 0.5
 """At which warped pictures are stretched by half, or twice as dense; at 1 they fold."""
-_LARGEST_CUT = 0.05
+_MAX_CUT = 0.05
 """Share of a frame whose loss is worth a warning."""
 
 
@@ -91,7 +91,7 @@ def find_distances(
     depths = np.concatenate([np.zeros(0), *executor.map(
         stereo_depths, tasks, label="working range"
     )])  # fmt: skip
-    if len(depths) >= _LEAST_POINTS:
+    if len(depths) >= _MIN_POINTS:
         near, far = np.percentile(depths, [2.0, 98.0])
         return WorkingDistances(near_m=float(near), far_m=float(far), source="stereo")
     altitudes = np.array([r.altitude_m for r in records])
@@ -125,14 +125,14 @@ def warn_of_warps(warps: Mapping[str, PinholeWarp], distances: WorkingDistances)
     """Warn, one line a camera, where a pinhole stands in badly or leaves much of the frame out."""
     for name, warp in warps.items():
         found = warp_record(warp, distances)
-        if found.contraction > _LARGEST_CONTRACTION:
+        if found.contraction > _MAX_CONTRACTION:
             warn(
                 f"camera {name}: from {distances.near_m:.3g} to {distances.far_m:.3g} m its port "
                 f"shifts neighbouring pixels by up to {found.contraction:.2f} px differently, and "
                 "from 1 on two of them show one spot: centre the pupil behind the port, or keep "
                 "farther from the sea floor"
             )
-        if found.cut_share > _LARGEST_CUT:
+        if found.cut_share > _MAX_CUT:
             warn(
                 f"camera {name}: {found.cut_share:.0%} of its frame, at the edges, lie beyond the "
                 "undistorted picture and are left out: narrow the lens, or crop the pictures"
@@ -153,7 +153,7 @@ def stereo_depths(task: _StereoTask) -> Array:
     depths = np.stack([points[:, 2], task.second_from_first.apply(points)[:, 2]])
     focal = first.focal_in_water_px
     with np.errstate(invalid="ignore"):
-        good = (along_a > 0) & (gap * focal < _LARGEST_GAP_PX * depths[0]) & (depths[1] > 0)
+        good = (along_a > 0) & (gap * focal < _MAX_GAP_PX * depths[0]) & (depths[1] > 0)
     return depths[:, good].ravel()
 
 

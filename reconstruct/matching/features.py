@@ -14,7 +14,7 @@ _CONTRAST = 0.01
 """SIFT's contrast threshold: a quarter of the usual, since sediment has little."""
 _CELLS = 16
 """Cells along the longer side over which features are spread."""
-_MOST_MPX = 1.5
+_MAX_MPX = 1.5
 """Largest picture in which features are looked for, unless a scale is set (see `detection_scales`).
 """
 _PIXELS_PER_FEATURE = 100.0
@@ -42,7 +42,7 @@ def find_features(
     mask: NDArray[np.bool_] | None,
     *,
     scale: float | None,
-    most: int,
+    maximum: int,
     thrifty: bool = False,
 ) -> Features:
     """Find SIFT features.
@@ -53,11 +53,11 @@ def find_features(
         grey: (H, W) normalised picture.
         mask: (H, W) where features may be, or None.
         scale: the picture is reduced by this much first, at most 1; None: see `detection_scales`.
-        most: how many to keep, evenly over the picture.
+        maximum: how many to keep, evenly over the picture.
         thrifty: without a scale, look where there are enough first, see `detection_scales`.
     """
     height, width = grey.shape
-    scales = detection_scales((width, height), most) if scale is None else (scale,)
+    scales = detection_scales((width, height), maximum) if scale is None else (scale,)
     if not thrifty:
         scales = scales[-1:]
     # Without the precise upscaling every keypoint lies a quarter pixel towards the origin.
@@ -66,7 +66,7 @@ def find_features(
         size = (max(1, round(width * tried)), max(1, round(height * tried)))
         small = grey if tried >= 1.0 else cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
         keypoints = sift.detect(small, None)
-        if len(keypoints) >= most:
+        if len(keypoints) >= maximum:
             break
     steps = np.array([width / small.shape[1], height / small.shape[0]])
     pixels = np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2)
@@ -80,7 +80,9 @@ def find_features(
         usable = np.flatnonzero(free_px[rows, columns] > _SUPPORT * steps.mean() * sizes)
     else:
         usable = np.arange(len(pixels))
-    chosen = usable[spread(pixels[usable], sizes[usable], response[usable], (width, height), most)]
+    chosen = usable[
+        spread(pixels[usable], sizes[usable], response[usable], (width, height), maximum)
+    ]
     if not len(chosen):
         return Features(
             pixels=np.zeros((0, 2)),
@@ -96,7 +98,7 @@ def find_features(
     )
 
 
-def detection_scales(size: tuple[int, int], most: int) -> tuple[float, ...]:
+def detection_scales(size: tuple[int, int], maximum: int) -> tuple[float, ...]:
     """Factors by which a picture of some width and height is reduced to look for features.
 
     SIFT doubles a picture first. Pictures of rich texture have more features than are kept, and the
@@ -106,8 +108,8 @@ def detection_scales(size: tuple[int, int], most: int) -> tuple[float, ...]:
     be calibrated from them: a block of 18 drone pictures bent more with the larger features.
     """
     area = size[0] * size[1]
-    largest = min(1.0, float(np.sqrt(1e6 * _MOST_MPX / area)))
-    first = min(largest, float(np.sqrt(_PIXELS_PER_FEATURE * most / area)))
+    largest = min(1.0, float(np.sqrt(1e6 * _MAX_MPX / area)))
+    first = min(largest, float(np.sqrt(_PIXELS_PER_FEATURE * maximum / area)))
     return (first, largest) if first < largest else (largest,)
 
 
@@ -120,7 +122,7 @@ def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def spread(
-    pixels: Array, sizes: Array, response: Array, size: tuple[int, int], most: int
+    pixels: Array, sizes: Array, response: Array, size: tuple[int, int], maximum: int
 ) -> NDArray[np.intp]:
     """Choose features so that every part of the picture keeps its largest.
 
@@ -132,7 +134,7 @@ def spread(
         sizes: (N,) diameters, by which features are chosen.
         response: (N,) strength, which decides between equals.
         size: width and height of the picture.
-        most: how many to choose at most.
+        maximum: how many to choose at most.
 
     Returns:
         Indices; first the largest of every cell, then the second of every cell, and so on.
@@ -146,7 +148,7 @@ def spread(
     starts = np.flatnonzero(np.r_[True, np.diff(cells[order]) != 0])
     rank = np.arange(len(order)) - np.repeat(starts, np.diff(np.r_[starts, len(order)]))
     turn: NDArray[np.intp] = order[np.lexsort((-sizes[order], rank))]
-    return turn[:most]
+    return turn[:maximum]
 
 
 def save_features(path: Path, features: Features) -> None:

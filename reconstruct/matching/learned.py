@@ -29,11 +29,11 @@ from reconstruct.matching.matches import (
 
 RATIO = 0.85
 """Largest distance of a match over that of the second nearest."""
-_MOST_PX = 1.5e6
+_MAX_PX = 1.5e6
 """Pixels to which a larger picture is reduced, as for SIFT."""
 _LARGEST = 2.0
 """Small pictures are enlarged by up to this much, as SIFT doubles them."""
-_MOST_FALSE_ALARMS = 1e-3
+_MAX_FALSE_ALARMS = 1e-3
 """Expected number of pairs of unrelated pictures, for each pair, that would agree as well."""
 _MAX_ERROR_PX = 4.0
 """Distance from an epipolar line up to which a match agrees: COLMAP's."""
@@ -45,7 +45,7 @@ _CELL = 8
 """Pixels along the side of a cell."""
 _STEP = 32
 """What width and height are multiples of: the coarsest layer has one value for so many pixels."""
-_LEAST_SCORE = 0.05
+_MIN_SCORE = 0.05
 """Least probability of a keypoint times reliability. The authors ask this of the probability alone:
 in turbid water the doubtful keypoints that this adds give wrong ties, and few right ones."""
 _APART = 5
@@ -60,14 +60,14 @@ Floats = NDArray[np.float32]
 
 
 def find_learned(
-    grey: NDArray[np.uint8], mask: NDArray[np.bool_] | None, *, most: int, turns: int = 0
+    grey: NDArray[np.uint8], mask: NDArray[np.bool_] | None, *, maximum: int, turns: int = 0
 ) -> Features:
     """Find learned features, evenly over a picture.
 
     Args:
         grey: (H, W) normalised picture.
         mask: (H, W) where features may be, or None.
-        most: how many to keep.
+        maximum: how many to keep.
         turns: quarter turns, counter-clockwise, by which the picture is turned first: descriptors
             of one spot resemble each other only when seen less than about 45 degrees turned.
 
@@ -78,19 +78,19 @@ def find_learned(
     if turns % 4:
         rest = None if mask is None else np.ascontiguousarray(np.rot90(mask))
         turned = find_learned(
-            np.ascontiguousarray(np.rot90(grey)), rest, most=most, turns=turns - 1
+            np.ascontiguousarray(np.rot90(grey)), rest, maximum=maximum, turns=turns - 1
         )
         # what has become the row was counted from the right
         back = np.column_stack([grey.shape[1] - turned.pixels[:, 1], turned.pixels[:, 0]])
         return replace(turned, pixels=back)
     height, width = grey.shape
-    by = min(_LARGEST, math.sqrt(_MOST_PX / (width * height)))
+    by = min(_LARGEST, math.sqrt(_MAX_PX / (width * height)))
     size = [max(_STEP, round(side * by / _STEP) * _STEP) for side in (width, height)]
     way = cv2.INTER_AREA if size[0] < width else cv2.INTER_CUBIC
     descriptors, likely, reliable = dense_features(cv2.resize(grey, size, interpolation=way))
     score = likely * reliable
     highest = cv2.dilate(score, np.ones((_APART, _APART), np.uint8))
-    rows, columns = np.nonzero((score == highest) & (score > _LEAST_SCORE))
+    rows, columns = np.nonzero((score == highest) & (score > _MIN_SCORE))
     steps = np.array([width / size[0], height / size[1]])
     pixels = (np.column_stack([columns, rows]) + 0.5) * steps
     strength = score[rows, columns].astype(np.float64)
@@ -101,7 +101,7 @@ def find_learned(
     else:
         usable = np.arange(len(pixels))
     sizes = np.full(len(usable), _CELL * steps.mean())
-    chosen = usable[spread(pixels[usable], sizes, strength[usable], (width, height), most)]
+    chosen = usable[spread(pixels[usable], sizes, strength[usable], (width, height), maximum)]
     there = (np.column_stack([columns, rows])[chosen] + 0.5) / _CELL - 0.5
     found = sampled(descriptors, there)
     found = found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), _EPSILON)
@@ -129,7 +129,7 @@ def match_learned(task: PairTask) -> PairMatches:
     matches = matches[way > _STILL * max(width, height)]
     pair = verified(task, seen, matches)
     if pair.geometry is not None and (
-        false_alarms(len(pair.matches), len(matches), (width, height)) > _MOST_FALSE_ALARMS
+        false_alarms(len(pair.matches), len(matches), (width, height)) > _MAX_FALSE_ALARMS
     ):
         return PairMatches(matches=matches[:0], geometry=None)
     return pair

@@ -26,7 +26,7 @@ _PROBE_FEATURES = 1500
 """Largest features of both pictures whose matches predict where all others are."""
 _WORTH_PROBING = 2.0
 """Products of a full match over those of the probe, from which prediction saves time."""
-_LEAST_PROBED = 30
+_MIN_PROBED = 30
 """Matches of the probe near one plane below which nothing is predicted."""
 _CELLS_ALONG = 12
 """Cells along the longer side of a picture that share one prediction."""
@@ -38,7 +38,7 @@ _TRIALS = 300
 """Trials for the plane through the matches of the probe, most of which are right."""
 _RELIEF = 0.1
 """Farthest that a match of the probe may be from one plane's, as a share of the longer side."""
-_LEAST_RADIUS = 0.02
+_MIN_RADIUS = 0.02
 """Least radius of the search, as a share of the picture's longer side."""
 
 
@@ -54,19 +54,19 @@ def _best_two(
     """
     for i in range(products.shape[0]):
         row = offset + i
-        least, next_least, index = first[row], second[row], best[row]
+        minimum, next_least, index = first[row], second[row], best[row]
         for j in range(products.shape[1]):
             distance = norms_a[row] + norms_b[j] - 2.0 * products[i, j]
-            if distance < least:
-                next_least = least
-                least = distance
+            if distance < minimum:
+                next_least = minimum
+                minimum = distance
                 index = j
             elif distance < next_least:
                 next_least = distance
             if distance < nearest_b[j]:
                 nearest_b[j] = distance
                 best_b[j] = row
-        first[row], second[row], best[row] = least, next_least, index
+        first[row], second[row], best[row] = minimum, next_least, index
 
 
 def match_descriptors(
@@ -225,7 +225,7 @@ def _guided(task: PairTask, a: Features, b: Features, seen: tuple[Array, Array])
     few = match_descriptors(
         a.descriptors[:_PROBE_FEATURES], b.descriptors[:_PROBE_FEATURES], task.ratio
     )
-    if len(few) < _LEAST_PROBED:
+    if len(few) < _MIN_PROBED:
         return None
     at, there = a.pixels[few[:, 0]], b.pixels[few[:, 1]]
     long_side = float(a.pixels.max())
@@ -236,14 +236,14 @@ def _guided(task: PairTask, a: Features, b: Features, seen: tuple[Array, Array])
         return None
     miss = np.linalg.norm(apply_homography(homography, at) - there, axis=1)
     close = miss <= _RELIEF * long_side
-    if close.sum() < _LEAST_PROBED:
+    if close.sum() < _MIN_PROBED:
         return None
     near = close & (miss <= _FALSE * np.median(miss[close]))
-    if near.sum() < _LEAST_PROBED / 2:  # a fit that does not hold, or has no solution at all
+    if near.sum() < _MIN_PROBED / 2:  # a fit that does not hold, or has no solution at all
         return None
     homography = fit_homography(at[near], there[near])
     miss = np.linalg.norm(apply_homography(homography, at[near]) - there[near], axis=1)
-    radius = max(_SLACK * float(miss.max()), _LEAST_RADIUS * long_side)
+    radius = max(_SLACK * float(miss.max()), _MIN_RADIUS * long_side)
     predicted = apply_homography(homography, a.pixels)
     if not np.isfinite(predicted).all() or radius > long_side / 3:
         return None

@@ -40,7 +40,7 @@ NEIGHBOURS = 4
 """Stations on either side that are matched when nothing else is known."""
 _NEAREST = 20
 """Pictures nearest by navigation that get a coarse look when footprints are not known."""
-_LEAST_OVERLAP = 0.05
+_MIN_OVERLAP = 0.05
 _SURE_OVERLAP = 0.3
 _SECTORS = 6
 """Directions in which a picture looks for partners, for each side of its survey line and across."""
@@ -219,7 +219,7 @@ def _overlapping(
             overlap = _overlap(polygons[i], polygons[j])
             if overlap >= _SURE_OVERLAP:
                 (across if apart else sure)[i, j] = overlap
-            elif _overlap(polygon, wider[j]) >= _LEAST_OVERLAP:
+            elif _overlap(polygon, wider[j]) >= _MIN_OVERLAP:
                 maybe[i, j] = overlap
     headings = np.array([r.heading_deg for r in records])
     away = {(i, j): float(np.linalg.norm(centres[i] - centres[j])) for i, j in (*across, *maybe)}
@@ -246,11 +246,11 @@ def _sharing(
     pairs = [pair for pair in near_pairs(frusta, chosen, slack) if not linked_within(*pair)]
     sure: dict[Pair, float] = {}
     maybe: dict[Pair, float] = {}
-    for pair, (middle, most) in shared(frusta, pairs, slack).items():
+    for pair, (middle, maximum) in shared(frusta, pairs, slack).items():
         if middle >= _SURE_OVERLAP:
             sure[pair] = middle
-        elif most >= _LEAST_OVERLAP:
-            maybe[pair] = most
+        elif maximum >= _MIN_OVERLAP:
+            maybe[pair] = maximum
     middles = frusta.middles
     away = {(i, j): float(np.linalg.norm(middles[i] - middles[j])) for i, j in maybe}
     chosen_pairs = all_round(frusta, sure, _SECTORS)
@@ -339,13 +339,13 @@ def well_conditioned(
     return chosen
 
 
-def nearest_each(pairs: Iterable[Pair], apart: Mapping[Pair, float], most: int) -> set[Pair]:
+def nearest_each(pairs: Iterable[Pair], apart: Mapping[Pair, float], maximum: int) -> set[Pair]:
     """Pairs that are among the nearest few of either picture."""
     partners: dict[int, list[tuple[float, Pair]]] = {}
     for pair in pairs:
         for i in pair:
             partners.setdefault(i, []).append((apart[pair], pair))
-    return {pair for found in partners.values() for _, pair in sorted(found)[:most]}
+    return {pair for found in partners.values() for _, pair in sorted(found)[:maximum]}
 
 
 def _nearest(records: Sequence[ImageRecord], datum: Datum) -> set[Pair]:

@@ -34,12 +34,12 @@ _SIGMA = 5.0
 """Sigma of the weight that falls towards the border of a patch, pixels."""
 _STEPS = 12
 _SETTLED_PX = 0.005
-_FARTHEST_PX = 3.0
+_MAX_PX = 3.0
 """A position that would move by more has found something else, and stays."""
-_LEAST_CORRELATION = 0.7
+_MIN_CORRELATION = 0.7
 _LEVELS = 3
 """Pictures tried: the whole, its half and its quarter."""
-_LEAST_SUPPORT = 6
+_MIN_SUPPORT = 6
 _SUPPORT = 12
 """Matches around a feature from which its first affine warp is estimated."""
 _UNKNOWNS = 10
@@ -152,7 +152,7 @@ def _tasks(
             pair = matched[min(r, j), max(r, j)]
             columns = (0, 1) if r < j else (1, 0)
             support = pixels[r][pair[:, columns[0]]], pixels[j][pair[:, columns[1]]]
-        if len(support[0]) >= _LEAST_SUPPORT:
+        if len(support[0]) >= _MIN_SUPPORT:
             partners.setdefault(r, []).append(
                 _Partner(grey=greys[j], nodes=mine, reference=at[0], pixels=at[1], support=support)
             )
@@ -366,10 +366,10 @@ def _align(first: Any, second: Any, reference: Any, pixels: Any, affine: Any) ->
             go_y = m[1, 0] * step[0] + m[1, 1] * step[1]
             x, y = x - go_x, y - go_y
             away_x, away_y = x + 0.5 - pixels[point, 0], y + 0.5 - pixels[point, 1]
-            if not away_x * away_x + away_y * away_y <= _FARTHEST_PX * _FARTHEST_PX:
+            if not away_x * away_x + away_y * away_y <= _MAX_PX * _MAX_PX:
                 break
             if go_x * go_x + go_y * go_y < _SETTLED_PX * _SETTLED_PX:
-                settled = correlation >= _LEAST_CORRELATION
+                settled = correlation >= _MIN_CORRELATION
                 break
         if settled:
             found[point, 0], found[point, 1] = x + 0.5, y + 0.5

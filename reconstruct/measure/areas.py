@@ -19,7 +19,7 @@ from reconstruct.measure.surface import MeasuredSurface
 _BLOCK_CELLS = 512
 _RIM = REACH_CELLS + 1
 """Cells around a block whose squares count for own errors in it."""
-_MOST_CELLS = 10_000_000
+_MAX_CELLS = 10_000_000
 _SHARE_DIGITS = 12
 """Decimals of shares of squares: less is rounding."""
 NOTHING_KNOWN = "no surface is known within the polygon: draw it on the surface"
@@ -63,9 +63,9 @@ class PolygonOnGrid:
             (west - grid.west) / grid.cell, (east - grid.west) / grid.cell, grid.columns
         )
         cells = max(0, np.ptp(self._rows)) * max(0, np.ptp(self._columns))
-        if cells > _MOST_CELLS:
+        if cells > _MAX_CELLS:
             raise ReconstructionError(
-                f"a polygon over {cells:,} cells: at most {_MOST_CELLS:,} are measured at once; "
+                f"a polygon over {cells:,} cells: at most {_MAX_CELLS:,} are measured at once; "
                 "measure it in parts"
             )
 
@@ -131,8 +131,8 @@ def covered(rings: Sequence[Array], shape: tuple[int, int]) -> Array:
     start = np.concatenate([ring[:-1] for ring in rings])
     way = np.concatenate([np.diff(ring, axis=0) for ring in rings])
     edges, cuts = [np.arange(len(start))] * 2, [np.zeros(len(start)), np.ones(len(start))]
-    for axis, most in ((0, shape[1]), (1, shape[0])):
-        ends = np.clip(np.stack([start[:, axis], start[:, axis] + way[:, axis]]), -1, most + 1)
+    for axis, maximum in ((0, shape[1]), (1, shape[0])):
+        ends = np.clip(np.stack([start[:, axis], start[:, axis] + way[:, axis]]), -1, maximum + 1)
         first = np.ceil(ends.min(axis=0)).astype(np.int64)
         counts = np.maximum(np.floor(ends.max(axis=0)).astype(np.int64) - first + 1, 0)
         counts[way[:, axis] == 0.0] = 0

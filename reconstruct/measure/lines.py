@@ -19,7 +19,7 @@ from reconstruct.measure.figures import (
 )
 from reconstruct.measure.surface import MeasuredSurface, Samples
 
-_MOST_SAMPLES = 20_000
+_MAX_SAMPLES = 20_000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,9 +48,9 @@ def profile(surface: MeasuredSurface, vertices: Sequence[Sequence[float]]) -> Su
         raise ReconstructionError("a line needs two places that differ")
     sides = np.linalg.norm(np.diff(corners, axis=0), axis=1)
     steps = np.ceil(sides / surface.grid.cell - 1e-9).astype(np.int64)
-    if steps.sum() > _MOST_SAMPLES:
+    if steps.sum() > _MAX_SAMPLES:
         raise ReconstructionError(
-            f"a line over {steps.sum():,} cells: at most {_MOST_SAMPLES:,} are followed; "
+            f"a line over {steps.sum():,} cells: at most {_MAX_SAMPLES:,} are followed; "
             "measure it in parts"
         )
     parts = [

@@ -22,10 +22,10 @@ from reconstruct.measure.errors import FigureSlopes
 from reconstruct.measure.figures import Measured, as_places, figure, of_points, plan_area, polyline
 from reconstruct.measure.surface import MeasuredSurface, Samples
 
-_MOST_RIM_SAMPLES = 4000
-_LEAST_SHARE = 0.5
+_MAX_RIM_SAMPLES = 4000
+_MIN_SHARE = 0.5
 """Share of a rim, and of a quadrat, that must be there."""
-_MOST_QUADRATS = 400
+_MAX_QUADRATS = 400
 
 Base = float | Literal["rim"]
 """Plane of a volume: level at a height, or fitted to the heights along the polygon's rim."""
@@ -169,13 +169,13 @@ class _VolumePlane:
         if base != "rim":
             return cls(np.array([float(base), 0.0, 0.0]), None, np.zeros((3, 0)))
         ring = region.polygon.exterior
-        step = max(surface.grid.cell, ring.length / _MOST_RIM_SAMPLES)
+        step = max(surface.grid.cell, ring.length / _MAX_RIM_SAMPLES)
         count = max(3, math.ceil(ring.length / step))
         places = shapely.get_coordinates(
             shapely.line_interpolate_point(ring, np.arange(count) / count, normalized=True)
         )
         known = np.isfinite(surface.at(places).height)
-        if known.mean() < _LEAST_SHARE or known.sum() < 3:
+        if known.mean() < _MIN_SHARE or known.sum() < 3:
             raise ReconstructionError(
                 f"only {known.mean():.0%} of the polygon's rim has a height, too little to fit the "
                 "plane of the volume to it: give the plane's height, or draw the rim on the surface"
@@ -304,9 +304,9 @@ def quadrats(
     polygon = polygon_of(as_places(vertices))
     west, south, east, north = polygon.bounds
     columns, rows = (max(1, math.ceil(w / side - 1e-9)) for w in (east - west, north - south))
-    if rows * columns > _MOST_QUADRATS:
+    if rows * columns > _MAX_QUADRATS:
         raise ReconstructionError(
-            f"{rows * columns:,} quadrats of {side:g} {surface.unit}: at most {_MOST_QUADRATS} are "
+            f"{rows * columns:,} quadrats of {side:g} {surface.unit}: at most {_MAX_QUADRATS} are "
             "measured; make them larger"
         )
     found = []
@@ -316,7 +316,7 @@ def quadrats(
                 west + column * side, south + row * side,
                 west + (column + 1) * side, south + (row + 1) * side,
             )  # fmt: skip
-            if box.intersection(polygon).area < _LEAST_SHARE * box.area:
+            if box.intersection(polygon).area < _MIN_SHARE * box.area:
                 continue
             corners = tuple((float(x), float(y)) for x, y in box.exterior.coords[:4])
             try:

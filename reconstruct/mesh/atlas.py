@@ -71,7 +71,7 @@ def make_wedges(triangles: Triangles, charts: Charts) -> Wedges:
 
 
 @progress.step("pack patches")
-def make_atlas(pixels: Array, wedges: Wedges, count: int, page_px: int, most_pages: int) -> Atlas:
+def make_atlas(pixels: Array, wedges: Wedges, count: int, page_px: int, max_pages: int) -> Atlas:
     """Pack the boxes of all patches into pages.
 
     Args:
@@ -79,7 +79,7 @@ def make_atlas(pixels: Array, wedges: Wedges, count: int, page_px: int, most_pag
         wedges: of the mesh.
         count: of patches.
         page_px: side of a page.
-        most_pages: the texture is made coarser until it needs no more.
+        max_pages: the texture is made coarser until it needs no more.
     """
     low, high = _bounds(pixels, wedges, count)
     widest = float((high - low).max(initial=1.0))
@@ -89,9 +89,9 @@ def make_atlas(pixels: Array, wedges: Wedges, count: int, page_px: int, most_pag
         box = np.ceil(high * scale).astype(np.int64) + PADDING_PX - source
         page, corner = pack(box, page_px)
         pages = int(page.max(initial=0)) + 1
-        if pages <= most_pages:
+        if pages <= max_pages:
             break
-        scale *= 0.95 * float(np.sqrt(most_pages / pages))
+        scale *= 0.95 * float(np.sqrt(max_pages / pages))
     if pages == 1:  # the smallest page that does
         side = 256
         while side < page_px:

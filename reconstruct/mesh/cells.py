@@ -21,7 +21,7 @@ from reconstruct.mesh.decimate import decimate
 from reconstruct.mesh.topology import Triangles, component_areas, edges_of, split_fans
 from reconstruct.mesh.visibility import ray_scene
 
-MOST_CELL_TRIANGLES = 60_000
+MAX_CELL_TRIANGLES = 60_000
 """The error of a coarser cell grows until it has no more."""
 GROWTH = 1.3
 """Factor by which the error grows until the triangles are few enough."""
@@ -132,34 +132,34 @@ def _numbered(parts: Sequence[NDArray[np.int32]], starts: NDArray[np.int64]) -> 
     return np.concatenate([np.empty((0, parts[0].shape[1]), np.int64), *moved])
 
 
-def decimated(mesh: CellMesh, error: float, *, least_area: float = 0.0, most: int = 0) -> CellMesh:
+def decimated(mesh: CellMesh, error: float, *, min_area: float = 0.0, maximum: int = 0) -> CellMesh:
     """Decimate all but the ends of cut edges.
 
     Args:
         mesh: of a cell or several; its vertices may have several fans.
         error: that decimation may make.
-        least_area: parts of less, which no cut edge bounds, are left out.
-        most: the error grows until there are no more triangles; 0 for any number. The distance
+        min_area: parts of less, which no cut edge bounds, are left out.
+        maximum: the error grows until there are no more triangles; 0 for any number. The distance
             between the meshes is measured then.
     """
     if not len(mesh.triangles):
         return mesh
     vertices, triangles, source = split_fans(mesh.vertices, without_pairs(mesh.triangles))
     locked = np.isin(source, mesh.cut)
-    if least_area > 0.0 and len(triangles):
+    if min_area > 0.0 and len(triangles):
         part, area = component_areas(vertices, triangles)
-        kept = area >= least_area
+        kept = area >= min_area
         kept[part[locked[triangles].any(axis=1)]] = True
         vertices, triangles, again = split_fans(vertices, triangles[kept[part]])
         source, locked = source[again], locked[again]
     fewer = decimate(vertices, triangles, locked, error)
     for _ in range(_GROWTHS):
-        if not most or len(fewer.triangles) <= most:
+        if not maximum or len(fewer.triangles) <= maximum:
             break
         error *= GROWTH
         fewer = decimate(vertices, triangles, locked, error)
     distance = mesh.distance
-    if most and len(fewer.triangles):
+    if maximum and len(fewer.triangles):
         distance += max(
             farthest(vertices, fewer.vertices, fewer.triangles),
             farthest(fewer.vertices, vertices, triangles),
@@ -228,19 +228,19 @@ class SquareTask:
 
 
 def decimate_square(
-    folder: Path, error: float, least_area: float, most: int, task: SquareTask
+    folder: Path, error: float, min_area: float, maximum: int, task: SquareTask
 ) -> list[tuple[Key, Cell]]:
     """Decimate a square of cells and write the cells that it becomes.
 
     Args:
         folder: to write into.
         error: that decimation may make.
-        least_area: see `decimated`.
-        most: see `decimated`.
+        min_area: see `decimated`.
+        maximum: see `decimated`.
         task: the square.
     """
     whole = join([cell.mesh() for cell in task.paths])
-    mesh = decimated(whole, error, least_area=least_area, most=most)
+    mesh = decimated(whole, error, min_area=min_area, maximum=maximum)
     (x, y), part = task.key, np.zeros(len(mesh.triangles), np.int64)
     if task.middle is not None:
         part = mesh.vertices[mesh.triangles, :2].mean(axis=1) >= task.middle
@@ -257,10 +257,10 @@ def coarser(
     level: CellLevel,
     folder: Path,
     error: float,
-    least_area: float,
+    min_area: float,
     executor: Executor,
     *,
-    most: int = MOST_CELL_TRIANGLES,
+    maximum: int = MAX_CELL_TRIANGLES,
 ) -> CellLevel:
     """The level of cells twice as wide.
 
@@ -268,9 +268,9 @@ def coarser(
         level: to start from.
         folder: for the files; it does not exist yet.
         error: that decimation may make.
-        least_area: parts of less are left out.
+        min_area: parts of less are left out.
         executor: where tasks run.
-        most: triangles of a cell; 0 for any number, and the finest level.
+        maximum: triangles of a cell; 0 for any number, and the finest level.
     """
     cells = level.cells
     for shift in (1, 0):
@@ -290,6 +290,6 @@ def coarser(
             )
             for (x, y), mine in squares.items()
         ]
-        work = partial(decimate_square, into, error, least_area, most)
+        work = partial(decimate_square, into, error, min_area, maximum)
         cells = dict(pair for made in executor.map(work, tasks, label="decimate") for pair in made)
     return CellLevel(origin=level.origin, side=2 * level.side, error=error, cells=cells)

@@ -18,16 +18,16 @@ from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
 from reconstruct.mesh.topology import Triangles, edges_of
 
-_MOST_ROUNDS = 60
+_MAX_ROUNDS = 60
 _ENOUGH = 0.004
 """A round that removes less than this share of the vertices is the last."""
 _SHARE = 0.5
 """Only this share of the edges, the cheapest, may collapse in one round."""
 _RIM_WEIGHT = 3.0
 """Weight of the planes that hold the outline of a mesh, over that of its faces."""
-_LEAST_COSINE = 0.3
+_MIN_COSINE = 0.3
 """Least cosine between the normals of a face before and after a collapse."""
-_LEAST_QUALITY = 0.06
+_MIN_QUALITY = 0.06
 """4 sqrt(3) area over the sum of squared sides (1 if equilateral) that a face must keep."""
 _SHORTNESS = 1e-4
 """Share of an edge's squared length added to its cost: on a plane short edges go first."""
@@ -61,7 +61,7 @@ def decimate(
     source = np.arange(len(vertices))
     fixed = locked.copy()
     quadrics = _quadrics(place, faces)
-    for _ in range(_MOST_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         if not len(faces):
             break
         edges, edge = edges_of(faces)
@@ -236,13 +236,13 @@ def _turns_or_thins(
             corner[k] = spot if face[k] == moving else place[face[k]]
         after = _normal(corner[0], corner[1], corner[2], new)
         dot = old[0] * new[0] + old[1] * new[1] + old[2] * new[2]
-        if not dot > _LEAST_COSINE * before * after:
+        if not dot > _MIN_COSINE * before * after:
             return True
         sides = 0.0
         for k in range(3):
             for axis in range(3):
                 sides += (corner[k, axis] - corner[(k + 1) % 3, axis]) ** 2
-        if not 2.0 * math.sqrt(3.0) * after > _LEAST_QUALITY * sides:
+        if not 2.0 * math.sqrt(3.0) * after > _MIN_QUALITY * sides:
             return True
     return False
 

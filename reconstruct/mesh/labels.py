@@ -25,7 +25,7 @@ _SWEEPS = 30
 _SMALL_FACES = 60
 """Patches of fewer faces are given away if they can be."""
 _MERGES = 6
-_LEAST_AXIS_COSINE = 0.3
+_MIN_AXIS_COSINE = 0.3
 """Least cosine between the normal of a face and the axis along which its texture lies."""
 
 
@@ -75,7 +75,7 @@ def choose_axes(vertices: Array, triangles: Triangles) -> NDArray[np.int32]:
     cosine = np.stack([-normal, normal], axis=2).reshape(-1, 6)
     best = np.argsort(-cosine, axis=1, kind="stable")[:, :3]
     quality = np.take_along_axis(cosine, best, axis=1)
-    seen = quality > _LEAST_AXIS_COSINE
+    seen = quality > _MIN_AXIS_COSINE
     axes = Candidates(
         views=np.where(seen, best, -1).astype(np.int32),
         quality=np.where(seen, quality, 0.0).astype(np.float32),
@@ -146,7 +146,7 @@ def smooth(
     for _ in range(sweeps):
         changed = 0
         for face in range(label.size):
-            best, least = label[face], np.inf
+            best, minimum = label[face], np.inf
             for k in range(views.shape[1]):
                 if views[face, k] < 0:
                     break
@@ -155,8 +155,8 @@ def smooth(
                     other = neighbours[face, side]
                     if other >= 0 and label[other] != views[face, k]:
                         total += seam[face, side]
-                if total < least:
-                    best, least = views[face, k], total
+                if total < minimum:
+                    best, minimum = views[face, k], total
             if best != label[face]:
                 label[face] = best
                 changed += 1

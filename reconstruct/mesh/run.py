@@ -16,7 +16,7 @@ from reconstruct.light.solve import read_light
 from reconstruct.mesh.formats import GLB_AXES, render_oblique, write_mesh
 from reconstruct.mesh.labels import choose_views, make_charts
 from reconstruct.mesh.surface import (
-    MOST_TRIANGLES,
+    MAX_TRIANGLES,
     TRIM_STEPS,
     TriangleMesh,
     coarser_level,
@@ -58,7 +58,7 @@ def run_mesh(
         cloud,
         step,
         reconstruct.mesh_error_px * pixel,
-        reconstruct.mesh_triangles or MOST_TRIANGLES,
+        reconstruct.mesh_triangles or MAX_TRIANGLES,
         scratch,
         executor,
     )

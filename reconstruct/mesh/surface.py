@@ -56,11 +56,11 @@ TRIM_STEPS = 1.5
 """The surface ends so far from the nearest point: gaps of twice this are bridged."""
 _NEIGHBOURS, _NEIGHBOURHOOD_STEPS = 4, 2.5
 """A vertex needs this many points in this many steps around it."""
-_LEAST_PART_STEPS2 = 400.0
+_MIN_PART_STEPS2 = 400.0
 """Parts with an area of fewer lattice squares are taken for strays."""
-_MOST_WEIGHT = 4.0
+_MAX_WEIGHT = 4.0
 """Largest weight of a point that is better known than the median."""
-MOST_TRIANGLES = 4_000_000
+MAX_TRIANGLES = 4_000_000
 """Most triangles of a mesh that is held at once, where the settings name no number."""
 KERNEL_STEPS = 0.8
 """Standard deviation of the points' Gaussian weight, lattice steps."""
@@ -84,7 +84,7 @@ def mesh_cloud(
     cloud: CloudFile,
     step: float,
     error: float,
-    most_triangles: int,
+    max_triangles: int,
     folder: Path,
     executor: Executor,
 ) -> tuple[TriangleMesh, list[CellLevel]]:
@@ -94,7 +94,7 @@ def mesh_cloud(
         cloud: oriented points.
         step: of the lattice: the spacing of the points.
         error: that decimation may make, in the unit of the points.
-        most_triangles: the error is raised until there are no more.
+        max_triangles: the error is raised until there are no more.
         folder: for files.
         executor: where tasks run.
 
@@ -106,20 +106,20 @@ def mesh_cloud(
         ReconstructionError: no surface is left.
     """
     levels = [finest_level(cloud, step, error, folder, executor)]
-    while levels[-1].triangles > max(most_triangles, MOST_TRIANGLES) and len(levels[-1].cells) > 1:
+    while levels[-1].triangles > max(max_triangles, MAX_TRIANGLES) and len(levels[-1].cells) > 1:
         levels.append(coarser_level(levels, step, folder, executor))
     whole, error = levels[-1].whole(), levels[-1].error
     vertices = whole.vertices
     triangles = without_folds(vertices, without_pairs(whole.triangles))
     part, area = component_areas(vertices, triangles)
-    large = area[part] >= min(_LEAST_PART_STEPS2 * step * step, area.max(initial=0.0))
+    large = area[part] >= min(_MIN_PART_STEPS2 * step * step, area.max(initial=0.0))
     if not large.any():
         raise ReconstructionError(
             f"{cloud.header.path}: its {cloud.header.count} points, {step:.3g} apart, lie too "
             "thinly to carry a surface; the pictures need more overlap or sharper texture"
         )
     vertices, triangles, _ = split_fans(vertices, triangles[large])
-    vertices, triangles, error = _to_count(vertices, triangles, error, most_triangles)
+    vertices, triangles, error = _to_count(vertices, triangles, error, max_triangles)
     return TriangleMesh(vertices=vertices, triangles=triangles, error=error), levels
 
 
@@ -140,10 +140,10 @@ def finest_level(
         error=error,
         cells={((i - x) // side, (j - y) // side): c for ((i, j), _), c in made if c is not None},
     )
-    least = _LEAST_PART_STEPS2 * step * step
-    found = coarser(lattice, folder / "0", error, least, executor, most=0)
+    minimum = _MIN_PART_STEPS2 * step * step
+    found = coarser(lattice, folder / "0", error, minimum, executor, maximum=0)
     if not found.cells:  # a survey that is smaller than what is a stray elsewhere
-        found = coarser(lattice, folder / "all", error, 0.0, executor, most=0)
+        found = coarser(lattice, folder / "all", error, 0.0, executor, maximum=0)
     return found
 
 
@@ -151,16 +151,16 @@ def coarser_level(
     levels: Sequence[CellLevel], step: float, folder: Path, executor: Executor
 ) -> CellLevel:
     """The level after the last, with twice its error; arguments as `mesh_cloud` takes them."""
-    least, into = _LEAST_PART_STEPS2 * step * step, folder / str(len(levels))
-    return coarser(levels[-1], into, 2.0 * levels[-1].error, least, executor)
+    minimum, into = _MIN_PART_STEPS2 * step * step, folder / str(len(levels))
+    return coarser(levels[-1], into, 2.0 * levels[-1].error, minimum, executor)
 
 
 def surface_tiles(cloud: CloudFile, step: float) -> list[tuple[tuple[int, int], tuple[int, int]]]:
     """Tiles over the bounds of a cloud, row by row: first cells along x and y, and how many."""
     low = np.floor(cloud.low / step).astype(int) - 3
     high = np.ceil(cloud.high / step).astype(int) + 3
-    least, most = _TILE_STEPS
-    side = int(np.clip(math.sqrt(_NODES / (high[2] - low[2])), least, most))
+    minimum, maximum = _TILE_STEPS
+    side = int(np.clip(math.sqrt(_NODES / (high[2] - low[2])), minimum, maximum))
     return [
         ((x, y), (min(side, int(high[0]) - x), min(side, int(high[1]) - y)))
         for y in range(int(low[1]), int(high[1]), side)
@@ -203,7 +203,7 @@ def mesh_tile(
     weights = np.ones(len(points))
     if "sigma" in (records.dtype.names or ()):
         ratio = sigma / np.maximum(records["sigma"].astype(np.float64), 1e-3 * sigma)
-        weights = np.minimum(ratio * ratio, _MOST_WEIGHT)
+        weights = np.minimum(ratio * ratio, _MAX_WEIGHT)
     sound = np.isfinite(normals).all(axis=1) & np.isfinite(weights) & (weights > 0)
     points, normals, weights = points[sound], normals[sound], weights[sound]
     if len(points) < _NEIGHBOURS:
@@ -233,17 +233,17 @@ def mesh_tile(
 
 
 def _to_count(
-    vertices: Array, triangles: Triangles, error: float, most: int
+    vertices: Array, triangles: Triangles, error: float, maximum: int
 ) -> tuple[Array, Triangles, float]:
     """Decimate with a growing error until few triangles are left."""
-    while len(triangles) > most:
+    while len(triangles) > maximum:
         before, error = len(triangles), GROWTH * error
         free = np.zeros(len(vertices), np.bool_)
         fewer = decimate(vertices, triangles, free, error)
         vertices, triangles, _ = clean(fewer.vertices, fewer.triangles)
         if len(triangles) == before and error > np.ptp(vertices, axis=0).max():
             raise ReconstructionError(
-                f"the surface keeps {before} triangles where mesh_triangles asks for {most}: "
+                f"the surface keeps {before} triangles where mesh_triangles asks for {maximum}: "
                 "raise it"
             )
     return vertices, triangles, error

@@ -35,15 +35,15 @@ from reconstruct.views.model import View
 Float32 = NDArray[np.float32]
 _SEAM_SIGMA_PX = 4.0
 """Sigma of the average around a seam's vertices by which both sides are compared."""
-_MOST_PAGES = 16
+_MAX_PAGES = 16
 _JPEG_QUALITY = 93
-_MOST_ROWS = 30_000
+_MAX_ROWS = 30_000
 """Most rows for `cv2.remap`, which takes at most 32767."""
 _SMOOTHNESS = 0.1
 """Weight of a change along an edge within a patch, over that of a step at a seam."""
 _PULL = 1e-4
 """Weight of the correction itself, which keeps the level of the whole."""
-_TOLERANCE, _MOST_STEPS = 1e-5, 5000
+_TOLERANCE, _MAX_STEPS = 1e-5, 5000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -121,7 +121,7 @@ def paint(
     wedges = make_wedges(triangles, charts)
     pixels = wedge_pixels(vertices, wedges, charts, views, offset_enu, plain_pixel)
     if page is None:
-        atlas = make_atlas(pixels, wedges, len(charts.views), page_px, _MOST_PAGES)
+        atlas = make_atlas(pixels, wedges, len(charts.views), page_px, _MAX_PAGES)
     else:
         atlas = make_pages(pixels, wedges, page, page_px)
     corrections = _corrections(pixels, wedges, charts, views, workspace, light, executor)
@@ -258,8 +258,8 @@ def remapped(picture: NDArray[Any], pixels: Array, interpolation: int, border: i
     """
     at = np.nan_to_num(pixels - 0.5, nan=-1e4).astype(np.float32)
     parts = [np.empty((0, *picture.shape[2:]), picture.dtype)]
-    for first in range(0, len(at), _MOST_ROWS):
-        x, y = at[first : first + _MOST_ROWS].T[:, :, None]
+    for first in range(0, len(at), _MAX_ROWS):
+        x, y = at[first : first + _MAX_ROWS].T[:, :, None]
         parts.append(
             cv2.remap(
                 picture, np.ascontiguousarray(x), np.ascontiguousarray(y), interpolation,
@@ -325,7 +325,7 @@ def level_seams(wedges: Wedges, colours: Array, free: NDArray[np.bool_]) -> Arra
         target = np.bincount(pairs[:, 0], step, count) - np.bincount(pairs[:, 1], step, count)
         if not np.any(target[kept]):
             continue
-        solution, failed = cg(system, target[kept], rtol=_TOLERANCE, maxiter=_MOST_STEPS, M=inverse)
+        solution, failed = cg(system, target[kept], rtol=_TOLERANCE, maxiter=_MAX_STEPS, M=inverse)
         if failed:
             warn(f"colours of the mesh (channel {channel}) are not levelled to {_TOLERANCE:g}")
         result[kept, channel] = solution

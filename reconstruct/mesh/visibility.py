@@ -19,7 +19,7 @@ CANDIDATES = 8
 """Views kept for a face."""
 _RIM_PX = 3.0
 """Pixels at the edges of a picture that are not used."""
-_LEAST_COSINE = 0.15
+_MIN_COSINE = 0.15
 """Least cosine between the normal of a face and the line of sight."""
 _BLOCK = 512
 """Vertices that are tested against a view's frame at once."""
@@ -179,7 +179,7 @@ def _quality(
     a, b = pixels[:, 1] - pixels[:, 0], pixels[:, 2] - pixels[:, 0]
     area_px = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
     area = face_areas(vertices, triangles[faces])
-    facing = (cosine > _LEAST_COSINE) & (area > 0)
+    facing = (cosine > _MIN_COSINE) & (area > 0)
     towards = middle[:, None] * (1 - _SHRINK) + corners * _SHRINK
     spots = np.concatenate([middle[:, None], towards], axis=1)
     spots = spots[facing] + lift * normal[facing][:, None]

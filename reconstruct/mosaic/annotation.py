@@ -22,7 +22,7 @@ from alice_survey.core.errors import ConfigError
 from alice_survey.core.executor import progress
 from alice_survey.core.records import MosaicRecord
 
-LARGEST_SIDE_PX = 32_767
+MAX_SIDE_PX = 32_767
 _STRIP = 512
 _BAR_SHARE = 0.2
 _HEADER = (
@@ -59,8 +59,8 @@ def mosaic_tiles(
         ConfigError: a size is out of range.
         WorkspaceError: there is no mosaic.
     """
-    if not 64 <= side_px <= LARGEST_SIDE_PX:
-        raise ConfigError(f"tiles of {side_px} px: give 64 to {LARGEST_SIDE_PX}")
+    if not 64 <= side_px <= MAX_SIDE_PX:
+        raise ConfigError(f"tiles of {side_px} px: give 64 to {MAX_SIDE_PX}")
     if not 0 <= overlap_px < side_px:
         raise ConfigError(f"overlap of {overlap_px} px: give 0 to {side_px - 1}, less than a side")
     mosaic = need_stage(workspace, "mosaic", "reconstruct")

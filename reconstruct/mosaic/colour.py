@@ -35,27 +35,27 @@ from reconstruct.light.solve import (
     node_weights,
     solve_patterns,
 )
-from reconstruct.light.water import GREEN, LEAST_LEFT, WaterLight, grown, solve_water
-from reconstruct.mosaic.finish import LEAST_RANGE, MOST_RANGE
+from reconstruct.light.water import GREEN, MIN_LEFT, WaterLight, grown, solve_water
+from reconstruct.mosaic.finish import MAX_RANGE, MIN_RANGE
 from reconstruct.mosaic.picture_measures import PictureMeasures
 from reconstruct.mosaic.reference import ReferencePatch
 
 Float32 = NDArray[np.float32]
 Colour = Literal["even", "water", "raw"]
 
-_FEWEST_PICTURES = 12
+_MIN_PICTURES = 12
 """Fewest pictures of a camera for the darkest pixels of a place to be dark."""
 _DARK_QUANTILE = 0.15
 """Quantile of the pictures' darkest light at a place, which a few black outliers do not move."""
 _GAIN_SIGMA = 1.0
 """Expected size of the logarithm of a picture's own light: a stop and a half either way."""
-_MOST_SAMPLES = 20_000
+_MAX_SAMPLES = 20_000
 """Most samples that the light of the water is found from."""
 _WHITE_SIGMA = 0.2
 """Sigma of the logarithm of a colour's ratio to green, of lamp and camera, and of the sea floor."""
 _NEAREST = 8
 """Samples next to a patch that give its range."""
-_LARGEST_LIFT = 30.0
+_MAX_LIFT = 30.0
 _BRIGHT_LIGHT = 0.68
 _MIDDLE_LIGHT = 0.22
 _BLACK_QUANTILE = 0.01
@@ -63,7 +63,7 @@ _BLACK_QUANTILE = 0.01
 _BLACK_SHARE = 0.6
 """Share of that light that is taken as black: the rest keeps detail in shadows."""
 _HIGHEST_BLACK = 0.05
-_FEWEST_DARK = 50
+_MIN_DARK = 50
 """Places, for the dark of a survey to be known."""
 
 
@@ -81,7 +81,7 @@ class ColourModel:
     def nodes(self, camera: str, image: str) -> Float32:
         """(rows, columns, 6) factors, and light that is taken away before, at the nodes, BGR."""
         lift = np.exp(-(self.light.patterns[camera] + self.light.gains[image]))
-        lift = np.clip(lift, 1.0 / _LARGEST_LIFT, _LARGEST_LIFT) * self.light.white
+        lift = np.clip(lift, 1.0 / _MAX_LIFT, _MAX_LIFT) * self.light.white
         added = np.zeros_like(lift) if self.water is None else self.water.added[camera]
         both: Float32 = np.concatenate([lift, added], axis=2).astype(np.float32)
         return np.ascontiguousarray(both)
@@ -133,10 +133,10 @@ class ColourModel:
         added = found[..., 3:]
         if self.growth.any():
             added = added * grown(self.growth, ranges, model.middle_range).astype(np.float32)
-        result: Float32 = np.maximum(light - added, LEAST_LEFT * light) * found[..., :3]
+        result: Float32 = np.maximum(light - added, MIN_LEFT * light) * found[..., :3]
         if model.fall_off.any():
             back = np.exp(-self.weakening(ranges)).astype(np.float32)
-            result *= np.clip(back, LEAST_RANGE, MOST_RANGE)
+            result *= np.clip(back, MIN_RANGE, MAX_RANGE)
         return result
 
     def to_json(self) -> dict[str, Any]:
@@ -229,11 +229,11 @@ def _water(samples: LightSamples, facts: Sequence[PictureMeasures]) -> tuple[Wat
     few = dark is None
     if dark is None:
         dark = {fact.camera: np.zeros((*GRID, 3)) for fact in facts}
-    thin = _part(samples, slice(None, None, max(1, -(-len(samples.views) // _MOST_SAMPLES))))
+    thin = _part(samples, slice(None, None, max(1, -(-len(samples.views) // _MAX_SAMPLES))))
     water = solve_water(thin, dark, [fact.camera for fact in facts])
     if few:
         note = (
-            f"colours: fewer than {_FEWEST_PICTURES} pictures of a camera show each place of it; "
+            f"colours: fewer than {_MIN_PICTURES} pictures of a camera show each place of it; "
             "no light of the water taken away"
         )
     elif not water.share.any():
@@ -270,7 +270,7 @@ def _patterns(
         cleaned = replace(cleaned, levels=levels.astype(np.float32), ranges=None)
     left = nodes - added
     with np.errstate(invalid="ignore"):
-        usable = left > LEAST_LEFT * nodes
+        usable = left > MIN_LEFT * nodes
     found = solve_patterns(
         cleaned,
         np.where(usable, np.log(np.where(usable, left, 1.0)), np.nan),
@@ -305,7 +305,7 @@ def _black(model: ColourModel, facts: Sequence[PictureMeasures]) -> Array:
         dark.append(((fact.dark - nodes[..., 3:]) * nodes[..., :3]).reshape(-1, 3))
     levels = np.concatenate(dark)
     levels = levels[np.isfinite(levels).all(axis=1)]
-    if len(levels) < _FEWEST_DARK:
+    if len(levels) < _MIN_DARK:
         return np.zeros(3)
     black: Array = _BLACK_SHARE * np.maximum(np.quantile(levels, _BLACK_QUANTILE, axis=0), 0.0)
     return np.minimum(black, _HIGHEST_BLACK)
@@ -351,7 +351,7 @@ def _without_water(
     light = np.exp(samples.levels.astype(np.float64))
     beyond = grown(model.growth, np.asarray(samples.ranges), model.light.middle_range)
     left = light - sampled(samples, model.water.added, facts) * beyond
-    kept = (left > LEAST_LEFT * light).all(axis=(1, 2))
+    kept = (left > MIN_LEFT * light).all(axis=(1, 2))
     loss = np.diff(model.weakening(np.asarray(samples.ranges)[kept]), axis=1)[:, 0]
     unsure = np.hypot((light[kept] / left[kept]).mean(axis=1), loss)
     levels = np.log(left[kept]).astype(np.float32)
@@ -388,7 +388,7 @@ def darkest(facts: Sequence[PictureMeasures]) -> dict[str, Array] | None:
     maps = {}
     for name in sorted({fact.camera for fact in facts}):
         mine = np.stack([fact.dark for fact in facts if fact.camera == name])
-        if (np.isfinite(mine).sum(axis=0) < _FEWEST_PICTURES).any():
+        if (np.isfinite(mine).sum(axis=0) < _MIN_PICTURES).any():
             return None
         level = np.nanquantile(mine, _DARK_QUANTILE, axis=0).astype(np.float32)
         # light in water is smooth; a node may hold what was never dark there

@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.core.compiled import compiled
-from reconstruct.light.water import LEAST_LEFT
+from reconstruct.light.water import MIN_LEFT
 from reconstruct.mosaic.picture_measures import encoded
 
 Float32 = NDArray[np.float32]
 
-LEAST_RANGE, MOST_RANGE = np.float32(0.2), np.float32(5.0)
+MIN_RANGE, MAX_RANGE = np.float32(0.2), np.float32(5.0)
 """Factors by which light is changed at least and at most for its distance."""
 _ROOT_STEPS = np.float32(2048)
 _BRIGHTEST_ROOT = 2.0
@@ -108,14 +108,14 @@ def finish_colours(
                 shown = light[row, column, c]
                 if growing:
                     added *= np.float32(math.expm1(-law[10 + c] * distance)) / whole[c]
-                shown = max(shown - added, LEAST_LEFT * shown)
+                shown = max(shown - added, MIN_LEFT * shown)
                 shown *= lift * (above * (1 - f_q) + below * f_q)
                 if weakened:
                     farther = np.float32(math.exp(law[c] * (distance - law[3]))) * spread
-                    if farther < LEAST_RANGE:
-                        farther = LEAST_RANGE
-                    if farther > MOST_RANGE:
-                        farther = MOST_RANGE
+                    if farther < MIN_RANGE:
+                        farther = MIN_RANGE
+                    if farther > MAX_RANGE:
+                        farther = MAX_RANGE
                     shown *= farther
                 shown = (shown - law[4 + c]) * law[7 + c]
                 root = np.float32(0.0)

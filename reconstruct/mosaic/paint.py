@@ -30,7 +30,7 @@ Float32 = NDArray[np.float32]
 
 _BROAD_POWER = 3
 """Power of quality that weighs views in the broadest band."""
-_LARGEST_CHANGE = 3.0
+_MAX_CHANGE = 3.0
 """Factor by which broad tones of a view are changed at most to meet its neighbours'."""
 _AROUND = np.ones((9, 9), np.uint8)
 """Cells around those of a view in which it is sampled: as far as the broadest band reaches."""
@@ -108,7 +108,7 @@ class LightTask:
     views: tuple[SeenView, ...]
     step_px: int
     """Distance of spots."""
-    most: int
+    maximum: int
     """Samples to return at most."""
 
 
@@ -183,12 +183,12 @@ def _thinned(seen: list[_Shown], spots: int, task: LightTask) -> list[_Shown]:
     for shown in seen:
         times[shown.spots] += 1
     pairs = times * (times - 1) // 2
-    if pairs.sum() <= task.most:
+    if pairs.sum() <= task.maximum:
         return seen
     rng = np.random.default_rng([task.block.core.row_off, task.block.core.col_off])
     order = rng.permutation(np.flatnonzero(pairs))
     kept = np.zeros(spots, np.bool_)
-    kept[order[np.cumsum(pairs[order]) <= task.most]] = True
+    kept[order[np.cumsum(pairs[order]) <= task.maximum]] = True
     return [shown.part(kept[shown.spots]) for shown in seen]
 
 
@@ -430,7 +430,7 @@ def _changes(
 ) -> dict[int, tuple[Float32, tuple[slice, slice]]]:
     """Per view factors (h, w, 3) at the cells of a box that take its broad tones to the mean."""
     changes = {}
-    limit = np.float32(np.log(_LARGEST_CHANGE))
+    limit = np.float32(np.log(_MAX_CHANGE))
     for found in looks if task.even else ():
         tone = _logarithm(_small_light(task, tools, found, broad=True))
         seen = found.sight.quality > 0

@@ -24,12 +24,12 @@ from reconstruct.pictures.undistorted import Pictures
 from reconstruct.raster import DemGrid, opened_raster, small_cache
 from reconstruct.views.model import View, enu_from_cam
 
-_MOST_CELLS = 16_000_000
+_MAX_CELLS = 16_000_000
 """Most cells of the DEM for one view; views that see more, to the horizon, are looked at block by
 block."""
 _SMALL_PX = 432
 """Width of the copies in which views are compared, at most."""
-_LEAST_SHRINK = 4
+_MIN_SHRINK = 4
 """Half a cell of the mosaic, whose pixels are about as large as those of pictures."""
 DARKEST, BRIGHTEST = 0.001, 0.95
 """Linear light beyond which a broad level is not used."""
@@ -108,7 +108,7 @@ def measure_picture(workspace: Path, folder: Path, view: View) -> PictureMeasure
     taken, usable = pictures.taken(view.image), pictures.usable(view.image)
     height, width = taken.shape[:2]
     table = linear_table()
-    shrink = max(_LEAST_SHRINK, round(width / _SMALL_PX))
+    shrink = max(_MIN_SHRINK, round(width / _SMALL_PX))
     size = (max(8, width // shrink), max(8, height // shrink))
     small = np.ones((size[1], size[0], 4), np.float32)
     if usable is not None:
@@ -286,7 +286,7 @@ def _part_seen(
         c0, c1 = np.clip((np.array(columns) - t.c) / t.a + [-3, 4], 0, raster.width).astype(int)
         r0, r1 = np.clip((t.f - np.array(rows)) / t.a + [-3, 4], 0, raster.height).astype(int)
         window = Window(int(c0), int(r0), int(c1 - c0), int(r1 - r0))
-        coarser = int(np.ceil(np.sqrt(window.width * window.height / _MOST_CELLS)))
+        coarser = int(np.ceil(np.sqrt(window.width * window.height / _MAX_CELLS)))
         shape = -(-window.height // max(coarser, 1)), -(-window.width // max(coarser, 1))
         dem = raster.read(1, window=window, out_shape=shape) if min(shape) else np.empty(
             shape, np.float32

@@ -21,8 +21,8 @@ from reconstruct.mosaic.picture_measures import BRIGHTEST, DARKEST, linear_table
 from reconstruct.pictures.undistorted import Pictures
 
 _NUMBERS = ("x", "y", "radius_px", "red", "green", "blue")
-_FEWEST_PIXELS = 9
-_MOST_BURNT = 0.01
+_MIN_PIXELS = 9
+_MAX_BURNT = 0.01
 """Share of a patch's pixels that may be burnt out."""
 
 
@@ -83,16 +83,16 @@ def _measured(where: str, row: dict[str, str], pictures: Pictures) -> ReferenceP
     rows, columns = np.mgrid[:height, :width]
     inside = np.hypot(columns - x, rows - y) <= radius
     inside &= True if usable is None else usable
-    if inside.sum() < _FEWEST_PIXELS:
+    if inside.sum() < _MIN_PIXELS:
         raise WorkspaceError(
             f"{where}: {inside.sum()} pixels in the circle, masked ones left out; "
-            f"{_FEWEST_PIXELS} are needed: raise radius_px"
+            f"{_MIN_PIXELS} are needed: raise radius_px"
         )
     light = linear_table()[taken[inside]].astype(np.float64)
     burnt = float((light > BRIGHTEST).any(axis=1).mean())
     mean = light.mean(axis=0)
-    if burnt > _MOST_BURNT or (mean < DARKEST).any():
-        state = f"{burnt:.0%} of the patch is burnt out" if burnt > _MOST_BURNT else "it is black"
+    if burnt > _MAX_BURNT or (mean < DARKEST).any():
+        state = f"{burnt:.0%} of the patch is burnt out" if burnt > _MAX_BURNT else "it is black"
         raise WorkspaceError(f"{where}: {state}: take another patch or picture")
     return ReferencePatch(
         image=row["image"],

@@ -60,13 +60,13 @@ from reconstruct.views.model import SparseModel, read_model, read_warps
 _TILE_PX = 1024
 _GROUP = 2
 """Tiles along and across that one process paints, since they share pictures."""
-_LABEL_PX, _LEAST_LABEL_PX = 2048, 512
+_LABEL_PX, _MIN_LABEL_PX = 2048, 512
 _LABEL_MARGIN_PX = 256
-_MOST_LOOKS = 12e6
+_MAX_LOOKS = 12e6
 """Views times cells of a block whose seams are solved at once, which take some 30 bytes each."""
 _LIGHT_LATTICE = 24
 """Spots across a picture at which light is compared."""
-_MOST_SAMPLES = 150_000
+_MAX_SAMPLES = 150_000
 _CACHE_MIB = 48
 """Cache for files that GDAL reads and writes in this process."""
 _TASK_MIB = 400
@@ -273,7 +273,7 @@ def seam_blocks(grid: DemGrid, ground: Footprints) -> list[Block]:
         blocks = blocks_of(grid, ground, size, _LABEL_MARGIN_PX)
         cells = [len(b.views) * b.grid.rows * b.grid.columns // CELL_PX**2 for b in blocks]
         looks = max(cells, default=0)
-        if looks <= _MOST_LOOKS or size <= _LEAST_LABEL_PX:
+        if looks <= _MAX_LOOKS or size <= _MIN_LABEL_PX:
             return blocks
         size //= 2
 
@@ -308,7 +308,7 @@ def _solve(
             block=block,
             views=tuple(views[n] for n in block.views),
             step_px=step_px,
-            most=max(1000, _MOST_SAMPLES // len(blocks)),
+            maximum=max(1000, _MAX_SAMPLES // len(blocks)),
         )
         for block in blocks
     ]

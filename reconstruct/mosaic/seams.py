@@ -15,16 +15,16 @@ from alice_survey.core.compiled import compiled
 
 Float32 = NDArray[np.float32]
 
-MOST_VIEWS = 6
+MAX_VIEWS = 6
 """Candidates of a cell."""
-LEAST_SHARE = 0.3
+MIN_SHARE = 0.3
 """Share of the best quality that a candidate must have."""
 _SWEEPS = 24
 _SEAM_COST = 0.1
 """Cost of a seam along one cell where views agree, in logarithms of quality lost in one cell."""
 _DIFFERENCE_COST = 10.0
 """Cost of a seam along one cell where views differ by a factor of e."""
-_MOST_DIFFERENCE = 1.0
+_MAX_DIFFERENCE = 1.0
 _UNSETTLING_COST = 1000.0
 """Cost of another view than the one that a cell has already."""
 
@@ -42,11 +42,11 @@ def candidates(
         (H, W, K) numbers, -1 where there are fewer, best first; (H, W, K) qualities over the best;
         and (H, W, K) rows of `qualities`.
     """
-    kept = min(MOST_VIEWS, len(views))
+    kept = min(MAX_VIEWS, len(views))
     order = np.argsort(-qualities, axis=0, kind="stable")[:kept]
     best = np.take_along_axis(qualities, order, axis=0)
     share = best / np.maximum(best[:1], np.float32(1e-30))
-    number = np.where((best > 0) & (share >= LEAST_SHARE), views[order], -1)
+    number = np.where((best > 0) & (share >= MIN_SHARE), views[order], -1)
     return (
         np.ascontiguousarray(number.transpose(1, 2, 0)).astype(np.int32),
         np.ascontiguousarray(share.transpose(1, 2, 0)),
@@ -96,7 +96,7 @@ def seam_cost(
     total = 0.0
     for side in range(2):
         # how much the two views differ in one of the cells; unknown counts as most
-        difference = _MOST_DIFFERENCE
+        difference = _MAX_DIFFERENCE
         if side == 0:
             for k in range(len(number_p)):
                 if number_p[k] == number_q[b]:
@@ -109,7 +109,7 @@ def seam_cost(
                     difference = 0.0
                     for c in range(3):
                         difference += abs(colours_q[b, c] - colours_q[k, c]) / 3.0
-        total += min(difference, _MOST_DIFFERENCE)
+        total += min(difference, _MAX_DIFFERENCE)
     return _SEAM_COST + _DIFFERENCE_COST * 0.5 * total
 
 
@@ -117,13 +117,13 @@ def seam_cost(
 def _trws(
     number: NDArray[np.int32], own: Float32, colours: Float32, sweeps: int
 ) -> NDArray[np.int32]:
-    rows, columns, most = number.shape
+    rows, columns, maximum = number.shape
     # edges[r, c, 0] to the right, [1] downwards; messages into a cell from left, up, right, down
-    edges = np.zeros((rows, columns, 2, most, most), np.float32)
+    edges = np.zeros((rows, columns, 2, maximum, maximum), np.float32)
     count = np.zeros((rows, columns), np.int32)
     for r in range(rows):
         for c in range(columns):
-            while count[r, c] < most and number[r, c, count[r, c]] >= 0:
+            while count[r, c] < maximum and number[r, c, count[r, c]] >= 0:
                 count[r, c] += 1
     for r in range(rows):
         for c in range(columns):
@@ -136,9 +136,9 @@ def _trws(
                         edges[r, c, way, a, b] = seam_cost(
                             number[r, c], number[s, d], colours[r, c], colours[s, d], a, b
                         )
-    messages = np.zeros((rows, columns, 4, most), np.float32)
+    messages = np.zeros((rows, columns, 4, maximum), np.float32)
     chosen = np.full((rows, columns), -1, np.int32)
-    total = np.zeros(most)
+    total = np.zeros(maximum)
     for sweep in range(sweeps):
         forward = sweep % 2 == 0
         for i in range(rows * columns):
@@ -157,16 +157,16 @@ def _trws(
                     continue
                 came = (2 + way) if forward else way
                 into = way if forward else 2 + way
-                least = np.inf
+                minimum = np.inf
                 for b in range(count[s, d]):
                     low = np.inf
                     for a in range(n):
                         pair = edges[r, c, way, a, b] if forward else edges[s, d, way, b, a]
                         low = min(low, 0.5 * total[a] - messages[r, c, came, a] + pair)
                     messages[s, d, into, b] = low
-                    least = min(least, low)
+                    minimum = min(minimum, low)
                 for b in range(count[s, d]):
-                    messages[s, d, into, b] -= least
+                    messages[s, d, into, b] -= minimum
     for r in range(rows):
         for c in range(columns):
             lowest = np.inf

@@ -29,7 +29,7 @@ from reconstruct.raster import (
 from reconstruct.views.model import WorldFrame
 
 _THUMBNAIL_PX = 1600
-_LARGEST_UINT16 = 65_535
+_MAX_UINT16 = 65_535
 
 
 def write_tiles(
@@ -43,7 +43,7 @@ def write_tiles(
 ) -> float:
     """Write colours and sources as they come; return the share of pixels that have colour."""
     shared = _profile(grid, frame, threads)
-    numbers = "uint16" if len(names) <= _LARGEST_UINT16 else "uint32"
+    numbers = "uint16" if len(names) <= _MAX_UINT16 else "uint32"
     painted = 0
     with (
         rasterio.open(

@@ -34,7 +34,7 @@ from reconstruct.adjustment.exact_observations import (
 )
 from reconstruct.adjustment.normal_equations import Gauge, PointEquations, by_pose, reduce_parts
 from reconstruct.adjustment.pixel_parts import Linearised, PixelParts
-from reconstruct.mapping.arrays import LEAST_POINTS, Indices, first_of, linked_groups
+from reconstruct.mapping.arrays import MIN_POINTS, Indices, first_of, linked_groups
 from reconstruct.picking.registered import RegisteredPictures
 from reconstruct.placing.control_file import Pick
 from reconstruct.placing.picked_points import (
@@ -48,9 +48,9 @@ from reconstruct.placing.picked_points import (
 from reconstruct.placing.place import LENGTH_SCALE_SIGMA
 from reconstruct.views.model_files import ImagesFile, points_of
 
-MOST_STATIONS = 120
+MAX_STATIONS = 120
 """Stations that are adjusted: the nearest to the spots."""
-_MOST_OBSERVATIONS = 400_000
+_MAX_OBSERVATIONS = 400_000
 """Observations that are adjusted; of more, evenly chosen points."""
 
 
@@ -139,7 +139,7 @@ class StationBlock:
         )
         held = gauge.held.copy()
         held[first_of(group)] = True
-        held[np.bincount(pixels.station, minlength=len(numbers)) < LEAST_POINTS] = True
+        held[np.bincount(pixels.station, minlength=len(numbers)) < MIN_POINTS] = True
         return cls(
             numbers=numbers, state=state, fields=fields, covariance=known, gauge=gauge,
             equations=replace(reduce_parts(linear), free=~held),
@@ -252,7 +252,7 @@ class Lengths:
         along = ends[0] + np.linspace(0.0, 1.0, 20)[:, None] * (ends[1] - ends[0])
         away = np.asarray(KDTree(along).query(self._places)[0])
         away[np.isin(self._numbers, needed)] = -1.0
-        chosen = np.sort(self._numbers[np.argsort(away, kind="stable")[:MOST_STATIONS]])
+        chosen = np.sort(self._numbers[np.argsort(away, kind="stable")[:MAX_STATIONS]])
         if self._kept is None or self._kept[0] != chosen.tobytes():
             self._kept = (
                 chosen.tobytes(),
@@ -345,7 +345,7 @@ def _observations(
     every = np.concatenate(ids)
     points, inverse, counts = np.unique(every, return_inverse=True, return_counts=True)
     chosen = counts > 1
-    step = -(-int(counts[chosen].sum()) // _MOST_OBSERVATIONS)
+    step = -(-int(counts[chosen].sum()) // _MAX_OBSERVATIONS)
     if step > 1:
         chosen &= np.arange(len(points)) % step == 0
     kept = np.flatnonzero(chosen[inverse])

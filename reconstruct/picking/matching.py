@@ -26,22 +26,22 @@ _WEIGHT_PX = 0.5 * HALF_PX
 _SPLINE = 5
 _SPARE_PX = 12
 """Pixels around a part of a picture that its spline needs to be that of the whole."""
-_LEAST_REACH_PX, _MOST_REACH_PX = 4, 24
+_MIN_REACH_PX, _MAX_REACH_PX = 4, 24
 """A search goes at least and at most this far from where the surface says."""
 _REACH_SIGMAS = 4.0
 _POSE_SIGMA_PX = 0.5
 """By what poses may move a place besides the surface."""
 _ROUNDS = 20
 _SETTLED_PX = 1e-4
-_LEAST_CORRELATION = 0.6
+_MIN_CORRELATION = 0.6
 _RIVAL = 0.85
 """A second place whose correlation is more than this share of the best's: they look the same."""
 _RIVAL_PX = 4
 """Places at least this far apart are two."""
-_MOST_SIGMA_PX = 0.25
-_MOST_DRIFT_PX = 1.5
+_MAX_SIGMA_PX = 0.25
+_MAX_DRIFT_PX = 1.5
 """The fit must end this close to where the search found the best place."""
-_MOST_STRETCH = 0.3
+_MAX_STRETCH = 0.3
 _LAG_PX = 1
 """Residuals farther apart are independent."""
 
@@ -109,11 +109,11 @@ class Matcher:
             return NoMatch(image=image, why="the picture does not see the spot")
         raised = picture.project(self._place.point - [0.0, 0.0, self._place.sigma])
         spread = float(np.hypot(np.linalg.norm(raised - middle), _POSE_SIGMA_PX))
-        reach = int(np.clip(np.ceil(_REACH_SIGMAS * spread), _LEAST_REACH_PX, _MOST_REACH_PX))
+        reach = int(np.clip(np.ceil(_REACH_SIGMAS * spread), _MIN_REACH_PX, _MAX_REACH_PX))
         extent = int(np.ceil(np.abs(expected - middle).max())) + reach + 2
         part = _PicturePart.around(grey, middle, extent)
         shift, likeness, rival = self._search(part, expected, reach)
-        if likeness < _LEAST_CORRELATION:
+        if likeness < _MIN_CORRELATION:
             return NoMatch(
                 image=image,
                 why=f"nothing there looks like the pick (correlation {max(likeness, 0.0):.2f}): "
@@ -125,9 +125,9 @@ class Matcher:
         if fit is None:
             return NoMatch(image=image, why="the match does not settle")
         move, sigma, correlation = fit
-        if np.linalg.norm(move) > _MOST_DRIFT_PX or correlation < _LEAST_CORRELATION:
+        if np.linalg.norm(move) > _MAX_DRIFT_PX or correlation < _MIN_CORRELATION:
             return NoMatch(image=image, why="the match does not settle")
-        if sigma > _MOST_SIGMA_PX:
+        if sigma > _MAX_SIGMA_PX:
             return NoMatch(
                 image=image, why=f"too little texture: it would be known to {sigma:.1f} px only"
             )
@@ -240,7 +240,7 @@ def _fit(
             return None
         step = inverse @ (columns.T @ (weight * rest))
         change = change + step[:6]
-        if np.abs(change[2:]).max() > _MOST_STRETCH or np.linalg.norm(change[:2]) > 2 * HALF_PX:
+        if np.abs(change[2:]).max() > _MAX_STRETCH or np.linalg.norm(change[:2]) > 2 * HALF_PX:
             return None
         if np.linalg.norm(step[:2]) < _SETTLED_PX:
             return (

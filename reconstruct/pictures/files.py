@@ -49,7 +49,7 @@ _GPS, _EXIF, _FOCAL_35 = 0x8825, 0x8769, 0xA405
 _MAKE, _MODEL, _SERIAL, _ORIENTATION = 0x010F, 0x0110, 0xA431, 0x0112
 _MIRRORED = (2, 4, 5, 7)
 """EXIF orientations of mirror images, which no lens projects."""
-_LONGEST_DEVICE = 80
+_MAX_DEVICE = 80
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,10 +162,10 @@ def _named(reason: str, paths: Sequence[Path]) -> str:
     return f"{len(paths)} {reason} ({', '.join(names[:_NAMED])}{more})"
 
 
-def named(names: Sequence[str], most: int = 8) -> str:
+def named(names: Sequence[str], maximum: int = 8) -> str:
     """The first few of some names, and how many more there are."""
-    rest = len(names) - most
-    return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")
+    rest = len(names) - maximum
+    return ", ".join(names[:maximum]) + (f" and {rest} more" if rest > 0 else "")
 
 
 def _walked(folder: Path, apart: Collection[Path]) -> list[Path]:
@@ -242,8 +242,8 @@ def decode(path: Path) -> NDArray[Any]:
     """
     suffix = path.suffix.lower()
     heic = suffix in HEIC and can_read_heic()  # which makes Pillow know them
-    if most := pixels_too_many(path):
-        raise ImageError(f"states over {most / 1e6:.0f} million pixels: make it smaller")
+    if maximum := pixels_too_many(path):
+        raise ImageError(f"states over {maximum / 1e6:.0f} million pixels: make it smaller")
     if heic:
         return _decode_heic(path)
     if suffix in RAW:
@@ -326,7 +326,7 @@ def _device(exif: Any) -> str:
     """Make, model and serial number; the make only where the model does not start with it."""
     details = exif.get_ifd(_EXIF)
     make, model, serial = (
-        "".join(c for c in str(value or "") if c.isprintable()).strip()[:_LONGEST_DEVICE]
+        "".join(c for c in str(value or "") if c.isprintable()).strip()[:_MAX_DEVICE]
         for value in (exif.get(_MAKE), exif.get(_MODEL), details.get(_SERIAL))
     )
     words = [model if model.lower().startswith(make.lower()) else f"{make} {model}"]

@@ -28,16 +28,16 @@ _PATIENCE_S = 0.5
 """For how long a frame may be looked for that shows what was seen before."""
 _DARK = 12.0
 """Mean grey level below which a frame is black."""
-_CORNERS, _LEAST_CORNERS, _LEAST_TRACKED = 300, 20, 12
+_CORNERS, _MIN_CORNERS, _MIN_TRACKED = 300, 20, 12
 _TRACKED_SHARE, _INLIER_SHARE = 0.25, 0.5
 """Least share of corners that are tracked there and back, and of these that agree."""
 _BACK_PX = 0.5
 _INLIER_PX, _INLIER_OF_MOTION = 1.5, 0.25
 """How far a corner may be from the common motion: relief moves near ground more than far."""
-_LEAST_LIKENESS = 0.3
+_MIN_LIKENESS = 0.3
 """Correlation of two frames over each other: noise can be tracked too."""
 _DETAIL_PX = (2.0, 8.0)
-_LARGEST_ZOOM = 2.0
+_MAX_ZOOM = 2.0
 """Change of size from one frame to the next beyond which their motion is not believed."""
 _CROP_PX = (640, 480)
 """Middle of a frame in which its sharpness is measured: all of it would take too long."""
@@ -204,7 +204,7 @@ def motion(before: Grey, after: Grey) -> Array | None:
         (3, 3), or None where they have too little in common.
     """
     corners = cv2.goodFeaturesToTrack(before, _CORNERS, 0.01, 7)
-    if corners is None or len(corners) < _LEAST_CORNERS:
+    if corners is None or len(corners) < _MIN_CORNERS:
         return None
     found = _similarity(before, after, corners, np.zeros(2))
     if found is not None:
@@ -223,7 +223,7 @@ def _similarity(before: Grey, after: Grey, corners: Array, shift: Array) -> Arra
     )
     away = np.linalg.norm((back - corners).reshape(-1, 2), axis=1)
     good = (seen.ravel() == 1) & (kept.ravel() == 1) & (away < _BACK_PX)
-    if good.sum() < max(_LEAST_TRACKED, _TRACKED_SHARE * len(corners)):
+    if good.sum() < max(_MIN_TRACKED, _TRACKED_SHARE * len(corners)):
         return None
     lengths = np.linalg.norm((there - corners)[good].reshape(-1, 2), axis=1)
     near_px = max(_INLIER_PX, _INLIER_OF_MOTION * float(np.median(lengths)))
@@ -234,9 +234,9 @@ def _similarity(before: Grey, after: Grey, corners: Array, shift: Array) -> Arra
     if found is None or inliers.sum() < _INLIER_SHARE * good.sum():
         return None
     zoom = float(np.hypot(found[0, 0], found[1, 0]))
-    if not 1.0 / _LARGEST_ZOOM < zoom < _LARGEST_ZOOM:
+    if not 1.0 / _MAX_ZOOM < zoom < _MAX_ZOOM:
         return None
-    if likeness(before, after, found) < _LEAST_LIKENESS:
+    if likeness(before, after, found) < _MIN_LIKENESS:
         return None
     return np.vstack([found, [0.0, 0.0, 1.0]])
 
@@ -252,7 +252,7 @@ def likeness(before: Grey, after: Grey, moved: Array) -> float:
     size = (after.shape[1], after.shape[0])
     there = cv2.warpAffine(_detail(before), moved, size)
     inside = cv2.warpAffine(np.ones(before.shape, np.uint8), moved, size) > 0
-    if inside.sum() < _LEAST_TRACKED:
+    if inside.sum() < _MIN_TRACKED:
         return 0.0
     one, other = there[inside], _detail(after)[inside]
     scale = float(np.sqrt(np.mean(one**2) * np.mean(other**2)))

@@ -17,11 +17,11 @@ import numpy as np
 from alice_survey.core.frames import Array
 from reconstruct.pictures.mp4 import TelemetryTrack, payloads
 
-_LEAST_FIX = 3
+_MIN_FIX = 3
 """A fix in three dimensions."""
-_LARGEST_DOP = 5.0
+_MAX_DOP = 5.0
 """Dilution of precision below which GoPro calls a fix good."""
-_MOST_ITEMS = 20_000
+_MAX_ITEMS = 20_000
 _EPOCH = datetime(2000, 1, 1, tzinfo=UTC)
 _GPS9 = "lllllllSS"
 """Latitude, longitude, altitude, speeds in 2D and 3D, days, seconds, dilution, fix."""
@@ -88,8 +88,8 @@ def read_fixes(path: Path, track: TelemetryTrack) -> Fixes:
         np.isfinite(table[:, :4]).all(axis=1)
         & (np.abs(table[:, 1]) <= 90)
         & (np.abs(table[:, 2]) <= 180)
-        & (table[:, 5] >= _LEAST_FIX)
-        & (table[:, 6] < _LARGEST_DOP)
+        & (table[:, 5] >= _MIN_FIX)
+        & (table[:, 6] < _MAX_DOP)
     )
     table = table[good]
     table = table[np.argsort(table[:, 0], kind="stable")]
@@ -105,7 +105,7 @@ def read_fixes(path: Path, track: TelemetryTrack) -> Fixes:
 def _items(data: bytes) -> Iterator[_KlvItem]:
     """Keys that lie one after the other, each padded to 4 bytes."""
     at = 0
-    for _ in range(_MOST_ITEMS):
+    for _ in range(_MAX_ITEMS):
         if at + 8 > len(data):
             return
         key, kind, size, repeat = struct.unpack_from(">4scBH", data, at)

@@ -44,8 +44,8 @@ from reconstruct.pictures.summary import (
 )
 from reconstruct.pictures.video_frames import (
     DEFAULT_OVERLAP,
-    LEAST_OVERLAP,
-    MOST_OVERLAP,
+    MAX_OVERLAP,
+    MIN_OVERLAP,
     FrameSettings,
     take_frames,
 )
@@ -260,7 +260,7 @@ def _cameras_of(recordings: Sequence[Recording], mono: str) -> list[str]:
     for recording in recordings:
         seconds[recording.size] += round(sum(file.duration_s for file in recording.files) + 1)
     names = [mono, *(f"{mono}-{number}" for number in range(2, len(seconds) + 1))]
-    by_size = {size: name for (size, _), name in zip(seconds.most_common(), names, strict=True)}
+    by_size = {size: name for (size, _), name in zip(seconds.max_common(), names, strict=True)}
     return [by_size[recording.size] for recording in recordings]
 
 
@@ -291,8 +291,8 @@ def _frame_settings(
         raise ImageError("--overlap and --every exclude each other: give one of them")
     if every_s is not None and not every_s > 0:
         raise ImageError(f"--every {every_s}: seconds between frames must be more than 0")
-    if overlap is not None and not LEAST_OVERLAP <= overlap <= MOST_OVERLAP:
+    if overlap is not None and not MIN_OVERLAP <= overlap <= MAX_OVERLAP:
         raise ImageError(
-            f"--overlap {overlap}: neighbouring frames share {LEAST_OVERLAP} to {MOST_OVERLAP}"
+            f"--overlap {overlap}: neighbouring frames share {MIN_OVERLAP} to {MAX_OVERLAP}"
         )
     return FrameSettings(overlap=DEFAULT_OVERLAP if overlap is None else overlap, every_s=every_s)

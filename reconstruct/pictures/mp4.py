@@ -19,11 +19,11 @@ from alice_survey.core.errors import ImageError
 _EPOCH = datetime(1904, 1, 1, tzinfo=UTC)
 _YEARS = range(2000, 2200)
 """Years in which a digital camera can have made a video."""
-_MOST_INDEX = 128 << 20
+_MAX_INDEX = 128 << 20
 """Bytes of the index of a video: a day of it takes less."""
-_MOST_BOXES = 4096
-_MOST_SAMPLES = 1_000_000
-_MOST_PAYLOAD = 4 << 20
+_MAX_BOXES = 4096
+_MAX_SAMPLES = 1_000_000
+_MAX_PAYLOAD = 4 << 20
 """Bytes of telemetry of one sample, which holds a second."""
 _MAKER = b"GoPro"
 
@@ -78,7 +78,7 @@ def payloads(path: Path, track: TelemetryTrack) -> Iterator[tuple[float, float, 
             total = rest = path.stat().st_size
             for i, (offset, size) in enumerate(zip(track.offsets, track.sizes, strict=True)):
                 rest -= int(size)  # samples do not overlap
-                if 0 < size <= _MOST_PAYLOAD and 0 <= offset <= total - size and rest >= 0:
+                if 0 < size <= _MAX_PAYLOAD and 0 <= offset <= total - size and rest >= 0:
                     file.seek(int(offset))
                     yield float(track.starts_s[i]), float(track.starts_s[i + 1]), file.read(size)
     except OSError as error:
@@ -88,7 +88,7 @@ def payloads(path: Path, track: TelemetryTrack) -> Iterator[tuple[float, float, 
 def _index(file: BinaryIO) -> bytes:
     """Content of the box `moov`; empty where there is none."""
     at, total = 0, file.seek(0, os.SEEK_END)
-    for _ in range(_MOST_BOXES):
+    for _ in range(_MAX_BOXES):
         file.seek(at)
         head = file.read(16)
         if len(head) < 8:
@@ -100,7 +100,7 @@ def _index(file: BinaryIO) -> bytes:
         if kind == b"moov":
             file.seek(begin)
             long = (total if size == 0 else min(at + size, total)) - begin
-            return file.read(long) if 0 < long < _MOST_INDEX else b""
+            return file.read(long) if 0 < long < _MAX_INDEX else b""
         if size < 8 or at + size > total:
             return b""
         at += size
@@ -110,7 +110,7 @@ def _index(file: BinaryIO) -> bytes:
 def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
     """Kinds and contents of the boxes that lie one after the other."""
     at = 0
-    for _ in range(_MOST_BOXES):
+    for _ in range(_MAX_BOXES):
         if at + 8 > len(data):
             return
         size, kind = struct.unpack_from(">I4s", data, at)
@@ -164,7 +164,7 @@ def _telemetry(track: bytes) -> TelemetryTrack | None:
     offsets = _offsets(table, sizes)
     count = min(len(sizes), len(offsets))
     times = _rows(_inside(table, b"stts"), 4, 2)
-    if scale == 0 or count == 0 or times[:, 0].sum() > _MOST_SAMPLES:
+    if scale == 0 or count == 0 or times[:, 0].sum() > _MAX_SAMPLES:
         return None
     steps = np.repeat(times[:, 1], times[:, 0])[:count]
     count = len(steps)
@@ -174,7 +174,7 @@ def _telemetry(track: bytes) -> TelemetryTrack | None:
 
 def _sizes(box: bytes) -> NDArray[np.int64]:
     same, count = struct.unpack_from(">II", box, 4)
-    if count > _MOST_SAMPLES:
+    if count > _MAX_SAMPLES:
         return np.zeros(0, np.int64)
     return np.full(count, same) if same else _rows(box, 8, 1)[:, 0]
 
@@ -199,6 +199,6 @@ def _rows(box: bytes, at: int, columns: int, *, wide: bool = False) -> NDArray[n
     """(N, columns) numbers of a table, which follow their count at a place."""
     (count,) = struct.unpack_from(">I", box, at)
     kind = np.dtype(">u8" if wide else ">u4")
-    count = min(count, (len(box) - at - 4) // (columns * kind.itemsize), _MOST_SAMPLES)
+    count = min(count, (len(box) - at - 4) // (columns * kind.itemsize), _MAX_SAMPLES)
     flat = np.frombuffer(box, kind, count * columns, at + 4)
     return flat.astype(np.int64).reshape(count, columns)

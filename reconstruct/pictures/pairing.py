@@ -31,7 +31,7 @@ _DATE = re.compile(
     r"(?:\.(\d{1,9})|_?(\d{6})|(\d{3}))?(?!\d)"
 )
 """A date and a time of day. Fewer digits behind a dash are a counter, not a fraction."""
-_LEAST_PAIRED = 0.5
+_MIN_PAIRED = 0.5
 """Share of the pictures of the camera with fewest that times must pair."""
 _WHOLE_SECONDS_S = 4.0
 """Times in whole seconds tell pictures apart that are this far from each other."""
@@ -92,8 +92,8 @@ def _timed(sides: Mapping[str, Sequence[Path]]) -> list[dict[str, Path]] | None:
             moments = moments_of(times)
         except ImageError:
             moments = []
-        fewest = min(len(own) for own in times.values())
-        if sum(len(moment) > 1 for moment in moments) < _LEAST_PAIRED * fewest:
+        minimum = min(len(own) for own in times.values())
+        if sum(len(moment) > 1 for moment in moments) < _MIN_PAIRED * minimum:
             warn(
                 f"times in {source} are not of one clock: pictures are paired by numbers or order, "
                 "by which a picture that a camera dropped can shift the pairs after it; a trigger "

@@ -26,8 +26,8 @@ from reconstruct.pictures.files import (
 from reconstruct.pictures.incoming import camera_key
 from reconstruct.pictures.recordings import find_videos, read_recordings
 
-_MOST_HEADERS = 300
-_MOST_CAMERAS = 8
+_MAX_HEADERS = 300
+_MAX_CAMERAS = 8
 _ALIKE = 0.02
 """Folders of a rig's cameras hold equally many pictures, but for this share that one dropped."""
 
@@ -158,15 +158,15 @@ def cameras_in(folder: Path) -> dict[str, Path]:
     except OSError as error:
         raise ImageError(f"{folder}: cannot be read: {error.strerror}") from None
     counts = {name: count for name, count in counts.items() if count}
-    if not 2 <= len(counts) <= _MOST_CAMERAS:
+    if not 2 <= len(counts) <= _MAX_CAMERAS:
         return {}
-    most, least = max(counts.values()), min(counts.values())
-    return {name: folder / name for name in counts} if most - least <= _ALIKE * most else {}
+    maximum, minimum = max(counts.values()), min(counts.values())
+    return {name: folder / name for name in counts} if maximum - minimum <= _ALIKE * maximum else {}
 
 
 def _headers(paths: Sequence[Path]) -> list[PictureFacts]:
     """Headers of pictures, or of some of them, evenly spread, with the first and the last."""
-    chosen = np.unique(np.linspace(0, len(paths) - 1, min(len(paths), _MOST_HEADERS)).round())
+    chosen = np.unique(np.linspace(0, len(paths) - 1, min(len(paths), _MAX_HEADERS)).round())
     return [read_header(paths[int(i)]) for i in chosen]
 
 
@@ -174,7 +174,7 @@ def _rows(
     facts: Sequence[PictureFacts], pictures: int, name: str, *, apart: bool
 ) -> list[PreviewedCamera]:
     """The cameras of some pictures; told apart by device and size if that is wanted."""
-    counts = Counter(camera_key(one) for one in facts if not one.fault).most_common()
+    counts = Counter(camera_key(one) for one in facts if not one.fault).max_common()
     if not apart:
         counts = counts[:1]
     total = sum(count for _, count in counts)

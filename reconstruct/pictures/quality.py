@@ -23,9 +23,9 @@ from reconstruct.pictures.normalise import even_light
 from reconstruct.pictures.undistorted import read_mask
 
 NAN = math.nan
-MOST_BRIGHT = 0.25
+MAX_BRIGHT = 0.25
 """Share of burnt-out pixels from which a picture is bad by itself."""
-MOST_DARK = 0.5
+MAX_DARK = 0.5
 """Share of black pixels from which a picture is bad by itself."""
 OUTLIER_SIGMAS = 4.0
 """Robust standard deviations from the survey's median from which a picture stands out ..."""
@@ -227,13 +227,13 @@ def _reasons(quality: PictureQuality, spreads: dict[str, tuple[float, float]]) -
     if math.isnan(quality.sharpness):
         return ()
     reasons = []
-    if quality.bright_share > MOST_BRIGHT:
+    if quality.bright_share > MAX_BRIGHT:
         reasons.append(f"overexposed: {quality.bright_share:.0%} of its pixels are burnt out")
-    if quality.dark_share > MOST_DARK:
+    if quality.dark_share > MAX_DARK:
         reasons.append(f"underexposed: {quality.dark_share:.0%} of its pixels are black")
     veil, veil_sigma = spreads["veil"]
     veiled = math.log(max(quality.veil, 1e-6)) > veil + OUTLIER_SIGMAS * veil_sigma
-    pale = "hazy" if veiled and quality.bright_share <= MOST_BRIGHT else "pale"
+    pale = "hazy" if veiled and quality.bright_share <= MAX_BRIGHT else "pale"
     for name, word in (("sharpness", "blurred"), ("contrast", pale), ("brightness", "dark")):
         middle, sigma = spreads[name]
         below = middle - math.log(max(getattr(quality, name), 1e-6))

@@ -25,7 +25,7 @@ from reconstruct.pictures.quality import (
 
 _NUMBERS = tuple(f.name for f in fields(PictureQuality) if f.type in (float, "float"))
 _HEADER = ("image", "camera", "station", *_NUMBERS, "reasons")
-_MOST_SHOWN = 8
+_MAX_SHOWN = 8
 _ACROSS = 4
 _THUMBNAIL_PX = 420
 _STRIPS = ("sharpness", "contrast", "veil", "brightness")
@@ -40,7 +40,7 @@ def plot_quality(path: Path, images: Path, found: Sequence[PictureQuality]) -> N
         images: folder of the pictures.
         found: all pictures, judged.
     """
-    worst = worst_first(found)[:_MOST_SHOWN]
+    worst = worst_first(found)[:_MAX_SHOWN]
     rows = -(-len(worst) // _ACROSS)
     figure = new_figure(5.2 + 2.6 * rows, 12)
     if not rows:

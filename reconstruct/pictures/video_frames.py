@@ -17,9 +17,9 @@ from reconstruct.pictures.frame_choice import Frame, FrameCounts, OverlapChooser
 from reconstruct.pictures.incoming import Incoming
 from reconstruct.pictures.recordings import Recording, frame_count, frame_rate, opened
 
-LEAST_OVERLAP, DEFAULT_OVERLAP, MOST_OVERLAP = 0.3, 0.7, 0.95
+MIN_OVERLAP, DEFAULT_OVERLAP, MAX_OVERLAP = 0.3, 0.7, 0.95
 """Of neighbouring frames. Below the least they hardly match; above the most, they hardly differ."""
-_MOST_HZ = 15.0
+_MAX_HZ = 15.0
 """Frames a second that are looked at."""
 _TOUCH_S = 1e-6
 
@@ -145,7 +145,7 @@ def _by_overlap(
     chooser = OverlapChooser(overlap, counts)
     last_s = -1.0
     for one in grabbed:
-        if one.time_s - last_s < (1.0 - 0.1) / _MOST_HZ:
+        if one.time_s - last_s < (1.0 - 0.1) / _MAX_HZ:
             continue
         last_s = one.time_s
         pixels = one.retrieve()

@@ -28,20 +28,20 @@ from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.working_range import ray_passes
 from reconstruct.matching.pairs import positions_ned
 from reconstruct.pictures.files import named
-from reconstruct.placing.bend import LEAST_STATIONS, Bend, quadratic
+from reconstruct.placing.bend import MIN_STATIONS, Bend, quadratic
 from reconstruct.views.model_files import as_transform
 
 FAR_SIGMAS, FAR_M = 5.0, 0.5
 """A station is off navigation when it misses by more than both."""
 SCALE_BOUND = 1e-3
 """Relative error of lengths that a known rig must not exceed."""
-_LEAST_STATIONS = 5
+_MIN_STATIONS = 5
 _ROUNDS = 20
 _MEDIAN_SIGMAS = 1.5382
 """Median length of a vector of three independent unit normal numbers."""
 _SIGMAS = 3.0
 _FIT_ROUNDS = 10
-_LEAST_STEREO_POINTS = 20
+_MIN_STEREO_POINTS = 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,7 +146,7 @@ def scale_trend(
         for frame in sorted(reference)
         if (given := _station_scale(model, seen, frame)) is not None
     ]
-    if len(local) < LEAST_STATIONS:
+    if len(local) < MIN_STATIONS:
         return None
     centres = np.array([row[0] for row in local])
     scale, sigma = np.array([row[1:] for row in local]).T
@@ -267,7 +267,7 @@ def _station_scale(
         for a, b in combinations(numbers, 2)
     }
     pair = max(shared, key=lambda found: len(shared[found][0]), default=None)
-    if pair is None or len(shared[pair][0]) < _LEAST_STEREO_POINTS:
+    if pair is None or len(shared[pair][0]) < _MIN_STEREO_POINTS:
         return None
     both, *at = shared[pair]
     first, second = (model.images[n] for n in pair)
@@ -413,7 +413,7 @@ def _far_stations(
     model: pycolmap.Reconstruction, records: Sequence[ImageRecord], positions: Array, sigmas: Array
 ) -> tuple[int, float, tuple[FarStation, ...]]:
     numbers = sorted(first_pictures(model, positions + sigmas).values())
-    if len(numbers) < _LEAST_STATIONS:
+    if len(numbers) < _MIN_STATIONS:
         return len(numbers), float("nan"), ()
     rows = np.array(numbers) - 1
     centres = np.array(

@@ -14,7 +14,7 @@ _BEAM = np.tan(np.deg2rad(15.0))
 and a Doppler log's four, about as far apart, are averaged."""
 _SIGMA_M = 0.1
 """Used where navigation states no sigma."""
-_LEAST_POINTS, _LEAST_STATIONS = 5, 3
+_MIN_POINTS, _MIN_STATIONS = 5, 3
 
 
 def scale_by_altitudes(
@@ -37,13 +37,13 @@ def scale_by_altitudes(
     first = {r.station: i for i, r in reversed(list(enumerate(records))) if r.altitude_m > 0}
     logs, reliefs, sigmas, places = [], [], [], []
     for i in sorted(first.values()):
-        near = points[tree.query(centres[i, :2], min(_LEAST_POINTS, len(points)))[1]]
+        near = points[tree.query(centres[i, :2], min(_MIN_POINTS, len(points)))[1]]
         reach = _BEAM * float(np.median(near[:, 2]) - centres[i, 2])
         if not reach > 0:
             continue
         below = points[tree.query_ball_point(centres[i, :2], reach), 2] - centres[i, 2]
         below = below[below > 0]
-        if len(below) < _LEAST_POINTS:
+        if len(below) < _MIN_POINTS:
             continue
         middle = float(np.median(below))
         logs.append(np.log(records[i].altitude_m / middle))
@@ -51,7 +51,7 @@ def scale_by_altitudes(
         stated = records[i].sigma_altitude_m
         sigmas.append((stated if stated > 0 else _SIGMA_M) / records[i].altitude_m)
         places.append(np.append(centres[i, :2], middle))
-    if len(logs) < _LEAST_STATIONS:
+    if len(logs) < _MIN_STATIONS:
         return None
     way, middles = np.array(places)[:, :2], np.array(places)[:, 2]
     length = float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())

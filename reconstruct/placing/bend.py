@@ -15,7 +15,7 @@ from reconstruct.placing.alignment import Similarity
 _THIN = 0.1
 """Width over length of a block below which it has no curvature across."""
 _SIGMAS = 3.0
-LEAST_STATIONS = 8
+MIN_STATIONS = 8
 """A paraboloid has six coefficients."""
 
 

@@ -18,7 +18,7 @@ from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.control import ControlFit, aligned
 
 _TRIPLE = 3
-_MOST_TRIPLES = 500
+_MAX_TRIPLES = 500
 _INSIDE_SIGMAS, _WRONG_SIGMAS = 2.5, 4.0
 """What takes part in a first spread of the misfits, and what is wrong by the spread of these."""
 _CHI_SIGMAS = 3.0
@@ -77,10 +77,10 @@ def without_wrong_points(control: ControlFit, known_scale: float | None) -> Cont
 
 def _triples(count: int) -> list[list[int]]:
     every = [list(triple) for triple in itertools.combinations(range(count), _TRIPLE)]
-    if len(every) <= _MOST_TRIPLES:
+    if len(every) <= _MAX_TRIPLES:
         return every
     rng = np.random.default_rng(0)  # any choice will do; the same each time
-    return [every[k] for k in rng.choice(len(every), _MOST_TRIPLES, replace=False)]
+    return [every[k] for k in rng.choice(len(every), _MAX_TRIPLES, replace=False)]
 
 
 def _misfits(control: ControlFit, place: Similarity) -> Array:
@@ -114,10 +114,10 @@ def real_sigma_factor(control: ControlFit, place: Similarity, parameters: int) -
     ratio = 1.0 + excess(0.0)
     if ratio <= 1.0 + _CHI_SIGMAS * np.sqrt(2.0 / freedom):
         return 1.0
-    most = np.log(ratio)
-    while excess(most) > 0:
-        most *= 2.0
-    return float(np.exp(brentq(excess, 0.0, most)))
+    maximum = np.log(ratio)
+    while excess(maximum) > 0:
+        maximum *= 2.0
+    return float(np.exp(brentq(excess, 0.0, maximum)))
 
 
 def widened(control: ControlFit, factor: float) -> ControlFit:

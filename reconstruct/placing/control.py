@@ -16,7 +16,7 @@ from reconstruct.placing.picked_points import Spot
 from reconstruct.placing.placement_problem import Extra
 
 _CONTRADICTED_SIGMAS = 4.0
-_LEAST_SPREAD = 1e-3
+_MIN_SPREAD = 1e-3
 """Points this close to one line, over their length, do not say how the model is turned about it."""
 
 
@@ -209,7 +209,7 @@ class ControlFit:
 def aligned(model: Array, ned: Array, known_scale: float | None) -> Similarity | None:
     """The placement of points (N, 3) of the model on known ones; None where they are on a line."""
     spread = np.linalg.svd(ned - ned.mean(axis=0), compute_uv=False)
-    if spread[1] < _LEAST_SPREAD * spread[0]:
+    if spread[1] < _MIN_SPREAD * spread[0]:
         return None
     if known_scale is None:
         return align_similarity(model, ned)

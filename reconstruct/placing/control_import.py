@@ -26,7 +26,7 @@ _READERS: tuple[tuple[Callable[[str], bool], Callable[[str], ForeignControl]], .
     (is_markers, read_markers),
     (is_gcp_list, read_gcp_list),
 )
-_LARGEST_BYTES = 200_000_000
+_MAX_BYTES = 200_000_000
 _CONTROL_HEADER = (
     "kind", "name", "use", "latitude_deg", "longitude_deg", "north_m", "east_m", "depth_m",
     "height_m", "sigma_m", "sigma_vertical_m", "from", "to", "length_m",
@@ -129,8 +129,8 @@ def read_foreign(path: Path) -> ForeignControl:
         WorkspaceError: it cannot be read or is of none.
     """
     try:
-        if path.stat().st_size > _LARGEST_BYTES:
-            raise WorkspaceError(f"{path}: is larger than {_LARGEST_BYTES // 1_000_000} MB")
+        if path.stat().st_size > _MAX_BYTES:
+            raise WorkspaceError(f"{path}: is larger than {_MAX_BYTES // 1_000_000} MB")
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise WorkspaceError(f"{path}: cannot be read: {why(error)}") from None

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
 
-LEAST_WHITE = 1e-4
+MIN_WHITE = 1e-4
 """Share of white error that two readings at the same time need to have any innovation."""
 
 
@@ -42,7 +42,7 @@ def whiten(
         used: (N,) what is there; the rest is passed over as a gap.
         values: (N, P) columns, each over its sigma.
         tau: time in which the correlation falls to 1/e, above 0.
-        white: share w of the variance that is white, `LEAST_WHITE` to 1.
+        white: share w of the variance that is white, `MIN_WHITE` to 1.
 
     Returns:
         (N, P) innovations over their standard deviation, zero where not used, and the logarithm of

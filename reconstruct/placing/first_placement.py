@@ -8,7 +8,7 @@ from alice_survey.core.errors import warn
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.navigation_equations import Epochs
 
-_LEAST_SPREAD = 0.1
+_MIN_SPREAD = 0.1
 """Positions that spread less than this share of their sigma do not place a model."""
 _RELIEF_SIGMAS = 3.0
 """Relief of a track over the sigma of its depths from which depths alone give the scale."""
@@ -54,8 +54,8 @@ def first_placement(
     flat = levelled.apply(epochs.centres)[at]
     has = _has_angles(epochs)
     if not has.any() or known_scale is None:
-        least = 2 if has.any() else 3
-        if count < least or spread <= _LEAST_SPREAD * need:
+        minimum = 2 if has.any() else 3
+        if count < minimum or spread <= _MIN_SPREAD * need:
             warn(
                 f"{count} positions spread over {spread:.2f} m at a sigma of {need:.2f} m do not "
                 "place the model: it stays without CRS"

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from alice_survey.core.frames import Array
 from alice_survey.core.robust import MAD_TO_SIGMA
-from reconstruct.placing.correlated_errors import LEAST_WHITE, standard_residuals
+from reconstruct.placing.correlated_errors import MIN_WHITE, standard_residuals
 from reconstruct.placing.navigation_equations import GROUPS, NavigationEquations
 from reconstruct.placing.placement_problem import Correlation, Extra, PlacementProblem, channels_of
 
-_WHITE = (LEAST_WHITE, 3e-3, 0.05, 0.3, 0.8, 0.97)
+_WHITE = (MIN_WHITE, 3e-3, 0.05, 0.3, 0.8, 0.97)
 _CONSTANT = (0.0, 0.5, 0.75, 0.9)
 """The varying part's variance goes down by halves: what is not known of a variance is its size."""
 _JUMPS = (4.0, 16.0, 64.0, 256.0)
@@ -29,7 +29,7 @@ _JUMPS = (4.0, 16.0, 64.0, 256.0)
 _SURFACED_S, _SURFACED_STEPS = 300.0, 20.0
 """A gap between stations is one between dives from these times on, in seconds and usual steps."""
 _TAUS = 10
-_SHORTEST_STEPS, _LONGEST_SPANS = 0.2, 30.0
+_MIN_STEPS, _MAX_SPANS = 0.2, 30.0
 """Correlation times tried: from this many median time steps to this many lengths of the survey."""
 _GROSS_SIGMAS = 5.0
 _CONTRADICTED_SIGMAS = 4.5
@@ -139,7 +139,7 @@ def _grid(problem: PlacementProblem) -> list[Correlation]:
     if not len(steps):
         return [Correlation(tau=1.0, white=0.1)]
     taus = np.geomspace(
-        _SHORTEST_STEPS * float(np.median(steps)), _LONGEST_SPANS * float(np.ptp(time)), _TAUS
+        _MIN_STEPS * float(np.median(steps)), _MAX_SPANS * float(np.ptp(time)), _TAUS
     )
     return [
         Correlation(tau=float(tau), white=white, constant=constant, restart=restart)
@@ -234,7 +234,7 @@ def _factor(
     problem: PlacementProblem, used: NDArray[np.bool_], now: Mapping[str, Correlation], group: str
 ) -> float:
     """Factor by which a group's misfits are larger than its sigmas allow, 1 or more."""
-    least = problem.widened.get(group, 1.0)
+    minimum = problem.widened.get(group, 1.0)
     change, covariance = problem.total(used, now).solve()
     own = problem.group(group, used, now[group])
     square = own.square + 2.0 * float(own.vector @ change) + float(change @ own.matrix @ change)
@@ -243,7 +243,7 @@ def _factor(
         return now[group].factor
     ratio = square / freedom * now[group].factor ** 2
     significant = ratio > 1.0 + _CHI_SIGMAS * np.sqrt(2.0 / freedom)
-    return max(float(np.sqrt(ratio)) if significant else 1.0, least)
+    return max(float(np.sqrt(ratio)) if significant else 1.0, minimum)
 
 
 def _without_contradicted(

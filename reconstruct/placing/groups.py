@@ -33,7 +33,7 @@ from reconstruct.placing.navigation_equations import (
 from reconstruct.placing.placement_fit import PlacementFit
 from reconstruct.views.model_files import as_transform, rigid3d
 
-_MOST_TURN_RAD = 0.1
+_MAX_TURN_RAD = 0.1
 """Sigma of a group's turn about any axis up to which turns are linear."""
 
 
@@ -137,7 +137,7 @@ def _placed(
     if fit is None:
         return None
     sigmas = np.sqrt(np.diag(fit.covariance)[:6])
-    return fit if np.all(sigmas > 0) and sigmas[:3].max() <= _MOST_TURN_RAD else None
+    return fit if np.all(sigmas > 0) and sigmas[:3].max() <= _MAX_TURN_RAD else None
 
 
 def _pictures(model: pycolmap.Reconstruction, frames: Sequence[int]) -> list[int]:

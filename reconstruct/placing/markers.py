@@ -36,7 +36,7 @@ DICTIONARIES = (
 """Dictionaries tried one after the other where none is named."""
 _HEADER = ("image", "point", "x", "y", "sigma_px")
 _TEMPLATE = ("image", "point", "x", "y", "sigma_px", "near_x", "near_y")
-_LEAST_VIEWS = 2
+_MIN_VIEWS = 2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -105,11 +105,11 @@ def survey_control(
         (name, f"{marker.number}.{k}", f"{x:.4f}", f"{y:.4f}", MARKER_SIGMA_PX)
         for name, markers in zip(names, (seen[best] for seen in found), strict=True)
         for marker in markers
-        if views[marker.number] >= _LEAST_VIEWS
+        if views[marker.number] >= _MIN_VIEWS
         for k, (x, y) in enumerate(marker.corners)
     ]
     write_csv(workspace / MARKERS_FILE, _HEADER, rows)
-    seen_often = {n: count for n, count in sorted(views.items()) if count >= _LEAST_VIEWS}
+    seen_often = {n: count for n, count in sorted(views.items()) if count >= _MIN_VIEWS}
     lines = [
         f"{len(seen_often)} markers of {best} in {len({row[0] for row in rows})} of {len(names)} "
         f"pictures: {MARKERS_FILE}"
@@ -153,7 +153,7 @@ def _best_dictionary(
     """The dictionary with most detections of markers that two pictures or more show."""
     views = {name: Counter(m.number for seen in found for m in seen[name]) for name in tried}
     detections = {
-        name: sum(n for n in counts.values() if n >= _LEAST_VIEWS) for name, counts in views.items()
+        name: sum(n for n in counts.values() if n >= _MIN_VIEWS) for name, counts in views.items()
     }
     best = max(tried, key=lambda name: (detections[name], -tried.index(name)))
     return best, views[best]

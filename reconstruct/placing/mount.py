@@ -22,7 +22,7 @@ _AXES = ("mount_forward_deg", "mount_right_deg", "mount_down_deg")
 _ARMS = ("lever_forward_m", "lever_right_m", "lever_down_m")
 _UNKNOWN_RAD, _UNKNOWN_LEVER_M = 1.0, 1.0
 """Sigmas of a mount of which nothing is known, about a first value, and of its lever arm."""
-_LEAST_PICTURES = 3
+_MIN_PICTURES = 3
 _STEPS = 8
 _SETTLED_DEG = 1e-4
 _TRIMS, _TRIMMED = 5, 3.0
@@ -93,7 +93,7 @@ def _first_mount(
         for r, pose in zip(records, model_from_cam, strict=True)
         if r.has_attitude
     ]
-    return _usual(Rotation.concatenate(turns)) if len(turns) >= _LEAST_PICTURES else None
+    return _usual(Rotation.concatenate(turns)) if len(turns) >= _MIN_PICTURES else None
 
 
 def _collected(

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from alice_survey.core.errors import ReconstructionError, warn
 from alice_survey.core.frames import Array
 from reconstruct.placing.alignment import Similarity
-from reconstruct.placing.bend import LEAST_STATIONS, Bend, bend_modes, quadratic
+from reconstruct.placing.bend import MIN_STATIONS, Bend, bend_modes, quadratic
 from reconstruct.placing.generalised_fit import Estimate, estimate, without_gross_errors
 from reconstruct.placing.navigation_equations import (
     CLOCK,
@@ -40,7 +40,7 @@ _ROBUST_SIGMAS = 2.0
 """Sigmas beyond which the first placement lets a misfit pull only in proportion."""
 _STEPS = 8
 _SETTLED_SIGMAS = 0.01
-_LEAST_BOUND = 1e-9
+_MIN_BOUND = 1e-9
 SHRUNK = 1e-6
 """Share of its first scale below which a model has shrunk to a point."""
 _SIGNIFICANT = 3.0
@@ -103,7 +103,7 @@ class NavigationTask:
         bounds = self._frame_bounds()
         modes = range(PARAMETERS, PARAMETERS + len(sizes))
         soft = len(sizes) - self.joints
-        solved_for = [*free, *(p for p, bound in bounds.items() if bound > _LEAST_BOUND), *modes]
+        solved_for = [*free, *(p for p, bound in bounds.items() if bound > _MIN_BOUND), *modes]
         if epochs.has_attitude:
             solved_for += range(LEVER.start, LEVER.stop)
             if self.installed.mount_rad > 0:
@@ -244,7 +244,7 @@ class NavigationTask:
     ) -> tuple[Bend, ...]:
         """How bent the placed model is by navigation alone, whatever its modes allow."""
         epochs = self.epochs.deformed(sizes)
-        if got.used[:, 2].sum() < LEAST_STATIONS:
+        if got.used[:, 2].sum() < MIN_STATIONS:
             return ()
         places = place.apply(epochs.centres)
         modes = _VAGUE_PER_M * bend_modes(places, place)
@@ -290,7 +290,7 @@ class NavigationTask:
         Only a known tilt tells it from one of the model.
         """
         epochs = self.epochs
-        if not (epochs.timed and epochs.has_tilt and got.used[:, 2].sum() >= LEAST_STATIONS):
+        if not (epochs.timed and epochs.has_tilt and got.used[:, 2].sum() >= MIN_STATIONS):
             return 0.0
         usual = self._usual_sigma(2)
         found = estimate(

@@ -18,7 +18,7 @@ from reconstruct.placing.foreign_control import (
 
 _UTM = re.compile(r"WGS84\s+UTM\s+(\d{1,2})\s*([NS])", re.IGNORECASE)
 _SYSTEM = re.compile(r"\s*(EPSG:|\+proj|WGS84\b)", re.IGNORECASE)
-_LEAST_FIELDS = 6
+_MIN_FIELDS = 6
 
 
 def is_gcp_list(text: str) -> bool:
@@ -44,7 +44,7 @@ def read_gcp_list(text: str) -> ForeignControl:
     picks = []
     for number, line in rows:
         fields = line.split()
-        if len(fields) < _LEAST_FIELDS:
+        if len(fields) < _MIN_FIELDS:
             raise ValueError(
                 f"line {number}: {len(fields)} fields, not x y z im_x im_y picture [name]"
             )
@@ -54,8 +54,8 @@ def read_gcp_list(text: str) -> ForeignControl:
             raise ValueError(f"line {number}: {shown(line)!r} has no five numbers") from None
         if not all(map(math.isfinite, (x, y, column, row))):
             raise ValueError(f"line {number}: {shown(line)!r} has a number that is not finite")
-        if len(fields) > _LEAST_FIELDS:
-            name = fields[_LEAST_FIELDS]
+        if len(fields) > _MIN_FIELDS:
+            name = fields[_MIN_FIELDS]
         else:
             name = names.setdefault((x, y, z), f"P{len(names) + 1}")
         point = ForeignPoint(

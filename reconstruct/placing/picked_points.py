@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import min_squares
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.errors import warn
@@ -27,7 +27,7 @@ _WRONG_PX = 2.0
 _TRIED = 6
 _COARSE = 3.0
 """How many of their sigmas picks of most points must be off to count as coarser than stated."""
-_LEAST_POINTS = 3
+_MIN_POINTS = 3
 """Points that say how coarse picks are."""
 
 
@@ -128,7 +128,7 @@ def _with_real_sigmas(
         off = _fit(start, some, cameras)[0] / np.array([[p.sigma_px] for p in some])
         if np.isfinite(off).all():
             sizes.append(float(np.sqrt(np.sum(off**2) / (2 * len(some) - 3))))
-    factor = float(np.median(sizes)) if len(sizes) >= _LEAST_POINTS else 1.0
+    factor = float(np.median(sizes)) if len(sizes) >= _MIN_POINTS else 1.0
     if factor <= _COARSE:
         return dict(by_name)
     usual = float(np.median([p.sigma_px for some in by_name.values() for p in some]))
@@ -292,7 +292,7 @@ def _fit(
         found: Array = weight * misses(x)
         return found
 
-    found = least_squares(
+    found = min_squares(
         weighted, np.zeros(3), loss="soft_l1", f_scale=near_px, xtol=1e-12,
         ftol=1e-12, gtol=1e-12, jac="3-point",
     )  # fmt: skip

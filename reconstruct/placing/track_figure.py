@@ -21,13 +21,13 @@ from alice_survey.kit.figure import (
 )
 from reconstruct.placing.track import read_track_poses
 
-_LONGEST_PX = 1800
-_LONGEST_IN = 9.0
+_MAX_PX = 1800
+_MAX_IN = 9.0
 _TURN_DEG = 50.0
 """A track that turns by more than this between legs starts a new line."""
-_MOST_NAMED = 24
+_MAX_NAMED = 24
 """Lines that the legend names one by one: a big survey has hundreds."""
-_LEAST_LINE = 3
+_MIN_LINE = 3
 """Stations of a line; fewer lie in a turn."""
 _TWO_SIGMA = 2.0
 _COLOURS = (
@@ -69,7 +69,7 @@ def plot_track_over(mosaic_tif: Path, track_csv: Path, path: Path) -> None:
         on = lines == number
         colour = _COLOURS[number % len(_COLOURS)]
         label = f"line {number + 1}: {int(on.sum())} stations"
-        if count > _MOST_NAMED:
+        if count > _MAX_NAMED:
             label = "_" if number else f"{count} lines of {int((lines >= 0).sum())} stations"
         axes.plot(
             places[on, 1], places[on, 0], "o-", color=colour, markersize=3.5, linewidth=1.2,
@@ -122,7 +122,7 @@ def split_lines(places: Array) -> NDArray[np.int64]:
         places: (N, 2) in the order they were visited.
     """
     count = len(places)
-    if count < _LEAST_LINE:
+    if count < _MIN_LINE:
         return np.zeros(count, dtype=np.int64)
     legs = np.diff(places, axis=0)
     course = np.arctan2(legs[:, 1], legs[:, 0])
@@ -135,7 +135,7 @@ def split_lines(places: Array) -> NDArray[np.int64]:
         )
         if not (ends or turned):
             continue
-        if leg - first + 1 >= _LEAST_LINE:
+        if leg - first + 1 >= _MIN_LINE:
             free = found[first : leg + 1] < 0
             found[first : leg + 1] = np.where(free, number, found[first : leg + 1])
             number += 1
@@ -187,7 +187,7 @@ def _read_mosaic(path: Path) -> tuple[Array, tuple[float, float, float, float], 
     """A mosaic reduced, (H, W, 3) from 0 to 1, dark where empty; west, east, south, north; tags."""
     try:
         with rasterio.open(path) as raster:
-            shrink = max(1.0, max(raster.width, raster.height) / _LONGEST_PX)
+            shrink = max(1.0, max(raster.width, raster.height) / _MAX_PX)
             shape = (max(1, int(raster.height / shrink)), max(1, int(raster.width / shrink)))
             bands = list(range(1, min(raster.count, 3) + 1))
             resampling = rasterio.enums.Resampling.average
@@ -206,5 +206,5 @@ def _read_mosaic(path: Path) -> tuple[Array, tuple[float, float, float, float], 
 def _size(extent: tuple[float, float, float, float]) -> tuple[float, float]:
     """Size of a figure for a map with a legend at its right, inches."""
     wide, high = extent[1] - extent[0], extent[3] - extent[2]
-    scale = (_LONGEST_IN - 2.0) / max(wide, high, 1e-9)
+    scale = (_MAX_IN - 2.0) / max(wide, high, 1e-9)
     return max(4.0, wide * scale) + 2.4, max(3.0, high * scale) + 0.8

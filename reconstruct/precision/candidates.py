@@ -28,7 +28,7 @@ BETWEEN_DIVES_S = 3600.0
 """By then slow errors of navigation are new ones."""
 _MORE_CROSS_LINES = (1, 2, 4)
 _MORE_OVERLAP = (0.1, 0.2)
-_MOST_OVERLAP = 0.9
+_MAX_OVERLAP = 0.9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -239,7 +239,7 @@ def _levels(plan: PlanConfig) -> Iterator[Sequence[_PlanChange]]:
         _PlanChange(f"{word} overlap {own + more:.0%}", setting, round(own + more, 3))
         for setting, word in overlaps.items()
         for more in _MORE_OVERLAP
-        if (own := getattr(plan, setting)) + more <= _MOST_OVERLAP
+        if (own := getattr(plan, setting)) + more <= _MAX_OVERLAP
     ]
 
 

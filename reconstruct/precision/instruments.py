@@ -26,7 +26,7 @@ from camera_calib.rig import Covariance, Rig, design_rig
 from missions.fly.check import rig_of
 from reconstruct.adjustment.exact_observations import Pixels, RigState, exact_observations
 from reconstruct.mapping.arrays import cross_matrices
-from reconstruct.placing.correlated_errors import LEAST_WHITE
+from reconstruct.placing.correlated_errors import MIN_WHITE
 from reconstruct.placing.navigation_equations import USUAL_INSTALLATION, Installation
 from reconstruct.placing.placement_problem import Correlation
 
@@ -128,7 +128,7 @@ class ChannelErrors:
         varying = math.hypot(self.slow, self.white)
         return Correlation(
             tau=self.slow_s,
-            white=max((self.white / varying) ** 2, LEAST_WHITE),
+            white=max((self.white / varying) ** 2, MIN_WHITE),
             constant=(self.constant / self.sigma) ** 2,
             restart=float(self.by_dive),
         )

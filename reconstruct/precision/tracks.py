@@ -32,9 +32,9 @@ _NOISE_PX = 0.15
 """Residuals show 0.033 px in the demo and 0.060 in Caesarea, but errors of one feature or picture
 go together. Independent ones of 0.15 px give the errors of both surveys' cameras within a factor of
 two: 0.21 and 0.85 mm, where 0.18 and 1.7 mm were found."""
-_MOST_OBSERVATIONS, _PER_PICTURE = 80_000, (20, 60)
+_MAX_OBSERVATIONS, _PER_PICTURE = 80_000, (20, 60)
 """Drawn in all, and least and most of a picture, which two parts of it share."""
-_LEAST_ANGLE_RAD = math.radians(1.5)
+_MIN_ANGLE_RAD = math.radians(1.5)
 """Between two rays to a point; COLMAP's least."""
 
 Floor = Callable[[Array], Array]
@@ -106,7 +106,7 @@ def expected_block(
     count, reference = len(ned_from_body), rig.cam_from_rig[rig.reference]
     pictures = count * len(rig.cameras)
     if drawn is None:
-        drawn = float(np.clip(_MOST_OBSERVATIONS / pictures, *_PER_PICTURE))
+        drawn = float(np.clip(_MAX_OBSERVATIONS / pictures, *_PER_PICTURE))
     drawn = min(drawn, tracks.per_picture)
     rng = np.random.default_rng(seed)
     points, reach_m = _points(rig, ned_from_body, floor, drawn / tracks.matched, rng)
@@ -159,7 +159,7 @@ def _is_wide(point: Indices, rays: Array) -> Flags:
     count = np.bincount(point)
     sums = np.column_stack([np.bincount(point, weights=axis) for axis in rays.T])
     mean = np.linalg.norm(sums, axis=1) / np.maximum(count, 1)
-    wide: Flags = (mean < math.cos(_LEAST_ANGLE_RAD / 2.0))[point]
+    wide: Flags = (mean < math.cos(_MIN_ANGLE_RAD / 2.0))[point]
     return wide
 
 

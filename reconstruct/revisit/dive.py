@@ -89,7 +89,7 @@ def tie_line(found: Found, place: WeakPlace) -> Line | None:
     core = ~loose & (found.piece == 0)
     shapes = footprints(found.rig, stations)
     both = [shapely.union_all(shapes[part]) for part in (loose, core)]
-    least_m2 = found.least_tracks / LOOSE_SHARE / found.tracks_per_point * found.step_m**2
+    min_m2 = found.least_tracks / LOOSE_SHARE / found.tracks_per_point * found.step_m**2
     best: tuple[tuple[bool, float], Line] | None = None
     spread = np.linspace(0, loose.sum() - 1, min(_ENDS, int(loose.sum()))).round().astype(int)
     for start in stations.glass_ne[loose][spread]:
@@ -102,7 +102,7 @@ def tie_line(found: Found, place: WeakPlace) -> Line | None:
                 footprints(found.rig, stations_of_lines([line], plan.altitude_m))
             )
             tied_m2 = min(float(shown.intersection(one).area) for one in both)
-            firm = tied_m2 >= least_m2
+            firm = tied_m2 >= min_m2
             rank = (firm, -line.length_m if firm else tied_m2)
             if best is None or rank > best[0]:
                 best = rank, line

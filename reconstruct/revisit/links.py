@@ -63,19 +63,19 @@ def links(views: sp.csr_array) -> sp.csr_array:
     return sp.csr_array(found)
 
 
-def pieces(linked: sp.csr_array, least: float) -> Indices:
+def pieces(linked: sp.csr_array, minimum: float) -> Indices:
     """The piece of each station, (S,), counted from the largest.
 
-    Stations are in one piece where every cut between them takes `least` tracks or more.
+    Stations are in one piece where every cut between them takes `minimum` tracks or more.
     A link of that many decides by itself; of what these leave, greatest flows decide, and each
     pair that is found to be in one piece becomes one node, which changes no lesser cut.
     """
     piece, nodes, first = np.arange(linked.shape[0]), linked, 0
     while first < nodes.shape[0]:
-        heavy = nodes.multiply(nodes >= least)
+        heavy = nodes.multiply(nodes >= minimum)
         label = _by_first(connected_components(heavy, directed=False)[1])
         piece, nodes = label[piece], _merged(nodes, label)
-        other = _firmly_linked(nodes, first, least)
+        other = _firmly_linked(nodes, first, minimum)
         if other is None:  # nodes before `first` stand apart from all others, and keep their place
             first += 1
         else:
@@ -94,14 +94,14 @@ def cut_around(linked: sp.csr_array, group: NDArray[np.bool_]) -> float:
     return float(linked[group][:, ~group].sum())
 
 
-def _firmly_linked(nodes: sp.csr_array, first: int, least: float) -> int | None:
-    """A node after the first between which and it no cut is below `least`."""
+def _firmly_linked(nodes: sp.csr_array, first: int, minimum: float) -> int | None:
+    """A node after the first between which and it no cut is below `minimum`."""
     whole = sp.csr_array((nodes * _CAPACITY).astype(np.int32))
     degree = nodes.sum(axis=0)
     for other in range(first + 1, nodes.shape[0]):
         if (
-            min(degree[first], degree[other]) >= least
-            and maximum_flow(whole, first, other).flow_value >= least * _CAPACITY
+            min(degree[first], degree[other]) >= minimum
+            and maximum_flow(whole, first, other).flow_value >= minimum * _CAPACITY
         ):
             return other
     return None

@@ -225,12 +225,12 @@ def measured(
         )
     per_point = float(np.median(linked.sum(axis=0)[tied] / shown[tied]))
     ideal = links(views_of_floor(footprints(rig, stations_of_plan(plan)), step_m)).sum(axis=0)
-    least = LOOSE_SHARE * per_point * float(ideal.min())
+    minimum = LOOSE_SHARE * per_point * float(ideal.min())
     return Found(
         plan=plan, rig=rig, pattern=pattern, pictured=pictured, linked=linked, record=record,
         seen=certificate(plan.area, rig, pictured.good, pattern, executor=executor),
-        tracks_per_point=per_point, step_m=step_m, least_tracks=least,
-        piece=pieces(linked, least), sigma_goal_m=sigma_goal_m, places=(),
+        tracks_per_point=per_point, step_m=step_m, least_tracks=minimum,
+        piece=pieces(linked, minimum), sigma_goal_m=sigma_goal_m, places=(),
     )  # fmt: skip
 
 
@@ -333,19 +333,19 @@ def _short_places(found: Found) -> list[WeakPlace]:
     short = seen.inside & ~seen.at_overlap
     reached = np.minimum(seen.least_pictures / wanted, seen.least_lines / found.pattern.passes)
     lacking_m2 = (1 - np.minimum(reached, 1.0)) * seen.grid.cell_m**2
-    for hole in find_holes(seen, most_of_patches(found, short)):
+    for hole in find_holes(seen, max_of_patches(found, short)):
         spoilt = Counter(
             fault
             for fault, shape in zip(found.pictured.faults, shapes, strict=True)
             if shape.intersects(hole.outline)
         )
-        why = ", ".join(f"{count} stations {fault}" for fault, count in spoilt.most_common())
+        why = ", ".join(f"{count} stations {fault}" for fault, count in spoilt.max_common())
         some = f"{hole.fewest_pictures} of {wanted} pictures of each camera at its thinnest"
-        least = "in no good picture" if hole.unseen_m2 == hole.area_m2 else some
+        minimum = "in no good picture" if hole.unseen_m2 == hole.area_m2 else some
         places.append(
             WeakPlace(
                 cause="overlap",
-                reason=f"{least}; {why or 'no picture was taken'}",
+                reason=f"{minimum}; {why or 'no picture was taken'}",
                 outline=hole.outline,
                 area_m2=hole.area_m2,
                 severity_m2=float(lacking_m2[cells_in(seen, hole.outline)].sum()),
@@ -360,7 +360,7 @@ def cells_in(seen: Certificate, outline: MultiPolygon) -> NDArray[np.bool_]:
     return np.asarray(within) & seen.inside
 
 
-def most_of_patches(found: Found, lacking: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def max_of_patches(found: Found, lacking: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Where most of a patch lacks something, (rows, columns): single cells are noise.
 
     Patches are as large as planned lines distinguish; parts smaller than one do not count.
@@ -369,10 +369,12 @@ def most_of_patches(found: Found, lacking: NDArray[np.bool_]) -> NDArray[np.bool
     size = max(1, round(patch_m / found.seen.grid.cell_m))
     inside = found.seen.inside.astype(np.float64)
     here = cv2.blur(lacking * inside, (size, size), borderType=cv2.BORDER_REPLICATE)
-    most = here > 0.5 * cv2.blur(inside, (size, size), borderType=cv2.BORDER_REPLICATE)
-    most &= found.seen.inside
-    _, labels, figures, _ = cv2.connectedComponentsWithStats(most.astype(np.uint8), connectivity=8)
-    large: NDArray[np.bool_] = most & (figures[labels, cv2.CC_STAT_AREA] >= size**2)
+    maximum = here > 0.5 * cv2.blur(inside, (size, size), borderType=cv2.BORDER_REPLICATE)
+    maximum &= found.seen.inside
+    _, labels, figures, _ = cv2.connectedComponentsWithStats(
+        maximum.astype(np.uint8), connectivity=8
+    )
+    large: NDArray[np.bool_] = maximum & (figures[labels, cv2.CC_STAT_AREA] >= size**2)
     return large
 
 
@@ -382,7 +384,7 @@ def _surface_places(found: Found, elevation: Elevation, shift_ne: Array) -> list
     places_en = (seen.grid.middles_ne - shift_ne).reshape(-1, 2)[:, ::-1]
     sigma = elevation.at(elevation.sigma, places_en).reshape(seen.grid.shape)
     unsure = ~(sigma <= found.sigma_goal_m)
-    weak = most_of_patches(found, unsure & seen.at_overlap)
+    weak = max_of_patches(found, unsure & seen.at_overlap)
     lacking = np.where(np.isfinite(sigma), np.maximum(0.0, 1 - found.sigma_goal_m / sigma), 1.0)
     places = []
     for hole in find_holes(seen, weak):

@@ -51,8 +51,8 @@ _FEATURES = 6000
 _RATIO = 0.8
 _AGREE_SIGMAS = 3.0
 """Depths of left and right differ by at most this many standard deviations."""
-_LEAST_SHARE = 0.02
-_MOST_VERTICES = 600_000
+_MIN_SHARE = 0.02
+_MAX_VERTICES = 600_000
 _STEEPEST = 8.0
 """Change of depth over the length of a side across the picture beyond which a side is a jump."""
 _ERROR_SIGMAS = 0.3
@@ -119,7 +119,7 @@ def reconstruct_pair(
     optics, matches = find_optics(calibrated, (left, right), near_m, far_m)
     found = dense_pair(optics, (left, right), matches, scale)
     known = np.isfinite(found.depth)
-    if known.mean() < _LEAST_SHARE:
+    if known.mean() < _MIN_SHARE:
         raise ReconstructionError(
             f"only {known.mean():.1%} of {left.name} has depth; the pair needs more light, texture "
             "or overlap"
@@ -211,7 +211,7 @@ def find_optics(
     stereo = stereo_rig(rig)
     greys = [normalise(read_colour(path)) for path in pictures]
     scale = min(1.0, 1600.0 / max(greys[0].shape))
-    features = [find_features(grey, None, scale=scale, most=_FEATURES) for grey in greys]
+    features = [find_features(grey, None, scale=scale, maximum=_FEATURES) for grey in greys]
     matches = match_descriptors(features[0].descriptors, features[1].descriptors, _RATIO)
     points = matched_points(
         stereo, (features[0].pixels[matches[:, 0]], features[1].pixels[matches[:, 1]])
@@ -392,7 +392,7 @@ def _write_cloud(path: Path, found: PairDepth) -> int:
 
 @progress.step("make the mesh")
 def depth_mesh(
-    view: View, depth: NDArray[np.float32], sigma: NDArray[np.float32], most: int
+    view: View, depth: NDArray[np.float32], sigma: NDArray[np.float32], maximum: int
 ) -> TriangleMesh:
     """Triangles between the pixels of a depth map, without those across jumps, decimated.
 
@@ -400,12 +400,12 @@ def depth_mesh(
         view: of the depth.
         depth: (H, W), NaN where unknown: holes stay holes.
         sigma: (H, W) of it: the mesh keeps within a share of its median.
-        most: triangles.
+        maximum: triangles.
 
     Raises:
         ReconstructionError: no triangle is left.
     """
-    step = max(1, int(np.ceil(np.sqrt(np.isfinite(depth).sum() / _MOST_VERTICES))))
+    step = max(1, int(np.ceil(np.sqrt(np.isfinite(depth).sum() / _MAX_VERTICES))))
     thinned = depth[::step, ::step].astype(np.float64)
     rows, columns = np.nonzero(np.isfinite(thinned))
     pixels: Array = np.column_stack([columns, rows]) * float(step) + np.array([0.5, 0.5])
@@ -428,7 +428,7 @@ def depth_mesh(
     while True:
         fewer = decimate(vertices, triangles, np.zeros(len(vertices), np.bool_), error)
         vertices, triangles = fewer.vertices, fewer.triangles
-        if len(triangles) <= most:
+        if len(triangles) <= maximum:
             break
         error *= _GROWTH
     vertices, triangles, _ = clean(vertices, triangles)

@@ -38,8 +38,8 @@ _SPLINE = 5
 _LAG_PX = 1
 """Residuals farther apart are independent: the noise of a picture as taken is white, and the spline
 between its pixels joins neighbours only."""
-_LEAST_CORRELATION = 0.5
-_LEAST_SAMPLE = 20
+_MIN_CORRELATION = 0.5
+_MIN_SAMPLE = 20
 _GROSS_SIGMAS = 5.0
 _ROUNDS = 2
 
@@ -110,7 +110,7 @@ def precise_depth(
         before, rest, after = (stack[rows, middle + k].astype(np.float64) for k in (-1, 0, 1))
         tried = _STEP_PX * np.arange(-1.0, 2.0)
     sigma_px = _sigma_px(before, rest, after, bend, weight)
-    good = inside & (bend > 0) & (likeness.max(axis=1) >= _LEAST_CORRELATION)
+    good = inside & (bend > 0) & (likeness.max(axis=1) >= _MIN_CORRELATION)
     depth = np.where(good, 1.0 / inverse, np.nan)
     sigma_px = np.where(good, sigma_px, np.nan)
     # the same across the epipolar line, where the true answer is known to be none
@@ -152,7 +152,7 @@ def inflation(found: PreciseDepth) -> float:
         ReconstructionError: too few pixels are matched.
     """
     missed = found.missed_sigmas[np.isfinite(found.missed_sigmas)]
-    if len(missed) < _LEAST_SAMPLE:
+    if len(missed) < _MIN_SAMPLE:
         raise ReconstructionError(
             f"only {len(missed)} of {len(found.depth)} sampled pixels match to a fraction of a "
             "pixel; the pair needs more light or texture"

@@ -19,8 +19,8 @@ from reconstruct.mapping.working_range import ray_passes
 from reconstruct.views.model import View
 from reconstruct.views.range_shift import range_shift
 
-_LEAST_POINTS = 50
-_LARGEST_GAP_PX = 2.0
+_MIN_POINTS = 50
+_MAX_GAP_PX = 2.0
 """Rays of a match pass each other by at most this many pixels."""
 _STEP_SIGMAS = 0.1
 """Share of a parameter's standard deviation, as the step for slopes."""
@@ -118,17 +118,17 @@ def matched_points(rig: StereoRig, pixels: tuple[Array, Array]) -> Array:
     along, gap = ray_passes(start_a, ray_a, start_b, ray_b)
     focal = rig.cameras[0].focal_in_water_px
     with np.errstate(invalid="ignore"):
-        meet = gap * focal < _LARGEST_GAP_PX * np.abs(along)
+        meet = gap * focal < _MAX_GAP_PX * np.abs(along)
         before, behind = meet & (along > 0), meet & (along < 0)
-    if behind.sum() > max(before.sum(), _LEAST_POINTS):
+    if behind.sum() > max(before.sum(), _MIN_POINTS):
         raise ReconstructionError(
             f"{int(behind.sum())} matches meet behind the cameras and {int(before.sum())} before "
             f"them: the pictures are swapped; give that of {rig.names[0]!r} first"
         )
-    if before.sum() < _LEAST_POINTS:
+    if before.sum() < _MIN_POINTS:
         raise ReconstructionError(
             f"hardly any match: {len(along)} found and {int(before.sum())} whose rays meet, "
-            f"{_LEAST_POINTS} are needed; were both pictures taken at one moment, sharp, and with "
+            f"{_MIN_POINTS} are needed; were both pictures taken at one moment, sharp, and with "
             "this rig?"
         )
     found: Array = start_a[before] + along[before, None] * ray_a[before]

@@ -202,23 +202,23 @@ def all_points(folder: Path) -> tuple[NDArray[np.int64], Array]:
 @compiled
 def _point_starts(content: NDArray[np.uint8]) -> tuple[NDArray[np.int64], int]:
     """(P,) where the entries of `points3D.bin` start, and where they end; -1 if it is too short."""
-    size, least = content.shape[0], _TRACK_LENGTH + 8
+    size, minimum = content.shape[0], _TRACK_LENGTH + 8
     if size < 8:
         return np.empty(0, np.int64), -1
     count = np.int64(0)
     for k in range(8):
         count |= np.int64(content[k]) << (8 * k)
-    if count < 0 or count > size // least:
+    if count < 0 or count > size // minimum:
         return np.empty(0, np.int64), -1
     starts, at = np.empty(count, np.int64), np.int64(8)
     for i in range(count):
-        if at + least > size:
+        if at + minimum > size:
             return starts[:i], -1
         starts[i] = at
         track = np.int64(0)
         for k in range(4):  # a longer one has no room in a file either
             track |= np.int64(content[at + _TRACK_LENGTH + k]) << (8 * k)
-        at += least + 8 * track
+        at += minimum + 8 * track
     return starts, int(at)
 
 

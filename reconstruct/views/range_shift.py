@@ -26,7 +26,7 @@ FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 _COLUMNS = 129
 """Nodes along the picture's width; fewer along its height."""
-_MOST_STEPS, _STILL_PX = 6, 0.1
+_MAX_STEPS, _STILL_PX = 6, 0.1
 """Newton's steps to a warped pixel: the error after one is the square of its length times half the
 field's curvature, below 1e-4 px after one that is shorter than this."""
 
@@ -188,7 +188,7 @@ def warped_at(
     """The warped picture's pixel of what the pinhole sees at pixel (u, v), by Newton's method."""
     x, y = u, v
     step = inverse_depth - inverse_working
-    for _ in range(0 if inverse_working == 0.0 else _MOST_STEPS):
+    for _ in range(0 if inverse_working == 0.0 else _MAX_STEPS):
         a, b, a_x, a_y, b_x, b_y = between_nodes(field, x, y)
         miss_x, miss_y = x + a * step - u, y + b * step - v
         a_x, b_y = 1.0 + a_x * step, 1.0 + b_y * step

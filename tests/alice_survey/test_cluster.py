@@ -296,7 +296,7 @@ def test_a_survey_on_a_cluster_has_the_same_bytes_whatever_is_killed(
         run = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
         for number, stage in enumerate(FOLDERS):
             assert wait_for(run, events, 0, event="stage_started", stage=stage), stage
-            wait_for(run, events, 0, longest_s=2.0, event="step_progress", stage=stage)
+            wait_for(run, events, 0, max_s=2.0, event="step_progress", stage=stage)
             kill_work(machines.workers[number % 2])
             if stage == "dense":
                 assert machines.scheduler

@@ -108,9 +108,9 @@ def test_pictures_are_halved_as_the_stages_do(mpx: float) -> None:
     assert size_of(10, mpx, ReconstructConfig(dense_scale=0.4)).refined_mpx == pytest.approx(
         0.16 * mpx
     )
-    for most in (1000, 8000):
-        reconstruct = ReconstructConfig(max_features=most)
-        scales = detection_scales((side, side), most)
+    for maximum in (1000, 8000):
+        reconstruct = ReconstructConfig(max_features=maximum)
+        scales = detection_scales((side, side), maximum)
         for known, scale in ((True, scales[0]), (False, scales[-1])):
             found = size_of(10, mpx, reconstruct, rig_known=known).feature_mpx
             assert found == pytest.approx(mpx * scale**2, rel=0.02)

@@ -12,8 +12,8 @@ import pytest
 from PIL import Image
 
 from camera_calib.picture_files import (
-    MOST_PIXELS,
-    MOST_PIXELS_JPEG,
+    MAX_PIXELS,
+    MAX_PIXELS_JPEG,
     is_cut_short,
     pixels_too_many,
     read_pixels,
@@ -53,9 +53,9 @@ def _stating(width: int, height: int) -> bytes:
 
 def test_pictures_are_not_decoded_to_more_than_a_bound(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
-    for side, most in ((10_000, 0), (12_000, MOST_PIXELS), (50_000, MOST_PIXELS_JPEG)):
+    for side, maximum in ((10_000, 0), (12_000, MAX_PIXELS), (50_000, MAX_PIXELS_JPEG)):
         path.write_bytes(_stating(side, side))
-        assert pixels_too_many(path) == most
+        assert pixels_too_many(path) == maximum
         assert read_pixels(path, cv2.IMREAD_COLOR) is None
 
 

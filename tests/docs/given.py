@@ -14,7 +14,7 @@ from tests.docs import given_divers
 from tests.docs import given_files as files
 from tests.docs.pages import DOCS, script_of
 
-LONGEST_S = 1200.0
+MAX_S = 1200.0
 TUTORIAL = "tutorial.md"
 SMALL_PX = 282
 """Width of pictures that are brought along: small, so that they are soon reconstructed."""
@@ -58,7 +58,7 @@ class Made:
             },
             capture_output=True,
             text=True,
-            timeout=LONGEST_S,
+            timeout=MAX_S,
             preexec_fn=_on_one_core,
         )
         return Run(

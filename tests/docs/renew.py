@@ -16,7 +16,7 @@ from tests.docs.given import TUTORIAL, Made
 from tests.docs.pages import DOCS
 
 Picture = NDArray[np.uint8]
-MOST_BYTES = 1_500_000
+MAX_BYTES = 1_500_000
 STATION = 14
 """One that shows the amphora."""
 GAP_PX = 12
@@ -54,7 +54,7 @@ def renew(made: Path, out: Path) -> None:
     png(out / "errors.png", read(reef / "evaluation/errors.png"))
     photograph(reef / "report/report.html", out / "report.jpg")
     size = sum(path.stat().st_size for path in out.iterdir())
-    if size > MOST_BYTES:
+    if size > MAX_BYTES:
         raise ValueError(f"{size / 1e6:.2f} MB of pictures in {out}")
 
 

@@ -114,8 +114,8 @@ def read_board(path: Path) -> object:
 
 def _pixels(channels: int, kind: type) -> Any:
     shape = (_SIZE[1], _SIZE[0], channels) if channels > 1 else (_SIZE[1], _SIZE[0])
-    most = np.iinfo(kind).max
-    return np.random.default_rng(3).integers(0, most, shape, endpoint=True).astype(kind)
+    maximum = np.iinfo(kind).max
+    return np.random.default_rng(3).integers(0, maximum, shape, endpoint=True).astype(kind)
 
 
 def picture(path: Path, mode: str = "RGB", **more: Any) -> Path:

@@ -21,9 +21,9 @@ from typing import Any, Literal
 
 from alice_survey.core.errors import AliceError
 
-LONGEST_S = 10.0
-MOST_BYTES = 1 << 30
-LONGEST_MESSAGE = 20_000
+MAX_S = 10.0
+MAX_BYTES = 1 << 30
+MAX_MESSAGE = 20_000
 _ROOMS = ("alice_survey", "camera_calib", "missions", "reconstruct")
 _CHECKOUT = Path(__file__).resolve().parents[2]
 _NAME = re.compile(r"[\w.]+(?<!\.)")
@@ -95,15 +95,15 @@ def judge(
     path: Path,
     sandbox: Sandbox,
     *,
-    most_bytes: int = MOST_BYTES,
-    longest_s: float = LONGEST_S,
+    max_bytes: int = MAX_BYTES,
+    max_s: float = MAX_S,
 ) -> Verdict:
     """Let a reader read a file of the sandbox, and judge what it did."""
     started, before = time.monotonic(), _resident()
     outcome: Literal["value", "refused", "fault"] = "value"
     message = trace = place = ""
     try:
-        with sandbox.entered(), bounded(longest_s), warnings.catch_warnings():
+        with sandbox.entered(), bounded(max_s), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             read(path)
     except AliceError as error:
@@ -117,10 +117,10 @@ def judge(
     fault = _misworded(message, sandbox) if outcome == "refused" else ""
     if fault:
         trace, outcome, message = message, "fault", f"{fault} in {place}"
-    if outcome != "fault" and took_s > longest_s:
-        outcome, message = "fault", f"took over {longest_s:g} s"
-    if outcome != "fault" and peak > most_bytes:
-        outcome, message = "fault", f"took over {most_bytes >> 20} MiB"
+    if outcome != "fault" and took_s > max_s:
+        outcome, message = "fault", f"took over {max_s:g} s"
+    if outcome != "fault" and peak > max_bytes:
+        outcome, message = "fault", f"took over {max_bytes >> 20} MiB"
     strays = sandbox.written()
     if strays:
         names = ", ".join(os.path.relpath(p, sandbox.root) for p in strays)
@@ -129,19 +129,19 @@ def judge(
 
 
 @contextlib.contextmanager
-def bounded(longest_s: float) -> Iterator[None]:
+def bounded(max_s: float) -> Iterator[None]:
     """Less memory than there is, and an alarm.
 
     The alarm cannot stop a library's own loop.
     """
 
     def ring(_: int, __: FrameType | None) -> Any:
-        raise TooSlow(f"took over {longest_s:g} s")
+        raise TooSlow(f"took over {max_s:g} s")
 
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     before = signal.signal(signal.SIGALRM, ring)
     resource.setrlimit(resource.RLIMIT_AS, (_address_space() + _ROOM_TO_ALLOCATE, hard))
-    signal.setitimer(signal.ITIMER_REAL, longest_s)
+    signal.setitimer(signal.ITIMER_REAL, max_s)
     try:
         yield
     finally:
@@ -154,8 +154,8 @@ def _misworded(message: str, sandbox: Sandbox) -> str:
     """What is wrong with the wording of a refusal."""
     if len(message.splitlines()) > 1 or "\x1b" in message:
         return "message of several lines"
-    if len(message) > LONGEST_MESSAGE:
-        return f"message of over {LONGEST_MESSAGE} characters"
+    if len(message) > MAX_MESSAGE:
+        return f"message of over {MAX_MESSAGE} characters"
     if not sandbox.names & set(_NAME.findall(message)):
         return "message that names no file"
     return ""

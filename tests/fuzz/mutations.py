@@ -13,7 +13,7 @@ from random import Random
 from typing import Any, Literal
 
 Syntax = Literal["json", "toml", "csv", "text", "binary"]
-MOST_BYTES = 1_000_000
+MAX_BYTES = 1_000_000
 
 _WORDS = (
     "nan", "NaN", "-nan", "inf", "-inf", "Infinity", "1e308", "-1e308", "1e999", "-1", "0", "-0.0",
@@ -36,12 +36,12 @@ _SIZES = (0, 1, 2, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xF
 
 
 def mutate(data: bytes, syntax: Syntax, rng: Random) -> bytes:
-    """A damaged copy of a file, of at most `MOST_BYTES`."""
+    """A damaged copy of a file, of at most `MAX_BYTES`."""
     known = _OF_SYNTAX[syntax]
     for _ in range(rng.randint(1, 4)):
         general = syntax != "binary" and rng.random() < 0.15
         data = rng.choice(_BYTES if general else known)(data, rng)
-    return data[:MOST_BYTES]
+    return data[:MAX_BYTES]
 
 
 def nested(depth: int) -> Any:

@@ -375,7 +375,7 @@ def test_rasters_that_name_other_files_are_not_followed(sandbox: Sandbox, source
 def test_bags_whose_chunks_swell(
     sandbox: Sandbox, tmp_path: Path, packed: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bag_reader, "LARGEST_BYTES", 8 << 20)
+    monkeypatch.setattr(bag_reader, "MAX_BYTES", 8 << 20)
     path = logs.swelling_bag(tmp_path, packed, 10 << 20)
     data = path.read_bytes()
     assert len(data) < 100_000

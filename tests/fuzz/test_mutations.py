@@ -70,8 +70,8 @@ def test_the_judge_sees_each_kind_of_fault(read: object, fault: str, tmp_path: P
         read,  # type: ignore[arg-type]
         sandbox.inside / "file",
         sandbox,
-        most_bytes=200 << 20,
-        longest_s=2.0,
+        max_bytes=200 << 20,
+        max_s=2.0,
     )
     assert verdict.outcome == "fault"
     assert fault in verdict.message

@@ -13,7 +13,7 @@ from alice_survey.app.cli.main import app
 from alice_survey.core.config import load_config
 from alice_survey.core.errors import AliceError
 from tests.fuzz import areas
-from tests.fuzz.judge import LONGEST_S, Sandbox, bounded, judge
+from tests.fuzz.judge import MAX_S, Sandbox, bounded, judge
 from tests.fuzz.workspace import read_and_check_survey
 
 pytestmark = pytest.mark.slow
@@ -52,7 +52,7 @@ def loaded(tmp_path_factory: pytest.TempPathFactory) -> None:
 def test_odd_numbers_of_options_are_used_or_refused(words: tuple[str, ...], tmp_path: Path) -> None:
     for number in ODD:
         where = ["-w", str(tmp_path)] if words[0] == "plan" else []
-        with bounded(LONGEST_S):
+        with bounded(MAX_S):
             done = CliRunner().invoke(app, [*words, number, *where])
         error = done.exception
         assert error is None or isinstance(error, SystemExit | AliceError), (number, repr(error))
@@ -104,5 +104,5 @@ def test_what_is_no_file_is_refused_at_once(
         os.mkfifo(path)
     else:
         path.symlink_to("/dev/zero")
-    verdict = judge(read, path, sandbox, longest_s=5.0)
+    verdict = judge(read, path, sandbox, max_s=5.0)
     assert verdict.outcome == "refused", verdict.message

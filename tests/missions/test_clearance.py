@@ -17,7 +17,7 @@ from missions.values.flight import Flight
 from missions.values.plan_file import Plan
 from tests.missions.flown_plans import flown, planned
 
-LEAST_M = 1.0
+MIN_M = 1.0
 """Half the altitude of 2 m."""
 DEPTH_M = 12.0
 HULL = vehicle_from("alice").hull
@@ -58,11 +58,11 @@ def fly(floor: FloorGrid, *silent_s: tuple[float, float]) -> Flight:
 def true_clearance_m(flight: Flight, floor: FloorGrid) -> float:
     """Least height of a point of the hull, the port or the DVL above the floor below it."""
     turn = Rotation.from_quat(flight.flown.truth[::4, 3:7])
-    least = math.inf
+    minimum = math.inf
     for place in (*HULL.profile_body_m, (0.55, -0.05, 0.08), (-0.4145, 0.0, 0.11)):
         points = flight.flown.truth[::4, :3] + turn.apply(place)
-        least = min(least, *(floor_depth(floor, n, e) - d for n, e, d in points))
-    return float(least)
+        minimum = min(minimum, *(floor_depth(floor, n, e) - d for n, e, d in points))
+    return float(minimum)
 
 
 @pytest.mark.parametrize("angle_deg", [20.0, 30.0])
@@ -70,7 +70,7 @@ def test_slopes_are_flown_up_and_down_at_the_planned_altitude(angle_deg: float) 
     floor = slope(angle_deg)
     flight = fly(floor)
     assert flight.ending == "complete"
-    assert true_clearance_m(flight, floor) > 0.8 * LEAST_M
+    assert true_clearance_m(flight, floor) > 0.8 * MIN_M
     columns = flight.flown.navigation
     believed, sigma = columns[:, 12], columns[:, 19]
     true = np.array([floor_depth(floor, n, e) - d for n, e, d in flight.glass_ned])
@@ -78,14 +78,14 @@ def test_slopes_are_flown_up_and_down_at_the_planned_altitude(angle_deg: float) 
     off = (believed - true)[on_line]
     assert np.sqrt(np.mean(off**2)) < 0.1
     assert 0.5 < np.sqrt(np.mean((off / sigma[on_line]) ** 2)) < 1.5
-    assert columns[on_line, -1].min() > 0.8 * LEAST_M
+    assert columns[on_line, -1].min() > 0.8 * MIN_M
 
 
 @pytest.mark.parametrize("start_s", [75.0, 90.0])
 def test_a_silence_on_the_way_up_a_slope_stops_the_vehicle(start_s: float) -> None:
     floor = slope(20.0)
     flight = fly(floor, (start_s, start_s + 15.0))
-    assert true_clearance_m(flight, floor) > 0.8 * LEAST_M
+    assert true_clearance_m(flight, floor) > 0.8 * MIN_M
     assert flight.ending == "complete"
 
 
@@ -94,7 +94,7 @@ def test_a_silent_dive_stops_above_the_planned_floor_whatever_lies_elsewhere() -
     flight = fly(floor, (-1.0, 80.0))
     silent = flight.flown.time_s < 80.0
     assert DEPTH_M - 3.5 < flight.flown.truth[silent, 2].max() < DEPTH_M - 2.7
-    assert true_clearance_m(flight, floor) > LEAST_M
+    assert true_clearance_m(flight, floor) > MIN_M
     assert flight.ending == "complete"
 
 
@@ -102,8 +102,8 @@ def test_a_silent_dive_stops_above_the_planned_floor_whatever_lies_elsewhere() -
 def test_a_step_is_climbed_or_given_up_in_time(step_m: float) -> None:
     floor = ground(lambda north: np.where(north > 3.0, DEPTH_M - step_m, DEPTH_M))
     flight = fly(floor)
-    assert true_clearance_m(flight, floor) > 0.25 * LEAST_M
-    if step_m < LEAST_M:
+    assert true_clearance_m(flight, floor) > 0.25 * MIN_M
+    if step_m < MIN_M:
         assert flight.ending == "complete"
     else:
         assert flight.ending in ("complete", f"aborted: {REASONS[TOO_LOW]}")

@@ -97,7 +97,7 @@ def test_all_meet_the_same_gusts(small: Plan) -> None:
         fresh = np.random.default_rng(5)
         mission_setup(small, settings, level_floor(6.0), 300.0, fresh)
         chance = np.random.default_rng(6)
-        ticks = len(simulate(setup, chance, longest_s=5.0, label="", sea_rng=water).time_s)
+        ticks = len(simulate(setup, chance, max_s=5.0, label="", sea_rng=water).time_s)
         fresh.standard_normal(6 * ticks)
         assert water.standard_normal() == fresh.standard_normal()
         left.append(water.standard_normal())

@@ -24,7 +24,7 @@ from missions.fly.flight_route import (
     stations_of_dives,
     whole_route,
 )
-from missions.fly.simulation import longest_mission_s
+from missions.fly.simulation import max_mission_s
 from missions.values.flight import Flight
 from tests.missions.flown_plans import flown, plan_of, walk
 
@@ -83,7 +83,7 @@ def test_one_dive_is_the_plan_with_that_dive_alone() -> None:
     assert second.lines == PLAN.lines
     assert (stations_of_dives(second), stations_of_dives(PLAN)) == (6, 18)
     assert second.duration_s == PLAN.dives[1].duration_s
-    assert longest_mission_s(second) < longest_mission_s(PLAN)
+    assert max_mission_s(second) < max_mission_s(PLAN)
     assert one_dive(PLAN, None) is PLAN
 
 

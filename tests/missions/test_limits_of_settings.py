@@ -19,7 +19,7 @@ from missions.plan.strength import survey_costs
 SECTIONS = ("camera", "water", "plan", "vehicle", "sea", "imaging")
 _TINY = 1e-300
 _LARGEST = 1e300
-_LONGEST_NUMBER = re.compile(r"\d{19}|\b(?:nan|inf)\b")
+_MAX_NUMBER = re.compile(r"\d{19}|\b(?:nan|inf)\b")
 
 
 def numbers() -> list[tuple[str, str, type]]:
@@ -72,7 +72,7 @@ def test_a_number_at_its_limit_is_used_or_refused_in_a_line(
         except AliceError as error:
             said = str(error)
             assert len(said.split("; ways out")[0].splitlines()) == 1
-        odd = _LONGEST_NUMBER.search(said)
+        odd = _MAX_NUMBER.search(said)
         assert not odd, f"{value}: {said[max(0, odd.start() - 100) : odd.end() + 100]}"
 
 

@@ -10,7 +10,7 @@ from alice_survey.core.config import SurveyConfig, parse_config
 from alice_survey.core.errors import PlanError, VehicleError
 from alice_survey.sim.vehicle.pilot.gains import STEADY_SHARE
 from alice_survey.sim.vehicle.pilot.memory import ABORT, PHASE
-from alice_survey.sim.vehicle.under_way import least_radius_m, least_speed_mps
+from alice_survey.sim.vehicle.under_way import min_radius_m, min_speed_mps
 from missions.exposure.ways_out import ConflictError
 from missions.fly.flight_records import true_log
 from missions.fly.flight_route import path_of, roomier_side
@@ -44,10 +44,10 @@ def test_a_survey_is_planned_with_turns_that_it_holds_and_flown_on_its_lines() -
     plan = planned(config)
     craft = craft_of(config.vehicle)
     legs = [leg for dive in plan.dives for leg in dive.route.legs]
-    least_m = least_radius_m(craft, 1.0, STEADY_SHARE)
+    min_m = min_radius_m(craft, 1.0, STEADY_SHARE)
     curved = [abs(leg.curvature_per_m) for leg in legs if leg.curvature_per_m != 0.0]
-    assert curved and max(curved) <= 1.0 / least_m
-    assert 1.0 < plan.turn_radius_m / least_m < 1.5
+    assert curved and max(curved) <= 1.0 / min_m
+    assert 1.0 < plan.turn_radius_m / min_m < 1.5
     assert not any(leg.turn_rad or leg.side_rad for leg in legs)
     assert plan.coverage > 0.999
 
@@ -121,8 +121,8 @@ def test_a_speed_below_the_lowest_is_refused_with_one_that_does() -> None:
     speeds = [way.settings.get("plan.speed_mps") for way in found.value.ways]
     tried = [speed for speed in speeds if speed is not None]
     assert tried
-    least = least_speed_mps(craft_of(config.vehicle), STEADY_SHARE)
-    assert all(speed > least for speed in tried)
+    minimum = min_speed_mps(craft_of(config.vehicle), STEADY_SHARE)
+    assert all(speed > minimum for speed in tried)
     faster = survey({"speed_mps": tried[0]})
     assert planned(faster).coverage > 0.999
 

@@ -87,9 +87,11 @@ def test_every_point_is_there_once(name: str, tmp_path: Path):
         assert reader.header.point_count == reader.header.number_of_points_by_return[0]
         (sigma,) = reader.header.vlrs.get("ExtraBytesVlr")[0].extra_bytes_structs
         assert not (sigma.min_is_relevant() or sigma.max_is_relevant())
-        for least, most, axis in zip(reader.header.mins, reader.header.maxs, "XYZ", strict=True):
+        for minimum, maximum, axis in zip(
+            reader.header.mins, reader.header.maxs, "XYZ", strict=True
+        ):
             at = written[axis] * STEP_M + OFFSET_M["XYZ".index(axis)]
-            assert (least, most) == pytest.approx((at.min(), at.max()), abs=1e-9)
+            assert (minimum, maximum) == pytest.approx((at.min(), at.max()), abs=1e-9)
 
 
 def test_a_long_strip_is_found_by_bounds(strip: tuple[Path, np.ndarray]):

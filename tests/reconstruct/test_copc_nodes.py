@@ -72,7 +72,7 @@ def test_a_node_is_what_laspy_finds_in_its_cube(deep: Path) -> None:
             assert np.isin(ours.sigmas, np.asarray(theirs["sigma"])).all()
 
 
-def in_pages(path: Path, most: int) -> Path:
+def in_pages(path: Path, maximum: int) -> Path:
     """A copy whose hierarchy is in pages of a few entries, each named by the one before."""
     nodes = read_nodes(path)
     rows = [
@@ -80,10 +80,10 @@ def in_pages(path: Path, most: int) -> Path:
         for e in nodes.entries
     ]
     data, page = path.read_bytes(), b""
-    for start in range((len(rows) - 1) // most * most, -1, -most):
-        further = [(*rows[start + most][:4], len(data), len(page), -1)] if page else []
+    for start in range((len(rows) - 1) // maximum * maximum, -1, -maximum):
+        further = [(*rows[start + maximum][:4], len(data), len(page), -1)] if page else []
         data += page
-        page = b"".join(ENTRY.pack(*row) for row in [*rows[start : start + most], *further])
+        page = b"".join(ENTRY.pack(*row) for row in [*rows[start : start + maximum], *further])
     at = data.index(struct.pack("<d", nodes.spacing), 375) + 8
     copy = path.with_name("pages.copc.laz")
     copy.write_bytes(data[:at] + struct.pack("<2Q", len(data), len(page)) + data[at + 16 :] + page)
@@ -97,10 +97,10 @@ def test_a_hierarchy_of_many_pages_is_read_whole(deep: Path) -> None:
 
 def test_what_is_too_large_is_refused(deep: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     nodes = read_nodes(deep)
-    monkeypatch.setattr(copc_nodes, "_MOST_POINTS", int(nodes.entries["count"].max()) - 1)
+    monkeypatch.setattr(copc_nodes, "_MAX_POINTS", int(nodes.entries["count"].max()) - 1)
     with pytest.raises(ReconstructionError, match="at most"):
         read_node(nodes, int(nodes.entries["count"].argmax()))
-    monkeypatch.setattr(copc_nodes, "_MOST_NODES", len(nodes.entries) - 1)
+    monkeypatch.setattr(copc_nodes, "_MAX_NODES", len(nodes.entries) - 1)
     with pytest.raises(ReconstructionError, match="too many to show"):
         read_nodes(deep)
 

@@ -110,7 +110,7 @@ def test_preview_is_white_where_nothing_is_known(tmp_path):
     values = heights()
     values[:, 300:] = np.nan
     write(tmp_path / "dem.tif", values=values)
-    preview_dem(tmp_path / "dem.tif", tmp_path / "dem.png", longest_px=210)
+    preview_dem(tmp_path / "dem.tif", tmp_path / "dem.png", max_px=210)
     picture = cv2.imread(str(tmp_path / "dem.png"))
     assert picture.shape == (150, 210, 3)
     assert (picture[:, 155:] == 255).all()

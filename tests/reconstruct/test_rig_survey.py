@@ -24,10 +24,10 @@ LINES = 2
 NAMES = ("wide", "tele", "bow", "side")
 
 
-def check(found: RigScore, pictures: int, most_px: float) -> None:
+def check(found: RigScore, pictures: int, max_px: float) -> None:
     """Errors in ground pixels; a camera mounted 0.1 deg off puts them off by a whole one."""
     assert found.cameras.registered == found.cameras.total == pictures
-    assert 0.005 < found.cameras.rms_m / found.pixel_m < most_px
+    assert 0.005 < found.cameras.rms_m / found.pixel_m < max_px
     assert abs(found.cameras.scale_error) < 5e-4
     assert np.rad2deg(found.cameras.truth_from_world.rotation.magnitude()) < 3.0
     surface = found.surface

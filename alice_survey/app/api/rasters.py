@@ -111,12 +111,12 @@ class Mosaic(_Placed):
         )
 
 
-def read_dem(workspace: str | Path, most_cells: int = 4000) -> Dem:
+def read_dem(workspace: str | Path, max_cells: int = 4000) -> Dem:
     """Read the surface of a reconstructed workspace.
 
     Args:
         workspace: its folder.
-        most_cells: rows and columns at most; a larger raster is averaged by blocks.
+        max_cells: rows and columns at most; a larger raster is averaged by blocks.
 
     Raises:
         WorkspaceError: there is no surface, or its file is damaged.
@@ -127,17 +127,17 @@ def read_dem(workspace: str | Path, most_cells: int = 4000) -> Dem:
         True
     """
     folder = Path(workspace) / "dense"
-    height, place = _read(folder / "dem.tif", [1], most_cells)
-    sigma, _ = _read(folder / "sigma.tif", [1], most_cells)
+    height, place = _read(folder / "dem.tif", [1], max_cells)
+    sigma, _ = _read(folder / "sigma.tif", [1], max_cells)
     return Dem(height=height[0].astype(float), sigma=sigma[0].astype(float), **place)
 
 
-def read_mosaic(workspace: str | Path, most_pixels: int = 4000) -> Mosaic:
+def read_mosaic(workspace: str | Path, max_pixels: int = 4000) -> Mosaic:
     """Read the mosaic of a reconstructed workspace.
 
     Args:
         workspace: its folder.
-        most_pixels: rows and columns at most; a larger raster is averaged by blocks.
+        max_pixels: rows and columns at most; a larger raster is averaged by blocks.
 
     Raises:
         WorkspaceError: there is no mosaic, or its file is damaged.
@@ -147,14 +147,14 @@ def read_mosaic(workspace: str | Path, most_pixels: int = 4000) -> Mosaic:
         >>> alice.read_mosaic("small", most_pixels=100).rgba.dtype
         dtype('uint8')
     """
-    bands, place = _read(Path(workspace) / "mosaic" / "mosaic.tif", [1, 2, 3, 4], most_pixels)
+    bands, place = _read(Path(workspace) / "mosaic" / "mosaic.tif", [1, 2, 3, 4], max_pixels)
     return Mosaic(rgba=np.ascontiguousarray(bands.transpose(1, 2, 0)), **place)
 
 
-def _read(path: Path, bands: list[int], most: int) -> tuple[Any, dict[str, Any]]:
+def _read(path: Path, bands: list[int], maximum: int) -> tuple[Any, dict[str, Any]]:
     """Bands (B, rows, columns), and where they lie."""
     with opened_raster(path) as raster:
-        shrink = max(1, math.ceil(max(raster.height, raster.width) / most))
+        shrink = max(1, math.ceil(max(raster.height, raster.width) / maximum))
         shape = max(1, raster.height // shrink), max(1, raster.width // shrink)
         # Whole blocks only, so that cells stay square: less than one at the south and east edges.
         window = Window(0, 0, shape[1] * shrink, shape[0] * shrink)

@@ -131,7 +131,7 @@ def simulate(
     if not ros:
         raise typer.BadParameter("give --ros: there is no other way to reach the vehicle yet")
     pace = Pace(
-        rate=rate, longest_s=math.inf if longest is None else longest, patience_s=patience
+        rate=rate, max_s=math.inf if longest is None else longest, patience_s=patience
     )  # fmt: skip
     result = simulate_report(
         workspace, settings(workspace, survey, needed=True), takes=takes, pace=pace, track=track

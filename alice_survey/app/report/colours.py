@@ -129,8 +129,8 @@ def _from_zero(values: Array) -> tuple[float, float]:
 
 
 def _around_zero(values: Array) -> tuple[float, float]:
-    most = even_limit(values)
-    return -most, most
+    maximum = even_limit(values)
+    return -maximum, maximum
 
 
 def _whole(values: Array) -> tuple[float, float]:
@@ -173,21 +173,21 @@ def known_values(raster: Any, window: Window) -> Array:
 
 
 def read_shrunk(
-    path: Path, bands: list[int], most_px: float, resampling: Resampling = Resampling.average
+    path: Path, bands: list[int], max_px: float, resampling: Resampling = Resampling.average
 ) -> tuple[Array, Array, Affine]:
     """A raster, shrunk to about so many pixels at most.
 
     Args:
         path: its file.
         bands: their numbers.
-        most_px: most pixels of one band.
+        max_px: most pixels of one band.
         resampling: how pixels are merged.
 
     Returns:
         (B, H, W) masked values, (H, W) opacity from 0 to 255, and the transform of a pixel.
     """
     with rasterio.open(path) as raster:
-        shrink = max(1.0, float(np.sqrt(raster.height * raster.width / most_px)))
+        shrink = max(1.0, float(np.sqrt(raster.height * raster.width / max_px)))
         shape = max(1, round(raster.height / shrink)), max(1, round(raster.width / shrink))
         values: Array = raster.read(
             bands, out_shape=(len(bands), *shape), resampling=resampling, masked=True

@@ -21,11 +21,11 @@ from alice_survey.kit.document import Figure, Mesh
 from alice_survey.kit.figure import shrunk_png
 from alice_survey.kit.words import count
 
-_MOST_TRIANGLES = 250_000
-_MOST_TEXTURE_PX = 3072
-_MOST_CELLS = 90_000
+_MAX_TRIANGLES = 250_000
+_MAX_TEXTURE_PX = 3072
+_MAX_CELLS = 90_000
 _QUALITY = 80
-_MOST_STILL_PX = 1600
+_MAX_STILL_PX = 1600
 
 
 @progress.step("thin the mesh")
@@ -34,7 +34,7 @@ def mesh_copy(held: Held, glb: Path) -> Mesh | None:
     mesh = held.read(MeshRecord)
     if mesh is None:
         return None
-    whole = mesh.triangles <= _MOST_TRIANGLES
+    whole = mesh.triangles <= _MAX_TRIANGLES
     if not whole and not held.has("mosaic"):
         return None
     offset = np.array(mesh.offset_east_north_up)
@@ -47,10 +47,10 @@ def mesh_copy(held: Held, glb: Path) -> Mesh | None:
     )
 
 
-def mesh_still(picture: Path, most_px: int = _MOST_STILL_PX) -> Figure:
+def mesh_still(picture: Path, max_px: int = _MAX_STILL_PX) -> Figure:
     """Image of the mesh for print."""
     return Figure(
-        png=shrunk_png(picture, most_px),
+        png=shrunk_png(picture, max_px),
         title="Mesh",
         alt="The mesh seen from above and from the side",
         shows="The mesh from above and from the side.",
@@ -60,7 +60,7 @@ def mesh_still(picture: Path, most_px: int = _MOST_STILL_PX) -> Figure:
 def mesh_about(mesh: MeshRecord) -> str:
     """Description of the light copy."""
     triangles = mesh.triangles
-    if triangles <= _MOST_TRIANGLES:
+    if triangles <= _MAX_TRIANGLES:
         return f"{count(triangles, 'triangle')}, texture shrunk for the page."
     return (
         f"The elevation model under the mosaic, since the mesh's {triangles:,} triangles are "
@@ -79,7 +79,7 @@ def _shrunk(path: Path) -> Any:
         if material.baseColorTexture is None:
             continue
         picture = material.baseColorTexture.convert("RGB")
-        shrink = max(picture.size) / _MOST_TEXTURE_PX
+        shrink = max(picture.size) / _MAX_TEXTURE_PX
         if shrink > 1.0:
             size = tuple(max(1, round(side / shrink)) for side in picture.size)
             picture = picture.resize(size, Image.Resampling.LANCZOS)
@@ -92,14 +92,14 @@ def _relief(held: Held, offset: Array) -> Any:
     import trimesh
     from PIL import Image
 
-    (heights,), _, cell = read_shrunk(held.workspace / "dense" / "dem.tif", [1], _MOST_CELLS)
+    (heights,), _, cell = read_shrunk(held.workspace / "dense" / "dem.tif", [1], _MAX_CELLS)
     rows, columns = heights.shape
     east = cell.c + cell.a * (np.arange(columns) + 0.5)
     north = cell.f + cell.e * (np.arange(rows) + 0.5)
     points, faces, used = grid_mesh(east, north, heights.astype(np.float64).filled(np.nan))
     points -= offset[[0, 2, 1]] * [1.0, 1.0, -1.0]
     with rasterio.open(held.workspace / "mosaic" / "mosaic.tif") as raster:
-        shrink = max(1.0, max(raster.width, raster.height) / _MOST_TEXTURE_PX)
+        shrink = max(1.0, max(raster.width, raster.height) / _MAX_TEXTURE_PX)
         size = (max(1, round(raster.height / shrink)), max(1, round(raster.width / shrink)))
         bands = raster.read([1, 2, 3], out_shape=(3, *size), resampling=Resampling.average)
         over = raster.bounds

@@ -110,8 +110,8 @@ def heights(figures: Figures) -> Figure | None:
 
     def paint(axes: Sequence[Any]) -> None:
         shown = factor * values
-        most = float(np.percentile(shown, 99))
-        axes[0].hist(shown, bins=60, range=(0, most), color=INKS[0])
+        maximum = float(np.percentile(shown, 99))
+        axes[0].hist(shown, bins=60, range=(0, maximum), color=INKS[0])
         axes[0].axvline(float(np.median(shown)), color=INKS[1], label="median")
         axes[0].set(xlabel=f"stated sigma of a height, {label}", ylabel="cells", yticks=[])
         axes[0].legend()
@@ -156,7 +156,7 @@ def sigma_test(figures: Figures) -> Figure | None:
     )
 
 
-_MOST_SHIFT, _LEAST_SPREAD, _MOST_SPREAD = 0.25, 0.8, 1.25
+_MAX_SHIFT, _MIN_SPREAD, _MAX_SPREAD = 0.25, 0.8, 1.25
 
 
 def ratio_words(ratio: Array) -> str:
@@ -168,9 +168,9 @@ def ratio_words(ratio: Array) -> str:
     middle = float(np.median(ratio))
     spread = 1.4826 * float(np.median(np.abs(ratio - middle)))
     found = []
-    if abs(middle) > _MOST_SHIFT:
+    if abs(middle) > _MAX_SHIFT:
         found.append(f"shifted by {middle:+.2f} sigma")
-    if not _LEAST_SPREAD <= spread <= _MOST_SPREAD:
+    if not _MIN_SPREAD <= spread <= _MAX_SPREAD:
         than = "wider" if spread > 1 else "narrower"
         found.append(f"{than} than stated ({spread:.2f} sigma, one expected)")
     within = [share(float((np.abs(ratio) <= sigmas).mean())) for sigmas in (1, 2)]
@@ -186,13 +186,13 @@ def seen_by(figures: Figures) -> Figure | None:
     values = sampled(figures.held, "dense/stations.tif", counts=True)
     if values is None or not len(values):
         return None
-    most = int(np.percentile(values, 99.5))
-    counts = np.bincount(np.minimum(values.astype(np.int64), most), minlength=most + 1)
+    maximum = int(np.percentile(values, 99.5))
+    counts = np.bincount(np.minimum(values.astype(np.int64), maximum), minlength=maximum + 1)
     percent = 100 * counts / len(values)
 
     def paint(axes: Sequence[Any]) -> None:
-        inks = [INKS[1] if n < 3 else INKS[0] for n in range(1, most + 1)]
-        axes[0].bar(range(1, most + 1), percent[1:], color=inks)
+        inks = [INKS[1] if n < 3 else INKS[0] for n in range(1, maximum + 1)]
+        axes[0].bar(range(1, maximum + 1), percent[1:], color=inks)
         axes[0].set(xlabel="stations that see a spot", ylabel="% of the surface")
 
     return drawn(

@@ -28,9 +28,9 @@ from alice_survey.app.report.held import Held
 from alice_survey.kit.document import PictureLayer, Scale
 from reconstruct.measure.surface import is_of_surface
 
-_MOST_PAINTED_PX = 24_000_000
+_MAX_PAINTED_PX = 24_000_000
 """Pixels of the mosaic in a page: about 5 MB."""
-_MOST_COLOURED_PX = 2_000_000
+_MAX_COLOURED_PX = 2_000_000
 """Pixels of a layer that shows numbers."""
 
 
@@ -47,11 +47,11 @@ def picture_layers(held: Held) -> Iterator[PictureLayer]:
             first = False
 
 
-def mosaic_layer(path: Path, most_px: int = _MOST_PAINTED_PX) -> PictureLayer:
+def mosaic_layer(path: Path, max_px: int = _MAX_PAINTED_PX) -> PictureLayer:
     """The mosaic; what no picture saw is transparent."""
     with rasterio.open(path) as raster:
         full = raster.transform.a
-    bands, opacity, transform = read_shrunk(path, [1, 2, 3], most_px)
+    bands, opacity, transform = read_shrunk(path, [1, 2, 3], max_px)
     picture = np.dstack([*np.ma.getdata(bands), np.where(opacity > 0, 255, 0)]).astype(np.uint8)
     shrunk = "" if transform.a == full else f" Shrunk {transform.a / full:.1f} times."
     return _layer(
@@ -63,7 +63,7 @@ def mosaic_layer(path: Path, most_px: int = _MOST_PAINTED_PX) -> PictureLayer:
 def _number_layer(path: Path, numbers: Numbers, *, shown: bool) -> PictureLayer:
     with rasterio.open(path) as raster:
         limits = limits_of(raster, numbers)
-    (values,), _, transform = read_shrunk(path, [1], _MOST_COLOURED_PX)
+    (values,), _, transform = read_shrunk(path, [1], _MAX_COLOURED_PX)
     level = numbers.levels(values.astype(np.float64).filled(np.nan))
     return _layer(
         coloured(level, numbers, limits, transform.a), transform,

@@ -43,7 +43,7 @@ from camera_calib.camera import camera_from_json
 from camera_calib.rig import Rig, read_rig
 from missions.values.plan_file import Plan
 
-_MOST_LOST = 20
+_MAX_LOST = 20
 """Pictures that are not in the model, of which more are only counted."""
 
 
@@ -339,9 +339,9 @@ def _model(figures: Figures, found: RegistrationRecord) -> Section:
     tables = [Table(title="Model", header=("what", "value"), rows=rows)]
     if lost:
         shown = [(row["image"], row["reason"], row["placed_by"] or "not placed") for row in lost]
-        if len(shown) > _MOST_LOST:
-            rest = f"{len(shown) - _MOST_LOST} more in sparse/unregistered.csv"
-            shown = [*shown[:_MOST_LOST], (rest, "", "")]
+        if len(shown) > _MAX_LOST:
+            rest = f"{len(shown) - _MAX_LOST} more in sparse/unregistered.csv"
+            shown = [*shown[:_MAX_LOST], (rest, "", "")]
         tables.append(
             Table(title="Pictures not in the model", header=("picture", "why", "placed by"),
                   rows=shown)

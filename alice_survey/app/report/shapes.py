@@ -15,9 +15,9 @@ from reconstruct.views.model import datum_of
 
 _BLUE, _ORANGE, _GREEN, _RED, _BLACK = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#333333"
 """Okabe and Ito's palette, safe for the colour-blind."""
-_MOST_VERTICES = 4000
+_MAX_VERTICES = 4000
 """Most points of a track on the map."""
-_MOST_OUTLINES, _MOST_POINTS = 4000, 20_000
+_MAX_OUTLINES, _MAX_POINTS = 4000, 20_000
 """Most shapes on the map: some 4 MB of the page each."""
 
 Shape = Sequence[tuple[float, float]]
@@ -37,7 +37,7 @@ def shape_layers(held: Held) -> Iterator[ShapeLayer]:
             shapes=[_pairs(np.array(part.exterior.coords)) for part in area.geoms],
             colour=_BLACK, dashed=True,
         )  # fmt: skip
-    footprints, every = thinned(list(_footprints(held)), _MOST_OUTLINES)
+    footprints, every = thinned(list(_footprints(held)), _MAX_OUTLINES)
     if footprints:
         yield ShapeLayer(
             name="footprints", title="Footprints", kind="polygon", colour=_GREEN, shown=False,
@@ -57,19 +57,19 @@ def shape_layers(held: Held) -> Iterator[ShapeLayer]:
     flown = held.rows("flight/truth/track.csv")
     if flown:
         places = np.array([[number(row, "east_m"), number(row, "north_m")] for row in flown])
-        step = max(1, len(places) // _MOST_VERTICES)
+        step = max(1, len(places) // _MAX_VERTICES)
         yield ShapeLayer(
             name="flown", title="Flown", about="Where the vehicle really was (simulated).",
             kind="line", shapes=[_pairs(places[::step])], colour=_ORANGE,
         )  # fmt: skip
-    cameras, every = thinned(_cameras(held), _MOST_POINTS)
+    cameras, every = thinned(_cameras(held), _MAX_POINTS)
     if cameras:
         yield ShapeLayer(
             name="cameras", title="Cameras", kind="point", colour=_BLUE, shown=not flown,
             about=f"Where pictures were taken, from the model{every}.",
             shapes=[place for place, _ in cameras], texts=[text for _, text in cameras],
         )  # fmt: skip
-    lost, every = thinned(_lost(held), _MOST_POINTS)
+    lost, every = thinned(_lost(held), _MAX_POINTS)
     if lost:
         yield ShapeLayer(
             name="lost", title="Lost pictures", kind="point", colour=_RED,
@@ -86,10 +86,10 @@ def camera_place(row: Mapping[str, str]) -> Array:
 
 
 def thinned(
-    shapes: Sequence[tuple[Shape, str]], most: int
+    shapes: Sequence[tuple[Shape, str]], maximum: int
 ) -> tuple[Sequence[tuple[Shape, str]], str]:
     """At most this many shapes, evenly taken, and words on what was left out."""
-    step = -(-len(shapes) // most)
+    step = -(-len(shapes) // maximum)
     return (shapes, "") if step <= 1 else (shapes[::step], f"; one of {step} is shown")
 
 

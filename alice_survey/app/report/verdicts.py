@@ -27,9 +27,9 @@ _SURE_SIGMAS = 3.0
 """Sigmas from which a difference is significant."""
 _HONEST = (0.7, 1.4)
 """Errors over stated sigmas, root mean square, that are neither too large nor too small."""
-_LEAST_COVERED, _WELL_COVERED = 0.9, 0.99
-_LEAST_REGISTERED = 0.9
-_LEAST_STATIONS = 3.0
+_MIN_COVERED, _WELL_COVERED = 0.9, 0.99
+_MIN_REGISTERED = 0.9
+_MIN_STATIONS = 3.0
 """Stations that must see a spot, so that more than one pair checks its height."""
 _NAMED = 4
 
@@ -118,7 +118,7 @@ def _registration(figures: Figures) -> Iterator[Verdict]:
         "Fly with more overlap where pictures were lost (see the map), or with more light if they "
         "are dark.",
         good=whole,
-        bad=registered < _LEAST_REGISTERED * total,
+        bad=registered < _MIN_REGISTERED * total,
     )
     mapping, found = figures.mapping, figures.registration
     for joint in () if found is None else found.joints:
@@ -200,7 +200,7 @@ def _surface(figures: Figures) -> Iterator[Verdict]:
             "Fly the holes again: the map shows them, and 'alice-survey plan check' writes a plan "
             "for them.",
             good=surface.covered >= _WELL_COVERED,
-            bad=surface.covered < _LEAST_COVERED,
+            bad=surface.covered < _MIN_COVERED,
         )
     if math.isfinite(surface.sigma_median):
         text = (
@@ -213,7 +213,7 @@ def _surface(figures: Figures) -> Iterator[Verdict]:
             "Fly lower or with more overlap for better heights.",
             good=fine,
         )
-    if surface.stations_median < _LEAST_STATIONS:
+    if surface.stations_median < _MIN_STATIONS:
         yield Verdict(
             level="look",
             text=f"most spots are seen from {surface.stations_median:.0f} stations only, so that "
@@ -292,7 +292,7 @@ def _control(figures: Figures) -> Iterator[Verdict]:
         )
 
 
-_MOST_ACTIONS = 2
+_MAX_ACTIONS = 2
 
 
 def summary(figures: Figures, found: Sequence[Verdict]) -> Mapping[str, str]:
@@ -390,7 +390,7 @@ def _next(figures: Figures, found: Sequence[Verdict]) -> str:
     if not actions:
         actions = list(dict.fromkeys(v.action for v in found if v.level == "look" and v.action))
     if actions:
-        return " ".join(actions[:_MOST_ACTIONS])
+        return " ".join(actions[:_MAX_ACTIONS])
     if figures.surface is None:
         return "Make the model: 'alice-survey reconstruct'." if figures.total else "Take pictures."
     return "Nothing has to be done again: use the files below."

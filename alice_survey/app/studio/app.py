@@ -41,7 +41,7 @@ _KEEP = "private, max-age=86400, immutable"
 """Cache policy of requests that state a version."""
 _BODY_S = 30.0
 """Time for the body of a request to arrive."""
-_MOST_STREAMS = 100
+_MAX_STREAMS = 100
 _STUDIO_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:{}; "
     "connect-src 'self'; frame-src 'self'; base-uri 'none'; form-action 'none'"
@@ -76,9 +76,9 @@ def _route(studio: Studio, endpoint: Endpoint) -> Route:
         body = b""
         if endpoint.method == "POST":
             size = int(request.headers["Content-Length"])
-            if size > endpoint.most_bytes:
+            if size > endpoint.max_bytes:
                 return _fault(
-                    413, f"{size:,} bytes: at most {endpoint.most_bytes:,} are taken", close=True
+                    413, f"{size:,} bytes: at most {endpoint.max_bytes:,} are taken", close=True
                 )
             try:
                 body = await asyncio.wait_for(request.body(), _BODY_S)
@@ -134,8 +134,8 @@ def _events(studio: Studio) -> Callable[[Request], Awaitable[Response]]:
 
     async def answer(request: Request) -> Response:
         nonlocal open_now
-        if open_now >= _MOST_STREAMS:
-            return line(503, f"{_MOST_STREAMS} pages are open: close some")
+        if open_now >= _MAX_STREAMS:
+            return line(503, f"{_MAX_STREAMS} pages are open: close some")
 
         async def counted() -> AsyncIterator[str]:
             nonlocal open_now

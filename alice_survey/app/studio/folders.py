@@ -13,8 +13,8 @@ from pathlib import Path
 from alice_survey.core.errors import AliceError, why
 from reconstruct.pictures.files import VIDEO, kind_of
 
-_MOST_FOLDERS = 500
-_MOST_ENTRIES = 20_000
+_MAX_FOLDERS = 500
+_MAX_ENTRIES = 20_000
 _CHOSEN = (".csv", ".json")
 """Endings of files that a person may choose next to their pictures."""
 
@@ -74,7 +74,7 @@ class Folders:
         above = real.parent
         try:
             with os.scandir(real) as entries:
-                seen = [entry for entry in islice(entries, _MOST_ENTRIES) if _is_shown(entry)]
+                seen = [entry for entry in islice(entries, _MAX_ENTRIES) if _is_shown(entry)]
         except OSError as error:
             raise AliceError(f"{real}: cannot be listed: {why(error)}") from None
         seen.sort(key=lambda entry: entry.name.lower())
@@ -83,7 +83,7 @@ class Folders:
         return Listing(
             here=_counted(real),
             above=str(above) if above != real and self._may_list(above) else None,
-            inside=[_counted(one) for one in inside[:_MOST_FOLDERS]],
+            inside=[_counted(one) for one in inside[:_MAX_FOLDERS]],
             files=[e.path for e in files if Path(e.name).suffix.lower() in _CHOSEN],
         )
 
@@ -102,7 +102,7 @@ def _counted(folder: Path) -> Folder:
         with os.scandir(folder) as entries:
             for entry in entries:
                 entries_n += 1
-                if entries_n > _MOST_ENTRIES:
+                if entries_n > _MAX_ENTRIES:
                     break
                 if not _is_shown(entry):
                     continue
@@ -116,5 +116,5 @@ def _counted(folder: Path) -> Folder:
         pass
     return Folder(
         path=str(folder), name=folder.name or str(folder), pictures=pictures, videos=videos,
-        folders=folders, more=entries_n > _MOST_ENTRIES,
+        folders=folders, more=entries_n > _MAX_ENTRIES,
     )  # fmt: skip

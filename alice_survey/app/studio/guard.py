@@ -14,7 +14,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from alice_survey.app.studio.files import INERT, POLICY
 
-_LONGEST_HEAD = 32 << 10
+_MAX_HEAD = 32 << 10
 _ALLOWED = ("GET", "HEAD")
 _COMMON = {
     "X-Content-Type-Options": "nosniff",
@@ -62,8 +62,8 @@ class Guard:
         hosts = headers.getlist("Host")
         if scope["http_version"] not in ("1.0", "1.1"):
             return line(505, "HTTP 1.1 alone is spoken")
-        if sum(map(len, itertools.chain(*scope["headers"]))) > _LONGEST_HEAD:
-            return line(431, f"more than {_LONGEST_HEAD} bytes of headers", Connection="close")
+        if sum(map(len, itertools.chain(*scope["headers"]))) > _MAX_HEAD:
+            return line(431, f"more than {_MAX_HEAD} bytes of headers", Connection="close")
         if len(hosts) != 1:
             return line(400, f"{len(hosts)} Host headers, 1 expected")
         host = hosts[0].strip().lower()

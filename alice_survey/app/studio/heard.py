@@ -11,7 +11,7 @@ from alice_survey.core.run.events import Event, described
 KEPT_LINES = 2000
 _KEPT_WARNINGS = 100
 _LOGGED_EVERY_S = 30.0
-_LONGEST_LINE = 4000
+_MAX_LINE = 4000
 _CHUNK = 1 << 20
 _KINDS = {"warning": "warning", "error": "error"}
 
@@ -99,7 +99,7 @@ class Heard:
             {
                 "time_utc": str(event.get("time_utc", "")),
                 "kind": _KINDS.get(str(event.get("event")), "note"),
-                "text": text[:_LONGEST_LINE],
+                "text": text[:_MAX_LINE],
             }
         )
         self.lines_n += 1

@@ -47,7 +47,7 @@ from reconstruct.measure.surface import is_of_surface
 
 _KEPT_TILES = 1000
 _KEPT_PYRAMIDS = 12
-_MOST_RENDERERS = 4
+_MAX_RENDERERS = 4
 _ENDING_S = 3.0
 """Time to wait at the end for tiles in work."""
 _DAMAGES = (RasterioError, IndexError, MemoryError)
@@ -204,8 +204,8 @@ class Layers:
         self._workspace, self.chart, self._address = workspace, chart, address
         self._overlays = {one.name: one for one in overlays}
         self._files = {name: one.file for name, one in self._overlays.items()} or FILES
-        self._most_renderers = min(_MOST_RENDERERS, os.cpu_count() or 1)
-        self._renderers = threading.BoundedSemaphore(self._most_renderers)
+        self._max_renderers = min(_MAX_RENDERERS, os.cpu_count() or 1)
+        self._renderers = threading.BoundedSemaphore(self._max_renderers)
         # By the token of the file, so that a changed raster is read again.
         self._pyramid = lru_cache(_KEPT_PYRAMIDS)(self._read_pyramid)
         self._tile = lru_cache(_KEPT_TILES)(self._read_tile)
@@ -277,8 +277,8 @@ class Layers:
 
     def close(self) -> None:
         """Wait briefly for the tiles in work."""
-        for _ in range(self._most_renderers):
-            self._renderers.acquire(timeout=_ENDING_S / self._most_renderers)
+        for _ in range(self._max_renderers):
+            self._renderers.acquire(timeout=_ENDING_S / self._max_renderers)
 
     @contextmanager
     def _unchanged(self, name: str, token: str | None) -> Iterator[str]:

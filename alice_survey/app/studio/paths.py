@@ -18,9 +18,9 @@ from alice_survey.core.stages import LOOSE_FOLDERS, STAGES
 PRODUCTS = (*(stage.folder for stage in STAGES), *LOOSE_FOLDERS, "check", "revisit")
 """Folders that are shown."""
 _LOOSE_FILES = ("survey.toml",)
-_LONGEST_PATH = 2000
-_LONGEST_NAME = 255
-_MOST_LISTED = 20_000
+_MAX_PATH = 2000
+_MAX_NAME = 255
+_MAX_LISTED = 20_000
 _ESCAPE = re.compile(r"%(?![0-9A-Fa-f]{2})")
 _UNFINISHED = (".partial", ".replaced")
 
@@ -47,8 +47,8 @@ def names_of(path: str) -> tuple[str, ...]:
     Raises:
         RefusedError: it climbs, is absolute, or has a name that no product has.
     """
-    if len(path) > _LONGEST_PATH:
-        raise RefusedError(f"a path of {len(path)} characters: at most {_LONGEST_PATH} are taken")
+    if len(path) > _MAX_PATH:
+        raise RefusedError(f"a path of {len(path)} characters: at most {_MAX_PATH} are taken")
     if _ESCAPE.search(path):
         raise RefusedError("a percent sign without two digits of base 16")
     try:
@@ -134,7 +134,7 @@ class Workspace:
                 ),
                 key=lambda entry: (not entry.is_folder, entry.name),
             )
-        return found[:_MOST_LISTED], max(0, len(found) - _MOST_LISTED)
+        return found[:_MAX_LISTED], max(0, len(found) - _MAX_LISTED)
 
     def state(self, paths: Sequence[str]) -> tuple[str, ...]:
         """Tokens of all finished stages and of some files, empty where there is none."""
@@ -181,5 +181,5 @@ def _may_be_named(name: str) -> bool:
         and "\\" not in name
         and not name.startswith(".")
         and not name.endswith(_UNFINISHED)
-        and 0 < len(name.encode()) <= _LONGEST_NAME
+        and 0 < len(name.encode()) <= _MAX_NAME
     )

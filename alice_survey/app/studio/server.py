@@ -36,7 +36,7 @@ _ANSWER_S = 900.0
 """Time to take an answer in: ten gigabytes by a slow disk."""
 _ENDING_S = 3
 """Time to wait at the end for answers in work."""
-_MOST_CONNECTIONS = 400
+_MAX_CONNECTIONS = 400
 
 
 class _TimedConnection(H11Protocol):
@@ -120,7 +120,7 @@ class Server:
                 log_config=None,
                 access_log=False,
                 server_header=False,
-                limit_concurrency=_MOST_CONNECTIONS,
+                limit_concurrency=_MAX_CONNECTIONS,
                 timeout_keep_alive=int(_ASK_S),
                 timeout_graceful_shutdown=_ENDING_S,
             )

@@ -14,7 +14,7 @@ from alice_survey.core.manifest import ImageRecord, read_manifest
 from reconstruct.pictures.undistorted import Colour, read_colour
 
 TILE_PX = 512
-_MOST_BYTES = 500_000_000
+_MAX_BYTES = 500_000_000
 """Of decoded pictures that are kept; the last one is, whatever its size."""
 _QUALITY = 95
 _GREY = np.array([0.114, 0.587, 0.299])
@@ -78,7 +78,7 @@ class TakenPictures:
             pixels = read_colour(self.path(name))
             with self._lock:
                 self._kept[key] = pixels
-                while len(self._kept) > 1 and self._bytes() > _MOST_BYTES:
+                while len(self._kept) > 1 and self._bytes() > _MAX_BYTES:
                     self._kept.popitem(last=False)
                 self._decoding.pop(key, None)
         return pixels

@@ -55,7 +55,7 @@ _MEMORY = "MEMORY"
 """Resource of workers that Dask's documentation gives that name, in bytes."""
 
 
-def most_in_flight(workers: int) -> int:
+def max_in_flight(workers: int) -> int:
     """Tasks sent whose results are not taken: enough that a long one holds few others back."""
     return 32 + 4 * workers
 
@@ -143,7 +143,7 @@ class ClusterExecutor(Executor):
         task_mib: float,
     ) -> Iterator[TaskResult[Result]]:
         tasks = _Tasks(self.cluster, label, task_mib)
-        yield from in_order(tasks, function, items, tasks.most_queued)
+        yield from in_order(tasks, function, items, tasks.max_queued)
 
 
 class Cluster:
@@ -320,14 +320,14 @@ class _Tasks:
     def __init__(self, cluster: Cluster, label: str, task_mib: float) -> None:
         self.cluster = cluster
         self.label = label
-        self.longest_s = 0.0
+        self.max_s = 0.0
         self._memory = task_mib * 2**20
         self._function: Any = None
         self._packed: bytes | str = b""
 
-    def most_queued(self) -> int:
+    def max_queued(self) -> int:
         """How many tasks may be in flight."""
-        return most_in_flight(len(self.cluster.fit()))
+        return max_in_flight(len(self.cluster.fit()))
 
     def submit(self, function: Callable[..., Any], /, *args: Any) -> "_Submitted":
         """Send a task to the scheduler."""
@@ -355,10 +355,10 @@ class _Tasks:
         fit = cluster.fit()
         large = {a: w for a, w in fit.items() if not 0 < w["memory_limit"] < self._memory}
         if fit and not large:
-            most = max(about["memory_limit"] for about in fit.values())
+            maximum = max(about["memory_limit"] for about in fit.values())
             raise AliceError(
                 f"{self.label!r} takes {self._memory / 2**20:.0f} MiB a task, and no worker has "
-                f"more than {most / 2**20:.0f} MiB: start fewer workers on each machine"
+                f"more than {maximum / 2**20:.0f} MiB: start fewer workers on each machine"
             )
         allowed = set(large) if cluster.is_any_unfit or len(large) < len(fit) else set()
         if allowed:
@@ -413,7 +413,7 @@ class _Submitted:
                 self._send()
                 continue
             cluster.forget(self._number)
-            self._tasks.longest_s = max(self._tasks.longest_s, answer.took_s)
+            self._tasks.max_s = max(self._tasks.max_s, answer.took_s)
             value = pickle.loads(answer.data)  # noqa: S301 (its own)
             if answer.failed:
                 raise value
@@ -480,11 +480,11 @@ class _Submitted:
         if begun is None or begun[1] not in cluster.fit():
             return
         took_s = time.monotonic() - begun[0]
-        if took_s > max(_PATIENCE_S, _TIMES_LONGEST * tasks.longest_s):
+        if took_s > max(_PATIENCE_S, _TIMES_LONGEST * tasks.max_s):
             cluster.retire(
                 begun[1],
                 f"it hangs, {took_s:.0f} s in a task of {tasks.label!r}, others took "
-                f"{tasks.longest_s:.0f} s at most",
+                f"{tasks.max_s:.0f} s at most",
             )
 
     def _recheck(self, address: str) -> str:

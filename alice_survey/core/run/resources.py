@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _EVERY_S = 1.0
 _REPORTED_EVERY_S = 5.0
-_LARGEST_SHARE = 0.01
+_MAX_SHARE = 0.01
 """Of a core's time, for reading."""
 _PACKAGES = {
     "alice-survey": "alice-survey",
@@ -113,7 +113,7 @@ def watched(meter: Meter, report: Callable[[Spent], None]) -> Iterator[None]:
             began_s = time.thread_time()
             spent = meter.look()
             since_s += wait_s
-            wait_s = max(_EVERY_S, (time.thread_time() - began_s) / _LARGEST_SHARE)
+            wait_s = max(_EVERY_S, (time.thread_time() - began_s) / _MAX_SHARE)
             if since_s >= _REPORTED_EVERY_S:
                 since_s = 0.0
                 report(spent)
@@ -169,18 +169,18 @@ def release_memory() -> None:
             trim(0)
 
 
-def user_lock(name: str, longest_wait_s: float = -1.0) -> FileLock:
+def user_lock(name: str, max_wait_s: float = -1.0) -> FileLock:
     """A lock that all processes of a user on this machine share; it is in no folder of a network.
 
     Args:
         name: of what is locked.
-        longest_wait_s: for another process, after which `filelock.Timeout` is raised; below 0
+        max_wait_s: for another process, after which `filelock.Timeout` is raised; below 0
             there is no end.
     """
     user = os.getuid() if hasattr(os, "getuid") else 0
     folder = Path(gettempdir()) / f"alice-survey-locks-{user}"
     folder.mkdir(mode=0o700, exist_ok=True)
-    return FileLock(folder / f"{name}.lock", timeout=longest_wait_s)
+    return FileLock(folder / f"{name}.lock", timeout=max_wait_s)
 
 
 @cache

@@ -64,7 +64,7 @@ def _built(camera: Camera, rng: np.random.Generator) -> Camera:
     skew = 1.0 + rng.uniform(-1e-4, 1e-4)
     centre = rng.uniform(-CENTRE_TOLERANCE_PX, CENTRE_TOLERANCE_PX, 2)
     port = _shifted(camera, camera.port.places, PORT_TOLERANCE_M, rng)
-    port = {name: max(value, camera.port.least(name)) for name, value in port.items()}
+    port = {name: max(value, camera.port.minimum(name)) for name, value in port.items()}
     terms = {name: rng.uniform(*ends) for name, ends in _DISTORTION[camera.lens.model].items()}
     return camera.with_parameters(
         {

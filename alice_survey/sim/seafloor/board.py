@@ -19,7 +19,7 @@ from camera_calib.rig import Rig
 
 Floats = NDArray[np.float32]
 
-NEAREST_M, FARTHEST_M = 0.7, 2.0
+NEAREST_M, MAX_M = 0.7, 2.0
 STEEPEST_RAD = math.radians(35.0)
 _WHITE, _BLACK, _TILE = 0.75, 0.04, 0.30
 _WALL_M = 3.5
@@ -86,8 +86,8 @@ def _pool_pose(
         # As near as the board fits at the place aimed at, or up to twice as far; later tries draw
         # back, and towards the middle.
         ease = attempt / _TRIES
-        near = NEAREST_M + ease * (FARTHEST_M - NEAREST_M)
-        distance_m = 1.0 / rng.uniform(1.0 / min(2.0 * near, FARTHEST_M), 1.0 / near)
+        near = NEAREST_M + ease * (MAX_M - NEAREST_M)
+        distance_m = 1.0 / rng.uniform(1.0 / min(2.0 * near, MAX_M), 1.0 / near)
         tilt = STEEPEST_RAD * math.sqrt(rng.uniform(0.05, 1.0)) * (1.0 - 0.5 * ease)
         towards = 2.399963 * view + rng.uniform(-0.5, 0.5)
         spin = rng.uniform(-0.5, 0.5) + (math.pi / 2.0 if view % 4 == 3 else 0.0)
@@ -102,7 +102,7 @@ def _pool_pose(
     raise CalibrationError(
         f"pool view {view + 1} of {views}: a board of {board.columns} x {board.rows} corners of "
         f"{board.square_m * 1e3:.0f} mm fits into no picture of both cameras between {NEAREST_M} "
-        f"and {FARTHEST_M} m: check focal_mm and baseline_m"
+        f"and {MAX_M} m: check focal_mm and baseline_m"
     )
 
 

@@ -13,7 +13,7 @@ from alice_survey.core.frames import Array
 
 _RIPPLE_LENGTH_M = 0.16
 _RIPPLE_HEIGHT_M = 0.012
-_SMALLEST_ROCK_M = 0.07
+_MIN_ROCK_M = 0.07
 _FILLET_M = 0.006
 """Approximate radius with which sand rounds the foot of a rock."""
 _EDGE = 0.05
@@ -102,7 +102,7 @@ def scatter_rocks(
     """
     south, north, west, east = bounds_ne_m
     count = rng.poisson(rocks_per_m2 * (north - south) * (east - west))
-    smallest_m = min(_SMALLEST_ROCK_M, 0.5 * largest_m)
+    smallest_m = min(_MIN_ROCK_M, 0.5 * largest_m)
     rocks = []
     for _ in range(count):
         place = rng.uniform((south, west), (north, east))

@@ -30,7 +30,7 @@ DETRITUS, SAND, ROCK, CERAMIC = -1.0, 0.0, 1.0, 2.0
 ripples, or of rock)."""
 
 _FORMAT = {"format": "alice-survey terrain", "version": 1}
-_MOST_VERTICES = 60_000_000
+_MAX_VERTICES = 60_000_000
 _SEED_STREAM = 3100
 _PLY_VERTEX = np.dtype([("xyz", "<f4", 3), ("material", "<f4")])
 _PLY_FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
@@ -334,10 +334,10 @@ def build_terrain(
     south, north, west, east = bounds_ne_m
     grid_m = config.grid_m
     rows, columns = (int(np.ceil(d / grid_m)) + 1 for d in (north - south, east - west))
-    if rows * columns > _MOST_VERTICES:
+    if rows * columns > _MAX_VERTICES:
         raise ConfigError(
             f"seafloor.grid_m = {grid_m}: {rows} x {columns} points over {north - south:.0f} x "
-            f"{east - west:.0f} m are more than {_MOST_VERTICES / 1e6:.0f} million; "
+            f"{east - west:.0f} m are more than {_MAX_VERTICES / 1e6:.0f} million; "
             "raise it or survey a smaller area"
         )
     if min(rows, columns) < 4:

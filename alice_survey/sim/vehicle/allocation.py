@@ -68,7 +68,7 @@ LEVEL_WEIGHTS: Array = np.array([1.0, 3.0, 30.0, 30.0, 30.0, 10.0])
 """The same where thrusters hold roll and pitch: a vehicle that tips over steers no more."""
 LEVEL_WEIGHTS.setflags(write=False)
 
-_MOST_EXPONENT = 9.0
+_MAX_EXPONENT = 9.0
 
 
 @kernel
@@ -84,7 +84,7 @@ def preference_weights(propulsion: Propulsion, u: float, weights: Array) -> None
     """
     t = propulsion.table
     for i in range(t.shape[0]):
-        weights[i] = math.exp(min(t[i, DISTRUST] * u * u, _MOST_EXPONENT))
+        weights[i] = math.exp(min(t[i, DISTRUST] * u * u, _MAX_EXPONENT))
 
 
 _X, _B, _LOW, _HIGH, _STEP, _SCALE, _REST, _PRICE, _Y = range(9)
@@ -142,16 +142,16 @@ def allocate_exact(
                 a[m, i] = axes[axis] * matrix[axis, i] * scale[i]
             m += 1
     limit = 10 * n + 10
-    solved = _least_miss(m, n, scratch, limit)
+    solved = _min_miss(m, n, scratch, limit)
     if solved > 1:
-        solved = _least_norm(m, n, scratch, solved, limit)
+        solved = _min_norm(m, n, scratch, solved, limit)
     for i in range(n):
         thrust[i] = min(max(x[i] * scale[i], lower[i]), upper[i])
     return solved
 
 
 @kernel
-def _least_miss(m: int, n: int, scratch: AllocationScratch, limit: int) -> int:
+def _min_miss(m: int, n: int, scratch: AllocationScratch, limit: int) -> int:
     """Bring x, (n,), to a least |a x - b| within the bounds; return the number of problems solved.
 
     It is 1 if x is of least norm too, as when no bound is in the way. Afterwards thrusters are
@@ -215,7 +215,7 @@ def _least_miss(m: int, n: int, scratch: AllocationScratch, limit: int) -> int:
 
 
 @kernel
-def _least_norm(m: int, n: int, scratch: AllocationScratch, solved: int, limit: int) -> int:
+def _min_norm(m: int, n: int, scratch: AllocationScratch, solved: int, limit: int) -> int:
     """Bring x, (n,), to the least |x| with the same a x within the bounds.
 
     Returns:

@@ -59,7 +59,7 @@ _MERIT = 0.07 / 0.4566**1.5
 in water at rest (k_t 0.4566, k_q 0.0700; T. I. Fossen's MSS toolbox, remus100): 0.227. Where no
 torque of a propeller is known: inferred to be as good as that one, both ways. Momentum theory asks
 for 0.090 at least; Stonefish's k_q of 0.01 for a k_t of 0.698 is 0.017."""
-_MOST_FAULTS = 3
+_MAX_FAULTS = 3
 """Faults of a file that one message names."""
 _NEEDED_FOR_SPEEDS = ("diameter_m", "kt_forward", "kt_reverse", "time_constant_s")
 _NEEDED_TO_FLY = (*_NEEDED_FOR_SPEEDS, "most_rps")
@@ -320,6 +320,6 @@ def validated(path: Path, kind: type[_Kind], table: object) -> _Kind:
     except ValidationError as error:
         faults = [
             f"{shown('.'.join(map(str, fault['loc']))) or 'the table'}: {fault['msg']}"
-            for fault in error.errors()[:_MOST_FAULTS]
+            for fault in error.errors()[:_MAX_FAULTS]
         ]
         raise VehicleError(f"{path}: {'; '.join(faults)}") from None

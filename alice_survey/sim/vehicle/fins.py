@@ -114,7 +114,7 @@ DRIVE = 15
 """Index of the drive that turns it."""
 SURFACE_COLUMNS = 16
 # Columns of `Fins.drives`.
-MOST_RAD, MOST_RAD_S, LAG_RATE = 0, 1, 2
+MAX_RAD, MAX_RAD_S, LAG_RATE = 0, 1, 2
 """Greatest angle, rad, either way, and rate, rad/s; 1 / lag, 1/s."""
 
 
@@ -247,8 +247,8 @@ def add_fin_rates(fins: Fins, angles: Array, commands: Array, out: Array) -> Non
     """
     d = fins.drives
     for j in range(d.shape[0]):
-        most, fastest = d[j, MOST_RAD], d[j, MOST_RAD_S]
-        rate = (min(max(commands[j], -most), most) - angles[j]) * d[j, LAG_RATE]
+        maximum, fastest = d[j, MAX_RAD], d[j, MAX_RAD_S]
+        rate = (min(max(commands[j], -maximum), maximum) - angles[j]) * d[j, LAG_RATE]
         out[j] = min(max(rate, -fastest), fastest)
 
 

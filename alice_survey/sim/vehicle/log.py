@@ -179,7 +179,7 @@ def log_of_columns(columns: Mapping[str, Array], source: str) -> VehicleLog:
     )  # fmt: skip
 
 
-def longest_step_s(time_s: Array) -> float:
+def max_step_s(time_s: Array) -> float:
     """The longest step between times, (T,), that is not a gap; 0 of one time."""
     steps = np.diff(time_s)
     return _GAP_STEPS * float(np.median(steps)) if len(steps) else 0.0
@@ -187,7 +187,7 @@ def longest_step_s(time_s: Array) -> float:
 
 def segments(log: VehicleLog) -> list[slice]:
     """Cut a log where its times have gaps; together the stretches hold every row."""
-    gaps = np.flatnonzero(np.diff(log.time_s) > longest_step_s(log.time_s))
+    gaps = np.flatnonzero(np.diff(log.time_s) > max_step_s(log.time_s))
     cuts = [0, *(gaps + 1).tolist(), len(log.time_s)]
     return [slice(a, b) for a, b in itertools.pairwise(cuts)]
 

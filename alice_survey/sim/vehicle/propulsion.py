@@ -112,10 +112,10 @@ class Thruster:
             ("forward", self.kt_forward, self.kq_forward),
             ("reverse", self.kt_reverse, self.kq_reverse),
         ):
-            least = _least_torque(kt)
-            if 0 < kq < least:
+            minimum = _min_torque(kt)
+            if 0 < kq < minimum:
                 raise VehicleError(
-                    f"k_q {kq:g} of thruster {self.name!r} {way} is less than {least:.4g}: with "
+                    f"k_q {kq:g} of thruster {self.name!r} {way} is less than {minimum:.4g}: with "
                     f"k_t {kt:g} it would take less power than the jet carries away"
                 )
 
@@ -126,7 +126,7 @@ class Thruster:
             )
 
 
-def _least_torque(kt: float) -> float:
+def _min_torque(kt: float) -> float:
     """The least k_q that momentum theory allows at k_t in water at rest.
 
     The jet of a thruster in a duct or tunnel leaves at the full area and carries
@@ -317,8 +317,8 @@ def add_speed_rates(propulsion: Propulsion, rps: Array, command_rps: Array, out:
         asked = command_rps[i]
         if abs(asked) < t[i, DEAD_BAND]:
             asked = 0.0
-        most = t[i, MOST]
-        out[i] = (min(max(asked, -most), most) - rps[i]) * t[i, RATE]
+        maximum = t[i, MOST]
+        out[i] = (min(max(asked, -maximum), maximum) - rps[i]) * t[i, RATE]
 
 
 @kernel
@@ -346,9 +346,9 @@ def thrust_limits(
     """
     t = propulsion.table
     for i in range(t.shape[0]):
-        most = t[i, MOST] * math.sqrt(health[i])
-        lower[i] = min(_net_thrust(t, i, -most, nu), 0.0)
-        upper[i] = max(_net_thrust(t, i, most, nu), 0.0)
+        maximum = t[i, MOST] * math.sqrt(health[i])
+        lower[i] = min(_net_thrust(t, i, -maximum, nu), 0.0)
+        upper[i] = max(_net_thrust(t, i, maximum, nu), 0.0)
 
 
 @kernel

@@ -220,7 +220,7 @@ def simulate(
     setup: Setup,
     rng: np.random.Generator,
     *,
-    longest_s: float,
+    max_s: float,
     label: str,
     expected_s: float | None = None,
     sea_rng: np.random.Generator | None = None,
@@ -230,7 +230,7 @@ def simulate(
     Args:
         setup: the mission.
         rng: source of all noise.
-        longest_s: the mission ends at this time at the latest.
+        max_s: the mission ends at this time at the latest.
         label: text of the progress bar; there is none if it is empty.
         expected_s: how long the mission will take, for that bar.
         sea_rng: source of the gusts, six numbers a tick, so that vehicles can be flown in the same
@@ -243,9 +243,9 @@ def simulate(
 
     note_compiling(_fly_ticks, "the vehicle's model, once: this takes about a minute")
     chunks: list[TickRows] = []
-    total = math.ceil((expected_s or longest_s) / TICK_S / _CHUNK_TICKS)
+    total = math.ceil((expected_s or max_s) / TICK_S / _CHUNK_TICKS)
     found: list[FoundFailure] = []
-    flying = _chunks(setup, rng, sea_rng or rng, longest_s, found)
+    flying = _chunks(setup, rng, sea_rng or rng, max_s, found)
     for chunk in progress(flying, label, total) if label else flying:
         chunks.append(chunk)  # noqa: PERF402  the bar takes an iterator
     rows = TickRows(*(np.concatenate(parts) for parts in zip(*chunks, strict=True)))
@@ -261,7 +261,7 @@ def _chunks(
     setup: Setup,
     rng: np.random.Generator,
     sea_rng: np.random.Generator,
-    longest_s: float,
+    max_s: float,
     found: list[FoundFailure],
 ) -> Iterator[TickRows]:
     """Rows of a minute each at most, until the mission is over; adds failures that are found."""
@@ -277,15 +277,15 @@ def _chunks(
         exact_allocation=setup.exact_allocation, believed=setup.believed, known_health=known,
         without=setup.without, tick_s=TICK_S,
     )  # fmt: skip
-    thrusters, last, first = len(setup.vehicle.thrusters), math.ceil(longest_s / TICK_S), 0
-    most = _CHUNK_TICKS if setup.without is None else _WATCHED_TICKS
+    thrusters, last, first = len(setup.vehicle.thrusters), math.ceil(max_s / TICK_S), 0
+    maximum = _CHUNK_TICKS if setup.without is None else _WATCHED_TICKS
     waiting = sorted(setup.failures, key=lambda failure: failure.time_s)
     while first < last:
         while waiting and round(waiting[0].time_s / TICK_S) <= first:
             (pushing if waiting[0].turns else left)[waiting[0].thruster] = waiting[0].left
             afloat.weaken(left, pushing)
             del waiting[0]
-        end = min(first + most, last)
+        end = min(first + maximum, last)
         if waiting:
             end = min(end, round(waiting[0].time_s / TICK_S))
         rows = _new_rows(end - first, thrusters, setup.vehicle.actuators)

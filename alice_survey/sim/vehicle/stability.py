@@ -12,7 +12,7 @@ from alice_survey.sim.vehicle.pilot.linear import (
 from alice_survey.sim.vehicle.vehicle import Vehicle
 
 _VERTICAL = [2, 4]
-_MOST_MPS = 5.0
+_MAX_MPS = 5.0
 _STEP_MPS = 0.02
 _GROWS_PER_S = 1e-6
 """Growth beyond rounding errors."""
@@ -56,7 +56,7 @@ def pitch_divergence_speed_mps(vehicle: Vehicle) -> float:
     high = _STEP_MPS
     while not grows(high):
         high += _STEP_MPS
-        if high > _MOST_MPS:
+        if high > _MAX_MPS:
             return math.inf
     low = high - _STEP_MPS
     while high - low > 1e-6:

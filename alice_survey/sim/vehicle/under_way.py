@@ -15,10 +15,10 @@ import numpy as np
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.dynamics import add_coriolis, add_damping, add_weight
-from alice_survey.sim.vehicle.fins import MOST_RAD, add_fins, write_fin_matrix
+from alice_survey.sim.vehicle.fins import MAX_RAD, add_fins, write_fin_matrix
 from alice_survey.sim.vehicle.vehicle import Vehicle
 
-MOST_DRIFT_RAD = math.radians(10.0)
+MAX_DRIFT_RAD = math.radians(10.0)
 """Greatest angle of the hull to the flow in steady flight, up to about which the laws of body lift
 hold (Hoerner 1975, chapter 19)."""
 _SPEEDS_MPS = (0.05, 10.0)
@@ -93,20 +93,20 @@ def keeps(vehicle: Vehicle, speed_mps: float, turn_rad_s: float = 0.0) -> FinFli
         pitch_rad=float(pitch),
         angles_rad=angles,
         force_x_n=-float(forces(found.x)[0]),
-        load=float(np.max(np.abs(angles) / fins.drives[:, MOST_RAD])),
+        load=float(np.max(np.abs(angles) / fins.drives[:, MAX_RAD])),
     )
 
 
 def held(vehicle: Vehicle, speed_mps: float, turn_rad_s: float, share: float) -> FinFlight | None:
     """Steady level flight with a share of the fins' angles and the hull along the flow, or None."""
     flight = keeps(vehicle, speed_mps, turn_rad_s)
-    if flight is None or flight.load > share or flight.drift_rad > MOST_DRIFT_RAD:
+    if flight is None or flight.load > share or flight.drift_rad > MAX_DRIFT_RAD:
         return None
     return flight
 
 
 @lru_cache(maxsize=64)
-def least_radius_m(vehicle: Vehicle, speed_mps: float, share: float) -> float:
+def min_radius_m(vehicle: Vehicle, speed_mps: float, share: float) -> float:
     """Radius of the tightest turn that fins hold at a speed, in both senses.
 
     Args:
@@ -135,7 +135,7 @@ def least_radius_m(vehicle: Vehicle, speed_mps: float, share: float) -> float:
 
 
 @lru_cache(maxsize=64)
-def least_speed_mps(vehicle: Vehicle, share: float) -> float:
+def min_speed_mps(vehicle: Vehicle, share: float) -> float:
     """Lowest speed at which fins and hull carry a vehicle's buoyancy or weight level.
 
     Args:
@@ -165,10 +165,10 @@ def least_speed_mps(vehicle: Vehicle, share: float) -> float:
 
 def too_slow(vehicle: Vehicle, speed_mps: float, share: float) -> str:
     """What is wrong with a speed, in words."""
-    least = math.ceil(100.0 * least_speed_mps(vehicle, share)) / 100.0
+    minimum = math.ceil(100.0 * min_speed_mps(vehicle, share)) / 100.0
     net_n = (vehicle.rigid_body.buoyancy_kg - vehicle.rigid_body.dry_kg) * 9.80665
     return (
-        f"{vehicle.name} is held level by its fins from {least:.2f} m/s through the water on, not "
-        f"at {speed_mps:.2f} (it is {abs(net_n):.1f} N {'light' if net_n > 0 else 'heavy'}): raise "
-        "the speed, or trim it closer to neutral"
+        f"{vehicle.name} is held level by its fins from {minimum:.2f} m/s through the water on, "
+        f"not at {speed_mps:.2f} (it is {abs(net_n):.1f} N {'light' if net_n > 0 else 'heavy'}): "
+        "raise the speed, or trim it closer to neutral"
     )

@@ -92,11 +92,11 @@ class Vehicle:
             VehicleError: it is not positive definite.
         """
         mass: Array = self.rigid_body.mass_matrix + self.coefficients.added_mass
-        least = float(np.linalg.eigvalsh(mass)[0])
-        if least <= 0:
+        minimum = float(np.linalg.eigvalsh(mass)[0])
+        if minimum <= 0:
             raise VehicleError(
                 f"the inertia matrix of {self.name} with {self.coefficients.name!r} coefficients "
-                f"has the eigenvalue {least:.3g}: an added mass has the wrong sign"
+                f"has the eigenvalue {minimum:.3g}: an added mass has the wrong sign"
             )
         return mass
 

@@ -15,7 +15,7 @@ from alice_survey.core.errors import WorkspaceError
 from reconstruct.annotations.values import signed_area
 
 Ring = tuple[tuple[float, float], ...]
-_MOST_PX = 100_000_000
+_MAX_PX = 100_000_000
 """Pixels of the box around a mask."""
 
 
@@ -90,9 +90,9 @@ def decoded(runs: Sequence[int], height: int, width: int) -> Mask | None:
     top = 0 if whole else int((first % height).min())
     bottom = height - 1 if whole else int((last % height).max())
     size = (right - left + 1, bottom - top + 1)
-    if size[0] * size[1] > _MOST_PX:
+    if size[0] * size[1] > _MAX_PX:
         raise WorkspaceError(
-            f"a mask of {size[0]} x {size[1]} pixels: at most {_MOST_PX} are taken: cut the "
+            f"a mask of {size[0]} x {size[1]} pixels: at most {_MAX_PX} are taken: cut the "
             "picture into tiles"
         )
     marks = np.zeros(size, dtype=np.uint8)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
+from scipy.optimize import min_squares
 
 from alice_survey.core.block_solver import BlockStep, Equations, Minimum, inverse_of, minimise
 from alice_survey.core.errors import AliceError
@@ -138,7 +138,7 @@ def curves(rate: float, seed: int = 0) -> Curves:
 
 
 def solved(problem: Curves, start: Array, **options: float) -> Minimum[Array, Equations]:
-    return minimise(problem, start, settled=1e-7, most_steps=200, damping=1e-3, **options)
+    return minimise(problem, start, settled=1e-7, max_steps=200, damping=1e-3, **options)
 
 
 @pytest.mark.parametrize("rate", [0.1, 3.0])
@@ -149,7 +149,7 @@ def test_it_ends_where_a_plain_minimiser_does(rate: float) -> None:
     def misses(x: Array) -> Array:
         return problem.misses(x).ravel()
 
-    plain = least_squares(
+    plain = min_squares(
         misses, far, loss="huber", f_scale=1.0, x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14
     )
     assert found.is_settled
@@ -167,7 +167,7 @@ def test_a_parameter_that_would_leave_its_range_stays_at_its_bound() -> None:
     def misses(x: Array) -> Array:
         return problem.misses(np.append(x, 2.0)).ravel()
 
-    free = least_squares(misses, found.guess[:-1], loss="huber")
+    free = min_squares(misses, found.guess[:-1], loss="huber")
     np.testing.assert_allclose(found.guess[:-1], free.x, rtol=1e-4)
 
 
@@ -185,6 +185,6 @@ def test_an_end_at_which_observations_would_be_lost_is_not_settled() -> None:
 
 
 def test_too_few_steps_are_not_settled() -> None:
-    found = minimise(curves(1.2), np.append(np.ones(8), 3.0), settled=1e-7, most_steps=2)
+    found = minimise(curves(1.2), np.append(np.ones(8), 3.0), settled=1e-7, max_steps=2)
     assert not found.is_settled
     assert not found.is_stuck

@@ -85,7 +85,7 @@ def test_a_flat_picture_shows_every_tile_on_white() -> None:
     difference = found.astype(int) - np.asarray(floor).astype(int)
     assert abs(difference.mean()) < 0.5
     assert np.abs(difference).mean() < 6  # of JPEG
-    assert flat_picture(layer, most_px=400).shape == (250, 350, 3)
+    assert flat_picture(layer, max_px=400).shape == (250, 350, 3)
     clear = floor.convert("RGBA")
     clear.putalpha(0)
     assert (flat_picture(picture_layer("c", "C", clear)) == 255).all()

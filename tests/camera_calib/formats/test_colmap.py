@@ -84,7 +84,7 @@ def test_every_model_projects_as_in_colmap(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("target", ["model", "model/cameras.bin"])
 @settings(max_examples=25, deadline=None)
-@given(rig=rigs(RATIONAL, lenses=BOTH_LENSES, most=3))
+@given(rig=rigs(RATIONAL, lenses=BOTH_LENSES, maximum=3))
 def test_colmap_projects_as_we_do_from_what_it_reads(target: str, rig: Rig) -> None:
     with tempfile.TemporaryDirectory() as folder:
         written = write_colmap(Path(folder) / target, rig)

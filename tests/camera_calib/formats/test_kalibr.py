@@ -62,7 +62,7 @@ fault = partial(fault_of, read_kalibr)
 
 
 @settings(max_examples=25, deadline=None)
-@given(rig=rigs(RADTAN, most=3))
+@given(rig=rigs(RADTAN, maximum=3))
 def test_opencv_projects_as_we_do_from_the_chain(rig: Rig) -> None:
     with tempfile.TemporaryDirectory() as folder:
         write_kalibr(Path(folder) / "camchain.yaml", rig)
@@ -93,7 +93,7 @@ def test_opencv_projects_as_we_do_from_the_chain(rig: Rig) -> None:
 
 
 @settings(max_examples=25, deadline=None)
-@given(rig=rigs(lenses=("fisheye",), most=3))
+@given(rig=rigs(lenses=("fisheye",), maximum=3))
 def test_kalibrs_equidistant_equations_give_our_pixels(rig: Rig) -> None:
     """Those of `EquidistantDistortion::distort`, on tangents, of points before the camera."""
     with tempfile.TemporaryDirectory() as folder:

@@ -66,7 +66,7 @@ def manual_pixels(text: str, points: np.ndarray) -> np.ndarray:
 
 
 @settings(max_examples=50, deadline=None)
-@given(rig=rigs(PLUMB_BOB, lenses=BOTH_LENSES, most=1))
+@given(rig=rigs(PLUMB_BOB, lenses=BOTH_LENSES, maximum=1))
 def test_the_manuals_equations_give_our_pixels(rig: Rig) -> None:
     with tempfile.TemporaryDirectory() as folder:
         (file,) = write_metashape(Path(folder) / "a.xml", rig)
@@ -128,7 +128,7 @@ def test_faults_name_file_and_key(tmp_path: Path) -> None:
 
 
 @settings(max_examples=1, deadline=None)
-@given(rig=rigs(most=2).filter(lambda rig: len(rig.cameras) == 2))
+@given(rig=rigs(maximum=2).filter(lambda rig: len(rig.cameras) == 2))
 def test_two_cameras_are_too_many(rig: Rig) -> None:
     with pytest.raises(CalibrationError, match="--camera"):
         write_metashape(Path("a.xml"), rig)

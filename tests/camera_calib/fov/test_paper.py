@@ -49,7 +49,7 @@ def test_the_validation_can_fail(
     monkeypatch: pytest.MonkeyPatch, validation: PaperValidation
 ) -> None:
     assert validation.passed
-    claim = replace(validation.claims[0], most=60.0)
+    claim = replace(validation.claims[0], maximum=60.0)
     assert not replace(validation, claims=(claim,)).passed
     monkeypatch.setattr(
         "camera_calib.fov.paper.PAPER_TABLE", (*PAPER_TABLE, (12.5, "vertical", "m", "1.18"))

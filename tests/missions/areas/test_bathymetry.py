@@ -204,7 +204,7 @@ def test_only_the_window_is_read_and_says_the_same(
     np.testing.assert_allclose(window.depth_at(points), whole.depth_at(points), atol=1e-5)
     assert np.all(np.isfinite(window.depth_at(points)))
     assert 20 * 10 < window.depth_m.size < 40 * 30
-    monkeypatch.setattr(module, "_MOST_CELLS", 10_000)
+    monkeypatch.setattr(module, "_MAX_CELLS", 10_000)
     assert read_bathymetry(path, DATUM, bounds_ne=bounds).depth_m.shape == window.depth_m.shape
     with pytest.raises(PlanError, match="500 x 400"):
         read_bathymetry(path, DATUM)

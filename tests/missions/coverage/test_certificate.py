@@ -135,9 +135,9 @@ def test_shares_are_those_of_the_union_of_polygons(seed: int) -> None:
     both = unary_union([a & b for a, b in zip(polygons["left"], polygons["right"], strict=True)])
     for share, shape in ((seen.covered_share, any_camera), (seen.stereo_share, both)):
         within = shape.intersection(area.survey)
-        most_m2 = misjudged_m2(seen, within) + misjudged_m2(seen, area.survey)
+        max_m2 = misjudged_m2(seen, within) + misjudged_m2(seen, area.survey)
         error_m2 = abs(share * area.survey.area - within.area)
-        assert error_m2 <= most_m2
+        assert error_m2 <= max_m2
         assert error_m2 < 2e-3 * area.survey.area  # as it is in practice
 
 
@@ -291,7 +291,7 @@ def test_cells_grow_where_there_would_be_too_many(
 ) -> None:
     from missions.coverage import certificate as module
 
-    monkeypatch.setattr(module, "_MOST_CELLS", 10_000)
+    monkeypatch.setattr(module, "_MAX_CELLS", 10_000)
     seen = certificate(area_of(shapely.box(0, 0, 30, 40)), RIG, stations_at([(5, 5)], 2.0), ONCE)
 
     assert (seen.grid.rows - 1) * (seen.grid.columns - 1) <= 10_000

@@ -36,7 +36,7 @@ def test_rectangles_overlap_by_what_their_width_leaves(spacing_m: float) -> None
 
     expected = max(0.0, 1.0 - spacing_m / 2.0)
     assert measured.mean == pytest.approx(expected, abs=1e-3)
-    assert measured.least == pytest.approx(expected, abs=1e-3)
+    assert measured.minimum == pytest.approx(expected, abs=1e-3)
 
 
 def test_lines_one_metre_apart_overlap_as_the_paper_should_have_said() -> None:
@@ -58,7 +58,7 @@ def test_the_spacing_for_an_overlap_yields_it(rig: Rig, asked: float, altitude_m
 
     expected = 1 - spacing_m / middle_row_m(rig, altitude_m)
     assert measured.mean == pytest.approx(expected, abs=0.0025)
-    assert asked < measured.least < asked + 0.02
+    assert asked < measured.minimum < asked + 0.02
 
 
 def test_a_vehicle_off_its_line_overlaps_less_on_one_side() -> None:
@@ -83,7 +83,7 @@ def test_a_vehicle_off_its_line_overlaps_less_on_one_side() -> None:
     assert of_line[0] == pytest.approx(1 - 1.1 / width_m, abs=2e-3)
     assert of_line[1] == pytest.approx(1 - 1.1 / width_m, abs=2e-3)
     assert of_line[2] == pytest.approx(1 - 1.0 / width_m, abs=2e-3)
-    assert measured.least == pytest.approx(1 - 1.1 / width_m, abs=2e-3)
+    assert measured.minimum == pytest.approx(1 - 1.1 / width_m, abs=2e-3)
 
 
 def test_a_rolled_vehicle_loses_overlap_on_the_side_it_looks_away_from() -> None:

@@ -128,9 +128,9 @@ def test_in_a_current_steps_end_outside_of_the_turning_circle(tmp_path: Path) ->
     plan, known = small_plan(), Options(follower=FOLLOWER)
     write_exports(tmp_path, plan, RIG, formats=["cola2"], options=known)
     steps = read_cola2(tmp_path / "mission_dive1.xml")
-    least_m = 0.4 + 0.05 / 0.5
+    min_m = 0.4 + 0.05 / 0.5
     for step in steps:
-        assert float(step.values.get("tolerance_xy", 1.0)) >= least_m - 1e-4
+        assert float(step.values.get("tolerance_xy", 1.0)) >= min_m - 1e-4
     # A line goes on by as much, and its run-in begins farther off than planned, within the area.
     for i, step in enumerate(steps):
         if step.kind != "section" or step.actions != ["camera_trigger/disable"]:
@@ -141,7 +141,7 @@ def test_in_a_current_steps_end_outside_of_the_turning_circle(tmp_path: Path) ->
         assert length_m > 2 * plan.run_in_m
         on_m = math.dist(place(plan, step, "initial"), place(plan, step))
         line_m = min(line.length_m for line in plan.lines[:3])
-        assert on_m == pytest.approx(line_m + least_m + plan.station_spacing_m, abs=MM)
+        assert on_m == pytest.approx(line_m + min_m + plan.station_spacing_m, abs=MM)
         heading = math.atan2(*(place(plan, step) - place(plan, step, "initial"))[::-1])
         arm = turned((0.55, -0.05), heading)
         allowed = plan.area.allowed.buffer(1e-6)
@@ -168,7 +168,7 @@ def test_the_tolerance_keeps_neighbouring_lines_together(
 ) -> None:
     # Never COLA2's 1.5 m, never less than what a vehicle holds.
     assert line_tolerance_m(small_plan(line_spacing_m=1.26), RIG) == 0.12
-    monkeypatch.setattr(options, "LEAST_TOLERANCE_M", 0.01)
+    monkeypatch.setattr(options, "MIN_TOLERANCE_M", 0.01)
     plan = small_plan(line_spacing_m=0.8)
     stereo = common_swath(RIG, 2.0, plan.station_spacing_m)
     error_m = line_tolerance_m(plan, RIG)

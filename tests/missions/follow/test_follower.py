@@ -207,10 +207,10 @@ def test_a_proposal_keeps_to_its_budget(rows: Array) -> None:
     assert gains[-1] == 0.0
     assert np.all(np.diff(gains) <= 1e-9)
     assert len(set(gains)) >= 4
-    most = follower.propose(Budget(time_s=np.inf, energy_wh=np.inf))
-    assert most is not None
-    less = follower.propose(Budget(time_s=np.inf, energy_wh=0.6 * most.extra_wh))
+    maximum = follower.propose(Budget(time_s=np.inf, energy_wh=np.inf))
+    assert maximum is not None
+    less = follower.propose(Budget(time_s=np.inf, energy_wh=0.6 * maximum.extra_wh))
     assert less is not None
-    assert less.extra_wh <= 0.6 * most.extra_wh
-    assert 0 < less.gain_m2 < most.gain_m2
+    assert less.extra_wh <= 0.6 * maximum.extra_wh
+    assert 0 < less.gain_m2 < maximum.gain_m2
     assert follower.propose(Budget(time_s=0.0, energy_wh=1.0)) is None

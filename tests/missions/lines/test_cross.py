@@ -7,7 +7,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from shapely.geometry import MultiPolygon, Polygon, box
 
-from missions.lines.cross import LEAST_STEPS, stabs
+from missions.lines.cross import MIN_STEPS, stabs
 from missions.values.line import Line
 from missions.values.pattern import Pattern
 from tests.oracles_lines import PATTERNS, STEREO, area_of, areas, as_string, lay
@@ -49,7 +49,7 @@ def test_every_survey_line_with_a_neighbour_is_crossed(
         assert not crossing
         return
     for line in grid:
-        if line.stations - 1 < LEAST_STEPS:
+        if line.stations - 1 < MIN_STEPS:
             continue
         if any(next_to(line, other, pattern.spacing_m) for other in grid):
             assert any(as_string(line).distance(as_string(x)) < 1e-6 for x in crossing)
@@ -109,7 +109,7 @@ def test_the_fewest_places_meet_all_intervals(spans: list[tuple[int, int]]) -> N
         met = (intervals[:, :1] <= place) & (place <= intervals[:, 1:])
         assert met.any(axis=1).all()
     ends = sorted({float(x) for x in intervals[:, 1]})
-    fewest = next(
+    minimum = next(
         count
         for count in range(1, len(ends) + 1)
         if any(
@@ -117,4 +117,4 @@ def test_the_fewest_places_meet_all_intervals(spans: list[tuple[int, int]]) -> N
             for places in itertools.combinations(ends, count)
         )
     )
-    assert len(found) == fewest
+    assert len(found) == minimum

@@ -122,7 +122,7 @@ def test_pieces_less_than_two_steps_apart_become_one_where_that_is_allowed() -> 
 
 
 def test_the_least_piece_is_as_long_as_its_pictures_ask_for() -> None:
-    pieces, _ = lay(box(0, 0, 0.1, 1), box(-5, -5, 20, 5), overhang_m=-0.2, least_steps=3)
+    pieces, _ = lay(box(0, 0, 0.1, 1), box(-5, -5, 20, 5), overhang_m=-0.2, min_steps=3)
     np.testing.assert_allclose(pieces, [[0, 0.05 - 0.75, 0.05 + 0.75, 3]], atol=1e-9)
 
 

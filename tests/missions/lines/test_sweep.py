@@ -12,7 +12,7 @@ from shapely.geometry import MultiPolygon, Point, Polygon, box
 from alice_survey.core.errors import PlanError
 from missions.lines import sweep as sweep_module
 from missions.lines.lay import Laid, laid
-from missions.lines.sweep import best_heading, least_width, widths_m
+from missions.lines.sweep import best_heading, min_width, widths_m
 from missions.route.fence import edges_of
 from missions.route.ways import Ways
 from missions.values.costs import Costs, time_costs
@@ -32,7 +32,7 @@ def test_no_direction_is_narrower_than_the_least_width(
     survey: MultiPolygon, heading: float
 ) -> None:
     edges = edges_of(survey)
-    best, width = least_width(edges)
+    best, width = min_width(edges)
     sampled = widths_m(edges, np.append(np.arange(720) * math.pi / 720, heading))
     assert width <= sampled.min() + 1e-9
     assert widths_m(edges, np.array([best]))[0] == pytest.approx(width, abs=1e-9)

@@ -44,7 +44,9 @@ class InnerLoops:
 
     def __init__(self, vehicle: SimulatedVehicle) -> None:
         gains = gains_for(vehicle.vehicle, 0.2)
-        self.mass, self.least, self.most = (gains.axes[list(AXES), k] for k in (MASS, LEAST, MOST))
+        self.mass, self.minimum, self.maximum = (
+            gains.axes[list(AXES), k] for k in (MASS, LEAST, MOST)
+        )
         self.allocation = new_allocation(
             vehicle.vehicle, np.ones(len(vehicle.vehicle.thrusters)), exact=True, axes=AXIS_WEIGHTS
         )
@@ -57,8 +59,10 @@ class InnerLoops:
         off = body.apply(velocity_ned - truth[7:10])
         turning = np.clip(0.6 * wrapped(heading_rad - heading), -0.25, 0.25)
         error = np.array([*off, turning - truth[12]])
-        self.total = np.clip(self.total + 0.05 * 0.3 * self.mass * error, self.least, self.most)
-        asked = np.clip(1.0 * self.mass * error + self.total, self.least, self.most)
+        self.total = np.clip(
+            self.total + 0.05 * 0.3 * self.mass * error, self.minimum, self.maximum
+        )
+        asked = np.clip(1.0 * self.mass * error + self.total, self.minimum, self.maximum)
         wrench = np.array([asked[0], asked[1], asked[2], 0.0, 0.0, asked[3]])
         estimate = np.zeros(14)
         estimate[6:9], estimate[9:12] = body.apply(truth[7:10]), truth[10:13]

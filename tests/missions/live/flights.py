@@ -101,10 +101,10 @@ class LoopFlight:
         self.glass.append(self.truth[:3] + Rotation.from_quat(self.truth[3:7]).apply(point))
         self.vehicle.move(self.command.rps)
 
-    def until(self, phase: str, most_s: float = 400.0) -> None:
+    def until(self, phase: str, max_s: float = 400.0) -> None:
         """Fly until the guidance is in a phase."""
-        for _ in range(math.ceil(most_s / 0.05)):
+        for _ in range(math.ceil(max_s / 0.05)):
             if self.mission.phase == phase:
                 return
             self.tick()
-        raise AssertionError(f"no {phase} within {most_s} s, but {self.mission.phase}")
+        raise AssertionError(f"no {phase} within {max_s} s, but {self.mission.phase}")

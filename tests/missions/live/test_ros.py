@@ -316,9 +316,9 @@ class Navigator:
             ros_messages.odometry_message(self.ros.build, odometry, "alice/base_link", np.zeros(6))
         )
 
-    def until(self, holds: Any, *, depth: float | None, most_s: float = 600.0) -> None:
+    def until(self, holds: Any, *, depth: float | None, max_s: float = 600.0) -> None:
         """Spin, and publish odometry if there is a depth, until something holds."""
-        end = time.monotonic() + most_s
+        end = time.monotonic() + max_s
         while not holds():
             assert time.monotonic() < end, (len(self.wrenches), self.wrenches[-1:])
             if depth is not None:

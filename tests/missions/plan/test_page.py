@@ -77,10 +77,10 @@ def test_pages_stay_small(tmp_path: Path) -> None:
     """The paper's mission, and 1,000 lines of 100 pictures."""
     paper = [line((0.0, i + 0.5), (15.0, i + 0.5)) for i in range(17)]
     large = [line((0.0, float(i)), (46.0, float(i)), step=0.4647) for i in range(1000)]
-    for lines, most in ((paper, 260_000), (large, 500_000)):
+    for lines, maximum in ((paper, 260_000), (large, 500_000)):
         plan = plan_of(lines, [(0, len(lines) - 1)])
         write(tmp_path / "plan.html", plan, cell_m=0.25 if lines is large else None)
-        assert 200_000 < (tmp_path / "plan.html").stat().st_size < most
+        assert 200_000 < (tmp_path / "plan.html").stat().st_size < maximum
     assert plan.stations == 100_000
 
 

@@ -82,7 +82,7 @@ def test_a_quick_look_estimates_the_certificate(cells: int) -> None:
     config = changed(SMALL, "plan", line_spacing_m=1.45)
     made, rig = planned(config), design_rig(config.camera, config.water)
     stations, pattern = stations_of_plan(made.plan), plan_pattern(made.plan, rig)
-    quick = certificate(made.plan.area, rig, stations, pattern, most_cells=cells)
+    quick = certificate(made.plan.area, rig, stations, pattern, max_cells=cells)
     whole = made.certificate
     assert quick.estimated and not whole.estimated
     assert 0.4 * cells < quick.grid.rows * quick.grid.columns < 1.3 * cells

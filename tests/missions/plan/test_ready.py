@@ -34,10 +34,10 @@ def planned(config: SurveyConfig) -> Planned:
     ],
     ids=["current", "current, arcs", "relief", "rate", "thruster", "baseline", "focus"],
 )
-def test_every_way_out_that_is_offered_plans(config: SurveyConfig, least: int) -> None:
+def test_every_way_out_that_is_offered_plans(config: SurveyConfig, minimum: int) -> None:
     with pytest.raises(ConflictError) as caught:
         planned(config)
-    assert least <= len(caught.value.ways) <= 3
+    assert minimum <= len(caught.value.ways) <= 3
     for way in caught.value.ways:
         assert f"  - {way.change}: {way.price}" in str(caught.value).splitlines()
         seen = planned(with_settings(config, way.settings)).certificate

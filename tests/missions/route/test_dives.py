@@ -76,7 +76,7 @@ def test_no_parting_is_better(
     """Against all partings of up to nine lines, by dives' own routes."""
     lines = [_lines(count, length)[i] for i, length in enumerate(lengths[:count])]
     alone = np.array([_of_dive(lines, i, i) for i in range(count)])
-    usable_j, longest_s = energy * alone[:, 0].max(), time and time * alone[:, 1].max()
+    usable_j, max_s = energy * alone[:, 0].max(), time and time * alone[:, 1].max()
     known: dict[tuple[int, int], tuple[float, float]] = {}
 
     def cost(first: int, last: int) -> tuple[float, float]:
@@ -84,9 +84,9 @@ def test_no_parting_is_better(
             known[first, last] = _of_dive(lines, first, last)
         return known[first, last]
 
-    dives = _split(lines, usable_j / 3600, longest_s=longest_s)
+    dives = _split(lines, usable_j / 3600, max_s=max_s)
 
-    best = best_parting(count, cost, usable_j, np.inf if longest_s is None else longest_s)
+    best = best_parting(count, cost, usable_j, np.inf if max_s is None else max_s)
     assert best is not None
     assert len(dives) == best[0]
     assert sum(dive.energy_wh for dive in dives) * 3600 == pytest.approx(best[1], rel=1e-9)
@@ -94,7 +94,7 @@ def test_no_parting_is_better(
     assert dives[-1].last_line == count - 1
     for dive in dives:
         assert dive.energy_wh * 3600 <= usable_j * (1 + 1e-9)
-        assert longest_s is None or dive.duration_s <= longest_s * (1 + 1e-9)
+        assert max_s is None or dive.duration_s <= max_s * (1 + 1e-9)
         numbers = [leg.line for leg in dive.route.legs if leg.line >= 0]
         assert numbers == list(range(dive.first_line, dive.last_line + 1))
 
@@ -164,7 +164,7 @@ def test_a_line_that_fits_no_dive_is_named() -> None:
         assert named in text
     assert "\n" not in text
     with pytest.raises(PlanError, match=r"plan\.dive_s"):
-        _split(lines, 1e6, longest_s=300.0)
+        _split(lines, 1e6, max_s=300.0)
 
 
 def test_without_splitting_it_says_how_much_fits() -> None:
@@ -177,7 +177,7 @@ def test_without_splitting_it_says_how_much_fits() -> None:
     for number in ("5 lines", "60 m", "42%", "split_dives = true", f"{dives} dives"):
         assert number in text
     with pytest.raises(PlanError, match=rf"plan\.dive_s = {int(np.ceil(whole[1]))}"):
-        _split(lines, 1e6, longest_s=part[1] + 1, split=False)
+        _split(lines, 1e6, max_s=part[1] + 1, split=False)
 
 
 def test_a_course_against_too_much_current_is_refused() -> None:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.geometry import box
 
-from missions.route.dubins import moved, shortest_turn
+from missions.route.dubins import min_turn, moved
 from missions.route.fence import OPEN_WATER, Fence
 from missions.route.ways import Ways
 from missions.values.area import multipolygon
@@ -26,7 +26,7 @@ def turn(
     radius_m: float,
     fence: Fence = OPEN_WATER,
 ) -> list[Leg]:
-    pieces = shortest_turn(fence, np.array([*start, first]), np.array([*goal, last]), radius_m)
+    pieces = min_turn(fence, np.array([*start, first]), np.array([*goal, last]), radius_m)
     legs, heading = [], first
     for curvature, length_m in pieces.tolist():
         leg = Leg(
@@ -132,5 +132,5 @@ def test_a_turn_keeps_out_of_forbidden_water() -> None:
     assert math.dist(other[-1].end_ne_m, (0.0, 2.0)) < 1e-9
 
     tight = Ways(multipolygon(box(-0.5, -0.5, 0.5, 2.5))).fence
-    none = shortest_turn(tight, np.zeros(3), np.array([0.0, 2.0, math.pi]), 1.0)
+    none = min_turn(tight, np.zeros(3), np.array([0.0, 2.0, math.pi]), 1.0)
     assert np.isinf(none[:, 1]).all()

@@ -191,8 +191,8 @@ def test_a_descent_is_as_fast_as_three_quarters_of_the_thrust_allow() -> None:
     rates = np.linspace(0.1, 0.4, 3001)
     rps, thruster = math.sqrt(0.75) * 50.0, vehicle_from("alice").thrusters[2]
     thrust = 1025.0 * 0.08**3 * rps * (0.278 * 0.08 * rps - thruster.advance_slope * rates)
-    most = rates[thrust + 0.1 * 9.80665 > 326.169 * rates**2].max()
-    assert most - 0.0101 <= costs.heave_mps <= most
+    maximum = rates[thrust + 0.1 * 9.80665 > 326.169 * rates**2].max()
+    assert maximum - 0.0101 <= costs.heave_mps <= maximum
     assert costs.dive_s(13.0) == pytest.approx(26.0 / costs.heave_mps)
     assert costs.dive_j(13.0) == pytest.approx(costs.dive_s(13.0) * costs.heave_w)
 
@@ -232,11 +232,11 @@ def _changed(config: SurveyConfig, way: str) -> SurveyConfig:
         (_config(0.3, vehicle={"controller": "los"}), 3),
     ],
 )
-def test_ways_out_of_a_current_work(config: SurveyConfig, least: int) -> None:
+def test_ways_out_of_a_current_work(config: SurveyConfig, minimum: int) -> None:
     setup = ImagingSetup.of(config)
     text = str(too_strong(flight_conditions(config), config.vehicle, setup, ""))
     head, *ways = text.splitlines()
-    assert least <= len(ways) <= 3
+    assert minimum <= len(ways) <= 3
     assert f"{config.sea.current_mps:.2f} m/s" in head
     for way in ways:
         changed = _changed(config, way)
@@ -280,7 +280,7 @@ def test_a_way_between_lines_that_cannot_be_flown_is_refused_with_the_current() 
     with pytest.raises(PlanError, match=r"0\.30 m/s .* 0\.19 m/s"):
         split_dives(
             [line], ways=None, costs=costs, home_ne=(-5.0, 0.0), turn_radius_m=0.5, run_in_m=0.5,
-            turns="auto", usable_wh=1000.0, longest_s=None, depth_m=10.0, split=True,
+            turns="auto", usable_wh=1000.0, max_s=None, depth_m=10.0, split=True,
         )  # fmt: skip
 
 

@@ -9,7 +9,7 @@ from shapely.geometry import MultiPolygon, box
 
 from alice_survey.core.errors import PlanError
 from missions.route.fence import TOUCH_M
-from missions.route.joins import LONGEST_SWAY_M
+from missions.route.joins import MAX_SWAY_M
 from missions.route.turns import Turns
 from missions.route.ways import Ways
 from missions.values.area import multipolygon
@@ -44,7 +44,7 @@ def check_joints(route: Route) -> None:
         elif leg.side_rad:
             assert abs(leg.side_rad) == math.pi / 2
             assert leg.curvature_per_m == 0.0
-            assert leg.length_m <= LONGEST_SWAY_M
+            assert leg.length_m <= MAX_SWAY_M
         assert leg.length_m > 0.0 or leg.turn_rad
     for before, after in pairwise(route.legs):
         assert math.dist(before.end_ne_m, after.start_ne_m) < 1e-6
@@ -196,7 +196,7 @@ def test_what_has_no_room_is_flown_otherwise_with_a_warning(
     assert "4 of 4 turns" in warned
     assert warned.count("\n") == 1
 
-    far = route_through(lawn(3, 10.0, LONGEST_SWAY_M + 0.1), 0.5, 0.5, turns="sway")
+    far = route_through(lawn(3, 10.0, MAX_SWAY_M + 0.1), 0.5, 0.5, turns="sway")
     assert turn_counts(far)[2] == 0
     assert "2 of 2 turns" in capsys.readouterr().err
 

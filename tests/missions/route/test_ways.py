@@ -12,7 +12,7 @@ from missions.route.fence import OPEN_WATER, TOUCH_M, arc_inside, straight_insid
 from missions.route.ways import Ways
 from missions.values.area import multipolygon
 from missions.values.legs import Leg
-from tests.oracles_route import inside, sampled_leg, shortest_way_m, way_m
+from tests.oracles_route import inside, min_way_m, sampled_leg, way_m
 from tests.strategies_areas import areas, places_in
 
 seeds = st.integers(0, 2**32 - 1)
@@ -58,7 +58,7 @@ def test_ways_are_as_short_as_by_trying_all_corners(area: MultiPolygon, seed: in
     )
     for i in range(3):
         a, b = tuple(places[i].tolist()), tuple(places[i + 3].tolist())
-        expected = shortest_way_m(area, a, b)
+        expected = min_way_m(area, a, b)
         assert distances[i, i + 3] == pytest.approx(expected, abs=1e-5)
         assert way_m(ways, a, b) == pytest.approx(expected, abs=1e-5)
         if math.isinf(expected):

@@ -238,7 +238,7 @@ def test_a_large_survey_is_adjusted_in_parts_as_a_whole(
         np.testing.assert_array_equal(again.after, parts.after)
         np.testing.assert_array_equal(again.state.points, parts.state.points)
         np.testing.assert_array_equal(again.calibration.points, parts.calibration.points)
-    monkeypatch.setattr(survey_fit, "_MOST_PLACES", len(whole.point_ids) // 3)
+    monkeypatch.setattr(survey_fit, "_MAX_PLACES", len(whole.point_ids) // 3)
     some = fit_survey(mapped, seen, wrong, port=False, pose=True).calibration
     assert some is not None
     assert 0.2 < len(some.places) / len(whole.point_ids) < 0.35

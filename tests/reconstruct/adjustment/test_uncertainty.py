@@ -152,10 +152,10 @@ def test_memory_hardly_grows_with_the_observations(monkeypatch: pytest.MonkeyPat
             pixels=PixelParts(pixels, 60), state=state, fields=(), noise=(0.1, 0.01)
         )
         found = shape_of_block(linear, pixels, state.centres, state.points, None, scale_free=False)
-        most = tracemalloc.get_traced_memory()[1]
+        maximum = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         kept = (found.points, found.noise, found.modes.points, found.shared.motions)
-        return len(pixels.station), most - sum(a.nbytes for a in kept)
+        return len(pixels.station), maximum - sum(a.nbytes for a in kept)
 
     (few, small), (many, large) = (peak(points, 4_000) for points in (300, 1200))
     assert many > 3.5 * few > 14 * 4_000

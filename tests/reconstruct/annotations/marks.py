@@ -56,7 +56,7 @@ def number(low: float, high: float) -> st.SearchStrategy[float]:
 
 @st.composite
 def pixel_shapes(
-    draw: st.DrawFn, wide: float, high: float, kinds: tuple[str, ...] = KINDS, least_holes: int = 0
+    draw: st.DrawFn, wide: float, high: float, kinds: tuple[str, ...] = KINDS, min_holes: int = 0
 ) -> DrawnShape:
     """Any shape within a picture: its vertices by angle and distance from a middle."""
     kind = draw(st.sampled_from(kinds))
@@ -77,7 +77,7 @@ def pixel_shapes(
     outer = _star(x, y, away, turn)
     within = Polygon(outer).buffer(-0.05 * radius)
     holes = []
-    for n in range(draw(st.integers(least_holes, 3))):
+    for n in range(draw(st.integers(min_holes, 3))):
         around = 0.28 * radius
         spot = (x + around * math.cos(turn + 2.1 * n), y + around * math.sin(turn + 2.1 * n))
         sides = draw(st.integers(3, 6))

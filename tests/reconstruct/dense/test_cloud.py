@@ -105,7 +105,7 @@ def test_cubes_grow_only_when_there_are_too_many():
 
 
 def test_the_overview_is_thinned_and_the_copc_is_not(tmp_path, monkeypatch):
-    monkeypatch.setattr(cloud_module, "_MOST_OVERVIEW_POINTS", 1000)
+    monkeypatch.setattr(cloud_module, "_MAX_OVERVIEW_POINTS", 1000)
     surface, offset = random_surface(), (1.0, 2.0, -12.0)
     store = ViewStore(tmp_path / "scratch")
     left = store.folder / "copc" / "0_0_0" / "0.points"  # of a run that was interrupted

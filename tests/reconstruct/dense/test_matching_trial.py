@@ -117,7 +117,7 @@ def test_scale_follows_from_the_cell_that_is_wanted(survey, cell, scale):
 
 def test_detail_below_the_scale_of_matching_is_kept_where_pictures_are_clear(survey, monkeypatch):
     workspace, model = survey
-    monkeypatch.setattr(scales, "LARGEST_PIXELS", 30_000)
+    monkeypatch.setattr(scales, "MAX_PIXELS", 30_000)
     partners, points = choose_partners(model, 3), points_of_views(model).__getitem__
     found = find_scales(workspace, model.views, partners, points, 1.0, SERIAL)
     assert found == Scales(depth=1.0, matching=0.5)

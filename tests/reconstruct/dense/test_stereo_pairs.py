@@ -45,9 +45,9 @@ def test_rig_partner_comes_first_then_neighbours_ahead_and_astern():
 
 def test_at_most_the_given_number_of_partners_and_none_twice():
     model = sparse_model(line(), SCENE)
-    for most in (1, 2, 4):
-        for partners in choose_partners(model, per_view=most):
-            assert 1 <= len(partners) <= most
+    for maximum in (1, 2, 4):
+        for partners in choose_partners(model, per_view=maximum):
+            assert 1 <= len(partners) <= maximum
             assert len(set(partners)) == len(partners)
 
 

@@ -61,7 +61,7 @@ def test_parts_say_what_the_whole_says(tmp_path: Path, monkeypatch: pytest.Monke
     assert np.isfinite(expected).all(axis=1).sum() > 290
     one_by_one = [dem.met_by(s[None], w[None]) for s, w in zip(starts, ways, strict=True)]
     np.testing.assert_allclose([met[0] for _, met in one_by_one], expected, atol=2e-3)
-    monkeypatch.setattr(elevation, "_MOST_CELLS", 90_000)
+    monkeypatch.setattr(elevation, "_MAX_CELLS", 90_000)
     bounded = [dem.met_by(s[None], w[None]) for s, w in zip(starts, ways, strict=True)]
     assert max(part.height.size for part, _ in bounded) <= 100_000
     np.testing.assert_allclose([met[0] for _, met in bounded], expected, atol=2e-2)

@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from reconstruct.mapping.arrays import LEAST_POINTS, first_of, linked_groups, observed
+from reconstruct.mapping.arrays import MIN_POINTS, first_of, linked_groups, observed
 from reconstruct.views import model_files
 from tests.reconstruct.mapping.test_mapper import block_mapped
 
@@ -65,7 +65,7 @@ def test_groups_are_the_stations_that_points_link() -> None:
         rng = np.random.default_rng(seed)
         station, point = rng.integers(0, 12, 70), rng.integers(0, 60, 70)
         group = linked_groups(station, point, 13)
-        seen = np.bincount(station, minlength=13) >= LEAST_POINTS
+        seen = np.bincount(station, minlength=13) >= MIN_POINTS
         shown = [set(point[station == s].tolist()) if seen[s] else set() for s in range(13)]
         label = np.arange(13)
         for _ in range(13):

@@ -31,7 +31,7 @@ def nearest(pixels: np.ndarray, centre: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("scale", [1.0, 0.5])
 def test_keypoints_lie_on_blobs_half_pixel_included(scale: float) -> None:
     centres = np.array([[50.2, 40.75], [110.5, 80.0], [100.9, 30.3]])
-    found = find_features(blobs(centres), None, scale=scale, most=100)
+    found = find_features(blobs(centres), None, scale=scale, maximum=100)
     for centre in centres:
         np.testing.assert_allclose(nearest(found.pixels, centre), centre, atol=0.06 / scale)
 
@@ -39,8 +39,10 @@ def test_keypoints_lie_on_blobs_half_pixel_included(scale: float) -> None:
 def test_mirrored_picture_has_mirrored_keypoints() -> None:
     rng = np.random.default_rng(3)
     picture = blobs(rng.uniform(15, 105, (8, 2)), sigma=3.0)
-    left = find_features(picture, None, scale=1.0, most=100).pixels
-    right = find_features(np.ascontiguousarray(picture[:, ::-1]), None, scale=1.0, most=100).pixels
+    left = find_features(picture, None, scale=1.0, maximum=100).pixels
+    right = find_features(
+        np.ascontiguousarray(picture[:, ::-1]), None, scale=1.0, maximum=100
+    ).pixels
     mirrored = np.stack([picture.shape[1] - right[:, 0], right[:, 1]], axis=1)
     offset = np.array([nearest(mirrored, p) - p for p in left])
     offset = offset[np.linalg.norm(offset, axis=1) < 1]
@@ -55,8 +57,8 @@ def test_features_keep_away_from_the_border_of_a_mask() -> None:
     centres = np.array([[40.0, 60.0], [40.0 + 2 * sigma, 20.0]])
     mask = np.ones((120, 160), bool)
     mask[:, 52:] = False
-    found = find_features(blobs(centres, sigma=sigma), mask, scale=1.0, most=100)
-    whole = find_features(blobs(centres, sigma=sigma), None, scale=1.0, most=100)
+    found = find_features(blobs(centres, sigma=sigma), mask, scale=1.0, maximum=100)
+    whole = find_features(blobs(centres, sigma=sigma), None, scale=1.0, maximum=100)
     assert np.linalg.norm(nearest(whole.pixels, centres[1]) - centres[1]) < 0.1
     assert np.linalg.norm(nearest(found.pixels, centres[0]) - centres[0]) > 0.1 or len(found.pixels)
     reach = 52.0 - found.pixels[:, 0]
@@ -75,28 +77,28 @@ def test_features_keep_away_from_the_border_of_a_mask() -> None:
     ],
 )
 def test_pictures_are_reduced_to_what_the_wanted_features_need(
-    size: tuple[int, int], most: int, scales: tuple[float, ...]
+    size: tuple[int, int], maximum: int, scales: tuple[float, ...]
 ) -> None:
-    assert detection_scales(size, most) == pytest.approx(scales, abs=0.001)
+    assert detection_scales(size, maximum) == pytest.approx(scales, abs=0.001)
 
 
 def test_a_picture_with_little_to_show_is_searched_at_full_scale() -> None:
     rng = np.random.default_rng(1)
     few = blobs(rng.uniform(20, 380, (40, 2)), (400, 400), sigma=1.2)
-    small = find_features(few, None, scale=0.3, most=900)
-    found = find_features(few, None, scale=None, most=900, thrifty=True)
-    whole = find_features(few, None, scale=1.0, most=900)
+    small = find_features(few, None, scale=0.3, maximum=900)
+    found = find_features(few, None, scale=None, maximum=900, thrifty=True)
+    whole = find_features(few, None, scale=1.0, maximum=900)
     assert len(small.pixels) < len(found.pixels)
     np.testing.assert_array_equal(found.pixels, whole.pixels)
     rich = blobs(rng.uniform(0, 400, (900, 2)), (400, 400), sigma=2.5)
-    plain = find_features(rich, None, scale=None, most=100)
-    quick = find_features(rich, None, scale=None, most=100, thrifty=True)
+    plain = find_features(rich, None, scale=None, maximum=100)
+    quick = find_features(rich, None, scale=None, maximum=100, thrifty=True)
     assert len(plain.pixels) == len(quick.pixels) == 100
     assert not np.array_equal(plain.pixels, quick.pixels)
 
 
 def test_a_blank_picture_has_no_features() -> None:
-    found = find_features(np.full((80, 90), 70, np.uint8), None, scale=1.0, most=100)
+    found = find_features(np.full((80, 90), 70, np.uint8), None, scale=1.0, maximum=100)
     assert found.pixels.shape == (0, 2)
     assert found.descriptors.shape == (0, 128)
 
@@ -133,7 +135,7 @@ def test_root_sift_has_norm_512() -> None:
 
 
 def test_features_survive_a_file(tmp_path: Path) -> None:
-    found = find_features(blobs(np.array([[60.0, 60.0]])), None, scale=1.0, most=10)
+    found = find_features(blobs(np.array([[60.0, 60.0]])), None, scale=1.0, maximum=10)
     save_features(tmp_path / "f.npz", found)
     again = load_features(tmp_path / "f.npz")
     for name in ("pixels", "scale_px", "descriptors"):

@@ -60,7 +60,7 @@ def test_the_network_gives_what_the_original_gives(reference: dict[str, np.ndarr
 
 
 def test_bytes_of_descriptors_keep_their_distances(reference: dict[str, np.ndarray]) -> None:
-    found = find_learned(reference["picture"], None, most=200)
+    found = find_learned(reference["picture"], None, maximum=200)
     assert 60 <= len(found.pixels) <= 200
     vectors = (found.descriptors.astype(np.float64) - 128) / 256
     lengths = np.linalg.norm(vectors, axis=1)
@@ -125,11 +125,11 @@ def taken(folder: Path, pictures: list[np.ndarray], turns: list[int]) -> list[Ta
     found = []
     for i, (picture, turn) in enumerate(zip(pictures, turns, strict=True)):
         cv2.imwrite(str(folder / f"{i}.png"), picture)
-        found_sift = find_features(normalise(picture), None, scale=None, most=3000)
+        found_sift = find_features(normalise(picture), None, scale=None, maximum=3000)
         save_features(folder / f"{i}.npz", found_sift)
         found.append(
             Taken(
-                picture=folder / f"{i}.png", mask=None, features=folder / f"{i}.npz", most=3000,
+                picture=folder / f"{i}.png", mask=None, features=folder / f"{i}.npz", maximum=3000,
                 turns=turn,
             )
         )  # fmt: skip
@@ -173,7 +173,7 @@ def test_what_moves_with_the_camera_ties_nothing(tmp_path: Path) -> None:
     for k in range(2):
         noise = np.random.default_rng(k).normal(size=pattern.shape)
         grey = np.clip(110 + 20 * pattern + 5 * noise, 0, 255).astype(np.uint8)
-        save_features(tmp_path / f"{k}.npz", find_learned(grey, None, most=800))
+        save_features(tmp_path / f"{k}.npz", find_learned(grey, None, maximum=800))
     assert match_pair(task(tmp_path / "0.npz", tmp_path / "1.npz", RATIO)).geometry is not None
     assert match_learned(task(tmp_path / "0.npz", tmp_path / "1.npz", RATIO)).geometry is None
 
@@ -186,7 +186,7 @@ def test_a_turned_picture_is_tied_once_it_is_turned_back(tmp_path: Path, turns: 
     counts = []
     for back in (turns, 0):
         for k, (picture, by) in enumerate(((clear, 0), (turned, back))):
-            save_features(tmp_path / f"{k}.npz", find_learned(picture, None, most=800, turns=by))
+            save_features(tmp_path / f"{k}.npz", find_learned(picture, None, maximum=800, turns=by))
         found = match_learned(task(tmp_path / "0.npz", tmp_path / "1.npz", RATIO)).matches
         counts.append(len(found))
         if back == turns:
@@ -213,8 +213,8 @@ def test_turns_bring_north_up(heading: float, turns: int) -> None:
 def test_masks_keep_learned_features_away(reference: dict[str, np.ndarray]) -> None:
     mask = np.ones(reference["picture"].shape, bool)
     mask[:, :60] = False
-    free = find_learned(reference["picture"], None, most=500)
-    kept = find_learned(reference["picture"], mask, most=500)
+    free = find_learned(reference["picture"], None, maximum=500)
+    kept = find_learned(reference["picture"], mask, maximum=500)
     assert free.pixels[:, 0].min() < 30
     assert 60 + 7 < kept.pixels[:, 0].min() < 60 + 30
     assert len(kept.pixels) >= len(free.pixels) / 4

@@ -190,10 +190,10 @@ def test_partners_of_a_picture_do_not_grow_with_visits_to_the_place() -> None:
         for r in scene.records
     ]
     once, _ = partners_each(scene.records)
-    often, most = partners_each(visits)
+    often, maximum = partners_each(visits)
     # six directions on lines along and across, two in each, chosen by either of the two
     assert once < often < 2 * (2 * 6 * 2 + 12)
-    assert most < len(visits) / 4
+    assert maximum < len(visits) / 4
 
 
 def test_every_direction_keeps_a_partner() -> None:

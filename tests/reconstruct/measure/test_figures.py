@@ -294,8 +294,8 @@ def test_memory_does_not_grow_with_the_raster(tmp_path: Path) -> None:
     found = named(measure_polygon(surface, corners, 1.5)[0])
     line = named(measure_line(surface, [corners[0], corners[2]]))
     profile(surface, [(1.0, 1.0), (150.0, 100.0)])
-    most = tracemalloc.get_traced_memory()[1]
+    maximum = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert found["volume"].value == pytest.approx(0.5 * 16.0, rel=1e-6)
     assert line["length"].value == pytest.approx(4.0 * np.sqrt(2), rel=1e-6)
-    assert most < 400e6 < 4 * cells.rows * cells.columns / 10
+    assert maximum < 400e6 < 4 * cells.rows * cells.columns / 10

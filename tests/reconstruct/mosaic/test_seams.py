@@ -4,13 +4,13 @@ from reconstruct.mosaic.seams import candidates, choose_views
 from tests.oracles_mosaic import labels_energy, lowest_energy
 
 
-def random_problem(seed: int, rows: int, columns: int, most: int) -> tuple[np.ndarray, ...]:
+def random_problem(seed: int, rows: int, columns: int, maximum: int) -> tuple[np.ndarray, ...]:
     rng = np.random.default_rng(seed)
-    number = np.stack([rng.permutation(most + 1)[:most] for _ in range(rows * columns)]).reshape(
-        rows, columns, most
-    )
-    share = rng.uniform(0.3, 1.0, (rows, columns, most))
-    colours = rng.normal(0, 0.2, (rows, columns, most, 3))
+    number = np.stack(
+        [rng.permutation(maximum + 1)[:maximum] for _ in range(rows * columns)]
+    ).reshape(rows, columns, maximum)
+    share = rng.uniform(0.3, 1.0, (rows, columns, maximum))
+    colours = rng.normal(0, 0.2, (rows, columns, maximum, 3))
     return number.astype(np.int32), share.astype(np.float32), colours.astype(np.float32)
 
 

@@ -98,7 +98,7 @@ def test_a_line_has_no_bend_across_and_a_few_stations_have_none() -> None:
 
 @pytest.mark.parametrize(("sag_mm", "least", "most"), [(0.0, 0.0, 0.1), (8.0, 0.9, 1.0)])
 def test_a_bend_of_eight_millimetres_over_thirty_metres_is_seen(
-    sag_mm: float, least: float, most: float
+    sag_mm: float, minimum: float, maximum: float
 ) -> None:
     """Depths of a pressure sensor: 5 cm that last, 6 mm that drift in ten minutes, 2 mm white."""
     body, seen = flight(10, 61), 0
@@ -108,7 +108,7 @@ def test_a_bend_of_eight_millimetres_over_thirty_metres_is_seen(
         errors = SIGMA * lasting(rng, len(body))
         found = bends_of(body, records_of(body, errors, SIGMA), 8e-3 * sag_mm / north**2, 0.0, seed)
         seen += found[0].significant(5e-3)
-    assert least <= seen / 10 <= most
+    assert minimum <= seen / 10 <= maximum
 
 
 def lasting(rng: np.random.Generator, count: int) -> Array:

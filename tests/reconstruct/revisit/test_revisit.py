@@ -97,15 +97,15 @@ def test_pieces_are_parted_by_lesser_cuts_alone(seed: int) -> None:
     rng = np.random.default_rng(seed)
     weights = np.triu(rng.integers(0, 9, (8, 8)) * (rng.random((8, 8)) < 0.45), 1).astype(float)
     linked = sp.csr_array(weights + weights.T)
-    least = 9.0
+    minimum = 9.0
     sides = [np.array(side) for side in itertools.product([False, True], repeat=8)]
     cuts = [(side, cut_around(linked, side)) for side in sides if 0 < side.sum() < 8]
 
-    piece = pieces(linked, least)
+    piece = pieces(linked, minimum)
 
     for i, j in itertools.combinations(range(8), 2):
         smallest = min(cut for side, cut in cuts if side[i] != side[j])
-        assert (piece[i] == piece[j]) == (smallest >= least)
+        assert (piece[i] == piece[j]) == (smallest >= minimum)
     sizes = np.bincount(piece)
     assert (np.diff(sizes) <= 0).all()
 

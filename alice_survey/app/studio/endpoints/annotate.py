@@ -42,11 +42,11 @@ from reconstruct.annotations.table import (
 from reconstruct.annotations.transfer import GEOJSON, exported, frame_of, import_data
 from reconstruct.annotations.values import COLOURS, Annotation, AnnotationSet, Label, with_labels
 
-_MOST_BYTES = 64 << 20
-_MOST_PICTURES = 8
+_MAX_BYTES = 64 << 20
+_MAX_PICTURES = 8
 _AROUND = 0.6
 """Of an outline's extent that is shown around it."""
-_LEAST_AROUND_PX = 40
+_MIN_AROUND_PX = 40
 _TURN_S = 0.7
 """Time in which surfaces are measured for one request."""
 _KINDS = {".json": "application/json", ".csv": "text/csv; charset=utf-8"}
@@ -205,7 +205,7 @@ class _Annotate:
         else:
             spots = projector.to_plane(one.image, whole)
         _check(spots, one)
-        shown = projector.shown_in(spots, _MOST_PICTURES)
+        shown = projector.shown_in(spots, _MAX_PICTURES)
         return {
             "pictures": [_described(here, lengths) for here in shown],
             "sigma": float(np.median(spots.sigma)),
@@ -235,7 +235,7 @@ def _described(here: InPicture, lengths: Sequence[int]) -> dict[str, Any]:
     """A picture, the part of it around the outline, and the outline in it."""
     known: Array = here.pixels[np.isfinite(here.pixels).all(axis=1)]
     low, high = known.min(axis=0), known.max(axis=0)
-    margin = max(_LEAST_AROUND_PX, _AROUND * float((high - low).max()))
+    margin = max(_MIN_AROUND_PX, _AROUND * float((high - low).max()))
     size = np.array(here.size_px)
     corner = np.clip(np.floor(low - margin), 0, size - 1).astype(int)
     end = np.clip(np.ceil(high + margin), corner + 1, size).astype(int)
@@ -269,10 +269,10 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
         Endpoint(path="/api/annotations/{id}/pictures", answer=tab.pictures),
         Endpoint(
             path="/api/annotations/change", answer=tab.change, method="POST", writes=True,
-            most_bytes=_MOST_BYTES,
+            max_bytes=_MAX_BYTES,
         ),
         Endpoint(
             path="/api/annotations/import", answer=tab.take, method="POST", writes=True,
-            most_bytes=_MOST_BYTES,
+            max_bytes=_MAX_BYTES,
         ),
     )  # fmt: skip

@@ -28,7 +28,7 @@ M = TypeVar("M", bound=BaseModel)
 T = TypeVar("T")
 _ALIVE_S = 5.0
 """Time after which a silent stream of events says that it is there."""
-_MOST_WAITING = 1000
+_MAX_WAITING = 1000
 """Events that a page may be behind; a slower one misses the oldest."""
 
 
@@ -129,7 +129,7 @@ class Endpoint:
     method: Literal["GET", "POST"] = "GET"
     writes: bool = False
     """Whether files change, or files outside of the workspace are named: needs the token."""
-    most_bytes: int = 1 << 20
+    max_bytes: int = 1 << 20
     """Largest body."""
 
     def __post_init__(self) -> None:
@@ -218,7 +218,7 @@ class Events:
 
 
 def _put(queue: asyncio.Queue[str], text: str) -> None:
-    if queue.qsize() >= _MOST_WAITING:
+    if queue.qsize() >= _MAX_WAITING:
         queue.get_nowait()
     queue.put_nowait(text)
 

@@ -32,9 +32,9 @@ from alice_survey.kit.map import picture_json
 from reconstruct.evaluate.elevation import enu_from_enu
 from reconstruct.views.model import datum_of
 
-_MOST_OPEN = 4
-_MOST_SIBLINGS = 200
-_MOST_SHOWN = 100
+_MAX_OPEN = 4
+_MAX_SIBLINGS = 200
+_MAX_SHOWN = 100
 """Where a program that is started finds the package."""
 _CHANGED = "the survey was worked on meanwhile: choose it again"
 
@@ -57,7 +57,7 @@ class _Compare:
         self._studio, self._folder = studio, studio.workspace.folder
         self._lock = threading.Lock()
         self._others: dict[str, _Other] = {}
-        self._results = lru_cache(_MOST_OPEN)(self._layers_of)
+        self._results = lru_cache(_MAX_OPEN)(self._layers_of)
 
     def near(self, call: Call) -> dict[str, Any]:
         """Workspaces next to this one."""
@@ -68,7 +68,7 @@ class _Compare:
             folders = []
         surveys = [
             {"name": path.name, "path": str(path)}
-            for path in map(Path, folders[:_MOST_SIBLINGS])
+            for path in map(Path, folders[:_MAX_SIBLINGS])
             if path != self._folder and _is_survey(path)
         ]
         return {"folder": str(self._folder.parent), "surveys": surveys}
@@ -92,7 +92,7 @@ class _Compare:
         other = _Other(workspace=workspace, layers=layers, name=Held.of(path).name)
         with self._lock:
             self._others[name] = other
-            for old in list(self._others)[:-_MOST_OPEN]:
+            for old in list(self._others)[:-_MAX_OPEN]:
                 del self._others[old]
         return {"id": name, **self._described(other)}
 
@@ -197,7 +197,7 @@ def _regions(change: Mapping[str, Any]) -> list[dict[str, Any]]:
     keys = ("east_m", "north_m", "area_m2", "volume_l", "sigma_l", "most_mm")
     return [
         {**{key: one.get(key) for key in keys}, "outlines": one.get("outlines") or []}
-        for one in regions[:_MOST_SHOWN]
+        for one in regions[:_MAX_SHOWN]
         if isinstance(one, dict)
     ]
 

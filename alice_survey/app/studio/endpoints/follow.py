@@ -34,7 +34,7 @@ _PROPOSE_S, _BUSY = 5.0, 4.0
 """Lines are looked for by themselves every so many seconds at most, and no more often than after so
 many times the time that it took."""
 _LOG_FOLDERS = ("", "flight", "logs")
-_MOST_LOGS = 50
+_MAX_LOGS = 50
 _HEAD = 4096
 _COLOURS = np.zeros((256, 4), np.uint8)
 """Colour and opacity of a cell of the coverage: grey not seen, orange in a picture, blue in stereo,
@@ -189,7 +189,7 @@ class FollowTab:
         for folder in _LOG_FOLDERS:
             for path in sorted((root / folder).glob("*.csv")):
                 name = path.relative_to(root).as_posix()
-                if len(found) < _MOST_LOGS and self._studio.workspace.has(name) and _is_log(path):
+                if len(found) < _MAX_LOGS and self._studio.workspace.has(name) and _is_log(path):
                     found.append(name)
         return found
 
@@ -322,7 +322,7 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
     tab = FollowTab(studio)
 
     def change(path: str, answer: Any) -> Endpoint:
-        return Endpoint(path=path, answer=answer, method="POST", writes=True, most_bytes=4096)
+        return Endpoint(path=path, answer=answer, method="POST", writes=True, max_bytes=4096)
 
     return (
         Endpoint(path="/api/follow/state", answer=tab.state),

@@ -21,13 +21,13 @@ from reconstruct.measure.lines import measure_line, measure_points, profile
 from reconstruct.measure.polygons import measure_polygon, quadrats
 from reconstruct.measure.surface import MOSAIC, RASTERS, MeasuredSurface, values_at
 
-_MOST_PLACES = 2000
-_MOST_MEASURES = 1000
+_MAX_PLACES = 2000
+_MAX_MEASURES = 1000
 _READ = (*RASTERS, "mosaic/mosaic_source.tif", "sparse/frame.json", "sparse/covariance.npz",
          "sparse/registration.json", "sparse/track.csv", "dense/surface.json", "dense/plane.json",
          "dense/stage.json", "sparse/stage.json")  # fmt: skip
 """Files that figures are of."""
-_MOST_DRAWN = 1200
+_MAX_DRAWN = 1200
 """Samples of a profile that a page draws."""
 _OTHERS = {"dense/count.tif": ("Views", ""), "dense/surfaces.tif": ("Surfaces", ""),
          "dense/lower.tif": ("Lowest surface", None),
@@ -41,14 +41,14 @@ Place = tuple[float, float]
 class AskedProfile(Config):
     """A line on the surface."""
 
-    places: list[Place] = Field(min_length=2, max_length=_MOST_PLACES)
+    places: list[Place] = Field(min_length=2, max_length=_MAX_PLACES)
 
 
 class AskedMeasure(Config):
     """A line, points in space, or a polygon."""
 
     kind: Literal["line", "points", "polygon"]
-    places: list[tuple[float, ...]] = Field(min_length=2, max_length=_MOST_PLACES)
+    places: list[tuple[float, ...]] = Field(min_length=2, max_length=_MAX_PLACES)
     base: float | Literal["rim"] | None = None
     """Plane of a polygon's volume."""
     quadrat: float | None = Field(None, gt=0)
@@ -72,7 +72,7 @@ class ExportedMeasure(Config):
 
     name: str = Field(max_length=200)
     kind: Literal["line", "points", "polygon"]
-    places: list[tuple[float, ...]] = Field(min_length=1, max_length=_MOST_PLACES)
+    places: list[tuple[float, ...]] = Field(min_length=1, max_length=_MAX_PLACES)
     figures: list[ExportedFigure] = Field(max_length=100)
     notes: list[str] = Field(default=[], max_length=20)
 
@@ -81,7 +81,7 @@ class AskedExport(Config):
     """Measurements to write."""
 
     form: Literal["csv", "geojson"]
-    measures: list[ExportedMeasure] = Field(min_length=1, max_length=_MOST_MEASURES)
+    measures: list[ExportedMeasure] = Field(min_length=1, max_length=_MAX_MEASURES)
 
 
 def plane_json(held: Held) -> dict[str, Any] | None:
@@ -163,7 +163,7 @@ class _ModelTab:
         with self._surface() as surface:
             found = profile(surface, asked.places)
             sigma = found.samples.sigma
-            step = max(1, -(-len(found.along) // _MOST_DRAWN))
+            step = max(1, -(-len(found.along) // _MAX_DRAWN))
             kept = np.unique(
                 [*range(0, len(found.along), step), *found.corners, len(found.along) - 1]
             )
@@ -257,5 +257,5 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
         Endpoint(path="/api/model/mesh", answer=model.mesh),
         Endpoint(path="/api/model/profile", answer=model.profile, method="POST"),
         Endpoint(path="/api/model/measure", answer=model.measure, method="POST"),
-        Endpoint(path="/api/model/export", answer=model.export, method="POST", most_bytes=16 << 20),
+        Endpoint(path="/api/model/export", answer=model.export, method="POST", max_bytes=16 << 20),
     )

@@ -38,8 +38,8 @@ from reconstruct.placing.picked_points import Spot, find_spots
 from reconstruct.placing.scale import note_scale
 
 T = TypeVar("T")
-_MOST_LISTED = 500
-_MOST_SEEING = 60
+_MAX_LISTED = 500
+_MAX_SEEING = 60
 _MODEL = ("sparse/cameras.json", "sparse/model/images.bin", "sparse/frame.json")
 
 Name = Annotated[str, Field(min_length=1, max_length=1000)]
@@ -66,7 +66,7 @@ class _AskedPick(Config):
 
 class _Refine(Config):
     pick: _AskedPick
-    images: Annotated[list[Name], Field(max_length=_MOST_SEEING)] | None = None
+    images: Annotated[list[Name], Field(max_length=_MAX_SEEING)] | None = None
     """The best of those that see the spot where they are not named."""
 
 
@@ -129,7 +129,7 @@ class _Tab:
             "total": len(found),
             "pictures": [
                 self._about(record, model)
-                for record in found[first : first + _count(call, "count", 100, _MOST_LISTED)]
+                for record in found[first : first + _count(call, "count", 100, _MAX_LISTED)]
             ],
         }
 
@@ -172,7 +172,7 @@ class _Tab:
         model = self._read_model()
         place = self._place(model, call)
         seen, hidden = _unhidden(model, place)
-        most = _count(call, "count", 24, _MOST_SEEING)
+        maximum = _count(call, "count", 24, _MAX_SEEING)
         return {
             "place": {
                 "n": place.point[0], "e": place.point[1], "down": place.point[2],
@@ -185,7 +185,7 @@ class _Tab:
                     "resolution": one.pixels_per_unit,
                     "off_nadir_deg": float(np.degrees(one.off_nadir_rad)),
                 }
-                for one in seen[:most]
+                for one in seen[:maximum]
             ],
         }  # fmt: skip
 
@@ -216,7 +216,7 @@ class _Tab:
         place = self._met(model, pick.image, pick.x_px, pick.y_px)
         images = asked.images
         if images is None:
-            images = [s.image for s in _unhidden(model, place)[0]][: _MOST_SEEING // 3]
+            images = [s.image for s in _unhidden(model, place)[0]][: _MAX_SEEING // 3]
         for image in images:
             model.pictures.row(image)
         found = refine(pick, images, place, model.pictures.picture, self._taken.grey)
@@ -393,7 +393,7 @@ class _Tab:
 
 def _unhidden(model: _OpenModel, place: SurfacePlace) -> tuple[list[Sight], int]:
     """Pictures that see a place with nothing between, and how many it is hidden from."""
-    found = model.pictures.seeing(place.point, place.normal)[: 4 * _MOST_SEEING]
+    found = model.pictures.seeing(place.point, place.normal)[: 4 * _MAX_SEEING]
     centres = np.array([model.pictures.centres[model.pictures.row(s.image)] for s in found])
     hidden = model.surface.hidden(place, centres.reshape(-1, 3))
     return [s for s, out in zip(found, hidden, strict=True) if not out], int(hidden.sum())
@@ -414,11 +414,11 @@ def _spot_json(spot: Spot) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _count(call: Call, name: str, usual: int, most: int = 1_000_000_000) -> int:
+def _count(call: Call, name: str, usual: int, maximum: int = 1_000_000_000) -> int:
     text = call.query.get(name, str(usual))
     if not (text.isascii() and text.isdigit() and len(text) < 10):
         raise AliceError(f"{name}={text!r} is no count")
-    return min(int(text), most)
+    return min(int(text), maximum)
 
 
 def endpoints(studio: Studio) -> Sequence[Endpoint]:
@@ -432,11 +432,11 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
         Endpoint(path="/api/picks", answer=tab.picks),
         Endpoint(path="/api/picks/refine", answer=tab.refine, method="POST"),
         Endpoint(path="/api/picks/save", answer=tab.save, method="POST", writes=True,
-                 most_bytes=8 << 20),
+                 max_bytes=8 << 20),
         Endpoint(path="/api/picks/spot", answer=tab.spot, method="POST"),
         Endpoint(path="/api/picks/length", answer=tab.length, method="POST"),
         Endpoint(path="/api/control", answer=tab.control),
         Endpoint(path="/api/control/save", answer=tab.save_control, method="POST", writes=True,
-                 most_bytes=8 << 20),
+                 max_bytes=8 << 20),
         Endpoint(path="/api/scale", answer=tab.scale, method="POST", writes=True),
     )  # fmt: skip

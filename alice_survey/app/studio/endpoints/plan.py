@@ -50,11 +50,11 @@ from reconstruct.precision.candidates import Candidate, worst_bend
 from reconstruct.precision.run import heights_layer, heights_raster, summary
 
 SETTINGS = "survey.toml"
-_MOST_REQUEST = 8 << 20
-_MOST_FILE = 32 << 20
-_MOST_PRECISION = 3000
+_MAX_REQUEST = 8 << 20
+_MAX_FILE = 32 << 20
+_MAX_PRECISION = 3000
 """Stations of which the precision is predicted while somebody waits."""
-_MOST_MOMENTS = 4000
+_MAX_MOMENTS = 4000
 """Moments of a playback."""
 _LENSES_MM = (12.5, 25.0)
 """Of the paper."""
@@ -192,9 +192,9 @@ class _PlanTab:
         """What the model of a plan is expected to be worth."""
         with _drawn(self.draft(call.read(PlanRequest))) as config, _quiet():
             plan = plan_survey(config, design_rig(config.camera, config.water)).plan
-            if plan.stations > _MOST_PRECISION:
+            if plan.stations > _MAX_PRECISION:
                 raise PlanError(
-                    f"{plan.stations:,} stations: the precision of up to {_MOST_PRECISION:,} is "
+                    f"{plan.stations:,} stations: the precision of up to {_MAX_PRECISION:,} is "
                     "predicted here; save, and run 'alice-survey plan precision'"
                 )
             # What calibrates and what flies is heavy, and needed here alone.
@@ -396,7 +396,7 @@ def _moments(
     pictures_s: Array,
 ) -> dict[str, Any]:  # fmt: skip
     """A playback as JSON values, of so many moments as can be seen."""
-    step = max(1, math.ceil(len(time_s) / _MOST_MOMENTS))
+    step = max(1, math.ceil(len(time_s) / _MAX_MOMENTS))
     shown = np.unique(np.append(np.arange(0, len(time_s), step), len(time_s) - 1))
     return {
         "what": what,
@@ -417,7 +417,7 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
     def post(name: str, answer: Callable[[Call], Any], **options: Any) -> Endpoint:
         return Endpoint(
             path=f"/api/plan/{name}", answer=answer, method="POST",
-            **{"most_bytes": _MOST_REQUEST, **options},
+            **{"most_bytes": _MAX_REQUEST, **options},
         )  # fmt: skip
 
     return (
@@ -426,7 +426,7 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
         post("preview", plan.preview),
         post("precision", plan.precision),
         post("play", plan.play),
-        post("import", plan.dropped, most_bytes=_MOST_FILE),
+        post("import", plan.dropped, max_bytes=_MAX_FILE),
         post("text", plan.text),
         post("save", plan.save, writes=True),
     )

@@ -22,7 +22,7 @@ from missions.areas.files import SUFFIXES
 from missions.areas.survey import survey_area
 from reconstruct.pictures.preview import cameras_in, preview_import
 
-_MOST_BYTES = 12 << 20
+_MAX_BYTES = 12 << 20
 _COLOUR = '[reconstruct]\ncolour = "{}"\n'
 """Settings of a survey of real pictures that has no others."""
 _TRIAL: Values = {
@@ -171,6 +171,6 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
     return (
         Endpoint(path="/api/start/folders", answer=start.listed, **post),
         Endpoint(path="/api/start/preview", answer=start.preview, **post),
-        Endpoint(path="/api/start/survey", answer=start.survey, most_bytes=_MOST_BYTES, **post),
+        Endpoint(path="/api/start/survey", answer=start.survey, max_bytes=_MAX_BYTES, **post),
         Endpoint(path="/api/start/pictures", answer=start.pictures, **post),
     )

@@ -3,8 +3,8 @@
 import {button, download, el, table} from "./core.js";
 import {counted, csv, number, withSigma} from "./words.js";
 
-const MOST_ROWS = 100;
-const MOST_LINES = 5;
+const MAX_ROWS = 100;
+const MAX_LINES = 5;
 const WHOLE = 0.999;  /* share of a known surface from which on it counts as all */
 
 /* Area of the surface and rugosity of a row of the server's tables; empty where there are none. */
@@ -27,13 +27,13 @@ function csvOf(name, rows) {
    button that chooses it, and `rows` all rows of surfaces, or null while they are not there. */
 export function annotationTable(ones, {unit, mark, surface, name, rows}) {
   const square = unit + "²";
-  const lines = ones.slice(0, MOST_ROWS).map((one) => {
+  const lines = ones.slice(0, MAX_ROWS).map((one) => {
     const plan = mark(one);
     const size = plan && plan.area !== null ? withSigma(plan.area, plan.sigma)
       : plan && plan.length !== null ? number(plan.length, unit, 4) : "";
     return [name(one), size, ...surfaceCells(surface(one)), one.image === null ? one.shape.kind : one.shape.kind + ", picture"];
   });
-  const more = ones.length > lines.length ? el("p", {class: "note"}, "The first " + MOST_ROWS + " of " + ones.length.toLocaleString("en") + ".") : null;
+  const more = ones.length > lines.length ? el("p", {class: "note"}, "The first " + MAX_ROWS + " of " + ones.length.toLocaleString("en") + ".") : null;
   const head = ["Label", "Area in plan, " + square, "Surface, " + square, "Rugosity", "Shape"];
   return [
     scrolled("Annotations one by one", table(counted(ones.length, "annotation"), head, lines)), more,
@@ -56,7 +56,7 @@ export function coverTable(rows, known, unit) {
 
 /* Lines of the server, the first of many. */
 export function warnings(title, lines) {
-  const shown = lines.slice(0, MOST_LINES).map((line) => el("p", {class: "warn"}, title + ": " + line));
+  const shown = lines.slice(0, MAX_LINES).map((line) => el("p", {class: "warn"}, title + ": " + line));
   const left = lines.length - shown.length;
   return left ? [...shown, el("p", {class: "warn"}, title + ": " + left.toLocaleString("en") + " more")] : shown;
 }

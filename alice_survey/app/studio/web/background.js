@@ -7,7 +7,7 @@ const E2 = FLATTENING * (2 - FLATTENING);
 const RAD = Math.PI / 180;
 const FINEST = 19;
 const TILE_PX = 256;
-const MOST_TILES = 120;
+const MAX_TILES = 120;
 
 function ecef(lat, lon) {
   const [s, c] = [Math.sin(lat * RAD), Math.cos(lat * RAD)];
@@ -65,7 +65,7 @@ export function background(datum, address) {
       do {
         range = [columnOf(west, z), columnOf(east, z), rowOf(north, z), rowOf(south, z)].map(Math.floor);
         z -= 1;
-      } while (z >= 0 && (range[1] - range[0] + 1) * (range[3] - range[2] + 1) > MOST_TILES);
+      } while (z >= 0 && (range[1] - range[0] + 1) * (range[3] - range[2] + 1) > MAX_TILES);
       z += 1;
       const wanted = new Set();
       for (let x = range[0]; x <= range[1]; x += 1) {

@@ -1,7 +1,7 @@
 /* A model in parts, each finer than the one above it, loaded as the view needs them: 3D Tiles and COPC. */
 
 const AT_ONCE = 4;
-const MOST_MIB = 384;
+const MAX_MIB = 384;
 const COARSER = 1.5;
 const COARSEST = 1000;
 
@@ -33,7 +33,7 @@ function isSeen(box, clip) {
 /* Draws the parts below `root` whose error is at most `mostPx` on the screen, children on top of their parent (`adds`)
    or in place of it. `load` gives the model and the bytes of a part, or what a link stands for; `drop` gives the memory of
    a model back. `progress` gets the parts drawn, the number of those on the way and the bytes held; `failed` the fault of one
-   that did not come, which is not asked for again: its parent stands for it. Above MOST_MIB, or the canvas' attribute
+   that did not come, which is not asked for again: its parent stands for it. Above MAX_MIB, or the canvas' attribute
    data-most-mib, parts out of view go, longest unseen first, and what is left is drawn coarser until it fits. */
 export function startDetail({camera, canvas, draw}, root, {adds, mostPx, load, drop, progress, failed}) {
   const group = new three.Scene();
@@ -42,7 +42,7 @@ export function startDetail({camera, canvas, draw}, root, {adds, mostPx, load, d
   let loading = 0;
   let coarser = 1;
 
-  const mostBytes = () => (canvas.dataset.mostMib || MOST_MIB) * 2 ** 20;
+  const mostBytes = () => (canvas.dataset.mostMib || MAX_MIB) * 2 ** 20;
   const sumOf = (parts) => [...parts].reduce((sum, part) => sum + part.bytes, 0);
   const shown = () => [...held].filter((part) => part.model.visible);
   const pixelsAtOne = () => canvas.height / (2 * Math.tan(camera.fov * Math.PI / 360));

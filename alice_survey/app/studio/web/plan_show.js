@@ -9,12 +9,12 @@ const LINES = ["survey", "cross", "closing", "fill", "tie"];
 const GROUP = "The plan";
 const MADE = ["area", "plan"];  /* layers of the shell */
 const eastNorth = ([n, e]) => [e, n];
-const MOST_POINTS = 500;
+const MAX_POINTS = 500;
 
 /* A way in pieces that join: Leaflet simplifies by recursion, as deep as a zigzag has points. */
 function pieces(way) {
-  const count = Math.ceil((way.length - 1) / MOST_POINTS);
-  return Array.from({length: count}, (_, i) => way.slice(i * MOST_POINTS, (i + 1) * MOST_POINTS + 1));
+  const count = Math.ceil((way.length - 1) / MAX_POINTS);
+  return Array.from({length: count}, (_, i) => way.slice(i * MAX_POINTS, (i + 1) * MAX_POINTS + 1));
 }
 
 export function shown(studio) {

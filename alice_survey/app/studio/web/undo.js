@@ -1,6 +1,6 @@
 /* Undo and redo: a list of states, of which one is current. States are values: they never change. */
 
-const MOST_STEPS = 500;
+const MAX_STEPS = 500;
 const ONE_EDIT_MS = 1000;
 
 export const startHistory = (state) => ({states: [state], at: 0, tag: "", time: 0});
@@ -14,7 +14,7 @@ export function record(history, state, tag = "", time = 0) {
   if (same(state, current(history))) return history;
   const goesOn = tag !== "" && tag === history.tag && time - history.time < ONE_EDIT_MS && history.at > 0;
   const kept = history.states.slice(0, goesOn ? history.at : history.at + 1);
-  const states = [...kept, state].slice(-MOST_STEPS);
+  const states = [...kept, state].slice(-MAX_STEPS);
   return {states, at: states.length - 1, tag, time};
 }
 

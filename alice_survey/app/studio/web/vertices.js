@@ -4,7 +4,7 @@
 import {el} from "./core.js";
 import {fixed} from "./words.js";
 
-const MOST_HANDLES = 400;
+const MAX_HANDLES = 400;
 const LONG_PRESS_MS = 650;
 const APART_PX = 26;  /* between vertices whose middle gets a handle */
 const ARROWS = {ArrowUp: [1, 0], ArrowDown: [-1, 0], ArrowRight: [0, 1], ArrowLeft: [0, -1]};
@@ -83,7 +83,7 @@ export function vertexHandles(map, name, {unit = "m", text = northEastIn(unit), 
   function fill({points, closed}, ring) {
     const view = map.getBounds().pad(0.2);
     const spots = points.map(place);
-    const seen = points.map((_, i) => i).filter((i) => view.contains(points[i])).slice(0, MOST_HANDLES);
+    const seen = points.map((_, i) => i).filter((i) => view.contains(points[i])).slice(0, MAX_HANDLES);
     const hole = ring ? ", hole " + ring : "";
     seen.forEach((i) => {
       pane.append(handle("corner", "c" + ring + "-" + i, spots[i], {

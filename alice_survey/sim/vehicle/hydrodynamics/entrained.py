@@ -20,7 +20,7 @@ from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.hydrodynamics.geometry import Geometry, Outline
 
 _EXACT_M = 1e-12
-_MOST_STEPS = 200
+_MAX_STEPS = 200
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +105,7 @@ def _root(function: Callable[[float], float], low: float, high: float) -> float:
     a tenth of a second to load, at every start of a command that plans.
     """
     at_low, at_high = function(low), function(high)
-    for _ in range(_MOST_STEPS):
+    for _ in range(_MAX_STEPS):
         if at_high == 0.0 or abs(high - low) <= _EXACT_M:
             break
         place = high - at_high * (high - low) / (at_high - at_low)

@@ -142,11 +142,11 @@ def _series(values: Array, gaps: Places) -> Array:
     return broken
 
 
-def _limit(strip: Axes, values: Array, least: float) -> None:
+def _limit(strip: Axes, values: Array, minimum: float) -> None:
     """Limits that include nearly all values: diverging ones leave the strip."""
     known = values[np.isfinite(values)]
     if not len(known):
         return
     low, high = np.percentile(known, [0.2, 99.8])
-    middle, half = 0.5 * (low + high), max(0.6 * (high - low), least)
+    middle, half = 0.5 * (low + high), max(0.6 * (high - low), minimum)
     strip.set_ylim(middle - half, middle + half)

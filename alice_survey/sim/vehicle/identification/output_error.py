@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import min_squares
 from scipy.spatial.transform import Rotation
 
 from alice_survey.core.errors import VehicleError
@@ -60,7 +60,7 @@ smaller: a parameter that does less is not seen at all."""
 _NOTICED = 2e-3
 """Change of the sum of squares, in sigmas squared, that ends a fit: a twentieth of a sigma of one
 parameter."""
-_MOST_EVALUATIONS = 60
+_MAX_EVALUATIONS = 60
 """Most evaluations of all windows, in each round."""
 _ROUNDS = 4
 """Most re-estimations of the noise."""
@@ -68,7 +68,7 @@ _SAME = 0.02
 """Relative change of the noise that counts as zero."""
 _SAME_WEIGHT = 0.1
 """The same of the prior's weight."""
-_LEAST_SIGMA = np.array([1e-6] * CHANNELS)
+_MIN_SIGMA = np.array([1e-6] * CHANNELS)
 """Noise cannot be estimated smaller: m/s, rad/s, rad."""
 _SINGULAR = 1e-12
 """Ratio of the information's least to greatest eigenvalue, in units of its diagonal."""
@@ -78,7 +78,7 @@ _SINGULAR = 1e-12
 class Simulation:
     """Settings of the simulation of windows."""
 
-    longest_step_s: float = 0.025
+    max_step_s: float = 0.025
     """Rows farther apart are crossed in several steps."""
     hold: bool = False
     """Inputs are held until the next row; else they are linear between rows."""
@@ -148,11 +148,11 @@ def fit_output_error(
     how = simulation or Simulation()
     lower, upper = parameters.bounds
     short = [part for window in windows for part in cut(window, _SHORT_S)]
-    rough = replace(how, longest_step_s=max(how.longest_step_s, _ROUGH_STEP_S))
+    rough = replace(how, max_step_s=max(how.max_step_s, _ROUGH_STEP_S))
     known = prior_of(parameters, windows, prior)
     approach = _FitProblem(short, parameters, rough, _first_sigma(windows), known, settled=1.0)
     approach.begin(parameters.start)
-    result = least_squares(
+    result = min_squares(
         approach.residuals, np.clip(parameters.start, lower, upper), approach.jacobian,
         bounds=(lower, upper), x_scale="jac", ftol=1e-3, xtol=1e-10, gtol=None, max_nfev=20,
     )  # fmt: skip
@@ -165,14 +165,14 @@ def fit_output_error(
         if settled and looseness > 1.0:
             continue
         problem.begin(values)
-        result = least_squares(
+        result = min_squares(
             problem.residuals, np.clip(values, lower, upper), problem.jacobian,
             bounds=(lower, upper), x_scale="jac", ftol=looseness * _NOTICED / problem.samples,
-            xtol=1e-10, gtol=None, max_nfev=_MOST_EVALUATIONS,
+            xtol=1e-10, gtol=None, max_nfev=_MAX_EVALUATIONS,
         )  # fmt: skip
         if result.status == 0:
             raise VehicleError(
-                f"the fit has not settled after {_MOST_EVALUATIONS} evaluations: free fewer "
+                f"the fit has not settled after {_MAX_EVALUATIONS} evaluations: free fewer "
                 "parameters, or start from coefficients that are closer"
             )
         values = result.x
@@ -198,7 +198,7 @@ class _FitProblem:
     ) -> None:
         self.windows, self.parameters, self.how, self.settled = windows, parameters, how, settled
         self.prior, self.prior_weight = prior, 1.0
-        self.sigma = np.maximum(np.where(np.isfinite(sigma), sigma, 1.0), _LEAST_SIGMA)
+        self.sigma = np.maximum(np.where(np.isfinite(sigma), sigma, 1.0), _MIN_SIGMA)
         self.count = len(parameters.names)
         self.measured = [
             np.isfinite(residual_channels(w, _blank(w))) & np.ones(CHANNELS, bool) for w in windows
@@ -266,7 +266,7 @@ class _FitProblem:
         """Estimate the noise from the residuals; return its relative change."""
         sigma = self._channel_sigma(self._by_channel(self.residuals(values)))
         known = np.isfinite(sigma)
-        new = np.maximum(np.where(known, sigma * self.sigma, 1.0), _LEAST_SIGMA)
+        new = np.maximum(np.where(known, sigma * self.sigma, 1.0), _MIN_SIGMA)
         changed = float(np.max(np.abs(new / self.sigma - 1.0)[known]))
         self.sigma = new
         return changed
@@ -287,8 +287,8 @@ class _FitProblem:
         # By chance it may come out below that of white noise: this is not used.
         from_logs = inverse @ (information - held) @ inverse
         if scattered is not None:
-            least = np.sqrt(np.maximum(np.diag(from_logs) / np.diag(scattered), 1.0))
-            from_logs = scattered * np.outer(least, least)
+            minimum = np.sqrt(np.maximum(np.diag(from_logs) / np.diag(scattered), 1.0))
+            from_logs = scattered * np.outer(minimum, minimum)
         # The start is off by its own sigma: a score of weight times that of the prior alone.
         from_prior = self.prior_weight * inverse @ held @ inverse
         tables = [np.zeros((self.count, self.count)) for _ in range(3)]
@@ -376,7 +376,7 @@ class _FitProblem:
         states, observed = np.empty((rows, STATES)), np.empty((rows, CHANNELS))
         slopes = np.empty((rows, CHANNELS, self.count + START))
         simulate(
-            physics, self.parameters.terms, window.record, start, self.how.longest_step_s,
+            physics, self.parameters.terms, window.record, start, self.how.max_step_s,
             self.how.hold, self.scratch, self.sensitivity, states, observed, slopes,
         )  # fmt: skip
         mask = self.measured[i]

@@ -99,7 +99,7 @@ class Replay:
         )
 
     @property
-    def longest_s(self) -> float:
+    def max_s(self) -> float:
         """Duration of the longest stretch."""
         return max(float(self.time_s[b - 1] - self.time_s[a]) for a, b in self._stretches())
 
@@ -285,7 +285,7 @@ def _data(found: Replay, vehicle: Vehicle, others: dict[str, float]) -> dict[str
         "others": others,
         "rows": len(found.time_s),
         "duration_s": float(found.time_s[-1] - found.time_s[0]),
-        "longest_stretch_s": found.longest_s,
+        "longest_stretch_s": found.max_s,
         "starts_s": [float(found.time_s[row] - found.time_s[0]) for row in found.starts],
         "axes": axes,
     }

@@ -492,7 +492,7 @@ def simulate(
     terms: Terms,
     record: Record,
     start: Array,
-    longest_step_s: float,
+    max_step_s: float,
     hold: bool,
     scratch: SlopeScratch,
     sensitivity: Array,
@@ -507,7 +507,7 @@ def simulate(
         terms: P parameters.
         record: T rows.
         start: (10,) state at the first row.
-        longest_step_s: rows farther apart are crossed in equal steps no longer than this.
+        max_step_s: rows farther apart are crossed in equal steps no longer than this.
         hold: the input stays what it was in a row until the next.
         scratch: for C = P + 9 columns; or for none, with no terms.
         sensitivity: (10, C) room.
@@ -543,7 +543,7 @@ def simulate(
             states[row + 1, i] = states[row, i]
         span = record.time_s[row + 1] - record.time_s[row]
         # Slightly over a step is still one step: times are written with rounding.
-        count = max(int(np.ceil(span / longest_step_s - 1e-6)), 1)
+        count = max(int(np.ceil(span / max_step_s - 1e-6)), 1)
         for i in range(count):
             _step(
                 physics, terms, record, row, i * span / count, span / count, hold, states[row + 1],

@@ -194,7 +194,7 @@ def simulated(
     states, observed = np.empty((rows, STATES)), np.empty((rows, CHANNELS))
     nothing = np.zeros(0, np.int64)
     simulate(
-        physics, Terms(nothing, nothing, nothing), window.record, start, how.longest_step_s,
+        physics, Terms(nothing, nothing, nothing), window.record, start, how.max_step_s,
         how.hold, scratch_for(0, window.record.rps.shape[1]), np.zeros((STATES, 0)), states,
         observed, np.empty((rows, CHANNELS, 0)),
     )  # fmt: skip

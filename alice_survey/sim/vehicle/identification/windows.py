@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from alice_survey.core.errors import VehicleError, warn
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.identification.sensitivity import CHANNELS, STATES, Record
-from alice_survey.sim.vehicle.log import VehicleLog, longest_step_s, segments
+from alice_survey.sim.vehicle.log import VehicleLog, max_step_s, segments
 from alice_survey.sim.vehicle.vehicle import Vehicle
 
 RATE_NAMES = ("p", "q", "r")
@@ -18,7 +18,7 @@ Mask = NDArray[np.bool_]
 
 CHANNEL_NAMES = ("u", "v", "w", "p", "q", "r", "roll", "pitch", "heading")
 """Velocity over ground, m/s; rates, rad/s; attitude about the body's axes, rad."""
-_FEWEST_ROWS = 5
+_MIN_ROWS = 5
 """Fewest rows: a shorter stretch gives less information than its free start needs."""
 
 
@@ -82,12 +82,12 @@ def make_windows(
         lost += int(np.sum(~known))
     if not windows:
         raise VehicleError(
-            f"{log.source}: no stretch of {_FEWEST_ROWS} rows has motion, attitude and input"
+            f"{log.source}: no stretch of {_MIN_ROWS} rows has motion, attitude and input"
         )
     if lost:
         warn(
             f"{log.source}: {lost} of {len(log.time_s)} rows are not used: no input, or a stretch "
-            f"of less than {_FEWEST_ROWS} rows or without motion"
+            f"of less than {_MIN_ROWS} rows or without motion"
         )
     return windows
 
@@ -125,12 +125,12 @@ def inputs(log: VehicleLog, vehicle: Vehicle) -> tuple[Array, Array]:
     return np.zeros((count, 0)), table @ np.array(columns)
 
 
-def cut(window: Window, longest_s: float) -> list[Window]:
+def cut(window: Window, max_s: float) -> list[Window]:
     """A window in equal shorter ones; those without information are left out."""
     record = window.record
     known = np.ones(len(record.time_s), bool)
     parts = []
-    for piece in _pieces(record.time_s, known, longest_s):
+    for piece in _pieces(record.time_s, known, max_s):
         short = Record(*(np.ascontiguousarray(table[piece]) for table in record))
         made = _window(window.source, short, window.measured[piece], window.given)
         if made is not None:
@@ -198,7 +198,7 @@ def _held(time_s: Array, rps: Array, wrench: Array) -> Mask:
 
     An input is not carried on for longer than a gap of the log.
     """
-    longest = longest_step_s(time_s)
+    longest = max_step_s(time_s)
     known = np.all(np.isfinite(rps), axis=1) & np.all(np.isfinite(wrench), axis=1)
     last = np.maximum.accumulate(np.where(known, np.arange(len(time_s)), -1))
     fresh: Mask = (last >= 0) & (time_s - time_s[np.maximum(last, 0)] <= longest)
@@ -223,7 +223,7 @@ def _pieces(time_s: Array, known: Mask, window_s: float | None) -> list[slice]:
 def _window(source: str, record: Record, measured: Array, given: tuple[int, ...]) -> Window | None:
     """A stretch; None where it is too short or has nothing of motion or attitude."""
     attitudes = np.flatnonzero(np.all(np.isfinite(record.attitude), axis=1))
-    if len(measured) < _FEWEST_ROWS or not len(attitudes) or not np.any(np.isfinite(measured)):
+    if len(measured) < _MIN_ROWS or not len(attitudes) or not np.any(np.isfinite(measured)):
         return None
     start = np.zeros(STATES)
     start[:4] = record.attitude[attitudes[0]]

@@ -82,10 +82,10 @@ class DvlSpec(NamedTuple):
     range_noise_m: float = 0.02
     range_noise_fraction: float = 0.003
     """Added in squares, of the range (both inferred)."""
-    least_range_m: float = 0.2
+    min_range_m: float = 0.2
     """Inferred."""
-    most_range_m: float = 75.0
-    most_tilt_rad: float = math.radians(25.0)
+    max_range_m: float = 75.0
+    max_tilt_rad: float = math.radians(25.0)
     """Greatest tilt of the instrument's axis from the vertical (inferred)."""
     ping_loss: float = 0.01
     beam_loss: float = 0.01
@@ -125,7 +125,7 @@ class GpsSpec(NamedTuple):
     bias_sigma_m: float = 1.0
     bias_correlation_s: float = 600.0
     """Inferred."""
-    most_depth_m: float = 0.3
+    max_depth_m: float = 0.3
     """Greatest depth of the body's origin with a fix."""
 
 
@@ -145,7 +145,7 @@ class UsblSpec(NamedTuple):
     """Inferred."""
     outlier_m: float = 20.0
     """Half width of an echo's place about the true one (inferred)."""
-    most_range_m: float = 1000.0
+    max_range_m: float = 1000.0
 
 
 class Sensors(NamedTuple):
@@ -168,7 +168,7 @@ class Sensors(NamedTuple):
     """(K, 2)"""
     bottom_dropouts_s: Array
     """(K, 2)"""
-    least_cos_tilt: float
+    min_cos_tilt: float
     compass_every: int
     pressure_every: int
     dvl_every: int
@@ -229,7 +229,7 @@ class SensorSuite(NamedTuple):
             beams=janus_beams(dvl.beam_angle_rad),
             dropouts_s=np.array(self.dvl_dropouts_s, dtype=np.float64).reshape(-1, 2),
             bottom_dropouts_s=np.array(self.bottom_dropouts_s, dtype=np.float64).reshape(-1, 2),
-            least_cos_tilt=math.cos(dvl.most_tilt_rad),
+            min_cos_tilt=math.cos(dvl.max_tilt_rad),
             compass_every=_ticks("compass", compass.rate_hz, tick_s),
             pressure_every=_ticks("pressure sensor", pressure.rate_hz, tick_s),
             dvl_every=_ticks("DVL", dvl.rate_hz, tick_s),

@@ -117,7 +117,7 @@ ranges, how many measurements of each instrument were used and rejected so far, 
 LOG_ROW = len(LOG_COLUMNS)
 LOG_SIGMA, LOG_RANGE, LOG_USED, LOG_REJECTED, LOG_CLEARANCE = 13, 20, 24, 30, 36
 """Offsets of sigmas, ranges, counts and clearance in a row."""
-_LEAST_SPREAD = 0.01
+_MIN_SPREAD = 0.01
 """Least determinant of the scatter of the ends over its squared trace: 1/4 for a square, 0.19 for
 three corners."""
 
@@ -274,7 +274,7 @@ def _hear_floor(time_s: float, used: int, nav: NavigationState, suite: Sensors) 
     cnn, cne, cee = snn - n * sn, sne - n * se, see - e * se
     cnd, ced, cdd = snd - n * sd, sed - e * sd, sdd - d * sd
     determinant = cnn * cee - cne * cne
-    if determinant < _LEAST_SPREAD * (cnn + cee) * (cnn + cee):
+    if determinant < _MIN_SPREAD * (cnn + cee) * (cnn + cee):
         return
     north, east = (cee * cnd - cne * ced) / determinant, (cnn * ced - cne * cnd) / determinant
     altitude = d - north * n - east * e
@@ -493,7 +493,7 @@ def measure_gps(
     time_s: float, now: Array, sensors: Sensors, nav: NavigationState, rng: np.random.Generator
 ) -> bool:
     """North and east of the antenna, if it is out of the water; whether it was."""
-    if now[2] > sensors.gps.most_depth_m:
+    if now[2] > sensors.gps.max_depth_m:
         return False
     place = sensors.place[GPS]
     arm = applied(nav.turns[TRUTH_NOW], place[0], place[1], place[2])
@@ -528,7 +528,7 @@ def measure_usbl(
     a, b = north - sensors.usbl.boat_ned_m[0], east - sensors.usbl.boat_ned_m[1]
     c = depth - sensors.usbl.boat_ned_m[2]
     # A transponder that breaks the surface is not received.
-    if depth <= 0.0 or math.sqrt(a * a + b * b + c * c) > sensors.usbl.most_range_m:
+    if depth <= 0.0 or math.sqrt(a * a + b * b + c * c) > sensors.usbl.max_range_m:
         return False
     sigma = usbl_sigma(sensors, north, east, depth)
     wrong = rng.random() < sensors.usbl.outlier_probability
@@ -564,7 +564,7 @@ def measure_dvl(
     for i in range(sensors.dropouts_s.shape[0]):
         if sensors.dropouts_s[i, 0] <= time_s < sensors.dropouts_s[i, 1]:
             return
-    if turn[2, 2] < sensors.least_cos_tilt or rng.random() < dvl.ping_loss:
+    if turn[2, 2] < sensors.min_cos_tilt or rng.random() < dvl.ping_loss:
         return
     x, y, z = sensors.place[DVL, 0], sensors.place[DVL, 1], sensors.place[DVL, 2]
     p, q, r = now[10], now[11], now[12]
@@ -582,11 +582,11 @@ def measure_dvl(
     for i in range(BEAMS if bottom else 0):
         b0, b1, b2 = sensors.beams[i, 0], sensors.beams[i, 1], sensors.beams[i, 2]
         beam_n, beam_e, down = applied(turn, b0, b1, b2)
-        reach = floor_range(floor, north, east, depth, beam_n, beam_e, down, dvl.most_range_m)
+        reach = floor_range(floor, north, east, depth, beam_n, beam_e, down, dvl.max_range_m)
         if not math.isfinite(reach):
             continue
         clearance = min(clearance, reach * down)
-        if reach < dvl.least_range_m or rng.random() < dvl.beam_loss:
+        if reach < dvl.min_range_m or rng.random() < dvl.beam_loss:
             continue
         heard += 1
         slope = dvl.range_noise_fraction * reach

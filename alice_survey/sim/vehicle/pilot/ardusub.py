@@ -34,9 +34,9 @@ from alice_survey.sim.vehicle.pilot.steering import clamped, head_for
 from alice_survey.sim.vehicle.pilot.steps import END_E, END_N, HEADING, HOLD_S, SPEED, TOLERANCE
 from alice_survey.sim.vehicle.rotations import wrapped
 
-LEAST_SPEED_MPS = 0.2
+MIN_SPEED_MPS = 0.2
 """WPNAV_SPEED_MIN: a slower speed is not taken."""
-LEAST_RADIUS_M = 0.05
+MIN_RADIUS_M = 0.05
 """WPNAV_RADIUS_MIN"""
 _SPARE = 0.05
 _SLOW = 0.1
@@ -80,7 +80,7 @@ def to_waypoint(
     length = math.hypot(dn, de)
     course = math.atan2(de, dn) if length > 1e-6 else now
     s, c = math.sin(course), math.cos(course)
-    speed = max(step[SPEED], LEAST_SPEED_MPS)
+    speed = max(step[SPEED], MIN_SPEED_MPS)
     acceleration = min(settings[_ACCEL], 0.5 * math.sqrt(speed * settings[_JERK]))
     _set_pace(c, s, now, dt_s, settings, pilot)
     quicken, dt = 0.0, memory[slot.TRACK_PACE] * dt_s
@@ -108,7 +108,7 @@ def to_waypoint(
     pilot.report[slot.BY_SWAY] = 1.0
 
     away = math.hypot(step[END_N] - point[slot.POINT_NORTH], step[END_E] - point[slot.POINT_EAST])
-    radius = max(step[TOLERANCE], LEAST_RADIUS_M)
+    radius = max(step[TOLERANCE], MIN_RADIUS_M)
     if memory[slot.KEEPS] == 0.0 and (at < length or math.hypot(away, heave_m) > radius):
         return False
     memory[slot.KEEPS] = 1.0

@@ -17,7 +17,7 @@ from alice_survey.sim.vehicle.allocation import (
     preference_weights,
 )
 from alice_survey.sim.vehicle.compiled import kernel
-from alice_survey.sim.vehicle.fins import MOST_RAD, Fins, write_fin_matrix
+from alice_survey.sim.vehicle.fins import MAX_RAD, Fins, write_fin_matrix
 from alice_survey.sim.vehicle.pilot.gains import INNER, SWAY, Gains
 from alice_survey.sim.vehicle.pilot.guidance import steer
 from alice_survey.sim.vehicle.pilot.memory import (
@@ -81,7 +81,7 @@ def new_allocation(vehicle: Vehicle, health: Array, *, exact: bool, axes: Array)
     n, thrusters, fins = vehicle.actuators, len(vehicle.thrusters), vehicle.plant.fins
     matrix, upper = np.zeros((6, n)), np.zeros(n)
     matrix[:, :thrusters] = vehicle.configuration_matrix
-    upper[thrusters:] = fins.drives[:, MOST_RAD]
+    upper[thrusters:] = fins.drives[:, MAX_RAD]
     return Allocation(
         exact, vehicle.plant.propulsion, fins, matrix, axes.copy(), health,
         lower=-upper, upper=upper, weights=np.ones(n), thrust=np.zeros(n),

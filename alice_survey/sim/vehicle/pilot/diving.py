@@ -29,7 +29,7 @@ from alice_survey.sim.vehicle.pilot.linear import (
 )
 from alice_survey.sim.vehicle.pilot.memory import PilotState
 
-MOST_PITCH_RAD = math.radians(20.0)
+MAX_PITCH_RAD = math.radians(20.0)
 """Greatest commanded pitch besides that of level flight: two thirds of what ends a mission."""
 _DEPTH_KEPT_M = 0.2
 """Within it the integral learns."""
@@ -104,14 +104,14 @@ def fly_to_depth(
     memory, demand = pilot.memory, pilot.demand
     off, ahead = estimate[vector.DEPTH] - depth_m, under_way.dive_ahead_m
     bent = off / ahead + memory[slot.HEAVE_SUM] - feed_mps / speed_mps
-    kept = min(max(bent, -MOST_PITCH_RAD), MOST_PITCH_RAD)
+    kept = min(max(bent, -MAX_PITCH_RAD), MAX_PITCH_RAD)
     demand[slot.REF_PITCH] = under_way.level_rad + kept
     demand[slot.REF_PITCH_RATE] = 0.0
     if kept == bent:
         demand[slot.REF_PITCH_RATE] = (pilot.point[slot.SINK_SPEED] - feed_mps) / ahead
     if abs(off) < _DEPTH_KEPT_M:
         total = memory[slot.HEAVE_SUM] + INTEGRAL_SHARE * speed_mps / (ahead * ahead) * off * dt_s
-        memory[slot.HEAVE_SUM] = min(max(total, -0.5 * MOST_PITCH_RAD), 0.5 * MOST_PITCH_RAD)
+        memory[slot.HEAVE_SUM] = min(max(total, -0.5 * MAX_PITCH_RAD), 0.5 * MAX_PITCH_RAD)
     pilot.report[slot.WANTED_DEPTH] = depth_m
 
 

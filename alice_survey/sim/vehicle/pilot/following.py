@@ -17,14 +17,14 @@ from alice_survey.sim.vehicle.pilot.gains import (
     Gains,
 )
 from alice_survey.sim.vehicle.pilot.memory import PilotState
-from alice_survey.sim.vehicle.pilot.path import LEAST_SLANT, Path, heading_at, place_at
+from alice_survey.sim.vehicle.pilot.path import MIN_SLANT, Path, heading_at, place_at
 from alice_survey.sim.vehicle.pilot.settings import Guidance, turning_speed_mps
 from alice_survey.sim.vehicle.pilot.steering import clamped, head_for, surge_at, sway_by
 from alice_survey.sim.vehicle.rotations import wrapped
 
 _HOVER_M = 2.0
 """Nearer than this a vehicle with sway hovers towards its goal instead of heading for it."""
-_MOST_LEAN_RAD = math.radians(30.0)
+_MAX_LEAN_RAD = math.radians(30.0)
 """Greatest angle into a current that is learned (inferred: half of a vehicle's speed across)."""
 _HOVER_SHARE = 0.25
 """Bandwidth of keeping place by surge, over that of the surge loop."""
@@ -107,7 +107,7 @@ def follow(
     course = now - beta
     sine, cosine = math.sin(course), math.cos(course)
     surge, sway = point[slot.SURGE_SPEED], point[slot.SWAY_SPEED]
-    slant = max(1.0 - curvature * cross, LEAST_SLANT)
+    slant = max(1.0 - curvature * cross, MIN_SLANT)
     pace = min(max(surge * cosine - sway * sine, 0.0), 2.0 * speed) / slant
     feed = curvature * pace
     quicken = (k_front - k_back) / (2.0 * window) * pace * pace
@@ -166,7 +166,7 @@ def _lean(
     if straight and abs(cross) < 0.5 * ahead:
         step = -INTEGRAL_SHARE * path.speed_mps / (ahead * ahead) * cross * dt_s
         north, east = memory[slot.LEAN_N] - s * step, memory[slot.LEAN_E] + c * step
-        cut = min(1.0, _MOST_LEAN_RAD / max(math.hypot(north, east), 1e-9))
+        cut = min(1.0, _MAX_LEAN_RAD / max(math.hypot(north, east), 1e-9))
         memory[slot.LEAN_N], memory[slot.LEAN_E] = cut * north, cut * east
     return float(c * memory[slot.LEAN_E] - s * memory[slot.LEAN_N])
 

@@ -20,7 +20,7 @@ Yaw is not a bare axis: under way a slender hull slips through its turns, and th
 gives turns it further (Munk moment) or back. Where the gains above leave a mode of heading, sway,
 yaw rate, lag and integral together damped by less than HEADING_DAMPING at the survey's speed, the
 gains are the nearest to them (by their logarithms, on a grid) that damp enough; if none do, those
-that damp best, unless that is less than LEAST_HEADING_DAMPING. At rest and at half the speed, which
+that damp best, unless that is less than MIN_HEADING_DAMPING. At rest and at half the speed, which
 are passed through, PASSING_DAMPING less is enough.
 
 The sway axis is a PID that asks a speed of an inner loop (paper, section VII): the inner gain is
@@ -48,7 +48,7 @@ from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.allocation import AXIS_WEIGHTS, LEVEL_WEIGHTS
 from alice_survey.sim.vehicle.dynamics import Body
-from alice_survey.sim.vehicle.fins import MOST_RAD, Fins, fin_slope, write_fin_matrix
+from alice_survey.sim.vehicle.fins import MAX_RAD, Fins, fin_slope, write_fin_matrix
 from alice_survey.sim.vehicle.pilot.linear import (
     LATERAL,
     NO_FINS,
@@ -58,7 +58,7 @@ from alice_survey.sim.vehicle.pilot.linear import (
     mode_damping,
 )
 from alice_survey.sim.vehicle.propulsion import thrust_limits
-from alice_survey.sim.vehicle.under_way import keeps, least_radius_m
+from alice_survey.sim.vehicle.under_way import keeps, min_radius_m
 from alice_survey.sim.vehicle.vehicle import Vehicle
 
 SURGE, SWAY, HEAVE, YAW, ROLL, PITCH = range(6)
@@ -82,11 +82,11 @@ DAMPING_RATIO = 1.0
 INTEGRAL_SHARE = 0.1
 """Bandwidth of integral action over that of the loop (Fossen 2011, section 12.2)."""
 SAMPLES_PER_PERIOD = 20.0
-LEAST_SAMPLES_PER_PERIOD = 10.0
+MIN_SAMPLES_PER_PERIOD = 10.0
 """Samples per period of an oscillation that couples heading and sway."""
 HEADING_DAMPING = 0.7
 """Wanted damping of every mode of the heading loop (inferred: an overshoot of a twentieth)."""
-LEAST_HEADING_DAMPING = 0.5
+MIN_HEADING_DAMPING = 0.5
 """Below it a vehicle is not flown (inferred: an overshoot of a sixth)."""
 PASSING_DAMPING = 0.2
 """Reduction of the heading loop's damping below the survey's speed (inferred)."""
@@ -94,7 +94,7 @@ KEPT_RAD = math.radians(10.0)
 """Tolerance within which a heading counts as kept."""
 _TICK_S = 0.05
 """Of the control; half of it is added to the lag (a held value is half a tick old)."""
-_MOST_TURN_RAD_S = math.radians(30.0)
+_MAX_TURN_RAD_S = math.radians(30.0)
 """Greatest commanded yaw rate, if the thrusters allow it."""
 _NO_FORCE = 1e-6
 """A force or moment of less is none, N or N m."""
@@ -172,16 +172,16 @@ def gains_for(vehicle: Vehicle, speed_mps: float, navigation_hz: float = 5.0) ->
     gyradius_m = math.sqrt(vehicle.mass[5, 5] / vehicle.mass[1, 1])
     for axis, degree in enumerate(degrees[: len(configuration)]):
         inertia = float(vehicle.mass[degree, degree])
-        least, most = authority(configuration, lower, upper, axis)
-        axes[axis, [MASS, LEAST, MOST]] = inertia, least, most
-        weakest = min(-least, most)
+        minimum, maximum = authority(configuration, lower, upper, axis)
+        axes[axis, [MASS, LEAST, MOST]] = inertia, minimum, maximum
+        weakest = min(-minimum, maximum)
         if weakest < _NO_FORCE:
             if axis == SWAY:
                 continue
             name = ("surge", "sway", "heave", "yaw")[axis]
             raise VehicleError(
                 f"the thrusters of {vehicle.name} cannot control {name} both ways "
-                f"({least:.2g} to {most:.2g}): it cannot fly a survey"
+                f"({minimum:.2g} to {maximum:.2g}): it cannot fly a survey"
             )
         lag_s = effective_lag_s(configuration, lower, upper, slowness_s, axis, gyradius_m)
         lag_s += _TICK_S / 2
@@ -197,20 +197,20 @@ def gains_for(vehicle: Vehicle, speed_mps: float, navigation_hz: float = 5.0) ->
         axes[axis, FASTEST] = fastest = _steady_speed(plant.body, degree, STEADY_SHARE * weakest)
         moving = np.zeros(6)
         moving[degree] = fastest
-        most_decay = float(linear_damping(plant.body, moving)[degree, degree]) / inertia
+        max_decay = float(linear_damping(plant.body, moving)[degree, degree]) / inertia
         if axis == YAW:
-            sampled_rad_s = 2 * math.pi * navigation_hz / LEAST_SAMPLES_PER_PERIOD
+            sampled_rad_s = 2 * math.pi * navigation_hz / MIN_SAMPLES_PER_PERIOD
             bare = np.array([rate, place])
             rate, place, damped = _damped_together(
-                plant.body, speed_mps, bare, lag_s, omega, most_decay, sampled_rad_s
+                plant.body, speed_mps, bare, lag_s, omega, max_decay, sampled_rad_s
             )
             _check_damped(vehicle, "yaw", damped, speed_mps)
             axes[axis, [RATE, PLACE, INNER]] = rate, place, rate
-        axes[axis, INTEGRAL] = _integral(rate, place, omega, most_decay)
+        axes[axis, INTEGRAL] = _integral(rate, place, omega, max_decay)
         axes[axis, [LAG, BANDWIDTH]] = lag_s, omega
         if rate > 0.0:
             axes[axis, WEIGHT] = min(max((place / omega - decay) / rate, 0.0), 1.0)
-    axes[YAW, FASTEST] = min(axes[YAW, FASTEST], _MOST_TURN_RAD_S)
+    axes[YAW, FASTEST] = min(axes[YAW, FASTEST], _MAX_TURN_RAD_S)
     return Gains(plant.body, plant.fins, np.zeros(0), 0.0, axes)
 
 
@@ -223,10 +223,10 @@ def _gains_of_fins(vehicle: Vehicle, speed_mps: float, navigation_hz: float) -> 
             "controlled together: leave out the one or the other"
         )
     cruise = np.array([speed_mps, 0.0, 0.0, 0.0, 0.0, 0.0])
-    radius_m = least_radius_m(vehicle, speed_mps, STEADY_SHARE)
+    radius_m = min_radius_m(vehicle, speed_mps, STEADY_SHARE)
     lower, upper = np.zeros(vehicle.actuators), np.zeros(vehicle.actuators)
     thrust_limits(plant.propulsion, np.ones(count), cruise, lower, upper)
-    upper[count:] = plant.fins.drives[:, MOST_RAD]
+    upper[count:] = plant.fins.drives[:, MAX_RAD]
     lower[count:] = -upper[count:]
     matrix = np.zeros((6, vehicle.actuators))
     matrix[:, :count] = vehicle.configuration_matrix
@@ -245,14 +245,14 @@ def _gains_of_fins(vehicle: Vehicle, speed_mps: float, navigation_hz: float) -> 
     for row, axis in enumerate(used):
         degree = _DEGREE[axis]
         inertia = float(vehicle.mass[degree, degree])
-        least, most = authority(steers, lower, upper, row)
-        axes[axis, [MASS, LEAST, MOST]] = inertia, least, most
-        weakest = min(-least, most)
+        minimum, maximum = authority(steers, lower, upper, row)
+        axes[axis, [MASS, LEAST, MOST]] = inertia, minimum, maximum
+        weakest = min(-minimum, maximum)
         if weakest < _NO_FORCE:
             name = ("surge", "", "", "yaw", "roll", "pitch")[axis]
             raise VehicleError(
                 f"thrusters and fins of {vehicle.name} cannot control {name} both ways at "
-                f"{speed_mps:g} m/s ({least:.2g} to {most:.2g}): it cannot fly a survey"
+                f"{speed_mps:g} m/s ({minimum:.2g} to {maximum:.2g}): it cannot fly a survey"
             )
         lag_s = effective_lag_s(matrix[list(_DEGREE)], lower, upper, slowness_s, axis, gyradius_m)
         lag_s += _TICK_S / 2
@@ -266,7 +266,7 @@ def _gains_of_fins(vehicle: Vehicle, speed_mps: float, navigation_hz: float) -> 
             plane = LATERAL if axis == YAW else VERTICAL
             rate, place, damped = _damped_together(
                 plant.body, speed_mps, np.array([rate, place]), lag_s, omega, max(decay, 0.0),
-                2 * math.pi * known_hz / LEAST_SAMPLES_PER_PERIOD,
+                2 * math.pi * known_hz / MIN_SAMPLES_PER_PERIOD,
                 fins=plant.fins, plane=plane, slower=_SLOWER_BY_FINS,
             )  # fmt: skip
             _check_damped(vehicle, "yaw" if axis == YAW else "pitch", damped, speed_mps)
@@ -280,18 +280,18 @@ def _gains_of_fins(vehicle: Vehicle, speed_mps: float, navigation_hz: float) -> 
             axes[axis, FASTEST] = _steady_speed(plant.body, degree, STEADY_SHARE * weakest)
             if rate > 0.0:
                 axes[axis, WEIGHT] = min(max((place / omega - decay) / rate, 0.0), 1.0)
-    axes[YAW, FASTEST] = min(speed_mps / radius_m, _MOST_TURN_RAD_S)
+    axes[YAW, FASTEST] = min(speed_mps / radius_m, _MAX_TURN_RAD_S)
     level = keeps(vehicle, speed_mps)
     level_rad = 0.0 if level is None else level.pitch_rad
     return Gains(plant.body, plant.fins, np.zeros(len(vehicle.fins)), level_rad, axes)
 
 
 def _check_damped(vehicle: Vehicle, axis: str, damped: float, speed_mps: float) -> None:
-    if damped < LEAST_HEADING_DAMPING:
+    if damped < MIN_HEADING_DAMPING:
         raise VehicleError(
             f"the {axis} loop of {vehicle.name} with {vehicle.coefficients.name!r} "
             f"coefficients cannot be damped at {speed_mps:g} m/s (damping ratio "
-            f"{damped:.2f} at best, {LEAST_HEADING_DAMPING:g} is needed): lower the speed"
+            f"{damped:.2f} at best, {MIN_HEADING_DAMPING:g} is needed): lower the speed"
         )
 
 
@@ -306,7 +306,7 @@ def _holds(configuration: Array, lower: Array, upper: Array) -> bool:
     if np.linalg.matrix_rank(configuration[[0, 2, 3, 4, 5]]) < 5:
         return False
     ends = [authority(configuration, lower, upper, axis) for axis in (ROLL, PITCH)]
-    return all(min(-least, most) > _NO_FORCE for least, most in ends)
+    return all(min(-minimum, maximum) > _NO_FORCE for minimum, maximum in ends)
 
 
 def placed(lag_s: float, decay_per_s: float, fastest_rad_s: float) -> tuple[float, float, float]:
@@ -326,8 +326,8 @@ def placed(lag_s: float, decay_per_s: float, fastest_rad_s: float) -> tuple[floa
     return omega, max(rate, 0.0), lag_s * real * omega**2
 
 
-def _integral(rate: float, place: float, omega: float, most_decay: float) -> float:
-    return place * min(INTEGRAL_SHARE * omega, place / (rate + most_decay))
+def _integral(rate: float, place: float, omega: float, max_decay: float) -> float:
+    return place * min(INTEGRAL_SHARE * omega, place / (rate + max_decay))
 
 
 def heading_loop(
@@ -370,7 +370,7 @@ def _damped_together(
     bare: Array,
     lag_s: float,
     omega: float,
-    most_decay: float,
+    max_decay: float,
     sampled_rad_s: float,
     *,
     fins: Fins = NO_FINS,
@@ -385,7 +385,7 @@ def _damped_together(
         bare: (2,) gains of the axis by itself.
         lag_s: lag of the thrusters.
         omega: natural frequency placed for the axis by itself.
-        most_decay: greatest d / m.
+        max_decay: greatest d / m.
         sampled_rad_s: bound on the frequency of a pair of poles.
         fins: of the vehicle.
         plane: `LATERAL` or `VERTICAL`.
@@ -404,7 +404,7 @@ def _damped_together(
     for share in (1.0, *slower):
         loop = heading_loop(body, share * speed_mps, row, fins, plane)
         loops = np.repeat(loop[None], len(gains), axis=0)
-        integral = [_integral(rate, place, omega, most_decay) for rate, place in gains]
+        integral = [_integral(rate, place, omega, max_decay) for rate, place in gains]
         loops[:, 4, 0] = -np.array(integral) / lag_s
         loops[:, 4, [1, 3]] = -gains[:, ::-1] / lag_s
         # Without speed sway decays by itself, or not at all; it is not of the loop then.

@@ -194,7 +194,7 @@ def _target_m(path: Path, guidance: Guidance, pilot: PilotState) -> float:
     """
     if pilot.memory[slot.FLOOR_KNOWN] == 0.0:
         limits = guidance.limits
-        return float(min(limits.blind_depth_m, limits.most_depth_m - _CAUTION_M))
+        return float(min(limits.blind_depth_m, limits.max_depth_m - _CAUTION_M))
     return float(pilot.memory[slot.FLOOR] - path.altitude_m)
 
 
@@ -330,7 +330,7 @@ def _on_path(
         _enter(pilot, ASCEND)
     elif abs(report[slot.CROSS]) > guidance.lost_m:
         memory[slot.RETURNS] += 1.0
-        if memory[slot.RETURNS] > guidance.limits.most_returns:
+        if memory[slot.RETURNS] > guidance.limits.max_returns:
             _abort(LOST_PATH, estimate, pilot)
             return
         # Back to where the path was left; of an arc, to its start, since the way in is straight.

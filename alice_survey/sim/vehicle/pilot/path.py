@@ -20,7 +20,7 @@ from alice_survey.sim.vehicle.compiled import kernel
 
 _GAP_M = 1e-3
 _KINK_RAD = 1e-3
-LEAST_SLANT = 0.3
+MIN_SLANT = 0.3
 """Least 1 - k e of the projection: towards an arc's centre the path's length per vehicle's way
 grows without bound."""
 
@@ -216,7 +216,7 @@ def advance(
     c, s = math.cos(heading), math.sin(heading)
     ahead = (north_m - n) * c + (east_m - e) * s
     cross = (east_m - e) * c - (north_m - n) * s
-    step = ahead / max(1.0 - k * cross, LEAST_SLANT)
+    step = ahead / max(1.0 - k * cross, MIN_SLANT)
     moved = along_m + min(max(step, -most_m), most_m)
     # Before a leg's start only where progress already is there: on the way in.
     moved = max(moved, min(along_m, 0.0))

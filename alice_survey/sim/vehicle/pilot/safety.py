@@ -61,16 +61,16 @@ _STEP_M = 0.1
 class SafetyLimits(NamedTuple):
     """Bounds beyond which the vehicle aborts and surfaces."""
 
-    least_altitude_m: float
+    min_altitude_m: float
     """Least clearance of all parts of the vehicle above the sea floor."""
-    most_depth_m: float
-    most_pitch_rad: float = math.radians(30.0)
+    max_depth_m: float
+    max_pitch_rad: float = math.radians(30.0)
     lost_bottom_s: float = 20.0
     stuck_s: float = 90.0
     """Longest time without progress of the dive, the approach or the survey."""
-    most_returns: float = 3.0
+    max_returns: float = 3.0
     """Number of times that the vehicle may be carried off the path and return."""
-    longest_s: float = 86400.0
+    max_s: float = 86400.0
     """Longest duration of the mission up to the ascent."""
     climb_s: float = 10.0
     """How long the vehicle may take to climb back to the least altitude; below half of it there is
@@ -121,7 +121,7 @@ def mind_floor(depth_m: float, estimate: Array, limits: SafetyLimits, pilot: Pil
     Returns:
         A depth, no greater, with at least 1.25 times the least clearance.
     """
-    memory, least = pilot.memory, limits.least_altitude_m
+    memory, minimum = pilot.memory, limits.min_altitude_m
     clear = _clear_m(estimate)
     if not math.isfinite(clear):
         if _goes_on_blind(limits, pilot):
@@ -129,8 +129,8 @@ def mind_floor(depth_m: float, estimate: Array, limits: SafetyLimits, pilot: Pil
         else:
             memory[PACE] = max(0.0, 1.0 - memory[LOST_S] / _STOP_S)
         return depth_m
-    spare = clear - _KEPT * least
-    memory[PACE] = min(max((clear / least - 1.0) / (_KEPT - 1.0), 0.0), 1.0)
+    spare = clear - _KEPT * minimum
+    memory[PACE] = min(max((clear / minimum - 1.0) / (_KEPT - 1.0), 0.0), 1.0)
     return float(min(depth_m, estimate[DEPTH] + spare))
 
 
@@ -165,10 +165,10 @@ def watch(
     memory[LOST_S] = 0.0 if heard or phase == DIVE else memory[LOST_S] + dt_s
     # A missing altitude neither clears nor adds to the suspicion.
     if heard:
-        least = limits.least_altitude_m
-        memory[LOW_S] = memory[LOW_S] + dt_s if clear < least else 0.0
-        memory[UNSAFE_S] = memory[UNSAFE_S] + dt_s if clear < 0.5 * least else 0.0
-    steep = abs(estimate[PITCH]) > limits.most_pitch_rad
+        minimum = limits.min_altitude_m
+        memory[LOW_S] = memory[LOW_S] + dt_s if clear < minimum else 0.0
+        memory[UNSAFE_S] = memory[UNSAFE_S] + dt_s if clear < 0.5 * minimum else 0.0
+    steep = abs(estimate[PITCH]) > limits.max_pitch_rad
     memory[PITCHED_S] = memory[PITCHED_S] + dt_s if steep else 0.0
     if progress_m > memory[BEST] + _STEP_M:
         memory[BEST], memory[SINCE_BEST_S] = progress_m, 0.0
@@ -179,7 +179,7 @@ def watch(
         return TOO_LOW
     if memory[PITCHED_S] > _WITHIN_S:
         return TOO_STEEP
-    if estimate[DEPTH] > limits.most_depth_m:
+    if estimate[DEPTH] > limits.max_depth_m:
         return TOO_DEEP
     if memory[LOST_S] > limits.lost_bottom_s and not _goes_on_blind(limits, pilot):
         return NO_BOTTOM
@@ -187,7 +187,7 @@ def watch(
         if phase == DIVE:
             return NO_DIVE if memory[FLOOR_KNOWN] > 0.0 else NO_BOTTOM
         return NO_APPROACH if phase == APPROACH else NO_PROGRESS
-    if time_s > limits.longest_s:
+    if time_s > limits.max_s:
         return TOO_LONG
     return NONE
 

@@ -102,7 +102,7 @@ def pilot_guidance(
     path: Path,
     controller: Literal["sway", "los"],
     *,
-    most_depth_m: float,
+    max_depth_m: float,
     point_body_m: tuple[float, float, float] = LEFT_PORT_BODY_M,
     look_ahead_m: float | None = None,
     spot_rad_s: float = SPOT_RAD_S,
@@ -117,9 +117,9 @@ def pilot_guidance(
         gains: gains of the vehicle.
         path: its speed and altitude count.
         controller: `sway` or `los`.
-        most_depth_m: no deeper than this.
+        max_depth_m: no deeper than this.
         point_body_m: the followed point.
-        look_ahead_m: when heading for the path; `shortest_look_ahead_m` when left out, and for
+        look_ahead_m: when heading for the path; `min_look_ahead_m` when left out, and for
             `sway`, where there is none, SWAY_LOOK_AHEAD_M.
         spot_rad_s: greatest rate of turns on the spot; a vehicle that can do less turns slower.
         limits: for safety; half the path's altitude is the least when left out.
@@ -141,7 +141,7 @@ def pilot_guidance(
             "cannot fly: plan with turns = 'spot' or 'arcs', or fly alice with the controller sway"
         )
     if look_ahead_m is None:
-        look_ahead_m = shortest_look_ahead_m(gains, speed, point_body_m[0])
+        look_ahead_m = min_look_ahead_m(gains, speed, point_body_m[0])
     if gains.dives_by_pitch:
         look_ahead_m = max(look_ahead_m, _gentle_m(gains, YAW, speed, 0.5 * CONTROL_LENGTH_M))
     if math.isnan(look_ahead_m) and not by_sway:
@@ -174,7 +174,7 @@ def pilot_guidance(
         spot_rad_s2=spot_rad_s * float(axes[YAW, BANDWIDTH]) / _RAMP_PERIODS,
         step_mps=step_mps,
         step_mps2=step_mps * float(axes[SWAY, BANDWIDTH]) / _RAMP_PERIODS,
-        limits=limits or SafetyLimits(0.5 * path.altitude_m, most_depth_m),
+        limits=limits or SafetyLimits(0.5 * path.altitude_m, max_depth_m),
         under_way=under_way,
     )
 
@@ -204,7 +204,7 @@ def _under_way(gains: Gains, path: Path, tightest_per_m: float) -> UnderWay:
             f"the route has turns of {1 / tightest_per_m:.2f} m radius, and the fins hold "
             f"{speed / fastest:.2f} m at {speed:g} m/s: raise plan.turn_radius_m"
         )
-    look_ahead_m = _shortest_m(lambda ahead_m: damping_ratio(dive_loop(gains, speed, ahead_m)))
+    look_ahead_m = _min_m(lambda ahead_m: damping_ratio(dive_loop(gains, speed, ahead_m)))
     if math.isnan(look_ahead_m):
         raise VehicleError(
             f"no look-ahead up to {_LOOK_AHEADS_M[-1]:g} m keeps the vehicle from weaving about "
@@ -300,7 +300,7 @@ def los_loop(gains: Gains, speed_mps: float, lever_m: float, look_ahead_m: float
     return loop
 
 
-def shortest_look_ahead_m(gains: Gains, speed_mps: float, lever_m: float) -> float:
+def min_look_ahead_m(gains: Gains, speed_mps: float, lever_m: float) -> float:
     """The shortest look-ahead with which `los` is damped well enough on a straight path.
 
     The longer it is, the further does a current hold the vehicle off the path; the shorter, the
@@ -321,10 +321,10 @@ def shortest_look_ahead_m(gains: Gains, speed_mps: float, lever_m: float) -> flo
     Returns:
         NaN where no look-ahead up to 100 m gives that damping.
     """
-    return _shortest_m(lambda ahead_m: damping_ratio(los_loop(gains, speed_mps, lever_m, ahead_m)))
+    return _min_m(lambda ahead_m: damping_ratio(los_loop(gains, speed_mps, lever_m, ahead_m)))
 
 
-def _shortest_m(damping: Callable[[float], float]) -> float:
+def _min_m(damping: Callable[[float], float]) -> float:
     """The shortest look-ahead with LOS_DAMPING_RATIO; NaN where there is none."""
     ratios = np.array([damping(float(each)) for each in _LOOK_AHEADS_M])
     if not np.any(ratios >= LOS_DAMPING_RATIO):

@@ -93,7 +93,7 @@ def start_standing(at: float, speed: float, pilot: PilotState) -> None:
 
 @kernel
 def ramp(
-    at: float, speed: float, goal: float, most: float, acceleration: float, dt_s: float
+    at: float, speed: float, goal: float, maximum: float, acceleration: float, dt_s: float
 ) -> tuple[float, float, float]:
     """Move a reference towards its goal for a tick, so that it can still stop there.
 
@@ -101,7 +101,7 @@ def ramp(
         at: its place, at or before the goal.
         speed: its speed, not negative.
         goal: place to stop at.
-        most: greatest speed.
+        maximum: greatest speed.
         acceleration: greatest, either way.
         dt_s: the tick.
 
@@ -112,7 +112,7 @@ def ramp(
     # Braking from here with the greatest acceleration takes all that is left.
     stopping = math.sqrt(2.0 * acceleration * max(left, 0.0))
     # Down no faster than it may, but for the law of stopping, which decides.
-    wanted = max(min(speed + acceleration * dt_s, most), speed - acceleration * dt_s)
+    wanted = max(min(speed + acceleration * dt_s, maximum), speed - acceleration * dt_s)
     wanted = min(wanted, stopping)
     step = wanted * dt_s
     if step >= left - _TINY:
@@ -140,7 +140,7 @@ class StopReference(NamedTuple):
 
 @kernel
 def _move_on(
-    goal: float, most: float, acceleration: float, lag_s: float, dt_s: float, pilot: PilotState
+    goal: float, maximum: float, acceleration: float, lag_s: float, dt_s: float, pilot: PilotState
 ) -> float:
     """Move ramp and reference on by a tick.
 
@@ -149,7 +149,7 @@ def _move_on(
     """
     memory = pilot.memory
     memory[slot.RAMP], memory[slot.RAMP_SPEED], quicken = ramp(
-        memory[slot.RAMP], memory[slot.RAMP_SPEED], goal, most, acceleration, dt_s
+        memory[slot.RAMP], memory[slot.RAMP_SPEED], goal, maximum, acceleration, dt_s
     )
     speed = memory[slot.REF_SPEED]
     speed += min(dt_s / lag_s, 1.0) * (memory[slot.RAMP_SPEED] - speed)
@@ -172,10 +172,10 @@ def _turning(
     memory, sense = pilot.memory, math.copysign(1.0, path.turn_rad[leg])
     n, e, start, _ = place_at(path, leg, 0.0)
     behind = abs(wrapped(start + sense * memory[slot.REF] - estimate[vector.HEADING]))
-    most = guidance.spot_rad_s * _patience(behind / _BEHIND_RAD)
+    maximum = guidance.spot_rad_s * _patience(behind / _BEHIND_RAD)
     goal = abs(path.turn_rad[leg])
     lag_s = gains.axes[YAW, LAG]
-    quicken = sense * _move_on(goal, most, guidance.spot_rad_s2, lag_s, dt_s, pilot)
+    quicken = sense * _move_on(goal, maximum, guidance.spot_rad_s2, lag_s, dt_s, pilot)
     heading, rate = start + sense * memory[slot.REF], sense * memory[slot.REF_SPEED]
     over = goal - memory[slot.REF] < 0.5 * STOP_RAD and memory[slot.RAMP] >= goal
     return StopReference(n, e, heading, 0.0, 0.0, heading, rate, quicken, 0.0, over)
@@ -190,12 +190,12 @@ def _moving(
     n, e, course, _ = place_at(path, leg, memory[slot.REF])
     dn, de = n - point[slot.POINT_NORTH], e - point[slot.POINT_EAST]
     behind = math.cos(course) * dn + math.sin(course) * de
-    most = path.speed_mps if side == 0.0 else guidance.step_mps
-    most *= memory[slot.PACE] * _patience(behind / _BEHIND_M)
+    maximum = path.speed_mps if side == 0.0 else guidance.step_mps
+    maximum *= memory[slot.PACE] * _patience(behind / _BEHIND_M)
     acceleration = guidance.stop_mps2 if side == 0.0 else guidance.step_mps2
     lag_s = gains.axes[SURGE if side == 0.0 else SWAY, LAG]
     goal = path.length_m[leg]
-    quicken = _move_on(goal, most, acceleration, lag_s, dt_s, pilot)
+    quicken = _move_on(goal, maximum, acceleration, lag_s, dt_s, pilot)
     along, speed = memory[slot.REF], memory[slot.REF_SPEED]
     n, e, course, curvature = place_at(path, leg, along)
     over = goal - along < 0.5 * STOP_M and memory[slot.RAMP] >= goal

@@ -49,14 +49,14 @@ from alice_survey.sim.vehicle.rotations import wrapped
 
 
 @kernel
-def clamped(value: float, most: float) -> float:
+def clamped(value: float, maximum: float) -> float:
     """The value within -most and most."""
-    return min(max(value, -most), most)
+    return min(max(value, -maximum), maximum)
 
 
 @kernel
 def place_demand(
-    gains: Gains, axis: int, error: float, speed: float, feed: float, total: float, most: float
+    gains: Gains, axis: int, error: float, speed: float, feed: float, total: float, maximum: float
 ) -> tuple[float, float]:
     """A PID on place that commands a speed, and a proportional loop on that speed.
 
@@ -70,14 +70,14 @@ def place_demand(
         speed: measured.
         feed: speed of the wanted place.
         total: k_I times the integral of the error, a speed.
-        most: bound of the proportional part, a speed.
+        maximum: bound of the proportional part, a speed.
 
     Returns:
         The speed that drag is to be expected at, and the acceleration.
     """
     row = gains.axes[axis]
     inner = row[INNER]
-    steady = feed + clamped(row[PLACE] / inner * error, most)
+    steady = feed + clamped(row[PLACE] / inner * error, maximum)
     derivative = (row[RATE] / inner - 1.0) * (feed - speed)
     return steady, inner * (steady + total + derivative - speed)
 
@@ -156,9 +156,11 @@ def write_wrench(gains: Gains, pilot: PilotState, wrench: Array) -> None:
             asked += body.mass[i, other if other < 3 else 5] * demand[slot.ACC_SURGE + other]
         if i == 2:
             asked -= body.weight_n - body.buoyancy_n
-        least, most = gains.axes[axis, LEAST], gains.axes[axis, MOST]
-        demand[slot.FULL_SURGE + axis] = 1.0 if asked > most else (-1.0 if asked < least else 0.0)
-        wrench[i] = min(max(asked, least), most)
+        minimum, maximum = gains.axes[axis, LEAST], gains.axes[axis, MOST]
+        demand[slot.FULL_SURGE + axis] = (
+            1.0 if asked > maximum else (-1.0 if asked < minimum else 0.0)
+        )
+        wrench[i] = min(max(asked, minimum), maximum)
 
 
 @kernel
@@ -203,7 +205,7 @@ _AT_REST = 0.1
 """Below this share of the greatest speed an axis is not on its way. Integrals learn while a depth
 or heading is kept, or stays wrong, but no faster than at the edge of being kept; on the way to a
 new one they would only wind up."""
-_MOST_INNOVATION_M = 1.0
+_MAX_INNOVATION_M = 1.0
 """A greater step of the sea floor is followed at this rate only: it may be a false echo, and a
 ledge is not to be dived from at once."""
 _RISE_ON_S = 5.0
@@ -252,7 +254,7 @@ def hear_floor(estimate: Array, dt_s: float, guidance: Guidance, pilot: PilotSta
         memory[slot.FLOOR_KNOWN], memory[slot.FLOOR] = 1.0, heard
         restart_watch(pilot)
         return
-    innovation = clamped(heard - memory[slot.FLOOR], _MOST_INNOVATION_M)
+    innovation = clamped(heard - memory[slot.FLOOR], _MAX_INNOVATION_M)
     memory[slot.FLOOR] += dt_s * (memory[slot.FLOOR_SLOPE] + 2.0 * rate * innovation)
     memory[slot.FLOOR_SLOPE] += dt_s * rate * rate * innovation
 
@@ -273,17 +275,17 @@ def sink_to(
         fly_to_depth(depth_m, feed_mps, path.speed_mps, estimate, dt_s, guidance.under_way, pilot)
         return
     memory, demand = pilot.memory, pilot.demand
-    error, most = depth_m - estimate[vector.DEPTH], gains.axes[HEAVE, FASTEST]
+    error, maximum = depth_m - estimate[vector.DEPTH], gains.axes[HEAVE, FASTEST]
     demand[slot.REF_HEAVE], demand[slot.ACC_HEAVE] = place_demand(
         gains,
         HEAVE,
         error,
         pilot.point[slot.SINK_SPEED],
-        clamped(feed_mps, 0.5 * most),
+        clamped(feed_mps, 0.5 * maximum),
         memory[slot.HEAVE_SUM],
-        most,
+        maximum,
     )
-    if abs(error) < DEPTH_KEPT_M or abs(pilot.point[slot.SINK_SPEED]) < _AT_REST * most:
+    if abs(error) < DEPTH_KEPT_M or abs(pilot.point[slot.SINK_SPEED]) < _AT_REST * maximum:
         near = clamped(error, DEPTH_KEPT_M)
         step = place_sum_step(gains, HEAVE, near, demand[slot.FULL_HEAVE], dt_s)
         memory[slot.HEAVE_SUM] = clamped(memory[slot.HEAVE_SUM] + step, sum_bound(gains, HEAVE))
@@ -315,13 +317,13 @@ def head_for(
         Wanted minus present heading, within -pi and pi.
     """
     memory, demand = pilot.memory, pilot.demand
-    error, most = wrapped(heading - estimate[vector.HEADING]), gains.axes[YAW, FASTEST]
+    error, maximum = wrapped(heading - estimate[vector.HEADING]), gains.axes[YAW, FASTEST]
     demand[slot.REF_YAW], accelerate = place_demand(
-        gains, YAW, error, pilot.point[slot.TURN_SPEED], feed, memory[slot.YAW_SUM], most
+        gains, YAW, error, pilot.point[slot.TURN_SPEED], feed, memory[slot.YAW_SUM], maximum
     )
     demand[slot.ACC_YAW] = accelerate + quicken
     off = abs(pilot.point[slot.TURN_SPEED] - feed)
-    if abs(error) < HEADING_KEPT_RAD or off < _AT_REST * most:
+    if abs(error) < HEADING_KEPT_RAD or off < _AT_REST * maximum:
         near = clamped(error, HEADING_KEPT_RAD)
         step = place_sum_step(gains, YAW, near, demand[slot.FULL_YAW], dt_s)
         memory[slot.YAW_SUM] = clamped(memory[slot.YAW_SUM] + step, sum_bound(gains, YAW))

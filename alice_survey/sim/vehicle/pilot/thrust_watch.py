@@ -38,12 +38,12 @@ _MEMORY = 12
 """Stretches, a minute of them, over which the noise and the slow force are learned ..."""
 _FIRST = 6
 """... and before which nothing is judged."""
-_LEAST_SPEED = np.array([0.003] * 3 + [0.002] * 3)
+_MIN_SPEED = np.array([0.003] * 3 + [0.002] * 3)
 """Noise of a velocity, m/s and rad/s, that navigation has at least (inferred)."""
 _MODEL_SHARE = 0.3
 """Share of the hull's and of the thrusters' forces that the model may be off by (inferred: most
 coefficients that were computed and then measured, table V of the paper, differ by more)."""
-_LONGEST_MEMORY = 0.9
+_MAX_MEMORY = 0.9
 """Greatest correlation of one stretch's force with the next's."""
 _GREATEST_SHARE = 1.5
 """More than all of a thrust is missing: another force, and no failure."""
@@ -110,9 +110,9 @@ class ThrustWatch:
         count = len(vehicle.thrusters)
         self._names = [thruster.name for thruster in vehicle.thrusters]
         self._plant, self._tick_s = vehicle.plant, tick_s
-        noise = np.diag(vehicle.plant.body.mass) * _LEAST_SPEED / (_SAMPLE_TICKS * tick_s)
-        self._least = noise**2
-        self._white, self._constant = self._least.copy(), self._least / _MEMORY
+        noise = np.diag(vehicle.plant.body.mass) * _MIN_SPEED / (_SAMPLE_TICKS * tick_s)
+        self._minimum = noise**2
+        self._white, self._constant = self._minimum.copy(), self._minimum / _MEMORY
         self._slow, self._before, self._lagged, self._next = (np.zeros(6) for _ in range(4))
         self._learned = 0
         self._sums, self._scores, self._information = (np.zeros(count) for _ in range(3))
@@ -234,7 +234,7 @@ class ThrustWatch:
         rest = residual - self._slow
         mean = rest.mean(axis=0)
         white = np.sum((rest - mean) ** 2, axis=0) / (len(rest) - 1.0)
-        self._white += share * (np.maximum(white, self._least) - self._white)
+        self._white += share * (np.maximum(white, self._minimum) - self._white)
         about = rest - mean
         product = np.sum(about[1:] * about[:-1], axis=0) / (len(rest) - 1.0)
         self._next += share * (product - self._next)
@@ -247,6 +247,6 @@ class ThrustWatch:
 
 def _lasting(variance: Array, lagged: Array) -> Array:
     """Variance, (6,), of independent values that say as much as those with this covariance."""
-    kept = np.clip(lagged / variance, 0.0, _LONGEST_MEMORY)
+    kept = np.clip(lagged / variance, 0.0, _MAX_MEMORY)
     longer: Array = variance * (1.0 + kept) / (1.0 - kept)
     return longer

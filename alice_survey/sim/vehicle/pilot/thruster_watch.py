@@ -23,7 +23,7 @@ _SLOW = 0.7
 """A propeller that turns by less than this share of what it should is slow ..."""
 _OFTEN = 0.8
 """... and failing where it is slow for this share of the time that it should turn."""
-_LEAST_S = 1.0
+_MIN_S = 1.0
 """It must be asked to turn for at least this long in a stretch to be judged."""
 
 
@@ -45,7 +45,7 @@ class ThrusterWatch:
     def __init__(self, thrusters: Sequence[Thruster], tick_s: float) -> None:
         self._thrusters, self._tick_s = thrusters, tick_s
         self._slow = np.zeros(len(thrusters), dtype=np.int64)
-        self._most = np.array([thruster.most_rps for thruster in thrusters])
+        self._maximum = np.array([thruster.most_rps for thruster in thrusters])
         self._gone = np.zeros(len(thrusters), dtype=np.bool_)
 
     def judge(self, end_s: float, command_rps: Array, rps: Array) -> list[FoundFailure]:
@@ -63,15 +63,15 @@ class ThrusterWatch:
                 continue
             asked = turned_speeds(time_s, command_rps[:, i], thruster, float(rps[0, i]))
             turning = np.abs(asked) > thruster.dead_band_rps + _MARGIN_RPS
-            if turning.sum() * self._tick_s < _LEAST_S:
+            if turning.sum() * self._tick_s < _MIN_S:
                 continue
             turned = rps[:, i] * np.sign(asked)
             slow = turned[turning] < _SLOW * np.abs(asked[turning])
             self._slow[i] = self._slow[i] + 1 if slow.mean() > _OFTEN else 0
             if self._slow[i] == _STRETCHES:
                 self._gone[i] = True
-                most = float(np.abs(rps[:, i]).max())
-                turns = most > thruster.dead_band_rps + _MARGIN_RPS
-                left = (most / thruster.most_rps) ** 2 if turns else 0.0
+                maximum = float(np.abs(rps[:, i]).max())
+                turns = maximum > thruster.dead_band_rps + _MARGIN_RPS
+                left = (maximum / thruster.most_rps) ** 2 if turns else 0.0
                 found.append(FoundFailure(time_s=end_s, thruster=thruster.name, left=left))
         return found

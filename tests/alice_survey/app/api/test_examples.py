@@ -131,7 +131,7 @@ def test_an_averaged_surface_stays_in_its_place(tmp_path: Path) -> None:
             width=203, height=301, nodata=np.nan, transform=Affine(0.1, 0, 7.0, 0, -0.1, 40.0),
         ) as raster:  # fmt: skip
             raster.write(plane, 1)
-    dem = alice.read_dem(tmp_path, most_cells=100)
+    dem = alice.read_dem(tmp_path, max_cells=100)
     assert dem.height.shape == (75, 50)
     row, column = np.mgrid[:75, :50]
     east, north = dem.west + (column + 0.5) * dem.cell, dem.north - (row + 0.5) * dem.cell

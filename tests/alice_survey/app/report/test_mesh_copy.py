@@ -48,7 +48,7 @@ def test_a_small_mesh_keeps_its_triangles_and_gets_a_smaller_texture(tmp_path: P
     (part,) = trimesh.load_scene(tmp_path / "copy.glb").geometry.values()
     assert len(part.faces) == 12
     texture = part.visual.material.baseColorTexture
-    assert max(texture.size) == copies._MOST_TEXTURE_PX
+    assert max(texture.size) == copies._MAX_TEXTURE_PX
     assert texture.format == "JPEG"
 
 

@@ -63,7 +63,7 @@ def test_a_coarser_level_is_the_mean_of_the_finer(workspace: Path) -> None:
 
 
 def test_a_mosaic_too_large_is_shrunk_and_says_so(workspace: Path) -> None:
-    layer = mosaic_layer(workspace / "mosaic" / "mosaic.tif", most_px=60_000)
+    layer = mosaic_layer(workspace / "mosaic" / "mosaic.tif", max_px=60_000)
     assert layer.width_px * layer.height_px <= 61_000
     assert layer.pixel_m * layer.width_px == pytest.approx(0.8)
     assert "2.0 times" in layer.about

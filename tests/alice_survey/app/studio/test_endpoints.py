@@ -41,7 +41,7 @@ def endpoints(studio: Studio) -> list[Endpoint]:
         raise kinds[request.path["kind"]]
 
     return [
-        Endpoint(path="/api/test/write", answer=write, method="POST", writes=True, most_bytes=1000),
+        Endpoint(path="/api/test/write", answer=write, method="POST", writes=True, max_bytes=1000),
         Endpoint(path="/api/test/sum", method="POST",
                  answer=lambda asked: {"sum": sum(asked.read(Sum).terms), "nan": float("nan")}),
         Endpoint(path="/api/test/{kind}/fails", answer=fail),

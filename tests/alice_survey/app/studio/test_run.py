@@ -22,7 +22,7 @@ from alice_survey.app.studio.server import ADDRESS, Server
 from tests.alice_survey.app.report.tiny import tiny_workspace
 
 SIDE = 32_768
-MOST_GROWTH_MIB = 180
+MAX_GROWTH_MIB = 180
 """Seen: 87. While it is served; the elevation model alone has 4096 MiB, the mosaic as many."""
 
 
@@ -49,7 +49,7 @@ def large_workspace(folder: Path) -> Path:
     return workspace
 
 
-def most_mib(process: int) -> float:
+def max_mib(process: int) -> float:
     text = Path(f"/proc/{process}/status").read_text()
     found = re.search(r"VmHWM:\s+(\d+) kB", text)
     assert found is not None
@@ -79,7 +79,7 @@ def test_a_large_raster_in_little_memory_until_ctrl_c(tmp_path: Path) -> None:
         url = line.split(" is shown at ")[1].split("?")[0]
         assert url.startswith(f"http://{ADDRESS}:")
         loaded(f"{url}tiles/sigma/0/0/0.webp")  # what it needs anyway is loaded
-        before = most_mib(started.pid)
+        before = max_mib(started.pid)
         for spot, expected in {
             "height/6/1/0": 0, "height/6/0/0": 512**2, "height/6/37/37": 512**2,
             "height/5/10/10": 256**2, "height/3/2/2": 64**2, "height/1/0/0": 2 * 16**2,
@@ -90,14 +90,14 @@ def test_a_large_raster_in_little_memory_until_ctrl_c(tmp_path: Path) -> None:
             # A level covers the whole raster, so that coarse pixels are not quite 2**h wide.
             assert (spot, opaque.sum()) == (spot, pytest.approx(expected, rel=0.3))
         assert b"/tiles/height/{}.webp" in loaded(f"{url}api/map")
-        grown = most_mib(started.pid) - before
+        grown = max_mib(started.pid) - before
         started.send_signal(signal.SIGINT)
         out, shown = started.communicate(timeout=20)
     finally:
         started.kill()
     assert (started.returncode, out, shown) == (130, "", "interrupted\n")
     assert list(temporary.iterdir()) == []
-    assert grown < MOST_GROWTH_MIB
+    assert grown < MAX_GROWTH_MIB
     with pytest.raises(OSError):  # the port is closed
         socket.create_connection((ADDRESS, int(url.rsplit(":", 1)[1].strip("/"))), timeout=2)
 

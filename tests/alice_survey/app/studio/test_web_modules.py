@@ -311,13 +311,13 @@ def test_totals_as_words(tmp_path: Path) -> None:
 def test_counts_are_coloured_and_what_lacks_overlap_stands_out(tmp_path: Path) -> None:
     """Five pixels: outside, few, most, half, and one without its overlap."""
     pixels = [(255, 0, 0), (1, 1, 1), (8, 2, 1), (4, 2, 1), (3, 1, 0)]
-    most, painted = run(
+    maximum, painted = run(
         tmp_path, "plan_words",
         "(() => { const d = new Uint8ClampedArray(p); return [m.paintCounts(d), [...d]]; })()",
         p=[value for pixel in pixels for value in (*pixel, 255)],
     )  # fmt: skip
     rgba = np.array(painted).reshape(-1, 4)
-    assert most == math.floor(most) and 4 <= most <= 8
+    assert maximum == math.floor(maximum) and 4 <= maximum <= 8
     assert rgba[:, 3].tolist() == [0, 215, 215, 215, 190]
     assert rgba[4, :3].tolist() == [0xD3, 0x54, 0x00]
     assert rgba[1, :3].sum() > rgba[3, :3].sum() > rgba[2, :3].sum()
@@ -385,8 +385,8 @@ def test_unknown_depths_interrupt_the_profile(tmp_path: Path) -> None:
 def test_ticks_are_round_and_within_their_limits(tmp_path: Path) -> None:
     limits = [(-12.31, -11.87, 5), (0.0, 1234.0, 5), (0.0, 4.0, 4), (-5.0, 0.0, 5)]
     found = run(tmp_path, "way", "l.map(([a, b, n]) => m.ticks(a, b, n))", l=limits)
-    for (low, high, most), (values, digits) in zip(limits, found, strict=True):
-        assert 2 <= len(values) <= most + 1
+    for (low, high, maximum), (values, digits) in zip(limits, found, strict=True):
+        assert 2 <= len(values) <= maximum + 1
         assert low - 1e-9 <= min(values) and max(values) <= high + 1e-9
         assert np.allclose(values, np.round(values, digits), atol=1e-9)
 

@@ -98,7 +98,7 @@ def test_what_cannot_be_had_is_missed_as_little_as_by_bvls(craft: Vehicle) -> No
         wanted = rng.normal(size=6) * REACH
         weights = np.exp(rng.uniform(0, 4, count))
         thrust = solve(matrix, wanted, lower, upper, weights)
-        best = oracles.least_miss(matrix, wanted, lower, upper, AXIS_WEIGHTS)
+        best = oracles.min_miss(matrix, wanted, lower, upper, AXIS_WEIGHTS)
         np.testing.assert_allclose(
             (AXIS_WEIGHTS * (matrix @ thrust))[asked], best, atol=1e-6, rtol=0
         )

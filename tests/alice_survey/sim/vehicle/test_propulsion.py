@@ -170,8 +170,8 @@ def test_more_thrust_takes_more_speed_and_limits_are_those_of_full_speed() -> No
     for thrust, row in zip(grid, rps, strict=True):
         kernels.speeds_for(PACKED, thrust, nu, row)
     assert np.all(np.diff(rps, axis=0) > 0)
-    most = PACKED.table[:, kernels.MOST]
-    np.testing.assert_allclose(rps[[0, -1]], [-most, most], rtol=1e-9)
+    maximum = PACKED.table[:, kernels.MOST]
+    np.testing.assert_allclose(rps[[0, -1]], [-maximum, maximum], rtol=1e-9)
 
 
 def test_no_thrust_is_no_speed_and_no_force() -> None:

@@ -32,7 +32,7 @@ def setup(disturbance: Disturbance = STILL, failed: str | None = None) -> Setup:
     return Setup(
         vehicle=craft,
         path=path,
-        guidance=pilot_guidance(gains, path, "sway", most_depth_m=5.0),
+        guidance=pilot_guidance(gains, path, "sway", max_depth_m=5.0),
         gains=gains,
         sensors=SensorSuite().pack(),
         floor=level_floor(5.0),
@@ -45,12 +45,12 @@ def setup(disturbance: Disturbance = STILL, failed: str | None = None) -> Setup:
 
 @pytest.fixture(scope="module")
 def calm() -> Flown:
-    return simulate(setup(), np.random.default_rng(1), longest_s=300.0, label="test")
+    return simulate(setup(), np.random.default_rng(1), max_s=300.0, label="test")
 
 
 @pytest.fixture(scope="module")
 def gusty() -> Flown:
-    return simulate(setup(GUSTS), np.random.default_rng(1), longest_s=300.0, label="test")
+    return simulate(setup(GUSTS), np.random.default_rng(1), max_s=300.0, label="test")
 
 
 def test_a_mission_passes_through_its_phases_in_order(calm: Flown) -> None:
@@ -103,8 +103,8 @@ def test_gusts_shake_the_vehicle_and_calm_water_does_not(calm: Flown, gusty: Flo
 
 
 def test_the_same_seed_flies_the_same_way_and_another_does_not(gusty: Flown) -> None:
-    again = simulate(setup(GUSTS), np.random.default_rng(1), longest_s=300.0, label="test")
-    other = simulate(setup(GUSTS), np.random.default_rng(2), longest_s=300.0, label="test")
+    again = simulate(setup(GUSTS), np.random.default_rng(1), max_s=300.0, label="test")
+    other = simulate(setup(GUSTS), np.random.default_rng(2), max_s=300.0, label="test")
     np.testing.assert_array_equal(again.state, gusty.state)
     np.testing.assert_array_equal(again.navigation, gusty.navigation)
     rows = min(len(other.state), len(gusty.state))
@@ -112,17 +112,17 @@ def test_the_same_seed_flies_the_same_way_and_another_does_not(gusty: Flown) -> 
 
 
 def test_a_mission_that_takes_too_long_is_broken_off_where_it_is() -> None:
-    flown = simulate(setup(), np.random.default_rng(1), longest_s=10.0, label="test")
+    flown = simulate(setup(), np.random.default_rng(1), max_s=10.0, label="test")
     assert len(flown.time_s) == 200
     assert flown.report[-1, PHASE] == DIVE
 
 
 def test_an_unknown_thruster_cannot_fail() -> None:
     with pytest.raises(VehicleError, match=r"'warp'.* starboard, port"):
-        simulate(setup(failed="warp"), np.random.default_rng(1), longest_s=1.0, label="test")
+        simulate(setup(failed="warp"), np.random.default_rng(1), max_s=1.0, label="test")
 
 
 def test_a_failed_thruster_does_not_turn() -> None:
-    flown = simulate(setup(failed="stern"), np.random.default_rng(1), longest_s=120.0, label="test")
+    flown = simulate(setup(failed="stern"), np.random.default_rng(1), max_s=120.0, label="test")
     assert np.all(flown.state[:, STATE + 4] == 0.0)
     assert np.abs(flown.state[:, STATE + 3]).max() > 1.0

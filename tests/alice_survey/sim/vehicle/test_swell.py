@@ -45,14 +45,14 @@ def test_deep_water_orbits_are_circles_that_shrink_with_depth() -> None:
 def test_swell_is_added_to_the_current_along_its_way() -> None:
     depth_m, period_s, towards = 15.0, 6.0, math.radians(30.0)
     current = with_swell(constant_current(0.1, 90.0), 0.5, period_s, 30.0, depth_m, 60.0)
-    most = float(orbital_speed_mps(0.5, period_s, depth_m, 12.5))
+    maximum = float(orbital_speed_mps(0.5, period_s, depth_m, 12.5))
     for time_s in (0.0, 1.0, 17.3, 42.0):
         waves = at(current, time_s, 12.5) - [0.0, 0.1]
         along = waves @ [math.cos(towards), math.sin(towards)]
         across = waves @ [-math.sin(towards), math.cos(towards)]
-        expected = most * math.cos(2 * math.pi * time_s / period_s)
+        expected = maximum * math.cos(2 * math.pi * time_s / period_s)
         # Straight pieces between times and between layers.
-        assert along == pytest.approx(expected, abs=0.012 * most)
+        assert along == pytest.approx(expected, abs=0.012 * maximum)
         assert across == pytest.approx(0.0, abs=1e-12)
 
 

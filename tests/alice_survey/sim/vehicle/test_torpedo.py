@@ -25,11 +25,11 @@ from alice_survey.sim.vehicle.pilot.gains import (
 from alice_survey.sim.vehicle.pilot.linear import LATERAL, VERTICAL, damping_ratio
 from alice_survey.sim.vehicle.steady import steady_flight
 from alice_survey.sim.vehicle.under_way import (
-    MOST_DRIFT_RAD,
+    MAX_DRIFT_RAD,
     held,
     keeps,
-    least_radius_m,
-    least_speed_mps,
+    min_radius_m,
+    min_speed_mps,
 )
 from tests import oracles_dynamics as oracle
 from tests.alice_survey.sim.vehicle.motions import STILL
@@ -136,16 +136,16 @@ def test_steady_flight_is_one_by_the_equations_of_the_textbook(speed: float, tur
 
 
 def test_the_lowest_speed_is_that_at_which_lift_carries_the_buoyancy() -> None:
-    least = least_speed_mps(REMUS, SHARE)
-    assert 0.3 < least < 0.6
-    assert held(REMUS, 1.01 * least, 0.0, SHARE) is not None
-    assert held(REMUS, 0.97 * least, 0.0, SHARE) is None
+    minimum = min_speed_mps(REMUS, SHARE)
+    assert 0.3 < minimum < 0.6
+    assert held(REMUS, 1.01 * minimum, 0.0, SHARE) is not None
+    assert held(REMUS, 0.97 * minimum, 0.0, SHARE) is None
     # Lift grows with the square of the speed: four times as light, twice as fast, where nothing
     # rights the hull.
     body = replace(REMUS.rigid_body, cg_body_m=(0.0, 0.0, 0.0))
     light = body.buoyancy_kg - body.dry_kg
     speeds = [
-        least_speed_mps(
+        min_speed_mps(
             replace(REMUS, rigid_body=replace(body, buoyancy_kg=body.dry_kg + share * light)), SHARE
         )
         for share in (1.0, 4.0, -1.0)
@@ -157,11 +157,11 @@ def test_the_lowest_speed_is_that_at_which_lift_carries_the_buoyancy() -> None:
 
 
 def test_the_tightest_turn_is_one_that_fins_hold() -> None:
-    radius = least_radius_m(REMUS, 1.0, SHARE)
+    radius = min_radius_m(REMUS, 1.0, SHARE)
     assert 5.0 < radius < 8.0
     flight = held(REMUS, 1.0, 1.0 / (1.01 * radius), SHARE)
     assert flight is not None
-    assert flight.load <= SHARE and flight.drift_rad <= MOST_DRIFT_RAD
+    assert flight.load <= SHARE and flight.drift_rad <= MAX_DRIFT_RAD
     assert held(REMUS, 1.0, 1.0 / (0.98 * radius), SHARE) is None
 
 
@@ -173,7 +173,7 @@ def test_loops_are_damped_and_within_the_strength_of_the_fins(speed: float) -> N
     for axis, plane in ((g.YAW, LATERAL), (g.PITCH, VERTICAL)):
         row = gains.axes[axis]
         loop = heading_loop(gains.body, speed, row, gains.fins, plane)
-        assert g.LEAST_HEADING_DAMPING < damping_ratio(loop) < 1.0
+        assert g.MIN_HEADING_DAMPING < damping_ratio(loop) < 1.0
         poles = np.linalg.eigvals(loop)
         assert poles.real.max() < -0.02
         # An error of 10 deg takes about the moment that there is.
@@ -204,7 +204,7 @@ def test_what_cannot_be_flown_by_fins_is_said() -> None:
     with pytest.raises(VehicleError, match="cannot control surge"):
         gains_for(replace(REMUS, thrusters=()), 1.0)
     with pytest.raises(VehicleError, match="at no speed"):
-        least_speed_mps(replace(REMUS, fins=REMUS.fins[1:]), SHARE)
+        min_speed_mps(replace(REMUS, fins=REMUS.fins[1:]), SHARE)
 
 
 def test_power_is_that_of_drag_and_turns() -> None:

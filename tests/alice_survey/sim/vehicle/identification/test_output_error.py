@@ -21,7 +21,7 @@ from tests.alice_survey.sim.vehicle.identification.manoeuvres import fly, hidden
 
 KNOWN = vehicle_from("alice")
 DAMPING = ("X_uu", "Y_vv", "Z_ww", "N_rr")
-QUICK = Simulation(longest_step_s=0.05)
+QUICK = Simulation(max_step_s=0.05)
 
 
 def fitted(log: VehicleLog, free: tuple[str, ...], window_s: float | None = None) -> OutputErrorFit:

@@ -14,7 +14,7 @@ from alice_survey.sim.vehicle.identification.windows import make_windows
 from tests.alice_survey.sim.vehicle.identification.manoeuvres import Noise, fly, hidden, measured
 
 KNOWN = vehicle_from("alice")
-QUICK = Simulation(longest_step_s=0.05)
+QUICK = Simulation(max_step_s=0.05)
 
 
 def test_where_a_log_says_little_the_start_is_kept_and_where_much_the_log() -> None:

@@ -63,8 +63,8 @@ def test_a_wrong_drag_drifts_by_what_it_makes(log: VehicleLog) -> None:
         assert np.nanmax(np.abs(one.errors[:, W])) > 0.02
     worst = [float(np.abs(one.errors[:, DEPTH]).max()) for one in (whole, again)]
     assert worst[0] > 1.5 * worst[1] > 0.05
-    assert whole.longest_s == pytest.approx(59.95)
-    assert again.longest_s == pytest.approx(10.0, abs=0.1)
+    assert whole.max_s == pytest.approx(59.95)
+    assert again.max_s == pytest.approx(10.0, abs=0.1)
 
 
 def test_commands_go_through_the_lag(log: VehicleLog) -> None:

@@ -21,7 +21,7 @@ from alice_survey.sim.vehicle.identification.windows import make_windows
 from alice_survey.sim.vehicle.log import VehicleLog
 
 HERE = Path(__file__).parent
-QUICK = Simulation(longest_step_s=0.05)
+QUICK = Simulation(max_step_s=0.05)
 FREE = (
     "X_u", "X_uu", "Y_v", "Y_vv", "Z_w", "Z_ww", "N_r", "N_rr", "gain_X", "gain_Y", "gain_Z",
     "gain_N", "buoyancy",

@@ -216,7 +216,7 @@ def test_no_echo_comes_in_a_drop_out() -> None:
 
 
 def test_gps_is_heard_at_the_surface_alone() -> None:
-    suite = SensorSuite(gps=GpsSpec(rate_hz=1.0, most_depth_m=0.3))
+    suite = SensorSuite(gps=GpsSpec(rate_hz=1.0, max_depth_m=0.3))
     for depth_m, fixes in ((0.2, 21), (0.4, 0)):
         run = fly(suite.pack(), straight(20.0, depth_m=depth_m), level_floor(15.0), 0)
         assert np.isfinite(run.innovations[:, 10]).sum() == fixes

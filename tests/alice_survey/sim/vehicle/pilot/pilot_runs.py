@@ -227,7 +227,7 @@ def launch(
 ) -> Flight:
     """A vehicle at rest over a plane; `following`: at depth, with the path begun."""
     craft, gains = vehicle_from(name), gains_of(name, path.speed_mps)
-    guidance = pilot_guidance(gains, path, controller, most_depth_m=DEEPEST_M)
+    guidance = pilot_guidance(gains, path, controller, max_depth_m=DEEPEST_M)
     pilot = new_pilot()
     if following:
         pilot.report[slot.PHASE] = slot.FOLLOW

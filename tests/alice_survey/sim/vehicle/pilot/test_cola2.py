@@ -88,11 +88,13 @@ def test_in_weak_currents_the_offset_is_that_of_the_drift_angle() -> None:
 @pytest.mark.parametrize(
     ("name", "least", "most"), [("alice", 0.34, 0.44), ("sparus2", 0.55, 0.72)]
 )
-def test_the_circle_is_that_of_a_simulated_vehicle(name: str, least: float, most: float) -> None:
+def test_the_circle_is_that_of_a_simulated_vehicle(
+    name: str, minimum: float, maximum: float
+) -> None:
     """Bounds: 10 % about what `test_mission_flight` measures."""
     vehicle = craft_of(VehicleConfig(name=name))
     circle = circling_m(gains_for(vehicle, 0.2), 0.2)
-    assert least < circle < most
+    assert minimum < circle < maximum
     assert circling_m(gains_for(vehicle, 0.4), 0.4) > circle
 
 

@@ -62,8 +62,8 @@ def test_place_loop_near_the_place_is_the_placed_one(
 ) -> None:
     gains = gains_of("alice")
     row = gains.axes[axis]
-    most = 100.0
-    steady, acceleration = steering.place_demand(gains, axis, error, speed, feed, 0.0, most)
+    maximum = 100.0
+    steady, acceleration = steering.place_demand(gains, axis, error, speed, feed, 0.0, maximum)
     # Whatever the share of the inner loop: rate on the speed, place on the place.
     expected = row[g.RATE] * (feed - speed) + row[g.PLACE] * error
     assert acceleration == pytest.approx(expected, abs=1e-12)
@@ -72,7 +72,7 @@ def test_place_loop_near_the_place_is_the_placed_one(
     assert steady - feed == pytest.approx(row[g.PLACE] / row[g.INNER] * error)
 
 
-def _hold(gains: g.Gains, push: float, seconds: float, most: float) -> tuple[Array, Array]:
+def _hold(gains: g.Gains, push: float, seconds: float, maximum: float) -> tuple[Array, Array]:
     """Sway of a bare mass with lag, pushed by a force; offsets and the integral over time."""
     row, dt_s = gains.axes[g.SWAY], 0.05
     place = speed = force = total = 0.0
@@ -81,8 +81,8 @@ def _hold(gains: g.Gains, push: float, seconds: float, most: float) -> tuple[Arr
         _, acceleration = steering.place_demand(gains, g.SWAY, -place, speed, 0.0, total, 1.0)
         total += steering.place_sum_step(gains, g.SWAY, -place, full, dt_s)
         asked = row[g.MASS] * acceleration
-        full = 1.0 if asked > most else (-1.0 if asked < -most else 0.0)
-        asked = min(max(asked, -most), most)
+        full = 1.0 if asked > maximum else (-1.0 if asked < -maximum else 0.0)
+        asked = min(max(asked, -maximum), maximum)
         for _ in range(50):
             force += (asked - force) * dt_s / 50 / row[g.LAG]
             speed += (force + push) / row[g.MASS] * dt_s / 50

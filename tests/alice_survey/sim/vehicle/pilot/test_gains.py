@@ -50,8 +50,8 @@ def test_each_loop_is_damped_with_lag_integral_and_any_drag(name: str, axis: int
     # From no drag at all to what the axis meets at its greatest speed.
     nu = np.zeros(6)
     nu[DEGREES[axis]] = row[g.FASTEST] if axis else 0.3
-    most = linear_damping(gains_of(name).body, nu)[DEGREES[axis], DEGREES[axis]] / row[g.MASS]
-    for decay in np.linspace(0.0, most, 5):
+    maximum = linear_damping(gains_of(name).body, nu)[DEGREES[axis], DEGREES[axis]] / row[g.MASS]
+    for decay in np.linspace(0.0, maximum, 5):
         damped = [row[g.LAG], 1 + row[g.LAG] * decay, decay + row[g.RATE]]
         poles = np.roots([*damped, row[g.PLACE], row[g.INTEGRAL]])
         assert np.all(poles.real < 0)
@@ -134,7 +134,7 @@ def test_authority_is_reached_and_not_exceeded_by_any_thrusts(axis: int) -> None
     matrix = craft.configuration_matrix[list(DEGREES)]
     upper = rng.uniform(10.0, 80.0, (matrix.shape[1],))
     lower = -rng.uniform(10.0, 40.0, (matrix.shape[1],))
-    least, most = g.authority(matrix, lower, upper, axis)
+    minimum, maximum = g.authority(matrix, lower, upper, axis)
     # Thrusts that push the other axes not at all form the null space of their rows: sample it.
     others = np.delete(matrix, axis, axis=0)
     null = np.linalg.svd(others)[2][np.linalg.matrix_rank(others) :].T
@@ -142,10 +142,10 @@ def test_authority_is_reached_and_not_exceeded_by_any_thrusts(axis: int) -> None
     draws[np.abs(draws) < 1e-12] = 1e-12
     room = np.where(draws > 0, upper / draws, lower / draws).min(axis=1)
     forces = (draws * room[:, None]) @ matrix[axis]
-    assert least <= forces.min() + 1e-6
-    assert most >= forces.max() - 1e-6
-    assert forces.max() > 0.9 * most
-    assert forces.min() < 0.9 * least
+    assert minimum <= forces.min() + 1e-6
+    assert maximum >= forces.max() - 1e-6
+    assert forces.max() > 0.9 * maximum
+    assert forces.min() < 0.9 * minimum
 
 
 @pytest.mark.parametrize(("name", "axis"), AXES)
@@ -193,15 +193,15 @@ def test_heading_is_damped_with_the_sway_that_it_brings(
     poles = np.linalg.eigvals(_coupled_loop(gains.body, speed_mps, gains.axes[g.YAW]))
     ratio = np.min(-poles.real / np.abs(poles))
     # Only the slow thrusters of SPARUS II at speed give less than is wanted.
-    least = g.LEAST_HEADING_DAMPING if (name, speed_mps) == ("sparus2", 0.5) else g.HEADING_DAMPING
-    assert least - 1e-4 <= ratio < 0.95
+    minimum = g.MIN_HEADING_DAMPING if (name, speed_mps) == ("sparus2", 0.5) else g.HEADING_DAMPING
+    assert minimum - 1e-4 <= ratio < 0.95
     oscillating = np.abs(poles[np.abs(poles.imag) > 1e-9])
-    assert np.all(oscillating < 2 * math.pi * 5.0 / g.LEAST_SAMPLES_PER_PERIOD)
+    assert np.all(oscillating < 2 * math.pi * 5.0 / g.MIN_SAMPLES_PER_PERIOD)
     # Neither sluggish, nor faster than the thrusters.
     assert np.min(np.abs(poles)) > 0.01
     assert np.max(np.abs(poles)) < 1.2 / gains.axes[g.YAW, g.LAG]
     slower = _coupled_loop(gains.body, 0.5 * speed_mps, gains.axes[g.YAW])
-    assert damping_ratio(slower) > g.LEAST_HEADING_DAMPING - g.PASSING_DAMPING
+    assert damping_ratio(slower) > g.MIN_HEADING_DAMPING - g.PASSING_DAMPING
 
 
 def test_gains_of_a_bare_axis_are_kept_where_they_damp_the_coupled_loop() -> None:

@@ -30,8 +30,8 @@ from alice_survey.sim.vehicle.pilot.settings import (
     SWAY_LOOK_AHEAD_M,
     Guidance,
     los_loop,
+    min_look_ahead_m,
     pilot_guidance,
-    shortest_look_ahead_m,
 )
 from alice_survey.sim.vehicle.pilot.steering import hear_floor, write_point
 from tests import oracles_guidance as oracle
@@ -59,7 +59,7 @@ def pilot_on(path: Path, leg: int = 0, along_m: float = 0.0) -> PilotState:
 
 def guide(path: Path, name: str, controller: str) -> tuple[g.Gains, Guidance]:
     gains = gains_of(name, path.speed_mps)
-    guidance = pilot_guidance(gains, path, controller, most_depth_m=40.0)  # type: ignore[arg-type]
+    guidance = pilot_guidance(gains, path, controller, max_depth_m=40.0)  # type: ignore[arg-type]
     return gains, guidance
 
 
@@ -202,7 +202,7 @@ def test_the_offset_has_its_closed_form_without_a_current_along() -> None:
 @pytest.mark.parametrize("name", ["alice", "sparus2"])
 def test_look_ahead_is_the_shortest_that_damps(name: str) -> None:
     gains = gains_of(name)
-    shortest = shortest_look_ahead_m(gains, 0.2, 0.55)
+    shortest = min_look_ahead_m(gains, 0.2, 0.55)
     ratios = [damping_ratio(los_loop(gains, 0.2, 0.55, shortest * f)) for f in (0.8, 1.0, 1.25)]
     assert ratios[0] < ratios[1] < ratios[2]
     assert ratios[1] == pytest.approx(LOS_DAMPING_RATIO, abs=1e-3)
@@ -234,8 +234,8 @@ def test_look_ahead_hangs_on_the_coefficients_as_documented(
     coefficients: str, expected_m: float
 ) -> None:
     gains = gains_for(vehicle_from("sparus2", coefficients), 0.2)
-    assert shortest_look_ahead_m(gains, 0.2, 0.0) == pytest.approx(expected_m, abs=0.006)
-    with_port = shortest_look_ahead_m(gains, 0.2, 0.55)
+    assert min_look_ahead_m(gains, 0.2, 0.0) == pytest.approx(expected_m, abs=0.006)
+    with_port = min_look_ahead_m(gains, 0.2, 0.55)
     assert with_port == pytest.approx(2.23 if coefficients == "calibrated" else 1.6, abs=0.006)
 
 
@@ -245,7 +245,7 @@ def test_look_ahead_hangs_on_the_coefficients_as_documented(
 def test_los_is_damped_with_every_set(name: str, coefficients: str, speed_mps: float) -> None:
     gains = gains_for(vehicle_from(name, coefficients), speed_mps)
     for lever_m in (0.0, 0.55):
-        look_ahead_m = shortest_look_ahead_m(gains, speed_mps, lever_m)
+        look_ahead_m = min_look_ahead_m(gains, speed_mps, lever_m)
         ratio = damping_ratio(los_loop(gains, speed_mps, lever_m, look_ahead_m))
         assert LOS_DAMPING_RATIO <= ratio <= 1.0
         shorter = damping_ratio(los_loop(gains, speed_mps, lever_m, 0.98 * look_ahead_m))
@@ -258,8 +258,8 @@ def test_where_no_look_ahead_will_do_los_is_refused_and_sway_has_another() -> No
     loose.axes[g.YAW, [g.RATE, g.INNER]] = 0.1  # hardly damps the heading
     path = straight(20.0, speed_mps=1.0)
     with pytest.raises(VehicleError, match="1 m/s"):
-        pilot_guidance(loose, path, "los", most_depth_m=40.0)
-    guidance = pilot_guidance(loose, path, "sway", most_depth_m=40.0)
+        pilot_guidance(loose, path, "los", max_depth_m=40.0)
+    guidance = pilot_guidance(loose, path, "sway", max_depth_m=40.0)
     assert guidance.look_ahead_m == SWAY_LOOK_AHEAD_M == 2.5 * CONTROL_LENGTH_M
 
 

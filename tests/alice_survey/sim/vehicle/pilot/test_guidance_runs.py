@@ -181,7 +181,7 @@ def test_carried_off_again_and_again_it_gives_up() -> None:
         phases = flight.fly(150.0).phases()
         if phases[-1] == ABORT:
             break
-    assert flight.pilot.memory[slot.RETURNS] == flight.guidance.limits.most_returns + 1
+    assert flight.pilot.memory[slot.RETURNS] == flight.guidance.limits.max_returns + 1
     assert phases[-1] == ABORT
     assert flight.pilot.report[slot.REASON] == safety.LOST_PATH
 

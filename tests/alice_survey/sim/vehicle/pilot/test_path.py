@@ -70,17 +70,17 @@ def test_progress_is_the_projection(curvature: float, share: float, cross: float
 @settings(deadline=None, max_examples=15)
 def test_no_leg_is_skipped_however_wild_the_position(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    leg, along, most, over = 0, 0.0, 0.02, False
+    leg, along, maximum, over = 0, 0.0, 0.02, False
     seen, total = [0], 0.0
     place = np.zeros(2)
     for _ in range(4000):
         if rng.random() < 0.05:
             place = rng.uniform([-3.0, -3.0], [8.0, 6.0])
         before = leg
-        leg, along, over = advance(MOWER, leg, along, place[0], place[1], most)
+        leg, along, over = advance(MOWER, leg, along, place[0], place[1], maximum)
         assert leg in (before, before + 1)
         now = MOWER.begins_m[leg] + along
-        assert abs(now - total) <= most + 1e-12
+        assert abs(now - total) <= maximum + 1e-12
         total = now
         if leg != before:
             seen.append(leg)

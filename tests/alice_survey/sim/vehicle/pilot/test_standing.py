@@ -44,24 +44,24 @@ MOTIONS = arrays(np.float64, 12, elements=st.floats(-1.0, 1.0))
 SCALES = np.array([0.2, 0.2, 1.0, 0.1, 0.1, 0.15, 0.2, 0.2, 0.1, 0.05, 0.05, 0.2])
 
 
-@given(goal=st.floats(0.02, 20.0), most=st.floats(0.05, 0.5), acceleration=st.floats(0.02, 0.5))
+@given(goal=st.floats(0.02, 20.0), maximum=st.floats(0.05, 0.5), acceleration=st.floats(0.02, 0.5))
 @settings(deadline=None, max_examples=60)
 def test_a_reference_goes_as_far_as_the_closed_form_says(
-    goal: float, most: float, acceleration: float
+    goal: float, maximum: float, acceleration: float
 ) -> None:
     at, speed, time_s = 0.0, 0.0, 0.0
-    top = min(most, math.sqrt(goal * acceleration))
+    top = min(maximum, math.sqrt(goal * acceleration))
     total_s = goal / top + top / acceleration
     while at < goal:
         before, last = at, speed
-        at, speed, quicken = ramp(at, speed, goal, most, acceleration, TICK_S)
+        at, speed, quicken = ramp(at, speed, goal, maximum, acceleration, TICK_S)
         time_s += TICK_S
         assert before <= at <= goal
-        assert 0.0 <= speed <= most + 1e-12
+        assert 0.0 <= speed <= maximum + 1e-12
         assert abs(quicken) <= acceleration + 1e-12
         assert speed - last <= acceleration * TICK_S + 1e-12
         # Held for a tick, and late by less than two of them.
-        here = oracle.trapezoid(goal, most, acceleration, time_s)[0]
+        here = oracle.trapezoid(goal, maximum, acceleration, time_s)[0]
         assert abs(at - here) <= 2.0 * top * TICK_S
         assert time_s < total_s + 1.0
     assert speed == 0.0
@@ -90,7 +90,7 @@ def test_a_reference_without_a_pace_waits() -> None:
 
 def guidance_of(path: Path, name: str = "alice") -> Guidance:
     gains = gains_of(name, path.speed_mps)
-    return pilot_guidance(gains, path, "sway" if name == "alice" else "los", most_depth_m=DEEPEST_M)
+    return pilot_guidance(gains, path, "sway" if name == "alice" else "los", max_depth_m=DEEPEST_M)
 
 
 @pytest.mark.parametrize(("leg", "progress"), [(1, 0.4), (2, 0.8), (0, 2.7)])

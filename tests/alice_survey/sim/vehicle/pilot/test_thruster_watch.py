@@ -16,10 +16,10 @@ STRETCH = 100
 
 def turned(command_rps: Array, *, share: float = 1.0, slower: float = 1.0) -> Array:
     """Speeds (T,) of a propeller with a lag, a dead band and what is left of it."""
-    most, speed, speeds = STERN.most_rps * np.sqrt(share), 0.0, []
+    maximum, speed, speeds = STERN.most_rps * np.sqrt(share), 0.0, []
     for command in command_rps.tolist():
         speeds.append(speed)
-        wanted = 0.0 if abs(command) < STERN.dead_band_rps else np.clip(command, -most, most)
+        wanted = 0.0 if abs(command) < STERN.dead_band_rps else np.clip(command, -maximum, maximum)
         speed += (wanted - speed) * TICK_S / (slower * STERN.time_constant_s)
     return np.array(speeds)
 
