@@ -6,7 +6,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from scipy.optimize import min_squares
+from scipy.optimize import least_squares
 
 from alice_survey.core.frames import Array
 
@@ -91,5 +91,5 @@ def _fitted(
         return law(p, z) - value
 
     bounds = [0.0] * len(maximum), maximum
-    best = min_squares(misses, start, bounds=bounds, loss="huber", f_scale=scale)
+    best = least_squares(misses, start, bounds=bounds, loss="huber", f_scale=scale)
     return lambda z: law(best.x, z)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import min_squares
+from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from camera_calib.camera import Camera
@@ -43,7 +43,7 @@ def triangulate_slowly(
         seen = [c.project(pose.apply(point)) for c, pose in zip(cameras, poses, strict=True)]
         return (np.stack(seen) - pixels).ravel()
 
-    found = min_squares(miss, start, jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    found = least_squares(miss, start, jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-15)
     return np.asarray(found.x)
 
 

@@ -51,7 +51,7 @@ def align_slowly(
 ) -> np.ndarray:
     """Least squares over position, affine warp, gain and offset by a general solver."""
     from scipy.ndimage import map_coordinates
-    from scipy.optimize import min_squares
+    from scipy.optimize import least_squares
 
     steps = np.arange(-radius, radius + 1.0)
     v, u = (x.ravel() for x in np.meshgrid(steps, steps, indexing="ij"))
@@ -68,7 +68,7 @@ def align_slowly(
         return weight * (gain * seen + offset - wanted)
 
     start = np.concatenate([pixel, affine.ravel(), [1.0, 0.0]])
-    return min_squares(misses, start, x_scale=[1, 1, 0.1, 0.1, 0.1, 0.1, 0.1, 10]).x[:2]
+    return least_squares(misses, start, x_scale=[1, 1, 0.1, 0.1, 0.1, 0.1, 0.1, 10]).x[:2]
 
 
 def match_near_slowly(

@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from scipy.optimize import min_squares
+from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -69,7 +69,7 @@ def adjust_through_ports(
     pattern = csr_matrix((np.ones(len(lines)), (lines, columns)), shape=(line, size))
     x = np.zeros(size)
     for _ in range(6):  # lsmr stops early along weak directions; a new start goes on
-        found = min_squares(
+        found = least_squares(
             misses, x, jac="3-point", jac_sparsity=pattern, x_scale="jac", tr_solver="lsmr",
             tr_options={"atol": 1e-14, "btol": 1e-14, "maxiter": 1000},
             ftol=1e-14, xtol=1e-14, gtol=1e-14, max_nfev=30,

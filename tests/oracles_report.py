@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import min_squares
+from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.config import CameraConfig, WaterConfig
@@ -183,7 +183,7 @@ def best_pose_by_search(true: Camera, wrong: Camera, anchors_cam: Array) -> Rigi
     def misses(vector: Array) -> Array:
         return (wrong.project(pose(vector).apply(anchors_cam)) - wanted).ravel()
 
-    found = min_squares(
+    found = least_squares(
         misses,
         np.zeros(6),
         x_scale=[1e-3] * 6,

@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 import numpy as np
-from scipy.optimize import min_squares
+from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform
 from scipy.special import erf
 
@@ -159,5 +159,5 @@ def fit_saddle(picture: np.ndarray, near: np.ndarray, half: int) -> np.ndarray:
     starts = [
         [*near, first, first + np.pi / 2, 1.5, sign * height, grey.mean(), 0, 0] for sign in (1, -1)
     ]
-    fits = [min_squares(misses, start) for start in starts]
+    fits = [least_squares(misses, start) for start in starts]
     return min(fits, key=lambda fit: fit.cost).x[:2]

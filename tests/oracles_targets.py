@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-from scipy.optimize import min_squares
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
@@ -198,7 +198,7 @@ def slow_corner(picture: np.ndarray, used: np.ndarray, near: np.ndarray) -> np.n
         for angle in (0.0, np.pi / 4):
             swing = 0.5 * sign * np.ptp(light)
             start = [*near, angle, angle + np.pi / 2, 1.5, swing, light.mean(), 0, 0]
-            fit = min_squares(misses, start, xtol=1e-12, ftol=1e-12, gtol=1e-12)
+            fit = least_squares(misses, start, xtol=1e-12, ftol=1e-12, gtol=1e-12)
             if best is None or fit.cost < best.cost:
                 best = fit
     return best.x[:2]

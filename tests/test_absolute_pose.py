@@ -3,7 +3,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.optimize import min_squares
+from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from benchmarks.absolute_pose import Sighting, absolute_pose, pose_information
@@ -180,7 +180,7 @@ def test_refinement_ends_where_another_solver_does() -> None:
         points_cam = (moved * truth).apply(seen.points_world[keep])
         return (seen.camera.project(points_cam) - seen.pixels[keep]).ravel()
 
-    other = min_squares(miss, np.zeros(6), xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    other = least_squares(miss, np.zeros(6), xtol=1e-15, ftol=1e-15, gtol=1e-15)
 
     expected = (
         RigidTransform.from_components(other.x[3:], Rotation.from_rotvec(other.x[:3])) * truth

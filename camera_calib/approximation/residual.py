@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.optimize import min_squares
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from alice_survey.core.errors import CalibrationError, ConfigError
@@ -269,7 +269,7 @@ def _fitted(model: str, camera: Camera, pixels: Array, points: Array, turned: bo
         "cy": camera.cy_px,
     }
     first = np.array([0.0] * (4 if turned else 1) + [start.get(name, 0.0) for name in names])
-    return stand_in(min_squares(cost, first, x_scale="jac", max_nfev=200).x)
+    return stand_in(least_squares(cost, first, x_scale="jac", max_nfev=200).x)
 
 
 def _seen(camera: Camera, distances: Array, grid: int) -> tuple[Array, Array]:

@@ -114,7 +114,7 @@ def _one_size(
     if not sizes:
         first = next(what.detection.refused for key, what in seen.items() if key[1] == camera)
         raise CalibrationError(f"none of the pictures of {camera} can be read: {first}")
-    counts = Counter(sizes.values()).max_common()
+    counts = Counter(sizes.values()).most_common()
     if len(counts) > 1:
         (common, many), (other, few) = counts[:2]
         odd = next(paths[key].name for key, size in sizes.items() if size == other)
@@ -131,7 +131,7 @@ def _check_board(target: Target, seen: Sequence[_Seen]) -> None:
     boards = [what.board for what in seen if what.board is not None]
     larger = [b for b in boards if b[0] >= wanted[0] and b[1] >= wanted[1] and b != wanted]
     if len(larger) > len(boards) / 2:
-        (columns, rows), count = Counter(larger).max_common(1)[0]
+        (columns, rows), count = Counter(larger).most_common(1)[0]
         raise CalibrationError(
             f"the chessboard has {columns}x{rows} inner corners in {count} of {len(boards)} "
             f"pictures looked at, more than the {target.columns}x{target.rows} of --target: count "
@@ -143,7 +143,7 @@ def _check_found(camera: str, target: Target, seen: Sequence[_Seen]) -> None:
     looked = [what.detection for what in seen if what.size is not None]
     if any(detection.pixels is not None for detection in looked):
         return
-    reasons = Counter(str(detection.refused) for detection in looked).max_common(1)
+    reasons = Counter(str(detection.refused) for detection in looked).most_common(1)
     raise CalibrationError(
         f"the target '{target.description}' was found in none of the {len(looked)} pictures of "
         f"{camera}; of {reasons[0][1]} of them: {reasons[0][0]}"

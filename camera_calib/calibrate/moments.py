@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
-from scipy.optimize import min_squares
+from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation, RotationSpline
 
 from alice_survey.core.errors import CalibrationError
@@ -166,12 +166,12 @@ def clock_offset(
 
     time_s, pixels, fit = other.time_s[known], other.pixels[known], np.zeros(7)
     for _ in range(2):
-        fit = min_squares(misses, fit, args=(time_s, pixels), loss="soft_l1", x_scale="jac").x
+        fit = least_squares(misses, fit, args=(time_s, pixels), loss="soft_l1", x_scale="jac").x
         squares = misses(fit, time_s, pixels).reshape(len(time_s), -1) ** 2
         lengths = np.sqrt(squares.mean(axis=1))
         usual = lengths <= _ODD * np.median(lengths)
         time_s, pixels = time_s[usual], pixels[usual]
-    last = min_squares(misses, fit, args=(time_s, pixels), x_scale="jac")
+    last = least_squares(misses, fit, args=(time_s, pixels), x_scale="jac")
     # Points of a picture err together, with the pose that they are compared with: each picture is
     # one draw.
     slopes = np.asarray(last.jac, dtype=np.float64)

@@ -260,7 +260,7 @@ def _cameras_of(recordings: Sequence[Recording], mono: str) -> list[str]:
     for recording in recordings:
         seconds[recording.size] += round(sum(file.duration_s for file in recording.files) + 1)
     names = [mono, *(f"{mono}-{number}" for number in range(2, len(seconds) + 1))]
-    by_size = {size: name for (size, _), name in zip(seconds.max_common(), names, strict=True)}
+    by_size = {size: name for (size, _), name in zip(seconds.most_common(), names, strict=True)}
     return [by_size[recording.size] for recording in recordings]
 
 

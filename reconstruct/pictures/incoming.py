@@ -117,7 +117,7 @@ def by_camera(entries: Sequence[Incoming], name: str) -> list[Incoming]:
     counts = Counter(camera_key(entry.facts) for entry in entries)
     names = {
         key: name if number == 1 else f"{name}-{number}"
-        for number, (key, _) in enumerate(counts.max_common(), 1)
+        for number, (key, _) in enumerate(counts.most_common(), 1)
     }
     return [replace(entry, camera=names[camera_key(entry.facts)]) for entry in entries]
 

@@ -174,7 +174,7 @@ def _rows(
     facts: Sequence[PictureFacts], pictures: int, name: str, *, apart: bool
 ) -> list[PreviewedCamera]:
     """The cameras of some pictures; told apart by device and size if that is wanted."""
-    counts = Counter(camera_key(one) for one in facts if not one.fault).max_common()
+    counts = Counter(camera_key(one) for one in facts if not one.fault).most_common()
     if not apart:
         counts = counts[:1]
     total = sum(count for _, count in counts)

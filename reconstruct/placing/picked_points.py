@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.optimize import min_squares
+from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.errors import warn
@@ -292,7 +292,7 @@ def _fit(
         found: Array = weight * misses(x)
         return found
 
-    found = min_squares(
+    found = least_squares(
         weighted, np.zeros(3), loss="soft_l1", f_scale=near_px, xtol=1e-12,
         ftol=1e-12, gtol=1e-12, jac="3-point",
     )  # fmt: skip

@@ -339,7 +339,7 @@ def _short_places(found: Found) -> list[WeakPlace]:
             for fault, shape in zip(found.pictured.faults, shapes, strict=True)
             if shape.intersects(hole.outline)
         )
-        why = ", ".join(f"{count} stations {fault}" for fault, count in spoilt.max_common())
+        why = ", ".join(f"{count} stations {fault}" for fault, count in spoilt.most_common())
         some = f"{hole.fewest_pictures} of {wanted} pictures of each camera at its thinnest"
         minimum = "in no good picture" if hole.unseen_m2 == hole.area_m2 else some
         places.append(

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.optimize import min_squares
+from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from camera_calib.camera import Camera
@@ -108,7 +108,7 @@ class Aquarium:
             plane = rays[:, :2] / rays[:, 2:]
             _, turn, shift = cv2.solvePnP(points, plane, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
             start = pose_of(np.concatenate([turn.ravel(), shift.ravel()]))
-            best = min_squares(self.corner_misses, np.zeros(6), args=(start, pixels, points))
+            best = least_squares(self.corner_misses, np.zeros(6), args=(start, pixels, points))
             poses.append(pose_of(best.x) * start)
         return self.tank(poses)
 
@@ -141,7 +141,7 @@ class Aquarium:
             robust = np.sign(found) * np.sqrt(np.log1p(found**2))  # Cauchy's, of detections alone
             return np.concatenate([robust.ravel(), *(miss / CLICKED_PX for miss in of_corners)])
 
-        best = min_squares(misses, np.zeros(12), x_scale=0.01)
+        best = least_squares(misses, np.zeros(12), x_scale=0.01)
         return moved(best.x)
 
 

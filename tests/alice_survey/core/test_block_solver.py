@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.optimize import min_squares
+from scipy.optimize import least_squares
 
 from alice_survey.core.block_solver import BlockStep, Equations, Minimum, inverse_of, minimise
 from alice_survey.core.errors import AliceError
@@ -149,7 +149,7 @@ def test_it_ends_where_a_plain_minimiser_does(rate: float) -> None:
     def misses(x: Array) -> Array:
         return problem.misses(x).ravel()
 
-    plain = min_squares(
+    plain = least_squares(
         misses, far, loss="huber", f_scale=1.0, x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14
     )
     assert found.is_settled
@@ -167,7 +167,7 @@ def test_a_parameter_that_would_leave_its_range_stays_at_its_bound() -> None:
     def misses(x: Array) -> Array:
         return problem.misses(np.append(x, 2.0)).ravel()
 
-    free = min_squares(misses, found.guess[:-1], loss="huber")
+    free = least_squares(misses, found.guess[:-1], loss="huber")
     np.testing.assert_allclose(found.guess[:-1], free.x, rtol=1e-4)
 
 

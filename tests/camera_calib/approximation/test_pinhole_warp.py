@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.optimize import min_squares
+from scipy.optimize import least_squares
 
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp, residual_px
 from camera_calib.camera import Camera
@@ -42,7 +42,7 @@ def test_the_closed_form_finds_the_centre_that_a_search_finds(port: float, tilt_
     def residuals(centre: np.ndarray) -> np.ndarray:
         return residual_px(replace(warp, centre_m=tuple(centre)), depths).ravel()
 
-    found = min_squares(residuals, np.zeros(3), x_scale=1e-3, xtol=1e-12, ftol=1e-12)
+    found = least_squares(residuals, np.zeros(3), x_scale=1e-3, xtol=1e-12, ftol=1e-12)
     np.testing.assert_allclose(warp.centre_m, found.x, atol=2e-3 * port * 1e-3)
     assert (residuals(np.array(warp.centre_m)) ** 2).sum() < 1.0001 * (found.fun**2).sum()
 

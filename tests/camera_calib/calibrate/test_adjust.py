@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.optimize import min_squares
+from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.errors import CalibrationError
@@ -158,7 +158,7 @@ def test_it_finds_the_minimum_and_the_covariance_that_a_plain_solver_finds() -> 
     def misses(x: Array) -> Array:
         return root * vector_misses(x, names, found.rig, seen_views, points)
 
-    result = min_squares(
+    result = least_squares(
         misses, start, x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14, jac="3-point"
     )
     moved = (result.x - start)[: len(names)] / [found.rig.sigmas[name] for name in names]

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from scipy.optimize import min_squares
+from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from reconstruct.mapping.stations import RigPinholes, refine_link
@@ -28,7 +28,7 @@ def stereo(points: np.ndarray, pixels: list[np.ndarray]) -> np.ndarray:
         )
 
     pattern = np.kron(np.ones((2, 1)), np.kron(np.eye(len(points)), np.ones((2, 3))))
-    return min_squares(miss, points.ravel(), jac_sparsity=pattern).x.reshape(-1, 3)
+    return least_squares(miss, points.ravel(), jac_sparsity=pattern).x.reshape(-1, 3)
 
 
 def station_pair(
@@ -85,7 +85,7 @@ def test_it_is_the_adjustment_of_pose_and_points_together() -> None:
 
     guess = start()
     first = np.concatenate([guess.rotation.as_rotvec(), guess.translation, points.ravel()])
-    oracle = min_squares(miss, first).x
+    oracle = least_squares(miss, first).x
     found = refine_link(points, pixels, camera, PINHOLES, guess)
     assert found is not None
     pose, covariance = found

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import min_squares
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from alice_survey.core.errors import VehicleError
@@ -152,7 +152,7 @@ def fit_output_error(
     known = prior_of(parameters, windows, prior)
     approach = _FitProblem(short, parameters, rough, _first_sigma(windows), known, settled=1.0)
     approach.begin(parameters.start)
-    result = min_squares(
+    result = least_squares(
         approach.residuals, np.clip(parameters.start, lower, upper), approach.jacobian,
         bounds=(lower, upper), x_scale="jac", ftol=1e-3, xtol=1e-10, gtol=None, max_nfev=20,
     )  # fmt: skip
@@ -165,7 +165,7 @@ def fit_output_error(
         if settled and looseness > 1.0:
             continue
         problem.begin(values)
-        result = min_squares(
+        result = least_squares(
             problem.residuals, np.clip(values, lower, upper), problem.jacobian,
             bounds=(lower, upper), x_scale="jac", ftol=looseness * _NOTICED / problem.samples,
             xtol=1e-10, gtol=None, max_nfev=_MAX_EVALUATIONS,
