@@ -92,6 +92,8 @@ class ExportFormat:
     read_by: str
     """Programs that read it, in words."""
     files: tuple[ExportFile, ...]
+    keeps_altitude: bool = False
+    """Whether the vehicle keeps one altitude above the sea floor, as its altimeter measures it."""
     read: Callable[[str], Mission | None] | None = None
     """Reads a mission from the text of a file, as the vehicle does; None where the text is of
     another format. A `ValueError` says what is wrong with it."""

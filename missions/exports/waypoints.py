@@ -85,7 +85,7 @@ def waypoints(
     Raises:
         PlanError: depths do not fit the lines.
     """
-    depths = _depths(plan)
+    depths = line_depths(plan)
     if not dive.route.legs:
         raise PlanError("a dive has no legs: plan again")
     points = _switched(list(_points(plan, dive, turn_rate_rad_s, depths)))
@@ -272,8 +272,12 @@ def _with_depths(
     return [replace(p, glass_depth_m=float(d)) for p, d in zip(points, levels, strict=True)]
 
 
-def _depths(plan: Plan) -> list[Array] | None:
-    """Depths of the glass at each line's stations; None over a level sea floor."""
+def line_depths(plan: Plan) -> list[Array] | None:
+    """Depths of the glass at each line's stations; None over a level sea floor.
+
+    Raises:
+        PlanError: they do not fit the lines.
+    """
     if not plan.line_depths_m:
         return None
     depths = [np.asarray(row, dtype=np.float64) for row in plan.line_depths_m]

@@ -1,5 +1,6 @@
 """All exports of a plan: missions that vehicles load, and files that people look at."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -7,14 +8,18 @@ from typing import Any
 
 from alice_survey.core.artefacts import atomic_path, read_stage
 from alice_survey.core.config import SurveyConfig, parse_config
-from alice_survey.core.errors import PlanError
+from alice_survey.core.errors import PlanError, warn
 from alice_survey.core.run import progress
 from camera_calib.rig import Rig, design_rig
 from missions.exports.advice import advice
-from missions.exports.format import Export
+from missions.exports.format import Export, ExportFormat
 from missions.exports.options import Options, line_tolerance_m, options_of
 from missions.exports.registry import format_named, format_names
+from missions.exports.waypoints import line_depths
 from missions.values.plan_file import Plan, read_plan
+
+MAX_ALTITUDE_DIFFERENCE_M = 0.3
+"""Between a plan's altitude and the one altitude of a mission, where the plan follows terrain."""
 
 
 @progress.step("write missions for vehicles")
@@ -41,19 +46,66 @@ def write_exports(
         The files, in order, and what each is in words.
 
     Raises:
-        PlanError: a format is not known, or the plan's depths do not fit its lines.
+        PlanError: a format is not known, the plan's depths do not fit its lines, or a chosen format
+            keeps one altitude where the plan does not. Where all formats are written, such ones are
+            left out with a warning.
     """
     names = format_names() if formats is None else list(formats)
     chosen = [format_named(name) for name in names]
+    refusal = altitude_refusal(plan)
+    if refusal and formats is not None and any(each.keeps_altitude for each in chosen):
+        raise PlanError(refusal)
     export = Export(plan=plan, rig=rig, options=options or Options())
     folder.mkdir(parents=True, exist_ok=True)
     files: dict[Path, str] = {}
     for each in chosen:
-        files |= each.write(folder, export)
+        if refusal and each.keeps_altitude:
+            _remove(folder, each)
+        else:
+            files |= each.write(folder, export)
     about = folder / "about.txt"
     files[about] = "what the files hold, and how"
-    _write_about(about, export, files, advice(export, names, chosen=formats is not None))
+    notes = advice(export, names, chosen=formats is not None)
+    if refusal:
+        warn(f"missions are left out: {refusal}")
+        notes = [f"Missions are left out: {refusal}."]
+    _write_about(about, export, files, notes)
     return files
+
+
+def altitude_refusal(plan: Plan) -> str:
+    """Why no vehicle may fly a plan at one altitude above the sea floor; empty where it may.
+
+    A mission states one altitude, which the altimeter measures straight down. Over a bathymetry the
+    plan climbs ahead of what is higher, which such a vehicle does not.
+    """
+    if line_depths(plan) is None:
+        return ""
+    terrain = plan.details.get("terrain") or {}
+    known = terrain.get("at_constant_altitude") or {}
+    difference_m = float(known.get("max_difference_m", math.nan))
+    clearance_m = float(known.get("min_clearance_m", math.nan))
+    if not math.isfinite(difference_m + clearance_m):
+        return (
+            "the plan follows a bathymetry and does not say how far that is from one altitude: "
+            "plan again"
+        )
+    if difference_m <= MAX_ALTITUDE_DIFFERENCE_M:
+        return ""
+    return (
+        f"COLA2, WPL and QGroundControl missions keep {plan.altitude_m:.2f} m of altitude, from "
+        f"which the plan over its bathymetry differs by up to {difference_m:.2f} m: the least "
+        f"clearance of such a mission is {clearance_m:.2f} m"
+        f"{' (it runs into the sea floor)' if clearance_m <= 0.0 else ''}. Leave the steep part "
+        "out of the area, or turn the lines along the slope (plan.line_heading_deg)"
+    )
+
+
+def _remove(folder: Path, left_out: ExportFormat) -> None:
+    """Remove files of an earlier plan, which nobody may load for this one."""
+    for file in left_out.files:
+        for path in folder.glob(file.name.format("*")):
+            path.unlink()
 
 
 def export_report(

@@ -282,6 +282,7 @@ def terrain_report(
     data: dict[str, Any] = {
         "altitude_m": [low, high],
         "least_clearance_m": float(min(p.clearance_m.min() for p in profiles)),
+        "at_constant_altitude": _at_constant_altitude(profiles, limits.altitude_m),
         "steepest_deg": math.degrees(max(slopes)),
         "steepest_floor_deg": math.degrees(max(floor_slopes)),
         "raised_stations": sum(climbing),
@@ -307,6 +308,21 @@ def terrain_report(
         f"coarsest pixels {data['coarsest_pixel']:.2f} times those at altitude_m"
     )
     return text, data
+
+
+def _at_constant_altitude(profiles: Sequence[DepthProfile], altitude_m: float) -> dict[str, float]:
+    """What happens if a vehicle keeps one altitude above the floor below instead of the profiles.
+
+    Returns:
+        `max_difference_m` from the profiles, and `min_clearance_m` above the highest floor within
+        reach: negative where the vehicle runs into it.
+    """
+    return {
+        "max_difference_m": max(float(np.abs(p.altitude_m - altitude_m).max()) for p in profiles),
+        "min_clearance_m": min(
+            float((altitude_m + p.highest_floor_m - p.floor_m).min()) for p in profiles
+        ),
+    }
 
 
 def _spread(low: float, high: float, finest: float) -> Array:

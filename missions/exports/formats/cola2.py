@@ -212,4 +212,5 @@ FORMAT = ExportFormat(
         ),
     ),
     read=read_cola2,
+    keeps_altitude=True,
 )

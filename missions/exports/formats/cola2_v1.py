@@ -113,4 +113,5 @@ FORMAT = ExportFormat(
         ),
     ),
     read=read_cola2_v1,
+    keeps_altitude=True,
 )

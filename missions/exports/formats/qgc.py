@@ -176,4 +176,5 @@ FORMAT = ExportFormat(
         ),
     ),
     read=read_qgc,
+    keeps_altitude=True,
 )

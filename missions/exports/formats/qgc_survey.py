@@ -117,4 +117,5 @@ FORMAT = ExportFormat(
             write=write_qgc_survey,
         ),
     ),
+    keeps_altitude=True,
 )

@@ -56,4 +56,5 @@ FORMAT = ExportFormat(
         ),
     ),
     read=read_wpl,
+    keeps_altitude=True,
 )

@@ -222,7 +222,9 @@ def test_lines_that_follow_a_bathymetry_bend_where_the_floor_does() -> None:
     ramps = [np.full(line.stations, 13.0) for line in plan.lines]
     ramps[1] = np.interp(np.arange(plan.lines[1].stations), [0, 4, 10], [12.0, 12.8, 12.9])
     depths = tuple(tuple(map(float, ramp)) for ramp in ramps)
-    steps = steps_of(small_plan(line_depths_m=depths), RIG)
+    terrain = {"at_constant_altitude": {"max_difference_m": 0.1, "min_clearance_m": 1.9}}
+    bent = small_plan(line_depths_m=depths, details={"terrain": terrain})
+    steps = steps_of(bent, RIG)
     second = [s for s in steps if s.kind == "section" and s.values["final_depth"] < 12.9]
 
     # A bend at 12.8 m, then the end; the run-in comes in at the line's first depth.
