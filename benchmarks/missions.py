@@ -37,12 +37,9 @@ from missions.values.plan_file import Plan
 
 FORMATS = {
     "cola2": "mission_dive1.xml",
-    "cola2-v1": "mission_v1_dive1.xml",
     "wpl": "mission_dive1.waypoints",
     "qgc": "mission_dive1.plan",
-    "qgc-survey": "survey_dive1.plan",
 }
-_COLA2 = ("cola2", "cola2-v1")
 _SPARE = 0.02
 """How much less than promised may be seen: navigation and gusts."""
 
@@ -106,7 +103,7 @@ def measure(*, quick: bool) -> list[Row]:
     seas = [(0.0, False), (0.1, True)] if quick else _SEAS
     rows = []
     for vehicle in ("alice", "sparus2"):
-        flown = _COLA2[:1] if vehicle == "sparus2" else (("cola2", "qgc") if quick else FORMATS)
+        flown = ("cola2",) if vehicle == "sparus2" else (("cola2", "qgc") if quick else FORMATS)
         for current, across in seas:
             towards = (along_deg + (90.0 if across else 0.0)) % 360.0
             at = changed(config, "sea", current_mps=current, current_towards_deg=towards)
@@ -129,7 +126,7 @@ def _fly(plan: Plan, rig: Rig, config: SurveyConfig, name: str, *, across: bool)
         beyond_m = overshot(mission_of_settings(plan, settings), flight)
     seen = certificate(plan.area, rig, stations_of_flight(flight), plan_pattern(plan, rig))
     expected, warned = plan.coverage, False
-    if name in _COLA2 and options.follower is not None:
+    if name == "cola2" and options.follower is not None:
         lever_m = config.camera.position_body_m[0]
         outlook = cola2_outlook(plan, rig, options.follower, lever_m)
         expected = outlook.share_at_overlap

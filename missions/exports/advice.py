@@ -83,9 +83,9 @@ def advice(export: Export, formats: list[str], *, chosen: bool) -> list[str]:
         chosen: whether somebody chose them.
     """
     lines = []
-    if any(name.startswith("cola2") for name in formats):
+    if "cola2" in formats:
         lines += _cola2(export, chosen=chosen)
-    if any(name in ("wpl", "qgc", "qgc-survey") for name in formats):
+    if any(name in ("wpl", "qgc") for name in formats):
         lines += _ardusub(export)
     return lines
 
@@ -96,15 +96,7 @@ def _cola2(export: Export, *, chosen: bool) -> list[str]:
         return []
     if not math.isfinite(follower.delta_m):
         return [f"COLA2: no section/delta keeps {follower.name} from weaving: lower the speed."]
-    own, given = cola2_settings(follower.delta_m, plan.speed_mps), Cola2Settings()
-    lines = [
-        f"COLA2, parameters of the pilot: section/delta {own.delta_m:.1f} m (the shortest that "
-        f"{follower.name} follows without weaving at {plan.speed_mps:g} m/s; the longer, the "
-        f"farther a current pushes it off; the default is {given.delta_m:g}), section/tolerance_z "
-        f"{own.tolerance_z_m:g} m ({given.tolerance_z_m:g}), section/min_surge_velocity "
-        f"{own.min_surge_mps:g} m/s and section/max_surge_velocity {own.max_surge_mps:g} m/s, so "
-        "that lines are flown at one speed."
-    ]
+    own, default = cola2_settings(follower.delta_m, plan.speed_mps), Cola2Settings()
     outlook = cola2_outlook(plan, export.rig, follower, export.mount.glass_body_m[0])
     expected = (
         f"in the expected current of {follower.current_mps:g} m/s COLA2 holds {follower.name} up "
@@ -121,29 +113,27 @@ def _cola2(export: Export, *, chosen: bool) -> list[str]:
             "for less of it, or fly another autopilot's mission"
         )
     return [
-        *lines,
-        f"{expected[0].upper()}{expected[1:]}. To see it flown: alice-survey fly --mission FILE. "
-        "What helps: lines along the current, and closer lines (plan.track_error_m).",
+        "COLA2 pilot parameters:",
+        f"  section/delta {own.delta_m:.1f} m (default {default.delta_m:g})",
+        f"  section/tolerance_z {own.tolerance_z_m:g} m (default {default.tolerance_z_m:g})",
+        f"  section/min_surge_velocity {own.min_surge_mps:g} m/s",
+        f"  section/max_surge_velocity {own.max_surge_mps:g} m/s",
+        f"{expected[0].upper()}{expected[1:]}.",
     ]
 
 
 def _ardusub(export: Export) -> list[str]:
     plan, follower = export.plan, export.options.follower
     radius_cm = math.ceil(100.0 * max(export.tolerance_m, MIN_RADIUS_M))
-    speed_cms = 100.0 * plan.speed_mps
     lines = [
-        f"ArduSub 4.5 parameters: WPNAV_SPEED {speed_cms:.0f} cm/s, WPNAV_RADIUS {radius_cm} cm "
-        "(files' radii are ignored), WP_YAW_BEHAVIOR 4 (the default: along the track) or 1, "
-        "WPNAV_RFND_USE 1. It comes to rest at every way-point."
+        "ArduSub 4.5 parameters:",
+        f"  WPNAV_SPEED {100.0 * plan.speed_mps:.0f} cm/s",
+        f"  WPNAV_RADIUS {radius_cm} cm (the radii of files are ignored)",
+        "  WP_YAW_BEHAVIOR 4 (default) or 1",
+        "  WPNAV_RFND_USE 1",
     ]
     if plan.speed_mps < MIN_SPEED_MPS:
-        lines.append(
-            f"ArduSub takes no speed below {MIN_SPEED_MPS:g} m/s: it flies faster than the "
-            f"plan's {plan.speed_mps:g} m/s, with more blur: plan at {MIN_SPEED_MPS:g} m/s."
-        )
+        lines.append(f"ArduSub flies {MIN_SPEED_MPS:g} m/s or faster: plan at that speed.")
     if follower is not None and not follower.sways:
-        lines.append(
-            f"ArduSub holds on to its track sideways, which {follower.name} has no thrusters for: "
-            "do not fly these files with it."
-        )
+        lines.append(f"ArduSub needs thrusters sideways, which {follower.name} does not have.")
     return lines

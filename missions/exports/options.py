@@ -21,8 +21,6 @@ class Options:
 
     altimeter_body_m: tuple[float, float, float] = CameraConfig().dvl_position_body_m
     """The sensor whose altitude the vehicle holds, from its reference point."""
-    pixel_um: float = CameraConfig().pixel_um
-    """Size of the sensor's pixels; QGroundControl needs the sensor's size."""
     camera_on: str = "camera_trigger/enable"
     """COLA2: the service (without arguments) that starts pictures."""
     camera_off: str = "camera_trigger/disable"
@@ -46,7 +44,6 @@ def options_of(
     follower = None if vehicle is None or sea is None else follower_of(vehicle, sea, plan.speed_mps)
     return Options(
         altimeter_body_m=camera.dvl_position_body_m,
-        pixel_um=camera.pixel_um,
         turn_rate_rad_s=spot_rate_rad_s(plan.turn_rate_limit_deg_s),
         follower=follower,
     )

@@ -10,6 +10,8 @@ from missions.exports import formats
 if TYPE_CHECKING:
     from missions.exports.format import ExportFormat
 
+_REMOVED = {"cola2-v1": "cola2", "qgc-survey": "qgc"}
+
 
 def format_names() -> list[str]:
     """Names of all formats, in alphabetical order; imports none of them."""
@@ -23,6 +25,8 @@ def format_named(name: str) -> "ExportFormat":
     Raises:
         PlanError: there is none of this name.
     """
+    if name in _REMOVED:
+        raise PlanError(f"format {name!r} is no longer written: use {_REMOVED[name]!r}")
     if name not in format_names():
         raise PlanError(f"format {name!r} is not known; known are {', '.join(format_names())}")
     module = import_module(f"{formats.__name__}.{name.replace('-', '_')}")

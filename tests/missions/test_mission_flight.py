@@ -38,8 +38,7 @@ from missions.values.plan_file import Plan
 from tests.missions.flown_plans import plan_of, planned, walk
 
 FILES = {
-    "cola2": "mission_dive1.xml", "cola2-v1": "mission_v1_dive1.xml",
-    "wpl": "mission_dive1.waypoints", "qgc": "mission_dive1.plan",
+    "cola2": "mission_dive1.xml", "wpl": "mission_dive1.waypoints", "qgc": "mission_dive1.plan",
 }  # fmt: skip
 
 

@@ -3,18 +3,32 @@
 Structure as its loaders read it (cola2_lib, class Mission): actions
 of a step are called when its manoeuvre is done, so the camera starts with the step that ends at a
 line's start. `no_altitude_goes_up` makes the vehicle rise while its altimeter sees no floor.
+
+COLA2 ends a step only near its end and turns on the spot by itself: a heading far off the requested
+one stops its surge. So
+
+- a line goes on past its end by the tolerance and a picture's step, as far as the allowed area lets
+  it: the step may end early and still take the line's last picture;
+- turns on the spot are left to the step that follows; they need no thrusters sideways;
+- the step that leads to a line ends beyond it by the tolerance, less the way that the vehicle goes
+  on while it turns, so that it is done where there is just that way left to the line;
+- a run-in begins as far before its line as the vehicle needs to come onto it, where there is room;
+- of the chords that stand for an arc those are left out that lie nearer to the one before than
+  twice their tolerance, except the last before a line.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 from xml.etree.ElementTree import Element
 
-from missions.exports.cola2_way import Cola2Step, cola2_steps
+import numpy as np
+
 from missions.exports.format import Export, ExportFile, ExportFormat
-from missions.exports.options import Options
-from missions.exports.waypoints import Waypoint
+from missions.exports.options import MIN_TOLERANCE_M, Options
+from missions.exports.waypoints import Waypoint, gone_on, moved, room_m
 from missions.exports.xml_text import (
     child,
     degrees,
@@ -29,13 +43,98 @@ from missions.values.mission import Heave, Mission, MissionStep
 _DEPTH, _ALTITUDE, _BOTH = 0, 1, 2
 """Version 2.0's heave modes. Both: altitude where the altimeter sees the floor, else depth."""
 _HEAVES: tuple[Heave, ...] = ("depth", "altitude", "both")
+_TOUCH_M = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cola2Step:
+    """A step of a COLA2 mission."""
+
+    start: Waypoint
+    """Where its way begins; of a section, what the file states."""
+    end: Waypoint
+    tolerance_m: float
+
+    @property
+    def is_section(self) -> bool:
+        """Whether it goes along a straight that is stated."""
+        return self.end.kind in ("line", "run-in")
+
+
+def _steps(export: Export, points: tuple[Waypoint, ...]) -> Iterator[Cola2Step]:
+    """The steps of a dive's way-points."""
+    exact_m, ways_m = export.cola2_tolerance_m, _way_tolerance_m(export)
+    before = start = points[0]
+    for i, planned in enumerate(points):
+        point, following = planned, points[i + 1] if i + 1 < len(points) else None
+        leads_in = following is not None and following.kind in ("line", "run-in", "turn")
+        near = math.dist(point.vehicle_ne_m, before.vehicle_ne_m) < 2.0 * ways_m
+        idle = point.camera is None
+        if idle and (point.kind == "turn" or (near and point.kind == "way" and not leads_in)):
+            if following is not None and following.kind == "run-in":
+                point = _set_back(export, point, following)
+            start = point
+            continue
+        tolerance_m = exact_m if leads_in or point.kind in ("line", "run-in", "turn") else ways_m
+        end = point
+        if point.kind == "line" and point.camera == "off":
+            end = gone_on(export.plan, point, tolerance_m)
+        elif leads_in and idle and point.kind == "way":
+            if following is not None and following.kind == "run-in":
+                point = _set_back(export, point, following)
+            end = _led_beyond(export, before, point, tolerance_m)
+        yield Cola2Step(start=start, end=end, tolerance_m=tolerance_m)
+        before = start = point
+
+
+def _way_tolerance_m(export: Export) -> float:
+    """Tolerance between lines: as far as the run-in lets the vehicle settle again."""
+    plan = export.plan
+    return max(export.cola2_tolerance_m, min(plan.run_in_m, plan.line_spacing_m / 2))
+
+
+def _set_back(export: Export, point: Waypoint, start: Waypoint) -> Waypoint:
+    """The place where a run-in begins, moved back along it as far as the vehicle may turn there.
+
+    Coming onto it as far off as its tolerance, COLA2 needs the way delta ln(tolerance / allowed)
+    until it is no farther off than its pictures may be.
+
+    Args:
+        export: the plan.
+        point: where the run-in is planned to begin.
+        start: where the line begins.
+    """
+    follower, plan = export.options.follower, export.plan
+    if follower is None or not math.isfinite(follower.delta_m):
+        return point
+    allowed_m = max(0.5 * (plan.footprint_m[0] - plan.line_spacing_m), MIN_TOLERANCE_M)
+    requested_m = follower.delta_m * math.log(max(export.cola2_tolerance_m / allowed_m, 1.0))
+    line = plan.lines[start.line]
+    back = -np.array([math.cos(line.heading_rad), math.sin(line.heading_rad)])
+    reach_m = max(requested_m, plan.run_in_m) + follower.circle_m
+    free_m = room_m(plan, np.array(line.start_ne_m), reach_m * back) - follower.circle_m
+    by_m = free_m - math.dist(point.vehicle_ne_m, start.vehicle_ne_m)
+    return moved(plan, point, max(by_m, 0.0) * back)
+
+
+def _led_beyond(
+    export: Export, came_from: Waypoint, point: Waypoint, tolerance_m: float
+) -> Waypoint:
+    """A way-point before a line, moved on along the way to it."""
+    follower = export.options.follower
+    way = np.subtract(point.vehicle_ne_m, came_from.vehicle_ne_m)
+    length_m = float(np.hypot(*way))
+    if follower is None or length_m < _TOUCH_M:
+        return point
+    by_m = max(tolerance_m - follower.turn_in_m, -length_m)
+    return moved(export.plan, point, by_m / length_m * way)
 
 
 def write_cola2(path: Path, export: Export, dive: int) -> None:
     """Write a dive as a mission of version 2.0: sections along lines, gotos, parks for sways."""
     root = Element("mission")
     child(root, "version", "2.0")
-    for planned in cola2_steps(export, dive):
+    for planned in _steps(export, export.dives[dive]):
         step = child(root, "mission_step")
         if planned.end.kind == "sway":
             _park(step, planned.end)
@@ -43,8 +142,8 @@ def write_cola2(path: Path, export: Export, dive: int) -> None:
             _section(step, planned)
         else:
             _goto(step, planned.end, planned.tolerance_m)
-        add_actions(step, planned.end, export.options)
-    write_xml(path, root, comment(export))
+        _add_actions(step, planned.end, export.options)
+    write_xml(path, root, _comment(export))
 
 
 def _goto(step: Element, point: Waypoint, tolerance_m: float) -> None:
@@ -90,7 +189,7 @@ def _final(manoeuvre: Element, point: Waypoint) -> None:
     child(manoeuvre, "final_altitude", metres(point.altitude_m))
 
 
-def add_actions(step: Element, point: Waypoint, options: Options) -> None:
+def _add_actions(step: Element, point: Waypoint, options: Options) -> None:
     """Call the service that starts or stops pictures, where a way-point does so."""
     if point.camera is None:
         return
@@ -99,7 +198,7 @@ def add_actions(step: Element, point: Waypoint, options: Options) -> None:
     child(action, "action_id", name)
 
 
-def comment(export: Export) -> str:
+def _comment(export: Export) -> str:
     """What the places of a mission are of, for people who read the file."""
     plan = export.plan
     return (
@@ -122,17 +221,17 @@ def read_cola2(text: str) -> Mission | None:
     if value_of(root, "version") != "2.0":
         raise ValueError(f"version {value_of(root, 'version')} of COLA2 missions is not known")
     elements = root.findall("mission_step")
-    cameras = camera_switches(elements)
+    cameras = _camera_switches(elements)
     return Mission(
         autopilot="cola2",
         steps=tuple(
-            _read_step(manoeuvre_of(element), camera)
+            _read_step(_manoeuvre_of(element), camera)
             for element, camera in zip(elements, cameras, strict=True)
         ),
     )
 
 
-def manoeuvre_of(step: Element) -> Element:
+def _manoeuvre_of(step: Element) -> Element:
     """The manoeuvre of a step.
 
     Raises:
@@ -178,7 +277,7 @@ def _park_kind(turns: bool) -> Literal["keep", "anchor"]:
     return "keep" if turns else "anchor"
 
 
-def camera_switches(steps: Sequence[Element]) -> list[Literal["on", "off"] | None]:
+def _camera_switches(steps: Sequence[Element]) -> list[Literal["on", "off"] | None]:
     """What each step of a mission switches pictures to.
 
     A mission calls two services in turn, whatever their names are.

@@ -31,26 +31,15 @@ from missions.values.plan_file import Plan
 
 _ARDUPILOT, _SUBMARINE = 3, 12
 """MAV_AUTOPILOT_ARDUPILOTMEGA and MAV_TYPE_SUBMARINE."""
-ALTITUDE_MODES = {FRAME_ABOVE_HOME: 1, FRAME_ABOVE_TERRAIN: 4}
+_ALTITUDE_MODES = {FRAME_ABOVE_HOME: 1, FRAME_ABOVE_TERRAIN: 4}
 """QGroundControl's own numbers for MAVLink frames."""
 _MIXED = 0
 
 
 def write_qgc(path: Path, export: Export, dive: int) -> None:
-    """Write a dive as single mission items."""
-    write_json(path, document(export, dive, simple_items(export.items(dive))))
-
-
-def simple_items(items: Sequence[Item], first: int = 1) -> list[dict[str, Any]]:
-    """Mission items as QGroundControl lists them, numbered from the first."""
-    return [_simple(item, number) for number, item in enumerate(items, start=first)]
-
-
-def document(export: Export, dive: int, items: list[dict[str, Any]]) -> dict[str, Any]:
-    """The whole file, with the fence."""
+    """Write a dive as single mission items, with the fence."""
     plan, home, mount = export.plan, export.home_lat_lon_deg, export.mount
-    fence = _fence(plan, export.dives[dive], mount)
-    return {
+    document = {
         "fileType": "Plan",
         "version": 1,
         "groundStation": "QGroundControl",
@@ -62,16 +51,17 @@ def document(export: Export, dive: int, items: list[dict[str, Any]]) -> dict[str
             "cruiseSpeed": plan.speed_mps,
             "hoverSpeed": plan.speed_mps,
             "plannedHomePosition": [round(home[0], 10), round(home[1], 10), 0],
-            "items": items,
+            "items": [_simple(item, i) for i, item in enumerate(export.items(dive), start=1)],
         },
         "geoFence": {
             "version": 2,
             "circles": [],
-            "polygons": fence,
+            "polygons": _fence(plan, export.dives[dive], mount),
         },
         "rallyPoints": {"version": 2, "points": []},
         "aliceSurvey": {"name": plan.name, "about": mount.about},
     }
+    write_json(path, document)
 
 
 def _simple(item: Item, number: int) -> dict[str, Any]:
@@ -87,7 +77,7 @@ def _simple(item: Item, number: int) -> dict[str, Any]:
         data |= {
             "AMSLAltAboveTerrain": None,
             "Altitude": item.params[6],
-            "AltitudeMode": ALTITUDE_MODES[item.frame],
+            "AltitudeMode": _ALTITUDE_MODES[item.frame],
         }
     return data
 
@@ -122,10 +112,10 @@ def _fence(plan: Plan, points: Sequence[Waypoint], mount: CameraMount) -> list[d
 
 
 def _polygon(plan: Plan, polygon: Polygon, *, inclusion: bool) -> dict[str, Any]:
-    return {"version": 1, "inclusion": inclusion, "polygon": corners(plan, polygon)}
+    return {"version": 1, "inclusion": inclusion, "polygon": _corners(plan, polygon)}
 
 
-def corners(plan: Plan, polygon: Polygon) -> list[list[float]]:
+def _corners(plan: Plan, polygon: Polygon) -> list[list[float]]:
     """Latitudes and longitudes of a polygon's outer corners."""
     outer_ne = np.asarray(polygon.exterior.coords, dtype=np.float64)[:-1, :2]
     rows = lat_lon(plan.datum, outer_ne, 0.0)

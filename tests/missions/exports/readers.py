@@ -29,11 +29,6 @@ _CHILDREN = {
         "no_altitude_goes_up",
     ],
 }  # fmt: skip
-_V1 = {
-    "waypoint": ["position", "speed", "tolerance"],
-    "section": ["initial_position", "final_position", "speed", "tolerance"],
-    "park": ["position", "speed", "time", "tolerance"],
-}
 
 
 @dataclass(frozen=True)
@@ -75,33 +70,6 @@ def read_cola2(path: Path) -> list[Step]:
         assert [child.tag for child in manoeuvre] == _CHILDREN[kind]
         values = {child.tag: _value(child) for child in manoeuvre}
         assert values["heave_mode"] in (0, 1, 2)
-        steps.append(Step(kind, values, actions))
-    return steps
-
-
-def read_cola2_v1(path: Path) -> list[Step]:
-    """Strict reader of version 1: `initial_position.z` and the like become keys."""
-    root = _root(path)
-    assert root.tag == "mission"
-    assert not root.attrib
-    steps = []
-    for element in root:
-        manoeuvre, actions = _step(element)
-        kind = manoeuvre.attrib["type"]
-        assert [child.tag for child in manoeuvre] == _V1[kind]
-        values: dict[str, float | bool | int] = {}
-        for child in manoeuvre:
-            if child.tag.endswith("position"):
-                tags = [part.tag for part in child]
-                assert tags == ["latitude", "longitude", "z", "altitude_mode"]
-                assert child[3].text in ("True", "False")
-                values |= {f"{child.tag}.{part.tag}": _value(part) for part in child[:3]}
-                values[f"{child.tag}.altitude_mode"] = child[3].text == "True"
-            elif child.tag == "tolerance":
-                assert [part.tag for part in child] == ["x", "y", "z"]
-                values |= {f"tolerance.{part.tag}": _value(part) for part in child}
-            else:
-                values[child.tag] = _value(child)
         steps.append(Step(kind, values, actions))
     return steps
 

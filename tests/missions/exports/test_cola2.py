@@ -24,7 +24,6 @@ from tests.missions.exports.readers import (
     local_ne,
     plans,
     read_cola2,
-    read_cola2_v1,
     rigs,
     turned,
 )
@@ -44,11 +43,10 @@ def place(plan: Plan, step: Step, which: str = "final") -> np.ndarray:
     return np.array(local_ne(plan.datum, latitude, longitude))
 
 
-@pytest.mark.parametrize(("format_", "name"), [("cola2", "mission"), ("cola2-v1", "mission_v1")])
-def test_missions_are_those_on_file(tmp_path: Path, format_: str, name: str) -> None:
-    write_exports(tmp_path, golden_plan(), RIG, formats=[format_])
-    written = (tmp_path / f"{name}_dive1.xml").read_bytes()
-    assert written == (GOLDEN / f"{name}.xml").read_bytes()
+def test_a_mission_is_that_on_file(tmp_path: Path) -> None:
+    write_exports(tmp_path, golden_plan(), RIG, formats=["cola2"])
+    written = (tmp_path / "mission_dive1.xml").read_bytes()
+    assert written == (GOLDEN / "mission.xml").read_bytes()
 
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -180,27 +178,6 @@ def test_the_tolerance_keeps_neighbouring_lines_together(
     assert close == pytest.approx(0.23)
     written = [s.values["tolerance_xy"] for s in steps_of(plan, RIG) if s.kind == "section"]
     assert written == pytest.approx([error_m] * len(written), abs=1e-4)
-
-
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(plan=plans())
-def test_version_1_flies_the_same_places(plan: Plan) -> None:
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        write_exports(folder, plan, RIG, formats=["cola2", "cola2-v1"])
-        for number in range(1, len(plan.dives) + 1):
-            new = read_cola2(folder / f"mission_dive{number}.xml")
-            old = read_cola2_v1(folder / f"mission_v1_dive{number}.xml")
-            assert len(new) == len(old)
-            for step, former in zip(new, old, strict=True):
-                key = "final_position" if former.kind == "section" else "position"
-                for axis in ("latitude", "longitude"):
-                    assert step.values[f"final_{axis}"] == former.values[f"{key}.{axis}"]
-                by_altitude = bool(former.values[f"{key}.altitude_mode"])
-                z = step.values["final_altitude" if by_altitude else "final_depth"]
-                assert former.values[f"{key}.z"] == z
-                assert step.actions == former.actions
-                assert former.kind == {"goto": "waypoint"}.get(step.kind, step.kind)
 
 
 def test_names_of_actions_are_the_vehicles_own() -> None:

@@ -108,13 +108,11 @@ def test_wpl_in_pymavlink(plan: Plan, rig: Rig) -> None:
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
 @given(plan=plans(), rig=rigs())
-@pytest.mark.parametrize("format_", ["qgc", "qgc-survey"])
-def test_plans_in_mavsdk(import_plan: Importer, format_: str, plan: Plan, rig: Rig) -> None:
-    name = {"qgc": "mission", "qgc-survey": "survey"}[format_]
+def test_plans_in_mavsdk(import_plan: Importer, plan: Plan, rig: Rig) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        written(plan, rig, [format_], Path(folder))
+        written(plan, rig, ["qgc"], Path(folder))
         for dive in range(len(plan.dives)):
-            data = import_plan(str(Path(folder) / f"{name}_dive{dive + 1}.plan"))
+            data = import_plan(str(Path(folder) / f"mission_dive{dive + 1}.plan"))
             items = [
                 {"command": m.command, "frame": m.frame, "param1": m.param1, "lat": m.x * 1e-7,
                  "lon": m.y * 1e-7, "z": m.z} for m in data.mission_items
@@ -123,14 +121,12 @@ def test_plans_in_mavsdk(import_plan: Importer, format_: str, plan: Plan, rig: R
             check_lines(plan, rig, dive, items, 0.0058)
 
 
-def test_both_plans_and_the_wpl_say_the_same(tmp_path: Path, import_plan: Importer) -> None:
+def test_a_plan_and_the_wpl_say_the_same(tmp_path: Path, import_plan: Importer) -> None:
     plan = small_plan()
-    written(plan, RIG, ["qgc", "qgc-survey", "wpl"], tmp_path)
+    written(plan, RIG, ["qgc", "wpl"], tmp_path)
     for dive in (1, 2):
         simple = import_plan(str(tmp_path / f"mission_dive{dive}.plan")).mission_items
-        survey = import_plan(str(tmp_path / f"survey_dive{dive}.plan")).mission_items
         rows = read_wpl(tmp_path / f"mission_dive{dive}.waypoints")
-        assert [vars(item) for item in simple] == [vars(item) for item in survey]
         # The first item is home in all; MAVSDK says it in integers.
         assert [item.command for item in simple] == [row.command for row in rows]
         for item, row in list(zip(simple, rows, strict=True))[1:]:
@@ -226,32 +222,11 @@ def test_a_zone_that_the_reference_point_must_cut_is_shrunk_or_left_out(
     assert "0.12 m2" in capsys.readouterr().err
 
 
-def test_the_survey_item_has_what_qgroundcontrol_needs(tmp_path: Path) -> None:
-    plan = small_plan(name='a<b&"c')
-    written(plan, RIG, ["qgc-survey"], tmp_path)
-    data = json.loads((tmp_path / "survey_dive1.plan").read_text())
-    (survey,) = [item for item in data["mission"]["items"] if item["type"] == "ComplexItem"]
-    calc = survey["TransectStyleComplexItem"]["CameraCalc"]
-
+def test_a_plan_has_what_qgroundcontrol_needs(tmp_path: Path) -> None:
+    written(small_plan(name='a<b&"c'), RIG, ["qgc"], tmp_path)
+    data = json.loads((tmp_path / "mission_dive1.plan").read_text())
     assert (data["fileType"], data["version"], data["mission"]["version"]) == ("Plan", 1, 2)
     assert (data["mission"]["firmwareType"], data["mission"]["vehicleType"]) == (3, 12)
-    assert (survey["complexItemType"], survey["version"]) == ("survey", 5)
-    assert {"angle", "entryLocation", "flyAlternateTransects", "splitConcavePolygons"} < set(survey)
-    assert len(survey["polygon"]) == 4
     assert data["aliceSurvey"]["name"] == 'a<b&"c'
-    # What QGroundControl computes with a pinhole is what the camera sees through its port.
-    across = calc["SensorWidth"] / calc["FocalLength"] * calc["DistanceToSurface"]
-    assert across == pytest.approx(plan.footprint_m[0], abs=1e-6)
-    assert across * (1 - calc["SideOverlap"] / 100) == pytest.approx(1.0, abs=1e-4)
-    assert calc["AdjustedFootprintSide"] == 1.0
-    assert survey["TransectStyleComplexItem"]["CameraShots"] == 33
-    numbers = [
-        item["doJumpId"]
-        for entry in data["mission"]["items"]
-        for item in (
-            entry["TransectStyleComplexItem"]["Items"]
-            if entry["type"] == "ComplexItem"
-            else [entry]
-        )
-    ]
+    numbers = [item["doJumpId"] for item in data["mission"]["items"]]
     assert numbers == list(range(1, len(numbers) + 1))

@@ -21,10 +21,8 @@ from tests.missions.exports.readers import local_ne, plans, read_cola2, turned
 MM = 1e-3
 FORMATS = {
     "cola2": "mission_dive{}.xml",
-    "cola2-v1": "mission_v1_dive{}.xml",
     "wpl": "mission_dive{}.waypoints",
     "qgc": "mission_dive{}.plan",
-    "qgc-survey": "survey_dive{}.plan",
 }
 
 
@@ -111,10 +109,15 @@ def test_waypoints_are_read_as_pymavlink_reads_them(tmp_path: Path) -> None:
         assert step.speed_mps == pytest.approx(plan.speed_mps)
 
 
-def test_both_plans_of_qgroundcontrol_and_the_waypoints_are_one_mission(tmp_path: Path) -> None:
+def test_plans_of_qgroundcontrol_and_the_waypoints_are_one_mission(tmp_path: Path) -> None:
     paths = files_of(golden_plan(), tmp_path)
     first = read_mission(paths["qgc"])
-    assert first == read_mission(paths["qgc-survey"])
+    data = json.loads(paths["qgc"].read_text())
+    items = data["mission"]["items"]
+    survey = {"type": "ComplexItem", "TransectStyleComplexItem": {"Items": items[2:-1]}}
+    data["mission"]["items"] = [*items[:2], survey, items[-1]]
+    (tmp_path / "survey.plan").write_text(json.dumps(data))
+    assert first == read_mission(tmp_path / "survey.plan")
     again = read_mission(paths["wpl"])
     assert len(first.steps) == len(again.steps)
     for a, b in zip(first.steps, again.steps, strict=True):

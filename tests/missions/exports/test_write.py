@@ -33,8 +33,7 @@ def test_every_format_is_written_the_same_twice(tmp_path: Path) -> None:
     second = write_exports(tmp_path / "b", plan, RIG)
 
     names = {path.name for path in first}
-    for stem in ("mission_dive{}.xml", "mission_v1_dive{}.xml", "mission_dive{}.plan",
-                 "survey_dive{}.plan", "mission_dive{}.waypoints"):  # fmt: skip
+    for stem in ("mission_dive{}.xml", "mission_dive{}.plan", "mission_dive{}.waypoints"):
         assert {stem.format(1), stem.format(2)} < names
     assert {"plan.kml", "plan.gpx", "plan.geojson", "lines.csv", "stations.csv",
             "waypoints.csv", "about.txt"} < names  # fmt: skip
@@ -54,6 +53,8 @@ def test_a_format_comes_alone_with_its_description(tmp_path: Path, format_: str)
 
 
 def test_an_unknown_format_names_those_that_are_known(tmp_path: Path) -> None:
+    with pytest.raises(PlanError, match="no longer written: use 'cola2'"):
+        write_exports(tmp_path / "none", small_plan(), RIG, formats=["cola2-v1"])
     with pytest.raises(PlanError, match="dxf"):
         write_exports(tmp_path / "none", small_plan(), RIG, formats=["cola2", "dxf"])
     assert not (tmp_path / "none").exists()
