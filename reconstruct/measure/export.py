@@ -9,12 +9,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import shapely
+from shapely.geometry.base import BaseGeometry
 
-from alice_survey.core.frames import Array, Datum
+from alice_survey.core.frames import Datum
 
 _HEADER = ("name", "kind", "figure", "value", "sigma", "unit", "sigma_own", "sigma_shared",
            "notes", "places")  # fmt: skip
-_GEOMETRIES = {"point": "Point", "line": "LineString", "points": "LineString"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,6 +30,18 @@ class Measurement:
     figures: Sequence[Mapping[str, Any]]
     """As `Measured.to_json`; values that are not known are None."""
     notes: Sequence[str] = ()
+    shape: BaseGeometry | None = None
+    """Of a polygon with holes or of several parts, in the same coordinates."""
+
+    @property
+    def geometry(self) -> BaseGeometry:
+        """As shapely has it."""
+        if self.shape is not None:
+            return self.shape
+        if len(self.places) == 1:
+            return shapely.Point(self.places[0])
+        make = shapely.Polygon if self.kind == "polygon" else shapely.LineString
+        return make(self.places)
 
 
 def as_csv(measurements: Sequence[Measurement]) -> str:
@@ -42,7 +55,7 @@ def as_csv(measurements: Sequence[Measurement]) -> str:
             value, sigma, own, shared = (_digits(number) for number in numbers)
             rows.writerow(
                 [_plain(one.name), one.kind, figure["title"], value, sigma, figure["unit"], own,
-                 shared, "; ".join(one.notes), _well_known(one)]
+                 shared, "; ".join(one.notes), one.geometry.wkt]
             )  # fmt: skip
     return text.getvalue()
 
@@ -56,17 +69,13 @@ def as_geojson(measurements: Sequence[Measurement], datum: Datum | None, unit: s
             are written then.
         unit: of lengths.
     """
+
+    def placed(places: Any) -> Any:
+        return places if datum is None else np.round(datum.lon_lat_from_en(places), 11)
+
     features = []
     for one in measurements:
-        places = np.asarray(one.places, dtype=np.float64)[:, :2]
-        if datum is not None:
-            places = np.round(datum.lon_lat_from_en(places), 9)
-        if one.kind == "polygon":
-            places = _counter_clockwise(places)
-            coordinates: Any = [[*places.tolist(), places[0].tolist()]]
-        else:
-            coordinates = places.tolist() if len(places) > 1 else places[0].tolist()
-        kind = "Polygon" if one.kind == "polygon" else _GEOMETRIES[one.kind]
+        geometry = shapely.transform(shapely.force_2d(one.geometry), placed)
         figures = {}
         for figure in one.figures:
             figures[figure["name"]] = figure["value"]
@@ -75,7 +84,7 @@ def as_geojson(measurements: Sequence[Measurement], datum: Datum | None, unit: s
         features.append(
             {
                 "type": "Feature",
-                "geometry": {"type": kind, "coordinates": coordinates},
+                "geometry": shapely.geometry.mapping(shapely.orient_polygons(geometry)),
                 "properties": {
                     "name": one.name, "kind": one.kind, **figures, "notes": list(one.notes),
                 },
@@ -85,20 +94,6 @@ def as_geojson(measurements: Sequence[Measurement], datum: Datum | None, unit: s
     if datum is None:
         whole["coordinates"] = f"of the model or its plane, in {unit}, not longitude and latitude"
     return json.dumps(whole, indent=1, allow_nan=False) + "\n"
-
-
-def _counter_clockwise(places: Array) -> Array:
-    x, y = places.T
-    turns = float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum())
-    return places if turns >= 0 else places[::-1]
-
-
-def _well_known(one: Measurement) -> str:
-    places = list(one.places) + ([one.places[0]] if one.kind == "polygon" else [])
-    texts = ", ".join(" ".join(f"{value:.6g}" for value in place) for place in places)
-    if one.kind == "polygon":
-        return f"POLYGON (({texts}))"
-    return f"POINT ({texts})" if len(places) == 1 else f"LINESTRING ({texts})"
 
 
 def _digits(number: float | None) -> str:

@@ -26,7 +26,7 @@ COMMANDS = (
     "init", "fov", "target", "plan", "fly", "image", "calibrate", "import-images", "reconstruct",
     "scale", "evaluate", "run", "demo", "status", "camera", "vehicle", "import-control",
     "import-log", "measure", "control", "quality", "mosaic-tiles", "report", "studio", "view",
-    "join", "pilot", "simulate", "annotations",
+    "join", "pilot", "simulate",
 )  # fmt: skip
 
 

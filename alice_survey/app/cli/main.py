@@ -7,7 +7,6 @@ from typing import Annotated, Literal
 
 import typer
 
-from alice_survey.app.cli.annotations import app as annotations_app
 from alice_survey.app.cli.camera import app as camera_app
 from alice_survey.app.cli.intake import app as import_app
 from alice_survey.app.cli.live import app as live_app
@@ -50,7 +49,6 @@ app.add_typer(import_app)
 app.add_typer(live_app)
 app.add_typer(reconstruct_app, name="reconstruct")
 app.add_typer(model_app)
-app.add_typer(annotations_app, name="annotations")
 app.add_typer(report_app)
 app.add_typer(camera_app, name="camera")
 app.add_typer(vehicle_app, name="vehicle")

@@ -20,6 +20,7 @@ from alice_survey.app.cli.options import (
     executor_on,
     print_result,
 )
+from alice_survey.core.errors import ConfigError
 
 app = typer.Typer()
 reconstruct_app = typer.Typer(
@@ -132,30 +133,62 @@ def pair(
     epilog=examples(
         "measure stingray --points '1210,804 1893,850'",
         "measure reef --points 'left/000012.png:301,255 left/000012.png:640,270' --json",
+        "measure reef --polygons colonies.gpkg --label species -o colonies.csv",
     )
 )
 def measure(
     points: Annotated[
-        str,
+        str | None,
         typer.Option(
             help="Two or more: 'x,y' in the left picture of a pair, 'IMAGE:x,y' in a workspace, "
             "or 'IMAGE:x,y=IMAGE:x,y' where two pictures show the spot."
         ),
-    ],
-    pick_sigma: Annotated[float, typer.Option(min=0, help="Sigma of a picked pixel, px.")] = 0.0,
+    ] = None,
+    polygons: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Measure the polygons of a file: GeoJSON, GeoPackage, shapefile or KML.",
+        ),
+    ] = None,
+    label: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Attribute that holds the label of each polygon."),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--output", metavar="FILE", help="Write polygons and figures: .csv or .geojson."
+        ),
+    ] = None,
+    pick_sigma: Annotated[
+        float, typer.Option(min=0, help="Sigma of a picked pixel, or of a polygon's corner, px.")
+    ] = 0.0,
     n_water_sigma: Annotated[
         float, typer.Option(min=0, help="Of the water's index, where the rig does not say.")
     ] = 0.0,
     workspace: Workspace = WORK,
     as_json: AsJson = False,
 ) -> None:
-    """Measure between picked pixels.
+    """Measure between picked pixels, or within polygons.
 
-    The distance of two points with its sigma; of more, their path and the area they enclose.
+    The distance of two points with its sigma; of more, their path and the area they enclose. Of
+    polygons the area in plan and of the surface, the rugosity, and what each label covers.
     """
-    from reconstruct.station.measure import measure as measured
+    if (points is None) == (polygons is None):
+        raise ConfigError("measure takes either --points or --polygons")
+    if polygons is not None:
+        from reconstruct.measure.polygon_files import measure_polygon_file
 
-    result = measured(workspace, points, pick_sigma_px=pick_sigma, n_water_sigma=n_water_sigma)
+        result = measure_polygon_file(
+            workspace, polygons, label=label, pick_sigma_px=pick_sigma, output=output
+        )
+    else:
+        from reconstruct.station.measure import measure as measured
+
+        result = measured(
+            workspace, points or "", pick_sigma_px=pick_sigma, n_water_sigma=n_water_sigma
+        )
     print_result(*result, as_json)
 
 

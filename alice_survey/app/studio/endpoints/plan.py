@@ -417,7 +417,7 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
     def post(name: str, answer: Callable[[Call], Any], **options: Any) -> Endpoint:
         return Endpoint(
             path=f"/api/plan/{name}", answer=answer, method="POST",
-            **{"most_bytes": _MAX_REQUEST, **options},
+            **{"max_bytes": _MAX_REQUEST, **options},
         )  # fmt: skip
 
     return (

@@ -15,7 +15,7 @@ from alice_survey.core.errors import PlanError, warn
 from alice_survey.kit.document import EAST_NORTH, PictureLayer, ShapeLayer
 from alice_survey.kit.map import map_data, map_extent
 
-TABS = ("plan", "model", "pictures", "annotate", "compare", "follow", "run")
+TABS = ("plan", "model", "pictures", "compare", "follow", "run")
 _PRODUCTS = {
     "plan": "plan/plan.json", "flight": "flight/navigation.csv", "pictures": "images/manifest.csv",
     "sparse": "sparse/track.csv", "dem": "dense/dem.tif", "mosaic": "mosaic/mosaic.tif",

@@ -1,1 +1,0 @@
-"""ToolFiles of annotation tools: one module each, read and written."""
