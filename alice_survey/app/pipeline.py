@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from filelock import FileLock, Timeout
 
 from alice_survey.core import stages as survey_stages
-from alice_survey.core.artefacts import read_json, read_stage
+from alice_survey.core.artefacts import read_json, read_stage, refuse_links
 from alice_survey.core.config import (
     SurveyConfig,
     changed,
@@ -259,6 +259,7 @@ def init_survey(
     if area is not None and not area.is_file():
         raise WorkspaceError(f"{area}: no such file")
     path = folder / "survey.toml"
+    refuse_links(folder, path)
     if path.exists():
         raise WorkspaceError(f"{path} exists already; edit it, or remove it first")
     from alice_survey.core.settings_text import with_settings_changed
@@ -381,6 +382,7 @@ def is_locked(workspace: Path) -> bool:
 @contextlib.contextmanager
 def only_one(workspace: Path) -> Iterator[None]:
     """Lock the workspace so that no second run writes into it."""
+    refuse_links(workspace, workspace / ".lock")
     lock = FileLock(workspace / ".lock", timeout=0)
     try:
         workspace.mkdir(parents=True, exist_ok=True)

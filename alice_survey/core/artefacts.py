@@ -9,12 +9,14 @@ import contextlib
 import csv
 import functools
 import hashlib
+import itertools
 import json
 import os
 import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, ClassVar, Self, TypeVar
 
@@ -126,9 +128,13 @@ def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], object]) -> 
 
     Returns:
         True when the work was done, False when it was skipped.
+
+    Raises:
+        WorkspaceError: an input does not exist, or the folder is or holds a link.
     """
     final, partial = workspace / stage.name, workspace / f"{stage.name}.partial"
     replaced = workspace / f"{stage.name}.replaced"
+    refuse_links(workspace, final, partial, replaced)
     if replaced.exists():  # a kill fell between the two renames below
         if final.exists():
             shutil.rmtree(replaced)
@@ -177,6 +183,31 @@ def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], object]) -> 
             shutil.rmtree(replaced)
         finish(**spent, **how)
     return True
+
+
+def refuse_links(root: Path, *paths: Path) -> None:
+    """Refuse links below a folder, through which writing and deleting would leave it.
+
+    Args:
+        root: such as a workspace; it may be a link itself.
+        paths: files and folders that are to be written or removed; what lies outside of the root,
+            as a person has named it, is not looked at.
+
+    Raises:
+        WorkspaceError: one of them, a folder above it, or something inside it is a link.
+    """
+    for path in paths:
+        if path.is_relative_to(root) and (link := _first_link(root, path)) is not None:
+            raise WorkspaceError(
+                f"{link} is a link, and a survey is not written through links: remove it, or "
+                "replace it by what it points to"
+            )
+
+
+def _first_link(root: Path, path: Path) -> Path | None:
+    above = itertools.takewhile(lambda one: one != root, (path, *path.parents))
+    inside = (Path(folder, name) for folder, *both in os.walk(path) for name in chain(*both))
+    return next((one for one in chain(above, inside) if one.is_symlink()), None)
 
 
 def _measured(partial: Path, work: Callable[[Path], object]) -> Spent:

@@ -8,7 +8,7 @@ from typing import Any
 
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.core.artefacts import need_stage, write_json
+from alice_survey.core.artefacts import need_stage, refuse_links, write_json
 from alice_survey.core.config import CameraConfig, SurveyConfig, WaterConfig
 from alice_survey.core.errors import PlanError, warn
 from alice_survey.core.executor import SERIAL, Executor, local_executor
@@ -174,6 +174,7 @@ def check_report(
     rig = rig_of(workspace, config.camera, config.water)
     check = check_log(workspace, rig, path, triggers=triggers, manifest=manifest, executor=executor)
     folder = workspace / "check" if out is None else out
+    refuse_links(workspace, folder)
     (folder / "hole_probability.png").unlink(missing_ok=True)  # of an earlier check
     if not check.holes and (folder / "refly").exists():
         warn(f"{folder / 'refly'} is of an earlier check: there are no holes now")

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from alice_survey.core.artefacts import refuse_links
 from alice_survey.core.errors import ReconstructionError, WorkspaceError, warn
 from alice_survey.core.records import ChangeRecord
 from alice_survey.core.run import progress
@@ -82,6 +83,7 @@ def evaluate_against(
             f"bent or wrongly scaled, or they are laid on each other wrongly; look at the maps"
         )
     folder = out or workspace / "against" / earlier.resolve().name
+    refuse_links(workspace, folder)
     folder.mkdir(parents=True, exist_ok=True)
     figures = {
         "format": "alice-survey change",

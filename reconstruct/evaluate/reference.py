@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from alice_survey.core.artefacts import need_stage
+from alice_survey.core.artefacts import need_stage, refuse_links
 from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.frames import Array
 from alice_survey.core.records import ReferenceRecord, RegistrationRecord
@@ -101,6 +101,7 @@ def evaluate_reference(
         "doming": fit_doming(ours.points[:, :2], ours.signed_m).to_json(),
     }
     folder = out or workspace / "reference"
+    refuse_links(workspace, folder)
     folder.mkdir(parents=True, exist_ok=True)
     plot_reference(folder / "reference.png", ours, back, pixel_m)
     ReferenceRecord.save(folder / "reference.json", figures)

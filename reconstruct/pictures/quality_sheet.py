@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from alice_survey.core.artefacts import read_stage, write_csv
+from alice_survey.core.artefacts import read_stage, refuse_links, write_csv
 from alice_survey.core.errors import ImageError
 from alice_survey.core.executor import Executor
 from alice_survey.core.manifest import read_manifest
@@ -124,6 +124,7 @@ def quality_report(workspace: Path, executor: Executor) -> tuple[str, dict[str, 
     Raises:
         ImageError: there is no manifest, or it names no picture.
     """
+    refuse_links(workspace, workspace / "quality")
     images = workspace / "images"
     records = read_manifest(images / "manifest.csv")
     if not records:

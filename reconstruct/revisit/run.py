@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from alice_survey.core.artefacts import write_json
+from alice_survey.core.artefacts import refuse_links, write_json
 from alice_survey.core.config import SurveyConfig
 from alice_survey.core.errors import PlanError, warn
 from alice_survey.core.executor import Executor
@@ -65,6 +65,7 @@ def revisit_report(
     goal_m = None if sigma_mm is None else 1e-3 * sigma_mm
     found = find_weak(workspace, rig, sigma_goal_m=goal_m, executor=executor)
     folder = workspace / "revisit" if out is None else out
+    refuse_links(workspace, folder)
     again, dive, words = None, None, ""
     cures: tuple[Prediction, ...] = ()
     if found.places:

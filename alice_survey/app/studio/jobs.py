@@ -8,8 +8,8 @@ both as Ctrl-C ends a command: its stages resume where they were.
 
 import contextlib
 import os
+import re
 import shlex
-import shutil
 import signal
 import subprocess
 import sys
@@ -27,14 +27,16 @@ from pydantic import Field
 from alice_survey.app.pipeline import is_locked
 from alice_survey.app.studio.commands import COMMANDS, words_of
 from alice_survey.app.studio.heard import EventsTail, Heard
-from alice_survey.core.artefacts import JsonRecord
+from alice_survey.core.artefacts import JsonRecord, refuse_links
 from alice_survey.core.errors import AliceError, WorkspaceError, why
 from alice_survey.core.run.interrupts import for_other_programs
 from alice_survey.core.stages import spec
 
-RECORD, OUTPUT, ERRORS = "job.json", "output.txt", "errors.txt"
+RECORD, OUTPUT, ERRORS, EVENTS = "job.json", "output.txt", "errors.txt", "events.jsonl"
 """Files of a job."""
 FOLDER = Path(".studio", "jobs")
+_NUMBER = re.compile("[0-9]{4,9}")
+"""Names of jobs' folders."""
 _KEPT_JOBS = 20
 _LOOK_EVERY_S = 0.1
 _PUBLISH_EVERY_S = 0.25
@@ -102,7 +104,7 @@ class _Job:
         self.folder, self.record = folder, record
         self.heard, self.stopping = Heard(), False
         self.ended = threading.Event()
-        self._process, self._tail = process, EventsTail(folder / "events.jsonl")
+        self._process, self._tail = process, EventsTail(folder / EVENTS)
 
     @property
     def is_own(self) -> bool:
@@ -218,6 +220,7 @@ class Jobs:
         words = words_of(name, arguments or {}, self._workspace)
         with self._lock:
             try:
+                refuse_links(self._workspace, self.folder.parent)
                 self.folder.mkdir(parents=True, exist_ok=True)
                 with FileLock(self.folder / ".starting", timeout=_LOCK_S):
                     self._adopt()
@@ -286,7 +289,7 @@ class Jobs:
             folder = self.folder / f"{number:04d}"
             if not (folder / RECORD).is_file():
                 raise FileNotFoundError(folder)
-            heard, tail = Heard(), EventsTail(folder / "events.jsonl")
+            heard, tail = Heard(), EventsTail(folder / EVENTS)
             heard.take(tail.read())
             output = "" if heard.lines_n else _output(folder / ERRORS)
         return {"lines": heard.log(after), "total": heard.lines_n, "output": output}
@@ -305,13 +308,13 @@ class Jobs:
     def _started(self, name: str, arguments: Mapping[str, Any], words: Sequence[str]) -> _Job:
         folders = self._folders()
         number = int(folders[0].name) + 1 if folders else 1
-        for old in folders[_KEPT_JOBS - 1 :]:
-            shutil.rmtree(old, ignore_errors=True)
+        for old in self._records()[_KEPT_JOBS - 1 :]:
+            _remove(self.folder / f"{old.number:04d}")
         folder = self.folder / f"{number:04d}"
         folder.mkdir()
         command = [
             *self._program, *words[: len(name.split())],
-            f"--events={folder / 'events.jsonl'}", *words[len(name.split()) :],
+            f"--events={folder / EVENTS}", *words[len(name.split()) :],
         ]  # fmt: skip
         with (
             (folder / OUTPUT).open("wb") as output,
@@ -356,14 +359,18 @@ class Jobs:
         for folder in self._folders():
             with contextlib.suppress(WorkspaceError):  # of one that is being written or is damaged
                 record = JobRecord.made(folder / RECORD)
-                found += [] if record is None else [record]
+                if record is not None and folder.name == f"{record.number:04d}":
+                    found.append(record)
         return found
 
     def _folders(self) -> list[Path]:
+        """Folders with a number, the highest first; none where links are among them."""
         try:
-            return sorted((p for p in self.folder.iterdir() if p.name.isdecimal()), reverse=True)
-        except OSError:
+            refuse_links(self._workspace, self.folder)
+            found = [path for path in self.folder.iterdir() if _NUMBER.fullmatch(path.name)]
+        except (OSError, WorkspaceError):
             return []
+        return sorted(found, key=lambda path: int(path.name), reverse=True)
 
     def _follow(self, job: _Job) -> None:
         threading.Thread(target=self._listen, args=(job,), name="job", daemon=True).start()
@@ -394,6 +401,14 @@ class Jobs:
         self._publish(
             "run", {"job": None, "last": record.to_json(), "elsewhere": None, "ended": True}
         )
+
+
+def _remove(folder: Path) -> None:
+    """Remove the files of a job, and its folder if it holds nothing else."""
+    with contextlib.suppress(OSError):
+        for name in (RECORD, OUTPUT, ERRORS, EVENTS):
+            (folder / name).unlink(missing_ok=True)
+        folder.rmdir()
 
 
 def _first_signal() -> signal.Signals:

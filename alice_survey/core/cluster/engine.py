@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from filelock import FileLock, Timeout
 
+from alice_survey.core.artefacts import refuse_links
 from alice_survey.core.cluster.connection import Connection, connected
 from alice_survey.core.cluster.worker import (
     Answer,
@@ -100,6 +101,7 @@ def _store(workspace: Path) -> Iterator[Path]:
 
     Those of runs that were killed go now: what holds their locks has ended.
     """
+    refuse_links(workspace, workspace / STORE)
     folder = (workspace / STORE).resolve() / os.urandom(6).hex()
     lock = FileLock(folder.with_suffix(_LOCK), timeout=0)
     try:

@@ -13,7 +13,7 @@ from alice_survey.app.pipeline import init_survey
 from alice_survey.app.studio.commands import ImportImagesArguments
 from alice_survey.app.studio.endpoints.base import Call, Endpoint, Studio
 from alice_survey.app.studio.folders import Folders
-from alice_survey.core.artefacts import json_values
+from alice_survey.core.artefacts import json_values, refuse_links
 from alice_survey.core.config import Config, load_config
 from alice_survey.core.edited_files import StaleError
 from alice_survey.core.errors import AliceError, WorkspaceError
@@ -122,6 +122,7 @@ class _StartPage:
             raise AliceError(f"{given.name} did not arrive whole: drop it again") from None
         folder = self.studio.workspace.folder
         area, toml = folder / f"area{suffix}", folder / "survey.toml"
+        refuse_links(folder, area, toml)
         if area.exists():
             raise StaleError(f"{area} exists already: remove it first")
         try:
@@ -145,6 +146,7 @@ class _StartPage:
         """Write the colours that are not the usual ones; what an earlier try has written goes."""
         toml = self.studio.workspace.folder / "survey.toml"
         text = "" if colour == "water" else _COLOUR.format(colour)
+        refuse_links(toml.parent, toml)
         before = toml.read_text(encoding="utf-8") if toml.is_file() else ""
         if before == text:
             return

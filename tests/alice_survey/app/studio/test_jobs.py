@@ -273,6 +273,47 @@ def test_few_jobs_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
             jobs.log(1)
 
 
+@pytest.mark.parametrize("linked", [".studio", ".studio/jobs", ".studio/jobs/2024"])
+def test_jobs_behind_a_link_are_not_touched(linked: str, tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    for year in range(2000, 2025):
+        (photos / "jobs" / str(year)).mkdir(parents=True)
+        (photos / "jobs" / str(year) / "photo.jpg").touch()
+    target = {".studio": photos, ".studio/jobs": photos / "jobs"}.get(linked, photos / "jobs/2024")
+    before = sorted(photos.rglob("*"))
+    link = tmp_path / "work" / linked
+    link.parent.mkdir(parents=True)
+    link.symlink_to(target)
+    with jobs_in(tmp_path / "work") as jobs:
+        assert jobs.history() == []
+        with pytest.raises(AliceError, match="is a link"):
+            jobs.start("quality")
+    assert sorted(photos.rglob("*")) == before
+
+
+def test_only_folders_of_recorded_jobs_are_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("alice_survey.app.studio.jobs._KEPT_JOBS", 1)
+    with jobs_in(tmp_path) as jobs:
+        jobs.start("quality")
+        until(lambda: jobs.running() is None)
+        (folder_of(tmp_path) / "notes.txt").write_text("of a person")
+        photo = folder_of(tmp_path, 2000) / "photo.jpg"
+        photo.parent.mkdir()
+        photo.write_text("a photo")
+        copied = JobRecord.read(folder_of(tmp_path) / "job.json")
+        copied.write(folder_of(tmp_path, 1999) / "job.json")  # of another number than its folder's
+        for _ in range(2):
+            jobs.start("quality")
+            until(lambda: jobs.running() is None)
+        assert [one["number"] for one in jobs.history()] == [2002]
+    assert photo.read_text() == "a photo"
+    assert (folder_of(tmp_path, 1999) / "job.json").is_file()
+    assert [path.name for path in folder_of(tmp_path).iterdir()] == ["notes.txt"]
+    assert not folder_of(tmp_path, 2001).exists()
+
+
 @pytest.mark.parametrize(
     ("name", "arguments"),
     [
