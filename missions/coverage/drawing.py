@@ -87,28 +87,6 @@ def draw_certificate(
     save_figure(figure, path)
 
 
-@figure_style()
-def draw_risk(
-    path: Path, area: Area, grid: Grid, probability: Array, title: str, text: str
-) -> None:
-    """Draw the probability, (rows, columns), that a place is not covered at the requested overlap.
-
-    NaN is outside of the area.
-    """
-    figure, axes = map_sheet(_bounds(area))
-    image, extent = _resampled(area, grid, probability)
-    colour_map = _RISK.with_extremes(bad=(0, 0, 0, 0))
-    drawn = axes.imshow(
-        image, extent=extent, origin="lower", cmap=colour_map, interpolation="nearest",
-        vmin=0.0, vmax=max(float(np.nanmax(probability)), 1e-9), zorder=1,
-    )  # fmt: skip
-    colour_bar(drawn, axes, "share of flights that leave a hole here", format="{x:.0%}")
-    draw_polygons(axes, area.survey, "survey area", edgecolor=_AREA, lw=1.4)
-    _draw_no_go(axes, area)
-    finish_map(figure, axes, area.datum, title, text)
-    save_figure(figure, path)
-
-
 def _class(low: int, following: int) -> str:
     return str(low) if following == low + 1 else f"{low}-{following - 1}"
 

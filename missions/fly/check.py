@@ -1,6 +1,5 @@
 """`alice-survey plan check`: what a dive has seen, which holes are left, and a plan for these."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +12,6 @@ from alice_survey.core.config import CameraConfig, SurveyConfig, WaterConfig
 from alice_survey.core.errors import PlanError, warn
 from alice_survey.core.executor import SERIAL, Executor, local_executor
 from alice_survey.kit.words import share
-from alice_survey.sim.seafloor.terrain import survey_terrain
 from camera_calib.rig import Rig, design_rig, mounted, read_rig
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.dive_record import DiveRecord, read_dive_record
@@ -21,10 +19,7 @@ from missions.coverage.geofiles import write_coverage_tif, write_outlines
 from missions.coverage.holes import Hole, find_holes
 from missions.coverage.stations import plan_pattern, stations_of_plan
 from missions.exports.write import counted
-from missions.fly.monte_carlo import MonteCarlo
-from missions.fly.monte_carlo import monte_carlo as fly_often
 from missions.fly.refly import refly_plan, to_see, write_refly
-from missions.fly.simulation import flight_settings, floor_grid
 from missions.plan.strength import survey_costs
 from missions.route.energy import craft_of, usable_wh
 from missions.route.flyable import without_stops
@@ -145,13 +140,12 @@ def check_report(
     triggers: Path | None = None,
     manifest: Path | None = None,
     out: Path | None = None,
-    monte_carlo: int = 0,
     executor: Executor | None = None,
 ) -> tuple[str, dict[str, Any]]:
     """Check a dive, write what is found, and plan the holes again.
 
     Writes `certificate.json`, `coverage.png`, `coverage.tif`, `holes.geojson`; where holes are left
-    `refly/`, a workspace with its own plan; after simulated flights `hole_probability.png`.
+    `refly/`, a workspace with its own plan.
 
     Args:
         workspace: as of `check_log`.
@@ -160,7 +154,6 @@ def check_report(
         triggers: as of `check_log`.
         manifest: as of `check_log`.
         out: folder to write; left out, `check` in the workspace.
-        monte_carlo: how many times to also fly the plan in simulation.
         executor: where tasks run; all cores of this machine when left out.
 
     Returns:
@@ -175,7 +168,6 @@ def check_report(
     check = check_log(workspace, rig, path, triggers=triggers, manifest=manifest, executor=executor)
     folder = workspace / "check" if out is None else out
     refuse_links(workspace, folder)
-    (folder / "hole_probability.png").unlink(missing_ok=True)  # of an earlier check
     if not check.holes and (folder / "refly").exists():
         warn(f"{folder / 'refly'} is of an earlier check: there are no holes now")
     data = check.to_json()
@@ -202,29 +194,8 @@ def check_report(
                 f"\nto fly the holes again: {words}; then {share(plan.coverage, 2)} of them are "
                 f"at that overlap: {folder / 'refly'}"
             )
-    if monte_carlo:
-        terrain = survey_terrain(
-            config.seafloor,
-            check.plan.area.allowed_corners_ne,
-            margin_m=config.plan.altitude_m,
-            depth_m=config.area.seafloor_depth_m,
-            seed=config.seed,
-        )
-        flights = fly_often(
-            check.plan,
-            flight_settings(config),
-            check.rig,
-            floor_grid(terrain),
-            seed=config.seed,
-            flights=monte_carlo,
-            executor=executor,
-        )
-        _draw_flights(folder, check.plan, flights)
-        data["monte_carlo"] = flights.to_json()
-        text += _flights_text(flights)
     _write(folder, check, data)
     files = "certificate.json, coverage.png, coverage.tif, holes.geojson"
-    files += ", hole_probability.png" if monte_carlo else ""
     return f"{text}\n{folder}: {files}", {**data, "folder": str(folder)}
 
 
@@ -239,17 +210,6 @@ def _write(folder: Path, check: Check, data: dict[str, Any]) -> None:
         check.record.stations,
     )  # fmt: skip
     write_json(folder / "certificate.json", data)
-
-
-def _draw_flights(folder: Path, plan: Plan, result: MonteCarlo) -> None:
-    from missions.coverage.drawing import draw_risk
-
-    folder.mkdir(parents=True, exist_ok=True)
-    draw_risk(
-        folder / "hole_probability.png", plan.area, result.planned.grid, result.hole_probability,
-        f"{plan.name}: holes in {counted(result.flights, 'simulated flight')}",
-        _flights_text(result).strip(),
-    )  # fmt: skip
 
 
 def _check_text(check: Check) -> str:
@@ -316,16 +276,3 @@ def _hole_rows(holes: Sequence[Hole]) -> list[str]:
         rest = sum(hole.area_m2 for hole in holes[_LISTED:])
         rows.append(f"  and {len(holes) - _LISTED} more, {rest:.2f} m2 in all (certificate.json)")
     return rows
-
-
-def _flights_text(result: MonteCarlo) -> str:
-    data = result.to_json()
-    often, seen = data["share_at_overlap"], data["covered_share"]
-    complete = result.endings.get("complete", 0)
-    return (
-        f"\n{counted(result.flights, 'simulated flight')}, {complete} complete: at the "
-        f"requested overlap {share(often['p50'], 2)} ({share(often['p05'], 2)} in the worst "
-        f"twentieth), in at least one picture {share(seen['p50'], 2)} ({share(seen['p05'], 2)});\n"
-        f"the place that is missed most is missed in "
-        f"{math.ceil(100 * data['greatest_hole_probability'])} % of flights"
-    )

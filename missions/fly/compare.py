@@ -1,25 +1,29 @@
-"""The paper's section VIII in simulation: one survey, flown before and after the modification.
+"""The command `vehicle compare`: one survey, flown before and after the paper's modification.
 
 The original SPARUS II steers by line of sight with two horizontal thrusters; ALICE has two lateral
-thrusters more and holds its lines by sway. All fly the same plan in the same sea: the current and
-the gusts are drawn from a separate generator, so that vehicles which behave differently still
-meet the same water. The followed point is the body's origin, as in the paper ("the coordinates of
-the vehicle", eq. los_heading), not the left port's glass as in `fly`.
+thrusters more and holds its lines by sway (section VIII). All fly the same plan in the same sea:
+the current and the gusts are drawn from a separate generator, so that vehicles which behave
+differently still meet the same water. The followed point is the body's origin, as in the paper
+("the coordinates of the vehicle", eq. los_heading), not the left port's glass as in `fly`.
 """
 
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.core.errors import VehicleError
-from alice_survey.core.executor import Executor
+from alice_survey.core.artefacts import write_csv, write_json
+from alice_survey.core.config import SurveyConfig, changed, parse_current
+from alice_survey.core.errors import ConfigError, VehicleError
+from alice_survey.core.executor import Executor, local_executor
 from alice_survey.core.frames import Array
+from alice_survey.core.text_table import text_table
 from alice_survey.sim.vehicle.dynamics import STATE
 from alice_survey.sim.vehicle.files import vehicle_to_fly
 from alice_survey.sim.vehicle.floor import level_floor
@@ -29,22 +33,36 @@ from alice_survey.sim.vehicle.pilot.settings import pilot_guidance
 from alice_survey.sim.vehicle.propulsion import add_thrust
 from alice_survey.sim.vehicle.simulator import Flown, Setup, simulate
 from alice_survey.sim.vehicle.vehicle import Vehicle
+from camera_calib.rig import design_rig
 from missions.fly.flight_records import true_velocity
 from missions.fly.simulation import (
     FlightSettings,
     flight_of,
+    flight_settings,
     max_mission_s,
     mission_setup,
     with_values,
 )
+from missions.plan.planner import plan_survey
 from missions.route.energy import has_sway
 from missions.values.flight import Flight, rms
 from missions.values.plan_file import Plan
 
 _CHANCE, _SEA = 40, 41
 """Streams of a seed: instruments, and the water."""
-_TRACE_STEP = 4
-"""Ticks from one point of a trace to the next."""
+_PAPER_SPACING_M = 1.0
+_COLUMNS = {
+    "lines, m": ("lines_true_m", 3), "believed": ("lines_believed_m", 3),
+    "route, m": ("route_true_m", 3), "heading, deg": ("heading_rms_deg", 1),
+    "roll, deg": ("turn_roll_peak_deg", 1), "surge, m/s": ("turn_surge_peak_mps", 2),
+    "yaw, deg/s": ("turn_yaw_peak_deg_s", 0), "Wh": ("survey_energy_wh", 1), "s": ("survey_s", 0),
+    "complete": ("complete", 2),
+}  # fmt: skip
+"""Of the printed table: figure and digits; `flights.csv` and `compare.json` hold all."""
+_PAPER_COLUMNS = {
+    "lines, m": "cross_track_rms_m", "roll, deg": "roll_in_turns_deg",
+    "surge, m/s": "surge_in_turns_mps", "yaw, deg/s": "yaw_in_turns_deg_s",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,16 +110,14 @@ def variants_of(vehicles: Sequence[str]) -> tuple[Variant, ...]:
     Raises:
         VehicleError: one is not known, or two have one name.
     """
-    crafts = [vehicle_to_fly(vehicle) for vehicle in vehicles]
-    names = [craft.name for craft in crafts]
+    found = [vehicle_to_fly(vehicle) for vehicle in vehicles]
+    names = [one.name for one in found]
     if len(set(names)) < len(names):
         raise VehicleError(f"vehicles {', '.join(names)}: two have one name")
     return (
         tuple(
-            Variant(
-                name=craft.name, vehicle=vehicle, controller="sway" if has_sway(craft) else "los"
-            )
-            for vehicle, craft in zip(vehicles, crafts, strict=True)
+            Variant(name=one.name, vehicle=vehicle, controller="sway" if has_sway(one) else "los")
+            for vehicle, one in zip(vehicles, found, strict=True)
         )
         or VARIANTS
     )
@@ -157,18 +173,6 @@ class FlightFigures:
     """1 if the mission came to its end."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Trace:
-    """A flight for drawing, every fifth of a second from the start of the route."""
-
-    time_s: Array
-    true_ne: Array
-    """(T, 2) true north and east."""
-    cross_m: Array
-    """(T,) true, to starboard of the route."""
-    roll_deg: Array
-
-
 @dataclass(frozen=True, kw_only=True)
 class Case:
     """A sea: where its current flows, and its swell."""
@@ -197,7 +201,6 @@ class Outcome:
     case: Case
     seed: int
     figures: FlightFigures
-    trace: Trace | None
     ending: str
     look_ahead_m: float
 
@@ -258,7 +261,7 @@ def fly_all(
     executor: Executor,
     variants: Sequence[Variant] = VARIANTS,
 ) -> Iterator[Outcome]:
-    """Fly each variant in each sea, once a seed; flights of the first seed keep their trace.
+    """Fly each variant in each sea, once a seed.
 
     Args:
         settings: sea and instruments; vehicle and the current's mean are those of the variants and
@@ -269,22 +272,19 @@ def fly_all(
         executor: where tasks run.
         variants: what flies.
     """
-    fly = partial(fly_one, settings, plan, seeds[0])
+    fly = partial(fly_one, settings, plan)
     yield from executor.map(fly, list(itertools.product(cases, variants, seeds)), label="flights")
 
 
-def fly_one(
-    settings: FlightSettings, plan: Plan, traced_seed: int, which: tuple[Case, Variant, int]
-) -> Outcome:
-    """Make one flight; that of one seed keeps its trace."""
+def fly_one(settings: FlightSettings, plan: Plan, which: tuple[Case, Variant, int]) -> Outcome:
+    """Make one flight."""
     case, variant, seed = which
-    setup, flown, flight = fly_variant(settings, plan, variant, case, seed)
+    setup, _, flight = fly_variant(settings, plan, variant, case, seed)
     return Outcome(
         variant=variant.name,
         case=case,
         seed=seed,
         figures=figures_of(flight, setup.vehicle),
-        trace=_trace(flight, flown) if seed == traced_seed else None,
         ending=flight.ending,
         look_ahead_m=float(setup.guidance.look_ahead_m),
     )
@@ -412,7 +412,7 @@ def roll_moment(vehicle: Vehicle, flown: Flown, turns: Sequence[slice]) -> Array
     return moment
 
 
-def summarised(outcomes: Sequence[Outcome]) -> Summary:
+def summarise(outcomes: Sequence[Outcome]) -> Summary:
     """Mean and extremes of each figure over flights, and the standard deviation of two or more."""
     summary = {}
     for name in FlightFigures.__dataclass_fields__:
@@ -427,17 +427,6 @@ def summarised(outcomes: Sequence[Outcome]) -> Summary:
     return summary
 
 
-def _trace(flight: Flight, flown: Flown) -> Trace:
-    rows = np.flatnonzero(flown.report[:, PHASE] == FOLLOW)[::_TRACE_STEP]
-    first = flown.time_s[rows[0]] if len(rows) else 0.0
-    return Trace(
-        time_s=flown.time_s[rows] - first,
-        true_ne=flight.glass_ned[rows, :2],
-        cross_m=flight.route_error[rows],
-        roll_deg=np.rad2deg(flight.attitude_rad[rows, 0]),
-    )
-
-
 def _peaks(values: Array, turns: Sequence[slice]) -> Array:
     return np.array([values[rows].max() for rows in turns])
 
@@ -448,3 +437,216 @@ def _mean(values: Array) -> float:
 
 def _worst(values: Array) -> float:
     return float(values.max()) if len(values) else math.nan
+
+
+def compare_report(
+    config: SurveyConfig,
+    out: Path,
+    *,
+    currents: Sequence[str] = (),
+    swell: str | None = None,
+    seed: int | None = None,
+    flights: int = 5,
+    executor: Executor | None = None,
+    vehicles: Sequence[str] = (),
+) -> tuple[str, dict[str, Any]]:
+    """Fly a survey by both configurations, and write a table, all figures and a picture.
+
+    Args:
+        config: the survey; lines are 1 m apart, as the paper's, where it does not say.
+        out: folder to write.
+        currents: `SPEED@DIRECTION`; `default_cases` when left out.
+        swell: `HEIGHT@PERIOD`, m and s, of waves that travel across the lines in all currents.
+        seed: of the first flight; the survey's when left out.
+        flights: of each variant in each current.
+        executor: where tasks run; all cores of this machine when left out.
+        vehicles: names or files of the vehicles to compare; the paper's two configurations when
+            left out.
+
+    Returns:
+        Text, and the same as values for JSON.
+
+    Raises:
+        ConfigError: a current or swell is not of that form, or the folder cannot be written.
+    """
+    variants = variants_of(vehicles)
+    # Turns that all can fly.
+    config = changed(config, "plan", turns="arcs")
+    if config.plan.line_spacing_m is None:
+        config = changed(config, "plan", line_spacing_m=_PAPER_SPACING_M)
+    plan = plan_survey(config, design_rig(config.camera, config.water)).plan
+    cases = [_case(text) for text in currents] or list(default_cases(plan))
+    if swell is not None:
+        cases = [_with_swell(plan, case, swell) for case in cases]
+    first = config.seed if seed is None else seed
+    seeds = list(range(first, first + flights))
+    settings = flight_settings(config)
+    outcomes = list(fly_all(settings, plan, cases, seeds, executor or local_executor(), variants))
+    results = [_result(plan, case, outcomes, variants) for case in cases]
+    text = f"{_heading(plan, seeds)}\n{_table(results)}"
+    data = _data(plan, seeds, results, variants)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        write_json(out / "compare.json", data)
+        _write_flights(out / "flights.csv", outcomes)
+        (out / "compare.txt").write_text(text + "\n", encoding="utf-8")
+        draw_cross_track(out / "compare.png", results)
+    except OSError as error:
+        raise ConfigError(f"{error.filename}: cannot be written: {error.strerror}") from None
+    return f"{text}\n\nwrote {out}", data
+
+
+def _heading(plan: Plan, seeds: Sequence[int]) -> str:
+    return (
+        f"{len(plan.lines)} lines {plan.line_spacing_m:g} m apart at {plan.speed_mps:g} m/s, "
+        f"{len(seeds)} flight(s) of each vehicle in the same water (docs/vehicle-comparison.md): "
+        "cross-track rms, mean peak of the turns, mean ± standard deviation over flights"
+    )
+
+
+def _table(results: Sequence[CaseResult]) -> str:
+    rows = []
+    for result in results:
+        paper = [name for name in PAPER if name in result.summaries]
+        rows += [
+            (result.title, f"paper, {name}", *(_paper_cell(name, column) for column in _COLUMNS))
+            for name in paper
+        ]
+        rows += [
+            (result.title, name, *(_cell(summary[key], n) for key, n in _COLUMNS.values()))
+            for name, summary in result.summaries.items()
+        ]
+    return text_table(("sea", "vehicle", *_COLUMNS), rows)
+
+
+def _paper_cell(name: str, column: str) -> str:
+    limits = PAPER[name].get(_PAPER_COLUMNS.get(column, ""))
+    return "" if limits is None else "-".join(f"{limit:g}" for limit in sorted(set(limits)))
+
+
+def _cell(values: dict[str, float], digits: int) -> str:
+    sd = f" ±{values['sd']:.{digits}f}" if "sd" in values else ""
+    return f"{values['mean']:.{digits}f}{sd}"
+
+
+def _data(
+    plan: Plan,
+    seeds: Sequence[int],
+    results: Sequence[CaseResult],
+    variants: Sequence[Variant],
+) -> dict[str, Any]:
+    return {
+        "paper": PAPER,
+        "followed_point": "body origin",
+        "plan": {
+            "lines": len(plan.lines),
+            "line_spacing_m": plan.line_spacing_m,
+            "speed_mps": plan.speed_mps,
+            "altitude_m": plan.altitude_m,
+        },
+        "seeds": list(seeds),
+        "variants": {
+            variant.name: {**asdict(variant), "failed": list(variant.failed)}
+            for variant in variants
+        },
+        "cases": [
+            {
+                "current": result.case.name,
+                "across_mps": result.across_mps,
+                "along_mps": result.along_mps,
+                "look_ahead_m": {o.variant: o.look_ahead_m for o in result.outcomes},
+                "variants": {
+                    name: {
+                        figure: {key: _known(value) for key, value in values.items()}
+                        for figure, values in summary.items()
+                    }
+                    for name, summary in result.summaries.items()
+                },
+            }
+            for result in results
+        ],
+    }
+
+
+def _result(
+    plan: Plan, case: Case, outcomes: Sequence[Outcome], variants: Sequence[Variant]
+) -> CaseResult:
+    mine = tuple(outcome for outcome in outcomes if outcome.case == case)
+    turned = math.radians(case.towards_deg) - plan.lines[0].heading_rad
+    return CaseResult(
+        case=case,
+        across_mps=case.current_mps * math.sin(turned),
+        along_mps=case.current_mps * math.cos(turned),
+        outcomes=mine,
+        summaries={
+            variant.name: summarise([o for o in mine if o.variant == variant.name])
+            for variant in variants
+            if any(o.variant == variant.name for o in mine)
+        },
+    )
+
+
+def _case(text: str) -> Case:
+    speed, towards = parse_current(text)
+    if speed is None or towards is None or speed < 0.0 or not math.isfinite(speed + towards):
+        raise ConfigError(f"current {text!r}: give SPEED@DIRECTION with a speed of 0 or more")
+    return Case(current_mps=speed, towards_deg=towards)
+
+
+def _with_swell(plan: Plan, case: Case, text: str) -> Case:
+    height, _, period = text.partition("@")
+    try:
+        found = replace(
+            case, swell_m=float(height), swell_s=float(period),
+            swell_towards_deg=math.degrees(plan.lines[0].heading_rad) + 90.0,
+        )  # fmt: skip
+    except ValueError:
+        found = case
+    if found is case or not (0.0 <= found.swell_m < math.inf and 0.0 < found.swell_s < math.inf):
+        raise ConfigError(f"swell {text!r}: give HEIGHT@PERIOD, m and s, as 0.5@6")
+    return found
+
+
+def _write_flights(path: Path, outcomes: Sequence[Outcome]) -> None:
+    names = list(asdict(outcomes[0].figures))
+    write_csv(
+        path,
+        [
+            "configuration", "current_mps", "towards_deg", "swell_m", "swell_s", "seed", "ending",
+            "look_ahead_m", *names,
+        ],
+        (
+            [
+                o.variant, o.case.current_mps, o.case.towards_deg, o.case.swell_m,
+                o.case.swell_s, o.seed, o.ending,
+                round(o.look_ahead_m, 6),
+                *(round(value, 6) for value in asdict(o.figures).values()),
+            ]
+            for o in outcomes
+        ),
+    )  # fmt: skip
+
+
+def _known(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def draw_cross_track(path: Path, results: Sequence[CaseResult]) -> None:
+    """Draw the true cross-track rms on lines of each vehicle in each sea, next to the paper's."""
+    from alice_survey.kit.figure import INKS, figure_style, new_figure, save_figure
+
+    with figure_style():
+        figure = new_figure(1.0 + 2.2 * len(results))
+        charts = figure.subplots(len(results), 1, sharex=True, squeeze=False)[:, 0]
+        for axes, result in zip(charts, results, strict=True):
+            names = list(result.summaries)
+            found = [result.summaries[name]["lines_true_m"] for name in names]
+            spread = [values.get("sd", 0.0) for values in found]
+            axes.barh(names, [values["mean"] for values in found], xerr=spread, color=INKS[0])
+            for name in (name for name in PAPER if name in names):
+                limit = PAPER[name]["cross_track_rms_m"][1]
+                axes.plot(limit, name, "|", color=INKS[1], ms=16, mew=2, label="paper")
+            axes.invert_yaxis()
+            axes.set_title(result.title)
+        charts[-1].set_xlabel("true cross-track rms on lines, m (paper's as strokes)")
+        save_figure(figure, path)

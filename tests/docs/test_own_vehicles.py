@@ -3,13 +3,15 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from alice_survey.core.config import parse_config
 from alice_survey.sim.vehicle.floor import level_floor
 from camera_calib.rig import design_rig
-from missions.fly.monte_carlo import fly_and_certify
-from missions.fly.simulation import flight_settings
+from missions.coverage.certificate import certificate
+from missions.coverage.stations import plan_pattern, stations_of_flight
+from missions.fly.simulation import flight_settings, simulate_plan
 from missions.plan.planner import plan_survey
 from tests.docs.pages import DOCS
 
@@ -54,11 +56,13 @@ def test_any_vehicle_covers_the_area_of_the_tutorial(
     rig = design_rig(config.camera, config.water)
     planned = plan_survey(config, rig)
     assert planned.plan.coverage > 0.99
-    flown = fly_and_certify(
-        planned.plan, flight_settings(config), rig, level_floor(_DEPTH_M), config.seed,
-        planned.certificate.grid.cell_m, 0,
-    )  # fmt: skip
-    assert flown.ending == "complete"
+    flight = simulate_plan(
+        planned.plan, flight_settings(config), level_floor(_DEPTH_M), np.random.default_rng(7)
+    )
+    assert flight.ending == "complete"
+    flown = certificate(
+        planned.plan.area, rig, stations_of_flight(flight), plan_pattern(planned.plan, rig)
+    )
     assert 0.97 < flown.stereo_share <= 1.0
     assert 0.8 < flown.share_at_overlap <= 1.0
     assert flown.fewest_pictures >= 1

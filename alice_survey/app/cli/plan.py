@@ -172,7 +172,6 @@ def gain(
         "plan check -w reef",
         "plan check navigation.csv -w reef",
         "plan check navigation.csv --triggers triggers.csv -w reef -o checked",
-        "plan check -w reef --monte-carlo 20",
     )
 )
 def check(
@@ -188,10 +187,6 @@ def check(
         Path | None,
         typer.Option(help="CSV with the times of the pictures; the plan's interval if not given."),
     ] = None,
-    monte_carlo: Annotated[
-        int,
-        typer.Option(min=0, max=10_000, help="Also simulate this many flights of the plan."),
-    ] = 0,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Folder to write.")] = None,
     threads: Threads = None,
     as_json: AsJson = False,
@@ -207,7 +202,7 @@ def check(
     print_result(
         *check_report(
             workspace, config, log,
-            triggers=triggers, out=output, monte_carlo=monte_carlo, executor=executor_of(threads),
+            triggers=triggers, out=output, executor=executor_of(threads),
         ),
         as_json,
     )  # fmt: skip

@@ -19,8 +19,25 @@ from alice_survey.app.cli.options import (
 
 VehicleName = Annotated[
     str | None,
-    typer.Option(help="A known vehicle, or a TOML or JSON file; alice if not given."),
+    typer.Option(metavar="NAME|FILE", help="Known vehicle or its TOML file; default: alice."),
 ]
+CoefficientSet = Annotated[
+    str | None, typer.Option(metavar="NAME|FILE", help="Set of coefficients to start from.")
+]
+Held = Annotated[
+    list[str] | None,
+    typer.Option(metavar="NAME=VALUE", help="Value to hold, as current_north_mps=0.1."),
+]
+Columns = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="TOML file that explains the logs' columns.")
+]
+Given = Annotated[
+    str | None, typer.Option(metavar="RATES", help="Rates, of p,q,r, to take from the log.")
+]
+HoldInput = Annotated[
+    bool, typer.Option("--hold-input", help="Hold each input until the next row.")
+]
+Output = Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Directory to write.")]
 app = typer.Typer(
     help="The vehicle: coefficients from geometry and from logs, and how its two forms compare.",
     no_args_is_help=True,
@@ -33,17 +50,16 @@ app = typer.Typer(
     epilog=examples(
         "vehicle coefficients",
         "vehicle coefficients --csv coefficients.csv --plot coefficients.png",
-        "vehicle coefficients --json",
     )
 )
 def coefficients(
-    csv: Annotated[Path | None, typer.Option(help="CSV file to write.")] = None,
-    plot: Annotated[Path | None, typer.Option(help="PNG, PDF or SVG to draw.")] = None,
+    csv: Annotated[Path | None, typer.Option(metavar="FILE", help="CSV file to write.")] = None,
+    plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Figure to draw.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Compute coefficients from shape, next to the paper's.
 
-    Every row of the paper's three tables of added mass, damping and lift, with the equation.
+    Every row of the paper's three tables of added mass, damping and lift.
     """
     from alice_survey.sim.vehicle.hydrodynamics.report import coefficients_report
 
@@ -54,8 +70,7 @@ def coefficients(
     epilog=examples(
         "vehicle compare",
         "vehicle compare -w reef --current 0.1@90 --current 0.05@0 -o compared",
-        "vehicle compare -s survey.toml --seed 7 --flights 3 --json",
-        "vehicle compare --current 0@0 --swell 0.5@6",
+        "vehicle compare --current 0@0 --swell 0.5@6 --flights 3",
         "vehicle compare -w reef --vehicle bluerov2_heavy --vehicle own.toml",
     )
 )
@@ -64,19 +79,24 @@ def compare(
     survey: SurveyFile = None,
     current: Annotated[
         list[str] | None,
-        typer.Option(help="SPEED@DIRECTION; across the lines, along, and none if not given."),
+        typer.Option(metavar="SPEED@DIRECTION", help="Current to fly in, m/s and degrees."),
     ] = None,
     swell: Annotated[
-        str | None, typer.Option(help="HEIGHT@PERIOD of waves across the lines: m, s.")
+        str | None,
+        typer.Option(metavar="HEIGHT@PERIOD", help="Swell across the lines, metres and seconds."),
     ] = None,
     vehicle: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME|FILE", help="One to compare; the paper's two if not given."),
+        typer.Option(metavar="NAME|FILE", help="Vehicle to compare; default: the paper's two."),
     ] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Of the first flight.")] = None,
-    flights: Annotated[int, typer.Option(min=1, max=1000, help="Of each, in each current.")] = 5,
+    seed: Annotated[
+        int | None, typer.Option(min=0, metavar="SEED", help="Seed of the first flight.")
+    ] = None,
+    flights: Annotated[
+        int, typer.Option(min=1, max=1000, metavar="COUNT", help="Flights of each vehicle.")
+    ] = 5,
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="Folder; WORKSPACE/compare if not given.")
+        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Directory to write.")
     ] = None,
     threads: Threads = None,
     as_json: AsJson = False,
@@ -85,10 +105,10 @@ def compare(
 
     SPARUS II steering by line of sight, and ALICE holding its lines by sway: cross-track error,
     roll, speed and energy next to the paper's section VIII. Other vehicles are steered by sway if
-    they can sway.
+    they can sway. Without a current: across the lines, along them, and none.
     """
     from alice_survey.app.pipeline import settings
-    from missions.fly.compare_report import compare_report
+    from missions.fly.compare import compare_report
 
     config = settings(workspace, survey, needed=workspace != WORK)
     text, data = compare_report(
@@ -104,42 +124,49 @@ def compare(
         "vehicle identify dive.csv --validate second.csv --bollard pull.csv --method two-step",
         "vehicle identify run1.csv run2.csv --columns columns.toml --vehicle rov.toml "
         "--given p,q --window 5 --free X_u,X_uu,N_r,N_rr,gain_X,gain_N --validate run3.csv",
+        "vehicle identify --validate dive.csv --coefficients found/coefficients.json",
     )
 )
 def identify(
-    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="docs/vehicle-logs.md")],
-    vehicle: VehicleName = None,
-    coefficients: Annotated[
-        str | None, typer.Option(help="Set or file to start from; the vehicle's if not given.")
+    logs: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="LOG...", help="Logs to fit (docs/vehicle-logs.md)."),
     ] = None,
-    validate: Annotated[Path | None, typer.Option(help="Log to predict.")] = None,
-    bollard: Annotated[Path | None, typer.Option(help="CSV: thruster, rpm, force_n.")] = None,
+    vehicle: VehicleName = None,
+    coefficients: CoefficientSet = None,
+    validate: Annotated[
+        Path | None,
+        typer.Option(metavar="LOG", help="Log to predict; by the known vehicle if none is fitted."),
+    ] = None,
+    bollard: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="CSV: thruster, rpm, force_n.")
+    ] = None,
     free: Annotated[
         str | None,
-        typer.Option(help="Such as X_uu,Y_vdot,N_r,Y_uv; current, buoyancy, trim, bias, gain."),
+        typer.Option(
+            metavar="NAMES",
+            help="Parameters to fit: X_uu,Y_vdot,N_r,Y_uv,current,buoyancy,trim,bias,gain.",
+        ),
     ] = None,
-    held: Annotated[
-        list[str] | None, typer.Option(metavar="NAME=VALUE", help="As current_north_mps=0.1.")
-    ] = None,
-    method: Annotated[str, typer.Option(help="joint, or two-step as in the paper.")] = "joint",
-    columns: Annotated[Path | None, typer.Option(help="TOML: what other columns mean.")] = None,
-    given: Annotated[
-        str | None, typer.Option(help="Rates, of p,q,r, that follow the log, not the forces.")
-    ] = None,
+    held: Held = None,
+    method: Annotated[
+        str, typer.Option(metavar="METHOD", help="Method: joint, or two-step as in the paper.")
+    ] = "joint",
+    columns: Columns = None,
+    given: Given = None,
     window: Annotated[
-        float | None, typer.Option(min=0.1, help="s simulated in one go; all if not given.")
+        float | None,
+        typer.Option(min=0.1, metavar="SECONDS", help="Longest stretch to simulate in one go."),
     ] = None,
-    hold_input: Annotated[
-        bool, typer.Option("--hold-input", help="Inputs stay until the next row.")
-    ] = False,
+    hold_input: HoldInput = False,
     prior: Annotated[
         str | None,
         typer.Option(
             metavar="SIGMAS",
-            help="Relative, about the start: damping=0.5,added_mass=0.3,...; a number; none.",
+            help="Relative sigmas of the start: damping=0.5,added_mass=0.3; a number; none.",
         ),
     ] = None,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder to write.")] = Path("identified"),
+    out: Output = Path("identified"),
     as_json: AsJson = False,
 ) -> None:
     """Identify coefficients from logs of motion.
@@ -158,53 +185,24 @@ def identify(
         method=method, columns=columns, given=tuple(given.split(",")) if given else (),
         window_s=window, hold_input=hold_input, prior=read_prior(prior or ""),
     )  # fmt: skip
-    print_result(*identify_report(logs, out, options), as_json)
+    print_result(*identify_report(logs or [], out, options), as_json)
 
 
-@app.command(
-    epilog=examples(
-        "vehicle replay reef/flight/vehicle.csv",
-        "vehicle replay dive.csv --vehicle own.toml --coefficients found/coefficients.json",
-        "vehicle replay run1.csv --columns columns.toml --vehicle rov.toml --given p,q --reset 60",
-    )
-)
+@app.command(hidden=True)
 def replay(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="docs/vehicle-logs.md")],
+    log: Annotated[Path, typer.Argument(metavar="LOG")],
     vehicle: VehicleName = None,
-    coefficients: Annotated[
-        str | None, typer.Option(help="Set or file, as of identify; the vehicle's if not given.")
-    ] = None,
-    held: Annotated[
-        list[str] | None, typer.Option(metavar="NAME=VALUE", help="As current_north_mps=0.1.")
-    ] = None,
-    columns: Annotated[Path | None, typer.Option(help="TOML: what other columns mean.")] = None,
-    given: Annotated[
-        str | None, typer.Option(help="Rates, of p,q,r, that follow the log, not the forces.")
-    ] = None,
-    commanded: Annotated[
-        bool, typer.Option("--commanded", help="Speeds are commands: add the thrusters' lag.")
-    ] = False,
-    reset: Annotated[
-        float | None, typer.Option(min=0.5, help="s between starts from the log; none if not set.")
-    ] = None,
-    hold_input: Annotated[
-        bool, typer.Option("--hold-input", help="Inputs stay until the next row.")
-    ] = False,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder to write.")] = Path("replayed"),
+    coefficients: CoefficientSet = None,
+    held: Held = None,
+    columns: Columns = None,
+    given: Given = None,
+    hold_input: HoldInput = False,
+    out: Output = Path("replayed"),
     as_json: AsJson = False,
 ) -> None:
-    """Run a whole log through the model, open loop.
-
-    Velocities, rates, attitude and place that the model makes of the log's thruster speeds, thrusts
-    or forces, next to what was measured: errors of each axis, and how fast they grow.
-    """
-    from alice_survey.core.config import DEFAULT_VEHICLE
-    from alice_survey.sim.vehicle.identification.replay import ReplayOptions, replay_report
-
-    options = ReplayOptions(
-        vehicle=vehicle or DEFAULT_VEHICLE, coefficients=coefficients, held=tuple(held or ()),
-        columns=columns,
-        given=tuple(given.split(",")) if given else (), commanded=commanded, reset_s=reset,
-        hold_input=hold_input,
+    """Use `vehicle identify --validate LOG`."""
+    typer.echo("vehicle replay is now: vehicle identify --validate LOG", err=True)
+    identify(
+        None, vehicle, coefficients, validate=log, held=held, columns=columns, given=given,
+        hold_input=hold_input, out=out, as_json=as_json,
     )  # fmt: skip
-    print_result(*replay_report(log, out, options), as_json)

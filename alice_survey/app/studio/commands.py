@@ -167,7 +167,6 @@ class PlanCheckArguments(WorkingArguments):
     plain: ClassVar[tuple[str, ...]] = ("log",)
     log: Given | None = None
     triggers: Given | None = None
-    monte_carlo: Annotated[int | None, Field(ge=0, le=10_000)] = None
 
 
 class PlanRevisitArguments(WorkingArguments):

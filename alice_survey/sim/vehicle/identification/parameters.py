@@ -144,8 +144,6 @@ def free_parameters(
             added mass; a fixed one is a coefficient.
     """
     flat = [one for name in names for one in GROUPS.get(name, (name,))]
-    if not flat:
-        raise VehicleError("no parameter is free: name some, such as --free X_uu,Y_vv,current")
     places: dict[tuple[int, int, int], str] = {}
     for name in flat:
         kind, i, j = place_of(name)

@@ -1,4 +1,7 @@
-"""The command `vehicle identify`: from files to coefficients, a report and pictures."""
+"""The command `vehicle identify`: from logs to coefficients, a report and a picture.
+
+Without logs to fit, `--validate` alone runs a log through the vehicle as it is known, open loop.
+"""
 
 import math
 from collections.abc import Sequence
@@ -11,15 +14,23 @@ import numpy as np
 from alice_survey.core.config import DEFAULT_VEHICLE
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.files import speeds_missing, write_coefficients
+from alice_survey.core.text_table import text_table
+from alice_survey.kit.figure import INKS, SOFT, figure_style, new_figure, save_figure
+from alice_survey.sim.vehicle.files import (
+    coefficients_from_file,
+    read_table,
+    speeds_missing,
+    validated,
+    vehicle_from,
+    write_coefficients,
+)
 from alice_survey.sim.vehicle.identification.bollard import (
     ThrustCoefficient,
     fit_pulls,
     read_pulls,
     with_thrust,
 )
-from alice_survey.sim.vehicle.identification.drawing import draw_motion
-from alice_survey.sim.vehicle.identification.given import given_log, given_values, given_vehicle
+from alice_survey.sim.vehicle.identification.foreign import read_column_map, read_foreign_log
 from alice_survey.sim.vehicle.identification.output_error import (
     OutputErrorFit,
     Simulation,
@@ -41,6 +52,7 @@ from alice_survey.sim.vehicle.identification.windows import (
     make_windows,
     of_windows,
 )
+from alice_survey.sim.vehicle.log import read_vehicle_log
 from alice_survey.sim.vehicle.vehicle import Vehicle
 
 JOINT_FREE = ("X_uu", "Y_vv", "Z_ww", "N_rr", "current")
@@ -50,10 +62,9 @@ _VALIDATION_WINDOW_S = 10.0
 _HIGH_CORRELATION = 0.9
 _POOR = 0.25
 """Relative sigma of a coefficient that the logs hardly determine."""
-
-
 _AS_GOOD = 1.0
 """Points of fit by which two predictions may differ and be equally good."""
+_MAX_POINTS = 8000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,73 +106,109 @@ class _Identified:
     """Step in which each was calibrated; none of the joint fit."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Validation:
+    """A log predicted by the identified vehicle, and by the one that the fit began with."""
+
+    found: MotionValidation
+    started: MotionValidation | None = None
+    current_ne: Array | None = None
+    """(2,) current of that log, where it was fitted to it."""
+
+    @property
+    def worse(self) -> list[str]:
+        """Motions that the start predicts better."""
+        if self.started is None:
+            return []
+        gain = self.found.fit_percent - self.started.fit_percent
+        return [name for name, g in zip(CHANNEL_NAMES[:6], gain, strict=True) if g < -_AS_GOOD]
+
+
 def identify_report(
     logs: Sequence[Path], out: Path, options: IdentifyOptions
 ) -> tuple[str, dict[str, Any]]:
-    """Identify a vehicle from logs; write coefficients.json, report.txt and figures into a folder.
+    """Identify a vehicle from logs; write coefficients.json, report.txt and fit.png into a folder.
+
+    Without logs the vehicle is as it is known, and a log to validate is predicted by it.
 
     Raises:
         VehicleError: a file or an option is wrong, or the logs do not determine what is free.
     """
     if options.method not in ("joint", "two-step"):
         raise VehicleError(f"method {options.method!r} is not known: joint or two-step")
-    vehicle = given_vehicle(options.vehicle, options.coefficients)
-    if vehicle.fins:
-        raise VehicleError(
-            f"{vehicle.name} is steered by fins, whose angles are not used: give the file of a "
-            "vehicle without [[fins]], and logs of the whole wrench (X_n to N_nm)"
-        )
+    vehicle = _vehicle_of(options)
+    if not logs and options.validate is None:
+        raise VehicleError("there is no log: name logs to fit, or one to predict by --validate LOG")
     thrust: list[ThrustCoefficient] = []
     if options.bollard is not None:
         thrust = fit_pulls(read_pulls(options.bollard), vehicle)
         vehicle = with_thrust(vehicle, thrust)
     windows = [window for path in logs for window in _windows(path, vehicle, options)]
-    used = of_windows(windows, vehicle)
-    if used.thrusters and Path(options.vehicle).suffix:
-        missing = speeds_missing(Path(options.vehicle))
-        if missing:
-            raise VehicleError(
-                f"the logs give speeds, but {options.vehicle} does not say what they mean of "
-                f"{'; '.join(missing)}"
-            )
-    free = options.free or (JOINT_FREE if options.method == "joint" else TWO_STEP_FREE)
-    parameters = free_parameters(used, free, given_values(options.held))
-    how = Simulation(hold=options.hold_input)
-    result = _identify(windows, parameters, how, options)
-    validation, started, drift = None, None, None
+    shorter: list[Window] = []
     if options.validate is not None:
-        shorter = _windows(options.validate, vehicle, options, _VALIDATION_WINDOW_S)
-        of_windows([*windows, *shorter], vehicle)
-        values, drift = _with_its_current(shorter, parameters, result.values, how)
-        validation = validate(shorter, parameters, values, simulation=how)
-        started = _from_start(shorter, parameters, how)
-    own = validate(windows, parameters, result.values, simulation=how, horizons_s=())
-    text = _text(vehicle, logs, result, thrust, own, validation, started, drift, options)
-    data = _data(vehicle, logs, result, thrust, own, validation, started)
+        length_s = options.window_s if not logs else _VALIDATION_WINDOW_S
+        shorter = _windows(options.validate, vehicle, options, length_s)
+    used = of_windows([*windows, *shorter], vehicle)
+    missing = speeds_missing(Path(options.vehicle)) if Path(options.vehicle).suffix else []
+    if used.thrusters and missing:
+        raise VehicleError(
+            f"the logs give speeds, but {options.vehicle} does not say what they mean of "
+            f"{'; '.join(missing)}"
+        )
+    how = Simulation(hold=options.hold_input)
+    result = _identify(windows, used, how, options)
+    validation = _validation(shorter, result, how) if shorter else None
+    own = validate(windows, result.parameters, result.values, simulation=how) if windows else None
+    text = _text(vehicle, logs, result, thrust, own, validation, options)
+    data = _data(vehicle, logs, result, thrust, own, validation)
     try:
         out.mkdir(parents=True, exist_ok=True)
-        identified = parameters.coefficients(result.values, "identified")
-        write_coefficients(out / "coefficients.json", identified, data)
+        if logs:
+            identified = result.parameters.coefficients(result.values, "identified")
+            write_coefficients(out / "coefficients.json", identified, data)
         (out / "report.txt").write_text(text + "\n", encoding="utf-8")
-        draw_motion(out / "fit.png", f"{vehicle.name}: the logs it was identified from", own)
-        if validation is not None:
-            title = f"{vehicle.name}: predicted, {Path(validation.source).name}"
-            draw_motion(out / "validation.png", title, validation)
+        shown = validation.found if validation is not None else own
+        if shown is not None:
+            draw_motion(out / "fit.png", f"{vehicle.name}: {shown.source}", shown)
     except OSError as error:
         raise VehicleError(f"{out}: cannot be written: {error.strerror}") from None
-    return f"{text}\n\nwritten to {out}", data
+    return f"{text}\nwritten to {out}", data
+
+
+def _vehicle_of(options: IdentifyOptions) -> Vehicle:
+    """The vehicle by its name or file, with a set of coefficients by its name or file."""
+    name, coefficients = options.vehicle, options.coefficients
+    if coefficients is not None and Path(coefficients).suffix:
+        vehicle = vehicle_from(name).with_coefficients(coefficients_from_file(Path(coefficients)))
+    else:
+        vehicle = vehicle_from(name) if coefficients is None else vehicle_from(name, coefficients)
+    if vehicle.fins:
+        raise VehicleError(
+            f"{vehicle.name} is steered by fins, whose angles are not used: give the file of a "
+            "vehicle without [[fins]], and logs of the whole wrench (X_n to N_nm)"
+        )
+    return vehicle
 
 
 def _windows(
     path: Path, vehicle: Vehicle, options: IdentifyOptions, window_s: float | None = None
 ) -> list[Window]:
-    log = given_log(path, options.columns)
+    if options.columns is None:
+        log = read_vehicle_log(path)
+    else:
+        log = read_foreign_log(path, read_column_map(options.columns))
     return make_windows(log, vehicle, window_s=window_s or options.window_s, given=options.given)
 
 
 def _identify(
-    windows: Sequence[Window], parameters: Parameters, how: Simulation, options: IdentifyOptions
+    windows: Sequence[Window], vehicle: Vehicle, how: Simulation, options: IdentifyOptions
 ) -> _Identified:
+    held, nothing = _held_values(options.held), np.zeros(0)
+    if not windows:
+        known = free_parameters(vehicle, (), _others_of(options.coefficients) | held)
+        return _Identified(parameters=known, values=nothing, sigma=nothing, fit=None, steps=())
+    free = options.free or (JOINT_FREE if options.method == "joint" else TWO_STEP_FREE)
+    parameters = free_parameters(vehicle, free, held)
     if options.method == "two-step":
         found = calibrate(windows, parameters)
         return _Identified(
@@ -172,15 +219,38 @@ def _identify(
     return _Identified(parameters=parameters, values=fit.values, sigma=fit.sigma, fit=fit, steps=())
 
 
-def _from_start(
-    windows: Sequence[Window], parameters: Parameters, how: Simulation
-) -> MotionValidation | None:
-    """Motions of another log by the values that the fit began with; None if they do not last."""
+def _held_values(pairs: Sequence[str]) -> dict[str, float]:
+    """Numbers by name, of `NAME=VALUE`."""
+    values = {}
+    for pair in pairs:
+        name, _, value = pair.partition("=")
+        try:
+            values[name.strip()] = float(value)
+        except ValueError:
+            raise VehicleError(f"{pair!r} is not NAME=VALUE") from None
+    return values
+
+
+def _others_of(coefficients: str | None) -> dict[str, float]:
+    """Buoyancy, trim, biases and gains of a file of `vehicle identify`; a current is of its day."""
+    if coefficients is None or not Path(coefficients).suffix:
+        return {}
+    table = read_table(Path(coefficients)).get("others", {})
+    found = validated(Path(coefficients), dict[str, float], table)
+    return {name: value for name, value in found.items() if name not in CURRENTS}
+
+
+def _validation(windows: Sequence[Window], result: _Identified, how: Simulation) -> _Validation:
+    values, current_ne = _with_its_current(windows, result.parameters, result.values, how)
+    found = validate(windows, result.parameters, values, simulation=how)
+    if not len(values):
+        return _Validation(found=found)
     try:
-        values, _ = _with_its_current(windows, parameters, parameters.start, how)
-        return validate(windows, parameters, values, simulation=how, horizons_s=())
-    except VehicleError:
-        return None
+        start, _ = _with_its_current(windows, result.parameters, result.parameters.start, how)
+        started = validate(windows, result.parameters, start, simulation=how, horizons_s=())
+    except VehicleError:  # the motions of the start may not last
+        started = None
+    return _Validation(found=found, started=started, current_ne=current_ne)
 
 
 def _with_its_current(
@@ -208,24 +278,12 @@ def _with_its_current(
     return values, drift
 
 
-def _factor(start: float, value: float) -> float:
-    return value / start if start else math.nan
+def _factor(name: str, start: float, value: float) -> float:
+    return value / start if start and name not in OTHERS else math.nan
 
 
 def _cell(value: float, style: str) -> str:
     return f"{value:{style}}" if math.isfinite(value) else "-"
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a table, the first column to the left."""
-    widths = [max(len(row[i]) for row in (head, *rows)) for i in range(len(head))]
-    return [
-        "  ".join(
-            cell.ljust(width) if i == 0 else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in (head, *rows)
-    ]
 
 
 def _text(
@@ -233,103 +291,76 @@ def _text(
     logs: Sequence[Path],
     result: _Identified,
     thrust: Sequence[ThrustCoefficient],
-    own: MotionValidation,
-    validation: MotionValidation | None,
-    started: MotionValidation | None,
-    drift: Array | None,
+    own: MotionValidation | None,
+    validation: _Validation | None,
     options: IdentifyOptions,
 ) -> str:
+    names = ", ".join(path.name for path in logs) or "no log"
     lines = [
-        f"{vehicle.name} by the {options.method} "
-        f"{'fit' if options.method == 'joint' else 'calibration'} to "
-        f"{', '.join(path.name for path in logs)}; from {vehicle.coefficients.name!r} coefficients",
-        "",
+        f"{vehicle.name}, {options.method}, fitted to {names}; from "
+        f"{vehicle.coefficients.name!r} coefficients"
     ]
-    if thrust:
-        rows = [
-            (
-                f"{'+'.join(one.thrusters)} {one.way}", f"{one.model:.4g}", f"{one.identified:.4g}",
-                _cell(one.sigma, ".2g"), f"{one.factor:.3g}", str(one.readings),
-            )
-            for one in thrust
-        ]  # fmt: skip
-        head = ("k_t by bollard pull", "model", "identified", "sigma", "factor", "readings")
-        lines += [*_table(head, rows), ""]
-    rows_ = []
+    rows = [
+        (
+            f"k_t {'+'.join(one.thrusters)} {one.way}", f"{one.model:.4g}",
+            f"{one.identified:.4g}", _cell(one.sigma, ".2g"), f"{one.factor:.3g}", "",
+            f"{one.readings} readings",
+        )
+        for one in thrust
+    ]  # fmt: skip
     for k, name in enumerate(result.parameters.names):
         start, value = float(result.parameters.start[k]), float(result.values[k])
-        factor = math.nan if name in OTHERS else _factor(start, value)
-        row = [
+        rows.append((
             name, f"{start:.5g}", f"{value:.5g}", _cell(float(result.sigma[k]), ".2g"),
-            _cell(factor, ".3g"), unit_of(name),
-        ]  # fmt: skip
-        rows_.append([*row, result.steps[k]] if result.steps else row)
-    head_ = ["coefficient", "start", "identified", "sigma", "factor", "unit"]
-    lines += _table([*head_, "step"] if result.steps else head_, rows_)
-    lines += _remarks(result)
-    lines += ["", *_fit_lines("Simulated over the same logs", own)]
+            _cell(_factor(name, start, value), ".3g"), unit_of(name), _remark(result, k),
+        ))  # fmt: skip
+    if rows:
+        head = ("coefficient", "start", "identified", "sigma", "factor", "unit", "")
+        lines.append(text_table(head, rows))
+    if result.fit is not None:
+        pairs = high_correlations(result.fit)
+        lines += [f"correlated {value:+.3f}: {a} and {b}" for a, b, value in pairs]
+        if result.fit.prior is not None:
+            lines.append(f"prior about the start, relative sigmas: {result.fit.prior}")
+    if own is not None:
+        lines.append(_fit_line("the same logs", own, None))
     if validation is not None:
-        lines += ["", *_fit_lines(f"Validated on {validation.source}", validation, started)]
-        worse = _worse(validation, started)
-        if worse:
+        lines.append(_fit_line(validation.found.source, validation.found, validation.started))
+        if validation.worse:
             lines.append(
-                f"Worse than the values that the fit began with in {', '.join(worse)}: there the "
-                "logs say less than is known of the vehicle; free fewer coefficients, or log "
-                "manoeuvres that excite these motions"
+                f"Worse than the values that the fit began with in {', '.join(validation.worse)}: "
+                "free fewer coefficients, or log manoeuvres that excite these motions"
             )
-    if drift is not None:
-        lines.append(
-            f"The current of that log, fitted to it with all else held: {drift[0]:.3f} m/s to the "
-            f"north, {drift[1]:.3f} m/s to the east"
-        )
+        if validation.current_ne is not None:
+            north, east = validation.current_ne
+            lines.append(f"current of that log: {north:.3f} m/s north, {east:.3f} m/s east")
     return "\n".join(lines)
 
 
-def _remarks(result: _Identified) -> list[str]:
-    """Caveats on the numbers."""
-    lines = [""]
-    names, fit = result.parameters.names, result.fit
-    poor = poorly_determined(names, result.values, result.sigma)
-    if poor:
-        lines.append(f"hardly determined (sigma over {_POOR:.0%}): {', '.join(poor)}")
-    if fit is None:
-        lines.append("Sigmas are those of the regressions; noise pulls coefficients towards zero.")
-        return lines
-    bound = [name for name, held in zip(names, fit.at_bound, strict=True) if held]
-    if bound:
-        lines.append(f"at a bound, so without sigma: {', '.join(bound)}")
-    lines += [f"correlated {value:+.3f}: {a} and {b}" for a, b, value in high_correlations(fit)]
-    lines += _prior_lines(fit)
-    sigma = ", ".join(
-        f"{name} {value * scale:.3g} {unit}"
-        for name, value, scale, unit in zip(
-            CHANNEL_NAMES, fit.channel_sigma, [1.0] * 3 + [180 / math.pi] * 6,
-            ["m/s"] * 3 + ["deg/s"] * 3 + ["deg"] * 3, strict=True,
-        )
-        if math.isfinite(value)
-    )  # fmt: skip
-    lines.append(f"residuals: {sigma}")
-    white = np.sqrt(np.diag(fit.white_covariance))
-    ratio = np.max(np.where(fit.at_bound, 1.0, fit.sigma / np.where(white > 0, white, 1.0)))
-    longest = float(np.nanmax(fit.correlation_s))
-    if ratio > 1.2:
-        lines.append(
-            f"Residuals are correlated (over {longest:.2g} s): the model misses something or the "
-            f"vehicle was pushed unseen. Sigmas allow for it (up to {ratio:.2g} times those of "
-            "white noise), but not for what a wrong model shifts."
-        )
-    return lines
+def _remark(result: _Identified, k: int) -> str:
+    """What limits a parameter; of the two-step calibration the step as well."""
+    name, fit = result.parameters.names[k], result.fit
+    remarks = [result.steps[k]] if result.steps else []
+    if name in poorly_determined(result.parameters.names, result.values, result.sigma):
+        remarks.append(f"sigma over {_POOR:.0%}")
+    if fit is not None and fit.at_bound[k]:
+        remarks.append("at a bound")
+    if fit is not None and name in held_by_prior(fit):
+        remarks.append("held by the prior")
+    return ", ".join(remarks)
 
 
-def _prior_lines(fit: OutputErrorFit) -> list[str]:
-    """What the prior was, and where it says more than the logs."""
-    if fit.prior is None:
-        return []
-    lines = [f"prior about the start, relative sigmas: {fit.prior}"]
-    held = held_by_prior(fit)
-    if held:
-        lines.append(f"held by the prior more than by the logs: {', '.join(held)}")
-    return lines
+def _fit_line(name: str, found: MotionValidation, started: MotionValidation | None) -> str:
+    """Fit of each motion, next to that of the start and of a velocity that is kept."""
+    shown = {"model": found.fit_percent}
+    if started is not None:
+        shown["start"] = started.fit_percent
+    shown["constant velocity"] = found.constant_fit_percent
+    cells = "; ".join(
+        f"{of} {' / '.join(_cell(value, '.1f') for value in values)}"
+        for of, values in shown.items()
+    )
+    return f"fit of {name} in stretches of {found.window_s:.4g} s, % of u/v/w/p/q/r: {cells}"
 
 
 def held_by_prior(fit: OutputErrorFit) -> list[str]:
@@ -359,124 +390,97 @@ def high_correlations(fit: OutputErrorFit) -> list[tuple[str, str, float]]:
     return sorted(pairs, key=lambda pair: -abs(pair[2]))
 
 
-def _worse(found: MotionValidation, started: MotionValidation | None) -> list[str]:
-    """Motions that the start predicts better than the fit."""
-    if started is None:
-        return []
-    gain = found.fit_percent - started.fit_percent
-    return [name for name, g in zip(CHANNEL_NAMES[:6], gain, strict=True) if g < -_AS_GOOD]
-
-
-def _fit_lines(
-    title: str, found: MotionValidation, started: MotionValidation | None = None
-) -> list[str]:
-    """Fit of each motion, and the errors of forecasts."""
-    names = CHANNEL_NAMES[:6]
-    lines = [
-        f"{title}, in stretches of at most {found.window_s:.4g} s, each from its first row",
-        "fit = 100 (1 - |y - model| / |y - mean y|) %; constant: that row's velocity is kept"
-        + ("; start: the values that the fit began with" if started is not None else ""),
-    ]
-    fits, constant = found.fit_percent, found.constant_fit_percent
-    rows = [
-        ("model", *(_cell(value, ".1f") for value in fits)),
-        ("constant", *(_cell(value, ".1f") for value in constant)),
-    ]
-    if started is not None:
-        rows.insert(1, ("start", *(_cell(value, ".1f") for value in started.fit_percent)))
-    lines += _table(("fit, %", *names), rows)
-    if found.forecasts:
-        rows = [
-            (
-                f"after {one.horizon_s:g} s",
-                *(
-                    f"{_cell(a, '.3g')} / {_cell(b, '.3g')}"
-                    for a, b in zip(one.model, one.constant, strict=True)
-                ),
-            )
-            for one in found.forecasts
-        ]
-        head = ("rms error, model / constant (m/s, rad/s)", *names)
-        lines += ["", *_table(head, rows)]
-    return lines
-
-
 def _data(
     vehicle: Vehicle,
     logs: Sequence[Path],
     result: _Identified,
     thrust: Sequence[ThrustCoefficient],
-    own: MotionValidation,
-    validation: MotionValidation | None,
-    started: MotionValidation | None,
+    own: MotionValidation | None,
+    validation: _Validation | None,
 ) -> dict[str, Any]:
     """The same as JSON values; unknown ones are null."""
-
-    def known(value: float) -> float | None:
-        return float(value) if math.isfinite(value) else None
-
-    def motions(values: Array) -> dict[str, float | None]:
-        return {name: known(v) for name, v in zip(CHANNEL_NAMES[:6], values, strict=True)}
-
-    def fits(found: MotionValidation) -> dict[str, Any]:
-        return {
-            "source": found.source,
-            "window_s": found.window_s,
-            "fit_percent": motions(found.fit_percent),
-            "constant_fit_percent": motions(found.constant_fit_percent),
-            "forecasts": [
-                {
-                    "horizon_s": one.horizon_s,
-                    "starts": one.starts,
-                    "model_rms": motions(one.model),
-                    "constant_rms": motions(one.constant),
-                }
-                for one in found.forecasts
-            ],
-        }
-
-    fit, start = result.fit, result.parameters.start
-    identified = {
-        name: {
-            "start": float(start[k]),
-            "identified": float(result.values[k]),
-            "sigma": known(float(result.sigma[k])),
-            "factor": None
-            if name in OTHERS
-            else known(_factor(float(start[k]), float(result.values[k]))),
-            "unit": unit_of(name),
-        }
-        for k, name in enumerate(result.parameters.names)
-    }
+    names, fit, start = result.parameters.names, result.fit, result.parameters.start
     data: dict[str, Any] = {
         "vehicle": vehicle.name,
         "logs": [path.name for path in logs],
-        "method": "joint" if fit is not None else "two-step",
-        "identified": identified,
+        "method": "joint" if fit is not None or not names else "two-step",
+        "identified": {
+            name: {
+                "start": float(start[k]),
+                "identified": float(result.values[k]),
+                "sigma": _known(result.sigma[k]),
+                "factor": _known(_factor(name, float(start[k]), float(result.values[k]))),
+                "unit": unit_of(name),
+            }
+            for k, name in enumerate(names)
+        },
         "others": result.parameters.others(result.values),
-        "poorly_determined": poorly_determined(
-            result.parameters.names, result.values, result.sigma
-        ),
+        "poorly_determined": poorly_determined(names, result.values, result.sigma),
         "thrust": [
-            {**asdict(one), "sigma": known(one.sigma), "factor": one.factor} for one in thrust
+            {**asdict(one), "sigma": _known(one.sigma), "factor": one.factor} for one in thrust
         ],
-        "same_logs": fits(own),
     }
+    if own is not None:
+        data["same_logs"] = _fit_data(own)
     if fit is not None:
         data["high_correlations"] = [
             {"of": [a, b], "correlation": value} for a, b, value in high_correlations(fit)
         ]
         data["residual_sigma"] = {
-            name: known(float(value))
+            name: _known(value)
             for name, value in zip(CHANNEL_NAMES, fit.channel_sigma, strict=True)
         }
         data["prior"] = None if fit.prior is None else asdict(fit.prior)
         data["held_by_prior"] = held_by_prior(fit)
-        data["covariance"] = [[float(value) for value in row] for row in fit.covariance]
+        data["covariance"] = fit.covariance.tolist()
     if validation is not None:
+        started = validation.started
         data["validation"] = {
-            **fits(validation),
-            "start_fit_percent": None if started is None else motions(started.fit_percent),
-            "worse_than_start": _worse(validation, started),
+            **_fit_data(validation.found),
+            "start_fit_percent": None if started is None else _motions(started.fit_percent),
+            "worse_than_start": validation.worse,
         }
     return data
+
+
+def _known(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _motions(values: Array) -> dict[str, float | None]:
+    return {name: _known(value) for name, value in zip(CHANNEL_NAMES[:6], values, strict=True)}
+
+
+def _fit_data(found: MotionValidation) -> dict[str, Any]:
+    return {
+        "source": found.source,
+        "window_s": found.window_s,
+        "fit_percent": _motions(found.fit_percent),
+        "constant_fit_percent": _motions(found.constant_fit_percent),
+        "forecasts": [
+            {
+                "horizon_s": one.horizon_s,
+                "starts": one.starts,
+                "model_rms": _motions(one.model),
+                "constant_rms": _motions(one.constant),
+            }
+            for one in found.forecasts
+        ],
+    }
+
+
+@figure_style()
+def draw_motion(path: Path, title: str, found: MotionValidation) -> None:
+    """Draw measured and simulated velocities and rates, row by row of all windows."""
+    figure = new_figure(8.5, 13)
+    rows = np.arange(len(found.time_s))[:: max(len(found.time_s) // _MAX_POINTS, 1)]
+    for k, axes in enumerate(figure.subplots(3, 2, sharex=True).T.flat):
+        scale = 1.0 if k < 3 else math.degrees(1.0)
+        axes.plot(rows, scale * found.measured[rows, k], ".", color=SOFT, ms=2.5, label="measured")
+        axes.plot(rows, scale * found.simulated[rows, k], color=INKS[0], lw=1.1, label="model")
+        axes.set_ylabel(f"{CHANNEL_NAMES[k]}, {'m/s' if k < 3 else 'deg/s'}")
+        axes.set_title(f"fit {_cell(found.fit_percent[k], '.0f')} %")
+    figure.axes[0].legend(loc="upper right", ncol=2)
+    figure.supxlabel("row of the logs")
+    figure.suptitle(title)
+    save_figure(figure, path, dpi=110)

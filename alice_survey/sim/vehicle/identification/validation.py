@@ -179,17 +179,6 @@ def run(window: Window, start: Array, physics: Physics, how: Simulation) -> Arra
     Raises:
         VehicleError: the simulation does not stay finite.
     """
-    return simulated(window, start, physics, how)[1]
-
-
-def simulated(
-    window: Window, start: Array, physics: Physics, how: Simulation
-) -> tuple[Array, Array]:
-    """Attitude as quaternions, (T, 4), and motion as of `run`, (T, 6), from a start (10,).
-
-    Raises:
-        VehicleError: the simulation does not stay finite.
-    """
     rows = len(window.record.time_s)
     states, observed = np.empty((rows, STATES)), np.empty((rows, CHANNELS))
     nothing = np.zeros(0, np.int64)
@@ -202,13 +191,7 @@ def simulated(
         raise VehicleError(
             f"{window.source}: the simulation does not stay finite: simulate shorter stretches"
         )
-    return states[:, :4], observed[:, :_MOTIONS]
-
-
-def measured_start(window: Window, physics: Physics) -> Array:
-    """The state (10,) that the first row of a window measured, or the first after it."""
-    filled = _held(window.measured)
-    return _state(window, filled, 0, physics.current_ne, physics.bias)
+    return observed[:, :_MOTIONS]
 
 
 def _state(window: Window, filled: Array, row: int, current_ne: Array, bias: Array) -> Array:

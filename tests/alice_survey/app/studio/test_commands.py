@@ -44,7 +44,7 @@ def test_the_command_line_takes_what_is_written(name: str, tmp_path: Path) -> No
         "crs": "EPSG:32636", "export": "undistorted", "vehicle": "alice", "controller": "sway",
         "dive": 1, "overlap": 0.7, "every": 2.0, "recursive": True, "clock_offset": -1.5,
         "time_zone": "Europe/Oslo", "vertical_datum": "-NN 2000", "dictionary": "DICT_5X5_250",
-        "monte_carlo": 3, "sigma": 5.0, "formats": ["wpl", "cola2"], "declination": -3.4,
+        "sigma": 5.0, "formats": ["wpl", "cola2"], "declination": -3.4,
         "dead_reckon": True, "output": "navigation-2.csv",
     }  # fmt: skip
     fields = COMMANDS[name].arguments.model_fields
