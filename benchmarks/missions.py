@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from alice_survey.core.config import SurveyConfig, changed
-from alice_survey.sim.vehicle.floor import level_floor
+from alice_survey.sim.vehicle.sea import level_floor
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
 from camera_calib.rig import Rig, design_rig

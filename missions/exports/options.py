@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from alice_survey.core.config import CameraConfig, PlanConfig, SeaConfig, VehicleConfig
 from alice_survey.core.errors import PlanError
-from alice_survey.sim.vehicle.limits import SPOT_RAD_S, spot_rate_rad_s
+from alice_survey.sim.vehicle.pilot.settings import SPOT_RAD_S, spot_rate_rad_s
 from camera_calib.rig import Rig
 from missions.exports.follower import Follower, follower_of
 from missions.values.footprint import common_swath

@@ -26,11 +26,11 @@ from alice_survey.core.frames import Array
 from alice_survey.core.text_table import text_table
 from alice_survey.sim.vehicle.dynamics import STATE
 from alice_survey.sim.vehicle.files import vehicle_to_fly
-from alice_survey.sim.vehicle.floor import level_floor
 from alice_survey.sim.vehicle.pilot.gains import gains_for
 from alice_survey.sim.vehicle.pilot.memory import CROSS, FOLLOW, PHASE
 from alice_survey.sim.vehicle.pilot.settings import pilot_guidance
 from alice_survey.sim.vehicle.propulsion import add_thrust
+from alice_survey.sim.vehicle.sea import level_floor
 from alice_survey.sim.vehicle.simulator import Flown, Setup, simulate
 from alice_survey.sim.vehicle.vehicle import Vehicle
 from camera_calib.rig import design_rig

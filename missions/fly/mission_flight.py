@@ -11,12 +11,12 @@ import numpy as np
 from alice_survey.core.config import CameraConfig, VehicleConfig
 from alice_survey.core.errors import PlanError, VehicleError
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.floor import FloorGrid
 from alice_survey.sim.vehicle.pilot import mission as pilot
 from alice_survey.sim.vehicle.pilot import steps as column
-from alice_survey.sim.vehicle.pilot.ardusub import MIN_SPEED_MPS, ArduSubSettings
 from alice_survey.sim.vehicle.pilot.gains import gains_for
 from alice_survey.sim.vehicle.pilot.memory import ALONG, LEG
+from alice_survey.sim.vehicle.pilot.mission import MIN_SPEED_MPS, ArduSubSettings
+from alice_survey.sim.vehicle.sea import FloorGrid
 from alice_survey.sim.vehicle.simulator import simulate
 from camera_calib.rig import Rig
 from missions.coverage.certificate import certificate

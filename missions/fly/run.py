@@ -12,8 +12,8 @@ from alice_survey.core.executor import Executor, progress
 from alice_survey.core.records import FlightRecord
 from alice_survey.core.trajectory import write_track
 from alice_survey.sim.seafloor.terrain import survey_terrain
-from alice_survey.sim.vehicle.floor import FloorGrid
 from alice_survey.sim.vehicle.log import write_vehicle_log
+from alice_survey.sim.vehicle.sea import FloorGrid
 from camera_calib.rig import design_rig
 from missions.fly.flight_plots import draw_flight, draw_vehicle
 from missions.fly.flight_records import bag_record, believed_log, flight_summary, true_log

@@ -19,8 +19,6 @@ from alice_survey.core.config import (
 from alice_survey.core.errors import warn
 from alice_survey.core.frames import Array, rotation_from_attitude
 from alice_survey.core.trajectory import Trajectory
-from alice_survey.sim.vehicle.floor import FloorGrid, floor_depth
-from alice_survey.sim.vehicle.limits import spot_rate_rad_s
 from alice_survey.sim.vehicle.navigation.sensors import (
     CompassSpec,
     DvlSpec,
@@ -30,22 +28,23 @@ from alice_survey.sim.vehicle.navigation.sensors import (
 )
 from alice_survey.sim.vehicle.navigation.tick import LOG_COLUMNS
 from alice_survey.sim.vehicle.pilot.command import Without
-from alice_survey.sim.vehicle.pilot.gains import Gains, gains_for
+from alice_survey.sim.vehicle.pilot.gains import Gains, gains_for, pitch_divergence_speed_mps
 from alice_survey.sim.vehicle.pilot.memory import DONE, FOLLOW, LINE, PHASE, REASON
 from alice_survey.sim.vehicle.pilot.mission import NO_LAW, NO_MISSION, PilotMission
 from alice_survey.sim.vehicle.pilot.path import Path
 from alice_survey.sim.vehicle.pilot.safety import NONE, REASONS, SafetyLimits
-from alice_survey.sim.vehicle.pilot.settings import Guidance, pilot_guidance
+from alice_survey.sim.vehicle.pilot.settings import Guidance, pilot_guidance, spot_rate_rad_s
 from alice_survey.sim.vehicle.sea import (
     Current,
     Disturbance,
+    FloorGrid,
+    floor_depth,
     read_current,
     sheared_current,
     varying_current,
+    with_swell,
 )
 from alice_survey.sim.vehicle.simulator import Failure, Flown, Setup, simulate
-from alice_survey.sim.vehicle.stability import pitch_divergence_speed_mps
-from alice_survey.sim.vehicle.swell import with_swell
 from alice_survey.sim.vehicle.vehicle import Vehicle
 from missions.fly.flight_route import path_of, room_behind_m, roomier_side, turns_on_the_spot
 from missions.route.energy import sound_craft_of

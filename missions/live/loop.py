@@ -31,11 +31,11 @@ from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.navigation.sensors import DvlSpec
 from alice_survey.sim.vehicle.pilot import memory as slot
 from alice_survey.sim.vehicle.pilot.command import Pilot
+from alice_survey.sim.vehicle.pilot.failures import WATCHED_S, FoundFailure
 from alice_survey.sim.vehicle.pilot.memory import DONE
 from alice_survey.sim.vehicle.pilot.safety import NONE, REASONS
-from alice_survey.sim.vehicle.pilot.thruster_watch import WATCHED_S, FoundFailure
 from alice_survey.sim.vehicle.rotations import wrapped
-from alice_survey.sim.vehicle.simulated_vehicle import TICK_S
+from alice_survey.sim.vehicle.simulator import TICK_S
 
 FIRST_S, SILENCE_S = 600.0, 60.0
 """With simulated time nothing ticks without messages: a transport ends after so long without one,

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array, Datum, rotation_from_attitude
 from alice_survey.sim.vehicle import estimate_vector as vector
-from alice_survey.sim.vehicle.simulated_vehicle import TICK_S
+from alice_survey.sim.vehicle.simulator import TICK_S
 from missions.live.loop import FIRST_S, SILENCE_S, Command, LinkState, Odometry
 from missions.live.mavlink_link import mavlink_to
 from missions.live.mission import LiveMission

@@ -10,7 +10,7 @@ from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.pilot import memory as slot
 from alice_survey.sim.vehicle.pilot.command import Pilot
 from alice_survey.sim.vehicle.pilot.memory import FOLLOW
-from alice_survey.sim.vehicle.simulated_vehicle import TICK_S
+from alice_survey.sim.vehicle.simulator import TICK_S
 from alice_survey.sim.vehicle.vehicle import Vehicle
 from missions.fly.flight_route import one_dive
 from missions.fly.simulation import FlightSettings, max_mission_s, piloting_of

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from alice_survey.core.errors import VehicleError
-from alice_survey.sim.vehicle.simulated_vehicle import TICK_S
+from alice_survey.sim.vehicle.simulator import TICK_S
 from missions.live.loop import FIRST_S, SILENCE_S, Command, LinkState
 from missions.live.mission import LiveMission
 from missions.live.ros_messages import (

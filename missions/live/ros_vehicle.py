@@ -19,12 +19,12 @@ from alice_survey.core.trajectory import Trajectory
 from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.allocation import AXIS_WEIGHTS, LEVEL_WEIGHTS
 from alice_survey.sim.vehicle.dynamics import STATE
-from alice_survey.sim.vehicle.floor import floor_range
 from alice_survey.sim.vehicle.navigation.filter import DVL_TIME, DVL_VELOCITY, PUSH, RATES
 from alice_survey.sim.vehicle.navigation.sensors import DVL
 from alice_survey.sim.vehicle.navigation.tick import LOG_ROW, LOG_SIGMA, log_row
 from alice_survey.sim.vehicle.pilot.command import allocate, new_allocation
-from alice_survey.sim.vehicle.simulated_vehicle import TICK_S, SimulatedVehicle
+from alice_survey.sim.vehicle.sea import floor_range
+from alice_survey.sim.vehicle.simulator import TICK_S, SimulatedVehicle
 from missions.live.loop import Odometry
 from missions.live.ros_messages import (
     RosLibrary,

@@ -9,7 +9,7 @@ import numpy as np
 from alice_survey.core.config import SurveyConfig
 from alice_survey.core.errors import note
 from alice_survey.core.trajectory import write_track
-from alice_survey.sim.vehicle.simulated_vehicle import SimulatedVehicle
+from alice_survey.sim.vehicle.simulator import SimulatedVehicle
 from missions.fly.run import flight_noise, true_floor
 from missions.fly.simulation import flight_settings, max_mission_s, mission_setup
 from missions.live.loop import LinkLimits

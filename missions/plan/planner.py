@@ -17,7 +17,7 @@ from shapely.geometry import Point
 
 from alice_survey.core.config import AreaConfig, PlanConfig, SurveyConfig
 from alice_survey.core.errors import PlanError, heard, warn
-from alice_survey.sim.vehicle.hull import POINT, Hull
+from alice_survey.sim.vehicle.hydrodynamics.geometry import POINT, Hull
 from alice_survey.sim.vehicle.vehicle import Vehicle
 from camera_calib.camera import Camera
 from camera_calib.rig import Rig

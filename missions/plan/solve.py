@@ -10,7 +10,7 @@ import numpy as np
 from alice_survey.core.artefacts import json_values
 from alice_survey.core.config import PlanConfig, SurveyConfig
 from alice_survey.core.errors import ConfigError, PlanError
-from alice_survey.sim.vehicle.limits import spot_rate_rad_s
+from alice_survey.sim.vehicle.pilot.settings import spot_rate_rad_s
 from missions.exposure.settings import ImagingSetup, imaging_settings
 from missions.exposure.solve import (
     lens_text,

@@ -12,8 +12,8 @@ from alice_survey.core.config import PlanConfig, SurveyConfig, VehicleConfig
 from alice_survey.core.errors import AliceError, PlanError, warn
 from alice_survey.sim.vehicle.files import vehicles_of_a_geometry
 from alice_survey.sim.vehicle.pilot.gains import STEADY_SHARE
-from alice_survey.sim.vehicle.swell import orbital_speed_mps
-from alice_survey.sim.vehicle.under_way import held, too_slow
+from alice_survey.sim.vehicle.sea import orbital_speed_mps
+from alice_survey.sim.vehicle.steady import held, too_slow
 from missions.exposure.settings import ImagingSetup, imaging_settings
 from missions.exposure.ways_out import Settings, Way, conflict
 from missions.route.energy import (

@@ -34,9 +34,8 @@ from alice_survey.core.config import SeaConfig, SurveyConfig, VehicleConfig
 from alice_survey.core.errors import PlanError, VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.files import coefficients_from_file, vehicle_to_fly
-from alice_survey.sim.vehicle.limits import STEP_MPS, spot_rate_rad_s
-from alice_survey.sim.vehicle.pilot.diving import MAX_PITCH_RAD
 from alice_survey.sim.vehicle.pilot.gains import STEADY_SHARE
+from alice_survey.sim.vehicle.pilot.settings import MAX_PITCH_RAD, STEP_MPS, spot_rate_rad_s
 from alice_survey.sim.vehicle.steady import steady_flight
 from alice_survey.sim.vehicle.vehicle import Vehicle
 from missions.values.costs import SETTLE_S, Costs

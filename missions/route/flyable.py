@@ -5,7 +5,7 @@ import math
 from alice_survey.core.config import PlanConfig, SurveyConfig
 from alice_survey.core.errors import PlanError
 from alice_survey.sim.vehicle.pilot.gains import STEADY_SHARE
-from alice_survey.sim.vehicle.under_way import held, min_radius_m
+from alice_survey.sim.vehicle.steady import held, min_radius_m
 from alice_survey.sim.vehicle.vehicle import Vehicle
 from missions.route.energy import craft_of
 

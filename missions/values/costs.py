@@ -9,7 +9,7 @@ import numpy as np
 from alice_survey.core.compiled import compiled_ieee
 from alice_survey.core.errors import PlanError
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.limits import SPOT_RAD_S, STEP_MPS
+from alice_survey.sim.vehicle.pilot.settings import SPOT_RAD_S, STEP_MPS
 from missions.values.legs import Route
 
 SETTLE_S = 6.5

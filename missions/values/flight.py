@@ -10,7 +10,7 @@ import numpy as np
 from alice_survey.core.frames import Array, attitude_from_rotation
 from alice_survey.core.trajectory import Trajectory
 from alice_survey.sim.vehicle.pilot.memory import CROSS, PATH_HEADING
-from alice_survey.sim.vehicle.pilot.standing import STOP_M
+from alice_survey.sim.vehicle.pilot.steering import STOP_M
 from alice_survey.sim.vehicle.simulator import Flown
 from alice_survey.sim.vehicle.vehicle import Vehicle
 from missions.values.navigation import BelievedNavigation

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from alice_survey.core.config import parse_config
-from alice_survey.sim.vehicle.floor import level_floor
+from alice_survey.sim.vehicle.sea import level_floor
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import plan_pattern, stations_of_flight

@@ -230,7 +230,7 @@ def _column_map(folder: Path) -> None:
 
 
 def read_column_map(path: Path) -> object:
-    from alice_survey.sim.vehicle.identification.foreign import read_column_map as read
+    from alice_survey.sim.vehicle.log import read_column_map as read
 
     return read(path)
 
@@ -262,7 +262,7 @@ def swelling_bag(folder: Path, packed: str, size: int) -> Path:
 
 
 def read_foreign(path: Path) -> object:
-    from alice_survey.sim.vehicle.identification.foreign import read_column_map, read_foreign_log
+    from alice_survey.sim.vehicle.log import read_column_map, read_foreign_log
 
     return read_foreign_log(path.with_name("log.csv"), read_column_map(path.with_name("map.toml")))
 
@@ -302,7 +302,7 @@ def _pulls() -> list[str]:
 
 
 def read_pulls(path: Path) -> object:
-    from alice_survey.sim.vehicle.identification.bollard import read_pulls as read
+    from alice_survey.sim.vehicle.identification.two_step import read_pulls as read
 
     return read(path)
 

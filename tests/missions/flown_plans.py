@@ -10,7 +10,7 @@ from shapely.geometry import MultiPolygon, box
 from alice_survey.core.config import SurveyConfig
 from alice_survey.core.frames import Datum
 from alice_survey.sim.seafloor.terrain import Terrain, survey_terrain
-from alice_survey.sim.vehicle.floor import FloorGrid, level_floor
+from alice_survey.sim.vehicle.sea import FloorGrid, level_floor
 from camera_calib.rig import design_rig
 from missions.fly.simulation import flight_settings, simulate_plan
 from missions.plan.planner import plan_survey

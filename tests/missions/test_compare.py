@@ -17,7 +17,7 @@ from alice_survey.core.errors import ConfigError, VehicleError
 from alice_survey.core.executor import SERIAL
 from alice_survey.sim.vehicle import files
 from alice_survey.sim.vehicle.files import vehicle_from
-from alice_survey.sim.vehicle.floor import level_floor
+from alice_survey.sim.vehicle.sea import level_floor
 from alice_survey.sim.vehicle.simulator import Flown, Setup, simulate
 from missions.fly.compare import (
     EQUAL,

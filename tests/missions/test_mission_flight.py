@@ -13,10 +13,10 @@ import pytest
 from alice_survey.core.config import SurveyConfig, changed, parse_config
 from alice_survey.core.errors import PlanError, VehicleError
 from alice_survey.core.frames import Datum
-from alice_survey.sim.vehicle.floor import level_floor
-from alice_survey.sim.vehicle.pilot.cola2 import circling_m, steady_drift
 from alice_survey.sim.vehicle.pilot.gains import gains_for
 from alice_survey.sim.vehicle.pilot.memory import ABORT, ALONG, CROSS, LEG, PHASE
+from alice_survey.sim.vehicle.pilot.mission import circling_m, steady_drift
+from alice_survey.sim.vehicle.sea import level_floor
 from camera_calib.rig import Rig, design_rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import plan_pattern, stations_of_flight

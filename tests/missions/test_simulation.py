@@ -16,10 +16,9 @@ from alice_survey.core.config import (
     parse_config,
 )
 from alice_survey.core.errors import VehicleError
-from alice_survey.sim.vehicle.floor import FloorGrid
 from alice_survey.sim.vehicle.navigation.tick import LOG_COLUMNS
-from alice_survey.sim.vehicle.pilot.thrust_watch import ThrustWatch
-from alice_survey.sim.vehicle.sea import current_at
+from alice_survey.sim.vehicle.pilot.failures import ThrustWatch
+from alice_survey.sim.vehicle.sea import FloorGrid, current_at
 from camera_calib.rig import design_rig
 from missions.fly.flight_records import flight_summary
 from missions.fly.simulation import current_of

@@ -10,7 +10,7 @@ from alice_survey.core.config import SurveyConfig, parse_config
 from alice_survey.core.errors import PlanError, VehicleError
 from alice_survey.sim.vehicle.pilot.gains import STEADY_SHARE
 from alice_survey.sim.vehicle.pilot.memory import ABORT, PHASE
-from alice_survey.sim.vehicle.under_way import min_radius_m, min_speed_mps
+from alice_survey.sim.vehicle.steady import min_radius_m, min_speed_mps
 from missions.exposure.ways_out import ConflictError
 from missions.fly.flight_records import true_log
 from missions.fly.flight_route import path_of, roomier_side

@@ -61,7 +61,7 @@ def coefficients(
 
     Every row of the paper's three tables of added mass, damping and lift.
     """
-    from alice_survey.sim.vehicle.hydrodynamics.report import coefficients_report
+    from alice_survey.sim.vehicle.hydrodynamics.paper_tables import coefficients_report
 
     print_result(*coefficients_report(csv, plot), as_json)
 
@@ -175,7 +175,7 @@ def identify(
     they predict another log.
     """
     from alice_survey.core.config import DEFAULT_VEHICLE
-    from alice_survey.sim.vehicle.identification.prior import read_prior
+    from alice_survey.sim.vehicle.identification.output_error import read_prior
     from alice_survey.sim.vehicle.identification.report import IdentifyOptions, identify_report
 
     options = IdentifyOptions(

@@ -34,8 +34,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey.core.compiled import kernel
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.compiled import kernel
 from alice_survey.sim.vehicle.propulsion import DISTRUST, Propulsion
 
 

@@ -10,14 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from alice_survey.core.compiled import kernel
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.compiled import kernel
 from alice_survey.sim.vehicle.fins import Fins, add_fin_rates, add_fins
 from alice_survey.sim.vehicle.propulsion import Propulsion, add_speed_rates, add_thrust
 from alice_survey.sim.vehicle.rotations import matrix_rows
 from alice_survey.sim.vehicle.sea import Current, current_at
 
-GRAVITY = 9.80665
 STATE = 13
 """Length of the state without thrusters and fins."""
 

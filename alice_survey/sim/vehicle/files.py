@@ -26,9 +26,13 @@ from alice_survey.core.contents import one_line, shown
 from alice_survey.core.errors import VehicleError, why
 from alice_survey.sim.vehicle.coefficients import FORCES, Coefficients
 from alice_survey.sim.vehicle.fins import Fin
-from alice_survey.sim.vehicle.hull import POINT, Hull
-from alice_survey.sim.vehicle.hydrodynamics.entrained import entrained_water
-from alice_survey.sim.vehicle.hydrodynamics.geometry import ALICE, SPARUS2
+from alice_survey.sim.vehicle.hydrodynamics.geometry import (
+    ALICE,
+    POINT,
+    SPARUS2,
+    Hull,
+    entrained_water,
+)
 from alice_survey.sim.vehicle.hydrodynamics.paper_tables import CALIBRATED, CFD, ESTIMATED
 from alice_survey.sim.vehicle.hydrodynamics.parts import estimate
 from alice_survey.sim.vehicle.propulsion import Thruster

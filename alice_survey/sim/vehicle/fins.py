@@ -25,9 +25,9 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import ConfigDict
 
+from alice_survey.core.compiled import kernel
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.compiled import kernel
 
 _SECTION_SHARE = 0.9
 """Lift slope of a section over the 2 pi of theory (Hoerner; Prestero 2001, equation 4.46)."""

@@ -33,9 +33,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 from pydantic import ConfigDict
 
+from alice_survey.core.compiled import kernel
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.compiled import kernel
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,8 +2,8 @@
 
 import math
 
+from alice_survey.core.compiled import kernel
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.compiled import kernel
 
 Row = tuple[float, float, float]
 

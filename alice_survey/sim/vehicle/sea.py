@@ -1,4 +1,11 @@
-"""The water the vehicle moves through: currents that vary with depth and time, and disturbances."""
+"""The water and the sea floor: currents, swell, disturbances, and a grid of depths.
+
+Swell are linear waves over a level sea floor (R. G. Dean and R. A. Dalrymple, Water Wave Mechanics,
+1991, section 3.4): omega^2 = g k tanh(k h), and horizontally
+u(z, t) = (pi H / T) cosh(k (h - z)) / sinh(k h) cos(omega t). The vehicle is much shorter than the
+waves and stays where it is compared with them, so that all of it meets one phase. The vertical
+motion, small near the floor, is left out.
+"""
 
 import math
 from dataclasses import dataclass
@@ -7,11 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from alice_survey.core.compiled import kernel
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.core.trajectory import read_columns
-from alice_survey.sim.vehicle.compiled import kernel
 
+GRAVITY = 9.80665
+"""m/s^2."""
 _COLUMNS = ("time_s", "depth_m", "north_mps", "east_mps")
 
 
@@ -172,3 +181,161 @@ def current_at(current: Current, time_s: float, depth_m: float, out: Array) -> N
         out[4 + axis] = (
             (deep - shallow) / (current.depth_m[j1] - current.depth_m[j]) if within_z else 0.0
         )
+
+
+_PER_PERIOD = 24
+"""Samples per period: linear pieces between are within 1 % of the wave."""
+_LAYERS = 16
+
+
+def wave_number(period_s: float, depth_m: float) -> float:
+    """Wave number of waves of a period over a depth, rad/m."""
+    from scipy.optimize import brentq
+
+    # In deep water k h is this number; in shallow water its root: the root lies between.
+    deep = (2.0 * math.pi / period_s) ** 2 * depth_m / GRAVITY
+    low, high = 0.5 * min(deep, math.sqrt(deep)), 2.0 * max(deep, math.sqrt(deep))
+    return float(brentq(lambda kh: kh * math.tanh(kh) - deep, low, high, xtol=1e-14)) / depth_m
+
+
+def orbital_speed_mps(
+    height_m: float, period_s: float, depth_m: float, below_m: Array | float
+) -> Array:
+    """Amplitude of the horizontal speed at depths (...) below the surface.
+
+    Args:
+        height_m: height of the waves, trough to crest.
+        period_s: period of the waves.
+        depth_m: depth of the sea floor.
+        below_m: (...) depths of the points.
+    """
+    k = wave_number(period_s, depth_m)
+    share = np.cosh(k * (depth_m - np.asarray(below_m))) / math.sinh(k * depth_m)
+    return np.asarray(math.pi * height_m / period_s * share)
+
+
+def with_swell(
+    current: Current,
+    height_m: float,
+    period_s: float,
+    towards_deg: float,
+    depth_m: float,
+    duration_s: float,
+) -> Current:
+    """A current to which regular waves are added.
+
+    Args:
+        current: without waves.
+        height_m: trough to crest.
+        period_s: period of the waves.
+        towards_deg: where they travel.
+        depth_m: depth of the sea floor.
+        duration_s: how long the waves last.
+
+    Raises:
+        VehicleError: a number is invalid.
+    """
+    if not (height_m >= 0 and period_s > 0 and depth_m > 0):
+        raise VehicleError(
+            f"swell of {height_m:g} m and {period_s:g} s over {depth_m:g} m: give a height of 0 or "
+            "more, and a period and a depth above 0"
+        )
+    step_s = period_s / _PER_PERIOD
+    time_s = np.union1d(
+        step_s * np.arange(math.ceil(duration_s / step_s) + 1, dtype=np.float64), current.time_s
+    )
+    layers = np.union1d(np.linspace(0.0, depth_m, _LAYERS), current.depth_m)
+    before = _resampled(current, time_s, layers)
+    speed = orbital_speed_mps(height_m, period_s, depth_m, np.clip(layers, 0.0, depth_m))
+    phase = np.cos(2.0 * math.pi / period_s * time_s)
+    towards = math.radians(towards_deg)
+    way = np.array([math.cos(towards), math.sin(towards)])
+    waves = phase[:, None, None] * speed[None, :, None] * way
+    velocity: Array = np.ascontiguousarray(before + waves)
+    return checked_current(Current(time_s, layers, velocity))
+
+
+def _resampled(current: Current, time_s: Array, depth_m: Array) -> Array:
+    """(T, Z, 2) the current at other times and depths; constant beyond its own."""
+    at_depths = np.stack(
+        [
+            [np.interp(depth_m, current.depth_m, row[:, axis]) for row in current.velocity_ne_mps]
+            for axis in (0, 1)
+        ],
+        axis=-1,
+    )
+    flat = at_depths.reshape(len(current.time_s), -1)
+    columns = [np.interp(time_s, current.time_s, column) for column in flat.T]
+    return np.stack(columns, axis=1).reshape(len(time_s), len(depth_m), 2)
+
+
+class FloorGrid(NamedTuple):
+    """Depths at the nodes of a regular grid; beyond its edges the floor continues level."""
+
+    north_m: float
+    """North of the first row."""
+    east_m: float
+    """East of the first column."""
+    spacing_m: float
+    depth_m: Array
+    """(N, E)."""
+
+
+def level_floor(depth_m: float) -> FloorGrid:
+    """A level sea floor of infinite extent."""
+    return FloorGrid(0.0, 0.0, 1.0, np.full((2, 2), depth_m))
+
+
+@kernel
+def floor_depth(floor: FloorGrid, north_m: float, east_m: float) -> float:
+    """Depth of the sea floor at a place, metres."""
+    rows, columns = floor.depth_m.shape
+    y = min(max((north_m - floor.north_m) / floor.spacing_m, 0.0), rows - 1.0)
+    x = min(max((east_m - floor.east_m) / floor.spacing_m, 0.0), columns - 1.0)
+    i, j = min(int(y), rows - 2), min(int(x), columns - 2)
+    b, a = y - i, x - j
+    grid = floor.depth_m
+    north_side = grid[i, j] + a * (grid[i, j + 1] - grid[i, j])
+    south_side = grid[i + 1, j] + a * (grid[i + 1, j + 1] - grid[i + 1, j])
+    return float(north_side + b * (south_side - north_side))
+
+
+@kernel
+def floor_range(
+    floor: FloorGrid,
+    north_m: float,
+    east_m: float,
+    depth_m: float,
+    beam_n: float,
+    beam_e: float,
+    beam_d: float,
+    reach_m: float,
+) -> float:
+    """Range along a unit beam from a place in the water to the sea floor.
+
+    The beam is walked in steps of the grid's spacing until it is below the floor, and the crossing
+    is then found by bisection, so that the first of several crossings is returned.
+
+    Returns:
+        Metres, or NaN when the beam does not reach the floor within `reach_m` or begins below it.
+    """
+    if depth_m >= floor_depth(floor, north_m, east_m):
+        return math.nan
+    step = max(floor.spacing_m, reach_m / 200.0)
+    near = 0.0
+    while near < reach_m:
+        far = min(near + step, reach_m)
+        if depth_m + far * beam_d >= floor_depth(
+            floor, north_m + far * beam_n, east_m + far * beam_e
+        ):
+            for _ in range(20):
+                middle = 0.5 * (near + far)
+                if depth_m + middle * beam_d >= floor_depth(
+                    floor, north_m + middle * beam_n, east_m + middle * beam_e
+                ):
+                    far = middle
+                else:
+                    near = middle
+            return 0.5 * (near + far)
+        near = far
+    return math.nan

@@ -10,10 +10,11 @@ from pydantic import ConfigDict
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.coefficients import Coefficients
-from alice_survey.sim.vehicle.dynamics import GRAVITY, Body, Plant
+from alice_survey.sim.vehicle.dynamics import Body, Plant
 from alice_survey.sim.vehicle.fins import Fin, pack_fins
-from alice_survey.sim.vehicle.hull import POINT, Hull
+from alice_survey.sim.vehicle.hydrodynamics.geometry import POINT, Hull
 from alice_survey.sim.vehicle.propulsion import Thruster, pack
+from alice_survey.sim.vehicle.sea import GRAVITY
 
 
 @dataclass(frozen=True, kw_only=True)

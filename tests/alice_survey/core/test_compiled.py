@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numba import njit
+from numba.core.errors import TypingError
 
-from alice_survey.core.compiled import closure_digest
+from alice_survey.core.compiled import closure_digest, kernel
 
 ASK = "import inner, outer; print(outer.twice(3.0), sum(outer.twice.stats.cache_hits.values()))"
 INNER = '''
@@ -169,3 +170,11 @@ def test_processes_that_start_together_compile_a_kernel_once(tmp_path):
     found = [process.communicate(timeout=120)[0].split() for process in started]
     assert [float(answer) for answer, *_ in found] == [8.0] * 3
     assert [sum(int(row[k]) for row in found) for k in (1, 2)] == [1, 1]
+
+
+def test_a_kernel_cannot_allocate() -> None:
+    def allocates(x: float) -> float:
+        return float(np.zeros(3)[0] + x)
+
+    with pytest.raises(TypingError):
+        kernel(allocates)(1.0)

@@ -9,7 +9,7 @@ import pytest
 
 from alice_survey.core.config import CameraConfig, PlanConfig, SeaConfig, VehicleConfig
 from alice_survey.core.errors import heard
-from alice_survey.sim.vehicle.pilot.cola2 import steady_drift
+from alice_survey.sim.vehicle.pilot.mission import steady_drift
 from missions.coverage.stations import stations_of_plan
 from missions.exports.follower import (
     end_tolerance_m,

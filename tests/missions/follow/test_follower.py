@@ -9,7 +9,7 @@ import pytest
 
 from alice_survey.core.config import SurveyConfig
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.floor import level_floor
+from alice_survey.sim.vehicle.sea import level_floor
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.dive_record import read_dive_record

@@ -17,7 +17,6 @@ from alice_survey.core.artefacts import write_csv
 from alice_survey.core.config import SurveyConfig, load_config
 from alice_survey.core.frames import Array, Datum, attitude_from_rotation
 from alice_survey.sim.vehicle.allocation import AXIS_WEIGHTS
-from alice_survey.sim.vehicle.floor import floor_range
 from alice_survey.sim.vehicle.navigation.sensors import DVL
 from alice_survey.sim.vehicle.pilot.command import allocate, new_allocation
 from alice_survey.sim.vehicle.pilot.gains import (
@@ -31,7 +30,8 @@ from alice_survey.sim.vehicle.pilot.gains import (
     gains_for,
 )
 from alice_survey.sim.vehicle.rotations import wrapped
-from alice_survey.sim.vehicle.simulated_vehicle import SimulatedVehicle
+from alice_survey.sim.vehicle.sea import floor_range
+from alice_survey.sim.vehicle.simulator import SimulatedVehicle
 from missions.live.mission import plan_to_fly
 from tests.missions.live.flights import vehicle_afloat
 

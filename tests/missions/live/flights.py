@@ -7,8 +7,8 @@ import numpy as np
 
 from alice_survey.core.config import SurveyConfig
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.floor import level_floor
-from alice_survey.sim.vehicle.simulated_vehicle import SimulatedVehicle
+from alice_survey.sim.vehicle.sea import level_floor
+from alice_survey.sim.vehicle.simulator import SimulatedVehicle
 from missions.fly.simulation import flight_settings, mission_setup
 from missions.live.loop import LinkLimits, Odometry
 from missions.live.mission import LiveMission, mission_of

@@ -21,7 +21,7 @@ from alice_survey.core.config import SurveyConfig, load_config
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array, attitude_from_rotation, interpolate_poses
 from alice_survey.core.trajectory import read_track
-from alice_survey.sim.vehicle.floor import floor_depth
+from alice_survey.sim.vehicle.sea import floor_depth
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import Stations, plan_pattern, stations_of_flight

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from alice_survey.core.config import SurveyConfig
-from alice_survey.sim.vehicle.floor import level_floor
 from alice_survey.sim.vehicle.pilot.memory import FOLLOW, LEG, PHASE
+from alice_survey.sim.vehicle.sea import level_floor
 from camera_calib.rig import design_rig
 from missions.fly.simulation import flight_settings, simulate_plan
 from missions.plan.planner import plan_survey

@@ -5,12 +5,36 @@ simulated from a start of its own, so that a log in one window is single shootin
 many is multiple shooting. The starts are eliminated (variable projection, Golub & Pereyra, Inverse
 Problems 19, 2003): for given parameters each window's start is solved for, and the parameters see
 residuals and slopes with the directions of the start taken out. The sensitivities are exact.
+
+What is known of the parameters before a fit: that they are near the values it starts from.
+
+A coefficient that keeps its sign and starts from a value theta_0 is as likely to be too large as
+to be too small by one factor: ln(theta / theta_0) is normal about zero, and it never ends at zero.
+A damping that starts from zero is normal about it, with the scale of the motion's other damping
+at the speeds that the logs hold. Cross terms and body lift may change sign and are normal about
+their start. There is no prior on what changes from day to day, such as a current or the trim,
+nor on terms that start from zero and have no damping to be compared with.
+
+The residuals of a log are correlated in time, so that their sum of squares claims more than the log
+knows. The prior counts times that ratio (adjustment of the magnitude of a composite likelihood:
+M. Ribatet, D. Cooley & A. C. Davison, Statistica Sinica 22, 2012).
+
+Covariance of fitted parameters whose residuals are correlated: stretches are left out.
+
+Logs are cut into stretches that are long against the residuals' memory, and so hardly depend on one
+another. Leaving one out moves the parameters by a Gauss-Newton step; the spread of these moves is
+the delete-a-group jackknife (J. Shao & D. Tu, The Jackknife and Bootstrap, 1995, 2.3), a sandwich
+that allows for what each stretch weighs. It needs no model of the noise: forces of waves, of a
+tether, and what the vehicle's equations do not hold, all count by how differently the stretches
+would have the parameters. White residuals give the inverse information.
 """
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -18,18 +42,15 @@ from alice_survey.core.errors import VehicleError
 from alice_survey.core.executor import progress
 from alice_survey.core.frames import Array
 from alice_survey.core.run.progress import step as named_step
-from alice_survey.sim.vehicle.identification.covariance import (
-    Stretches,
-    design_effect,
-    in_stretches,
-    jackknife_covariance,
-    stretch_numbers,
-)
+from alice_survey.sim.vehicle.coefficients import MOTIONS
 from alice_survey.sim.vehicle.identification.noise import autocovariance, noise_sigma
-from alice_survey.sim.vehicle.identification.parameters import Parameters
-from alice_survey.sim.vehicle.identification.prior import PriorSigmas, StartPrior, prior_of
+from alice_survey.sim.vehicle.identification.parameters import QUADRATICS, Parameters, place_of
 from alice_survey.sim.vehicle.identification.sensitivity import (
+    ADDED_MASS,
     CHANNELS,
+    GAIN,
+    LIFT,
+    LINEAR,
     START,
     STATES,
     Physics,
@@ -39,6 +60,231 @@ from alice_survey.sim.vehicle.identification.sensitivity import (
 )
 from alice_survey.sim.vehicle.identification.windows import Mask, Window, cut, residual_channels
 from alice_survey.sim.vehicle.log import attitude_of
+
+_LEAST, _MOST = 10, 20
+"""Stretches that logs are cut into: few are long, many show the spread better."""
+_WINDOWS = 4
+"""Windows in a stretch where there are many."""
+_FEWEST = 5
+"""With fewer stretches the spread is not known."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Stretches:
+    """What stretches of logs say of P parameters."""
+
+    scores: Array
+    """(B, P) gradients: slopes times residuals, in sigmas."""
+    information: Array
+    """(B, P, P) slopes times slopes."""
+
+    def __len__(self) -> int:
+        return len(self.scores)
+
+
+def in_stretches(residuals: Array, slopes: Array, number: NDArray[np.intp]) -> Stretches:
+    """Sum up residuals, (N,), and slopes, (N, P), by the numbers, (N,), of their stretches."""
+    count, width = int(number.max()) + 1, slopes.shape[1]
+    scores, information = np.zeros((count, width)), np.zeros((count, width, width))
+    order = np.argsort(number, kind="stable")
+    edges = np.searchsorted(number[order], np.arange(count + 1))
+    for b in range(count):
+        rows = order[edges[b] : edges[b + 1]]
+        scores[b] = slopes[rows].T @ residuals[rows]
+        information[b] = slopes[rows].T @ slopes[rows]
+    return Stretches(scores=scores, information=information)
+
+
+def stretch_numbers(times_s: list[Array]) -> list[NDArray[np.intp]]:
+    """Put windows, given by the times of their rows, into stretches of about one length.
+
+    Each window has a start of its own, that balances the residuals within it: windows stay whole,
+    several of them in a stretch. Only fewer than five are cut.
+
+    Returns:
+        The number of its stretch for each row of each window.
+    """
+    spans = np.array([float(time_s[-1] - time_s[0]) for time_s in times_s])
+    wanted = min(max(len(spans) // _WINDOWS, _LEAST), _MOST)
+    length_s, ends = spans.sum() / wanted, np.cumsum(spans)
+    numbers: list[NDArray[np.intp]] = []
+    if len(spans) < _FEWEST:
+        for time_s, end_s in zip(times_s, ends.tolist(), strict=True):
+            passed = end_s - (time_s[-1] - time_s)
+            numbers.append(np.minimum(passed / length_s, wanted - 1).astype(np.intp))
+    else:
+        middles = (ends - 0.5 * spans) / length_s
+        places = np.minimum(middles, wanted - 1).astype(np.intp)
+        _, places = np.unique(places, return_inverse=True)
+        numbers = [np.full(len(t), k) for t, k in zip(times_s, places.tolist(), strict=True)]
+    return numbers
+
+
+def jackknife_covariance(stretches: Stretches, prior: Array) -> Array | None:
+    """Covariance, (P, P), of parameters as far as the logs' noise makes it; None of few stretches.
+
+    Args:
+        stretches: at the fit.
+        prior: (P, P) information that is not of the logs and stays when a stretch is left out.
+    """
+    count = len(stretches)
+    if count < _FEWEST:
+        return None
+    total = stretches.information.sum(axis=0) + prior
+    moves = np.array(
+        [
+            np.linalg.solve(total - information, score - stretches.scores.mean(axis=0))
+            for score, information in zip(stretches.scores, stretches.information, strict=True)
+        ]
+    )
+    # Errors by a spread of few are spread as Student's t, with a variance of n / (n - 2).
+    student = (count - 1.0) / (count - 3.0)
+    covariance: Array = student * (count - 1.0) / count * (moves.T @ moves)
+    return covariance
+
+
+def design_effect(stretches: Stretches, prior: Array) -> float:
+    """How many times more the residuals vary in what they say than white ones would; at least 1.
+
+    The trace of the sandwich by that of the Hessian, as in the information criterion for models
+    that are wrong (K. Takeuchi, 1976; C. Varin & P. Vidoni, Biometrika 92(3), 2005).
+
+    Args:
+        stretches: at the fit.
+        prior: (P, P) information that is not of the logs.
+    """
+    count = len(stretches)
+    if count < _FEWEST:
+        return 1.0
+    away = stretches.scores - stretches.scores.mean(axis=0)
+    logs = stretches.information.sum(axis=0)
+    inverse = np.linalg.pinv(logs + prior, hermitian=True)
+    spread = count / (count - 1.0) * np.trace(inverse @ (away.T @ away))
+    return max(float(spread / np.trace(inverse @ logs)), 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PriorSigmas:
+    """Relative standard deviations of the start, by kind of parameter; infinite: none."""
+
+    damping: float = 0.5
+    added_mass: float = 0.3
+    lift: float = 0.5
+    gain: float = 1.0
+
+    def __post_init__(self) -> None:
+        for one in fields(self):
+            value = getattr(self, one.name)
+            if not value > 0:
+                raise VehicleError(f"prior {one.name}={value:g}: a relative sigma is above 0")
+
+    def __str__(self) -> str:
+        named = ((one.name, getattr(self, one.name)) for one in fields(self))
+        return ", ".join(f"{name} {value:g}" for name, value in named if math.isfinite(value))
+
+    def of_kind(self, kind: int) -> float:
+        """The sigma of a kind of parameter; infinite of kinds without prior."""
+        known = {
+            LINEAR: self.damping, **dict.fromkeys(QUADRATICS, self.damping),
+            ADDED_MASS: self.added_mass, LIFT: self.lift, GAIN: self.gain,
+        }  # fmt: skip
+        return known.get(kind, math.inf)
+
+
+def read_prior(text: str) -> PriorSigmas | None:
+    """A prior as the command line has it: `none`, one number for all, or `KIND=SIGMA,...`.
+
+    Kinds that are not named have their default.
+
+    Raises:
+        VehicleError: it is neither.
+    """
+    if text.strip() == "none":
+        return None
+    kinds = [one.name for one in fields(PriorSigmas)]
+    given: dict[str, float] = {}
+    for part in filter(None, text.split(",")):
+        name, mark, number = (one.strip() for one in part.partition("="))
+        try:
+            value = float(number if mark else name)
+        except ValueError:
+            value = math.nan
+        if math.isnan(value) or (mark and name not in kinds) or (not mark and "," in text):
+            raise VehicleError(
+                f"--prior {text!r}: give none, a relative sigma, or KIND=SIGMA,... with kinds of "
+                f"{', '.join(kinds)}"
+            )
+        given |= {name: value} if mark else dict.fromkeys(kinds, value)
+    return PriorSigmas(**given)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StartPrior:
+    """A normal distribution of each parameter, or of its logarithm."""
+
+    start: Array
+    """(P,)"""
+    sigma: Array
+    """(P,) of the parameter, or of the logarithm; infinite where nothing is known."""
+    logarithmic: Mask
+    """(P,)"""
+
+    def residuals(self, values: Array) -> Array:
+        """Distances, (P,), from the start in sigmas; zero where nothing is known."""
+        away = values - self.start
+        with np.errstate(divide="ignore"):
+            away[self.logarithmic] = np.log((values / self.start_or_one)[self.logarithmic])
+        return away / self.sigma
+
+    def slopes(self, values: Array) -> Array:
+        """Derivatives of the residuals, (P,)."""
+        slope: Array = 1.0 / (self.sigma * np.where(self.logarithmic, values, 1.0))
+        return slope
+
+    @property
+    def start_or_one(self) -> Array:
+        """(P,) the start where logarithms are taken, else one."""
+        return np.where(self.logarithmic, self.start, 1.0)
+
+
+def prior_of(
+    parameters: Parameters, windows: Sequence[Window], sigmas: PriorSigmas | None
+) -> StartPrior | None:
+    """The prior of parameters for a fit to windows; None if there is none."""
+    if sigmas is None:
+        return None
+    speeds = _speeds(windows)
+    known, start = parameters.vehicle.coefficients.values, parameters.start
+    sigma = np.full(len(start), math.inf)
+    logarithmic = np.zeros(len(start), bool)
+    for k, name in enumerate(parameters.names):
+        kind, i, j = place_of(name)
+        relative = sigmas.of_kind(kind)
+        if not math.isfinite(relative):
+            continue
+        definite = kind == GAIN or (kind != LIFT and i == j)
+        if definite and start[k] != 0.0:
+            sigma[k], logarithmic[k] = relative, True
+            continue
+        scale = abs(start[k])
+        if kind == LINEAR:
+            scale = max(scale, abs(known.get(f"{name}{name[2]}", 0.0)) * speeds[j])
+        elif kind in QUADRATICS and speeds[j] > 0:
+            scale = max(scale, abs(known.get(name[:3], 0.0)) / speeds[j])
+        if scale > 0:
+            sigma[k] = relative * scale
+    if not np.any(np.isfinite(sigma)):
+        return None
+    return StartPrior(start=start, sigma=sigma, logarithmic=logarithmic)
+
+
+def _speeds(windows: Sequence[Window]) -> Array:
+    """Root mean square, (6,), of the motions that the windows measured; zero of others."""
+    table = np.concatenate([window.measured for window in windows])
+    known = np.isfinite(table)
+    total = np.sum(np.where(known, table, 0.0) ** 2, axis=0)
+    return np.asarray(np.sqrt(total / np.maximum(known.sum(axis=0), 1)))[: len(MOTIONS)]
+
 
 _SHORT_S = 5.0
 """First approximation uses windows no longer than this: over a short time a simulation stays

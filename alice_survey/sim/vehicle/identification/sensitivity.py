@@ -21,8 +21,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey.core.compiled import kernel
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.compiled import kernel
 from alice_survey.sim.vehicle.dynamics import Body, add_coriolis, add_damping, add_weight
 from alice_survey.sim.vehicle.propulsion import Propulsion, add_thrust
 from alice_survey.sim.vehicle.rotations import matrix_rows

@@ -24,13 +24,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from alice_survey.core.compiled import kernel
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.compiled import kernel
-from alice_survey.sim.vehicle.dynamics import GRAVITY
 from alice_survey.sim.vehicle.estimate_vector import ESTIMATE
 from alice_survey.sim.vehicle.navigation.sensors import BEAMS, DVL, IMU, PRESSURE, Sensors
 from alice_survey.sim.vehicle.rotations import applied, applied_inverse, matrix_of, turn, wrapped
+from alice_survey.sim.vehicle.sea import GRAVITY
 
 POSITION, VELOCITY, ATTITUDE, GYRO_BIAS, ACCELEROMETER_BIAS = 0, 3, 6, 9, 12
 HEADING_BIAS, DEPTH_BIAS, DVL_SCALE, DVL_ANGLE, DVL_BIAS, GPS_BIAS, WATER = (

@@ -22,8 +22,8 @@ import numpy as np
 
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.dynamics import GRAVITY
-from alice_survey.sim.vehicle.hull import POINT, Hull
+from alice_survey.sim.vehicle.hydrodynamics.geometry import POINT, Hull
+from alice_survey.sim.vehicle.sea import GRAVITY
 
 Place = tuple[float, float, float]
 

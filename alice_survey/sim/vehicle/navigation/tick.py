@@ -12,11 +12,9 @@ import math
 
 import numpy as np
 
+from alice_survey.core.compiled import kernel
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import estimate_vector as vector
-from alice_survey.sim.vehicle.compiled import kernel
-from alice_survey.sim.vehicle.dynamics import GRAVITY
-from alice_survey.sim.vehicle.floor import FloorGrid, floor_range
 from alice_survey.sim.vehicle.navigation.filter import (
     ACCELEROMETER_BIAS,
     ALTITUDE_NOW,
@@ -101,6 +99,7 @@ from alice_survey.sim.vehicle.rotations import (
     turn_between,
     wrapped,
 )
+from alice_survey.sim.vehicle.sea import GRAVITY, FloorGrid, floor_range
 
 LOG_COLUMNS = (
     "north_m", "east_m", "depth_m", "roll_rad", "pitch_rad", "heading_rad",

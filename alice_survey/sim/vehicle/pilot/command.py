@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from alice_survey.core.compiled import kernel
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import estimate_vector as vector
@@ -16,8 +17,13 @@ from alice_survey.sim.vehicle.allocation import (
     allocation_scratch,
     preference_weights,
 )
-from alice_survey.sim.vehicle.compiled import kernel
 from alice_survey.sim.vehicle.fins import MAX_RAD, Fins, write_fin_matrix
+from alice_survey.sim.vehicle.pilot.failures import (
+    FoundFailure,
+    NavigatedStretch,
+    ThrusterWatch,
+    ThrustWatch,
+)
 from alice_survey.sim.vehicle.pilot.gains import INNER, SWAY, Gains
 from alice_survey.sim.vehicle.pilot.guidance import steer
 from alice_survey.sim.vehicle.pilot.memory import (
@@ -34,8 +40,6 @@ from alice_survey.sim.vehicle.pilot.mission import NO_MISSION
 from alice_survey.sim.vehicle.pilot.path import Path
 from alice_survey.sim.vehicle.pilot.safety import THRUSTER_LOST
 from alice_survey.sim.vehicle.pilot.settings import Guidance
-from alice_survey.sim.vehicle.pilot.thrust_watch import NavigatedStretch, ThrustWatch
-from alice_survey.sim.vehicle.pilot.thruster_watch import FoundFailure, ThrusterWatch
 from alice_survey.sim.vehicle.propulsion import Propulsion, speeds_for, thrust_limits
 from alice_survey.sim.vehicle.vehicle import Vehicle
 

@@ -40,26 +40,90 @@ their drives are fast: omega is so low that an error of KEPT_RAD takes no more t
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.allocation import AXIS_WEIGHTS, LEVEL_WEIGHTS
-from alice_survey.sim.vehicle.dynamics import Body
-from alice_survey.sim.vehicle.fins import MAX_RAD, Fins, fin_slope, write_fin_matrix
-from alice_survey.sim.vehicle.pilot.linear import (
-    LATERAL,
-    NO_FINS,
-    VERTICAL,
-    coupled_pair,
-    linear_damping,
-    mode_damping,
-)
+from alice_survey.sim.vehicle.dynamics import Body, coriolis_matrix
+from alice_survey.sim.vehicle.fins import MAX_RAD, Fins, fin_slope, pack_fins, write_fin_matrix
 from alice_survey.sim.vehicle.propulsion import thrust_limits
-from alice_survey.sim.vehicle.under_way import keeps, min_radius_m
+from alice_survey.sim.vehicle.steady import keeps, min_radius_m
 from alice_survey.sim.vehicle.vehicle import Vehicle
+
+LATERAL, VERTICAL = (1, 5), (2, 4)
+"""Degrees of freedom that a turn couples: sway and yaw, heave and pitch."""
+NO_FINS = pack_fins((), 0.0)
+_AT_REST_PER_S = 1e-9
+"""Poles nearer to 0 do not move."""
+
+
+def coupled_pair(
+    body: Body, speed_mps: float, fins: Fins = NO_FINS, plane: tuple[int, int] = LATERAL
+) -> tuple[Array, Array]:
+    """Sway and yaw rate under way: (v, r)' = A (v, r) + b moment; or heave and pitch rate.
+
+    Args:
+        body: body of the vehicle.
+        speed_mps: surge; without drift or turning.
+        fins: of the vehicle, not turned.
+        plane: `LATERAL` or `VERTICAL`.
+
+    Returns:
+        (2, 2) and (2,)
+    """
+    nu = np.array([speed_mps, 0.0, 0.0, 0.0, 0.0, 0.0])
+    both = np.ix_(plane, plane)
+    inverse = np.linalg.inv(body.mass[both])
+    slope = linear_damping(body, nu) + linear_coriolis(body, nu)
+    if len(fins.surfaces):
+        slope = slope + fin_slope(fins, nu)
+    pair: Array = -inverse @ slope[both]
+    return pair, np.array(inverse[:, 1], np.float64)
+
+
+def damping_ratio(loop: Array) -> float:
+    """Least damping ratio of a state matrix's modes; negative if one grows."""
+    return float(mode_damping(np.linalg.eigvals(loop)).min())
+
+
+def mode_damping(poles: NDArray[Any]) -> Array:
+    """Damping ratio of each pole; 1 of one at rest: a sway that no water damps is its own loop's.
+
+    Args:
+        poles: complex.
+    """
+    size = np.abs(poles)
+    return np.where(size > _AT_REST_PER_S, -poles.real / np.maximum(size, _AT_REST_PER_S), 1.0)
+
+
+def linear_damping(body: Body, nu: Array) -> Array:
+    """(6, 6) slope of damping and body lift by velocity at a velocity (6,)."""
+    quadratic = np.where(np.asarray(nu) > 0.0, body.quadratic, body.quadratic_back)
+    slope = -(body.linear + 2.0 * quadratic * np.abs(nu))
+    u, v, w = nu[0], nu[1], nu[2]
+    y_uv, z_uw, m_uw, n_uv = body.lift
+    slope[1, [0, 1]] -= y_uv * np.sign(u) * v, y_uv * abs(u)
+    slope[2, [0, 2]] -= z_uw * np.sign(u) * w, z_uw * abs(u)
+    slope[4, [0, 2]] -= m_uw * w, m_uw * u
+    slope[5, [0, 1]] -= n_uv * v, n_uv * u
+    result: Array = slope
+    return result
+
+
+def linear_coriolis(body: Body, nu: Array) -> Array:
+    """(6, 6) slope of C(nu) nu by velocity at a velocity (6,).
+
+    C(a) b is bilinear, so that the slope's column j is C(e_j) nu + C(nu) e_j.
+    """
+    slope = coriolis_matrix(body.mass, nu)
+    columns = [coriolis_matrix(body.mass, unit) @ nu for unit in np.eye(6)]
+    result: Array = slope + np.array(columns).T
+    return result
+
 
 SURGE, SWAY, HEAVE, YAW, ROLL, PITCH = range(6)
 """Rows of `Gains.axes`."""
@@ -483,3 +547,57 @@ def _steady_speed(body: Body, degree: int, force: float) -> float:
     if quadratic <= 0.0:
         return force / linear if linear > 0.0 else math.inf
     return float((math.sqrt(linear**2 + 4.0 * quadratic * force) - linear) / (2.0 * quadratic))
+
+
+_VERTICAL = [2, 4]
+_MAX_MPS = 5.0
+_STEP_MPS = 0.02
+_GROWS_PER_S = 1e-6
+"""Growth beyond rounding errors."""
+
+
+def pitch_matrix(vehicle: Vehicle, speed_mps: float) -> Array:
+    """State matrix of heave w, pitch rate q and pitch about level flight at a held surge.
+
+    The Munk moment of the added masses grows with the square of the speed and turns a hull that
+    pitches further; the low centre of gravity turns it back (Fossen 2011, sections 6.3 and 7.5).
+
+    Args:
+        vehicle: level when at rest, with all thrusters steady.
+        speed_mps: surge.
+
+    Returns:
+        (3, 3)
+    """
+    body = vehicle.plant.body
+    nu = np.array([speed_mps, 0.0, 0.0, 0.0, 0.0, 0.0])
+    pair = np.ix_(_VERTICAL, _VERTICAL)
+    inverse = np.linalg.inv(body.mass[pair])
+    matrix = np.zeros((3, 3))
+    matrix[:2, :2] = -inverse @ (linear_damping(body, nu) + linear_coriolis(body, nu))[pair]
+    matrix[:2, 2] = -inverse[:, 1] * body.weight_n * body.cg[2]
+    matrix[2, 1] = 1.0
+    return matrix
+
+
+def pitch_divergence_speed_mps(vehicle: Vehicle) -> float:
+    """The lowest speed above which a pitch grows, by bisection; infinite if none up to 5 m/s.
+
+    Args:
+        vehicle: as in `pitch_matrix`.
+    """
+
+    def grows(speed_mps: float) -> bool:
+        growth = np.linalg.eigvals(pitch_matrix(vehicle, speed_mps)).real.max()
+        return bool(growth > _GROWS_PER_S)
+
+    high = _STEP_MPS
+    while not grows(high):
+        high += _STEP_MPS
+        if high > _MAX_MPS:
+            return math.inf
+    low = high - _STEP_MPS
+    while high - low > 1e-6:
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if grows(middle) else (middle, high)
+    return high

@@ -14,9 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from alice_survey.core.compiled import kernel
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.compiled import kernel
 
 _GAP_M = 1e-3
 _KINK_RAD = 1e-3

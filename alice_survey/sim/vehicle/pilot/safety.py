@@ -3,8 +3,8 @@
 import math
 from typing import NamedTuple
 
+from alice_survey.core.compiled import kernel
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.compiled import kernel
 from alice_survey.sim.vehicle.estimate_vector import ALTITUDE, CLEARANCE, DEPTH, ESTIMATE, PITCH
 from alice_survey.sim.vehicle.pilot.memory import (
     APPROACH,

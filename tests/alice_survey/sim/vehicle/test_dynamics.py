@@ -11,7 +11,6 @@ from hypothesis.extra.numpy import arrays
 
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.dynamics import (
-    GRAVITY,
     STATE,
     add_coriolis,
     add_damping,
@@ -19,6 +18,7 @@ from alice_survey.sim.vehicle.dynamics import (
     initial_state,
 )
 from alice_survey.sim.vehicle.files import SETS
+from alice_survey.sim.vehicle.sea import GRAVITY
 from alice_survey.sim.vehicle.vehicle import Vehicle
 from tests import oracles_dynamics as oracle
 from tests.alice_survey.sim.vehicle.motions import (

@@ -5,8 +5,8 @@ import pytest
 
 from alice_survey.core.errors import VehicleError
 from alice_survey.sim.vehicle import files
-from alice_survey.sim.vehicle.dynamics import GRAVITY
 from alice_survey.sim.vehicle.files import GEOMETRIES, SETS, vehicle_from
+from alice_survey.sim.vehicle.sea import GRAVITY
 
 NAMES = ("alice", "sparus2")
 STARBOARD, PORT, VERTICAL, BOW, STERN = range(5)

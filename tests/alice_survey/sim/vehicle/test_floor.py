@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.floor import FloorGrid, floor_depth, floor_range, level_floor
+from alice_survey.sim.vehicle.sea import FloorGrid, floor_depth, floor_range, level_floor
 
 
 def tilted(at_origin: float, per_north: float, per_east: float) -> FloorGrid:

@@ -8,9 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from alice_survey.core.errors import VehicleError
-from alice_survey.sim.vehicle.dynamics import GRAVITY
-from alice_survey.sim.vehicle.sea import Current, constant_current, current_at
-from alice_survey.sim.vehicle.swell import orbital_speed_mps, wave_number, with_swell
+from alice_survey.sim.vehicle.sea import (
+    GRAVITY,
+    Current,
+    constant_current,
+    current_at,
+    orbital_speed_mps,
+    wave_number,
+    with_swell,
+)
 
 
 def at(current: Current, time_s: float, depth_m: float) -> np.ndarray:

@@ -17,19 +17,21 @@ from alice_survey.core.errors import VehicleError
 from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.identification.report import IdentifyOptions, identify_report
 from alice_survey.sim.vehicle.pilot import gains as g
-from alice_survey.sim.vehicle.pilot.diving import UnderWay, circle_course, dive_loop
 from alice_survey.sim.vehicle.pilot.gains import (
+    LATERAL,
+    VERTICAL,
+    damping_ratio,
     gains_for,
     heading_loop,
 )
-from alice_survey.sim.vehicle.pilot.linear import LATERAL, VERTICAL, damping_ratio
-from alice_survey.sim.vehicle.steady import steady_flight
-from alice_survey.sim.vehicle.under_way import (
+from alice_survey.sim.vehicle.pilot.settings import UnderWay, circle_course, dive_loop
+from alice_survey.sim.vehicle.steady import (
     MAX_DRIFT_RAD,
     held,
     keeps,
     min_radius_m,
     min_speed_mps,
+    steady_flight,
 )
 from tests import oracles_dynamics as oracle
 from tests.alice_survey.sim.vehicle.motions import STILL

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from alice_survey.core.errors import VehicleError
-from alice_survey.sim.vehicle.hydrodynamics.entrained import entrained_water
 from alice_survey.sim.vehicle.hydrodynamics.geometry import (
     ALICE,
     SHELL_M,
@@ -14,6 +13,7 @@ from alice_survey.sim.vehicle.hydrodynamics.geometry import (
     T200_LENGTH_M,
     Geometry,
     Outline,
+    entrained_water,
     farthest_tunnel_x,
 )
 

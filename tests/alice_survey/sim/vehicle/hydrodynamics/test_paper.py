@@ -20,13 +20,11 @@ from alice_survey.sim.vehicle.hydrodynamics.paper_tables import (
     TABLE_IV,
     TABLE_V,
     TABLES,
-)
-from alice_survey.sim.vehicle.hydrodynamics.parts import estimate
-from alice_survey.sim.vehicle.hydrodynamics.report import (
     CoefficientRow,
     coefficient_rows,
     coefficients_report,
 )
+from alice_survey.sim.vehicle.hydrodynamics.parts import estimate
 
 ROWS = coefficient_rows()
 

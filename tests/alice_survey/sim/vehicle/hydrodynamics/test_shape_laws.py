@@ -7,22 +7,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from alice_survey.sim.vehicle.hydrodynamics import added_mass, drag, parts
+from alice_survey.sim.vehicle.hydrodynamics import parts
 from tests.oracles_hydrodynamics import finned_circle, lamb_constants
 
 RHO = 1025.0
 
 
 def test_a_sphere_drags_half_of_its_displaced_mass() -> None:
-    assert added_mass.alpha_0(0.3, 0.3) == pytest.approx(2.0 / 3.0, rel=1e-12)
+    assert parts.alpha_0(0.3, 0.3) == pytest.approx(2.0 / 3.0, rel=1e-12)
     displaced = RHO * math.pi * 0.3**3 / 6.0
-    assert added_mass.ellipsoid_mass(0.3, 0.3, RHO) == pytest.approx(displaced, rel=1e-13)
-    assert added_mass.ellipsoid_axial(0.3, 0.3, RHO) == pytest.approx(displaced / 2.0, rel=1e-12)
+    assert parts.ellipsoid_mass(0.3, 0.3, RHO) == pytest.approx(displaced, rel=1e-13)
+    assert parts.ellipsoid_axial(0.3, 0.3, RHO) == pytest.approx(displaced / 2.0, rel=1e-12)
 
 
 @pytest.mark.parametrize("fineness", [1.0 + 1e-9, 1.0000004, 1.000001, 1.01, 2.0, 8.52, 60.0])
 def test_alpha_0_is_lambs_integral(fineness: float) -> None:
-    assert added_mass.alpha_0(fineness, 1.0) == pytest.approx(
+    assert parts.alpha_0(fineness, 1.0) == pytest.approx(
         lamb_constants(fineness, 1.0)[0], rel=1e-6 if fineness < 1.01 else 1e-9
     )
 
@@ -30,32 +30,30 @@ def test_alpha_0_is_lambs_integral(fineness: float) -> None:
 def test_a_needle_drags_nothing_along_its_axis() -> None:
     """k_1 -> (d / l)^2 (ln(2 l / d) - 1) of a slender spheroid."""
     for fineness in (200.0, 2000.0):
-        k_1 = added_mass.ellipsoid_axial(fineness, 1.0, RHO) / added_mass.ellipsoid_mass(
-            fineness, 1.0, RHO
-        )
+        k_1 = parts.ellipsoid_axial(fineness, 1.0, RHO) / parts.ellipsoid_mass(fineness, 1.0, RHO)
         slender = (math.log(2.0 * fineness) - 1.0) / fineness**2
         assert k_1 == pytest.approx(slender, rel=10.0 / fineness)
 
 
 def test_sections_by_hand() -> None:
     np.testing.assert_allclose(
-        added_mass.circle_section(np.array([0.0, 0.115]), RHO), [0, RHO * math.pi * 0.115**2]
+        parts.circle_section(np.array([0.0, 0.115]), RHO), [0, RHO * math.pi * 0.115**2]
     )
     # An elliptic section of equal axes is a circle.
-    assert added_mass.elliptic_section(0.23, RHO) == pytest.approx(
-        float(added_mass.circle_section(np.array(0.115), RHO)), rel=1e-13
+    assert parts.elliptic_section(0.23, RHO) == pytest.approx(
+        float(parts.circle_section(np.array(0.115), RHO)), rel=1e-13
     )
 
 
 @given(radius=st.floats(0.02, 0.2), extra=st.floats(1e-3, 3.0))
 def test_finned_circles_between_circle_and_plate(radius: float, extra: float) -> None:
     span = radius * (1.0 + extra)
-    finned = float(added_mass.finned_circle_section(np.array(radius), span, RHO))
-    circle = float(added_mass.circle_section(np.array(radius), RHO))
+    finned = float(parts.finned_circle_section(np.array(radius), span, RHO))
+    circle = float(parts.circle_section(np.array(radius), RHO))
     plate = RHO * math.pi * span**2
     assert circle < finned < plate
-    roll = float(added_mass.finned_circle_roll(np.array(radius), span, RHO))
-    wider = float(added_mass.finned_circle_roll(np.array(radius), 1.01 * span, RHO))
+    roll = float(parts.finned_circle_roll(np.array(radius), span, RHO))
+    wider = float(parts.finned_circle_roll(np.array(radius), 1.01 * span, RHO))
     assert 0 < roll < wider
 
 
@@ -64,16 +62,16 @@ def test_finned_circles_agree_with_a_conformal_map(extra: float) -> None:
     radius, span = 0.115, 0.115 * (1.0 + extra)
     across, rolling = finned_circle(radius, span, RHO)
     r = np.array(radius)
-    assert float(added_mass.finned_circle_section(r, span, RHO)) == pytest.approx(across, rel=1e-4)
-    assert float(added_mass.finned_circle_roll(r, span, RHO)) == pytest.approx(rolling, rel=1e-3)
+    assert float(parts.finned_circle_section(r, span, RHO)) == pytest.approx(across, rel=1e-4)
+    assert float(parts.finned_circle_roll(r, span, RHO)) == pytest.approx(rolling, rel=1e-3)
 
 
 def test_without_fins_a_finned_circle_is_a_circle() -> None:
     r = np.array([0.115])
     np.testing.assert_allclose(
-        added_mass.finned_circle_section(r, 0.115, RHO), added_mass.circle_section(r, RHO)
+        parts.finned_circle_section(r, 0.115, RHO), parts.circle_section(r, RHO)
     )
-    np.testing.assert_allclose(added_mass.finned_circle_roll(r, 0.115, RHO), 0.0, atol=1e-12)
+    np.testing.assert_allclose(parts.finned_circle_roll(r, 0.115, RHO), 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -82,31 +80,31 @@ def test_without_fins_a_finned_circle_is_a_circle() -> None:
     [(1e5, 8.333e-3), (1e6, 4.688e-3), (1e7, 3.000e-3), (1e8, 2.083e-3), (1e9, 1.531e-3)],
 )
 def test_ittc57_is_the_published_line(reynolds: float, friction: float) -> None:
-    assert drag.ittc57(reynolds) == pytest.approx(friction, rel=4e-4)
+    assert parts.ittc57(reynolds) == pytest.approx(friction, rel=4e-4)
 
 
 def test_ellipsoid_drag_by_hand() -> None:
     """d / l = 1/4, C_f = 0.005: 0.11 + 0.08 + 0.01."""
-    assert drag.ellipsoid_axial(2.0, 0.5, 0.005) == pytest.approx(0.20, rel=1e-12)
+    assert parts.ellipsoid_drag(2.0, 0.5, 0.005) == pytest.approx(0.20, rel=1e-12)
 
 
 def test_cylinder_across_by_hand_and_at_its_ends() -> None:
-    assert drag.cylinder_across(10.0) == pytest.approx(1.2 * 0.75, rel=1e-12)
-    assert drag.cylinder_across(1.0) == pytest.approx(1.2 * 0.58, rel=1e-12)
-    assert drag.cylinder_across(1e4) == 1.2
+    assert parts.cylinder_across(10.0) == pytest.approx(1.2 * 0.75, rel=1e-12)
+    assert parts.cylinder_across(1.0) == pytest.approx(1.2 * 0.58, rel=1e-12)
+    assert parts.cylinder_across(1e4) == 1.2
     # The two branches meet within a per cent.
-    assert drag.cylinder_across(57.49) == pytest.approx(1.2, rel=0.01)
+    assert parts.cylinder_across(57.49) == pytest.approx(1.2, rel=0.01)
 
 
 def test_plates_of_hoerner() -> None:
     """1.17 of a square within his scatter, growing towards the 2 of an endless plate."""
-    assert 1.10 < drag.plate_across(1.0) < 1.20
-    assert drag.plate_across(4.0) == drag.plate_across(0.25)
-    assert 1.6 < drag.plate_across(30.0) < 2.0
+    assert 1.10 < parts.plate_across(1.0) < 1.20
+    assert parts.plate_across(4.0) == parts.plate_across(0.25)
+    assert 1.6 < parts.plate_across(30.0) < 2.0
 
 
 def test_struts_lie_between_a_plate_edge_on_and_a_cylinder() -> None:
-    thin, round_ = drag.strut_along(1.0, 1e-3, 1e5), drag.strut_along(0.1, 0.1, 3e4)
+    thin, round_ = parts.strut_along(1.0, 1e-3, 1e5), parts.strut_along(0.1, 0.1, 3e4)
     friction = 1.328 / math.sqrt(1e5)
     assert thin * 1e-3 == pytest.approx(2.0 * friction, rel=2e-3)  # by its plan area, both sides
     assert 1.0 < round_ < 1.3
@@ -114,7 +112,7 @@ def test_struts_lie_between_a_plate_edge_on_and_a_cylinder() -> None:
 
 def test_tunnels_cost_little() -> None:
     """C_D by the tunnel's section is 8 C_BTO: 0.1 at most (Holtrop and Mennen)."""
-    area = drag.tunnel_area(0.08)
+    area = parts.tunnel_area(0.08)
     assert area / (math.pi / 4.0 * 0.08**2) == pytest.approx(8.0 * 0.012, rel=1e-12)
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from alice_survey.core.errors import VehicleError
 from alice_survey.sim.vehicle.files import vehicle_from
-from alice_survey.sim.vehicle.identification.bollard import fit_pulls, read_pulls, with_thrust
+from alice_survey.sim.vehicle.identification.two_step import fit_pulls, read_pulls, with_thrust
 from alice_survey.sim.vehicle.propulsion import add_thrust
 
 KNOWN = vehicle_from("alice")

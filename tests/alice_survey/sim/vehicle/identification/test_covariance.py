@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.identification.covariance import (
+from alice_survey.sim.vehicle.identification.output_error import (
     Stretches,
     design_effect,
     in_stretches,

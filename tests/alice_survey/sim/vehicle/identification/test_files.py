@@ -17,9 +17,8 @@ from alice_survey.sim.vehicle.files import (
     vehicle_from_file,
     write_coefficients,
 )
-from alice_survey.sim.vehicle.identification.foreign import read_column_map, read_foreign_log
 from alice_survey.sim.vehicle.identification.windows import inputs, make_windows
-from alice_survey.sim.vehicle.log import vehicle_log
+from alice_survey.sim.vehicle.log import read_column_map, read_foreign_log, vehicle_log
 
 HERE = Path(__file__).parent
 SMALL = """

@@ -7,9 +7,14 @@ import pytest
 
 from alice_survey.core.errors import VehicleError
 from alice_survey.sim.vehicle.files import vehicle_from
-from alice_survey.sim.vehicle.identification.output_error import Simulation, fit_output_error
+from alice_survey.sim.vehicle.identification.output_error import (
+    PriorSigmas,
+    Simulation,
+    fit_output_error,
+    prior_of,
+    read_prior,
+)
 from alice_survey.sim.vehicle.identification.parameters import free_parameters
-from alice_survey.sim.vehicle.identification.prior import PriorSigmas, prior_of, read_prior
 from alice_survey.sim.vehicle.identification.windows import make_windows
 from tests.alice_survey.sim.vehicle.identification.manoeuvres import Noise, fly, hidden, measured
 

@@ -5,7 +5,7 @@ import pytest
 
 from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.identification.parameters import free_parameters
-from alice_survey.sim.vehicle.identification.validation import fit_percent, validate
+from alice_survey.sim.vehicle.identification.report import fit_percent, validate
 from alice_survey.sim.vehicle.identification.windows import make_windows
 from tests.alice_survey.sim.vehicle.identification.manoeuvres import fly, hidden
 

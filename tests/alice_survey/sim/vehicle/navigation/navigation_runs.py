@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from alice_survey.sim.vehicle.compiled import kernel
+from alice_survey.core.compiled import kernel
 from alice_survey.sim.vehicle.estimate_vector import ESTIMATE
-from alice_survey.sim.vehicle.floor import FloorGrid
 from alice_survey.sim.vehicle.navigation.filter import (
     GYRO_BIAS,
     WATER,
@@ -17,6 +16,7 @@ from alice_survey.sim.vehicle.navigation.filter import (
 )
 from alice_survey.sim.vehicle.navigation.sensors import IMU, Sensors
 from alice_survey.sim.vehicle.navigation.tick import LOG_ROW, log_row, navigation_tick
+from alice_survey.sim.vehicle.sea import FloorGrid
 
 Array = NDArray[np.float64]
 TICK_S = 0.05

@@ -8,9 +8,9 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from alice_survey.sim.vehicle.floor import FloorGrid, level_floor
 from alice_survey.sim.vehicle.navigation.sensors import FOLLOWED, DvlSpec, SensorSuite, UsblSpec
 from alice_survey.sim.vehicle.navigation.tick import LOG_COLUMNS
+from alice_survey.sim.vehicle.sea import FloorGrid, level_floor
 from tests.alice_survey.sim.vehicle.navigation.navigation_runs import (
     Array,
     Run,

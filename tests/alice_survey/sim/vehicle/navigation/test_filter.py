@@ -7,7 +7,6 @@ import pytest
 from numpy.random import default_rng
 
 from alice_survey.sim.vehicle import rotations
-from alice_survey.sim.vehicle.floor import FloorGrid, level_floor
 from alice_survey.sim.vehicle.navigation.filter import (
     BEAM,
     BELIEVED,
@@ -58,6 +57,7 @@ from alice_survey.sim.vehicle.navigation.tick import (
     measure_imu,
     navigation_tick,
 )
+from alice_survey.sim.vehicle.sea import FloorGrid, level_floor
 from tests import oracles_navigation as oracle
 from tests.alice_survey.sim.vehicle.navigation.navigation_runs import (
     TICK_S,

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.core.errors import VehicleError
 from alice_survey.sim.vehicle import rotations
-from alice_survey.sim.vehicle.floor import FloorGrid, level_floor
 from alice_survey.sim.vehicle.navigation.filter import (
     BEAM,
     DVL_VELOCITY,
@@ -34,6 +33,7 @@ from alice_survey.sim.vehicle.navigation.sensors import (
     janus_beams,
 )
 from alice_survey.sim.vehicle.navigation.tick import measure_dvl, measure_imu, solve_beams
+from alice_survey.sim.vehicle.sea import FloorGrid, level_floor
 from tests.alice_survey.sim.vehicle.navigation.navigation_runs import (
     TICK_S,
     Array,

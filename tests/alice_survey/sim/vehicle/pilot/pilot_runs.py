@@ -8,9 +8,9 @@ from typing import Literal
 
 import numpy as np
 
+from alice_survey.core.compiled import kernel
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import estimate_vector as vector
-from alice_survey.sim.vehicle.compiled import kernel
 from alice_survey.sim.vehicle.dynamics import (
     Plant,
     Scratch,

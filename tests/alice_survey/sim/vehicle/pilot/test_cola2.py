@@ -8,15 +8,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from alice_survey.core.config import VehicleConfig
-from alice_survey.sim.vehicle.pilot.cola2 import (
+from alice_survey.sim.vehicle.pilot.gains import gains_for
+from alice_survey.sim.vehicle.pilot.mission import (
+    COLA2,
     Cola2Settings,
     aim,
     circling_m,
+    mission_of,
     steady_drift,
     timeout_s,
 )
-from alice_survey.sim.vehicle.pilot.gains import gains_for
-from alice_survey.sim.vehicle.pilot.mission import COLA2, mission_of
 from alice_survey.sim.vehicle.pilot.steps import (
     BY_ALTITUDE,
     BY_DEPTH,

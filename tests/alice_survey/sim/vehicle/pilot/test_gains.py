@@ -16,10 +16,8 @@ from alice_survey.sim.vehicle.pilot import gains as g
 from alice_survey.sim.vehicle.pilot.gains import (
     DEGREES,
     Gains,
-    gains_for,
-)
-from alice_survey.sim.vehicle.pilot.linear import (
     damping_ratio,
+    gains_for,
     linear_coriolis,
     linear_damping,
 )

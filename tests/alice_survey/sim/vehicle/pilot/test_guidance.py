@@ -15,12 +15,10 @@ from alice_survey.sim.vehicle.files import SETS, vehicle_from
 from alice_survey.sim.vehicle.pilot import gains as g
 from alice_survey.sim.vehicle.pilot import memory as slot
 from alice_survey.sim.vehicle.pilot.gains import (
+    damping_ratio,
     gains_for,
 )
 from alice_survey.sim.vehicle.pilot.guidance import steer
-from alice_survey.sim.vehicle.pilot.linear import (
-    damping_ratio,
-)
 from alice_survey.sim.vehicle.pilot.memory import PilotState, new_pilot
 from alice_survey.sim.vehicle.pilot.mission import NO_MISSION
 from alice_survey.sim.vehicle.pilot.path import Path, place_at

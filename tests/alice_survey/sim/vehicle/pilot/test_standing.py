@@ -11,7 +11,6 @@ from hypothesis.extra.numpy import arrays
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import estimate_vector as vector
-from alice_survey.sim.vehicle.limits import SPOT_RAD_S, STEP_MPS
 from alice_survey.sim.vehicle.pilot import memory as slot
 from alice_survey.sim.vehicle.pilot.gains import FASTEST, LAG, SURGE, SWAY, YAW
 from alice_survey.sim.vehicle.pilot.guidance import steer
@@ -19,11 +18,13 @@ from alice_survey.sim.vehicle.pilot.memory import new_pilot
 from alice_survey.sim.vehicle.pilot.mission import NO_MISSION
 from alice_survey.sim.vehicle.pilot.path import Path
 from alice_survey.sim.vehicle.pilot.settings import (
+    SPOT_RAD_S,
+    STEP_MPS,
     Guidance,
     pilot_guidance,
     stop_speeds,
 )
-from alice_survey.sim.vehicle.pilot.standing import STOP_M, STOP_RAD, ramp
+from alice_survey.sim.vehicle.pilot.steering import STOP_M, STOP_RAD, ramp
 from tests import oracles_guidance as oracle
 from tests.alice_survey.sim.vehicle.pilot.pilot_runs import (
     DEEPEST_M,

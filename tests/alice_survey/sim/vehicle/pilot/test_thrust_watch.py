@@ -10,8 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.files import vehicle_from
-from alice_survey.sim.vehicle.pilot.thrust_watch import FALSE_ALARM_H, NavigatedStretch, ThrustWatch
-from alice_survey.sim.vehicle.pilot.thruster_watch import WATCHED_S, FoundFailure
+from alice_survey.sim.vehicle.pilot.failures import (
+    FALSE_ALARM_H,
+    WATCHED_S,
+    FoundFailure,
+    NavigatedStretch,
+    ThrustWatch,
+)
 from alice_survey.sim.vehicle.vehicle import Vehicle
 from tests.alice_survey.sim.vehicle.identification.manoeuvres import fly, survey_like
 

@@ -7,7 +7,7 @@ import pytest
 
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.files import vehicle_from
-from alice_survey.sim.vehicle.pilot.thruster_watch import FoundFailure, ThrusterWatch
+from alice_survey.sim.vehicle.pilot.failures import FoundFailure, ThrusterWatch
 
 TICK_S = 0.05
 STRETCH = 100
