@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -214,14 +214,6 @@ class TileCounts:
             stamp=np.full(grid.shape, -1, np.int32),
         )
 
-    def copy(self) -> "TileCounts":
-        """The same counts, to go on from here in another way."""
-        return replace(
-            self,
-            **{name: getattr(self, name).copy()
-               for name in ("pictures", "lines", "pairs", "last", "stamp")},
-        )  # fmt: skip
-
     def add(self, rays: tuple[Array, Array], stations: Stations) -> None:
         """Count stations: all of one line before those of the next, and none that is blind."""
         for rows in _chunks(len(stations)):
@@ -233,16 +225,6 @@ class TileCounts:
                 self.stamp, self.pairs,
             )  # fmt: skip
             self.stations += len(which)
-
-    def return_to(self, rays: tuple[Array, Array], stations: Stations) -> None:
-        """Go back to a line that was left: what its stations have seen counts on it no more.
-
-        Args:
-            rays: as of `add`.
-            stations: of that line, all that were counted.
-        """
-        aside = replace(TileCounts.of(self.grid, len(self.pictures)), last=self.last)
-        aside.add(rays, stations)
 
     def summary(self, inside: NDArray[np.bool_]) -> TileSummary:
         """The counts of all cameras together.

@@ -107,48 +107,57 @@ def read_dive_record(
         raise NavigationError("give triggers or a manifest, not both")
     if log.is_dir():
         return _simulated(log, plan, rig, triggers)
-    nav = _read_log(log)
+    nav = _located(log, read_navigation(log, find_zone("UTC"), ()))
     if manifest is not None:
-        when = _triggers_of_manifest(manifest, rig)
-    elif triggers is not None:
-        when = read_triggers(triggers, nav)
-    else:
-        span_s = float(nav.time_s[-1] - nav.time_s[0])
-        if not span_s <= _MAX_TRIGGERS * plan.interval_s:
-            raise NavigationError(
-                f"{log}: spans {span_s:.3g} s, over {_MAX_TRIGGERS} pictures every "
-                f"{plan.interval_s:.3g} s: check its times, or give the triggers"
-            )
-        times = plan_triggers(nav.time_s[0], nav.time_s[-1], plan.interval_s)
-        when = Triggers(
-            source=f"the plan's interval, {plan.interval_s:.3g} s, from the start of the log",
-            time_s=times,
-            line=None,
-        )
-    return _logged(log, nav, when, plan, rig)
+        return _logged(log, nav, _triggers_of_manifest(manifest, rig), plan, rig)
+    if triggers is not None:
+        return _logged(log, nav, read_triggers(triggers, nav), plan, rig)
+    return record_of_log(log, nav, plan, rig)
 
 
-def plan_triggers(start_s: float, end_s: float, interval_s: float, first: int = 0) -> Array:
-    """Times, (N,), of the pictures every interval from a start on, before an end.
+def read_growing_log(path: Path) -> NavigationLog:
+    """The rows with positions of a log that is being written: its last row may not be whole.
+
+    Raises:
+        NavigationError: as `read_dive_record`.
+    """
+    return _located(path, read_navigation(path, find_zone("UTC"), (), is_growing=True))
+
+
+def record_of_log(path: Path, nav: NavigationLog, plan: Plan, rig: Rig) -> DiveRecord:
+    """Where the pictures of a dive were taken, at the plan's interval from the log's start on.
 
     Args:
-        start_s: time of picture 0.
-        end_s: none at or after it.
-        interval_s: between pictures.
-        first: number of the first picture of those wanted.
+        path: of the log, for what is reported.
+        nav: its rows with positions.
+        plan: what was to be flown.
+        rig: the cameras.
+
+    Raises:
+        NavigationError: the log spans too long, or is of another place.
     """
-    last = max(first, math.ceil((end_s - start_s) / interval_s) + 1)
-    times: Array = start_s + interval_s * np.arange(first, last, dtype=np.float64)
-    return times[times < end_s]
+    start_s, end_s, interval_s = float(nav.time_s[0]), float(nav.time_s[-1]), plan.interval_s
+    if not end_s - start_s <= _MAX_TRIGGERS * interval_s:
+        raise NavigationError(
+            f"{path}: spans {end_s - start_s:.3g} s, over {_MAX_TRIGGERS} pictures every "
+            f"{interval_s:.3g} s: check its times, or give the triggers"
+        )
+    count = math.ceil((end_s - start_s) / interval_s) + 1
+    time_s = start_s + interval_s * np.arange(count, dtype=np.float64)
+    when = Triggers(
+        source=f"the plan's interval, {interval_s:.3g} s, from the start of the log",
+        time_s=time_s[time_s < end_s],
+        line=None,
+    )
+    return _logged(path, nav, when, plan, rig)
 
 
-def _read_log(path: Path) -> NavigationLog:
+def _located(path: Path, nav: NavigationLog) -> NavigationLog:
     """The rows with positions of a log that spans some time.
 
     Raises:
-        NavigationError: it cannot be used, holds no positions, or has one row.
+        NavigationError: it holds no positions, or has one row.
     """
-    nav = read_navigation(path, find_zone("UTC"), ())
     nothing = np.full(len(nav.time_s), np.nan)
     located = np.isfinite(sum(nav.columns.get(name, nothing) for name in POSITION[:2]))
     if not located.any():
@@ -235,7 +244,9 @@ def _triggers_of_manifest(path: Path, rig: Rig) -> Triggers:
 
 def _simulated(folder: Path, plan: Plan, rig: Rig, triggers: Path | None) -> DiveRecord:
     """The true stations of a simulated flight; the altitude is what its DVL measured."""
-    nav = _read_log(folder / "navigation.csv")
+    nav = _located(
+        folder / "navigation.csv", read_navigation(folder / "navigation.csv", find_zone("UTC"), ())
+    )
     when = read_triggers(triggers or folder / "triggers.csv", nav)
     truth = folder / "truth" / "track.csv"
     if not truth.is_file():
@@ -290,11 +301,11 @@ def _logged(path: Path, nav: NavigationLog, triggers: Triggers, plan: Plan, rig:
         ned = plan.datum.ned_from_geodetic(np.column_stack([*places, np.zeros(len(nav.time_s))]))
         return _courses(nav.time_s, ned[:, :2], time_s[unknown], plan)
 
-    attitude, assumed = attitude_of(at, courses)
+    attitude, assumed = _attitude_of(at, courses)
     glass_ned = glass_places(at, attitude, plan, rig)
-    altitude, unknown = altitude_of(at, glass_ned[:, 2], plan)
+    altitude, unknown = _altitude_of(at, glass_ned[:, 2], plan)
     assumed["no_altitude"] = unknown
-    notes = notes_of(assumed, len(kept), plan)
+    notes = _notes_of(assumed, len(kept), plan)
     stations = Stations(
         glass_ne=glass_ned[:, :2],
         altitude_m=altitude,
@@ -303,7 +314,7 @@ def _logged(path: Path, nav: NavigationLog, triggers: Triggers, plan: Plan, rig:
         time_s=time_s,
     )
     _check_place(path, plan, stations)
-    high, below = too_high(stations.altitude_m, plan), stations.altitude_m <= 0
+    high, below = _too_high(stations.altitude_m, plan), stations.altitude_m <= 0
     stations = stations.some(~(high | below))
     if triggers.line is None:
         stations = replace(stations, line=assign_lines(stations, plan))
@@ -329,7 +340,7 @@ def _logged(path: Path, nav: NavigationLog, triggers: Triggers, plan: Plan, rig:
     return record
 
 
-def attitude_of(
+def _attitude_of(
     at: Mapping[str, Array], courses: Callable[[NDArray[np.bool_]], Array]
 ) -> tuple[Array, dict[str, int]]:
     """Roll, pitch, heading, (S, 3) radians; level, and along the track, where they are unknown.
@@ -363,20 +374,20 @@ def glass_places(at: Mapping[str, Array], attitude: Array, plan: Plan, rig: Rig)
     return glass_ned
 
 
-def altitude_of(at: Mapping[str, Array], glass_depth_m: Array, plan: Plan) -> tuple[Array, int]:
+def _altitude_of(at: Mapping[str, Array], glass_depth_m: Array, plan: Plan) -> tuple[Array, int]:
     """Altitude, (S,), from the plan's sea floor where the log has none; and how often that is."""
     unknown = ~np.isfinite(at["altitude_m"])
     altitude: Array = np.where(unknown, plan.seafloor_depth_m - glass_depth_m, at["altitude_m"])
     return altitude, int(unknown.sum())
 
 
-def too_high(altitude_m: Array, plan: Plan) -> NDArray[np.bool_]:
+def _too_high(altitude_m: Array, plan: Plan) -> NDArray[np.bool_]:
     """(S,) whether pictures from altitudes are too coarse to count."""
     high: NDArray[np.bool_] = altitude_m > MAX_ALTITUDES * plan.altitude_m
     return high
 
 
-def notes_of(assumed: Mapping[str, int], stations: int, plan: Plan) -> tuple[str, ...]:
+def _notes_of(assumed: Mapping[str, int], stations: int, plan: Plan) -> tuple[str, ...]:
     """What was assumed of stations, in words."""
     texts = {
         "no_tilt": "stations have no roll and pitch: taken as level",
@@ -446,7 +457,7 @@ def assign_lines(stations: Stations, plan: Plan) -> NDArray[np.intp]:
     three pictures or more on one course without a pause count as separate lines, numbered on
     from the plan's; the rest is -1: seen, but on no line.
     """
-    line = planned_lines(stations, plan)
+    line = _planned_lines(stations, plan)
     runs = _runs(line, stations, RUN_STEPS * plan.station_spacing_m)
     long = [run for run in runs if len(run) >= MIN_RUN]
     for number, run in enumerate(long, len(plan.lines)):
@@ -454,7 +465,7 @@ def assign_lines(stations: Stations, plan: Plan) -> NDArray[np.intp]:
     return line
 
 
-def planned_lines(stations: Stations, plan: Plan) -> NDArray[np.intp]:
+def _planned_lines(stations: Stations, plan: Plan) -> NDArray[np.intp]:
     """The plan's line of each station, (S,), as of `assign_lines`; -1 of none."""
     line = np.full(len(stations), -1, dtype=np.intp)
     nearest_m = np.full(len(stations), plan.line_spacing_m / 2 + 1e-9)

@@ -19,10 +19,8 @@ from missions.coverage.geofiles import write_coverage_tif, write_outlines
 from missions.coverage.holes import Hole, find_holes
 from missions.coverage.stations import plan_pattern, stations_of_plan
 from missions.exports.write import counted
-from missions.fly.refly import refly_plan, to_see, write_refly
+from missions.fly.refly import holes_plan, write_refly
 from missions.plan.strength import survey_costs
-from missions.route.energy import craft_of, usable_wh
-from missions.route.flyable import without_stops
 from missions.values.plan_file import Plan, read_plan
 
 _LISTED = 20
@@ -174,15 +172,8 @@ def check_report(
     text = _check_text(check)
     if check.holes:
         try:
-            plan = refly_plan(
-                check.plan,
-                check.rig,
-                to_see(check.plan.area, check.flown, check.holes),
-                check.flown.pattern,
-                name=f"{check.plan.name} holes",
-                costs=survey_costs(config),
-                settings=without_stops(config.plan, craft_of(config.vehicle)),
-                usable_wh=usable_wh(config.vehicle),
+            plan = holes_plan(
+                check.plan, check.rig, check.flown, check.holes, config, survey_costs(config)
             )
         except PlanError as error:
             warn(f"the holes cannot be planned again: {error}")

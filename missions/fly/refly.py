@@ -13,7 +13,7 @@ import shapely
 from shapely.geometry import MultiPolygon
 
 from alice_survey.core.artefacts import Stage, run_stage, write_json
-from alice_survey.core.config import CameraConfig, PlanConfig, WaterConfig
+from alice_survey.core.config import CameraConfig, PlanConfig, SurveyConfig, WaterConfig
 from alice_survey.core.errors import PlanError
 from camera_calib.rig import Rig
 from missions.coverage.certificate import Certificate, certificate
@@ -24,6 +24,8 @@ from missions.exports.write import counted, write_exports
 from missions.lines.fill import lines_over
 from missions.lines.lay import ordered
 from missions.route.dives import split_dives
+from missions.route.energy import craft_of, usable_wh
+from missions.route.flyable import without_stops
 from missions.route.ways import Ways
 from missions.values.area import Area, multipolygon
 from missions.values.costs import Costs
@@ -92,6 +94,39 @@ def refly_plan(
     again = again_over(plan, multipolygon(seen), lines, dives, name)
     seen_alone = certificate(again.area, rig, stations_of_plan(again), pattern)
     return replace(again, coverage=seen_alone.share_at_overlap)
+
+
+def holes_plan(
+    plan: Plan,
+    rig: Rig,
+    seen: Certificate,
+    holes: Sequence[Hole],
+    config: SurveyConfig,
+    costs: Costs,
+) -> Plan:
+    """Plan the holes of a dive again.
+
+    Args:
+        plan: what was flown.
+        rig: the cameras.
+        seen: what the dive saw, or will have seen.
+        holes: of it.
+        config: the survey.
+        costs: what flying takes.
+
+    Raises:
+        PlanError: as `refly_plan`.
+    """
+    return refly_plan(
+        plan,
+        rig,
+        to_see(plan.area, seen, holes),
+        seen.pattern,
+        name=f"{plan.name} holes",
+        costs=costs,
+        settings=without_stops(config.plan, craft_of(config.vehicle)),
+        usable_wh=usable_wh(config.vehicle),
+    )
 
 
 def again_over(

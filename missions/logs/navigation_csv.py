@@ -139,7 +139,9 @@ def utc_date(text: str, zone: tzinfo = UTC) -> datetime:
         raise ValueError(f"{text} is not within the years 1 to 9999 in UTC") from None
 
 
-def read_navigation(path: Path, zone: tzinfo, needed: Sequence[str] = POSITION) -> NavigationLog:
+def read_navigation(
+    path: Path, zone: tzinfo, needed: Sequence[str] = POSITION, *, is_growing: bool = False
+) -> NavigationLog:
     """Read a navigation CSV: `time_s` or `time_utc`, what is needed, and any other of `COLUMNS`.
 
     A row without a finite time or a needed value, or whose time does not follow the row before, is
@@ -149,11 +151,13 @@ def read_navigation(path: Path, zone: tzinfo, needed: Sequence[str] = POSITION) 
         path: the file.
         zone: of dates that name none.
         needed: columns without which a row is of no use; with none, any one value is enough.
+        is_growing: the file is being written: leave out its last row, which may not be whole.
 
     Raises:
         NavigationError: the file cannot be read, lacks a column, or holds no usable row.
     """
     header, rows = read_csv(path, needed)
+    rows = rows[:-1] if is_growing else rows
     parser = RowParser(header, zone, needed, str(path))
     times: list[float] = []
     table: list[list[float]] = []

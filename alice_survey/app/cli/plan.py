@@ -212,22 +212,21 @@ def check(
     epilog=examples(
         "plan follow nav.csv -w reef",
         "plan follow nav.csv -w reef --every 5",
-        "plan follow udp:14600 -w reef --every 10 --json",
-        "plan follow mavlink:udpin:127.0.0.1:14550 -w reef --every 5 -o holes",
+        "plan follow nav.csv -w reef --every 5 --json -o holes",
     )
 )
 def follow(
     log: Annotated[
         str,
         typer.Argument(
-            metavar="LOG", help="Navigation CSV that grows, udp[:PORT], mavlink:URL or ros[:TOPIC]."
+            metavar="LOG", help="Navigation CSV that the vehicle's software appends to."
         ),
     ],
     workspace: Workspace = WORK,
     survey: SurveyFile = None,
     every: Annotated[
         float | None,
-        typer.Option(min=0.2, max=3600, help="s between states; once if not given."),
+        typer.Option(min=0.2, max=3600, help="Show the state again every so many seconds."),
     ] = None,
     dive: Annotated[
         int | None, typer.Option(min=1, help="Which dive of the plan; found if not given.")
@@ -240,11 +239,11 @@ def follow(
 ) -> None:
     """Follow a dive while it is flown.
 
-    What it has seen, holes behind the vehicle, time and energy left, and lines that would close the
-    holes before it comes up. The studio shows the same on a map ('studio --log').
+    Shows what it has seen, holes behind the vehicle, time and energy left, and a plan that flies
+    the holes again. The studio shows the same on a map ('studio --log').
     """
     from alice_survey.app.pipeline import settings
-    from missions.follow.session import follow_report
+    from missions.follow.dive import follow_report
 
     config = settings(workspace, survey, needed=False)
     for text, data in follow_report(workspace, config, log, every_s=every, dive=dive, out=output):

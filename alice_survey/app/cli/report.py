@@ -68,7 +68,7 @@ def studio(
         str | None,
         typer.Option(
             metavar="LOG",
-            help="Dive to follow: growing navigation CSV, udp[:PORT], mavlink:URL, ros[:TOPIC].",
+            help="Navigation CSV of a dive to follow, which grows.",
         ),
     ] = None,
 ) -> None:

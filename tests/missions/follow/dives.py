@@ -1,25 +1,26 @@
-"""Logs of dives, as text that is cut anywhere."""
+"""Logs of dives along a plan."""
 
 from pathlib import Path
 
 import numpy as np
-import shapely
 
-from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.artefacts import Stage, run_stage, write_json
 from alice_survey.core.frames import Array
-from camera_calib.rig import Rig, design_rig
-from missions.coverage.certificate import Certificate, certificate
-from missions.coverage.dive_record import read_dive_record
-from missions.coverage.growing import GrowingCoverage
-from missions.coverage.stations import Stations, plan_pattern
-from missions.follow.pictures import PictureTrack
-from missions.follow.rows import ROW, Piece
+from missions.logs.navigation_csv import READINGS
 from missions.values.plan_file import Plan
-from tests.oracles_coverage import DATUM, area_of, lawnmower, plan_of
+from tests.oracles_coverage import DATUM
 
-RIG: Rig = design_rig(CameraConfig(), WaterConfig())
-PLAN: Plan = plan_of(area_of(shapely.box(0, 0, 4, 2)), lawnmower(4.0, 2.0, 1.0, 0.46, over_m=0.5))
-CELL_M = 0.06
+ROW = ("time_s", *READINGS)
+
+
+def workspace_of(folder: Path, plan: Plan) -> Path:
+    """A workspace with a plan over an area of 6 x 4 m."""
+    stage = Stage(name="plan", version=1, settings={})
+    run_stage(folder, stage, lambda part: write_json(part / "plan.json", plan.to_json()))
+    (folder / "survey.toml").write_text(
+        "[area]\nlength_m = 6.0\nwidth_m = 4.0\nseafloor_depth_m = 15.0\n"
+    )
+    return folder
 
 
 def route_rows(
@@ -71,39 +72,3 @@ def text_of(rows: Array) -> bytes:
         for row in rows
     ]
     return ("\n".join([",".join(ROW), *lines]) + "\n").encode()
-
-
-def at_once(path: Path, plan: Plan = PLAN, cell_m: float = CELL_M) -> Certificate:
-    """The certificate of a whole log, as `plan check` has it."""
-    record = read_dive_record(path, plan, RIG)
-    return certificate(plan.area, RIG, record.stations, plan_pattern(plan, RIG), cell_m=cell_m)
-
-
-class Followed:
-    """Pictures and coverage of rows as they come."""
-
-    def __init__(self, plan: Plan = PLAN, cell_m: float = CELL_M) -> None:
-        self.track = PictureTrack(plan, RIG)
-        self.coverage = GrowingCoverage(plan.area, RIG, plan_pattern(plan, RIG), cell_m)
-        self.again = 0
-
-    def take(self, pieces: list[Piece]) -> None:
-        for piece in pieces:
-            if piece.starts:
-                self.coverage.add(self.track.begin_again())
-            new, again = self.track.add(piece.rows)
-            if again:
-                self.again += 1
-                self.coverage.restart()
-            self.coverage.add(new)
-
-    def certificate(self) -> Certificate:
-        rest: Stations = self.track.rest()
-        return self.coverage.certificate(rest)
-
-
-def same(one: Certificate, other: Certificate) -> None:
-    """Both are equal, to the cell."""
-    for name in ("pictures", "least_pictures", "least_lines", "pairs"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
-    assert one.to_json() == other.to_json()

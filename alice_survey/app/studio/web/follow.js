@@ -1,4 +1,4 @@
-/* Follow a dive: figures to read on deck, the map of what is seen, holes, and lines that close them. */
+/* Follow a dive: figures to read on deck, the map of what is seen, holes, and a plan that flies them again. */
 
 import {attempt, button, el, field, get, on, say, send, table} from "./core.js";
 import {missing} from "./missing.js";
@@ -15,11 +15,10 @@ export function tab(studio) {
   let state = null;
   let heardAt = 0;
   let fixes = [];
-  let blocks = new Map();
+  let overlay = null;
   let arrow = null;
   let drawn = {};
   let wasSilent = false;
-  let shownNumber = null;
   let isHere = false;
   let centred = false;
   let fetching = false;
@@ -49,11 +48,8 @@ export function tab(studio) {
   const profile = profileChart("Altitude over time", {high: 120});
   const holeTable = el("div", {});
   const proposalText = el("p", {}, "");
-  const minutes = el("input", {type: "number", min: "0.5", max: "6000", step: "0.5", inputmode: "decimal"});
   const format = el("select", {});
-  const accept = button("Accept and download", acceptIt, {class: "primary", disabled: true});
-  const again = el("a", {href: "/api/follow/export", download: "", hidden: true}, "Download again");
-  const upIn = el("input", {type: "number", min: "1", max: "6000", step: "1", inputmode: "decimal"});
+  const fetchIt = button("Download missions", download, {class: "primary", disabled: true});
   const more = el("div", {});
   const keep = el("input", {type: "checkbox", checked: true});
   const logs = el("select", {});
@@ -65,7 +61,7 @@ export function tab(studio) {
     el("div", {class: "buttons"}, button("Follow it", () => opened({log: logs.value})),
       button("Replay it", () => opened({log: logs.value, replay: Number(pace.value)})),
       stop),
-    el("p", {class: "note"}, "For files elsewhere and for vehicles: alice-survey studio --log nav.csv, udp:14600, mavlink:udpin:127.0.0.1:14550 or ros."));
+    el("p", {class: "note"}, "For a file elsewhere: alice-survey studio --log nav.csv."));
 
   // files may come while the page is open
   for (const event of ["pointerenter", "focusin"]) {
@@ -80,14 +76,11 @@ export function tab(studio) {
       el("span", {class: "swatch", style: {background: colour}}), text))),
     el("div", {class: "field"}, el("label", {}, keep, " Keep the vehicle in view")),
     el("h3", {}, "Altitude against the plan"), profile.element,
-    el("h3", {}, "Lines that close the holes"), proposalText,
-    el("div", {class: "row"}, field("May take, minutes", minutes, "Empty: what is to spare"), field("Format", format)),
-    el("div", {class: "buttons"}, button("Look for lines", propose), accept, again),
+    el("h3", {}, "A plan over the holes"), proposalText,
+    field("Format", format),
+    el("div", {class: "buttons"}, fetchIt),
     holeTable,
-    el("details", {}, el("summary", {}, "Time, energy, log"),
-      el("div", {class: "row"}, field("Up in, minutes", upIn, "When the vehicle has to be at the surface")),
-      el("div", {class: "buttons"}, button("Set", () => change("/api/follow/allow", {minutes: upIn.value ? Number(upIn.value) : null}))),
-      more));
+    el("details", {}, el("summary", {}, "Time, energy, log"), more));
   const content = el("div", {}, el("h2", {}, "Follow a dive"), now, live, choose);
   const lack = missing(studio, content, () => (studio.state.has.plan || state?.following ? null
     : ["A dive is followed along its plan, and there is none yet: draw it in Plan, and save it.", "plan", "Open Plan"]));
@@ -111,19 +104,8 @@ export function tab(studio) {
     if (await change("/api/follow/open", body)) choose.open = false;
   }
 
-  async function propose() {
-    const body = minutes.value ? {minutes: Number(minutes.value)} : {};
-    const found = await change("/api/follow/propose", body);
-    if (found) say(found.proposal ? "Lines are proposed" : "No lines fit, or nothing is left to close", found.proposal ? "note" : "warn");
-  }
-
-  async function acceptIt() {
-    const done = await change("/api/follow/accept", {number: shownNumber});
-    if (!done) return;
-    again.href = "/api/follow/export?" + new URLSearchParams(format.value ? {format: format.value} : {});
-    again.hidden = false;
-    again.click();
-    say("The lines are counted on: load the mission into the vehicle before it comes up");
+  function download() {
+    el("a", {href: "/api/follow/export?" + new URLSearchParams(format.value ? {format: format.value} : {}), download: ""}).click();
   }
 
   on("follow", (heard) => { if (isHere) attempt(() => take(heard)); });
@@ -144,7 +126,7 @@ export function tab(studio) {
     }
     if (source !== state.source) forget();
     showFigures();
-    showBlocks();
+    showCoverage();
     await catchUp();
   }
 
@@ -163,36 +145,32 @@ export function tab(studio) {
     fixes = [];
     drawn = {};
     centred = false;
-    shownNumber = null;
-    blocks.forEach((block) => block.overlay.remove());
-    blocks = new Map();
+    overlay?.remove();
+    overlay = null;
     arrow?.remove();
     arrow = null;
     ["follow-left", "follow-done", "follow-track", "follow-holes", "follow-proposal"].forEach((name) => map.remove(name));
   }
 
-  /* Fixes, lines, holes and the proposal are asked for where they have changed. */
+  /* Fixes, lines and holes are asked for where the log was read again. */
   async function catchUp() {
-    if (fetching) return;
+    if (fetching || !state.fix) return;
     fetching = true;
     try {
-      const last = fixes.length ? {after: fixes[fixes.length - 1][0]} : {};
-      const {fixes: came} = await get("/api/follow/track", last);
-      fixes.push(...came);
-      if (fixes.length > KEPT) fixes = fixes.filter((_, i) => i % 2 || i > KEPT / 2);
-      if (came.length) showTrack();
-      const lineKey = JSON.stringify([state.lines, state.accepted && state.accepted.extra_s]);
-      if (drawn.lines !== lineKey) {
-        showLines((await get("/api/follow/lines")).lines);
-        drawn.lines = lineKey;
+      if (drawn.version !== state.version) {
+        const last = fixes.length ? {after: fixes[fixes.length - 1][0]} : {};
+        const {version} = state;
+        const dive = await get("/api/follow/dive", last);
+        fixes.push(...dive.fixes);
+        if (fixes.length > KEPT) fixes = fixes.filter((_, i) => i % 2 || i > KEPT / 2);
+        if (dive.fixes.length) showTrack();
+        showLines(dive.lines);
+        showHoles(dive.holes);
+        drawn.version = version;
       }
-      if (drawn.holes !== state.hole_key) {
-        showHoles((await get("/api/follow/holes")).holes);
-        drawn.holes = state.hole_key;
-      }
-      const proposalKey = JSON.stringify([state.number, state.proposal && state.proposal.extra_s]);
+      const proposalKey = JSON.stringify(state.proposal);
       if (drawn.proposal !== proposalKey) {
-        showProposal(await get("/api/follow/proposal"));
+        showProposal(state.proposal);
         drawn.proposal = proposalKey;
       }
       showArrow();
@@ -204,8 +182,12 @@ export function tab(studio) {
   /* ---- Figures ---- */
 
   function showFigures() {
+    if (!state.fix) {
+      tick();
+      return;
+    }
     const {finish, spare, coverage, holes, lines, pictures} = state;
-    put("finish", clock(finish.time_s), "± " + clock(finish.sigma_s) + ", " + number(finish.energy_wh, "Wh", 3));
+    put("finish", clock(finish.time_s), number(finish.energy_wh, "Wh", 3));
     const tight = (spare.time_s !== null && spare.time_s < 0) || (spare.energy_wh !== null && spare.energy_wh < 0);
     put("spare", spare.time_s === null ? number(spare.energy_wh, "", 3) : clock(spare.time_s),
       spare.time_s === null ? "Wh; no limit of time is set" : number(spare.energy_wh, "Wh", 3), tight);
@@ -216,12 +198,10 @@ export function tab(studio) {
     const left = Object.entries(state.left_out).filter(([, count]) => count);
     more.replaceChildren(table("So far", [], [
       ["Under water", clock(state.elapsed_s)],
-      ["Pace, true over planned", number(state.pace.ratio, "", 3) + " ± " + number(state.pace.sigma, "", 2)],
+      ["Pace, true over planned", number(state.pace, "", 3)],
       ["Energy spent, by the plan", number(state.spent_wh, "Wh", 3)],
       ["Time that a dive may take", state.limit.dive_s === null ? "not set" : clock(state.limit.dive_s)],
       ["Pictures that count", number(pictures.counted, "", 6)],
-      ["Pictures lost in gaps", String(pictures.lost_in_gaps)],
-      ["Pictures too high", String(pictures.too_high)],
       ["Gaps of the log", String(state.gaps)],
       ...left.map(([why, count]) => ["Left out: " + why, String(count)]),
     ]), el("p", {class: "note"}, state.source));
@@ -232,7 +212,7 @@ export function tab(studio) {
   function tick() {
     if (!state || !state.following) return;
     const {fix} = state;
-    if (state.fault) {
+    if (state.fault && !fix) {
       now.className = "now bad";
       now.textContent = state.fault;
       return;
@@ -258,20 +238,16 @@ export function tab(studio) {
 
   /* ---- The map ---- */
 
-  function showBlocks() {
-    state.blocks.forEach(([row, column, version, south, west, north, east]) => {
-      const name = row + "/" + column;
-      const address = "/api/follow/block/" + name + "?v=" + version;
-      const held = blocks.get(name);
-      if (!held) {
-        const overlay = leaflet.imageOverlay(address, [[south, west], [north, east]], {pane: "over", className: "follow-block"});
-        if (isHere) overlay.addTo(map.leaflet);
-        blocks.set(name, {overlay, version});
-      } else if (held.version !== version) {
-        held.overlay.setUrl(address);
-        held.version = version;
-      }
-    });
+  function showCoverage() {
+    const [south, west, north, east] = state.bounds;
+    const address = "/api/follow/coverage?v=" + state.version;
+    if (overlay) {
+      if (drawn.coverage !== address) overlay.setUrl(address);
+    } else {
+      overlay = leaflet.imageOverlay(address, [[south, west], [north, east]], {pane: "over", className: "follow-coverage"});
+      if (isHere) overlay.addTo(map.leaflet);
+    }
+    drawn.coverage = address;
   }
 
   const flat = (ne) => [ne[1], ne[0]];
@@ -330,19 +306,15 @@ export function tab(studio) {
         hole.area_m2.toFixed(2), hole.unseen_m2.toFixed(2), hole.north_m.toFixed(1) + ", " + hole.east_m.toFixed(1)])) : "");
   }
 
-  function showProposal({number: shown, proposal}) {
-    shownNumber = shown;
-    accept.disabled = !proposal || !studio.mayWrite();
-    shapes("follow-proposal", "line", "Proposed lines", PINK,
+  function showProposal(proposal) {
+    fetchIt.disabled = !proposal;
+    shapes("follow-proposal", "line", "Lines over the holes", PINK,
       proposal ? proposal.lines.map((line) => [flat(line.start_ne), flat(line.end_ne)]) : [], {width: 5});
     if (proposal) {
-      proposalText.textContent = counted(proposal.lines.length, "more line takes", "more lines take") + " " + clock(proposal.extra_s) + " min and " + number(proposal.extra_wh, "Wh", 2)
-        + " for " + number(proposal.gain_m2, "m²", 3) + " of the " + number(proposal.holes_m2, "m²", 3) + " of holes: then "
-        + share(proposal.share_at_overlap, 1) + " is at the overlap. They are flown after the planned lines, on the way home.";
-    } else if (state.accepted) {
-      proposalText.textContent = counted(state.accepted.lines, "accepted line is", "accepted lines are") + " flown after the planned ones.";
+      proposalText.textContent = counted(proposal.lines.length, "line takes", "lines take") + " " + clock(proposal.time_s) + " min and " + number(proposal.energy_wh, "Wh", 2)
+        + " from home to home: then " + share(proposal.holes_share, 1) + " of the holes is at the overlap. It is a plan of its own, to fly after this dive.";
     } else {
-      proposalText.textContent = state.holes.count ? "No lines fit what is to spare, or can be reached." : "No holes so far: nothing to close.";
+      proposalText.textContent = state.holes.count ? "No lines can reach the holes." : "No holes so far: nothing to close.";
     }
   }
 
@@ -367,7 +339,7 @@ export function tab(studio) {
     panel,
     enter() {
       isHere = true;
-      blocks.forEach((block) => block.overlay.addTo(map.leaflet));
+      overlay?.addTo(map.leaflet);
       lack.show();
       attempt(async () => take(await get("/api/follow/state")));
     },
@@ -375,6 +347,6 @@ export function tab(studio) {
       isHere = false;
       forget();
     },
-    keys: {p: propose, v: () => { keep.checked = !keep.checked; }},
+    keys: {v: () => { keep.checked = !keep.checked; }},
   };
 }

@@ -72,7 +72,7 @@ def opaque(page: Any) -> int:
     return int(
         page.evaluate("""async () => {
         let total = 0;
-        for (const img of document.querySelectorAll("img.follow-block")) {
+        for (const img of document.querySelectorAll("img.follow-coverage")) {
             await img.decode();
             const canvas = document.createElement("canvas");
             canvas.width = img.naturalWidth; canvas.height = img.naturalHeight;
@@ -113,7 +113,7 @@ def test_a_dive_is_followed_and_its_hole_closed(tmp_path: Path, size: dict[str, 
         button(page, "Follow it").click()
         come(dive.between(0.01, first_s))
         phase(page, "On line 1")
-        page.wait_for_selector("img.follow-block")
+        page.wait_for_selector("img.follow-coverage")
         early = opaque(page)
         come(dive.between(first_s, third_s))
         phase(page, "On line 3")
@@ -129,12 +129,11 @@ def test_a_dive_is_followed_and_its_hole_closed(tmp_path: Path, size: dict[str, 
         page.wait_for_selector("#panel-follow .now.bad:has-text('No news for')")
         is_accessible(page, tmp_path / "silent.png")
 
-        offered = json.loads(ask(server, "/api/follow/proposal").text)["proposal"]
+        offered = json.loads(ask(server, "/api/follow/state").text)["proposal"]
         with page.expect_download() as waiting:
-            button(page, "Accept and download").click()
+            button(page, "Download missions").click()
         assert waiting.value.suggested_filename == "holes.zip"
-        figure_is(page, "lines", f"{len(plan.lines) - 2 + len(offered['lines'])} of")
-        # The rest of the plan, and then the lines accepted.
+        # The rest of the plan, and then the lines over the hole.
         come(dive.between(third_s, end_s), rows_along(offered["route_ne"], plan, end_s + 0.5))
         figure_is(page, "lines", "0 of")
         page.wait_for_function(
