@@ -158,35 +158,6 @@ function startMap(data, root) {
     readCentre();
   }
 
-  function ruler() {
-    const places = [];
-    const line = leaflet.polyline([], {
-      color: "#8e44ad", weight: 2.5, dashArray: "6 3", interactive: false,
-    }).addTo(map);
-    const button = root.querySelector('[data-act="measure"]');
-    button.setAttribute("aria-pressed", "true");
-    return {
-      name: "ruler",
-      click(place) {
-        places.push(place);
-        line.setLatLngs(places);
-      },
-      move: (place) => line.setLatLngs([...places, place]),
-      text(place) {
-        const all = [...places, place];
-        const total = all.slice(1).reduce(
-          (sum, end, i) => sum + Math.hypot(end.lat - all[i].lat, end.lng - all[i].lng), 0,
-        );
-        return places.length ? "; measured " + lengthText(total, data.unit, 4) : "; click to measure";
-      },
-      end() {
-        line.remove();
-        button.setAttribute("aria-pressed", "false");
-      },
-    };
-  }
-  const measure = () => (tool && tool.name === "ruler" ? release() : take(ruler()));
-
   /* What others add for a place, each a function of it. */
   const more = [];
   const decimals = () => Math.min(4, Math.max(0, Math.ceil(Math.log10(2 ** map.getZoom()))));
@@ -243,14 +214,14 @@ function startMap(data, root) {
       show(input.value, input.checked);
     });
   });
-  const acts = {in: () => map.zoomIn(1), out: () => map.zoomOut(1), all: () => fit(!still), measure};
+  const acts = {in: () => map.zoomIn(1), out: () => map.zoomOut(1), all: () => fit(!still)};
   root.querySelectorAll("button[data-act]").forEach((button) => {
     button.addEventListener("click", acts[button.dataset.act]);
   });
   box.addEventListener("keydown", (event) => {
     if (event.target !== box || event.ctrlKey || event.metaKey || event.altKey) return;
     const act = tool?.keys?.[event.key] || {
-      0: acts.all, Enter: tool ? () => click(map.getCenter()) : describeMiddle, m: measure,
+      0: acts.all, Enter: tool ? () => click(map.getCenter()) : describeMiddle,
       Escape: tool ? release : null,
     }[event.key];
     if (!act) return;

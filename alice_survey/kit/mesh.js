@@ -6,14 +6,13 @@ const FILLED = 0.9;
 const MARK_PX = 6;
 const WINDS = ["north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west"];
 
-/* A mesh that turns, of binary glTF: east is x, up is y, south is z; without one, an empty box
-   `around` what `show` draws. `told` gets words on where it is seen from, `lost` is called when the
+/* A mesh that turns, of binary glTF: east is x, up is y, south is z. `told` gets words on where it is seen from, `lost` is called when the
    browser takes its graphics memory back. Returns `pick`, which gives what is under a pixel of the
    canvas, with its `point`, or null, `mark`, which shows some points and the
    lines between, and `show`, which draws another model, in the same axes, that is brought up to date
    before each frame, or the first one again; `dress` makes a model ready for it, `forget` gives its
    memory back. */
-async function startMesh(root, canvas, bytes, {told, lost, around}) {
+async function startMesh(root, canvas, bytes, {told, lost}) {
   const view = canvas.parentElement;
   const renderer = new three.WebGLRenderer({canvas, antialias: true, preserveDrawingBuffer: true});
   renderer.setPixelRatio(Math.min(2, window.devicePixelRatio || 1));
@@ -22,9 +21,9 @@ async function startMesh(root, canvas, bytes, {told, lost, around}) {
   const lamp = new three.DirectionalLight(0xffffff, 2.6);
   scene.add(new three.HemisphereLight(0xffffff, 0x8c98a0, 1.1), lamp, lamp.target);
 
-  const model = bytes ? (await parse(bytes)).scene : new three.Scene();
+  const model = (await parse(bytes)).scene;
   scene.add(model);
-  const box = around || new three.Box3().setFromObject(model);
+  const box = new three.Box3().setFromObject(model);
   const ball = box.getBoundingSphere(new three.Sphere());
   lamp.position.copy(ball.center).add(new three.Vector3(-1, 0.7, -0.5).multiplyScalar(ball.radius));
   lamp.target.position.copy(ball.center);
@@ -147,7 +146,6 @@ async function startMesh(root, canvas, bytes, {told, lost, around}) {
   function pick(x, y) {
     const {clientWidth: width, clientHeight: height} = canvas;
     caster.setFromCamera(new three.Vector2(2 * x / width - 1, 1 - 2 * y / height), camera);
-    if (current.pick) return current.pick(caster.ray);
     const seen = current.group === model ? [model] : current.group.children.filter((part) => part.visible);
     return caster.intersectObjects(seen, true)[0] || null;
   }

@@ -1,6 +1,5 @@
 """Commands that show a survey: the report, and the server for what is too large for one page."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -41,7 +40,6 @@ def report(
 @app.command(
     epilog=examples(
         "studio -w reef",
-        "studio -w reef --chart harbour.tif",
         "studio -w reef --log nav.csv",
         "studio -w reef --port 8000 --no-browser",
     )
@@ -51,10 +49,6 @@ def studio(
     port: Annotated[
         int, typer.Option(min=0, max=65535, help="To listen on; 0 for any that is free.")
     ] = 0,
-    chart: Annotated[
-        Path | None,
-        typer.Option(help="GeoTIFF, BAG or other raster, to lie under the survey."),
-    ] = None,
     background: Annotated[
         str | None,
         typer.Option(
@@ -80,7 +74,4 @@ def studio(
     """
     from alice_survey.app.studio.server import run_studio
 
-    run_studio(
-        workspace, port, browser=browser, show=typer.echo, log=log, chart=chart,
-        background=background,
-    )  # fmt: skip
+    run_studio(workspace, port, browser=browser, show=typer.echo, log=log, background=background)

@@ -94,31 +94,6 @@ def number_rasters(unit: str) -> tuple[Numbers, ...]:
     )  # fmt: skip
 
 
-def change_rasters(name: str) -> tuple[Numbers, ...]:
-    """The rasters of a comparison with an earlier survey.
-
-    Args:
-        name: of the comparison, a folder in `against`.
-    """
-    return (
-        Numbers(
-            file=f"against/{name}/difference.tif", name="difference", title="Difference of height",
-            about="Height now minus height before.", palette="PuOr", limits=_around_zero,
-            factor=1e3, label="now minus before, mm",
-        ),
-        Numbers(
-            file=f"against/{name}/significance.tif", name="significance",
-            title="Significance of the difference", palette="PuOr", limits=_four_sigmas,
-            about="Difference over its sigma: beyond 2 it is hardly chance.",
-            label="difference over sigma",
-        ),
-    )  # fmt: skip
-
-
-def _four_sigmas(values: Array) -> tuple[float, float]:
-    return -4.0, 4.0
-
-
 def _middle(values: Array) -> tuple[float, float]:
     low, high = np.percentile(values, [1, 99])
     return float(low), float(max(high, low + 1e-9))

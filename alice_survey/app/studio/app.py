@@ -14,7 +14,6 @@ from starlette.responses import RedirectResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from alice_survey.app.studio.chart import CHART, server_of
 from alice_survey.app.studio.endpoints.base import (
     Call,
     Content,
@@ -34,7 +33,7 @@ from alice_survey.core.edited_files import StaleError
 from alice_survey.core.errors import AliceError, WorkspaceError, known_fault
 
 _TILE = re.compile(
-    rf"/tiles/({'|'.join((*FILES, CHART))})/([0-9]{{1,2}})/([0-9]{{1,6}})/([0-9]{{1,6}})\.webp"
+    rf"/tiles/({'|'.join(FILES)})/([0-9]{{1,2}})/([0-9]{{1,6}})/([0-9]{{1,6}})\.webp"
 )
 _VERSION = re.compile(r"v=([0-9a-f-]{1,64})")
 _KEEP = "private, max-age=86400, immutable"
@@ -47,6 +46,8 @@ _STUDIO_POLICY = (
     "connect-src 'self'; frame-src 'self'; base-uri 'none'; form-action 'none'"
 )
 """Policy of the studio's page, with the server of a web map where one is named."""
+_WEB_MAP = re.compile(r"(https?://[a-z0-9.-]+(?::[0-9]{1,5})?)/[A-Za-z0-9/._~{}?=&%+-]*")
+"""Address of tiles; no character that could end a content security policy's source."""
 _TOKEN = "X-Studio-Token"  # noqa: S105 (the name of a header)
 _JSON = "application/json"
 _APP = re.compile(r"/app/([a-z_]+\.(?:js|css))")
@@ -65,6 +66,25 @@ def application(studio: Studio, hosts: frozenset[str]) -> ASGIApp:
     routes = [_route(studio, endpoint) for endpoint in all_endpoints(studio)]
     events = Route(f"{API}events", _events(studio))
     return Guard(Starlette(routes=[events, *routes, Route("/{path:path}", answers.answer)]), hosts)
+
+
+def server_of(background: str) -> str:
+    """Scheme, host and port of a web map's tiles.
+
+    Args:
+        background: their address, with {z}, {x} and {y}.
+
+    Raises:
+        WorkspaceError: it is none.
+    """
+    found = _WEB_MAP.fullmatch(background)
+    parts = re.findall(r"\{.*?\}", background)
+    if found is None or sorted(parts) != ["{x}", "{y}", "{z}"]:
+        raise WorkspaceError(
+            f"--background {background}: give the address of tiles, such as "
+            "https://tiles.example.org/{z}/{x}/{y}.png"
+        )
+    return found.group(1)
 
 
 def _route(studio: Studio, endpoint: Endpoint) -> Route:

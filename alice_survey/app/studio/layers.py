@@ -17,10 +17,8 @@ from typing import Any
 
 import numpy as np
 import rasterio
-from rasterio.crs import CRS
 from rasterio.enums import Resampling
 from rasterio.errors import RasterioError
-from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 
 from alice_survey.app.report.colours import (
@@ -37,7 +35,6 @@ from alice_survey.app.report.colours import (
     scale_of,
 )
 from alice_survey.app.report.held import Held
-from alice_survey.app.studio.chart import CHART, CHART_TITLE, chart_crs, chart_numbers
 from alice_survey.app.studio.paths import Workspace, token_of, worked_on
 from alice_survey.core.contents import one_line
 from alice_survey.core.errors import WorkspaceError
@@ -80,24 +77,23 @@ class Level:
 class Pyramid:
     """All levels of one raster in its colours."""
 
-    def __init__(self, path: Path, numbers: Numbers | None, crs: CRS | None = None) -> None:
+    def __init__(self, path: Path, numbers: Numbers | None) -> None:
         """Open a raster.
 
         Args:
             path: path of the file.
             numbers: its colouring; None for a mosaic, which has its own colours.
-            crs: system to warp it to; None leaves it as it is.
 
         Raises:
             rasterio.errors.RasterioError: it cannot be read.
         """
-        self._path, self.numbers, self._crs = path, numbers, crs
+        self._path, self.numbers = path, numbers
         with self._opened() as raster:
             self.west, self.north = raster.transform.c, raster.transform.f
             self.pixel = raster.transform.a
             self.limits = None if numbers is None else limits_of(raster, numbers)
             sizes = [(raster.width, raster.height)]
-            factors = raster.overviews(1) if crs is None else []  # a warp chooses its own
+            factors = raster.overviews(1)
         while max(sizes[-1]) > TILE_PX:
             if 2 ** len(sizes) in factors:
                 with self._opened(overview_level=factors.index(2 ** len(sizes))) as raster:
@@ -112,21 +108,11 @@ class Pyramid:
 
     @contextmanager
     def _opened(self, **options: int) -> Iterator[Any]:
-        driver = "GTiff" if self._crs is None else None
         with (
             rasterio.Env(**_GDAL),
-            rasterio.open(self._path, driver=driver, sharing=False, **options) as raster,
+            rasterio.open(self._path, driver="GTiff", sharing=False, **options) as raster,
         ):
-            if self._crs is None:
-                yield raster
-                return
-            unknown: dict[str, Any] = {"nodata": np.nan, "dtype": "float32"}
-            if self.numbers is None:
-                unknown = {"add_alpha": raster.count < 4}
-            with WarpedVRT(
-                raster, crs=self._crs, resampling=Resampling.bilinear, **unknown
-            ) as warped:
-                yield warped
+            yield raster
 
     def tile(self, level: int, x: int, y: int) -> Rgba:
         """Pixels of a tile of a level.
@@ -185,25 +171,9 @@ def _window(
 class Layers:
     """Layers of a map of a workspace; threads may share it."""
 
-    def __init__(
-        self,
-        workspace: Workspace,
-        chart: Path | None = None,
-        *,
-        overlays: Sequence[Numbers] = (),
-        address: str = "/tiles",
-    ) -> None:
-        """Take a workspace.
-
-        Args:
-            workspace: whose rasters are shown.
-            chart: a raster of the user's own that lies under them.
-            overlays: rasters to show over a map, in place of those of the stages.
-            address: where their tiles are.
-        """
-        self._workspace, self.chart, self._address = workspace, chart, address
-        self._overlays = {one.name: one for one in overlays}
-        self._files = {name: one.file for name, one in self._overlays.items()} or FILES
+    def __init__(self, workspace: Workspace) -> None:
+        """Take a workspace, whose rasters are shown."""
+        self._workspace = workspace
         self._max_renderers = min(_MAX_RENDERERS, os.cpu_count() or 1)
         self._renderers = threading.BoundedSemaphore(self._max_renderers)
         # By the token of the file, so that a changed raster is read again.
@@ -213,11 +183,10 @@ class Layers:
     def picture_layers(self) -> Sequence[PictureLayer]:
         """The layers that are there, for a page that requests their tiles."""
         found: list[PictureLayer] = []
-        for name in (*self._files, CHART):
+        for name, file in FILES.items():
             try:
-                shown = not self._overlays and (not found or name == CHART)
-                layer = self._picture_layer(name, shown=shown)
-                if is_of_surface(self._workspace.folder, self._files.get(name, "")):
+                layer = self._picture_layer(name, shown=not found)
+                if is_of_surface(self._workspace.folder, file):
                     found.append(layer)
             except FileNotFoundError:
                 continue
@@ -229,32 +198,25 @@ class Layers:
         Raises:
             FileNotFoundError: there is none.
         """
-        if name in self._files:
-            return self._workspace.file(self._files[name].split("/"))
-        if (
-            name != CHART
-            or self.chart is None
-            or Held.of(self._workspace.folder).frame.datum is None
-        ):
+        if name not in FILES:
             raise FileNotFoundError(name)
-        return self.chart
+        return self._workspace.file(FILES[name].split("/"))
 
     def _picture_layer(self, name: str, *, shown: bool) -> PictureLayer:
         with self._unchanged(name, None) as token:
             pyramid = self._pyramid(name, token)
         numbers, limits, full = pyramid.numbers, pyramid.limits, pyramid.levels[0]
-        title, about = (MOSAIC_TITLE, MOSAIC_ABOUT) if name != CHART else (CHART_TITLE, "")
         return PictureLayer(
             name=name,
-            title=title if numbers is None else numbers.title,
-            about=about if numbers is None else numbers.about,
-            base=name != CHART and not self._overlays,
+            title=MOSAIC_TITLE if numbers is None else numbers.title,
+            about=MOSAIC_ABOUT if numbers is None else numbers.about,
+            base=True,
             west_m=pyramid.west, north_m=pyramid.north, pixel_m=pyramid.pixel,
             width_px=full.columns, height_px=full.rows, tile_px=TILE_PX,
             levels=len(pyramid.levels), tiles={}, shown=shown,
             scale=None if numbers is None or limits is None else scale_of(numbers, limits),
             sizes=[(s.columns, s.rows, s.east, s.north) for s in pyramid.levels],
-            address=f"{self._address}/{name}/{{}}.webp?v={token}",
+            address=f"/tiles/{name}/{{}}.webp?v={token}",
         )  # fmt: skip
 
     def tile(self, name: str, level: int, x: int, y: int, token: str | None) -> tuple[bytes, str]:
@@ -299,13 +261,6 @@ class Layers:
             raise worked_on()
 
     def _read_pyramid(self, name: str, token: str) -> Pyramid:
-        if name == CHART:
-            place, path = Held.of(self._workspace.folder).frame.datum, self._path(name)
-            if place is None:
-                raise FileNotFoundError(name)
-            return Pyramid(path, chart_numbers(path), chart_crs(place))
-        if name in self._overlays:
-            return Pyramid(self._path(name), self._overlays[name])
         unit = Held.of(self._workspace.folder).unit
         numbers = next((one for one in number_rasters(unit) if one.name == name), None)
         return Pyramid(self._path(name), numbers)

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from alice_survey.app.studio.chart import check_chart
 from alice_survey.app.studio.layers import Layers
 from alice_survey.app.studio.paths import Workspace
 from alice_survey.core.errors import WorkspaceError, why
@@ -79,7 +78,6 @@ class Server:
         port: int = 0,
         *,
         log: str | None = None,
-        chart: Path | None = None,
         background: str | None = None,
     ) -> None:
         """Listen.
@@ -88,16 +86,15 @@ class Server:
             folder: folder of the workspace.
             port: 0 for any that is free.
             log: where the navigation of a dive comes from.
-            chart: raster to lie under the survey.
             background: address of a web map's tiles to lie under it.
 
         Raises:
-            WorkspaceError: the port is not available, or the chart cannot be shown.
+            WorkspaceError: the port is not available.
         """
         workspace = Workspace(folder)
         self.studio = Studio(
             workspace=workspace,
-            layers=Layers(workspace, None if chart is None else check_chart(chart)),
+            layers=Layers(workspace),
             token=secrets.token_urlsafe(24),
             log=log,
             background=background,
@@ -178,7 +175,6 @@ def run_studio(
     browser: bool,
     show: Callable[[str], Any],
     log: str | None = None,
-    chart: Path | None = None,
     background: str | None = None,
 ) -> None:
     """Serve a workspace; Ctrl-C ends it as it ends every command.
@@ -189,13 +185,12 @@ def run_studio(
         browser: open one.
         show: prints a line.
         log: where the navigation of a dive comes from.
-        chart: raster to lie under the survey.
         background: address of a web map's tiles to lie under it.
 
     Raises:
-        WorkspaceError: the port is taken, or the chart cannot be shown.
+        WorkspaceError: the port is taken.
     """
-    server = Server(workspace, port, log=log, chart=chart, background=background)
+    server = Server(workspace, port, log=log, background=background)
     threading.Thread(target=prepare_planning, daemon=True).start()
     try:
         show(f"{workspace} is shown at {server.address} to this machine alone; Ctrl-C ends it")

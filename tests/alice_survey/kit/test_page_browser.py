@@ -203,20 +203,6 @@ def test_scale_bar_is_true(page: Any) -> None:
     assert bar.bounding_box()["width"] == pytest.approx(length_m * px_per_m, abs=1)
 
 
-def test_ruler_measures_between_clicks(page: Any) -> None:
-    button = page.get_by_role("button", name="Measure a length")
-    button.click()
-    page.mouse.click(*place_on_page(page, -1.0, 0.5))
-    page.mouse.click(*place_on_page(page, 0.5, 0.5))
-    text = page.locator("#map-readout").inner_text()
-    assert float(re.findall(r"measured ([\d.]+) m", text)[0]) == pytest.approx(1.5, abs=0.02)
-    assert page.locator(".leaflet-popup-content").count() == 0
-    page.locator(MAP).focus()
-    page.keyboard.press("Escape")
-    assert button.get_attribute("aria-pressed") == "false"
-    assert "measured" not in page.locator("#map-readout").inner_text()
-
-
 def test_popups(page: Any) -> None:
     page.mouse.click(*place_on_page(page, 0.6, -0.533))
     popup = page.locator(".leaflet-popup-content")

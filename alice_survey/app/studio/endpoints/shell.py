@@ -3,19 +3,16 @@
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from importlib import resources
 from typing import Any
 
 from alice_survey.app.report.held import Held
 from alice_survey.app.report.run import survey_map
 from alice_survey.app.report.shapes import shape_layers
-from alice_survey.app.studio.chart import CHART, contours_of
 from alice_survey.app.studio.endpoints.base import Call, Endpoint, Studio, scale_json
-from alice_survey.core.errors import PlanError, warn
 from alice_survey.kit.document import EAST_NORTH, PictureLayer, ShapeLayer
 from alice_survey.kit.map import map_data, map_extent
 
-TABS = ("plan", "model", "pictures", "compare", "follow", "run")
+TABS = ("plan", "model", "pictures", "follow", "run")
 _PRODUCTS = {
     "plan": "plan/plan.json", "flight": "flight/navigation.csv", "pictures": "images/manifest.csv",
     "sparse": "sparse/track.csv", "dem": "dense/dem.tif", "mosaic": "mosaic/mosaic.tif",
@@ -39,7 +36,6 @@ class _Shell:
         placed = found.axes == EAST_NORTH or not held.has(
             "sparse"
         )  # a plan is drawn on east and north
-        web = resources.files("alice_survey.app.studio") / "web"
         return {
             "workspace": str(workspace.folder),
             "name": held.name,
@@ -54,7 +50,7 @@ class _Shell:
             "has": {name: workspace.has(path) for name, path in _PRODUCTS.items()},
             "log": self.studio.log,
             "background": self.studio.background,
-            "tabs": [name for name in TABS if (web / f"{name}.js").is_file()],
+            "tabs": TABS,
         }
 
     def map(self, call: Call) -> dict[str, Any]:
@@ -66,19 +62,12 @@ class _Shell:
         held = Held.of(self.studio.workspace.folder)
         pictures = self.studio.layers.picture_layers()
         layers: list[PictureLayer | ShapeLayer] = [*pictures, *shape_layers(held)]
-        surveyed = [layer for layer in layers if layer.name != CHART]
-        extent = (-_EMPTY_M, -_EMPTY_M, _EMPTY_M, _EMPTY_M)
-        if surveyed:
-            extent = map_extent(survey_map(held, surveyed))
-        chart, place = self.studio.layers.chart, held.frame.datum
-        if chart is not None and place is not None:
-            try:
-                layers += contours_of(chart, place, extent)
-            except PlanError as fault:
-                warn(f"the chart has no contours: {fault}")
         found: dict[str, Any] = {"layers": []}
+        extent = (-_EMPTY_M, -_EMPTY_M, _EMPTY_M, _EMPTY_M)
         if layers:
-            found = json.loads(map_data(survey_map(held, layers))[0])
+            page_map = survey_map(held, layers)
+            found = json.loads(map_data(page_map)[0])
+            extent = map_extent(page_map)
         found["extent"] = extent
         for described, layer in zip(found["layers"], layers, strict=True):
             described |= _listed(layer)
@@ -88,15 +77,11 @@ class _Shell:
 def _listed(layer: PictureLayer | ShapeLayer) -> dict[str, Any]:
     """What the list of layers says of one."""
     is_base = isinstance(layer, PictureLayer) and layer.base
-    group = "Background" if layer.name in (CHART, "contours") else layer.group
-    if is_base:
-        group = "Base layer"
     return {
         "title": layer.title,
         "about": layer.about,
         "shown": layer.shown,
-        "group": group,
-        "under": layer.name == CHART,
+        "group": "Base layer" if is_base else layer.group,
         "scale": scale_json(layer) if isinstance(layer, PictureLayer) else None,
     }
 

@@ -1,7 +1,6 @@
-/* The model in 3D in the tab Model, as a mesh or as points: it turns, a click picks a place on it, two picks give a length. */
+/* The mesh in 3D in the tab Model: it turns, a click picks a place on it, two picks give a length. */
 
 import {attempt, button, bytes, el, field, get, say} from "./core.js";
-import {boxOf, startPoints} from "./model_points.js";
 import {startTiles} from "./model_tiles.js";
 import {WHITE} from "./palette.js";
 import {counted, number} from "./words.js";
@@ -71,11 +70,6 @@ export function meshPart(studio, {colour, measured}) {
   const starts = {
     light: () => null,
     tiles: () => startTiles(scene, lies.tiles, heard((parts) => counted(parts.length, "tile"))),
-    points: async () => {
-      const cloud = await get("/api/model/points");
-      const all = counted(cloud.points, "point");
-      return startPoints(scene, cloud, lies.offset, heard((parts) => parts.reduce((sum, part) => sum + part.count, 0).toLocaleString("en") + " of " + all));
-    },
   };
 
   async function draw() {
@@ -88,7 +82,6 @@ export function meshPart(studio, {colour, measured}) {
       drawn?.detail?.clear();
       drawn = {kind, detail: next};
       streamed.textContent = "";
-      relief.hidden = kind === "points";
       scene.show(next);
     } catch (fault) {
       delete started[kind];
@@ -127,19 +120,17 @@ export function meshPart(studio, {colour, measured}) {
     picks = picks.length === 2 ? [hit] : [...picks, hit];
     const places = shown();
     const last = places[places.length - 1].map((value) => number(value, "", 6)).join(", ");
-    const sigma = hit.sigma ? ", with a sigma of " + number(hit.sigma, state.unit, 2) + " across the surface" : "";
-    picked.textContent = "Picked " + last + " " + state.unit + sigma + (picks.length === 1 ? ": click another place." : "");
+    picked.textContent = "Picked " + last + " " + state.unit + (picks.length === 1 ? ": click another place." : "");
     if (picks.length === 2) measured(places);
   }
 
   async function begin() {
     begun = true;
-    const mesh = state.has.mesh ? await get("/api/model/mesh") : null;
-    const cloud = mesh ? null : await get("/api/model/points");
-    lies = mesh || {offset: cloud.centre, plane: cloud.plane};
-    about.textContent = mesh ? mesh.about + (mesh.tiles ? " Other viewers of 3D Tiles: " + window.location.origin + mesh.tiles
-      : " There are no 3D Tiles of it, to draw it at full detail: mesh_tiles = \"on\" under [reconstruct] makes them with the mesh.")
-      : "There is no mesh yet: the points are those of the dense surface.";
+    lies = await get("/api/model/mesh");
+    about.textContent = lies.about + (lies.tiles
+      ? " Other viewers of 3D Tiles: " + window.location.origin + lies.tiles
+      : " There are no 3D Tiles of it, to draw it at full detail: mesh_tiles = \"on\" under"
+        + " [reconstruct] makes them with the mesh.");
     const context = document.createElement("canvas").getContext("webgl2");
     if (!context) {
       still("This browser has no WebGL, which turning the model needs");
@@ -148,15 +139,14 @@ export function meshPart(studio, {colour, measured}) {
     context.getExtension("WEBGL_lose_context")?.loseContext();
     await loaded("/app/vendor_mesh.js");
     await loaded("/app/mesh.js");
-    const model = mesh && await bytes(mesh.address);
+    const model = await bytes(lies.address);
     root.hidden = false;
     scene = await startMesh(root, canvas, model, {
       told: (text) => { told.textContent = text; },
       lost: () => still("The browser took its graphics memory back"),
-      around: cloud && boxOf(cloud, lies.offset),
     });
-    kinds.append(...[["light", "Mesh, light copy", mesh], ["tiles", "Mesh, full detail (3D Tiles)", mesh?.tiles], ["points", "Points of the dense cloud", state.has.cloud]]
-      .filter(([, , isThere]) => isThere).map(([value, text]) => el("option", {value}, text)));
+    const choices = [["light", "Mesh, light copy"], ["tiles", "Mesh, full detail (3D Tiles)"]];
+    choices.slice(0, lies.tiles ? 2 : 1).forEach(([value, text]) => kinds.append(el("option", {value}, text)));
     choice.hidden = kinds.length < 2;
     root.dataset.ready = "";
     await draw();
@@ -191,7 +181,7 @@ export function meshPart(studio, {colour, measured}) {
 
   return {
     element,
-    enter() { element.hidden = !(state.has.mesh || state.has.cloud); },
+    enter() { element.hidden = !state.has.mesh; },
     leave() {
       enlarge(false);
       spots.remove();

@@ -268,7 +268,6 @@ export function tab(studio) {
         const made = (name) => state.stages.some((stage) => stage.name === name && stage.made_utc);
         list.replaceChildren(...rows.filter((one) => made(one[2])).map(([name, title]) =>
           button(title, () => start(name), {disabled: Boolean(busy) || Boolean(state.elsewhere) || !mayWrite()})));
-        if (made("dense")) list.append(button("Compare with another survey", () => studio.open("compare")));
         this.element.hidden = !list.firstChild;
       },
     };

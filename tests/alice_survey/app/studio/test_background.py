@@ -15,7 +15,7 @@ from PIL import Image
 from pyproj import Transformer
 
 import alice_survey.app.studio
-from alice_survey.app.studio.chart import server_of
+from alice_survey.app.studio.app import server_of
 from alice_survey.core.errors import WorkspaceError
 from tests.alice_survey.app.report.tiny import tiny_workspace
 from tests.alice_survey.app.studio.client import ask, serving

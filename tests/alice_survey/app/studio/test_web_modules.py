@@ -2,7 +2,6 @@
 
 import json
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -403,54 +402,3 @@ def test_words_of_figures(tmp_path: Path) -> None:
         "−1,235 m", "unknown", "−1.235 ± 0.012 m", "2.000", "−0:20", "–", "99.9 %", "–",
         "1 line", "1,200 passes", "−0.26 m", 'a,b\n"x""y",\n"1,2",3\n',
     ]  # fmt: skip
-
-
-def annotation(kind: str, points: Sequence[Sequence[float]], **more: Any) -> dict[str, Any]:
-    return {"id": "a", "shape": {"kind": kind, "points": points, "holes": [], **more}}
-
-
-def test_vertices_of_annotations_come_and_go(tmp_path: Path) -> None:
-    """Handles have places [north, east], annotations [east, north]."""
-    outer, hole = [[0, 0], [4, 0], [4, 3]], [[2, 1], [3, 1], [3, 2]]
-    shape = annotation("polygon", outer, holes=[hole])
-    rings, moved, more, fewer, none, shifted = run(
-        tmp_path, "annotate_shapes",
-        """(() => {
-          const t = m.targetOf(s);
-          return [t.rings, t.move(1, 0, [9, 8]).shape, t.insert(0, 2, null).shape,
-                  t.remove(1, 0).shape, t.remove(0, 0), t.shift(1, 10).shape];
-        })()""",
-        s=shape,
-    )  # fmt: skip
-    assert [ring["closed"] for ring in rings] == [True, True]
-    assert rings[0]["points"] == [[0, 0], [0, 4], [3, 4]]
-    assert moved["points"] == outer and moved["holes"][0][0] == [8, 9]
-    assert more["points"] == [*outer, [2, 1.5]]
-    assert fewer["holes"] == [] and fewer["points"] == outer
-    assert none is None
-    assert shifted["points"][0] == [10, 1] and shifted["holes"][0][0] == [12, 2]
-
-
-@settings(max_examples=8, deadline=None)
-@given(corner=st.integers(0, 3), turn=st.floats(0, 3), place=st.tuples(*[st.floats(-9, 9)] * 2))
-def test_a_rectangle_stays_one(
-    corner: int,
-    turn: float,
-    place: tuple[float, float],
-    tmp_path_factory: pytest.TempPathFactory,
-) -> None:
-    """Whichever corner moves anywhere, the opposite one stays and all angles are right."""
-    c, s = math.cos(turn), math.sin(turn)
-    points = [[c * x - s * y, s * x + c * y] for x, y in ((0, 0), (4, 0), (4, 3), (0, 3))]
-    moved = run(
-        tmp_path_factory.mktemp("rectangle"), "annotate_shapes",
-        "m.targetOf(a).move(0, corner, place).shape.points",
-        a=annotation("rectangle", points), corner=corner, place=place,
-    )  # fmt: skip
-    got = np.array(moved)
-    opposite = (corner + 2) % 4
-    assert np.allclose(got[opposite], points[opposite])
-    assert np.allclose(got[corner], place[::-1])
-    assert np.allclose(got[0] + got[2], got[1] + got[3], atol=1e-9)
-    sides = np.roll(got, -1, axis=0) - got
-    assert np.allclose((sides * np.roll(sides, -1, axis=0)).sum(axis=1), 0, atol=1e-8)
