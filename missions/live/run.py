@@ -1,4 +1,4 @@
-"""What `alice-survey pilot` and `simulate` do: from a workspace to a node, and its result."""
+"""What `alice-survey pilot` does: from a workspace to a pilot or a simulated vehicle."""
 
 from collections.abc import Callable
 from pathlib import Path

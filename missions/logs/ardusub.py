@@ -1,23 +1,44 @@
 """ArduSub's logs as a logged dive: the on-board log (DataFlash) and the ground station's (tlog).
 
+pymavlink reads both (the extra `mavlink`).
+
 Which messages hold what: ardupilot.org/sub, "Onboard Message Log Messages", and
 mavlink.io/en/messages/common.html. ArduSub puts its home at the water's surface
 (ArduSub/commands.cpp, set_home_to_current_location), so that heights above home are minus the
 depth; its barometer is zeroed at the surface.
 """
 
+import math
+import tempfile
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from alice_survey.core.errors import NavigationError, warn
 from alice_survey.core.frames import Array, Datum
-from missions.logs.dataflash import LogTable, Mask, read_dataflash
 from missions.logs.dive import DATED_AFTER_S, LoggedDive
-from missions.logs.message_sources import Keep, Source, Tables, dive_from, take, with_time
-from missions.logs.tlog import COMPONENT, RECORDED, SYSTEM, read_tlog
+from missions.logs.message_sources import (
+    Keep,
+    LogTable,
+    Mask,
+    Source,
+    Tables,
+    dive_from,
+    first_bytes,
+    read_by,
+    take,
+    with_time,
+)
+
+RECORDED, SYSTEM, COMPONENT = "recorded_s", "system", "component"
+"""Columns of a tlog: time of the ground station, seconds since 1970, and who has sent it."""
+_NOISE = "bytes that are not a message, or of one that is cut off"
+_DATAFLASH = b"\xa3\x95\x80"
+_TEXTS = "anNZ"
+"""Field types of text."""
 
 _GPS_EPOCH_S = 315964800.0
 """6 January 1980 in seconds since 1970."""
@@ -269,3 +290,190 @@ def _tlog_times(table: LogTable) -> Array:
         rows = session == number
         times[rows] = boot[rows] + np.min(recorded[rows] - boot[rows])
     return times
+
+
+def read_dataflash(
+    path: Path, wanted: Collection[str], lost: Counter[str]
+) -> tuple[dict[str, LogTable], list[str]]:
+    """Read the messages of some names of an on-board log.
+
+    Args:
+        path: a .BIN or a text .log.
+        wanted: names of messages.
+        lost: counts what cannot be read; is added to.
+
+    Returns:
+        Tables by name, and the names of all messages in the log.
+
+    Raises:
+        NavigationError: it is not such a log, or cannot be read.
+    """
+    start = first_bytes(path, 8192)
+    if _DATAFLASH in start[:4096]:
+        return _read_binary(path, wanted, lost)
+    if b"FMT," in start:
+        return _read_text(path, wanted, lost)
+    raise NavigationError(
+        f"{path}: no DataFlash log: its first bytes hold no FMT message (was it cut at the start?)"
+    )
+
+
+def _read_binary(
+    path: Path, wanted: Collection[str], lost: Counter[str]
+) -> tuple[dict[str, LogTable], list[str]]:
+    rows: dict[str, list[Any]] = {}
+    with read_by("pymavlink", path):
+        from pymavlink.DFReader import DFReader_binary
+
+        class Log(DFReader_binary):  # type: ignore[misc]
+            """A log without an index, which ends at the first damage, and without a clock."""
+
+            def init_arrays(self, progress_callback: Any = None) -> None:
+                self.name_to_id: dict[str, int] = {}
+                self.id_to_name: dict[int, str] = {}
+
+            init_arrays_fast = init_arrays
+
+            def init_clock(self) -> None:
+                pass
+
+        with Log(str(path)) as log:
+            noise = log.data_len
+            for message in _messages(log, lost):
+                noise -= message.fmt.len
+                kept = rows.setdefault(message.get_type(), [])
+                if message.get_type() in wanted:
+                    kept.append(message)
+            if noise > 0:
+                lost[_NOISE] += noise
+            tables = _dataflash_tables(rows, lost)
+    return tables, sorted(rows)
+
+
+def _read_text(
+    path: Path, wanted: Collection[str], lost: Counter[str]
+) -> tuple[dict[str, LogTable], list[str]]:
+    """Lines of comma-separated values, already scaled; FMT lines first name the fields."""
+    rows: dict[str, list[Any]] = {}
+    with tempfile.TemporaryDirectory(prefix="alice-survey-") as folder, read_by("pymavlink", path):
+        from pymavlink.DFReader import DFReader_text
+
+        class Log(DFReader_text):  # type: ignore[misc]
+            """A log without a clock."""
+
+            def init_clock(self) -> None:
+                pass
+
+        clean = Path(folder) / "clean.log"  # pymavlink takes no byte that is not UTF-8
+        clean.write_text(path.read_text("utf-8", "replace"), "ascii", "replace", newline="\n")
+        with Log(str(clean)) as log:
+            noise = sum(log.counts.values())
+            for message in _messages(log, lost):
+                noise -= 1
+                kept = rows.setdefault(message.get_type(), [])
+                if message.get_type() in wanted:
+                    kept.append(message)
+            if noise > 0:
+                lost["lines that are not a message, or without all of its fields"] += noise
+            tables = _dataflash_tables(rows, lost)
+    return tables, sorted(rows)
+
+
+def _messages(log: Any, lost: Counter[str]) -> Iterator[Any]:
+    """Messages of a log of pymavlink, past those that it cannot read."""
+    while True:
+        before = log.offset
+        try:
+            message = log.recv_msg()
+        except (ValueError, TypeError, AttributeError, LookupError):
+            if log.offset <= before:
+                return
+            lost["messages that cannot be read"] += 1
+            continue
+        if message is None:
+            return
+        yield message
+
+
+def _dataflash_tables(rows: Mapping[str, Sequence[Any]], lost: Counter[str]) -> dict[str, LogTable]:
+    def number(message: Any, field: str) -> float:
+        try:
+            return float(getattr(message, field))
+        except (ValueError, TypeError, OverflowError):
+            lost[f"{message.get_type()}: {field} is not a number"] += 1
+            return math.nan
+
+    tables = {}
+    for name, messages in rows.items():
+        if not messages:
+            continue
+        form = messages[0].fmt
+        columns: dict[str, Array] = {}
+        texts: dict[str, list[str]] = {}
+        for field, kind in zip(form.columns, form.msg_fmts, strict=False):
+            own = [message for message in messages if field in message.fmt.colhash]
+            if len(own) < len(messages):
+                continue
+            if kind in _TEXTS:
+                texts[field] = [str(getattr(message, field)) for message in messages]
+            elif kind != "M":
+                columns[field] = np.array([number(message, field) for message in messages])
+        tables[name] = LogTable(name=name, columns=columns, texts=texts)
+    return tables
+
+
+def read_tlog(
+    path: Path, wanted: Collection[str], lost: Counter[str]
+) -> tuple[dict[str, LogTable], list[str]]:
+    """Read the messages of some names of a ground station's log.
+
+    Args:
+        path: the file.
+        wanted: names of messages.
+        lost: counts what cannot be read; is added to.
+
+    Returns:
+        Tables by name with the columns `RECORDED`, `SYSTEM` and `COMPONENT`, and the names of all
+        messages in the log.
+
+    Raises:
+        NavigationError: the file cannot be read, or holds no MAVLink packet.
+    """
+    first_bytes(path, 0)
+    rows: dict[str, list[list[float]]] = {}
+    fields: dict[str, list[str]] = {}
+    present: set[str] = set()
+    with read_by("pymavlink", path):
+        from pymavlink import mavutil
+        from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+        log = mavutil.mavlogfile(str(path))
+        log.mav, log.first_byte = dialect.MAVLink(None), False  # it reads version 1 too
+        log.mav.robust_parsing = True
+        try:
+            while (message := log.recv_msg()) is not None:
+                name = message.get_type()
+                if name == "BAD_DATA":
+                    lost[_NOISE] += len(message.data)
+                    continue
+                present.add(name)
+                if name not in wanted:
+                    continue
+                if name not in fields:
+                    scalars = (f for f in message.get_fieldnames()
+                               if isinstance(getattr(message, f), int | float))  # fmt: skip
+                    fields[name] = list(scalars)
+                rows.setdefault(name, []).append(
+                    [message._timestamp, message.get_srcSystem(), message.get_srcComponent(),
+                     *(getattr(message, f) for f in fields[name])]
+                )  # fmt: skip
+        finally:
+            log.close()
+    if not present:
+        raise NavigationError(f"{path}: no telemetry log: it holds no MAVLink packet")
+    tables = {}
+    for name, table in rows.items():
+        names = (RECORDED, SYSTEM, COMPONENT, *fields[name])
+        cells = np.array(table, dtype=np.float64).T
+        tables[name] = LogTable(name=name, columns=dict(zip(names, cells, strict=True)))
+    return tables, sorted(present)

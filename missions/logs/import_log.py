@@ -22,6 +22,11 @@ from missions.values.navigation import COLUMNS, write_navigation_rows
 _NAMED = 8
 _JSON = (".json", ".jsonl", ".log", ".txt", "")
 """What files of JSON reports are called."""
+_NOT_READ = {
+    ".csv": "a CSV is not a vehicle's log: give a navigation CSV to import-images --navigation; of "
+    "QGroundControl import the .tlog",
+    ".pd0": "PD0 is no longer read: export velocities and ranges as a navigation CSV",
+}
 _MAX_S = 1e9
 _MAX_OUT_OF_WATER_M = 2.0
 """A vehicle on deck, or a barometer that is off, seldom is higher."""
@@ -52,8 +57,6 @@ class ImportOptions:
     """Offset added to altitudes."""
     start_utc: str | None = None
     """Time of the first position of a log without dates, ISO 8601."""
-    time_zone: str = "UTC"
-    """Time zone of dates that name none (QGroundControl's CSV)."""
     vehicle_log: Path | None = None
     """Vehicle log to write, too."""
     dead_reckon: TrackErrors | None = None
@@ -95,8 +98,8 @@ def import_log(
     is counted, by reason, in warnings and in the result.
 
     Args:
-        path: a bag of ROS 1 or 2, ArduSub's .BIN, .log or .tlog, PX4's .ulg, a QGroundControl CSV,
-            or the reports of a DVL.
+        path: a bag of ROS 1 or 2, ArduSub's .BIN, .log or .tlog, PX4's .ulg, or the
+            reports of a DVL.
         out: CSV to write.
         options: what to change, and what to choose.
 
@@ -203,9 +206,7 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
     """
     from missions.logs.ardusub import read_ardusub_bin, read_ardusub_tlog
     from missions.logs.bag_reader import is_bag
-    from missions.logs.pd0 import is_pd0, read_pd0
     from missions.logs.px4_ulog import is_ulog, read_px4_ulog
-    from missions.logs.qgc_csv import read_qgc_csv
     from missions.logs.ros_bag import read_ros_bag
     from missions.logs.waterlinked import is_waterlinked, read_waterlinked
 
@@ -224,18 +225,15 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
         return read_waterlinked(path, chosen)
     if suffix in (".ulg", ".ulog") or is_ulog(path):
         return read_px4_ulog(path, chosen)
-    if suffix == ".pd0" or is_pd0(path):
-        return read_pd0(path, chosen)
     if suffix in (".bin", ".log"):
         return read_ardusub_bin(path, chosen, datum)
     if suffix == ".tlog":
         return read_ardusub_tlog(path, chosen)
-    if suffix == ".csv":
-        return read_qgc_csv(path, chosen, options.time_zone)
+    if suffix in _NOT_READ:
+        raise NavigationError(f"{path}: {_NOT_READ[suffix]}")
     raise NavigationError(
         f"{path}: not a known log: a ROS bag (.bag, .mcap, .db3 or a folder), ArduSub's .BIN, "
-        ".log or .tlog, PX4's .ulg, QGroundControl's .csv, JSON reports of a Water Linked DVL, or "
-        "PD0 of a Teledyne DVL"
+        ".log or .tlog, PX4's .ulg, or JSON reports of a Water Linked DVL"
     )
 
 

@@ -1,19 +1,58 @@
-"""Quantities of a dive from a log of named messages: for each, the best message that is there."""
+"""Quantities of a dive from a log of named messages: for each, the best message that is there.
 
+Libraries read the messages. What they are given is checked here first, and what they print or raise
+on a damaged log ends in one line.
+"""
+
+import contextlib
+import os
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from alice_survey.core.errors import NavigationError
+from alice_survey.core.contents import one_line
+from alice_survey.core.errors import NavigationError, why
 from alice_survey.core.frames import Array
-from missions.logs.dataflash import LogTable, Mask
 from missions.logs.dive import ROLES, LoggedDive, Signal, cleaned, usable_positions
+
+MAX_LOG_BYTES = 4_000_000_000
 
 _INSTANCE = ("C", "I", "Instance", "id")
 """Fields that identify one of several cores or sensors."""
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LogTable:
+    """All messages of one name."""
+
+    name: str
+    columns: dict[str, Array]
+    """(N,) numbers by field."""
+    texts: dict[str, list[str]] = field(default_factory=dict)
+    """Fields of text."""
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values()), ()))
+
+    def has(self, *names: str) -> bool:
+        """Whether all of these columns are there."""
+        return all(name in self.columns for name in names)
+
+    def rows(self, keep: Mask) -> "LogTable":
+        """The rows of numbers where a mask, (N,), holds."""
+        columns = {name: column[keep] for name, column in self.columns.items()}
+        return LogTable(name=self.name, columns=columns)
+
+    def stacked(self, *names: str) -> Array:
+        """Columns side by side, (N, k)."""
+        return np.stack([self.columns[name] for name in names], axis=1)
+
 
 Tables = Mapping[str, LogTable]
 Reader = Callable[[LogTable, Tables], tuple[Array, Array] | str]
@@ -198,3 +237,46 @@ def _one_instance(
 def with_time(table: LogTable, time_s: Array) -> LogTable:
     """A table whose rows have times, (N,) seconds."""
     return replace(table, columns={**table.columns, "time_s": time_s})
+
+
+def first_bytes(path: Path, count: int) -> bytes:
+    """The first bytes of a log.
+
+    Raises:
+        NavigationError: it cannot be read, or is too large for one.
+    """
+    try:
+        with path.open("rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            start = file.read(count)
+    except OSError as error:
+        raise NavigationError(f"{path}: cannot be read: {why(error)}") from None
+    if size > MAX_LOG_BYTES:
+        raise NavigationError(f"{path}: is larger than {MAX_LOG_BYTES // 10**9} GB: cut it")
+    return start
+
+
+@contextlib.contextmanager
+def read_by(library: str, path: Path) -> Iterator[None]:
+    """Silence a library that reads a log, and turn what it raises into one line.
+
+    Raises:
+        NavigationError: it has raised something; the message says what.
+    """
+    with (
+        open(os.devnull, "w") as nowhere,  # noqa: PTH123  it is no path
+        contextlib.redirect_stdout(nowhere),
+        contextlib.redirect_stderr(nowhere),
+    ):
+        try:
+            yield
+        except (NavigationError, MemoryError):
+            raise
+        except ImportError:
+            raise NavigationError(
+                f"{path}: {library} is needed to read it: pip install 'alice-survey[mavlink]'"
+            ) from None
+        except Exception as error:  # damaged logs raise all kinds
+            raise NavigationError(
+                f"{path}: cannot be read by {library}: {one_line(error)}"
+            ) from None

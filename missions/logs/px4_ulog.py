@@ -1,39 +1,40 @@
 """PX4's on-board log (.ulg) as a logged dive.
 
-The format describes itself: definitions of message types (F), which number stands for which of them
-(A), and their packed values (D), each behind its length (docs.px4.io, "ULog File Format"). What the
-messages hold: docs.px4.io, "uORB Message Reference". Quaternions of `vehicle_attitude` are of the
-FRD body in NED, with w first; `eph` is the root of the summed variances of north and east.
+pyulog reads it. What the messages hold: docs.px4.io, "uORB Message Reference". Quaternions of
+`vehicle_attitude` are of the FRD body in NED, with w first; `eph` is the root of the summed
+variances of north and east.
 """
 
-import re
-import struct
+import io
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from alice_survey.core.errors import NavigationError
 from alice_survey.core.frames import Array, Datum, attitude_from_rotation
-from missions.logs.dataflash import LogTable, Mask
 from missions.logs.dive import LoggedDive, Signal, cleaned
-from missions.logs.message_sources import Keep, Source, Tables, dive_from, take, with_time
+from missions.logs.message_sources import (
+    Keep,
+    LogTable,
+    Mask,
+    Source,
+    Tables,
+    dive_from,
+    first_bytes,
+    read_by,
+    take,
+    with_time,
+)
 
 MAGIC = b"ULog\x01\x12\x35"
 _HEADER = 16
-_TYPES = {
-    "int8_t": "i1", "uint8_t": "u1", "int16_t": "<i2", "uint16_t": "<u2", "int32_t": "<i4",
-    "uint32_t": "<u4", "int64_t": "<i8", "uint64_t": "<u8", "float": "<f4", "double": "<f8",
-    "bool": "u1", "char": "S1",
-}  # fmt: skip
-_FIELD = re.compile(r"(\w+)(?:\[(\d+)\])? +(\w+)")
-_APPENDED = 1
-"""Flag of a log that was written on later, after a crash."""
-_DEEPEST, _MAX_FIELDS = 8, 4096
+_MAX_DEPTH, _MAX_FIELDS = 8, 4096
+_MAX_READS = 8
+"""Times that a log may be read over."""
 _FIX_3D = 3
 _DOWN = 25
 """ROTATION_PITCH_270: a range finder that looks down."""
@@ -214,103 +215,59 @@ def read_ulog(
     Raises:
         NavigationError: it is not such a log, or cannot be read.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise NavigationError(f"{path}: cannot be read: {error.strerror}") from None
-    if not data.startswith(MAGIC) or len(data) < _HEADER:
+    if not first_bytes(path, _HEADER).startswith(MAGIC):
         raise NavigationError(f"{path}: no log of PX4: it does not begin with ULog")
-    forms: dict[str, str] = {}
-    topics: dict[int, tuple[str, int]] = {}
-    starts: dict[int, list[int]] = {}
-    ends: dict[int, int] = {}
-    for kind, start, end in _messages(path, data, lost):
-        if kind == b"F":
-            name, _, fields = data[start:end].decode("ascii", "replace").partition(":")
-            forms[name] = fields
-        elif kind == b"A" and end - start > 3:
-            instance, number = struct.unpack_from("<BH", data, start)
-            topics[number] = (data[start + 3 : end].decode("ascii", "replace"), instance)
-        elif kind == b"D" and end - start > 2:
-            number = int.from_bytes(data[start : start + 2], "little")
-            shortest = ends.setdefault(number, end - start - 2)
-            ends[number] = min(shortest, end - start - 2)
-            starts.setdefault(number, []).append(start + 2)
-        elif kind == b"O":
-            lost["pauses of the recording"] += 1
+    with read_by("pyulog", path):
+        from pyulog import ULog
+
+        data = _Bounded(path.read_bytes())
+        log = ULog(data, None, parse_header_only=True)
+        forms = {name: form.fields for name, form in log.message_formats.items()}
+        for name in forms:
+            if _field_count(name, forms) > _MAX_FIELDS:
+                raise NavigationError(f"{path}: message {name} has over {_MAX_FIELDS} fields")
+        log = ULog(_Bounded(path.read_bytes()), None)
+        if log.dropouts:
+            lost["pauses of the recording"] += len(log.dropouts)
+        if log.file_corruption:
+            lost["(the log is damaged: messages are left out)"] += 1
     parts: dict[str, list[LogTable]] = {}
-    view = np.frombuffer(data, np.uint8)
-    for number, (name, instance) in sorted(topics.items(), key=lambda item: item[1]):
-        if name not in wanted or number not in starts:
-            continue
-        kept = _dtype(name, forms)
-        if kept is None or kept.itemsize > ends[number]:
-            lost[f"{name}: messages that do not fit their definition"] += len(starts[number])
-            continue
-        raw = view[np.array(starts[number])[:, None] + np.arange(kept.itemsize)]
-        parts.setdefault(name, []).append(_table(name, instance, raw.view(kept)[:, 0]))
-    present = sorted({name for number, (name, _) in topics.items() if number in starts})
+    for topic in log.data_list:
+        if topic.name in wanted:
+            columns = {n: np.asarray(v, dtype=np.float64) for n, v in topic.data.items()}
+            columns["Instance"] = np.full(len(columns["timestamp"]), float(topic.multi_id))
+            parts.setdefault(topic.name, []).append(LogTable(name=topic.name, columns=columns))
+    present = sorted({topic.name for topic in log.data_list})
     return {name: _joined(own) for name, own in parts.items()}, present
 
 
-def _messages(path: Path, data: bytes, lost: Counter[str]) -> Iterator[tuple[bytes, int, int]]:
-    """Kind, start and end of every message's content."""
-    place, stops = _HEADER, [len(data)]
-    while place + 3 <= len(data):
-        size = int.from_bytes(data[place : place + 2], "little")
-        kind, start, end = data[place + 2 : place + 3], place + 3, place + 3 + size
-        if kind == b"B" and size >= 40:
-            incompatible = data[start + 8 : start + 16]
-            if incompatible[0] & ~_APPENDED or any(incompatible[1:]):
-                raise NavigationError(f"{path}: a later kind of ULog, which is not known")
-            offsets = struct.unpack_from("<3Q", data, start + 16)
-            stops = sorted({*(o for o in offsets if _HEADER < o < len(data)), len(data)})
-        stop = next(s for s in stops if s > place)
-        if end > stop:  # cut off, at the end or where the log was written on
-            lost["bytes of a message cut off"] += stop - place
-            place = stop
-            continue
-        yield kind, start, end
-        place = end
+class _Bounded(io.BytesIO):
+    """Bytes that are read a few times at most: pyulog goes back where they are damaged."""
+
+    def __init__(self, data: bytes) -> None:
+        super().__init__(data)
+        self._reads_left = _MAX_READS * (len(data) + 1024)
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        found = super().read(size)
+        self._reads_left -= len(found) + 1
+        if self._reads_left < 0:
+            raise EOFError("it is damaged")
+        return found
 
 
-def _dtype(name: str, forms: Mapping[str, str]) -> np.dtype[Any] | None:
-    """Record type of a message without the padding at its end; None where it is not known."""
-    fields = _fields(name, forms, 0)
-    while fields and fields[-1][0].startswith("_padding"):
-        fields.pop()
-    if not fields or any(not kind for _, kind in fields) or len(fields) > _MAX_FIELDS:
-        return None
-    if len({field for field, _ in fields}) < len(fields):
-        return None
-    return np.dtype(fields)
-
-
-def _fields(name: str, forms: Mapping[str, str], depth: int) -> list[tuple[str, str]]:
-    """Name and type of every number; an empty type where it is not known."""
-    found: list[tuple[str, str]] = []
-    for text in filter(None, forms.get(name, "").split(";")):
-        match = _FIELD.fullmatch(text.strip())
-        if match is None or depth > _DEEPEST or len(found) > _MAX_FIELDS:
-            return [(text, "")]
-        kind, count, field = match[1], match[2], match[3]
-        if field.startswith("_padding"):
-            found.append((f"{field}{len(found)}", f"S{count or 1}"))
-            continue
-        each = [field] if count is None else [f"{field}[{i}]" for i in range(min(int(count), 999))]
-        if kind in _TYPES:
-            found += [(one, _TYPES[kind]) for one in each]
-            continue
-        inner = _fields(kind, forms, depth + 1) or [("", "")]
-        found += [(f"{one}.{sub}", own) for one in each for sub, own in inner]
-    return found
-
-
-def _table(name: str, instance: int, records: Any) -> LogTable:
-    numbers = [f for f in records.dtype.names if records.dtype[f].kind != "S"]
-    columns = {field: records[field].astype(np.float64) for field in numbers}
-    columns["Instance"] = np.full(len(records), float(instance))
-    return LogTable(name=name, columns=columns, texts={})
+def _field_count(
+    name: str, forms: Mapping[str, Sequence[tuple[str, int, str]]], depth: int = 0
+) -> int:
+    """How many numbers a message holds, up to a few more than are allowed."""
+    if depth > _MAX_DEPTH:
+        return _MAX_FIELDS + 1
+    total = 0
+    for kind, count, _ in forms.get(name, ()):
+        total += max(count, 1) * (_field_count(kind, forms, depth + 1) if kind in forms else 1)
+        if total > _MAX_FIELDS:
+            return total
+    return total
 
 
 def _joined(parts: list[LogTable]) -> LogTable:
@@ -320,4 +277,4 @@ def _joined(parts: list[LogTable]) -> LogTable:
     columns = {field: np.concatenate([p.columns[field] for p in parts]) for field in shared}
     order = np.argsort(columns.get("timestamp", columns["Instance"]), kind="stable")
     columns = {field: column[order] for field, column in columns.items()}
-    return LogTable(name=parts[0].name, columns=columns, texts={})
+    return LogTable(name=parts[0].name, columns=columns)

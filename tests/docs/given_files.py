@@ -29,7 +29,6 @@ from tests.alice_survey.sim.vehicle.identification.manoeuvres import fly, hidden
 from tests.camera_calib.calibration_scenes import board_poses, in_air
 from tests.cameras import changed
 from tests.missions.logs.log_files import Bag, dataflash_log, tlog
-from tests.missions.logs.test_import_pd0 import log_of
 from tests.missions.logs.test_import_ulog import dive as px4_dive
 from tests.missions.logs.test_import_ulog import ulog
 from tests.oracles_targets import BLACK, WALL, WHITE, to_srgb
@@ -279,7 +278,15 @@ def vehicle_logs(reef: Path, folder: Path) -> None:
     bag.write(folder / "sparus2.bag")
     dvl.write(folder / "dvl.bag")
     (folder / "flight.ulg").write_bytes(ulog(px4_dive()))
-    log_of(0x10, folder / "dvl.pd0", 100)
+    reports = [
+        '{"time": 100.0, "vx": 0.2, "vy": 0.0, "vz": 0.0, "altitude": 2.5, '
+        f'"velocity_valid": true, "time_of_validity": {1_714_564_800_000_000 + 100_000 * i}, '
+        '"type": "velocity"}\n'
+        f'{{"ts": {1_714_564_800 + 0.1 * i}, "roll": 0.0, "pitch": 0.0, "yaw": 0.0, '
+        f'"type": "position_local"}}\n'
+        for i in range(100)
+    ]
+    (folder / "dvl.json").write_text("".join(reports))
     (folder / "00000042.BIN").write_bytes(dataflash_log(messages))
     (folder / "dive.tlog").write_bytes(tlog(records))
     with (folder / "tides.csv").open("w", newline="") as file:

@@ -84,12 +84,6 @@ def _ulog(folder: Path) -> None:
     (folder / "a.ulg").write_bytes(ulog(dive(6)))
 
 
-def _pd0(folder: Path, transform: int) -> None:
-    from tests.missions.logs.test_import_pd0 import log_of
-
-    log_of(transform, folder / "a.pd0", 6)
-
-
 def read_pairing(path: Path) -> object:
     """As `import-images --triggers`."""
     from reconstruct.pictures.pairing import pair_by_time
@@ -128,17 +122,6 @@ def _telemetry(folder: Path) -> None:
             (t, mavlink.MAVLink_distance_sensor_message(ms, 20, 3000, 180 + i, 0, 0, 25, 255)),
         ]
     (folder / "a.tlog").write_bytes(tlog(records))
-
-
-def _qgc(folder: Path) -> None:
-    rows = [
-        "Timestamp,roll,pitch,heading,altitudeRelative,gps.lat,gps.lon,"
-        "apmSubInfo.rangefinderDistance"
-    ]
-    rows += [
-        f"2024-05-01 14:00:{i:02d}.100,1.0,-2.0,{i}.0,-3.0,60.1{i:03d},5.25,2.0" for i in range(9)
-    ]
-    (folder / "a.csv").write_text("\n".join(rows) + "\n")
 
 
 def navigation_rows(*, dated: bool) -> list[str]:
@@ -350,14 +333,6 @@ TARGETS = (
     ),
     Target(name="ULog", syntax="binary", file="a.ulg", build=_ulog, read=read_any_log),
     Target(
-        name="PD0, beams", syntax="binary", file="a.pd0",
-        build=partial(_pd0, transform=0x00), read=read_any_log,
-    ),
-    Target(
-        name="PD0, ship", syntax="binary", file="a.pd0",
-        build=partial(_pd0, transform=0x14), read=read_any_log,
-    ),
-    Target(
         name="trigger log of pictures", syntax="csv", file="p.csv", build=_pairing,
         read=read_pairing,
     ),
@@ -370,7 +345,6 @@ TARGETS = (
         build=partial(_dataflash, name="a.log"), read=read_any_log,
     ),
     Target(name="tlog", syntax="binary", file="a.tlog", build=_telemetry, read=read_any_log),
-    Target(name="QGC CSV", syntax="csv", file="a.csv", build=_qgc, read=read_any_log),
     _csv("navigation CSV", "n.csv", partial(navigation_rows, dated=False), read_nav),
     _csv("navigation CSV, dated", "n.csv", partial(navigation_rows, dated=True), read_nav),
     Target(name="triggers", syntax="csv", file="t.csv", build=_triggers, read=read_triggers),

@@ -156,57 +156,85 @@ def import_control(
         "import-log 00000042.BIN --declination 3.4 --tide tides.csv -o navigation.csv",
         "import-log dive.tlog --topic depth=VFR_HUD --vehicle-log vehicle.csv -o navigation.csv",
         "import-log dvl.bag --dead-reckon --start-at 43.05 5.92 10 -o navigation.csv",
-        "import-log dvl.pd0 --dead-reckon --start-at 43.05 5.92 10 -o navigation.csv",
+        "import-log dvl.json --dead-reckon --start-at 43.05 5.92 10 -o navigation.csv",
     ),
 )
 def import_log(
     log: Annotated[
-        Path, typer.Argument(help="ROS bag; ArduSub, PX4 or QGC log; PD0 or JSON of a DVL.")
+        Path, typer.Argument(help="ROS bag, log of ArduSub or PX4, or JSON of a Water Linked DVL.")
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="CSV to write.")],
-    declination: Annotated[float, typer.Option(help="Added to headings, deg; east +.")] = 0.0,
-    tide: Annotated[str, typer.Option(help="Water above the depths' level: m, or a CSV.")] = "0",
-    clock_offset: Annotated[float, typer.Option(help="s; added to the log's times.")] = 0.0,
-    start: Annotated[float | None, typer.Option(help="s after the first position.")] = None,
-    end: Annotated[float | None, typer.Option(help="s after the first position.")] = None,
+    declination: Annotated[
+        float, typer.Option(help="Add this declination to headings, degrees; east is positive.")
+    ] = 0.0,
+    tide: Annotated[
+        str, typer.Option(help="Height of the water above the level of depths: metres, or a CSV.")
+    ] = "0",
+    clock_offset: Annotated[
+        float, typer.Option(metavar="SECONDS", help="Add this to the times of the log.")
+    ] = 0.0,
+    start: Annotated[
+        float | None,
+        typer.Option(metavar="SECONDS", help="Begin so long after the first position."),
+    ] = None,
+    end: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="End so long after the first position.")
+    ] = None,
     topic: Annotated[
-        list[str] | None, typer.Option(metavar="ROLE=NAME", help="Topic or message to use.")
+        list[str] | None,
+        typer.Option(
+            metavar="ROLE=NAME",
+            help="Use this topic or message for navigation, depth, attitude, altitude or velocity.",
+        ),
     ] = None,
     datum: Annotated[
-        tuple[float, float] | None, typer.Option(help="Origin of a bag's odometry or of XKF1, deg.")
+        tuple[float, float] | None,
+        typer.Option(
+            metavar="LATITUDE LONGITUDE", help="Origin of the odometry of a bag, or of XKF1."
+        ),
     ] = None,
     lever_arm: Annotated[
-        tuple[float, float, float], typer.Option(help="Of the logged position on the body, m.")
+        tuple[float, float, float],
+        typer.Option(metavar="X Y Z", help="Place on the body that the logged position is of, m."),
     ] = (0.0, 0.0, 0.0),
-    altitude_offset: Annotated[float, typer.Option(help="Added to altitudes, m.")] = 0.0,
-    start_utc: Annotated[str | None, typer.Option(help="Date of a log without dates.")] = None,
-    time_zone: Annotated[str, typer.Option(help="Of a CSV's dates.")] = "UTC",
-    vehicle_log: Annotated[Path | None, typer.Option(help="Vehicle log to write, too.")] = None,
+    altitude_offset: Annotated[
+        float, typer.Option(metavar="METRES", help="Add this to altitudes.")
+    ] = 0.0,
+    start_utc: Annotated[
+        str | None,
+        typer.Option(metavar="DATE", help="Date of the first position of a log without dates."),
+    ] = None,
+    vehicle_log: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write a vehicle log too.")
+    ] = None,
     dead_reckon: Annotated[
-        bool, typer.Option("--dead-reckon", help="Positions from velocities, tied to fixes.")
+        bool,
+        typer.Option("--dead-reckon", help="Compute positions from velocities, tied to fixes."),
     ] = False,
     start_at: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(help="Of the first velocity: latitude, longitude, deg, and sigma, m."),
+        typer.Option(
+            metavar="LATITUDE LONGITUDE SIGMA", help="Place of the first velocity and its sigma, m."
+        ),
     ] = None,
     speed_sigma: Annotated[
-        float, typer.Option(help="Of dead reckoning: relative error of speeds.")
+        float, typer.Option(help="Relative error of speeds in dead reckoning.")
     ] = 0.005,
     heading_sigma: Annotated[
-        float, typer.Option(help="Of dead reckoning: constant error of headings, deg.")
+        float, typer.Option(help="Constant error of headings in dead reckoning, degrees.")
     ] = 1.0,
     velocity_noise: Annotated[
-        float, typer.Option(help="Of dead reckoning: over one second, m/s.")
+        float, typer.Option(help="Noise of velocities over one second in dead reckoning, m/s.")
     ] = 0.02,
     flip_velocity: Annotated[
-        bool, typer.Option("--flip-velocity", help="Velocities of a DVL the other way round.")
+        bool, typer.Option("--flip-velocity", help="Turn the velocities of a DVL round.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Turn a vehicle's own log into the navigation CSV of import-images.
 
     ROS 1 and ROS 2 bags (COLA2 and common messages), ArduSub's DataFlash and telemetry logs, PX4's
-    .ulg, PD0 of Teledyne's DVLs and JSON of Water Linked's.
+    .ulg, and JSON of Water Linked's DVLs.
     """
     from missions.logs.dead_reckoning import TrackErrors
     from missions.logs.import_log import ImportOptions
@@ -215,7 +243,7 @@ def import_log(
     options = ImportOptions(
         declination_deg=declination, tide=tide, clock_offset_s=clock_offset, start_s=start,
         end_s=end, topics=topic or (), datum_deg=datum, lever_body_m=lever_arm,
-        altitude_offset_m=altitude_offset, start_utc=start_utc, time_zone=time_zone,
+        altitude_offset_m=altitude_offset, start_utc=start_utc,
         vehicle_log=vehicle_log, start_at=start_at,
         flip_velocity=flip_velocity,
         dead_reckon=(

@@ -1,6 +1,5 @@
-"""Commands that fly a plan with a vehicle outside this program, or offer it a simulated one."""
+"""The command that flies a plan with a vehicle outside this program, or is that vehicle."""
 
-import math
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -24,6 +23,7 @@ app = typer.Typer()
         "pilot -w reef --odometry /auv/odom --altitude /auv/altimeter --record dive.csv",
         "pilot -w reef --sim-time",
         "pilot -w reef --mavlink udpin:127.0.0.1:14550",
+        "pilot -w reef --simulated --rate 0 --track truth.csv",
     )
 )
 def pilot(
@@ -31,44 +31,85 @@ def pilot(
     survey: SurveyFile = None,
     mavlink: Annotated[
         str | None,
-        typer.Option(metavar="ADDRESS", help="ArduSub, such as udpin:127.0.0.1:14550, not ROS 2."),
+        typer.Option(
+            metavar="ADDRESS", help="Fly ArduSub over MAVLink, such as udpin:127.0.0.1:14550."
+        ),
     ] = None,
     odometry: Annotated[
-        str, typer.Option(metavar="TOPIC", help="nav_msgs/Odometry from the plan's datum.")
+        str, typer.Option(metavar="TOPIC", help="Topic of nav_msgs/Odometry from the plan's datum.")
     ] = "navigation/odometry",
     altitude: Annotated[
-        str, typer.Option(metavar="TOPIC", help="sensor_msgs/Range of the altimeter.")
+        str, typer.Option(metavar="TOPIC", help="Topic of sensor_msgs/Range of the altimeter.")
     ] = "altimeter",
     altimeter: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(metavar="X Y Z", help="Its place: forward, right, down, m; else the DVL's."),
+        typer.Option(
+            metavar="X Y Z",
+            help="Place of the altimeter: forward, right, down, m; that of the DVL if not given.",
+        ),
     ] = None,
     sim_time: Annotated[
         bool,
-        typer.Option("--sim-time", help="Tick by the simulator's clock."),
+        typer.Option("--sim-time", help="Tick by the clock of a simulator."),
     ] = False,
     on_loss: Annotated[
         Literal["surface", "drift"],
-        typer.Option(help="When odometry is lost for good: push up, or leave thrusters off."),
+        typer.Option(help="Push up, or leave thrusters off, when odometry is lost for good."),
     ] = "surface",
     grace: Annotated[
-        float, typer.Option(min=0, max=600, help="s without thrust until it is lost for good.")
+        float,
+        typer.Option(
+            min=0, max=600, metavar="SECONDS", help="Wait this long before it is lost for good."
+        ),
     ] = 5.0,
     odometry_age: Annotated[
-        float, typer.Option(min=0.05, max=5, help="s; older odometry is not flown by.")
+        float,
+        typer.Option(min=0.05, max=5, metavar="SECONDS", help="Refuse odometry older than this."),
     ] = 0.5,
     record: Annotated[
-        Path | None, typer.Option(help="CSV of what was flown by and commanded.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Write what was flown by and commanded as CSV."),
+    ] = None,
+    simulated: Annotated[
+        bool, typer.Option("--simulated", help="Be the vehicle instead, for any pilot over ROS 2.")
+    ] = False,
+    takes: Annotated[
+        Literal["thrusters", "wrench"],
+        typer.Option(help="Commands that the simulated vehicle follows."),
+    ] = "thrusters",
+    rate: Annotated[
+        float,
+        typer.Option(
+            min=0,
+            max=1000,
+            help="Speed of the simulated vehicle, times real time; 0 waits for each command.",
+        ),
+    ] = 1.0,
+    track: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the simulated true track as CSV.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Fly the plan with a vehicle outside this program.
+    """Fly the plan with a vehicle outside this program, or be that vehicle in simulation.
 
-    By the pilot of the simulation. A ROS 2 node: odometry and altitude in, wrench and thruster
-    speeds out; or over MAVLink velocities and headings for ArduSub in GUIDED. Ends at the surface;
-    exit code 1 unless the mission was complete.
+    Flies as the pilot of the simulation does. As a ROS 2 node it takes odometry and altitude and
+    gives wrench and thruster speeds; over MAVLink it gives velocities and headings to ArduSub in
+    GUIDED. It ends at the surface, with exit code 1 unless the mission was complete. With
+    --simulated it is the other side: dynamics, sea and sensors of the vehicle as a ROS 2 node on a
+    simulated clock.
     """
     from alice_survey.app.pipeline import settings
+
+    if simulated:
+        from missions.live.ros_vehicle import Pace
+        from missions.live.run import simulate_report
+
+        survey_settings = settings(workspace, survey, needed=True)
+        result = simulate_report(
+            workspace, survey_settings, takes=takes, pace=Pace(rate=rate), track=track
+        )
+        print_result(*result, as_json)
+        return
     from missions.live.loop import LinkLimits
     from missions.live.mavlink_pilot import pilot_over_mavlink
     from missions.live.mission import LiveMission
@@ -92,48 +133,14 @@ def pilot(
 
 
 @app.command(
-    epilog=examples(
-        "simulate --ros -w reef",
-        "simulate --ros -w reef --rate 10 --takes wrench",
-        "simulate --ros -w reef --rate 0 --track truth.csv",
-    )
+    hidden=True, context_settings={"allow_extra_args": True, "ignore_unknown_options": True}
 )
-def simulate(
-    workspace: Workspace = WORK,
-    survey: SurveyFile = None,
-    ros: Annotated[bool, typer.Option("--ros", help="As a ROS 2 node.")] = False,
-    takes: Annotated[
-        Literal["thrusters", "wrench"], typer.Option(help="Commands that are followed.")
-    ] = "thrusters",
-    rate: Annotated[
-        float,
-        typer.Option(min=0, max=1000, help="Times real time; 0: wait for each tick's command."),
-    ] = 1.0,
-    longest: Annotated[
-        float | None, typer.Option(min=0.05, help="Simulated s after which it ends.")
-    ] = None,
-    patience: Annotated[
-        float, typer.Option(min=1, help="s to wait for a command at rate 0.")
-    ] = 600.0,
-    track: Annotated[Path | None, typer.Option(help="CSV of the true track.")] = None,
-    as_json: AsJson = False,
-) -> None:
-    """Simulate the vehicle for a pilot outside this program.
+def simulate(context: typer.Context) -> None:
+    """Run 'pilot --simulated' under its former name."""
+    from alice_survey.core.errors import note
 
-    Its dynamics, sea and sensors as a ROS 2 node on a simulated clock: thruster speeds or a wrench
-    in; odometry, truth, altimeter, DVL, IMU and thruster speeds out. 'alice-survey fly' flies the
-    whole plan instead.
-    """
-    from alice_survey.app.pipeline import settings
-    from missions.live.ros_vehicle import Pace
-    from missions.live.run import simulate_report
-
-    if not ros:
-        raise typer.BadParameter("give --ros: there is no other way to reach the vehicle yet")
-    pace = Pace(
-        rate=rate, max_s=math.inf if longest is None else longest, patience_s=patience
-    )  # fmt: skip
-    result = simulate_report(
-        workspace, settings(workspace, survey, needed=True), takes=takes, pace=pace, track=track
-    )
-    print_result(*result, as_json)
+    note("'simulate' is now 'pilot --simulated', and is gone in the next version")
+    assert context.parent is not None  # noqa: S101  it is a command of the program
+    command = context.parent.command.get_command(context, "pilot")  # type: ignore[attr-defined]
+    given = [argument for argument in context.args if argument != "--ros"]
+    command.main([*given, "--simulated"], context.info_name, standalone_mode=False)

@@ -211,10 +211,10 @@ def test_sensors_measure_what_is_true(afloat: VehicleNode) -> None:
 
 @pytest.mark.slow
 def test_dive_of_two_processes_covers_what_the_closed_loop_does(workspace: Path) -> None:
-    """Tick by tick on the simulation's clock: `simulate --ros` and `pilot` over the loopback."""
+    """Tick by tick on the simulation's clock: `pilot --simulated` and `pilot` over the loopback."""
     track, record = workspace / "track.csv", workspace / "record.csv"
     at_sea = subprocess.Popen(
-        command("simulate", "--ros", "-w", str(workspace), "--rate", "0", "--track", str(track)),
+        command("pilot", "--simulated", "-w", str(workspace), "--rate", "0", "--track", str(track)),
         env=DOMAIN, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:
