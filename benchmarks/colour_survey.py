@@ -27,9 +27,16 @@ from alice_survey.core.config import (
 from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Array, Datum, rotation_from_attitude
 from alice_survey.sim.seafloor.as_built import true_rig
-from alice_survey.sim.seafloor.light import CameraLight, camera_light
+from alice_survey.sim.seafloor.light import (
+    CameraLight,
+    Sensor,
+    camera_light,
+    develop,
+    expose,
+    make_sensor,
+    nominal_gain,
+)
 from alice_survey.sim.seafloor.renderer import Scene, flat_floor_radiance, range_map, render
-from alice_survey.sim.seafloor.sensor import Sensor, develop, expose, make_sensor, nominal_gain
 from alice_survey.sim.seafloor.terrain import Terrain, build_terrain
 from alice_survey.sim.seafloor.texture import SAND_ALBEDO, Texture, survey_texture
 from camera_calib.approximation.pinhole_warp import best_warp

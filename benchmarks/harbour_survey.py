@@ -22,9 +22,15 @@ from alice_survey.core.config import CameraConfig, ImagingConfig, WaterConfig
 from alice_survey.core.executor import Executor
 from alice_survey.core.frames import BODY_FROM_NADIR_CAM, Array, Datum, rotation_from_attitude
 from alice_survey.sim.seafloor.as_built import true_rig
-from alice_survey.sim.seafloor.light import CameraLight, camera_light
+from alice_survey.sim.seafloor.light import (
+    MIDDLE_GREY,
+    CameraLight,
+    Sensor,
+    camera_light,
+    develop,
+    expose,
+)
 from alice_survey.sim.seafloor.renderer import Scene, flat_floor_radiance, render
-from alice_survey.sim.seafloor.sensor import MIDDLE_GREY, Sensor, develop, expose
 from alice_survey.sim.seafloor.texture import SAND_ALBEDO, survey_texture
 from benchmarks.harbour_meshes import moving_at, still_harbour
 from benchmarks.harbour_scene import PILE

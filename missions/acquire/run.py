@@ -26,9 +26,16 @@ from alice_survey.core.records import BoardRecord, PicturesRecord
 from alice_survey.core.trajectory import Trajectory, read_columns, read_track
 from alice_survey.sim.seafloor.as_built import true_rig
 from alice_survey.sim.seafloor.board import PoolBoard, board_records, pool_poses, render_board
-from alice_survey.sim.seafloor.light import CameraLight, camera_light
+from alice_survey.sim.seafloor.light import (
+    CameraLight,
+    Sensor,
+    camera_light,
+    develop,
+    expose,
+    make_sensor,
+    nominal_gain,
+)
 from alice_survey.sim.seafloor.renderer import Scene, flat_floor_radiance, range_map, render
-from alice_survey.sim.seafloor.sensor import Sensor, develop, expose, make_sensor, nominal_gain
 from alice_survey.sim.seafloor.terrain import read_terrain, survey_terrain
 from alice_survey.sim.seafloor.texture import SAND_ALBEDO, survey_texture
 from camera_calib.camera import Camera

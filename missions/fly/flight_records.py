@@ -162,8 +162,8 @@ def _coverage(flight: Flight, rig: Rig) -> dict[str, float]:
     """What the pictures of the true track see of the whole area; `plan check` shows more."""
     if not len(flight.trigger_s):
         return {"covered_share": 0.0, "every_camera_share": 0.0, "share_at_overlap": 0.0}
-    wanted = plan_pattern(flight.plan, rig)
-    seen = certificate(flight.plan.area, rig, stations_of_flight(flight), wanted)
+    pattern = plan_pattern(flight.plan, rig)
+    seen = certificate(flight.plan.area, rig, stations_of_flight(flight), pattern)
     return {
         "covered_share": seen.covered_share,
         "every_camera_share": seen.every_camera_share,

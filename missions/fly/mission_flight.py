@@ -184,15 +184,15 @@ def pilot_mission(
             lacks.
     """
     mission, plan = known.mission, known.plan
-    wanted = vehicle.follower or mission.autopilot
-    if wanted != mission.autopilot:
+    follower = vehicle.follower or mission.autopilot
+    if follower != mission.autopilot:
         raise VehicleError(
-            f"{known.path}: is a mission for {mission.autopilot}, which {wanted} does not read: "
-            f"give one of {wanted}'s, or leave the follower out"
+            f"{known.path}: is a mission for {mission.autopilot}, which {follower} does not read: "
+            f"give one of {follower}'s, or leave the follower out"
         )
     gains = gains_for(sound_craft_of(vehicle), plan.speed_mps)
     steps = _rows(known, mount)
-    if wanted == "ardusub":
+    if follower == "ardusub":
         if not sways(gains):
             raise VehicleError(
                 f"ArduSub holds on to its track sideways; {vehicle.name} has no thrusters for it: "

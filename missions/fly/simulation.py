@@ -178,11 +178,11 @@ def piloting_of(
     Raises:
         VehicleError: a setting does not fit the vehicle, or it cannot fly the plan's sway steps.
     """
-    craft = sound_craft_of(settings.vehicle)
-    diverging_mps = math.inf if craft.fins else pitch_divergence_speed_mps(craft)
+    vehicle = sound_craft_of(settings.vehicle)
+    diverging_mps = math.inf if vehicle.fins else pitch_divergence_speed_mps(vehicle)
     if plan.speed_mps > _PITCH_MARGIN * diverging_mps:
         warn(
-            f"the pitch of {craft.name} with {craft.coefficients.name!r} coefficients diverges "
+            f"the pitch of {vehicle.name} with {vehicle.coefficients.name!r} coefficients diverges "
             f"above {diverging_mps:.2f} m/s and is badly damped at the plan's {plan.speed_mps:g} "
             "m/s: lower the speed"
         )
@@ -190,7 +190,7 @@ def piloting_of(
     turns = turns_on_the_spot(path)
     if turns and mission.law == NO_LAW and settings.vehicle.controller == "los":
         warn(
-            f"{craft.name} cannot push itself sideways under the controller los: in each of the "
+            f"{vehicle.name} cannot push itself sideways under the controller los: in each of the "
             f"{turns} turns on the spot it swings off its place and drifts with the current; "
             "plan.turns = 'arcs' suits it better"
         )
@@ -199,8 +199,8 @@ def piloting_of(
     reference = (0.0, 0.0, 0.0)
     followed_body_m = settings.camera.position_body_m if mission.law == NO_LAW else reference
 
-    def piloted(left: Mapping[str, float]) -> tuple[Gains, Guidance]:
-        gains = gains_for(craft.weakened(left), plan.speed_mps)
+    def pilot_without(left: Mapping[str, float]) -> tuple[Gains, Guidance]:
+        gains = gains_for(vehicle.weakened(left), plan.speed_mps)
         guidance = pilot_guidance(
             gains,
             path,
@@ -224,22 +224,22 @@ def piloting_of(
         side, outside = roomier_side(plan, path, way_in_m, radius_m)
         if outside > _OUTSIDE:
             warn(
-                f"{outside:.0%} of the circle of {radius_m:.1f} m on which {craft.name} dives lies "
-                "outside of the allowed area or in zones: widen area.turn_margin_m, or move "
+                f"{outside:.0%} of the circle of {radius_m:.1f} m on which {vehicle.name} dives "
+                "lies outside of the allowed area or in zones: widen area.turn_margin_m, or move "
                 "plan.home_ne_m"
             )
         return gains, guidance._replace(under_way=guidance.under_way._replace(side=side))
 
     # The pilot flies as well as the thrusters allow that he knows to be sound.
     known = settings.vehicle.impaired if settings.vehicle.health_known else {}
-    gains, guidance = piloted(known)
+    gains, guidance = pilot_without(known)
     return Piloting(
-        vehicle=craft,
+        vehicle=vehicle,
         path=path,
         gains=gains,
         guidance=guidance,
         known_health=known,
-        without=piloted if settings.vehicle.finds_failures else None,
+        without=pilot_without if settings.vehicle.finds_failures else None,
     )
 
 
@@ -262,18 +262,18 @@ def mission_setup(
         mission: of way-points of the vehicle's reference point, flown instead of the plan's route.
     """
     flies = piloting_of(plan, settings, max_s, mission)
-    craft, path = flies.vehicle, flies.path
+    vehicle, path = flies.vehicle, flies.path
     gust, heading_rad = settings.sea.gust_n, float(path.heading_rad[0] + path.side_rad[0])
     # The vehicle is let go where its left port is above the start of the route.
     glass_ned = rotation_from_attitude(0.0, 0.0, heading_rad).apply(settings.camera.position_body_m)
     start_ne = np.array([path.start_n[0], path.start_e[0]]) - glass_ned[:2]
     return Setup(
-        vehicle=craft,
+        vehicle=vehicle,
         path=path,
         guidance=flies.guidance,
         gains=flies.gains,
         mission=mission,
-        sensors=sensors_of(settings.navigation, settings.camera).pack(craft.hull),
+        sensors=sensors_of(settings.navigation, settings.camera).pack(vehicle.hull),
         floor=floor,
         current=current_of(settings.sea, plan.seafloor_depth_m, max_s, rng),
         disturbance=Disturbance(
@@ -284,12 +284,12 @@ def mission_setup(
         known_health=flies.known_health,
         start_ne_m=(float(start_ne[0]), float(start_ne[1])),
         start_heading_rad=heading_rad,
-        failures=_failures(craft, settings.vehicle),
+        failures=_failures(vehicle, settings.vehicle),
         without=flies.without,
     )
 
 
-def _failures(craft: Vehicle, settings: VehicleConfig) -> tuple[Failure, ...]:
+def _failures(vehicle: Vehicle, settings: VehicleConfig) -> tuple[Failure, ...]:
     """Thrusters that fail on the way.
 
     Raises:
@@ -297,7 +297,7 @@ def _failures(craft: Vehicle, settings: VehicleConfig) -> tuple[Failure, ...]:
     """
     kinds = ((settings.failures, False), (settings.lost_propellers, True))
     for failures, _ in kinds:
-        craft.health_of({name: share for name, _, share in failures})
+        vehicle.health_of({name: share for name, _, share in failures})
     return tuple(
         Failure(thruster=name, time_s=time_s, left=share, turns=turns)
         for failures, turns in kinds

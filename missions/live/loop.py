@@ -282,7 +282,7 @@ class PilotLoop:
             thrust_n=pilot.allocation.thrust.copy(),
             rps=pilot.allocation.command.copy(),
             velocity_body=np.zeros(3) if blind else demand[slot.REF_SURGE : slot.REF_YAW].copy(),
-            heading_rad=math.nan if blind else float(pilot.state.report[slot.WANTED_HEADING]),
+            heading_rad=math.nan if blind else float(pilot.state.report[slot.TARGET_HEADING]),
         )
 
     def _off(self, now_s: float) -> Command:

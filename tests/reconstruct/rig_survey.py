@@ -23,9 +23,15 @@ from alice_survey.core.executor import Executor, local_executor
 from alice_survey.core.frames import BODY_FROM_NADIR_CAM, Datum, rotation_from_attitude
 from alice_survey.core.manifest import read_manifest
 from alice_survey.core.records import RegistrationRecord
-from alice_survey.sim.seafloor.light import CameraLight, camera_light
+from alice_survey.sim.seafloor.light import (
+    MIDDLE_GREY,
+    CameraLight,
+    Sensor,
+    camera_light,
+    develop,
+    expose,
+)
 from alice_survey.sim.seafloor.renderer import Scene, render
-from alice_survey.sim.seafloor.sensor import MIDDLE_GREY, Sensor, develop, expose
 from alice_survey.sim.seafloor.terrain import build_terrain
 from alice_survey.sim.seafloor.texture import survey_texture
 from camera_calib.camera import Camera

@@ -12,8 +12,8 @@ from alice_survey.core.compiled import compiled
 from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import Array
 from alice_survey.core.run import progress
-from alice_survey.sim.seafloor.noise import noise
 from alice_survey.sim.seafloor.renderer import camera_rays, ray_bands
+from alice_survey.sim.seafloor.texture import noise
 from camera_calib.camera import Camera
 from camera_calib.rig import Rig
 

@@ -18,9 +18,8 @@ from alice_survey.core.compiled import compiled
 from alice_survey.core.errors import ImageError
 from alice_survey.core.frames import Array
 from alice_survey.sim.seafloor.light import CameraLight, add_direct, backscatter_at
-from alice_survey.sim.seafloor.noise import mix
 from alice_survey.sim.seafloor.terrain import Patch, Terrain
-from alice_survey.sim.seafloor.texture import Texture
+from alice_survey.sim.seafloor.texture import Texture, mix
 from camera_calib.camera import Camera
 
 Floats = NDArray[np.float32]

@@ -19,8 +19,15 @@ from alice_survey.core.config import SeafloorConfig
 from alice_survey.core.errors import ConfigError, WorkspaceError
 from alice_survey.core.frames import Array
 from alice_survey.core.run import progress
-from alice_survey.sim.seafloor.amphora import BELLY_X_M, LENGTH_M, amphora_mesh
-from alice_survey.sim.seafloor.relief import add_rocks, ground_relief, scatter_rocks, trough_share
+from alice_survey.sim.seafloor.relief import (
+    BELLY_X_M,
+    LENGTH_M,
+    add_rocks,
+    amphora_mesh,
+    ground_relief,
+    scatter_rocks,
+    trough_share,
+)
 
 Floats = NDArray[np.float32]
 Triangles = NDArray[np.int32]

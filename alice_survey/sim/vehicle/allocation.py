@@ -1,15 +1,16 @@
 """Thrust allocation: which thrusters make a wrench.
 
-Both solvers take the matrix B (6, n) of `Vehicle.configuration_matrix`, the wrench wanted (6,), the
-bounds of thrust (n,), the weights of axes (6,) and of thrusters (n,), and write the thrust (n,):
+Both solvers take the matrix B (6, n) of `Vehicle.configuration_matrix`, the requested wrench (6,),
+the bounds of thrust (n,), the weights of axes (6,) and of thrusters (n,), and write the thrust
+(n,):
 
-- `allocate_exact`: the least weighted miss within the bounds and, of all ways to it, the least
+- `allocate_exact`: the least weighted residual within the bounds and, of all ways to it, the least
   weighted thrust;
 - `allocate_rpi`: the redistributed pseudo-inverse of the paper.
 
 An axis of weight 0 is not requested: gravity handles roll and pitch, unless thrusters can. The
 others decide what is given up when not all is attainable, by the square of their weights times the
-squared miss.
+squared residual.
 A failed thruster has the bounds 0 and 0. A wrench that is not a number gives NaN thrusts.
 
 The exact solver: bounded weighted least squares, then least thrust, by two small active sets.
@@ -61,8 +62,8 @@ def allocation_scratch(thrusters: int) -> AllocationScratch:
 AXIS_WEIGHTS: Array = np.array([1.0, 3.0, 30.0, 0.0, 0.0, 10.0])
 """Priorities when not all is attainable. Heave keeps the vehicle off the sea floor; yaw keeps
 the pictures square and the thrusters pointing where the controller thinks they point; sway keeps to
-the line; surge only costs time. Each counts about ten times the next by the square of its miss, a
-newton metre of yaw, on arms near a metre, as a newton."""
+the line; surge only costs time. Each counts about ten times the next by the square of its residual,
+a newton metre of yaw, on arms near a metre, as a newton."""
 AXIS_WEIGHTS.setflags(write=False)
 LEVEL_WEIGHTS: Array = np.array([1.0, 3.0, 30.0, 30.0, 30.0, 10.0])
 """The same where thrusters hold roll and pitch: a vehicle that tips over steers no more."""
@@ -109,14 +110,14 @@ def allocate_exact(
     thrust: Array,
     scratch: AllocationScratch,
 ) -> int:
-    """Allocate a wrench with the least miss and, of all ways to it, the least thrust.
+    """Allocate a wrench with the least residual and, of all ways to it, the least thrust.
 
     Args:
         matrix: (6, n) B, wrench per thrust.
-        wrench: (6,) wanted, N and N m.
+        wrench: (6,) requested, N and N m.
         lower: (n,) least thrust, N.
         upper: (n,) greatest thrust, N; the same as `lower` of a thruster that has failed.
-        axes: (6,) weights of the axes' misses; 0 of an axis that is not requested.
+        axes: (6,) weights of the axes' residuals; 0 of an axis that is not requested.
         weights: (n,) positive; the cost is the sum of weight times thrust squared.
         thrust: (n,) is written, N.
         scratch: work arrays.
@@ -142,7 +143,7 @@ def allocate_exact(
                 a[m, i] = axes[axis] * matrix[axis, i] * scale[i]
             m += 1
     limit = 10 * n + 10
-    solved = _min_miss(m, n, scratch, limit)
+    solved = _min_residual(m, n, scratch, limit)
     if solved > 1:
         solved = _min_norm(m, n, scratch, solved, limit)
     for i in range(n):
@@ -151,11 +152,11 @@ def allocate_exact(
 
 
 @kernel
-def _min_miss(m: int, n: int, scratch: AllocationScratch, limit: int) -> int:
+def _min_residual(m: int, n: int, scratch: AllocationScratch, limit: int) -> int:
     """Bring x, (n,), to a least |a x - b| within the bounds; return the number of problems solved.
 
     It is 1 if x is of least norm too, as when no bound is in the way. Afterwards thrusters are
-    fixed whose bound is in the way of a smaller miss, and the others are free.
+    fixed whose bound is in the way of a smaller residual, and the others are free.
     """
     a, state, v = scratch.matrices[0], scratch.states, scratch.vectors
     x, b, low, high, step = v[_X], v[_B], v[_LOW], v[_HIGH], v[_STEP]
@@ -221,8 +222,9 @@ def _min_norm(m: int, n: int, scratch: AllocationScratch, solved: int, limit: in
     Returns:
         Number of problems solved, with those before; negative if they were too many.
     """
-    a, state, v = scratch.matrices[0], scratch.states, scratch.vectors
-    x, low, step, made, price = v[_X], v[_LOW], v[_STEP], v[_REST], v[_PRICE]
+    a, state, vectors = scratch.matrices[0], scratch.states, scratch.vectors
+    x, low, step = vectors[_X], vectors[_LOW], vectors[_STEP]
+    made, price, y = vectors[_REST], vectors[_PRICE], vectors[_Y]
     for total in range(solved + 1, solved + limit + 1):
         for k in range(m):
             made[k] = 0.0
@@ -237,8 +239,21 @@ def _min_norm(m: int, n: int, scratch: AllocationScratch, solved: int, limit: in
                 free += 1
         if rank < free and _advance(n, scratch):
             continue
-        # At the least norm x = a^T y on the free ones; a held one is let go if it would shrink.
-        _price(m, n, rank, x, price, scratch)
+        # At the least norm x = a^T y on the free ones, as they were factored last; a held one is
+        # let go if it would shrink.
+        q, v, el = scratch.matrices[1], scratch.matrices[2], scratch.matrices[3]
+        for r in range(rank):
+            y[r] = 0.0
+            for i in range(n):
+                y[r] += v[r, i] * x[i]
+        for r in range(rank - 1, -1, -1):
+            for s in range(r + 1, rank):
+                y[r] -= el[s, r] * y[s]
+            y[r] /= el[r, r]
+        for k in range(m):
+            price[k] = 0.0
+            for r in range(rank):
+                price[k] += q[r, k] * y[r]
         worst, chosen = 0.0, -1
         for i in range(n):
             if state[i] == _HELD:
@@ -283,17 +298,17 @@ def _advance(n: int, scratch: AllocationScratch) -> bool:
 
 
 @kernel
-def _factor(m: int, n: int, scratch: AllocationScratch) -> int:
-    """Factor the free columns, a = Q^T L V, by Gram and Schmidt; the rank.
+def _pseudo_solve(m: int, n: int, right: Array, out: Array, scratch: AllocationScratch) -> int:
+    """Write the least-norm least-squares solution of the free columns, 0 elsewhere; the rank.
 
-    Q (rank, m) spans the columns, V (rank, n) the rows, both of orthonormal rows; L is lower
-    triangular. They are left in the scratch.
+    The free columns are factored, a = Q^T L V, by Gram and Schmidt: Q (rank, m) spans the columns,
+    V (rank, n) the rows, both of orthonormal rows; L is lower triangular.
     """
     a, q, v, el, work = (
         scratch.matrices[0], scratch.matrices[1], scratch.matrices[2], scratch.matrices[3],
         scratch.matrices[4],
     )  # fmt: skip
-    state = scratch.states
+    state, y = scratch.states, scratch.vectors[_Y]
     for i in range(n):
         if state[i] == _FREE:
             for k in range(m):
@@ -342,14 +357,6 @@ def _factor(m: int, n: int, scratch: AllocationScratch) -> int:
         el[r, r] = math.sqrt(square)
         for i in range(n):
             v[r, i] /= el[r, r]
-    return rank
-
-
-@kernel
-def _pseudo_solve(m: int, n: int, right: Array, out: Array, scratch: AllocationScratch) -> int:
-    """Write the least-norm least-squares solution of the free columns, 0 elsewhere; the rank."""
-    rank = _factor(m, n, scratch)
-    q, v, el, y = scratch.matrices[1], scratch.matrices[2], scratch.matrices[3], scratch.vectors[_Y]
     for i in range(n):
         out[i] = 0.0
     for r in range(rank):
@@ -362,24 +369,6 @@ def _pseudo_solve(m: int, n: int, right: Array, out: Array, scratch: AllocationS
         for i in range(n):
             out[i] += v[r, i] * y[r]
     return rank
-
-
-@kernel
-def _price(m: int, n: int, rank: int, x: Array, out: Array, scratch: AllocationScratch) -> None:
-    """Write the least y, (m,), with a^T y = x on the free columns, as they were factored last."""
-    q, v, el, y = scratch.matrices[1], scratch.matrices[2], scratch.matrices[3], scratch.vectors[_Y]
-    for r in range(rank):
-        y[r] = 0.0
-        for i in range(n):
-            y[r] += v[r, i] * x[i]
-    for r in range(rank - 1, -1, -1):
-        for s in range(r + 1, rank):
-            y[r] -= el[s, r] * y[s]
-        y[r] /= el[r, r]
-    for k in range(m):
-        out[k] = 0.0
-        for r in range(rank):
-            out[k] += q[r, k] * y[r]
 
 
 _EPSILON = 1e-9
@@ -444,7 +433,20 @@ def allocate_rpi(
             break
         for a in range(m):
             gram[a, a] += _EPSILON * trace / m
-        _solve(gram, solution, m)
+        # By Cholesky, in place: gram is symmetric, of which the lower half is given.
+        for a in range(m):
+            for b in range(a + 1):
+                total = gram[a, b]
+                for k in range(b):
+                    total -= gram[a, k] * gram[b, k]
+                gram[a, b] = math.sqrt(total) if a == b else total / gram[b, b]
+            for k in range(a):
+                solution[a] -= gram[a, k] * solution[k]
+            solution[a] /= gram[a, a]
+        for a in range(m - 1, -1, -1):
+            for k in range(a + 1, m):
+                solution[a] -= gram[k, a] * solution[k]
+            solution[a] /= gram[a, a]
         for i in range(n):
             if held[i]:
                 continue
@@ -460,21 +462,3 @@ def allocate_rpi(
                 held[i] = 1
                 again = True
     return rounds
-
-
-@kernel
-def _solve(matrix: Array, vector: Array, size: int) -> None:
-    """Solve a symmetric positive definite system, of which the lower half is given, in place."""
-    for i in range(size):
-        for j in range(i + 1):
-            total = matrix[i, j]
-            for k in range(j):
-                total -= matrix[i, k] * matrix[j, k]
-            matrix[i, j] = math.sqrt(total) if i == j else total / matrix[j, j]
-        for k in range(i):
-            vector[i] -= matrix[i, k] * vector[k]
-        vector[i] /= matrix[i, i]
-    for i in range(size - 1, -1, -1):
-        for k in range(i + 1, size):
-            vector[i] -= matrix[k, i] * vector[k]
-        vector[i] /= matrix[i, i]

@@ -12,7 +12,7 @@ import numpy as np
 
 from alice_survey.core.compiled import kernel
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.fins import Fins, add_fin_rates, add_fins
+from alice_survey.sim.vehicle.fins import LAG_RATE, MAX_RAD, MAX_RAD_S, Fins, add_fins
 from alice_survey.sim.vehicle.propulsion import Propulsion, add_speed_rates, add_thrust
 from alice_survey.sim.vehicle.rotations import matrix_rows
 from alice_survey.sim.vehicle.sea import Current, current_at
@@ -237,7 +237,12 @@ def derivative(
             total += body.mass_inverse[i, j] * force[j]
         out[7 + i] = total
     add_speed_rates(plant.propulsion, state[13:], command, out[13:])
-    add_fin_rates(plant.fins, state[13 + fins_from :], command[fins_from:], out[13 + fins_from :])
+    # The fins lag too, with limits of angle and rate.
+    drives = plant.fins.drives
+    for j in range(drives.shape[0]):
+        maximum, fastest, k = drives[j, MAX_RAD], drives[j, MAX_RAD_S], fins_from + j
+        rate = (min(max(command[k], -maximum), maximum) - state[13 + k]) * drives[j, LAG_RATE]
+        out[13 + k] = min(max(rate, -fastest), fastest)
 
 
 @kernel

@@ -223,13 +223,13 @@ def vehicle_to_fly(name_or_file: str, coefficients: str = OWN_SET) -> Vehicle:
     Raises:
         VehicleError: as there; or a file leaves out what its thrusters can.
     """
-    craft, path = vehicle_from(name_or_file, coefficients), Path(name_or_file)
+    vehicle, path = vehicle_from(name_or_file, coefficients), Path(name_or_file)
     if path.suffix.lower() in VEHICLE_FILES:
         lacking = speeds_missing(path, _NEEDED_TO_FLY)
-        if lacking or not craft.thrusters:
+        if lacking or not vehicle.thrusters:
             what = f"of thrusters {'; '.join(lacking)}" if lacking else "thrusters"
             raise VehicleError(f"{path}: to be flown it needs {what}")
-    return craft
+    return vehicle
 
 
 def speeds_missing(path: Path, needed: Sequence[str] = _NEEDED_FOR_SPEEDS) -> list[str]:

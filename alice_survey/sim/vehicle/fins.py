@@ -151,21 +151,6 @@ def pack_fins(fins: Sequence[Fin], density: float) -> Fins:
 
 
 @kernel
-def lift_and_drag(surfaces: Array, i: int, alpha: float) -> tuple[float, float]:
-    """C_L and C_D of a surface at an angle of attack, rad, from -pi to pi."""
-    lift = surfaces[i, SLOPE] * alpha
-    drag = surfaces[i, INDUCED] * lift * lift
-    beyond = (abs(alpha) - surfaces[i, STALL]) / _STALLS_OVER_RAD
-    if beyond > 0.0:
-        share = min(beyond, 1.0)
-        share *= share * (3.0 - 2.0 * share)
-        sine, cosine = math.sin(alpha), math.cos(alpha)
-        lift += share * (surfaces[i, PLATE] * sine * cosine - lift)
-        drag += share * (surfaces[i, PLATE] * sine * sine - drag)
-    return lift, drag + surfaces[i, PROFILE]
-
-
-@kernel
 def add_fins(fins: Fins, angles: Array, nu: Array, force: Array) -> None:
     """Add the wrench of all fins to a force (6,).
 
@@ -190,7 +175,17 @@ def add_fins(fins: Fins, angles: Array, nu: Array, force: Array) -> None:
         square = along_chord * along_chord + along_normal * along_normal
         if square == 0.0:
             continue
-        lift, drag = lift_and_drag(s, i, math.atan2(-along_normal, along_chord))
+        alpha = math.atan2(-along_normal, along_chord)
+        lift = s[i, SLOPE] * alpha
+        drag = s[i, INDUCED] * lift * lift
+        beyond = (abs(alpha) - s[i, STALL]) / _STALLS_OVER_RAD
+        if beyond > 0.0:
+            share = min(beyond, 1.0)
+            share *= share * (3.0 - 2.0 * share)
+            sine, cosine = math.sin(alpha), math.cos(alpha)
+            lift += share * (s[i, PLATE] * sine * cosine - lift)
+            drag += share * (s[i, PLATE] * sine * sine - drag)
+        drag += s[i, PROFILE]
         pressure = s[i, PRESSURE] * math.sqrt(square)
         # Lift is V turned by a right angle, from the chord towards the normal; drag is against V.
         f_x = pressure * (-lift * across - drag * a)
@@ -233,23 +228,6 @@ def write_fin_matrix(fins: Fins, nu: Array, out: Array, first: int) -> None:
         out[3, column] += y * f_z - z * f_y
         out[4, column] -= x * f_z
         out[5, column] += x * f_y
-
-
-@kernel
-def add_fin_rates(fins: Fins, angles: Array, commands: Array, out: Array) -> None:
-    """Write the rate of change, (m,) rad/s, of fins' angles: a lag, with limits of angle and rate.
-
-    Args:
-        fins: of m drives.
-        angles: (m,) rad.
-        commands: (m,) commanded, rad.
-        out: (m,) is written.
-    """
-    d = fins.drives
-    for j in range(d.shape[0]):
-        maximum, fastest = d[j, MAX_RAD], d[j, MAX_RAD_S]
-        rate = (min(max(commands[j], -maximum), maximum) - angles[j]) * d[j, LAG_RATE]
-        out[j] = min(max(rate, -fastest), fastest)
 
 
 def fin_slope(fins: Fins, nu: Array) -> Array:

@@ -188,11 +188,11 @@ def turned_speeds(
         thruster: whose limits, dead band and time constant.
         start_rps: speed at the first time.
     """
-    wanted = np.clip(command_rps, -thruster.most_rps, thruster.most_rps)
-    wanted = np.where(np.abs(wanted) < thruster.dead_band_rps, 0.0, wanted)
+    target = np.clip(command_rps, -thruster.most_rps, thruster.most_rps)
+    target = np.where(np.abs(target) < thruster.dead_band_rps, 0.0, target)
     kept = np.exp(-np.diff(time_s) / thruster.time_constant_s).tolist()
     speeds, speed = [start_rps], start_rps
-    for asked, share in zip(wanted[:-1].tolist(), kept, strict=True):
+    for asked, share in zip(target[:-1].tolist(), kept, strict=True):
         speed = asked + (speed - asked) * share
         speeds.append(speed)
     return np.array(speeds)
@@ -322,16 +322,6 @@ def add_speed_rates(propulsion: Propulsion, rps: Array, command_rps: Array, out:
 
 
 @kernel
-def _net_thrust(t: Array, i: int, n: float, nu: Array) -> float:
-    """Thrust along its axis, N, that a thruster gives at a speed: the law of `add_thrust`."""
-    gain = t[i, FORWARD] if n > 0.0 else t[i, REVERSE]
-    thrust = abs(n) * (gain * n - t[i, ADVANCE] * _inflow(t, i, nu))
-    if thrust != 0.0:
-        thrust *= math.exp(-t[i, JET_LOSS] * nu[0] * nu[0] / abs(thrust))
-    return float(t[i, KEPT] * thrust)
-
-
-@kernel
 def thrust_limits(
     propulsion: Propulsion, health: Array, nu: Array, lower: Array, upper: Array
 ) -> None:
@@ -347,24 +337,16 @@ def thrust_limits(
     t = propulsion.table
     for i in range(t.shape[0]):
         maximum = t[i, MOST] * math.sqrt(health[i])
-        lower[i] = min(_net_thrust(t, i, -maximum, nu), 0.0)
-        upper[i] = max(_net_thrust(t, i, maximum, nu), 0.0)
-
-
-@kernel
-def _lambert_w(z: float) -> float:
-    """The root y >= 0 of y exp(y) = z, z >= 0, to rounding.
-
-    The first guess is within 2 % (R. Iacono and J. P. Boyd, Adv. Comput. Math. 43, 2017), and
-    their iteration y <- y (1 + log(z / y)) / (1 + y) converges quadratically.
-    """
-    if z < 1e-8:
-        return z
-    root = math.log1p(z)
-    root *= 1.0 - math.log1p(root) / (2.0 + root)
-    for _ in range(4):
-        root *= (1.0 + math.log(z / root)) / (1.0 + root)
-    return float(root)
+        for ahead in range(2):  # the law of `add_thrust`
+            n = maximum if ahead else -maximum
+            gain = t[i, FORWARD] if n > 0.0 else t[i, REVERSE]
+            thrust = abs(n) * (gain * n - t[i, ADVANCE] * _inflow(t, i, nu))
+            if thrust != 0.0:
+                thrust *= math.exp(-t[i, JET_LOSS] * nu[0] * nu[0] / abs(thrust))
+            if ahead:
+                upper[i] = max(t[i, KEPT] * thrust, 0.0)
+            else:
+                lower[i] = min(t[i, KEPT] * thrust, 0.0)
 
 
 @kernel
@@ -383,7 +365,15 @@ def speeds_for(propulsion: Propulsion, thrust: Array, nu: Array, command_rps: Ar
             continue
         loss = t[i, JET_LOSS] * nu[0] * nu[0]
         if loss > 0.0:
-            size *= math.exp(_lambert_w(loss / size))
+            # W is the root y >= 0 of y exp(y) = z. The first guess is within 2 % (R. Iacono and J.
+            # P. Boyd, Adv. Comput. Math. 43, 2017); their iteration converges quadratically.
+            root = z = loss / size
+            if z >= 1e-8:
+                root = math.log1p(z)
+                root *= 1.0 - math.log1p(root) / (2.0 + root)
+                for _ in range(4):
+                    root *= (1.0 + math.log(z / root)) / (1.0 + root)
+            size *= math.exp(root)
         ahead = thrust[i] > 0.0
         gain = t[i, FORWARD] if ahead else t[i, REVERSE]
         slope = t[i, ADVANCE] * _inflow(t, i, nu)

@@ -26,20 +26,12 @@ from alice_survey.sim.vehicle.dynamics import (
 from alice_survey.sim.vehicle.navigation.filter import NavigationState, new_navigation
 from alice_survey.sim.vehicle.navigation.sensors import DVL, FOLLOWED, Sensors
 from alice_survey.sim.vehicle.navigation.tick import LOG_ROW, log_row, navigation_tick
+from alice_survey.sim.vehicle.pilot import memory as slot
 from alice_survey.sim.vehicle.pilot.command import Allocation, Pilot, Without, allocate
 from alice_survey.sim.vehicle.pilot.failures import WATCHED_S, FoundFailure, navigated_stretch
 from alice_survey.sim.vehicle.pilot.gains import Gains
 from alice_survey.sim.vehicle.pilot.guidance import steer
-from alice_survey.sim.vehicle.pilot.memory import (
-    ABORT,
-    AT_SURFACE,
-    DONE,
-    PHASE,
-    REASON,
-    REPORT,
-    SIGMA_M,
-    PilotState,
-)
+from alice_survey.sim.vehicle.pilot.memory import PilotState
 from alice_survey.sim.vehicle.pilot.mission import NO_MISSION, PilotMission
 from alice_survey.sim.vehicle.pilot.path import Path
 from alice_survey.sim.vehicle.pilot.safety import TOUCHED
@@ -285,13 +277,13 @@ def _fly_ticks(
         tick = first + k
         sense(tick, sea, floor, sensors, navigation, world, rng)
         spread = max(navigation.covariance[0, 0], navigation.covariance[1, 1])
-        pilot.memory[SIGMA_M] = math.sqrt(max(spread, 0.0))
+        pilot.memory[slot.SIGMA_M] = math.sqrt(max(spread, 0.0))
         steer(
             tick * TICK_S, TICK_S, world.estimate, path, mission, guidance, gains, pilot, wrench
         )  # fmt: skip
         touched = touches(world.now, sensors, floor)
         if touched:
-            pilot.report[PHASE], pilot.report[REASON] = ABORT, TOUCHED
+            pilot.report[slot.PHASE], pilot.report[slot.REASON] = slot.ABORT, TOUCHED
         allocate(wrench, world.estimate, allocation)
 
         for i in range(STATE + actuators):
@@ -302,14 +294,14 @@ def _fly_ticks(
             rows.wrench[k, i] = wrench[i]
         for i in range(thrusters):
             rows.command_rps[k, i] = allocation.command[i]
-        for i in range(REPORT):
+        for i in range(slot.REPORT):
             rows.report[k, i] = pilot.report[i]
         electrical_power(
             plant.propulsion, world.state[STATE:], world.state[7:STATE], rows.power_w[k]
         )
         log_row(navigation, rows.navigation[k])
         flown += 1
-        if touched or pilot.report[PHASE] == DONE or pilot.report[AT_SURFACE] == 1.0:
+        if touched or pilot.report[slot.PHASE] == slot.DONE or pilot.report[slot.AT_SURFACE] == 1.0:
             break
 
         move(tick, plant, sea, allocation.command, world, scratch, sea_rng)
@@ -456,7 +448,7 @@ def _chunks(
     """Rows of a minute each at most, until the mission is over; adds failures that are found."""
     left, pushing = dict(setup.health), dict[str, float]()
     known = setup.health if setup.known_health is None else setup.known_health
-    afloat = SimulatedVehicle(
+    simulated = SimulatedVehicle(
         setup.vehicle, setup.sensors, setup.floor, setup.current, setup.disturbance, rng,
         sea_rng=sea_rng, start_ne_m=setup.start_ne_m, start_heading_rad=setup.start_heading_rad,
         health=left,
@@ -472,29 +464,30 @@ def _chunks(
     while first < last:
         while waiting and round(waiting[0].time_s / TICK_S) <= first:
             (pushing if waiting[0].turns else left)[waiting[0].thruster] = waiting[0].left
-            afloat.weaken(left, pushing)
+            simulated.weaken(left, pushing)
             del waiting[0]
         end = min(first + maximum, last)
         if waiting:
             end = min(end, round(waiting[0].time_s / TICK_S))
         rows = _new_rows(end - first, thrusters, setup.vehicle.actuators)
         flown = _fly_ticks(
-            first, afloat.plant, afloat.sea, afloat.floor, afloat.sensors, afloat.navigation,
-            pilot.path, setup.mission, pilot.guidance, pilot.gains, pilot.state, pilot.wrench,
-            pilot.allocation, afloat.world, afloat.scratch, rng, sea_rng, rows,
+            first, simulated.plant, simulated.sea, simulated.floor, simulated.sensors,
+            simulated.navigation, pilot.path, setup.mission, pilot.guidance, pilot.gains,
+            pilot.state, pilot.wrench, pilot.allocation, simulated.world, simulated.scratch,
+            rng, sea_rng, rows,
         )  # fmt: skip
         yield TickRows(*(part[:flown] for part in rows))
-        if flown < len(rows.state) or pilot.state.report[REASON] == TOUCHED:
+        if flown < len(rows.state) or pilot.state.report[slot.REASON] == TOUCHED:
             return
         first = end
         found += pilot.judge(
             first * TICK_S,
             rows.command_rps,
             rows.state[:, STATE : STATE + thrusters],
-            navigated_stretch(rows.navigation, afloat.navigation),
+            navigated_stretch(rows.navigation, simulated.navigation),
         )
 
 
 def _new_rows(count: int, thrusters: int, actuators: int) -> TickRows:
-    widths = (STATE + actuators, STATE, LOG_ROW, REPORT, 6, thrusters, thrusters)
+    widths = (STATE + actuators, STATE, LOG_ROW, slot.REPORT, 6, thrusters, thrusters)
     return TickRows(*(np.zeros((count, width)) for width in widths))

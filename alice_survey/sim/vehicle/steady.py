@@ -200,7 +200,7 @@ def too_slow(vehicle: Vehicle, speed_mps: float, share: float) -> str:
 BALANCED = (0, 1, 2, 5)
 """Surge, sway, heave and yaw."""
 _ROUNDS = 60
-_MISS_N = 1e-9
+_TOLERANCE_N = 1e-9
 """Tolerance, N and N m, within which a wrench is met."""
 
 
@@ -252,14 +252,16 @@ def steady_flight(
     nu = np.ascontiguousarray(nu, dtype=np.float64)
     matrix = np.ascontiguousarray(vehicle.configuration_matrix)
     if vehicle.fins:
-        wanted, axes = _wanted_of_fins(vehicle, nu, share), np.eye(6)[0]
+        requested, axes = _fin_force_ahead(vehicle, nu, share), np.eye(6)[0]
     else:
         water = np.zeros((len(nu), 6))
-        _add_water(body, nu, water)
-        wanted = -water
-        wanted[:, 2] -= body.weight_n - body.buoyancy_n
+        for motion, force in zip(nu, water, strict=True):
+            add_damping(body, motion, force)
+            add_coriolis(body, motion, force)
+        requested = -water
+        requested[:, 2] -= body.weight_n - body.buoyancy_n
         if nu_rate is not None:
-            wanted += nu_rate @ body.mass
+            requested += nu_rate @ body.mass
         axes = AXIS_WEIGHTS * np.any(np.abs(matrix) > 1e-12, axis=1)
     n = len(vehicle.thrusters)
     room = _Room(
@@ -267,10 +269,10 @@ def steady_flight(
         target=np.zeros(6), allocation=allocation_scratch(n),
     )  # fmt: skip
     rps, power_w, made = np.zeros((len(nu), n)), np.zeros((len(nu), n)), np.zeros((len(nu), 6))
-    _keep(propulsion, matrix, axes, np.full(n, share), wanted, nu, room, made, rps, power_w)
+    _keep(propulsion, matrix, axes, np.full(n, share), requested, nu, room, made, rps, power_w)
     balanced = np.flatnonzero(axes) if slips or vehicle.fins else list(BALANCED)
-    off = np.abs(wanted - made)[:, balanced].max(axis=1)
-    lost = ~(off <= 1e3 * _MISS_N)
+    off = np.abs(requested - made)[:, balanced].max(axis=1)
+    lost = ~(off <= 1e3 * _TOLERANCE_N)
     load = (rps / propulsion.table[:, MOST]) ** 2
     return SteadyFlight(
         rps=np.where(lost[:, None], np.nan, rps),
@@ -279,14 +281,14 @@ def steady_flight(
     )
 
 
-def _wanted_of_fins(vehicle: Vehicle, nu: Array, share: float) -> Array:
+def _fin_force_ahead(vehicle: Vehicle, nu: Array, share: float) -> Array:
     """Force ahead, (N, 6), that keeps a vehicle with fins at surges and rates of turn.
 
     NaN where they do not fly level, or more is asked than surge and turn.
     """
-    wanted = np.zeros((len(nu), 6))
+    requested = np.zeros((len(nu), 6))
     known: dict[tuple[float, float], float] = {}
-    for row, (u, v, w, _, _, r) in zip(wanted, np.round(nu, 3).tolist(), strict=True):
+    for row, (u, v, w, _, _, r) in zip(requested, np.round(nu, 3).tolist(), strict=True):
         if u <= 0.0 or v != 0.0 or w != 0.0:
             row[0] = np.nan
             continue
@@ -294,31 +296,17 @@ def _wanted_of_fins(vehicle: Vehicle, nu: Array, share: float) -> Array:
             flight = held(vehicle, u, abs(r), share)
             known[u, abs(r)] = np.nan if flight is None else flight.force_x_n
         row[0] = known[u, abs(r)]
-    return wanted
+    return requested
 
 
 def drag_power(body: Body, nu: Array) -> Array:
     """Power, (N,) W, that the water takes from a body at velocities (N, 6) relative to it."""
     nu = np.ascontiguousarray(nu, dtype=np.float64)
     force = np.zeros_like(nu)
-    _add_drag(body, nu, force)
+    for motion, row in zip(nu, force, strict=True):
+        add_damping(body, motion, row)
     power: Array = -np.sum(nu * force, axis=1)
     return power
-
-
-@kernel
-def _add_drag(body: Body, nu: Array, force: Array) -> None:
-    """Add damping and body lift at velocities (N, 6) to forces (N, 6)."""
-    for k in range(nu.shape[0]):
-        add_damping(body, nu[k], force[k])
-
-
-@kernel
-def _add_water(body: Body, nu: Array, force: Array) -> None:
-    """Add damping, body lift and Coriolis force at velocities (N, 6) to forces (N, 6)."""
-    for k in range(nu.shape[0]):
-        add_damping(body, nu[k], force[k])
-        add_coriolis(body, nu[k], force[k])
 
 
 @kernel
@@ -327,14 +315,14 @@ def _keep(
     matrix: Array,
     axes: Array,
     share: Array,
-    wanted: Array,
+    requested: Array,
     nu: Array,
     room: _Room,
     made: Array,
     rps: Array,
     power_w: Array,
 ) -> None:
-    """Find thruster speeds whose wrench, jets and torques included, is the one wanted.
+    """Find thruster speeds whose wrench, jets and torques included, is the one requested.
 
     The wrench that is allocated is corrected by what was missed until nothing is; a row whose
     allocation cannot be met is left with what it makes.
@@ -344,7 +332,7 @@ def _keep(
         matrix: (6, n) wrench per thrust.
         axes: (6,) weights of the axes, 0 of one that no thruster has.
         share: (n,) of each thruster's greatest speed squared.
-        wanted: (N, 6)
+        requested: (N, 6)
         nu: (N, 6)
         room: work arrays for one velocity.
         made: (N, 6) wrench, is written.
@@ -356,7 +344,7 @@ def _keep(
         thrust_limits(propulsion, share, nu[k], room.lower, room.upper)
         preference_weights(propulsion, nu[k, 0], room.weights)
         for axis in range(6):
-            room.target[axis] = wanted[k, axis]
+            room.target[axis] = requested[k, axis]
         for _ in range(_ROUNDS):
             allocate_exact(
                 matrix, room.target, room.lower, room.upper, axes, room.weights, room.thrust,
@@ -373,11 +361,11 @@ def _keep(
                     allocated = 0.0
                     for i in range(n):
                         allocated += matrix[axis, i] * room.thrust[i]
-                    slack = _MISS_N * (1.0 + abs(room.target[axis]))
+                    slack = _TOLERANCE_N * (1.0 + abs(room.target[axis]))
                     beyond = beyond or abs(allocated - room.target[axis]) > slack
-                    miss = wanted[k, axis] - made[k, axis]
-                    worst = max(worst, abs(miss))
-                    room.target[axis] += miss
-            if beyond or worst <= _MISS_N:
+                    residual = requested[k, axis] - made[k, axis]
+                    worst = max(worst, abs(residual))
+                    room.target[axis] += residual
+            if beyond or worst <= _TOLERANCE_N:
                 break
         electrical_power(propulsion, rps[k], nu[k], power_w[k])

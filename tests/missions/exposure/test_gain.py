@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alice_survey.core.errors import ImageError
-from alice_survey.sim.seafloor.sensor import develop
+from alice_survey.sim.seafloor.light import develop
 from missions.exposure.gain import gain_advice, gain_report, noise_sigma, picture_files, read_linear
 
 SIZE = (160, 200)

@@ -3,9 +3,8 @@ import math
 import numpy as np
 import pytest
 
-from alice_survey.sim.seafloor.light import LUMENS_PER_WATT, camera_light
+from alice_survey.sim.seafloor.light import LUMENS_PER_WATT, camera_light, make_sensor, nominal_gain
 from alice_survey.sim.seafloor.renderer import flat_floor_radiance
-from alice_survey.sim.seafloor.sensor import make_sensor, nominal_gain
 from alice_survey.sim.seafloor.texture import SAND_ALBEDO
 from camera_calib.water import WaterOptics, water_optics
 from missions.exposure.lamp import LED_B3, LED_NM, watts_per_lumen

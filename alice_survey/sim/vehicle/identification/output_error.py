@@ -105,16 +105,16 @@ def stretch_numbers(times_s: list[Array]) -> list[NDArray[np.intp]]:
         The number of its stretch for each row of each window.
     """
     spans = np.array([float(time_s[-1] - time_s[0]) for time_s in times_s])
-    wanted = min(max(len(spans) // _WINDOWS, _LEAST), _MOST)
-    length_s, ends = spans.sum() / wanted, np.cumsum(spans)
+    target = min(max(len(spans) // _WINDOWS, _LEAST), _MOST)
+    length_s, ends = spans.sum() / target, np.cumsum(spans)
     numbers: list[NDArray[np.intp]] = []
     if len(spans) < _FEWEST:
         for time_s, end_s in zip(times_s, ends.tolist(), strict=True):
             passed = end_s - (time_s[-1] - time_s)
-            numbers.append(np.minimum(passed / length_s, wanted - 1).astype(np.intp))
+            numbers.append(np.minimum(passed / length_s, target - 1).astype(np.intp))
     else:
         middles = (ends - 0.5 * spans) / length_s
-        places = np.minimum(middles, wanted - 1).astype(np.intp)
+        places = np.minimum(middles, target - 1).astype(np.intp)
         _, places = np.unique(places, return_inverse=True)
         numbers = [np.full(len(t), k) for t, k in zip(times_s, places.tolist(), strict=True)]
     return numbers

@@ -120,39 +120,6 @@ def force_on(physics: Physics, state: Array, rps: Array, load: Array, force: Arr
 
 
 @kernel
-def rate_of(
-    physics: Physics,
-    state: Array,
-    rps: Array,
-    load: Array,
-    acceleration: Array,
-    force: Array,
-    out: Array,
-) -> None:
-    """Write the rate of change, (10,), of a state.
-
-    Given motions have the acceleration (6,) that they are given; the others feel it through the
-    inertia that couples them, and answer with the rest of the mass matrix alone. `force` is room.
-    """
-    x, y, z, s = state[0], state[1], state[2], state[3]
-    p, q, r = state[7], state[8], state[9]
-    out[0] = 0.5 * (s * p + y * r - z * q)
-    out[1] = 0.5 * (s * q + z * p - x * r)
-    out[2] = 0.5 * (s * r + x * q - y * p)
-    out[3] = -0.5 * (x * p + y * q + z * r)
-    force_on(physics, state, rps, load, force)
-    for j in range(6):
-        if physics.given[j] != 0.0:
-            for i in range(6):
-                force[i] -= physics.body.mass[i, j] * acceleration[j]
-    for i in range(6):
-        total = physics.given[i] * acceleration[i]
-        for j in range(6):
-            total += physics.body.mass_inverse[i, j] * force[j]
-        out[4 + i] = total
-
-
-@kernel
 def slope_by_state(
     physics: Physics, state: Array, rps: Array, load: Array, scratch: SlopeScratch
 ) -> None:
@@ -345,9 +312,28 @@ class Record(NamedTuple):
 def _stage(
     physics: Physics, terms: Terms, state: Array, sensitivity: Array, scratch: SlopeScratch
 ) -> None:
-    """Write the rates of a state and of its sensitivities into the first of the stages."""
-    rate, slopes = scratch.stage[0], scratch.stages[0]
-    rate_of(physics, state, scratch.rps, scratch.load, scratch.acceleration, scratch.force[0], rate)
+    """Write the rates of a state and of its sensitivities into the first of the stages.
+
+    Given motions have the acceleration (6,) that they are given; the others feel it through the
+    inertia that couples them, and answer with the rest of the mass matrix alone.
+    """
+    rate, slopes, force = scratch.stage[0], scratch.stages[0], scratch.force[0]
+    x, y, z, s = state[0], state[1], state[2], state[3]
+    p, q, r = state[7], state[8], state[9]
+    rate[0] = 0.5 * (s * p + y * r - z * q)
+    rate[1] = 0.5 * (s * q + z * p - x * r)
+    rate[2] = 0.5 * (s * r + x * q - y * p)
+    rate[3] = -0.5 * (x * p + y * q + z * r)
+    force_on(physics, state, scratch.rps, scratch.load, force)
+    for j in range(6):
+        if physics.given[j] != 0.0:
+            for i in range(6):
+                force[i] -= physics.body.mass[i, j] * scratch.acceleration[j]
+    for i in range(6):
+        total = physics.given[i] * scratch.acceleration[i]
+        for j in range(6):
+            total += physics.body.mass_inverse[i, j] * force[j]
+        rate[4 + i] = total
     slope_by_state(physics, state, scratch.rps, scratch.load, scratch)
     slope_by_parameters(physics, terms, state, rate[4:10], scratch)
     a, b = scratch.by_state, scratch.by_column

@@ -250,7 +250,19 @@ def predict(dt_s: float, sensors: Sensors, nav: NavigationState) -> None:
         flow[GAINED + i] = push + turned[2, i] * GRAVITY * dt_s
         flow[NEW + i] = x[VELOCITY + i] + flow[GAINED + i]
         flow[SUM + i] = x[VELOCITY + i] + flow[NEW + i]
-    _exponential(angle[0], angle[1], angle[2], dt_s, spin)
+    # exp(-angle) (9), then J = -(I - [angle]x / 2) dt (9), row by row (Sola 2017, 78 and 184):
+    # exp(-angle) = I - k [angle]x + m [angle]x^2, by series where the angle is next to nothing.
+    a, b, c, h = angle[0], angle[1], angle[2], 0.5 * dt_s
+    size2 = a * a + b * b + c * c
+    size = math.sqrt(size2)
+    k = math.sin(size) / size if size > 1e-4 else 1.0 - size2 / 6.0
+    m = (1.0 - math.cos(size)) / size2 if size > 1e-4 else 0.5 - size2 / 24.0
+    spin[0], spin[1], spin[2] = 1.0 - m * (b * b + c * c), k * c + m * a * b, m * a * c - k * b
+    spin[3], spin[4], spin[5] = m * a * b - k * c, 1.0 - m * (a * a + c * c), k * a + m * b * c
+    spin[6], spin[7], spin[8] = k * b + m * a * c, m * b * c - k * a, 1.0 - m * (a * a + b * b)
+    spin[9], spin[10], spin[11] = -dt_s, -h * c, h * b
+    spin[12], spin[13], spin[14] = h * c, -dt_s, -h * a
+    spin[15], spin[16], spin[17] = -h * b, h * a, -dt_s
     for i in range(3):
         x[VELOCITY + i] = (
             spin[3 * i] * flow[NEW]
@@ -264,28 +276,19 @@ def predict(dt_s: float, sensors: Sensors, nav: NavigationState) -> None:
     _transition(dt_s, nav)
     turn(attitude, angle)
     matrix_of(attitude, turned)
-    _turn_by_bias(nav)
+    # Attitude by gyroscope bias, R' J (9), behind the others in row LEVERS + 1.
+    swing = nav.scratch[LEVERS + 1]
+    for i in range(3):
+        for j in range(3):
+            swing[9 + 3 * i + j] = (
+                turned[i, 0] * spin[9 + j]
+                + turned[i, 1] * spin[12 + j]
+                + turned[i, 2] * spin[15 + j]
+            )
     for i, correlation_s, _ in correlated_states(sensors):
         nav.scratch[KEPT, i] = math.exp(-dt_s / correlation_s)
         x[i + 1] *= nav.scratch[KEPT, i]
     _propagate(dt_s, sensors, nav)
-
-
-@kernel
-def _exponential(a: float, b: float, c: float, dt_s: float, out: Array) -> None:
-    """exp(-angle) (9), then -(I - [angle]x / 2) dt (9), row by row (Sola 2017, 78 and 184)."""
-    size2 = a * a + b * b + c * c
-    size = math.sqrt(size2)
-    # exp(-angle) = I - k [angle]x + m [angle]x^2, by series where the angle is next to nothing.
-    k = math.sin(size) / size if size > 1e-4 else 1.0 - size2 / 6.0
-    m = (1.0 - math.cos(size)) / size2 if size > 1e-4 else 0.5 - size2 / 24.0
-    out[0], out[1], out[2] = 1.0 - m * (b * b + c * c), k * c + m * a * b, m * a * c - k * b
-    out[3], out[4], out[5] = m * a * b - k * c, 1.0 - m * (a * a + c * c), k * a + m * b * c
-    out[6], out[7], out[8] = k * b + m * a * c, m * b * c - k * a, 1.0 - m * (a * a + b * b)
-    h = 0.5 * dt_s
-    out[9], out[10], out[11] = -dt_s, -h * c, h * b
-    out[12], out[13], out[14] = h * c, -dt_s, -h * a
-    out[15], out[16], out[17] = -h * b, h * a, -dt_s
 
 
 @kernel
@@ -295,7 +298,7 @@ def _transition(dt_s: float, nav: NavigationState) -> None:
     Into row LEVERS: position by each of the two velocities, R dt / 2 (9); velocity by attitude,
     R^T [g dt]x without its third column, which is 0 (6); half the tick's way, R (v + s) dt / 2 = w
     (3): position by attitude is -[w]x, by the DVL's scale -w. Into row LEVERS + 1: velocity by
-    gyroscope bias, [v']x J (9), with J as in `_exponential`.
+    gyroscope bias, [v']x J (9), with J as in `predict`.
     """
     x, turned, flow = nav.nominal, nav.turns[BELIEVED], nav.scratch[FLOW]
     spin, levers, swing = nav.scratch[BLOCKS], nav.scratch[LEVERS], nav.scratch[LEVERS + 1]
@@ -312,25 +315,16 @@ def _transition(dt_s: float, nav: NavigationState) -> None:
 
 
 @kernel
-def _turn_by_bias(nav: NavigationState) -> None:
-    """Attitude by gyroscope bias, R' J (9), behind the others in row LEVERS + 1."""
-    turned, spin, swing = nav.turns[BELIEVED], nav.scratch[BLOCKS], nav.scratch[LEVERS + 1]
-    for i in range(3):
-        for j in range(3):
-            swing[9 + 3 * i + j] = (
-                turned[i, 0] * spin[9 + j]
-                + turned[i, 1] * spin[12 + j]
-                + turned[i, 2] * spin[15 + j]
-            )
-
-
-@kernel
 def _propagate(dt_s: float, sensors: Sensors, nav: NavigationState) -> None:
     """P <- F P F^T + Q, from the blocks of the transition.
 
-    F acts on rows; on the transpose it acts once more.
+    F acts on rows; on the transpose it acts once more. Q: a turn's noise n moves attitude by -R n,
+    velocity by -[v]x n; a push's m velocity, and by the trapezoid half of it the position. A
+    velocity with the DVL's scale in it gains more than the push says: counted as noise, the same
+    for MANOEUVRE_S.
     """
-    p = nav.covariance
+    p, x, turned = nav.covariance, nav.nominal, nav.turns[BELIEVED]
+    imu = sensors.imu
     _transform_rows(dt_s, nav)
     for i in range(ERROR):
         for j in range(i):
@@ -341,18 +335,6 @@ def _propagate(dt_s: float, sensors: Sensors, nav: NavigationState) -> None:
         for j in range(i):
             mean = 0.5 * (p[i, j] + p[j, i])
             p[i, j] = p[j, i] = mean
-    _add_noise(dt_s, sensors, nav)
-
-
-@kernel
-def _add_noise(dt_s: float, sensors: Sensors, nav: NavigationState) -> None:
-    """Add Q: a turn's noise n moves attitude by -R n, velocity by -[v]x n; a push's m velocity.
-
-    By the trapezoid half of it reaches the position within the tick. A velocity with the DVL's
-    scale in it gains more than the push says: counted as noise, the same for MANOEUVRE_S.
-    """
-    p, x, turned = nav.covariance, nav.nominal, nav.turns[BELIEVED]
-    imu = sensors.imu
     push = imu.accelerometer_noise_mps_per_sqrt_s**2 * dt_s
     gained2 = 0.0
     for i in range(3):

@@ -15,63 +15,8 @@ import numpy as np
 from alice_survey.core.compiled import kernel
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import estimate_vector as vector
+from alice_survey.sim.vehicle.navigation import filter as slot
 from alice_survey.sim.vehicle.navigation.filter import (
-    ACCELEROMETER_BIAS,
-    ALTITUDE_NOW,
-    ALTITUDE_PING,
-    ALTITUDE_SIGMA,
-    ALTITUDE_TIME,
-    ALTITUDE_VARIANCE,
-    ATTITUDE,
-    BEAM,
-    BELIEVED,
-    CLEARANCE_NOW,
-    CLEARANCE_PING,
-    DEPTH,
-    DEPTH_BIAS,
-    DEPTH_TIME,
-    DVL_ANGLE,
-    DVL_BIAS,
-    DVL_SCALE,
-    DVL_TIME,
-    DVL_VELOCITY,
-    FOLLOWED_DEPTH,
-    GPS_BIAS,
-    GPS_FIX,
-    GPS_TIME,
-    GPS_USE,
-    GYRO_BIAS,
-    HEADING,
-    HEADING_BIAS,
-    HEADING_TIME,
-    HEADING_TURNS,
-    IMU_PLACE,
-    LATEST,
-    MEAN_SLOPE_EAST,
-    MEAN_SLOPE_NORTH,
-    MOVED_EAST,
-    MOVED_NORTH,
-    PUSH,
-    QUATERNION,
-    RANGE,
-    RATES,
-    REJECTED,
-    RELIEF_PINGS,
-    RELIEF_VARIANCE,
-    SLOPE_EAST,
-    SLOPE_NORTH,
-    SLOPE_VARIANCE,
-    TRUTH_BEFORE,
-    TRUTH_NOW,
-    TURN,
-    USBL_FIX,
-    USBL_TIME,
-    USBL_USE,
-    USED,
-    VELOCITY,
-    WATER_BEAM,
-    WATER_TIME,
-    WATER_VELOCITY,
     NavigationState,
     correct,
     correlated_states,
@@ -154,29 +99,74 @@ def navigation_tick(
     """
     for i in range(nav.innovations.shape[0]):
         nav.innovations[i] = math.nan
-    matrix_of(now[3:7], nav.turns[TRUTH_NOW])
+    truth = nav.turns[slot.TRUTH_NOW]
+    matrix_of(now[3:7], truth)
     if tick > 0:
         measure_imu(dt_s, before, now, suite, nav, rng)
         predict(dt_s, suite, nav)
-        drift(dt_s, suite, nav, rng)
-    else:
-        measure_rates(dt_s, now, suite, nav, rng)
-        matrix_of(nav.nominal[QUATERNION : QUATERNION + 4], nav.turns[BELIEVED])
+        # The instruments' biases drift: random walks and Gauss-Markov processes.
+        hidden, root, imu = nav.hidden, math.sqrt(dt_s), suite.imu
+        for i in range(3):
+            hidden[i] += imu.gyro_bias_walk_radps_per_sqrt_s * root * rng.standard_normal()
+        for i in range(
+            slot.ACCELEROMETER_BIAS - slot.GYRO_BIAS, slot.ACCELEROMETER_BIAS - slot.GYRO_BIAS + 3
+        ):
+            hidden[i] += imu.accelerometer_bias_walk_mps2_per_sqrt_s * root * rng.standard_normal()
+        for i, correlation_s, sigma in correlated_states(suite)[:-2]:  # water is no instrument
+            kept = math.exp(-dt_s / correlation_s)
+            draw = sigma * math.sqrt(1.0 - kept * kept) * rng.standard_normal()
+            hidden[i - slot.GYRO_BIAS] = kept * hidden[i - slot.GYRO_BIAS] + draw
+    else:  # the first tick has no increment, but rates
+        noise = suite.imu.gyro_noise_rad_per_sqrt_s / math.sqrt(dt_s)
+        for i in range(3):
+            nav.readings[slot.RATES + i] = (
+                now[10 + i] + nav.hidden[i] + noise * rng.standard_normal()
+            )
+        matrix_of(nav.nominal[slot.QUATERNION : slot.QUATERNION + 4], nav.turns[slot.BELIEVED])
     pinged, used = False, False
     bottom = 0
     if suite.compass_every > 0 and tick % suite.compass_every == 0:
-        measure_heading(time_s, suite, nav, rng)
+        nav.readings[slot.HEADING_TIME] = time_s
+        nav.readings[slot.HEADING] = (
+            math.atan2(truth[1, 0], truth[0, 0])
+            + nav.hidden[slot.HEADING_BIAS - slot.GYRO_BIAS]
+            + suite.compass.noise_rad * rng.standard_normal()
+        )
         used |= use_heading(nav, suite)
     if suite.pressure_every > 0 and tick % suite.pressure_every == 0:
-        measure_depth(time_s, now, suite, nav, rng)
+        place = suite.place[PRESSURE]
+        nav.readings[slot.DEPTH_TIME] = time_s
+        nav.readings[slot.DEPTH] = (
+            now[2]
+            + applied(truth, place[0], place[1], place[2])[2]
+            + nav.hidden[slot.DEPTH_BIAS - slot.GYRO_BIAS]
+            + suite.pressure.noise_m * rng.standard_normal()
+        )
         used |= use_depth(nav, suite)
     due = suite.gps_every > 0 and tick % suite.gps_every == 0
-    if due and measure_gps(time_s, now, suite, nav, rng):
-        noise = suite.gps.noise_m * suite.gps.noise_m
-        used |= use_fix(nav, suite, GPS_USE, GPS, GPS_FIX, noise, GPS_BIAS)
+    if due and now[2] <= suite.gps.max_depth_m:  # the antenna is out of the water
+        place = suite.place[GPS]
+        arm = applied(truth, place[0], place[1], place[2])
+        for i in range(2):
+            drawn = suite.gps.noise_m * rng.standard_normal()
+            bias = nav.hidden[slot.GPS_BIAS - slot.GYRO_BIAS + i]
+            nav.readings[slot.GPS_FIX + i] = now[i] + arm[i] + bias + drawn
+        nav.readings[slot.GPS_TIME] = time_s
+        used |= use_fix(
+            nav,
+            suite,
+            slot.GPS_USE,
+            GPS,
+            slot.GPS_FIX,
+            suite.gps.noise_m * suite.gps.noise_m,
+            slot.GPS_BIAS,
+        )
     due = suite.usbl_every > 0 and tick % suite.usbl_every == 0
     if due and measure_usbl(time_s, now, suite, nav, rng):
-        used |= _use_usbl(nav, suite)
+        # The sigma of the distance that is estimated.
+        north, east = lever_row(nav, suite, USBL, 0), lever_row(nav, suite, USBL, 1)
+        sigma = usbl_sigma(suite, north, east, lever_row(nav, suite, USBL, 2))
+        used |= use_fix(nav, suite, slot.USBL_USE, USBL, slot.USBL_FIX, sigma * sigma, -1)
     if suite.dvl_every > 0 and tick % suite.dvl_every == 0:
         pinged = True
         ping = tick // suite.dvl_every
@@ -190,44 +180,35 @@ def navigation_tick(
     if pinged and bottom != 0:
         _hear_floor(time_s, bottom, nav, suite)
     _carry_altitude(time_s, nav, suite)
-    estimate[vector.ALTITUDE] = nav.memory[ALTITUDE_NOW]
-    estimate[vector.CLEARANCE] = nav.memory[CLEARANCE_NOW]
+    estimate[vector.ALTITUDE] = nav.memory[slot.ALTITUDE_NOW]
+    estimate[vector.CLEARANCE] = nav.memory[slot.CLEARANCE_NOW]
     for i in range(vector.ESTIMATE):
-        nav.memory[LATEST + i] = estimate[i]
-
-
-@kernel
-def _use_usbl(nav: NavigationState, suite: Sensors) -> bool:
-    """Weigh the fix of the transponder, with the sigma of its estimated distance."""
-    north = lever_row(nav, suite, USBL, 0)
-    east = lever_row(nav, suite, USBL, 1)
-    sigma = usbl_sigma(suite, north, east, lever_row(nav, suite, USBL, 2))
-    return use_fix(nav, suite, USBL_USE, USBL, USBL_FIX, sigma * sigma, -1)
+        nav.memory[slot.LATEST + i] = estimate[i]
 
 
 @kernel
 def _write_estimate(nav: NavigationState, suite: Sensors, estimate: Array) -> None:
     """Write the estimate of the body's origin, except for the altitude."""
-    x, turned, memory = nav.nominal, nav.turns[BELIEVED], nav.memory
+    x, turned, memory = nav.nominal, nav.turns[slot.BELIEVED], nav.memory
     a, b, c = suite.place[IMU, 0], suite.place[IMU, 1], suite.place[IMU, 2]
     for i in range(3):
         estimate[i] = x[i] - turned[i, 0] * a - turned[i, 1] * b - turned[i, 2] * c
-        estimate[vector.P + i] = nav.readings[RATES + i] - x[GYRO_BIAS + 1 + i]
+        estimate[vector.P + i] = nav.readings[slot.RATES + i] - x[slot.GYRO_BIAS + 1 + i]
     p, q, r = estimate[vector.P], estimate[vector.P + 1], estimate[vector.P + 2]
-    estimate[vector.U] = x[VELOCITY] - q * c + r * b
-    estimate[vector.U + 1] = x[VELOCITY + 1] - r * a + p * c
-    estimate[vector.U + 2] = x[VELOCITY + 2] - p * b + q * a
+    estimate[vector.U] = x[slot.VELOCITY] - q * c + r * b
+    estimate[vector.U + 1] = x[slot.VELOCITY + 1] - r * a + p * c
+    estimate[vector.U + 2] = x[slot.VELOCITY + 2] - p * b + q * a
     estimate[3] = math.atan2(turned[2, 1], turned[2, 2])
     estimate[4] = -math.asin(min(max(turned[2, 0], -1.0), 1.0))
     heading = math.atan2(turned[1, 0], turned[0, 0])
-    memory[HEADING_TURNS] += wrapped(heading - memory[HEADING_TURNS])
-    estimate[vector.HEADING] = memory[HEADING_TURNS]
+    memory[slot.HEADING_TURNS] += wrapped(heading - memory[slot.HEADING_TURNS])
+    estimate[vector.HEADING] = memory[slot.HEADING_TURNS]
 
 
 @kernel
 def _followed_depth(nav: NavigationState, suite: Sensors) -> float:
     """Believed depth of the followed point, metres."""
-    turned, total = nav.turns[BELIEVED], nav.nominal[2]
+    turned, total = nav.turns[slot.BELIEVED], nav.nominal[2]
     for i in range(3):
         total += turned[2, i] * (suite.place[FOLLOWED, i] - suite.place[IMU, i])
     return float(total)
@@ -244,14 +225,14 @@ def _hear_floor(time_s: float, used: int, nav: NavigationState, suite: Sensors) 
     A beam whose velocity was an outlier did not measure the sea floor. Fewer than three
     beams, or three with ends nearly in line, give no plane.
     """
-    turned, memory, place = nav.turns[BELIEVED], nav.memory, suite.place
+    turned, memory, place = nav.turns[slot.BELIEVED], nav.memory, suite.place
     count = 0
     noise = sn = se = sd = snn = sne = see = snd = sed = sdd = 0.0
     highest = math.inf
     for i in range(BEAMS):
         if used >> i & 1 == 0:
             continue
-        reach = nav.readings[RANGE + i]
+        reach = nav.readings[slot.RANGE + i]
         a = reach * suite.beams[i, 0] + place[DVL, 0] - place[FOLLOWED, 0]
         b = reach * suite.beams[i, 1] + place[DVL, 1] - place[FOLLOWED, 1]
         c = reach * suite.beams[i, 2] + place[DVL, 2] - place[FOLLOWED, 2]
@@ -281,27 +262,27 @@ def _hear_floor(time_s: float, used: int, nav: NavigationState, suite: Sensors) 
     leverage = 1.0 / count + (cee * n * n - 2.0 * cne * n * e + cnn * e * e) / determinant
 
     share = suite.dvl_every * suite.tick_s / suite.relief_memory_s
-    share = max(1.0 / (memory[RELIEF_PINGS] + 1.0), share)
+    share = max(1.0 / (memory[slot.RELIEF_PINGS] + 1.0), share)
     freedom = count - 3.0 + 2.0 * (1.0 - share) * (1.0 - share)
     if freedom > 0.0:
-        memory[RELIEF_PINGS] += 1.0
-        memory[MEAN_SLOPE_NORTH] += share * (north - memory[MEAN_SLOPE_NORTH])
-        memory[MEAN_SLOPE_EAST] += share * (east - memory[MEAN_SLOPE_EAST])
-        gn, ge = memory[MEAN_SLOPE_NORTH], memory[MEAN_SLOPE_EAST]
+        memory[slot.RELIEF_PINGS] += 1.0
+        memory[slot.MEAN_SLOPE_NORTH] += share * (north - memory[slot.MEAN_SLOPE_NORTH])
+        memory[slot.MEAN_SLOPE_EAST] += share * (east - memory[slot.MEAN_SLOPE_EAST])
+        gn, ge = memory[slot.MEAN_SLOPE_NORTH], memory[slot.MEAN_SLOPE_EAST]
         square = cdd - 2.0 * (gn * cnd + ge * ced)
         square += gn * gn * cnn + 2.0 * gn * ge * cne + ge * ge * cee
-        memory[RELIEF_VARIANCE] += share * (square / freedom - memory[RELIEF_VARIANCE])
-    relief = memory[RELIEF_VARIANCE]
+        memory[slot.RELIEF_VARIANCE] += share * (square / freedom - memory[slot.RELIEF_VARIANCE])
+    relief = memory[slot.RELIEF_VARIANCE]
     # The spread holds the ranges' noise, of which the plane keeps a part only.
     spread = max((1.0 + leverage) * relief - noise, leverage * noise)
     # A tilt turns the ends about the point: over a level floor that moves them sideways only.
-    tilt = _variance(nav, ATTITUDE, altitude * east, -altitude * north, 0.0)
-    memory[ALTITUDE_PING], memory[ALTITUDE_VARIANCE] = altitude, spread + tilt
-    memory[SLOPE_NORTH], memory[SLOPE_EAST] = north, east
-    memory[SLOPE_VARIANCE] = max(relief, noise) * (cnn + cee) / determinant
-    memory[MOVED_NORTH] = memory[MOVED_EAST] = 0.0
-    memory[ALTITUDE_TIME] = time_s
-    memory[FOLLOWED_DEPTH] = _followed_depth(nav, suite)
+    tilt = _variance(nav, slot.ATTITUDE, altitude * east, -altitude * north, 0.0)
+    memory[slot.ALTITUDE_PING], memory[slot.ALTITUDE_VARIANCE] = altitude, spread + tilt
+    memory[slot.SLOPE_NORTH], memory[slot.SLOPE_EAST] = north, east
+    memory[slot.SLOPE_VARIANCE] = max(relief, noise) * (cnn + cee) / determinant
+    memory[slot.MOVED_NORTH] = memory[slot.MOVED_EAST] = 0.0
+    memory[slot.ALTITUDE_TIME] = time_s
+    memory[slot.FOLLOWED_DEPTH] = _followed_depth(nav, suite)
 
     clearance, lowest = altitude, 0.0
     points = suite.hull.shape[0]
@@ -314,7 +295,7 @@ def _hear_floor(time_s: float, used: int, nav: NavigationState, suite: Sensors) 
         n, e, d = applied(turned, a, b, c)
         clearance = min(clearance, altitude + north * n + east * e - d)
         lowest = max(lowest, d)
-    memory[CLEARANCE_PING] = min(clearance, highest - lowest)
+    memory[slot.CLEARANCE_PING] = min(clearance, highest - lowest)
 
 
 @kernel
@@ -335,27 +316,35 @@ def _carry_altitude(time_s: float, nav: NavigationState, suite: Sensors) -> None
 
     The depth gained since and the rise of the plane below the way gone since are taken off.
     """
-    memory, x, turned = nav.memory, nav.nominal, nav.turns[BELIEVED]
-    age = time_s - memory[ALTITUDE_TIME]
+    memory, x, turned = nav.memory, nav.nominal, nav.turns[slot.BELIEVED]
+    age = time_s - memory[slot.ALTITUDE_TIME]
     # Not a number before the first ping: then this is false too.
     if age <= suite.altitude_age_s + 1e-9:
         if age > 0.0:
             # Summed speeds, not places: a fix would move the vehicle along the slope.
-            u, v, w = x[VELOCITY], x[VELOCITY + 1], x[VELOCITY + 2]
+            u, v, w = x[slot.VELOCITY], x[slot.VELOCITY + 1], x[slot.VELOCITY + 2]
             step = suite.tick_s
-            memory[MOVED_NORTH] += step * (turned[0, 0] * u + turned[0, 1] * v + turned[0, 2] * w)
-            memory[MOVED_EAST] += step * (turned[1, 0] * u + turned[1, 1] * v + turned[1, 2] * w)
-        n, e = memory[MOVED_NORTH], memory[MOVED_EAST]
-        gained = _followed_depth(nav, suite) - memory[FOLLOWED_DEPTH]
-        sinks = memory[SLOPE_NORTH] * n + memory[SLOPE_EAST] * e
-        drifted = age * age * _variance(nav, VELOCITY, turned[2, 0], turned[2, 1], turned[2, 2])
-        drifted += memory[SLOPE_VARIANCE] * (n * n + e * e)
-        memory[ALTITUDE_NOW] = memory[ALTITUDE_PING] - gained + sinks
-        memory[ALTITUDE_SIGMA] = math.sqrt(memory[ALTITUDE_VARIANCE] + drifted)
-        clearance = memory[CLEARANCE_PING] - gained + min(sinks, 0.0)
-        memory[CLEARANCE_NOW] = clearance - memory[ALTITUDE_SIGMA]
+            memory[slot.MOVED_NORTH] += step * (
+                turned[0, 0] * u + turned[0, 1] * v + turned[0, 2] * w
+            )
+            memory[slot.MOVED_EAST] += step * (
+                turned[1, 0] * u + turned[1, 1] * v + turned[1, 2] * w
+            )
+        n, e = memory[slot.MOVED_NORTH], memory[slot.MOVED_EAST]
+        gained = _followed_depth(nav, suite) - memory[slot.FOLLOWED_DEPTH]
+        sinks = memory[slot.SLOPE_NORTH] * n + memory[slot.SLOPE_EAST] * e
+        drifted = (
+            age * age * _variance(nav, slot.VELOCITY, turned[2, 0], turned[2, 1], turned[2, 2])
+        )
+        drifted += memory[slot.SLOPE_VARIANCE] * (n * n + e * e)
+        memory[slot.ALTITUDE_NOW] = memory[slot.ALTITUDE_PING] - gained + sinks
+        memory[slot.ALTITUDE_SIGMA] = math.sqrt(memory[slot.ALTITUDE_VARIANCE] + drifted)
+        clearance = memory[slot.CLEARANCE_PING] - gained + min(sinks, 0.0)
+        memory[slot.CLEARANCE_NOW] = clearance - memory[slot.ALTITUDE_SIGMA]
     else:
-        memory[ALTITUDE_NOW] = memory[ALTITUDE_SIGMA] = memory[CLEARANCE_NOW] = math.nan
+        memory[slot.ALTITUDE_NOW] = memory[slot.ALTITUDE_SIGMA] = memory[slot.CLEARANCE_NOW] = (
+            math.nan
+        )
 
 
 @kernel
@@ -364,46 +353,38 @@ def log_row(nav: NavigationState, out: Array) -> None:
 
     Sigmas are of the body's origin, whose position error includes attitude, and of Euler angles.
     """
-    p, turned = nav.covariance, nav.turns[BELIEVED]
-    latest = nav.memory[LATEST : LATEST + vector.ESTIMATE]
+    p, turned = nav.covariance, nav.turns[slot.BELIEVED]
+    latest = nav.memory[slot.LATEST : slot.LATEST + vector.ESTIMATE]
     for i in range(LOG_SIGMA):
         out[i] = latest[i]
     out[LOG_CLEARANCE] = latest[vector.CLEARANCE]
-    a, b, c = nav.memory[IMU_PLACE], nav.memory[IMU_PLACE + 1], nav.memory[IMU_PLACE + 2]
+    a, b, c = (
+        nav.memory[slot.IMU_PLACE],
+        nav.memory[slot.IMU_PLACE + 1],
+        nav.memory[slot.IMU_PLACE + 2],
+    )
     n, e, d = applied(turned, a, b, c)
-    t = ATTITUDE
+    t = slot.ATTITUDE
     # The origin lies at minus the lever l from the IMU: the error f moves it by -f x l.
     for i, g0, g1, g2 in ((0, 0.0, -d, e), (1, d, 0.0, -n), (2, -e, n, 0.0)):
         both = g0 * p[i, t] + g1 * p[i, t + 1] + g2 * p[i, t + 2]
-        variance = p[i, i] + 2.0 * both + _variance(nav, ATTITUDE, g0, g1, g2)
+        variance = p[i, i] + 2.0 * both + _variance(nav, slot.ATTITUDE, g0, g1, g2)
         out[LOG_SIGMA + i] = math.sqrt(max(variance, 0.0))
     # Of the bow (n, e, d): pitch turns about the level axis across it, roll about itself.
     n, e, d = turned[0, 0], turned[1, 0], turned[2, 0]
     level2 = n * n + e * e
     level = math.sqrt(level2)
-    out[LOG_SIGMA + 3] = math.sqrt(_variance(nav, ATTITUDE, n / level2, e / level2, 0.0))
-    out[LOG_SIGMA + 4] = math.sqrt(_variance(nav, ATTITUDE, -e / level, n / level, 0.0))
-    out[LOG_SIGMA + 5] = math.sqrt(_variance(nav, ATTITUDE, -d * n / level2, -d * e / level2, 1.0))
-    out[LOG_SIGMA + 6] = nav.memory[ALTITUDE_SIGMA]
+    out[LOG_SIGMA + 3] = math.sqrt(_variance(nav, slot.ATTITUDE, n / level2, e / level2, 0.0))
+    out[LOG_SIGMA + 4] = math.sqrt(_variance(nav, slot.ATTITUDE, -e / level, n / level, 0.0))
+    out[LOG_SIGMA + 5] = math.sqrt(
+        _variance(nav, slot.ATTITUDE, -d * n / level2, -d * e / level2, 1.0)
+    )
+    out[LOG_SIGMA + 6] = nav.memory[slot.ALTITUDE_SIGMA]
     for i in range(BEAMS):
-        out[LOG_RANGE + i] = nav.readings[RANGE + i]
+        out[LOG_RANGE + i] = nav.readings[slot.RANGE + i]
     for i in range(6):
-        out[LOG_USED + i] = nav.counts[i, USED]
-        out[LOG_REJECTED + i] = nav.counts[i, REJECTED]
-
-
-@kernel
-def drift(dt_s: float, sensors: Sensors, nav: NavigationState, rng: np.random.Generator) -> None:
-    """Advance the instruments' biases by a tick: random walks and Gauss-Markov processes."""
-    hidden, root, imu = nav.hidden, math.sqrt(dt_s), sensors.imu
-    for i in range(3):
-        hidden[i] += imu.gyro_bias_walk_radps_per_sqrt_s * root * rng.standard_normal()
-    for i in range(ACCELEROMETER_BIAS - GYRO_BIAS, ACCELEROMETER_BIAS - GYRO_BIAS + 3):
-        hidden[i] += imu.accelerometer_bias_walk_mps2_per_sqrt_s * root * rng.standard_normal()
-    for i, correlation_s, sigma in correlated_states(sensors)[:-2]:  # the water is no instrument
-        kept = math.exp(-dt_s / correlation_s)
-        draw = sigma * math.sqrt(1.0 - kept * kept) * rng.standard_normal()
-        hidden[i - GYRO_BIAS] = kept * hidden[i - GYRO_BIAS] + draw
+        out[LOG_USED + i] = nav.counts[i, slot.USED]
+        out[LOG_REJECTED + i] = nav.counts[i, slot.REJECTED]
 
 
 @kernel
@@ -422,9 +403,9 @@ def measure_imu(
     The white noise of the turn is that of the rates too: one gyroscope.
     """
     readings, hidden = nav.readings, nav.hidden
-    a, b = nav.turns[TRUTH_BEFORE], nav.turns[TRUTH_NOW]
+    a, b = nav.turns[slot.TRUTH_BEFORE], nav.turns[slot.TRUTH_NOW]
     matrix_of(before[3:7], a)
-    turn_between(before[3:7], now[3:7], readings[TURN : TURN + 3])
+    turn_between(before[3:7], now[3:7], readings[slot.TURN : slot.TURN + 3])
     x, y, z = sensors.place[IMU, 0], sensors.place[IMU, 1], sensors.place[IMU, 2]
     p, q, r = before[10], before[11], before[12]
     a0, a1, a2 = q * z - r * y, r * x - p * z, p * y - q * x
@@ -439,72 +420,13 @@ def measure_imu(
     root = math.sqrt(dt_s)
     for i in range(3):
         noise = sensors.imu.gyro_noise_rad_per_sqrt_s * root * rng.standard_normal()
-        readings[TURN + i] += hidden[i] * dt_s + noise
-        readings[RATES + i] = now[10 + i] + hidden[i] + noise / dt_s
-        readings[PUSH + i] = (
+        readings[slot.TURN + i] += hidden[i] * dt_s + noise
+        readings[slot.RATES + i] = now[10 + i] + hidden[i] + noise / dt_s
+        readings[slot.PUSH + i] = (
             (d0, d1, d2)[i]
             + hidden[3 + i] * dt_s
             + sensors.imu.accelerometer_noise_mps_per_sqrt_s * root * rng.standard_normal()
         )
-
-
-@kernel
-def measure_rates(
-    dt_s: float, now: Array, sensors: Sensors, nav: NavigationState, rng: np.random.Generator
-) -> None:
-    """The rates alone: the first tick has no increment."""
-    noise = sensors.imu.gyro_noise_rad_per_sqrt_s / math.sqrt(dt_s)
-    for i in range(3):
-        nav.readings[RATES + i] = now[10 + i] + nav.hidden[i] + noise * rng.standard_normal()
-
-
-@kernel
-def measure_heading(
-    time_s: float, sensors: Sensors, nav: NavigationState, rng: np.random.Generator
-) -> None:
-    """Heading of the compass, radians."""
-    turn = nav.turns[TRUTH_NOW]
-    nav.readings[HEADING] = (
-        math.atan2(turn[1, 0], turn[0, 0])
-        + nav.hidden[HEADING_BIAS - GYRO_BIAS]
-        + sensors.compass.noise_rad * rng.standard_normal()
-    )
-    nav.readings[HEADING_TIME] = time_s
-
-
-@kernel
-def measure_depth(
-    time_s: float, now: Array, sensors: Sensors, nav: NavigationState, rng: np.random.Generator
-) -> None:
-    """Depth of the pressure sensor, metres."""
-    place = sensors.place[PRESSURE]
-    nav.readings[DEPTH] = (
-        now[2]
-        + applied(nav.turns[TRUTH_NOW], place[0], place[1], place[2])[2]
-        + nav.hidden[DEPTH_BIAS - GYRO_BIAS]
-        + sensors.pressure.noise_m * rng.standard_normal()
-    )
-    nav.readings[DEPTH_TIME] = time_s
-
-
-@kernel
-def measure_gps(
-    time_s: float, now: Array, sensors: Sensors, nav: NavigationState, rng: np.random.Generator
-) -> bool:
-    """North and east of the antenna, if it is out of the water; whether it was."""
-    if now[2] > sensors.gps.max_depth_m:
-        return False
-    place = sensors.place[GPS]
-    arm = applied(nav.turns[TRUTH_NOW], place[0], place[1], place[2])
-    for i in range(2):
-        nav.readings[GPS_FIX + i] = (
-            now[i]
-            + arm[i]
-            + nav.hidden[GPS_BIAS - GYRO_BIAS + i]
-            + sensors.gps.noise_m * rng.standard_normal()
-        )
-    nav.readings[GPS_TIME] = time_s
-    return True
 
 
 @kernel
@@ -521,7 +443,7 @@ def measure_usbl(
     time_s: float, now: Array, sensors: Sensors, nav: NavigationState, rng: np.random.Generator
 ) -> bool:
     """North and east of the transponder; whether there was an answer."""
-    place, turn = sensors.place[USBL], nav.turns[TRUTH_NOW]
+    place, turn = sensors.place[USBL], nav.turns[slot.TRUTH_NOW]
     north, east, depth = applied(turn, place[0], place[1], place[2])
     north, east, depth = now[0] + north, now[1] + east, now[2] + depth
     a, b = north - sensors.usbl.boat_ned_m[0], east - sensors.usbl.boat_ned_m[1]
@@ -535,8 +457,8 @@ def measure_usbl(
         value = (north if i == 0 else east) + sigma * rng.standard_normal()
         if wrong:
             value += sensors.usbl.outlier_m * (2.0 * rng.random() - 1.0)
-        nav.readings[USBL_FIX + i] = value
-    nav.readings[USBL_TIME] = time_s
+        nav.readings[slot.USBL_FIX + i] = value
+    nav.readings[slot.USBL_TIME] = time_s
     return True
 
 
@@ -556,10 +478,10 @@ def measure_dvl(
     A velocity along a beam b is b . ((1 + s) Rz(a)^T v + bias), of the velocity v of the instrument
     in the body frame, its scale error s and its misalignment a about the vertical.
     """
-    readings, turn, dvl = nav.readings, nav.turns[TRUTH_NOW], sensors.dvl
-    for i in range(RANGE, WATER_VELOCITY + 3):
+    readings, turn, dvl = nav.readings, nav.turns[slot.TRUTH_NOW], sensors.dvl
+    for i in range(slot.RANGE, slot.WATER_VELOCITY + 3):
         readings[i] = math.nan
-    readings[DVL_TIME] = time_s
+    readings[slot.DVL_TIME] = time_s
     for i in range(sensors.dropouts_s.shape[0]):
         if sensors.dropouts_s[i, 0] <= time_s < sensors.dropouts_s[i, 1]:
             return
@@ -590,14 +512,18 @@ def measure_dvl(
         heard += 1
         slope = dvl.range_noise_fraction * reach
         noise = math.sqrt(dvl.range_noise_m * dvl.range_noise_m + slope * slope)
-        readings[RANGE + i] = reach + noise * rng.standard_normal()
-        readings[BEAM + i] = (
+        readings[slot.RANGE + i] = reach + noise * rng.standard_normal()
+        readings[slot.BEAM + i] = (
             _along_beam(sensors, nav.hidden, i, u, v, w) + sigma * rng.standard_normal()
         )
         if rng.random() < dvl.outlier_probability:
-            readings[BEAM + i] = dvl.outlier_mps * (2.0 * rng.random() - 1.0)
-            readings[RANGE + i] *= rng.random()
-    solve_beams(sensors.beams, readings[BEAM : BEAM + 4], readings[DVL_VELOCITY : DVL_VELOCITY + 3])
+            readings[slot.BEAM + i] = dvl.outlier_mps * (2.0 * rng.random() - 1.0)
+            readings[slot.RANGE + i] *= rng.random()
+    solve_beams(
+        sensors.beams,
+        readings[slot.BEAM : slot.BEAM + 4],
+        readings[slot.DVL_VELOCITY : slot.DVL_VELOCITY + 3],
+    )
     if dvl.water_every == 0 or (heard > 0 and ping % dvl.water_every != 0):
         return
     if clearance < dvl.water_least_altitude_m:
@@ -607,28 +533,28 @@ def measure_dvl(
     u, v, w = applied_inverse(turn, n, e, now[9])
     u, v, w = u + spin0, v + spin1, w + spin2
     for i in range(BEAMS):
-        readings[WATER_BEAM + i] = (
+        readings[slot.WATER_BEAM + i] = (
             _along_beam(sensors, nav.hidden, i, u, v, w)
             + dvl.water_noise_mps * rng.standard_normal()
         )
     solve_beams(
         sensors.beams,
-        readings[WATER_BEAM : WATER_BEAM + 4],
-        readings[WATER_VELOCITY : WATER_VELOCITY + 3],
+        readings[slot.WATER_BEAM : slot.WATER_BEAM + 4],
+        readings[slot.WATER_VELOCITY : slot.WATER_VELOCITY + 3],
     )
-    readings[WATER_TIME] = time_s
+    readings[slot.WATER_TIME] = time_s
 
 
 @kernel
 def _along_beam(sensors: Sensors, hidden: Array, i: int, u: float, v: float, w: float) -> float:
     """Velocity along a beam with the instrument's constant errors."""
-    angle = hidden[DVL_ANGLE - GYRO_BIAS]
-    scale = 1.0 + hidden[DVL_SCALE - GYRO_BIAS]
+    angle = hidden[slot.DVL_ANGLE - slot.GYRO_BIAS]
+    scale = 1.0 + hidden[slot.DVL_SCALE - slot.GYRO_BIAS]
     c, s = math.cos(angle), math.sin(angle)
     b = sensors.beams
     return float(
-        b[i, 0] * (scale * (c * u + s * v) + hidden[DVL_BIAS - GYRO_BIAS])
-        + b[i, 1] * (scale * (c * v - s * u) + hidden[DVL_BIAS - GYRO_BIAS + 1])
+        b[i, 0] * (scale * (c * u + s * v) + hidden[slot.DVL_BIAS - slot.GYRO_BIAS])
+        + b[i, 1] * (scale * (c * v - s * u) + hidden[slot.DVL_BIAS - slot.GYRO_BIAS + 1])
         + b[i, 2] * scale * w
     )
 

@@ -18,6 +18,7 @@ from alice_survey.sim.vehicle.allocation import (
     preference_weights,
 )
 from alice_survey.sim.vehicle.fins import MAX_RAD, Fins, write_fin_matrix
+from alice_survey.sim.vehicle.pilot import memory as slot
 from alice_survey.sim.vehicle.pilot.failures import (
     FoundFailure,
     NavigatedStretch,
@@ -26,16 +27,7 @@ from alice_survey.sim.vehicle.pilot.failures import (
 )
 from alice_survey.sim.vehicle.pilot.gains import INNER, SWAY, Gains
 from alice_survey.sim.vehicle.pilot.guidance import steer
-from alice_survey.sim.vehicle.pilot.memory import (
-    ABORT,
-    PHASE,
-    REASON,
-    SWAY_SUM_E,
-    SWAY_SUM_N,
-    YAW_SUM,
-    PilotState,
-    new_pilot,
-)
+from alice_survey.sim.vehicle.pilot.memory import PilotState, new_pilot
 from alice_survey.sim.vehicle.pilot.mission import NO_MISSION
 from alice_survey.sim.vehicle.pilot.path import Path
 from alice_survey.sim.vehicle.pilot.safety import THRUSTER_LOST
@@ -98,7 +90,7 @@ def allocate(wrench: Array, estimate: Array, allocation: Allocation) -> None:
     """Write the thrusts and the thruster speeds, and angles of fins, that make a wrench.
 
     Args:
-        wrench: (6,) wanted, N and N m.
+        wrench: (6,) requested, N and N m.
         estimate: of the navigation: its velocity counts; rest where it is not a number.
         allocation: is written.
     """
@@ -212,8 +204,8 @@ class Pilot:
                 _carry_over(self.state, before, self.gains)
             except VehicleError:
                 report = self.state.report
-                if report[PHASE] != ABORT:
-                    report[PHASE], report[REASON] = ABORT, THRUSTER_LOST
+                if report[slot.PHASE] != slot.ABORT:
+                    report[slot.PHASE], report[slot.REASON] = slot.ABORT, THRUSTER_LOST
         return found
 
 
@@ -223,7 +215,7 @@ def _carry_over(pilot: PilotState, before: Gains, after: Gains) -> None:
     Integrals are kept as speeds, of which the inner loops make accelerations: what holds against
     the current goes on. That of yaw has learned of what the lost thruster left undone.
     """
-    pilot.memory[YAW_SUM] = 0.0
+    pilot.memory[slot.YAW_SUM] = 0.0
     inner = after.axes[SWAY, INNER]
     factor = before.axes[SWAY, INNER] / inner if inner > 0.0 else 0.0
-    pilot.memory[[SWAY_SUM_N, SWAY_SUM_E]] *= factor
+    pilot.memory[[slot.SWAY_SUM_N, slot.SWAY_SUM_E]] *= factor

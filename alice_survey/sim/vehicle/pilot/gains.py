@@ -28,8 +28,8 @@ the critically damped one, 1 / (4 T), or rate if that is less; what rate has bey
 other axes need no k_D: their inner gain is rate.
 
 The same numbers serve a speed loop: its proportional gain is rate, its integral gain place. A PI
-has a zero at -place / rate, nearer than its poles, by which it overshoots a wanted speed. The
-proportional part therefore sees only a share of the wanted speed (set-point weighting: K. J.
+has a zero at -place / rate, nearer than its poles, by which it overshoots a target speed. The
+proportional part therefore sees only a share of the target speed (set-point weighting: K. J.
 Astrom, T. Hagglund, Advanced PID Control, 2006, section 3.4), weight = (place / omega - d/m) /
 rate, which with the feed-forward of drag moves the zero onto a pole at -omega.
 
@@ -138,7 +138,7 @@ _BY_FINS = (SURGE, YAW, PITCH, ROLL)
 MASS, RATE, PLACE, INTEGRAL, INNER, LEAST, MOST, FASTEST, LAG, BANDWIDTH, WEIGHT = range(11)
 """Columns of `Gains.axes`: inertia (kg, kg m^2); rate (1/s), place (1/s^2), integral (1/s^3); inner
 (1/s), the part of rate that the inner speed loop has; least and greatest force or moment; greatest
-commanded speed (m/s, rad/s); lag (s); bandwidth (rad/s); share of a wanted speed that the
+commanded speed (m/s, rad/s); lag (s); bandwidth (rad/s); share of a target speed that the
 proportional part of a speed loop sees."""
 
 DAMPING_RATIO = 1.0
@@ -149,7 +149,7 @@ SAMPLES_PER_PERIOD = 20.0
 MIN_SAMPLES_PER_PERIOD = 10.0
 """Samples per period of an oscillation that couples heading and sway."""
 HEADING_DAMPING = 0.7
-"""Wanted damping of every mode of the heading loop (inferred: an overshoot of a twentieth)."""
+"""Target damping of every mode of the heading loop (inferred: an overshoot of a twentieth)."""
 MIN_HEADING_DAMPING = 0.5
 """Below it a vehicle is not flown (inferred: an overshoot of a sixth)."""
 PASSING_DAMPING = 0.2
@@ -386,7 +386,7 @@ def placed(lag_s: float, decay_per_s: float, fastest_rad_s: float) -> tuple[floa
     pair = 2.0 * DAMPING_RATIO * omega
     real = total - pair
     rate = lag_s * (pair * real + omega**2) - decay_per_s
-    # Damping beyond what is wanted is left to the water: a negative gain would undo it.
+    # Damping beyond what is target is left to the water: a negative gain would undo it.
     return omega, max(rate, 0.0), lag_s * real * omega**2
 
 

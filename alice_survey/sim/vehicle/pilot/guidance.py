@@ -32,21 +32,12 @@ from alice_survey.sim.vehicle.pilot.gains import (
     SURGE,
     Gains,
 )
-from alice_survey.sim.vehicle.pilot.memory import (
-    ABORT,
-    APPROACH,
-    ASCEND,
-    DIVE,
-    DONE,
-    FOLLOW,
-    PilotState,
-)
+from alice_survey.sim.vehicle.pilot.memory import PilotState
 from alice_survey.sim.vehicle.pilot.mission import (
     COLA2,
     NO_LAW,
     PilotMission,
     fly_mission,
-    mission_progress_m,
 )
 from alice_survey.sim.vehicle.pilot.path import MIN_SLANT, Path, advance, heading_at, place_at
 from alice_survey.sim.vehicle.pilot.safety import (
@@ -62,13 +53,12 @@ from alice_survey.sim.vehicle.pilot.settings import Guidance, circle_course, tur
 from alice_survey.sim.vehicle.pilot.steering import (
     DEPTH_KEPT_M,
     HEADING_KEPT_RAD,
-    brake,
+    brake_for_stop,
     clamped,
     head_for,
     hear_floor,
     hold_level,
     leave_stop,
-    must_brake,
     sink_to,
     stand,
     stands,
@@ -78,8 +68,11 @@ from alice_survey.sim.vehicle.pilot.steering import (
     write_point,
     write_wrench,
 )
+from alice_survey.sim.vehicle.pilot.steps import END_E, END_N
 from alice_survey.sim.vehicle.rotations import wrapped
 
+_STEP_M = 1000.0
+"""Progress of a step of a mission that is done, above the length of any."""
 _HOVER_M = 2.0
 """Nearer than this a vehicle with sway hovers towards its goal instead of heading for it."""
 _MAX_LEAN_RAD = math.radians(30.0)
@@ -106,7 +99,7 @@ def go_to(
     that cannot hover circles, and comes through the place with the heading.
 
     Returns:
-        Distance from the goal, and the error of the wanted heading.
+        Distance from the goal, and the error of the requested heading.
     """
     now = estimate[vector.HEADING]
     dn, de = goal_n - pilot.point[slot.POINT_NORTH], goal_e - pilot.point[slot.POINT_EAST]
@@ -128,7 +121,7 @@ def go_to(
         error = head_for(math.atan2(de, dn), 0.0, 0.0, estimate, dt_s, gains, pilot)
         speed = path.speed_mps * max(math.cos(error), 0.0)
     else:
-        facing = pilot.report[slot.WANTED_HEADING]
+        facing = pilot.report[slot.TARGET_HEADING]
         if not math.isfinite(facing):
             facing = heading
         error = head_for(facing, 0.0, 0.0, estimate, dt_s, gains, pilot)
@@ -160,8 +153,25 @@ def follow(
     back, k_back = heading_at(path, leg, along - window)
     front, k_front = heading_at(path, leg, along + window)
     curvature = (front - back) / (2.0 * window)
-    smooth = _mean_heading(path, leg, along, window)
-    speed = _wanted_speed(path, guidance, gains, leg, along, curvature)
+    # Averaged over the window by Simpson's rule on its halves.
+    before, _ = heading_at(path, leg, along - 0.5 * window)
+    here, _ = heading_at(path, leg, along)
+    after, _ = heading_at(path, leg, along + 0.5 * window)
+    smooth = (back + 4.0 * before + 2.0 * here + 4.0 * after + front) / 12.0
+    # The speed now, low enough to brake before the turns ahead.
+    lever = abs(guidance.point_body_m[0]) if guidance.sway > 0.0 else 0.0
+    speed = min(path.speed_mps, turning_speed_mps(gains, abs(curvature), lever))
+    distance = path.length_m[leg] - along - window
+    reach = path.speed_mps * path.speed_mps / (2.0 * guidance.brake_mps2)
+    following = leg + 1
+    while (
+        following < path.length_m.shape[0] and distance < reach and path.stop[following - 1] == 0.0
+    ):
+        there = turning_speed_mps(gains, abs(path.curvature_per_m[following]), lever)
+        braking = 2.0 * guidance.brake_mps2 * max(distance, 0.0)
+        speed = min(speed, math.sqrt(there * there + braking))
+        distance += path.length_m[following]
+        following += 1
     course = now - beta
     sine, cosine = math.sin(course), math.cos(course)
     surge, sway = point[slot.SURGE_SPEED], point[slot.SWAY_SPEED]
@@ -186,8 +196,16 @@ def follow(
         heading = math.atan2(aim_e - east, aim_n - north)
         flies = guidance.under_way.circle_m > 0.0
         if flies:
-            straight = curvature == 0.0
-            heading += _lean(cross, beta, straight, dt_s, path, guidance, pilot)
+            # An angle into a current from the side: an integral of the cross-track error (Fossen,
+            # 10.3), kept as a vector in NED, that learns on straights, near the path, at a tenth
+            # of the bandwidth of the path's loop.
+            memory, s, c = pilot.memory, math.sin(beta), math.cos(beta)
+            if curvature == 0.0 and abs(cross) < 0.5 * ahead:
+                step = -INTEGRAL_SHARE * path.speed_mps / (ahead * ahead) * cross * dt_s
+                lean_n, lean_e = memory[slot.LEAN_N] - s * step, memory[slot.LEAN_E] + c * step
+                cut = min(1.0, _MAX_LEAN_RAD / max(math.hypot(lean_n, lean_e), 1e-9))
+                memory[slot.LEAN_N], memory[slot.LEAN_E] = cut * lean_n, cut * lean_e
+            heading += c * memory[slot.LEAN_E] - s * memory[slot.LEAN_N]
         # The aim turns as the offset changes: what its heading does is known, not awaited.
         drift = surge * sine + sway * cosine
         feed -= ahead * drift / (ahead * ahead + cross * cross)
@@ -204,63 +222,6 @@ def follow(
     report[slot.LEG], report[slot.ALONG], report[slot.LINE] = leg, along, path.line[leg]
 
 
-@kernel
-def _lean(
-    cross: float,
-    beta: float,
-    straight: bool,
-    dt_s: float,
-    path: Path,
-    guidance: Guidance,
-    pilot: PilotState,
-) -> float:
-    """Angle into a current from the side: an integral of the cross-track error (Fossen, 10.3).
-
-    It is kept as a vector in NED, as that of sway is, and learns on straights, near the path, at a
-    tenth of the bandwidth of the path's loop.
-    """
-    memory, ahead = pilot.memory, guidance.look_ahead_m
-    s, c = math.sin(beta), math.cos(beta)
-    if straight and abs(cross) < 0.5 * ahead:
-        step = -INTEGRAL_SHARE * path.speed_mps / (ahead * ahead) * cross * dt_s
-        north, east = memory[slot.LEAN_N] - s * step, memory[slot.LEAN_E] + c * step
-        cut = min(1.0, _MAX_LEAN_RAD / max(math.hypot(north, east), 1e-9))
-        memory[slot.LEAN_N], memory[slot.LEAN_E] = cut * north, cut * east
-    return float(c * memory[slot.LEAN_E] - s * memory[slot.LEAN_N])
-
-
-@kernel
-def _mean_heading(path: Path, leg: int, along_m: float, window_m: float) -> float:
-    """Heading of the path averaged over a window: Simpson's rule on its halves."""
-    a, _ = heading_at(path, leg, along_m - window_m)
-    b, _ = heading_at(path, leg, along_m - 0.5 * window_m)
-    c, _ = heading_at(path, leg, along_m)
-    d, _ = heading_at(path, leg, along_m + 0.5 * window_m)
-    e, _ = heading_at(path, leg, along_m + window_m)
-    return (a + 4.0 * b + 2.0 * c + 4.0 * d + e) / 12.0
-
-
-@kernel
-def _wanted_speed(
-    path: Path, guidance: Guidance, gains: Gains, leg: int, along_m: float, curvature: float
-) -> float:
-    """The speed now, low enough to brake before the turns ahead."""
-    lever = abs(guidance.point_body_m[0]) if guidance.sway > 0.0 else 0.0
-    speed = min(path.speed_mps, turning_speed_mps(gains, abs(curvature), lever))
-    distance = path.length_m[leg] - along_m - guidance.smooth_m
-    reach = path.speed_mps * path.speed_mps / (2.0 * guidance.brake_mps2)
-    following = leg + 1
-    while (
-        following < path.length_m.shape[0] and distance < reach and path.stop[following - 1] == 0.0
-    ):
-        there = turning_speed_mps(gains, abs(path.curvature_per_m[following]), lever)
-        braking = 2.0 * guidance.brake_mps2 * max(distance, 0.0)
-        speed = min(speed, math.sqrt(there * there + braking))
-        distance += path.length_m[following]
-        following += 1
-    return speed
-
-
 _DEPTH_SPEED_KEPT_MPS = 0.05
 _CAUTION_M = 0.5
 """A dive without bottom lock stops at least this far above the greatest depth."""
@@ -271,7 +232,7 @@ _SWING = 3.0
 """The path is entered from within so many times the distance that counts as near."""
 _SETTLE_S = 2.0
 _QUICKEST = 2.0
-"""Greatest progress along the path over the wanted speed: a projection may not jump."""
+"""Greatest progress along the path over the requested speed: a projection may not jump."""
 
 
 @kernel
@@ -304,12 +265,12 @@ def steer(
         demand[i] = 0.0
     for i in range(6):
         wrench[i] = 0.0
-    report[slot.WANTED_SWAY] = report[slot.WANTED_SURGE] = 0.0
-    if report[slot.PHASE] == DONE:
+    report[slot.TARGET_SWAY] = report[slot.TARGET_SURGE] = 0.0
+    if report[slot.PHASE] == slot.DONE:
         return
     if not navigates(estimate):
         report[slot.REASON] = NO_NAVIGATION
-        _enter(pilot, ABORT)
+        _enter(pilot, slot.ABORT)
     if report[slot.REASON] == NO_NAVIGATION:
         # Without an estimate of its motion the vehicle can only push itself up.
         wrench[2] = STEADY_SHARE * gains.axes[HEAVE, LEAST]
@@ -317,21 +278,18 @@ def steer(
 
     write_point(estimate, guidance, pilot)
     hear_floor(estimate, dt_s, guidance, pilot)
-    if mission.law == NO_LAW:
-        progress = _progress_m(estimate, path, guidance, pilot)
-    else:
-        progress = mission_progress_m(estimate, mission, pilot)
+    progress = _progress_m(estimate, path, mission, guidance, pilot)
     reason = watch(time_s, dt_s, estimate, progress, guidance.limits, pilot)
     if reason != NONE:
         _abort(reason, estimate, pilot)
 
     phase = report[slot.PHASE]
-    if mission.law != NO_LAW and (phase == FOLLOW or phase == DIVE):  # noqa: SIM109  as below
+    if mission.law != NO_LAW and (phase == slot.FOLLOW or phase == slot.DIVE):
         if fly_mission(dt_s, estimate, path, mission, guidance, gains, pilot):
-            _enter(pilot, ASCEND)
-    elif phase == FOLLOW:
+            _enter(pilot, slot.ASCEND)
+    elif phase == slot.FOLLOW:
         _on_path(dt_s, estimate, path, guidance, gains, pilot)
-    elif phase == DIVE or phase == APPROACH:  # noqa: SIM109  a tuple is slower here
+    elif phase == slot.DIVE or phase == slot.APPROACH:
         _on_the_way(dt_s, estimate, path, guidance, gains, pilot)
     else:
         sink_to(0.0, 0.0, dt_s, estimate, path, guidance, gains, pilot)
@@ -339,7 +297,7 @@ def steer(
         if guidance.under_way.circle_m > 0.0:
             speed = path.speed_mps
             turning = guidance.under_way.side * speed / guidance.under_way.circle_m
-        heading = report[slot.WANTED_HEADING] + turning * dt_s
+        heading = report[slot.TARGET_HEADING] + turning * dt_s
         if turning != 0.0:  # no farther ahead of the vehicle than it keeps up with
             behind = wrapped(heading - estimate[vector.HEADING])
             heading = estimate[vector.HEADING] + clamped(behind, HEADING_KEPT_RAD)
@@ -348,8 +306,8 @@ def steer(
         report[slot.LINE], report[slot.BY_SWAY] = -1.0, 0.0
         if estimate[vector.DEPTH] < guidance.surface_m:
             report[slot.AT_SURFACE] = 1.0
-            if phase == ASCEND:
-                report[slot.PHASE] = DONE
+            if phase == slot.ASCEND:
+                report[slot.PHASE] = slot.DONE
     write_wrench(gains, pilot, wrench)
     hold_level(estimate, dt_s, gains, pilot, wrench)
     if guidance.sway == 0.0 or (mission.law == COLA2 and pilot.memory[slot.KEEPS] == 0.0):
@@ -366,13 +324,13 @@ def _enter(pilot: PilotState, phase: int) -> None:
 @kernel
 def _abort(reason: int, estimate: Array, pilot: PilotState) -> None:
     pilot.report[slot.REASON] = reason
-    pilot.report[slot.WANTED_HEADING] = estimate[vector.HEADING]
-    _enter(pilot, ABORT)
+    pilot.report[slot.TARGET_HEADING] = estimate[vector.HEADING]
+    _enter(pilot, slot.ABORT)
 
 
 @kernel
 def _target_m(path: Path, guidance: Guidance, pilot: PilotState) -> float:
-    """Wanted depth of the origin: as deep as allowed without bottom lock until there is one.
+    """Requested depth of the origin: as deep as allowed without bottom lock until there is one.
 
     The smoothed sum of depth and altitude holds by how much the followed point is below the origin.
     """
@@ -384,7 +342,7 @@ def _target_m(path: Path, guidance: Guidance, pilot: PilotState) -> float:
 
 @kernel
 def _minded_m(estimate: Array, path: Path, guidance: Guidance, pilot: PilotState) -> float:
-    """Wanted depth of the origin, clear of the sea floor; the pace is slowed where one can."""
+    """Requested depth of the origin, clear of the sea floor; the pace is slowed where one can."""
     target = mind_floor(_target_m(path, guidance, pilot), estimate, guidance.limits, pilot)
     if guidance.under_way.circle_m > 0.0:
         pilot.memory[slot.PACE] = 1.0
@@ -406,16 +364,23 @@ def _goal(path: Path, guidance: Guidance, pilot: PilotState) -> tuple[float, flo
 
 
 @kernel
-def _progress_m(estimate: Array, path: Path, guidance: Guidance, pilot: PilotState) -> float:
-    """Quantity that should grow in the present phase."""
-    phase = pilot.report[slot.PHASE]
-    if phase == DIVE:
+def _progress_m(
+    estimate: Array, path: Path, mission: PilotMission, guidance: Guidance, pilot: PilotState
+) -> float:
+    """Quantity that should grow: of a mission the steps done, and less of this one left to go."""
+    phase, leg, point = pilot.report[slot.PHASE], int(pilot.report[slot.LEG]), pilot.point
+    if mission.law != NO_LAW:
+        step = mission.steps[leg]
+        left = math.hypot(
+            step[END_N] - point[slot.POINT_NORTH], step[END_E] - point[slot.POINT_EAST]
+        )
+        left += abs(pilot.report[slot.TARGET_DEPTH] - estimate[vector.DEPTH])
+        return float(_STEP_M * leg - left + pilot.memory[slot.HELD_S])
+    if phase == slot.DIVE:
         return float(-abs(_target_m(path, guidance, pilot) - estimate[vector.DEPTH]))
-    if phase == APPROACH:
+    if phase == slot.APPROACH:
         n, e, _ = _goal(path, guidance, pilot)
-        point = pilot.point
         return float(-math.hypot(n - point[slot.POINT_NORTH], e - point[slot.POINT_EAST]))
-    leg = int(pilot.report[slot.LEG])
     progress = path.begins_m[leg] + pilot.report[slot.ALONG]
     if path.turn_rad[leg] != 0.0:
         # A radian of a turn on the spot counts as a metre.
@@ -439,7 +404,7 @@ def _on_the_way(
     report[slot.PATH_HEADING], report[slot.LINE] = heading, -1.0
 
     swings = False
-    if phase == DIVE:
+    if phase == slot.DIVE:
         settled = (
             memory[slot.FLOOR_KNOWN] > 0.0
             and abs(target - estimate[vector.DEPTH]) < DEPTH_KEPT_M
@@ -449,38 +414,27 @@ def _on_the_way(
         hovers = guidance.under_way.circle_m == 0.0
         heads = (hovers and guidance.sway == 0.0) or abs(error) < HEADING_KEPT_RAD
         settled = distance < guidance.capture_m and heads
-        swings = _is_near_on_the_mean(dn, de, dt_s, guidance.capture_m, pilot) and heads
+        # In swell the followed point never stays at its goal, but swings about it.
+        share = dt_s / _MEAN_S
+        memory[slot.MEAN_N] += share * (dn - memory[slot.MEAN_N])
+        memory[slot.MEAN_E] += share * (de - memory[slot.MEAN_E])
+        near = math.hypot(memory[slot.MEAN_N], memory[slot.MEAN_E]) < guidance.capture_m
+        memory[slot.NEAR_S] = memory[slot.NEAR_S] + dt_s if near else 0.0
+        swings = (
+            heads
+            and memory[slot.NEAR_S] > _MEAN_S
+            and math.hypot(dn, de) < _SWING * guidance.capture_m
+        )
     memory[slot.SETTLED_S] = memory[slot.SETTLED_S] + dt_s if settled else 0.0
-    if phase == DIVE and memory[slot.SETTLED_S] > _SETTLE_S:
-        _enter(pilot, APPROACH)
-    elif phase == APPROACH and (
+    if phase == slot.DIVE and memory[slot.SETTLED_S] > _SETTLE_S:
+        _enter(pilot, slot.APPROACH)
+    elif phase == slot.APPROACH and (
         swings or memory[slot.SETTLED_S] > (_SETTLE_S if guidance.sway > 0.0 else 0.0)
     ):
         memory[slot.STANDING] = 0.0
         if not stands(path, int(report[slot.LEG])):
             report[slot.ALONG] -= guidance.way_in_m
-        _enter(pilot, FOLLOW)
-
-
-@kernel
-def _is_near_on_the_mean(
-    dn: float, de: float, dt_s: float, near_m: float, pilot: PilotState
-) -> bool:
-    """Whether the followed point swings about its goal: in swell it never stays there.
-
-    Args:
-        dn: how far it is north of the goal, m.
-        de: how far east.
-        dt_s: the tick.
-        near_m: how far it may be off on the mean.
-        pilot: its memory is written.
-    """
-    memory, share = pilot.memory, dt_s / _MEAN_S
-    memory[slot.MEAN_N] += share * (dn - memory[slot.MEAN_N])
-    memory[slot.MEAN_E] += share * (de - memory[slot.MEAN_E])
-    near = math.hypot(memory[slot.MEAN_N], memory[slot.MEAN_E]) < near_m
-    memory[slot.NEAR_S] = memory[slot.NEAR_S] + dt_s if near else 0.0
-    return bool(memory[slot.NEAR_S] > _MEAN_S and math.hypot(dn, de) < _SWING * near_m)
+        _enter(pilot, slot.FOLLOW)
 
 
 @kernel
@@ -501,9 +455,8 @@ def _on_path(
             point[slot.POINT_EAST],
             _QUICKEST * path.speed_mps * dt_s,
         )
-        if must_brake(path, guidance, gains, pilot, leg, along):
-            speed = max(point[slot.SURGE_SPEED], 0.0)
-            brake(speed, along, estimate[vector.HEADING], gains, pilot)
+        heading = estimate[vector.HEADING]
+        brake_for_stop(leg, along, heading, path, guidance, gains, pilot)
     target = _minded_m(estimate, path, guidance, pilot)
     sink_to(target, memory[slot.FLOOR_SLOPE], dt_s, estimate, path, guidance, gains, pilot)
     if memory[slot.STANDING] == 0.0:
@@ -511,7 +464,7 @@ def _on_path(
     elif stand(leg, dt_s, estimate, path, guidance, gains, pilot):
         over = leave_stop(path, estimate[vector.HEADING], pilot)
     if over:
-        _enter(pilot, ASCEND)
+        _enter(pilot, slot.ASCEND)
     elif abs(report[slot.CROSS]) > guidance.lost_m:
         memory[slot.RETURNS] += 1.0
         if memory[slot.RETURNS] > guidance.limits.max_returns:
@@ -520,4 +473,4 @@ def _on_path(
         # Back to where the path was left; of an arc, to its start, since the way in is straight.
         if path.curvature_per_m[leg] != 0.0:
             report[slot.ALONG] = 0.0
-        _enter(pilot, APPROACH)
+        _enter(pilot, slot.APPROACH)

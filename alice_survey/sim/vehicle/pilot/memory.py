@@ -8,13 +8,13 @@ import numpy as np
 from alice_survey.core.frames import Array
 
 (
-    PHASE, LEG, ALONG, CROSS, WANTED_HEADING, WANTED_SURGE, BY_SWAY, REASON, LINE, WANTED_DEPTH,
-    WANTED_SWAY, AT_SURFACE, PATH_HEADING,
+    PHASE, LEG, ALONG, CROSS, TARGET_HEADING, TARGET_SURGE, BY_SWAY, REASON, LINE, TARGET_DEPTH,
+    TARGET_SWAY, AT_SURFACE, PATH_HEADING,
 ) = range(13)  # fmt: skip
 """Columns of a report: phase (below); leg; distance along it, m; how far the followed point is
-to starboard of the path, m; wanted heading, rad; wanted surge over ground, m/s; 1 while the path is
-held by sway, 0 while it is by heading; reason of an abort (safety.py); survey line or -1; wanted
-depth of the body's origin, m; wanted sway over ground, m/s; 1 at the surface after the mission or
+to starboard of the path, m; target heading, rad; target surge over ground, m/s; 1 while the path is
+held by sway, 0 while it is by heading; reason of an abort (safety.py); survey line or -1; target
+depth of the body's origin, m; target sway over ground, m/s; 1 at the surface after the mission or
 an abort; heading of the path, rad. Phase, leg, distance, the steering mode and the reason are
 also inputs of the pilot on the next tick."""
 REPORT = 13
@@ -35,7 +35,7 @@ its slope, m/s, and whether there is one; integrals of the inner loops as speeds
 vector in NED, that of heave as an angle where the vehicle dives by its pitch; the time that depth,
 or place and heading, are kept; the watchdog's best value and its age; returns to the path; how long
 bottom lock is lost, the altitude too low, the pitch too large, s; how long the clearance is less
-than half of what is allowed, s; the share of the wanted surge that the sea floor leaves; 1 while
+than half of what is allowed, s; the share of the target surge that the sea floor leaves; 1 while
 the vehicle follows a place that moves along the leg or a heading that turns on the spot
 (standing.py), how far these have got, m or rad, and how fast; how long it waits at the leg's end,
 s; the integral, as a speed, of keeping that place by surge, a vector in NED; the place or heading,
@@ -53,7 +53,7 @@ MEMORY = 40
     REF_PITCH, REF_PITCH_RATE,
 ) = range(14)  # fmt: skip
 """Places in the demand on the inner loops: body velocity that feed-forward is for, m/s and rad/s;
-wanted acceleration; +1 or -1 where the last wrench was cut at the greatest or least; and wanted
+target acceleration; +1 or -1 where the last wrench was cut at the greatest or least; and target
 pitch, rad, with its rate, rad/s, which are 0 but for a vehicle that dives by its pitch."""
 DEMAND = 14
 
@@ -85,6 +85,6 @@ def new_pilot() -> PilotState:
     memory = np.zeros(MEMORY)
     memory[BEST], memory[PACE] = -math.inf, 1.0
     report = np.zeros(REPORT)
-    report[WANTED_HEADING] = math.nan
+    report[TARGET_HEADING] = math.nan
     report[LINE] = -1.0
     return PilotState(memory, report, np.zeros(DEMAND), np.zeros(6), np.zeros(6), np.zeros(6))

@@ -37,14 +37,14 @@ After the public sources of ArduPilot (`ArduSub/mode_auto.cpp`, `commands_logic.
   that no way-point is passed. Here it starts and stops with the constant acceleration that takes as
   long as that jerk does.
 - Its time runs slower while the vehicle cannot keep up: at the share 0.05 + (v - PSC_POSXY_P e) / v
-  wanted, through a low-pass of the time WPNAV_ACCEL / WPNAV_JERK.
+  requested, through a low-pass of the time WPNAV_ACCEL / WPNAV_JERK.
 - The vehicle holds on to the target by surge and sway. AC_PosControl's P on position and PID on
   velocity take our own gains of these axes, as a vehicle would be tuned; a steady current is met by
   the integral.
 - The way-point is reached when the target is there and the vehicle within `WPNAV_RADIUS`, depth
   included; then the stay counts.
 - Heading: `WP_YAW_BEHAVIOR` 4, ArduSub's default: the track's bearing, corrected towards the
-  velocity that is wanted by at most `XTRACK_ANG_LIM`; or that of a `CONDITION_YAW`.
+  velocity that is requested by at most `XTRACK_ANG_LIM`; or that of a `CONDITION_YAW`.
 """
 
 import math
@@ -58,6 +58,7 @@ from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.dynamics import add_coriolis, add_damping
 from alice_survey.sim.vehicle.pilot import memory as slot
+from alice_survey.sim.vehicle.pilot import steps as column
 from alice_survey.sim.vehicle.pilot.gains import FASTEST, PLACE, RATE, SURGE, WEIGHT, YAW, Gains
 from alice_survey.sim.vehicle.pilot.memory import DIVE, FOLLOW, PilotState
 from alice_survey.sim.vehicle.pilot.path import Path
@@ -71,27 +72,6 @@ from alice_survey.sim.vehicle.pilot.steering import (
     ramp,
     sink_to,
     surge_at,
-)
-from alice_survey.sim.vehicle.pilot.steps import (
-    ALTITUDE,
-    ANCHOR,
-    BY_ALTITUDE,
-    BY_DEPTH,
-    COLUMNS,
-    DEPTH,
-    END_E,
-    END_N,
-    FROM_END,
-    HEADING,
-    HOLD_S,
-    KEEP,
-    KIND,
-    LINE,
-    SECTION,
-    SPEED,
-    START_E,
-    START_N,
-    TOLERANCE,
 )
 from alice_survey.sim.vehicle.rotations import wrapped
 
@@ -137,13 +117,24 @@ def to_waypoint(
 ) -> bool:
     """Fly to a way-point for a tick; return whether it is done. Arguments as of `manoeuvre`."""
     memory, point, now = pilot.memory, pilot.point, estimate[vector.HEADING]
-    dn, de = step[END_N] - memory[slot.FROM_N], step[END_E] - memory[slot.FROM_E]
+    dn, de = step[column.END_N] - memory[slot.FROM_N], step[column.END_E] - memory[slot.FROM_E]
     length = math.hypot(dn, de)
     course = math.atan2(de, dn) if length > 1e-6 else now
     s, c = math.sin(course), math.cos(course)
-    speed = max(step[SPEED], MIN_SPEED_MPS)
+    speed = max(step[column.SPEED], MIN_SPEED_MPS)
     acceleration = min(settings[_ACCEL], 0.5 * math.sqrt(speed * settings[_JERK]))
-    _set_pace(c, s, now, dt_s, settings, pilot)
+    # How fast the target's time runs.
+    moves, pace = memory[slot.RAMP_SPEED], 1.0
+    if moves > 0.0:
+        done = (point[slot.POINT_NORTH] - memory[slot.FROM_N]) * c
+        done += (point[slot.POINT_EAST] - memory[slot.FROM_E]) * s
+        cosine = c * math.cos(now) + s * math.sin(now)
+        sine = s * math.cos(now) - c * math.sin(now)
+        track_speed = point[slot.SURGE_SPEED] * cosine + point[slot.SWAY_SPEED] * sine
+        behind = settings[_POSITION_P] * (memory[slot.RAMP] - done)
+        pace = min(max(_SPARE + (track_speed - behind) / moves, 0.0), 1.0)
+    time_s = settings[_ACCEL] / settings[_JERK]
+    memory[slot.TRACK_PACE] += (pace - memory[slot.TRACK_PACE]) * min(dt_s / time_s, 1.0)
     quicken, dt = 0.0, memory[slot.TRACK_PACE] * dt_s
     if dt > _TINY_S:
         memory[slot.RAMP], memory[slot.RAMP_SPEED], quicken = ramp(
@@ -155,54 +146,28 @@ def to_waypoint(
     north, east = memory[slot.FROM_N] + at * c, memory[slot.FROM_E] + at * s
     off_n, off_e = north - point[slot.POINT_NORTH], east - point[slot.POINT_EAST]
 
-    heading = step[HEADING]
+    heading = step[column.HEADING]
     if not math.isfinite(heading):
         heading = course
-        wanted_n = moves * c + settings[_POSITION_P] * off_n
-        wanted_e = moves * s + settings[_POSITION_P] * off_e
-        if length > 1e-6 and math.hypot(wanted_n, wanted_e) >= _SLOW * speed:
-            error = wrapped(math.atan2(wanted_e, wanted_n) - course)
+        target_n = moves * c + settings[_POSITION_P] * off_n
+        target_e = moves * s + settings[_POSITION_P] * off_e
+        if length > 1e-6 and math.hypot(target_n, target_e) >= _SLOW * speed:
+            error = wrapped(math.atan2(target_e, target_n) - course)
             heading += clamped(error, settings[_XTRACK])
     head_for(heading, 0.0, 0.0, estimate, dt_s, gains, pilot)
-    wanted = StopReference(north, east, course, moves, quicken, heading, 0.0, 0.0, at, False)
-    keep_place(wanted, dt_s, estimate, path, guidance, gains, pilot)
+    reference = StopReference(north, east, course, moves, quicken, heading, 0.0, 0.0, at, False)
+    keep_place(reference, dt_s, estimate, path, guidance, gains, pilot)
     pilot.report[slot.BY_SWAY] = 1.0
 
-    away = math.hypot(step[END_N] - point[slot.POINT_NORTH], step[END_E] - point[slot.POINT_EAST])
-    radius = max(step[TOLERANCE], MIN_RADIUS_M)
+    away = math.hypot(
+        step[column.END_N] - point[slot.POINT_NORTH], step[column.END_E] - point[slot.POINT_EAST]
+    )
+    radius = max(step[column.TOLERANCE], MIN_RADIUS_M)
     if memory[slot.KEEPS] == 0.0 and (at < length or math.hypot(away, heave_m) > radius):
         return False
     memory[slot.KEEPS] = 1.0
     memory[slot.HELD_S] += dt_s
-    return bool(memory[slot.HELD_S] >= step[HOLD_S])
-
-
-@kernel
-def _set_pace(
-    c: float, s: float, heading: float, dt_s: float, settings: Array, pilot: PilotState
-) -> None:
-    """Set how fast the target's time runs.
-
-    Args:
-        c: cosine of the course.
-        s: its sine.
-        heading: of the vehicle.
-        dt_s: the tick.
-        settings: of the law.
-        pilot: its memory is written.
-    """
-    memory, point = pilot.memory, pilot.point
-    wanted, pace = memory[slot.RAMP_SPEED], 1.0
-    if wanted > 0.0:
-        done = (point[slot.POINT_NORTH] - memory[slot.FROM_N]) * c
-        done += (point[slot.POINT_EAST] - memory[slot.FROM_E]) * s
-        cosine = c * math.cos(heading) + s * math.sin(heading)
-        sine = s * math.cos(heading) - c * math.sin(heading)
-        speed = point[slot.SURGE_SPEED] * cosine + point[slot.SWAY_SPEED] * sine
-        behind = settings[_POSITION_P] * (memory[slot.RAMP] - done)
-        pace = min(max(_SPARE + (speed - behind) / wanted, 0.0), 1.0)
-    time_s = settings[_ACCEL] / settings[_JERK]
-    memory[slot.TRACK_PACE] += (pace - memory[slot.TRACK_PACE]) * min(dt_s / time_s, 1.0)
+    return bool(memory[slot.HELD_S] >= step[column.HOLD_S])
 
 
 PARK_APPROACH_M = 3.0
@@ -339,9 +304,9 @@ def timeout_s(step: Array, distance_m: float, heave_m: float, settings: Array) -
         heave_m: to its depth.
         settings: of the law.
     """
-    speed = max(min(step[SPEED], settings[_MAX_SURGE]), 1e-3)
-    heave = abs(heave_m) if step[BY_DEPTH] > 0.0 else 0.0
-    heave += _DVL_RANGE_M if step[BY_ALTITUDE] > 0.0 else 0.0
+    speed = max(min(step[column.SPEED], settings[_MAX_SURGE]), 1e-3)
+    heave = abs(heave_m) if step[column.BY_DEPTH] > 0.0 else 0.0
+    heave += _DVL_RANGE_M if step[column.BY_ALTITUDE] > 0.0 else 0.0
     return float(2.0 * max(math.sqrt(2.0) * distance_m / speed, heave / _HEAVE_MPS) + _SPARE_S)
 
 
@@ -371,9 +336,9 @@ def manoeuvre(
         pilot: is written.
     """
     memory = pilot.memory
-    parks = step[KIND] == KEEP or step[KIND] == ANCHOR
+    parks = step[column.KIND] == column.KEEP or step[column.KIND] == column.ANCHOR
     if not parks or memory[slot.KEEPS] == 0.0:
-        tolerance = PARK_APPROACH_M if parks else step[TOLERANCE]
+        tolerance = PARK_APPROACH_M if parks else step[column.TOLERANCE]
         done = _section(step, tolerance, heave_m, dt_s, estimate, settings, guidance, gains, pilot)
         done = done or memory[slot.STEP_S] > memory[slot.TIMEOUT_S]
         if done and parks:
@@ -384,11 +349,28 @@ def manoeuvre(
             memory[slot.PLACE_SUM_E] = held * math.sin(heading)
         return bool(done and not parks)
     memory[slot.HELD_S] += dt_s
-    if step[KIND] == KEEP:
-        _keep(step, dt_s, estimate, path, guidance, gains, pilot)
-    else:
-        _anchor(step, dt_s, estimate, settings, guidance, gains, pilot)
-    return bool(memory[slot.HELD_S] >= step[HOLD_S])
+    if (
+        step[column.KIND] == column.KEEP
+    ):  # by surge and sway, or by surge alone without thrusters for it
+        heading = step[column.HEADING]
+        head_for(heading, 0.0, 0.0, estimate, dt_s, gains, pilot)
+        reference = StopReference(
+            step[column.END_N], step[column.END_E], heading, 0.0, 0.0, heading, 0.0, 0.0, 0.0, True
+        )
+        keep_place(reference, dt_s, estimate, path, guidance, gains, pilot)
+        pilot.report[slot.BY_SWAY] = 1.0 if guidance.sway > 0.0 else 0.0
+    else:  # face the place and keep a radius off it
+        dn = step[column.END_N] - pilot.point[slot.POINT_NORTH]
+        de = step[column.END_E] - pilot.point[slot.POINT_EAST]
+        heading = math.atan2(de, dn)
+        speed = settings[_ANCHOR_KP] * (math.hypot(dn, de) - settings[_ANCHOR_RADIUS])
+        speed = min(max(speed, settings[_ANCHOR_MIN]), settings[_ANCHOR_MAX])
+        if abs(wrapped(heading - estimate[vector.HEADING])) > _ANCHOR_RAD:
+            speed = 0.0
+        head_for(heading, 0.0, 0.0, estimate, dt_s, gains, pilot)
+        surge_at(speed, dt_s, guidance, gains, pilot)
+        pilot.report[slot.BY_SWAY] = 0.0
+    return bool(memory[slot.HELD_S] >= step[column.HOLD_S])
 
 
 @kernel
@@ -433,13 +415,13 @@ def _section(
     """Follow a section for a tick; return whether its end is reached."""
     memory, point, now = pilot.memory, pilot.point, estimate[vector.HEADING]
     north, east = point[slot.POINT_NORTH], point[slot.POINT_EAST]
-    to_end = math.hypot(step[END_N] - north, step[END_E] - east)
+    to_end = math.hypot(step[column.END_N] - north, step[column.END_E] - east)
     to_start = math.hypot(memory[slot.FROM_N] - north, memory[slot.FROM_E] - east)
     heading = aim(
-        north, east, memory[slot.FROM_N], memory[slot.FROM_E], step[END_N], step[END_E],
-        settings[_DELTA],
+        north, east, memory[slot.FROM_N], memory[slot.FROM_E], step[column.END_N],
+        step[column.END_E], settings[_DELTA],
     )  # fmt: skip
-    speed = min(step[SPEED], settings[_MAX_SURGE])
+    speed = min(step[column.SPEED], settings[_MAX_SURGE])
     near = min(to_end, to_start) / max(settings[_RAMP], 1e-9)
     if 0.0 < near < 1.0:
         speed -= (speed - min(settings[_MIN_SURGE], speed)) * (1.0 - near)
@@ -455,52 +437,7 @@ def _section(
     return bool(to_end < tolerance_m and abs(heave_m) < settings[_TOLERANCE_Z])
 
 
-@kernel
-def _keep(
-    step: Array,
-    dt_s: float,
-    estimate: Array,
-    path: Path,
-    guidance: Guidance,
-    gains: Gains,
-    pilot: PilotState,
-) -> None:
-    """Hold a place and a heading: by surge and sway, or by surge alone without thrusters for it."""
-    heading = step[HEADING]
-    head_for(heading, 0.0, 0.0, estimate, dt_s, gains, pilot)
-    wanted = StopReference(
-        step[END_N], step[END_E], heading, 0.0, 0.0, heading, 0.0, 0.0, 0.0, True
-    )
-    keep_place(wanted, dt_s, estimate, path, guidance, gains, pilot)
-    pilot.report[slot.BY_SWAY] = 1.0 if guidance.sway > 0.0 else 0.0
-
-
-@kernel
-def _anchor(
-    step: Array,
-    dt_s: float,
-    estimate: Array,
-    settings: Array,
-    guidance: Guidance,
-    gains: Gains,
-    pilot: PilotState,
-) -> None:
-    """Face a place and keep a radius off it."""
-    dn = step[END_N] - pilot.point[slot.POINT_NORTH]
-    de = step[END_E] - pilot.point[slot.POINT_EAST]
-    heading = math.atan2(de, dn)
-    speed = settings[_ANCHOR_KP] * (math.hypot(dn, de) - settings[_ANCHOR_RADIUS])
-    speed = min(max(speed, settings[_ANCHOR_MIN]), settings[_ANCHOR_MAX])
-    if abs(wrapped(heading - estimate[vector.HEADING])) > _ANCHOR_RAD:
-        speed = 0.0
-    head_for(heading, 0.0, 0.0, estimate, dt_s, gains, pilot)
-    surge_at(speed, dt_s, guidance, gains, pilot)
-    pilot.report[slot.BY_SWAY] = 0.0
-
-
 NO_LAW, COLA2, ARDUSUB = 0, 1, 2
-_STEP_M = 1000.0
-"""Progress of a step that is done, above the length of any."""
 
 
 class PilotMission(NamedTuple):
@@ -514,7 +451,7 @@ class PilotMission(NamedTuple):
 
 
 _SETTINGS = max(COLA2_SETTINGS, ARDUSUB_SETTINGS)
-NO_MISSION = PilotMission(NO_LAW, np.zeros((0, COLUMNS)), np.zeros(_SETTINGS))
+NO_MISSION = PilotMission(NO_LAW, np.zeros((0, column.COLUMNS)), np.zeros(_SETTINGS))
 """The path is followed by our own guidance."""
 
 
@@ -529,16 +466,6 @@ def mission_of(law: int, steps: Array, settings: Sequence[float]) -> PilotMissio
     padded = np.zeros(_SETTINGS)
     padded[: len(settings)] = settings
     return PilotMission(law, np.ascontiguousarray(steps, np.float64), padded)
-
-
-@kernel
-def mission_progress_m(estimate: Array, mission: PilotMission, pilot: PilotState) -> float:
-    """Quantity that grows while a mission gets on: steps done, and the way left of this one."""
-    leg = int(pilot.report[slot.LEG])
-    step, point = mission.steps[leg], pilot.point
-    left = math.hypot(step[END_N] - point[slot.POINT_NORTH], step[END_E] - point[slot.POINT_EAST])
-    left += abs(pilot.report[slot.WANTED_DEPTH] - estimate[vector.DEPTH])
-    return float(_STEP_M * leg - left + pilot.memory[slot.HELD_S])
 
 
 @kernel
@@ -568,22 +495,44 @@ def fly_mission(
     memory, report, point = pilot.memory, pilot.report, pilot.point
     leg = int(report[slot.LEG])
     step = mission.steps[leg]
-    heave = step[BY_DEPTH] > 0.0 and (step[BY_ALTITUDE] == 0.0 or memory[slot.FLOOR_KNOWN] == 0.0)
+    heave = step[column.BY_DEPTH] > 0.0 and (
+        step[column.BY_ALTITUDE] == 0.0 or memory[slot.FLOOR_KNOWN] == 0.0
+    )
     if heave:
-        depth, slope = step[DEPTH], 0.0
+        depth, slope = step[column.DEPTH], 0.0
     elif memory[slot.FLOOR_KNOWN] == 0.0:
         depth, slope = guidance.limits.blind_depth_m, 0.0
     else:
-        depth, slope = memory[slot.FLOOR] - step[ALTITUDE], memory[slot.FLOOR_SLOPE]
+        depth, slope = memory[slot.FLOOR] - step[column.ALTITUDE], memory[slot.FLOOR_SLOPE]
     target = mind_floor(depth, estimate, guidance.limits, pilot)
     if memory[slot.STEP_S] == 0.0:
-        _begin(leg, target, estimate, mission, guidance, pilot)
+        north, east = point[slot.POINT_NORTH], point[slot.POINT_EAST]
+        memory[slot.HELD_S] = memory[slot.KEEPS] = 0.0
+        memory[slot.TRACK_PACE] = 1.0
+        if step[column.KIND] == column.SECTION:
+            memory[slot.FROM_N], memory[slot.FROM_E] = step[column.START_N], step[column.START_E]
+        elif step[column.KIND] == column.FROM_END and leg > 0:
+            before = mission.steps[leg - 1]
+            memory[slot.FROM_N], memory[slot.FROM_E] = before[column.END_N], before[column.END_E]
+        else:
+            memory[slot.FROM_N], memory[slot.FROM_E] = north, east
+        memory[slot.RAMP] = memory[slot.RAMP_SPEED] = memory[slot.REF] = memory[slot.REF_SPEED] = (
+            0.0
+        )
+        memory[slot.TIMEOUT_S] = math.inf
+        if mission.law == COLA2:
+            memory[slot.TIMEOUT_S] = timeout_s(
+                step,
+                math.hypot(step[column.END_N] - north, step[column.END_E] - east),
+                target - estimate[vector.DEPTH],
+                mission.settings,
+            )
     memory[slot.STEP_S] += dt_s
     sink_to(target, slope, dt_s, estimate, path, guidance, gains, pilot)
     # Until there is a floor a dive may take as long as it gets on.
     report[slot.PHASE] = DIVE if memory[slot.FLOOR_KNOWN] == 0.0 or heave else FOLLOW
-    report[slot.LINE] = step[LINE]
-    dn, de = step[END_N] - memory[slot.FROM_N], step[END_E] - memory[slot.FROM_E]
+    report[slot.LINE] = step[column.LINE]
+    dn, de = step[column.END_N] - memory[slot.FROM_N], step[column.END_E] - memory[slot.FROM_E]
     course = math.atan2(de, dn) if math.hypot(dn, de) > 1e-6 else estimate[vector.HEADING]
     off_n, off_e = (
         point[slot.POINT_NORTH] - memory[slot.FROM_N],
@@ -601,7 +550,7 @@ def fly_mission(
             step, away, dt_s, estimate, path, mission.settings, guidance, gains, pilot
         )
     last = leg + 1 == mission.steps.shape[0]
-    if heave and last and estimate[vector.DEPTH] < guidance.surface_m and step[DEPTH] == 0.0:
+    if heave and last and estimate[vector.DEPTH] < guidance.surface_m and step[column.DEPTH] == 0.0:
         done = True
     if not done:
         return False
@@ -611,35 +560,3 @@ def fly_mission(
     memory[slot.STEP_S] = 0.0
     restart_watch(pilot)
     return False
-
-
-@kernel
-def _begin(
-    leg: int,
-    target_m: float,
-    estimate: Array,
-    mission: PilotMission,
-    guidance: Guidance,
-    pilot: PilotState,
-) -> None:
-    """Begin a step: where its way starts, and how long it may take."""
-    memory, point, step = pilot.memory, pilot.point, mission.steps[leg]
-    north, east = point[slot.POINT_NORTH], point[slot.POINT_EAST]
-    memory[slot.HELD_S] = memory[slot.KEEPS] = 0.0
-    memory[slot.TRACK_PACE] = 1.0
-    if step[KIND] == SECTION:
-        memory[slot.FROM_N], memory[slot.FROM_E] = step[START_N], step[START_E]
-    elif step[KIND] == FROM_END and leg > 0:
-        before = mission.steps[leg - 1]
-        memory[slot.FROM_N], memory[slot.FROM_E] = before[END_N], before[END_E]
-    else:
-        memory[slot.FROM_N], memory[slot.FROM_E] = north, east
-    memory[slot.RAMP] = memory[slot.RAMP_SPEED] = memory[slot.REF] = memory[slot.REF_SPEED] = 0.0
-    memory[slot.TIMEOUT_S] = math.inf
-    if mission.law == COLA2:
-        memory[slot.TIMEOUT_S] = timeout_s(
-            step,
-            math.hypot(step[END_N] - north, step[END_E] - east),
-            target_m - estimate[vector.DEPTH],
-            mission.settings,
-        )

@@ -51,9 +51,9 @@ class Path(NamedTuple):
     stop: Array
     """(L,) 1 where the vehicle comes to rest at the leg's end, else 0."""
     altitude_m: float
-    """Wanted altitude of the followed point."""
+    """Target altitude of the followed point."""
     speed_mps: float
-    """Wanted speed over ground, along the heading."""
+    """Target speed over ground, along the heading."""
 
 
 def path_from_legs(
@@ -75,8 +75,8 @@ def path_from_legs(
         length_m: (L,) 0 of turns on the spot.
         curvature_per_m: (L,) positive to starboard.
         line: (L,) index of the survey line, -1 between lines.
-        altitude_m: wanted above the sea floor, of the followed point.
-        speed_mps: wanted over ground.
+        altitude_m: target above the sea floor, of the followed point.
+        speed_mps: target over ground.
         turn_rad: (L,) of turns on the spot, else 0; there are none if left out.
         side_rad: (L,) heading minus course, +-pi/2 of sway steps, else 0; there are none if left
             out.

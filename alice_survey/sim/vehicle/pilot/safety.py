@@ -6,22 +6,8 @@ from typing import NamedTuple
 from alice_survey.core.compiled import kernel
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.estimate_vector import ALTITUDE, CLEARANCE, DEPTH, ESTIMATE, PITCH
-from alice_survey.sim.vehicle.pilot.memory import (
-    APPROACH,
-    BEST,
-    DIVE,
-    FLOOR_KNOWN,
-    FOLLOW,
-    LOST_S,
-    LOW_S,
-    PACE,
-    PHASE,
-    PITCHED_S,
-    SIGMA_M,
-    SINCE_BEST_S,
-    UNSAFE_S,
-    PilotState,
-)
+from alice_survey.sim.vehicle.pilot import memory as slot
+from alice_survey.sim.vehicle.pilot.memory import PilotState
 
 (
     NONE, TOO_LOW, TOO_STEEP, NO_BOTTOM, NO_DIVE, NO_APPROACH, NO_PROGRESS, LOST_PATH, TOO_DEEP,
@@ -33,7 +19,7 @@ REASONS = {
     TOO_LOW: "the clearance stayed below the least that is allowed",
     TOO_STEEP: "the pitch stayed beyond the most that is allowed",
     NO_BOTTOM: "the DVL did not hear the bottom for longer than is allowed",
-    NO_DIVE: "the dive came no nearer to the wanted altitude",
+    NO_DIVE: "the dive came no nearer to the target altitude",
     NO_APPROACH: "the vehicle came no nearer to the start of the path",
     NO_PROGRESS: "the vehicle made no progress along the path",
     LOST_PATH: "the vehicle was carried off the path more often than it may return to it",
@@ -95,13 +81,9 @@ def navigates(estimate: Array) -> bool:
 @kernel
 def _goes_on_blind(limits: SafetyLimits, pilot: PilotState) -> bool:
     """Whether the vehicle goes on without bottom lock: it knows well enough where it is."""
-    return bool(0.0 <= pilot.memory[SIGMA_M] <= limits.blind_sigma_m and limits.blind_sigma_m > 0.0)
-
-
-@kernel
-def _clear_m(estimate: Array) -> float:
-    """Least of altitude and clearance; NaN without bottom lock."""
-    return float(min(estimate[ALTITUDE], estimate[CLEARANCE]))
+    return bool(
+        0.0 <= pilot.memory[slot.SIGMA_M] <= limits.blind_sigma_m and limits.blind_sigma_m > 0.0
+    )
 
 
 @kernel
@@ -113,7 +95,7 @@ def mind_floor(depth_m: float, estimate: Array, limits: SafetyLimits, pilot: Pil
     bottom lock may not have been found yet, nor where the vehicle is to go on blind.
 
     Args:
-        depth_m: wanted, of the origin.
+        depth_m: target, of the origin.
         estimate: (14,) of the navigation.
         limits: bounds.
         pilot: its memory's pace is written.
@@ -122,15 +104,15 @@ def mind_floor(depth_m: float, estimate: Array, limits: SafetyLimits, pilot: Pil
         A depth, no greater, with at least 1.25 times the least clearance.
     """
     memory, minimum = pilot.memory, limits.min_altitude_m
-    clear = _clear_m(estimate)
+    clear = min(estimate[ALTITUDE], estimate[CLEARANCE])
     if not math.isfinite(clear):
         if _goes_on_blind(limits, pilot):
-            memory[PACE] = 1.0
+            memory[slot.PACE] = 1.0
         else:
-            memory[PACE] = max(0.0, 1.0 - memory[LOST_S] / _STOP_S)
+            memory[slot.PACE] = max(0.0, 1.0 - memory[slot.LOST_S] / _STOP_S)
         return depth_m
     spare = clear - _KEPT * minimum
-    memory[PACE] = min(max((clear / minimum - 1.0) / (_KEPT - 1.0), 0.0), 1.0)
+    memory[slot.PACE] = min(max((clear / minimum - 1.0) / (_KEPT - 1.0), 0.0), 1.0)
     return float(min(depth_m, estimate[DEPTH] + spare))
 
 
@@ -156,37 +138,37 @@ def watch(
     Returns:
         NONE, or the reason to abort.
     """
-    memory, phase = pilot.memory, pilot.report[PHASE]
-    if phase != DIVE and phase != APPROACH and phase != FOLLOW:
+    memory, phase = pilot.memory, pilot.report[slot.PHASE]
+    if phase != slot.DIVE and phase != slot.APPROACH and phase != slot.FOLLOW:
         return NONE
-    clear = _clear_m(estimate)
+    clear = min(estimate[ALTITUDE], estimate[CLEARANCE])
     heard = math.isfinite(clear)
     # On the way down the bottom may be out of reach; the watch on the dive's progress covers it.
-    memory[LOST_S] = 0.0 if heard or phase == DIVE else memory[LOST_S] + dt_s
+    memory[slot.LOST_S] = 0.0 if heard or phase == slot.DIVE else memory[slot.LOST_S] + dt_s
     # A missing altitude neither clears nor adds to the suspicion.
     if heard:
         minimum = limits.min_altitude_m
-        memory[LOW_S] = memory[LOW_S] + dt_s if clear < minimum else 0.0
-        memory[UNSAFE_S] = memory[UNSAFE_S] + dt_s if clear < 0.5 * minimum else 0.0
+        memory[slot.LOW_S] = memory[slot.LOW_S] + dt_s if clear < minimum else 0.0
+        memory[slot.UNSAFE_S] = memory[slot.UNSAFE_S] + dt_s if clear < 0.5 * minimum else 0.0
     steep = abs(estimate[PITCH]) > limits.max_pitch_rad
-    memory[PITCHED_S] = memory[PITCHED_S] + dt_s if steep else 0.0
-    if progress_m > memory[BEST] + _STEP_M:
-        memory[BEST], memory[SINCE_BEST_S] = progress_m, 0.0
+    memory[slot.PITCHED_S] = memory[slot.PITCHED_S] + dt_s if steep else 0.0
+    if progress_m > memory[slot.BEST] + _STEP_M:
+        memory[slot.BEST], memory[slot.SINCE_BEST_S] = progress_m, 0.0
     else:
-        memory[SINCE_BEST_S] += dt_s
+        memory[slot.SINCE_BEST_S] += dt_s
 
-    if memory[UNSAFE_S] > _WITHIN_S or memory[LOW_S] > limits.climb_s:
+    if memory[slot.UNSAFE_S] > _WITHIN_S or memory[slot.LOW_S] > limits.climb_s:
         return TOO_LOW
-    if memory[PITCHED_S] > _WITHIN_S:
+    if memory[slot.PITCHED_S] > _WITHIN_S:
         return TOO_STEEP
     if estimate[DEPTH] > limits.max_depth_m:
         return TOO_DEEP
-    if memory[LOST_S] > limits.lost_bottom_s and not _goes_on_blind(limits, pilot):
+    if memory[slot.LOST_S] > limits.lost_bottom_s and not _goes_on_blind(limits, pilot):
         return NO_BOTTOM
-    if memory[SINCE_BEST_S] > limits.stuck_s:
-        if phase == DIVE:
-            return NO_DIVE if memory[FLOOR_KNOWN] > 0.0 else NO_BOTTOM
-        return NO_APPROACH if phase == APPROACH else NO_PROGRESS
+    if memory[slot.SINCE_BEST_S] > limits.stuck_s:
+        if phase == slot.DIVE:
+            return NO_DIVE if memory[slot.FLOOR_KNOWN] > 0.0 else NO_BOTTOM
+        return NO_APPROACH if phase == slot.APPROACH else NO_PROGRESS
     if time_s > limits.max_s:
         return TOO_LONG
     return NONE
@@ -195,4 +177,4 @@ def watch(
 @kernel
 def restart_watch(pilot: PilotState) -> None:
     """Reset the progress of the phase that ends."""
-    pilot.memory[BEST], pilot.memory[SINCE_BEST_S] = -math.inf, 0.0
+    pilot.memory[slot.BEST], pilot.memory[slot.SINCE_BEST_S] = -math.inf, 0.0

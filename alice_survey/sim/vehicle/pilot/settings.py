@@ -2,7 +2,7 @@
 
 Guidance of vehicles that fins steer: depth by pitch, and circles in place of hovering.
 
-In the vertical plane the vehicle heads for a point ahead on the wanted depth, as `los` does in the
+In the vertical plane the vehicle heads for a point ahead on the target depth, as `los` does in the
 horizontal one: its pitch is that of level flight plus the depth's error by a look-ahead distance,
 plus an integral for what level flight takes that is not modelled. It cannot stop: it dives, waits
 and surfaces on a circle that touches the way in to its path, at the survey's speed.
@@ -17,7 +17,6 @@ import numpy as np
 from alice_survey.core.compiled import kernel
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.pilot import memory as slot
 from alice_survey.sim.vehicle.pilot.gains import (
     BANDWIDTH,
@@ -40,7 +39,6 @@ from alice_survey.sim.vehicle.pilot.gains import (
     damping_ratio,
     heading_loop,
 )
-from alice_survey.sim.vehicle.pilot.memory import PilotState
 from alice_survey.sim.vehicle.pilot.path import Path
 from alice_survey.sim.vehicle.pilot.safety import SafetyLimits
 
@@ -62,8 +60,6 @@ def spot_rate_rad_s(turn_rate_limit_deg_s: float) -> float:
 
 MAX_PITCH_RAD = math.radians(20.0)
 """Greatest commanded pitch besides that of level flight: two thirds of what ends a mission."""
-_DEPTH_KEPT_M = 0.2
-"""Within it the integral learns."""
 
 
 class UnderWay(NamedTuple):
@@ -103,47 +99,12 @@ def dive_loop(gains: Gains, speed_mps: float, look_ahead_m: float) -> Array:
     sink = np.array([0.0, -speed_mps, 1.0, 0.0, 0.0, 0.0, 0.0])
     learns = INTEGRAL_SHARE * speed_mps / look_ahead_m**2
     loop[5], loop[6, 5] = sink, learns
-    # Wanted pitch depth / look-ahead + integral, and its rate, without that of the integral.
-    wanted, rate = np.zeros(7), sink / look_ahead_m
-    wanted[5], wanted[6] = 1.0 / look_ahead_m, 1.0
-    loop[0] -= wanted
-    loop[4] += (row[PLACE] * wanted + row[RATE] * rate) / row[LAG]
+    # Target pitch depth / look-ahead + integral, and its rate, without that of the integral.
+    target, rate = np.zeros(7), sink / look_ahead_m
+    target[5], target[6] = 1.0 / look_ahead_m, 1.0
+    loop[0] -= target
+    loop[4] += (row[PLACE] * target + row[RATE] * rate) / row[LAG]
     return loop
-
-
-@kernel
-def fly_to_depth(
-    depth_m: float,
-    feed_mps: float,
-    speed_mps: float,
-    estimate: Array,
-    dt_s: float,
-    under_way: UnderWay,
-    pilot: PilotState,
-) -> None:
-    """Command the pitch that takes the origin to a depth, which itself moves at a speed.
-
-    Args:
-        depth_m: wanted.
-        feed_mps: rate of that, downwards.
-        speed_mps: of the survey.
-        estimate: (14,) of the navigation.
-        dt_s: the tick.
-        under_way: settings.
-        pilot: its demand and memory are written.
-    """
-    memory, demand = pilot.memory, pilot.demand
-    off, ahead = estimate[vector.DEPTH] - depth_m, under_way.dive_ahead_m
-    bent = off / ahead + memory[slot.HEAVE_SUM] - feed_mps / speed_mps
-    kept = min(max(bent, -MAX_PITCH_RAD), MAX_PITCH_RAD)
-    demand[slot.REF_PITCH] = under_way.level_rad + kept
-    demand[slot.REF_PITCH_RATE] = 0.0
-    if kept == bent:
-        demand[slot.REF_PITCH_RATE] = (pilot.point[slot.SINK_SPEED] - feed_mps) / ahead
-    if abs(off) < _DEPTH_KEPT_M:
-        total = memory[slot.HEAVE_SUM] + INTEGRAL_SHARE * speed_mps / (ahead * ahead) * off * dt_s
-        memory[slot.HEAVE_SUM] = min(max(total, -0.5 * MAX_PITCH_RAD), 0.5 * MAX_PITCH_RAD)
-    pilot.report[slot.WANTED_DEPTH] = depth_m
 
 
 @kernel
@@ -375,10 +336,10 @@ def stop_speeds(
         gains: gains of the vehicle.
         lever_m: how far the followed point is ahead of the origin.
         by_sway: whether sway is controlled.
-        spot_rad_s: rate that is wanted.
+        spot_rad_s: rate that is target.
 
     Returns:
-        The rate, no greater than wanted, and the speed, at most `STEP_MPS`, 0 without sway.
+        The rate, no greater than target, and the speed, at most `STEP_MPS`, 0 without sway.
     """
     rate = min(spot_rad_s, float(gains.axes[YAW, FASTEST]))
     if not by_sway:
@@ -434,7 +395,7 @@ def los_loop(gains: Gains, speed_mps: float, lever_m: float, look_ahead_m: float
     loop[1, 3] = 1.0
     loop[2:4, 2:4] = pair
     loop[2:4, 4] = by_moment * row[MASS]
-    # Wanted heading -offset / look-ahead, and its rate.
+    # Target heading -offset / look-ahead, and its rate.
     asked = -row[RATE] / look_ahead_m * loop[0]
     asked[[0, 1, 3]] -= row[PLACE] / look_ahead_m, row[PLACE], row[RATE]
     loop[4] = asked / row[LAG]

@@ -4,11 +4,11 @@ Each commands velocities and accelerations of the inner loops (`PilotState.deman
 together are called in the order heave, yaw, surge, sway: surge and sway of the followed point
 depend on the commanded yaw.
 
-The inner loops lead from wanted velocities and accelerations to a wrench.
+The inner loops lead from target velocities and accelerations to a wrench.
 
 Feedback commands an acceleration; inertia, Coriolis forces and drag convert it to forces (computed
 torque: T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control, 2011), at the
-wanted motion over ground. The current is not known, so that what it adds to drag is left to the
+target motion over ground. The current is not known, so that what it adds to drag is left to the
 integrals.
 
 Stops: coming to rest at a corner, turning on the spot, and stepping aside.
@@ -37,6 +37,7 @@ from alice_survey.sim.vehicle.pilot.gains import (
     HEAVE,
     INNER,
     INTEGRAL,
+    INTEGRAL_SHARE,
     KEPT_RAD,
     LAG,
     LEAST,
@@ -56,7 +57,7 @@ from alice_survey.sim.vehicle.pilot.gains import (
 from alice_survey.sim.vehicle.pilot.memory import PilotState
 from alice_survey.sim.vehicle.pilot.path import Path, place_at
 from alice_survey.sim.vehicle.pilot.safety import restart_watch
-from alice_survey.sim.vehicle.pilot.settings import Guidance, fly_to_depth
+from alice_survey.sim.vehicle.pilot.settings import MAX_PITCH_RAD, Guidance
 from alice_survey.sim.vehicle.rotations import wrapped
 
 
@@ -78,9 +79,9 @@ def place_demand(
     Args:
         gains: gains of all axes.
         axis: row of gains.
-        error: wanted place minus place.
+        error: target place minus place.
         speed: measured.
-        feed: speed of the wanted place.
+        feed: speed of the target place.
         total: k_I times the integral of the error, a speed.
         maximum: bound of the proportional part, a speed.
 
@@ -101,7 +102,7 @@ def place_sum_step(gains: Gains, axis: int, error: float, full: float, dt_s: flo
     Args:
         gains: gains of all axes.
         axis: row of gains.
-        error: wanted place minus place.
+        error: target place minus place.
         full: +1 or -1 where the force is cut at its greatest or least, else 0.
         dt_s: the tick.
     """
@@ -121,14 +122,14 @@ def sum_bound(gains: Gains, axis: int) -> float:
 
 @kernel
 def speed_demand(
-    gains: Gains, axis: int, wanted: float, speed: float, full: float, total: float, dt_s: float
+    gains: Gains, axis: int, target: float, speed: float, full: float, total: float, dt_s: float
 ) -> tuple[float, float]:
-    """A PI on speed whose proportional part sees a share of the wanted speed (gains.py).
+    """A PI on speed whose proportional part sees a share of the target speed (gains.py).
 
     Args:
         gains: gains of all axes.
         axis: row of gains.
-        wanted: speed.
+        target: speed.
         speed: measured.
         full: +1 or -1 where the force is cut at its greatest or least, else 0.
         total: the integral part, as a speed.
@@ -137,11 +138,11 @@ def speed_demand(
     Returns:
         The acceleration, and the new integral.
     """
-    row, error = gains.axes[axis], wanted - speed
+    row, error = gains.axes[axis], target - speed
     if full * error <= 0.0:
         step = row[PLACE] / row[RATE] * error * dt_s
         total = clamped(total + step, sum_bound(gains, axis))
-    return row[RATE] * (row[WEIGHT] * wanted - speed + total), total
+    return row[RATE] * (row[WEIGHT] * target - speed + total), total
 
 
 @kernel
@@ -179,11 +180,11 @@ def write_wrench(gains: Gains, pilot: PilotState, wrench: Array) -> None:
 def hold_level(
     estimate: Array, dt_s: float, gains: Gains, pilot: PilotState, wrench: Array
 ) -> None:
-    """Add the moments that hold roll level and pitch as wanted, where thrusters or fins can.
+    """Add the moments that hold roll level and pitch as target, where thrusters or fins can.
 
     PID and computed torque.
 
-    The computed part is what the wanted motion and the centre of gravity do at level attitude,
+    The computed part is what the target motion and the centre of gravity do at level attitude,
     which is why `write_wrench` comes first. What gravity rights by itself comes on top.
     """
     body = gains.body
@@ -283,10 +284,21 @@ def sink_to(
     pilot: PilotState,
 ) -> None:
     """Command the heave, or the pitch, that takes the origin to a depth, which moves at a speed."""
-    if guidance.under_way.circle_m > 0.0:
-        fly_to_depth(depth_m, feed_mps, path.speed_mps, estimate, dt_s, guidance.under_way, pilot)
-        return
     memory, demand = pilot.memory, pilot.demand
+    pilot.report[slot.TARGET_DEPTH] = depth_m
+    if guidance.under_way.circle_m > 0.0:
+        off, ahead = estimate[vector.DEPTH] - depth_m, guidance.under_way.dive_ahead_m
+        bent = off / ahead + memory[slot.HEAVE_SUM] - feed_mps / path.speed_mps
+        kept = min(max(bent, -MAX_PITCH_RAD), MAX_PITCH_RAD)
+        demand[slot.REF_PITCH] = guidance.under_way.level_rad + kept
+        demand[slot.REF_PITCH_RATE] = 0.0
+        if kept == bent:
+            demand[slot.REF_PITCH_RATE] = (pilot.point[slot.SINK_SPEED] - feed_mps) / ahead
+        if abs(off) < DEPTH_KEPT_M:
+            learned = INTEGRAL_SHARE * path.speed_mps / (ahead * ahead) * off * dt_s
+            total = memory[slot.HEAVE_SUM] + learned
+            memory[slot.HEAVE_SUM] = min(max(total, -0.5 * MAX_PITCH_RAD), 0.5 * MAX_PITCH_RAD)
+        return
     error, maximum = depth_m - estimate[vector.DEPTH], gains.axes[HEAVE, FASTEST]
     demand[slot.REF_HEAVE], demand[slot.ACC_HEAVE] = place_demand(
         gains,
@@ -301,7 +313,6 @@ def sink_to(
         near = clamped(error, DEPTH_KEPT_M)
         step = place_sum_step(gains, HEAVE, near, demand[slot.FULL_HEAVE], dt_s)
         memory[slot.HEAVE_SUM] = clamped(memory[slot.HEAVE_SUM] + step, sum_bound(gains, HEAVE))
-    pilot.report[slot.WANTED_DEPTH] = depth_m
 
 
 @kernel
@@ -314,10 +325,10 @@ def head_for(
     gains: Gains,
     pilot: PilotState,
 ) -> float:
-    """Command the yaw that takes the heading to a wanted one.
+    """Command the yaw that takes the heading to a target one.
 
     Args:
-        heading: wanted.
+        heading: target.
         feed: its rate.
         quicken: the rate of that.
         estimate: (13,)
@@ -326,7 +337,7 @@ def head_for(
         pilot: is written.
 
     Returns:
-        Wanted minus present heading, within -pi and pi.
+        Target minus present heading, within -pi and pi.
     """
     memory, demand = pilot.memory, pilot.demand
     error, maximum = wrapped(heading - estimate[vector.HEADING]), gains.axes[YAW, FASTEST]
@@ -339,7 +350,7 @@ def head_for(
         near = clamped(error, HEADING_KEPT_RAD)
         step = place_sum_step(gains, YAW, near, demand[slot.FULL_YAW], dt_s)
         memory[slot.YAW_SUM] = clamped(memory[slot.YAW_SUM] + step, sum_bound(gains, YAW))
-    pilot.report[slot.WANTED_HEADING] = heading
+    pilot.report[slot.TARGET_HEADING] = heading
     return error
 
 
@@ -355,7 +366,7 @@ def surge_at(
         gains, SURGE, speed, now, demand[slot.FULL_SURGE], memory[slot.SURGE_SUM], dt_s
     )
     demand[slot.REF_SURGE] = speed + demand[slot.REF_YAW] * guidance.point_body_m[1]
-    pilot.report[slot.WANTED_SURGE] = speed
+    pilot.report[slot.TARGET_SURGE] = speed
 
 
 @kernel
@@ -388,7 +399,7 @@ def sway_by(
     lever = guidance.point_body_m[0]
     demand[slot.REF_SWAY] = steady - lever * demand[slot.REF_YAW]
     demand[slot.ACC_SWAY] = accelerate - lever * demand[slot.ACC_YAW]
-    pilot.report[slot.WANTED_SWAY] = steady
+    pilot.report[slot.TARGET_SWAY] = steady
     if abs(offset) < guidance.far_m:
         step = place_sum_step(gains, SWAY, -offset, demand[slot.FULL_SWAY], dt_s)
         north, east = memory[slot.SWAY_SUM_N] - s * step, memory[slot.SWAY_SUM_E] + c * step
@@ -419,32 +430,33 @@ def stands(path: Path, leg: int) -> bool:
 
 
 @kernel
-def must_brake(
-    path: Path, guidance: Guidance, gains: Gains, pilot: PilotState, leg: int, along_m: float
-) -> bool:
-    """Whether a vehicle that goes ahead must begin to brake for the stop at its leg's end."""
-    if path.stop[leg] == 0.0:
-        return False
-    speed = max(pilot.point[slot.SURGE_SPEED], 0.0)
-    braking = speed * speed / (2.0 * guidance.stop_mps2) + speed * gains.axes[SURGE, LAG]
-    return bool(path.length_m[leg] - along_m <= braking)
-
-
-@kernel
-def brake(
-    speed_mps: float, along_m: float, heading_rad: float, gains: Gains, pilot: PilotState
+def brake_for_stop(
+    leg: int,
+    along_m: float,
+    heading_rad: float,
+    path: Path,
+    guidance: Guidance,
+    gains: Gains,
+    pilot: PilotState,
 ) -> None:
-    """Begin to brake: the reference starts where the vehicle is, as fast as it is.
+    """Begin to brake, as soon as the stop at the leg's end is that near.
 
-    The integral of the speed loop holds the share of the speed that its proportional part does not
-    see (gains.py), and what the current takes; only this is wanted of the place's.
+    The reference starts where the vehicle is, as fast as it is. The integral of the speed loop
+    holds the share of the speed that its proportional part does not see (gains.py), and what the
+    current takes; only this is passed on to the place's.
     """
-    memory = pilot.memory
-    held = memory[slot.SURGE_SUM] - (1.0 - gains.axes[SURGE, WEIGHT]) * speed_mps
+    if path.stop[leg] == 0.0:
+        return
+    memory, lag_s = pilot.memory, gains.axes[SURGE, LAG]
+    speed = max(pilot.point[slot.SURGE_SPEED], 0.0)
+    braking = speed * speed / (2.0 * guidance.stop_mps2) + speed * lag_s
+    if not path.length_m[leg] - along_m <= braking:
+        return
+    held = memory[slot.SURGE_SUM] - (1.0 - gains.axes[SURGE, WEIGHT]) * speed
     memory[slot.PLACE_SUM_N] = held * math.cos(heading_rad)
     memory[slot.PLACE_SUM_E] = held * math.sin(heading_rad)
-    start_standing(along_m, speed_mps, pilot)
-    memory[slot.RAMP] += gains.axes[SURGE, LAG] * speed_mps
+    start_standing(along_m, speed, pilot)
+    memory[slot.RAMP] += lag_s * speed
 
 
 @kernel
@@ -477,12 +489,12 @@ def ramp(
     # Braking from here with the greatest acceleration takes all that is left.
     stopping = math.sqrt(2.0 * acceleration * max(left, 0.0))
     # Down no faster than it may, but for the law of stopping, which decides.
-    wanted = max(min(speed + acceleration * dt_s, maximum), speed - acceleration * dt_s)
-    wanted = min(wanted, stopping)
-    step = wanted * dt_s
+    target = max(min(speed + acceleration * dt_s, maximum), speed - acceleration * dt_s)
+    target = min(target, stopping)
+    step = target * dt_s
     if step >= left - _TINY:
         return goal, 0.0, clamped(-speed / dt_s, acceleration)
-    return at + step, wanted, clamped((wanted - speed) / dt_s, acceleration)
+    return at + step, target, clamped((target - speed) / dt_s, acceleration)
 
 
 class StopReference(NamedTuple):
@@ -524,58 +536,6 @@ def _move_on(
 
 
 @kernel
-def _turning(
-    leg: int,
-    dt_s: float,
-    estimate: Array,
-    path: Path,
-    guidance: Guidance,
-    gains: Gains,
-    pilot: PilotState,
-) -> StopReference:
-    """Move the heading of a turn on the spot on by a tick."""
-    memory, sense = pilot.memory, math.copysign(1.0, path.turn_rad[leg])
-    n, e, start, _ = place_at(path, leg, 0.0)
-    behind = abs(wrapped(start + sense * memory[slot.REF] - estimate[vector.HEADING]))
-    maximum = guidance.spot_rad_s * _patience(behind / _BEHIND_RAD)
-    goal = abs(path.turn_rad[leg])
-    lag_s = gains.axes[YAW, LAG]
-    quicken = sense * _move_on(goal, maximum, guidance.spot_rad_s2, lag_s, dt_s, pilot)
-    heading, rate = start + sense * memory[slot.REF], sense * memory[slot.REF_SPEED]
-    over = goal - memory[slot.REF] < 0.5 * STOP_RAD and memory[slot.RAMP] >= goal
-    return StopReference(n, e, heading, 0.0, 0.0, heading, rate, quicken, 0.0, over)
-
-
-@kernel
-def _moving(
-    leg: int, dt_s: float, path: Path, guidance: Guidance, gains: Gains, pilot: PilotState
-) -> StopReference:
-    """Move the place on by a tick, ahead into a stop or aside."""
-    memory, point, side = pilot.memory, pilot.point, path.side_rad[leg]
-    n, e, course, _ = place_at(path, leg, memory[slot.REF])
-    dn, de = n - point[slot.POINT_NORTH], e - point[slot.POINT_EAST]
-    behind = math.cos(course) * dn + math.sin(course) * de
-    maximum = path.speed_mps if side == 0.0 else guidance.step_mps
-    maximum *= memory[slot.PACE] * _patience(behind / _BEHIND_M)
-    acceleration = guidance.stop_mps2 if side == 0.0 else guidance.step_mps2
-    lag_s = gains.axes[SURGE if side == 0.0 else SWAY, LAG]
-    goal = path.length_m[leg]
-    quicken = _move_on(goal, maximum, acceleration, lag_s, dt_s, pilot)
-    along, speed = memory[slot.REF], memory[slot.REF_SPEED]
-    n, e, course, curvature = place_at(path, leg, along)
-    over = goal - along < 0.5 * STOP_M and memory[slot.RAMP] >= goal
-    return StopReference(
-        n, e, course, speed, quicken, course + side, curvature * speed, 0.0, along, over
-    )
-
-
-@kernel
-def _patience(behind: float) -> float:
-    """Share of a reference's speed: 1 while the vehicle is near, 0 from twice that on."""
-    return min(max(2.0 - behind, 0.0), 1.0)
-
-
-@kernel
 def stand(
     leg: int,
     dt_s: float,
@@ -601,21 +561,44 @@ def stand(
     """
     memory, report, point = pilot.memory, pilot.report, pilot.point
     if path.turn_rad[leg] != 0.0:
-        wanted = _turning(leg, dt_s, estimate, path, guidance, gains, pilot)
+        sense, goal = math.copysign(1.0, path.turn_rad[leg]), abs(path.turn_rad[leg])
+        n, e, start, _ = place_at(path, leg, 0.0)
+        behind = abs(wrapped(start + sense * memory[slot.REF] - estimate[vector.HEADING]))
+        # A reference goes slower from this far ahead of the vehicle on, and waits at twice that.
+        maximum = guidance.spot_rad_s * min(max(2.0 - behind / _BEHIND_RAD, 0.0), 1.0)
+        lag_s = gains.axes[YAW, LAG]
+        quicken = sense * _move_on(goal, maximum, guidance.spot_rad_s2, lag_s, dt_s, pilot)
+        heading, rate = start + sense * memory[slot.REF], sense * memory[slot.REF_SPEED]
+        over = goal - memory[slot.REF] < 0.5 * STOP_RAD and memory[slot.RAMP] >= goal
+        target = StopReference(n, e, heading, 0.0, 0.0, heading, rate, quicken, 0.0, over)
     else:
-        wanted = _moving(leg, dt_s, path, guidance, gains, pilot)
+        side, goal = path.side_rad[leg], path.length_m[leg]
+        n, e, course, _ = place_at(path, leg, memory[slot.REF])
+        dn, de = n - point[slot.POINT_NORTH], e - point[slot.POINT_EAST]
+        behind = math.cos(course) * dn + math.sin(course) * de
+        maximum = path.speed_mps if side == 0.0 else guidance.step_mps
+        maximum *= memory[slot.PACE] * min(max(2.0 - behind / _BEHIND_M, 0.0), 1.0)
+        acceleration = guidance.stop_mps2 if side == 0.0 else guidance.step_mps2
+        lag_s = gains.axes[SURGE if side == 0.0 else SWAY, LAG]
+        quicken = _move_on(goal, maximum, acceleration, lag_s, dt_s, pilot)
+        along, speed = memory[slot.REF], memory[slot.REF_SPEED]
+        n, e, course, curvature = place_at(path, leg, along)
+        over = goal - along < 0.5 * STOP_M and memory[slot.RAMP] >= goal
+        target = StopReference(
+            n, e, course, speed, quicken, course + side, curvature * speed, 0.0, along, over
+        )
     error = head_for(
-        wanted.heading_rad, wanted.turn_rad_s, wanted.quicken_rad_s2, estimate, dt_s, gains, pilot
+        target.heading_rad, target.turn_rad_s, target.quicken_rad_s2, estimate, dt_s, gains, pilot
     )
-    ahead, abeam = keep_place(wanted, dt_s, estimate, path, guidance, gains, pilot)
+    ahead, abeam = keep_place(target, dt_s, estimate, path, guidance, gains, pilot)
 
     by_sway = guidance.sway > 0.0
     report[slot.BY_SWAY] = 1.0 if by_sway else 0.0
-    report[slot.LEG], report[slot.ALONG], report[slot.LINE] = leg, wanted.along_m, path.line[leg]
-    report[slot.PATH_HEADING] = wanted.course_rad
-    dn, de = point[slot.POINT_NORTH] - wanted.north_m, point[slot.POINT_EAST] - wanted.east_m
-    report[slot.CROSS] = de * math.cos(wanted.course_rad) - dn * math.sin(wanted.course_rad)
-    if not wanted.over:
+    report[slot.LEG], report[slot.ALONG], report[slot.LINE] = leg, target.along_m, path.line[leg]
+    report[slot.PATH_HEADING] = target.course_rad
+    dn, de = point[slot.POINT_NORTH] - target.north_m, point[slot.POINT_EAST] - target.east_m
+    report[slot.CROSS] = de * math.cos(target.course_rad) - dn * math.sin(target.course_rad)
+    if not target.over:
         return False
     memory[slot.WAITED_S] += dt_s
     wide = 1.0 + memory[slot.WAITED_S] / _WIDEN_S
@@ -632,7 +615,7 @@ def stand(
 
 @kernel
 def keep_place(
-    wanted: StopReference,
+    target: StopReference,
     dt_s: float,
     estimate: Array,
     path: Path,
@@ -649,10 +632,10 @@ def keep_place(
     """
     memory, demand, now = pilot.memory, pilot.demand, estimate[vector.HEADING]
     s, c = math.sin(now), math.cos(now)
-    dn = wanted.north_m - pilot.point[slot.POINT_NORTH]
-    de = wanted.east_m - pilot.point[slot.POINT_EAST]
+    dn = target.north_m - pilot.point[slot.POINT_NORTH]
+    de = target.east_m - pilot.point[slot.POINT_EAST]
     ahead, abeam = c * dn + s * de, c * de - s * dn
-    cosine, sine = math.cos(wanted.course_rad - now), math.sin(wanted.course_rad - now)
+    cosine, sine = math.cos(target.course_rad - now), math.sin(target.course_rad - now)
     pulled, lever = memory[slot.PACE] * ahead, guidance.point_body_m[1]
     total = c * memory[slot.PLACE_SUM_N] + s * memory[slot.PLACE_SUM_E]
     steady, accelerate = place_demand(
@@ -660,23 +643,23 @@ def keep_place(
         SURGE,
         pulled,
         pilot.point[slot.SURGE_SPEED],
-        wanted.speed_mps * cosine,
+        target.speed_mps * cosine,
         total,
         path.speed_mps,
     )
     demand[slot.REF_SURGE] = steady + lever * demand[slot.REF_YAW]
     demand[slot.ACC_SURGE] = (
-        accelerate + wanted.quicken_mps2 * cosine + lever * demand[slot.ACC_YAW]
+        accelerate + target.quicken_mps2 * cosine + lever * demand[slot.ACC_YAW]
     )
-    pilot.report[slot.WANTED_SURGE] = steady
+    pilot.report[slot.TARGET_SURGE] = steady
     near = clamped(pulled, STOP_M)
     step = place_sum_step(gains, SURGE, near, demand[slot.FULL_SURGE], dt_s)
     north, east = memory[slot.PLACE_SUM_N] + c * step, memory[slot.PLACE_SUM_E] + s * step
     cut = min(1.0, sum_bound(gains, SURGE) / max(math.hypot(north, east), 1e-9))
     memory[slot.PLACE_SUM_N], memory[slot.PLACE_SUM_E] = cut * north, cut * east
     if guidance.sway > 0.0:
-        sway_by(-abeam, wanted.speed_mps * sine, estimate, dt_s, guidance, gains, pilot)
-        demand[slot.ACC_SWAY] += wanted.quicken_mps2 * sine
+        sway_by(-abeam, target.speed_mps * sine, estimate, dt_s, guidance, gains, pilot)
+        demand[slot.ACC_SWAY] += target.quicken_mps2 * sine
     return ahead, abeam
 
 

@@ -6,7 +6,7 @@
 ) = range(14)  # fmt: skip
 """Kind of manoeuvre; where a section starts and where the step ends, m north and east; heading to
 hold, rad, NaN where it follows from the way; 1 where heave may be by depth, by altitude (by both:
-altitude as soon as there is one); wanted depth of the origin, m; wanted altitude of the point
+altitude as soon as there is one); target depth of the origin, m; target altitude of the point
 whose altitude the navigation gives, m; speed, m/s; how near to its end it is done, m; how long to
 stay there, s; the survey line on which pictures are taken meanwhile, or -1."""
 COLUMNS = 14

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from alice_survey.core.config import CameraConfig
-from alice_survey.sim.seafloor.sensor import (
+from alice_survey.sim.seafloor.light import (
     MIDDLE_GREY,
     Sensor,
     develop,

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from alice_survey.core.config import SeafloorConfig
 from alice_survey.core.errors import ConfigError, WorkspaceError
-from alice_survey.sim.seafloor.amphora import LENGTH_M, amphora_mesh
+from alice_survey.sim.seafloor.relief import LENGTH_M, amphora_mesh
 from alice_survey.sim.seafloor.terrain import (
     CERAMIC,
     Terrain,

@@ -3,9 +3,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alice_survey.sim.seafloor.noise import add_octave, noise, spot
 from alice_survey.sim.seafloor.terrain import CERAMIC, ROCK, SAND
-from alice_survey.sim.seafloor.texture import SAND_ALBEDO, Texture, survey_texture
+from alice_survey.sim.seafloor.texture import (
+    SAND_ALBEDO,
+    Texture,
+    add_octave,
+    noise,
+    spot,
+    survey_texture,
+)
 from tests.oracles_seafloor import gradient_noise
 
 PIXEL_M = 0.00042

@@ -152,7 +152,7 @@ def test_turns_begin_before_the_arc_and_end_after_it(at: float) -> None:
     assert pilot.report[slot.CROSS] == pytest.approx(0.0, abs=1e-12)
     # Simpson's rule across the kink of the heading.
     expected = oracle.mean_heading(path, at, guidance.smooth_m)
-    assert pilot.report[slot.WANTED_HEADING] == pytest.approx(expected, abs=0.02)
+    assert pilot.report[slot.TARGET_HEADING] == pytest.approx(expected, abs=0.02)
 
 
 def test_the_floor_is_smoothed_as_its_transfer_function_says() -> None:

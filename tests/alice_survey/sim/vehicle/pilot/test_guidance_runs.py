@@ -243,11 +243,11 @@ def test_fast_paths_slow_down_for_turns_that_are_too_tight(name: str) -> None:
     middle = (on_arcs[:, slot.ALONG] > 0.6) & (on_arcs[:, slot.ALONG] < 1.0)
     assert np.count_nonzero(middle) > 10
     limit = min(yaw, flight.gains.axes[g.SWAY, g.FASTEST] / 0.55 if name == "alice" else yaw) / 2.0
-    assert on_arcs[middle, slot.WANTED_SURGE].max() < 1.1 * limit
-    assert rows.on_lines().report[:, slot.WANTED_SURGE].max() == pytest.approx(0.5, abs=0.01)
+    assert on_arcs[middle, slot.TARGET_SURGE].max() < 1.1 * limit
+    assert rows.on_lines().report[:, slot.TARGET_SURGE].max() == pytest.approx(0.5, abs=0.01)
     # Braking begins before the turn.
     run_outs = rows.report[(rows.report[:, slot.LEG].astype(int) % 4) == 2]
-    assert run_outs[:, slot.WANTED_SURGE].min() < 0.5 * (0.5 + limit)
+    assert run_outs[:, slot.TARGET_SURGE].min() < 0.5 * (0.5 + limit)
 
 
 def test_mirrored_currents_mirror_the_flight() -> None:

@@ -197,9 +197,9 @@ def test_over_a_rock_it_stops_climbs_and_goes_on() -> None:
     assert rows.estimate[:, vector.CLEARANCE].min() > 0.6
     low = rows.estimate[:, vector.CLEARANCE] < 1.0
     assert 0.5 < low.sum() * TICK_S < LIMITS.climb_s
-    assert np.all(rows.report[low, slot.WANTED_SURGE] == 0.0)
+    assert np.all(rows.report[low, slot.TARGET_SURGE] == 0.0)
     assert rows.estimate[-1, vector.ALTITUDE] == pytest.approx(2.0, abs=0.1)
-    assert rows.report[-1, slot.WANTED_SURGE] == pytest.approx(0.2)
+    assert rows.report[-1, slot.TARGET_SURGE] == pytest.approx(0.2)
 
 
 def test_without_the_bottom_it_stops_rises_as_the_floor_did_and_goes_on_when_it_hears() -> None:
