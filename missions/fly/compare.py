@@ -24,12 +24,10 @@ from alice_survey.core.errors import ConfigError, VehicleError
 from alice_survey.core.executor import Executor, local_executor
 from alice_survey.core.frames import Array
 from alice_survey.core.text_table import text_table
-from alice_survey.sim.vehicle.dynamics import STATE
 from alice_survey.sim.vehicle.files import vehicle_to_fly
 from alice_survey.sim.vehicle.pilot.gains import gains_for
 from alice_survey.sim.vehicle.pilot.memory import CROSS, FOLLOW, PHASE
 from alice_survey.sim.vehicle.pilot.settings import pilot_guidance
-from alice_survey.sim.vehicle.propulsion import add_thrust
 from alice_survey.sim.vehicle.sea import level_floor
 from alice_survey.sim.vehicle.simulator import Flown, Setup, simulate
 from alice_survey.sim.vehicle.vehicle import Vehicle
@@ -152,19 +150,12 @@ class FlightFigures:
     route_believed_m: float
     lines_worst_m: float
     heading_rms_deg: float
-    line_roll_rms_deg: float
     turn_roll_peak_deg: float
     """Mean over turns."""
     turn_roll_worst_deg: float
     turn_surge_peak_mps: float
     turn_surge_worst_mps: float
-    turn_speed_peak_mps: float
-    """Peak of the horizontal speed: surge and sway."""
     turn_yaw_peak_deg_s: float
-    turn_torque_peak_nm: float
-    """Roll moment of the propellers."""
-    turn_s: float
-    """Time from the end of one line to the start of the next."""
     navigation_rms_m: float
     survey_energy_wh: float
     """Energy from the run-in to the end of the last line."""
@@ -284,7 +275,7 @@ def fly_one(settings: FlightSettings, plan: Plan, which: tuple[Case, Variant, in
         variant=variant.name,
         case=case,
         seed=seed,
-        figures=figures_of(flight, setup.vehicle),
+        figures=figures_of(flight),
         ending=flight.ending,
         look_ahead_m=float(setup.guidance.look_ahead_m),
     )
@@ -343,7 +334,7 @@ def with_equal_thrust(vehicle: Vehicle) -> Vehicle:
     )
 
 
-def figures_of(flight: Flight, vehicle: Vehicle) -> FlightFigures:
+def figures_of(flight: Flight) -> FlightFigures:
     """What came out of a flight."""
     flown, line = flight.flown, flight.line
     tick_s = float(flown.time_s[1] - flown.time_s[0])
@@ -358,10 +349,7 @@ def figures_of(flight: Flight, vehicle: Vehicle) -> FlightFigures:
     roll = np.abs(np.rad2deg(flight.attitude_rad[:, 0]))
     off = flight.log.position_ned - flight.truth.ned_from_body.translation
     turns = turn_rows(line, following)
-    speed = np.hypot(velocity[:, 0], velocity[:, 1])
     roll_peaks, surge_peaks = _peaks(roll, turns), _peaks(velocity[:, 0], turns)
-    torque = np.abs(roll_moment(vehicle, flown, turns))
-    between = [int(np.sum(line[rows] < 0)) for rows in turns]
     return FlightFigures(
         lines_true_m=rms(true),
         lines_believed_m=rms(believed),
@@ -369,15 +357,11 @@ def figures_of(flight: Flight, vehicle: Vehicle) -> FlightFigures:
         route_believed_m=rms(flown.report[route, CROSS]),
         lines_worst_m=_worst(np.abs(true[~np.isnan(true)])),
         heading_rms_deg=rms(np.rad2deg(heading)),
-        line_roll_rms_deg=rms(roll[line >= 0]),
         turn_roll_peak_deg=_mean(roll_peaks),
         turn_roll_worst_deg=_worst(roll_peaks),
         turn_surge_peak_mps=_mean(surge_peaks),
         turn_surge_worst_mps=_worst(surge_peaks),
-        turn_speed_peak_mps=_mean(_peaks(speed, turns)),
         turn_yaw_peak_deg_s=_mean(_peaks(np.abs(np.rad2deg(velocity[:, 5])), turns)),
-        turn_torque_peak_nm=_mean(_peaks(torque, turns)),
-        turn_s=_mean(tick_s * np.array(between, np.float64)),
         navigation_rms_m=rms(np.linalg.norm(off[route, :2], axis=1)),
         survey_energy_wh=float(flown.power_w[route].sum()) * tick_s / 3600.0,
         survey_s=float(route.sum()) * tick_s,
@@ -398,18 +382,6 @@ def turn_rows(line: Array, following: NDArray[np.bool_]) -> list[slice]:
         if begun > left and known[left - 1] != known[begun]:
             turns.append(slice(left, (begun + ended) // 2))
     return turns
-
-
-def roll_moment(vehicle: Vehicle, flown: Flown, turns: Sequence[slice]) -> Array:
-    """(T,) moment of the thrusters about the roll axis, N m; NaN outside of turns."""
-    moment = np.full(len(flown.time_s), np.nan)
-    for rows in turns:
-        for row in range(rows.start, rows.stop):
-            wrench = np.zeros(6)
-            nu = flown.state[row, 7:STATE]
-            add_thrust(vehicle.plant.propulsion, flown.rps[row], nu, wrench)
-            moment[row] = wrench[3]
-    return moment
 
 
 def summarise(outcomes: Sequence[Outcome]) -> Summary:

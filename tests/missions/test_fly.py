@@ -8,7 +8,7 @@ from rosbags.highlevel import AnyReader
 
 from alice_survey.app.pipeline import FlightChanges, run
 from alice_survey.core.config import SurveyConfig, parse_config
-from alice_survey.core.errors import PlanError, VehicleError, WorkspaceError
+from alice_survey.core.errors import PlanError, VehicleError
 from alice_survey.core.executor import SERIAL
 from alice_survey.core.frames import interpolate_poses
 from alice_survey.core.stages import spec
@@ -41,11 +41,6 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     spec("plan").make(folder, survey(), SERIAL)
     assert spec("fly").make(folder, survey(), SERIAL)
     return folder
-
-
-def test_a_flight_needs_a_plan(tmp_path: Path) -> None:
-    with pytest.raises(WorkspaceError):
-        spec("fly").make(tmp_path, survey(), SERIAL)
 
 
 def test_it_is_skipped_while_nothing_it_needs_changes(workspace: Path) -> None:
@@ -164,14 +159,6 @@ def test_a_stale_plan_is_flown_with_a_warning_and_options_are_said_to_be_for_onc
     warned = capsys.readouterr().err
     assert "stale" in warned
     assert "survey.toml" in warned
-
-
-def test_a_current_given_on_the_command_line_replaces_a_measured_one() -> None:
-    measured = survey(sea={"current_file": "adcp.csv", "current_mps": 0.3})
-    changed = FlightChanges(current="0.1@90").applied(measured)
-    assert changed.sea.current_file is None
-    assert changed.sea.current_mps == 0.1
-    assert FlightChanges(vehicle="alice").applied(measured).sea.current_file is not None
 
 
 def test_an_exported_mission_is_flown_next_to_its_certificate(

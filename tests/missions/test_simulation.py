@@ -192,11 +192,6 @@ def test_the_original_vehicle_flies_by_heading_alone() -> None:
     assert rms(flight.line_errors[0]) > 3 * rms(fly(survey()).line_errors[0])
 
 
-def test_a_vehicle_without_sway_cannot_be_flown_by_sway() -> None:
-    with pytest.raises(VehicleError, match="los"):
-        fly(survey(vehicle={"name": "sparus2"}))
-
-
 def test_the_pseudo_inverse_flies_the_survey_too() -> None:
     flight = fly(survey(vehicle={"allocation": "rpi"}))
     assert flight.ending == "complete"
@@ -245,16 +240,6 @@ def test_a_current_too_strong_is_refused_by_the_vehicle() -> None:
     flight = fly(survey(sea={"current_mps": 2.5, "current_towards_deg": 110.0}))
     assert flight.ending.startswith("aborted: ")
     assert len(flight.trigger_s) < plan_of().stations
-
-
-def test_the_current_of_the_settings_flows_as_they_say() -> None:
-    sea = SeaConfig(
-        current_mps=0.1, current_towards_deg=90.0, surface_current_mps=0.5, current_sigma_mps=0.0
-    )
-    current, out = current_of(sea, 20.0, 100.0, np.random.default_rng(1)), np.zeros(6)
-    for depth, speed in ((0.0, 0.5), (10.0, 0.3), (20.0, 0.1), (30.0, 0.1)):
-        current_at(current, 5.0, depth, out)
-        np.testing.assert_allclose(out[:2], [0.0, speed], atol=1e-12)
 
 
 def test_a_slowly_varying_current_has_the_sigma_of_the_settings() -> None:
@@ -349,12 +334,6 @@ def test_a_thruster_that_turns_and_pushes_nothing_is_found_and_flown_without() -
     assert np.abs(stern[seconds > one.time_s + 5.0]).max() < 1.0
 
 
-def test_nothing_is_found_where_nothing_fails() -> None:
-    other = {"name": "sparus2", "controller": "los"}
-    for changes in ({}, {"sea": {"current_mps": 0.3}}, {"vehicle": other}):
-        assert fly(survey(**changes)).flown.found == ()
-
-
 @pytest.mark.slow
 def test_in_seven_seas_nothing_adds_up_and_lost_propellers_do(
     monkeypatch: pytest.MonkeyPatch,
@@ -398,11 +377,6 @@ def test_a_vehicle_that_loses_its_only_vertical_thruster_gives_up() -> None:
     flight = fly(survey(vehicle={"failures": [["vertical", 60.0, 0.0]]}))
     assert flight.ending == "aborted: a thruster failed without which it cannot fly a survey"
     assert flight.flown.found[0].thruster == "vertical"
-
-
-def test_failures_of_unknown_thrusters_are_named() -> None:
-    with pytest.raises(VehicleError, match="no thruster 'warp'"):
-        fly(survey(vehicle={"failures": [["warp", 10.0, 0.0]]}))
 
 
 @pytest.mark.parametrize("height_m", [1.2, 1.5])

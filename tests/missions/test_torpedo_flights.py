@@ -7,7 +7,7 @@ import pytest
 from shapely.geometry import MultiPolygon, Polygon
 
 from alice_survey.core.config import SurveyConfig, parse_config
-from alice_survey.core.errors import PlanError, VehicleError
+from alice_survey.core.errors import PlanError
 from alice_survey.sim.vehicle.pilot.gains import STEADY_SHARE
 from alice_survey.sim.vehicle.pilot.memory import ABORT, PHASE
 from alice_survey.sim.vehicle.steady import min_radius_m, min_speed_mps
@@ -16,7 +16,6 @@ from missions.fly.flight_records import true_log
 from missions.fly.flight_route import path_of, roomier_side
 from missions.plan.solve import area_for_dive
 from missions.route.energy import craft_of
-from missions.route.flyable import as_flown
 from missions.values.flight import rms
 from tests.missions.flown_plans import flown, planned
 
@@ -97,12 +96,6 @@ def test_a_dead_propeller_ends_the_mission_at_the_surface() -> None:
     assert flight.truth.ned_from_body.translation[-1, 2] < 0.35
 
 
-@pytest.mark.parametrize("turns", ["spot", "sway"])
-def test_turns_that_need_a_stop_are_refused(turns: str) -> None:
-    with pytest.raises(PlanError, match="cannot stop"):
-        planned(survey({"turns": turns}))
-
-
 def test_turns_that_are_too_tight_are_refused() -> None:
     with pytest.raises(PlanError, match=r"turn_radius_m 3 is tighter than the 6\.\d+ m"):
         planned(survey({"turn_radius_m": 3.0, "turns": "arcs"}))
@@ -132,12 +125,6 @@ def test_a_current_that_leaves_too_little_speed_is_refused() -> None:
         planned(survey({"speed_mps": 0.6}, sea={"current_mps": 0.3, "current_towards_deg": 0.0}))
 
 
-def test_it_is_not_flown_by_sway() -> None:
-    config = survey(vehicle={"name": "remus100", "controller": "sway"})
-    with pytest.raises(VehicleError, match="no lateral thrusters"):
-        flown(planned(config), config)
-
-
 def test_a_dive_holds_less_area_where_turns_are_wide() -> None:
     """Each turn back to a line 1 m beside takes some 7 radii."""
     wide = area_for_dive(survey(), 3600.0)
@@ -163,8 +150,3 @@ def test_the_circle_is_flown_on_the_roomier_side() -> None:
         found, outside = roomier_side(replace(plan, area=area), path, 5.0, 8.0)
         assert found == side
         assert outside == pytest.approx(share, abs=0.01)
-
-
-def test_other_vehicles_are_planned_as_before() -> None:
-    config = parse_config({}, "test")
-    assert as_flown(config) is config

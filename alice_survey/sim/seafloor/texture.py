@@ -259,9 +259,22 @@ def _albedo(points: Array, material: Array, footprint: Array, seed: int, out: Ar
             at = start + i
             kind = material[at]
             if kind > 1.5:
-                r, g, b = _ceramic(coarse[i], fine[i], growth[i], hue[i])
+                level = 1.0 + 0.12 * coarse[i] + 0.4 * fine[i]
+                r, g, b = (0.46 + 0.03 * hue[i]) * level, 0.255 * level, 0.158 * level
+                silt = 0.55 * _step(-0.4, 0.7, hue[i] + 0.8 * fine[i])
+                r, g, b = r + silt * (0.36 - r), g + silt * (0.30 - g), b + silt * (0.215 - b)
+                turf = 0.6 * _step(0.1, 0.8, growth[i] + 0.5 * fine[i])
+                r, g, b = r + turf * (0.13 - r), g + turf * (0.135 - g), b + turf * (0.07 - b)
+                worms = 0.6 * _step(0.65, 1.0, 0.6 * fine[i] - growth[i])
+                r, g, b = r + worms * (0.62 - r), g + worms * (0.58 - g), b + worms * (0.50 - b)
             else:
-                r, g, b = _sand(coarse[i], fine[i], hue[i], max(-kind, 0.0))
+                film = 0.45 * _step(0.1, 0.75, coarse[i] + 0.25 * hue[i] - 0.2 * fine[i])
+                detritus = max(-kind, 0.0) - 0.5 * fine[i] + 0.35 * coarse[i]
+                film = max(film, 0.6 * _step(0.2, 1.1, detritus))
+                level = 1.0 + 0.12 * coarse[i] + 0.30 * fine[i]
+                r = level * (0.41 + 0.035 * hue[i]) * (1.0 - film * 0.62)
+                g = level * 0.355 * (1.0 - film * 0.52)
+                b = level * (0.262 - 0.03 * hue[i]) * (1.0 - film * 0.55)
                 # The edge of a stone is ragged, not the smooth contour of the grid.
                 stone = _step(0.44, 0.56, kind + 0.3 * fine[i]) if kind > 0.001 else 0.0
                 if stone < 1.0:
@@ -272,17 +285,6 @@ def _albedo(points: Array, material: Array, footprint: Array, seed: int, out: Ar
             out[at, 0] = min(max(r, 0.01), 0.95)
             out[at, 1] = min(max(g, 0.01), 0.95)
             out[at, 2] = min(max(b, 0.01), 0.95)
-
-
-@compiled(inline="always")
-def _sand(coarse: float, fine: float, hue: float, detritus: float) -> tuple[float, float, float]:
-    film = 0.45 * _step(0.1, 0.75, coarse + 0.25 * hue - 0.2 * fine)
-    film = max(film, 0.6 * _step(0.2, 1.1, detritus - 0.5 * fine + 0.35 * coarse))
-    level = 1.0 + 0.12 * coarse + 0.30 * fine
-    r = level * (0.41 + 0.035 * hue) * (1.0 - film * 0.62)
-    g = level * 0.355 * (1.0 - film * 0.52)
-    b = level * (0.262 - 0.03 * hue) * (1.0 - film * 0.55)
-    return r, g, b
 
 
 @compiled(inline="always")
@@ -303,18 +305,6 @@ def _rock(coarse: float, fine: float, growth: float, hue: float) -> tuple[float,
         g + crust * (0.215 * level - g),
         b + crust * (0.20 * level - b),
     )
-
-
-@compiled(inline="always")
-def _ceramic(coarse: float, fine: float, growth: float, hue: float) -> tuple[float, float, float]:
-    level = 1.0 + 0.12 * coarse + 0.4 * fine
-    r, g, b = (0.46 + 0.03 * hue) * level, 0.255 * level, 0.158 * level
-    silt = 0.55 * _step(-0.4, 0.7, hue + 0.8 * fine)
-    r, g, b = r + silt * (0.36 - r), g + silt * (0.30 - g), b + silt * (0.215 - b)
-    turf = 0.6 * _step(0.1, 0.8, growth + 0.5 * fine)
-    r, g, b = r + turf * (0.13 - r), g + turf * (0.135 - g), b + turf * (0.07 - b)
-    worms = 0.6 * _step(0.65, 1.0, 0.6 * fine - growth)
-    return r + worms * (0.62 - r), g + worms * (0.58 - g), b + worms * (0.50 - b)
 
 
 @compiled(inline="always")

@@ -151,6 +151,30 @@ def move(
         )  # fmt: skip
 
 
+class VehicleParts(NamedTuple):
+    """A vehicle in its sea, as compiled code takes it."""
+
+    plant: Plant
+    sea: Sea
+    floor: FloorGrid
+    sensors: Sensors
+    navigation: NavigationState
+    world: World
+    scratch: Scratch
+
+
+class PilotParts(NamedTuple):
+    """A pilot, as compiled code takes it."""
+
+    path: Path
+    mission: PilotMission
+    guidance: Guidance
+    gains: Gains
+    state: PilotState
+    wrench: Array
+    allocation: Allocation
+
+
 class SimulatedVehicle:
     """A vehicle in its sea, with its sensors and the state of both."""
 
@@ -221,6 +245,14 @@ class SimulatedVehicle:
         return self.world.estimate
 
     @property
+    def parts(self) -> VehicleParts:
+        """For compiled code."""
+        return VehicleParts(
+            self.plant, self.sea, self.floor, self.sensors, self.navigation, self.world,
+            self.scratch,
+        )  # fmt: skip
+
+    @property
     def touches_floor(self) -> bool:
         """Whether hull, DVL or port is on the sea floor, or in it."""
         return bool(touches(self.world.now, self.sensors, self.floor))
@@ -252,25 +284,15 @@ class TickRows(NamedTuple):
 @kernel
 def _fly_ticks(
     first: int,
-    plant: Plant,
-    sea: Sea,
-    floor: FloorGrid,
-    sensors: Sensors,
-    navigation: NavigationState,
-    path: Path,
-    mission: PilotMission,
-    guidance: Guidance,
-    gains: Gains,
-    pilot: PilotState,
-    wrench: Array,
-    allocation: Allocation,
-    world: World,
-    scratch: Scratch,
+    vehicle: VehicleParts,
+    piloting: PilotParts,
     rng: np.random.Generator,
     sea_rng: np.random.Generator,
     rows: TickRows,
 ) -> int:
     """Fly ticks until the rows are full or the mission is over; return their number."""
+    plant, sea, floor, sensors, navigation, world, scratch = vehicle
+    path, mission, guidance, gains, pilot, wrench, allocation = piloting
     count, flown = rows.state.shape[0], 0
     thrusters, actuators = rows.command_rps.shape[1], allocation.thrust.shape[0]
     for k in range(count):
@@ -471,9 +493,11 @@ def _chunks(
             end = min(end, round(waiting[0].time_s / TICK_S))
         rows = _new_rows(end - first, thrusters, setup.vehicle.actuators)
         flown = _fly_ticks(
-            first, simulated.plant, simulated.sea, simulated.floor, simulated.sensors,
-            simulated.navigation, pilot.path, setup.mission, pilot.guidance, pilot.gains,
-            pilot.state, pilot.wrench, pilot.allocation, simulated.world, simulated.scratch,
+            first, simulated.parts,
+            PilotParts(
+                pilot.path, setup.mission, pilot.guidance, pilot.gains, pilot.state, pilot.wrench,
+                pilot.allocation,
+            ),
             rng, sea_rng, rows,
         )  # fmt: skip
         yield TickRows(*(part[:flown] for part in rows))

@@ -49,7 +49,7 @@ from alice_survey.sim.vehicle.pilot.safety import (
     restart_watch,
     watch,
 )
-from alice_survey.sim.vehicle.pilot.settings import Guidance, circle_course, turning_speed_mps
+from alice_survey.sim.vehicle.pilot.settings import Guidance, Tick, circle_course, turning_speed_mps
 from alice_survey.sim.vehicle.pilot.steering import (
     DEPTH_KEPT_M,
     HEADING_KEPT_RAD,
@@ -82,17 +82,7 @@ _HOVER_SHARE = 0.25
 
 
 @kernel
-def go_to(
-    goal_n: float,
-    goal_e: float,
-    heading: float,
-    dt_s: float,
-    estimate: Array,
-    path: Path,
-    guidance: Guidance,
-    gains: Gains,
-    pilot: PilotState,
-) -> tuple[float, float]:
+def go_to(goal_n: float, goal_e: float, heading: float, tick: Tick) -> tuple[float, float]:
     """Go to a place and stay there, with a heading if the vehicle can sway.
 
     A vehicle without sway faces its goal and waits until the current has carried it off again. One
@@ -101,6 +91,7 @@ def go_to(
     Returns:
         Distance from the goal, and the error of the requested heading.
     """
+    _dt_s, estimate, path, guidance, gains, pilot = tick
     now = estimate[vector.HEADING]
     dn, de = goal_n - pilot.point[slot.POINT_NORTH], goal_e - pilot.point[slot.POINT_EAST]
     distance = math.hypot(dn, de)
@@ -108,42 +99,34 @@ def go_to(
         course, bend = circle_course(
             goal_n, goal_e, heading, guidance.look_ahead_m, guidance.under_way, pilot.point
         )
-        head_for(course, bend * path.speed_mps, 0.0, estimate, dt_s, gains, pilot)
-        surge_at(path.speed_mps, dt_s, guidance, gains, pilot)
+        head_for(course, bend * path.speed_mps, 0.0, tick)
+        surge_at(path.speed_mps, tick)
         pilot.report[slot.BY_SWAY] = 0.0
         return distance, wrapped(heading - now)
     ahead, abeam = math.cos(now) * dn + math.sin(now) * de, math.cos(now) * de - math.sin(now) * dn
     speed = clamped(_HOVER_SHARE * gains.axes[SURGE, BANDWIDTH] * ahead, path.speed_mps)
     hover = guidance.sway > 0.0 and distance < _HOVER_M
     if hover:
-        error = head_for(heading, 0.0, 0.0, estimate, dt_s, gains, pilot)
+        error = head_for(heading, 0.0, 0.0, tick)
     elif distance > guidance.capture_m:
-        error = head_for(math.atan2(de, dn), 0.0, 0.0, estimate, dt_s, gains, pilot)
+        error = head_for(math.atan2(de, dn), 0.0, 0.0, tick)
         speed = path.speed_mps * max(math.cos(error), 0.0)
     else:
         facing = pilot.report[slot.TARGET_HEADING]
         if not math.isfinite(facing):
             facing = heading
-        error = head_for(facing, 0.0, 0.0, estimate, dt_s, gains, pilot)
-    surge_at(speed, dt_s, guidance, gains, pilot)
+        error = head_for(facing, 0.0, 0.0, tick)
+    surge_at(speed, tick)
     if hover:
-        sway_by(-abeam, 0.0, estimate, dt_s, guidance, gains, pilot)
+        sway_by(-abeam, 0.0, tick)
     pilot.report[slot.BY_SWAY] = 1.0 if hover else 0.0
     return distance, error
 
 
 @kernel
-def follow(
-    leg: int,
-    along: float,
-    dt_s: float,
-    estimate: Array,
-    path: Path,
-    guidance: Guidance,
-    gains: Gains,
-    pilot: PilotState,
-) -> None:
+def follow(leg: int, along: float, tick: Tick) -> None:
     """Follow the path from where the progress is."""
+    dt_s, estimate, path, guidance, gains, pilot = tick
     report, point, now = pilot.report, pilot.point, estimate[vector.HEADING]
     north, east = point[slot.POINT_NORTH], point[slot.POINT_EAST]
     n, e, beta, _ = place_at(path, leg, along)
@@ -186,10 +169,10 @@ def follow(
     elif not by_sway and guidance.sway > 0.0 and abs(cross) < guidance.near_m:
         by_sway = True
     if by_sway:
-        head_for(smooth, feed, quicken, estimate, dt_s, gains, pilot)
-        surge_at(speed * max(cosine, 0.0), dt_s, guidance, gains, pilot)
+        head_for(smooth, feed, quicken, tick)
+        surge_at(speed * max(cosine, 0.0), tick)
         # The cross-track error as the sway sees it (paper, eq. los_sway_e).
-        sway_by(cross * cosine, -speed * sine, estimate, dt_s, guidance, gains, pilot)
+        sway_by(cross * cosine, -speed * sine, tick)
     else:
         ahead = guidance.look_ahead_m
         aim_n, aim_e = n + ahead * math.cos(beta), e + ahead * math.sin(beta)
@@ -209,14 +192,12 @@ def follow(
         # The aim turns as the offset changes: what its heading does is known, not awaited.
         drift = surge * sine + sway * cosine
         feed -= ahead * drift / (ahead * ahead + cross * cross)
-        error = head_for(heading + (smooth - beta), feed, quicken, estimate, dt_s, gains, pilot)
-        surge_at(
-            speed * (1.0 if flies else max(math.cos(error), 0.0)), dt_s, guidance, gains, pilot
-        )
+        error = head_for(heading + (smooth - beta), feed, quicken, tick)
+        surge_at(speed * (1.0 if flies else max(math.cos(error), 0.0)), tick)
         if guidance.sway > 0.0:
             # Lateral thrusters keep the vehicle from slipping sideways, so that it goes where it
             # heads: else a current could hold it off the path indefinitely.
-            sway_by(0.0, 0.0, estimate, dt_s, guidance, gains, pilot)
+            sway_by(0.0, 0.0, tick)
     report[slot.BY_SWAY] = 1.0 if by_sway else 0.0
     report[slot.CROSS], report[slot.PATH_HEADING] = cross, beta
     report[slot.LEG], report[slot.ALONG], report[slot.LINE] = leg, along, path.line[leg]
@@ -260,6 +241,7 @@ def steer(
         pilot: memory and report, written.
         wrench: (6,) N and N m, is written: forces and moments commanded of the thrusters.
     """
+    tick = Tick(dt_s, estimate, path, guidance, gains, pilot)
     report, demand = pilot.report, pilot.demand
     for i in range(slot.FULL_SURGE):
         demand[i] = 0.0
@@ -285,14 +267,14 @@ def steer(
 
     phase = report[slot.PHASE]
     if mission.law != NO_LAW and (phase == slot.FOLLOW or phase == slot.DIVE):
-        if fly_mission(dt_s, estimate, path, mission, guidance, gains, pilot):
+        if fly_mission(mission, tick):
             _enter(pilot, slot.ASCEND)
     elif phase == slot.FOLLOW:
-        _on_path(dt_s, estimate, path, guidance, gains, pilot)
+        _on_path(tick)
     elif phase == slot.DIVE or phase == slot.APPROACH:
-        _on_the_way(dt_s, estimate, path, guidance, gains, pilot)
+        _on_the_way(tick)
     else:
-        sink_to(0.0, 0.0, dt_s, estimate, path, guidance, gains, pilot)
+        sink_to(0.0, 0.0, tick)
         turning, speed = 0.0, 0.0
         if guidance.under_way.circle_m > 0.0:
             speed = path.speed_mps
@@ -301,8 +283,8 @@ def steer(
         if turning != 0.0:  # no farther ahead of the vehicle than it keeps up with
             behind = wrapped(heading - estimate[vector.HEADING])
             heading = estimate[vector.HEADING] + clamped(behind, HEADING_KEPT_RAD)
-        head_for(heading, turning, 0.0, estimate, dt_s, gains, pilot)
-        surge_at(speed, dt_s, guidance, gains, pilot)
+        head_for(heading, turning, 0.0, tick)
+        surge_at(speed, tick)
         report[slot.LINE], report[slot.BY_SWAY] = -1.0, 0.0
         if estimate[vector.DEPTH] < guidance.surface_m:
             report[slot.AT_SURFACE] = 1.0
@@ -341,8 +323,9 @@ def _target_m(path: Path, guidance: Guidance, pilot: PilotState) -> float:
 
 
 @kernel
-def _minded_m(estimate: Array, path: Path, guidance: Guidance, pilot: PilotState) -> float:
+def _minded_m(tick: Tick) -> float:
     """Requested depth of the origin, clear of the sea floor; the pace is slowed where one can."""
+    _dt_s, estimate, path, guidance, _gains, pilot = tick
     target = mind_floor(_target_m(path, guidance, pilot), estimate, guidance.limits, pilot)
     if guidance.under_way.circle_m > 0.0:
         pilot.memory[slot.PACE] = 1.0
@@ -389,16 +372,15 @@ def _progress_m(
 
 
 @kernel
-def _on_the_way(
-    dt_s: float, estimate: Array, path: Path, guidance: Guidance, gains: Gains, pilot: PilotState
-) -> None:
+def _on_the_way(tick: Tick) -> None:
     """Dive or approach for a tick."""
+    dt_s, estimate, path, guidance, _gains, pilot = tick
     memory, report, point = pilot.memory, pilot.report, pilot.point
     phase = report[slot.PHASE]
-    target = _minded_m(estimate, path, guidance, pilot)
-    sink_to(target, memory[slot.FLOOR_SLOPE], dt_s, estimate, path, guidance, gains, pilot)
+    target = _minded_m(tick)
+    sink_to(target, memory[slot.FLOOR_SLOPE], tick)
     n, e, heading = _goal(path, guidance, pilot)
-    distance, error = go_to(n, e, heading, dt_s, estimate, path, guidance, gains, pilot)
+    distance, error = go_to(n, e, heading, tick)
     dn, de = point[slot.POINT_NORTH] - n, point[slot.POINT_EAST] - e
     report[slot.CROSS] = de * math.cos(heading) - dn * math.sin(heading)
     report[slot.PATH_HEADING], report[slot.LINE] = heading, -1.0
@@ -438,10 +420,9 @@ def _on_the_way(
 
 
 @kernel
-def _on_path(
-    dt_s: float, estimate: Array, path: Path, guidance: Guidance, gains: Gains, pilot: PilotState
-) -> None:
+def _on_path(tick: Tick) -> None:
     """Follow the path for a tick."""
+    dt_s, estimate, path, guidance, _gains, pilot = tick
     memory, report, point = pilot.memory, pilot.report, pilot.point
     leg, along, over = int(report[slot.LEG]), report[slot.ALONG], False
     if memory[slot.STANDING] == 0.0 and stands(path, leg):
@@ -456,12 +437,12 @@ def _on_path(
             _QUICKEST * path.speed_mps * dt_s,
         )
         heading = estimate[vector.HEADING]
-        brake_for_stop(leg, along, heading, path, guidance, gains, pilot)
-    target = _minded_m(estimate, path, guidance, pilot)
-    sink_to(target, memory[slot.FLOOR_SLOPE], dt_s, estimate, path, guidance, gains, pilot)
+        brake_for_stop(leg, along, heading, tick)
+    target = _minded_m(tick)
+    sink_to(target, memory[slot.FLOOR_SLOPE], tick)
     if memory[slot.STANDING] == 0.0:
-        follow(leg, along, dt_s, estimate, path, guidance, gains, pilot)
-    elif stand(leg, dt_s, estimate, path, guidance, gains, pilot):
+        follow(leg, along, tick)
+    elif stand(leg, tick):
         over = leave_stop(path, estimate[vector.HEADING], pilot)
     if over:
         _enter(pilot, slot.ASCEND)

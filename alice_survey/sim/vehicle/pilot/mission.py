@@ -4,8 +4,8 @@ A mission is flown step by step. The law of a step says where to head, how fast 
 step is done; the inner loops beneath it are our own (gains.py), in the place of those that such a
 vehicle is tuned with. Two laws are known:
 
-- COLA2 (cola2.py), of SPARUS II and its kin;
-- ArduSub's AUTO mode (ardusub.py).
+- COLA2, of SPARUS II and its kin;
+- ArduSub's AUTO mode.
 
 Safety is our own, too: clearance, depth, pitch, bottom lock and progress are watched as on any
 mission, and the altitude follows the smoothed sea floor.
@@ -60,10 +60,9 @@ from alice_survey.sim.vehicle.dynamics import add_coriolis, add_damping
 from alice_survey.sim.vehicle.pilot import memory as slot
 from alice_survey.sim.vehicle.pilot import steps as column
 from alice_survey.sim.vehicle.pilot.gains import FASTEST, PLACE, RATE, SURGE, WEIGHT, YAW, Gains
-from alice_survey.sim.vehicle.pilot.memory import DIVE, FOLLOW, PilotState
-from alice_survey.sim.vehicle.pilot.path import Path
+from alice_survey.sim.vehicle.pilot.memory import DIVE, FOLLOW
 from alice_survey.sim.vehicle.pilot.safety import mind_floor, restart_watch
-from alice_survey.sim.vehicle.pilot.settings import Guidance
+from alice_survey.sim.vehicle.pilot.settings import Tick
 from alice_survey.sim.vehicle.pilot.steering import (
     StopReference,
     clamped,
@@ -104,18 +103,9 @@ _ACCEL, _JERK, _POSITION_P, _XTRACK = range(ARDUSUB_SETTINGS)
 
 
 @kernel
-def to_waypoint(
-    step: Array,
-    heave_m: float,
-    dt_s: float,
-    estimate: Array,
-    path: Path,
-    settings: Array,
-    guidance: Guidance,
-    gains: Gains,
-    pilot: PilotState,
-) -> bool:
+def to_waypoint(step: Array, heave_m: float, settings: Array, tick: Tick) -> bool:
     """Fly to a way-point for a tick; return whether it is done. Arguments as of `manoeuvre`."""
+    dt_s, estimate, pilot = tick.dt_s, tick.estimate, tick.pilot
     memory, point, now = pilot.memory, pilot.point, estimate[vector.HEADING]
     dn, de = step[column.END_N] - memory[slot.FROM_N], step[column.END_E] - memory[slot.FROM_E]
     length = math.hypot(dn, de)
@@ -154,9 +144,9 @@ def to_waypoint(
         if length > 1e-6 and math.hypot(target_n, target_e) >= _SLOW * speed:
             error = wrapped(math.atan2(target_e, target_n) - course)
             heading += clamped(error, settings[_XTRACK])
-    head_for(heading, 0.0, 0.0, estimate, dt_s, gains, pilot)
+    head_for(heading, 0.0, 0.0, tick)
     reference = StopReference(north, east, course, moves, quicken, heading, 0.0, 0.0, at, False)
-    keep_place(reference, dt_s, estimate, path, guidance, gains, pilot)
+    keep_place(reference, tick)
     pilot.report[slot.BY_SWAY] = 1.0
 
     away = math.hypot(
@@ -311,35 +301,21 @@ def timeout_s(step: Array, distance_m: float, heave_m: float, settings: Array) -
 
 
 @kernel
-def manoeuvre(
-    step: Array,
-    heave_m: float,
-    dt_s: float,
-    estimate: Array,
-    path: Path,
-    settings: Array,
-    guidance: Guidance,
-    gains: Gains,
-    pilot: PilotState,
-) -> bool:
+def manoeuvre(step: Array, heave_m: float, settings: Array, tick: Tick) -> bool:
     """Fly a goto, section or park for a tick; return whether it is done.
 
     Args:
         step: its row.
         heave_m: how much deeper the vehicle should be.
-        dt_s: the tick.
-        estimate: (14,) of the navigation.
-        path: its greatest speed bounds how a place is kept.
         settings: of the law.
-        guidance: settings of the pilot.
-        gains: gains of the inner loops.
-        pilot: is written.
+        tick: what is read, and the pilot that is written.
     """
+    dt_s, estimate, _path, guidance, gains, pilot = tick
     memory = pilot.memory
     parks = step[column.KIND] == column.KEEP or step[column.KIND] == column.ANCHOR
     if not parks or memory[slot.KEEPS] == 0.0:
         tolerance = PARK_APPROACH_M if parks else step[column.TOLERANCE]
-        done = _section(step, tolerance, heave_m, dt_s, estimate, settings, guidance, gains, pilot)
+        done = _section(step, tolerance, heave_m, settings, tick)
         done = done or memory[slot.STEP_S] > memory[slot.TIMEOUT_S]
         if done and parks:
             memory[slot.KEEPS] = 1.0
@@ -353,11 +329,11 @@ def manoeuvre(
         step[column.KIND] == column.KEEP
     ):  # by surge and sway, or by surge alone without thrusters for it
         heading = step[column.HEADING]
-        head_for(heading, 0.0, 0.0, estimate, dt_s, gains, pilot)
+        head_for(heading, 0.0, 0.0, tick)
         reference = StopReference(
             step[column.END_N], step[column.END_E], heading, 0.0, 0.0, heading, 0.0, 0.0, 0.0, True
         )
-        keep_place(reference, dt_s, estimate, path, guidance, gains, pilot)
+        keep_place(reference, tick)
         pilot.report[slot.BY_SWAY] = 1.0 if guidance.sway > 0.0 else 0.0
     else:  # face the place and keep a radius off it
         dn = step[column.END_N] - pilot.point[slot.POINT_NORTH]
@@ -367,8 +343,8 @@ def manoeuvre(
         speed = min(max(speed, settings[_ANCHOR_MIN]), settings[_ANCHOR_MAX])
         if abs(wrapped(heading - estimate[vector.HEADING])) > _ANCHOR_RAD:
             speed = 0.0
-        head_for(heading, 0.0, 0.0, estimate, dt_s, gains, pilot)
-        surge_at(speed, dt_s, guidance, gains, pilot)
+        head_for(heading, 0.0, 0.0, tick)
+        surge_at(speed, tick)
         pilot.report[slot.BY_SWAY] = 0.0
     return bool(memory[slot.HELD_S] >= step[column.HOLD_S])
 
@@ -401,18 +377,9 @@ def aim(
 
 
 @kernel
-def _section(
-    step: Array,
-    tolerance_m: float,
-    heave_m: float,
-    dt_s: float,
-    estimate: Array,
-    settings: Array,
-    guidance: Guidance,
-    gains: Gains,
-    pilot: PilotState,
-) -> bool:
+def _section(step: Array, tolerance_m: float, heave_m: float, settings: Array, tick: Tick) -> bool:
     """Follow a section for a tick; return whether its end is reached."""
+    estimate, pilot = tick.estimate, tick.pilot
     memory, point, now = pilot.memory, pilot.point, estimate[vector.HEADING]
     north, east = point[slot.POINT_NORTH], point[slot.POINT_EAST]
     to_end = math.hypot(step[column.END_N] - north, step[column.END_E] - east)
@@ -431,8 +398,8 @@ def _section(
         heading = now
     off = abs(wrapped(heading - now))
     speed *= min(max((_YAW_STOP_RAD - off) / (_YAW_STOP_RAD - _YAW_FREE_RAD), 0.0), 1.0)
-    head_for(heading, 0.0, 0.0, estimate, dt_s, gains, pilot)
-    surge_at(speed, dt_s, guidance, gains, pilot)
+    head_for(heading, 0.0, 0.0, tick)
+    surge_at(speed, tick)
     pilot.report[slot.BY_SWAY] = 0.0
     return bool(to_end < tolerance_m and abs(heave_m) < settings[_TOLERANCE_Z])
 
@@ -469,29 +436,17 @@ def mission_of(law: int, steps: Array, settings: Sequence[float]) -> PilotMissio
 
 
 @kernel
-def fly_mission(
-    dt_s: float,
-    estimate: Array,
-    path: Path,
-    mission: PilotMission,
-    guidance: Guidance,
-    gains: Gains,
-    pilot: PilotState,
-) -> bool:
+def fly_mission(mission: PilotMission, tick: Tick) -> bool:
     """Fly a mission for a tick.
 
     Args:
-        dt_s: the tick.
-        estimate: (14,) of the navigation.
-        path: its greatest speed bounds how a place is kept.
         mission: steps and law.
-        guidance: settings of the pilot, whose followed point is the vehicle's reference point.
-        gains: gains of the inner loops.
-        pilot: is written.
+        tick: what is read, and the pilot that is written.
 
     Returns:
         Whether it is over.
     """
+    dt_s, estimate, _path, guidance, _gains, pilot = tick
     memory, report, point = pilot.memory, pilot.report, pilot.point
     leg = int(report[slot.LEG])
     step = mission.steps[leg]
@@ -528,7 +483,7 @@ def fly_mission(
                 mission.settings,
             )
     memory[slot.STEP_S] += dt_s
-    sink_to(target, slope, dt_s, estimate, path, guidance, gains, pilot)
+    sink_to(target, slope, tick)
     # Until there is a floor a dive may take as long as it gets on.
     report[slot.PHASE] = DIVE if memory[slot.FLOOR_KNOWN] == 0.0 or heave else FOLLOW
     report[slot.LINE] = step[column.LINE]
@@ -544,11 +499,9 @@ def fly_mission(
 
     away = target - estimate[vector.DEPTH]
     if mission.law == COLA2:
-        done = manoeuvre(step, away, dt_s, estimate, path, mission.settings, guidance, gains, pilot)
+        done = manoeuvre(step, away, mission.settings, tick)
     else:
-        done = to_waypoint(
-            step, away, dt_s, estimate, path, mission.settings, guidance, gains, pilot
-        )
+        done = to_waypoint(step, away, mission.settings, tick)
     last = leg + 1 == mission.steps.shape[0]
     if heave and last and estimate[vector.DEPTH] < guidance.surface_m and step[column.DEPTH] == 0.0:
         done = True

@@ -39,6 +39,7 @@ from alice_survey.sim.vehicle.pilot.gains import (
     damping_ratio,
     heading_loop,
 )
+from alice_survey.sim.vehicle.pilot.memory import PilotState
 from alice_survey.sim.vehicle.pilot.path import Path
 from alice_survey.sim.vehicle.pilot.safety import SafetyLimits
 
@@ -198,6 +199,18 @@ class Guidance(NamedTuple):
     limits: SafetyLimits
     under_way: UnderWay = HOVERS
     """How a vehicle that cannot hover flies."""
+
+
+class Tick(NamedTuple):
+    """A tick, for the kernels that steer: what they read, and the pilot that they write."""
+
+    dt_s: float
+    estimate: Array
+    """(14,) of the navigation."""
+    path: Path
+    guidance: Guidance
+    gains: Gains
+    pilot: PilotState
 
 
 def pilot_guidance(

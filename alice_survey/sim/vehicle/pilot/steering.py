@@ -57,7 +57,7 @@ from alice_survey.sim.vehicle.pilot.gains import (
 from alice_survey.sim.vehicle.pilot.memory import PilotState
 from alice_survey.sim.vehicle.pilot.path import Path, place_at
 from alice_survey.sim.vehicle.pilot.safety import restart_watch
-from alice_survey.sim.vehicle.pilot.settings import MAX_PITCH_RAD, Guidance
+from alice_survey.sim.vehicle.pilot.settings import MAX_PITCH_RAD, Guidance, Tick
 from alice_survey.sim.vehicle.rotations import wrapped
 
 
@@ -273,17 +273,9 @@ def hear_floor(estimate: Array, dt_s: float, guidance: Guidance, pilot: PilotSta
 
 
 @kernel
-def sink_to(
-    depth_m: float,
-    feed_mps: float,
-    dt_s: float,
-    estimate: Array,
-    path: Path,
-    guidance: Guidance,
-    gains: Gains,
-    pilot: PilotState,
-) -> None:
+def sink_to(depth_m: float, feed_mps: float, tick: Tick) -> None:
     """Command the heave, or the pitch, that takes the origin to a depth, which moves at a speed."""
+    dt_s, estimate, path, guidance, gains, pilot = tick
     memory, demand = pilot.memory, pilot.demand
     pilot.report[slot.TARGET_DEPTH] = depth_m
     if guidance.under_way.circle_m > 0.0:
@@ -316,29 +308,19 @@ def sink_to(
 
 
 @kernel
-def head_for(
-    heading: float,
-    feed: float,
-    quicken: float,
-    estimate: Array,
-    dt_s: float,
-    gains: Gains,
-    pilot: PilotState,
-) -> float:
+def head_for(heading: float, feed: float, quicken: float, tick: Tick) -> float:
     """Command the yaw that takes the heading to a target one.
 
     Args:
         heading: target.
         feed: its rate.
         quicken: the rate of that.
-        estimate: (13,)
-        dt_s: the tick.
-        gains: gains of the inner loops.
-        pilot: is written.
+        tick: what is read, and the pilot that is written.
 
     Returns:
         Target minus present heading, within -pi and pi.
     """
+    dt_s, estimate, _path, _guidance, gains, pilot = tick
     memory, demand = pilot.memory, pilot.demand
     error, maximum = wrapped(heading - estimate[vector.HEADING]), gains.axes[YAW, FASTEST]
     demand[slot.REF_YAW], accelerate = place_demand(
@@ -355,10 +337,9 @@ def head_for(
 
 
 @kernel
-def surge_at(
-    speed: float, dt_s: float, guidance: Guidance, gains: Gains, pilot: PilotState
-) -> None:
+def surge_at(speed: float, tick: Tick) -> None:
     """Command a surge of the followed point over ground, as far as the sea floor permits."""
+    dt_s, _estimate, _path, guidance, gains, pilot = tick
     memory, demand = pilot.memory, pilot.demand
     speed *= memory[slot.PACE]
     now = pilot.point[slot.SURGE_SPEED]
@@ -370,20 +351,13 @@ def surge_at(
 
 
 @kernel
-def sway_by(
-    offset: float,
-    feed: float,
-    estimate: Array,
-    dt_s: float,
-    guidance: Guidance,
-    gains: Gains,
-    pilot: PilotState,
-) -> None:
+def sway_by(offset: float, feed: float, tick: Tick) -> None:
     """Command the sway that removes an offset of the followed point to starboard.
 
     The integral is kept as a vector in NED and turned into the body (Fossen 2011, section 12.2,
     does so for positioning): what holds against a current is still right after a turn.
     """
+    dt_s, estimate, _path, guidance, gains, pilot = tick
     memory, demand, heading = pilot.memory, pilot.demand, estimate[vector.HEADING]
     s, c = math.sin(heading), math.cos(heading)
     total = c * memory[slot.SWAY_SUM_E] - s * memory[slot.SWAY_SUM_N]
@@ -430,21 +404,14 @@ def stands(path: Path, leg: int) -> bool:
 
 
 @kernel
-def brake_for_stop(
-    leg: int,
-    along_m: float,
-    heading_rad: float,
-    path: Path,
-    guidance: Guidance,
-    gains: Gains,
-    pilot: PilotState,
-) -> None:
+def brake_for_stop(leg: int, along_m: float, heading_rad: float, tick: Tick) -> None:
     """Begin to brake, as soon as the stop at the leg's end is that near.
 
     The reference starts where the vehicle is, as fast as it is. The integral of the speed loop
     holds the share of the speed that its proportional part does not see (gains.py), and what the
     current takes; only this is passed on to the place's.
     """
+    _dt_s, _estimate, path, guidance, gains, pilot = tick
     if path.stop[leg] == 0.0:
         return
     memory, lag_s = pilot.memory, gains.axes[SURGE, LAG]
@@ -536,29 +503,17 @@ def _move_on(
 
 
 @kernel
-def stand(
-    leg: int,
-    dt_s: float,
-    estimate: Array,
-    path: Path,
-    guidance: Guidance,
-    gains: Gains,
-    pilot: PilotState,
-) -> bool:
+def stand(leg: int, tick: Tick) -> bool:
     """Brake, turn on the spot or step aside for a tick.
 
     Args:
         leg: that is flown.
-        dt_s: the tick.
-        estimate: (14,) of the navigation.
-        path: legs.
-        guidance: settings.
-        gains: gains of the inner loops.
-        pilot: is written.
+        tick: what is read, and the pilot that is written.
 
     Returns:
         Whether the stop is over: the reference is at its end and the vehicle with it, at rest.
     """
+    dt_s, estimate, path, guidance, gains, pilot = tick
     memory, report, point = pilot.memory, pilot.report, pilot.point
     if path.turn_rad[leg] != 0.0:
         sense, goal = math.copysign(1.0, path.turn_rad[leg]), abs(path.turn_rad[leg])
@@ -587,10 +542,8 @@ def stand(
         target = StopReference(
             n, e, course, speed, quicken, course + side, curvature * speed, 0.0, along, over
         )
-    error = head_for(
-        target.heading_rad, target.turn_rad_s, target.quicken_rad_s2, estimate, dt_s, gains, pilot
-    )
-    ahead, abeam = keep_place(target, dt_s, estimate, path, guidance, gains, pilot)
+    error = head_for(target.heading_rad, target.turn_rad_s, target.quicken_rad_s2, tick)
+    ahead, abeam = keep_place(target, tick)
 
     by_sway = guidance.sway > 0.0
     report[slot.BY_SWAY] = 1.0 if by_sway else 0.0
@@ -614,15 +567,7 @@ def stand(
 
 
 @kernel
-def keep_place(
-    target: StopReference,
-    dt_s: float,
-    estimate: Array,
-    path: Path,
-    guidance: Guidance,
-    gains: Gains,
-    pilot: PilotState,
-) -> tuple[float, float]:
+def keep_place(target: StopReference, tick: Tick) -> tuple[float, float]:
     """Command the surge and sway that keep the followed point at the place of a reference.
 
     The integral of surge is kept as a vector in NED, as that of sway is (steering.py).
@@ -630,6 +575,7 @@ def keep_place(
     Returns:
         Distance of the place ahead and to starboard of the followed point.
     """
+    dt_s, estimate, path, guidance, gains, pilot = tick
     memory, demand, now = pilot.memory, pilot.demand, estimate[vector.HEADING]
     s, c = math.sin(now), math.cos(now)
     dn = target.north_m - pilot.point[slot.POINT_NORTH]
@@ -658,7 +604,7 @@ def keep_place(
     cut = min(1.0, sum_bound(gains, SURGE) / max(math.hypot(north, east), 1e-9))
     memory[slot.PLACE_SUM_N], memory[slot.PLACE_SUM_E] = cut * north, cut * east
     if guidance.sway > 0.0:
-        sway_by(-abeam, target.speed_mps * sine, estimate, dt_s, guidance, gains, pilot)
+        sway_by(-abeam, target.speed_mps * sine, tick)
         demand[slot.ACC_SWAY] += target.quicken_mps2 * sine
     return ahead, abeam
 

@@ -41,23 +41,6 @@ def test_read_noise_adds_its_variance() -> None:
     assert noisy.var() - quiet.var() == pytest.approx(400.0, rel=0.05)
 
 
-def test_without_noise_every_pixel_has_its_mean() -> None:
-    np.testing.assert_allclose(expose(even(0.7, 4), plain(20.0), None), 700.0)
-
-
-def test_electrons_stop_at_the_full_well() -> None:
-    for rng in (None, np.random.default_rng(0)):
-        assert expose(even(50.0, 50), plain(full_well_e=9000.0), rng).max() == 9000.0
-
-
-def test_the_same_seed_gives_the_same_noise() -> None:
-    one, two, other = (
-        expose(even(0.3, 20), plain(5.0), np.random.default_rng(seed)) for seed in (1, 1, 2)
-    )
-    np.testing.assert_array_equal(one, two)
-    assert np.any(one != other)
-
-
 def test_the_noise_hardly_depends_on_how_a_machine_rounds() -> None:
     """Draws of a Poisson number are rejected by what it counts: one more shifts all that follow."""
     rng = np.random.default_rng(3)

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alice_survey.core.config import SeafloorConfig
-from alice_survey.core.errors import ConfigError, WorkspaceError
+from alice_survey.core.errors import WorkspaceError
 from alice_survey.sim.seafloor.relief import LENGTH_M, amphora_mesh
 from alice_survey.sim.seafloor.terrain import (
     CERAMIC,
@@ -17,7 +17,6 @@ from alice_survey.sim.seafloor.terrain import (
     build_terrain,
     read_terrain,
     survey_terrain,
-    terrain_bounds,
 )
 
 BOUNDS = (10.0, 16.0, -3.0, 2.0)
@@ -54,11 +53,6 @@ def test_sand_spans_the_relief_asked_for_about_the_mean_depth(relief_m: float) -
     depths = sand.vertices[:, 2]
     assert np.ptp(depths) == pytest.approx(relief_m, rel=1e-5)
     assert depths.mean() == pytest.approx(DEPTH_M, abs=1e-5)
-
-
-def test_no_relief_is_flat() -> None:
-    flat = build(relief_m=0.0, rocks_per_m2=0.0, amphora=False)
-    assert np.ptp(flat.vertices[:, 2]) == 0.0
 
 
 def test_sand_holds_nothing_finer_than_its_grid_can_carry() -> None:
@@ -194,21 +188,6 @@ def test_a_survey_has_one_terrain_by_its_seed() -> None:
     assert -2.5 < west <= -2.0
     assert 4.0 <= north < 4.5
     assert 5.0 <= east < 5.5
-
-
-def test_bounds_surround_the_area() -> None:
-    assert terrain_bounds([[1.0, 2.0], [4.0, -1.0], [2.0, 6.0]], 2.5) == (-1.5, 6.5, -3.5, 8.5)
-
-
-@pytest.mark.parametrize(("grid_m", "side_m"), [(0.01, 200.0), (1.0, 1.0)])
-def test_a_grid_that_is_too_fine_or_too_coarse_is_refused(grid_m: float, side_m: float) -> None:
-    with pytest.raises(ConfigError, match=f"grid_m = {grid_m:g}"):
-        build_terrain(
-            SeafloorConfig(grid_m=grid_m),
-            (0.0, side_m, 0.0, side_m),
-            15.0,
-            np.random.default_rng(0),
-        )
 
 
 def test_broken_and_missing_files_are_refused(terrain: Terrain, tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ from alice_survey.sim.seafloor.texture import (
     add_octave,
     noise,
     spot,
-    survey_texture,
 )
 from tests.oracles_seafloor import gradient_noise
 
@@ -144,8 +143,3 @@ def test_samples_do_not_alias(step_m: float) -> None:
     power = np.abs(spectra[0]) ** 2
     assert power[frequency > 0.45].sum() < 0.03 * power.sum()
     assert power[(frequency > 0.1) & (frequency < 0.3)].sum() > 0.02 * power.sum()
-
-
-def test_a_survey_has_one_texture_by_its_seed() -> None:
-    assert survey_texture(3) == survey_texture(3)
-    assert survey_texture(3) != survey_texture(4)

@@ -113,10 +113,6 @@ def test_a_strobe_sends_all_of_its_power(half_angle_deg: float) -> None:
     assert beam_profile(np.cos(min(beam + 0.22, 1.57)), beam) < 1e-3
 
 
-def test_a_wide_strobe_without_an_edge_is_lamberts() -> None:
-    assert beam_solid_angle_sr(np.deg2rad(120.0)) == pytest.approx(np.pi, rel=1e-6)
-
-
 def test_all_scattered_light_goes_somewhere_and_little_of_it_backward() -> None:
     total, _ = quad(lambda c: 2 * np.pi * float(phase_per_sr(np.array(c))), -1, 1)
     mean, _ = quad(lambda c: 2 * np.pi * c * float(phase_per_sr(np.array(c))), -1, 1)

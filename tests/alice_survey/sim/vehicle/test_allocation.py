@@ -178,39 +178,6 @@ def test_the_thrust_is_least_by_karush_kuhn_and_tucker(
                     assert float(weights @ moved**2) > cost - 1e-12 * (1 + cost)
 
 
-@settings(max_examples=100, deadline=None)
-@given(problem=problems(), factor=st.floats(0.1, 10.0))
-def test_twice_the_wrench_with_twice_the_bounds_is_twice_the_thrust(
-    problem: tuple[Array, Array, Array, Array, Array, Array], factor: float
-) -> None:
-    matrix, wanted, lower, upper, axes, weights = problem
-    once = solve(matrix, wanted, lower, upper, weights, axes)
-    scaled = solve(matrix, factor * wanted, factor * lower, factor * upper, weights, axes)
-    np.testing.assert_allclose(scaled, factor * once, atol=1e-6 * factor, rtol=1e-6)
-
-
-@pytest.mark.parametrize("solver", [allocate_exact, allocate_rpi])
-def test_nothing_asked_is_nothing_given(solver: object) -> None:
-    lower, upper = limits_of(ALICE)
-    matrix = ALICE.configuration_matrix
-    np.testing.assert_array_equal(solve(matrix, REST, lower, upper, solver=solver), 0.0)
-    nobody_asks = solve(matrix, REACH, lower, upper, axes=np.zeros(6), solver=solver)
-    np.testing.assert_array_equal(nobody_asks, 0.0)
-    none_left = solve(matrix, REACH, np.zeros(5), np.zeros(5), solver=solver)
-    np.testing.assert_array_equal(none_left, 0.0)
-
-
-def test_twin_thrusters_share_alike() -> None:
-    matrix = np.array([[1.0, 1.0, 1.0], *[[0.0] * 3] * 5])
-    wanted = np.array([3.0, 0, 0, 0, 0, 0])
-    thrust = solve(matrix, wanted, np.full(3, -9.0), np.full(3, 9.0))
-    np.testing.assert_allclose(thrust, 1.0)
-    held = solve(matrix, wanted, np.full(3, -9.0), np.array([0.5, 9.0, 9.0]))
-    np.testing.assert_allclose(held, [0.5, 1.25, 1.25])
-    dear = solve(matrix, wanted, np.full(3, -9.0), np.full(3, 9.0), np.array([1.0, 2.0, 2.0]))
-    np.testing.assert_allclose(dear, [1.5, 0.75, 0.75])
-
-
 def test_heave_comes_before_yaw_before_sway_before_surge() -> None:
     """Where one must be given up for the other, it is the lesser one, nearly whole."""
     matrix = np.zeros((6, 1))

@@ -40,20 +40,6 @@ def test_both_names_of_an_added_mass_share_their_mean() -> None:
         _ = named(Z_qdot=11.0, M_wdot=-11.0).added_mass
 
 
-@pytest.mark.parametrize(
-    "name", ["X_vw", "X_uv", "Q_uu", "X_zz", "X", "", "X_", "Xuu", "Y_vdott", "Y_uvv", "N_uw"]
-)
-def test_a_name_that_is_none_is_refused(name: str) -> None:
-    with pytest.raises(VehicleError, match=f"'{name}'"):
-        named(**{name: 1.0})
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_a_value_that_is_no_number_is_refused(value: float) -> None:
-    with pytest.raises(VehicleError, match="X_uu"):
-        named(X_uu=value)
-
-
 def test_replacing_an_added_mass_drops_its_mirror() -> None:
     before = named(Y_rdot=-8.5, X_uu=-7.0, K_vdot=-0.2)
     after = before.replaced("other", {"N_vdot": -2.5, "X_uu": -15.0})

@@ -11,11 +11,9 @@ from hypothesis.extra.numpy import arrays
 
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.dynamics import (
-    STATE,
     add_coriolis,
     add_damping,
     coriolis_matrix,
-    initial_state,
 )
 from alice_survey.sim.vehicle.files import SETS
 from alice_survey.sim.vehicle.sea import GRAVITY
@@ -238,14 +236,6 @@ def test_each_push_moves_the_vehicle_its_way() -> None:
     assert attitudes(turned)[2] > 0.01
 
 
-def test_pitched_up_it_climbs_and_headed_east_it_goes_east() -> None:
-    ahead = np.array([2.0, 0, 0, 0, 0, 0])
-    climbing = rates(block(), state_of(block(), ahead, (0.0, 0.1, 0.0)))
-    assert climbing[2] == pytest.approx(-2.0 * math.sin(0.1), rel=1e-12)
-    east = rates(block(), state_of(block(), ahead, (0.0, 0.0, math.pi / 2)))
-    np.testing.assert_allclose(east[:3], [0.0, 2.0, 0.0], atol=1e-14)
-
-
 def test_restoring_moments_by_hand() -> None:
     """52 kg, centre of gravity 3 cm low: 5 degrees of roll and of pitch are pushed back."""
     low = block(cg=(0.0, 0.0, 0.03), dry_kg=52.0, buoyancy_kg=52.0)
@@ -281,15 +271,6 @@ def test_munk_moment_turns_the_body_broadside() -> None:
     assert rate[M] == pytest.approx(6.7 / 7.0, rel=1e-12)
 
 
-def test_a_turn_throws_the_body_outwards() -> None:
-    """Ahead at 1 m/s and turning to starboard at 0.2 rad/s, in body axes: v' = -(m_x / m_y) u r."""
-    slender = block({"X_udot": -3.0, "Y_vdot": -70.0})
-    rate = rates(slender, state_of(slender, np.array([1.0, 0, 0, 0, 0, 0.2])))
-    assert rate[Y] == pytest.approx(-53.0 / 120.0 * 0.2, rel=1e-12)
-    without_water = rates(block(), state_of(block(), np.array([1.0, 0, 0, 0, 0, 0.2])))
-    assert without_water[Y] == pytest.approx(-0.2, rel=1e-12)
-
-
 def test_body_lift_opposes_drift_and_weathercocks_going_ahead() -> None:
     """The centre of lift lies 0.2 m behind the origin; astern the lift still opposes the drift."""
     hull = block({"Y_uv": -40.0, "N_uv": 8.0, "Z_uw": -40.0, "M_uw": -8.0})
@@ -299,25 +280,3 @@ def test_body_lift_opposes_drift_and_weathercocks_going_ahead() -> None:
     assert sinking[Z] == pytest.approx(-4.0 / 50.0) and sinking[M] == pytest.approx(-0.8 / 6.0)
     astern = rates(hull, state_of(hull, np.array([-1.0, 0.1, 0, 0, 0, 0])))
     assert astern[Y] == pytest.approx(-4.0 / 50.0) and astern[N] == pytest.approx(-0.8 / 7.0)
-
-
-def test_drag_of_the_mast_leans_the_vehicle_over() -> None:
-    """The mast is above the origin: in a sway to starboard its drag pushes the top to port."""
-    for coefficients in SETS:
-        vehicle = alice(coefficients)
-        force = np.zeros(6)
-        add_damping(vehicle.plant.body, np.array([0, 0.5, 0, 0, 0, 0]), force)
-        assert force[1] < 0.0 and force[3] < 0.0
-        # Its added mass does the same when sway begins.
-        assert vehicle.mass[1, 3] > vehicle.rigid_body.mass_matrix[1, 3]
-
-
-def test_initial_state_holds_what_it_is_given() -> None:
-    nu = np.arange(6.0)
-    state = initial_state(np.array([1.0, 2.0, 3.0]), np.array([0.1, -0.2, 2.0]), 3, nu)
-    assert state.shape == (STATE + 3,)
-    np.testing.assert_array_equal(state[:3], [1.0, 2.0, 3.0])
-    np.testing.assert_allclose(attitudes(state), [0.1, -0.2, 2.0], atol=1e-15)
-    np.testing.assert_array_equal(state[7:13], nu)
-    np.testing.assert_array_equal(state[13:], 0.0)
-    assert not initial_state(np.zeros(3), np.zeros(3), 2)[7:].any()

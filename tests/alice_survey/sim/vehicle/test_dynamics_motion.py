@@ -333,10 +333,3 @@ def test_the_step_is_of_fourth_order() -> None:
     errors = [np.abs(end(step) - best).max() for step in (0.04, 0.02, 0.01)]
     orders = np.log2(np.array(errors[:-1]) / errors[1:])
     assert np.all((orders > 3.7) & (orders < 4.4)), orders
-
-
-def test_attitude_stays_a_rotation() -> None:
-    vehicle = vehicle_from("alice")
-    spinning = state_of(vehicle, np.array([0.5, 0.2, 0.1, 4.0, -3.0, 5.0]), (1.0, 1.5, 2.0))
-    states = advance(vehicle, spinning, 20.0, 0.01)
-    np.testing.assert_allclose(np.linalg.norm(states[:, 3:7], axis=1), 1.0, atol=1e-14)

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from alice_survey.core.errors import VehicleError
 from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.fins import Fin, add_fins, fin_slope, pack_fins, write_fin_matrix
 from tests import oracles_dynamics as oracle
@@ -178,19 +177,3 @@ def test_runge_kutta_agrees_with_an_adaptive_method() -> None:
         np.abs(states[:, 13:] - actuators).max(),
     )
     assert 1e-7 < max(errors) < 1e-4
-
-
-@pytest.mark.parametrize(
-    ("changes", "named"),
-    [
-        ({"shaft_body": (1.0, 0.0, 0.0)}, "square to x"),
-        ({"shaft_body": (0.0, 2.0, 0.0)}, "square to x"),
-        ({"area_m2": 0.0}, "area_m2 0.0"),
-        ({"most_angle_deg": 120.0}, "most_angle_deg"),
-        ({"positions_body_m": ()}, "positions_body_m"),
-        ({"aspect_ratio": -1.0}, "aspect_ratio"),
-    ],
-)
-def test_what_is_no_fin_is_refused(changes: dict[str, object], named: str) -> None:
-    with pytest.raises(VehicleError, match=named):
-        replace(PLANE, **changes)  # type: ignore[arg-type]

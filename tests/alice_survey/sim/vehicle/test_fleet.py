@@ -44,12 +44,6 @@ def test_it_is_trimmed_level_and_floats_up_slowly(name: str) -> None:
     assert net < 0.05 * vehicle.density_kg_m3 * heave.diameter_m**4 * heave.kt_forward * 50.0**2
 
 
-def test_alice_has_two_thrusters_more_than_sparus2() -> None:
-    names = {name: [t.name for t in vehicle_from(name).thrusters] for name in NAMES}
-    assert names["sparus2"] == ["starboard", "port", "vertical"]
-    assert names["alice"] == [*names["sparus2"], "bow", "stern"]
-
-
 def test_thrust_turns_and_rolls_as_by_hand() -> None:
     b = vehicle_from("alice").configuration_matrix
     assert b.shape == (6, 5)
@@ -78,13 +72,6 @@ def test_lateral_thrusters_sit_in_their_tunnels() -> None:
             x, y, z = thruster.position_body_m
             assert pod.outline.tail_x_m < x < pod.outline.nose_x_m
             assert abs(y) == pytest.approx(pod.y_m, abs=1e-3) and z == 0.0
-
-
-def test_unknown_names_are_refused() -> None:
-    with pytest.raises(VehicleError, match=r"'bluerov'.* alice, .*sparus2"):
-        vehicle_from("bluerov")
-    with pytest.raises(VehicleError, match=r"'best'.* estimated"):
-        vehicle_from("alice", "best")
 
 
 def test_a_geometry_gives_hull_water_and_coefficients_to_any_file(tmp_path: Path) -> None:

@@ -101,13 +101,6 @@ def test_water_along_the_axis_takes_the_same_off_whichever_way_it_turns(n: float
     assert moving == pytest.approx(still - loss, rel=1e-12)
 
 
-def test_a_turn_feeds_the_inner_propeller_and_starves_the_outer() -> None:
-    turning = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.3])
-    still = thrust_of(PORT, 10.0)
-    # Turning to starboard the port side goes forward, into its water.
-    assert thrust_of(PORT, 10.0, turning) < still < thrust_of(STARBOARD, 10.0, turning)
-
-
 def test_the_jet_loss_is_c_at_the_jets_own_speed() -> None:
     whole = thrust_of(BOW, 20.0)
     jet = oracles.jet_speed_mps(BOW, DENSITY, whole)
@@ -172,20 +165,6 @@ def test_more_thrust_takes_more_speed_and_limits_are_those_of_full_speed() -> No
     assert np.all(np.diff(rps, axis=0) > 0)
     maximum = PACKED.table[:, kernels.MOST]
     np.testing.assert_allclose(rps[[0, -1]], [-maximum, maximum], rtol=1e-9)
-
-
-def test_no_thrust_is_no_speed_and_no_force() -> None:
-    nu, rps = np.array([1.0, 0.1, 0, 0, 0, 0.1]), np.full(5, np.nan)
-    kernels.speeds_for(PACKED, np.zeros(5), nu, rps)
-    np.testing.assert_array_equal(rps, 0.0)
-    np.testing.assert_array_equal(wrench_of(EVERY, [0.0] * 5, nu), 0.0)
-
-
-def test_a_vehicle_too_fast_for_its_propellers_has_no_thrust_ahead() -> None:
-    lower, upper = np.zeros(5), np.zeros(5)
-    kernels.thrust_limits(PACKED, np.ones(5), np.array([6.0, 0, 0, 0, 0, 0]), lower, upper)
-    assert upper[0] == 0.0 and lower[0] < 0.0
-    assert oracles.net_thrust_n(STARBOARD, DENSITY, 50.0, np.array([6.0, 0, 0, 0, 0, 0])) < 0
 
 
 def test_health_is_the_share_of_bollard_thrust_that_is_left() -> None:

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from alice_survey.core.errors import VehicleError
 from alice_survey.sim.vehicle.sea import (
     GRAVITY,
     Current,
@@ -71,9 +70,3 @@ def test_a_varying_current_is_kept_under_the_waves() -> None:
             np.testing.assert_allclose(
                 at(calm, time_s, depth_m), at(varying, time_s, depth_m), atol=1e-12
             )
-
-
-@pytest.mark.parametrize(("height_m", "period_s"), [(-1.0, 6.0), (0.5, 0.0), (math.nan, 6.0)])
-def test_senseless_swell_is_refused(height_m: float, period_s: float) -> None:
-    with pytest.raises(VehicleError, match="swell"):
-        with_swell(constant_current(0.0, 0.0), height_m, period_s, 0.0, 15.0, 10.0)

@@ -7,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from alice_survey.core.errors import VehicleError
 from alice_survey.sim.vehicle.hydrodynamics.geometry import Outline
 
 CYLINDER = Outline(x_m=(-0.7, 0.9), radius_m=(0.1, 0.1))
@@ -61,25 +60,3 @@ def test_stretching_scales_lengths_alone(tail: float, nose: float) -> None:
     assert stretched.side_fullness == pytest.approx(BLUNT.side_fullness, rel=1e-9)
     moved = tail + scale * (BLUNT.volume_x_m - BLUNT.tail_x_m)
     assert stretched.volume_x_m == pytest.approx(moved, abs=1e-9)
-
-
-def test_moving_changes_places_alone() -> None:
-    moved = BLUNT.moved(0.3)
-    assert moved.volume_m3 == pytest.approx(BLUNT.volume_m3, rel=1e-12)
-    assert moved.volume_x_m == pytest.approx(BLUNT.volume_x_m + 0.3, rel=1e-12)
-
-
-def test_beyond_the_ends_there_is_nothing() -> None:
-    np.testing.assert_array_equal(CYLINDER.radius_at(np.array([-0.71, 0.0, 0.91])), [0, 0.1, 0])
-
-
-@pytest.mark.parametrize(
-    ("x", "r"),
-    [
-        ((0.0,), (0.1,)), ((0.0, 1.0), (0.1,)), ((0.0, 1.0, 0.5), (0.1, 0.1, 0.1)),
-        ((0.0, 1.0), (0.1, -0.1)), ((0.0, 1.0), (0.0, 0.0)),
-    ],
-)  # fmt: skip
-def test_wrong_outlines_are_refused(x: tuple[float, ...], r: tuple[float, ...]) -> None:
-    with pytest.raises(VehicleError):
-        Outline(x_m=x, radius_m=r)

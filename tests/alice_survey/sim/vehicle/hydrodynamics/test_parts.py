@@ -52,15 +52,6 @@ def test_added_mass_is_symmetric_and_positive_definite(geometry: Geometry) -> No
     assert np.linalg.eigvalsh(matrix)[0] > 0.05
 
 
-def test_port_and_starboard_are_alike() -> None:
-    """No force across the middle plane by a motion along it."""
-    along, across = [0, 2, 4], [1, 3, 5]
-    values = estimate(ALICE)
-    for matrix in (values.added_mass, values.quadratic):
-        np.testing.assert_allclose(matrix[np.ix_(along, across)], 0.0, atol=1e-12)
-        np.testing.assert_allclose(matrix[np.ix_(across, along)], 0.0, atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("name", "sign"),
     [
@@ -155,8 +146,3 @@ def test_names_turn_back_into_the_matrix() -> None:
     symmetric = matrix + matrix.T
     again = Coefficients(name="test", values=named(symmetric, kind="dot"))
     np.testing.assert_array_equal(again.added_mass, symmetric)
-
-
-def test_faster_water_rubs_less() -> None:
-    slow, fast = (-estimate(ALICE, Flow(speed_mps=v)).values["X_uu"] for v in (0.2, 1.0))
-    assert 0.6 * slow < fast < 0.95 * slow

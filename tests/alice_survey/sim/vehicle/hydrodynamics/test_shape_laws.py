@@ -27,14 +27,6 @@ def test_alpha_0_is_lambs_integral(fineness: float) -> None:
     )
 
 
-def test_a_needle_drags_nothing_along_its_axis() -> None:
-    """k_1 -> (d / l)^2 (ln(2 l / d) - 1) of a slender spheroid."""
-    for fineness in (200.0, 2000.0):
-        k_1 = parts.ellipsoid_axial(fineness, 1.0, RHO) / parts.ellipsoid_mass(fineness, 1.0, RHO)
-        slender = (math.log(2.0 * fineness) - 1.0) / fineness**2
-        assert k_1 == pytest.approx(slender, rel=10.0 / fineness)
-
-
 def test_sections_by_hand() -> None:
     np.testing.assert_allclose(
         parts.circle_section(np.array([0.0, 0.115]), RHO), [0, RHO * math.pi * 0.115**2]
@@ -96,24 +88,11 @@ def test_cylinder_across_by_hand_and_at_its_ends() -> None:
     assert parts.cylinder_across(57.49) == pytest.approx(1.2, rel=0.01)
 
 
-def test_plates_of_hoerner() -> None:
-    """1.17 of a square within his scatter, growing towards the 2 of an endless plate."""
-    assert 1.10 < parts.plate_across(1.0) < 1.20
-    assert parts.plate_across(4.0) == parts.plate_across(0.25)
-    assert 1.6 < parts.plate_across(30.0) < 2.0
-
-
 def test_struts_lie_between_a_plate_edge_on_and_a_cylinder() -> None:
     thin, round_ = parts.strut_along(1.0, 1e-3, 1e5), parts.strut_along(0.1, 0.1, 3e4)
     friction = 1.328 / math.sqrt(1e5)
     assert thin * 1e-3 == pytest.approx(2.0 * friction, rel=2e-3)  # by its plan area, both sides
     assert 1.0 < round_ < 1.3
-
-
-def test_tunnels_cost_little() -> None:
-    """C_D by the tunnel's section is 8 C_BTO: 0.1 at most (Holtrop and Mennen)."""
-    area = parts.tunnel_area(0.08)
-    assert area / (math.pi / 4.0 * 0.08**2) == pytest.approx(8.0 * 0.012, rel=1e-12)
 
 
 def test_body_lift_is_the_papers() -> None:

@@ -1,6 +1,5 @@
 """Thrust coefficients from readings at the mooring."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -53,15 +52,6 @@ def test_sigmas_are_those_of_the_readings(tmp_path: Path) -> None:
         scores.append([(found[0].factor - 0.8) * found[0].model / found[0].sigma])
     # Student's t of three degrees of freedom: a median of its absolute value of 0.765.
     assert np.median(np.abs(scores)) == pytest.approx(0.765, abs=0.12)
-
-
-def test_one_reading_has_no_sigma(tmp_path: Path) -> None:
-    path = tmp_path / "pull.csv"
-    path.write_text("thruster,rpm,force_n\nvertical,1500,12.0\n")
-    (found,) = fit_pulls(read_pulls(path), KNOWN)
-    assert np.isnan(found.sigma)
-    deducted = replace(KNOWN.thrusters[2], kt_forward=found.identified)
-    assert deducted.kt_forward * 1025 * 0.08**4 * 25**2 == pytest.approx(12.0, rel=1e-6)
 
 
 @pytest.mark.parametrize(

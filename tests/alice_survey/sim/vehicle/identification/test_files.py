@@ -1,6 +1,5 @@
 """Vehicle files, coefficient files and foreign logs."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -63,22 +62,6 @@ def test_any_thruster_matrix_comes_from_a_file(tmp_path: Path) -> None:
         "left (diameter_m, kt_forward, kt_reverse, time_constant_s)",
         "right (diameter_m, kt_forward, kt_reverse, time_constant_s)",
     ]
-
-
-def test_json_says_the_same(tmp_path: Path) -> None:
-    import tomllib
-
-    path = tmp_path / "small.json"
-    path.write_text(json.dumps(tomllib.loads(SMALL)))
-    first, second = vehicle_from_file(path), vehicle_from_file(small(tmp_path))
-    np.testing.assert_array_equal(first.mass, second.mass)
-    np.testing.assert_array_equal(first.configuration_matrix, second.configuration_matrix)
-
-
-def test_a_name_is_a_known_vehicle() -> None:
-    assert vehicle_from("alice").thrusters == vehicle_from("alice").thrusters
-    with pytest.raises(VehicleError, match="'nautilus'"):
-        vehicle_from("nautilus")
 
 
 @pytest.mark.parametrize(
@@ -219,10 +202,3 @@ def test_numbers_and_nesting_without_end(tmp_path: Path) -> None:
         path.write_text(text, encoding="latin-1")
         with pytest.raises(VehicleError, match=r"map\.toml"):
             read_column_map(path)
-
-
-def test_a_log_of_texts_alone(tmp_path: Path) -> None:
-    (tmp_path / "map.toml").write_text("time_step_s = 0.1")
-    (tmp_path / "log.csv").write_text("a,b\nx,y\n")
-    with pytest.raises(VehicleError, match=r"log\.csv"):
-        read_foreign_log(tmp_path / "log.csv", read_column_map(tmp_path / "map.toml"))

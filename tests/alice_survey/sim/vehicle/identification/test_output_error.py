@@ -189,13 +189,3 @@ def test_parameters_that_a_log_does_not_determine_are_named() -> None:
 def test_wrong_names_are_refused(names: tuple[str, ...], named: str | None) -> None:
     with pytest.raises(VehicleError, match=named):
         free_parameters(KNOWN, names)
-
-
-def test_units_go_with_names() -> None:
-    units = {
-        "X_udot": "kg", "Y_rdot": "kg m", "N_vdot": "kg m", "N_rdot": "kg m2", "X_u": "N s/m",
-        "X_uu": "N s2/m2", "N_r": "N m s", "N_rr": "N m s2", "N_vv": "N m s2/m2",
-        "Y_uv": "N s2/m2", "current_north_mps": "m/s", "net_buoyancy_n": "N", "trim_x_m": "m",
-        "bias_p_rad_s": "rad/s", "gain_X": "1",
-    }  # fmt: skip
-    assert {name: unit_of(name) for name in units} == units

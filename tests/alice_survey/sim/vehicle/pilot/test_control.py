@@ -45,15 +45,6 @@ def test_saturated_axes_are_flagged(demand: Array) -> None:
             assert wrench[degree] == ends[int(full > 0)]
 
 
-def test_signs_of_a_wrench() -> None:
-    gains, pilot, wrench = gains_of("alice"), new_pilot(), np.zeros(6)
-    for axis, degree in enumerate(g.DEGREES):
-        pilot.demand[:] = 0.0
-        pilot.demand[slot.ACC_SURGE + axis] = 0.01
-        steering.write_wrench(gains, pilot, wrench)
-        assert wrench[degree] > 0.0  # ahead, to starboard, down, and the bow to starboard
-
-
 @settings(deadline=None)
 @given(error=st.floats(-2, 2), speed=st.floats(-1, 1), feed=st.floats(-1, 1))
 @pytest.mark.parametrize("axis", [g.SWAY, g.HEAVE, g.YAW])
@@ -122,7 +113,3 @@ def test_speed_integral_is_bounded_by_what_the_thrusters_give() -> None:
     assert total == pytest.approx(max(-row[g.LEAST], row[g.MOST]) / (row[g.MASS] * row[g.INNER]))
     held = steering.speed_demand(gains, g.SURGE, 1.0, 0.2, 1.0, 0.1, 0.05)
     assert held == (pytest.approx(row[g.RATE] * (row[g.WEIGHT] - 0.2 + 0.1)), 0.1)
-
-
-def test_an_axis_without_thrusters_has_no_integral() -> None:
-    assert steering.sum_bound(gains_of("sparus2"), g.SWAY) == 0.0

@@ -202,13 +202,6 @@ def test_heading_is_damped_with_the_sway_that_it_brings(
     assert damping_ratio(slower) > g.MIN_HEADING_DAMPING - g.PASSING_DAMPING
 
 
-def test_gains_of_a_bare_axis_are_kept_where_they_damp_the_coupled_loop() -> None:
-    for name, speed_mps in (("alice", 0.2), ("alice", 1.0), ("sparus2", 0.2)):
-        row = gains_of(name, speed_mps).axes[g.YAW]
-        _, rate, place = g.placed(row[g.LAG], 0.0, 2 * math.pi * 5.0 / 20.0)
-        assert (row[g.RATE], row[g.PLACE]) == pytest.approx((rate, place), rel=0.02)
-
-
 @pytest.mark.parametrize("name", ["alice", "sparus2"])
 @pytest.mark.parametrize("decay_share", [0.0, 0.5, 1.0])
 def test_a_wanted_speed_is_not_overshot(name: str, decay_share: float) -> None:
@@ -230,31 +223,11 @@ def test_a_wanted_speed_is_not_overshot(name: str, decay_share: float) -> None:
     assert 0.0 < row[g.WEIGHT] < 0.5
 
 
-def test_faster_thrusters_give_a_faster_loop() -> None:
-    alice, sparus = gains_of("alice").axes[g.YAW], gains_of("sparus2").axes[g.YAW]
-    assert alice[g.LAG] < 0.5 * sparus[g.LAG]
-    assert alice[g.BANDWIDTH] > 2.0 * sparus[g.BANDWIDTH]
-
-
 def test_a_lost_lateral_thruster_makes_sway_as_slow_as_the_pair_that_helps_it() -> None:
     whole, lame = vehicle_from("alice"), vehicle_from("alice").weakened({"bow": 0.0})
     slow = gains_for(lame, 0.2).axes[g.SWAY]
     assert slow[g.LAG] > 2.0 * gains_for(whole, 0.2).axes[g.SWAY, g.LAG]
     assert slow[g.LAG] < 0.85
-
-
-def test_a_weak_thruster_asks_for_less() -> None:
-    whole, weak = vehicle_from("alice"), vehicle_from("alice").weakened({"vertical": 0.25})
-    strong, feeble = (gains_for(craft, 0.2).axes[g.HEAVE] for craft in (whole, weak))
-    # Force by the square of the speed, speed by the root of the force: drag is quadratic.
-    assert feeble[g.MOST] == pytest.approx(0.25 * strong[g.MOST], rel=0.05)
-    assert feeble[g.FASTEST] == pytest.approx(0.5 * strong[g.FASTEST], rel=0.05)
-    assert feeble[g.RATE] == pytest.approx(strong[g.RATE], rel=1e-6)
-
-
-def test_slow_navigation_bounds_the_bandwidth() -> None:
-    slow = gains_for(vehicle_from("alice"), 0.2, navigation_hz=1.0)
-    assert slow.axes[g.SWAY, g.BANDWIDTH] == pytest.approx(2 * math.pi / 20)
 
 
 @pytest.mark.parametrize(("name", "lost"), [("alice", "vertical"), ("sparus2", "port")])

@@ -125,16 +125,6 @@ def test_north_is_nothing_special(motion: Array, cross_m: float, turn: float) ->
     np.testing.assert_allclose(wrenches[2], wrenches[0], atol=1e-8)
 
 
-@pytest.mark.parametrize(("controller", "axis"), [("sway", 1), ("los", 5)])
-def test_a_vehicle_to_starboard_is_taken_to_port(controller: str, axis: int) -> None:
-    path = straight(20.0)
-    gains, guidance = guide(path, "alice", controller)
-    wrench = np.zeros(6)
-    estimate = estimate_of(np.zeros(12), 0.2)
-    steer(0.0, TICK_S, estimate, path, NO_MISSION, guidance, gains, pilot_on(path, 0, 10.0), wrench)
-    assert wrench[axis] < -0.5
-
-
 @pytest.mark.parametrize("at", np.linspace(4.5, 9.5, 21))
 def test_turns_begin_before_the_arc_and_end_after_it(at: float) -> None:
     path = lawnmower(2, 5.0)
@@ -172,18 +162,6 @@ def test_the_floor_is_smoothed_as_its_transfer_function_says() -> None:
     ramp = 15.0 + 0.02 * np.arange(800) * TICK_S
     assert np.abs(np.array(smoothed[400:]) - ramp[400:]).max() < 0.03
     assert pilot.memory[slot.FLOOR_SLOPE] == pytest.approx(0.02, abs=0.01)
-
-
-def test_a_false_echo_moves_the_floor_little() -> None:
-    _, guidance = guide(straight(20.0), "alice", "sway")
-    pilot, estimate = new_pilot(), np.zeros(vector.ESTIMATE)
-    for k in range(400):
-        estimate[vector.DEPTH] = 13.0
-        estimate[vector.ALTITUDE] = 40.0 if k == 200 else 2.0
-        hear_floor(estimate, TICK_S, guidance, pilot)
-        if k == 200:
-            assert 0.0 < pilot.memory[slot.FLOOR] - 15.0 < 0.03
-    assert pilot.memory[slot.FLOOR] == pytest.approx(15.0, abs=0.02)
 
 
 def test_the_offset_has_its_closed_form_without_a_current_along() -> None:
@@ -259,9 +237,3 @@ def test_where_no_look_ahead_will_do_los_is_refused_and_sway_has_another() -> No
         pilot_guidance(loose, path, "los", max_depth_m=40.0)
     guidance = pilot_guidance(loose, path, "sway", max_depth_m=40.0)
     assert guidance.look_ahead_m == SWAY_LOOK_AHEAD_M == 2.5 * CONTROL_LENGTH_M
-
-
-def test_settings_that_make_no_sense_are_refused() -> None:
-    path = straight(20.0)
-    with pytest.raises(VehicleError):
-        guide(path, "sparus2", "sway")
