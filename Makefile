@@ -14,7 +14,7 @@ help:
 	@echo "make test-all  run these and the slow ones: the loop, kills, docs, browser, fuzzing, Monte Carlo"
 	@echo "make bench   run all benchmarks, for hours; table, logs and workspaces go into $(WORK)/"
 	@echo "make docs    build the site of docs/ into build/site/"
-	@echo "make check   lint, types and import rules"
+	@echo "make check   lint, types, import rules, and the bounds of make structure"
 	@echo "make lock    renew requirements.lock from pyproject.toml"
 
 setup: $(READY)
@@ -59,7 +59,7 @@ imports: $(READY)
 structure: $(READY)
 	$(BIN)/python -m tests.structure
 
-check: lint types imports
+check: lint types imports structure
 
 lock: $(READY)
 	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --extra dev --extra docs --extra bench \
