@@ -19,6 +19,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.core.artefacts import atomic_path
 from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import Array
+from alice_survey.core.untrusted import refuse_declarations
 
 _MAX_BYTES = 1 << 20
 _MAX_SKIPPED_BYTES = 1 << 26
@@ -217,8 +218,10 @@ def read_text(path: Path, skipped: tuple[bytes, bytes] | None = None) -> str:
         raise CalibrationError(f"{path}: is not text")
     if len(re.findall(r"[\[{]|<[A-Za-z_]", text)) > _MAX_PARTS:
         raise CalibrationError(f"{path}: has more than {_MAX_PARTS} parts: no calibration file")
-    if re.search(r"<!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE):
-        raise CalibrationError(f"{path}: declares a DOCTYPE or ENTITY, which is refused")
+    try:
+        refuse_declarations(text)
+    except ValueError as error:
+        raise CalibrationError(f"{path}: {error}") from None
     return text
 
 

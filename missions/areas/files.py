@@ -1,13 +1,15 @@
 """Areas in files: GeoJSON, KML, KMZ, GeoPackage, shapefile, well-known text, QGroundControl's plan.
 
 GDAL, through pyogrio, reads them; it is loaded only when a file is read. Heights are left out.
+Keys of plans are those of QGroundControl's developer guide, "Plan File Format": complex items hold
+`polygon`, or `polyline` and `CorridorWidth`; a geofence holds `polygons` and `circles`, each with
+`inclusion`.
 """
 
 import re
-import tempfile
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,28 +17,37 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from alice_survey.core.config import sides_of
 from alice_survey.core.contents import one_line, shown
 from alice_survey.core.errors import PlanError, warn
-from missions.areas.crs import LOCAL, geographic_shapes, parse_crs, usable_crs
-from missions.areas.qgc_plan import read_qgc_plan
-from missions.areas.raw import RawShapes, from_geometries
+from alice_survey.core.frames import Array
+from missions.areas.crs import (
+    LOCAL,
+    check_finite,
+    check_latitudes,
+    geographic_shapes,
+    parse_crs,
+    usable_crs,
+)
+from missions.areas.raw import RawLine, RawShapes, from_geometries, no_points
 from missions.areas.safe import (
-    check_file,
-    check_kml,
-    check_start,
+    DRIVERS,
+    MAX_CORNERS,
+    gis_files,
     read_bytes,
     read_geojson,
-    unpacked_kmz,
-    unpacked_shapefiles,
+    read_json,
 )
 
 Role = Literal["survey", "no_go", "allowed"]
-_MAX_CORNERS = 200_000
 _DEEPEST = 20
 _SRID = re.compile(r"\s*SRID\s*=\s*(\d+)\s*;", re.IGNORECASE)
 _LAYER_SETTING = {"survey": "layer", "no_go": "no_go_layer", "allowed": "allowed_layer"}
-SUFFIXES = (".geojson", ".json", ".kml", ".kmz", ".gpkg", ".shp", ".zip", ".wkt", ".plan")
+SUFFIXES = (*DRIVERS, ".wkt", ".plan")
+
+
+LAYERS = ("mission", "inclusion", "exclusion")
+_CIRCLE_CORNERS = 64
+_MAX_M = 1e6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,7 +84,7 @@ def read_area_file(
             f"{', '.join(SUFFIXES)}"
         )
     if suffix == ".plan":
-        return read_qgc_plan(path, layer, role)
+        return _read_qgc_plan(path, layer, role)
     if suffix == ".wkt":
         if layer is not None:
             raise PlanError(f"area: {path}: it has no layers: leave out {_LAYER_SETTING[role]}")
@@ -82,7 +93,7 @@ def read_area_file(
         except UnicodeDecodeError:
             raise PlanError(f"area: {path}: it is not text") from None
         return read_wkt(path.name, text, crs)
-    chosen = _choose(path, _layers(path, suffix), layer, role)
+    chosen = _choose(path, _layers(path), layer, role)
     return _placed(path, chosen, crs, role)
 
 
@@ -111,13 +122,13 @@ def read_wkt(origin: str, text: str, crs: str | None) -> RawShapes:
             raise PlanError(f"area: {origin}: it says SRID={match.group(1)} and crs is {crs}")
         crs = stated
     if _depth(text) > _DEEPEST:
-        raise PlanError(f"area: {origin}: no well-known text: it nests over {_DEEPEST} brackets")
+        raise PlanError(f"area: {origin}: not well-known text: it nests over {_DEEPEST} brackets")
     try:
         geometry = _geometry(shapely.from_wkt, text.strip(), origin)
     except shapely.errors.ShapelyError as error:
         what = shown(str(error)) or "it cannot be read"
         raise PlanError(
-            f"area: {origin}: no well-known text such as POLYGON ((0 0, 30 0, 30 20, 0 0)): {what}"
+            f"area: {origin}: not well-known text such as POLYGON ((0 0, 30 0, 30 20, 0 0)): {what}"
         ) from None
     shapes = from_geometries(origin, [geometry])
     _refuse_corners(shapes.origin, len(shapes.coordinates))
@@ -157,71 +168,18 @@ def _geometry(read: Callable[..., Any], content: str | bytes, where: str) -> Bas
     return geometry
 
 
-def _layers(path: Path, suffix: str) -> list[_Layer]:
+def _layers(path: Path) -> list[_Layer]:
     """All layers of a file that GDAL reads, after a look at what it is."""
-    if suffix == ".kmz":
-        with unpacked_kmz(path) as file:
-            check_kml(read_bytes(file), path.name)
-            return _gdal_layers(file, path, "KML")
-    if suffix == ".zip":
-        with unpacked_shapefiles(path) as files:
-            return [found for file in files for found in _gdal_layers(file, path, "ESRI Shapefile")]
-    if suffix == ".kml":
-        check_kml(read_bytes(path), path.name)
-        return _linked_layers([path], "KML")
-    if suffix == ".gpkg":
-        check_start(path, b"SQLite format 3\x00", "GeoPackage")
-        return _linked_layers([path], "GPKG")
-    if suffix == ".shp":
-        check_start(path, b"\x00\x00\x27\x0a", "shapefile")
-        sides = sides_of(path)
-        for side in sides:
-            check_file(side, may_be_empty=True)
-        return _linked_layers([path, *sides], "ESRI Shapefile")
-    data = read_geojson(path)
-    _check_places(path.name, data)
-    layers = _linked_layers([path], "GeoJSON")
-    if data.get("crs") is not None:
+    driver = DRIVERS[path.suffix.lower()]
+    with gis_files(path) as files:
+        layers = [layer for file in files for layer in _gdal_layers(file, path, driver)]
+    if driver != "GeoJSON" or read_geojson(path).get("crs") is not None:
         return layers
     # RFC 7946 makes it WGS 84, yet older writers left out other systems: the numbers show which.
     return [
         _Layer(name=found.name, shapes=found.shapes, crs=found.crs if _degrees(found) else None)
         for found in layers
     ]
-
-
-def _linked_layers(files: Sequence[Path], driver: str) -> list[_Layer]:
-    """The layers of the first of some files that belong together.
-
-    GDAL opens them by links of plain names, since pyogrio takes a `!` or `.zip` in a path for a
-    way into an archive.
-    """
-    stem = re.sub(r"\W", "_", files[0].stem)
-    with tempfile.TemporaryDirectory() as folder:
-        for file in files:
-            link = Path(folder) / (stem + file.suffix.lower())
-            if not link.exists():
-                link.symlink_to(file.resolve())
-        return _gdal_layers(Path(folder) / (stem + files[0].suffix.lower()), files[0], driver)
-
-
-def _check_places(origin: str, data: object) -> None:
-    """Refuse too many corners before GDAL makes shapes of them.
-
-    Raises:
-        PlanError: with their number.
-    """
-    count, waiting = 0, [data]
-    while waiting:
-        one = waiting.pop()
-        if isinstance(one, dict):
-            waiting += one.values()
-        elif isinstance(one, list):
-            if one and isinstance(one[0], int | float):
-                count += 1
-            else:
-                waiting += one
-    _refuse_corners(origin, count)
 
 
 def _degrees(layer: _Layer) -> bool:
@@ -247,7 +205,7 @@ def _gdal_layers(file: Path, shown: Path, driver: str) -> list[_Layer]:
                     continue
                 info = pyogrio.read_info(file, layer=i)
                 if info["driver"].removeprefix("LIB") != driver:
-                    raise PlanError(f"area: {shown}: no {driver} but {info['driver']}")
+                    raise PlanError(f"area: {shown}: not {driver} but {info['driver']}")
                 meta, _, wkb, _ = pyogrio.raw.read(file, layer=i, columns=[], force_2d=True)
                 shapes = _shapes(wkb, shown.name, several=len(names) > 1, layer=str(name))
                 layers.append(_Layer(name=str(name), shapes=shapes, crs=meta["crs"]))
@@ -281,9 +239,9 @@ def _shapes(wkb: Sequence[bytes | None], file: str, *, several: bool, layer: str
 
 
 def _refuse_corners(origin: str, count: int) -> None:
-    if count > _MAX_CORNERS:
+    if count > MAX_CORNERS:
         raise PlanError(
-            f"area: {origin}: {count} corners; at most {_MAX_CORNERS}: simplify it, or cut "
+            f"area: {origin}: {count} corners; at most {MAX_CORNERS}: simplify it, or cut "
             "out the part to survey"
         )
 
@@ -346,3 +304,136 @@ def _placed(path: Path, layer: _Layer, crs: str | None, role: Role) -> RawShapes
 def _is_map(crs: Any) -> bool:
     flat = crs.to_2d()
     return bool(flat.is_geographic or flat.is_projected)
+
+
+def _read_qgc_plan(path: Path, layer: str | None, role: Role) -> RawShapes:
+    """The shapes of one layer of a plan.
+
+    Args:
+        path: the `.plan` file.
+        layer: one of `LAYERS`; None takes what fits the role: the mission's items for the survey
+            area (and the exclusion fences as zones to keep out of), the inclusion fences for the
+            allowed area, the exclusion fences for zones.
+        role: what the shapes are for.
+
+    Raises:
+        PlanError: it is not a plan, or holds nothing of that kind.
+    """
+    data = read_json(path)
+    if not (isinstance(data, dict) and data.get("fileType") == "Plan"):
+        raise PlanError(f"area: {path}: not a QGroundControl plan: its fileType is not 'Plan'")
+    usual = {"survey": "mission", "no_go": "exclusion", "allowed": "inclusion"}[role]
+    chosen = layer or usual
+    if chosen not in LAYERS:
+        raise PlanError(f"area: {path}: a plan has the layers {', '.join(LAYERS)}, not {layer!r}")
+    origin = path.name
+    layers = {
+        "mission": _mission(data, origin),
+        "inclusion": _fence(data, origin, inclusion=True),
+        "exclusion": _fence(data, origin, inclusion=False),
+    }
+    found = layers[chosen]
+    if found.is_empty:
+        others = [name for name in LAYERS if not layers[name].is_empty]
+        raise PlanError(
+            f"area: {path}: no shapes in its layer {chosen!r}"
+            + (f"; there are some in {' and '.join(others)}" if others else "")
+        )
+    if role != "survey":
+        return found
+    fence = ""
+    if chosen == "mission" and not layers["inclusion"].is_empty:
+        fence = "its inclusion fence is not used; to stay inside it set allowed_file to the file"
+    exclusion = layers["exclusion"]
+    zones = exclusion if chosen != "exclusion" and not exclusion.is_empty else None
+    return replace(found, no_go=zones, unused_fence=fence)
+
+
+def _mission(data: dict[str, Any], origin: str) -> RawShapes:
+    polygons = []
+    lines = []
+    for i, item in enumerate(_list(data, origin, "mission", "items"), 1):
+        if not isinstance(item, dict):
+            raise _broken(origin, f"mission item {i}")
+        kind = item.get("complexItemType")
+        name = f"item {i} ({kind})"
+        if kind in ("survey", "StructureScan"):
+            polygons.append((_corners(item.get("polygon"), origin, name),))
+        elif kind == "CorridorScan":
+            width_m = _number(item.get("CorridorWidth"), origin, f"{name}, CorridorWidth")
+            points = _corners(item.get("polyline"), origin, name)
+            lines.append(RawLine(points=points, width_m=width_m))
+    return RawShapes(
+        origin=origin,
+        geographic=True,
+        polygons=tuple(polygons),
+        lines=tuple(lines),
+        points=no_points(),
+    )
+
+
+def _fence(data: dict[str, Any], origin: str, *, inclusion: bool) -> RawShapes:
+    polygons = []
+    for name, fence in _fences(data, origin, "polygons", inclusion=inclusion):
+        polygons.append((_corners(fence.get("polygon"), origin, name),))
+    for name, fence in _fences(data, origin, "circles", inclusion=inclusion):
+        circle = fence.get("circle")
+        if not isinstance(circle, dict):
+            raise _broken(origin, name)
+        centre = _corners([circle.get("center")], origin, name)
+        radius_m = _number(circle.get("radius"), origin, f"{name}, radius")
+        polygons.append((_circle(centre[0], radius_m, outside=not inclusion),))
+    return RawShapes(origin=origin, geographic=True, polygons=tuple(polygons), points=no_points())
+
+
+def _fences(
+    data: dict[str, Any], origin: str, key: str, *, inclusion: bool
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    if "geoFence" not in data:
+        return
+    for i, fence in enumerate(_list(data, origin, "geoFence", key), 1):
+        if not isinstance(fence, dict) or not isinstance(fence.get("inclusion"), bool):
+            raise _broken(origin, f"geoFence.{key} {i}")
+        if fence["inclusion"] == inclusion:
+            yield f"geoFence.{key} {i}", fence
+
+
+def _circle(centre_deg: Array, radius_m: float, *, outside: bool) -> Array:
+    """Corners (64, 2) of a polygon inside of a circle, or around it where that is the safe side."""
+    from pyproj import Geod
+
+    reach_m = radius_m / np.cos(np.pi / _CIRCLE_CORNERS) if outside else radius_m
+    azimuths = np.arange(_CIRCLE_CORNERS) * 360.0 / _CIRCLE_CORNERS
+    lat, lon = (np.full(_CIRCLE_CORNERS, value) for value in centre_deg)
+    lon, lat, _ = Geod(ellps="WGS84").fwd(lon, lat, azimuths, np.full(_CIRCLE_CORNERS, reach_m))
+    return np.column_stack([lat, lon])
+
+
+def _list(data: dict[str, Any], origin: str, section: str, key: str) -> list[Any]:
+    part = data.get(section)
+    found = part.get(key, []) if isinstance(part, dict) else None
+    if not isinstance(found, list):
+        raise _broken(origin, f"{section}.{key}")
+    return found
+
+
+def _corners(value: Any, origin: str, name: str) -> Array:
+    """(N, 2) latitudes and longitudes."""
+    try:
+        corners = np.array([[float(lat), float(lon)] for lat, lon, *_ in value])
+    except (TypeError, ValueError, OverflowError):
+        raise _broken(origin, name) from None
+    corners = corners.reshape(-1, 2)
+    check_finite(corners, origin, name)
+    check_latitudes(corners, origin, name)
+    return corners
+
+
+def _number(value: Any, origin: str, name: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < _MAX_M:
+        raise PlanError(f"area: {origin}: {name} is {value!r:.60}; it must be above 0")
+    return float(value)
+
+
+def _broken(origin: str, name: str) -> PlanError:
+    return PlanError(f"area: {origin}: {name} is not as QGroundControl writes it")

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
-from shapely.geometry import LineString, MultiPolygon, Point
+from shapely.geometry import LineString, MultiPolygon, Point, Polygon
 from shapely.geometry.base import BaseGeometry
 
 from alice_survey.core.config import AreaConfig
@@ -15,21 +15,59 @@ from alice_survey.core.frames import Array, Datum
 from missions.areas.crs import LocalFrame, middle
 from missions.areas.files import read_area_file, read_wkt
 from missions.areas.raw import RawLine, RawShapes, from_rings, no_points
-from missions.areas.repair import (
-    GRID_M,
-    Repaired,
-    buffered_line,
-    distinct,
-    repaired,
-    widened,
-    without_slivers,
-)
 from missions.values.area import Area, multipolygon
 
+SAME_PLACE_M = 1e-3
+"""Corners nearer than this are one; a spike is not wider."""
+SLIVER_M = 0.01
+"""A part that is narrower everywhere is left out."""
+_SLIGHT_M2 = 0.01
+"""A loop of crossing edges up to this size is a slip of the hand; a larger one is a wrong order of
+corners. Parts and holes below it are left out."""
+_NO_SIZE_M2 = 1e-4
+_NAMED = 3
+GRID_M = 1e-6
+"""Grid of corners where polygons are joined or cut: it closes the seams that rounding leaves."""
+_SHARP = 1e3
+"""Mitre limit with which a shape that is widened and narrowed keeps its corners."""
+MITRE_LIMIT = 2.0
+"""How far a corner of a widened shape may stand off, in widths: those sharper than 60 degrees are
+cut off (1 / sin 30 degrees = 2)."""
 _SMALL_SHARE = 1e-6
 _POLAR_DEG = 66.6
 """Few dive so far north or south: coordinates may be swapped."""
 _LOCAL_SETTINGS = ("no_go_ne_m", "allowed_ne_m")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Repaired:
+    """Valid polygons, metres north and east."""
+
+    solid: MultiPolygon
+    """The polygons minus their holes."""
+    holes: MultiPolygon
+    """The holes minus the other polygons; may be empty."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Reporter:
+    """Names faults and their places."""
+
+    origin: str
+    frame: LocalFrame
+    geographic: bool
+
+    def at(self, point_ne: Array) -> str:
+        return self.frame.place(point_ne, geographic=self.geographic)
+
+    def line(self, name: str, text: str) -> str:
+        return f"area: {self.origin}: {name + ': ' if name else ''}{text}"
+
+    def refuse(self, name: str, text: str) -> PlanError:
+        return PlanError(self.line(name, text))
+
+    def warn(self, name: str, text: str) -> None:
+        warn(self.line(name, text))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -374,3 +412,241 @@ def _rectangle(settings: AreaConfig) -> Array:
     right = settings.width_m * np.array([-math.sin(heading), math.cos(heading)])
     corners: Array = np.array([0 * along, along, along + right, right])
     return corners if settings.datum_at == "corner" else corners - (along + right) / 2
+
+
+def repaired(
+    raw: RawShapes, frame: LocalFrame, *, geographic: bool, overlaps: bool = True
+) -> Repaired:
+    """Check the polygons of a source.
+
+    Args:
+        raw: shapes in metres north and east; its lines and points do not count.
+        frame: to name places in.
+        geographic: whether the shapes were given in degrees, to name places so.
+        overlaps: whether to warn of polygons that overlap.
+
+    Returns:
+        Their union; corners keep their order where nothing had to be repaired or joined.
+
+    Raises:
+        PlanError: a polygon has fewer than 3 distinct corners, no size, or edges that cross; the
+            message names the polygon and the place.
+    """
+    report = _Reporter(origin=raw.origin, frame=frame, geographic=geographic)
+    solids: list[BaseGeometry] = []
+    names: list[str] = []
+    holes: list[BaseGeometry] = []
+    for i, rings in enumerate(raw.polygons):
+        name = raw.ring_name(i, 0)
+        shell = _ring_area(rings[0], name, report)
+        cuts = []
+        for j, ring in enumerate(rings[1:], 1):
+            hole = _hole(ring, shell, raw.ring_name(i, j), report)
+            if hole is not None:
+                cuts.append(hole)
+        holes += cuts
+        solid: BaseGeometry = shell
+        if cuts:
+            solid = shapely.difference(shell, shapely.union_all(cuts), grid_size=GRID_M)
+        if solid.area < _SLIGHT_M2 and len(raw.polygons) > 1:
+            report.warn(
+                name,
+                f"{solid.area:.2g} m2 at {report.at(rings[0][0])} is too small and left out",
+            )
+            continue
+        solids.append(solid)
+        names.append(name)
+    if raw.polygons and not any(solid.area > 0 for solid in solids):
+        raise report.refuse("", "its holes, or its size, leave nothing")
+    solid = _joined(solids, names, report if overlaps else None)
+    left: BaseGeometry = MultiPolygon()
+    if holes:
+        left = shapely.difference(shapely.union_all(holes), solid, grid_size=GRID_M)
+    return Repaired(solid=solid, holes=without_slivers(multipolygon(left)))
+
+
+def without_slivers(geometry: MultiPolygon) -> MultiPolygon:
+    """Leave out parts narrower than `SLIVER_M` everywhere."""
+    parts = geometry.geoms
+    kept = [p for p in parts if not p.buffer(-SLIVER_M / 2, join_style="mitre").is_empty]
+    return geometry if len(kept) == len(parts) else MultiPolygon(kept)
+
+
+def distinct(corners: Array, *, closed: bool) -> Array:
+    """Leave out points that repeat their predecessor (of a ring, the first one's is the last)."""
+    if len(corners) < 2:
+        return corners
+    steps = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+    if steps.min() >= SAME_PLACE_M:
+        back_m = float(np.linalg.norm(corners[-1] - corners[0]))
+        return corners[:-1] if closed and back_m < SAME_PLACE_M else corners
+    kept = [0]
+    for i in range(1, len(corners)):
+        if np.linalg.norm(corners[i] - corners[kept[-1]]) >= SAME_PLACE_M:
+            kept.append(i)
+    if closed and len(kept) > 1 and np.linalg.norm(corners[kept[-1]] - corners[0]) < SAME_PLACE_M:
+        kept.pop()
+    left: Array = corners[kept]
+    return left
+
+
+def _ring_area(ring: Array, name: str, report: _Reporter) -> Polygon | MultiPolygon:
+    """What a ring encloses, made valid where it is clear what is meant.
+
+    The signed area of a ring counts a loop run the other way round as less, and one run twice as
+    twice; where it equals the area of the repaired polygon, the ring only touches itself or runs
+    straight back over itself.
+
+    Raises:
+        PlanError: it encloses nothing, or its edges cross.
+    """
+    closed = len(ring) > 1 and np.linalg.norm(ring[0] - ring[-1]) < SAME_PLACE_M
+    corners = distinct(ring, closed=True)
+    if len(corners) < 3:
+        raise report.refuse(name, f"{len(corners)} distinct corners; a polygon needs 3 or more")
+    hull_m2 = Polygon(corners).convex_hull.area
+    if hull_m2 < _NO_SIZE_M2:
+        raise report.refuse(
+            name,
+            f"{hull_m2:.2g} m2 is too small; its corners lie on one line through "
+            f"{report.at(corners[0])}",
+        )
+    repeats = len(ring) - len(corners) - int(closed)
+    if repeats > 0:
+        report.warn(name, f"corners that repeat the one before ({repeats}) are left out")
+    corners = _without_spikes(corners, name, report)
+    if len(corners) < 3:
+        raise report.refuse(name, f"its corners enclose nothing near {report.at(ring[0])}")
+    polygon = Polygon(corners)
+    if polygon.is_valid:
+        return polygon
+    reason, _, text = shapely.is_valid_reason(polygon).partition("[")
+    where = report.at(np.array([float(value) for value in text.rstrip("]").split()[:2]]))
+    valid = multipolygon(shapely.make_valid(polygon, method="linework"))
+    # Of the corners less the first: products of large coordinates round.
+    north, east = (corners - corners[0]).T
+    signed = 0.5 * float(np.sum(north * np.roll(east, -1) - np.roll(north, -1) * east))
+    wrong_m2 = abs(abs(signed) - valid.area)
+    if wrong_m2 > _SLIGHT_M2:
+        what = "edges cross" if "intersection" in reason.lower() else reason.lower()
+        raise report.refuse(name, f"{what} near {where}; list the corners in order round the edge")
+    parts = [part for part in valid.geoms if part.area > _SLIGHT_M2]
+    if not parts:
+        raise report.refuse(name, f"its edges enclose no size near {where}")
+    kept = multipolygon(
+        MultiPolygon(
+            [Polygon(p.exterior, [r for r in p.interiors if Polygon(r).area > 1e-6]) for p in parts]
+        )
+    )
+    report.warn(
+        name,
+        f"its edge meets itself near {where}: taken as {len(parts)} "
+        f"part{'s' if len(parts) > 1 else ''} of {kept.area:.4g} m2",
+    )
+    return kept.geoms[0] if len(kept.geoms) == 1 else kept
+
+
+def _without_spikes(corners: Array, name: str, report: _Reporter) -> Array:
+    """Leave out corners where the edge runs straight back over itself."""
+    found = corners
+    while len(found) >= 3:
+        spikes_m = _spike_lengths_m(found)
+        if not spikes_m.any():
+            break
+        tip = int(spikes_m.argmax())
+        report.warn(
+            name,
+            f"a spike of {spikes_m[tip]:.3g} m without width at {report.at(found[tip])} is cut off",
+        )
+        found = distinct(np.delete(found, tip, axis=0), closed=True)
+    return found
+
+
+def _spike_lengths_m(corners: Array) -> Array:
+    """(N,) lengths of the shorter edges at corners whose two edges lie on one another, else 0."""
+    back = np.roll(corners, 1, axis=0) - corners
+    on = np.roll(corners, -1, axis=0) - corners
+    back_m, on_m = np.linalg.norm(back, axis=1), np.linalg.norm(on, axis=1)
+    off_m = np.abs(back[:, 0] * on[:, 1] - back[:, 1] * on[:, 0]) / np.maximum(back_m, on_m)
+    folded = ((back * on).sum(axis=1) > 0) & (off_m < SAME_PLACE_M)
+    lengths: Array = np.where(folded, np.minimum(back_m, on_m), 0.0)
+    return lengths
+
+
+def _hole(
+    ring: Array, shell: Polygon | MultiPolygon, name: str, report: _Reporter
+) -> Polygon | MultiPolygon | None:
+    """A hole of a polygon; None where it has no size."""
+    corners = distinct(ring, closed=True)
+    size_m2 = Polygon(corners).convex_hull.area if len(corners) > 2 else 0.0
+    if size_m2 < _SLIGHT_M2:
+        report.warn(name, f"{size_m2:.2g} m2 at {report.at(ring[0])} is too small and left out")
+        return None
+    hole = _ring_area(ring, name, report)
+    if not shell.contains_properly(hole):
+        outside = hole.difference(shell)
+        where = outside if outside.area > 1e-6 else hole.boundary.intersection(shell.boundary)
+        report.warn(
+            name,
+            f"{outside.area:.3g} m2 of it lie outside of its polygon, or it touches the edge, near "
+            f"{report.at(_inside(where))}: all of it is kept out of",
+        )
+    return hole
+
+
+def _joined(solids: list[BaseGeometry], names: list[str], report: _Reporter | None) -> MultiPolygon:
+    """The union of a source's polygons; overlaps are reported."""
+    if len(solids) <= 1:
+        return multipolygon(solids[0]) if solids else MultiPolygon()
+    tree = shapely.STRtree(solids)
+    near = tree.query(solids, predicate="dwithin", distance=SLIVER_M).T.tolist()
+    if all(i == j for i, j in near):
+        return multipolygon(MultiPolygon([p for s in solids for p in multipolygon(s).geoms]))
+    if report is not None:
+        _warn_of_overlaps(solids, names, near, report)
+    union = shapely.union_all(solids, grid_size=GRID_M)
+    if all(solids[i].distance(solids[j]) <= GRID_M for i, j in near):
+        return multipolygon(union)
+    if report is not None:
+        report.warn("", f"gaps narrower than {SLIVER_M:g} m between its polygons are closed")
+    wider = union.buffer(SLIVER_M / 2, join_style="mitre", mitre_limit=_SHARP)
+    closed = wider.buffer(-SLIVER_M / 2, join_style="mitre", mitre_limit=_SHARP)
+    return multipolygon(closed)
+
+
+def _warn_of_overlaps(
+    solids: list[BaseGeometry], names: list[str], pairs: list[list[int]], report: _Reporter
+) -> None:
+    common = [(solids[i].intersection(solids[j]), names[i], names[j]) for i, j in pairs if i < j]
+    overlaps = [overlap for overlap in common if overlap[0].area > _SLIGHT_M2]
+    for shared, one, other in overlaps[:_NAMED]:
+        report.warn(
+            "",
+            f"{one} and {other} overlap by {shared.area:.3g} m2 near {report.at(_inside(shared))}: "
+            "taken together",
+        )
+    if len(overlaps) > _NAMED:
+        report.warn("", f"{len(overlaps) - _NAMED} more overlaps of polygons: taken together")
+
+
+def _inside(geometry: BaseGeometry) -> Array:
+    point: Point = geometry.representative_point()
+    return np.array([point.x, point.y])
+
+
+def buffered_line(points: Array, width_m: float) -> Polygon | MultiPolygon:
+    """The strip along a line: flat ends, corners drawn out to no more than a width.
+
+    A line whose last point is its first goes round without ends.
+    """
+    strip: Polygon | MultiPolygon = LineString(points).buffer(
+        width_m / 2, cap_style="flat", join_style="mitre", mitre_limit=MITRE_LIMIT
+    )
+    return strip
+
+
+def widened(geometry: MultiPolygon, by_m: float) -> MultiPolygon:
+    """All places within a distance, with sharp corners kept sharp up to `MITRE_LIMIT`."""
+    if by_m == 0.0 or geometry.is_empty:
+        return geometry
+    return multipolygon(geometry.buffer(by_m, join_style="mitre", mitre_limit=MITRE_LIMIT))

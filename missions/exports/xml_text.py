@@ -6,6 +6,7 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 from alice_survey.core.artefacts import atomic_path
+from alice_survey.core.untrusted import xml_root
 
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 """What XML 1.0 cannot hold in any way (W3C, section 2.2)."""
@@ -57,12 +58,12 @@ def _in_comment(text: str) -> str:
 
 
 def root_of(text: str) -> ET.Element | None:
-    """The root of a document; None where the text is no XML, or declares entities."""
-    if "!DOCTYPE" in text or not text.lstrip("\ufeff \t\r\n").startswith("<"):
+    """The root of a document; None where the text is not XML, or declares entities."""
+    if not text.lstrip("\ufeff \t\r\n").startswith("<"):
         return None
     try:
-        return ET.fromstring(text.lstrip("\ufeff"))  # noqa: S314  no entities
-    except ET.ParseError:
+        return xml_root(text.lstrip("\ufeff"))
+    except ValueError:
         return None
 
 

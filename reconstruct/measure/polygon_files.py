@@ -1,6 +1,5 @@
 """Areas, cover and rugosity of the polygons of a GIS file on a survey's surface."""
 
-import contextlib
 import math
 import warnings
 from collections.abc import Iterator, Sequence
@@ -17,14 +16,7 @@ from alice_survey.core.artefacts import atomic_path
 from alice_survey.core.contents import one_line
 from alice_survey.core.errors import ConfigError, ReconstructionError, WorkspaceError
 from alice_survey.core.run import progress
-from missions.areas.safe import (
-    check_kml,
-    check_start,
-    read_bytes,
-    read_geojson,
-    unpacked_kmz,
-    unpacked_shapefiles,
-)
+from missions.areas.safe import DRIVERS, gis_files
 from reconstruct.measure.areas import SurfaceAreas, figures_of_all, surface_within
 from reconstruct.measure.errors import FigureSlopes, PackedSlopes, summed
 from reconstruct.measure.export import Measurement, as_csv, as_geojson
@@ -35,7 +27,6 @@ from reconstruct.raster import crs_of, opened_raster
 _LABELS = ("label", "class", "species", "name")
 """Attributes that are looked for, in this order and in any case, where none is named."""
 _MAX_CORNERS = 200_000
-_SUFFIXES = ".geojson, .json, .gpkg, .shp, .zip, .kml, .kmz"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -141,7 +132,9 @@ def read_polygons(
         WorkspaceError: it holds no polygon, or has no such attribute.
     """
     found: list[LabelledPolygon] = []
-    with _gdal_files(file) as parts:
+    if file.suffix.lower() not in DRIVERS:
+        raise WorkspaceError(f"{file}: polygons are read from {', '.join(DRIVERS)}")
+    with gis_files(file) as parts:
         for part in parts:
             found += _layers(part, file, surface, label)
     if not found:
@@ -150,31 +143,6 @@ def read_polygons(
     if corners > _MAX_CORNERS:
         raise WorkspaceError(f"{file}: {corners} corners; at most {_MAX_CORNERS}: simplify it")
     return found
-
-
-@contextlib.contextmanager
-def _gdal_files(file: Path) -> Iterator[Sequence[Path]]:
-    """What GDAL may open of a file: it is of bounded size and what its name says."""
-    suffix = file.suffix.lower()
-    if suffix == ".kmz":
-        with unpacked_kmz(file) as inner:
-            check_kml(read_bytes(inner), file.name)
-            yield [inner]
-    elif suffix == ".zip":
-        with unpacked_shapefiles(file) as inner_files:
-            yield inner_files
-    else:
-        if suffix == ".kml":
-            check_kml(read_bytes(file), file.name)
-        elif suffix == ".gpkg":
-            check_start(file, b"SQLite format 3\x00", "GeoPackage")
-        elif suffix == ".shp":
-            check_start(file, b"\x00\x00\x27\x0a", "shapefile")
-        elif suffix in (".geojson", ".json"):
-            read_geojson(file)
-        else:
-            raise WorkspaceError(f"{file}: polygons are read from {_SUFFIXES}")
-        yield [file.resolve()]
 
 
 def _layers(

@@ -9,11 +9,11 @@ by their numbers has their labels in its own, `A_B`, as Metashape makes them.
 """
 
 import math
-import re
 from collections.abc import Mapping
 from xml.etree import ElementTree as ET
 
 from alice_survey.core.contents import shown
+from alice_survey.core.untrusted import xml_root
 from reconstruct.placing.control_file import PICK_SIGMA_PX
 from reconstruct.placing.foreign_control import (
     Coordinates,
@@ -39,12 +39,7 @@ def read_markers(text: str) -> ForeignControl:
     Raises:
         ValueError: it is not valid, or lacks something.
     """
-    if re.search(r"<!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE):
-        raise ValueError("declares a DOCTYPE or ENTITY, which is refused")
-    try:
-        top = ET.fromstring(text)  # noqa: S314 - without a document type
-    except ET.ParseError as error:
-        raise ValueError(f"not valid XML: {error}") from None
+    top = xml_root(text)
     chunks = [top] if top.tag == "chunk" else list(top.iter("chunk"))
     chunks = [chunk for chunk in chunks if chunk.find("markers") is not None]
     if len(chunks) != 1:

@@ -224,7 +224,7 @@ BOMB = (
 @pytest.mark.parametrize(
     ("name", "content", "named"),
     [
-        ("a.kml", BOMB.encode(), "line 1: "),
+        ("a.kml", BOMB.encode(), "line 1: declares a DOCTYPE"),
         ("a.kml", ('<?xml version="1.0" encoding="UTF-16"?>' + BOMB).encode("utf-16"), "DOCTYPE"),
         ("a.kml", b"<OGRVRTDataSource/>", "OGRVRTDataSource"),
         ("a.kml", b"<kml><Document>", "a.kml"),

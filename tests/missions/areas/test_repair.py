@@ -11,8 +11,7 @@ from alice_survey.core.errors import PlanError
 from alice_survey.core.frames import Datum
 from missions.areas.crs import LocalFrame
 from missions.areas.raw import RawShapes, no_points
-from missions.areas.repair import Repaired, repaired
-from missions.areas.survey import survey_area
+from missions.areas.survey import Repaired, repaired, survey_area
 
 FRAME = LocalFrame(datum=Datum(32.0, 34.0), seafloor_depth_m=15.0, datum_is_given=True)
 SQUARE = ((0, 0), (10, 0), (10, 10), (0, 10))
@@ -67,7 +66,7 @@ def test_a_faulty_ring_is_refused_with_its_place(
     [
         (((*SQUARE, (0, 0)),), 100, ""),
         ((SQUARE[::-1],), 100, ""),
-        (((SQUARE[0], *SQUARE, SQUARE[-1]),), 100, "2 corners"),
+        (((SQUARE[0], *SQUARE, SQUARE[-1]),), 100, "repeat the one before (2)"),
         # Out 5 m and straight back; a spike whose way back goes on farther.
         (((*SQUARE[:2], (15, 0), (10, 0), *SQUARE[2:]),), 100, "5 m"),
         (((*SQUARE[:2], (15, 0), *SQUARE[1:]),), 100, "north 15.00 m, east 0.00 m"),
