@@ -87,7 +87,7 @@ def test_rows_are_the_fewest_that_reach_over_both_sides(
 def lay(
     survey: shapely.Geometry, allowed: shapely.Geometry, **changes: float
 ) -> tuple[Array, Array]:
-    wanted = {"half_m": 0.5, "overhang_m": 0.2, "step_m": 0.5, "least_steps": 1} | changes
+    wanted = {"half_m": 0.5, "overhang_m": 0.2, "step_m": 0.5, "min_steps": 1} | changes
     offsets = np.array([0.5])
     return lay_rows(turned(survey, 0.0), turned(allowed, 0.0), offsets, *wanted.values())
 

@@ -40,7 +40,7 @@ def _lines(count: int, length_m: float = 12.0, spacing_m: float = 1.0) -> list[L
 def _split(lines: list[Line], usable_wh: float, **options: Any) -> tuple[Dive, ...]:
     settings: dict[str, Any] = {
         "ways": WAYS, "costs": COSTS, "home_ne": HOME, "turn_radius_m": 0.5, "run_in_m": 0.5,
-        "turns": "auto", "longest_s": None, "depth_m": 3.0, "split": True,
+        "turns": "auto", "max_s": None, "depth_m": 3.0, "split": True,
     }  # fmt: skip
     return split_dives(lines, usable_wh=usable_wh, **(settings | options))
 
