@@ -15,13 +15,13 @@ from PIL import Image
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("alice_survey", "camera_calib", "missions", "reconstruct")
-_ROS = ("missions/live/ros_", "missions/follow/links.py")
+_ROS = "missions/live/ros_"
 EXTRAS: dict[str, str | tuple[str, ...]] = {
     "starlette": "alice_survey/app/studio/",
     "uvicorn": "alice_survey/app/studio/",
     "distributed": "alice_survey/core/cluster/",
     "zict": "alice_survey/core/cluster/",
-    "pymavlink": ("missions/live/mavlink_link.py", "missions/logs/"),
+    "pymavlink": ("missions/live/mavlink_pilot.py", "missions/logs/"),
     **dict.fromkeys(
         ("builtin_interfaces", "geometry_msgs", "nav_msgs", "rclpy", "rosgraph_msgs",
          "sensor_msgs", "std_msgs"), _ROS,

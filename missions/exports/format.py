@@ -9,9 +9,8 @@ import numpy as np
 
 from camera_calib.rig import Rig
 from missions.exports.follower import end_tolerance_m
-from missions.exports.geometry import lat_lon
+from missions.exports.geometry import CameraMount, lat_lon, mount_of
 from missions.exports.mavlink import Item, mission_items
-from missions.exports.mount import CameraMount, mount_of
 from missions.exports.options import Options, line_tolerance_m
 from missions.exports.waypoints import Waypoint, gone_on, waypoints
 from missions.values.mission import Mission

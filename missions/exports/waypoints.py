@@ -11,8 +11,7 @@ from shapely.geometry import LineString, Point
 
 from alice_survey.core.errors import PlanError
 from alice_survey.core.frames import Array
-from missions.exports.geometry import chords
-from missions.exports.mount import CameraMount
+from missions.exports.geometry import CameraMount, chords
 from missions.values.costs import SETTLE_S
 from missions.values.legs import Leg
 from missions.values.plan_file import Dive, Plan

@@ -24,7 +24,6 @@ from alice_survey.core.frames import Array, Datum, rotation_from_attitude
 from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.simulator import TICK_S
 from missions.live.loop import FIRST_S, SILENCE_S, Command, LinkState, Odometry
-from missions.live.mavlink_link import mavlink_to
 from missions.live.mission import LiveMission
 
 GUIDED, SURFACE = 4, 9
@@ -270,3 +269,27 @@ def odometry_from(position: Any, attitude: Any, origin_ned: Array) -> Odometry:
         velocity_body=turn.inv().apply([position.vx, position.vy, position.vz]),
         rates_body=np.array([attitude.rollspeed, attitude.pitchspeed, attitude.yawspeed]),
     )
+
+
+def mavlink_to(address: str, **settings: int) -> Any:
+    """Open a connection of pymavlink to ArduSub.
+
+    Args:
+        address: of pymavlink, such as udpin:127.0.0.1:14550.
+        settings: more of `mavutil.mavlink_connection`.
+
+    Raises:
+        VehicleError: pymavlink is not installed, or the address cannot be opened.
+    """
+    try:
+        from pymavlink import mavutil
+    except ImportError:
+        raise VehicleError(
+            "pymavlink is not installed: pip install 'alice-survey[mavlink]'"
+        ) from None
+    try:
+        return mavutil.mavlink_connection(address, dialect="ardupilotmega", **settings)
+    except (OSError, ValueError, IndexError) as error:
+        raise VehicleError(
+            f"{address}: cannot be opened ({error}): give one as udpin:127.0.0.1:14550"
+        ) from None

@@ -1,6 +1,6 @@
 """Messages of ROS 2 from numbers in NED and FRD, and back.
 
-ROS has ENU worlds and FLU bodies (REP-103); `missions.logs.ros_frames` swaps the axes.
+ROS has ENU worlds and FLU bodies (REP-103); `missions.logs.ros_builder` swaps the axes.
 """
 
 import importlib
@@ -14,8 +14,13 @@ import numpy as np
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from missions.live.loop import Odometry
-from missions.logs.ros_builder import NS_PER_S, MessageBuilder
-from missions.logs.ros_frames import flipped_body, flipped_quaternion, flipped_world
+from missions.logs.ros_builder import (
+    NS_PER_S,
+    MessageBuilder,
+    flipped_body,
+    flipped_quaternion,
+    flipped_world,
+)
 
 _TURN_RAD = 2.0 * math.pi
 

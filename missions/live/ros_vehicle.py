@@ -37,8 +37,17 @@ from missions.live.ros_messages import (
     speeds_message,
     wrench_from,
 )
-from missions.logs.ros_builder import CLOCK, IMU, JOINTS, ODOMETRY, RANGE, TWIST, WRENCH
-from missions.logs.ros_frames import flipped_body, flipped_quaternion
+from missions.logs.ros_builder import (
+    CLOCK,
+    IMU,
+    JOINTS,
+    ODOMETRY,
+    RANGE,
+    TWIST,
+    WRENCH,
+    flipped_body,
+    flipped_quaternion,
+)
 
 START_S = 1.0
 """The clock at the first tick: 0 would mean that it has not begun."""

@@ -30,8 +30,10 @@ from missions.logs.ros_builder import (
     RANGE,
     TRANSFORMS,
     MessageBuilder,
+    flipped_body,
+    flipped_quaternion,
+    flipped_world,
 )
-from missions.logs.ros_frames import flipped_body, flipped_quaternion, flipped_world
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from alice_survey.core.artefacts import read_csv
+from alice_survey.core.contents import shown
 from alice_survey.core.errors import NavigationError, warn
 from alice_survey.core.frames import Array, Datum, rotation_from_attitude
 from missions.logs.dead_reckoning import TrackErrors, with_dead_reckoning
-from missions.logs.dive import ROLES, LoggedDive, Signal
+from missions.logs.dive import DATED_AFTER_S, ROLES, LoggedDive, Signal
 from missions.logs.navigation_csv import READINGS, longest_gap_s, utc_date
-from missions.logs.tide import moment, read_tide, tide_at
 from missions.values.navigation import COLUMNS, write_navigation_rows
 
 _NAMED = 8
@@ -354,7 +355,7 @@ def navigation_table(
     values = [
         place[:, 0],
         (place[:, 1] + 180.0) % 360.0 - 180.0,
-        place[:, 2] - tide_at(time_s, tide),
+        place[:, 2] - _tide_at(time_s, tide),
         (angles[:, 0] + 180.0) % 360.0 - 180.0,
         angles[:, 1],
         angles[:, 2] % 360.0,
@@ -449,7 +450,9 @@ def _report(
     if lost:
         warn(f"{path}: left out: " + "; ".join(f"{n} {why}" for why, n in sorted(lost.items())))
     if gaps:
-        spans = ", ".join(f"{length:.1f} s from {moment(start)}" for start, length in gaps[:_NAMED])
+        spans = ", ".join(
+            f"{length:.1f} s from {_moment(start)}" for start, length in gaps[:_NAMED]
+        )
         more = f" and {len(gaps) - _NAMED} more" if len(gaps) > _NAMED else ""
         warn(f"{path}: {len(gaps)} gaps in {leading}: {spans}{more}")
     sources = {
@@ -477,7 +480,7 @@ def _report(
     }
     lines = [
         f"{path}: {dive.kind}, {dive.clock}",
-        f"{out}: {len(time_s)} rows from {moment(float(time_s[0]))}, {data['duration_s']:.1f} s",
+        f"{out}: {len(time_s)} rows from {_moment(float(time_s[0]))}, {data['duration_s']:.1f} s",
         *(f"  {role} from {source}" for role, source in named.items()),
     ]
     empty = [name for name, count in filled.items() if not count]
@@ -501,3 +504,74 @@ def _gaps(time_s: Array) -> list[tuple[float, float]]:
     """Start and length of steps that nothing is interpolated over."""
     longest = longest_gap_s(time_s)
     return [(a, b - a) for a, b in itertools.pairwise(time_s.tolist()) if b - a > longest]
+
+
+def _tide_at(time_s: Array, tide: float | Signal) -> Array:
+    """Heights, (N,) metres, of a tide at times.
+
+    Raises:
+        NavigationError: it does not cover them.
+    """
+    if not isinstance(tide, Signal):
+        return np.full(time_s.shape, float(tide))
+    first, last = tide.time_s[0], tide.time_s[-1]
+    if time_s[0] < first or time_s[-1] > last:
+        raise NavigationError(
+            f"{tide.source}: tides from {_moment(first)} to {_moment(last)} do not cover the "
+            f"dive, {_moment(float(time_s[0]))} to {_moment(float(time_s[-1]))}"
+        )
+    heights: Array = np.interp(time_s, tide.time_s, tide.values[:, 0])
+    return heights
+
+
+def read_tide(text: str, *, dated: bool) -> float | Signal:
+    """A tide as typed: metres, or a CSV with `time_utc` (or `time_s`) and `height_m`.
+
+    Args:
+        text: a number, or a path.
+        dated: whether the log's times are UTC: then the CSV's must be, too.
+
+    Raises:
+        NavigationError: it is neither, or the file cannot be used.
+    """
+    try:
+        metres = float(text)
+    except ValueError:
+        path = Path(text)
+    else:
+        if not math.isfinite(metres):
+            raise NavigationError(f"--tide {text}: give a finite number")
+        return metres
+    column = "time_utc" if dated else "time_s"
+    try:
+        names, rows = read_csv(path)
+    except NavigationError as error:
+        raise NavigationError(f"--tide is neither metres nor a CSV: {error}") from None
+    for name in (column, "height_m"):
+        if name not in names:
+            raise NavigationError(
+                f"{path}: column {name} is missing; it has {shown(', '.join(names))}"
+                + ("" if dated else " (the log's times have no date)")
+            )
+    times, heights = [], []
+    for line, row in rows:
+        try:
+            cell = row[column]
+            times.append(utc_date(cell).timestamp() if dated else float(cell))
+            heights.append(float(row["height_m"]))
+        except ValueError:
+            raise NavigationError(
+                f"{path} line {line}: {row[column]!r}, {row['height_m']!r}: not a time and a height"
+            ) from None
+    if not times or not np.all(np.isfinite([*times, *heights])):
+        raise NavigationError(f"{path}: holds no tides, or heights that are not numbers")
+    if not np.all(np.diff(times) > 0):
+        raise NavigationError(f"{path}: the times must increase")
+    return Signal(source=text, time_s=np.array(times), values=np.array(heights)[:, None])
+
+
+def _moment(time_s: float) -> str:
+    """A time as people read it: a date where it is one."""
+    if time_s < DATED_AFTER_S:
+        return f"{time_s:.1f} s"
+    return datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%d %H:%M:%S")

@@ -22,7 +22,7 @@ from alice_survey.core.executor import progress
 from alice_survey.core.frames import Array, Datum, attitude_from_rotation
 from missions.logs.bag_reader import opened_bag
 from missions.logs.dive import DATED_AFTER_S, LoggedDive, Signal, cleaned, usable_positions
-from missions.logs.ros_frames import flipped_body, flipped_quaternion, flipped_world
+from missions.logs.ros_builder import flipped_body, flipped_quaternion, flipped_world
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader

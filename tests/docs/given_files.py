@@ -24,7 +24,7 @@ from camera_calib.camera import Camera
 from camera_calib.rig import Rig, design_rig, write_rig
 from camera_calib.targets.pattern import black_rectangles
 from camera_calib.targets.target import Target, parse_target
-from missions.logs.ros_frames import flipped_quaternion
+from missions.logs.ros_builder import flipped_quaternion
 from tests.alice_survey.sim.vehicle.identification.manoeuvres import fly, hidden, measured
 from tests.camera_calib.calibration_scenes import board_poses, in_air
 from tests.cameras import changed

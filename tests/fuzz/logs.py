@@ -177,7 +177,7 @@ def _check_log(folder: Path) -> None:
 
 
 def read_tide(path: Path) -> object:
-    from missions.logs.tide import read_tide
+    from missions.logs.import_log import read_tide
 
     return read_tide(str(path), dated=True)
 

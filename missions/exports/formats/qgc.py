@@ -15,7 +15,7 @@ from shapely.geometry import Polygon
 from alice_survey.core.artefacts import write_json
 from alice_survey.core.errors import warn
 from missions.exports.format import Export, ExportFile, ExportFormat
-from missions.exports.geometry import grown, lat_lon
+from missions.exports.geometry import CameraMount, grown, lat_lon
 from missions.exports.mavlink import (
     FRAME_ABOVE_HOME,
     FRAME_ABOVE_TERRAIN,
@@ -24,7 +24,6 @@ from missions.exports.mavlink import (
     item_of,
     mission_of,
 )
-from missions.exports.mount import CameraMount
 from missions.exports.waypoints import Waypoint
 from missions.values.mission import Mission
 from missions.values.plan_file import Plan

@@ -16,7 +16,7 @@ from alice_survey.sim.vehicle.log import read_vehicle_log
 from missions.logs.bag import write_bag
 from missions.logs.import_log import ImportOptions, import_log
 from missions.logs.navigation_csv import read_navigation
-from missions.logs.ros_frames import flipped_quaternion, flipped_world
+from missions.logs.ros_builder import flipped_quaternion, flipped_world
 from tests.missions.logs.log_files import Bag
 from tests.missions.logs.test_bag import flight
 

@@ -11,7 +11,7 @@ from alice_survey.core.errors import NavigationError
 from alice_survey.core.frames import Array, Datum, rotation_from_attitude
 from missions.logs.dead_reckoning import TrackErrors
 from missions.logs.import_log import ImportOptions, import_log
-from missions.logs.ros_frames import flipped_quaternion
+from missions.logs.ros_builder import flipped_quaternion
 from tests.missions.logs.log_files import Bag
 from tests.missions.logs.test_import_bag import START, numbers
 
