@@ -41,8 +41,7 @@ from benchmarks.bend_survey import (
 from benchmarks.figures import Figure, Findings, add_options, hand_over
 from benchmarks.machine import heading, machine
 from camera_calib.rig import Rig
-from reconstruct.placing.alignment import align_rigid, align_similarity
-from reconstruct.placing.bend import sag_weights
+from reconstruct.placing.alignment import align_rigid, align_similarity, sag_weights
 
 _FIRST_SEED = 11
 """Of the flights: the example's own."""

@@ -18,10 +18,9 @@ from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.refraction import refract
 from reconstruct.mapping.working_range import WorkingDistances
-from reconstruct.placing.alignment import Similarity
-from reconstruct.placing.bend import sag_weights
-from reconstruct.placing.georeference import fit_navigation, level
-from reconstruct.placing.navigation_equations import PLACE, body_from_pinhole
+from reconstruct.placing.alignment import Similarity, level, sag_weights
+from reconstruct.placing.fit import fit_navigation
+from reconstruct.placing.navigation import PLACE, body_from_pinhole
 from reconstruct.placing.track import picture_modes, pose_covariances, track_rows
 from reconstruct.views.model import WorldFrame
 from reconstruct.views.model_files import as_transform

@@ -23,9 +23,8 @@ from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
 from camera_calib.rig import design_rig
 from missions.exposure.footprints import pixel_on_floor_m
-from reconstruct.placing.alignment import Similarity
-from reconstruct.placing.bend import Bend, bend_modes, quadratic
-from reconstruct.placing.georeference import fit_navigation, level
+from reconstruct.placing.alignment import Bend, Similarity, bend_modes, level, quadratic
+from reconstruct.placing.fit import fit_navigation
 
 BENDS_MM = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 10.0)
 _FIRST_SEED = 11

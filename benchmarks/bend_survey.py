@@ -34,7 +34,7 @@ from camera_calib.freedom import moved
 from camera_calib.rig import Covariance, Rig, read_rig
 from missions.logs.navigation_csv import NavigationLog, read_navigation
 from missions.values.plan_file import read_plan
-from reconstruct.adjustment.keypoint_bias import bias_covariance
+from reconstruct.adjustment.survey_fit import bias_covariance
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.working_range import WorkingDistances

@@ -39,7 +39,8 @@ from reconstruct.adjustment.exact_observations import (
 from reconstruct.adjustment.normal_equations import Gauge
 from reconstruct.adjustment.soft_modes import soft_modes
 from reconstruct.adjustment.survey_fit import SurveyProblem
-from reconstruct.placing.georeference import fit_navigation, level
+from reconstruct.placing.alignment import level
+from reconstruct.placing.fit import fit_navigation
 
 ALTITUDE_M, _STEP_M, _LINES_M, _DEPTH_M, _SPEED_MPS = 2.0, 0.4, 0.8, 10.0, 0.2
 _MATCHED = 0.5

@@ -11,8 +11,7 @@ from alice_survey.core.frames import Array
 from alice_survey.sim.seafloor.terrain import Terrain, read_terrain
 from reconstruct.evaluate.figures import rms
 from reconstruct.evaluate.truth import read_true_poses, surface_distance
-from reconstruct.placing.alignment import Similarity, align_rigid, align_similarity
-from reconstruct.placing.bend import sag_weights
+from reconstruct.placing.alignment import Similarity, align_rigid, align_similarity, sag_weights
 from reconstruct.placing.track import read_track_poses
 from reconstruct.views.model import read_model
 

@@ -48,7 +48,8 @@ from reconstruct.mapping.mapper import map_calibrated
 from reconstruct.mapping.refraction import refract
 from reconstruct.matching.matches import PairMatches
 from reconstruct.matching.pairs import choose_pairs, most_alike
-from reconstruct.placing.georeference import fit_navigation, level
+from reconstruct.placing.alignment import level
+from reconstruct.placing.fit import fit_navigation
 from reconstruct.placing.run import run_sparse
 from reconstruct.views.model import SparseModel, View, WorldFrame
 from reconstruct.views.model_files import colmap_pinhole

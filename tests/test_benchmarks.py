@@ -21,7 +21,7 @@ from benchmarks.parts import PARTS, Part, Settings, chosen
 from benchmarks.reconstruct_figures import against_peers
 from benchmarks.reconstruct_scores import Accuracy, bend_mm
 from benchmarks.runs import Run, run
-from reconstruct.placing.bend import sag_weights
+from reconstruct.placing.alignment import sag_weights
 
 ROOT = Path(__file__).parents[1]
 MODULES = sorted({part.module for part in PARTS})

@@ -29,7 +29,7 @@ from reconstruct.adjustment.normal_equations import (
     pattern_of,
 )
 from reconstruct.mapping.arrays import Indices
-from reconstruct.mapping.robust import cauchy_weights
+from reconstruct.mapping.bundle import cauchy_weights
 
 Value = TypeVar("Value")
 Result = TypeVar("Result")

@@ -4,6 +4,18 @@ Each parameter of the rig moves within what calibration knew of it: the covarian
 wide bounds where it has none. Where anything is free, all uncertain parameters of the calibration
 (focal lengths, say) move within its covariance, since holding them would push their errors into
 what is free. The model is then rebuilt on the pinholes of the refined rig.
+
+A detector of features finds texture whose blur, light and scale change from the middle of a picture
+to its edge a little farther in or out than a calibration saw the corners of its target, and does so
+in all pictures alike, so that the number of keypoints does not lessen it. A survey therefore knows
+the radial part of its lenses no better than that, however well a calibration determined it. Ports
+and poses, whose effect depends on the distance, are known as well as stated; with lenses held to
+their own small sigmas, the bias would pull at those instead.
+
+A right calibration with covariance P lets pictures move its parameters by d, and leaves the
+covariance Q: d is then normal with covariance P - Q. In the directions that pictures measure, the
+eigenvectors u of P^-1/2 (P - Q) P^-T/2 with eigenvalues above zero, (u . P^-1/2 d)^2 / eigenvalue
+adds up to chi-square.
 """
 
 import math
@@ -15,6 +27,7 @@ from typing import Any, Self
 import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.stats import chi2
 
 from alice_survey.core.block_solver import BlockStep, Flags, inverse_of, minimise
 from alice_survey.core.config import ReconstructConfig
@@ -32,34 +45,143 @@ from reconstruct.adjustment.exact_observations import (
     choose_pixels,
     start_state,
 )
-from reconstruct.adjustment.keypoint_bias import bias_covariance
-from reconstruct.adjustment.normal_equations import (
-    POSE,
-    PointEquations,
-    reduce_parts,
-)
+from reconstruct.adjustment.normal_equations import POSE, PointEquations, reduce_parts
 from reconstruct.adjustment.pixel_parts import ALONE, Linearised, PixelParts, Workers
-from reconstruct.adjustment.rig_evidence import Contradiction, contradiction
 from reconstruct.adjustment.soft_modes import Motions, SoftModes
-from reconstruct.mapping.arrays import (
-    MIN_POINTS,
-    Indices,
-    first_of,
-    frames_of,
-    linked_groups,
+from reconstruct.mapping.arrays import MIN_POINTS, Indices, first_of, frames_of, linked_groups
+from reconstruct.mapping.bundle import (
+    cauchy_cost,
+    cauchy_weights,
+    loss_scale,
+    move_points,
+    sigma_of,
+    variance_of,
 )
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.refraction import Keypoints
-from reconstruct.mapping.robust import (
-    cauchy_cost,
-    cauchy_weights,
-    loss_scale,
-    sigma_of,
-    variance_of,
-)
-from reconstruct.mapping.spread_points import move_points
 from reconstruct.views.model_files import colmap_pinhole, rigid3d
+
+BIAS_PX = 0.01
+"""Sigma of the bias, root mean square over a picture: in rendered surveys it is 0.005 to 0.007."""
+_RADIAL = frozenset({"fx_px", "fy_px", *(f"k{i}" for i in range(1, 7))})
+_GRID = 24
+"""Places along a side of the picture at which a lens is sampled."""
+
+
+def bias_covariance(rig: Rig, names: Sequence[str], sigma_px: float = BIAS_PX) -> Array:
+    """Changes of a rig that are worth a radial bias of keypoints, as a covariance (K, K).
+
+    Changes of a lens are as likely as the pixels that they move are near: with J the slopes of the
+    pixels by the lens's L radial parameters, it is `sigma^2 / L` times the inverse of the mean of
+    J^T J, which makes `sigma^2` the expected mean square shift over the picture.
+
+    Args:
+        rig: cameras.
+        names: parameters of the rig; those that are not radial ones of a lens have no bias.
+        sigma_px: of the bias.
+    """
+    found = np.zeros((len(names), len(names)))
+    for owner, camera in rig.cameras.items():
+        at = {field: names.index(f"{owner}.{field}") for field in camera.lens.parameters
+              if field in _RADIAL and f"{owner}.{field}" in names}  # fmt: skip
+        if not at:
+            continue
+        axes = [(np.arange(_GRID) + 0.5) / _GRID * n for n in (camera.width_px, camera.height_px)]
+        starts, rays = camera.unproject(np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2))
+        lit = np.isfinite(rays).all(axis=1)
+        by_all = camera.project_jacobian(starts[lit] + rays[lit])[2]
+        slopes = by_all[..., [camera.parameters.index(field) for field in at]].reshape(-1, len(at))
+        size = np.linalg.norm(slopes, axis=0)
+        inverse = np.linalg.inv((slopes / size).T @ (slopes / size)) / np.outer(size, size)
+        found[np.ix_([*at.values()], [*at.values()])] = sigma_px**2 / len(at) * lit.sum() * inverse
+    return found
+
+
+_MEASURED = 0.05
+"""Share of the prior variance that pictures take away, from which a direction is measured."""
+_UNLIKELY = 1e-4
+"""Probability of the whole pull, if the calibration were right, below which it is named."""
+_FAR = 2.0
+"""Prior sigmas from which a parameter is named."""
+_MAX_NAMED = 4
+_NAMES = {
+    "port_distance_m": "distance of the port",
+    "normal_x": "tilt of the port",
+    "normal_y": "tilt of the port",
+    "n_water": "index of the water",
+}
+_MOTIONS = ("rx_rad", "ry_rad", "rz_rad", "x_m", "y_m", "z_m")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Contradiction:
+    """Pictures and calibration disagree by more than chance."""
+
+    chi_square: float
+    directions: int
+    """Combinations of parameters that the pictures measure: the mean of a right calibration's."""
+    named: tuple[str, ...]
+    """Parameters that moved by the most prior sigmas, the most moved first."""
+    pulls: tuple[float, ...]
+    """By how many."""
+
+    @property
+    def words(self) -> str:
+        """What to tell, in one line."""
+        moved = ", ".join(
+            f"{_about(name)} by {pull:+.1f} sigmas"
+            for name, pull in zip(self.named, self.pulls, strict=True)
+        )
+        return (
+            f"the pictures contradict the calibration (chi-square {self.chi_square:.0f} of "
+            f"{self.directions}): they move {moved} of what it states: calibrate again in the "
+            "water, or state sigmas that hold"
+        )
+
+
+def contradiction(
+    parameters: Sequence[str], change: Array, prior: Array, left: Array
+) -> Contradiction | None:
+    """What pictures say against a calibration; None where they agree with it.
+
+    Args:
+        parameters: (G,) names.
+        change: (G,) by the adjustment.
+        prior: (G, G) covariance before.
+        left: (G, G) covariance after.
+    """
+    if not len(parameters):
+        return None
+    sigmas = np.sqrt(np.diag(prior))
+    scaled = np.outer(sigmas, sigmas)
+    values, axes = np.linalg.eigh(prior / scaled)
+    kept = values > values.max() * len(values) * np.finfo(float).eps
+    white = (axes[:, kept] / np.sqrt(values[kept])).T / sigmas
+    gain, directions = np.linalg.eigh(np.eye(kept.sum()) - white @ left @ white.T)
+    measured = gain > _MEASURED
+    along = directions[:, measured].T @ (white @ change)
+    total = float((along**2 / gain[measured]).sum())
+    count = int(measured.sum())
+    if count == 0 or chi2.sf(total, count) > _UNLIKELY:
+        return None
+    pulls = change / sigmas
+    order = np.argsort(-np.abs(pulls))
+    far = [int(k) for k in order if abs(pulls[k]) > _FAR][:_MAX_NAMED] or [int(order[0])]
+    return Contradiction(
+        chi_square=total,
+        directions=count,
+        named=tuple(parameters[k] for k in far),
+        pulls=tuple(float(pulls[k]) for k in far),
+    )
+
+
+def _about(name: str) -> str:
+    camera, field = name.split(".", 1)
+    if field in _MOTIONS:
+        return f"the place of {camera!r} on the rig ({name})"
+    return f"the {_NAMES.get(field, 'lens')} of {camera!r} ({name})"
+
 
 _RIG_SIGMAS = dict(zip(TURN_AND_SHIFT, [0.02] * 3 + [0.005] * 3, strict=True))
 """Prior sigmas of parameters that no calibration determines: very wide."""

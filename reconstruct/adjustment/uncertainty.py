@@ -1,7 +1,7 @@
 """How well a model's stations and points are known: `sparse/covariance.npz`.
 
 The covariance is that of the last adjustment: the inverse of its weighted normal equations, scaled
-by the variance of the keypoints that its residuals show (see `reconstruct.mapping.robust`), and
+by the variance of the keypoints that its residuals show (see `reconstruct.mapping.bundle`), and
 what errors of the calibration add to it. A model of pictures has no place of its own, so that what
 is stated is its shape: the covariance of what is left when all stations together are moved onto the
 truth by a rigid motion (and by a scale, where nothing fixes that) with the least squares error (the
@@ -53,8 +53,8 @@ from reconstruct.mapping.arrays import (
     observed,
     rig_poses,
 )
+from reconstruct.mapping.bundle import cauchy_weights, sigma_of, variance_of
 from reconstruct.mapping.mapper import Mapped
-from reconstruct.mapping.robust import cauchy_weights, sigma_of, variance_of
 from reconstruct.views.model_files import as_transform
 
 _MAX_PLACES = 2000

@@ -20,11 +20,19 @@ from alice_survey.core.errors import warn
 from alice_survey.core.frames import Array
 from alice_survey.core.run import progress
 from reconstruct.mapping.arrays import Indices, first_of, frames_of, model_groups, observed
-from reconstruct.mapping.bundle import FULLY, ROUGHLY, all_pictures, held_options
+from reconstruct.mapping.bundle import (
+    FULLY,
+    ROUGHLY,
+    all_pictures,
+    held_options,
+    loss_scale,
+    move_points,
+    pixel_sigma,
+    spread_part,
+    take_poses,
+)
 from reconstruct.mapping.database import Observations, new_folder, write_database
 from reconstruct.mapping.mapper import Mapped
-from reconstruct.mapping.robust import loss_scale, pixel_sigma
-from reconstruct.mapping.spread_points import move_points, spread_part, take_poses
 from reconstruct.views.model_files import stored_of
 
 SETTLED_PX = 1e-4

@@ -36,8 +36,8 @@ from reconstruct.adjustment.normal_equations import Gauge, PointEquations, by_po
 from reconstruct.adjustment.pixel_parts import Linearised, PixelParts
 from reconstruct.mapping.arrays import MIN_POINTS, Indices, first_of, linked_groups
 from reconstruct.picking.registered import RegisteredPictures
-from reconstruct.placing.control_file import Pick
-from reconstruct.placing.picked_points import (
+from reconstruct.placing.control_points import (
+    Pick,
     Spot,
     covariance_of_picks,
     find_spots,

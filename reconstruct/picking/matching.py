@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from alice_survey.core.frames import Array
 from reconstruct.picking.surface import SurfacePlace
-from reconstruct.placing.picked_points import RegisteredPicture
+from reconstruct.placing.control_points import RegisteredPicture
 
 Grey = NDArray[np.uint8]
 HALF_PX = 7

@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.control import ControlFit, tie_control
-from reconstruct.placing.control_file import Control
-from reconstruct.placing.picked_points import Spot
+from reconstruct.placing.control_points import Control, Spot
 from reconstruct.views.model import WorldFrame
 
 

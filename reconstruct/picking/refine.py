@@ -13,8 +13,8 @@ import numpy as np
 
 from reconstruct.picking.matching import Grey, Match, Matcher, NoMatch
 from reconstruct.picking.surface import SurfacePlace
-from reconstruct.placing.control_file import Pick
-from reconstruct.placing.picked_points import (
+from reconstruct.placing.control_points import (
+    Pick,
     RegisteredPicture,
     Spot,
     find_spots,

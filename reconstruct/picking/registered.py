@@ -16,7 +16,7 @@ from alice_survey.core.frames import Array
 from alice_survey.core.records import CamerasRecord
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.mapping.arrays import Indices
-from reconstruct.placing.picked_points import RegisteredPicture
+from reconstruct.placing.control_points import RegisteredPicture
 from reconstruct.views.model import WorldFrame, read_frame, read_warps
 from reconstruct.views.model_files import ImagesFile
 

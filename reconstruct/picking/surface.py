@@ -15,7 +15,7 @@ from alice_survey.core.artefacts import read_stage
 from alice_survey.core.errors import ReconstructionError
 from alice_survey.core.frames import Array
 from reconstruct.evaluate.elevation import LEVEL, Elevation, StoredElevation
-from reconstruct.placing.picked_points import RegisteredPicture
+from reconstruct.placing.control_points import RegisteredPicture
 from reconstruct.planes import read_plane
 from reconstruct.views.model_files import all_points
 

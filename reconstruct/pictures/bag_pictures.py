@@ -16,7 +16,7 @@ from alice_survey.core.executor import progress
 from alice_survey.core.frames import Array
 from missions.logs.bag_reader import opened_bag
 from reconstruct.pictures.files import safe_name
-from reconstruct.pictures.moments import moments_of
+from reconstruct.pictures.pairing import moments_of
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader

@@ -1,4 +1,8 @@
-"""Picture files as cameras write them: found, checked by decoding them whole, and copied."""
+"""Picture files as cameras write them: found, checked by decoding them whole, and copied.
+
+HEIC, the pictures of phones, needs `pillow-heif`, which is not a dependency: its wheels hold
+libraries under the GPL.
+"""
 
 import os
 import re
@@ -9,6 +13,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, tzinfo
 from fractions import Fraction
+from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +31,27 @@ from camera_calib.picture_files import (
     read_pixels,
     without_orientation,
 )
-from reconstruct.pictures.heic import HEIC, can_read_heic, stored_turns
+
+HEIC = (".heic", ".heif", ".hif", ".avif")
+_TURNS = {3: 2, 6: 1, 8: 3}
+"""Quarter turns, counter-clockwise, that undo a decoder's, by the EXIF orientation it took off."""
+
+
+@cache
+def can_read_heic() -> bool:
+    """Whether `pillow-heif` is installed; Pillow then knows its formats."""
+    try:
+        pillow_heif = import_module("pillow_heif")
+    except ImportError:
+        return False
+    pillow_heif.register_heif_opener()
+    return True
+
+
+def stored_turns(info: Mapping[str, Any]) -> int:
+    """Quarter turns, counter-clockwise, from a picture as decoded to its pixels as stored."""
+    return _TURNS.get(info.get("original_orientation") or 1, 0)
+
 
 PLAIN = (".jpg", ".jpeg", ".png")
 TIFF = (".tif", ".tiff")

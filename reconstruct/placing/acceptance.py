@@ -4,8 +4,8 @@ Both are reported, not repaired: a station far off navigation may be a jump of n
 as a wrong pose, and a scale that the rig's own stereo contradicts a wrong rig as well as a bent
 model.
 
-How bent a model is navigation shows (`reconstruct.placing.bend`); and a stereo rig carries its own
-yardstick to every station.
+Navigation shows how bent a model is (`reconstruct.placing.alignment`); and a stereo rig carries its
+own yardstick to every station.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,7 +28,7 @@ from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.working_range import ray_passes
 from reconstruct.matching.pairs import positions_ned
 from reconstruct.pictures.files import named
-from reconstruct.placing.bend import MIN_STATIONS, Bend, quadratic
+from reconstruct.placing.alignment import MIN_STATIONS, Bend, quadratic
 from reconstruct.views.model_files import as_transform
 
 FAR_SIGMAS, FAR_M = 5.0, 0.5

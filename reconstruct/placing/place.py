@@ -1,7 +1,14 @@
-"""The place of a model in the world: by navigation, control points, a scale or the sea floor."""
+"""The place of a model in the world: by navigation, control points, a scale or the sea floor.
+
+Where the mount of the cameras on the vehicle is unknown, it is found from its attitudes and the
+pictures: a model placed by positions alone has attitudes of its own; what is between these and the
+measured ones is the mount (the robot-world and hand-eye problem: Zhuang, Roth & Sudhakar 1994, with
+the world's part solved first). The fit of the place then has the mount and the lever arm among its
+unknowns, so that every sigma counts theirs.
+"""
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -9,13 +16,21 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 from scipy.spatial import KDTree
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.config import ReconstructConfig
-from alice_survey.core.errors import ReconstructionError, WorkspaceError, warn
-from alice_survey.core.frames import Array, Datum
+from alice_survey.core.errors import (
+    Level,
+    ReconstructionError,
+    WorkspaceError,
+    collected_by,
+    note,
+    warn,
+)
+from alice_survey.core.frames import Array, Datum, rotation_from_attitude
 from alice_survey.core.manifest import ImageRecord
 from alice_survey.core.records import MappingRecord, PicturesRecord, ScaleRecord
+from alice_survey.core.robust import MAD_TO_SIGMA
 from alice_survey.core.run import progress
 from alice_survey.core.stages import SCALE_FILE
 from camera_calib.approximation.pinhole_warp import PinholeWarp
@@ -23,36 +38,181 @@ from camera_calib.rig import Rig, mounted
 from reconstruct.adjustment.soft_modes import SoftModes
 from reconstruct.adjustment.uncertainty import Uncertainty
 from reconstruct.pictures.files import named
-from reconstruct.placing.alignment import Similarity
-from reconstruct.placing.altitude_scale import scale_by_altitudes
-from reconstruct.placing.coarse_control import (
+from reconstruct.placing.alignment import Similarity, level
+from reconstruct.placing.control import (
+    ControlFit,
     real_sigma_factor,
+    tie_control,
     warn_of_coarse,
     widened,
     without_wrong_points,
 )
-from reconstruct.placing.control import ControlFit, tie_control
-from reconstruct.placing.control_file import (
+from reconstruct.placing.control_points import (
     CONTROL_FILE,
     MARKERS_FILE,
     PICKS_FILE,
     Control,
     Pick,
+    RegisteredPicture,
+    find_spots,
     read_control,
     read_picks,
 )
-from reconstruct.placing.georeference import fit_control, fit_navigation, level
-from reconstruct.placing.mount import fit_with_mount
-from reconstruct.placing.navigation_equations import (
-    PLACE,
-    SCALE,
-    Installation,
-    body_from_pinhole,
-)
-from reconstruct.placing.picked_points import RegisteredPicture, find_spots
-from reconstruct.placing.placement_fit import PlacementFit
+from reconstruct.placing.fit import FoundMount, PlacementFit, fit_control, fit_navigation
+from reconstruct.placing.navigation import PLACE, SCALE, Installation, body_from_pinhole
 from reconstruct.placing.track import picture_modes
 from reconstruct.views.model import MEAN_PLANE, WorldFrame
+
+_BEAM = np.tan(np.deg2rad(15.0))
+"""Radius of what a sonar's beam covers over the altitude: echo sounders' beams are 30 degrees wide,
+and a Doppler log's four, about as far apart, are averaged."""
+_SIGMA_M = 0.1
+"""Used where navigation states no sigma."""
+_MIN_POINTS, _MIN_STATIONS = 5, 3
+
+
+def scale_by_altitudes(
+    records: Sequence[ImageRecord], centres: Array, points: Array
+) -> tuple[float, float] | None:
+    """Metres in a unit of the model, and their relative sigma.
+
+    The sigma holds what all altitudes have wrong together, as large as stated, the relief within
+    the beam, of which a sonar may see the nearest point or the mean, and the scatter.
+
+    Args:
+        records: pictures.
+        centres: (N, 3) their cameras in the levelled model, third axis down.
+        points: (P, 3) points of the levelled model.
+
+    Returns:
+        Scale and sigma; None with fewer than three stations that have an altitude and points below.
+    """
+    tree = KDTree(points[:, :2])
+    first = {r.station: i for i, r in reversed(list(enumerate(records))) if r.altitude_m > 0}
+    logs, reliefs, sigmas, places = [], [], [], []
+    for i in sorted(first.values()):
+        near = points[tree.query(centres[i, :2], min(_MIN_POINTS, len(points)))[1]]
+        reach = _BEAM * float(np.median(near[:, 2]) - centres[i, 2])
+        if not reach > 0:
+            continue
+        below = points[tree.query_ball_point(centres[i, :2], reach), 2] - centres[i, 2]
+        below = below[below > 0]
+        if len(below) < _MIN_POINTS:
+            continue
+        middle = float(np.median(below))
+        logs.append(np.log(records[i].altitude_m / middle))
+        reliefs.append(MAD_TO_SIGMA * float(np.median(np.abs(below - middle))) / middle)
+        stated = records[i].sigma_altitude_m
+        sigmas.append((stated if stated > 0 else _SIGMA_M) / records[i].altitude_m)
+        places.append(np.append(centres[i, :2], middle))
+    if len(logs) < _MIN_STATIONS:
+        return None
+    way, middles = np.array(places)[:, :2], np.array(places)[:, 2]
+    length = float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())
+    # Beams that overlap see the same relief: one beam's width of way counts once.
+    count = min(len(logs), 1.0 + length / (2.0 * _BEAM * float(np.median(middles))))
+    found = float(np.median(logs))
+    scatter = MAD_TO_SIGMA * float(np.median(np.abs(np.array(logs) - found))) / np.sqrt(count)
+    sigma = np.linalg.norm([np.median(sigmas), np.median(reliefs), scatter])
+    return float(np.exp(found)), float(sigma)
+
+
+_AXES = ("mount_forward_deg", "mount_right_deg", "mount_down_deg")
+_ARMS = ("lever_forward_m", "lever_right_m", "lever_down_m")
+_UNKNOWN_RAD, _UNKNOWN_LEVER_M = 1.0, 1.0
+"""Sigmas of a mount of which nothing is known, about a first value, and of its lever arm."""
+_MIN_PICTURES = 3
+_MOUNT_STEPS = 8
+_SETTLED_DEG = 1e-4
+_TRIMS, _TRIMMED = 5, 3.0
+
+Navigate = Callable[[Mapping[str, RigidTransform] | None, Installation], PlacementFit | None]
+"""The fit of a model with such mounts of its cameras, known to these sigmas."""
+
+
+def fit_with_mount(
+    records: Sequence[ImageRecord],
+    model_from_cam: Sequence[RigidTransform],
+    cam_from_rig: Mapping[str, RigidTransform],
+    navigate: Navigate,
+    usual: Installation,
+) -> PlacementFit | None:
+    """Place a model on a rig whose mount is unknown, and find the mount where attitudes show it.
+
+    Args:
+        records: registered pictures.
+        model_from_cam: pose of each picture's camera in the model, in metres but for the scale.
+        cam_from_rig: of the cameras.
+        navigate: the fit.
+        usual: sigmas of the clock and, where larger than a metre, of the lever arm.
+
+    Returns:
+        The fit, with the mount where there are attitudes; None where positions do not place the
+        model. Of all fits on the way only this one's notes and warnings are reported.
+    """
+    fit, messages = _collected(navigate, None, usual)
+    first = None if fit is None else _first_mount(records, model_from_cam, cam_from_rig, fit)
+    if first is not None:
+        known = replace(usual, mount_rad=_UNKNOWN_RAD, lever_m=max(usual.lever_m, _UNKNOWN_LEVER_M))
+        mount = RigidTransform.from_rotation(first)
+        for _ in range(_MOUNT_STEPS):
+            mounts = {name: mount * pose.inv() for name, pose in cam_from_rig.items()}
+            found, said = _collected(navigate, mounts, known)
+            if found is None:
+                break
+            turn_deg, turn_sigma_deg = np.array([found.nuisances[name] for name in _AXES]).T
+            arm_m, arm_sigma_m = np.array([found.nuisances[name] for name in _ARMS]).T
+            mount = RigidTransform.from_components(
+                mount.translation - arm_m,
+                Rotation.from_rotvec(-turn_deg, degrees=True) * mount.rotation,
+            )
+            corrected = FoundMount(
+                body_from_rig=mount, turn_sigma_deg=turn_sigma_deg, lever_sigma_m=arm_sigma_m
+            )
+            fit, messages = replace(found, mount=corrected), said
+            if np.abs(turn_deg).max() < _SETTLED_DEG:
+                break
+    for kind, text in messages:
+        (warn if kind == "warning" else note)(text)
+    return fit
+
+
+def _first_mount(
+    records: Sequence[ImageRecord],
+    model_from_cam: Sequence[RigidTransform],
+    cam_from_rig: Mapping[str, RigidTransform],
+    fit: PlacementFit,
+) -> Rotation | None:
+    """Rotation from rig to body by attitudes at a place; None where there are too few."""
+    turns = [
+        rotation_from_attitude(*np.deg2rad([r.roll_deg, r.pitch_deg, r.heading_deg])).inv()
+        * fit.ned_from_model.rotation
+        * pose.rotation
+        * cam_from_rig[r.camera].rotation
+        for r, pose in zip(records, model_from_cam, strict=True)
+        if r.has_attitude
+    ]
+    return _trimmed_mean(Rotation.concatenate(turns)) if len(turns) >= _MIN_PICTURES else None
+
+
+def _collected(
+    navigate: Navigate, mounts: Mapping[str, RigidTransform] | None, installed: Installation
+) -> tuple[PlacementFit | None, list[tuple[Level, str]]]:
+    """A fit, and its notes and warnings, which are not reported yet."""
+    messages: list[tuple[Level, str]] = []
+    with collected_by(lambda *message: messages.append(message)):
+        return navigate(mounts, installed), messages
+
+
+def _trimmed_mean(turns: Rotation) -> Rotation:
+    """The mean of most of the rotations (N,)."""
+    kept = turns
+    for _ in range(_TRIMS):
+        mean = kept.mean()
+        off = (mean.inv() * turns).magnitude()
+        kept = turns[np.flatnonzero(off <= _TRIMMED * np.median(off) + 1e-12)]
+    return kept.mean()
+
 
 RIG_SCALE_SIGMA = 1e-3
 """Relative, of a scale that a rig gives, where control may correct it: what calibrated rigs reach

@@ -1,22 +1,34 @@
-"""The placing of a model in the world, apart from its mapping.
+"""The placing of a model in the world, apart from its mapping: the stage `sparse/`.
 
 `mapping/` holds the model in its own gauge, the long work; `sparse/` holds it in world coordinates,
 so that a new scale or georeference does not repeat the mapping.
+
+Groups of stations that no point links are put where navigation has them. Pictures do not show where
+such groups are relative to each other. Each is placed by its own navigation first, which brings it
+near enough for the adjustment's linear motions of groups (see
+`reconstruct.adjustment.soft_modes.SoftModes`); the model's place then finds these motions, with
+navigation's errors correlated between groups as along the track.
+
+Pictures that are not in the model are listed with their reasons and with the place that navigation
+gives them. Navigation errs slowly: its residuals at the model just before and just after such a
+picture correct it. How well that predicts is measured on pictures in the model, across such gaps.
 """
 
 import math
 import shutil
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pycolmap
+from scipy.spatial.transform import RigidTransform
 
+from alice_survey.core.artefacts import read_csv, write_csv
 from alice_survey.core.config import ReconstructConfig
-from alice_survey.core.errors import warn
+from alice_survey.core.errors import WorkspaceError, collected_by, warn
 from alice_survey.core.executor import Executor
-from alice_survey.core.frames import Array
+from alice_survey.core.frames import Array, Datum, rotation_from_attitude
 from alice_survey.core.manifest import ImageRecord
 from alice_survey.core.records import (
     AcceptanceRecord,
@@ -33,15 +45,25 @@ from alice_survey.core.records import (
 from camera_calib.freedom import knowing_water
 from camera_calib.rig import Rig, mounted, write_rig
 from reconstruct.adjustment.adjusted import adjust_survey
+from reconstruct.adjustment.normal_equations import POSE
 from reconstruct.adjustment.pixel_parts import Workers
+from reconstruct.adjustment.soft_modes import SoftModes
 from reconstruct.adjustment.uncertainty import Uncertainty, write_uncertainty
+from reconstruct.mapping.arrays import cross_matrices, frames_of, model_groups
 from reconstruct.mapping.mapper import Mapped, model_baseline
-from reconstruct.mapping.run import read_inputs
-from reconstruct.mapping.unregistered import UNREGISTERED
+from reconstruct.mapping.run import UNREGISTERED, read_inputs
+from reconstruct.pictures.files import named
 from reconstruct.placing.acceptance import Acceptance, Doming, judge_model
+from reconstruct.placing.alignment import level
 from reconstruct.placing.control import warn_of_contradictions
-from reconstruct.placing.groups import join_groups, joints_of
-from reconstruct.placing.navigation_equations import PLACE, Installation
+from reconstruct.placing.fit import PlacementFit, fit_navigation
+from reconstruct.placing.navigation import (
+    PLACE,
+    SCALE,
+    USUAL_INSTALLATION,
+    Installation,
+    body_from_pinhole,
+)
 from reconstruct.placing.place import Placed, Placing, find_place
 from reconstruct.placing.track import (
     TrackRow,
@@ -53,9 +75,281 @@ from reconstruct.placing.track import (
     write_track_geojson,
     write_track_tum,
 )
-from reconstruct.placing.unregistered import navigation_places, read_reasons, write_unregistered
 from reconstruct.views.model import read_warps, write_frame
-from reconstruct.views.model_files import as_transform, read_reconstruction
+from reconstruct.views.model_files import as_transform, read_reconstruction, rigid3d
+
+_FEWEST = 4
+"""Pictures in the model from which navigation's error is known."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NavigationPlaces:
+    """Where navigation puts cameras; arrays of N pictures."""
+
+    images: tuple[str, ...]
+    ned: Array
+    """(N, 3)."""
+    sigma: Array
+    """(N, 2) horizontal, each of north and east, and of depth."""
+    corrected: bool
+    """Whether by what the model finds navigation off before and after."""
+
+
+def read_reasons(mapping: Path) -> dict[str, str]:
+    """Why pictures are not in the model, by name, as the mapping wrote it; empty if all are."""
+    path = mapping / UNREGISTERED
+    if not path.exists():
+        return {}
+    rows = read_csv(path, ("image", "reason"), exact=True, fault=WorkspaceError)[1]
+    return {row["image"]: row["reason"] for _, row in rows}
+
+
+def navigation_places(
+    lost: Sequence[ImageRecord],
+    known: Mapping[str, ImageRecord],
+    rows: Sequence[TrackRow],
+    rig: Rig | None,
+    datum: Datum,
+) -> NavigationPlaces:
+    """Place pictures by navigation, corrected by its misses at pictures in the model.
+
+    Args:
+        lost: pictures that are not in the model, those with a position count.
+        known: all pictures by name.
+        rows: the track.
+        rig: with its mount, or None.
+        datum: of the model's frame.
+    """
+    lost = [record for record in lost if record.has_position]
+    places = np.array([_place(record, rig, datum) for record in lost]).reshape(-1, 3)
+    sigma = np.array([[r.sigma_horizontal_m, r.sigma_depth_m] for r in lost]).reshape(-1, 2)
+    names = tuple(record.image for record in lost)
+    based = [row for row in rows if known[row.image].has_position]
+    corrected = len(based) >= _FEWEST and bool(lost)
+    if corrected:
+        timed = bool(np.isfinite([one.time_s for one in lost]).all())
+        timed &= bool(np.isfinite([row.time_s for row in based]).all())
+        based = sorted(based, key=lambda row: row.time_s if timed else row.station)
+        times = np.array([row.time_s if timed else float(row.station) for row in based])
+        spacing = float(np.median(np.diff(np.unique(times)))) if np.ptp(times) else 0.0
+        misses = np.array([
+            row.world_from_cam.translation - _place(known[row.image], rig, datum) for row in based
+        ])  # fmt: skip
+        when = np.array([one.time_s if timed else float(one.station) for one in lost])
+        for n, at in enumerate(when):
+            places[n] += _between(times, misses, at, 0.0)
+            apart = max(float(np.abs(times - at).min()), spacing)
+            left = misses - np.array([_between(times, misses, t, apart) for t in times])
+            rms = np.sqrt(np.nanmean(np.square(left), axis=0))
+            sigma[n] = np.sqrt(np.mean(np.square(rms[:2]))), rms[2]
+    return NavigationPlaces(images=names, ned=places, sigma=sigma, corrected=corrected)
+
+
+def _place(record: ImageRecord, rig: Rig | None, datum: Datum) -> Array:
+    """(3,) where navigation puts a camera, NED."""
+    reading = np.array([[record.latitude_deg, record.longitude_deg, record.depth_m]])
+    place: Array = datum.ned_from_geodetic(reading)[0]
+    if rig is not None and record.has_attitude:
+        angles = np.deg2rad([record.roll_deg, record.pitch_deg, record.heading_deg])
+        place = place + rotation_from_attitude(*angles).apply(
+            rig.body_from_cam(record.camera).translation
+        )
+    return place
+
+
+def _between(times: Array, values: Array, at: float, apart: float) -> Array:
+    """(3,) values at a time from those just before and after it, at least so far apart from it.
+
+    At the ends, where there is one side alone, that counts.
+    """
+    before, after = np.flatnonzero(times <= at - apart), np.flatnonzero(times >= at + apart)
+    if not len(before) and not len(after):
+        return np.full(values.shape[1], np.nan)
+    first = before[-1] if len(before) else after[0]
+    last = after[0] if len(after) else before[-1]
+    span = times[last] - times[first]
+    share = (at - times[first]) / span if span > 0 else 0.0
+    return np.asarray(values[first] + share * (values[last] - values[first]))
+
+
+def write_unregistered(
+    path: Path,
+    lost: Sequence[ImageRecord],
+    words: Mapping[str, str],
+    places: NavigationPlaces | None,
+    datum: Datum | None,
+) -> None:
+    """Write pictures that are not in the model, why, and where navigation puts them."""
+    at = {} if places is None else {name: n for n, name in enumerate(places.images)}
+    lines = []
+    for record in lost:
+        cells = ["", *[""] * 7]
+        if places is not None and datum is not None and record.image in at:
+            n = at[record.image]
+            lat, lon, _ = datum.geodetic_from_ned(places.ned[n : n + 1])[0]
+            cells = [
+                "navigation, corrected" if places.corrected else "navigation",
+                *(f"{v:.4f}" for v in places.ned[n]),
+                f"{lat:.10f}", f"{lon:.10f}",
+                *("" if np.isnan(s) else f"{s:.4g}" for s in places.sigma[n]),
+            ]  # fmt: skip
+        lines.append([record.image, record.camera, record.station, words[record.image], *cells])
+    header = (
+        "image", "camera", "station", "reason", "placed_by", "north_m", "east_m", "depth_m",
+        "latitude_deg", "longitude_deg", "sigma_horizontal_m", "sigma_depth_m",
+    )  # fmt: skip
+    write_csv(path, header, lines)
+
+
+_MAX_TURN_RAD = 0.1
+"""Sigma of a group's turn about any axis up to which turns are linear."""
+
+
+def join_groups(
+    mapped: Mapped,
+    records: Sequence[ImageRecord],
+    rig: Rig | None,
+    datum: Datum | None,
+    installed: Installation = USUAL_INSTALLATION,
+) -> Mapped:
+    """Move groups of linked stations to where navigation has them, seen from the largest.
+
+    Args:
+        mapped: its groups may be anywhere.
+        records: pictures.
+        rig: as calibrated; None where it is unknown.
+        datum: origin of the local frame; None where no latitude and longitude are known.
+        installed: how well it is known where the cameras are on the vehicle, and their clock.
+
+    Returns:
+        The model without those groups that navigation does not place or whose scale nothing gives,
+        which are reported.
+    """
+    frames, groups = frames_of(mapped.model), model_groups(mapped.model)
+    if not groups.any():
+        return mapped
+    model, notes = pycolmap.Reconstruction(mapped.model), []
+    of_name = {record.image: record for record in records}
+    members = [frames[groups == group].tolist() for group in range(int(groups.max()) + 1)]
+    rig = mounted(rig)
+    mounts = None if rig is None else body_from_pinhole(rig, mapped.warps)
+    fits = [
+        _placed(model, of_frames, of_name, mounts, datum if mapped.scaled else None, installed)
+        for of_frames in members
+    ]
+    for of_frames, fit in list(zip(members, fits, strict=True))[1:]:
+        if fit is None or fits[0] is None:
+            notes.append(_leave_out(model, of_frames))
+        else:
+            _move(model, of_frames, _rigid(fits[0]).inv() * _rigid(fit))
+            notes.append(f"{len(of_frames)} stations joined to the others by navigation alone")
+    model.tear_down()  # what is left out is no longer in it at all
+    model.update_point_3d_errors()
+    return replace(mapped, model=model, notes=(*mapped.notes, *notes))
+
+
+def joints_of(fit: PlacementFit, modes: SoftModes) -> tuple[JointRecord, ...]:
+    """How well the place of each group after the first is known relative to the first.
+
+    Args:
+        fit: of the place and the modes.
+        modes: of the model before they were found.
+    """
+    if modes.groups is None:
+        return ()
+    place, found = fit.ned_from_model, []
+    turn, middles = place.rotation.as_matrix(), place.apply(modes.groups.middles)
+    each = modes.joints // (len(middles) - 1)
+    for group in range(1, len(middles)):
+        away = middles[group] - middles[0]
+        first = len(fit.joint) - each * (len(middles) - group)
+        slopes = np.zeros((POSE, len(fit.joint)))
+        slopes[:3, :3], slopes[:3, SCALE] = -cross_matrices(away[None])[0], away
+        slopes[:3, first + 3 : first + 6] = place.scale * turn
+        slopes[3:, first : first + 3] = turn
+        sigmas = np.sqrt(np.einsum("ij,jk,ik->i", slopes, fit.joint, slopes))
+        north, east, down = sigmas[:3].tolist()
+        found.append(
+            JointRecord(
+                stations=int((modes.groups.station == group).sum()),
+                sigma_north_m=north,
+                sigma_east_m=east,
+                sigma_depth_m=down,
+                sigma_tilt_deg=float(np.rad2deg(np.sqrt((sigmas[3:5] ** 2).mean()))),
+                sigma_heading_deg=float(np.rad2deg(sigmas[5])),
+            )
+        )
+    return tuple(found)
+
+
+def _placed(
+    model: pycolmap.Reconstruction,
+    frames: Sequence[int],
+    records: Mapping[str, ImageRecord],
+    mounts: Mapping[str, RigidTransform] | None,
+    datum: Datum | None,
+    installed: Installation,
+) -> PlacementFit | None:
+    """The place of a group by its own navigation; None where that leaves it loose."""
+    numbers = _pictures(model, frames)
+    poses = [as_transform(model.images[n].cam_from_world()).inv() for n in numbers]
+    points = np.array([model.points3D[p].xyz for p in _points(model, numbers)]).reshape(-1, 3)
+    if datum is None or len(points) < 3:
+        return None
+    centres = np.stack([pose.translation for pose in poses])
+    with collected_by(lambda *_: None):  # of the whole model it is reported later
+        fit = fit_navigation(
+            [records[model.images[n].name] for n in numbers], poses, mounts, datum,
+            level(points, centres), known_scale=1.0, installed=installed,
+        )  # fmt: skip
+    if fit is None:
+        return None
+    sigmas = np.sqrt(np.diag(fit.covariance)[:6])
+    return fit if np.all(sigmas > 0) and sigmas[:3].max() <= _MAX_TURN_RAD else None
+
+
+def _pictures(model: pycolmap.Reconstruction, frames: Sequence[int]) -> list[int]:
+    inside = set(frames)
+    posed = [n for n, image in model.images.items() if image.has_pose]
+    return sorted(n for n in posed if model.images[n].frame_id in inside)
+
+
+def _points(model: pycolmap.Reconstruction, pictures: Sequence[int]) -> list[int]:
+    inside = set(pictures)
+    return [
+        number
+        for number, point in sorted(model.points3D.items())
+        if point.track.elements[0].image_id in inside
+    ]
+
+
+def _leave_out(model: pycolmap.Reconstruction, frames: Sequence[int]) -> str:
+    """Take a group out of a model, in place; a line that says so."""
+    names = sorted(model.images[n].name for n in _pictures(model, frames))
+    for frame in frames:
+        model.deregister_frame(frame)
+    text = (
+        f"{len(names)} pictures make a separate model that neither points nor navigation join to "
+        f"the largest: {named(names)}"
+    )
+    warn(text)
+    return text
+
+
+def _move(model: pycolmap.Reconstruction, frames: Sequence[int], motion: RigidTransform) -> None:
+    """Move a group, in place."""
+    points = _points(model, _pictures(model, frames))
+    for frame in frames:
+        pose = as_transform(model.frames[frame].rig_from_world)
+        model.frames[frame].rig_from_world = rigid3d(pose * motion.inv())
+    for number in points:
+        model.points3D[number].xyz = motion.apply(model.points3D[number].xyz)
+
+
+def _rigid(fit: PlacementFit) -> RigidTransform:
+    place = fit.ned_from_model
+    return RigidTransform.from_components(place.translation, place.rotation)
+
 
 _LEFT_OUT = "in a part of the model that neither pictures nor navigation tie to the rest"
 _UNKNOWN = "not known: the mapping was made by an earlier version"

@@ -23,8 +23,8 @@ from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.adjustment.uncertainty import Uncertainty
 from reconstruct.mapping.arrays import cross_matrices, observed
 from reconstruct.placing.alignment import Similarity
-from reconstruct.placing.navigation_equations import PLACE, SCALE, attitude_axes
-from reconstruct.placing.placement_fit import PlacementFit
+from reconstruct.placing.fit import PlacementFit
+from reconstruct.placing.navigation import PLACE, SCALE, attitude_axes
 from reconstruct.views.model import WorldFrame
 from reconstruct.views.model_files import as_transform
 

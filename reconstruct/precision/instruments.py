@@ -26,9 +26,8 @@ from camera_calib.rig import Covariance, Rig, design_rig
 from missions.fly.check import rig_of
 from reconstruct.adjustment.exact_observations import Pixels, RigState, exact_observations
 from reconstruct.mapping.arrays import cross_matrices
-from reconstruct.placing.correlated_errors import MIN_WHITE
-from reconstruct.placing.navigation_equations import USUAL_INSTALLATION, Installation
-from reconstruct.placing.placement_problem import Correlation
+from reconstruct.placing.correlated_fit import MIN_WHITE, Correlation
+from reconstruct.placing.navigation import USUAL_INSTALLATION, Installation
 
 CORNER_PX = 0.01
 """Sigma of a corner's coordinate in a calibration that is yet to be made; rendered pools of the

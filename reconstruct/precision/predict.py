@@ -23,10 +23,9 @@ from reconstruct.adjustment.soft_modes import Motions
 from reconstruct.adjustment.survey_fit import calibrated_covariance, motions_of
 from reconstruct.adjustment.uncertainty import BlockShape, shape_of_block
 from reconstruct.mapping.arrays import cross_matrices, first_of, linked_groups
-from reconstruct.placing.alignment import Similarity
-from reconstruct.placing.bend import sag_weights
-from reconstruct.placing.generalised_fit import estimate
-from reconstruct.placing.navigation_equations import (
+from reconstruct.placing.alignment import Similarity, sag_weights
+from reconstruct.placing.correlated_fit import Extra, estimate
+from reconstruct.placing.navigation import (
     GROUP_OF,
     PARAMETERS,
     PLACE,
@@ -36,7 +35,6 @@ from reconstruct.placing.navigation_equations import (
     Epochs,
     equations,
 )
-from reconstruct.placing.placement_problem import Extra
 from reconstruct.precision.instruments import NavigationErrors
 from reconstruct.precision.tracks import ExpectedBlock
 

@@ -27,8 +27,7 @@ from reconstruct.measure.errors import SharedErrors, shared_errors
 from reconstruct.measure.figures import polygon_area, polyline, slopes_of
 from reconstruct.picking.registered import RegisteredPictures
 from reconstruct.picking.surface import ShownPlaces, shown_places
-from reconstruct.placing.control_file import Pick
-from reconstruct.placing.picked_points import RegisteredPicture, find_spots
+from reconstruct.placing.control_points import Pick, RegisteredPicture, find_spots
 from reconstruct.planes import LEVEL_PLANE
 from reconstruct.station.pair import pair_samplers, read_depth, to_axes
 from reconstruct.station.precise import precise_depth

@@ -21,8 +21,7 @@ def _film(folder: Path, payload: bytes) -> None:
 
 def read_video(path: Path) -> object:
     """As `import-images` does next to the decoder of its frames."""
-    from reconstruct.pictures.gpmf import read_fixes
-    from reconstruct.pictures.mp4 import read_mp4
+    from reconstruct.pictures.telemetry import read_fixes, read_mp4
 
     facts = read_mp4(path)
     fixes = None if facts.telemetry is None else read_fixes(path, facts.telemetry)

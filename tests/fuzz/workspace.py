@@ -65,7 +65,7 @@ def _control(folder: Path) -> None:
 
 
 def read_control(path: Path) -> object:
-    from reconstruct.placing.control_file import read_control
+    from reconstruct.placing.control_points import read_control
 
     control = read_control(path)
     datum = control.datum() or _DATUM
@@ -96,13 +96,13 @@ def _markers(folder: Path) -> None:
 
 
 def read_foreign_control(path: Path) -> object:
-    from reconstruct.placing.control_import import read_foreign
+    from reconstruct.placing.foreign_control import read_foreign
 
     return read_foreign(path)
 
 
 def read_picks(path: Path) -> object:
-    from reconstruct.placing.control_file import read_picks
+    from reconstruct.placing.control_points import read_picks
 
     return read_picks(path)
 

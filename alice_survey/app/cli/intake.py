@@ -140,7 +140,7 @@ def import_control(
     Writes control.csv and picks.csv of the workspace, by which the next 'reconstruct' places the
     model.
     """
-    from reconstruct.placing.control_import import import_control as work
+    from reconstruct.placing.foreign_control import import_control as work
 
     found = work(
         workspace, file, sigma_m=sigma, sigma_vertical_m=sigma_vertical, heights=heights,

@@ -206,7 +206,7 @@ def control(
     Known points, bars and markers stand in WORKSPACE/control.csv; the next 'reconstruct' places
     and scales the model by those for control, and scores those for check.
     """
-    from reconstruct.placing.markers import survey_control
+    from reconstruct.placing.control_command import survey_control
 
     result = survey_control(workspace, dictionary=dictionary, executor=executor_of(threads))
     print_result(*result, as_json)
@@ -218,7 +218,7 @@ def quality(workspace: Workspace = WORK, threads: Threads = None, as_json: AsJso
 
     Sharpness, exposure, turbidity and overlap of each; the bad ones by name, with the reason.
     """
-    from reconstruct.pictures.quality_sheet import quality_report
+    from reconstruct.pictures.quality import quality_report
 
     print_result(*quality_report(workspace, executor_of(threads)), as_json)
 
@@ -240,7 +240,7 @@ def scale(
     workspace: Workspace = WORK,
 ) -> None:
     """Scale a model by a known length."""
-    from reconstruct.placing.scale import scale_model
+    from reconstruct.placing.control_command import scale_model
 
     typer.echo(scale_model(workspace, points, length))
 

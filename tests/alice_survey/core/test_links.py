@@ -10,7 +10,7 @@ from alice_survey.core.artefacts import Stage, refuse_links, run_stage
 from alice_survey.core.cluster.engine import STORE, _store
 from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.executor import Executor
-from reconstruct.pictures.quality_sheet import quality_report
+from reconstruct.pictures.quality import quality_report
 
 STAGE = Stage(name="dense", version=1, settings={}, resumes=True)
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from reconstruct.adjustment.keypoint_bias import BIAS_PX, bias_covariance
+from reconstruct.adjustment.survey_fit import BIAS_PX, bias_covariance
 from tests.reconstruct.rig_survey import four_cameras
 
 

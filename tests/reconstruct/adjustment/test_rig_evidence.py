@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from camera_calib.rig import Covariance, Rig
-from reconstruct.adjustment.rig_evidence import contradiction
-from reconstruct.adjustment.survey_fit import fit_survey
+from reconstruct.adjustment.survey_fit import contradiction, fit_survey
 from tests.reconstruct.adjustment.test_survey_fit import modelled, noisy
 
 NAMES = tuple(f"left.p{n}" for n in range(6))

@@ -19,12 +19,12 @@ from reconstruct.adjustment.adjusted import AdjustedSurvey, adjust_survey
 from reconstruct.adjustment.exact_observations import choose_pixels, exact_observations
 from reconstruct.adjustment.normal_equations import Gauge
 from reconstruct.mapping.arrays import cross_matrices, frames_of
+from reconstruct.mapping.bundle import cauchy_weights
 from reconstruct.mapping.refraction import adjust_freely, refract
-from reconstruct.mapping.robust import cauchy_weights
 from reconstruct.mapping.working_range import WorkingDistances
-from reconstruct.placing.alignment import align_rigid, align_similarity
-from reconstruct.placing.georeference import fit_navigation, level
-from reconstruct.placing.navigation_equations import PLACE, body_from_pinhole
+from reconstruct.placing.alignment import align_rigid, align_similarity, level
+from reconstruct.placing.fit import fit_navigation
+from reconstruct.placing.navigation import PLACE, body_from_pinhole
 from reconstruct.placing.track import picture_modes
 from reconstruct.views.model_files import as_transform
 from tests.oracles_refraction import dense_normal_equations

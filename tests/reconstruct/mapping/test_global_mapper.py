@@ -11,9 +11,14 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.core.executor import SERIAL, local_executor
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.mapping.arrays import model_groups
-from reconstruct.mapping.global_mapper import average_poses, station_groups
+from reconstruct.mapping.global_mapper import (
+    StationLink,
+    average_poses,
+    link_stations,
+    station_groups,
+    stereo_points,
+)
 from reconstruct.mapping.mapper import Mapped, faults_of, map_calibrated
-from reconstruct.mapping.stations import StationLink, link_stations, stereo_points
 from reconstruct.placing.alignment import align_rigid
 from tests.reconstruct.mapping.test_mapper import camera_rms, pupils, seen_by_pinholes
 from tests.reconstruct.scenes import Scene, make_scene

@@ -3,7 +3,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from reconstruct.mapping.stations import RigPinholes, refine_link
+from reconstruct.mapping.global_mapper import RigPinholes, refine_link
 
 FOCAL = 1130.0
 PINHOLES = RigPinholes(

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import integrate
 
+from reconstruct.mapping.bundle import cauchy_weights, pixel_sigma, sigma_of, variance_of
 from reconstruct.mapping.refraction import adjust_freely
-from reconstruct.mapping.robust import cauchy_weights, pixel_sigma, sigma_of, variance_of
 from tests.reconstruct.mapping.test_mapper import camera_rms, mapped_scene
 from tests.reconstruct.scenes import Scene, make_scene
 

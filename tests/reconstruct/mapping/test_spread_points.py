@@ -6,9 +6,9 @@ import pytest
 from scipy.optimize import minimize
 
 from reconstruct.mapping.arrays import observed
+from reconstruct.mapping.bundle import move_points, spread_part
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.refraction import adjust_freely, adjust_roughly
-from reconstruct.mapping.spread_points import move_points, spread_part
 from reconstruct.placing.alignment import align_rigid
 from tests.reconstruct.scenes import Scene, make_scene
 from tests.reconstruct.true_models import near_truth, pupils_and_points, warped_scene

@@ -11,8 +11,14 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.core.frames import Array
 from alice_survey.core.manifest import ImageRecord
 from camera_calib.rig import Rig
-from reconstruct.matching.frusta import frusta_of, near_pairs, shared
-from reconstruct.matching.pairs import choose_pairs, neighbours, placed_pictures
+from reconstruct.matching.pairs import (
+    choose_pairs,
+    frusta_of,
+    near_pairs,
+    neighbours,
+    placed_pictures,
+    shared,
+)
 from tests.reconstruct.scenes import DATUM, make_scene
 
 DISTANCE_M = 2.0

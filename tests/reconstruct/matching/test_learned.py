@@ -14,15 +14,18 @@ import pytest
 
 from alice_survey.core.executor import SERIAL
 from alice_survey.core.manifest import ImageRecord
-from reconstruct.mapping.learned_ties import Taken, all_pixels, quarter_turns, with_learned
 from reconstruct.matching.features import find_features, load_features, save_features
 from reconstruct.matching.learned import (
     RATIO,
+    Taken,
+    all_pixels,
     dense_features,
     false_alarms,
     find_learned,
     match_learned,
+    quarter_turns,
     sampled,
+    with_learned,
 )
 from reconstruct.matching.matches import PairTask, apply_homography, match_pair
 from reconstruct.pictures.normalise import normalise

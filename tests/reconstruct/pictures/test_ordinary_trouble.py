@@ -16,8 +16,7 @@ from alice_survey.core.artefacts import read_json
 from alice_survey.core.errors import ImageError, heard
 from alice_survey.core.manifest import read_manifest
 from camera_calib.picture_files import without_orientation
-from reconstruct.pictures.files import decode, exif_focal_px, inspect
-from reconstruct.pictures.heic import can_read_heic
+from reconstruct.pictures.files import can_read_heic, decode, exif_focal_px, inspect
 from reconstruct.pictures.importing import import_images
 from reconstruct.pictures.undistorted import read_colour
 

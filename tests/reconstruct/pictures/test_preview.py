@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from alice_survey.core.errors import ImageError, NavigationError
-from reconstruct.pictures.importing import import_images
-from reconstruct.pictures.preview import cameras_in, preview_import
+from reconstruct.pictures.importing import cameras_in, import_images, preview_import
 from tests.reconstruct.pictures.dated import BEGAN, navigation, take
 
 
@@ -58,7 +57,7 @@ def test_time_zone_and_offset_tie_a_log_as_the_import_does(tmp_path: Path) -> No
 def test_many_pictures_are_sampled_with_first_and_last(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("reconstruct.pictures.preview._MAX_HEADERS", 5)
+    monkeypatch.setattr("reconstruct.pictures.importing._MAX_HEADERS", 5)
     for n in range(23):
         take(tmp_path / f"{n}.jpg", n, model="GoPro" if n < 12 else "Sony")
     found = preview_import([tmp_path])

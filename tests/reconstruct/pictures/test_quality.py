@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from alice_survey.core.errors import ImageError
 from alice_survey.core.executor import SERIAL
 from alice_survey.core.manifest import ImageRecord, write_manifest
-from reconstruct.pictures.quality import PictureQuality, judge, measure
-from reconstruct.pictures.quality_sheet import quality_report, worst_first
+from reconstruct.pictures.quality import PictureQuality, judge, measure, quality_report, worst_first
 
 Picture = NDArray[np.uint8]
 

@@ -11,10 +11,9 @@ import pytest
 from alice_survey.core.artefacts import read_json
 from alice_survey.core.errors import ImageError, heard
 from alice_survey.core.manifest import read_manifest
-from reconstruct.pictures.gpmf import read_fixes
 from reconstruct.pictures.importing import import_images
-from reconstruct.pictures.mp4 import payloads, read_mp4
-from reconstruct.pictures.recordings import find_videos, read_recordings
+from reconstruct.pictures.telemetry import payloads, read_fixes, read_mp4
+from reconstruct.pictures.videos import find_videos, read_recordings
 from tests.reconstruct.pictures import gopro
 
 NOON = datetime(2024, 7, 1, 12, tzinfo=UTC)

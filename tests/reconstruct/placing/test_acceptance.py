@@ -18,7 +18,7 @@ from reconstruct.placing.acceptance import (
     pinhole_positions,
     scale_trend,
 )
-from reconstruct.placing.bend import Bend
+from reconstruct.placing.alignment import Bend
 from tests.reconstruct.mapping.test_mapper import block, block_mapped
 from tests.reconstruct.scenes import ALTITUDE_M, DATUM
 

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from reconstruct.placing.altitude_scale import scale_by_altitudes
+from reconstruct.placing.place import scale_by_altitudes
 from tests.reconstruct.scenes import make_scene
 
 

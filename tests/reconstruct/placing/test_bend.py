@@ -8,8 +8,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.frames import Array
 from alice_survey.core.manifest import ImageRecord
-from reconstruct.placing.bend import Bend
-from reconstruct.placing.georeference import fit_navigation, level
+from reconstruct.placing.alignment import Bend, level
+from reconstruct.placing.fit import fit_navigation
 from tests.reconstruct.placing.test_sigmas import (
     BODY_FROM_CAM,
     DATUM,

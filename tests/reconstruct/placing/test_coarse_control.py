@@ -7,12 +7,16 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.errors import heard
-from reconstruct.placing.coarse_control import real_sigma_factor, widened, without_wrong_points
-from reconstruct.placing.control import ControlFit, describe, tie_control
-from reconstruct.placing.control_file import Control, KnownPoint
-from reconstruct.placing.georeference import fit_control
-from reconstruct.placing.picked_points import find_spots
-from reconstruct.placing.placement_fit import PlacementFit
+from reconstruct.placing.control import (
+    ControlFit,
+    describe,
+    real_sigma_factor,
+    tie_control,
+    widened,
+    without_wrong_points,
+)
+from reconstruct.placing.control_points import Control, KnownPoint, find_spots
+from reconstruct.placing.fit import PlacementFit, fit_control
 from tests.reconstruct.placing.test_control import KNOWN, Gauge, in_gauge, picks_of, site
 from tests.reconstruct.scenes import DATUM
 

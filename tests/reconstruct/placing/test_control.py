@@ -12,12 +12,17 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.errors import WorkspaceError, collected_by
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
-from reconstruct.placing.alignment import Similarity
+from reconstruct.placing.alignment import Similarity, level
 from reconstruct.placing.control import ControlFit, tie_control
-from reconstruct.placing.control_file import Pick, read_control, read_picks
-from reconstruct.placing.georeference import fit_control, fit_navigation, level
-from reconstruct.placing.navigation_equations import body_from_pinhole
-from reconstruct.placing.picked_points import RegisteredPicture, find_spots
+from reconstruct.placing.control_points import (
+    Pick,
+    RegisteredPicture,
+    find_spots,
+    read_control,
+    read_picks,
+)
+from reconstruct.placing.fit import fit_control, fit_navigation
+from reconstruct.placing.navigation import body_from_pinhole
 from reconstruct.placing.place import picks_of_model
 from tests.reconstruct.scenes import ALTITUDE_M, DATUM, Scene, make_scene
 

@@ -12,8 +12,8 @@ from alice_survey.core.artefacts import write_json
 from alice_survey.core.errors import WorkspaceError, collected_by, heard
 from alice_survey.core.frames import Array
 from alice_survey.core.manifest import ImageRecord, write_manifest
-from reconstruct.placing.control_file import read_control, read_picks
-from reconstruct.placing.control_import import import_control
+from reconstruct.placing.control_points import read_control, read_picks
+from reconstruct.placing.foreign_control import import_control
 
 PLACES = {
     "A": (46.8426, -91.9946, -12.5),

@@ -8,8 +8,10 @@ from hypothesis import strategies as st
 
 from alice_survey.core.edited_files import StaleError
 from alice_survey.core.errors import WorkspaceError
-from reconstruct.placing.control_file import Pick, read_control, read_picks
-from reconstruct.placing.control_tables import (
+from reconstruct.placing.control_points import (
+    Pick,
+    read_control,
+    read_picks,
     save_control,
     save_picks,
     table_token,

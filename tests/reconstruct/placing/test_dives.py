@@ -7,7 +7,7 @@ import pytest
 
 from alice_survey.core.frames import Array
 from alice_survey.core.manifest import ImageRecord
-from reconstruct.placing.generalised_fit import dives_of
+from reconstruct.placing.correlated_fit import dives_of
 from tests.reconstruct.placing.test_sigmas import SIGMA, flight, place, records_of
 
 BODY = flight(8, 15)

@@ -8,9 +8,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.manifest import ImageRecord
-from reconstruct.placing.alignment import Similarity
-from reconstruct.placing.georeference import fit_navigation, level
-from reconstruct.placing.placement_fit import PlacementFit
+from reconstruct.placing.alignment import Similarity, level
+from reconstruct.placing.fit import PlacementFit, fit_navigation
 from tests.reconstruct.scenes import DATUM, Scene, make_scene
 
 

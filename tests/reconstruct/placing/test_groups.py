@@ -20,11 +20,10 @@ from reconstruct.adjustment.uncertainty import Uncertainty
 from reconstruct.mapping.arrays import Indices, frames_of, model_groups
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.refraction import refract
-from reconstruct.placing.alignment import align_rigid
-from reconstruct.placing.georeference import fit_navigation, level
-from reconstruct.placing.groups import _move, join_groups
-from reconstruct.placing.navigation_equations import PLACE, body_from_pinhole
-from reconstruct.placing.placement_fit import PlacementFit
+from reconstruct.placing.alignment import align_rigid, level
+from reconstruct.placing.fit import PlacementFit, fit_navigation
+from reconstruct.placing.navigation import PLACE, body_from_pinhole
+from reconstruct.placing.run import _move, join_groups
 from reconstruct.placing.track import picture_modes, pose_covariances, read_track_poses, track_rows
 from reconstruct.views.model import WorldFrame
 from reconstruct.views.model_files import as_transform

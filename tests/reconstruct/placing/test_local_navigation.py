@@ -14,10 +14,9 @@ from alice_survey.core.frames import Datum
 from alice_survey.core.manifest import ImageRecord
 from alice_survey.core.records import MappingRecord, PicturesRecord
 from camera_calib.freedom import part_of_rig
-from reconstruct.placing.alignment import Similarity
-from reconstruct.placing.georeference import fit_navigation, level
+from reconstruct.placing.alignment import Similarity, level
+from reconstruct.placing.fit import PlacementFit, fit_navigation
 from reconstruct.placing.place import Placed, Placing, find_place
-from reconstruct.placing.placement_fit import PlacementFit
 from reconstruct.views.model_files import as_transform
 from tests.reconstruct.placing.test_georeference import (
     exact,

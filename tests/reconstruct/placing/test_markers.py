@@ -14,9 +14,8 @@ from alice_survey.core.frames import Array
 from alice_survey.core.manifest import write_manifest
 from camera_calib.approximation.pinhole_warp import best_warp
 from camera_calib.camera import Camera
-from reconstruct.placing.control_file import read_picks
-from reconstruct.placing.markers import find_markers, survey_control
-from reconstruct.placing.picked_points import RegisteredPicture, find_spots
+from reconstruct.placing.control_command import find_markers, survey_control
+from reconstruct.placing.control_points import RegisteredPicture, find_spots, read_picks
 from tests.reconstruct.scenes import ALTITUDE_M, Scene, make_scene
 
 SIDE_M, DEPTH_M = 0.15, 15.0

@@ -10,8 +10,7 @@ from alice_survey.core.config import CameraConfig, WaterConfig
 from alice_survey.core.frames import Array
 from camera_calib.approximation.pinhole_warp import best_warp
 from camera_calib.rig import design_rig
-from reconstruct.placing.control_file import Pick
-from reconstruct.placing.picked_points import RegisteredPicture, find_spots
+from reconstruct.placing.control_points import Pick, RegisteredPicture, find_spots
 
 NADIR = Rotation.from_euler("z", 90, degrees=True)
 

@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.frames import Array
-from reconstruct.placing.georeference import fit_navigation, level
-from reconstruct.placing.placement_fit import PlacementFit
+from reconstruct.placing.alignment import level
+from reconstruct.placing.fit import PlacementFit, fit_navigation
 from tests.reconstruct.placing.test_sigmas import BODY_FROM_CAM, DATUM, flight, flown
 
 _MODES, _SIGMA_M = 16, 0.03

@@ -10,10 +10,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.core.errors import collected_by, warn
 from alice_survey.core.frames import Array
 from camera_calib.mount import mount_rotation
-from reconstruct.placing.georeference import fit_navigation, level
-from reconstruct.placing.mount import fit_with_mount
-from reconstruct.placing.navigation_equations import USUAL_INSTALLATION, Installation
-from reconstruct.placing.placement_fit import PlacementFit
+from reconstruct.placing.alignment import level
+from reconstruct.placing.fit import PlacementFit, fit_navigation
+from reconstruct.placing.navigation import USUAL_INSTALLATION, Installation
+from reconstruct.placing.place import fit_with_mount
 from tests.reconstruct.placing.test_sigmas import DATUM, flight, flown
 
 BODY = flight(8, 15)

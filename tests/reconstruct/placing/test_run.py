@@ -20,9 +20,9 @@ from alice_survey.core.records import RegistrationRecord
 from alice_survey.core.stages import spec
 from reconstruct.pictures.importing import import_images
 from reconstruct.pictures.undistorted import Pictures
-from reconstruct.placing.control_import import import_control
-from reconstruct.placing.picked_points import RegisteredPicture
-from reconstruct.placing.scale import scale_model
+from reconstruct.placing.control_command import scale_model
+from reconstruct.placing.control_points import RegisteredPicture
+from reconstruct.placing.foreign_control import import_control
 from reconstruct.placing.track import read_track_poses
 from reconstruct.views.model import read_model, read_warps
 
@@ -202,7 +202,7 @@ def test_without_positions_the_model_is_level_unscaled_and_says_so(nowhere: Path
 
 
 def test_one_mark_is_taken_on_the_surface(drone: Path) -> None:
-    from reconstruct.placing.scale import find_point
+    from reconstruct.placing.control_command import find_point
 
     model, pictures = read_model(drone / "sparse"), Pictures.open(drone)
     warps = read_warps(drone / "sparse" / "cameras.json")

@@ -9,10 +9,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.frames import Array, Datum, rotation_from_attitude
 from alice_survey.core.manifest import ImageRecord
-from reconstruct.placing.correlated_errors import correlated_share, standard_residuals, whiten
-from reconstruct.placing.georeference import fit_navigation, level
-from reconstruct.placing.navigation_equations import USUAL_INSTALLATION, Installation
-from reconstruct.placing.placement_fit import PlacementFit
+from reconstruct.placing.alignment import level
+from reconstruct.placing.correlated_fit import correlated_share, standard_residuals, whiten
+from reconstruct.placing.fit import PlacementFit, fit_navigation
+from reconstruct.placing.navigation import USUAL_INSTALLATION, Installation
 from tests.oracles_place import covariance_matrix, standard_residuals_densely
 
 DATUM = Datum(32.8236, 34.9553)

@@ -16,8 +16,8 @@ from reconstruct.adjustment.soft_modes import SoftModes, no_modes
 from reconstruct.adjustment.uncertainty import Uncertainty
 from reconstruct.mapping.arrays import cross_matrices
 from reconstruct.placing.alignment import Similarity
-from reconstruct.placing.navigation_equations import USUAL_INSTALLATION, attitude_axes
-from reconstruct.placing.placement_fit import PlacementFit
+from reconstruct.placing.fit import PlacementFit
+from reconstruct.placing.navigation import USUAL_INSTALLATION, attitude_axes
 from reconstruct.placing.track import (
     SIGMAS,
     TrackRow,

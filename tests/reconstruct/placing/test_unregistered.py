@@ -11,10 +11,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.frames import Datum
 from alice_survey.core.manifest import ImageRecord
-from reconstruct.mapping.unregistered import reasons, write_reasons
+from reconstruct.mapping.run import reasons, write_reasons
 from reconstruct.matching.matches import PairMatches
+from reconstruct.placing.run import navigation_places, read_reasons, write_unregistered
 from reconstruct.placing.track import TrackRow
-from reconstruct.placing.unregistered import navigation_places, read_reasons, write_unregistered
 
 DATUM = Datum(32.8, 34.9)
 

@@ -21,7 +21,7 @@ from camera_calib.rig import Rig, design_rig
 from missions.plan.planner import plan_survey
 from missions.plan.strength import survey_costs
 from missions.values.plan_file import Plan, read_plan
-from reconstruct.placing.bend import sag_weights
+from reconstruct.placing.alignment import sag_weights
 from reconstruct.precision import candidates
 from reconstruct.precision.candidates import (
     Candidate,

@@ -20,22 +20,21 @@ from reconstruct.picking.preview import preview_control
 from reconstruct.picking.refine import refine
 from reconstruct.picking.registered import RegisteredPictures, Sight
 from reconstruct.picking.surface import ModelSurface, SurfacePlace
-from reconstruct.placing.control_file import (
+from reconstruct.placing.control_command import note_scale
+from reconstruct.placing.control_points import (
     CONTROL_FILE,
     MARKERS_FILE,
     PICKS_FILE,
     Control,
     Pick,
+    Spot,
+    find_spots,
     read_control,
     read_picks,
-)
-from reconstruct.placing.control_tables import (
     save_control,
     save_picks,
     table_token,
 )
-from reconstruct.placing.picked_points import Spot, find_spots
-from reconstruct.placing.scale import note_scale
 
 T = TypeVar("T")
 _MAX_LISTED = 500

@@ -20,7 +20,7 @@ from alice_survey.core.errors import AliceError, WorkspaceError
 from alice_survey.core.settings_text import Values
 from missions.areas.files import SUFFIXES
 from missions.areas.survey import survey_area
-from reconstruct.pictures.preview import cameras_in, preview_import
+from reconstruct.pictures.importing import cameras_in, preview_import
 
 _MAX_BYTES = 12 << 20
 _COLOUR = '[reconstruct]\ncolour = "{}"\n'

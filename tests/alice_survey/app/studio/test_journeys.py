@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from alice_survey.app.studio.server import Server
-from reconstruct.placing.control_file import read_control, read_picks
+from reconstruct.placing.control_points import read_control, read_picks
 from tests.alice_survey.app.studio.client import ask, looks_at, serving, still
 from tests.alice_survey.app.studio.journey_page import (
     LONG_MS,

@@ -7,19 +7,335 @@ misfit between navigation and the model gives, the model being stiff. Whether er
 dive, and how far the constants of dives are apart, is found in the same way. They are found by
 restricted maximum likelihood (Patterson & Thompson 1971), which counts what the placement itself
 has absorbed, and the covariance of the placement is averaged over all that are likely.
+
+The error of a channel of navigation, over its stated sigma, is taken as
+`u = sqrt(1 - w) m + sqrt(w) n`: m a first-order Gauss-Markov process of unit variance that keeps
+`exp(-dt / tau)` of itself (Uhlenbeck & Ornstein 1930), n white. Where the sigma changes, m is
+also reduced by the lesser over the greater of the two: an error in metres neither grows with a
+sigma that grows (drift is added to it) nor shrinks in proportion (the errors before and after the
+update of an optimal filter covary by the variance after it). The covariance matrix K of all values
+is dense, but a scalar Kalman filter turns values into innovations, which are white: the same as a
+multiplication by the inverse of K's Cholesky factor, in one pass (Kailath 1968).
 """
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
 from alice_survey.core.robust import MAD_TO_SIGMA
-from reconstruct.placing.correlated_errors import MIN_WHITE, standard_residuals
-from reconstruct.placing.navigation_equations import GROUPS, NavigationEquations
-from reconstruct.placing.placement_problem import Correlation, Extra, PlacementProblem, channels_of
+from reconstruct.placing.navigation import GROUP_OF, GROUPS, PARAMETERS, NavigationEquations
+
+MIN_WHITE = 1e-4
+"""Share of white error that two readings at the same time need to have any innovation."""
+
+
+@compiled
+def _kept(time: Array, sigma: Array, i: int, j: int, tau: float) -> float:
+    """Correlation of the Markov parts of two neighbours."""
+    lesser, greater = min(sigma[i], sigma[j]), max(sigma[i], sigma[j])
+    kept: float = math.exp(-abs(time[j] - time[i]) / tau) * lesser / greater
+    return kept
+
+
+@compiled
+def whiten(
+    time: Array, sigma: Array, used: NDArray[np.bool_], values: Array, tau: float, white: float
+) -> tuple[Array, float]:
+    """Make columns of correlated values of unit variance white.
+
+    Args:
+        time: (N,) not decreasing.
+        sigma: (N,) of the values before they were divided by it.
+        used: (N,) what is there; the rest is passed over as a gap.
+        values: (N, P) columns, each over its sigma.
+        tau: time in which the correlation falls to 1/e, above 0.
+        white: share w of the variance that is white, `MIN_WHITE` to 1.
+
+    Returns:
+        (N, P) innovations over their standard deviation, zero where not used, and the logarithm of
+        the determinant of the covariance matrix of what is used.
+    """
+    found, log_det, _, _ = _filtered(time, sigma, used, values, tau, white)
+    return found, log_det
+
+
+@compiled
+def _filtered(
+    time: Array, sigma: Array, used: NDArray[np.bool_], values: Array, tau: float, white: float
+) -> tuple[Array, float, Array, Array]:
+    """As `whiten`; also the mean (N, P) and variance (N,) of the Markov part before each value."""
+    count, columns = values.shape
+    found = np.zeros((count, columns))
+    means, variances = np.zeros((count, columns)), np.ones(count)
+    state = np.zeros(columns)
+    gain_in = math.sqrt(1.0 - white)
+    variance, log_det, last = 1.0, 0.0, -1
+    for i in range(count):
+        if not used[i]:
+            continue
+        kept = _kept(time, sigma, last, i, tau) if last >= 0 else 1.0
+        last = i
+        variance = kept * kept * variance + 1.0 - kept * kept
+        variances[i] = variance
+        spread = gain_in * gain_in * variance + white
+        root = math.sqrt(spread)
+        gain = gain_in * variance / spread
+        for k in range(columns):
+            state[k] *= kept
+            means[i, k] = state[k]
+            innovation = values[i, k] - gain_in * state[k]
+            found[i, k] = innovation / root
+            state[k] += gain * innovation
+        variance -= gain * gain_in * variance
+        log_det += math.log(spread)
+    return found, log_det, means, variances
+
+
+def standard_residuals(
+    time: Array, sigma: Array, used: NDArray[np.bool_], values: Array, tau: float, white: float
+) -> Array:
+    """How far each value is from what all the others predict, in standard deviations.
+
+    Past and future predict independently but for the process's own mean and variance, which both
+    hold and which is taken out once (the two-filter smoother; Fraser & Potter 1969).
+
+    Args:
+        time: (N,) not decreasing.
+        sigma: (N,) of the values before they were divided by it.
+        used: (N,) what is there.
+        values: (N,), each over its sigma.
+        tau: as in `whiten`.
+        white: as in `whiten`.
+
+    Returns:
+        (N,), meaningless where not used.
+    """
+    past, past_variance = _filtered(time, sigma, used, values[:, None], tau, white)[2:]
+    reversed_ = (np.ascontiguousarray(row[::-1]) for row in (time, sigma, used, values[:, None]))
+    future, future_variance = (row[::-1] for row in _filtered(*reversed_, tau, white)[2:])
+    past, future = past[:, 0], future[:, 0]
+    precision = 1.0 / past_variance + 1.0 / future_variance - 1.0
+    mean = (past / past_variance + future / future_variance) / precision
+    spread = (1.0 - white) / precision + white
+    found: Array = (values - math.sqrt(1.0 - white) * mean) / np.sqrt(spread)
+    return found
+
+
+def correlated_share(time: Array, tau: float, white: float) -> float:
+    """Share of the variance that the plain mean over all times keeps beyond that of white error.
+
+    0 for white error, near 1 where one error is constant. The times are taken as evenly
+    spread: twice the integral of `(1 - s) exp(-s T / tau)`.
+    """
+    ratio = float(time[-1] - time[0]) / tau
+    if ratio < 1e-6:
+        return 1.0 - white
+    return (1.0 - white) * 2.0 / ratio * (1.0 - (1.0 - math.exp(-ratio)) / ratio)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Correlation:
+    """How the errors of a group of channels are correlated in time."""
+
+    tau: float
+    """Correlation time of the varying part, in the unit of the epochs' time."""
+    white: float
+    """Share of the varying part's variance that is white."""
+    constant: float = 0.0
+    """Share of all variance that one constant error has."""
+    factor: float = 1.0
+    """Factor by which the stated sigmas are too small."""
+    restart: float = 0.0
+    """Constant error of each dive over what the constant share allows; 0: errors outlast gaps."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Extra:
+    """Independent further equations, made white: misfit + jacobian x change = N(0, 1)."""
+
+    misfit: Array
+    """(E,) misfits."""
+    jacobian: Array
+    """(E, P) their slopes."""
+
+
+def no_extra(columns: int = PARAMETERS) -> Extra:
+    """No further equations, in so many parameters."""
+    return Extra(misfit=np.zeros(0), jacobian=np.zeros((0, columns)))
+
+
+def frame_sigma(bound: float, time: Array, how: Correlation) -> float:
+    """Sigma of a turn or stretch of navigation's own frame, from that of errors that last."""
+    share = correlated_share(time, how.tau, how.white)
+    share = how.constant + (1.0 - how.constant) * share
+    return max(bound * how.factor * float(np.sqrt(share)), 1e-9)
+
+
+class _Normal(NamedTuple):
+    """Normal equations and likelihood of a group."""
+
+    matrix: Array
+    vector: Array
+    square: float
+    log_det: float
+    rows: int
+
+    def plus(self, other: "_Normal") -> "_Normal":
+        return _Normal(
+            self.matrix + other.matrix,
+            self.vector + other.vector,
+            self.square + other.square,
+            self.log_det + other.log_det,
+            self.rows + other.rows,
+        )
+
+    def solve(self) -> tuple[Array, Array]:
+        """Parameters and their covariance."""
+        size = np.sqrt(np.diag(self.matrix))
+        size = np.where(size > 0, size, 1.0)
+        inverse = np.linalg.pinv(self.matrix / np.outer(size, size), rcond=1e-14, hermitian=True)
+        covariance = inverse / np.outer(size, size)
+        return -covariance @ self.vector, covariance
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlacementProblem:
+    """What a place is solved from, whatever the correlation of navigation's errors."""
+
+    time: Array
+    """(M,) times, not decreasing."""
+    found: NavigationEquations
+    free: NDArray[np.int64]
+    """Parameters to solve for."""
+    extra: Extra
+    frame_bounds: Mapping[int, float]
+    """Sigmas of nuisances of navigation's own frame if its position errors lasted throughout."""
+    widened: Mapping[str, float]
+    """Groups whose stated sigmas are too small by this factor or more."""
+    dives: NDArray[np.int64]
+    """(M,) number of the dive of each time."""
+    cache: dict[Any, _Normal] = field(default_factory=dict)
+
+    def group(self, group: str, used: NDArray[np.bool_], correlation: Correlation) -> _Normal:
+        """Normal equations of one group.
+
+        Constant errors of variance 1 with columns C add `C C'` to the covariance matrix: its
+        inverse is that of the varying part minus a product (Woodbury 1950).
+        """
+        key = group, used.tobytes(), replace(correlation, factor=1.0)
+        if key not in self.cache:
+            self.cache[key] = self._unscaled(group, used, correlation)
+        found, square = self.cache[key], correlation.factor**2
+        return _Normal(
+            matrix=found.matrix / square,
+            vector=found.vector / square,
+            square=found.square / square,
+            log_det=found.log_det + found.rows * float(np.log(square)),
+            rows=found.rows,
+        )
+
+    def _unscaled(self, group: str, used: NDArray[np.bool_], correlation: Correlation) -> _Normal:
+        size = len(self.free)
+        total = _Normal(
+            matrix=np.zeros((size, size)), vector=np.zeros(size), square=0.0, log_det=0.0, rows=0
+        )
+        for channel in channels_of(group):
+            rows = used[:, channel]
+            if not rows.any():
+                continue
+            product, log_det, count = self._products(channel, rows, correlation)
+            matrix, steady = product[: size + 1, : size + 1], product[: size + 1, size + 1 :]
+            inner = np.eye(steady.shape[1]) + product[size + 1 :, size + 1 :]
+            kept = matrix - steady @ np.linalg.solve(inner, steady.T)
+            total = total.plus(
+                _Normal(
+                    matrix=kept[:-1, :-1],
+                    vector=kept[:-1, -1],
+                    square=float(kept[-1, -1]),
+                    log_det=log_det + float(np.linalg.slogdet(inner)[1]),
+                    rows=count,
+                )
+            )
+        return total
+
+    def _products(
+        self, channel: int, rows: NDArray[np.bool_], correlation: Correlation
+    ) -> tuple[Array, float, int]:
+        """Products of all white columns, the last those of constant errors; log det; readings."""
+        varying, constants = self.shares(channel, rows, correlation)
+        misfit = self.found.misfit[:, channel]
+        columns = np.column_stack([self.found.jacobian[:, channel][:, self.free], misfit])
+        even, log_det = self.whitened(
+            channel, rows, correlation, varying, np.column_stack([columns, constants])
+        )
+        return even.T @ even, log_det + 2.0 * float(np.log(varying[rows]).sum()), int(rows.sum())
+
+    def whitened(
+        self,
+        channel: int,
+        rows: NDArray[np.bool_],
+        how: Correlation,
+        varying: Array,
+        columns: Array,
+    ) -> tuple[Array, float]:
+        """Columns (M, C) over the stated sigma, made white; log det of what is used."""
+        columns = np.where(rows[:, None], columns / varying[:, None], 0.0)
+        sigma = varying * self.found.sigma[:, channel]
+        return whiten(self.times(how), sigma, rows, columns, how.tau, how.white)
+
+    def times(self, how: Correlation) -> Array:
+        """(M,) times; dives where errors restart are too far apart for any correlation."""
+        if not how.restart:
+            return self.time
+        apart = 100.0 * how.tau + float(np.ptp(self.time))
+        return self.time + apart * self.dives
+
+    def shares(
+        self, channel: int, rows: NDArray[np.bool_], correlation: Correlation
+    ) -> tuple[Array, Array]:
+        """Sigmas of the varying (M,) and the constant parts (M, D) over the stated one.
+
+        The constant part is as large as the least of the stated sigmas allows.
+        """
+        sigma = self.found.sigma[:, channel]
+        constant = np.sqrt(correlation.constant) * sigma[rows].min() / sigma
+        constant = np.minimum(constant, np.sqrt(correlation.constant))
+        own = np.ones((len(sigma), 1))
+        if correlation.restart:
+            own = correlation.restart * np.eye(self.dives[-1] + 1)[self.dives]
+        return np.sqrt(1.0 - constant**2), constant[:, None] * own
+
+    def rest(self, correlation: Mapping[str, Correlation]) -> _Normal:
+        """Normal equations of what is not navigation, and of the turn of navigation's frame."""
+        jacobian, misfit = self.extra.jacobian[:, self.free], self.extra.misfit
+        matrix, vector = jacobian.T @ jacobian, jacobian.T @ misfit
+        if "horizontal" in correlation:
+            how = correlation["horizontal"]
+            for parameter, bound in self.frame_bounds.items():
+                at = np.flatnonzero(self.free == parameter)
+                matrix[at, at] += frame_sigma(bound, self.time, how) ** -2
+        return _Normal(
+            matrix=matrix, vector=vector, square=float(misfit @ misfit), log_det=0.0, rows=0
+        )
+
+    def total(self, used: NDArray[np.bool_], correlation: Mapping[str, Correlation]) -> _Normal:
+        """Normal equations of all."""
+        total = self.rest(correlation)
+        for group, how in correlation.items():
+            total = total.plus(self.group(group, used, how))
+        return total
+
+
+def channels_of(group: str) -> list[int]:
+    """Numbers of a group's channels among the six."""
+    return [k for k, name in enumerate(GROUP_OF) if name == group]
+
 
 _WHITE = (MIN_WHITE, 3e-3, 0.05, 0.3, 0.8, 0.97)
 _CONSTANT = (0.0, 0.5, 0.75, 0.9)

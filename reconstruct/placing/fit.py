@@ -1,21 +1,33 @@
-"""Steps of the fit of a model's place to navigation and control, and what it shows of both.
+"""The fit of a model's place to navigation and control, and what it shows of both.
 
 The place, nuisances of navigation and sizes of the model's soft modes are found together, from a
 robust first placement on; then what contradicts itself is named and counts as that unsure.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.errors import ReconstructionError, warn
-from alice_survey.core.frames import Array
-from reconstruct.placing.alignment import Similarity
-from reconstruct.placing.bend import MIN_STATIONS, Bend, bend_modes, quadratic
-from reconstruct.placing.generalised_fit import Estimate, estimate, without_gross_errors
-from reconstruct.placing.navigation_equations import (
+from alice_survey.core.frames import Array, Datum, pose_to_json
+from alice_survey.core.manifest import ImageRecord
+from camera_calib.mount import nearest_mount
+from reconstruct.placing.alignment import MIN_STATIONS, Bend, Similarity, bend_modes, quadratic
+from reconstruct.placing.correlated_fit import (
+    Correlation,
+    Estimate,
+    Extra,
+    estimate,
+    frame_sigma,
+    no_extra,
+    without_gross_errors,
+)
+from reconstruct.placing.navigation import (
     CLOCK,
     DRIFT,
     GROUPS,
@@ -26,12 +38,174 @@ from reconstruct.placing.navigation_equations import (
     SCALE,
     STRETCH,
     TURN,
+    USUAL_INSTALLATION,
     Epochs,
     Installation,
     equations,
+    first_placement,
+    observable,
+    read_epochs,
+    without_navigation,
 )
-from reconstruct.placing.placement_fit import PlacementFit
-from reconstruct.placing.placement_problem import Correlation, Extra, frame_sigma, no_extra
+
+_METHOD = (
+    "generalised least squares; errors of navigation as first-order Gauss-Markov processes of the "
+    "stated sigmas, correlation times and white shares by restricted maximum likelihood"
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FoundMount:
+    """How the rig is mounted on the vehicle, found with the place."""
+
+    body_from_rig: RigidTransform
+    turn_sigma_deg: Array
+    """(3,) about the vehicle's axes forward, right, down."""
+    lever_sigma_m: Array
+    """(3,) forward, right, down."""
+
+    @property
+    def words(self) -> str:
+        """What was found, with its sigmas."""
+        arm = zip(self.body_from_rig.translation, self.lever_sigma_m, strict=True)
+        forward, right, down = (f"{value:+.2f} (sigma {sigma:.2g})" for value, sigma in arm)
+        return (
+            f"mount found: {nearest_mount(self.body_from_rig.rotation)}, sigma "
+            f"{self.turn_sigma_deg.max():.2g} deg; pupil {forward} m forward, {right} m right, "
+            f"{down} m down"
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """What `georeference.json` says."""
+        return {
+            "words": self.words,
+            "body_from_rig": pose_to_json(self.body_from_rig),
+            "turn_sigma_deg": self.turn_sigma_deg.tolist(),
+            "lever_sigma_m": self.lever_sigma_m.tolist(),
+        }
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlacementFit:
+    """A model placed by navigation, and how well."""
+
+    ned_from_model: Similarity
+    used: int
+    """Stations with a position (without any, with a depth) that took part."""
+    left_out: Mapping[str, int]
+    """For each group of channels, how many readings the rest contradicts."""
+    rms_m: Array
+    """(3,) north, east, down misses of the positions that took part, root mean square; NaN where
+    none did."""
+    free_scale: float
+    """Scale that a similarity would choose: 1 where navigation agrees with the known scale."""
+    free_scale_sigma: float
+    middle_ned: Array
+    """(3,) middle of the camera track, about which the covariance's rotation and scale act."""
+    correlation: Mapping[str, Correlation]
+    """For each group, how navigation's errors are correlated."""
+    time_unit: str
+    installed: Installation
+    modes: Array
+    """(K,) sizes of the model's soft modes, in their sigmas."""
+    mode_factor: float
+    """How many times larger such modes are than the pictures' sigmas say, 1 or more."""
+    joint: Array
+    """(7 + K, 7 + K) covariance of the placement (as `covariance`) and the modes."""
+    bends: tuple[Bend, ...]
+    """How bent the model is still, along the block and, where it is wide, across; none where
+    stations are too few."""
+    nuisances: Mapping[str, tuple[float, float]]
+    """What was found of the errors of the lever arm (m), the clock (s), the mount (degrees) and
+    navigation's own frame (turn in degrees, stretch), and their sigmas."""
+    mount: FoundMount | None = None
+    """The mount, where it was not known."""
+
+    @property
+    def covariance(self) -> Array:
+        """(7, 7) of the placement.
+
+        Rotation about north, east, down (rad), shift north, east, down of the middle (m), and the
+        logarithm of the scale.
+        """
+        return self.joint[:PLACE, :PLACE]
+
+    @property
+    def sigma_position_m(self) -> Array:
+        """(3,) sigma of the middle of the track, north, east and down."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)[3:6]))
+
+    @property
+    def sigma_tilt_deg(self) -> Array:
+        """(2,) sigma of rotation about north and about east."""
+        return np.asarray(np.rad2deg(np.sqrt(np.diag(self.covariance)[:2])))
+
+    @property
+    def sigma_heading_deg(self) -> float:
+        """Sigma of rotation about down."""
+        return float(np.rad2deg(np.sqrt(self.covariance[2, 2])))
+
+    @property
+    def sigma_scale(self) -> float:
+        """Sigma of the logarithm of the scale, 0 where it is held."""
+        return float(np.sqrt(self.covariance[SCALE, SCALE]))
+
+    def to_json(self) -> dict[str, Any]:
+        """What `georeference.json` says."""
+        tilts, axes = np.linalg.eigh(self.covariance[:2, :2])
+        axis = np.rad2deg(np.arctan2(axes[1, 1], axes[0, 1])) % 180.0
+        # What is the model's own by choice has no sigma.
+        north, east, down = (sigma or None for sigma in self.sigma_position_m.tolist())
+        return {
+            "format": "alice-survey georeference",
+            "version": 1,
+            "method": _METHOD,
+            "stations": self.used,
+            "left_out": dict(self.left_out),
+            **{
+                f"rms_{axis}_m": None if np.isnan(rms_m) else float(rms_m)
+                for axis, rms_m in zip(("north", "east", "depth"), self.rms_m, strict=True)
+            },
+            "sigma_north_m": north,
+            "sigma_east_m": east,
+            "sigma_depth_m": down,
+            "sigma_heading_deg": self.sigma_heading_deg or None,
+            "sigma_tilt_deg": float(np.rad2deg(np.sqrt(tilts.mean()))) or None,
+            "sigma_tilt_north_deg": float(self.sigma_tilt_deg[0]),
+            "sigma_tilt_east_deg": float(self.sigma_tilt_deg[1]),
+            "largest_tilt_deg": float(np.rad2deg(np.sqrt(tilts[1]))),
+            "largest_tilt_axis_deg": float(axis),
+            "sigma_scale": self.sigma_scale,
+            "scale_of_navigation": self.free_scale,
+            "scale_of_navigation_sigma": self.free_scale_sigma,
+            "mount_sigma_deg": math.degrees(self.installed.mount_rad),
+            "lever_sigma_m": self.installed.lever_m,
+            "clock_sigma_s": self.installed.clock_s,
+            "nuisances": {
+                name: {"value": found, "sigma": sigma}
+                for name, (found, sigma) in self.nuisances.items()
+            },
+            "mount": None if self.mount is None else self.mount.to_json(),
+            "soft_modes": self.modes.tolist(),
+            "soft_modes_factor": self.mode_factor,
+            "middle_ned_m": self.middle_ned.tolist(),
+            "covariance": self.covariance.tolist(),
+            "covariance_order": [
+                "rotation_north_rad", "rotation_east_rad", "rotation_down_rad",
+                "north_m", "east_m", "down_m", "log_scale",
+            ],
+            "errors": {
+                group: {
+                    f"correlation_{'s' if self.time_unit == 's' else 'stations'}": how.tau,
+                    "white_share": how.white,
+                    "constant_share": how.constant,
+                    "sigma_factor": how.factor,
+                    "dive_constants": how.restart,
+                }
+                for group, how in self.correlation.items()
+            },
+        }  # fmt: skip
+
 
 _LEVEL_SIGMA_DEG = 10.0
 """How far from level the sea floor's mean plane may be, where no attitude was measured."""
@@ -475,3 +649,138 @@ def _rms(misses: Array) -> Array:
     total = np.where(known, misses, 0.0) ** 2
     counts = known.sum(axis=0)
     return np.sqrt(np.where(counts > 0, total.sum(axis=0) / np.maximum(counts, 1), np.nan))
+
+
+_ROUGH_SCALE, _VAGUE_SCALE = 0.03, 0.15
+"""Relative sigmas of a scale by positions: from the first it is worth a warning; beyond the second
+it is none: of vaguer ones those that are too large would pass."""
+
+
+def fit_navigation(
+    records: Sequence[ImageRecord],
+    model_from_cam: Sequence[RigidTransform],
+    body_from_cam: Mapping[str, RigidTransform] | None,
+    datum: Datum | None,
+    levelled: Similarity,
+    *,
+    known_scale: float | None,
+    installed: Installation = USUAL_INSTALLATION,
+    scale_sigma: float = 0.0,
+    control: ExtraOf | None = None,
+    modes: Array | None = None,
+    joints: int = 0,
+) -> PlacementFit | None:
+    """Fit a model to the positions and attitudes of navigation.
+
+    Args:
+        records: registered pictures.
+        model_from_cam: pose of each picture's camera in the model.
+        body_from_cam: mount of every camera, metres; None where it is unknown: positions are those
+            of the cameras, and attitudes, which are the vehicle's, are not used.
+        datum: origin of the local frame; None where no latitude and longitude are known: the model
+            keeps the origin of `levelled`, its heading too where none is known.
+        levelled: `level` of the model; where no attitude is known it keeps the model from turning
+            about a straight track, with a sigma of 10 degrees.
+        known_scale: metres in a unit of the model, or None: then the scale is fitted too.
+        installed: how well it is known where the cameras are on the vehicle, and their clock.
+        scale_sigma: relative, of a known scale; above 0 the scale is fitted about it.
+        control: equations of control points and bars.
+        modes: (N, 6, K) of the pictures by the model's soft modes; None where it is stiff.
+        joints: how many of them, the last, are motions of groups of which pictures know nothing.
+
+    Returns:
+        The fit; None, after a warning, where positions are too few or too close together, or have
+        no scale in common with the model.
+    """
+    epochs = read_epochs(records, model_from_cam, body_from_cam, datum, modes)
+    if epochs is None or (datum is not None and not epochs.has_horizontal):
+        return None
+    start = first_placement(epochs, levelled, known_scale)
+    if start is None:
+        return None
+    free = observable(epochs)
+    if known_scale is None or scale_sigma > 0:
+        free.append(SCALE)
+    task = NavigationTask(
+        epochs=epochs,
+        levelled=levelled,
+        known_scale=known_scale,
+        scale_sigma=scale_sigma,
+        installed=installed,
+        control=control,
+        joints=joints,
+    )
+    near, fit = task.robust(start, free), None
+    if near.scale >= SHRUNK * start.scale:
+        with suppress(ReconstructionError):
+            fit = task.fit(near, free)
+    if fit is None:
+        warn(
+            "positions of navigation and model have no scale in common: it stays without CRS; are "
+            "they of these pictures?"
+        )
+        return None
+    return fit if known_scale is not None or control is not None else _with_rough_scale(fit)
+
+
+def _with_rough_scale(fit: PlacementFit) -> PlacementFit | None:
+    """The fit with a sigma of its scale that holds where positions hardly show the scale.
+
+    Errors of the scale itself are normal, those of its logarithm not: three sigmas s below a scale
+    are -ln(1 - 3 s) away. None, after a warning, where the scale might as well be zero.
+    """
+    sigma = fit.sigma_scale
+    if sigma < _ROUGH_SCALE:
+        return fit
+    if sigma > _VAGUE_SCALE:
+        warn(
+            f"positions of navigation show the scale to {sigma:.0%} only: the model stays without "
+            "CRS; measure a known length with 'alice-survey scale'"
+        )
+        return None
+    honest = -float(np.log1p(-3.0 * sigma)) / 3.0
+    warn(
+        f"positions spread little for their errors: the scale is rough, sigma {honest:.0%}; "
+        "measure a known length with 'alice-survey scale'"
+    )
+    grown = np.ones(len(fit.joint))
+    grown[SCALE] = honest / sigma
+    return replace(fit, joint=fit.joint * np.outer(grown, grown))
+
+
+def fit_control(
+    records: Sequence[ImageRecord],
+    model_from_cam: Sequence[RigidTransform],
+    start: Similarity,
+    control: ExtraOf,
+    *,
+    known_scale: float | None,
+    scale_sigma: float,
+    modes: Array | None = None,
+    joints: int = 0,
+) -> PlacementFit:
+    """Place a model by control points alone.
+
+    Args:
+        records: registered pictures.
+        model_from_cam: pose of each picture's camera in the model.
+        start: a placement near the right one.
+        control: equations of three or more points that are not on one line.
+        known_scale: metres in a unit of the model, or None: then the scale is fitted too.
+        scale_sigma: relative, of a known scale.
+        modes: as in `fit_navigation`.
+        joints: as there.
+    """
+    free = [0, 1, 2, 3, 4, 5]
+    if known_scale is None or scale_sigma > 0:
+        free.append(SCALE)
+    task = NavigationTask(
+        epochs=without_navigation(records, model_from_cam, modes),
+        levelled=None,
+        known_scale=known_scale,
+        scale_sigma=scale_sigma,
+        installed=USUAL_INSTALLATION,
+        control=control,
+        joints=joints,
+    )
+    return task.fit(task.robust(start, free), free)
