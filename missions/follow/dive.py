@@ -352,20 +352,6 @@ class FollowedDive:
                     return None
             return self.proposal
 
-    def write_proposal(self, folder: Path) -> str:
-        """Write the proposal as a workspace with exports, and say what it takes.
-
-        Raises:
-            PlanError: there is none.
-        """
-        with self.lock:
-            if self.proposal is None:
-                raise PlanError("there is no proposal to write")
-            config = self.config
-            return write_refly(
-                folder, self.proposal, self.rig, config.camera, config.water, config.plan
-            )[0]
-
     @cached_property
     def _frame(self) -> tuple[Array, tuple[float, float, float, float]]:
         """Places, (H, W, 2), of pixels of the coverage, and south, west, north, east, metres."""
@@ -424,7 +410,6 @@ class FollowedDive:
         finish_wh = 0.0 if view.is_up else progress.pace * (progress.left_j + ways * down_j) / 3600
         spent_wh = progress.pace * (progress.spent_j + (2.0 - ways) * down_j) / 3600.0
         dive_s = math.inf if self.config.plan.dive_s is None else self.config.plan.dive_s
-        usable = usable_wh(self.config.vehicle)
         keys = ("dive_s", "north_m", "east_m", "altitude_m", "heading_deg", "depth_m")
         lines = self.lines()
         return {
@@ -438,11 +423,9 @@ class FollowedDive:
             "elapsed_s": view.elapsed_s,
             "pace": progress.pace,
             "finish": {"time_s": finish_s, "energy_wh": finish_wh},
-            "spent_wh": spent_wh,
-            "limit": {"dive_s": dive_s, "usable_wh": usable},
             "spare": {
                 "time_s": dive_s - view.elapsed_s - finish_s,
-                "energy_wh": usable - spent_wh - finish_wh,
+                "energy_wh": usable_wh(self.config.vehicle) - spent_wh - finish_wh,
             },
             "coverage": {
                 "seen": view.flown.covered_share,
@@ -455,7 +438,7 @@ class FollowedDive:
                 "area_m2": sum(hole.area_m2 for hole in view.holes),
                 "unseen_m2": sum(hole.unseen_m2 for hole in view.holes),
             },
-            "pictures": {"triggered": view.record.triggered, "counted": view.flown.stations},
+            "pictures": view.flown.stations,
             "left_out": view.record.left_out,
             "gaps": len(view.record.gaps),
             "warnings": list(view.warnings),
@@ -468,8 +451,7 @@ class FollowedDive:
         if progress.line < 0:
             return "at the surface" if view.elapsed_s == 0.0 else "on the way down"
         if progress.is_on_line:
-            kind = self.plan.lines[progress.line].kind
-            return f"on line {progress.line + 1}" + ("" if kind == "survey" else f" ({kind})")
+            return f"on line {progress.line + 1}"
         return "between lines" if progress.left else "on the way home"
 
     def _proposal_json(self) -> dict[str, Any] | None:
@@ -564,7 +546,10 @@ def follow_report(
         state = followed.snapshot() | {"hole_list": followed.holes()}
         text = state_text(state)
         if out is not None and followed.proposal is not None:
-            text += f"\n{out}: {followed.write_proposal(out)}"
+            words, _ = write_refly(
+                out, followed.proposal, followed.rig, config.camera, config.water, config.plan
+            )
+            text += f"\n{out}: {words}"
             state["written"] = str(out)
         yield text, state
         if every_s is None:

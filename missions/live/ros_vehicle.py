@@ -7,7 +7,6 @@ command of that tick, so that it is as fast as what commands it, on any machine.
 
 import math
 import time
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -55,25 +54,17 @@ _KEPT_S = 0.5
 """A command that is older is not followed: the thrusters stop, as a driver's own watchdog does."""
 _REPEAT_S = 0.5
 """Wall time after which a tick without an answer is published again."""
+_MANY_LATE = 200
+"""After so many late ticks the machine is too slow for the rate."""
+_PATIENCE_S = 600.0
+"""Wall time for which it waits for a command, at rate 0."""
 _EXACT = np.zeros(6)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Pace:
-    """How fast the simulation runs, and how long."""
-
-    rate: float
-    """Simulated over wall time; 0 waits for the command of each tick."""
-    max_s: float = math.inf
-    """Simulated time after which it ends."""
-    patience_s: float = 600.0
-    """Wall time for which it waits for a command, at rate 0."""
 
 
 def vehicle_over_ros(
     vehicle: SimulatedVehicle,
     takes: Literal["thrusters", "wrench"],
-    pace: Pace,
+    rate: float,
     rng: np.random.Generator,
 ) -> tuple[Trajectory, str]:
     """Simulate a vehicle that others command, until they leave or it is interrupted.
@@ -81,7 +72,7 @@ def vehicle_over_ros(
     Args:
         vehicle: at rest on the surface.
         takes: which command is followed.
-        pace: how fast and how long.
+        rate: simulated over wall time; 0 waits for the command of each tick.
         rng: noise of the altimeter.
 
     Returns:
@@ -97,7 +88,7 @@ def vehicle_over_ros(
     try:
         node = VehicleNode(ros, vehicle, takes, rng)
         try:
-            why = node.run(pace)
+            why = node.run(rate)
         except KeyboardInterrupt:
             why = "interrupted"
         finally:
@@ -150,32 +141,29 @@ class VehicleNode:
         """Time on the simulation's clock."""
         return START_S + self.vehicle.tick * TICK_S
 
-    def run(self, pace: Pace) -> str:
+    def run(self, rate: float) -> str:
         """Simulate tick by tick; why it ended."""
         begun, late = time.monotonic(), 0
-        while self.now_s - START_S < pace.max_s:
+        while True:
             estimate = self.vehicle.sense()
             self.track.append([self.now_s, *self.vehicle.world.now[:7].tolist()])
             if self.vehicle.touches_floor:
                 return "the hull touched the sea floor"
             readings = self.readings(estimate)
             self._publish(readings)
-            if pace.rate == 0.0:
-                if not self._answered(readings, pace.patience_s):
+            if rate == 0.0:
+                if not self._answered(readings):
                     return "its commander left"
             else:
-                due = begun + (self.vehicle.tick + 1) * TICK_S / pace.rate
-                late += time.monotonic() > due
+                due = begun + (self.vehicle.tick + 1) * TICK_S / rate
+                if time.monotonic() > due:
+                    late += 1
+                    if late == _MANY_LATE:
+                        warn(f"{late} ticks were late: the machine does not keep --rate {rate:g}")
                 self._spin_until(due)
             self.vehicle.move(self.speeds())
-        if late > 0.01 * self.vehicle.tick:
-            warn(
-                f"{late} of {self.vehicle.tick} ticks were late: the machine does not keep the "
-                f"rate {pace.rate:g}; lower it"
-            )
-        return f"{pace.max_s:g} s are over"
 
-    def _answered(self, readings: list[tuple[Any, Any]], patience_s: float) -> bool:
+    def _answered(self, readings: list[tuple[Any, Any]]) -> bool:
         """Wait for the command of this tick; whether one came, or false if none will."""
         begun = published = time.monotonic()
         while self.command is None or self.command[0] < self.now_s - 1e-6:
@@ -183,9 +171,9 @@ class VehicleNode:
             now = time.monotonic()
             if self.command is not None and not self._is_commanded:
                 return False
-            if now - begun > patience_s:
+            if now - begun > _PATIENCE_S:
                 raise VehicleError(
-                    f"no command came on {self.commands.topic_name} for {patience_s:g} s: start "
+                    f"no command came on {self.commands.topic_name} for {_PATIENCE_S:g} s: start "
                     "what commands the vehicle with simulated time, or give --rate 1"
                 )
             if now - published > _REPEAT_S:

@@ -14,7 +14,7 @@ from missions.fly.run import flight_noise, true_floor
 from missions.fly.simulation import flight_settings, max_mission_s, mission_setup
 from missions.live.loop import LinkLimits
 from missions.live.mission import LiveMission, mission_of, need_thrusters_alone, plan_to_fly
-from missions.live.ros_vehicle import Pace, vehicle_over_ros
+from missions.live.ros_vehicle import vehicle_over_ros
 
 _ALTIMETER_STREAM = 21
 
@@ -73,7 +73,7 @@ def simulate_report(
     survey: SurveyConfig,
     *,
     takes: Literal["thrusters", "wrench"],
-    pace: Pace,
+    rate: float,
     track: Path | None,
 ) -> tuple[str, dict[str, Any]]:
     """Simulate the vehicle of a workspace's plan for others to command over ROS 2.
@@ -82,7 +82,7 @@ def simulate_report(
         workspace: that holds the plan: the vehicle is let go at its start, over its sea floor.
         survey: its settings.
         takes: which command is followed.
-        pace: how fast and how long.
+        rate: simulated over wall time; 0 waits for each command.
         track: CSV of the true track, if wanted.
 
     Returns:
@@ -106,7 +106,7 @@ def simulate_report(
         health=setup.health,
     )  # fmt: skip
     altimeter = np.random.default_rng([survey.seed, _ALTIMETER_STREAM])
-    flown, why = vehicle_over_ros(vehicle, takes, pace, altimeter)
+    flown, why = vehicle_over_ros(vehicle, takes, rate, altimeter)
     if track is not None:
         write_track(track, flown)
     return (

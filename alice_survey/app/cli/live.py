@@ -101,13 +101,10 @@ def pilot(
     from alice_survey.app.pipeline import settings
 
     if simulated:
-        from missions.live.ros_vehicle import Pace
         from missions.live.run import simulate_report
 
         survey_settings = settings(workspace, survey, needed=True)
-        result = simulate_report(
-            workspace, survey_settings, takes=takes, pace=Pace(rate=rate), track=track
-        )
+        result = simulate_report(workspace, survey_settings, takes=takes, rate=rate, track=track)
         print_result(*result, as_json)
         return
     from missions.live.loop import LinkLimits

@@ -199,9 +199,7 @@ export function tab(studio) {
     more.replaceChildren(table("So far", [], [
       ["Under water", clock(state.elapsed_s)],
       ["Pace, true over planned", number(state.pace, "", 3)],
-      ["Energy spent, by the plan", number(state.spent_wh, "Wh", 3)],
-      ["Time that a dive may take", state.limit.dive_s === null ? "not set" : clock(state.limit.dive_s)],
-      ["Pictures that count", number(pictures.counted, "", 6)],
+      ["Pictures that count", number(pictures, "", 6)],
       ["Gaps of the log", String(state.gaps)],
       ...left.map(([why, count]) => ["Left out: " + why, String(count)]),
     ]), el("p", {class: "note"}, state.source));
