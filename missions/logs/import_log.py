@@ -213,6 +213,8 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
 
     if not path.exists():
         raise NavigationError(f"{path}: no such file or folder")
+    if not (path.is_file() or path.is_dir()):  # a pipe would be waited on for ever
+        raise NavigationError(f"{path}: is not a file")
     chosen = _roles(options.topics)
     suffix = path.suffix.lower()
     datum = None if options.datum_deg is None else Datum(*options.datum_deg)

@@ -182,8 +182,8 @@ def _texts(
     """The labels of a layer's features; None where no attribute is one."""
     lower = [field.lower() for field in fields]
     if label is not None and label.lower() not in lower:
-        names = ", ".join(fields) or "none"
-        raise WorkspaceError(f"{shown}: no attribute {label!r}; there are {names}")
+        known = ", ".join(fields) or "none"
+        raise WorkspaceError(f"{shown}: no attribute {label!r}; there are {known}")
     names = [label.lower()] if label is not None else [name for name in _LABELS if name in lower]
     if not names:
         return None

@@ -268,31 +268,6 @@ def test_pictures_that_state_a_great_size(
         looked_at(sandbox, name, data, _READERS[reader])
 
 
-@pytest.mark.parametrize("reader", _READERS)
-@pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.tif", "a.dng"])
-@pytest.mark.parametrize(
-    "data",
-    [b"", b"\0", b"\xff\xd8", b"\x89PNG\r\n\x1a\n", b"II*\0\xff\xff\xff\xff", b"GIF89a",
-     b"SIMPLE  = T", b"PK\3\4", b"\0" * 5000, b"<svg/>", b"RIFF\xff\xff\xff\xffWEBPVP8 "],
-)  # fmt: skip
-def test_what_is_no_picture(sandbox: Sandbox, name: str, data: bytes, reader: str) -> None:
-    looked_at(sandbox, name, data, _READERS[reader])
-
-
-@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA", "CMYK", "I;16", "I", "F"])
-@pytest.mark.parametrize("kind", ["png", "tif", "jpg"])
-def test_pictures_of_one_pixel(sandbox: Sandbox, mode: str, kind: str) -> None:
-    from PIL import Image
-
-    try:
-        Image.new(mode, (1, 1)).save(sandbox.inside / f"a.{kind}")
-    except OSError:
-        pytest.skip(f"{kind} has no {mode}")
-    data = (sandbox.inside / f"a.{kind}").read_bytes()
-    for read in _READERS.values():
-        looked_at(sandbox, f"a.{kind}", data, read)
-
-
 @pytest.mark.parametrize(
     ("tags", "gps"),
     [

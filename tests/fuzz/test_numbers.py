@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from alice_survey.app.cli.main import app
 from alice_survey.core.config import load_config
 from alice_survey.core.errors import AliceError
-from tests.fuzz import areas
+from tests.fuzz import areas, logs
 from tests.fuzz.judge import MAX_S, Sandbox, bounded, judge
 from tests.fuzz.workspace import read_and_check_survey
 
@@ -92,6 +92,7 @@ def test_a_vehicle_without_any_thrust_is_refused(tmp_path: Path) -> None:
         ("survey.toml", load_config),
         *((f"a.{ending}", areas.read_area) for ending in ("kml", "kmz", "geojson", "wkt", "plan")),
         ("a.tif", areas.read_depths),
+        ("a.tlog", logs.read_any_log),
     ],
 )
 def test_what_is_no_file_is_refused_at_once(
