@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from alice_survey.core.frames import Array
 from camera_calib.calibration import Calibration, stack_views
 from camera_calib.camera import Camera
-from camera_calib.rig import Rig
 
 GATE_SIGMAS = 5.0
 """Residuals longer than this many times the noise are outliers: counted, and kept out of the
@@ -17,8 +16,6 @@ PROFILE_BINS = 12
 _MIN_IN_BIN = 8
 COVERED_REACH = 0.75
 """A corner of the frame is covered when a point lies beyond this share of both half sides."""
-TILTED_DEG = 15.0
-"""A view tilted by less gives little information on focal length and port."""
 CORNERS = ("top left", "top right", "bottom left", "bottom right")
 
 
@@ -252,28 +249,4 @@ def coverage(camera: Camera, pixels: Array) -> Coverage:
             name: float(np.max((off * sign).min(axis=1), initial=0.0))
             for name, sign in zip(CORNERS, signs, strict=True)
         },
-    )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Spread:
-    """Poses of the target, seen from one camera."""
-
-    range_m: Array
-    """(V,) distance of the target's middle along the axis."""
-    tilt_xy_deg: Array
-    """(V, 2) tilt of the target about the camera's x and y axes."""
-
-
-def spread(rig: Rig, camera: str, calibration: Calibration) -> Spread:
-    """Distances and tilts of the views that one camera saw."""
-    kept = [v for v, view in enumerate(calibration.views) if camera in view.pixels]
-    middle = calibration.target_points.mean(axis=0)
-    poses = [rig.cam_from_rig[camera] * calibration.rig_from_target[v] for v in kept]
-    matrices = np.stack([pose.rotation.as_matrix() for pose in poses]).reshape(-1, 3, 3)
-    normals = matrices[:, :, 2] * np.sign(matrices[:, 2:, 2])  # away from the camera
-    tilts = np.degrees(np.arctan2([-normals[:, 1], normals[:, 0]], normals[:, 2])).T
-    return Spread(
-        range_m=np.array([pose.apply(middle)[2] for pose in poses]),
-        tilt_xy_deg=tilts,
     )

@@ -15,12 +15,10 @@ from camera_calib.judge.fit_quality import (
     Coverage,
     PictureFit,
     Profile,
-    Spread,
     camera_residuals,
     coverage,
     picture_fits,
     residual_profiles,
-    spread,
 )
 from camera_calib.judge.homography import HomographyTest, homography_test
 from camera_calib.judge.target_frame import TargetFrame, target_frame
@@ -30,10 +28,7 @@ from camera_calib.judge.uncertainty import (
     baseline_sigma_m,
     compensation,
     covariance_of,
-    overlap_points,
-    point_sigmas_m,
     projection_sigma,
-    shape_sigmas_m,
     stereo_sigma,
 )
 from camera_calib.judge.validation import (
@@ -93,26 +88,11 @@ class CameraJudgement:
     by_incidence: Profile
     """Residuals against the radius and against the angle to the port's normal in water, deg."""
     coverage: Coverage
-    spread: Spread
     homography: HomographyTest | None
-    map_pixels: Array
-    """(R, C, 2)"""
     sigma: ProjectionSigma
     """(R, C) at the working range."""
     by_range: tuple[RangeSigma, ...]
     halves: HalvesDifference | None
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class StereoMap:
-    """Triangulation uncertainty over the cameras' overlap at the working range."""
-
-    points_rig: Array
-    """(N, 3)"""
-    depth_m: Array
-    """(N,) sigma of the distance."""
-    shape_m: Array
-    """(N,) the same after the best rigid motion of all points."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -129,7 +109,6 @@ class Judgement:
     cameras: dict[str, CameraJudgement]
     stereo: tuple[StereoSigma, ...]
     """By distance; empty for one camera."""
-    stereo_map: StereoMap | None
     lengths: LengthErrors | None
     """Errors on the views used; None for one camera."""
     held_lengths: LengthErrors | None
@@ -166,7 +145,7 @@ def judge(
     range_m = working_range_m or _working_range_m(calibration)
     ranges = tuple(float(r) for r in range_m * _RANGE_STEPS)
     stereo = len(rig.cameras) > 1
-    lengths = held_lengths = stereo_map = None
+    lengths = held_lengths = None
     if stereo:
         lengths = length_errors(
             rig,
@@ -175,12 +154,6 @@ def judge(
             calibration.residuals_px,
             calibration.target_points,
             calibration.sigma_px,
-        )
-        points = overlap_points(rig, range_m)
-        stereo_map = StereoMap(
-            points_rig=points,
-            depth_m=point_sigmas_m(rig, points)[:, 2],
-            shape_m=shape_sigmas_m(rig, points)[:, 2],
         )
     if stereo and held is not None:
         held_lengths = length_errors(
@@ -204,7 +177,6 @@ def judge(
         pictures=tuple(picture_fits(calibration)),
         cameras={name: _camera(calibration, held, name, range_m, ranges) for name in rig.cameras},
         stereo=tuple(stereo_sigma(rig, r, calibration.noise_px) for r in ranges) if stereo else (),
-        stereo_map=stereo_map,
         lengths=lengths,
         held_lengths=held_lengths,
         hold_out=None if held is None else score_hold_out(held),
@@ -254,9 +226,7 @@ def _camera(
         by_radius=by_radius,
         by_incidence=by_incidence,
         coverage=coverage(model, seen.pixels),
-        spread=spread(rig, name, calibration),
         homography=homography_test(calibration, name),
-        map_pixels=pixels,
         sigma=projection_sigma(rig, name, pixels, range_m, compensating),
         by_range=tuple(
             over_frame(r, projection_sigma(rig, name, coarse, r, compensating)) for r in ranges

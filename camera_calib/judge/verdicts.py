@@ -11,7 +11,6 @@ from alice_survey.kit.document import Level, Verdict, worst_first
 from alice_survey.kit.words import with_sigma
 from camera_calib.calibrate.housing import likely_port
 from camera_calib.judge.judgement import CameraJudgement, Judgement
-from camera_calib.rig import Rig
 from camera_calib.target_shape import BOW_X, BOW_Y
 
 _ODD_PICTURE = 2.0
@@ -45,34 +44,17 @@ _SIGMA_LOOK, _SIGMA_BAD = 3.0, 10.0
 
 
 def verdicts(judged: Judgement) -> tuple[Verdict, ...]:
-    """All verdicts as lines, the worst first."""
+    """Six kinds of verdicts, the worst first: fit, port, held-out views, scale, target, pixels."""
     return tuple(worst_first(list(_lines(judged))))
 
 
 def _lines(judged: Judgement) -> Iterator[Verdict]:
-    yield from _side_verdicts(judged.calibration.rig)
     yield from _fit_verdicts(judged)
-    yield from _housing_verdicts(judged)
-    yield from _prior_verdicts(judged)
+    yield from _port_verdicts(judged)
     yield from _hold_out_verdicts(judged)
     yield from _length_verdicts(judged)
     yield from _target_verdicts(judged)
-    for name, camera in judged.cameras.items():
-        yield from _homography_verdicts(judged, name, camera)
     yield from _uncertainty_verdicts(judged)
-
-
-def _side_verdicts(rig: Rig) -> Iterator[Verdict]:
-    """A verdict where the pictures of the left and the right camera seem to be swapped."""
-    if set(rig.cameras) != {"left", "right"}:
-        return
-    x, y, z = (1e3 * rig.cam_from_rig["right"].inv().translation).tolist()
-    if x < -max(abs(y), abs(z)):
-        yield Verdict(
-            level="bad",
-            text=f"the right camera stands {-x:.0f} mm to the left of the left one: swap --left "
-            "and --right, unless the cameras hang upside down",
-        )
 
 
 def _graded(ratio: float, look: float, bad: float) -> Level:
@@ -80,70 +62,90 @@ def _graded(ratio: float, look: float, bad: float) -> Level:
 
 
 def _fit_verdicts(judged: Judgement) -> Iterator[Verdict]:
-    usual = float(np.median([p.rms_px for p in judged.pictures]))
-    odd = [p for p in judged.pictures if p.rms_px > _ODD_PICTURE * usual]
+    """Pictures that fit badly, outliers, and what homographies leave at the edges."""
+    median = float(np.median([p.rms_px for p in judged.pictures]))
+    bad = [p for p in judged.pictures if p.rms_px > _ODD_PICTURE * median]
     outliers = sum(p.outliers for p in judged.pictures)
     points = sum(p.points for p in judged.pictures)
-    if odd:
-        listed = ", ".join(
-            f"view {p.view} of the {p.camera} camera at {p.rms_px:.3f} px" for p in odd[:5]
-        )
-        rest = f" and {len(odd) - 5} more" if len(odd) > 5 else ""
+    if bad:
+        listed = ", ".join(f"view {p.view} of {p.camera} ({p.rms_px:.3f} px)" for p in bad[:5])
+        more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
         held = judged.hold_out
         harmless = held is not None and held.rms_px <= _HELD_LOOK * held.expected_px
+        advice = "held-out views fit as expected nonetheless"
+        if not harmless:
+            advice = "look at them for blur, motion or a bent target"
         yield Verdict(
             level="good" if harmless else "look",
-            text=f"pictures that fit {_ODD_PICTURE:g} times worse than the median of {usual:.3f} "
-            f"px: {listed}{rest}; "
-            + (
-                "views that were held out fit as well as noise and covariance promise, so that "
-                "these do no harm"
-                if harmless
-                else "look at them for blur, motion or a bent target"
-            ),
+            text=f"pictures over {_ODD_PICTURE:g} times the median of {median:.3f} px rms: "
+            f"{listed}{more}; {advice}",
         )
     else:
-        yield Verdict(level="good", text=f"all pictures fit alike (median {usual:.3f} px rms)")
+        yield Verdict(level="good", text=f"all pictures fit alike (median {median:.3f} px rms)")
     if outliers > _MAX_OUTLIERS * points:
-        yield Verdict(
-            level="look",
-            text=f"{outliers} of {points} points are outliers; look where they lie in the pictures",
-        )
+        yield Verdict(level="look", text=f"{outliers} of {points} points are outliers")
+    for name, camera in judged.cameras.items():
+        yield from _homography_verdicts(judged, name, camera)
 
 
-def _housing_verdicts(judged: Judgement) -> Iterator[Verdict]:
-    """Whether the port that was calibrated can be the one that the views were taken through."""
+def _homography_verdicts(
+    judged: Judgement, name: str, camera: CameraJudgement
+) -> Iterator[Verdict]:
+    test, frame = camera.homography, judged.target_frame
+    if test is None or not np.isfinite(test.outer_px):
+        return
+    ratio = test.excess_px / max(test.inner_px, 1e-12)
+    cause = "the model of lens or port does not fit"
+    if frame is not None and frame.returns:
+        if frame.cause == "shape":
+            cause = "the target departs from its drawing"
+        elif frame.returning_px > _RETURNING * judged.calibration.noise_px:
+            cause = f"the target is uneven, or {cause}"
+    yield Verdict(
+        level=_graded(ratio, _TREND_LOOK, _TREND_BAD),
+        text=f"{name}: homographies leave {test.inner_px:.3f} px within and {test.outer_px:.3f}"
+        f" px beyond {test.outer_from_px:.0f} px from the centre"
+        + ("" if ratio <= _TREND_LOOK else f"; {cause}"),
+    )
+
+
+def _port_verdicts(judged: Judgement) -> Iterator[Verdict]:
+    """Whether the rig can be the one that the views were taken with, and its port theirs."""
     calibration = judged.calibration
-    for name, camera in calibration.rig.cameras.items():
-        flat = camera.port.magnification
-        ratio = calibration.housing.focal_ratios.get(name)
-        n_water = max(camera.n_water, _FRESH_WATER)
-        if ratio is not None:
-            text = (
-                f"focal lengths of {name} under water are {ratio:.3f} times those in air: "
-                f"{n_water:.3g} behind a flat port, near 1 behind a dome or without a port"
+    rig = calibration.rig
+    if set(rig.cameras) == {"left", "right"}:
+        x, y, z = (1e3 * rig.cam_from_rig["right"].inv().translation).tolist()
+        if x < -max(abs(y), abs(z)):
+            yield Verdict(
+                level="bad",
+                text=f"the right camera is {-x:.0f} mm to the left of the left one: swap --left "
+                "and --right, unless the cameras hang upside down",
             )
-            likely = likely_port(ratio)
-            fits = abs(ratio / flat - 1.0) < _RATIO_OFF
-            more = "" if fits else f"; calibrate with --port {likely}, or --port auto"
-            yield Verdict(level="good" if fits else "bad", text=text + more)
-        sigma_m = calibration.rig.sigmas.get(f"{name}.port_distance_m")
+    for name, camera in rig.cameras.items():
+        ratio = calibration.housing.focal_ratios.get(name)
+        if ratio is not None:
+            n_water = max(camera.n_water, _FRESH_WATER)
+            fits = abs(ratio / camera.port.magnification - 1.0) < _RATIO_OFF
+            advice = f"; calibrate with --port {likely_port(ratio)}, or --port auto"
+            yield Verdict(
+                level="good" if fits else "bad",
+                text=f"focal lengths of {name} under water are {ratio:.3f} times those in air: "
+                f"{n_water:.3g} behind a flat port, near 1 behind a dome or without a port"
+                + ("" if fits else advice),
+            )
+        sigma_m = rig.sigmas.get(f"{name}.port_distance_m")
         if sigma_m is None:
             continue
         distance_m = camera.parameter("port_distance_m")
-        if not distance_m + _SIGMAS * sigma_m > _NEAREST_GLASS_M:
+        near = not distance_m + _SIGMAS * sigma_m > _NEAREST_GLASS_M
+        if near or distance_m - _SIGMAS * sigma_m > _MAX_GLASS_M:
             yield Verdict(
                 level="bad",
                 text=f"the flat port of {name} ended {distance_m * 1e3:.2g} mm before the pupil, "
-                "where no glass can be: the pictures are through a dome, without a port, or in "
-                "air; try --port auto",
+                "where no housing has glass: the pictures are through a dome, without a port, or "
+                "in air; try --port auto",
             )
-        elif distance_m - _SIGMAS * sigma_m > _MAX_GLASS_M:
-            yield Verdict(
-                level="bad",
-                text=f"the flat port of {name} ended {distance_m * 1e3:.0f} mm before the pupil, "
-                "farther than in any housing: the pictures may be through a dome; try --port auto",
-            )
+    yield from _prior_verdicts(judged)
 
 
 def _prior_verdicts(judged: Judgement) -> Iterator[Verdict]:
@@ -172,28 +174,27 @@ def _prior_verdicts(judged: Judgement) -> Iterator[Verdict]:
     else:
         yield Verdict(
             level=level,
-            text=f"{text}: port, lens or water are not what was taken; try --port auto, or "
+            text=f"{text}: port, lens or water differ from the prior; try --port auto, or "
             "--intrinsics free if the focus changed",
         )
 
 
 def _hold_out_verdicts(judged: Judgement) -> Iterator[Verdict]:
-    score = judged.hold_out
+    """Views that took no part, and calibrations from halves of the views."""
+    score, halves = judged.hold_out, judged.halves
     if score is None:
         yield Verdict(level="look", text="no views were held out: the fit is not tested")
         return
-    ratio = score.rms_px / score.expected_px
+    ratio, points = score.rms_px / score.expected_px, score.points + score.outliers
     yield Verdict(
         level=_graded(ratio, _HELD_LOOK, _HELD_BAD),
         text=f"{score.views} held-out views fit to {score.rms_px:.3f} px rms, {ratio:.2f} times "
-        f"what noise and covariance promise ({score.expected_px:.3f} px); used views to "
+        f"what noise and covariance predict ({score.expected_px:.3f} px); used views to "
         f"{score.used_rms_px:.3f} px",
     )
-    if score.outliers > _MAX_OUTLIERS * (score.points + score.outliers):
+    if score.outliers > _MAX_OUTLIERS * points:
         yield Verdict(
-            level="look",
-            text=f"{score.outliers} of {score.points + score.outliers} held-out points are "
-            "outliers: they were found badly, or the model does not reach them",
+            level="look", text=f"{score.outliers} of {points} held-out points are outliers"
         )
     for name, camera in judged.cameras.items():
         if camera.halves is not None:
@@ -201,67 +202,50 @@ def _hold_out_verdicts(judged: Judgement) -> Iterator[Verdict]:
             yield Verdict(
                 level=_graded(found / expected, _HALVES_LOOK, _HALVES_BAD),
                 text=f"{name}: calibrations from either half of the views differ by {found:.3f} px "
-                f"rms over the frame, {found / expected:.2f} times what their covariances promise",
+                f"rms, {found / expected:.2f} times what their covariances predict",
             )
-
-    if judged.halves is not None:
-        halves = judged.halves
+    if halves is not None:
         level: Level = "good" if halves.p_value >= _P_LOOK else "look"
-        level = level if halves.p_value >= _P_BAD else "bad"
-        plausible = "plausible" if level == "good" else "not plausible"
         yield Verdict(
-            level=level,
+            level=level if halves.p_value >= _P_BAD else "bad",
             text=f"parameters from either half of the views differ by chi2 {halves.chi2:.1f} for "
-            f"{halves.parameters} (p = {halves.p_value:.2g}): {plausible}"
-            + ("" if level == "good" else ", the sigmas are too small: is a view wrong, or did "
-               "lens, port or target change?"),
+            f"{halves.parameters} (p = {halves.p_value:.2g})"
+            + ("" if level == "good" else ": the sigmas are too small; did lens, port or target "
+               "change between views?"),
         )  # fmt: skip
 
 
 def _target_verdicts(judged: Judgement) -> Iterator[Verdict]:
-    """Verdicts on the target itself."""
+    """The target's bend, and what returns in its frame in view after view."""
     shape, frame = judged.calibration.shape, judged.target_frame
-    for name in (BOW_X, BOW_Y):
-        if name in shape.parameters:
-            bow_m, sigma_m = shape.known(name)
-            at = shape.parameters.index(name)
-            usual_m, along = float(shape.prior_sigmas[at]), "width" if name == BOW_X else "height"
-            known = f"{with_sigma(1e3 * bow_m, 1e3 * sigma_m)} mm"
-            if sigma_m > _OPEN * usual_m:
-                yield Verdict(
-                    level="look",
-                    text=f"the views hardly show how the target bends over its {along}: {known}; "
-                    "the sigmas include that; tilt it more",
-                )
-            elif abs(bow_m) > _VERY_BENT * usual_m:
-                yield Verdict(
-                    level="look",
-                    text=f"the target is bent over its {along} by {known}: more than a board "
-                    f"should ({_VERY_BENT * 1e3 * usual_m:.1f} mm); it is taken into account, but "
-                    "such a board may bend differently in every view: use a stiff one",
-                )
+    for name, along in ((BOW_X, "width"), (BOW_Y, "height")):
+        if name not in shape.parameters:
+            continue
+        bow_m, sigma_m = shape.known(name)
+        prior_m = float(shape.prior_sigmas[shape.parameters.index(name)])
+        known = f"{with_sigma(1e3 * bow_m, 1e3 * sigma_m)} mm over its {along}"
+        if sigma_m > _OPEN * prior_m:
+            text = f"the views hardly show how the target bends: {known}; tilt it more"
+            yield Verdict(level="look", text=text)
+        elif abs(bow_m) > _VERY_BENT * prior_m:
+            text = f"the target is bent by {known}: it is taken into account; use a stiffer one"
+            yield Verdict(level="look", text=text)
     if frame is None:
         return
-    noise_px = judged.calibration.noise_px
     if not frame.returns:
-        yield Verdict(
-            level="good",
-            text="in the target's frame residuals average to nothing"
-            + (": it is as drawn, but for the shape that was found" if shape.parameters else ""),
-        )
+        yield Verdict(level="good", text="residuals average to nothing in the target's frame")
         return
-    small = frame.returning_px <= _RETURNING * noise_px
+    small = frame.returning_px <= _RETURNING * judged.calibration.noise_px
     cause = {
         "shape": "the target is bent or stretched, and its shape was not adjusted",
-        "corners": "a few of its corners are out of their places, or damaged",
-        "uneven": "its print or paper is uneven, or it bends where no smooth sheet would",
+        "corners": "a few of its corners are displaced or damaged",
+        "uneven": "its print or paper is uneven",
     }[frame.cause]
     yield Verdict(
         level="good" if small and frame.cause != "shape" else "look",
-        text=f"in the target's frame {frame.returning_px:.3f} px of the residuals return in view "
-        f"after view (p = {frame.p_value:.1g}), {1e3 * frame.in_plane_m:.2f} mm rms in its plane: "
-        f"likely {cause}"
-        + ("; small against the noise, and in the sigmas" if small else "; use a better target"),
+        text=f"in the target's frame {frame.returning_px:.3f} px of the residuals return in every "
+        f"view (p = {frame.p_value:.1g}), {1e3 * frame.in_plane_m:.2f} mm rms in its plane: "
+        f"likely {cause}" + ("; the sigmas include it" if small else "; use a better target"),
     )
 
 
@@ -276,30 +260,9 @@ def _length_verdicts(judged: Judgement) -> Iterator[Verdict]:
         off = abs(scale) > _SIGMAS * sigma or found > _HELD_LOOK**2 * expected
         yield Verdict(
             level="look" if off else "good",
-            text=f"long lengths on {which} views: scale off by {scale:+.0f} +/- {sigma:.0f} ppm, "
+            text=f"long lengths on {which} views: scale error {scale:+.0f} +/- {sigma:.0f} ppm, "
             f"{1e3 * found:.2f} mm rms ({1e3 * expected:.2f} mm by the noise alone)",
         )
-
-
-def _homography_verdicts(
-    judged: Judgement, name: str, camera: CameraJudgement
-) -> Iterator[Verdict]:
-    test, frame = camera.homography, judged.target_frame
-    if test is None or not np.isfinite(test.outer_px):
-        return
-    ratio = test.excess_px / max(test.inner_px, 1e-12)
-    cause = "the model of lens or port does not fit"
-    if frame is not None and frame.returns:
-        if frame.cause == "shape":
-            cause = "the target is not as drawn (above)"
-        elif frame.returning_px > _RETURNING * judged.calibration.noise_px:
-            cause = f"the target is uneven (above), or {cause}"
-    yield Verdict(
-        level=_graded(ratio, _TREND_LOOK, _TREND_BAD),
-        text=f"{name}: homographies leave {test.inner_px:.3f} px within and {test.outer_px:.3f}"
-        f" px beyond {test.outer_from_px:.0f} px from the centre"
-        + ("" if ratio <= _TREND_LOOK else f"; {cause}"),
-    )
 
 
 def _uncertainty_verdicts(judged: Judgement) -> Iterator[Verdict]:

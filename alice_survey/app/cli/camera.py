@@ -8,10 +8,7 @@ import typer
 from alice_survey.app.cli.options import (
     CONTEXT,
     AsJson,
-    RigCamera,
-    Threads,
     examples,
-    executor_of,
     print_result,
 )
 
@@ -47,73 +44,6 @@ def water(
     from camera_calib.water import water_report
 
     print_result(*water_report(temperature, salinity, depth, jerlov, wavelength), as_json)
-
-
-@app.command(
-    epilog=examples(
-        "camera undisperse images/left/*.png --rig rig.json --range 2 -o corrected/left",
-        "camera undisperse dive/*.jpg --rig rig.json --range 1.5 -o out --material pmma",
-    )
-)
-def undisperse(
-    pictures: Annotated[list[Path], typer.Argument(metavar="PICTURE...", help="Colour pictures.")],
-    rig: Annotated[Path, typer.Option(help="rig.json; its indices hold for green.")],
-    folder: Annotated[Path, typer.Option("-o", "--out", help="Folder for the corrected ones.")],
-    distance: Annotated[float, typer.Option("--range", min=0.0, help="Distance to the scene, m.")],
-    camera: RigCamera = None,
-    temperature: Temperature = 20.0,
-    salinity: Salinity = 35.0,
-    depth: Depth = 10.0,
-    material: Annotated[
-        str, typer.Option(help="Port: bk7, fused-silica, sapphire, pmma, polycarbonate.")
-    ] = "bk7",
-    wavelength: Annotated[
-        list[float] | None, typer.Option(help="nm, three times: of red, green and blue.")
-    ] = None,
-    threads: Threads = None,
-    as_json: AsJson = False,
-) -> None:
-    """Warp red and blue onto green.
-
-    A flat port shows each colour at its own scale: some pixels apart at the edge of the frame.
-    """
-    from camera_calib.approximation.undisperse import undisperse_files
-
-    text, data = undisperse_files(
-        pictures, folder, rig=rig, camera=camera, range_m=distance, temperature_c=temperature,
-        salinity_psu=salinity, depth_m=depth, glass=material, wavelengths_nm=wavelength,
-        executor=executor_of(threads),
-    )  # fmt: skip
-    print_result(text, data, as_json)
-
-
-@app.command(
-    epilog=examples(
-        "camera residual --near 1.5 --far 2.5",
-        "camera residual --near 1 --far 3 --rig rig.json --camera left --plot residual.png",
-    )
-)
-def residual(
-    near: Annotated[float, typer.Option(help="Nearest distance, m.")],
-    far: Annotated[float, typer.Option(help="Farthest distance, m.")],
-    survey: Annotated[Path | None, typer.Option("-s", "--survey", help="With a design.")] = None,
-    rig: Annotated[Path | None, typer.Option(help="rig.json; instead of a design.")] = None,
-    camera: RigCamera = None,
-    exact_at: Annotated[float | None, typer.Option(help="Range of the warp, m.")] = None,
-    plot: Annotated[Path | None, typer.Option(help="PNG, PDF or SVG to draw.")] = None,
-    as_json: AsJson = False,
-) -> None:
-    """Show what approximations cost.
-
-    Pixels that pinholes after a warp, and COLMAP's cameras without one, are wrong by through this
-    port. Distances are from the entrance pupil along the axis.
-    """
-    from camera_calib.approximation.report import residual_report
-
-    text, data = residual_report(
-        near, far, survey=survey, rig=rig, camera=camera, working_range_m=exact_at, plot=plot
-    )
-    print_result(text, data, as_json)
 
 
 @app.command(
