@@ -22,7 +22,7 @@ def planned(config: SurveyConfig) -> Planned:
 
 
 @pytest.mark.parametrize(
-    ("config", "least"),
+    ("config", "minimum"),
     [
         (survey(sea={"current_mps": 0.5}), 3),
         (survey(sea={"current_mps": 0.5}, plan={"turns": "arcs"}), 3),

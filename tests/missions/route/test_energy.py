@@ -223,7 +223,7 @@ def _changed(config: SurveyConfig, way: str) -> SurveyConfig:
 
 
 @pytest.mark.parametrize(
-    ("config", "least"),
+    ("config", "minimum"),
     [
         (_config(0.5), 3),
         (_config(0.9), 1),

@@ -67,7 +67,7 @@ def test_features_keep_away_from_the_border_of_a_mask() -> None:
 
 
 @pytest.mark.parametrize(
-    ("size", "most", "scales"),
+    ("size", "maximum", "scales"),
     [
         ((846, 677), 8000, (1.0,)),
         ((846, 677), 3000, (0.724, 1.0)),

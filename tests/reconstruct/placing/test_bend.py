@@ -96,7 +96,7 @@ def test_a_line_has_no_bend_across_and_a_few_stations_have_none() -> None:
     assert bends_of(short, flown(short, 5, 1.0), 0.0, 0.0) == ()
 
 
-@pytest.mark.parametrize(("sag_mm", "least", "most"), [(0.0, 0.0, 0.1), (8.0, 0.9, 1.0)])
+@pytest.mark.parametrize(("sag_mm", "minimum", "maximum"), [(0.0, 0.0, 0.1), (8.0, 0.9, 1.0)])
 def test_a_bend_of_eight_millimetres_over_thirty_metres_is_seen(
     sag_mm: float, minimum: float, maximum: float
 ) -> None:

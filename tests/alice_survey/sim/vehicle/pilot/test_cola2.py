@@ -87,7 +87,7 @@ def test_in_weak_currents_the_offset_is_that_of_the_drift_angle() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "least", "most"), [("alice", 0.34, 0.44), ("sparus2", 0.55, 0.72)]
+    ("name", "minimum", "maximum"), [("alice", 0.34, 0.44), ("sparus2", 0.55, 0.72)]
 )
 def test_the_circle_is_that_of_a_simulated_vehicle(
     name: str, minimum: float, maximum: float
