@@ -29,7 +29,7 @@ from missions.coverage.stations import plan_pattern, stations_of_flight
 from missions.exports.advice import cola2_outlook
 from missions.exports.options import options_of
 from missions.exports.write import write_exports
-from missions.fly.mission_flight import PASSED_M, mission_of_settings, overshot, simulate_mission
+from missions.fly.mission_flight import PASSED_M, mission_of_settings, overshoot_m, simulate_mission
 from missions.fly.simulation import flight_settings
 from missions.plan.planner import plan_survey
 from missions.values.flight import rms
@@ -123,7 +123,7 @@ def _fly(plan: Plan, rig: Rig, config: SurveyConfig, name: str, *, across: bool)
         settings = flight_settings(config)
         floor = level_floor(config.area.seafloor_depth_m)
         flight = simulate_mission(plan, settings, floor, np.random.default_rng(7), label="")
-        beyond_m = overshot(mission_of_settings(plan, settings), flight)
+        beyond_m = overshoot_m(mission_of_settings(plan, settings), flight)
     seen = certificate(plan.area, rig, stations_of_flight(flight), plan_pattern(plan, rig))
     expected, warned = plan.coverage, False
     if name == "cola2" and options.follower is not None:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import CodeType, ModuleType
-from typing import Any, ParamSpec, TypeVar, overload
+from typing import Any, ParamSpec, TypeVar, cast, overload
 
 import numpy as np
 from filelock import Timeout
@@ -77,6 +77,14 @@ def kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Res
     """
     kept: Callable[_Arguments, _Result] = compiled(_nrt=False)(function)
     return kept
+
+
+def columns(count: int) -> tuple[int, ...]:
+    """Places in an array for kernels that take one as an argument.
+
+    A constant that is a Python integer has a type of its own, and its kernel a version for each.
+    """
+    return tuple(cast(int, np.int64(place)) for place in range(count))
 
 
 def closure_digest(kernel: Any) -> str:

@@ -213,18 +213,8 @@ class CaseResult:
 
     @property
     def title(self) -> str:
-        """Which way the water flows, in words."""
-        waves = (
-            f", swell of {self.case.swell_m:g} m and {self.case.swell_s:g} s across the lines"
-            if self.case.swell_m > 0.0
-            else ""
-        )
-        if self.case.current_mps == 0.0:
-            return f"no current{waves}" if waves else "still water"
-        return (
-            f"current {self.case.name}: {self.across_mps:+.2f} m/s across the first line, "
-            f"{self.along_mps:+.2f} m/s along it{waves}"
-        )
+        """The current, and its parts across and along the first line."""
+        return f"{self.case.name} ({self.across_mps:+.2f} across, {self.along_mps:+.2f} along)"
 
 
 def default_cases(plan: Plan) -> tuple[Case, ...]:
@@ -301,13 +291,13 @@ def fly_variant(
     max_s = max_mission_s(plan)
     water = np.random.default_rng([seed, _SEA])
     floor = level_floor(plan.seafloor_depth_m)
-    setup = varied(mission_setup(plan, settings, floor, max_s, water), variant)
+    setup = with_variant(mission_setup(plan, settings, floor, max_s, water), variant)
     chance = np.random.default_rng([seed, _CHANCE])
     flown = simulate(setup, chance, max_s=max_s, label="", sea_rng=water)
     return setup, flown, flight_of(plan, settings.camera.position_body_m, setup, flown)
 
 
-def varied(setup: Setup, variant: Variant) -> Setup:
+def with_variant(setup: Setup, variant: Variant) -> Setup:
     """A mission with the variant's look-ahead and belief."""
     believed = with_equal_thrust(setup.vehicle) if variant.equal_speeds else setup.vehicle
     gains = gains_for(believed.weakened(dict.fromkeys(variant.failed, 0.0)), setup.path.speed_mps)

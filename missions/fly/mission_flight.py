@@ -281,7 +281,7 @@ def _every(places_ne: Array, step_m: float) -> list[int]:
     return taken
 
 
-def overshot(known: MissionOfPlan, flight: Flight) -> list[float]:
+def overshoot_m(known: MissionOfPlan, flight: Flight) -> list[float]:
     """How far past the end of its way the vehicle went on each line, by its own estimate, m.
 
     Zero where the step was done before its end was passed. ArduSub comes to rest at an end, about
@@ -321,7 +321,7 @@ def mission_summary(known: MissionOfPlan, flight: Flight, rig: Rig) -> dict[str,
     promised = certificate(
         plan.area, rig, stations_of_lines(lines, plan.altitude_m), plan_pattern(plan, rig)
     )
-    beyond_m = overshot(known, flight)
+    beyond_m = overshoot_m(known, flight)
     return {
         "file": known.path.name,
         "follower": known.mission.autopilot,

@@ -34,7 +34,7 @@ from alice_survey.sim.vehicle.pilot.command import Pilot
 from alice_survey.sim.vehicle.pilot.failures import WATCHED_S, FoundFailure
 from alice_survey.sim.vehicle.pilot.memory import DONE
 from alice_survey.sim.vehicle.pilot.safety import NONE, REASONS
-from alice_survey.sim.vehicle.rotations import wrapped
+from alice_survey.sim.vehicle.rotations import wrap_angle
 from alice_survey.sim.vehicle.simulator import TICK_S
 
 FIRST_S, SILENCE_S = 600.0, 60.0
@@ -323,7 +323,7 @@ class PilotLoop:
         """
         turn = Rotation.from_quat(odometry.quaternion_xyzw)
         roll, pitch, heading = attitude_from_rotation(turn)
-        self._heading_rad += wrapped(heading - self._heading_rad)
+        self._heading_rad += wrap_angle(heading - self._heading_rad)
         estimate = self.estimate
         estimate[vector.NORTH : vector.ROLL] = odometry.position_ned
         estimate[vector.ROLL : vector.U] = roll, pitch, self._heading_rad

@@ -13,7 +13,7 @@ from alice_survey.core.errors import AliceError, PlanError, warn
 from alice_survey.sim.vehicle.files import vehicles_of_a_geometry
 from alice_survey.sim.vehicle.pilot.gains import STEADY_SHARE
 from alice_survey.sim.vehicle.sea import orbital_speed_mps
-from alice_survey.sim.vehicle.steady import held, too_slow
+from alice_survey.sim.vehicle.steady import fin_flight, too_slow
 from missions.exposure.settings import ImagingSetup, imaging_settings
 from missions.exposure.ways_out import Settings, Way, conflict
 from missions.route.energy import (
@@ -103,7 +103,11 @@ def too_strong(
     against = f"a current of {size:.2f} m/s towards {towards_deg:03.0f} deg"
     ways = [*_waits(flown, held_mps), *_changes(flown, vehicle, setup)]
     said = f"{what} in {against}" if what else f"{against} is above the strength of {name}"
-    if held_mps == 0.0 and flown.craft.fins and held(flown.craft, speed, 0.0, STEADY_SHARE) is None:
+    if (
+        held_mps == 0.0
+        and flown.craft.fins
+        and fin_flight(flown.craft, speed, 0.0, STEADY_SHARE) is None
+    ):
         said = too_slow(flown.craft, speed, STEADY_SHARE)
         return conflict(said, ("plan.speed_mps", "the lift of its fins and hull"), ways)
     if held_mps == 0.0:

@@ -5,7 +5,7 @@ import math
 from alice_survey.core.config import PlanConfig, SurveyConfig
 from alice_survey.core.errors import PlanError
 from alice_survey.sim.vehicle.pilot.gains import STEADY_SHARE
-from alice_survey.sim.vehicle.steady import held, min_radius_m
+from alice_survey.sim.vehicle.steady import fin_flight, min_radius_m
 from alice_survey.sim.vehicle.vehicle import Vehicle
 from missions.route.energy import craft_of
 
@@ -44,7 +44,7 @@ def plan_as_flown(plan: PlanConfig, craft: Vehicle) -> PlanConfig:
             f"{craft.name} is steered by fins and cannot stop: plan.turns = {plan.turns!r} cannot "
             "be flown; set 'arcs', or leave it out"
         )
-    if held(craft, plan.speed_mps, 0.0, STEADY_SHARE) is None:
+    if fin_flight(craft, plan.speed_mps, 0.0, STEADY_SHARE) is None:
         return plan
     min_m = min_radius_m(craft, plan.speed_mps, STEADY_SHARE)
     if plan.turns == "auto":

@@ -27,7 +27,7 @@ from missions.fly.mission_flight import (
     PASSED_M,
     mission_of_settings,
     mission_summary,
-    overshot,
+    overshoot_m,
     picture_times,
     simulate_mission,
 )
@@ -113,7 +113,7 @@ def test_in_still_water_an_exported_mission_sees_what_its_certificate_promises(
     assert seen.covered_share > 0.999
     assert plan.coverage - 0.01 < seen.share_at_overlap <= plan.coverage
     known = mission_of_settings(plan, flight_settings(config))
-    beyond_m = overshot(known, flight)
+    beyond_m = overshoot_m(known, flight)
     assert len(beyond_m) == len(plan.lines)
     assert max(beyond_m) < (PASSED_M if name == "cola2" else 0.3)
     found = mission_summary(known, flight, rig_of(config))

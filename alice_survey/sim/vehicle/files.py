@@ -150,7 +150,7 @@ def vehicle_from_file(path: Path, coefficients: str = OWN_SET) -> Vehicle:
 @lru_cache(maxsize=32)
 def _vehicle_of(path: Path, text: str, coefficients: str) -> Vehicle:
     """The vehicle of a file's text; kept, as the water inside of a hull takes a while to find."""
-    found = validated(path, _VehicleFile, _with_shape(_table_of(path, text)))
+    found = parse_table(path, _VehicleFile, _with_shape(_table_of(path, text)))
     for what, parts in (("thrusters", found.thrusters), ("fins", found.fins)):
         names = [part.name for part in parts]
         if len(set(names)) < len(names):
@@ -263,7 +263,7 @@ def coefficients_from_file(path: Path) -> Coefficients:
     values = table.get("values", table)
     if table.get("format", COEFFICIENTS_FORMAT) != COEFFICIENTS_FORMAT:
         raise VehicleError(f"{path}: format {table['format']!r} is not {COEFFICIENTS_FORMAT!r}")
-    values = validated(path, dict[str, float], values)
+    values = parse_table(path, dict[str, float], values)
     if not values:
         raise VehicleError(f"{path}: holds no coefficients")
     found = _coefficients(path, str(table.get("name", path.stem)), values)
@@ -313,7 +313,7 @@ def _table_of(path: Path, text: str) -> dict[str, Any]:
     return table
 
 
-def validated(path: Path, kind: type[_Kind], table: object) -> _Kind:
+def parse_table(path: Path, kind: type[_Kind], table: object) -> _Kind:
     """The value of a kind that a table read from a file holds.
 
     Raises:

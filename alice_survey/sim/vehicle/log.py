@@ -25,7 +25,7 @@ from alice_survey.core.config import Config
 from alice_survey.core.contents import shown
 from alice_survey.core.errors import VehicleError, warn
 from alice_survey.core.frames import Array, attitude_from_rotation, rotation_from_attitude
-from alice_survey.sim.vehicle.files import read_table, validated
+from alice_survey.sim.vehicle.files import parse_table, read_table
 
 TIME = "time_s"
 POSITION = ("north_m", "east_m", "depth_m")
@@ -394,7 +394,7 @@ def read_column_map(path: Path) -> ColumnMap:
     Raises:
         VehicleError: the file cannot be read or has an unknown key or value.
     """
-    found = validated(path, ColumnMap, read_table(path))
+    found = parse_table(path, ColumnMap, read_table(path))
     if (found.time is None) == (found.time_step_s is None):
         raise VehicleError(f"{path}: give time, or time_step_s where the rows have no time")
     if found.angles_deg is not None and (found.body, found.world) != ("frd", "ned"):

@@ -225,7 +225,7 @@ def pack(thrusters: Sequence[Thruster], density: float, displaced_kg: float) -> 
     return Propulsion(table)
 
 
-def weakened(propulsion: Propulsion, health: Array) -> Propulsion:
+def with_health(propulsion: Propulsion, health: Array) -> Propulsion:
     """The same thrusters at reduced greatest speeds.
 
     Args:

@@ -28,7 +28,7 @@ def matrix_of(quaternion: Array, out: Array) -> None:
 
 
 @kernel
-def applied(matrix: Array, x: float, y: float, z: float) -> Row:
+def rotate(matrix: Array, x: float, y: float, z: float) -> Row:
     """A rotation matrix, (3, 3), times a vector."""
     return (
         matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z,
@@ -38,7 +38,7 @@ def applied(matrix: Array, x: float, y: float, z: float) -> Row:
 
 
 @kernel
-def applied_inverse(matrix: Array, x: float, y: float, z: float) -> Row:
+def rotate_back(matrix: Array, x: float, y: float, z: float) -> Row:
     """The inverse of a rotation matrix, (3, 3), times a vector."""
     return (
         matrix[0, 0] * x + matrix[1, 0] * y + matrix[2, 0] * z,
@@ -89,6 +89,6 @@ def turn_between(before: Array, after: Array, out: Array) -> None:
 
 
 @kernel
-def wrapped(angle_rad: float) -> float:
+def wrap_angle(angle_rad: float) -> float:
     """The same angle between -pi and pi."""
     return angle_rad - 2.0 * math.pi * math.floor(angle_rad / (2.0 * math.pi) + 0.5)

@@ -49,7 +49,7 @@ def sheared_current(depth_m: Array, speed_mps_towards_deg: Array) -> Current:
     """
     speed, towards = speed_mps_towards_deg[:, 0], np.deg2rad(speed_mps_towards_deg[:, 1])
     velocity: Array = np.stack([speed * np.cos(towards), speed * np.sin(towards)], axis=1)
-    return checked_current(Current(np.zeros(1), np.asarray(depth_m, np.float64), velocity[None]))
+    return check_current(Current(np.zeros(1), np.asarray(depth_m, np.float64), velocity[None]))
 
 
 def varying_current(
@@ -77,7 +77,7 @@ def varying_current(
     for i in range(1, len(time_s)):
         process[i] = decay * process[i - 1] + math.sqrt(1 - decay**2) * draws[i]
     velocity = mean.velocity_ne_mps + sigma_mps * process[:, None, :]
-    return checked_current(Current(time_s, mean.depth_m, np.array(velocity, dtype=np.float64)))
+    return check_current(Current(time_s, mean.depth_m, np.array(velocity, dtype=np.float64)))
 
 
 def read_current(path: Path) -> Current:
@@ -101,10 +101,10 @@ def read_current(path: Path) -> Current:
             f"{path}: {len(row)} rows for {len(times)} times and {len(depths)} depths; give each "
             "depth once at each time"
         )
-    return checked_current(Current(times, depths, grid))
+    return check_current(Current(times, depths, grid))
 
 
-def checked_current(current: Current) -> Current:
+def check_current(current: Current) -> Current:
     """The current, if it is valid.
 
     Raises:
@@ -252,7 +252,7 @@ def with_swell(
     way = np.array([math.cos(towards), math.sin(towards)])
     waves = phase[:, None, None] * speed[None, :, None] * way
     velocity: Array = np.ascontiguousarray(before + waves)
-    return checked_current(Current(time_s, layers, velocity))
+    return check_current(Current(time_s, layers, velocity))
 
 
 def _resampled(current: Current, time_s: Array, depth_m: Array) -> Array:

@@ -36,7 +36,7 @@ from alice_survey.sim.vehicle.pilot.mission import NO_MISSION, PilotMission
 from alice_survey.sim.vehicle.pilot.path import Path
 from alice_survey.sim.vehicle.pilot.safety import TOUCHED
 from alice_survey.sim.vehicle.pilot.settings import Guidance
-from alice_survey.sim.vehicle.propulsion import electrical_power, weakened, without_thrust
+from alice_survey.sim.vehicle.propulsion import electrical_power, with_health, without_thrust
 from alice_survey.sim.vehicle.rotations import matrix_rows
 from alice_survey.sim.vehicle.sea import Current, Disturbance, FloorGrid, current_at, floor_depth
 from alice_survey.sim.vehicle.vehicle import Vehicle
@@ -233,7 +233,7 @@ class SimulatedVehicle:
             pushing: the same, of propellers that turn as before.
         """
         sound = self.vehicle.plant
-        slower = weakened(sound.propulsion, self.vehicle.health_of(left))
+        slower = with_health(sound.propulsion, self.vehicle.health_of(left))
         propulsion = without_thrust(slower, self.vehicle.health_of(pushing or {}))
         self.plant = sound._replace(propulsion=propulsion)
 

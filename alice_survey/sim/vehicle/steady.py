@@ -4,7 +4,7 @@ The laws are those of `dynamics`, `propulsion` and `allocation`, called at many 
 planner counts on is what the simulator flies. The vehicle is level; what rolls and pitches it is
 left to its weight, as in allocation. Surge, sway, heave and yaw are balanced exactly, the torque of
 propellers and the drag of jets included. A vehicle that fins steer is not level: its pitch and
-drift are those of `held`, and its thrusters give what that takes ahead.
+drift are those of `fin_flight`, and its thrusters give what that takes ahead.
 
 Such a vehicle holds its depth by the lift of a hull that is pitched, and turns by that of one that
 drifts: at a speed u and a rate of turn r pitch, drift v and the fins' angles are those at which
@@ -70,7 +70,7 @@ class FinFlight:
         return math.atan2(math.hypot(self.nu[1], self.nu[2]), self.nu[0])
 
 
-def keeps(vehicle: Vehicle, speed_mps: float, turn_rad_s: float = 0.0) -> FinFlight | None:
+def balance_fins(vehicle: Vehicle, speed_mps: float, turn_rad_s: float = 0.0) -> FinFlight | None:
     """Steady level flight at a surge and a rate of turn; None where nothing balances."""
     from scipy.optimize import root
 
@@ -120,9 +120,11 @@ def keeps(vehicle: Vehicle, speed_mps: float, turn_rad_s: float = 0.0) -> FinFli
     )
 
 
-def held(vehicle: Vehicle, speed_mps: float, turn_rad_s: float, share: float) -> FinFlight | None:
+def fin_flight(
+    vehicle: Vehicle, speed_mps: float, turn_rad_s: float, share: float
+) -> FinFlight | None:
     """Steady level flight with a share of the fins' angles and the hull along the flow, or None."""
-    flight = keeps(vehicle, speed_mps, turn_rad_s)
+    flight = balance_fins(vehicle, speed_mps, turn_rad_s)
     if flight is None or flight.load > share or flight.drift_rad > MAX_DRIFT_RAD:
         return None
     return flight
@@ -143,7 +145,7 @@ def min_radius_m(vehicle: Vehicle, speed_mps: float, share: float) -> float:
 
     def turns(radius_m: float) -> bool:
         rates = (speed_mps / radius_m, -speed_mps / radius_m)
-        return all(held(vehicle, speed_mps, rate, share) is not None for rate in rates)
+        return all(fin_flight(vehicle, speed_mps, rate, share) is not None for rate in rates)
 
     wide, tight = _WIDEST_M, _WIDEST_M
     if not turns(wide):
@@ -169,7 +171,7 @@ def min_speed_mps(vehicle: Vehicle, share: float) -> float:
         VehicleError: there is none.
     """
     speeds = np.geomspace(*_SPEEDS_MPS, 60).tolist()
-    flies = [held(vehicle, speed, 0.0, share) is not None for speed in speeds]
+    flies = [fin_flight(vehicle, speed, 0.0, share) is not None for speed in speeds]
     if not any(flies):
         raise VehicleError(
             f"the fins of {vehicle.name} hold it level at no speed: check their places, areas and "
@@ -181,7 +183,7 @@ def min_speed_mps(vehicle: Vehicle, share: float) -> float:
     low, high = speeds[first - 1], speeds[first]
     while high - low > 1e-4:
         middle = 0.5 * (low + high)
-        flies_there = held(vehicle, middle, 0.0, share) is not None
+        flies_there = fin_flight(vehicle, middle, 0.0, share) is not None
         low, high = (low, middle) if flies_there else (middle, high)
     return float(high)
 
@@ -293,7 +295,7 @@ def _fin_force_ahead(vehicle: Vehicle, nu: Array, share: float) -> Array:
             row[0] = np.nan
             continue
         if (u, abs(r)) not in known:
-            flight = held(vehicle, u, abs(r), share)
+            flight = fin_flight(vehicle, u, abs(r), share)
             known[u, abs(r)] = np.nan if flight is None else flight.force_x_n
         row[0] = known[u, abs(r)]
     return requested

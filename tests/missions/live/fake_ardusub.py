@@ -29,7 +29,7 @@ from alice_survey.sim.vehicle.pilot.gains import (
     YAW,
     gains_for,
 )
-from alice_survey.sim.vehicle.rotations import wrapped
+from alice_survey.sim.vehicle.rotations import wrap_angle
 from alice_survey.sim.vehicle.sea import floor_range
 from alice_survey.sim.vehicle.simulator import SimulatedVehicle
 from missions.live.mission import plan_to_fly
@@ -57,7 +57,7 @@ class InnerLoops:
         heading = float(attitude_from_rotation(turn)[2])
         body = turn.inv()
         off = body.apply(velocity_ned - truth[7:10])
-        turning = np.clip(0.6 * wrapped(heading_rad - heading), -0.25, 0.25)
+        turning = np.clip(0.6 * wrap_angle(heading_rad - heading), -0.25, 0.25)
         error = np.array([*off, turning - truth[12]])
         self.total = np.clip(
             self.total + 0.05 * 0.3 * self.mass * error, self.minimum, self.maximum

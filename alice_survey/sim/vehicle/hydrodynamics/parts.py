@@ -388,10 +388,13 @@ def estimate(geometry: Geometry, flow: Flow | None = None) -> Coefficients:
 
 def part_coefficients(part: HullPart) -> dict[str, float]:
     """One part's share by name."""
-    return {**named(part.added_mass, kind="dot"), **named(part.quadratic, kind="quadratic")}
+    return {
+        **by_name(part.added_mass, kind="dot"),
+        **by_name(part.quadratic, kind="quadratic"),
+    }
 
 
-def named(matrix: Array, *, kind: Literal["dot", "quadratic"]) -> dict[str, float]:
+def by_name(matrix: Array, *, kind: Literal["dot", "quadratic"]) -> dict[str, float]:
     """A (6, 6) matrix by SNAME names: of `dot`, M_A with its sign turned; of `quadratic`, as is."""
     sign = -1.0 if kind == "dot" else 1.0
     return {

@@ -11,7 +11,7 @@ see only the inputs from there on; next to them the velocity of that row is kept
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,9 +26,9 @@ from alice_survey.core.text_table import text_table
 from alice_survey.kit.figure import INKS, SOFT, figure_style, new_figure, save_figure
 from alice_survey.sim.vehicle.files import (
     coefficients_from_file,
+    parse_table,
     read_table,
     speeds_missing,
-    validated,
     vehicle_from,
     write_coefficients,
 )
@@ -376,8 +376,8 @@ def identify_report(
     result = _identify(windows, used, how, options)
     validation = _validation(shorter, result, how) if shorter else None
     own = validate(windows, result.parameters, result.values, simulation=how) if windows else None
-    text = _text(vehicle, logs, result, thrust, own, validation, options)
     data = _data(vehicle, logs, result, thrust, own, validation)
+    text = _text(data, result, validation)
     try:
         out.mkdir(parents=True, exist_ok=True)
         if logs:
@@ -453,7 +453,7 @@ def _others_of(coefficients: str | None) -> dict[str, float]:
     if coefficients is None or not Path(coefficients).suffix:
         return {}
     table = read_table(Path(coefficients)).get("others", {})
-    found = validated(Path(coefficients), dict[str, float], table)
+    found = parse_table(Path(coefficients), dict[str, float], table)
     return {name: value for name, value in found.items() if name not in CURRENTS}
 
 
@@ -495,62 +495,50 @@ def _with_its_current(
     return values, drift
 
 
-def _factor(name: str, start: float, value: float) -> float:
-    return value / start if start and name not in OTHERS else math.nan
+def _cell(value: float | None, style: str) -> str:
+    return "-" if value is None or not math.isfinite(value) else f"{value:{style}}"
 
 
-def _cell(value: float, style: str) -> str:
-    return f"{value:{style}}" if math.isfinite(value) else "-"
-
-
-def _text(
-    vehicle: Vehicle,
-    logs: Sequence[Path],
-    result: _Identified,
-    thrust: Sequence[ThrustCoefficient],
-    own: MotionValidation | None,
-    validation: _Validation | None,
-    options: IdentifyOptions,
-) -> str:
-    names = ", ".join(path.name for path in logs) or "no log"
-    lines = [
-        f"{vehicle.name}, {options.method}, fitted to {names}; from "
-        f"{vehicle.coefficients.name!r} coefficients"
-    ]
+def _text(data: Mapping[str, Any], result: _Identified, validation: _Validation | None) -> str:
+    """The report: one table, and a line for each fit."""
+    found = {
+        f"k_t {'+'.join(one['thrusters'])} {one['way']}": {
+            **one, "start": one["model"], "unit": "", "remark": f"{one['readings']} readings"
+        }
+        for one in data["thrust"]
+    }  # fmt: skip
+    for k, (name, one) in enumerate(data["identified"].items()):
+        found[name] = {**one, "remark": _remark(result, k)}
+    styles = {"start": ".5g", "identified": ".5g", "sigma": ".2g", "factor": ".3g"}
     rows = [
         (
-            f"k_t {'+'.join(one.thrusters)} {one.way}", f"{one.model:.4g}",
-            f"{one.identified:.4g}", _cell(one.sigma, ".2g"), f"{one.factor:.3g}", "",
-            f"{one.readings} readings",
+            name,
+            *(_cell(one[key], style) for key, style in styles.items()),
+            one["unit"],
+            one["remark"],
         )
-        for one in thrust
-    ]  # fmt: skip
-    for k, name in enumerate(result.parameters.names):
-        start, value = float(result.parameters.start[k]), float(result.values[k])
-        rows.append((
-            name, f"{start:.5g}", f"{value:.5g}", _cell(float(result.sigma[k]), ".2g"),
-            _cell(_factor(name, start, value), ".3g"), unit_of(name), _remark(result, k),
-        ))  # fmt: skip
+        for name, one in found.items()
+    ]
+    lines = [
+        f"{data['vehicle']}, {data['method']}, fitted to {', '.join(data['logs']) or 'no log'}"
+    ]
     if rows:
-        head = ("coefficient", "start", "identified", "sigma", "factor", "unit", "")
-        lines.append(text_table(head, rows))
-    if result.fit is not None:
-        pairs = high_correlations(result.fit)
-        lines += [f"correlated {value:+.3f}: {a} and {b}" for a, b, value in pairs]
-        if result.fit.prior is not None:
-            lines.append(f"prior about the start, relative sigmas: {result.fit.prior}")
-    if own is not None:
-        lines.append(_fit_line("the same logs", own, None))
-    if validation is not None:
-        lines.append(_fit_line(validation.found.source, validation.found, validation.started))
-        if validation.worse:
-            lines.append(
-                f"Worse than the values that the fit began with in {', '.join(validation.worse)}: "
-                "free fewer coefficients, or log manoeuvres that excite these motions"
-            )
-        if validation.current_ne is not None:
-            north, east = validation.current_ne
-            lines.append(f"current of that log: {north:.3f} m/s north, {east:.3f} m/s east")
+        lines.append(text_table(("coefficient", *styles, "unit", ""), rows))
+    lines += [
+        f"correlated {one['correlation']:+.3f}: {' and '.join(one['of'])}"
+        for one in data.get("high_correlations", ())
+    ]
+    if result.fit is not None and result.fit.prior is not None:
+        lines.append(f"prior about the start, relative sigmas: {result.fit.prior}")
+    lines += [_fit_line(data[key]) for key in ("same_logs", "validation") if key in data]
+    if validation is not None and validation.worse:
+        lines.append(
+            f"Worse than the values that the fit began with in {', '.join(validation.worse)}: "
+            "free fewer coefficients, or log manoeuvres that excite these motions"
+        )
+    if validation is not None and validation.current_ne is not None:
+        north, east = validation.current_ne
+        lines.append(f"current of that log: {north:.3f} m/s north, {east:.3f} m/s east")
     return "\n".join(lines)
 
 
@@ -567,17 +555,15 @@ def _remark(result: _Identified, k: int) -> str:
     return ", ".join(remarks)
 
 
-def _fit_line(name: str, found: MotionValidation, started: MotionValidation | None) -> str:
+def _fit_line(found: Mapping[str, Any]) -> str:
     """Fit of each motion, next to that of the start and of a velocity that is kept."""
-    shown = {"model": found.fit_percent}
-    if started is not None:
-        shown["start"] = started.fit_percent
-    shown["constant velocity"] = found.constant_fit_percent
-    cells = "; ".join(
-        f"{of} {' / '.join(_cell(value, '.1f') for value in values)}"
-        for of, values in shown.items()
+    keys = ("fit_percent", "start_fit_percent", "constant_fit_percent")
+    fits = "; ".join(
+        f"{of} {' / '.join(_cell(value, '.1f') for value in found[key].values())}"
+        for of, key in zip(("model", "start", "constant velocity"), keys, strict=True)
+        if found.get(key) is not None
     )
-    return f"fit of {name} in stretches of {found.window_s:.4g} s, % of u/v/w/p/q/r: {cells}"
+    return f"fit of {found['source']} by {found['window_s']:.4g} s, % of u/v/w/p/q/r: {fits}"
 
 
 def held_by_prior(fit: OutputErrorFit) -> list[str]:
@@ -626,7 +612,9 @@ def _data(
                 "start": float(start[k]),
                 "identified": float(result.values[k]),
                 "sigma": _known(result.sigma[k]),
-                "factor": _known(_factor(name, float(start[k]), float(result.values[k]))),
+                "factor": None
+                if name in OTHERS or start[k] == 0.0
+                else float(result.values[k] / start[k]),
                 "unit": unit_of(name),
             }
             for k, name in enumerate(names)

@@ -24,12 +24,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from alice_survey.core.compiled import kernel
+from alice_survey.core.compiled import columns, kernel
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.estimate_vector import ESTIMATE
 from alice_survey.sim.vehicle.navigation.sensors import BEAMS, DVL, IMU, PRESSURE, Sensors
-from alice_survey.sim.vehicle.rotations import applied, applied_inverse, matrix_of, turn, wrapped
+from alice_survey.sim.vehicle.rotations import matrix_of, rotate, rotate_back, turn, wrap_angle
 from alice_survey.sim.vehicle.sea import GRAVITY
 
 POSITION, VELOCITY, ATTITUDE, GYRO_BIAS, ACCELEROMETER_BIAS = 0, 3, 6, 9, 12
@@ -40,6 +40,7 @@ HEADING_BIAS, DEPTH_BIAS, DVL_SCALE, DVL_ANGLE, DVL_BIAS, GPS_BIAS, WATER = (
 ground in the body frame with the DVL's scale error in it, its attitude about the axes of NED, its
 biases, then the compass's, the depth's, scale and misalignment of the DVL, its bias of surge and
 sway, the GPS's bias of north and east, the current."""
+NORTH_AXIS, EAST_AXIS, DOWN_AXIS = columns(3)
 ERROR = 25
 QUATERNION = 6
 NOMINAL = ERROR + 1
@@ -512,7 +513,7 @@ def lever_row(nav: NavigationState, sensors: Sensors, place: int, axis: int) -> 
     a = sensors.place[place, 0] - sensors.place[IMU, 0]
     b = sensors.place[place, 1] - sensors.place[IMU, 1]
     c = sensors.place[place, 2] - sensors.place[IMU, 2]
-    n, e, d = applied(turned, a, b, c)
+    n, e, d = rotate(turned, a, b, c)
     # A lever l turned by the error f moves by f x l; along an axis a that is f . (l x a).
     h[axis] = 1.0
     if axis == 0:
@@ -528,7 +529,7 @@ def lever_row(nav: NavigationState, sensors: Sensors, place: int, axis: int) -> 
 @kernel
 def use_depth(nav: NavigationState, sensors: Sensors) -> bool:
     """Weigh the depth in `readings`."""
-    believed = lever_row(nav, sensors, PRESSURE, 2)
+    believed = lever_row(nav, sensors, PRESSURE, DOWN_AXIS)
     nav.scratch[ROW, DEPTH_BIAS] = 1.0
     innovation = nav.readings[DEPTH] - believed - nav.nominal[DEPTH_BIAS + 1]
     noise = sensors.pressure.noise_m * sensors.pressure.noise_m
@@ -547,7 +548,7 @@ def use_heading(nav: NavigationState, sensors: Sensors) -> bool:
     h[ATTITUDE], h[ATTITUDE + 1], h[ATTITUDE + 2] = -d * n / level, -d * e / level, 1.0
     h[HEADING_BIAS] = 1.0
     believed = math.atan2(turned[1, 0], turned[0, 0]) + nav.nominal[HEADING_BIAS + 1]
-    innovation = wrapped(nav.readings[HEADING] - believed)
+    innovation = wrap_angle(nav.readings[HEADING] - believed)
     noise = sensors.compass.noise_rad * sensors.compass.noise_rad
     return weigh(
         nav, sensors, COMPASS_USE, INNOVATION_AT[COMPASS_USE], innovation, noise, HEADING_BIAS, 1
@@ -577,7 +578,7 @@ def use_beams(nav: NavigationState, sensors: Sensors, through_water: bool) -> in
     # The water's velocity in the body frame.
     i0 = i1 = i2 = 0.0
     if through_water:
-        i0, i1, i2 = applied_inverse(turned, x[WATER + 1], x[WATER + 2], 0.0)
+        i0, i1, i2 = rotate_back(turned, x[WATER + 1], x[WATER + 2], 0.0)
     # What the scale multiplies still: the DVL's velocity about the IMU, minus the water's.
     k0, k1, k2 = q * l2 - r * l1 - i0, r * l0 - p * l2 - i1, p * l1 - q * l0 - i2
     u, v, w = x[VELOCITY] + k0, x[VELOCITY + 1] + k1, x[VELOCITY + 2] + k2
@@ -607,7 +608,7 @@ def use_beams(nav: NavigationState, sensors: Sensors, through_water: bool) -> in
             h[j] = 0.0
         h[VELOCITY], h[VELOCITY + 1], h[VELOCITY + 2] = c0, c1, c2
         if through_water:
-            a, b, c = applied(turned, c0, c1, c2)
+            a, b, c = rotate(turned, c0, c1, c2)
             n, e = x[WATER + 1], x[WATER + 2]
             h[ATTITUDE], h[ATTITUDE + 1], h[ATTITUDE + 2] = e * c, -n * c, n * b - e * a
             h[WATER], h[WATER + 1] = -a, -b
@@ -704,7 +705,7 @@ def correct(nav: NavigationState) -> None:
         x[i + 1] += error[i]
     # A turn f in NED is R^T f in the body frame.
     local = nav.scratch[GAIN]
-    local[0], local[1], local[2] = applied_inverse(turned, angle[0], angle[1], angle[2])
+    local[0], local[1], local[2] = rotate_back(turned, angle[0], angle[1], angle[2])
     turn(x[QUATERNION : QUATERNION + 4], local)
     for i in range(ERROR):
         error[i] = 0.0

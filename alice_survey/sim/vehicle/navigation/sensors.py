@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from alice_survey.core.compiled import columns
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.hydrodynamics.geometry import POINT, Hull
@@ -27,7 +28,7 @@ from alice_survey.sim.vehicle.sea import GRAVITY
 
 Place = tuple[float, float, float]
 
-IMU, DVL, PRESSURE, GPS, USBL, FOLLOWED = 0, 1, 2, 3, 4, 5
+IMU, DVL, PRESSURE, GPS, USBL, FOLLOWED = columns(6)
 """Rows of `Sensors.place`."""
 BEAMS = 4
 

@@ -38,11 +38,11 @@ from alice_survey.sim.vehicle.navigation.sensors import (
     Sensors,
 )
 from alice_survey.sim.vehicle.rotations import (
-    applied,
-    applied_inverse,
     matrix_of,
+    rotate,
+    rotate_back,
     turn_between,
-    wrapped,
+    wrap_angle,
 )
 from alice_survey.sim.vehicle.sea import GRAVITY, FloorGrid, floor_range
 
@@ -138,7 +138,7 @@ def navigation_tick(
         nav.readings[slot.DEPTH_TIME] = time_s
         nav.readings[slot.DEPTH] = (
             now[2]
-            + applied(truth, place[0], place[1], place[2])[2]
+            + rotate(truth, place[0], place[1], place[2])[2]
             + nav.hidden[slot.DEPTH_BIAS - slot.GYRO_BIAS]
             + suite.pressure.noise_m * rng.standard_normal()
         )
@@ -146,7 +146,7 @@ def navigation_tick(
     due = suite.gps_every > 0 and tick % suite.gps_every == 0
     if due and now[2] <= suite.gps.max_depth_m:  # the antenna is out of the water
         place = suite.place[GPS]
-        arm = applied(truth, place[0], place[1], place[2])
+        arm = rotate(truth, place[0], place[1], place[2])
         for i in range(2):
             drawn = suite.gps.noise_m * rng.standard_normal()
             bias = nav.hidden[slot.GPS_BIAS - slot.GYRO_BIAS + i]
@@ -164,8 +164,9 @@ def navigation_tick(
     due = suite.usbl_every > 0 and tick % suite.usbl_every == 0
     if due and measure_usbl(time_s, now, suite, nav, rng):
         # The sigma of the distance that is estimated.
-        north, east = lever_row(nav, suite, USBL, 0), lever_row(nav, suite, USBL, 1)
-        sigma = usbl_sigma(suite, north, east, lever_row(nav, suite, USBL, 2))
+        north = lever_row(nav, suite, USBL, slot.NORTH_AXIS)
+        east = lever_row(nav, suite, USBL, slot.EAST_AXIS)
+        sigma = usbl_sigma(suite, north, east, lever_row(nav, suite, USBL, slot.DOWN_AXIS))
         used |= use_fix(nav, suite, slot.USBL_USE, USBL, slot.USBL_FIX, sigma * sigma, -1)
     if suite.dvl_every > 0 and tick % suite.dvl_every == 0:
         pinged = True
@@ -201,7 +202,7 @@ def _write_estimate(nav: NavigationState, suite: Sensors, estimate: Array) -> No
     estimate[3] = math.atan2(turned[2, 1], turned[2, 2])
     estimate[4] = -math.asin(min(max(turned[2, 0], -1.0), 1.0))
     heading = math.atan2(turned[1, 0], turned[0, 0])
-    memory[slot.HEADING_TURNS] += wrapped(heading - memory[slot.HEADING_TURNS])
+    memory[slot.HEADING_TURNS] += wrap_angle(heading - memory[slot.HEADING_TURNS])
     estimate[vector.HEADING] = memory[slot.HEADING_TURNS]
 
 
@@ -237,7 +238,7 @@ def _hear_floor(time_s: float, used: int, nav: NavigationState, suite: Sensors) 
         b = reach * suite.beams[i, 1] + place[DVL, 1] - place[FOLLOWED, 1]
         c = reach * suite.beams[i, 2] + place[DVL, 2] - place[FOLLOWED, 2]
         # Where the beam ends, from the followed point.
-        n, e, d = applied(turned, a, b, c)
+        n, e, d = rotate(turned, a, b, c)
         count += 1
         sn, se, sd = sn + n, se + e, sd + d
         snn, sne, see = snn + n * n, sne + n * e, see + e * e
@@ -292,7 +293,7 @@ def _hear_floor(time_s: float, used: int, nav: NavigationState, suite: Sensors) 
         else:
             a, b, c = place[DVL, 0], place[DVL, 1], place[DVL, 2]
         a, b, c = a - place[FOLLOWED, 0], b - place[FOLLOWED, 1], c - place[FOLLOWED, 2]
-        n, e, d = applied(turned, a, b, c)
+        n, e, d = rotate(turned, a, b, c)
         clearance = min(clearance, altitude + north * n + east * e - d)
         lowest = max(lowest, d)
     memory[slot.CLEARANCE_PING] = min(clearance, highest - lowest)
@@ -363,7 +364,7 @@ def log_row(nav: NavigationState, out: Array) -> None:
         nav.memory[slot.IMU_PLACE + 1],
         nav.memory[slot.IMU_PLACE + 2],
     )
-    n, e, d = applied(turned, a, b, c)
+    n, e, d = rotate(turned, a, b, c)
     t = slot.ATTITUDE
     # The origin lies at minus the lever l from the IMU: the error f moves it by -f x l.
     for i, g0, g1, g2 in ((0, 0.0, -d, e), (1, d, 0.0, -n), (2, -e, n, 0.0)):
@@ -411,12 +412,12 @@ def measure_imu(
     a0, a1, a2 = q * z - r * y, r * x - p * z, p * y - q * x
     p, q, r = now[10], now[11], now[12]
     b0, b1, b2 = q * z - r * y, r * x - p * z, p * y - q * x
-    a0, a1, a2 = applied(a, a0, a1, a2)
-    b0, b1, b2 = applied(b, b0, b1, b2)
+    a0, a1, a2 = rotate(a, a0, a1, a2)
+    b0, b1, b2 = rotate(b, b0, b1, b2)
     d0 = now[7] - before[7] + b0 - a0
     d1 = now[8] - before[8] + b1 - a1
     d2 = now[9] - before[9] + b2 - a2 - GRAVITY * dt_s
-    d0, d1, d2 = applied_inverse(a, d0, d1, d2)
+    d0, d1, d2 = rotate_back(a, d0, d1, d2)
     root = math.sqrt(dt_s)
     for i in range(3):
         noise = sensors.imu.gyro_noise_rad_per_sqrt_s * root * rng.standard_normal()
@@ -444,7 +445,7 @@ def measure_usbl(
 ) -> bool:
     """North and east of the transponder; whether there was an answer."""
     place, turn = sensors.place[USBL], nav.turns[slot.TRUTH_NOW]
-    north, east, depth = applied(turn, place[0], place[1], place[2])
+    north, east, depth = rotate(turn, place[0], place[1], place[2])
     north, east, depth = now[0] + north, now[1] + east, now[2] + depth
     a, b = north - sensors.usbl.boat_ned_m[0], east - sensors.usbl.boat_ned_m[1]
     c = depth - sensors.usbl.boat_ned_m[2]
@@ -490,9 +491,9 @@ def measure_dvl(
     x, y, z = sensors.place[DVL, 0], sensors.place[DVL, 1], sensors.place[DVL, 2]
     p, q, r = now[10], now[11], now[12]
     spin0, spin1, spin2 = q * z - r * y, r * x - p * z, p * y - q * x
-    north, east, depth = applied(turn, x, y, z)
+    north, east, depth = rotate(turn, x, y, z)
     north, east, depth = now[0] + north, now[1] + east, now[2] + depth
-    u, v, w = applied_inverse(turn, now[7], now[8], now[9])
+    u, v, w = rotate_back(turn, now[7], now[8], now[9])
     u, v, w = u + spin0, v + spin1, w + spin2
     speed = math.sqrt(u * u + v * v + w * w)
     sigma = dvl.beam_noise_mps + dvl.beam_noise_per_speed * speed
@@ -502,7 +503,7 @@ def measure_dvl(
         bottom &= not (silent[0] <= time_s < silent[1])
     for i in range(BEAMS if bottom else 0):
         b0, b1, b2 = sensors.beams[i, 0], sensors.beams[i, 1], sensors.beams[i, 2]
-        beam_n, beam_e, down = applied(turn, b0, b1, b2)
+        beam_n, beam_e, down = rotate(turn, b0, b1, b2)
         reach = floor_range(floor, north, east, depth, beam_n, beam_e, down, dvl.max_range_m)
         if not math.isfinite(reach):
             continue
@@ -530,7 +531,7 @@ def measure_dvl(
         return
     # Relative to the water: its velocity is taken off in NED before it is turned.
     n, e = now[7] - water_ned[0], now[8] - water_ned[1]
-    u, v, w = applied_inverse(turn, n, e, now[9])
+    u, v, w = rotate_back(turn, n, e, now[9])
     u, v, w = u + spin0, v + spin1, w + spin2
     for i in range(BEAMS):
         readings[slot.WATER_BEAM + i] = (

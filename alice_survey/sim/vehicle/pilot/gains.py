@@ -45,13 +45,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey.core.compiled import columns
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.allocation import AXIS_WEIGHTS, LEVEL_WEIGHTS
 from alice_survey.sim.vehicle.dynamics import Body, coriolis_matrix
 from alice_survey.sim.vehicle.fins import MAX_RAD, Fins, fin_slope, pack_fins, write_fin_matrix
 from alice_survey.sim.vehicle.propulsion import thrust_limits
-from alice_survey.sim.vehicle.steady import keeps, min_radius_m
+from alice_survey.sim.vehicle.steady import balance_fins, min_radius_m
 from alice_survey.sim.vehicle.vehicle import Vehicle
 
 LATERAL, VERTICAL = (1, 5), (2, 4)
@@ -125,7 +126,7 @@ def linear_coriolis(body: Body, nu: Array) -> Array:
     return result
 
 
-SURGE, SWAY, HEAVE, YAW, ROLL, PITCH = range(6)
+SURGE, SWAY, HEAVE, YAW, ROLL, PITCH = columns(6)
 """Rows of `Gains.axes`."""
 DEGREES = (0, 1, 2, 5)
 """Which of the 6 degrees of freedom each of the first rows is: those that a mission steers."""
@@ -251,11 +252,13 @@ def gains_for(vehicle: Vehicle, speed_mps: float, navigation_hz: float = 5.0) ->
         lag_s += _TICK_S / 2
         decay = float(damping[degree, degree]) / inertia
         if axis >= STEERED:  # attitude and its rates are known at every tick
-            omega, rate, place = placed(lag_s, decay, 2 * math.pi / (SAMPLES_PER_PERIOD * _TICK_S))
+            omega, rate, place = place_poles(
+                lag_s, decay, 2 * math.pi / (SAMPLES_PER_PERIOD * _TICK_S)
+            )
             axes[axis, [RATE, PLACE, LAG, BANDWIDTH]] = rate, place, lag_s, omega
             axes[axis, INTEGRAL] = _integral(rate, place, omega, decay)
             continue
-        omega, rate, place = placed(lag_s, decay, fastest_rad_s)
+        omega, rate, place = place_poles(lag_s, decay, fastest_rad_s)
         axes[axis, [RATE, PLACE]] = rate, place
         axes[axis, INNER] = min(rate, 1.0 / (4.0 * lag_s)) if axis == SWAY else rate
         axes[axis, FASTEST] = fastest = _steady_speed(plant.body, degree, STEADY_SHARE * weakest)
@@ -325,7 +328,7 @@ def _gains_of_fins(vehicle: Vehicle, speed_mps: float, navigation_hz: float) -> 
         fastest_rad_s = 2 * math.pi * known_hz / SAMPLES_PER_PERIOD
         if axis != SURGE:
             fastest_rad_s = min(fastest_rad_s, math.sqrt(weakest / inertia / KEPT_RAD))
-        omega, rate, place = placed(lag_s, decay, fastest_rad_s)
+        omega, rate, place = place_poles(lag_s, decay, fastest_rad_s)
         if axis in (YAW, PITCH):
             plane = LATERAL if axis == YAW else VERTICAL
             rate, place, damped = _damped_together(
@@ -345,7 +348,7 @@ def _gains_of_fins(vehicle: Vehicle, speed_mps: float, navigation_hz: float) -> 
             if rate > 0.0:
                 axes[axis, WEIGHT] = min(max((place / omega - decay) / rate, 0.0), 1.0)
     axes[YAW, FASTEST] = min(speed_mps / radius_m, _MAX_TURN_RAD_S)
-    level = keeps(vehicle, speed_mps)
+    level = balance_fins(vehicle, speed_mps)
     level_rad = 0.0 if level is None else level.pitch_rad
     return Gains(plant.body, plant.fins, np.zeros(len(vehicle.fins)), level_rad, axes)
 
@@ -373,7 +376,9 @@ def _holds(configuration: Array, lower: Array, upper: Array) -> bool:
     return all(min(-minimum, maximum) > _NO_FORCE for minimum, maximum in ends)
 
 
-def placed(lag_s: float, decay_per_s: float, fastest_rad_s: float) -> tuple[float, float, float]:
+def place_poles(
+    lag_s: float, decay_per_s: float, fastest_rad_s: float
+) -> tuple[float, float, float]:
     """Natural frequency, rate gain and place gain of the rule above.
 
     Args:

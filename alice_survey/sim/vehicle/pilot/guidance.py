@@ -54,7 +54,7 @@ from alice_survey.sim.vehicle.pilot.steering import (
     DEPTH_KEPT_M,
     HEADING_KEPT_RAD,
     brake_for_stop,
-    clamped,
+    clamp,
     head_for,
     hear_floor,
     hold_level,
@@ -69,7 +69,7 @@ from alice_survey.sim.vehicle.pilot.steering import (
     write_wrench,
 )
 from alice_survey.sim.vehicle.pilot.steps import END_E, END_N
-from alice_survey.sim.vehicle.rotations import wrapped
+from alice_survey.sim.vehicle.rotations import wrap_angle
 
 _STEP_M = 1000.0
 """Progress of a step of a mission that is done, above the length of any."""
@@ -102,9 +102,9 @@ def go_to(goal_n: float, goal_e: float, heading: float, tick: Tick) -> tuple[flo
         head_for(course, bend * path.speed_mps, 0.0, tick)
         surge_at(path.speed_mps, tick)
         pilot.report[slot.BY_SWAY] = 0.0
-        return distance, wrapped(heading - now)
+        return distance, wrap_angle(heading - now)
     ahead, abeam = math.cos(now) * dn + math.sin(now) * de, math.cos(now) * de - math.sin(now) * dn
-    speed = clamped(_HOVER_SHARE * gains.axes[SURGE, BANDWIDTH] * ahead, path.speed_mps)
+    speed = clamp(_HOVER_SHARE * gains.axes[SURGE, BANDWIDTH] * ahead, path.speed_mps)
     hover = guidance.sway > 0.0 and distance < _HOVER_M
     if hover:
         error = head_for(heading, 0.0, 0.0, tick)
@@ -281,8 +281,8 @@ def steer(
             turning = guidance.under_way.side * speed / guidance.under_way.circle_m
         heading = report[slot.TARGET_HEADING] + turning * dt_s
         if turning != 0.0:  # no farther ahead of the vehicle than it keeps up with
-            behind = wrapped(heading - estimate[vector.HEADING])
-            heading = estimate[vector.HEADING] + clamped(behind, HEADING_KEPT_RAD)
+            behind = wrap_angle(heading - estimate[vector.HEADING])
+            heading = estimate[vector.HEADING] + clamp(behind, HEADING_KEPT_RAD)
         head_for(heading, turning, 0.0, tick)
         surge_at(speed, tick)
         report[slot.LINE], report[slot.BY_SWAY] = -1.0, 0.0

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from alice_survey.core.compiled import columns
 from alice_survey.core.frames import Array
 
 (
@@ -19,7 +20,7 @@ an abort; heading of the path, rad. Phase, leg, distance, the steering mode and 
 also inputs of the pilot on the next tick."""
 REPORT = 13
 
-DIVE, APPROACH, FOLLOW, ASCEND, DONE, ABORT = 0, 1, 2, 3, 4, 5
+DIVE, APPROACH, FOLLOW, ASCEND, DONE, ABORT = columns(6)
 """Phases of the guidance."""
 
 (

@@ -65,14 +65,14 @@ from alice_survey.sim.vehicle.pilot.safety import mind_floor, restart_watch
 from alice_survey.sim.vehicle.pilot.settings import Tick
 from alice_survey.sim.vehicle.pilot.steering import (
     StopReference,
-    clamped,
+    clamp,
     head_for,
     keep_place,
     ramp,
     sink_to,
     surge_at,
 )
-from alice_survey.sim.vehicle.rotations import wrapped
+from alice_survey.sim.vehicle.rotations import wrap_angle
 
 MIN_SPEED_MPS = 0.2
 """WPNAV_SPEED_MIN: a slower speed is not taken."""
@@ -142,8 +142,8 @@ def to_waypoint(step: Array, heave_m: float, settings: Array, tick: Tick) -> boo
         target_n = moves * c + settings[_POSITION_P] * off_n
         target_e = moves * s + settings[_POSITION_P] * off_e
         if length > 1e-6 and math.hypot(target_n, target_e) >= _SLOW * speed:
-            error = wrapped(math.atan2(target_e, target_n) - course)
-            heading += clamped(error, settings[_XTRACK])
+            error = wrap_angle(math.atan2(target_e, target_n) - course)
+            heading += clamp(error, settings[_XTRACK])
     head_for(heading, 0.0, 0.0, tick)
     reference = StopReference(north, east, course, moves, quicken, heading, 0.0, 0.0, at, False)
     keep_place(reference, tick)
@@ -341,7 +341,7 @@ def manoeuvre(step: Array, heave_m: float, settings: Array, tick: Tick) -> bool:
         heading = math.atan2(de, dn)
         speed = settings[_ANCHOR_KP] * (math.hypot(dn, de) - settings[_ANCHOR_RADIUS])
         speed = min(max(speed, settings[_ANCHOR_MIN]), settings[_ANCHOR_MAX])
-        if abs(wrapped(heading - estimate[vector.HEADING])) > _ANCHOR_RAD:
+        if abs(wrap_angle(heading - estimate[vector.HEADING])) > _ANCHOR_RAD:
             speed = 0.0
         head_for(heading, 0.0, 0.0, tick)
         surge_at(speed, tick)
@@ -396,7 +396,7 @@ def _section(step: Array, tolerance_m: float, heave_m: float, settings: Array, t
         speed = 0.0
     if to_end < _STRAIGHT * tolerance_m:
         heading = now
-    off = abs(wrapped(heading - now))
+    off = abs(wrap_angle(heading - now))
     speed *= min(max((_YAW_STOP_RAD - off) / (_YAW_STOP_RAD - _YAW_FREE_RAD), 0.0), 1.0)
     head_for(heading, 0.0, 0.0, tick)
     surge_at(speed, tick)

@@ -58,11 +58,11 @@ from alice_survey.sim.vehicle.pilot.memory import PilotState
 from alice_survey.sim.vehicle.pilot.path import Path, place_at
 from alice_survey.sim.vehicle.pilot.safety import restart_watch
 from alice_survey.sim.vehicle.pilot.settings import MAX_PITCH_RAD, Guidance, Tick
-from alice_survey.sim.vehicle.rotations import wrapped
+from alice_survey.sim.vehicle.rotations import wrap_angle
 
 
 @kernel
-def clamped(value: float, maximum: float) -> float:
+def clamp(value: float, maximum: float) -> float:
     """The value within -most and most."""
     return min(max(value, -maximum), maximum)
 
@@ -90,7 +90,7 @@ def place_demand(
     """
     row = gains.axes[axis]
     inner = row[INNER]
-    steady = feed + clamped(row[PLACE] / inner * error, maximum)
+    steady = feed + clamp(row[PLACE] / inner * error, maximum)
     derivative = (row[RATE] / inner - 1.0) * (feed - speed)
     return steady, inner * (steady + total + derivative - speed)
 
@@ -141,7 +141,7 @@ def speed_demand(
     row, error = gains.axes[axis], target - speed
     if full * error <= 0.0:
         step = row[PLACE] / row[RATE] * error * dt_s
-        total = clamped(total + step, sum_bound(gains, axis))
+        total = clamp(total + step, sum_bound(gains, axis))
     return row[RATE] * (row[WEIGHT] * target - speed + total), total
 
 
@@ -208,7 +208,7 @@ def hold_level(
         wrench[i] = min(max(asked, row[LEAST]), row[MOST])
         if (asked - wrench[i]) * angle >= 0.0:  # not cut, or on the way back
             step = row[INTEGRAL] * angle * dt_s
-            pilot.memory[place] = clamped(total + step, max(-row[LEAST], row[MOST]) / row[MASS])
+            pilot.memory[place] = clamp(total + step, max(-row[LEAST], row[MOST]) / row[MASS])
 
 
 DEPTH_KEPT_M = 0.2
@@ -267,7 +267,7 @@ def hear_floor(estimate: Array, dt_s: float, guidance: Guidance, pilot: PilotSta
         memory[slot.FLOOR_KNOWN], memory[slot.FLOOR] = 1.0, heard
         restart_watch(pilot)
         return
-    innovation = clamped(heard - memory[slot.FLOOR], _MAX_INNOVATION_M)
+    innovation = clamp(heard - memory[slot.FLOOR], _MAX_INNOVATION_M)
     memory[slot.FLOOR] += dt_s * (memory[slot.FLOOR_SLOPE] + 2.0 * rate * innovation)
     memory[slot.FLOOR_SLOPE] += dt_s * rate * rate * innovation
 
@@ -297,14 +297,14 @@ def sink_to(depth_m: float, feed_mps: float, tick: Tick) -> None:
         HEAVE,
         error,
         pilot.point[slot.SINK_SPEED],
-        clamped(feed_mps, 0.5 * maximum),
+        clamp(feed_mps, 0.5 * maximum),
         memory[slot.HEAVE_SUM],
         maximum,
     )
     if abs(error) < DEPTH_KEPT_M or abs(pilot.point[slot.SINK_SPEED]) < _AT_REST * maximum:
-        near = clamped(error, DEPTH_KEPT_M)
+        near = clamp(error, DEPTH_KEPT_M)
         step = place_sum_step(gains, HEAVE, near, demand[slot.FULL_HEAVE], dt_s)
-        memory[slot.HEAVE_SUM] = clamped(memory[slot.HEAVE_SUM] + step, sum_bound(gains, HEAVE))
+        memory[slot.HEAVE_SUM] = clamp(memory[slot.HEAVE_SUM] + step, sum_bound(gains, HEAVE))
 
 
 @kernel
@@ -322,16 +322,16 @@ def head_for(heading: float, feed: float, quicken: float, tick: Tick) -> float:
     """
     dt_s, estimate, _path, _guidance, gains, pilot = tick
     memory, demand = pilot.memory, pilot.demand
-    error, maximum = wrapped(heading - estimate[vector.HEADING]), gains.axes[YAW, FASTEST]
+    error, maximum = wrap_angle(heading - estimate[vector.HEADING]), gains.axes[YAW, FASTEST]
     demand[slot.REF_YAW], accelerate = place_demand(
         gains, YAW, error, pilot.point[slot.TURN_SPEED], feed, memory[slot.YAW_SUM], maximum
     )
     demand[slot.ACC_YAW] = accelerate + quicken
     off = abs(pilot.point[slot.TURN_SPEED] - feed)
     if abs(error) < HEADING_KEPT_RAD or off < _AT_REST * maximum:
-        near = clamped(error, HEADING_KEPT_RAD)
+        near = clamp(error, HEADING_KEPT_RAD)
         step = place_sum_step(gains, YAW, near, demand[slot.FULL_YAW], dt_s)
-        memory[slot.YAW_SUM] = clamped(memory[slot.YAW_SUM] + step, sum_bound(gains, YAW))
+        memory[slot.YAW_SUM] = clamp(memory[slot.YAW_SUM] + step, sum_bound(gains, YAW))
     pilot.report[slot.TARGET_HEADING] = heading
     return error
 
@@ -460,8 +460,8 @@ def ramp(
     target = min(target, stopping)
     step = target * dt_s
     if step >= left - _TINY:
-        return goal, 0.0, clamped(-speed / dt_s, acceleration)
-    return at + step, target, clamped((target - speed) / dt_s, acceleration)
+        return goal, 0.0, clamp(-speed / dt_s, acceleration)
+    return at + step, target, clamp((target - speed) / dt_s, acceleration)
 
 
 class StopReference(NamedTuple):
@@ -518,7 +518,7 @@ def stand(leg: int, tick: Tick) -> bool:
     if path.turn_rad[leg] != 0.0:
         sense, goal = math.copysign(1.0, path.turn_rad[leg]), abs(path.turn_rad[leg])
         n, e, start, _ = place_at(path, leg, 0.0)
-        behind = abs(wrapped(start + sense * memory[slot.REF] - estimate[vector.HEADING]))
+        behind = abs(wrap_angle(start + sense * memory[slot.REF] - estimate[vector.HEADING]))
         # A reference goes slower from this far ahead of the vehicle on, and waits at twice that.
         maximum = guidance.spot_rad_s * min(max(2.0 - behind / _BEHIND_RAD, 0.0), 1.0)
         lag_s = gains.axes[YAW, LAG]
@@ -598,7 +598,7 @@ def keep_place(target: StopReference, tick: Tick) -> tuple[float, float]:
         accelerate + target.quicken_mps2 * cosine + lever * demand[slot.ACC_YAW]
     )
     pilot.report[slot.TARGET_SURGE] = steady
-    near = clamped(pulled, STOP_M)
+    near = clamp(pulled, STOP_M)
     step = place_sum_step(gains, SURGE, near, demand[slot.FULL_SURGE], dt_s)
     north, east = memory[slot.PLACE_SUM_N] + c * step, memory[slot.PLACE_SUM_E] + s * step
     cut = min(1.0, sum_bound(gains, SURGE) / max(math.hypot(north, east), 1e-9))

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from alice_survey.core.errors import VehicleError
 from alice_survey.sim.vehicle import propulsion as kernels
 from alice_survey.sim.vehicle.files import vehicle_from
-from alice_survey.sim.vehicle.propulsion import Thruster, pack, weakened
+from alice_survey.sim.vehicle.propulsion import Thruster, pack, with_health
 from tests import oracles_propulsion as oracles
 from tests.oracles_propulsion import Array
 
@@ -173,18 +173,18 @@ def test_health_is_the_share_of_bollard_thrust_that_is_left() -> None:
     kernels.thrust_limits(PACKED, np.ones(5), REST, full[0], full[1])
     kernels.thrust_limits(PACKED, health, REST, weak[0], weak[1])
     np.testing.assert_allclose(weak, health * full, rtol=1e-12)
-    kernels.thrust_limits(weakened(PACKED, health), np.ones(5), REST, full[0], full[1])
+    kernels.thrust_limits(with_health(PACKED, health), np.ones(5), REST, full[0], full[1])
     np.testing.assert_allclose(full, weak, rtol=1e-12)
 
 
 def test_a_failed_thruster_runs_down_whatever_is_asked() -> None:
     rates = np.zeros(5)
-    failed = weakened(PACKED, np.array([1.0, 0.0, 1.0, 1.0, 1.0]))
+    failed = with_health(PACKED, np.array([1.0, 0.0, 1.0, 1.0, 1.0]))
     kernels.add_speed_rates(failed, np.full(5, 10.0), np.full(5, 40.0), rates)
     assert rates[1] == pytest.approx(-10.0 / PORT.time_constant_s)
     assert np.all(np.delete(rates, 1) > 0)
     with pytest.raises(VehicleError):
-        weakened(PACKED, np.array([1.0, 2.0, 1.0, 1.0, 1.0]))
+        with_health(PACKED, np.array([1.0, 2.0, 1.0, 1.0, 1.0]))
 
 
 def test_speeds_follow_what_is_asked_with_a_first_order_lag() -> None:

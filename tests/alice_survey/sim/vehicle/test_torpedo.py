@@ -27,8 +27,8 @@ from alice_survey.sim.vehicle.pilot.gains import (
 from alice_survey.sim.vehicle.pilot.settings import UnderWay, circle_course, dive_loop
 from alice_survey.sim.vehicle.steady import (
     MAX_DRIFT_RAD,
-    held,
-    keeps,
+    balance_fins,
+    fin_flight,
     min_radius_m,
     min_speed_mps,
     steady_flight,
@@ -120,7 +120,7 @@ def test_fins_lift_as_their_shape_has_it() -> None:
 @pytest.mark.parametrize("turn", [0.0, 0.1, -0.1])
 def test_steady_flight_is_one_by_the_equations_of_the_textbook(speed: float, turn: float) -> None:
     """Nothing changes but roll, which is left to the low weight: heave, pitch, sway and yaw."""
-    flight = keeps(REMUS, speed, turn)
+    flight = balance_fins(REMUS, speed, turn)
     assert flight is not None
     attitude = np.array([0.0, flight.pitch_rad, 0.4])
     load = np.array([flight.force_x_n, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -140,8 +140,8 @@ def test_steady_flight_is_one_by_the_equations_of_the_textbook(speed: float, tur
 def test_the_lowest_speed_is_that_at_which_lift_carries_the_buoyancy() -> None:
     minimum = min_speed_mps(REMUS, SHARE)
     assert 0.3 < minimum < 0.6
-    assert held(REMUS, 1.01 * minimum, 0.0, SHARE) is not None
-    assert held(REMUS, 0.97 * minimum, 0.0, SHARE) is None
+    assert fin_flight(REMUS, 1.01 * minimum, 0.0, SHARE) is not None
+    assert fin_flight(REMUS, 0.97 * minimum, 0.0, SHARE) is None
     # Lift grows with the square of the speed: four times as light, twice as fast, where nothing
     # rights the hull.
     body = replace(REMUS.rigid_body, cg_body_m=(0.0, 0.0, 0.0))
@@ -161,10 +161,10 @@ def test_the_lowest_speed_is_that_at_which_lift_carries_the_buoyancy() -> None:
 def test_the_tightest_turn_is_one_that_fins_hold() -> None:
     radius = min_radius_m(REMUS, 1.0, SHARE)
     assert 5.0 < radius < 8.0
-    flight = held(REMUS, 1.0, 1.0 / (1.01 * radius), SHARE)
+    flight = fin_flight(REMUS, 1.0, 1.0 / (1.01 * radius), SHARE)
     assert flight is not None
     assert flight.load <= SHARE and flight.drift_rad <= MAX_DRIFT_RAD
-    assert held(REMUS, 1.0, 1.0 / (0.98 * radius), SHARE) is None
+    assert fin_flight(REMUS, 1.0, 1.0 / (0.98 * radius), SHARE) is None
 
 
 @pytest.mark.parametrize("speed", SPEEDS)
@@ -215,7 +215,7 @@ def test_power_is_that_of_drag_and_turns() -> None:
     nu[:, 0], nu[1, 5], nu[2, 0], nu[3, 1] = 1.5, 0.2, 0.2, 0.1
     flight = steady_flight(REMUS, nu, share=SHARE)
     assert np.isnan(flight.power_w).tolist() == [False, False, True, True]
-    level = keeps(REMUS, 1.5)
+    level = balance_fins(REMUS, 1.5)
     assert level is not None
     assert level.force_x_n == pytest.approx(2.94 * 1.5**2, rel=0.05)
     n = flight.rps[0, 0]

@@ -11,10 +11,10 @@ from alice_survey.sim.vehicle.coefficients import Coefficients
 from alice_survey.sim.vehicle.hydrodynamics.geometry import ALICE, SPARUS2, Geometry, Outline
 from alice_survey.sim.vehicle.hydrodynamics.parts import (
     Flow,
+    by_name,
     drag_of,
     estimate,
     inertia_of,
-    named,
     part_coefficients,
     parts,
 )
@@ -141,8 +141,8 @@ def test_strips_of_a_spheroid_lie_just_above_the_exact_added_mass() -> None:
 
 def test_names_turn_back_into_the_matrix() -> None:
     matrix = np.arange(36, dtype=np.float64).reshape(6, 6)
-    again = Coefficients(name="test", values=named(matrix, kind="quadratic"))
+    again = Coefficients(name="test", values=by_name(matrix, kind="quadratic"))
     np.testing.assert_array_equal(again.quadratic, matrix)
     symmetric = matrix + matrix.T
-    again = Coefficients(name="test", values=named(symmetric, kind="dot"))
+    again = Coefficients(name="test", values=by_name(symmetric, kind="dot"))
     np.testing.assert_array_equal(again.added_mass, symmetric)

@@ -152,9 +152,9 @@ def twin_update(
 
     if tick % 2 == 0:
         heading = oracle.heading(belief)
-        wrapped = heading + rotations.wrapped(readings[HEADING] - heading)
+        wrapped = heading + rotations.wrap_angle(readings[HEADING] - heading)
         add(
-            lambda b: np.array([heading + rotations.wrapped(oracle.heading(b) - heading)]),
+            lambda b: np.array([heading + rotations.wrap_angle(oracle.heading(b) - heading)]),
             np.array([wrapped]),
             np.array([sensors.compass.noise_rad**2]),
         )

@@ -29,7 +29,7 @@ AXES = [("alice", axis) for axis in range(4)] + [("sparus2", axis) for axis in (
 @given(lag_s=st.floats(0.02, 3.0), decay_per_s=st.floats(0.0, 3.0), fastest=st.floats(0.1, 30.0))
 @settings(deadline=None)
 def test_poles_lie_where_they_are_placed(lag_s: float, decay_per_s: float, fastest: float) -> None:
-    omega, rate, place = g.placed(lag_s, decay_per_s, fastest)
+    omega, rate, place = g.place_poles(lag_s, decay_per_s, fastest)
     if rate == 0.0:  # the water damps more than was wanted
         assert lag_s * (2 * omega * (1 / lag_s + decay_per_s - 2 * omega) + omega**2) <= decay_per_s
         return
