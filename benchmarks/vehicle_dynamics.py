@@ -175,7 +175,7 @@ class NumpyTwin:
         force -= body.in_current @ np.concatenate([along, rotation[:2].T @ self.water[2:4]])
         out[7:STATE] = body.mass_inverse @ force
         asked = np.where(np.abs(command_rps) < t[:, propulsion.DEAD_BAND], 0.0, command_rps)
-        maximum = t[:, propulsion.MOST]
+        maximum = t[:, propulsion.MAX_RPS]
         out[STATE:] = (np.clip(asked, -maximum, maximum) - rps) * t[:, propulsion.RATE]
         return out
 

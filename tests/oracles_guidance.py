@@ -74,7 +74,7 @@ def wrench(gains: Gains, demand: Array) -> Array:
     force[2] -= body.weight_n - body.buoyancy_n
     result = np.zeros(6)
     for axis, degree in enumerate(g.DEGREES):
-        result[degree] = np.clip(force[degree], *gains.axes[axis, [g.LEAST, g.MOST]])
+        result[degree] = np.clip(force[degree], *gains.axes[axis, [g.MIN_FORCE, g.MAX_FORCE]])
     return result
 
 

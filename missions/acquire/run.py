@@ -170,7 +170,7 @@ def run_images(
     if not stations:
         raise NavigationError(f"{triggers} holds no trigger: plan a larger area")
     truth = read_track(track)
-    believed = _believed(navigation, np.array([t for _, t in stations]))
+    believed = _believed_records(navigation, np.array([t for _, t in stations]))
     rig = true_rig(camera, water, scale=imaging.scale, seed=seed)
     terrain = folder / "truth" / "terrain.ply"
     if not terrain.with_suffix(".json").exists():
@@ -220,7 +220,7 @@ def run_images(
     )
 
 
-def _believed(path: Path, at_s: Array) -> list[ImageRecord]:
+def _believed_records(path: Path, at_s: Array) -> list[ImageRecord]:
     """What the navigation log says at some times: rows of the manifest that lack their picture."""
     log = read_navigation(path, UTC)
     if at_s.min() < log.time_s[0] or at_s.max() > log.time_s[-1]:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from alice_survey.core.config import CameraConfig, PlanConfig, SeaConfig, VehicleConfig
 from alice_survey.core.errors import PlanError
-from alice_survey.sim.vehicle.pilot.settings import SPOT_RAD_S, spot_rate_rad_s
+from alice_survey.sim.vehicle.pilot.settings import TURN_IN_PLACE_RAD_S, turn_in_place_rate_rad_s
 from camera_calib.rig import Rig
 from missions.exports.follower import Follower, follower_of
 from missions.values.footprint import common_swath
@@ -24,7 +24,7 @@ class Options:
     camera_on: str = "camera_trigger/enable"
     """COLA2: the service (without arguments) that starts pictures."""
     camera_off: str = "camera_trigger/disable"
-    turn_rate_rad_s: float = SPOT_RAD_S
+    turn_rate_rad_s: float = TURN_IN_PLACE_RAD_S
     """Rate of turns on the spot, which way-points wait for."""
     follower: Follower | None = None
     """The vehicle and its sea; None where they are not known."""
@@ -44,7 +44,7 @@ def options_of(
     follower = None if vehicle is None or sea is None else follower_of(vehicle, sea, plan.speed_mps)
     return Options(
         altimeter_body_m=camera.dvl_position_body_m,
-        turn_rate_rad_s=spot_rate_rad_s(plan.turn_rate_limit_deg_s),
+        turn_rate_rad_s=turn_in_place_rate_rad_s(plan.turn_rate_limit_deg_s),
         follower=follower,
     )
 

@@ -207,11 +207,15 @@ def _check_text(check: Check) -> str:
     record, planned, flown = check.record, check.planned, check.flown
     pattern = flown.pattern
     pictures = pattern.passes * pattern.pictures
-    wanted = f"{counted(pattern.passes, 'line')}, {pictures} pictures of each camera"
+    pattern_text = f"{counted(pattern.passes, 'line')}, {pictures} pictures of each camera"
     rows = [
         ("in at least one picture", planned.covered_share, flown.covered_share),
         ("in stereo", planned.stereo_share, flown.stereo_share),
-        (f"at the requested overlap ({wanted})", planned.share_at_overlap, flown.share_at_overlap),
+        (
+            f"at the requested overlap ({pattern_text})",
+            planned.share_at_overlap,
+            flown.share_at_overlap,
+        ),
     ]
     width = max(len(name) for name, _, _ in rows)
     altitude = record.stations.altitude_m

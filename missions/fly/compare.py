@@ -300,7 +300,7 @@ def fly_variant(
 def with_variant(setup: Setup, variant: Variant) -> Setup:
     """A mission with the variant's look-ahead and belief."""
     believed = with_equal_thrust(setup.vehicle) if variant.equal_speeds else setup.vehicle
-    gains = gains_for(believed.weakened(dict.fromkeys(variant.failed, 0.0)), setup.path.speed_mps)
+    gains = gains_for(believed.weaken(dict.fromkeys(variant.failed, 0.0)), setup.path.speed_mps)
     guidance = pilot_guidance(
         gains,
         setup.path,
@@ -519,7 +519,7 @@ def _data(
                 "look_ahead_m": {o.variant: o.look_ahead_m for o in result.outcomes},
                 "variants": {
                     name: {
-                        figure: {key: _known(value) for key, value in values.items()}
+                        figure: {key: _or_none(value) for key, value in values.items()}
                         for figure, values in summary.items()
                     }
                     for name, summary in result.summaries.items()
@@ -589,7 +589,7 @@ def _write_flights(path: Path, outcomes: Sequence[Outcome]) -> None:
     )  # fmt: skip
 
 
-def _known(value: float) -> float | None:
+def _or_none(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 

@@ -38,7 +38,7 @@ _SIGMAS = 2.0
 @figure_style()
 def draw_flight(path: Path, flight: Flight) -> None:
     """Draw a map of plan, true track and navigation next to strips of the errors."""
-    cross, heading = (values[_thinned(flight)] for values in flight.line_errors)
+    cross, heading = (values[_every_nth(flight)] for values in flight.line_errors)
     attitude = np.rad2deg(flight.attitude_rad)
     figure, strips = _sheet(flight, 6)
     for axes, label, curves in zip(
@@ -59,9 +59,9 @@ def draw_flight(path: Path, flight: Flight) -> None:
     altitude_m = flight.plan.altitude_m
     strips[3].set_ylim(altitude_m - 0.5, altitude_m + 0.5)
     for axes, name in zip(strips[4:], ("north", "east"), strict=True):
-        column = flight.flown.navigation[_thinned(flight), LOG_COLUMNS.index(f"sigma_{name}_m")]
+        column = flight.flown.navigation[_every_nth(flight), LOG_COLUMNS.index(f"sigma_{name}_m")]
         axes.fill_between(
-            flight.truth.time_s[_thinned(flight)], -_SIGMAS * column, _SIGMAS * column, color=NAV,
+            flight.truth.time_s[_every_nth(flight)], -_SIGMAS * column, _SIGMAS * column, color=NAV,
             alpha=0.18, lw=0, label=f"±{_SIGMAS:g} logged sigmas",
         )  # fmt: skip
     strips[0].set_title(f"{rms(cross):.3f} m rms on lines, heading {np.rad2deg(rms(heading)):.1f}°")
@@ -134,7 +134,7 @@ def _sheet(flight: Flight, count: int) -> tuple[Sheet, list[Axes]]:
     chart, first = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
     strips = [first, *(figure.add_subplot(grid[i, 1], sharex=first) for i in range(1, count))]
     draw_plan(chart, flight.plan)
-    some = _thinned(flight)
+    some = _every_nth(flight)
     for track, colour, label in (
         (flight.glass_ned, TRUE, "true track of the left port"),
         (flight.believed_glass_ned, NAV, "believed track"),
@@ -161,7 +161,7 @@ def _navigation_error(flight: Flight, axis: int) -> list[tuple[str, Array]]:
     return [("believed minus true", error[:, axis])]
 
 
-def _thinned(flight: Flight) -> slice:
+def _every_nth(flight: Flight) -> slice:
     """Every n-th tick, so that a curve stays light."""
     return slice(None, None, max(1, math.ceil(len(flight.line) / _MAX_POINTS)))
 
@@ -169,7 +169,7 @@ def _thinned(flight: Flight) -> slice:
 def _draw_curves(
     axes: Axes, flight: Flight, label: str, curves: Iterable[tuple[str, Array]]
 ) -> None:
-    some = _thinned(flight)
+    some = _every_nth(flight)
     colours = itertools.cycle(INKS)
     for (name, values), colour in zip(curves, colours, strict=False):
         axes.plot(flight.truth.time_s[some], values[some], color=colour, label=name, lw=0.9)

@@ -59,10 +59,10 @@ def whole_route(plan: Plan) -> Route:
     Raises:
         PlanError: a dive begins elsewhere than the one before has ended.
     """
-    return Route(legs=tuple(_joined(plan)))
+    return Route(legs=tuple(_join_dives(plan)))
 
 
-def _joined(plan: Plan) -> Iterator[Leg]:
+def _join_dives(plan: Plan) -> Iterator[Leg]:
     last: Leg | None = None
     for dive in plan.dives:
         first = dive.route.legs[0]
@@ -104,25 +104,25 @@ def path_of(plan: Plan) -> Path:
     )
 
 
-def turns_on_the_spot(path: Path) -> int:
+def turns_in_place(path: Path) -> int:
     """How many there are."""
     return int(np.count_nonzero(path.turn_rad))
 
 
-def room_behind_m(plan: Plan, path: Path, most_m: float) -> float:
+def room_behind_m(plan: Plan, path: Path, max_m: float) -> float:
     """How far the vehicle may go back from the path's start, to come in straight.
 
     Args:
         plan: whose allowed area counts.
         path: its first leg's course.
-        most_m: the most that is of use.
+        max_m: the most that is of use.
     """
     start = np.array([path.start_n[0], path.start_e[0]])
     course = float(path.heading_rad[0])
-    end = start - most_m * np.array([math.cos(course), math.sin(course)])
+    end = start - max_m * np.array([math.cos(course), math.sin(course)])
     inside = LineString([start, end]).intersection(plan.area.allowed.buffer(_TOUCH_M))
     parts = [part for part in shapely.get_parts(inside) if part.distance(Point(start)) <= _TOUCH_M]
-    return min(most_m, max((float(part.length) for part in parts), default=0.0))
+    return min(max_m, max((float(part.length) for part in parts), default=0.0))
 
 
 def roomier_side(plan: Plan, path: Path, way_in_m: float, radius_m: float) -> tuple[float, float]:

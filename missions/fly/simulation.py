@@ -33,7 +33,11 @@ from alice_survey.sim.vehicle.pilot.memory import DONE, FOLLOW, LINE, PHASE, REA
 from alice_survey.sim.vehicle.pilot.mission import NO_LAW, NO_MISSION, PilotMission
 from alice_survey.sim.vehicle.pilot.path import Path
 from alice_survey.sim.vehicle.pilot.safety import NONE, REASONS, SafetyLimits
-from alice_survey.sim.vehicle.pilot.settings import Guidance, pilot_guidance, spot_rate_rad_s
+from alice_survey.sim.vehicle.pilot.settings import (
+    Guidance,
+    pilot_guidance,
+    turn_in_place_rate_rad_s,
+)
 from alice_survey.sim.vehicle.sea import (
     Current,
     Disturbance,
@@ -46,7 +50,7 @@ from alice_survey.sim.vehicle.sea import (
 )
 from alice_survey.sim.vehicle.simulator import Failure, Flown, Setup, simulate
 from alice_survey.sim.vehicle.vehicle import Vehicle
-from missions.fly.flight_route import path_of, room_behind_m, roomier_side, turns_on_the_spot
+from missions.fly.flight_route import path_of, room_behind_m, roomier_side, turns_in_place
 from missions.route.energy import sound_craft_of
 from missions.values.flight import Flight, trigger_times
 from missions.values.navigation import BelievedNavigation
@@ -187,7 +191,7 @@ def piloting_of(
             "m/s: lower the speed"
         )
     path = path_of(plan)
-    turns = turns_on_the_spot(path)
+    turns = turns_in_place(path)
     if turns and mission.law == NO_LAW and settings.vehicle.controller == "los":
         warn(
             f"{vehicle.name} cannot push itself sideways under the controller los: in each of the "
@@ -200,14 +204,14 @@ def piloting_of(
     followed_body_m = settings.camera.position_body_m if mission.law == NO_LAW else reference
 
     def pilot_without(left: Mapping[str, float]) -> tuple[Gains, Guidance]:
-        gains = gains_for(vehicle.weakened(left), plan.speed_mps)
+        gains = gains_for(vehicle.weaken(left), plan.speed_mps)
         guidance = pilot_guidance(
             gains,
             path,
             settings.vehicle.controller,
             max_depth_m=deepest_m,
             point_body_m=followed_body_m,
-            spot_rad_s=spot_rate_rad_s(settings.turn_rate_limit_deg_s),
+            turn_in_place_rad_s=turn_in_place_rate_rad_s(settings.turn_rate_limit_deg_s),
             limits=SafetyLimits(
                 0.5 * plan.altitude_m,
                 deepest_m,

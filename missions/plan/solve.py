@@ -10,7 +10,7 @@ import numpy as np
 from alice_survey.core.artefacts import json_values
 from alice_survey.core.config import PlanConfig, SurveyConfig
 from alice_survey.core.errors import ConfigError, PlanError
-from alice_survey.sim.vehicle.pilot.settings import spot_rate_rad_s
+from alice_survey.sim.vehicle.pilot.settings import turn_in_place_rate_rad_s
 from missions.exposure.settings import ImagingSetup, imaging_settings
 from missions.exposure.solve import (
     lens_text,
@@ -175,7 +175,7 @@ def turn_s(plan: PlanConfig, spacing_m: float) -> float:
     three arcs `R (pi + 4 acos((2 R + s) / (4 R)))`; on the spot: two right angles and the way
     between. `turns = "auto"` takes the quicker.
     """
-    rate_rad_s = spot_rate_rad_s(plan.turn_rate_limit_deg_s)
+    rate_rad_s = turn_in_place_rate_rad_s(plan.turn_rate_limit_deg_s)
     costs, radius = time_costs(plan.speed_mps, turn_rate_rad_s=rate_rad_s), plan.arc_radius_m
     if spacing_m >= 2 * radius:
         arcs = math.pi * radius + spacing_m - 2 * radius

@@ -35,7 +35,11 @@ from alice_survey.core.errors import PlanError, VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.files import coefficients_from_file, vehicle_to_fly
 from alice_survey.sim.vehicle.pilot.gains import STEADY_SHARE
-from alice_survey.sim.vehicle.pilot.settings import MAX_PITCH_RAD, STEP_MPS, spot_rate_rad_s
+from alice_survey.sim.vehicle.pilot.settings import (
+    MAX_PITCH_RAD,
+    STEP_MPS,
+    turn_in_place_rate_rad_s,
+)
 from alice_survey.sim.vehicle.steady import steady_flight
 from alice_survey.sim.vehicle.vehicle import Vehicle
 from missions.values.costs import SETTLE_S, Costs
@@ -103,7 +107,7 @@ def flight_conditions(config: SurveyConfig) -> FlightConditions:
         line_heading_deg=plan.line_heading_deg,
         current_ne_mps=expected_current(config.sea, config.area.seafloor_depth_m - plan.altitude_m),
         turn_radius_m=plan.arc_radius_m,
-        max_spot_rad_s=spot_rate_rad_s(plan.turn_rate_limit_deg_s),
+        max_spot_rad_s=turn_in_place_rate_rad_s(plan.turn_rate_limit_deg_s),
         glass_body_m=config.camera.position_body_m,
         hotel_w=hotel_w(config.vehicle),
         needs_arcs=plan.turns == "arcs" or bool(craft.fins),
@@ -264,7 +268,7 @@ def craft_of(settings: VehicleConfig) -> Vehicle:
         VehicleError: as `sound_craft_of`.
     """
     craft = sound_craft_of(settings)
-    left = craft.weakened(settings.impaired if settings.health_known else {})
+    left = craft.weaken(settings.impaired if settings.health_known else {})
     if not left.thrusters:
         raise VehicleError(f"{craft.name} has no thruster left: check vehicle.thruster_health")
     return left

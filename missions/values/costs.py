@@ -9,7 +9,7 @@ import numpy as np
 from alice_survey.core.compiled import compiled_ieee
 from alice_survey.core.errors import PlanError
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.pilot.settings import SPOT_RAD_S, STEP_MPS
+from alice_survey.sim.vehicle.pilot.settings import STEP_MPS, TURN_IN_PLACE_RAD_S
 from missions.values.legs import Route
 
 SETTLE_S = 6.5
@@ -78,7 +78,7 @@ class Costs(NamedTuple):
 def time_costs(
     speed_mps: float,
     *,
-    turn_rate_rad_s: float = SPOT_RAD_S,
+    turn_rate_rad_s: float = TURN_IN_PLACE_RAD_S,
     settle_s: float = SETTLE_S,
     sway_mps: float = STEP_MPS,
     heave_mps: float = 0.15,

@@ -45,10 +45,10 @@ def true_rig(camera: CameraConfig, water: WaterConfig, *, scale: int, seed: int)
     """
     rng = np.random.default_rng([seed, _SEED_STREAM])
     design = design_rig(camera, water)
-    cameras = {name: _built(drawn, rng).reduced(scale) for name, drawn in design.cameras.items()}
+    cameras = {name: _build(drawn, rng).reduced(scale) for name, drawn in design.cameras.items()}
     turn = Rotation.from_rotvec(rng.uniform(-TURN_TOLERANCE_RAD, TURN_TOLERANCE_RAD, 3))
     shift = rng.uniform(-BASELINE_TOLERANCE_M, BASELINE_TOLERANCE_M, 3)
-    cameras = {name: _tilted(built, rng) for name, built in cameras.items()}
+    cameras = {name: _tilt(built, rng) for name, built in cameras.items()}
     pose = design.cam_from_rig["right"]
     right = RigidTransform.from_components(pose.translation + shift, turn * pose.rotation)
     return replace(
@@ -59,11 +59,11 @@ def true_rig(camera: CameraConfig, water: WaterConfig, *, scale: int, seed: int)
     )
 
 
-def _built(camera: Camera, rng: np.random.Generator) -> Camera:
+def _build(camera: Camera, rng: np.random.Generator) -> Camera:
     focal = 1.0 + rng.uniform(-FOCAL_TOLERANCE, FOCAL_TOLERANCE)
     skew = 1.0 + rng.uniform(-1e-4, 1e-4)
     centre = rng.uniform(-CENTRE_TOLERANCE_PX, CENTRE_TOLERANCE_PX, 2)
-    port = _shifted(camera, camera.port.places, PORT_TOLERANCE_M, rng)
+    port = _shift(camera, camera.port.places, PORT_TOLERANCE_M, rng)
     port = {name: max(value, camera.port.minimum(name)) for name, value in port.items()}
     terms = {name: rng.uniform(*ends) for name, ends in _DISTORTION[camera.lens.model].items()}
     return camera.with_parameters(
@@ -78,11 +78,11 @@ def _built(camera: Camera, rng: np.random.Generator) -> Camera:
     )
 
 
-def _tilted(camera: Camera, rng: np.random.Generator) -> Camera:
-    return camera.with_parameters(_shifted(camera, camera.port.tilts, TILT_TOLERANCE, rng))
+def _tilt(camera: Camera, rng: np.random.Generator) -> Camera:
+    return camera.with_parameters(_shift(camera, camera.port.tilts, TILT_TOLERANCE, rng))
 
 
-def _shifted(
+def _shift(
     camera: Camera, names: Sequence[str], tolerance: float, rng: np.random.Generator
 ) -> dict[str, float]:
     return {name: camera.parameter(name) + rng.uniform(-tolerance, tolerance) for name in names}

@@ -109,7 +109,7 @@ def add_octave(
 
 
 @compiled
-def spot(
+def speck(
     x: float,
     y: float,
     z: float,
@@ -278,7 +278,7 @@ def _albedo(points: Array, material: Array, footprint: Array, seed: int, out: Ar
                 # The edge of a stone is ragged, not the smooth contour of the grid.
                 stone = _step(0.44, 0.56, kind + 0.3 * fine[i]) if kind > 0.001 else 0.0
                 if stone < 1.0:
-                    r, g, b = _specked(x[i], y[i], z[i], apart[i], seed, fine[i], r, g, b)
+                    r, g, b = _add_specks(x[i], y[i], z[i], apart[i], seed, fine[i], r, g, b)
                 if stone > 0.0:
                     rr, rg, rb = _rock(coarse[i], fine[i], growth[i], hue[i])
                     r, g, b = r + stone * (rr - r), g + stone * (rg - g), b + stone * (rb - b)
@@ -308,13 +308,13 @@ def _rock(coarse: float, fine: float, growth: float, hue: float) -> tuple[float,
 
 
 @compiled(inline="always")
-def _specked(
+def _add_specks(
     x: float, y: float, z: float, apart: float, seed: int, fine: float, r: float, g: float, b: float
 ) -> tuple[float, float, float]:
     for k in range(len(_SPECKS)):
         if _SPECKS[k, 0] < 3.0 * apart:
             continue
-        cover, back, gloom, own = spot(
+        cover, back, gloom, own = speck(
             x,
             y,
             z,

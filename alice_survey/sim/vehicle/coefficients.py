@@ -87,7 +87,7 @@ class Coefficients:
         """(4,) body lift: Y_uv, Z_uw, M_uw, N_uv."""
         return np.array([self.values.get(name, 0.0) for name in LIFTS])
 
-    def replaced(self, name: str, values: Mapping[str, float]) -> "Coefficients":
+    def with_values(self, name: str, values: Mapping[str, float]) -> "Coefficients":
         """Another set with some values replaced or added.
 
         An added mass replaces its mirror too: a new N_vdot drops the old Y_rdot; and a damping of

@@ -158,7 +158,7 @@ def _vehicle_of(path: Path, text: str, coefficients: str) -> Vehicle:
     return Vehicle(
         name=found.name or path.stem,
         rigid_body=found.rigid_body,
-        coefficients=_chosen(path, found, coefficients),
+        coefficients=_choose_set(path, found, coefficients),
         thrusters=found.thrusters,
         fins=found.fins,
         hull=found.hull,
@@ -192,7 +192,7 @@ def _with_shape(table: dict[str, Any]) -> dict[str, Any]:
     return {"hull": shape.hull, **table, "rigid_body": {**water, **body}}
 
 
-def _chosen(path: Path, found: _VehicleFile, name: str) -> Coefficients:
+def _choose_set(path: Path, found: _VehicleFile, name: str) -> Coefficients:
     """Coefficients of a file: its own, or one of its sets."""
     if not found.coefficient_sets:
         if name != OWN_SET:
@@ -209,11 +209,11 @@ def _chosen(path: Path, found: _VehicleFile, name: str) -> Coefficients:
         return PAPER_SETS[chosen]
     if found.geometry is None:
         raise VehicleError(f"{path}: coefficients are {chosen} from a shape: name its geometry")
-    return _computed(found.geometry)
+    return _estimate_of(found.geometry)
 
 
 @cache
-def _computed(geometry: str) -> Coefficients:
+def _estimate_of(geometry: str) -> Coefficients:
     return estimate(GEOMETRIES[geometry])
 
 

@@ -105,14 +105,14 @@ def vehicle_log(
 ) -> VehicleLog:
     """A log of what is known; the rest is NaN. Fields as in `VehicleLog`."""
 
-    def filled(value: Array | None, *shape: int) -> Array:
+    def fill(value: Array | None, *shape: int) -> Array:
         return np.full((len(time_s), *shape), np.nan) if value is None else np.asarray(value, float)
 
     return VehicleLog(
-        source=source, time_s=np.asarray(time_s, float), position_ned=filled(position_ned, 3),
-        quaternion_xyzw=filled(quaternion_xyzw, 4), velocity_body=filled(velocity_body, 3),
-        rates_body=filled(rates_body, 3), altitude_m=filled(altitude_m), rpm=dict(rpm or {}),
-        thrust_n=dict(thrust_n or {}), wrench=filled(wrench, 6),
+        source=source, time_s=np.asarray(time_s, float), position_ned=fill(position_ned, 3),
+        quaternion_xyzw=fill(quaternion_xyzw, 4), velocity_body=fill(velocity_body, 3),
+        rates_body=fill(rates_body, 3), altitude_m=fill(altitude_m), rpm=dict(rpm or {}),
+        thrust_n=dict(thrust_n or {}), wrench=fill(wrench, 6),
     )  # fmt: skip
 
 
@@ -443,7 +443,7 @@ def read_foreign_log(path: Path, columns: ColumnMap) -> VehicleLog:
             position = np.stack([position[:, 1], position[:, 0], -position[:, 2]], axis=1)
         add("north_m east_m depth_m", position)
     if columns.quaternion_xyzw is not None:
-        add("quat_x quat_y quat_z quat_w", _turned(many(columns.quaternion_xyzw), columns, path))
+        add("quat_x quat_y quat_z quat_w", _turn_axes(many(columns.quaternion_xyzw), columns, path))
     elif columns.angles_deg is not None:
         angles = np.deg2rad(many(columns.angles_deg))
         known = np.all(np.isfinite(angles), axis=1)
@@ -481,7 +481,7 @@ def _thrust(pulses: Array, columns: ColumnMap, source: str) -> Array:
     return np.where(pulses == 0.0, 0.0, thrust)
 
 
-def _turned(quaternions: Array, columns: ColumnMap, path: Path) -> Array:
+def _turn_axes(quaternions: Array, columns: ColumnMap, path: Path) -> Array:
     """Quaternions of ned_from_frd, (T, 4); NaN stays."""
     known = np.isfinite(unit_lengths(quaternions, str(path)))
     turned = np.full(quaternions.shape, np.nan)

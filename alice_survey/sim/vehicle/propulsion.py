@@ -152,7 +152,7 @@ JET_AREA = 15
 """rho A, kg/m."""
 DRAG = 16
 """Four columns: 1/2 rho V^(2/3) times a, then b; and times c, then d."""
-MOST, DEAD_BAND, RATE = 20, 21, 22
+MAX_RPS, DEAD_BAND, RATE = 20, 21, 22
 """rev/s, rev/s, 1/s."""
 WATTS, IDLE = 23, 24
 """Electrical watts per watt on the shaft; W."""
@@ -219,7 +219,7 @@ def pack(thrusters: Sequence[Thruster], density: float, displaced_kg: float) -> 
         row[DRAG : DRAG + 4] = np.array(t.jet_drag) * [
             0.5 * density * volume, 1.0, 0.5 * density * volume, 1.0,
         ]  # fmt: skip
-        row[[MOST, DEAD_BAND, RATE]] = t.most_rps, t.dead_band_rps, 1.0 / t.time_constant_s
+        row[[MAX_RPS, DEAD_BAND, RATE]] = t.most_rps, t.dead_band_rps, 1.0 / t.time_constant_s
         row[WATTS], row[IDLE] = 1.0 / t.efficiency, t.idle_w
         row[DISTRUST] = 2.0 * row[JET_LOSS] / (_REFERENCE_SHARE * row[FORWARD] * t.most_rps**2)
     return Propulsion(table)
@@ -240,7 +240,7 @@ def with_health(propulsion: Propulsion, health: Array) -> Propulsion:
             f"health {health} is not a share, 0 to 1, of each of {len(propulsion.table)} thrusters"
         )
     table = propulsion.table.copy()
-    table[:, MOST] *= np.sqrt(health)
+    table[:, MAX_RPS] *= np.sqrt(health)
     return Propulsion(table)
 
 
@@ -317,7 +317,7 @@ def add_speed_rates(propulsion: Propulsion, rps: Array, command_rps: Array, out:
         asked = command_rps[i]
         if abs(asked) < t[i, DEAD_BAND]:
             asked = 0.0
-        maximum = t[i, MOST]
+        maximum = t[i, MAX_RPS]
         out[i] = (min(max(asked, -maximum), maximum) - rps[i]) * t[i, RATE]
 
 
@@ -336,7 +336,7 @@ def thrust_limits(
     """
     t = propulsion.table
     for i in range(t.shape[0]):
-        maximum = t[i, MOST] * math.sqrt(health[i])
+        maximum = t[i, MAX_RPS] * math.sqrt(health[i])
         for ahead in range(2):  # the law of `add_thrust`
             n = maximum if ahead else -maximum
             gain = t[i, FORWARD] if n > 0.0 else t[i, REVERSE]

@@ -245,7 +245,7 @@ def with_swell(
         step_s * np.arange(math.ceil(duration_s / step_s) + 1, dtype=np.float64), current.time_s
     )
     layers = np.union1d(np.linspace(0.0, depth_m, _LAYERS), current.depth_m)
-    before = _resampled(current, time_s, layers)
+    before = _resample(current, time_s, layers)
     speed = orbital_speed_mps(height_m, period_s, depth_m, np.clip(layers, 0.0, depth_m))
     phase = np.cos(2.0 * math.pi / period_s * time_s)
     towards = math.radians(towards_deg)
@@ -255,7 +255,7 @@ def with_swell(
     return check_current(Current(time_s, layers, velocity))
 
 
-def _resampled(current: Current, time_s: Array, depth_m: Array) -> Array:
+def _resample(current: Current, time_s: Array, depth_m: Array) -> Array:
     """(T, Z, 2) the current at other times and depths; constant beyond its own."""
     at_depths = np.stack(
         [

@@ -32,7 +32,7 @@ from alice_survey.sim.vehicle.allocation import (
 from alice_survey.sim.vehicle.dynamics import Body, add_coriolis, add_damping, add_weight
 from alice_survey.sim.vehicle.fins import MAX_RAD, add_fins, write_fin_matrix
 from alice_survey.sim.vehicle.propulsion import (
-    MOST,
+    MAX_RPS,
     Propulsion,
     add_thrust,
     electrical_power,
@@ -100,12 +100,12 @@ def balance_fins(vehicle: Vehicle, speed_mps: float, turn_rad_s: float = 0.0) ->
         add_weight(body, -math.sin(pitch), 0.0, math.cos(pitch), force)
         return force
 
-    def unbalanced(unknown: Array) -> Array:
+    def imbalance(unknown: Array) -> Array:
         left: Array = forces(unknown)[[1, 2, 4, 5]]
         return left
 
     found = root(
-        unbalanced,
+        imbalance,
         np.array([0.0, -0.3 * turn_rad_s / max(speed_mps, 1e-9), 0.0, 0.0]),
     )
     if np.abs(found.fun).max() > _BALANCED * (1.0 + np.abs(matrix).max()):
@@ -275,7 +275,7 @@ def steady_flight(
     balanced = np.flatnonzero(axes) if slips or vehicle.fins else list(BALANCED)
     off = np.abs(requested - made)[:, balanced].max(axis=1)
     lost = ~(off <= 1e3 * _TOLERANCE_N)
-    load = (rps / propulsion.table[:, MOST]) ** 2
+    load = (rps / propulsion.table[:, MAX_RPS]) ** 2
     return SteadyFlight(
         rps=np.where(lost[:, None], np.nan, rps),
         power_w=np.where(lost, np.nan, power_w.sum(axis=1)),

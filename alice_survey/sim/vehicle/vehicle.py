@@ -165,9 +165,9 @@ class Vehicle:
 
     def without(self, thrusters: Sequence[str]) -> "Vehicle":
         """The same vehicle with some thrusters taken off."""
-        return self.weakened(dict.fromkeys(thrusters, 0.0))
+        return self.weaken(dict.fromkeys(thrusters, 0.0))
 
-    def weakened(self, left: Mapping[str, float]) -> "Vehicle":
+    def weaken(self, left: Mapping[str, float]) -> "Vehicle":
         """The same vehicle with weaker thrusters, and without those that have failed.
 
         Args:

@@ -21,9 +21,9 @@ from alice_survey.sim.vehicle.navigation.sensors import DVL
 from alice_survey.sim.vehicle.pilot.command import allocate, new_allocation
 from alice_survey.sim.vehicle.pilot.gains import (
     HEAVE,
-    LEAST,
     MASS,
-    MOST,
+    MAX_FORCE,
+    MIN_FORCE,
     SURGE,
     SWAY,
     YAW,
@@ -45,7 +45,7 @@ class InnerLoops:
     def __init__(self, vehicle: SimulatedVehicle) -> None:
         gains = gains_for(vehicle.vehicle, 0.2)
         self.mass, self.minimum, self.maximum = (
-            gains.axes[list(AXES), k] for k in (MASS, LEAST, MOST)
+            gains.axes[list(AXES), k] for k in (MASS, MIN_FORCE, MAX_FORCE)
         )
         self.allocation = new_allocation(
             vehicle.vehicle, np.ones(len(vehicle.vehicle.thrusters)), exact=True, axes=AXIS_WEIGHTS

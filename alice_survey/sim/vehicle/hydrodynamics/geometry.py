@@ -166,11 +166,11 @@ class Outline:
         sides = np.sum((r[1:] + r[:-1]) * np.hypot(np.diff(x), np.diff(r)))
         return float(np.pi * (sides + r[0] ** 2 + r[-1] ** 2))
 
-    def moved(self, by_m: float) -> "Outline":
+    def shift(self, by_m: float) -> "Outline":
         """The same shape, further forward."""
         return Outline(x_m=tuple(x + by_m for x in self.x_m), radius_m=self.radius_m)
 
-    def stretched(self, tail_x_m: float, nose_x_m: float) -> "Outline":
+    def stretch(self, tail_x_m: float, nose_x_m: float) -> "Outline":
         """The same radii on stations spread evenly to other ends."""
         scale = (nose_x_m - tail_x_m) / self.length_m
         return Outline(
@@ -357,7 +357,7 @@ SPARUS2 = Geometry(
     tunnels=(Tunnel(name="vertical", x_m=0.0, axis="z", diameter_m=0.08),),
 )
 
-_ALICE_HULL = _SPARUS2_HULL.stretched(-0.90, 1.06)
+_ALICE_HULL = _SPARUS2_HULL.stretch(-0.90, 1.06)
 """Inferred. The paper states 1.6 m, but its tables hold for 1.96 m only: Y_uv = -39.71 gives
 l_h / d_h = 8.52, and M_uw = -8.498 gives x_cp = -0.214 and so x_n = 1.06. Both ends of ALICE were
 rebuilt (a nose with camera and thruster, "completely redesigned" tail), so that the shape of the
@@ -373,7 +373,7 @@ ALICE = Geometry(
     name="alice",
     outline=_ALICE_HULL,
     mast=replace(SPARUS2.mast, x_m=-0.472),
-    pod=replace(SPARUS2.pod, outline=_POD.moved(_MOVED_M)),
+    pod=replace(SPARUS2.pod, outline=_POD.shift(_MOVED_M)),
     mount=replace(
         SPARUS2.mount,
         aft_x_m=SPARUS2.mount.aft_x_m + _MOVED_M,

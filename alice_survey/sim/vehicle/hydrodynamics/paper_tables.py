@@ -46,14 +46,14 @@ class PaperRow:
     @property
     def value(self) -> float:
         """First column with its sign corrected."""
-        return self._signed(self.printed)
+        return self._with_sign(self.printed)
 
     @property
     def other(self) -> float | None:
         """Second column with its sign corrected."""
-        return None if self.printed_other is None else self._signed(self.printed_other)
+        return None if self.printed_other is None else self._with_sign(self.printed_other)
 
-    def _signed(self, printed: float) -> float:
+    def _with_sign(self, printed: float) -> float:
         sign = _SIGNS.get(self.coefficient)
         return printed if sign is None else sign * abs(printed)
 
@@ -123,10 +123,10 @@ _LIFT = {name: v for name, v in _values(TABLE_IV, "estimated").items() if name i
 ESTIMATED = Coefficients(name="estimated", values={**_values(TABLE_III, "estimated"), **_LIFT})
 """Table III, with the body lift of table IV's analytic column."""
 
-CFD = ESTIMATED.replaced("cfd", _values(TABLE_IV, "other"))
+CFD = ESTIMATED.with_values("cfd", _values(TABLE_IV, "other"))
 """Damping and lift from the paper's CFD; added mass, which it did not compute, as estimated."""
 
-CALIBRATED = CFD.replaced("calibrated", _values(TABLE_V, "other"))
+CALIBRATED = CFD.with_values("calibrated", _values(TABLE_V, "other"))
 """What was fitted at sea (table V), the rest as in CFD; the paper's numbers, unchanged.
 
 X_udot = -28.06 is a fit and no property of the hull: it exceeds Y_vdot = -23.53, which no slender

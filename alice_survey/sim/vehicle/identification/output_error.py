@@ -61,11 +61,11 @@ from alice_survey.sim.vehicle.identification.sensitivity import (
 from alice_survey.sim.vehicle.identification.windows import Mask, Window, cut, residual_channels
 from alice_survey.sim.vehicle.log import attitude_of
 
-_LEAST, _MOST = 10, 20
+_MIN_STRETCHES, _MAX_STRETCHES = 10, 20
 """Stretches that logs are cut into: few are long, many show the spread better."""
 _WINDOWS = 4
 """Windows in a stretch where there are many."""
-_FEWEST = 5
+_MIN_JUDGED = 5
 """With fewer stretches the spread is not known."""
 
 
@@ -105,10 +105,10 @@ def stretch_numbers(times_s: list[Array]) -> list[NDArray[np.intp]]:
         The number of its stretch for each row of each window.
     """
     spans = np.array([float(time_s[-1] - time_s[0]) for time_s in times_s])
-    target = min(max(len(spans) // _WINDOWS, _LEAST), _MOST)
+    target = min(max(len(spans) // _WINDOWS, _MIN_STRETCHES), _MAX_STRETCHES)
     length_s, ends = spans.sum() / target, np.cumsum(spans)
     numbers: list[NDArray[np.intp]] = []
-    if len(spans) < _FEWEST:
+    if len(spans) < _MIN_JUDGED:
         for time_s, end_s in zip(times_s, ends.tolist(), strict=True):
             passed = end_s - (time_s[-1] - time_s)
             numbers.append(np.minimum(passed / length_s, target - 1).astype(np.intp))
@@ -128,7 +128,7 @@ def jackknife_covariance(stretches: Stretches, prior: Array) -> Array | None:
         prior: (P, P) information that is not of the logs and stays when a stretch is left out.
     """
     count = len(stretches)
-    if count < _FEWEST:
+    if count < _MIN_JUDGED:
         return None
     total = stretches.information.sum(axis=0) + prior
     moves = np.array(
@@ -154,7 +154,7 @@ def design_effect(stretches: Stretches, prior: Array) -> float:
         prior: (P, P) information that is not of the logs.
     """
     count = len(stretches)
-    if count < _FEWEST:
+    if count < _MIN_JUDGED:
         return 1.0
     away = stretches.scores - stretches.scores.mean(axis=0)
     logs = stretches.information.sum(axis=0)
@@ -581,7 +581,7 @@ class _FitProblem:
             return None  # an inertia that is none: the step was too long
         solved = []
         for i, window in enumerate(self.windows):
-            start = _moved(self.starts[i], -self.gains[i] @ (values - self.at))
+            start = _move_start(self.starts[i], -self.gains[i] @ (values - self.at))
             found = self._start(window, i, physics, start)
             if found is None:
                 found = self._start(window, i, physics, window.start)
@@ -605,7 +605,7 @@ class _FitProblem:
                 break
             step, share = -np.linalg.solve(triangle, along), 1.0
             while share > 1e-3:
-                trial = _moved(start, share * step)
+                trial = _move_start(start, share * step)
                 better = self._simulate(window, i, physics, trial)
                 if better is not None and better[0] @ better[0] < residual @ residual:
                     start, found = trial, better
@@ -680,7 +680,7 @@ class _FitProblem:
 def _first_sigma(windows: Sequence[Window]) -> Array:
     """First sigma of each channel, (9,): the noise, or a share of the spread if larger."""
     sigma = np.full(CHANNELS, np.nan)
-    attitude = [np.unwrap(_known(attitude_of(w.record.attitude)), axis=0) for w in windows]
+    attitude = [np.unwrap(_known_rows(attitude_of(w.record.attitude)), axis=0) for w in windows]
     for channel in range(CHANNELS):
         table = (
             [w.measured[:, channel] for w in windows]
@@ -695,7 +695,7 @@ def _first_sigma(windows: Sequence[Window]) -> Array:
     return sigma
 
 
-def _known(angles: Array) -> Array:
+def _known_rows(angles: Array) -> Array:
     return angles[np.all(np.isfinite(angles), axis=1)]
 
 
@@ -706,7 +706,7 @@ def _blank(window: Window) -> Array:
     return blank
 
 
-def _moved(start: Array, step: Array) -> Array:
+def _move_start(start: Array, step: Array) -> Array:
     """A start (10,) turned about the body's axes and with nu changed by a step (9,)."""
     moved = start.copy()
     turned = Rotation.from_quat(start[:4]) * Rotation.from_rotvec(step[:3])

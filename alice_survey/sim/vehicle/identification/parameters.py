@@ -64,7 +64,7 @@ class Parameters:
     @cached_property
     def start(self) -> Array:
         """(P,) values that the vehicle has."""
-        return np.array([self._given(name) for name in self.names])
+        return np.array([self._given_value(name) for name in self.names])
 
     @cached_property
     def bounds(self) -> tuple[Array, Array]:
@@ -91,12 +91,12 @@ class Parameters:
             for key, value in zip(self.names, values, strict=True)
             if key not in OTHERS
         }
-        return self.vehicle.coefficients.replaced(name, free)
+        return self.vehicle.coefficients.with_values(name, free)
 
     def others(self, values: Array) -> dict[str, float]:
         """All parameters that are not coefficients."""
         free = dict(zip(self.names, (float(v) for v in values), strict=True))
-        return {name: free.get(name, self._given(name)) for name in OTHERS}
+        return {name: free.get(name, self._given_value(name)) for name in OTHERS}
 
     def physics(self, values: Array) -> Physics:
         """The vehicle with values (P,) of the parameters, for compiled code.
@@ -121,7 +121,7 @@ class Parameters:
             np.zeros(6),
         )
 
-    def _given(self, name: str) -> float:
+    def _given_value(self, name: str) -> float:
         if name not in OTHERS:
             return self.vehicle.coefficients.value(name)
         if name in self.fixed:

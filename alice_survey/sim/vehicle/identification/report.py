@@ -157,7 +157,7 @@ def validate(
     simulated, constant, longest = [], [], 0.0
     errors: dict[float, list[tuple[Array, Array]]] = {h: [] for h in horizons_s}
     for window in windows:
-        filled = _held(window.measured)
+        filled = _hold_last(window.measured)
         start = _state(window, filled, 0, physics.current_ne, physics.bias)
         simulated.append(run(window, start, physics, how))
         constant.append(np.tile(filled[0], (len(filled), 1)))
@@ -248,7 +248,7 @@ def _state(window: Window, filled: Array, row: int, current_ne: Array, bias: Arr
     return state
 
 
-def _held(measured: Array) -> Array:
+def _hold_last(measured: Array) -> Array:
     """Measurements with the last known one in rows without; the first known one before it."""
     filled = measured.copy()
     for column in filled.T:
@@ -611,7 +611,7 @@ def _data(
             name: {
                 "start": float(start[k]),
                 "identified": float(result.values[k]),
-                "sigma": _known(result.sigma[k]),
+                "sigma": _or_none(result.sigma[k]),
                 "factor": None
                 if name in OTHERS or start[k] == 0.0
                 else float(result.values[k] / start[k]),
@@ -622,7 +622,7 @@ def _data(
         "others": result.parameters.others(result.values),
         "poorly_determined": poorly_determined(names, result.values, result.sigma),
         "thrust": [
-            {**asdict(one), "sigma": _known(one.sigma), "factor": one.factor} for one in thrust
+            {**asdict(one), "sigma": _or_none(one.sigma), "factor": one.factor} for one in thrust
         ],
     }
     if own is not None:
@@ -632,7 +632,7 @@ def _data(
             {"of": [a, b], "correlation": value} for a, b, value in high_correlations(fit)
         ]
         data["residual_sigma"] = {
-            name: _known(value)
+            name: _or_none(value)
             for name, value in zip(CHANNEL_NAMES, fit.channel_sigma, strict=True)
         }
         data["prior"] = None if fit.prior is None else asdict(fit.prior)
@@ -648,12 +648,12 @@ def _data(
     return data
 
 
-def _known(value: float) -> float | None:
+def _or_none(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
 def _motions(values: Array) -> dict[str, float | None]:
-    return {name: _known(value) for name, value in zip(CHANNEL_NAMES[:6], values, strict=True)}
+    return {name: _or_none(value) for name, value in zip(CHANNEL_NAMES[:6], values, strict=True)}
 
 
 def _fit_data(found: MotionValidation) -> dict[str, Any]:

@@ -243,7 +243,7 @@ def calibrate(windows: Sequence[Window], parameters: Parameters) -> TwoStep:
             f"the two-step calibration knows coefficients only, not {', '.join(strange)}: use "
             "--method joint"
         )
-    rows = _smoothed(windows, parameters)
+    rows = _smooth(windows, parameters)
     values, sigma = parameters.start.copy(), np.full(len(parameters.names), np.nan)
     steps = [""] * len(parameters.names)
     for _ in range(_PASSES):
@@ -282,7 +282,7 @@ def _regress(
     forces = np.empty((len(rows.states), 6))
     _forces(physics, rows.states, rows.rps, rows.wrench, forces)
     known = physics.body.mass[force] @ rows.accelerations.T
-    known -= _averaged(rows, forces[:, force : force + 1])[:, 0]
+    known -= _average(rows, forces[:, force : force + 1])[:, 0]
     if much:
         # Inertia was kept for the Coriolis forces; its part of this row is the unknown.
         for k in group:
@@ -290,7 +290,7 @@ def _regress(
     regressors = [_regressor(rows, int(terms.kind[k]), force, int(terms.column[k])) for k in group]
     table = np.stack(regressors, axis=1)
     if not much:
-        table = _averaged(rows, table)
+        table = _average(rows, table)
     change = np.abs(rows.accelerations[:, force])
     usual = float(np.median(change[rows.inner]))
     chosen = rows.inner & ((change > usual) if much else (change <= usual))
@@ -311,7 +311,7 @@ def _regress(
     sigma[group] = np.sqrt(np.diag(covariance))
 
 
-def _averaged(rows: _Rows, table: Array) -> Array:
+def _average(rows: _Rows, table: Array) -> Array:
     """Weighted means, (T, K), over sliding stretches of columns (T, K)."""
     cuts = np.cumsum(rows.runs)[:-1]
     runs = zip(np.split(table, cuts), rows.weights, strict=True)
@@ -342,7 +342,7 @@ def _forces(physics: Physics, states: Array, rps: Array, wrench: Array, out: Arr
         force_on(physics, states[row], rps[row], wrench[row], out[row])
 
 
-def _smoothed(windows: Sequence[Window], parameters: Parameters) -> _Rows:
+def _smooth(windows: Sequence[Window], parameters: Parameters) -> _Rows:
     """Motion relative to the water and its rates, by sliding straight lines."""
     physics = parameters.physics(parameters.start)
     pieces = []

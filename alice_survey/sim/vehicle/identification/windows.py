@@ -61,11 +61,11 @@ def make_windows(
     _check(log)
     rps, wrench = inputs(log, vehicle)
     motion = np.concatenate([log.velocity_body, log.rates_body], axis=1)
-    places = _given(log, motion, given)
+    places = _given_places(log, motion, given)
     acceleration = _accelerations(log.time_s, motion, places)
     windows, lost = [], 0
     for part in segments(log):
-        known = _held(log.time_s[part], rps[part], wrench[part])
+        known = _hold_inputs(log.time_s[part], rps[part], wrench[part])
         for piece in _pieces(log.time_s[part], known, window_s):
             rows = slice(part.start + piece.start, part.start + piece.stop)
             record = Record(
@@ -170,7 +170,7 @@ def _check(log: VehicleLog) -> None:
         )
 
 
-def _given(log: VehicleLog, motion: Array, names: Sequence[str]) -> tuple[int, ...]:
+def _given_places(log: VehicleLog, motion: Array, names: Sequence[str]) -> tuple[int, ...]:
     """Places in nu of motions that follow the log; their gaps in `motion` are filled in place."""
     places = []
     for name in names:
@@ -193,7 +193,7 @@ def _accelerations(time_s: Array, motion: Array, places: tuple[int, ...]) -> Arr
     return result
 
 
-def _held(time_s: Array, rps: Array, wrench: Array) -> Mask:
+def _hold_inputs(time_s: Array, rps: Array, wrench: Array) -> Mask:
     """Fill gaps of the input in place from the row before; (T,) where there is one.
 
     An input is not carried on for longer than a gap of the log.

@@ -254,16 +254,16 @@ class ThrustWatch:
         inertial = np.diff(nu[edges], axis=0) @ self._plant.body.mass.T / span_s
         pairs = list(itertools.pairwise(edges.tolist()))
 
-        def sampled(table: Array) -> Array:
+        def sample(table: Array) -> Array:
             return np.array([table[a:b].mean(axis=0) for a, b in pairs])
 
-        by_hull, by_thrust = sampled(hull), sampled(thrust)
+        by_hull, by_thrust = sample(hull), sample(thrust)
         pushed = by_thrust.sum(axis=1)
         doubts = [_MODEL_SHARE * by_hull, _MODEL_SHARE * pushed]
         for axis in range(2):
             other = nu.copy()
             other[:, axis] += water_sigma_mps
-            doubts.append(sampled(self._forces(other, down, rps)[0] - hull))
+            doubts.append(sample(self._forces(other, down, rps)[0] - hull))
         doubt = np.sum([[d.mean(axis=0) ** 2, d.var(axis=0)] for d in doubts], axis=0)
         return inertial - by_hull - pushed, by_thrust, doubt
 

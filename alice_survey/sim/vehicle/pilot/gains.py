@@ -136,7 +136,9 @@ LEVEL = (3, 4)
 _DEGREE = (*DEGREES, *LEVEL)
 _BY_FINS = (SURGE, YAW, PITCH, ROLL)
 
-MASS, RATE, PLACE, INTEGRAL, INNER, LEAST, MOST, FASTEST, LAG, BANDWIDTH, WEIGHT = range(11)
+MASS, RATE, PLACE, INTEGRAL, INNER, MIN_FORCE, MAX_FORCE, FASTEST, LAG, BANDWIDTH, WEIGHT = range(
+    11
+)
 """Columns of `Gains.axes`: inertia (kg, kg m^2); rate (1/s), place (1/s^2), integral (1/s^3); inner
 (1/s), the part of rate that the inner speed loop has; least and greatest force or moment; greatest
 commanded speed (m/s, rad/s); lag (s); bandwidth (rad/s); share of a target speed that the
@@ -238,7 +240,7 @@ def gains_for(vehicle: Vehicle, speed_mps: float, navigation_hz: float = 5.0) ->
     for axis, degree in enumerate(degrees[: len(configuration)]):
         inertia = float(vehicle.mass[degree, degree])
         minimum, maximum = authority(configuration, lower, upper, axis)
-        axes[axis, [MASS, LEAST, MOST]] = inertia, minimum, maximum
+        axes[axis, [MASS, MIN_FORCE, MAX_FORCE]] = inertia, minimum, maximum
         weakest = min(-minimum, maximum)
         if weakest < _NO_FORCE:
             if axis == SWAY:
@@ -313,7 +315,7 @@ def _gains_of_fins(vehicle: Vehicle, speed_mps: float, navigation_hz: float) -> 
         degree = _DEGREE[axis]
         inertia = float(vehicle.mass[degree, degree])
         minimum, maximum = authority(steers, lower, upper, row)
-        axes[axis, [MASS, LEAST, MOST]] = inertia, minimum, maximum
+        axes[axis, [MASS, MIN_FORCE, MAX_FORCE]] = inertia, minimum, maximum
         weakest = min(-minimum, maximum)
         if weakest < _NO_FORCE:
             name = ("surge", "", "", "yaw", "roll", "pitch")[axis]

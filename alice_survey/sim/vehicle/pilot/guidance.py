@@ -27,7 +27,7 @@ from alice_survey.sim.vehicle.pilot.gains import (
     BANDWIDTH,
     HEAVE,
     INTEGRAL_SHARE,
-    LEAST,
+    MIN_FORCE,
     STEADY_SHARE,
     SURGE,
     Gains,
@@ -255,7 +255,7 @@ def steer(
         _enter(pilot, slot.ABORT)
     if report[slot.REASON] == NO_NAVIGATION:
         # Without an estimate of its motion the vehicle can only push itself up.
-        wrench[2] = STEADY_SHARE * gains.axes[HEAVE, LEAST]
+        wrench[2] = STEADY_SHARE * gains.axes[HEAVE, MIN_FORCE]
         return
 
     write_point(estimate, guidance, pilot)

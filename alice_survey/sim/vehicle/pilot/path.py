@@ -89,22 +89,22 @@ def path_from_legs(
     length = np.asarray(length_m, np.float64)
     curvature = np.asarray(curvature_per_m, np.float64)
     lines = np.asarray(line, np.float64)
-    spot = np.zeros(len(start)) if turn_rad is None else np.asarray(turn_rad, np.float64)
+    turns = np.zeros(len(start)) if turn_rad is None else np.asarray(turn_rad, np.float64)
     side = np.zeros(len(start)) if side_rad is None else np.asarray(side_rad, np.float64)
     if not len(start):
         raise VehicleError("the path has no leg: give at least one")
-    columns = (heading, length, curvature, lines, spot, side)
+    columns = (heading, length, curvature, lines, turns, side)
     if any(len(column) != len(start) for column in columns):
         raise VehicleError(f"the columns of the path's {len(start)} legs are not equally long")
     values = np.concatenate([start.ravel(), *columns, [altitude_m, speed_mps]])
     if not np.all(np.isfinite(values)):
         raise VehicleError("the path holds a value that is not a finite number")
-    if np.any(length[spot == 0] <= 0) or altitude_m <= 0 or speed_mps <= 0:
+    if np.any(length[turns == 0] <= 0) or altitude_m <= 0 or speed_mps <= 0:
         raise VehicleError(
             f"the path's lengths (least {length.min():g} m), altitude ({altitude_m:g} m) and speed "
             f"({speed_mps:g} m/s) must be positive"
         )
-    _check_stops(length, curvature, spot, side)
+    _check_stops(length, curvature, turns, side)
     for i in range(1, len(start)):
         before = i - 1
         turned = curvature[before] * length[before]
@@ -112,7 +112,7 @@ def path_from_legs(
         mean = heading[before] + turned / 2
         end = start[before] + chord * np.array([math.cos(mean), math.sin(mean)])
         gap_m = float(np.hypot(*(start[i] - end)))
-        turned += spot[before] + side[before] - side[i]
+        turned += turns[before] + side[before] - side[i]
         kink_rad = math.remainder(heading[i] - heading[before] - turned, 2 * math.pi)
         if gap_m > _GAP_M or abs(kink_rad) > _KINK_RAD:
             raise VehicleError(
@@ -120,7 +120,7 @@ def path_from_legs(
                 f"off the end of leg {before}: legs must join"
             )
         heading[i] = heading[before] + turned + kink_rad
-    standing = (spot != 0) | (side != 0)
+    standing = (turns != 0) | (side != 0)
     return Path(
         start_n=np.ascontiguousarray(start[:, 0]),
         start_e=np.ascontiguousarray(start[:, 1]),
@@ -129,7 +129,7 @@ def path_from_legs(
         curvature_per_m=curvature,
         line=lines,
         begins_m=np.concatenate([[0.0], np.cumsum(length)[:-1]]),
-        turn_rad=spot,
+        turn_rad=turns,
         side_rad=side,
         stop=(standing | np.append(standing[1:], False)).astype(np.float64),
         altitude_m=float(altitude_m),
@@ -137,11 +137,11 @@ def path_from_legs(
     )
 
 
-def _check_stops(length: Array, curvature: Array, spot: Array, side: Array) -> None:
+def _check_stops(length: Array, curvature: Array, turns: Array, side: Array) -> None:
     """Reject legs that are neither ahead, nor on the spot, nor sideways."""
-    for i in np.flatnonzero((spot != 0) & ((length != 0) | (curvature != 0) | (side != 0))):
+    for i in np.flatnonzero((turns != 0) & ((length != 0) | (curvature != 0) | (side != 0))):
         raise VehicleError(
-            f"leg {i} of the path turns {math.degrees(spot[i]):.1f} deg on the spot and goes "
+            f"leg {i} of the path turns {math.degrees(turns[i]):.1f} deg on the spot and goes "
             f"{length[i]:g} m: a turn on the spot has no length, curvature or side"
         )
     square = np.abs(np.abs(side) - math.pi / 2) <= _KINK_RAD
@@ -202,9 +202,9 @@ def heading_at(path: Path, leg: int, along_m: float) -> tuple[float, float]:
 
 @kernel
 def advance(
-    path: Path, leg: int, along_m: float, north_m: float, east_m: float, most_m: float
+    path: Path, leg: int, along_m: float, north_m: float, east_m: float, max_m: float
 ) -> tuple[int, float, bool]:
-    """Move the progress towards the projection of a place on the path, by at most `most_m`.
+    """Move the progress towards the projection of a place on the path, by at most `max_m`.
 
     One Newton step on (p - P(s)) . t(s) = 0, whose slope is -(1 - k e); on a straight it is exact.
     Progress may fall within a leg but not back into the one before, nor does it pass a stop.
@@ -217,7 +217,7 @@ def advance(
     ahead = (north_m - n) * c + (east_m - e) * s
     cross = (east_m - e) * c - (north_m - n) * s
     step = ahead / max(1.0 - k * cross, MIN_SLANT)
-    moved = along_m + min(max(step, -most_m), most_m)
+    moved = along_m + min(max(step, -max_m), max_m)
     # Before a leg's start only where progress already is there: on the way in.
     moved = max(moved, min(along_m, 0.0))
     last = path.length_m.shape[0] - 1

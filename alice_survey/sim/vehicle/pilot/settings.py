@@ -23,9 +23,9 @@ from alice_survey.sim.vehicle.pilot.gains import (
     FASTEST,
     INTEGRAL_SHARE,
     LAG,
-    LEAST,
     MASS,
-    MOST,
+    MAX_FORCE,
+    MIN_FORCE,
     PITCH,
     PLACE,
     RATE,
@@ -43,20 +43,20 @@ from alice_survey.sim.vehicle.pilot.memory import PilotState
 from alice_survey.sim.vehicle.pilot.path import Path
 from alice_survey.sim.vehicle.pilot.safety import SafetyLimits
 
-SPOT_RAD_S = math.radians(15.0)
+TURN_IN_PLACE_RAD_S = math.radians(15.0)
 """Rate of a turn on the spot: half of the fastest that gains.py lets a vehicle ask for (inferred).
 """
 STEP_MPS = 0.15
 """Speed of a sway step (inferred: what ALICE swayed at in the paper's turns, section VI)."""
 
 
-def spot_rate_rad_s(turn_rate_limit_deg_s: float) -> float:
+def turn_in_place_rate_rad_s(turn_rate_limit_deg_s: float) -> float:
     """Rate of turns on the spot under a survey's limit; a vehicle that can do less turns slower.
 
     Args:
         turn_rate_limit_deg_s: the setting `plan.turn_rate_limit_deg_s`.
     """
-    return min(SPOT_RAD_S, math.radians(turn_rate_limit_deg_s))
+    return min(TURN_IN_PLACE_RAD_S, math.radians(turn_rate_limit_deg_s))
 
 
 MAX_PITCH_RAD = math.radians(20.0)
@@ -188,9 +188,9 @@ class Guidance(NamedTuple):
     """Depth of the origin at which the vehicle is at the surface."""
     stop_mps2: float
     """Deceleration into a stop."""
-    spot_rad_s: float
+    turn_in_place_rad_s: float
     """Rate of a turn on the spot."""
-    spot_rad_s2: float
+    turn_in_place_rad_s2: float
     """Angular acceleration of that turn."""
     step_mps: float
     """Speed of a sway step."""
@@ -221,7 +221,7 @@ def pilot_guidance(
     max_depth_m: float,
     point_body_m: tuple[float, float, float] = LEFT_PORT_BODY_M,
     look_ahead_m: float | None = None,
-    spot_rad_s: float = SPOT_RAD_S,
+    turn_in_place_rad_s: float = TURN_IN_PLACE_RAD_S,
     limits: SafetyLimits | None = None,
 ) -> Guidance:
     """Settings for a vehicle and a path.
@@ -237,7 +237,8 @@ def pilot_guidance(
         point_body_m: the followed point.
         look_ahead_m: when heading for the path; `min_look_ahead_m` when left out, and for
             `sway`, where there is none, SWAY_LOOK_AHEAD_M.
-        spot_rad_s: greatest rate of turns on the spot; a vehicle that can do less turns slower.
+        turn_in_place_rad_s: greatest rate of turns on the spot; a vehicle that can do less
+            turns slower.
         limits: for safety; half the path's altitude is the least when left out.
 
     Raises:
@@ -265,13 +266,15 @@ def pilot_guidance(
             f"no look-ahead from {CONTROL_LENGTH_M:g} to {_LOOK_AHEADS_M[-1]:g} m keeps los from "
             f"weaving at {speed:g} m/s: lower the speed, or check the vehicle's coefficients"
         )
-    weakest = min(-axes[SURGE, LEAST], axes[SURGE, MOST])
+    weakest = min(-axes[SURGE, MIN_FORCE], axes[SURGE, MAX_FORCE])
     tightest = float(np.abs(path.curvature_per_m).max())
     under_way = HOVERS
     if gains.dives_by_pitch:
         under_way = _under_way(gains, path, tightest)
     turning = turning_speed_mps(gains, tightest, abs(point_body_m[0]) if by_sway else 0.0)
-    spot_rad_s, step_mps = stop_speeds(gains, point_body_m[0], by_sway, spot_rad_s)
+    turn_in_place_rad_s, step_mps = stop_speeds(
+        gains, point_body_m[0], by_sway, turn_in_place_rad_s
+    )
     return Guidance(
         sway=float(by_sway),
         point_body_m=np.array(point_body_m, np.float64),
@@ -286,8 +289,8 @@ def pilot_guidance(
         floor_rate_rad_s=2.0 * speed / _TERRAIN_SMOOTHING_M,
         surface_m=0.3,
         stop_mps2=speed * float(axes[SURGE, BANDWIDTH]) / _RAMP_PERIODS,
-        spot_rad_s=spot_rad_s,
-        spot_rad_s2=spot_rad_s * float(axes[YAW, BANDWIDTH]) / _RAMP_PERIODS,
+        turn_in_place_rad_s=turn_in_place_rad_s,
+        turn_in_place_rad_s2=turn_in_place_rad_s * float(axes[YAW, BANDWIDTH]) / _RAMP_PERIODS,
         step_mps=step_mps,
         step_mps2=step_mps * float(axes[SWAY, BANDWIDTH]) / _RAMP_PERIODS,
         limits=limits or SafetyLimits(0.5 * path.altitude_m, max_depth_m),
@@ -339,7 +342,7 @@ def stop_speeds(
     gains: Gains,
     lever_m: float,
     by_sway: bool,
-    spot_rad_s: float = SPOT_RAD_S,
+    turn_in_place_rad_s: float = TURN_IN_PLACE_RAD_S,
 ) -> tuple[float, float]:
     """Rate of turns on the spot and speed of sway steps that a vehicle can do.
 
@@ -349,12 +352,12 @@ def stop_speeds(
         gains: gains of the vehicle.
         lever_m: how far the followed point is ahead of the origin.
         by_sway: whether sway is controlled.
-        spot_rad_s: rate that is target.
+        turn_in_place_rad_s: rate that is target.
 
     Returns:
         The rate, no greater than target, and the speed, at most `STEP_MPS`, 0 without sway.
     """
-    rate = min(spot_rad_s, float(gains.axes[YAW, FASTEST]))
+    rate = min(turn_in_place_rad_s, float(gains.axes[YAW, FASTEST]))
     if not by_sway:
         return rate, 0.0
     fastest = float(gains.axes[SWAY, FASTEST])

@@ -40,9 +40,9 @@ from alice_survey.sim.vehicle.pilot.gains import (
     INTEGRAL_SHARE,
     KEPT_RAD,
     LAG,
-    LEAST,
     MASS,
-    MOST,
+    MAX_FORCE,
+    MIN_FORCE,
     PITCH,
     PLACE,
     RATE,
@@ -117,7 +117,7 @@ def sum_bound(gains: Gains, axis: int) -> float:
     row = gains.axes[axis]
     if row[INNER] == 0.0:
         return 0.0
-    return float(max(-row[LEAST], row[MOST]) / (row[MASS] * row[INNER]))
+    return float(max(-row[MIN_FORCE], row[MAX_FORCE]) / (row[MASS] * row[INNER]))
 
 
 @kernel
@@ -169,7 +169,7 @@ def write_wrench(gains: Gains, pilot: PilotState, wrench: Array) -> None:
             asked += body.mass[i, other if other < 3 else 5] * demand[slot.ACC_SURGE + other]
         if i == 2:
             asked -= body.weight_n - body.buoyancy_n
-        minimum, maximum = gains.axes[axis, LEAST], gains.axes[axis, MOST]
+        minimum, maximum = gains.axes[axis, MIN_FORCE], gains.axes[axis, MAX_FORCE]
         demand[slot.FULL_SURGE + axis] = (
             1.0 if asked > maximum else (-1.0 if asked < minimum else 0.0)
         )
@@ -205,10 +205,12 @@ def hold_level(
             k = other if other < 3 else 5
             asked += body.mass[i, k] * pilot.demand[slot.ACC_SURGE + other]
         asked += body.weight_n * (-body.cg[1] if axis == ROLL else body.cg[0])
-        wrench[i] = min(max(asked, row[LEAST]), row[MOST])
+        wrench[i] = min(max(asked, row[MIN_FORCE]), row[MAX_FORCE])
         if (asked - wrench[i]) * angle >= 0.0:  # not cut, or on the way back
             step = row[INTEGRAL] * angle * dt_s
-            pilot.memory[place] = clamp(total + step, max(-row[LEAST], row[MOST]) / row[MASS])
+            pilot.memory[place] = clamp(
+                total + step, max(-row[MIN_FORCE], row[MAX_FORCE]) / row[MASS]
+            )
 
 
 DEPTH_KEPT_M = 0.2
@@ -520,9 +522,9 @@ def stand(leg: int, tick: Tick) -> bool:
         n, e, start, _ = place_at(path, leg, 0.0)
         behind = abs(wrap_angle(start + sense * memory[slot.REF] - estimate[vector.HEADING]))
         # A reference goes slower from this far ahead of the vehicle on, and waits at twice that.
-        maximum = guidance.spot_rad_s * min(max(2.0 - behind / _BEHIND_RAD, 0.0), 1.0)
+        maximum = guidance.turn_in_place_rad_s * min(max(2.0 - behind / _BEHIND_RAD, 0.0), 1.0)
         lag_s = gains.axes[YAW, LAG]
-        quicken = sense * _move_on(goal, maximum, guidance.spot_rad_s2, lag_s, dt_s, pilot)
+        quicken = sense * _move_on(goal, maximum, guidance.turn_in_place_rad_s2, lag_s, dt_s, pilot)
         heading, rate = start + sense * memory[slot.REF], sense * memory[slot.REF_SPEED]
         over = goal - memory[slot.REF] < 0.5 * STOP_RAD and memory[slot.RAMP] >= goal
         target = StopReference(n, e, heading, 0.0, 0.0, heading, rate, quicken, 0.0, over)

@@ -9,7 +9,7 @@ from alice_survey.sim.seafloor.texture import (
     Texture,
     add_octave,
     noise,
-    spot,
+    speck,
 )
 from tests.oracles_seafloor import gradient_noise
 
@@ -70,7 +70,7 @@ def test_octaves_fade_before_samples_are_too_far_apart(footprint_m: float, left:
 def test_specks_cover_between_nothing_and_all(
     place: tuple[float, float, float], share: float
 ) -> None:
-    cover, back, gloom, own = spot(*place, 0.03, share, 0.001, 0.0, 99)
+    cover, back, gloom, own = speck(*place, 0.03, share, 0.001, 0.0, 99)
     assert 0.0 <= cover <= 1.0
     assert 0.0 <= back <= 1.0
     assert 0.0 <= gloom <= 1.0
@@ -85,9 +85,9 @@ def test_specks_end_smoothly_within_their_cell() -> None:
     for axis in range(3):
         at = np.random.default_rng(axis).uniform(-1.0, 1.0, (n * n, 3))
         at[:, axis] = cell_m * np.round(at[:, axis] / cell_m) + 1e-9
-        faces.append([spot(*p, cell_m, 1.0, 1e-4, 0.0, 5)[0] for p in at])
+        faces.append([speck(*p, cell_m, 1.0, 1e-4, 0.0, 5)[0] for p in at])
     inside = [
-        spot(*p, cell_m, 1.0, 1e-4, 0.0, 5)[0]
+        speck(*p, cell_m, 1.0, 1e-4, 0.0, 5)[0]
         for p in np.random.default_rng(9).uniform(-1, 1, (3000, 3))
     ]
     assert np.max(faces) == 0.0

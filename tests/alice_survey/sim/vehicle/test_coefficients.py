@@ -42,7 +42,7 @@ def test_both_names_of_an_added_mass_share_their_mean() -> None:
 
 def test_replacing_an_added_mass_drops_its_mirror() -> None:
     before = named(Y_rdot=-8.5, X_uu=-7.0, K_vdot=-0.2)
-    after = before.replaced("other", {"N_vdot": -2.5, "X_uu": -15.0})
+    after = before.with_values("other", {"N_vdot": -2.5, "X_uu": -15.0})
     assert after.name == "other"
     assert dict(after.values) == {"N_vdot": -2.5, "X_uu": -15.0, "K_vdot": -0.2}
     assert after.added_mass[1, 5] == 2.5
@@ -72,9 +72,9 @@ def test_damping_may_differ_by_the_way_of_the_motion() -> None:
     assert (kinds.quadratic[0, 0], kinds.quadratic_back[0, 0]) == (-5.0, 0.0)
     assert kinds.quadratic[1, 1] == kinds.quadratic_back[1, 1] == -9.0
     assert (kinds.value("Z_ww_pos"), kinds.value("Z_ww_neg")) == (-200.0, -260.0)
-    both = kinds.replaced("both", {"Z_ww": -100.0})
+    both = kinds.with_values("both", {"Z_ww": -100.0})
     assert both.quadratic[2, 2] == both.quadratic_back[2, 2] == -100.0
-    one = kinds.replaced("one", {"Z_ww_pos": -100.0})
+    one = kinds.with_values("one", {"Z_ww_pos": -100.0})
     assert (one.quadratic[2, 2], one.quadratic_back[2, 2]) == (-100.0, -260.0)
     with pytest.raises(VehicleError, match="Z_w_neg"):
         Coefficients(name="test", values={"Z_w_neg": -1.0})

@@ -151,7 +151,7 @@ def test_speeds_give_the_thrust_they_were_found_for(nu: Array, share: Array) -> 
     np.testing.assert_allclose(got, wanted, rtol=1e-9, atol=1e-11)
     asked = np.abs(wanted) > 1e-9
     np.testing.assert_array_equal(np.sign(rps)[asked], np.sign(wanted)[asked])
-    assert np.all(np.abs(rps) <= PACKED.table[:, kernels.MOST] * (1 + 1e-9))
+    assert np.all(np.abs(rps) <= PACKED.table[:, kernels.MAX_RPS] * (1 + 1e-9))
 
 
 def test_more_thrust_takes_more_speed_and_limits_are_those_of_full_speed() -> None:
@@ -163,7 +163,7 @@ def test_more_thrust_takes_more_speed_and_limits_are_those_of_full_speed() -> No
     for thrust, row in zip(grid, rps, strict=True):
         kernels.speeds_for(PACKED, thrust, nu, row)
     assert np.all(np.diff(rps, axis=0) > 0)
-    maximum = PACKED.table[:, kernels.MOST]
+    maximum = PACKED.table[:, kernels.MAX_RPS]
     np.testing.assert_allclose(rps[[0, -1]], [-maximum, maximum], rtol=1e-9)
 
 

@@ -179,7 +179,7 @@ def test_loops_are_damped_and_within_the_strength_of_the_fins(speed: float) -> N
         poles = np.linalg.eigvals(loop)
         assert poles.real.max() < -0.02
         # An error of 10 deg takes about the moment that there is.
-        assert 0.3 < row[g.MASS] * row[g.PLACE] * g.KEPT_RAD / row[g.MOST] < 1.5
+        assert 0.3 < row[g.MASS] * row[g.PLACE] * g.KEPT_RAD / row[g.MAX_FORCE] < 1.5
     depth = np.linalg.eigvals(dive_loop(gains, speed, 2.5))
     assert depth.real.max() < -0.005
 
@@ -193,7 +193,7 @@ def test_four_fins_that_turn_apart_hold_roll_too() -> None:
     )
     gains = gains_for(replace(REMUS, fins=apart), 1.0)
     assert gains.holds_level and gains.dives_by_pitch
-    assert gains.axes[g.ROLL, g.MOST] > 0.5
+    assert gains.axes[g.ROLL, g.MAX_FORCE] > 0.5
 
 
 def test_what_cannot_be_flown_by_fins_is_said() -> None:

@@ -53,7 +53,7 @@ def test_strips_integrate_what_coefficients_need(outline: Outline, power: int) -
 
 @given(tail=st.floats(-2.0, -0.1), nose=st.floats(0.1, 2.0))
 def test_stretching_scales_lengths_alone(tail: float, nose: float) -> None:
-    stretched = BLUNT.stretched(tail, nose)
+    stretched = BLUNT.stretch(tail, nose)
     scale = (nose - tail) / BLUNT.length_m
     assert stretched.tail_x_m == tail and stretched.nose_x_m == nose
     assert stretched.volume_m3 == pytest.approx(scale * BLUNT.volume_m3, rel=1e-9)

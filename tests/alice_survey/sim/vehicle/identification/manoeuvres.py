@@ -41,7 +41,7 @@ def survey_like(time_s: float) -> Array:
 def hidden(values: Mapping[str, float]) -> Vehicle:
     """ALICE with other coefficients than it is known by."""
     known = vehicle_from("alice")
-    return known.with_coefficients(known.coefficients.replaced("hidden", values))
+    return known.with_coefficients(known.coefficients.with_values("hidden", values))
 
 
 def fly(

@@ -38,7 +38,7 @@ def test_saturated_axes_are_flagged(demand: Array) -> None:
     steering.write_wrench(gains, pilot, wrench)
     for axis, degree in enumerate(g.DEGREES):
         full = pilot.demand[slot.FULL_SURGE + axis]
-        ends = gains.axes[axis, [g.LEAST, g.MOST]]
+        ends = gains.axes[axis, [g.MIN_FORCE, g.MAX_FORCE]]
         if full == 0.0:
             assert ends[0] <= wrench[degree] <= ends[1]
         else:
@@ -110,6 +110,8 @@ def test_speed_integral_is_bounded_by_what_the_thrusters_give() -> None:
     row, total = gains.axes[g.SURGE], 0.0
     for _ in range(20000):
         _, total = steering.speed_demand(gains, g.SURGE, 1.0, 0.0, 0.0, total, 0.05)
-    assert total == pytest.approx(max(-row[g.LEAST], row[g.MOST]) / (row[g.MASS] * row[g.INNER]))
+    assert total == pytest.approx(
+        max(-row[g.MIN_FORCE], row[g.MAX_FORCE]) / (row[g.MASS] * row[g.INNER])
+    )
     held = steering.speed_demand(gains, g.SURGE, 1.0, 0.2, 1.0, 0.1, 0.05)
     assert held == (pytest.approx(row[g.RATE] * (row[g.WEIGHT] - 0.2 + 0.1)), 0.1)

@@ -152,7 +152,7 @@ def test_greatest_speed_takes_three_quarters_of_the_force(name: str, axis: int) 
     row, nu, force = gains.axes[axis], np.zeros(6), np.zeros(6)
     nu[DEGREES[axis]] = row[g.FASTEST]
     add_damping(gains.body, nu, force)
-    share = -force[DEGREES[axis]] / min(-row[g.LEAST], row[g.MOST])
+    share = -force[DEGREES[axis]] / min(-row[g.MIN_FORCE], row[g.MAX_FORCE])
     if axis == g.YAW and row[g.FASTEST] == pytest.approx(math.radians(30.0)):
         assert share < g.STEADY_SHARE  # bounded by the rate, not by the thrusters
     else:
@@ -224,7 +224,7 @@ def test_a_wanted_speed_is_not_overshot(name: str, decay_share: float) -> None:
 
 
 def test_a_lost_lateral_thruster_makes_sway_as_slow_as_the_pair_that_helps_it() -> None:
-    whole, lame = vehicle_from("alice"), vehicle_from("alice").weakened({"bow": 0.0})
+    whole, lame = vehicle_from("alice"), vehicle_from("alice").weaken({"bow": 0.0})
     slow = gains_for(lame, 0.2).axes[g.SWAY]
     assert slow[g.LAG] > 2.0 * gains_for(whole, 0.2).axes[g.SWAY, g.LAG]
     assert slow[g.LAG] < 0.85
@@ -233,4 +233,4 @@ def test_a_lost_lateral_thruster_makes_sway_as_slow_as_the_pair_that_helps_it() 
 @pytest.mark.parametrize(("name", "lost"), [("alice", "vertical"), ("sparus2", "port")])
 def test_a_vehicle_that_cannot_be_controlled_is_refused(name: str, lost: str) -> None:
     with pytest.raises(VehicleError):
-        gains_for(vehicle_from(name).weakened({lost: 0.0}), 0.2)
+        gains_for(vehicle_from(name).weaken({lost: 0.0}), 0.2)

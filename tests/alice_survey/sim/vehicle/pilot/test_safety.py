@@ -153,7 +153,7 @@ def test_without_navigation_the_vehicle_pushes_itself_up(lost: int) -> None:
     estimate[lost] = math.nan
     for _ in range(3):
         wrench = _steered(flight, estimate)
-        expected = g.STEADY_SHARE * flight.gains.axes[g.HEAVE, g.LEAST]
+        expected = g.STEADY_SHARE * flight.gains.axes[g.HEAVE, g.MIN_FORCE]
         np.testing.assert_array_equal(wrench, [0, 0, expected, 0, 0, 0])
     assert flight.pilot.report[slot.PHASE] == slot.ABORT
     assert flight.pilot.report[slot.REASON] == safety.NO_NAVIGATION

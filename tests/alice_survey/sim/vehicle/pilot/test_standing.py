@@ -18,8 +18,8 @@ from alice_survey.sim.vehicle.pilot.memory import new_pilot
 from alice_survey.sim.vehicle.pilot.mission import NO_MISSION
 from alice_survey.sim.vehicle.pilot.path import Path
 from alice_survey.sim.vehicle.pilot.settings import (
-    SPOT_RAD_S,
     STEP_MPS,
+    TURN_IN_PLACE_RAD_S,
     Guidance,
     pilot_guidance,
     stop_speeds,
@@ -102,8 +102,8 @@ def test_a_tick_of_a_stop_asks_for_what_its_twin_asks(
 ) -> None:
     path, gains = STEPS, gains_of("alice")
     guidance, pilot = guidance_of(path), new_pilot()
-    fastest = (0.2, guidance.step_mps, guidance.spot_rad_s)[leg]
-    slowing = (guidance.stop_mps2, guidance.step_mps2, guidance.spot_rad_s2)[leg]
+    fastest = (0.2, guidance.step_mps, guidance.turn_in_place_rad_s)[leg]
+    slowing = (guidance.stop_mps2, guidance.step_mps2, guidance.turn_in_place_rad_s2)[leg]
     goal = (path.length_m[0], path.length_m[1], abs(path.turn_rad[2]))[leg]
     speed = share * fastest
     pilot.report[[slot.PHASE, slot.LEG, slot.ALONG]] = slot.FOLLOW, leg, progress
@@ -264,8 +264,8 @@ def test_carried_off_a_stop_the_vehicle_comes_back_to_it() -> None:
 
 def test_stops_are_no_faster_than_the_vehicle() -> None:
     gains = gains_of("alice")
-    assert stop_speeds(gains, 0.55, by_sway=True) == (SPOT_RAD_S, STEP_MPS)
-    rate, step = stop_speeds(gains, 2.0, by_sway=True, spot_rad_s=9.0)
+    assert stop_speeds(gains, 0.55, by_sway=True) == (TURN_IN_PLACE_RAD_S, STEP_MPS)
+    rate, step = stop_speeds(gains, 2.0, by_sway=True, turn_in_place_rad_s=9.0)
     assert step == STEP_MPS
     assert rate == min(gains.axes[SWAY, FASTEST] / 2.0, gains.axes[YAW, FASTEST])
     assert stop_speeds(gains_of("sparus2"), 0.55, by_sway=False)[1] == 0.0

@@ -118,7 +118,7 @@ def test_a_model_that_is_off_and_a_wrong_current_are_no_failure() -> None:
     """Drag of 1.3 times, thrust of 0.8, and a current of 0.1 m/s that is not there."""
     values = ALICE.coefficients.values
     draggy = ALICE.with_coefficients(
-        ALICE.coefficients.replaced(
+        ALICE.coefficients.with_values(
             "draggy", {name: 1.3 * values[name] for name in ("X_uu", "Y_vv", "Z_ww", "N_rr")}
         )
     )
