@@ -1,4 +1,4 @@
-"""One figure of what lenses see through a flat port: six panels."""
+"""One figure of what lenses see through a flat port: four panels."""
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
@@ -14,9 +14,8 @@ from alice_survey.kit.figure import (
     new_figure,
     save_figure,
 )
-from camera_calib.fov.angles import RELIEF, AngleRow
 from camera_calib.fov.paper import PAPER_TABLE
-from camera_calib.fov.table import TRUSTED_FOV_DEG, FovChoices, FovRow
+from camera_calib.fov.table import FovChoices, FovRow
 
 FovTable = Callable[[Sequence[float], FovChoices], list[FovRow]]
 """Rows of all lenses at altitudes, lenses outside."""
@@ -35,20 +34,18 @@ def draw_fov(
     speeds_mps: Sequence[float],
     exposures_s: Sequence[float],
     allowed_px: float,
-    angles: Sequence[AngleRow],
     paper: bool,
 ) -> None:
-    """Draw footprint, pixel, depth of field, depth precision, blur and distortion.
+    """Draw footprint, pixel, depth of field and motion blur.
 
     Args:
         path: ends in .png, .svg or .pdf; the same input gives the same bytes.
         table: rows of all lenses at given altitudes.
         altitudes_m: altitudes of interest; the curves go some way beyond them.
-        choices: circle of confusion, focus, matching noise.
+        choices: circle of confusion and focus.
         speeds_mps: speeds of the blur curves.
         exposures_s: exposures of interest; marked.
         allowed_px: blur that is allowed; marked.
-        angles: distortion against the field of view.
         paper: mark what the paper's table prints; its sensor is drawn.
 
     Raises:
@@ -61,8 +58,8 @@ def draw_fov(
     curves = _by_lens(table(curve, choices))
     soft = _by_lens(table(curve, replace(choices, coc_px=3 * choices.coc_px)))
 
-    figure = new_figure(9.4, 15.0)
-    panels = figure.subplots(2, 3)
+    figure = new_figure(9.4, 10.4)
+    panels = figure.subplots(2, 2)
     for axes, title, unit, series, printed in (
         (panels[0, 0], "Footprint", "m", (("horizontal_m", "wide"), ("vertical_m", "high")),
          ("horizontal", "vertical")),
@@ -75,10 +72,8 @@ def draw_fov(
         axes.set_title(title)
         axes.set_ylabel(unit)
         axes.legend(fontsize=9)
-    _depth_of_field(panels[0, 2], curves, soft, choices)
-    _precision(panels[1, 0], curves, marked)
+    _depth_of_field(panels[1, 0], curves, soft, choices)
     _blur(panels[1, 1], marked, speeds_mps, exposures_s, allowed_px)
-    _distortion(panels[1, 2], angles, marked)
     first = next(iter(marked.values()))[0]
     figure.suptitle(
         f"Through a flat port: n {first.n_water:.4g}, {first.port} before the pupil",
@@ -176,23 +171,6 @@ def _depth_of_field(
     axes.legend(facecolor="white", edgecolor="none", framealpha=0.8, fontsize=9, loc="upper left")
 
 
-def _precision(
-    axes: Axes, curves: dict[float, list[FovRow]], marked: dict[float, list[FovRow]]
-) -> None:
-    first = next(iter(curves.values()))[0]
-    if not np.isfinite(first.baseline_m):
-        axes.set_axis_off()
-        axes.text(0.5, 0.5, "one camera: no stereo", ha="center", transform=axes.transAxes)
-        return
-    axes.set_title(
-        f"Depth precision of the {first.baseline_m * 1e3:.0f} mm pair,\n"
-        f"{first.match_sigma_px:g} px of disparity noise"
-    )
-    _curves(axes, curves, marked, (("depth_sigma_mm", ""),))
-    axes.set_ylabel("one sigma, mm")
-    axes.legend(fontsize=9)
-
-
 def _blur(
     axes: Axes,
     marked: dict[float, list[FovRow]],
@@ -226,44 +204,3 @@ def _blur(
     axes.set_ylabel("px")
     axes.set_xlim(low * 1e3, high * 1e3)
     axes.legend(fontsize=9)
-
-
-def _distortion(axes: Axes, angles: Sequence[AngleRow], marked: dict[float, list[FovRow]]) -> None:
-    degrees = [row.fov_air_deg for row in angles]
-    curves = (
-        ("displacement_px", "corner displaced", "-", "#212f3d"),
-        ("chromatic_px", "blue from red in it", "-.", "#6c3483"),
-        ("residual_max_px", "best pinhole, worst", "--", "#1e8449"),
-        ("residual_rms_px", "best pinhole, rms", "-", "#1e8449"),
-    )
-    for name, label, style, colour in curves:
-        values = np.array([getattr(row, name) for row in angles])
-        if np.all(values > 1e-6):
-            axes.semilogy(degrees, values, style, color=colour)
-            axes.annotate(
-                label, (degrees[-1], values[-1]), ha="right", va="top", fontsize=9, color=colour,
-                xytext=(0, -17), textcoords="offset points",
-            )  # fmt: skip
-    axes.axvline(TRUSTED_FOV_DEG, color="black", lw=0.9, ls="--")
-    bottom = 0.1 * axes.get_ylim()[0]
-    axes.set_ylim(bottom=bottom)
-    axes.annotate(
-        f"the paper's {TRUSTED_FOV_DEG:g} deg", (TRUSTED_FOV_DEG, bottom), rotation=90,
-        ha="left", va="bottom", fontsize=9, xytext=(3, 6), textcoords="offset points",
-    )  # fmt: skip
-    for i, (lens, rows) in enumerate(marked.items()):
-        angle = rows[0].diagonal_air_deg
-        axes.axvline(angle, color=_colour(i), lw=0.9, ls=":")
-        axes.annotate(
-            f"{lens:.4g} mm", (angle, bottom), rotation=90, ha="right", va="bottom", fontsize=9,
-            color=_colour(i), xytext=(-2, 6), textcoords="offset points",
-        )  # fmt: skip
-    axes.yaxis.set_major_formatter("{x:g}")
-    first = angles[0]
-    axes.set_title(
-        f"Against the field of view: n {first.n_water:.4g}, {first.port},\n"
-        f"{first.altitude_m:g} m altitude, relief +/-{RELIEF:.0%}",
-        fontsize=11,
-    )
-    axes.set_xlabel("full angle of the diagonal in air, deg")
-    axes.set_ylabel("px")

@@ -1,4 +1,4 @@
-"""Tables of fields of view as plain text, Markdown and CSV."""
+"""Tables of fields of view as plain text and CSV."""
 
 import csv
 import io
@@ -22,18 +22,11 @@ class TextTable:
     header: tuple[str, ...]
     cells: tuple[tuple[str, ...], ...]
     notes: tuple[str, ...] = ()
-    listed: bool = False
-    """Plain text shows a list under each new first cell: the cells are long."""
 
 
 def as_text(tables: Iterable[TextTable]) -> str:
     """The tables one below the other, in columns of spaces."""
-    return "\n\n".join(_list(t) if t.listed else _columns(t) for t in tables)
-
-
-def as_markdown(tables: Iterable[TextTable]) -> str:
-    """The tables one below the other, in Markdown."""
-    return "\n\n".join(_markdown(table) for table in tables)
+    return "\n\n".join(_columns(t) for t in tables)
 
 
 def as_csv(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -57,26 +50,18 @@ def fov_csv_rows(rows: Sequence[FovRow], blur: Sequence[BlurRow]) -> list[dict[s
 
 def validation_csv_rows(validation: PaperValidation) -> list[dict[str, Any]]:
     """Every check and claim, flat."""
-    stated: list[tuple[PaperCheck | PaperClaim, str, str, str]] = [
-        (
-            c,
-            f"{c.quantity} of the {c.lens_mm:g} mm lens: {c.paper} {c.unit}",
-            PAPER_RULE.partition(";")[0],
-            f"within {c.tolerance:g} {c.unit}",
-        )
+    rule = PAPER_RULE.partition(";")[0]
+    checks = [
+        (c, f"{c.quantity} of the {c.lens_mm:g} mm lens: {c.paper} {c.unit}", rule,
+         f"within {c.tolerance:g} {c.unit}")
         for c in validation.table
-    ]
-    stated += [(c, c.claim, c.assumption, _bounds(c)) for c in validation.claims]
+    ]  # fmt: skip
+    claims = [(c, c.claim, c.assumption, _bounds(c)) for c in validation.claims]
     return [
-        {
-            "claim": claim,
-            "verdict": _verdict(c),
-            "computed": f"{c.computed:.4f} {c.unit}",
-            "assumption": assumption,
-            "rule": rule,
-        }
-        for c, claim, assumption, rule in stated
-    ]
+        {"claim": claim, "verdict": _verdict(c), "computed": f"{c.computed:.4f} {c.unit}",
+         "assumption": assumption, "rule": bound}
+        for c, claim, assumption, bound in (*checks, *claims)
+    ]  # fmt: skip
 
 
 def fov_tables(rows: Sequence[FovRow], blur: Sequence[BlurRow] = ()) -> list[TextTable]:
@@ -219,7 +204,6 @@ def _claims(claims: Sequence[PaperClaim]) -> TextTable:
             for c in claims
         ),
         notes=("other readings of these claims, and why they differ: docs/paper-optics.md",),
-        listed=True,
     )
 
 
@@ -283,27 +267,3 @@ def _span(near: float, far: float) -> str:
 
 def _columns(table: TextTable) -> str:
     return "\n".join([table.title, text_table(table.header, table.cells), *table.notes])
-
-
-def _list(table: TextTable) -> str:
-    lines, last = [table.title], ""
-    for subject, verdict, *cells in table.cells:
-        if subject != last:
-            lines.append(subject)
-            last = subject
-        words = [
-            f"{name}: {cell}"
-            for name, cell in zip(table.header[3:], cells[1:], strict=True)
-            if cell
-        ]
-        lines.append(f"  {verdict:<8}  {cells[0]}")
-        lines += [f"            {word}" for word in words]
-    return "\n".join([*lines, *table.notes])
-
-
-def _markdown(table: TextTable) -> str:
-    def line(cells: Sequence[str]) -> str:
-        return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
-
-    rows = [line(table.header), line(["---"] * len(table.header)), *map(line, table.cells)]
-    return "\n".join([f"### {table.title}", "", *rows, *(f"\n{note}" for note in table.notes)])

@@ -1,7 +1,7 @@
 """The `fov` command: what a lens sees, and the check of the paper's optics."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +9,10 @@ from alice_survey.core.artefacts import json_values
 from alice_survey.core.config import CameraConfig, SurveyConfig, load_config, parse_config
 from alice_survey.core.errors import ConfigError, warn
 from camera_calib.formats.rigs import led_by
-from camera_calib.fov.angles import angle_table
 from camera_calib.fov.paper import paper_settings, validate_paper
 from camera_calib.fov.table import FovChoices, FovRow, blur_table, fov_table, rig_fov_table
 from camera_calib.fov.text import (
-    TextTable,
     as_csv,
-    as_markdown,
     as_text,
     fov_csv_rows,
     fov_tables,
@@ -26,14 +23,12 @@ from camera_calib.rig import Rig, port_settings, read_rig
 
 PAPER_LENSES_MM = (12.5, 25.0)
 PAPER_EXPOSURE_MS = 3.0
-_PLOT_ANGLES_DEG = tuple(float(angle) for angle in range(30, 111, 5))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Output:
     """Output options of a table."""
 
-    markdown: bool = False
     csv: Path | None = None
     plot: Path | None = None
 
@@ -50,25 +45,15 @@ class FovOptions:
     rig: Path | None = None
     rig_camera: str | None = None
     n_water: float | None = None
-    temperature_c: float | None = None
-    salinity_psu: float | None = None
-    port_distance_mm: float | None = None
-    glass_mm: float | None = None
-    n_glass: float | None = None
-    pixel_um: float | None = None
-    f_number: float | None = None
-    blur_px: float | None = None
-    choices: FovChoices = field(default_factory=FovChoices)
 
 
 def fov_report(options: FovOptions, output: Output) -> tuple[str, Any, bool]:
     """FOV, resolution, focus, stereo and blur as text and JSON values."""
     settings = _settings(options)
-    choices = options.choices
     rig = _rig(options, settings.water.n_water)
     camera, n_water = settings.camera, settings.water.n_water
     if rig is not None:
-        camera, n_water = _sensor_of(rig, settings.camera, options)
+        camera, n_water = _sensor_of(rig, settings.camera)
     lenses = options.lens_mm or ((camera.focal_mm,) if options.survey else PAPER_LENSES_MM)
 
     def table(altitudes_m: Sequence[float], chosen: FovChoices) -> list[FovRow]:
@@ -79,25 +64,25 @@ def fov_report(options: FovOptions, output: Output) -> tuple[str, Any, bool]:
     altitudes = options.altitude_m or (settings.plan.altitude_m,)
     speeds = options.speed_mps or (settings.plan.speed_mps,)
     exposures = [ms * 1e-3 for ms in options.exposure_ms or (PAPER_EXPOSURE_MS,)]
-    allowed = options.blur_px or settings.plan.allowed_blur_px
-    rows = table(altitudes, choices)
+    allowed = settings.plan.allowed_blur_px
+    rows = table(altitudes, FovChoices())
     blur = blur_table(rows, speeds, exposures, allowed)
     if output.csv is not None:
         _write(output.csv, as_csv(fov_csv_rows(rows, blur)))
     if output.plot is not None:
         from camera_calib.fov.plot import draw_fov
 
-        angles = angle_table(camera, n_water, altitude_m=altitudes[0], angles_deg=_PLOT_ANGLES_DEG)
         draw_fov(
-            output.plot, table, altitudes, choices, speeds_mps=speeds, exposures_s=exposures,
-            allowed_px=allowed, angles=angles, paper=rig is None and _is_papers(camera),
+            output.plot, table, altitudes, FovChoices(), speeds_mps=speeds,
+            exposures_s=exposures, allowed_px=allowed,
+            paper=rig is None and _is_papers(camera),
         )  # fmt: skip
     data = {
         "source": "design values" if rig is None else rig.source,
         "rows": json_values(rows),
         "blur": json_values(blur),
     }
-    return _printed(fov_tables(rows, blur), output), data, True
+    return as_text(fov_tables(rows, blur)), data, True
 
 
 def validation_report(options: FovOptions, output: Output) -> tuple[str, Any, bool]:
@@ -109,7 +94,7 @@ def validation_report(options: FovOptions, output: Output) -> tuple[str, Any, bo
     if options != FovOptions():
         raise ConfigError(
             "--validate checks the paper's own lenses, water and altitude: leave out all options "
-            "but --plot, --csv, --markdown and --json"
+            "but --plot, --csv and --json"
         )
     validation = validate_paper()
     if output.csv is not None:
@@ -118,46 +103,23 @@ def validation_report(options: FovOptions, output: Output) -> tuple[str, Any, bo
         from camera_calib.fov.plot import draw_fov
 
         camera, n_water, altitude = paper_settings()
-        angles = angle_table(
-            CameraConfig(),
-            validation.angles[0].n_water,
-            altitude_m=altitude,
-            angles_deg=_PLOT_ANGLES_DEG,
-        )
         draw_fov(
             output.plot,
             lambda heights, chosen: fov_table(PAPER_LENSES_MM, heights, n_water, camera, chosen),
             [altitude], FovChoices(), speeds_mps=[0.2, 0.5],
-            exposures_s=[PAPER_EXPOSURE_MS * 1e-3], allowed_px=1.0, angles=angles, paper=True,
+            exposures_s=[PAPER_EXPOSURE_MS * 1e-3], allowed_px=1.0, paper=True,
         )  # fmt: skip
-    text = _printed(validation_tables(validation), output)
+    text = as_text(validation_tables(validation))
     return text, validation.to_json(), validation.passed
 
 
 def _settings(options: FovOptions) -> SurveyConfig:
     """The survey's settings, overridden by the command line."""
     survey = SurveyConfig() if options.survey is None else load_config(options.survey)
-    values = survey.model_dump(mode="json")
-    given = {
-        "port_distance_m": _metres(options.port_distance_mm),
-        "glass_thickness_m": _metres(options.glass_mm),
-        "n_glass": options.n_glass,
-        "pixel_um": options.pixel_um,
-        "f_number": options.f_number,
-    }
-    values["camera"] |= {key: value for key, value in given.items() if value is not None}
-    by_water = (options.temperature_c, options.salinity_psu)
-    if any(value is not None for value in by_water):
-        if options.n_water is not None or None in by_water:
-            raise ConfigError("give --n-water, or --temperature and --salinity together")
-        values["water"] = {
-            "jerlov": survey.water.jerlov,
-            "temperature_c": options.temperature_c,
-            "salinity_psu": options.salinity_psu,
-        }
-    elif options.n_water is not None:
-        values["water"] = {"jerlov": survey.water.jerlov, "n_water": options.n_water}
-    return parse_config(values, "options")
+    if options.n_water is None:
+        return survey
+    water = {"jerlov": survey.water.jerlov, "n_water": options.n_water}
+    return parse_config(survey.model_dump(mode="json") | {"water": water}, "options")
 
 
 def _rig(options: FovOptions, n_water: float) -> Rig | None:
@@ -165,35 +127,27 @@ def _rig(options: FovOptions, n_water: float) -> Rig | None:
         if options.rig_camera is not None:
             raise ConfigError("--camera names a camera of a rig: give --rig too")
         return None
-    designed = {
-        "--lens": options.lens_mm or None,
-        "--port-distance": options.port_distance_mm,
-        "--glass": options.glass_mm,
-        "--n-glass": options.n_glass,
-    }
-    wrong = [name for name, value in designed.items() if value is not None]
-    if wrong:
-        raise ConfigError(f"{options.rig} has lenses and ports of its own: leave out {wrong[0]}")
+    if options.lens_mm:
+        raise ConfigError(f"{options.rig} has lenses of its own: leave out --lens")
     rig = read_rig(options.rig)
     if options.rig_camera is not None:
         rig = led_by(rig, options.rig_camera)
     elif len(rig.cameras) > 2:
         first, *others = rig.cameras
         warn(f"of the rig's cameras, this is {first}; --camera shows {', '.join(others)}")
-    other_water = options.n_water is not None or options.temperature_c is not None
-    return rig.in_water(n_water) if other_water else rig
+    return rig if options.n_water is None else rig.in_water(n_water)
 
 
-def _sensor_of(rig: Rig, camera: CameraConfig, options: FovOptions) -> tuple[CameraConfig, float]:
+def _sensor_of(rig: Rig, camera: CameraConfig) -> tuple[CameraConfig, float]:
     """Sensor and port of a rig's reference camera, and its water; a rig has no pixel pitch."""
     own = rig.cameras[rig.reference]
     pixel_um = camera.pixel_um
-    if options.pixel_um is None and own.width_px != camera.width_px:
+    if own.width_px != camera.width_px:
         pixel_um *= camera.width_px / own.width_px
         warn(
             f"the rig's pictures are {own.width_px} px wide and the settings' "
             f"{camera.width_px}: pixels of {pixel_um:.4g} um (the same sensor) are taken for the "
-            "depth of field; --pixel says otherwise"
+            "depth of field; pixel_um under [camera] of --survey sets it"
         )
     update = {
         "width_px": own.width_px,
@@ -208,14 +162,6 @@ def _is_papers(camera: CameraConfig) -> bool:
     """The sensor is the one of the paper's table."""
     sensor = ("width_px", "height_px", "pixel_um")
     return all(getattr(camera, key) == CameraConfig.model_fields[key].default for key in sensor)
-
-
-def _metres(mm: float | None) -> float | None:
-    return None if mm is None else mm * 1e-3
-
-
-def _printed(tables: Sequence[TextTable], output: Output) -> str:
-    return as_markdown(tables) if output.markdown else as_text(tables)
 
 
 def _write(path: Path, text: str) -> None:

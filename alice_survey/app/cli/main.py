@@ -93,66 +93,67 @@ def init(
     epilog=examples(
         "fov",
         "fov --lens 12.5 --lens 25 --altitude 1.5 --altitude 2 --n-water 1.345 --json",
-        "fov --lens 12.5 --temperature 22 --salinity 35 --port-distance 30 --glass 12 --coc 2",
-        "fov --focus-air 1.5 --f-number 5.6 --speed 0.2 --speed 0.5 --exposure 1 --exposure 3",
+        "fov --speed 0.2 --speed 0.5 --exposure 1 --exposure 3",
+        "fov --survey reef/survey.toml --altitude 2",
         "fov --rig calibration/rig.json --altitude 2 --plot fov.png --csv fov.csv",
-        "fov --validate --markdown",
+        "fov --validate",
     )
 )
 def fov(
-    lens: Annotated[list[float] | None, typer.Option(help="Focal length, mm.")] = None,
-    altitude: Annotated[list[float] | None, typer.Option(help="Altitude of the glass, m.")] = None,
+    lens: Annotated[
+        list[float] | None, typer.Option(metavar="MM", help="Focal length of a lens to show.")
+    ] = None,
+    altitude: Annotated[
+        list[float] | None,
+        typer.Option(metavar="METRES", help="Altitude of the port's outer glass."),
+    ] = None,
     n_water: Annotated[
-        float | None, typer.Option(min=1, max=1.4, help="Index of the water.")
+        float | None,
+        typer.Option(min=1, max=1.4, metavar="INDEX", help="Refractive index of the water."),
     ] = None,
-    temperature: Annotated[float | None, typer.Option(help="Temperature of the water, C.")] = None,
-    salinity: Annotated[float | None, typer.Option(help="Salinity of the water, psu.")] = None,
-    port_distance: Annotated[
-        float | None, typer.Option(min=0, max=500, help="Pupil to glass, mm.")
+    speed: Annotated[
+        list[float] | None, typer.Option(metavar="M/S", help="Speed over ground, for the blur.")
     ] = None,
-    glass: Annotated[
-        float | None, typer.Option(min=0, max=500, help="Thickness of the port, mm.")
+    exposure: Annotated[
+        list[float] | None,
+        typer.Option(metavar="MS", help="Time of the shutter, or of the strobe if shorter."),
     ] = None,
-    n_glass: Annotated[float | None, typer.Option(min=1, max=2, help="Index of the port.")] = None,
-    rig: Annotated[Path | None, typer.Option(help="A calibrated rig.json instead.")] = None,
+    rig: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Show a calibrated rig.json instead.")
+    ] = None,
     camera: RigCamera = None,
-    f_number: Annotated[float | None, typer.Option(help="Aperture, 4 for F/4.")] = None,
-    coc: Annotated[float, typer.Option(help="Blur circle that is sharp, px.")] = 1.0,
-    focus_air: Annotated[float | None, typer.Option(help="Focus set in air, m.")] = None,
-    pixel: Annotated[float | None, typer.Option(help="Pitch of the sensor, um.")] = None,
-    match_sigma: Annotated[
-        float, typer.Option(min=1e-6, help="Disparity noise of the pair, px.")
-    ] = 0.3,
-    speed: Annotated[list[float] | None, typer.Option(help="Over ground, m/s.")] = None,
-    exposure: Annotated[list[float] | None, typer.Option(help="Shutter or strobe, ms.")] = None,
-    blur: Annotated[float | None, typer.Option(min=1e-6, help="Allowed motion blur, px.")] = None,
-    validate: Annotated[
-        bool, typer.Option("--validate", help="Check what the paper says; exit 1 if it fails.")
-    ] = False,
-    plot: Annotated[Path | None, typer.Option(help="Draw it: .png, .svg or .pdf.")] = None,
-    csv: Annotated[Path | None, typer.Option(help="Write the rows as CSV.")] = None,
-    markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown.")] = False,
     survey: Annotated[
-        Path | None, typer.Option("-s", "--survey", help="Camera, water and plan to take.")
+        Path | None,
+        typer.Option(
+            "-s",
+            "--survey",
+            metavar="FILE",
+            help="Take camera, port, aperture, water and plan from this survey.toml.",
+        ),
+    ] = None,
+    validate: Annotated[
+        bool,
+        typer.Option("--validate", help="Check the paper's optics; exit with 1 if one is wrong."),
+    ] = False,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draw the curves: .png, .svg or .pdf.")
+    ] = None,
+    csv: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the rows to a CSV file.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Show field of view and resolution.
 
-    Footprint (across the middle of the frame, and surely, between its corners), pixel, focus, depth
-    of field, stereo and blur through the exact flat port, for any lens, altitude and water. What is
-    not given is the survey's, or else the paper's.
+    Footprint, pixel, focus, depth of field, stereo and blur through the exact port. What is not
+    given is taken from the survey, or else from the paper.
     """
     from alice_survey.app.cli.fov_tables import FovOptions, Output, fov_report, validation_report
-    from camera_calib.fov.table import FovChoices
 
-    output = Output(markdown=markdown, csv=csv, plot=plot)
+    output = Output(csv=csv, plot=plot)
     options = FovOptions(
         lens_mm=lens or (), altitude_m=altitude or (), speed_mps=speed or (),
         exposure_ms=exposure or (), survey=survey, rig=rig, rig_camera=camera, n_water=n_water,
-        temperature_c=temperature, salinity_psu=salinity, port_distance_mm=port_distance,
-        glass_mm=glass, n_glass=n_glass, pixel_um=pixel, f_number=f_number, blur_px=blur,
-        choices=FovChoices(coc_px=coc, focus_air_m=focus_air, match_sigma_px=match_sigma),
     )  # fmt: skip
     table, data, passed = (
         validation_report(options, output) if validate else fov_report(options, output)

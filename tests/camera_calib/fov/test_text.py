@@ -6,14 +6,11 @@ import pytest
 
 from alice_survey.core.config import CameraConfig
 from alice_survey.core.errors import ConfigError
-from camera_calib.fov.angles import angle_table
 from camera_calib.fov.paper import PaperValidation, validate_paper
 from camera_calib.fov.plot import draw_fov
 from camera_calib.fov.table import FovChoices, blur_table, fov_table
 from camera_calib.fov.text import (
-    TextTable,
     as_csv,
-    as_markdown,
     as_text,
     fov_csv_rows,
     fov_tables,
@@ -55,13 +52,6 @@ def test_a_lens_wider_than_straight_ones_are_made_is_called_a_fisheye(
     assert f"{rows[1].sure_horizontal_m:.3f} x {rows[1].sure_vertical_m:.3f} m" in text
 
 
-def test_markdown_is_a_table_with_bars_escaped() -> None:
-    table = TextTable(title="T", header=("a", "b"), cells=(("1|2", "3"),), notes=("note",))
-    assert as_markdown([table]).splitlines() == [
-        "### T", "", "| a | b |", "| --- | --- |", "| 1\\|2 | 3 |", "", "note",
-    ]  # fmt: skip
-
-
 def test_csv_has_each_lens_altitude_speed_and_exposure_once() -> None:
     rows = fov_table([12.5, 25.0], [1.0, 2.0], 1.34, PORT)
     blur = blur_table(rows, [0.2, 0.5], [1e-3], 1.0)
@@ -79,7 +69,8 @@ def test_the_validation_has_a_verdict_for_each_check(validation: PaperValidation
     rows = validation_csv_rows(validation)
     assert len(rows) == 6 + len(validation.claims)
     assert {row["verdict"] for row in rows} == {"pass"}
-    assert as_markdown(validation_tables(validation)).count("### ") == 3
+    text = as_text(validation_tables(validation))
+    assert sum(line.split().count("pass") > 0 for line in text.splitlines()) >= len(rows)
 
 
 def draw(path: Path) -> bytes:
@@ -91,7 +82,6 @@ def draw(path: Path) -> bytes:
         speeds_mps=[0.2],
         exposures_s=[3e-3],
         allowed_px=1.0,
-        angles=angle_table(PORT, 1.34, angles_deg=[40.0, 70.0, 100.0]),
         paper=True,
     )
     return path.read_bytes()
