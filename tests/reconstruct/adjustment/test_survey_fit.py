@@ -26,7 +26,7 @@ from reconstruct.adjustment.exact_observations import (
 )
 from reconstruct.adjustment.normal_equations import PointEquations, reduce_parts
 from reconstruct.adjustment.pixel_parts import Linearised, PixelParts, Workers
-from reconstruct.adjustment.survey_fit import SurveyFit, fit_survey, frees_poses, on_pinholes
+from reconstruct.adjustment.survey_fit import SurveyFit, fit_survey, frees_poses
 from reconstruct.mapping.arrays import frames_of, observed
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped, model_baseline
@@ -313,33 +313,3 @@ def test_a_calibration_with_sigmas_lets_the_survey_refine_the_rig(tmp_path: Path
     assert any("12 points" in note for note in refined(wrong, few).mapped.notes)
     with pytest.raises(ReconstructionError, match="12 points"):
         refined(wrong, few, refine_rig="on")
-
-
-def test_the_same_rig_gives_the_same_model(tmp_path: Path) -> None:
-    """New pinholes of an unchanged rig: nothing moves."""
-    scene = noisy(7)
-    mapped, seen = modelled(scene, scene.rig, tmp_path)
-    fit = fit_survey(mapped, seen, scene.rig, port=False, pose=False)
-    frames, names = frames_of(mapped.model), list(seen.cameras)
-    same = replace(fit, state=start_state(mapped, scene.rig, names, frames, fit.point_ids))
-    found = on_pinholes(mapped, seen, same, mapped.warps)
-    for number, image in mapped.model.images.items():
-        np.testing.assert_allclose(
-            found.model.images[number].cam_from_world().matrix(),
-            image.cam_from_world().matrix(),
-            atol=1e-12,
-        )
-        at = image.get_observation_point2D_idxs()
-        before, after = (
-            np.array([one.points2D[k].xy for k in at])
-            for one in (image, found.model.images[number])
-        )
-        np.testing.assert_allclose(after, before, atol=1e-4)
-
-
-def test_one_camera_is_refused(tmp_path: Path) -> None:
-    scene = noisy(0)
-    mapped, _ = modelled(scene, scene.rig, tmp_path)
-    alone = replace(mapped, scaled=False)
-    with pytest.raises(ReconstructionError, match="two cameras"):
-        adjust_survey(alone, scene.records, scene.rig, DISTANCES, PORT)

@@ -1,6 +1,5 @@
 """Stated covariances against what many draws of noise show, and against dense algebra."""
 
-import tracemalloc
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -11,9 +10,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from alice_survey.core.block_solver import BlockStep
-from alice_survey.core.errors import ReconstructionError
 from alice_survey.core.frames import Array
-from benchmarks.block_size import block
 from camera_calib.rig import Covariance, Rig
 from reconstruct.adjustment import exact_observations
 from reconstruct.adjustment.exact_observations import exact_observations as linearised
@@ -22,7 +19,7 @@ from reconstruct.adjustment.normal_equations import (
     LinearObservations,
     reduce_points,
 )
-from reconstruct.adjustment.pixel_parts import Linearised, PixelParts, Workers
+from reconstruct.adjustment.pixel_parts import Workers
 from reconstruct.adjustment.soft_modes import Motions, spread
 from reconstruct.adjustment.survey_fit import fit_survey
 from reconstruct.adjustment.uncertainty import (
@@ -30,7 +27,6 @@ from reconstruct.adjustment.uncertainty import (
     estimate,
     pinhole_survey,
     read_uncertainty,
-    shape_of_block,
     write_uncertainty,
 )
 from reconstruct.mapping.arrays import frames_of, observed
@@ -139,31 +135,6 @@ def test_parts_of_a_large_survey_know_what_the_whole_knows(
         np.testing.assert_array_equal(again.modes.points, parts.modes.points)
 
 
-def test_memory_hardly_grows_with_the_observations(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is what a part takes, and what is found of the points."""
-
-    def peak(points: int, part: int) -> tuple[int, int]:
-        monkeypatch.setattr(exact_observations, "PART", part)
-        survey = block(calibrated().rig, 60, points)
-        pixels, order = survey.pixels.by_place(survey.truth.centres)
-        state = replace(survey.truth, points=survey.truth.points[order])
-        tracemalloc.start()
-        linear = Linearised(
-            pixels=PixelParts(pixels, 60), state=state, fields=(), noise=(0.1, 0.01)
-        )
-        found = shape_of_block(linear, pixels, state.centres, state.points, None, scale_free=False)
-        maximum = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        kept = (found.points, found.noise, found.modes.points, found.shared.motions)
-        return len(pixels.station), maximum - sum(a.nbytes for a in kept)
-
-    (few, small), (many, large) = (peak(points, 4_000) for points in (300, 1200))
-    assert many > 3.5 * few > 14 * 4_000
-    assert abs(large - small) / (many - few) < 20  # bytes
-    _, whole = peak(1200, many)
-    assert (whole - small) / (many - few) > 300
-
-
 def test_the_file_gives_back_what_was_written(tmp_path: Path) -> None:
     scene, mapped = drawn(2, tmp_path)
     found = estimate(mapped, scene.records)
@@ -196,14 +167,6 @@ def test_a_station_that_sees_next_to_nothing_has_no_covariance(tmp_path: Path) -
     assert np.isnan(found.frame_cov[4]).all()
     rest = np.delete(found.frame_cov, 4, axis=0)
     assert np.isfinite(rest).all()
-
-
-def test_too_small_a_model_is_reported(tmp_path: Path) -> None:
-    scene, mapped = drawn(4, tmp_path)
-    for point in sorted(mapped.model.points3D)[3:]:
-        mapped.model.delete_point3D(point)
-    with pytest.raises(ReconstructionError, match=" 3 points"):
-        estimate(mapped, scene.records)
 
 
 def _points_of(mapped: Mapped, number: int) -> list[int]:

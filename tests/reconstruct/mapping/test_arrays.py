@@ -1,13 +1,9 @@
 """A model's observations as arrays, against the model's own, one by one."""
 
-from pathlib import Path
-
 import numpy as np
 import pycolmap
-import pytest
 
 from reconstruct.mapping.arrays import MIN_POINTS, first_of, linked_groups, observed
-from reconstruct.views import model_files
 from tests.reconstruct.mapping.test_mapper import block_mapped
 
 
@@ -35,28 +31,6 @@ def test_observations_are_those_of_the_model() -> None:
             np.testing.assert_allclose(seen.in_cameras[row], local, atol=1e-12)
             expected = image.camera.img_from_cam(local) - point2d.xy
             np.testing.assert_allclose(missed[row], expected, atol=1e-9)
-
-
-def test_an_empty_model_has_no_observations() -> None:
-    seen = observed(pycolmap.Reconstruction())
-    assert len(seen.pictures) == len(seen.point) == len(seen.points) == 0
-    assert seen.pixels.shape == (0, 2) and seen.in_cameras.shape == (0, 3)
-
-
-def test_a_copy_for_which_there_was_no_room_is_named(tmp_path: Path) -> None:
-    model = block_mapped().model
-    model.write_binary(tmp_path)
-    for name, read in (
-        ("images.bin", lambda folder: dict(model_files._all_keypoints(folder / "images.bin"))),
-        ("points3D.bin", model_files.all_points),
-    ):
-        read(tmp_path)
-        whole = (tmp_path / name).read_bytes()
-        for length in (0, 4, 30, len(whole) // 2, len(whole) - 1):
-            (tmp_path / name).write_bytes(whole[:length])
-            with pytest.raises(OSError):
-                read(tmp_path)
-        (tmp_path / name).write_bytes(whole)
 
 
 def test_groups_are_the_stations_that_points_link() -> None:

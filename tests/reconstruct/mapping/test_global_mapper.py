@@ -165,19 +165,6 @@ def test_threads_do_not_change_a_byte(tmp_path: Path) -> None:
         assert file.read_bytes() == (tmp_path / "2" / file.name).read_bytes()
 
 
-def test_a_fall_back_is_reported(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from reconstruct.mapping import mapper
-
-    scene = make_scene(lines=1, stations=5, points=3000, noise_px=0.2)
-    monkeypatch.setattr(mapper, "map_globally", lambda *_: [])
-    mapped = mapped_by(scene, "auto")
-    assert mapped.models[0] == 10
-    assert "10 of 10" in mapped.notes[0]
-    assert mapped.notes[0] in capsys.readouterr().err
-
-
 def test_a_model_that_lost_pictures_is_not_sound() -> None:
     scene = make_scene(lines=1, stations=4, points=2500, noise_px=0.2)
     model = mapped_by(scene, "global").model

@@ -5,19 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.core.errors import ReconstructionError, heard
+from alice_survey.core.errors import ReconstructionError
 from alice_survey.core.executor import SERIAL
-from camera_calib.approximation.pinhole_warp import best_warp
 from camera_calib.rig import Rig
 from reconstruct.mapping.working_range import (
-    WorkingDistances,
     find_distances,
     ray_passes,
-    warn_of_warps,
-    warp_record,
 )
 from reconstruct.matching.features import Features, save_features
-from tests.cameras import changed
 from tests.reconstruct.rig_survey import four_cameras
 from tests.reconstruct.scenes import ALTITUDE_M, Scene, make_scene
 
@@ -96,31 +91,3 @@ def test_rays_pass_where_they_were_built_to() -> None:
     np.testing.assert_allclose(gap, 0.01, rtol=1e-6)
     parallel = ray_passes(start_a[:1], ray_a[:1], start_b[:1], ray_a[:1])
     assert np.isnan(parallel[0]).all()
-
-
-def test_a_pinhole_that_stands_in_badly_is_warned_of_in_one_line() -> None:
-    """A lens of 120 degrees in air whose pupil is 100 mm behind the glass, 40 mm from the floor."""
-    camera = make_scene(lines=1, stations=1, points=10).rig.cameras["left"]
-    usual = WorkingDistances(near_m=1.75, far_m=2.35, source="test")
-    good = best_warp(camera, usual.near_m, usual.far_m)
-    close = WorkingDistances(near_m=0.15, far_m=2.0, source="test")
-    wide = changed(camera, port_distance_m=0.1, fx_px=0.3 * camera.fx_px, fy_px=0.3 * camera.fy_px)
-    bad = best_warp(wide, close.near_m, close.far_m)
-
-    assert 1e-5 < warp_record(good, usual).contraction < 0.01
-    assert 1e-5 < warp_record(good, usual).offset_m < 1e-3
-    assert 0.5 < warp_record(bad, close).contraction < 0.7
-    with heard() as warnings:
-        warn_of_warps({"good": good}, usual)
-        assert not warnings
-        warn_of_warps({"bad": bad}, close)
-    assert len(warnings) == 1
-    assert "bad" in warnings[0]
-    assert "0.55" in warnings[0]
-    assert "\n" not in warnings[0]
-
-
-def test_a_camera_of_one_centre_has_nothing_to_warn_of() -> None:
-    camera = make_scene(lines=1, stations=1, points=10).rig.cameras["left"].in_air()
-    found = warp_record(best_warp(camera, 0.1, 10.0), None)
-    assert (found.offset_m, found.contraction, found.cut_share) == (0.0, 0.0, 0.0)

@@ -97,12 +97,6 @@ def test_a_picture_with_little_to_show_is_searched_at_full_scale() -> None:
     assert not np.array_equal(plain.pixels, quick.pixels)
 
 
-def test_a_blank_picture_has_no_features() -> None:
-    found = find_features(np.full((80, 90), 70, np.uint8), None, scale=1.0, maximum=100)
-    assert found.pixels.shape == (0, 2)
-    assert found.descriptors.shape == (0, 128)
-
-
 def test_spread_takes_the_largest_of_every_cell_first() -> None:
     rng = np.random.default_rng(4)
     crowd = np.column_stack([rng.uniform(0, 20, 500), rng.uniform(0, 20, 500)])
@@ -114,18 +108,6 @@ def test_spread_takes_the_largest_of_every_cell_first() -> None:
     assert {500, 501} <= set(chosen)
     in_first_cell = [i for i in chosen if np.all(pixels[i] < 20)]
     assert int(np.argmax(sizes[:500])) in in_first_cell
-
-
-def test_spread_does_not_depend_on_the_order_of_detection() -> None:
-    rng = np.random.default_rng(5)
-    pixels, sizes = rng.uniform(0, 300, (400, 2)), rng.integers(2, 6, 400).astype(float)
-    response = rng.integers(1, 3, 400).astype(float)
-    shuffle = rng.permutation(400)
-    one = pixels[spread(pixels, sizes, response, (300, 300), 50)]
-    other = pixels[shuffle][
-        spread(pixels[shuffle], sizes[shuffle], response[shuffle], (300, 300), 50)
-    ]
-    assert {tuple(p) for p in one} == {tuple(p) for p in other}
 
 
 def test_root_sift_has_norm_512() -> None:

@@ -71,18 +71,6 @@ def test_bytes_of_descriptors_keep_their_distances(reference: dict[str, np.ndarr
     assert (found.descriptors == 255).mean() < 0.01
 
 
-@pytest.mark.parametrize("threads", [1, 4])
-def test_threads_change_no_byte(reference: dict[str, np.ndarray], threads: int) -> None:
-    before = cv2.getNumThreads()
-    whole = [values.tobytes() for values in dense_features(reference["picture"])]
-    try:
-        cv2.setNumThreads(threads)
-        again = [values.tobytes() for values in dense_features(reference["picture"])]
-    finally:
-        cv2.setNumThreads(before)
-    assert again == whole
-
-
 def test_sampling_equals_its_slow_twin() -> None:
     rng = np.random.default_rng(3)
     field = rng.normal(size=(6, 9, 4)).astype(np.float32)

@@ -53,13 +53,6 @@ def test_products_of_full_descriptors_are_exact() -> None:
     np.testing.assert_array_equal(a.astype(np.float32) @ b.T.astype(np.float32), exact)
 
 
-@pytest.mark.parametrize(("n", "m"), [(0, 5), (5, 0), (5, 1)])
-def test_too_few_descriptors_give_no_match(n: int, m: int) -> None:
-    assert match_descriptors(
-        np.zeros((n, 128), np.uint8), np.zeros((m, 128), np.uint8), 0.8
-    ).shape == (0, 2)
-
-
 def pair_task(
     folder: Path, camera: pycolmap.Camera, *sides: tuple[Array, NDArray[np.int64]]
 ) -> PairTask:
@@ -115,18 +108,6 @@ def test_pictures_without_a_common_spot_share_nothing(tmp_path: Path) -> None:
     task = pair_task(tmp_path, pinhole(800, 600, 900), *sides)
     assert coarse_matches(task) < 10
     assert match_pair(task).geometry is None
-
-
-def test_features_written_again_are_read_again(tmp_path: Path) -> None:
-    """One process may map a workspace twice with other settings."""
-    task, _ = two_views(tmp_path, outliers=0)
-    many = match_pair(task)
-    whole = load_features(task.first)
-    few = Features(
-        pixels=whole.pixels[:40], scale_px=whole.scale_px[:40], descriptors=whole.descriptors[:40]
-    )
-    save_features(task.first, few)
-    assert 30 <= len(match_pair(task).matches) <= 40 < len(many.matches)
 
 
 def random_features(rng: np.random.Generator, count: int, size: int = 8) -> Features:

@@ -17,7 +17,6 @@ from reconstruct.matching.pairs import (
     describe,
     footprints,
     make_codebook,
-    nearest_each,
     neighbours,
     placed_pictures,
     well_conditioned,
@@ -47,11 +46,6 @@ def test_neighbours_of_stereo_stations_cross_the_cameras() -> None:
     assert ("left/1.png", "right/0.png") in names
     assert not any({"left/0.png", "right/2.png"} == set(pair) for pair in names)
     assert len(names) == 3 + 2 * 4
-
-
-def test_gaps_in_station_numbers_do_not_part_neighbours() -> None:
-    records = [replace(r, station=10 * r.station) for r in mono(4)]
-    assert neighbours(records, 1) == {(0, 1), (1, 2), (2, 3)}
 
 
 def test_few_pictures_without_navigation_are_all_looked_at() -> None:
@@ -220,13 +214,6 @@ def test_uncertain_navigation_widens_the_search() -> None:
     assert len(found[1][1]) > len(found[0][1])
 
 
-def test_looks_go_to_the_nearest() -> None:
-    apart = {(0, j): float(j) for j in range(1, 10)} | {(10, 11): 99.0}
-    assert nearest_each(apart, apart, 1) == {(0, j) for j in range(1, 10)} | {(10, 11)}
-    star = {(i, j): float(abs(i - j)) for i in range(20) for j in range(i + 1, 20)}
-    assert nearest_each(star, star, 1) == {(i, i + 1) for i in range(19)}
-
-
 def test_pictures_that_look_alike_get_a_look_where_navigation_is_silent() -> None:
     sure, maybe = choose_pairs(mono(200), None, None, [(3, 150), (4, 5)])
     assert maybe == [(3, 150)]
@@ -280,18 +267,6 @@ def test_vectors_equal_those_of_the_slow_twin(tmp_path: Path) -> None:
     with np.load(files[1]) as data:
         slow = vlad_slowly(data["descriptors"], words)
     np.testing.assert_allclose(describe(files[1], words), slow, atol=1e-5)
-
-
-def test_a_picture_without_features_looks_like_nothing(tmp_path: Path) -> None:
-    files = strip(tmp_path, pictures=4)
-    empty = Features(
-        pixels=np.zeros((0, 2)),
-        scale_px=np.zeros(0, np.float32),
-        descriptors=np.zeros((0, 128), np.uint8),
-    )
-    save_features(files[2], empty)
-    words = make_codebook(files, seed=4)
-    assert not describe(files[2], words).any()
 
 
 @pytest.mark.parametrize("off_nadir_deg", [75.0, 90.0])

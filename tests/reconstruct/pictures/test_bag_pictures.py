@@ -157,18 +157,6 @@ def test_navigation_on_the_same_clock_places_them(tmp_path: Path) -> None:
     np.testing.assert_allclose([r.depth_m for r in lefts], expected, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("options", "named"),
-    [
-        ({"topics": {"left": "/nothing"}}, "no pictures in /nothing; it has /stereo/left"),
-        ({"overlap": 0.7}, "--overlap"),
-    ],
-)
-def test_wrong_wishes_are_named(tmp_path: Path, options: dict[str, Any], named: str) -> None:
-    with pytest.raises(ImageError, match=named):
-        import_images(tmp_path / "w", [], bag=stereo(tmp_path), **options)
-
-
 def test_cameras_of_different_clocks_are_refused(tmp_path: Path) -> None:
     bag = stereo(tmp_path, late_ns=100_000_000)
     with pytest.raises(ImageError, match="one clock"):

@@ -2,9 +2,7 @@ import csv
 import struct
 from collections.abc import Callable
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -129,15 +127,6 @@ def test_a_divers_folder_is_counted_by_kind_and_reason(
         assert sum(name in line for line in warnings) == 1
     again = import_images(tmp_path / "w", [source])
     assert not again.changed and replace(again, changed=True) == found
-
-
-def test_a_folder_without_pictures_names_what_it_holds(tmp_path: Path, draw: Draw) -> None:
-    (tmp_path / "in").mkdir()
-    (tmp_path / "in" / "a.HEIC").write_bytes(b"x")
-    draw(tmp_path / "in" / "dive1" / "b.jpg")
-    with pytest.raises(ImageError) as caught:
-        import_images(tmp_path / "w", [tmp_path / "in"])
-    assert "1 HEIC" in str(caught.value) and "dive1" in str(caught.value)
 
 
 def test_one_folder_does_not_serve_twice(tmp_path: Path, several: Several) -> None:
@@ -396,24 +385,6 @@ def test_depths_in_the_air_are_warned_of(
     assert "sea surface" not in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("rows", "named"),
-    [
-        ([[f"2024-07-01T12:00:{s:02d}Z", ""] for s in range(9)], "no row with a time"),
-        ([["2024-07-01T12:00:07Z", 10 + s] for s in range(9)], "log at 0.0 to 0.0 s"),
-        ([[f"2024-07-01T11:00:{s:02d}Z", 10] for s in range(9)], "--clock-offset"),
-    ],
-)
-def test_a_depth_log_of_no_use_is_one_line(
-    tmp_path: Path, several: Several, rows: list[list[Any]], named: str
-) -> None:
-    source = several(2, dated=True)
-    nav = navigation(tmp_path / "nav.csv", rows, "time_utc,depth_m")
-    with pytest.raises(AliceError, match=named) as caught:
-        import_images(tmp_path / "w", [source], navigation=nav)
-    assert "\n" not in str(caught.value)
-
-
 def test_masks_come_along(tmp_path: Path, several: Several) -> None:
     several(3, suffix=".png")
     near, apart = np.full((48, 64), 255, np.uint8), np.zeros((48, 64), np.uint8)
@@ -603,30 +574,6 @@ def test_raw_pictures_are_developed_alike(
     light = ((bright[inner] / 255.0 + 0.099) / 1.099) ** (1 / 0.45)  # BT.709 undone
     expected = 255.0 * (1.099 * (light / 2) ** 0.45 - 0.099)
     assert np.abs(dim[inner] - expected).max() < 2.0
-
-
-@pytest.mark.parametrize(
-    ("tags", "taken"),
-    [
-        ({0x9003: "2024:05:01 12:00:00", 0x9011: "+02:00"}, datetime(2024, 5, 1, 10, tzinfo=UTC)),
-        ({0x9003: "2024:05:01 12:00:00", 0x9011: "+99:99"}, datetime(2024, 5, 1, 12)),
-        ({0x9003: "0001:01:01 00:00:00", 0x9011: "+23:59"}, None),
-        ({0x9003: "9999:12:31 23:59:59"}, None),
-    ],
-)  # fmt: skip
-def test_dates_of_exif_that_cannot_be(tmp_path: Path, tags: Any, taken: datetime | None) -> None:
-    exif = Image.Exif()
-    exif.get_ifd(0x8769).update(tags)
-    Image.new("RGB", (48, 32)).save(tmp_path / "a.jpg", exif=exif)
-    assert inspect(tmp_path / "a.jpg").time_local == taken
-
-
-def test_positions_of_exif_that_are_no_angles(tmp_path: Path) -> None:
-    exif = Image.Exif()
-    exif.get_ifd(0x8825).update({2: 5.0, 4: (1.0, 2.0), 6: 3.0})
-    Image.new("RGB", (48, 32)).save(tmp_path / "a.jpg", exif=exif)
-    facts = inspect(tmp_path / "a.jpg")
-    assert (facts.fault, facts.latitude_deg, facts.longitude_deg) == ("", None, None)
 
 
 def test_a_picture_that_states_more_than_can_be_read(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from alice_survey.core.errors import ImageError
 from alice_survey.core.executor import SERIAL
 from alice_survey.core.manifest import ImageRecord, write_manifest
-from reconstruct.pictures.quality import PictureQuality, judge, measure, quality_report, worst_first
+from reconstruct.pictures.quality import PictureQuality, judge, measure, quality_report
 
 Picture = NDArray[np.uint8]
 
@@ -153,16 +153,3 @@ def test_each_fault_is_named_and_nothing_else(survey: Path) -> None:
     assert all(math.isfinite(float(row["sharpness"])) for row in rows[:18])
     sheet = cv2.imread(str(survey / "quality" / "quality.png"))
     assert sheet.shape[1] > 1000
-
-
-def test_the_worst_come_first(survey: Path) -> None:
-    unreadable = PictureQuality(image="b", camera="l", station=1, reasons=("unreadable",))
-    dim = PictureQuality(image="a", camera="l", station=0, sharpness=0.2, reasons=("dark",))
-    fine = PictureQuality(image="c", camera="l", station=2, sharpness=1.0)
-    assert [q.image for q in worst_first([fine, dim, unreadable])] == ["b", "a"]
-
-
-def test_an_empty_manifest_is_refused(tmp_path: Path) -> None:
-    write_manifest(tmp_path / "images" / "manifest.csv", [])
-    with pytest.raises(ImageError, match=r"manifest\.csv"):
-        quality_report(tmp_path, SERIAL)

@@ -6,10 +6,9 @@ import pycolmap
 import pytest
 
 from alice_survey.core.artefacts import write_json
-from alice_survey.core.errors import ImageError, WorkspaceError
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp, warp_from_json
 from reconstruct.mapping.self_calibration import self_calibrated_warp
-from reconstruct.pictures.undistorted import Pictures, read_mask, undistortion_maps
+from reconstruct.pictures.undistorted import Pictures, undistortion_maps
 from reconstruct.views.model_files import colmap_pinhole
 from tests.cameras import flat_port_camera
 
@@ -135,25 +134,3 @@ def test_masks_follow_the_warp(tmp_path: Path) -> None:
     for x, y in edge:
         assert not valid[int(y), int(x) - 3]
         assert valid[int(y), int(x) + 3]
-
-
-def test_grey_is_normalised_and_as_large_as_colour(tmp_path: Path) -> None:
-    rng = np.random.default_rng(3)
-    dim = rng.integers(5, 25, (HEIGHT, WIDTH, 3)).astype(np.uint8)
-    pictures = workspace_of(tmp_path, opencv_lens(), dim)
-    grey = pictures.grey("camera/a.png")
-    assert grey.shape == pictures.colour("camera/a.png").shape[:2]
-    assert grey[50:-50, 50:-50].mean() > 60
-
-
-def test_faults_name_the_file(tmp_path: Path) -> None:
-    pictures = workspace_of(tmp_path, port_lens(), np.zeros((10, 20, 3), np.uint8), "m.png")
-    with pytest.raises(ImageError, match=r"a\.png.*20 x 10.*320 x 240"):
-        pictures.colour("camera/a.png")
-    with pytest.raises(ImageError, match=r"m\.png"):
-        pictures.valid("camera/a.png")
-    with pytest.raises(WorkspaceError, match="'x'"):
-        pictures.colour("x")
-    cv2.imwrite(str(tmp_path / "m.png"), np.zeros((4, 5), np.uint8))
-    with pytest.raises(ImageError, match="5 x 4"):
-        read_mask(tmp_path / "m.png", (20, 10))

@@ -6,17 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.core.frames import Array
 from alice_survey.core.manifest import ImageRecord
 from reconstruct.placing.alignment import Bend, level
 from reconstruct.placing.fit import fit_navigation
 from tests.reconstruct.placing.test_sigmas import (
     BODY_FROM_CAM,
     DATUM,
-    SIGMA,
     flight,
     flown,
-    records_of,
 )
 
 
@@ -94,28 +91,3 @@ def test_a_line_has_no_bend_across_and_a_few_stations_have_none() -> None:
     assert along.curvature_per_m == pytest.approx(3e-3, abs=4 * along.sigma_per_m)
     short = flight(1, 6)
     assert bends_of(short, flown(short, 5, 1.0), 0.0, 0.0) == ()
-
-
-@pytest.mark.parametrize(("sag_mm", "minimum", "maximum"), [(0.0, 0.0, 0.1), (8.0, 0.9, 1.0)])
-def test_a_bend_of_eight_millimetres_over_thirty_metres_is_seen(
-    sag_mm: float, minimum: float, maximum: float
-) -> None:
-    """Depths of a pressure sensor: 5 cm that last, 6 mm that drift in ten minutes, 2 mm white."""
-    body, seen = flight(10, 61), 0
-    north = np.ptp(body.translation[:, 0])
-    for seed in range(10):
-        rng = np.random.default_rng([12, seed])
-        errors = SIGMA * lasting(rng, len(body))
-        found = bends_of(body, records_of(body, errors, SIGMA), 8e-3 * sag_mm / north**2, 0.0, seed)
-        seen += found[0].significant(5e-3)
-    assert minimum <= seen / 10 <= maximum
-
-
-def lasting(rng: np.random.Generator, count: int) -> Array:
-    """(count, 6) errors in sigmas: constant, slow and white parts of every channel."""
-    slow = rng.normal(size=(count, 6))
-    kept = np.exp(-2.5 / 600.0)
-    for i in range(1, count):
-        slow[i] = kept * slow[i - 1] + np.sqrt(1 - kept**2) * slow[i]
-    part = np.array([1.0, 0.12, 0.04])
-    return part[0] * rng.normal(size=6) + part[1] * slow + part[2] * rng.normal(size=(count, 6))

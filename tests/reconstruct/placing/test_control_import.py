@@ -244,13 +244,6 @@ def test_faults_are_named_in_one_line(
     assert not (workspace / "control.csv").exists()
 
 
-def test_pictures_that_are_not_there_are_named(workspace: Path, tmp_path: Path) -> None:
-    path = tmp_path / "gcp_list.txt"
-    path.write_text("EPSG:4326\n-91 46 1 10 20 other.jpg A\n")
-    with pytest.raises(WorkspaceError, match=r"none of its 1 picks .*other\.jpg"):
-        import_control(workspace, path, sigma_m=0.02)
-
-
 SCALEBARS = (
     '<scalebars next_id="4"><scalebar id="0" label="short" {ends}>'
     '<reference distance="0.5" accuracy="0.0002" enabled="true"/></scalebar>'
@@ -286,13 +279,3 @@ def test_scale_bars_of_metashape_become_bars(workspace: Path, ends: str, placed:
         ("A", "C"), 81.5, 0.004, "check",
     )  # fmt: skip
     assert {pick.point for pick in read_picks(workspace / "picks.csv")} == {"A", "B", "C"}
-
-
-def test_scale_bars_without_an_accuracy_ask_for_it(workspace: Path) -> None:
-    path = markers_xml(workspace / "markers.xml", system=SCALEBARS.format(ends='marker="0"'))
-    text = re.sub(r'<reference x="[^>]*/>', "", path.read_text())
-    path.write_text(text)
-    with pytest.raises(WorkspaceError, match="accuracy of scale bar A_C"):
-        import_control(workspace, path)
-    found = import_control(workspace, path, sigma_m=0.002)
-    assert str(found) == "0 points, 1 scale bar (1 of them to check by), 4 picks in 2 pictures"

@@ -3,8 +3,6 @@
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from alice_survey.core.edited_files import StaleError
 from alice_survey.core.errors import WorkspaceError
@@ -16,11 +14,6 @@ from reconstruct.placing.control_points import (
     save_picks,
     table_token,
 )
-
-NAMES = st.text(
-    st.characters(codec="utf-8", exclude_categories=("Cc", "Cs", "Zl", "Zp", "Zs")), min_size=1,
-    max_size=12,
-).filter(lambda name: name == name.strip() and not name.startswith("#"))  # fmt: skip
 
 
 def pick(image: str, point: str, x: float = 10.0, y: float = 20.0, **more: object) -> Pick:
@@ -116,13 +109,3 @@ def test_control_rows_are_replaced_by_kind_and_name(tmp_path: Path) -> None:
     assert known.points[0].depth_m == 10.0 and known.lengths[0].length_m == 0.5
     save_control(path, token, [], [("point", "1")])
     assert read_control(path).points == () and len(read_control(path).lengths) == 1
-
-
-@given(points=st.lists(st.tuples(NAMES, NAMES), unique=True, min_size=1, max_size=6))
-def test_names_of_any_script_come_back(
-    tmp_path_factory: pytest.TempPathFactory, points: list[tuple[str, str]]
-) -> None:
-    path = tmp_path_factory.mktemp("names") / "picks.csv"
-    picks = [pick(f"sub folder/{image}.png", point) for image, point in points]
-    save_picks(path, "", picks, {p.point for p in picks})
-    assert read_picks(path) == picks

@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.app.pipeline import run
 from alice_survey.core.config import ReconstructConfig
-from alice_survey.core.executor import local_executor
 from alice_survey.core.frames import Array
-from alice_survey.core.records import RangeRecord, RegistrationRecord
+from alice_survey.core.records import RangeRecord
 from reconstruct.adjustment.adjusted import adjust_survey
 from reconstruct.adjustment.normal_equations import Gauge
 from reconstruct.adjustment.uncertainty import Uncertainty
@@ -24,11 +22,10 @@ from reconstruct.placing.alignment import align_rigid, level
 from reconstruct.placing.fit import PlacementFit, fit_navigation
 from reconstruct.placing.navigation import PLACE, body_from_pinhole
 from reconstruct.placing.run import _move, join_groups
-from reconstruct.placing.track import picture_modes, pose_covariances, read_track_poses, track_rows
+from reconstruct.placing.track import picture_modes, pose_covariances, track_rows
 from reconstruct.views.model import WorldFrame
 from reconstruct.views.model_files import as_transform
 from tests.reconstruct.placing.test_sigmas import SIGMA, gauss_markov, records_of
-from tests.reconstruct.rig_survey import bodies, four_cameras, import_survey, render_survey
 from tests.reconstruct.scenes import ALTITUDE_M, DATUM, Scene, make_scene
 from tests.reconstruct.true_models import near_truth, warped_scene
 
@@ -265,29 +262,3 @@ def test_a_linked_survey_has_one_group(tmp_path: Path) -> None:
     assert found.shape is not None
     assert found.shape.modes.joints == 0
     assert found.shape.modes.groups is None
-
-
-@pytest.mark.slow
-def test_rendered_lines_with_a_gap_between_them(tmp_path: Path) -> None:
-    """The first and the last of four lines, by the commands: no picture of one shows the other."""
-    pictures, workspace, names = tmp_path / "pictures", tmp_path / "two", ("wide", "tele")
-    render_survey(pictures, local_executor(), moments=(*range(4), *range(12, 16)), names=names)
-    import_survey(pictures, pictures / "rig.json", workspace, names)
-    (workspace / "survey.toml").write_text("[reconstruct]\nmax_features = 3000\n")
-    run(["mapping", "placing"], workspace, None)
-    found = RegistrationRecord.read(workspace / "sparse" / "registration.json")
-    assert (found.registered, found.models) == (16, (8, 8))
-    (joint,) = found.joints
-    assert joint.stations == 4
-    sigma = np.hypot(joint.sigma_north_m, joint.sigma_east_m)
-    assert 5e-3 < sigma < 0.3
-    poses, read = bodies(4), read_track_poses(workspace / "sparse" / "track.csv")
-    cameras = [name for name in sorted(read) if name.startswith("wide/")]
-    places = np.array([read[name].translation for name in cameras])
-    mount = four_cameras().body_from_cam("wide")
-    true = np.array([(poses[int(name[5:9])] * mount).translation for name in cameras])
-    for line in (slice(0, 4), slice(4, 8)):
-        off = align_rigid(places[line], true[line]).apply(places[line]) - true[line]
-        assert np.sqrt((off**2).sum(axis=1).mean()) < 1e-3
-    by_first = align_rigid(places[:4], true[:4]).apply(places[4:]) - true[4:]
-    assert 0.0 < np.linalg.norm(by_first.mean(axis=0)) < 3.0 * sigma

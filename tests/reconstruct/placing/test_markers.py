@@ -9,12 +9,11 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.artefacts import write_json
-from alice_survey.core.errors import ReconstructionError
 from alice_survey.core.frames import Array
 from alice_survey.core.manifest import write_manifest
 from camera_calib.approximation.pinhole_warp import best_warp
 from camera_calib.camera import Camera
-from reconstruct.placing.control_command import find_markers, survey_control
+from reconstruct.placing.control_command import survey_control
 from reconstruct.placing.control_points import RegisteredPicture, find_spots, read_picks
 from tests.reconstruct.scenes import ALTITUDE_M, Scene, make_scene
 
@@ -104,16 +103,6 @@ def test_markers_are_found_to_a_part_of_a_pixel_and_their_side_measured(workspac
     np.testing.assert_allclose(spots["7"].model[:2], middle_ne(), atol=0.003)
     sides = np.linalg.norm(place - np.roll(place, -1, axis=0), axis=1)
     assert sides.mean() == pytest.approx(SIDE_M, rel=0.01)
-
-
-def test_a_picture_without_markers_has_none() -> None:
-    noise = np.random.default_rng(0).integers(0, 255, (300, 400)).astype(np.uint8)
-    assert find_markers(cv2.GaussianBlur(noise, (0, 0), 2.0), "DICT_6X6_250") == []
-
-
-def test_an_unknown_dictionary_is_refused(workspace: Path) -> None:
-    with pytest.raises(ReconstructionError, match="DICT_9X9"):
-        survey_control(workspace, dictionary="DICT_9X9")
 
 
 def test_markers_of_another_dictionary_are_not_seen(workspace: Path) -> None:

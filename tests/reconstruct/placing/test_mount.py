@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.core.errors import collected_by, warn
+from alice_survey.core.errors import warn
 from alice_survey.core.frames import Array
 from camera_calib.mount import mount_rotation
 from reconstruct.placing.alignment import level
@@ -82,13 +82,3 @@ def test_the_mount_is_found_within_its_sigmas(words: str) -> None:
         places.append(error / np.sqrt(np.diag(fit.covariance))[:6])
     for ratios, low in ((turns, 0.4), (np.array(arms)[:, :2], 0.4), (places, 0.3)):
         assert low < np.sqrt(np.mean(np.square(ratios))) < 1.6
-
-
-def test_of_all_fits_on_the_way_the_last_alone_warns() -> None:
-    calls: list[str] = []
-    reported: list[tuple[str, str]] = []
-    with collected_by(lambda *message: reported.append(message)):
-        fit, _, _ = placed("nadir-bow-left", 0, calls=calls)
-    assert fit.mount is not None
-    assert len(calls) > 2
-    assert reported == [("warning", calls[-1])]

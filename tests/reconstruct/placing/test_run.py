@@ -116,10 +116,6 @@ def test_the_track_agrees_with_the_model(drone: Path) -> None:
     assert times == sorted(times)
 
 
-def test_what_is_done_is_not_done_again(drone: Path) -> None:
-    assert not reconstruct(drone, QUICK, local_executor(2))
-
-
 def test_two_processes_give_the_same_bytes(drone: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
     import_images(other, [drone / "in"])

@@ -306,12 +306,6 @@ def test_the_correlated_share_is_that_of_the_mean(tau: float) -> None:
     assert correlated_share(time, 1e12, 0.0) == pytest.approx(1.0)
 
 
-def test_placing_is_the_same_twice() -> None:
-    body = flight()
-    first, second = (place(body, flown(body, 1, 50.0), 1)[0] for _ in range(2))
-    assert first.to_json() == second.to_json()
-
-
 @pytest.mark.slow
 def test_twenty_flights_are_placed_within_their_sigmas() -> None:
     """The built-in flight simulator, its sensors and its filter, 20 times over one small plan."""

@@ -14,7 +14,6 @@ from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.frames import Array, Datum, attitude_from_rotation, rotation_from_attitude
 from reconstruct.adjustment.soft_modes import SoftModes, no_modes
 from reconstruct.adjustment.uncertainty import Uncertainty
-from reconstruct.mapping.arrays import cross_matrices
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.fit import PlacementFit
 from reconstruct.placing.navigation import USUAL_INSTALLATION, attitude_axes
@@ -182,11 +181,6 @@ def test_axes_of_the_attitude_are_its_derivatives(angles_deg: tuple[float, ...])
         np.testing.assert_allclose(turn.as_rotvec() / 1e-6, axes[:, k], atol=1e-5)
 
 
-def test_cross_matrices() -> None:
-    a, b = np.random.default_rng(0).normal(size=(2, 5, 3))
-    np.testing.assert_allclose(np.einsum("nij,nj->ni", cross_matrices(a), b), np.cross(a, b))
-
-
 def test_sigmas_of_the_attitude_are_those_of_the_vehicle_not_of_north() -> None:
     """One degree about north is roll when heading north, pitch when heading east."""
     covariance = np.zeros((1, 6, 6))
@@ -283,26 +277,3 @@ def test_the_figure_shows_the_mosaic_and_the_stations_on_it(tmp_path: Path) -> N
     assert figures[0].shape != figures[1].shape or (figures[0] != figures[1]).any()  # ellipses
     with pytest.raises(WorkspaceError):
         plot_track_over(tmp_path / "none.tif", tmp_path / "track.csv", tmp_path / "t.png")
-
-
-def test_the_figure_of_a_track_of_many_lines_is_a_map_not_a_legend(tmp_path: Path) -> None:
-    write_green(tmp_path / "mosaic.tif")
-    first = rows()[0]
-    track = [
-        replace(
-            first,
-            image=f"left/{line:03d}{place}.png",
-            station=4 * line + place,
-            time_s=float(4 * line + place),
-            world_from_cam=RigidTransform.from_components(
-                [-5.5 + 11.0 * line / 200, (place if line % 2 == 0 else 3 - place) - 1.5, 10.0],
-                first.world_from_cam.rotation,
-            ),
-        )
-        for line in range(200)
-        for place in range(4)
-    ]
-    write_track_csv(tmp_path / "track.csv", track, FRAME, track_sigmas(track, None))
-    plot_track_over(tmp_path / "mosaic.tif", tmp_path / "track.csv", tmp_path / "t.png")
-    high, wide = cv2.imread(str(tmp_path / "t.png")).shape[:2]
-    assert 0.5 * wide < high < wide

@@ -1,9 +1,7 @@
 """Pictures that are not in a model: why, and where navigation puts them."""
 
-import csv
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,9 +9,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.frames import Datum
 from alice_survey.core.manifest import ImageRecord
-from reconstruct.mapping.run import reasons, write_reasons
+from reconstruct.mapping.run import reasons
 from reconstruct.matching.matches import PairMatches
-from reconstruct.placing.run import navigation_places, read_reasons, write_unregistered
+from reconstruct.placing.run import navigation_places
 from reconstruct.placing.track import TrackRow
 
 DATUM = Datum(32.8, 34.9)
@@ -103,26 +101,3 @@ def test_without_a_model_around_navigation_stands_as_it_is():
     assert not found.corrected
     np.testing.assert_allclose(found.ned, true[5:6], atol=1e-6)
     np.testing.assert_array_equal(found.sigma, [[5.0, 0.3]])
-
-
-def test_tables_are_written_and_read(tmp_path: Path):
-    records, true = survey(np.random.default_rng(1), 0.05, 1.0)
-    write_reasons(tmp_path / "unregistered.csv", records, {})
-    assert read_reasons(tmp_path) == {}
-    words = {"004.png": "12 features: too dark, too blurred", "005.png": "no, overlap"}
-    write_reasons(tmp_path / "unregistered.csv", records, words)
-    assert read_reasons(tmp_path) == words
-    lost = [records[4], replace(records[5], depth_m=math.nan)]
-    kept = [n for n in range(60) if n not in (4, 5)]
-    places = navigation_places(
-        lost, {r.image: r for r in records}, rows_of(records, true, kept), None, DATUM
-    )
-    write_unregistered(tmp_path / "all.csv", lost, words, places, DATUM)
-    with (tmp_path / "all.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [row["reason"] for row in rows] == list(words.values())
-    assert rows[0]["placed_by"] == "navigation, corrected"
-    there = [float(rows[0][name]) for name in ("latitude_deg", "longitude_deg", "depth_m")]
-    np.testing.assert_allclose(DATUM.ned_from_geodetic(np.array([there]))[0], true[4], atol=0.3)
-    assert 0 < float(rows[0]["sigma_horizontal_m"]) < 0.3
-    assert rows[1]["placed_by"] == rows[1]["latitude_deg"] == ""
