@@ -735,13 +735,13 @@ def _with_rough_scale(fit: PlacementFit) -> PlacementFit | None:
     if sigma > _VAGUE_SCALE:
         warn(
             f"positions of navigation show the scale to {sigma:.0%} only: the model stays without "
-            "CRS; measure a known length with 'alice-survey scale'"
+            "CRS; measure a known length with 'alice-survey control'"
         )
         return None
     honest = -float(np.log1p(-3.0 * sigma)) / 3.0
     warn(
         f"positions spread little for their errors: the scale is rough, sigma {honest:.0%}; "
-        "measure a known length with 'alice-survey scale'"
+        "measure a known length with 'alice-survey control'"
     )
     grown = np.ones(len(fit.joint))
     grown[SCALE] = honest / sigma

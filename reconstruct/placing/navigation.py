@@ -475,7 +475,7 @@ def _scale_by_relief(epochs: Epochs, levelled: Similarity) -> float | None:
         warn(
             f"depths along the track show {max(size, 0.0):.2f} m of the model's relief at a sigma "
             f"of {sigma:.2f} m, too little for its scale: it stays unscaled, without CRS; measure "
-            "a known length with 'alice-survey scale'"
+            "a known length with 'alice-survey control'"
         )
         return None
     # The depth's gradient in the model has the length of the scale; the slopes are its other part.

@@ -547,7 +547,7 @@ def _known_scale(workspace: Path, mapping: MappingRecord) -> _KnownScale | None:
     if measured.gauge != mapping.gauge:
         raise ReconstructionError(
             f"{path} measures an earlier model: remove it, run 'alice-survey reconstruct', and "
-            "measure the known length again with 'alice-survey scale'"
+            "measure the known length again with 'alice-survey control'"
         )
     return _KnownScale(
         scale=measured.metres_per_unit,

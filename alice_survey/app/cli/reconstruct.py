@@ -192,24 +192,64 @@ def measure(
     print_result(*result, as_json)
 
 
-@app.command(epilog=examples("control -w reef", "control -w reef --dictionary DICT_5X5_250"))
+ScalePoints = Annotated[
+    str | None,
+    typer.Option(
+        metavar="POINTS",
+        help="Two points of a known distance: 'x,y,z x,y,z' in the model, or 'IMAGE:x,y IMAGE:x,y' "
+        "in pictures.",
+    ),
+]
+ScaleLength = Annotated[
+    float | None,
+    typer.Option(min=1e-6, metavar="METRES", help="Distance between the two points of --points."),
+]
+
+
+@app.command(
+    epilog=examples(
+        "control -w reef",
+        "control -w reef --dictionary DICT_5X5_250",
+        "control -w reef --points '0,0,0 1.2,0,0.1' --length 0.5",
+        "control -w reef --points 'left/001.png:512,300 left/001.png:930,312' --length 0.5",
+    )
+)
 def control(
     workspace: Workspace = WORK,
     dictionary: Annotated[
-        str | None, typer.Option(help="Of the coded markers; found out when not given (slow).")
+        str | None,
+        typer.Option(
+            metavar="NAME", help="Dictionary of the coded markers; without it all are tried (slow)."
+        ),
     ] = None,
+    points: ScalePoints = None,
+    length: ScaleLength = None,
     threads: Threads = None,
     as_json: AsJson = False,
 ) -> None:
-    """Find coded markers, and prepare the picking of control points.
+    """Find coded markers and prepare the picking of control points, or scale by a known length.
 
     Known points, bars and markers stand in WORKSPACE/control.csv; the next 'reconstruct' places
-    and scales the model by those for control, and scores those for check.
+    and scales the model by those for control, and scores those for check. One length between two
+    points of the model, given by --points and --length, scales a model without control.
     """
-    from reconstruct.placing.control_command import survey_control
+    from reconstruct.placing.control_command import scale_model, survey_control
 
-    result = survey_control(workspace, dictionary=dictionary, executor=executor_of(threads))
-    print_result(*result, as_json)
+    if points is None and length is None:
+        result = survey_control(workspace, dictionary=dictionary, executor=executor_of(threads))
+        print_result(*result, as_json)
+        return
+    if points is None or length is None:
+        raise typer.BadParameter("--points and --length go together: give both, or neither")
+    text = scale_model(workspace, points, length)
+    print_result(text, {"text": text}, as_json)
+
+
+@app.command(hidden=True)
+def scale(points: ScalePoints, length: ScaleLength, workspace: Workspace = WORK) -> None:
+    """Run 'control --points --length' under its former name."""
+    typer.echo("scale is now: control --points POINTS --length METRES", err=True)
+    control(workspace, points=points, length=length)
 
 
 @app.command(epilog=examples("quality -w reef", "quality -w reef --json"))
@@ -221,28 +261,6 @@ def quality(workspace: Workspace = WORK, threads: Threads = None, as_json: AsJso
     from reconstruct.pictures.quality import quality_report
 
     print_result(*quality_report(workspace, executor_of(threads)), as_json)
-
-
-@app.command(
-    epilog=examples(
-        "scale -w reef --points '0,0,0 1.2,0,0.1' --length 0.5",
-        "scale -w reef --points 'left/001.png:512,300 left/001.png:930,312' --length 0.5",
-    )
-)
-def scale(
-    points: Annotated[
-        str,
-        typer.Option(
-            help="Two points: 'x,y,z x,y,z', or spots in pictures, 'IMAGE:x,y IMAGE:x,y'."
-        ),
-    ],
-    length: Annotated[float, typer.Option(min=1e-6, help="Their true distance, m.")],
-    workspace: Workspace = WORK,
-) -> None:
-    """Scale a model by a known length."""
-    from reconstruct.placing.control_command import scale_model
-
-    typer.echo(scale_model(workspace, points, length))
 
 
 @app.command(

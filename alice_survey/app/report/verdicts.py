@@ -150,7 +150,7 @@ def _scale(figures: Figures) -> Iterator[Verdict]:
         yield Verdict(
             level="bad",
             text=f"no scale: {source}; all lengths are in arbitrary units",
-            action="Give a rig, a scale bar or positions: 'alice-survey scale' takes a length.",
+            action="Give a rig, a scale bar or positions: 'alice-survey control' takes a length.",
         )
         return
     place = found.georeference

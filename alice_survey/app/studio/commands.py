@@ -152,13 +152,8 @@ class ControlArguments(WorkingArguments):
     """Arguments of `control`."""
 
     dictionary: Name | None = None
-
-
-class ScaleModelArguments(Arguments):
-    """Arguments of `scale`."""
-
-    points: Text
-    length: Annotated[float, Field(ge=1e-6, le=1e6)]
+    points: Text | None = None
+    length: Annotated[float, Field(ge=1e-6, le=1e6)] | None = None
 
 
 class PlanCheckArguments(WorkingArguments):
@@ -215,9 +210,8 @@ COMMANDS: Mapping[str, Startable] = {
     ),
     "import-images": Startable(title="Import pictures", arguments=ImportImagesArguments),
     "import-log": Startable(title="Import a vehicle's log", arguments=ImportLogArguments),
-    "control": Startable(title="Find coded markers", arguments=ControlArguments),
+    "control": Startable(title="Find coded markers, or scale a model", arguments=ControlArguments),
     "quality": Startable(title="Judge the pictures", arguments=WorkingArguments),
-    "scale": Startable(title="Scale the model", arguments=ScaleModelArguments),
     "plan check": Startable(title="Check what a dive has seen", arguments=PlanCheckArguments),
     "plan revisit": Startable(title="Plan a dive over weak places", arguments=PlanRevisitArguments),
     "plan export": Startable(title="Write the plan for vehicles", arguments=PlanExportArguments),

@@ -162,7 +162,7 @@ def test_positions_closer_than_their_sigma_give_a_rough_scale_with_an_honest_sig
                     levers=False)  # fmt: skip
         assert found is not None
         (line,) = capsys.readouterr().err.splitlines()
-        assert "rough" in line and "alice-survey scale" in line
+        assert "rough" in line and "alice-survey control" in line
         misses.append(np.log(found.ned_from_model.scale / 2.0) / found.sigma_scale)
         sigmas.append(found.sigma_scale)
     assert min(sigmas) > 0.02 and max(sigmas) < 0.2

@@ -90,7 +90,7 @@ def test_nothing_is_required_but_what_a_command_cannot_do_without() -> None:
         for field, about in one.arguments.model_fields.items()
         if about.default is PydanticUndefined
     }
-    assert needed == {("import-log", "log"), ("scale", "points"), ("scale", "length")}
+    assert needed == {("import-log", "log")}
 
 
 def test_a_wrong_value_is_named_in_one_line(tmp_path: Path) -> None:
