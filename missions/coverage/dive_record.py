@@ -31,12 +31,12 @@ from missions.logs.navigation_csv import (
 )
 from missions.values.plan_file import Plan
 
-ALIKE_RAD = math.radians(45.0)
+_ALIKE_RAD = math.radians(45.0)
 """A vehicle that crabs or yaws by less than this still flies its line (inferred: half way to a line
 across)."""
 MIN_RUN = 3
 """Pictures that make a straight run outside of the plan."""
-RUN_STEPS = 3.0
+_RUN_STEPS = 3.0
 """Pictures of a run are no more steps apart."""
 
 _MAX_TRIGGERS = 1_000_000
@@ -458,7 +458,7 @@ def assign_lines(stations: Stations, plan: Plan) -> NDArray[np.intp]:
     from the plan's; the rest is -1: seen, but on no line.
     """
     line = _planned_lines(stations, plan)
-    runs = _runs(line, stations, RUN_STEPS * plan.station_spacing_m)
+    runs = _runs(line, stations, _RUN_STEPS * plan.station_spacing_m)
     long = [run for run in runs if len(run) >= MIN_RUN]
     for number, run in enumerate(long, len(plan.lines)):
         line[run] = number
@@ -476,7 +476,7 @@ def _planned_lines(stations: Stations, plan: Plan) -> NDArray[np.intp]:
         off = stations.glass_ne - planned.start_ne_m
         along, across = off @ ahead, np.abs(off @ np.array([-ahead[1], ahead[0]]))
         here = (along >= -step_m) & (along <= planned.length_m + step_m)
-        here &= np.abs(np.cos(heading - planned.heading_rad)) >= math.cos(ALIKE_RAD)
+        here &= np.abs(np.cos(heading - planned.heading_rad)) >= math.cos(_ALIKE_RAD)
         here &= across < nearest_m
         line[here] = index
         nearest_m[here] = across[here]
@@ -494,7 +494,7 @@ def _runs(line: NDArray[np.intp], stations: Stations, longest_m: float) -> list[
             last is not None
             and last[-1] == i - 1
             and math.dist(places[i], places[i - 1]) <= longest_m
-            and math.cos(heading[i] - heading[last[0]]) >= math.cos(ALIKE_RAD)
+            and math.cos(heading[i] - heading[last[0]]) >= math.cos(_ALIKE_RAD)
         ):
             last.append(i)
         else:

@@ -22,7 +22,7 @@ TURNING = ("roll_deg", "pitch_deg", "heading_deg", "longitude_deg")
 _RANGES = {"latitude_deg": (-85.0, 85.0), "longitude_deg": (-180.0, 180.0)}
 _GAP_S, _GAP_INTERVALS = 2.0, 5.0
 """A gap is longer than both this many seconds and this many median intervals."""
-FEW = 5
+_FEW = 5
 """So many known values show no interval of their own."""
 _MS = 1000.0
 _NAMED = 8
@@ -54,10 +54,10 @@ class NavigationLog:
 
     def _at(self, name: str, values: Array, at_s: Array) -> Array:
         turning = name in TURNING
-        return within_turn(name, interpolated(self.time_s, values, at_s, turning=turning))
+        return _within_turn(name, interpolated(self.time_s, values, at_s, turning=turning))
 
 
-def within_turn(name: str, values: Array) -> Array:
+def _within_turn(name: str, values: Array) -> Array:
     """Values of a column, (N,), with angles in 0 to 360 degrees (headings), or within 180."""
     if name == "heading_deg":
         return values % 360.0
@@ -69,12 +69,7 @@ def longest_gap_s(time_s: Array) -> float:
     if len(time_s) < 2:
         return _GAP_S
     steps_ms = np.rint(np.diff(time_s) * _MS)
-    return gap_of_interval_s(float(np.median(steps_ms)) / _MS)
-
-
-def gap_of_interval_s(interval_s: float) -> float:
-    """The same of rows whose median interval, in whole milliseconds, is known."""
-    return max(_GAP_S, _GAP_INTERVALS * interval_s)
+    return max(_GAP_S, _GAP_INTERVALS * float(np.median(steps_ms)) / _MS)
 
 
 def _max_gap_of(known_s: Array, time_s: Array) -> float:
@@ -82,7 +77,7 @@ def _max_gap_of(known_s: Array, time_s: Array) -> float:
 
     Positions may be rarer than depths in one log; few of them show no rate of their own.
     """
-    return longest_gap_s(known_s if len(known_s) > FEW else time_s)
+    return longest_gap_s(known_s if len(known_s) > _FEW else time_s)
 
 
 def interpolated(time_s: Array, values: Array, at_s: Array, *, turning: bool) -> Array:
