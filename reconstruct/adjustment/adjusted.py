@@ -69,7 +69,7 @@ class AdjustedSurvey:
             raise ValueError("a model of unknown shape has no modes")
         shape, modes = self.shape.knowing(left), self.shape.modes
         if self.exact is None:
-            return replace(self, mapped=_moved(self.mapped, modes, sizes), shape=shape)
+            return replace(self, mapped=_move_model(self.mapped, modes, sizes), shape=shape)
         fit = self.exact.fit.deformed(modes, self.shape.point_ids, sizes, left)
         exact = replace(self.exact, fit=fit)
         return replace(self, mapped=exact.on_pinholes(), rig=fit.rig, exact=exact, shape=shape)
@@ -185,7 +185,7 @@ def taken_pixels(
     return found
 
 
-def _moved(mapped: Mapped, modes: SoftModes, sizes: Array) -> Mapped:
+def _move_model(mapped: Mapped, modes: SoftModes, sizes: Array) -> Mapped:
     """A model of pinholes with its soft modes (K,) of these sizes."""
     model = pycolmap.Reconstruction(mapped.model)
     frames, seen = frames_of(model), observed(model)

@@ -132,8 +132,8 @@ class BlockPattern:
     def at(self, stations: Indices, part: "BlockPattern") -> Indices:
         """Where the blocks of a part of the stations, (f,), are among these."""
         rows, columns = np.divmod(part.keys, len(stations))
-        wanted = stations[rows] * (len(self.pointers) - 1) + stations[columns]
-        return np.searchsorted(self.keys, wanted)
+        requested = stations[rows] * (len(self.pointers) - 1) + stations[columns]
+        return np.searchsorted(self.keys, requested)
 
 
 def pattern_of(starts: Indices, station: Indices, stations: int) -> BlockPattern:

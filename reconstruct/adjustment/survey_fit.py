@@ -394,7 +394,7 @@ class SurveyProblem:
         self.held = seen < MIN_POINTS
         group = linked_groups(pixels.station, pixels.point, len(seen))
         self.held[first_of(group)] = True
-        self.start = self._seen(state)
+        self.start = self._observations(state)
 
     def _spare(self, state: RigState) -> int:
         observations, points = len(self.pixels.station), self.pixels.points
@@ -407,7 +407,7 @@ class SurveyProblem:
             )
         return spare
 
-    def _seen(self, state: RigState) -> _Guess:
+    def _observations(self, state: RigState) -> _Guess:
         miss = self.parts.misses(state)
         lost = ~np.isfinite(miss).all(axis=1)
         miss[lost] = 0.0
@@ -448,7 +448,7 @@ class SurveyProblem:
     def moved(self, guess: _Guess, equations: PointEquations, step: BlockStep) -> _Guess:
         """The guess after a step."""
         state = guess.state
-        return self._seen(
+        return self._observations(
             RigState(
                 rig=moved(state.rig, self.fields, step.shared),
                 turns=Rotation.from_rotvec(step.poses[:, :3]).as_matrix() @ state.turns,

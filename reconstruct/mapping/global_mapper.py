@@ -477,13 +477,13 @@ def triangulate_and_adjust(
         cache_options = pycolmap.DatabaseCacheOptions()
         cache_options.min_num_matches = options.min_num_matches
         cache = pycolmap.DatabaseCache.create(opened, cache_options)
-    rough = _triangulated(cache, rig_from_world, _wide(options))
+    rough = _triangulate(cache, rig_from_world, _wide(options))
     rough.filter_points(_filter(options, _FIRST_ERROR_PX))
     model = rough.reconstruction
     adjust(model, options, tolerance=1e-2, robust_px=_ROBUST_PX)
     # Again, since the first poses joined what they should not, and left out what they should not.
     poses = {f: as_transform(model.frames[f].rig_from_world) for f in model.reg_frame_ids()}
-    mapper = _triangulated(cache, poses, options.get_triangulation())
+    mapper = _triangulate(cache, poses, options.get_triangulation())
     model = mapper.reconstruction
     # Filter before every plain adjustment: what is wrong would bend the model, and the next
     # adjustment would spend most of its rounds on straightening it (23 rounds instead of 3).
@@ -536,7 +536,7 @@ def adjust(
         move_points(whole, robust_px)
 
 
-def _triangulated(
+def _triangulate(
     cache: pycolmap.DatabaseCache,
     rig_from_world: Mapping[int, RigidTransform],
     options: pycolmap.IncrementalTriangulatorOptions,
@@ -588,7 +588,7 @@ def _frame_poses(
 
 def station_groups(links: Sequence[StationLink]) -> list[list[int]]:
     """Stations that links join, the largest group first (of equals that with the first station)."""
-    names, ends = _numbered(links)
+    names, ends = _number_stations(links)
     graph = coo_array((np.ones(len(links)), tuple(ends.T)), shape=(len(names),) * 2)
     count, label = connected_components(graph, directed=False)
     groups = [names[label == g].tolist() for g in range(count)]
@@ -610,7 +610,7 @@ def average_poses(links: Sequence[StationLink]) -> Mapping[int, RigidTransform]:
     """
     if len(station_groups(links)) != 1:
         raise ValueError("links of more than one group have no common frame")
-    names, ends = _numbered(links)
+    names, ends = _number_stations(links)
     first, second = ends.T
     turn = 1.0 / np.array([link.turn_variance for link in links])
     shift = 1.0 / np.array([link.shift_variance for link in links])
@@ -624,7 +624,7 @@ def average_poses(links: Sequence[StationLink]) -> Mapping[int, RigidTransform]:
     return {name: poses[k] for k, name in enumerate(names.tolist())}
 
 
-def _numbered(links: Sequence[StationLink]) -> tuple[Indices, Indices]:
+def _number_stations(links: Sequence[StationLink]) -> tuple[Indices, Indices]:
     """Stations, ascending, and for each link the indices (N, 2) of its two."""
     ends = np.array([(link.first, link.second) for link in links], dtype=np.int64)
     names, index = np.unique(ends, return_inverse=True)
@@ -686,9 +686,9 @@ def _trust(residuals: Array, floor: float) -> Array:
 
 
 def _solve(
-    count: int, first: Indices, second: Indices, wanted: Array, weight: Array, root: int
+    count: int, first: Indices, second: Indices, target: Array, weight: Array, root: int
 ) -> Array:
-    """Least squares of `x[second] - x[first] = wanted` with `x[root] = 0`; (count, 3)."""
+    """Least squares of `x[second] - x[first] = target` with `x[root] = 0`; (count, 3)."""
     rows = np.arange(len(first))
     sign = np.concatenate([-np.ones(len(first)), np.ones(len(first))])
     incidence = csr_array(
@@ -701,5 +701,5 @@ def _solve(
     reduced = incidence[:, free]
     normal = csr_array(reduced.T @ (diags_array(weight).tocsr() @ reduced)).tocsc()
     solved = np.zeros((count, 3))
-    solved[free] = splu(normal).solve(reduced.T @ (weight[:, None] * wanted))
+    solved[free] = splu(normal).solve(reduced.T @ (weight[:, None] * target))
     return solved

@@ -26,7 +26,7 @@ from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.mapping.arrays import observed
 from reconstruct.mapping.database import Observations, new_folder, station_frames, write_database
 from reconstruct.mapping.global_mapper import adjust, map_globally, triangulate_and_adjust
-from reconstruct.pictures.files import named
+from reconstruct.pictures.files import list_names
 from reconstruct.views.model_files import as_transform, rigid3d
 
 Method = Literal["auto", "global", "incremental"]
@@ -173,13 +173,13 @@ def _globally(
     scratch = new_folder(folder / "mapper")
     database = scratch / "database.db"
     write_database(database, seen, cam_from_rig)
-    found = _sorted(map_globally(database, seen, cam_from_rig, options, seed, executor))
+    found = _sort_by_size(map_globally(database, seen, cam_from_rig, options, seed, executor))
     if found and not unsound(found[0]):
-        grown = _grown(found[0], len(seen.images), scratch, options)
+        grown = _grow(found[0], len(seen.images), scratch, options)
         if grown is not found[0]:
-            found = merge_models(_sorted([grown, *found[1:]]), database, options)
+            found = merge_models(_sort_by_size([grown, *found[1:]]), database, options)
     shutil.rmtree(scratch)
-    return _sorted(found)
+    return _sort_by_size(found)
 
 
 def map_from_poses(
@@ -210,13 +210,13 @@ def map_from_poses(
     frames = station_frames(seen.images)
     poses = {frame: rig_from_world[s] for frame, s in frames.items() if s in rig_from_world}
     model = triangulate_and_adjust(database, poses, options)
-    model = _grown(model, len(seen.images), scratch, options)
-    model = _grown(model, len(seen.images), scratch, _undemanding(options))
+    model = _grow(model, len(seen.images), scratch, options)
+    model = _grow(model, len(seen.images), scratch, _undemanding(options))
     shutil.rmtree(scratch)
     return model
 
 
-def _grown(
+def _grow(
     model: pycolmap.Reconstruction,
     total: int,
     scratch: Path,
@@ -226,7 +226,9 @@ def _grown(
     if model.num_reg_images() == total:
         return model
     options.multiple_models = False
-    grown = _sorted([pycolmap.Reconstruction(more) for more in _continued(model, scratch, options)])
+    grown = _sort_by_size(
+        [pycolmap.Reconstruction(more) for more in _continue_mapping(model, scratch, options)]
+    )
     if not grown or grown[0].num_reg_images() <= model.num_reg_images():
         return model
     adjust(grown[0], options, tolerance=1e-7)
@@ -257,7 +259,7 @@ def unsound(model: pycolmap.Reconstruction) -> list[str]:
     return faults
 
 
-def _sorted(models: Sequence[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
+def _sort_by_size(models: Sequence[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
     return sorted(models, key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
 
 
@@ -372,17 +374,17 @@ def _map_once(
             scratch / "database.db", scratch, scratch, options, next_image_callback=counter.advance
         )
     models = [pycolmap.Reconstruction(model) for model in found.values()]
-    models = [_repaired(model, scratch, options) for model in models]
+    models = [_repair(model, scratch, options) for model in models]
     if cam_from_rig is not None and free == "nothing":
         for model in models:
             adjust(model, options, tolerance=1e-7)
             model.update_point_3d_errors()
-        models = merge_models(_sorted(models), scratch / "database.db", options)
+        models = merge_models(_sort_by_size(models), scratch / "database.db", options)
     shutil.rmtree(scratch)
-    return _sorted(models)
+    return _sort_by_size(models)
 
 
-def _repaired(
+def _repair(
     model: pycolmap.Reconstruction, scratch: Path, options: pycolmap.IncrementalPipelineOptions
 ) -> pycolmap.Reconstruction:
     """A model whose collapsed stations are taken out and registered again from the others.
@@ -397,13 +399,13 @@ def _repaired(
             return model
         for frame in collapsed:
             model.deregister_frame(frame)
-        found = _continued(model, scratch, options)
+        found = _continue_mapping(model, scratch, options)
         if found:
             model = max(found, key=lambda m: m.num_reg_images())
     return model
 
 
-def _continued(
+def _continue_mapping(
     model: pycolmap.Reconstruction, scratch: Path, options: pycolmap.IncrementalPipelineOptions
 ) -> list[pycolmap.Reconstruction]:
     """What mapping makes of a model, with the database in the folder `scratch`."""
@@ -571,7 +573,7 @@ def report_left_out(models: Sequence[pycolmap.Reconstruction]) -> list[str]:
         if names:
             notes.append(
                 f"{len(names)} pictures make a separate model that could not be joined to the "
-                f"largest: {named(names)}"
+                f"largest: {list_names(names)}"
             )
             warn(notes[-1])
     return notes

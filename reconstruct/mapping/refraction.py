@@ -43,7 +43,7 @@ _SETTLED_SIGMAS = 0.05
 _ROUNDS = 6
 _UNMOVED_PX = 1e-6
 """Keypoints that move less are not written again."""
-_NEAREST, _FARTHEST = 0.2, 20.0
+_MIN_DEPTHS, _MAX_DEPTHS = 0.2, 20.0
 """Depths of spots over the working depth; beyond, a point is wrong and is left to the filter."""
 _WRONG_SIGMAS, _MIN_WRONG_PX, _MAX_WRONG_PX = 5.0, 1.0, 4.0
 """An observation that misses by this many sigmas of the usual miss is wrong; none below the first
@@ -144,7 +144,7 @@ class Keypoints:
     def _ideal(self, number: int, at: Indices, depth_m: Array) -> Array:
         """Where a picture's pinhole sees the spots of some keypoints, (M, 2), from depths (M,)."""
         warp, working = self._warps[number], self._warps[number].working_depth_m
-        metres = np.clip(depth_m, _NEAREST * working, _FARTHEST * working)
+        metres = np.clip(depth_m, _MIN_DEPTHS * working, _MAX_DEPTHS * working)
         slope, offset = warp.lines(self._seen.taken[number - 1][at])
         ideal = warp.pinhole.pixels(slope + offset / metres[:, None])
         return np.where(np.isfinite(ideal), ideal, self._seen.pixels[number - 1][at])

@@ -40,7 +40,7 @@ from reconstruct.matching.learned import Taken, all_pixels, quarter_turns, with_
 from reconstruct.matching.matches import PairTask, coarse_matches, match_pair
 from reconstruct.matching.pairs import SMALL_SET, alike_pairs, choose_pairs, placed_pictures
 from reconstruct.matching.refinement import refine_tracks
-from reconstruct.pictures.files import exif_focal_px, named
+from reconstruct.pictures.files import exif_focal_px, list_names
 from reconstruct.pictures.normalise import even_light, finely, normalise, read_deep
 from reconstruct.pictures.undistorted import read_colour, read_mask
 from reconstruct.views.model import datum_of
@@ -192,7 +192,7 @@ def run_mapping(
     if words:
         warn(
             f"{len(words)} of {len(images)} pictures are not in the model, "
-            f"mapping/{UNREGISTERED} says why: {named(list(words))}"
+            f"mapping/{UNREGISTERED} says why: {list_names(list(words))}"
         )
     _write(folder, inputs, mapped, distances, refracted)
     shutil.rmtree(folder / "features")
@@ -238,7 +238,7 @@ def _find_all(
     counts = list(executor.map(extract, tasks, label="features"))
     poor = [r.image for r, n in zip(inputs.records, counts, strict=True) if n < FEW_FEATURES]
     if poor:
-        warn(f"{len(poor)} pictures have fewer than {FEW_FEATURES} features: {named(poor)}")
+        warn(f"{len(poor)} pictures have fewer than {FEW_FEATURES} features: {list_names(poor)}")
     return targets, counts
 
 

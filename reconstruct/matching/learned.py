@@ -43,7 +43,7 @@ RATIO = 0.85
 """Largest distance of a match over that of the second nearest."""
 _MAX_PX = 1.5e6
 """Pixels to which a larger picture is reduced, as for SIFT."""
-_LARGEST = 2.0
+_MAX_SIDE_PX = 2.0
 """Small pictures are enlarged by up to this much, as SIFT doubles them."""
 _MAX_FALSE_ALARMS = 1e-3
 """Expected number of pairs of unrelated pictures, for each pair, that would agree as well."""
@@ -96,7 +96,7 @@ def find_learned(
         back = np.column_stack([grey.shape[1] - turned.pixels[:, 1], turned.pixels[:, 0]])
         return replace(turned, pixels=back)
     height, width = grey.shape
-    by = min(_LARGEST, math.sqrt(_MAX_PX / (width * height)))
+    by = min(_MAX_SIDE_PX, math.sqrt(_MAX_PX / (width * height)))
     size = [max(_STEP, round(side * by / _STEP) * _STEP) for side in (width, height)]
     way = cv2.INTER_AREA if size[0] < width else cv2.INTER_CUBIC
     descriptors, likely, reliable = dense_features(cv2.resize(grey, size, interpolation=way))
@@ -257,10 +257,10 @@ def with_learned(
     number = {picture.features: i for i, picture in enumerate(taken)}
     pairs = [(number[task.first], number[task.second]) for task in tasks]
     open_ = [k for k, pair in enumerate(found) if pair.geometry is None]
-    gained = _matched(taken, tasks, pairs, open_, executor)
+    gained = _match_pairs(taken, tasks, pairs, open_, executor)
     touched = {i for k in gained for i in pairs[k]}
     around = [k for k, pair in enumerate(pairs) if k not in set(open_) and touched & {*pair}]
-    gained |= _matched(taken, tasks, pairs, around, executor)
+    gained |= _match_pairs(taken, tasks, pairs, around, executor)
     counts = {i: len(load_features(taken[i].features).pixels) for k in gained for i in pairs[k]}
     whole = list(found)
     for k, pair in gained.items():
@@ -270,7 +270,7 @@ def with_learned(
     return whole
 
 
-def _matched(
+def _match_pairs(
     taken: Sequence[Taken],
     tasks: Sequence[PairTask],
     pairs: Sequence[tuple[int, int]],

@@ -187,11 +187,11 @@ class PairMatches:
 def kept_features(path: Path) -> Features:
     """Features from their file; those read last are kept, as long as their file is the same."""
     stat = path.stat()
-    return _kept(path, stat.st_mtime_ns, stat.st_ino)
+    return _keep_mutual(path, stat.st_mtime_ns, stat.st_ino)
 
 
 @lru_cache(maxsize=32)
-def _kept(path: Path, _changed_ns: int, _inode: int) -> Features:
+def _keep_mutual(path: Path, _changed_ns: int, _inode: int) -> Features:
     return load_features(path)
 
 
@@ -214,13 +214,15 @@ def match_pair(task: PairTask) -> PairMatches:
     probe = min(len(a.pixels), _PROBE_FEATURES) * min(len(b.pixels), _PROBE_FEATURES)
     matches = None
     if len(a.pixels) * len(b.pixels) >= _WORTH_PROBING * probe:
-        matches = _guided(task, a, b, seen)
+        matches = _guided_matches(task, a, b, seen)
     if matches is None:
         matches = match_descriptors(a.descriptors, b.descriptors, task.ratio)
     return verified(task, seen, matches)
 
 
-def _guided(task: PairTask, a: Features, b: Features, seen: tuple[Array, Array]) -> Matches | None:
+def _guided_matches(
+    task: PairTask, a: Features, b: Features, seen: tuple[Array, Array]
+) -> Matches | None:
     """Matches where those of the largest features predict them; None where they predict nothing."""
     few = match_descriptors(
         a.descriptors[:_PROBE_FEATURES], b.descriptors[:_PROBE_FEATURES], task.ratio

@@ -129,15 +129,17 @@ def shared(
     middle = _DISTANCES // 2
     for i, j in pairs:
         wide = float(np.hypot(slack_m[i], slack_m[j]))
-        sure = 0.5 * (_seen(frusta, i, j, 0.0) + _seen(frusta, j, i, 0.0))
+        sure = 0.5 * (_seen_by(frusta, i, j, 0.0) + _seen_by(frusta, j, i, 0.0))
         likely = (
-            sure if wide == 0 else 0.5 * (_seen(frusta, i, j, wide) + _seen(frusta, j, i, wide))
+            sure
+            if wide == 0
+            else 0.5 * (_seen_by(frusta, i, j, wide) + _seen_by(frusta, j, i, wide))
         )
         found[i, j] = float(sure[middle]), float(likely.max())
     return found
 
 
-def _seen(frusta: Frusta, i: int, j: int, wide_m: float) -> Array:
+def _seen_by(frusta: Frusta, i: int, j: int, wide_m: float) -> Array:
     """(D,) share of a picture's points at each distance that another one has in its frame."""
     camera, points = frusta.cameras[j], frusta.points[i]
     there = frusta.ned_from_cam[j].inv()
@@ -236,7 +238,7 @@ _WORDS = 64
 _SAMPLE = 30_000
 """Features from which the codebook is made."""
 _ROUNDS = 12
-_LARGEST = 1500
+_MAX_FEATURES = 1500
 """Features of each picture that are described."""
 _BLOCK, _AT_A_TIME = 512, 4096
 """Pictures whose partners are sought at a time, and those they are compared with: 0.3 GiB."""
@@ -547,13 +549,18 @@ def _nearest(records: Sequence[ImageRecord], datum: Datum) -> set[Pair]:
 
 
 def alike_pairs(
-    features: Sequence[Path], wanted: Sequence[int], partners: int, *, seed: int, executor: Executor
+    features: Sequence[Path],
+    requested: Sequence[int],
+    partners: int,
+    *,
+    seed: int,
+    executor: Executor,
 ) -> list[Pair]:
     """Pairs of pictures that look most alike.
 
     Args:
         features: files of the features of every picture.
-        wanted: pictures for which partners are sought, among all.
+        requested: pictures for which partners are sought, among all.
         partners: how many for each.
         seed: of the codebook.
         executor: where tasks run.
@@ -561,7 +568,7 @@ def alike_pairs(
     Returns:
         Pairs in rising order.
     """
-    if len(features) < 2 or not len(wanted):
+    if len(features) < 2 or not len(requested):
         return []
     words = make_codebook(features, seed)
     file = features[0].parent / "looks.npy"
@@ -573,7 +580,7 @@ def alike_pairs(
         looks[number] = row
     find = partial(most_alike, file, looks.mean(axis=0), min(partners, len(features) - 1))
     looks.flush()
-    blocks = [np.asarray(wanted[n : n + _BLOCK]) for n in range(0, len(wanted), _BLOCK)]
+    blocks = [np.asarray(requested[n : n + _BLOCK]) for n in range(0, len(requested), _BLOCK)]
     found = executor.map(find, blocks, label="pictures that look alike")
     pairs: set[Pair] = set()
     for some, best in zip(blocks, found, strict=True):
@@ -641,7 +648,7 @@ def make_codebook(features: Sequence[Path], seed: int) -> NDArray[np.float32]:
 
 def describe(features: Path, words: NDArray[np.float32]) -> NDArray[np.float32]:
     """The vector of a picture, (W * 128,); zeros without features."""
-    descriptors = load_features(features).descriptors[:_LARGEST].astype(np.float32)
+    descriptors = load_features(features).descriptors[:_MAX_FEATURES].astype(np.float32)
     if not len(descriptors):
         return np.zeros(words.size, np.float32)
     word = _nearest_words(descriptors, words)

@@ -265,7 +265,7 @@ def _template(picture: Any, x: float, y: float, patch: Any, levels: Any, slopes:
 
 
 @compiled(error_model="numpy", fastmath=FAST)
-def _weighted(weights: Any, slopes: Any, weighted: Any, square: Any) -> None:
+def _weighted_sum(weights: Any, slopes: Any, weighted: Any, square: Any) -> None:
     """Fill the weighted slopes, and the matrix of the normal equations."""
     count = len(weights)
     for n in range(_UNKNOWNS):
@@ -340,7 +340,7 @@ def _align(first: Any, second: Any, reference: Any, pixels: Any, affine: Any) ->
         if not is_inside(first, x, y, _RADIUS + 3.0):
             continue
         _template(first, x, y, patch, levels, slopes)
-        _weighted(weights, slopes, weighted, square)
+        _weighted_sum(weights, slopes, weighted, square)
         inverse = np.linalg.inv(square)
         x, y = pixels[point, 0] - 0.5, pixels[point, 1] - 0.5
         m[:] = affine[point]

@@ -38,12 +38,12 @@ from reconstruct.mapping.arrays import MIN_POINTS, Indices, first_of, linked_gro
 from reconstruct.picking.registered import RegisteredPictures
 from reconstruct.placing.control_points import (
     Pick,
-    Spot,
+    TriangulatedPoint,
     covariance_of_picks,
-    find_spots,
     gain_of,
     own_sigmas,
     residuals,
+    triangulate_picks,
 )
 from reconstruct.placing.place import LENGTH_SCALE_SIGMA
 from reconstruct.views.model_files import ImagesFile, points_of
@@ -58,7 +58,7 @@ _MAX_OBSERVATIONS = 400_000
 class SpotErrors:
     """How a spot errs."""
 
-    spot: Spot
+    spot: TriangulatedPoint
     picks: Array
     """(3, 3) covariance by its own picks."""
     by_poses: Array
@@ -145,7 +145,9 @@ class StationBlock:
             equations=replace(reduce_parts(linear), free=~held),
         )  # fmt: skip
 
-    def errors(self, spot: Spot, picks: Sequence[Pick], pictures: RegisteredPictures) -> SpotErrors:
+    def errors(
+        self, spot: TriangulatedPoint, picks: Sequence[Pick], pictures: RegisteredPictures
+    ) -> SpotErrors:
         """How a spot errs that was found from picks in pictures of the block."""
         kept = [p for p in picks if p.image in pictures and p.image not in spot.left_out]
         rows = [pictures.row(p.image) for p in kept]
@@ -229,7 +231,7 @@ class Lengths:
             sigma_scale=float(np.sqrt(max(rig[0, 0], 0.0) + scale**2)),
         )  # fmt: skip
 
-    def spot(self, picks: Sequence[Pick]) -> Spot:
+    def spot(self, picks: Sequence[Pick]) -> TriangulatedPoint:
         """The spot that picks show.
 
         Raises:
@@ -239,7 +241,7 @@ class Lengths:
             p.image: self._pictures.picture(p.image) for p in picks if p.image in self._pictures
         }
         alone = [replace(pick, point="spot") for pick in picks]
-        found, lost = find_spots(alone, cameras)
+        found, lost = triangulate_picks(alone, cameras)
         if "spot" not in found:
             raise ReconstructionError(f"the spot is not found: {lost.get('spot', 'no picks')}")
         return found["spot"]
@@ -262,7 +264,7 @@ class Lengths:
 
 
 def spot_residuals(
-    spots: Mapping[str, Spot], picks: Sequence[Pick], pictures: RegisteredPictures
+    spots: Mapping[str, TriangulatedPoint], picks: Sequence[Pick], pictures: RegisteredPictures
 ) -> list[Array | None]:
     """(2,) pixels by which each pick misses its spot; None where that is not known."""
     found: list[Array | None] = []

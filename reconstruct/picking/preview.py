@@ -13,12 +13,15 @@ from scipy.spatial.transform import Rotation
 
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.control import ControlFit, tie_control
-from reconstruct.placing.control_points import Control, Spot
+from reconstruct.placing.control_points import Control, TriangulatedPoint
 from reconstruct.views.model import WorldFrame
 
 
 def preview_control(
-    control: Control, spots: Mapping[str, Spot], lost: Mapping[str, str], frame: WorldFrame
+    control: Control,
+    spots: Mapping[str, TriangulatedPoint],
+    lost: Mapping[str, str],
+    frame: WorldFrame,
 ) -> dict[str, Any]:
     """Residuals of control points and bars.
 

@@ -16,10 +16,10 @@ from reconstruct.picking.surface import SurfacePlace
 from reconstruct.placing.control_points import (
     Pick,
     RegisteredPicture,
-    Spot,
-    find_spots,
+    TriangulatedPoint,
     own_sigmas,
     residuals,
+    triangulate_picks,
 )
 
 _USUAL_FACTOR, _USUAL_WEIGHT = 2.0, 4.0
@@ -37,7 +37,7 @@ class Refined:
     matches: tuple[Match, ...]
     """One for each of the other picks, with the sigma that these state."""
     refused: tuple[NoMatch, ...]
-    spot: Spot | None
+    spot: TriangulatedPoint | None
     """The point that they have in common."""
     factor: float
     """By which sigmas were enlarged."""
@@ -74,7 +74,7 @@ def refine(
     cameras = {image: picture(image) for image in (pick.image, *found)}
     while True:
         picks = [pick, *(_pick_of(match, pick) for match in found.values())]
-        spot = find_spots(picks, cameras)[0].get(pick.point) if found else None
+        spot = triangulate_picks(picks, cameras)[0].get(pick.point) if found else None
         if spot is None:
             break
         factor = _factor(spot, picks, cameras)
@@ -96,7 +96,7 @@ def refine(
     picks = [pick, *(_pick_of(match, pick) for match in matches)]
     return Refined(
         picks=tuple(picks), matches=tuple(matches), refused=tuple(refused), factor=factor,
-        spot=find_spots(picks, cameras)[0].get(pick.point),
+        spot=triangulate_picks(picks, cameras)[0].get(pick.point),
     )  # fmt: skip
 
 
@@ -107,7 +107,9 @@ def _pick_of(match: Match, pick: Pick) -> Pick:
     )
 
 
-def _factor(spot: Spot, picks: Sequence[Pick], cameras: Mapping[str, RegisteredPicture]) -> float:
+def _factor(
+    spot: TriangulatedPoint, picks: Sequence[Pick], cameras: Mapping[str, RegisteredPicture]
+) -> float:
     """By which matches are worse than they state, at least 1."""
     off = residuals(spot.model, picks, cameras) / own_sigmas(picks)[:, None]
     spare = 2 * len(picks) - 3
@@ -117,7 +119,10 @@ def _factor(spot: Spot, picks: Sequence[Pick], cameras: Mapping[str, RegisteredP
 
 
 def _worst(
-    spot: Spot, picks: Sequence[Pick], cameras: Mapping[str, RegisteredPicture], factor: float
+    spot: TriangulatedPoint,
+    picks: Sequence[Pick],
+    cameras: Mapping[str, RegisteredPicture],
+    factor: float,
 ) -> tuple[str, float]:
     """The match that is farthest off the common point, and by how many of its sigmas."""
     off = np.linalg.norm(residuals(spot.model, picks, cameras), axis=1) / own_sigmas(picks) / factor

@@ -73,11 +73,11 @@ def take_bag(
             raise ImageError(f"{bag}: no pictures in {', '.join(cameras)}")
         moments = moments_of({c: 1e-9 * np.array(own) for c, own in times.items() if own})
         starts = 1e-9 * np.array([min(times[c][i] for c, i in m.items()) for m in moments])
-        kept = [moments[k] for k in _thinned(starts, every_s)]
-        wanted = {(c, times[c][i]) for moment in kept for c, i in moment.items()}
+        kept = [moments[k] for k in _thin(starts, every_s)]
+        requested = {(c, times[c][i]) for moment in kept for c, i in moment.items()}
         files: dict[tuple[str, int], Path] = {}
         for camera, time_ns, topic, message in _messages(reader, cameras, "pictures of the bag"):
-            if (camera, time_ns) in wanted and (camera, time_ns) not in files:
+            if (camera, time_ns) in requested and (camera, time_ns) not in files:
                 stem = folder / safe_name(camera) / f"{time_ns // 10**9}_{time_ns % 10**9:09d}"
                 path = _write(stem, message, lost, topic)
                 if path is not None:
@@ -155,7 +155,7 @@ def _choose(bag: Path, present: Sequence[str], mono: str) -> dict[str, str]:
     raise ImageError(f"{bag}: choose its topics with --camera NAME=TOPIC: {', '.join(present)}")
 
 
-def _thinned(start_s: Array, every_s: float | None) -> list[int]:
+def _thin(start_s: Array, every_s: float | None) -> list[int]:
     """Moments that are at least an interval apart."""
     if every_s is None:
         return list(range(len(start_s)))

@@ -114,7 +114,7 @@ class PictureFolder:
     def warnings(self) -> list[str]:
         """A line for each reason: how many, such as which, and what to do."""
         return [
-            f"{self.folder}: {_named(reason, paths)} left out; {ADVICE[reason]}"
+            f"{self.folder}: {_name_some(reason, paths)} left out; {ADVICE[reason]}"
             for reason, paths in self.left_out.items()
         ]
 
@@ -134,7 +134,7 @@ def look_into(
     """
     known = {path.resolve() for path in apart}
     try:
-        inside = _walked(folder, known) if recursive else list(folder.iterdir())
+        inside = _walk(folder, known) if recursive else list(folder.iterdir())
     except OSError as error:
         raise ImageError(f"{folder}: cannot be read: {error.strerror}") from None
     inside = [p for p in inside if not p.name.startswith(".")]
@@ -162,7 +162,7 @@ def look_into(
         left_out={reason: tuple(left_out[reason]) for reason in ADVICE if reason in left_out},
     )
     if not pictures:
-        held = [_named(reason, paths) for reason, paths in found.left_out.items()]
+        held = [_name_some(reason, paths) for reason, paths in found.left_out.items()]
         but = f", but {', '.join(held)}: {ADVICE[next(iter(found.left_out))]}" if held else ""
         raise ImageError(f"{folder}: holds no pictures (JPEG, PNG, TIFF or camera RAW){but}")
     return found
@@ -179,7 +179,7 @@ def kind_of(path: Path) -> str:
     return next((kind for kind, names in kinds.items() if path.suffix.lower() in names), "")
 
 
-def _named(reason: str, paths: Sequence[Path]) -> str:
+def _name_some(reason: str, paths: Sequence[Path]) -> str:
     """Such as `2 HEIC (a.heic, b.heic)`; of folders inside, their names."""
     names = [p.name for p in paths]
     if reason == IN_FOLDERS:
@@ -188,13 +188,13 @@ def _named(reason: str, paths: Sequence[Path]) -> str:
     return f"{len(paths)} {reason} ({', '.join(names[:_NAMED])}{more})"
 
 
-def named(names: Sequence[str], maximum: int = 8) -> str:
+def list_names(names: Sequence[str], maximum: int = 8) -> str:
     """The first few of some names, and how many more there are."""
     rest = len(names) - maximum
     return ", ".join(names[:maximum]) + (f" and {rest} more" if rest > 0 else "")
 
 
-def _walked(folder: Path, apart: Collection[Path]) -> list[Path]:
+def _walk(folder: Path, apart: Collection[Path]) -> list[Path]:
     """Files of a folder and of those inside, without hidden folders and those apart."""
     found = []
     for top, folders, names in os.walk(folder, onerror=_raise):

@@ -131,7 +131,11 @@ class OverlapChooser:
             self.counts.unfollowed += self._followed
             return
         last = self._best
-        if last is None and self._before is not None and self._gone() > _AT_START * self._advance:
+        if (
+            last is None
+            and self._before is not None
+            and self._motion_since() > _AT_START * self._advance
+        ):
             last = self._before
         self._best = self._before = None
         if last is not None:
@@ -145,12 +149,12 @@ class OverlapChooser:
         self._before = None
         self._best = _SharpFrame(frame=frame, sharpness=_sharpness(frame.pixels))
 
-    def _gone(self) -> float:
+    def _motion_since(self) -> float:
         """Share of the picture that the last taken frame does not show."""
         return 1.0 - shared(self._moved, self._size)
 
     def _weigh(self, frame: Frame) -> Iterator[Frame]:
-        gone = self._gone()
+        gone = self._motion_since()
         near, far = _NEAR * self._advance, _FAR * self._advance
         if self._starting:
             near, far = 0.0, _AT_START * self._advance

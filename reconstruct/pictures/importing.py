@@ -31,8 +31,8 @@ from reconstruct.pictures.files import (
     PictureFacts,
     PictureFolder,
     kind_of,
+    list_names,
     look_into,
-    named,
     read_header,
     to_utc,
 )
@@ -126,7 +126,7 @@ class ImportRecord(JsonRecord):
             *(f"{name}: {row}" for name, row in self.cameras.items() if known),
             *(f"{name}: {row}" for name, row in self.recordings.items()),
             *(
-                f"left out: {len(names)} {reason} ({named(names, _NAMED)}); {_WHY[reason]}"
+                f"left out: {len(names)} {reason} ({list_names(names, _NAMED)}); {_WHY[reason]}"
                 for reason, names in self.left_out.items()
             ),
         ]
@@ -419,7 +419,9 @@ def _unreadable(facts: Sequence[PictureFacts]) -> list[str]:
     faulty = [one.path.name for one in facts if one.fault]
     if not faulty:
         return []
-    return [f"{len(faulty)} of {len(facts)} that were looked at cannot be read: {named(faulty, 3)}"]
+    return [
+        f"{len(faulty)} of {len(facts)} that were looked at cannot be read: {list_names(faulty, 3)}"
+    ]
 
 
 def _navigation(

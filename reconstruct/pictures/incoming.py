@@ -23,7 +23,7 @@ from reconstruct.pictures.files import (
     bits_used,
     copy_picture,
     inspect,
-    named,
+    list_names,
     safe_name,
     target_suffix,
     to_utc,
@@ -326,8 +326,8 @@ def _without_times(entries: Sequence[Incoming]) -> str:
     recordings = list(dict.fromkeys(e.recording for e in entries if e.recording))
     if recordings:
         return (
-            f"{named(recordings)} do not say when they began, so navigation cannot be tied: import "
-            "each into a workspace of its own with --clock-offset, then 'join' them"
+            f"{list_names(recordings)} do not say when they began, so navigation cannot be tied: "
+            "import each into a workspace of its own with --clock-offset, then 'join' them"
         )
     return (
         "no picture carries a time (EXIF DateTimeOriginal), so navigation cannot be tied: give "
@@ -393,5 +393,5 @@ def _with_gps(records: Sequence[ImageRecord], entries: Sequence[Incoming]) -> li
             )
         )
     if lost and len(lost) < len(records) and not entries[0].recording:
-        warn(f"{len(lost)} pictures have no complete GPS in EXIF: {named(lost)}")
+        warn(f"{len(lost)} pictures have no complete GPS in EXIF: {list_names(lost)}")
     return placed

@@ -80,7 +80,7 @@ def join_dives(workspace: Path, dives: Sequence[Path]) -> str:
                 target = partial / f"dive{number}" / name
                 target.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(folder / name, target)
-            records += _moved(own, f"dive{number}", records)
+            records += _append_dive(own, f"dive{number}", records)
         write_manifest(partial / "manifest.csv", records)
         if rig is not None:
             write_rig(partial / "rig.json", read_rig(rig))
@@ -111,7 +111,7 @@ def _same_rig(dives: Sequence[Path]) -> Path | None:
     return files[0] if files else None
 
 
-def _moved(
+def _append_dive(
     records: Sequence[ImageRecord], folder: str, before: Sequence[ImageRecord]
 ) -> list[ImageRecord]:
     """A dive's pictures in a folder, after those of earlier dives in stations and in time."""

@@ -20,7 +20,7 @@ from camera_calib.calibrate.picture_sets import pair_pictures
 from camera_calib.picture_files import time_taken
 from missions.logs.dive import finite_number
 from missions.logs.navigation_csv import utc_date
-from reconstruct.pictures.files import can_read_heic, named, to_utc
+from reconstruct.pictures.files import can_read_heic, list_names, to_utc
 
 _WITHIN_SHARE = 0.25
 """Pictures this share of the shortest usual interval apart are of one moment: a dropped picture
@@ -146,10 +146,10 @@ def pair_by_time(
         return PairedPictures(stations=tuple(found), time_s=logged)
     if len(sides) <= 1:
         return PairedPictures(stations=tuple({s: p} for s, paths in sides.items() for p in paths))
-    return PairedPictures(stations=tuple(_timed(sides) or _numbered(sides)))
+    return PairedPictures(stations=tuple(_pair_by_times(sides) or _pair_by_numbers(sides)))
 
 
-def _timed(sides: Mapping[str, Sequence[Path]]) -> list[dict[str, Path]] | None:
+def _pair_by_times(sides: Mapping[str, Sequence[Path]]) -> list[dict[str, Path]] | None:
     """Moments by names or EXIF; None where these give no times, or not of one clock."""
     for source, read in (("their names", _time_in_name), ("EXIF", _time_in_exif)):
         known = {side: [read(p) for p in paths] for side, paths in sides.items()}
@@ -188,7 +188,7 @@ def _distinct(times: Mapping[str, Array]) -> bool:
     return min(float(np.median(own)) for own in steps) >= _WHOLE_SECONDS_S
 
 
-def _numbered(sides: Mapping[str, Sequence[Path]]) -> list[Mapping[str, Path]]:
+def _pair_by_numbers(sides: Mapping[str, Sequence[Path]]) -> list[Mapping[str, Path]]:
     """Moments by numbers in names, else by order."""
     try:
         sets = pair_pictures(sides)
@@ -199,9 +199,9 @@ def _numbered(sides: Mapping[str, Sequence[Path]]) -> list[Mapping[str, Path]]:
     if paired and not all(whole) and all(whole[: paired[-1] + 1]):
         rest = [path.name for one in sets[paired[-1] + 1 :] for path in one.paths.values()]
         warn(
-            f"only the last pictures have no partner ({named(rest)}): a camera that counts its own "
-            "pictures and dropped one shifts the pairs after it; a trigger log (--triggers) pairs "
-            "by time"
+            f"only the last pictures have no partner ({list_names(rest)}): a camera that counts "
+            "its own pictures and dropped one shifts the pairs after it; a trigger log "
+            "(--triggers) pairs by time"
         )
     return [one.paths for one in sets]
 
@@ -269,11 +269,11 @@ def _trigger_times(
             found[path] = time
     if not found:
         raise ImageError(
-            f"{triggers}: holds none of the pictures, such as {named(lost, 2)}; its first is "
+            f"{triggers}: holds none of the pictures, such as {list_names(lost, 2)}; its first is "
             f"{shown(rows[0][1][which]) if rows else 'missing'}"
         )
     if lost:
-        warn(f"{len(lost)} pictures are not in {triggers} and are left out: {named(lost)}")
+        warn(f"{len(lost)} pictures are not in {triggers} and are left out: {list_names(lost)}")
     return found
 
 

@@ -133,8 +133,8 @@ def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
 
 def _inside(data: bytes, *kinds: bytes) -> bytes:
     """Content of the first box of a kind, in the first box of the kind before; else empty."""
-    for wanted in kinds:
-        data = next((content for kind, content in _boxes(data) if kind == wanted), b"")
+    for requested in kinds:
+        data = next((content for kind, content in _boxes(data) if kind == requested), b"")
     return data
 
 
@@ -143,13 +143,13 @@ def _facts(index: bytes) -> Mp4Facts:
     names = [_inside(track, b"mdia", b"hdlr") for track in tracks]
     telemetry = [t for t in tracks if _sample_format(t) == b"gpmd"]
     return Mp4Facts(
-        created=_created(_inside(index, b"mvhd")),
+        created=_creation_time(_inside(index, b"mvhd")),
         is_gopro=bool(telemetry) or any(_MAKER in name for name in names),
         telemetry=_telemetry(telemetry[0]) if telemetry else None,
     )
 
 
-def _created(header: bytes) -> datetime | None:
+def _creation_time(header: bytes) -> datetime | None:
     if len(header) < 12:
         return None
     (seconds,) = struct.unpack_from(">Q" if header[0] == 1 else ">I", header, 4)

@@ -147,7 +147,7 @@ class Pictures:
         """
         path = workspace / "sparse" / "cameras.json"
         written_ns = path.stat().st_mtime_ns if path.is_file() else 0
-        return _opened(workspace / "images", path, written_ns)
+        return _open_once(workspace / "images", path, written_ns)
 
     @classmethod
     def still(cls, workspace: Path) -> "Pictures":
@@ -247,5 +247,5 @@ class Pictures:
 
 
 @lru_cache(maxsize=1)
-def _opened(images: Path, cameras_json: Path, written_ns: int) -> Pictures:
+def _open_once(images: Path, cameras_json: Path, written_ns: int) -> Pictures:
     return Pictures.from_json(images, cameras_json)

@@ -298,7 +298,7 @@ def take_frames(
         name = safe_name(recording.name)
         if any(safe_name(other.name) == name for other in recordings[:number]):
             name = f"{name}_{number + 1}"
-        grabbed = _grabbed(recording)
+        grabbed = _grab_frames(recording)
         if settings.every_s is None:
             counts = FrameCounts()
             frames = _by_overlap(grabbed, settings.overlap, counts)
@@ -338,7 +338,7 @@ def _entry(recording: Recording, camera: str, frame: Frame, image: str, station:
     )  # fmt: skip
 
 
-def _grabbed(recording: Recording) -> Iterator[_Grabbed]:
+def _grab_frames(recording: Recording) -> Iterator[_Grabbed]:
     """Frames of all chapters, at times since the start of the recording."""
     for file in recording.files:
         capture = opened(file.path)

@@ -27,7 +27,7 @@ from reconstruct.mapping.arrays import Observed, first_pictures, observed
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.working_range import ray_passes
 from reconstruct.matching.pairs import positions_ned
-from reconstruct.pictures.files import named
+from reconstruct.pictures.files import list_names
 from reconstruct.placing.alignment import MIN_STATIONS, Bend, quadratic
 from reconstruct.views.model_files import as_transform
 
@@ -322,7 +322,7 @@ class Acceptance:
         """A line for every fault."""
         notes = []
         if self.far:
-            names = named([f"{f.image} ({f.off_m:.2f} m)" for f in self.far])
+            names = list_names([f"{f.image} ({f.off_m:.2f} m)" for f in self.far])
             notes.append(
                 f"{len(self.far)} of {self.checked} stations lie more than {FAR_SIGMAS:.0f} sigmas "
                 f"and {FAR_M} m from where navigation has them, which others miss by "
@@ -452,13 +452,13 @@ def misses(centres: Array, given: Array, sigmas: Array) -> tuple[Array, Array]:
     off = np.zeros(len(centres))
     spread = 1.0
     for _ in range(_ROUNDS):
-        off = np.linalg.norm(_aligned(centres, given, weight / stated**2) - given, axis=1)
+        off = np.linalg.norm(_align_weighted(centres, given, weight / stated**2) - given, axis=1)
         spread = max(float(np.median(off / stated)) / _MEDIAN_SIGMAS, 1e-9)
         weight = 1.0 / (1.0 + (off / (CAUCHY_TUNING * spread * stated)) ** 2)
     return off, stated * max(spread, 1.0)
 
 
-def _aligned(source: Array, target: Array, weight: Array) -> Array:
+def _align_weighted(source: Array, target: Array, weight: Array) -> Array:
     """The source where a rigid motion brings it nearest to the target (Kabsch 1976)."""
     share = weight / weight.sum()
     from_middle, to_middle = share @ source, share @ target

@@ -19,7 +19,7 @@ from alice_survey.core.frames import Array, Datum
 from alice_survey.core.robust import MAD_TO_SIGMA
 from reconstruct.mapping.arrays import cross_matrices
 from reconstruct.placing.alignment import Similarity, align_rigid, align_similarity
-from reconstruct.placing.control_points import Control, KnownLength, Spot
+from reconstruct.placing.control_points import Control, KnownLength, TriangulatedPoint
 from reconstruct.placing.correlated_fit import Extra
 from reconstruct.placing.navigation import PARAMETERS, SCALE
 
@@ -38,7 +38,7 @@ class _Tie:
 
     name: str
     use: str
-    spot: Spot
+    picked_point: TriangulatedPoint
     ned: Array
     sigma: Array
     """(3,) sigma of `ned`."""
@@ -50,7 +50,7 @@ class _Bar:
 
     name: str
     use: str
-    pairs: tuple[tuple[Spot, Spot], ...]
+    pairs: tuple[tuple[TriangulatedPoint, TriangulatedPoint], ...]
     """One for a bar; the four sides of a marker."""
     known: KnownLength
 
@@ -108,9 +108,11 @@ class ControlFit:
         misfits, rows = [np.zeros(0)], [np.zeros((0, columns))]
         turn = place.rotation.as_matrix()
         for tie in self.used_points:
-            motion = self._motion(tie.spot, len(sizes))
-            at = place.apply((tie.spot.model + motion @ sizes)[None])[0]
-            spread = place.scale**2 * turn @ tie.spot.covariance @ turn.T + np.diag(tie.sigma**2)
+            motion = self._motion(tie.picked_point, len(sizes))
+            at = place.apply((tie.picked_point.model + motion @ sizes)[None])[0]
+            spread = place.scale**2 * turn @ tie.picked_point.covariance @ turn.T + np.diag(
+                tie.sigma**2
+            )
             white = np.linalg.inv(np.linalg.cholesky(spread))
             jacobian = np.zeros((3, columns))
             jacobian[:, :3] = -cross_matrices((at - middle)[None])[0]
@@ -136,12 +138,15 @@ class ControlFit:
     def deformed(self, sizes: Array) -> "ControlFit":
         """The same on the model after its soft modes (K,) have been found."""
 
-        def moved(spot: Spot) -> Spot:
-            return replace(spot, model=spot.model + self._motion(spot, len(sizes)) @ sizes)
+        def moved(picked_point: TriangulatedPoint) -> TriangulatedPoint:
+            return replace(
+                picked_point,
+                model=picked_point.model + self._motion(picked_point, len(sizes)) @ sizes,
+            )
 
         return replace(
             self,
-            ties=tuple(replace(tie, spot=moved(tie.spot)) for tie in self.ties),
+            ties=tuple(replace(tie, picked_point=moved(tie.picked_point)) for tie in self.ties),
             bars=tuple(
                 replace(bar, pairs=tuple((moved(a), moved(b)) for a, b in bar.pairs))
                 for bar in self.bars
@@ -149,11 +154,11 @@ class ControlFit:
             motion_at=None,
         )
 
-    def _motion(self, spot: Spot, modes: int) -> Array:
+    def _motion(self, picked_point: TriangulatedPoint, modes: int) -> Array:
         """(3, K) of a point by the soft modes."""
         if self.motion_at is None:
             return np.zeros((3, modes))
-        motion: Array = self.motion_at(spot.model[None])[0]
+        motion: Array = self.motion_at(picked_point.model[None])[0]
         return motion
 
     def start(self, known_scale: float | None) -> Similarity | None:
@@ -161,7 +166,7 @@ class ControlFit:
         ties = self.used_points
         if len(ties) < 3:
             return None
-        model, ned = np.stack([t.spot.model for t in ties]), np.stack([t.ned for t in ties])
+        model, ned = np.stack([t.picked_point.model for t in ties]), np.stack([t.ned for t in ties])
         return aligned(model, ned, known_scale)
 
     def misfits(self, place: Similarity) -> list[tuple[Array, Array]]:
@@ -169,8 +174,9 @@ class ControlFit:
         turn = place.rotation.as_matrix()
         return [
             (
-                place.apply(tie.spot.model[None])[0] - tie.ned,
-                place.scale**2 * turn @ tie.spot.covariance @ turn.T + np.diag(tie.sigma**2),
+                place.apply(tie.picked_point.model[None])[0] - tie.ned,
+                place.scale**2 * turn @ tie.picked_point.covariance @ turn.T
+                + np.diag(tie.sigma**2),
             )
             for tie in self.used_points
         ]
@@ -226,12 +232,15 @@ def aligned(model: Array, ned: Array, known_scale: float | None) -> Similarity |
 
 
 def tie_control(
-    control: Control, spots: Mapping[str, Spot], lost: Mapping[str, str], datum: Datum | None
+    control: Control,
+    picked: Mapping[str, TriangulatedPoint],
+    lost: Mapping[str, str],
+    datum: Datum | None,
 ) -> ControlFit:
     """Bring together what is known and what the model shows."""
     missing, ties, bars = dict(lost), [], []
     for point in control.points:
-        if point.name not in spots:
+        if point.name not in picked:
             missing.setdefault(point.name, "not picked in any picture")
             continue
         sigma = np.array([point.sigma_m, point.sigma_m, point.sigma_vertical_m])
@@ -239,18 +248,18 @@ def tie_control(
             _Tie(
                 name=point.name,
                 use=point.use,
-                spot=spots[point.name],
+                picked_point=picked[point.name],
                 ned=point.ned(datum),
                 sigma=sigma,
             )
         )
     for length in control.lengths:
         names = [length.ends] if length.ends else _sides(length.name)
-        absent = sorted({n for pair in names for n in pair} - set(spots))
+        absent = sorted({n for pair in names for n in pair} - set(picked))
         if absent:
             missing.setdefault(length.name, f"{', '.join(absent)} not found in the pictures")
             continue
-        pairs = tuple((spots[a], spots[b]) for a, b in names)
+        pairs = tuple((picked[a], picked[b]) for a, b in names)
         bars.append(_Bar(name=length.name, use=length.use, pairs=pairs, known=length))
     return ControlFit(ties=tuple(ties), bars=tuple(bars), lost=missing)
 
@@ -300,16 +309,16 @@ def _log_factor(bar: _Bar) -> tuple[float, float]:
 
 
 def _score_point(tie: _Tie, place: Similarity) -> dict[str, Any]:
-    miss = place.apply(tie.spot.model[None])[0] - tie.ned
+    miss = place.apply(tie.picked_point.model[None])[0] - tie.ned
     turn = place.rotation.as_matrix()
-    spread = place.scale**2 * turn @ tie.spot.covariance @ turn.T
+    spread = place.scale**2 * turn @ tie.picked_point.covariance @ turn.T
     sigmas = np.sqrt(np.diag(spread) + tie.sigma**2)
     return {
         "name": tie.name,
         "use": tie.use,
-        "views": tie.spot.views,
-        "left_out": list(tie.spot.left_out),
-        "reprojection_px": tie.spot.rms_px,
+        "views": tie.picked_point.views,
+        "left_out": list(tie.picked_point.left_out),
+        "reprojection_px": tie.picked_point.rms_px,
         "north_m": float(miss[0]),
         "east_m": float(miss[1]),
         "down_m": float(miss[2]),
@@ -369,7 +378,7 @@ def without_wrong_points(control: ControlFit, known_scale: float | None) -> Cont
     agreeing = (count + _TRIPLE + 1) // 2
     if count <= agreeing:
         return control
-    model, ned = np.stack([t.spot.model for t in ties]), np.stack([t.ned for t in ties])
+    model, ned = np.stack([t.picked_point.model for t in ties]), np.stack([t.ned for t in ties])
     best = np.full(count, np.inf)
     for triple in _triples(count):
         place = aligned(model[triple], ned[triple], known_scale)

@@ -33,9 +33,9 @@ from reconstruct.placing.control_points import (
     KnownPoint,
     Pick,
     RegisteredPicture,
-    find_spots,
     read_control,
     read_picks,
+    triangulate_picks,
 )
 from reconstruct.views.model import SparseModel, View, read_frame, read_model, read_warps
 
@@ -324,7 +324,7 @@ def find_point(token: str, model: SparseModel, warps: Mapping[str, PinholeWarp])
         for image, view in views.items()
         if image in {pick.image for pick in picks}
     }
-    found, lost = find_spots(picks, cameras)
+    found, lost = triangulate_picks(picks, cameras)
     if not found:
         raise ReconstructionError(f"{token!r}: {lost['spot']}; mark it again")
     return found["spot"].model

@@ -283,13 +283,13 @@ CONTROL_HEADER = (
     "kind", "name", "use", "north_m", "east_m", "depth_m", "from", "to", "length_m", "sigma_m",
     "sigma_vertical_m",
 )  # fmt: skip
-_LONGEST = 64 << 20
+_MAX_BYTES = 64 << 20
 """Bytes of a table that is read whole."""
 
 
 def table_token(path: Path) -> str:
     """Token of a table's content; empty where there is no file."""
-    return content_token(content_of(path, _LONGEST))
+    return content_token(content_of(path, _MAX_BYTES))
 
 
 def save_picks(path: Path, token: str, picks: Sequence[Pick], points: Collection[str]) -> str:
@@ -370,16 +370,16 @@ def _save(
     meant: Callable[[Mapping[str, str]], bool],
     read: Callable[[Path], Any],
 ) -> str:
-    now = content_of(path, _LONGEST)
+    now = content_of(path, _MAX_BYTES)
     check_token(path.name, now, token)
     before = now or b""
     if before:
         read(path)  # a file that is wrong is the user's to mend, with the line named
     mark, records, end = _records(path, before)
     names = [cell.strip() for cell in records[0].cells] if records else []
-    wanted = {name for row in rows.values() for name, cell in row.items() if cell}
-    more = [name for name in header if name not in names and (not names or name in wanted)]
-    more += sorted(wanted - {*names, *more})
+    requested = {name for row in rows.values() for name, cell in row.items() if cell}
+    more = [name for name in header if name not in names and (not names or name in requested)]
+    more += sorted(requested - {*names, *more})
     first = records[0].text.rstrip("\r\n") if records else ""
     lines = [
         mark + (",".join(([first] if first else []) + more) + end if more else records[0].text)
@@ -465,7 +465,7 @@ class RegisteredPicture:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Spot:
+class TriangulatedPoint:
     """A point found from picks."""
 
     name: str
@@ -479,9 +479,9 @@ class Spot:
     rms_px: float
 
 
-def find_spots(
+def triangulate_picks(
     picks: Sequence[Pick], cameras: Mapping[str, RegisteredPicture]
-) -> tuple[dict[str, Spot], dict[str, str]]:
+) -> tuple[dict[str, TriangulatedPoint], dict[str, str]]:
     """Find every picked point that two or more registered pictures show.
 
     Returns:
@@ -508,7 +508,7 @@ def find_spots(
         corners = [found.get(f"{name}.{k}") for k in range(4)]
         whole = [c for c in corners if c is not None]
         if len(whole) == 4:
-            found[name] = Spot(
+            found[name] = TriangulatedPoint(
                 name=name,
                 model=np.mean([c.model for c in whole], axis=0),
                 covariance=np.sum([c.covariance for c in whole], axis=0) / 16.0,
@@ -547,7 +547,7 @@ def _with_real_sigmas(
 
 def _triangulate(
     name: str, picks: list[Pick], cameras: Mapping[str, RegisteredPicture]
-) -> Spot | str:
+) -> TriangulatedPoint | str:
     """The point that fits the picks best, or why there is none."""
     start = _nearest(picks, cameras)
     if isinstance(start, str):
@@ -570,7 +570,7 @@ def _triangulate(
     gain = gain_of(jacobian, sigma)
     covariance = gain @ covariance_of_picks(kept, jacobian, max(1.0, chi)) @ gain.T
     names = {p.image for p in kept}
-    return Spot(
+    return TriangulatedPoint(
         name=name,
         model=point,
         covariance=covariance,

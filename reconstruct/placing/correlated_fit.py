@@ -36,7 +36,7 @@ MIN_WHITE = 1e-4
 
 
 @compiled
-def _kept(time: Array, sigma: Array, i: int, j: int, tau: float) -> float:
+def _kept_share(time: Array, sigma: Array, i: int, j: int, tau: float) -> float:
     """Correlation of the Markov parts of two neighbours."""
     lesser, greater = min(sigma[i], sigma[j]), max(sigma[i], sigma[j])
     kept: float = math.exp(-abs(time[j] - time[i]) / tau) * lesser / greater
@@ -61,12 +61,12 @@ def whiten(
         (N, P) innovations over their standard deviation, zero where not used, and the logarithm of
         the determinant of the covariance matrix of what is used.
     """
-    found, log_det, _, _ = _filtered(time, sigma, used, values, tau, white)
+    found, log_det, _, _ = _filter(time, sigma, used, values, tau, white)
     return found, log_det
 
 
 @compiled
-def _filtered(
+def _filter(
     time: Array, sigma: Array, used: NDArray[np.bool_], values: Array, tau: float, white: float
 ) -> tuple[Array, float, Array, Array]:
     """As `whiten`; also the mean (N, P) and variance (N,) of the Markov part before each value."""
@@ -79,7 +79,7 @@ def _filtered(
     for i in range(count):
         if not used[i]:
             continue
-        kept = _kept(time, sigma, last, i, tau) if last >= 0 else 1.0
+        kept = _kept_share(time, sigma, last, i, tau) if last >= 0 else 1.0
         last = i
         variance = kept * kept * variance + 1.0 - kept * kept
         variances[i] = variance
@@ -116,9 +116,9 @@ def standard_residuals(
     Returns:
         (N,), meaningless where not used.
     """
-    past, past_variance = _filtered(time, sigma, used, values[:, None], tau, white)[2:]
+    past, past_variance = _filter(time, sigma, used, values[:, None], tau, white)[2:]
     reversed_ = (np.ascontiguousarray(row[::-1]) for row in (time, sigma, used, values[:, None]))
-    future, future_variance = (row[::-1] for row in _filtered(*reversed_, tau, white)[2:])
+    future, future_variance = (row[::-1] for row in _filter(*reversed_, tau, white)[2:])
     past, future = past[:, 0], future[:, 0]
     precision = 1.0 / past_variance + 1.0 / future_variance - 1.0
     mean = (past / past_variance + future / future_variance) / precision
@@ -230,7 +230,7 @@ class PlacementProblem:
         """
         key = group, used.tobytes(), replace(correlation, factor=1.0)
         if key not in self.cache:
-            self.cache[key] = self._unscaled(group, used, correlation)
+            self.cache[key] = self._unscaled_group(group, used, correlation)
         found, square = self.cache[key], correlation.factor**2
         return _Normal(
             matrix=found.matrix / square,
@@ -240,7 +240,9 @@ class PlacementProblem:
             rows=found.rows,
         )
 
-    def _unscaled(self, group: str, used: NDArray[np.bool_], correlation: Correlation) -> _Normal:
+    def _unscaled_group(
+        self, group: str, used: NDArray[np.bool_], correlation: Correlation
+    ) -> _Normal:
         size = len(self.free)
         total = _Normal(
             matrix=np.zeros((size, size)), vector=np.zeros(size), square=0.0, log_det=0.0, rows=0
@@ -404,7 +406,7 @@ def estimate(
     used = used & np.isfinite(found.misfit)
     if correlation is not None:
         parameters, spread = problem.total(used, correlation).solve()
-        change, covariance = _filled(problem, parameters, spread)
+        change, covariance = _fill(problem, parameters, spread)
         return Estimate(change=change, covariance=covariance, correlation=correlation, used=used)
     correlation = {
         group: Correlation(tau=float(np.ptp(time)) or 1.0, white=0.1)
@@ -417,7 +419,7 @@ def estimate(
         if np.array_equal(kept, used):
             break
         used = kept
-    change, covariance = _averaged(problem, used, correlation)
+    change, covariance = _average(problem, used, correlation)
     return Estimate(change=change, covariance=covariance, correlation=correlation, used=used)
 
 
@@ -598,7 +600,7 @@ def _without_contradicted(
     return kept
 
 
-def _averaged(
+def _average(
     problem: PlacementProblem, used: NDArray[np.bool_], correlation: Mapping[str, Correlation]
 ) -> tuple[Array, Array]:
     """Parameters and covariance over all likely correlations of errors, (P,) and (P, P).
@@ -622,10 +624,10 @@ def _averaged(
     mean = changes.mean(axis=0)
     spread = (changes - mean).T @ (changes - mean) / len(changes)
     covariance = np.mean([c for _, c in solutions], axis=0) + spread
-    return _filled(problem, mean, covariance)
+    return _fill(problem, mean, covariance)
 
 
-def _filled(problem: PlacementProblem, mean: Array, covariance: Array) -> tuple[Array, Array]:
+def _fill(problem: PlacementProblem, mean: Array, covariance: Array) -> tuple[Array, Array]:
     """Parameters and covariance with zeros for what is held."""
     columns = problem.found.jacobian.shape[2]
     full, matrix = np.zeros(columns), np.zeros((columns, columns))

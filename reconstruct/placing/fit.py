@@ -300,7 +300,7 @@ class NavigationTask:
                 frame_bounds=bounds,
                 widened=widened,
             )
-            place = _moved(place, _without_overshoot(got.change), middle)
+            place = _move(place, _without_overshoot(got.change), middle)
             if not SHRUNK < place.scale / start.scale < 1.0 / SHRUNK:
                 raise ReconstructionError("positions of navigation show no scale of the model")
             sizes = sizes + got.change[PARAMETERS:]
@@ -601,7 +601,7 @@ class NavigationTask:
             step = -np.linalg.lstsq(weight[:, None] * rows / size, weight * misfit)[0] / size
             change = np.zeros(rows_of.shape[1])
             change[free] = step
-            place = _moved(place, _without_overshoot(change), middle)
+            place = _move(place, _without_overshoot(change), middle)
             if np.all(np.abs(step) * size < 1e-6) or place.scale < SHRUNK * start.scale:
                 break
         return place
@@ -615,7 +615,7 @@ def _without_overshoot(change: Array) -> Array:
     return grown
 
 
-def _moved(place: Similarity, change: Array, middle: Array) -> Similarity:
+def _move(place: Similarity, change: Array, middle: Array) -> Similarity:
     """A placement after a small change of its first seven parameters about a point."""
     turn, grow = Rotation.from_rotvec(change[:3]), float(np.exp(change[SCALE]))
     shift = middle + grow * turn.apply(place.translation - middle) + change[3:6]

@@ -421,8 +421,8 @@ def import_control(
     points = _usable(path, found, sigma_m, sigma_vertical_m)
     bars = _bars(path, found, sigma_m)
     names = [record.image for record in read_manifest(images / "manifest.csv")]
-    wanted = {point.name for point in points} | {end for bar in bars for end in bar.ends}
-    rows, lost = _picks(found, wanted, names)
+    requested = {point.name for point in points} | {end for bar in bars for end in bar.ends}
+    rows, lost = _picks(found, requested, names)
     if not rows:
         raise WorkspaceError(
             f"{path}: none of its {len(found.picks)} picks is in a picture of {images}: "
@@ -520,7 +520,7 @@ def _bars(path: Path, foreign: ForeignControl, sigma_m: float | None) -> list[Fo
 
 
 def _picks(
-    found: ForeignControl, wanted: set[str], names: Sequence[str]
+    found: ForeignControl, requested: set[str], names: Sequence[str]
 ) -> tuple[list[tuple[str, str, float, float, float]], list[str]]:
     """Rows of `picks.csv`, and pictures of the file that the workspace lacks or has twice."""
     by_stem: dict[str, list[str]] = {}
@@ -531,7 +531,7 @@ def _picks(
         image = _image(pick.picture, by_stem)
         if image is None:
             lost.append(pick.picture)
-        elif pick.point in wanted:
+        elif pick.point in requested:
             # Files count from the outer corner of the first pixel, `picks.csv` from its middle.
             rows.append((image, pick.point, pick.x_px - 0.5, pick.y_px - 0.5, pick.sigma_px))
     return rows, list(dict.fromkeys(lost))

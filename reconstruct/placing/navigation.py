@@ -423,7 +423,7 @@ def first_placement(
     else:
         rotation = Rotation.from_rotvec([0.0, 0.0, np.angle(turn)]) * levelled.rotation
     scale = abs(turn) if known_scale is None else known_scale
-    return _shifted(epochs, levelled, scale, rotation)
+    return _shift(epochs, levelled, scale, rotation)
 
 
 def _without_positions(
@@ -442,7 +442,7 @@ def _without_positions(
         found = (rotation * epochs.model_from_body[headed]).as_euler("ZYX")[:, 0]
         turn = np.angle(np.exp(1j * (stated - found)).mean())
         rotation = Rotation.from_rotvec([0.0, 0.0, turn]) * rotation
-    return _shifted(epochs, levelled, scale, rotation)
+    return _shift(epochs, levelled, scale, rotation)
 
 
 def _has_angles(epochs: Epochs) -> NDArray[np.bool_]:
@@ -483,7 +483,7 @@ def _scale_by_relief(epochs: Epochs, levelled: Similarity) -> float | None:
     return float(np.sqrt(along**2 + tilt @ tilt))
 
 
-def _shifted(epochs: Epochs, levelled: Similarity, scale: float, rotation: Rotation) -> Similarity:
+def _shift(epochs: Epochs, levelled: Similarity, scale: float, rotation: Rotation) -> Similarity:
     """A placement shifted onto the readings, else with the origin of the levelled model."""
     start = Similarity(scale=scale, rotation=rotation, translation=np.zeros(3))
     origin = -levelled.rotation.inv().apply(levelled.translation) / levelled.scale

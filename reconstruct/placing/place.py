@@ -37,7 +37,7 @@ from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.rig import Rig, mounted
 from reconstruct.adjustment.soft_modes import SoftModes
 from reconstruct.adjustment.uncertainty import Uncertainty
-from reconstruct.pictures.files import named
+from reconstruct.pictures.files import list_names
 from reconstruct.placing.alignment import Similarity, level
 from reconstruct.placing.control import (
     ControlFit,
@@ -54,9 +54,9 @@ from reconstruct.placing.control_points import (
     Control,
     Pick,
     RegisteredPicture,
-    find_spots,
     read_control,
     read_picks,
+    triangulate_picks,
 )
 from reconstruct.placing.fit import FoundMount, PlacementFit, fit_control, fit_navigation
 from reconstruct.placing.navigation import PLACE, SCALE, Installation, body_from_pinhole
@@ -150,14 +150,14 @@ def fit_with_mount(
         The fit, with the mount where there are attitudes; None where positions do not place the
         model. Of all fits on the way only this one's notes and warnings are reported.
     """
-    fit, messages = _collected(navigate, None, usual)
+    fit, messages = _collect_messages(navigate, None, usual)
     first = None if fit is None else _first_mount(records, model_from_cam, cam_from_rig, fit)
     if first is not None:
         known = replace(usual, mount_rad=_UNKNOWN_RAD, lever_m=max(usual.lever_m, _UNKNOWN_LEVER_M))
         mount = RigidTransform.from_rotation(first)
         for _ in range(_MOUNT_STEPS):
             mounts = {name: mount * pose.inv() for name, pose in cam_from_rig.items()}
-            found, said = _collected(navigate, mounts, known)
+            found, said = _collect_messages(navigate, mounts, known)
             if found is None:
                 break
             turn_deg, turn_sigma_deg = np.array([found.nuisances[name] for name in _AXES]).T
@@ -195,7 +195,7 @@ def _first_mount(
     return _trimmed_mean(Rotation.concatenate(turns)) if len(turns) >= _MIN_PICTURES else None
 
 
-def _collected(
+def _collect_messages(
     navigate: Navigate, mounts: Mapping[str, RigidTransform] | None, installed: Installation
 ) -> tuple[PlacementFit | None, list[tuple[Level, str]]]:
     """A fit, and its notes and warnings, which are not reported yet."""
@@ -325,7 +325,7 @@ def find_place(task: Placing) -> Placed:
             factor, source = found[0], _scale_source(known, ties)
         place = replace(levelled, scale=factor, translation=factor * levelled.translation)
         scaled, vertical = known is not None or found is not None, MEAN_PLANE
-        turned = None if scaled else _turned(task, levelled)
+        turned = None if scaled else _turn_by_attitudes(task, levelled)
         if turned is not None:
             place, note = turned
             notes.append(f"unscaled; {note}")
@@ -428,7 +428,7 @@ def _fit(
     return fit, None
 
 
-def _turned(task: Placing, levelled: Similarity) -> tuple[Similarity, str] | None:
+def _turn_by_attitudes(task: Placing, levelled: Similarity) -> tuple[Similarity, str] | None:
     """Where attitudes turn a model that has no scale, and a note; None where none is of use."""
     nan = math.nan
     records = [
@@ -492,7 +492,7 @@ def picks_of_model(workspace: Path, images: Collection[str]) -> list[Pick]:
         like = f"not in the model, whose pictures have names such as {min(images)}"
         if not found:
             raise WorkspaceError(f"no picture of the model is picked; {strange[0]} is {like}")
-        warn(f"picks in {len(strange)} pictures are left out: {named(strange)}: {like}")
+        warn(f"picks in {len(strange)} pictures are left out: {list_names(strange)}: {like}")
     return found
 
 
@@ -505,12 +505,12 @@ def _tie(task: Placing, control: Control, datum: Datum | None) -> ControlFit:
         record.image: RegisteredPicture(warp=task.warps[record.camera], model_from_pinhole=pose)
         for record, pose in zip(task.records, task.pinholes, strict=True)
     }
-    spots, lost = find_spots(picks, cameras)
-    wanted = {p.name for p in control.points} | {
+    picked, lost = triangulate_picks(picks, cameras)
+    requested = {p.name for p in control.points} | {
         end for length in control.lengths for end in length.ends or ()
     }
-    lost = {name: why for name, why in lost.items() if name in wanted}
-    found = tie_control(control, spots, lost, datum)
+    lost = {name: why for name, why in lost.items() if name in requested}
+    found = tie_control(control, picked, lost, datum)
     if task.shape is None:
         return found
     xyz = np.array([p.xyz for _, p in sorted(task.model.points3D.items())])

@@ -52,7 +52,7 @@ from reconstruct.adjustment.uncertainty import Uncertainty, write_uncertainty
 from reconstruct.mapping.arrays import cross_matrices, frames_of, model_groups
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.run import UNREGISTERED, read_inputs
-from reconstruct.pictures.files import named
+from reconstruct.pictures.files import list_names
 from reconstruct.placing.acceptance import Acceptance, Doming, judge_model
 from reconstruct.placing.alignment import level
 from reconstruct.placing.control import warn_of_contradictions
@@ -78,7 +78,7 @@ from reconstruct.placing.track import (
 from reconstruct.views.model import read_warps, write_frame
 from reconstruct.views.model_files import as_transform, read_reconstruction, rigid3d
 
-_FEWEST = 4
+_MIN_CORRECTING = 4
 """Pictures in the model from which navigation's error is known."""
 
 
@@ -125,7 +125,7 @@ def navigation_places(
     sigma = np.array([[r.sigma_horizontal_m, r.sigma_depth_m] for r in lost]).reshape(-1, 2)
     names = tuple(record.image for record in lost)
     based = [row for row in rows if known[row.image].has_position]
-    corrected = len(based) >= _FEWEST and bool(lost)
+    corrected = len(based) >= _MIN_CORRECTING and bool(lost)
     if corrected:
         timed = bool(np.isfinite([one.time_s for one in lost]).all())
         timed &= bool(np.isfinite([row.time_s for row in based]).all())
@@ -234,7 +234,7 @@ def join_groups(
     rig = mounted(rig)
     mounts = None if rig is None else body_from_pinhole(rig, mapped.warps)
     fits = [
-        _placed(model, of_frames, of_name, mounts, datum if mapped.scaled else None, installed)
+        _place_group(model, of_frames, of_name, mounts, datum if mapped.scaled else None, installed)
         for of_frames in members
     ]
     for of_frames, fit in list(zip(members, fits, strict=True))[1:]:
@@ -282,7 +282,7 @@ def joints_of(fit: PlacementFit, modes: SoftModes) -> tuple[JointRecord, ...]:
     return tuple(found)
 
 
-def _placed(
+def _place_group(
     model: pycolmap.Reconstruction,
     frames: Sequence[int],
     records: Mapping[str, ImageRecord],
@@ -330,7 +330,7 @@ def _leave_out(model: pycolmap.Reconstruction, frames: Sequence[int]) -> str:
         model.deregister_frame(frame)
     text = (
         f"{len(names)} pictures make a separate model that neither points nor navigation join to "
-        f"the largest: {named(names)}"
+        f"the largest: {list_names(names)}"
     )
     warn(text)
     return text
@@ -379,7 +379,7 @@ def run_sparse(
     inputs = read_inputs(workspace)
     mapping = MappingRecord.read(workspace / "mapping" / "mapping.json")
     known = join_groups(
-        _mapped(workspace, mapping), inputs.records, inputs.rig, inputs.datum,
+        _read_mapping(workspace, mapping), inputs.records, inputs.rig, inputs.datum,
         Installation.of(reconstruct),
     )  # fmt: skip
     left = sum(image.has_pose for image in known.model.images.values())
@@ -468,13 +468,13 @@ def run_sparse(
         bends = () if placed.fit is None else placed.fit.bends
         doming, accepted = judge_model(adjusted.mapped, inputs.records, rig, inputs.datum, bends)
     joints = () if shape is None or placed.fit is None else joints_of(placed.fit, shape.modes)
-    _unregistered(workspace, folder, inputs.records, rows, known_mount, placed)
+    _report_unregistered(workspace, folder, inputs.records, rows, known_mount, placed)
     _registration(model, mapping, placed, rows, doming, accepted, joints).write(
         folder / "registration.json"
     )
 
 
-def _unregistered(
+def _report_unregistered(
     workspace: Path,
     folder: Path,
     records: Sequence[ImageRecord],
@@ -504,7 +504,7 @@ def _unregistered(
     write_unregistered(folder / UNREGISTERED, lost, words, places, datum)
 
 
-def _mapped(workspace: Path, mapping: MappingRecord) -> Mapped:
+def _read_mapping(workspace: Path, mapping: MappingRecord) -> Mapped:
     """The model of the mapping."""
     return Mapped(
         model=read_reconstruction(workspace / "mapping" / "model"),

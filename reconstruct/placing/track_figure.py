@@ -130,7 +130,7 @@ def split_lines(places: Array) -> NDArray[np.int64]:
     first, number = 0, 0
     for leg in range(1, count):
         ends = leg == count - 1
-        turned = not ends and abs(_wrapped(course[leg] - _mean(course[first:leg]))) > np.deg2rad(
+        turned = not ends and abs(_wrap(course[leg] - _mean(course[first:leg]))) > np.deg2rad(
             _TURN_DEG
         )
         if not (ends or turned):
@@ -143,7 +143,7 @@ def split_lines(places: Array) -> NDArray[np.int64]:
     return found
 
 
-def _wrapped(angle: float) -> float:
+def _wrap(angle: float) -> float:
     return float((angle + np.pi) % (2.0 * np.pi) - np.pi)
 
 

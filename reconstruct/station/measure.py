@@ -27,7 +27,7 @@ from reconstruct.measure.errors import SharedErrors, shared_errors
 from reconstruct.measure.figures import polygon_area, polyline, slopes_of
 from reconstruct.picking.registered import RegisteredPictures
 from reconstruct.picking.surface import ShownPlaces, shown_places
-from reconstruct.placing.control_points import Pick, RegisteredPicture, find_spots
+from reconstruct.placing.control_points import Pick, RegisteredPicture, triangulate_picks
 from reconstruct.planes import LEVEL_PLANE
 from reconstruct.station.pair import pair_samplers, read_depth, to_axes
 from reconstruct.station.precise import precise_depth
@@ -315,7 +315,7 @@ def _crossed(
     picks: Sequence[Pick], cameras: Mapping[str, RegisteredPicture]
 ) -> tuple[Array, Array]:
     """The point that two pictures show, and its covariance."""
-    found, lost = find_spots(picks, cameras)
+    found, lost = triangulate_picks(picks, cameras)
     if not found:
         raise ReconstructionError(
             f"{' and '.join(map(_named, picks))} show no common spot: {lost['spot']}: pick again"

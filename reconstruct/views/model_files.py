@@ -137,10 +137,10 @@ class ImagesFile:
         """
         path = folder / "images.bin"
         _check(path, _image)
-        self._content = _mapped(path)
-        self.pictures = tuple(self._walked())
+        self._content = _map_file(path)
+        self.pictures = tuple(self._walk())
 
-    def _walked(self) -> Iterator[PosedPicture]:
+    def _walk(self) -> Iterator[PosedPicture]:
         content, at = self._content, 8
         (pictures,) = struct.unpack_from("<Q", content)
         for _ in range(pictures):
@@ -171,13 +171,13 @@ def points_of(folder: Path, ids: NDArray[np.int64]) -> Array:
     _check(path, _point)
     content = np.asarray(np.memmap(path, np.uint8, "r"))
     starts, _ = _point_starts(content)
-    wanted, at = np.unique(ids, return_inverse=True)
-    found = np.full((len(wanted) + 1, 3), np.nan)
+    requested, at = np.unique(ids, return_inverse=True)
+    found = np.full((len(requested) + 1, 3), np.nan)
     for first in range(0, len(starts), _POINTS_AT_A_TIME):
         head = content[starts[first : first + _POINTS_AT_A_TIME, None] + np.arange(_POINT_HEAD)]
         numbers = head[:, :8].copy().view("<i8")[:, 0]
-        rows = np.searchsorted(wanted, numbers)
-        known = np.flatnonzero(np.append(wanted, -1)[rows] == numbers)
+        rows = np.searchsorted(requested, numbers)
+        known = np.flatnonzero(np.append(requested, -1)[rows] == numbers)
         found[rows[known]] = head[known, 8:].copy().view("<f8")
     return found[at]
 
@@ -236,7 +236,7 @@ def _all_keypoints(path: Path) -> Iterator[tuple[int, NDArray[np.void]]]:
         raise OSError(errno.ENOSPC, _NO_ROOM, path) from None
 
 
-def _mapped(path: Path) -> Content:
+def _map_file(path: Path) -> Content:
     """The bytes of a file, read where they are looked at."""
     with path.open("rb") as file:
         try:
@@ -248,7 +248,7 @@ def _mapped(path: Path) -> Content:
 def _check(path: Path, length: Callable[[Content, int], int]) -> None:
     """Follow a file's counts to its end."""
     try:
-        content = _mapped(path)
+        content = _map_file(path)
     except OSError as error:
         raise ReconstructionError(f"{path}: cannot be read: {error.strerror}") from None
     at = 8

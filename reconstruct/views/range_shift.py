@@ -57,11 +57,11 @@ class RangeShift:
             warped: pixels of the warped picture.
             depth: (N,) of the spot before the pinhole's centre; NaN or infinite as known.
         """
-        return self._moved(warped, depth, inverse=False)
+        return self._move_all(warped, depth, inverse=False)
 
     def warped(self, ideal: Array, depth: Array | float) -> Array:
         """The inverse of `ideal`."""
-        return self._moved(ideal, depth, inverse=True)
+        return self._move_all(ideal, depth, inverse=True)
 
     def contraction(self, depth: Array) -> Array:
         """How much the shift of a pixel changes with the pixel at depths, (N,); largest of all.
@@ -82,21 +82,21 @@ class RangeShift:
 
         Views that share a field share the smaller one, in memory and in what goes to processes.
         """
-        return _scaled(self, sx, sy)
+        return _scale(self, sx, sy)
 
     @property
     def field(self) -> Nodes:
         """The field as kernels take it."""
         return as_nodes(self.nodes, self.width_px, self.height_px)
 
-    def _moved(self, pixels: Array, depth: Array | float, *, inverse: bool) -> Array:
+    def _move_all(self, pixels: Array, depth: Array | float, *, inverse: bool) -> Array:
         pixels = np.ascontiguousarray(pixels, dtype=np.float64)
         per_depth = 1.0 / np.broadcast_to(np.asarray(depth, dtype=np.float64), len(pixels))
         return _move(self.field, self.inverse_working, pixels, per_depth, inverse)
 
 
 @lru_cache(maxsize=16)
-def _scaled(shift: RangeShift, sx: float, sy: float) -> RangeShift:
+def _scale(shift: RangeShift, sx: float, sy: float) -> RangeShift:
     return replace(
         shift,
         nodes=shift.nodes * [sx, sy],

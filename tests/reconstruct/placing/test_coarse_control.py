@@ -15,7 +15,7 @@ from reconstruct.placing.control import (
     widened,
     without_wrong_points,
 )
-from reconstruct.placing.control_points import Control, KnownPoint, find_spots
+from reconstruct.placing.control_points import Control, KnownPoint, triangulate_picks
 from reconstruct.placing.fit import PlacementFit, fit_control
 from tests.reconstruct.placing.test_control import KNOWN, Gauge, in_gauge, picks_of, site
 from tests.reconstruct.scenes import DATUM
@@ -41,7 +41,7 @@ def known(places: np.ndarray, sigma_m: float = STATED_M) -> Control:
 
 
 def tied(gauge: Gauge, places: np.ndarray, noise_px: float = 0.3) -> ControlFit:
-    spots, lost = find_spots(picks_of(POINTS[: len(places)], noise_px), gauge.cameras)
+    spots, lost = triangulate_picks(picks_of(POINTS[: len(places)], noise_px), gauge.cameras)
     return tie_control(known(places), spots, lost, DATUM)
 
 
@@ -109,7 +109,7 @@ def test_hasty_picks_count_with_what_they_are_worth() -> None:
         picks = picks_of(POINTS, noise_px, seed)
         picks[seed] = replace(picks[seed], x_px=picks[seed].x_px + 150.0)
         with heard() as said:
-            spots, lost = find_spots(picks, gauge.cameras)
+            spots, lost = triangulate_picks(picks, gauge.cameras)
         assert not lost and len(said) == 1 and "count with a sigma of" in said[0]
         stated = float(said[0].rsplit("sigma of ", 1)[1].split()[0])
         assert 0.7 * noise_px < stated < 1.4 * noise_px

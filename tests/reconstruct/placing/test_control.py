@@ -17,9 +17,9 @@ from reconstruct.placing.control import ControlFit, tie_control
 from reconstruct.placing.control_points import (
     Pick,
     RegisteredPicture,
-    find_spots,
     read_control,
     read_picks,
+    triangulate_picks,
 )
 from reconstruct.placing.fit import fit_control, fit_navigation
 from reconstruct.placing.navigation import body_from_pinhole
@@ -122,13 +122,13 @@ def control_rows(uses: str, sigma_m: float = 0.002) -> list[dict[str, object]]:
 
 
 def tied(path: Path, gauge: Gauge, picks: list[Pick]) -> ControlFit:
-    spots, lost = find_spots(picks, gauge.cameras)
+    spots, lost = triangulate_picks(picks, gauge.cameras)
     return tie_control(read_control(path), spots, lost, DATUM)
 
 
 def test_points_are_found_exactly_through_the_ports() -> None:
     gauge = in_gauge(1)
-    spots, lost = find_spots(picks_of(KNOWN), gauge.cameras)
+    spots, lost = triangulate_picks(picks_of(KNOWN), gauge.cameras)
     assert not lost
     found = np.stack([spots[f"p{k}"].model for k in range(len(KNOWN))])
     np.testing.assert_allclose(found, gauge.points(KNOWN), atol=1e-8)
@@ -139,7 +139,7 @@ def test_points_are_found_exactly_through_the_ports() -> None:
 def test_the_sigma_of_a_found_point_is_that_of_its_error() -> None:
     gauge, ratios = in_gauge(2), []
     for seed in range(8):
-        spots, _ = find_spots(picks_of(KNOWN, 0.3, seed), gauge.cameras)
+        spots, _ = triangulate_picks(picks_of(KNOWN, 0.3, seed), gauge.cameras)
         for k, true in enumerate(gauge.points(KNOWN)):
             spot = spots[f"p{k}"]
             white = np.linalg.solve(np.linalg.cholesky(spot.covariance), spot.model - true)
@@ -151,7 +151,7 @@ def test_a_wrong_pick_is_left_out_and_named() -> None:
     gauge, picks = in_gauge(3), picks_of(KNOWN, 0.2)
     at = next(i for i, p in enumerate(picks) if p.point == "p4")
     picks[at] = Pick(image=picks[at].image, point="p4", x_px=400, y_px=300, sigma_px=0.3)
-    spots, _ = find_spots(picks, gauge.cameras)
+    spots, _ = triangulate_picks(picks, gauge.cameras)
     assert spots["p4"].left_out == (picks[at].image,)
     assert np.linalg.norm(spots["p4"].model - gauge.points(KNOWN)[4]) < 0.003
 
@@ -159,12 +159,12 @@ def test_a_wrong_pick_is_left_out_and_named() -> None:
 def test_points_that_cannot_be_found_are_named() -> None:
     gauge, picks = in_gauge(4), picks_of(KNOWN)
     once = next(p for p in picks if p.point == "p0")
-    spots, lost = find_spots([once], gauge.cameras)
+    spots, lost = triangulate_picks([once], gauge.cameras)
     assert not spots
     assert lost.keys() == {"p0"}
     two = [p for p in picks if p.point == "p1"][:2]
     two[1] = Pick(image=two[1].image, point="p1", x_px=20, y_px=20, sigma_px=0.3)
-    spots, lost = find_spots(two, gauge.cameras)
+    spots, lost = triangulate_picks(two, gauge.cameras)
     assert not spots
     assert lost.keys() == {"p1"}
     assert " px" in lost["p1"]
@@ -174,7 +174,7 @@ def test_points_that_cannot_be_found_are_named() -> None:
 def test_control_points_alone_place_a_model(tmp_path: Path, stretch: float) -> None:
     """Of known scale, or in a unit of which 3.7 make a metre: four points show it."""
     gauge = in_gauge(5)
-    spots, _ = find_spots(picks_of(KNOWN), gauge.cameras)
+    spots, _ = triangulate_picks(picks_of(KNOWN), gauge.cameras)
     spots = {
         name: replace(spot, model=spot.model * stretch, covariance=spot.covariance * stretch**2)
         for name, spot in spots.items()
@@ -307,7 +307,7 @@ def test_picks_beyond_the_model_are_named(tmp_path: Path) -> None:
 def test_control_points_straighten_a_bent_model(tmp_path: Path) -> None:
     """A mode of 5 mm bends it by 20 mm; points held out agree once others have found that."""
     gauge = in_gauge(4)
-    spots, lost = find_spots(picks_of(KNOWN, 0.3, 1), gauge.cameras)
+    spots, lost = triangulate_picks(picks_of(KNOWN, 0.3, 1), gauge.cameras)
     control = read_control(write(tmp_path / "control.csv", control_rows("+++?+")))
     turn = gauge.ned_from_model.rotation.inv()
 

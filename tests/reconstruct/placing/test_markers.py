@@ -14,7 +14,7 @@ from alice_survey.core.manifest import write_manifest
 from camera_calib.approximation.pinhole_warp import best_warp
 from camera_calib.camera import Camera
 from reconstruct.placing.control_command import survey_control
-from reconstruct.placing.control_points import RegisteredPicture, find_spots, read_picks
+from reconstruct.placing.control_points import RegisteredPicture, read_picks, triangulate_picks
 from tests.reconstruct.scenes import ALTITUDE_M, Scene, make_scene
 
 SIDE_M, DEPTH_M = 0.15, 15.0
@@ -96,7 +96,7 @@ def test_markers_are_found_to_a_part_of_a_pixel_and_their_side_measured(workspac
         )
         for r, p in of_name.values()
     }
-    spots, lost = find_spots(picks, cameras)
+    spots, lost = triangulate_picks(picks, cameras)
     assert not lost
     place = np.stack([spots[f"7.{k}"].model for k in range(4)])
     np.testing.assert_allclose(place, corners_ned(), atol=0.012)

@@ -10,7 +10,7 @@ from alice_survey.core.config import CameraConfig, WaterConfig
 from alice_survey.core.frames import Array
 from camera_calib.approximation.pinhole_warp import best_warp
 from camera_calib.rig import design_rig
-from reconstruct.placing.control_points import Pick, RegisteredPicture, find_spots
+from reconstruct.placing.control_points import Pick, RegisteredPicture, triangulate_picks
 
 NADIR = Rotation.from_euler("z", 90, degrees=True)
 
@@ -63,7 +63,7 @@ def test_errors_of_matched_spots_are_as_stated(mark: float, match: float) -> Non
     rng, views = np.random.default_rng(3), cameras(6)
     chi = []
     for _ in range(60):
-        spot = find_spots(drawn(views, mark, match, rng), views)[0]["p"]
+        spot = triangulate_picks(drawn(views, mark, match, rng), views)[0]["p"]
         chi.append(spot.model @ np.linalg.solve(spot.covariance, spot.model))
     # three degrees of freedom; chi above 1 only widens
     assert 0.7**2 < np.mean(chi) / 3 < 1.3**2
@@ -76,6 +76,6 @@ def test_counting_matches_as_picks_by_eye_would_state_too_little() -> None:
         picks = drawn(views, 0.5, 0.05, rng)
         alone = [replace(pick, matched_to="") for pick in picks]
         for some, chi in ((picks, stated), (alone, apart)):
-            spot = find_spots(some, views)[0]["p"]
+            spot = triangulate_picks(some, views)[0]["p"]
             chi.append(spot.model @ np.linalg.solve(spot.covariance, spot.model) / 3)
     assert np.mean(stated) < 1.7 and np.mean(apart) > 10.0

@@ -27,13 +27,13 @@ from reconstruct.placing.control_points import (
     PICKS_FILE,
     Control,
     Pick,
-    Spot,
-    find_spots,
+    TriangulatedPoint,
     read_control,
     read_picks,
     save_control,
     save_picks,
     table_token,
+    triangulate_picks,
 )
 
 T = TypeVar("T")
@@ -237,13 +237,13 @@ class _Tab:
         picks = [*(own or []), *(coded or [])]
         control = self._read(CONTROL_FILE, read_control) or Control()
         model = self._read_model() if self._has_model() else None
-        spots: dict[str, Spot] = {}
+        spots: dict[str, TriangulatedPoint] = {}
         lost: dict[str, str] = {}
         off: list[Array | None] = [None] * len(picks)
         if model is not None:
             known = {p.image for p in picks if p.image in model.pictures}
             cameras = {name: model.pictures.picture(name) for name in known}
-            spots, lost = find_spots(picks, cameras)
+            spots, lost = triangulate_picks(picks, cameras)
             off = spot_residuals(spots, picks, model.pictures)
         points: dict[str, dict[str, Any]] = {}
         for number, (pick, miss) in enumerate(zip(picks, off, strict=True)):
@@ -405,7 +405,7 @@ def _pick_json(pick: Pick) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _spot_json(spot: Spot) -> dict[str, Any]:
+def _spot_json(spot: TriangulatedPoint) -> dict[str, Any]:
     return {
         "n": spot.model[0], "e": spot.model[1], "down": spot.model[2],
         "sigma": np.sqrt(np.diag(spot.covariance)).tolist(), "views": spot.views,
