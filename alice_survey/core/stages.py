@@ -510,7 +510,6 @@ STAGES: tuple[StageSpec, ...] = (
             "plan.json": "the plan, for the next stages",
             "settings.txt": "every setting with its equation, source and limit",
             "exports": "the plan for vehicles",
-            "plan.html": "the plan as a page",
         },
         picture="map.png",
         reported=("plan.json",),

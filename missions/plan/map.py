@@ -25,10 +25,18 @@ from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.drawing import draw_counts, draw_polygons, finish_map, map_sheet
 from missions.coverage.stations import plan_pattern, stations_of_plan
 from missions.exports.geometry import footprint_outline, footprints_ne
-from missions.plan.page_map import COLOURS, KINDS
 from missions.plan.planner import area_bathymetry
 from missions.values.plan_file import Plan, read_plan
 
+KINDS = ("survey", "cross", "closing", "fill", "tie")
+COLOURS = {
+    "survey": "#1b4f72", "cross": "#6c3483", "closing": "#117a65", "fill": "#b9770e",
+    "tie": "#c0392b",
+    "area": "#c8553d", "allowed": "#566573", "no_go": "#b03a2e", "way": "#7f8c8d",
+    "footprint": "#2e86c1", "contour": "#5d6d7e", "current": "#2471a3", "missed": "#d35400",
+    "home": "#1e8449",
+}  # fmt: skip
+"""Colours of all maps of a plan."""
 _MAX_ARROWS = 500
 _MAX_FOOTPRINTS = 3000
 """Most footprints drawn one by one; beyond, the count of pictures shows what they cover."""

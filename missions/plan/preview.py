@@ -5,12 +5,15 @@ coarser grid (`MAX_CELLS`): the shares that it gives, and the holes, are then es
 `certificate.estimated` says so.
 """
 
+import base64
+import io
 import math
 import time
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from alice_survey.core.artefacts import json_values
 from alice_survey.core.config import SurveyConfig
@@ -24,7 +27,6 @@ from missions.exports.geometry import dive_of_line, footprint_outline, rings_ne,
 from missions.exposure.settings_table import Setting
 from missions.exposure.storage import raw_bytes
 from missions.exposure.ways_out import ConflictError
-from missions.plan.page_map import counts_data
 from missions.plan.planner import Planned, plan_survey
 from missions.plan.playback import depths_along
 from missions.route.energy import craft_of, usable_wh
@@ -32,6 +34,10 @@ from missions.values.plan_file import Plan
 
 MAX_CELLS = 400_000
 """Cells of the certificate of a large area."""
+_MAX_PICTURE_CELLS = 420
+"""Most cells on a side of the picture of counts."""
+_MAX_COUNT = 254
+"""Highest number of pictures in the picture of counts, where 255 is outside of the area."""
 _MAX_HOLES = 60
 _PROFILE_POINTS = 600
 _DETAIL = 1 / 5000
@@ -111,7 +117,7 @@ def planned_json(planned: Planned, rig: Rig, config: SurveyConfig) -> dict[str, 
             )
         },
         "outline": np.round(footprint_outline(plan, rig), 4).tolist(),
-        "counts": counts_data(seen, optimized=False),
+        "counts": counts_data(seen),
         "certificate": {
             "cell_m": seen.grid.cell_m,
             "estimated": seen.estimated,
@@ -294,3 +300,63 @@ def _by_section(settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         section, key = name.split(".")
         result.setdefault(section, {})[key] = json_values(value)
     return result
+
+
+def counts_picture(seen: Certificate) -> tuple[NDArray[np.uint8], tuple[float, float], float]:
+    """Counts with north up: red pictures, green lines, blue 1 at the requested overlap.
+
+    Cells become larger ones that show the worst of them.
+
+    Returns:
+        The (H, W, 3) picture, red 255 outside of the area; north and east of its upper left
+        corner; and the side of a pixel, metres.
+    """
+    grid = seen.grid
+    block = max(1, math.ceil(max(grid.rows, grid.columns) / _MAX_PICTURE_CELLS))
+    inside = _blocks(seen.inside, block, fill=False)
+    pictures = np.where(inside, _blocks(seen.pictures, block, fill=0), 65535).min(axis=(1, 3))
+    lines = np.where(inside, _blocks(seen.least_lines, block, fill=0), 65535).min(axis=(1, 3))
+    met = (_blocks(seen.at_overlap, block, fill=True) | ~inside).all(axis=(1, 3))
+    within = inside.any(axis=(1, 3))
+    cells = np.zeros((*within.shape, 3), dtype=np.uint8)
+    cells[..., 0] = np.where(within, np.minimum(pictures, _MAX_COUNT), 255)
+    cells[..., 1] = np.where(within, np.minimum(lines, _MAX_COUNT), 0)
+    cells[..., 2] = np.where(within, met, 0)
+    corners = grid.places_of(block * np.array([[0, 0], [0, 1], [1, 0], [1, 1]]) * within.shape)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    # Half the side of a cell that lies diagonally: no cell falls between pixels.
+    aslant = abs(math.sin(2.0 * grid.heading_rad)) > 1e-9
+    pixel_m = grid.cell_m * block / (2.0 if aslant else 1.0)
+    rows, columns = np.maximum(np.ceil((high - low) / pixel_m - 1e-6).astype(int), 1)
+    norths = high[0] - pixel_m * (np.arange(rows) + 0.5)
+    easts = low[1] + pixel_m * (np.arange(columns) + 0.5)
+    places = np.stack(np.meshgrid(norths, easts, indexing="ij"), axis=-1)
+    row, column = np.moveaxis(np.floor(grid.cells_of(places) / block).astype(int), -1, 0)
+    on = (row >= 0) & (column >= 0) & (row < within.shape[0]) & (column < within.shape[1])
+    rgb = np.zeros((rows, columns, 3), dtype=np.uint8)
+    rgb[..., 0] = 255
+    rgb[on] = cells[row[on], column[on]]
+    return rgb, (float(high[0]), float(low[1])), pixel_m
+
+
+def counts_data(seen: Certificate) -> dict[str, Any]:
+    """The counts for the page's script, which reads those under the pointer."""
+    rgb, (north, west), pixel_m = counts_picture(seen)
+    png = base64.b64encode(_png(rgb)).decode("ascii")
+    return {"png": f"data:image/png;base64,{png}", "north": north, "west": west, "pixel": pixel_m}
+
+
+def _blocks(cells: NDArray[Any], block: int, *, fill: int | bool) -> NDArray[Any]:
+    """Cells in blocks, (rows, block, columns, block); beyond the last cell stands `fill`."""
+    rows, columns = (-(-size // block) for size in cells.shape)
+    padded = np.full((rows * block, columns * block), fill, dtype=cells.dtype)
+    padded[: cells.shape[0], : cells.shape[1]] = cells
+    return padded.reshape(rows, block, columns, block)
+
+
+def _png(pixels: NDArray[np.uint8]) -> bytes:
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, format="PNG")
+    return buffer.getvalue()

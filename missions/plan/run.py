@@ -1,6 +1,5 @@
 """The stage `plan`: a survey planned, and written for the next stages, for people, for vehicles."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,14 +8,12 @@ from alice_survey.core.artefacts import write_json
 from alice_survey.core.config import SeaConfig, SurveyConfig
 from alice_survey.core.executor import Executor
 from alice_survey.core.run import progress
-from alice_survey.kit.document import Link, PictureLayer
 from camera_calib.rig import Rig, design_rig
 from missions.exports.options import Options, options_of
 from missions.exports.write import write_exports
 from missions.exposure.settings_table import settings_table
 from missions.exposure.timetable import trigger_table, write_timetable
 from missions.plan.map import draw_plan
-from missions.plan.page import write_page
 from missions.plan.planner import Planned, plan_survey
 from missions.values.costs import Costs, leg_costs
 from missions.values.plan_file import Dive, Plan
@@ -43,7 +40,6 @@ def write_planned(
     rig: Rig,
     options: Options,
     sea: SeaConfig,
-    layers: Sequence[PictureLayer] = (),
 ) -> None:
     """Write a plan.
 
@@ -53,7 +49,6 @@ def write_planned(
         rig: its cameras in water.
         options: what vehicles need besides the plan.
         sea: the current that maps show.
-        layers: more of the page's map.
     """
     plan = planned.plan
     write_json(folder / "plan.json", plan.to_json())
@@ -62,22 +57,7 @@ def write_planned(
     (folder / "settings.txt").write_text(table + "\n", encoding="utf-8")
     write_triggers(folder, plan, planned.costs, planned.imaging.shortest_interval_s)
     draw_plan(folder / "map.png", plan, rig, planned.certificate, planned.bathymetry, sea)
-    files = write_exports(folder / "exports", plan, rig, options=options)
-    write_page(
-        folder / "plan.html",
-        plan,
-        rig,
-        planned.certificate,
-        planned.rows,
-        bathymetry=planned.bathymetry,
-        sea=sea,
-        warnings=planned.warnings,
-        links=[
-            Link(text=file.name, address=f"exports/{file.name}", about=about)
-            for file, about in files.items()
-        ],
-        layers=layers,
-    )
+    write_exports(folder / "exports", plan, rig, options=options)
 
 
 def write_triggers(folder: Path, plan: Plan, costs: Costs, shortest_interval_s: float) -> None:

@@ -2,32 +2,23 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
-from alice_survey.core.artefacts import atomic_path, need_stage, read_json, write_json
+from alice_survey.core.artefacts import atomic_path, need_stage, write_json
 from alice_survey.core.config import SurveyConfig
-from alice_survey.core.errors import ConfigError, warn
+from alice_survey.core.errors import ConfigError
 from alice_survey.core.frames import Array
 from alice_survey.core.text_table import text_table
-from alice_survey.kit.document import PictureLayer, Scale
 from alice_survey.kit.figure import (
     check_figure_path,
     colour_bar,
     figure_style,
     map_axes,
     new_figure,
-    palette_colours,
-    palette_steps,
     save_figure,
 )
-from camera_calib.rig import design_rig
-from missions.exports.options import options_of
-from missions.plan.page_map import picture_layer
-from missions.plan.planner import plan_survey
-from missions.plan.run import write_planned
 from missions.values.plan_file import Plan, read_plan
 from reconstruct.precision.candidates import (
     Candidate,
@@ -116,7 +107,7 @@ def precision_report(
         text.append(_measures_text(base, options))
         data["measures"] = [_measure_json(base, one) for one in options]
     _write(folder, base, data)
-    text.append(f"{folder}: precision.json, precision.tif, plan.html with the sigmas of heights")
+    text.append(f"{folder}: precision.json, precision.tif with the sigmas of heights")
     if plot is not None:
         _draw(plot, plan, found, without)
     return "\n\n".join(text), data
@@ -229,8 +220,8 @@ def heights_raster(found: Precision) -> tuple[Array, DemGrid]:
 
 
 def _write(folder: Path, base: Candidate, data: Mapping[str, Any]) -> None:
-    """Write a prediction into the folder of its plan: values, raster of heights, page with it."""
-    config, plan = base.config, base.plan
+    """Write a prediction into the folder of its plan: values, raster of heights."""
+    plan = base.plan
     write_json(folder / "precision.json", data)
     heights, grid = heights_raster(base.precision)
     frame = WorldFrame(name="ned", datum=plan.datum, scaled=True, vertical_datum=_LEVEL)
@@ -240,31 +231,6 @@ def _write(folder: Path, base: Candidate, data: Mapping[str, Any]) -> None:
         tiled_raster(path, grid, frame, "float32", float("nan"), text) as raster,
     ):
         raster.write(heights.astype(np.float32), 1)
-    with TemporaryDirectory() as scratch:
-        design, again = design_rig(config.camera, config.water), Path(scratch)
-        options = options_of(config.camera, config.plan)
-        planned = plan_survey(config, design)
-        write_planned(again, planned, design, options, config.sea, [heights_layer(heights, grid)])
-        if read_json(again / "plan.json") != read_json(folder / "plan.json"):
-            warn("plan.html stays without sigmas: settings differ from the plan's; run plan")
-            return
-        with atomic_path(folder / "plan.html") as page:
-            page.write_bytes((again / "plan.html").read_bytes())
-
-
-def heights_layer(heights: Array, grid: DemGrid) -> PictureLayer:
-    """Sigmas of heights as a layer of the plan's page."""
-    known = np.isfinite(heights)
-    low, high = (_MM * float(x) for x in (np.nanmin(heights), np.nanmax(heights)))
-    shares = (_MM * np.where(known, heights, 0.0) - low) / max(high - low, 1e-9)
-    rgba = palette_colours(_PALETTE, np.clip(shares, 0.0, 1.0))
-    rgba[..., 3] = np.where(known, _OPACITY, 0)
-    colours = palette_steps(_PALETTE, _COLOURS)
-    return picture_layer(
-        rgba, (grid.north, grid.west), grid.cell, name="heights",
-        title="Expected sigma of heights", about="After a rigid alignment.",
-        scale=Scale(label="expected sigma of heights, mm", low=low, high=high, colours=colours),
-    )  # fmt: skip
 
 
 def _draw(path: Path, plan: Plan, found: Precision, without: Mapping[str, Precision]) -> None:

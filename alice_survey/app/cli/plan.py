@@ -336,19 +336,18 @@ def draw_map(
     print_result(*map_report(workspace / "plan" / "plan.json", config, output), as_json)
 
 
-@app.command(epilog=examples("plan current -w reef", "plan current -w reef --plot trade.png"))
+@app.command(epilog=examples("plan current -w reef"))
 def current(
     workspace: Workspace = WORK,
     survey: SurveyFile = None,
-    plot: Annotated[Path | None, typer.Option(help="PNG, PDF or SVG to draw.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Show what the current costs.
 
-    Power by the direction of lines: along the current, across it by sway, or crabbing.
+    Headings of lines that take least and most power, and how far the battery reaches.
     """
     from alice_survey.app.pipeline import settings
     from missions.plan.trade import current_report
 
     config = settings(workspace, survey, needed=False)
-    print_result(*current_report(config, plot), as_json)
+    print_result(*current_report(config), as_json)

@@ -14,8 +14,9 @@ from missions.coverage.certificate import certificate
 from missions.coverage.stations import plan_pattern, stations_of_plan
 from missions.plan.planner import Planned, plan_survey
 from missions.plan.playback import play
-from missions.plan.preview import preview
+from missions.plan.preview import counts_picture, preview
 from missions.route.ways import Ways
+from tests.missions.exports.plans import RIG, small_plan
 
 SMALL = parse_config({"area": {"length_m": 8.0, "width_m": 6.0}}, "test")
 
@@ -113,3 +114,22 @@ def test_a_playback_takes_as_long_as_the_plan_and_stays_inside(values: dict[str,
         <= len(played.pictures_s) + len(made.plan.lines)
     )
     assert np.all(played.altitude_m == pytest.approx(2.0))
+
+
+def test_counts_in_the_picture_are_those_of_their_cells() -> None:
+    plan = small_plan()
+    stations, pattern = stations_of_plan(plan), plan_pattern(plan, RIG)
+    seen = certificate(plan.area, RIG, stations, pattern)
+    rgb, (north, west), pixel_m = counts_picture(seen)
+    rows, columns = rgb.shape[:2]
+    row, column = np.mgrid[:rows, :columns]
+    places = np.stack([north - pixel_m * (row + 0.5), west + pixel_m * (column + 0.5)], axis=-1)
+    cells = np.floor(seen.grid.cells_of(places)).astype(int)
+    on = np.all((cells >= 0) & (cells < seen.grid.shape), axis=-1)
+    at = (cells[on][:, 0], cells[on][:, 1])
+    inside = seen.inside[at]
+    assert (rgb[~on][:, 0] == 255).all()
+    assert (rgb[on][~inside][:, 0] == 255).all()
+    for channel, counts in enumerate((seen.pictures, seen.least_lines, seen.at_overlap)):
+        assert (rgb[on][inside][:, channel] == counts[at][inside]).all()
+    assert (rgb[..., 0] < 255).mean() > 0.9 * plan.area.survey.area / (rows * columns * pixel_m**2)

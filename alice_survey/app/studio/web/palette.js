@@ -11,7 +11,7 @@ export const GREY = "#6b6b6b";
 export const INK = "#16232b";  /* rims and signs on pictures, with WHITE */
 export const WHITE = "#fff";
 
-/* Kinds of lines and shapes of a plan, as in plan.html. */
+/* Kinds of lines and shapes of a plan. */
 export const PLAN = {
   survey: "#1b4f72", cross: "#6c3483", closing: "#117a65", fill: "#b9770e", tie: "#c0392b",
   way: "#7f8c8d", home: "#1e8449", footprint: "#2e86c1", mark: "#8e44ad", allowed: "#566573",

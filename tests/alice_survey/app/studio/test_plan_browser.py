@@ -176,7 +176,7 @@ def test_a_survey_is_drawn_changed_and_saved(size: str, browser: Any, tmp_path: 
         saved = plan.text()
         _save(plan)
         assert (folder / "survey.toml").read_text(encoding="utf-8") == saved
-        assert {"plan.json", "plan.html"} <= {path.name for path in (folder / "plan").iterdir()}
+        assert {"plan.json", "map.png"} <= {path.name for path in (folder / "plan").iterdir()}
         config = load_config(folder / "survey.toml")
         assert config.plan.altitude_m == plan.altitude()
         assert "As in survey.toml" in page.locator(".plan-top .note").inner_text()
