@@ -139,7 +139,7 @@ def test_headings_are_taken_across_north(tmp_path: Path) -> None:
     path = tmp_path / "navigation.csv"
     row = [32.8, 34.9, 12.8, 0, 0, 359.0, 2.0, 0.3, 0.01, 0.3, 1, 0.02]
     write_csv(path, NAVIGATION_COLUMNS, [[0.0, *row], [1.0, *row[:5], 2.0, *row[6:]]])
-    (half,) = imaging._believed(path, np.array([2 / 3]))
+    (half,) = imaging._believed_records(path, np.array([2 / 3]))
     assert half.heading_deg == pytest.approx(1.0)
 
 
