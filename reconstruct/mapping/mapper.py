@@ -131,12 +131,13 @@ def _map_rig(
 ) -> tuple[list[pycolmap.Reconstruction], list[str]]:
     """Models, largest first, and how they came about."""
     total = len(seen.images)
-    if method == "incremental" or len(seen.cameras) < 2:
-        why = "one camera has no stereo pairs"
+    one_station = len({record.station for record in seen.images}) == 1
+    if method == "incremental" or len(seen.cameras) < 2 or one_station:
+        why = "there is one station" if one_station else "one camera has no stereo pairs"
         if method == "incremental":
             why = "as set in survey.toml"
         if method == "global":
-            warn("one camera has no stereo pairs to map globally from: incremental mapping instead")
+            warn(f"{why} to map globally from: incremental mapping instead")
         return run_mapper(seen, cam_from_rig, folder, seed, free="nothing"), [
             f"incremental mapping: {why}"
         ]

@@ -11,7 +11,7 @@ the rig, as the survey refined it, moves both. Only stations around the spots co
 out knows less, never more.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -35,6 +35,7 @@ from reconstruct.adjustment.exact_observations import (
 from reconstruct.adjustment.normal_equations import Gauge, PointEquations, by_pose, reduce_parts
 from reconstruct.adjustment.pixel_parts import Linearised, PixelParts
 from reconstruct.mapping.arrays import MIN_POINTS, Indices, first_of, linked_groups
+from reconstruct.measure.figures import polyline, slopes_of
 from reconstruct.picking.registered import RegisteredPictures
 from reconstruct.placing.control_points import (
     Pick,
@@ -68,8 +69,18 @@ class SpotErrors:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Length:
-    """A distance between two spots, in the unit of the model, and parts of its sigma."""
+class Figure:
+    """A figure of points in space."""
+
+    value: Callable[[Array], float]
+    """Of (N, 3) points."""
+    power: int
+    """Of a length that it is."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PickedFigure:
+    """A figure of picked points, in the unit of the model, and parts of its sigma."""
 
     value: float
     sigma_picks: float
@@ -122,7 +133,10 @@ class StationBlock:
         known = np.zeros((0, 0))
         if rig.covariance is not None:
             known = rig.covariance.marginal(fields).matrix
-        sigma = float(read_arrays(workspace / "sparse" / "covariance.npz", "sigma_px")["sigma_px"])
+        sigma = 1.0  # of no effect on one station, which has no shape
+        if len(numbers) > 1:
+            path = workspace / "sparse" / "covariance.npz"
+            sigma = float(read_arrays(path, "sigma_px")["sigma_px"])
         linear = Linearised(
             pixels=PixelParts(pixels, len(numbers)), state=state, fields=fields,
             noise=(sigma, sigma**2),
@@ -182,6 +196,8 @@ class StationBlock:
                 are taken out.
             by_rig: (K, G) by the rig, the stations held.
         """
+        if len(self.numbers) == 1:  # which moves as a whole
+            return np.zeros((len(by_poses),) * 2), by_rig @ self.covariance @ by_rig.T
         shape = np.stack([self.gauge.shape_weights(one) for one in by_poses], axis=-1)
         poses = np.einsum("fik,fil->kl", shape, self.equations.undamped.solve(shape))
         along = np.einsum("fik,fig->kg", shape, self._response) + by_rig
@@ -203,33 +219,53 @@ class Lengths:
         numbers, first = np.unique(pictures.station, return_index=True)
         self._numbers, self._places = numbers, pictures.centres[first]
 
-    def between(self, first: Sequence[Pick], second: Sequence[Pick]) -> Length:
+    def between(self, first: Sequence[Pick], second: Sequence[Pick]) -> PickedFigure:
         """The distance between two spots, each by its picks.
 
         Raises:
             ReconstructionError: one is not found, or the distance is not determined.
         """
-        spots = [self.spot(picks) for picks in (first, second)]
-        way = spots[1].model - spots[0].model
-        value = float(np.linalg.norm(way))
-        if not value > 0:
+        return self.figures([first, second], [Figure(value=polyline, power=1)])[1][0]
+
+    def figures(
+        self, picks: Sequence[Sequence[Pick]], figures: Sequence[Figure]
+    ) -> tuple[Array, list[PickedFigure]]:
+        """Points, (N, 3) in the model, each by its picks, and figures of them.
+
+        Raises:
+            ReconstructionError: a point is not found, two that follow each other are one, or
+                their distances are not determined.
+        """
+        spots = [self.spot(some) for some in picks]
+        points = np.stack([spot.model for spot in spots])
+        if not (np.linalg.norm(np.diff(points, axis=0), axis=1) > 0).all():
             raise ReconstructionError("the two spots are one and the same")
-        way /= value
-        block = self._block([*first, *second])
-        at = [
-            block.errors(s, p, self._pictures) for s, p in zip(spots, (first, second), strict=True)
-        ]
-        picks = float(way @ (at[0].picks + at[1].picks) @ way)
-        poses, rig = block.variances(
-            np.einsum("i,ifk->fk", way, at[1].by_poses - at[0].by_poses)[None],
-            (way @ (at[1].by_rig - at[0].by_rig))[None],
+        block = self._block([pick for some in picks for pick in some])
+        errors = [block.errors(s, p, self._pictures) for s, p in zip(spots, picks, strict=True)]
+        by_picks, by_poses, by_rig = (
+            np.stack([getattr(one, name) for one in errors])
+            for name in ("picks", "by_poses", "by_rig")
         )
-        scale = value * _scale_sigma(self._workspace)
-        return Length(
-            value=value, sigma_picks=float(np.sqrt(picks)),
-            sigma_poses=float(np.sqrt(max(poses[0, 0], 0.0))),
-            sigma_scale=float(np.sqrt(max(rig[0, 0], 0.0) + scale**2)),
-        )  # fmt: skip
+        centred = points - points.mean(axis=0)
+        slopes = np.stack([slopes_of(figure.value, centred) for figure in figures])
+        own = np.einsum("kni,nij,knj->k", slopes, by_picks, slopes)
+        poses, rig = block.variances(
+            np.einsum("kni,nifj->kfj", slopes, by_poses), np.einsum("kni,nig->kg", slopes, by_rig)
+        )
+        scale = _scale_sigma(self._workspace)
+        found = []
+        for n, figure in enumerate(figures):
+            value = figure.value(centred)
+            found.append(
+                PickedFigure(
+                    value=value, sigma_picks=float(np.sqrt(max(own[n], 0.0))),
+                    sigma_poses=float(np.sqrt(max(poses[n, n], 0.0))),
+                    sigma_scale=float(np.hypot(
+                        np.sqrt(max(rig[n, n], 0.0)), figure.power * value * scale
+                    )),
+                )
+            )  # fmt: skip
+        return points, found
 
     def spot(self, picks: Sequence[Pick]) -> TriangulatedPoint:
         """The spot that picks show.

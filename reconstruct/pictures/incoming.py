@@ -134,11 +134,12 @@ def camera_key(facts: PictureFacts) -> tuple[str, int, int]:
 
 def check_entries(entries: Sequence[Incoming], rig: Rig | None) -> None:
     """Check that pictures are enough, of one size by camera, and of the size that the rig says."""
-    if len({entry.station for entry in entries}) < 2:
+    cameras = {entry.camera for entry in entries}
+    if len({entry.station for entry in entries}) < 2 and (rig is None or len(cameras) < 2):
         count = len(entries)
         raise ImageError(
             f"{count} usable picture{'s' * (count != 1)}: a model needs pictures from 2 or more "
-            "places that overlap"
+            "places that overlap, or a stereo pair with its rig"
         )
     for camera in dict.fromkeys(entry.camera for entry in entries):
         own = [e for e in entries if e.camera == camera]

@@ -223,7 +223,8 @@ def _big_survey(folder: Path, made: Made) -> None:
 def _reconstruction(folder: Path, made: Made) -> None:
     _reef(folder, made)
     for side in ("left", "right"):
-        shutil.copy(made.reef / f"images/{side}/000005.png", folder / f"{side}.png")
+        (folder / side).mkdir()
+        shutil.copy(made.reef / f"images/{side}/000005.png", folder / side)
     shutil.copy(made.reef / "calibration/rig.json", folder)
 
 

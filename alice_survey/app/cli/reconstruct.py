@@ -34,7 +34,6 @@ reconstruct_app = typer.Typer(
         "reconstruct -w quay --plane level --plane 'wall=facing 180'",
         "reconstruct -w reef --export undistorted",
         "reconstruct -w reef --crs EPSG:32636",
-        "reconstruct pair left.png right.png --rig rig.json -o stingray",
     ),
 )
 
@@ -95,43 +94,17 @@ def reconstruct(
         print_result(text, values, as_json)
 
 
-@reconstruct_app.command(
-    epilog=examples(
-        "reconstruct pair left.png right.png --rig rig.json -o stingray",
-        "reconstruct pair left.png right.png --rig rig.json -o ray --near 0.8 --far 2.5",
+@reconstruct_app.command(hidden=True)
+def pair(pictures: Annotated[list[Path], typer.Argument()], rig: Path = Path("rig.json")) -> None:
+    """Say what to use instead."""
+    raise ConfigError(
+        "two pictures are a workspace now: run 'import-images --left FOLDER --right FOLDER "
+        f"--rig {rig} -w NAME', 'reconstruct -w NAME' and 'measure -w NAME'"
     )
-)
-def pair(
-    left: Annotated[Path, typer.Argument(help="Picture of the rig's first camera, as taken.")],
-    right: Annotated[
-        Path, typer.Argument(help="Picture of the second camera, of the same moment.")
-    ],
-    rig: Annotated[Path, typer.Option(help="The rig.json of these cameras.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write.")] = Path("pair"),
-    near: Annotated[float | None, typer.Option(min=0.01, help="Nearest distance, m.")] = None,
-    far: Annotated[float | None, typer.Option(min=0.01, help="Farthest distance, m.")] = None,
-    scale: Annotated[
-        float | None, typer.Option(min=0.05, max=1, help="Shrink pictures for matching.")
-    ] = None,
-    triangles: Annotated[int, typer.Option(min=100, help="Most that the mesh has.")] = 200_000,
-    as_json: AsJson = False,
-) -> None:
-    """Reconstruct one stereo pair.
-
-    Depth and its sigma, cloud and textured mesh of what both pictures show; 'alice-survey measure'
-    then gives lengths.
-    """
-    from reconstruct.station.pair import reconstruct_pair
-
-    result = reconstruct_pair(
-        left, right, rig, output, near_m=near, far_m=far, scale=scale, triangles=triangles
-    )
-    print_result(*result, as_json)
 
 
 @app.command(
     epilog=examples(
-        "measure stingray --points '1210,804 1893,850'",
         "measure reef --points 'left/000012.png:301,255 left/000012.png:640,270' --json",
         "measure reef --polygons colonies.gpkg --label species -o colonies.csv",
     )
@@ -140,8 +113,8 @@ def measure(
     points: Annotated[
         str | None,
         typer.Option(
-            help="Two or more: 'x,y' in the left picture of a pair, 'IMAGE:x,y' in a workspace, "
-            "or 'IMAGE:x,y=IMAGE:x,y' where two pictures show the spot."
+            help="Two or more pixels: 'IMAGE:x,y', or 'IMAGE:x,y=IMAGE:x,y' where two pictures "
+            "show the point."
         ),
     ] = None,
     polygons: Annotated[
@@ -164,9 +137,6 @@ def measure(
     pick_sigma: Annotated[
         float, typer.Option(min=0, help="Sigma of a picked pixel, or of a polygon's corner, px.")
     ] = 0.0,
-    n_water_sigma: Annotated[
-        float, typer.Option(min=0, help="Of the water's index, where the rig does not say.")
-    ] = 0.0,
     workspace: Workspace = WORK,
     as_json: AsJson = False,
 ) -> None:
@@ -184,11 +154,9 @@ def measure(
             workspace, polygons, label=label, pick_sigma_px=pick_sigma, output=output
         )
     else:
-        from reconstruct.station.measure import measure as measured
+        from reconstruct.picking.measure import measure as measured
 
-        result = measured(
-            workspace, points or "", pick_sigma_px=pick_sigma, n_water_sigma=n_water_sigma
-        )
+        result = measured(workspace, points or "", pick_sigma_px=pick_sigma)
     print_result(*result, as_json)
 
 
