@@ -1,8 +1,9 @@
 """A pick found again in all other pictures, with sigmas that their agreement confirms.
 
 What one patch shows of its own precision is too little: grain that is finer than the pixels and a
-surface that is not a plane leave errors that its residuals do not show. The matches of one pick must
-meet in one point; how far they are off, over what they state, is the factor by which all are worse.
+surface that is not a plane leave errors that its residuals do not show. The matches of one pick
+must meet in one point; how far they are off, over what they state, is the factor by which all are
+worse.
 """
 
 from collections.abc import Callable, Mapping, Sequence
