@@ -6,7 +6,7 @@ WORKSPACE ?= demo
 WORKERS ?= 2
 WORK ?= build/benchmarks
 
-.PHONY: help setup demo test test-slow test-all bench docs lint types imports structure check lock clean
+.PHONY: help setup demo test test-slow test-all bench docs lint types imports structure lint-js check lock clean
 
 help:
 	@echo "make demo    plan, fly, image, reconstruct and score a small survey into $(WORKSPACE)/"
@@ -14,7 +14,7 @@ help:
 	@echo "make test-all  run these and the slow ones: the loop, kills, docs, browser, fuzzing, Monte Carlo"
 	@echo "make bench   run all benchmarks, for hours; table, logs and workspaces go into $(WORK)/"
 	@echo "make docs    build the site of docs/ into build/site/"
-	@echo "make check   lint, types, import rules, and the bounds of make structure"
+	@echo "make check   lint (Python and JavaScript), types, import rules, and the bounds of make structure"
 	@echo "make lock    renew requirements.lock from pyproject.toml"
 
 setup: $(READY)
@@ -59,7 +59,13 @@ imports: $(READY)
 structure: $(READY)
 	$(BIN)/python -m tests.structure
 
-check: lint types imports structure
+node_modules/.package-lock.json: package-lock.json
+	npm ci --silent
+
+lint-js: node_modules/.package-lock.json
+	npm run --silent lint
+
+check: lint types imports lint-js structure
 
 lock: $(READY)
 	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --extra dev --extra docs --extra bench \

@@ -28,8 +28,8 @@ from rasterio.windows import Window
 
 from alice_survey.app.pipeline import template_text
 from alice_survey.app.report.colours import encoded
+from alice_survey.app.studio.files import Workspace
 from alice_survey.app.studio.layers import Layers
-from alice_survey.app.studio.paths import Workspace
 from alice_survey.core.config import SurveyConfig
 from alice_survey.core.errors import collected_by
 from alice_survey.core.executor import SERIAL

@@ -1,9 +1,10 @@
-/* The map of pages and of the studio, part 2 of 2: what lies over the pictures, and the controls. */
+/* The map of pages and of the studio, part 2 of 2: what lies over the pictures, and the
+   controls. */
 
 const RIMMED = 20;
 
-/* Metres east and north stand where Leaflet has longitude and latitude. `data.room()`, if there is one,
-   returns what Leaflet is to leave free where all is shown. Returns Leaflet's map and
+/* Metres east and north stand where Leaflet has longitude and latitude. `data.room()`, if there
+   is one, returns what Leaflet is to leave free where all is shown. Returns Leaflet's map and
    what changes it: `put` and `remove` a layer that is described as in `data.layers`, `show` one,
    `fit` all, `moreAt` a place in the line below the map, `take` clicks for a tool and `release`. */
 function startMap(data, root) {
@@ -29,7 +30,8 @@ function startMap(data, root) {
   function extend([west, south, east, north]) {
     whole = leaflet.latLngBounds([south, west], [north, east]);
     const span = Math.max(east - west, north - south) || 1;
-    const pixels = [...layers.values()].filter((layer) => layer.about).map((layer) => layer.about.pixel);
+    const pixels = [...layers.values()].filter((layer) => layer.about)
+      .map((layer) => layer.about.pixel);
     map.setMaxZoom(Math.log2(16 / Math.min(span / 500, ...pixels)));
     map.setMinZoom(Math.log2(60 / span));
   }
@@ -56,7 +58,8 @@ function startMap(data, root) {
     const group = leaflet.featureGroup();
     const dashes = about.dashed ? {dashArray: "7 5"} : {};
     /* A light rim keeps a shape readable on dark ground; many outlines would drown in it. */
-    const rimmed = about.kind === "line" || (about.kind === "polygon" && about.shapes.length <= RIMMED);
+    const rimmed = about.kind === "line" || (about.kind === "polygon"
+      && about.shapes.length <= RIMMED);
     about.shapes.forEach((shape, index) => {
       const many = about.kind === "polygon" ? leaflet.polygon : leaflet.polyline;
       if (rimmed) {
@@ -88,12 +91,14 @@ function startMap(data, root) {
     const text = document.createElement("p");
     text.textContent = shape.survey.text;
     content.append(title, text);
-    leaflet.popup({minWidth: 110, maxWidth: 260, className: "described"}).setLatLng(at).setContent(content).openOn(map);
+    leaflet.popup({minWidth: 110, maxWidth: 260, className: "described"}).setLatLng(at)
+      .setContent(content).openOn(map);
   }
 
   /* What a pointer would choose, for those who have none: the shape nearest to the middle. */
   function describeMiddle() {
     const middle = map.containerPointToLayerPoint(map.getSize().divideBy(2));
+    /** @type {any[]} */
     let best = null;
     let least = 60;
     layers.forEach((group) => {
@@ -163,7 +168,8 @@ function startMap(data, root) {
   const decimals = () => Math.min(4, Math.max(0, Math.ceil(Math.log10(2 ** map.getZoom()))));
   function read(word, place) {
     const [e, n] = [place.lng, place.lat].map((v) => v.toFixed(decimals()).replace("-", "−"));
-    let text = word + e + " " + data.unit + " " + data.axes[0] + ", " + n + " " + data.unit + " " + data.axes[1];
+    let text = word + e + " " + data.unit + " " + data.axes[0] + ", " + n + " " + data.unit + " "
+      + data.axes[1];
     if (data.geodetic) text += "; " + latLon(data.geodetic, place.lat, place.lng);
     if (tool && tool.text) text += tool.text(place);
     readout.textContent = text + more.map((add) => add(place)).join("");
@@ -174,7 +180,8 @@ function startMap(data, root) {
   function drawBar() {
     const longest = 130 / 2 ** map.getZoom();
     const power = 10 ** Math.floor(Math.log10(longest));
-    const length = [5, 2, 1].map((step) => step * power).find((step) => step <= longest * (1 + 1e-9));
+    const length = [5, 2, 1].map((step) => step * power)
+      .find((step) => step <= longest * (1 + 1e-9));
     bar.style.width = length * 2 ** map.getZoom() + "px";
     bar.firstChild.textContent = lengthText(length, data.unit);
   }
@@ -231,7 +238,8 @@ function startMap(data, root) {
   new ResizeObserver(() => map.invalidateSize({pan: false})).observe(box);
   root.dataset.ready = "";
   return {
-    leaflet: map, layers, put, remove, show, extend, fit: (animate = !still) => fit(animate), take, release,
+    leaflet: map, layers, put, remove, show, extend, fit: (animate = !still) => fit(animate), take,
+      release,
     data, moreAt: (add) => more.push(add), refresh: readCentre,
   };
 }
@@ -240,7 +248,8 @@ function startMap(data, root) {
 function latLon(geodetic, n, e) {
   const terms = [1, n, e, n * n, n * e, e * e];
   const [lat, lon] = geodetic.map((c) => terms.reduce((sum, term, i) => sum + c[i] * term, 0));
-  const degrees = (value, ahead, astern) => Math.abs(value).toFixed(7) + "° " + (value < 0 ? astern : ahead);
+  const degrees = (value, ahead, astern) => Math.abs(value).toFixed(7) + "° " + (
+    value < 0 ? astern : ahead);
   return degrees(lat, "N", "S") + " " + degrees((lon + 540) % 360 - 180, "E", "W");
 }
 
@@ -252,5 +261,6 @@ function lengthText(length, unit, digits = 2) {
 }
 
 if (document.getElementById("map-data")) {
-  startMap(JSON.parse(document.getElementById("map-data").textContent), document.getElementById("map"));
+  startMap(JSON.parse(document.getElementById("map-data").textContent),
+    document.getElementById("map"));
 }

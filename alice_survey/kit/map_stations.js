@@ -31,8 +31,10 @@ function stationAt(line, i) {
   return [line.n0 + t * (line.n1 - line.n0), line.e0 + t * (line.e1 - line.e0)];
 }
 
-/* Places ahead and to starboard of a station of a line, on the map. */
-function aroundStation(line, [n, e], offsets) {
+/** Places ahead and to starboard of a station of a line, on the map.
+ * @param {number[]} place */
+function aroundStation(line, place, offsets) {
+  const [n, e] = place;
   const [c, s] = [Math.cos(line.heading), Math.sin(line.heading)];
   return offsets.map(([ahead, right]) => [n + ahead * c - right * s, e + ahead * s + right * c]);
 }
@@ -53,7 +55,8 @@ function stationLine([n0, e0], [n1, e1], about) {
    its width, `spacing` that of the lines; `counts` a picture: red pictures, green lines, red 255
    outside of the area; `style` is added to what is drawn. Returns `textAt` a place, `refresh`, and
    `remove`. */
-function drawStations(map, {lines, groups, stations, footprints, outline, across, spacing, counts, style = {}}) {
+function drawStations(
+  map, {lines, groups, stations, footprints, outline, across, spacing, counts, style = {}}) {
   const metrePx = () => 2 ** map.getZoom();
   const arrows = leaflet.featureGroup().addTo(map);
   const hovered = leaflet.featureGroup().addTo(map);
@@ -61,9 +64,11 @@ function drawStations(map, {lines, groups, stations, footprints, outline, across
 
   function refresh() {
     const view = map.getBounds().pad(0.05);
-    const [south, west, north, east] = [view.getSouth(), view.getWest(), view.getNorth(), view.getEast()];
+    const [south, west, north, east] = [view.getSouth(), view.getWest(), view.getNorth(),
+      view.getEast()];
     const inView = lines().filter(({n0, e0, n1, e1}) => (
-      Math.max(n0, n1) >= south && Math.min(n0, n1) <= north && Math.max(e0, e1) >= west && Math.min(e0, e1) <= east
+      Math.max(n0, n1) >= south && Math.min(n0, n1) <= north && Math.max(e0, e1) >= west
+        && Math.min(e0, e1) <= east
     ));
     stations.clearLayers();
     footprints.clearLayers();
@@ -76,7 +81,8 @@ function drawStations(map, {lines, groups, stations, footprints, outline, across
     const apartPx = (line) => line.length / Math.max(1, line.stations - 1) * metrePx();
     const far = inView.filter((line) => line.stations === 1 || apartPx(line) >= 6);
     const checked = far.reduce((sum, line) => sum + line.stations, 0) <= MAX_CHECKED ? far : [];
-    const places = checked.flatMap((line) => Array.from({length: line.stations}, (_, i) => [line, stationAt(line, i)]))
+    const places = checked.flatMap((line) => Array.from(
+      {length: line.stations}, (_, i) => [line, stationAt(line, i)]))
       .filter(([, [n, e]]) => n >= south && n <= north && e >= west && e <= east);
     if (map.hasLayer(stations) && places.length <= MAX_SHOWN) {
       places.forEach(([line, place]) => stations.addLayer(leaflet.circleMarker(place, {
@@ -87,10 +93,13 @@ function drawStations(map, {lines, groups, stations, footprints, outline, across
     if (!map.hasLayer(footprints)) return;
     const drawn = {...fixed, color: FOOTPRINT, weight: 0.6, opacity: 0.5, fillOpacity: 0.05};
     if (places.length && places.length <= MAX_SHOWN && across * metrePx() > 6) {
-      places.forEach(([line, place]) => footprints.addLayer(leaflet.polygon(aroundStation(line, place, outline), drawn)));
+      places.forEach(([line, place]) =>
+        footprints.addLayer(leaflet.polygon(aroundStation(line, place, outline), drawn)));
     } else {  /* the bands that they make */
-      const band = {...fixed, color: FOOTPRINT, weight: across * metrePx(), opacity: 0.16, lineCap: "butt"};
-      inView.forEach(({n0, e0, n1, e1}) => footprints.addLayer(leaflet.polyline([[n0, e0], [n1, e1]], band)));
+      const band = {...fixed, color: FOOTPRINT, weight: across * metrePx(), opacity: 0.16,
+        lineCap: "butt"};
+      inView.forEach(({n0, e0, n1, e1}) =>
+        footprints.addLayer(leaflet.polyline([[n0, e0], [n1, e1]], band)));
     }
   }
 
@@ -107,16 +116,21 @@ function drawStations(map, {lines, groups, stations, footprints, outline, across
 
   function hover({latlng: {lat: n, lng: e}}) {
     hovered.clearLayers();
-    if (map.getContainer().dataset.tool !== undefined) return;  /* the pointer means something else */
+    if (map.getContainer()
+      .dataset.tool !== undefined) return;  /* the pointer means something else */
     const found = nearestStation(lines(), n, e, NEAR_PX / metrePx());
     if (!found) return;
     const {line, station} = found;
     const place = stationAt(line, station);
     const drawn = {...fixed, color: HOVER, weight: 1.2, fillColor: "#f1c40f"};
-    hovered.addLayer(leaflet.polyline([[line.n0, line.e0], [line.n1, line.e1]], {...fixed, color: "#f1c40f", weight: 4, opacity: 0.75}));
-    hovered.addLayer(leaflet.polygon(aroundStation(line, place, outline), {...drawn, fillOpacity: 0.18}));
+    hovered.addLayer(
+      leaflet.polyline([[line.n0, line.e0], [line.n1, line.e1]], {
+      ...fixed, color: "#f1c40f", weight: 4, opacity: 0.75}));
+    hovered.addLayer(
+      leaflet.polygon(aroundStation(line, place, outline), {...drawn, fillOpacity: 0.18}));
     const content = document.createElement("span");
-    Object.assign(content.style, {display: "block", whiteSpace: "pre-line", width: "max-content", maxWidth: "230px"});
+    Object.assign(content.style, {display: "block", whiteSpace: "pre-line", width: "max-content",
+      maxWidth: "230px"});
     content.textContent = [
       line.text,
       "Station " + (line.first + station) + ", " + (station + 1) + " of " + line.stations,

@@ -1,7 +1,8 @@
 /* The report's map, part 1 of 2: a picture with a pyramid of tiles. */
 
-/* Its tiles are the page's own, or a server's. Shows the level that fits the zoom. A tile is decoded when it comes into view; the tiles of the
-   level before stay until those of the next are there, so that the map never blinks. */
+/* Its tiles are the page's own, or a server's. Shows the level that fits the zoom. A tile is
+   decoded when it comes into view; the tiles of the level before stay until those of the next
+   are there, so that the map never blinks. */
 const Pyramid = leaflet.Layer.extend({
   initialize(about, pane) {
     this.about = about;
@@ -70,7 +71,8 @@ const Pyramid = leaflet.Layer.extend({
     const view = this._map.getBounds().pad(0.1);
     const [wide, high] = [about.tile * width, about.tile * height];
     const first = (at, side) => Math.max(0, Math.floor(at / side));
-    const last = (at, side, pixels) => Math.min(Math.ceil(pixels / about.tile) - 1, Math.floor(at / side));
+    const last = (at, side, pixels) => Math.min(Math.ceil(pixels / about.tile) - 1,
+      Math.floor(at / side));
     const [left, right] = [view.getWest() - about.west, view.getEast() - about.west];
     const [above, below] = [about.north - view.getNorth(), about.north - view.getSouth()];
     const found = new Map();

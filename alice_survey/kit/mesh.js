@@ -4,14 +4,15 @@ const TURN = Math.PI / 24;
 const NEARER = 1.2;
 const FILLED = 0.9;
 const MARK_PX = 6;
-const WINDS = ["north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west"];
+const WINDS = ["north", "north-east", "east", "south-east", "south", "south-west", "west",
+  "north-west"];
 
-/* A mesh that turns, of binary glTF: east is x, up is y, south is z. `told` gets words on where it is seen from, `lost` is called when the
-   browser takes its graphics memory back. Returns `pick`, which gives what is under a pixel of the
-   canvas, with its `point`, or null, `mark`, which shows some points and the
-   lines between, and `show`, which draws another model, in the same axes, that is brought up to date
-   before each frame, or the first one again; `dress` makes a model ready for it, `forget` gives its
-   memory back. */
+/* A mesh that turns, of binary glTF: east is x, up is y, south is z. `told` gets words on where
+   it is seen from, `lost` is called when the browser takes its graphics memory back. Returns
+   `pick`, which gives what is under a pixel of the canvas, with its `point`, or null, `mark`,
+   which shows some points and the lines between, and `show`, which draws another model, in the
+   same axes, that is brought up to date before each frame, or the first one again; `dress` makes
+   a model ready for it, `forget` gives its memory back. */
 async function startMesh(root, canvas, bytes, {told, lost}) {
   const view = canvas.parentElement;
   const renderer = new three.WebGLRenderer({canvas, antialias: true, preserveDrawingBuffer: true});
@@ -83,7 +84,8 @@ async function startMesh(root, canvas, bytes, {told, lost}) {
       current.update();
       const perPx = 2 * Math.tan(camera.fov * Math.PI / 360) / canvas.clientHeight;
       marks.forEach((one) => {
-        if (one.isMesh) one.scale.setScalar(MARK_PX * perPx * camera.position.distanceTo(one.position));
+        if (one.isMesh) one.scale.setScalar(MARK_PX * perPx * camera.position.distanceTo(
+          one.position));
       });
       renderer.render(scene, camera);
     });
@@ -98,14 +100,16 @@ async function startMesh(root, canvas, bytes, {told, lost}) {
     canvas.dataset.distance = from.radius.toPrecision(6);
     told(above > 88
       ? "Seen from above"
-      : "Seen from the " + WINDS[Math.round(compass / 45) % 8] + ", " + Math.round(above) + "° above the horizon");
+      : "Seen from the " + WINDS[Math.round(compass / 45) % 8] + ", " + Math.round(above)
+        + "° above the horizon");
   }
 
   function turn(around, over, farther = 1) {
     const from = new three.Spherical().setFromVector3(camera.position.clone().sub(controls.target));
     from.theta += around;
     from.phi = Math.min(Math.PI - 0.01, Math.max(0.01, from.phi + over));
-    from.radius = Math.min(controls.maxDistance, Math.max(controls.minDistance, from.radius * farther));
+    from.radius = Math.min(controls.maxDistance, Math.max(
+      controls.minDistance, from.radius * farther));
     camera.position.setFromSpherical(from).add(controls.target);
     controls.update();
     draw();
@@ -146,7 +150,8 @@ async function startMesh(root, canvas, bytes, {told, lost}) {
   function pick(x, y) {
     const {clientWidth: width, clientHeight: height} = canvas;
     caster.setFromCamera(new three.Vector2(2 * x / width - 1, 1 - 2 * y / height), camera);
-    const seen = current.group === model ? [model] : current.group.children.filter((part) => part.visible);
+    const seen = current.group === model ? [model] : current.group.children.filter((part) =>
+      part.visible);
     return caster.intersectObjects(seen, true)[0] || null;
   }
 
@@ -162,7 +167,8 @@ async function startMesh(root, canvas, bytes, {told, lost}) {
     });
     if (points.length > 1) {
       const line = new three.BufferGeometry().setFromPoints(points);
-      marks.push(new three.Line(line, new three.LineBasicMaterial({color: colour, depthTest: false})));
+      marks.push(new three.Line(line, new three.LineBasicMaterial(
+        {color: colour, depthTest: false})));
     }
     marks.forEach((one) => {
       one.renderOrder = 1;
@@ -248,7 +254,8 @@ function awaitMesh() {
   const root = document.getElementById("mesh");
   const canvas = document.getElementById("mesh-canvas");
   if (!hasWebgl()) {
-    showStill(root, "This browser has no WebGL, which turning the mesh needs: this is a still picture.");
+    showStill(root, "This browser has no WebGL, which turning the mesh needs: this is a still "
+      + "picture.");
     return;
   }
   root.hidden = false;
@@ -257,9 +264,12 @@ function awaitMesh() {
     if (!entries.some((entry) => entry.isIntersecting)) return;
     watch.disconnect();
     const told = (text) => { document.getElementById("mesh-readout").textContent = text; };
-    const lost = () => showStill(root, "The browser took its graphics memory back: this is a still picture.");
-    bytesOf("mesh-glb").then((bytes) => startMesh(root, canvas, bytes, {told, lost})).then(() => { root.dataset.ready = ""; }, (fault) => {
-      showStill(root, "The mesh cannot be shown here (" + fault.message + "): this is a still picture.");
+    const lost = () =>
+      showStill(root, "The browser took its graphics memory back: this is a still picture.");
+    bytesOf("mesh-glb").then((bytes) => startMesh(root, canvas, bytes, {told, lost}))
+      .then(() => { root.dataset.ready = ""; }, (fault) => {
+      showStill(root, "The mesh cannot be shown here (" + fault.message
+        + "): this is a still picture.");
       throw fault;
     });
   }, {rootMargin: "200px"});

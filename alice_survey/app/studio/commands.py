@@ -139,7 +139,6 @@ class ImportLogArguments(Arguments):
     output: Annotated[str, Field(pattern=r"^navigation[\w-]{0,40}\.csv$")] = "navigation.csv"
     declination: Number | None = None
     clock_offset: Number | None = None
-    time_zone: Annotated[str | None, Field(pattern=r"^[A-Za-z][\w/+-]{0,63}$")] = None
     dead_reckon: bool = False
 
     def words(self, workspace: Path) -> list[str]:

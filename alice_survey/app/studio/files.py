@@ -1,22 +1,42 @@
-"""Files of a workspace as answers: their types, their policies, and parts of them."""
+"""Files of a workspace, by the names that a request gives, and of the studio's page.
+
+Nothing else can be reached: paths that climb, hidden or unfinished files, and links are refused or
+not found.
+"""
 
 import os
 import re
-from collections.abc import Iterator
-from email.utils import formatdate
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path, PurePath
-from typing import BinaryIO
+from urllib.parse import quote
 
+from rasterio.errors import RasterioError
+from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers
-from starlette.requests import Request
-from starlette.responses import Response, StreamingResponse
+from starlette.exceptions import HTTPException
+from starlette.responses import FileResponse, RedirectResponse, Response
+from starlette.staticfiles import NotModifiedResponse, StaticFiles
+from starlette.types import Scope
 
-from alice_survey.app.studio.paths import token_of
+from alice_survey.core.artefacts import STAGE_FILE
+from alice_survey.core.edited_files import StaleError
+from alice_survey.core.errors import AliceError
+from alice_survey.core.stages import LOOSE_FOLDERS, STAGES
+from alice_survey.kit.document import Link, Report, Section
+from alice_survey.kit.page import page_policy, render_html
+from alice_survey.kit.words import count
 
+PRODUCTS = (*(stage.folder for stage in STAGES), *LOOSE_FOLDERS, "check", "revisit")
+"""Folders that are shown."""
+_LOOSE_FILES = ("survey.toml",)
+_MAX_NAME = 255
+_MAX_LISTED = 20_000
+_UNFINISHED = (".partial", ".replaced")
 POLICY = "Content-Security-Policy"
 REVALIDATE = "no-cache"
-_RANGE = re.compile(r"bytes=(?:([0-9]{1,18})-([0-9]{0,18})|-([0-9]{1,18}))")
-_CHUNK = 1 << 20
 INERT = "default-src 'none'; sandbox"
 _CLOSED_PAGE = (
     "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; "
@@ -26,84 +46,255 @@ _CLOSED_PAGE = (
 _TEXT = "text/plain; charset=utf-8"
 PAGE = "text/html; charset=utf-8"
 _TYPES = {
-    ".bin": "application/octet-stream", ".csv": "text/csv; charset=utf-8",
-    ".geojson": "application/geo+json", ".glb": "model/gltf-binary",
-    ".gpkg": "application/geopackage+sqlite3", ".html": PAGE,
-    ".jpeg": "image/jpeg", ".jpg": "image/jpeg", ".js": "text/javascript; charset=utf-8",
-    ".css": "text/css; charset=utf-8", ".json": "application/json",
-    ".kml": "application/vnd.google-earth.kml+xml",
-    ".kmz": "application/vnd.google-earth.kmz", ".laz": "application/vnd.laszip",
-    ".md": _TEXT, ".mtl": "model/mtl", ".obj": "model/obj", ".pdf": "application/pdf",
-    ".png": "image/png", ".svg": "image/svg+xml", ".tif": "image/tiff", ".tiff": "image/tiff",
-    ".toml": _TEXT, ".tum": _TEXT, ".txt": _TEXT, ".webp": "image/webp", ".xml": "text/xml",
+    ".css": "text/css; charset=utf-8", ".csv": "text/csv; charset=utf-8",
+    ".geojson": "application/geo+json", ".glb": "model/gltf-binary", ".html": PAGE,
+    ".jpg": "image/jpeg", ".js": "text/javascript; charset=utf-8", ".json": "application/json",
+    ".md": _TEXT, ".pdf": "application/pdf", ".png": "image/png", ".svg": "image/svg+xml",
+    ".tif": "image/tiff", ".toml": _TEXT, ".tum": _TEXT, ".txt": _TEXT, ".webp": "image/webp",
+    ".xml": "text/xml",
 }  # fmt: skip
+"""What browsers show; all other files are bytes to save."""
+_SCRIPT = re.compile(r"[a-z_]+\.(js|css)")
 
 
-def content_type(name: str) -> str:
-    """Content type of a file, by the end of its name."""
-    return _TYPES.get(PurePath(name).suffix.lower(), "application/octet-stream")
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """One line of a listing."""
+
+    name: str
+    is_folder: bool
+    size: int
 
 
-def policy_of(name: str) -> str:
-    """Content security policy of a file in a browser."""
-    return _CLOSED_PAGE if content_type(name) == PAGE else INERT
+def stale_page() -> StaleError:
+    """The error of a page whose files are others by now."""
+    return StaleError("the survey was worked on meanwhile: load the page again")
 
 
-def requested_bytes(headers: Headers, size: int, tag: str) -> tuple[int, int, int]:
-    """Part of a file to send for a request (RFC 9110, sections 13 and 14).
+def token_of(status: os.stat_result) -> str:
+    """Token of a file's content: another file, or the same file changed, has another."""
+    return f"{status.st_ino:x}-{status.st_size:x}-{status.st_mtime_ns:x}"
 
-    Of several ranges at once, or one that is of another version, the whole file is the answer, as
-    the standard lets a server do.
 
-    Args:
-        headers: headers of the request.
-        size: size of the file, bytes.
-        tag: entity tag of its content.
+class Workspace:
+    """A folder, of which files are opened to read."""
 
-    Returns:
-        Status, first byte and number of bytes.
+    def __init__(self, folder: Path) -> None:
+        """Take a folder; it need not hold anything yet."""
+        self.folder = folder.resolve()
+
+    def file(self, names: Sequence[str]) -> Path:
+        """A file, by the names along its path.
+
+        Raises:
+            FileNotFoundError: there is no such file, or it is a link or below one.
+        """
+        path = self._unlinked(names)
+        if not path.is_file():
+            raise FileNotFoundError(path)
+        return path
+
+    def has(self, path: str) -> bool:
+        """Whether there is such a file; see `file`."""
+        try:
+            return bool(self.file(path.split("/")))
+        except FileNotFoundError:
+            return False
+
+    def token(self, path: str) -> str:
+        """Token of a file as it is now; see `file`."""
+        return token_of(self.file(path.split("/")).stat())
+
+    def is_folder(self, names: Sequence[str]) -> bool:
+        """Whether a folder, not a link to one, is there."""
+        try:
+            return self._unlinked(names).is_dir()
+        except FileNotFoundError:
+            return False
+
+    def entries(self, names: Sequence[str]) -> tuple[Sequence[Entry], int]:
+        """Visible contents of a folder, folders first, and the number of further entries.
+
+        Raises:
+            FileNotFoundError: there is no such folder.
+        """
+        if not self.is_folder(names):
+            raise FileNotFoundError
+        with os.scandir(self._unlinked(names)) as entries:
+            found = sorted(
+                (
+                    Entry(
+                        name=entry.name,
+                        is_folder=entry.is_dir(follow_symlinks=False),
+                        size=entry.stat(follow_symlinks=False).st_size,
+                    )
+                    for entry in entries
+                    if _is_shown(entry, top=not names)
+                ),
+                key=lambda entry: (not entry.is_folder, entry.name),
+            )
+        return found[:_MAX_LISTED], max(0, len(found) - _MAX_LISTED)
+
+    def state(self, paths: Sequence[str]) -> tuple[str, ...]:
+        """Tokens of all finished stages and of some files, empty where there is none."""
+        files = (*(f"{name}/{STAGE_FILE}" for name in PRODUCTS), *paths)
+        return tuple(self.token(path) if self.has(path) else "" for path in files)
+
+    @contextmanager
+    def unchanged(self, paths: Sequence[str] = ()) -> Iterator[tuple[str, ...]]:
+        """The state of finished stages and of some files, which are read within this block.
+
+        Raises:
+            StaleError: they are others by now; what reading them raised gives way to that.
+        """
+        before = self.state(paths)
+        try:
+            yield before
+        except (AliceError, OSError, RasterioError):
+            if self.state(paths) != before:
+                raise stale_page() from None
+            raise
+        if self.state(paths) != before:
+            raise stale_page()
+
+    def _unlinked(self, names: Sequence[str]) -> Path:
+        path = self.folder.joinpath(*names)
+        if path.resolve() != path:
+            raise FileNotFoundError(path)
+        return path
+
+
+def _is_shown(entry: os.DirEntry[str], *, top: bool) -> bool:
+    is_folder = entry.is_dir(follow_symlinks=False)
+    is_file = entry.is_file(follow_symlinks=False)
+    if top:
+        is_folder = is_folder and entry.name in PRODUCTS
+        is_file = is_file and entry.name in _LOOSE_FILES
+    return _may_be_named(entry.name) and (is_folder or is_file)
+
+
+def _may_be_named(name: str) -> bool:
+    return (
+        name.isprintable()  # neither NUL nor bytes that are not UTF-8
+        and "\\" not in name
+        and not name.startswith(".")
+        and not name.endswith(_UNFINISHED)
+        and 0 < len(name.encode()) <= _MAX_NAME
+    )
+
+
+class _Files(StaticFiles):
+    """Files in whole and in parts, with the policies of the studio."""
+
+    def file_response(
+        self,
+        full_path: str | os.PathLike[str],
+        stat_result: os.stat_result,
+        scope: Scope,
+        status_code: int = 200,
+    ) -> Response:
+        """A file, or that the browser's copy is still good."""
+        kind = _TYPES.get(PurePath(full_path).suffix.lower(), "application/octet-stream")
+        policy = _CLOSED_PAGE if kind == PAGE else INERT
+        headers = {
+            "Cache-Control": REVALIDATE,
+            POLICY: policy,
+            "ETag": f'"{token_of(stat_result)}"',
+        }
+        response = FileResponse(
+            full_path, status_code, headers, media_type=kind, stat_result=stat_result
+        )
+        if self.is_not_modified(response.headers, Headers(scope=scope)):
+            return NotModifiedResponse(response.headers)
+        return response
+
+
+class ScriptFiles(_Files):
+    """Scripts and styles: the studio's own, and those of the kit that reports use too."""
+
+    def __init__(self) -> None:
+        """Take them from the package."""
+        super().__init__()
+        package = resources.files("alice_survey")
+        folders = ("app/studio/web", "kit", "kit/web")
+        self.all_directories = [str(package / folder) for folder in folders]
+
+    def lookup_path(self, path: str) -> tuple[str, os.stat_result | None]:
+        """A file by its name."""
+        return super().lookup_path(path) if _SCRIPT.fullmatch(path) else ("", None)
+
+
+class WorkspaceFiles(_Files):
+    """Files of a workspace's products; folders are listed."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        """Take a workspace."""
+        super().__init__()
+        self._workspace = workspace
+
+    def get_path(self, scope: Scope) -> str:
+        """The path as it was requested, below the folder of files."""
+        path: str = scope["path"]
+        return path.removeprefix(scope["root_path"]).removeprefix("/")
+
+    def lookup_path(self, path: str) -> tuple[str, os.stat_result | None]:
+        """A file, or a folder.
+
+        Raises:
+            ValueError: no product can have such a path.
+        """
+        names = _names_of(path)
+        try:
+            found = self._workspace.folder.joinpath(*names)
+            if not self._workspace.is_folder(names):
+                found = self._workspace.file(names)
+            return str(found), found.stat()
+        except OSError:
+            return "", None
+
+    async def get_response(self, path: str, scope: Scope) -> Response:
+        """A file, or the list of a folder's contents."""
+        try:
+            names = _names_of(path)
+        except ValueError:
+            raise HTTPException(404) from None
+        if scope["method"] not in ("GET", "HEAD") or not self._workspace.is_folder(names):
+            if path.endswith("/"):
+                raise HTTPException(404)
+            return await super().get_response(path, scope)
+        if path and not path.endswith("/"):
+            return RedirectResponse("/files/" + "/".join(map(quote, names)) + "/", 301)
+        content, policy = await run_in_threadpool(self._listing, names)
+        headers = {"Cache-Control": REVALIDATE, POLICY: policy}
+        return Response(content, headers=headers, media_type=PAGE)
+
+    def _listing(self, names: Sequence[str]) -> tuple[bytes, str]:
+        """A page that lists a folder, and its policy."""
+        entries, more = self._workspace.entries(names)
+        links = [Link(text="The studio", address="/")]
+        if names:
+            links.append(Link(text="..", address="../"))
+        for entry in entries:
+            mark = "/" if entry.is_folder else ""
+            size = "" if entry.is_folder else count(entry.size, "byte")
+            address = f"./{quote(entry.name)}{mark}"
+            links.append(Link(text=entry.name + mark, address=address, about=size))
+        text = [f"and {more:,} more"] if more else []
+        report = Report(
+            title="/".join(("files", *names)), subtitle="",
+            sections=[Section(title="Files", text=text, links=links)],
+        )  # fmt: skip
+        return render_html(report).encode(), page_policy(report)
+
+
+def _names_of(path: str) -> tuple[str, ...]:
+    """The names along a requested path.
+
+    Raises:
+        ValueError: it climbs, is absolute, or has a name that no product has.
     """
-    if tag in re.split(r"(?:\s*,\s*|^)(?:W/)?", headers.get("If-None-Match", "")):
-        return 304, 0, 0
-    found = _RANGE.fullmatch(headers.get("Range", ""))
-    if found is None or headers.get("If-Range", tag) != tag:
-        return 200, 0, size
-    first, last, suffix = found.groups()
-    if last and int(last) < int(first):
-        return 200, 0, size  # no range by the standard's grammar
-    start = int(first) if suffix is None else max(0, size - int(suffix))
-    end = min(int(last) + 1, size) if last else size
-    return (206, start, end - start) if start < end else (416, 0, 0)
-
-
-def opened(request: Request, path: Path) -> Response:
-    """A file, or a part of it; what replaces it meanwhile does not change the answer."""
-    file = path.open("rb")
-    status = os.fstat(file.fileno())
-    tag, size = f'"{token_of(status)}"', status.st_size
-    code, first, count = 200, 0, size
-    if request.method == "GET":  # ranges have no meaning for HEAD
-        code, first, count = requested_bytes(request.headers, size, tag)
-    headers = {
-        "Accept-Ranges": "bytes",
-        "Cache-Control": REVALIDATE,
-        "Content-Length": str(count),
-        "ETag": tag,
-        "Last-Modified": formatdate(int(status.st_mtime), usegmt=True),
-        POLICY: policy_of(path.name),
-    }
-    if code == 206:
-        headers["Content-Range"] = f"bytes {first}-{first + count - 1}/{size}"
-    elif code == 416:
-        headers["Content-Range"] = f"bytes */{size}"
-    elif code == 304:
-        del headers["Content-Length"]
-    return StreamingResponse(_chunks(file, first, count), code, headers, content_type(path.name))
-
-
-def _chunks(file: BinaryIO, first: int, count: int) -> Iterator[bytes]:
-    with file:
-        file.seek(first)
-        while count and (chunk := file.read(min(_CHUNK, count))):
-            yield chunk
-            count -= len(chunk)
+    names = tuple(path.removesuffix("/").split("/")) if path else ()
+    is_product = not names or names[0] in PRODUCTS or names == _LOOSE_FILES
+    if not is_product or not all(map(_may_be_named, names)):
+        raise ValueError("no product of a survey has this path")
+    return names

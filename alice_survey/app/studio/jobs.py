@@ -7,6 +7,7 @@ both as Ctrl-C ends a command: its stages resume where they were.
 """
 
 import contextlib
+import json
 import os
 import re
 import shlex
@@ -15,7 +16,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -26,11 +28,11 @@ from pydantic import Field
 
 from alice_survey.app.pipeline import is_locked
 from alice_survey.app.studio.commands import COMMANDS, words_of
-from alice_survey.app.studio.heard import EventsTail, Heard
 from alice_survey.core.artefacts import JsonRecord, refuse_links
 from alice_survey.core.errors import AliceError, WorkspaceError, why
+from alice_survey.core.run.events import Event, described
 from alice_survey.core.run.interrupts import for_other_programs
-from alice_survey.core.stages import spec
+from alice_survey.core.stages import STAGES
 
 RECORD, OUTPUT, ERRORS, EVENTS = "job.json", "output.txt", "errors.txt", "events.jsonl"
 """Files of a job."""
@@ -38,10 +40,10 @@ FOLDER = Path(".studio", "jobs")
 _NUMBER = re.compile("[0-9]{4,9}")
 """Names of jobs' folders."""
 _KEPT_JOBS = 20
-_LOOK_EVERY_S = 0.1
+_POLL_S = 0.1
 _PUBLISH_EVERY_S = 0.25
 _ALIVE_EVERY_S = 2.0
-"""Time after which a job that says nothing is published again."""
+"""Time after which a silent job is published again."""
 _HARDER_S = (8.0, 5.0)
 """Time to wait after Ctrl-C, then after SIGTERM, before the next harder way to end a job."""
 _ENDING_S = 3.0
@@ -55,7 +57,118 @@ _OUTPUT_TAIL = 8192
 _PROGRAM = (sys.executable, "-P", "-m", "alice_survey")
 """This program, without modules of the folder that it is started in."""
 
+KEPT_LINES = 2000
+_KEPT_WARNINGS = 100
+_LOGGED_EVERY_S = 30.0
+_MAX_LINE = 4000
+_CHUNK = 1 << 20
+
 Publish = Callable[[str, Any], None]
+
+
+class RunState:
+    """State of a run, from the events that it has reported."""
+
+    def __init__(self) -> None:
+        """Nothing is reported yet."""
+        self.stage, self.title = "", ""
+        self.finished: list[str] = []
+        """Stages that it has finished or found up to date."""
+        self.warnings: deque[str] = deque(maxlen=_KEPT_WARNINGS)
+        self.warned = 0
+        self.error, self.result = "", ""
+        self.exit_code: int | None = None
+        self.lines: deque[dict[str, str]] = deque(maxlen=KEPT_LINES)
+        self.lines_n = 0
+        """Lines of the log so far, also those that are no longer kept."""
+        self._steps: dict[int, Event] = {}
+        self._logged_s: dict[int, float] = {}
+
+    def update(self, events: Iterable[Event]) -> bool:
+        """Take more events, in their order; whether there were any."""
+        any_new = False
+        for event in events:
+            any_new = True
+            # An events file that was damaged, or written by another version, has other values.
+            with contextlib.suppress(TypeError, ValueError):
+                self._update(event)
+        return any_new
+
+    @property
+    def steps(self) -> list[dict[str, Any]]:
+        """The steps that run, outer ones first."""
+        kept = ("step", "done", "total", "elapsed_s", "remaining_s")
+        return [{key: step.get(key) for key in kept} for step in self._steps.values()]
+
+    def log(self, after: int = 0) -> list[dict[str, str]]:
+        """Lines of the log that are kept, after some number of them."""
+        dropped = self.lines_n - len(self.lines)
+        return list(self.lines)[max(0, after - dropped) :]
+
+    def _update(self, event: Event) -> None:
+        name, text = event.get("event"), str(event.get("message", ""))
+        number, elapsed_s = int(event.get("step_number", 0)), float(event.get("elapsed_s", 0.0))
+        match name:
+            case "stage_started":
+                self.stage, self.title = str(event.get("stage", "")), text
+            case "stage_finished" | "stage_skipped":
+                self.finished.append(str(event.get("stage", "")))
+            case "step_started" | "step_progress":
+                self._steps[number] = event
+            case "step_finished":
+                self._steps.pop(number, None)
+            case "warning":
+                self.warnings.append(text)
+                self.warned += 1
+            case "error":
+                self.error = text
+            case "result":
+                self.result = text
+            case "run_finished":
+                self._steps.clear()
+                self.exit_code = int(event["exit_code"])
+        if name == "step_progress":
+            if elapsed_s - self._logged_s.get(number, 0.0) < _LOGGED_EVERY_S:
+                return
+            self._logged_s[number] = elapsed_s
+        try:
+            text = described(event)
+        except (KeyError, TypeError, ValueError):  # of another version of the program
+            text = text or str(name)
+        kind = str(name) if name in ("warning", "error") else "note"
+        time_utc = str(event.get("time_utc", ""))
+        self.lines.append({"time_utc": time_utc, "kind": kind, "text": text[:_MAX_LINE]})
+        self.lines_n += 1
+
+
+class EventsTail:
+    """The whole lines that are added to an events file."""
+
+    def __init__(self, path: Path) -> None:
+        """Take a file that may not be there yet."""
+        self._path, self._at, self._rest = path, 0, b""
+
+    def read(self) -> list[Event]:
+        """Events since the last call; a damaged line is left out."""
+        events: list[Event] = []
+        try:
+            with self._path.open("rb") as file:
+                file.seek(self._at)
+                while chunk := file.read(_CHUNK):
+                    self._at += len(chunk)
+                    *lines, self._rest = (self._rest + chunk).split(b"\n")
+                    events += [event for line in lines if (event := _event_in(line))]
+        except FileNotFoundError:
+            return []
+        return events
+
+
+def _event_in(line: bytes) -> Event | None:
+    try:
+        event = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    return dict(event) if isinstance(event, Mapping) else None
 
 
 class BusyError(AliceError):
@@ -65,13 +178,13 @@ class BusyError(AliceError):
 class JobRecord(JsonRecord):
     """`job.json` of a job: a command that the studio has started."""
 
-    number: int
+    number: int = Field(ge=1)
     name: str
     title: str
     command: str
     """As a terminal takes it."""
     started_utc: str
-    process: int
+    process: int = Field(ge=1)
     created_s: float
     """When the process began, as the system counts: tells it from another of the same number."""
     ended_utc: str | None = None
@@ -102,7 +215,7 @@ class _Job:
         self, folder: Path, record: JobRecord, process: subprocess.Popen[bytes] | None
     ) -> None:
         self.folder, self.record = folder, record
-        self.heard, self.stopping = Heard(), False
+        self.run, self.stopping = RunState(), False
         self.ended = threading.Event()
         self._process, self._tail = process, EventsTail(folder / EVENTS)
 
@@ -115,33 +228,33 @@ class _Job:
         """Whether it runs; of one that this studio has started, what it leaves is taken away."""
         return self.record.is_alive() if self._process is None else self._process.poll() is None
 
-    def listen(self) -> bool:
-        return self.heard.take(self._tail.read())
+    def read_events(self) -> bool:
+        """Take what it has reported since; whether there was anything."""
+        return self.run.update(self._tail.read())
 
-    def finished(self) -> JobRecord:
+    def end_record(self) -> JobRecord:
         """The record of its end."""
-        heard = self.heard
-        heard.end()
-        code = heard.exit_code
+        run = self.run
+        code = run.exit_code
         if code is None and self._process is not None:
             code = self._process.returncode
         state = "killed" if code is None or code < 0 else "done" if code == 0 else "failed"
         if code in _CODES_OF_STOP or (self.stopping and state != "done"):
             state = "stopped"
-        line = heard.error or ("" if state == "done" else _last_line(self.folder / ERRORS))
+        line = run.error or ("" if state == "done" else _last_line(self.folder / ERRORS))
         if state == "done":
-            line = _main_line(heard.result or _output(self.folder / OUTPUT), heard.finished)
+            line = _main_line(run.result or _output(self.folder / OUTPUT), run.finished)
         elif state == "stopped":
             line = "stopped: the same command goes on from where it was"
-        elif state == "killed" and not heard.error:
+        elif state == "killed" and not run.error:
             line = (
                 "it ended without a word, as a program does that was killed or that the system "
                 "had no memory for: start it again, with fewer threads if that happens again"
             )
         return self.record.model_copy(
             update={
-                "state": state, "exit_code": code, "line": line, "stage": heard.stage,
-                "finished": tuple(heard.finished),
+                "state": state, "exit_code": code, "line": line, "stage": run.stage,
+                "finished": tuple(run.finished),
                 "ended_utc": _now(),
             }
         )  # fmt: skip
@@ -165,16 +278,16 @@ class _Job:
 
     def to_json(self) -> dict[str, Any]:
         """As a page takes it."""
-        record, heard = self.record, self.heard
+        record, run = self.record, self.run
         began = datetime.fromisoformat(record.started_utc)
         return {
             "number": record.number, "name": record.name, "title": record.title,
             "command": record.command, "state": "stopping" if self.stopping else record.state,
             "started_utc": record.started_utc,
             "elapsed_s": round((datetime.now(UTC) - began).total_seconds(), 1),
-            "stage": heard.stage, "stage_title": heard.title, "finished": list(heard.finished),
-            "steps": heard.steps, "warned": heard.warned, "warnings": list(heard.warnings)[-5:],
-            "lines": heard.lines_n,
+            "stage": run.stage, "stage_title": run.title, "finished": list(run.finished),
+            "steps": run.steps, "warned": run.warned, "warnings": list(run.warnings)[-5:],
+            "lines": run.lines_n,
         }  # fmt: skip
 
 
@@ -225,7 +338,7 @@ class Jobs:
                 with FileLock(self.folder / ".starting", timeout=_LOCK_S):
                     self._adopt()
                     self._check_free()
-                    self._job = job = self._started(name, arguments or {}, words)
+                    self._job = job = self._start(name, arguments or {}, words)
             except OSError as error:  # also of a lock that another studio holds too long
                 raise WorkspaceError(f"{self.folder}: no job can start: {why(error)}") from None
         self._follow(job)
@@ -265,7 +378,7 @@ class Jobs:
         return {
             "job": running,
             "last": None if last is None else last.to_json(),
-            "elsewhere": _elsewhere(self._workspace) if elsewhere else None,
+            "elsewhere": _other_command(self._workspace) if elsewhere else None,
         }
 
     def history(self) -> list[dict[str, Any]]:
@@ -284,15 +397,15 @@ class Jobs:
         """
         job = self._job
         if job is not None and job.record.number == number:
-            heard, output = job.heard, ""
+            run, output = job.run, ""
         else:
             folder = self.folder / f"{number:04d}"
             if not (folder / RECORD).is_file():
                 raise FileNotFoundError(folder)
-            heard, tail = Heard(), EventsTail(folder / EVENTS)
-            heard.take(tail.read())
-            output = "" if heard.lines_n else _output(folder / ERRORS)
-        return {"lines": heard.log(after), "total": heard.lines_n, "output": output}
+            run, tail = RunState(), EventsTail(folder / EVENTS)
+            run.update(tail.read())
+            output = "" if run.lines_n else _output(folder / ERRORS)
+        return {"lines": run.log(after), "total": run.lines_n, "output": output}
 
     def _check_free(self) -> None:
         if self._job is not None:
@@ -303,9 +416,9 @@ class Jobs:
         while is_locked(self._workspace):
             if time.monotonic() > until_s:
                 raise BusyError(f"another command is working in {self._workspace}: wait for it")
-            time.sleep(_LOOK_EVERY_S)
+            time.sleep(_POLL_S)
 
-    def _started(self, name: str, arguments: Mapping[str, Any], words: Sequence[str]) -> _Job:
+    def _start(self, name: str, arguments: Mapping[str, Any], words: Sequence[str]) -> _Job:
         folders = self._folders()
         number = int(folders[0].name) + 1 if folders else 1
         for old in self._records()[_KEPT_JOBS - 1 :]:
@@ -350,8 +463,8 @@ class Jobs:
                     self._job = job
                     self._follow(job)
                 elif not job.is_alive():
-                    job.listen()
-                    job.finished().write(job.folder / RECORD)
+                    job.read_events()
+                    job.end_record().write(job.folder / RECORD)
 
     def _records(self) -> list[JobRecord]:
         """Records of all jobs, the last one first."""
@@ -380,15 +493,15 @@ class Jobs:
         published_s, is_news = 0.0, True
         while True:
             is_alive = job.is_alive()  # before its last events are read
-            is_news |= job.listen()
+            is_news |= job.read_events()
             if not is_alive:
                 break
             since_s = time.monotonic() - published_s
             if (is_news and since_s >= _PUBLISH_EVERY_S) or since_s >= _ALIVE_EVERY_S:
                 self._publish("run", {"job": job.to_json(), "last": None, "elsewhere": None})
                 published_s, is_news = time.monotonic(), False
-            time.sleep(_LOOK_EVERY_S)
-        record = job.finished()
+            time.sleep(_POLL_S)
+        record = job.end_record()
         with contextlib.suppress(OSError, WorkspaceError):  # a full disk, a folder that was removed
             known = None if job.is_own else JobRecord.made(job.folder / RECORD)
             if known is not None and known.ended_utc is not None:
@@ -423,7 +536,7 @@ def _environment() -> dict[str, str]:
     return os.environ | {"PYTHONPATH": os.pathsep.join(places)}
 
 
-def _elsewhere(workspace: Path) -> dict[str, Any]:
+def _other_command(workspace: Path) -> dict[str, Any]:
     """What a command that another program has started seems to be doing."""
     partial = [path for path in workspace.glob("*.partial") if path.is_dir()]
     newest = max(partial, key=lambda path: path.stat().st_mtime, default=None)
@@ -441,9 +554,11 @@ def _output(path: Path) -> str:
 
 
 def _main_line(result: str, finished: Sequence[str]) -> str:
-    """The line of a result that tells most: that of the last stage, else the first."""
+    """The line of the last stage of a result, else the first line."""
     lines = result.splitlines() or [""]
-    name = spec(finished[-1]).name if finished else ""
+    name = next(
+        (one.name for one in STAGES if finished and finished[-1] in (one.name, one.folder)), ""
+    )
     return next((line for line in lines if line.startswith(f"{name}: ")), lines[0])
 
 

@@ -35,7 +35,7 @@ from alice_survey.app.report.colours import (
     scale_of,
 )
 from alice_survey.app.report.held import Held
-from alice_survey.app.studio.paths import Workspace, token_of, worked_on
+from alice_survey.app.studio.files import Workspace, stale_page, token_of
 from alice_survey.core.contents import one_line
 from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.frames import Array
@@ -247,18 +247,18 @@ class Layers:
         """The token of a layer's file, which is read within this block."""
         now = token_of(self._path(name).stat())
         if token not in (None, now):
-            raise worked_on()
+            raise stale_page()
         try:
             yield now
         except _DAMAGES as error:
             path = self._path(name)
             if token_of(path.stat()) != now:
-                raise worked_on() from None
+                raise stale_page() from None
             raise WorkspaceError(
                 f"{path}: is damaged ({one_line(error)}): delete it and run again"
             ) from error
         if token_of(self._path(name).stat()) != now:
-            raise worked_on()
+            raise stale_page()
 
     def _read_pyramid(self, name: str, token: str) -> Pyramid:
         unit = Held.of(self._workspace.folder).unit

@@ -10,8 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from alice_survey.app.studio.files import Workspace
 from alice_survey.app.studio.layers import Layers
-from alice_survey.app.studio.paths import Workspace
 from alice_survey.core.errors import WorkspaceError, why
 from alice_survey.core.run.interrupts import for_other_programs
 
@@ -106,11 +106,9 @@ class Server:
                 f"port {port} of {ADDRESS}: {why(error)}: give another --port, or none"
             ) from None
         self.port: int = self.socket.getsockname()[1]
-        names = (ADDRESS, "localhost")
-        hosts = {f"{name}:{self.port}" for name in names} | (set(names) if port == 80 else set())
         self._uvicorn = uvicorn.Server(
             uvicorn.Config(
-                application(self.studio, frozenset(hosts)),
+                application(self.studio, self.port),
                 http=_TimedConnection,
                 ws="none",
                 lifespan="off",

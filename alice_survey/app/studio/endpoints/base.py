@@ -16,10 +16,9 @@ from typing import Any, Generic, Literal, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
+from alice_survey.app.studio.files import Workspace
 from alice_survey.app.studio.jobs import Jobs
 from alice_survey.app.studio.layers import Layers
-from alice_survey.app.studio.paths import Workspace
-from alice_survey.app.studio.taken_pictures import TakenPictures
 from alice_survey.core.contents import first_fault
 from alice_survey.core.errors import AliceError
 from alice_survey.kit.document import PictureLayer
@@ -161,11 +160,6 @@ class Studio:
     def jobs(self) -> Jobs:
         """The commands that run in the workspace."""
         return Jobs(self.workspace.folder, self.publish)
-
-    @functools.cached_property
-    def taken(self) -> TakenPictures:
-        """The pictures of the workspace as taken."""
-        return TakenPictures(self.workspace)
 
     @contextlib.contextmanager
     def only_writer(self) -> Iterator[None]:

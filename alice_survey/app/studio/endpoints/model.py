@@ -1,16 +1,19 @@
 """What the tab of the model asks for: values at a place, profiles, measures, the mesh."""
 
+import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
 from alice_survey.app.report.colours import number_rasters
 from alice_survey.app.report.held import Held
-from alice_survey.app.report.mesh_copy import mesh_about
+from alice_survey.app.report.mesh_copy import mesh_about, mesh_copy
 from alice_survey.app.studio.endpoints.base import Call, Content, Endpoint, KeptValue, Studio
+from alice_survey.app.studio.files import stale_page
 from alice_survey.core.config import Config
 from alice_survey.core.errors import AliceError
 from alice_survey.core.records import MeshRecord
@@ -21,6 +24,7 @@ from reconstruct.measure.lines import measure_line, measure_points, profile
 from reconstruct.measure.polygons import measure_polygon, quadrats
 from reconstruct.measure.surface import MOSAIC, RASTERS, MeasuredSurface, values_at
 
+_MESH = "mesh/mesh.glb"
 _MAX_PLACES = 2000
 _MAX_MEASURES = 1000
 _READ = (*RASTERS, "mosaic/mosaic_source.tif", "sparse/frame.json", "sparse/covariance.npz",
@@ -35,7 +39,9 @@ _OTHERS = {"dense/count.tif": ("Views", ""), "dense/surfaces.tif": ("Surfaces", 
          MOSAIC: ("Colour", "red, green, blue")}  # fmt: skip
 """Titles and units of rasters that are no layers of numbers; None is the unit of lengths."""
 
-Place = tuple[float, float]
+Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
+"""Metres, or units of a model without scale."""
+Place = tuple[Coordinate, Coordinate]
 
 
 class AskedProfile(Config):
@@ -48,7 +54,7 @@ class AskedMeasure(Config):
     """A line, points in space, or a polygon."""
 
     kind: Literal["line", "points", "polygon"]
-    places: list[tuple[float, ...]] = Field(min_length=2, max_length=_MAX_PLACES)
+    places: list[tuple[Coordinate, ...]] = Field(min_length=2, max_length=_MAX_PLACES)
     base: float | Literal["rim"] | None = None
     """Plane of a polygon's volume."""
     quadrat: float | None = Field(None, gt=0)
@@ -96,6 +102,7 @@ def plane_json(held: Held) -> dict[str, Any] | None:
 class _ModelTab:
     def __init__(self, studio: Studio) -> None:
         self.studio = studio
+        self._light = KeptValue(self._make_light_mesh)
         self._kept = KeptValue(lambda: MeasuredSurface.of(studio.workspace.folder))
 
     @contextmanager
@@ -229,16 +236,30 @@ class _ModelTab:
             kind = "application/geo+json"
         return Content(data=text.encode(), kind=kind, name=f"measures.{asked.form}")
 
+    def light_mesh(self, call: Call) -> Content:
+        """The light copy of the mesh as binary glTF."""
+        token = self.studio.workspace.token(_MESH)
+        if call.query.get("v") not in (None, token):
+            raise stale_page()
+        return Content(data=self._light.of(token), kind="model/gltf-binary", tag=token)
+
+    def _make_light_mesh(self) -> bytes:
+        with tempfile.TemporaryDirectory(prefix="alice-survey-") as folder:
+            path = Path(folder) / "mesh.glb"
+            if mesh_copy(Held.of(self.studio.workspace.folder), path) is None:
+                raise FileNotFoundError(_MESH)
+            return path.read_bytes()
+
     def mesh(self, call: Call) -> dict[str, Any]:
         """Where the mesh is to be had, and how its points lie on the map."""
         workspace = self.studio.workspace
         held = Held.of(workspace.folder)
         record = held.read(MeshRecord)
-        if record is None or not workspace.has("mesh/mesh.glb"):
-            raise FileNotFoundError("mesh/mesh.glb")
+        if record is None or not workspace.has(_MESH):
+            raise FileNotFoundError(_MESH)
         tiles = "mesh/tiles/tileset.json"
         return {
-            "address": f"/mesh.glb?v={workspace.token('mesh/mesh.glb')}",
+            "address": f"/mesh.glb?v={workspace.token(_MESH)}",
             "about": mesh_about(record),
             "triangles": record.triangles,
             "still": "/files/mesh/mesh.png" if workspace.has("mesh/mesh.png") else None,
@@ -255,6 +276,7 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
         Endpoint(path="/api/model/about", answer=model.about),
         Endpoint(path="/api/model/value", answer=model.value),
         Endpoint(path="/api/model/mesh", answer=model.mesh),
+        Endpoint(path="/mesh.glb", answer=model.light_mesh),
         Endpoint(path="/api/model/profile", answer=model.profile, method="POST"),
         Endpoint(path="/api/model/measure", answer=model.measure, method="POST"),
         Endpoint(path="/api/model/export", answer=model.export, method="POST", max_bytes=16 << 20),

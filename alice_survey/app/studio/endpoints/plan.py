@@ -11,6 +11,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from pydantic import Field
 from pydantic_core import to_json
@@ -21,11 +22,8 @@ from alice_survey.app.studio.endpoints.base import (
     Content,
     Endpoint,
     Studio,
-    scale_json,
     zipped,
 )
-from alice_survey.app.studio.newest import Newest, SupersededError
-from alice_survey.app.studio.paths import RefusedError
 from alice_survey.app.studio.setting_limits import setting_limits
 from alice_survey.core.artefacts import json_values
 from alice_survey.core.config import AreaConfig, Config, SurveyConfig, parse_settings, settings_in
@@ -35,7 +33,7 @@ from alice_survey.core.executor import local_executor
 from alice_survey.core.frames import Array, Datum, attitude_from_rotation
 from alice_survey.core.stages import spec
 from alice_survey.core.trajectory import read_columns, read_track
-from alice_survey.kit.document import PictureLayer
+from alice_survey.kit.figure import palette_colours, palette_steps
 from alice_survey.sim.vehicle.files import known_vehicles
 from camera_calib.rig import design_rig
 from missions.areas.drawn import AreaDrawing, DrawnShapes, area_drawing, drawing_of_file
@@ -47,18 +45,54 @@ from missions.plan.playback import play
 from missions.plan.preview import preview, refusal_json
 from missions.values.plan_file import read_plan
 from reconstruct.precision.candidates import Candidate, worst_bend
-from reconstruct.precision.run import heights_layer, heights_raster, summary
+from reconstruct.precision.predict import Precision
+from reconstruct.precision.run import heights_raster, summary
 
 SETTINGS = "survey.toml"
 _MAX_REQUEST = 8 << 20
 _MAX_FILE = 32 << 20
 _MAX_PRECISION = 3000
 """Stations of which the precision is predicted while somebody waits."""
+_PALETTE, _COLOURS, _OPACITY = "viridis", 9, 215
 _MAX_MOMENTS = 4000
 """Moments of a playback."""
 _LENSES_MM = (12.5, 25.0)
 """Of the paper."""
 _JSON = "application/json"
+
+
+class SupersededError(AliceError):
+    """The same page has sent a newer request."""
+
+
+@dataclass(eq=False)
+class LatestRequests:
+    """Work of which only the newest of each page counts: older ones that wait are dropped."""
+
+    _condition: threading.Condition = field(default_factory=threading.Condition)
+    tickets: dict[str, int] = field(default_factory=dict)
+    """Requests of each page so far."""
+    _busy: bool = False
+
+    def run(self, page: str, work: Callable[[], Any]) -> Any:
+        """Do some work when no other is being done.
+
+        Raises:
+            SupersededError: newer work came from the same page while this waited.
+        """
+        with self._condition:
+            mine = self.tickets[page] = self.tickets.get(page, 0) + 1
+            self._condition.notify_all()
+            self._condition.wait_for(lambda: not self._busy or self.tickets[page] != mine)
+            if self.tickets[page] != mine:
+                raise SupersededError("a newer change is being planned")
+            self._busy = True
+        try:
+            return work()
+        finally:
+            with self._condition:
+                self._busy = False
+                self._condition.notify_all()
 
 
 def prepare_planning() -> None:
@@ -90,7 +124,7 @@ class _Settings:
 @dataclass(eq=False)
 class _PlanTab:
     studio: Studio
-    newest: Newest = field(default_factory=Newest)
+    latest: LatestRequests = field(default_factory=LatestRequests)
     saving: threading.Lock = field(default_factory=threading.Lock)
     kept: tuple[str, dict[str, Any]] | None = None
     """Preview of what is saved, with the token of its settings and their files."""
@@ -111,7 +145,7 @@ class _PlanTab:
         """
         try:
             data = self.studio.workspace.file([SETTINGS]).read_bytes()
-        except (FileNotFoundError, RefusedError):
+        except FileNotFoundError:
             return _Settings(template_text(), "")
         except OSError as error:
             raise ConfigError(f"{self.path}: cannot be read: {error.strerror}") from None
@@ -175,7 +209,7 @@ class _PlanTab:
         """Plan with a page's changes; nothing is written."""
         request = call.read(PlanRequest)
         try:
-            found = self.newest.run(request.page, lambda: self._preview(request))
+            found = self.latest.run(request.page, lambda: self._preview(request))
         except SupersededError as error:
             found = {**refusal_json(error), "superseded": True}
         return _json(found)
@@ -209,7 +243,7 @@ class _PlanTab:
             "scale_ppm": 1e6 * found.scale,
             "height_mm": 1e3 * found.heights_rms_m,
             "station_mm": 1e3 * float(np.sqrt((station_m**2).mean())),
-            "layer": _layer(heights_layer(*heights_raster(found))),
+            "layer": _heights_layer(found),
             "text": summary(found),
         }
 
@@ -363,17 +397,26 @@ def _datum(datum: Datum) -> dict[str, float]:
     return {"latitude_deg": datum.latitude_deg, "longitude_deg": datum.longitude_deg}
 
 
-def _layer(layer: PictureLayer) -> dict[str, Any]:
-    """A picture for the map, and what its colours mean."""
-    [png] = layer.tiles.values()
+def _heights_layer(found: Precision) -> dict[str, Any]:
+    """Expected sigmas of heights as a picture for the map, and what its colours mean."""
+    heights, grid = heights_raster(found)
+    heights_mm, known = 1e3 * heights, np.isfinite(heights)
+    low, high = float(np.nanmin(heights_mm)), float(np.nanmax(heights_mm))
+    shares = np.where(known, heights_mm - low, 0.0) / max(high - low, 1e-9)
+    rgba = palette_colours(_PALETTE, np.clip(shares, 0.0, 1.0))
+    rgba[..., 3] = np.where(known, _OPACITY, 0)
+    png = cv2.imencode(".png", cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA))[1].tobytes()
     return {
         "png": f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}",
-        "north": layer.north_m,
-        "west": layer.west_m,
-        "pixel": layer.pixel_m,
-        "title": layer.title,
-        "scale": scale_json(layer),
-    }
+        "north": grid.north,
+        "west": grid.west,
+        "pixel": grid.cell,
+        "title": "Expected sigma of heights",
+        "scale": {
+            "label": "expected sigma of heights, mm", "low": low, "high": high,
+            "colours": palette_steps(_PALETTE, _COLOURS),
+        },
+    }  # fmt: skip
 
 
 def _flown(folder: Path, config: SurveyConfig) -> dict[str, Any]:

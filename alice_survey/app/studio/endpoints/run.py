@@ -1,14 +1,167 @@
 """The Run tab: the stages, and the job that makes them."""
 
-from collections.abc import Sequence
+import re
+import shlex
+import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 from pydantic import Field
 
+from alice_survey.app.computing import (
+    StageCost,
+    SurveyCost,
+    correction,
+    slowness,
+    stage_costs,
+    workspace_size,
+)
+from alice_survey.app.pipeline import settings, stage_states
+from alice_survey.app.studio.commands import COMMANDS
 from alice_survey.app.studio.endpoints.base import Call, Endpoint, Studio
-from alice_survey.app.studio.survey_state import survey_state, ways_on
-from alice_survey.core.config import Config
+from alice_survey.core.artefacts import STAGE_FILE, StageRecord, read_stage
+from alice_survey.core.config import Config, SurveyConfig
+from alice_survey.core.errors import AliceError
+from alice_survey.core.executor import default_threads
+from alice_survey.core.run.resources import processor
+from alice_survey.core.stages import StageSpec, is_imported, spec
+
+UP_TO_DATE = "up to date"
+_STALE = re.compile(r"stale \((.*)\)", re.DOTALL)
+_COMMAND = re.compile(r"'alice-survey ([a-z][a-z -]*[a-z])( [^']*)?'")
+_NOT_THERE = ("missing", "interrupted")
+_SIMULATED = ("run", "plan", "fly", "image", "calibrate", "evaluate")
+"""Commands for simulated surveys."""
+
+
+def survey_state(workspace: Path) -> dict[str, Any]:
+    """State of every stage, commands that may be started, and what they would take.
+
+    Args:
+        workspace: folder of the survey; it need not exist.
+
+    Returns:
+        JSON values; `fault` is the line where settings or pictures cannot be read.
+    """
+    is_new = not any((workspace / name).exists() for name in ("survey.toml", "images", "plan"))
+    found: dict[str, Any] = {
+        "new": is_new, "fault": None, "stages": [], "commands": [], "disk": _disk(workspace),
+        "cores": default_threads(), "imported": False,
+    }  # fmt: skip
+    if is_new:
+        inside = workspace.iterdir() if workspace.is_dir() else ()
+        return found | {"others": sum(not path.name.startswith(".") for path in inside)}
+    try:
+        imported = found["imported"] = is_imported(workspace)
+        config = settings(workspace, None, needed=not imported)
+        states = stage_states(workspace, config)
+        costs = _costs(workspace, config, states)
+    except AliceError as error:
+        return found | {"fault": str(error), "ways": ways_on(str(error))}
+    found["stages"] = [
+        _stage(workspace, spec(name), state, costs.get(name)) for name, state in states.items()
+    ]
+    found["commands"] = _commands(workspace, states, costs, imported=imported)
+    return found
+
+
+def ways_on(line: str) -> list[dict[str, Any]]:
+    """Commands that a line of a fault names, and whether the studio starts them."""
+    found = {}
+    for match in _COMMAND.finditer(line):
+        words = match[1].split(" -")[0]
+        name = next((n for n in (words, words.split()[0]) if n in COMMANDS), None)
+        found[match[0]] = {
+            "command": match[0].strip("'"),
+            "name": None if name == "import-images" else name,
+            "title": "" if name is None else COMMANDS[name].title,
+        }
+    return list(found.values())
+
+
+def _stage(workspace: Path, stage: StageSpec, state: str, cost: StageCost | None) -> dict[str, Any]:
+    """One line of the list of stages."""
+    folder = workspace / stage.folder
+    record = read_stage(folder)
+    stale = _STALE.fullmatch(state)
+    made = None
+    if record is not None:
+        made_s = (folder / STAGE_FILE).stat().st_mtime
+        made = datetime.fromtimestamp(made_s, UTC).isoformat(timespec="seconds")
+    return {
+        "name": stage.name, "folder": stage.folder, "command": stage.command,
+        "about": stage.about.replace("`", ""),
+        "state": "stale" if stale else state, "why": stale[1] if stale else "",
+        "made_utc": made,
+        "took_s": None if record is None else record.took_s,
+        "peak_mib": None if record is None else record.peak_mib,
+        "cost": None if cost is None or state == UP_TO_DATE else _taken({stage.name: cost}),
+        "products": [
+            {"path": f"{stage.folder}/{path}", "about": what}
+            for path, what in stage.products.items()
+            if record is not None and (folder / path).exists()
+        ],
+    }  # fmt: skip
+
+
+def _costs(
+    workspace: Path, config: SurveyConfig, states: Mapping[str, str]
+) -> dict[str, StageCost]:
+    """What stages are predicted to take, as those that ran here correct it; empty where unknown."""
+    size = workspace_size(
+        workspace, config.camera, config.imaging, config.seafloor, config.reconstruct
+    )
+    if size is None or all(state == UP_TO_DATE for state in states.values()):
+        return {}
+    costs = stage_costs(size, slowness())
+    done: dict[str, StageRecord] = {}
+    for name, state in states.items():
+        record = read_stage(workspace / spec(name).folder)
+        if state == UP_TO_DATE and record is not None:
+            done[name] = record
+    _, factor, _ = correction(costs, done, processor(), default_threads())
+    return {name: cost.scaled(factor) for name, cost in costs.items()}
+
+
+def _taken(costs: Mapping[str, StageCost]) -> dict[str, float]:
+    cost = SurveyCost(stages=costs, workers=default_threads())
+    return {
+        "time_s": round(cost.time_s(cost.workers), 1),
+        "memory_mib": round(cost.memory_mib(cost.workers)),
+        "disk_mb": round(cost.disk_mb, 1),
+    }
+
+
+def _commands(
+    workspace: Path, states: Mapping[str, str], costs: Mapping[str, StageCost], *, imported: bool
+) -> list[dict[str, Any]]:
+    """Commands that make stages, in order, and what each has left to do."""
+    found = []
+    for name, command in COMMANDS.items():
+        if not command.stages or (imported and name in _SIMULATED):
+            continue
+        left = [s for s in command.stages if states.get(s, UP_TO_DATE) != UP_TO_DATE]
+        known = {stage: costs[stage] for stage in left if stage in costs}
+        needs = {n for s in left for n in spec(s).needs if n not in command.stages}
+        found.append(
+            {
+                "name": name, "title": command.title, "left": left,
+                "after": [n for n in states if n in needs and states[n] in _NOT_THERE],
+                "command": shlex.join(["alice-survey", name, "-w", str(workspace)]),
+                "cost": _taken(known) if known else None,
+            }
+        )  # fmt: skip
+    return found
+
+
+def _disk(workspace: Path) -> dict[str, float]:
+    """Room on the disk of a workspace, which need not exist yet."""
+    place = next(folder for folder in (workspace, *workspace.parents) if folder.exists())
+    usage = shutil.disk_usage(place)
+    return {"free_gb": usage.free / 1e9, "total_gb": usage.total / 1e9}
 
 
 class _AskedCommand(Config):

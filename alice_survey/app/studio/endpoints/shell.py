@@ -8,7 +8,7 @@ from typing import Any
 from alice_survey.app.report.held import Held
 from alice_survey.app.report.run import survey_map
 from alice_survey.app.report.shapes import shape_layers
-from alice_survey.app.studio.endpoints.base import Call, Endpoint, Studio, scale_json
+from alice_survey.app.studio.endpoints.base import Call, Content, Endpoint, Studio, scale_json
 from alice_survey.kit.document import EAST_NORTH, PictureLayer, ShapeLayer
 from alice_survey.kit.map import map_data, map_extent
 
@@ -53,6 +53,13 @@ class _Shell:
             "tabs": TABS,
         }
 
+    def tile(self, call: Call) -> Content:
+        """A tile of a raster; of the version that the page has, where it states one."""
+        name, token = call.path["name"], call.query.get("v")
+        level, x, y = (call.whole(part) for part in ("level", "x", "y"))
+        data, found = self.studio.layers.tile(name, level, x, y, token)
+        return Content(data=data, kind="image/webp", tag=f"{found}-{level}-{x}-{y}")
+
     def map(self, call: Call) -> dict[str, Any]:
         """The layers of what the workspace holds, as the map's script takes them."""
         with self.studio.workspace.unchanged():
@@ -92,6 +99,7 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
     return (
         Endpoint(path="/api/state", answer=shell.state),
         Endpoint(path="/api/map", answer=shell.map),
+        Endpoint(path="/tiles/{name}/{level}/{x}/{y}.webp", answer=shell.tile),
     )
 
 

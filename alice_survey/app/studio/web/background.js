@@ -12,14 +12,16 @@ const MAX_TILES = 120;
 function ecef(lat, lon) {
   const [s, c] = [Math.sin(lat * RAD), Math.cos(lat * RAD)];
   const radius = AXIS_M / Math.sqrt(1 - E2 * s * s);
-  return [radius * c * Math.cos(lon * RAD), radius * c * Math.sin(lon * RAD), radius * (1 - E2) * s];
+  return [radius * c * Math.cos(lon * RAD), radius * c * Math.sin(lon * RAD),
+    radius * (1 - E2) * s];
 }
 
 /* Metres north and east of a datum, in its horizontal plane. */
 export function northEast([lat0, lon0], lat, lon) {
   const [from, to] = [ecef(lat0, lon0), ecef(lat, lon)];
   const [dx, dy, dz] = to.map((value, i) => value - from[i]);
-  const [sp, cp, sl, cl] = [Math.sin(lat0 * RAD), Math.cos(lat0 * RAD), Math.sin(lon0 * RAD), Math.cos(lon0 * RAD)];
+  const [sp, cp, sl, cl] = [Math.sin(lat0 * RAD), Math.cos(lat0 * RAD), Math.sin(lon0 * RAD),
+    Math.cos(lon0 * RAD)];
   return [-sp * cl * dx - sp * sl * dy + cp * dz, -sl * dx + cl * dy];
 }
 
@@ -28,7 +30,8 @@ function latLonNear([lat0, lon0], north, east) {
   const s = Math.sin(lat0 * RAD);
   const root = Math.sqrt(1 - E2 * s * s);
   const meridian = AXIS_M * (1 - E2) / root ** 3;
-  return [lat0 + north / meridian / RAD, lon0 + east / (AXIS_M / root * Math.cos(lat0 * RAD)) / RAD];
+  return [lat0 + north / meridian / RAD,
+    lon0 + east / (AXIS_M / root * Math.cos(lat0 * RAD)) / RAD];
 }
 
 const columnOf = (lon, z) => (lon + 180) / 360 * 2 ** z;
@@ -63,13 +66,15 @@ export function background(datum, address) {
       let z = Math.max(0, Math.min(FINEST, Math.round(Math.log2(perTile * 2 ** map.getZoom()))));
       let range = null;
       do {
-        range = [columnOf(west, z), columnOf(east, z), rowOf(north, z), rowOf(south, z)].map(Math.floor);
+        range = [columnOf(west, z), columnOf(east, z), rowOf(north, z), rowOf(south, z)].map(
+          Math.floor);
         z -= 1;
       } while (z >= 0 && (range[1] - range[0] + 1) * (range[3] - range[2] + 1) > MAX_TILES);
       z += 1;
       const wanted = new Set();
       for (let x = range[0]; x <= range[1]; x += 1) {
-        for (let y = Math.max(0, range[2]); y <= Math.min(2 ** z - 1, range[3]); y += 1) wanted.add([z, x, y].join("/"));
+        for (let y = Math.max(0, range[2]); y <= Math.min(2 ** z - 1, range[3]); y += 1) wanted.add(
+          [z, x, y].join("/"));
       }
       this._tiles.forEach((tile, name) => {
         if (wanted.has(name)) return;
@@ -79,7 +84,8 @@ export function background(datum, address) {
       wanted.forEach((name) => {
         if (this._tiles.has(name)) return;
         const [tz, tx, ty] = name.split("/").map(Number);
-        const url = address.replace("{z}", tz).replace("{x}", (tx + 2 ** tz) % 2 ** tz).replace("{y}", ty);
+        const url = address.replace("{z}", tz).replace("{x}", (tx + 2 ** tz) % 2 ** tz)
+          .replace("{y}", ty);
         const tile = leaflet.imageOverlay(url, boundsOf(datum, tz, tx, ty), {pane: "under"});
         this._tiles.set(name, tile);
         tile.addTo(map);

@@ -21,7 +21,8 @@ async function asked(address, options) {
   if (response.ok) return response;
   const text = (await response.text()).trim();
   const line = text.startsWith("{") ? JSON.parse(text).error : text;
-  throw Object.assign(new Error(line || "the studio answered " + response.status), {status: response.status});
+  throw Object.assign(new Error(line || "the studio answered " + response.status), {
+    status: response.status});
 }
 
 const addressOf = (path, params) => {
@@ -49,15 +50,17 @@ function posted(body, signal) {
   };
 }
 
-export async function send(path, body = {}, {params, signal} = {}) {
-  return (await asked(addressOf(path, params), posted(body, signal))).json();
-}
+/** @typedef {{params?: any, signal?: AbortSignal}} Options
+ * @type {(path: string, body?: any, options?: Options) => Promise<any>} */
+export const send = async (path, body = {}, {params, signal} = {}) => (
+  await asked(addressOf(path, params), posted(body, signal))).json();
 
 /* Save a file that the server makes, under the name that it gives, else the given one. */
 export async function save(path, name, body = null) {
   const response = await asked(path, body ? posted(body) : {});
   const named = /filename\*=UTF-8''([^;]+)/.exec(response.headers.get("Content-Disposition") || "");
-  download(named ? decodeURIComponent(named[1]) : name, await response.blob(), response.headers.get("Content-Type"));
+  download(named ? decodeURIComponent(named[1]) : name, await response.blob(),
+    response.headers.get("Content-Type"));
 }
 
 /* Events of the server: `on("run", (data) => ...)`; returns a function that ends it. */
@@ -69,10 +72,11 @@ export function on(name, listener) {
   return () => source.removeEventListener(name, heard);
 }
 
-/* An element: el("button", {type: "button", class: "primary", onclick: fn, disabled: true}, "Save").
-   Children are elements, texts, or lists of them; null and false are left out. */
+/* An element: el("button", {type: "button", class: "primary", onclick: fn, disabled: true},
+   "Save"). Children are elements, texts, or lists of them; null and false are left out. */
 export function el(tag, attributes = {}, ...children) {
-  const svg = ["svg", "path", "line", "polyline", "polygon", "circle", "rect", "g", "text"].includes(tag);
+  const svg = ["svg", "path", "line", "polyline", "polygon", "circle", "rect", "g",
+    "text"].includes(tag);
   const made = svg
     ? document.createElementNS("http://www.w3.org/2000/svg", tag) : document.createElement(tag);
   Object.entries(attributes || {}).forEach(([name, value]) => {
@@ -82,11 +86,13 @@ export function el(tag, attributes = {}, ...children) {
     else if (name === "style") Object.assign(made.style, value);
     else made.setAttribute(name, value === true ? "" : value);
   });
-  made.append(...children.flat(Infinity).filter((child) => child !== null && child !== undefined && child !== false));
+  made.append(...children.flat(Infinity).filter((child) => child !== null && child !== undefined
+    && child !== false));
   return made;
 }
 
-export const button = (text, onclick, attributes = {}) => el("button", {type: "button", onclick, ...attributes}, text);
+export const button = (text, onclick, attributes = {}) =>
+  el("button", {type: "button", onclick, ...attributes}, text);
 
 /* A labelled control: field("Altitude", el("input", {type: "number"}), "m over the floor"). */
 let fields = 0;
@@ -98,13 +104,16 @@ export function field(label, control, hint) {
   return el("div", {class: "field"}, el("label", {for: control.id}, label), control, about);
 }
 
-/* A table of figures: rows of texts or elements, or {cells, attributes of the row}; the first cell of a
-   row heads it. */
+/* A table of figures: rows of texts or elements, or {cells, attributes of the row}; the first
+   cell of a row heads it. */
 export function table(caption, header, rows) {
-  const head = header.length ? el("thead", {}, el("tr", {}, header.map((text) => el("th", {scope: "col"}, text)))) : null;
-  return el("table", {class: "figures"}, el("caption", {}, caption), head, el("tbody", {}, rows.map((row) => {
+  const head = header.length
+    ? el("thead", {}, el("tr", {}, header.map((text) => el("th", {scope: "col"}, text)))) : null;
+  return el("table", {class: "figures"}, el("caption", {}, caption), head,
+    el("tbody", {}, rows.map((row) => {
     const {cells, ...attributes} = Array.isArray(row) ? {cells: row} : row;
-    return el("tr", attributes, cells.map((cell, i) => (i ? el("td", {}, cell) : el("th", {scope: "row"}, cell))));
+    return el("tr", attributes,
+      cells.map((cell, i) => (i ? el("td", {}, cell) : el("th", {scope: "row"}, cell))));
   })));
 }
 

@@ -31,13 +31,15 @@ export function drawingTool(studio, name) {
   const removing = button("Remove the last", () => removeLast(), {title: "Backspace"});
   const several = [finishing, removing];
   const element = el("div", {class: "drawing", hidden: true}, hint,
-    el("div", {class: "buttons"}, several, button("Cancel", () => studio.map.release(), {title: "Escape"})));
+    el("div", {class: "buttons"}, several, button("Cancel", () => studio.map.release(),
+      {title: "Escape"})));
   let session = null;
 
-  /* `done(points)` takes points [north, east]; `most` of them end it; with `again` the tool stays in
-     hand for the next one; `ended()` is called when it is
-     put down; while not `ready()` it cannot be finished. */
-  function begin({kind, colour, most = {point: 1, rectangle: 2}[kind] || Infinity, again = false, ready = () => true, done, ended = () => {}}) {
+  /* `done(points)` takes points [north, east]; `most` of them end it; with `again` the tool
+     stays in hand for the next one; `ended()` is called when it is put down; while not `ready()`
+     it cannot be finished. */
+  function begin({kind, colour, most = {point: 1, rectangle: 2}[kind] || Infinity, again = false,
+    ready = () => true, done, ended = () => {}}) {
     studio.map.release();
     session = {kind, colour, most, again, ready, done, points: []};
     const own = session;
@@ -47,7 +49,8 @@ export function drawingTool(studio, name) {
       name,
       click: ({lat, lng}) => add([lat, lng]),
       move: ({lat, lng}) => drawn([lat, lng]),
-      text: () => (session?.points.length ? "; " + session.points.length + " drawn" : "; Escape ends"),
+      text: () => (session?.points.length ? "; " + session.points.length
+        + " drawn" : "; Escape ends"),
       keys: {Backspace: () => removeLast(), f: () => finish()},
       end() {
         if (session === own) putDown();
@@ -91,7 +94,8 @@ export function drawingTool(studio, name) {
     const style = {renderer, pane: "drawing", interactive: false};
     sketch.clearLayers();
     sketch.addLayer(many(corners, {...style, color: WHITE, weight: 5, opacity: 0.75, fill: false}));
-    sketch.addLayer(many(corners, {...style, color: colour, weight: 2.6, dashArray: "6 4", fillOpacity: 0.08}));
+    sketch.addLayer(many(
+      corners, {...style, color: colour, weight: 2.6, dashArray: "6 4", fillOpacity: 0.08}));
     points.forEach((point) => sketch.addLayer(leaflet.circleMarker(point, {
       ...style, radius: 5, color: WHITE, weight: 1.5, fillColor: colour, fillOpacity: 1,
     })));
@@ -101,9 +105,11 @@ export function drawingTool(studio, name) {
   function describe() {
     const {kind, points} = session;
     const missing = LEAST[kind] - points.length;
-    const first = FIRST[kind] || "Click on the map, or press Enter to take its middle: " + missing + " more at least.";
+    const first = FIRST[kind] || "Click on the map, or press Enter to take its middle: " + missing
+      + " more at least.";
     hint.textContent = missing > 0 || FIRST[kind] ? first
-      : "Go on, or finish: click the " + (kind === "polygon" ? "first" : "last") + " place again, or press F.";
+      : "Go on, or finish: click the " + (kind === "polygon" ? "first" : "last")
+        + " place again, or press F.";
     finishing.disabled = missing > 0;
     removing.disabled = !points.length;
   }

@@ -1,4 +1,5 @@
-/* Follow a dive: figures to read on deck, the map of what is seen, holes, and a plan that flies them again. */
+/* Follow a dive: figures to read on deck, the map of what is seen, holes, and a plan that flies
+   them again. */
 
 import {attempt, button, el, field, get, on, say, send, table} from "./core.js";
 import {missing} from "./missing.js";
@@ -6,7 +7,8 @@ import {BLUE, GREEN, GREY, INK, ORANGE, PINK, RED, SKY, WHITE} from "./palette.j
 import {profileChart} from "./profile_chart.js";
 import {clock, counted, number, paceText, share} from "./words.js";
 
-const LEGEND = [[GREEN, "at the requested overlap"], [SKY, "in stereo"], [ORANGE, "in a picture"], ["#3c3c3c3c", "not yet"]];  /* as the coverage's own */
+const LEGEND = [[GREEN, "at the requested overlap"], [SKY, "in stereo"], [ORANGE, "in a picture"],
+  ["#3c3c3c3c", "not yet"]];  /* as the coverage's own */
 const PROFILE_S = 300;
 const KEPT = 6000;
 
@@ -53,7 +55,8 @@ export function tab(studio) {
   const more = el("div", {});
   const keep = el("input", {type: "checkbox", checked: true});
   const logs = el("select", {});
-  const pace = el("select", {}, [1, 2, 5, 10, 20, 50, 200].map((n) => el("option", {value: n}, paceText(n))));
+  const pace = el("select", {}, [1, 2, 5, 10, 20, 50, 200].map(
+    (n) => el("option", {value: n}, paceText(n))));
   const stop = button("Stop", () => change("/api/follow/end", {}), {hidden: true});
   const choose = el("details", {}, el("summary", {}, "Choose a log"),
     field("Navigation CSV of this workspace", logs),
@@ -72,7 +75,8 @@ export function tab(studio) {
   }
 
   const live = el("div", {hidden: true}, big,
-    el("ul", {class: "legend-row", "aria-label": "Colours of the coverage"}, LEGEND.map(([colour, text]) => el("li", {},
+    el("ul", {class: "legend-row", "aria-label": "Colours of the coverage"},
+      LEGEND.map(([colour, text]) => el("li", {},
       el("span", {class: "swatch", style: {background: colour}}), text))),
     el("div", {class: "field"}, el("label", {}, keep, " Keep the vehicle in view")),
     el("h3", {}, "Altitude against the plan"), profile.element,
@@ -83,7 +87,8 @@ export function tab(studio) {
     el("details", {}, el("summary", {}, "Time, energy, log"), more));
   const content = el("div", {}, el("h2", {}, "Follow a dive"), now, live, choose);
   const lack = missing(studio, content, () => (studio.state.has.plan || state?.following ? null
-    : ["A dive is followed along its plan, and there is none yet: draw it in Plan, and save it.", "plan", "Open Plan"]));
+    : ["A dive is followed along its plan, and there is none yet: draw it in Plan, and save it.",
+      "plan", "Open Plan"]));
   const panel = el("div", {}, lack.element, content);
 
   /* ---- What the server says ---- */
@@ -105,7 +110,8 @@ export function tab(studio) {
   }
 
   function download() {
-    el("a", {href: "/api/follow/export?" + new URLSearchParams(format.value ? {format: format.value} : {}), download: ""}).click();
+    el("a", {href: "/api/follow/export?" + new URLSearchParams(format.value
+      ? {format: format.value} : {}), download: ""}).click();
   }
 
   on("follow", (heard) => { if (isHere) attempt(() => take(heard)); });
@@ -137,7 +143,8 @@ export function tab(studio) {
       if (heard.logs.includes(chosen)) logs.value = chosen;
     }
     if (!format.children.length) {
-      format.append(el("option", {value: ""}, "all formats"), ...heard.formats.map((name) => el("option", {value: name}, name)));
+      format.append(el("option", {value: ""}, "all formats"),
+        ...heard.formats.map((name) => el("option", {value: name}, name)));
     }
   }
 
@@ -149,7 +156,8 @@ export function tab(studio) {
     overlay = null;
     arrow?.remove();
     arrow = null;
-    ["follow-left", "follow-done", "follow-track", "follow-holes", "follow-proposal"].forEach((name) => map.remove(name));
+    ["follow-left", "follow-done", "follow-track", "follow-holes", "follow-proposal"].forEach(
+      (name) => map.remove(name));
   }
 
   /* Fixes, lines and holes are asked for where the log was read again. */
@@ -188,13 +196,18 @@ export function tab(studio) {
     }
     const {finish, spare, coverage, holes, lines, pictures} = state;
     put("finish", clock(finish.time_s), number(finish.energy_wh, "Wh", 3));
-    const tight = (spare.time_s !== null && spare.time_s < 0) || (spare.energy_wh !== null && spare.energy_wh < 0);
+    const tight = (spare.time_s !== null && spare.time_s < 0)
+      || (spare.energy_wh !== null && spare.energy_wh < 0);
     put("spare", spare.time_s === null ? number(spare.energy_wh, "", 3) : clock(spare.time_s),
-      spare.time_s === null ? "Wh; no limit of time is set" : number(spare.energy_wh, "Wh", 3), tight);
-    put("overlap", share(coverage.at_overlap, 1), "then " + share(coverage.expected_at_overlap, 1) + "; seen " + share(coverage.seen, 1));
+      spare.time_s === null ? "Wh; no limit of time is set" : number(spare.energy_wh, "Wh", 3),
+        tight);
+    put("overlap", share(coverage.at_overlap, 1),
+      "then " + share(coverage.expected_at_overlap, 1) + "; seen " + share(coverage.seen, 1));
     put("holes", holes.count ? holes.area_m2.toFixed(holes.area_m2 < 99.5 ? 1 : 0) + " m²" : "none",
-      holes.count ? counted(holes.count, "hole") + ", unseen " + holes.unseen_m2.toFixed(1) + " m²" : "nothing is missed", holes.area_m2 >= 0.05);
-    put("lines", lines.left + " of " + (lines.left + lines.done), "dive " + state.dive.number + " of " + state.dive.of);
+      holes.count ? counted(holes.count, "hole") + ", unseen " + holes.unseen_m2.toFixed(1)
+        + " m²" : "nothing is missed", holes.area_m2 >= 0.05);
+    put("lines", lines.left + " of " + (lines.left + lines.done),
+      "dive " + state.dive.number + " of " + state.dive.of);
     const left = Object.entries(state.left_out).filter(([, count]) => count);
     more.replaceChildren(table("So far", [], [
       ["Under water", clock(state.elapsed_s)],
@@ -224,12 +237,15 @@ export function tab(studio) {
     const age = state.silent_s + (performance.now() - heardAt) / 1000;
     const silent = age > state.patience_s;
     now.className = silent ? "now bad" : state.proposal || state.holes.count ? "now" : "now good";
-    now.textContent = silent ? "No news for " + (age < 100 ? Math.round(age) + " s" : clock(age) + " min") + "; it was " + state.phase
+    now.textContent = silent ? "No news for " + (age < 100
+      ? Math.round(age) + " s" : clock(age) + " min") + "; it was " + state.phase
       : state.phase[0].toUpperCase() + state.phase.slice(1);
-    put("fix", silent ? Math.round(age) + " s ago" : "now", number(fix.depth_m, "m deep", 3) + ", " + number(fix.altitude_m, "m up", 3), silent);
+    put("fix", silent ? Math.round(age) + " s ago" : "now",
+      number(fix.depth_m, "m deep", 3) + ", " + number(fix.altitude_m, "m up", 3), silent);
     if (silent !== wasSilent) {
       wasSilent = silent;
-      say(silent ? "No news from the vehicle" : "News from the vehicle again", silent ? "warn" : "note");
+      say(silent ? "No news from the vehicle" : "News from the vehicle again",
+        silent ? "warn" : "note");
     }
   }
   setInterval(() => { if (isHere) tick(); }, 1000);
@@ -242,7 +258,8 @@ export function tab(studio) {
     if (overlay) {
       if (drawn.coverage !== address) overlay.setUrl(address);
     } else {
-      overlay = leaflet.imageOverlay(address, [[south, west], [north, east]], {pane: "over", className: "follow-coverage"});
+      overlay = leaflet.imageOverlay(address, [[south, west], [north, east]], {
+        pane: "over", className: "follow-coverage"});
       if (isHere) overlay.addTo(map.leaflet);
     }
     drawn.coverage = address;
@@ -254,17 +271,22 @@ export function tab(studio) {
       map.remove(name);
       return;
     }
-    map.put({kind, name, title, colour, shapes: list, texts: [], group: "Dive", shown: true, fill: 0.35, ...others});
+    map.put({kind, name, title, colour, shapes: list, texts: [], group: "Dive", shown: true,
+      fill: 0.35, ...others});
   }
 
   function showLines(lines) {
-    const ends = (wanted) => lines.filter(wanted).map((line) => [flat(line.start_ne), flat(line.end_ne)]);
-    shapes("follow-done", "line", "Lines done", GREY, ends((line) => line.state === "done"), {width: 1.5});
-    shapes("follow-left", "line", "Lines left", BLUE, ends((line) => line.state !== "done"), {dashed: true});
+    const ends = (wanted) => lines.filter(wanted).map((line) =>
+      [flat(line.start_ne), flat(line.end_ne)]);
+    shapes("follow-done", "line", "Lines done", GREY, ends((line) => line.state === "done"),
+      {width: 1.5});
+    shapes("follow-left", "line", "Lines left", BLUE, ends((line) => line.state !== "done"),
+      {dashed: true});
   }
 
   function showTrack() {
-    shapes("follow-track", "line", "Track", INK, [fixes.map((fix) => [fix[2], fix[1]])], {width: 1.6});
+    shapes("follow-track", "line", "Track", INK, [fixes.map((fix) => [fix[2], fix[1]])],
+      {width: 1.6});
     showProfile();
     const fix = fixes[fixes.length - 1];
     const place = leaflet.latLng(fix[1], fix[2]);
@@ -289,7 +311,9 @@ export function tab(studio) {
     if (arrow) {
       arrow.setLatLngs(corners);
     } else {
-      arrow = leaflet.polygon(corners, {color: WHITE, weight: 2, fillColor: BLUE, fillOpacity: 1, interactive: false}).addTo(map.leaflet);
+      arrow = leaflet.polygon(
+        corners, {color: WHITE, weight: 2, fillColor: BLUE, fillOpacity: 1, interactive: false})
+        .addTo(map.leaflet);
     }
     arrow.bringToFront();
   }
@@ -298,21 +322,28 @@ export function tab(studio) {
   function showHoles(holes) {
     const outlines = holes.flatMap((hole) => hole.rings_ne.map((ring) => ring.map(flat)));
     shapes("follow-holes", "polygon", "Holes", RED, outlines);
-    holeTable.replaceChildren(holes.length ? table("Holes, worst first", ["hole", "m²", "unseen m²", "north, east m"],
+    holeTable.replaceChildren(holes.length ? table(
+      "Holes, worst first", ["hole", "m²", "unseen m²", "north, east m"],
       holes.slice(0, 6).map((hole, i) => [
-        el("button", {type: "button", onclick: () => map.leaflet.panTo([hole.north_m, hole.east_m])}, "Hole " + (i + 1)),
-        hole.area_m2.toFixed(2), hole.unseen_m2.toFixed(2), hole.north_m.toFixed(1) + ", " + hole.east_m.toFixed(1)])) : "");
+        el("button", {type: "button", onclick: () => map.leaflet.panTo(
+          [hole.north_m, hole.east_m])}, "Hole " + (i + 1)),
+        hole.area_m2.toFixed(2), hole.unseen_m2.toFixed(2),
+          hole.north_m.toFixed(1) + ", " + hole.east_m.toFixed(1)])) : "");
   }
 
   function showProposal(proposal) {
     fetchIt.disabled = !proposal;
     shapes("follow-proposal", "line", "Lines over the holes", PINK,
-      proposal ? proposal.lines.map((line) => [flat(line.start_ne), flat(line.end_ne)]) : [], {width: 5});
+      proposal ? proposal.lines.map((line) => [flat(line.start_ne), flat(line.end_ne)]) : [],
+        {width: 5});
     if (proposal) {
-      proposalText.textContent = counted(proposal.lines.length, "line takes", "lines take") + " " + clock(proposal.time_s) + " min and " + number(proposal.energy_wh, "Wh", 2)
-        + " from home to home: then " + share(proposal.holes_share, 1) + " of the holes is at the overlap. It is a plan of its own, to fly after this dive.";
+      proposalText.textContent = counted(proposal.lines.length, "line takes", "lines take") + " "
+        + clock(proposal.time_s) + " min and " + number(proposal.energy_wh, "Wh", 2)
+        + " from home to home: then " + share(proposal.holes_share, 1)
+          + " of the holes is at the overlap. It is a plan of its own, to fly after this dive.";
     } else {
-      proposalText.textContent = state.holes.count ? "No lines can reach the holes." : "No holes so far: nothing to close.";
+      proposalText.textContent = state.holes.count
+        ? "No lines can reach the holes." : "No holes so far: nothing to close.";
     }
   }
 
@@ -325,10 +356,14 @@ export function tab(studio) {
     const minutes = (fix) => (fix[0] - last) / 60;
     const latest = shown.length ? shown[shown.length - 1][3] : null;
     profile.show({
-      lines: [{kind: "planned", xs: [-PROFILE_S / 60, 0], ys: [plan, plan]}, {kind: "flown", xs: shown.map(minutes), ys: shown.map((fix) => Math.min(fix[3], 2 * plan))}],
+      lines: [{kind: "planned", xs: [-PROFILE_S / 60, 0], ys: [plan, plan]},
+        {kind: "flown", xs: shown.map(minutes),
+        ys: shown.map((fix) => Math.min(fix[3], 2 * plan))}],
       range: [0, 2 * plan], caption: "minutes from now; altitude, m",
     });
-    profile.element.firstChild.setAttribute("aria-label", "Altitude over the last five minutes: now " + number(latest, "m") + ", planned " + number(plan, "m"));
+    profile.element.firstChild.setAttribute(
+      "aria-label", "Altitude over the last five minutes: now " + number(latest, "m") + ", planned "
+      + number(plan, "m"));
   }
 
   return {

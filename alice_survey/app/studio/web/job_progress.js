@@ -10,11 +10,14 @@ export function showSteps(place, job) {
     let bar = place.children[i];
     if (!bar) {
       made += 1;
-      bar = el("div", {class: "step"}, el("span", {id: "step-" + made}), el("progress", {"aria-labelledby": "step-" + made}));
+      bar = el("div", {class: "step"}, el("span", {id: "step-" + made}),
+        el("progress", {"aria-labelledby": "step-" + made}));
       place.append(bar);
     }
-    const count = step.done === null ? "" : step.total ? ` ${step.done} of ${step.total}` : ` ${step.done}`;
-    const left = step.remaining_s === null ? `, for ${duration(step.elapsed_s)}` : `, about ${duration(step.remaining_s)} left`;
+    const count = step.done === null ? "" : step.total
+      ? ` ${step.done} of ${step.total}` : ` ${step.done}`;
+    const left = step.remaining_s === null
+      ? `, for ${duration(step.elapsed_s)}` : `, about ${duration(step.remaining_s)} left`;
     bar.firstChild.textContent = step.step + count + left;
     const meter = bar.lastChild;
     if (step.total) {

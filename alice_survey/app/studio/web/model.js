@@ -19,7 +19,8 @@ const TOOLS = {
 };
 const LAYERS = ["measured-line", "measured-polygon", "quadrats"];
 const FILES = [
-  ["report/report.html", "The report"], ["mosaic/mosaic.tif", "The mosaic, cloud-optimised GeoTIFF"],
+  ["report/report.html", "The report"], ["mosaic/mosaic.tif",
+    "The mosaic, cloud-optimised GeoTIFF"],
   ["dense/dem.tif", "The elevation model, GeoTIFF"], ["dense/sigma.tif", "Its sigma, GeoTIFF"],
   ["dense/cloud.copc.laz", "The point cloud, COPC"], ["mesh/mesh.glb", "The mesh, glTF"],
   ["sparse/track.csv", "The cameras' track, CSV"],
@@ -48,26 +49,35 @@ export function tab(studio) {
   let wanted = null;
 
   function heightText(found) {
-    return found.height === null ? "; no height here" : "; height " + withSigma(found.height, found.sigma, found.unit);
+    return found.height === null ? "; no height here" : "; height " + withSigma(found.height,
+      found.sigma, found.unit);
   }
 
   function valueOf({value, unit}) {
-    if (!Array.isArray(value)) return Number.isInteger(value) ? value + " " + unit : number(value, unit, unit === state.unit ? 5 : 3);
-    return el("span", {title: value.join(", ")}, el("span", {class: "swatch", style: {background: "rgb(" + value.join(",") + ")"}}), " ", value.join(" "));
+    if (!Array.isArray(value)) return Number.isInteger(value)
+      ? value + " " + unit : number(value, unit, unit === state.unit ? 5 : 3);
+    return el("span", {title: value.join(", ")},
+      el("span", {class: "swatch", style: {background: "rgb(" + value.join(",") + ")"}}), " ",
+      value.join(" "));
   }
 
   async function ask() {
     const place = wanted;
-    const found = await get("/api/model/value", {east: place.lng, north: place.lat}).catch((fault) => ({fault}));
+    const found = await get("/api/model/value", {east: place.lng, north: place.lat})
+      .catch((fault) => ({fault}));
     asking = null;
     if (!active) return;
     if (found.fault) {
       under.replaceChildren(el("p", {class: "error"}, found.fault.message));
       return;
     }
-    const at = map.data.axes.map((axis, i) => number([place.lng, place.lat][i], state.unit, 6) + " " + axis).join(", ");
-    under.replaceChildren(el("p", {}, found.values.length ? "At " + at : "No raster knows anything at " + at + "."),
-      el("dl", {}, found.values.map((row) => el("div", {}, el("dt", {}, row.title.replace(" of height", "")), el("dd", {}, valueOf(row))))));
+    const at = map.data.axes.map((axis, i) => number([place.lng, place.lat][i], state.unit, 6) + " "
+      + axis).join(", ");
+    under.replaceChildren(
+      el("p", {}, found.values.length ? "At " + at : "No raster knows anything at " + at + "."),
+      el("dl", {}, found.values.map(
+        (row) => el("div", {}, el("dt", {}, row.title.replace(" of height", "")),
+        el("dd", {}, valueOf(row))))));
     if (wanted === place) readout.textContent += heightText(found);
     else later();
   }
@@ -87,8 +97,10 @@ export function tab(studio) {
   /* ---- Drawing ---- */
 
   const drawing = drawingTool(studio, "model");
-  const toolButtons = Object.entries(TOOLS).map(([name, tool]) => button(tool.title, () => begin(name), {
-    "aria-pressed": "false", "data-tool": name, title: tool.title + " (" + tool.key.toUpperCase() + ")",
+  const toolButtons = Object.entries(TOOLS).map(([name, tool]) =>
+    button(tool.title, () => begin(name), {
+    "aria-pressed": "false", "data-tool": name,
+      title: tool.title + " (" + tool.key.toUpperCase() + ")",
   }));
 
   const base = el("select", {}, el("option", {value: "rim"}, "fitted to the polygon's rim"),
@@ -97,7 +109,8 @@ export function tab(studio) {
   const levelField = field("Height of the plane, " + state.unit, level);
   const quadrat = el("input", {type: "number", step: "any", min: "0"});
   const forVolume = el("div", {hidden: true}, field("Plane of the volume", base), levelField);
-  const forRugosity = el("div", {hidden: true}, field("Side of quadrats, " + state.unit, quadrat, "Empty: the polygon as a whole."));
+  const forRugosity = el("div", {hidden: true},
+    field("Side of quadrats, " + state.unit, quadrat, "Empty: the polygon as a whole."));
   base.addEventListener("change", () => { levelField.hidden = base.value !== "level"; });
   levelField.hidden = true;
 
@@ -118,7 +131,8 @@ export function tab(studio) {
 
   function held(name) {
     inHand = name;
-    toolButtons.forEach((one) => one.setAttribute("aria-pressed", String(one.dataset.tool === name)));
+    toolButtons.forEach((one) => one.setAttribute(
+      "aria-pressed", String(one.dataset.tool === name)));
     if (!name) return;
     forVolume.hidden = name !== "volume";
     forRugosity.hidden = name !== "rugosity";
@@ -145,7 +159,8 @@ export function tab(studio) {
     const tool = TOOLS[name];
     const same = measures.filter((one) => one.tool === name).length + 1;
     const made = {
-      id: Math.max(0, ...measures.map((one) => one.id)) + 1, name: tool.title + " " + same, tool: name,
+      id: Math.max(0, ...measures.map((one) => one.id)) + 1, name: tool.title + " " + same,
+        tool: name,
       kind: asked.kind, places: asked.places, ...found,
     };
     measures.push(made);
@@ -175,10 +190,12 @@ export function tab(studio) {
     const described = (kind) => {
       const some = measures.filter((one) => (one.kind === "polygon") === (kind === "polygon"));
       return {
-        kind, name: "measured-" + kind, title: kind === "polygon" ? "Measured areas" : "Measured lines", colour: RED,
+        kind, name: "measured-" + kind, title: kind === "polygon"
+          ? "Measured areas" : "Measured lines", colour: RED,
         dashed: false, fill: 0.12, width: 3, group: "Measures",
         shapes: some.map((one) => one.places.map(([east, north]) => [east, north])),
-        texts: some.map((one) => one.name + ": " + withSigma(mainOf(one).value, mainOf(one).sigma, mainOf(one).unit)),
+        texts: some.map((one) => one.name + ": " + withSigma(mainOf(one).value, mainOf(one).sigma,
+          mainOf(one).unit)),
       };
     };
     ["line", "polygon"].forEach((kind) => {
@@ -190,14 +207,17 @@ export function tab(studio) {
     map.remove("quadrats");
     if (squares.length) {
       map.put({
-        kind: "polygon", name: "quadrats", title: "Quadrats", colour: PINK, dashed: false, fill: 0.1, width: 1.5, group: "Measures",
+        kind: "polygon", name: "quadrats", title: "Quadrats", colour: PINK, dashed: false,
+          fill: 0.1, width: 1.5, group: "Measures",
         shapes: squares.map((one) => one.places),
-        texts: squares.map((one) => figureText(one.figures.find((figure) => figure.name === "rugosity"))),
+        texts: squares.map(
+          (one) => figureText(one.figures.find((figure) => figure.name === "rugosity"))),
       });
     }
   }
 
-  const figureText = (figure) => figure.title + " " + withSigma(figure.value, figure.sigma, figure.unit);
+  const figureText = (figure) => figure.title + " " + withSigma(figure.value, figure.sigma,
+    figure.unit);
 
   function showResults() {
     if (!measures.length) {
@@ -205,14 +225,16 @@ export function tab(studio) {
       return;
     }
     const rows = measures.map((one) => {
-      const name = el("input", {value: one.name, maxlength: 200, "aria-label": "Name of " + one.name});
+      const name = el("input", {value: one.name, maxlength: 200,
+        "aria-label": "Name of " + one.name});
       name.addEventListener("change", () => {
         one.name = name.value.trim() || one.name;
         changed();
       });
       const main = mainOf(one);
       const cells = [name, withSigma(main.value, main.sigma, main.unit),
-        [button("Show", () => { chosen = one.id; changed(); lookAt(one); }, {"aria-label": "Show " + one.name}), " ",
+        [button("Show", () => { chosen = one.id; changed(); lookAt(one); },
+          {"aria-label": "Show " + one.name}), " ",
           button("×", () => drop(one), {"aria-label": "Delete " + one.name})]];
       return {cells, "data-measure": one.id, "aria-current": one.id === chosen ? "true" : null};
     });
@@ -244,7 +266,8 @@ export function tab(studio) {
       details.replaceChildren();
       return;
     }
-    const rows = one.figures.map((figure) => [figure.title, withSigma(figure.value, figure.sigma, figure.unit)]);
+    const rows = one.figures.map(
+      (figure) => [figure.title, withSigma(figure.value, figure.sigma, figure.unit)]);
     details.replaceChildren(
       table(one.name, ["Figure", "Value ± sigma"], rows),
       ...one.notes.map((note) => el("p", {class: "note"}, note)),
@@ -258,17 +281,24 @@ export function tab(studio) {
   }
 
   function squaresTable(one) {
-    const rough = one.quadrats.map((square) => square.figures.find((figure) => figure.name === "rugosity"));
+    const rough = one.quadrats.map((square) => square.figures.find(
+      (figure) => figure.name === "rugosity"));
     const mean = rough.reduce((sum, figure) => sum + figure.value, 0) / rough.length;
-    const spread = Math.sqrt(rough.reduce((sum, figure) => sum + (figure.value - mean) ** 2, 0) / Math.max(1, rough.length - 1));
-    return el("details", {}, el("summary", {}, rough.length + " quadrats: rugosity " + number(mean, "", 4) + ", scatter " + number(spread, "", 2)),
-      table("Quadrats, from south-west", ["Quadrat", "Rugosity"], rough.map((figure, i) => [String(i + 1), withSigma(figure.value, figure.sigma)])));
+    const spread = Math.sqrt(
+      rough.reduce((sum, figure) => sum + (figure.value - mean) ** 2, 0) / Math.max(
+      1, rough.length - 1));
+    return el("details", {},
+      el("summary", {}, rough.length + " quadrats: rugosity " + number(mean, "", 4) + ", scatter "
+      + number(spread, "", 2)),
+      table("Quadrats, from south-west", ["Quadrat", "Rugosity"],
+        rough.map((figure, i) => [String(i + 1), withSigma(figure.value, figure.sigma)])));
   }
 
   async function exported(form) {
     await save("/api/model/export", "measures." + form, {
       form,
-      measures: measures.map(({name, kind, places, figures, notes}) => ({name, kind, places, figures, notes})),
+      measures: measures.map(({name, kind, places, figures, notes}) => (
+        {name, kind, places, figures, notes})),
     });
     say(counted(measures.length, "measure") + " written to measures." + form);
   }
@@ -288,25 +318,32 @@ export function tab(studio) {
   const links = el("ul", {});
   function fillFiles() {
     const has = {
-      "report/report.html": state.has.report, "mosaic/mosaic.tif": state.has.mosaic, "dense/dem.tif": state.has.dem,
-      "dense/sigma.tif": state.has.dem, "dense/cloud.copc.laz": state.has.cloud, "mesh/mesh.glb": state.has.mesh,
+      "report/report.html": state.has.report, "mosaic/mosaic.tif": state.has.mosaic,
+        "dense/dem.tif": state.has.dem,
+      "dense/sigma.tif": state.has.dem, "dense/cloud.copc.laz": state.has.cloud,
+        "mesh/mesh.glb": state.has.mesh,
       "sparse/track.csv": state.has.sparse,
     };
-    links.replaceChildren(...FILES.filter(([path]) => has[path]).map(([path, text]) => el("li", {}, el("a", {href: "/files/" + path}, text))),
+    links.replaceChildren(...FILES.filter(([path]) => has[path]).map(
+      ([path, text]) => el("li", {}, el("a", {href: "/files/" + path}, text))),
       el("li", {}, el("a", {href: "/files/"}, "All files of this workspace")));
   }
   const files = el("details", {}, el("summary", {}, "Files"), links, el("p", {class: "note"},
-    "A GIS reads rasters from here part by part, without a copy: in QGIS add a raster layer with the protocol HTTP(S) and the address "
+    "A GIS reads rasters from here part by part, without a copy: in QGIS add a raster layer with "
+      + "the protocol HTTP(S) and the address "
     + window.location.origin + "/files/mosaic/mosaic.tif"));
 
-  const mesh = meshPart(studio, {colour: RED, measured: (points) => measure("length", {kind: "points", places: points})});
+  const mesh = meshPart(
+    studio, {colour: RED, measured: (points) => measure("length",
+    {kind: "points", places: points})});
 
   const content = el("div", {},
     el("h2", {}, "Look and measure"),
     el("div", {class: "buttons", role: "group", "aria-label": "Measure on the map"}, toolButtons),
     drawing.element, forVolume, forRugosity, under, results, details, mesh.element, about);
   const lack = missing(studio, content, () => (state.has.dem ? null
-    : ["There is no model of the sea floor to look at yet: make it in Run, from a simulated dive or from pictures.", "run", "Open Run"]));
+    : ["There is no model of the sea floor to look at yet: make it in Run, from a simulated dive "
+      + "or from pictures.", "run", "Open Run"]));
   const panel = el("div", {class: "model"}, lack.element, content, files);
 
   return {
@@ -326,6 +363,7 @@ export function tab(studio) {
       profile.clear();
       mesh.leave();
     },
-    keys: Object.fromEntries(Object.entries(TOOLS).map(([name, tool]) => [tool.key, () => state.has.dem && begin(name)])),
+    keys: Object.fromEntries(Object.entries(TOOLS).map(
+      ([name, tool]) => [tool.key, () => state.has.dem && begin(name)])),
   };
 }

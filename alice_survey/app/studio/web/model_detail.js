@@ -12,9 +12,9 @@ export function boxAbout([e, n, u], [de, dn, du]) {
   return new three.Box3(centre.clone().sub(half), centre.clone().add(half));
 }
 
-/* A tile as its tree describes it: its `error` is how far what it shows is from the truth, `isEmpty`
-   says that it has nothing to draw, `isLink` that it stands for a tree that has yet to come, `bytes`
-   what it takes, where that is known. */
+/* A tile as its tree describes it: its `error` is how far what it shows is from the truth,
+   `isEmpty` says that it has nothing to draw, `isLink` that it stands for a tree that has yet to
+   come, `bytes` what it takes, where that is known. */
 export const tileOf = (about) => ({
   depth: 0, children: [], isEmpty: false, isLink: false, bytes: 0, model: null, isBusy: false,
   isBad: false, ...about,
@@ -36,12 +36,13 @@ function isInView(box, clip) {
   return outside.every((count) => count < 8);
 }
 
-/* Draws the tiles below `root` whose error is at most `errorPx` on the screen, children in place of
-   their parent. `load` gives the model and the bytes of a tile, or what a link stands for; `drop`
-   gives the memory of a model back. `progress` gets the tiles drawn, the number of those on the way
-   and the bytes held; `failed` the fault of one that did not come, which is not requested again: its
-   parent stands for it. Above MAX_MIB, or the canvas' attribute data-max-mib, tiles out of view go,
-   longest unseen first, and what remains is drawn coarser until it fits. */
+/* Draws the tiles below `root` whose error is at most `errorPx` on the screen, children in place
+   of their parent. `load` gives the model and the bytes of a tile, or what a link stands for;
+   `drop` gives the memory of a model back. `progress` gets the tiles drawn, the number of those
+   on the way and the bytes held; `failed` the fault of one that did not come, which is not
+   requested again: its parent stands for it. Above MAX_MIB, or the canvas' attribute
+   data-max-mib, tiles out of view go, longest unseen first, and what remains is drawn coarser
+   until it fits. */
 export function startDetail(scene, root, {errorPx, load, drop, progress, failed}) {
   const {camera, canvas, draw} = scene;
   const group = new three.Scene();

@@ -1,4 +1,5 @@
-/* The mesh in 3D in the tab Model: it turns, a click picks a place on it, two picks give a length. */
+/* The mesh in 3D in the tab Model: it turns, a click picks a place on it, two picks give a
+   length. */
 
 import {attempt, button, bytes, el, field, get, say} from "./core.js";
 import {startTiles} from "./model_tiles.js";
@@ -6,7 +7,8 @@ import {WHITE} from "./palette.js";
 import {counted, number} from "./words.js";
 
 const STILL_PX = 4;
-const ACTS = [["left", "Turn left", "←"], ["right", "Turn right", "→"], ["up", "Look from higher", "↑"], ["down", "Look from lower", "↓"],
+const ACTS = [["left", "Turn left", "←"], ["right", "Turn right", "→"],
+  ["up", "Look from higher", "↑"], ["down", "Look from lower", "↓"],
   ["nearer", "Nearer", "+"], ["farther", "Farther", "−"], ["reset", "Reset the view", "⟲"]];
 
 function loaded(address) {
@@ -15,7 +17,9 @@ function loaded(address) {
       resolve();
       return;
     }
-    const script = el("script", {src: address, onload: resolve, onerror: () => reject(new Error(address + " did not come: load the page again"))});
+    const script = el(
+      "script", {src: address, onload: resolve,
+      onerror: () => reject(new Error(address + " did not come: load the page again"))});
     document.head.append(script);
   });
 }
@@ -25,30 +29,39 @@ export function onMap(point, {offset, plane}) {
   const enu = [point.x + offset[0], offset[1] - point.z, point.y + offset[2]];
   if (!plane) return enu;
   const arm = enu.map((value, i) => value - plane.origin[i]);
-  return [plane.right, plane.up, plane.out].map((axis) => axis.reduce((sum, part, i) => sum + part * arm[i], 0));
+  return [plane.right, plane.up, plane.out].map(
+    (axis) => axis.reduce((sum, part, i) => sum + part * arm[i], 0));
 }
 
 export function meshPart(studio, {colour, measured}) {
   const {map, state} = studio;
   const canvas = el("canvas", {
     id: "mesh-canvas", tabindex: "0", role: "application",
-    "aria-label": "The sea floor in 3D: arrow keys turn it, + and - move nearer and farther, 0 resets the view, Enter picks what is in the middle, Escape drops the picks",
+    "aria-label": "The sea floor in 3D: arrow keys turn it, + and - move nearer and farther, 0 "
+      + "resets the view, Enter picks what is in the middle, Escape drops the picks",
   });
   const told = el("p", {class: "readout"});
-  const relief = el("button", {type: "button", class: "word", "data-act": "relief", "aria-pressed": "false", title: "Grey under a lamp from the side: shape without colours"}, "Relief");
+  const relief = el(
+    "button", {type: "button", class: "word", "data-act": "relief", "aria-pressed": "false",
+    title: "Grey under a lamp from the side: shape without colours"}, "Relief");
   const tools = el("div", {class: "tools", role: "group", "aria-label": "Turn the model"},
-    ACTS.map(([act, label, sign]) => el("button", {type: "button", "data-act": act, title: label, "aria-label": label}, sign)), relief);
+    ACTS.map(([act, label, sign]) =>
+      el("button", {type: "button", "data-act": act, title: label, "aria-label": label}, sign)),
+      relief);
   const view = el("div", {class: "view"}, canvas, tools, told);
   const root = el("div", {class: "mesh live", hidden: true}, view);
   const home = el("div", {});
-  const picked = el("p", {class: "note", role: "status"}, "Click a place on the model, then another: their distance is measured.");
-  const large = button("Larger, over the map", () => enlarge(large.getAttribute("aria-pressed") !== "true"), {"aria-pressed": "false"});
+  const picked = el("p", {class: "note", role: "status"},
+    "Click a place on the model, then another: their distance is measured.");
+  const large = button("Larger, over the map", () => enlarge(
+    large.getAttribute("aria-pressed") !== "true"), {"aria-pressed": "false"});
   const about = el("p", {class: "note"});
   const kinds = el("select");
   const choice = field("Drawn as", kinds);
   choice.hidden = true;
   const streamed = el("p", {class: "note"});
-  const body = el("div", {}, choice, el("div", {class: "buttons"}, large), home, streamed, picked, about);
+  const body = el("div", {}, choice, el("div", {class: "buttons"}, large), home, streamed, picked,
+    about);
   home.append(root);
   const element = el("details", {hidden: true}, el("summary", {}, "In 3D"), body);
   const spots = leaflet.featureGroup();
@@ -61,8 +74,10 @@ export function meshPart(studio, {colour, measured}) {
 
   const heard = (words) => ({
     progress({parts, coming, bytes: held}) {
-      Object.assign(canvas.dataset, {parts: parts.length, coming, mib: (held / 2 ** 20).toFixed(3)});
-      streamed.textContent = words(parts) + " drawn, " + coming + " on the way, " + number(held / 2 ** 20, "MB", 2) + " held";
+      Object.assign(canvas.dataset, {parts: parts.length, coming,
+        mib: (held / 2 ** 20).toFixed(3)});
+      streamed.textContent = words(parts) + " drawn, " + coming + " on the way, " + number(
+        held / 2 ** 20, "MB", 2) + " held";
     },
     failed: (fault) => say("A part is not drawn: " + fault.message, "error"),
   });
@@ -120,7 +135,8 @@ export function meshPart(studio, {colour, measured}) {
     picks = picks.length === 2 ? [hit] : [...picks, hit];
     const places = shown();
     const last = places[places.length - 1].map((value) => number(value, "", 6)).join(", ");
-    picked.textContent = "Picked " + last + " " + state.unit + (picks.length === 1 ? ": click another place." : "");
+    picked.textContent = "Picked " + last + " " + state.unit + (picks.length === 1
+      ? ": click another place." : "");
     if (picks.length === 2) measured(places);
   }
 
@@ -146,7 +162,8 @@ export function meshPart(studio, {colour, measured}) {
       lost: () => still("The browser took its graphics memory back"),
     });
     const choices = [["light", "Mesh, light copy"], ["tiles", "Mesh, full detail (3D Tiles)"]];
-    choices.slice(0, lies.tiles ? 2 : 1).forEach(([value, text]) => kinds.append(el("option", {value}, text)));
+    choices.slice(0, lies.tiles ? 2 : 1).forEach(([value, text]) =>
+      kinds.append(el("option", {value}, text)));
     choice.hidden = kinds.length < 2;
     root.dataset.ready = "";
     await draw();
@@ -157,7 +174,8 @@ export function meshPart(studio, {colour, measured}) {
     large.hidden = true;
     choice.hidden = true;
     picked.textContent = why + (lies.still ? ": this is a still picture." : ".");
-    if (lies.still) home.append(el("img", {src: lies.still, alt: "The mesh seen from above and from the side"}));
+    if (lies.still) home.append(
+      el("img", {src: lies.still, alt: "The mesh seen from above and from the side"}));
   }
 
   kinds.addEventListener("change", () => attempt(draw));

@@ -8,7 +8,9 @@ import {number, withSigma} from "./words.js";
 const REACH_PX = 25;
 
 export function measuredProfile(map, unit) {
-  const spot = leaflet.circleMarker([0, 0], {radius: 6, color: WHITE, weight: 2, fillColor: BLUE, fillOpacity: 1, interactive: false});
+  const spot = leaflet.circleMarker(
+    [0, 0], {radius: 6, color: WHITE, weight: 2, fillColor: BLUE, fillOpacity: 1,
+    interactive: false});
   let found = null;
   const chart = profileChart("Place along the profile", {describe, pointed, high: 170});
 
@@ -54,7 +56,8 @@ export function measuredProfile(map, unit) {
     found = profile;
     chart.show({
       lines: [{kind: "vehicle", xs: found.along, ys: found.height, sigmas: found.sigma}],
-      caption: "along the line, " + unit + "; height ± sigma, " + unit, rules: found.corners.slice(1, -1),
+      caption: "along the line, " + unit + "; height ± sigma, " + unit,
+        rules: found.corners.slice(1, -1),
     });
     chart.move(0);
   }

@@ -1,10 +1,11 @@
 /* What a page has saved itself, among the changes that the server reports to all pages.
 
-   A report may come before the answer to the request that it is of, and after the answer to the next one. */
+   A report may come before the answer to the request that it is of, and after the answer to the
+   next one. */
 
 export function startOwnSaves() {
   const tokens = [];
-  let saving = Promise.resolve();
+  let saving = /** @type {Promise<any>} */ (Promise.resolve());
   return {
     /* Send a change; the answer has the token of the file as it is then. */
     save(request) {

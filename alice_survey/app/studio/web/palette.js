@@ -19,4 +19,5 @@ export const PLAN = {
 };
 
 /* From few to many, light to dark. */
-export const COUNTS = ["#f7fcf0", "#ddf1d9", "#bfe6c4", "#93d3c0", "#60bbc8", "#3597c1", "#1474b0", "#084c8d"];
+export const COUNTS = ["#f7fcf0", "#ddf1d9", "#bfe6c4", "#93d3c0", "#60bbc8", "#3597c1", "#1474b0",
+  "#084c8d"];

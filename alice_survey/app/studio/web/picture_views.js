@@ -7,21 +7,26 @@ import {number} from "./words.js";
 
 const CLOSE = 2;  /* zoom at which a pixel has four of the screen's */
 const place = (x, y) => [-(y + 0.5), x + 0.5];
-export const addressOf = (name) => "/api/pictures/" + name.split("/").map(encodeURIComponent).join("/");
+export const addressOf = (name) => "/api/pictures/" + name.split("/").map(encodeURIComponent).join(
+  "/");
 
 /* A cross of lines with a gap in its middle, so that the pixel under it is seen. */
 function cross(kind) {
   const dark = {stroke: "#000", "stroke-width": 4, "stroke-opacity": 0.55, fill: "none"};
-  const light = {stroke: kind === "picked" ? "#ffd400" : "#4cc9ff", "stroke-width": 2, fill: "none"};
-  const paths = kind === "picked" ? "M-16 0h12M4 0h12M0-16v12M0 4v12" : "M-12-12l7 7M12-12l-7 7M-12 12l7-7M12 12l-7-7";
-  return el("svg", {viewBox: "-20 -20 40 40", width: 40, height: 40, "aria-hidden": "true", class: "cross " + kind},
+  const light = {stroke: kind === "picked" ? "#ffd400" : "#4cc9ff", "stroke-width": 2,
+    fill: "none"};
+  const paths = kind === "picked"
+    ? "M-16 0h12M4 0h12M0-16v12M0 4v12" : "M-12-12l7 7M12-12l-7 7M-12 12l7-7M12 12l-7-7";
+  return el("svg", {viewBox: "-20 -20 40 40", width: 40, height: 40, "aria-hidden": "true",
+    class: "cross " + kind},
     el("path", {d: paths, ...dark}), el("path", {d: paths, ...light}));
 }
 
 class PictureView {
-  /* `seen` is a picture that sees the spot: name, and where it is expected (x, y), or the `rings` that are
-     seen in it. `changed(view)` is called where a person picks, if one may, `used(view)` where one takes
-     or drops a pick that stays, and `opened(view)` once the picture is there. */
+  /* `seen` is a picture that sees the spot: name, and where it is expected (x, y), or the
+     `rings` that are seen in it. `changed(view)` is called where a person picks, if one may,
+     `used(view)` where one takes or drops a pick that stays, and `opened(view)` once the picture
+     is there. */
   constructor(seen, {changed, used, chosen, opened}) {
     this.name = seen.name;
     this.seen = seen;
@@ -31,10 +36,14 @@ class PictureView {
     this.onOpen = opened;
     this.box = el("div", {
       class: "picture-view", tabindex: "0", role: "application",
-      "aria-label": "Picture " + seen.name + (changed ? ": click to pick; arrow keys move the pick by a pixel, with Shift by a tenth; Enter picks the middle; + and - zoom" : ": arrow keys move it, + and - zoom"),
+      "aria-label": "Picture " + seen.name
+        + (changed ? ": click to pick; arrow keys move the pick by a pixel, with Shift by a "
+        + "tenth; Enter picks the middle; + and - zoom" : ": arrow keys move it, + and - zoom"),
       onkeydown: (event) => this.key(event), onfocus: () => chosen(this),
     });
-    this.about = el("p", {}, seen.about || (seen.off_nadir_deg === undefined ? "" : number(seen.off_nadir_deg, "", 2) + "° off the normal"));
+    this.about = el("p", {},
+      seen.about || (seen.off_nadir_deg === undefined
+      ? "" : number(seen.off_nadir_deg, "", 2) + "° off the normal"));
     this.text = el("p", {class: "note"}, used ? "not picked" : "");
     this.check = el("input", {type: "checkbox", checked: true, onchange: () => {
       this.use = this.check.checked;
@@ -51,17 +60,21 @@ class PictureView {
     const about = await attempt(() => get(addressOf(this.name) + "/about"));
     if (!about || !this.card.isConnected) return;
     const map = new leaflet.Map(this.box, {
-      crs: leaflet.CRS.Simple, attributionControl: false, zoomControl: false, zoomSnap: 0.5, keyboard: false,
-      scrollWheelZoom: true, doubleClickZoom: false, fadeAnimation: false, zoomAnimation: false, maxZoom: 6,
+      crs: leaflet.CRS.Simple, attributionControl: false, zoomControl: false, zoomSnap: 0.5,
+        keyboard: false,
+      scrollWheelZoom: true, doubleClickZoom: false, fadeAnimation: false, zoomAnimation: false,
+        maxZoom: 6,
       minZoom: Math.log2(160 / Math.max(about.width, about.height)),
     });
     map.createPane("pictures").style.zIndex = 200;
     this.map = map;
     this.size = [about.width, about.height];
     const {seen} = this;
-    map.setView(place(seen.x, seen.y), seen.whole ? Math.log2(this.box.clientWidth / about.width) : CLOSE);
+    map.setView(place(seen.x, seen.y), seen.whole ? Math.log2(
+      this.box.clientWidth / about.width) : CLOSE);
     new Pyramid({
-      west: 0, north: 0, pixel: 1, width: about.width, height: about.height, tile: about.tile, levels: about.levels,
+      west: 0, north: 0, pixel: 1, width: about.width, height: about.height, tile: about.tile,
+        levels: about.levels,
       address: addressOf(this.name) + "/tile/{}.webp?v=" + about.token,
     }, "pictures").addTo(map);
     if (seen.rings) this.outline(seen);
@@ -76,16 +89,20 @@ class PictureView {
     this.onOpen?.(this);
   }
 
-  /* Rings of pixels from the outer corner of the first, of which those that are not known are null. */
+  /* Rings of pixels from the outer corner of the first, of which those that are not known are
+     null. */
   outline({rings, closed, colour = WHITE, closest = CLOSE}, framed = true) {
     const places = rings.map((ring) => ring.filter(([x]) => x !== null).map(([x, y]) => [-y, x]));
     const many = closed ? leaflet.polygon : leaflet.polyline;
     this.shape = (this.shape || leaflet.featureGroup().addTo(this.map)).clearLayers();
     this.colour = this.colour || colour;
-    [[INK, 6], [this.colour, 2.5]].forEach(([color, weight]) => this.shape.addLayer(places[0].length > 1
+    [[INK, 6], [this.colour, 2.5]].forEach(([color, weight]) => this.shape.addLayer(
+      places[0].length > 1
       ? many(places, {color, weight, fill: false, interactive: false})
-      : leaflet.circleMarker(places[0][0], {radius: 7, color, weight, fill: false, interactive: false})));
-    if (framed) this.map.fitBounds(leaflet.latLngBounds(places.flat()).pad(0.3), {maxZoom: closest, animate: false});
+      : leaflet.circleMarker(
+        places[0][0], {radius: 7, color, weight, fill: false, interactive: false})));
+    if (framed) this.map.fitBounds(leaflet.latLngBounds(places.flat()).pad(0.3), {
+      maxZoom: closest, animate: false});
   }
 
   byHand(x, y) {
@@ -107,7 +124,8 @@ class PictureView {
 
   draw() {
     if (!this.map) return;
-    this.crosses = this.crosses.filter(([drawn]) => !drawn.classList.contains("picked") || drawn.remove());
+    this.crosses = this.crosses.filter(([drawn]) => !drawn.classList.contains("picked")
+      || drawn.remove());
     this.crosses.forEach(([drawn]) => drawn.toggleAttribute("hidden", Boolean(this.pick)));
     if (this.pick) this.crosses.push([cross("picked"), place(this.pick.x, this.pick.y)]);
     this.settle();
@@ -128,7 +146,8 @@ class PictureView {
   key(event) {
     if (!this.map || event.ctrlKey || event.metaKey || event.altKey) return;
     const step = event.shiftKey ? 0.1 : 1;
-    const move = {ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, -step], ArrowDown: [0, step]}[event.key];
+    const move = {ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, -step],
+      ArrowDown: [0, step]}[event.key];
     const middle = this.map.getCenter();
     if (move && this.pick) {
       this.byHand(this.pick.x + move[0], this.pick.y + move[1]);
@@ -156,19 +175,27 @@ class PictureView {
 
 /* The wall of views over the map. */
 export class Wall {
+  /** @param {any} listeners */
   constructor({changed, used, opened, refine} = {}) {
     this.views = [];
     this.active = null;
     this.acts = {changed, used, opened, chosen: (view) => this.choose(view)};
     this.title = el("strong", {}, "");
-    this.refineButton = el("button", {type: "button", disabled: true, hidden: !refine, onclick: () => refine(this.active)}, "Find it in all others");
-    this.more = el("button", {type: "button", hidden: true, onclick: () => this.showMore()}, "More pictures");
-    this.light = el("input", {type: "range", min: "0.4", max: "3", step: "0.05", value: "1", oninput: () => this.lit()});
-    this.list = el("div", {class: "views", tabindex: "0", role: "region", "aria-label": "Pictures that show it"});
+    this.refineButton =
+      el("button", {type: "button", disabled: true, hidden: !refine,
+      onclick: () => refine(this.active)}, "Find it in all others");
+    this.more = el("button", {type: "button", hidden: true, onclick: () => this.showMore()},
+      "More pictures");
+    this.light = el("input", {type: "range", min: "0.4", max: "3", step: "0.05", value: "1",
+      oninput: () => this.lit()});
+    this.list = el("div", {class: "views", tabindex: "0", role: "region",
+      "aria-label": "Pictures that show it"});
     this.root = el("div", {class: "wall", hidden: true, role: "region", "aria-label": "Pictures"},
       el("div", {class: "bar-top"}, this.title, this.refineButton,
-        el("button", {type: "button", onclick: () => this.views.forEach((view) => view.closer(1))}, "Closer"),
-        el("button", {type: "button", onclick: () => this.views.forEach((view) => view.closer(-1))}, "Farther"),
+        el("button", {type: "button", onclick: () => this.views.forEach((view) => view.closer(1))},
+          "Closer"),
+        el("button", {type: "button", onclick: () => this.views.forEach((view) => view.closer(-1))},
+          "Farther"),
         el("label", {}, "Brightness", this.light), this.more,
         el("button", {type: "button", onclick: () => this.hide()}, "Back to the map")),
       this.list);

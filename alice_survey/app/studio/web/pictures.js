@@ -22,7 +22,8 @@ export function tab(studio) {
   const name = el("input", {type: "text", value: "", maxlength: "100", autocomplete: "off"});
   const sigma = el("input", {type: "number", min: "0.01", max: "20", step: "any", value: "0.3"});
   const spotText = el("p", {class: "note", "aria-live": "polite"}, "No spot yet.");
-  const save = button("Save the point", () => attempt(savePoint), {class: "primary", disabled: true});
+  const save = button("Save the point", () => attempt(savePoint), {
+    class: "primary", disabled: true});
   const find = el("input", {type: "search", placeholder: "part of a name"});
   const list = el("div", {class: "list", role: "group", "aria-label": "Pictures"});
   const points = el("div", {class: "points"});
@@ -40,19 +41,23 @@ export function tab(studio) {
       button("Show pictures", () => { ready().root.hidden = false; })),
     el("details", {ontoggle: (event) => event.target.open && attempt(listPictures)},
       el("summary", {}, "Start from a picture"), field("Find", find), list),
-    el("div", {class: "row"}, field("Name of the point", name), field("Sigma of a pick by eye, px", sigma)),
+    el("div", {class: "row"}, field("Name of the point", name),
+      field("Sigma of a pick by eye, px", sigma)),
     spotText, el("div", {class: "buttons"}, save, button("Start another", clearSpot)),
     points,
     el("h2", {}, "Length"), lengthText, scaleBox,
     el("h2", {}, "Control"), controlBox, lastBox,
   );
-  const lack = missing(studio, content, () => (["pictures", "sparse", "dem"].some((name) => studio.state.has[name]) ? null
-    : ["There are no pictures to pick in yet: fly the plan or import your own in Run, then reconstruct them.", "run", "Open Run"]));
+  const lack = missing(studio, content, () => (
+    ["pictures", "sparse", "dem"].some((name) => studio.state.has[name]) ? null
+    : ["There are no pictures to pick in yet: fly the plan or import your own in Run, then "
+      + "reconstruct them.", "run", "Open Run"]));
   const panel = el("div", {class: "pictures"}, lack.element, content);
   find.addEventListener("input", () => attempt(listPictures));
 
   function ready() {
-    wall = wall || new Wall({changed: picked, used: () => attempt(look), refine: (view) => attempt(() => refine(view))});
+    wall = wall || new Wall(
+      {changed: picked, used: () => attempt(look), refine: (view) => attempt(() => refine(view))});
     return wall;
   }
 
@@ -78,8 +83,10 @@ export function tab(studio) {
     if (!found.pictures.length) throw new Error("no picture shows that spot");
     clearSpot();
     ready().show(shownBy(found.total), found.pictures);
-    say("The spot is at " + number(found.place.n, held.unit, 5) + " north, " + number(found.place.e, held.unit, 5)
-      + " east. Click it in a picture" + (found.hidden ? "; in " + found.hidden + " it is hidden." : "."));
+    say("The spot is at " + number(found.place.n, held.unit, 5) + " north, "
+      + number(found.place.e, held.unit, 5)
+      + " east. Click it in a picture" + (found.hidden ? "; in " + found.hidden
+        + " it is hidden." : "."));
     return found;
   }
 
@@ -87,9 +94,11 @@ export function tab(studio) {
     const wanted = find.value;
     const found = await get("/api/pictures", {find: wanted, count: 60});
     if (wanted !== find.value) return;  /* an answer that a later one has overtaken */
-    list.replaceChildren(...found.pictures.map((one) => button(one.name + (one.registered ? "" : " (not in the model)"),
+    list.replaceChildren(...found.pictures.map(
+      (one) => button(one.name + (one.registered ? "" : " (not in the model)"),
       () => showOne(one.name), {disabled: !one.registered})));
-    if (found.total > found.pictures.length) list.append(el("small", {}, "and " + (found.total - found.pictures.length) + " more"));
+    if (found.total > found.pictures.length) list.append(
+      el("small", {}, "and " + (found.total - found.pictures.length) + " more"));
   }
 
   /* A picture whole; what is picked in it says which others show the spot. */
@@ -97,7 +106,8 @@ export function tab(studio) {
     clearSpot();
     const about = await attempt(() => get(addressOf(image) + "/about"));
     if (!about) return;
-    ready().show("Click the spot in the picture", [{name: image, x: about.width / 2, y: about.height / 2, whole: true}]);
+    ready().show("Click the spot in the picture",
+      [{name: image, x: about.width / 2, y: about.height / 2, whole: true}]);
   }
 
   /* ---- Picks ---- */
@@ -133,20 +143,26 @@ export function tab(studio) {
     checking += 1;
     const mine = checking;
     if (views.length < 2) {
-      spotText.textContent = views.length ? "Picked in one picture; two are needed." : "No spot yet.";
+      spotText.textContent = views.length
+        ? "Picked in one picture; two are needed." : "No spot yet.";
       return;
     }
     const found = await send("/api/picks/spot", {picks: views.map(asPick)});
     if (mine !== checking) return;
     const {spot} = found;
-    spotText.textContent = counted(spot.views, "picture") + ", " + number(spot.rms_px, "px", 2) + " rms; sigma north "
-      + mm(spot.sigma[0]) + ", east " + mm(spot.sigma[1]) + ", down " + mm(spot.sigma[2]) + (held.unit === "m" ? " mm" : " thousandths");
+    spotText.textContent = counted(spot.views, "picture") + ", " + number(spot.rms_px, "px", 2)
+      + " rms; sigma north "
+      + mm(spot.sigma[0]) + ", east " + mm(spot.sigma[1]) + ", down " + mm(spot.sigma[2])
+        + (held.unit === "m" ? " mm" : " thousandths");
     found.residuals.forEach((one) => {
       const view = wall.of(one.image);
       const size = one.residual ? Math.hypot(...one.residual) : null;
-      const how = view.pick.matched_to ? "found, sigma " + number(view.pick.sigma_px, "px", 2) : "picked by eye";
-      if (one.left_out) view.say("BAD: " + number(size, "px", 2) + " off the others, left out", "error");
-      else view.say(how + "; " + number(size, "px", 2) + " off" + (size > BAD_PX ? ": BAD, pick again" : ""), size > BAD_PX ? "error" : "note");
+      const how = view.pick.matched_to ? "found, sigma " + number(view.pick.sigma_px, "px",
+        2) : "picked by eye";
+      if (one.left_out) view.say("BAD: " + number(size, "px", 2) + " off the others, left out",
+        "error");
+      else view.say(how + "; " + number(size, "px", 2) + " off"
+        + (size > BAD_PX ? ": BAD, pick again" : ""), size > BAD_PX ? "error" : "note");
     });
   }
 
@@ -154,14 +170,17 @@ export function tab(studio) {
     if (!view?.pick) throw new Error("pick the spot in a picture first");
     say("Looking for it in the other pictures…");
     const pick = {...asPick(view), matched_to: ""};
-    const wanted = [...wall.views, ...wall.waiting].map((one) => one.name).filter((one) => one !== view.name);
+    const wanted = [...wall.views, ...wall.waiting].map((one) => one.name)
+      .filter((one) => one !== view.name);
     const found = await send("/api/picks/refine", {pick, images: wanted.slice(0, 20)});
     found.picks.slice(1).forEach((one) => {
       const target = wall.need({name: one.image, x: one.x, y: one.y});
-      if (!target.pick || target.pick.matched_to) target.set({x: one.x, y: one.y, sigma_px: one.sigma_px, matched_to: view.name});
+      if (!target.pick || target.pick.matched_to) target.set(
+        {x: one.x, y: one.y, sigma_px: one.sigma_px, matched_to: view.name});
     });
     found.refused.forEach((one) => wall.of(one.name)?.say("not found: " + one.why, "warn"));
-    say("Found in " + counted(found.picks.length - 1, "picture") + ", not in " + found.refused.length + ".");
+    say("Found in " + counted(found.picks.length - 1, "picture") + ", not in "
+      + found.refused.length + ".");
     await look();
   }
 
@@ -184,13 +203,16 @@ export function tab(studio) {
   async function savePoint() {
     const point = name.value.trim();
     if (!point) throw new Error("give the point a name");
-    held.token = (await saves.save(send("/api/picks/save", {token: held.token, points: [point], picks: used().map(asPick)}))).token;
+    held.token = (await saves.save(
+      send("/api/picks/save", {token: held.token, points: [point], picks: used().map(asPick)})))
+      .token;
     await load();
     say("Saved " + point + " to picks.csv.");
   }
 
   async function removePoint(point) {
-    held.token = (await saves.save(send("/api/picks/save", {token: held.token, points: [point], picks: []}))).token;
+    held.token = (await saves.save(
+      send("/api/picks/save", {token: held.token, points: [point], picks: []}))).token;
     chosen = chosen.filter((one) => one !== point);
     await load();
     say("Took " + point + " out of picks.csv.");
@@ -199,12 +221,14 @@ export function tab(studio) {
   function openPoint(point) {
     clearSpot();
     name.value = point.name;
-    ready().show(point.name, point.picks.map((one) => ({name: one.image, x: one.x, y: one.y})), point.picks.length);
+    ready().show(point.name, point.picks.map((one) => ({name: one.image, x: one.x, y: one.y})),
+      point.picks.length);
     point.picks.forEach((one) => wall.of(one.image).set({...one}));
     attempt(look);
     if (point.spot) {
       attempt(async () => {
-        const found = await get("/api/pictures/seeing", {n: point.spot.n, e: point.spot.e, count: 40});
+        const found = await get("/api/pictures/seeing", {
+          n: point.spot.n, e: point.spot.e, count: 40});
         wall.waiting = found.pictures.filter((one) => !wall.of(one.name));
         wall.showMore(0);
       });
@@ -224,22 +248,31 @@ export function tab(studio) {
       return;
     }
     const unit = held.unit === "m" ? "mm" : "1/1000";
-    points.replaceChildren(table("Points", ["Point", "Views", "Sigma N, E, D, " + unit, "Worst, px", "Change"], held.points.map((point) => {
+    points.replaceChildren(
+      table("Points", ["Point", "Views", "Sigma N, E, D, " + unit, "Worst, px", "Change"],
+      held.points.map((point) => {
       const worst = worstOf(point);
       const bad = point.picks.some((pick) => pick.left_out) || worst.size > BAD_PX;
-      const box = el("input", {type: "checkbox", "data-point": point.name, checked: chosen.includes(point.name), onchange: (event) => choose(point.name, event.target.checked)});
+      const box = el("input", {type: "checkbox", "data-point": point.name,
+        checked: chosen.includes(point.name),
+        onchange: (event) => choose(point.name, event.target.checked)});
       return [
         el("label", {}, box, " " + point.name),
         point.spot ? String(point.spot.views) : String(point.picks.length),
-        point.spot ? point.spot.sigma.map(mm).join(", ") : el("span", {class: "warn"}, point.why || "no model yet"),
-        el("span", {class: bad ? "error" : null}, worst.size < 0 ? "" : number(worst.size, "", 2) + (bad ? " BAD: " + worst.image : "")),
-        point.coded ? "marker" : [button("Open", () => openPoint(point), {"aria-label": "Open " + point.name}), " ",
-          button("Delete", () => attempt(() => removePoint(point.name)), {"aria-label": "Delete " + point.name})],
+        point.spot ? point.spot.sigma.map(mm)
+          .join(", ") : el("span", {class: "warn"}, point.why || "no model yet"),
+        el("span", {class: bad ? "error" : null},
+          worst.size < 0 ? "" : number(worst.size, "", 2) + (bad ? " BAD: " + worst.image : "")),
+        point.coded ? "marker" : [
+          button("Open", () => openPoint(point), {"aria-label": "Open " + point.name}), " ",
+          button("Delete", () => attempt(() => removePoint(point.name)),
+            {"aria-label": "Delete " + point.name})],
       ];
     })), el("div", {class: "buttons"}, button("Export CSV", exportPoints)));
     studio.map.put({
       kind: "point", name: "picked", title: "Picked points", colour: ORANGE, group: "Pictures",
-      shapes: held.points.filter((point) => point.spot).map((point) => [[point.spot.e, point.spot.n]]),
+      shapes: held.points.filter((point) => point.spot)
+        .map((point) => [[point.spot.e, point.spot.n]]),
       texts: held.points.filter((point) => point.spot).map((point) => point.name),
     });
   }
@@ -247,7 +280,8 @@ export function tab(studio) {
   function exportPoints() {
     const rows = held.points.filter((point) => point.spot).map(({name: of, spot}) => [
       of, spot.n, spot.e, spot.down, ...spot.sigma, spot.views, spot.rms_px]);
-    const header = ["name", "north", "east", "down", "sigma_north", "sigma_east", "sigma_down", "views", "rms_px"];
+    const header = ["name", "north", "east", "down", "sigma_north", "sigma_east", "sigma_down",
+      "views", "rms_px"];
     download("points.csv", csv(header, rows), "text/csv");
   }
 
@@ -255,7 +289,8 @@ export function tab(studio) {
     chosen = chosen.filter((one) => one !== point);
     if (isOn) chosen = [...chosen, point].slice(-2);
     drawPoints();
-    [...points.querySelectorAll("[data-point]")].find((box) => box.dataset.point === point)?.focus({preventScroll: true});
+    [...points.querySelectorAll("[data-point]")].find((box) => box.dataset.point === point)?.focus(
+      {preventScroll: true});
     attempt(measure);
   }
 
@@ -271,13 +306,17 @@ export function tab(studio) {
       return;
     }
     lengthText.textContent = "Measuring…";
-    const found = await send("/api/picks/length", {first: picksOf(chosen[0]), second: picksOf(chosen[1])}).catch((fault) => {
+    const found = await send("/api/picks/length", {
+      first: picksOf(chosen[0]), second: picksOf(chosen[1])}).catch((fault) => {
       lengthText.textContent = "No length between these two.";
       throw fault;
     });
     const part = (value) => (found.unit === "m" ? mm(value) + " mm" : number(value, found.unit, 2));
-    lengthText.replaceChildren(el("strong", {}, chosen.join(" to ") + ": " + withSigma(found.value, found.sigma, found.unit)),
-      ". Of the sigma, picks " + part(found.sigma_picks) + ", poses " + part(found.sigma_poses) + ", scale " + part(found.sigma_scale) + ".");
+    lengthText.replaceChildren(
+      el("strong", {}, chosen.join(" to ") + ": " + withSigma(found.value, found.sigma,
+      found.unit)),
+      ". Of the sigma, picks " + part(found.sigma_picks) + ", poses " + part(found.sigma_poses)
+        + ", scale " + part(found.sigma_scale) + ".");
     lengthText.dataset.value = found.value;
     lengthText.dataset.sigma = found.sigma;
     scaleBox.hidden = held.scaled_by_rig;
@@ -286,29 +325,36 @@ export function tab(studio) {
   async function setScale() {
     const length_m = Number(known.value);
     if (!(length_m > 0)) throw new Error("give the true length in metres");
-    const done = await send("/api/scale", {first: picksOf(chosen[0]), second: picksOf(chosen[1]), length_m});
+    const done = await send(
+      "/api/scale", {first: picksOf(chosen[0]), second: picksOf(chosen[1]), length_m});
     say(done.line);
   }
 
   /* ---- Control ---- */
 
   async function saveControl(rows, names) {
-    control.token = (await saves.save(send("/api/control/save", {token: control.token, rows, names}))).token;
+    control.token = (
+      await saves.save(send("/api/control/save", {token: control.token, rows, names}))).token;
     await load();
     say("Saved to control.csv. Run the reconstruction for the model to use it.");
   }
 
   function drawControl() {
     controlBox.replaceChildren(
-      controlRows(control.rows, held.control, (row) => attempt(() => saveControl([], [[row.kind, row.name]]))),
-      controlForm(held.points.map((point) => point.name), (row) => attempt(() => saveControl([row], []))));
+      controlRows(control.rows, held.control,
+        (row) => attempt(() => saveControl([], [[row.kind, row.name]]))),
+      controlForm(held.points.map((point) => point.name),
+        (row) => attempt(() => saveControl([row], []))));
     const {last} = held;
     const rms = last?.rms?.control;
     lastBox.replaceChildren(
-      last ? el("p", {class: "note"}, "The last reconstruction used " + (rms.points || 0) + " points and " + (rms.bars || 0) + " lengths"
-        + (rms.points ? ": rms north " + mm(rms.north_m) + ", east " + mm(rms.east_m) + ", down " + mm(rms.down_m) + " mm" : "")
+      last ? el("p", {class: "note"}, "The last reconstruction used " + (rms.points || 0)
+        + " points and " + (rms.bars || 0) + " lengths"
+        + (rms.points ? ": rms north " + mm(rms.north_m) + ", east " + mm(rms.east_m) + ", down "
+          + mm(rms.down_m) + " mm" : "")
         + (rms.bars ? "; lengths " + mm(rms.length_m) + " mm" : "") + ".") : "",
-      control.rows.length ? el("p", {class: "note"}, "Run the reconstruction again for the model to use what is saved here. ",
+      control.rows.length ? el("p", {class: "note"},
+        "Run the reconstruction again for the model to use what is saved here. ",
         button("Open Run", () => studio.open("run"))) : "");
   }
 
@@ -319,7 +365,8 @@ export function tab(studio) {
   }
 
   on("picks", async ({file, token}) => {
-    if (await saves.isOwn(token) || panel.hidden || !file || token === held.token || token === control.token) return;
+    if (await saves.isOwn(token) || panel.hidden || !file || token === held.token
+      || token === control.token) return;
     say(file + " was changed by another page: loaded again.", "warn");
     attempt(load);
   });

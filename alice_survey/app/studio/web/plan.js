@@ -22,7 +22,8 @@ const ROLES = {survey: "area to survey", no_go: "no-go zones", allowed: "allowed
 const EMPTY = "Draw the area to survey on the map, or import a file with it.";
 
 export function tab(studio) {
-  let [file, history, active, preview, fitted, quiet, saving] = [null, startHistory(AS_IN_FILE), false, null, false, null, false];
+  let [file, history, active, preview, fitted, quiet, saving] =
+    [null, startHistory(AS_IN_FILE), false, null, false, null, false];
   const body = () => current(history);
   const isDirty = () => !same(body(), AS_IN_FILE);
 
@@ -30,27 +31,33 @@ export function tab(studio) {
 
   const view = shown(studio);
   const draw = drawing(studio, {changed: reshaped, moving: (shapes) => plan({...body(), shapes})});
-  const results = resultsPanel((changes) => edit({...body(), changes: withChanges(body().changes, file, changes)}));
+  const results = resultsPanel(
+    (changes) => edit({...body(), changes: withChanges(body().changes, file, changes)}));
   const along = planProfile((place) => view.mark(place));
   const play = playback({ask: () => send("/api/plan/play", body()), mark: view.mark});
   const controls = el("div");
-  const precision = el("p", {class: "note plan-precision"}, "How well the model of this survey is expected to be known.");
+  const precision = el("p", {class: "note plan-precision"},
+    "How well the model of this survey is expected to be known.");
   const exports = el("ul");
   const back = button("Undo", () => step(undo), {title: "Ctrl+Z"});
   const forth = button("Redo", () => step(redo), {title: "Ctrl+Shift+Z"});
   const keep = button("Save", save, {class: "primary"});
   const note = el("p", {class: "note"});
-  const dropped = el("input", {type: "file", onchange: () => { importFile(dropped.files[0]); dropped.value = ""; }});
-  const role = el("select", {}, Object.entries(ROLES).map(([value, text]) => el("option", {value}, text)));
+  const dropped = el(
+    "input", {type: "file", onchange: () => { importFile(dropped.files[0]); dropped.value = ""; }});
+  const role = el("select", {}, Object.entries(ROLES).map(
+    ([value, text]) => el("option", {value}, text)));
   let settings = null;
 
   const content = el("div", {hidden: true},
-    el("div", {class: "plan-top"}, el("div", {class: "buttons"}, back, forth, keep, button("Text", showText, {title: "Show survey.toml as it would be saved"})),
+    el("div", {class: "plan-top"}, el("div", {class: "buttons"}, back, forth, keep,
+      button("Text", showText, {title: "Show survey.toml as it would be saved"})),
       results.key, note),
     results.top,
     el("h2", {}, "Area"), draw.panel,
     el("details", {}, el("summary", {}, "Import a file"), field("It is the", role),
-      field("File", dropped, "GeoJSON, KML, GeoPackage, zipped shapefile, WKT and others; or drop it on the map")),
+      field("File", dropped,
+        "GeoJSON, KML, GeoPackage, zipped shapefile, WKT and others; or drop it on the map")),
     el("h2", {}, "How to fly"), controls,
     results.below,
     el("details", {open: true}, el("summary", {}, "Depth along the way"), along.element),
@@ -58,7 +65,8 @@ export function tab(studio) {
     el("details", {}, el("summary", {}, "Expected precision"), precision,
       el("div", {class: "buttons"}, button("Compute it", () => attempt(showPrecision)))),
     el("details", {}, el("summary", {}, "Export"), exports));
-  const missing = el("div", {hidden: true}, el("p", {}, "The settings cannot be read; the line below says why."),
+  const missing = el("div", {hidden: true}, el(
+    "p", {}, "The settings cannot be read; the line below says why."),
     el("div", {class: "buttons"}, button("Read them again", () => start())));
   const waiting = el("p", {class: "note"}, "Planning …");
   const wait = (on) => { waiting.hidden = !on; };
@@ -103,7 +111,8 @@ export function tab(studio) {
   /* ---- Edits ---- */
 
   /* Of a new survey nothing is planned before something is drawn. */
-  const hasArea = (state) => Boolean(file.token) || ["survey", "corridors"].some((kind) => shapesOf(state)[kind].length);
+  const hasArea = (state) => Boolean(file.token) || ["survey", "corridors"].some((kind) =>
+    shapesOf(state)[kind].length);
   const shapesOf = (state) => ({...noShapes(), ...(state.shapes || file.shapes)});
 
   function reshaped(shapes, tag = "") {
@@ -111,7 +120,8 @@ export function tab(studio) {
   }
 
   function setting(values, tag) {
-    const changes = values.reduce((all, [section, key, value]) => withChange(all, file, section, key, value), body().changes);
+    const changes = values.reduce((all, [section, key, value]) => withChange(
+      all, file, section, key, value), body().changes);
     edit({...body(), changes}, tag);
   }
 
@@ -185,12 +195,14 @@ export function tab(studio) {
   /* Another page saved. */
   on("plan", ({token}) => {
     if (!file || saving || token === file.token) return;
-    if (isDirty()) say("survey.toml was changed by another page; what is changed here is kept", "warn");
+    if (isDirty()) say("survey.toml was changed by another page; what is changed here is kept",
+      "warn");
     else attempt(() => restart());
   });
 
   function dialog(title, ...children) {
-    const box = el("dialog", {"aria-label": title, onclose: () => box.remove()}, el("h2", {}, title), ...children);
+    const box = el("dialog", {"aria-label": title, onclose: () => box.remove()},
+      el("h2", {}, title), ...children);
     document.body.append(box);
     box.showModal();
     return box;
@@ -211,7 +223,8 @@ export function tab(studio) {
     return attempt(async () => {
       const text = await send("/api/plan/text", {...body(), token: file.token});
       const box = dialog("survey.toml, as Save writes it",
-        el("div", {class: "plan-text", tabindex: "0", role: "region", "aria-label": "Text of survey.toml"}, text.survey_toml),
+        el("div", {class: "plan-text", tabindex: "0", role: "region",
+          "aria-label": "Text of survey.toml"}, text.survey_toml),
         el("div", {class: "buttons"}, button("Close", () => box.close(), {class: "primary"})));
     });
   }
@@ -221,32 +234,41 @@ export function tab(studio) {
   async function showPrecision() {
     precision.textContent = "Computing ...";
     const asked = body();
-    const found = await send("/api/plan/precision", asked).finally(() => { precision.textContent = ""; });
+    const found = await send("/api/plan/precision", asked)
+      .finally(() => { precision.textContent = ""; });
     if (!same(asked, body())) return;
-    precision.textContent = found.text || "Bend " + number(found.bend_mm, "mm") + ", scale " + number(found.scale_ppm, "ppm")
-      + ", heights " + number(found.height_mm, "mm") + ", stations " + number(found.station_mm, "mm");
+    precision.textContent = found.text || "Bend " + number(found.bend_mm, "mm") + ", scale "
+      + number(found.scale_ppm, "ppm")
+      + ", heights " + number(found.height_mm, "mm") + ", stations "
+        + number(found.station_mm, "mm");
     view.sigma(found.layer);
   }
 
   function importFile(taken) {
     if (!taken) return;
     if (taken.size > TOO_LARGE) {
-      say(taken.name + " has " + Math.round(taken.size / 1e6) + " MB: at most 20 are taken", "error");
+      say(taken.name + " has " + Math.round(taken.size / 1e6) + " MB: at most 20 are taken",
+        "error");
       return;
     }
     attempt(async () => {
-      const found = await send("/api/plan/import", taken, {params: {name: taken.name, role: role.value}});
-      const shapes = {...noShapes(), ...Object.fromEntries(Object.keys(noShapes()).map((kind) => [kind, found[kind] || []]))};
+      const found = await send("/api/plan/import", taken, {
+        params: {name: taken.name, role: role.value}});
+      const shapes = {...noShapes(), ...Object.fromEntries(
+        Object.keys(noShapes()).map((kind) => [kind, found[kind] || []]))};
       fitted = false;
-      edit({changes: withChanges(body().changes, file, moved(found.datum)), shapes: withImported(shapesOf(body()), shapes)});
-      say([paths(shapes).length + " shapes from " + taken.name, ...found.warnings].join("; "), found.warnings.length ? "warn" : "note");
+      edit({changes: withChanges(body().changes, file, moved(found.datum)),
+        shapes: withImported(shapesOf(body()), shapes)});
+      say([paths(shapes).length + " shapes from " + taken.name, ...found.warnings].join("; "),
+        found.warnings.length ? "warn" : "note");
     });
   }
 
   /* The middle of a file is the datum of a new survey. */
   const moved = (datum) => (same(datum, file.datum) ? {} : {area: datum});
 
-  fileDrop(studio.map.leaflet.getContainer(), ([first]) => importFile(first), () => active && Boolean(file));
+  fileDrop(studio.map.leaflet.getContainer(), ([first]) => importFile(first),
+    () => active && Boolean(file));
 
   /* ---- The page ---- */
 

@@ -1,5 +1,5 @@
-/* What is changed of a plan: {changes, shapes}. `changes` are settings by section and key, where null
-   takes a key out of survey.toml; shapes are null as the file has them. */
+/* What is changed of a plan: {changes, shapes}. `changes` are settings by section and key, where
+   null takes a key out of survey.toml; shapes are null as the file has them. */
 
 import {same} from "./undo.js";
 
@@ -9,7 +9,8 @@ export const AS_IN_FILE = Object.freeze({changes: {}, shapes: null});
    the file gives already is no change. */
 export function withChange(changes, file, section, key, value) {
   const written = (file.written[section] || []).includes(key);
-  const asFile = value === null ? !written : same(value, (file.settings[section] || {})[key] ?? null);
+  const asFile = value === null ? !written : same(value, (file.settings[section] || {})[key]
+    ?? null);
   const own = {...changes[section]};
   if (asFile) delete own[key];
   else own[key] = value;

@@ -1,10 +1,12 @@
-/* Areas, zones and corridors on the map: draw them by clicks, choose one, edit it by its handles. */
+/* Areas, zones and corridors on the map: draw them by clicks, choose one, edit it by its
+   handles. */
 
 import {button, el} from "./core.js";
 import {drawingTool} from "./drawing.js";
 import {WHITE} from "./palette.js";
 import {
-  KINDS, addRing, insertVertex, isClosed, moveRing, moveVertex, nameOf, noShapes, pathAt, paths, pointsOf, removeRing,
+  KINDS, addRing, insertVertex, isClosed, moveRing, moveVertex, nameOf, noShapes, pathAt, paths,
+    pointsOf, removeRing,
   removeVertex, samePath, sizeOf,
 } from "./plan_shapes.js";
 import {vertexHandles} from "./vertices.js";
@@ -14,7 +16,8 @@ const fixed = {interactive: false};
 
 /* A ring as what handles edit. */
 const targetOf = (shapes, path) => ({
-  value: shapes, name: nameOf(shapes, path).toLowerCase(), word: isClosed(path) ? "Corner" : "Point",
+  value: shapes, name: nameOf(shapes, path).toLowerCase(),
+    word: isClosed(path) ? "Corner" : "Point",
   rings: [{points: pointsOf(shapes, path), closed: isClosed(path)}],
   move: (_, i, place) => moveVertex(shapes, path, i, place),
   insert: (_, after, place) => insertVertex(shapes, path, after, place),
@@ -85,7 +88,8 @@ export function drawing(studio, {changed, moving}) {
 
   function begin(kind, inside = null) {
     tool.begin({
-      kind: kind === "corridors" ? "line" : "polygon", colour: KINDS[kind].colour, ended: toolsShown,
+      kind: kind === "corridors" ? "line" : "polygon", colour: KINDS[kind].colour,
+        ended: toolsShown,
       done(points) {
         const added = addRing(shapes, kind, points, inside);
         chosen = added.path;
@@ -96,9 +100,11 @@ export function drawing(studio, {changed, moving}) {
   }
 
   const choices = Object.entries(KINDS).map(([kind, {title}]) => button(title, () => begin(kind)));
-  const holes = button("Hole", () => begin(chosen.kind, chosen), {title: "A no-go zone within the chosen area"});
+  const holes = button("Hole", () => begin(chosen.kind, chosen), {
+    title: "A no-go zone within the chosen area"});
   choices.splice(1, 0, holes);
-  const tools = el("div", {class: "buttons", role: "group", "aria-label": "Draw on the map"}, choices);
+  const tools = el("div", {class: "buttons", role: "group", "aria-label": "Draw on the map"},
+    choices);
 
   function toolsShown() {
     tools.hidden = tool.isDrawing();
@@ -112,18 +118,21 @@ export function drawing(studio, {changed, moving}) {
   let listed = "";
 
   function list() {
-    const rows = paths(shapes).map((path) => [path, nameOf(shapes, path), sizeOf(shapes, path), samePath(path, chosen)]);
+    const rows = paths(shapes)
+      .map((path) => [path, nameOf(shapes, path), sizeOf(shapes, path), samePath(path, chosen)]);
     const now = JSON.stringify(rows);
     if (now === listed) return;
     listed = now;
-    const focused = items.contains(document.activeElement) ? document.activeElement.dataset.at : null;
+    const focused = items.contains(document.activeElement)
+      ? document.activeElement.dataset.at : null;
     items.replaceChildren(...rows.map(([path, name, size, on]) => el(
       "li", {},
       button([name, el("small", {}, size)], () => {
         choose(on ? null : path);
         if (!on) edges.focus();
       }, {"aria-pressed": String(on), "data-at": name, class: "choose"}),
-      button("Delete", () => changed(removeRing(shapes, path)), {"aria-label": "Delete " + name.toLowerCase(), "data-at": "x" + name}),
+      button("Delete", () => changed(removeRing(shapes, path)),
+        {"aria-label": "Delete " + name.toLowerCase(), "data-at": "x" + name}),
     )));
     if (focused) (items.querySelector(`[data-at="${CSS.escape(focused)}"]`) || choices[0]).focus();
   }

@@ -18,7 +18,8 @@ export function slider(title, limits, changed, {percent = false} = {}) {
   const about = limits.about ? el("small", {id: id + "-hint"}, limits.about) : null;
   if (about) exact.setAttribute("aria-describedby", about.id);
   const unit = percent ? "%" : limits.unit || "";
-  const element = el("div", {class: "field plan-number"}, el("label", {for: id}, title), range, exact,
+  const element = el("div", {class: "field plan-number"}, el("label", {for: id}, title), range,
+    exact,
     el("span", {class: "plan-unit"}, unit), about);
 
   function taken(text) {
@@ -54,7 +55,8 @@ export function slider(title, limits, changed, {percent = false} = {}) {
 
 /* A number, or none where it is left empty. */
 export function numberField(title, {low, high, step, unit, about}, changed) {
-  const input = el("input", {type: "number", min: low, max: high, step: "any", placeholder: "not set"});
+  const input = el(
+    "input", {type: "number", min: low, max: high, step: "any", placeholder: "not set"});
   input.addEventListener("change", () => {
     const value = input.value === "" ? null : Number(input.value);
     if (value === null || Number.isFinite(value)) changed(value);
@@ -63,7 +65,9 @@ export function numberField(title, {low, high, step, unit, about}, changed) {
     const way = {ArrowUp: 1, ArrowDown: -1}[event.key];
     if (!way) return;
     event.preventDefault();
-    input.value = String(Number(Math.min(high ?? Infinity, Math.max(low ?? -Infinity, Number(input.value) + way * step)).toPrecision(9)));
+    input.value = String(
+      Number(Math.min(high ?? Infinity, Math.max(low ?? -Infinity,
+      Number(input.value) + way * step)).toPrecision(9)));
     changed(Number(input.value));
   });
   const element = field(title + (unit ? ", " + unit : ""), input, about);
@@ -73,7 +77,8 @@ export function numberField(title, {low, high, step, unit, about}, changed) {
 
 /* One of several values; `options` are [value, text]. */
 export function choice(title, options, changed, hint = "") {
-  const select = el("select", {}, options.map(([value, text]) => el("option", {value: String(value)}, text)));
+  const select = el("select", {}, options.map(
+    ([value, text]) => el("option", {value: String(value)}, text)));
   select.addEventListener("change", () => changed(options[select.selectedIndex][0]));
   const element = field(title, select, hint);
   function set(value) {
@@ -87,7 +92,8 @@ export function choice(title, options, changed, hint = "") {
 }
 
 /* Degrees from north towards a place of the compass, whole, 0 to 359. */
-const bearing = (right, up) => ((Math.round(Math.atan2(right, up) * 180 / Math.PI) % 360) + 360) % 360;
+const bearing = (right, up) =>
+  ((Math.round(Math.atan2(right, up) * 180 / Math.PI) % 360) + 360) % 360;
 
 /* An arrow that points where something flows to, as long as it is strong: drag its tip, or use the
    arrow keys. `most` is the strength at the rim. `changed(strength, towards)`. */
@@ -98,22 +104,26 @@ export function compass(title, {unit, most, step, strengthTitle}, changed) {
   const tip = el("path", {class: "tip", d: "M 0 -9 L 6 5 L -6 5 Z"});
   const north = el("text", {x: 0, y: -rim - 3}, "N");
   const svg = el("svg", {
-    viewBox: `${-size} ${-size} ${2 * size} ${2 * size}`, tabindex: "0", role: "slider", "aria-label": title + ", direction",
+    viewBox: `${-size} ${-size} ${2 * size} ${2 * size}`, tabindex: "0", role: "slider",
+      "aria-label": title + ", direction",
     "aria-valuemin": "0", "aria-valuemax": "359",
   }, el("circle", {class: "rim", r: rim}), north, line, tip);
   const strong = el("input", {type: "number", min: 0, step: "any"});
   const way = el("input", {type: "number", min: 0, max: 359, step: "any"});
   const element = el("div", {class: "plan-compass"}, el("h3", {}, title), svg,
-    el("div", {}, field(strengthTitle + ", " + unit, strong), field("Towards, degrees from north", way)));
+    el("div", {}, field(strengthTitle + ", " + unit, strong),
+      field("Towards, degrees from north", way)));
 
   function draw() {
     const reach = rim * Math.min(1, strength / most);
-    const [x, y] = [reach * Math.sin(towards * Math.PI / 180), -reach * Math.cos(towards * Math.PI / 180)];
+    const [x, y] = [reach * Math.sin(towards * Math.PI / 180),
+      -reach * Math.cos(towards * Math.PI / 180)];
     line.setAttribute("x2", x);
     line.setAttribute("y2", y);
     tip.setAttribute("transform", `translate(${x} ${y}) rotate(${towards})`);
     svg.setAttribute("aria-valuenow", String(Math.round(towards)));
-    svg.setAttribute("aria-valuetext", `${strength} ${unit} towards ${Math.round(towards)} degrees`);
+    svg.setAttribute(
+      "aria-valuetext", `${strength} ${unit} towards ${Math.round(towards)} degrees`);
     if (document.activeElement !== strong) strong.value = strength;
     if (document.activeElement !== way) way.value = towards;
   }
@@ -137,7 +147,8 @@ export function compass(title, {unit, most, step, strengthTitle}, changed) {
     svg.setPointerCapture(event.pointerId);
     dragged(event);
   });
-  svg.addEventListener("pointermove", (event) => { if (svg.hasPointerCapture(event.pointerId)) dragged(event); });
+  svg.addEventListener("pointermove", (event) => {
+    if (svg.hasPointerCapture(event.pointerId)) dragged(event); });
   svg.addEventListener("keydown", (event) => {
     const [turn, more] = {
       ArrowLeft: [-5, 0], ArrowRight: [5, 0], ArrowUp: [0, step], ArrowDown: [0, -step],

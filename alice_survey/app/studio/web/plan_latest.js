@@ -1,9 +1,9 @@
 /* Ask for the newest state only: a request waits until edits pause, stops the one on its way, and
    no answer is shown after that of a newer request. */
 
-/* `ask(state, signal)` returns a promise; `shown(answer, state)`, `failed(error, state)` and `busy(on)`
-   are called for the newest request alone. */
-export function latest({ask, shown, failed, busy = () => {}, delay = 120}) {
+/* `ask(state, signal)` returns a promise; `shown(answer, state)`, `failed(error, state)` and
+   `busy(on)` are called for the newest request alone. */
+export function latest({ask, shown, failed, busy = (_) => {}, delay = 120}) {
   let [number, timer, onItsWay] = [0, null, null];
 
   function stop() {

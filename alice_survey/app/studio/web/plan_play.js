@@ -13,8 +13,10 @@ export function playback({ask, mark}) {
   const still = window.matchMedia("(prefers-reduced-motion: reduce)");
   const toggle = button("Play", () => (running ? pause() : play()));
   const scrub = el("input", {type: "range", min: 0, max: 1, step: "any", value: 0, disabled: true});
-  const speed = el("select", {}, SPEEDS.map((times) => el("option", {value: times}, paceText(times))));
-  const readout = el("p", {class: "note"}, "The vehicle on its way, as planned, or as flown where it was.");
+  const speed = el("select", {}, SPEEDS.map(
+    (times) => el("option", {value: times}, paceText(times))));
+  const readout = el("p", {class: "note"},
+    "The vehicle on its way, as planned, or as flown where it was.");
   speed.selectedIndex = 2;
   let [dive, time, running, before] = [null, 0, false, 0];
 
@@ -59,9 +61,13 @@ export function playback({ask, mark}) {
   function show() {
     const state = stateAt(dive, time);
     const taken = countUpTo(dive.pictures_s, time);
-    const text = clock(time) + " of " + clock(Number(scrub.max)) + ", " + dive.what + ": depth " + state.depth.toFixed(2)
-      + " m" + (Number.isNaN(state.altitude) ? "" : ", altitude " + state.altitude.toFixed(2) + " m") + ", heading " + Math.round(state.heading) % 360 + "°, "
-      + taken.toLocaleString("en") + " of " + dive.pictures_s.length.toLocaleString("en") + " pictures";
+    const text = clock(time) + " of " + clock(Number(scrub.max)) + ", " + dive.what + ": depth "
+      + state.depth.toFixed(2)
+      + " m" + (Number.isNaN(state.altitude)
+        ? "" : ", altitude " + state.altitude.toFixed(2) + " m") + ", heading "
+        + Math.round(state.heading) % 360 + "°, "
+      + taken.toLocaleString("en") + " of " + dive.pictures_s.length.toLocaleString("en")
+        + " pictures";
     scrub.value = time;
     scrub.setAttribute("aria-valuetext", clock(time));
     readout.textContent = text;
@@ -83,6 +89,7 @@ export function playback({ask, mark}) {
     [dive, time, scrub.disabled, scrub.value] = [null, 0, true, 0];
   }
 
-  const element = el("div", {}, el("div", {class: "buttons"}, toggle), field("Time", scrub), field("Speed", speed), readout);
+  const element = el("div", {}, el("div", {class: "buttons"}, toggle), field("Time", scrub), field(
+    "Speed", speed), readout);
   return {element, forget, pause};
 }

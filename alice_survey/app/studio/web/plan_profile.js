@@ -9,14 +9,16 @@ export function planProfile(pointed) {
   let [held, routes, along] = [null, [], []];
   const chart = profileChart("Place along the way", {
     describe,
-    pointed: (length) => pointed(length === null || !held ? null : profileAt(held, routes, along, length).place),
+    pointed: (length) =>
+      pointed(length === null || !held ? null : profileAt(held, routes, along, length).place),
   });
 
   function describe(length) {
     const {dive, floor, vehicle} = profileAt(held, routes, along, length);
     return fixed(length, 0, "m") + " along, dive " + dive
       + (Number.isFinite(vehicle) ? ": camera at " + fixed(vehicle, 2, "m") : "")
-      + (Number.isFinite(floor - vehicle) ? ", " + fixed(floor - vehicle, 2, "m") + " over the sea floor at " + fixed(floor, 2, "m") : "");
+      + (Number.isFinite(floor - vehicle) ? ", " + fixed(floor - vehicle, 2, "m")
+        + " over the sea floor at " + fixed(floor, 2, "m") : "");
   }
 
   function show(profile, newRoutes) {
@@ -27,7 +29,8 @@ export function planProfile(pointed) {
     }
     along = growing(held.s_m);
     chart.show({
-      lines: [{kind: "floor", xs: along, ys: held.floor_depth_m, ground: true}, {kind: "vehicle", xs: along, ys: held.vehicle_depth_m}],
+      lines: [{kind: "floor", xs: along, ys: held.floor_depth_m, ground: true},
+        {kind: "vehicle", xs: along, ys: held.vehicle_depth_m}],
       downwards: true, caption: "along the way, m; depth, m",
       rules: along.filter((_, i) => i && held.dive[i] !== held.dive[i - 1]),
     });

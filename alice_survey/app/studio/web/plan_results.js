@@ -21,15 +21,18 @@ export function resultsPanel(apply) {
       refuse(preview);
       return;
     }
-    key.replaceChildren(...keyFigures(preview.totals).map(([name, text]) => el("div", {}, el("dt", {}, name), el("dd", {}, text))));
+    key.replaceChildren(...keyFigures(preview.totals).map(
+      ([name, text]) => el("div", {}, el("dt", {}, name), el("dd", {}, text))));
     totals.replaceChildren(table("Totals", [], totalRows(preview.totals)));
     warnings.hidden = !preview.warnings.length;
     warnings.replaceChildren(...preview.warnings.map((text) => el("li", {}, text)));
     const binding = preview.limits.filter((limit) => limit.binds);
     limitsBox.hidden = !preview.limits.length;
     limitsBox.querySelector("summary").textContent = "Limits: " + (binding.length
-      ? binding.map((limit) => limit.name).join(", ") + (binding.length > 1 ? " bind" : " binds") : "none binds");
-    limits.replaceChildren(el("ul", {}, preview.limits.map((limit) => el("li", limit.binds ? {class: "binds"} : {},
+      ? binding.map((limit) => limit.name).join(", ")
+        + (binding.length > 1 ? " bind" : " binds") : "none binds");
+    limits.replaceChildren(
+      el("ul", {}, preview.limits.map((limit) => el("li", limit.binds ? {class: "binds"} : {},
       (limit.binds ? "Binds: " : "") + limit.text, el("small", {}, limit.name)))));
     rowsBox.hidden = !preview.rows.length;
     rows.replaceChildren(table("Settings and why", ["setting", "value", "why"], preview.rows));
@@ -47,5 +50,6 @@ export function resultsPanel(apply) {
   }
 
   const totalsBox = el("details", {}, el("summary", {}, "All figures"), totals);
-  return {key, top: el("div", {}, refused, warnings), below: el("div", {}, totalsBox, limitsBox, rowsBox), show};
+  return {key, top: el("div", {}, refused, warnings),
+    below: el("div", {}, totalsBox, limitsBox, rowsBox), show};
 }

@@ -29,7 +29,8 @@ export function paths(shapes) {
   )));
 }
 
-export const samePath = (a, b) => Boolean(a && b) && a.kind === b.kind && a.index === b.index && a.ring === b.ring;
+export const samePath = (a, b) => Boolean(a && b) && a.kind === b.kind && a.index === b.index
+  && a.ring === b.ring;
 
 /* The points of a ring or a corridor; an empty list where there is none. */
 export function pointsOf(shapes, {kind, index, ring}) {
@@ -101,10 +102,12 @@ export function addRing(shapes, kind, points, inside = null) {
   }
   const shape = kind === "corridors" ? own : {outer: own, holes: []};
   const before = shapes[kind] || [];
-  return {shapes: {...shapes, [kind]: [...before, shape]}, path: {kind, index: before.length, ring: 0}};
+  return {shapes: {...shapes, [kind]: [...before, shape]},
+    path: {kind, index: before.length, ring: 0}};
 }
 
-/* With the shapes of a file: survey areas, corridors and each other kind that it has replace ours. */
+/* With the shapes of a file: survey areas, corridors and each other kind that it has replace
+   ours. */
 export function withImported(shapes, imported) {
   const some = (kind) => (imported[kind] || []).length > 0;
   const areas = some("survey") || some("corridors");
@@ -163,7 +166,8 @@ export function pathAt(shapes, place, reach) {
   let smallest = Infinity;
   paths(shapes).filter(isClosed).forEach((path) => {
     const points = pointsOf(shapes, path);
-    if (encloses(points, place) && areaOf(points) < smallest) [best, smallest] = [path, areaOf(points)];
+    if (encloses(points, place) && areaOf(points) < smallest) [best, smallest] =
+      [path, areaOf(points)];
   });
   return best;
 }
@@ -175,7 +179,8 @@ export function boundsOf(shapes) {
   const [norths, easts] = [all.map(([n]) => n), all.map(([, e]) => e)];
   const reduced = (pick, values) => values.reduce((a, b) => pick(a, b));
   return [
-    reduced(Math.min, norths), reduced(Math.min, easts), reduced(Math.max, norths), reduced(Math.max, easts),
+    reduced(Math.min, norths), reduced(Math.min, easts), reduced(Math.max, norths),
+      reduced(Math.max, easts),
   ];
 }
 

@@ -22,13 +22,15 @@ export function shown(studio) {
   const off = new Set(["plan-footprints"]);
   const away = new Set();
   const marks = leaflet.featureGroup();
-  let [names, stations, number, active, last, sigmaLayer, whole, fitted] = [new Set(), null, 0, false, null, null, null, ""];
+  let [names, stations, number, active, last, sigmaLayer, whole, fitted] =
+    [new Set(), null, 0, false, null, null, null, ""];
   map.moreAt((place) => (active && stations ? stations.textAt(place) : ""));
 
   function put(about) {
     names.add(about.name);
     const layer = map.put({
-      group: GROUP, texts: [], fill: 0, dashed: false, about: "", shown: !off.has(about.name), ...about,
+      group: GROUP, texts: [], fill: 0, dashed: false, about: "", shown: !off.has(about.name),
+        ...about,
     });
     /* A click chooses an area; what a line is appears under the pointer. */
     layer.eachLayer?.((shape) => shape.off("click"));
@@ -52,22 +54,28 @@ export function shown(studio) {
   function putLayers(preview) {
     const {totals, holes, homes, routes, outline, area} = preview;
     put({
-      kind: "polygon", name: "plan-allowed", title: "The vehicle may be within", colour: PLAN.allowed, dashed: true, width: 1.2,
+      kind: "polygon", name: "plan-allowed", title: "The vehicle may be within",
+        colour: PLAN.allowed, dashed: true, width: 1.2,
       shapes: area.allowed.flat().map((ring) => [...ring, ring[0]].map(eastNorth)),
     });
     if (holes.length) {
       put({
-        kind: "polygon", name: "plan-holes", title: counted(holes.length, "hole"), colour: PLAN.missed, fill: 0.25,
+        kind: "polygon", name: "plan-holes", title: counted(holes.length, "hole"),
+          colour: PLAN.missed, fill: 0.25,
         shapes: holes.map((hole) => hole.outer.map(eastNorth)),
         texts: holes.map((hole) => "Not seen: " + hole.area_m2.toFixed(2) + " m²"),
       });
     }
-    const footprints = put({kind: "polygon", name: "plan-footprints", title: "Footprints", colour: PLAN.footprint, shapes: []});
+    const footprints =
+      put({kind: "polygon", name: "plan-footprints", title: "Footprints", colour: PLAN.footprint,
+      shapes: []});
     putLines("plan-way", "Way between lines", PLAN.way, routes.flatMap(pieces), 1.1);
     const drawn = lineLayers(preview.lines);
-    const points = put({kind: "point", name: "plan-stations", title: "Stations", colour: PLAN.survey, shapes: []});
+    const points = put(
+      {kind: "point", name: "plan-stations", title: "Stations", colour: PLAN.survey, shapes: []});
     put({
-      kind: "point", name: "plan-home", title: homes.length > 1 ? "Homes" : "Home", colour: PLAN.home, shapes: homes.map((home) => [eastNorth(home)]),
+      kind: "point", name: "plan-home", title: homes.length > 1 ? "Homes" : "Home",
+        colour: PLAN.home, shapes: homes.map((home) => [eastNorth(home)]),
     });
     const rights = outline.map(([, right]) => right);
     stations = drawStations(map.leaflet, {
@@ -81,7 +89,8 @@ export function shown(studio) {
   /* Lines of one colour with a light rim: two shapes, however many lines there are. */
   function putLines(name, title, colour, lines, weight) {
     const group = put({kind: "line", name, title, colour, shapes: []});
-    const rim = leaflet.polyline(lines, {color: WHITE, weight: 5, opacity: 0.75, interactive: false});
+    const rim = leaflet.polyline(
+      lines, {color: WHITE, weight: 5, opacity: 0.75, interactive: false});
     const drawn = leaflet.polyline(lines, {color: colour, weight, interactive: false});
     drawn.survey = {title, text: ""};
     group.addLayer(rim).addLayer(drawn);
@@ -100,14 +109,16 @@ export function shown(studio) {
     const drawn = kinds.flatMap((kind) => {
       const own = numbered.filter((line) => line.kind === kind);
       const ends = own.map(({from, to}) => [from, to]);
-      const group = putLines("plan-" + kind, counted(own.length, kind + " line"), PLAN[kind], ends, 1.7);
+      const group = putLines("plan-" + kind, counted(own.length, kind + " line"), PLAN[kind], ends,
+        1.7);
       groups.push(group);
       return own.map((line) => {
         const made = stationLine(line.from, line.to, {
           group, index: line.index, first: line.first, stations: line.stations, colour: PLAN[kind],
         });
         const heading = ((made.heading * 180 / Math.PI) + 360) % 360;
-        made.text = "Line " + line.index + ", dive " + line.dive + ": " + made.length.toFixed(2) + " m, heading "
+        made.text = "Line " + line.index + ", dive " + line.dive + ": " + made.length.toFixed(2)
+          + " m, heading "
           + heading.toFixed(1) + "°, " + counted(line.stations, "station");
         return made;
       });
@@ -123,7 +134,8 @@ export function shown(studio) {
     const canvas = document.createElement("canvas");
     [canvas.width, canvas.height] = [pixels.width, pixels.height];
     canvas.getContext("2d").putImageData(pixels, 0, 0);
-    putPicture("plan-counts", "Pictures that see a place", canvas.toDataURL(), {...counts, ...size(pixels)}, {
+    putPicture("plan-counts", "Pictures that see a place", canvas.toDataURL(),
+      {...counts, ...size(pixels)}, {
       about: "Orange: below the requested overlap.",
       scale: {label: "pictures that see a place", low: 0, high: most, colours: COUNTS},
     });
@@ -132,7 +144,8 @@ export function shown(studio) {
   const size = ({width, height}) => ({width, height});
   function putPicture(name, title, address, {north, west, pixel, width, height}, more) {
     put({
-      kind: "picture", name, title, address, north, west, pixel, width, height, tile: Math.max(width, height), levels: 1, base: false, ...more,
+      kind: "picture", name, title, address, north, west, pixel, width, height,
+        tile: Math.max(width, height), levels: 1, base: false, ...more,
     });
   }
 
@@ -141,7 +154,8 @@ export function shown(studio) {
     const own = number;
     const pixels = await readPixels(layer.png);
     if (own !== number || !active) return;
-    putPicture("plan-sigma", layer.title || "Expected sigma of the model", layer.png, {...layer, ...size(pixels)}, {scale: layer.scale});
+    putPicture("plan-sigma", layer.title || "Expected sigma of the model", layer.png,
+      {...layer, ...size(pixels)}, {scale: layer.scale});
   }
 
   /* The expected sigma as a layer, until the plan is another one. */
@@ -158,8 +172,10 @@ export function shown(studio) {
   function mark(place, heading = null, way = []) {
     marks.clearLayers();
     if (!place) return;
-    const style = {color: WHITE, weight: 2, fillColor: PLAN.mark, fillOpacity: 1, interactive: false};
-    if (way.length > 1) marks.addLayer(leaflet.polyline(way, {color: PLAN.mark, weight: 3, opacity: 0.8, interactive: false}));
+    const style = {color: WHITE, weight: 2, fillColor: PLAN.mark, fillOpacity: 1,
+      interactive: false};
+    if (way.length > 1) marks.addLayer(
+      leaflet.polyline(way, {color: PLAN.mark, weight: 3, opacity: 0.8, interactive: false}));
     if (heading === null) marks.addLayer(leaflet.circleMarker(place, {...style, radius: 6}));
     else {
       const px = 1 / 2 ** map.leaflet.getZoom();
@@ -185,7 +201,8 @@ export function shown(studio) {
 
   /* The plan as it was made is put away while the one in work is shown. */
   function alone() {
-    MADE.filter((name) => map.layers.has(name) && map.leaflet.hasLayer(map.layers.get(name))).forEach((name) => {
+    MADE.filter((name) => map.layers.has(name) && map.leaflet.hasLayer(map.layers.get(name)))
+      .forEach((name) => {
       away.add(name);
       map.show(name, false);
     });
@@ -218,6 +235,7 @@ export function shown(studio) {
     away.clear();
   }
 
-  const dim = (on) => { map.leaflet.getContainer().closest("main").toggleAttribute("data-planning", on); };
+  const dim = (on) => { map.leaflet.getContainer().closest("main").toggleAttribute(
+    "data-planning", on); };
   return {show, sigma, mark, fit, alone, enter, leave, dim};
 }

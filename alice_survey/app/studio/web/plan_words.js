@@ -6,6 +6,7 @@ import {counted, duration, share} from "./words.js";
 const known = (value) => value !== null && value !== undefined && !Number.isNaN(value);
 const rounded = (value, digits) => Number(value.toPrecision(digits)).toString().replace("-", "−");
 
+/** @type {[string, (totals: any) => string | false][]} */
 const ROWS = [
   ["Area", (t) => known(t.area_m2) && rounded(t.area_m2, 4) + " m²"],
   ["Covered", (t) => known(t.covered) && share(t.covered)],
@@ -40,8 +41,10 @@ export function totalRows(totals) {
 /* [name, text] of the six that say most. */
 export function keyFigures(t) {
   return [
-    ["Time", duration(t.duration_s)], ["Dives", String(t.dives)], ["Energy", Math.round(t.energy_wh) + " Wh"],
-    ["Pictures", t.pictures.toLocaleString("en")], ["Data", rounded(t.data_gb, 3) + " GB"], ["Covered", share(t.covered)],
+    ["Time", duration(t.duration_s)], ["Dives", String(t.dives)],
+      ["Energy", Math.round(t.energy_wh) + " Wh"],
+    ["Pictures", t.pictures.toLocaleString("en")], ["Data", rounded(t.data_gb, 3) + " GB"],
+      ["Covered", share(t.covered)],
   ];
 }
 
@@ -61,7 +64,8 @@ export function summaryOf(preview) {
 const OUTSIDE = 255;
 
 /* Pixels of the picture of counts as they are shown: red pictures, green lines, blue 1 at the
-   requested overlap. Returns the greatest count; writes the colours into `data`, four bytes a pixel. */
+   requested overlap. Returns the greatest count; writes the colours into `data`, four bytes a
+   pixel. */
 export function paintCounts(data) {
   const counts = [];
   for (let i = 0; i < data.length; i += 4) if (data[i] !== OUTSIDE) counts.push(data[i]);

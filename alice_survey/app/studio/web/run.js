@@ -1,4 +1,5 @@
-/* The Run tab: what is made, what is left and what it takes; the job that runs, its log, its end. */
+/* The Run tab: what is made, what is left and what it takes; the job that runs, its log, its
+   end. */
 
 import {attempt, button, el, field, get, mayWrite, on, say, send, table} from "./core.js";
 import {showSteps} from "./job_progress.js";
@@ -22,6 +23,9 @@ const LONG_S = 20;
 const LOUD_EVERY_S = 60;
 const SILENT_MS = 6000;
 
+const secondsOf = ({started_utc: start, ended_utc: end}) =>
+  (new Date(end).getTime() - new Date(start).getTime()) / 1000;
+
 export function tab(studio) {
   const job = el("section", {class: "job", "aria-label": "Running now", hidden: true});
   const last = el("section", {class: "job", "aria-label": "Last run", hidden: true});
@@ -31,7 +35,8 @@ export function tab(studio) {
   const history = historyView();
   const options = optionsView();
   const more = moreView();
-  const work = el("div", {}, job, last, begin, el("h2", {}, "Stages"), stages, options.element, more.element, log.element, history.element);
+  const work = el("div", {}, job, last, begin, el("h2", {}, "Stages"), stages, options.element,
+    more.element, log.element, history.element);
   const first = el("div", {hidden: true});
   const panel = el("div", {class: "run"}, first, work);
   let known = null;
@@ -57,7 +62,8 @@ export function tab(studio) {
     first.hidden = !known.new || Boolean(running);
     work.hidden = !first.hidden;
     wide(!first.hidden && opened);
-    if (!first.hidden && !first.firstChild) first.append(startPage(studio, {started: load, disk: known.disk, others: known.others}));
+    if (!first.hidden && !first.firstChild) first.append(
+      startPage(studio, {started: load, disk: known.disk, others: known.others}));
     if (!first.hidden) showLast(first.querySelector(".start-last"));
     if (work.hidden) return;
     showJob();
@@ -82,22 +88,28 @@ export function tab(studio) {
     if (!running) {
       const what = known.elsewhere.stage ? `: it makes ${known.elsewhere.stage}` : "";
       job.replaceChildren(el("h2", {}, "Another command is working here"),
-        el("p", {}, `A terminal or another program works in this survey${what}. Nothing else can start until it ends; it can be stopped only there.`));
+        el("p", {}, `A terminal or another program works in this survey${what}. Nothing else can `
+          + `start until it ends; it can be stopped only there.`));
       return;
     }
     if (job.dataset.number !== String(running.number)) {
       job.dataset.number = running.number;
-      job.replaceChildren(el("h2", {}, running.title), el("p", {class: "what"}), el("div", {class: "bars"}),
+      job.replaceChildren(el("h2", {}, running.title), el("p", {class: "what"}), el(
+        "div", {class: "bars"}),
         el("p", {class: "warn", hidden: true}),
-        el("div", {class: "buttons"}, button("Stop", stop, {class: "stop", disabled: !mayWrite()})));
+        el("div", {class: "buttons"}, button("Stop", stop,
+          {class: "stop", disabled: !mayWrite()})));
     }
     const stopping = running.state === "stopping";
     const stage = running.stage_title ? `${running.stage_title}, ` : "";
-    job.querySelector(".what").textContent = stopping ? "stopping: what is made so far is kept" : `${stage}running for ${duration(running.elapsed_s)}`;
+    job.querySelector(".what").textContent = stopping
+      ? "stopping: what is made so far is kept" : `${stage}running for `
+        + `${duration(running.elapsed_s)}`;
     showSteps(job.querySelector(".bars"), running);
     const warned = job.querySelector(".warn");
     warned.hidden = !running.warned;
-    warned.textContent = running.warned ? `${counted(running.warned, "warning")}; the last: ${running.warnings.at(-1)}` : "";
+    warned.textContent = running.warned
+      ? `${counted(running.warned, "warning")}; the last: ${running.warnings.at(-1)}` : "";
     job.querySelector(".stop").disabled = stopping || !mayWrite();
     speak();
   }
@@ -108,7 +120,8 @@ export function tab(studio) {
     const isNew = running.stage_title !== spoken.stage;
     if (!isNew && (Date.now() - spoken.at < 1000 * LOUD_EVERY_S || !step)) return;
     if (isNew && running.stage_title) say(`${running.stage_title} begins`);
-    else if (step) say(`${running.stage_title}: ${step.step}, about ${duration(step.remaining_s)} left`);
+    else if (step) say(
+      `${running.stage_title}: ${step.step}, about ${duration(step.remaining_s)} left`);
     spoken = {stage: running.stage_title, at: Date.now()};
   }
 
@@ -138,18 +151,25 @@ export function tab(studio) {
     place.hidden = !ended || Boolean(running) || Boolean(known.elsewhere);
     if (place.hidden) return;
     const [icon, colour, words] = ENDS[ended.state] || ENDS.killed;
-    const again = {done: null, stopped: "Go on", failed: "Try again", killed: "Start again"}[ended.state];
+    const again = {done: null, stopped: "Go on", failed: "Try again", killed: "Start again"}[
+      ended.state];
     const ways = (ended.ways || []).map((way) => el("li", {}, el("code", {}, way.command), " ",
       way.name ? button(way.title, () => start(way.name), {disabled: !mayWrite()}) : null));
     place.replaceChildren(...[
-      el("h2", {}, el("span", {class: "icon " + colour, "aria-hidden": "true"}, icon), ` ${ended.title}: ${words}`),
-      el("p", {}, `${ago(ended.ended_utc)}, after ${duration((new Date(ended.ended_utc) - new Date(ended.started_utc)) / 1000)}`),
-      ended.line ? el("p", {class: ["failed", "killed"].includes(ended.state) ? "line error" : "line"}, ended.line) : null,
+      el("h2", {}, el("span", {class: "icon " + colour, "aria-hidden": "true"}, icon),
+        ` ${ended.title}: ${words}`),
+      el("p", {}, `${ago(ended.ended_utc)}, after `
+        + `${duration(secondsOf(ended))}`),
+      ended.line ? el("p",
+        {class: ["failed", "killed"].includes(ended.state) ? "line error" : "line"},
+        ended.line) : null,
       ways.length ? el("div", {}, el("p", {}, "The way on:"), el("ul", {}, ways)) : null,
       el("div", {class: "buttons"},
-        again && ended.name !== "import-images" ? button(again, () => repeat(ended), {disabled: !mayWrite()}) : null,
+        again && ended.name !== "import-images"
+          ? button(again, () => repeat(ended), {disabled: !mayWrite()}) : null,
         button("Show its log", () => log.show(ended)),
-        ended.state === "done" && ended.finished.includes("report") ? button("Open the report", report) : null),
+        ended.state === "done" && ended.finished.includes("report")
+          ? button("Open the report", report) : null),
     ].filter(Boolean));
   }
 
@@ -158,28 +178,35 @@ export function tab(studio) {
   /* ---- What is left ---- */
 
   function costText(cost) {
-    return cost ? `About ${duration(cost.time_s)} on ${counted(known.cores, "core")}, ${gigabytes(cost.disk_mb)} of disk` : "";
+    return cost ? `About ${duration(cost.time_s)} on ${counted(known.cores, "core")}, `
+      + `${gigabytes(cost.disk_mb)} of disk` : "";
   }
 
   function showBegin() {
     const free = el("small", {}, `${number(known.disk.free_gb, "GB", 3)} of the disk are free`);
     if (known.fault) {
       begin.replaceChildren(el("p", {class: "error line"}, known.fault),
-        known.ways.length ? el("ul", {}, known.ways.map((way) => el("li", {}, el("code", {}, way.command)))) : null,
+        known.ways.length
+          ? el("ul", {}, known.ways.map((way) => el("li", {}, el("code", {}, way.command)))) : null,
         el("p", {}, "The stages are shown once that is settled."));
       return;
     }
-    const wanted = known.commands.filter((one) => (known.imported ? ["reconstruct", "report"] : ["run"]).includes(one.name));
+    const wanted = known.commands.filter(
+      (one) => (known.imported ? ["reconstruct", "report"] : ["run"]).includes(one.name));
     const all = wanted.find((one) => one.left.length);
     const left = all ? all.left : [];
     const tight = all?.cost && all.cost.disk_mb / 1000 > 0.9 * known.disk.free_gb;
     const made = known.stages.find((one) => one.name === "report");
     begin.replaceChildren(...[
-      left.length ? el("p", {}, costText(all.cost) || "What it takes is known once there is a plan or pictures.", el("br"), free)
+      left.length ? el("p", {}, costText(all.cost)
+        || "What it takes is known once there is a plan or pictures.", el("br"), free)
         : el("p", {}, "All stages are up to date. ", free),
-      tight ? el("p", {class: "error"}, "That is more than there is room for: free some of the disk first.") : null,
+      tight ? el("p", {class: "error"},
+        "That is more than there is room for: free some of the disk first.") : null,
       el("div", {class: "buttons"},
-        left.length ? button(all.title, () => start(all.name, options.of(all.name)), {class: "primary", disabled: Boolean(running) || Boolean(known.elsewhere) || !mayWrite()}) : null,
+        left.length ? button(all.title, () => start(all.name, options.of(all.name)), {
+          class: "primary", disabled: Boolean(running) || Boolean(known.elsewhere)
+          || !mayWrite()}) : null,
         made && made.made_utc ? button("Open the report", report) : null),
     ].filter(Boolean));
   }
@@ -191,45 +218,61 @@ export function tab(studio) {
       const busy = Boolean(running) || Boolean(known.elsewhere);
       const begun = own.some((stage) => stage.state === "interrupted");
       const word = command.left.length && !command.after.length ? begun ? "Go on" : "Start" : null;
-      const after = known.commands.filter((one) => one.name !== "run" && one.left.some((name) => command.after.includes(name)));
+      const after = known.commands.filter((one) => one.name !== "run" && one.left.some(
+        (name) => command.after.includes(name)));
       return el("section", {class: "group", "aria-label": command.title},
         el("div", {class: "head"}, el("h3", {}, command.title),
-          word ? button(word, () => start(command.name, options.of(command.name)), {"aria-label": `${word}: ${command.title}`, disabled: busy || !mayWrite()}) : null),
+          word ? button(word, () => start(command.name, options.of(command.name)),
+            {"aria-label": `${word}: ${command.title}`, disabled: busy || !mayWrite()}) : null),
         after.length ? el("small", {}, "after: " + after.map((one) => one.title).join(", ")) : null,
         command.cost ? el("small", {}, costText(command.cost)) : null,
         el("ul", {}, own.map(row)));
     }).filter(Boolean);
-    const rest = known.stages.filter((stage) => !known.commands.some((one) => one.name === stage.command));
-    if (rest.length) groups.unshift(el("section", {class: "group", "aria-label": "Pictures"}, el("div", {class: "head"}, el("h3", {}, "Imported pictures")), el("ul", {}, rest.map(row))));
+    const rest = known.stages.filter((stage) => !known.commands.some(
+      (one) => one.name === stage.command));
+    if (rest.length) groups.unshift(
+      el("section", {class: "group", "aria-label": "Pictures"},
+      el("div", {class: "head"}, el("h3", {}, "Imported pictures")), el("ul", {}, rest.map(row))));
     stages.replaceChildren(...groups);
   }
 
   function row(stage) {
-    const working = running && running.stage === stage.folder && !running.finished.includes(stage.folder);
+    const working = running && running.stage === stage.folder
+      && !running.finished.includes(stage.folder);
     const [icon, colour, words] = STATES[working ? "working" : stage.state] || STATES.missing;
     const why = stage.why && !working ? ` (${stage.why})` : "";
-    const took = stage.took_s === null ? "" : `; took ${duration(stage.took_s)}${stage.made_utc ? ", " + ago(stage.made_utc) : ""}`;
-    const broken = failed && failed.name === stage.command && stage.state !== "up to date" && !running && failed.stage === stage.folder;
-    const open = stage.products.filter((one) => /\.(html|json|csv|txt|pdf|png)$/.test(one.path) || !one.path.includes("."));
+    const took = stage.took_s === null
+      ? "" : `; took ${duration(stage.took_s)}${stage.made_utc ? ", " + ago(stage.made_utc) : ""}`;
+    const broken = failed && failed.name === stage.command && stage.state !== "up to date"
+      && !running && failed.stage === stage.folder;
+    const open = stage.products.filter((one) => /\.(html|json|csv|txt|pdf|png)$/.test(one.path)
+      || !one.path.includes("."));
     return el("li", {"data-stage": stage.name, "data-state": working ? "working" : stage.state},
       el("span", {class: "icon " + colour, "aria-hidden": "true"}, icon),
       el("div", {}, el("strong", {}, stage.name), ` ${words}${why}${took}`,
         broken ? el("p", {class: "error line"}, failed.line) : null,
         el("small", {}, stage.about),
-        open.length ? el("small", {}, open.map((one, i) => [i ? ", " : "", one.path === "report/report.html"
-          ? el("a", {href: "#run", onclick: (event) => { event.preventDefault(); report(); }}, one.about)
-          : el("a", {href: "/files/" + one.path + (one.path.includes(".") ? "" : "/"), target: "_blank", rel: "noopener"}, one.about)])) : null));
+        open.length ? el("small", {}, open.map(
+          (one, i) => [i ? ", " : "", one.path === "report/report.html"
+          ? el("a", {href: "#run", onclick: (event) => { event.preventDefault(); report(); }},
+            one.about)
+          : el("a", {href: "/files/" + one.path + (one.path.includes(".") ? "" : "/"),
+            target: "_blank", rel: "noopener"}, one.about)])) : null));
   }
 
   /* ---- The report, inside ---- */
 
   function report() {
-    const frame = el("iframe", {src: "/files/report/report.html", sandbox: "allow-scripts", title: "Report of the survey"});
+    const frame = el(
+      "iframe", {src: "/files/report/report.html", sandbox: "allow-scripts",
+      title: "Report of the survey"});
     const close = button("Close the report", () => sheet.close(), {class: "primary"});
     const sheet = el("dialog", {class: "report", "aria-label": "Report of the survey"},
       el("div", {class: "buttons"}, close,
-        el("a", {href: "/files/report/report.html", target: "_blank", rel: "noopener"}, "in a page of its own"),
-        el("a", {href: "/files/report/report.pdf", target: "_blank", rel: "noopener"}, "PDF")), frame);
+        el("a", {href: "/files/report/report.html", target: "_blank", rel: "noopener"},
+          "in a page of its own"),
+        el("a", {href: "/files/report/report.pdf", target: "_blank", rel: "noopener"}, "PDF")),
+          frame);
     sheet.addEventListener("close", () => sheet.remove());
     document.body.append(sheet);
     sheet.showModal();
@@ -239,7 +282,8 @@ export function tab(studio) {
 
   function optionsView() {
     const threads = el("input", {type: "number", min: 1, max: 256, step: 1, placeholder: "all"});
-    const scale = el("input", {type: "number", min: 1, max: 16, step: 1, placeholder: "as in the settings"});
+    const scale = el(
+      "input", {type: "number", min: 1, max: 16, step: 1, placeholder: "as in the settings"});
     const given = (input) => (input.value && input.checkValidity() ? Number(input.value) : null);
     const takes = {run: ["threads", "scale"], image: ["threads", "scale"], plan: [], fly: []};
     return {
@@ -248,7 +292,8 @@ export function tab(studio) {
         field("Resolution of rendered pictures divided by", scale, "4 renders 16 times faster")),
       of(name) {
         const values = {threads: given(threads), scale: given(scale)};
-        return Object.fromEntries((takes[name] || ["threads"]).filter((key) => values[key] !== null).map((key) => [key, values[key]]));
+        return Object.fromEntries((takes[name] || ["threads"]).filter((key) => values[key] !== null)
+          .map((key) => [key, values[key]]));
       },
     };
   }
@@ -267,7 +312,8 @@ export function tab(studio) {
       show(state, busy) {
         const made = (name) => state.stages.some((stage) => stage.name === name && stage.made_utc);
         list.replaceChildren(...rows.filter((one) => made(one[2])).map(([name, title]) =>
-          button(title, () => start(name), {disabled: Boolean(busy) || Boolean(state.elsewhere) || !mayWrite()})));
+          button(title, () => start(name),
+            {disabled: Boolean(busy) || Boolean(state.elsewhere) || !mayWrite()})));
         this.element.hidden = !list.firstChild;
       },
     };
@@ -297,8 +343,9 @@ export function tab(studio) {
     running = null;
     finished = 0;
     const [icon, , words] = ENDS[ended.state] || ENDS.killed;
-    const lasted = (new Date(ended.ended_utc) - new Date(ended.started_utc)) / 1000;
-    say(`${ended.title}: ${words}${ended.state === "done" ? "" : ". " + ended.line}`, {done: "note", stopped: "warn"}[ended.state] || "error");
+    const lasted = secondsOf(ended);
+    say(`${ended.title}: ${words}${ended.state === "done" ? "" : ". " + ended.line}`,
+      {done: "note", stopped: "warn"}[ended.state] || "error");
     if (lasted > LONG_S && !document.hasFocus()) notice(`${icon} ${words}: ${ended.title}`);
     log.follow({number: ended.number});
     await attempt(() => studio.refresh());
@@ -360,8 +407,12 @@ function logView() {
     busy = false;
     if (!found || asked !== job) return;
     const atEnd = lines.scrollTop + lines.clientHeight >= lines.scrollHeight - 8;
-    const texts = found.lines.length || had || !found.output ? found.lines : [{kind: "note", text: found.output, time_utc: ""}];
-    lines.append(...texts.map((line) => el("li", {class: line.kind}, line.time_utc ? el("time", {datetime: line.time_utc}, new Date(line.time_utc).toLocaleTimeString("en-GB")) : null, " ", line.text)));
+    const texts = found.lines.length || had || !found.output
+      ? found.lines : [{kind: "note", text: found.output, time_utc: ""}];
+    lines.append(...texts.map(
+      (line) => el("li", {class: line.kind},
+      line.time_utc ? el("time", {datetime: line.time_utc}, new Date(line.time_utc)
+      .toLocaleTimeString("en-GB")) : null, " ", line.text)));
     while (lines.children.length > KEPT_LINES) lines.firstChild.remove();
     had = found.total;
     if (atEnd) lines.scrollTop = lines.scrollHeight;
@@ -414,9 +465,12 @@ function historyView() {
       place.replaceChildren(el("p", {}, "None yet: runs that the studio starts are listed here."));
       return;
     }
-    place.replaceChildren(table("Runs that the studio has started, the last first", ["what", "how it ended", "when"], found.jobs.map((one) => {
+    place.replaceChildren(
+      table("Runs that the studio has started, the last first", ["what", "how it ended", "when"],
+      found.jobs.map((one) => {
       const [icon, colour, words] = ENDS[one.state] || ENDS.killed;
-      return [one.title, [el("span", {class: "icon " + colour, "aria-hidden": "true"}, icon), " " + words], ago(one.ended_utc)];
+      return [one.title, [el("span", {class: "icon " + colour, "aria-hidden": "true"}, icon),
+        " " + words], ago(one.ended_utc)];
     })));
   }
   element.addEventListener("toggle", show);

@@ -19,7 +19,10 @@ export function startPage(studio, {started, disk, others}) {
     button(text, () => choose(name), {"data-choice": name, "aria-pressed": "false"}));
   return el("div", {class: "start"},
     el("h2", {}, "What do you want to do?"),
-    el("p", {}, el("code", {}, studio.state.workspace), others ? " holds no survey yet; what else is in it stays as it is." : " holds nothing yet.", " A survey is planned here and flown, in simulation or by a vehicle; or pictures that you have become a model of the sea floor."),
+    el("p", {}, el("code", {}, studio.state.workspace),
+      others ? " holds no survey yet; what else is in it stays as it is." : " holds nothing yet.",
+      " A survey is planned here and flown, in simulation or by a vehicle; or pictures that you "
+        + "have become a model of the sea floor."),
     el("div", {class: "buttons choices"}, choices),
     el("section", {class: "job start-last", "aria-label": "Last run", hidden: true}),
     forms.plan, forms.pictures);
@@ -31,13 +34,15 @@ const valueOf = (input) => (input.value.trim() === "" ? null : Number(input.valu
 /* ---- A survey to plan ---- */
 
 function planForm(studio) {
-  const name = el("input", {type: "text", required: true, maxlength: 80, pattern: "[A-Za-z0-9][A-Za-z0-9 ._\\-]*", value: nameOf(studio.state.workspace)});
+  const name = el("input", {type: "text", required: true, maxlength: 80,
+    pattern: "[A-Za-z0-9][A-Za-z0-9 ._\\-]*", value: nameOf(studio.state.workspace)});
   const latitude = numeric({min: -85, max: 85, placeholder: "32.8236"});
   const longitude = numeric({min: -180, max: 180, placeholder: "34.9553"});
   const depth = numeric({min: 0.1, max: 6000, required: true, value: "15"});
   const along = numeric({min: 0.1, max: 10000, value: "15"});
   const across = numeric({min: 0.1, max: 10000, value: "17"});
-  const lens = el("select", {}, el("option", {value: "12.5"}, "12.5 mm: sees 2 m across from 2 m"), el("option", {value: "25"}, "25 mm: half as wide, twice as fine"));
+  const lens = el("select", {}, el("option", {value: "12.5"}, "12.5 mm: sees 2 m across from 2 m"),
+    el("option", {value: "25"}, "25 mm: half as wide, twice as fine"));
   let usual = null;
   const trial = el("input", {type: "checkbox", onchange: () => {
     if (trial.checked) usual = [along.value, across.value];
@@ -45,10 +50,14 @@ function planForm(studio) {
   }});
   const file = el("input", {type: "file", accept: AREA_FILES});
   const place = el("fieldset", {class: "drop"}, el("legend", {}, "Where is it?"),
-    el("div", {class: "row"}, field("Latitude, degrees", latitude), field("Longitude, degrees", longitude)),
-    el("small", {}, "Left empty, it lies at the example's place, off Haifa; all lengths are right there too."),
+    el("div", {class: "row"}, field("Latitude, degrees", latitude),
+      field("Longitude, degrees", longitude)),
+    el("small", {}, "Left empty, it lies at the example's place, off Haifa; all lengths are "
+      + "right there too."),
     el("p", {}, "or a file of the area from a map program: choose it, or drop it here"),
-    field("Map file", file, "GeoJSON, KML, KMZ, GeoPackage, zipped shapefile, WKT or QGroundControl plan; its outline is then the area"));
+    field("Map file", file,
+      "GeoJSON, KML, KMZ, GeoPackage, zipped shapefile, WKT or QGroundControl plan; its outline "
+        + "is then the area"));
   const taken = () => {
     const has = Boolean(file.files.length);
     [latitude, longitude, along, across].forEach((input) => { input.disabled = has; });
@@ -59,17 +68,21 @@ function planForm(studio) {
     file.files = files;
     taken();
   });
-  const make = button("Make the survey", null, {class: "primary", type: "submit", disabled: !mayWrite()});
+  const make = button("Make the survey", null, {
+    class: "primary", type: "submit", disabled: !mayWrite()});
   const form = el("form", {hidden: true, onsubmit: save},
     el("h2", {}, "Plan a survey"),
     field("Its name", name, "letters, digits and spaces"), place,
     field("Depth of the sea floor, m", depth, "about; a chart can be given later"),
     el("div", {class: "field"}, el("label", {}, trial, " A small one, to try the program"),
-      el("small", {}, "2 x 2 m, pictures at a sixth of their resolution: from plan to report in a few minutes")),
+      el("small", {}, "2 x 2 m, pictures at a sixth of their resolution: from plan to report in "
+        + "a few minutes")),
     el("details", {}, el("summary", {}, "Size and camera"),
       el("div", {class: "row"}, field("Length, m", along), field("Width, m", across)),
       el("p", {}, "The area starts as this rectangle; draw it as it is in the Plan tab."),
-      field("Lens", lens, "of two 9-megapixel cameras 0.1 m apart behind flat ports; everything else of them stands in survey.toml")),
+      field("Lens", lens,
+        "of two 9-megapixel cameras 0.1 m apart behind flat ports; everything else of them "
+          + "stands in survey.toml")),
     el("div", {class: "buttons"}, make));
 
   async function save(event) {
@@ -78,7 +91,8 @@ function planForm(studio) {
     const chosen = file.files[0];
     const made = await attempt(async () => send("/api/start/survey", {
       name: name.value.trim(), seafloor_depth_m: valueOf(depth), focal_mm: Number(lens.value),
-      latitude_deg: chosen ? null : valueOf(latitude), longitude_deg: chosen ? null : valueOf(longitude),
+      latitude_deg: chosen ? null : valueOf(latitude),
+        longitude_deg: chosen ? null : valueOf(longitude),
       length_m: chosen ? null : valueOf(along), width_m: chosen ? null : valueOf(across),
       area: chosen ? {name: chosen.name, base64: await base64(chosen)} : null, trial: trial.checked,
     }));
@@ -88,7 +102,8 @@ function planForm(studio) {
   return form;
 }
 
-const nameOf = (folder) => folder.split(/[\\/]/).at(-1).replace(/[^A-Za-z0-9 ._-]/g, "-").replace(/^[^A-Za-z0-9]+/, "") || "survey";
+const nameOf = (folder) => folder.split(/[\\/]/).at(-1).replace(/[^A-Za-z0-9 ._-]/g, "-").replace(
+  /^[^A-Za-z0-9]+/, "") || "survey";
 
 function reloadAt(tab) {
   window.location.hash = tab;
@@ -98,7 +113,7 @@ function reloadAt(tab) {
 function base64(file) {
   return new Promise((done, fail) => {
     const reader = new FileReader();
-    reader.onload = () => done(reader.result.slice(reader.result.indexOf(",") + 1));
+    reader.onload = () => done(String(reader.result).replace(/^.*?,/, ""));
     reader.onerror = () => fail(new Error(`${file.name} cannot be read`));
     reader.readAsDataURL(file);
   });
@@ -118,8 +133,12 @@ function picturesForm(started, disk) {
   const above = button("Folder above", () => list(above.dataset.path), {disabled: true});
   const files = el("datalist", {id: "start-files"});
   const found = el("div", {class: "found", "aria-live": "polite"});
-  const calibration = el("input", {type: "text", list: "start-files", spellcheck: "false", autocomplete: "off", placeholder: "none"});
-  const navigation = el("input", {type: "text", list: "start-files", spellcheck: "false", autocomplete: "off", placeholder: "none"});
+  const calibration =
+    el("input", {type: "text", list: "start-files", spellcheck: "false", autocomplete: "off",
+    placeholder: "none"});
+  const navigation =
+    el("input", {type: "text", list: "start-files", spellcheck: "false", autocomplete: "off",
+    placeholder: "none"});
   const colour = el("select", {}, COLOURS.map(([value, text]) => el("option", {value}, text)));
   const zone = el("input", {type: "text", value: "UTC", autocomplete: "off"});
   const offset = numeric({value: "0"});
@@ -136,13 +155,21 @@ function picturesForm(started, disk) {
 
   const form = el("form", {hidden: true, onsubmit: save},
     el("h2", {}, "I have pictures"),
-    field("Folder of the pictures", path, "type its path, or choose it below; videos are taken too"),
-    el("div", {class: "buttons"}, button("Look into it", () => list(path.value.trim(), true)), above),
+    field("Folder of the pictures", path,
+      "type its path, or choose it below; videos are taken too"),
+    el("div", {class: "buttons"}, button("Look into it", () => list(path.value.trim(), true)),
+      above),
     listing, found, questions, files);
   questions.append(rig,
-    field("Calibration of the cameras", calibration, "a rig.json, if you have calibrated them. Without one the cameras are found from the pictures: good for shape, less so for size"),
-    field("Navigation", navigation, "a CSV with time and position, depth or heading, as import-log writes it. Without one, and without GPS in the pictures, the model has no place and no scale: a known length gives it one later"),
-    field("Colours of the mosaic", colour, "can be changed later, below [reconstruct] in survey.toml"),
+    field("Calibration of the cameras", calibration,
+      "a rig.json, if you have calibrated them. Without one the cameras are found from the "
+        + "pictures: good for shape, less so for size"),
+    field("Navigation", navigation,
+      "a CSV with time and position, depth or heading, as import-log writes it. Without one, and "
+        + "without GPS in the pictures, the model has no place and no scale: a known length "
+        + "gives it one later"),
+    field("Colours of the mosaic", colour,
+      "can be changed later, below [reconstruct] in survey.toml"),
     el("details", {}, el("summary", {}, "Times, folders inside, videos"),
       field("Time zone of the camera's clock", zone, "such as Europe/Oslo"),
       field("Seconds to add to the pictures' times", offset),
@@ -154,20 +181,24 @@ function picturesForm(started, disk) {
     event.preventDefault();
     list(path.value.trim(), true);
   });
-  [calibration, navigation, zone, offset, overlap, inside].forEach((input) => input.addEventListener("change", () => look()));
+  [calibration, navigation, zone, offset, overlap, inside].forEach(
+    (input) => input.addEventListener("change", () => look()));
   form.enter = () => { if (!here) list(""); };
 
   async function list(folder, typed = false) {
     const number = listings += 1;
     const before = path.value;
     const seen = await attempt(() => send("/api/start/folders", {path: folder, typed}));
-    if (!seen || number !== listings || path.value !== before) return;  /* something else is asked by now */
+    if (!seen || number !== listings
+      || path.value !== before) return;  /* something else is asked by now */
     here = seen.here;
     path.value = here.path;
     above.disabled = !seen.above;
     above.dataset.path = seen.above || "";
     files.replaceChildren(...seen.files.map((value) => el("option", {value})));
-    listing.replaceChildren(...seen.inside.map((one) => el("li", {}, button(one.name, () => list(one.path)), ` ${held(one)}`)));
+    listing.replaceChildren(
+      ...seen.inside.map(
+      (one) => el("li", {}, button(one.name, () => list(one.path)), ` ${held(one)}`)));
     if (!seen.inside.length) listing.replaceChildren(el("li", {}, "no folders inside"));
     inside.checked = false;
     isRig = true;
@@ -181,7 +212,8 @@ function picturesForm(started, disk) {
     questions.hidden = true;
     const deeper = seen.inside.some((one) => one.pictures);
     found.replaceChildren(deeper
-      ? el("p", {}, "No pictures are in this folder itself: choose one inside, or take all: ", button("Take the folders inside too", () => { inside.checked = true; look(); }))
+      ? el("p", {}, "No pictures are in this folder itself: choose one inside, or take all: ",
+        button("Take the folders inside too", () => { inside.checked = true; look(); }))
       : el("p", {}, "No pictures are in this folder itself."));
   }
 
@@ -193,7 +225,8 @@ function picturesForm(started, disk) {
     };
     if (Object.keys(rigFolders).length && isRig) return {...common, cameras: rigFolders};
     if (Object.keys(rigFolders).length) return {...common, folders: [here.path], recursive: true};
-    if (!here.pictures && here.videos && !inside.checked) return {...common, videos: [here.path], overlap: valueOf(overlap)};
+    if (!here.pictures && here.videos && !inside.checked) return {
+      ...common, videos: [here.path], overlap: valueOf(overlap)};
     return {...common, folders: [here.path], recursive: inside.checked};
   }
 
@@ -234,17 +267,29 @@ function picturesForm(started, disk) {
 
   function showFound(seen) {
     const size = seen.size_mb / 1000;
-    const times = seen.first_utc ? `from ${minuteOf(seen.first_utc)} to ${minuteOf(seen.last_utc)} UTC` : "no times";
-    const gps = seen.with_gps ? `GPS in ${Math.round(100 * seen.with_gps / seen.looked_at)} % of them` : "no GPS";
-    const what = [seen.pictures ? counted(seen.pictures, "picture") : null, seen.videos ? `${counted(seen.videos, "video")}, ${duration(seen.video_s)}` : null].filter(Boolean).join(" and ");
+    const times = seen.first_utc
+      ? `from ${minuteOf(seen.first_utc)} to ${minuteOf(seen.last_utc)} UTC` : "no times";
+    const gps = seen.with_gps
+      ? `GPS in ${Math.round(100 * seen.with_gps / seen.looked_at)} % of them` : "no GPS";
+    const what = [seen.pictures ? counted(seen.pictures, "picture") : null,
+      seen.videos ? `${counted(seen.videos, "video")}, ${duration(seen.video_s)}` : null].filter(
+      Boolean).join(" and ");
     found.replaceChildren(...[
       el("h3", {}, `Found: ${what}`),
-      el("ul", {}, seen.cameras.map((one) => el("li", {}, el("strong", {}, one.name), ` ${one.pictures} pictures${one.width_px ? ` of ${one.width_px} × ${one.height_px} pixels` : ""}${one.device ? ", " + one.device : ""}`)),
+      el("ul", {}, seen.cameras.map(
+        (one) => el("li", {}, el("strong", {}, one.name), ` ${one.pictures} pictures`,
+          one.width_px ? ` of ${one.width_px} × ${one.height_px} pixels` : "",
+          one.device ? ", " + one.device : "")),
         el("li", {}, `${times}, ${gps}${seen.masks ? `, ${seen.masks} masks` : ""}`),
         seen.navigation ? el("li", {}, `navigation: ${seen.navigation}`) : null,
-        el("li", {}, `${gigabytes(seen.size_mb)}${seen.pictures ? " are copied" : " of videos, of which frames are taken"}; ${number(disk.free_gb, "GB", 3)} are free`)),
-      size > 0.9 * disk.free_gb ? el("p", {class: "error"}, "That is more than there is room for: free some of the disk, or start with another folder.") : null,
-      seen.warnings.length ? el("ul", {class: "warn"}, seen.warnings.map((line) => el("li", {}, line))) : null,
+        el("li", {}, gigabytes(seen.size_mb),
+          seen.pictures ? " are copied" : " of videos, of which frames are taken",
+          `; ${number(disk.free_gb, "GB", 3)} are free`)),
+      size > 0.9 * disk.free_gb ? el("p", {class: "error"},
+        "That is more than there is room for: free some of the disk, or start with another "
+          + "folder.") : null,
+      seen.warnings.length ? el("ul", {class: "warn"},
+        seen.warnings.map((line) => el("li", {}, line))) : null,
     ].filter(Boolean));
     found.querySelectorAll(":scope ul > *").forEach((one) => one.textContent || one.remove());
   }
@@ -252,7 +297,8 @@ function picturesForm(started, disk) {
   async function save(event) {
     event.preventDefault();
     take.disabled = true;
-    const begun = await attempt(() => send("/api/start/pictures", {arguments: given(), colour: colour.value}));
+    const begun = await attempt(
+      () => send("/api/start/pictures", {arguments: given(), colour: colour.value}));
     take.disabled = false;
     if (!begun) return;
     say("Pictures are being imported");
@@ -264,12 +310,14 @@ function picturesForm(started, disk) {
 /* Whether folders look like those of a rig's cameras, as the server judges it too. */
 function alike(folders) {
   const counts = folders.map((one) => one.pictures).filter((n) => n);
-  return counts.length >= 2 && counts.length <= 8 && Math.max(...counts) - Math.min(...counts) <= 0.02 * Math.max(...counts);
+  return counts.length >= 2 && counts.length <= 8
+    && Math.max(...counts) - Math.min(...counts) <= 0.02 * Math.max(...counts);
 }
 
 function held(folder) {
   const count = (n, one) => (n ? `${n}${folder.more ? "+" : ""} ${one}${n > 1 ? "s" : ""}` : null);
-  return [count(folder.pictures, "picture"), count(folder.videos, "video"), count(folder.folders, "folder")].filter(Boolean).join(", ") || "empty";
+  return [count(folder.pictures, "picture"), count(folder.videos, "video"),
+    count(folder.folders, "folder")].filter(Boolean).join(", ") || "empty";
 }
 
 const minuteOf = (utc) => utc.slice(0, 19).replace("T", " ");

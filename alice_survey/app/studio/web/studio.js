@@ -9,7 +9,8 @@ document.getElementById("title").textContent = state.name;
 
 const held = await attempt(() => get("/api/map"));
 const mapData = {
-  unit: state.unit, axes: state.axes, extent: [-50, -50, 50, 50], layers: [], geodetic: null, ...held,
+  unit: state.unit, axes: state.axes, extent: [-50, -50, 50, 50], layers: [], geodetic: null,
+    ...held,
 };
 const described = mapData.layers;
 mapData.layers = [];
@@ -22,11 +23,15 @@ const list = document.getElementById("layer-list");
 function legendOf(about) {
   const {scale} = about;
   const {colours} = scale;
-  const bars = el("svg", {viewBox: "0 0 " + colours.length + " 1", preserveAspectRatio: "none", "aria-hidden": "true"},
+  const bars = el("svg", {viewBox: "0 0 " + colours.length + " 1", preserveAspectRatio: "none",
+    "aria-hidden": "true"},
     colours.map((fill, i) => el("rect", {x: i, width: 1.02, height: 1, fill})));
   const ends = [scale.low, (scale.low + scale.high) / 2, scale.high];
-  return el("div", {class: "legend", id: "legend-" + about.name, hidden: true}, el("p", {}, scale.label), bars,
-    el("div", {class: "values"}, ends.map((value) => el("span", {}, Number(value.toPrecision(4)).toString().replace("-", "−")))));
+  return el("div", {class: "legend", id: "legend-" + about.name, hidden: true},
+    el("p", {}, scale.label), bars,
+    el("div", {class: "values"},
+      ends.map((value) =>
+      el("span", {}, Number(value.toPrecision(4)).toString().replace("-", "−")))));
 }
 
 function groupOf(name) {
@@ -46,13 +51,18 @@ function put(about) {
   const layer = core.put(about);
   if (about.title) {
     const radio = about.kind === "picture" && about.base;
-    const input = el("input", {type: radio ? "radio" : "checkbox", name: radio ? "base" : null, value: about.name, checked: shown});
+    const input = el(
+      "input", {type: radio ? "radio" : "checkbox", name: radio ? "base" : null, value: about.name,
+      checked: shown});
     input.addEventListener("change", () => {
-      if (radio) list.querySelectorAll("input[type=radio]").forEach((other) => core.show(other.value, other === input));
+      if (radio) list.querySelectorAll("input[type=radio]")
+        .forEach((other) => core.show(other.value, other === input));
       else core.show(about.name, input.checked);
     });
-    const key = about.colour ? el("span", {class: "swatch", style: {background: about.colour}}) : null;
-    const choice = el("div", {class: "choice", "data-layer": about.name}, el("label", {}, input, key, about.title),
+    const key = about.colour
+      ? el("span", {class: "swatch", style: {background: about.colour}}) : null;
+    const choice = el("div", {class: "choice", "data-layer": about.name}, el(
+      "label", {}, input, key, about.title),
       about.about ? el("small", {}, about.about) : null, about.scale ? legendOf(about) : null);
     const old = list.querySelector(`[data-layer="${CSS.escape(about.name)}"]`);
     if (old) old.replaceWith(choice);
@@ -79,29 +89,39 @@ function show(name, on) {
 
 const map = {...core, put, remove, show};
 const isLine = (about) => ["flown", "plan", "footprints"].includes(about.name);
-described.forEach((about) => put({...about, shown: about.shown && !(state.has.mosaic && isLine(about))}));
+described.forEach(
+  (about) => put({...about, shown: about.shown && !(state.has.mosaic && isLine(about))}));
 if (state.background && state.datum) {
   const tiles = background(state.datum, state.background).addTo(core.leaflet);
   const input = el("input", {type: "checkbox", value: "background", checked: true});
-  input.addEventListener("change", () => (input.checked ? tiles.addTo(core.leaflet) : tiles.remove()));
+  input.addEventListener(
+    "change", () => (input.checked ? tiles.addTo(core.leaflet) : tiles.remove()));
   const host = new URL(state.background).host;
-  groupOf("Background").append(el("div", {class: "choice"}, el("label", {}, input, "Map of " + host),
-    el("small", {}, "From the network, as --background says; its terms are those of " + host + ".")));
+  groupOf("Background")
+    .append(el("div", {class: "choice"}, el("label", {}, input, "Map of " + host),
+    el("small", {}, "From the network, as --background says; its terms are those of " + host
+      + ".")));
 }
 
 /* The list is open where it leaves two thirds of the map free, until it is closed by hand. */
 const layersKey = "alice-survey layers";
 const layers = document.getElementById("layers");
-layers.firstElementChild.addEventListener("click", () => sessionStorage.setItem(layersKey, layers.open ? "closed" : "open"));
-const fits = () => layers.offsetWidth * layers.offsetHeight < core.leaflet.getSize().x * core.leaflet.getSize().y / 3;
+layers.firstElementChild.addEventListener("click", () => sessionStorage.setItem(
+  layersKey, layers.open ? "closed" : "open"));
+const fits = () => layers.offsetWidth * layers.offsetHeight < core.leaflet.getSize()
+  .x * core.leaflet.getSize().y / 3;
 function fold() {
   const wanted = sessionStorage.getItem(layersKey);
   layers.open = wanted ? wanted === "open" : window.innerWidth > 900 && Boolean(list.firstChild);
   if (layers.open && !wanted && !fits()) layers.open = false;
 }
-new ResizeObserver(() => { if (layers.open && !sessionStorage.getItem(layersKey) && !fits()) layers.open = false; }).observe(list);
+new ResizeObserver(
+  () => { if (layers.open && !sessionStorage.getItem(layersKey) && !fits()) layers.open = false; })
+  .observe(list);
 fold();
-mapData.room = () => (layers.open && fits() ? {paddingTopLeft: [56, 24], paddingBottomRight: [layers.offsetWidth + 32, 40]} : {});
+mapData.room = () =>
+  (layers.open && fits() ? {paddingTopLeft: [56, 24],
+  paddingBottomRight: [layers.offsetWidth + 32, 40]} : {});
 core.fit(false);
 
 /* ---- Tabs ---- */
@@ -149,7 +169,8 @@ async function begin() {
     const tab = module.tab(studio);
     tabs.set(tab.name, tab);
     bar.append(el("button", {
-      type: "button", role: "tab", id: "tab-" + tab.name, "data-tab": tab.name, "aria-controls": "panel-" + tab.name,
+      type: "button", role: "tab", id: "tab-" + tab.name, "data-tab": tab.name,
+        "aria-controls": "panel-" + tab.name,
       "aria-selected": "false", tabindex: "-1", onclick: () => open(tab.name),
     }, tab.title));
     tab.panel.id = "panel-" + tab.name;
@@ -171,20 +192,25 @@ async function begin() {
   });
   document.addEventListener("keydown", (event) => {
     const withCtrl = event.ctrlKey || event.metaKey;
-    const typing = event.target.closest(withCtrl ? "input:not([type=range], [type=checkbox], [type=radio]), textarea"
+    const typing = event.target.closest(
+      withCtrl ? "input:not([type=range], [type=checkbox], [type=radio]), textarea"
       : "input, textarea, select, [role=application]");
     if (event.altKey || (typing && event.target.id !== "map-canvas")) return;
-    const name = (withCtrl ? "Ctrl+" : "") + (event.shiftKey && event.key.length > 1 ? "Shift+" : "") + event.key;
+    const name = (withCtrl ? "Ctrl+" : "") + (event.shiftKey && event.key.length > 1
+      ? "Shift+" : "") + event.key;
     const act = current?.keys?.[name];
     if (!act) return;
     event.preventDefault();
     act(event);
   });
   const empty = !state.stages.length && !state.has.survey;
-  const first = state.log ? "follow" : state.has.dem || state.has.mosaic ? "model" : empty ? "run" : "plan";
+  const first = state.log ? "follow" : state.has.dem || state.has.mosaic ? "model" : empty
+    ? "run" : "plan";
   open(tabs.has(window.location.hash.slice(1)) ? window.location.hash.slice(1) : first);
   window.addEventListener("hashchange", () => open(window.location.hash.slice(1)));
-  if (!mayWrite()) say("Opened without its token: this page looks, and changes nothing. The command printed the address with it.", "warn");
+  if (!mayWrite()) say(
+    "Opened without its token: this page looks, and changes nothing. The command printed the "
+      + "address with it.", "warn");
   document.body.dataset.ready = "";
 }
 

@@ -1,4 +1,5 @@
-/* Undo and redo: a list of states, of which one is current. States are values: they never change. */
+/* Undo and redo: a list of states, of which one is current. States are values: they never
+   change. */
 
 const MAX_STEPS = 500;
 const ONE_EDIT_MS = 1000;
@@ -12,19 +13,22 @@ export const canRedo = (history) => history.at < history.states.length - 1;
    follow within a second are one step: a slider that is dragged, an arrow key held down. */
 export function record(history, state, tag = "", time = 0) {
   if (same(state, current(history))) return history;
-  const goesOn = tag !== "" && tag === history.tag && time - history.time < ONE_EDIT_MS && history.at > 0;
+  const goesOn = tag !== "" && tag === history.tag && time - history.time < ONE_EDIT_MS
+    && history.at > 0;
   const kept = history.states.slice(0, goesOn ? history.at : history.at + 1);
   const states = [...kept, state].slice(-MAX_STEPS);
   return {states, at: states.length - 1, tag, time};
 }
 
 export const undo = (history) => ({...history, at: Math.max(0, history.at - 1), tag: ""});
-export const redo = (history) => ({...history, at: Math.min(history.states.length - 1, history.at + 1), tag: ""});
+export const redo = (history) =>
+  ({...history, at: Math.min(history.states.length - 1, history.at + 1), tag: ""});
 
 /* Equal as JSON values, whatever the order of keys. */
 export function same(a, b) {
   if (a === b) return true;
-  if (a instanceof Map && b instanceof Map) return a.size === b.size && [...a].every(([key, value]) => same(value, b.get(key)));
+  if (a instanceof Map && b instanceof Map) return a.size === b.size
+    && [...a].every(([key, value]) => same(value, b.get(key)));
   if (typeof a !== "object" || typeof b !== "object" || a === null || b === null) return false;
   const [keys, others] = [Object.keys(a), Object.keys(b)];
   return Array.isArray(a) === Array.isArray(b) && keys.length === others.length

@@ -1,5 +1,5 @@
-/* Handles over the map by which shapes are edited: their vertices, the middles of their edges, and one
-   that moves all of it. Each is a button, so that all can be done by keyboard. */
+/* Handles over the map by which shapes are edited: their vertices, the middles of their edges,
+   and one that moves all of it. Each is a button, so that all can be done by keyboard. */
 
 import {el} from "./core.js";
 import {fixed} from "./words.js";
@@ -15,14 +15,17 @@ function roundStep(length) {
   return [5, 2, 1].find((step) => step * power <= length * (1 + 1e-9)) * power;
 }
 
-const northEastIn = (unit) => ([n, e]) => fixed(n, 2, unit) + " north, " + fixed(e, 2, unit) + " east";
+const northEastIn = (unit) => ([n, e]) => fixed(n, 2, unit) + " north, " + fixed(e, 2, unit)
+  + " east";
 
-/* What is edited is shown as a target: `name`, `word` of a vertex, and rings [{points, closed}] of points
-   [north, east]; `value` is what is edited and `move(ring, i, place)` returns a new one; so do, where it can be done,
-   `insert(ring, after, place or null)`, `remove(ring, i)`, `shift(north, east)` and `drop()` of all of it.
-   `text(point)` says where a vertex is; `changed(value, tag)` takes an edit, `moving(value)` one that goes on, and `left()` is called when
-   Escape gives the focus back. */
-export function vertexHandles(map, name, {unit = "m", text = northEastIn(unit), changed, moving, left}) {
+/* What is edited is shown as a target: `name`, `word` of a vertex, and rings [{points, closed}]
+   of points [north, east]; `value` is what is edited and `move(ring, i, place)` returns a new
+   one; so do, where it can be done, `insert(ring, after, place or null)`, `remove(ring, i)`,
+   `shift(north, east)` and `drop()` of all of it. `text(point)` says where a vertex is;
+   `changed(value, tag)` takes an edit, `moving(value)` one that goes on, and `left()` is called
+   when Escape gives the focus back. */
+export function vertexHandles(
+  map, name, {unit = "m", text = northEastIn(unit), changed, moving, left}) {
   const pane = map.createPane(name + "-vertices");
   pane.classList.add("vertices", "leaflet-zoom-hide");
   /* Where a handle was replaced meanwhile, the click is the pane's. */
@@ -68,13 +71,15 @@ export function vertexHandles(map, name, {unit = "m", text = northEastIn(unit), 
   }
 
   function draw() {
-    const focused = pane.contains(document.activeElement) ? document.activeElement.dataset.at : null;
+    const focused = pane.contains(document.activeElement)
+      ? document.activeElement.dataset.at : null;
     pane.replaceChildren();
     if (target) target.rings.forEach(fill);
     if (target?.shift && target.rings[0].points.length) {
       pane.append(handle("mover", "move", centre(target.rings[0].points.map(place)), {
         "aria-label": "Move " + target.name,
-        title: "Drag, or arrow keys, to move all of it" + (target.drop ? "; Delete removes it" : ""),
+        title: "Drag, or arrow keys, to move all of it"
+          + (target.drop ? "; Delete removes it" : ""),
       }, whole()));
     }
     if (focused) focus(at(focused) || pane.querySelector(".corner") || map.getContainer());
@@ -83,12 +88,15 @@ export function vertexHandles(map, name, {unit = "m", text = northEastIn(unit), 
   function fill({points, closed}, ring) {
     const view = map.getBounds().pad(0.2);
     const spots = points.map(place);
-    const seen = points.map((_, i) => i).filter((i) => view.contains(points[i])).slice(0, MAX_HANDLES);
+    const seen = points.map((_, i) => i).filter((i) => view.contains(points[i]))
+      .slice(0, MAX_HANDLES);
     const hole = ring ? ", hole " + ring : "";
     seen.forEach((i) => {
       pane.append(handle("corner", "c" + ring + "-" + i, spots[i], {
-        "aria-label": target.word + " " + (i + 1) + " of " + points.length + " of " + target.name + hole + ": " + text(points[i]),
-        title: "Drag, or arrow keys, with Shift by less" + (target.insert ? "; Delete removes; Enter adds one after it" : ""),
+        "aria-label": target.word + " " + (i + 1) + " of " + points.length + " of " + target.name
+          + hole + ": " + text(points[i]),
+        title: "Drag, or arrow keys, with Shift by less"
+          + (target.insert ? "; Delete removes; Enter adds one after it" : ""),
       }, corner(ring, i, closed)));
     });
     if (!target.insert) return;
@@ -96,12 +104,14 @@ export function vertexHandles(map, name, {unit = "m", text = northEastIn(unit), 
       const next = nextOf(ring, i);
       if ((next === 0 && !closed) || spots[i].distanceTo(spots[next]) < APART_PX) return;
       pane.append(handle("middle", "m" + ring + "-" + i, centre([spots[i], spots[next]]), {
-        "aria-label": "Add one after " + target.word.toLowerCase() + " " + (i + 1) + hole, tabindex: "-1",
+        "aria-label": "Add one after " + target.word.toLowerCase() + " " + (i + 1) + hole,
+          tabindex: "-1",
       }, middle(ring, i)));
     });
   }
 
-  /* What each kind of handle does: `drag(from, to, start)`, of the target at the start, and keys. */
+  /* What each kind of handle does: `drag(from, to, start)`, of the target at the start, and
+     keys. */
   function corner(ring, i, closed) {
     return {
       tag: "corner " + ring + "-" + i,
@@ -136,7 +146,8 @@ export function vertexHandles(map, name, {unit = "m", text = northEastIn(unit), 
   });
 
   function handle(name, key, spot, attributes, does) {
-    const made = el("button", {type: "button", class: "vertex " + name, "data-at": key, ...attributes});
+    const made = el("button", {type: "button", class: "vertex " + name, "data-at": key,
+      ...attributes});
     put(made, spot);
     /* Neither the map nor its tool must take what is meant for a handle. */
     ["mousedown", "touchstart", "dblclick", "click"].forEach(
@@ -158,7 +169,8 @@ export function vertexHandles(map, name, {unit = "m", text = northEastIn(unit), 
     event.stopPropagation();
     event.preventDefault();
     focus(made);
-    pressed = {does, made, from: northEast(event), at: [event.clientX, event.clientY], start: target, now: null};
+    pressed = {does, made, from: northEast(event), at: [event.clientX, event.clientY],
+      start: target, now: null};
     const held = pressed;
     pressed.timer = setTimeout(() => {
       if (pressed !== held || held.now || !does.remove || event.pointerType === "mouse") return;
@@ -207,7 +219,8 @@ export function vertexHandles(map, name, {unit = "m", text = northEastIn(unit), 
     if (way && does.shift) {
       const metres = step(event.shiftKey);
       changed(does.shift(metres * way[0], metres * way[1]), "arrow " + does.tag + target.name);
-    } else if ((event.key === "Delete" || event.key === "Backspace") && does.remove) changed(does.remove(), "");
+    } else if ((event.key === "Delete" || event.key === "Backspace") && does.remove) changed(
+      does.remove(), "");
     else if (event.key === "Enter" || event.key === " ") (does.enter || does.click)?.();
     else if (event.key === "Escape") {
       if (pressed) cancel();

@@ -24,8 +24,8 @@ export function growing(lengths) {
   });
 }
 
-/* What a profile has at a length along all dives: the dive, depths between those of two samples, and
-   the place on the route of the dive; dives count from 1. */
+/* What a profile has at a length along all dives: the dive, depths between those of two samples,
+   and the place on the route of the dive; dives count from 1. */
 export function profileAt(profile, routes, along, length) {
   let i = Math.min(Math.max(0, countUpTo(along, length) - 1), along.length - 1);
   if (i === along.length - 1 && i > 0) i -= 1;
@@ -86,12 +86,14 @@ export function pathData(xs, ys) {
   }).join("");
 }
 
-/* Round values within limits, at most about so many, and the decimals that they need. */
-export function ticks(low, high, most) {
+/** Round values within limits, at most about so many, and the decimals that they need.
+ * @type {(low: number, high: number, most: number) => [number[], number]} */
+export const ticks = (low, high, most) => {
   const rough = (high - low) / most;
   const power = 10 ** Math.floor(Math.log10(rough));
   const step = [1, 2, 5, 10].map((n) => n * power).find((n) => n >= rough * (1 - 1e-9));
   const found = [];
-  for (let at = Math.ceil(low / step - 1e-9) * step; at <= high + 1e-9 * step; at += step) found.push(at);
+  for (let at = Math.ceil(low / step - 1e-9) * step; at <= high + 1e-9 * step;
+    at += step) found.push(at);
   return [found, Math.max(0, -Math.floor(Math.log10(step) + 1e-9))];
-}
+};

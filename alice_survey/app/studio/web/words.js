@@ -10,8 +10,10 @@ const withUnit = (text, unit) => text + (unit ? " " + unit : "");
 export function number(value, unit = "", digits = 3) {
   if (!isKnown(value)) return "unknown";
   const size = Math.abs(value);
-  const places = size === 0 ? 0 : Math.min(9, Math.max(0, digits - 1 - Math.floor(Math.log10(size))));
-  const text = value.toLocaleString("en", {maximumFractionDigits: places, minimumFractionDigits: Math.min(places, 6)});
+  const places = size === 0
+    ? 0 : Math.min(9, Math.max(0, digits - 1 - Math.floor(Math.log10(size))));
+  const text = value.toLocaleString(
+    "en", {maximumFractionDigits: places, minimumFractionDigits: Math.min(places, 6)});
   return withUnit(signed(text), unit);
 }
 
@@ -23,10 +25,12 @@ export function withSigma(value, sigma, unit = "") {
 }
 
 /* A value to some decimals: −0.25 m. */
-export const fixed = (value, decimals, unit = "") => (isKnown(value) ? withUnit(signed(value.toFixed(decimals)), unit) : "unknown");
+export const fixed = (value, decimals, unit = "") =>
+  (isKnown(value) ? withUnit(signed(value.toFixed(decimals)), unit) : "unknown");
 
 /* "1 dive", "1,224 pictures". */
-export const counted = (count, word, words = word + "s") => count.toLocaleString("en") + " " + (count === 1 ? word : words);
+export const counted = (count, word, words = word + "s") =>
+  count.toLocaleString("en") + " " + (count === 1 ? word : words);
 
 /* "48 s", "12 min", "3.4 h". */
 export function duration(seconds) {
@@ -41,7 +45,8 @@ export function clock(seconds) {
   const whole = Math.floor(Math.abs(seconds));
   const pair = (value) => String(value).padStart(2, "0");
   const [hours, minutes] = [Math.floor(whole / 3600), Math.floor(whole / 60) % 60];
-  return (seconds <= -1 ? MINUS : "") + (hours ? hours + ":" + pair(minutes) : minutes) + ":" + pair(whole % 60);
+  return (seconds <= -1 ? MINUS : "") + (hours ? hours + ":" + pair(minutes) : minutes) + ":"
+    + pair(whole % 60);
 }
 
 /* How fast a dive is shown. */
@@ -52,7 +57,8 @@ export function ago(utc) {
   const seconds = (Date.now() - new Date(utc).getTime()) / 1000;
   if (seconds < 60) return "just now";
   if (seconds < 24 * 3600) return duration(seconds) + " ago";
-  return new Date(utc).toLocaleDateString("en-GB", {day: "numeric", month: "short", year: "numeric"});
+  return new Date(utc).toLocaleDateString("en-GB",
+    {day: "numeric", month: "short", year: "numeric"});
 }
 
 /* All of it is only what is all of it: 0.99996 is 99.99 %. */

@@ -10,8 +10,8 @@ from affine import Affine
 from alice_survey.app.report.colours import read_shrunk
 from alice_survey.app.report.held import Held
 from alice_survey.app.report.rasters import mosaic_layer, picture_layers
+from alice_survey.app.studio.files import Workspace
 from alice_survey.app.studio.layers import Layers
-from alice_survey.app.studio.paths import Workspace
 from alice_survey.kit.document import PictureLayer
 from reconstruct.measure.surface import values_at
 from tests.alice_survey.app.report.tiny import COLUMNS, ROWS, tiny_workspace

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from alice_survey.app.studio.folders import Folders
+from alice_survey.app.studio.endpoints.start import Folders
 from alice_survey.core.errors import AliceError
 
 

@@ -14,8 +14,14 @@ import psutil
 import pytest
 from filelock import FileLock
 
-from alice_survey.app.studio.heard import KEPT_LINES, EventsTail, Heard
-from alice_survey.app.studio.jobs import BusyError, JobRecord, Jobs
+from alice_survey.app.studio.jobs import (
+    KEPT_LINES,
+    BusyError,
+    EventsTail,
+    JobRecord,
+    Jobs,
+    RunState,
+)
 from alice_survey.core.errors import AliceError
 from tests.alice_survey.app.studio.client import until
 
@@ -341,14 +347,45 @@ def test_what_is_no_argument_is_refused(
 
 def test_a_log_is_bounded_and_damaged_lines_are_left_out(tmp_path: Path) -> None:
     path = tmp_path / "events.jsonl"
-    tail, heard = EventsTail(path), Heard()
-    assert not heard.take(tail.read())
+    tail, run = EventsTail(path), RunState()
+    assert not run.update(tail.read())
     note = json.dumps({"event": "note", "message": "words", "time_utc": "2026"})
     path.write_text(f"{note}\n" * (KEPT_LINES + 5) + "{damaged\n[1]\n" + note[:9])
-    assert heard.take(tail.read())
-    assert heard.lines_n == KEPT_LINES + 5 and len(heard.log()) == KEPT_LINES
+    assert run.update(tail.read())
+    assert run.lines_n == KEPT_LINES + 5 and len(run.log()) == KEPT_LINES
     with path.open("a") as file:
         file.write(note[9:] + "\n")
-    heard.take(tail.read())
-    assert heard.lines_n == KEPT_LINES + 6
-    assert len(heard.log(after=KEPT_LINES + 5)) == 1 and heard.log(after=10**6) == []
+    run.update(tail.read())
+    assert run.lines_n == KEPT_LINES + 6
+    assert len(run.log(after=KEPT_LINES + 5)) == 1 and run.log(after=10**6) == []
+
+
+@pytest.mark.parametrize(
+    ("file", "text"),
+    [
+        ("job.json", {"process": -1}), ("job.json", {"process": "x"}), ("job.json", {"number": 0}),
+        ("job.json", {"number": 10**400}), ("job.json", {"started_utc": "yesterday"}),
+        ("events.jsonl", {"step_number": "x"}), ("events.jsonl", {"step_number": None}),
+        ("events.jsonl", {"elapsed_s": "abc"}), ("events.jsonl", {"event": "run_finished"}),
+        ("events.jsonl", {"event": "run_finished", "exit_code": "x"}),
+        ("events.jsonl", {"event": "stage_finished", "stage": "nostage"}),
+    ],
+)  # fmt: skip
+def test_damaged_records_hide_a_job_at_most(
+    file: str, text: dict[str, Any], tmp_path: Path
+) -> None:
+    with jobs_in(tmp_path) as jobs:
+        jobs.start("quality")
+        until(lambda: jobs.running() is None)
+    path = folder_of(tmp_path) / file
+    if file == "job.json":
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"ended_utc": None} | text))
+    else:
+        path.write_text(json.dumps({"event": "step_progress", **text}))
+        record = JobRecord.read(folder_of(tmp_path) / "job.json")
+        record.model_copy(update={"ended_utc": None}).write(folder_of(tmp_path) / "job.json")
+    with jobs_in(tmp_path) as later:
+        later.state()
+        assert len(later.history()) <= 1
+        later.start("quality")
+        until(lambda: later.running() is None)

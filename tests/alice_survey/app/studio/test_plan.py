@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from alice_survey.app.pipeline import run, template_text
-from alice_survey.app.studio.newest import Newest, SupersededError
+from alice_survey.app.studio.endpoints.plan import LatestRequests, SupersededError
 from alice_survey.app.studio.server import Server
 from alice_survey.app.studio.setting_limits import setting_limits
 from alice_survey.core.artefacts import read_json
@@ -297,8 +297,8 @@ def test_precision_comes_with_a_layer(server: Server) -> None:
     assert found["layer"]["png"].startswith("data:image/png;base64,") and found["text"]
 
 
-def test_of_requests_that_wait_only_the_newest_of_a_page_is_worked_on() -> None:
-    newest, began, go_on = Newest(), threading.Event(), threading.Event()
+def test_of_requests_that_wait_only_the_newest_of_a_page_is_stale_page() -> None:
+    newest, began, go_on = LatestRequests(), threading.Event(), threading.Event()
     done: list[str] = []
 
     def first() -> None:

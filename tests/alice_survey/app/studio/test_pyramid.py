@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from rasterio.transform import Affine
 
 from alice_survey.app.report.colours import TILE_PX, coloured, limits_of, number_rasters
+from alice_survey.app.studio.files import Workspace
 from alice_survey.app.studio.layers import Layers, Pyramid
-from alice_survey.app.studio.paths import Workspace
 from alice_survey.core.edited_files import StaleError
 from tests.alice_survey.app.report.tiny import tiny_workspace
 
