@@ -57,7 +57,7 @@ def features(picture: Path, runs: int) -> list[Figure]:
 
     def ours() -> None:
         grey = normalise(read_deep(picture))
-        find_features(grey, None, scale=settings.feature_scale, maximum=settings.max_features)
+        find_features(grey, None, scale=None, maximum=settings.max_features)
 
     with TemporaryDirectory() as folder:
         database = Path(folder) / "database.db"

@@ -58,7 +58,7 @@ SEAS = (
         Sea(
             name=f"{thruster} {'known to have' if known else 'has'} failed, 0.1 m/s across",
             across_mps=0.1,
-            vehicle={"thruster_health": {thruster: 0.0}, "health_known": known},
+            vehicle={"failures": [thruster if known else f"{thruster}@0"]},
             must_fly=thruster in ("starboard", "port"),
         )
         for thruster in ("starboard", "port", "bow", "stern", "vertical")
@@ -68,7 +68,7 @@ SEAS = (
         Sea(
             name=f"{thruster} fails after 600 s, 0.1 m/s across",
             across_mps=0.1,
-            vehicle={"failures": ((thruster, 600.0, 0.0),)},
+            vehicle={"failures": [f"{thruster}@600"]},
             must_fly=thruster in ("starboard", "port"),
         )
         for thruster in ("starboard", "bow", "stern", "vertical")

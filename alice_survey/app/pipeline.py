@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from filelock import FileLock, Timeout
 
@@ -20,12 +20,12 @@ from alice_survey.core.config import (
     load_config,
     parse_config,
     parse_current,
-    parse_health,
     settings_in,
 )
 from alice_survey.core.errors import ConfigError, WorkspaceError, warn
 from alice_survey.core.executor import Executor, local_executor
 from alice_survey.core.run.progress import part
+from alice_survey.core.settings_form import settings_template
 from alice_survey.core.stages import is_imported, names, spec
 
 if TYPE_CHECKING:
@@ -49,8 +49,6 @@ class FlightChanges:
     """Number of the dive to fly, from 1."""
     mission: Path | None = None
     """Mission file to fly instead of the plan's route."""
-    follower: Literal["cola2", "ardusub"] | None = None
-    """Autopilot by whose law it is flown."""
 
     def applied(self, config: SurveyConfig) -> SurveyConfig:
         """The survey with these changes.
@@ -63,13 +61,10 @@ class FlightChanges:
             sea = config.sea.model_copy(update={"current_file": None})
             config = config.model_copy(update={"sea": sea})
         config = changed(config, "sea", current_mps=speed, current_towards_deg=towards)
-        health = parse_health(self.failed)
         return changed(
             config, "vehicle",
             name=self.vehicle, controller=self.controller,
-            thruster_health=health.at_start, failures=health.later,
-            lost_propellers=health.propellers, dive=self.dive,
-            mission_file=self.mission, follower=self.follower,
+            failures=self.failed, dive=self.dive, mission_file=self.mission,
         )  # fmt: skip
 
 
@@ -280,13 +275,15 @@ def init_survey(
 
 
 def template_text(template: str = "survey.toml") -> str:
-    """The commented settings that a new survey starts from."""
+    """The commented settings that a new survey starts from: of all settings, or of an example."""
+    if template == "survey.toml":
+        return settings_template()
     return (resources.files("alice_survey") / template).read_text(encoding="utf-8")
 
 
 def _with_area(text: str, area: Path, folder: Path) -> str:
     """Settings whose rectangle is replaced by the area of a file, named from the folder."""
-    rectangle = ("latitude_deg", "longitude_deg", "length_m", "width_m", "heading_deg", "datum_at")
+    rectangle = ("latitude_deg", "longitude_deg", "length_m", "width_m", "heading_deg")
     own = re.compile(rf"^(?=({'|'.join(rectangle)}) = )", re.MULTILINE)
     try:
         named = Path(os.path.relpath(area.resolve(), folder.resolve())).as_posix()

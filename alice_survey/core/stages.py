@@ -17,7 +17,7 @@ from pydantic import BaseModel
 
 from alice_survey.core import artefacts, records
 from alice_survey.core.artefacts import Stage, read_json, read_stage, run_stage, why_stale
-from alice_survey.core.config import Config, SurveyConfig
+from alice_survey.core.config import VEHICLE_FILES, Config, SurveyConfig
 from alice_survey.core.errors import AliceError, WorkspaceError
 from alice_survey.core.executor import Executor
 from alice_survey.core.manifest import read_manifest
@@ -180,10 +180,13 @@ def settings_of(wanted: Any, config: Config) -> Any:
         include=None if part.only is None else set(part.only),
         exclude=set(part.without),
     )
-    return {
-        name: path.name if isinstance(path := getattr(value, name), Path) else values[name]
-        for name in values
-    }
+    return {name: _file_name(getattr(value, name), values[name]) for name in values}
+
+
+def _file_name(value: Any, as_json: Any) -> Any:
+    """A file's name, of a path or of text that names a vehicle's file; other values as JSON."""
+    is_file = isinstance(value, str) and value.lower().endswith(VEHICLE_FILES)
+    return Path(value).name if is_file or isinstance(value, Path) else as_json
 
 
 def files_of(wanted: Sequence[str], config: Config) -> list[Path]:
@@ -493,7 +496,7 @@ STAGES: tuple[StageSpec, ...] = (
             "water": without("water", "n_water_sigma"),
             "plan": "plan",
             "sea": "sea",
-            "vehicle": without("vehicle", "dive", "mission_file", "follower", "cola2_delta_m"),
+            "vehicle": without("vehicle", "dive", "mission_file"),
             "datum_given": "area.datum_given",
             "strobes": only("imaging", "strobe_lumens", "strobe_beam_deg", "strobes_body_m"),
         },
@@ -525,7 +528,7 @@ STAGES: tuple[StageSpec, ...] = (
         needs=("plan",),
         settings={
             "seed": "seed",
-            "vehicle": without("vehicle", "coefficients_file", "mission_file"),
+            "vehicle": without("vehicle", "mission_file"),
             "sea": without("sea", "current_file"),
             "navigation": "navigation",
             "seafloor": "seafloor",
@@ -565,7 +568,7 @@ STAGES: tuple[StageSpec, ...] = (
             "camera": "camera",
             "n_water": "water.n_water",
             "board": records.BoardRecord().to_json(),
-            "imaging": only("imaging", "scale", "image_format", "samples", "noise", "pool_views"),
+            "imaging": only("imaging", "scale", "pool_views"),
         },
         summary=_pictures_summary,
         resumes=True,
@@ -638,11 +641,8 @@ STAGES: tuple[StageSpec, ...] = (
         uses=("calibrate",),
         settings={
             "seed": "seed",
-            "feature_scale": "reconstruct.feature_scale",
             "max_features": "reconstruct.max_features",
             "learned_features": "reconstruct.learned_features",
-            "working_range_m": "reconstruct.working_range_m",
-            "mapper": "reconstruct.mapper",
         },
         inputs=_mapping_inputs,
         summary=_mapping_summary,
@@ -684,9 +684,7 @@ STAGES: tuple[StageSpec, ...] = (
         work="reconstruct.dense.run:run_dense",
         takes=("reconstruct",),
         needs=("image", "placing"),
-        settings=only(
-            "reconstruct", "dense_scale", "dense_partners", "dem_cell_m", "planes", "mask_moving"
-        ),
+        settings=only("reconstruct", "dense_scale", "dem_cell_m", "planes", "mask_moving"),
         inputs=_dense_inputs,
         summary=_dense_summary,
         resumes=True,
@@ -712,7 +710,6 @@ STAGES: tuple[StageSpec, ...] = (
         settings={
             "mosaic_pixel_m": "reconstruct.mosaic_pixel_m",
             "colour": "reconstruct.colour",
-            "dispersion": "reconstruct.dispersion",
             "water": without("water", "n_water_sigma"),
         },
         inputs=_mosaic_inputs,
@@ -734,9 +731,7 @@ STAGES: tuple[StageSpec, ...] = (
         work="reconstruct.mesh.run:run_mesh",
         takes=("reconstruct",),
         needs=("image", "placing", "dense"),
-        settings=only(
-            "reconstruct", "mesh_triangles", "mesh_error_px", "mesh_page_px", "mesh_tiles"
-        ),
+        settings=only("reconstruct", "mesh_error_px"),
         inputs=_mesh_inputs,
         summary=_mesh_summary,
         products={

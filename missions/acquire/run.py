@@ -35,7 +35,7 @@ from alice_survey.sim.seafloor.light import (
     make_sensor,
     nominal_gain,
 )
-from alice_survey.sim.seafloor.renderer import Scene, flat_floor_radiance, range_map, render
+from alice_survey.sim.seafloor.renderer import Scene, flat_floor_radiance, render
 from alice_survey.sim.seafloor.terrain import read_terrain, survey_terrain
 from alice_survey.sim.seafloor.texture import SAND_ALBEDO, survey_texture
 from camera_calib.camera import Camera
@@ -122,7 +122,7 @@ def _take_boards(
 def _take_board(job: tuple[_Shoot, PoolBoard, int, str, Camera, Array]) -> ImageRecord:
     shoot, board, view, camera, one, matrix = job
     imaging = shoot.imaging
-    image = f"{camera}/{view:02d}.{imaging.image_format}"
+    image = f"{camera}/{view:02d}.png"
     record = ImageRecord(image=image, camera=camera, station=view)
     if (shoot.folder / image).exists():
         return record
@@ -137,7 +137,7 @@ def _take_board(job: tuple[_Shoot, PoolBoard, int, str, Camera, Array]) -> Image
         read_noise_e=sensor.read_noise_e,
     )
     seed = [shoot.seed, _POOL_NOISE_STREAM, view, CAMERAS.index(camera)]
-    rng = np.random.default_rng(seed) if imaging.noise else None
+    rng = np.random.default_rng(seed)
     _write_picture(shoot.folder / image, develop(expose(light, lit, rng), 1.0 / white))
     return record
 
@@ -265,22 +265,16 @@ def _take(job: tuple[_Shoot, int, str, Array]) -> str:
     """Render one picture, unless it is there; returns its path below the folder."""
     shoot, station, camera, body = job
     imaging = shoot.imaging
-    image = f"{camera}/{station:06d}.{imaging.image_format}"
-    ranges = shoot.folder / "truth" / "range" / f"{camera}_{station:06d}.tif"
-    needs_range = imaging.range_maps and not ranges.exists()
-    if (shoot.folder / image).exists() and not needs_range:
+    image = f"{camera}/{station:06d}.png"
+    if (shoot.folder / image).exists():
         return image
     scene, rig, lights, sensor, gain = _studio(shoot)
     one, poses = rig.cameras[camera], RigidTransform.from_matrix(body) * rig.body_from_cam(camera)
     try:
-        if not (shoot.folder / image).exists():
-            radiance = render(scene, one, lights[camera], poses[:MOMENTS], imaging.samples)
-            seed = [shoot.seed, _NOISE_STREAM, station, CAMERAS.index(camera)]
-            rng = np.random.default_rng(seed) if imaging.noise else None
-            picture = develop(expose(radiance, sensor, rng), gain)
-            _write_picture(shoot.folder / image, picture)
-        if needs_range:
-            _write_picture(ranges, range_map(scene, one, poses[MOMENTS]))
+        radiance = render(scene, one, lights[camera], poses[:MOMENTS], imaging.samples)
+        seed = [shoot.seed, _NOISE_STREAM, station, CAMERAS.index(camera)]
+        picture = develop(expose(radiance, sensor, np.random.default_rng(seed)), gain)
+        _write_picture(shoot.folder / image, picture)
     except ImageError as error:
         raise ImageError(f"station {station}, {camera} camera: {error}") from None
     return image

@@ -198,10 +198,8 @@ def read_bathymetry(
         with rasterio.open(path) as file:
             _check_filled(path, file)
             if crs is None and file.crs is None:
-                raise PlanError(
-                    f"{path}: names no coordinate system; give area.bathymetry_crs, as EPSG:32636"
-                )
-            flat = _flat_wkt(crs or file.crs.to_wkt(), path)
+                raise PlanError(f"{path}: names no coordinate system; give area.crs, as EPSG:32636")
+            flat = _flat_wkt(file.crs.to_wkt() if file.crs else str(crs), path)
             window = _window(path, file, flat, datum, bounds_ne)
             band = file.read(1, window=Window(*window), masked=True)
             heights = sense == "heights" if sense != "auto" else _are_heights(path, file, band)

@@ -28,12 +28,9 @@ FILES = {
 }  # fmt: skip
 """Names of the files that hold drawn shapes."""
 _KEYS = {
-    "survey": (
-        "polygon_ne_m", "polygon_latlon_deg", "corridor_ne_m", "corridor_latlon_deg", "wkt",
-        "file", "layer",
-    ),
-    "no_go": ("no_go_ne_m", "no_go_latlon_deg", "no_go_file", "no_go_layer"),
-    "allowed": ("allowed_ne_m", "allowed_latlon_deg", "allowed_file", "allowed_layer"),
+    "survey": ("polygon_ne_m", "polygon_latlon_deg", "corridor_ne_m", "wkt", "file", "layer"),
+    "no_go": ("no_go_ne_m", "no_go_file"),
+    "allowed": ("allowed_ne_m", "allowed_file"),
 }  # fmt: skip
 _NEED_CRS = ("file", "wkt", "no_go_file", "allowed_file")
 _MAX_INLINE = 100

@@ -41,7 +41,6 @@ from missions.areas.safe import (
 Role = Literal["survey", "no_go", "allowed"]
 _DEEPEST = 20
 _SRID = re.compile(r"\s*SRID\s*=\s*(\d+)\s*;", re.IGNORECASE)
-_LAYER_SETTING = {"survey": "layer", "no_go": "no_go_layer", "allowed": "allowed_layer"}
 SUFFIXES = (*DRIVERS, ".wkt", ".plan")
 
 
@@ -87,7 +86,7 @@ def read_area_file(
         return _read_qgc_plan(path, layer, role)
     if suffix == ".wkt":
         if layer is not None:
-            raise PlanError(f"area: {path}: it has no layers: leave out {_LAYER_SETTING[role]}")
+            raise PlanError(f"area: {path}: it has no layers: leave out layer")
         try:
             text = read_bytes(path).decode("utf-8-sig")
         except UnicodeDecodeError:
@@ -252,12 +251,11 @@ def _choose(path: Path, layers: list[_Layer], layer: str | None, role: Role) -> 
     Raises:
         PlanError: there is none, or there are several to choose from.
     """
-    setting = _LAYER_SETTING[role]
     if layer is not None:
         found = [one for one in layers if one.name == layer]
         if not found:
             names = ", ".join(repr(one.name) for one in layers) or "none"
-            raise PlanError(f"area: {path}: no layer {layer!r}; there are {names}: set {setting}")
+            raise PlanError(f"area: {path}: no layer {layer!r}; there are {names}: set layer")
         if len(found) > 1:
             raise PlanError(f"area: {path}: {len(found)} layers are named {layer!r}: rename one")
         return found[0]
@@ -272,7 +270,8 @@ def _choose(path: Path, layers: list[_Layer], layer: str | None, role: Role) -> 
         raise PlanError(f"area: {path}: it holds {held}; an area needs a polygon or a line")
     if len(usable) > 1:
         names = ", ".join(repr(one.name) for one in usable)
-        raise PlanError(f"area: {path}: shapes in the layers {names}: set {setting} to one of them")
+        cure = "set layer to one of them" if role == "survey" else "save one as a file of its own"
+        raise PlanError(f"area: {path}: shapes in the layers {names}: {cure}")
     return usable[0]
 
 

@@ -336,17 +336,15 @@ def _survey_shapes(settings: AreaConfig) -> RawShapes:
         return read_area_file(settings.file, settings.layer, settings.crs)
     if settings.wkt is not None:
         return read_wkt("wkt", settings.wkt, settings.crs)
-    for name in ("corridor_ne_m", "corridor_latlon_deg"):
-        points = getattr(settings, name)
-        if points is not None:
-            line = RawLine(points=np.asarray(points, dtype=np.float64))
-            return RawShapes(
-                origin=name, geographic="latlon" in name, lines=(line,), points=no_points()
-            )
-    for name in ("polygon_ne_m", "polygon_latlon_deg"):
-        corners = getattr(settings, name)
-        if corners is not None:
-            return from_rings(name, [corners], geographic="latlon" in name)
+    if settings.corridor_ne_m is not None:
+        line = RawLine(points=np.asarray(settings.corridor_ne_m, dtype=np.float64))
+        return RawShapes(
+            origin="corridor_ne_m", geographic=False, lines=(line,), points=no_points()
+        )
+    if settings.polygon_ne_m is not None:
+        return from_rings("polygon_ne_m", [settings.polygon_ne_m], geographic=False)
+    if settings.polygon_latlon_deg is not None:
+        return from_rings("polygon_latlon_deg", [settings.polygon_latlon_deg], geographic=True)
     return from_rings("rectangle", [_rectangle(settings)], geographic=False)
 
 
@@ -377,14 +375,10 @@ def _no_go_shapes(settings: AreaConfig) -> list[RawShapes]:
         PlanError: a file cannot be read.
     """
     zones = []
-    for name in ("no_go_ne_m", "no_go_latlon_deg"):
-        rings = getattr(settings, name)
-        if rings:
-            zones.append(from_rings(name, rings, geographic="latlon" in name))
+    if settings.no_go_ne_m:
+        zones.append(from_rings("no_go_ne_m", settings.no_go_ne_m, geographic=False))
     if settings.no_go_file is not None:
-        zones.append(
-            read_area_file(settings.no_go_file, settings.no_go_layer, settings.crs, role="no_go")
-        )
+        zones.append(read_area_file(settings.no_go_file, None, settings.crs, role="no_go"))
     return zones
 
 
@@ -394,15 +388,11 @@ def _allowed_shapes(settings: AreaConfig) -> RawShapes | None:
     Raises:
         PlanError: a file cannot be read.
     """
-    for name in ("allowed_ne_m", "allowed_latlon_deg"):
-        corners = getattr(settings, name)
-        if corners is not None:
-            return from_rings(name, [corners], geographic="latlon" in name)
+    if settings.allowed_ne_m is not None:
+        return from_rings("allowed_ne_m", [settings.allowed_ne_m], geographic=False)
     if settings.allowed_file is None:
         return None
-    return read_area_file(
-        settings.allowed_file, settings.allowed_layer, settings.crs, role="allowed"
-    )
+    return read_area_file(settings.allowed_file, None, settings.crs, role="allowed")
 
 
 def _rectangle(settings: AreaConfig) -> Array:
@@ -411,7 +401,7 @@ def _rectangle(settings: AreaConfig) -> Array:
     along = settings.length_m * np.array([math.cos(heading), math.sin(heading)])
     right = settings.width_m * np.array([-math.sin(heading), math.cos(heading)])
     corners: Array = np.array([0 * along, along, along + right, right])
-    return corners if settings.datum_at == "corner" else corners - (along + right) / 2
+    return corners
 
 
 def repaired(

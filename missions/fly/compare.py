@@ -279,7 +279,7 @@ def fly_variant(
         settings,
         vehicle=with_values(
             settings.vehicle, name=variant.vehicle, controller=variant.controller,
-            thruster_health=dict.fromkeys(variant.failed, 0.0),
+            failures=list(variant.failed),
         ),
         sea=with_values(
             settings.sea, current_mps=case.current_mps, current_towards_deg=case.towards_deg,

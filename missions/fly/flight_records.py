@@ -119,7 +119,7 @@ def flight_summary(flight: Flight, vehicle: VehicleConfig, rig: Rig) -> dict[str
         "coefficients": vehicle.coefficients,
         "allocation": vehicle.allocation,
         "thruster_health": {
-            thruster.name: vehicle.thruster_health.get(thruster.name, 1.0)
+            thruster.name: vehicle.impaired.get(thruster.name, 1.0)
             for thruster in flight.vehicle.thrusters
         },
         "failures_found": [asdict(one) for one in flown.found],

@@ -184,26 +184,19 @@ def pilot_mission(
             lacks.
     """
     mission, plan = known.mission, known.plan
-    follower = vehicle.follower or mission.autopilot
-    if follower != mission.autopilot:
-        raise VehicleError(
-            f"{known.path}: is a mission for {mission.autopilot}, which {follower} does not read: "
-            f"give one of {follower}'s, or leave the follower out"
-        )
     gains = gains_for(sound_craft_of(vehicle), plan.speed_mps)
     steps = _rows(known, mount)
-    if follower == "ardusub":
+    if mission.autopilot == "ardusub":
         if not sways(gains):
             raise VehicleError(
                 f"ArduSub holds on to its track sideways; {vehicle.name} has no thrusters for it: "
                 "fly a mission for COLA2, or another vehicle"
             )
         return pilot.mission_of(pilot.ARDUSUB, steps, ArduSubSettings())
-    delta_m = vehicle.cola2_delta_m or cola2_delta_m(gains, plan.speed_mps)
+    delta_m = cola2_delta_m(gains, plan.speed_mps)
     if not math.isfinite(delta_m):
         raise VehicleError(
-            f"no look-ahead keeps {vehicle.name} from weaving under COLA2: set "
-            "vehicle.cola2_delta_m, or lower the speed"
+            f"no look-ahead keeps {vehicle.name} from weaving under COLA2: lower the speed"
         )
     return pilot.mission_of(pilot.COLA2, steps, cola2_settings(delta_m, plan.speed_mps))
 

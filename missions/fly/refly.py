@@ -89,7 +89,7 @@ def refly_plan(
         usable_wh=usable_wh,
         max_s=settings.dive_s,
         depth_m=plan.seafloor_depth_m - plan.altitude_m,
-        split=settings.split_dives,
+        split=True,
     )
     again = again_over(plan, multipolygon(seen), lines, dives, name)
     seen_alone = certificate(again.area, rig, stations_of_plan(again), pattern)

@@ -15,6 +15,7 @@ from alice_survey.core.config import (
     SeaConfig,
     SurveyConfig,
     VehicleConfig,
+    parse_failures,
 )
 from alice_survey.core.errors import warn
 from alice_survey.core.frames import Array, rotation_from_attitude
@@ -235,7 +236,7 @@ def piloting_of(
         return gains, guidance._replace(under_way=guidance.under_way._replace(side=side))
 
     # The pilot flies as well as the thrusters allow that he knows to be sound.
-    known = settings.vehicle.impaired if settings.vehicle.health_known else {}
+    known = settings.vehicle.impaired
     gains, guidance = pilot_without(known)
     return Piloting(
         vehicle=vehicle,
@@ -299,7 +300,8 @@ def _failures(vehicle: Vehicle, settings: VehicleConfig) -> tuple[Failure, ...]:
     Raises:
         VehicleError: one is not the vehicle's.
     """
-    kinds = ((settings.failures, False), (settings.lost_propellers, True))
+    found = parse_failures(settings.failures)
+    kinds = ((found.later, False), (found.propellers, True))
     for failures, _ in kinds:
         vehicle.health_of({name: share for name, _, share in failures})
     return tuple(
@@ -354,7 +356,8 @@ def sensors_of(navigation: NavigationConfig, camera: CameraConfig) -> SensorSuit
             beam_noise_mps=navigation.dvl_noise_mps,
         ),
         usbl=UsblSpec(
-            rate_hz=_USBL_HZ if navigation.usbl else 0.0, noise_m=navigation.usbl_noise_m
+            rate_hz=_USBL_HZ if navigation.usbl_noise_m else 0.0,
+            noise_m=navigation.usbl_noise_m or UsblSpec().noise_m,
         ),
         dvl_dropouts_s=navigation.dvl_dropouts_s,
         bottom_dropouts_s=navigation.bottom_dropouts_s,

@@ -15,7 +15,7 @@ import shapely.ops
 from shapely.geometry import MultiPolygon, Point
 
 from alice_survey.core.config import PlanConfig
-from alice_survey.core.errors import PlanError, warn
+from alice_survey.core.errors import warn
 from missions.lines.lay import check_size, lay_lines
 from missions.lines.sweep import Sweep, best_heading
 from missions.route.dives import split_dives
@@ -64,15 +64,10 @@ def plan_parts(
         depth_m: that the vehicle goes down to.
 
     Raises:
-        PlanError: a part cannot be planned, or the parts may not be dived one by one.
+        PlanError: a part cannot be planned.
     """
     check_size(area, pattern)
     parts = parts_of(area, home_ne)
-    if len(parts) > 1 and not wanted.split_dives:
-        raise PlanError(
-            f"the vehicle may be in {len(parts)} parts and cannot pass between them in one dive: "
-            "set split_dives = true, or widen area.turn_margin_m"
-        )
     whole, tied = PlannedDives(lines=(), dives=(), sweep=None), True
     for number, (part, home) in enumerate(parts):
         more = _plan_part(part, wanted, pattern, costs, home, usable_wh, depth_m)
@@ -93,10 +88,9 @@ def plan_parts(
             + transit_text(whole.dives, costs, usable_wh)
         )
     if len(whole.dives) > len(parts) and not (tied or wanted.cross_lines):
-        room = "" if wanted.tie_dives else ", plan.tie_dives = true flies a line of each again"
         warn(
             f"{len(whole.dives)} dives are tied by the overlap of neighbouring lines "
-            f"alone: plan.cross_lines = 1 crosses the lines of all of them{room}"
+            "alone: plan.cross_lines = 1 crosses the lines of all of them"
         )
     return whole
 
@@ -209,8 +203,8 @@ def _plan_part(
         usable_wh=usable_wh,
         max_s=math.inf if wanted.dive_s is None else wanted.dive_s,
         depth_m=depth_m,
-        split=wanted.split_dives,
-        tied=wanted.tie_dives,
+        split=True,
+        tied=True,
     )
     return with_ties(PlannedDives(lines=tuple(lines), dives=dives, sweep=sweep))
 

@@ -244,7 +244,7 @@ def area_bathymetry(settings: AreaConfig, area: Area, altitude_m: float) -> Bath
         area.datum,
         bounds_ne=(south - reach_m, west - reach_m, north + reach_m, east + reach_m),
         sense=settings.bathymetry_values,
-        crs=settings.bathymetry_crs,
+        crs=settings.crs,
     )
 
 

@@ -116,8 +116,8 @@ def too_strong(
             f"at {speed:g} m/s over ground"
         )
         if not ways:
-            return PlanError(f"{said} with the thrust it has left: check vehicle.thruster_health")
-        return conflict(said, (against, "the thrust it has left (vehicle.thruster_health)"), ways)
+            return PlanError(f"{said} with the thrust it has left: check vehicle.failures")
+        return conflict(said, (against, "the thrust it has left (vehicle.failures)"), ways)
     strength = (
         f"the {held_mps:.2f} m/s that {name} holds at {speed:g} m/s over ground, lines"
         f"{heading} {manner}"
@@ -179,12 +179,12 @@ def _changes(flown: FlightConditions, own: VehicleConfig, setup: ImagingSetup) -
     if own.file is not None or own.coefficients_file is not None:  # of this vehicle alone
         return
     for other in (name for name in vehicles_of_a_geometry() if name != own.name):
-        changed = flown.with_vehicle(own.model_copy(update={"name": other, "thruster_health": {}}))
+        changed = flown.with_vehicle(own.model_copy(update={"name": other, "failures": ()}))
         named = f"vehicle.name = '{other}'"
         settings: dict[str, Any] = {"vehicle.name": other}
         if own.impaired:
-            named += " without vehicle.thruster_health"
-            settings["vehicle.thruster_health"] = {}
+            named += " without vehicle.failures"
+            settings["vehicle.failures"] = ()
         yield from _tried(changed, setup, named, 1.0, settings)
 
 

@@ -268,9 +268,9 @@ def craft_of(settings: VehicleConfig) -> Vehicle:
         VehicleError: as `sound_craft_of`.
     """
     craft = sound_craft_of(settings)
-    left = craft.weaken(settings.impaired if settings.health_known else {})
+    left = craft.weaken(settings.impaired)
     if not left.thrusters:
-        raise VehicleError(f"{craft.name} has no thruster left: check vehicle.thruster_health")
+        raise VehicleError(f"{craft.name} has no thruster left: check vehicle.failures")
     return left
 
 
@@ -485,8 +485,7 @@ def _heave(conditions: FlightConditions) -> tuple[float, float]:
     can = np.flatnonzero(np.isfinite(power))
     if not len(can):
         raise PlanError(
-            f"{craft.name} cannot dive with the vertical thrust it has left: check "
-            "vehicle.thruster_health"
+            f"{craft.name} cannot dive with the vertical thrust it has left: check vehicle.failures"
         )
     return float(_HEAVES_MPS[can[0]]), float(power[can[0]])
 

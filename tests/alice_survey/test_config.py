@@ -1,4 +1,6 @@
 import math
+import re
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +10,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from alice_survey.core.config import (
+    REMOVED,
     AreaConfig,
     PlanConfig,
     SurveyConfig,
@@ -15,10 +18,11 @@ from alice_survey.core.config import (
     load_config,
     parse_config,
     parse_current,
-    parse_health,
+    parse_failures,
 )
 from alice_survey.core.errors import ConfigError
 from alice_survey.core.seawater import n_water, n_water_sigma
+from alice_survey.core.settings_form import sections, settings_template
 
 
 def fault(settings: dict[str, Any]) -> str:
@@ -99,16 +103,10 @@ def test_settings_come_back_from_their_json() -> None:
 
 def test_the_index_of_water_follows_from_temperature_salinity_and_depth() -> None:
     sea = {"temperature_c": 24.0, "salinity_psu": 35.0}
-    for depth_m, wavelength_nm in ((15.0, 530.0), (4000.0, 460.0)):
-        config = parse_config(
-            {
-                "water": sea | ({} if wavelength_nm == 530.0 else {"wavelength_nm": 460.0}),
-                "area": {"seafloor_depth_m": depth_m},
-            },
-            "x",
-        )
-        assert config.water.n_water == float(n_water(24.0, 35.0, depth_m, wavelength_nm))
-        assert config.water.index_sigma == n_water_sigma(24.0, 35.0, wavelength_nm)
+    for depth_m in (15.0, 4000.0):
+        config = parse_config({"water": sea, "area": {"seafloor_depth_m": depth_m}}, "x")
+        assert config.water.n_water == float(n_water(24.0, 35.0, depth_m, 530.0))
+        assert config.water.index_sigma == n_water_sigma(24.0, 35.0, 530.0)
         assert SurveyConfig.model_validate(config.model_dump(mode="json")) == config
     assert parse_config({}, "x").water.n_water == 1.34
     assert parse_config({}, "x").water.index_sigma == n_water_sigma()
@@ -120,7 +118,6 @@ def test_the_index_of_water_follows_from_temperature_salinity_and_depth() -> Non
     [
         ({"temperature_c": 24, "salinity_psu": 35, "n_water": 1.34}, "n_water = 1.34118"),
         ({"temperature_c": 24}, "salinity_psu"), ({"salinity_psu": 35}, "temperature_c"),
-        ({"wavelength_nm": 460}, "wavelength_nm"),
         ({"temperature_c": 50, "salinity_psu": 35}, "temperature_c = 50"),
         ({"temperature_c": 24, "salinity_psu": 350}, "salinity_psu = 350"),
     ],
@@ -170,7 +167,7 @@ def test_defaults_pass_their_own_bounds() -> None:
 def test_files_named_in_settings_are_relative_to_them(tmp_path: Path) -> None:
     path = tmp_path / "survey.toml"
     path.write_text(
-        '[sea]\ncurrent_file = "adcp.csv"\n[vehicle]\ncoefficients_file = "/far/found.json"\n'
+        '[sea]\ncurrent_file = "adcp.csv"\n[vehicle]\ncoefficients = "/far/found.json"\n'
     )
     config = load_config(path)
     assert config.sea.current_file == tmp_path / "adcp.csv"
@@ -178,16 +175,16 @@ def test_files_named_in_settings_are_relative_to_them(tmp_path: Path) -> None:
 
 
 def test_thrusters_have_their_health_by_name() -> None:
-    config = parse_config({"vehicle": {"thruster_health": {"stern": 0.0, "bow": 0.5}}}, "test")
+    config = parse_config({"vehicle": {"failures": ["stern", "bow=0.5", "port@60"]}}, "test")
     assert config.vehicle.impaired == {"stern": 0.0, "bow": 0.5}
-    for wrong in (1.5, -0.1, True, "half"):
-        with pytest.raises(ConfigError, match="thruster_health"):
-            parse_config({"vehicle": {"thruster_health": {"bow": wrong}}}, "test")
+    for wrong in ("bow=1.5", "bow=-0.1", "bow=half", "bow@-1", True):
+        with pytest.raises(ConfigError, match=r"vehicle\.failures"):
+            parse_config({"vehicle": {"failures": [wrong]}}, "test")
 
 
 def test_surveys_are_keys() -> None:
     """Results are kept by the survey that they are of."""
-    weak = {"vehicle": {"thruster_health": {"bow": 0.5}}}
+    weak = {"vehicle": {"failures": ["bow=0.5"]}}
     same, again, other = (parse_config(given, "test") for given in (weak, weak, {}))
     assert len({same: 1, again: 2, other: 3}) == 2
 
@@ -227,15 +224,38 @@ def test_a_changed_setting_is_checked_like_one_in_the_file() -> None:
 
 
 def test_weak_thrusters_are_read_from_their_texts() -> None:
-    assert parse_health(["stern", "bow=0.5"]) == ({"stern": 0.0, "bow": 0.5}, None, None)
-    assert parse_health(["stern@600", "bow=0.5@30"])[1] == [("stern", 600, 0), ("bow", 30, 0.5)]
-    assert parse_health(["bow:propeller=0.2", "stern:propeller@600"]) == (
-        None,
-        None,
-        [("bow", 0.0, 0.2), ("stern", 600.0, 0.0)],
+    assert parse_failures(["stern", "bow=0.5"]) == ({"stern": 0.0, "bow": 0.5}, [], [])
+    assert parse_failures(["stern@600", "bow=0.5@30"])[1] == [("stern", 600, 0), ("bow", 30, 0.5)]
+    propellers = parse_failures(["bow:propeller=0.2", "stern:propeller@600"])
+    assert propellers == ({}, [], [("bow", 0.0, 0.2), ("stern", 600.0, 0.0)])
+    assert parse_failures([]) == ({}, [], [])
+    for wrong in ("bow@soon", "bow=half"):
+        with pytest.raises(ConfigError, match="stern@600"):
+            parse_failures([wrong])
+
+
+def test_a_key_that_is_gone_says_what_to_do() -> None:
+    for name, cure in REMOVED.items():
+        section, key = name.split(".")
+        assert f"{name} is gone: {cure}" in fault({section: {key: 1}})
+
+
+def test_a_new_file_holds_every_setting_with_its_default() -> None:
+    text = settings_template()
+    new = parse_config(tomllib.loads(text), "template")
+    assert new == changed(SurveyConfig(), "plan", line_spacing_m=1.0)
+    lines = text.splitlines()
+    for section, kind in sections().items():
+        part = lines[next(i for i, x in enumerate(lines) if x.startswith(f"[{section}]")) :]
+        for key in kind.model_fields:
+            assert any(
+                re.match(rf"(# )?{key} = .* # \S", line.replace("#   ", "# ")) for line in part
+            ), key
+    examples = "\n".join(
+        line.removeprefix("# ") for line in lines if re.match(r"# \w+ = |\[", line)
     )
-    assert parse_health(None) == (None, None, None)
-    with pytest.raises(ConfigError, match="stern@600"):
-        parse_health(["bow@soon"])
-    with pytest.raises(ConfigError):
-        parse_health(["bow=half"])
+    for section, values in tomllib.loads(examples).items():
+        for key, value in values.items():
+            one = {"temperature_c": {"salinity_psu": 39.0}, "salinity_psu": {"temperature_c": 22.0}}
+            parse_config({section: {key: value, **one.get(key, {})}}, "example")
+    assert max(map(len, lines)) <= 120

@@ -78,10 +78,7 @@ def test_odd_numbers_of_settings_are_used_or_refused(
 def test_a_vehicle_without_any_thrust_is_refused(tmp_path: Path) -> None:
     sandbox = Sandbox(tmp_path)
     path = sandbox.inside / "survey.toml"
-    health = ", ".join(
-        f"{name} = 0.0" for name in ("starboard", "port", "vertical", "bow", "stern")
-    )
-    path.write_text(f"[vehicle]\nthruster_health = {{ {health} }}\n")
+    path.write_text('[vehicle]\nfailures = ["starboard", "port", "vertical", "bow", "stern"]\n')
     assert judge(read_and_check_survey, path, sandbox).outcome == "refused"
 
 

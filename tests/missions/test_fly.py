@@ -186,5 +186,3 @@ def test_an_exported_mission_is_flown_next_to_its_certificate(
     with pytest.raises(PlanError, match="no mission") as caught:
         run(["fly"], tmp_path, None, flight=FlightChanges(mission=tmp_path / "notes.txt"))
     assert "\n" not in str(caught.value)
-    with pytest.raises(VehicleError, match="cola2 does not read"):
-        run(["fly"], tmp_path, None, flight=FlightChanges(mission=file, follower="cola2"))

@@ -112,8 +112,6 @@ def test_an_area_from_a_pipe_is_refused_at_once(tmp_path: Path) -> None:
 
 
 def test_a_vehicle_without_thrust_is_refused() -> None:
-    dead = dict.fromkeys(("starboard", "port", "vertical", "bow", "stern"), 0.0)
-    with pytest.raises(
-        AliceError, match=r"alice has no thruster left: check vehicle.thruster_health"
-    ):
-        survey_costs(parse_config({"vehicle": {"thruster_health": dead}}, "settings"))
+    dead = ["starboard", "port", "vertical", "bow", "stern"]
+    with pytest.raises(AliceError, match=r"alice has no thruster left: check vehicle\.failures"):
+        survey_costs(parse_config({"vehicle": {"failures": dead}}, "settings"))

@@ -133,8 +133,8 @@ def test_no_vehicle_dives_deeper_than_it_is_built_for() -> None:
         ({"name": "nautilus"}, "alice, bluerov2_heavy, remus100, sparus2, or a TOML file"),
         ({"name": "none.toml"}, "none.toml: cannot be read"),
         ({"name": "bluerov2_heavy", "coefficients": "cfd"}, "has its own coefficients, not 'cfd'"),
-        ({"thruster_health": {"warp": 0.5}}, "no thruster 'warp'; it has starboard"),
-        ({"name": "sparus2", "thruster_health": {"bow": 0.0}}, "sparus2 has no thruster 'bow'"),
+        ({"failures": ["warp=0.5"]}, "no thruster 'warp'; it has starboard"),
+        ({"name": "sparus2", "failures": ["bow"]}, "sparus2 has no thruster 'bow'"),
     ],
 )
 def test_what_is_not_known_is_named(vehicle: dict[str, object], named: str) -> None:

@@ -12,6 +12,7 @@ from alice_survey.core.config import (
     CameraConfig,
     SeaConfig,
     SurveyConfig,
+    VehicleConfig,
     WaterConfig,
     parse_config,
 )
@@ -111,7 +112,7 @@ def test_altitude_is_held_over_a_slope() -> None:
 
 @pytest.mark.parametrize("thruster", ["starboard", "port", "bow", "stern"])
 def test_with_one_thruster_failed_she_still_flies_the_survey(thruster: str) -> None:
-    flight = fly(survey(vehicle={"thruster_health": {thruster: 0.0}}))
+    flight = fly(survey(vehicle={"failures": [thruster]}))
     turns = flight.flown.rps[:, flight.flown.thrusters.index(thruster)]
     assert np.all(turns == 0.0)
     assert flight.ending == "complete"
@@ -123,8 +124,7 @@ def test_with_one_thruster_failed_she_still_flies_the_survey(thruster: str) -> N
 
 
 def test_weak_thrusters_push_no_more_than_is_left_of_them() -> None:
-    weak = {"bow": 0.3, "starboard": 0.3}
-    flight = fly(survey(vehicle={"thruster_health": weak}))
+    flight = fly(survey(vehicle={"failures": ["bow=0.3", "starboard=0.3"]}))
     fastest = dict(zip(flight.flown.thrusters, np.abs(flight.flown.rps).max(axis=0), strict=True))
     assert fastest["bow"] <= 56.5 * 0.3**0.5 + 1e-9
     assert fastest["starboard"] <= 50.0 * 0.3**0.5 + 1e-9
@@ -133,8 +133,8 @@ def test_weak_thrusters_push_no_more_than_is_left_of_them() -> None:
 
 
 def test_a_thruster_that_fails_unnoticed_leaves_pictures_off_their_lines() -> None:
-    known = fly(survey(vehicle={"thruster_health": {"bow": 0.0}}))
-    dead = survey(vehicle={"thruster_health": {"bow": 0.0}, "health_known": False})
+    known = fly(survey(vehicle={"failures": ["bow"]}))
+    dead = survey(vehicle={"failures": ["bow@0"]})
     unknown = fly(dead)
     # Off their lines, or not taken at all, where the vehicle spins before it has reached the start.
     on_line = [len(f.trigger_s) - f.stations_off_line for f in (known, unknown)]
@@ -182,7 +182,7 @@ def test_navigation_is_consistent_in_the_closed_loop() -> None:
 
 def test_without_the_vertical_thruster_she_cannot_dive_and_says_so() -> None:
     with pytest.raises(VehicleError, match="heave"):
-        fly(survey(vehicle={"thruster_health": {"vertical": 0.0}}))
+        fly(survey(vehicle={"failures": ["vertical"]}))
 
 
 def test_the_original_vehicle_flies_by_heading_alone() -> None:
@@ -243,8 +243,8 @@ def test_a_current_too_strong_is_refused_by_the_vehicle() -> None:
 
 
 def test_a_slowly_varying_current_has_the_sigma_of_the_settings() -> None:
-    sea = SeaConfig(current_mps=0.1, current_sigma_mps=0.03, current_correlation_s=20.0)
-    current = current_of(sea, 20.0, 40_000.0, np.random.default_rng(1))
+    sea = SeaConfig(current_mps=0.1, current_sigma_mps=0.03)
+    current = current_of(sea, 20.0, 600_000.0, np.random.default_rng(1))
     north = current.velocity_ne_mps[:, 0, 0]
     assert 0.025 < north.std() < 0.035
     assert abs(north.mean()) < 0.006
@@ -296,12 +296,13 @@ def heading_deg(flight: Flight, after_s: float) -> float:
     return float(np.rad2deg(rms(flight.line_errors[1][flight.truth.time_s > after_s])))
 
 
-def test_a_thruster_that_fails_on_the_way_is_found_and_flown_without() -> None:
+def test_a_thruster_that_fails_on_the_way_is_found_and_flown_without(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     at_s = 70.0
-    lost = {"failures": [["stern", at_s, 0.0]]}
-    found, blind = (
-        fly(survey(vehicle={**lost, "finds_failures": finds})) for finds in (True, False)
-    )
+    found = fly(survey(vehicle={"failures": ["stern@70"]}))
+    monkeypatch.setattr(VehicleConfig, "finds_failures", False)
+    blind = fly(survey(vehicle={"failures": ["stern@70"]}))
     (one,) = found.flown.found
     assert (one.thruster, one.left) == ("stern", 0.0)
     assert at_s + 5.0 <= one.time_s <= at_s + 40.0
@@ -314,12 +315,13 @@ def test_a_thruster_that_fails_on_the_way_is_found_and_flown_without() -> None:
     np.testing.assert_array_equal(found.flown.state[before], whole.flown.state[: before.sum()])
 
 
-def test_a_thruster_that_turns_and_pushes_nothing_is_found_and_flown_without() -> None:
+def test_a_thruster_that_turns_and_pushes_nothing_is_found_and_flown_without(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     at_s = 70.0
-    lost = {"lost_propellers": [["stern", at_s, 0.0]]}
-    found, blind = (
-        fly(survey(vehicle={**lost, "finds_failures": finds})) for finds in (True, False)
-    )
+    found = fly(survey(vehicle={"failures": ["stern:propeller@70"]}))
+    monkeypatch.setattr(VehicleConfig, "finds_failures", False)
+    blind = fly(survey(vehicle={"failures": ["stern:propeller@70"]}))
     (one,) = found.flown.found
     assert (one.thruster, one.left, one.turns) == ("stern", 0.0, True)
     assert at_s + 5.0 <= one.time_s <= at_s + 60.0
@@ -367,14 +369,14 @@ def test_in_seven_seas_nothing_adds_up_and_lost_propellers_do(
     assert 0.5 < max(sums) < 0.5 * alarm
     for sea, latest_s in ((None, 60.0), (along, 60.0), (across, 150.0)):
         for name in ("bow", "stern", "vertical"):
-            lost = {"lost_propellers": [[name, 70.0, 0.0]]}
+            lost = {"failures": [f"{name}:propeller@70"]}
             one = fly(survey(vehicle=lost, **({"sea": sea} if sea else {}))).flown.found[0]
             assert (one.thruster, one.turns) == (name, True)
             assert 5.0 <= one.time_s - 70.0 <= latest_s
 
 
 def test_a_vehicle_that_loses_its_only_vertical_thruster_gives_up() -> None:
-    flight = fly(survey(vehicle={"failures": [["vertical", 60.0, 0.0]]}))
+    flight = fly(survey(vehicle={"failures": ["vertical@60"]}))
     assert flight.ending == "aborted: a thruster failed without which it cannot fly a survey"
     assert flight.flown.found[0].thruster == "vertical"
 

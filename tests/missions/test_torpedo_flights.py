@@ -89,7 +89,7 @@ def test_an_aborted_flight_comes_up_in_a_circle() -> None:
 def test_a_dead_propeller_ends_the_mission_at_the_surface() -> None:
     """Without a propeller nothing steers; the light vehicle floats up by itself."""
     config = survey(vehicle={
-        "name": "remus100", "controller": "los", "failures": [["propeller", 60.0, 0.0]],
+        "name": "remus100", "controller": "los", "failures": ["propeller@60"],
     })  # fmt: skip
     flight = flown(planned(config), config)
     assert flight.ending.startswith("aborted: a thruster failed")

@@ -202,10 +202,6 @@ def fly(
             help="Fly this exported mission of the plan (COLA2, QGC WPL, QGroundControl).",
         ),
     ] = None,
-    follower: Annotated[
-        Literal["cola2", "ardusub"] | None,
-        typer.Option(help="Autopilot that flies the mission; the file's own when not given."),
-    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Fly the plan, or a mission that was exported from it.
@@ -217,7 +213,7 @@ def fly(
 
     changes = FlightChanges(
         vehicle=vehicle, controller=controller, current=current, failed=fail, dive=dive,
-        mission=mission, follower=follower,
+        mission=mission,
     )  # fmt: skip
     print_result(*run(["fly"], workspace, survey, flight=changes), as_json)
 

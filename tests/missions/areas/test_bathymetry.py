@@ -216,13 +216,13 @@ def test_faults_say_what_to_change(tmp_path: Path) -> None:
         read_bathymetry(path, DATUM, bounds_ne=(500.0, 500.0, 600.0, 600.0))
     with pytest.raises(PlanError, match=r"missing\.tif"):
         read_bathymetry(tmp_path / "missing.tif", DATUM)
-    with pytest.raises(PlanError, match="EPSG:999999"):
-        read_bathymetry(path, DATUM, crs="EPSG:999999")
     with pytest.raises(PlanError, match=r"area\.bathymetry_file"):
         read_bathymetry(_written(tmp_path / "e.tif", np.full((5, 5), np.nan)), DATUM)
     nameless = _written(tmp_path / "n.tif", _plane(), crs=None)
-    with pytest.raises(PlanError, match=r"area\.bathymetry_crs"):
+    with pytest.raises(PlanError, match=r"area\.crs"):
         read_bathymetry(nameless, DATUM)
+    with pytest.raises(PlanError, match="EPSG:999999"):
+        read_bathymetry(nameless, DATUM, crs="EPSG:999999")
     named = read_bathymetry(nameless, DATUM, crs=UTM)
     np.testing.assert_array_equal(named.depth_m, _plane())
 

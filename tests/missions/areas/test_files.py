@@ -175,12 +175,14 @@ def test_a_wrong_system_lands_far_from_the_datum(tmp_path: Path) -> None:
 def test_layers_are_chosen_by_name(tmp_path: Path, wanted: Area) -> None:
     file = write(tmp_path / "chart.gpkg", [SITE], "GPKG", layer="reef")
     write(file, [SITE.buffer(5)], "GPKG", layer="permit", append=True)
+    permit, buoys = tmp_path / "permit.gpkg", tmp_path / "buoys.gpkg"
+    write(permit, [SITE.buffer(5)], "GPKG")
+    write(buoys, [Point(700020, 3640003)], "GPKG")
     write(file, [Point(700020, 3640003)], "GPKG", layer="buoys", append=True)
     assert " layer" in refusal(file=file)
     assert "wreck" in refusal(file=file, layer="wreck")
     area = area_of(
-        file=file, layer="reef", allowed_file=file, allowed_layer="permit",
-        no_go_file=file, no_go_layer="buoys", no_go_clearance_m=1.0,
+        file=file, layer="reef", allowed_file=permit, no_go_file=buoys, no_go_clearance_m=1.0,
     )  # fmt: skip
     assert area.allowed.area > wanted.survey.area
     # The hole (12.5 m2, 15.6 m round) and the disc about the buoy, each 1 m wider.
@@ -188,7 +190,7 @@ def test_layers_are_chosen_by_name(tmp_path: Path, wanted: Area) -> None:
     hole, disc = sorted((part.area for part in area.no_go.geoms), reverse=True)
     assert disc == pytest.approx(np.pi, rel=0.02)
     assert 12.5 + 15.6 < hole < 12.5 + 15.6 + 8
-    assert "no_go_layer" in refusal(file=file, layer="reef", no_go_file=file)
+    assert "file of its own" in refusal(file=file, layer="reef", no_go_file=file)
 
 
 def test_mixed_shapes_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -64,11 +64,6 @@ def test_dives_of_parts_are_flown_one_by_one(plan: Plan) -> None:
     )
 
 
-def test_parts_that_may_not_be_dived_one_by_one_are_refused() -> None:
-    with pytest.raises(PlanError, match="split_dives"):
-        planned(parse_config({"area": {"wkt": APART}, "plan": {"split_dives": False}}, "test"))
-
-
 def test_the_way_between_parts_at_the_surface_is_weighed_against_the_battery(plan: Plan) -> None:
     """At 1 W and 0.2 m/s, from the end of a part to the nearest place of the next."""
     costs = time_costs(0.2)
@@ -109,14 +104,13 @@ def _seen_by(plan: Plan, rig: Rig, dive: Dive) -> BaseGeometry:
     )
 
 
-@pytest.mark.parametrize("tie_dives", [False, True])
-def test_pictures_of_neighbouring_dives_overlap_by_a_line(tie_dives: bool) -> None:
-    """Along a whole line, by all that it sees; untied, by the overlap of two lines' sides alone."""
+def test_pictures_of_neighbouring_dives_overlap_by_a_line() -> None:
+    """Along a whole line, by all that it sees."""
     config = parse_config(
         {
             "area": {"length_m": 12.0, "width_m": 40.0},
             "plan": {
-                "dive_s": 1600.0, "tie_dives": tie_dives, "cross_lines": 0, "closing_line": False,
+                "dive_s": 1600.0, "cross_lines": 0, "closing_line": False,
                 "line_heading_deg": 0.0,
             },
         },
@@ -131,12 +125,8 @@ def test_pictures_of_neighbouring_dives_overlap_by_a_line(tie_dives: bool) -> No
         shared, again = plan.lines[before.last_line], plan.lines[after.first_line]
         both = _seen_by(plan, rig, before).intersection(_seen_by(plan, rig, after)).area
         swath_m2 = plan.footprint_m[0] * shared.length_m
-        if tie_dives:
-            assert again == replace(shared, kind="tie")
-            assert 1.0 < both / swath_m2 < 2.0
-        else:
-            assert again.kind == "survey"
-            assert 0.1 < both / swath_m2 < 0.6
+        assert again == replace(shared, kind="tie")
+        assert 1.0 < both / swath_m2 < 2.0
     for dive in plan.dives:
         assert dive.duration_s <= 1600.0
         assert [leg.line for leg in dive.route.legs if leg.line >= 0] == list(
@@ -146,7 +136,7 @@ def test_pictures_of_neighbouring_dives_overlap_by_a_line(tie_dives: bool) -> No
 
 @pytest.mark.parametrize("cross_lines", [0, 1])
 def test_cross_lines_tie_all_dives(cross_lines: int, capsys: pytest.CaptureFixture[str]) -> None:
-    wanted = {"dive_s": 500.0, "cross_lines": cross_lines, "tie_dives": False}
+    wanted = {"dive_s": 500.0, "cross_lines": cross_lines}
     plan = planned(parse_config({"plan": wanted}, "test"))
     assert len(plan.dives) >= 4
     owner = [

@@ -28,7 +28,7 @@ def planned(config: SurveyConfig) -> Planned:
         (survey(sea={"current_mps": 0.5}, plan={"turns": "arcs"}), 3),
         (survey(plan={"altitude_m": 0.4, "relief_m": 0.35, "line_spacing_m": 1.0}), 1),
         (survey(plan={"speed_mps": 2.0, "forward_overlap": 0.95}), 1),
-        (survey(vehicle={"thruster_health": {**FIVE_THRUSTERS, "vertical": 0.0}}), 1),
+        (survey(vehicle={"failures": ["vertical"]}), 1),
         (survey(camera={"baseline_m": 2.0}, area={**SMALL, "seafloor_depth_m": 20.0}), 1),
         (survey(plan={"relief_m": 1.2, "sharp_px": 0.5}), 2),
     ],

@@ -171,7 +171,7 @@ def test_turning_on_the_spot_costs_more_in_a_current_and_about_the_glass() -> No
     about_itself = survey_costs(_config(0.0, camera={"position_body_m": (0.0, 0.0, 0.08)}))
     assert 60.0 < about_itself.spot_w < still.spot_w < moved.spot_w
     assert still.turn_rate_rad_s == pytest.approx(math.radians(15.0))
-    lame = survey_costs(_config(0.1, vehicle={"thruster_health": {"bow": 0.0}}))
+    lame = survey_costs(_config(0.1, vehicle={"failures": ["bow"]}))
     assert 0.0 < lame.turn_rate_rad_s < still.turn_rate_rad_s
 
 
@@ -267,8 +267,8 @@ def test_what_is_held_is_the_most_that_flies() -> None:
 
 
 def test_a_vehicle_without_thrust_gets_no_advice_on_the_current() -> None:
-    with pytest.raises(PlanError, match=r"vehicle\.thruster_health"):
-        survey_costs(_config(0.0, vehicle={"thruster_health": {"vertical": 0.0}}))
+    with pytest.raises(PlanError, match=r"vehicle\.failures"):
+        survey_costs(_config(0.0, vehicle={"failures": ["vertical"]}))
 
 
 def test_a_heading_that_cannot_be_flown_is_refused_with_the_nearest_that_can() -> None:
@@ -291,9 +291,9 @@ def test_a_way_between_lines_that_cannot_be_flown_is_refused_with_the_current() 
 
 
 def test_known_failures_count_and_unknown_ones_do_not() -> None:
-    health = {"thruster_health": {"bow": 0.0}}
+    health = {"failures": ["bow"]}
     sound, lame = survey_costs(_config()), survey_costs(_config(vehicle=health))
-    unknown = survey_costs(_config(vehicle={**health, "health_known": False}))
+    unknown = survey_costs(_config(vehicle={"failures": ["bow@0"]}))
     assert lame.line_w[0] > sound.line_w[0] + 5.0
     np.testing.assert_array_equal(unknown.line_w, sound.line_w)
 

@@ -30,8 +30,8 @@ from tests.oracles_dense import (
 )
 
 SCENE = Scene(depth_of=sloped_with_step, paint=speckle())
-CONFIG = SurveyConfig(reconstruct=ReconstructConfig(dense_partners=3))
-UNMASKED = SurveyConfig(reconstruct=ReconstructConfig(dense_partners=3, mask_moving=False))
+CONFIG = SurveyConfig(reconstruct=ReconstructConfig())
+UNMASKED = SurveyConfig(reconstruct=ReconstructConfig(mask_moving=False))
 SEMI_AXES_M = (0.14, 0.06)
 
 

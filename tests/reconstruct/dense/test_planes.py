@@ -34,9 +34,7 @@ BANDS = ("dem", "sigma", "slope", "count", "stations", "surfaces", "lower")
 
 
 def config(*planes: str) -> SurveyConfig:
-    return SurveyConfig(
-        reconstruct=ReconstructConfig(dense_partners=3, dem_cell_m=0.01, planes=planes)
-    )
+    return SurveyConfig(reconstruct=ReconstructConfig(dem_cell_m=0.01, planes=planes))
 
 
 def survey() -> tuple[list, SparseModel]:

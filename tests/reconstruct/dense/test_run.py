@@ -26,7 +26,7 @@ from tests.oracles_dense import (
 )
 
 SCENE = Scene(depth_of=sloped_with_step, paint=speckle())
-CONFIG = SurveyConfig(reconstruct=ReconstructConfig(dense_partners=3))
+CONFIG = SurveyConfig(reconstruct=ReconstructConfig())
 
 
 def survey_views() -> list:

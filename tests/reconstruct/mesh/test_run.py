@@ -73,7 +73,7 @@ def test_tasks_do_not_grow_with_the_survey(tmp_path: Path):
     write_workspace(tmp_path, sparse_model(views, SCENE), SCENE)
     others = [f"left/other_{n:05d}.png" for n in range(5000)]
     write_dense(tmp_path, [*(view.image for view in views), *others])
-    settings = SurveyConfig(reconstruct=ReconstructConfig(mesh_error_px=1.0, mesh_page_px=512))
+    settings = SurveyConfig(reconstruct=ReconstructConfig(mesh_error_px=1.0))
     with PicklingThreads(2) as engine:
         assert spec("mesh").make(tmp_path, settings, engine.executor)
     assert engine.tasks > 10
@@ -86,8 +86,10 @@ def mesh(tmp_path_factory: pytest.TempPathFactory) -> Path:
     views = stereo_views(np.array([-0.2, 0.2, 0.5]), np.array([0.0, 0.05, 0.0]))
     write_workspace(folder, sparse_model(views, SCENE), SCENE)
     write_dense(folder, [view.image for view in views])
-    settings = SurveyConfig(reconstruct=ReconstructConfig(mesh_error_px=0.1, mesh_page_px=1024))
-    assert spec("mesh").make(folder, settings, SERIAL)
+    settings = SurveyConfig(reconstruct=ReconstructConfig(mesh_error_px=0.1))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ReconstructConfig, "mesh_page_px", 1024)
+        assert spec("mesh").make(folder, settings, SERIAL)
     assert not spec("mesh").make(folder, settings, SERIAL)
     return folder / "mesh"
 

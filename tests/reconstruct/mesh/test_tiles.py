@@ -113,14 +113,11 @@ def survey(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(surface, "_TILE_STEPS", (12, 12))
         patch.setattr("reconstruct.mesh.tiles._LEVELS_OF_A_FILE", 2)
-        assert spec("mesh").make(folder, settings_for("on"), SERIAL)
+        patch.setattr(ReconstructConfig, "mesh_page_px", PAGE_PX)
+        patch.setattr(ReconstructConfig, "mesh_tiles", "on")
+        settings = SurveyConfig(reconstruct=ReconstructConfig(mesh_error_px=0.1))
+        assert spec("mesh").make(folder, settings, SERIAL)
         yield folder
-
-
-def settings_for(tiles: str) -> SurveyConfig:
-    return SurveyConfig(
-        reconstruct=ReconstructConfig(mesh_error_px=0.1, mesh_page_px=PAGE_PX, mesh_tiles=tiles)
-    )
 
 
 @pytest.fixture(scope="module")

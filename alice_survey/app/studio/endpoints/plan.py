@@ -24,13 +24,13 @@ from alice_survey.app.studio.endpoints.base import (
     Studio,
     zipped,
 )
-from alice_survey.app.studio.setting_limits import setting_limits
 from alice_survey.core.artefacts import json_values
 from alice_survey.core.config import AreaConfig, Config, SurveyConfig, parse_settings, settings_in
 from alice_survey.core.edited_files import check_token, content_of, content_token
 from alice_survey.core.errors import AliceError, ConfigError, PlanError, collected_by, heard
 from alice_survey.core.executor import local_executor
 from alice_survey.core.frames import Array, Datum, attitude_from_rotation
+from alice_survey.core.settings_form import settings_form
 from alice_survey.core.stages import spec
 from alice_survey.core.trajectory import read_columns, read_track
 from alice_survey.kit.figure import palette_colours, palette_steps
@@ -135,7 +135,7 @@ class _PlanTab:
 
     @cached_property
     def limits(self) -> dict[str, dict[str, Any]]:
-        return setting_limits(template_text())
+        return settings_form(("plan", "area", "camera", "water", "sea", "vehicle", "imaging"))
 
     def settings(self) -> _Settings:
         """The settings file.

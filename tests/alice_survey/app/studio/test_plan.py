@@ -16,10 +16,10 @@ import pytest
 from alice_survey.app.pipeline import run, template_text
 from alice_survey.app.studio.endpoints.plan import LatestRequests, SupersededError
 from alice_survey.app.studio.server import Server
-from alice_survey.app.studio.setting_limits import setting_limits
 from alice_survey.core.artefacts import read_json
 from alice_survey.core.errors import collected_by
 from alice_survey.core.executor import local_executor
+from alice_survey.core.settings_form import settings_form
 from missions.values.plan_file import read_plan
 from tests.alice_survey.app.studio.client import ask, call, serving
 from tests.small_survey import settings_in
@@ -222,7 +222,7 @@ def test_what_the_page_starts_from(server: Server) -> None:
     assert limit["about"] == "of the left port's outer glass"
     assert {"alice", "sparus2"} <= set(found["vehicles"]) and 12.5 in found["lenses_mm"]
     assert found["saved"]["ok"] and found["error"] is None
-    about = setting_limits(template_text())
+    about = settings_form(("plan", "sea", "camera", "vehicle"))
     for name in ("plan.side_overlap", "sea.current_mps", "camera.focal_mm", "vehicle.battery_wh"):
         assert about[name]["step"] > 0 and about[name]["low"] is not None
 
