@@ -1,10 +1,8 @@
-"""Time, memory and disk that imaging and reconstruction will take, from settings and pictures.
+"""Time, memory and disk that imaging and reconstruction will take: one table, and what ran here.
 
-The computing of a stage is a sum of non-negative coefficients times what drives it: pictures,
-megapixels as taken and as matched, cells of the surface. The part that runs as tasks is shared out
-among workers, the rest is serial; memory and disk are sums of the same kind. `computing.toml` holds
-the coefficients, which `python -m benchmarks.costs` measures on one machine; a short probe compares
-this one with it, and what stages of a survey have taken here corrects what is left.
+The computing of a stage is a start, a time per picture and a time per megapixel (`COSTS`). The part
+that runs as tasks is shared out among workers. A short probe compares this machine with that of the
+table, and what stages of a survey have taken here corrects what is left.
 """
 
 import contextlib
@@ -13,223 +11,137 @@ import math
 import os
 import sys
 import time
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from alice_survey.core.artefacts import StageRecord, read_json, write_json
-from alice_survey.core.config import (
-    CameraConfig,
-    ImagingConfig,
-    ReconstructConfig,
-    SeafloorConfig,
-    SurveyConfig,
-)
+from alice_survey.core.config import SurveyConfig
 from alice_survey.core.executor import default_threads
 from alice_survey.core.manifest import read_manifest
 from alice_survey.core.run.resources import processor
 from alice_survey.kit.words import count, duration
-from reconstruct.dense.scales import CELL_PIXELS, matching_scale, scale_for_cell
+from reconstruct.dense.scales import CELL_PIXELS, scale_for_cell
 
-PREDICTED = ("pool", "image", "calibrate", "mapping", "placing", "dense", "mosaic", "mesh")
-"""Stages whose cost is known; the others take little."""
-GROUPS = {"image": PREDICTED[:2], "calibrate and reconstruct": PREDICTED[2:]}
-"""What a plan shows, and the stages of it."""
-BOARD_STAGES = ("pool", "calibrate")
-"""Those whose tasks are pictures of a board."""
 OTHER_CORES = 16
-FEATURE_MPX, PIXELS_PER_FEATURE = 1.5, 100.0
-"""Most megapixels in which features are sought, and pixels for each that is wanted, if a rig is
-known."""
-_FOUND_PER_MPX = 28_000
-"""Features of a picture of rich texture: one for 36 pixels, on rendered sand."""
-_LOOKS = 6.0
-"""Pictures in which a place is seen, where no plan says so."""
 _CAMERAS = 2
 _COMPILE_S = 60
 """Computing of the first run after an installation, which compiles kernels."""
+_PROBE_S = 0.2719
+"""What `probe_s` took on the machine of the table, an Intel Xeon at 2 GHz."""
+
+
+class _Cost(NamedTuple):
+    """What a stage takes: seconds of processor time, MiB of memory and MB of disk."""
+
+    start_s: float
+    picture_s: float
+    mpx_s: float
+    """For each picture, and each megapixel of all pictures as the stage works on them."""
+    serial: float
+    """Share of these two that is not divided among workers."""
+    process_mib: float
+    picture_mib: float
+    """Of the process, and more for each picture."""
+    worker_mib: float
+    worker_mpx_mib: float
+    """Of a worker, and more for each megapixel of a picture."""
+    product_mb: float
+    scratch_mb: float
+    """For each megapixel: what stays, and what is removed at the end."""
+
+
+COSTS = {
+    #                 start pic.s   Mpx s  ser. process MiB worker MiB  MB kept, scratch
+    "pool": _Cost(0.4, 0.0, 1.08, 0.0, 70, 0.0, 273, 208, 1.05, 0.0),
+    "image": _Cost(3.1, 0.0076, 2.56, 0.002, 242, 0.0, 396, 160, 1.93, 0.0),
+    "calibrate": _Cost(9.8, 0.0, 0.142, 0.04, 620, 0.0, 0, 159, 0.05, 0.0),
+    "mapping": _Cost(3.4, 0.92, 0.02, 0.2, 811, 3.9, 0, 26.8, 0.33, 1.94),
+    "placing": _Cost(1.7, 0.305, 0.0, 0.44, 798, 1.91, 0, 45.4, 0.3, 0.0),
+    "dense": _Cost(1.5, 0.44, 2.52, 0.03, 414, 0.0, 189, 158, 1.28, 9.09),
+    "mosaic": _Cost(6.9, 0.0027, 0.333, 0.13, 600, 0.0, 158, 50.6, 0.54, 0.56),
+    "mesh": _Cost(3.2, 0.0, 1.08, 0.08, 198, 0.0, 398, 176, 1.13, 0.99),
+}
+"""Measured on surveys of 0.25 to 9 megapixels a picture; within a factor of 1.7 of each stage."""
+PREDICTED = tuple(COSTS)
+"""Stages whose cost is known; the others take little."""
+GROUPS = {"image": PREDICTED[:2], "calibrate and reconstruct": PREDICTED[2:]}
+"""What a plan shows, and the stages of it."""
+_OF_BOARD = ("pool", "calibrate")
+_OF_SURFACE = ("dense", "mesh")
 
 
 @dataclass(frozen=True, kw_only=True)
 class SurveySize:
-    """What drives the cost of a survey; areas in millions of cells or pixels."""
+    """What drives the cost of a survey."""
 
     pictures: int
     mpx: float
     """Megapixels of a picture as taken."""
-    feature_mpx: float
-    features: float
-    """To expect in a picture."""
-    matched_mpx: float
     refined_mpx: float
-    """Megapixels at which dense matching runs, and at which its depth is refined and kept."""
-    partners: int = 4
-    """Pictures that each is densely matched with."""
-    cells: float
-    mosaic_mpx: float
-    floor_cells: float = 0.0
-    """Of a sea floor to render."""
-    rig_known: bool = True
-    """Whether the cameras are calibrated."""
+    """Those at which its depth is found."""
     board_pictures: int = 0
-    samples: int = 2
-    board_samples: int = 3
-    """Rays for a pixel rendered of the sea floor and of a board, along each side."""
     pixel_m: float | None = None
     cell_m: float | None = None
     """Sides of a pixel on the ground and of a cell, where they are known."""
-
-    @property
-    def drivers(self) -> dict[str, float]:
-        """What coefficients are multiplied by, by name."""
-        rays, board_rays = (self.samples / 2) ** 2, (self.board_samples / 3) ** 2
-        return {
-            "once": 1.0,
-            "picture_mpx": self.mpx,
-            "refined_picture_mpx": self.refined_mpx,
-            "board_pictures": self.board_pictures,
-            "board_mpx": self.board_pictures * self.mpx,
-            "board_rays": self.board_pictures * self.mpx * board_rays,
-            "board_rays_large": self.board_pictures * self.mpx**1.5 * board_rays,
-            "floor_cells": self.floor_cells,
-            "pictures": self.pictures,
-            "uncalibrated_pictures": 0 if self.rig_known else self.pictures,
-            "rendered_mpx": self.pictures * self.mpx * rays,
-            "taken_mpx": self.pictures * self.mpx,
-            "feature_mpx": self.pictures * self.feature_mpx,
-            "kilofeatures": self.pictures * self.features / 1e3,
-            "compared": self.pictures * (self.features / 1e3) ** 2,
-            "matched_mpx": self.pictures * self.matched_mpx * self.partners / 4,
-            "refined_mpx": self.pictures * self.refined_mpx,
-            "cells": self.cells,
-            "mosaic_mpx": self.mosaic_mpx,
-        }
 
 
 def size_of(
     pictures: int,
     mpx: float,
-    reconstruct: ReconstructConfig,
+    config: SurveyConfig,
     *,
-    rig_known: bool = True,
+    board_pictures: int = 0,
     pixel_m: float | None = None,
-    area_m2: float | None = None,
-    **others: Any,
 ) -> SurveySize:
-    """The size of a survey, from its pictures and settings.
+    """The size of a survey.
 
     Args:
         pictures: their number.
         mpx: megapixels of each.
-        reconstruct: settings.
-        rig_known: whether the cameras are calibrated; features are sought in more pixels if not.
+        config: settings of the survey.
+        board_pictures: those of a board, to calibrate from.
         pixel_m: side of a pixel on the ground, if known.
-        area_m2: area in the pictures, if known; else each place is taken to be in six of them.
-        others: further fields of `SurveySize`.
     """
-    maximum = reconstruct.max_features
-    wanted = PIXELS_PER_FEATURE / 1e6 * maximum if rig_known else math.inf
-    feature_mpx = min(mpx, FEATURE_MPX, wanted)
-    if reconstruct.feature_scale is not None:
-        feature_mpx = mpx * reconstruct.feature_scale**2
-    cell_m, scale = reconstruct.dem_cell_m, reconstruct.dense_scale
+    cell_m, scale = config.reconstruct.dem_cell_m, config.reconstruct.dense_scale
     if scale is None:
         scale = 1.0 if pixel_m is None else scale_for_cell(cell_m, pixel_m)
-    refined_mpx = mpx * scale**2
-    matched_mpx = mpx * matching_scale(1e6 * mpx, scale) ** 2
-    cells = pictures * refined_mpx / (_LOOKS * CELL_PIXELS**2)
-    mosaic_mpx = pictures * mpx / _LOOKS
     if pixel_m is not None:
-        cell_m = cell_m or CELL_PIXELS * pixel_m * math.sqrt(mpx / refined_mpx)
-        area_m2 = pictures * mpx * 1e6 * pixel_m**2 / _LOOKS if area_m2 is None else area_m2
-        cells = area_m2 / cell_m**2 / 1e6
-        mosaic_mpx = area_m2 / (reconstruct.mosaic_pixel_m or pixel_m) ** 2 / 1e6
+        cell_m = cell_m or CELL_PIXELS * pixel_m / scale
     return SurveySize(
-        pictures=pictures, mpx=mpx, rig_known=rig_known, feature_mpx=feature_mpx,
-        features=min(maximum, _FOUND_PER_MPX * feature_mpx),
-        matched_mpx=matched_mpx, refined_mpx=refined_mpx, partners=reconstruct.dense_partners,
-        cells=cells, mosaic_mpx=mosaic_mpx, pixel_m=pixel_m, cell_m=cell_m, **others,
+        pictures=pictures, mpx=mpx, refined_mpx=mpx * scale**2, board_pictures=board_pictures,
+        pixel_m=pixel_m, cell_m=cell_m,
     )  # fmt: skip
 
 
-def planned_size(
-    plan: Mapping[str, Any],
-    camera: CameraConfig,
-    imaging: ImagingConfig,
-    seafloor: SeafloorConfig,
-    reconstruct: ReconstructConfig,
-    *,
-    pictures: int | None = None,
-) -> SurveySize:
-    """The size of a planned survey.
-
-    Args:
-        plan: the contents of `plan.json`.
-        camera: settings, as the other sections.
-        imaging: its scale is that of the pictures.
-        seafloor: to render.
-        reconstruct: how.
-        pictures: their number, once they are taken; None for as many as are planned.
-    """
-    import shapely
-
-    strips = [shapely.LineString([line["start_ne_m"], line["end_ne_m"]]) for line in plan["lines"]]
-    reach_m = plan["footprint_m"][0] / 2
-    seen = shapely.union_all(shapely.buffer(strips, reach_m, cap_style="square"))
-    south, west, north, east = shapely.geometry.shape(plan["area"]["allowed"]).bounds
-    margin_m = 2 * plan["altitude_m"]
-    floor_m2 = (north - south + margin_m) * (east - west + margin_m)
-    return size_of(
-        pictures or _CAMERAS * plan["stations"],
-        (camera.width_px // imaging.scale) * (camera.height_px // imaging.scale) / 1e6,
-        reconstruct,
-        pixel_m=imaging.scale * plan["details"]["imaging"]["pixel_m"],
-        area_m2=seen.area,
-        floor_cells=floor_m2 / seafloor.grid_m**2 / 1e6,
-        board_pictures=_CAMERAS * imaging.pool_views,
-        samples=imaging.samples,
-        board_samples=imaging.samples + (imaging.scale > 1),
-    )
-
-
-def workspace_size(
-    workspace: Path,
-    camera: CameraConfig,
-    imaging: ImagingConfig,
-    seafloor: SeafloorConfig,
-    reconstruct: ReconstructConfig,
-) -> SurveySize | None:
+def workspace_size(workspace: Path, config: SurveyConfig) -> SurveySize | None:
     """The size of the survey of a workspace; None while it has neither a plan nor pictures.
 
     Args:
         workspace: folder of the survey.
-        camera: settings, as the other sections.
-        imaging: its scale counts until there are pictures.
-        seafloor: to render.
-        reconstruct: how.
+        config: its settings; the scale of imaging counts until there are pictures.
     """
-    manifest, plan = workspace / "images" / "manifest.csv", workspace / "plan" / "plan.json"
+    manifest, plan_file = workspace / "images" / "manifest.csv", workspace / "plan" / "plan.json"
     rows = read_manifest(manifest) if manifest.is_file() else []
-    width, height = camera.width_px // imaging.scale, camera.height_px // imaging.scale
+    width, height = (
+        side // config.imaging.scale for side in (config.camera.width_px, config.camera.height_px)
+    )
     if rows:
         from PIL import Image
 
         with Image.open(manifest.parent / rows[0].image) as picture:
             width, height = picture.size
-    if plan.is_file():
-        scale = max(1, round(camera.width_px / width))
-        return planned_size(
-            read_json(plan), camera, imaging.model_copy(update={"scale": scale}), seafloor,
-            reconstruct, pictures=len(rows) or None,
+    if plan_file.is_file():
+        plan = read_json(plan_file)
+        scale = max(1, round(config.camera.width_px / width))
+        return size_of(
+            len(rows) or _CAMERAS * plan["stations"], width * height / 1e6, config,
+            board_pictures=_CAMERAS * config.imaging.pool_views,
+            pixel_m=scale * plan["details"]["imaging"]["pixel_m"],
         )  # fmt: skip
-    if not rows:
-        return None
-    rigs = (workspace / folder / "rig.json" for folder in ("calibration", "images"))
-    known = any(rig.is_file() for rig in rigs)
-    return size_of(len(rows), width * height / 1e6, reconstruct, rig_known=known)
+    return size_of(len(rows), width * height / 1e6, config) if rows else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -239,8 +151,6 @@ class StageCost:
     serial_s: float
     tasks_s: float
     """Computing outside of tasks, and in all of them."""
-    start_s: float = 0.0
-    """For the start of each worker, all at once, where there is more than one."""
     tasks: int
     """How many there are at least: more workers have nothing to do."""
     process_mib: float
@@ -250,15 +160,14 @@ class StageCost:
     scratch_mb: float
     """Disk for good, and what is removed at its end."""
 
-    def cpu_s(self, workers: int) -> float:
+    @property
+    def cpu_s(self) -> float:
         """All computing."""
-        busy = min(workers, self.tasks)
-        return self.serial_s + self.tasks_s + (busy * self.start_s if busy > 1 else 0.0)
+        return self.serial_s + self.tasks_s
 
     def time_s(self, workers: int) -> float:
         """How long it takes with some workers, each on a core of its own."""
-        busy = min(workers, self.tasks)
-        return self.serial_s + self.tasks_s / busy + (self.start_s if busy > 1 else 0.0)
+        return self.serial_s + self.tasks_s / min(workers, self.tasks)
 
     def memory_mib(self, workers: int) -> float:
         """Most memory at once; a single worker is the process itself."""
@@ -266,62 +175,39 @@ class StageCost:
 
     def scaled(self, factor: float) -> "StageCost":
         """The same with more computing."""
-        return replace(
-            self,
-            serial_s=factor * self.serial_s,
-            tasks_s=factor * self.tasks_s,
-            start_s=factor * self.start_s,
-        )
+        return replace(self, serial_s=factor * self.serial_s, tasks_s=factor * self.tasks_s)
 
 
-def model() -> dict[str, Any]:
-    """The measured coefficients."""
-    text = (resources.files("alice_survey") / "computing.toml").read_text(encoding="utf-8")
-    return tomllib.loads(text)
-
-
-def weighed(coefficients: Mapping[str, float], drivers: Mapping[str, float]) -> float:
-    """Sum of coefficients times drivers."""
-    return sum(value * drivers[name] for name, value in coefficients.items())
-
-
-def stage_costs(
-    size: SurveySize, slowness: float = 1.0, measured: Mapping[str, Any] | None = None
-) -> dict[str, StageCost]:
+def stage_costs(size: SurveySize, slowness: float = 1.0) -> dict[str, StageCost]:
     """What each stage takes.
 
     Args:
         size: of the survey.
-        slowness: time that this machine takes for what the machine of the coefficients does in 1.
-        measured: the coefficients; None for those of the package.
+        slowness: time that this machine takes for what the machine of the table does in 1.
     """
-    drivers = size.drivers
     found = {}
-    for stage, part in (model() if measured is None else measured)["stages"].items():
-        sums = {name: weighed(values, drivers) for name, values in part.items()}
+    for stage, cost in COSTS.items():
+        pictures = size.board_pictures if stage in _OF_BOARD else size.pictures
+        mpx = pictures * (size.refined_mpx if stage in _OF_SURFACE else size.mpx)
+        work_s = slowness * (cost.picture_s * pictures + cost.mpx_s * mpx)
         found[stage] = StageCost(
-            serial_s=slowness * sums["serial_s"],
-            tasks_s=slowness * sums["tasks_s"],
-            start_s=slowness * sums["start_s"],
-            tasks=max(1, size.board_pictures if stage in BOARD_STAGES else size.pictures),
-            process_mib=sums["process_mib"],
-            worker_mib=sums["worker_mib"],
-            product_mb=sums["product_mb"],
-            scratch_mb=sums["scratch_mb"],
+            serial_s=slowness * cost.start_s + cost.serial * work_s,
+            tasks_s=(1.0 - cost.serial) * work_s,
+            tasks=max(1, pictures),
+            process_mib=cost.process_mib + cost.picture_mib * size.pictures,
+            worker_mib=cost.worker_mib + cost.worker_mpx_mib * size.mpx,
+            product_mb=cost.product_mb * mpx,
+            scratch_mb=cost.scratch_mb * mpx,
         )
     return found
 
 
 def task_memory_mib(stage: str, workspace: Path, config: SurveyConfig) -> float:
     """What a process that runs tasks of a stage takes; 0 where it is not known."""
-    if stage not in PREDICTED:
-        return 0.0
     try:
-        size = workspace_size(
-            workspace, config.camera, config.imaging, config.seafloor, config.reconstruct
-        )
+        size = workspace_size(workspace, config) if stage in PREDICTED else None
     except OSError:  # of a picture, which the stage reports
-        return 0.0
+        size = None
     return 0.0 if size is None else stage_costs(size)[stage].worker_mib
 
 
@@ -340,10 +226,6 @@ class SurveyCost:
     def memory_mib(self, workers: int) -> float:
         """The most that one of them takes."""
         return max(cost.memory_mib(workers) for cost in self.stages.values())
-
-    def cpu_s(self, workers: int) -> float:
-        """All computing."""
-        return sum(cost.cpu_s(workers) for cost in self.stages.values())
 
     @property
     def disk_mb(self) -> float:
@@ -369,7 +251,7 @@ class SurveyCost:
         return {
             "stages": list(self.stages),
             "workers": self.workers,
-            "cpu_s": round(self.cpu_s(self.workers)),
+            "cpu_s": round(sum(cost.cpu_s for cost in self.stages.values())),
             "time_s": {str(n): round(self.time_s(n)) for n in workers},
             "memory_mib": {str(n): round(self.memory_mib(n)) for n in workers},
             "disk_mb": round(self.disk_mb),
@@ -377,7 +259,7 @@ class SurveyCost:
 
 
 def correction(
-    costs: Mapping[str, StageCost], records: Mapping[str, StageRecord], here: str, workers: int
+    costs: Mapping[str, StageCost], records: Mapping[str, StageRecord], here: str
 ) -> tuple[float, float, list[str]]:
     """How much more computing to expect than predicted, from stages that ran on a processor.
 
@@ -389,7 +271,6 @@ def correction(
         costs: as predicted.
         records: of finished stages, by their names.
         here: name of the processor.
-        workers: how many they are taken to have had.
 
     Returns:
         Measured over predicted computing of these stages, the factor to expect of others, and
@@ -402,12 +283,12 @@ def correction(
     }
     if not ran:
         return 1.0, 1.0, []
-    ratio = sum(ran.values()) / sum(costs[name].cpu_s(workers) for name in ran)
+    ratio = sum(ran.values()) / sum(costs[name].cpu_s for name in ran)
     return ratio, ratio ** (len(ran) / (len(ran) + 1)), list(ran)
 
 
 def slowness() -> float:
-    """Time that a core of this machine takes for what that of the coefficients does in 1.
+    """Time that a core of this machine takes for what that of the table does in 1.
 
     Measured once for each kind of processor, in about a second, and kept in the user's cache.
     """
@@ -420,7 +301,7 @@ def slowness() -> float:
         with contextlib.suppress(OSError):  # next time it is measured again
             file.parent.mkdir(parents=True, exist_ok=True)
             write_json(file, known)
-    return known[here] / float(model()["probe_s"])
+    return known[here] / _PROBE_S
 
 
 def probe_s() -> float:
@@ -478,13 +359,12 @@ def summary(
         records: of finished stages of this survey, whose measured cost corrects the rest.
     """
     costs = stage_costs(size, slowness())
-    cores = default_threads()
-    ratio, factor, ran = correction(costs, records or {}, processor(), cores)
+    ratio, factor, ran = correction(costs, records or {}, processor())
     found: dict[str, Any] = {}
     lines = []
     for name, stages in groups.items():
         chosen = {stage: costs[stage].scaled(factor) for stage in stages}
-        group = SurveyCost(stages=chosen, workers=workers or cores)
+        group = SurveyCost(stages=chosen, workers=workers or default_threads())
         found[name] = group.to_json()
         lines.append(f"{name}: {group.text('worker' if workers else 'core')}")
     if lines and size.pixel_m is not None and size.cell_m is not None:

@@ -181,9 +181,7 @@ def _predicted(
     from alice_survey.app.computing import summary, workspace_size
 
     config = settings(workspace, survey, needed=not is_imported(workspace))
-    size = workspace_size(
-        workspace, config.camera, config.imaging, config.seafloor, config.reconstruct
-    )
+    size = workspace_size(workspace, config)
     if size is None:
         return "", {}
     records = {name: read_stage(workspace / spec(name).folder) for name in done}

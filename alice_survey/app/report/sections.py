@@ -1,26 +1,31 @@
-"""The parts of a report: products, model, pictures, camera, mission, and how to reproduce it."""
+"""The parts of a report: products, model, pictures, camera, mission, and how to reproduce it.
+
+A number that the summary, the facts or a verdict says is not said again in a table.
+"""
 
 import math
 import platform
-from collections.abc import Iterator, Sequence
+import tomllib
+from collections.abc import Iterator
 from importlib.metadata import version
-from typing import Any
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from alice_survey.app.report import plots
 from alice_survey.app.report.figures import Figures
 from alice_survey.app.report.held import Held, known_column
-from alice_survey.app.report.planes import planes_section
 from alice_survey.core import stages
 from alice_survey.core.records import (
-    CalibrationRecord,
     CalibrationReportRecord,
     CamerasRecord,
     ControlRecord,
     DomingRecord,
     FlightRecord,
     MeshRecord,
+    MosaicRecord,
+    PlaneRecord,
     PortRecord,
     RegistrationRecord,
     ScoreRecord,
@@ -45,16 +50,38 @@ from missions.values.plan_file import Plan
 
 _MAX_LOST = 20
 """Pictures that are not in the model, of which more are only counted."""
+_PACKAGES = (
+    "alice-survey", "numpy", "scipy", "numba", "opencv-contrib-python-headless", "pycolmap",
+    "open3d", "rasterio", "shapely", "pyproj",
+)  # fmt: skip
+_SETTINGS = "survey.toml"
+_DIGEST_CHARACTERS = 12
+
+
+class _Still(NamedTuple):
+    """A picture that a stage has drawn."""
+
+    path: str
+    title: str
+    shows: str
+    good: str = ""
+    otherwise: str = ""
 
 
 def sections(figures: Figures, *, has_map: bool, has_mesh: bool) -> Iterator[Section]:
     """All parts for which there is something, and what is needed to reproduce the survey."""
-    if has_map:
-        yield _map(figures)
     held = figures.held
-    mesh = held.read(MeshRecord)
+    mesh, plan = held.read(MeshRecord), held.plan
+    if has_map:
+        yield _map(held)
+    if plan is not None and not held.has("dense"):  # the plan is the result so far
+        yield _mission(held, plan)
     if has_mesh and mesh is not None:
-        yield _mesh(mesh, held.unit)
+        text = (
+            f"{count(mesh.triangles, 'triangle')}, {digits(mesh.area)} {held.unit}² of surface, "
+            f"{share(mesh.textured_share)} of it with texture. The files are in mesh/."
+        )
+        yield Section(name="mesh", title="Mesh", text=[text], scene="mesh")
     if figures.truth is not None:
         yield _truth(figures.truth, held)
     if figures.reference or held.earlier:
@@ -63,112 +90,94 @@ def sections(figures: Figures, *, has_map: bool, has_mesh: bool) -> Iterator[Sec
         yield _control(figures.control)
     if held.has("dense"):
         yield _surface(figures)
-    planes = planes_section(held)
-    if planes is not None:
-        yield planes
+    planes = list(_planes(held))
+    if planes:
+        text = (
+            "The same surface as someone sees it who faces each plane. plane.json next to the "
+            "rasters in dense/planes/ and mosaic/planes/ says where a pixel lies in space."
+        )
+        yield Section(name="planes", title="Planes", text=[text], figures=planes)
     if figures.registration is not None:
         yield _model(figures, figures.registration)
     if held.has("mapping") or held.has("calibration"):
-        yield _camera(figures)
+        yield _camera(held)
     if held.rows("quality/quality.csv"):
-        yield _quality(held)
-    if held.plan is not None:
-        yield _mission(held, held.plan)
-    yield _reproduce(figures)
+        still = _Still("quality/quality.png", "Quality along the survey",
+                       "Sharpness, contrast, brightness and veil of each picture.",
+                       "An even band.", "Look at the pictures named.")  # fmt: skip
+        yield Section(name="quality", title="Quality of the pictures", figures=_stills(held, still))
+    if plan is not None and held.has("dense"):
+        yield _mission(held, plan)
+    yield _reproduce(held)
 
 
-def _map(figures: Figures) -> Section:
-    held = figures.held
+def _table(title: str, *rows: tuple[str, str | None]) -> Table:
+    """What is known, by name; rows without a value are left out."""
+    known = [(name, value) for name, value in rows if value not in (None, "", "unknown")]
+    return Table(title=title, header=("what", "value"), rows=known)
+
+
+def _map(held: Held) -> Section:
     footprints = held.rows("mosaic/footprints.csv")
-    text = []
-    if held.has("plan", "flight"):
-        text.append(
-            "Plan and flown track differ by navigation's error as well as by the vehicle's."
-        )
-    tables = []
     areas, pixels = (known_column(footprints, name) for name in ("area_", "ground_pixel_"))
+    tables = []
     if len(areas) and len(pixels):
-        tables.append(
-            Table(
-                title="Footprints",
-                header=("", "least", "median", "most"),
-                rows=[
-                    ("area of a picture", *(f"{v:.2f} {held.unit}²" for v in _three(areas))),
-                    ("pixel on the floor", *(length(v, held.unit) for v in _three(pixels))),
-                ],
-            )
-        )
-    return Section(name="map", title="Map", text=text, tables=tables, scene="map")
-
-
-def _three(values: Any) -> tuple[float, float, float]:
-    return float(values.min()), float(np.median(values)), float(values.max())
-
-
-def _mesh(found: MeshRecord, unit: str) -> Section:
-    return Section(
-        name="mesh",
-        title="Mesh",
-        text=[
-            f"{count(found.triangles, 'triangle')}, {digits(found.area)} {unit}² of "
-            f"surface, {share(found.textured_share)} of it with texture. The files are "
-            "in mesh/."
-        ],
-        scene="mesh",
-    )
+        rows = [
+            ("area of a picture", *(f"{f(areas):.2f} {held.unit}²" for f in (min, np.median, max))),
+            ("pixel on the floor", *(length(float(f(pixels)), held.unit)
+                                     for f in (min, np.median, max))),
+        ]  # fmt: skip
+        header = ("", "least", "median", "most")
+        tables.append(Table(title="Footprints", header=header, rows=rows))
+    return Section(name="map", title="Map", tables=tables, scene="map")
 
 
 def _truth(score: ScoreRecord, held: Held) -> Section:
     cameras, surface, mosaic = score.cameras, score.surface, score.mosaic
-    rows: list[Sequence[str]] = [
-        ("cameras", _mm(cameras.rms_mm), _mm(cameras.max_mm), "position, rms"),
-        ("surface", _mm(surface.distance_rms_mm), _mm(surface.distance_max_mm),
-         "distance from the true surface, rms over all cells"),
-        ("mosaic", _mm(mosaic.position_rms_mm), _mm(mosaic.position_95_mm),
-         "position, rms; 95 % are below the larger one"),
-        ("lengths", _mm(score.lengths.rms_mm), "",
-         f"rms, over {length(score.lengths.mean_length_m)}"),
-        ("dome", _mm(surface.doming.dome_mm), "", "bend of the whole surface"),
+    seen, mesh = surface.seen_from_3_stations, score.mesh
+    rows = [
+        ("cameras", None, cameras.max_mm, "position"),
+        ("surface", None, surface.distance_max_mm, "distance from the true surface"),
+        ("mosaic", mosaic.position_rms_mm, mosaic.position_95_mm, "position; the larger: 95 %"),
+        ("lengths", score.lengths.rms_mm, None, f"over {length(score.lengths.mean_length_m)}"),
+        ("surface, 3 stations and more", seen and seen.distance_rms_mm, None,
+         f"{share(seen and seen.share)} of the area"),
+        ("mesh", mesh and mesh.distance_rms_mm, None, "distance from the true surface"),
     ]  # fmt: skip
-    seen = surface.seen_from_3_stations
-    if seen is not None:
-        rows.insert(
-            2, ("surface, 3 stations and more", _mm(seen.distance_rms_mm), "",
-                f"{share(seen.share)} of the area"),
-        )  # fmt: skip
-    if score.mesh is not None:
-        rows.insert(
-            3, ("mesh", _mm(score.mesh.distance_rms_mm), "", "distance from the true surface, rms")
-        )
     within = surface.completeness_within_px
     return Section(
         name="truth",
         title="Error against the truth",
         text=[
             "The sea floor was simulated, so that every error is known. The model was moved and "
-            "turned onto the truth by its cameras; its scale was not fitted: it is "
-            f"{parts(1e-6 * cameras.scale_error_ppm)} off."
+            "rotated onto the truth by its cameras; its scale was not fitted."
         ],
         tables=[
-            Table(title="Errors", header=("what", "error", "largest", "of"), rows=rows),
+            Table(
+                title="Errors",
+                header=("what", "rms", "largest", "of"),
+                rows=[
+                    (name, *("" if mm is None else millimetres(mm) for mm in (rms, most)), of)
+                    for name, rms, most, of in rows
+                    if rms is not None or most is not None
+                ],
+            ),
             Table(
                 title="Share of the area within so many ground pixels "
-                f"({_mm(surface.ground_pixel_mm)}) of the truth",
+                f"({millimetres(surface.ground_pixel_mm)}) of the truth",
                 header=[f"{pixels} px" for pixels in within],
                 rows=[[share(value) for value in within.values()]],
             ),
         ],
-        figures=_stills(held, [
-            ("evaluation/errors.png", "Where the surface errs",
-             "Map and histogram of height errors.",
-             "Without a slope or a dome.",
-             "Errors at the rim come from few pictures; a dome from calibration."),
-        ]),
+        figures=[
+            *_stills(held, _Still(
+                "evaluation/errors.png", "Where the surface errs",
+                "Map and histogram of height errors.", "Without a slope or a dome.",
+                "Errors at the rim come from few pictures; a dome from calibration.",
+            )),
+            *plots.sigma_test(held),
+        ],
     )  # fmt: skip
-
-
-def _mm(value: float | None) -> str:
-    return "" if value is None else millimetres(value)
 
 
 def _compared(figures: Figures) -> Section:
@@ -183,36 +192,28 @@ def _compared(figures: Figures) -> Section:
                 ("reference to survey", found.reference_to_survey),
             )
         ]  # fmt: skip
-        tables.append(
-            Table(
-                title=f"Distances from {found.reference.rsplit('/', 1)[-1]}",
-                header=("", "median", "rms", "95 %", "covered"),
-                rows=rows,
-            )
-        )
+        title = f"Distances from {found.reference.rsplit('/', 1)[-1]}"
+        header = ("", "median", "rms", "95 %", "covered")
+        tables.append(Table(title=title, header=header, rows=rows))
         stills.append(
-            ("reference/reference.png", "Distance from the reference",
-             "Signed distance after the registration.", "No slope, no dome.",
-             "A dome or a slope is the survey's, or the registration's.")
+            _Still("reference/reference.png", "Distance from the reference",
+                   "Signed distance after the registration.", "No slope, no dome.",
+                   "A dome or a slope is the survey's, or the registration's.")
         )  # fmt: skip
     for name, change in figures.held.earlier:
-        tables.append(
-            Table(
-                title=f"Change since {name}",
-                header=("what", "value"),
-                rows=[(name.replace("_", " "), _plain(v)) for name, v in change.plain.items()],
-            )
-        )
+        plain = change.plain.items()
+        rows_of = [(key.replace("_", " "), _plain(value)) for key, value in plain]
+        tables.append(_table(f"Change since {name}", *rows_of))
         stills.append(
-            (f"against/{name}/change.png", f"Change since {name}",
-             "Height minus that of the earlier survey, and how sure it is.",
-             "Where nothing has changed, nothing is coloured.", "")
+            _Still(f"against/{name}/change.png", f"Change since {name}",
+                   "Height minus that of the earlier survey, and how sure it is.",
+                   "Where nothing has changed, nothing is coloured.")
         )  # fmt: skip
     return Section(
         name="compared",
         title="Against other data",
         tables=tables,
-        figures=_stills(figures.held, stills),
+        figures=_stills(figures.held, *stills),
     )
 
 
@@ -221,166 +222,148 @@ def _plain(value: float | str) -> str:
 
 
 def _control(score: ControlRecord) -> Section:
-    points: list[Sequence[str]] = [
+    points = [
         (row.name, row.use, str(row.views), length(row.north_m), length(row.east_m),
          length(row.down_m), digits(row.misfit_sigmas, 2))
         for row in score.points
     ]  # fmt: skip
-    bars: list[Sequence[str]] = [
+    bars = [
         (row.name, row.use, length(row.known_m), length(row.error_m),
          parts(row.error_relative), digits(row.misfit_sigmas, 2))
         for row in score.bars
     ]  # fmt: skip
-    tables = []
-    if points:
-        header = ("point", "use", "pictures", "north", "east", "down", "in sigmas")
-        tables.append(Table(title="Points", header=header, rows=points))
-    if bars:
-        columns = ("bar", "use", "length", "error", "relative", "in sigmas")
-        tables.append(Table(title="Scale bars", header=columns, rows=bars))
+    tables = [
+        Table(title="Points", rows=points,
+              header=("point", "use", "pictures", "north", "east", "down", "in sigmas")),
+        Table(title="Scale bars", rows=bars,
+              header=("bar", "use", "length", "error", "relative", "in sigmas")),
+    ]  # fmt: skip
     return Section(
         name="control",
         title="Control and check points",
         text=["Those used as check took no part in placing the model."],
-        tables=tables,
+        tables=[table for table in tables if table.rows],
     )
 
 
 def _surface(figures: Figures) -> Section:
-    surface, held = figures.surface, figures.held
+    held = figures.held
     found = held.read(SurfaceRecord)
-    if surface is None or found is None:
+    if figures.surface is None or found is None:
         return Section(name="surface", title="Surface")
-    unit = held.unit
-    rows = [
-        ("cell", length(surface.cell, unit)),
-        ("area with a height", f"{digits(surface.area)} {unit}²"),
-        ("relief (99 % of it)", length(surface.high - surface.low, unit)),
-        ("share of the planned area", share(surface.covered)),
-        ("sigma of a height, median", length(surface.sigma_median, unit)),
-        ("of that the cameras' share", length(found.pose_sigma, unit)),
-        ("sigma of a match", f"{digits(found.match_sigma_px, 2)} px"),
-        ("stations that see a spot, median", f"{surface.stations_median:.0f}"),
-        ("heights count from", found.vertical_datum),
-    ]
-    text = []
     moving = found.moving
+    masked = None
     if moving is not None and moving.masked:
-        text.append(
-            f"Parts of {moving.masked} of {count(moving.pictures, 'picture')} are masked "
-            f"({moving.masked_share:.2%} of the area of all): other stations show something else "
-            "there. They move, or are shadows that move with the lamps. Mosaic and texture do "
-            "without them. mask_moving = false below [reconstruct] keeps them."
+        masked = (
+            f"parts of {moving.masked} of {count(moving.pictures, 'picture')}, "
+            f"{moving.masked_share:.2%} of the area of all; mask_moving = false keeps them"
         )
-    drawn = [
-        plots.heights(figures), plots.sigma_test(figures), plots.seen_by(figures),
-        *_stills(held, [
-            ("dense/moving.png", "What moves",
-             "Masked parts of the pictures in which they are largest, outlined.",
-             "Fish, weed, divers, shadows.",
-             "Look at dense/moving; mask_moving = false below [reconstruct] keeps all."),
-        ]),
-    ]  # fmt: skip
+    rows = [
+        ("share of a height's sigma that is the cameras'", length(found.pose_sigma, held.unit)),
+        ("sigma of a match", f"{digits(found.match_sigma_px, 2)} px"),
+        ("heights count from", found.vertical_datum),
+        ("masked since it moves", masked),
+    ]
+    still = _Still(
+        "dense/moving.png", "What moves",
+        "Masked parts of the pictures in which they are largest, outlined.",
+        "Fish, weed, divers, shadows.",
+        "Look at dense/moving; mask_moving = false below [reconstruct] keeps all.",
+    )  # fmt: skip
     return Section(
         name="surface",
         title="Surface",
-        text=text,
-        tables=[Table(title="Elevation model", header=("what", "value"), rows=rows)],
-        figures=[figure for figure in drawn if figure is not None],
+        tables=[_table("Elevation model", *rows)],
+        figures=[*plots.overlap(held), *_stills(held, still)],
     )
 
 
+def _planes(held: Held) -> Iterator[Figure]:
+    """Mosaic, else surface, of every further plane."""
+    for stage, what in (("mosaic", "mosaic"), ("dense", "dem")):
+        for folder in sorted((held.workspace / stage / "planes").glob("*")):
+            painted = held.workspace / "mosaic" / "planes" / folder.name / "mosaic.png"
+            there = held.has(stage) and all(
+                (folder / name).is_file() for name in (f"{what}.png", "plane.json")
+            )
+            if there and (what == "mosaic" or not painted.is_file()):
+                yield _plane(held, folder, what)
+
+
+def _plane(held: Held, folder: Path, what: str) -> Figure:
+    plane = PlaneRecord.read(folder / "plane.json")
+    shows = f"Surface over the plane: {plane.about}. No picture looks at it."
+    if what == "mosaic":
+        found = MosaicRecord.read(folder / "mosaic.json")
+        wide, high = (side * found.pixel for side in (found.width_px, found.height_px))
+        shows = (
+            f"Mosaic of the plane: {plane.about}, {length(wide, held.unit)} wide and "
+            f"{length(high, held.unit)} high."
+        )
+    png = shrunk_png(folder / f"{what}.png")
+    return Figure(png=png, title=f"Plane {plane.name}", alt=shows, shows=shows)
+
+
 def _model(figures: Figures, found: RegistrationRecord) -> Section:
-    rows = [
-        ("pictures", f"{found.registered} of {found.total}"),
+    rows: list[tuple[str, str | None]] = [
         ("points", f"{found.points:,}"),
         ("pictures that see a point, mean", digits(found.mean_track_length)),
-        ("reprojection error, mean", f"{digits(found.mean_reprojection_px)} px"),
-        ("scale", found.scale_source or "unknown"),
     ]
     doming = found.doming or DomingRecord()
     for way, bend in doming.bends.items():
+        removed = bend.straightened_per_m * bend.length_m**2 / 8.0
         rows.append((f"sag {way} the lines", length_with_sigma(bend.sag_m, bend.sag_sigma_m)))
-        taken_out = bend.straightened_per_m * bend.length_m**2 / 8.0
-        rows.append((f"sag {way} the lines that navigation took out", length(taken_out)))
-    scale = doming.scale
-    if scale is not None:
-        own = parts_with_sigma(scale.mean - 1.0, scale.mean_sigma)
+        rows.append((f"sag {way} the lines that navigation took out", length(removed)))
+    if doming.scale is not None:
+        own = parts_with_sigma(doming.scale.mean - 1.0, doming.scale.mean_sigma)
         rows.append(("scale by what each station sees alone", own))
     place = found.georeference
     if place is not None:
-        residuals = (place.rms_north_m, place.rms_east_m, place.rms_depth_m)
-        sigmas = (place.sigma_north_m, place.sigma_east_m, place.sigma_depth_m)
-        axes = ("north", "east", "depth")
-        rows += [
-            (f"navigation's residual {axis}", f"{length(value)} rms")
-            for axis, value in zip(axes, residuals, strict=True)
-            if value is not None
-        ]
-        rows += [
-            (f"sigma of the whole survey, {axis}", length(value))
-            for axis, value in zip(axes, sigmas, strict=True)
-            if value is not None
-        ]
-        if place.sigma_heading_deg is not None:
-            rows.append(("sigma of its heading", _degrees(place.sigma_heading_deg)))
-        if place.sigma_tilt_deg is not None:
-            rows.append(("sigma of its level", _degrees(place.sigma_tilt_deg)))
-        if place.mount is not None:
-            rows.append(("mount of the rig", place.mount.words))
-    for joint in found.joints:
-        apart = (joint.sigma_north_m, joint.sigma_east_m, joint.sigma_depth_m)
-        what = f"of {count(joint.stations, 'station')} that navigation alone joins to the others"
-        rows.append(
-            (f"sigma north, east and depth {what}", ", ".join(length(value) for value in apart))
-        )
-        rows.append((f"sigma of heading {what}", _degrees(joint.sigma_heading_deg)))
-    lost = figures.held.rows("sparse/unregistered.csv")
-    tables = [Table(title="Model", header=("what", "value"), rows=rows)]
+        for axis in ("north", "east", "depth"):
+            rms, sigma = (getattr(place, f"{kind}_{axis}_m") for kind in ("rms", "sigma"))
+            rows.append((f"navigation's residual {axis}, rms", length(rms)))
+            rows.append((f"sigma of the whole survey, {axis}", length(sigma)))
+        rows.append(("sigma of its heading", _degrees(place.sigma_heading_deg)))
+        rows.append(("sigma of its level", _degrees(place.sigma_tilt_deg)))
+        rows.append(("mount of the rig", place.mount and place.mount.words))
+    rows += [
+        (f"sigma of heading of {count(joint.stations, 'station')} that navigation alone joins",
+         _degrees(joint.sigma_heading_deg))
+        for joint in found.joints
+    ]  # fmt: skip
+    tables = [_table("Model", *rows)]
+    lost = [
+        (row["image"], row["reason"], row["placed_by"] or "not placed")
+        for row in figures.held.rows("sparse/unregistered.csv")
+    ]
     if lost:
-        shown = [(row["image"], row["reason"], row["placed_by"] or "not placed") for row in lost]
-        if len(shown) > _MAX_LOST:
-            rest = f"{len(shown) - _MAX_LOST} more in sparse/unregistered.csv"
-            shown = [*shown[:_MAX_LOST], (rest, "", "")]
-        tables.append(
-            Table(title="Pictures not in the model", header=("picture", "why", "placed by"),
-                  rows=shown)
-        )  # fmt: skip
+        more = len(lost) - _MAX_LOST
+        rest = [(f"{more} more in sparse/unregistered.csv", "", "")] if more > 0 else []
+        header, shown = ("picture", "why", "placed by"), [*lost[:_MAX_LOST], *rest]
+        tables.append(Table(title="Pictures not in the model", header=header, rows=shown))
     notes = figures.held.frame.notes
-    drawn = [plots.camera_sigmas(figures), plots.pictures_used(figures)]
     return Section(
         name="model",
         title="Camera track and points",
         text=[f"How it was made: {'; '.join(notes)}."] if notes else [],
         tables=tables,
-        figures=[figure for figure in drawn if figure is not None],
+        figures=[*plots.camera_sigmas(figures.held), *plots.pictures_used(figures.held)],
     )
 
 
-def _degrees(value: float | None) -> str:
-    return "unknown" if value is None else f"{digits(value, 2)} deg"
+def _degrees(value: float | None) -> str | None:
+    return None if value is None else f"{digits(value, 2)} deg"
 
 
-def _camera(figures: Figures) -> Section:
-    held = figures.held
+def _camera(held: Held) -> Section:
     calibrated, refined = held.read(CalibrationReportRecord), held.read(PortRecord)
-    own, cameras = held.read(CalibrationRecord), held.read(CamerasRecord)
-    text, tables, drawn = [], [], []
+    cameras = held.read(CamerasRecord)
+    text, tables, drawn = [], [], list[Figure]()
     if calibrated is not None:
         text.append(
             f"Calibrated from {count(calibrated.views, 'view')}: "
-            f"{digits(calibrated.rms_px, 2)} px rms. The calibration's own report is "
-            "calibration/report.html."
-        )
-        tables.append(
-            Table(
-                title="Calibration",
-                header=("parameter", "value", "sigma", "unit"),
-                rows=[
-                    (row.name, f"{row.value:.8g}", _sigma(row.sigma), row.unit)
-                    for row in calibrated.parameters
-                ],
-            )
+            f"{digits(calibrated.rms_px, 2)} px rms. The calibration's own report, with every "
+            "parameter, is calibration/report.html."
         )
     if refined is not None:
         text.append(
@@ -389,26 +372,20 @@ def _camera(figures: Figures) -> Section:
         )
         if refined.contradiction is not None:
             text.append(f"But {refined.contradiction}.")
+        values = zip(
+            refined.parameters, refined.before, refined.after, refined.prior_sigmas,
+            refined.sigmas, strict=True,
+        )  # fmt: skip
         tables.append(
             Table(
                 title="Rig refined by the survey",
                 header=("parameter", "calibrated", "refined", "sigma before", "sigma after"),
                 rows=[
                     (name, f"{a:.8g}", f"{b:.8g}", _sigma(before), _sigma(after))
-                    for name, a, b, before, after in zip(
-                        refined.parameters,
-                        refined.before,
-                        refined.after,
-                        refined.prior_sigmas,
-                        refined.sigmas,
-                        strict=True,
-                    )
+                    for name, a, b, before, after in values
                 ],
             )
         )
-        drawn.append(plots.correlations(refined.parameters, np.array(refined.correlation)))
-    elif own is not None:
-        drawn.append(plots.correlations(own.parameters, np.array(own.correlation)))
     if cameras is not None:
         rig_file = held.file("sparse/rig.json") or stages.rig_file(held.workspace)
         rig = None if rig_file is None else read_rig(rig_file)
@@ -430,86 +407,55 @@ def _cameras(cameras: CamerasRecord, rig: Rig | None) -> list[Table]:
         values = {key: one.parameter(key) for key in one.lens.parameters}
         terms = ", ".join(f"{key} {value:.6g}" for key, value in values.items() if value)
         lenses.append((name, f"{one.width_px} x {one.height_px}", one.lens.model, terms))
-        place: list[str] = []
         if rig is not None:
             first = rig.cam_from_rig[next(iter(cameras.cameras))]
             pose = first * rig.cam_from_rig[name].inv()
             tilt = np.rad2deg(np.arccos(np.clip(pose.rotation.as_matrix()[2, 2], -1.0, 1.0)))
             shift = ", ".join(f"{1e3 * value:z.1f}" for value in pose.translation)
-            place = [f"{shift} mm", f"{tilt:.1f} deg"]
-        housings.append((name, one.port.words, *place))
+            housings.append((name, one.port.words, f"{shift} mm", f"{tilt:.1f} deg"))
+    header = ("camera", "housing", "right, down, forward", "off the first's axis")
     tables = [
-        Table(title="Cameras", header=("camera", "pixels", "lens", "parameters"), rows=lenses)
+        Table(title="Cameras", header=("camera", "pixels", "lens", "parameters"), rows=lenses),
+        Table(title="Housings and places", header=header, rows=housings),
     ]
-    if rig is not None:
-        header = ("camera", "housing", "right, down, forward", "off the first's axis")
-        tables.append(Table(title="Housings and places", header=header, rows=housings))
-    return tables
+    return [table for table in tables if table.rows]
 
 
 def _sigma(value: float | None) -> str:
     if value is None or not math.isfinite(value) or value == 0.0:
-        return "held"
+        return "fixed"
     return f"{value:.2g}"
 
 
-def _quality(held: Held) -> Section:
-    rows = held.rows("quality/quality.csv")
-    flagged = [row for row in rows if row["reasons"]]
-    table = Table(
-        title="Pictures that stand out",
-        header=("picture", "why"),
-        rows=[(row["image"], row["reasons"]) for row in flagged] or [("none", "")],
-    )
-    return Section(
-        name="quality",
-        title="Quality of the pictures",
-        text=[f"{len(flagged)} of {count(len(rows), 'picture')} stand out; all are used where "
-              "they can be."],
-        tables=[table],
-        figures=_stills(held, [
-            ("quality/quality.png", "Quality along the survey",
-             "Sharpness, contrast, brightness and veil of each picture.",
-             "An even band.", "Look at the pictures named."),
-        ]),
-    )  # fmt: skip
-
-
 def _mission(held: Held, plan: Plan) -> Section:
+    overlap = f"{plan.reached_forward_overlap:.0%} forward, {plan.reached_side_overlap:.0%} side"
+    dives = f"{len(plan.dives)}, {duration(plan.duration_s)}, {plan.energy_wh:.1f} Wh"
     rows = [
         ("altitude, speed", f"{plan.altitude_m:g} m, {plan.speed_mps:g} m/s"),
         ("lines", f"{len(plan.lines)}, {plan.line_spacing_m:.2f} m apart"),
         ("stations", f"{plan.stations}, {plan.station_spacing_m:.2f} m apart"),
-        ("overlap", f"{plan.reached_forward_overlap:.0%} forward, "
-                    f"{plan.reached_side_overlap:.0%} side"),
+        ("overlap", overlap),
+        ("covered as requested", share(plan.coverage)),
         ("a picture every", f"{plan.interval_s:.2f} s"),
         ("exposure", f"{1e3 * plan.exposure_s:.2g} ms"),
         ("motion blur", f"{plan.blur_px:.2f} px"),
         ("pixel on the floor", length(plan.pixel_m)),
-        ("dives, time, energy", f"{len(plan.dives)}, {duration(plan.duration_s)}, "
-                                f"{plan.energy_wh:.1f} Wh"),
-    ]  # fmt: skip
-    tables = [Table(title="Plan", header=("what", "value"), rows=rows)]
+        ("dives, time, energy", dives),
+    ]
+    tables = [_table("Plan", *rows)]
     flight = held.read(FlightRecord)
     if flight is not None:
         line = flight.on_lines
         tables.append(
-            Table(
-                title="Flight",
-                header=("what", "value"),
-                rows=[
-                    ("ending", flight.ending),
-                    ("stations", f"{flight.stations} of {flight.stations_planned}"),
-                    ("time", duration(flight.duration_s)),
-                    ("energy", f"{sum(flight.energy_wh.values()):.1f} Wh"),
-                    ("off the line", f"{length(line.cross_track_rms_m)} rms"),
-                    ("of that the control's part",
-                     f"{length(line.believed_cross_track_rms_m)} rms"),
-                    ("error of navigation", f"{length(flight.navigation_error_rms_m)} rms"),
-                    ("pictured as often as required", share(flight.coverage.share_at_overlap)),
-                ],
+            _table(
+                "Flight",
+                ("time", duration(flight.duration_s)),
+                ("energy", f"{sum(flight.energy_wh.values()):.1f} Wh"),
+                ("off the line, rms", length(line.cross_track_rms_m)),
+                ("of that the control's part", length(line.believed_cross_track_rms_m)),
+                ("error of navigation, rms", length(flight.navigation_error_rms_m)),
             )
-        )  # fmt: skip
+        )
     settings = held.file("plan/settings.txt")
     text = ["Every setting with its equation, source and limit is in plan/settings.txt."]
     return Section(
@@ -517,79 +463,60 @@ def _mission(held: Held, plan: Plan) -> Section:
         title="Mission",
         text=text if settings is not None else [],
         tables=tables,
-        figures=_stills(held, [
-            ("plan/map.png", "The plan", "Area, lines, turns and stations.", "", ""),
-            ("flight/track.png", "Plan and flown track", "Where the vehicle flew, and how far "
-             "it was off its lines.", "The track lies on the lines.",
-             "Check the current, the thrusters and navigation."),
-        ]),
+        figures=_stills(
+            held,
+            _Still("plan/map.png", "The plan", "Area, lines, turns and stations."),
+            _Still("flight/track.png", "Plan and flown track", "Where the vehicle flew, and how "
+                   "far it was off its lines; navigation's error is part of that.",
+                   "The track lies on the lines.",
+                   "Check the current, the thrusters and navigation."),
+        ),
     )  # fmt: skip
 
 
-def _stills(held: Held, wanted: Sequence[tuple[str, str, str, str, str]]) -> list[Figure]:
-    """Pictures that stages have drawn: path, title, what it shows, good, otherwise."""
+def _stills(held: Held, *stills: _Still) -> list[Figure]:
+    """Those that are there."""
     found = []
-    for path, title, shows, good, otherwise in wanted:
-        file = held.file(path)
+    for still in stills:
+        file = held.file(still.path)
         if file is not None:
             found.append(
                 Figure(
-                    png=shrunk_png(file), title=title, alt=shows, shows=shows, good=good,
-                    otherwise=otherwise,
+                    png=shrunk_png(file), title=still.title, alt=still.shows, shows=still.shows,
+                    good=still.good, otherwise=still.otherwise,
                 )
             )  # fmt: skip
     return found
 
 
-_PACKAGES = (
-    "alice-survey", "numpy", "scipy", "numba", "opencv-contrib-python-headless", "pycolmap",
-    "open3d", "rasterio", "shapely", "pyproj",
-)  # fmt: skip
-_SETTINGS = "survey.toml"
-_SHORT = 12
-"""Length of a digest as shown."""
-
-
-def _reproduce(figures: Figures) -> Section:
+def _reproduce(held: Held) -> Section:
     """Stages, versions, settings and files."""
-    held = figures.held
-    drawn = plots.stage_times(figures)
+    text = []
+    if held.simulated:
+        text.append("Everything is seeded: 'alice-survey run' with the same settings repeats it.")
     makers = (_stage_table, _version_table, _settings_table, _file_table)
     tables = [table_of(held) for table_of in makers]
     return Section(
         name="reproduce",
         title="Time, versions and settings",
-        text=list(_reproduction(held)),
-        figures=[] if drawn is None else [drawn],
+        text=text,
         tables=[table for table in tables if table.rows],
     )
 
 
-def _reproduction(held: Held) -> Iterator[str]:
-    settings = held.workspace / _SETTINGS
-    if settings.is_file():
-        yield (
-            "The same settings, inputs and versions give the same results; a stage is run again "
-            "when its digest changes."
-        )
-    if held.simulated:
-        yield "Everything is seeded: 'alice-survey run' with the same survey.toml flies it again."
-
-
 def _stage_table(held: Held) -> Table:
-    rows = []
-    for name, stage in held.stages.items():
-        rows.append(
-            (
-                name,
-                str(stage.version),
-                duration(stage.took_s),
-                "" if stage.cpu_s is None else duration(stage.cpu_s),
-                "" if stage.peak_mib is None else f"{stage.peak_mib:.0f} MiB",
-                f"{len(stage.inputs)}",
-                stage.digest[:_SHORT],
-            )
+    rows = [
+        (
+            name,
+            str(stage.version),
+            duration(stage.took_s),
+            "" if stage.cpu_s is None else duration(stage.cpu_s),
+            "" if stage.peak_mib is None else f"{stage.peak_mib:.0f} MiB",
+            f"{len(stage.inputs)}",
+            stage.digest[:_DIGEST_CHARACTERS],
         )
+        for name, stage in held.stages.items()
+    ]
     header = ("stage", "version", "time", "CPU time", "memory", "input files", "digest")
     return Table(title="Stages", header=header, rows=rows)
 
@@ -606,14 +533,12 @@ def _version_table(held: Held) -> Table:
 
 def _settings_table(held: Held) -> Table:
     """Settings as in the file; missing ones have their defaults."""
-    import tomllib
-
     path = held.workspace / _SETTINGS
     rows: list[tuple[str, str]] = []
     if path.is_file():
         for key, value in tomllib.loads(path.read_text(encoding="utf-8")).items():
-            parts = value.items() if isinstance(value, dict) else [("", value)]
-            rows += [(f"{key}.{name}".rstrip("."), _shortened(part)) for name, part in parts]
+            inner = value.items() if isinstance(value, dict) else [("", value)]
+            rows += [(f"{key}.{name}".rstrip("."), _shortened(part)) for name, part in inner]
     return Table(title="Settings in survey.toml", header=("setting", "value"), rows=rows)
 
 
