@@ -51,6 +51,11 @@ class Config(BaseModel):
     """A settings section: immutable, and an unknown key is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    constants: ClassVar[Mapping[str, Any]] = {}
+    """Settings that are gone, and their values: files may still hold these, for one version, and
+    stages record them, so that those of earlier versions stay up to date."""
+    unrecorded: ClassVar[frozenset[str]] = frozenset()
+    """Those of them that stages do not record."""
 
     @field_validator("*", mode="before")
     @classmethod
@@ -73,6 +78,12 @@ class AreaConfig(Config):
     or a file. The datum is the origin of the local North-East-Down frame, on the sea surface; of a
     shape in geographic or projected coordinates it is the middle unless it is given.
     """
+
+    constants: ClassVar[Mapping[str, Any]] = {
+        "datum_at": "corner", "corridor_latlon_deg": None, "no_go_latlon_deg": [],
+        "allowed_latlon_deg": None, "no_go_layer": None, "allowed_layer": None,
+        "bathymetry_crs": None,
+    }  # fmt: skip
 
     latitude_deg: Latitude = setting(
         32.8236, "the datum: origin of local north, east, down, on the sea surface"
@@ -240,6 +251,8 @@ class WaterConfig(Config):
     `SurveyConfig` sets `n_water` for the depth of its sea floor.
     """
 
+    constants: ClassVar[Mapping[str, Any]] = {"wavelength_nm": None}
+
     n_water: float = setting(
         1.34, "index of refraction; or leave it out and give the next keys:", ge=1, le=1.4
     )
@@ -275,6 +288,10 @@ class WaterConfig(Config):
 class PlanConfig(Config):
     """Settings of the plan: altitude, speed, overlap, lines and turns."""
 
+    constants: ClassVar[Mapping[str, Any]] = {
+        "strobe_lead_s": 0.0002, "split_dives": True, "tie_dives": True,
+    }  # fmt: skip
+    unrecorded: ClassVar[frozenset[str]] = frozenset({"tie_dives"})
     strobe_lead_s: ClassVar[float] = 0.0002
     """The strobe lights so long before the exposure and after it."""
 
@@ -354,6 +371,11 @@ class VehicleConfig(Config):
     Battery and hotel load are ALICE's; of another vehicle its own, where they are not set.
     """
 
+    constants: ClassVar[Mapping[str, Any]] = {
+        "thruster_health": dict.fromkeys(("starboard", "port", "vertical", "bow", "stern"), 1.0),
+        "health_known": True, "coefficients_file": None, "finds_failures": True,
+    }  # fmt: skip
+    unrecorded: ClassVar[frozenset[str]] = frozenset({"finds_failures"})
     finds_failures: ClassVar[bool] = True
     """Whether the vehicle watches how its thrusters turn, and what they push."""
 
@@ -372,7 +394,7 @@ class VehicleConfig(Config):
     )
     failures: tuple[str, ...] = setting(
         (), "share of thrust left; @: from these seconds on",
-        example='["bow=0.5", "stern@600", "stern:propeller@600"]',
+        example='["bow=0.5", "stern@600", "stern:propeller@600"]', exclude_if=lambda f: not f,
     )  # fmt: skip
     battery_wh: float = setting(
         1400.0, "the vehicle's own where it is left out", example="1400.0", ge=0.01, le=1_000_000
@@ -431,6 +453,9 @@ class SeaConfig(Config):
     Swell comes on top.
     """
 
+    constants: ClassVar[Mapping[str, Any]] = {
+        "current_correlation_s": 300.0, "gust_correlation_s": 2.0
+    }  # fmt: skip
     current_correlation_s: ClassVar[float] = 300.0
     gust_correlation_s: ClassVar[float] = 2.0
     """How long slow changes of the current and random forces last."""
@@ -458,6 +483,7 @@ class SeaConfig(Config):
 class NavigationConfig(Config):
     """Navigation sensors of the vehicle; the rest as in `vehicle.navigation.sensors`."""
 
+    constants: ClassVar[Mapping[str, Any]] = {"gps_noise_m": 0.02, "usbl": True}
     gps_noise_m: ClassVar[float] = 0.02
 
     gps_bias_m: float = setting(
@@ -498,6 +524,9 @@ class SeafloorConfig(Config):
 class ImagingConfig(Config):
     """Settings of taking and rendering pictures."""
 
+    constants: ClassVar[Mapping[str, Any]] = {
+        "image_format": "png", "samples": 2, "noise": True, "range_maps": False
+    }  # fmt: skip
     samples: ClassVar[int] = 2
     """Rays a pixel, along x and along y."""
 
@@ -515,6 +544,10 @@ class ImagingConfig(Config):
 class ReconstructConfig(Config):
     """Settings of the reconstruction."""
 
+    constants: ClassVar[Mapping[str, Any]] = {
+        "feature_scale": None, "working_range_m": None, "mapper": "auto", "dense_partners": 4,
+        "mesh_triangles": None, "mesh_tiles": "auto", "mesh_page_px": 8192, "dispersion": "auto",
+    }  # fmt: skip
     feature_scale: ClassVar[float | None] = None
     working_range_m: ClassVar[float | None] = None
     mapper: ClassVar[Literal["auto", "global", "incremental"]] = "auto"
@@ -774,9 +807,23 @@ def parse_config(settings: dict[str, Any], origin: str) -> SurveyConfig:
         ConfigError: as `load_config`.
     """
     try:
-        return SurveyConfig.model_validate(settings)
+        return SurveyConfig.model_validate(_without_constants(settings))
     except ValidationError as error:
         raise ConfigError(f"{origin}: {_one_line(error)}") from None
+
+
+def _without_constants(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings without those that are gone and had the value that now always holds."""
+    result = dict(settings)
+    for section, values in settings.items():
+        field = SurveyConfig.model_fields.get(section)
+        kind = None if field is None else field.annotation
+        if isinstance(values, dict) and isinstance(kind, type) and issubclass(kind, Config):
+            gone = kind.constants
+            result[section] = {
+                key: value for key, value in values.items() if key not in gone or gone[key] != value
+            }  # fmt: skip
+    return result
 
 
 def changed(config: SurveyConfig, section: str, **values: Any) -> SurveyConfig:

@@ -180,7 +180,14 @@ def settings_of(wanted: Any, config: Config) -> Any:
         include=None if part.only is None else set(part.only),
         exclude=set(part.without),
     )
-    return {name: _file_name(getattr(value, name), values[name]) for name in values}
+    gone = type(value).constants if isinstance(value, Config) else {}
+    kept = {
+        name: constant
+        for name, constant in gone.items()
+        if (part.only is None or name in part.only)
+        and name not in part.without | type(value).unrecorded
+    }
+    return kept | {name: _file_name(getattr(value, name), values[name]) for name in values}
 
 
 def _file_name(value: Any, as_json: Any) -> Any:
@@ -528,7 +535,7 @@ STAGES: tuple[StageSpec, ...] = (
         needs=("plan",),
         settings={
             "seed": "seed",
-            "vehicle": without("vehicle", "mission_file"),
+            "vehicle": without("vehicle", "coefficients_file", "mission_file"),
             "sea": without("sea", "current_file"),
             "navigation": "navigation",
             "seafloor": "seafloor",
@@ -568,7 +575,7 @@ STAGES: tuple[StageSpec, ...] = (
             "camera": "camera",
             "n_water": "water.n_water",
             "board": records.BoardRecord().to_json(),
-            "imaging": only("imaging", "scale", "pool_views"),
+            "imaging": only("imaging", "scale", "image_format", "samples", "noise", "pool_views"),
         },
         summary=_pictures_summary,
         resumes=True,
@@ -641,8 +648,11 @@ STAGES: tuple[StageSpec, ...] = (
         uses=("calibrate",),
         settings={
             "seed": "seed",
+            "feature_scale": "reconstruct.feature_scale",
             "max_features": "reconstruct.max_features",
             "learned_features": "reconstruct.learned_features",
+            "working_range_m": "reconstruct.working_range_m",
+            "mapper": "reconstruct.mapper",
         },
         inputs=_mapping_inputs,
         summary=_mapping_summary,
@@ -684,7 +694,9 @@ STAGES: tuple[StageSpec, ...] = (
         work="reconstruct.dense.run:run_dense",
         takes=("reconstruct",),
         needs=("image", "placing"),
-        settings=only("reconstruct", "dense_scale", "dem_cell_m", "planes", "mask_moving"),
+        settings=only(
+            "reconstruct", "dense_scale", "dense_partners", "dem_cell_m", "planes", "mask_moving"
+        ),
         inputs=_dense_inputs,
         summary=_dense_summary,
         resumes=True,
@@ -710,6 +722,7 @@ STAGES: tuple[StageSpec, ...] = (
         settings={
             "mosaic_pixel_m": "reconstruct.mosaic_pixel_m",
             "colour": "reconstruct.colour",
+            "dispersion": "reconstruct.dispersion",
             "water": without("water", "n_water_sigma"),
         },
         inputs=_mosaic_inputs,
@@ -731,7 +744,9 @@ STAGES: tuple[StageSpec, ...] = (
         work="reconstruct.mesh.run:run_mesh",
         takes=("reconstruct",),
         needs=("image", "placing", "dense"),
-        settings=only("reconstruct", "mesh_error_px"),
+        settings=only(
+            "reconstruct", "mesh_triangles", "mesh_error_px", "mesh_page_px", "mesh_tiles"
+        ),
         inputs=_mesh_inputs,
         summary=_mesh_summary,
         products={

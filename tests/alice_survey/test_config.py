@@ -237,7 +237,15 @@ def test_weak_thrusters_are_read_from_their_texts() -> None:
 def test_a_key_that_is_gone_says_what_to_do() -> None:
     for name, cure in REMOVED.items():
         section, key = name.split(".")
-        assert f"{name} is gone: {cure}" in fault({section: {key: 1}})
+        assert f"{name} is gone: {cure}" in fault({section: {key: "other"}})
+
+
+def test_a_key_that_is_gone_may_hold_what_now_always_holds() -> None:
+    """As files that an earlier version wrote."""
+    for section, kind in sections().items():
+        for key, value in kind.constants.items():
+            assert f"{section}.{key}" in REMOVED
+            assert parse_config({section: {key: value}}, "old") == SurveyConfig()
 
 
 def test_a_new_file_holds_every_setting_with_its_default() -> None:

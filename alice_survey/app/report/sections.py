@@ -175,7 +175,6 @@ def _truth(score: ScoreRecord, held: Held) -> Section:
                 "Map and histogram of height errors.", "Without a slope or a dome.",
                 "Errors at the rim come from few pictures; a dome from calibration.",
             )),
-            *plots.sigma_test(held),
         ],
     )  # fmt: skip
 
@@ -274,7 +273,7 @@ def _surface(figures: Figures) -> Section:
         name="surface",
         title="Surface",
         tables=[_table("Elevation model", *rows)],
-        figures=[*plots.overlap(held), *_stills(held, still)],
+        figures=[*plots.sigma_test(held), *plots.overlap(held), *_stills(held, still)],
     )
 
 
