@@ -15,6 +15,7 @@ from pydantic import (
     field_validator,
     model_validator,
 )
+from pydantic.config import JsonDict
 
 from alice_survey.core.contents import one_line, shown
 from alice_survey.core.errors import ConfigError
@@ -43,7 +44,7 @@ def setting(
         above: comment lines above it in a new file.
         how: limits, as of pydantic's `Field`.
     """
-    extra = {"example": example, "template": template, "above": above}
+    extra: JsonDict = {"example": example, "template": template, "above": above}
     return Field(default, description=about, json_schema_extra=extra, **how)
 
 

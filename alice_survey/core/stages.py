@@ -180,13 +180,14 @@ def settings_of(wanted: Any, config: Config) -> Any:
         include=None if part.only is None else set(part.only),
         exclude=set(part.without),
     )
-    gone = type(value).constants if isinstance(value, Config) else {}
-    kept = {
-        name: constant
-        for name, constant in gone.items()
-        if (part.only is None or name in part.only)
-        and name not in part.without | type(value).unrecorded
-    }
+    kept = {}
+    if isinstance(value, Config):
+        left_out = part.without | value.unrecorded
+        kept = {
+            name: constant
+            for name, constant in value.constants.items()
+            if name not in left_out and (part.only is None or name in part.only)
+        }
     return kept | {name: _file_name(getattr(value, name), values[name]) for name in values}
 
 

@@ -140,9 +140,9 @@ def _truth(score: ScoreRecord, held: Held) -> Section:
         ("surface", None, surface.distance_max_mm, "distance from the true surface"),
         ("mosaic", mosaic.position_rms_mm, mosaic.position_95_mm, "position; the larger: 95 %"),
         ("lengths", score.lengths.rms_mm, None, f"over {length(score.lengths.mean_length_m)}"),
-        ("surface, 3 stations and more", seen and seen.distance_rms_mm, None,
-         f"{share(seen and seen.share)} of the area"),
-        ("mesh", mesh and mesh.distance_rms_mm, None, "distance from the true surface"),
+        ("surface, 3 stations and more", None if seen is None else seen.distance_rms_mm, None,
+         f"{share(None if seen is None else seen.share)} of the area"),
+        ("mesh", None if mesh is None else mesh.distance_rms_mm, None, "distance from the true surface"),
     ]  # fmt: skip
     within = surface.completeness_within_px
     return Section(
@@ -324,7 +324,7 @@ def _model(figures: Figures, found: RegistrationRecord) -> Section:
             rows.append((f"sigma of the whole survey, {axis}", length(sigma)))
         rows.append(("sigma of its heading", _degrees(place.sigma_heading_deg)))
         rows.append(("sigma of its level", _degrees(place.sigma_tilt_deg)))
-        rows.append(("mount of the rig", place.mount and place.mount.words))
+        rows.append(("mount of the rig", None if place.mount is None else place.mount.words))
     rows += [
         (f"sigma of heading of {count(joint.stations, 'station')} that navigation alone joins",
          _degrees(joint.sigma_heading_deg))

@@ -111,9 +111,7 @@ def _costs(
     workspace: Path, config: SurveyConfig, states: Mapping[str, str]
 ) -> dict[str, StageCost]:
     """What stages are predicted to take, as those that ran here correct it; empty where unknown."""
-    size = workspace_size(
-        workspace, config.camera, config.imaging, config.seafloor, config.reconstruct
-    )
+    size = workspace_size(workspace, config)
     if size is None or all(state == UP_TO_DATE for state in states.values()):
         return {}
     costs = stage_costs(size, slowness())
@@ -122,7 +120,7 @@ def _costs(
         record = read_stage(workspace / spec(name).folder)
         if state == UP_TO_DATE and record is not None:
             done[name] = record
-    _, factor, _ = correction(costs, done, processor(), default_threads())
+    _, factor, _ = correction(costs, done, processor())
     return {name: cost.scaled(factor) for name, cost in costs.items()}
 
 
