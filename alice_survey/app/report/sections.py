@@ -142,7 +142,7 @@ def _truth(score: ScoreRecord, held: Held) -> Section:
         ("lengths", score.lengths.rms_mm, None, f"over {length(score.lengths.mean_length_m)}"),
         ("surface, 3 stations and more", None if seen is None else seen.distance_rms_mm, None,
          f"{share(None if seen is None else seen.share)} of the area"),
-        ("mesh", None if mesh is None else mesh.distance_rms_mm, None, "distance from the true surface"),
+        ("mesh", None if mesh is None else mesh.distance_rms_mm, None, "distance from the truth"),
     ]  # fmt: skip
     within = surface.completeness_within_px
     return Section(
