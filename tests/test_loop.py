@@ -145,7 +145,7 @@ def test_killed_again_and_again_it_ends_the_same(undisturbed: Path, tmp_path: Pa
         run.wait()
         if ended and not ended.get("resumed"):  # where kernels had to be compiled it took longer
             took_s[stage] = min(took_s[stage], ended["took_s"])
-    assert whole_before_kill < len(KILLED) / 2  # most fell into the work of their stage
+    assert whole_before_kill < len(KILLED) - 4  # at least five fell into the work of their stage
     assert start(workspace, threads=1).wait() == 0
     assert not list(workspace.glob("*.partial"))
     again, whole = results(workspace), results(undisturbed)

@@ -46,7 +46,7 @@ class Region:
     volume_m3: float
     """Positive where there is more now."""
     sigma_m3: float
-    most_m: float
+    max_m: float
     """Largest change of height (95 % of the cells are below)."""
     outlines: tuple[tuple[tuple[float, float], ...], ...]
     """Rings of east and north around its cells, the outer one of each part and its holes."""
@@ -256,7 +256,7 @@ def _measure(
         area_m2=area,
         volume_m3=float(values.sum()) * now.cell**2,
         sigma_m3=float(np.hypot(random, shared)),
-        most_m=float(sign * np.percentile(sign * values, 95)),
+        max_m=float(sign * np.percentile(sign * values, 95)),
         outlines=_outlines(inside, window, now),
     )
 
@@ -294,6 +294,6 @@ def _region(region: Region) -> dict[str, Any]:
         "area_m2": round(region.area_m2, 4),
         "volume_l": round(1e3 * region.volume_m3, 4),
         "sigma_l": round(1e3 * region.sigma_m3, 4),
-        "most_mm": round(1e3 * region.most_m, 2),
+        "most_mm": round(1e3 * region.max_m, 2),
         "outlines": [[[round(e, 4), round(n, 4)] for e, n in ring] for ring in region.outlines],
     }

@@ -56,7 +56,7 @@ def plot_dem(dem: Dem) -> Sheet:
 
     Example:
         >>> import alice_survey as alice
-        >>> alice.plot_dem(alice.read_dem("small", most_cells=200)).savefig("dem.png")
+        >>> alice.plot_dem(alice.read_dem("small", max_cells=200)).savefig("dem.png")
     """
     sheet = new_figure(_HEIGHT_IN)
     for axes, values, label in zip(

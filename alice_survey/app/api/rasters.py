@@ -123,7 +123,7 @@ def read_dem(workspace: str | Path, max_cells: int = 4000) -> Dem:
 
     Example:
         >>> import alice_survey as alice
-        >>> alice.read_dem("small", most_cells=50).height.shape[0] <= 50
+        >>> alice.read_dem("small", max_cells=50).height.shape[0] <= 50
         True
     """
     folder = Path(workspace) / "dense"
@@ -144,7 +144,7 @@ def read_mosaic(workspace: str | Path, max_pixels: int = 4000) -> Mosaic:
 
     Example:
         >>> import alice_survey as alice
-        >>> alice.read_mosaic("small", most_pixels=100).rgba.dtype
+        >>> alice.read_mosaic("small", max_pixels=100).rgba.dtype
         dtype('uint8')
     """
     bands, place = _read(Path(workspace) / "mosaic" / "mosaic.tif", [1, 2, 3, 4], max_pixels)

@@ -169,14 +169,14 @@ class Bag:
         )
         self.add(topic, "sensor_msgs/msg/Imu", stamp_ns, message)
 
-    def add_range(self, stamp_ns: int, topic: str, range_m: float, most_m: float = 50.0) -> None:
+    def add_range(self, stamp_ns: int, topic: str, range_m: float, max_m: float = 50.0) -> None:
         message = self.make(
             "sensor_msgs/msg/Range",
             header=self.header(stamp_ns, "sonar"),
             radiation_type=0,
             field_of_view=0.1,
             min_range=0.1,
-            max_range=most_m,
+            max_range=max_m,
             range=range_m,
         )
         self.add(topic, "sensor_msgs/msg/Range", stamp_ns, message)
