@@ -51,16 +51,16 @@ def fov_csv_rows(rows: Sequence[FovRow], blur: Sequence[BlurRow]) -> list[dict[s
 def validation_csv_rows(validation: PaperValidation) -> list[dict[str, Any]]:
     """Every check and claim, flat."""
     rule = PAPER_RULE.partition(";")[0]
-    checks = [
+    checks: list[tuple[PaperCheck | PaperClaim, str, str, str]] = [
         (c, f"{c.quantity} of the {c.lens_mm:g} mm lens: {c.paper} {c.unit}", rule,
          f"within {c.tolerance:g} {c.unit}")
         for c in validation.table
     ]  # fmt: skip
-    claims = [(c, c.claim, c.assumption, _bounds(c)) for c in validation.claims]
+    checks += [(c, c.claim, c.assumption, _bounds(c)) for c in validation.claims]
     return [
         {"claim": claim, "verdict": _verdict(c), "computed": f"{c.computed:.4f} {c.unit}",
          "assumption": assumption, "rule": bound}
-        for c, claim, assumption, bound in (*checks, *claims)
+        for c, claim, assumption, bound in checks
     ]  # fmt: skip
 
 

@@ -358,7 +358,7 @@ def _read_text(
     with tempfile.TemporaryDirectory(prefix="alice-survey-") as folder, read_by("pymavlink", path):
         from pymavlink.DFReader import DFReader_text
 
-        class Log(DFReader_text):  # type: ignore[misc]
+        class TextLog(DFReader_text):  # type: ignore[misc]
             """A log without a clock."""
 
             def init_clock(self) -> None:
@@ -366,7 +366,7 @@ def _read_text(
 
         clean = Path(folder) / "clean.log"  # pymavlink takes no byte that is not UTF-8
         clean.write_text(path.read_text("utf-8", "replace"), "ascii", "replace", newline="\n")
-        with Log(str(clean)) as log:
+        with TextLog(str(clean)) as log:
             noise = sum(log.counts.values())
             for message in _messages(log, lost):
                 noise -= 1

@@ -133,7 +133,7 @@ def write_bag(path: Path, record: BagRecord) -> None:
 
 
 @dataclass(frozen=True)
-class _Topic:
+class _BagTopic:
     """One topic: when its messages are, and how to make one."""
 
     name: str
@@ -143,7 +143,7 @@ class _Topic:
     """Makes the message of a stamp and a row of the record."""
 
 
-def _topics(record: BagRecord, ros: MessageBuilder) -> list[_Topic]:
+def _topics(record: BagRecord, ros: MessageBuilder) -> list[_BagTopic]:
     """All topics of a record."""
     name, datum = record.name, record.datum
     body, true_body = f"{name}/base_link", f"{name}/base_link_truth"
@@ -164,46 +164,46 @@ def _topics(record: BagRecord, ros: MessageBuilder) -> list[_Topic]:
     label = ",".join(record.thrusters)
     stamps, heard = _nanoseconds(record.time_s), _nanoseconds(record.beam_time_s)
 
-    def beam(number: int) -> _Topic:
+    def beam(number: int) -> _BagTopic:
         frame, ranges = f"{name}/dvl_beam_{number + 1}", record.beam_m[:, number]
-        return _Topic(
+        return _BagTopic(
             f"/{name}/dvl/beam_{number + 1}", RANGE, heard,
             lambda stamp, i: ros.range(stamp, frame, ranges[i]),
         )  # fmt: skip
 
     return [
-        _Topic(
+        _BagTopic(
             f"/{name}/datum", FIX, stamps[:1], lambda stamp, _: ros.fix(stamp, MAP, origin, None)
         ),
-        _Topic(
+        _BagTopic(
             f"/{name}/truth/odometry", ODOMETRY, stamps,
             lambda stamp, i: ros.odometry(
                 stamp, true_body, true_place[i], true_turn[i], exact, true_speed[i]
             ),
         ),
-        _Topic(
+        _BagTopic(
             f"/{name}/navigation/odometry", ODOMETRY, stamps,
             lambda stamp, i: ros.odometry(stamp, body, place[i], turn[i], variances[i], speed[i]),
         ),
-        _Topic(
+        _BagTopic(
             f"/{name}/navigation/fix", FIX, stamps,
             lambda stamp, i: ros.fix(stamp, body, geodetic[i], variances[i, :3]),
         ),
-        _Topic(
+        _BagTopic(
             "/tf", TRANSFORMS, stamps,
             lambda stamp, i: ros.transforms(
                 stamp, {body: (place[i], turn[i]), true_body: (true_place[i], true_turn[i])}
             ),
         ),
-        _Topic(
+        _BagTopic(
             f"/{name}/navigation/altitude", RANGE, stamps,
             lambda stamp, i: ros.range(stamp, f"{name}/port", record.altitude_m[i]),
         ),
-        _Topic(
+        _BagTopic(
             f"/{name}/thrusters/state", JOINTS, stamps,
             lambda stamp, i: ros.joints(stamp, record.thrusters, rad_s[i]),
         ),
-        _Topic(
+        _BagTopic(
             f"/{name}/thrusters/power", NUMBERS, stamps,
             lambda _, i: ros.numbers(label, record.power_w[i]),
         ),

@@ -69,7 +69,7 @@ class SpotErrors:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Figure:
+class PolylineFigure:
     """A figure of points in space."""
 
     value: Callable[[Array], float]
@@ -225,10 +225,10 @@ class Lengths:
         Raises:
             ReconstructionError: one is not found, or the distance is not determined.
         """
-        return self.figures([first, second], [Figure(value=polyline, power=1)])[1][0]
+        return self.figures([first, second], [PolylineFigure(value=polyline, power=1)])[1][0]
 
     def figures(
-        self, picks: Sequence[Sequence[Pick]], figures: Sequence[Figure]
+        self, picks: Sequence[Sequence[Pick]], figures: Sequence[PolylineFigure]
     ) -> tuple[Array, list[PickedFigure]]:
         """Points, (N, 3) in the model, each by its picks, and figures of them.
 

@@ -18,7 +18,7 @@ import numpy as np
 from alice_survey.core.errors import ReconstructionError
 from alice_survey.core.frames import Array
 from reconstruct.measure.figures import polygon_area, polyline
-from reconstruct.picking.lengths import Figure, Lengths, PickedFigure
+from reconstruct.picking.lengths import Lengths, PickedFigure, PolylineFigure
 from reconstruct.picking.refine import refine
 from reconstruct.picking.registered import RegisteredPictures
 from reconstruct.picking.surface import ModelSurface, SurfacePlace
@@ -63,9 +63,12 @@ def measure(
         raise ReconstructionError("the model has no scale: lengths in it are not metres")
     finder = _PickFinder(workspace, pictures)
     picks = [finder.find(some) if len(some) == 1 else finder.checked(some) for some in marks]
-    lines = [Figure(value=partial(_segment, n), power=1) for n in range(len(picks) - 1)]
+    lines = [PolylineFigure(value=partial(_segment, n), power=1) for n in range(len(picks) - 1)]
     if len(picks) > 2:
-        lines += [Figure(value=polyline, power=1), Figure(value=polygon_area, power=2)]
+        lines += [
+            PolylineFigure(value=polyline, power=1),
+            PolylineFigure(value=polygon_area, power=2),
+        ]
     places, figures = Lengths(workspace, pictures).figures(picks, lines)
     return _described(words, places, figures)
 

@@ -260,7 +260,7 @@ def evaluate(
     """Score a survey.
 
     A simulated one against its truth: camera track, surface, mosaic, mesh. A real one against
-    a reference, or against an earlier survey: what has changed, how surely, and its volume.
+    a reference, or against an earlier survey: what has changed, with its significance and volume.
     """
     if reference is not None:
         from reconstruct.evaluate.reference import evaluate_reference
