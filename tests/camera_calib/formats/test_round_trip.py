@@ -30,18 +30,18 @@ QUICK = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCh
 BOTH: dict[str, Any] = {"lenses": BOTH_LENSES}
 ALL: dict[str, Any] = {**BOTH, "ports": ("none", "flat", "dome")}
 TARGETS = {
-    "rig": ("rig", "rig.json", {"terms": EVERY, **ALL, "most": 3}),
+    "rig": ("rig", "rig.json", {"terms": EVERY, **ALL, "maximum": 3}),
     "opencv-yaml": ("opencv", "cameras.yml", {"terms": EVERY, **ALL}),
     "opencv-xml": ("opencv", "cameras.xml", {"terms": EVERY, **ALL}),
-    "colmap-text": ("colmap", "model", {"terms": RATIONAL, **BOTH, "most": 3}),
-    "colmap-binary": ("colmap", "model/cameras.bin", {"terms": RATIONAL, **BOTH, "most": 3}),
-    "refractive-text": ("refractive", "model", {"terms": RATIONAL, **ALL, "most": 3}),
+    "colmap-text": ("colmap", "model", {"terms": RATIONAL, **BOTH, "maximum": 3}),
+    "colmap-binary": ("colmap", "model/cameras.bin", {"terms": RATIONAL, **BOTH, "maximum": 3}),
+    "refractive-text": ("refractive", "model", {"terms": RATIONAL, **ALL, "maximum": 3}),
     "refractive-binary": ("refractive", "model/cameras.bin", {"terms": RATIONAL, **ALL}),
-    "kalibr": ("kalibr", "camchain.yaml", {"terms": RADTAN, **BOTH, "most": 3}),
+    "kalibr": ("kalibr", "camchain.yaml", {"terms": RADTAN, **BOTH, "maximum": 3}),
     "ros-rational": ("ros", "out.yaml", {"terms": RATIONAL, **BOTH, "one_size": True}),
     "ros-plumb-bob": ("ros", "out.yaml", {"terms": PLUMB_BOB, "one_size": True}),
-    "metashape": ("metashape", "camera.xml", {"terms": PLUMB_BOB, **BOTH, "most": 1}),
-    "mrcal": ("mrcal", "out.cameramodel", {"terms": EVERY, "most": 3}),
+    "metashape": ("metashape", "camera.xml", {"terms": PLUMB_BOB, **BOTH, "maximum": 1}),
+    "mrcal": ("mrcal", "out.cameramodel", {"terms": EVERY, "maximum": 3}),
 }
 SAME_FORMAT = {"refractive": ("refractive", "colmap")}
 """Without any port, the cameras of Refractive COLMAP are COLMAP's."""
