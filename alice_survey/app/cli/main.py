@@ -94,7 +94,6 @@ def init(
         "fov",
         "fov --lens 12.5 --lens 25 --altitude 1.5 --altitude 2 --n-water 1.345 --json",
         "fov --speed 0.2 --speed 0.5 --exposure 1 --exposure 3",
-        "fov --survey reef/survey.toml --altitude 2",
         "fov --rig calibration/rig.json --altitude 2 --plot fov.png --csv fov.csv",
         "fov --validate",
     )
