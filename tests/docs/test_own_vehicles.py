@@ -57,11 +57,18 @@ def test_any_vehicle_covers_the_area_of_the_tutorial(
     planned = plan_survey(config, rig)
     assert planned.plan.coverage > 0.99
     flight = simulate_plan(
-        planned.plan, flight_settings(config), level_floor(_DEPTH_M), np.random.default_rng(7)
+        planned.plan,
+        flight_settings(config),
+        level_floor(_DEPTH_M),
+        np.random.default_rng(config.seed),
     )
     assert flight.ending == "complete"
     flown = certificate(
-        planned.plan.area, rig, stations_of_flight(flight), plan_pattern(planned.plan, rig)
+        planned.plan.area,
+        rig,
+        stations_of_flight(flight),
+        plan_pattern(planned.plan, rig),
+        cell_m=planned.certificate.grid.cell_m,
     )
     assert 0.97 < flown.stereo_share <= 1.0
     assert 0.8 < flown.share_at_overlap <= 1.0
