@@ -17,8 +17,7 @@ from shapely.geometry import Point
 
 from alice_survey.core.config import AreaConfig, PlanConfig, SurveyConfig
 from alice_survey.core.errors import PlanError, heard, warn
-from alice_survey.sim.vehicle.hydrodynamics.geometry import POINT, Hull
-from alice_survey.sim.vehicle.vehicle import Vehicle
+from alice_survey.sim.vehicle.vehicle import POINT, Hull, Vehicle
 from camera_calib.camera import Camera
 from camera_calib.rig import Rig
 from missions.areas.bathymetry import Bathymetry, mean_depth_m, read_bathymetry

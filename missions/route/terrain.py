@@ -21,7 +21,7 @@ import numpy as np
 
 from alice_survey.core.errors import PlanError, warn
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.hydrodynamics.geometry import Hull
+from alice_survey.sim.vehicle.vehicle import Hull
 from missions.areas.bathymetry import Bathymetry
 from missions.values.line import Line
 

@@ -57,11 +57,11 @@ def coefficients(
     plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Figure to draw.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compute coefficients from shape, next to the paper's.
+    """Show coefficients computed from shape, next to the paper's.
 
     Every row of the paper's three tables of added mass, damping and lift.
     """
-    from alice_survey.sim.vehicle.hydrodynamics.paper_tables import coefficients_report
+    from alice_survey.sim.vehicle.paper_tables import coefficients_report
 
     print_result(*coefficients_report(csv, plot), as_json)
 

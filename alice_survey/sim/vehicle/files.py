@@ -5,15 +5,15 @@ A vehicle file is TOML or JSON with the fields of `Vehicle`: `name`, `rigid_body
 as `Hull`, `density_kg_m3`, `depth_rating_m`, `battery_wh`, `hotel_w`. Of a thruster only name,
 place and direction are needed where logs give thrusts; speeds need its diameter and k_t too.
 
-Instead of a hull, `geometry` names a shape of `hydrodynamics.geometry`, from which the hull and the
-water inside follow; and `coefficient_sets`, instead of coefficients, those of such a vehicle: the
-paper's tables, and `computed` from the shape.
+Instead of a hull, `geometry` names a shape of shapes.toml with its hull and the water inside; and
+`coefficient_sets`, instead of coefficients, those of such a vehicle: the paper's tables, and
+`computed` from the shape.
 """
 
 import json
 import tomllib
 from collections.abc import Mapping, Sequence
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -26,17 +26,9 @@ from alice_survey.core.contents import one_line, shown
 from alice_survey.core.errors import VehicleError, why
 from alice_survey.sim.vehicle.coefficients import FORCES, Coefficients
 from alice_survey.sim.vehicle.fins import Fin
-from alice_survey.sim.vehicle.hydrodynamics.geometry import (
-    ALICE,
-    POINT,
-    SPARUS2,
-    Hull,
-    entrained_water,
-)
-from alice_survey.sim.vehicle.hydrodynamics.paper_tables import CALIBRATED, CFD, ESTIMATED
-from alice_survey.sim.vehicle.hydrodynamics.parts import estimate
+from alice_survey.sim.vehicle.paper_tables import CALIBRATED, CFD, COMPUTED, ESTIMATED, SHAPES
 from alice_survey.sim.vehicle.propulsion import Thruster
-from alice_survey.sim.vehicle.vehicle import RigidBody, Vehicle
+from alice_survey.sim.vehicle.vehicle import POINT, Hull, RigidBody, Vehicle
 
 _Kind = TypeVar("_Kind")
 COEFFICIENTS_FORMAT = "alice-survey coefficients 1"
@@ -52,7 +44,6 @@ _DESCRIBED = {
     path.stem: path for path in sorted((Path(__file__).parent / "fleet_files").glob("*.toml"))
 }
 """Files of the vehicles that are known by name."""
-GEOMETRIES = {shape.name: shape for shape in (ALICE, SPARUS2)}
 PAPER_SETS = {"estimated": ESTIMATED, "cfd": CFD, "calibrated": CALIBRATED}
 OWN_SET = "calibrated"
 """Stands for a vehicle's own coefficients where none are named."""
@@ -130,7 +121,7 @@ def known_vehicles() -> list[str]:
 
 def vehicles_of_a_geometry() -> list[str]:
     """Names of the known vehicles whose shape is known: they carry the same payload."""
-    return [name for name in _DESCRIBED if name in GEOMETRIES]
+    return [name for name in _DESCRIBED if name in SHAPES]
 
 
 def vehicle_from_file(path: Path, coefficients: str = OWN_SET) -> Vehicle:
@@ -149,7 +140,7 @@ def vehicle_from_file(path: Path, coefficients: str = OWN_SET) -> Vehicle:
 
 @lru_cache(maxsize=32)
 def _vehicle_of(path: Path, text: str, coefficients: str) -> Vehicle:
-    """The vehicle of a file's text; kept, as the water inside of a hull takes a while to find."""
+    """The vehicle of a file's text; kept, as it is asked for often."""
     found = parse_table(path, _VehicleFile, _with_shape(_table_of(path, text)))
     for what, parts in (("thrusters", found.thrusters), ("fins", found.fins)):
         names = [part.name for part in parts]
@@ -174,22 +165,15 @@ def _with_shape(table: dict[str, Any]) -> dict[str, Any]:
     named, body = table.get("geometry"), table.get("rigid_body")
     if named is None:
         return table
-    shape = GEOMETRIES.get(str(named))
+    shape = SHAPES.get(str(named))
     if shape is None:
         raise VehicleError(
-            f"geometry {shown(str(named))!r} is not known; known: {', '.join(GEOMETRIES)}: leave "
+            f"geometry {shown(str(named))!r} is not known; known: {', '.join(SHAPES)}: leave "
             "it out, and give [hull] and [coefficients]"
         )
-    drained = body.get("buoyancy_kg") if isinstance(body, dict) else None
-    if not isinstance(body, dict) or not isinstance(drained, int | float):
+    if not isinstance(body, dict):
         return table  # whose faults are named elsewhere
-    inside = entrained_water(shape, drained, float(table.get("density_kg_m3", _DENSITY)))
-    water = {
-        "entrained_kg": inside.mass_kg,
-        "entrained_cg_body_m": (inside.x_m, 0.0, 0.0),
-        "entrained_inertia_kg_m2": inside.inertia_kg_m2,
-    }
-    return {"hull": shape.hull, **table, "rigid_body": {**water, **body}}
+    return {"hull": shape["hull"], **table, "rigid_body": {**shape["rigid_body"], **body}}
 
 
 def _choose_set(path: Path, found: _VehicleFile, name: str) -> Coefficients:
@@ -209,12 +193,7 @@ def _choose_set(path: Path, found: _VehicleFile, name: str) -> Coefficients:
         return PAPER_SETS[chosen]
     if found.geometry is None:
         raise VehicleError(f"{path}: coefficients are {chosen} from a shape: name its geometry")
-    return _estimate_of(found.geometry)
-
-
-@cache
-def _estimate_of(geometry: str) -> Coefficients:
-    return estimate(GEOMETRIES[geometry])
+    return COMPUTED[found.geometry]
 
 
 def vehicle_to_fly(name_or_file: str, coefficients: str = OWN_SET) -> Vehicle:

@@ -23,8 +23,8 @@ import numpy as np
 from alice_survey.core.compiled import columns
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.hydrodynamics.geometry import POINT, Hull
 from alice_survey.sim.vehicle.sea import GRAVITY
+from alice_survey.sim.vehicle.vehicle import POINT, Hull
 
 Place = tuple[float, float, float]
 

@@ -5,10 +5,12 @@ import pytest
 
 from alice_survey.core.errors import VehicleError
 from alice_survey.sim.vehicle import files
-from alice_survey.sim.vehicle.files import GEOMETRIES, SETS, vehicle_from
+from alice_survey.sim.vehicle.files import SETS, vehicle_from
 from alice_survey.sim.vehicle.sea import GRAVITY
+from tests.oracles_shape import ALICE, SPARUS2
 
 NAMES = ("alice", "sparus2")
+GEOMETRIES = {shape.name: shape for shape in (ALICE, SPARUS2)}
 STARBOARD, PORT, VERTICAL, BOW, STERN = range(5)
 
 

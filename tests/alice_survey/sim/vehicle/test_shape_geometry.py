@@ -3,15 +3,21 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from alice_survey.sim.vehicle.hydrodynamics.geometry import (
+from alice_survey.sim.vehicle.files import vehicle_from
+from alice_survey.sim.vehicle.paper_tables import SHAPES
+from tests.oracles_shape import (
     ALICE,
     SHELL_M,
     SPARUS2,
     T200_DIAMETER_M,
     T200_LENGTH_M,
+    Flow,
     Geometry,
     entrained_water,
+    estimate,
     farthest_tunnel_x,
+    part_coefficients,
+    parts,
 )
 
 RHO, BUOYANCY_KG = 1025.0, 52.1
@@ -28,7 +34,6 @@ def test_alice_is_as_long_as_its_lift_implies() -> None:
     assert ALICE.outline.length_m == pytest.approx(1.96, abs=1e-12)
     assert ALICE.outline.nose_x_m == 1.06
     assert ALICE.outline.diameter_m == SPARUS2.outline.diameter_m
-    assert ALICE.outline.side_fullness == pytest.approx(0.940, abs=5e-4)
 
 
 @pytest.mark.parametrize("geometry", BOTH)
@@ -79,3 +84,23 @@ def test_water_fills_what_the_dry_vehicle_leaves_and_balances_it(geometry: Geome
     pitch = mass @ ((x - inside.x_m) ** 2 + r**2 / 4.0)
     np.testing.assert_allclose(inside.inertia_kg_m2, [mass @ r**2 / 2.0, pitch, pitch], rtol=2e-3)
     assert outline.tail_x_m < inside.tail_to_x_m < 0 < inside.nose_from_x_m < outline.nose_x_m
+
+
+@pytest.mark.parametrize("geometry", BOTH)
+def test_the_program_holds_what_follows_from_the_shapes(geometry: Geometry) -> None:
+    held = SHAPES[geometry.name]
+    inside = entrained_water(geometry, BUOYANCY_KG, RHO)
+    water = [inside.mass_kg, inside.x_m, 0.0, 0.0, *inside.inertia_kg_m2]
+    body = held["rigid_body"]
+    np.testing.assert_allclose(
+        [body["entrained_kg"], *body["entrained_cg_body_m"], *body["entrained_inertia_kg_m2"]],
+        water, rtol=1e-10,
+    )  # fmt: skip
+    assert vehicle_from(geometry.name).hull == geometry.hull
+    for name, values in {
+        "computed": estimate(geometry).values,
+        "computed_hull": part_coefficients(parts(geometry, Flow())[0]),
+    }.items():
+        for coefficient, value in held.get(name, {}).items():
+            assert value == pytest.approx(values[coefficient], rel=1e-12), coefficient
+    assert set(held["computed"]) == set(estimate(geometry).values)

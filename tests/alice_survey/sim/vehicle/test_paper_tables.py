@@ -11,18 +11,15 @@ from typer.testing import CliRunner
 from alice_survey.app.cli.main import app
 from alice_survey.core.errors import AliceError
 from alice_survey.sim.vehicle.files import vehicle_from
-from alice_survey.sim.vehicle.hydrodynamics.geometry import ALICE
-from alice_survey.sim.vehicle.hydrodynamics.paper_tables import (
+from alice_survey.sim.vehicle.paper_tables import (
     CALIBRATED,
     CFD,
+    COMPUTED,
     ESTIMATED,
+    ROWS,
     CoefficientRow,
-    coefficient_rows,
     coefficients_report,
 )
-from alice_survey.sim.vehicle.hydrodynamics.parts import estimate
-
-ROWS = coefficient_rows()
 
 
 def row(table: str, coefficient: str, part: str = "vehicle") -> CoefficientRow:
@@ -48,7 +45,7 @@ def test_every_row_is_marked_by_its_difference() -> None:
 
 def test_signs_of_the_paper_are_those_of_the_computed_set() -> None:
     """Once corrected: the same axes, and the same mast above and behind the origin."""
-    computed = estimate(ALICE).values
+    computed = COMPUTED["alice"].values
     for each in (ESTIMATED, CFD, CALIBRATED):
         for name, value in each.values.items():
             assert math.copysign(1, value) == math.copysign(1, computed[name]), (each.name, name)

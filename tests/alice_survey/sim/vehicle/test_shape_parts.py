@@ -8,9 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from alice_survey.sim.vehicle.coefficients import Coefficients
-from alice_survey.sim.vehicle.hydrodynamics.geometry import ALICE, SPARUS2, Geometry, Outline
-from alice_survey.sim.vehicle.hydrodynamics.parts import (
+from tests.oracles_hydrodynamics import Array, lamb_constants, reaction
+from tests.oracles_shape import (
+    ALICE,
+    SPARUS2,
     Flow,
+    Geometry,
+    Outline,
     by_name,
     drag_of,
     estimate,
@@ -18,7 +22,6 @@ from alice_survey.sim.vehicle.hydrodynamics.parts import (
     part_coefficients,
     parts,
 )
-from tests.oracles_hydrodynamics import Array, lamb_constants, reaction
 
 RHO = 1025.0
 SHARES = {part.name: part_coefficients(part) for part in parts(ALICE, Flow())}

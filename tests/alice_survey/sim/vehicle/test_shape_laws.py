@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from alice_survey.sim.vehicle.hydrodynamics import parts
+from tests import oracles_shape as parts
 from tests.oracles_hydrodynamics import finned_circle, lamb_constants
 
 RHO = 1025.0

@@ -1,1 +1,0 @@
-"""Hydrodynamic coefficients from a vehicle's geometry, and the tables of the paper."""
