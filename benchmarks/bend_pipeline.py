@@ -17,7 +17,6 @@ from reconstruct.adjustment.adjusted import adjust_survey
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.refraction import refract
-from reconstruct.mapping.working_range import WorkingDistances
 from reconstruct.placing.alignment import Similarity, level, sag_weights
 from reconstruct.placing.fit import fit_navigation
 from reconstruct.placing.navigation import PLACE, body_from_pinhole
@@ -46,7 +45,7 @@ class Adjusted:
     """How navigation's errors of depth are correlated, in words."""
 
 
-Adjust = Callable[[Mapped, Observations, Rig, WorkingDistances, Datum, Path], Adjusted]
+Adjust = Callable[[Mapped, Observations, Rig, RangeRecord, Datum, Path], Adjusted]
 """Takes a model near the truth on a calibrated rig, and a folder for its files."""
 
 
@@ -54,7 +53,7 @@ def adjusted(
     mapped: Mapped,
     seen: Observations,
     rig: Rig,
-    distances: WorkingDistances,
+    distances: RangeRecord,
     datum: Datum,
     folder: Path,
 ) -> Adjusted:
@@ -66,9 +65,7 @@ def adjusted(
     mapped, _ = refract(
         mapped, seen, folder, {name: rig.cam_from_rig[name] for name in seen.cameras}
     )
-    found = adjust_survey(
-        mapped, seen.images, rig, RangeRecord(**vars(distances)), ReconstructConfig()
-    )
+    found = adjust_survey(mapped, seen.images, rig, distances, ReconstructConfig())
     if found.rig is None or found.shape is None:
         raise ReconstructionError("the shape of the model is not known")
     model = found.mapped.model

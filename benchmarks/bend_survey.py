@@ -28,6 +28,7 @@ from alice_survey.core.frames import (
     interpolate_poses,
 )
 from alice_survey.core.manifest import ImageRecord
+from alice_survey.core.records import RangeRecord
 from alice_survey.core.trajectory import Trajectory, read_columns, read_track
 from alice_survey.sim.seafloor.terrain import Terrain, survey_terrain
 from camera_calib.freedom import moved
@@ -37,7 +38,6 @@ from missions.values.plan_file import read_plan
 from reconstruct.adjustment.survey_fit import bias_covariance
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
-from reconstruct.mapping.working_range import WorkingDistances
 from tests.reconstruct.scenes import Scene
 from tests.reconstruct.true_models import near_truth, warped_scene
 
@@ -313,7 +313,7 @@ class Started:
     """On the calibrated rig; pixels are those of the true one."""
     seen: Observations
     mapped: Mapped
-    distances: WorkingDistances
+    distances: RangeRecord
     datum: Datum
 
 
@@ -367,7 +367,7 @@ def start(track: FlownTrack, rig: Rig, true: Rig, read: Readings, seed: int) -> 
         scene=scene,
         seen=observations,
         mapped=near_truth(scene, observations, warps, rng),
-        distances=WorkingDistances(near_m=near_m, far_m=far_m, source="truth"),
+        distances=RangeRecord(near_m=near_m, far_m=far_m, source="truth"),
         datum=track.datum,
     )
 

@@ -57,7 +57,7 @@ def features(picture: Path, runs: int) -> list[Figure]:
 
     def ours() -> None:
         grey = normalise(read_deep(picture))
-        find_features(grey, None, scale=None, maximum=settings.max_features)
+        find_features(grey, None, maximum=settings.max_features)
 
     with TemporaryDirectory() as folder:
         database = Path(folder) / "database.db"
@@ -82,7 +82,7 @@ def matches(first: Path, second: Path, runs: int) -> list[Figure]:
 
     maximum = SurveyConfig().reconstruct.max_features
     greys = [normalise(read_deep(path)) for path in (first, second)]
-    found = [find_features(grey, None, scale=None, maximum=maximum) for grey in greys]
+    found = [find_features(grey, None, maximum=maximum) for grey in greys]
     with TemporaryDirectory() as folder:
         files = [Path(folder) / f"{k}.npz" for k in range(2)]
         for file, row in zip(files, found, strict=True):

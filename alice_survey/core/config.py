@@ -549,9 +549,8 @@ class ReconstructConfig(Config):
         "feature_scale": None, "working_range_m": None, "mapper": "auto", "dense_partners": 4,
         "mesh_triangles": None, "mesh_tiles": "auto", "mesh_page_px": 8192, "dispersion": "auto",
     }  # fmt: skip
-    feature_scale: ClassVar[float | None] = None
-    working_range_m: ClassVar[float | None] = None
-    mapper: ClassVar[Literal["auto", "global", "incremental"]] = "auto"
+    mapper: ClassVar[str] = "auto"
+    """Only recorded, so that mappings of earlier versions stay up to date."""
     dense_partners: ClassVar[int] = 4
     """Pictures that each is matched with."""
     mesh_triangles: ClassVar[int | None] = None

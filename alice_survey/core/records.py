@@ -145,9 +145,18 @@ class RangeRecord(JsonRecord):
 
 
 class RefractionRecord(JsonRecord):
-    """How the correction of refraction converged."""
+    """How the keypoints of a mapping converged to where refraction puts them."""
 
+    moved_px: tuple[float, ...] = ()
+    """Largest shift of a keypoint in every round."""
+    corrected_px: float = 0.0
+    """Root mean square of the whole shift from the warped keypoints."""
+    removed: int = 0
+    """Observations that the exact keypoints showed to be wrong."""
+    added: int = 0
+    """Observations that they let in."""
     settled: bool
+    """Whether the last shift was negligible."""
 
 
 class BendRecord(JsonRecord):

@@ -649,10 +649,10 @@ STAGES: tuple[StageSpec, ...] = (
         uses=("calibrate",),
         settings={
             "seed": "seed",
-            "feature_scale": "reconstruct.feature_scale",
+            "feature_scale": None,
             "max_features": "reconstruct.max_features",
             "learned_features": "reconstruct.learned_features",
-            "working_range_m": "reconstruct.working_range_m",
+            "working_range_m": None,
             "mapper": "reconstruct.mapper",
         },
         inputs=_mapping_inputs,

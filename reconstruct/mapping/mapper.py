@@ -29,9 +29,6 @@ from reconstruct.mapping.global_mapper import adjust, map_globally, triangulate_
 from reconstruct.pictures.files import list_names
 from reconstruct.views.model_files import as_transform, rigid3d
 
-Method = Literal["auto", "global", "incremental"]
-"""How a calibrated rig is mapped; `auto`: globally, and incrementally where that fails."""
-
 Free = Literal["nothing", "distortion", "all"]
 """What of the cameras is refined: `all` is distortion and focal length."""
 
@@ -83,7 +80,6 @@ def map_calibrated(
     folder: Path,
     seed: int,
     *,
-    method: Method = "auto",
     executor: Executor = SERIAL,
 ) -> Mapped:
     """Map with cameras and rig held constant: the rig gives the scale.
@@ -93,13 +89,12 @@ def map_calibrated(
         cam_from_rig: poses of the cameras on the rig; their pinholes' centres lie elsewhere.
         folder: for scratch files.
         seed: of the mapper.
-        method: all stations at once, one after the other, or the first if it works.
         executor: where tasks run for work on pairs; the result does not depend on it.
     """
     pinhole_from_rig = {
         name: warp.pinhole_from_cam * cam_from_rig[name] for name, warp in seen.warps.items()
     }
-    found, notes = _map_rig(seen, pinhole_from_rig, folder, seed, method, executor)
+    found, notes = _map_rig(seen, pinhole_from_rig, folder, seed, executor)
     model, kept = largest(found, seen.images), found
     if len(seen.cameras) > 1:
         model, *_ = kept = side_by_side(found)
@@ -126,27 +121,20 @@ def _map_rig(
     cam_from_rig: Mapping[str, RigidTransform],
     folder: Path,
     seed: int,
-    method: Method,
     executor: Executor,
 ) -> tuple[list[pycolmap.Reconstruction], list[str]]:
     """Models, largest first, and how they came about."""
     total = len(seen.images)
     one_station = len({record.station for record in seen.images}) == 1
-    if method == "incremental" or len(seen.cameras) < 2 or one_station:
+    if len(seen.cameras) < 2 or one_station:
         why = "there is one station" if one_station else "one camera has no stereo pairs"
-        if method == "incremental":
-            why = "as set in survey.toml"
-        if method == "global":
-            warn(f"{why} to map globally from: incremental mapping instead")
         return run_mapper(seen, cam_from_rig, folder, seed, free="nothing"), [
             f"incremental mapping: {why}"
         ]
     found = _globally(seen, cam_from_rig, folder, seed, executor)
     faults = faults_of(found, total)
-    if not faults or method == "global":
-        for fault in faults:
-            warn(f"global mapping {fault}")
-        return found, ["global mapping of stations", *(f"it {f}" for f in faults)]
+    if not faults:
+        return found, ["global mapping of stations"]
     again = run_mapper(seen, cam_from_rig, folder, seed, free="nothing")
     ranks = [
         (not (models and unsound(models[0])), models[0].num_reg_images() if models else 0)

@@ -9,7 +9,7 @@ pixels as taken through the port. Where rays meet in one centre nothing changes.
 
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.errors import warn
 from alice_survey.core.frames import Array
+from alice_survey.core.records import RefractionRecord
 from alice_survey.core.run import progress
 from reconstruct.mapping.arrays import Indices, first_of, frames_of, model_groups, observed
 from reconstruct.mapping.bundle import (
@@ -50,22 +51,6 @@ _WRONG_SIGMAS, _MIN_WRONG_PX, _MAX_WRONG_PX = 5.0, 1.0, 4.0
 bound is called wrong, all beyond the second (COLMAP's) is."""
 _MIN_ANGLE_DEG = 1.5
 """Least angle between the rays of a point (COLMAP's)."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Convergence:
-    """How the keypoints converged."""
-
-    moved_px: tuple[float, ...]
-    """Largest shift of a keypoint in every round."""
-    corrected_px: float
-    """Root mean square of the whole shift from the warped keypoints."""
-    removed: int
-    """Observations that the exact keypoints showed to be wrong."""
-    added: int
-    """Observations that they let in."""
-    settled: bool
-    """Whether the last shift was negligible."""
 
 
 class Keypoints:
@@ -169,7 +154,7 @@ def refract(
     cam_from_rig: Mapping[str, RigidTransform] | None = None,
     *,
     settle: bool = True,
-) -> tuple[Mapped, Convergence]:
+) -> tuple[Mapped, RefractionRecord]:
     """Make a model exact that was mapped from keypoints warped at one working depth.
 
     Keypoints are corrected and the model adjusted, in turns, until the keypoints converge. Once,
@@ -224,7 +209,7 @@ def refract(
         mapped = adjust_freely(replace(mapped, model=model))
         model = pycolmap.Reconstruction(mapped.model)
     model.update_point_3d_errors()
-    found = Convergence(
+    found = RefractionRecord(
         moved_px=tuple(moves),
         corrected_px=corrected,
         removed=removed,

@@ -21,16 +21,23 @@ from alice_survey.core.errors import ImageError, WorkspaceError, warn
 from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Datum
 from alice_survey.core.manifest import ImageRecord, read_manifest
-from alice_survey.core.records import CamerasRecord, MappingRecord, PicturesRecord
+from alice_survey.core.records import (
+    CamerasRecord,
+    MappingRecord,
+    PictureCamera,
+    PicturesRecord,
+    RangeRecord,
+    RefractionRecord,
+)
 from alice_survey.core.stages import rig_file
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.rig import Rig, mounted, read_rig
 from reconstruct.mapping.database import Observations, VerifiedPair
 from reconstruct.mapping.mapper import Mapped, map_calibrated
-from reconstruct.mapping.refraction import Convergence, refract
+from reconstruct.mapping.refraction import refract
 from reconstruct.mapping.self_calibration import SIMPLE, map_self_calibrated
 from reconstruct.mapping.working_range import (
-    WorkingDistances,
+    ANY_DISTANCE,
     find_distances,
     warn_of_warps,
     warp_record,
@@ -138,7 +145,6 @@ class _FeatureTask:
     picture: Path
     mask: Path | None
     target: Path
-    scale: float | None
     maximum: int
     thrifty: bool
 
@@ -155,9 +161,9 @@ def run_mapping(
     inputs = read_inputs(workspace)
     pycolmap.logging.minloglevel = 2  # its own account of every step is for its developers
     features, counts = _find_all(inputs, folder / "features", reconstruct, executor)
-    warps, distances = _warps(inputs, features, reconstruct, executor)
+    warps, distances = _warps(inputs, features, executor)
     cameras, exif_focal = _cameras(inputs, warps)
-    known = None if distances is None or not distances.measured else distances
+    known = None if distances is None or distances.source == ANY_DISTANCE else distances
     pairs = _match_all(inputs, features, cameras, warps, known, reconstruct, seed, executor)
     refined = refine_tracks(
         all_pixels(features),
@@ -166,22 +172,11 @@ def run_mapping(
         executor=executor,
     )
     seen = Observations(
-        images=inputs.records,
-        cameras=cameras,
-        taken=refined,
-        pairs=pairs,
-        warps=warps,
+        images=inputs.records, cameras=cameras, taken=refined, pairs=pairs, warps=warps
     )
     if inputs.rig is not None:
         poses = {name: inputs.rig.cam_from_rig[name] for name in cameras}
-        mapped = map_calibrated(
-            seen,
-            poses,
-            folder,
-            seed,
-            method=reconstruct.mapper,
-            executor=executor,
-        )
+        mapped = map_calibrated(seen, poses, folder, seed, executor=executor)
         mapped, refracted = refract(mapped, seen, folder, poses, settle=not mapped.scaled)
     else:
         mapped, refracted = map_self_calibrated(seen, exif_focal, folder, seed), None
@@ -204,9 +199,7 @@ def extract(task: _FeatureTask) -> int:
         picture = read_deep(task.picture)
         grey = normalise(picture)
         mask = None if task.mask is None else read_mask(task.mask, (grey.shape[1], grey.shape[0]))
-        found = find_features(
-            grey, mask, scale=task.scale, maximum=task.maximum, thrifty=task.thrifty
-        )
+        found = find_features(grey, mask, maximum=task.maximum, thrifty=task.thrifty)
         with atomic_path(_grey_file(task.target)) as temporary, temporary.open("wb") as file:
             np.save(file, finely(even_light(picture)))
         save_features(task.target, found)
@@ -228,7 +221,6 @@ def _find_all(
             picture=inputs.images / record.image,
             mask=inputs.images / record.mask if record.mask else None,
             target=target,
-            scale=settings.feature_scale,
             maximum=settings.max_features,
             thrifty=inputs.rig is not None,
         )
@@ -243,19 +235,12 @@ def _find_all(
 
 
 def _warps(
-    inputs: Inputs, features: Sequence[Path], settings: ReconstructConfig, executor: Executor
-) -> tuple[dict[str, PinholeWarp], WorkingDistances | None]:
+    inputs: Inputs, features: Sequence[Path], executor: Executor
+) -> tuple[dict[str, PinholeWarp], RangeRecord | None]:
     """The pinholes that stand in for calibrated cameras; none without a rig."""
     if inputs.rig is None:
         return {}, None
-    distances = find_distances(
-        inputs.records,
-        features,
-        inputs.rig,
-        given_m=settings.working_range_m,
-        ratio=RATIO,
-        executor=executor,
-    )
+    distances = find_distances(inputs.records, features, inputs.rig, ratio=RATIO, executor=executor)
     warps = {
         name: best_warp(inputs.rig.cameras[name], distances.near_m, distances.far_m)
         for name in _camera_names(inputs)
@@ -313,7 +298,7 @@ def _match_all(
     features: Sequence[Path],
     cameras: Mapping[str, pycolmap.Camera],
     warps: Mapping[str, PinholeWarp],
-    distances: WorkingDistances | None,
+    distances: RangeRecord | None,
     settings: ReconstructConfig,
     seed: int,
     executor: Executor,
@@ -375,43 +360,35 @@ def _write(
     partial: Path,
     inputs: Inputs,
     mapped: Mapped,
-    distances: WorkingDistances | None,
-    refracted: Convergence | None,
+    distances: RangeRecord | None,
+    refracted: RefractionRecord | None,
 ) -> None:
     model = mapped.model
     registered = {image.name for image in model.images.values() if image.has_pose}
     (partial / "model").mkdir(exist_ok=True)
     model.write_binary(partial / "model")
-    CamerasRecord.save(
-        partial / "cameras.json",
-        {
-            "cameras": {name: warp.to_json() for name, warp in mapped.warps.items()},
-            "images": {
-                r.image: {"camera": r.camera, "station": r.station, "mask": r.mask}
-                for r in inputs.records
-                if r.image in registered
-            },
+    CamerasRecord(
+        cameras={name: warp.to_json() for name, warp in mapped.warps.items()},
+        images={
+            r.image: PictureCamera(camera=r.camera, station=r.station, mask=r.mask)
+            for r in inputs.records
+            if r.image in registered
         },
-    )
+    ).write(partial / "cameras.json")
     content = b"".join(p.read_bytes() for p in sorted((partial / "model").iterdir()))
-    MappingRecord.save(
-        partial / "mapping.json",
-        {
-            "registered": len(registered),
-            "total": len(inputs.records),
-            "models": list(mapped.models),
-            "scaled": mapped.scaled,
-            "baseline": mapped.baseline if np.isfinite(mapped.baseline) else None,
-            "rig_factor": mapped.rig_factor,
-            "distances": None if distances is None else vars(distances),
-            "refraction": None if refracted is None else vars(refracted),
-            "warps": {
-                name: warp_record(warp, distances).to_json() for name, warp in mapped.warps.items()
-            },
-            "gauge": hashlib.blake2b(content, digest_size=16).hexdigest(),
-            "notes": list(mapped.notes),
-        },
-    )
+    MappingRecord(
+        registered=len(registered),
+        total=len(inputs.records),
+        models=mapped.models,
+        scaled=mapped.scaled,
+        baseline=mapped.baseline if np.isfinite(mapped.baseline) else None,
+        rig_factor=mapped.rig_factor,
+        distances=distances,
+        refraction=refracted,
+        warps={name: warp_record(warp, distances) for name, warp in mapped.warps.items()},
+        gauge=hashlib.blake2b(content, digest_size=16).hexdigest(),
+        notes=mapped.notes,
+    ).write(partial / "mapping.json")
 
 
 def read_inputs(workspace: Path) -> Inputs:

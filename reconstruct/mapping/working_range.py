@@ -12,7 +12,7 @@ from alice_survey.core.errors import ReconstructionError, warn
 from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Array
 from alice_survey.core.manifest import ImageRecord
-from alice_survey.core.records import WarpRecord
+from alice_survey.core.records import RangeRecord, WarpRecord
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.camera import Camera
 from camera_calib.rig import Rig
@@ -28,26 +28,12 @@ _MAX_GAP_PX = 2.0
 """Rays of a match pass each other by at most this many pixels."""
 _NEAR, _FAR = 0.75, 1.5
 """Nearest and farthest distances over the working range, when only the range is known."""
-_ANY = "no refraction"
+ANY_DISTANCE = "no refraction"
 """Source of distances where any would do."""
 _MAX_CONTRACTION = 0.5
 """At which warped pictures are stretched by half, or twice as dense; at 1 they fold."""
 _MAX_CUT = 0.05
 """Share of a frame whose loss is worth a warning."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class WorkingDistances:
-    """Distances of the sea floor from the entrance pupils along the axes."""
-
-    near_m: float
-    far_m: float
-    source: str
-
-    @property
-    def measured(self) -> bool:
-        """Whether they are those of this survey, and not any."""
-        return self.source != _ANY
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,36 +50,30 @@ def find_distances(
     features: Sequence[Path],
     rig: Rig,
     *,
-    given_m: float | None,
     ratio: float,
     executor: Executor,
-) -> WorkingDistances:
-    """Distances from the setting, else from stereo matches, else from the altitudes measured.
+) -> RangeRecord:
+    """Distances of the sea floor from stereo matches, else from the altitudes measured.
 
     Args:
         records: pictures.
         features: file of features of every picture.
         rig: calibrated cameras.
-        given_m: working range set by the user.
         ratio: for matching.
         executor: where tasks run.
 
     Raises:
-        ReconstructionError: none of the three is there, and a camera refracts.
+        ReconstructionError: neither is there, and a camera refracts.
     """
     if not any(camera.refracts for camera in rig.cameras.values()):
-        return WorkingDistances(near_m=_NEAR, far_m=_FAR, source=_ANY)
-    if given_m is not None:
-        return WorkingDistances(
-            near_m=_NEAR * given_m, far_m=_FAR * given_m, source="working_range_m"
-        )
+        return RangeRecord(near_m=_NEAR, far_m=_FAR, source=ANY_DISTANCE)
     tasks = _stereo_tasks(records, features, rig, ratio)
     depths = np.concatenate([np.zeros(0), *executor.map(
         stereo_depths, tasks, label="working range"
     )])  # fmt: skip
     if len(depths) >= _MIN_POINTS:
         near, far = np.percentile(depths, [2.0, 98.0])
-        return WorkingDistances(near_m=float(near), far_m=float(far), source="stereo")
+        return RangeRecord(near_m=float(near), far_m=float(far), source="stereo")
     altitudes = np.array([r.altitude_m for r in records])
     if np.isfinite(altitudes).any():
         reference = rig.cameras[rig.reference]
@@ -101,14 +81,14 @@ def find_distances(
         middle = float(np.nanmedian(altitudes)) + glass
         if tasks:
             warn(f"{len(depths)} points in stereo matches: the altitude sets the working range")
-        return WorkingDistances(near_m=_NEAR * middle, far_m=_FAR * middle, source="altitude")
+        return RangeRecord(near_m=_NEAR * middle, far_m=_FAR * middle, source="altitude")
     raise ReconstructionError(
         f"the distance to the sea floor is not known ({len(depths)} points in stereo matches, no "
-        "altitude): set working_range_m under [reconstruct] in survey.toml"
+        "altitude): import the pictures with a navigation log that has the altitude"
     )
 
 
-def warp_record(warp: PinholeWarp, distances: WorkingDistances | None) -> WarpRecord:
+def warp_record(warp: PinholeWarp, distances: RangeRecord | None) -> WarpRecord:
     """How well a pinhole stands in for a camera over distances; None: it has one centre."""
     contraction = np.zeros(1)
     if distances is not None:
@@ -121,7 +101,7 @@ def warp_record(warp: PinholeWarp, distances: WorkingDistances | None) -> WarpRe
     )
 
 
-def warn_of_warps(warps: Mapping[str, PinholeWarp], distances: WorkingDistances) -> None:
+def warn_of_warps(warps: Mapping[str, PinholeWarp], distances: RangeRecord) -> None:
     """Warn, one line a camera, where a pinhole stands in badly or leaves much of the frame out."""
     for name, warp in warps.items():
         found = warp_record(warp, distances)

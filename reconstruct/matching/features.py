@@ -15,8 +15,7 @@ _CONTRAST = 0.01
 _CELLS = 16
 """Cells along the longer side over which features are spread."""
 _MAX_MPX = 1.5
-"""Largest picture in which features are looked for, unless a scale is set (see `detection_scales`).
-"""
+"""Largest picture in which features are looked for (see `detection_scales`)."""
 _PIXELS_PER_FEATURE = 100.0
 """Pixels for each feature of a picture of rich texture, with about twice as many features as are
 needed."""
@@ -41,7 +40,6 @@ def find_features(
     grey: NDArray[np.uint8],
     mask: NDArray[np.bool_] | None,
     *,
-    scale: float | None,
     maximum: int,
     thrifty: bool = False,
 ) -> Features:
@@ -52,12 +50,11 @@ def find_features(
     Args:
         grey: (H, W) normalised picture.
         mask: (H, W) where features may be, or None.
-        scale: the picture is reduced by this much first, at most 1; None: see `detection_scales`.
         maximum: how many to keep, evenly over the picture.
-        thrifty: without a scale, look where there are enough first, see `detection_scales`.
+        thrifty: look where there are enough first, see `detection_scales`.
     """
     height, width = grey.shape
-    scales = detection_scales((width, height), maximum) if scale is None else (scale,)
+    scales = detection_scales((width, height), maximum)
     if not thrifty:
         scales = scales[-1:]
     # Without the precise upscaling every keypoint lies a quarter pixel towards the origin.

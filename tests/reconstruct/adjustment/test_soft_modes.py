@@ -21,7 +21,6 @@ from reconstruct.adjustment.normal_equations import Gauge
 from reconstruct.mapping.arrays import cross_matrices, frames_of
 from reconstruct.mapping.bundle import cauchy_weights
 from reconstruct.mapping.refraction import adjust_freely, refract
-from reconstruct.mapping.working_range import WorkingDistances
 from reconstruct.placing.alignment import align_rigid, align_similarity, level
 from reconstruct.placing.fit import fit_navigation
 from reconstruct.placing.navigation import PLACE, body_from_pinhole
@@ -154,8 +153,7 @@ def mute(scene: Scene) -> Scene:
 def flown(scene: Scene, folder: Path) -> Adjusted:
     seen, warps = warped_scene(scene)
     start = near_truth(scene, seen, warps, np.random.default_rng(1))
-    distances = WorkingDistances(near_m=1.75, far_m=2.35, source="test")
-    return adjusted(start, seen, scene.rig, distances, DATUM, folder)
+    return adjusted(start, seen, scene.rig, DISTANCES, DATUM, folder)
 
 
 def rms_and_scale(found: Adjusted, scene: Scene) -> tuple[float, float]:

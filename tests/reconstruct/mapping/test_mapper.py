@@ -14,7 +14,6 @@ from camera_calib.approximation.pinhole_warp import best_warp
 from reconstruct.mapping.database import Observations, write_database
 from reconstruct.mapping.mapper import (
     Mapped,
-    Method,
     _options,
     collapsed_frames,
     map_calibrated,
@@ -44,14 +43,14 @@ def seen_by_pinholes(scene: Scene) -> Observations:
     )
 
 
-def mapped_scene(scene: Scene, rig_scale: float = 1.0, method: Method = "auto") -> Mapped:
+def mapped_scene(scene: Scene, rig_scale: float = 1.0) -> Mapped:
     seen = seen_by_pinholes(scene)
     poses = {
         name: RigidTransform.from_components(rig_scale * pose.translation, pose.rotation)
         for name, pose in scene.rig.cam_from_rig.items()
     }
     with TemporaryDirectory() as folder:
-        return map_calibrated(seen, poses, Path(folder), 1, method=method)
+        return map_calibrated(seen, poses, Path(folder), 1)
 
 
 def pupils(mapped: Mapped, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
@@ -290,8 +289,9 @@ def test_a_station_that_collapsed_onto_another_is_registered_again(
         return found
 
     monkeypatch.setattr(pycolmap, "incremental_mapping", collapsing)
+    monkeypatch.setattr("reconstruct.mapping.mapper.map_globally", lambda *_: [])
     scene = make_scene(lines=1, stations=7, points=5000, noise_px=0.3)
-    mapped = mapped_scene(scene, method="incremental")
+    mapped = mapped_scene(scene)
 
     assert len(begun_from) == 2
     assert begun_from[1] is not None

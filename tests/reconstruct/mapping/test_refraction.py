@@ -9,11 +9,12 @@ import pycolmap
 import pytest
 
 from alice_survey.core.frames import Array
+from alice_survey.core.records import RangeRecord, RefractionRecord
 from camera_calib.ports.dome import DomePort
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
-from reconstruct.mapping.refraction import SETTLED_PX, Convergence, adjust_freely, refract
-from reconstruct.mapping.working_range import WorkingDistances, warp_record
+from reconstruct.mapping.refraction import SETTLED_PX, adjust_freely, refract
+from reconstruct.mapping.working_range import warp_record
 from reconstruct.placing.alignment import align_rigid, align_similarity
 from reconstruct.views.range_shift import range_shift
 from tests.cameras import changed
@@ -47,7 +48,7 @@ def started(port_m: float, tilt_deg: float, noise_px: float = 0.3) -> tuple[Mapp
 
 def exact(
     scene: Scene, start: tuple[Mapped, Observations], folder: Path
-) -> tuple[Mapped, Convergence]:
+) -> tuple[Mapped, RefractionRecord]:
     return refract(start[0], start[1], folder)
 
 
@@ -97,7 +98,7 @@ def test_without_noise_nothing_is_left_of_a_dome(
     assert rigid_rms(pupils, true_pupils) < 0.01e-3
     assert found.settled
     assert found.corrected_px == pytest.approx(corrected_px, rel=0.2)
-    distances = WorkingDistances(near_m=1.75, far_m=2.35, source="test")
+    distances = RangeRecord(near_m=1.75, far_m=2.35, source="test")
     record = warp_record(warps["left"], distances)
     assert record.contraction == pytest.approx(contraction, rel=0.2)
 

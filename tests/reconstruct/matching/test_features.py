@@ -28,21 +28,18 @@ def nearest(pixels: np.ndarray, centre: np.ndarray) -> np.ndarray:
     return pixels[np.argmin(np.linalg.norm(pixels - centre, axis=1))]
 
 
-@pytest.mark.parametrize("scale", [1.0, 0.5])
-def test_keypoints_lie_on_blobs_half_pixel_included(scale: float) -> None:
+def test_keypoints_lie_on_blobs_half_pixel_included() -> None:
     centres = np.array([[50.2, 40.75], [110.5, 80.0], [100.9, 30.3]])
-    found = find_features(blobs(centres), None, scale=scale, maximum=100)
+    found = find_features(blobs(centres), None, maximum=100)
     for centre in centres:
-        np.testing.assert_allclose(nearest(found.pixels, centre), centre, atol=0.06 / scale)
+        np.testing.assert_allclose(nearest(found.pixels, centre), centre, atol=0.06)
 
 
 def test_mirrored_picture_has_mirrored_keypoints() -> None:
     rng = np.random.default_rng(3)
     picture = blobs(rng.uniform(15, 105, (8, 2)), sigma=3.0)
-    left = find_features(picture, None, scale=1.0, maximum=100).pixels
-    right = find_features(
-        np.ascontiguousarray(picture[:, ::-1]), None, scale=1.0, maximum=100
-    ).pixels
+    left = find_features(picture, None, maximum=100).pixels
+    right = find_features(np.ascontiguousarray(picture[:, ::-1]), None, maximum=100).pixels
     mirrored = np.stack([picture.shape[1] - right[:, 0], right[:, 1]], axis=1)
     offset = np.array([nearest(mirrored, p) - p for p in left])
     offset = offset[np.linalg.norm(offset, axis=1) < 1]
@@ -57,8 +54,8 @@ def test_features_keep_away_from_the_border_of_a_mask() -> None:
     centres = np.array([[40.0, 60.0], [40.0 + 2 * sigma, 20.0]])
     mask = np.ones((120, 160), bool)
     mask[:, 52:] = False
-    found = find_features(blobs(centres, sigma=sigma), mask, scale=1.0, maximum=100)
-    whole = find_features(blobs(centres, sigma=sigma), None, scale=1.0, maximum=100)
+    found = find_features(blobs(centres, sigma=sigma), mask, maximum=100)
+    whole = find_features(blobs(centres, sigma=sigma), None, maximum=100)
     assert np.linalg.norm(nearest(whole.pixels, centres[1]) - centres[1]) < 0.1
     assert np.linalg.norm(nearest(found.pixels, centres[0]) - centres[0]) > 0.1 or len(found.pixels)
     reach = 52.0 - found.pixels[:, 0]
@@ -85,14 +82,12 @@ def test_pictures_are_reduced_to_what_the_wanted_features_need(
 def test_a_picture_with_little_to_show_is_searched_at_full_scale() -> None:
     rng = np.random.default_rng(1)
     few = blobs(rng.uniform(20, 380, (40, 2)), (400, 400), sigma=1.2)
-    small = find_features(few, None, scale=0.3, maximum=900)
-    found = find_features(few, None, scale=None, maximum=900, thrifty=True)
-    whole = find_features(few, None, scale=1.0, maximum=900)
-    assert len(small.pixels) < len(found.pixels)
+    found = find_features(few, None, maximum=900, thrifty=True)
+    whole = find_features(few, None, maximum=900)
     np.testing.assert_array_equal(found.pixels, whole.pixels)
     rich = blobs(rng.uniform(0, 400, (900, 2)), (400, 400), sigma=2.5)
-    plain = find_features(rich, None, scale=None, maximum=100)
-    quick = find_features(rich, None, scale=None, maximum=100, thrifty=True)
+    plain = find_features(rich, None, maximum=100)
+    quick = find_features(rich, None, maximum=100, thrifty=True)
     assert len(plain.pixels) == len(quick.pixels) == 100
     assert not np.array_equal(plain.pixels, quick.pixels)
 
@@ -117,7 +112,7 @@ def test_root_sift_has_norm_512() -> None:
 
 
 def test_features_survive_a_file(tmp_path: Path) -> None:
-    found = find_features(blobs(np.array([[60.0, 60.0]])), None, scale=1.0, maximum=10)
+    found = find_features(blobs(np.array([[60.0, 60.0]])), None, maximum=10)
     save_features(tmp_path / "f.npz", found)
     again = load_features(tmp_path / "f.npz")
     for name in ("pixels", "scale_px", "descriptors"):

@@ -116,7 +116,7 @@ def taken(folder: Path, pictures: list[np.ndarray], turns: list[int]) -> list[Ta
     found = []
     for i, (picture, turn) in enumerate(zip(pictures, turns, strict=True)):
         cv2.imwrite(str(folder / f"{i}.png"), picture)
-        found_sift = find_features(normalise(picture), None, scale=None, maximum=3000)
+        found_sift = find_features(normalise(picture), None, maximum=3000)
         save_features(folder / f"{i}.npz", found_sift)
         found.append(
             Taken(
