@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +15,7 @@ from alice_survey.core.executor import progress
 from alice_survey.core.frames import Array
 from missions.logs.bag_reader import opened_bag
 from reconstruct.pictures.files import safe_name
-from reconstruct.pictures.pairing import moments_of
+from reconstruct.pictures.pairing import PairedPictures, moments_of
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -39,19 +38,9 @@ _YUV = {"yuv422": cv2.COLOR_YUV2BGR_UYVY, "uyvy": cv2.COLOR_YUV2BGR_UYVY,
         "yuv422_yuy2": cv2.COLOR_YUV2BGR_YUY2, "yuyv": cv2.COLOR_YUV2BGR_YUY2}  # fmt: skip
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class BagPictures:
-    """Pictures of a bag as files, grouped by moment."""
-
-    stations: tuple[Mapping[str, Path], ...]
-    """File of each camera, by moment."""
-    time_s: Mapping[Path, float]
-    """When each was taken, on the bag's clock."""
-
-
 def take_bag(
     bag: Path, topics: Mapping[str, str], mono: str, folder: Path, every_s: float | None
-) -> BagPictures:
+) -> PairedPictures:
     """Write the pictures of a bag to files, as they are or as PNG.
 
     Args:
@@ -90,7 +79,7 @@ def take_bag(
         {c: files[c, times[c][i]] for c, i in moment.items() if (c, times[c][i]) in files}
         for moment in kept
     ]
-    return BagPictures(
+    return PairedPictures(
         stations=tuple(station for station in stations if station),
         time_s={path: 1e-9 * time_ns for (_, time_ns), path in files.items()},
     )

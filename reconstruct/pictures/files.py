@@ -98,6 +98,11 @@ class PictureFacts:
     altitude_m: float | None = None
     fault: str = ""
 
+    @property
+    def key(self) -> tuple[str, int, int]:
+        """What tells the pictures of one camera from those of another: device, width, height."""
+        return self.device, self.width_px, self.height_px
+
 
 @dataclass(frozen=True, kw_only=True)
 class PictureFolder:

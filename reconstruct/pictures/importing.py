@@ -1,30 +1,33 @@
 """Real pictures into a workspace: checked, named, timed and placed; the stage `images/`.
 
-Before an import, `preview_import` says what it would find from headers alone, of all pictures or of
-some spread evenly, so that folders of any size take seconds. What only decoding shows, such as
-damaged files, the import finds.
+What folders, videos and logs hold is scanned once, before a picture is decoded (`scan_sources`).
+`preview_import` counts it from headers alone, of all pictures or of some spread evenly, so that
+folders of any size take seconds; the import goes on from it, and finds what only decoding shows,
+such as damaged files.
 """
 
 import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime, timedelta
+from datetime import datetime, timedelta, tzinfo
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import ClassVar
 
 import numpy as np
+from pydantic import Field
 
 from alice_survey.core.artefacts import JsonRecord, Stage, run_stage
 from alice_survey.core.errors import ImageError, WorkspaceError, heard, warn
 from alice_survey.core.executor import SERIAL, Executor
-from alice_survey.core.manifest import ImageRecord, read_manifest, write_manifest
-from alice_survey.core.records import PicturesRecord
+from alice_survey.core.manifest import read_manifest, write_manifest
+from alice_survey.core.records import PicturesRecord, PlaceRecord
 from camera_calib.freedom import part_of_rig
 from camera_calib.rig import Rig, read_rig, write_rig
 from missions.logs.navigation_csv import NavigationLog, find_zone, read_navigation
-from reconstruct.pictures.bag_pictures import BagPictures, take_bag
+from reconstruct.pictures.bag_pictures import take_bag
 from reconstruct.pictures.files import (
     ADVICE,
     VIDEO,
@@ -41,32 +44,29 @@ from reconstruct.pictures.incoming import (
     MIRRORED,
     UNDECODABLE,
     Incoming,
-    at_time,
-    by_camera,
-    camera_key,
+    camera_names,
     check_entries,
-    checked_level,
+    check_rig,
     copy_all,
     find_entries,
+    level_of_log,
     mask_of,
-    named_apart,
-    placed,
+    place_records,
     readings_of,
     record_of,
+    unique_names,
+    with_time,
 )
-from reconstruct.pictures.pairing import PairedPictures, pair_by_time
+from reconstruct.pictures.pairing import pair_by_time
 from reconstruct.pictures.videos import (
     DEFAULT_OVERLAP,
-    MAX_OVERLAP,
-    MIN_OVERLAP,
-    FrameSettings,
     Recording,
     find_videos,
     read_recordings,
     take_frames,
 )
 
-_WHY = {
+_ADVICE = {
     UNDECODABLE: "copy them from the camera again",
     MIRRORED: "save them as they are seen, without an EXIF orientation",
     COPIES: "each file counts once",
@@ -80,8 +80,10 @@ class CameraRow(JsonRecord):
     """A camera that took pictures."""
 
     pictures: int
+    """Their number; of a preview, scaled from the headers where several share folders."""
     width_px: int
     height_px: int
+    """0 where only decoding can tell."""
     device: str = ""
 
     def __str__(self) -> str:
@@ -108,15 +110,23 @@ class RecordingRow(JsonRecord):
 
 
 class ImportRecord(JsonRecord):
-    """`images/imported.json`: cameras, kinds of files and recordings, and what was left out."""
+    """`images/imported.json`: what a workspace got, and what was left out."""
 
     path: ClassVar = "images/imported.json"
     cameras: dict[str, CameraRow]
     kinds: dict[str, int]
+    """Pictures by kind of file."""
     recordings: dict[str, RecordingRow]
     left_out: dict[str, tuple[str, ...]]
-    """Names by reason, of files that were looked into."""
+    """Names by reason, of what folders hold and is not imported."""
+    positions: int = 0
+    """Number of pictures with a known position."""
+    readings: dict[str, int] = Field(default_factory=dict)
+    """Pictures by what navigation measured of them."""
+    changed: bool = Field(False, exclude=True)
+    """False when all was there already."""
 
+    @property
     def lines(self) -> list[str]:
         """A line for each camera that was recognised, each recording, and each reason."""
         rows = self.cameras.values()
@@ -126,34 +136,14 @@ class ImportRecord(JsonRecord):
             *(f"{name}: {row}" for name, row in self.cameras.items() if known),
             *(f"{name}: {row}" for name, row in self.recordings.items()),
             *(
-                f"left out: {len(names)} {reason} ({list_names(names, _NAMED)}); {_WHY[reason]}"
+                f"left out: {len(names)} {reason} ({list_names(names, _NAMED)}); {_ADVICE[reason]}"
                 for reason, names in self.left_out.items()
             ),
         ]
 
-
-@dataclass(frozen=True, kw_only=True)
-class ImportedPictures:
-    """What a workspace got, and what was left out."""
-
-    changed: bool
-    """False when all was there already."""
-    cameras: Mapping[str, int]
-    """Pictures by camera."""
-    kinds: Mapping[str, int]
-    """Pictures by kind of file."""
-    positions: int
-    """Number of pictures with a known position."""
-    readings: Mapping[str, int]
-    """Pictures by what navigation measured of them."""
-    left_out: Mapping[str, int]
-    """Files that were not imported, by reason."""
-    lines: Sequence[str] = ()
-    """A line for each camera, recording and reason."""
-
     def __str__(self) -> str:
         """A line such as `68 pictures (68 PNG) of left and right, 0 with a position`; the lines."""
-        total = sum(self.cameras.values())
+        total = sum(row.pictures for row in self.cameras.values())
         *others, last = self.cameras
         of = f" of {', '.join(others)} and {last}" if others else ""
         kinds = ", ".join(f"{count} {what}" for what, count in self.kinds.items())
@@ -163,101 +153,102 @@ class ImportedPictures:
         return "\n".join([text, *self.lines])
 
 
-def import_record(
-    entries: Sequence[Incoming],
-    order: Sequence[str],
-    recordings: Sequence[Recording],
-    left_out: Mapping[str, Sequence[str]],
-) -> ImportRecord:
-    """Count what came in.
+@dataclass(frozen=True, kw_only=True)
+class ImportScan:
+    """What folders, videos and a log hold, before any picture is decoded."""
 
-    Args:
-        entries: pictures that were imported.
-        order: names of cameras, first ones first.
-        recordings: whose frames they are, if they are.
-        left_out: names of pictures that were not imported, by reason.
+    folders: Mapping[str, Sequence[PictureFolder]]
+    """By camera; folders without a name are those of `mono`."""
+    videos: Sequence[Path]
+    navigation: Path | None
+    rig: Rig | None
+    mono: str
+    """Name of the camera of folders, videos and topics without one."""
+    zone: tzinfo
+    """Of dates that name none."""
+    unnamed: bool
+    """Whether the folders are of cameras that only their pictures tell apart."""
+
+    @property
+    def every_folder(self) -> list[PictureFolder]:
+        """All folders."""
+        return [folder for own in self.folders.values() for folder in own]
+
+    @property
+    def pictures(self) -> dict[str, list[Path]]:
+        """Pictures by camera."""
+        return {name: [p for f in own for p in f.pictures] for name, own in self.folders.items()}
+
+    @cached_property
+    def recordings(self) -> list[Recording]:
+        """Recordings of the videos."""
+        return read_recordings(self.videos, self.zone) if self.videos else []
+
+    @cached_property
+    def log(self) -> NavigationLog | None:
+        """The navigation log."""
+        if self.navigation is None:
+            return None
+        return read_navigation(self.navigation, self.zone, ())
+
+
+def scan_sources(
+    folders: Sequence[Path],
+    cameras: Mapping[str, Path],
+    videos: Sequence[Path],
+    *,
+    bag: Path | None = None,
+    recursive: bool = False,
+    navigation: Path | None = None,
+    time_zone: str = "UTC",
+    rig: Path | None = None,
+    apart: Sequence[Path] = (),
+) -> ImportScan:
+    """List what an import would take; arguments as of `import_images`, `apart` as of `look_into`.
+
+    Raises:
+        ImageError: not one kind of source is given, one is given twice or holds nothing.
+        NavigationError: the time zone is not known.
+        CalibrationError: the rig cannot be read.
     """
-    counts = Counter(entry.camera for entry in entries)
-    some = {entry.camera: entry.facts for entry in entries}
-    frames = Counter(entry.recording for entry in entries)
-    kinds = Counter(FRAMES if e.recording else kind_of(e.source) for e in entries)
-    rows: dict[str, RecordingRow] = {}
-    for recording in recordings:
-        last = recording.files[-1]
-        rows[recording.name] = RecordingRow(
-            files=tuple(file.path.name for file in recording.files),
-            frames=frames[recording.name],
-            duration_s=last.start_s + last.duration_s,
-            start=None if recording.start is None else recording.start.isoformat(" ", "seconds"),
-            clock=recording.clock,
+    if sum([bool(folders), bool(cameras), bool(videos), bag is not None]) != 1:
+        raise ImageError(
+            "give folders of pictures, or --left and --right, or --camera for each camera, or "
+            "--video, or --bag: one of them"
         )
-    return ImportRecord(
-        cameras={
-            name: CameraRow(
-                pictures=counts[name], width_px=some[name].width_px,
-                height_px=some[name].height_px, device=some[name].device,
-            )
-            for name in dict.fromkeys([*order, *sorted(counts)])
-            if counts[name]
+    every = [*folders, *cameras.values()]
+    places = [folder.resolve() for folder in every]
+    twice = [folder for folder in every if places.count(folder.resolve()) > 1]
+    if twice:
+        raise ImageError(f"{twice[0]} is given twice")
+    known_rig = None if rig is None else read_rig(rig)
+    mono = "camera" if known_rig is None else known_rig.reference
+    named = {name: [path] for name, path in cameras.items()} or ({mono: folders} if folders else {})
+    return ImportScan(
+        folders={
+            name: [look_into(path, [*every, *apart], recursive=recursive) for path in paths]
+            for name, paths in named.items()
         },
-        kinds=dict(kinds),
-        recordings=rows,
-        left_out={reason: tuple(names) for reason, names in left_out.items()},
-    )  # fmt: skip
-
-
-def with_folders(record: ImportRecord, folders: Sequence[PictureFolder]) -> ImportRecord:
-    """The record with what the folders hold now that is not imported."""
-    found: dict[str, list[str]] = {reason: list(names) for reason, names in record.left_out.items()}
-    for folder in folders:
-        for reason, paths in folder.left_out.items():
-            names = [str(path.relative_to(folder.folder)) for path in paths]
-            found.setdefault(reason, []).extend(names)
-    left_out = {reason: tuple(names) for reason, names in found.items()}
-    return record.model_copy(update={"left_out": left_out})
-
-
-def summary(
-    workspace: Path, records: Sequence[ImageRecord], folders: Sequence[PictureFolder], *,
-    changed: bool,
-) -> ImportedPictures:  # fmt: skip
-    """Counts of a finished import."""
-    record = with_folders(ImportRecord.read(workspace / ImportRecord.path), folders)
-    return ImportedPictures(
-        changed=changed,
-        cameras={name: row.pictures for name, row in record.cameras.items()},
-        kinds=record.kinds,
-        positions=sum(one.has_position for one in records),
-        readings=readings_of(records),
-        left_out={reason: len(names) for reason, names in record.left_out.items()},
-        lines=record.lines(),
+        videos=find_videos(videos),
+        navigation=navigation,
+        rig=known_rig,
+        mono=mono,
+        zone=find_zone(time_zone),
+        unnamed=bool(folders) and known_rig is None,
     )
 
 
 _MAX_HEADERS = 300
 _MAX_CAMERAS = 8
-_ALIKE = 0.02
+_DROPPED_SHARE = 0.02
 """Folders of a rig's cameras hold equally many pictures, but for this share that one dropped."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PreviewedCamera:
-    """A camera whose pictures were found."""
-
-    name: str
-    pictures: int
-    """Their number; of headers that were looked at, scaled, where several cameras share folders."""
-    width_px: int
-    height_px: int
-    """0 where only decoding can tell."""
-    device: str
 
 
 @dataclass(frozen=True, kw_only=True)
 class Preview:
     """What an import would find."""
 
-    cameras: tuple[PreviewedCamera, ...]
+    cameras: Mapping[str, CameraRow]
     pictures: int
     looked_at: int
     """How many headers were read."""
@@ -270,9 +261,8 @@ class Preview:
     first_utc: str | None
     last_utc: str | None
     """Times of the first and the last picture that states one, ISO 8601."""
-    timed: int
-    """Of those looked at."""
     with_gps: int
+    """Of those looked at."""
     navigation: str
     """What a navigation log holds and how many of the times fall into it; empty without one."""
     warnings: tuple[str, ...]
@@ -295,55 +285,51 @@ def preview_import(
         AliceError: the import would be refused: a folder without pictures, a log that cannot be
             read, a rig of other cameras.
     """
-    zone = find_zone(time_zone)
-    cameras = cameras or {}
-    if not (folders or cameras or videos):
-        raise ImageError("no folder is given: choose the one that holds the pictures")
     with heard() as warnings:
-        known_rig = None if rig is None else read_rig(rig)
-        log = None if navigation is None else read_navigation(navigation, zone, ())
-        apart = [*folders, *cameras.values()]
-        rigged = {
-            name: look_into(path, apart, recursive=recursive) for name, path in cameras.items()
-        }
-        unnamed = [look_into(path, apart, recursive=recursive) for path in folders]
-        recordings = read_recordings(find_videos(videos), zone) if videos else []
-    every = [*rigged.values(), *unnamed]
-    warnings += [line for each in every for line in each.warnings()]
-    rows, facts = [], list[PictureFacts]()
-    mono = "camera" if known_rig is None else known_rig.reference
-    sides = {name: folder.pictures for name, folder in rigged.items()}
-    if unnamed:
-        sides[mono] = tuple(path for folder in unnamed for path in folder.pictures)
-    for name, paths in sides.items():
-        seen = _headers(paths)
+        scan = scan_sources(
+            folders, cameras or {}, videos, recursive=recursive, navigation=navigation,
+            time_zone=time_zone, rig=rig,
+        )  # fmt: skip
+        log, recordings = scan.log, scan.recordings
+    warnings += [line for folder in scan.every_folder for line in folder.warnings()]
+    rows, facts = dict[str, CameraRow](), list[PictureFacts]()
+    for name, paths in scan.pictures.items():
+        # Some headers, evenly spread, with the first and the last.
+        chosen = np.unique(np.linspace(0, len(paths) - 1, min(len(paths), _MAX_HEADERS)).round())
+        seen = [read_header(paths[int(i)]) for i in chosen]
         facts += seen
-        rows += _rows(seen, len(paths), name, apart=bool(unnamed) and known_rig is None)
-    _check_rig(rows, known_rig)
-    warnings += _unreadable(facts)
-    times = sorted(to_utc(one.time_local, zone) for one in facts if one.time_local is not None)
-    lasting = {r.name: r.files[-1].start_s + r.files[-1].duration_s for r in recordings}
-    spans = list(times)
-    for recording in recordings:
-        if recording.start is not None:
-            start = to_utc(recording.start, zone)
-            spans += [start, start + timedelta(seconds=lasting[recording.name])]
-    pictures = [path for paths in sides.values() for path in paths]
+        names = camera_names([one for one in seen if not one.fault], name)
+        names = names if scan.unnamed else names[:1]
+        total = sum(count for _, _, count in names)
+        for camera, (device, width, height), count in names:
+            rows[camera] = CameraRow(
+                pictures=round(len(paths) * count / total), width_px=width, height_px=height,
+                device=device,
+            )  # fmt: skip
+    if scan.rig is not None:
+        check_rig({name: (row.width_px, row.height_px) for name, row in rows.items()}, scan.rig)
+    faulty = [one.path.name for one in facts if one.fault]
+    if faulty:
+        names_of = list_names(faulty, _NAMED)
+        warnings.append(f"{len(faulty)} of {len(facts)} headers cannot be read: {names_of}")
+    times = [to_utc(one.time_local, scan.zone) for one in facts if one.time_local is not None]
+    began = [(to_utc(r.start, scan.zone), r.duration_s) for r in recordings if r.start is not None]
+    spans = [*times, *(t for t, _ in began), *(t + timedelta(seconds=s) for t, s in began)]
+    pictures = [path for paths in scan.pictures.values() for path in paths]
     files = [*pictures, *(file.path for r in recordings for file in r.files)]
     return Preview(
-        cameras=tuple(rows),
+        cameras=rows,
         pictures=len(pictures),
         looked_at=len(facts),
         kinds=dict(Counter(kind_of(path) for path in pictures)),
         size_mb=sum(path.stat().st_size for path in files) / 1e6,
-        masks=sum(len(folder.masks) for folder in every),
+        masks=sum(len(folder.masks) for folder in scan.every_folder),
         videos=len(recordings),
-        video_s=sum(lasting.values()),
+        video_s=sum(r.duration_s for r in recordings),
         first_utc=min(spans).isoformat(timespec="seconds") if spans else None,
         last_utc=max(spans).isoformat(timespec="seconds") if spans else None,
-        timed=len(times),
         with_gps=sum(one.latitude_deg is not None for one in facts),
-        navigation="" if log is None else _navigation(log, times, spans, clock_offset_s),
+        navigation="" if log is None else _describe_log(log, times, spans, clock_offset_s),
         warnings=tuple(warnings),
     )
 
@@ -369,62 +355,11 @@ def cameras_in(folder: Path) -> dict[str, Path]:
     if not 2 <= len(counts) <= _MAX_CAMERAS:
         return {}
     maximum, minimum = max(counts.values()), min(counts.values())
-    return {name: folder / name for name in counts} if maximum - minimum <= _ALIKE * maximum else {}
+    equal = maximum - minimum <= _DROPPED_SHARE * maximum
+    return {name: folder / name for name in counts} if equal else {}
 
 
-def _headers(paths: Sequence[Path]) -> list[PictureFacts]:
-    """Headers of pictures, or of some of them, evenly spread, with the first and the last."""
-    chosen = np.unique(np.linspace(0, len(paths) - 1, min(len(paths), _MAX_HEADERS)).round())
-    return [read_header(paths[int(i)]) for i in chosen]
-
-
-def _rows(
-    facts: Sequence[PictureFacts], pictures: int, name: str, *, apart: bool
-) -> list[PreviewedCamera]:
-    """The cameras of some pictures; told apart by device and size if that is wanted."""
-    counts = Counter(camera_key(one) for one in facts if not one.fault).most_common()
-    if not apart:
-        counts = counts[:1]
-    total = sum(count for _, count in counts)
-    return [
-        PreviewedCamera(
-            name=name if number == 1 else f"{name}-{number}",
-            pictures=round(pictures * count / total), width_px=width, height_px=height,
-            device=device,
-        )
-        for number, ((device, width, height), count) in enumerate(counts, 1)
-    ]  # fmt: skip
-
-
-def _check_rig(rows: Sequence[PreviewedCamera], rig: Rig | None) -> None:
-    """Check that a rig is of these cameras, as far as headers show it."""
-    if rig is None:
-        return
-    for row in rows:
-        if row.name not in rig.cameras:
-            raise ImageError(
-                f"the rig has no camera {row.name!r}, only {', '.join(rig.cameras)}: call the "
-                "folders as the rig does"
-            )
-        model = rig.cameras[row.name]
-        if row.width_px and (row.width_px, row.height_px) != (model.width_px, model.height_px):
-            raise ImageError(
-                f"pictures of {row.name} have {row.width_px} x {row.height_px} pixels, but those "
-                f"of the rig {model.width_px} x {model.height_px}: give the rig of these pictures, "
-                "or none"
-            )
-
-
-def _unreadable(facts: Sequence[PictureFacts]) -> list[str]:
-    faulty = [one.path.name for one in facts if one.fault]
-    if not faulty:
-        return []
-    return [
-        f"{len(faulty)} of {len(facts)} that were looked at cannot be read: {list_names(faulty, 3)}"
-    ]
-
-
-def _navigation(
+def _describe_log(
     log: NavigationLog,
     times: Sequence[datetime],
     spans: Sequence[datetime],
@@ -450,7 +385,6 @@ def _navigation(
     return f"{text}; {inside} of {len(times)} picture times fall into it" if times else text
 
 
-_MONO = "camera"
 _SCRATCH = "bag"
 """Folder for pictures of a bag until they are checked."""
 
@@ -474,7 +408,7 @@ def import_images(
     masks: Path | None = None,
     triggers: Path | None = None,
     executor: Executor = SERIAL,
-) -> ImportedPictures:
+) -> ImportRecord:
     """Write `images/` from pictures, of cameras on a rig or not, or from videos.
 
     A picture that cannot be decoded to its end, a copy of another and a mirror image are left out
@@ -521,38 +455,18 @@ def import_images(
     """
     videos = [*videos, *(f for f in folders if f.is_file() and f.suffix.lower() in VIDEO)]
     folders = [folder for folder in folders if folder not in videos]
-    _check_sources(folders, cameras, videos, bag)
-    if triggers is not None and not (folders or cameras):
-        raise ImageError("--triggers is for folders of pictures: videos and bags have times")
-    frames = _frame_settings(overlap, every_s, videos, bag)
+    _check_options(folders, cameras, videos, bag, overlap, every_s, triggers)
     if not np.isfinite(clock_offset_s):
         raise ImageError(f"--clock-offset {clock_offset_s} is not a number of seconds")
-    zone = find_zone(time_zone)
-    logged_level = checked_level(vertical_datum, navigation)
-    given = [
-        *folders,
-        *cameras.values(),
-        *videos,
-        *(p for p in (bag, navigation, rig, masks, triggers) if p is not None),
-    ]
-    for path in given:
-        if not path.exists():
-            raise ImageError(f"{path}: no such file or folder")
-    for path in given:
-        if path.resolve().is_relative_to((workspace / "images").resolve()):
-            raise WorkspaceError(f"{path} is inside {workspace / 'images'}, which is written again")
-    for simulated in (workspace / "images" / "truth", workspace / "pool" / "truth"):
-        if simulated.exists():
-            raise WorkspaceError(
-                f"{workspace} holds a simulated survey, whose rig is not that of real pictures: "
-                "choose another workspace with -w"
-            )
-    known_rig = None if rig is None else read_rig(rig)
-    mono = _MONO if known_rig is None else known_rig.reference
-    found_videos = find_videos(videos)
-    sides = _look_into(folders, cameras, mono, [*given, workspace], recursive)
-    folders_read = [each for side in sides.values() for each in side]
-    files = [file for each in folders_read for file in (*each.pictures, *each.masks)]
+    level_name = level_of_log(vertical_datum, navigation)
+    more = [path for path in (bag, navigation, rig, masks, triggers) if path is not None]
+    given = [*folders, *cameras.values(), *videos, *more]
+    _check_paths(workspace, given)
+    scan = scan_sources(
+        folders, cameras, videos, bag=bag, recursive=recursive, navigation=navigation,
+        time_zone=time_zone, rig=rig, apart=[*given, workspace],
+    )  # fmt: skip
+    frame_overlap = DEFAULT_OVERLAP if overlap is None else overlap
     stage = Stage(
         name="images",
         version=4,
@@ -561,9 +475,9 @@ def import_images(
             "stereo": bool(cameras),
             **({} if bag is None else {"topics": dict(topics)}),
             **({} if set(cameras) in (set(), {"left", "right"}) else {"cameras": list(cameras)}),
-            "every_s": frames.every_s,
-            "overlap": frames.overlap if videos else None,
-            "videos": [path.name for path in found_videos],
+            "every_s": every_s,
+            "overlap": frame_overlap if videos else None,
+            "videos": [path.name for path in scan.videos],
             "recursive": recursive,
             "navigation": navigation is not None,
             "clock_offset_s": clock_offset_s,
@@ -574,124 +488,147 @@ def import_images(
             **({} if triggers is None else {"triggers": True}),
         },
         inputs=[
-            *files,
-            *found_videos,
-            *(path for path in (bag, navigation, rig, masks, triggers) if path is not None),
+            *(file for each in scan.every_folder for file in (*each.pictures, *each.masks)),
+            *scan.videos,
+            *more,
         ],
     )
 
     def work(partial: Path) -> None:
         notes: list[str] = []
-        log = None if navigation is None else read_navigation(navigation, zone, ())
-        recordings: list[Recording] = []
         left_out: dict[str, list[str]] = {}
-        if found_videos:
-            recordings = read_recordings(found_videos, zone)
-            names = [mono] * len(recordings) if known_rig else _cameras_of(recordings, mono)
-            entries = take_frames(recordings, names, frames, partial)
+        if scan.videos:
+            one_camera = [scan.mono] * len(scan.recordings)
+            names = one_camera if scan.rig else _cameras_by_size(scan.recordings, scan.mono)
+            entries = take_frames(scan.recordings, names, partial, frame_overlap, every_s)
         else:
-            for each in folders_read:
+            for each in scan.every_folder:
                 for line in each.warnings():
                     warn(line)
-            found: BagPictures | PairedPictures
             if bag is None:
-                paths = {name: [p for f in own for p in f.pictures] for name, own in sides.items()}
-                found = pair_by_time(paths, triggers, zone)
+                found = pair_by_time(scan.pictures, triggers, scan.zone)
             else:
-                found = take_bag(bag, topics, mono, partial / _SCRATCH, every_s)
+                found = take_bag(bag, topics, scan.mono, partial / _SCRATCH, every_s)
             entries, left_out = find_entries(found.stations, executor)
-            entries = [
-                at_time(entry, found.time_s[entry.source]) if found.time_s else entry
-                for entry in entries
-            ]
-            if folders and known_rig is None:
-                entries = by_camera(entries, mono)
-        check_entries(entries, known_rig)
-        entries = named_apart(entries)
+            if found.time_s:
+                entries = [with_time(entry, found.time_s[entry.source]) for entry in entries]
+            if scan.unnamed:
+                by_key = {
+                    key: name
+                    for name, key, _ in camera_names([e.facts for e in entries], scan.mono)
+                }
+                entries = [replace(entry, camera=by_key[entry.facts.key]) for entry in entries]
+        check_entries(entries, scan.rig)
+        entries = unique_names(entries)
         entries = [replace(e, mask=mask_of(e, masks, bool(cameras))) for e in entries]
-        if not found_videos:
+        if not scan.videos:
             notes += copy_all(entries, partial, executor)
             shutil.rmtree(partial / _SCRATCH, ignore_errors=True)
         records = [record_of(entry, partial) for entry in entries]
-        records, datum, level = placed(
-            entries, records, log, logged_level, clock_offset_s, zone, notes
+        records, datum, level = place_records(
+            entries, records, scan.log, level_name, clock_offset_s, scan.zone, notes
         )
-        records = sorted(records, key=lambda r: (r.station, r.camera))
-        write_manifest(partial / "manifest.csv", records)
-        if known_rig is not None:
+        write_manifest(
+            partial / "manifest.csv", sorted(records, key=lambda r: (r.station, r.camera))
+        )
+        if scan.rig is not None:
             taken = {entry.camera for entry in entries}
-            names = [name for name in known_rig.cameras if name in taken]
-            write_rig(partial / "rig.json", part_of_rig(known_rig, names))
-        record = import_record(entries, list(sides), recordings, left_out)
+            names = [name for name in scan.rig.cameras if name in taken]
+            write_rig(partial / "rig.json", part_of_rig(scan.rig, names))
+        record = _import_record(entries, scan, left_out)
         record.write(partial / Path(ImportRecord.path).name)
-        notes += with_folders(record, folders_read).lines()
-        PicturesRecord.save(
-            partial / "survey.json",
-            {"source": "imported", "datum": datum, "vertical_datum": level, "notes": notes},
-        )
+        PicturesRecord(
+            source="imported",
+            datum=None if datum is None else PlaceRecord(**datum),
+            vertical_datum=level,
+            notes=(*notes, *record.lines),
+        ).write(partial / "survey.json")
 
     changed = run_stage(workspace, stage, work)
     records = read_manifest(workspace / "images" / "manifest.csv")
-    return summary(workspace, records, folders_read, changed=changed)
-
-
-def _look_into(
-    folders: Sequence[Path],
-    cameras: Mapping[str, Path],
-    mono: str,
-    apart: Sequence[Path],
-    recursive: bool,
-) -> dict[str, list[PictureFolder]]:
-    """Contents of the folders of each camera; `mono` names the one camera of unnamed folders."""
-    if cameras:
-        return {
-            name: [look_into(folder, apart, recursive=recursive)]
-            for name, folder in cameras.items()
+    return ImportRecord.read(workspace / ImportRecord.path).model_copy(
+        update={
+            "changed": changed,
+            "positions": sum(one.has_position for one in records),
+            "readings": dict(readings_of(records)),
         }
-    if not folders:
-        return {}
-    return {mono: [look_into(folder, apart, recursive=recursive) for folder in folders]}
+    )
 
 
-def _cameras_of(recordings: Sequence[Recording], mono: str) -> list[str]:
+def _import_record(
+    entries: Sequence[Incoming], scan: ImportScan, left_out: Mapping[str, Sequence[str]]
+) -> ImportRecord:
+    """Count what came in, and what did not: by decoding, then by folders."""
+    counts = Counter(entry.camera for entry in entries)
+    some = {entry.camera: entry.facts for entry in entries}
+    frames = Counter(entry.recording for entry in entries)
+    lost = {reason: list(names) for reason, names in left_out.items()}
+    for folder in scan.every_folder:
+        for reason, paths in folder.left_out.items():
+            lost.setdefault(reason, []).extend(str(p.relative_to(folder.folder)) for p in paths)
+    return ImportRecord(
+        cameras={
+            name: CameraRow(
+                pictures=counts[name], width_px=some[name].width_px,
+                height_px=some[name].height_px, device=some[name].device,
+            )
+            for name in dict.fromkeys([*scan.folders, *sorted(counts)])
+            if counts[name]
+        },
+        kinds=dict(Counter(FRAMES if e.recording else kind_of(e.source) for e in entries)),
+        recordings={
+            recording.name: RecordingRow(
+                files=tuple(file.path.name for file in recording.files),
+                frames=frames[recording.name],
+                duration_s=recording.duration_s,
+                start=recording.start and recording.start.isoformat(" ", "seconds"),
+                clock=recording.clock,
+            )
+            for recording in scan.recordings
+        },
+        left_out={reason: tuple(names) for reason, names in lost.items()},
+    )  # fmt: skip
+
+
+def _cameras_by_size(recordings: Sequence[Recording], mono: str) -> list[str]:
     """Camera of each recording: those of one size are one; that of most seconds has the name."""
     seconds: Counter[tuple[int, int]] = Counter()
     for recording in recordings:
         seconds[recording.size] += round(sum(file.duration_s for file in recording.files) + 1)
-    names = [mono, *(f"{mono}-{number}" for number in range(2, len(seconds) + 1))]
-    by_size = {size: name for (size, _), name in zip(seconds.most_common(), names, strict=True)}
-    return [by_size[recording.size] for recording in recordings]
+    order = [size for size, _ in seconds.most_common()]
+    numbers = [order.index(recording.size) for recording in recordings]
+    return [f"{mono}-{number + 1}" if number else mono for number in numbers]
 
 
-def _check_sources(
+def _check_options(
     folders: Sequence[Path],
     cameras: Mapping[str, Path],
     videos: Sequence[Path],
     bag: Path | None,
+    overlap: float | None,
+    every_s: float | None,
+    triggers: Path | None,
 ) -> None:
-    if sum([bool(folders), bool(cameras), bool(videos), bag is not None]) != 1:
-        raise ImageError(
-            "give folders of pictures, or --left and --right, or --camera for each camera, or "
-            "--video, or --bag: one of them"
-        )
-    every = [*folders, *cameras.values()]
-    places = [folder.resolve() for folder in every]
-    twice = [folder for folder in every if places.count(folder.resolve()) > 1]
-    if twice:
-        raise ImageError(f"{twice[0]} is given twice")
-
-
-def _frame_settings(
-    overlap: float | None, every_s: float | None, videos: Sequence[Path], bag: Path | None
-) -> FrameSettings:
+    """Check that options are of the source that is given."""
+    if triggers is not None and not (folders or cameras):
+        raise ImageError("--triggers is for folders of pictures: videos and bags have times")
     if not videos and (overlap is not None or (every_s is not None and bag is None)):
         raise ImageError("--overlap and --every choose frames of a video: give --video too")
     if overlap is not None and every_s is not None:
         raise ImageError("--overlap and --every exclude each other: give one of them")
-    if every_s is not None and not every_s > 0:
-        raise ImageError(f"--every {every_s}: seconds between frames must be more than 0")
-    if overlap is not None and not MIN_OVERLAP <= overlap <= MAX_OVERLAP:
-        raise ImageError(
-            f"--overlap {overlap}: neighbouring frames share {MIN_OVERLAP} to {MAX_OVERLAP}"
-        )
-    return FrameSettings(overlap=DEFAULT_OVERLAP if overlap is None else overlap, every_s=every_s)
+
+
+def _check_paths(workspace: Path, given: Sequence[Path]) -> None:
+    """Check that what is given exists, and that a workspace may have these pictures."""
+    images = workspace / "images"
+    for path in given:
+        if not path.exists():
+            raise ImageError(f"{path}: no such file or folder")
+        if path.resolve().is_relative_to(images.resolve()):
+            raise WorkspaceError(f"{path} is inside {images}, which is written again")
+    for simulated in (images / "truth", workspace / "pool" / "truth"):
+        if simulated.exists():
+            raise WorkspaceError(
+                f"{workspace} holds a simulated survey, whose rig is not that of real pictures: "
+                "choose another workspace with -w"
+            )

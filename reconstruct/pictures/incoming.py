@@ -106,7 +106,7 @@ def same_bytes(paths: Sequence[Path]) -> dict[Path, Path]:
     return copies
 
 
-def at_time(entry: Incoming, time_s: float) -> Incoming:
+def with_time(entry: Incoming, time_s: float) -> Incoming:
     """A picture with the time of its message: a date, or seconds of a clock without dates."""
     if time_s < DATED_AFTER_S:
         return replace(entry, video_time_s=time_s)
@@ -114,59 +114,60 @@ def at_time(entry: Incoming, time_s: float) -> Incoming:
     return replace(entry, facts=replace(entry.facts, time_local=date))
 
 
-def by_camera(entries: Sequence[Incoming], name: str) -> list[Incoming]:
-    """Name the cameras that took pictures, as far as EXIF and sizes distinguish them.
+def camera_names(
+    facts: Sequence[PictureFacts], name: str
+) -> list[tuple[str, tuple[str, int, int], int]]:
+    """Name, key and pictures of the cameras, as far as EXIF and sizes distinguish them.
 
     The camera of most pictures has the name that is given; the next ones a number more.
     """
-    counts = Counter(camera_key(entry.facts) for entry in entries)
-    names = {
-        key: name if number == 1 else f"{name}-{number}"
-        for number, (key, _) in enumerate(counts.most_common(), 1)
-    }
-    return [replace(entry, camera=names[camera_key(entry.facts)]) for entry in entries]
-
-
-def camera_key(facts: PictureFacts) -> tuple[str, int, int]:
-    """What tells the pictures of one camera from those of another: device, width, height."""
-    return facts.device, facts.width_px, facts.height_px
+    counts = Counter(one.key for one in facts).most_common()
+    return [
+        (name if number == 1 else f"{name}-{number}", key, count)
+        for number, (key, count) in enumerate(counts, 1)
+    ]
 
 
 def check_entries(entries: Sequence[Incoming], rig: Rig | None) -> None:
     """Check that pictures are enough, of one size by camera, and of the size that the rig says."""
-    cameras = {entry.camera for entry in entries}
-    if len({entry.station for entry in entries}) < 2 and (rig is None or len(cameras) < 2):
+    first = {entry.camera: entry for entry in reversed(entries)}
+    if len({entry.station for entry in entries}) < 2 and (rig is None or len(first) < 2):
         count = len(entries)
         raise ImageError(
             f"{count} usable picture{'s' * (count != 1)}: a model needs pictures from 2 or more "
             "places that overlap, or a stereo pair with its rig"
         )
-    for camera in dict.fromkeys(entry.camera for entry in entries):
-        own = [e for e in entries if e.camera == camera]
-        first = own[0].facts
-        for entry in own:
-            facts = entry.facts
-            if (facts.width_px, facts.height_px) != (first.width_px, first.height_px):
-                raise ImageError(
-                    f"{entry.source} has {facts.width_px} x {facts.height_px} pixels, but "
-                    f"{own[0].source.name} of the same camera has {first.width_px} x "
-                    f"{first.height_px}: import pictures of one size only"
-                )
-        if rig is None:
-            continue
-        if camera not in rig.cameras:
-            raise ImageError(f"the rig has no camera {camera!r}, only {', '.join(rig.cameras)}")
-        model = rig.cameras[camera]
-        if (model.width_px, model.height_px) != (first.width_px, first.height_px):
-            others = ", ".join(name for name in rig.cameras if name != camera)
+    for entry in entries:
+        facts, one = entry.facts, first[entry.camera].facts
+        if (facts.width_px, facts.height_px) != (one.width_px, one.height_px):
             raise ImageError(
-                f"{own[0].source} has {first.width_px} x {first.height_px} pixels, but the rig's "
-                f"camera {camera} has {model.width_px} x {model.height_px}"
+                f"{entry.source} has {facts.width_px} x {facts.height_px} pixels, but "
+                f"{one.path.name} of the same camera has {one.width_px} x {one.height_px}: import "
+                "pictures of one size only"
+            )
+    if rig is not None:
+        check_rig({n: (e.facts.width_px, e.facts.height_px) for n, e in first.items()}, rig)
+
+
+def check_rig(sizes: Mapping[str, tuple[int, int]], rig: Rig) -> None:
+    """Check that a rig is of these cameras, by their widths and heights (0 where unknown)."""
+    for name, (width, height) in sizes.items():
+        if name not in rig.cameras:
+            raise ImageError(
+                f"the rig has no camera {name!r}, only {', '.join(rig.cameras)}: call the folders "
+                "as the rig does"
+            )
+        model = rig.cameras[name]
+        if width and (width, height) != (model.width_px, model.height_px):
+            others = ", ".join(other for other in rig.cameras if other != name)
+            raise ImageError(
+                f"pictures of {name} have {width} x {height} pixels, but the rig's camera {name} "
+                f"has {model.width_px} x {model.height_px}"
                 + (f": --camera NAME=FOLDER says if {others} took them" if others else "")
             )
 
 
-def named_apart(entries: Sequence[Incoming]) -> list[Incoming]:
+def unique_names(entries: Sequence[Incoming]) -> list[Incoming]:
     """Names below `images/`: the camera's folder and a safe, unique form of the file's own name."""
     taken: set[str] = set()
     named = []
@@ -241,7 +242,7 @@ _ABOVE_M = 0.5
 """Depths are on the wrong side of the surface beyond waves and the zero of a sensor."""
 
 
-def checked_level(name: str | None, navigation: Path | None) -> str:
+def level_of_log(name: str | None, navigation: Path | None) -> str:
     """What to call the level of logged depths; files that state it give it one line."""
     if name is None:
         return _LOGGED_LEVEL
@@ -262,7 +263,7 @@ def readings_of(records: Sequence[ImageRecord]) -> Counter[str]:
     return Counter(name for r in records for name, known in r.readings.items() if known)
 
 
-def placed(
+def place_records(
     entries: Sequence[Incoming],
     records: Sequence[ImageRecord],
     log: NavigationLog | None,

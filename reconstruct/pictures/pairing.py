@@ -116,7 +116,7 @@ class PairedPictures:
     stations: tuple[Mapping[str, Path], ...]
     """Picture of each camera, by moment."""
     time_s: Mapping[Path, float] = field(default_factory=dict)
-    """When pictures were taken by the trigger log, on its clock."""
+    """When pictures were taken by the trigger log or the bag, on its clock."""
 
 
 def pair_by_time(

@@ -1,12 +1,11 @@
 """How good the pictures of a survey are: sharpness, exposure, contrast, noise and overlap.
 
 Every picture is measured by itself, then compared with the survey: what lies far from the median of
-all is listed with the reason, in a table and on a sheet of the worst. Nothing is left out of the
-reconstruction because of it.
+all is listed with the reason. Nothing is left out of the reconstruction because of it.
 """
 
 import math
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -15,13 +14,14 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
 
 from alice_survey.core.artefacts import read_stage, refuse_links, write_csv
 from alice_survey.core.errors import ImageError, why
 from alice_survey.core.executor import Executor
 from alice_survey.core.manifest import ImageRecord, read_manifest
 from alice_survey.core.robust import MAD_TO_SIGMA
-from alice_survey.kit.figure import INKS, Axes, figure_style, new_figure, plain_name, save_figure
+from alice_survey.kit.figure import INKS, figure_style, new_figure, save_figure
 from reconstruct.pictures.files import decode
 from reconstruct.pictures.normalise import even_light
 from reconstruct.pictures.undistorted import read_mask
@@ -255,79 +255,33 @@ def add_overlap(found: Sequence[PictureQuality], sparse: Path) -> list[PictureQu
     from reconstruct.views.model import read_model
 
     model = read_model(sparse)
-    seen: dict[int, list[int]] = defaultdict(list)
-    for point, view in model.observations:
-        seen[int(point)].append(int(view))
-    points: Counter[int] = Counter()
-    shared: dict[int, Counter[int]] = defaultdict(Counter)
-    for views in seen.values():
-        points.update(views)
-        for one in views:
-            shared[one].update(
-                v for v in views if model.views[v].station != model.views[one].station
-            )
-    index = {view.image: i for i, view in enumerate(model.views)}
+    point, view = model.observations.T
+    size = (int(point.max(initial=0)) + 1, len(model.views))
+    sees = coo_array((np.ones(len(point), np.int64), (point, view)), shape=size).tocsr()
+    station = np.array([one.station for one in model.views])
+    shared = np.where(station[:, None] == station, 0, (sees.T @ sees).toarray())
+    points = np.bincount(view, minlength=len(station))
+    partners = (shared >= _SHARED_POINTS).sum(axis=1)
+    overlap = shared.max(axis=1, initial=0) / np.maximum(points, 1)
+    index = {one.image: i for i, one in enumerate(model.views)}
+    table = np.column_stack([points, partners, overlap])
     filled = []
     for quality in found:
         i = index.get(quality.image)
-        if i is None:
-            filled.append(replace(quality, points=0.0, partners=0.0, overlap=0.0))
-            continue
-        counts = shared[i].values()
-        filled.append(
-            replace(
-                quality,
-                points=float(points[i]),
-                partners=float(sum(count >= _SHARED_POINTS for count in counts)),
-                overlap=max(counts, default=0) / max(points[i], 1),
-            )
-        )
+        row = np.zeros(3) if i is None else table[i]
+        filled.append(replace(quality, points=row[0], partners=row[1], overlap=row[2]))
     return filled
 
 
 _NUMBERS = tuple(f.name for f in fields(PictureQuality) if f.type in (float, "float"))
 _HEADER = ("image", "camera", "station", *_NUMBERS, "reasons")
-_MAX_SHOWN = 8
-_ACROSS = 4
-_THUMBNAIL_PX = 420
 _STRIPS = ("sharpness", "contrast", "veil", "brightness")
 
 
 @figure_style()
-def plot_quality(path: Path, images: Path, found: Sequence[PictureQuality]) -> None:
-    """Draw figures of all pictures in their order, and thumbnails of the worst with the reason.
-
-    Args:
-        path: PNG to write.
-        images: folder of the pictures.
-        found: all pictures, judged.
-    """
-    worst = worst_first(found)[:_MAX_SHOWN]
-    rows = -(-len(worst) // _ACROSS)
-    figure = new_figure(5.2 + 2.6 * rows, 12)
-    if not rows:
-        _strips(figure, found)
-    else:
-        upper, lower = figure.subfigures(2, 1, height_ratios=[5.2, 2.6 * rows])
-        _strips(upper, found)
-        panels = lower.subplots(rows, _ACROSS, squeeze=False).ravel()
-        for panel in panels:
-            panel.axis("off")
-        for panel, quality in zip(panels, worst, strict=False):
-            _thumbnail(panel, images, quality)
-    save_figure(figure, path)
-
-
-def worst_first(found: Sequence[PictureQuality]) -> list[PictureQuality]:
-    """Flagged pictures: unreadable ones, then those with the most reasons, then by sharpness."""
-    flagged = [quality for quality in found if quality.flagged]
-    return sorted(
-        flagged,
-        key=lambda q: (not np.isnan(q.sharpness), -len(q.reasons), q.sharpness, q.image),
-    )
-
-
-def _strips(figure: Any, found: Sequence[PictureQuality]) -> None:
+def plot_quality(path: Path, found: Sequence[PictureQuality]) -> None:
+    """Draw figures of all pictures in their order, the flagged ones in circles."""
+    figure = new_figure(5.2, 12)
     axes = figure.subplots(len(_STRIPS), 1, sharex=True)
     cameras = sorted({quality.camera for quality in found})
     order = np.arange(len(found))
@@ -349,28 +303,7 @@ def _strips(figure: Any, found: Sequence[PictureQuality]) -> None:
     axes[0].legend(loc="lower right", ncols=len(cameras))
     axes[-1].set_xlabel("picture")
     axes[-1].xaxis.get_major_locator().set_params(integer=True)
-
-
-def _thumbnail(panel: Axes, images: Path, quality: PictureQuality) -> None:
-    panel.set_title(
-        plain_name(f"{quality.image}\n" + "\n".join(_short(r) for r in quality.reasons)),
-        fontsize=8,
-    )
-    try:
-        pixels = decode(images / quality.image)
-    except (ImageError, OSError):
-        panel.text(0.5, 0.5, "cannot be shown", ha="center", va="center", color="0.4")
-        return
-    if pixels.dtype == np.uint16:
-        pixels = (pixels >> 8).astype(np.uint8)
-    shrink = _THUMBNAIL_PX / max(pixels.shape[:2])
-    small = cv2.resize(pixels, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-    colours = cv2.COLOR_GRAY2RGB if small.ndim == 2 else cv2.COLOR_BGR2RGB
-    panel.imshow(cv2.cvtColor(small, colours))
-
-
-def _short(reason: str) -> str:
-    return reason if len(reason) <= 54 else reason[:53] + "…"
+    save_figure(figure, path)
 
 
 def quality_report(workspace: Path, executor: Executor) -> tuple[str, dict[str, Any]]:
@@ -398,8 +331,24 @@ def quality_report(workspace: Path, executor: Executor) -> tuple[str, dict[str, 
     found = judge(found)
     folder = workspace / "quality"
     write_csv(folder / "quality.csv", _HEADER, (_row(quality) for quality in found))
-    plot_quality(folder / "quality.png", images, found)
-    return _text(found, folder), _figures(found)
+    plot_quality(folder / "quality.png", found)
+    flagged = [quality for quality in found if quality.flagged]
+    lines = [f"{q.image}: {'; '.join(q.reasons)}" for q in flagged]
+    lines.append(
+        f"{len(found)} pictures, {len(flagged)} to look at (all are still used where they can be); "
+        f"{folder / 'quality.csv'}"
+    )
+    medians = {}
+    for name in _NUMBERS:
+        values = np.array([getattr(q, name) for q in found])
+        if np.isfinite(values).any():
+            medians[name] = round(float(np.nanmedian(values)), 6)
+    return "\n".join(lines), {
+        "pictures": len(found),
+        "unreadable": sum(math.isnan(q.sharpness) for q in found),
+        "flagged": [{"image": q.image, "reasons": list(q.reasons)} for q in flagged],
+        "median": medians,
+    }
 
 
 def _row(quality: PictureQuality) -> list[Any]:
@@ -408,27 +357,3 @@ def _row(quality: PictureQuality) -> list[Any]:
     return [
         quality.image, quality.camera, quality.station, *cells, "; ".join(quality.reasons)
     ]  # fmt: skip
-
-
-def _text(found: Sequence[PictureQuality], folder: Path) -> str:
-    flagged = [quality for quality in found if quality.flagged]
-    lines = [f"{q.image}: {'; '.join(q.reasons)}" for q in flagged]
-    lines.append(
-        f"{len(found)} pictures, {len(flagged)} to look at (all are still used where they can be); "
-        f"{folder / 'quality.csv'}"
-    )
-    return "\n".join(lines)
-
-
-def _figures(found: Sequence[PictureQuality]) -> dict[str, Any]:
-    medians = {}
-    for name in _NUMBERS:
-        values = np.array([getattr(q, name) for q in found])
-        if np.isfinite(values).any():
-            medians[name] = round(float(np.nanmedian(values)), 6)
-    return {
-        "pictures": len(found),
-        "unreadable": sum(math.isnan(q.sharpness) for q in found),
-        "flagged": [{"image": q.image, "reasons": list(q.reasons)} for q in found if q.flagged],
-        "median": medians,
-    }

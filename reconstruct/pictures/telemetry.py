@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,35 +25,69 @@ from alice_survey.core.frames import Array
 _MP4_EPOCH = datetime(1904, 1, 1, tzinfo=UTC)
 _YEARS = range(2000, 2200)
 """Years in which a digital camera can have made a video."""
-_MAX_INDEX = 128 << 20
-"""Bytes of the index of a video: a day of it takes less."""
+_MAX_BOX = 32 << 20
+"""Bytes of a table of the index of a video: a day of it takes less."""
 _MAX_BOXES = 4096
 _MAX_SAMPLES = 1_000_000
 _MAX_PAYLOAD = 4 << 20
 """Bytes of telemetry of one sample, which holds a second."""
 _MAKER = b"GoPro"
+_MIN_FIX = 3
+"""A fix in three dimensions."""
+_MAX_DOP = 5.0
+"""Dilution of precision below which GoPro calls a fix good."""
+_MAX_ITEMS = 20_000
+_GPS_EPOCH = datetime(2000, 1, 1, tzinfo=UTC)
+_GPS9 = "lllllllSS"
+"""Latitude, longitude, altitude, speeds in 2D and 3D, days, seconds, dilution, fix."""
+_CODES = {"b": "b", "B": "B", "s": "h", "S": "H", "l": "i", "L": "I", "f": "f", "d": "d",
+          "j": "q", "J": "Q"}  # fmt: skip
+_MAX_FIX_AGE_S = 1.0
+"""Time to a fix within which a picture has its place."""
+
+Span = tuple[int, int]
+"""First byte and end of the content of a box."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class TelemetryTrack:
-    """Where the samples of the telemetry of a GoPro are in its file."""
+class Fixes:
+    """Good fixes of a GPS, (N,) each, by the time of the video."""
 
-    offsets: NDArray[np.int64]
-    sizes: NDArray[np.int64]
-    """(N,) bytes."""
-    starts_s: NDArray[np.float64]
-    """(N + 1,) seconds from the start of the video; the last is where the last sample ends."""
+    time_s: Array
+    """Seconds from the start of the video, increasing."""
+    places: Array
+    """(N, 3) latitude, longitude (degrees) and altitude (m)."""
+    utc_s: Array
+    """Seconds since 2000 of the fix itself; NaN where they are not stated."""
+
+    def at(self, time_s: float) -> tuple[float, float, float] | None:
+        """Latitude, longitude and altitude at a time; None where no fix is near."""
+        if not len(self.time_s) or np.abs(self.time_s - time_s).min() > _MAX_FIX_AGE_S:
+            return None
+        latitude, longitude, altitude = (
+            float(np.interp(time_s, self.time_s, values)) for values in self.places.T
+        )
+        return latitude, longitude, altitude
+
+    def start_utc(self) -> datetime | None:
+        """When the video began, by the median fix; None without any."""
+        known = np.isfinite(self.utc_s)
+        if not known.any():
+            return None
+        seconds = float(np.median(self.utc_s[known] - self.time_s[known]))
+        return _GPS_EPOCH + timedelta(seconds=seconds)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Mp4Facts:
-    """What the index of an MP4 says."""
+    """What an MP4 says of when and where it was made."""
 
     created: datetime | None = None
     """As the container states it, in UTC; None where it states nothing that can be."""
     is_gopro: bool = False
     """Whether a GoPro made it, which writes its local time as if it were UTC."""
-    telemetry: TelemetryTrack | None = None
+    fixes: Fixes | None = None
+    """Of its telemetry; what is damaged counts as none."""
 
 
 def read_mp4(path: Path) -> Mp4Facts:
@@ -64,88 +98,58 @@ def read_mp4(path: Path) -> Mp4Facts:
     """
     try:
         with path.open("rb") as file:
-            index = _index(file)
+            return _facts(file, file.seek(0, os.SEEK_END))
     except OSError as error:
         raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
-    try:
-        return _facts(index)
     except (struct.error, ValueError, IndexError, OverflowError):
         return Mp4Facts()  # OpenCV decides whether its pictures can be read all the same
 
 
-def payloads(path: Path, track: TelemetryTrack) -> Iterator[tuple[float, float, bytes]]:
-    """Start, end (seconds) and bytes of each sample of telemetry that the file holds.
-
-    Raises:
-        ImageError: the file cannot be read.
-    """
-    try:
-        with path.open("rb") as file:
-            total = rest = path.stat().st_size
-            for i, (offset, size) in enumerate(zip(track.offsets, track.sizes, strict=True)):
-                rest -= int(size)  # samples do not overlap
-                if 0 < size <= _MAX_PAYLOAD and 0 <= offset <= total - size and rest >= 0:
-                    file.seek(int(offset))
-                    yield float(track.starts_s[i]), float(track.starts_s[i + 1]), file.read(size)
-    except OSError as error:
-        raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
-
-
-def _index(file: BinaryIO) -> bytes:
-    """Content of the box `moov`; empty where there is none."""
-    at, total = 0, file.seek(0, os.SEEK_END)
+def _boxes(file: BinaryIO, inside: Span) -> Iterator[tuple[bytes, Span]]:
+    """Kinds and contents of the boxes that lie one after the other."""
+    at, end = inside
     for _ in range(_MAX_BOXES):
         file.seek(at)
         head = file.read(16)
-        if len(head) < 8:
-            return b""
+        if at + 8 > end or len(head) < 8:
+            return
         size, kind = struct.unpack(">I4s", head[:8])
         begin = at + 8
         if size == 1 and len(head) == 16:
             size, begin = struct.unpack(">Q", head[8:])[0], at + 16
-        if kind == b"moov":
-            file.seek(begin)
-            long = (total if size == 0 else min(at + size, total)) - begin
-            return file.read(long) if 0 < long < _MAX_INDEX else b""
-        if size < 8 or at + size > total:
-            return b""
-        at += size
-    return b""
-
-
-def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """Kinds and contents of the boxes that lie one after the other."""
-    at = 0
-    for _ in range(_MAX_BOXES):
-        if at + 8 > len(data):
+        at = end if size == 0 else min(at + size, end)
+        if at < begin:
             return
-        size, kind = struct.unpack_from(">I4s", data, at)
-        head = 8
-        if size == 1:
-            size, head = struct.unpack_from(">Q", data, at + 8)[0], 16
-        if size == 0:
-            size = len(data) - at
-        if size < head or at + size > len(data):
-            return
-        yield kind, data[at + head : at + size]
-        at += size
+        yield kind, (begin, at)
 
 
-def _inside(data: bytes, *kinds: bytes) -> bytes:
-    """Content of the first box of a kind, in the first box of the kind before; else empty."""
+def _find(file: BinaryIO, inside: Span, *kinds: bytes) -> Span:
+    """The first box of a kind, in the first box of the kind before; else an empty one."""
     for requested in kinds:
-        data = next((content for kind, content in _boxes(data) if kind == requested), b"")
-    return data
+        inside = next((span for kind, span in _boxes(file, inside) if kind == requested), (0, 0))
+    return inside
 
 
-def _facts(index: bytes) -> Mp4Facts:
-    tracks = [content for kind, content in _boxes(index) if kind == b"trak"]
-    names = [_inside(track, b"mdia", b"hdlr") for track in tracks]
-    telemetry = [t for t in tracks if _sample_format(t) == b"gpmd"]
+def _content(file: BinaryIO, inside: Span, *kinds: bytes) -> bytes:
+    begin, end = _find(file, inside, *kinds)
+    file.seek(begin)
+    return file.read(min(end - begin, _MAX_BOX))
+
+
+def _facts(file: BinaryIO, total: int) -> Mp4Facts:
+    index = _find(file, (0, total), b"moov")
+    tracks = [span for kind, span in _boxes(file, index) if kind == b"trak"]
+    of_gopro = any(_MAKER in _content(file, track, b"mdia", b"hdlr") for track in tracks)
+    tables = [_find(file, track, b"mdia", b"minf", b"stbl") for track in tracks]
+    telemetry = [
+        (_content(file, track, b"mdia", b"mdhd"), table)
+        for track, table in zip(tracks, tables, strict=True)
+        if _content(file, table, b"stsd")[12:16] == b"gpmd"
+    ]
     return Mp4Facts(
-        created=_creation_time(_inside(index, b"mvhd")),
-        is_gopro=bool(telemetry) or any(_MAKER in name for name in names),
-        telemetry=_telemetry(telemetry[0]) if telemetry else None,
+        created=_creation_time(_content(file, index, b"mvhd")),
+        is_gopro=of_gopro or bool(telemetry),
+        fixes=_read_fixes(file, total, *telemetry[0]) if telemetry else None,
     )
 
 
@@ -159,23 +163,25 @@ def _creation_time(header: bytes) -> datetime | None:
     return made if made.year in _YEARS else None
 
 
-def _sample_format(track: bytes) -> bytes:
-    return _inside(track, b"mdia", b"minf", b"stbl", b"stsd")[12:16]
-
-
-def _telemetry(track: bytes) -> TelemetryTrack | None:
-    header, table = _inside(track, b"mdia", b"mdhd"), _inside(track, b"mdia", b"minf", b"stbl")
+def _payloads(
+    file: BinaryIO, total: int, header: bytes, table: Span
+) -> Iterator[tuple[float, float, bytes]]:
+    """Start, end (seconds) and bytes of each sample of a track that the file holds."""
     (scale,) = struct.unpack_from(">I", header, 20 if header[0] == 1 else 12)
-    sizes = _sizes(_inside(table, b"stsz"))
-    offsets = _offsets(table, sizes)
-    count = min(len(sizes), len(offsets))
-    times = _rows(_inside(table, b"stts"), 4, 2)
-    if scale == 0 or count == 0 or times[:, 0].sum() > _MAX_SAMPLES:
-        return None
-    steps = np.repeat(times[:, 1], times[:, 0])[:count]
-    count = len(steps)
-    starts = np.concatenate([[0], np.cumsum(steps)]) / scale
-    return TelemetryTrack(offsets=offsets[:count], sizes=sizes[:count], starts_s=starts)
+    sizes = _sizes(_content(file, table, b"stsz"))
+    offsets = _offsets(file, table, sizes)
+    times = _rows(_content(file, table, b"stts"), 4, 2)
+    if scale == 0 or times[:, 0].sum() > _MAX_SAMPLES:
+        return
+    starts_s = np.concatenate([[0], np.cumsum(np.repeat(times[:, 1], times[:, 0]))]) / scale
+    left = total
+    for offset, size, start_s, end_s in zip(
+        offsets.tolist(), sizes.tolist(), starts_s.tolist(), starts_s[1:].tolist(), strict=False
+    ):
+        left -= size  # samples do not overlap
+        if 0 < size <= _MAX_PAYLOAD and 0 <= offset <= total - size and left >= 0:
+            file.seek(offset)
+            yield start_s, end_s, file.read(size)
 
 
 def _sizes(box: bytes) -> NDArray[np.int64]:
@@ -185,12 +191,12 @@ def _sizes(box: bytes) -> NDArray[np.int64]:
     return np.full(count, same) if same else _rows(box, 8, 1)[:, 0]
 
 
-def _offsets(table: bytes, sizes: NDArray[np.int64]) -> NDArray[np.int64]:
+def _offsets(file: BinaryIO, table: Span, sizes: NDArray[np.int64]) -> NDArray[np.int64]:
     """Where samples are: by chunks, in each of which some of them follow one another."""
-    narrow = _inside(table, b"stco")
-    wide = b"" if narrow else _inside(table, b"co64")
+    narrow = _content(file, table, b"stco")
+    wide = b"" if narrow else _content(file, table, b"co64")
     chunks = _rows(narrow, 4, 1)[:, 0] if narrow else _rows(wide, 4, 1, wide=True)[:, 0]
-    runs = _rows(_inside(table, b"stsc"), 4, 3)
+    runs = _rows(_content(file, table, b"stsc"), 4, 3)
     run = np.searchsorted(runs[:, 0], np.arange(1, len(chunks) + 1), side="right") - 1
     held = np.where(run >= 0, runs[run, 1], 0) if len(runs) else np.zeros(len(chunks), np.int64)
     first = np.concatenate([[0], np.cumsum(np.minimum(held, len(sizes)))])[:-1]
@@ -210,89 +216,36 @@ def _rows(box: bytes, at: int, columns: int, *, wide: bool = False) -> NDArray[n
     return flat.astype(np.int64).reshape(count, columns)
 
 
-_MIN_FIX = 3
-"""A fix in three dimensions."""
-_MAX_DOP = 5.0
-"""Dilution of precision below which GoPro calls a fix good."""
-_MAX_ITEMS = 20_000
-_GPS_EPOCH = datetime(2000, 1, 1, tzinfo=UTC)
-_GPS9 = "lllllllSS"
-"""Latitude, longitude, altitude, speeds in 2D and 3D, days, seconds, dilution, fix."""
-_CODES = {"b": "b", "B": "B", "s": "h", "S": "H", "l": "i", "L": "I", "f": "f", "d": "d",
-          "j": "q", "J": "Q"}  # fmt: skip
-_FURTHEST_S = 1.0
-"""From a fix at which a picture may have its place."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Fixes:
-    """Good fixes of a GPS, (N,) each, by the time of the video."""
-
-    time_s: Array
-    """Seconds from the start of the video, increasing."""
-    latitude_deg: Array
-    longitude_deg: Array
-    altitude_m: Array
-    utc_s: Array
-    """Seconds since 2000 of the fix itself; NaN where they are not stated."""
-
-    def at(self, time_s: float) -> tuple[float, float, float] | None:
-        """Latitude, longitude and altitude at a time; None where no fix is near."""
-        if not len(self.time_s) or np.abs(self.time_s - time_s).min() > _FURTHEST_S:
-            return None
-        latitude, longitude, altitude = (
-            float(np.interp(time_s, self.time_s, values))
-            for values in (self.latitude_deg, self.longitude_deg, self.altitude_m)
-        )
-        return latitude, longitude, altitude
-
-    def start_utc(self) -> datetime | None:
-        """When the video began, by the median fix; None without any."""
-        known = np.isfinite(self.utc_s)
-        if not known.any():
-            return None
-        seconds = float(np.median(self.utc_s[known] - self.time_s[known]))
-        return _GPS_EPOCH + timedelta(seconds=seconds)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _KlvItem:
-    """One key with its values."""
-
-    key: bytes
-    kind: str
-    size: int
-    repeat: int
-    data: bytes
-
-
-def read_fixes(path: Path, track: TelemetryTrack) -> Fixes:
-    """Good fixes in the telemetry of a video; what is damaged counts as none."""
+def _read_fixes(file: BinaryIO, total: int, header: bytes, table: Span) -> Fixes:
+    """Good fixes in a track of telemetry."""
     rows: list[tuple[float, ...]] = []
-    for start_s, end_s, data in payloads(path, track):
+    for start_s, end_s, data in _payloads(file, total, header, table):
         for device in _items(data):
             for stream in _items(device.data) if device.key == b"DEVC" else ():
                 if stream.key == b"STRM":
                     found = _fixes_of(list(_items(stream.data)))
                     for i, row in enumerate(found):
                         rows.append((start_s + (end_s - start_s) * i / len(found), *row))
-    table = np.array(rows, dtype=np.float64).reshape(-1, 7)
+    fixes = np.array(rows, dtype=np.float64).reshape(-1, 7)
     good = (
-        np.isfinite(table[:, :4]).all(axis=1)
-        & (np.abs(table[:, 1]) <= 90)
-        & (np.abs(table[:, 2]) <= 180)
-        & (table[:, 5] >= _MIN_FIX)
-        & (table[:, 6] < _MAX_DOP)
+        np.isfinite(fixes[:, :4]).all(axis=1)
+        & (np.abs(fixes[:, 1]) <= 90)
+        & (np.abs(fixes[:, 2]) <= 180)
+        & (fixes[:, 5] >= _MIN_FIX)
+        & (fixes[:, 6] < _MAX_DOP)
     )
-    table = table[good]
-    table = table[np.argsort(table[:, 0], kind="stable")]
-    return Fixes(
-        time_s=table[:, 0],
-        latitude_deg=table[:, 1],
-        longitude_deg=table[:, 2],
-        altitude_m=table[:, 3],
-        utc_s=table[:, 4],
-    )
+    fixes = fixes[good]
+    fixes = fixes[np.argsort(fixes[:, 0], kind="stable")]
+    return Fixes(time_s=fixes[:, 0], places=fixes[:, 1:4], utc_s=fixes[:, 4])
+
+
+class _KlvItem(NamedTuple):
+    """One key with its values."""
+
+    key: bytes
+    kind: str
+    size: int
+    data: bytes
 
 
 def _items(data: bytes) -> Iterator[_KlvItem]:
@@ -305,14 +258,14 @@ def _items(data: bytes) -> Iterator[_KlvItem]:
         end = at + 8 + size * repeat
         if key == b"\0\0\0\0" or end > len(data):
             return
-        yield _KlvItem(
-            key=key, kind=kind.decode("latin-1"), size=size, repeat=repeat, data=data[at + 8 : end]
-        )
+        yield _KlvItem(key, kind.decode("latin-1"), size, data[at + 8 : end])
         at = end + -(size * repeat) % 4
 
 
-def _values(item: _KlvItem, kinds: str = "") -> Array:
+def _values(item: _KlvItem | None, kinds: str = "") -> Array:
     """(repeat, N) numbers of an item; (0, 0) of a kind that holds none."""
+    if item is None:
+        return np.zeros((0, 0))
     codes = "".join(_CODES.get(kind, "") for kind in kinds)
     if not codes and (code := _CODES.get(item.kind)):
         codes = code * (item.size // struct.calcsize(f">{code}"))
@@ -325,29 +278,24 @@ def _fixes_of(stream: list[_KlvItem]) -> list[tuple[float, ...]]:
     """Latitude, longitude, altitude, seconds since 2000, fix and dilution of every sample."""
     said = {item.key: item for item in stream}
     newer = said.get(b"GPS9")
-    item = newer or said.get(b"GPS5")
-    if item is None or b"SCAL" not in said:
-        return []
-    scale, values = _values(said[b"SCAL"]).ravel(), _values(item, _GPS9 if newer else "")
+    scale = _values(said.get(b"SCAL")).ravel()
+    values = _values(newer, _GPS9) if newer else _values(said.get(b"GPS5"))
     width = len(_GPS9) if newer else 5
     if values.shape[1:] != (width,) or scale.size not in (1, width) or not scale.all():
         return []
     values = values / scale
     if newer:
-        utc_s = values[:, 5] * 86400.0 + values[:, 6]
-        columns = (*values[:, :3].T, utc_s, values[:, 8], values[:, 7])
-        return [tuple(map(float, row)) for row in zip(*columns, strict=True)]
-    fix, precision = (_first(said.get(key)) for key in (b"GPSF", b"GPSP"))
-    first_utc_s = _utc_s(said.get(b"GPSU"))  # of the first sample
-    return [
-        (*map(float, row[:3]), first_utc_s if i == 0 else math.nan, fix, precision / 100.0)
-        for i, row in enumerate(values)
-    ]
-
-
-def _first(item: _KlvItem | None) -> float:
-    values = np.zeros(0) if item is None else _values(item).ravel()
-    return float(values[0]) if values.size else math.nan
+        utc_s, fix, precision = values[:, 5] * 86400.0 + values[:, 6], values[:, 8], values[:, 7]
+    else:
+        fix, precision = (
+            np.full(len(values), next(iter(_values(said.get(key)).ravel()), math.nan))
+            for key in (b"GPSF", b"GPSP")
+        )
+        precision = precision / 100.0
+        utc_s = np.full(len(values), math.nan)
+        utc_s[:1] = _utc_s(said.get(b"GPSU"))  # of the first sample
+    columns = (*values[:, :3].T, utc_s, fix, precision)
+    return [tuple(map(float, row)) for row in zip(*columns, strict=True)]
 
 
 def _utc_s(item: _KlvItem | None) -> float:

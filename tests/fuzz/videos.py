@@ -21,11 +21,11 @@ def _film(folder: Path, payload: bytes) -> None:
 
 def read_video(path: Path) -> object:
     """As `import-images` does next to the decoder of its frames."""
-    from reconstruct.pictures.telemetry import read_fixes, read_mp4
+    from reconstruct.pictures.telemetry import read_mp4
 
     facts = read_mp4(path)
-    fixes = None if facts.telemetry is None else read_fixes(path, facts.telemetry)
-    return facts, fixes, None if fixes is None else (fixes.start_utc(), fixes.at(0.5))
+    fixes = facts.fixes
+    return facts, None if fixes is None else (fixes.start_utc(), fixes.at(0.5))
 
 
 def _turned(folder: Path, name: str) -> None:

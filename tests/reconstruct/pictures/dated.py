@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from reconstruct.pictures.importing import ImportRecord, Preview
+
 BEGAN = datetime(2024, 7, 1, 12, 0, 0)
 
 
@@ -34,3 +36,13 @@ def navigation(path: Path, seconds: int, start: datetime = BEGAN) -> Path:
     ]
     path.write_text("\n".join(rows))
     return path
+
+
+def counts(found: ImportRecord | Preview) -> dict[str, int]:
+    """Pictures by camera."""
+    return {name: row.pictures for name, row in found.cameras.items()}
+
+
+def reasons(found: ImportRecord) -> dict[str, int]:
+    """How many files were left out, by reason."""
+    return {reason: len(names) for reason, names in found.left_out.items()}

@@ -13,6 +13,7 @@ from alice_survey.core.manifest import read_manifest
 from reconstruct.pictures.bag_pictures import pixels_of
 from reconstruct.pictures.importing import import_images
 from tests.missions.logs.log_files import Bag
+from tests.reconstruct.pictures.dated import counts
 
 START_NS, STEP_NS, COUNT = 1_700_000_000_000_000_000, 200_000_000, 12
 SHAPE = (24, 32)
@@ -115,7 +116,7 @@ def test_a_stereo_bag_becomes_stations_by_time(tmp_path: Path, version: int) -> 
     said: list[str] = []
     with collected_by(lambda _, text: said.append(text)):
         found = import_images(workspace, [], bag=bag)
-    assert found.cameras == {"left": COUNT, "right": COUNT - 1}
+    assert counts(found) == {"left": COUNT, "right": COUNT - 1}
     records = read_manifest(workspace / "images" / "manifest.csv")
     by_station: dict[int, dict[str, float]] = {}
     for record in records:
@@ -166,7 +167,7 @@ def test_cameras_of_different_clocks_are_refused(tmp_path: Path) -> None:
 def test_one_topic_of_two_can_be_taken(tmp_path: Path) -> None:
     topics = {"camera": "/stereo/left/image_raw"}
     found = import_images(tmp_path / "w", [], bag=stereo(tmp_path), topics=topics)
-    assert found.cameras == {"camera": COUNT}
+    assert counts(found) == {"camera": COUNT}
 
 
 def test_a_bag_without_pictures_or_of_no_bag_is_named(tmp_path: Path) -> None:

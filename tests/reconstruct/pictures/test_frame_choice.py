@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from reconstruct.pictures.frame_choice import (
+from reconstruct.pictures.videos import (
     Frame,
     FrameCounts,
     OverlapChooser,
     motion,
-    shared,
-    shrunk,
+    overlap_share,
+    small_grey,
 )
 
 WIDTH, HEIGHT = 320, 240
@@ -125,7 +125,7 @@ def _turned_share(angle_deg: float) -> float:
 
 def test_a_jump_of_a_third_of_the_picture_is_followed() -> None:
     ground = floor(6, 1000, HEIGHT + 60)
-    one, other = (shrunk(view(ground, *at)) for at in ((10.0, 5.0), (115.0, 25.0)))
+    one, other = (small_grey(view(ground, *at)) for at in ((10.0, 5.0), (115.0, 25.0)))
     found = motion(one, other)
     assert found is not None
     scale = max(one.shape) / WIDTH
@@ -134,7 +134,7 @@ def test_a_jump_of_a_third_of_the_picture_is_followed() -> None:
 
 
 def test_pictures_of_different_places_have_no_motion() -> None:
-    one, other = (shrunk(view(floor(seed, 600, HEIGHT), 0.0)) for seed in (7, 8))
+    one, other = (small_grey(view(floor(seed, 600, HEIGHT), 0.0)) for seed in (7, 8))
     assert motion(one, other) is None
 
 
@@ -168,4 +168,4 @@ def test_open_water_gives_no_frames() -> None:
 @pytest.mark.parametrize(("zoom", "expected"), [(1.0, 1.0), (2.0, 0.25), (0.5, 0.25)])
 def test_frames_at_two_heights_share_the_smaller_part(zoom: float, expected: float) -> None:
     about = np.array([[zoom, 0, 100 * (1 - zoom)], [0, zoom, 50 * (1 - zoom)], [0, 0, 1]])
-    assert shared(about, (200, 100)) == pytest.approx(expected, abs=1e-6)
+    assert overlap_share(about, (200, 100)) == pytest.approx(expected, abs=1e-6)

@@ -19,6 +19,7 @@ from camera_calib.picture_files import without_orientation
 from reconstruct.pictures.files import can_read_heic, decode, exif_focal_px, inspect
 from reconstruct.pictures.importing import import_images
 from reconstruct.pictures.undistorted import read_colour
+from tests.reconstruct.pictures.dated import counts, reasons
 
 DISPLAYED: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     1: lambda a: a, 2: np.fliplr, 3: lambda a: np.rot90(a, 2), 4: np.flipud,
@@ -105,7 +106,7 @@ def test_cameras_of_a_mixed_folder_are_told_apart_by_exif_and_size(tmp_path: Pat
         save(tmp_path / "in" / f"c{number}.jpg", smooth(20 + number, (80, 60)), **phone)
     save(tmp_path / "in" / "d.jpg", smooth(30))
     found = import_images(tmp_path / "w", [tmp_path / "in"])
-    assert found.cameras == {"camera": 6, "camera-2": 3, "camera-3": 2, "camera-4": 1}
+    assert counts(found) == {"camera": 6, "camera-2": 3, "camera-3": 2, "camera-4": 1}
     assert found.lines == [
         "camera: 6 of 64 x 48 pixels, GoPro HERO9 #C3",
         "camera-2: 3 of 64 x 48 pixels, GoPro HERO9 #C4",
@@ -127,7 +128,7 @@ def test_copies_are_left_out_and_named(tmp_path: Path) -> None:
     (tmp_path / "more" / "IMG_2.png").write_bytes(path.read_bytes())
     with heard() as warnings:
         found = import_images(tmp_path / "w", [tmp_path / "in", tmp_path / "more"])
-    assert found.cameras == {"camera": 3} and found.left_out == {"copies of others": 2}
+    assert counts(found) == {"camera": 3} and reasons(found) == {"copies of others": 2}
     assert len(warnings) == 2 and "2 (1).png" in warnings[0] + warnings[1]
     assert "left out: 2 copies of others" in found.lines[-1] and "IMG_2.png" in found.lines[-1]
     (tmp_path / "other").mkdir()
@@ -160,7 +161,7 @@ def test_folders_inside_are_taken_on_request(tmp_path: Path) -> None:
         assert [r.image for r in records] == [
             "camera/G2.jpg", "camera/G10.jpg", "camera/G2_2.jpg", "camera/a.jpg",
         ]  # fmt: skip
-        assert found.left_out == {"other files": 1}
+        assert reasons(found) == {"other files": 1}
     assert [bool(r.mask) for r in records] == [False, True, False, False]
     import_images(tmp_path / "v", [source], recursive=True)
     records = read_manifest(tmp_path / "v" / "images" / "manifest.csv")
@@ -214,8 +215,8 @@ def test_heic_is_read_with_the_users_decoder(tmp_path: Path, heif: None) -> None
     (tmp_path / "in" / "IMG_9.heic").write_bytes(b"HEIC, cut")
     with heard() as warnings:
         found = import_images(tmp_path / "w", [tmp_path / "in"])
-    assert found.kinds == {"HEIC": 4} and found.cameras == {"camera": 4}
-    assert found.left_out == {"cannot be decoded": 1}
+    assert found.kinds == {"HEIC": 4} and counts(found) == {"camera": 4}
+    assert reasons(found) == {"cannot be decoded": 1}
     assert len(warnings) == 1 and "IMG_9.heic" in warnings[0]
     images = tmp_path / "w" / "images"
     for seed, record in enumerate(read_manifest(images / "manifest.csv")):
@@ -235,7 +236,7 @@ def test_heic_without_a_decoder_is_one_line(
             (tmp_path / "in" / f"IMG_{seed}.heic").write_bytes(b"x")
         with heard() as warnings:
             found = import_images(tmp_path / "w", [tmp_path / "in"])
-        assert found.left_out == {"HEIC": 2}
+        assert reasons(found) == {"HEIC": 2}
         (line,) = warnings
         assert "pip install pillow-heif" in line and "JPEG" in line
     finally:

@@ -276,8 +276,8 @@ function picturesForm(started, disk) {
       Boolean).join(" and ");
     found.replaceChildren(...[
       el("h3", {}, `Found: ${what}`),
-      el("ul", {}, seen.cameras.map(
-        (one) => el("li", {}, el("strong", {}, one.name), ` ${one.pictures} pictures`,
+      el("ul", {}, Object.entries(seen.cameras).map(
+        ([name, one]) => el("li", {}, el("strong", {}, name), ` ${one.pictures} pictures`,
           one.width_px ? ` of ${one.width_px} × ${one.height_px} pixels` : "",
           one.device ? ", " + one.device : "")),
         el("li", {}, `${times}, ${gps}${seen.masks ? `, ${seen.masks} masks` : ""}`),

@@ -223,9 +223,9 @@ def test_a_preview_tells_a_rig_from_one_camera(home: Path, server: Server) -> No
     dive = str(home / "dive")
     rig = call(server, "/api/start/preview", {"folders": [dive]}).json
     assert list(rig["rig_folders"]) == ["left", "right"]
-    assert {one["name"]: one["pictures"] for one in rig["cameras"]} == {"left": 4, "right": 4}
+    assert {n: one["pictures"] for n, one in rig["cameras"].items()} == {"left": 4, "right": 4}
     one = call(server, "/api/start/preview", {"folders": [dive], "recursive": True}).json
-    assert one["rig_folders"] == {} and [c["pictures"] for c in one["cameras"]] == [8]
+    assert one["rig_folders"] == {} and [c["pictures"] for c in one["cameras"].values()] == [8]
     log = str(home / "dive" / "nav.csv")
     tied = call(server, "/api/start/preview", {"folders": [dive + "/left"], "navigation": log}).json
     assert "4 of 4 picture times" in tied["navigation"]
