@@ -9,7 +9,6 @@ depth; its barometer is zeroed at the surface.
 """
 
 import math
-import tempfile
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -166,7 +165,7 @@ def read_ardusub_bin(
     """Read an on-board log.
 
     Args:
-        path: a .BIN or a text .log.
+        path: a .BIN.
         requested: the message to use for each role (`dive.ROLES`), `NAME` or `NAME[instance]`.
         datum: the filter's origin instead of the log's ORGN.
 
@@ -293,13 +292,13 @@ def _tlog_times(table: LogTable) -> Array:
 
 
 def read_dataflash(
-    path: Path, wanted: Collection[str], lost: Counter[str]
+    path: Path, needed: Collection[str], lost: Counter[str]
 ) -> tuple[dict[str, LogTable], list[str]]:
     """Read the messages of some names of an on-board log.
 
     Args:
-        path: a .BIN or a text .log.
-        wanted: names of messages.
+        path: a .BIN.
+        needed: names of messages.
         lost: counts what cannot be read; is added to.
 
     Returns:
@@ -308,19 +307,11 @@ def read_dataflash(
     Raises:
         NavigationError: it is not such a log, or cannot be read.
     """
-    start = first_bytes(path, 8192)
-    if _DATAFLASH in start[:4096]:
-        return _read_binary(path, wanted, lost)
-    if b"FMT," in start:
-        return _read_text(path, wanted, lost)
-    raise NavigationError(
-        f"{path}: no DataFlash log: its first bytes hold no FMT message (was it cut at the start?)"
-    )
-
-
-def _read_binary(
-    path: Path, wanted: Collection[str], lost: Counter[str]
-) -> tuple[dict[str, LogTable], list[str]]:
+    if _DATAFLASH not in first_bytes(path, 4096):
+        raise NavigationError(
+            f"{path}: no DataFlash log: its first bytes hold no FMT message (was it cut at the "
+            "start?)"
+        )
     rows: dict[str, list[Any]] = {}
     with read_by("pymavlink", path):
         from pymavlink.DFReader import DFReader_binary
@@ -342,39 +333,10 @@ def _read_binary(
             for message in _messages(log, lost):
                 noise -= message.fmt.len
                 kept = rows.setdefault(message.get_type(), [])
-                if message.get_type() in wanted:
+                if message.get_type() in needed:
                     kept.append(message)
             if noise > 0:
                 lost[_NOISE] += noise
-            tables = _dataflash_tables(rows, lost)
-    return tables, sorted(rows)
-
-
-def _read_text(
-    path: Path, wanted: Collection[str], lost: Counter[str]
-) -> tuple[dict[str, LogTable], list[str]]:
-    """Lines of comma-separated values, already scaled; FMT lines first name the fields."""
-    rows: dict[str, list[Any]] = {}
-    with tempfile.TemporaryDirectory(prefix="alice-survey-") as folder, read_by("pymavlink", path):
-        from pymavlink.DFReader import DFReader_text
-
-        class TextLog(DFReader_text):  # type: ignore[misc]
-            """A log without a clock."""
-
-            def init_clock(self) -> None:
-                pass
-
-        clean = Path(folder) / "clean.log"  # pymavlink takes no byte that is not UTF-8
-        clean.write_text(path.read_text("utf-8", "replace"), "ascii", "replace", newline="\n")
-        with TextLog(str(clean)) as log:
-            noise = sum(log.counts.values())
-            for message in _messages(log, lost):
-                noise -= 1
-                kept = rows.setdefault(message.get_type(), [])
-                if message.get_type() in wanted:
-                    kept.append(message)
-            if noise > 0:
-                lost["lines that are not a message, or without all of its fields"] += noise
             tables = _dataflash_tables(rows, lost)
     return tables, sorted(rows)
 

@@ -4,7 +4,7 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -26,9 +26,9 @@ _JSON = (".json", ".jsonl", ".log", ".txt", "")
 _NOT_READ = {
     ".csv": "a CSV is not a vehicle's log: give a navigation CSV to import-images --navigation; of "
     "QGroundControl import the .tlog",
+    ".log": "text logs of ArduSub are not read: give the .BIN that the text was made of",
     ".pd0": "PD0 is no longer read: export velocities and ranges as a navigation CSV",
 }
-_MAX_S = 1e9
 _MAX_OUT_OF_WATER_M = 2.0
 """A vehicle on deck, or a barometer that is off, seldom is higher."""
 _MICRO = 1e6
@@ -42,11 +42,6 @@ class ImportOptions:
     """Declination added to headings; east is positive."""
     tide: str = "0"
     """Height of the water above the level that depths are to count from: metres, or a CSV."""
-    clock_offset_s: float = 0.0
-    """Offset added to times."""
-    start_s: float | None = None
-    end_s: float | None = None
-    """Seconds from the first position, else the first row: what is before or after is left out."""
     topics: Sequence[str] = ()
     """`ROLE=NAME`, roles as in `dive.ROLES`: which topic or message to use."""
     datum_deg: tuple[float, float] | None = None
@@ -56,8 +51,6 @@ class ImportOptions:
     """Place on the body (FRD) that the logged position is of."""
     altitude_offset_m: float = 0.0
     """Offset added to altitudes."""
-    start_utc: str | None = None
-    """Time of the first position of a log without dates, ISO 8601."""
     vehicle_log: Path | None = None
     """Vehicle log to write, too."""
     dead_reckon: TrackErrors | None = None
@@ -68,16 +61,13 @@ class ImportOptions:
     """Latitude, longitude and its sigma in metres of the first velocity, for dead reckoning."""
 
     def __post_init__(self) -> None:
-        numbers = (
-            self.declination_deg, self.clock_offset_s, self.altitude_offset_m, *self.lever_body_m,
-        )  # fmt: skip
-        if not all(math.isfinite(number) for number in numbers):
-            raise NavigationError("declination, offsets and lever arm need finite numbers")
-        if abs(self.clock_offset_s) > _MAX_S:
-            raise NavigationError(f"--clock-offset {self.clock_offset_s:g} s is more than 30 years")
-        if abs(self.declination_deg) > 180:
+        if not (
+            abs(self.declination_deg) <= 180
+            and np.isfinite([*self.lever_body_m, self.altitude_offset_m]).all()
+        ):
             raise NavigationError(
-                f"a declination of {self.declination_deg:g} degrees: give -180 to 180"
+                f"declination {self.declination_deg:g}, lever arm {self.lever_body_m}: give -180 "
+                "to 180 degrees, and finite metres"
             )
         if self.start_at is not None:
             latitude, longitude, sigma = self.start_at
@@ -99,8 +89,7 @@ def import_log(
     is counted, by reason, in warnings and in the result.
 
     Args:
-        path: a bag of ROS 1 or 2, ArduSub's .BIN, .log or .tlog, PX4's .ulg, or the
-            reports of a DVL.
+        path: a bag of ROS 1 or 2, ArduSub's .BIN or .tlog, PX4's .ulg, or the reports of a DVL.
         out: CSV to write.
         options: what to change, and what to choose.
 
@@ -116,54 +105,52 @@ def import_log(
     for file in written:
         if file.resolve() == path.resolve() or written.count(file) > 1:
             raise NavigationError(f"{file} would be written over: choose another name")
-    dive = read_dive(path, options)
-    if options.flip_velocity:
-        dive = _flipped(path, dive)
-    dive = dead_reckoned(path, dive, options)
-    dated = dive.dated or options.start_utc is not None
-    if options.start_utc is not None:
-        dive = _dated(dive, options.start_utc)
-    tide = read_tide(options.tide, dated=dated)
+    dive = dead_reckoned(path, read_dive(path, options), options)
+    tide = read_tide(options.tide, dated=dive.dated)
     _warn_of_declination(dive, options.declination_deg)
-    logged_s = _stretch(dive, options.start_s, options.end_s)
-    time_s, columns = navigation_table(dive, logged_s, options, tide)
+    columns = navigation_table(dive, dive.row_times, options, tide)
     useful = np.any([np.isfinite(columns[name]) for name in READINGS], axis=0)
     lost = Counter(dict(dive.lost))
     if not useful.any():
         raise NavigationError(_nothing_of_use(path, dive, lost))
     if not useful.all():
         lost["rows without any reading"] += int((~useful).sum())
-    logged_s, time_s = logged_s[useful], time_s[useful]
+    time_s = dive.row_times[useful]
     columns = {name: column[useful] for name, column in columns.items()}
-    _warn_of_height(path, columns["depth_m"])
-    try:
-        texts = [_date(t) if dated else f"{t:.6f}" for t in time_s.tolist()]
-        write_navigation_rows(out, texts, columns, "time_utc" if dated else "time_s")
-        if options.vehicle_log is not None:
-            _write_vehicle_log(options.vehicle_log, dive, logged_s, options)
-    except OSError as error:
-        raise NavigationError(f"{error.filename}: cannot be written: {error.strerror}") from None
-    tidal = isinstance(tide, Signal) or tide != 0.0
-    return _report(path, out, dive, time_s, columns, lost, dated=dated, tidal=tidal)
-
-
-def _warn_of_height(path: Path, depth_m: Array) -> None:
-    """Warn of places that no submarine gets to."""
-    dry = depth_m < -_MAX_OUT_OF_WATER_M
+    dry = columns["depth_m"] < -_MAX_OUT_OF_WATER_M
     if dry.any():
         warn(
             f"{path}: {int(dry.sum())} of {len(dry)} rows lie above the water, by "
-            f"{-np.nanmin(depth_m):.1f} m at most: check the log's zero of depth, its vehicle, and "
-            "the tide; --start and --end leave parts out"
+            f"{-np.nanmin(columns['depth_m']):.1f} m at most: check the log's zero of depth, its "
+            "vehicle, and the tide"
         )
+    try:
+        texts = [_date(t) if dive.dated else f"{t:.6f}" for t in time_s.tolist()]
+        write_navigation_rows(out, texts, columns, "time_utc" if dive.dated else "time_s")
+        if options.vehicle_log is not None:
+            _write_vehicle_log(options.vehicle_log, dive, time_s, options)
+    except OSError as error:
+        raise NavigationError(f"{error.filename}: cannot be written: {error.strerror}") from None
+    tidal = isinstance(tide, Signal) or tide != 0.0
+    return _report(path, out, dive, time_s, columns, lost, tidal=tidal)
 
 
 def dead_reckoned(path: Path, dive: LoggedDive, options: ImportOptions) -> LoggedDive:
-    """A log's dive with positions by dead reckoning, where the options ask for them.
+    """A log's dive with positions by dead reckoning and velocities turned, as the options ask.
 
     Raises:
         NavigationError: the log holds too little; the message names it.
     """
+    if options.flip_velocity:
+        velocities = {"velocity_ned": dive.velocity_ned, "velocity_body": dive.velocity_body}
+        turned: dict[str, Any] = {
+            name: replace(signal, values=-signal.values)
+            for name, signal in velocities.items()
+            if signal is not None
+        }
+        if not turned:
+            raise NavigationError(f"{path}: holds no velocity that --flip-velocity could turn")
+        dive = replace(dive, **turned)
     if options.dead_reckon is None:
         return dive
     try:
@@ -172,21 +159,6 @@ def dead_reckoned(path: Path, dive: LoggedDive, options: ImportOptions) -> Logge
         )
     except NavigationError as error:
         raise NavigationError(f"{path}: {error}") from None
-
-
-def _flipped(path: Path, dive: LoggedDive) -> LoggedDive:
-    """The dive with its velocities the other way."""
-    if dive.velocity_ned is None and dive.velocity_body is None:
-        raise NavigationError(f"{path}: holds no velocity that --flip-velocity could turn round")
-
-    def other_way(signal: Signal | None) -> Signal | None:
-        return None if signal is None else replace(signal, values=-signal.values)
-
-    return replace(
-        dive,
-        velocity_ned=other_way(dive.velocity_ned),
-        velocity_body=other_way(dive.velocity_body),
-    )
 
 
 def _nothing_of_use(path: Path, dive: LoggedDive, lost: Mapping[str, int]) -> str:
@@ -218,7 +190,7 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
     chosen = _roles(options.topics)
     suffix = path.suffix.lower()
     datum = None if options.datum_deg is None else Datum(*options.datum_deg)
-    if suffix not in ("", ".bag", ".mcap", ".db3", ".bin", ".log") and datum is not None:
+    if suffix not in ("", ".bag", ".mcap", ".db3", ".bin") and datum is not None:
         raise NavigationError(
             "--datum is for the odometry of a bag of ROS and for ArduSub's .BIN: leave it out"
         )
@@ -228,15 +200,15 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
         return read_waterlinked(path, chosen)
     if suffix in (".ulg", ".ulog") or is_ulog(path):
         return read_px4_ulog(path, chosen)
-    if suffix in (".bin", ".log"):
+    if suffix == ".bin":
         return read_ardusub_bin(path, chosen, datum)
     if suffix == ".tlog":
         return read_ardusub_tlog(path, chosen)
     if suffix in _NOT_READ:
         raise NavigationError(f"{path}: {_NOT_READ[suffix]}")
     raise NavigationError(
-        f"{path}: not a known log: a ROS bag (.bag, .mcap, .db3 or a folder), ArduSub's .BIN, "
-        ".log or .tlog, PX4's .ulg, or JSON reports of a Water Linked DVL"
+        f"{path}: not a known log: a ROS bag (.bag, .mcap, .db3 or a folder), ArduSub's .BIN "
+        "or .tlog, PX4's .ulg, or JSON reports of a Water Linked DVL"
     )
 
 
@@ -260,52 +232,6 @@ def _roles(topics: Sequence[str]) -> dict[str, str]:
     return chosen
 
 
-def _dated(dive: LoggedDive, start_utc: str) -> LoggedDive:
-    """A log without dates, shifted so that its first position is at a moment."""
-    if dive.dated:
-        raise NavigationError("--start-utc is for logs without dates; this one has dates")
-    try:
-        start_s = utc_date(start_utc).timestamp()
-    except ValueError:
-        raise NavigationError(
-            f"--start-utc {start_utc!r} is not a date such as 2024-05-01T12:00:00Z"
-        ) from None
-    shift = start_s - _first_s(dive)
-    signals = {field.name: getattr(dive, field.name) for field in fields(dive)}
-    moved: dict[str, Any] = {
-        name: _later(signal, shift)
-        for name, signal in signals.items()
-        if isinstance(signal, Signal)
-    }
-    sigmas = {name: _later(signal, shift) for name, signal in dive.sigmas.items()}
-    return replace(dive, sigmas=sigmas, **moved)
-
-
-def _later(signal: Signal, by_s: float) -> Signal:
-    return replace(signal, time_s=signal.time_s + by_s)
-
-
-def _first_s(dive: LoggedDive) -> float:
-    """Time of the first position, else of the first row; 0 without rows."""
-    times = dive.row_times if dive.position is None else dive.position.time_s
-    return float(times[0]) if len(times) else 0.0
-
-
-def _stretch(dive: LoggedDive, start_s: float | None, end_s: float | None) -> Array:
-    """(N,) times of rows in a stretch, which is counted from the first position."""
-    times = dive.row_times
-    since = times - _first_s(dive)
-    first = -math.inf if start_s is None else start_s
-    last = math.inf if end_s is None else end_s
-    keep = (since >= first) & (since <= last)
-    if len(times) and not keep.any():
-        raise NavigationError(
-            f"--start {first:g} and --end {last:g} leave nothing of {since[-1]:.1f} s"
-        )
-    kept: Array = times[keep]
-    return kept
-
-
 def _warn_of_declination(dive: LoggedDive, declination_deg: float) -> None:
     known = dive.declination_in_log_deg
     if known is None or not declination_deg:
@@ -320,30 +246,29 @@ def _warn_of_declination(dive: LoggedDive, declination_deg: float) -> None:
 
 
 def navigation_table(
-    dive: LoggedDive, logged_s: Array, options: ImportOptions, tide: float | Signal
-) -> tuple[Array, dict[str, Array]]:
-    """Times, (N,), and the columns of the navigation CSV, (N,) each.
+    dive: LoggedDive, time_s: Array, options: ImportOptions, tide: float | Signal
+) -> dict[str, Array]:
+    """The columns of the navigation CSV, (N,) each.
 
     What is not known is NaN. Readings are interpolated onto the rows, but not across gaps. Depth
     is from the level that the tide counts from.
 
     Args:
         dive: as logged.
-        logged_s: (N,) times of rows as logged.
+        time_s: (N,) times of rows.
         options: what to correct.
         tide: height of the water above the level that depths are to count from, metres; or (N, 1)
-            of it on the clock of the log after the offset.
+            of it on the clock of the log.
 
     Raises:
         NavigationError: the lever arm needs an attitude that the log lacks, or the tide does not
             cover the dive.
     """
-    time_s = logged_s + options.clock_offset_s
 
     def at_rows(signal: Signal | None, count: int, *, turning: bool = False) -> Array:
         if signal is None:
-            return np.full((len(logged_s), count), np.nan)
-        return signal.at(logged_s, turning=turning)
+            return np.full((len(time_s), count), np.nan)
+        return signal.at(time_s, turning=turning)
 
     angles = at_rows(dive.attitude, 3, turning=True)
     angles[:, 2] += options.declination_deg
@@ -366,7 +291,7 @@ def navigation_table(
     columns = dict(zip(COLUMNS, values, strict=False))
     for name in COLUMNS[len(values) :]:
         columns[name] = at_rows(dive.sigmas.get(name), 1)[:, 0]
-    return time_s, columns
+    return columns
 
 
 def _at_origin(
@@ -398,7 +323,7 @@ def _write_vehicle_log(path: Path, dive: LoggedDive, at_s: Array, options: Impor
     from alice_survey.sim.vehicle.log import vehicle_log, write_vehicle_log
 
     # Depths of the log, not of the chart: a vehicle's log knows of no tide.
-    time_s, columns = navigation_table(dive, at_s, options, 0.0)
+    columns = navigation_table(dive, at_s, options, 0.0)
     place = np.stack([columns[name] for name in COLUMNS[:3]], axis=1)
     known = np.isfinite(place).all(axis=1)
     position = np.full(place.shape, np.nan)
@@ -422,7 +347,7 @@ def _write_vehicle_log(path: Path, dive: LoggedDive, at_s: Array, options: Impor
     if dive.pwm is not None:
         others = {f"pwm_{i}_us": column for i, column in enumerate(dive.pwm.at(at_s).T, 1)}
     log = vehicle_log(
-        np.round(time_s - time_s[0], 6),
+        np.round(at_s - at_s[0], 6),
         source=str(path),
         position_ned=position,
         quaternion_xyzw=quaternion,
@@ -442,7 +367,6 @@ def _report(
     columns: Mapping[str, Array],
     lost: Counter[str],
     *,
-    dated: bool,
     tidal: bool,
 ) -> tuple[str, dict[str, Any]]:
     """What was read, from where, and what is missing; warns of what was left out and of gaps."""
@@ -452,25 +376,20 @@ def _report(
     if lost:
         warn(f"{path}: left out: " + "; ".join(f"{n} {why}" for why, n in sorted(lost.items())))
     if gaps:
-        spans = ", ".join(
-            f"{length:.1f} s from {_moment(start)}" for start, length in gaps[:_NAMED]
-        )
+        spans = ", ".join(f"{length:.1f} s from {_moment(at)}" for at, length in gaps[:_NAMED])
         more = f" and {len(gaps) - _NAMED} more" if len(gaps) > _NAMED else ""
         warn(f"{path}: {len(gaps)} gaps in {leading}: {spans}{more}")
-    sources = {
-        "position": dive.position, "depth": dive.depth, "attitude": dive.attitude,
-        "altitude": dive.altitude,
-    }  # fmt: skip
-    named = {role: signal.source for role, signal in sources.items() if signal is not None}
+    signals = {role: getattr(dive, role) for role in ("position", "depth", "attitude", "altitude")}
+    named = {role: signal.source for role, signal in signals.items() if signal is not None}
     steps = np.diff(time_s)
     data: dict[str, Any] = {
         "log": str(path),
         "kind": dive.kind,
         "clock": dive.clock,
-        "dated": dated,
+        "dated": dive.dated,
         "out": str(out),
         "rows": len(time_s),
-        "start": _date(float(time_s[0])) if dated else float(time_s[0]),
+        "start": _date(float(time_s[0])) if dive.dated else float(time_s[0]),
         "duration_s": round(float(time_s[-1] - time_s[0]), 6),
         "median_interval_s": round(float(np.median(steps)), 6) if len(steps) else None,
         "sources": named,
@@ -480,26 +399,20 @@ def _report(
         "gaps": [{"start_s": round(a, 6), "length_s": round(b, 6)} for a, b in gaps],
         "notes": list(dive.notes),
     }
-    lines = [
-        f"{path}: {dive.kind}, {dive.clock}",
-        f"{out}: {len(time_s)} rows from {_moment(float(time_s[0]))}, {data['duration_s']:.1f} s",
-        *(f"  {role} from {source}" for role, source in named.items()),
-    ]
-    empty = [name for name, count in filled.items() if not count]
-    if empty:
-        lines.append(f"  not known: {', '.join(empty)}")
-    lines += [f"  {note}" for note in dive.notes]
-    lines += [f"  left out: {count} {reason}" for reason, count in data["left_out"].items()]
-    if gaps:
-        lines.append(f"  {len(gaps)} gaps, the longest {max(g[1] for g in gaps):.1f} s")
+    notes = [f"{role} from {source}" for role, source in named.items()]
+    if not all(filled.values()):
+        notes.append("not known: " + ", ".join(name for name, n in filled.items() if not n))
+    notes += dive.notes
     if tidal:
-        lines.append(
-            "  depths count from the level that --tide refers to: give import-images its name by "
+        notes.append(
+            "depths count from the level that --tide refers to: give import-images its name by "
             "--vertical-datum"
         )
-    if not dated:
-        lines.append("  the log has no dates: pictures are tied to it by --clock-offset alone")
-    return "\n".join(lines), data
+    if not dive.dated:
+        notes.append("the log has no dates: pictures are tied to it by --clock-offset alone")
+    head = f"{path}: {dive.kind}, {dive.clock}\n{out}: {len(time_s)} rows from "
+    head += f"{_moment(float(time_s[0]))}, {data['duration_s']:.1f} s"
+    return "\n  ".join([head, *notes]), data
 
 
 def _gaps(time_s: Array) -> list[tuple[float, float]]:

@@ -98,12 +98,9 @@ def _pairing(folder: Path) -> None:
 
 
 def _dataflash(folder: Path, name: str) -> None:
-    from tests.missions.logs.log_files import dataflash_log, dataflash_text
+    from tests.missions.logs.log_files import dataflash_log
 
-    if name.endswith(".log"):
-        (folder / name).write_text(dataflash_text(_dive()))
-    else:
-        (folder / name).write_bytes(dataflash_log(_dive()))
+    (folder / name).write_bytes(dataflash_log(_dive()))
 
 
 def _telemetry(folder: Path) -> None:
@@ -339,10 +336,6 @@ TARGETS = (
     Target(
         name="DataFlash .BIN", syntax="binary", file="a.bin",
         build=partial(_dataflash, name="a.bin"), read=read_any_log,
-    ),
-    Target(
-        name="DataFlash .log", syntax="csv", file="a.log",
-        build=partial(_dataflash, name="a.log"), read=read_any_log,
     ),
     Target(name="tlog", syntax="binary", file="a.tlog", build=_telemetry, read=read_any_log),
     _csv("navigation CSV", "n.csv", partial(navigation_rows, dated=False), read_nav),

@@ -170,16 +170,6 @@ def import_log(
     tide: Annotated[
         str, typer.Option(help="Height of the water above the level of depths: metres, or a CSV.")
     ] = "0",
-    clock_offset: Annotated[
-        float, typer.Option(metavar="SECONDS", help="Add this to the times of the log.")
-    ] = 0.0,
-    start: Annotated[
-        float | None,
-        typer.Option(metavar="SECONDS", help="Begin so long after the first position."),
-    ] = None,
-    end: Annotated[
-        float | None, typer.Option(metavar="SECONDS", help="End so long after the first position.")
-    ] = None,
     topic: Annotated[
         list[str] | None,
         typer.Option(
@@ -200,10 +190,6 @@ def import_log(
     altitude_offset: Annotated[
         float, typer.Option(metavar="METRES", help="Add this to altitudes.")
     ] = 0.0,
-    start_utc: Annotated[
-        str | None,
-        typer.Option(metavar="DATE", help="Date of the first position of a log without dates."),
-    ] = None,
     vehicle_log: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write a vehicle log too.")
     ] = None,
@@ -217,15 +203,9 @@ def import_log(
             metavar="LATITUDE LONGITUDE SIGMA", help="Place of the first velocity and its sigma, m."
         ),
     ] = None,
-    speed_sigma: Annotated[
-        float, typer.Option(help="Relative error of speeds in dead reckoning.")
-    ] = 0.005,
     heading_sigma: Annotated[
         float, typer.Option(help="Constant error of headings in dead reckoning, degrees.")
     ] = 1.0,
-    velocity_noise: Annotated[
-        float, typer.Option(help="Noise of velocities over one second in dead reckoning, m/s.")
-    ] = 0.02,
     flip_velocity: Annotated[
         bool, typer.Option("--flip-velocity", help="Turn the velocities of a DVL round.")
     ] = False,
@@ -241,14 +221,9 @@ def import_log(
     from missions.logs.import_log import import_log as work
 
     options = ImportOptions(
-        declination_deg=declination, tide=tide, clock_offset_s=clock_offset, start_s=start,
-        end_s=end, topics=topic or (), datum_deg=datum, lever_body_m=lever_arm,
-        altitude_offset_m=altitude_offset, start_utc=start_utc,
-        vehicle_log=vehicle_log, start_at=start_at,
-        flip_velocity=flip_velocity,
-        dead_reckon=(
-            TrackErrors(scale=speed_sigma, heading_deg=heading_sigma, noise_mps=velocity_noise)
-            if dead_reckon else None
-        ),
+        declination_deg=declination, tide=tide, topics=topic or (), datum_deg=datum,
+        lever_body_m=lever_arm, altitude_offset_m=altitude_offset, vehicle_log=vehicle_log,
+        start_at=start_at, flip_velocity=flip_velocity,
+        dead_reckon=TrackErrors(heading_deg=heading_sigma) if dead_reckon else None,
     )  # fmt: skip
     print_result(*work(log, output, options), as_json)

@@ -287,18 +287,6 @@ def dataflash_log(messages: Iterable[tuple[Any, ...]], names: Iterable[str] | No
     return log + b"".join(dataflash_message(*message) for message in own)
 
 
-def dataflash_text(messages: Iterable[tuple[Any, ...]]) -> str:
-    """The same as a text log."""
-    own = list(messages)
-    lines = []
-    for name in dict.fromkeys(["FMT", *(m[0] for m in own)]):
-        number, kinds, fields = DATAFLASH[name]
-        lines.append(f"FMT, {number}, 0, {name}, {kinds}, {fields}")
-    lines += [", ".join([m[0], *(f"{v:.7f}" if isinstance(v, float) else str(v) for v in m[1:])])
-              for m in own]  # fmt: skip
-    return "\n".join(lines) + "\n"
-
-
 def tlog(records: Iterable[tuple[float, Any]], *, version: int = 2, system: int = 1) -> bytes:
     """A ground station's log of messages (time recorded, message of pymavlink's dialect)."""
     from pymavlink.dialects.v20 import ardupilotmega as mavlink

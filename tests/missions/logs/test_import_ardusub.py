@@ -16,7 +16,7 @@ from alice_survey.sim.vehicle.identification.windows import make_windows
 from alice_survey.sim.vehicle.log import read_column_map, read_foreign_log, read_vehicle_log
 from missions.logs.import_log import ImportOptions, import_log
 from missions.logs.navigation_csv import read_navigation
-from tests.missions.logs.log_files import dataflash_log, dataflash_message, dataflash_text, tlog
+from tests.missions.logs.log_files import dataflash_log, dataflash_message, tlog
 
 # Week 2312 of GPS began on Sunday 28 April 2024; 302418 s into it are 1 May 12:00:18 by GPS, whose
 # clock was 18 s ahead of UTC.
@@ -72,15 +72,8 @@ def numbers(path: Path, *names: str) -> np.ndarray:
         )
 
 
-@pytest.mark.parametrize("form", ["dive.BIN", "dive.log"])
-def test_an_on_board_log_becomes_navigation(tmp_path: Path, form: str) -> None:
-    log = tmp_path / form
-    if form.endswith("BIN"):
-        log.write_bytes(dataflash_log(dive_messages()))
-    else:
-        log.write_text(dataflash_text(dive_messages()))
-
-    data = imported(tmp_path, log)
+def test_an_on_board_log_becomes_navigation(tmp_path: Path) -> None:
+    data = imported(tmp_path, bin_log(tmp_path))
 
     assert data["left_out"] == {}
     assert data["sources"] == {
@@ -147,18 +140,6 @@ def test_tide_by_hand(tmp_path: Path) -> None:
 
     data = imported(tmp_path, log)
     assert data["depths_from"] == "sea surface"
-
-
-def test_clock_offset_and_trimming(tmp_path: Path) -> None:
-    log = bin_log(tmp_path)
-    options = ImportOptions(clock_offset_s=-2.5, start_s=0.45, end_s=1.05)
-    import_log(log, tmp_path / "n.csv", options)
-    read = read_navigation(tmp_path / "n.csv", UTC)
-    assert read.start_utc is not None
-    assert (read.start_utc - FIX_UTC).total_seconds() == pytest.approx(1.5 - 2.5, abs=2e-6)
-    np.testing.assert_allclose(read.time_s, 0.1 * np.arange(6), atol=2e-6)
-    with pytest.raises(NavigationError, match="--start"):
-        imported(tmp_path, log, start_s=5.0)
 
 
 def test_a_lever_arm_moves_positions_to_the_body(tmp_path: Path) -> None:
@@ -279,7 +260,7 @@ def test_one_of_several_depth_sensors_must_be_chosen(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("messages", "known"),
     [
-        (("XKF1",), {"depth_m"}),
+        (("XKF1",), {"depth_m", "roll_deg", "pitch_deg", "heading_deg"}),
         (("XKF1", "ATT"), {"depth_m", "roll_deg", "pitch_deg", "heading_deg"}),
         (("ATT",), {"roll_deg", "pitch_deg", "heading_deg"}),
         (("ATT", "RFND"), {"roll_deg", "pitch_deg", "heading_deg", "altitude_m"}),
@@ -288,20 +269,9 @@ def test_one_of_several_depth_sensors_must_be_chosen(tmp_path: Path) -> None:
 def test_a_vehicle_without_positions_logs_what_it_measures(
     tmp_path: Path, messages: tuple[str, ...], known: set[str]
 ) -> None:
-    """A BlueROV2 without GPS: the filter has a depth, but no origin to count north and east from.
-
-    Without an ATT, XKF1 would give attitudes too: its angles are left out of the log here.
-    """
-    kept = [
-        (*m[:3], *([math.nan] * 3 if "ATT" not in messages else m[3:6]), *m[6:])
-        if m[0] == "XKF1"
-        else m
-        for m in dive_messages()
-        if m[0] in messages
-    ]
-    log = tmp_path / "dive.log"
-    log.write_text(dataflash_text(kept))
-    data = imported(tmp_path, log)
+    """A BlueROV2 without GPS: the filter has a depth, but no origin to count north and east from."""
+    kept = [m for m in dive_messages() if m[0] in messages]
+    data = imported(tmp_path, bin_log(tmp_path, kept))
     assert {name for name, count in data["filled"].items() if count} == known
     read = read_navigation(tmp_path / "n.csv", UTC, ())
     if "depth_m" in known:
@@ -425,6 +395,7 @@ def test_telemetry_without_a_position(tmp_path: Path) -> None:
     ("name", "content"),
     [
         ("a.txt", "hello"),
+        ("text.log", "FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns"),
         ("nav.csv", "time_s,latitude_deg,longitude_deg,depth_m\n"),
         ("dvl.pd0", "\x7f\x7f"),
         ("dive.BIN", ""),
@@ -439,11 +410,10 @@ def test_other_files_are_refused_by_name(tmp_path: Path, name: str, content: str
         import_log(tmp_path / name, tmp_path / "n.csv")
 
 
-@pytest.mark.parametrize("form", ["dive.BIN", "dive.log", "dive.tlog"])
+@pytest.mark.parametrize("form", ["dive.BIN", "dive.tlog"])
 def test_damaged_logs_end_in_a_table_or_in_one_line(tmp_path: Path, form: str) -> None:
     whole = {
         "dive.BIN": dataflash_log(dive_messages()),
-        "dive.log": dataflash_text(dive_messages()).encode(),
         "dive.tlog": tlog(telemetry()),
     }[form]
     rng = np.random.default_rng(11)

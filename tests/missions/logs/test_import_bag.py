@@ -137,11 +137,6 @@ def test_a_simulations_clock_gives_seconds(tmp_path: Path) -> None:
     times = numbers(tmp_path / "n.csv", "time_s")[:, 0]
     np.testing.assert_allclose(times, flight().time_s, atol=1e-6)
 
-    import_log(
-        tmp_path / "dive", tmp_path / "n.csv", ImportOptions(start_utc="2024-05-01T12:00:00Z")
-    )
-    assert rows_of(tmp_path / "n.csv")[1]["time_utc"] == "2024-05-01T12:00:00.100000Z"
-
 
 @pytest.mark.parametrize("frame", ["world_ned", "odom"])
 def test_odometry_in_either_convention(tmp_path: Path, frame: str) -> None:
