@@ -269,7 +269,7 @@ def test_one_of_several_depth_sensors_must_be_chosen(tmp_path: Path) -> None:
 def test_a_vehicle_without_positions_logs_what_it_measures(
     tmp_path: Path, messages: tuple[str, ...], known: set[str]
 ) -> None:
-    """A BlueROV2 without GPS: the filter has a depth, but no origin to count north and east from."""
+    """A BlueROV2 without GPS: the filter has a depth, but no origin to count from."""
     kept = [m for m in dive_messages() if m[0] in messages]
     data = imported(tmp_path, bin_log(tmp_path, kept))
     assert {name for name, count in data["filled"].items() if count} == known
