@@ -11,6 +11,7 @@ from alice_survey.core.frames import Array
 from camera_calib.freedom import HELD, Freedom
 from camera_calib.rig import Covariance, Rig
 from camera_calib.target_shape import AS_DRAWN, TargetShape
+from camera_calib.targets.target import Rejection
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -21,17 +22,6 @@ class TargetView:
     pixels: Mapping[str, Array]
     """By camera: (N, 2) pixels of the target's N points; NaN rows were not found. A camera that
     found nothing is absent."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Rejection:
-    """A picture, or points of it, that took no part, and why."""
-
-    view: str
-    camera: str
-    points: int
-    """Number of points; 0 for the whole picture."""
-    reason: str
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

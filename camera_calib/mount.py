@@ -162,7 +162,7 @@ def mount_report(
     elif mount is not None:
         lines.append("nothing is written: add -o FILE")
     if plot is not None:
-        from camera_calib.judge.mount_figure import plot_mount
+        from camera_calib.mount_figure import plot_mount
 
         plot_mount(rig, plot)
         lines.append(f"drawing in {plot}")

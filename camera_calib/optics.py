@@ -22,8 +22,15 @@ Optics = tuple[int, Array, int, Array]
 """Kind and values of a lens, kind and values of a port."""
 LENSES: dict[str, type[LensValues]] = {lens.model: lens for lens in (OpenCVLens, FisheyeLens)}
 PORTS: dict[str, type[PortValues]] = {port.shape: port for port in (NoPort, FlatPort, DomePort)}
+_BETWEEN = 1.17
+"""Between the ratio of focal lengths of a dome, 1, and that of a flat port, the water's index."""
 _FISHEYE = FisheyeLens.kind
 _FLAT, _DOME = FlatPort.kind, DomePort.kind
+
+
+def likely_port(focal_ratio: float) -> str:
+    """The kind of port that makes focal lengths so many times longer under water than in air."""
+    return FlatPort.shape if focal_ratio > _BETWEEN else DomePort.shape
 
 
 @compiled_ieee

@@ -6,11 +6,7 @@ from functools import partial
 
 from alice_survey.core.errors import CalibrationError
 from camera_calib.calibrate.detect_views import Detections, Size
-from camera_calib.calibrate.housing import (
-    compare_housings,
-    focal_ratios,
-    likely_port,
-)
+from camera_calib.calibrate.housing import compare_housings, focal_ratios
 from camera_calib.calibrate.options import AUTO, PORT_KINDS, CalibrateOptions, kinds_by_camera
 from camera_calib.calibrate.solve import (
     blank_camera,
@@ -24,7 +20,7 @@ from camera_calib.calibration import Calibration, TargetView
 from camera_calib.camera import Camera
 from camera_calib.freedom import LENSES, USUAL_LENS, LensNames, part_of_rig
 from camera_calib.lenses.opencv import OpenCVLens
-from camera_calib.optics import PORTS
+from camera_calib.optics import PORTS, likely_port
 from camera_calib.ports.flat import FlatPort
 from camera_calib.ports.none import NO_PORT, NoPort
 from camera_calib.ports.values import PortValues

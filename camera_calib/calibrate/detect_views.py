@@ -11,11 +11,11 @@ import numpy as np
 from alice_survey.core.errors import CalibrationError
 from alice_survey.core.executor import Executor
 from camera_calib.calibrate.picture_sets import PictureSet
-from camera_calib.calibration import Rejection, TargetView
+from camera_calib.calibration import TargetView
 from camera_calib.picture_files import is_cut_short, read_pixels
 from camera_calib.targets.detect import Detection, detect_with_reasons
 from camera_calib.targets.grow import chessboard_size
-from camera_calib.targets.target import Target
+from camera_calib.targets.target import Rejection, Target
 
 _CHECKED = 3
 _READ = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION

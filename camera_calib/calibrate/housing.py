@@ -18,12 +18,9 @@ from camera_calib.calibrate.solve import blank_camera, first_cameras
 from camera_calib.calibration import Calibration, HousingJudgement, HousingTrial, TargetView
 from camera_calib.freedom import LensNames, lens_of
 from camera_calib.ports.dome import DomePort
-from camera_calib.ports.flat import FlatPort
 from camera_calib.ports.none import NoPort
 from camera_calib.rig import Rig
 
-_BETWEEN = 1.17
-"""Between the ratio of a dome, 1, and that of a flat port, the water's index."""
 _ALIKE = 1.01
 """Noise over the least one, below which a housing explains the views as well."""
 
@@ -50,11 +47,6 @@ def focal_ratios(
         )
         for name, camera in found.items()
     }
-
-
-def likely_port(focal_ratio: float) -> str:
-    """The kind of port that makes focal lengths so many times longer under water."""
-    return FlatPort.shape if focal_ratio > _BETWEEN else DomePort.shape
 
 
 def compare_housings(calibrations: Mapping[str, Callable[[], Calibration]]) -> Calibration:

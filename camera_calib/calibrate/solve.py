@@ -23,7 +23,6 @@ from camera_calib.calibrate.observability import advice, unobservable
 from camera_calib.calibrate.start import first_cam_from_rig, first_focal_px, locate_all, spans
 from camera_calib.calibration import (
     Calibration,
-    Rejection,
     TargetView,
     residuals_px,
     stack_views,
@@ -46,6 +45,7 @@ from camera_calib.ports.none import NO_PORT
 from camera_calib.ports.values import PortValues
 from camera_calib.rig import Rig
 from camera_calib.target_shape import TargetShape, usual_shape
+from camera_calib.targets.target import Rejection
 
 Intrinsics = Literal["held", "prior", "free"]
 

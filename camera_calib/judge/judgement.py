@@ -1,34 +1,43 @@
-"""All measures of a calibration that its report shows, as numbers."""
+"""All measures of a calibration that its report shows, and the verdicts on them.
 
-import math
-from collections.abc import Collection
+A verdict is one line with its numbers and what to do. What the views do not constrain is in the
+calibration's own warnings.
+"""
+
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from alice_survey.core.frames import Array
 from alice_survey.core.run import progress
+from alice_survey.kit.document import Level, Verdict, worst_first
+from alice_survey.kit.words import with_sigma
 from camera_calib.calibration import Calibration
-from camera_calib.freedom import POSE, value
-from camera_calib.judge.fit_quality import (
+from camera_calib.judge.residuals import (
     CameraResiduals,
     Coverage,
+    HomographyTest,
     PictureFit,
     Profile,
+    TargetFrame,
     camera_residuals,
     coverage,
+    homography_test,
+    incidence_profile,
     picture_fits,
-    residual_profiles,
+    target_frame,
 )
-from camera_calib.judge.homography import HomographyTest, homography_test
-from camera_calib.judge.target_frame import TargetFrame, target_frame
 from camera_calib.judge.uncertainty import (
+    Parameter,
     ProjectionSigma,
+    RangeSigma,
     StereoSigma,
-    baseline_sigma_m,
+    baselines_m,
     compensation,
-    covariance_of,
     projection_sigma,
+    rig_parameters,
+    sigmas_by_range,
     stereo_sigma,
 )
 from camera_calib.judge.validation import (
@@ -42,41 +51,49 @@ from camera_calib.judge.validation import (
     length_errors,
     score_hold_out,
 )
-from camera_calib.rig import Rig
+from camera_calib.optics import likely_port
+from camera_calib.target_shape import BOW_X, BOW_Y
 
 DESIGN_RANGE_M = 2.0
 """Usual working range; used if the views are close to it."""
 _RANGE_STEPS = np.array([0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.0])
 """Distances evaluated, in working ranges: 0.5 to 10 m for 2 m."""
 _MAP_COLUMNS, _MAP_ROWS = 25, 21
-_DEG = math.degrees(1.0)
 
-
-@dataclass(frozen=True, kw_only=True)
-class Parameter:
-    """One calibrated or held number, in units for readers."""
-
-    name: str
-    value: float
-    sigma: float | None
-    """Standard deviation; None: it was held."""
-    unit: str
-    most_alike: str
-    """The parameter it correlates with most; empty when held or alone."""
-    correlation: float
-    prior: bool
-    """Whether it had a prior."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class RangeSigma:
-    """Projection uncertainty over the frame of one camera at one distance, px."""
-
-    range_m: float
-    plain_median_px: float
-    plain_worst_px: float
-    compensated_median_px: float
-    compensated_worst_px: float
+_ODD_PICTURE = 2.0
+_MAX_OUTLIERS = 0.01
+"""Share of the points."""
+_HELD_OUT_LIMITS = 1.2, 2.0
+"""Ratios above which a verdict is `look` and `bad`, here as in all pairs of limits."""
+_HALVES_LIMITS = 2.0, 3.5
+"""One difference is a single draw from what is expected."""
+_P_LOOK, _P_BAD = 1e-2, 1e-6
+"""Probabilities of the difference of two halves."""
+_FRESH_WATER = 1.33
+_RATIO_OFF = 0.12
+"""Share by which a ratio of focal lengths may differ from what the port makes of it; domes are
+centred by hand, and a flat port's distance lengthens them a little."""
+_NEAREST_GLASS_M, _MAX_GLASS_M = 0.002, 0.25
+"""Distances from the pupil that a flat port of a housing may have."""
+_OPEN = 0.5
+"""Share of its prior's sigma above which the views do not show a bow."""
+_VERY_BENT = 2.0
+"""Bow over its prior's sigma."""
+_RETURNING = 0.5
+"""Residuals that return in the target's frame, over the noise of a coordinate."""
+_SIGMAS = 3.0
+_MOVED_LIMITS = 3.5, 6.0
+"""Sigmas by which views may move a parameter from its prior."""
+_LEARNT = 0.99
+"""Share of a prior's variance below which the views determine a parameter as well."""
+_TREND_LIMITS = 0.35, 1.0
+_SIGMA_LIMITS = 3.0, 10.0
+"""Projection sigma that nine tenths of the frame keep below, over the noise."""
+_CAUSES = {
+    "shape": "the target is bent or stretched, and its shape was not adjusted",
+    "corners": "a few of its corners are displaced or damaged",
+    "uneven": "its print or paper is uneven",
+}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -84,9 +101,8 @@ class CameraJudgement:
     """Measures of one camera."""
 
     seen: CameraResiduals
-    by_radius: Profile
     by_incidence: Profile
-    """Residuals against the radius and against the angle to the port's normal in water, deg."""
+    """Residuals against the angle to the port's normal in water, deg."""
     coverage: Coverage
     homography: HomographyTest | None
     sigma: ProjectionSigma
@@ -100,7 +116,6 @@ class Judgement:
     """Contents of a calibration report."""
 
     calibration: Calibration
-    held: HeldOut | None
     working_range_m: float
     parameters: tuple[Parameter, ...]
     baselines_m: dict[str, tuple[float, float]]
@@ -121,8 +136,7 @@ class Judgement:
     @property
     def stereo_at_work(self) -> StereoSigma | None:
         """Stereo at the working range."""
-        at = [s for s in self.stereo if s.range_m == self.working_range_m]
-        return at[0] if at else None
+        return next((s for s in self.stereo if s.range_m == self.working_range_m), None)
 
 
 @progress.step("judge the calibration")
@@ -140,40 +154,27 @@ def judge(
     Raises:
         CalibrationError: the rig has no covariance.
     """
-    rig = calibration.rig
-    covariance_of(rig)
+    rig, found = calibration.rig, calibration
+    parameters = rig_parameters(rig, calibration.freedom.prior.parameters)
     range_m = working_range_m or _working_range_m(calibration)
     ranges = tuple(float(r) for r in range_m * _RANGE_STEPS)
     stereo = len(rig.cameras) > 1
     lengths = held_lengths = None
     if stereo:
         lengths = length_errors(
-            rig,
-            calibration.views,
-            calibration.rig_from_target,
-            calibration.residuals_px,
-            calibration.target_points,
-            calibration.sigma_px,
-        )
+            rig, found.views, found.rig_from_target, found.residuals_px, found.target_points,
+            found.sigma_px,
+        )  # fmt: skip
     if stereo and held is not None:
         held_lengths = length_errors(
-            held.used.rig,
-            held.views,
-            held.rig_from_target,
-            held.residuals_px,
-            held.used.target_points,
-            held.used.noise_px,
-        )
+            held.used.rig, held.views, held.rig_from_target, held.residuals_px,
+            held.used.target_points, held.used.noise_px,
+        )  # fmt: skip
     return Judgement(
         calibration=calibration,
-        held=held,
         working_range_m=range_m,
-        parameters=rig_parameters(rig, calibration.freedom.prior.parameters),
-        baselines_m={
-            name: (float(np.linalg.norm(pose.translation)), baseline_sigma_m(rig, name))
-            for name, pose in rig.cam_from_rig.items()
-            if name != rig.reference
-        },
+        parameters=parameters,
+        baselines_m=baselines_m(rig),
         pictures=tuple(picture_fits(calibration)),
         cameras={name: _camera(calibration, held, name, range_m, ranges) for name in rig.cameras},
         stereo=tuple(stereo_sigma(rig, r, calibration.noise_px) for r in ranges) if stereo else (),
@@ -186,8 +187,8 @@ def judge(
 
 
 def _working_range_m(calibration: Calibration) -> float:
-    middle = calibration.target_points.mean(axis=0)
-    ranges = calibration.rig_from_target.apply(middle)[:, 2]
+    centre = calibration.target_points.mean(axis=0)
+    ranges = calibration.rig_from_target.apply(centre)[:, 2]
     if ranges.min() / 2 <= DESIGN_RANGE_M <= ranges.max() * 2:
         return DESIGN_RANGE_M
     return float(np.median(ranges))
@@ -213,94 +214,240 @@ def _camera(
     ranges: tuple[float, ...],
 ) -> CameraJudgement:
     rig, model = calibration.rig, calibration.rig.cameras[name]
-    seen = camera_residuals(calibration, name)
-    by_radius, by_incidence = residual_profiles(model, seen)
-    anchors = anchors_cam(calibration, name)
-    pixels = model.frame_grid(_MAP_COLUMNS, _MAP_ROWS)
+    seen, anchors = camera_residuals(calibration, name), anchors_cam(calibration, name)
+    pixels, compensating = (
+        model.frame_grid(_MAP_COLUMNS, _MAP_ROWS),
+        compensation(rig, name, anchors),
+    )
     halves = None
     if held is not None and held.halves is not None:
         halves = halves_difference(held.halves, name, pixels, range_m, anchors)
-    coarse, compensating = pixels[::2, ::2], compensation(rig, name, anchors)
     return CameraJudgement(
         seen=seen,
-        by_radius=by_radius,
-        by_incidence=by_incidence,
+        by_incidence=incidence_profile(model, seen),
         coverage=coverage(model, seen.pixels),
         homography=homography_test(calibration, name),
         sigma=projection_sigma(rig, name, pixels, range_m, compensating),
-        by_range=tuple(
-            over_frame(r, projection_sigma(rig, name, coarse, r, compensating)) for r in ranges
-        ),
+        by_range=sigmas_by_range(rig, name, pixels[::2, ::2], ranges, compensating),
         halves=halves,
     )
 
 
-def over_frame(range_m: float, sigma: ProjectionSigma) -> RangeSigma:
-    """Median and largest of a map; NaN where nothing is known."""
+def verdicts(judged: Judgement) -> tuple[Verdict, ...]:
+    """Six kinds of verdicts, the worst first: fit, port, held-out views, scale, target, pixels."""
+    kinds = (
+        _fit_verdicts, _port_verdicts, _hold_out_verdicts, _length_verdicts, _target_verdicts,
+        _uncertainty_verdicts,
+    )  # fmt: skip
+    found = [verdict for kind in kinds for verdict in kind(judged)]
+    return tuple(worst_first(found))
 
-    def known(values: Array) -> tuple[float, float]:
-        kept = values[np.isfinite(values)]
-        return (float(np.median(kept)), float(kept.max())) if len(kept) else (np.nan, np.nan)
 
-    plain, compensated = known(sigma.plain_px), known(sigma.compensated_px)
-    return RangeSigma(
-        range_m=range_m,
-        plain_median_px=plain[0],
-        plain_worst_px=plain[1],
-        compensated_median_px=compensated[0],
-        compensated_worst_px=compensated[1],
+def _graded(ratio: float, limits: tuple[float, float], text: str, advice: str = "") -> Verdict:
+    """A verdict on a ratio; advice is added where it is not good."""
+    level: Level = "good" if ratio <= limits[0] else "look" if ratio <= limits[1] else "bad"
+    return Verdict(level=level, text=text if level == "good" else text + advice)
+
+
+def _look(text: str) -> Verdict:
+    return Verdict(level="look", text=text)
+
+
+def _outlier_verdicts(outliers: int, points: int, which: str) -> Iterator[Verdict]:
+    if outliers > _MAX_OUTLIERS * points:
+        yield _look(f"{outliers} of {points} {which} are outliers")
+
+
+def _fit_verdicts(judged: Judgement) -> Iterator[Verdict]:
+    """Pictures that fit badly, outliers, and what homographies leave at the edges."""
+    median = float(np.median([p.rms_px for p in judged.pictures]))
+    odd = [p for p in judged.pictures if p.rms_px > _ODD_PICTURE * median]
+    score = judged.hold_out
+    if odd:
+        harmless = score is not None and score.rms_px <= _HELD_OUT_LIMITS[0] * score.expected_px
+        listed = ", ".join(f"view {p.view} of {p.camera} ({p.rms_px:.3f} px)" for p in odd[:5])
+        yield Verdict(
+            level="good" if harmless else "look",
+            text=f"{len(odd)} pictures over {_ODD_PICTURE:g} times the median of {median:.3f} px "
+            f"rms, such as {listed}; "
+            + ("held-out views fit as expected nonetheless" if harmless
+               else "look at them for blur, motion or a bent target"),
+        )  # fmt: skip
+    else:
+        yield Verdict(level="good", text=f"all pictures fit alike (median {median:.3f} px rms)")
+    outliers, points = (sum(getattr(p, n) for p in judged.pictures) for n in ("outliers", "points"))
+    yield from _outlier_verdicts(outliers, points, "points")
+    frame, noise_px = judged.target_frame, judged.calibration.noise_px
+    cause = "the model of lens or port does not fit"
+    if frame is not None and frame.likely == "shape":
+        cause = "the target departs from its drawing"
+    elif frame is not None and frame.likely and frame.returning_px > _RETURNING * noise_px:
+        cause = f"the target is uneven, or {cause}"
+    for name, camera in judged.cameras.items():
+        test = camera.homography
+        if test is not None and np.isfinite(test.outer_px):
+            yield _graded(
+                test.excess_px / max(test.inner_px, 1e-12), _TREND_LIMITS,
+                f"{name}: homographies leave {test.inner_px:.3f} px within and "
+                f"{test.outer_px:.3f} px beyond {test.outer_from_px:.0f} px from the centre",
+                f"; {cause}",
+            )  # fmt: skip
+
+
+def _port_verdicts(judged: Judgement) -> Iterator[Verdict]:
+    """Whether the rig can be the one that the views were taken with, and its port theirs."""
+    calibration = judged.calibration
+    rig = calibration.rig
+    if set(rig.cameras) == {"left", "right"}:
+        x, y, z = (1e3 * rig.cam_from_rig["right"].inv().translation).tolist()
+        if x < -max(abs(y), abs(z)):
+            yield Verdict(
+                level="bad",
+                text=f"the right camera is {-x:.0f} mm to the left of the left one: swap --left "
+                "and --right, unless the cameras hang upside down",
+            )
+    for name, camera in rig.cameras.items():
+        ratio = calibration.housing.focal_ratios.get(name)
+        if ratio is not None:
+            fits = abs(ratio / camera.port.magnification - 1.0) < _RATIO_OFF
+            yield Verdict(
+                level="good" if fits else "bad",
+                text=f"focal lengths of {name} under water are {ratio:.3f} times those in air: "
+                f"{max(camera.n_water, _FRESH_WATER):.3g} behind a flat port, near 1 behind a dome "
+                "or without a port"
+                + ("" if fits
+                   else f"; calibrate with --port {likely_port(ratio)}, or --port auto"),
+            )  # fmt: skip
+        spread_m = _SIGMAS * rig.sigmas.get(f"{name}.port_distance_m", np.inf)
+        if np.isfinite(spread_m):
+            distance_m = camera.parameter("port_distance_m")
+            if not _NEAREST_GLASS_M - spread_m < distance_m <= _MAX_GLASS_M + spread_m:
+                yield Verdict(
+                    level="bad",
+                    text=f"the flat port of {name} ended {distance_m * 1e3:.2g} mm before the "
+                    "pupil, where no housing has glass: the pictures are through a dome, without a "
+                    "port, or in air; try --port auto",
+                )
+    yield from _prior_verdicts(calibration)
+
+
+def _prior_verdicts(calibration: Calibration) -> Iterator[Verdict]:
+    """Whether the views contradict what was known before, as a wrong kind of port makes them do.
+
+    The change of a parameter by the views has the variance of its prior less that of the result.
+    Where correlated noise of the corners makes the result the less certain of the two, it has their
+    sum at most.
+    """
+    prior, result = calibration.freedom.prior, calibration.rig.covariance
+    if result is None or not prior.parameters:
+        return
+    before = np.diag(prior.covariance)
+    after = np.diag(result.marginal(prior.parameters).matrix)
+    spread = np.sqrt(np.where(after < _LEARNT * before, before - after, before + after))
+    moved = np.abs(prior.misfit(calibration.rig) / spread)
+    largest = int(moved.argmax())
+    yield _graded(
+        float(moved[largest]), _MOVED_LIMITS,
+        f"the views move {prior.parameters[largest]} by {moved[largest]:.1f} sigmas from its prior,"
+        " more than any other parameter",
+        ": port, lens or water differ from the prior; try --port auto, or --intrinsics free if the "
+        "focus changed",
+    )  # fmt: skip
+
+
+def _hold_out_verdicts(judged: Judgement) -> Iterator[Verdict]:
+    """Views that took no part, and calibrations from halves of the views."""
+    score, halves = judged.hold_out, judged.halves
+    if score is None:
+        yield _look("no views were held out: the fit is not tested")
+        return
+    ratio = score.rms_px / score.expected_px
+    yield _graded(
+        ratio, _HELD_OUT_LIMITS,
+        f"{score.views} held-out views fit to {score.rms_px:.3f} px rms, {ratio:.2f} times what "
+        f"noise and covariance predict ({score.expected_px:.3f} px); used views to "
+        f"{score.used_rms_px:.3f} px",
+    )  # fmt: skip
+    yield from _outlier_verdicts(score.outliers, score.points + score.outliers, "held-out points")
+    for name, camera in judged.cameras.items():
+        if camera.halves is not None:
+            ratio = camera.halves.rms_px / camera.halves.expected_px
+            yield _graded(
+                ratio, _HALVES_LIMITS,
+                f"{name}: calibrations from either half of the views differ by "
+                f"{camera.halves.rms_px:.3f} px rms, {ratio:.2f} times what their covariances "
+                "predict",
+            )  # fmt: skip
+    if halves is not None:
+        yield _graded(
+            -np.log(max(halves.p_value, 1e-300)), (-np.log(_P_LOOK), -np.log(_P_BAD)),
+            f"parameters from either half of the views differ by chi2 {halves.chi2:.1f} for "
+            f"{halves.parameters} (p = {halves.p_value:.2g})",
+            ": the sigmas are too small; did lens, port or target change between views?",
+        )  # fmt: skip
+
+
+def _target_verdicts(judged: Judgement) -> Iterator[Verdict]:
+    """The target's bend, and what returns in its frame in view after view."""
+    shape, frame = judged.calibration.shape, judged.target_frame
+    for name, along in ((BOW_X, "width"), (BOW_Y, "height")):
+        if name not in shape.parameters:
+            continue
+        bow_m, sigma_m = shape.known(name)
+        prior_m = float(shape.prior_sigmas[shape.parameters.index(name)])
+        known = f"{with_sigma(1e3 * bow_m, 1e3 * sigma_m)} mm over its {along}"
+        if sigma_m > _OPEN * prior_m:
+            yield _look(f"the views hardly show how the target bends: {known}; tilt it more")
+        elif abs(bow_m) > _VERY_BENT * prior_m:
+            yield _look(
+                f"the target is bent by {known}: it is taken into account; use a stiffer one"
+            )
+    if frame is None:
+        return
+    if frame.likely is None:
+        yield Verdict(level="good", text="residuals average to nothing in the target's frame")
+        return
+    small = frame.returning_px <= _RETURNING * judged.calibration.noise_px
+    yield Verdict(
+        level="good" if small and frame.likely != "shape" else "look",
+        text=f"in the target's frame {frame.returning_px:.3f} px of the residuals return in every "
+        f"view (p = {frame.p_value:.1g}), {1e3 * frame.in_plane_m:.2f} mm rms in its plane: "
+        f"likely {_CAUSES[frame.likely]}"
+        + ("; the sigmas include it" if small else "; use a better target"),
     )
 
 
-def rig_parameters(rig: Rig, with_prior: Collection[str] = ()) -> tuple[Parameter, ...]:
-    """All parameters of a rig's cameras and poses, calibrated or held.
-
-    Args:
-        rig: with its covariance.
-        with_prior: names of those that had a prior.
-    """
-    covariance = covariance_of(rig)
-    names = [f"{c}.{p}" for c, camera in rig.cameras.items() for p in camera.parameters]
-    names += [f"{c}.{p}" for c in rig.cameras if c != rig.reference for p in POSE]
-    off_diagonal = covariance.correlation - np.eye(len(covariance.parameters))
-    rows = []
-    for name in names:
-        sigma, maximum, correlation = None, "", 0.0
-        if name in covariance.parameters:
-            at = covariance.parameters.index(name)
-            sigma = covariance.sigmas[name]
-            other = int(np.abs(off_diagonal[at]).argmax())
-            if other != at:
-                maximum, correlation = covariance.parameters[other], float(off_diagonal[at, other])
-        shown, shown_sigma, unit = _for_readers(name, value(rig, name), sigma)
-        rows.append(
-            Parameter(
-                name=name,
-                value=shown,
-                sigma=shown_sigma,
-                unit=unit,
-                most_alike=maximum,
-                correlation=correlation,
-                prior=name in with_prior,
-            )
+def _length_verdicts(judged: Judgement) -> Iterator[Verdict]:
+    for lengths, which in ((judged.held_lengths, "held-out"), (judged.lengths, "used")):
+        if lengths is None:
+            continue
+        scale, sigma = lengths.scale_ppm()
+        found, expected = lengths.rms_m(long=True)
+        if not (np.isfinite(scale) and np.isfinite(found)):
+            continue
+        off = abs(scale) > _SIGMAS * sigma or found > _HELD_OUT_LIMITS[0] ** 2 * expected
+        yield Verdict(
+            level="look" if off else "good",
+            text=f"long lengths on {which} views: scale error {scale:+.0f} +/- {sigma:.0f} ppm, "
+            f"{1e3 * found:.2f} mm rms ({1e3 * expected:.2f} mm by the noise alone)",
         )
-    return tuple(rows)
 
 
-def _for_readers(name: str, number: float, sigma: float | None) -> tuple[float, float | None, str]:
-    """Value, sigma and unit: mm and degrees instead of m, radians and sines of tilts."""
-    if name.endswith(("normal_x", "normal_y")):
-        steep = math.sqrt(1.0 - number * number)
-        spread = None if sigma is None else math.degrees(sigma / steep)
-        return math.degrees(math.asin(number)), spread, "deg"
-    for ending, factor, unit in (("_px", 1.0, "px"), ("_m", 1e3, "mm"), ("_rad", _DEG, "deg")):
-        if name.endswith(ending):
-            return number * factor, None if sigma is None else sigma * factor, unit
-    return number, sigma, ""
-
-
-def short_label(field: str) -> str:
-    """A parameter's name without its unit: `fx_px` as `fx`."""
-    for ending in ("_px", "_rad", "_m"):
-        field = field.removesuffix(ending)
-    return field.replace("_", " ")
+def _uncertainty_verdicts(judged: Judgement) -> Iterator[Verdict]:
+    noise_px, range_m = judged.calibration.noise_px, judged.working_range_m
+    for name, camera in judged.cameras.items():
+        median, high, worst = np.nanquantile(camera.sigma.compensated_px, [0.5, 0.9, 1.0]).tolist()
+        yield _graded(
+            high / noise_px, _SIGMA_LIMITS,
+            f"{name}: at {range_m:.3g} m the calibration lets a projection err by {median:.3f} "
+            f"px (median of the frame), {high:.3f} px (nine tenths of it stay below) to "
+            f"{worst:.3f} px (worst), best pose taken",
+            "; more views towards the edges bring it down",
+        )  # fmt: skip
+    at_work = judged.stereo_at_work
+    if at_work is not None and np.isfinite(at_work.length_sigma_m):
+        yield Verdict(
+            level="good" if at_work.length_sigma_m < 1e-3 * at_work.length_m else "look",
+            text=f"stereo at {range_m:.3g} m: a length of {at_work.length_m:.2f} m errs by "
+            f"{1e3 * at_work.length_sigma_m:.3f} mm from the calibration alone",
+        )

@@ -5,21 +5,31 @@ so the pixel's is J S J^T. The derivatives J are the analytic ones of `Camera`.
 """
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey.core.artefacts import json_values
 from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import Array
+from alice_survey.core.text_table import text_table
+from alice_survey.kit.words import with_sigma
 from camera_calib.camera import Camera, pose_jacobian
-from camera_calib.freedom import POSE
-from camera_calib.rig import Covariance, Rig
+from camera_calib.freedom import POSE, all_names, value
+from camera_calib.rig import Covariance, Rig, read_rig
 
 _OVERLAP_GRID = 25
 """Pixels a side of the reference frame at which the overlap of the cameras is evaluated."""
 _EDGE_PX = 1e-6
 """Tolerance above rounding: a point on the edge of a frame is in it."""
+_READER_UNITS = (("_px", 1.0, "px"), ("_m", 1e3, "mm"), ("_rad", math.degrees(1.0), "deg"))
+"""Endings of parameters, and the factors to the units in which they are shown."""
+RANGES_M = (0.5, 1.0, 2.0, 4.0, 8.0)
+_GRID = 11
 
 
 def covariance_of(rig: Rig) -> Covariance:
@@ -32,13 +42,9 @@ def covariance_of(rig: Rig) -> Covariance:
         raise CalibrationError(
             f"the rig ({rig.source}) has no covariance, so its uncertainty is unknown: calibrate it"
         )
-    for name in rig.covariance.parameters:
-        camera, _, field = name.rpartition(".")
-        known = camera in rig.cameras and (
-            field in rig.cameras[camera].parameters or (field in POSE and camera != rig.reference)
-        )
-        if not known:
-            raise CalibrationError(f"the rig's covariance has {name}, which the rig has not")
+    unknown = set(rig.covariance.parameters) - set(all_names(rig))
+    if unknown:
+        raise CalibrationError(f"the rig's covariance has {unknown.pop()}, which the rig has not")
     return rig.covariance
 
 
@@ -315,3 +321,190 @@ def baseline_sigma_m(rig: Rig, camera: str) -> float:
         if owner == camera and field in POSE[3:]:
             slopes[column] = along[POSE[3:].index(field)]
     return float(_sigmas(rig, slopes))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parameter:
+    """One calibrated or fixed number, in units for readers."""
+
+    name: str
+    value: float
+    sigma: float | None
+    """Standard deviation; None: it was fixed."""
+    unit: str
+    most_alike: str
+    """The parameter it correlates with most; empty when fixed or alone."""
+    correlation: float
+    prior: bool
+    """Whether it had a prior."""
+
+
+def rig_parameters(rig: Rig, with_prior: Collection[str] = ()) -> tuple[Parameter, ...]:
+    """All parameters of a rig's cameras and poses, calibrated or fixed.
+
+    Args:
+        rig: with its covariance.
+        with_prior: names of those that had a prior.
+    """
+    covariance = covariance_of(rig)
+    names, sigmas = covariance.parameters, covariance.sigmas
+    off_diagonal = covariance.correlation - np.eye(len(names))
+    rows = []
+    for name in all_names(rig):
+        other, correlation = "", 0.0
+        if name in sigmas:
+            row = off_diagonal[names.index(name)]
+            largest = int(np.abs(row).argmax())
+            if names[largest] != name:
+                other, correlation = names[largest], float(row[largest])
+        shown, factor, unit = _reader_unit(name, value(rig, name))
+        rows.append(
+            Parameter(
+                name=name,
+                value=shown,
+                sigma=sigmas[name] * factor if name in sigmas else None,
+                unit=unit,
+                most_alike=other,
+                correlation=correlation,
+                prior=name in with_prior,
+            )
+        )
+    return tuple(rows)
+
+
+def _reader_unit(name: str, number: float) -> tuple[float, float, str]:
+    """Value, factor of its sigma and unit: mm and degrees, not m, radians and sines of tilts."""
+    if name.endswith(("normal_x", "normal_y")):
+        per_sine = math.degrees(1.0) / math.sqrt(1.0 - number * number)
+        return math.degrees(math.asin(number)), per_sine, "deg"
+    for ending, factor, unit in _READER_UNITS:
+        if name.endswith(ending):
+            return number * factor, factor, unit
+    return number, 1.0, ""
+
+
+def short_label(field: str) -> str:
+    """A parameter's name without its unit: `fx_px` as `fx`."""
+    for ending, _, _ in _READER_UNITS:
+        field = field.removesuffix(ending)
+    return field.replace("_", " ")
+
+
+def baselines_m(rig: Rig) -> dict[str, tuple[float, float]]:
+    """Distance from the reference camera and its sigma, by camera."""
+    return {
+        name: (float(np.linalg.norm(pose.translation)), baseline_sigma_m(rig, name))
+        for name, pose in rig.cam_from_rig.items()
+        if name != rig.reference
+    }
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RangeSigma:
+    """Projection uncertainty over the frame of one camera at one distance, px."""
+
+    range_m: float
+    plain_median_px: float
+    plain_worst_px: float
+    compensated_median_px: float
+    compensated_worst_px: float
+
+
+def sigmas_by_range(
+    rig: Rig, camera: str, pixels: Array, ranges_m: Collection[float], compensating: Array
+) -> tuple[RangeSigma, ...]:
+    """Median and largest of `projection_sigma` over pixels, at each distance; NaN: unknown."""
+
+    def over_frame(values: Array) -> tuple[float, float]:
+        known = values[np.isfinite(values)]
+        return (float(np.median(known)), float(known.max())) if len(known) else (np.nan, np.nan)
+
+    found = []
+    for range_m in ranges_m:
+        sigma = projection_sigma(rig, camera, pixels, range_m, compensating)
+        plain, compensated = over_frame(sigma.plain_px), over_frame(sigma.compensated_px)
+        found.append(
+            RangeSigma(
+                range_m=range_m,
+                plain_median_px=plain[0],
+                plain_worst_px=plain[1],
+                compensated_median_px=compensated[0],
+                compensated_worst_px=compensated[1],
+            )
+        )
+    return tuple(found)
+
+
+def uncertainty_report(
+    path: Path, ranges_m: list[float] | None, near_m: float, far_m: float, noise_px: float
+) -> tuple[str, dict[str, Any]]:
+    """Sigmas of parameters, projections and stereo of a rig, as text and as JSON values.
+
+    Args:
+        path: `rig.json` with a covariance.
+        ranges_m: distances to evaluate; `RANGES_M` if none.
+        near_m: nearest distance of the points that poses are estimated from.
+        far_m: farthest.
+        noise_px: noise of one measured coordinate, for comparison.
+
+    Raises:
+        CalibrationError: the rig has no covariance, or the distances are not in order.
+    """
+    rig, ranges = read_rig(path), ranges_m or RANGES_M
+    if not (0 < near_m <= far_m < math.inf and all(0 < r < math.inf for r in ranges)):
+        raise CalibrationError(
+            f"distances {near_m:g} to {far_m:g} m and --range: they must be positive and finite, "
+            "the near one not beyond the far one"
+        )
+    parameters = [p for p in rig_parameters(rig) if p.sigma is not None]
+    baselines = baselines_m(rig)
+    between = tuple(np.geomspace(near_m, far_m, 4).tolist())
+    maps = {
+        name: sigmas_by_range(
+            rig, name, camera.frame_grid(_GRID, _GRID), ranges,
+            compensation(rig, name, frame_points(camera, between)),
+        )
+        for name, camera in rig.cameras.items()
+    }  # fmt: skip
+    stereo = [stereo_sigma(rig, r, noise_px) for r in ranges] if baselines else []
+    data = {"parameters": parameters, "baselines_m": baselines, "projection_sigma": maps}
+    parts = [
+        text_table(
+            ("parameter", "value", "unit", "correlates most with"),
+            [
+                (p.name, with_sigma(p.value, p.sigma or 0.0), p.unit,
+                 f"{p.most_alike} {p.correlation:+.2f}")
+                for p in parameters
+            ],
+        ),
+        *(
+            f"{rig.reference} to {name}: {with_sigma(1e3 * length, 1e3 * sigma)} mm"
+            for name, (length, sigma) in baselines.items()
+        ),
+        "one sigma of a projection over the frame\n"
+        + text_table(
+            ("camera", "at m", "best pose px", "worst", "fixed pose px", "worst"),
+            [
+                (name, f"{s.range_m:g}", f"{s.compensated_median_px:.3f}",
+                 f"{s.compensated_worst_px:.3f}", f"{s.plain_median_px:.3f}",
+                 f"{s.plain_worst_px:.3f}")
+                for name, sigmas in maps.items() for s in sigmas
+            ],
+        ),
+    ]  # fmt: skip
+    if stereo:
+        data["stereo"] = stereo
+        lengths_m = [
+            (s.point_m[2], s.worst_shape_m, s.noise_m[2], s.length_sigma_m) for s in stereo
+        ]
+        parts.append(
+            "one sigma of stereo by calibration alone, mm\n"
+            + text_table(
+                ("at m", "depth", "shape", f"{noise_px:g} px noise", "length", "length m"),
+                [
+                    (f"{s.range_m:g}", *(f"{1e3 * m:.3g}" for m in row), f"{s.length_m:.2f}")
+                    for s, row in zip(stereo, lengths_m, strict=True)
+                ],
+            )
+        )
+    return "\n\n".join(parts), json_values(data)

@@ -5,8 +5,6 @@
 - Halves: two calibrations from disjoint views, and how far their projections lie apart (mrcal's
   cross-validation), against what their covariances predict.
 - Lengths: distances on the target, from triangulated points.
-- Homographies: a flat target through a perfect camera is a plane seen by a pinhole; residuals of
-  a homography per picture show lens and port errors without any truth.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,7 +23,7 @@ from alice_survey.core.run import progress
 from camera_calib.calibration import Calibration, TargetView, residuals_px, stack_views
 from camera_calib.camera import Camera, pose_jacobian
 from camera_calib.freedom import POSE, value
-from camera_calib.judge.fit_quality import rms_length_px, within_gate
+from camera_calib.judge.residuals import rms_length_px, within_gate
 from camera_calib.judge.uncertainty import (
     camera_slopes,
     compensation,
@@ -154,26 +152,14 @@ def score_hold_out(held: HeldOut) -> HoldOutScore:
     )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True)
 class HalvesDifference:
     """Difference of projections of two calibrations of one camera, after the best pose."""
 
-    pixels: Array
-    """(R, C, 2) where."""
-    difference_px: Array
-    """(R, C, 2) second minus first."""
-    expected_px: Array
-    """(R, C) root mean square length of the difference by both covariances."""
-
-    @property
-    def rms_px(self) -> float:
-        """Root mean square length over the frame."""
-        return float(np.sqrt(np.nanmean((self.difference_px**2).sum(axis=-1))))
-
-    @property
-    def expected_rms_px(self) -> float:
-        """Expected `rms_px`, if the covariances are true."""
-        return float(np.sqrt(np.nanmean(self.expected_px**2)))
+    rms_px: float
+    """Root mean square length over the frame."""
+    expected_px: float
+    """What both covariances predict of it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,11 +169,8 @@ class HalvesAgreement:
     chi2: float
     parameters: int
     """Mean of `chi2`, if the covariances are true."""
-
-    @property
-    def p_value(self) -> float:
-        """Probability of as large a difference, if the covariances are true."""
-        return float(chi2.sf(self.chi2, self.parameters))
+    p_value: float
+    """Probability of as large a difference, if the covariances are true."""
 
 
 def _difference_covariance(halves: tuple[Calibration, Calibration]) -> Array:
@@ -219,9 +202,8 @@ def halves_agreement(halves: tuple[Calibration, Calibration]) -> HalvesAgreement
     values, vectors = np.linalg.eigh(matrix * np.outer(scale, scale))
     known = values > _MIN_KNOWN * values[-1]
     along = vectors[:, known].T @ (scale * apart)
-    return HalvesAgreement(
-        chi2=float((along**2 / values[known]).sum()), parameters=int(known.sum())
-    )
+    total, count = float((along**2 / values[known]).sum()), int(known.sum())
+    return HalvesAgreement(chi2=total, parameters=count, p_value=float(chi2.sf(total, count)))
 
 
 def halves_difference(
@@ -236,7 +218,7 @@ def halves_difference(
     Args:
         halves: from different views of the same target.
         camera: which camera.
-        pixels: (R, C, 2) where to evaluate.
+        pixels: (..., 2) where to evaluate.
         range_m: distance of the points along the axis.
         anchors_cam: (A, 3) points in the camera's frame that fix the pose between both.
     """
@@ -248,23 +230,23 @@ def halves_difference(
     _, by_point, plain = camera_slopes(rig, camera, points)
     moved = plain + pose_jacobian(by_point, points) @ compensation(rig, camera, anchors_cam)
     variance = np.einsum("nap,pq,naq->n", moved, _difference_covariance(halves), moved)
+    square = ((second.project(pose.apply(points)) - flat) ** 2).sum(axis=-1)
     return HalvesDifference(
-        pixels=pixels,
-        difference_px=(second.project(pose.apply(points)) - flat).reshape(pixels.shape),
-        expected_px=np.sqrt(np.maximum(variance, 0.0)).reshape(pixels.shape[:-1]),
+        rms_px=float(np.sqrt(np.nanmean(square))),
+        expected_px=float(np.sqrt(np.nanmean(np.maximum(variance, 0.0)))),
     )
 
 
 def _best_pose(first: Camera, second: Camera, anchors_cam: Array) -> RigidTransform:
     """`second_from_first` that makes both project the anchors most alike (Gauss-Newton)."""
-    wanted = first.project(anchors_cam)
+    target = first.project(anchors_cam)
     pose = RigidTransform.identity()
     for _ in range(10):
         moved = pose.apply(anchors_cam)
         pixels, by_point, _ = second.project_jacobian(moved)
-        miss, slopes = wanted - pixels, pose_jacobian(by_point, moved)
-        known = np.isfinite(miss).all(axis=1)
-        step = np.linalg.lstsq(slopes[known].reshape(-1, 6), miss[known].ravel(), rcond=None)[0]
+        off, slopes = target - pixels, pose_jacobian(by_point, moved)
+        known = np.isfinite(off).all(axis=1)
+        step = np.linalg.lstsq(slopes[known].reshape(-1, 6), off[known].ravel(), rcond=None)[0]
         small = RigidTransform.from_components(step[3:], Rotation.from_rotvec(step[:3]))
         pose = small * pose
         if np.abs(step).max() < 1e-12:
@@ -288,33 +270,23 @@ class LengthErrors:
     """(L,) number of the view."""
     long: NDArray[np.bool_]
     """(L,) from a point to the farthest seen one; else between neighbours."""
-    range_m: Array
-    """(L,) of the middle, from the reference camera along its axis."""
 
-    def scales(self) -> tuple[NDArray[np.intp], Array, Array]:
-        """By view that has long lengths: its number, relative error, and weight.
+    def scale_ppm(self) -> tuple[float, float]:
+        """Relative error of the long lengths, and its sigma from the scatter between views.
 
-        The error is that of long lengths beyond their bias; the weight the inverse of their mean
-        variance.
+        The error of a view is that of its long lengths beyond their bias; its weight the inverse of
+        their mean variance. NaN where fewer than two views have long lengths.
         """
         views = np.unique(self.view[self.long])
-        errors, weights = np.zeros((2, len(views)))
+        count = len(views)
+        if count < 2:
+            return float("nan"), float("nan")
+        errors, weights = np.zeros((2, count))
         for i, v in enumerate(views):
             at = self.long & (self.view == v)
             beyond, true = self.error_m[at] - self.bias_m[at], self.true_m[at]
             errors[i] = beyond @ true / (true @ true)
             weights[i] = 1.0 / (self.sigma_m[at] ** 2).mean()
-        return views, errors, weights
-
-    def scale_ppm(self) -> tuple[float, float]:
-        """Relative error of the long lengths, and its sigma from the scatter between views.
-
-        NaN where fewer than two views have long lengths.
-        """
-        _, errors, weights = self.scales()
-        count = len(errors)
-        if count < 2:
-            return float("nan"), float("nan")
         share = weights / weights.sum()
         mean = float(share @ errors)
         variance = float(share**2 @ (errors - mean) ** 2) * count / (count - 1)
@@ -325,17 +297,15 @@ class LengthErrors:
         at = self.long == long
         if not at.any():
             return float("nan"), float("nan")
-        return (
-            float(np.sqrt((self.error_m[at] ** 2).mean())),
-            float(np.sqrt((self.sigma_m[at] ** 2 + self.bias_m[at] ** 2).mean())),
-        )
+        square, expected = self.error_m**2, self.sigma_m**2 + self.bias_m**2
+        return float(np.sqrt(square[at].mean())), float(np.sqrt(expected[at].mean()))
 
 
 def length_errors(
     rig: Rig,
     views: Sequence[TargetView],
     rig_from_target: RigidTransform,
-    missed_px: Array,
+    residuals: Array,
     target_points: Array,
     noise_px: Array | float,
 ) -> LengthErrors:
@@ -349,16 +319,15 @@ def length_errors(
         rig: calibrated.
         views: (V) where the cameras saw the target.
         rig_from_target: (V,) its poses; they only give the directions of the lengths.
-        missed_px: (V, cameras, N, 2) residuals; outliers among them take no part.
+        residuals: (V, cameras, N, 2); outliers among them take no part.
         target_points: (N, 3).
         noise_px: standard deviation of one coordinate, of all or of each picture (V, cameras).
     """
     near = neighbours(target_points)
     sigma_px = np.broadcast_to(noise_px, (len(views), len(rig.cameras)))
     pixels = stack_views(views, rig, len(target_points))
-    pixels[~within_gate(missed_px, sigma_px[..., None])] = np.nan
+    pixels[~within_gate(residuals, sigma_px[..., None])] = np.nan
     poses = [rig.cam_from_rig[camera] for camera in rig.cameras]
-    back = rig.cam_from_rig[rig.reference]
     parts: list[tuple[Array, ...]] = []
     for v in range(len(views)):
         found = triangulate(list(rig.cameras.values()), poses, pixels[v], sigma_px[v].tolist())
@@ -378,22 +347,15 @@ def length_errors(
         across = (np.eye(3) - unit[:, :, None] * unit[:, None, :]) @ spread
         bias = np.trace(across, axis1=1, axis2=2) / (2 * true)
         variance = lengthwise + np.einsum("nab,nba->n", across, across) / (2 * true**2)
-        range_m = back.apply((found.points_world[a] + found.points_world[b]) / 2)[:, 2]
-        number = np.full(len(pairs), v)
-        parts.append((true, length - true, bias, np.sqrt(variance), range_m, number, long))
-    empty = (np.zeros(0),) * 7
-    true, error, bias, sigma, range_m, number, long = (
+        parts.append((true, length - true, bias, np.sqrt(variance), np.full(len(pairs), v), long))
+    empty = (np.zeros(0),) * 6
+    true, error, bias, sigma, number, long = (
         np.concatenate(columns) for columns in zip(*(parts or [empty]), strict=True)
     )
     return LengthErrors(
-        true_m=true,
-        error_m=error,
-        bias_m=bias,
-        sigma_m=sigma,
-        range_m=range_m,
-        view=number.astype(np.intp),
-        long=long.astype(bool),
-    )
+        true_m=true, error_m=error, bias_m=bias, sigma_m=sigma,
+        view=number.astype(np.intp), long=long.astype(bool),
+    )  # fmt: skip
 
 
 def neighbours(target_points: Array) -> NDArray[np.intp]:

@@ -17,7 +17,6 @@ from scipy.spatial import cKDTree
 
 from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import Array
-from camera_calib.calibration import Rejection
 from camera_calib.targets.corners import (
     ASTRAY,
     FITTED,
@@ -38,6 +37,7 @@ from camera_calib.targets.target import (
     TAG_BITS,
     TAG_BORDER_BITS,
     TAG_FAMILY,
+    Rejection,
     Target,
     aruco_dictionary,
 )

@@ -53,6 +53,17 @@ _GRAMMAR = (
 
 
 @dataclass(frozen=True, kw_only=True)
+class Rejection:
+    """A picture, or points of it, that took no part, and why."""
+
+    view: str
+    camera: str
+    points: int
+    """Number of points; 0 for the whole picture."""
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
 class Target:
     """A flat pattern whose points are known.
 

@@ -12,8 +12,8 @@ from alice_survey.app.cli.camera import app as camera_commands
 from alice_survey.core.config import SurveyConfig
 from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import BODY_FROM_NADIR_CAM, Array
-from camera_calib.judge.mount_figure import plot_mount
 from camera_calib.mount import mount_line, mount_report, mount_rotation, with_mount
+from camera_calib.mount_figure import plot_mount
 from camera_calib.rig import Rig, design_rig, read_rig, write_rig
 
 RIGHT, BOTTOM, AHEAD = np.eye(3)

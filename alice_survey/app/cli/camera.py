@@ -198,6 +198,6 @@ def uncertainty(
 
     For pixels over the frame, for triangulated points and for lengths, against distance.
     """
-    from camera_calib.judge.rig_uncertainty import uncertainty_report
+    from camera_calib.judge.uncertainty import uncertainty_report
 
     print_result(*uncertainty_report(rig, ranges, near, far, noise), as_json)

@@ -12,8 +12,8 @@ from alice_survey.core.frames import Array
 from alice_survey.kit.document import Figure
 from alice_survey.kit.figure import INKS, MARKS, drawn
 from alice_survey.kit.words import digits, share
-from camera_calib.judge.mount_figure import paint_mount
 from camera_calib.mount import mount_line
+from camera_calib.mount_figure import paint_mount
 from camera_calib.rig import Rig
 
 _MAX_VALUES_PX = 4e6

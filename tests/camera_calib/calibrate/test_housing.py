@@ -13,8 +13,7 @@ from camera_calib.calibrate.housing import housing_lines
 from camera_calib.calibrate.options import CalibrateOptions
 from camera_calib.calibrate.solve import calibrate_in_air
 from camera_calib.calibrate.text import calibration_text
-from camera_calib.judge.judgement import judge
-from camera_calib.judge.verdicts import verdicts
+from camera_calib.judge.judgement import judge, verdicts
 from camera_calib.ports.dome import DomePort
 from camera_calib.ports.flat import FlatPort
 from camera_calib.ports.values import PortValues

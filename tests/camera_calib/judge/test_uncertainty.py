@@ -21,11 +21,9 @@ from camera_calib.judge.uncertainty import (
     rig_slopes,
     shape_sigmas_m,
     stereo_sigma,
-    taken_up,
 )
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.ports.flat import FlatPort
-from camera_calib.rig import Covariance
 from camera_calib.triangulate import reproject, triangulate
 from tests.oracles_report import (
     DESIGN,
@@ -92,19 +90,6 @@ def test_a_turn_hidden_in_the_principal_point_is_compensated() -> None:
     assert 0.0 < sigma.compensated_px.max() < 0.25
 
 
-def test_sigmas_grow_with_the_noise() -> None:
-    rig = usual().rig
-    assert rig.covariance is not None
-    twice = replace(
-        rig,
-        covariance=Covariance(
-            parameters=rig.covariance.parameters, matrix=4 * rig.covariance.matrix
-        ),
-    )
-    at = np.array([[0.0, 0.0, 2.0]])
-    np.testing.assert_allclose(point_sigmas_m(twice, at), 2 * point_sigmas_m(rig, at))
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_triangulated_points_and_lengths_err_by_their_sigmas(seed: int) -> None:
     """True pixels, triangulated exactly in a rig with one error."""
@@ -160,23 +145,15 @@ def test_a_rigs_rigid_motion_does_not_count_as_shape() -> None:
 
 
 def test_points_that_one_camera_sees_have_no_sigma() -> None:
+    away = {
+        "left": RigidTransform.identity(),
+        "right": RigidTransform.from_translation([-5.0, 0.0, 0.0]),
+    }
+    assert np.isnan(stereo_sigma(replace(usual().rig, cam_from_rig=away), 2.0, 0.1).length_sigma_m)
     outside = np.array([[-0.72, 0.0, 2.0], [0.0, 0.0, 2.0]])
     sigmas = point_sigmas_m(usual().rig, outside)
     assert np.isnan(sigmas[0]).all()
     assert np.isfinite(sigmas[1]).all()
-
-
-def test_cameras_that_look_apart_share_nothing() -> None:
-    away = replace(
-        usual().rig,
-        cam_from_rig={
-            "left": RigidTransform.identity(),
-            "right": RigidTransform.from_translation([-5.0, 0.0, 0.0]),
-        },
-    )
-    found = stereo_sigma(away, 2.0, 0.1)
-    assert np.isnan(found.length_sigma_m)
-    assert np.isnan(found.point_m).all()
 
 
 def test_a_length_fits_the_overlap() -> None:
@@ -197,33 +174,20 @@ def test_the_baselines_sigma_is_that_of_its_length() -> None:
     assert baseline_sigma_m(rig, "right") == pytest.approx(lengths.std(), rel=0.05)
 
 
-def test_what_a_pose_takes_up_is_the_least_squares_fit() -> None:
-    rng = np.random.default_rng(5)
-    slopes, moved = rng.normal(size=(40, 6)), rng.normal(size=(40, 3))
-    expected = np.linalg.lstsq(slopes, moved, rcond=None)[0]
-    np.testing.assert_allclose(taken_up(slopes, moved), expected, rtol=1e-9)
-
-
-def test_a_design_has_no_uncertainty() -> None:
-    with pytest.raises(CalibrationError):
-        point_sigmas_m(DESIGN, POINTS)
-
-
-@pytest.mark.parametrize("name", ["middle.fx_px", "left.rx_rad", "left.colour"])
-def test_a_covariance_of_what_the_rig_has_not_is_refused(name: str) -> None:
-    with pytest.raises(CalibrationError, match=name):
-        point_sigmas_m(with_one_error(DESIGN, {name: 1.0}), POINTS)
-
-
-def test_two_points_hold_no_pose() -> None:
-    with pytest.raises(CalibrationError, match="2 points"):
-        compensation(usual().rig, "left", POINTS[:2])
-
-
-@pytest.mark.parametrize("seed", range(1, 5))
+@pytest.mark.parametrize("seed", range(1, 4))
 def test_all_of_the_overlap_has_sigmas(seed: int) -> None:
     """Also its points on the very edge of a frame, which rounding may put beyond."""
     points = overlap_points(usual(seed).rig, 2.0)
     assert len(points) > 100
     assert np.isfinite(point_sigmas_m(usual(seed).rig, points)).all()
     assert np.isfinite(shape_sigmas_m(usual(seed).rig, points)).all()
+
+
+def test_what_is_unknown_is_refused() -> None:
+    with pytest.raises(CalibrationError):
+        point_sigmas_m(DESIGN, POINTS)
+    for name in ("middle.fx_px", "left.rx_rad", "left.colour"):
+        with pytest.raises(CalibrationError, match=name):
+            point_sigmas_m(with_one_error(DESIGN, {name: 1.0}), POINTS)
+    with pytest.raises(CalibrationError, match="2 points"):
+        compensation(usual().rig, "left", POINTS[:2])

@@ -97,7 +97,7 @@ def test_halves_differ_as_their_covariances_promise() -> None:
             difference = halves_difference(
                 held.halves, name, camera.frame_grid(9, 7), 1.5, anchors_cam(found, name)
             )
-            ratios.append(difference.rms_px / difference.expected_rms_px)
+            ratios.append(difference.rms_px / difference.expected_px)
     assert 0.6 < np.sqrt(np.mean(np.square(ratios))) < 1.4
 
 
@@ -124,8 +124,8 @@ def test_an_error_of_the_prior_is_the_same_in_both_halves() -> None:
             shared = halves_difference((first, second), name, pixels, 1.5, anchors)
             unaware = (replace(first, freedom=alone), replace(second, freedom=alone))
             apart = halves_difference(unaware, name, pixels, 1.5, anchors)
-            ratios.append(shared.rms_px / shared.expected_rms_px)
-            independent.append(apart.rms_px / apart.expected_rms_px)
+            ratios.append(shared.rms_px / shared.expected_px)
+            independent.append(apart.rms_px / apart.expected_px)
     assert 0.75 < np.sqrt(np.mean(np.square(ratios))) < 1.3
     assert np.sqrt(np.mean(np.square(independent))) < 0.75
 
@@ -146,29 +146,20 @@ def test_the_same_calibration_twice_does_not_differ() -> None:
     moved = halves_difference((found, other), "left", pixels, 2.0, anchors)
     assert same.rms_px < 1e-6
     assert 0.0 < moved.rms_px < 0.005
-    assert same.expected_rms_px > 0.05
+    assert same.expected_px > 0.05
 
 
-def test_too_few_views_are_not_held_out(capsys: pytest.CaptureFixture[str]) -> None:
-    def refuse(views: Sequence[TargetView]) -> Calibration:
-        raise CalibrationError(f"{len(views)} views")
-
-    assert hold_out(usual().views[:6], refuse, locate) is None
-    assert "5 views" in capsys.readouterr().err
-
-
-def test_halves_are_left_out_where_they_do_not_calibrate() -> None:
+@pytest.mark.parametrize("enough", [8, 14])
+def test_tests_are_left_out_where_too_few_views_calibrate(enough: int) -> None:
     found = usual()
 
     def calibrate(views: Sequence[TargetView]) -> Calibration:
-        if len(views) < 8:
+        if len(views) < enough:
             raise CalibrationError("too few")
         return adjusted(views, found.target_points, found.rig, all_free(DESIGN))
 
     held = hold_out(found.views, calibrate, locate)
-
-    assert held is not None
-    assert held.halves is None
+    assert held is None if enough == 14 else held is not None and held.halves is None
 
 
 def test_lengths_are_exact_in_the_true_rig() -> None:
@@ -212,23 +203,18 @@ def test_lengths_in_dull_pictures_err_as_their_noise() -> None:
         assert np.std(scores[found.view % 2 == odd]) == pytest.approx(1.0, abs=0.1)
 
 
-def test_a_wrong_baseline_is_a_wrong_scale() -> None:
+def test_a_wrong_baseline_or_target_is_a_wrong_scale() -> None:
     found = usual()
     longer = moved_rig(found.rig, {"right.x_m": -0.001 * 0.1001})
     scale, sigma = lengths_of(replace(found, rig=longer)).scale_ppm()
     before, _ = lengths_of(found).scale_ppm()
     assert scale - before == pytest.approx(1000.0, abs=60.0)
     assert sigma < 1000.0
-
-
-def test_a_wrong_target_size_is_a_wrong_scale() -> None:
-    found = usual()
-    true = lengths_of(found)
     wrong = lengths_of(replace(found, target_points=0.998 * found.target_points))
-    assert wrong.scale_ppm()[0] - true.scale_ppm()[0] == pytest.approx(2000.0, abs=60.0)
+    assert wrong.scale_ppm()[0] - before == pytest.approx(2000.0, abs=60.0)
 
 
-def test_neighbours_of_a_grid_are_a_square_apart() -> None:
+def test_neighbours_of_a_grid_are_a_square_apart_and_the_farthest_its_corners() -> None:
     points = board_points(5, 4)
     pairs = neighbours(points)
     assert len(pairs) == 4 * 4 + 5 * 3
@@ -236,13 +222,9 @@ def test_neighbours_of_a_grid_are_a_square_apart() -> None:
     np.testing.assert_allclose(apart, SQUARE_M)
     assert (pairs[:, 0] < pairs[:, 1]).all()
 
-
-def test_the_farthest_of_a_grid_are_its_corners() -> None:
-    points = board_points(5, 4)
     pairs = farthest(points, np.arange(20))
-    assert {0, 4, 15, 19} == set(pairs.ravel()) & {0, 4, 15, 19}
+    assert {0, 4, 15, 19} <= set(pairs.ravel())
     apart = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
     assert apart.max() == pytest.approx(SQUARE_M * 5.0)
-    assert len(np.unique(pairs, axis=0)) == len(pairs)
     some = farthest(points, np.array([0, 1, 2]))
     np.testing.assert_array_equal(some, [[0, 1], [0, 2]])

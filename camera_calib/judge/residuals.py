@@ -1,0 +1,505 @@
+"""What the residuals of a calibration show: pictures, trends, coverage, homographies, the target.
+
+- By picture, over the frame and against the angle at the port.
+- Homographies: through a perfect model a flat target is seen as a plane by a pinhole, so its
+  points map to the pinhole's pixels by a homography, whatever its pose. The flat port has no single
+  centre: a pixel's ray is followed exactly to the target's own distance there, and a virtual
+  pinhole looks at that point. Of the pose only these distances are used, and they hardly matter: an
+  error of 1 cm moves such a pixel by about 0.001 px (20 mm port, 12.5 mm lens). No truth is needed;
+  residuals that grow outwards are an error of the model. What the found shape of a bent target
+  moves is taken off first.
+- In the target's frame: noise differs from view to view, and an error of lens or port stays in the
+  picture while the board moves through it. What returns at the same place of the board in view
+  after view is the board's own: bent, stretched by the printer, a corner out of its place.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+from scipy.stats import norm
+
+from alice_survey.core.frames import Array
+from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
+from camera_calib.calibration import Calibration, stack_views
+from camera_calib.camera import Camera
+from camera_calib.target_shape import usual_shape
+
+Cause = Literal["shape", "corners", "uneven"]
+
+GATE_SIGMAS = 5.0
+"""Residuals longer than this many times the noise are outliers: counted, and kept out of the
+statistics. Of 2D normal errors, 4 in a million are longer."""
+PROFILE_BINS = 12
+_MIN_IN_BIN = 8
+COVERED_REACH = 0.75
+"""A corner of the frame is covered when a point lies beyond this share of both half sides."""
+CORNERS = {
+    f"{high} {side}": (x, y)
+    for high, y in (("top", -1), ("bottom", 1))
+    for side, x in (("left", -1), ("right", 1))
+}
+"""Directions from the centre to the corners of a frame."""
+_CELLS = np.array([10, 8])
+"""Columns and rows of a frame in which points are counted."""
+_MIN_POINTS = 12
+"""Fewest points of a view: 8 unknowns of a homography against 24 coordinates."""
+_FLAT_SHARE = 1e-6
+"""A target is flat if its points leave a plane by less than this share of its size."""
+_OUTLYING = 6.0
+"""Outlier limit of length over median length: 7 sigmas of normal noise."""
+_HALF_STEP_PX = 0.5
+_OUTER_SHARE = 0.7
+"""Residuals beyond this share of the largest radius with points are compared with the others."""
+_MIN_VIEWS = 4
+_FEW = 0.05
+"""Share of a target's corners that are `a few`."""
+_BY_CHANCE = 1e-3
+_MAX_OF = 0.5
+"""Share of what returns that makes a cause the likely one."""
+
+
+def within_gate(residuals_px: Array, noise_px: Array | float) -> NDArray[np.bool_]:
+    """Which residuals (..., 2) are known and not outliers, by the noise (...) of a coordinate."""
+    squared = (residuals_px**2).sum(axis=-1)
+    known: NDArray[np.bool_] = squared <= (GATE_SIGMAS * noise_px) ** 2
+    return known
+
+
+def rms_length_px(residuals_px: Array, noise_px: Array | float) -> float:
+    """Root mean square length of the residuals (..., 2) that are not outliers; NaN for none."""
+    kept = residuals_px[within_gate(residuals_px, noise_px)]
+    return float(np.sqrt((kept**2).sum(axis=-1).mean())) if len(kept) else float("nan")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PictureFit:
+    """One picture of the target."""
+
+    view: str
+    camera: str
+    points: int
+    rms_px: float
+    """Length of the residuals, outliers included."""
+    worst_px: float
+    outliers: int
+    range_m: float
+    """Mean distance of its points from the entrance pupil along the axis."""
+    tilt_deg: float
+    """Angle between the target's normal and the camera's axis."""
+
+
+def picture_fits(calibration: Calibration) -> list[PictureFit]:
+    """All pictures, view by view, cameras in the rig's order."""
+    rows, noise_px = [], calibration.sigma_px
+    for v, view in enumerate(calibration.views):
+        for c, camera in enumerate(calibration.rig.cameras):
+            lengths = np.linalg.norm(calibration.residuals_px[v, c], axis=-1)
+            seen = np.isfinite(lengths)
+            if not seen.any():
+                continue
+            pose = calibration.rig.cam_from_rig[camera] * calibration.rig_from_target[v]
+            along_axis = abs(float(pose.rotation.as_matrix()[2, 2]))
+            rows.append(
+                PictureFit(
+                    view=view.name,
+                    camera=camera,
+                    points=int(seen.sum()),
+                    rms_px=float(np.sqrt((lengths[seen] ** 2).mean())),
+                    worst_px=float(lengths[seen].max()),
+                    outliers=int((lengths[seen] > GATE_SIGMAS * noise_px[v, c]).sum()),
+                    range_m=float(pose.apply(calibration.target_points[seen])[:, 2].mean()),
+                    tilt_deg=float(np.degrees(np.arccos(min(along_axis, 1.0)))),
+                )
+            )
+    return rows
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CameraResiduals:
+    """All points that one camera saw, in one list, without outliers."""
+
+    pixels: Array
+    """(N, 2) as measured."""
+    residuals_px: Array
+    """(N, 2) projected minus measured."""
+    sigma_px: Array
+    """(N,) expected standard deviation of a coordinate: the noise of the point's picture."""
+
+
+def camera_residuals(calibration: Calibration, camera: str) -> CameraResiduals:
+    """The points of one camera, without outliers."""
+    index = list(calibration.rig.cameras).index(camera)
+    residuals = calibration.residuals_px[:, index]
+    sigma_px = np.repeat(calibration.sigma_px[:, index, None], residuals.shape[1], axis=1)
+    kept = within_gate(residuals, sigma_px)
+    pixels = stack_views(calibration.views, calibration.rig, residuals.shape[1])[:, index]
+    return CameraResiduals(
+        pixels=pixels[kept], residuals_px=residuals[kept], sigma_px=sigma_px[kept]
+    )
+
+
+def outward(camera: Camera, pixels: Array) -> Array:
+    """Unit vectors (..., 2) from the principal point to pixels (..., 2); 0 at that point."""
+    away = pixels - np.array([camera.cx_px, camera.cy_px])
+    length = np.linalg.norm(away, axis=-1, keepdims=True)
+    unit: Array = np.divide(away, length, out=np.zeros_like(away), where=length > 0)
+    return unit
+
+
+def incidence_deg(camera: Camera, pixels: Array) -> Array:
+    """(...,) angles between the rays in water and the port's normal, degrees."""
+    points, directions = camera.unproject(pixels)
+    normals = camera.port.clearance(points.reshape(-1, 3))[1].reshape(points.shape)
+    angles: Array = np.degrees(np.arccos(np.clip((directions * normals).sum(axis=-1), -1, 1)))
+    return angles
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Profile:
+    """Residuals in bins of one quantity; NaN in bins with too few points."""
+
+    edges: Array
+    """(B + 1,) ends of the bins."""
+    count: NDArray[np.intp]
+    """(B,) number of points."""
+    rms_px: Array
+    """(B,) rms of one coordinate."""
+    expected_px: Array
+    """(B,) rms from noise alone; its sigma is expected / (2 sqrt(count))."""
+    outward_px: Array
+    """(B,) mean of the part away from the principal point: 0 but for noise if the model is right,
+    with sigma expected / sqrt(count)."""
+
+    @property
+    def centres(self) -> Array:
+        """(B,) centres of the bins."""
+        centres: Array = (self.edges[1:] + self.edges[:-1]) / 2
+        return centres
+
+
+def profile(
+    position: Array, residuals_px: Array, outward_px: Array, sigma_px: Array, largest: float
+) -> Profile:
+    """Bin residuals by a position between 0 and `largest`.
+
+    Args:
+        position: (N,).
+        residuals_px: (N, 2).
+        outward_px: (N,).
+        sigma_px: (N,) expected standard deviation of one coordinate of each.
+        largest: end of the last bin.
+    """
+    edges = np.linspace(0.0, largest, PROFILE_BINS + 1)
+    bins = np.clip(np.searchsorted(edges, position, side="right") - 1, 0, PROFILE_BINS - 1)
+    count: NDArray[np.intp] = np.bincount(bins, minlength=PROFILE_BINS)
+
+    def mean(values: Array) -> Array:
+        total = np.bincount(bins, weights=values, minlength=PROFILE_BINS)
+        few = np.full(PROFILE_BINS, np.nan)
+        means: Array = np.divide(total, count, out=few, where=count >= _MIN_IN_BIN)
+        return means
+
+    return Profile(
+        edges=edges,
+        count=count,
+        rms_px=np.sqrt(mean((residuals_px**2).mean(axis=1))),
+        expected_px=np.sqrt(mean(sigma_px**2)),
+        outward_px=mean(outward_px),
+    )
+
+
+def incidence_profile(camera: Camera, seen: CameraResiduals) -> Profile:
+    """Residuals against the angle at the port, up to the steepest corner of the frame."""
+    angles = incidence_deg(camera, seen.pixels)
+    steepest = float(np.nanmax(np.append(incidence_deg(camera, camera.border(1)), angles)))
+    away = (seen.residuals_px * outward(camera, seen.pixels)).sum(axis=1)
+    return profile(angles, seen.residuals_px, away, seen.sigma_px, steepest)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Coverage:
+    """Distribution of the points over one frame."""
+
+    counts: NDArray[np.intp]
+    """(rows, columns) points by cell of the frame."""
+    empty_share: float
+    """Share of the cells without a point."""
+    corner_reach: dict[str, float]
+    """By corner: how far out, as a share of both half sides, the outermost point lies."""
+    uncovered: tuple[str, ...]
+    """Corners that no point comes near."""
+
+
+def coverage(camera: Camera, pixels: Array) -> Coverage:
+    """Count pixels (N, 2) by cell of the frame, and measure how near they come to its corners."""
+    size = np.array([camera.width_px, camera.height_px])
+    cell = np.floor(pixels / size * _CELLS).astype(int)
+    inside = ((cell >= 0) & (cell < _CELLS)).all(axis=1)
+    columns, rows = _CELLS
+    counts = np.bincount(cell[inside] @ [1, columns], minlength=rows * columns)
+    off = pixels / (size / 2) - 1.0
+    reach = {
+        name: float(np.max((off * sign).min(axis=1), initial=0.0)) for name, sign in CORNERS.items()
+    }
+    return Coverage(
+        counts=counts.reshape(rows, columns),
+        empty_share=float((counts == 0).mean()),
+        corner_reach=reach,
+        uncovered=tuple(name for name, share in reach.items() if share < COVERED_REACH),
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HomographyTest:
+    """Homography residuals of one camera, over all views."""
+
+    views: int
+    inner_px: float
+    """Standard deviation of one coordinate of the inner points, by the degrees of freedom."""
+    outer_px: float
+    """The same of the outer points."""
+    outer_from_px: float
+    """Radius at which outer points begin."""
+    inner_count: int
+    outer_count: int
+
+    @property
+    def excess_px(self) -> float:
+        """Excess of the outer residuals over the inner ones and chance (3 sigma); 0 if none.
+
+        The variance of n points, two coordinates each, has a relative sigma of 1 / sqrt(n).
+        """
+        if not self.outer_count:
+            return 0.0
+        chance = self.inner_px**2 * (1.0 + 3.0 / self.outer_count**0.5)
+        return float(max(self.outer_px**2 - chance, 0.0) ** 0.5)
+
+
+def homography_test(calibration: Calibration, camera: str) -> HomographyTest | None:
+    """Fit a homography to every view of one camera.
+
+    Returns:
+        None where the target is not flat, or no view has enough points.
+    """
+    points = calibration.drawn_points
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    index = list(calibration.rig.cameras).index(camera)
+    model = calibration.rig.cameras[camera]
+    known = np.isfinite(calibration.residuals_px[:, index, :, 0])
+    usable = np.nonzero(known.sum(axis=1) >= _MIN_POINTS)[0]
+    if spread[2] >= _FLAT_SHARE * spread[0] or not len(usable):
+        return None
+    measured = stack_views(calibration.views, calibration.rig, len(points))[:, index]
+    poses = [calibration.rig.cam_from_rig[camera] * pose for pose in calibration.rig_from_target]
+    if calibration.shape.parameters:
+        for v in usable:
+            bent = model.project(poses[v].apply(calibration.target_points))
+            measured[v] -= bent - model.project(poses[v].apply(points))
+    depths = np.concatenate([poses[v].apply(points[known[v]])[:, 2] for v in usable])
+    warp = best_warp(model, float(depths.min()), float(depths.max()))
+    fits = [_fit_view(warp, points[known[v]], measured[v, known[v]], poses[v]) for v in usable]
+    pixels, residuals, freedom = (np.concatenate(parts) for parts in zip(*fits, strict=True))
+    radius = np.linalg.norm(pixels - [model.cx_px, model.cy_px], axis=1)
+    outer_from = _OUTER_SHARE * float(radius.max())
+    inner = radius < outer_from
+    return HomographyTest(
+        views=len(usable),
+        inner_px=_sigma(residuals[inner], freedom[inner]),
+        outer_px=_sigma(residuals[~inner], freedom[~inner]),
+        outer_from_px=outer_from,
+        inner_count=int(inner.sum()),
+        outer_count=int((~inner).sum()),
+    )
+
+
+def _fit_view(
+    warp: PinholeWarp, target_points: Array, pixels: Array, cam_from_target: RigidTransform
+) -> tuple[Array, Array, Array]:
+    """Pixels and their `homography_residuals`, once outliers are set aside.
+
+    Outliers are found by the homography, not by the calibration's residuals: what its model cannot
+    fit must not hide here.
+    """
+    while True:
+        residuals, freedom = homography_residuals(warp, target_points, pixels, cam_from_target)
+        length = np.linalg.norm(residuals, axis=1)
+        stay = length <= _OUTLYING * float(np.median(length))
+        if stay.all() or stay.sum() < _MIN_POINTS:
+            return pixels, residuals, freedom
+        target_points, pixels = target_points[stay], pixels[stay]
+
+
+def _sigma(residuals: Array, freedom: Array) -> float:
+    total = float(freedom.sum())
+    return float(((residuals**2).mean(axis=1).sum() / total) ** 0.5) if total > 0 else float("nan")
+
+
+def homography_residuals(
+    warp: PinholeWarp, target_points: Array, pixels: Array, cam_from_target: RigidTransform
+) -> tuple[Array, Array]:
+    """Fit one view's homography, least squares in the camera's own pixels.
+
+    Args:
+        warp: the camera, whose lens and port are undone, and the pinhole that looks instead.
+        target_points: (N, 3) on one plane, N > 4.
+        pixels: (N, 2) as measured.
+        cam_from_target: gives the distances of the points.
+
+    Returns:
+        Residuals (N, 2), fitted minus measured, in the camera's pixels; and (N,) the share of the
+        noise's variance that the fit leaves in each (1 minus its leverage).
+    """
+    depth = cam_from_target.apply(target_points)[:, 2]
+    seen = warp.to_pinhole(pixels, depth)
+    # How ideal pixels move with measured ones, whose noise is the same everywhere.
+    columns = [
+        (warp.to_pinhole(pixels + s, depth) - warp.to_pinhole(pixels - s, depth))
+        / (2 * _HALF_STEP_PX)
+        for s in _HALF_STEP_PX * np.eye(2)
+    ]
+    back = np.linalg.inv(np.stack(columns, axis=-1))
+    plane = _plane_coordinates(target_points)
+    centre, size = seen.mean(axis=0), np.abs(seen - seen.mean(axis=0)).max()
+
+    def left(h: Array) -> tuple[Array, Array]:
+        """Residuals (N, 2) and their slopes by h, (2 N, 8)."""
+        mapped, slopes = _map(h, plane)
+        off = np.einsum("nab,nb->na", back, size * mapped + centre - seen)
+        return off, (back @ (size * slopes)).reshape(-1, 8)
+
+    h = np.ravel(cv2.findHomography(plane, (seen - centre) / size)[0])[:8]
+    for _ in range(20):
+        residuals, rows = left(h)
+        step = np.linalg.lstsq(rows, -residuals.ravel(), rcond=None)[0]
+        h = h + step
+        if np.abs(step).max() < 1e-13:
+            break
+    residuals, rows = left(h)
+    leverage = (np.linalg.qr(rows)[0] ** 2).sum(axis=1).reshape(-1, 2).mean(axis=1)
+    return residuals, 1.0 - leverage
+
+
+def _plane_coordinates(points: Array) -> Array:
+    """(N, 2) in the points' own plane, about their centre, at most about 1 in size."""
+    centred = points - points.mean(axis=0)
+    axes = np.linalg.svd(centred, full_matrices=False)[2][:2]
+    flat: Array = centred @ axes.T / np.abs(centred @ axes.T).max()
+    return flat
+
+
+def _map(h: Array, plane: Array) -> tuple[Array, Array]:
+    """Where a homography takes the plane's points, (N, 2), and its slopes by h, (N, 2, 8)."""
+    x, y = plane.T
+    bottom = h[6] * x + h[7] * y + 1.0
+    row = np.stack([x, y, np.ones_like(x)], axis=1) / bottom[:, None]
+    image = row @ np.stack([h[:3], h[3:6]], axis=1)
+    slopes = np.zeros((len(plane), 2, 8))
+    slopes[:, 0, :3] = slopes[:, 1, 3:6] = row
+    slopes[:, :, 6:] = -image[:, :, None] * row[:, None, :2]
+    return image, slopes
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TargetFrame:
+    """What returns in the target's frame."""
+
+    returning_px: float
+    """Root mean square length of what returns, a residual of every view; 0 if nothing does."""
+    p_value: float
+    """Probability of as much by chance, if views are independent of each other."""
+    in_plane_m: float
+    """Root mean square offset in the target's plane, beyond what noise gives."""
+    likely: Cause | None
+    """Bends and stretch that were not adjusted, a few corners, or neither; None if nothing returns
+    but by chance."""
+
+
+def target_frame(calibration: Calibration) -> TargetFrame | None:
+    """Average the residuals of all pictures at every place of the target.
+
+    With D the slopes of a corner's pixels by its place and r their residuals, over their sigmas,
+    view v pulls at place n by g_nv = D^T r. Products of the pulls of two views with errors of their
+    own are 0 on average, and their scatter is known from the products themselves, as any view's
+    errors might have had the other sign.
+
+    Returns:
+        None with fewer than four views, or without the noise of the corners.
+    """
+    if len(calibration.views) < _MIN_VIEWS or calibration.spread is None:
+        return None
+    count = calibration.target_points.size
+    information = calibration.spread.of_places.reshape(count, count)
+    pulls, weight, points = _pulls(calibration)
+    known = np.linalg.matrix_rank(weight, hermitian=True) == 3
+    inverse = np.zeros_like(weight)
+    inverse[known] = np.linalg.inv(weight[known])
+    moved = np.einsum("nij,vnj->vni", inverse, pulls)
+    products = np.einsum("vni,wni->vw", pulls, moved)
+    own = float(np.trace(products))
+    apart = products - np.diag(np.diag(products))
+    scatter, excess = float(np.sqrt(2.0 * (apart**2).sum())), float(apart.sum())
+    offsets = -moved.sum(axis=0)
+    # Every view's own pull, squared, is what noise adds to the square of their sum.
+    plane = (offsets[:, :2] ** 2 - (moved[..., :2] ** 2).sum(axis=0))[known]
+    sigma_px = float(np.sqrt(np.mean(calibration.sigma_px**2)))
+
+    def left(modes: Array) -> float:
+        """Excess after offsets along modes (K, N, 3) and all unknowns were adjusted."""
+        rows = modes.reshape(-1, count) @ information
+        pull = pulls.sum(axis=0).ravel()
+        table, pulled = rows @ modes.reshape(-1, count).T, modes.reshape(-1, count) @ pull
+        values = np.linalg.lstsq(table, pulled, rcond=1e-10)[0]
+        rest = (pull - values @ rows).reshape(-1, 3)
+        return float(np.einsum("ni,nij,nj->", rest, inverse, rest)) - own
+
+    p_value = float(norm.sf(excess / scatter)) if scatter > 0.0 else 1.0
+    squares = np.einsum("ni,nij,nj->n", offsets, weight, offsets)
+    returns = p_value < _BY_CHANCE
+    return TargetFrame(
+        returning_px=sigma_px * float(np.sqrt(max(excess, 0.0) / points)),
+        p_value=p_value,
+        in_plane_m=float(np.sqrt(max(plane.sum(axis=1).mean(), 0.0))) if known.any() else 0.0,
+        likely=_cause(calibration.drawn_points, squares, excess, left) if returns else None,
+    )
+
+
+def _pulls(calibration: Calibration) -> tuple[Array, Array, int]:
+    """(V, N, 3) pulls of the views, (N, 3, 3) their weight, and the number of points."""
+    rig, target = calibration.rig, calibration.target_points
+    pulls = np.zeros((len(calibration.views), *target.shape))
+    weight, count = np.zeros((len(target), 3, 3)), 0
+    weights = np.nan_to_num(calibration.weights)
+    for v, c in np.ndindex(*calibration.sigma_px.shape):
+        residuals = calibration.residuals_px[v, c]
+        seen = np.isfinite(residuals).all(axis=1)
+        if not seen.any():
+            continue
+        name = list(rig.cameras)[c]
+        pose = rig.cam_from_rig[name] * calibration.rig_from_target[v]
+        _, by_point, _ = rig.cameras[name].project_jacobian(pose.apply(target[seen]))
+        slopes = by_point @ pose.rotation.as_matrix() / calibration.sigma_px[v, c]
+        scaled = residuals[seen] * weights[v, c, seen, None] / calibration.sigma_px[v, c]
+        pulls[v, seen] += np.einsum("nai,na->ni", slopes, scaled)
+        weight[seen] += np.einsum("nai,naj->nij", slopes, slopes)
+        count += int(seen.sum())
+    return pulls, weight, count
+
+
+def _cause(drawn: Array, squares: Array, excess: float, left: Callable[[Array], float]) -> Cause:
+    """What takes most of the excess away."""
+    count = len(drawn)
+    few = np.argsort(squares)[-max(round(_FEW * count), 1) :]
+    axes = np.zeros((len(few), 3, count, 3))
+    axes[np.arange(len(few))[:, None], np.arange(3), few[:, None], np.arange(3)] = 1.0
+    modes: dict[Cause, Array] = {"corners": axes.reshape(-1, count, 3)}
+    shape = usual_shape(drawn)
+    if shape.parameters:
+        modes["shape"] = shape.modes
+    rest = {cause: left(some) for cause, some in modes.items()}
+    cause = min(rest, key=lambda name: rest[name])
+    return cause if rest[cause] < _MAX_OF * excess else "uneven"
