@@ -90,7 +90,7 @@ def measured_s(work: Path, survey: Path, workers: int) -> float:
     with workers_of(work, workers) as file:
         command(
             "reconstruct", "-w", str(copy), "--quiet", "--cluster", str(file),
-            "--events", str(events),
+            "--log-file", str(events),
         )  # fmt: skip
     return float(sum(read_json(copy / stage / "stage.json")["took_s"] for stage in _STAGES))
 

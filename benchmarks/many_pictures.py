@@ -121,7 +121,7 @@ def reconstruct(workspace: Path, threads: int) -> list[str]:
     """The command that makes all stages of a workspace."""
     return python("-m", "alice_survey", "reconstruct", "-w", str(workspace), "--quiet",
                   "--threads", str(threads), "--device", "cpu",
-                  "--events", str(workspace / "events.jsonl"))  # fmt: skip
+                  "--log-file", str(workspace / "events.jsonl"))  # fmt: skip
 
 
 def lattice_of(tile: Path, copies: int) -> Lattice:

@@ -49,7 +49,7 @@ from pathlib import Path
 from alice_survey.app.cli.session import session
 from alice_survey.app.pipeline import run
 
-with session(sys.argv[1:], quiet=True, log_file=None, events=Path(sys.argv[2])):
+with session(sys.argv[1:], quiet=True, files=[Path(sys.argv[2])]):
     run(sys.argv[3:], Path(sys.argv[1]), None)
 """
 

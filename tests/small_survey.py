@@ -34,7 +34,7 @@ def start(workspace: Path, threads: int) -> subprocess.Popen[bytes]:
     """Begin to run all stages, with events next to the workspace."""
     command = [sys.executable, "-m", "alice_survey", "run", "-w", str(workspace)]
     return subprocess.Popen(
-        [*command, "--threads", str(threads), "--events", str(workspace.with_suffix(".jsonl"))],
+        [*command, "--threads", str(threads), "--log-file", str(workspace.with_suffix(".jsonl"))],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,

@@ -197,7 +197,7 @@ def test_what_goes_wrong_half_way_is_reported_in_a_line_and_nothing_is_lost(
         ("matching", lambda: shutil.copy(first, last)),
     ):
         seen = events.stat().st_size if events.exists() else 0
-        run = reconstruct(workspace, "--events", str(events))
+        run = reconstruct(workspace, "--log-file", str(events))
         assert wait_for(run, events, seen, event="step_started", step=step)
         spoil()
         line = run.communicate()[1].strip()

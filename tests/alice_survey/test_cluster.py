@@ -291,7 +291,7 @@ def test_a_survey_on_a_cluster_has_the_same_bytes_whatever_is_killed(
     with Machines(tmp_path / "machines") as machines:
         command = [
             sys.executable, "-m", "alice_survey", "run", "-w", str(workspace),
-            "--cluster", str(machines.file), "--events", str(events),
+            "--cluster", str(machines.file), "--log-file", str(events),
         ]  # fmt: skip
         run = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
         for number, stage in enumerate(FOLDERS):

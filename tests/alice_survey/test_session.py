@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import psutil
 import pytest
@@ -19,53 +19,34 @@ import typer
 from typer.testing import CliRunner
 
 from alice_survey.app.cli import main as cli
-from alice_survey.app.cli.options import print_result, with_sessions
+from alice_survey.app.commands.base import ReportCommand, option
 from alice_survey.core.errors import PlanError, note, warn
 from alice_survey.core.executor import local_executor
 from alice_survey.core.run import interrupts, progress
 
 
+class Works(ReportCommand):
+    """Work hard."""
+
+    name = "work-hard"
+    length: int = option(1, "How long.")
+    work: ClassVar[Callable[[], None]]
+
+    def run(self) -> tuple[str, object]:
+        type(self).work()
+        return f"done {self.length}", {"done": self.length}
+
+
 def made(work: Callable[[], None]) -> typer.Typer:
     """An app of one command, and of a group with one below it."""
-    app, group = typer.Typer(), typer.Typer(invoke_without_command=True)
-
-    @app.command()
-    def work_hard(length: int = 1) -> None:
-        work()
-        print_result(f"done {length}", {"done": length}, as_json=False)
-
-    @group.callback()
-    def whole(context: typer.Context) -> None:
-        if context.invoked_subcommand is None:
-            work()
-
-    @group.command()
-    def below() -> None:
-        work()
-
-    app.add_typer(group, name="group")
-    with_sessions(app)
-    return app
+    names = ("work-hard", "group", "group below")
+    return cli.make_app(
+        [type("Works", (Works,), {"name": name, "work": staticmethod(work)}) for name in names]
+    )
 
 
 def events_of(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().splitlines()]
-
-
-def test_every_command_takes_the_options() -> None:
-    commands = [command for _, command in _all_commands(cli.app)]
-    assert len(commands) > 30
-    for path, command in _all_commands(cli.app):
-        options = set(command.__annotations__)
-        assert {"quiet", "log_file", "events"} <= options, path
-
-
-def _all_commands(app: typer.Typer, *path: str) -> list[tuple[tuple[str, ...], Any]]:
-    found = [((*path, c.name or ""), c.callback) for c in app.registered_commands]
-    for group in app.registered_groups:
-        assert group.typer_instance is not None
-        found += _all_commands(group.typer_instance, *path, group.name or "")
-    return found
 
 
 def test_events_follow_a_run_from_its_beginning_to_its_end(tmp_path: Path) -> None:
@@ -77,7 +58,7 @@ def test_events_follow_a_run_from_its_beginning_to_its_end(tmp_path: Path) -> No
             counter.advance()
 
     file, log = tmp_path / "events.jsonl", tmp_path / "log"
-    arguments = ["work-hard", "--length", "7", "--events", str(file), "--log-file", str(log)]
+    arguments = ["work-hard", "--length", "7", "--log-file", str(file), "--log-file", str(log)]
     done = CliRunner().invoke(made(work), arguments)
     assert (done.exit_code, done.stdout) == (0, "done 7\n")
     assert done.stderr == "warning: odd\ncompiling\n"
@@ -118,9 +99,9 @@ def test_the_end_of_a_run_is_reported(
     def work() -> None:
         raise error
 
-    file, log = tmp_path / "events", tmp_path / "log"
+    file, log = tmp_path / "events.jsonl", tmp_path / "log"
     done = CliRunner().invoke(
-        made(work), ["work-hard", "--events", str(file), "--log-file", str(log)]
+        made(work), ["work-hard", "--log-file", str(file), "--log-file", str(log)]
     )
     assert done.exit_code == code
     *_, before, last = events_of(file)
@@ -133,10 +114,8 @@ def test_the_end_of_a_run_is_reported(
     assert ("Traceback" in log.read_text()) == ("traceback" in before) == traced
 
 
-@pytest.mark.parametrize("option", ["--events", "--log-file"])
 @pytest.mark.parametrize("path", ["-", "FOLDER", "FILE/below", "/dev/full"])
 def test_a_file_that_cannot_be_written_ends_the_run_before_it_begins(
-    option: str,
     path: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -145,7 +124,7 @@ def test_a_file_that_cannot_be_written_ends_the_run_before_it_begins(
     monkeypatch.chdir(tmp_path)
     Path("FOLDER").mkdir()
     Path("FILE").write_text("a file")
-    monkeypatch.setattr(sys, "argv", ["alice-survey", "init", "new", option, path])
+    monkeypatch.setattr(sys, "argv", ["alice-survey", "init", "new", "--log-file", path])
     if path == "/dev/full":  # it opens: the run goes on with a warning
         _exits(0)
         assert path in capsys.readouterr().err
@@ -165,14 +144,14 @@ def _exits(code: int) -> None:
 
 def test_options_go_behind_the_last_command(tmp_path: Path) -> None:
     worked: list[int] = []
-    app, file = made(lambda: worked.append(1)), str(tmp_path / "events")
-    assert CliRunner().invoke(app, ["group", "--events", file, "below"]).exit_code == 2
+    app, file = made(lambda: worked.append(1)), str(tmp_path / "events.jsonl")
+    assert CliRunner().invoke(app, ["group", "--log-file", file, "below"]).exit_code == 2
     assert not worked
-    assert CliRunner().invoke(app, ["group", "below", "--events", file]).exit_code == 0
-    assert CliRunner().invoke(app, ["group", "--events", file]).exit_code == 0
+    assert CliRunner().invoke(app, ["group", "below", "--log-file", file]).exit_code == 0
+    assert CliRunner().invoke(app, ["group", "--log-file", file]).exit_code == 0
     assert worked == [1, 1]
     names = [event["event"] for event in events_of(Path(file))]
-    assert names == ["run_started", "run_finished"] * 2
+    assert names == ["run_started", "result", "run_finished"] * 2
 
 
 def _warns(item: int) -> int:
@@ -190,9 +169,9 @@ def test_warnings_of_other_processes_are_reported_in_order(
         for _ in local_executor(threads).map(_warns, range(3), label="look"):
             pass
 
-    done = CliRunner().invoke(made(work), ["work-hard", "--events", str(tmp_path / "e")])
+    done = CliRunner().invoke(made(work), ["work-hard", "--log-file", str(tmp_path / "e.jsonl")])
     assert isinstance(done.exception, PlanError)
-    warnings = [e["message"] for e in events_of(tmp_path / "e") if e["event"] == "warning"]
+    warnings = [e["message"] for e in events_of(tmp_path / "e.jsonl") if e["event"] == "warning"]
     assert warnings == ["item 0 is odd", "item 1 is odd", "item 2 is odd"]
     assert done.stderr.splitlines() == [f"warning: {line}" for line in warnings]
     assert capfd.readouterr().err == ""  # the other processes say nothing themselves
@@ -204,14 +183,19 @@ from pathlib import Path
 import typer
 from alice_survey.core.run import interrupts
 from alice_survey.core.artefacts import Stage, run_stage
-from alice_survey.app.cli.options import with_sessions
+from alice_survey.app.cli.main import make_app
+from alice_survey.app.commands.base import Command, argument
 from alice_survey.core.executor import local_executor
 import sleeping
 
-app = typer.Typer()
+class Run(Command):
+    name = "run"
+    kind: str = argument(..., "")
+    folder: Path = argument(..., "")
+    def run(self) -> None:
+        make(self.kind, self.folder)
 
-@app.command()
-def run(kind: str, folder: Path) -> None:
+def make(kind, folder):
     def work(partial: Path) -> None:
         import pycolmap  # whose log has an answer of its own to some signals
         (partial / "half").touch()
@@ -224,8 +208,7 @@ def run(kind: str, folder: Path) -> None:
 
 if __name__ == "__main__":
     interrupts._GRACE_S = 0.5
-    with_sessions(app)
-    app()
+    make_app([Run])()
 """
 SLEEPING = """
 import os, time
@@ -248,11 +231,11 @@ def test_a_signal_ends_all_processes_and_says_how_to_go_on(
     """Of Ctrl-C, a scheduler, and a terminal that closes; twice at once, as `timeout` sends it."""
     (tmp_path / "sleeping.py").write_text(SLEEPING)
     (tmp_path / "script.py").write_text(SCRIPT)
-    folder, file = tmp_path / "workspace", tmp_path / "events"
+    folder, file = tmp_path / "workspace", tmp_path / "events.jsonl"
     folder.mkdir()
     command = [sys.executable, str(tmp_path / "script.py"), kind, str(folder)]
     run = subprocess.Popen(
-        [*command, "--events", str(file)],
+        [*command, "--log-file", str(file)],
         stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
         preexec_fn=_default_signals,
     )  # fmt: skip
@@ -281,9 +264,9 @@ def test_ctrl_c_that_a_library_makes_a_fault_of_is_none(tmp_path: Path) -> None:
         except KeyboardInterrupt as error:
             raise SystemError("returned a result with an exception set") from error
 
-    done = CliRunner().invoke(made(work), ["work-hard", "--events", str(tmp_path / "e")])
+    done = CliRunner().invoke(made(work), ["work-hard", "--log-file", str(tmp_path / "e.jsonl")])
     assert (done.exit_code, done.stderr) == (130, "interrupted\n")
-    *_, before, last = events_of(tmp_path / "e")
+    *_, before, last = events_of(tmp_path / "e.jsonl")
     assert (before["event"], before["message"]) == ("error", "interrupted")
     assert (last["event"], last["exit_code"]) == ("run_finished", 130)
 
@@ -295,12 +278,12 @@ def test_a_terminal_that_closes_ends_what_was_not_meant_to_outlive_it(
     """As `nohup` has it. Nothing reads what either writes any more."""
     (tmp_path / "sleeping.py").write_text(SLEEPING.replace("60", "2" if outlives else "60"))
     (tmp_path / "script.py").write_text(SCRIPT)
-    folder, file = tmp_path / "workspace", tmp_path / "events"
+    folder, file = tmp_path / "workspace", tmp_path / "events.jsonl"
     folder.mkdir()
     run, terminal = pty.fork()
     if run == 0:
         signal.signal(signal.SIGHUP, signal.SIG_IGN if outlives else signal.SIG_DFL)
-        command = [str(tmp_path / "script.py"), "parallel", str(folder), "--events", str(file)]
+        command = [str(tmp_path / "script.py"), "parallel", str(folder), "--log-file", str(file)]
         os.execv(sys.executable, [sys.executable, *command])  # noqa: S606 (a fork's own end)
     _wait_until(lambda: len(list(folder.glob("begun*"))) == 2)
     os.close(terminal)
@@ -323,14 +306,14 @@ sys.modules["fcntl"] = None
 from pathlib import Path
 from alice_survey.core.executor import local_executor
 from alice_survey.app.cli.session import session
-with session([], quiet=True, log_file=None, events=Path(sys.argv[1])):
+with session([], quiet=True, files=[Path(sys.argv[1])]):
     assert list(local_executor(1).map(abs, [-1, -2], label="abs")) == [1, 2]
 """
 
 
 def test_a_run_needs_no_signals_of_posix(tmp_path: Path) -> None:
-    subprocess.run([sys.executable, "-c", NOT_POSIX, str(tmp_path / "e")], check=True)
-    *_, last = events_of(tmp_path / "e")
+    subprocess.run([sys.executable, "-c", NOT_POSIX, str(tmp_path / "e.jsonl")], check=True)
+    *_, last = events_of(tmp_path / "e.jsonl")
     assert (last["event"], last["exit_code"]) == ("run_finished", 0)
 
 
@@ -384,9 +367,9 @@ def test_a_killed_worker_is_reported_in_one_line(tmp_path: Path) -> None:
     def work() -> None:
         list(local_executor(2).map(_dies, range(4), label="die"))
 
-    done = CliRunner().invoke(made(work), ["work-hard", "--events", str(tmp_path / "e")])
+    done = CliRunner().invoke(made(work), ["work-hard", "--log-file", str(tmp_path / "e.jsonl")])
     assert done.exit_code == 1
-    (line,) = [e["message"] for e in events_of(tmp_path / "e") if e["event"] == "error"]
+    (line,) = [e["message"] for e in events_of(tmp_path / "e.jsonl") if e["event"] == "error"]
     assert "--threads" in line
 
 
@@ -399,13 +382,11 @@ BARS = """
 import time
 import typer
 from alice_survey.core.run import progress
-from alice_survey.app.cli.options import print_result, with_sessions
+from alice_survey.app.cli.main import make_app
+from alice_survey.app.commands.base import Command
 from alice_survey.core.errors import warn
 
-app = typer.Typer()
-
-@app.command()
-def run() -> None:
+def run(self):
     with progress.part("sparse", 2, 5), progress.stage("mapping") as finish:
         with progress.step("[features]", 10) as counter:
             for _ in range(10):
@@ -415,10 +396,9 @@ def run() -> None:
         with progress.step("solve"):
             time.sleep(0.3)
         finish(took_s=125.0, cpu_s=1.0, peak_mib=1.0)
-    print_result("the result", {}, as_json=False)
+    return "the result", {}
 
-with_sessions(app)
-app()
+make_app([type("Run", (Command,), {"name": "run", "run": run})])()
 """
 
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from typer.testing import CliRunner
 
-from alice_survey.app.cli.camera import app as camera_commands
+from alice_survey.app.cli.main import app
 from alice_survey.core.config import SurveyConfig
 from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import BODY_FROM_NADIR_CAM, Array
@@ -123,18 +123,18 @@ def test_only_the_rig_itself_is_replaced_without_being_asked(rig: Rig, tmp_path:
     before = other.read_bytes()
     arguments = ["mount", str(path), "forward+30", "-o"]
 
-    refused = CliRunner().invoke(camera_commands, [*arguments, str(other)])
+    refused = CliRunner().invoke(app, ["camera", *arguments, str(other)])
     assert "exists: name another, or add --overwrite" in str(refused.exception)
     assert other.read_bytes() == before
 
     for output, options in ((other, ["--overwrite"]), (same, []), (tmp_path / "new.json", [])):
-        done = CliRunner().invoke(camera_commands, [*arguments, str(output), *options])
+        done = CliRunner().invoke(app, ["camera", *arguments, str(output), *options])
         assert done.exit_code == 0
         assert "from forward+30" in mount_line(read_rig(output))
 
 
 def test_the_mount_is_shown_as_an_argument_that_may_be_left_out() -> None:
-    usage = CliRunner().invoke(camera_commands, ["mount", "--help"]).output
+    usage = CliRunner().invoke(app, ["camera", "mount", "--help"]).output
     assert " [MOUNT]" in usage
     assert "[[" not in usage
 

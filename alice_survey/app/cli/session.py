@@ -19,22 +19,19 @@ from alice_survey.core.run.resources import versions
 
 
 @contextlib.contextmanager
-def session(
-    arguments: Sequence[str], *, quiet: bool, log_file: Path | None, events: Path | None
-) -> Iterator[None]:
+def session(arguments: Sequence[str], *, quiet: bool, files: Sequence[Path]) -> Iterator[None]:
     """Within this block a command does its work.
 
     Args:
         arguments: arguments of the command line, without the program's name.
         quiet: show warnings and errors alone.
-        log_file: to add lines to.
-        events: file to add events to.
+        files: to add lines to; events to those whose name ends in .jsonl.
 
     Raises:
         WorkspaceError: a file cannot be written; nothing is done then.
         SystemExit: with 130 after Ctrl-C, 143 or 129 after SIGTERM or SIGHUP.
     """
-    run = Run(Console(quiet=quiet), _opened(log_file, events))
+    run = Run(Console(quiet=quiet), [_log_handler(path) for path in files])
     command = shlex.join(["alice-survey", *arguments])
     packages = {"python": platform.python_version(), **versions()}
     first = _Once()
@@ -63,17 +60,13 @@ def session(
             raise SystemExit(interrupts.exit_code(error)) from None
 
 
-def _opened(log_file: Path | None, events: Path | None) -> list[LogFile | EventFile]:
-    for path, option in ((log_file, "--log-file"), (events, "--events")):
-        if path == Path("-"):
-            raise WorkspaceError(
-                f"{option} -: standard output is for results; give a file or a named pipe, or "
-                "/dev/stderr"
-            )
-    if log_file is not None and events is not None and log_file.resolve() == events.resolve():
-        raise WorkspaceError(f"{events}: give --log-file and --events a file each")
-    files: list[LogFile | EventFile] = [] if log_file is None else [LogFile(log_file)]
-    return files if events is None else [*files, EventFile(events)]
+def _log_handler(path: Path) -> LogFile | EventFile:
+    if path == Path("-"):
+        raise WorkspaceError(
+            "--log-file -: standard output is for results; give a file or a named pipe, or "
+            "/dev/stderr"
+        )
+    return EventFile(path) if path.suffix == ".jsonl" else LogFile(path)
 
 
 class _Once:

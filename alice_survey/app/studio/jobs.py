@@ -24,12 +24,14 @@ from typing import Any
 
 import psutil
 from filelock import FileLock
-from pydantic import Field
+from pydantic import Field, ValidationError
 
+from alice_survey.app.commands import COMMANDS
+from alice_survey.app.commands.base import Command
 from alice_survey.app.pipeline import is_locked
-from alice_survey.app.studio.commands import COMMANDS, words_of
 from alice_survey.core.artefacts import JsonRecord, refuse_links
-from alice_survey.core.errors import AliceError, WorkspaceError, why
+from alice_survey.core.contents import first_fault, shown
+from alice_survey.core.errors import AliceError, ConfigError, WorkspaceError, why
 from alice_survey.core.run.events import Event, described
 from alice_survey.core.run.interrupts import for_other_programs
 from alice_survey.core.stages import STAGES
@@ -39,6 +41,7 @@ RECORD, OUTPUT, ERRORS, EVENTS = "job.json", "output.txt", "errors.txt", "events
 FOLDER = Path(".studio", "jobs")
 _NUMBER = re.compile("[0-9]{4,9}")
 """Names of jobs' folders."""
+_NAVIGATION_FILE = re.compile(r"navigation[\w-]{0,40}\.csv")
 _KEPT_JOBS = 20
 _POLL_S = 0.1
 _PUBLISH_EVERY_S = 0.25
@@ -64,6 +67,50 @@ _MAX_LINE = 4000
 _CHUNK = 1 << 20
 
 Publish = Callable[[str, Any], None]
+OFFERED: Mapping[str, type[Command]] = {one.name: one for one in COMMANDS if one.title}
+"""The commands that the studio may start."""
+
+
+def command_of(name: str, arguments: Mapping[str, Any], workspace: Path) -> Command:
+    """A command that a page asks for.
+
+    Args:
+        name: one of `OFFERED`.
+        arguments: JSON values by the names of its fields; of `import-log` the output is a file
+            name.
+        workspace: folder to work in.
+
+    Raises:
+        ConfigError: there is no such command, or an argument is not what it takes.
+    """
+    if name not in OFFERED:
+        raise ConfigError(f"there is no command {name!r}: {', '.join(OFFERED)}")
+    kind = OFFERED[name]
+    given = {field: value for field, value in arguments.items() if value is not None}
+    if refused := sorted(given.keys() - set(kind.offered)):
+        raise ConfigError(f"{name}: {refused[0]}: cannot be set by a page")
+    if "workspace" in kind.model_fields:
+        given["workspace"] = str(workspace.resolve())
+    elif "output" in kind.offered:  # a file of the workspace
+        file = str(given.get("output", "navigation.csv"))
+        if not _NAVIGATION_FILE.fullmatch(file):
+            raise ConfigError(f"{name}: output: {shown(file)} is not a name like navigation-2.csv")
+        given["output"] = str(workspace.resolve() / file)
+    try:
+        command = kind.model_validate(given)
+    except ValidationError as error:
+        raise ConfigError(f"{name}: {first_fault(error, 'arguments')}") from None
+    for field in kind.offered:
+        value = getattr(command, field)
+        for one in value if isinstance(value, list) else [value]:
+            if not str(one).isprintable():
+                raise ConfigError(f"{name}: {field}: {shown(str(one))} is not one printable line")
+            if isinstance(one, Path) and field != "output":
+                if not one.is_absolute():
+                    raise ConfigError(f"{name}: {field}: {one} is not a whole path")
+                if not one.exists():
+                    raise ConfigError(f"{name}: {field}: {one}: no such file or folder")
+    return command
 
 
 class RunState:
@@ -319,8 +366,8 @@ class Jobs:
         """Start a command.
 
         Args:
-            name: one of `COMMANDS`.
-            arguments: of it, JSON values.
+            name: one of `OFFERED`.
+            arguments: of it, as `command_of` takes them.
 
         Returns:
             The job, as `running` gives it.
@@ -330,7 +377,7 @@ class Jobs:
             BusyError: another command is working in the workspace.
             WorkspaceError: the workspace cannot be written.
         """
-        words = words_of(name, arguments or {}, self._workspace)
+        words = command_of(name, arguments or {}, self._workspace).words()
         with self._lock:
             try:
                 refuse_links(self._workspace, self.folder.parent)
@@ -427,7 +474,7 @@ class Jobs:
         folder.mkdir()
         command = [
             *self._program, *words[: len(name.split())],
-            f"--events={folder / EVENTS}", *words[len(name.split()) :],
+            f"--log-file={folder / EVENTS}", *words[len(name.split()) :],
         ]  # fmt: skip
         with (
             (folder / OUTPUT).open("wb") as output,
@@ -443,7 +490,7 @@ class Jobs:
         except psutil.Error:  # it has ended already
             created_s = 0.0
         record = JobRecord(
-            number=number, name=name, title=COMMANDS[name].title, arguments=dict(arguments),
+            number=number, name=name, title=OFFERED[name].title, arguments=dict(arguments),
             command=shlex.join(["alice-survey", *words]), started_utc=_now(),
             process=process.pid, created_s=created_s,
         )  # fmt: skip

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from alice_survey.app.cli.options import executor_on
+from alice_survey.app.commands.base import DeviceCommand
 from alice_survey.core import device
 from alice_survey.core.errors import ConfigError, collected_by
 
@@ -21,7 +21,7 @@ def chosen(tmp_path: Path) -> Chosen:
         said: list[str] = []
         with (
             collected_by(lambda _, text: said.append(text)),
-            executor_on(tmp_path, 1, None, None, choice) as executor,
+            DeviceCommand(workspace=tmp_path, threads=1).started_executor(choice) as executor,
         ):
             return executor.uses_gpu, said
 
@@ -65,7 +65,7 @@ def test_a_gpu_that_does_not_answer_is_an_error_of_one_line(
 def test_a_cluster_takes_no_gpu(tmp_path: Path) -> None:
     with (
         pytest.raises(typer.BadParameter, match="--device"),
-        executor_on(tmp_path, None, "tcp://127.0.0.1:1", None, "gpu"),
+        DeviceCommand(workspace=tmp_path, scheduler="tcp://127.0.0.1:1").started_executor("gpu"),
     ):
         pass
 

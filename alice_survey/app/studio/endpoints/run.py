@@ -20,8 +20,8 @@ from alice_survey.app.computing import (
     workspace_size,
 )
 from alice_survey.app.pipeline import settings, stage_states
-from alice_survey.app.studio.commands import COMMANDS
 from alice_survey.app.studio.endpoints.base import Call, Endpoint, Studio
+from alice_survey.app.studio.jobs import OFFERED
 from alice_survey.core.artefacts import STAGE_FILE, StageRecord, read_stage
 from alice_survey.core.config import Config, SurveyConfig
 from alice_survey.core.errors import AliceError
@@ -73,11 +73,11 @@ def ways_on(line: str) -> list[dict[str, Any]]:
     found = {}
     for match in _COMMAND.finditer(line):
         words = match[1].split(" -")[0]
-        name = next((n for n in (words, words.split()[0]) if n in COMMANDS), None)
+        name = next((n for n in (words, words.split()[0]) if n in OFFERED), None)
         found[match[0]] = {
             "command": match[0].strip("'"),
             "name": None if name == "import-images" else name,
-            "title": "" if name is None else COMMANDS[name].title,
+            "title": "" if name is None else OFFERED[name].title,
         }
     return list(found.values())
 
@@ -138,12 +138,13 @@ def _commands(
 ) -> list[dict[str, Any]]:
     """Commands that make stages, in order, and what each has left to do."""
     found = []
-    for name, command in COMMANDS.items():
-        if not command.stages or (imported and name in _SIMULATED):
+    for name, command in OFFERED.items():
+        made = command.stages()
+        if not made or (imported and name in _SIMULATED):
             continue
-        left = [s for s in command.stages if states.get(s, UP_TO_DATE) != UP_TO_DATE]
+        left = [s for s in made if states.get(s, UP_TO_DATE) != UP_TO_DATE]
         known = {stage: costs[stage] for stage in left if stage in costs}
-        needs = {n for s in left for n in spec(s).needs if n not in command.stages}
+        needs = {n for s in left for n in spec(s).needs if n not in made}
         found.append(
             {
                 "name": name, "title": command.title, "left": left,

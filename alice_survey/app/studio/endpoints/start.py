@@ -7,13 +7,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, cast
 
-from pydantic import Field
+from pydantic import Field, RootModel
 
+from alice_survey.app.commands.intake import ImportImagesCommand
 from alice_survey.app.pipeline import init_survey
-from alice_survey.app.studio.commands import ImportImagesArguments
 from alice_survey.app.studio.endpoints.base import Call, Endpoint, Studio
+from alice_survey.app.studio.jobs import command_of
 from alice_survey.core.artefacts import json_values, refuse_links
 from alice_survey.core.config import Config, load_config
 from alice_survey.core.edited_files import StaleError
@@ -167,8 +168,12 @@ class _NewSurvey(Config):
     trial: bool = False
 
 
+class _Arguments(RootModel[dict[str, Any]]):
+    pass
+
+
 class _NewPictures(Config):
-    arguments: ImportImagesArguments
+    arguments: dict[str, Any]
     colour: Literal["water", "even", "raw"] = "water"
 
 
@@ -184,14 +189,18 @@ class _StartPage:
 
     def preview(self, call: Call) -> Any:
         """What an import would find, and whether folders inside look like those of a rig."""
-        given = call.read(ImportImagesArguments)
-        folders = given.folders
+        asked = call.read(_Arguments).root
+        given = cast(
+            ImportImagesCommand,
+            command_of("import-images", asked, self.studio.workspace.folder),
+        )
+        folders = given.folders or []
         rig = cameras_in(folders[0]) if len(folders) == 1 and not given.recursive else {}
         try:
             found = preview_import(
-                () if rig else folders, cameras=rig or given.cameras, videos=given.videos,
+                () if rig else folders, cameras=rig or given.cameras(), videos=given.video or (),
                 recursive=given.recursive, navigation=given.navigation, rig=given.rig,
-                clock_offset_s=given.clock_offset or 0.0, time_zone=given.time_zone or "UTC",
+                clock_offset_s=given.clock_offset, time_zone=given.time_zone,
             )  # fmt: skip
         except WorkspaceError as fault:  # of a rig that is none, which was chosen wrongly
             raise AliceError(str(fault)) from None
@@ -247,9 +256,9 @@ class _StartPage:
     def pictures(self, call: Call) -> Any:
         """Import pictures, as a job; what differs from the usual goes into survey.toml."""
         asked = call.read(_NewPictures)
-        given = asked.arguments.model_dump(mode="json", exclude_defaults=True)
+        command_of("import-images", asked.arguments, self.studio.workspace.folder)
         self._keep_colour(asked.colour)
-        return {"job": self.studio.jobs.start("import-images", given)}
+        return {"job": self.studio.jobs.start("import-images", asked.arguments)}
 
     def _keep_colour(self, colour: str) -> None:
         """Write the colours that are not the usual ones; what an earlier try has written goes."""

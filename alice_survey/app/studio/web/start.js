@@ -223,10 +223,11 @@ function picturesForm(started, disk) {
       rig: calibration.value.trim() || null, navigation: navigation.value.trim() || null,
       time_zone: zone.value.trim() || null, clock_offset: valueOf(offset) || null,
     };
-    if (Object.keys(rigFolders).length && isRig) return {...common, cameras: rigFolders};
+    if (Object.keys(rigFolders).length && isRig) return {
+      ...common, camera: Object.entries(rigFolders).map(([name, place]) => `${name}=${place}`)};
     if (Object.keys(rigFolders).length) return {...common, folders: [here.path], recursive: true};
     if (!here.pictures && here.videos && !inside.checked) return {
-      ...common, videos: [here.path], overlap: valueOf(overlap)};
+      ...common, video: [here.path], overlap: valueOf(overlap)};
     return {...common, folders: [here.path], recursive: inside.checked};
   }
 

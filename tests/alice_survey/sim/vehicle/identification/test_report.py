@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from alice_survey.app.cli.vehicle import app
+from alice_survey.app.cli.main import app
 from alice_survey.core.errors import VehicleError
 from alice_survey.sim.vehicle.files import coefficients_from_file, vehicle_from
 from alice_survey.sim.vehicle.identification.report import IdentifyOptions, identify_report
@@ -86,7 +86,10 @@ def test_a_log_is_predicted_open_loop_by_what_was_identified(
         "--coefficients", str(tmp_path / "found.json"), "--held", "current_north_mps=-0.05",
         "--held", "current_east_mps=0.1", "-o", str(tmp_path / "out"), "--json",
     ]  # fmt: skip
-    for command in (["identify", "--validate", str(logs[1])], ["replay", str(logs[1])]):
+    for command in (
+        ["vehicle", "identify", "--validate", str(logs[1])],
+        ["vehicle", "replay", str(logs[1])],
+    ):
         result = CliRunner().invoke(app, [*command, *arguments])
         assert result.exit_code == 0, result.output
         data = json.loads(result.stdout)
@@ -115,7 +118,7 @@ def test_the_command_takes_a_bollard_pull_and_held_values(
 ) -> None:
     pull = pull_csv(tmp_path / "pull.csv", 0.0, factors=(1.0, 1.0))
     arguments = [
-        "identify", str(logs[0]), "--method", method, "--free", "X_uu,N_rr", "--bollard",
+        "vehicle", "identify", str(logs[0]), "--method", method, "--free", "X_uu,N_rr", "--bollard",
         str(pull), "--held", "current_north_mps=0.1", "--held", "current_east_mps=-0.05", "-o",
         str(tmp_path / "out"), "--json",
     ]  # fmt: skip

@@ -47,7 +47,7 @@ class FovOptions:
     n_water: float | None = None
 
 
-def fov_report(options: FovOptions, output: Output) -> tuple[str, Any, bool]:
+def fov_report(options: FovOptions, output: Output) -> tuple[str, Any]:
     """FOV, resolution, focus, stereo and blur as text and JSON values."""
     settings = _settings(options)
     rig = _rig(options, settings.water.n_water)
@@ -82,11 +82,11 @@ def fov_report(options: FovOptions, output: Output) -> tuple[str, Any, bool]:
         "rows": json_values(rows),
         "blur": json_values(blur),
     }
-    return as_text(fov_tables(rows, blur)), data, True
+    return as_text(fov_tables(rows, blur)), data
 
 
-def validation_report(options: FovOptions, output: Output) -> tuple[str, Any, bool]:
-    """The paper's claims on optics, and whether every check that has a rule passed.
+def validation_report(options: FovOptions, output: Output) -> tuple[str, Any]:
+    """The paper's claims on optics, with `passed`: whether every check that has a rule does.
 
     Raises:
         ConfigError: an option was given: the claims bring their own lenses, water and altitude.
@@ -109,8 +109,7 @@ def validation_report(options: FovOptions, output: Output) -> tuple[str, Any, bo
             [altitude], FovChoices(), speeds_mps=[0.2, 0.5],
             exposures_s=[PAPER_EXPOSURE_MS * 1e-3], allowed_px=1.0, paper=True,
         )  # fmt: skip
-    text = as_text(validation_tables(validation))
-    return text, validation.to_json(), validation.passed
+    return as_text(validation_tables(validation)), validation.to_json()
 
 
 def _settings(options: FovOptions) -> SurveyConfig:

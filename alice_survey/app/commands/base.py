@@ -1,0 +1,196 @@
+"""A command is a class: its docstring is the help, its fields the options, and `run` does the work.
+
+The command line makes its options of the fields (`alice_survey.app.cli.main`), and the studio
+checks by them what a page asks for. Numeric packages are imported by `run` alone, so that `--help`
+stays quick.
+"""
+
+import contextlib
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import typer
+from pydantic import BaseModel, ConfigDict, Field
+
+from alice_survey.core.device import Choice, is_gpu_chosen
+
+if TYPE_CHECKING:
+    from alice_survey.core.executor import Executor
+
+Result = tuple[str, Any]
+"""What a command gives: text, and JSON values."""
+WORK = Path("work")
+
+
+def option(default: Any, text: str, *names: str, metavar: str | None = None, **bounds: Any) -> Any:
+    """A field that is an option.
+
+    Args:
+        default: value where it is not given; `...` where it must be.
+        text: its help.
+        names: where they are not that of the field.
+        metavar: what its value is called in the help.
+        bounds: `ge` and `le`.
+    """
+    extra: Any = {"names": names, "metavar": metavar, "is_argument": False}
+    return Field(default, description=text, json_schema_extra=extra, **bounds)
+
+
+def argument(default: Any, text: str, metavar: str | None = None) -> Any:
+    """A field that is an argument without a name."""
+    extra: Any = {"names": (), "metavar": metavar, "is_argument": True}
+    return Field(default, description=text, json_schema_extra=extra)
+
+
+class Command(BaseModel):
+    """A command and its arguments."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
+    name: ClassVar[str]
+    """Its words on the command line."""
+    examples: ClassVar[Sequence[str]] = ()
+    """Arguments to show in its help, after the program's name."""
+    title: ClassVar[str] = ""
+    """What it does, in words; only where the studio offers it."""
+    offered: ClassVar[Sequence[str]] = ()
+    """Fields that a page of the studio may set."""
+    quiet: bool = option(False, "Show warnings, errors and the result alone.", "-q", "--quiet")
+    log_file: list[Path] | None = option(
+        None, "Add all that happens, with times, to this file; as JSON lines to a .jsonl.",
+        metavar="FILE",
+    )  # fmt: skip
+
+    @classmethod
+    def declaration(cls, field: str) -> Any:
+        """What `option` or `argument` keeps of a field."""
+        return cls.model_fields[field].json_schema_extra
+
+    @classmethod
+    def option_name(cls, field: str) -> str:
+        """The long name of an option."""
+        named = [name for name in cls.declaration(field)["names"] if name.startswith("--")]
+        return named[0].split("/")[0] if named else f"--{field.replace('_', '-')}"
+
+    @classmethod
+    def stages(cls) -> list[str]:
+        """Stages that it makes."""
+        from alice_survey.core.stages import names
+
+        return names(cls.name)
+
+    def words(self) -> list[str]:
+        """This command on the command line: a value is never taken for another option."""
+        options, plain = list[str](), list[str]()
+        for field in type(self).model_fields:
+            value = getattr(self, field) if field in self.model_fields_set else None
+            values = value if isinstance(value, list) else [] if value is None else [value]
+            if self.declaration(field)["is_argument"]:
+                plain += map(str, values)
+            elif isinstance(value, bool):
+                options += [self.option_name(field)] * value
+            else:
+                options += [f"{self.option_name(field)}={one}" for one in values]
+        return [*self.name.split(), *options, *(["--", *plain] if plain else [])]
+
+    def run(self) -> Result | None:
+        """Do its work."""
+        raise NotImplementedError
+
+    def is_passed(self, data: Any) -> bool:
+        """Whether a result is one to end with exit code 0."""
+        return True
+
+    def show(self, text: str, data: Any) -> None:
+        """Print a result."""
+        from alice_survey.core.run.progress import current
+
+        typer.echo(json.dumps(data, indent=2) if getattr(self, "as_json", False) else text)
+        current().report("result", text)
+
+
+class ReportCommand(Command):
+    """A command whose result is text or JSON."""
+
+    as_json: bool = option(False, "Print machine-readable JSON.", "--json")
+
+
+class WorkspaceCommand(Command):
+    """A command that works in the workspace of a survey."""
+
+    workspace: Path = option(
+        WORK, "Folder that holds the stages of one survey.", "-w", "--workspace"
+    )
+
+
+class SurveyCommand(WorkspaceCommand, ReportCommand):
+    """A command that reads the settings of a survey."""
+
+    survey: Path | None = option(
+        None, "Settings; WORKSPACE/survey.toml, then ./survey.toml, if not given.",
+        "-s", "--survey",
+    )  # fmt: skip
+
+    def settings(self, *, needed: bool = False) -> Any:
+        """The settings, as `pipeline.settings` finds them."""
+        from alice_survey.app.pipeline import settings
+
+        return settings(self.workspace, self.survey, needed=needed)
+
+
+class ThreadsCommand(Command):
+    """A command that computes on cores of this machine."""
+
+    threads: int | None = option(None, "Cores to use; all when not given.", ge=1, le=256)
+
+    def executor(self) -> "Executor":
+        """Where its tasks run."""
+        from alice_survey.core.executor import local_executor
+
+        if self.threads is not None:
+            import cv2
+
+            cv2.setNumThreads(self.threads)
+        return local_executor(self.threads)
+
+
+class ClusterCommand(ThreadsCommand, SurveyCommand):
+    """A command that computes on this machine or on a cluster."""
+
+    scheduler: str | None = option(
+        None, "Run tasks on the Dask cluster of this scheduler.", metavar="ADDRESS"
+    )
+    cluster: Path | None = option(
+        None, "Run tasks on the Dask cluster of this file.", metavar="FILE"
+    )
+
+    @contextlib.contextmanager
+    def started_executor(self, device: Choice = "cpu") -> "Iterator[Executor]":
+        """Within this block, where its tasks run: on a cluster if one is given."""
+        if self.scheduler is None and self.cluster is None:
+            yield replace(self.executor(), uses_gpu=is_gpu_chosen(device))
+            return
+        if device == "gpu":
+            raise typer.BadParameter("--device gpu is for this machine: a cluster uses processors")
+        if self.scheduler is not None and self.cluster is not None:
+            raise typer.BadParameter("give --scheduler or --cluster, not both")
+        if self.threads is not None:
+            raise typer.BadParameter("--threads is for this machine: a cluster has its own workers")
+        from alice_survey.core.cluster.engine import cluster_executor
+
+        with cluster_executor(self.workspace, self.scheduler, self.cluster) as executor:
+            yield executor
+
+
+class DeviceCommand(ClusterCommand):
+    """A command that refines depth."""
+
+    device: Choice = option(
+        "auto", "What refines depth: auto takes an NVIDIA GPU if one can be used."
+    )
+
+
+SCALE = option(None, "Divide the resolution of rendered pictures by this.", ge=1, le=16)
+OUTPUT = option(None, "Folder to write.", "-o", "--output", metavar="DIR")

@@ -1,0 +1,216 @@
+"""Commands that bring in what real dives recorded: pictures and logs."""
+
+from pathlib import Path
+from typing import Literal
+
+import typer
+
+from alice_survey.app.commands.base import (
+    ReportCommand,
+    Result,
+    ThreadsCommand,
+    WorkspaceCommand,
+    argument,
+    option,
+)
+
+
+class ImportImagesCommand(WorkspaceCommand, ThreadsCommand):
+    """Bring in real pictures.
+
+    Pictures of one camera, of several or of a rig of up to eight, or videos, with a navigation log,
+    GPS from EXIF, or nothing at all.
+    """
+
+    name = "import-images"
+    examples = (
+        "import-images photos -w reef",
+        "import-images --left cam1 --right cam2 -w reef",
+        "import-images --left cam1 --right cam2 --triggers triggers.csv -w reef",
+        "import-images --camera bow=B --camera port=P --camera down=D --rig rig.json -w reef",
+        "import-images --bag dive.mcap --every 0.5 --rig rig.json --navigation dive.csv -w reef",
+        "import-images photos --navigation dive.csv --clock-offset -1.5 --masks masks -w reef",
+        "import-images photos --navigation dive.csv --vertical-datum NN2000 -w reef",
+        "import-images phone cameras --recursive -w reef",
+        "import-images --video GX010042.MP4 --video GX020042.MP4 --overlap 0.7 -w reef",
+        "import-images --video CARD --navigation dive.csv --time-zone Europe/Oslo -w reef",
+    )
+    title = "Import pictures"
+    offered = (
+        "folders", "camera", "bag", "video", "overlap", "every", "recursive", "navigation",
+        "clock_offset", "time_zone", "vertical_datum", "rig", "masks", "triggers", "threads",
+    )  # fmt: skip
+    folders: list[Path] | None = argument(None, "Folders of pictures; videos.", "DIR...")
+    left: Path | None = option(None, "Pictures of the left camera.", metavar="DIR")
+    right: Path | None = option(None, "Pictures of the right camera.", metavar="DIR")
+    camera: list[str] | None = option(
+        None, "NAME=FOLDER of a camera, for each of a rig; of a bag NAME=TOPIC."
+    )
+    bag: Path | None = option(None, "ROS bag with pictures.")
+    video: list[Path] | None = option(None, "Videos to take frames from, or a folder of them.")
+    overlap: float | None = option(
+        None, "Of neighbouring frames; 0.7 without --every.", ge=0.3, le=0.95
+    )
+    every: float | None = option(None, "Seconds between frames, at a fixed step.", ge=0.01)
+    recursive: bool = option(False, "Also take folders inside.")
+    navigation: Path | None = option(None, "CSV: time, position, ...", metavar="FILE")
+    clock_offset: float = option(0.0, "Seconds to add to picture times.")
+    time_zone: str = option("UTC", "Of times that name none.")
+    vertical_datum: str | None = option(None, "What the CSV's depths count from.", metavar="NAME")
+    rig: Path | None = option(None, "rig.json of the cameras.", metavar="FILE")
+    masks: Path | None = option(None, "Folder of masks; black is left out.", metavar="DIR")
+    triggers: Path | None = option(
+        None, "CSV: image or number, time_s or time_utc; camera.", metavar="FILE"
+    )
+
+    def cameras(self) -> dict[str, Path]:
+        """Folder of each camera of a rig, by its name.
+
+        Raises:
+            ImageError: one is not NAME=FOLDER, or left is given without right.
+        """
+        from alice_survey.core.errors import ImageError
+        from camera_calib.picture_files import places_of_cameras
+
+        if (self.left is None) != (self.right is None):
+            raise ImageError(
+                "--left and --right go together; of one camera give the folder, or --camera "
+                "NAME=FOLDER"
+            )
+        pair = {} if self.left is None or self.right is None else {
+            "left": self.left, "right": self.right,
+        }  # fmt: skip
+        named = {} if self.bag is not None else places_of_cameras(self.camera or ())
+        return pair | {name: Path(place) for name, place in named.items()}
+
+    def run(self) -> None:
+        """Import them."""
+        from alice_survey.app.pipeline import only_one
+        from camera_calib.picture_files import places_of_cameras
+        from reconstruct.pictures.importing import import_images
+
+        cameras = self.cameras()
+        with only_one(self.workspace):
+            found = import_images(
+                self.workspace, self.folders or [], cameras=cameras, bag=self.bag,
+                topics={} if self.bag is None else places_of_cameras(self.camera or ()),
+                videos=self.video or (), overlap=self.overlap, every_s=self.every,
+                recursive=self.recursive, navigation=self.navigation,
+                clock_offset_s=self.clock_offset, time_zone=self.time_zone,
+                vertical_datum=self.vertical_datum, rig=self.rig, masks=self.masks,
+                triggers=self.triggers, executor=self.executor(),
+            )  # fmt: skip
+        typer.echo(
+            f"{found}\nin {self.workspace / 'images'}; next: alice-survey reconstruct -w "
+            f"{self.workspace}"
+        )
+
+
+class JoinCommand(WorkspaceCommand):
+    """Bring the pictures of several dives together.
+
+    One workspace whose 'reconstruct' makes one model of all. The dives share one rig.
+    """
+
+    name = "join"
+    examples = ("join reef reef/revisit/dive -w both", "join day1 day2 day3 -w reef")
+    dives: list[Path] = argument(..., "Their workspaces.", "DIVE...")
+
+    def run(self) -> None:
+        """Join them."""
+        from reconstruct.pictures.joining import join_dives
+
+        found = join_dives(self.workspace, self.dives)
+        typer.echo(
+            f"{found}\nin {self.workspace / 'images'}; next: alice-survey reconstruct -w "
+            f"{self.workspace}"
+        )
+
+
+class ImportControlCommand(WorkspaceCommand):
+    """Bring in ground control points of another program.
+
+    Writes control.csv and picks.csv of the workspace, by which the next 'reconstruct' places the
+    model.
+    """
+
+    name = "import-control"
+    examples = (
+        "import-control gcp_list.txt --sigma 0.02 -w reef",
+        "import-control markers.xml -w reef --overwrite",
+    )
+    file: Path = argument(..., "ODM's gcp_list.txt, or Metashape's markers XML.")
+    sigma: float | None = option(None, "m; of points whose accuracy is not stated.", ge=1e-6)
+    sigma_vertical: float | None = option(None, "m; of heights; as --sigma if not given.", ge=1e-6)
+    heights: Literal["level", "ellipsoid"] = option(
+        "level", "They count from the level of the survey's depths, or from WGS 84's."
+    )
+    overwrite: bool = option(False, "Replace files that are there.")
+
+    def run(self) -> None:
+        """Convert them."""
+        from reconstruct.placing.foreign_control import import_control
+
+        found = import_control(
+            self.workspace, self.file, sigma_m=self.sigma, sigma_vertical_m=self.sigma_vertical,
+            heights=self.heights, overwrite=self.overwrite,
+        )  # fmt: skip
+        typer.echo(
+            f"{found}\nin {self.workspace}; next: alice-survey reconstruct -w {self.workspace}"
+        )
+
+
+class ImportLogCommand(ReportCommand):
+    """Turn a vehicle's own log into the navigation CSV of import-images.
+
+    ROS 1 and ROS 2 bags (COLA2 and common messages), ArduSub's DataFlash and telemetry logs, PX4's
+    .ulg, and JSON of Water Linked's DVLs.
+    """
+
+    name = "import-log"
+    examples = (
+        "import-log sparus2.bag -o navigation.csv",
+        "import-log 00000042.BIN --declination 3.4 --tide tides.csv -o navigation.csv",
+        "import-log dive.tlog --topic depth=VFR_HUD --vehicle-log vehicle.csv -o navigation.csv",
+        "import-log dvl.bag --dead-reckon --start-at 43.05 5.92 10 -o navigation.csv",
+        "import-log dvl.json --dead-reckon --start-at 43.05 5.92 10 -o navigation.csv",
+    )
+    title = "Import a vehicle's log"
+    offered = ("log", "output", "declination", "dead_reckon")
+    log: Path = argument(..., "ROS bag, log of ArduSub or PX4, or JSON of a Water Linked DVL.")
+    output: Path = option(..., "CSV to write.", "-o", "--output", metavar="FILE")
+    declination: float = option(0.0, "Add this declination to headings, degrees; east is positive.")
+    tide: str = option("0", "Height of the water above the level of depths: metres, or a CSV.")
+    topic: list[str] | None = option(
+        None, "Use this topic or message for navigation, depth, attitude, altitude or velocity.",
+        metavar="ROLE=NAME",
+    )  # fmt: skip
+    datum: tuple[float, float] | None = option(
+        None, "Origin of the odometry of a bag, or of XKF1.", metavar="LATITUDE LONGITUDE"
+    )
+    lever_arm: tuple[float, float, float] = option(
+        (0.0, 0.0, 0.0), "Place on the body that the logged position is of, m.", metavar="X Y Z"
+    )
+    altitude_offset: float = option(0.0, "Add this to altitudes.", metavar="METRES")
+    vehicle_log: Path | None = option(None, "Write a vehicle log too.", metavar="FILE")
+    dead_reckon: bool = option(False, "Compute positions from velocities, tied to fixes.")
+    start_at: tuple[float, float, float] | None = option(
+        None, "Place of the first velocity and its sigma, m.",
+        metavar="LATITUDE LONGITUDE SIGMA",
+    )  # fmt: skip
+    heading_sigma: float = option(1.0, "Constant error of headings in dead reckoning, degrees.")
+    flip_velocity: bool = option(False, "Turn the velocities of a DVL round.")
+
+    def run(self) -> Result:
+        """Read it and write the CSV."""
+        from missions.logs.dead_reckoning import TrackErrors
+        from missions.logs.import_log import ImportOptions, import_log
+
+        options = ImportOptions(
+            declination_deg=self.declination, tide=self.tide, topics=self.topic or (),
+            datum_deg=self.datum, lever_body_m=self.lever_arm,
+            altitude_offset_m=self.altitude_offset, vehicle_log=self.vehicle_log,
+            start_at=self.start_at, flip_velocity=self.flip_velocity,
+            dead_reckon=TrackErrors(heading_deg=self.heading_sigma) if self.dead_reckon else None,
+        )  # fmt: skip
+        return import_log(self.log, self.output, options)
