@@ -40,8 +40,11 @@ def test_every_bound_that_is_broken_fails_the_check(tmp_path: Path) -> None:
         (room / f"extra_{number}.py").write_text("import matplotlib\nFlatPort = '<!doctype'\n")
     importer = [f"import alice_survey.core.extra_{number}\n" for number in range(modules)]
     (room / "importer.py").write_text("".join(importer))
-    kernel = "@compiled\ndef moved():\n    wanted = 1\n    return wanted\n"
-    (room / "kernels.py").write_text(kernel * excess("kernels"))
+    kernel = "@compiled\ndef moved():\n    return 1\n"
+    many = max(excess("kernels"), excess("functions named by a participle"))
+    (room / "kernels.py").write_text(kernel * many)
+    names = [f"wanted_{n} = 1\n" for n in range(excess("identifiers with an avoided word"))]
+    (room / "names.py").write_text("".join(names))
     takes = "def call(config: SurveyConfig):\n    return config\n"
     lines = "x = 1\n" * excess("code lines of the packages")
     whole = takes * excess("functions that take the whole SurveyConfig")
@@ -69,7 +72,8 @@ def test_every_bound_that_is_broken_fails_the_check(tmp_path: Path) -> None:
     settings = "".join(f"    extra_{n}: int = 0\n" for n in range(excess("settings")))
     insert(copy / "alice_survey/core/config.py", "class SurveyConfig(Config):\n", settings)
     insert(copy / "pyproject.toml", "layers = [\n", '    "nowhere_at_all",\n' * 9)
-    append(copy / "README.md", "There is a way out.\n")
+    phrase = "There is a way out.\n"
+    append(copy / "README.md", phrase * excess("lines of docs with an avoided phrase"))
 
     run = subprocess.run(
         [sys.executable, "-m", "tests.structure"],

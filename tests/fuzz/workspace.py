@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 
 from alice_survey.core.frames import Datum
+from alice_survey.core.settings_form import settings_template
 from missions.values.plan_file import Plan
 from tests.fuzz.target import Target
 
 _DATUM = Datum(46.8426, -91.9946)
+_DEMO = (resources.files("alice_survey") / "demo.toml").read_text(encoding="utf-8")
 
 
 def small_plan() -> Plan:
@@ -23,8 +25,7 @@ def small_plan() -> Plan:
     return plan_of([line((0.0, 0.0), (5.0, 0.0)), line((5.0, 1.0), (0.0, 1.0))], [(0, 1)])
 
 
-def _survey(folder: Path, name: str) -> None:
-    text = (resources.files("alice_survey") / name).read_text(encoding="utf-8")
+def _survey(folder: Path, text: str) -> None:
     (folder / "survey.toml").write_text(text, encoding="utf-8")
 
 
@@ -166,13 +167,13 @@ def _target(
 
 TARGETS = (
     _target(
-        "survey.toml", "toml", "survey.toml", partial(_survey, name="survey.toml"), read_survey
+        "survey.toml", "toml", "survey.toml", partial(_survey, text=settings_template()), read_survey
     ),
     _target(
-        "survey.toml, demo", "toml", "survey.toml", partial(_survey, name="demo.toml"), read_survey
+        "survey.toml, demo", "toml", "survey.toml", partial(_survey, text=_DEMO), read_survey
     ),
     _target(
-        "survey.toml, used", "toml", "survey.toml", partial(_survey, name="survey.toml"),
+        "survey.toml, used", "toml", "survey.toml", partial(_survey, text=settings_template()),
         read_and_check_survey, examples=60,
     ),
     _target("control.csv", "csv", "control.csv", _control, read_control),

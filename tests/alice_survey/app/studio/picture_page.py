@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-WAIT_MS = 60_000
+WAIT_MS = 240_000
 _ALL_READY = """() => [...document.querySelectorAll('.picture-view')].every(
     (view) => 'ready' in view.dataset)"""
 
