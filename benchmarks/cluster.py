@@ -23,9 +23,9 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from alice_survey.app.stages import names, spec
 from alice_survey.core.artefacts import read_json
 from alice_survey.core.manifest import read_manifest
-from alice_survey.core.stages import names, spec
 from benchmarks.cluster_model import Network, RecordedStage, Recording, makespan, recorded
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine

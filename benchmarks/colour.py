@@ -26,11 +26,11 @@ import rasterio
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
+from alice_survey.app.stages import spec
 from alice_survey.core.artefacts import write_csv
 from alice_survey.core.config import ReconstructConfig, SurveyConfig
 from alice_survey.core.executor import local_executor
 from alice_survey.core.frames import Array
-from alice_survey.core.stages import spec
 from benchmarks.colour_difference import delta_e_2000, lab_from_rgb
 from benchmarks.colour_peers import grey_world, sea_thru
 from benchmarks.colour_survey import ColourSurvey, card_rows, from_above, write_survey

@@ -32,6 +32,7 @@ from rasterio.windows import Window
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.app.api.survey import Survey
+from alice_survey.app.stages import spec
 from alice_survey.core.artefacts import (
     Stage,
     read_csv,
@@ -43,7 +44,6 @@ from alice_survey.core.artefacts import (
 )
 from alice_survey.core.frames import Array
 from alice_survey.core.manifest import ImageRecord, read_manifest, write_manifest
-from alice_survey.core.stages import spec
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
 from benchmarks.measured import python

@@ -44,7 +44,7 @@ _POINTS = 20
 _MAX_MIB = 1536.0
 _RUN = (
     "import sys; from pathlib import Path; from alice_survey.core.config import ReconstructConfig, "
-    "SurveyConfig; from alice_survey.core.stages import spec; "
+    "SurveyConfig; from alice_survey.app.stages import spec; "
     "from alice_survey.core.executor import local_executor; "
     "spec('mosaic').make(Path(sys.argv[1]), SurveyConfig(reconstruct=ReconstructConfig("
     f"mosaic_pixel_m={PIXEL_M})), local_executor(int(sys.argv[2])))"

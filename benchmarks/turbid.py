@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 
 from alice_survey.app.api.survey import Survey
+from alice_survey.app.stages import spec
 from alice_survey.core.config import Jerlov
 from alice_survey.core.errors import AliceError
 from alice_survey.core.executor import local_executor
-from alice_survey.core.stages import spec
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
 from benchmarks.measured import measured

@@ -39,7 +39,7 @@ def on_page_content(content: str, *, page: Page, config: MkDocsConfig, files: Fi
 def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Put the tables of stages and of export formats where a page asks for them."""
     if _STAGES in markdown:
-        from alice_survey.core import stages
+        from alice_survey.app import stages
 
         markdown = markdown.replace(_STAGES, stages.table())
     if _FORMATS in markdown:

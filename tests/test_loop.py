@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 import rasterio
 
+from alice_survey.app.stages import STAGES
 from alice_survey.core.config import load_config
 from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.executor import SERIAL
-from alice_survey.core.stages import STAGES
 from missions.values.plan_file import read_plan
 from reconstruct.revisit.run import revisit_report
 from tests.small_survey import settings_in, start

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from filelock import FileLock, Timeout
 
-from alice_survey.core import stages as survey_stages
+from alice_survey.app import stages as survey_stages
+from alice_survey.app.stages import names, spec
 from alice_survey.core.artefacts import read_json, read_stage, refuse_links
 from alice_survey.core.config import (
     SurveyConfig,
@@ -26,7 +27,7 @@ from alice_survey.core.errors import ConfigError, WorkspaceError, warn
 from alice_survey.core.executor import Executor, local_executor
 from alice_survey.core.run.progress import part
 from alice_survey.core.settings_form import settings_template
-from alice_survey.core.stages import is_imported, names, spec
+from alice_survey.core.stages import is_imported
 
 if TYPE_CHECKING:
     from alice_survey.core.settings_text import Values
@@ -136,6 +137,8 @@ def run(
                 warn(f"the plan is {states[0]}; 'alice-survey plan -w {workspace}' renews it")
         for number, stage in enumerate(map(spec, stages), 1):
             with part(stage.folder, number, len(stages)):
+                for needed in stage.needs:
+                    spec(needed).need(workspace)
                 task_mib = task_memory_mib(stage.name, workspace, config)
                 done = stage.make(workspace, config, replace(executor, task_mib=task_mib))
             text, data = stage.summary(workspace / stage.folder)

@@ -25,9 +25,9 @@ from alice_survey.core.errors import ConfigError, ReconstructionError
 from alice_survey.core.frames import Array
 from alice_survey.core.records import MeshRecord, SurfaceRecord
 from alice_survey.core.run import progress
-from alice_survey.core.stages import need
 from reconstruct.copc import PointSpool, write_copc
 from reconstruct.raster import BLOCK, local_crs, opened_raster, small_cache, tiles_of_shape
+from reconstruct.stages import DENSE, MESH, MOSAIC
 from reconstruct.views.model import WorldFrame, read_frame
 
 _SMOOTH = {"dem.tif", "sigma.tif", "slope.tif", "lower.tif"}
@@ -83,8 +83,8 @@ def export_projected(workspace: Path, crs: str) -> tuple[str, dict[str, Any]]:
         ReconstructionError: the model has no place in the world.
         WorkspaceError: a stage is missing.
     """
-    for name in ("dense", "mosaic", "mesh"):
-        need(workspace, name)
+    for needed in (DENSE, MOSAIC, MESH):
+        needed.need(workspace)
     frame = read_frame(workspace / "sparse" / "frame.json")
     if frame.datum is None or frame.name != "ned":
         raise ReconstructionError(

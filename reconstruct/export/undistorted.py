@@ -19,10 +19,10 @@ from scipy.ndimage import distance_transform_edt
 from alice_survey.core.artefacts import Stage, atomic_path, run_stage, write_json
 from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Array
-from alice_survey.core.stages import need
 from reconstruct.evaluate.mesh import read_mesh
 from reconstruct.export.nerfstudio import write_nerfstudio
 from reconstruct.pictures.undistorted import Pictures
+from reconstruct.stages import MESH, PLACING
 from reconstruct.views.model import View, points_of_views, read_model
 from reconstruct.views.model_files import read_reconstruction
 
@@ -53,8 +53,8 @@ def export_undistorted(workspace: Path, executor: Executor) -> tuple[str, dict[s
     Raises:
         WorkspaceError: the workspace has no finished model or mesh.
     """
-    for name in ("placing", "mesh"):
-        need(workspace, name)
+    for needed in (PLACING, MESH):
+        needed.need(workspace)
     sparse = workspace / "sparse"
     stage = Stage(
         name=FOLDER,

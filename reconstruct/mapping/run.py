@@ -29,7 +29,6 @@ from alice_survey.core.records import (
     RangeRecord,
     RefractionRecord,
 )
-from alice_survey.core.stages import rig_file
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.rig import Rig, mounted, read_rig
 from reconstruct.mapping.database import Observations, VerifiedPair
@@ -50,6 +49,7 @@ from reconstruct.matching.refinement import refine_tracks
 from reconstruct.pictures.files import exif_focal_px, list_names
 from reconstruct.pictures.normalise import even_light, finely, normalise, read_deep
 from reconstruct.pictures.undistorted import read_colour, read_mask
+from reconstruct.stages import rig_file
 from reconstruct.views.model import datum_of
 from reconstruct.views.model_files import colmap_pinhole
 

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from alice_survey.core.artefacts import read_csv
 from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.frames import Array
-from alice_survey.core.stages import COLOUR_FILE
 from reconstruct.mosaic.picture_measures import BRIGHTEST, DARKEST, linear_table
 from reconstruct.pictures.undistorted import Pictures
+from reconstruct.stages import COLOUR_FILE
 
 _NUMBERS = ("x", "y", "radius_px", "red", "green", "blue")
 _MIN_PIXELS = 9

@@ -24,7 +24,6 @@ from alice_survey.core.contents import read_arrays
 from alice_survey.core.errors import ReconstructionError
 from alice_survey.core.frames import Array
 from alice_survey.core.records import MappingRecord, RegistrationRecord, ScaleRecord
-from alice_survey.core.stages import SCALE_FILE
 from camera_calib.rig import Rig, read_rig
 from reconstruct.adjustment.exact_observations import (
     Pixels,
@@ -47,6 +46,7 @@ from reconstruct.placing.control_points import (
     triangulate_picks,
 )
 from reconstruct.placing.place import LENGTH_SCALE_SIGMA
+from reconstruct.stages import SCALE_FILE
 from reconstruct.views.model_files import ImagesFile, points_of
 
 MAX_STATIONS = 120

@@ -11,10 +11,10 @@ from alice_survey.core.artefacts import Stage, need_stage, read_stage, run_stage
 from alice_survey.core.errors import CalibrationError, ImageError, PlanError, WorkspaceError
 from alice_survey.core.manifest import ImageRecord, read_manifest, write_manifest
 from alice_survey.core.records import PicturesRecord
-from alice_survey.core.stages import rig_file
 from camera_calib.rig import read_rig, write_rig
 from missions.values.legs import Route
 from missions.values.plan_file import Plan, read_plan
+from reconstruct.stages import rig_file
 
 _APART_S = 86_400.0
 """Between the end of a dive and the start of the next: their clocks are their own, and errors of

@@ -22,7 +22,6 @@ from alice_survey.core.executor import SERIAL, Executor
 from alice_survey.core.frames import Array, Datum
 from alice_survey.core.manifest import read_manifest
 from alice_survey.core.records import ControlRecord, MappingRecord, RegistrationRecord, ScaleRecord
-from alice_survey.core.stages import SCALE_FILE
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.pictures.undistorted import Pictures, read_colour
 from reconstruct.placing.control import describe
@@ -37,6 +36,7 @@ from reconstruct.placing.control_points import (
     read_picks,
     triangulate_picks,
 )
+from reconstruct.stages import SCALE_FILE
 from reconstruct.views.model import SparseModel, View, read_frame, read_model, read_warps
 
 MARKER_SIGMA_PX = 0.2

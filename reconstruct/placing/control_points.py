@@ -48,9 +48,9 @@ from alice_survey.core.artefacts import read_csv
 from alice_survey.core.edited_files import check_token, content_of, content_token, replaced
 from alice_survey.core.errors import WorkspaceError, warn, why
 from alice_survey.core.frames import Array, Datum
-from alice_survey.core.stages import CONTROL_FILES
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.triangulate import nearest_to_rays
+from reconstruct.stages import CONTROL_FILES
 
 CONTROL_FILE, PICKS_FILE, MARKERS_FILE = CONTROL_FILES
 PICK_SIGMA_PX = 0.5

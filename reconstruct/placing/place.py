@@ -32,7 +32,6 @@ from alice_survey.core.manifest import ImageRecord
 from alice_survey.core.records import MappingRecord, PicturesRecord, ScaleRecord
 from alice_survey.core.robust import MAD_TO_SIGMA
 from alice_survey.core.run import progress
-from alice_survey.core.stages import SCALE_FILE
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.rig import Rig, mounted
 from reconstruct.adjustment.soft_modes import SoftModes
@@ -61,6 +60,7 @@ from reconstruct.placing.control_points import (
 from reconstruct.placing.fit import FoundMount, PlacementFit, fit_control, fit_navigation
 from reconstruct.placing.navigation import PLACE, SCALE, Installation, body_from_pinhole
 from reconstruct.placing.track import picture_modes
+from reconstruct.stages import SCALE_FILE
 from reconstruct.views.model import MEAN_PLANE, WorldFrame
 
 _BEAM = np.tan(np.deg2rad(15.0))

@@ -17,8 +17,8 @@ from typer.testing import CliRunner
 
 from alice_survey.app.cli.main import app, main
 from alice_survey.app.pipeline import init_survey
+from alice_survey.app.stages import names
 from alice_survey.core.config import CameraConfig, SurveyConfig, WaterConfig, load_config
-from alice_survey.core.stages import names
 from camera_calib.rig import design_rig, write_rig
 from tests.missions.flown_plans import plan_of, walk
 

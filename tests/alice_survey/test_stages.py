@@ -12,18 +12,20 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from alice_survey.app import stages
 from alice_survey.app.cli.main import app
 from alice_survey.app.pipeline import FlightChanges, run, workspace_status
 from alice_survey.app.report.figures import Figures
 from alice_survey.app.report.held import Held
 from alice_survey.app.report.sections import sections
 from alice_survey.app.report.verdicts import verdicts
-from alice_survey.core import records, stages
+from alice_survey.app.stages import STAGES, spec
+from alice_survey.core import records
 from alice_survey.core.artefacts import JsonRecord, read_stage
 from alice_survey.core.config import SurveyConfig, load_config
 from alice_survey.core.errors import WorkspaceError, heard
 from alice_survey.core.executor import Executor
-from alice_survey.core.stages import STAGES, StageSpec, spec
+from alice_survey.core.stages import StageSpec, files_of, settings_of
 
 OLD = Path(__file__).parent / "workspace_0_1_0.zip"
 """Made with version 0.1.0: records and small files as it wrote them, others cut short."""
@@ -185,8 +187,8 @@ def test_a_stage_declares_what_there_is(stage: StageSpec) -> None:
     assert arguments == ["workspace", "folder", "executor", *taken]
     earlier = [one.name for one in STAGES[: STAGES.index(stage)]]
     assert set(stage.needs) | set(stage.uses) <= set(earlier)
-    json.dumps(stages.settings_of(stage.settings, SurveyConfig()))
-    assert stages.files_of(stage.setting_files, SurveyConfig()) == []
+    json.dumps(settings_of(stage.settings, SurveyConfig()))
+    assert files_of(stage.setting_files, SurveyConfig()) == []
     commands = CliRunner().invoke(app, [stage.command, "--help"])
     assert commands.exit_code == 0
 
@@ -197,7 +199,7 @@ def test_settings_that_are_not_named_leave_a_stage_as_it_is(old: Path) -> None:
     same = [
         stage.name
         for stage in STAGES
-        if stages.settings_of(stage.settings, config) == stages.settings_of(stage.settings, other)
+        if settings_of(stage.settings, config) == settings_of(stage.settings, other)
     ]
     assert same == ["calibrate", "placing", "dense", "mosaic", "mesh", "report"]
 

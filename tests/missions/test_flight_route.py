@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from shapely.geometry import MultiPolygon, Polygon, box
 
+from alice_survey.app.stages import spec
 from alice_survey.core.config import CameraConfig, SurveyConfig, WaterConfig, parse_config
 from alice_survey.core.errors import PlanError, VehicleError
 from alice_survey.core.executor import SERIAL
-from alice_survey.core.stages import spec
 from alice_survey.sim.vehicle.pilot.memory import FOLLOW, LEG, PHASE
 from camera_calib.rig import design_rig
 from missions.fly.flight_records import flight_summary

@@ -7,11 +7,11 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from alice_survey.app.pipeline import FlightChanges, run
+from alice_survey.app.stages import spec
 from alice_survey.core.config import SurveyConfig, parse_config
 from alice_survey.core.errors import PlanError, VehicleError
 from alice_survey.core.executor import SERIAL
 from alice_survey.core.frames import interpolate_poses
-from alice_survey.core.stages import spec
 from alice_survey.core.trajectory import read_columns, read_track
 from alice_survey.sim.vehicle.log import read_vehicle_log
 from missions.values.plan_file import read_plan

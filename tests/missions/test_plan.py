@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from alice_survey.app.stages import spec
 from alice_survey.core.artefacts import read_stage
 from alice_survey.core.config import SurveyConfig, parse_config
 from alice_survey.core.errors import PlanError
 from alice_survey.core.executor import SERIAL
-from alice_survey.core.stages import spec
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import stations_of_plan

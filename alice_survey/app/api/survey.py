@@ -79,8 +79,8 @@ class Survey:
             AliceError: a stage cannot be done; the message states what to change.
         """
         from alice_survey.app.pipeline import run
+        from alice_survey.app.stages import names
         from alice_survey.core.executor import local_executor
-        from alice_survey.core.stages import names
 
         return run(stages or names(), self.folder, None, executor=local_executor(threads))[1]
 

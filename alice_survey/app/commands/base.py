@@ -77,7 +77,7 @@ class Command(BaseModel):
     @classmethod
     def stages(cls) -> list[str]:
         """Stages that it makes."""
-        from alice_survey.core.stages import names
+        from alice_survey.app.stages import names
 
         return names(cls.name)
 

@@ -50,7 +50,7 @@ class ReconstructCommand(DeviceCommand):
     @classmethod
     def stages(cls) -> list[str]:
         """The model's, and the calibration before them."""
-        from alice_survey.core.stages import names
+        from alice_survey.app.stages import names
 
         return names("calibrate", "reconstruct")
 

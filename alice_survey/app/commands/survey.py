@@ -304,7 +304,7 @@ class RunCommand(DeviceCommand):
     @classmethod
     def stages(cls) -> list[str]:
         """All."""
-        from alice_survey.core.stages import names
+        from alice_survey.app.stages import names
 
         return names()
 

@@ -10,7 +10,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from alice_survey.core import stages
+from alice_survey.app import stages
+from alice_survey.app.stages import finished
 from alice_survey.core.artefacts import JsonRecord, StageRecord
 from alice_survey.core.frames import Array
 from alice_survey.core.plane_settings import LEVEL
@@ -21,7 +22,6 @@ from alice_survey.core.records import (
     PlaceRecord,
     PlaneRecord,
 )
-from alice_survey.core.stages import finished
 from missions.values.plan_file import Plan, read_plan
 
 R = TypeVar("R", bound=JsonRecord)

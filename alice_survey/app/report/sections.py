@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from alice_survey.app import stages
 from alice_survey.app.report import plots
 from alice_survey.app.report.figures import Figures
 from alice_survey.app.report.held import Held, known_column
-from alice_survey.core import stages
 from alice_survey.core.records import (
     CalibrationReportRecord,
     CamerasRecord,
@@ -47,6 +47,7 @@ from alice_survey.kit.words import (
 from camera_calib.camera import camera_from_json
 from camera_calib.rig import Rig, read_rig
 from missions.values.plan_file import Plan
+from reconstruct.stages import rig_file as rig_file_of
 
 _MAX_LOST = 20
 """Pictures that are not in the model, of which more are only counted."""
@@ -386,7 +387,7 @@ def _camera(held: Held) -> Section:
             )
         )
     if cameras is not None:
-        rig_file = held.file("sparse/rig.json") or stages.rig_file(held.workspace)
+        rig_file = held.file("sparse/rig.json") or rig_file_of(held.workspace)
         rig = None if rig_file is None else read_rig(rig_file)
         if rig is None:
             text.append("The cameras calibrated themselves from the survey's pictures.")

@@ -21,10 +21,10 @@ from starlette.responses import FileResponse, RedirectResponse, Response
 from starlette.staticfiles import NotModifiedResponse, StaticFiles
 from starlette.types import Scope
 
+from alice_survey.app.stages import LOOSE_FOLDERS, STAGES
 from alice_survey.core.artefacts import STAGE_FILE
 from alice_survey.core.edited_files import StaleError
 from alice_survey.core.errors import AliceError
-from alice_survey.core.stages import LOOSE_FOLDERS, STAGES
 from alice_survey.kit.document import Link, Report, Section
 from alice_survey.kit.page import page_policy, render_html
 from alice_survey.kit.words import count

@@ -29,12 +29,12 @@ from pydantic import Field, ValidationError
 from alice_survey.app.commands import COMMANDS
 from alice_survey.app.commands.base import Command
 from alice_survey.app.pipeline import is_locked
+from alice_survey.app.stages import STAGES
 from alice_survey.core.artefacts import JsonRecord, refuse_links
 from alice_survey.core.contents import first_fault, shown
 from alice_survey.core.errors import AliceError, ConfigError, WorkspaceError, why
 from alice_survey.core.run.events import Event, described
 from alice_survey.core.run.interrupts import for_other_programs
-from alice_survey.core.stages import STAGES
 
 RECORD, OUTPUT, ERRORS, EVENTS = "job.json", "output.txt", "errors.txt", "events.jsonl"
 """Files of a job."""

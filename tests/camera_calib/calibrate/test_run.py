@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from alice_survey.app.stages import spec
 from alice_survey.core.config import CameraConfig, ImagingConfig, SurveyConfig
 from alice_survey.core.executor import SERIAL
-from alice_survey.core.stages import spec
 from camera_calib.rig import read_rig
 
 DOME = CameraConfig(

@@ -10,10 +10,10 @@ import shapely
 from matplotlib.collections import LineCollection
 from shapely.geometry import MultiPolygon
 
+from alice_survey.app.stages import spec
 from alice_survey.core.config import SeaConfig, parse_config
 from alice_survey.core.errors import ConfigError
 from alice_survey.core.executor import SERIAL
-from alice_survey.core.stages import spec
 from alice_survey.kit.figure import Sheet
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import plan_pattern, stations_of_plan

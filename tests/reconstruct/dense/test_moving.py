@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import rasterio
 
+from alice_survey.app.stages import spec
 from alice_survey.core.artefacts import read_json
 from alice_survey.core.config import ReconstructConfig, SurveyConfig
 from alice_survey.core.executor import SERIAL
-from alice_survey.core.stages import spec
 from reconstruct.dense.moving import adapt, agreed, cells_at, draw, odd_ones, with_bounds
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.views.model import View

@@ -8,11 +8,11 @@ import rasterio
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.app.stages import spec
 from alice_survey.core.artefacts import read_json, write_csv
 from alice_survey.core.config import ReconstructConfig, SurveyConfig
 from alice_survey.core.errors import ReconstructionError, heard
 from alice_survey.core.executor import SERIAL
-from alice_survey.core.stages import spec
 from reconstruct.evaluate.elevation import elevation_in
 from reconstruct.views.model import SparseModel
 from tests.oracles_dense import (

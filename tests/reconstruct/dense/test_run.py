@@ -6,11 +6,11 @@ import rasterio
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from alice_survey.app.stages import spec
 from alice_survey.core.artefacts import read_json
 from alice_survey.core.config import ReconstructConfig, SurveyConfig
 from alice_survey.core.errors import ReconstructionError, WorkspaceError
 from alice_survey.core.executor import SERIAL, local_executor
-from alice_survey.core.stages import spec
 from reconstruct.dense import plane_rasters
 from reconstruct.dense.stereo_pairs import in_frame
 from tests.oracles_dense import (

@@ -6,10 +6,10 @@ import open3d as o3d
 import pytest
 import trimesh
 
+from alice_survey.app.stages import spec
 from alice_survey.core.artefacts import read_json, write_json
 from alice_survey.core.config import ReconstructConfig, SurveyConfig
 from alice_survey.core.executor import SERIAL
-from alice_survey.core.stages import spec
 from reconstruct.dense.cloud import VERTEX, write_cloud, write_cloud_json
 from reconstruct.light.solve import GRID, LightModel, write_light
 from reconstruct.mesh.atlas import pack

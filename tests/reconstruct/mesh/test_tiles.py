@@ -13,9 +13,9 @@ import open3d as o3d
 import pyproj
 import pytest
 
+from alice_survey.app.stages import spec
 from alice_survey.core.config import ReconstructConfig, SurveyConfig
 from alice_survey.core.executor import SERIAL, local_executor
-from alice_survey.core.stages import spec
 from reconstruct.dense.cloud import VERTEX, write_cloud
 from reconstruct.mesh import surface
 from reconstruct.mesh.cells import CellLevel

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import rasterio
 
+from alice_survey.app.stages import spec
 from alice_survey.core.artefacts import read_json, write_json
 from alice_survey.core.config import CameraConfig, ReconstructConfig, SurveyConfig, WaterConfig
 from alice_survey.core.errors import ReconstructionError
 from alice_survey.core.executor import SERIAL
-from alice_survey.core.stages import spec
 from camera_calib.approximation.pinhole_warp import best_warp
 from camera_calib.rig import design_rig
 from reconstruct.dense.cloud import write_cloud, write_cloud_json

@@ -13,12 +13,13 @@ from alice_survey.core.errors import CalibrationError, ImageError, PlanError, Wo
 from alice_survey.core.frames import Datum
 from alice_survey.core.manifest import ImageRecord, read_manifest, write_manifest
 from alice_survey.core.records import PicturesRecord, PlaceRecord
-from alice_survey.core.stages import is_imported, rig_file
+from alice_survey.core.stages import is_imported
 from camera_calib.rig import design_rig, read_rig, write_rig
 from missions.coverage.dive_record import assign_lines
 from missions.coverage.stations import stations_of_plan
 from missions.values.plan_file import Plan, read_plan
 from reconstruct.pictures.joining import join_dives
+from reconstruct.stages import rig_file
 from tests.oracles_coverage import area_of, lawnmower, plan_of
 
 RIG = design_rig(CameraConfig(), WaterConfig())

@@ -11,13 +11,13 @@ from PIL import Image
 from pyproj import Transformer
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.app.stages import spec
 from alice_survey.core.artefacts import read_json
 from alice_survey.core.config import ReconstructConfig, SurveyConfig
 from alice_survey.core.errors import AliceError, ReconstructionError
 from alice_survey.core.executor import SERIAL, Executor, local_executor
 from alice_survey.core.manifest import read_manifest, write_manifest
 from alice_survey.core.records import RegistrationRecord
-from alice_survey.core.stages import spec
 from reconstruct.pictures.importing import import_images
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.placing.control_command import scale_model

@@ -17,6 +17,7 @@ from pydantic import Field
 from pydantic_core import to_json
 
 from alice_survey.app.pipeline import init_survey, run, template_text
+from alice_survey.app.stages import spec
 from alice_survey.app.studio.endpoints.base import (
     Call,
     Content,
@@ -31,7 +32,6 @@ from alice_survey.core.errors import AliceError, ConfigError, PlanError, collect
 from alice_survey.core.executor import local_executor
 from alice_survey.core.frames import Array, Datum, attitude_from_rotation
 from alice_survey.core.settings_form import settings_form
-from alice_survey.core.stages import spec
 from alice_survey.core.trajectory import read_columns, read_track
 from alice_survey.kit.figure import palette_colours, palette_steps
 from alice_survey.sim.vehicle.files import known_vehicles

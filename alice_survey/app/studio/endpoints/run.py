@@ -20,6 +20,7 @@ from alice_survey.app.computing import (
     workspace_size,
 )
 from alice_survey.app.pipeline import settings, stage_states
+from alice_survey.app.stages import spec
 from alice_survey.app.studio.endpoints.base import Call, Endpoint, Studio
 from alice_survey.app.studio.jobs import OFFERED
 from alice_survey.core.artefacts import STAGE_FILE, StageRecord, read_stage
@@ -27,7 +28,7 @@ from alice_survey.core.config import Config, SurveyConfig
 from alice_survey.core.errors import AliceError
 from alice_survey.core.executor import default_threads
 from alice_survey.core.run.resources import processor
-from alice_survey.core.stages import StageSpec, is_imported, spec
+from alice_survey.core.stages import StageSpec, is_imported
 
 UP_TO_DATE = "up to date"
 _STALE = re.compile(r"stale \((.*)\)", re.DOTALL)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from pypdf import PdfReader
 
+from alice_survey.app.stages import spec
 from alice_survey.core.artefacts import write_json
 from alice_survey.core.config import SurveyConfig
 from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.executor import SERIAL
-from alice_survey.core.stages import spec
 from camera_calib.approximation.pinhole_warp import best_warp
 from camera_calib.mount import with_mount
 from camera_calib.rig import design_rig, write_rig

@@ -7,9 +7,9 @@ import pytest
 import typer.main
 
 from alice_survey.app.cli.main import app
+from alice_survey.app.stages import STAGES
 from alice_survey.app.studio.jobs import OFFERED, command_of
 from alice_survey.core.errors import ConfigError
-from alice_survey.core.stages import STAGES
 
 
 @pytest.mark.parametrize("name", OFFERED)

@@ -12,13 +12,13 @@ from typing import Any
 
 import pytest
 
+from alice_survey.app.stages import STAGES
 from alice_survey.app.studio.endpoints import start as start_page
 from alice_survey.app.studio.endpoints.run import ways_on
 from alice_survey.app.studio.endpoints.start import Folders
 from alice_survey.app.studio.jobs import Jobs
 from alice_survey.app.studio.server import Server
 from alice_survey.core.config import load_config
-from alice_survey.core.stages import STAGES
 from tests.alice_survey.app.studio.client import Reply, ask, call, serving, until
 from tests.alice_survey.app.studio.test_jobs import PROGRAM
 from tests.reconstruct.pictures.dated import navigation, take

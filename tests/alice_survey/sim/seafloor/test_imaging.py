@@ -11,13 +11,13 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from shapely.geometry import MultiPolygon, box
 
+from alice_survey.app.stages import spec
 from alice_survey.core.artefacts import Stage, run_stage, write_csv, write_json
 from alice_survey.core.config import SurveyConfig, parse_config
 from alice_survey.core.errors import NavigationError
 from alice_survey.core.executor import SERIAL, local_executor
 from alice_survey.core.frames import interpolate_poses, rotation_from_attitude
 from alice_survey.core.manifest import read_manifest
-from alice_survey.core.stages import spec
 from alice_survey.core.trajectory import Trajectory, read_track, write_track
 from alice_survey.sim.seafloor.renderer import render
 from camera_calib.rig import read_rig

@@ -1,0 +1,42 @@
+"""The stage that calibrates: what it depends on, makes and says."""
+
+from pathlib import Path
+
+from alice_survey.core.records import CalibrationRecord
+from alice_survey.core.stages import StageSpec, Summary, without
+
+
+def _calibrate_inputs(workspace: Path) -> list[Path]:
+    pool = workspace / "pool"
+    air = [pool / "air"] if (pool / "air").exists() else []
+    return [pool / name for name in ("manifest.csv", "board.json", "left", "right")] + air
+
+
+def _calibrate_summary(folder: Path) -> Summary:
+    found = CalibrationRecord.read(folder / "calibration.json")
+    text = (
+        f"{found.views} views, {found.rms_px:.3f} px rms; rig in {folder / 'rig.json'}, "
+        f"report in {folder / 'report.html'}"
+    )
+    return text, {"views": found.views, "rms_px": found.rms_px, "worst_px": found.worst_px}
+
+
+CALIBRATE = StageSpec(
+    name="calibrate",
+    folder="calibration",
+    command="calibrate",
+    about="the rig, from the pictures of the board",
+    version=5,
+    work="camera_calib.calibrate.run:run_calibrate",
+    takes=("camera", "water"),
+    needs=("pool",),
+    settings={"camera": "camera", "water": without("water", "n_water_sigma")},
+    inputs=_calibrate_inputs,
+    summary=_calibrate_summary,
+    simulated=True,
+    products={
+        "rig.json": "cameras, ports and baseline with their covariance",
+        "report.html": "how good the calibration is",
+    },
+    reported=("report.json",),
+)

@@ -1,0 +1,215 @@
+"""The stages that plan, fly and render a survey: what each depends on, makes and says.
+
+Nothing here imports the modules that do the work: they are named, and loaded when a stage is made.
+"""
+
+from pathlib import Path
+
+from alice_survey.core.artefacts import read_json
+from alice_survey.core.manifest import read_manifest
+from alice_survey.core.records import BoardRecord, FlightRecord
+from alice_survey.core.stages import WHOLE, StageSpec, Summary, only, without
+from alice_survey.kit.words import share
+
+
+def _plan_summary(folder: Path) -> Summary:
+    plan = read_json(folder / "plan.json")
+    dives = len(plan["dives"])
+    text = (
+        f"{len(plan['lines'])} lines, {plan['stations']} stations, {plan['length_m']:.0f} m, "
+        f"{plan['duration_s'] / 60:.0f} min, {plan['energy_wh']:.0f} Wh in {dives} "
+        f"dive{'s' if dives > 1 else ''}; overlap {plan['forward_overlap']:.0%} forward, "
+        f"{plan['side_overlap']:.0%} side, {share(plan['coverage'])} covered as requested; "
+        f"a picture every {plan['interval_s']:.2f} s, exposed {1e3 * plan['exposure_s']:.2g} ms; "
+        f"map in {folder / 'map.png'}, files for vehicles in {folder / 'exports'}"
+    )
+    return text, plan
+
+
+def _fly_summary(folder: Path) -> Summary:
+    flight = FlightRecord.read(folder / "flight.json")
+    line = flight.on_lines
+    mission = flight.mission
+    how = flight.controller if mission is None else f"{mission.file} as {mission.follower} flies it"
+    promised = (
+        ""
+        if mission is None
+        else f" (the plan's certificate: {share(mission.planned.share_at_overlap)}; "
+        f"{mission.line_ends_overshot} of {mission.line_ends} line ends overshot)"
+    )
+    text = (
+        f"{flight.vehicle} with {how}: {flight.ending}, {flight.stations} of "
+        f"{flight.stations_planned} stations in {flight.duration_s / 60:.0f} min; on lines "
+        f"{_metres(line.cross_track_rms_m)} cross-track rms (the control's part "
+        f"{_metres(line.believed_cross_track_rms_m)}), heading {_degrees(line.heading_rms_deg)} "
+        f"rms; roll in turns to {_degrees(flight.in_turns.roll_worst_deg)}; "
+        f"{sum(flight.energy_wh.values()):.1f} Wh; "
+        f"{share(flight.coverage.share_at_overlap)} of the area covered as requested{promised}, "
+        f"{share(flight.coverage.every_camera_share)} seen by every camera; "
+        f"plots in {folder / 'track.png'} and {folder / 'vehicle.png'}"
+    )
+    return text, flight.to_json()
+
+
+def _metres(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.3f} m"
+
+
+def _degrees(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.1f} deg"
+
+
+def _image_inputs(workspace: Path) -> list[Path]:
+    flight = workspace / "flight"
+    return [
+        workspace / "plan" / "plan.json",
+        flight / "triggers.csv",
+        flight / "navigation.csv",
+        flight / "truth" / "track.csv",
+    ]
+
+
+def _pictures_summary(folder: Path) -> Summary:
+    count = len(read_manifest(folder / "manifest.csv"))
+    return f"{count} pictures in {folder}", {"pictures": count}
+
+
+PLAN = StageSpec(
+    name="plan",
+    folder="plan",
+    command="plan",
+    about="lines, stations and camera settings that image the area",
+    version=7,
+    work="missions.plan.run:run_plan",
+    takes=(WHOLE,),
+    settings={
+        "name": "name",
+        "area": "area",
+        "camera": "camera",
+        "water": without("water", "n_water_sigma"),
+        "plan": "plan",
+        "sea": "sea",
+        "vehicle": without("vehicle", "dive", "mission_file"),
+        "datum_given": "area.datum_given",
+        "strobes": only("imaging", "strobe_lumens", "strobe_beam_deg", "strobes_body_m"),
+    },
+    setting_files=(
+        "area.files",
+        "area.bathymetry_file",
+        "sea.current_file",
+        "vehicle.coefficients_file",
+        "vehicle.file",
+    ),
+    summary=_plan_summary,
+    simulated=True,
+    products={
+        "plan.json": "the plan, for the next stages",
+        "settings.txt": "every setting with its equation, source and limit",
+        "exports": "the plan for vehicles",
+    },
+    picture="map.png",
+    reported=("plan.json",),
+)
+
+
+FLY = StageSpec(
+    name="fly",
+    folder="flight",
+    command="fly",
+    about="the plan flown by a simulated vehicle",
+    version=5,
+    work="missions.fly.run:run_fly",
+    takes=(WHOLE,),
+    needs=("plan",),
+    settings={
+        "seed": "seed",
+        "vehicle": without("vehicle", "coefficients_file", "mission_file"),
+        "sea": without("sea", "current_file"),
+        "navigation": "navigation",
+        "seafloor": "seafloor",
+        "seafloor_depth_m": "area.seafloor_depth_m",
+        "plan": "plan",
+        "position_body_m": "camera.position_body_m",
+        "dvl_position_body_m": "camera.dvl_position_body_m",
+    },
+    setting_files=(
+        "sea.current_file",
+        "vehicle.coefficients_file",
+        "vehicle.file",
+        "vehicle.mission_file",
+    ),
+    inputs=lambda workspace: [workspace / "plan" / "plan.json"],
+    summary=_fly_summary,
+    simulated=True,
+    products={
+        "triggers.csv": "when pictures are taken",
+        "navigation.csv": "where the vehicle believed to be",
+        "vehicle.csv": "log of the vehicle",
+        "bag": "the same as a ROS 2 bag",
+    },
+    picture="track.png",
+    reported=("flight.json",),
+)
+
+
+POOL = StageSpec(
+    name="pool",
+    folder="pool",
+    command="image",
+    about="rendered pictures of a board, to calibrate from",
+    version=4,
+    work="missions.acquire.run:run_pool",
+    takes=("camera", "water", "imaging", "seed"),
+    settings={
+        "seed": "seed",
+        "camera": "camera",
+        "n_water": "water.n_water",
+        "board": BoardRecord().to_json(),
+        "imaging": only("imaging", "scale", "image_format", "samples", "noise", "pool_views"),
+    },
+    summary=_pictures_summary,
+    resumes=True,
+    simulated=True,
+    products={"manifest.csv": "the pictures", "board.json": "the board"},
+    picture="left/00.png",
+)
+
+
+IMAGE = StageSpec(
+    name="image",
+    folder="images",
+    command="image",
+    about="the pictures: rendered, or real ones (`import-images`)",
+    version=5,
+    work="missions.acquire.run:run_images",
+    takes=(
+        "camera",
+        "water",
+        "imaging",
+        "seafloor",
+        "plan.altitude_m",
+        "area.seafloor_depth_m",
+        "seed",
+    ),
+    needs=("plan", "fly"),
+    settings={
+        "seed": "seed",
+        "seafloor_depth_m": "area.seafloor_depth_m",
+        "margins": only("plan", "altitude_m", "run_in_m", "turn_radius_m", "margin_m"),
+        "camera": "camera",
+        "water": without("water", "n_water_sigma"),
+        "seafloor": "seafloor",
+        "imaging": without("imaging", "pool_views"),
+    },
+    inputs=_image_inputs,
+    summary=_pictures_summary,
+    resumes=True,
+    simulated=True,
+    products={"manifest.csv": "the pictures, with time and navigation"},
+    picture="left/000000.png",
+    reported=("manifest.csv",),
+)
+
+
+STAGES = (PLAN, FLY, POOL, IMAGE)
+"""In the order in which they run."""

@@ -1,0 +1,294 @@
+"""The stages from pictures to a model and its score: what each depends on, makes and says.
+
+Nothing here imports the modules that do the work: they are named, and loaded when a stage is made.
+"""
+
+import math
+from pathlib import Path
+
+from alice_survey.core import records
+from alice_survey.core.artefacts import read_stage
+from alice_survey.core.errors import WorkspaceError
+from alice_survey.core.manifest import read_manifest
+from alice_survey.core.stages import StageSpec, Summary, only, without
+
+CONTROL_FILES = ("control.csv", "picks.csv", "markers.csv")
+SCALE_FILE = "scale.json"
+COLOUR_FILE = "colour_reference.csv"
+
+
+def _existing(*paths: Path) -> list[Path]:
+    return [path for path in paths if path.is_file()]
+
+
+def rig_file(workspace: Path) -> Path | None:
+    """The rig of a survey's pictures: as calibrated, else as imported with them; None without."""
+    folders = ("calibration", "images")
+    return next(iter(_existing(*(workspace / folder / "rig.json" for folder in folders))), None)
+
+
+def _about_pictures(workspace: Path) -> list[Path]:
+    """Files that say what the pictures are."""
+    images, rig = workspace / "images", rig_file(workspace)
+    return [images / "manifest.csv", images / "survey.json", *([] if rig is None else [rig])]
+
+
+def _mapping_inputs(workspace: Path) -> list[Path]:
+    images = workspace / "images"
+    rows = read_manifest(images / "manifest.csv")
+    files = [*(row.image for row in rows), *(row.mask for row in rows if row.mask)]
+    return [*_about_pictures(workspace), *(images / file for file in files)]
+
+
+def _mapping_summary(folder: Path) -> Summary:
+    found = records.MappingRecord.read(folder / "mapping.json")
+    text = f"{found.registered} of {found.total} pictures in the model, in its own gauge"
+    return text, {"registered": found.registered, "total": found.total}
+
+
+def _placing_inputs(workspace: Path) -> list[Path]:
+    known = _existing(*(workspace / name for name in (SCALE_FILE, *CONTROL_FILES)))
+    return [workspace / "mapping", *_about_pictures(workspace), *known]
+
+
+def _placing_summary(folder: Path) -> Summary:
+    found = records.RegistrationRecord.read(folder / "registration.json")
+    text = (
+        f"{found.registered} of {found.total} pictures registered, "
+        f"{found.mean_reprojection_px:.2f} px; {found.scale_source}"
+    )
+    if found.joints:
+        text += f"; {len(found.joints) + 1} parts that navigation alone joins, to " + " and ".join(
+            f"{math.hypot(joint.sigma_north_m, joint.sigma_east_m, joint.sigma_depth_m):.2g} m"
+            for joint in found.joints
+        )
+    if found.georeference is not None and found.georeference.mount is not None:
+        text += f"; {found.georeference.mount.words}"
+    return text, found.to_json()
+
+
+def _model_inputs(workspace: Path) -> list[Path]:
+    """The placed model, and the pictures and masks that are in it."""
+    sparse, images = workspace / "sparse", workspace / "images"
+    pictures = records.CamerasRecord.read(sparse / "cameras.json").images
+    files = [*pictures, *(picture.mask for picture in pictures.values() if picture.mask)]
+    return [sparse, *(images / file for file in files)]
+
+
+def _dense_summary(folder: Path) -> Summary:
+    found = records.CloudRecord.read(folder / "cloud.json")
+    surfaces = [folder / "dem.tif", *sorted(folder.glob("planes/*/dem.tif"))]
+    text = f"{found.points} points; surface in {', '.join(str(path) for path in surfaces)}"
+    return text, found.to_json()
+
+
+def _mosaic_inputs(workspace: Path) -> list[Path]:
+    dense = workspace / "dense"
+    planes = sorted((dense / "planes").glob("*/dem.tif"))
+    about = _existing(*(path.with_name("plane.json") for path in (dense / "dem.tif", *planes)))
+    about += _existing(dense / "moving.csv", workspace / COLOUR_FILE)
+    cloud = [dense / name for name in ("cloud.ply", "cloud.json")]
+    return [dense / "dem.tif", *planes, *cloud, *about, *_model_inputs(workspace)]
+
+
+def _mosaic_summary(folder: Path) -> Summary:
+    texts, values = [], []
+    for path in _existing(folder / "mosaic.json", *sorted(folder.glob("planes/*/mosaic.json"))):
+        found = records.MosaicRecord.read(path)
+        texts.append(f"{found.width_px} x {found.height_px} px in {path.with_suffix('.tif')}")
+        values.append(found.to_json())
+    return "; ".join(texts), values[0] if values else {}
+
+
+def _mesh_inputs(workspace: Path) -> list[Path]:
+    dense = [workspace / "dense" / name for name in ("cloud.ply", "cloud.json", "light.json")]
+    return [*dense, *_existing(workspace / "dense" / "moving.csv"), *_model_inputs(workspace)]
+
+
+def _mesh_summary(folder: Path) -> Summary:
+    found = records.MeshRecord.read(folder / "mesh.json")
+    text = (
+        f"{found.triangles} triangles, {found.textured_share:.0%} textured, in "
+        f"{folder / 'mesh.glb'}"
+    )
+    return text, found.to_json()
+
+
+def _evaluate_inputs(workspace: Path) -> list[Path]:
+    images, mesh = workspace / "images", workspace / "mesh"
+    if not (images / "truth").is_dir():
+        raise WorkspaceError(
+            f"{images} has no truth: only simulated surveys can be scored; what is known of this "
+            f"one is in {workspace / 'sparse' / 'registration.json'}"
+        )
+    read = [
+        "images/truth/poses.csv", "images/truth/terrain.ply", "images/truth/rig.json",
+        "dense/dem.tif", "dense/sigma.tif", "mosaic/mosaic.tif", "sparse/track.csv",
+        "sparse/registration.json", "plan/plan.json", "images/manifest.csv", "flight/triggers.csv",
+    ]  # fmt: skip
+    if read_stage(mesh) is not None:
+        read += ["mesh/mesh.ply", "mesh/mesh.json"]
+    return [workspace / path for path in read]
+
+
+def _evaluate_summary(folder: Path) -> Summary:
+    score = records.ScoreRecord.read(folder / "score.json").to_json()
+    rows = [
+        (f"{group}.{name}", value)
+        for group, part in score.items()
+        for name, value in (part or {}).items()
+    ]
+    table = "\n".join(f"  {name:44} {value}" for name, value in rows)
+    return f"score in {folder / 'score.json'}\n{table}", score
+
+
+MAPPING = StageSpec(
+    name="mapping",
+    folder="mapping",
+    command="reconstruct",
+    about="cameras and points in the model's own gauge",
+    version=13,
+    work="reconstruct.mapping.run:run_mapping",
+    takes=("reconstruct", "seed"),
+    needs=("image",),
+    uses=("calibrate",),
+    settings={
+        "seed": "seed",
+        "feature_scale": None,
+        "max_features": "reconstruct.max_features",
+        "learned_features": "reconstruct.learned_features",
+        "working_range_m": None,
+        "mapper": "reconstruct.mapper",
+    },
+    inputs=_mapping_inputs,
+    summary=_mapping_summary,
+    resumes=True,
+    reported=("mapping.json",),
+)
+
+
+PLACING = StageSpec(
+    name="placing",
+    folder="sparse",
+    command="reconstruct",
+    about="the model placed in the world",
+    version=17,
+    work="reconstruct.placing.run:run_sparse",
+    takes=("reconstruct", "water.index_sigma"),
+    needs=("image", "mapping"),
+    uses=("calibrate",),
+    settings={
+        "reconstruct": only(
+            "reconstruct",
+            "mount_sigma_deg",
+            "lever_sigma_m",
+            "clock_sigma_s",
+            "refine_port",
+            "refine_rig",
+        ),
+        "index_sigma": "water.index_sigma",
+    },
+    inputs=_placing_inputs,
+    summary=_placing_summary,
+    products={"track.csv": "camera track with sigmas", "model": "COLMAP model"},
+    reported=(".",),
+)
+
+
+DENSE = StageSpec(
+    name="dense",
+    folder="dense",
+    command="reconstruct",
+    about="the surface: depth of every view, fused",
+    version=13,
+    work="reconstruct.dense.run:run_dense",
+    takes=("reconstruct",),
+    needs=("image", "placing"),
+    settings=only(
+        "reconstruct", "dense_scale", "dense_partners", "dem_cell_m", "planes", "mask_moving"
+    ),
+    inputs=_model_inputs,
+    summary=_dense_summary,
+    resumes=True,
+    products={
+        "dem.tif": "elevation model (GeoTIFF)",
+        "sigma.tif": "sigma of its heights",
+        "planes": "the same over further planes",
+        "cloud.copc.laz": "point cloud (COPC) with colour, normal, sigma",
+        "moving": "masks of what moves",
+    },
+    picture="dem.png",
+    reported=("dem.tif", "sigma.tif", "plane.json", "planes", "moving.png"),
+)
+
+
+MOSAIC = StageSpec(
+    name="mosaic",
+    folder="mosaic",
+    command="reconstruct",
+    about="the orthomosaic, painted on the surface",
+    version=11,
+    work="reconstruct.mosaic.run:run_mosaic",
+    takes=("reconstruct", "water", "area.seafloor_depth_m"),
+    needs=("image", "placing", "dense"),
+    settings={
+        "mosaic_pixel_m": "reconstruct.mosaic_pixel_m",
+        "colour": "reconstruct.colour",
+        "dispersion": "reconstruct.dispersion",
+        "water": without("water", "n_water_sigma"),
+    },
+    inputs=_mosaic_inputs,
+    summary=_mosaic_summary,
+    products={
+        "mosaic.tif": "orthomosaic (cloud-optimised GeoTIFF)",
+        "planes": "those of further planes",
+        "footprints.geojson": "what each picture shows",
+    },
+    picture="mosaic.png",
+    reported=("mosaic.tif", "planes"),
+)
+
+
+MESH = StageSpec(
+    name="mesh",
+    folder="mesh",
+    command="reconstruct",
+    about="the textured mesh",
+    version=4,
+    work="reconstruct.mesh.run:run_mesh",
+    takes=("reconstruct",),
+    needs=("image", "placing", "dense"),
+    settings=only("reconstruct", "mesh_triangles", "mesh_error_px", "mesh_page_px", "mesh_tiles"),
+    inputs=_mesh_inputs,
+    summary=_mesh_summary,
+    products={
+        "mesh.glb": "textured mesh",
+        "tiles/tileset.json": "the same in full detail as 3D Tiles, where it is large",
+    },
+    picture="mesh.png",
+    reported=("mesh.glb",),
+)
+
+
+EVALUATE = StageSpec(
+    name="evaluate",
+    folder="evaluation",
+    command="evaluate",
+    about="errors against the truth of the simulation",
+    version=4,
+    work="reconstruct.evaluate.run:run_evaluate",
+    takes=("seed",),
+    needs=("image", "placing", "dense", "mosaic", "plan"),
+    uses=("mesh",),
+    settings={"seed": "seed"},
+    inputs=_evaluate_inputs,
+    summary=_evaluate_summary,
+    simulated=True,
+    products={"score.json": "errors against the truth"},
+    picture="errors.png",
+    reported=(".",),
+)
+
+
+STAGES = (MAPPING, PLACING, DENSE, MOSAIC, MESH, EVALUATE)
+"""In the order in which they run."""
