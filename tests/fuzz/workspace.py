@@ -167,7 +167,11 @@ def _target(
 
 TARGETS = (
     _target(
-        "survey.toml", "toml", "survey.toml", partial(_survey, text=settings_template()), read_survey
+        "survey.toml",
+        "toml",
+        "survey.toml",
+        partial(_survey, text=settings_template()),
+        read_survey,
     ),
     _target(
         "survey.toml, demo", "toml", "survey.toml", partial(_survey, text=_DEMO), read_survey
