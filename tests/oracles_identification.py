@@ -27,17 +27,6 @@ def integrated(vehicle: Vehicle, start: Array, rps: Array, at_s: Array, load: Ar
     return solved.y.T[:, 3:13]
 
 
-def dense_information(run: Array, lags: Array) -> Array:
-    """S^T T S with the Toeplitz matrix T of autocovariances written out."""
-    rows = len(run)
-    matrix = np.zeros((rows, rows))
-    for i in range(rows):
-        for j in range(rows):
-            if abs(i - j) < len(lags):
-                matrix[i, j] = lags[abs(i - j)]
-    return run.T @ matrix @ run
-
-
 def numpy_observation(state: Array, current_ne: Array, bias: Array, attitude: Array) -> Array:
     """What sensors measure of a state (10,): velocity over ground, rates, attitude error."""
     from scipy.spatial.transform import Rotation

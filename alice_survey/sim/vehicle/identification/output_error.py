@@ -43,7 +43,6 @@ from alice_survey.core.executor import progress
 from alice_survey.core.frames import Array
 from alice_survey.core.run.progress import step as named_step
 from alice_survey.sim.vehicle.coefficients import MOTIONS
-from alice_survey.sim.vehicle.identification.noise import autocovariance, noise_sigma
 from alice_survey.sim.vehicle.identification.parameters import QUADRATICS, Parameters, place_of
 from alice_survey.sim.vehicle.identification.sensitivity import (
     ADDED_MASS,
@@ -342,14 +341,10 @@ class OutputErrorFit:
     zero of parameters at a bound."""
     prior_covariance: Array
     """(P, P) the part that comes of the start's own error; zero without a prior."""
-    white_covariance: Array
-    """(P, P) as if the residuals were white: from the Gauss-Newton Hessian alone."""
     at_bound: Mask
     """(P,) bool: held by a bound, so without sigma."""
     channel_sigma: Array
     """(9,) sigmas of the residuals, NaN where nothing was measured."""
-    correlation_s: Array
-    """(9,) correlation time of the residuals: zero if white."""
     windows: Sequence[Window]
     starts: Sequence[Array]
     """(10,) state each window begins with, nu relative to the water."""
@@ -523,11 +518,7 @@ class _FitProblem:
         free = np.flatnonzero(~at_bound)
         information = table[:, free].T @ table[:, free]
         inverse = _inverse(information, [self.parameters.names[k] for k in free])
-        runs, times = self._by_channel(residuals), np.full(CHANNELS, np.nan)
-        for channel, series in enumerate(runs):
-            if any(len(run) for run in series):
-                lags = autocovariance(series)
-                times[channel] = self._step_s(channel) * float(np.sum(lags[1:])) / lags[0]
+        runs = self._by_channel(residuals)
         held = self._prior_information(values)[np.ix_(free, free)]
         scattered = jackknife_covariance(self._stretches(residuals, table[:, free]), held)
         # By chance it may come out below that of white noise: this is not used.
@@ -537,13 +528,13 @@ class _FitProblem:
             from_logs = scattered * np.outer(minimum, minimum)
         # The start is off by its own sigma: a score of weight times that of the prior alone.
         from_prior = self.prior_weight * inverse @ held @ inverse
-        tables = [np.zeros((self.count, self.count)) for _ in range(3)]
-        for whole, part in zip(tables, (from_logs, from_prior, inverse), strict=True):
+        tables = [np.zeros((self.count, self.count)) for _ in range(2)]
+        for whole, part in zip(tables, (from_logs, from_prior), strict=True):
             whole[np.ix_(free, free)] = part
         return OutputErrorFit(
             parameters=self.parameters, values=values, covariance=tables[0] + tables[1],
-            prior_covariance=tables[1], white_covariance=tables[2], at_bound=at_bound,
-            channel_sigma=self._channel_sigma(runs) * self.sigma, correlation_s=times,
+            prior_covariance=tables[1], at_bound=at_bound,
+            channel_sigma=self._channel_sigma(runs) * self.sigma,
             windows=self.windows, starts=list(self.starts), samples=self.samples,
         )  # fmt: skip
 
@@ -667,15 +658,6 @@ class _FitProblem:
                 sigma[channel] = np.sqrt(spread * float(values @ values) / len(values))
         return sigma
 
-    def _step_s(self, channel: int) -> float:
-        """Median time between samples of a channel."""
-        steps = [
-            np.diff(w.record.time_s[m[:, channel]])
-            for w, m in zip(self.windows, self.measured, strict=True)
-        ]
-        together = np.concatenate(steps)
-        return float(np.median(together)) if len(together) else 0.0
-
 
 def _first_sigma(windows: Sequence[Window]) -> Array:
     """First sigma of each channel, (9,): the noise, or a share of the spread if larger."""
@@ -693,6 +675,21 @@ def _first_sigma(windows: Sequence[Window]) -> Array:
             spread = float(np.std(np.concatenate(table)))
             sigma[channel] = max(float(np.median(found)), _ROUGH_SHARE * spread)
     return sigma
+
+
+_SECOND_DIFFERENCE = 6.0
+"""Variance of the second difference of white noise, by its own: 1 + 4 + 1."""
+_MAD = 1.4826
+"""Standard deviation of a normal variable by its median absolute deviation."""
+
+
+def noise_sigma(series: Array) -> float:
+    """Standard deviation of the white noise on a smooth series, (T,), by second differences.
+
+    The median suppresses steps and outliers.
+    """
+    second = np.diff(series, 2) / np.sqrt(_SECOND_DIFFERENCE)
+    return float(_MAD * np.median(np.abs(second)))
 
 
 def _known_rows(angles: Array) -> Array:

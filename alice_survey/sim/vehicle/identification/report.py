@@ -49,7 +49,6 @@ from alice_survey.sim.vehicle.identification.sensitivity import (
     CHANNELS,
     STATES,
     Physics,
-    Record,
     Terms,
     scratch_for,
     simulate,
@@ -71,22 +70,7 @@ from alice_survey.sim.vehicle.identification.windows import (
 from alice_survey.sim.vehicle.log import read_column_map, read_foreign_log, read_vehicle_log
 from alice_survey.sim.vehicle.vehicle import Vehicle
 
-HORIZONS_S = (0.5, 1.0, 2.0, 5.0, 10.0)
 _MOTIONS = 6
-_START_ROWS_S = 0.5
-"""A forecast starts this long after the one before."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Forecast:
-    """Errors after a time from a start, root mean square over many starts."""
-
-    horizon_s: float
-    starts: int
-    model: Array
-    """(6,) m/s and rad/s."""
-    constant: Array
-    """(6,) of the velocity that is kept."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -104,7 +88,6 @@ class MotionValidation:
     """(T, 6) the velocity at the start of each window."""
     window_s: float
     """Longest of the windows."""
-    forecasts: tuple[Forecast, ...]
 
     @property
     def fit_percent(self) -> Array:
@@ -135,7 +118,6 @@ def validate(
     values: Array,
     *,
     simulation: Simulation | None = None,
-    horizons_s: Sequence[float] = HORIZONS_S,
 ) -> MotionValidation:
     """Compare simulations with windows of a log.
 
@@ -144,7 +126,6 @@ def validate(
         parameters: parameters of the model.
         values: (P,) theirs.
         simulation: steps and inputs.
-        horizons_s: times after which forecasts are judged; those longer than a window are left out.
 
     Raises:
         VehicleError: a simulation does not stay finite.
@@ -155,72 +136,29 @@ def validate(
     # A motion that follows the log is not predicted.
     measured[:, list(windows[0].given)] = np.nan
     simulated, constant, longest = [], [], 0.0
-    errors: dict[float, list[tuple[Array, Array]]] = {h: [] for h in horizons_s}
     for window in windows:
         filled = _hold_last(window.measured)
-        start = _state(window, filled, 0, physics.current_ne, physics.bias)
-        simulated.append(run(window, start, physics, how))
+        simulated.append(_run(window, filled[0], physics, how))
         constant.append(np.tile(filled[0], (len(filled), 1)))
         time_s = window.record.time_s
         longest = max(longest, float(time_s[-1] - time_s[0]))
-        _forecast(window, filled, physics, how, errors)
-    forecasts = []
-    for horizon, rows in errors.items():
-        if rows:
-            model, kept = (np.array([row[i] for row in rows]) for i in range(2))
-            forecasts.append(
-                Forecast(
-                    horizon_s=horizon, starts=len(rows), model=_rms(model), constant=_rms(kept)
-                )
-            )
     return MotionValidation(
         source=Path(windows[0].source).name,
         time_s=np.concatenate([w.record.time_s for w in windows]),
         measured=measured, simulated=np.concatenate(simulated), constant=np.concatenate(constant),
-        window_s=longest, forecasts=tuple(forecasts),
+        window_s=longest,
     )  # fmt: skip
 
 
-def _forecast(
-    window: Window,
-    filled: Array,
-    physics: Physics,
-    how: Simulation,
-    errors: dict[float, list[tuple[Array, Array]]],
-) -> None:
-    """Add the errors of forecasts from many rows of a window."""
-    time_s = window.record.time_s
-    next_s = time_s[0]
-    for row in range(len(time_s) - 1):
-        if time_s[row] < next_s or not np.all(np.isfinite(window.record.attitude[row])):
-            continue
-        next_s = time_s[row] + _START_ROWS_S
-        ends = {h: int(np.searchsorted(time_s, time_s[row] + h - 1e-6)) for h in errors}
-        ends = {h: end for h, end in ends.items() if end < len(time_s)}
-        if not ends:
-            break
-        last = max(ends.values())
-        part = Window(
-            source=window.source,
-            record=Record(*(np.ascontiguousarray(a[row : last + 1]) for a in window.record)),
-            measured=window.measured[row : last + 1],
-            given=window.given,
-            start=window.start,
-        )
-        start = _state(window, filled, row, physics.current_ne, physics.bias)
-        found = run(part, start, physics, how)
-        for horizon, end in ends.items():
-            truth = window.measured[end].copy()
-            truth[list(window.given)] = np.nan
-            errors[horizon].append((found[end - row] - truth, filled[row] - truth))
-
-
-def run(window: Window, start: Array, physics: Physics, how: Simulation) -> Array:
-    """Velocity over ground and rates, (T, 6), of a window simulated from a start (10,).
+def _run(window: Window, motion: Array, physics: Physics, how: Simulation) -> Array:
+    """Velocity over ground and rates, (T, 6), of a window simulated from those of its first row.
 
     Raises:
         VehicleError: the simulation does not stay finite.
     """
+    start = window.start.copy()
+    start[4:] = motion - physics.bias
+    start[4:7] -= Rotation.from_quat(start[:4]).inv().apply([*physics.current_ne, 0.0])
     rows = len(window.record.time_s)
     states, observed = np.empty((rows, STATES)), np.empty((rows, CHANNELS))
     nothing = np.zeros(0, np.int64)
@@ -236,18 +174,6 @@ def run(window: Window, start: Array, physics: Physics, how: Simulation) -> Arra
     return observed[:, :_MOTIONS]
 
 
-def _state(window: Window, filled: Array, row: int, current_ne: Array, bias: Array) -> Array:
-    """The state (10,) that a row measured; its attitude, where unknown, is the window's first."""
-    attitude = window.record.attitude[row]
-    state = window.start.copy()
-    if np.all(np.isfinite(attitude)):
-        state[:4] = attitude
-    state[4:] = filled[row] - bias
-    drift = Rotation.from_quat(state[:4]).inv().apply([current_ne[0], current_ne[1], 0.0])
-    state[4:7] -= drift
-    return state
-
-
 def _hold_last(measured: Array) -> Array:
     """Measurements with the last known one in rows without; the first known one before it."""
     filled = measured.copy()
@@ -259,17 +185,6 @@ def _hold_last(measured: Array) -> Array:
         last = np.maximum.accumulate(np.where(np.isfinite(column), np.arange(len(column)), -1))
         column[:] = column[np.where(last < 0, known[0], last)]
     return filled
-
-
-def _rms(errors: Array) -> Array:
-    """(6,) over the rows where something was measured; NaN where nothing was."""
-    known = np.isfinite(errors)
-    count = known.sum(axis=0)
-    total = np.where(known, errors, 0.0) ** 2
-    result: Array = np.sqrt(
-        np.divide(total.sum(axis=0), count, out=np.full(errors.shape[1], np.nan), where=count > 0)
-    )
-    return result
 
 
 JOINT_FREE = ("X_uu", "Y_vv", "Z_ww", "N_rr", "current")
@@ -464,7 +379,7 @@ def _validation(windows: Sequence[Window], result: _Identified, how: Simulation)
         return _Validation(found=found)
     try:
         start, _ = _with_its_current(windows, result.parameters, result.parameters.start, how)
-        started = validate(windows, result.parameters, start, simulation=how, horizons_s=())
+        started = validate(windows, result.parameters, start, simulation=how)
     except VehicleError:  # the motions of the start may not last
         started = None
     return _Validation(found=found, started=started, current_ne=current_ne)
@@ -662,15 +577,6 @@ def _fit_data(found: MotionValidation) -> dict[str, Any]:
         "window_s": found.window_s,
         "fit_percent": _motions(found.fit_percent),
         "constant_fit_percent": _motions(found.constant_fit_percent),
-        "forecasts": [
-            {
-                "horizon_s": one.horizon_s,
-                "starts": one.starts,
-                "model_rms": _motions(one.model),
-                "constant_rms": _motions(one.constant),
-            }
-            for one in found.forecasts
-        ],
     }
 
 

@@ -4,7 +4,9 @@ With x' = f(x, parameters), the sensitivities S = dx/d(columns) follow
 S' = (df/dx) S + df/d(columns) (forward sensitivities; e.g. Hairer, Norsett & Wanner, Solving
 Ordinary Differential Equations I, I.14). Both are carried through the same Runge-Kutta steps, so
 that S is the derivative of the numerical solution itself. Columns are the parameters, then the
-start: three small turns about the body's axes and the six of nu.
+start: three small turns about the body's axes and the six of nu. df/dx is by central differences of
+the forces, which are of second order in nu and in the quaternion but for the thrust, so that these
+differences are exact to rounding.
 
 A constant current moves the water that nu is relative to: it enters the measured velocity over
 ground only.
@@ -34,8 +36,8 @@ from alice_survey.sim.vehicle.rotations import matrix_rows
 """Kinds of parameters."""
 STATES = 10
 """Length of the state."""
-_TILT = 1e-6
-"""Step, m/s and rad/s, of the slope of thrust by velocity: thrust is given as a program."""
+_TILT = 1e-5
+"""Step, m/s, rad/s or of the quaternion, of the slope of the force by the state."""
 
 
 class Terms(NamedTuple):
@@ -67,9 +69,9 @@ class SlopeScratch(NamedTuple):
     """Work arrays for intermediate results."""
 
     force: Array
-    """(3, 6): force, tilted force, rates of nu."""
-    by_nu: Array
-    """(6, 6) slope of the force."""
+    """(3, 6): force, and forces at both ends of a difference."""
+    tilted: Array
+    """(10,) a state a step away."""
     by_state: Array
     """(10, 10) slope of the state's rate."""
     by_column: Array
@@ -89,7 +91,8 @@ class SlopeScratch(NamedTuple):
 def scratch_for(columns: int, thrusters: int) -> SlopeScratch:
     """Work arrays for a number of columns and thrusters."""
     return SlopeScratch(
-        np.zeros((3, 6)), np.zeros((6, 6)), np.zeros((STATES, STATES)), np.zeros((STATES, columns)),
+        np.zeros((3, 6)), np.zeros(STATES), np.zeros((STATES, STATES)),
+        np.zeros((STATES, columns)),
         np.zeros((3, STATES)), np.zeros((3, STATES, columns)), np.zeros(thrusters), np.zeros(6),
         np.zeros(6),
     )  # fmt: skip
@@ -124,10 +127,9 @@ def slope_by_state(
     physics: Physics, state: Array, rps: Array, load: Array, scratch: SlopeScratch
 ) -> None:
     """Write df/dx into `by_state`."""
-    body, nu, by_nu, out = physics.body, state[4:10], scratch.by_nu, scratch.by_state
+    tilted, out, inverse = scratch.tilted, scratch.by_state, physics.body.mass_inverse
     x, y, z, s = state[0], state[1], state[2], state[3]
-    p, q, r = nu[3], nu[4], nu[5]
-    u, v, w = nu[0], nu[1], nu[2]
+    p, q, r = state[7], state[8], state[9]
     out[:, :] = 0.0
     # Attitude: q' = q * (omega, 0) / 2, linear in both.
     out[0, 1], out[0, 2], out[0, 3] = 0.5 * r, -0.5 * q, 0.5 * p
@@ -138,86 +140,18 @@ def slope_by_state(
     out[1, 7], out[1, 8], out[1, 9] = 0.5 * z, 0.5 * s, -0.5 * x
     out[2, 7], out[2, 8], out[2, 9] = -0.5 * y, 0.5 * x, 0.5 * s
     out[3, 7], out[3, 8], out[3, 9] = -0.5 * x, -0.5 * y, -0.5 * z
-    # Force by velocity: damping and lift,
-    for i in range(6):
-        for j in range(6):
-            square = body.quadratic[i, j] if nu[j] > 0.0 else body.quadratic_back[i, j]
-            by_nu[i, j] = body.linear[i, j] + 2.0 * square * abs(nu[j])
-    sign = 1.0 if u > 0.0 else (-1.0 if u < 0.0 else 0.0)
-    by_nu[1, 0] += body.lift[0] * sign * v
-    by_nu[1, 1] += body.lift[0] * abs(u)
-    by_nu[2, 0] += body.lift[1] * sign * w
-    by_nu[2, 2] += body.lift[1] * abs(u)
-    by_nu[4, 0] += body.lift[2] * w
-    by_nu[4, 2] += body.lift[2] * u
-    by_nu[5, 0] += body.lift[3] * v
-    by_nu[5, 1] += body.lift[3] * u
-    # Coriolis: -omega x A, and -v x A - omega x B, with the momenta A and B linear in nu,
-    m = body.mass
-    ax = ay = az = bx = by = bz = 0.0
-    for j in range(6):
-        n = nu[j]
-        ax += m[0, j] * n
-        ay += m[1, j] * n
-        az += m[2, j] * n
-        bx += m[3, j] * n
-        by += m[4, j] * n
-        bz += m[5, j] * n
-        by_nu[0, j] -= q * m[2, j] - r * m[1, j]
-        by_nu[1, j] -= r * m[0, j] - p * m[2, j]
-        by_nu[2, j] -= p * m[1, j] - q * m[0, j]
-        by_nu[3, j] -= v * m[2, j] - w * m[1, j] + q * m[5, j] - r * m[4, j]
-        by_nu[4, j] -= w * m[0, j] - u * m[2, j] + r * m[3, j] - p * m[5, j]
-        by_nu[5, j] -= u * m[1, j] - v * m[0, j] + p * m[4, j] - q * m[3, j]
-    by_nu[0, 4] -= az
-    by_nu[0, 5] += ay
-    by_nu[1, 5] -= ax
-    by_nu[1, 3] += az
-    by_nu[2, 3] -= ay
-    by_nu[2, 4] += ax
-    by_nu[3, 1] -= az
-    by_nu[3, 2] += ay
-    by_nu[3, 4] -= bz
-    by_nu[3, 5] += by
-    by_nu[4, 2] -= ax
-    by_nu[4, 0] += az
-    by_nu[4, 5] -= bx
-    by_nu[4, 3] += bz
-    by_nu[5, 0] -= ay
-    by_nu[5, 1] += ax
-    by_nu[5, 3] -= by
-    by_nu[5, 4] += bx
-    # and thrust, by differences.
-    if rps.shape[0] > 0:
-        base, tilted = scratch.force[0], scratch.force[1]
-        base[:] = 0.0
-        add_thrust(physics.propulsion, rps, nu, base)
-        for j in range(6):
-            kept = nu[j]
-            nu[j] = kept + _TILT
-            tilted[:] = 0.0
-            add_thrust(physics.propulsion, rps, nu, tilted)
-            nu[j] = kept
-            for i in range(6):
-                by_nu[i, j] += (tilted[i] - base[i]) / _TILT
-    inverse = body.mass_inverse
-    for i in range(6):
-        for j in range(6):
+    for j in range(STATES):
+        tilted[j] = state[j]
+    for j in range(STATES):
+        for end in range(2):
+            tilted[j] = state[j] + (_TILT if end else -_TILT)
+            force_on(physics, tilted, rps, load, scratch.force[1 + end])
+        tilted[j] = state[j]
+        for i in range(6):
             total = 0.0
             for k in range(6):
-                total += inverse[i, k] * by_nu[k, j]
-            out[4 + i, 4 + j] = total
-    # Weight and buoyancy along the body's down: force by (r20, r21, r22), and these by q.
-    net, weight = body.weight_n - body.buoyancy_n, body.weight_n
-    gx, gy, gz = weight * body.cg[0], weight * body.cg[1], weight * body.cg[2]
-    for i in range(6):
-        d0 = inverse[i, 0] * net + inverse[i, 4] * gz - inverse[i, 5] * gy
-        d1 = inverse[i, 1] * net - inverse[i, 3] * gz + inverse[i, 5] * gx
-        d2 = inverse[i, 2] * net + inverse[i, 3] * gy - inverse[i, 4] * gx
-        out[4 + i, 0] = 2 * z * d0 + 2 * s * d1 - 4 * x * d2
-        out[4 + i, 1] = -2 * s * d0 + 2 * z * d1 - 4 * y * d2
-        out[4 + i, 2] = 2 * x * d0 + 2 * y * d1
-        out[4 + i, 3] = -2 * y * d0 + 2 * x * d1
+                total += inverse[i, k] * (scratch.force[2, k] - scratch.force[1, k])
+            out[4 + i, j] = total / (2.0 * _TILT)
 
 
 @kernel
@@ -226,6 +160,7 @@ def slope_by_parameters(
 ) -> None:
     """Write df/d(parameters) into `by_column`; `rates` is nu' (6,)."""
     body, nu, force, out = physics.body, state[4:10], scratch.force[2], scratch.by_column
+    momentum = scratch.force[1]
     x, y, z, s = state[0], state[1], state[2], state[3]
     r20, r21, r22 = matrix_rows(x, y, z, s)[2]
     u, v, w, p, q, r = nu[0], nu[1], nu[2], nu[3], nu[4], nu[5]
@@ -254,24 +189,17 @@ def slope_by_parameters(
                 force[5] = u * v
         elif kind == ADDED_MASS:
             # The inertia loses the coefficient in (i, j) and (j, i): momentum d, and -dM nu'.
-            d0 = d1 = d2 = d3 = d4 = d5 = 0.0
-            for side in range(2):
-                a, b = (i, j) if side == 0 else (j, i)
-                if side == 1 and i == j:
-                    break
-                force[a] += rates[b]
-                d0 -= nu[b] if a == 0 else 0.0
-                d1 -= nu[b] if a == 1 else 0.0
-                d2 -= nu[b] if a == 2 else 0.0
-                d3 -= nu[b] if a == 3 else 0.0
-                d4 -= nu[b] if a == 4 else 0.0
-                d5 -= nu[b] if a == 5 else 0.0
-            force[0] -= q * d2 - r * d1
-            force[1] -= r * d0 - p * d2
-            force[2] -= p * d1 - q * d0
-            force[3] -= v * d2 - w * d1 + q * d5 - r * d4
-            force[4] -= w * d0 - u * d2 + r * d3 - p * d5
-            force[5] -= u * d1 - v * d0 + p * d4 - q * d3
+            momentum[:] = 0.0
+            force[i], momentum[i] = rates[j], -nu[j]
+            if i != j:
+                force[j], momentum[j] = rates[i], -nu[i]
+            a, b = momentum[:3], momentum[3:]
+            force[0] -= q * a[2] - r * a[1]
+            force[1] -= r * a[0] - p * a[2]
+            force[2] -= p * a[1] - q * a[0]
+            force[3] -= v * a[2] - w * a[1] + q * b[2] - r * b[1]
+            force[4] -= w * a[0] - u * a[2] + r * b[0] - p * b[2]
+            force[5] -= u * a[1] - v * a[0] + p * b[1] - q * b[0]
         elif kind == GAIN:
             force[i] = scratch.load[i]
         elif kind == BUOYANCY:

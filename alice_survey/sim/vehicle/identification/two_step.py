@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.signal import fftconvolve, savgol_filter
 from scipy.spatial.transform import Rotation
 
@@ -33,7 +34,11 @@ from alice_survey.core.compiled import kernel
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.core.run.progress import step as named_step
-from alice_survey.sim.vehicle.identification.noise import autocovariance, correlated_information
+from alice_survey.sim.vehicle.identification.output_error import (
+    in_stretches,
+    jackknife_covariance,
+    stretch_numbers,
+)
 from alice_survey.sim.vehicle.identification.parameters import OTHERS, Parameters
 from alice_survey.sim.vehicle.identification.sensitivity import (
     ADDED_MASS,
@@ -224,6 +229,8 @@ class _Rows:
     wrench: Array
     runs: tuple[int, ...]
     """Number of rows of each window."""
+    stretches: tuple[NDArray[np.intp], ...]
+    """By window: the number of the stretch of each row, which sigmas leave out in turn."""
 
 
 @named_step("fit in two steps")
@@ -301,13 +308,11 @@ def _regress(
     if np.any(scale == 0) or np.linalg.cond(information / np.outer(scale, scale)) > 1e10:
         raise VehicleError(f"the logs do not determine {', '.join(names)}: do not free all of them")
     values[group] = np.linalg.solve(information, x.T @ y)
-    rest, ends = y - x @ values[group], np.cumsum(rows.runs)
-    starts = np.concatenate([[0], ends[:-1]])
-    parts = [chosen[a:b] for a, b in zip(starts, ends, strict=True)]
-    cuts = np.cumsum([int(part.sum()) for part in parts])[:-1]
-    lags = autocovariance(np.split(rest, cuts))
-    inverse = np.linalg.inv(information)
-    covariance = inverse @ correlated_information(np.split(x, cuts), lags) @ inverse
+    residual = y - x @ values[group]
+    white = float(residual @ residual) / max(len(y) - len(group), 1)
+    stretches = in_stretches(residual, x, np.concatenate(rows.stretches)[chosen])
+    spread = jackknife_covariance(stretches, np.zeros_like(information))
+    covariance = white * np.linalg.inv(information) if spread is None else spread
     sigma[group] = np.sqrt(np.diag(covariance))
 
 
@@ -381,14 +386,15 @@ def _smooth(windows: Sequence[Window], parameters: Parameters) -> _Rows:
         parabola = (length // 2 + 1.0) ** 2 - away**2
         place = np.arange(len(even))
         inner = (place >= length // 2) & (place < len(even) - length // 2)
-        pieces.append((state, rates, *inputs, inner, parabola / parabola.sum()))
+        pieces.append((state, rates, *inputs, inner, even, parabola / parabola.sum()))
     if not pieces:
         raise VehicleError(f"no stretch of the logs is {_SMOOTH_S:g} s long")
-    *tables, weights = zip(*pieces, strict=True)
+    *tables, times, weights = zip(*pieces, strict=True)
     states, accelerations, rps, wrench, inside = (np.concatenate(table) for table in tables)
     return _Rows(
         states=states, accelerations=accelerations, inner=inside, weights=weights, rps=rps,
         wrench=wrench, runs=tuple(len(state) for state in tables[0]),
+        stretches=tuple(stretch_numbers([*times])),
     )  # fmt: skip
 
 

@@ -73,8 +73,6 @@ def test_each_run_is_predicted_from_the_others(runs: list[VehicleLog], left_out:
     assert np.all(model > 20.0)
     assert np.all(model < 90.0)
     assert np.all(model > constant + 30.0)
-    late = next(one for one in found.forecasts if one.horizon_s == 2.0)
-    assert np.all(late.model[moving] < late.constant[moving])
     # All in all better than the published coefficients, too.
     published = validate(shorter, parameters, parameters.start, simulation=QUICK)
     assert model.mean() > published.fit_percent[moving].mean() + 10.0
@@ -111,9 +109,7 @@ def test_unseen_runs_are_not_predicted_worse_than_by_the_start(
     for k, run in enumerate(runs):
         windows = make_windows(run, rov, window_s=10.0, given=("p", "q"))
         start, *others = (
-            validate(
-                windows, fits[0].parameters, values, simulation=QUICK, horizons_s=()
-            ).fit_percent[MOVING]
+            validate(windows, fits[0].parameters, values, simulation=QUICK).fit_percent[MOVING]
             for values in (
                 fits[0].parameters.start,
                 *(fit.values for j, fit in enumerate(fits) if j != k),
