@@ -9,7 +9,7 @@ differently still meet the same water. The followed point is the body's origin, 
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -184,37 +184,9 @@ class Case:
         return f"{current} with swell {self.swell_m:g}@{self.swell_s:g}"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Outcome:
-    """What one flight gives."""
-
-    variant: str
-    case: Case
-    seed: int
-    figures: FlightFigures
-    ending: str
-    look_ahead_m: float
-
-
-Summary = dict[str, dict[str, float]]
-
-
-@dataclass(frozen=True, kw_only=True)
-class CaseResult:
-    """All flights in one sea."""
-
-    case: Case
-    across_mps: float
-    """Speed of the current to starboard of the first line."""
-    along_mps: float
-    outcomes: tuple[Outcome, ...]
-    summaries: dict[str, Summary]
-    """Summary of each variant."""
-
-    @property
-    def title(self) -> str:
-        """The current, and its parts across and along the first line."""
-        return f"{self.case.name} ({self.across_mps:+.2f} across, {self.along_mps:+.2f} along)"
+Outcome = dict[str, Any]
+"""A row of `flights.csv`: configuration, sea, seed, ending, look-ahead, and `FlightFigures`."""
+Summary = dict[str, dict[str, float | None]]
 
 
 def default_cases(plan: Plan) -> tuple[Case, ...]:
@@ -253,22 +225,19 @@ def fly_all(
         executor: where tasks run.
         variants: what flies.
     """
-    fly = partial(fly_one, settings, plan)
+    fly = partial(_fly_one, settings, plan)
     yield from executor.map(fly, list(itertools.product(cases, variants, seeds)), label="flights")
 
 
-def fly_one(settings: FlightSettings, plan: Plan, which: tuple[Case, Variant, int]) -> Outcome:
-    """Make one flight."""
+def _fly_one(settings: FlightSettings, plan: Plan, which: tuple[Case, Variant, int]) -> Outcome:
     case, variant, seed = which
     setup, _, flight = fly_variant(settings, plan, variant, case, seed)
-    return Outcome(
-        variant=variant.name,
-        case=case,
-        seed=seed,
-        figures=figures_of(flight),
-        ending=flight.ending,
-        look_ahead_m=float(setup.guidance.look_ahead_m),
-    )
+    return {
+        "configuration": variant.name, "current_mps": case.current_mps,
+        "towards_deg": case.towards_deg, "swell_m": case.swell_m, "swell_s": case.swell_s,
+        "seed": seed, "ending": flight.ending,
+        "look_ahead_m": float(setup.guidance.look_ahead_m), **asdict(figures_of(flight)),
+    }  # fmt: skip
 
 
 def fly_variant(
@@ -376,16 +345,15 @@ def turn_rows(line: Array, following: NDArray[np.bool_]) -> list[slice]:
 
 def summarise(outcomes: Sequence[Outcome]) -> Summary:
     """Mean and extremes of each figure over flights, and the standard deviation of two or more."""
-    summary = {}
+    summary: Summary = {}
     for name in FlightFigures.__dataclass_fields__:
-        values = np.array([getattr(outcome.figures, name) for outcome in outcomes])
-        summary[name] = {
-            "mean": float(values.mean()),
-            "least": float(values.min()),
-            "most": float(values.max()),
-        }
+        values = np.array([outcome[name] for outcome in outcomes])
+        found = {"mean": values.mean(), "least": values.min(), "most": values.max()}
         if len(values) > 1:
-            summary[name]["sd"] = float(values.std(ddof=1))
+            found["sd"] = values.std(ddof=1)
+        summary[name] = {
+            key: float(value) if math.isfinite(value) else None for key, value in found.items()
+        }
     return summary
 
 
@@ -444,39 +412,74 @@ def compare_report(
     seeds = list(range(first, first + flights))
     settings = flight_settings(config)
     outcomes = list(fly_all(settings, plan, cases, seeds, executor or local_executor(), variants))
-    results = [_result(plan, case, outcomes, variants) for case in cases]
-    text = f"{_heading(plan, seeds)}\n{_table(results)}"
-    data = _data(plan, seeds, results, variants)
+    each = len(variants) * flights
+    data: dict[str, Any] = {
+        "paper": PAPER,
+        "followed_point": "body origin",
+        "plan": {
+            "lines": len(plan.lines), "line_spacing_m": plan.line_spacing_m,
+            "speed_mps": plan.speed_mps, "altitude_m": plan.altitude_m,
+        },
+        "seeds": seeds,
+        "variants": {
+            variant.name: {**asdict(variant), "failed": list(variant.failed)}
+            for variant in variants
+        },
+        "cases": [
+            _case_data(plan, case, outcomes[i * each : (i + 1) * each], variants)
+            for i, case in enumerate(cases)
+        ],
+    }  # fmt: skip
+    text = (
+        f"{len(plan.lines)} lines {plan.line_spacing_m:g} m apart at {plan.speed_mps:g} m/s, "
+        f"{len(seeds)} flight(s) of each vehicle in the same water (docs/vehicle-comparison.md): "
+        "cross-track rms, mean peak of the turns, mean ± standard deviation over flights\n"
+        f"{_table(data['cases'])}"
+    )
     try:
         out.mkdir(parents=True, exist_ok=True)
         write_json(out / "compare.json", data)
-        _write_flights(out / "flights.csv", outcomes)
+        rows = ([_rounded(value) for value in outcome.values()] for outcome in outcomes)
+        write_csv(out / "flights.csv", list(outcomes[0]), rows)
         (out / "compare.txt").write_text(text + "\n", encoding="utf-8")
-        draw_cross_track(out / "compare.png", results)
+        draw_cross_track(out / "compare.png", data["cases"])
     except OSError as error:
         raise ConfigError(f"{error.filename}: cannot be written: {error.strerror}") from None
     return f"{text}\n\nwrote {out}", data
 
 
-def _heading(plan: Plan, seeds: Sequence[int]) -> str:
-    return (
-        f"{len(plan.lines)} lines {plan.line_spacing_m:g} m apart at {plan.speed_mps:g} m/s, "
-        f"{len(seeds)} flight(s) of each vehicle in the same water (docs/vehicle-comparison.md): "
-        "cross-track rms, mean peak of the turns, mean ± standard deviation over flights"
-    )
+def _case_data(
+    plan: Plan, case: Case, outcomes: Sequence[Outcome], variants: Sequence[Variant]
+) -> dict[str, Any]:
+    """The flights in one sea, whose current is split across and along the first line."""
+    turned = math.radians(case.towards_deg) - plan.lines[0].heading_rad
+    of = {v.name: [o for o in outcomes if o["configuration"] == v.name] for v in variants}
+    return {
+        "current": case.name,
+        "across_mps": case.current_mps * math.sin(turned),
+        "along_mps": case.current_mps * math.cos(turned),
+        "look_ahead_m": {name: rows[-1]["look_ahead_m"] for name, rows in of.items()},
+        "variants": {name: summarise(rows) for name, rows in of.items()},
+    }
 
 
-def _table(results: Sequence[CaseResult]) -> str:
+def _title(case: Mapping[str, Any]) -> str:
+    across, along = case["across_mps"], case["along_mps"]
+    return f"{case['current']} ({across:+.2f} across, {along:+.2f} along)"
+
+
+def _table(cases: Sequence[Mapping[str, Any]]) -> str:
     rows = []
-    for result in results:
-        paper = [name for name in PAPER if name in result.summaries]
+    for case in cases:
+        title, variants = _title(case), case["variants"]
         rows += [
-            (result.title, f"paper, {name}", *(_paper_cell(name, column) for column in _COLUMNS))
-            for name in paper
+            (title, f"paper, {name}", *(_paper_cell(name, column) for column in _COLUMNS))
+            for name in PAPER
+            if name in variants
         ]
         rows += [
-            (result.title, name, *(_cell(summary[key], n) for key, n in _COLUMNS.values()))
-            for name, summary in result.summaries.items()
+            (title, name, *(_cell(summary[key], digits) for key, digits in _COLUMNS.values()))
+            for name, summary in variants.items()
         ]
     return text_table(("sea", "vehicle", *_COLUMNS), rows)
 
@@ -486,66 +489,14 @@ def _paper_cell(name: str, column: str) -> str:
     return "" if limits is None else "-".join(f"{limit:g}" for limit in sorted(set(limits)))
 
 
-def _cell(values: dict[str, float], digits: int) -> str:
-    sd = f" ±{values['sd']:.{digits}f}" if "sd" in values else ""
-    return f"{values['mean']:.{digits}f}{sd}"
+def _cell(values: Mapping[str, float | None], digits: int) -> str:
+    mean, sd = values["mean"], values.get("sd")
+    shown = "nan" if mean is None else f"{mean:.{digits}f}"
+    return shown if sd is None else f"{shown} ±{sd:.{digits}f}"
 
 
-def _data(
-    plan: Plan,
-    seeds: Sequence[int],
-    results: Sequence[CaseResult],
-    variants: Sequence[Variant],
-) -> dict[str, Any]:
-    return {
-        "paper": PAPER,
-        "followed_point": "body origin",
-        "plan": {
-            "lines": len(plan.lines),
-            "line_spacing_m": plan.line_spacing_m,
-            "speed_mps": plan.speed_mps,
-            "altitude_m": plan.altitude_m,
-        },
-        "seeds": list(seeds),
-        "variants": {
-            variant.name: {**asdict(variant), "failed": list(variant.failed)}
-            for variant in variants
-        },
-        "cases": [
-            {
-                "current": result.case.name,
-                "across_mps": result.across_mps,
-                "along_mps": result.along_mps,
-                "look_ahead_m": {o.variant: o.look_ahead_m for o in result.outcomes},
-                "variants": {
-                    name: {
-                        figure: {key: _or_none(value) for key, value in values.items()}
-                        for figure, values in summary.items()
-                    }
-                    for name, summary in result.summaries.items()
-                },
-            }
-            for result in results
-        ],
-    }
-
-
-def _result(
-    plan: Plan, case: Case, outcomes: Sequence[Outcome], variants: Sequence[Variant]
-) -> CaseResult:
-    mine = tuple(outcome for outcome in outcomes if outcome.case == case)
-    turned = math.radians(case.towards_deg) - plan.lines[0].heading_rad
-    return CaseResult(
-        case=case,
-        across_mps=case.current_mps * math.sin(turned),
-        along_mps=case.current_mps * math.cos(turned),
-        outcomes=mine,
-        summaries={
-            variant.name: summarise([o for o in mine if o.variant == variant.name])
-            for variant in variants
-            if any(o.variant == variant.name for o in mine)
-        },
-    )
+def _rounded(value: Any) -> Any:
+    return round(value, 6) if isinstance(value, float) else value
 
 
 def _case(text: str) -> Case:
@@ -569,46 +520,23 @@ def _with_swell(plan: Plan, case: Case, text: str) -> Case:
     return found
 
 
-def _write_flights(path: Path, outcomes: Sequence[Outcome]) -> None:
-    names = list(asdict(outcomes[0].figures))
-    write_csv(
-        path,
-        [
-            "configuration", "current_mps", "towards_deg", "swell_m", "swell_s", "seed", "ending",
-            "look_ahead_m", *names,
-        ],
-        (
-            [
-                o.variant, o.case.current_mps, o.case.towards_deg, o.case.swell_m,
-                o.case.swell_s, o.seed, o.ending,
-                round(o.look_ahead_m, 6),
-                *(round(value, 6) for value in asdict(o.figures).values()),
-            ]
-            for o in outcomes
-        ),
-    )  # fmt: skip
-
-
-def _or_none(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def draw_cross_track(path: Path, results: Sequence[CaseResult]) -> None:
+def draw_cross_track(path: Path, cases: Sequence[Mapping[str, Any]]) -> None:
     """Draw the true cross-track rms on lines of each vehicle in each sea, next to the paper's."""
     from alice_survey.kit.figure import INKS, figure_style, new_figure, save_figure
 
     with figure_style():
-        figure = new_figure(1.0 + 2.2 * len(results))
-        charts = figure.subplots(len(results), 1, sharex=True, squeeze=False)[:, 0]
-        for axes, result in zip(charts, results, strict=True):
-            names = list(result.summaries)
-            found = [result.summaries[name]["lines_true_m"] for name in names]
-            spread = [values.get("sd", 0.0) for values in found]
-            axes.barh(names, [values["mean"] for values in found], xerr=spread, color=INKS[0])
-            for name in (name for name in PAPER if name in names):
+        figure = new_figure(1.0 + 2.2 * len(cases))
+        charts = figure.subplots(len(cases), 1, sharex=True, squeeze=False)[:, 0]
+        for axes, case in zip(charts, cases, strict=True):
+            found = {name: each["lines_true_m"] for name, each in case["variants"].items()}
+            means, spread = (
+                [values.get(key) or 0.0 for values in found.values()] for key in ("mean", "sd")
+            )
+            axes.barh(list(found), means, xerr=spread, color=INKS[0])
+            for name in (name for name in PAPER if name in found):
                 limit = PAPER[name]["cross_track_rms_m"][1]
                 axes.plot(limit, name, "|", color=INKS[1], ms=16, mew=2, label="paper")
             axes.invert_yaxis()
-            axes.set_title(result.title)
+            axes.set_title(_title(case))
         charts[-1].set_xlabel("true cross-track rms on lines, m (paper's as strokes)")
         save_figure(figure, path)

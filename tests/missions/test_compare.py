@@ -4,7 +4,7 @@ import csv
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,6 @@ from missions.fly.compare import (
     ORIGINAL,
     VARIANTS,
     Case,
-    Outcome,
     compare_report,
     default_cases,
     figures_of,
@@ -175,13 +174,7 @@ def test_turns_are_from_a_line_to_the_middle_of_the_next() -> None:
 def test_summaries_are_means_and_spreads(small: Plan) -> None:
     job = fly_variant(SETTINGS, small, BY_NAME[IMPROVED], STILL, 1)
     figures = figures_of(job[2])
-    outcomes = [
-        Outcome(
-            variant=IMPROVED, case=STILL, seed=seed, ending="complete",
-            look_ahead_m=1.0, figures=replace(figures, lines_true_m=value),
-        )
-        for seed, value in enumerate((0.1, 0.2, 0.6))
-    ]  # fmt: skip
+    outcomes = [asdict(replace(figures, lines_true_m=value)) for value in (0.1, 0.2, 0.6)]
     found = summarise(outcomes)["lines_true_m"]
     assert found["mean"] == pytest.approx(0.3)
     assert found["sd"] == pytest.approx(math.sqrt(0.07))

@@ -294,7 +294,7 @@ def _fly_ticks(
     plant, sea, floor, sensors, navigation, world, scratch = vehicle
     path, mission, guidance, gains, pilot, wrench, allocation = piloting
     count, flown = rows.state.shape[0], 0
-    thrusters, actuators = rows.command_rps.shape[1], allocation.thrust.shape[0]
+    thrusters = rows.command_rps.shape[1]
     for k in range(count):
         tick = first + k
         sense(tick, sea, floor, sensors, navigation, world, rng)
@@ -308,16 +308,8 @@ def _fly_ticks(
             pilot.report[slot.PHASE], pilot.report[slot.REASON] = slot.ABORT, TOUCHED
         allocate(wrench, world.estimate, allocation)
 
-        for i in range(STATE + actuators):
-            rows.state[k, i] = world.state[i]
-        for i in range(STATE):
-            rows.truth[k, i] = world.now[i]
-        for i in range(6):
-            rows.wrench[k, i] = wrench[i]
-        for i in range(thrusters):
-            rows.command_rps[k, i] = allocation.command[i]
-        for i in range(slot.REPORT):
-            rows.report[k, i] = pilot.report[i]
+        rows.state[k], rows.truth[k], rows.wrench[k] = world.state, world.now, wrench
+        rows.report[k], rows.command_rps[k] = pilot.report, allocation.command[:thrusters]
         electrical_power(
             plant.propulsion, world.state[STATE:], world.state[7:STATE], rows.power_w[k]
         )

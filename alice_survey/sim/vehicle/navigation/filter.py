@@ -274,11 +274,24 @@ def predict(dt_s: float, sensors: Sensors, nav: NavigationState) -> None:
             turned[i, 0] * flow[SUM] + turned[i, 1] * flow[SUM + 1] + turned[i, 2] * flow[SUM + 2]
         )
         x[i] += 0.5 * dt_s * along
-    _transition(dt_s, nav)
+    # Blocks of the transition that need the attitude before it is moved on. Into row LEVERS:
+    # position by each of the two velocities, R dt / 2 (9); velocity by attitude, R^T [g dt]x but
+    # for its third column, 0 (6); half the tick's way, R (v + s) dt / 2 = w (3): position by
+    # attitude is -[w]x, by the DVL's scale -w. Into row LEVERS + 1: velocity by gyroscope bias,
+    # [v']x J (9).
+    levers, swing, fall = nav.scratch[LEVERS], nav.scratch[LEVERS + 1], GRAVITY * dt_s
+    for i in range(3):
+        r0, r1, r2 = h * turned[i, 0], h * turned[i, 1], h * turned[i, 2]
+        levers[3 * i], levers[3 * i + 1], levers[3 * i + 2] = r0, r1, r2
+        levers[9 + 2 * i], levers[10 + 2 * i] = fall * turned[1, i], -fall * turned[0, i]
+        levers[15 + i] = r0 * flow[SUM] + r1 * flow[SUM + 1] + r2 * flow[SUM + 2]
+    u, v, w = x[VELOCITY], x[VELOCITY + 1], x[VELOCITY + 2]
+    for j in range(3):
+        j0, j1, j2 = spin[9 + j], spin[12 + j], spin[15 + j]
+        swing[j], swing[3 + j], swing[6 + j] = v * j2 - w * j1, w * j0 - u * j2, u * j1 - v * j0
     turn(attitude, angle)
     matrix_of(attitude, turned)
     # Attitude by gyroscope bias, R' J (9), behind the others in row LEVERS + 1.
-    swing = nav.scratch[LEVERS + 1]
     for i in range(3):
         for j in range(3):
             swing[9 + 3 * i + j] = (
@@ -290,29 +303,6 @@ def predict(dt_s: float, sensors: Sensors, nav: NavigationState) -> None:
         nav.scratch[KEPT, i] = math.exp(-dt_s / correlation_s)
         x[i + 1] *= nav.scratch[KEPT, i]
     _propagate(dt_s, sensors, nav)
-
-
-@kernel
-def _transition(dt_s: float, nav: NavigationState) -> None:
-    """The blocks of the transition that need the attitude before it is moved on.
-
-    Into row LEVERS: position by each of the two velocities, R dt / 2 (9); velocity by attitude,
-    R^T [g dt]x without its third column, which is 0 (6); half the tick's way, R (v + s) dt / 2 = w
-    (3): position by attitude is -[w]x, by the DVL's scale -w. Into row LEVERS + 1: velocity by
-    gyroscope bias, [v']x J (9), with J as in `predict`.
-    """
-    x, turned, flow = nav.nominal, nav.turns[BELIEVED], nav.scratch[FLOW]
-    spin, levers, swing = nav.scratch[BLOCKS], nav.scratch[LEVERS], nav.scratch[LEVERS + 1]
-    h, fall = 0.5 * dt_s, GRAVITY * dt_s
-    for i in range(3):
-        r0, r1, r2 = h * turned[i, 0], h * turned[i, 1], h * turned[i, 2]
-        levers[3 * i], levers[3 * i + 1], levers[3 * i + 2] = r0, r1, r2
-        levers[9 + 2 * i], levers[10 + 2 * i] = fall * turned[1, i], -fall * turned[0, i]
-        levers[15 + i] = r0 * flow[SUM] + r1 * flow[SUM + 1] + r2 * flow[SUM + 2]
-    u, v, w = x[VELOCITY], x[VELOCITY + 1], x[VELOCITY + 2]
-    for j in range(3):
-        j0, j1, j2 = spin[9 + j], spin[12 + j], spin[15 + j]
-        swing[j], swing[3 + j], swing[6 + j] = v * j2 - w * j1, w * j0 - u * j2, u * j1 - v * j0
 
 
 @kernel

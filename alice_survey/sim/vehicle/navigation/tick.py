@@ -162,12 +162,8 @@ def navigation_tick(
             slot.GPS_BIAS,
         )
     due = suite.usbl_every > 0 and tick % suite.usbl_every == 0
-    if due and measure_usbl(time_s, now, suite, nav, rng):
-        # The sigma of the distance that is estimated.
-        north = lever_row(nav, suite, USBL, slot.NORTH_AXIS)
-        east = lever_row(nav, suite, USBL, slot.EAST_AXIS)
-        sigma = usbl_sigma(suite, north, east, lever_row(nav, suite, USBL, slot.DOWN_AXIS))
-        used |= use_fix(nav, suite, slot.USBL_USE, USBL, slot.USBL_FIX, sigma * sigma, -1)
+    if due:
+        used |= _use_usbl(time_s, now, suite, nav, rng)
     if suite.dvl_every > 0 and tick % suite.dvl_every == 0:
         pinged = True
         ping = tick // suite.dvl_every
@@ -177,33 +173,9 @@ def navigation_tick(
         used |= use_beams(nav, suite, True) != 0
     if used:
         correct(nav)
-    _write_estimate(nav, suite, estimate)
     if pinged and bottom != 0:
         _hear_floor(time_s, bottom, nav, suite)
-    _carry_altitude(time_s, nav, suite)
-    estimate[vector.ALTITUDE] = nav.memory[slot.ALTITUDE_NOW]
-    estimate[vector.CLEARANCE] = nav.memory[slot.CLEARANCE_NOW]
-    for i in range(vector.ESTIMATE):
-        nav.memory[slot.LATEST + i] = estimate[i]
-
-
-@kernel
-def _write_estimate(nav: NavigationState, suite: Sensors, estimate: Array) -> None:
-    """Write the estimate of the body's origin, except for the altitude."""
-    x, turned, memory = nav.nominal, nav.turns[slot.BELIEVED], nav.memory
-    a, b, c = suite.place[IMU, 0], suite.place[IMU, 1], suite.place[IMU, 2]
-    for i in range(3):
-        estimate[i] = x[i] - turned[i, 0] * a - turned[i, 1] * b - turned[i, 2] * c
-        estimate[vector.P + i] = nav.readings[slot.RATES + i] - x[slot.GYRO_BIAS + 1 + i]
-    p, q, r = estimate[vector.P], estimate[vector.P + 1], estimate[vector.P + 2]
-    estimate[vector.U] = x[slot.VELOCITY] - q * c + r * b
-    estimate[vector.U + 1] = x[slot.VELOCITY + 1] - r * a + p * c
-    estimate[vector.U + 2] = x[slot.VELOCITY + 2] - p * b + q * a
-    estimate[3] = math.atan2(turned[2, 1], turned[2, 2])
-    estimate[4] = -math.asin(min(max(turned[2, 0], -1.0), 1.0))
-    heading = math.atan2(turned[1, 0], turned[0, 0])
-    memory[slot.HEADING_TURNS] += wrap_angle(heading - memory[slot.HEADING_TURNS])
-    estimate[vector.HEADING] = memory[slot.HEADING_TURNS]
+    _write_estimate(time_s, nav, suite, estimate)
 
 
 @kernel
@@ -312,12 +284,26 @@ def _variance(nav: NavigationState, t: int, a: float, b: float, c: float) -> flo
 
 
 @kernel
-def _carry_altitude(time_s: float, nav: NavigationState, suite: Sensors) -> None:
-    """Altitude and clearance now, by the last ping's plane; NaN when that is too long ago.
+def _write_estimate(time_s: float, nav: NavigationState, suite: Sensors, estimate: Array) -> None:
+    """Write the estimate of the body's origin, and altitude and clearance by the last ping's plane.
 
-    The depth gained since and the rise of the plane below the way gone since are taken off.
+    The depth gained since the ping and the rise of the plane below the way gone since are taken
+    off. Both are NaN when the ping is too long ago.
     """
     memory, x, turned = nav.memory, nav.nominal, nav.turns[slot.BELIEVED]
+    a, b, c = suite.place[IMU, 0], suite.place[IMU, 1], suite.place[IMU, 2]
+    for i in range(3):
+        estimate[i] = x[i] - turned[i, 0] * a - turned[i, 1] * b - turned[i, 2] * c
+        estimate[vector.P + i] = nav.readings[slot.RATES + i] - x[slot.GYRO_BIAS + 1 + i]
+    p, q, r = estimate[vector.P], estimate[vector.P + 1], estimate[vector.P + 2]
+    estimate[vector.U] = x[slot.VELOCITY] - q * c + r * b
+    estimate[vector.U + 1] = x[slot.VELOCITY + 1] - r * a + p * c
+    estimate[vector.U + 2] = x[slot.VELOCITY + 2] - p * b + q * a
+    estimate[3] = math.atan2(turned[2, 1], turned[2, 2])
+    estimate[4] = -math.asin(min(max(turned[2, 0], -1.0), 1.0))
+    heading = math.atan2(turned[1, 0], turned[0, 0])
+    memory[slot.HEADING_TURNS] += wrap_angle(heading - memory[slot.HEADING_TURNS])
+    estimate[vector.HEADING] = memory[slot.HEADING_TURNS]
     age = time_s - memory[slot.ALTITUDE_TIME]
     # Not a number before the first ping: then this is false too.
     if age <= suite.altitude_age_s + 1e-9:
@@ -346,6 +332,10 @@ def _carry_altitude(time_s: float, nav: NavigationState, suite: Sensors) -> None
         memory[slot.ALTITUDE_NOW] = memory[slot.ALTITUDE_SIGMA] = memory[slot.CLEARANCE_NOW] = (
             math.nan
         )
+    estimate[vector.ALTITUDE] = memory[slot.ALTITUDE_NOW]
+    estimate[vector.CLEARANCE] = memory[slot.CLEARANCE_NOW]
+    for i in range(vector.ESTIMATE):
+        memory[slot.LATEST + i] = estimate[i]
 
 
 @kernel
@@ -440,27 +430,34 @@ def usbl_sigma(sensors: Sensors, north_m: float, east_m: float, depth_m: float) 
 
 
 @kernel
-def measure_usbl(
+def _use_usbl(
     time_s: float, now: Array, sensors: Sensors, nav: NavigationState, rng: np.random.Generator
 ) -> bool:
-    """North and east of the transponder; whether there was an answer."""
-    place, turn = sensors.place[USBL], nav.turns[slot.TRUTH_NOW]
+    """Measure and weigh north and east of the transponder; whether there was an answer of use."""
+    place, turn, usbl = sensors.place[USBL], nav.turns[slot.TRUTH_NOW], sensors.usbl
     north, east, depth = rotate(turn, place[0], place[1], place[2])
     north, east, depth = now[0] + north, now[1] + east, now[2] + depth
-    a, b = north - sensors.usbl.boat_ned_m[0], east - sensors.usbl.boat_ned_m[1]
-    c = depth - sensors.usbl.boat_ned_m[2]
+    boat = usbl.boat_ned_m
+    reach2 = (north - boat[0]) ** 2 + (east - boat[1]) ** 2 + (depth - boat[2]) ** 2
     # A transponder that breaks the surface is not received.
-    if depth <= 0.0 or math.sqrt(a * a + b * b + c * c) > sensors.usbl.max_range_m:
+    if depth <= 0.0 or math.sqrt(reach2) > usbl.max_range_m:
         return False
-    sigma = usbl_sigma(sensors, north, east, depth)
-    wrong = rng.random() < sensors.usbl.outlier_probability
+    slope2, noise2 = usbl.noise_fraction * usbl.noise_fraction, usbl.noise_m * usbl.noise_m
+    sigma = math.sqrt(noise2 + slope2 * reach2)
+    wrong = rng.random() < usbl.outlier_probability
     for i in range(2):
         value = (north if i == 0 else east) + sigma * rng.standard_normal()
         if wrong:
-            value += sensors.usbl.outlier_m * (2.0 * rng.random() - 1.0)
+            value += usbl.outlier_m * (2.0 * rng.random() - 1.0)
         nav.readings[slot.USBL_FIX + i] = value
     nav.readings[slot.USBL_TIME] = time_s
-    return True
+    # The filter takes the sigma of the distance that is estimated.
+    north = lever_row(nav, sensors, USBL, slot.NORTH_AXIS)
+    east = lever_row(nav, sensors, USBL, slot.EAST_AXIS)
+    depth = lever_row(nav, sensors, USBL, slot.DOWN_AXIS)
+    reach2 = (north - boat[0]) ** 2 + (east - boat[1]) ** 2 + (depth - boat[2]) ** 2
+    sigma = math.sqrt(noise2 + slope2 * reach2)
+    return use_fix(nav, sensors, slot.USBL_USE, USBL, slot.USBL_FIX, sigma * sigma, -1)
 
 
 @kernel

@@ -135,6 +135,7 @@ LEVEL = (3, 4)
 """The same of the rows after them, which are held level: by thrusters that can, else by gravity."""
 _DEGREE = (*DEGREES, *LEVEL)
 _BY_FINS = (SURGE, YAW, PITCH, ROLL)
+_AXES = ("surge", "sway", "heave", "yaw", "roll", "pitch")
 
 MASS, RATE, PLACE, INTEGRAL, INNER, MIN_FORCE, MAX_FORCE, FASTEST, LAG, BANDWIDTH, WEIGHT = range(
     11
@@ -221,136 +222,85 @@ def gains_for(vehicle: Vehicle, speed_mps: float, navigation_hz: float = 5.0) ->
         VehicleError: surge, heave or yaw cannot be controlled, or yaw not damped at that speed; or
             a vehicle with fins has vertical thrusters too, or does not fly level at that speed.
     """
-    if vehicle.fins:
-        return _gains_of_fins(vehicle, speed_mps, navigation_hz)
-    plant = vehicle.plant
-    count = len(vehicle.thrusters)
-    lower, upper = np.zeros(count), np.zeros(count)
-    cruise = np.array([speed_mps, 0.0, 0.0, 0.0, 0.0, 0.0])
-    thrust_limits(plant.propulsion, np.ones(count), cruise, lower, upper)
-    degrees = (*DEGREES, *LEVEL)
-    configuration = vehicle.configuration_matrix[list(degrees)]
-    if not _holds(configuration, lower, upper):
-        configuration = configuration[:STEERED]
-    slowness_s = np.array([thruster.time_constant_s for thruster in vehicle.thrusters])
-    damping = linear_damping(plant.body, cruise)
-    axes = np.zeros((6, 11))
-    fastest_rad_s = 2 * math.pi * navigation_hz / SAMPLES_PER_PERIOD
-    gyradius_m = math.sqrt(vehicle.mass[5, 5] / vehicle.mass[1, 1])
-    for axis, degree in enumerate(degrees[: len(configuration)]):
-        inertia = float(vehicle.mass[degree, degree])
-        minimum, maximum = authority(configuration, lower, upper, axis)
-        axes[axis, [MASS, MIN_FORCE, MAX_FORCE]] = inertia, minimum, maximum
-        weakest = min(-minimum, maximum)
-        if weakest < _NO_FORCE:
-            if axis == SWAY:
-                continue
-            name = ("surge", "sway", "heave", "yaw")[axis]
-            raise VehicleError(
-                f"the thrusters of {vehicle.name} cannot control {name} both ways "
-                f"({minimum:.2g} to {maximum:.2g}): it cannot fly a survey"
-            )
-        lag_s = effective_lag_s(configuration, lower, upper, slowness_s, axis, gyradius_m)
-        lag_s += _TICK_S / 2
-        decay = float(damping[degree, degree]) / inertia
-        if axis >= STEERED:  # attitude and its rates are known at every tick
-            omega, rate, place = place_poles(
-                lag_s, decay, 2 * math.pi / (SAMPLES_PER_PERIOD * _TICK_S)
-            )
-            axes[axis, [RATE, PLACE, LAG, BANDWIDTH]] = rate, place, lag_s, omega
-            axes[axis, INTEGRAL] = _integral(rate, place, omega, decay)
-            continue
-        omega, rate, place = place_poles(lag_s, decay, fastest_rad_s)
-        axes[axis, [RATE, PLACE]] = rate, place
-        axes[axis, INNER] = min(rate, 1.0 / (4.0 * lag_s)) if axis == SWAY else rate
-        axes[axis, FASTEST] = fastest = _steady_speed(plant.body, degree, STEADY_SHARE * weakest)
-        moving = np.zeros(6)
-        moving[degree] = fastest
-        max_decay = float(linear_damping(plant.body, moving)[degree, degree]) / inertia
-        if axis == YAW:
-            sampled_rad_s = 2 * math.pi * navigation_hz / MIN_SAMPLES_PER_PERIOD
-            bare = np.array([rate, place])
-            rate, place, damped = _damped_together(
-                plant.body, speed_mps, bare, lag_s, omega, max_decay, sampled_rad_s
-            )
-            _check_damped(vehicle, "yaw", damped, speed_mps)
-            axes[axis, [RATE, PLACE, INNER]] = rate, place, rate
-        axes[axis, INTEGRAL] = _integral(rate, place, omega, max_decay)
-        axes[axis, [LAG, BANDWIDTH]] = lag_s, omega
-        if rate > 0.0:
-            axes[axis, WEIGHT] = min(max((place / omega - decay) / rate, 0.0), 1.0)
-    axes[YAW, FASTEST] = min(axes[YAW, FASTEST], _MAX_TURN_RAD_S)
-    return Gains(plant.body, plant.fins, np.zeros(0), 0.0, axes)
-
-
-def _gains_of_fins(vehicle: Vehicle, speed_mps: float, navigation_hz: float) -> Gains:
-    """Gains for a vehicle that fins steer; as `gains_for`."""
-    plant, count = vehicle.plant, len(vehicle.thrusters)
-    if np.any(np.abs(vehicle.configuration_matrix[[2, 4]]) > _NO_FORCE):
+    plant, count, fins = vehicle.plant, len(vehicle.thrusters), bool(vehicle.fins)
+    if fins and np.any(np.abs(vehicle.configuration_matrix[[2, 4]]) > _NO_FORCE):
         raise VehicleError(
             f"{vehicle.name} has fins and thrusters that push it up or down, which are not "
             "controlled together: leave out the one or the other"
         )
     cruise = np.array([speed_mps, 0.0, 0.0, 0.0, 0.0, 0.0])
-    radius_m = min_radius_m(vehicle, speed_mps, STEADY_SHARE)
-    lower, upper = np.zeros(vehicle.actuators), np.zeros(vehicle.actuators)
-    thrust_limits(plant.propulsion, np.ones(count), cruise, lower, upper)
+    radius_m = min_radius_m(vehicle, speed_mps, STEADY_SHARE) if fins else 0.0
+    upper, matrix = np.zeros(vehicle.actuators), np.zeros((6, vehicle.actuators))
     upper[count:] = plant.fins.drives[:, MAX_RAD]
-    lower[count:] = -upper[count:]
-    matrix = np.zeros((6, vehicle.actuators))
+    lower = -upper
+    thrust_limits(plant.propulsion, np.ones(count), cruise, lower, upper)
     matrix[:, :count] = vehicle.configuration_matrix
     write_fin_matrix(plant.fins, cruise, matrix, count)
-    rolls = np.linalg.matrix_rank(matrix[3:, count:]) == 3
-    used = _BY_FINS if rolls else _BY_FINS[:-1]
+    rows = matrix[list(_DEGREE)]
+    if fins:
+        rolls = np.linalg.matrix_rank(matrix[3:, count:]) == 3
+        used = _BY_FINS if rolls else _BY_FINS[:-1]
+    else:
+        used = tuple(range(6 if _holds(rows, lower, upper) else STEERED))
+        rows = rows[list(used)]
     steers = matrix[[_DEGREE[axis] for axis in used]]
     slowness_s = np.array([
         *(thruster.time_constant_s for thruster in vehicle.thrusters),
         *(fin.time_constant_s for fin in vehicle.fins),
     ])  # fmt: skip
-    slope = linear_damping(plant.body, cruise) + fin_slope(plant.fins, cruise)
+    slope = linear_damping(plant.body, cruise)
+    if fins:
+        slope += fin_slope(plant.fins, cruise)
     gyradius_m = math.sqrt(vehicle.mass[5, 5] / vehicle.mass[1, 1])
-    slow_hz, quick_hz = navigation_hz, 1.0 / _TICK_S
     axes = np.zeros((6, 11))
     for row, axis in enumerate(used):
-        degree = _DEGREE[axis]
+        degree, levels = _DEGREE[axis], axis in (ROLL, PITCH)
         inertia = float(vehicle.mass[degree, degree])
         minimum, maximum = authority(steers, lower, upper, row)
         axes[axis, [MASS, MIN_FORCE, MAX_FORCE]] = inertia, minimum, maximum
         weakest = min(-minimum, maximum)
         if weakest < _NO_FORCE:
-            name = ("surge", "", "", "yaw", "roll", "pitch")[axis]
+            if axis == SWAY:
+                continue
             raise VehicleError(
-                f"thrusters and fins of {vehicle.name} cannot control {name} both ways at "
-                f"{speed_mps:g} m/s ({minimum:.2g} to {maximum:.2g}): it cannot fly a survey"
+                f"{vehicle.name} cannot control {_AXES[axis]} both ways at {speed_mps:g} m/s "
+                f"({minimum:.2g} to {maximum:.2g}): it cannot fly a survey"
             )
-        lag_s = effective_lag_s(matrix[list(_DEGREE)], lower, upper, slowness_s, axis, gyradius_m)
-        lag_s += _TICK_S / 2
+        lag_s = effective_lag_s(rows, lower, upper, slowness_s, axis, gyradius_m) + _TICK_S / 2
         decay = float(slope[degree, degree]) / inertia
-        known_hz = slow_hz if axis in (SURGE, YAW) else quick_hz
+        # Attitude and its rates are known at every tick.
+        known_hz = 1.0 / _TICK_S if levels else navigation_hz
         fastest_rad_s = 2 * math.pi * known_hz / SAMPLES_PER_PERIOD
-        if axis != SURGE:
+        if fins and axis != SURGE:
             fastest_rad_s = min(fastest_rad_s, math.sqrt(weakest / inertia / KEPT_RAD))
         omega, rate, place = place_poles(lag_s, decay, fastest_rad_s)
-        if axis in (YAW, PITCH):
-            plane = LATERAL if axis == YAW else VERTICAL
+        max_decay = max(decay, 0.0) if fins else decay
+        fastest = _steady_speed(plant.body, degree, STEADY_SHARE * weakest)
+        if fins and axis == PITCH:
+            fastest = min(fastest, STEADY_SHARE * weakest / slope[degree, degree])
+        elif not fins and not levels:
+            moving = np.zeros(6)
+            moving[degree] = fastest
+            max_decay = float(linear_damping(plant.body, moving)[degree, degree]) / inertia
+        if axis == YAW or (fins and axis == PITCH):
             rate, place, damped = _damped_together(
-                plant.body, speed_mps, np.array([rate, place]), lag_s, omega, max(decay, 0.0),
-                2 * math.pi * known_hz / MIN_SAMPLES_PER_PERIOD,
-                fins=plant.fins, plane=plane, slower=_SLOWER_BY_FINS,
+                plant.body, speed_mps, np.array([rate, place]), lag_s, omega, max_decay,
+                2 * math.pi * known_hz / MIN_SAMPLES_PER_PERIOD, fins=plant.fins,
+                plane=LATERAL if axis == YAW else VERTICAL,
+                slower=_SLOWER_BY_FINS if fins else _SLOWER,
             )  # fmt: skip
-            _check_damped(vehicle, "yaw" if axis == YAW else "pitch", damped, speed_mps)
-        axes[axis, [RATE, PLACE, INNER]] = rate, place, rate
-        axes[axis, INTEGRAL] = _integral(rate, place, omega, max(decay, 0.0))
-        axes[axis, [LAG, BANDWIDTH]] = lag_s, omega
-        if axis == PITCH:
-            held = _steady_speed(plant.body, degree, STEADY_SHARE * weakest)
-            axes[axis, FASTEST] = min(held, STEADY_SHARE * weakest / slope[degree, degree])
-        if axis == SURGE:
-            axes[axis, FASTEST] = _steady_speed(plant.body, degree, STEADY_SHARE * weakest)
-            if rate > 0.0:
-                axes[axis, WEIGHT] = min(max((place / omega - decay) / rate, 0.0), 1.0)
-    axes[YAW, FASTEST] = min(speed_mps / radius_m, _MAX_TURN_RAD_S)
-    level = balance_fins(vehicle, speed_mps)
+            _check_damped(vehicle, _AXES[axis], damped, speed_mps)
+        axes[axis, [RATE, PLACE, LAG, BANDWIDTH]] = rate, place, lag_s, omega
+        axes[axis, INTEGRAL] = _integral(rate, place, omega, max_decay)
+        if fins or not levels:
+            axes[axis, INNER] = min(rate, 1.0 / (4.0 * lag_s)) if axis == SWAY else rate
+            axes[axis, FASTEST] = fastest
+        if rate > 0.0 and (axis == SURGE or not (fins or levels)):
+            axes[axis, WEIGHT] = min(max((place / omega - decay) / rate, 0.0), 1.0)
+    if fins:
+        axes[YAW, FASTEST], axes[ROLL, FASTEST] = speed_mps / radius_m, 0.0
+    axes[YAW, FASTEST] = min(axes[YAW, FASTEST], _MAX_TURN_RAD_S)
+    level = balance_fins(vehicle, speed_mps) if fins else None
     level_rad = 0.0 if level is None else level.pitch_rad
     return Gains(plant.body, plant.fins, np.zeros(len(vehicle.fins)), level_rad, axes)
 

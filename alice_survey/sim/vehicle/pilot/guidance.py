@@ -27,9 +27,11 @@ from alice_survey.sim.vehicle.pilot.gains import (
     BANDWIDTH,
     HEAVE,
     INTEGRAL_SHARE,
+    LAG,
     MIN_FORCE,
     STEADY_SHARE,
     SURGE,
+    WEIGHT,
     Gains,
 )
 from alice_survey.sim.vehicle.pilot.memory import PilotState
@@ -45,7 +47,6 @@ from alice_survey.sim.vehicle.pilot.safety import (
     NO_NAVIGATION,
     NONE,
     mind_floor,
-    navigates,
     restart_watch,
     watch,
 )
@@ -53,12 +54,9 @@ from alice_survey.sim.vehicle.pilot.settings import Guidance, Tick, circle_cours
 from alice_survey.sim.vehicle.pilot.steering import (
     DEPTH_KEPT_M,
     HEADING_KEPT_RAD,
-    brake_for_stop,
     clamp,
     head_for,
     hear_floor,
-    hold_level,
-    leave_stop,
     sink_to,
     stand,
     stands,
@@ -250,7 +248,10 @@ def steer(
     report[slot.TARGET_SWAY] = report[slot.TARGET_SURGE] = 0.0
     if report[slot.PHASE] == slot.DONE:
         return
-    if not navigates(estimate):
+    known = 0.0
+    for i in range(vector.ALTITUDE):
+        known += estimate[i]
+    if not math.isfinite(known):
         report[slot.REASON] = NO_NAVIGATION
         _enter(pilot, slot.ABORT)
     if report[slot.REASON] == NO_NAVIGATION:
@@ -260,7 +261,25 @@ def steer(
 
     write_point(estimate, guidance, pilot)
     hear_floor(estimate, dt_s, guidance, pilot)
-    progress = _progress_m(estimate, path, mission, guidance, pilot)
+    # What should grow: of a mission the steps done, and less of this one left to go.
+    leg, point = int(report[slot.LEG]), pilot.point
+    if mission.law != NO_LAW:
+        step = mission.steps[leg]
+        left = math.hypot(
+            step[END_N] - point[slot.POINT_NORTH], step[END_E] - point[slot.POINT_EAST]
+        )
+        left += abs(report[slot.TARGET_DEPTH] - estimate[vector.DEPTH])
+        progress = _STEP_M * leg - left + pilot.memory[slot.HELD_S]
+    elif report[slot.PHASE] == slot.DIVE:
+        progress = -abs(_target_m(path, guidance, pilot) - estimate[vector.DEPTH])
+    elif report[slot.PHASE] == slot.APPROACH:
+        n, e, _ = _goal(path, guidance, pilot)
+        progress = -math.hypot(n - point[slot.POINT_NORTH], e - point[slot.POINT_EAST])
+    else:
+        progress = path.begins_m[leg] + report[slot.ALONG]
+        if path.turn_rad[leg] != 0.0:
+            # A radian of a turn on the spot counts as a metre.
+            progress += pilot.memory[slot.REF]
     reason = watch(time_s, dt_s, estimate, progress, guidance.limits, pilot)
     if reason != NONE:
         _abort(reason, estimate, pilot)
@@ -290,8 +309,7 @@ def steer(
             report[slot.AT_SURFACE] = 1.0
             if phase == slot.ASCEND:
                 report[slot.PHASE] = slot.DONE
-    write_wrench(gains, pilot, wrench)
-    hold_level(estimate, dt_s, gains, pilot, wrench)
+    write_wrench(estimate, dt_s, gains, pilot, wrench)
     if guidance.sway == 0.0 or (mission.law == COLA2 and pilot.memory[slot.KEEPS] == 0.0):
         wrench[1] = 0.0
 
@@ -347,31 +365,6 @@ def _goal(path: Path, guidance: Guidance, pilot: PilotState) -> tuple[float, flo
 
 
 @kernel
-def _progress_m(
-    estimate: Array, path: Path, mission: PilotMission, guidance: Guidance, pilot: PilotState
-) -> float:
-    """Quantity that should grow: of a mission the steps done, and less of this one left to go."""
-    phase, leg, point = pilot.report[slot.PHASE], int(pilot.report[slot.LEG]), pilot.point
-    if mission.law != NO_LAW:
-        step = mission.steps[leg]
-        left = math.hypot(
-            step[END_N] - point[slot.POINT_NORTH], step[END_E] - point[slot.POINT_EAST]
-        )
-        left += abs(pilot.report[slot.TARGET_DEPTH] - estimate[vector.DEPTH])
-        return float(_STEP_M * leg - left + pilot.memory[slot.HELD_S])
-    if phase == slot.DIVE:
-        return float(-abs(_target_m(path, guidance, pilot) - estimate[vector.DEPTH]))
-    if phase == slot.APPROACH:
-        n, e, _ = _goal(path, guidance, pilot)
-        return float(-math.hypot(n - point[slot.POINT_NORTH], e - point[slot.POINT_EAST]))
-    progress = path.begins_m[leg] + pilot.report[slot.ALONG]
-    if path.turn_rad[leg] != 0.0:
-        # A radian of a turn on the spot counts as a metre.
-        progress += pilot.memory[slot.REF]
-    return float(progress)
-
-
-@kernel
 def _on_the_way(tick: Tick) -> None:
     """Dive or approach for a tick."""
     dt_s, estimate, path, guidance, _gains, pilot = tick
@@ -422,7 +415,7 @@ def _on_the_way(tick: Tick) -> None:
 @kernel
 def _on_path(tick: Tick) -> None:
     """Follow the path for a tick."""
-    dt_s, estimate, path, guidance, _gains, pilot = tick
+    dt_s, estimate, path, guidance, gains, pilot = tick
     memory, report, point = pilot.memory, pilot.report, pilot.point
     leg, along, over = int(report[slot.LEG]), report[slot.ALONG], False
     if memory[slot.STANDING] == 0.0 and stands(path, leg):
@@ -436,14 +429,32 @@ def _on_path(tick: Tick) -> None:
             point[slot.POINT_EAST],
             _QUICKEST * path.speed_mps * dt_s,
         )
-        heading = estimate[vector.HEADING]
-        brake_for_stop(leg, along, heading, tick)
+        speed, lag_s = max(point[slot.SURGE_SPEED], 0.0), gains.axes[SURGE, LAG]
+        braking = speed * speed / (2.0 * guidance.stop_mps2) + speed * lag_s
+        if path.stop[leg] > 0.0 and path.length_m[leg] - along <= braking:
+            # The reference starts where the vehicle is, as fast as it is. The integral of the speed
+            # loop holds the share of the speed that its proportional part does not see (gains.py),
+            # and what the current takes; only this is passed on to the place's.
+            held = memory[slot.SURGE_SUM] - (1.0 - gains.axes[SURGE, WEIGHT]) * speed
+            memory[slot.PLACE_SUM_N] = held * math.cos(estimate[vector.HEADING])
+            memory[slot.PLACE_SUM_E] = held * math.sin(estimate[vector.HEADING])
+            start_standing(along, speed, pilot)
+            memory[slot.RAMP] += lag_s * speed
     target = _minded_m(tick)
     sink_to(target, memory[slot.FLOOR_SLOPE], tick)
     if memory[slot.STANDING] == 0.0:
         follow(leg, along, tick)
     elif stand(leg, tick):
-        over = leave_stop(path, estimate[vector.HEADING], pilot)
+        over = leg + 1 == path.length_m.shape[0]
+        if not over:
+            report[slot.LEG], report[slot.ALONG] = leg + 1, 0.0
+            start_standing(0.0, 0.0, pilot)
+            if not stands(path, leg + 1):
+                memory[slot.STANDING], heading = 0.0, estimate[vector.HEADING]
+                memory[slot.SURGE_SUM] = memory[slot.PLACE_SUM_N] * math.cos(heading) + memory[
+                    slot.PLACE_SUM_E
+                ] * math.sin(heading)
+            restart_watch(pilot)
     if over:
         _enter(pilot, slot.ASCEND)
     elif abs(report[slot.CROSS]) > guidance.lost_m:

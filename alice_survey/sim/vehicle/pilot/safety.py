@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from alice_survey.core.compiled import kernel
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.estimate_vector import ALTITUDE, CLEARANCE, DEPTH, ESTIMATE, PITCH
+from alice_survey.sim.vehicle.estimate_vector import ALTITUDE, CLEARANCE, DEPTH, PITCH
 from alice_survey.sim.vehicle.pilot import memory as slot
 from alice_survey.sim.vehicle.pilot.memory import PilotState
 
@@ -69,24 +69,6 @@ class SafetyLimits(NamedTuple):
 
 
 @kernel
-def navigates(estimate: Array) -> bool:
-    """Whether the navigation gives all required values: all but altitude and clearance."""
-    total = 0.0
-    for i in range(ESTIMATE):
-        if i != ALTITUDE and i != CLEARANCE:
-            total += estimate[i]
-    return math.isfinite(total)
-
-
-@kernel
-def _goes_on_blind(limits: SafetyLimits, pilot: PilotState) -> bool:
-    """Whether the vehicle goes on without bottom lock: it knows well enough where it is."""
-    return bool(
-        0.0 <= pilot.memory[slot.SIGMA_M] <= limits.blind_sigma_m and limits.blind_sigma_m > 0.0
-    )
-
-
-@kernel
 def mind_floor(depth_m: float, estimate: Array, limits: SafetyLimits, pilot: PilotState) -> float:
     """Keep clear of the sea floor: slow down, and climb.
 
@@ -106,10 +88,9 @@ def mind_floor(depth_m: float, estimate: Array, limits: SafetyLimits, pilot: Pil
     memory, minimum = pilot.memory, limits.min_altitude_m
     clear = min(estimate[ALTITUDE], estimate[CLEARANCE])
     if not math.isfinite(clear):
-        if _goes_on_blind(limits, pilot):
-            memory[slot.PACE] = 1.0
-        else:
-            memory[slot.PACE] = max(0.0, 1.0 - memory[slot.LOST_S] / _STOP_S)
+        memory[slot.PACE] = max(0.0, 1.0 - memory[slot.LOST_S] / _STOP_S)
+        if limits.blind_sigma_m > 0.0 and 0.0 <= memory[slot.SIGMA_M] <= limits.blind_sigma_m:
+            memory[slot.PACE] = 1.0  # it knows well enough where it is
         return depth_m
     spare = clear - _KEPT * minimum
     memory[slot.PACE] = min(max((clear / minimum - 1.0) / (_KEPT - 1.0), 0.0), 1.0)
@@ -163,7 +144,8 @@ def watch(
         return TOO_STEEP
     if estimate[DEPTH] > limits.max_depth_m:
         return TOO_DEEP
-    if memory[slot.LOST_S] > limits.lost_bottom_s and not _goes_on_blind(limits, pilot):
+    blind = limits.blind_sigma_m > 0.0 and 0.0 <= memory[slot.SIGMA_M] <= limits.blind_sigma_m
+    if memory[slot.LOST_S] > limits.lost_bottom_s and not blind:
         return NO_BOTTOM
     if memory[slot.SINCE_BEST_S] > limits.stuck_s:
         if phase == slot.DIVE:

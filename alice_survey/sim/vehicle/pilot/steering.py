@@ -146,13 +146,21 @@ def speed_demand(
 
 
 @kernel
-def write_wrench(gains: Gains, pilot: PilotState, wrench: Array) -> None:
+def write_wrench(
+    estimate: Array, dt_s: float, gains: Gains, pilot: PilotState, wrench: Array
+) -> None:
     """Turn the demand into a wrench, and note where it is cut.
 
+    Moments that hold roll level and pitch as demanded, where thrusters or fins can, are a PID and
+    computed torque: what the motion and the centre of gravity do at level attitude. What gravity
+    rights by itself comes on top.
+
     Args:
+        estimate: (14,) of the navigation.
+        dt_s: the tick.
         gains: the vehicle.
         pilot: its demand is read, and the notes are written into it.
-        wrench: (6,) N and N m is written; of roll and pitch see `hold_level`.
+        wrench: (6,) N and N m is written.
     """
     body, demand, motion, force = gains.body, pilot.demand, pilot.motion, pilot.force
     for i in range(6):
@@ -174,20 +182,6 @@ def write_wrench(gains: Gains, pilot: PilotState, wrench: Array) -> None:
             1.0 if asked > maximum else (-1.0 if asked < minimum else 0.0)
         )
         wrench[i] = min(max(asked, minimum), maximum)
-
-
-@kernel
-def hold_level(
-    estimate: Array, dt_s: float, gains: Gains, pilot: PilotState, wrench: Array
-) -> None:
-    """Add the moments that hold roll level and pitch as target, where thrusters or fins can.
-
-    PID and computed torque.
-
-    The computed part is what the target motion and the centre of gravity do at level attitude,
-    which is why `write_wrench` comes first. What gravity rights by itself comes on top.
-    """
-    body = gains.body
     for axis in (ROLL, PITCH):
         row = gains.axes[axis]
         if row[MASS] == 0.0:
@@ -406,29 +400,6 @@ def stands(path: Path, leg: int) -> bool:
 
 
 @kernel
-def brake_for_stop(leg: int, along_m: float, heading_rad: float, tick: Tick) -> None:
-    """Begin to brake, as soon as the stop at the leg's end is that near.
-
-    The reference starts where the vehicle is, as fast as it is. The integral of the speed loop
-    holds the share of the speed that its proportional part does not see (gains.py), and what the
-    current takes; only this is passed on to the place's.
-    """
-    _dt_s, _estimate, path, guidance, gains, pilot = tick
-    if path.stop[leg] == 0.0:
-        return
-    memory, lag_s = pilot.memory, gains.axes[SURGE, LAG]
-    speed = max(pilot.point[slot.SURGE_SPEED], 0.0)
-    braking = speed * speed / (2.0 * guidance.stop_mps2) + speed * lag_s
-    if not path.length_m[leg] - along_m <= braking:
-        return
-    held = memory[slot.SURGE_SUM] - (1.0 - gains.axes[SURGE, WEIGHT]) * speed
-    memory[slot.PLACE_SUM_N] = held * math.cos(heading_rad)
-    memory[slot.PLACE_SUM_E] = held * math.sin(heading_rad)
-    start_standing(along_m, speed, pilot)
-    memory[slot.RAMP] += lag_s * speed
-
-
-@kernel
 def start_standing(at: float, speed: float, pilot: PilotState) -> None:
     """Let a reference begin at a place or heading, at a speed."""
     memory = pilot.memory
@@ -609,24 +580,3 @@ def keep_place(target: StopReference, tick: Tick) -> tuple[float, float]:
         sway_by(-abeam, target.speed_mps * sine, tick)
         demand[slot.ACC_SWAY] += target.quicken_mps2 * sine
     return ahead, abeam
-
-
-@kernel
-def leave_stop(path: Path, heading_rad: float, pilot: PilotState) -> bool:
-    """Go on to the next leg.
-
-    Returns:
-        Whether there is none: the path is over.
-    """
-    memory, report = pilot.memory, pilot.report
-    following = int(report[slot.LEG]) + 1
-    if following == path.length_m.shape[0]:
-        return True
-    report[slot.LEG], report[slot.ALONG] = following, 0.0
-    start_standing(0.0, 0.0, pilot)
-    if not stands(path, following):
-        memory[slot.STANDING] = 0.0
-        north, east = memory[slot.PLACE_SUM_N], memory[slot.PLACE_SUM_E]
-        memory[slot.SURGE_SUM] = north * math.cos(heading_rad) + east * math.sin(heading_rad)
-    restart_watch(pilot)
-    return False

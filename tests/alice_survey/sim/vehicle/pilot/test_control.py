@@ -23,7 +23,7 @@ DEMANDS = arrays(np.float64, 8, elements=st.floats(-0.6, 0.6))
 def test_wrench_is_that_of_the_matrices(name: str, demand: Array) -> None:
     gains, pilot, wrench = gains_of(name), new_pilot(), np.full(6, 9.0)
     pilot.demand[:8] = demand
-    steering.write_wrench(gains, pilot, wrench)
+    steering.write_wrench(np.zeros(14), 0.05, gains, pilot, wrench)
     np.testing.assert_allclose(wrench, oracle.wrench(gains, demand), atol=1e-9)
     # Roll and pitch are not requested, nor sway where nothing gives it.
     assert wrench[3] == wrench[4] == 0.0
@@ -35,7 +35,7 @@ def test_wrench_is_that_of_the_matrices(name: str, demand: Array) -> None:
 def test_saturated_axes_are_flagged(demand: Array) -> None:
     gains, pilot, wrench = gains_of("alice"), new_pilot(), np.zeros(6)
     pilot.demand[:8] = demand * np.array([1, 1, 1, 1, 5, 5, 5, 20])
-    steering.write_wrench(gains, pilot, wrench)
+    steering.write_wrench(np.zeros(14), 0.05, gains, pilot, wrench)
     for axis, degree in enumerate(g.DEGREES):
         full = pilot.demand[slot.FULL_SURGE + axis]
         ends = gains.axes[axis, [g.MIN_FORCE, g.MAX_FORCE]]
