@@ -25,13 +25,3 @@ def integrated(vehicle: Vehicle, start: Array, rps: Array, at_s: Array, load: Ar
     state = np.concatenate([np.zeros(3), start, rps])
     solved = solve_ivp(rate, (at_s[0], at_s[-1]), state, t_eval=at_s, rtol=1e-11, atol=1e-12)
     return solved.y.T[:, 3:13]
-
-
-def numpy_observation(state: Array, current_ne: Array, bias: Array, attitude: Array) -> Array:
-    """What sensors measure of a state (10,): velocity over ground, rates, attitude error."""
-    from scipy.spatial.transform import Rotation
-
-    ned_from_body = Rotation.from_quat(state[:4])
-    ground = state[4:7] + ned_from_body.inv().apply([*current_ne, 0.0])
-    turn = Rotation.from_quat(attitude).inv() * ned_from_body
-    return np.concatenate([ground + bias[:3], state[7:] + bias[3:], turn.as_rotvec()])

@@ -19,7 +19,6 @@ from alice_survey.core.executor import SERIAL, local_executor
 from alice_survey.core.frames import interpolate_poses, rotation_from_attitude
 from alice_survey.core.manifest import read_manifest
 from alice_survey.core.trajectory import Trajectory, read_track, write_track
-from alice_survey.sim.seafloor.renderer import render
 from camera_calib.rig import read_rig
 from missions.acquire import run as imaging
 from tests.missions.flown_plans import plan_of, walk
@@ -162,63 +161,7 @@ def test_two_processes_give_the_same_bytes_as_one(survey: Path, tmp_path: Path) 
     assert content(tmp_path / "images") == content(survey / "images")
 
 
-def test_an_interrupted_run_goes_on_and_ends_the_same(
-    survey: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    fly(tmp_path)
-    taken: list[Any] = []
-
-    def dies_at_the_fourth(*args: Any) -> Any:
-        if len(taken) == 3:
-            raise KeyboardInterrupt
-        taken.append(args)
-        return render(*args)
-
-    monkeypatch.setattr(imaging, "render", dies_at_the_fourth)
-    with pytest.raises(KeyboardInterrupt):
-        spec("image").make(tmp_path, settings(), SERIAL)
-    assert not (tmp_path / "images").exists()
-    left = sorted((tmp_path / "images.partial").glob("*/*.png"))
-    assert len(left) == 3
-    before = {path.relative_to(path.parents[1]): path.stat().st_mtime_ns for path in left}
-
-    again: list[Any] = []
-    monkeypatch.setattr(imaging, "render", lambda *args: again.append(args) or render(*args))
-    assert spec("image").make(tmp_path, settings(), SERIAL)
-    assert len(again) == 3
-    kept = {path: (tmp_path / "images" / path).stat().st_mtime_ns for path in before}
-    assert kept == before
-    assert content(tmp_path / "images") == content(survey / "images")
-
-
 def test_a_flight_that_ends_before_its_triggers_is_refused(tmp_path: Path) -> None:
     fly(tmp_path, until_s=5.0)
     with pytest.raises(NavigationError, match=r"4\.90 s.* 6\.50"):
         spec("image").make(tmp_path, settings(), SERIAL)
-
-
-def test_the_pool_is_the_same_with_any_number_of_processes(tmp_path: Path) -> None:
-    one, two = tmp_path / "one", tmp_path / "two"
-    config = settings()
-    assert spec("pool").make(one, config, SERIAL)
-    assert spec("pool").make(two, config, local_executor(2))
-    assert content(one / "pool") == content(two / "pool")
-    assert not spec("pool").make(one, config, SERIAL)
-    records = read_manifest(one / "pool" / "manifest.csv")
-    assert len(records) == 16
-    assert records[3].image == "right/01.png"
-    board = json.loads((one / "pool" / "board.json").read_text())
-    assert set(board) == {"columns", "rows", "square_m"}
-    boards = json.loads((one / "pool" / "truth" / "boards.json").read_text())["cam_from_board"]
-    assert [view["station"] for view in boards] == list(range(8))
-    rig = read_rig(one / "pool" / "truth" / "rig.json")
-    for view in boards:
-        left, right = (
-            RigidTransform.from_components(
-                view[name]["translation_m"], Rotation.from_quat(view[name]["quaternion_xyzw"])
-            )
-            for name in ("left", "right")
-        )
-        np.testing.assert_allclose(
-            (right * left.inv()).as_matrix(), rig.cam_from_rig["right"].as_matrix(), atol=1e-9
-        )

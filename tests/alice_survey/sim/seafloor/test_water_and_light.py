@@ -1,4 +1,3 @@
-from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -8,7 +7,7 @@ from scipy.integrate import quad
 from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.core.config import ImagingConfig, Jerlov
+from alice_survey.core.config import ImagingConfig
 from alice_survey.core.frames import BODY_FROM_NADIR_CAM
 from alice_survey.sim.seafloor.light import (
     LUMENS_PER_WATT,
@@ -29,7 +28,6 @@ from camera_calib.water import (
 from tests.cameras import flat_port_camera
 from tests.oracles_seafloor import direct_light
 
-CLEAR_TO_TURBID: Sequence[Jerlov] = ("I", "II", "III", "1C", "3C", "5C", "7C", "9C")
 DOWN = np.array([0.0, 0.0, 1.0])
 UP = -DOWN
 NO_LOSS = np.zeros(3)
@@ -47,13 +45,6 @@ def irradiance(
         0.0, 0.0, 0.0, UP, path_m, np.ones(1), strobe, DOWN, 1.0, 5.0, attenuation, out
     )  # fmt: skip
     return out
-
-
-@settings(deadline=None)
-@given(near=st.floats(0.3, 5.0), factor=st.floats(1.1, 5.0))
-def test_light_falls_with_the_square_of_the_distance(near: float, factor: float) -> None:
-    np.testing.assert_allclose(irradiance(near), irradiance(near * factor) * factor**2, rtol=1e-9)
-    np.testing.assert_allclose(irradiance(near), 5.0 / near**2, rtol=1e-12)
 
 
 @settings(deadline=None)
@@ -84,16 +75,6 @@ def test_direct_light_is_that_of_its_slow_twin(
     add_direct(*point, normal, path, np.ones(2), strobes, DOWN, beam, 3.0, attenuation, out)
     twin = direct_light(np.array(point), normal, path, strobes, DOWN, profile, 3.0, attenuation)
     np.testing.assert_allclose(out, twin, rtol=1e-12)
-
-
-def test_a_surface_that_faces_away_or_is_in_shadow_is_dark() -> None:
-    for normal, lit in ((DOWN, 1.0), (UP, 0.0)):
-        out = np.zeros(3)
-        strobe = np.array([[0.0, 0.0, -2.0]])
-        add_direct(
-            0.0, 0.0, 0.0, normal, 0.0, np.array([lit]), strobe, DOWN, 1.0, 1.0, NO_LOSS, out
-        )
-        assert np.all(out == 0.0)
 
 
 @pytest.mark.parametrize("half_angle_deg", [15.0, 45.0, 60.0, 80.0])

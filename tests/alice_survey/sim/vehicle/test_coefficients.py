@@ -5,8 +5,6 @@ import pytest
 
 from alice_survey.core.errors import VehicleError
 from alice_survey.sim.vehicle.coefficients import Coefficients
-from alice_survey.sim.vehicle.files import SETS
-from tests.alice_survey.sim.vehicle.motions import alice
 
 
 def named(**values: float) -> Coefficients:
@@ -47,20 +45,6 @@ def test_replacing_an_added_mass_drops_its_mirror() -> None:
     assert dict(after.values) == {"N_vdot": -2.5, "X_uu": -15.0, "K_vdot": -0.2}
     assert after.added_mass[1, 5] == 2.5
     assert before.added_mass[1, 5] == 8.5  # the old set is as it was
-
-
-@pytest.mark.parametrize("coefficients", SETS)
-def test_signs_of_the_papers_sets(coefficients: str) -> None:
-    """Diagonals resist; the nose and the stern are alike in sway and heave but for the mast."""
-    kinds = alice(coefficients).coefficients
-    assert np.all(np.diag(kinds.quadratic) < 0)
-    assert np.all(np.diag(kinds.added_mass) > 0)
-    np.testing.assert_array_equal(kinds.added_mass, kinds.added_mass.T)
-    y_uv, z_uw, m_uw, n_uv = kinds.lift
-    assert y_uv < 0 and z_uw < 0
-    assert m_uw == -n_uv < 0  # both turn the bow into the drift
-    # Mirror image of yaw-sway in pitch-heave: M_wdot has the other sign than N_vdot.
-    assert kinds.added_mass[4, 2] < 0 < kinds.added_mass[5, 1]
 
 
 def test_damping_may_differ_by_the_way_of_the_motion() -> None:

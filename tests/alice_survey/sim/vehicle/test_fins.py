@@ -14,13 +14,10 @@ from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.fins import Fin, add_fins, fin_slope, pack_fins, write_fin_matrix
 from tests import oracles_dynamics as oracle
 from tests.alice_survey.sim.vehicle.motions import (
-    SHEAR_AND_TIDE,
     advance,
     rates,
-    rotations,
     state_of,
 )
-from tests.alice_survey.sim.vehicle.test_dynamics_motion import thrust_of_all_laws
 
 Array = NDArray[np.float64]
 REMUS = vehicle_from("remus100")
@@ -47,21 +44,6 @@ def test_lift_of_a_plane_at_a_small_angle() -> None:
     assert force[0] == pytest.approx(-drag, rel=1e-4)
     assert force[1] == 0.0
     np.testing.assert_allclose(force[3:], np.cross([-0.6, 0.1, 0.02], force[:3]), atol=1e-12)
-
-
-def test_a_fin_square_to_the_flow_is_a_plate() -> None:
-    force = wrench(PLANE, 0.0, np.array([0, 0, 1.5, 0, 0, 0]))
-    assert force[2] == pytest.approx(-0.5 * 1000 * 0.01 * 1.5**2 * (0.56 + 0.01))
-    assert abs(force[0]) < 1e-12
-
-
-def test_lift_rises_to_the_stall_and_falls_smoothly_beyond() -> None:
-    alpha = np.radians(np.linspace(-180.0, 180.0, 3601))
-    lift = np.array([-wrench(PLANE, a, np.array([1.0, 0, 0, 0, 0, 0]))[2] for a in alpha]) / 5.0
-    assert np.degrees(abs(alpha[np.argmax(lift)])) == pytest.approx(21.0, abs=2.0)
-    assert 0.9 < lift.max() < 1.2
-    assert np.abs(np.diff(lift)).max() < 0.025
-    np.testing.assert_allclose(lift, -lift[::-1], atol=1e-12)
 
 
 def _triple(place: Array) -> tuple[float, float, float]:
@@ -93,14 +75,6 @@ def test_the_wrench_is_that_of_vectors_in_space(
     add_fins(vehicle.plant.fins, np.array(angles), np.array(nu), force)
     expected = oracle.fin_wrench(vehicle, np.array(angles), np.array(nu))
     np.testing.assert_allclose(force, expected, atol=1e-10 * (1.0 + np.abs(expected).max()))
-
-
-@settings(max_examples=40, deadline=None)
-@given(nu=st.tuples(*[SPEEDS] * 6))
-def test_fins_that_are_not_turned_take_energy_out(nu: tuple[float, ...]) -> None:
-    force, motion = np.zeros(6), np.array(nu)
-    add_fins(REMUS.plant.fins, np.zeros(2), motion, force)
-    assert force @ motion <= 1e-12
 
 
 def test_the_matrix_of_fins_is_the_slope_of_their_wrench() -> None:
@@ -146,34 +120,3 @@ def test_a_drive_lags_and_is_limited_in_rate_and_angle() -> None:
     )
     np.testing.assert_allclose(angles[:, 0], expected, atol=0.05)
     np.testing.assert_allclose(angles[:, 1], -(1.0 - np.exp(-time_s / 0.1)), atol=1e-3)
-
-
-def test_runge_kutta_agrees_with_an_adaptive_method() -> None:
-    """Propeller and fins at work, moved at will every 2 s, in a current that changes with depth and
-    time. Positions in m, attitudes in rad, velocities in m/s and rad/s. The rate limit of the
-    drives, and the stall, have kinks: the error hangs on how steps fall about them."""
-    rng = np.random.default_rng(5)
-    times = np.arange(0.0, 21.0, 2.0)
-    commands = rng.uniform(-1, 1, (len(times) - 1, 3)) * np.array([6.0, 0.2, 0.25])
-    commands[:, 0] += 9.0
-    loads = np.zeros((len(times) - 1, 6))
-    nu, attitude = np.array([1.0, 0.05, -0.04, 0.05, -0.03, 0.1]), (0.1, -0.05, 0.7)
-    start = np.array([0.0, 0.0, 5.0, *attitude])
-    at_rest = np.zeros(REMUS.actuators)
-    eta, velocity, actuators = oracle.integrate(
-        REMUS, SHEAR_AND_TIDE, start, nu, at_rest, times, commands, loads, thrust_of_all_laws
-    )
-    assert np.all(np.ptp(velocity, axis=0) > 0.05)
-    rows = [state_of(REMUS, nu, attitude)]
-    for i, time_s in enumerate(times[:-1]):
-        state = advance(REMUS, rows[-1], 2.0, 0.01, loads[i], SHEAR_AND_TIDE, time_s, commands[i])
-        rows.append(state[-1])
-    states = np.array(rows)
-    truth = Rotation.from_matrix([oracle.ned_from_body(row[3:]) for row in eta])
-    errors = (
-        np.abs(states[:, :3] - eta[:, :3]).max(),
-        (rotations(states).inv() * truth).magnitude().max(),
-        np.abs(states[:, 7:13] - velocity).max(),
-        np.abs(states[:, 13:] - actuators).max(),
-    )
-    assert 1e-7 < max(errors) < 1e-4

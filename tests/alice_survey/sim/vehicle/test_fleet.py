@@ -6,20 +6,11 @@ import pytest
 from alice_survey.core.errors import VehicleError
 from alice_survey.sim.vehicle import files
 from alice_survey.sim.vehicle.files import SETS, vehicle_from
-from alice_survey.sim.vehicle.sea import GRAVITY
 from tests.oracles_shape import ALICE, SPARUS2
 
 NAMES = ("alice", "sparus2")
 GEOMETRIES = {shape.name: shape for shape in (ALICE, SPARUS2)}
 STARBOARD, PORT, VERTICAL, BOW, STERN = range(5)
-
-
-@pytest.mark.parametrize("coefficients", SETS)
-@pytest.mark.parametrize("name", NAMES)
-def test_inertia_is_symmetric_and_positive_definite(name: str, coefficients: str) -> None:
-    mass = vehicle_from(name, coefficients).mass
-    np.testing.assert_array_equal(mass, mass.T)
-    assert 0.5 < np.linalg.eigvalsh(mass)[0] < 1.0  # roll
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -32,18 +23,6 @@ def test_the_water_inside_counts_once_with_every_set(name: str) -> None:
     geometry = GEOMETRIES[name]
     envelope = vehicle_from(name).density_kg_m3 * geometry.envelope_volume_m3
     assert bodies[0].entrained_kg + bodies[0].buoyancy_kg == pytest.approx(envelope)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_it_is_trimmed_level_and_floats_up_slowly(name: str) -> None:
-    """Weight right below buoyancy; 0.1 kg of net buoyancy, which the vertical thruster holds."""
-    vehicle = vehicle_from(name)
-    body, plant = vehicle.rigid_body, vehicle.plant.body
-    assert body.cg_body_m[:2] == (0.0, 0.0) and 0.02 <= body.cg_body_m[2] <= 0.04
-    net = plant.buoyancy_n - plant.weight_n
-    assert net == pytest.approx(0.1 * GRAVITY, rel=1e-9)
-    heave = vehicle.thrusters[VERTICAL]
-    assert net < 0.05 * vehicle.density_kg_m3 * heave.diameter_m**4 * heave.kt_forward * 50.0**2
 
 
 def test_thrust_turns_and_rolls_as_by_hand() -> None:

@@ -65,32 +65,10 @@ def test_attitude_reads_from_angles_and_from_quaternions(tmp_path: Path) -> None
     )
 
 
-def test_rows_of_one_time_are_merged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = written(tmp_path, "time_s,u_mps,r_rad_s\n0,0.1,\n1,0.2,\n1,,0.5\n1,0.3,\n2,0.4,0.6\n")
-    log = read_vehicle_log(path)
-    assert log.time_s.tolist() == [0, 1, 2]
-    assert log.velocity_body[:, 0].tolist() == [0.1, 0.3, 0.4]
-    assert log.rates_body[1:, 2].tolist() == [0.5, 0.6]
-    assert "row 3" in capsys.readouterr().err
-
-
 def test_segments_split_at_gaps_and_hold_every_row() -> None:
     time_s = np.concatenate([np.arange(30) * 0.1, 10 + np.arange(20) * 0.1, [20.0]])
     parts = segments(vehicle_log(time_s))
     assert [(p.start, p.stop) for p in parts] == [(0, 30), (30, 50), (50, 51)]
-
-
-def test_other_columns_are_carried_along(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = written(tmp_path, "time_s,power_port_w,mode,u_mp\n0,12.5,dive,1\n1,13,dive,2\n")
-    log = read_vehicle_log(path)
-    assert log.others["power_port_w"].tolist() == [12.5, 13.0]
-    warned = capsys.readouterr().err
-    assert ": mode" in warned
-    assert "u_mps?" in warned
-    write_vehicle_log(path, log)
-    assert read_vehicle_log(path).others["power_port_w"].tolist() == [12.5, 13.0]
 
 
 @pytest.mark.parametrize(

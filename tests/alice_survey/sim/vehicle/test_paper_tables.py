@@ -9,7 +9,6 @@ import pytest
 from typer.testing import CliRunner
 
 from alice_survey.app.cli.main import app
-from alice_survey.core.errors import AliceError
 from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.paper_tables import (
     CALIBRATED,
@@ -89,10 +88,3 @@ def test_the_command_prints_and_writes_every_row(tmp_path: Path) -> None:
     _, values = coefficients_report(plot=picture)
     assert values["counts"] == {"reproduced": 7, "near": 12, "no": 39}
     assert picture.read_bytes() == first
-
-
-@pytest.mark.parametrize(("option", "name"), [("plot", "picture.bmp"), ("csv", "folder")])
-def test_files_that_cannot_be_written_are_refused(tmp_path: Path, option: str, name: str) -> None:
-    (tmp_path / "folder").mkdir()
-    with pytest.raises(AliceError, match=name):
-        coefficients_report(**{option: tmp_path / name})

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from alice_survey.core.errors import VehicleError
 from alice_survey.sim.vehicle import propulsion as kernels
 from alice_survey.sim.vehicle.files import vehicle_from
-from alice_survey.sim.vehicle.propulsion import Thruster, pack, with_health
+from alice_survey.sim.vehicle.propulsion import Thruster, pack
 from tests import oracles_propulsion as oracles
 from tests.oracles_propulsion import Array
 
@@ -71,18 +71,6 @@ def test_signs_at_rest(thruster: Thruster, signs: list[int]) -> None:
     np.testing.assert_array_equal(np.sign(wrench_of((thruster,), [-10.0])), -np.array(signs))
 
 
-def test_the_pair_rolls_the_vehicle_only_when_its_propellers_work_against_each_other() -> None:
-    together = wrench_of((STARBOARD, PORT), [20.0, 20.0])
-    against = wrench_of((STARBOARD, PORT), [20.0, -20.0])
-    torque = DENSITY * 0.08**5 * 400.0
-    np.testing.assert_allclose(together[3:], 0.0, atol=1e-12)
-    assert against[3] == pytest.approx(torque * (STARBOARD.kq_forward + PORT.kq_reverse))
-    # Astern is weaker: the paper's unexplained surge in turns.
-    kept = 1 - STARBOARD.thrust_deduction
-    assert against[0] == pytest.approx(kept * DENSITY * 0.08**4 * 400.0 * (0.698 - 0.293))
-    assert against[5] < 0
-
-
 def test_bollard_thrust_is_the_published() -> None:
     """Of the T200 at 16 V and 3387 rpm, and of SPARUS II at 50 rev/s before the hull takes its."""
     assert thrust_of(BOW, 3387 / 60) == pytest.approx(51.4, rel=0.01)
@@ -91,14 +79,6 @@ def test_bollard_thrust_is_the_published() -> None:
     assert thrust_of(whole, -50.0) == pytest.approx(-30.0, rel=0.03)
     assert thrust_of(VERTICAL, 50.0) == pytest.approx(55.0, rel=0.03)
     assert thrust_of(VERTICAL, -50.0) == pytest.approx(-28.5, rel=0.03)
-
-
-@pytest.mark.parametrize(("n", "u"), [(20.0, 1.0), (20.0, -1.0), (-20.0, 1.0), (-20.0, -1.0)])
-def test_water_along_the_axis_takes_the_same_off_whichever_way_it_turns(n: float, u: float) -> None:
-    still, moving = thrust_of(PORT, n), thrust_of(PORT, n, np.array([u, 0, 0, 0, 0, 0]))
-    kept, inflow = 1 - PORT.thrust_deduction, (1 - PORT.wake_fraction) * u
-    loss = kept * DENSITY * 0.08**3 * PORT.advance_slope * 20.0 * inflow
-    assert moving == pytest.approx(still - loss, rel=1e-12)
 
 
 def test_the_jet_loss_is_c_at_the_jets_own_speed() -> None:
@@ -113,17 +93,6 @@ def test_the_jet_loss_is_c_at_the_jets_own_speed() -> None:
 
 def drag_of(n: float, u: float) -> float:
     return -float(wrench_of((BOW,), [n], np.array([u, 0, 0, 0, 0, 0]))[0])
-
-
-def test_a_jet_drags_against_the_way_and_not_at_all_when_the_thruster_stops() -> None:
-    assert drag_of(20.0, 0.5) == -drag_of(20.0, -0.5) > 0
-    assert drag_of(-20.0, 0.5) > 0
-    assert drag_of(0.0, 0.5) == 0.0
-    assert drag_of(20.0, 0.0) == 0.0
-    falling = [drag_of(n, 0.5) for n in (50.0, 20.0, 5.0, 1.0, 0.1)]
-    assert falling == sorted(falling, reverse=True)
-    # No step where it starts: all slopes vanish.
-    assert drag_of(0.05, 0.5) < 1e-6 * drag_of(20.0, 0.5)
 
 
 def test_jet_drag_is_that_of_delphin2() -> None:
@@ -152,51 +121,6 @@ def test_speeds_give_the_thrust_they_were_found_for(nu: Array, share: Array) -> 
     asked = np.abs(wanted) > 1e-9
     np.testing.assert_array_equal(np.sign(rps)[asked], np.sign(wanted)[asked])
     assert np.all(np.abs(rps) <= PACKED.table[:, kernels.MAX_RPS] * (1 + 1e-9))
-
-
-def test_more_thrust_takes_more_speed_and_limits_are_those_of_full_speed() -> None:
-    nu = np.array([0.8, 0.2, -0.1, 0.1, 0.05, 0.2])
-    lower, upper = np.zeros(5), np.zeros(5)
-    kernels.thrust_limits(PACKED, np.ones(5), nu, lower, upper)
-    grid = np.linspace(lower, upper, 201)
-    rps = np.array([[0.0] * 5 for _ in grid])
-    for thrust, row in zip(grid, rps, strict=True):
-        kernels.speeds_for(PACKED, thrust, nu, row)
-    assert np.all(np.diff(rps, axis=0) > 0)
-    maximum = PACKED.table[:, kernels.MAX_RPS]
-    np.testing.assert_allclose(rps[[0, -1]], [-maximum, maximum], rtol=1e-9)
-
-
-def test_health_is_the_share_of_bollard_thrust_that_is_left() -> None:
-    health = np.array([1.0, 0.25, 0.0, 0.5, 1.0])
-    full, weak = np.zeros((2, 5)), np.zeros((2, 5))
-    kernels.thrust_limits(PACKED, np.ones(5), REST, full[0], full[1])
-    kernels.thrust_limits(PACKED, health, REST, weak[0], weak[1])
-    np.testing.assert_allclose(weak, health * full, rtol=1e-12)
-    kernels.thrust_limits(with_health(PACKED, health), np.ones(5), REST, full[0], full[1])
-    np.testing.assert_allclose(full, weak, rtol=1e-12)
-
-
-def test_a_failed_thruster_runs_down_whatever_is_asked() -> None:
-    rates = np.zeros(5)
-    failed = with_health(PACKED, np.array([1.0, 0.0, 1.0, 1.0, 1.0]))
-    kernels.add_speed_rates(failed, np.full(5, 10.0), np.full(5, 40.0), rates)
-    assert rates[1] == pytest.approx(-10.0 / PORT.time_constant_s)
-    assert np.all(np.delete(rates, 1) > 0)
-    with pytest.raises(VehicleError):
-        with_health(PACKED, np.array([1.0, 2.0, 1.0, 1.0, 1.0]))
-
-
-def test_speeds_follow_what_is_asked_with_a_first_order_lag() -> None:
-    rps, asked, rates = np.zeros(5), np.array([10.0, -10.0, 1.9, 99.0, 4.0]), np.zeros(5)
-    step = 1e-4
-    for _ in range(8000):
-        kernels.add_speed_rates(PACKED, rps, asked, rates)
-        rps += step * rates
-    # The third and fifth lie in their dead bands; the fourth is beyond what it can.
-    ends = np.array([10.0, -10.0, 0.0, BOW.most_rps, 0.0])
-    lags = np.array([t.time_constant_s for t in EVERY])
-    np.testing.assert_allclose(rps, ends * (1 - np.exp(-0.8 / lags)), atol=2e-3)
 
 
 def test_power_is_the_shafts_over_the_efficiency_and_never_given_back() -> None:
@@ -229,18 +153,6 @@ def test_power_at_any_speed_is_that_of_the_textbooks_torque() -> None:
             for t, n in zip(EVERY, rps, strict=True)
         ]
         np.testing.assert_allclose(power, slow, rtol=1e-9)
-
-
-@pytest.mark.parametrize("thruster", ALICE.thrusters, ids=lambda t: t.name)
-@pytest.mark.parametrize("n", [10.0, -10.0])
-def test_no_thruster_beats_momentum_theory_nor_is_hopeless(thruster: Thruster, n: float) -> None:
-    """At bollard the jet of a duct of full area carries T^1.5 / (2 sqrt(rho A))."""
-    power = np.zeros(1)
-    kernels.electrical_power(pack((thruster,), DENSITY, DISPLACED), np.array([n]), REST, power)
-    thrust = abs(thrust_of(replace(thruster, thrust_deduction=0.0), n))
-    area = math.pi * thruster.diameter_m**2 / 4
-    jet = thrust**1.5 / (2 * math.sqrt(DENSITY * area))
-    assert jet < power[0] * thruster.efficiency < 4 * jet
 
 
 @pytest.mark.parametrize(

@@ -7,15 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from alice_survey.sim.vehicle.coefficients import Coefficients
-from tests.oracles_hydrodynamics import Array, lamb_constants, reaction
+from tests.oracles_hydrodynamics import Array, reaction
 from tests.oracles_shape import (
     ALICE,
     SPARUS2,
     Flow,
     Geometry,
     Outline,
-    by_name,
     drag_of,
     estimate,
     inertia_of,
@@ -121,31 +119,3 @@ def test_strips_of_a_cylinder_in_closed_form() -> None:
     assert hull["N_vv"] == pytest.approx(-drag * (high**2 - low**2) / 2.0)
     assert hull["N_rr"] == pytest.approx(-drag * (high**4 + low**4) / 4.0)
     assert hull["Y_rr"] == pytest.approx(-drag * (high**3 + low**3) / 3.0)
-
-
-def test_strips_of_a_spheroid_lie_just_above_the_exact_added_mass() -> None:
-    """Strip theory gives the displaced mass across; Lamb's exact k_2 is 6 % less at l / d = 8.5."""
-    angle = np.linspace(np.pi, 0.0, 2001)
-    radius = 0.115 * np.sin(angle)
-    radius[[0, -1]] = 0.0
-    outline = Outline(x_m=tuple(0.98 * np.cos(angle)), radius_m=tuple(radius))
-    spheroid = replace(
-        SPARUS2, outline=outline,
-        mount=replace(SPARUS2.mount, aft_x_m=0.2, fore_x_m=0.2 + 1e-12, tip_y_m=0.2),
-    )  # fmt: skip
-    hull = part_coefficients(parts(spheroid, Flow())[0])
-    displaced = RHO * 4.0 / 3.0 * np.pi * 0.98 * 0.115**2
-    assert -hull["Y_vdot"] == pytest.approx(displaced, rel=1e-5)
-    assert -hull["N_rdot"] == pytest.approx(displaced * 0.98**2 / 5.0, rel=1e-5)
-    alpha, beta = lamb_constants(1.96, 0.23)
-    assert 0.92 < beta / (2.0 - beta) < 0.97
-    assert -hull["X_udot"] == pytest.approx(alpha / (2.0 - alpha) * displaced, rel=1e-8)
-
-
-def test_names_turn_back_into_the_matrix() -> None:
-    matrix = np.arange(36, dtype=np.float64).reshape(6, 6)
-    again = Coefficients(name="test", values=by_name(matrix, kind="quadratic"))
-    np.testing.assert_array_equal(again.quadratic, matrix)
-    symmetric = matrix + matrix.T
-    again = Coefficients(name="test", values=by_name(symmetric, kind="dot"))
-    np.testing.assert_array_equal(again.added_mass, symmetric)

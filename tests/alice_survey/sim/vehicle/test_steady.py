@@ -1,7 +1,5 @@
 """Steady motion against the equations of motion."""
 
-import math
-
 import numpy as np
 import pytest
 
@@ -63,26 +61,6 @@ def test_what_cannot_be_kept_is_nan_and_a_slip_may_be_left() -> None:
     assert np.isnan(flight.rps).all(axis=1).tolist() == [True, False, True]
     slipping = steady_flight(SPARUS, nu, slips=True)
     assert np.isnan(slipping.power_w).tolist() == [False, False, True]
-
-
-def test_a_share_of_thrust_bounds_the_load() -> None:
-    nu = np.zeros((60, 6))
-    nu[:, 1] = np.linspace(0.01, 0.6, 60)
-    whole, part = steady_flight(ALICE, nu), steady_flight(ALICE, nu, share=0.5)
-    kept = np.isfinite(part.power_w)
-    assert 10 < kept.sum() < np.isfinite(whole.power_w).sum() < 60
-    assert np.all(part.load[kept] <= 0.5 + 1e-9)
-    assert np.all(whole.load[~kept & np.isfinite(whole.load)] > 0.5 - 1e-9)
-    # Speeds squared are thrust but for the drag of the flow: at the bound the share is used up.
-    assert part.load[kept].max() > 0.45
-
-
-def test_one_lateral_thruster_is_made_up_for_by_the_pair_astern() -> None:
-    nu = np.zeros((1, 6))
-    nu[0, :2] = 0.2, 0.08
-    sound, lame = steady_flight(ALICE, nu), steady_flight(ALICE.without(["bow"]), nu)
-    assert lame.power_w[0] > 2 * sound.power_w[0]
-    assert math.isfinite(lame.power_w[0])
 
 
 def test_turning_while_the_water_stands_still_over_ground_takes_its_acceleration() -> None:

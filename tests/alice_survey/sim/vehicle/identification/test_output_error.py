@@ -1,7 +1,5 @@
 """The joint fit on logs simulated with hidden coefficients."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -15,8 +13,7 @@ from alice_survey.sim.vehicle.identification.output_error import (
 )
 from alice_survey.sim.vehicle.identification.parameters import free_parameters, unit_of
 from alice_survey.sim.vehicle.identification.windows import make_windows
-from alice_survey.sim.vehicle.log import VehicleLog, vehicle_log
-from alice_survey.sim.vehicle.propulsion import add_thrust
+from alice_survey.sim.vehicle.log import VehicleLog
 from tests.alice_survey.sim.vehicle.identification.manoeuvres import fly, hidden, measured
 
 KNOWN = vehicle_from("alice")
@@ -107,58 +104,6 @@ def test_unseen_pushes_widen_the_sigmas() -> None:
         error = fit.values - fit.parameters.start
         scores.append(error / fit.sigma)
     assert 0.6 < np.sqrt(np.mean(np.square(scores))) < 2.0
-
-
-def test_forces_say_the_same_as_speeds() -> None:
-    truth = {"X_uu": -11.0, "N_rr": -75.0}
-    log = measured(fly(hidden(truth), duration_s=30.0), np.random.default_rng(3))
-    by_speed = fitted(log, ("X_uu", "N_rr"))
-    # The wrench by the model at the measured (held) velocity is not exact; at low speed near it.
-    wrench = np.zeros((len(log.time_s), 6))
-    speeds = np.stack([log.rpm[t.name] for t in KNOWN.thrusters], axis=1) / 60.0
-    truth_motion = fly(hidden(truth), duration_s=30.0)
-    motion = np.concatenate([truth_motion.velocity_body, truth_motion.rates_body], axis=1)
-    for row in range(len(wrench)):
-        add_thrust(KNOWN.plant.propulsion, speeds[row], motion[row], wrench[row])
-    forces = replace(log, rpm={}, wrench=wrench)
-    bare = KNOWN.without([t.name for t in KNOWN.thrusters])
-    by_force = fit_output_error(
-        make_windows(forces, KNOWN), free_parameters(bare, ("X_uu", "N_rr")), simulation=QUICK
-    )
-    np.testing.assert_allclose(by_force.values, by_speed.values, rtol=0.01)
-
-
-def test_windows_and_gaps_change_little() -> None:
-    truth = {"X_uu": -11.0, "N_rr": -75.0}
-    log = measured(fly(hidden(truth), duration_s=60.0), np.random.default_rng(6))
-    whole = fitted(log, ("X_uu", "N_rr"))
-    cut = fitted(log, ("X_uu", "N_rr"), window_s=12.0)
-    assert len(cut.windows) == 5
-    keep = np.ones(len(log.time_s), bool)
-    keep[500:600] = False
-    gappy = vehicle_log(
-        log.time_s[keep], quaternion_xyzw=log.quaternion_xyzw[keep],
-        velocity_body=log.velocity_body[keep], rates_body=log.rates_body[keep],
-        rpm={name: value[keep] for name, value in log.rpm.items()},
-    )  # fmt: skip
-    broken = fitted(gappy, ("X_uu", "N_rr"))
-    assert len(broken.windows) == 2
-    for fit in (whole, cut, broken):
-        assert np.all(np.abs(fit.values - np.array([-11.0, -75.0])) < 4 * fit.sigma)
-    # Every start that is free costs information.
-    assert np.all(cut.sigma > whole.sigma)
-
-
-def test_a_coefficient_without_effect_stops_at_its_bound() -> None:
-    log = measured(fly(hidden({"X_uu": -11.0}), duration_s=30.0), np.random.default_rng(8))
-    fit = fitted(log, ("X_uu", "X_u"))
-    linear = fit.values[1]
-    assert linear <= 0.0
-    if fit.at_bound[1]:
-        assert linear == 0.0
-        assert np.isnan(fit.sigma[1])
-    else:
-        assert abs(linear) < 3 * fit.sigma[1]
 
 
 def test_parameters_that_a_log_does_not_determine_are_named() -> None:

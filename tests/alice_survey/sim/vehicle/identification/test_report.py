@@ -100,18 +100,6 @@ def test_a_log_is_predicted_open_loop_by_what_was_identified(
     assert (tmp_path / "out" / "fit.png").stat().st_size > 10_000
 
 
-def test_a_fit_that_is_worse_than_its_start_is_said_to_be(
-    logs: tuple[Path, Path], tmp_path: Path
-) -> None:
-    """Identified from a vehicle with other drag, and validated on the one it is."""
-    log = fly(hidden({}), duration_s=24.0, asked=lambda time_s: survey_like(time_s + 53))
-    write_vehicle_log(tmp_path / "own.csv", measured(log, np.random.default_rng(4)))
-    options = IdentifyOptions(free=("X_uu", "N_rr", "current"), validate=tmp_path / "own.csv")
-    text, data = identify_report([logs[0]], tmp_path / "out", options)
-    assert set(data["validation"]["worse_than_start"]) >= {"u", "r"}
-    assert "Worse than the values that the fit began with in u" in text
-
-
 @pytest.mark.parametrize("method", ["joint", "two-step"])
 def test_the_command_takes_a_bollard_pull_and_held_values(
     logs: tuple[Path, Path], tmp_path: Path, method: str

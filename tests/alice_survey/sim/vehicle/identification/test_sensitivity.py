@@ -17,7 +17,7 @@ from alice_survey.sim.vehicle.identification.sensitivity import (
     simulate,
     with_given,
 )
-from tests.oracles_identification import integrated, numpy_observation
+from tests.oracles_identification import integrated
 
 ALL = (
     "X_u", "K_p", "N_r", "X_uu", "Y_vv", "Z_ww_pos", "Z_ww_neg", "M_qq", "N_rr", "N_vv", "Y_uv",
@@ -135,20 +135,6 @@ def test_sensitivities_to_the_start_are_slopes_too() -> None:
         np.testing.assert_allclose(derivatives[:, :, k], difference, atol=2e-6)
 
 
-def test_observations_are_what_sensors_measure() -> None:
-    parameters, values, record, start = a_case()
-    states, observed, _ = run(parameters, values, record, start)
-    physics = parameters.physics(values)
-    for row in (0, 7, ROWS - 1):
-        expected = numpy_observation(
-            states[row], physics.current_ne, physics.bias, record.attitude[row]
-        )
-        # The length of the quaternion is left to the steps: 1 to some 1e-7.
-        np.testing.assert_allclose(observed[row, :6], expected[:6], rtol=0, atol=1e-6)
-        # Twice the sine of half the angle stands for the angle: 0.2 % apart at 0.2 rad.
-        np.testing.assert_allclose(observed[row, 6:], expected[6:], rtol=0.01, atol=1e-6)
-
-
 def test_a_lagging_thruster_is_followed_exactly_between_rows() -> None:
     truth = vehicle_from("alice")
     parameters = free_parameters(truth, ("X_uu",))
@@ -166,24 +152,6 @@ def test_a_lagging_thruster_is_followed_exactly_between_rows() -> None:
     few = run(parameters, values, record(coarse_s), a_start(), slopes=False, step_s=0.01)[0]
     many = run(parameters, values, record(fine_s), a_start(), slopes=False, step_s=0.01)[0]
     np.testing.assert_allclose(few, many[::20], atol=1e-7)
-
-
-def test_held_inputs_stay_until_the_next_row() -> None:
-    parameters = free_parameters(vehicle_from("alice").without(
-        ("starboard", "port", "vertical", "bow", "stern")), ("X_uu",))  # fmt: skip
-    wrench = np.zeros((3, 6))
-    wrench[1, 0] = 10.0
-    time_s = np.array([0.0, 1.0, 2.0])
-    start = np.concatenate([[0.0, 0, 0, 1], np.zeros(6)])
-    record = Record(time_s, np.zeros((3, 0)), wrench, np.tile(start[:4], (3, 1)), np.zeros((3, 6)))
-    held = run(parameters, parameters.start, record, start, slopes=False, hold=True)[0]
-    straight = run(parameters, parameters.start, record, start, slopes=False)[0]
-    # At rest but for the body that turns upright about its centre of gravity.
-    assert abs(held[1, 4]) < 1e-3
-    assert straight[1, 4] > 0.03
-    mass = parameters.physics(parameters.start).body.mass[0, 0]
-    # Both get an impulse of 10 N s in all, but for the little that drag and pitch take.
-    np.testing.assert_allclose([held[2, 4], straight[2, 4]], 10.0 / mass, rtol=0.05)
 
 
 def test_a_given_motion_follows_the_log() -> None:

@@ -63,20 +63,6 @@ def test_innovations_are_white_and_of_unit_variance(name: str) -> None:
         assert abs(together) < 4.0 / np.sqrt(count) + 0.01
 
 
-def test_a_drop_out_costs_what_the_sigmas_say() -> None:
-    logs = np.array([run.log for run in runs("drop-out")])
-    truth = runs("drop-out")[0].truth
-    gone = slice(4020, 4600)
-    north = logs[:, gone, :2] - truth[gone, :2] - (logs[:, 4000:4001, :2] - truth[4000, :2])
-    assert np.isnan(logs[:, 4060:4600, LOG_COLUMNS.index("altitude_m")]).all()
-    end = np.sqrt(np.mean(north[:, -1] ** 2))
-    sigma = logs[:, [4000, 4599], LOG_COLUMNS.index("sigma_north_m")]
-    grown = np.sqrt(np.mean(sigma[:, 1] ** 2 - sigma[:, 0] ** 2))
-    assert 1.0 < grown < 3.0
-    # 100 draws are good to 7 %.
-    assert 0.75 < end / grown < 1.3
-
-
 @pytest.mark.parametrize("name", SUITES)
 def test_sigmas_of_the_log_are_those_of_the_errors(name: str) -> None:
     truth = runs(name)[0].truth

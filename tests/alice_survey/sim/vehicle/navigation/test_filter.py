@@ -267,40 +267,6 @@ def test_noise_of_the_dvl_walks_with_the_root_of_time() -> None:
         assert run.log[[1500, 6000][i], column("sigma_north_m")] == pytest.approx(walk, rel=0.03)
 
 
-def test_a_heading_bias_leads_astray_by_distance_times_bias() -> None:
-    suite = SensorSuite(
-        imu=PERFECT_IMU, dvl=PERFECT_DVL, gps=PERFECT_GPS,
-        compass=CompassSpec(bias_sigma_rad=np.deg2rad(1.0), bias_correlation_s=1e9),
-    )  # fmt: skip
-    sensors, truth = suite.pack(), straight(300.0)
-    run = fly(sensors, truth, FLOOR, 4)
-    bias = run.hidden[-1, HEADING_BIAS - 9]
-    distance_m = truth[-1, 0]
-    assert abs(bias) > np.deg2rad(0.3)
-    # Walked noise of the DVL, 0.04 m, and the compass's, which averages out.
-    assert run.log[-1, 1] == pytest.approx(distance_m * bias, abs=0.25)
-    sigma = run.log[-1, column("sigma_east_m")]
-    assert sigma == pytest.approx(distance_m * np.deg2rad(1.0), rel=0.03)
-
-
-def test_without_the_dvl_a_level_imu_falls_off_as_integrated_noise() -> None:
-    # Angle noise tilts gravity: variance g^2 n^2 t^5 / 20; velocity noise adds m^2 t^3 / 3.
-    imu = PERFECT_IMU._replace(gyro_noise_rad_per_sqrt_s=2e-4)
-    suite = SensorSuite(
-        imu=imu, compass=PERFECT_COMPASS, gps=PERFECT_GPS, dvl=PERFECT_DVL._replace(rate_hz=0.0)
-    )
-    sensors, time_s = suite.pack(), 40.0
-    nav = new_navigation(sensors, straight(time_s)[0], default_rng(0))
-    nav.covariance[3:6] = nav.covariance[:, 3:6] = 0.0
-    nav.covariance[3:6, 3:6] = 1e-12 * np.eye(3)
-    run = fly(sensors, straight(time_s), FLOOR, 0, start=nav)
-    m = imu.accelerometer_noise_mps_per_sqrt_s
-    expected = np.sqrt((9.80665 * 2e-4) ** 2 * time_s**5 / 20 + m**2 * time_s**3 / 3)
-    # The compass takes away nothing that leads north or east.
-    assert run.log[-1, column("sigma_north_m")] == pytest.approx(expected, rel=0.01)
-    assert run.log[-1, column("sigma_east_m")] == pytest.approx(expected, rel=0.01)
-
-
 def test_a_usbl_bounds_the_drift() -> None:
     truth = straight(600.0)
     compass = CompassSpec(bias_sigma_rad=np.deg2rad(2.0))

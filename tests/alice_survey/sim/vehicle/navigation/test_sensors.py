@@ -106,16 +106,6 @@ def test_increments_of_the_imu_rebuild_the_motion() -> None:
     np.testing.assert_allclose(velocity, expected, atol=1e-8)
 
 
-def test_an_imu_at_rest_feels_its_weight_upwards() -> None:
-    sensors, truth = silent(), at_depth(3.0, Rotation.from_euler("ZYX", [1.0, 0.0, np.pi / 2]))
-    nav = new_navigation(sensors, truth, np.random.default_rng(0))
-    rotations.matrix_of(truth[3:7], nav.turns[TRUTH_NOW])
-    measure_imu(TICK_S, truth, truth, sensors, nav, np.random.default_rng(0))
-    # Rolled to starboard, port is up: -y.
-    push = nav.readings[PUSH : PUSH + 3] / TICK_S
-    np.testing.assert_allclose(push, [0.0, -9.80665, 0.0], atol=1e-9)
-
-
 def test_the_imu_errs_by_its_random_walks() -> None:
     sensors, truth = SensorSuite().pack(), at_depth(3.0)
     rng = np.random.default_rng(3)
@@ -170,14 +160,6 @@ def test_the_dvl_hears_what_is_in_its_reach(
     heard = ping(silent(), truth, level_floor(15.0), count=0).readings
     assert np.isfinite(heard[BEAM : BEAM + 4]).sum() == beams
     assert np.isfinite(heard[WATER_VELOCITY]) == water
-
-
-def test_over_a_deep_floor_the_dvl_hears_the_water_alone() -> None:
-    heard = ping(silent(), at_depth(8.0), level_floor(200.0)).readings
-    assert np.all(np.isnan(heard[RANGE : RANGE + 4]))
-    np.testing.assert_allclose(
-        heard[WATER_VELOCITY : WATER_VELOCITY + 3], [-0.1, 0.2, 0.0], atol=1e-9
-    )
 
 
 @given(velocity=vectors, missing=st.integers(0, 4))

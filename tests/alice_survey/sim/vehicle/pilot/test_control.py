@@ -92,26 +92,3 @@ def test_integral_takes_away_what_a_steady_force_leaves() -> None:
     assert places.max() < 1.2 * 4.0 / (row[g.MASS] * row[g.PLACE])
     assert abs(places[-1]) < 1e-4
     assert totals[-1] * row[g.INNER] * row[g.MASS] == pytest.approx(-4.0, rel=1e-3)
-
-
-def test_integral_does_not_wind_up_while_the_force_is_cut() -> None:
-    gains = gains_of("alice")
-    row = gains.axes[g.SWAY]
-    # The push is stronger than the thrusters for 20 s; then it stops.
-    _, totals = _hold(gains, 12.0, 20.0, 10.0)
-    bound = 10.0 / (row[g.INNER] * row[g.MASS])
-    assert np.abs(totals).max() < 1.2 * bound
-    assert steering.place_sum_step(gains, g.SWAY, 1.0, 1.0, 0.05) == 0.0
-    assert steering.place_sum_step(gains, g.SWAY, -1.0, 1.0, 0.05) < 0.0
-
-
-def test_speed_integral_is_bounded_by_what_the_thrusters_give() -> None:
-    gains = gains_of("alice")
-    row, total = gains.axes[g.SURGE], 0.0
-    for _ in range(20000):
-        _, total = steering.speed_demand(gains, g.SURGE, 1.0, 0.0, 0.0, total, 0.05)
-    assert total == pytest.approx(
-        max(-row[g.MIN_FORCE], row[g.MAX_FORCE]) / (row[g.MASS] * row[g.INNER])
-    )
-    held = steering.speed_demand(gains, g.SURGE, 1.0, 0.2, 1.0, 0.1, 0.05)
-    assert held == (pytest.approx(row[g.RATE] * (row[g.WEIGHT] - 0.2 + 0.1)), 0.1)

@@ -146,25 +146,6 @@ def test_authority_is_reached_and_not_exceeded_by_any_thrusts(axis: int) -> None
     assert forces.min() < 0.9 * minimum
 
 
-@pytest.mark.parametrize(("name", "axis"), AXES)
-def test_greatest_speed_takes_three_quarters_of_the_force(name: str, axis: int) -> None:
-    gains = gains_of(name)
-    row, nu, force = gains.axes[axis], np.zeros(6), np.zeros(6)
-    nu[DEGREES[axis]] = row[g.FASTEST]
-    add_damping(gains.body, nu, force)
-    share = -force[DEGREES[axis]] / min(-row[g.MIN_FORCE], row[g.MAX_FORCE])
-    if axis == g.YAW and row[g.FASTEST] == pytest.approx(math.radians(30.0)):
-        assert share < g.STEADY_SHARE  # bounded by the rate, not by the thrusters
-    else:
-        assert share == pytest.approx(g.STEADY_SHARE, rel=1e-9)
-
-
-def test_without_lateral_thrusters_sway_has_no_gains() -> None:
-    row = gains_of("sparus2").axes[g.SWAY]
-    assert row[g.MASS] > 0
-    assert not np.any(row[[g.RATE, g.PLACE, g.INTEGRAL, g.FASTEST]])
-
-
 def _coupled_loop(body: Body, speed_mps: float, row: Array) -> Array:
     """Heading, sway, yaw rate, lag and integral; slopes of the kernels' forces by differences."""
     inverse = np.linalg.inv(body.mass[np.ix_([1, 5], [1, 5])])
@@ -221,13 +202,6 @@ def test_a_wanted_speed_is_not_overshot(name: str, decay_share: float) -> None:
     assert overshoot(row[g.WEIGHT]) < 0.05
     assert overshoot(1.0) > 0.1
     assert 0.0 < row[g.WEIGHT] < 0.5
-
-
-def test_a_lost_lateral_thruster_makes_sway_as_slow_as_the_pair_that_helps_it() -> None:
-    whole, lame = vehicle_from("alice"), vehicle_from("alice").weaken({"bow": 0.0})
-    slow = gains_for(lame, 0.2).axes[g.SWAY]
-    assert slow[g.LAG] > 2.0 * gains_for(whole, 0.2).axes[g.SWAY, g.LAG]
-    assert slow[g.LAG] < 0.85
 
 
 @pytest.mark.parametrize(("name", "lost"), [("alice", "vertical"), ("sparus2", "port")])

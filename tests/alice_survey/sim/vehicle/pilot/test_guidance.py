@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import estimate_vector as vector
-from alice_survey.sim.vehicle.files import SETS, vehicle_from
+from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.pilot import gains as g
 from alice_survey.sim.vehicle.pilot import memory as slot
 from alice_survey.sim.vehicle.pilot.gains import (
@@ -33,7 +33,7 @@ from alice_survey.sim.vehicle.pilot.settings import (
 )
 from alice_survey.sim.vehicle.pilot.steering import hear_floor, write_point
 from tests import oracles_guidance as oracle
-from tests.alice_survey.sim.vehicle.pilot.pilot_runs import gains_of, launch, lawnmower, straight
+from tests.alice_survey.sim.vehicle.pilot.pilot_runs import gains_of, lawnmower, straight
 from tests.oracles_guidance import los_offset_m
 
 TICK_S = 0.05
@@ -97,34 +97,6 @@ def test_a_tick_asks_for_what_its_twin_asks(
     np.testing.assert_allclose(wrench, full, atol=1e-9)
 
 
-@given(motion=MOTIONS, cross_m=st.floats(-1.5, 1.5), turn=st.floats(-6.0, 6.0))
-@settings(deadline=None, max_examples=40)
-def test_north_is_nothing_special(motion: Array, cross_m: float, turn: float) -> None:
-    wrenches = []
-    for angle in (0.0, turn, turn + 2 * math.pi):
-        path = straight(20.0, angle)
-        gains, guidance = guide(path, "alice", "sway")
-        estimate, wrench = estimate_of(motion, cross_m), np.zeros(6)
-        n, e = estimate[:2].copy()
-        estimate[0] = n * math.cos(angle) - e * math.sin(angle)
-        estimate[1] = n * math.sin(angle) + e * math.cos(angle)
-        estimate[vector.HEADING] += angle
-        steer(
-            0.0,
-            TICK_S,
-            estimate,
-            path,
-            NO_MISSION,
-            guidance,
-            gains,
-            pilot_on(path, 0, 10.0),
-            wrench,
-        )
-        wrenches.append(wrench)
-    np.testing.assert_allclose(wrenches[1], wrenches[0], atol=1e-8)
-    np.testing.assert_allclose(wrenches[2], wrenches[0], atol=1e-8)
-
-
 @pytest.mark.parametrize("at", np.linspace(4.5, 9.5, 21))
 def test_turns_begin_before_the_arc_and_end_after_it(at: float) -> None:
     path = lawnmower(2, 5.0)
@@ -186,22 +158,6 @@ def test_look_ahead_is_the_shortest_that_damps(name: str) -> None:
     assert 1.0 < shortest / CONTROL_LENGTH_M < 2.0
 
 
-@pytest.mark.parametrize("name", ["alice", "sparus2"])
-def test_small_offsets_fade_as_the_linear_loop_says(name: str) -> None:
-    from scipy.linalg import expm
-
-    flight = launch(straight(100.0), name, "los", following=True)
-    flight.fly(120.0)  # until all is steady
-    flight.state[1] += 0.01
-    before = flight.state.copy()
-    rows = flight.fly(80.0)
-    loop = los_loop(flight.gains, 0.2, 0.55, flight.guidance.look_ahead_m)
-    start = np.array([rows.cross_m[0], rows.estimate[0, vector.HEADING], before[8], before[12], 0])
-    for seconds in (5.0, 10.0, 20.0, 40.0, 60.0):
-        expected = (expm(loop * seconds) @ start)[0]
-        assert rows.cross_m[round(seconds / TICK_S)] == pytest.approx(expected, abs=0.0012)
-
-
 @pytest.mark.parametrize(
     ("coefficients", "expected_m"),
     [("calibrated", 2.87), ("estimated", 1.79), ("cfd", 1.97), ("computed", 1.74)],
@@ -213,19 +169,6 @@ def test_look_ahead_hangs_on_the_coefficients_as_documented(
     assert min_look_ahead_m(gains, 0.2, 0.0) == pytest.approx(expected_m, abs=0.006)
     with_port = min_look_ahead_m(gains, 0.2, 0.55)
     assert with_port == pytest.approx(2.23 if coefficients == "calibrated" else 1.6, abs=0.006)
-
-
-@pytest.mark.parametrize("name", ["alice", "sparus2"])
-@pytest.mark.parametrize("coefficients", SETS)
-@pytest.mark.parametrize("speed_mps", [0.1, 0.2, 0.5])
-def test_los_is_damped_with_every_set(name: str, coefficients: str, speed_mps: float) -> None:
-    gains = gains_for(vehicle_from(name, coefficients), speed_mps)
-    for lever_m in (0.0, 0.55):
-        look_ahead_m = min_look_ahead_m(gains, speed_mps, lever_m)
-        ratio = damping_ratio(los_loop(gains, speed_mps, lever_m, look_ahead_m))
-        assert LOS_DAMPING_RATIO <= ratio <= 1.0
-        shorter = damping_ratio(los_loop(gains, speed_mps, lever_m, 0.98 * look_ahead_m))
-        assert look_ahead_m == CONTROL_LENGTH_M or shorter < LOS_DAMPING_RATIO
 
 
 def test_where_no_look_ahead_will_do_los_is_refused_and_sway_has_another() -> None:

@@ -83,15 +83,6 @@ def test_a_vehicle_without_sway_flies_every_line_in_order(towards_deg: float) ->
         assert 0.6 * 8.0 / 0.2 < seconds < 1.6 * 8.0 / 0.2
 
 
-def test_surge_over_ground_is_held_against_a_head_current() -> None:
-    flight = launch(straight(60.0), "alice", "sway", current=(0.15, 180.0), following=True)
-    rows = flight.fly(120.0)
-    assert rows.estimate[-200:, vector.U].mean() == pytest.approx(0.2, abs=0.003)
-    # The thrust is the drag at the speed through the water.
-    quadratic = -flight.gains.body.quadratic[0, 0]
-    assert rows.wrench[-200:, 0].mean() == pytest.approx(quadratic * 0.35**2, rel=0.05)
-
-
 @pytest.mark.parametrize(
     ("name", "speed_mps", "current"),
     [
@@ -123,41 +114,6 @@ def test_far_off_the_path_it_heads_for_it_and_near_it_sways() -> None:
     assert np.abs(rows.cross_m[-400:]).max() < 0.01
 
 
-def test_between_the_switches_it_stays_as_it_is() -> None:
-    for at_m, flag in ((0.6, 0.0), (0.6, 1.0)):
-        flight = launch(straight(40.0), at_ned=(0.0, at_m + 0.05, 0.0), following=True)
-        flight.pilot.report[slot.BY_SWAY] = flag
-        assert flight.guidance.near_m < at_m < flight.guidance.far_m
-        assert flight.fly(0.5).report[-1, slot.BY_SWAY] == flag
-
-
-def test_a_far_vehicle_with_sway_comes_back_in_any_current() -> None:
-    # Where a current alone would hold the original guidance 1 m off for ever.
-    flight = launch(straight(80.0), at_ned=(0.0, 2.0, 0.0), current=(0.1, 90.0), following=True)
-    rows = flight.fly(150.0)
-    assert los_offset_m(flight.guidance.look_ahead_m, 0.2, 0.1) > flight.guidance.near_m
-    assert rows.report[-1, slot.BY_SWAY] == 1.0
-    assert abs(rows.cross_m[-1]) < 0.02
-
-
-@pytest.mark.parametrize(("name", "controller"), [("alice", "sway"), ("sparus2", "los")])
-def test_the_start_is_reached_from_afar_against_the_current(
-    name: str, controller: Controller
-) -> None:
-    path = lawnmower(2, 6.0)
-    flight = launch(
-        path, name, controller, current=(0.1, 150.0), at_ned=(-6.0, 14.0, 0.0), heading_rad=2.0
-    )
-    rows = flight.fly(300.0)
-    assert rows.phases()[:3] == [DIVE, APPROACH, FOLLOW]
-    first = rows.on_lines()
-    assert first.report[0, slot.LINE] == 0
-    began = rows.time_s[np.argmax(rows.report[:, slot.PHASE] == FOLLOW)]
-    assert began < 200.0
-    if name == "alice":
-        assert np.abs(first.cross_m).max() < 0.05
-
-
 def test_carried_off_it_goes_back_to_where_it_left_the_path() -> None:
     flight = launch(straight(40.0), following=True)
     left = flight.fly(60.0).report[-1, slot.ALONG]
@@ -172,38 +128,12 @@ def test_carried_off_it_goes_back_to_where_it_left_the_path() -> None:
     assert np.abs(resumed[there:, slot.CROSS]).max() < 0.03
 
 
-def test_carried_off_again_and_again_it_gives_up() -> None:
-    flight = launch(straight(200.0), following=True)
-    phases: list[int] = []
-    for _ in range(4):
-        flight.fly(20.0)
-        flight.state[1] += 12.0
-        phases = flight.fly(150.0).phases()
-        if phases[-1] == ABORT:
-            break
-    assert flight.pilot.memory[slot.RETURNS] == flight.guidance.limits.max_returns + 1
-    assert phases[-1] == ABORT
-    assert flight.pilot.report[slot.REASON] == safety.LOST_PATH
-
-
 def test_a_current_too_strong_for_the_vehicle_ends_in_an_explained_abort() -> None:
     flight = launch(straight(40.0), "sparus2", "los", current=(2.5, 90.0))
     rows = flight.fly(400.0)
     assert rows.phases()[-1] == ABORT
     assert rows.report[-1, slot.REASON] in (safety.NO_DIVE, safety.NO_APPROACH)
     assert rows.report[-1, slot.AT_SURFACE] == 1.0
-
-
-def test_no_bottom_within_the_depth_allowed_ends_the_dive() -> None:
-    flight = launch(straight(40.0))
-    flight.floor[2] = 0.0
-    rows = flight.fly(360.0)
-    assert rows.phases() == [DIVE, ABORT]
-    assert rows.report[-1, slot.REASON] == safety.NO_BOTTOM
-    assert 39.0 < rows.estimate[:, vector.DEPTH].max() < 40.0
-    # From rest to a depth far away: the speed is the one allowed, and no integral winds up.
-    sinking = np.diff(rows.estimate[400:2000, vector.DEPTH]) / 0.05
-    assert 0.8 < sinking.mean() / flight.gains.axes[g.HEAVE, g.FASTEST] < 1.05
 
 
 def test_a_blind_dive_goes_no_deeper_than_it_may_unseeing() -> None:
@@ -215,16 +145,6 @@ def test_a_blind_dive_goes_no_deeper_than_it_may_unseeing() -> None:
     rows = flight.fly(150.0)
     assert rows.phases() == [DIVE, ABORT]
     assert 11.9 < rows.estimate[:, vector.DEPTH].max() < 12.1
-
-
-@pytest.mark.parametrize("slope", [-0.1, 0.1])
-def test_a_slope_is_followed_without_lag(slope: float) -> None:
-    flight = launch(straight(60.0), following=True, slope=slope)
-    rows = flight.fly(150.0)
-    settled = rows.estimate[1200:, vector.ALTITUDE]
-    # Pitch and the point's lever are seen by the altitude itself.
-    assert settled.mean() == pytest.approx(2.0, abs=0.02)
-    assert np.ptp(settled) < 0.05
 
 
 @pytest.mark.parametrize("name", ["alice", "sparus2"])
@@ -248,14 +168,3 @@ def test_fast_paths_slow_down_for_turns_that_are_too_tight(name: str) -> None:
     # Braking begins before the turn.
     run_outs = rows.report[(rows.report[:, slot.LEG].astype(int) % 4) == 2]
     assert run_outs[:, slot.TARGET_SURGE].min() < 0.5 * (0.5 + limit)
-
-
-def test_mirrored_currents_mirror_the_flight() -> None:
-    crossings = []
-    for towards_deg in (90.0, 270.0):
-        flight = launch(
-            straight(30.0), "sparus2", "los", current=(0.08, towards_deg), following=True
-        )
-        flight.guidance = flight.guidance._replace(point_body_m=np.array([0.55, 0.0, 0.08]))
-        crossings.append(flight.fly(100.0).cross_m)
-    np.testing.assert_allclose(crossings[0], -crossings[1], atol=1e-6)

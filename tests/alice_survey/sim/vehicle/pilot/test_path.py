@@ -35,21 +35,6 @@ def test_places_are_those_reached_by_walking(curvature: float, length: float, sh
     assert k == (curvature if 0.0 <= along <= length else 0.0)
 
 
-def test_a_starboard_turn_from_north_ends_in_the_east() -> None:
-    n, e, heading, _ = place_at(arc(2.0, math.pi / 2, 0.0), 0, math.pi / 2)
-    np.testing.assert_allclose([n, e], [1.0, -1.0], atol=1e-12)
-    assert heading == pytest.approx(math.pi)
-
-
-@given(at=st.floats(-1.0, 40.0))
-@settings(deadline=None, max_examples=40)
-def test_headings_are_the_same_from_any_leg(at: float) -> None:
-    begins = MOWER.begins_m
-    found = [heading_at(MOWER, leg, at - begins[leg])[0] for leg in (0, 3, len(begins) - 1)]
-    np.testing.assert_allclose(found, found[0], atol=1e-9)
-    assert found[0] == pytest.approx(oracle.mean_heading(MOWER, at, 1e-6), abs=1e-4)
-
-
 @given(
     curvature=st.floats(-2.0, 2.0),
     share=st.floats(0.05, 0.95),
@@ -86,42 +71,6 @@ def test_no_leg_is_skipped_however_wild_the_position(seed: int) -> None:
             seen.append(leg)
     assert seen == list(range(leg + 1))
     assert over == (leg == len(seen) - 1 and total >= MOWER.begins_m[-1] + MOWER.length_m[-1])
-
-
-def test_a_neighbouring_line_does_not_take_over() -> None:
-    # Standing on the third line while the progress is on the first: only the projection counts.
-    leg, along, _ = 1, 2.0, False
-    for _ in range(200):
-        leg, along, _ = advance(MOWER, leg, along, 3.0, 2.0, 0.02)
-    assert leg == 1
-    assert along == pytest.approx(3.0)
-
-
-def test_an_overshot_end_leads_on_to_the_next_leg() -> None:
-    # 0.3 m beyond the end of the first run-out, where the turn begins.
-    leg, along, over = 2, 0.45, False
-    for _ in range(60):
-        leg, along, over = advance(MOWER, leg, along, 5.8, 0.0, 0.05)
-    assert (leg, over) == (3, False)
-    # On the half circle of radius 0.5 m about (5.5, 0.5) the nearest point is at this angle.
-    assert along == pytest.approx(0.5 * math.atan2(0.3, 0.5), abs=1e-3)
-
-
-def test_progress_before_a_leg_does_not_fall_into_the_one_before() -> None:
-    leg, along, _ = advance(MOWER, 1, 0.01, -3.0, 0.0, 0.5)
-    assert (leg, along) == (1, 0.0)
-    # On the way in it is negative, and grows only.
-    leg, along, _ = advance(MOWER, 0, -2.0, -4.0, 0.0, 0.5)
-    assert (leg, along) == (0, -2.0)
-    leg, along, _ = advance(MOWER, 0, -2.0, -2.1, 0.0, 0.5)
-    assert along == pytest.approx(-1.6)
-
-
-def test_the_path_ends() -> None:
-    last = len(MOWER.length_m) - 1
-    n, e, _, _ = place_at(MOWER, last, MOWER.length_m[last] + 0.01)
-    leg, along, over = advance(MOWER, last, MOWER.length_m[last] - 0.01, n, e, 0.05)
-    assert (leg, along, over) == (last, MOWER.length_m[last], True)
 
 
 def test_headings_of_legs_are_continuous_however_they_are_wrapped() -> None:

@@ -12,17 +12,14 @@ from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.pilot import memory as slot
-from alice_survey.sim.vehicle.pilot.gains import FASTEST, LAG, SURGE, SWAY, YAW
+from alice_survey.sim.vehicle.pilot.gains import LAG, SURGE, SWAY, YAW
 from alice_survey.sim.vehicle.pilot.guidance import steer
 from alice_survey.sim.vehicle.pilot.memory import new_pilot
 from alice_survey.sim.vehicle.pilot.mission import NO_MISSION
 from alice_survey.sim.vehicle.pilot.path import Path
 from alice_survey.sim.vehicle.pilot.settings import (
-    STEP_MPS,
-    TURN_IN_PLACE_RAD_S,
     Guidance,
     pilot_guidance,
-    stop_speeds,
 )
 from alice_survey.sim.vehicle.pilot.steering import STOP_M, STOP_RAD, ramp
 from tests import oracles_guidance as oracle
@@ -67,26 +64,6 @@ def test_a_reference_goes_as_far_as_the_closed_form_says(
         assert time_s < total_s + 1.0
     assert speed == 0.0
     assert time_s > total_s - 3 * TICK_S - 2.0 * math.sqrt(2.0 * TICK_S**2)
-
-
-@given(speed=st.floats(0.0, 0.4), goal=st.floats(0.0, 2.0))
-@settings(deadline=None, max_examples=40)
-def test_a_reference_that_is_too_fast_still_stops_at_its_goal(speed: float, goal: float) -> None:
-    at = 0.0
-    for _ in range(2000):
-        at, speed, quicken = ramp(at, speed, goal, 0.2, 0.05, TICK_S)
-        assert at <= goal
-        assert abs(quicken) <= 0.05 + 1e-12
-    assert (at, speed) == (goal, 0.0)
-
-
-def test_a_reference_without_a_pace_waits() -> None:
-    at, speed = 1.0, 0.2
-    for _ in range(200):
-        at, speed, _ = ramp(at, speed, 5.0, 0.0, 0.05, TICK_S)
-    assert speed == 0.0
-    # 0.2^2 / (2 x 0.05) = 0.4 m of braking.
-    assert at == pytest.approx(1.4, abs=0.02)
 
 
 def guidance_of(path: Path, name: str = "alice") -> Guidance:
@@ -194,27 +171,6 @@ def test_alice_steps_aside_with_her_heading_held(current: tuple[float, float]) -
     assert 6.7 < on.sum() * TICK_S < 12.0
 
 
-def test_the_vehicle_comes_to_rest_before_it_turns() -> None:
-    flight = launch(SPOTS, at_ned=(-1.2, 0.0, 0.0), following=True)
-    rows = flight.fly(60.0)
-    on = on_leg(rows, 0)
-    speed = np.hypot(rows.estimate[on, vector.U], rows.estimate[on, vector.V])
-    assert speed.max() > 0.18
-    assert speed[-1] < 0.06
-    # Not long before: from full speed it takes no more than its braking and the loop's settling.
-    slow = np.flatnonzero(speed < 0.18)
-    braking = slow[slow > np.argmax(speed)]
-    assert 2.0 < len(braking) * TICK_S < 12.0
-
-
-def test_a_turn_goes_its_given_way_even_if_it_is_longer() -> None:
-    path = with_stops([("go", 2.0, 0), ("spot", -1.5 * math.pi), ("go", 2.0, 1)])
-    rows = launch(path, at_ned=(-1.2, 0.0, 0.0), following=True).fly(60.0)
-    heading = np.unwrap(rows.estimate[:, vector.HEADING])
-    assert rows.phases()[-1] == slot.ASCEND
-    assert heading[-1] - heading[0] == pytest.approx(-1.5 * math.pi, abs=0.05)
-
-
 def test_a_vehicle_without_sway_turns_and_goes_on_but_takes_no_steps() -> None:
     flight = launch(SPOTS, "sparus2", "los", at_ned=(-1.2, 0.0, 0.0), following=True)
     rows = flight.fly(120.0)
@@ -260,12 +216,3 @@ def test_carried_off_a_stop_the_vehicle_comes_back_to_it() -> None:
     ]  # fmt: skip
     on = on_leg(rows, 2)
     assert np.abs(rows.cross_m[on]).max() < 0.3
-
-
-def test_stops_are_no_faster_than_the_vehicle() -> None:
-    gains = gains_of("alice")
-    assert stop_speeds(gains, 0.55, by_sway=True) == (TURN_IN_PLACE_RAD_S, STEP_MPS)
-    rate, step = stop_speeds(gains, 2.0, by_sway=True, turn_in_place_rad_s=9.0)
-    assert step == STEP_MPS
-    assert rate == min(gains.axes[SWAY, FASTEST] / 2.0, gains.axes[YAW, FASTEST])
-    assert stop_speeds(gains_of("sparus2"), 0.55, by_sway=False)[1] == 0.0

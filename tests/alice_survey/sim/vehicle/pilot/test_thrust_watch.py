@@ -135,22 +135,3 @@ def test_a_model_that_is_off_and_a_wrong_current_are_no_failure() -> None:
             found, sums = judged(ThrustWatch(believed, TICK_S), 0.0, flight, water_mps)
             assert found == []
             assert np.max(sums) < 8.0
-
-
-def test_a_thruster_that_is_known_to_be_gone_is_not_found_again() -> None:
-    watch = ThrustWatch(ALICE, TICK_S)
-    judged(watch, 0.0, flown("", 1.0, 0))
-    watch.known_gone("stern")
-    flight, rps = flown("stern", 0.0, 10)
-    assert judged(watch, SOUND_S, (flight, rps))[0] == []
-    assert watch.sums[NAMES.index("stern")] == 0.0
-
-
-def test_estimates_that_are_none_are_not_judged() -> None:
-    watch = ThrustWatch(ALICE, TICK_S)
-    flight, rps = flown("", 1.0, 0)
-    unknown = NavigatedStretch(flight[:STRETCH] * np.nan, np.zeros(2), 0.1)
-    assert watch.judge(5.0, unknown, rps[:STRETCH]) == []
-    short = NavigatedStretch(flight[:10], np.zeros(2), 0.1)
-    assert watch.judge(5.0, short, rps[:10]) == []
-    assert not watch.sums.any()
