@@ -1,8 +1,7 @@
-"""The vehicle compared with its peers: equations of motion, allocation, and whole missions.
+"""The vehicle: equations of motion, allocation next to a peer, and whole missions.
 
     .venv/bin/python -m benchmarks.vehicle [--quick] [--json FILE] [--only PART ...]
 
-Everything that is compared is measured in this run, but for the one figure that says otherwise.
 Ends with exit code 1 when a goal is missed. All code is compiled afresh, into a folder of its own,
 so that no kernel is older than the sources.
 """
@@ -19,10 +18,6 @@ from benchmarks.figures import Findings, add_options, hand_over
 from benchmarks.machine import heading, machine
 
 _PARTS = ("start", "dynamics", "accuracy", "allocation", "loop", "seas")
-_QUOTED = (
-    "PythonVehicleSimulator (T. I. Fossen), quoted, measured earlier on another machine: 187 us a "
-    "step\nof forward Euler, one derivative, of a vehicle of its own."
-)
 
 
 def main() -> None:
@@ -48,7 +43,7 @@ def _measure(options: argparse.Namespace, cache: Path) -> int:
         findings += Findings(figures=tuple(f for row in starts for f in row.figures()))
     if "dynamics" in options.only:
         rows = vehicle_dynamics.measure(20_000 if quick else 200_000, 3 if quick else 10)
-        print(f"Equations of motion:\n{vehicle_dynamics.table(rows)}\n{_QUOTED}\n", flush=True)
+        print(f"Equations of motion:\n{vehicle_dynamics.table(rows)}\n", flush=True)
         report["dynamics"] = [asdict(row) for row in rows]
         findings += Findings(figures=tuple(vehicle_dynamics.figures(rows)))
     if "accuracy" in options.only:

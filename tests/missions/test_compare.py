@@ -3,8 +3,7 @@
 import csv
 import json
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +12,9 @@ from typer.testing import CliRunner
 
 from alice_survey.app.cli.main import app
 from alice_survey.core.config import SurveyConfig, changed, parse_config
-from alice_survey.core.errors import ConfigError, VehicleError
+from alice_survey.core.errors import VehicleError
 from alice_survey.core.executor import SERIAL
 from alice_survey.sim.vehicle import files
-from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.sea import level_floor
 from alice_survey.sim.vehicle.simulator import Flown, Setup, simulate
 from missions.fly.compare import (
@@ -29,7 +27,6 @@ from missions.fly.compare import (
     default_cases,
     figures_of,
     fly_variant,
-    summarise,
     turn_rows,
     variants_of,
 )
@@ -103,15 +100,6 @@ def test_all_meet_the_same_gusts(small: Plan) -> None:
     assert left[0] == left[1]
 
 
-def test_another_seed_is_another_sea_and_the_same_seed_the_same_flight(small: Plan) -> None:
-    tracks = [
-        fly_variant(SETTINGS, small, BY_NAME[IMPROVED], STILL, seed)[1].truth for seed in (1, 1, 2)
-    ]
-    np.testing.assert_array_equal(tracks[0], tracks[1])
-    shortest = min(len(track) for track in tracks)
-    assert np.abs(tracks[0][:shortest, :3] - tracks[2][:shortest, :3]).max() > 1e-3
-
-
 def test_on_lines_the_route_error_is_the_line_error(
     flown: dict[str, tuple[Setup, Flown, Flight]],
 ) -> None:
@@ -169,17 +157,6 @@ def test_turns_are_from_a_line_to_the_middle_of_the_next() -> None:
     again = np.array([0, 0, -1, 0, 0], np.float64)
     assert turn_rows(again, np.ones(5, bool)) == []
     assert turn_rows(np.full(4, -1.0), np.ones(4, bool)) == []
-
-
-def test_summaries_are_means_and_spreads(small: Plan) -> None:
-    job = fly_variant(SETTINGS, small, BY_NAME[IMPROVED], STILL, 1)
-    figures = figures_of(job[2])
-    outcomes = [asdict(replace(figures, lines_true_m=value)) for value in (0.1, 0.2, 0.6)]
-    found = summarise(outcomes)["lines_true_m"]
-    assert found["mean"] == pytest.approx(0.3)
-    assert found["sd"] == pytest.approx(math.sqrt(0.07))
-    assert (found["least"], found["most"]) == (0.1, 0.6)
-    assert "sd" not in summarise(outcomes[:1])["lines_true_m"]
 
 
 def test_currents_are_across_along_and_none(small: Plan) -> None:
@@ -242,20 +219,6 @@ def test_any_vehicles_are_compared(tmp_path: Path) -> None:
         variants_of(["nautilus"])
 
 
-@pytest.mark.parametrize(
-    ("currents", "swell"),
-    [
-        (["fast"], None), (["-0.1@0"], None), (["nan@0"], None), ([], "high"), ([], "0.5@0"),
-        ([], "nan@6"),
-    ],
-)  # fmt: skip
-def test_a_sea_that_makes_no_sense_is_refused(
-    currents: Sequence[str], swell: str | None, tmp_path: Path
-) -> None:
-    with pytest.raises(ConfigError):
-        compare_report(CONFIG, tmp_path, currents=currents, swell=swell, flights=1, executor=SERIAL)
-
-
 def test_the_command_prints_what_it_writes(tmp_path: Path) -> None:
     text = (
         "[area]\nlength_m = 3.0\nwidth_m = 1.0\nseafloor_depth_m = 6.0\n[plan]\ncross_lines = 0\n"
@@ -267,11 +230,3 @@ def test_the_command_prints_what_it_writes(tmp_path: Path) -> None:
     data = json.loads(shown.stdout)
     assert data == json.loads((tmp_path / "compare" / "compare.json").read_text())
     assert data["plan"]["line_spacing_m"] == 1.0
-
-
-def test_variants_are_named_apart_and_fit_their_vehicle() -> None:
-    assert len(BY_NAME) == len(VARIANTS)
-    for variant in VARIANTS:
-        names = {thruster.name for thruster in vehicle_from(variant.vehicle).thrusters}
-        assert set(variant.failed) <= names
-        assert variant.controller == "los" or variant.vehicle == "alice"

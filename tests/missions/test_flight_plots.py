@@ -2,7 +2,6 @@
 
 import tempfile
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from alice_survey.core.config import parse_config
-from missions.fly.flight_plots import draw_flight, draw_vehicle, line_spans, true_current
+from missions.fly.flight_plots import draw_flight, draw_vehicle, line_spans
 from missions.fly.flight_records import rpm_of
 from missions.values.flight import Flight
 from tests.missions.flown_plans import flown, planned
@@ -61,11 +60,6 @@ def test_spans_are_the_times_on_lines(flight: Flight) -> None:
     np.testing.assert_array_equal(inside, flight.line >= 0)
 
 
-def test_the_current_is_that_of_the_sea(flight: Flight) -> None:
-    expected = np.broadcast_to([0.0, 0.1], (len(flight.line), 2))
-    np.testing.assert_allclose(true_current(flight.flown), expected, atol=1e-12)
-
-
 def test_strips_show_errors_thrusters_and_energy(
     flight: Flight, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -78,14 +72,3 @@ def test_strips_show_errors_thrusters_and_energy(
         np.testing.assert_array_equal(curve(figure, "rpm", name), rpm)
     energy_wh = curve(figure, "energy, Wh", "electrical")
     assert energy_wh[-1] == pytest.approx(flight.flown.energy_j.sum() / 3600.0, rel=1e-3)
-
-
-@pytest.mark.parametrize("draw", [draw_flight, draw_vehicle])
-def test_a_flight_without_lines_is_drawn_too(
-    draw: Callable[[Path, Flight], None], flight: Flight, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    lost = replace(
-        flight, line=np.full(len(flight.line), -1.0), trigger_s=np.empty(0), trigger_line=()
-    )
-    assert len(figure_of(draw, lost, monkeypatch).axes) > 5
-    assert line_spans(lost) == []

@@ -87,12 +87,6 @@ def test_one_dive_is_the_plan_with_that_dive_alone() -> None:
     assert one_dive(PLAN, None) is PLAN
 
 
-@pytest.mark.parametrize("dive", [0, 3])
-def test_a_dive_that_the_plan_has_not_is_refused(dive: int) -> None:
-    with pytest.raises(PlanError, match=f"dive {dive}"):
-        one_dive(PLAN, dive)
-
-
 def test_all_dives_are_flown_in_one_mission_from_home_to_home(flight: Flight) -> None:
     assert flight.ending == "complete"
     assert len(flight.trigger_s) == PLAN.stations == 18
@@ -154,15 +148,6 @@ def test_the_way_in_stays_where_the_vehicle_may_be(allowed: Polygon, room: float
     area = replace(PLAN.area, allowed=MultiPolygon([allowed]))
     fenced = replace(PLAN, area=area)
     assert room_behind_m(fenced, path_of(fenced), 1.6) == pytest.approx(room, abs=1e-5)
-
-
-def test_a_vehicle_at_the_fence_begins_without_a_way_in() -> None:
-    fence = MultiPolygon([box(0.0, -3.0, 8.0, 5.0)])
-    flight = flown(replace(PLAN, area=replace(PLAN.area, allowed=fence)), survey())
-    assert flight.ending == "complete"
-    following = flight.flown.report[:, PHASE] == FOLLOW
-    # But for the errors of control and navigation.
-    assert -0.3 < flight.glass_ned[following, 0].min() < 0.0
 
 
 def test_a_vehicle_without_sway_turns_on_the_spot_with_a_warning_but_cannot_step(

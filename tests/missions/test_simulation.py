@@ -123,15 +123,6 @@ def test_with_one_thruster_failed_she_still_flies_the_survey(thruster: str) -> N
     assert 0.002 < rms(cross[metres_into_line(flight) > 2.0]) < 0.15
 
 
-def test_weak_thrusters_push_no_more_than_is_left_of_them() -> None:
-    flight = fly(survey(vehicle={"failures": ["bow=0.3", "starboard=0.3"]}))
-    fastest = dict(zip(flight.flown.thrusters, np.abs(flight.flown.rps).max(axis=0), strict=True))
-    assert fastest["bow"] <= 56.5 * 0.3**0.5 + 1e-9
-    assert fastest["starboard"] <= 50.0 * 0.3**0.5 + 1e-9
-    assert flight.ending == "complete"
-    assert 0.002 < rms(flight.line_errors[0]) < 0.12
-
-
 def test_a_thruster_that_fails_unnoticed_leaves_pictures_off_their_lines() -> None:
     known = fly(survey(vehicle={"failures": ["bow"]}))
     dead = survey(vehicle={"failures": ["bow@0"]})
@@ -178,11 +169,6 @@ def test_navigation_is_consistent_in_the_closed_loop() -> None:
     mean = np.stack([square[:epochs] for square in squares]).mean(axis=0)
     low, high = (chi2.ppf(share, len(axes) * runs) / runs for share in (0.025, 0.975))
     assert ((mean > low) & (mean < high)).mean() >= 0.9
-
-
-def test_without_the_vertical_thruster_she_cannot_dive_and_says_so() -> None:
-    with pytest.raises(VehicleError, match="heave"):
-        fly(survey(vehicle={"failures": ["vertical"]}))
 
 
 def test_the_original_vehicle_flies_by_heading_alone() -> None:
@@ -234,20 +220,6 @@ def test_without_bottom_lock_the_vehicle_goes_on_by_choice_while_it_knows_where_
         gone_on.believed_glass_ned[blind, :2] - gone_on.glass_ned[blind, :2], axis=1
     )
     assert 0.2 < np.sqrt(np.mean((error / sigma[blind]) ** 2) / 2.0) < 2.0
-
-
-def test_a_current_too_strong_is_refused_by_the_vehicle() -> None:
-    flight = fly(survey(sea={"current_mps": 2.5, "current_towards_deg": 110.0}))
-    assert flight.ending.startswith("aborted: ")
-    assert len(flight.trigger_s) < plan_of().stations
-
-
-def test_a_slowly_varying_current_has_the_sigma_of_the_settings() -> None:
-    sea = SeaConfig(current_mps=0.1, current_sigma_mps=0.03)
-    current = current_of(sea, 20.0, 600_000.0, np.random.default_rng(1))
-    north = current.velocity_ne_mps[:, 0, 0]
-    assert 0.025 < north.std() < 0.035
-    assert abs(north.mean()) < 0.006
 
 
 def test_a_measured_current_is_read(tmp_path: Path) -> None:
@@ -379,17 +351,3 @@ def test_a_vehicle_that_loses_its_only_vertical_thruster_gives_up() -> None:
     flight = fly(survey(vehicle={"failures": ["vertical@60"]}))
     assert flight.ending == "aborted: a thruster failed without which it cannot fly a survey"
     assert flight.flown.found[0].thruster == "vertical"
-
-
-@pytest.mark.parametrize("height_m", [1.2, 1.5])
-def test_in_long_swell_the_first_line_is_reached(height_m: float) -> None:
-    """Water moves by +-0.4 m and more at the floor: no place is kept to 0.2 m for 2 s."""
-    deep = {"length_m": 6.0, "width_m": 4.0, "heading_deg": 20.0, "seafloor_depth_m": 15.0}
-    swell = {"swell_m": height_m, "swell_period_s": 8.0, "swell_towards_deg": 110.0}
-    config = survey(area=deep, sea={"current_mps": 0.0, **swell})
-    plan = planned(config)
-    for seed in (1, 2):
-        flight = flown(plan, config, None, seed)
-        assert flight.ending == "complete"
-        assert len(flight.trigger_s) == plan.stations
-        assert 0.1 < rms(flight.line_errors[0]) < 0.35

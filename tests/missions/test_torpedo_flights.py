@@ -14,7 +14,6 @@ from alice_survey.sim.vehicle.steady import min_radius_m, min_speed_mps
 from missions.exposure.ways_out import ConflictError
 from missions.fly.flight_records import true_log
 from missions.fly.flight_route import path_of, roomier_side
-from missions.plan.solve import area_for_dive
 from missions.route.energy import craft_of
 from missions.values.flight import rms
 from tests.missions.flown_plans import flown, planned
@@ -118,18 +117,6 @@ def test_a_speed_below_the_lowest_is_refused_with_one_that_does() -> None:
     assert all(speed > minimum for speed in tried)
     faster = survey({"speed_mps": tried[0]})
     assert planned(faster).coverage > 0.999
-
-
-def test_a_current_that_leaves_too_little_speed_is_refused() -> None:
-    with pytest.raises(ConflictError, match="the current"):
-        planned(survey({"speed_mps": 0.6}, sea={"current_mps": 0.3, "current_towards_deg": 0.0}))
-
-
-def test_a_dive_holds_less_area_where_turns_are_wide() -> None:
-    """Each turn back to a line 1 m beside takes some 7 radii."""
-    wide = area_for_dive(survey(), 3600.0)
-    assert 40.0 < wide.turn_s < 90.0
-    assert wide.side_m > 20.0
 
 
 def test_the_circle_is_flown_on_the_roomier_side() -> None:

@@ -102,24 +102,6 @@ def test_lost_odometry_ends_at_the_surface(following: LoopFlight) -> None:
     assert is_off(following)
 
 
-def test_given_up_stays_given_up(following: LoopFlight) -> None:
-    for _ in range(10 + GRACE_TICKS + 5):
-        following.tick(odometry="none")
-    for _ in range(20):
-        following.tick()
-        assert following.command.state == LinkState.GIVEN_UP
-        assert following.command.wrench[2] < -5.0
-
-
-def test_drift_leaves_the_thrusters_off() -> None:
-    flight = LoopFlight(on_loss="drift")
-    flight.until("follow")
-    for _ in range(10 + GRACE_TICKS + 200):
-        flight.tick(odometry="none")
-    assert flight.command.state == LinkState.GIVEN_UP
-    assert is_off(flight)
-
-
 @pytest.mark.parametrize(
     ("field", "value"),
     [
@@ -140,21 +122,6 @@ def test_odometry_that_is_not_a_number_is_refused(
     assert following.loop.refused == {"odometry is not a number": 20}
 
 
-def test_late_odometry_is_refused(following: LoopFlight) -> None:
-    for _ in range(20):
-        following.tick(odometry=following.true_odometry(following.now_s - 0.6))
-    assert following.command.state == LinkState.HELD
-    assert following.loop.refused == {"odometry comes too late": 20}
-
-
-def test_odometry_that_repeats_itself_is_stale(following: LoopFlight) -> None:
-    frozen = following.true_odometry(following.now_s)
-    for _ in range(30):
-        following.tick(odometry=frozen)
-    assert following.command.state == LinkState.HELD
-    assert is_off(following)
-
-
 @pytest.mark.parametrize("jump_s", [-30.0, 0.8, 3600.0])
 def test_clock_that_jumps_is_survived(following: LoopFlight, jump_s: float) -> None:
     """What was heard before the jump is forgotten; odometry on the new clock is flown by."""
@@ -166,18 +133,6 @@ def test_clock_that_jumps_is_survived(following: LoopFlight, jump_s: float) -> N
     following.tick()
     assert following.command.state == LinkState.FLYING
     assert following.loop.jumps == 1
-
-
-@pytest.mark.parametrize("jump_s", [-30.0, 30.0])
-def test_clock_that_leaves_the_stamps_behind_ends_the_mission(
-    following: LoopFlight, jump_s: float
-) -> None:
-    """The source's clock did not jump: its stamps do not fit any more."""
-    following.clock_offset_s += jump_s
-    for _ in range(GRACE_TICKS + 5):
-        following.tick(odometry=following.true_odometry(following.now_s - jump_s))
-    assert following.command.state == LinkState.GIVEN_UP
-    assert following.command.wrench[2] < -5.0
 
 
 def test_pilot_without_altitude_stops_and_surfaces(following: LoopFlight) -> None:
@@ -196,24 +151,6 @@ def test_pilot_without_altitude_stops_and_surfaces(following: LoopFlight) -> Non
     assert following.loop.ending == (
         "aborted: the DVL did not hear the bottom for longer than is allowed"
     )
-
-
-def test_late_ticks_are_counted_and_flown_over(following: LoopFlight) -> None:
-    before = following.loop.late_ticks
-    for _ in range(10):
-        # Every other tick is left out: the vehicle moves on under the command before.
-        following.tick()
-        following.vehicle.sense()
-        following.vehicle.move(following.command.rps)
-    assert following.loop.late_ticks - before == 9
-    assert following.command.state == LinkState.FLYING
-
-
-def test_tick_at_the_same_time_repeats_the_command(following: LoopFlight) -> None:
-    now_s = following.command.time_s
-    rows = len(following.mission.rows)
-    assert following.mission.tick(now_s) is following.command
-    assert len(following.mission.rows) == rows
 
 
 def test_altitude_is_that_of_a_level_floor_below_a_tilted_vehicle() -> None:

@@ -14,10 +14,9 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from alice_survey.core.artefacts import read_csv
 from alice_survey.core.config import SurveyConfig
-from alice_survey.core.errors import VehicleError
 from missions.fly.simulation import flight_settings
 from missions.live.loop import LinkLimits, LinkState
-from missions.live.mavlink_pilot import GUIDED, SURFACE, MavlinkPilot, pilot_over_mavlink
+from missions.live.mavlink_pilot import GUIDED, SURFACE, MavlinkPilot
 from missions.live.mission import mission_of
 from missions.values.flight import trigger_times
 from tests.missions.live.flights import FLOOR_M, small_plan
@@ -121,11 +120,6 @@ def test_setpoints_are_velocities_in_ned_and_a_heading(flying: Vehicle) -> None:
     assert target.yaw == pytest.approx(command.heading_rad, abs=1e-6)
 
 
-def test_setpoints_come_at_the_rate_of_the_loop(flying: Vehicle) -> None:
-    flying.step(100)
-    assert 99 <= len(flying.targets()) <= 101
-
-
 @pytest.mark.parametrize(("mode", "armed"), [(19, True), (GUIDED, False)])
 def test_nothing_is_commanded_before_the_operator_clears_it(mode: int, armed: bool) -> None:
     vehicle = Vehicle()
@@ -138,14 +132,6 @@ def test_nothing_is_commanded_before_the_operator_clears_it(mode: int, armed: bo
     vehicle.mode, vehicle.armed = GUIDED, True
     vehicle.step(5)
     assert vehicle.targets()
-
-
-def test_operator_takes_over(flying: Vehicle) -> None:
-    flying.mode = 19
-    flying.step(3)
-    assert flying.mission.loop.state == LinkState.OVER
-    assert flying.mission.loop.ending.startswith("ended: the vehicle was disarmed or taken out")
-    assert not flying.targets()
 
 
 def test_lost_position_stops_then_surfaces(flying: Vehicle) -> None:
@@ -167,17 +153,6 @@ def test_lost_position_stops_then_surfaces(flying: Vehicle) -> None:
     assert flying.mission.loop.ending.startswith("given up")
 
 
-def test_lost_position_with_drift_keeps_its_mode() -> None:
-    vehicle = Vehicle(on_loss="drift", grace_s=1.0)
-    vehicle.heartbeat()
-    vehicle.origin()
-    vehicle.step(20)
-    vehicle.step(200, moves=False)
-    assert vehicle.mission.loop.state == LinkState.GIVEN_UP
-    assert not [m for m in vehicle.sink.take("COMMAND_LONG") if m.command == 176]
-    assert all(m.vz == 0.0 for m in vehicle.targets()[-100:])
-
-
 @pytest.mark.parametrize("spoilt", ["late", "nan", "no heartbeat", "rebooted"])
 def test_what_is_not_of_now_is_not_flown_by(flying: Vehicle, spoilt: str) -> None:
     if spoilt == "late":
@@ -194,12 +169,6 @@ def test_what_is_not_of_now_is_not_flown_by(flying: Vehicle, spoilt: str) -> Non
     assert (last.vx, last.vy, last.vz) == (0.0, 0.0, 0.0)
 
 
-def test_packets_of_other_systems_are_not_looked_at(flying: Vehicle) -> None:
-    flying.own = dialect.MAVLink(None, srcSystem=7, srcComponent=1)
-    flying.step(30)
-    assert flying.mission.loop.state == LinkState.HELD
-
-
 def test_vehicle_without_an_origin_is_given_the_datum() -> None:
     vehicle = Vehicle()
     vehicle.heartbeat()
@@ -212,12 +181,6 @@ def test_vehicle_without_an_origin_is_given_the_datum() -> None:
     assert given.latitude * 1e-7 == pytest.approx(datum.latitude_deg, abs=1e-7)
     assert given.longitude * 1e-7 == pytest.approx(datum.longitude_deg, abs=1e-7)
     assert not vehicle.targets()
-
-
-def test_address_that_cannot_be_opened_is_a_line() -> None:
-    vehicle = Vehicle()
-    with pytest.raises(VehicleError, match="nowhere"):
-        pilot_over_mavlink(vehicle.mission, "nowhere:1:2:3", sim_time=False)
 
 
 @pytest.mark.slow

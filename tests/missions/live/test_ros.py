@@ -3,7 +3,6 @@
 import json
 import math
 import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -18,7 +17,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.artefacts import read_csv
 from alice_survey.core.config import SurveyConfig, load_config
-from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array, attitude_from_rotation, interpolate_poses
 from alice_survey.core.trajectory import read_track
 from alice_survey.sim.vehicle.sea import floor_depth
@@ -28,9 +26,7 @@ from missions.coverage.stations import Stations, plan_pattern, stations_of_fligh
 from missions.fly.run import flight_noise, true_floor
 from missions.fly.simulation import flight_settings, simulate_plan
 from missions.live import ros_messages
-from missions.live.loop import LinkLimits, Odometry
-from missions.live.mission import mission_of
-from missions.live.ros_pilot import Topics, pilot_over_ros
+from missions.live.loop import Odometry
 from missions.live.ros_vehicle import START_S, VehicleNode
 from missions.logs.ros_builder import JOINTS, ODOMETRY, WRENCH
 from missions.values.flight import trigger_times
@@ -118,15 +114,6 @@ def test_wrench_and_speeds_come_back() -> None:
     message.name, message.velocity = ["stern", "bow", "port"], [1.0, 2.0, 3.0]
     speeds = ros_messages.speeds_from(message, ("port", "stern", "vertical"))
     np.testing.assert_allclose(speeds * 2 * math.pi, [3.0, 1.0, math.nan])
-
-
-def test_ranges_out_of_bounds_are_no_echo() -> None:
-    build = ros_messages.load_ros().build
-    for value, expected in ((2.0, 2.0), (math.nan, math.inf)):
-        message = build.range(10**9, "alice/dvl", value)
-        assert ros_messages.range_from(message) == expected
-    message.range, message.max_range = 80.0, 75.0
-    assert ros_messages.range_from(message) == math.inf
 
 
 # ------------------------------------------------------------------ the simulated vehicle
@@ -387,20 +374,3 @@ def test_lost_odometry_stops_then_surfaces(
     assert diving.returncode == 1
     assert diving.stdout is not None
     assert diving.stdout.read().startswith("given up: ")
-
-
-@pytest.mark.slow
-def test_interrupted_pilot_leaves_the_thrusters_off(
-    diving: subprocess.Popen[str], navigator: Navigator
-) -> None:
-    diving.send_signal(signal.SIGTERM)
-    ends_without_thrust(diving, navigator, 1.0)
-    assert diving.returncode == 128 + signal.SIGTERM
-
-
-def test_topic_that_cannot_be_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in DOMAIN.items():
-        monkeypatch.setenv(name, value)
-    mission = mission_of(small_plan(), flight_settings(SurveyConfig()), LinkLimits())
-    with pytest.raises(VehicleError, match="2 odometry"):
-        pilot_over_ros(mission, Topics(odometry="2 odometry"), sim_time=True)

@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.frames import Datum, rotation_from_attitude
 from missions.logs.bag import BagRecord, write_bag
 from missions.logs.ros_builder import flipped_body, flipped_quaternion, flipped_world
@@ -85,15 +83,6 @@ def test_frames_are_those_of_ros_and_come_back() -> None:
     np.testing.assert_array_equal(flipped_body(flipped_body(points)), points)
 
 
-def test_a_vehicle_that_heads_east_has_no_rotation_in_ros() -> None:
-    east = rotation_from_attitude(0.0, 0.0, np.pi / 2).as_quat()
-    np.testing.assert_allclose(flipped_quaternion(east), [0, 0, 0, 1], atol=1e-15)
-    north = rotation_from_attitude(0.0, 0.0, 0.0).as_quat()
-    np.testing.assert_allclose(
-        flipped_quaternion(north), [0, 0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-15
-    )
-
-
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Any]]:
     """Messages of a written flight."""
@@ -158,17 +147,6 @@ def test_ranges_and_thrusters(found: dict[str, list[Any]]) -> None:
     assert (datum.latitude, datum.longitude, datum.altitude) == (32.83, 34.95, 17.5)
 
 
-def test_ros_tools_open_the_folder(tmp_path: Path) -> None:
-    """As `ros2 bag` does: by metadata.yaml, and messages in the order of their times."""
-    write_bag(tmp_path / "dive", flight())
-    with AnyReader([tmp_path / "dive"]) as reader:
-        stamps = [stamp for _, stamp, _ in reader.messages()]
-        assert reader.message_count == len(stamps) == 1 + 7 * 40 + 4 * 20
-        kinds = {connection.topic: connection.msgtype for connection in reader.connections}
-    assert stamps == sorted(stamps)
-    assert kinds["/tf"] == "tf2_msgs/msg/TFMessage"
-
-
 def test_the_same_flight_gives_the_same_bytes(tmp_path: Path) -> None:
     later = replace(flight(), time_s=flight().time_s + 1e-9)
     for folder, record in (("a", flight()), ("b", flight()), ("c", later)):
@@ -179,10 +157,3 @@ def test_the_same_flight_gives_the_same_bytes(tmp_path: Path) -> None:
         )
         assert first == second != third
     assert [p.name for p in (tmp_path / "a").iterdir()] == ["dive"]
-
-
-def test_an_existing_folder_stays(tmp_path: Path) -> None:
-    (tmp_path / "dive").mkdir()
-    with pytest.raises(WorkspaceError):
-        write_bag(tmp_path / "dive", flight())
-    assert not list((tmp_path / "dive").iterdir())

@@ -172,13 +172,6 @@ def test_vehicle_log_has_servo_outputs_and_body_velocity(tmp_path: Path) -> None
     assert u > 0.49
 
 
-def test_without_gps_the_times_are_those_since_boot(tmp_path: Path) -> None:
-    log = bin_log(tmp_path, (m for m in dive_messages() if m[0] != "GPS"))
-    data = imported(tmp_path, log)
-    assert not data["dated"]
-    assert numbers(tmp_path / "n.csv", "time_s")[0, 0] == pytest.approx(51.0, abs=1e-6)
-
-
 def test_filter_positions_count_from_its_origin(tmp_path: Path) -> None:
     messages = [m for m in dive_messages() if m[0] != "POS"]
     origin = ("ORGN", BOOT_US, 0, LAT, LON, 0.0)
@@ -279,15 +272,6 @@ def test_a_vehicle_without_positions_logs_what_it_measures(
     if "heading_deg" in known:
         at = read.at(np.array([BOOT_US * 1e-6 + 1.5]))
         assert at["heading_deg"][0] == pytest.approx(359.5, abs=0.02)
-
-
-def test_a_log_without_readings_lists_its_messages(tmp_path: Path) -> None:
-    log = bin_log(tmp_path, (m for m in dive_messages() if m[0] in ("RCOU", "IMU")))
-    with pytest.raises(NavigationError, match="IMU, RCOU"):
-        imported(tmp_path, log)
-    log = bin_log(tmp_path, (m for m in dive_messages() if m[0] == "RFND"))
-    with pytest.raises(NavigationError, match="RFND are of use with an attitude only"):
-        imported(tmp_path, log)
 
 
 def test_damage_costs_what_is_damaged_and_is_counted(tmp_path: Path) -> None:
@@ -458,13 +442,3 @@ def test_what_is_no_submarine_is_said(tmp_path: Path, capsys: pytest.CaptureFixt
     said = capsys.readouterr().err
     assert "the log is of an aeroplane that starts upright, not of a submarine" in said
     assert f"{data['rows']} of {data['rows']} rows lie above the water, by 63.4 m" in said
-
-
-def test_a_ground_station_beside_a_submarine_is_no_vehicle(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log = tmp_path / "dive.tlog"
-    beats = [(t, mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)) for t, _ in telemetry(2)]
-    log.write_bytes(tlog(telemetry()) + tlog(beats) + tlog(beats, system=255))
-    imported(tmp_path, log)
-    assert "submarine" not in capsys.readouterr().err

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin
-from scipy.spatial.transform import Rotation
 
 from alice_survey.core.errors import NavigationError
 from alice_survey.core.frames import Datum, attitude_from_rotation, rotation_from_attitude
@@ -162,13 +161,6 @@ def test_odometry_in_either_convention(tmp_path: Path, frame: str) -> None:
     np.testing.assert_allclose(vehicle.rates_body[0], [0.01, 0.02, 0.03], atol=1e-9)
 
 
-def test_odometry_needs_an_origin(tmp_path: Path) -> None:
-    bag = Bag(2)
-    bag.add_odometry(START, "/odom", "odom", (0, 0, 0), (0, 0, 0, 1))
-    with pytest.raises(NavigationError, match="--datum"):
-        imported(bag, tmp_path)
-
-
 def plain_bag() -> Bag:
     """GPS, pressure, attitude and a range at rates of their own."""
     bag = Bag(2)
@@ -239,25 +231,6 @@ def test_gaps_wild_times_and_missing_values_are_reported(
     assert "25.0 s" in warned
 
 
-def test_values_are_not_carried_across_gaps(tmp_path: Path) -> None:
-    """Pressure stops for 8 s: positions stay. Fixes stop for 8 s: depths stay."""
-    whole = plain_bag()
-    lost = np.array([6.5, 7.0, 11.0])
-    for topic, gone, left in (
-        ("/pressure", "depth_m", "latitude_deg"),
-        ("/gps/fix", "latitude_deg", "depth_m"),
-    ):
-        bag = Bag(2)
-        bag.rows = [row for row in whole.rows if row[1] != topic or not 5e9 < row[0] - START < 13e9]
-        import_log(bag.write(tmp_path / gone), tmp_path / "n.csv")
-        read = read_navigation(tmp_path / "n.csv", UTC, ())
-        at = read.at(np.append(lost, 3.5))
-        expected = {"latitude_deg": 41.0 + 1e-6 * lost, "depth_m": 2.0 + 0.1 * lost}
-        np.testing.assert_allclose(at[left][:3], expected[left], atol=1e-4, rtol=0)
-        assert np.all(np.isnan(at[gone][:3]))
-        assert np.isfinite(at[gone][3])
-
-
 def test_several_candidates_need_a_choice(tmp_path: Path) -> None:
     bag = cola2_bag(2)
     for i in range(5):
@@ -277,13 +250,6 @@ def test_several_candidates_need_a_choice(tmp_path: Path) -> None:
         import_log(log, tmp_path / "n.csv", ImportOptions(topics=("/third",)))
 
 
-def test_a_bag_without_positions_lists_its_topics(tmp_path: Path) -> None:
-    bag = Bag(2)
-    bag.add_range(START, "/sonar", 3.0)
-    with pytest.raises(NavigationError, match="/sonar are of use with an attitude only"):
-        imported(bag, tmp_path)
-
-
 @pytest.mark.parametrize("version", [1, 2])
 @pytest.mark.parametrize("share", [0.02, 0.3, 0.6, 0.97, 0.999])
 def test_a_truncated_bag_is_one_clear_line(tmp_path: Path, version: int, share: float) -> None:
@@ -295,50 +261,6 @@ def test_a_truncated_bag_is_one_clear_line(tmp_path: Path, version: int, share: 
         import_log(log, tmp_path / "n.csv")
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "n.csv").exists()
-
-
-def test_a_bathymetric_grid_is_no_bag(shared_data: Path, tmp_path: Path) -> None:
-    grid = next((shared_data / "bathymetry").glob("*.bag"))
-    with pytest.raises(NavigationError, match=grid.name):
-        import_log(grid, tmp_path / "n.csv")
-
-
-def test_zero_quaternions_are_no_attitude(tmp_path: Path) -> None:
-    bag = Bag(2)
-    for i in range(4):
-        turn = Rotation.identity().as_quat() if i else np.zeros(4)
-        bag.add_odometry(START + i * 10**8, "/odom", "ned", (0, 0, 1), turn)
-    data = imported(bag, tmp_path, datum_deg=(41.0, 3.0))
-    assert data["left_out"] == {"/odom: quaternions that are not of length 1": 1}
-    assert rows_of(tmp_path / "n.csv")[0]["roll_deg"] == ""
-
-
-def test_header_times_count_and_not_those_of_the_recording(tmp_path: Path) -> None:
-    bag = cola2_bag(1, 5)
-    bag.rows = [(stamp + 700_000_000, *rest) for stamp, *rest in bag.rows]
-    imported(bag, tmp_path)
-    start = datetime.fromtimestamp(START / 1e9, UTC)
-    assert read_navigation(tmp_path / "n.csv", UTC).start_utc == start
-
-
-def test_headers_without_a_time_have_that_of_the_recording(tmp_path: Path) -> None:
-    bag = Bag(2)
-    for i in range(3):
-        bag.add_nav_sts(0, (41.0, 3.0, 5.0), (0.0, 0.0, 0.0), 2.0)
-        bag.rows[-1] = (START + i * 10**8, *bag.rows[-1][1:])
-    data = imported(bag, tmp_path)
-    assert data["notes"] == [f"{TOPIC}: 3 headers without a time have that of their recording"]
-    read = read_navigation(tmp_path / "n.csv", UTC)
-    np.testing.assert_allclose(read.time_s, [0, 0.1, 0.2], atol=2e-6)
-
-
-def test_nothing_is_written_over(tmp_path: Path) -> None:
-    log = cola2_bag(1, 3).write(tmp_path / "d.bag")
-    with pytest.raises(NavigationError):
-        import_log(log, log)
-    options = ImportOptions(vehicle_log=tmp_path / "n.csv")
-    with pytest.raises(NavigationError):
-        import_log(log, tmp_path / "n.csv", options)
 
 
 def test_old_bags_without_definitions_and_lone_files(tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from alice_survey.core.errors import NavigationError
 from alice_survey.core.frames import Array, Datum, rotation_from_attitude
@@ -75,17 +74,6 @@ def test_a_circle_closes(tmp_path: Path, version: int, twist: str | None) -> Non
         np.testing.assert_allclose(altitude, 2.0 * np.cos(np.deg2rad(5.0)), atol=1e-4)
 
 
-def test_declination_turns_the_track(tmp_path: Path) -> None:
-    log = dive().write(tmp_path / "d")
-    options = ImportOptions(dead_reckon=TrackErrors(), declination_deg=12.0)
-    import_log(log, tmp_path / "n.csv", options)
-    _, _, places = circle()
-    turned = Rotation.from_euler("z", 12.0, degrees=True).apply(
-        np.column_stack([places, 0 * places[:, 0]])
-    )
-    np.testing.assert_allclose(track(tmp_path / "n.csv")[:, :2], turned[:, :2], atol=2e-3)
-
-
 def test_without_a_fix_a_start_is_asked_for_and_used(tmp_path: Path) -> None:
     log = dive(fix=False).write(tmp_path / "d")
     with pytest.raises(NavigationError, match="--start-at"):
@@ -138,20 +126,7 @@ def test_reports_of_a_water_linked_dvl_close_the_circle(tmp_path: Path) -> None:
     assert data["left_out"] == {"lines that are no report": 1}
 
 
-def test_reports_without_times_are_refused(tmp_path: Path) -> None:
-    log = tmp_path / "dvl.json"
-    log.write_text("\n".join(reports(stamped=False)))
-    with pytest.raises(NavigationError, match="time_of_validity"):
-        import_log(log, tmp_path / "n.csv")
-
-
 def test_velocities_of_the_world_are_refused(tmp_path: Path) -> None:
     log = dive(twist="odom").write(tmp_path / "d")
     with pytest.raises(NavigationError, match="does not turn with the body"):
         import_log(log, tmp_path / "n.csv", ImportOptions(dead_reckon=TrackErrors()))
-
-
-@pytest.mark.parametrize("start", [(91.0, 5.0, 1.0), (43.0, 5.0, 0.0), (43.0, np.nan, 1.0)])
-def test_a_start_that_is_none_is_refused(start: tuple[float, float, float]) -> None:
-    with pytest.raises(NavigationError, match="--start-at"):
-        ImportOptions(dead_reckon=TrackErrors(), start_at=start)

@@ -11,7 +11,7 @@ import pytest
 from alice_survey.core.errors import NavigationError
 from alice_survey.core.frames import Datum
 from missions.logs.dead_reckoning import TrackErrors
-from missions.logs.import_log import ImportOptions, import_log, read_dive
+from missions.logs.import_log import ImportOptions, import_log
 from tests.missions.logs.test_import_bag import numbers
 
 BOOT_US = 60_000_000
@@ -143,22 +143,6 @@ def test_velocities_reckon_between_fixes(tmp_path: Path) -> None:
     ned = ORIGIN.ned_from_geodetic(place)
     np.testing.assert_allclose(ned[-1] - ned[0], [0.5 * 4.9, 0.25 * 4.9, 0.0], atol=1e-3)
     assert data["sources"]["position"] == "vehicle_local_position, dead reckoning"
-
-
-def test_without_a_fix_there_are_no_dates(tmp_path: Path) -> None:
-    data = imported(tmp_path, ulog(dive()[3:]))
-    assert not data["dated"]
-    assert data["start"] == pytest.approx(BOOT_US * 1e-6 + 2.0)
-
-
-def test_a_log_that_was_written_on_after_a_crash_is_read(tmp_path: Path) -> None:
-    first, whole = ulog(dive(20)), ulog(dive(30))
-    rest = whole[len(first) :]
-    cut = len(first) - 10
-    data = ulog(dive(20), incompatible=1, appended=cut)[:cut] + rest
-    (tmp_path / "a.ulg").write_bytes(data)
-    found = read_dive(tmp_path / "a.ulg", ImportOptions())
-    assert found.position is not None and len(found.position.time_s) == 20
 
 
 def test_damaged_and_other_logs_end_in_one_line(tmp_path: Path) -> None:

@@ -96,20 +96,6 @@ def test_a_useless_log_gives_one_line(tmp_path: Path, header: str, rows: list[st
     assert "\n" not in str(fault.value)
 
 
-def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
-    for content in (None, b"\xff\xfe\x00time"):
-        if content is not None:
-            (tmp_path / "nav.csv").write_bytes(content)
-        with pytest.raises(NavigationError, match=r"nav\.csv"):
-            read_navigation(tmp_path / "nav.csv", UTC)
-
-
-@pytest.mark.parametrize("name", ["Mars/Olympus", "../../etc/passwd", ""])
-def test_unknown_time_zones_are_refused(name: str) -> None:
-    with pytest.raises(NavigationError, match="--time-zone"):
-        find_zone(name)
-
-
 def test_pictures_without_navigation_are_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -118,16 +104,6 @@ def test_pictures_without_navigation_are_named(
     warned = capsys.readouterr().err
     assert "b.jpg" in warned
     assert "a.jpg" not in warned
-
-
-@pytest.mark.parametrize("date", ["0001-01-01T00:00:00+23:59", "9999-12-31T23:59:59-12:00"])
-def test_dates_that_no_clock_in_utc_shows_are_left_out(
-    tmp_path: Path, date: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    header = HEADER.replace("time_s", "time_utc")
-    rows = [f"{date},60,5,1,0,2", "2024-05-01T12:00:00Z,60,5,1,0,2"]
-    assert len(read_navigation(log_file(tmp_path, *rows, header=header), UTC).time_s) == 1
-    assert "line 2" in capsys.readouterr().err
 
 
 def test_any_one_reading_is_enough_where_none_is_needed(tmp_path: Path) -> None:
@@ -149,10 +125,3 @@ def test_each_reading_has_gaps_of_its_own(tmp_path: Path) -> None:
     )
     np.testing.assert_allclose(found["latitude_deg"], [60.125, np.nan, 62.2])
     np.testing.assert_allclose(found["depth_m"], [1.25, 15.0, 22.0])
-
-
-def test_fixes_at_both_ends_of_a_dive_give_no_position_between(tmp_path: Path) -> None:
-    rows = [f"{t},{60 if t in (0, 600) else ''},{5 if t in (0, 600) else ''},4" for t in range(601)]
-    header = "time_s,latitude_deg,longitude_deg,depth_m"
-    log = read_navigation(log_file(tmp_path, *rows, header=header), UTC, ())
-    assert np.isnan(log.at(np.array([300.0]))["latitude_deg"][0])
