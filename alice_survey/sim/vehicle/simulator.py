@@ -282,6 +282,12 @@ class TickRows(NamedTuple):
 
 
 @kernel
+def _record(values: Array, row: Array) -> None:
+    for i in range(row.shape[0]):
+        row[i] = values[i]
+
+
+@kernel
 def _fly_ticks(
     first: int,
     vehicle: VehicleParts,
@@ -294,7 +300,6 @@ def _fly_ticks(
     plant, sea, floor, sensors, navigation, world, scratch = vehicle
     path, mission, guidance, gains, pilot, wrench, allocation = piloting
     count, flown = rows.state.shape[0], 0
-    thrusters = rows.command_rps.shape[1]
     for k in range(count):
         tick = first + k
         sense(tick, sea, floor, sensors, navigation, world, rng)
@@ -308,8 +313,11 @@ def _fly_ticks(
             pilot.report[slot.PHASE], pilot.report[slot.REASON] = slot.ABORT, TOUCHED
         allocate(wrench, world.estimate, allocation)
 
-        rows.state[k], rows.truth[k], rows.wrench[k] = world.state, world.now, wrench
-        rows.report[k], rows.command_rps[k] = pilot.report, allocation.command[:thrusters]
+        _record(world.state, rows.state[k])
+        _record(world.now, rows.truth[k])
+        _record(wrench, rows.wrench[k])
+        _record(pilot.report, rows.report[k])
+        _record(allocation.command, rows.command_rps[k])
         electrical_power(
             plant.propulsion, world.state[STATE:], world.state[7:STATE], rows.power_w[k]
         )
