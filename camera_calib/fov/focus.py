@@ -124,11 +124,6 @@ def axial_pixel_m(camera: Camera) -> tuple[float, float]:
     return 2.0 * first - second, second - first
 
 
-def air_rays(camera: Camera, pixels: Array) -> Array:
-    """Unit directions in air, (..., 3), of pixels: before the port bends them."""
-    return camera.in_air().unproject(pixels)[1]
-
-
 def apparent_depths(camera: Camera, pixels: Array) -> ApparentDepths:
     """Apparent depths of sea floors square to the camera's axis, for pixels (N, 2).
 

@@ -1,7 +1,6 @@
 """One figure of what lenses see through a flat port: four panels."""
 
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +14,21 @@ from alice_survey.kit.figure import (
     save_figure,
 )
 from camera_calib.fov.paper import PAPER_TABLE
-from camera_calib.fov.table import FovChoices, FovRow
+from camera_calib.fov.table import FovRow
 
-FovTable = Callable[[Sequence[float], FovChoices], list[FovRow]]
-"""Rows of all lenses at altitudes, lenses outside."""
+FovTable = Callable[[Sequence[float], float], list[FovRow]]
+"""Rows of all lenses at altitudes, for a blur circle that counts as sharp, px."""
+_ByLens = dict[float, list[FovRow]]
 
 _STYLES = ("-", "--", ":", "-.")
 _CURVE_POINTS = 30
+_COC_PX = 1.0, 3.0
+_PANELS = (
+    ("Footprint", "m", {"horizontal_m": "wide", "vertical_m": "high"}, ("horizontal", "vertical")),
+    ("Pixel on the sea floor", "mm", {"pixel_centre_mm": "centre", "pixel_corner_mm": "corner"},
+     ("pixel",)),
+)  # fmt: skip
+"""Title, unit, fields with their names in the legend, and the paper's quantities."""
 
 
 @figure_style()
@@ -29,7 +36,6 @@ def draw_fov(
     path: Path,
     table: FovTable,
     altitudes_m: Sequence[float],
-    choices: FovChoices,
     *,
     speeds_mps: Sequence[float],
     exposures_s: Sequence[float],
@@ -42,7 +48,6 @@ def draw_fov(
         path: ends in .png, .svg or .pdf; the same input gives the same bytes.
         table: rows of all lenses at given altitudes.
         altitudes_m: altitudes of interest; the curves go some way beyond them.
-        choices: circle of confusion and focus.
         speeds_mps: speeds of the blur curves.
         exposures_s: exposures of interest; marked.
         allowed_px: blur that is allowed; marked.
@@ -52,38 +57,40 @@ def draw_fov(
         ConfigError: another suffix, or the file cannot be written.
     """
     check_figure_path(path)
-    marked = _by_lens(table(altitudes_m, choices))
+    marked = _by_lens(table(altitudes_m, _COC_PX[0]))
     low, high = 0.25 * min(altitudes_m), 1.5 * max(altitudes_m)
-    curve = np.linspace(max(low, 0.01), high, _CURVE_POINTS).tolist()
-    curves = _by_lens(table(curve, choices))
-    soft = _by_lens(table(curve, replace(choices, coc_px=3 * choices.coc_px)))
+    heights = np.linspace(max(low, 0.01), high, _CURVE_POINTS).tolist()
+    sharp, soft = (_by_lens(table(heights, coc_px)) for coc_px in _COC_PX)
 
     figure = new_figure(9.4, 10.4)
     panels = figure.subplots(2, 2)
-    for axes, title, unit, series, printed in (
-        (panels[0, 0], "Footprint", "m", (("horizontal_m", "wide"), ("vertical_m", "high")),
-         ("horizontal", "vertical")),
-        (panels[0, 1], "Pixel on the sea floor", "mm",
-         (("pixel_centre_mm", "centre"), ("pixel_corner_mm", "corner")), ("pixel",)),
-    ):  # fmt: skip
-        _curves(axes, curves, marked, series)
-        if paper:
-            _paper(axes, printed, curves)
-        axes.set_title(title)
-        axes.set_ylabel(unit)
+    for axes, (title, unit, fields, quantities) in zip(panels[0], _PANELS, strict=True):
+        for i, (lens_mm, rows) in enumerate(sharp.items()):
+            for style, (field, label) in zip(_STYLES, fields.items(), strict=False):
+                axes.plot(heights, _values(rows, field), style, color=_colour(i),
+                          label=f"{lens_mm:.4g} mm {label}")  # fmt: skip
+                axes.plot(altitudes_m, _values(marked[lens_mm], field), "o", ms=4, color=_colour(i))
+        printed = [
+            float(value) for lens_mm, quantity, _, value in PAPER_TABLE
+            if paper and quantity in quantities and lens_mm in sharp
+        ]  # fmt: skip
+        if printed:
+            axes.plot([2.0] * len(printed), printed, "kx", ms=7, mew=1.6, label="paper", zorder=5)
+        axes.set(title=title, ylabel=unit, xlabel="altitude of the outer glass, m")
+        axes.set_xlim(left=0)
+        axes.set_ylim(bottom=0)
         axes.legend(fontsize=9)
-    _depth_of_field(panels[1, 0], curves, soft, choices)
+    _depth_of_field(panels[1, 0], sharp, soft)
     _blur(panels[1, 1], marked, speeds_mps, exposures_s, allowed_px)
     first = next(iter(marked.values()))[0]
     figure.suptitle(
-        f"Through a flat port: n {first.n_water:.4g}, {first.port} before the pupil",
-        fontsize=13,
+        f"Through a flat port: n {first.n_water:.4g}, {first.port} before the pupil", fontsize=13
     )
     save_figure(figure, path, dpi=120)
 
 
-def _by_lens(rows: Sequence[FovRow]) -> dict[float, list[FovRow]]:
-    lenses: dict[float, list[FovRow]] = {}
+def _by_lens(rows: Sequence[FovRow]) -> _ByLens:
+    lenses: _ByLens = {}
     for row in rows:
         lenses.setdefault(round(row.lens_mm, 6), []).append(row)
     return lenses
@@ -93,114 +100,50 @@ def _colour(i: int) -> str:
     return INKS[i % len(INKS)]
 
 
-def _values(rows: Sequence[FovRow], name: str) -> list[float]:
-    return [getattr(row, name) for row in rows]
+def _values(rows: Sequence[FovRow], field: str) -> list[float]:
+    return [getattr(row, field) for row in rows]
 
 
-def _curves(
-    axes: Axes,
-    curves: dict[float, list[FovRow]],
-    marked: dict[float, list[FovRow]],
-    series: Sequence[tuple[str, str]],
-) -> None:
-    """Fields of all lenses against altitude, each with a style of line; the marked ones as dots.
-
-    Args:
-        axes: where to draw.
-        curves: rows by lens, along the altitude.
-        marked: rows by lens, at altitudes of interest.
-        series: name of the field, and what it is called in the legend.
-    """
-    for i, (lens, rows) in enumerate(curves.items()):
-        for (name, called), style in zip(series, _STYLES, strict=False):
-            axes.plot(
-                _values(rows, "altitude_m"), _values(rows, name), style, color=_colour(i),
-                label=f"{lens:.4g} mm {called}".rstrip(),
-            )  # fmt: skip
-            axes.plot(
-                _values(marked[lens], "altitude_m"), _values(marked[lens], name),
-                "o", ms=4, color=_colour(i),
-            )  # fmt: skip
-    axes.set_xlabel("altitude of the outer glass, m")
-    axes.set_xlim(left=0)
-    axes.set_ylim(bottom=0)
-
-
-def _paper(axes: Axes, quantities: Sequence[str], lenses: Collection[float]) -> None:
-    printed = [
-        float(value)
-        for lens, quantity, _, value in PAPER_TABLE
-        if quantity in quantities and lens in lenses
-    ]
-    if printed:
-        axes.plot(
-            [2.0] * len(printed), printed, "x", ms=7, mew=1.6, color="black", label="paper",
-            zorder=5,
-        )  # fmt: skip
-
-
-def _depth_of_field(
-    axes: Axes,
-    curves: dict[float, list[FovRow]],
-    soft: dict[float, list[FovRow]],
-    choices: FovChoices,
-) -> None:
-    altitude = _values(next(iter(curves.values())), "altitude_m")
+def _depth_of_field(axes: Axes, sharp: _ByLens, soft: _ByLens) -> None:
+    first = next(iter(sharp.values()))
+    altitude = _values(first, "altitude_m")
     top = 2.0 * max(altitude)
-    for i, (lens, rows) in enumerate(curves.items()):
-        for band, style in ((soft[lens], "--"), (rows, "-")):
+    for i, (lens_mm, rows) in enumerate(sharp.items()):
+        for band, style in ((soft[lens_mm], "--"), (rows, "-")):
             near = _values(band, "near_altitude_m")
             far = np.minimum(_values(band, "far_altitude_m"), 2 * top)
-            label = f"{lens:.4g} mm, {band[0].coc_px:g} px"
+            label = f"{lens_mm:.4g} mm, {band[0].coc_px:g} px"
             axes.plot(altitude, near, style, color=_colour(i), lw=1.2, label=label)
             axes.plot(altitude, far, style, color=_colour(i), lw=1.2)
             if band is rows:
                 axes.fill_between(altitude, near, far, color=_colour(i), alpha=0.22, lw=0)
     axes.plot(altitude, altitude, color="black", lw=0.9, ls=":", label="the sea floor")
-    where = (
-        "focused on the sea floor"
-        if choices.focus_air_m is None
-        else f"focused at {choices.focus_air_m:g} m in air"
-    )
-    f_number = next(iter(curves.values()))[0].f_number
-    axes.set_title(f"Depth of field at the centre, F/{f_number:g},\n{where}")
-    axes.set_xlabel("altitude of the outer glass, m")
-    axes.set_ylabel("altitudes that are sharp, m")
-    axes.set_xlim(0, max(altitude))
-    axes.set_ylim(0, top)
+    axes.set_title(f"Depth of field at the centre, F/{first[0].f_number:g},\n"
+                   "focused on the sea floor")  # fmt: skip
+    axes.set(xlabel="altitude of the outer glass, m", ylabel="altitudes that are sharp, m")
+    axes.set(xlim=(0, max(altitude)), ylim=(0, top))
     axes.legend(facecolor="white", edgecolor="none", framealpha=0.8, fontsize=9, loc="upper left")
 
 
 def _blur(
     axes: Axes,
-    marked: dict[float, list[FovRow]],
+    marked: _ByLens,
     speeds_mps: Sequence[float],
     exposures_s: Sequence[float],
     allowed_px: float,
 ) -> None:
-    low, high = 0.2 * min(exposures_s), 5.0 * max(exposures_s)
-    exposure = np.geomspace(low, high, 2)
-    altitude = next(iter(marked.values()))[0].altitude_m
-    for i, (lens, rows) in enumerate(marked.items()):
-        pixel_m = rows[0].pixel_centre_mm * 1e-3
+    ends_ms = 1e3 * np.array([0.2 * min(exposures_s), 5.0 * max(exposures_s)])
+    at_ms = 1e3 * np.asarray(exposures_s)
+    for i, (lens_mm, rows) in enumerate(marked.items()):
         for k, speed in enumerate(speeds_mps):
-            axes.loglog(
-                exposure * 1e3, speed * exposure / pixel_m, _STYLES[k % len(_STYLES)],
-                color=_colour(i), label=f"{lens:.4g} mm, {speed:g} m/s",
-            )  # fmt: skip
-            axes.plot(
-                np.asarray(exposures_s) * 1e3, speed * np.asarray(exposures_s) / pixel_m, "o",
-                ms=4, color=_colour(i),
-            )  # fmt: skip
-    axes.axhline(allowed_px, color="black", lw=0.9, ls="--")
-    axes.annotate(
-        f"{allowed_px:g} px", (high * 1e3, allowed_px), ha="right", va="bottom", fontsize=9,
-        xytext=(-2, 2), textcoords="offset points",
-    )  # fmt: skip
+            per_ms = speed / rows[0].pixel_centre_mm
+            axes.loglog(ends_ms, per_ms * ends_ms, _STYLES[k % len(_STYLES)], color=_colour(i),
+                        label=f"{lens_mm:.4g} mm, {speed:g} m/s")  # fmt: skip
+            axes.plot(at_ms, per_ms * at_ms, "o", ms=4, color=_colour(i))
+    axes.axhline(allowed_px, color="black", lw=0.9, ls="--", label=f"{allowed_px:g} px")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter("{x:g}")
-    axes.set_title(f"Motion blur at {altitude:g} m altitude")
-    axes.set_xlabel("exposure, ms")
-    axes.set_ylabel("px")
-    axes.set_xlim(low * 1e3, high * 1e3)
+    altitude = next(iter(marked.values()))[0].altitude_m
+    axes.set(title=f"Motion blur at {altitude:g} m altitude", xlabel="exposure, ms", ylabel="px")
+    axes.set_xlim(*ends_ms)
     axes.legend(fontsize=9)

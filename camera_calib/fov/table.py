@@ -18,11 +18,7 @@ from alice_survey.core.config import CameraConfig, WaterConfig
 from alice_survey.core.errors import ConfigError
 from alice_survey.core.frames import Array
 from camera_calib.camera import Camera
-from camera_calib.fov.focus import (
-    FocusedLens,
-    air_rays,
-    apparent_depths,
-)
+from camera_calib.fov.focus import FocusedLens, apparent_depths
 from camera_calib.ports.flat import FlatPort
 from camera_calib.rig import Rig, design_rig
 
@@ -38,24 +34,6 @@ _POINTS_PER_SIDE = 16
 
 TRUSTED_FOV_DEG = FlatPort.trusted_deg
 """Full angle in air up to which the paper trusts a flat port (its section III.B)."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class FovChoices:
-    """Settings of a table of fields of view besides lenses, altitudes, water and port."""
-
-    coc_px: float = 1.0
-    """Largest blur circle that counts as sharp."""
-    focus_air_m: float | None = None
-    """Distance in air that the lens is set to; the sea floor's own when None."""
-    match_sigma_px: float = MATCH_SIGMA_PX
-    """Noise of a disparity between the two cameras."""
-
-    def __post_init__(self) -> None:
-        check_range("coc", [self.coc_px], 1e-3, 1e3, "px")
-        check_range("match_sigma", [self.match_sigma_px], 1e-6, 1e3, "px")
-        if self.focus_air_m is not None:
-            check_range("focus in air", [self.focus_air_m], 1e-3, 1e6, "m")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,7 +122,7 @@ def fov_table(
     altitudes_m: Sequence[float],
     n_water: float,
     camera_config: CameraConfig,
-    choices: FovChoices | None = None,
+    coc_px: float = 1.0,
 ) -> list[FovRow]:
     """Footprint, resolution, focus and stereo of lenses at altitudes, through the port as designed.
 
@@ -153,7 +131,7 @@ def fov_table(
         altitudes_m: altitudes of the left port's outer glass above a level sea floor.
         n_water: index of refraction of the water; 1 is air.
         camera_config: sensor, port, baseline and f-number.
-        choices: circle of confusion, focus, matching noise.
+        coc_px: largest blur circle that counts as sharp.
 
     Returns:
         One row per lens and altitude, lenses outside.
@@ -170,7 +148,7 @@ def fov_table(
     for lens_mm in map(float, lenses_mm):
         config = camera_config.model_copy(update={"focal_mm": lens_mm})
         rig = design_rig(config, WaterConfig(n_water=n_water))
-        rows += rig_fov_table(rig, altitudes_m, config, choices, lens_mm * 1e-3)
+        rows += rig_fov_table(rig, altitudes_m, config, coc_px, lens_mm * 1e-3)
     return rows
 
 
@@ -178,7 +156,7 @@ def rig_fov_table(
     rig: Rig,
     altitudes_m: Sequence[float],
     camera_config: CameraConfig,
-    choices: FovChoices | None = None,
+    coc_px: float = 1.0,
     focal_m: float | None = None,
 ) -> list[FovRow]:
     """The same of a calibrated rig, with its lens distortion, port tilt and relative pose.
@@ -187,7 +165,7 @@ def rig_fov_table(
         rig: the first camera is the left one, the second its partner.
         altitudes_m: of the first camera's outer glass, where the normal of its pupil meets it.
         camera_config: `pixel_um` and `f_number`, which a rig does not have; the rest is not used.
-        choices: circle of confusion, focus, matching noise.
+        coc_px: largest blur circle that counts as sharp.
         focal_m: focal length of the lens; from its image distance when not given.
 
     Returns:
@@ -197,10 +175,7 @@ def rig_fov_table(
         ConfigError: as `fov_table`.
     """
     check_range("altitude", altitudes_m, 0.01, 1000.0, "m")
-    return [
-        _row(rig, camera_config, float(altitude), choices or FovChoices(), focal_m)
-        for altitude in altitudes_m
-    ]
+    return [_row(rig, camera_config, float(one), coc_px, focal_m) for one in altitudes_m]
 
 
 def blur_table(
@@ -255,7 +230,7 @@ def check_range(
 
 
 def _row(
-    rig: Rig, config: CameraConfig, altitude_m: float, choices: FovChoices, focal_m: float | None
+    rig: Rig, config: CameraConfig, altitude_m: float, coc_px: float, focal_m: float | None
 ) -> FovRow:
     camera = rig.cameras[rig.reference]
     pixel_m = config.pixel_um * 1e-6
@@ -270,21 +245,24 @@ def _row(
     centre = np.array([w / 2, h / 2])
     pixel_mm = _pixel_sizes_mm(camera, np.vstack([centre, corner_pixels]), floor_z)
     if not (np.all(np.isfinite(edges)) and np.all(np.isfinite(pixel_mm))):
-        raise ConfigError(f"lens {lens_mm:g} mm: light of the frame's edge finds no way out")
+        raise ConfigError(f"lens {lens_mm:g} mm: no light reaches the edge of the frame")
 
     seen = apparent_depths(camera, np.vstack([centre, corners]))
     depths = seen.at(altitude_m)
     focus_air_m = float(2.0 / np.sum(1.0 / depths[0]))
-    focus_m = focus_air_m if choices.focus_air_m is None else choices.focus_air_m
     # A calibrated focal length is the image distance, at the focus it was calibrated at.
-    focal = focal_m or 1.0 / (1.0 / image_m + 1.0 / focus_m)
-    lens = FocusedLens(focal_m=focal, f_number=config.f_number, pixel_m=pixel_m, focus_m=focus_m)
+    lens = FocusedLens(
+        focal_m=focal_m or 1.0 / (1.0 / image_m + 1.0 / focus_air_m),
+        f_number=config.f_number,
+        pixel_m=pixel_m,
+        focus_m=focus_air_m,
+    )
     at_centre = apparent_depths(camera, centre[None])
-    near, far = at_centre.sharp_altitudes_m(lens, choices.coc_px)
-    frame_near, frame_far = seen.sharp_altitudes_m(lens, choices.coc_px)
-    hyperfocal = lens.hyperfocal_m(choices.coc_px)
+    near, far = at_centre.sharp_altitudes_m(lens, coc_px)
+    frame_near, frame_far = seen.sharp_altitudes_m(lens, coc_px)
+    hyperfocal = lens.hyperfocal_m(coc_px)
     blur = lens.blur_px(depths)
-    air_deg = _widest_deg(air_rays(camera, corners))
+    air_deg = _widest_deg(camera.in_air().unproject(corners)[1])
     sure_m = sure_size_m(camera, floor_z)
     return FovRow(
         lens_mm=lens_mm,
@@ -302,16 +280,14 @@ def _row(
         diagonal_water_deg=_widest_deg(camera.unproject(corners)[1]),
         baseline_m=rig.baseline_m,
         stereo_overlap=stereo_overlap(rig, floor_z),
-        depth_sigma_mm=choices.match_sigma_px / disparity_per_m(rig, floor_z) * 1e3,
-        match_sigma_px=choices.match_sigma_px,
+        depth_sigma_mm=MATCH_SIGMA_PX / disparity_per_m(rig, floor_z) * 1e3,
+        match_sigma_px=MATCH_SIGMA_PX,
         focus_air_m=focus_air_m,
         f_number=config.f_number,
-        coc_px=choices.coc_px,
-        focus_set_m=focus_m,
+        coc_px=coc_px,
+        focus_set_m=focus_air_m,
         hyperfocal_air_m=hyperfocal,
-        hyperfocal_altitude_m=float(
-            np.mean(at_centre.altitudes_m(hyperfocal)),
-        ),
+        hyperfocal_altitude_m=float(np.mean(at_centre.altitudes_m(hyperfocal))),
         near_altitude_m=near,
         far_altitude_m=far,
         depth_of_field_m=far - near,
@@ -364,10 +340,8 @@ def _widest_deg(corner_rays: Array) -> float:
     return float(np.degrees(np.arctan2(sines, (a * b).sum(axis=1))).max())
 
 
-def _pair(rig: Rig) -> tuple[Camera, Camera, RigidTransform] | None:
-    """Left, right and `right_from_left`; None for a single camera."""
-    if len(rig.cameras) < 2:
-        return None
+def _pair(rig: Rig) -> tuple[Camera, Camera, RigidTransform]:
+    """Left, right and `right_from_left`."""
     left, right = list(rig.cameras)[:2]
     right_from_left = rig.cam_from_rig[right] * rig.cam_from_rig[left].inv()
     return rig.cameras[left], rig.cameras[right], right_from_left
@@ -383,10 +357,9 @@ def stereo_overlap(rig: Rig, floor_z_m: float) -> float:
     Returns:
         NaN for a single camera, or where rays of a border never reach the sea floor.
     """
-    pair = _pair(rig)
-    if pair is None:
+    if len(rig.cameras) < 2:
         return math.nan
-    left, right, right_from_left = pair
+    left, right, right_from_left = _pair(rig)
     footprint = left.at_depth(left.border(64), floor_z_m)
     # The sea floor in the right camera's frame: its ray's fall along the left camera's axis.
     outer, directions = right.unproject(right.border(64))
@@ -406,10 +379,9 @@ def disparity_per_m(rig: Rig, floor_z_m: float) -> float:
     The point lies on the sea floor below the middle of the pair; NaN where one camera misses it,
     and for a single camera. The noise of a disparity over this is the depth precision.
     """
-    pair = _pair(rig)
-    if pair is None:
+    if len(rig.cameras) < 2:
         return math.nan
-    left, right, right_from_left = pair
+    left, right, right_from_left = _pair(rig)
     middle = right_from_left.inv().translation / 2
     pixel = left.project(np.array([middle[0], middle[1], floor_z_m]))
     step = 1e-4 * (floor_z_m - float(left.front_cam[2]))

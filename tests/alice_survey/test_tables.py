@@ -81,7 +81,7 @@ def test_files_are_written_or_refused(tmp_path: Path) -> None:
     assert len((tmp_path / "a.csv").read_text().splitlines()) == 3
     assert (tmp_path / "a.png").stat().st_size > 50_000
     with pytest.raises(ConfigError):
-        fov_report(FovOptions(), Output(csv=tmp_path / "missing" / "a.csv"))
+        fov_report(FovOptions(), Output(csv=tmp_path / "a.png" / "a.csv"))
 
 
 def test_validation_has_checks_claims_and_angles(tmp_path: Path) -> None:

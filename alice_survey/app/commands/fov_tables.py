@@ -1,24 +1,17 @@
 """The `fov` command: what a lens sees, and the check of the paper's optics."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from alice_survey.core.artefacts import json_values
+from alice_survey.core.artefacts import json_values, write_csv
 from alice_survey.core.config import CameraConfig, SurveyConfig, load_config, parse_config
 from alice_survey.core.errors import ConfigError, warn
 from camera_calib.formats.rigs import led_by
 from camera_calib.fov.paper import paper_settings, validate_paper
-from camera_calib.fov.table import FovChoices, FovRow, blur_table, fov_table, rig_fov_table
-from camera_calib.fov.text import (
-    as_csv,
-    as_text,
-    fov_csv_rows,
-    fov_tables,
-    validation_csv_rows,
-    validation_tables,
-)
+from camera_calib.fov.table import FovRow, blur_table, fov_table, rig_fov_table
+from camera_calib.fov.text import fov_csv_rows, fov_text, validation_csv_rows, validation_text
 from camera_calib.rig import Rig, port_settings, read_rig
 
 PAPER_LENSES_MM = (12.5, 25.0)
@@ -56,33 +49,32 @@ def fov_report(options: FovOptions, output: Output) -> tuple[str, Any]:
         camera, n_water = _sensor_of(rig, settings.camera)
     lenses = options.lens_mm or ((camera.focal_mm,) if options.survey else PAPER_LENSES_MM)
 
-    def table(altitudes_m: Sequence[float], chosen: FovChoices) -> list[FovRow]:
+    def table(altitudes_m: Sequence[float], coc_px: float = 1.0) -> list[FovRow]:
         if rig is not None:
-            return rig_fov_table(rig, altitudes_m, camera, chosen)
-        return fov_table(lenses, altitudes_m, n_water, camera, chosen)
+            return rig_fov_table(rig, altitudes_m, camera, coc_px)
+        return fov_table(lenses, altitudes_m, n_water, camera, coc_px)
 
     altitudes = options.altitude_m or (settings.plan.altitude_m,)
     speeds = options.speed_mps or (settings.plan.speed_mps,)
     exposures = [ms * 1e-3 for ms in options.exposure_ms or (PAPER_EXPOSURE_MS,)]
     allowed = settings.plan.allowed_blur_px
-    rows = table(altitudes, FovChoices())
+    rows = table(altitudes)
     blur = blur_table(rows, speeds, exposures, allowed)
     if output.csv is not None:
-        _write(output.csv, as_csv(fov_csv_rows(rows, blur)))
+        _write(output.csv, fov_csv_rows(rows, blur))
     if output.plot is not None:
         from camera_calib.fov.plot import draw_fov
 
         draw_fov(
-            output.plot, table, altitudes, FovChoices(), speeds_mps=speeds,
-            exposures_s=exposures, allowed_px=allowed,
-            paper=rig is None and _is_papers(camera),
+            output.plot, table, altitudes, speeds_mps=speeds, exposures_s=exposures,
+            allowed_px=allowed, paper=rig is None and _is_papers(camera),
         )  # fmt: skip
     data = {
         "source": "design values" if rig is None else rig.source,
         "rows": json_values(rows),
         "blur": json_values(blur),
     }
-    return as_text(fov_tables(rows, blur)), data
+    return fov_text(rows, blur), data
 
 
 def validation_report(options: FovOptions, output: Output) -> tuple[str, Any]:
@@ -98,18 +90,18 @@ def validation_report(options: FovOptions, output: Output) -> tuple[str, Any]:
         )
     validation = validate_paper()
     if output.csv is not None:
-        _write(output.csv, as_csv(validation_csv_rows(validation)))
+        _write(output.csv, validation_csv_rows(validation))
     if output.plot is not None:
         from camera_calib.fov.plot import draw_fov
 
         camera, n_water, altitude = paper_settings()
         draw_fov(
             output.plot,
-            lambda heights, chosen: fov_table(PAPER_LENSES_MM, heights, n_water, camera, chosen),
-            [altitude], FovChoices(), speeds_mps=[0.2, 0.5],
+            lambda heights, coc_px: fov_table(PAPER_LENSES_MM, heights, n_water, camera, coc_px),
+            [altitude], speeds_mps=[0.2, 0.5],
             exposures_s=[PAPER_EXPOSURE_MS * 1e-3], allowed_px=1.0, paper=True,
         )  # fmt: skip
-    return as_text(validation_tables(validation)), validation.to_json()
+    return validation_text(validation), validation.to_json()
 
 
 def _settings(options: FovOptions) -> SurveyConfig:
@@ -163,8 +155,8 @@ def _is_papers(camera: CameraConfig) -> bool:
     return all(getattr(camera, key) == CameraConfig.model_fields[key].default for key in sensor)
 
 
-def _write(path: Path, text: str) -> None:
+def _write(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     try:
-        path.write_text(text, encoding="utf-8")
+        write_csv(path, list(rows[0]), [list(row.values()) for row in rows])
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror}") from None

@@ -82,6 +82,7 @@ def render(
     picture = np.empty((camera.height_px, camera.width_px, 3), dtype=np.float32)
     pixel_rad = 1.0 / camera.focal_in_water_px
     table = (light.attenuation_per_m, light.backscatter, light.reach_m)
+    rest = np.empty((0, 3), np.float32) if patch.to_rest is None else patch.to_rest
     for first, last in ray_bands(camera, samples):
         rays = camera_rays(camera, samples, first, last)
         moments = _moments(last - first, camera.width_px, samples, len(places), first)
@@ -91,19 +92,10 @@ def render(
         lit = _visible_strobes(
             patch, light, world, path, moments, rotations, places, samples, shape
         )
-        points, normals, material = _surface(
-            world,
-            path,
-            triangle,
-            uv,
-            patch.vertices,
-            patch.triangles,
-            patch.normals,
-            patch.material,
-        )
-        footprint = _footprints(path, normals, world, np.float32(pixel_rad / samples))
-        if patch.to_rest is not None:
-            points += _between_corners(path, triangle, uv, patch.triangles, patch.to_rest)
+        points, normals, material, footprint = _surface(
+            world, path, triangle, uv, patch.triangles, patch.normals, patch.material, rest,
+            np.float32(pixel_rad / samples),
+        )  # fmt: skip
         albedo = scene.texture.albedo(points + patch.origin_ned, material, footprint)
         _shade(
             rays.origins, rays.directions, rays.vignetting, path, normals, albedo, lit, moments,
@@ -275,9 +267,17 @@ def _visible_strobes(
     import open3d as o3d
 
     step = samples * samples
+    first, distance = world[::step], path[::step]
+    met = np.isfinite(distance)
+    hits = first[met, :3] + distance[met, None] * first[met, 3:]
+    at = moments[::step][met]
     lit = np.empty((shape[0] * shape[1], len(light.positions_cam)), dtype=np.float32)
     for k, strobe in enumerate(light.positions_cam):
-        rays = _shadow_rays(world[::step], path[::step], moments[::step], rotations, places, strobe)
+        # From each hit to the strobe, with the distance as the unit of length.
+        rays = np.zeros((len(first), 6), np.float32)
+        rays[:, 5] = 1.0
+        aims = sum((rotations[..., axis] * strobe[axis] for axis in range(3)), start=places)
+        rays[met] = np.concatenate([hits, aims[at] - hits], axis=1)
         dark = patch.scene.test_occlusions(
             o3d.core.Tensor.from_numpy(rays), 0.002, 1.0 - 1e-4, nthreads=1
         )
@@ -322,49 +322,51 @@ def _to_world(
 
 
 @compiled
-def _shadow_rays(
-    world: Array, path: Array, moments: Array, rotations: Array, places: Array, strobe: Array
-) -> Floats:
-    """From each hit to a strobe, with the distance as the unit of length."""
-    rays = np.zeros((len(world), 6), np.float32)
-    for i in range(len(world)):
-        if not path[i] < np.inf:
-            rays[i, 5] = 1.0
-            continue
-        rotation, place = rotations[moments[i]], places[moments[i]]
-        for a in range(3):
-            hit = world[i, a] + path[i] * world[i, 3 + a]
-            aim = place[a]
-            for b in range(3):
-                aim += rotation[a, b] * strobe[b]
-            rays[i, a], rays[i, 3 + a] = hit, aim - hit
-    return rays
-
-
-@compiled
 def _surface(
     world: Array,
     path: Array,
     triangle: Array,
     uv: Array,
-    vertices: Array,
     triangles: Array,
     vertex_normals: Array,
     vertex_material: Array,
-) -> tuple[Array, Floats, Floats]:
-    """Place, smooth unit normal and material of each hit; a miss keeps zeros."""
+    to_rest: Array,
+    sample_rad: float,
+) -> tuple[Array, Floats, Floats, Floats]:
+    """What each ray hits; a ray that hits nothing keeps zeros.
+
+    Args:
+        world: (N, 6) rays.
+        path: (N,) along them; not finite where nothing is hit.
+        triangle: (N,) that is hit.
+        uv: (N, 2) place in it.
+        triangles: (T, 3) corners.
+        vertex_normals: (V, 3).
+        vertex_material: (V,).
+        to_rest: (V, 3) to where the texture is; without rows where nothing moves.
+        sample_rad: between neighbouring rays.
+
+    Returns:
+        Place of the texture, (N, 3); smooth unit normal, (N, 3); material, (N,); and distance
+        between neighbouring samples on the surface, (N,) metres.
+    """
     points = np.zeros((len(world), 3))
     normals = np.zeros((len(world), 3), np.float32)
     material = np.zeros(len(world), np.float32)
+    footprint = np.ones(len(world), np.float32)
     for i in range(len(world)):
         if not path[i] < np.inf:
             continue
         a, b, c = triangles[triangle[i]]
         u, v = uv[i, 0], uv[i, 1]
         w = np.float32(1.0) - u - v
-        length = 0.0
+        length, slant = 0.0, 0.0
         for axis in range(3):
             points[i, axis] = world[i, axis] + np.float64(path[i]) * world[i, 3 + axis]
+            if len(to_rest):
+                points[i, axis] += (
+                    (1.0 - u - v) * to_rest[a, axis] + u * to_rest[b, axis] + v * to_rest[c, axis]
+                )
             n = (
                 w * vertex_normals[a, axis]
                 + u * vertex_normals[b, axis]
@@ -375,41 +377,10 @@ def _surface(
         length = math.sqrt(length)
         for axis in range(3):
             normals[i, axis] /= length
-        material[i] = w * vertex_material[a] + u * vertex_material[b] + v * vertex_material[c]
-    return points, normals, material
-
-
-@compiled
-def _between_corners(
-    path: Array, triangle: Array, uv: Array, triangles: Array, values: Array
-) -> Array:
-    """(N, 3) values of vertices, linear within the triangle of each hit; a miss gets zeros."""
-    found = np.zeros((len(path), 3))
-    for i in range(len(path)):
-        if not path[i] < np.inf:
-            continue
-        a, b, c = triangles[triangle[i]]
-        u, v = uv[i, 0], uv[i, 1]
-        for axis in range(3):
-            found[i, axis] = (
-                (1.0 - u - v) * values[a, axis] + u * values[b, axis] + v * values[c, axis]
-            )
-    return found
-
-
-@compiled
-def _footprints(path: Array, normals: Array, world: Array, sample_rad: float) -> Floats:
-    """Distance between neighbouring samples on the surface, metres."""
-    footprint = np.empty(len(path), np.float32)
-    for i in range(len(path)):
-        if not path[i] < np.inf:
-            footprint[i] = 1.0
-            continue
-        slant = 0.0
-        for axis in range(3):
             slant -= normals[i, axis] * world[i, 3 + axis]
+        material[i] = w * vertex_material[a] + u * vertex_material[b] + v * vertex_material[c]
         footprint[i] = path[i] * sample_rad / math.sqrt(max(slant, 0.1))
-    return footprint
+    return points, normals, material, footprint
 
 
 @compiled

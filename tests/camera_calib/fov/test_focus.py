@@ -10,7 +10,7 @@ from alice_survey.core.config import CameraConfig, WaterConfig
 from alice_survey.core.errors import ConfigError
 from camera_calib.camera import Camera
 from camera_calib.fov.focus import FocusedLens, apparent_depths, apparent_distance_m
-from camera_calib.fov.table import FovChoices, fov_table
+from camera_calib.fov.table import fov_table
 from camera_calib.rig import design_rig
 from tests.cameras import changed
 from tests.oracles_fov import traced_blur_px
@@ -46,14 +46,6 @@ def test_limits_are_those_of_the_textbook(
     elif focus_m > hyperfocal:
         assert math.isinf(far)
     assert lens.blur_px(focus_m) == 0.0
-
-
-def test_the_hyperfocal_distance_is_the_nearest_that_reaches_infinity() -> None:
-    at = LENS.hyperfocal_m(1.0)
-    assert math.isinf(replace(LENS, focus_m=at * 1.001).sharp_depths_m(1.0)[1])
-    near, far = replace(LENS, focus_m=at * 0.999).sharp_depths_m(1.0)
-    assert math.isfinite(far)
-    assert near == pytest.approx(at / 2, rel=0.01)
 
 
 def test_a_lens_cannot_focus_within_its_focal_length() -> None:
@@ -142,9 +134,9 @@ def test_a_tilted_port_is_traced_too() -> None:
 def test_limits_in_water_are_where_the_blur_is_the_circle_of_confusion(
     altitude_m: float, n_water: float, coc_px: float, lens_mm: float
 ) -> None:
-    row = fov_table([lens_mm], [altitude_m], n_water, PORT, FovChoices(coc_px=coc_px))[0]
+    row = fov_table([lens_mm], [altitude_m], n_water, PORT, coc_px)[0]
     lens = FocusedLens(
-        focal_m=lens_mm * 1e-3, f_number=4.0, pixel_m=3.69e-6, focus_m=row.focus_set_m
+        focal_m=lens_mm * 1e-3, f_number=4.0, pixel_m=3.69e-6, focus_m=row.focus_air_m
     )
 
     def blur(altitude: float) -> float:
@@ -163,31 +155,11 @@ def test_limits_in_water_are_where_the_blur_is_the_circle_of_confusion(
         assert row.frame_far_altitude_m <= row.far_altitude_m
 
 
-def test_traced_rays_at_the_limits_blur_by_the_circle_of_confusion() -> None:
-    row = fov_table([12.5], [2.0], 1.34, PORT, FovChoices(coc_px=2.0))[0]
-    lens = replace(LENS, focus_m=row.focus_set_m)
-    for altitude_m in (row.near_altitude_m, row.far_altitude_m):
-        point = np.array([0.0, 0.0, 0.03 + altitude_m])
-        traced = traced_blur_px(CAMERA, lens, point, np.array([1.0, 0.0]))
-        assert traced == pytest.approx(2.0, rel=1e-3)
-
-
-def test_a_set_focus_stays_where_it_is() -> None:
-    low, high = fov_table([12.5], [1.0, 3.0], 1.34, PORT, FovChoices(focus_air_m=1.5))
-    assert low.focus_set_m == high.focus_set_m == 1.5
-    assert low.near_altitude_m == pytest.approx(high.near_altitude_m)
-    assert low.focus_air_m < 1.5 < high.focus_air_m
-    sharp_m = 1.34 * (1.5 - 0.02 - 0.01 / 1.52)
-    assert low.near_altitude_m < sharp_m < low.far_altitude_m
-    assert low.floor_blur_px > 1.0
-    assert high.floor_blur_px > 1.0
-
-
 def test_the_port_bends_the_field_so_that_no_altitude_is_sharp_everywhere() -> None:
     """At 1 m and F/4 the corners need another focus than the centre by more than 1 px allows."""
     row = fov_table([12.5], [1.0], 1.34, PORT)[0]
     assert math.isnan(row.frame_near_altitude_m)
     assert math.isnan(row.frame_far_altitude_m)
     assert row.corner_blur_px == pytest.approx(3.83, abs=0.01)
-    softer = fov_table([12.5], [1.0], 1.34, PORT, FovChoices(coc_px=5.0))[0]
+    softer = fov_table([12.5], [1.0], 1.34, PORT, 5.0)[0]
     assert softer.frame_near_altitude_m < 1.0 < softer.frame_far_altitude_m

@@ -5,7 +5,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from alice_survey.core.errors import PlanError
-from camera_calib.fov.table import FovChoices, fov_table
+from camera_calib.fov.table import fov_table
 from missions.exposure.focus import largest_f_number, needed_f_number, plan_focus, too_open
 from tests.missions.exposure.surveys import survey
 from tests.oracles_imaging import blur_circle_px
@@ -24,7 +24,7 @@ def test_the_papers_lens_focuses_at_one_and_a_half_metres_in_air() -> None:
 def test_the_depth_of_field_agrees_with_the_table_of_views() -> None:
     rig, config = survey(plan={"relief_m": 0.0})
     focus = plan_focus(rig.cameras["left"], config.camera, config.plan)
-    row = fov_table([12.5], [2.0], 1.34, config.camera, FovChoices(coc_px=3.0))[0]
+    row = fov_table([12.5], [2.0], 1.34, config.camera, 3.0)[0]
     assert focus.near_altitude_m == pytest.approx(row.near_altitude_m, rel=1e-6)
     assert focus.far_altitude_m == pytest.approx(row.far_altitude_m, rel=1e-6)
 
