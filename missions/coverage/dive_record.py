@@ -276,7 +276,7 @@ def _logged(path: Path, nav: NavigationLog, triggers: Triggers, plan: Plan, rig:
     beyond = (triggers.time_s < nav.time_s[0]) | (triggers.time_s > nav.time_s[-1])
     lost = ~np.isfinite(at["latitude_deg"] + at["longitude_deg"])
     _count(left_out, f"beyond the log ({nav.time_s[0]:.1f} to {nav.time_s[-1]:.1f} s)", beyond)
-    _count(left_out, f"in a gap of the log over {nav.longest_gap_s:.1f} s", lost & ~beyond)
+    _count(left_out, f"in a gap of the log over {nav.max_gap_s:.1f} s", lost & ~beyond)
     nothing = np.full(len(lost), np.nan)
     at = {"depth_m": nothing, "altitude_m": nothing} | at
     range_unknown = ~lost & np.isnan(at["depth_m"]) & np.isnan(at["altitude_m"])
@@ -445,7 +445,7 @@ def _count(left_out: dict[str, int], reason: str, which: NDArray[np.bool_]) -> N
 
 def _gaps(nav: NavigationLog) -> tuple[tuple[float, float], ...]:
     steps = np.diff(nav.time_s)
-    long = np.flatnonzero(steps > nav.longest_gap_s)
+    long = np.flatnonzero(steps > nav.max_gap_s)
     return tuple((float(nav.time_s[i]), float(steps[i])) for i in long)
 
 

@@ -439,7 +439,7 @@ def compare_report(
     try:
         out.mkdir(parents=True, exist_ok=True)
         write_json(out / "compare.json", data)
-        rows = ([_rounded(value) for value in outcome.values()] for outcome in outcomes)
+        rows = ([_round_figure(value) for value in outcome.values()] for outcome in outcomes)
         write_csv(out / "flights.csv", list(outcomes[0]), rows)
         (out / "compare.txt").write_text(text + "\n", encoding="utf-8")
         draw_cross_track(out / "compare.png", data["cases"])
@@ -495,7 +495,7 @@ def _cell(values: Mapping[str, float | None], digits: int) -> str:
     return shown if sd is None else f"{shown} ±{sd:.{digits}f}"
 
 
-def _rounded(value: Any) -> Any:
+def _round_figure(value: Any) -> Any:
     return round(value, 6) if isinstance(value, float) else value
 
 

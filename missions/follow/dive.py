@@ -284,7 +284,7 @@ class FollowedDive:
         nav = read_growing_log(self.log)
         if self.replay is not None:
             nav = self._replayed(nav, wall_s, self.replay)
-        self._patience_s = nav.longest_gap_s + _MIN_UPDATE_S + _SILENT_S
+        self._patience_s = nav.max_gap_s + _MIN_UPDATE_S + _SILENT_S
         plan = self.plan
         record = record_of_log(self.log, nav, plan, self.rig)
         progress = dive_progress(

@@ -259,7 +259,7 @@ class PilotLoop:
             self.end("complete" if reason == NONE else f"aborted: {REASONS[reason]}")
             return self._off(now_s)
         self._judge(now_s)
-        return self._commanded(now_s)
+        return self._make_command(now_s)
 
     def _given_up(self, now_s: float, step_s: float, odometry: Odometry | None) -> Command:
         self.estimate = np.full(vector.ESTIMATE, np.nan)
@@ -269,9 +269,9 @@ class PilotLoop:
             return self._off(now_s)
         # Without an estimate the pilot pushes the vehicle up.
         self.pilot.steer(self._flown_s, step_s, self.estimate)
-        return self._commanded(now_s)
+        return self._make_command(now_s)
 
-    def _commanded(self, now_s: float) -> Command:
+    def _make_command(self, now_s: float) -> Command:
         pilot, demand = self.pilot, self.pilot.state.demand
         blind = self.state != LinkState.FLYING
         return Command(

@@ -79,7 +79,7 @@ def _from_origin(table: LogTable, tables: Tables) -> tuple[Array, Array] | str:
         )
     last = rows[-1]
     datum = Datum(float(origin.columns["Lat"][last]), float(origin.columns["Lng"][last]))
-    ned = table.stacked("PN", "PE", "PD")
+    ned = table.stack("PN", "PE", "PD")
     return table.columns["time_s"], datum.geodetic_from_ned(ned)[:, :2]
 
 
@@ -173,8 +173,8 @@ def read_ardusub_bin(
         NavigationError: it is not such a log, or lacks what navigation needs.
     """
     lost: Counter[str] = Counter()
-    wanted = {source.message for sources in _BIN.values() for source in sources}
-    tables, present = read_dataflash(path, {*wanted, "GPS", "ORGN", "PARM"}, lost)
+    needed = {source.message for sources in _BIN.values() for source in sources}
+    tables, present = read_dataflash(path, {*needed, "GPS", "ORGN", "PARM"}, lost)
     offset_s, dated = _since_1970(tables)
     timed = {}
     for name, table in tables.items():
@@ -199,8 +199,8 @@ def read_ardusub_bin(
 def read_ardusub_tlog(path: Path, requested: Mapping[str, str]) -> LoggedDive:
     """Read a ground station's log; arguments and errors as of `read_ardusub_bin`."""
     lost: Counter[str] = Counter()
-    wanted = {source.message for sources in _TLOG.values() for source in sources}
-    tables, present = read_tlog(path, {*wanted, "HEARTBEAT"}, lost)
+    needed = {source.message for sources in _TLOG.values() for source in sources}
+    tables, present = read_tlog(path, {*needed, "HEARTBEAT"}, lost)
     beats = tables.pop("HEARTBEAT", None)
     vehicle = _vehicle(path, tables, present)
     _warn_of_other_kinds(path, beats, vehicle)
@@ -385,13 +385,13 @@ def _dataflash_tables(rows: Mapping[str, Sequence[Any]], lost: Counter[str]) -> 
 
 
 def read_tlog(
-    path: Path, wanted: Collection[str], lost: Counter[str]
+    path: Path, needed: Collection[str], lost: Counter[str]
 ) -> tuple[dict[str, LogTable], list[str]]:
     """Read the messages of some names of a ground station's log.
 
     Args:
         path: the file.
-        wanted: names of messages.
+        needed: names of messages.
         lost: counts what cannot be read; is added to.
 
     Returns:
@@ -419,7 +419,7 @@ def read_tlog(
                     lost[_NOISE] += len(message.data)
                     continue
                 present.add(name)
-                if name not in wanted:
+                if name not in needed:
                     continue
                 if name not in fields:
                     scalars = (f for f in message.get_fieldnames()

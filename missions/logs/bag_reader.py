@@ -86,10 +86,10 @@ def _bounded_chunks() -> Iterator[None]:
     from rosbags.rosbag2.storage_mcap import DECOMPRESSORS as OF_MCAP
     from rosbags.rosbag2.storage_mcap import zstd  # type: ignore[attr-defined]  # by Python's age
 
-    lz4_frames = _bounded(lambda: lz4.frame.LZ4FrameDecompressor())
-    zstd_frames = _bounded(lambda: zstd.ZstdDecompressor())
+    lz4_frames = _limit_unpacking(lambda: lz4.frame.LZ4FrameDecompressor())
+    zstd_frames = _limit_unpacking(lambda: zstd.ZstdDecompressor())
     before = dict(of_ros1), dict(OF_MCAP)
-    of_ros1.update(bz2=_bounded(bz2.BZ2Decompressor), lz4=lz4_frames)
+    of_ros1.update(bz2=_limit_unpacking(bz2.BZ2Decompressor), lz4=lz4_frames)
     OF_MCAP.update(lz4=lambda data, _: lz4_frames(data), zstd=lambda data, _: zstd_frames(data))
     try:
         yield
@@ -98,7 +98,7 @@ def _bounded_chunks() -> Iterator[None]:
         OF_MCAP.update(before[1])
 
 
-def _bounded(decompressor: Callable[[], Any]) -> Callable[[bytes], bytes]:
+def _limit_unpacking(decompressor: Callable[[], Any]) -> Callable[[bytes], bytes]:
     def unpack(data: bytes) -> bytes:
         unpacked: bytes = decompressor().decompress(data, MAX_BYTES + 1)
         if len(unpacked) > MAX_BYTES:

@@ -22,7 +22,7 @@ from alice_survey.core.compiled import compiled
 from alice_survey.core.errors import NavigationError
 from alice_survey.core.frames import Array, Datum, rotation_from_attitude
 from missions.logs.dive import LoggedDive, Signal
-from missions.logs.navigation_csv import longest_gap_s
+from missions.logs.navigation_csv import max_gap_s
 
 _FAR_M = 1e4
 """Standard deviation of a place before any fix, about the first one."""
@@ -141,7 +141,7 @@ def dead_reckoned(
     steps = np.diff(time_s, prepend=time_s[:1])
     moves = np.zeros((len(time_s), 2))
     moves[1:] = 0.5 * (velocity.values[1:] + velocity.values[:-1]) * steps[1:, None]
-    breaks = steps > longest_gap_s(time_s)
+    breaks = steps > max_gap_s(time_s)
     stretch = np.cumsum(breaks)
     fixes_s, places, sigmas = (np.asarray(part, dtype=np.float64) for part in fixes)
     order = np.argsort(fixes_s, kind="stable")
@@ -150,7 +150,7 @@ def dead_reckoned(
     # A fix counts at the nearest velocity, moved by the velocity in between.
     at = _nearest(time_s, fixes_s)
     late = (fixes_s - time_s[at])[:, None]
-    near = np.abs(late[:, 0]) <= 0.5 * longest_gap_s(time_s)
+    near = np.abs(late[:, 0]) <= 0.5 * max_gap_s(time_s)
     at, places, sigmas = at[near], (places - late * velocity.values[at])[near], sigmas[near]
     starts = np.searchsorted(at, np.arange(len(time_s) + 1))
     prior = np.array([errors.scale, np.deg2rad(errors.heading_deg)])
@@ -193,7 +193,7 @@ def _velocity_ne(dive: LoggedDive, declination_rad: float) -> tuple[Signal, int]
         raise NavigationError(f"{source}: no two velocities have an attitude")
     cos, sin = math.cos(declination_rad), math.sin(declination_rad)
     times, ne = times[good], ne[good] @ np.array([[cos, sin], [-sin, cos]])
-    broken = int((np.diff(times) > longest_gap_s(times)).sum())
+    broken = int((np.diff(times) > max_gap_s(times)).sum())
     return Signal(source=source, time_s=times, values=ne), broken
 
 

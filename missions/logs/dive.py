@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.core.frames import Array
-from missions.logs.navigation_csv import interpolated
+from missions.logs.navigation_csv import interpolate
 
 ROLES = ("navigation", "depth", "attitude", "altitude", "velocity")
 """What of a log may be chosen by name."""
@@ -41,7 +41,7 @@ class Signal:
             turning: whether values are angles in degrees, which turn the short way round.
         """
         columns = (
-            interpolated(self.time_s, column, time_s, turning=turning) for column in self.values.T
+            interpolate(self.time_s, column, time_s, turning=turning) for column in self.values.T
         )
         return np.stack(list(columns), axis=1)
 
@@ -99,7 +99,7 @@ class LoggedDive:
         for signal in (self.position, self.depth):
             if signal is not None:
                 lacking = np.isnan(
-                    interpolated(times, np.zeros(len(times)), signal.time_s, turning=False)
+                    interpolate(times, np.zeros(len(times)), signal.time_s, turning=False)
                 )
                 times = np.union1d(times, signal.time_s[lacking])
         return times
@@ -114,7 +114,7 @@ def finite_number(value: Any) -> float:
     return number if math.isfinite(number) and not isinstance(value, bool) else math.nan
 
 
-def cleaned(source: str, time_s: Array, values: Array, lost: Counter[str]) -> Signal | None:
+def clean_signal(source: str, time_s: Array, values: Array, lost: Counter[str]) -> Signal | None:
     """A signal of the rows whose times increase, the most that can be kept; None without rows.
 
     Args:

@@ -17,7 +17,7 @@ from alice_survey.core.errors import NavigationError, warn
 from alice_survey.core.frames import Array, Datum, rotation_from_attitude
 from missions.logs.dead_reckoning import TrackErrors, with_dead_reckoning
 from missions.logs.dive import DATED_AFTER_S, ROLES, LoggedDive, Signal
-from missions.logs.navigation_csv import READINGS, longest_gap_s, utc_date
+from missions.logs.navigation_csv import READINGS, max_gap_s, utc_date
 from missions.values.navigation import COLUMNS, write_navigation_rows
 
 _NAMED = 8
@@ -417,7 +417,7 @@ def _report(
 
 def _gaps(time_s: Array) -> list[tuple[float, float]]:
     """Start and length of steps that nothing is interpolated over."""
-    longest = longest_gap_s(time_s)
+    longest = max_gap_s(time_s)
     return [(a, b - a) for a, b in itertools.pairwise(time_s.tolist()) if b - a > longest]
 
 

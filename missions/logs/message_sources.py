@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from alice_survey.core.contents import one_line
 from alice_survey.core.errors import NavigationError, why
 from alice_survey.core.frames import Array
-from missions.logs.dive import ROLES, LoggedDive, Signal, cleaned, usable_positions
+from missions.logs.dive import ROLES, LoggedDive, Signal, clean_signal, usable_positions
 
 MAX_LOG_BYTES = 4_000_000_000
 
@@ -49,7 +49,7 @@ class LogTable:
         columns = {name: column[keep] for name, column in self.columns.items()}
         return LogTable(name=self.name, columns=columns)
 
-    def stacked(self, *names: str) -> Array:
+    def stack(self, *names: str) -> Array:
         """Columns side by side, (N, k)."""
         return np.stack([self.columns[name] for name in names], axis=1)
 
@@ -89,7 +89,7 @@ def take(
             return f"it lacks {', '.join(name for name in needed if not table.has(name))}"
         if keep is not None:
             table = table.rows(keep.rows(table))
-        values = table.stacked(*fields)
+        values = table.stack(*fields)
         if absent is not None:
             values = np.where(values == absent, np.nan, values)
         return table.columns["time_s"], values * scale
@@ -191,7 +191,7 @@ def _signal(
         if isinstance(read, str):
             why = read
             continue
-        found = cleaned(source.message, *read, lost) if len(read[0]) else None
+        found = clean_signal(source.message, *read, lost) if len(read[0]) else None
         if found is not None:
             return found, f"{source.note}{others}".strip("; ")
         why = "none of its rows can be used"

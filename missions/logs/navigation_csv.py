@@ -40,9 +40,9 @@ class NavigationLog:
     """Date of the first row, where the log holds dates."""
 
     @property
-    def longest_gap_s(self) -> float:
+    def max_gap_s(self) -> float:
         """Seconds between rows beyond which nothing is interpolated."""
-        return longest_gap_s(self.time_s)
+        return max_gap_s(self.time_s)
 
     def at(self, time_s: Array) -> dict[str, Array]:
         """All columns at other times, (N,) each.
@@ -54,7 +54,7 @@ class NavigationLog:
 
     def _at(self, name: str, values: Array, at_s: Array) -> Array:
         turning = name in TURNING
-        return _within_turn(name, interpolated(self.time_s, values, at_s, turning=turning))
+        return _within_turn(name, interpolate(self.time_s, values, at_s, turning=turning))
 
 
 def _within_turn(name: str, values: Array) -> Array:
@@ -64,7 +64,7 @@ def _within_turn(name: str, values: Array) -> Array:
     return (values + 180.0) % 360.0 - 180.0 if name in TURNING else values
 
 
-def longest_gap_s(time_s: Array) -> float:
+def max_gap_s(time_s: Array) -> float:
     """Seconds between rows, at times (T,), beyond which nothing is interpolated."""
     if len(time_s) < 2:
         return _GAP_S
@@ -77,10 +77,10 @@ def _max_gap_of(known_s: Array, time_s: Array) -> float:
 
     Positions may be rarer than depths in one log; few of them show no rate of their own.
     """
-    return longest_gap_s(known_s if len(known_s) > _FEW else time_s)
+    return max_gap_s(known_s if len(known_s) > _FEW else time_s)
 
 
-def interpolated(time_s: Array, values: Array, at_s: Array, *, turning: bool) -> Array:
+def interpolate(time_s: Array, values: Array, at_s: Array, *, turning: bool) -> Array:
     """Values at other times; NaN in gaps, beyond the ends, and where a time is NaN.
 
     Args:
@@ -285,5 +285,5 @@ def warn_of_gaps(images: Sequence[str], time_s: Array, found: Array, log: Naviga
     warn(
         f"{len(lost)} pictures get no navigation, without a time, beyond the log "
         f"({log.time_s[0]:.1f} to {log.time_s[-1]:.1f} s) or in a gap over "
-        f"{log.longest_gap_s:.1f} s{when}: {names}{more}"
+        f"{log.max_gap_s:.1f} s{when}: {names}{more}"
     )

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.core.errors import NavigationError
 from alice_survey.core.frames import Array, Datum, attitude_from_rotation
-from missions.logs.dive import LoggedDive, Signal, cleaned
+from missions.logs.dive import LoggedDive, Signal, clean_signal
 from missions.logs.message_sources import (
     Keep,
     LogTable,
@@ -56,11 +56,11 @@ def _from_origin(table: LogTable, _: Tables) -> tuple[Array, Array] | str:
     table = table.rows(
         (table.columns["xy_valid"] > 0)
         & (table.columns["xy_global"] > 0)
-        & np.isfinite(table.stacked("x", "y", "ref_lat", "ref_lon")).all(axis=1)
+        & np.isfinite(table.stack("x", "y", "ref_lat", "ref_lon")).all(axis=1)
     )
     places = np.full((len(table), 2), np.nan)
-    ne0 = np.column_stack([table.stacked("x", "y"), np.zeros(len(table))])
-    origins, of = np.unique(table.stacked("ref_lat", "ref_lon"), axis=0, return_inverse=True)
+    ne0 = np.column_stack([table.stack("x", "y"), np.zeros(len(table))])
+    origins, of = np.unique(table.stack("ref_lat", "ref_lon"), axis=0, return_inverse=True)
     for number, (latitude, longitude) in enumerate(origins.tolist()):
         if abs(latitude) < 90 and abs(longitude) <= 360:
             rows = of.ravel() == number
@@ -71,7 +71,7 @@ def _from_origin(table: LogTable, _: Tables) -> tuple[Array, Array] | str:
 def _attitude(table: LogTable, _: Tables) -> tuple[Array, Array] | str:
     if not table.has(*(f"q[{i}]" for i in range(4))):
         return "it lacks q"
-    quaternion = table.stacked(*(f"q[{i}]" for i in (1, 2, 3, 0)))
+    quaternion = table.stack(*(f"q[{i}]" for i in (1, 2, 3, 0)))
     known = np.abs(np.linalg.norm(quaternion, axis=1) - 1.0) < 0.05
     angles = np.full((len(table), 3), np.nan)
     if known.any():
@@ -148,8 +148,8 @@ def read_px4_ulog(path: Path, requested: Mapping[str, str]) -> LoggedDive:
         NavigationError: it is not such a log, or lacks what navigation needs.
     """
     lost: Counter[str] = Counter()
-    wanted = {source.message for sources in _SOURCES.values() for source in sources}
-    tables, present = read_ulog(path, wanted, lost)
+    needed = {source.message for sources in _SOURCES.values() for source in sources}
+    tables, present = read_ulog(path, needed, lost)
     offset_s = _since_1970(tables)
     timed = {
         name: with_time(table, table.columns["timestamp"] * 1e-6 + (offset_s or 0.0))
@@ -193,20 +193,20 @@ def _sigmas(dive: LoggedDive, tables: Tables) -> dict[str, Signal]:
             continue
         stated = table.columns[field]
         values = share * np.where(stated > 0, stated, np.nan)
-        sigma = cleaned(signal.source, table.columns["time_s"], values, Counter())
+        sigma = clean_signal(signal.source, table.columns["time_s"], values, Counter())
         if sigma is not None:
             found[column] = sigma
     return found
 
 
 def read_ulog(
-    path: Path, wanted: Collection[str], lost: Counter[str]
+    path: Path, needed: Collection[str], lost: Counter[str]
 ) -> tuple[dict[str, LogTable], list[str]]:
     """Read the messages of some names; those of several sensors have a column `Instance`.
 
     Args:
         path: a .ulg.
-        wanted: names of messages.
+        needed: names of messages.
         lost: counts what cannot be read; is added to.
 
     Returns:
@@ -233,12 +233,12 @@ def read_ulog(
             lost["(the log is damaged: messages are left out)"] += 1
     parts: dict[str, list[LogTable]] = {}
     for topic in log.data_list:
-        if topic.name in wanted:
+        if topic.name in needed:
             columns = {n: np.asarray(v, dtype=np.float64) for n, v in topic.data.items()}
             columns["Instance"] = np.full(len(columns["timestamp"]), float(topic.multi_id))
             parts.setdefault(topic.name, []).append(LogTable(name=topic.name, columns=columns))
     present = sorted({topic.name for topic in log.data_list})
-    return {name: _joined(own) for name, own in parts.items()}, present
+    return {name: _join_tables(own) for name, own in parts.items()}, present
 
 
 class _Bounded(io.BytesIO):
@@ -270,7 +270,7 @@ def _field_count(
     return total
 
 
-def _joined(parts: list[LogTable]) -> LogTable:
+def _join_tables(parts: list[LogTable]) -> LogTable:
     if len(parts) == 1:
         return parts[0]
     shared = [field for field in parts[0].columns if all(part.has(field) for part in parts)]

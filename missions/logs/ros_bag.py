@@ -21,7 +21,7 @@ from alice_survey.core.errors import NavigationError
 from alice_survey.core.executor import progress
 from alice_survey.core.frames import Array, Datum, attitude_from_rotation
 from missions.logs.bag_reader import opened_bag
-from missions.logs.dive import DATED_AFTER_S, LoggedDive, Signal, cleaned, usable_positions
+from missions.logs.dive import DATED_AFTER_S, LoggedDive, Signal, clean_signal, usable_positions
 from missions.logs.ros_builder import flipped_body, flipped_quaternion, flipped_world
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ def _choose(
     for role, name in requested.items():
         topic = by_name.get(name)
         if topic is None:
-            raise NavigationError(f"{path}: no topic {name}; it has {_listed(present)}")
+            raise NavigationError(f"{path}: no topic {name}; it has {_list_topics(present)}")
         if topic.kind not in _TAKES[role]:
             raise NavigationError(
                 f"{path}: {name} is {topic.kind}; {role} can come from {', '.join(_TAKES[role])}"
@@ -132,7 +132,8 @@ def _choose(
                 chosen[role] = found[0]
             elif role not in chosen and found:
                 raise NavigationError(
-                    f"{path}: {_listed(found)} could give {role}: choose with --topic {role}=NAME"
+                    f"{path}: {_list_topics(found)} could give {role}: choose with --topic "
+                    f"{role}=NAME"
                 )
     velocities = [
         t for t in present
@@ -152,7 +153,7 @@ def _choose(
     if not chosen:
         known = dict.fromkeys(kind for kinds in _TAKES.values() for kind in kinds)
         raise NavigationError(
-            f"{path}: no one topic of {', '.join(known)}; it has {_listed(present)}: "
+            f"{path}: no one topic of {', '.join(known)}; it has {_list_topics(present)}: "
             "choose with --topic ROLE=NAME"
         )
     return chosen
@@ -172,13 +173,13 @@ def _navigation(path: Path, present: Sequence[_Topic]) -> _Topic | None:
             return found[0] if len(found) == 1 else named[0]
         if found:
             raise NavigationError(
-                f"{path}: {_listed(found)} could all be navigation: choose one with "
+                f"{path}: {_list_topics(found)} could all be navigation: choose one with "
                 "--topic navigation=NAME"
             )
     return None
 
 
-def _listed(topics: Sequence[_Topic]) -> str:
+def _list_topics(topics: Sequence[_Topic]) -> str:
     return ", ".join(f"{topic.name} ({topic.kind})" for topic in topics) or "no topics"
 
 
@@ -194,15 +195,15 @@ class _Series:
 
 
 def _collect(
-    reader: "AnyReader", wanted: set[_Topic], lost: Counter[str], notes: list[str]
+    reader: "AnyReader", needed: set[_Topic], lost: Counter[str], notes: list[str]
 ) -> dict[_Topic, _Series]:
     """Messages with their times: of the header, else (unset, or no header) of the recording."""
-    kinds = {topic.name: topic for topic in wanted}
+    kinds = {topic.name: topic for topic in needed}
     connections = [c for c in reader.connections if c.topic in kinds]
     times: dict[str, list[float]] = {name: [] for name in kinds}
     rows: dict[str, list[Sequence[float]]] = {name: [] for name in kinds}
     names: dict[str, tuple[str, ...]] = {
-        topic.name: ROWS[topic.kind][0] for topic in wanted if topic.kind in ROWS
+        topic.name: ROWS[topic.kind][0] for topic in needed if topic.kind in ROWS
     }
     unset: Counter[str] = Counter()
     total = sum(c.msgcount for c in connections)
@@ -299,13 +300,13 @@ class _BagReading:
         if series is None or not len(series.time_s) or not set(names) <= set(series.columns):
             return None
         values = scale * np.stack([series.columns[name] for name in names], axis=1)
-        return self._cleaned(series, values)
+        return self._clean_series(series, values)
 
-    def _cleaned(self, series: _Series, values: Array) -> Signal | None:
+    def _clean_series(self, series: _Series, values: Array) -> Signal | None:
         """A signal; what its times cost is counted once for a topic."""
         lost = Counter() if series.topic in self._counted else self.lost
         self._counted.add(series.topic)
-        return cleaned(series.topic.name, series.time_s, values, lost)
+        return clean_signal(series.topic.name, series.time_s, values, lost)
 
     def _of(self, role: str) -> _Series | None:
         topic = self.chosen.get(role, self.chosen.get("navigation"))
@@ -339,7 +340,7 @@ class _BagReading:
         )
         per_metre = DENSITY_KG_M3 * GRAVITY_MPS2
         values = (series.columns["pressure"] - _SURFACE_PA) / per_metre
-        return self._cleaned(series, values)
+        return self._clean_series(series, values)
 
     def _attitude(self) -> Signal | None:
         series = self._of("attitude")
@@ -355,7 +356,7 @@ class _BagReading:
         angles = np.full((len(xyzw), 3), np.nan)
         if good.any():
             angles[good] = np.rad2deg(attitude_from_rotation(Rotation.from_quat(xyzw[good])))
-        return self._cleaned(series, angles)
+        return self._clean_series(series, angles)
 
     def _altitude(self) -> Signal | None:
         series = self._of("altitude")
@@ -368,7 +369,7 @@ class _BagReading:
             absent = values <= 0
         if absent.any():
             self.lost[f"{series.topic.name}: altitudes not above 0: no bottom"] += int(absent.sum())
-        return self._cleaned(series, np.where(absent, np.nan, values))
+        return self._clean_series(series, np.where(absent, np.nan, values))
 
     def _sigmas(self, series: _Series | None) -> dict[str, Signal]:
         """Standard deviations; a variance that is not positive is not known."""
@@ -381,7 +382,7 @@ class _BagReading:
             variance = np.mean([series.columns[name] for name in names], axis=0)
             with np.errstate(invalid="ignore"):
                 sigma = scale * np.sqrt(np.where(variance > 0, variance, np.nan))
-            signal = self._cleaned(series, sigma)
+            signal = self._clean_series(series, sigma)
             if signal is not None:
                 sigmas[column] = signal
         return sigmas
@@ -389,7 +390,7 @@ class _BagReading:
     def _rpm(self, joints: Sequence[_Topic]) -> tuple[Signal | None, tuple[str, ...]]:
         """Speeds of propellers, where exactly one topic has joints."""
         if len(joints) > 1:
-            self.notes.append(f"thrusters are left out: {_listed(joints)} all have joints")
+            self.notes.append(f"thrusters are left out: {_list_topics(joints)} all have joints")
         if len(joints) != 1:
             return None, ()
         series = self.series[joints[0]]

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from alice_survey.core.errors import NavigationError
-from missions.logs.dive import DATED_AFTER_S, LoggedDive, cleaned, finite_number
+from missions.logs.dive import DATED_AFTER_S, LoggedDive, clean_signal, finite_number
 
 VELOCITY, ATTITUDE = "velocity", "position_local"
 _MAX_LINE = 100_000
@@ -80,10 +80,10 @@ def read_waterlinked(path: Path, requested: Mapping[str, str]) -> LoggedDive:
         kind="reports of a Water Linked DVL",
         clock="the DVL's clock",
         dated=bool(np.nanmedian(times) > DATED_AFTER_S),
-        attitude=cleaned(ATTITUDE, turns[:, 0], turns[:, 1:], lost),
-        altitude=cleaned(VELOCITY, times, table[:, 5], Counter()),
+        attitude=clean_signal(ATTITUDE, turns[:, 0], turns[:, 1:], lost),
+        altitude=clean_signal(VELOCITY, times, table[:, 5], Counter()),
         altitude_slant=True,
-        velocity_body=cleaned(VELOCITY, times, table[:, 2:5], lost),
+        velocity_body=clean_signal(VELOCITY, times, table[:, 2:5], lost),
         lost=dict(lost),
         notes=("velocities are of the transducer: forward, right and down have to be the body's",),
     )

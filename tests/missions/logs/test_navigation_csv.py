@@ -30,7 +30,7 @@ def test_values_lie_on_the_line_between_rows(tmp_path: Path) -> None:
 def test_nothing_is_made_up_beyond_the_log_or_in_gaps(tmp_path: Path) -> None:
     rows = [f"{t},60,5,{t},0,2" for t in (0, 1, 2, 3, 20, 21)]
     log = read_navigation(log_file(tmp_path, *rows), UTC)
-    assert log.longest_gap_s == 5.0
+    assert log.max_gap_s == 5.0
     depth = log.at(np.array([-0.1, 2.5, 3.0, 10.0, 20.5, 21.1, np.nan]))["depth_m"]
     np.testing.assert_allclose(depth, [np.nan, 2.5, 3.0, np.nan, 20.5, np.nan, np.nan])
 
