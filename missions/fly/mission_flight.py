@@ -12,7 +12,6 @@ from alice_survey.core.config import CameraConfig, VehicleConfig
 from alice_survey.core.errors import PlanError, VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.pilot import mission as pilot
-from alice_survey.sim.vehicle.pilot import steps as column
 from alice_survey.sim.vehicle.pilot.gains import gains_for
 from alice_survey.sim.vehicle.pilot.memory import ALONG, LEG
 from alice_survey.sim.vehicle.pilot.mission import MIN_SPEED_MPS, ArduSubSettings
@@ -42,7 +41,7 @@ PASSED_M = 0.02
 """An end passed by more is overshot: a tick's way and the noise of navigation are less."""
 _SAME_COURSE_RAD = math.radians(10.0)
 _KINDS = {
-    "goto": column.GOTO, "section": column.SECTION, "keep": column.KEEP, "anchor": column.ANCHOR,
+    "goto": pilot.GOTO, "section": pilot.SECTION, "keep": pilot.KEEP, "anchor": pilot.ANCHOR,
 }  # fmt: skip
 
 
@@ -208,21 +207,21 @@ def _rows(known: MissionOfPlan, mount: CameraMount) -> Array:
     """
     mission, datum = known.mission, known.plan.datum
     lift_m = mount.glass_body_m[2] - mount.altimeter_body_m[2]
-    rows = np.full((len(mission.steps), column.COLUMNS), np.nan)
-    rows[:, [column.END_N, column.END_E]] = mission.ends_ne(datum)
-    rows[:, [column.START_N, column.START_E]] = mission.starts_ne(datum)
-    rows[:, column.LINE] = known.line
+    rows = np.full((len(mission.steps), pilot.COLUMNS), np.nan)
+    rows[:, [pilot.END_N, pilot.END_E]] = mission.ends_ne(datum)
+    rows[:, [pilot.START_N, pilot.START_E]] = mission.starts_ne(datum)
+    rows[:, pilot.LINE] = known.line
     for row, step in zip(rows, mission.steps, strict=True):
         by_track = mission.autopilot == "ardusub"
-        row[column.KIND] = column.FROM_END if by_track else _KINDS[step.manoeuvre]
-        row[column.HEADING] = step.heading_rad
-        row[column.BY_DEPTH] = step.heave != "altitude"
-        row[column.BY_ALTITUDE] = step.heave != "depth"
-        row[column.DEPTH] = step.depth_m
-        row[column.ALTITUDE] = step.altitude_m - lift_m
-        row[column.SPEED] = max(step.speed_mps, MIN_SPEED_MPS) if by_track else step.speed_mps
-        row[column.TOLERANCE] = step.tolerance_m
-        row[column.HOLD_S] = step.hold_s
+        row[pilot.KIND] = pilot.FROM_END if by_track else _KINDS[step.manoeuvre]
+        row[pilot.HEADING] = step.heading_rad
+        row[pilot.BY_DEPTH] = step.heave != "altitude"
+        row[pilot.BY_ALTITUDE] = step.heave != "depth"
+        row[pilot.DEPTH] = step.depth_m
+        row[pilot.ALTITUDE] = step.altitude_m - lift_m
+        row[pilot.SPEED] = max(step.speed_mps, MIN_SPEED_MPS) if by_track else step.speed_mps
+        row[pilot.TOLERANCE] = step.tolerance_m
+        row[pilot.HOLD_S] = step.hold_s
     return rows
 
 

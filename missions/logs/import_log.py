@@ -1,9 +1,18 @@
-"""`import-log`: a vehicle's own log becomes the navigation CSV that `import-images` reads."""
+"""`import-log`: a vehicle's own log becomes the navigation CSV that `import-images` reads.
+
+Reports of a Water Linked DVL (A50, A125) are read here: one JSON object a line, as its TCP port
+sends them. `velocity` reports hold vx, vy, vz (m/s; forward, right, down of the transducer), the
+range along its axis and when they were valid (`time_of_validity`, microseconds since 1970);
+`position_local` reports hold roll, pitch and yaw (degrees) at `ts` (seconds since 1970). Their own
+x, y and z count from the last reset and are not read. The maker's page "DVL protocol" describes
+formats json_v2 to json_v3.1.
+"""
 
 import itertools
+import json
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,7 +25,7 @@ from alice_survey.core.contents import shown
 from alice_survey.core.errors import NavigationError, warn
 from alice_survey.core.frames import Array, Datum, rotation_from_attitude
 from missions.logs.dead_reckoning import TrackErrors, with_dead_reckoning
-from missions.logs.dive import DATED_AFTER_S, ROLES, LoggedDive, Signal
+from missions.logs.dive import DATED_AFTER_S, ROLES, LoggedDive, Signal, clean_signal, finite_number
 from missions.logs.navigation_csv import READINGS, max_gap_s, utc_date
 from missions.values.navigation import COLUMNS, write_navigation_rows
 
@@ -181,7 +190,6 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
     from missions.logs.bag_reader import is_bag
     from missions.logs.px4_ulog import is_ulog, read_px4_ulog
     from missions.logs.ros_bag import read_ros_bag
-    from missions.logs.waterlinked import is_waterlinked, read_waterlinked
 
     if not path.exists():
         raise NavigationError(f"{path}: no such file or folder")
@@ -490,3 +498,95 @@ def _moment(time_s: float) -> str:
     if time_s < DATED_AFTER_S:
         return f"{time_s:.1f} s"
     return datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%d %H:%M:%S")
+
+
+VELOCITY, ATTITUDE = "velocity", "position_local"
+_MAX_LINE = 100_000
+_LOOKED_AT = 20
+"""Lines at which a file is recognised: the first may be cut."""
+_MICRO, _MILLI = 1e-6, 1e-3
+
+
+def is_waterlinked(path: Path) -> bool:
+    """Whether a file holds such reports."""
+    try:
+        with path.open("rb") as file:
+            lines = [file.readline(_MAX_LINE) for _ in range(_LOOKED_AT)]
+    except OSError:
+        return False
+    return any(
+        (report := _report(line)) and report["type"] in (VELOCITY, ATTITUDE) for line in lines
+    )
+
+
+def read_waterlinked(path: Path, requested: Mapping[str, str]) -> LoggedDive:
+    """Read a file of reports.
+
+    Raises:
+        NavigationError: it cannot be read, holds no velocity, or a topic is chosen.
+    """
+    if requested:
+        raise NavigationError(
+            f"--topic {next(iter(requested))}: reports of a DVL have nothing to choose from"
+        )
+    lost: Counter[str] = Counter()
+    velocities: list[list[float]] = []
+    attitudes: list[list[float]] = []
+    since_s, stamped = 0.0, True
+    for report in _reports(path, lost):
+        if report["type"] == ATTITUDE:
+            attitudes.append([finite_number(report.get(k)) for k in ("ts", "roll", "pitch", "yaw")])
+            continue
+        since_s += _MILLI * np.nan_to_num(finite_number(report.get("time")))
+        valid_s = _MICRO * finite_number(report.get("time_of_validity"))
+        stamped = stamped and math.isfinite(valid_s)
+        row = [finite_number(report.get(k)) for k in ("vx", "vy", "vz", "altitude")]
+        locked = report.get("velocity_valid") is True
+        if not locked:
+            lost["velocity reports without bottom lock"] += 1
+            row[:3] = [math.nan] * 3
+        if not row[3] > 0:
+            row[3] = math.nan
+        velocities.append([valid_s, since_s, *row])
+    if not velocities:
+        raise NavigationError(f"{path}: holds no velocity report of a Water Linked DVL")
+    table, turns = np.array(velocities), np.array(attitudes).reshape(-1, 4)
+    times = table[:, 0] if stamped else table[:, 1]
+    if not stamped and len(turns):
+        raise NavigationError(
+            f"{path}: velocity reports have no time_of_validity, so attitudes cannot be tied to "
+            "them: set the DVL's output to json_v3 or later"
+        )
+    return LoggedDive(
+        kind="reports of a Water Linked DVL",
+        clock="the DVL's clock",
+        dated=bool(np.nanmedian(times) > DATED_AFTER_S),
+        attitude=clean_signal(ATTITUDE, turns[:, 0], turns[:, 1:], lost),
+        altitude=clean_signal(VELOCITY, times, table[:, 5], Counter()),
+        altitude_slant=True,
+        velocity_body=clean_signal(VELOCITY, times, table[:, 2:5], lost),
+        lost=dict(lost),
+        notes=("velocities are of the transducer: forward, right and down have to be the body's",),
+    )
+
+
+def _reports(path: Path, lost: Counter[str]) -> Iterator[dict[str, Any]]:
+    try:
+        with path.open("rb") as file:
+            while line := file.readline(_MAX_LINE):
+                report = _report(line)
+                if report is None and line.strip():
+                    lost["lines that are no report"] += 1
+                elif report is not None and report["type"] in (VELOCITY, ATTITUDE):
+                    yield report
+    except OSError as error:
+        raise NavigationError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _report(line: bytes) -> dict[str, Any] | None:
+    """The object of a line that names its type."""
+    try:
+        found = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    return found if isinstance(found, dict) and isinstance(found.get("type"), str) else None

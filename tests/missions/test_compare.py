@@ -30,7 +30,7 @@ from missions.fly.compare import (
     turn_rows,
     variants_of,
 )
-from missions.fly.flight_plots import true_current
+from missions.fly.run import true_current
 from missions.fly.simulation import flight_settings, mission_setup, with_values
 from missions.values.flight import Flight
 from missions.values.plan_file import Plan

@@ -205,13 +205,13 @@ class PilotCommand(SurveyCommand):
         """Be the one or the other side."""
         config = self.settings(needed=True)
         if self.simulated:
-            from missions.live.run import simulate_report
+            from missions.live.mission import simulate_report
 
             return simulate_report(
                 self.workspace, config, takes=self.takes, rate=self.rate, track=self.track
             )
         from missions.live.loop import LinkLimits
-        from missions.live.run import pilot_report
+        from missions.live.mission import pilot_report
 
         limits = LinkLimits(on_loss=self.on_loss, grace_s=self.grace, odometry_s=self.odometry_age)
         return pilot_report(

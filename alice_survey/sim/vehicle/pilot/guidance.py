@@ -37,6 +37,8 @@ from alice_survey.sim.vehicle.pilot.gains import (
 from alice_survey.sim.vehicle.pilot.memory import PilotState
 from alice_survey.sim.vehicle.pilot.mission import (
     COLA2,
+    END_E,
+    END_N,
     NO_LAW,
     PilotMission,
     fly_mission,
@@ -66,7 +68,6 @@ from alice_survey.sim.vehicle.pilot.steering import (
     write_point,
     write_wrench,
 )
-from alice_survey.sim.vehicle.pilot.steps import END_E, END_N
 from alice_survey.sim.vehicle.rotations import wrap_angle
 
 _STEP_M = 1000.0

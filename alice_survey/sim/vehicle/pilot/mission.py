@@ -58,7 +58,6 @@ from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.dynamics import add_coriolis, add_damping
 from alice_survey.sim.vehicle.pilot import memory as slot
-from alice_survey.sim.vehicle.pilot import steps as column
 from alice_survey.sim.vehicle.pilot.gains import FASTEST, PLACE, RATE, SURGE, WEIGHT, YAW, Gains
 from alice_survey.sim.vehicle.pilot.memory import DIVE, FOLLOW
 from alice_survey.sim.vehicle.pilot.safety import mind_floor, restart_watch
@@ -73,6 +72,21 @@ from alice_survey.sim.vehicle.pilot.steering import (
     surge_at,
 )
 from alice_survey.sim.vehicle.rotations import wrap_angle
+
+(
+    KIND, START_N, START_E, END_N, END_E, HEADING, BY_DEPTH, BY_ALTITUDE, DEPTH, ALTITUDE, SPEED,
+    TOLERANCE, HOLD_S, LINE,
+) = range(14)  # fmt: skip
+"""Columns of the steps of a mission. Kind of manoeuvre; where a section starts and where the step ends, m north and east; heading to
+hold, rad, NaN where it follows from the way; 1 where heave may be by depth, by altitude (by both:
+altitude as soon as there is one); target depth of the origin, m; target altitude of the point
+whose altitude the navigation gives, m; speed, m/s; how near to its end it is done, m; how long to
+stay there, s; the survey line on which pictures are taken meanwhile, or -1."""
+COLUMNS = 14
+
+GOTO, SECTION, KEEP, ANCHOR, FROM_END = 0, 1, 2, 3, 4
+"""Kinds: from where the vehicle is; along a straight from its start; hold a place and a heading;
+stay about a place, facing it; along the straight from where the step before ends."""
 
 MIN_SPEED_MPS = 0.2
 """WPNAV_SPEED_MIN: a slower speed is not taken."""
@@ -107,11 +121,11 @@ def to_waypoint(step: Array, heave_m: float, settings: Array, tick: Tick) -> boo
     """Fly to a way-point for a tick; return whether it is done. Arguments as of `manoeuvre`."""
     dt_s, estimate, pilot = tick.dt_s, tick.estimate, tick.pilot
     memory, point, now = pilot.memory, pilot.point, estimate[vector.HEADING]
-    dn, de = step[column.END_N] - memory[slot.FROM_N], step[column.END_E] - memory[slot.FROM_E]
+    dn, de = step[END_N] - memory[slot.FROM_N], step[END_E] - memory[slot.FROM_E]
     length = math.hypot(dn, de)
     course = math.atan2(de, dn) if length > 1e-6 else now
     s, c = math.sin(course), math.cos(course)
-    speed = max(step[column.SPEED], MIN_SPEED_MPS)
+    speed = max(step[SPEED], MIN_SPEED_MPS)
     acceleration = min(settings[_ACCEL], 0.5 * math.sqrt(speed * settings[_JERK]))
     # How fast the target's time runs.
     moves, pace = memory[slot.RAMP_SPEED], 1.0
@@ -136,7 +150,7 @@ def to_waypoint(step: Array, heave_m: float, settings: Array, tick: Tick) -> boo
     north, east = memory[slot.FROM_N] + at * c, memory[slot.FROM_E] + at * s
     off_n, off_e = north - point[slot.POINT_NORTH], east - point[slot.POINT_EAST]
 
-    heading = step[column.HEADING]
+    heading = step[HEADING]
     if not math.isfinite(heading):
         heading = course
         target_n = moves * c + settings[_POSITION_P] * off_n
@@ -149,15 +163,13 @@ def to_waypoint(step: Array, heave_m: float, settings: Array, tick: Tick) -> boo
     keep_place(reference, tick)
     pilot.report[slot.BY_SWAY] = 1.0
 
-    away = math.hypot(
-        step[column.END_N] - point[slot.POINT_NORTH], step[column.END_E] - point[slot.POINT_EAST]
-    )
-    radius = max(step[column.TOLERANCE], MIN_RADIUS_M)
+    away = math.hypot(step[END_N] - point[slot.POINT_NORTH], step[END_E] - point[slot.POINT_EAST])
+    radius = max(step[TOLERANCE], MIN_RADIUS_M)
     if memory[slot.KEEPS] == 0.0 and (at < length or math.hypot(away, heave_m) > radius):
         return False
     memory[slot.KEEPS] = 1.0
     memory[slot.HELD_S] += dt_s
-    return bool(memory[slot.HELD_S] >= step[column.HOLD_S])
+    return bool(memory[slot.HELD_S] >= step[HOLD_S])
 
 
 PARK_APPROACH_M = 3.0
@@ -294,9 +306,9 @@ def timeout_s(step: Array, distance_m: float, heave_m: float, settings: Array) -
         heave_m: to its depth.
         settings: of the law.
     """
-    speed = max(min(step[column.SPEED], settings[_MAX_SURGE]), 1e-3)
-    heave = abs(heave_m) if step[column.BY_DEPTH] > 0.0 else 0.0
-    heave += _DVL_RANGE_M if step[column.BY_ALTITUDE] > 0.0 else 0.0
+    speed = max(min(step[SPEED], settings[_MAX_SURGE]), 1e-3)
+    heave = abs(heave_m) if step[BY_DEPTH] > 0.0 else 0.0
+    heave += _DVL_RANGE_M if step[BY_ALTITUDE] > 0.0 else 0.0
     return float(2.0 * max(math.sqrt(2.0) * distance_m / speed, heave / _HEAVE_MPS) + _SPARE_S)
 
 
@@ -312,9 +324,9 @@ def manoeuvre(step: Array, heave_m: float, settings: Array, tick: Tick) -> bool:
     """
     dt_s, estimate, _path, guidance, gains, pilot = tick
     memory = pilot.memory
-    parks = step[column.KIND] == column.KEEP or step[column.KIND] == column.ANCHOR
+    parks = step[KIND] == KEEP or step[KIND] == ANCHOR
     if not parks or memory[slot.KEEPS] == 0.0:
-        tolerance = PARK_APPROACH_M if parks else step[column.TOLERANCE]
+        tolerance = PARK_APPROACH_M if parks else step[TOLERANCE]
         done = _section(step, tolerance, heave_m, settings, tick)
         done = done or memory[slot.STEP_S] > memory[slot.TIMEOUT_S]
         if done and parks:
@@ -325,19 +337,17 @@ def manoeuvre(step: Array, heave_m: float, settings: Array, tick: Tick) -> bool:
             memory[slot.PLACE_SUM_E] = held * math.sin(heading)
         return bool(done and not parks)
     memory[slot.HELD_S] += dt_s
-    if (
-        step[column.KIND] == column.KEEP
-    ):  # by surge and sway, or by surge alone without thrusters for it
-        heading = step[column.HEADING]
+    if step[KIND] == KEEP:  # by surge and sway, or by surge alone without thrusters for it
+        heading = step[HEADING]
         head_for(heading, 0.0, 0.0, tick)
         reference = StopReference(
-            step[column.END_N], step[column.END_E], heading, 0.0, 0.0, heading, 0.0, 0.0, 0.0, True
+            step[END_N], step[END_E], heading, 0.0, 0.0, heading, 0.0, 0.0, 0.0, True
         )
         keep_place(reference, tick)
         pilot.report[slot.BY_SWAY] = 1.0 if guidance.sway > 0.0 else 0.0
     else:  # face the place and keep a radius off it
-        dn = step[column.END_N] - pilot.point[slot.POINT_NORTH]
-        de = step[column.END_E] - pilot.point[slot.POINT_EAST]
+        dn = step[END_N] - pilot.point[slot.POINT_NORTH]
+        de = step[END_E] - pilot.point[slot.POINT_EAST]
         heading = math.atan2(de, dn)
         speed = settings[_ANCHOR_KP] * (math.hypot(dn, de) - settings[_ANCHOR_RADIUS])
         speed = min(max(speed, settings[_ANCHOR_MIN]), settings[_ANCHOR_MAX])
@@ -346,7 +356,7 @@ def manoeuvre(step: Array, heave_m: float, settings: Array, tick: Tick) -> bool:
         head_for(heading, 0.0, 0.0, tick)
         surge_at(speed, tick)
         pilot.report[slot.BY_SWAY] = 0.0
-    return bool(memory[slot.HELD_S] >= step[column.HOLD_S])
+    return bool(memory[slot.HELD_S] >= step[HOLD_S])
 
 
 @kernel
@@ -382,13 +392,13 @@ def _section(step: Array, tolerance_m: float, heave_m: float, settings: Array, t
     estimate, pilot = tick.estimate, tick.pilot
     memory, point, now = pilot.memory, pilot.point, estimate[vector.HEADING]
     north, east = point[slot.POINT_NORTH], point[slot.POINT_EAST]
-    to_end = math.hypot(step[column.END_N] - north, step[column.END_E] - east)
+    to_end = math.hypot(step[END_N] - north, step[END_E] - east)
     to_start = math.hypot(memory[slot.FROM_N] - north, memory[slot.FROM_E] - east)
     heading = aim(
-        north, east, memory[slot.FROM_N], memory[slot.FROM_E], step[column.END_N],
-        step[column.END_E], settings[_DELTA],
+        north, east, memory[slot.FROM_N], memory[slot.FROM_E], step[END_N],
+        step[END_E], settings[_DELTA],
     )  # fmt: skip
-    speed = min(step[column.SPEED], settings[_MAX_SURGE])
+    speed = min(step[SPEED], settings[_MAX_SURGE])
     near = min(to_end, to_start) / max(settings[_RAMP], 1e-9)
     if 0.0 < near < 1.0:
         speed -= (speed - min(settings[_MIN_SURGE], speed)) * (1.0 - near)
@@ -412,13 +422,13 @@ class PilotMission(NamedTuple):
 
     law: int
     steps: Array
-    """(M, COLUMNS), see steps.py."""
+    """(M, COLUMNS), see above."""
     settings: Array
     """Of the law: `COLA2_SETTINGS` or `ARDUSUB_SETTINGS` values."""
 
 
 _SETTINGS = max(COLA2_SETTINGS, ARDUSUB_SETTINGS)
-NO_MISSION = PilotMission(NO_LAW, np.zeros((0, column.COLUMNS)), np.zeros(_SETTINGS))
+NO_MISSION = PilotMission(NO_LAW, np.zeros((0, COLUMNS)), np.zeros(_SETTINGS))
 """The path is followed by our own guidance."""
 
 
@@ -450,25 +460,23 @@ def fly_mission(mission: PilotMission, tick: Tick) -> bool:
     memory, report, point = pilot.memory, pilot.report, pilot.point
     leg = int(report[slot.LEG])
     step = mission.steps[leg]
-    heave = step[column.BY_DEPTH] > 0.0 and (
-        step[column.BY_ALTITUDE] == 0.0 or memory[slot.FLOOR_KNOWN] == 0.0
-    )
+    heave = step[BY_DEPTH] > 0.0 and (step[BY_ALTITUDE] == 0.0 or memory[slot.FLOOR_KNOWN] == 0.0)
     if heave:
-        depth, slope = step[column.DEPTH], 0.0
+        depth, slope = step[DEPTH], 0.0
     elif memory[slot.FLOOR_KNOWN] == 0.0:
         depth, slope = guidance.limits.blind_depth_m, 0.0
     else:
-        depth, slope = memory[slot.FLOOR] - step[column.ALTITUDE], memory[slot.FLOOR_SLOPE]
+        depth, slope = memory[slot.FLOOR] - step[ALTITUDE], memory[slot.FLOOR_SLOPE]
     target = mind_floor(depth, estimate, guidance.limits, pilot)
     if memory[slot.STEP_S] == 0.0:
         north, east = point[slot.POINT_NORTH], point[slot.POINT_EAST]
         memory[slot.HELD_S] = memory[slot.KEEPS] = 0.0
         memory[slot.TRACK_PACE] = 1.0
-        if step[column.KIND] == column.SECTION:
-            memory[slot.FROM_N], memory[slot.FROM_E] = step[column.START_N], step[column.START_E]
-        elif step[column.KIND] == column.FROM_END and leg > 0:
+        if step[KIND] == SECTION:
+            memory[slot.FROM_N], memory[slot.FROM_E] = step[START_N], step[START_E]
+        elif step[KIND] == FROM_END and leg > 0:
             before = mission.steps[leg - 1]
-            memory[slot.FROM_N], memory[slot.FROM_E] = before[column.END_N], before[column.END_E]
+            memory[slot.FROM_N], memory[slot.FROM_E] = before[END_N], before[END_E]
         else:
             memory[slot.FROM_N], memory[slot.FROM_E] = north, east
         memory[slot.RAMP] = memory[slot.RAMP_SPEED] = memory[slot.REF] = memory[slot.REF_SPEED] = (
@@ -478,7 +486,7 @@ def fly_mission(mission: PilotMission, tick: Tick) -> bool:
         if mission.law == COLA2:
             memory[slot.TIMEOUT_S] = timeout_s(
                 step,
-                math.hypot(step[column.END_N] - north, step[column.END_E] - east),
+                math.hypot(step[END_N] - north, step[END_E] - east),
                 target - estimate[vector.DEPTH],
                 mission.settings,
             )
@@ -486,8 +494,8 @@ def fly_mission(mission: PilotMission, tick: Tick) -> bool:
     sink_to(target, slope, tick)
     # Until there is a floor a dive may take as long as it gets on.
     report[slot.PHASE] = DIVE if memory[slot.FLOOR_KNOWN] == 0.0 or heave else FOLLOW
-    report[slot.LINE] = step[column.LINE]
-    dn, de = step[column.END_N] - memory[slot.FROM_N], step[column.END_E] - memory[slot.FROM_E]
+    report[slot.LINE] = step[LINE]
+    dn, de = step[END_N] - memory[slot.FROM_N], step[END_E] - memory[slot.FROM_E]
     course = math.atan2(de, dn) if math.hypot(dn, de) > 1e-6 else estimate[vector.HEADING]
     off_n, off_e = (
         point[slot.POINT_NORTH] - memory[slot.FROM_N],
@@ -503,7 +511,7 @@ def fly_mission(mission: PilotMission, tick: Tick) -> bool:
     else:
         done = to_waypoint(step, away, mission.settings, tick)
     last = leg + 1 == mission.steps.shape[0]
-    if heave and last and estimate[vector.DEPTH] < guidance.surface_m and step[column.DEPTH] == 0.0:
+    if heave and last and estimate[vector.DEPTH] < guidance.surface_m and step[DEPTH] == 0.0:
         done = True
     if not done:
         return False

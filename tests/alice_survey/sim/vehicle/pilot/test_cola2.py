@@ -10,19 +10,17 @@ from hypothesis import strategies as st
 from alice_survey.core.config import VehicleConfig
 from alice_survey.sim.vehicle.pilot.gains import gains_for
 from alice_survey.sim.vehicle.pilot.mission import (
+    BY_ALTITUDE,
+    BY_DEPTH,
     COLA2,
+    COLUMNS,
+    SPEED,
     Cola2Settings,
     aim,
     circling_m,
     mission_of,
     steady_drift,
     timeout_s,
-)
-from alice_survey.sim.vehicle.pilot.steps import (
-    BY_ALTITUDE,
-    BY_DEPTH,
-    COLUMNS,
-    SPEED,
 )
 from missions.route.energy import craft_of
 
