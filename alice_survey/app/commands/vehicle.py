@@ -26,16 +26,15 @@ class CoefficientsCommand(ReportCommand):
     name = "vehicle coefficients"
     examples = (
         "vehicle coefficients",
-        "vehicle coefficients --csv coefficients.csv --plot coefficients.png",
+        "vehicle coefficients --plot coefficients.png",
     )
-    csv: Path | None = option(None, "CSV file to write.", metavar="FILE")
     plot: Path | None = option(None, "Figure to draw.", metavar="FILE")
 
     def run(self) -> Result:
         """Compute and compare them."""
         from alice_survey.sim.vehicle.paper_tables import coefficients_report
 
-        return coefficients_report(self.csv, self.plot)
+        return coefficients_report(self.plot)
 
 
 class CompareCommand(SurveyCommand, ThreadsCommand):
@@ -119,7 +118,6 @@ class IdentifyCommand(ReportCommand):
     window: float | None = option(
         None, "Longest stretch to simulate in one go.", metavar="SECONDS", ge=0.1
     )
-    hold_input: bool = option(False, "Hold each input until the next row.")
     prior: str | None = option(
         None, "Relative sigmas of the start: damping=0.5,added_mass=0.3; a number; none.",
         metavar="SIGMAS",
@@ -141,7 +139,7 @@ class IdentifyCommand(ReportCommand):
             free=tuple((self.free or "").split(",")) if self.free else (),
             held=tuple(self.held or ()), method=self.method, columns=self.columns,
             given=tuple(self.given.split(",")) if self.given else (), window_s=self.window,
-            hold_input=self.hold_input, prior=read_prior(self.prior or ""),
+            prior=read_prior(self.prior or ""),
         )  # fmt: skip
         return identify_report(self.logs or [], self.out, options)
 

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.core.artefacts import write_csv
 from alice_survey.core.errors import ConfigError
 from alice_survey.core.text_table import text_table
 from alice_survey.sim.vehicle.coefficients import LIFTS, Coefficients
@@ -148,25 +147,19 @@ went the other way, the sum stays below that of the other sets.
 """
 
 
-def coefficients_report(
-    csv: Path | None = None, plot: Path | None = None
-) -> tuple[str, dict[str, Any]]:
+def coefficients_report(plot: Path | None = None) -> tuple[str, dict[str, Any]]:
     """The paper's three tables next to ALICE's coefficients from shape.
 
     Args:
-        csv: file to write the rows to.
         plot: figure of the ratios to the paper's values to draw.
 
     Returns:
         Text, and the same as values for JSON.
 
     Raises:
-        ConfigError: a file cannot be written.
+        ConfigError: the figure cannot be written.
     """
-    values = [asdict(row) for row in ROWS]
     try:
-        if csv is not None:
-            write_csv(csv, list(values[0]), [list(each.values()) for each in values])
         if plot is not None:
             draw_ratios(plot, ROWS)
     except OSError as error:
@@ -183,7 +176,7 @@ def coefficients_report(
         ],
     )  # fmt: skip
     data = {
-        "rows": values,
+        "rows": [asdict(row) for row in ROWS],
         "counts": {mark: sum(row.mark == mark for row in ROWS) for mark in (*_MARKS, "no")},
         "computed": dict(COMPUTED["alice"].values),
     }

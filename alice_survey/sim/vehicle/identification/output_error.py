@@ -325,8 +325,6 @@ class Simulation:
 
     max_step_s: float = 0.025
     """Rows farther apart are crossed in several steps."""
-    hold: bool = False
-    """Inputs are held until the next row; else they are linear between rows."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -614,7 +612,7 @@ class _FitProblem:
         slopes = np.empty((rows, CHANNELS, self.count + START))
         simulate(
             physics, self.parameters.terms, window.record, start, self.how.max_step_s,
-            self.how.hold, self.scratch, self.sensitivity, states, observed, slopes,
+            self.scratch, self.sensitivity, states, observed, slopes,
         )  # fmt: skip
         mask = self.measured[i]
         residual = (residual_channels(window, observed) / self.sigma)[mask]

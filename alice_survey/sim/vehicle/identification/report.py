@@ -164,7 +164,7 @@ def _run(window: Window, motion: Array, physics: Physics, how: Simulation) -> Ar
     nothing = np.zeros(0, np.int64)
     simulate(
         physics, Terms(nothing, nothing, nothing), window.record, start, how.max_step_s,
-        how.hold, scratch_for(0, window.record.rps.shape[1]), np.zeros((STATES, 0)), states,
+        scratch_for(0, window.record.rps.shape[1]), np.zeros((STATES, 0)), states,
         observed, np.empty((rows, CHANNELS, 0)),
     )  # fmt: skip
     if not np.all(np.isfinite(observed[:, :_MOTIONS])):
@@ -220,7 +220,6 @@ class IdentifyOptions:
     """Rates that follow the log."""
     window_s: float | None = None
     """Longest stretch simulated in one go; as long as there are no gaps if not given."""
-    hold_input: bool = False
     prior: PriorSigmas | None = field(default_factory=PriorSigmas)
     """How far the vehicle may be from where the joint fit starts; anywhere if None."""
 
@@ -287,7 +286,7 @@ def identify_report(
             f"the logs give speeds, but {options.vehicle} does not say what they mean of "
             f"{'; '.join(missing)}"
         )
-    how = Simulation(hold=options.hold_input)
+    how = Simulation()
     result = _identify(windows, used, how, options)
     validation = _validation(shorter, result, how) if shorter else None
     own = validate(windows, result.parameters, result.values, simulation=how) if windows else None

@@ -284,7 +284,6 @@ def _step(
     row: int,
     begin: float,
     step_s: float,
-    hold: bool,
     state: Array,
     sensitivity: Array,
     scratch: SlopeScratch,
@@ -293,7 +292,7 @@ def _step(
 
     Between two rows a wrench is linear, and a thruster's speed as a first-order lag with its
     time constant does under a constant command: straight if slow, and exact for a thruster that is
-    commanded with each row. Held inputs stay at the first row's.
+    commanded with each row.
     """
     span = record.time_s[row + 1] - record.time_s[row]
     total, trial = scratch.stage[1], scratch.stage[2]
@@ -303,10 +302,10 @@ def _step(
         scratch.acceleration[j] = record.acceleration[row, j]
     for k in range(4):
         at = begin + step_s * (0.0 if k == 0 else (1.0 if k == 3 else 0.5))
-        share = 0.0 if hold else at / span
+        share = at / span
         for j in range(scratch.rps.shape[0]):
             lag, part = lags[j], share
-            if not hold and lag > 0.0:
+            if lag > 0.0:
                 part = math.expm1(-at / lag) / math.expm1(-span / lag)
             scratch.rps[j] = (1 - part) * record.rps[row, j] + part * record.rps[row + 1, j]
         for j in range(6):
@@ -407,7 +406,6 @@ def simulate(
     record: Record,
     start: Array,
     max_step_s: float,
-    hold: bool,
     scratch: SlopeScratch,
     sensitivity: Array,
     states: Array,
@@ -422,7 +420,6 @@ def simulate(
         record: T rows.
         start: (10,) state at the first row.
         max_step_s: rows farther apart are crossed in equal steps no longer than this.
-        hold: the input stays what it was in a row until the next.
         scratch: for C = P + 9 columns; or for none, with no terms.
         sensitivity: (10, C) room.
         states: (T, 10) is written.
@@ -460,6 +457,6 @@ def simulate(
         count = max(int(np.ceil(span / max_step_s - 1e-6)), 1)
         for i in range(count):
             _step(
-                physics, terms, record, row, i * span / count, span / count, hold, states[row + 1],
+                physics, terms, record, row, i * span / count, span / count, states[row + 1],
                 sensitivity, scratch,
             )  # fmt: skip

@@ -47,7 +47,6 @@ def run(
     given: tuple[int, ...] = (),
     slopes: bool = True,
     step_s: float = STEP_S,
-    hold: bool = False,
 ) -> tuple[Array, Array, Array]:
     columns = len(values) + START if slopes else 0
     nothing = np.zeros(0, np.int64)
@@ -57,7 +56,7 @@ def run(
     derivatives = np.empty((rows, CHANNELS, columns))
     physics = with_given(parameters.physics(values), given)
     simulate(
-        physics, terms, record, start, step_s, hold, scratch_for(columns, record.rps.shape[1]),
+        physics, terms, record, start, step_s, scratch_for(columns, record.rps.shape[1]),
         np.zeros((STATES, columns)), states, observed, derivatives,
     )  # fmt: skip
     return states, observed, derivatives
