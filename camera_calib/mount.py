@@ -3,7 +3,6 @@
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -11,8 +10,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.core.artefacts import read_json
 from alice_survey.core.contents import one_line
 from alice_survey.core.errors import CalibrationError
-from alice_survey.core.frames import Array, pose_from_json, pose_to_json
-from camera_calib.rig import Rig, read_rig, write_rig
+from alice_survey.core.frames import Array, pose_from_json
+from camera_calib.rig import Rig, read_rig
 
 _DOWN = np.array([0.0, 0.0, 1.0])
 _TOPS = {
@@ -123,51 +122,6 @@ def with_mount(rig: Rig, mount: str, lever_m: tuple[float, float, float] | None)
         glass = pose.rotation.apply(rig.cameras[rig.reference].front_cam)
         pose = RigidTransform.from_components(np.array(lever_m) - glass, pose.rotation)
     return replace(rig, body_from_rig=pose)
-
-
-def mount_report(
-    path: Path,
-    mount: str | None,
-    lever_m: tuple[float, float, float] | None,
-    output: Path | None,
-    plot: Path | None,
-    *,
-    overwrite: bool = False,
-) -> tuple[str, dict[str, Any]]:
-    """Say and draw how a rig is mounted, or mount it.
-
-    Args:
-        path: of its `rig.json`.
-        mount: as of `with_mount`; None: as it is.
-        lever_m: as of `with_mount`.
-        output: `rig.json` to write, which may be the same.
-        plot: figure to draw.
-        overwrite: whether `output` may replace a file other than `path`.
-
-    Raises:
-        CalibrationError: the rig or the mount cannot be read, `output` is another file that exists,
-            or nothing is known to draw.
-    """
-    rig = read_rig(path)
-    if mount is not None:
-        rig = with_mount(rig, mount, lever_m)
-    elif lever_m is not None or output is not None:
-        raise CalibrationError(f"name a mount: {MOUNTS}, or a file")
-    if output is not None and output.exists() and not (overwrite or output.samefile(path)):
-        raise CalibrationError(f"{output}: exists: name another, or add --overwrite")
-    lines = [mount_line(rig)]
-    if output is not None:
-        write_rig(output, rig)
-        lines.append(f"rig in {output}")
-    elif mount is not None:
-        lines.append("nothing is written: add -o FILE")
-    if plot is not None:
-        from camera_calib.mount_figure import plot_mount
-
-        plot_mount(rig, plot)
-        lines.append(f"drawing in {plot}")
-    pose = rig.body_from_rig
-    return "\n".join(lines), {"body_from_rig": None if pose is None else pose_to_json(pose)}
 
 
 def _mount_of_file(path: Path) -> RigidTransform:

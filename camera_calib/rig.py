@@ -124,7 +124,7 @@ class Rig:
         if self.body_from_rig is None:
             raise CalibrationError(
                 f"{self.source}: how the rig is mounted on the vehicle is unknown: state it with "
-                "'alice-survey camera mount RIG nadir-bow-up --lever 0.55 -0.05 0.08 -o RIG'"
+                "'alice-survey camera convert RIG NEW --mount nadir-bow-up --lever 0.55 -0.05 0.08'"
             )
         return self.body_from_rig * self.cam_from_rig[camera].inv()
 

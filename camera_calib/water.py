@@ -10,7 +10,6 @@ The index of refraction is that of `alice_survey.core.seawater` (Quan and Fry 19
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -113,20 +112,19 @@ def water_report(
     salinity_psu: float,
     depth_m: float,
     jerlov: str,
-    wavelengths_nm: Sequence[float] | None = None,
 ) -> tuple[str, dict[str, Any]]:
-    """Index and attenuation by wavelength, as text and as JSON values.
+    """Index and attenuation of the camera's channels, as text and as JSON values.
 
-    Rows are the camera's three channels when no wavelengths are given. `diffuse_per_m` is Jerlov's
+    `diffuse_per_m` is Jerlov's
     K_d of daylight; `beam_per_m`, the attenuation of a strobe's beam, absorption and scattering.
 
     Raises:
-        ConfigError: the water or a wavelength is out of range, or the Jerlov type is unknown.
+        ConfigError: the water is out of range, or the Jerlov type is unknown.
     """
     kind = next((name for name in _DIFFUSE_PER_M if name == jerlov), None)
     if kind is None:
         raise ConfigError(f"no Jerlov type {jerlov!r}: known are {', '.join(_DIFFUSE_PER_M)}")
-    nm = WAVELENGTH_NM if wavelengths_nm is None else np.asarray(wavelengths_nm, dtype=np.float64)
+    nm = WAVELENGTH_NM
     optics = water_optics(kind, nm)
     columns = {
         "wavelength_nm": nm,
@@ -136,17 +134,16 @@ def water_report(
         "scattering_per_m": optics.scattering_per_m,
         "beam_per_m": optics.attenuation_per_m,
     }
-    names = dict(zip(WAVELENGTH_NM.tolist(), CHANNELS, strict=True))
     rows: list[dict[str, Any]] = [
-        {"channel": names.get(wave, "")} | {key: float(found[i]) for key, found in columns.items()}
-        for i, wave in enumerate(nm.tolist())
+        {"channel": name} | {key: float(found[i]) for key, found in columns.items()}
+        for i, name in enumerate(CHANNELS)
     ]
     pressure = float(pressure_dbar(depth_m))
     table = text_table(
         ("channel", "wavelength", "n_water", "daylight K_d", "absorption", "scattering", "beam c"),
         [
             (
-                row["channel"] or "-",
+                row["channel"],
                 f"{row['wavelength_nm']:g} nm",
                 f"{row['n_water']:.5f}",
                 f"{row['diffuse_per_m']:.3f} /m",

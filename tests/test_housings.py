@@ -68,7 +68,8 @@ def pool_as(workspace: Path, output: Path, port: str | None, **more: Any) -> lis
     )
     calibrate_pictures(
         CalibrateOptions(
-            left=str(pool / "left"), right=str(pool / "right"), target=BOARD, output=output,
+            cameras=(f"left={pool / 'left'}", f"right={pool / 'right'}"), target=BOARD,
+            output=output,
             water=port is not None, port=port, **glass, **more,
         )
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Which housing a camera looks through: a flat port, a dome, or none that bends light.
+"""The calibration of a task: in air, or through the housing that is stated or that fits best.
 
 A flat port makes focal lengths the water's index times longer than in air, a dome about its pupil
 leaves them as they are. Where both calibrations exist, their ratio shows the housing at once. Else
@@ -7,22 +7,127 @@ every parameter (G. Schwarz 1978, "Estimating the dimension of a model").
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from alice_survey.core.errors import AliceError, CalibrationError
 from alice_survey.core.frames import Array
-from camera_calib.calibrate.solve import blank_camera, first_cameras
-from camera_calib.calibration import Calibration, HousingJudgement, HousingTrial, TargetView
+from camera_calib.calibrate.detect_views import Detections
+from camera_calib.calibrate.options import AUTO, CalibrationTask
+from camera_calib.calibrate.solve import (
+    blank_camera,
+    calibrate_in_air,
+    calibrate_in_water_alone,
+    calibrate_through_ports,
+    first_cameras,
+)
+from camera_calib.calibrate.start import same_numbering
+from camera_calib.calibration import Calibration, HousingTrial, TargetView
+from camera_calib.camera import Camera
 from camera_calib.freedom import LensNames, lens_of
-from camera_calib.ports.dome import DomePort
-from camera_calib.ports.none import NoPort
+from camera_calib.optics import PORTS, likely_port
+from camera_calib.ports.flat import FlatPort
 from camera_calib.rig import Rig
+from camera_calib.target_shape import shape_of
 
-_ALIKE = 1.01
-"""Noise over the least one, below which a housing explains the views as well."""
+
+def calibrate_task(task: CalibrationTask, found: Detections) -> Calibration:
+    """The calibration that options ask for.
+
+    Args:
+        task: what is known before.
+        found: views of its target.
+
+    Raises:
+        CalibrationError: the views do not determine it, or are not of the start's cameras.
+    """
+    _check_sizes(task, found)
+    if not task.water:
+        cameras = task.cameras(found.sizes, task.ports)
+        start = None if task.start is None else replace(task.start, cameras=cameras)
+        shape = shape_of(task.target, task.target_shape)
+        views = _number_alike(task, found, cameras)
+        return calibrate_in_air(views, task.target.points, found.sizes, task.lenses, start, shape)
+    ratios: dict[str, float] = {}
+    if task.start is not None:
+        views = _number_alike(task, found, task.start.cameras)
+        ratios = focal_ratios(views, task.target.points, task.start, task.lenses)
+    if AUTO in task.ports.values():
+        calibration = _likeliest(task, found)
+    else:
+        try:
+            calibration = _through(task, found, task.ports)
+        except CalibrationError as error:
+            raise CalibrationError(f"{error}{_other_housing(ratios, task.ports)}") from None
+    return replace(calibration, housing=replace(calibration.housing, focal_ratios=ratios))
+
+
+def _check_sizes(task: CalibrationTask, found: Detections) -> None:
+    """Check that pictures are as large as those that the start was calibrated from.
+
+    Raises:
+        CalibrationError: they are not.
+    """
+    for name, camera in ({} if task.start is None else task.start.cameras).items():
+        if (camera.width_px, camera.height_px) != found.sizes[name]:
+            width, height = found.sizes[name]
+            raise CalibrationError(
+                f"pictures of {name} have {width} x {height} px, the start's camera "
+                f"{camera.width_px} x {camera.height_px}"
+            )
+
+
+def _number_alike(
+    task: CalibrationTask, found: Detections, cameras: Mapping[str, Camera]
+) -> Sequence[TargetView]:
+    """Views whose points all cameras number alike."""
+    if not task.target.is_ambiguous or len(cameras) < 2:
+        return found.views
+    points = task.target.points
+    if task.start is None:
+        cameras = first_cameras(found.views, points, cameras, task.lenses)
+    return same_numbering(cameras, found.views, points, task.target.symmetries)
+
+
+def _through(task: CalibrationTask, found: Detections, kinds: Mapping[str, str]) -> Calibration:
+    """The calibration under water through ports of the named kinds."""
+    points, shape = task.target.points, shape_of(task.target, task.target_shape)
+    cameras = task.cameras(found.sizes, kinds)
+    views, sigmas = _number_alike(task, found, cameras), task.sigmas_of(cameras)
+    if task.start is None:
+        return calibrate_in_water_alone(views, points, cameras, task.lenses, sigmas, shape)
+    start = replace(task.start, cameras=cameras)
+    return calibrate_through_ports(views, points, start, task.known, task.lenses, sigmas, shape)
+
+
+def _likeliest(task: CalibrationTask, found: Detections) -> Calibration:
+    """The calibration through the likeliest housing, with how the others did."""
+    trials, calibrations = [], {}
+    for kind in PORTS:
+        try:
+            calibrations[kind] = _through(task, found, dict.fromkeys(found.sizes, kind))
+        except AliceError as error:
+            trials.append(
+                HousingTrial(port=kind, noise_px=math.nan, criterion=math.inf, why=str(error))
+            )
+            continue
+        trials.append(judge_housing(kind, calibrations[kind]))
+    best = min(trials, key=lambda trial: trial.criterion).port
+    if best not in calibrations:
+        reasons = "; ".join(f"{trial.port}: {trial.why}" for trial in trials)
+        raise CalibrationError(f"no housing fits the views: {reasons}")
+    chosen = calibrations[best]
+    return replace(chosen, housing=replace(chosen.housing, trials=tuple(trials), chosen=best))
+
+
+def judge_housing(kind: str, found: Calibration) -> HousingTrial:
+    """How well views fit one kind of port; fewer parameters are likelier at the same noise."""
+    coordinates = 2 * int(np.isfinite(found.residuals_px[..., 0]).sum())
+    parameters = 0 if found.rig.covariance is None else len(found.rig.covariance.parameters)
+    criterion = 2.0 * coordinates * math.log(found.noise_px) + parameters * math.log(coordinates)
+    return HousingTrial(port=kind, noise_px=found.noise_px, criterion=criterion, why="")
 
 
 def focal_ratios(
@@ -49,54 +154,13 @@ def focal_ratios(
     }
 
 
-def compare_housings(calibrations: Mapping[str, Callable[[], Calibration]]) -> Calibration:
-    """Calibrate every housing, and return the likeliest with how the others did.
-
-    Args:
-        calibrations: by the name of the port.
-
-    Raises:
-        CalibrationError: none of them is determined by the views.
-    """
-    trials, found = [], {}
-    for name, calibrate in calibrations.items():
-        try:
-            found[name] = calibrate()
-        except AliceError as error:
-            failed = HousingTrial(port=name, noise_px=math.nan, criterion=math.inf, why=str(error))
-            trials.append(failed)
-            continue
-        trials.append(_trial(name, found[name]))
-    if not found:
-        reasons = "; ".join(f"{trial.port}: {trial.why}" for trial in trials)
-        raise CalibrationError(f"no housing fits the views: {reasons}")
-    best = min(trials, key=lambda trial: trial.criterion)
-    chosen = found[best.port]
-    return replace(chosen, housing=replace(chosen.housing, trials=tuple(trials), chosen=best.port))
-
-
-def _trial(name: str, found: Calibration) -> HousingTrial:
-    coordinates = 2 * int(np.isfinite(found.residuals_px[..., 0]).sum())
-    parameters = 0 if found.rig.covariance is None else len(found.rig.covariance.parameters)
-    criterion = 2.0 * coordinates * math.log(found.noise_px) + parameters * math.log(coordinates)
-    return HousingTrial(port=name, noise_px=found.noise_px, criterion=criterion, why="")
-
-
-def housing_lines(housing: HousingJudgement) -> list[str]:
-    """What was compared, one line; nothing where nothing was."""
-    if not housing.trials:
-        return []
-    shown = [
-        f"{trial.port} {trial.noise_px:.4g} px" if not trial.why else f"{trial.port}: {trial.why}"
-        for trial in housing.trials
-    ]
-    minimum = min(trial.noise_px for trial in housing.trials if not trial.why)
-    alike = [trial.port for trial in housing.trials if trial.noise_px < _ALIKE * minimum]
-    lines = [f"housing {housing.chosen}: noise with {', '.join(shown)}"]
-    if set(alike) == {NoPort.shape, DomePort.shape}:
-        lines.append("a dome about the pupil and no port are the same camera: both fit alike")
-    elif len(alike) > 1:
-        lines.append(
-            f"{', '.join(alike)} fit alike: --start with a calibration in air tells them apart"
-        )
-    return lines
+def _other_housing(ratios: Mapping[str, float], kinds: Mapping[str, str]) -> str:
+    """What focal lengths say against the ports, for the end of a message."""
+    for name, ratio in ratios.items():
+        likely = likely_port(ratio)
+        if FlatPort.shape in (likely, kinds[name]) and likely != kinds[name]:
+            return (
+                f"; focal lengths of {name} under water are {ratio:.3f} times those in air, which "
+                f"says --port {likely}"
+            )
+    return ""

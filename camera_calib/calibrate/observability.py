@@ -8,10 +8,11 @@ an error of it moves a by -S_aa^-1 S_ab.
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.block_solver import inverse_of
@@ -40,8 +41,6 @@ _MIN_TILT = math.radians(8.0)
 """Root mean square lean of the target about each axis, from its mean."""
 _MIN_RANGE_RATIO = 1.4
 _ALIKE = 0.99
-_BADLY = 2.5
-"""Ratio of a picture's residuals to those of all."""
 _LENS_ONLY = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
 _FOCAL = ("fx_px", "fy_px")
 _WATER = ("n_water",)
@@ -147,20 +146,14 @@ def _matters(camera: Camera, name: str) -> bool:
 def advice(
     rig: Rig,
     measured: Array,
-    residuals_px: Array,
-    names: Iterable[str],
     rig_from_target: RigidTransform,
-    noise_px: float,
 ) -> tuple[str, ...]:
     """Lines on what the views do not constrain, each stating which views to add.
 
     Args:
         rig: calibrated, with its covariance.
         measured: (V, cameras, N, 2) pixels used; NaN where unseen.
-        residuals_px: (V, cameras, N, 2).
-        names: names of the views.
         rig_from_target: (V,).
-        noise_px: standard deviation of one coordinate.
     """
     lines = []
     views = len(measured)
@@ -176,7 +169,6 @@ def advice(
     if rig.covariance is not None:
         lines += _loose(rig, rig.covariance)
         lines += _alike(rig.covariance)
-    lines += _bad_pictures(rig, residuals_px, list(names), noise_px)
     return tuple(lines)
 
 
@@ -250,15 +242,10 @@ def _alike(covariance: Covariance) -> list[str]:
     for kin in (_LENS_ONLY, _FOCAL, _WATER):  # always alike, and never used apart
         at = [i for i, field in enumerate(fields) if field in kin]
         strong[np.ix_(at, at)] = False
-    groups: list[set[int]] = []
-    for i in range(len(names)):
-        linked = {i, *np.flatnonzero(strong[i]).tolist()}
-        for group in [g for g in groups if g & linked]:
-            linked |= group
-            groups.remove(group)
-        groups.append(linked)
+    count, group_of = connected_components(strong, directed=False)
+    groups = [np.flatnonzero(group_of == group).tolist() for group in range(count)]
     lines = []
-    for together in sorted(sorted(group) for group in groups):
+    for together in groups:
         if len(together) < 2:
             continue
         both = np.abs(covariance.correlation[np.ix_(together, together)])
@@ -267,18 +254,5 @@ def _alike(covariance: Covariance) -> list[str]:
             f"{', '.join(names[i] for i in together)} go together (correlation {both.max():.4f}) "
             "and are not known one by one: tilt the target more, fill the frame's corners, or hold "
             "some of them"
-        )
-    return lines
-
-
-def _bad_pictures(rig: Rig, residuals_px: Array, names: list[str], noise_px: float) -> list[str]:
-    square = np.nanmean(np.where(np.isfinite(residuals_px), residuals_px, 0.0) ** 2, axis=(2, 3))
-    share = np.isfinite(residuals_px).mean(axis=(2, 3))
-    rms = np.sqrt(np.divide(square, share, out=np.zeros_like(square), where=share > 0))
-    lines = []
-    for v, c in zip(*np.nonzero(rms > _BADLY * noise_px), strict=True):
-        lines.append(
-            f"view {names[v]}, {list(rig.cameras)[c]}: residuals of {rms[v, c]:.3g} px where all "
-            f"have {noise_px:.3g}: is it blurred, or did the target move?"
         )
     return lines

@@ -1,137 +1,197 @@
-"""Options of `calibrate`: pictures, target, and prior knowledge of lens, port and water."""
+"""Options of `calibrate`: parsed once, here, into the values that a calibration takes."""
 
-import math
-from collections.abc import Collection, Iterable
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 
-from alice_survey.core.errors import CalibrationError
-from camera_calib.calibrate.solve import Intrinsics
+from alice_survey.core.errors import CalibrationError, WorkspaceError
+from camera_calib.calibrate.solve import Intrinsics, blank_camera
+from camera_calib.camera import Camera
+from camera_calib.freedom import LENSES, USUAL_LENS, part_of_rig
+from camera_calib.lenses.opencv import OpenCVLens
+from camera_calib.mount import MOUNTS, check_mount
 from camera_calib.optics import PORTS
 from camera_calib.picture_files import places_of_cameras
-from camera_calib.ports.dome import DomePort
-from camera_calib.ports.none import NoPort
-from camera_calib.rig import Rig
-from camera_calib.target_shape import (
-    ShapeKind,
-)
+from camera_calib.ports.flat import FlatPort
+from camera_calib.ports.none import NO_PORT, NoPort
+from camera_calib.ports.values import PortValues
+from camera_calib.rig import Rig, read_rig
+from camera_calib.target_shape import ShapeKind
+from camera_calib.targets.target import Target, parse_target
 
 AUTO = "auto"
 """The port that is found by trying all."""
-PORT_KINDS = (*PORTS, AUTO)
-ONE_CAMERA = "camera"
-"""Name of the camera of `--pictures`."""
+WRITTEN = (
+    "rig.json", "rig_carried.json", "calibration.json", "corners.csv", "report.html", "report.json",
+)  # fmt: skip
+"""Files of this command, also of earlier versions; a folder with other files is not replaced."""
+_GLASS = "glass_thickness_m"
+_PORT_OPTIONS: Mapping[str, tuple[str, str, float, tuple[float, float]]] = {
+    "outer_radius_m": ("dome_radius_mm", "--dome-radius", 1e3, (5.0, 1000.0)),
+    "port_distance_m": ("port_distance_mm", "--port-distance", 1e3, (0.0, 500.0)),
+    _GLASS: ("glass_mm", "--glass", 1e3, (0.0, 500.0)),
+    "n_glass": ("n_glass", "--n-glass", 1.0, (1.0, 2.0)),
+    "n_water": ("n_water", "--n-water", 1.0, (1.0, 1.4)),
+}
+"""Options that give parameters of ports: field, name, units in one metre or index, range."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateOptions:
+    """Options as typed; `read_task` makes values of them.
+
+    Lenses, ports and numbers of ports are texts as `words_by_camera` reads them.
+    """
+
+    cameras: tuple[str, ...] = ()
+    """`NAME=PLACE` of each, the reference first."""
+    target: str | None = None
+    target_shape: ShapeKind = "sheet"
+    output: Path | None = None
+    lens: str | None = None
+    water: bool = False
+    start: Path | None = None
+    known: Intrinsics | None = None
+    port: str | None = None
+    dome_radius_mm: str | None = None
+    port_distance_mm: str | None = None
+    glass_mm: str | None = None
+    n_glass: str | None = None
+    n_water: str | None = None
+    mount: str | None = None
+    lever_m: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CalibrationTask:
     """Pictures to calibrate from, and prior knowledge."""
 
-    left: str | None = None
-    """Folder or pattern; the left camera is the reference."""
-    right: str | None = None
-    pictures: str | None = None
-    """Pictures of a single camera, instead."""
-    cameras: tuple[str, ...] = ()
-    """`NAME=PLACE` of each camera, the reference first, where left and right do not do."""
-    own_clocks: bool = False
-    """Whether the cameras took their pictures by clocks of their own, without a common trigger."""
-    target: str | None = None
-    """Target, as `parse_target` reads it."""
-    target_shape: ShapeKind = "sheet"
-    """How it may differ from its drawing."""
-    output: Path | None = None
-    """Folder to write."""
-    lens: str | None = None
-    """Lens model, of `freedom.LENSES`, and those of some cameras, as `by_camera` reads them; None:
-    the usual one of the start's lens, or opencv5."""
+    places: Mapping[str, str]
+    """Folder or pattern of pictures by camera; the first is the reference."""
+    target: Target
+    output: Path
+    lenses: Mapping[str, str]
+    """Lens model by camera, of `freedom.LENSES`."""
+    ports: Mapping[str, str]
+    """Kind of port by camera, of `optics.PORTS`, or `AUTO` for all; in air none has a port."""
+    port_values: Mapping[str, Mapping[str, float]]
+    """Known parameters of the ports by camera; of those that are found, first values."""
+    port_sigmas: Mapping[str, Mapping[str, float]]
+    """Prior sigmas of parameters that are known and found again, by camera."""
     water: bool = False
     """Whether the pictures were taken under water, through the ports."""
-    start: Path | None = None
-    """rig.json of a calibration in air, or an earlier one."""
-    known: Intrinsics | None = None
-    """Use of the intrinsics of `start`; None: prior if it has a covariance, or held."""
-    port: str | None = None
-    """Kind of the port, of `optics.PORTS`, and those of single cameras, as `by_camera` reads them;
-    auto: the likeliest; None: that of the start, or flat."""
-    dome_radius_mm: str | None = None
-    """Outer radius of a dome; this and the next ones by camera, as `by_camera` reads them."""
-    port_distance_mm: str | None = None
-    """First value; it is estimated."""
-    glass_mm: str | None = None
-    """Thickness of the glass."""
-    n_glass: str | None = None
-    n_glass_sigma: float | None = None
-    glass_sigma_mm: float | None = None
-    """Prior sigma of the thickness, which is then estimated; the indices in the same way."""
-    n_water: float | None = None
-    n_water_sigma: float | None = None
-    carry_to_n: float | None = None
-    """Also write the rig in water of this index."""
+    start: Rig | None = None
+    """These cameras as calibrated in air, or earlier."""
+    known: Intrinsics = "free"
+    """Treatment of the start's intrinsics."""
+    target_shape: ShapeKind = "sheet"
     mount: str | None = None
     """How the rig sits on the vehicle, as `with_mount` reads it; None: as of the start."""
     lever_m: tuple[float, float, float] | None = None
-    """Place of the reference camera's front glass on the vehicle."""
 
-    def places(self) -> dict[str, str]:
-        """Folder or pattern by camera; the first is the reference.
+    def cameras(
+        self, sizes: Mapping[str, tuple[int, int]], kinds: Mapping[str, str]
+    ) -> dict[str, Camera]:
+        """Cameras of the start, or blank ones, behind ports of some kinds.
 
-        Raises:
-            CalibrationError: they are missing or do not go together.
+        Args:
+            sizes: width and height of each camera's pictures.
+            kinds: of port, by camera.
         """
-        stereo = {"left": self.left, "right": self.right}
-        given = {camera: place for camera, place in stereo.items() if place is not None}
-        if self.pictures is not None:
-            if given or self.cameras:
-                raise CalibrationError(
-                    "give --left and --right, or --camera, or --pictures, not two of them"
-                )
-            return {ONE_CAMERA: self.pictures}
-        if len(given) == 1:
-            raise CalibrationError(
-                "give both --left and --right, or --pictures for a single camera"
-            )
-        named = places_of_cameras(self.cameras)
-        if set(given) & set(named):
-            raise CalibrationError("--camera names left or right, which is given too")
-        given |= named
-        if not given:
-            raise CalibrationError(
-                "these options are for pictures: give --left and --right, --pictures, or --camera; "
-                "the pool of a survey takes none of them"
-            )
-        return given
+        if self.start is None:
+            return {
+                name: blank_camera(size, self.lenses[name], self._port(name, kinds[name], NO_PORT))
+                for name, size in sizes.items()
+            }
+        return {
+            name: replace(camera, port=self._port(name, kinds[name], camera.port))
+            for name, camera in self.start.cameras.items()
+        }
 
-    def port_values(self, cameras: Collection[str]) -> dict[str, dict[str, float]]:
-        """Parameters of the port of each camera that are given, in metres.
+    def _port(self, name: str, kind: str, old: PortValues) -> PortValues:
+        """First values of a port: those of the start, or usual ones, or as given."""
+        port = old if old.shape == kind else PORTS[kind].guess()
+        given = self.port_values[name].items()
+        return port.with_parameters({k: v for k, v in given if k in port.parameters})
 
-        Raises:
-            CalibrationError: one is not a number in its range, or for no camera.
-        """
-        water = {} if self.n_water is None else {"n_water": self.n_water}
-        found: dict[str, dict[str, float]] = {camera: {**water} for camera in cameras}
-        for option, text, parameter, unit, (minimum, maximum) in (
-            ("--dome-radius", self.dome_radius_mm, "outer_radius_m", 1e3, (5.0, 1000.0)),
-            ("--port-distance", self.port_distance_mm, "port_distance_m", 1e3, (0.0, 500.0)),
-            ("--glass", self.glass_mm, "glass_thickness_m", 1e3, (0.0, 500.0)),
-            ("--n-glass", self.n_glass, "n_glass", 1.0, (1.0, 2.0)),
-        ):
-            for camera, word in by_camera(text or "", cameras, option).items():
-                try:
-                    value = float(word) if word else minimum
-                except ValueError:
-                    value = math.nan
-                if not minimum <= value <= maximum:
-                    raise CalibrationError(
-                        f"{option} {text}: {word!r} for {camera} is not a number from "
-                        f"{minimum:g} to {maximum:g}"
-                    )
-                if word:
-                    found[camera][parameter] = value / unit
-        return found
+    def sigmas_of(self, cameras: Mapping[str, Camera]) -> dict[str, float]:
+        """Prior sigmas of parameters that the cameras have, such as `left.n_glass`."""
+        return {
+            f"{name}.{parameter}": sigma
+            for name, camera in cameras.items()
+            for parameter, sigma in self.port_sigmas[name].items()
+            if parameter in camera.parameters
+        }
 
 
-def by_camera(text: str, cameras: Iterable[str], option: str) -> dict[str, str]:
+def read_task(options: CalibrateOptions) -> CalibrationTask:
+    """The values that options state, checked before the work starts.
+
+    Raises:
+        CalibrationError: options are missing, wrong, or do not go together.
+        WorkspaceError: the output cannot be written or would take something with it.
+    """
+    places = places_of_cameras(options.cameras)
+    if not places:
+        raise CalibrationError(
+            "these options are for pictures: give --left and --right, --pictures, or --camera; "
+            "the pool of a survey takes none of them"
+        )
+    if options.target is None:
+        raise CalibrationError("--target is missing: what is seen, such as 'chessboard 9x6 25mm'")
+    if options.output is None:
+        raise CalibrationError("-o is missing: the folder to write the calibration into")
+    _check_output(options.output, options.start)
+    start = None if options.start is None else read_rig(options.start)
+    return task_of(options, places, options.output, parse_target(options.target), start)
+
+
+def task_of(
+    options: CalibrateOptions,
+    places: Mapping[str, str],
+    output: Path,
+    target: Target,
+    start: Rig | None,
+) -> CalibrationTask:
+    """As `read_task`, of what options name.
+
+    Raises:
+        CalibrationError: options are wrong or do not go together.
+    """
+    start = None if start is None else _part(start, places)
+    values, sigmas = _port_numbers(options, places)
+    if not options.water:
+        _check_in_air(options)
+    if options.known in ("held", "prior") and start is None:
+        raise CalibrationError(
+            f"--intrinsics {options.known} needs --start, the rig.json of a calibration in air"
+        )
+    usual: Intrinsics = "prior"
+    if start is None or start.covariance is None:
+        usual = "free" if start is None else "held"
+    ports = _ports(options, places, start)
+    _check_ports(ports, values, start)
+    if options.mount is not None:
+        check_mount(options.mount)
+    elif options.lever_m is not None:
+        raise CalibrationError(f"--lever goes with --mount: {MOUNTS}, or a file")
+    return CalibrationTask(
+        places=places, target=target, output=output, lenses=_lenses(options, places, start),
+        ports=ports, port_values=values, port_sigmas=sigmas, water=options.water, start=start,
+        known=options.known or usual, target_shape=options.target_shape, mount=options.mount,
+        lever_m=options.lever_m,
+    )  # fmt: skip
+
+
+def _part(rig: Rig, places: Collection[str]) -> Rig:
+    if not set(places) <= set(rig.cameras):
+        raise CalibrationError(
+            f"the start has cameras {', '.join(rig.cameras)}; pictures are of {', '.join(places)}"
+        )
+    return part_of_rig(rig, list(places))
+
+
+def words_by_camera(text: str, cameras: Iterable[str], option: str) -> dict[str, str]:
     """One word for all cameras, and others for some: `flat`, or `flat,bow=dome,side=none`.
 
     Args:
@@ -156,15 +216,11 @@ def by_camera(text: str, cameras: Iterable[str], option: str) -> dict[str, str]:
     return chosen
 
 
-def kinds_by_camera(
+def _kinds(
     text: str, cameras: Iterable[str], option: str, known: Collection[str]
 ) -> dict[str, str]:
-    """What `by_camera` reads, of known names.
-
-    Raises:
-        CalibrationError: a camera has none, or a name is unknown.
-    """
-    chosen = by_camera(text, cameras, option)
+    """Words by camera that are names of some kind."""
+    chosen = words_by_camera(text, cameras, option)
     for camera, kind in chosen.items():
         if kind not in known:
             wrong_kind = f"{kind!r} for {camera}" if kind else f"there is none for {camera}"
@@ -172,58 +228,100 @@ def kinds_by_camera(
     return chosen
 
 
-def check_settings(settings: CalibrateOptions, start: Rig | None) -> None:
-    """Reject options that do not go together, before the work starts.
+def _port_numbers(
+    options: CalibrateOptions, cameras: Collection[str]
+) -> tuple[dict[str, dict[str, float]], dict[str, dict[str, float]]]:
+    """Parameters of the ports that are given, and their sigmas, by camera: `10`, or `10+-0.2`."""
+    values: dict[str, dict[str, float]] = {camera: {} for camera in cameras}
+    sigmas: dict[str, dict[str, float]] = {camera: {} for camera in cameras}
+    for parameter, (field, option, unit, (minimum, maximum)) in _PORT_OPTIONS.items():
+        text = getattr(options, field) or ""
+        if parameter == "n_water" and "=" in text:
+            raise CalibrationError(f"{option} {text}: all cameras look into one water")
+        for camera, word in words_by_camera(text, cameras, option).items():
+            number, is_known_to, sigma = word.partition("+-")
+            try:
+                value, spread = (float(part or "nan") for part in (number, sigma))
+            except ValueError:
+                value = spread = -1.0
+            if (number and not minimum <= value <= maximum) or (is_known_to and not spread > 0.0):
+                raise CalibrationError(
+                    f"{option} {text}: {word!r} for {camera} is not a number from {minimum:g} to "
+                    f"{maximum:g}, or one with its sigma, such as {maximum / 2:g}+-0.1"
+                )
+            if number:
+                values[camera][parameter] = value / unit
+            if is_known_to:
+                sigmas[camera][parameter] = spread / unit
+    return values, sigmas
 
-    Args:
-        settings: of the command.
-        start: the rig of `--start`.
 
-    Raises:
-        CalibrationError: the first fault.
-    """
-    ports = {
-        "--port": settings.port,
-        "--dome-radius": settings.dome_radius_mm,
-        "--port-distance": settings.port_distance_mm,
-        "--glass": settings.glass_mm,
-        "--glass-sigma": settings.glass_sigma_mm,
-        "--n-glass": settings.n_glass,
-        "--n-glass-sigma": settings.n_glass_sigma,
-        "--n-water": settings.n_water,
-        "--n-water-sigma": settings.n_water_sigma,
-        "--carry-to-n": settings.carry_to_n,
-        "--intrinsics": settings.known,
-    }
-    if not settings.water:
-        given = [name for name, value in ports.items() if value is not None]
-        if given:
-            raise CalibrationError(f"{', '.join(given)} need --water: pictures in air see no port")
-        return
-    if settings.known in ("held", "prior") and start is None:
-        raise CalibrationError(
-            f"--intrinsics {settings.known} needs --start, the rig.json of a calibration in air"
-        )
-    names = list(settings.places())
-    given_of = settings.port_values(names)
-    kinds = {}
-    if settings.port is not None:
-        kinds = kinds_by_camera(settings.port, names, "--port", PORT_KINDS)
+def _check_in_air(options: CalibrateOptions) -> None:
+    given = {option: getattr(options, field) for field, option, *_ in _PORT_OPTIONS.values()}
+    given |= {"--port": options.port, "--intrinsics": options.known}
+    names = [name for name, value in given.items() if value is not None]
+    if names:
+        raise CalibrationError(f"{', '.join(names)} need --water: pictures in air see no port")
+
+
+def _lenses(
+    options: CalibrateOptions, cameras: Collection[str], start: Rig | None
+) -> dict[str, str]:
+    """The lens model of each camera: as named, or the usual one of the start's lens."""
+    if options.lens is not None:
+        return _kinds(options.lens, cameras, "--lens", LENSES)
+    if start is None:
+        return dict.fromkeys(cameras, USUAL_LENS[OpenCVLens.model])
+    return {name: USUAL_LENS[one.lens.model] for name, one in start.cameras.items()}
+
+
+def _ports(
+    options: CalibrateOptions, cameras: Collection[str], start: Rig | None
+) -> dict[str, str]:
+    """The kind of port of each camera: as named, or that of the start, or flat; none in air."""
+    if not options.water:
+        return dict.fromkeys(cameras, NoPort.shape)
+    if options.port is not None:
+        kinds = _kinds(options.port, cameras, "--port", (*PORTS, AUTO))
+        if AUTO in kinds.values() and len(set(kinds.values())) > 1:
+            raise CalibrationError(f"--port {options.port}: auto is for all cameras alike")
+        return kinds
     old = {} if start is None else start.cameras
-    domes = {n for n, c in old.items() if c.port.shape == DomePort.shape}
-    thick = {
-        n
-        for n, c in old.items()
-        if "glass_thickness_m" in c.parameters and c.parameter("glass_thickness_m") > 0.0
-    }
-    for name in names:
-        kind, given_here = kinds.get(name), given_of[name]
-        if kind == DomePort.shape and name not in domes and "outer_radius_m" not in given_here:
+    known = {name: one.port.shape for name, one in old.items() if one.port.parameters}
+    return dict.fromkeys(cameras, FlatPort.shape) | known
+
+
+def _check_ports(
+    ports: Mapping[str, str], values: Mapping[str, Mapping[str, float]], start: Rig | None
+) -> None:
+    """Reject ports of which something is neither given nor known from the start."""
+    for name, kind in ports.items():
+        port = PORTS[FlatPort.shape if kind == AUTO else kind]
+        if start is not None and start.cameras[name].port.shape == port.shape:
+            continue
+        needed = {field.name for field in fields(port) if field.default is MISSING}
+        for parameter in sorted({*needed, _GLASS} & set(port.parameters) - set(values[name])):
             raise CalibrationError(
-                f"--port dome needs --dome-radius, of the outer surface of {name} in mm"
+                f"--water with --port {kind} needs {_PORT_OPTIONS[parameter][1]} of {name}, in mm"
+                + (" (0 for a thin film)" if parameter == _GLASS else "")
             )
-        if kind != NoPort.shape and name not in thick and "glass_thickness_m" not in given_here:
-            raise CalibrationError(
-                f"--water needs --glass, the thickness of the port of {name} in mm (0 for a thin "
-                "film)"
-            )
+
+
+def _check_output(output: Path, start: Path | None) -> None:
+    """Reject a folder that is not of this command."""
+    if not output.name or output.name == "..":
+        raise WorkspaceError(f"-o {output}: name a new folder, such as -o air")
+    if not output.exists():
+        return
+    if not output.is_dir():
+        raise WorkspaceError(f"{output} is a file: name a folder with -o")
+    others = sorted(path.name for path in output.iterdir() if path.name not in WRITTEN)
+    if others:
+        raise WorkspaceError(
+            f"{output} holds other files (such as {others[0]}): choose another folder with -o"
+        )
+    if start is not None and start.resolve().parent == output.resolve():
+        raise WorkspaceError(
+            f"{output} holds the rig of --start, which would be replaced: choose another folder "
+            "with -o"
+        )

@@ -1,23 +1,18 @@
 """Pictures of a calibration: which files there are, and which were taken at the same moment."""
 
 import hashlib
-import math
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC
 from pathlib import Path
 
-from alice_survey.core.artefacts import read_csv
 from alice_survey.core.errors import CalibrationError, warn
-from camera_calib.picture_files import time_taken
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm")
 _MIN_PAIRED = 0.5
 """Share of each list whose numbers must be in another for names to pair."""
 _NAMED = 3
-_MANIFEST = "manifest.csv"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,52 +82,6 @@ def pair_pictures(lists: Mapping[str, Sequence[Path]]) -> list[PictureSet]:
     return [
         PictureSet(name=paths[0].stem, paths=dict(zip(lists, paths, strict=True))) for paths in sets
     ]
-
-
-def picture_times_s(camera: str, paths: Sequence[Path]) -> list[float]:
-    """When pictures were taken, seconds on their camera's clock, to fractions of a second.
-
-    From `manifest.csv` (columns `image`, `time_s`) in their folder or the one above, as
-    `import-images` writes it, or else from EXIF.
-
-    Raises:
-        CalibrationError: a picture has no time, or they have whole seconds only.
-    """
-    stated: dict[Path, float] = {}
-    for folder in {path.parent for path in paths}:
-        for place in (folder, folder.parent):
-            if (place / _MANIFEST).is_file():
-                stated |= _manifest_times_s(place / _MANIFEST)
-                break
-    times = []
-    for path in paths:
-        known = stated.get(path.resolve())
-        if known is None:
-            taken = time_taken(path)
-            if taken is None:
-                raise CalibrationError(
-                    f"{path} of {camera} has no time, in {_MANIFEST} (columns image, time_s) or in "
-                    "EXIF: --own-clocks needs the time of every picture"
-                )
-            known = taken.replace(tzinfo=taken.tzinfo or UTC).timestamp()
-        times.append(known)
-    if all(time.is_integer() for time in times):
-        raise CalibrationError(
-            f"times of {camera} are whole seconds, {paths[0].name} and all others: --own-clocks "
-            f"needs fractions, from EXIF's sub-seconds or from {_MANIFEST} (columns image, time_s)"
-        )
-    return times
-
-
-def _manifest_times_s(path: Path) -> dict[Path, float]:
-    _, rows = read_csv(path, ("image", "time_s"), exact=True, fault=CalibrationError)
-    times = {}
-    for line, row in rows:
-        try:
-            times[(path.parent / row["image"]).resolve()] = float(row["time_s"] or "nan")
-        except ValueError:
-            raise CalibrationError(f"{path} line {line}: time_s {row['time_s']!r}") from None
-    return {picture: time for picture, time in times.items() if math.isfinite(time)}
 
 
 def check_own(lists: Mapping[str, Sequence[Path]]) -> None:

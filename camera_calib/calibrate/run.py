@@ -9,8 +9,8 @@ from alice_survey.core.executor import Executor
 from alice_survey.core.manifest import read_manifest
 from alice_survey.core.records import BoardRecord
 from camera_calib.calibrate.detect_views import Size, detect_views
-from camera_calib.calibrate.files import finish, warn_of_unseen
 from camera_calib.calibrate.picture_sets import PictureSet
+from camera_calib.calibrate.results import warn_of_unseen, write_results
 from camera_calib.calibrate.solve import (
     Intrinsics,
     calibrate_in_air,
@@ -50,7 +50,7 @@ def run_calibrate(
         }
         start, known = replace(dry, cameras=cameras, body_from_rig=start.body_from_rig), "prior"
     calibration = calibrate_through_ports(found.views, target.points, start, known, lens)
-    finish(folder, calibration, found)
+    write_results(folder, calibration, found)
 
 
 def _pool_pictures(pool: Path) -> list[PictureSet]:

@@ -10,8 +10,9 @@ int_radius int_thick na ng nw`, its centre and the radius of its inner surface.
 
 import math
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +22,12 @@ from alice_survey.core.artefacts import atomic_path
 from alice_survey.core.contents import shown
 from alice_survey.core.errors import CalibrationError
 from camera_calib.camera import Camera
-from camera_calib.formats.fields import Fields, read_bytes, read_text
-from camera_calib.formats.opencv_model import behind_port, camera_in_air, distorts, is_fisheye
+from camera_calib.formats import fields, opencv_model
 from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.lenses.opencv import OpenCVLens
-from camera_calib.lenses.values import LensValues
 from camera_calib.ports.dome import DomePort
 from camera_calib.ports.flat import FlatPort
+from camera_calib.ports.values import PortValues
 
 MODELS = {
     "SIMPLE_PINHOLE": (0, ("f", "cx", "cy")),
@@ -47,16 +47,21 @@ PORTS = ("FLATPORT", "DOMEPORT")
 """Refraction models by their numbers; both have eight parameters, the last three indices."""
 _NO_REFRACTION = -1
 _PORT_PARAMETERS = 8
-_MAX_PX = 10**7
+_MAX_PX = 10**6
 _OURS = {"fx": "fx_px", "fy": "fy_px", "cx": "cx_px", "cy": "cy_px"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraRecord:
-    """A camera as these files have it."""
+    """A camera as these files have it.
+
+    Raises:
+        CalibrationError: a value is not what its model or port has.
+    """
 
     camera_id: int
     model: str
+    """One of `MODELS`."""
     width_px: int
     height_px: int
     params: tuple[float, ...]
@@ -65,16 +70,27 @@ class CameraRecord:
     port: tuple[float, ...] = ()
     """Its parameters."""
 
-    def fields(self, path: Path) -> Fields:
-        """The record as named values, for checks that name file and camera."""
+    def __post_init__(self) -> None:
         names = MODELS[self.model][1]
-        values = {
-            "WIDTH": float(self.width_px),
-            "HEIGHT": float(self.height_px),
-            **{name: [value] for name, value in zip(names, self.params, strict=True)},
-            "REFRAC_PARAMS": list(self.port),
-        }
-        return Fields(path=path, values=values, prefix=f"camera {self.camera_id}: ")
+        if len(self.params) != len(names):
+            raise CalibrationError(
+                f"{self.model} has {len(names)} PARAMS: {len(self.params)} found"
+            )
+        if self.refraction is not None and self.refraction not in PORTS:
+            raise CalibrationError(
+                f"port {shown(self.refraction)}: {' and '.join(PORTS)} can be read"
+            )
+        if self.refraction is not None and len(self.port) != _PORT_PARAMETERS:
+            raise CalibrationError(
+                f"{self.refraction} has {_PORT_PARAMETERS} REFRAC_PARAMS: {len(self.port)} found"
+            )
+        for name, value in zip(names, self.params, strict=True):
+            if not math.isfinite(value):
+                raise CalibrationError(f"{name} is not a finite number")
+        if not all(map(math.isfinite, self.port)):
+            raise CalibrationError("REFRAC_PARAMS are not finite numbers")
+        if not all(1 <= side <= _MAX_PX for side in (self.width_px, self.height_px)):
+            raise CalibrationError(f"WIDTH or HEIGHT is not from 1 to {_MAX_PX} px")
 
 
 def record_of(camera_id: int, camera: Camera, *, port: bool) -> CameraRecord:
@@ -85,12 +101,12 @@ def record_of(camera_id: int, camera: Camera, *, port: bool) -> CameraRecord:
         camera: without thin-prism terms.
         port: add the port's parameters.
     """
-    if is_fisheye(camera):
+    if opencv_model.is_fisheye(camera):
         model = "OPENCV_FISHEYE"
-    elif distorts(camera, "k3", "k4", "k5", "k6"):
+    elif opencv_model.distorts(camera, "k3", "k4", "k5", "k6"):
         model = "FULL_OPENCV"
     else:
-        model = "OPENCV" if distorts(camera, "k1", "k2", "p1", "p2") else "PINHOLE"
+        model = "OPENCV" if opencv_model.distorts(camera, "k1", "k2", "p1", "p2") else "PINHOLE"
     return CameraRecord(
         camera_id=camera_id,
         model=model,
@@ -118,42 +134,39 @@ def _housing(camera: Camera) -> dict[str, Any]:
     return {}
 
 
-def camera_of(path: Path, record: CameraRecord) -> Camera:
+def camera_of_record(path: Path, record: CameraRecord) -> Camera:
     """The camera of a record, with its port.
 
     Raises:
-        CalibrationError: a value is not a finite number or out of range.
+        CalibrationError: a value is out of range.
     """
-    fields = record.fields(path)
+    where = f"{path}: camera {record.camera_id}:"
     names = MODELS[record.model][1]
-    values = {_OURS.get(name, name): fields.number(name) for name in names}
-    focal = "fx"
+    values = {_OURS.get(n, n): value for n, value in zip(names, record.params, strict=True)}
     if "f" in values:
-        focal = "f"
         values["fx_px"] = values["fy_px"] = values.pop("f")
-    size = (fields.size("WIDTH"), fields.size("HEIGHT"))
-    lens: type[LensValues] = FisheyeLens if "FISHEYE" in record.model else OpenCVLens
-    camera = camera_in_air(fields, focal, size, lens, values)
+    size = (record.width_px, record.height_px)
+    lens = FisheyeLens if "FISHEYE" in record.model else OpenCVLens
     if record.refraction is None:
-        return camera
-    key = "REFRAC_PARAMS"
-    x, y, z, reach, thickness, n_air, n_glass, n_water = fields.numbers(key, 8).tolist()
+        return opencv_model.camera_of(f"{where} {names[0]}", size, lens, values)
+    x, y, z, reach, thickness, n_air, n_glass, n_water = record.port
     if n_air < 1 or min(n_glass, n_water) < n_air:
-        raise fields.fault(key, f"has the indices {n_air} {n_glass} {n_water}")
+        raise CalibrationError(f"{where} REFRAC_PARAMS has the indices {n_air} {n_glass} {n_water}")
     # Snell's law knows ratios only, so that an index of air other than 1 divides the others.
-    shared = {
+    port: dict[str, Any] = {
         "glass_thickness_m": thickness, "n_glass": n_glass / n_air, "n_water": n_water / n_air
     }  # fmt: skip
+    kind: type[PortValues] = FlatPort
     if record.refraction == "DOMEPORT":
-        centre = {"dome_x_m": x, "dome_y_m": y, "dome_z_m": z}
-        return behind_port(
-            fields, key, camera, DomePort, outer_radius_m=reach + thickness, **centre, **shared
+        kind = DomePort
+        port |= {"dome_x_m": x, "dome_y_m": y, "dome_z_m": z, "outer_radius_m": reach + thickness}
+    elif abs(math.hypot(x, y, z) - 1.0) > 1e-6 or z <= 0:
+        raise CalibrationError(
+            f"{where} REFRAC_PARAMS has no unit normal facing forward: {x} {y} {z}"
         )
-    if abs(math.hypot(x, y, z) - 1.0) > 1e-6 or z <= 0:
-        raise fields.fault(key, f"has no unit normal facing forward: {x} {y} {z}")
-    return behind_port(
-        fields, key, camera, FlatPort, normal=(x, y, z), port_distance_m=reach, **shared
-    )
+    else:
+        port |= {"normal": (x, y, z), "port_distance_m": reach}
+    return opencv_model.camera_of(f"{where} fx or REFRAC_PARAMS", size, lens, values, kind, port)
 
 
 def read_records(path: Path) -> list[CameraRecord]:
@@ -202,113 +215,85 @@ def _digits(value: float) -> str:
 
 
 def _packed(record: CameraRecord) -> bytes:
-    number = MODELS[record.model][0]
-    size = (record.width_px, record.height_px)
-    start = struct.pack("<IiQQ", record.camera_id, number, *size)
-    body = struct.pack(f"<{len(record.params)}d", *record.params)
-    if record.refraction is None:
-        return start + body + struct.pack("<i", _NO_REFRACTION)
-    return (
-        start
-        + body
-        + struct.pack(f"<i{_PORT_PARAMETERS}d", PORTS.index(record.refraction), *record.port)
-    )
+    number, params = MODELS[record.model][0], record.params
+    start = struct.pack("<IiQQ", record.camera_id, number, record.width_px, record.height_px)
+    end = struct.pack("<i", _NO_REFRACTION)
+    if record.refraction is not None:
+        kind = PORTS.index(record.refraction)
+        end = struct.pack(f"<i{_PORT_PARAMETERS}d", kind, *record.port)
+    return start + struct.pack(f"<{len(params)}d", *params) + end
 
 
 def _read_text(path: Path) -> list[CameraRecord]:
     records = []
-    for row, line in enumerate(read_text(path).splitlines(), start=1):
+    for row, line in enumerate(fields.read_text(path).splitlines(), start=1):
         items = line.split()
         if not items or items[0].startswith("#"):
             continue
         where = f"{path}: line {row}"
         if len(items) < 5:
             raise CalibrationError(f"{where}: CAMERA_ID MODEL WIDTH HEIGHT PARAMS[] expected")
-        model = _known(where, items[1])
-        count = len(MODELS[model][1])
-        params, port = items[4 : 4 + count], items[4 + count :]
-        if len(params) < count or (port and _is_number(port[0])):
-            raise CalibrationError(f"{where}: {model} has {count} PARAMS: {len(items) - 4} found")
-        if port:
-            if port[0] not in PORTS:
-                raise CalibrationError(
-                    f"{where}: port {shown(port[0])}: {' and '.join(PORTS)} can be read"
-                )
-            if len(port) != 1 + _PORT_PARAMETERS:
-                raise CalibrationError(
-                    f"{where}: {port[0]} has {_PORT_PARAMETERS} REFRAC_PARAMS: "
-                    f"{len(port) - 1} found"
-                )
+        params = list(takewhile(_is_number, items[4:]))
+        port = items[4 + len(params) :]
+        values: Mapping[str, Any] = {
+            "model": _check_model(where, items[1]),
+            "params": tuple(map(float, params)),
+            "refraction": port[0] if port else None,
+        }
         try:
+            camera_id, width, height = (int(items[i]) for i in (0, 2, 3))
+            numbers = tuple(map(float, port[1:]))
             records.append(
                 CameraRecord(
-                    camera_id=int(items[0]),
-                    model=model,
-                    width_px=int(items[2]),
-                    height_px=int(items[3]),
-                    params=tuple(map(float, params)),
-                    refraction=port[0] if port else None,
-                    port=tuple(map(float, port[1:])),
+                    camera_id=camera_id, width_px=width, height_px=height, port=numbers, **values
                 )
             )
-        except ValueError as error:
+        except (ValueError, CalibrationError) as error:
             raise CalibrationError(f"{where}: {shown(str(error))}") from None
-        if max(abs(records[-1].width_px), abs(records[-1].height_px)) > _MAX_PX:
-            raise CalibrationError(f"{where}: WIDTH or HEIGHT is over {_MAX_PX} px")
     return records
 
 
 def _read_binary(path: Path) -> list[CameraRecord]:
-    content = read_bytes(path)
+    content = fields.read_bytes(path)
+    others = {int(value): name for name, value in pycolmap.CameraModelId.__members__.items()}
+    first = int.from_bytes(content[12:16], "little") if len(content) >= 16 else -1
+    if first in others:
+        _check_model(f"{path}: first camera", others[first])
     # Only one of the two kinds ends where the file ends: the other is 4 bytes or more off.
     for refractive in (False, True):
-        records = _unpacked(path, content, refractive)
+        try:
+            records = _unpack(content, refractive)
+        except (struct.error, KeyError, IndexError, CalibrationError):
+            continue
         if records is not None:
             return records
     raise CalibrationError(f"{path}: is not a cameras.bin of COLMAP or Refractive COLMAP")
 
 
-def _unpacked(path: Path, content: bytes, refractive: bool) -> list[CameraRecord] | None:
+def _unpack(content: bytes, refractive: bool) -> list[CameraRecord] | None:
     """Cameras of a binary file, or None when it is not of this kind to the last byte."""
-    records = []
+    numbers = {number: name for name, (number, _) in MODELS.items()}
+    records: list[CameraRecord] = []
     at = 8
-    try:
-        (count,) = struct.unpack_from("<Q", content)
-        for _ in range(min(count, len(content))):
-            camera_id, number, width, height = struct.unpack_from("<IiQQ", content, at)
-            model = {known: name for name, (known, _) in MODELS.items()}.get(number)
-            if model is None:
-                name = _model_name(number) if at == 8 else None
-                if name is not None:
-                    _known(f"{path}: camera {camera_id}", name)
-                return None
-            size = len(MODELS[model][1])
-            params = struct.unpack_from(f"<{size}d", content, at + 24)
-            at += 24 + 8 * size
-            name = None
-            port: tuple[float, ...] = ()
-            if refractive:
-                (refraction,) = struct.unpack_from("<i", content, at)
-                at += 4
-                if refraction != _NO_REFRACTION:
-                    if not 0 <= refraction < len(PORTS):
-                        return None
-                    name = PORTS[refraction]
-                    port = struct.unpack_from(f"<{_PORT_PARAMETERS}d", content, at)
-                    at += 8 * _PORT_PARAMETERS
-            records.append(
-                CameraRecord(
-                    camera_id=camera_id,
-                    model=model,
-                    width_px=width,
-                    height_px=height,
-                    params=params,
-                    refraction=name,
-                    port=port,
-                )
+    (count,) = struct.unpack_from("<Q", content)
+    for _ in range(min(count, len(content))):
+        camera_id, number, width, height = struct.unpack_from("<IiQQ", content, at)
+        model, at = numbers[number], at + 24
+        params = struct.unpack_from(f"<{len(MODELS[model][1])}d", content, at)
+        at += 8 * len(params)
+        kind, port = _NO_REFRACTION, ()
+        if refractive:
+            (kind,) = struct.unpack_from("<i", content, at)
+            at += 4
+        if kind != _NO_REFRACTION:
+            port = struct.unpack_from(f"<{_PORT_PARAMETERS}d", content, at)
+            at += 8 * _PORT_PARAMETERS
+        records.append(
+            CameraRecord(
+                camera_id=camera_id, model=model, width_px=width, height_px=height, params=params,
+                refraction={_NO_REFRACTION: None, **dict(enumerate(PORTS))}[kind], port=port,
             )
-    except struct.error:
-        return None
+        )  # fmt: skip
     return records if at == len(content) else None
 
 
@@ -320,12 +305,7 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _model_name(number: int) -> str | None:
-    names = {int(value): name for name, value in pycolmap.CameraModelId.__members__.items()}
-    return names.get(number)
-
-
-def _known(where: str, model: str) -> str:
+def _check_model(where: str, model: str) -> str:
     if model not in MODELS:
         raise CalibrationError(
             f"{where}: model {shown(model)} is not held here: {', '.join(MODELS)} can be read"

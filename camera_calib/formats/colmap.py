@@ -20,20 +20,22 @@ from typing import Any
 
 import numpy as np
 import pycolmap
+from pydantic import Field
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.artefacts import write_json
 from alice_survey.core.errors import CalibrationError, warn
+from camera_calib.formats import fields, rigs
 from camera_calib.formats.camera_files import (
     MODELS,
     CameraRecord,
-    camera_of,
+    camera_of_record,
     read_records,
     record_of,
     write_records,
 )
-from camera_calib.formats.fields import Fields, read_bytes, read_json_fields, read_text
-from camera_calib.formats.rigs import ReadOptions, assemble
+from camera_calib.ports.dome import DomePort
+from camera_calib.ports.flat import FlatPort
 from camera_calib.rig import Rig
 
 CAMERA_FILES = ("cameras.bin", "cameras.txt")
@@ -49,12 +51,35 @@ _Sensor = tuple[int, int, tuple[float, ...]]
 _REFERENCE = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def read_colmap(path: Path, reading: ReadOptions) -> Rig:
+class _Entry(fields.FileModel):
+    """A camera of a rig configuration."""
+
+    camera_id: int | None = None
+    image_prefix: str = ""
+    ref_sensor: bool | None = None
+    turn: fields.Vector4 | None = Field(None, alias="cam_from_rig_rotation")
+    """Quaternion w x y z."""
+    shift: fields.Vector3 | None = Field(None, alias="cam_from_rig_translation")
+    camera_model_name: str | None = None
+    camera_params: fields.Numbers | None = None
+
+    @property
+    def name(self) -> str:
+        """Its folder of pictures."""
+        return self.image_prefix.strip("/") or "cam"
+
+
+class _RigConfig(fields.FileModel):
+    ref_camera_id: int | None = None
+    cameras: list[_Entry]
+
+
+def read_colmap(path: Path, reading: rigs.ReadOptions) -> Rig:
     """Read a model's cameras, of COLMAP or Refractive COLMAP, and what ties them to a rig.
 
     Args:
         path: folder of a model, its cameras.txt or cameras.bin, or a rig_config.json.
-        reading: picture size, for a rig_config.json without a model, and the camera wanted.
+        reading: picture size, for a rig_config.json without a model, and the camera to read.
 
     Raises:
         CalibrationError: a file is malformed, or several cameras have no common rig.
@@ -75,10 +100,10 @@ def read_colmap(path: Path, reading: ReadOptions) -> Rig:
                 f"or put {RIG_CONFIG} next to it"
             )
         ties = [(chosen[0], str(chosen[0].camera_id), RigidTransform.identity())]
-    cameras = [camera_of(file, record) for record, _, _ in ties]
+    cameras = [camera_of_record(file, record) for record, _, _ in ties]
     tool = "Refractive COLMAP" if any(record.refraction for record, _, _ in ties) else "COLMAP"
     names = [name for _, name, _ in ties]
-    return assemble(path, reading, tool, names, cameras, [pose for _, _, pose in ties])
+    return rigs.assemble(path, reading, tool, names, cameras, [pose for _, _, pose in ties])
 
 
 def write_colmap(path: Path, rig: Rig) -> list[Path]:
@@ -102,19 +127,22 @@ def write_colmap(path: Path, rig: Rig) -> list[Path]:
             params=np.array(record.params),
         )
         model.add_camera(colmap)
-        entry: dict[str, Any] = {"image_prefix": f"{name}/"}
+        pose = rig.cam_from_rig[name]
         if i == 1:
             sensors.add_ref_sensor(colmap.sensor_id)
-            entry["ref_sensor"] = True
         else:
-            pose = rig.cam_from_rig[name]
             rigid = pycolmap.Rigid3d(
                 pycolmap.Rotation3d(pose.rotation.as_quat()), np.array(pose.translation)
             )
             sensors.add_sensor(colmap.sensor_id, rigid)
-            entry |= _pose_entry(pose)
         entries.append(
-            entry | {"camera_model_name": record.model, "camera_params": list(record.params)}
+            _Entry(
+                image_prefix=f"{name}/",
+                ref_sensor=True if i == 1 else None,
+                **({} if i == 1 else _pose_values(pose)),
+                camera_model_name=record.model,
+                camera_params=list(record.params),
+            ).values()
         )
     model.add_rig(sensors)
     folder.mkdir(parents=True, exist_ok=True)
@@ -130,17 +158,16 @@ def write_refractive(path: Path, rig: Rig) -> list[Path]:
     folder, file = _target(path)
     records = [record_of(i, c, port=True) for i, c in enumerate(rig.cameras.values(), start=1)]
     entries = [
-        {"camera_id": i, "image_prefix": f"{name}/", **_pose_entry(rig.cam_from_rig[name])}
-        for i, name in enumerate(rig.cameras, start=1)
+        _Entry(camera_id=i, image_prefix=f"{name}/", **_pose_values(pose)).values()
+        for i, (name, pose) in enumerate(rig.cam_from_rig.items(), start=1)
     ]
     write_records(file, records)
     write_json(folder / RIG_CONFIG, [{"ref_camera_id": 1, "cameras": entries}])
     return [file, folder / RIG_CONFIG]
 
 
-def model_files(path: Path, rig: Rig) -> list[Path]:
+def model_files(path: Path, _: Rig) -> list[Path]:
     """The files that writing to `path` would replace."""
-    del rig
     folder, file = _target(path)
     kinds = [file.with_stem(stem) for stem in ("cameras", "rigs", "frames", "images", "points3D")]
     return [*kinds, folder / RIG_CONFIG]
@@ -171,26 +198,24 @@ def _camera_file(path: Path) -> Path | None:
 
 def _config_ties(path: Path, records: Sequence[CameraRecord]) -> list[_Tie]:
     """Each camera with its name and pose, the reference first, after a rig configuration."""
-    entries = _entries(path)
+    entries = _read_config(path)
     free = list(records)
     ties = []
-    guessed = False
     for entry in entries:
-        if "camera_id" in entry:
-            wanted = int(entry.number("camera_id"))
-            found = next((r for r in free if r.camera_id == wanted), None)
-        elif "camera_params" in entry:
-            model, params = _entry_lens(entry)
+        found = None
+        if entry.camera_id is not None:
+            found = next((r for r in free if r.camera_id == entry.camera_id), None)
+        elif entry.camera_params is not None:
+            model, params = _lens_of(path, entry)
             same = (r for r in free if r.model == model and np.allclose(r.params, params))
             found = next(same, None)
-        else:
-            guessed = len(records) > 1
-            found = free[0] if len(records) == len(entries) else None
+        elif len(records) == len(entries):
+            found = free[0]
         if found is None:
-            raise entry.fault("image_prefix", f"{entry.text('image_prefix')} fits no camera")
+            raise CalibrationError(f"{path}: image_prefix {entry.image_prefix} fits no camera")
         free.remove(found)
-        ties.append((found, _prefix_name(entry), _entry_pose(entry)))
-    if guessed:
+        ties.append((found, entry.name, _pose_of(path, entry)))
+    if len(records) > 1 and any(e.camera_id is None and e.camera_params is None for e in entries):
         warn(f"{path}: its cameras carry no numbers: taken in the order of their CAMERA_ID")
     return ties
 
@@ -207,71 +232,67 @@ def _model_ties(file: Path, records: Sequence[CameraRecord]) -> list[_Tie]:
     return []
 
 
-def _from_config_alone(path: Path, reading: ReadOptions) -> Rig:
+def _from_config_alone(path: Path, reading: rigs.ReadOptions) -> Rig:
     file = path / RIG_CONFIG if path.is_dir() else path
-    entries = _entries(file)
-    size = reading.size(file)
+    entries = _read_config(file)
+    width, height = reading.size(file)
     cameras = []
     for i, entry in enumerate(entries, start=1):
-        model, params = _entry_lens(entry)
+        model, params = _lens_of(file, entry)
         record = CameraRecord(
-            camera_id=i, model=model, width_px=size[0], height_px=size[1], params=params
+            camera_id=i, model=model, width_px=width, height_px=height, params=params
         )
-        cameras.append(camera_of(file, record))
-    names = [_prefix_name(entry) for entry in entries]
-    return assemble(file, reading, "COLMAP", names, cameras, [_entry_pose(e) for e in entries])
+        cameras.append(camera_of_record(file, record))
+    poses = [_pose_of(file, entry) for entry in entries]
+    return rigs.assemble(file, reading, "COLMAP", [entry.name for entry in entries], cameras, poses)
 
 
-def _entries(path: Path) -> list[Fields]:
+def _read_config(path: Path) -> list[_Entry]:
     """Cameras of a rig configuration, the reference first."""
-    rigs = read_json_fields(path).get("list")
-    if len(rigs) != 1 or not isinstance(rigs[0], dict):
-        raise CalibrationError(f"{path}: a list of one rig expected, {len(rigs)} found")
-    rig = Fields(path=path, values=rigs[0])
-    cameras = rig.get("cameras")
-    if not isinstance(cameras, list) or not all(isinstance(camera, dict) for camera in cameras):
-        raise rig.fault("cameras", "is not a list of cameras")
-    entries = [Fields(path=path, values=c, prefix=f"cameras[{i}].") for i, c in enumerate(cameras)]
-    first = rig.number("ref_camera_id") if "ref_camera_id" in rig else None
+    rigs = fields.read_json_values(path)
+    if not isinstance(rigs, list) or len(rigs) != 1:
+        raise CalibrationError(f"{path}: a list of one rig expected")
+    rig = _RigConfig.check(path, rigs[0])
     references = [
         entry
-        for entry in entries
-        if entry.values.get("ref_sensor") is True
-        or (first is not None and entry.number("camera_id") == first)
+        for entry in rig.cameras
+        if entry.ref_sensor
+        or (rig.ref_camera_id is not None and entry.camera_id == rig.ref_camera_id)
     ]
     if len(references) != 1:
-        raise rig.fault("cameras", f"has {len(references)} reference cameras; 1 expected")
-    return [references[0], *(entry for entry in entries if entry is not references[0])]
+        raise CalibrationError(
+            f"{path}: cameras has {len(references)} reference cameras; 1 expected"
+        )
+    return [references[0], *(entry for entry in rig.cameras if entry is not references[0])]
 
 
-def _entry_lens(entry: Fields) -> tuple[str, tuple[float, ...]]:
-    model = entry.text("camera_model_name")
+def _lens_of(path: Path, entry: _Entry) -> tuple[str, tuple[float, ...]]:
+    model, params = entry.camera_model_name, entry.camera_params
     if model not in MODELS:
-        raise entry.fault("camera_model_name", f"{model}: {', '.join(MODELS)} can be read")
-    return model, tuple(entry.numbers("camera_params", len(MODELS[model][1])).tolist())
+        raise CalibrationError(
+            f"{path}: camera_model_name {model}: {', '.join(MODELS)} can be read"
+        )
+    if params is None or len(params) != len(MODELS[model][1]):
+        raise CalibrationError(f"{path}: camera_params are not those of {model}")
+    return model, tuple(params.tolist())
 
 
-def _entry_pose(entry: Fields) -> RigidTransform:
-    if entry.values.get("ref_sensor") is True:
+def _pose_of(path: Path, entry: _Entry) -> RigidTransform:
+    if entry.ref_sensor:
         return RigidTransform.identity()
-    w, x, y, z = entry.numbers("cam_from_rig_rotation", 4)
-    if abs(np.linalg.norm([w, x, y, z]) - 1.0) > 1e-3:
-        raise entry.fault("cam_from_rig_rotation", "is not a unit quaternion w x y z")
-    return RigidTransform.from_components(
-        entry.numbers("cam_from_rig_translation", 3), Rotation.from_quat([x, y, z, w])
-    )
+    if entry.turn is None or abs(np.linalg.norm(entry.turn) - 1.0) > 1e-3:
+        raise CalibrationError(
+            f"{path}: cam_from_rig_rotation of {entry.name} is not a unit quaternion w x y z"
+        )
+    if entry.shift is None:
+        raise CalibrationError(f"{path}: lacks cam_from_rig_translation of {entry.name}")
+    turn = Rotation.from_quat(entry.turn, scalar_first=True)
+    return RigidTransform.from_components(entry.shift, turn)
 
 
-def _pose_entry(pose: RigidTransform) -> dict[str, list[float]]:
-    x, y, z, w = pose.rotation.as_quat(canonical=True).tolist()
-    return {
-        "cam_from_rig_rotation": [w, x, y, z],
-        "cam_from_rig_translation": pose.translation.tolist(),
-    }
-
-
-def _prefix_name(entry: Fields) -> str:
-    return entry.text("image_prefix").strip("/") or "cam"
+def _pose_values(pose: RigidTransform) -> dict[str, Any]:
+    turn = pose.rotation.as_quat(canonical=True, scalar_first=True)
+    return {"turn": turn.tolist(), "shift": pose.translation.tolist()}
 
 
 def read_rigs(path: Path) -> list[PosesById]:
@@ -306,7 +327,7 @@ def _poses(sensors: list[_Sensor]) -> PosesById:
 
 def _text_rows(path: Path) -> list[list[_Sensor]]:
     rows: list[list[_Sensor]] = []
-    for line in read_text(path).splitlines():
+    for line in fields.read_text(path).splitlines():
         items = line.split()
         if not items or items[0].startswith("#"):
             continue
@@ -325,7 +346,7 @@ def _text_rows(path: Path) -> list[list[_Sensor]]:
 
 
 def _binary_rows(path: Path) -> list[list[_Sensor]]:
-    content = read_bytes(path)
+    content = fields.read_bytes(path)
     (rigs,) = struct.unpack_from("<Q", content)
     at = 8
     rows: list[list[_Sensor]] = []
@@ -347,3 +368,42 @@ def _binary_rows(path: Path) -> list[list[_Sensor]]:
     if at != len(content):
         raise ValueError("more bytes than rigs")
     return rows
+
+
+def _owns(path: Path) -> bool:
+    if path.is_dir():
+        names = (*CAMERA_FILES, RIG_CONFIG)
+        found = [path / name for name in names if (path / name).is_file()]
+        return bool(found) and _owns(found[0])
+    suffix = path.suffix.lower()
+    if suffix == ".json":
+        return fields.read_text(path).lstrip().startswith("[")
+    return suffix in (".txt", ".bin") and not any(r.refraction for r in read_records(path))
+
+
+def _owns_refractive(path: Path) -> bool:
+    if path.is_dir():
+        found = [path / name for name in CAMERA_FILES if (path / name).is_file()]
+        return bool(found) and _owns_refractive(found[0])
+    suffixes = (".txt", ".bin")
+    return path.suffix.lower() in suffixes and any(r.refraction for r in read_records(path))
+
+
+FORMAT = rigs.CalibrationFormat(
+    name="colmap",
+    title="COLMAP model and rig_config.json",
+    holds=frozenset({rigs.K3, rigs.RATIONAL, rigs.FISHEYE}),
+    owns=_owns,
+    read=read_colmap,
+    write=write_colmap,
+    files=model_files,
+)
+REFRACTIVE = rigs.CalibrationFormat(
+    name="refractive",
+    title="Refractive COLMAP cameras with FLATPORT or DOMEPORT",
+    holds=FORMAT.holds | {FlatPort.shape, DomePort.shape},
+    owns=_owns_refractive,
+    read=read_colmap,
+    write=write_refractive,
+    files=model_files,
+)

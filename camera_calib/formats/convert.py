@@ -1,7 +1,7 @@
-"""Convert a camera calibration from one tool's format to another's, and lose nothing silently."""
+"""All formats, and conversions between them, in which nothing is lost silently."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,35 +11,84 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.core.errors import CalibrationError, warn
 from camera_calib.approximation.residual import COLMAP_PARAMETERS, Residual, approximations
 from camera_calib.camera import Camera
-from camera_calib.formats.fields import camera_name
-from camera_calib.formats.opencv_model import FISHEYE, distorts, is_fisheye
-from camera_calib.formats.registry import (
-    COVARIANCE,
-    K3,
-    MOUNT,
-    PRISM,
-    RATIONAL,
-    CalibrationFormat,
-    detect,
-    format_named,
-    of_target,
-)
-from camera_calib.formats.rigs import (
-    ReadOptions,
-    in_air,
-    only,
-    referenced,
-    renamed,
-    with_port,
-)
+from camera_calib.formats import colmap, gyroflow, metashape, opencv, rigs, yaml_files
+from camera_calib.formats.fields import camera_name, read_text
+from camera_calib.formats.opencv_model import distorts, is_fisheye
 from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.lenses.opencv import OpenCVLens
+from camera_calib.mount import mount_line, with_mount
 from camera_calib.ports.dome import DomePort
 from camera_calib.ports.none import NO_PORT
-from camera_calib.rig import Rig
+from camera_calib.rig import Rig, read_rig, write_rig
 
-_TERMS = {K3: ("k3",), RATIONAL: ("k4", "k5", "k6"), PRISM: ("s1", "s2", "s3", "s4")}
-MODELS = ("OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
+_TERMS = {rigs.K3: ("k3",), rigs.RATIONAL: ("k4", "k5", "k6"), rigs.PRISM: ("s1", "s2", "s3", "s4")}
+
+
+def _read_own(path: Path, _: rigs.ReadOptions) -> Rig:
+    return read_rig(path)
+
+
+def _write_own(path: Path, rig: Rig) -> list[Path]:
+    write_rig(path, rig)
+    return [path]
+
+
+_OWN = rigs.CalibrationFormat(
+    name="rig",
+    title="rig.json of this project",
+    holds=rigs.ALL,
+    owns=lambda path: path.suffix.lower() == ".json" and read_text(path).lstrip()[:1] != "[",
+    read=_read_own,
+    write=_write_own,
+    suffix=".json",
+)
+FORMATS = {
+    each.name: each
+    for each in (
+        gyroflow.FORMAT, _OWN, metashape.FORMAT, yaml_files.MRCAL, colmap.FORMAT, colmap.REFRACTIVE,
+        opencv.FORMAT, yaml_files.KALIBR, yaml_files.ROS,
+    )
+}  # fmt: skip
+"""By name, in the order in which a file is asked whose it is."""
+
+
+def format_named(name: str) -> rigs.CalibrationFormat:
+    """A format by its name.
+
+    Raises:
+        CalibrationError: there is none of this name.
+    """
+    if name not in FORMATS:
+        raise CalibrationError(f"no format {name!r}: {', '.join(FORMATS)}")
+    return FORMATS[name]
+
+
+def detect(path: Path) -> rigs.CalibrationFormat:
+    """The format of a file or folder, from its name and content.
+
+    Raises:
+        CalibrationError: it does not exist, or is of no known format.
+    """
+    if not path.exists():
+        raise CalibrationError(f"{path}: no such file or folder")
+    for each in FORMATS.values():
+        if each.owns(path):
+            return each
+    raise CalibrationError(f"{path}: of no known format: name it with --from")
+
+
+def of_target(path: Path) -> rigs.CalibrationFormat:
+    """The format that the name of a new file calls for.
+
+    Raises:
+        CalibrationError: several formats have such names.
+    """
+    if path.name in colmap.CAMERA_FILES:
+        return colmap.FORMAT
+    for each in FORMATS.values():
+        if each.suffix and each.suffix == path.suffix.lower():
+            return each
+    raise CalibrationError(f"{path}: name the format with --to: {', '.join(FORMATS)}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +100,7 @@ class Conversion:
     source_format: str | None = None
     """Format of the source; detected from the file when None."""
     target_format: str | None = None
-    reading: ReadOptions = field(default_factory=ReadOptions)
+    reading: rigs.ReadOptions = field(default_factory=rigs.ReadOptions)
     names: tuple[str, ...] = ()
     """New names of the cameras, in order."""
     port_distance_mm: float | None = None
@@ -62,10 +111,11 @@ class Conversion:
     glass_mm: float | None = None
     n_glass: float | None = None
     n_water: float | None = None
+    mount: str | None = None
+    """How the rig sits on its vehicle, as of `with_mount`."""
+    lever_m: tuple[float, float, float] | None = None
     water: tuple[float, float] | None = None
     """Nearest and farthest distance, m, over which a camera without port stands in for one with."""
-    model: str | None = None
-    """COLMAP's name of the model that stands in; `_best_model` when None."""
     drop_port: bool = False
     drop_covariance: bool = False
     overwrite: bool = False
@@ -84,23 +134,6 @@ class Conversion:
         return {name: value for name, value in given.items() if value is not None}
 
 
-@dataclass(frozen=True, kw_only=True)
-class Price:
-    """Errors of a stand-in without port against the exact camera."""
-
-    model: str
-    near_m: float
-    far_m: float
-    rms_px: float
-    max_px: float
-
-    def __str__(self) -> str:
-        return (
-            f"{self.model} for {self.near_m:g} to {self.far_m:g} m of water misses the exact "
-            f"camera by {self.rms_px:.3f} px rms, {self.max_px:.3f} px at most"
-        )
-
-
 def convert(task: Conversion) -> tuple[str, dict[str, Any]]:
     """Read, change as requested, write.
 
@@ -114,159 +147,160 @@ def convert(task: Conversion) -> tuple[str, dict[str, Any]]:
     target = (
         of_target(task.target) if task.target_format is None else format_named(task.target_format)
     )
-    rig = read_as(source, task.source, task.reading)
-    if task.names:
-        rig = renamed(rig, task.names)
-    if task.port:
-        rig = with_port(rig, dict(task.port))
-        dry = [name for name, one in rig.cameras.items() if one.n_water == 1.0]
-        if dry:
-            raise CalibrationError(
-                f"{task.source}: {', '.join(dry)} would look through a port into air: "
-                "give --n-water (1.333 is fresh, 1.34 sea water)"
-            )
-    prices: Mapping[str, Price] = {}
+    if target.write is None:
+        raise CalibrationError(f"{task.target}: {target.title}s are read only: choose another --to")
+    rig = _change(_read(source, task.source, task.reading), task)
+    prices: Mapping[str, Residual] = {}
     if task.water is not None:
         if task.drop_port:
             raise CalibrationError("--water and --drop-port: one of them, cameras in water or air")
         _may_lose_covariance(rig, task, f"{task.target}: cameras fitted in water have no longer")
-        models = {n: task.model or _best_model(c, target) for n, c in rig.cameras.items()}
+        models = {name: _best_model(camera, target) for name, camera in rig.cameras.items()}
         rig, prices = in_water(rig, *task.water, models)
     for name in rig.cameras:  # they become names of files and folders
         if camera_name(task.source, name) != name:
             raise CalibrationError(f"{task.source}: camera name {name!r} has a slash: give --names")
-    rig, notes = fitted(referenced(rig), target, task)
-    existing = [path for path in target.targets(task.target, rig) if path.is_file()]
+    rig, notes = fit_to_format(rigs.refer_to_first(rig), target, task)
+    existing = [path for path in target.files(task.target, rig) if path.is_file()]
     if existing and not task.overwrite:
         raise CalibrationError(f"{existing[0]}: exists: name another, or add --overwrite")
     written = target.write(task.target, rig)
     for note in notes:
         warn(note)
-    return _summary(source, target, rig, written, prices)
+    lines = [f"{source.title} -> {target.title}: {', '.join(str(path) for path in written)}"]
+    for name, c in rig.cameras.items():
+        place = _port_words(c) if c.port.parameters else "in water" if prices else "in air"
+        lines.append(
+            f"{name}: {c.width_px} x {c.height_px} px, f {c.fx_px:.3f} {c.fy_px:.3f}, "
+            f"c {c.cx_px:.3f} {c.cy_px:.3f} px, {place}"
+        )
+    for name, price in prices.items():
+        near_m, far_m = task.water or (0.0, 0.0)
+        lines.append(
+            f"{name}: {price.stand_in.model} for {near_m:g} to {far_m:g} m of water misses the "
+            f"exact camera by {price.rms_px:.3f} px rms, {price.max_px:.3f} px at most"
+        )
+    if len(rig.cameras) > 1:
+        lines.append(f"baseline {rig.baseline_m:.6g} m")
+    if rigs.MOUNT in target.holds:
+        lines.append(mount_line(rig))
+    data = {
+        "from": source.name,
+        "to": target.name,
+        "written": [str(path) for path in written],
+        "cameras": {name: camera.to_json() for name, camera in rig.cameras.items()},
+        "price": {
+            name: {"model": one.stand_in.model, "rms_px": one.rms_px, "max_px": one.max_px}
+            for name, one in prices.items()
+        },
+        "baseline_m": rig.baseline_m if len(rig.cameras) > 1 else None,
+    }
+    return "\n".join(lines), data
 
 
-def read_as(source: CalibrationFormat, path: Path, reading: ReadOptions) -> Rig:
-    """Read a rig; of several cameras only the one wanted, when one is named.
-
-    Raises:
-        CalibrationError: the message names the file.
-    """
+def _read(source: rigs.CalibrationFormat, path: Path, reading: rigs.ReadOptions) -> Rig:
+    """A rig; of several cameras the one that is named."""
     try:
         rig = source.read(path, reading)
         if reading.camera is not None and len(rig.cameras) > 1:
-            rig = only(rig, reading.camera)
+            rig = rigs.only(rig, reading.camera)
     except CalibrationError as error:
         text = str(error)
         raise CalibrationError(text if str(path) in text else f"{path}: {text}") from None
     return rig
 
 
-def fitted(rig: Rig, target: CalibrationFormat, task: Conversion) -> tuple[Rig, list[str]]:
+def _change(rig: Rig, task: Conversion) -> Rig:
+    """A rig with the names, port and mount that are stated."""
+    if task.names:
+        rig = rigs.rename_cameras(rig, task.names)
+    if task.port:
+        rig = rigs.with_port(rig, task.port)
+        dry = [name for name, one in rig.cameras.items() if one.n_water == 1.0]
+        if dry:
+            raise CalibrationError(
+                f"{task.source}: {', '.join(dry)} would look through a port into air: "
+                "give --n-water (1.333 is fresh, 1.34 sea water)"
+            )
+    if task.mount is not None:
+        return with_mount(rig, task.mount, task.lever_m)
+    if task.lever_m is not None:
+        raise CalibrationError("--lever goes with --mount")
+    return rig
+
+
+def fit_to_format(
+    rig: Rig, target: rigs.CalibrationFormat, task: Conversion
+) -> tuple[Rig, list[str]]:
     """The part of a rig that a format holds, and notes of what was left out as requested.
 
     Raises:
         CalibrationError: something would be lost without permission.
     """
-    where = f"{task.target}: {target.title} cannot hold"
+    where, instead = f"{task.target}: {target.title} cannot hold", "add --water NEAR FAR (m) for"
     notes = []
-    for terms, names in _TERMS.items():
-        bent = [name for name, camera in rig.cameras.items() if distorts(camera, *names)]
-        if bent and terms not in target.holds:
+    lost = {
+        f"the distortion {' '.join(names)}": [
+            name for name, camera in rig.cameras.items() if distorts(camera, *names)
+        ]
+        for terms, names in _TERMS.items()
+        if terms not in target.holds
+    }
+    if rigs.FISHEYE not in target.holds:
+        lost["the fisheye lens"] = [name for name, one in rig.cameras.items() if is_fisheye(one)]
+    for what, cameras in lost.items():
+        if cameras:
             raise CalibrationError(
-                f"{where} the distortion {' '.join(names)} of {', '.join(bent)}: "
-                "choose another format, or add --water NEAR FAR (m) for the best fit"
+                f"{where} {what} of {', '.join(cameras)}: choose another format, or {instead} the "
+                "best fit"
             )
-    wide = [n for n, one in rig.cameras.items() if is_fisheye(one) and FISHEYE not in target.holds]
-    if wide:
-        raise CalibrationError(
-            f"{where} the fisheye lens of {', '.join(wide)}: choose another format, or add "
-            "--water NEAR FAR (m) for the best fit"
-        )
-    behind = [name for name, camera in rig.cameras.items() if has_port(camera)]
-    lost = any(rig.cameras[name].port.shape not in target.holds for name in behind)
-    if task.drop_port or lost:
-        if behind and not task.drop_port:
+    if target.max_cameras is not None and len(rig.cameras) > target.max_cameras:
+        raise CalibrationError(f"{where} {len(rig.cameras)} cameras: choose one with --camera")
+    behind = {name: camera for name, camera in rig.cameras.items() if camera.port.parameters}
+    if behind and (
+        task.drop_port or any(c.port.shape not in target.holds for c in behind.values())
+    ):
+        port = f"the port of {', '.join(behind)} ({_port_words(next(iter(behind.values())))})"
+        if not task.drop_port:
             raise CalibrationError(
-                f"{where} the port of {', '.join(behind)} ({_port_words(rig.cameras[behind[0]])}): "
-                "add --water NEAR FAR (m) for the best fit under water, --drop-port for the "
-                "cameras in air"
+                f"{where} {port}: {instead} the best fit under water, --drop-port for the cameras "
+                "in air"
             )
-        if behind:
-            notes.append(
-                f"{task.target}: left out the port of {', '.join(behind)} "
-                f"({_port_words(rig.cameras[behind[0]])}): these cameras are in air"
-            )
-        rig = in_air(rig)
-    if rig.covariance is not None and (task.drop_covariance or COVARIANCE not in target.holds):
+        notes.append(f"{task.target}: left out {port}: these cameras are in air")
+        rig = rigs.in_air(rig)
+    if rig.covariance is not None and (task.drop_covariance or rigs.COVARIANCE not in target.holds):
         _may_lose_covariance(rig, task, where)
-        notes.append(f"{task.target}: left out {_covariance_words(rig)}")
+        count = len(rig.covariance.parameters)
+        notes.append(f"{task.target}: left out the covariance of {count} parameters")
         rig = replace(rig, covariance=None)
-    if MOUNT not in target.holds and rig.body_from_rig is not None:
+    if rigs.MOUNT not in target.holds and rig.body_from_rig is not None:
         notes.append(f"{task.target}: left out the rig's pose on the vehicle")
-    if MOUNT in target.holds and rig.body_from_rig is None:
+    if rigs.MOUNT in target.holds and rig.body_from_rig is None:
         notes.append(
-            f"{task.source}: states no pose on the vehicle, which stays unknown: "
-            "'alice-survey camera mount' states it"
+            f"{task.source}: states no pose on the vehicle, which stays unknown: --mount states it"
         )
     return rig, notes
 
 
 def _may_lose_covariance(rig: Rig, task: Conversion, why: str) -> None:
     if rig.covariance is not None and not task.drop_covariance:
-        raise CalibrationError(f"{why} {_covariance_words(rig)}: add --drop-covariance")
-
-
-def _covariance_words(rig: Rig) -> str:
-    count = 0 if rig.covariance is None else len(rig.covariance.parameters)
-    return f"the covariance of {count} parameters"
-
-
-def has_port(camera: Camera) -> bool:
-    """Whether a camera differs from one in air."""
-    return bool(camera.port.parameters)
+        count = len(rig.covariance.parameters)
+        raise CalibrationError(f"{why} the covariance of {count} parameters: add --drop-covariance")
 
 
 def _port_words(camera: Camera) -> str:
     return f"{camera.port.words}, water {camera.n_water:g}"
 
 
-def _summary(
-    source: CalibrationFormat,
-    target: CalibrationFormat,
-    rig: Rig,
-    written: Sequence[Path],
-    prices: Mapping[str, Price],
-) -> tuple[str, dict[str, Any]]:
-    lines = [f"{source.title} -> {target.title}: {', '.join(str(path) for path in written)}"]
-    for name, c in rig.cameras.items():
-        place = _port_words(c) if has_port(c) else "in water" if prices else "in air"
-        lines.append(
-            f"{name}: {c.width_px} x {c.height_px} px, f {c.fx_px:.3f} {c.fy_px:.3f}, "
-            f"c {c.cx_px:.3f} {c.cy_px:.3f} px, {place}"
-        )
-    lines += [f"{name}: {price}" for name, price in prices.items()]
-    if len(rig.cameras) > 1:
-        lines.append(f"baseline {rig.baseline_m:.6g} m")
-    data = {
-        "from": source.name,
-        "to": target.name,
-        "written": [str(path) for path in written],
-        "cameras": {name: camera.to_json() for name, camera in rig.cameras.items()},
-        "price": {name: asdict(price) for name, price in prices.items()},
-        "baseline_m": rig.baseline_m if len(rig.cameras) > 1 else None,
-    }
-    return "\n".join(lines), data
-
-
-def _best_model(camera: Camera, target: CalibrationFormat) -> str:
+def _best_model(camera: Camera, target: rigs.CalibrationFormat) -> str:
     if not is_fisheye(camera):
         return "OPENCV"
-    return "OPENCV_FISHEYE" if FISHEYE in target.holds else "FULL_OPENCV"
+    return "OPENCV_FISHEYE" if rigs.FISHEYE in target.holds else "FULL_OPENCV"
 
 
 def in_water(
     rig: Rig, near_m: float, far_m: float, models: Mapping[str, str]
-) -> tuple[Rig, Mapping[str, Price]]:
+) -> tuple[Rig, Mapping[str, Residual]]:
     """The rig for other software under water that has no port model.
 
     Each camera is the best fit, over the frame and the interval of distances, of a camera with
@@ -277,43 +311,35 @@ def in_water(
         rig: exact.
         near_m: nearest distance from the entrance pupil along the axis.
         far_m: farthest.
-        models: by camera, each one of `MODELS`.
+        models: by camera, each a name of `COLMAP_PARAMETERS`.
 
     Returns:
-        The rig, whose cameras are as in air and without covariance, and the price by camera.
+        The rig, whose cameras are as in air and without covariance, and by camera what the fit
+        leaves.
 
     Raises:
-        CalibrationError: the model is none of these, a part of a frame sees nothing, or the fit is
-            no lens over the whole frame.
+        CalibrationError: a part of a frame sees nothing, or the fit is no lens over all of it.
         ConfigError: the interval is empty or reaches into a port.
     """
-    for model in models.values():
-        if model not in MODELS:
-            raise CalibrationError(f"model {model}: {' or '.join(MODELS)} expected")
-    found = {
+    fits = {
         name: approximations(camera, near_m, far_m, models=(models[name],))[-1]
         for name, camera in rig.cameras.items()
     }
-    cameras = {name: _stand_in(rig.cameras[name], fit) for name, fit in found.items()}
+    cameras = {name: _stand_in(rig.cameras[name], fit) for name, fit in fits.items()}
     for name, one in cameras.items():
         if not np.isfinite(one.unproject(one.border())[1]).all():
             raise CalibrationError(
-                f"the best {models[name]} of {name} folds back inside the frame: give another "
-                "--model, or a format that holds fisheyes"
+                f"the best {models[name]} of {name} folds back inside the frame: choose a format "
+                "that holds fisheyes"
             )
-    poses = {name: _from_cam(fit) * rig.cam_from_rig[name] for name, fit in found.items()}
-    prices = {
-        name: Price(
-            model=models[name], near_m=near_m, far_m=far_m, rms_px=fit.rms_px, max_px=fit.max_px
-        )
-        for name, fit in found.items()
-    }
+    poses = {}
+    for name, fit in fits.items():
+        turn = fit.stand_in.approx_from_cam
+        place = -turn.apply(fit.stand_in.centre_m)
+        poses[name] = RigidTransform.from_components(place, turn) * rig.cam_from_rig[name]
     words = ", ".join(dict.fromkeys(models.values()))
     source = f"{rig.source}; best {words} in water, {near_m:g} to {far_m:g} m"
-    return (
-        replace(rig, cameras=cameras, cam_from_rig=poses, source=source, covariance=None),
-        prices,
-    )
+    return replace(rig, cameras=cameras, cam_from_rig=poses, source=source, covariance=None), fits
 
 
 def _stand_in(camera: Camera, fit: Residual) -> Camera:
@@ -322,8 +348,3 @@ def _stand_in(camera: Camera, fit: Residual) -> Camera:
     focal = {f"{name}_px": values.pop(name) for name in ("fx", "fy", "cx", "cy")}
     kind = FisheyeLens if stand_in.model == "OPENCV_FISHEYE" else OpenCVLens
     return replace(camera, lens=kind(**focal, **values), port=NO_PORT)
-
-
-def _from_cam(fit: Residual) -> RigidTransform:
-    turn = fit.stand_in.approx_from_cam
-    return RigidTransform.from_components(-turn.apply(fit.stand_in.centre_m), turn)

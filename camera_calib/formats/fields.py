@@ -1,4 +1,4 @@
-"""Files of other tools, read safely: bounded, checked value by value, faults named by key.
+"""Files of other tools, read safely: bounded, and checked by models that name the faulty key.
 
 YAML, OpenCV's FileStorage and JSON become plain values: nothing expands, nothing is constructed.
 """
@@ -6,17 +6,26 @@ YAML, OpenCV's FileStorage and JSON become plain values: nothing expands, nothin
 import json
 import math
 import re
-from collections.abc import Hashable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Self
 
 import cv2
 import numpy as np
 import yaml
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    PlainValidator,
+    ValidationError,
+)
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.artefacts import atomic_path
+from alice_survey.core.contents import first_fault, shown
 from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import Array
 from alice_survey.core.untrusted import refuse_declarations
@@ -34,119 +43,73 @@ _ROTATION_TOLERANCE = 1e-3
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Fields:
-    """Values by key, as parsers give them, with the file they come from."""
+class FileModel(BaseModel):
+    """Values of a file by its keys, to read and to write; other keys are ignored."""
 
-    path: Path
-    values: Mapping[str, Any]
-    prefix: str = ""
-    """Keys that lead here, such as `cam0.`."""
+    model_config = ConfigDict(
+        frozen=True, allow_inf_nan=False, arbitrary_types_allowed=True, populate_by_name=True
+    )
 
-    def fault(self, key: str, text: str) -> CalibrationError:
-        """Error about a key, as one line that names the file."""
-        return CalibrationError(f"{self.path}: {self.prefix}{key} {text}")
+    @classmethod
+    def check(cls, path: Path, values: Any, prefix: str = "") -> Self:
+        """The model of parsed values.
 
-    def __contains__(self, key: str) -> bool:
-        return key in self.values
-
-    def first(self, *keys: str) -> str | None:
-        """The first of these keys that is there."""
-        return next((key for key in keys if key in self.values), None)
-
-    def get(self, key: str) -> Any:
-        """A value of any kind.
+        Args:
+            path: of their file, for messages.
+            values: as parsers give them.
+            prefix: keys that lead here, such as `cam0.`.
 
         Raises:
-            CalibrationError: the key is missing.
+            CalibrationError: a value is missing or wrong; the message names file and key.
         """
-        if key not in self.values:
-            raise CalibrationError(f"{self.path}: lacks {self.prefix}{key}")
-        return self.values[key]
+        try:
+            return cls.model_validate(values)
+        except ValidationError as error:
+            given = error.errors(include_url=False)[0]["input"]
+            value = "" if isinstance(given, dict | list) else f" ({shown(repr(given))[:60]})"
+            raise CalibrationError(f"{path}: {prefix}{first_fault(error)}{value}") from None
 
-    def fields(self, key: str) -> "Fields":
-        """The mapping below a key."""
-        value = self.get(key)
-        if not isinstance(value, Mapping):
-            raise self.fault(key, "is not a mapping")
-        return Fields(path=self.path, values=value, prefix=f"{self.prefix}{key}.")
+    def values(self) -> dict[str, Any]:
+        """What a file holds of it, by its keys."""
+        return self.model_dump(mode="json", by_alias=True, exclude_none=True)
 
-    def text(self, key: str) -> str:
-        """A line of text."""
-        value = self.get(key)
-        if not isinstance(value, str) or "\n" in value:
-            raise self.fault(key, "is not a line of text")
-        return value
 
-    def texts(self, key: str) -> list[str]:
-        """A list of texts; OpenCV's XML has no other way to write a list of one than its text."""
-        value = self.get(key)
-        every = [value] if isinstance(value, str) else value
-        if not isinstance(every, list) or not all(isinstance(text, str) for text in every):
-            raise self.fault(key, "is not a list of names")
-        return every
+def read_vector(counts: tuple[int, ...], value: Any) -> Array:
+    """Finite numbers in a list, however nested, or in a matrix with its `data`."""
+    flat = _flat(value.get("data") if isinstance(value, Mapping) else value)
+    if flat is None:
+        raise ValueError("holds something that is not a finite number")
+    if counts and len(flat) not in counts:
+        expected = " or ".join(map(str, counts))
+        raise ValueError(f"holds {len(flat)} numbers; {expected} expected")
+    return np.array(flat)
 
-    def number(self, key: str) -> float:
-        """A finite number."""
-        return float(self.numbers(key, 1)[0])
 
-    def size(self, key: str) -> int:
-        """A positive whole number."""
-        value = self.number(key)
-        if value != int(value) or not 1 <= value <= 1e6:
-            raise self.fault(key, f"= {value:g} is not a number of pixels")
-        return int(value)
+def _read_matrix(rows: int, columns: int, value: Any) -> Array:
+    """A matrix, as nested lists or as a mapping of rows, cols and data row by row."""
+    if isinstance(value, Mapping) and [value.get("rows"), value.get("cols")] != [rows, columns]:
+        raise ValueError(f"is not a {rows} x {columns} matrix")
+    return read_vector((rows * columns,), value).reshape(rows, columns)
 
-    def numbers(self, key: str, *counts: int) -> Array:
-        """Finite numbers, however nested, as one vector of one of these lengths."""
-        flat = _flat(self.get(key))
-        if flat is None:
-            raise self.fault(key, "holds something that is not a finite number")
-        if len(flat) not in counts:
-            wanted = " or ".join(map(str, counts))
-            raise self.fault(key, f"holds {len(flat)} numbers; {wanted} expected")
-        return np.array(flat)
 
-    def matrix(self, key: str, rows: int, columns: int) -> Array:
-        """A matrix, as nested lists or as a mapping of rows, cols and data row by row."""
-        value = self.get(key)
-        if not isinstance(value, Mapping):
-            return self.numbers(key, rows * columns).reshape(rows, columns)
-        inner = self.fields(key)
-        if [inner.size("rows"), inner.size("cols")] != [rows, columns]:
-            raise self.fault(key, f"is not a {rows} x {columns} matrix")
-        return inner.numbers("data", rows * columns).reshape(rows, columns)
+def _read_rotation(value: Any) -> Rotation:
+    matrix = _read_matrix(3, 3, value)
+    off = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
+    if off > _ROTATION_TOLERANCE or np.linalg.det(matrix) < 0:
+        raise ValueError(f"is not a rotation (R R^T misses the identity by {off:.2g})")
+    return Rotation.from_matrix(matrix)
 
-    def vector(self, key: str, *counts: int) -> Array:
-        """Numbers in a list, or a row or column matrix."""
-        if isinstance(self.get(key), Mapping):
-            return self.fields(key).numbers("data", *counts)
-        return self.numbers(key, *counts)
 
-    def rotation(self, key: str, matrix: Array) -> Rotation:
-        """A 3 x 3 matrix read from `key` as a rotation.
-
-        Raises:
-            CalibrationError: it is not one.
-        """
-        off = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
-        if off > _ROTATION_TOLERANCE or np.linalg.det(matrix) < 0:
-            raise self.fault(key, f"is not a rotation (R R^T misses the identity by {off:.2g})")
-        return Rotation.from_matrix(matrix)
-
-    def pose(self, key: str) -> RigidTransform:
-        """A 4 x 4 rigid transformation."""
-        matrix = self.matrix(key, 4, 4)
-        if not np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]):
-            raise self.fault(key, "does not end in the row 0 0 0 1")
-        return RigidTransform.from_components(matrix[:3, 3], self.rotation(key, matrix[:3, :3]))
+def _read_pose(value: Any) -> RigidTransform:
+    matrix = _read_matrix(4, 4, value)
+    if not np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]):
+        raise ValueError("does not end in the row 0 0 0 1")
+    return RigidTransform.from_components(matrix[:3, 3], _read_rotation(matrix[:3, :3].tolist()))
 
 
 def _flat(value: Any, depth: int = 0) -> list[float] | None:
-    if isinstance(value, list):
-        if depth > _DEEPEST:
-            return None
-        parts = [_flat(part, depth + 1) for part in value]
+    if isinstance(value, list | tuple):
+        parts = [_flat(part, depth + 1) for part in value] if depth <= _DEEPEST else [None]
         if any(part is None for part in parts):
             return None
         return [number for part in parts if part is not None for number in part]
@@ -158,6 +121,36 @@ def _flat(value: Any, depth: int = 0) -> list[float] | None:
     except (ValueError, OverflowError):
         return None
     return [number] if math.isfinite(number) else None
+
+
+def _as_list(array: Array) -> Any:
+    return array.tolist()
+
+
+def matrix_of(array: Array) -> dict[str, Any]:
+    """A matrix, or a row of numbers, as OpenCV and ROS write it into YAML."""
+    rows, columns = np.atleast_2d(array).shape
+    return {"rows": rows, "cols": columns, "data": array.ravel().tolist()}
+
+
+def _validator(read: Callable[..., Any], *shape: Any) -> PlainValidator:
+    return PlainValidator(partial(read, *shape))
+
+
+Pixels = Annotated[int, Field(ge=1, le=1_000_000)]
+"""A number of pixels."""
+Numbers = Annotated[Array, _validator(read_vector, ()), PlainSerializer(_as_list)]
+Vector3 = Annotated[Array, _validator(read_vector, (3,)), PlainSerializer(_as_list)]
+Vector4 = Annotated[Array, _validator(read_vector, (4,)), PlainSerializer(_as_list)]
+Vector6 = Annotated[Array, _validator(read_vector, (6,)), PlainSerializer(_as_list)]
+Matrix33 = Annotated[Array, _validator(_read_matrix, 3, 3), PlainSerializer(matrix_of)]
+Matrix34 = Annotated[Array, _validator(_read_matrix, 3, 4), PlainSerializer(matrix_of)]
+Turn = Annotated[
+    Rotation, _validator(_read_rotation), PlainSerializer(lambda turn: matrix_of(turn.as_matrix()))
+]
+Pose = Annotated[
+    RigidTransform, _validator(_read_pose), PlainSerializer(lambda pose: pose.as_matrix().tolist())
+]
 
 
 def read_bytes(path: Path, largest: int = _MAX_BYTES) -> bytes:
@@ -184,17 +177,6 @@ def _check_size(path: Path, content: bytes, largest: int) -> None:
         )
 
 
-def _without(content: bytes, start: bytes, end: bytes) -> bytes:
-    kept, at = [], 0
-    while (first := content.find(start, at)) >= 0:
-        last = content.find(end, first + len(start))
-        if last < 0:
-            break
-        kept.append(content[at:first])
-        at = last + len(end)
-    return b"".join([*kept, content[at:]])
-
-
 def read_text(path: Path, skipped: tuple[bytes, bytes] | None = None) -> str:
     """The text of a file that parsers can take without harm.
 
@@ -208,20 +190,20 @@ def read_text(path: Path, skipped: tuple[bytes, bytes] | None = None) -> str:
     """
     content = read_bytes(path, _MAX_BYTES if skipped is None else _MAX_SKIPPED_BYTES)
     if skipped is not None:
-        content = _without(content, *skipped)
+        start, end = map(re.escape, skipped)
+        content = re.sub(start + b".*?" + end, b"", content, flags=re.DOTALL)
         _check_size(path, content, _MAX_BYTES)
     try:
         text = content.decode("utf-8-sig")
+        refuse_declarations(text)
     except UnicodeDecodeError:
         raise CalibrationError(f"{path}: is not UTF-8 text") from None
+    except ValueError as error:
+        raise CalibrationError(f"{path}: {error}") from None
     if "\0" in text:
         raise CalibrationError(f"{path}: is not text")
     if len(re.findall(r"[\[{]|<[A-Za-z_]", text)) > _MAX_PARTS:
         raise CalibrationError(f"{path}: has more than {_MAX_PARTS} parts: no calibration file")
-    try:
-        refuse_declarations(text)
-    except ValueError as error:
-        raise CalibrationError(f"{path}: {error}") from None
     return text
 
 
@@ -260,7 +242,7 @@ class _PlainLoader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no type
         return values
 
 
-def read_yaml(path: Path, skipped: tuple[bytes, bytes] | None = None) -> Fields:
+def read_yaml(path: Path, skipped: tuple[bytes, bytes] | None = None) -> dict[str, Any]:
     """A YAML file whose top is a mapping; `skipped` as for `read_text`.
 
     Raises:
@@ -284,20 +266,19 @@ def write_yaml(path: Path, document: Any) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def read_json_fields(path: Path) -> Fields:
-    """A JSON file whose top is a mapping, or a list, which is then found below the key `list`.
+def read_json_values(path: Path) -> Any:
+    """The value of a JSON file.
 
     Raises:
         CalibrationError: the file is missing or not JSON.
     """
     try:
-        value = json.loads(read_text(path))
+        return json.loads(read_text(path))
     except (ValueError, RecursionError) as error:
         raise CalibrationError(f"{path}: not valid JSON: {_one_line(str(error))}") from None
-    return _mapping(path, {"list": value} if isinstance(value, list) else value)
 
 
-def read_storage(path: Path) -> Fields:
+def read_storage(path: Path) -> dict[str, Any]:
     """A YAML, XML or JSON file of OpenCV's FileStorage; matrices are `{rows, cols, dt, data}`.
 
     Raises:
@@ -335,10 +316,35 @@ def _plain(path: Path, node: Any) -> Any:
     return node.real() if node.isReal() else None
 
 
-def _mapping(path: Path, value: Any) -> Fields:
+def write_storage(path: Path, values: Mapping[str, Any]) -> None:
+    """Write what `read_storage` reads: arrays, numbers, texts, lists of texts, and mappings."""
+    suffix = ".xml" if path.suffix.lower() == ".xml" else ".yml"
+    storage = cv2.FileStorage(suffix, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+
+    def write(key: str, value: Any) -> None:
+        if isinstance(value, Mapping):
+            storage.startWriteStruct(key, cv2.FileNode_MAP)
+            for inner, part in value.items():
+                write(inner, part)
+            storage.endWriteStruct()
+        elif isinstance(value, list):
+            storage.startWriteStruct(key, cv2.FileNode_SEQ)
+            for text in value:
+                storage.write("", text)
+            storage.endWriteStruct()
+        else:
+            storage.write(key, np.array([value]) if isinstance(value, tuple) else value)
+
+    for key, value in values.items():
+        write(key, value)
+    with atomic_path(path) as temporary:
+        temporary.write_text(storage.releaseAndGetString(), encoding="utf-8")
+
+
+def _mapping(path: Path, value: Any) -> dict[str, Any]:
     if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
         raise CalibrationError(f"{path}: is not a mapping of keys to values")
-    return Fields(path=path, values=value)
+    return value
 
 
 def _one_line(text: str) -> str:

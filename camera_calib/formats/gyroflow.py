@@ -5,53 +5,66 @@ camera, measured on another copy of it, in air. They are no calibration of the c
 have a wide covariance, and a calibration that starts from one takes it as a weak prior.
 """
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.errors import CalibrationError
-from camera_calib.formats.fields import Fields, read_json_fields
-from camera_calib.formats.opencv_model import read_camera
-from camera_calib.formats.rigs import ReadOptions, assemble
+from camera_calib.formats import fields, opencv_model, rigs
 from camera_calib.freedom import intrinsics
 from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.lenses.opencv import OpenCVLens
-from camera_calib.lenses.values import LensValues
 from camera_calib.rig import Covariance, Rig
 
-KEY = "fisheye_params"
 _FOCAL_SHARE, _CENTRE_SHARE, _DISTORTION = 0.03, 0.02, 0.05
 """Standard deviations between copies of a camera: of focal lengths over themselves, of the centre
 over the width, of distortion terms. Far wider than any calibration."""
 _KNOWN = {FisheyeLens.model: intrinsics("fisheye"), OpenCVLens.model: intrinsics("opencv5")}
-_MODELS: Mapping[str, type[LensValues]] = {
-    "opencv_fisheye": FisheyeLens,
-    "opencv_standard": OpenCVLens,
-}
 
 
-def read_gyroflow(path: Path, reading: ReadOptions) -> Rig:
+class _Size(fields.FileModel):
+    w: fields.Pixels
+    h: fields.Pixels
+
+
+class _Lens(fields.FileModel):
+    camera_matrix: fields.Matrix33
+    distortion_coeffs: fields.Numbers
+
+
+class _Profile(fields.FileModel):
+    calib_dimension: _Size
+    fisheye_params: _Lens
+    distortion_model: Literal["opencv_fisheye", "opencv_standard"] = "opencv_fisheye"
+    digital_lens: Any = None
+    input_horizontal_stretch: float = 1.0
+    input_vertical_stretch: float = 1.0
+    camera_brand: Any = ""
+    camera_model: Any = ""
+    lens_model: Any = ""
+
+
+def read_gyroflow(path: Path, reading: rigs.ReadOptions) -> Rig:
     """Read a profile, for the picture size it was measured at or one of the same shape.
 
     Raises:
         CalibrationError: a key is missing or wrong, or the camera's software bends the picture.
     """
-    fields = read_json_fields(path)
-    model = fields.text("distortion_model") if "distortion_model" in fields else "opencv_fisheye"
-    if model not in _MODELS:
-        raise fields.fault("distortion_model", f"is {model}; {' or '.join(_MODELS)} can be read")
-    if fields.values.get("digital_lens"):
-        raise fields.fault("digital_lens", "bends the picture (SuperView, HyperView): use another")
+    profile = _Profile.check(path, fields.read_json_values(path))
+    if profile.digital_lens:
+        raise CalibrationError(
+            f"{path}: digital_lens bends the picture (SuperView, HyperView): use another"
+        )
     for key in ("input_horizontal_stretch", "input_vertical_stretch"):
-        if key in fields and not np.isclose(fields.number(key), 1.0):
-            raise fields.fault(key, "is not 1: a picture that is stretched is not held")
-    dimension = fields.fields("calib_dimension")
-    size = dimension.size("w"), dimension.size("h")
-    camera = read_camera(
-        fields.fields(KEY), "camera_matrix", "distortion_coeffs", size, _MODELS[model]
+        if not np.isclose(getattr(profile, key), 1.0):
+            raise CalibrationError(f"{path}: {key} is not 1: a stretched picture is not held")
+    size, lens = (profile.calib_dimension.w, profile.calib_dimension.h), profile.fisheye_params
+    kind = FisheyeLens if profile.distortion_model == "opencv_fisheye" else OpenCVLens
+    where = f"{path}: fisheye_params.camera_matrix"
+    camera = opencv_model.camera_of_matrix(
+        where, lens.camera_matrix, lens.distortion_coeffs, size, kind
     )
     if reading.image_size is not None:
         width, height = reading.image_size
@@ -59,14 +72,14 @@ def read_gyroflow(path: Path, reading: ReadOptions) -> Rig:
             raise CalibrationError(
                 f"{path}: is of {size[0]} x {size[1]} px: {width} x {height} has another shape"
             )
-        lens = camera.lens.reduced(size[0] / width)
-        camera = replace(camera, width_px=width, height_px=height, lens=lens)
-    rig = assemble(path, reading, "Gyroflow", ["cam0"], [camera], [RigidTransform.identity()])
-    words = [_words(fields, key) for key in ("camera_brand", "camera_model", "lens_model")]
-    named = " ".join(filter(None, words)) or path.name
+        smaller = camera.lens.reduced(size[0] / width)
+        camera = replace(camera, width_px=width, height_px=height, lens=smaller)
+    rig = rigs.assemble(path, reading, "Gyroflow", ["cam0"], [camera], rigs.ONE)
+    words = f"{profile.camera_brand} {profile.camera_model} {profile.lens_model}".split()
     return replace(
         rig,
-        source=f"start of a calibration: lens profile of {named}, another camera",
+        source="start of a calibration: lens profile of "
+        f"{' '.join(words)[:180] or path.name}, another camera",
         covariance=_spread(rig),
     )
 
@@ -83,5 +96,15 @@ def _spread(rig: Rig) -> Covariance:
     )
 
 
-def _words(fields: Fields, key: str) -> str:
-    return " ".join(str(fields.values.get(key, "")).split())[:60]
+def _owns(path: Path) -> bool:
+    return path.suffix.lower() == ".json" and '"fisheye_params"' in fields.read_text(path)
+
+
+FORMAT = rigs.CalibrationFormat(
+    name="gyroflow",
+    title="Gyroflow lens profile",
+    holds=frozenset(),
+    owns=_owns,
+    read=read_gyroflow,
+    write=None,
+)

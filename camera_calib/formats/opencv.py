@@ -8,180 +8,201 @@ are k1 k2 p1 p2 of a pinhole or k1 to k4 of `cv2.fisheye`: `distortion_model` (w
 lenses of a pair differ) or the caller says which; without either it is a pinhole.
 """
 
-from dataclasses import asdict
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from dataclasses import fields as fields_of
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
+from pydantic import Field
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.core.artefacts import atomic_path
 from alice_survey.core.errors import CalibrationError, warn
 from camera_calib.camera import Camera
-from camera_calib.formats.fields import Fields, read_storage
-from camera_calib.formats.opencv_model import (
-    FISHEYE,
-    LENS_NAMES,
-    camera_matrix,
-    distortion,
-    is_fisheye,
-    read_camera,
-    read_port,
-)
-from camera_calib.formats.rigs import ReadOptions, assemble, default_names, own_keys
+from camera_calib.formats import fields, opencv_model, rigs
 from camera_calib.optics import PORTS
 from camera_calib.ports.flat import FlatPort
-from camera_calib.rig import Rig
+from camera_calib.rig import Covariance, Rig
 
-_MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K")
-_DISTORTION = ("distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "D")
-_PAIR = ("M{}", "K{}", "cameraMatrix{}", "camera_matrix{}")
-_PAIR_DISTORTION = ("D{}", "distCoeffs{}", "distortion_coefficients{}")
-_WIDTH = ("image_width", "image_Width")
-_HEIGHT = ("image_height", "image_Height")
+_KEYS: Mapping[str, tuple[str, ...]] = {
+    "camera_matrix": ("camera_matrix", "cameraMatrix", "Camera_Matrix", "M", "K"),
+    "distortion_coefficients": (
+        "distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "D"
+    ),
+    "distortion_model": ("distortion_model",),
+    "image_width": ("image_width", "image_Width"),
+    "image_height": ("image_height", "image_Height"),
+    "port": ("port",),
+}  # fmt: skip
+"""Other keys of what a camera has; of a pair they end in the camera's number."""
+_OF_BOTH = ("distortion_model", "image_width", "image_height")
+"""May be stated once for both."""
 
 
-def read_opencv(path: Path, reading: ReadOptions) -> Rig:
+class _Camera(fields.FileModel):
+    camera_matrix: fields.Matrix33
+    distortion_coefficients: fields.Numbers | None = None
+    distortion_model: str | None = None
+    image_width: fields.Pixels | None = None
+    image_height: fields.Pixels | None = None
+    port: dict[str, Any] | None = None
+
+
+class _PairPose(fields.FileModel):
+    rotation: fields.Turn = Field(alias="R")
+    shift: fields.Vector3 = Field(alias="T")
+
+
+class _Names(fields.FileModel):
+    camera_name: str | None = None
+    camera_names: list[str] | str | None = None
+    """OpenCV's XML has no other way to write a list of one than its text."""
+    source: str | None = None
+    body_from_rig: fields.Pose | None = None
+    covariance_parameters: tuple[str, ...] = ()
+    covariance: fields.Numbers | None = None
+
+
+def read_opencv(path: Path, reading: rigs.ReadOptions) -> Rig:
     """Read one camera or a stereo pair.
 
     Raises:
         CalibrationError: a key is missing or wrong; the message names file and key.
     """
-    fields = read_storage(path)
-    if fields.first(*_MATRIX) is not None:
-        cameras = [_numbered(fields, "", reading)]
-        poses = [RigidTransform.identity()]
-    else:
-        cameras = [_numbered(fields, number, reading) for number in ("1", "2")]
-        other = fields if reading.extrinsics is None else read_storage(reading.extrinsics)
-        poses = [RigidTransform.identity(), _second_pose(other, fields, reading)]
-    rig = assemble(path, reading, "OpenCV", _names(fields, len(cameras)), cameras, poses)
-    return own_keys(fields, rig)
+    values = fields.read_storage(path)
+    single = any(key in values for key in _KEYS["camera_matrix"])
+    numbers = [""] if single else ["1", "2"]
+    cameras = [_camera(path, values, number, reading) for number in numbers]
+    poses = list(rigs.ONE)
+    if not single:
+        other = values if reading.extrinsics is None else fields.read_storage(reading.extrinsics)
+        if reading.extrinsics is None and not {"R", "T"} & set(values):
+            raise CalibrationError(
+                f"{path}: lacks R and T of the second camera: name the file that holds them with "
+                "--extrinsics"
+            )
+        pose = _PairPose.check(reading.extrinsics or path, other)
+        poses.append(RigidTransform.from_components(pose.shift, pose.rotation))
+    found = _Names.check(path, values)
+    names = [found.camera_names] if isinstance(found.camera_names, str) else found.camera_names
+    if names is None:
+        names = rigs.default_names(len(cameras))
+        names = [found.camera_name] if single and found.camera_name is not None else names
+    if len(names) != len(cameras):
+        raise CalibrationError(
+            f"{path}: camera_names has {len(names)} names for {len(cameras)} cameras"
+        )
+    rig = rigs.assemble(path, reading, "OpenCV", names, cameras, poses)
+    rig = replace(rig, body_from_rig=found.body_from_rig, source=found.source or rig.source)
+    if found.covariance is None:
+        return rig
+    parameters = found.covariance_parameters
+    strange = {name.rsplit(".", 1)[0] for name in parameters} - set(rig.cameras)
+    if strange or len(found.covariance) != len(parameters) ** 2:
+        raise CalibrationError(f"{path}: covariance_parameters are not those of its covariance")
+    matrix = found.covariance.reshape(len(parameters), -1)
+    return replace(rig, covariance=Covariance(parameters=parameters, matrix=matrix))
 
 
 def write_opencv(path: Path, rig: Rig) -> list[Path]:
-    """Write one camera or two as YAML, or as XML when the path ends so.
-
-    Raises:
-        CalibrationError: the rig has more than two cameras.
-    """
-    names = list(rig.cameras)
-    if len(names) > 2:
-        raise CalibrationError(
-            f"{path}: OpenCV's stereo files hold two cameras, the rig has {len(names)}: "
-            "choose one with --camera"
-        )
-    suffix = ".xml" if path.suffix.lower() == ".xml" else ".yml"
-    storage = cv2.FileStorage(suffix, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
-    sizes = {(camera.width_px, camera.height_px) for camera in rig.cameras.values()}
-    for i, camera in enumerate(rig.cameras.values(), start=1):
-        number = str(i) if len(sizes) > 1 else ""
-        if i == 1 or number:
-            storage.write(f"image_width{number}", camera.width_px)
-            storage.write(f"image_height{number}", camera.height_px)
-    if len(names) == 1:
-        camera = rig.cameras[names[0]]
-        storage.write("camera_matrix", camera_matrix(camera))
-        storage.write("distortion_coefficients", distortion(camera)[None])
-        _write_lens(storage, "", camera)
-        _write_port(storage, "port", camera)
-    else:
-        for i, camera in enumerate(rig.cameras.values(), start=1):
-            storage.write(f"M{i}", camera_matrix(camera))
-            storage.write(f"D{i}", distortion(camera)[None])
-            _write_lens(storage, str(i), camera)
-        second_from_first = rig.cam_from_rig[names[1]]
-        storage.write("R", second_from_first.rotation.as_matrix())
-        storage.write("T", second_from_first.translation[:, None])
-        for i, camera in enumerate(rig.cameras.values(), start=1):
-            _write_port(storage, f"port{i}", camera)
-    _write_texts(storage, "camera_names", names)
-    storage.write("source", rig.source)
+    """Write one camera or two as YAML, or as XML when the path ends so."""
+    single = len(rig.cameras) == 1
+    cameras = [("" if single else str(i), c) for i, c in enumerate(rig.cameras.values(), start=1)]
+    sizes = {(camera.width_px, camera.height_px) for _, camera in cameras}
+    values: dict[str, Any] = {}
+    for number, camera in cameras[: len(sizes)]:
+        end = number if len(sizes) > 1 else ""
+        values |= {f"image_width{end}": camera.width_px, f"image_height{end}": camera.height_px}
+    for number, camera in cameras:
+        matrix, k = ("camera_matrix", "distortion_coefficients") if single else ("M", "D")
+        values |= {f"{matrix}{number}": opencv_model.camera_matrix(camera)}
+        values |= {f"{k}{number}": opencv_model.distortion(camera)[None]}
+        if opencv_model.is_fisheye(camera):
+            values[f"distortion_model{number}"] = opencv_model.FISHEYE
+        if camera.port.parameters:
+            values[f"port{number}"] = {"shape": camera.port.shape, **asdict(camera.port)}
+    if not single:
+        pose = list(rig.cam_from_rig.values())[1]
+        values |= {"R": pose.rotation.as_matrix(), "T": pose.translation[:, None]}
+    values |= {"camera_names": list(rig.cameras), "source": rig.source}
     if rig.body_from_rig is not None:
-        storage.write("body_from_rig", rig.body_from_rig.as_matrix())
+        values["body_from_rig"] = rig.body_from_rig.as_matrix()
     if rig.covariance is not None:
-        _write_texts(storage, "covariance_parameters", list(rig.covariance.parameters))
-        storage.write("covariance", rig.covariance.matrix)
-    text = storage.releaseAndGetString()
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        values["covariance_parameters"] = list(rig.covariance.parameters)
+        values["covariance"] = rig.covariance.matrix
+    fields.write_storage(path, values)
     return [path]
 
 
-def _write_port(storage: Any, key: str, camera: Camera) -> None:
-    if not camera.port.parameters:
-        return
-    storage.startWriteStruct(key, cv2.FileNode_MAP)
-    storage.write("shape", camera.port.shape)
-    for name, value in asdict(camera.port).items():
-        storage.write(name, np.array([value]) if isinstance(value, tuple) else value)
-    storage.endWriteStruct()
-
-
-def _write_lens(storage: Any, number: str, camera: Camera) -> None:
-    if is_fisheye(camera):
-        storage.write(f"distortion_model{number}", FISHEYE)
-
-
-def _write_texts(storage: Any, key: str, texts: list[str]) -> None:
-    storage.startWriteStruct(key, cv2.FileNode_SEQ)
-    for text in texts:
-        storage.write("", text)
-    storage.endWriteStruct()
-
-
-def _numbered(fields: Fields, number: str, reading: ReadOptions) -> Camera:
-    matrix = fields.first(*(key.format(number) for key in (_PAIR if number else _MATRIX)))
-    if matrix is None:
-        wanted = f"camera_matrix, or M{number} of a stereo pair"
-        raise CalibrationError(f"{fields.path}: lacks {wanted}: is it a calibration?")
-    every = _PAIR_DISTORTION if number else _DISTORTION
-    k = fields.first(*(key.format(number) for key in every))
-    named = fields.first(f"distortion_model{number}", "distortion_model")
-    name = (reading.lens if named is None else fields.text(named)) or "opencv"
-    if name not in LENS_NAMES:
-        raise fields.fault(named or "--lens", f"is {name}; {', '.join(LENS_NAMES)} can be read")
-    lens = LENS_NAMES[name]
-    unsure = named is None and reading.lens is None
-    if k is not None and unsure and fields.vector(k, 4, 5, 8, 12, 14).size == 4:
-        warn(f"{fields.path}: {k} taken for k1 k2 p1 p2: a fisheye needs --lens fisheye")
-    camera = read_camera(fields, matrix, k, _size(fields, number, reading), lens)
-    key = f"port{number}"
-    if key not in fields:
-        return camera
-    port = fields.fields(key)
-    shape = port.text("shape") if "shape" in port else FlatPort.shape
-    if shape not in PORTS:
-        raise port.fault("shape", f"is {shape}; {' or '.join(PORTS)} expected")
-    return read_port(fields, key, camera, PORTS[shape])
-
-
-def _size(fields: Fields, number: str, reading: ReadOptions) -> tuple[int, int]:
-    for end in (number, ""):
-        width = fields.first(*(key + end for key in _WIDTH))
-        height = fields.first(*(key + end for key in _HEIGHT))
-        if width is not None and height is not None:
-            return fields.size(width), fields.size(height)
-    return reading.size(fields.path)
-
-
-def _second_pose(fields: Fields, first: Fields, reading: ReadOptions) -> RigidTransform:
-    if reading.extrinsics is None and "R" not in first and "T" not in first:
+def _camera(
+    path: Path, values: Mapping[str, Any], number: str, reading: rigs.ReadOptions
+) -> Camera:
+    own = {}
+    for field, names in _KEYS.items():
+        ends = (number, "") if field in _OF_BOTH else (number,)
+        known = [name + end for end in ends for name in names if name + end in values]
+        if known:
+            own[field] = values[known[0]]
+    if "camera_matrix" not in own:
         raise CalibrationError(
-            f"{first.path}: lacks R and T of the second camera: "
-            "name the file that holds them with --extrinsics"
+            f"{path}: lacks camera_matrix, or M{number or 1} of a stereo pair: is it a calibration?"
         )
-    rotation = fields.rotation("R", fields.matrix("R", 3, 3))
-    return RigidTransform.from_components(fields.vector("T", 3), rotation)
+    prefix = f"camera {number}: " if number else ""
+    found = _Camera.check(path, own, prefix)
+    k, model, width, height = (
+        found.distortion_coefficients, found.distortion_model, found.image_width,
+        found.image_height,
+    )  # fmt: skip
+    name, where = model or reading.lens or "opencv", f"{path}: {prefix}"
+    if name not in opencv_model.LENS_NAMES:
+        key = "--lens" if model is None else "distortion_model"
+        raise CalibrationError(
+            f"{where}{key} is {name}; {', '.join(opencv_model.LENS_NAMES)} can be read"
+        )
+    if k is not None and len(k) == 4 and model is None and reading.lens is None:
+        warn(f"{where}4 coefficients taken for k1 k2 p1 p2: a fisheye needs --lens fisheye")
+    size = reading.size(path) if width is None or height is None else (width, height)
+    lens = opencv_model.LENS_NAMES[name]
+    camera = opencv_model.camera_of_matrix(
+        f"{where}camera_matrix", found.camera_matrix, k, size, lens
+    )
+    return camera if found.port is None else _behind_port(f"{where}port", camera, found.port)
 
 
-def _names(fields: Fields, count: int) -> list[str]:
-    if count == 1 and "camera_name" in fields:
-        return [fields.text("camera_name")]
-    if "camera_names" not in fields:
-        return default_names(count)
-    names = fields.texts("camera_names")
-    if len(names) != count:
-        raise fields.fault("camera_names", f"has {len(names)} names for {count} cameras")
-    return names
+def _behind_port(where: str, camera: Camera, values: Mapping[str, Any]) -> Camera:
+    """A camera behind a port whose fields are by our names."""
+    shape = values.get("shape", FlatPort.shape)
+    if shape not in PORTS:
+        raise CalibrationError(f"{where}.shape is {shape}; {' or '.join(PORTS)} expected")
+    port: dict[str, Any] = {}
+    for name in (each.name for each in fields_of(PORTS[shape])):
+        try:
+            count = 3 if name == "normal" else 1
+            numbers = fields.read_vector((count,), values.get(name)).tolist()
+        except ValueError as error:
+            raise CalibrationError(f"{where}.{name} {error}") from None
+        port[name] = tuple(numbers) if name == "normal" else numbers[0]
+    try:
+        return replace(camera, port=PORTS[shape](**port))
+    except CalibrationError as error:
+        raise CalibrationError(f"{where} is not a port: {error}") from None
+
+
+def _owns(path: Path) -> bool:
+    if path.is_dir() or path.suffix.lower() == ".json":
+        return False
+    text = fields.read_text(path)
+    marked = text.startswith("%YAML:1.") or "!!opencv-matrix" in text
+    return marked or path.suffix.lower() == ".xml"
+
+
+FORMAT = rigs.CalibrationFormat(
+    name="opencv",
+    title="OpenCV YAML or XML",
+    holds=rigs.ALL,
+    owns=_owns,
+    read=read_opencv,
+    write=write_opencv,
+    suffix=".xml",
+    max_cameras=2,
+)

@@ -5,8 +5,6 @@ its outer corner: principal points differ by 0.5 and nothing else does.
 """
 
 from collections.abc import Mapping
-from dataclasses import fields as dataclass_fields
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,30 +12,36 @@ import numpy as np
 from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import Array
 from camera_calib.camera import Camera
-from camera_calib.formats.fields import Fields
 from camera_calib.lenses.fisheye import COEFFICIENTS as FISHEYE_COEFFICIENTS
 from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.lenses.opencv import COEFFICIENTS, OpenCVLens
-from camera_calib.lenses.values import FOCAL_AND_CENTRE, LensValues
+from camera_calib.lenses.values import LensValues
+from camera_calib.ports.none import NO_PORT
 from camera_calib.ports.values import PortValues
 
-HALF_PIXEL = 0.5
 FISHEYE = FisheyeLens.model
 LENS_NAMES: Mapping[str, type[LensValues]] = {
     FISHEYE: FisheyeLens,
     "equidistant": FisheyeLens,
     "opencv": OpenCVLens,
     "radtan": OpenCVLens,
+    "none": OpenCVLens,
     "plumb_bob": OpenCVLens,
     "rational_polynomial": OpenCVLens,
 }
 """Lenses by the names of their distortion models in files and options."""
+_HALF_PIXEL = 0.5
+
+
+def focal_and_centre(camera: Camera) -> list[float]:
+    """OpenCV's fx, fy, cx and cy, pixels counted from the first one's centre."""
+    return [camera.fx_px, camera.fy_px, camera.cx_px - _HALF_PIXEL, camera.cy_px - _HALF_PIXEL]
 
 
 def camera_matrix(camera: Camera) -> Array:
-    """OpenCV's camera matrix, (3, 3), pixels counted from the first one's centre."""
-    cx, cy = camera.cx_px - HALF_PIXEL, camera.cy_px - HALF_PIXEL
-    return np.array([[camera.fx_px, 0.0, cx], [0.0, camera.fy_px, cy], [0.0, 0.0, 1.0]])
+    """OpenCV's camera matrix, (3, 3)."""
+    fx, fy, cx, cy = focal_and_centre(camera)
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def is_fisheye(camera: Camera) -> bool:
@@ -59,115 +63,78 @@ def distorts(camera: Camera, *names: str) -> bool:
     return not is_fisheye(camera) and any(camera.parameter(name) != 0.0 for name in names)
 
 
-def read_camera(
-    fields: Fields,
-    matrix_key: str,
-    distortion_key: str | None,
+def camera_of_matrix(
+    where: str,
+    matrix: Array,
+    k: Array | None,
     size: tuple[int, int],
     kind: type[LensValues] = OpenCVLens,
 ) -> Camera:
     """A camera in air from a camera matrix and a vector of distortion coefficients.
 
     Args:
-        fields: where both are.
-        matrix_key: key of the 3 x 3 matrix.
-        distortion_key: key of the coefficients, 4 of a fisheye, else 4, 5, 8, 12 or 14; None when
-            there is no distortion.
+        where: file and key, for messages.
+        matrix: (3, 3).
+        k: coefficients, 4 of a fisheye, else 4, 5, 8, 12 or 14; None: there is no distortion.
         size: width and height, px.
         kind: of the lens.
 
     Raises:
-        CalibrationError: a value is missing or wrong, the pixels are skewed or the sensor tilted.
+        CalibrationError: the values are of no camera, pixels are skewed, or the sensor is tilted.
     """
-    matrix = fields.matrix(matrix_key, 3, 3)
     if np.any(matrix[[0, 1, 2, 2], [1, 0, 0, 1]]) or matrix[2, 2] != 1.0:
-        raise fields.fault(matrix_key, "is not of the form [fx 0 cx; 0 fy cy; 0 0 1]")
-    k = np.zeros(0)
-    if distortion_key is not None:
-        counts = (4,) if kind is FisheyeLens else (4, 5, 8, 12, 14)
-        k = fields.vector(distortion_key, *counts)
-        if np.any(k[12:]):
-            raise fields.fault(distortion_key, "tilts the sensor, which no rig here can hold")
-    return counted_from_centre(
-        fields, matrix_key, size, kind, matrix[[0, 1, 0, 1], [0, 1, 2, 2]], k
-    )
+        raise CalibrationError(f"{where} is not of the form [fx 0 cx; 0 fy cy; 0 0 1]")
+    k = np.zeros(0) if k is None else k
+    counts = (0, 4) if kind is FisheyeLens else (0, 4, 5, 8, 12, 14)
+    if len(k) not in counts:
+        expected = " or ".join(map(str, counts[1:]))
+        raise CalibrationError(f"{where}: {len(k)} distortion_coefficients; {expected} expected")
+    if np.any(k[12:]):
+        raise CalibrationError(
+            f"{where}: distortion_coefficients tilt the sensor, which no rig here can hold"
+        )
+    return camera_of_numbers(where, [*matrix[[0, 1, 0, 1], [0, 1, 2, 2]], *k], size, kind)
 
 
-def counted_from_centre(
-    fields: Fields,
-    key: str,
-    size: tuple[int, int],
-    kind: type[LensValues],
-    focal_and_centre: Array,
-    k: Array,
+def camera_of_numbers(
+    where: str, numbers: Any, size: tuple[int, int], kind: type[LensValues]
 ) -> Camera:
     """A camera in air from numbers that count pixels from the centre of the first one.
 
     Args:
-        fields: where the numbers come from.
-        key: key of the focal lengths, named when they are wrong.
+        where: file and key, for messages.
+        numbers: fx, fy, cx, cy, and the first distortion coefficients in OpenCV's order.
         size: width and height, px.
         kind: of the lens.
-        focal_and_centre: (4,) fx, fy, cx, cy.
-        k: the first distortion coefficients, in OpenCV's order.
     """
-    fx, fy, cx, cy = focal_and_centre.tolist()
-    numbers = [fx, fy, cx + HALF_PIXEL, cy + HALF_PIXEL, *k.tolist()]
-    values = dict(zip(kind.parameters, numbers, strict=False))
-    return camera_in_air(fields, key, size, kind, values)
+    fx, fy, cx, cy, *k = map(float, numbers)
+    centred = [fx, fy, cx + _HALF_PIXEL, cy + _HALF_PIXEL, *k]
+    return camera_of(where, size, kind, dict(zip(kind.parameters, centred, strict=False)))
 
 
-def camera_in_air(
-    fields: Fields,
-    key: str,
+def camera_of(
+    where: str,
     size: tuple[int, int],
     kind: type[LensValues],
-    values: dict[str, float],
+    values: Mapping[str, float],
+    port: type[PortValues] | None = None,
+    port_values: Mapping[str, Any] | None = None,
 ) -> Camera:
-    """A camera without a port.
+    """A camera of the values of a file.
 
     Args:
-        fields: where the numbers come from.
-        key: key of the focal lengths, named when they are wrong.
+        where: file and key, for messages.
         size: width and height, px.
         kind: of the lens.
-        values: by its `parameters`, in this project's pixels.
-    """
-    fx, fy = values[FOCAL_AND_CENTRE[0]], values[FOCAL_AND_CENTRE[1]]
-    if min(fx, fy) <= 0:
-        raise fields.fault(key, f"has focal lengths of {fx:g} and {fy:g} px")
-    try:
-        return Camera(width_px=size[0], height_px=size[1], lens=kind(**values))
-    except CalibrationError as error:
-        raise fields.fault(key, f"is of no camera: {error}") from None
-
-
-def behind_port(
-    fields: Fields, key: str, camera: Camera, kind: type[PortValues], **values: Any
-) -> Camera:
-    """A camera with the port of a file.
-
-    Args:
-        fields: where the port is.
-        key: key of the port.
-        camera: in air.
-        kind: of the port.
-        **values: its fields.
+        values: of the lens, in this project's pixels.
+        port: kind of the port, if there is one.
+        port_values: its values.
 
     Raises:
         CalibrationError: a value is out of range; the message names file and key.
     """
     try:
-        return replace(camera, port=kind(**values))
+        behind = NO_PORT if port is None else port(**(port_values or {}))
+        return Camera(width_px=size[0], height_px=size[1], lens=kind(**values), port=behind)
     except CalibrationError as error:
-        raise fields.fault(key, f"is not a port: {error}") from None
-
-
-def read_port(fields: Fields, key: str, camera: Camera, kind: type[PortValues]) -> Camera:
-    """A camera with the port whose fields a file has by our names below a key."""
-    port = fields.fields(key)
-    values: dict[str, Any] = {}
-    for each in dataclass_fields(kind):
-        numbers = port.vector(each.name, 3 if each.name == "normal" else 1).tolist()
-        values[each.name] = tuple(numbers) if each.name == "normal" else numbers[0]
-    return behind_port(fields, key, camera, kind, **values)
+        raise CalibrationError(f"{where} is of no camera: {error}") from None

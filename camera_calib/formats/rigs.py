@@ -1,6 +1,6 @@
-"""Rigs assembled from files, and with parts removed or added."""
+"""What every format has, and rigs assembled from files, and with parts removed or added."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,11 +10,20 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.errors import CalibrationError
 from camera_calib.camera import Camera
-from camera_calib.formats.fields import Fields, camera_name
-from camera_calib.freedom import POSE
+from camera_calib.formats.fields import camera_name
+from camera_calib.freedom import part_of_rig
+from camera_calib.lenses.fisheye import FisheyeLens
+from camera_calib.optics import PORTS
 from camera_calib.ports.dome import DomePort
 from camera_calib.ports.flat import FlatPort
 from camera_calib.rig import Covariance, Rig
+
+K3, RATIONAL, PRISM, COVARIANCE, MOUNT = "k3", "rational", "prism", "covariance", "mount"
+FISHEYE = FisheyeLens.model
+PINHOLE = frozenset({K3, RATIONAL, PRISM})
+ALL = PINHOLE | {FISHEYE, COVARIANCE, MOUNT, *PORTS}
+ONE = (RigidTransform.identity(),)
+"""Pose of a camera alone."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,7 +37,7 @@ class ReadOptions:
     metres_per_unit: float = 1.0
     """Length of one unit of the file's translations."""
     camera: str | None = None
-    """The one camera that is wanted."""
+    """The one camera to read."""
     lens: str | None = None
     """Lens of cameras whose file does not name it: a key of `LENS_NAMES`."""
 
@@ -41,6 +50,31 @@ class ReadOptions:
         if self.image_size is None:
             raise CalibrationError(f"{path}: lacks image_width and image_height: give --image-size")
         return self.image_size
+
+
+def _itself(path: Path, _: Rig) -> list[Path]:
+    return [path]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrationFormat:
+    """One tool's format: what it holds, how it is recognised, read and written."""
+
+    name: str
+    title: str
+    holds: frozenset[str]
+    """More than cameras with k1 k2 p1 p2: terms, lenses, ports, and what belongs to the rig."""
+    owns: Callable[[Path], bool]
+    """Whether a file or folder is of this format."""
+    read: Callable[[Path, ReadOptions], Rig]
+    write: Callable[[Path, Rig], list[Path]] | None
+    """None: it is only read."""
+    files: Callable[[Path, Rig], list[Path]] = _itself
+    """The files that writing a rig to a path would replace."""
+    suffix: str = ""
+    """Ending of new files that are of this format if none is named."""
+    max_cameras: int | None = None
+    """Cameras that it holds; None: any number."""
 
 
 def assemble(
@@ -59,15 +93,19 @@ def assemble(
     plain = [camera_name(path, name) for name in names]
     if len(set(plain)) != len(plain):
         raise CalibrationError(f"{path}: two cameras of one name ({', '.join(plain)})")
-    rig_from_first = cam_from_rig[0].inv()
-    poses = [pose * rig_from_first for pose in cam_from_rig]
-    poses[0] = RigidTransform.identity()
-    return Rig(
+    poses = [
+        RigidTransform.from_components(
+            np.asarray(pose.translation) * reading.metres_per_unit, pose.rotation
+        )
+        for pose in cam_from_rig
+    ]
+    rig = Rig(
         cameras=dict(zip(plain, cameras, strict=True)),
-        cam_from_rig={name: _scaled(p, reading) for name, p in zip(plain, poses, strict=True)},
+        cam_from_rig=dict(zip(plain, poses, strict=True)),
         body_from_rig=None,
         source=f"{tool} file {path.name}",
     )
+    return refer_to_first(rig)
 
 
 def file_each(path: Path, rig: Rig, suffix: str = ".yaml") -> list[Path]:
@@ -96,21 +134,29 @@ def only(rig: Rig, camera: str) -> Rig:
     Raises:
         CalibrationError: there is no such camera.
     """
+    _check_known(rig, camera)
+    part = part_of_rig(rig, [camera])
+    known = part.covariance
+    return replace(part, covariance=known if known is not None and known.parameters else None)
+
+
+def led_by(rig: Rig, camera: str) -> Rig:
+    """The same rig with another first camera, which is its reference; without covariance.
+
+    Raises:
+        CalibrationError: there is no such camera.
+    """
+    _check_known(rig, camera)
+    names = [camera, *(name for name in rig.cameras if name != camera)]
+    return replace(part_of_rig(rig, names), covariance=None)
+
+
+def _check_known(rig: Rig, camera: str) -> None:
     if camera not in rig.cameras:
         raise CalibrationError(f"no camera {camera!r}; there are {', '.join(rig.cameras)}")
-    kept = [name for name in _parameters(rig) if name.startswith(f"{camera}.")]
-    # The pose in the rig was a parameter of this camera; alone it is the reference.
-    kept = [name for name in kept if name.rsplit(".", 1)[1] not in POSE]
-    return replace(
-        rig,
-        cameras={camera: rig.cameras[camera]},
-        cam_from_rig={camera: RigidTransform.identity()},
-        body_from_rig=_mount(rig, camera),
-        covariance=_part(rig.covariance, kept),
-    )
 
 
-def renamed(rig: Rig, names: Sequence[str]) -> Rig:
+def rename_cameras(rig: Rig, names: Sequence[str]) -> Rig:
     """The same rig with other names of its cameras, in order.
 
     Raises:
@@ -121,11 +167,8 @@ def renamed(rig: Rig, names: Sequence[str]) -> Rig:
             f"--names {','.join(names)}: {len(rig.cameras)} different names expected, "
             f"for {', '.join(rig.cameras)}"
         )
-    new = {
-        old: camera_name(Path("--names"), name)
-        for old, name in zip(rig.cameras, names, strict=True)
-    }
-    covariance = rig.covariance
+    plain = [camera_name(Path("--names"), name) for name in names]
+    new, covariance = dict(zip(rig.cameras, plain, strict=True)), rig.covariance
     if covariance is not None:
         parts = (name.rsplit(".", 1) for name in covariance.parameters)
         covariance = replace(
@@ -139,41 +182,13 @@ def renamed(rig: Rig, names: Sequence[str]) -> Rig:
     )
 
 
-def led_by(rig: Rig, camera: str) -> Rig:
-    """The same rig with another first camera, which is its reference; without covariance.
-
-    Raises:
-        CalibrationError: there is no such camera.
-    """
-    if camera not in rig.cameras:
-        raise CalibrationError(f"no camera {camera!r}; there are {', '.join(rig.cameras)}")
-    names = [camera, *(name for name in rig.cameras if name != camera)]
-    cameras = {name: rig.cameras[name] for name in names}
-    return referenced(replace(rig, cameras=cameras, covariance=None))
-
-
-def referenced(rig: Rig) -> Rig:
+def refer_to_first(rig: Rig) -> Rig:
     """The same rig relative to its first camera, whose pose becomes the identity."""
     rig_from_first = rig.cam_from_rig[rig.reference].inv()
     poses = {name: pose * rig_from_first for name, pose in rig.cam_from_rig.items()}
     poses[rig.reference] = RigidTransform.identity()
-    return replace(rig, cam_from_rig=poses, body_from_rig=_mount(rig, rig.reference))
-
-
-def own_keys(fields: Fields, rig: Rig) -> Rig:
-    """A rig with what only files of this project hold: mount, source and covariance."""
-    if "body_from_rig" in fields:
-        rig = replace(rig, body_from_rig=fields.pose("body_from_rig"))
-    if "source" in fields:
-        rig = replace(rig, source=str(fields.get("source")))
-    if "covariance" in fields:
-        names = fields.texts("covariance_parameters")
-        matrix = fields.matrix("covariance", len(names), len(names))
-        strange = {name.rsplit(".", 1)[0] for name in names} - set(rig.cameras)
-        if strange:
-            raise fields.fault("covariance_parameters", f"names no camera: {sorted(strange)[0]}")
-        rig = replace(rig, covariance=Covariance(parameters=tuple(names), matrix=matrix))
-    return rig
+    mount = None if rig.body_from_rig is None else rig.body_from_cam(rig.reference)
+    return replace(rig, cam_from_rig=poses, body_from_rig=mount)
 
 
 def with_port(rig: Rig, port: Mapping[str, Any]) -> Rig:
@@ -187,13 +202,8 @@ def with_port(rig: Rig, port: Mapping[str, Any]) -> Rig:
         CalibrationError: a camera has a port of another shape, or a value is out of range.
     """
     changed = {"normal_x", "normal_y"} if "normal" in port else set()
-    changed |= set(port)
-    kept = [name for name in _parameters(rig) if name.rsplit(".", 1)[1] not in changed]
-    return replace(
-        rig,
-        cameras={name: _with_port(camera, port) for name, camera in rig.cameras.items()},
-        covariance=_part(rig.covariance, kept),
-    )
+    cameras = {name: _with_port(camera, port) for name, camera in rig.cameras.items()}
+    return replace(rig, cameras=cameras, covariance=_without(rig, {*port, *changed}))
 
 
 def _with_port(camera: Camera, port: Mapping[str, Any]) -> Camera:
@@ -211,32 +221,14 @@ def _with_port(camera: Camera, port: Mapping[str, Any]) -> Camera:
 
 def in_air(rig: Rig) -> Rig:
     """The cameras of a rig without their ports; the covariance of these is dropped."""
-    ports = {f"{name}.{p}" for name, camera in rig.cameras.items() for p in camera.port.parameters}
-    kept = [name for name in _parameters(rig) if name not in ports]
-    return replace(
-        rig,
-        cameras={name: camera.in_air() for name, camera in rig.cameras.items()},
-        covariance=_part(rig.covariance, kept),
-    )
+    ports = {name for camera in rig.cameras.values() for name in camera.port.parameters}
+    cameras = {name: camera.in_air() for name, camera in rig.cameras.items()}
+    return replace(rig, cameras=cameras, covariance=_without(rig, ports))
 
 
-def _scaled(pose: RigidTransform, reading: ReadOptions) -> RigidTransform:
-    return RigidTransform.from_components(
-        np.asarray(pose.translation) * reading.metres_per_unit, pose.rotation
-    )
-
-
-def _mount(rig: Rig, camera: str) -> RigidTransform | None:
-    """The mount of a rig that another camera leads."""
-    return None if rig.body_from_rig is None else rig.body_from_cam(camera)
-
-
-def _parameters(rig: Rig) -> tuple[str, ...]:
-    return () if rig.covariance is None else rig.covariance.parameters
-
-
-def _part(covariance: Covariance | None, names: Sequence[str]) -> Covariance | None:
-    if covariance is None or not names:
+def _without(rig: Rig, fields: set[str]) -> Covariance | None:
+    """The covariance of a rig without some parameters of every camera."""
+    if rig.covariance is None:
         return None
-    at = [covariance.parameters.index(name) for name in names]
-    return Covariance(parameters=tuple(names), matrix=covariance.matrix[np.ix_(at, at)])
+    kept = [name for name in rig.covariance.parameters if name.rsplit(".", 1)[1] not in fields]
+    return rig.covariance.marginal(kept) if kept else None

@@ -19,7 +19,7 @@ from alice_survey.core.errors import warn
 from alice_survey.core.manifest import ImageRecord
 from alice_survey.core.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
-from camera_calib.formats.camera_files import CameraRecord, camera_of
+from camera_calib.formats.camera_files import CameraRecord, camera_of_record
 from reconstruct.mapping.bundle import all_pictures, direct_solver
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import (
@@ -151,7 +151,7 @@ def self_calibrated_warp(camera: pycolmap.Camera) -> PinholeWarp:
         params=tuple(float(p) for p in camera.params),
     )
     # Of one centre: exact at every distance.
-    return best_warp(camera_of(Path("pictures"), record), 1.0, 1.0)
+    return best_warp(camera_of_record(Path("pictures"), record), 1.0, 1.0)
 
 
 def rig_from_model(

@@ -403,7 +403,7 @@ def _fit(
     if attitudes and rig is None and (fit is None or fit.mount is None):
         warn(
             "attitudes of the navigation are not used: how the cameras are mounted is unknown; "
-            "state it with 'alice-survey camera mount', and import the pictures with that --rig"
+            "state it with 'alice-survey camera convert --mount', and import with that --rig"
         )
     if fit is not None:
         return fit, None

@@ -69,7 +69,7 @@ def _profile(folder: Path) -> None:
 
 def _write(name: str, file: str, rig: Callable[[], Rig]) -> Callable[[Path], None]:
     def build(folder: Path) -> None:
-        from camera_calib.formats.registry import FORMATS
+        from camera_calib.formats.convert import FORMATS
 
         FORMATS[name].write(folder / file, rig())
 
@@ -78,7 +78,7 @@ def _write(name: str, file: str, rig: Callable[[], Rig]) -> Callable[[Path], Non
 
 def read_calibration(path: Path) -> object:
     """As `camera convert` and `calibrate --from`: of whatever format it looks like."""
-    from camera_calib.formats.registry import detect
+    from camera_calib.formats.convert import detect
     from camera_calib.formats.rigs import ReadOptions
 
     return detect(path).read(path, ReadOptions(image_size=(640, 480), camera="1"))

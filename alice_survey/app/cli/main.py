@@ -25,6 +25,8 @@ RENAMED = {
     "scale": "control",
     "view": "studio",
     "vehicle replay": "vehicle identify --validate",
+    "camera water": "camera",
+    "camera mount": "camera convert",
 }
 """Commands of the last version, and what takes their arguments now."""
 
@@ -76,7 +78,6 @@ def make_app(commands: Sequence[type[Command]] = (*COMMANDS, StudioCommand)) -> 
         rich_markup_mode=None,
     )
     groups = {
-        "camera": "Look at, convert and judge camera models behind flat ports.",
         "vehicle": "The vehicle: coefficients from geometry and from logs, and how its two forms "
         "compare.",
     }

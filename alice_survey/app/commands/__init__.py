@@ -13,7 +13,7 @@ COMMANDS: tuple[type[Command], ...] = (
     survey.DemoCommand, survey.StatusCommand, vehicle.PilotCommand,
     plan.SolveCommand, plan.PrecisionCommand, plan.GainCommand, plan.CheckCommand,
     plan.FollowCommand, plan.RevisitCommand, plan.ExportCommand, plan.MapCommand,
-    plan.CurrentCommand, camera.WaterCommand, camera.ConvertCommand, camera.MountCommand,
-    camera.UncertaintyCommand, vehicle.CoefficientsCommand, vehicle.CompareCommand,
+    plan.CurrentCommand, camera.CameraCommand, camera.ConvertCommand, camera.UncertaintyCommand,
+    vehicle.CoefficientsCommand, vehicle.CompareCommand,
     vehicle.IdentifyCommand,
 )  # fmt: skip

@@ -5,27 +5,25 @@ from pathlib import Path
 from alice_survey.app.commands.base import ReportCommand, Result, argument, option
 
 
-class WaterCommand(ReportCommand):
-    """Show index and attenuation of water."""
+class CameraCommand(ReportCommand):
+    """Convert and judge cameras behind ports; by itself, show index and attenuation of water."""
 
-    name = "camera water"
+    name = "camera"
     examples = (
-        "camera water --temperature 24 --salinity 39 --depth 15",
-        "camera water --jerlov 3C --wavelength 450 --wavelength 520 --json",
+        "camera --temperature 24 --salinity 39 --depth 15",
+        "camera --jerlov 3C --json",
+        "camera convert --help",
     )
     temperature: float = option(20.0, "Temperature of the water, C.")
     salinity: float = option(35.0, "Salinity of the water, psu; 0 is fresh.")
     depth: float = option(10.0, "Depth below the surface, m.")
-    jerlov: str = option("II", "Type: I, II, III; coastal 1C to 9C.")
-    wavelength: list[float] | None = option(None, "nm; red, green and blue when not given.")
+    jerlov: str = option("II", "Type of the water: I, II, III; coastal 1C to 9C.")
 
     def run(self) -> Result:
         """Compute them."""
         from camera_calib.water import water_report
 
-        return water_report(
-            self.temperature, self.salinity, self.depth, self.jerlov, self.wavelength
-        )
+        return water_report(self.temperature, self.salinity, self.depth, self.jerlov)
 
 
 class ConvertCommand(ReportCommand):
@@ -44,6 +42,8 @@ class ConvertCommand(ReportCommand):
         "camera convert gopro.json rig.json --dome-radius 60 --dome-centre 0 0 5 --n-water 1.34",
         "camera convert intrinsics.yml rig.json --extrinsics extrinsics.yml --image-size 640 480",
         "camera convert rig.json left.yaml --to ros --camera left --drop-port --drop-covariance",
+        "camera convert rig.json mounted.json --mount nadir-bow-up --lever 0.55 -0.05 0.08",
+        "camera convert pool.json sea.json --n-water 1.342",
     )
     source: Path = argument(..., "File, or folder of a model.", "IN")
     target: Path = argument(..., "File, or folder.", "OUT")
@@ -75,8 +75,12 @@ class ConvertCommand(ReportCommand):
     water: tuple[float, float] | None = option(
         None, "m: fit cameras without port for these distances.", metavar="NEAR FAR"
     )
-    fitted: str | None = option(
-        None, "To fit: OPENCV, FULL_OPENCV or OPENCV_FISHEYE; as the lens if not given.", "--model"
+    mount: str | None = option(
+        None, "How the rig sits on its vehicle: nadir-bow-up, -right, -down, -left; forward, aft, "
+        "port, starboard; forward+30: 30 degrees down; or a file of a pose or of a rig.",
+    )  # fmt: skip
+    lever: tuple[float, float, float] | None = option(
+        None, "First camera's glass: forward, right, down, m.", metavar="X Y Z"
     )
     drop_port: bool = option(False, "Cameras as in air.")
     drop_covariance: bool = option(False, "Leave it out where OUT cannot hold it.")
@@ -97,47 +101,11 @@ class ConvertCommand(ReportCommand):
             names=tuple(self.names.split(",")) if self.names else (),
             port_distance_mm=self.port_distance, dome_radius_mm=self.dome_radius,
             dome_centre_mm=self.dome_centre, glass_mm=self.glass, n_glass=self.n_glass,
-            n_water=self.n_water, water=self.water, model=self.fitted, drop_port=self.drop_port,
-            drop_covariance=self.drop_covariance, overwrite=self.overwrite,
+            n_water=self.n_water, mount=self.mount, lever_m=self.lever, water=self.water,
+            drop_port=self.drop_port, drop_covariance=self.drop_covariance,
+            overwrite=self.overwrite,
         )  # fmt: skip
         return convert(task)
-
-
-class MountCommand(ReportCommand):
-    """Show or state how a rig is mounted on its vehicle.
-
-    The lever counts from the point whose position navigation states. Without a mount attitudes of
-    navigation mean nothing for the pictures, until a survey finds it.
-    """
-
-    name = "camera mount"
-    examples = (
-        "camera mount rig.json",
-        "camera mount rig.json nadir-bow-up --lever 0.55 -0.05 0.08 -o rig.json --plot mount.png",
-        "camera mount rig.json forward+30 -o mounted.json",
-    )
-    rig: Path = argument(..., "rig.json.", "RIG")
-    how: str | None = argument(
-        None, "nadir-bow-up, -right, -down, -left; forward, aft, port, starboard; forward+30: 30 "
-        "degrees down; or a file of a pose or of another rig.",
-        "MOUNT",
-    )  # fmt: skip
-    lever: tuple[float, float, float] | None = option(
-        None, "First camera's glass: forward, right, down, m.", metavar="X Y Z"
-    )
-    output: Path | None = option(
-        None, "rig.json to write; may be RIG itself.", "-o", "--output", metavar="FILE"
-    )
-    overwrite: bool = option(False, "Replace another file with --output.")
-    plot: Path | None = option(None, "PNG, SVG or PDF of the mount.", metavar="FILE")
-
-    def run(self) -> Result:
-        """Read or change the rig."""
-        from camera_calib.mount import mount_report
-
-        return mount_report(
-            self.rig, self.how, self.lever, self.output, self.plot, overwrite=self.overwrite
-        )
 
 
 class UncertaintyCommand(ReportCommand):

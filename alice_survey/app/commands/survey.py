@@ -212,7 +212,6 @@ class CalibrateCommand(SurveyCommand, ThreadsCommand):
         "calibrate --left 'left*.jpg' --right 'right*.jpg' --target 'chessboard 9x6 25mm' -o air",
         "calibrate --pictures dry --target 'charuco 12x9 40mm 30mm' --lens rational -o one",
         "calibrate --camera bow=B --camera port=P --camera down=D --target board.json -o three",
-        "calibrate --left L --right R --own-clocks --target board.json -o air",
         "calibrate --left L --right R --target board.json --water --start air/rig.json"
         " --glass 10 -o pool",
         "calibrate --camera bow=B --camera down=D --target board.json --water --start air/rig.json"
@@ -225,9 +224,6 @@ class CalibrateCommand(SurveyCommand, ThreadsCommand):
     pictures: str | None = option(None, "Pictures of a single camera.")
     camera: list[str] | None = option(
         None, "NAME=FOLDER of a camera, for each of up to 8; the reference first."
-    )
-    own_clocks: bool = option(
-        False, "No common trigger: find clock offsets from the target's motion."
     )
     target: str | None = option(None, "A target in words, or target.json.")
     target_shape: Literal["sheet", "markers", "flat"] = option(
@@ -249,15 +245,12 @@ class CalibrateCommand(SurveyCommand, ThreadsCommand):
     )  # fmt: skip
     dome_radius: str | None = option(None, "Outer radius of a dome, mm, and others: 80,bow=60.")
     port_distance: str | None = option(None, "Pupil to glass, first value, mm: 20, or 20,tele=45.")
-    glass: str | None = option(None, "Thickness of the port, mm: 6, or 6,bow=5.")
-    glass_sigma: float | None = option(None, "Find the thickness too; known to this, mm.", ge=1e-4)
+    glass: str | None = option(
+        None, "Thickness of the port, mm: 6, or 6,bow=5. With a sigma, 6+-0.1, this and the next "
+        "ones are found too.",
+    )  # fmt: skip
     n_glass: str | None = option(None, "Its index, 1.52 if not given: 1.49, or 1.52,bow=1.49.")
-    n_glass_sigma: float | None = option(None, "Find this index too; known to this.", ge=1e-7)
-    n_water: float | None = option(None, "Index of the water; 1.34 if not given.", ge=1, le=1.4)
-    n_water_sigma: float | None = option(None, "Find this index too; known to this.", ge=1e-7)
-    carry_to_n: float | None = option(
-        None, "Also write the rig in water of this index.", ge=1, le=1.4
-    )
+    n_water: str | None = option(None, "Index of the water, 1.34 if not given; or 1.34+-0.002.")
     mount: str | None = option(
         None, "On the vehicle: nadir-bow-up, forward+30 and others, or a file."
     )
@@ -270,15 +263,14 @@ class CalibrateCommand(SurveyCommand, ThreadsCommand):
         from camera_calib.calibrate.from_pictures import calibrate_pictures
         from camera_calib.calibrate.options import CalibrateOptions
 
+        stereo = {"left": self.left, "right": self.right, "camera": self.pictures}
+        cameras = [f"{name}={place}" for name, place in stereo.items() if place]
         options = CalibrateOptions(
-            left=self.left, right=self.right, pictures=self.pictures,
-            cameras=tuple(self.camera or ()), own_clocks=self.own_clocks, target=self.target,
+            cameras=(*cameras, *(self.camera or ())), target=self.target,
             target_shape=self.target_shape, output=self.output, lens=self.lens, water=self.water,
             start=self.start, known=self.intrinsics, port=self.port,
             dome_radius_mm=self.dome_radius, port_distance_mm=self.port_distance,
-            glass_mm=self.glass, glass_sigma_mm=self.glass_sigma, n_glass=self.n_glass,
-            n_glass_sigma=self.n_glass_sigma, n_water=self.n_water,
-            n_water_sigma=self.n_water_sigma, carry_to_n=self.carry_to_n, mount=self.mount,
+            glass_mm=self.glass, n_glass=self.n_glass, n_water=self.n_water, mount=self.mount,
             lever_m=self.lever,
         )  # fmt: skip
         if options != CalibrateOptions():

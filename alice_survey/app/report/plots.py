@@ -154,7 +154,7 @@ def mount(rig: Rig) -> Figure:
         shows=f"Places and fields of view of the cameras: {mount_line(rig)}.",
         good="It looks as the vehicle does: bow, tops of the pictures, places of the cameras.",
         otherwise="Positions are off by the error of the lever, headings by that of the mount: "
-        "state it with 'alice-survey camera mount'.",
+        "state it with 'alice-survey camera convert --mount'.",
     )  # fmt: skip
 
 

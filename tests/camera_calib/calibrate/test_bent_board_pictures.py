@@ -79,7 +79,8 @@ def test_a_board_taken_as_flat_gives_another_focal_length(
     kinds: tuple[ShapeKind, ...] = ("flat", "sheet")
     for kind in kinds:
         options = CalibrateOptions(
-            pictures=str(tmp_path / "pictures"), target=TARGET.description, target_shape=kind,
+            cameras=(f"camera={tmp_path / 'pictures'}",), target=TARGET.description,
+            target_shape=kind,
             lens="opencv4", output=tmp_path / kind,
         )  # fmt: skip
         _, found = calibrate_pictures(options, executor=SERIAL)

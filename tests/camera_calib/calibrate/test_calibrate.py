@@ -305,16 +305,6 @@ def test_weak_views_give_warnings_that_name_what_is_missing() -> None:
     assert strong.warnings == ()
 
 
-def test_a_blurred_picture_is_named() -> None:
-    rng = np.random.default_rng(1)
-    views = views_of(TRUTH, board_poses(TRUTH, 12, rng), NOISE_PX, rng)
-    soft = views[4].pixels["left"] + rng.normal(0, 0.35, (len(BOARD), 2))
-    views[4] = with_pixels(views[4], "left", soft)
-    found = calibrate_through_ports(views, BOARD, TRUTH, "held")
-    assert any("view 04, left" in line for line in found.warnings)
-    assert all(r.view != "04" for r in found.rejections)
-
-
 @pytest.mark.parametrize(
     ("work", "named"),
     [

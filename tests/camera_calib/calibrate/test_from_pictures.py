@@ -15,9 +15,9 @@ from alice_survey.core.errors import AliceError, CalibrationError
 from alice_survey.core.executor import SERIAL
 from alice_survey.sim.seafloor.board import PoolBoard, board_records, pool_poses, render_board
 from camera_calib.calibrate import from_pictures
-from camera_calib.calibrate.by_options import calibrated
 from camera_calib.calibrate.detect_views import detect_views
 from camera_calib.calibrate.from_pictures import calibrate_pictures
+from camera_calib.calibrate.housing import calibrate_task
 from camera_calib.calibrate.options import CalibrateOptions
 from camera_calib.calibrate.picture_sets import find_pictures, pair_pictures
 from camera_calib.rig import Rig, read_rig, write_rig
@@ -69,7 +69,11 @@ def wet(truth: Rig, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def both(folder: Path) -> dict[str, Any]:
-    return {"left": str(folder / "left"), "right": str(folder / "right")}
+    return {"cameras": tuple(f"{side}={folder / side}" for side in ("left", "right"))}
+
+
+def one(place: Path) -> dict[str, Any]:
+    return {"cameras": (f"camera={place}",)}
 
 
 POOL_BOARD = "chessboard 11x8 40mm"
@@ -79,8 +83,8 @@ POOL_BOARD = "chessboard 11x8 40mm"
 def real(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, Any]:
     """13 pairs of OpenCV's samples, calibrated: the folder, the text and the numbers."""
     folder, out = shared_data / "opencv_stereo", tmp_path_factory.mktemp("real") / "out"
-    pictures: dict[str, Any] = {side: str(folder / f"{side}*.jpg") for side in ("left", "right")}
-    settings = CalibrateOptions(**pictures, target=BOARD)
+    cameras = tuple(f"{side}={folder / side}*.jpg" for side in ("left", "right"))
+    settings = CalibrateOptions(cameras=cameras, target=BOARD)
     return out, *calibrate_pictures(replace(settings, output=out), executor=SERIAL)
 
 
@@ -145,17 +149,19 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     def without_plots(folder: Path, *_: object) -> None:
         (folder / "report.json").write_text('{"verdicts": []}')
 
-    monkeypatch.setattr("camera_calib.calibrate.files.write_report", without_plots)
+    monkeypatch.setattr("camera_calib.calibrate.results.write_report", without_plots)
 
 
 @pytest.mark.usefixtures("quick")
-def test_from_dry_pictures_to_the_sea(dry: Path, wet: Path, truth: Rig, tmp_path: Path) -> None:
-    """In air, then through the ports with the air's knowledge, then carried to the sea."""
+def test_from_dry_pictures_through_the_ports(
+    dry: Path, wet: Path, truth: Rig, tmp_path: Path
+) -> None:
+    """In air, then through the ports with the air's knowledge."""
     air = CalibrateOptions(**both(dry), target=POOL_BOARD, lens="opencv5")
     calibrate_pictures(replace(air, output=tmp_path / "air"), executor=SERIAL)
     pool = CalibrateOptions(
         **both(wet), target=POOL_BOARD, water=True, start=tmp_path / "air" / "rig.json",
-        glass_mm="10", carry_to_n=1.342,
+        glass_mm="10",
     )  # fmt: skip
     _, found = calibrate_pictures(replace(pool, output=tmp_path / "pool"), executor=SERIAL)
 
@@ -171,17 +177,11 @@ def test_from_dry_pictures_to_the_sea(dry: Path, wet: Path, truth: Rig, tmp_path
         assert camera.fx_px == pytest.approx(true.fx_px, abs=0.3)
     assert rig.baseline_m == pytest.approx(truth.baseline_m, abs=5e-5)
 
-    sea = read_rig(tmp_path / "pool" / "rig_carried.json")
-    assert {camera.n_water for camera in sea.cameras.values()} == {1.342}
-    assert sea.cameras["left"].fx_px == rig.cameras["left"].fx_px
-    assert "1.342" in sea.source
-    assert sea.sigmas == rig.sigmas
-
 
 @pytest.mark.usefixtures("quick")
 def test_one_camera(dry: Path, truth: Rig, tmp_path: Path) -> None:
     options = CalibrateOptions(
-        pictures=str(dry / "left"), target=POOL_BOARD, output=tmp_path / "one", lens="k2"
+        **one(dry / "left"), target=POOL_BOARD, output=tmp_path / "one", lens="k2"
     )
     _, found = calibrate_pictures(options, executor=SERIAL)
     rig = read_rig(tmp_path / "one" / "rig.json")
@@ -252,7 +252,7 @@ def test_a_board_of_another_size(wrong: str, dry: Path, tmp_path: Path) -> None:
     for view in range(3):
         (tmp_path / "few").mkdir(exist_ok=True)
         shutil.copy(dry / "left" / f"{view:02d}.png", tmp_path / "few")
-    settings = CalibrateOptions(pictures=str(tmp_path / "few"), target=wrong)
+    settings = CalibrateOptions(**one(tmp_path / "few"), target=wrong)
     message = refuses(settings, tmp_path)
     assert "11x8" in message
     assert wrong.split()[1] in message
@@ -262,7 +262,7 @@ def test_mixed_sizes(dry: Path, tmp_path: Path) -> None:
     shutil.copytree(dry / "left", tmp_path / "mixed")
     odd = cv2.imread(str(tmp_path / "mixed" / "04.png"))
     cv2.imwrite(str(tmp_path / "mixed" / "04.png"), odd[:-20, :-30])
-    settings = CalibrateOptions(pictures=str(tmp_path / "mixed"), target=POOL_BOARD)
+    settings = CalibrateOptions(**one(tmp_path / "mixed"), target=POOL_BOARD)
     message = refuses(settings, tmp_path)
     for named in ("564 x 451", "534 x 431", "04.png"):
         assert named in message
@@ -286,7 +286,7 @@ def test_a_start_of_another_size(dry: Path, tmp_path: Path) -> None:
         ({"lens": "mirror"}, "mirror"),
         ({"target": "chessboard"}, "chessboard"),
         ({"start": Path("nowhere.json")}, "nowhere.json"),
-        ({"left": "none*.png"}, "none"),
+        ({"cameras": ("left=none*.png",)}, "none"),
     ],
 )
 def test_options_that_do_not_go_together(
@@ -298,16 +298,12 @@ def test_options_that_do_not_go_together(
 
 @pytest.mark.parametrize(
     "given",
-    [
-        {"left": "a"},
-        {"left": "a", "right": "b", "pictures": "c"},
-        {"pictures": "c", "target": None},
-        {"pictures": "c", "output": None},
-    ],
+    [{"cameras": ()}, {"target": None}, {"output": None}, {"cameras": ("left=a", "left=b")}],
 )
 def test_commands_that_lack_something(given: dict[str, object]) -> None:
-    options: dict[str, object] = {"target": BOARD, "output": Path("out"), **given}
-    with pytest.raises(CalibrationError):
+    usual: dict[str, object] = {**one(Path("c")), "target": BOARD, "output": Path("out")}
+    options = usual | given
+    with pytest.raises(AliceError):
         calibrate_pictures(CalibrateOptions(**options))  # type: ignore[arg-type]
 
 
@@ -325,7 +321,7 @@ def test_a_folder_with_other_files_is_not_overwritten(dry: Path, tmp_path: Path)
 
 def test_a_place_that_cannot_be_a_folder_is_refused_at_once(tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("mine")
-    settings = CalibrateOptions(pictures=str(tmp_path), target=BOARD)
+    settings = CalibrateOptions(**one(tmp_path), target=BOARD)
     for output in (tmp_path / "taken", Path()):
         with pytest.raises(AliceError):
             calibrate_pictures(replace(settings, output=output), executor=SERIAL)
@@ -336,7 +332,7 @@ def test_a_start_is_not_replaced_by_what_it_gives(tmp_path: Path) -> None:
     (tmp_path / "air").mkdir()
     write_rig(tmp_path / "air" / "rig.json", built_rig())
     settings = CalibrateOptions(
-        pictures="nowhere", target=BOARD, start=tmp_path / "air" / "rig.json"
+        **one(Path("nowhere")), target=BOARD, start=tmp_path / "air" / "rig.json"
     )
     with pytest.raises(AliceError, match="--start"):
         calibrate_pictures(replace(settings, output=tmp_path / "air"), executor=SERIAL)
@@ -344,7 +340,7 @@ def test_a_start_is_not_replaced_by_what_it_gives(tmp_path: Path) -> None:
 
 
 def test_swapped_lists_are_reported_first(dry: Path, tmp_path: Path) -> None:
-    swapped = {"left": str(dry / "right"), "right": str(dry / "left")}
+    swapped = {"cameras": (f"left={dry / 'right'}", f"right={dry / 'left'}")}
     for pictures, is_bad in ((both(dry), False), (swapped, True)):
         settings = CalibrateOptions(**pictures, target=POOL_BOARD, lens="k2")
         text, _ = calibrate_pictures(replace(settings, output=tmp_path / "out"), executor=SERIAL)
@@ -354,8 +350,8 @@ def test_swapped_lists_are_reported_first(dry: Path, tmp_path: Path) -> None:
 
 
 def test_the_same_folder_twice_is_one_clear_line(dry: Path, tmp_path: Path) -> None:
-    place = str(dry / "left")
-    message = refuses(CalibrateOptions(left=place, right=place, target=POOL_BOARD), tmp_path)
+    twice = (f"left={dry / 'left'}", f"right={dry / 'left'}")
+    message = refuses(CalibrateOptions(cameras=twice, target=POOL_BOARD), tmp_path)
     assert "left and right have the same picture" in message
 
 
@@ -378,14 +374,14 @@ def test_a_camera_of_which_most_pictures_do_not_fit_is_no_calibration(
     """Files stay for a look, the exit says that they are no use."""
 
     def with_few(*arguments: Any) -> Any:
-        found = calibrated(*arguments)
+        found = calibrate_task(*arguments)
         few = [
             view if v < 5 else replace(view, pixels={"left": view.pixels["left"]})
             for v, view in enumerate(found.views)
         ]
         return replace(found, views=tuple(few))
 
-    monkeypatch.setattr(from_pictures, "calibrated", with_few)
+    monkeypatch.setattr(from_pictures, "calibrate_task", with_few)
     settings = CalibrateOptions(**both(dry), target=POOL_BOARD, lens="k2")
     with pytest.raises(CalibrationError, match="only 5 of 12 pictures of right") as caught:
         calibrate_pictures(replace(settings, output=tmp_path / "out"), executor=SERIAL)

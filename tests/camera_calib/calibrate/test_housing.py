@@ -2,18 +2,20 @@
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
+from camera_calib.judge.verdicts import verdicts
 
 from alice_survey.core.errors import CalibrationError
-from camera_calib.calibrate.by_options import calibrated
 from camera_calib.calibrate.detect_views import Detections
-from camera_calib.calibrate.housing import housing_lines
-from camera_calib.calibrate.options import CalibrateOptions
+from camera_calib.calibrate.housing import calibrate_task
+from camera_calib.calibrate.options import CalibrateOptions, task_of
+from camera_calib.calibrate.results import calibration_text
 from camera_calib.calibrate.solve import calibrate_in_air
-from camera_calib.calibrate.text import calibration_text
-from camera_calib.judge.judgement import judge, verdicts
+from camera_calib.calibration import Calibration
+from camera_calib.judge.judgement import judge
 from camera_calib.ports.dome import DomePort
 from camera_calib.ports.flat import FlatPort
 from camera_calib.ports.values import PortValues
@@ -53,23 +55,28 @@ def through(port: PortValues) -> Detections:
     return Detections(views=tuple(views), sizes=SIZES, rejections=())
 
 
+def calibrated(options: CalibrateOptions, found: Detections) -> Calibration:
+    places = dict.fromkeys(SIZES, "pictures")
+    return calibrate_task(task_of(options, places, Path("out"), TARGET, dry()), found)
+
+
 @pytest.mark.parametrize(
     ("port", "chosen", "ratio"), [(FLAT, "flat", 1.34), (CENTRED, "none", 1.0), (OFF, "dome", 0.98)]
 )
 def test_the_housing_is_found(port: PortValues, chosen: str, ratio: float) -> None:
     settings = CalibrateOptions(water=True, port="auto", glass_mm="6")
-    found = calibrated(settings, through(port), TARGET, dry())
+    found = calibrated(settings, through(port))
     assert found.housing.chosen == chosen
     for value in found.housing.focal_ratios.values():
         assert value == pytest.approx(ratio, abs=0.01)
-    lines = housing_lines(found.housing)
-    assert ("same camera" in lines[-1]) == (chosen == "none")
     assert 0.8 * NOISE_PX < found.noise_px < 1.2 * NOISE_PX
     if chosen == "dome":
         for camera in found.rig.cameras.values():
             for name, sigma_most in (("dome_x_m", 3e-4), ("dome_z_m", 3e-4)):
                 assert camera.parameter(name) == pytest.approx(getattr(port, name), abs=sigma_most)
-    lines = calibration_text(found, parse_target("chessboard 9x6 25mm"), []).splitlines()
+    text = calibration_text(found, parse_target("chessboard 9x6 25mm"), [])
+    assert ("same camera" in text) == (chosen == "none")
+    lines = text.splitlines()
     ports = [line for line in lines if f" {chosen} port: " in line]
     assert len(ports) == (0 if chosen == "none" else len(TRUTH.cameras))
     assert all("glass 6 mm (held)" in line for line in ports)
@@ -80,7 +87,7 @@ def test_the_housing_is_found(port: PortValues, chosen: str, ratio: float) -> No
 def test_a_dome_taken_for_a_flat_port_is_bad() -> None:
     settings = CalibrateOptions(water=True, glass_mm="6")
     try:
-        found = calibrated(settings, through(CENTRED), TARGET, dry())
+        found = calibrated(settings, through(CENTRED))
     except CalibrationError as error:
         assert "--port dome" in str(error)
     else:
@@ -90,17 +97,17 @@ def test_a_dome_taken_for_a_flat_port_is_bad() -> None:
 
 def test_a_flat_port_taken_for_a_dome_is_bad() -> None:
     settings = CalibrateOptions(water=True, port="none")
-    found = calibrated(settings, through(FLAT), TARGET, dry())
+    found = calibrated(settings, through(FLAT))
     said = [v.text for v in verdicts(judge(found, None)) if v.level == "bad"]
     assert any("--port flat" in text for text in said)
 
 
 def test_a_dome_off_its_centre_taken_for_none_contradicts_the_calibration_in_air() -> None:
     settings = CalibrateOptions(water=True, port="none")
-    found = calibrated(settings, through(OFF), TARGET, dry())
+    found = calibrated(settings, through(OFF))
     said = [v for v in verdicts(judge(found, None)) if "from its prior" in v.text]
     assert [v.level for v in said] == ["bad"]
     right = calibrated(replace(settings, port="dome", glass_mm="6", dome_radius_mm="80"),
-                       through(OFF), TARGET, dry())  # fmt: skip
+                       through(OFF))  # fmt: skip
     said = [v for v in verdicts(judge(right, None)) if "from its prior" in v.text]
     assert [v.level for v in said] == ["good"]

@@ -1,17 +1,19 @@
 """Rigs of many cameras, of other sizes, lenses and directions: from corners, and from pictures."""
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.errors import CalibrationError
-from camera_calib.calibrate.by_options import calibrated, port_kinds
 from camera_calib.calibrate.detect_views import Detections
-from camera_calib.calibrate.options import CalibrateOptions, check_settings
+from camera_calib.calibrate.housing import calibrate_task
+from camera_calib.calibrate.options import CalibrateOptions, task_of
 from camera_calib.calibrate.solve import calibrate_in_air
-from camera_calib.calibration import TargetView
+from camera_calib.calibration import Calibration, TargetView
 from camera_calib.camera import Camera
 from camera_calib.freedom import POSE, moved, part_of_rig
 from camera_calib.lenses.fisheye import FisheyeLens
@@ -64,6 +66,11 @@ def seen_by(truth: Rig, count: int, rng: np.random.Generator) -> Detections:
     ]
     sizes = {name: (c.width_px, c.height_px) for name, c in truth.cameras.items()}
     return Detections(sizes=sizes, views=tuple(views), rejections=())
+
+
+def calibrated(options: CalibrateOptions, found: Detections, start: Rig | None) -> Calibration:
+    task = task_of(options, dict.fromkeys(found.sizes, "pictures"), Path("out"), TARGET, start)
+    return calibrate_task(task, found)
 
 
 def test_four_oblique_cameras_are_found_within_their_sigmas() -> None:
@@ -131,7 +138,7 @@ def test_four_lenses_behind_four_ports_are_found_in_air_and_then_in_water() -> N
     terms = "k2,side=fisheye"
     in_air = calibrated(
         CalibrateOptions(lens=terms),
-        seen_by(dry, 30, rng), TARGET, None,
+        seen_by(dry, 30, rng), None,
     ).rig  # fmt: skip
     under_water = CalibrateOptions(
         lens=terms, water=True, port="flat,bow=dome,side=dome", dome_radius_mm="70,side=55",
@@ -139,7 +146,7 @@ def test_four_lenses_behind_four_ports_are_found_in_air_and_then_in_water() -> N
     )  # fmt: skip
     views = seen_by(wet, 30, rng)
 
-    found = calibrated(under_water, views, TARGET, in_air)
+    found = calibrated(under_water, views, in_air)
 
     errors, sigmas = differences(found.rig, wet), found.rig.sigmas
     over = np.array([errors[key] / sigmas[key] for key in sigmas])
@@ -147,31 +154,41 @@ def test_four_lenses_behind_four_ports_are_found_in_air_and_then_in_water() -> N
     assert np.abs(over).max() < 4.5
     assert 0.6 < np.sqrt(np.mean(over**2)) < 1.4
     assert 0.9 * NOISE_PX < found.noise_px < 1.1 * NOISE_PX
-    again = calibrated(replace(under_water, port=None, lens=None), views, TARGET, found.rig)
+    again = calibrated(replace(under_water, port=None, lens=None), views, found.rig)
     assert [c.port.shape for c in again.rig.cameras.values()] == ["flat", "flat", "dome", "dome"]
 
 
 @pytest.mark.parametrize(
-    ("text", "fault"),
-    [("flat,stern=dome", "no camera is called stern"), ("bow=dome", "there is none for left"),
-     ("cube", "'cube' for left; choose none, flat, dome, auto"), ("flat,dome", "two are for all"),
-     ("auto,bow=dome", "auto is for all")],
-)  # fmt: skip
-def test_a_wrong_port_is_named(text: str, fault: str) -> None:
-    with pytest.raises(CalibrationError, match=fault):
-        port_kinds(CalibrateOptions(port=text, water=True), list(four_cameras().cameras), None)
-
-
-@pytest.mark.parametrize(
     ("given", "fault"),
-    [({"glass_mm": "5,bow=thick"}, "'thick' for bow is not a number from 0 to 500"),
+    [({"port": "flat,stern=dome"}, "no camera is called stern"),
+     ({"port": "bow=dome"}, "there is none for left"),
+     ({"port": "cube"}, "'cube' for left; choose none, flat, dome, auto"),
+     ({"port": "flat,dome"}, "two are for all"), ({"port": "auto,bow=dome"}, "auto is for all"),
+     ({"glass_mm": "5,bow=thick"}, "'thick' for bow is not a number from 0 to 500"),
      ({"dome_radius_mm": "80,bow=2"}, "--dome-radius 80,bow=2: '2' for bow is not a number from 5"),
      ({"n_glass": "stern=1.5"}, "--n-glass stern=1.5: no camera is called stern"),
      ({"port_distance_mm": "nan"}, "'nan' for left is not a number"),
-     ({"glass_mm": "left=5,right=5,bow=5"}, "--glass, the thickness of the port of side"),
-     ({"port": "flat,bow=dome", "glass_mm": "5"}, "--dome-radius, of the outer surface of bow")],
+     ({"glass_mm": "5+-0"}, "'5.-0' for left is not a number"),
+     ({"n_water": "1.34,bow=1.33"}, "one water"),
+     ({"glass_mm": "left=5,right=5,bow=5"}, "needs --glass of side"),
+     ({"port": "flat,bow=dome", "glass_mm": "5"}, "needs --dome-radius of bow")],
 )  # fmt: skip
-def test_a_wrong_number_of_a_port_is_named(given: dict[str, str], fault: str) -> None:
-    cameras = tuple(f"{name}=folder" for name in four_cameras().cameras)
+def test_a_wrong_port_or_number_of_one_is_named(given: dict[str, Any], fault: str) -> None:
+    places = dict.fromkeys(four_cameras().cameras, "pictures")
     with pytest.raises(CalibrationError, match=fault):
-        check_settings(CalibrateOptions(cameras=cameras, water=True, **given), None)  # type: ignore[arg-type]
+        task_of(CalibrateOptions(water=True, **given), places, Path("out"), TARGET, None)
+
+
+def test_numbers_of_ports_have_sigmas_where_they_are_found_again() -> None:
+    options = CalibrateOptions(
+        water=True, port="flat,bow=none", glass_mm="5+-0.1,side=6", n_glass="+-0.01", n_water="1.34"
+    )
+    rig = four_cameras()
+    task = task_of(options, dict.fromkeys(rig.cameras, "p"), Path("out"), TARGET, rig)
+    assert task.ports["bow"] == "none" and task.ports["side"] == "flat"
+    assert task.port_values["left"] == pytest.approx({"glass_thickness_m": 0.005, "n_water": 1.34})
+    sizes = {name: (one.width_px, one.height_px) for name, one in rig.cameras.items()}
+    sigmas = task.sigmas_of(task.cameras(sizes, task.ports))
+    glass = {f"{n}.glass_thickness_m": 1e-4 for n in ("left", "right")}
+    index = {f"{n}.n_glass": 0.01 for n in ("left", "right", "side")}
+    assert sigmas == pytest.approx(glass | index)

@@ -3,15 +3,9 @@
 from pathlib import Path
 
 import pytest
-from PIL import Image
 
 from alice_survey.core.errors import CalibrationError
-from camera_calib.calibrate.picture_sets import (
-    check_own,
-    find_pictures,
-    pair_pictures,
-    picture_times_s,
-)
+from camera_calib.calibrate.picture_sets import check_own, find_pictures, pair_pictures
 
 
 def paths(*names: str) -> list[Path]:
@@ -117,36 +111,3 @@ def test_pairs_by_order_of_pictures_with_other_numbers_are_reported(
     shown = capsys.readouterr().err
     assert "a1.png" in shown and "b51.png" in shown
     assert len(shown.splitlines()) == 1
-
-
-def shot(path: Path, date: str, fraction: str) -> Path:
-    exif = Image.Exif()
-    exif.get_ifd(0x8769).update({0x9003: date, 0x9291: fraction})
-    Image.new("L", (8, 6)).save(path, exif=exif)
-    return path
-
-
-def test_times_are_those_of_exif_or_of_a_manifest(tmp_path: Path) -> None:
-    first = shot(tmp_path / "1.jpg", "2024:05:06 07:08:09", "25")
-    second = shot(tmp_path / "2.jpg", "2024:05:06 07:09:09", "5")
-    one, two = picture_times_s("left", [first, second])
-    assert two - one == pytest.approx(60.25, abs=1e-6)
-
-    (tmp_path / "manifest.csv").write_text("image,time_s\n1.jpg,3.5\n2.jpg,4.25\n")
-    assert picture_times_s("left", [second, first]) == [4.25, 3.5]
-    (tmp_path / "left").mkdir()
-    below = shot(tmp_path / "left" / "3.jpg", "2024:05:06 07:08:09", "0")
-    (tmp_path / "manifest.csv").write_text("image,camera,time_s\nleft/3.jpg,left,0.125\n")
-    assert picture_times_s("left", [below]) == [0.125]
-
-
-def test_pictures_without_fine_times_are_named(tmp_path: Path) -> None:
-    Image.new("L", (8, 6)).save(tmp_path / "a.png")
-    with pytest.raises(CalibrationError, match=r"a\.png of right has no time"):
-        picture_times_s("right", [tmp_path / "a.png"])
-    coarse = [shot(tmp_path / f"{i}.jpg", f"2024:05:06 07:08:0{i}", "") for i in range(3)]
-    with pytest.raises(CalibrationError, match=r"whole seconds.*0\.jpg"):
-        picture_times_s("right", coarse)
-    (tmp_path / "manifest.csv").write_text("image,time_s\na.png,soon\n")
-    with pytest.raises(CalibrationError, match=r"line 2.*soon"):
-        picture_times_s("right", [tmp_path / "a.png"])

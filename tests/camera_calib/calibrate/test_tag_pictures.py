@@ -168,7 +168,7 @@ def test_tag_pictures_calibrate_to_their_bound(
                 picture = to_srgb(one + rng.normal(0.0, NOISE, one.shape))
                 cv2.imwrite(str(tmp_path / side / f"{v:02d}.png"), picture)
         options = CalibrateOptions(
-            left=str(tmp_path / "left"), right=str(tmp_path / "right"),
+            cameras=(f"left={tmp_path / 'left'}", f"right={tmp_path / 'right'}"),
             target=TARGET.description, lens=stereo.model, output=tmp_path / f"out{trial}",
         )  # fmt: skip
         calibrate_pictures(options, executor=SERIAL)

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from camera_calib.calibrate.results import calibration_text, port_tilt_deg
 from camera_calib.calibrate.solve import calibrate_through_ports
-from camera_calib.calibrate.text import calibration_text, port_tilt_deg
 from camera_calib.rig import Covariance, Rig
 from camera_calib.targets.target import parse_target
 from tests.camera_calib.calibration_scenes import (

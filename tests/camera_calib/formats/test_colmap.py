@@ -16,7 +16,7 @@ from alice_survey.core.errors import CalibrationError
 from camera_calib.camera import Camera
 from camera_calib.formats.camera_files import MODELS
 from camera_calib.formats.colmap import read_colmap, write_colmap, write_refractive
-from camera_calib.formats.registry import detect
+from camera_calib.formats.convert import detect
 from camera_calib.formats.rigs import ReadOptions
 from camera_calib.ports.none import NO_PORT
 from camera_calib.rig import Rig

@@ -15,9 +15,8 @@ from alice_survey.app.cli.main import main
 from alice_survey.core.config import CameraConfig, WaterConfig
 from alice_survey.core.errors import AliceError, CalibrationError
 from camera_calib.camera import Camera
-from camera_calib.formats.convert import Conversion, convert, in_water
-from camera_calib.formats.registry import FORMATS, detect
-from camera_calib.formats.rigs import ReadOptions, in_air, only, renamed, with_port
+from camera_calib.formats.convert import FORMATS, Conversion, convert, detect, in_water
+from camera_calib.formats.rigs import ReadOptions, in_air, only, rename_cameras, with_port
 from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.ports.dome import DomePort
 from camera_calib.rig import Rig, design_rig, read_rig, write_rig
@@ -132,14 +131,21 @@ def test_a_fisheye_goes_only_where_its_lens_is_known(tmp_path: Path) -> None:
             )
 
 
-def test_metashape_takes_one_camera(tmp_path: Path) -> None:
+def test_formats_take_as_many_cameras_as_they_hold(tmp_path: Path) -> None:
     write_rig(tmp_path / "rig.json", in_air(DOMES))
     target = tmp_path / "a.xml"
     assert "--camera" in refused(tmp_path / "rig.json", target, target_format="metashape")
     convert_files(tmp_path / "rig.json", target, target_format="metashape", camera="right")
     (camera,) = FORMATS["metashape"].read(target, ReadOptions()).cameras.values()
     assert camera.parameter("k1") == 0.03
-    write_rig(tmp_path / "rig.json", IN_AIR)
+    three = {"left": 0, "right": 1, "third": 2}
+    one = IN_AIR.cameras["left"]
+    poses = {n: RigidTransform.from_translation([0.1 * i, 0.0, 0.0]) for n, i in three.items()}
+    many = replace(IN_AIR, cameras=dict.fromkeys(three, one), cam_from_rig=poses)
+    write_rig(tmp_path / "rig.json", many)
+    for name in ("opencv", "ros"):
+        shown = refused(tmp_path / "rig.json", tmp_path / CHANNELS[name], target_format=name)
+        assert "3 cameras" in shown and "--camera" in shown
     shown = refused(tmp_path / "rig.json", tmp_path / "a.json", target_format="gyroflow")
     assert "read only" in shown
 
@@ -204,21 +210,20 @@ def test_flatport_carries_the_port(own: Path, tmp_path: Path) -> None:
     assert_same_geometry(read_rig(tmp_path / "back.json"), BENT)
 
 
-@pytest.mark.parametrize("model", ["OPENCV", "FULL_OPENCV"])
 def test_the_price_in_water_is_what_colmap_misses_the_exact_camera_by(
-    own: Path, tmp_path: Path, model: str
+    own: Path, tmp_path: Path
 ) -> None:
     _, data = convert_files(
-        own, tmp_path / "model", target_format="colmap", water=(1.5, 3.0), model=model,
+        own, tmp_path / "model", target_format="colmap", water=(1.5, 3.0),
         drop_covariance=True,
     )  # fmt: skip
     opened = pycolmap.Reconstruction(tmp_path / "model")
     (sensors,) = opened.rigs.values()
     after = FORMATS["colmap"].read(tmp_path / "model", ReadOptions())
-    mount, _ = in_water(FULL, 1.5, 3.0, dict.fromkeys(FULL.cameras, model))
+    mount, _ = in_water(FULL, 1.5, 3.0, dict.fromkeys(FULL.cameras, "OPENCV"))
     for i, (name, camera) in enumerate(BENT.cameras.items(), start=1):
         colmap = opened.cameras[i]
-        assert colmap.model.name == model
+        assert colmap.model.name == "OPENCV"
         # Points that the exact camera sees at the corners and all over, near and far.
         pixels = camera.pixel_centres(step=40).reshape(-1, 2)
         misses = []
@@ -301,7 +306,7 @@ def test_names_can_be_chosen(own: Path, tmp_path: Path) -> None:
     assert "starboard.x_m" in rig.covariance.parameters
     for names in ("a", "a,a", "a,../b", "a,b c"):
         assert "--names" in refused(own, tmp_path / "other.json", names=tuple(names.split(",")))
-    assert renamed(rig, ["left", "right"]).sigmas == FULL.sigmas
+    assert rename_cameras(rig, ["left", "right"]).sigmas == FULL.sigmas
 
 
 def test_a_name_of_a_camera_cannot_lead_out_of_the_folder(own: Path, tmp_path: Path) -> None:
@@ -364,7 +369,6 @@ def test_contradictions_are_refused(own: Path, tmp_path: Path) -> None:
     to = {"target_format": "colmap", "drop_covariance": True}
     target = tmp_path / "m"
     assert "--drop-port" in refused(own, target, water=(1.5, 3.0), drop_port=True, **to)
-    assert "FOV" in refused(own, target, water=(1.5, 3.0), model="FOV", **to)
     assert "3 to 1.5" in refused(own, target, water=(3.0, 1.5), **to)
 
 

@@ -8,8 +8,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from camera_calib.formats.convert import detect
 from camera_calib.formats.gyroflow import read_gyroflow
-from camera_calib.formats.registry import detect
 from camera_calib.formats.rigs import ReadOptions
 from camera_calib.freedom import Prior, intrinsics, of_cameras
 from tests.strategies_formats import POINTS_RIG, fault_of

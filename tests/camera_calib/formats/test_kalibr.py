@@ -11,9 +11,9 @@ import yaml
 from hypothesis import given, settings
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from camera_calib.formats.kalibr import read_kalibr, write_kalibr
-from camera_calib.formats.registry import detect
+from camera_calib.formats.convert import detect
 from camera_calib.formats.rigs import ReadOptions
+from camera_calib.formats.yaml_files import read_kalibr, write_kalibr
 from camera_calib.rig import Rig
 from tests.strategies_formats import POINTS_RIG, RADTAN, WIDE_RIG, fault_of, rigs
 
@@ -160,7 +160,7 @@ def test_faults_name_file_and_key(tmp_path: Path) -> None:
         ("461.629", "fast", "cam0.intrinsics"),
         ("461.629", "-461.629", "cam0.intrinsics"),
         ("[752, 480]", "[752]", "cam0.resolution"),
-        ("[752, 480]", "[752.5, 480]", "width"),
+        ("[752, 480]", "[752.5, 480]", "cam0.resolution.0"),
         ("T_cn_cnm1", "T_c1_c0", "cam1.T_cn_cnm1"),
         ("[0.0, -1.0", "[0.0, 1.0", "cam1.T_cn_cnm1"),
         ("1.0]\n  rostopic: /s", "2.0]\n  rostopic: /s", "0 0 0 1"),

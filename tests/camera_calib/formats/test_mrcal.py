@@ -10,9 +10,9 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.errors import CalibrationError
 from camera_calib.camera import Camera
-from camera_calib.formats.mrcal import read_mrcal, write_mrcal
-from camera_calib.formats.registry import detect
+from camera_calib.formats.convert import detect
 from camera_calib.formats.rigs import ReadOptions
+from camera_calib.formats.yaml_files import read_mrcal, write_mrcal
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.rig import Rig
 from tests.strategies_formats import fault_of

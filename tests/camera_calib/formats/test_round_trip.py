@@ -10,9 +10,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from camera_calib.formats.convert import Conversion, convert
-from camera_calib.formats.registry import FORMATS, detect
-from camera_calib.formats.rigs import ReadOptions, renamed
+from camera_calib.formats.convert import FORMATS, Conversion, convert, detect
+from camera_calib.formats.rigs import ReadOptions, rename_cameras
 from camera_calib.rig import Rig, read_rig, write_rig
 from tests.strategies_formats import (
     BOTH_LENSES,
@@ -67,7 +66,7 @@ def test_a_rig_comes_back_through_a_format_found_by_itself(case: str) -> None:
             assert detect(target).name in SAME_FORMAT.get(kind, (kind,))
             after = detect(target).read(target, ReadOptions())
         if kind in ("metashape", "mrcal") and len(rig.cameras) == 1:
-            after = renamed(after, list(rig.cameras))  # the file holds no name
+            after = rename_cameras(after, list(rig.cameras))  # the file holds no name
         assert_same_geometry(after, rig)
 
     comes_back()

@@ -1,0 +1,381 @@
+"""YAML files of calibrations: Kalibr's chain, ROS's camera_info and mrcal's cameramodel.
+
+Kalibr's camchain YAML: pinhole cameras with radtan or equidistant distortion, in a chain.
+
+The format is that of https://github.com/ethz-asl/kalibr/wiki/yaml-formats: `T_cn_cnm1` takes points
+of the camera before (cam0 for cam1) to this camera, `radtan` has k1 k2 p1 p2 with OpenCV's meaning,
+`equidistant` k1 to k4 of OpenCV's `fisheye`, and pixels count from the centre of the first one.
+
+ROS's camera_info YAML: a file for each camera, as `camera_calibration_parsers` reads and writes.
+
+Keys are those of http://wiki.ros.org/camera_calibration_parsers, their meaning that of
+`sensor_msgs/CameraInfo`. A stereo pair has no pose as such: each camera has the rotation R to the
+rectified pair (`rectification_matrix`), and the second's projection P has -f B in its last column.
+From both follows the second camera's pose in the first, R2^T R1 and R2^T (P2[:, 3] / f).
+
+mrcal's .cameramodel: a file for each camera, with its pose in a common frame.
+
+https://mrcal.secretsauce.net/cameramodels.html: a Python literal, which without the packed
+`optimization_inputs` is YAML too. The pinhole models are read and written: intrinsics fx fy cx cy
+and OpenCV's coefficients, pixels counted from the centre of the first one. `extrinsics` is a
+rotation vector and a translation that take points of the reference to the camera.
+"""
+
+import re
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from pydantic import Field
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.core.artefacts import atomic_path
+from alice_survey.core.errors import CalibrationError, warn
+from alice_survey.core.frames import Array
+from camera_calib.camera import Camera
+from camera_calib.formats import fields, opencv_model, rigs
+from camera_calib.lenses.opencv import OpenCVLens
+from camera_calib.rig import Rig
+
+_NOT_HELD = ("T_cam_imu", "T_imu_cam", "timeshift_cam_imu")
+_TOPIC = re.compile(r"/(?P<name>[A-Za-z0-9][A-Za-z0-9_./-]*)/image_raw")
+_YAML = (".yaml", ".yml")
+
+
+class _KalibrCamera(fields.FileModel):
+    pose: fields.Pose | None = Field(None, alias="T_cn_cnm1")
+    cam_overlaps: tuple[int, ...] = ()
+    camera_model: Literal["pinhole"]
+    distortion_coeffs: fields.Numbers
+    distortion_model: Literal["radtan", "equidistant", "none"]
+    intrinsics: fields.Vector4
+    resolution: tuple[fields.Pixels, fields.Pixels]
+    rostopic: Any = None
+
+
+def read_kalibr(path: Path, reading: rigs.ReadOptions) -> Rig:
+    """Read a chain of cameras.
+
+    Raises:
+        CalibrationError: a key is missing or wrong, or a model is not held here.
+    """
+    top = fields.read_yaml(path)
+    count = sum(f"cam{i}" in top for i in range(len(top)))
+    if count == 0 or f"cam{count - 1}" not in top:
+        raise CalibrationError(f"{path}: lacks cam0, or a camera of the chain is left out")
+    cameras, poses, names = [], list(rigs.ONE), []
+    for i in range(count):
+        values, prefix = top[f"cam{i}"], f"cam{i}."
+        one = _KalibrCamera.check(path, values, prefix)
+        k = one.distortion_coeffs
+        if len(k) != 4 and one.distortion_model != "none":
+            raise CalibrationError(f"{path}: {prefix}distortion_coeffs: {len(k)}; 4 expected")
+        numbers = [*one.intrinsics, *(() if one.distortion_model == "none" else k)]
+        lens = opencv_model.LENS_NAMES[one.distortion_model]
+        cameras.append(
+            opencv_model.camera_of_numbers(
+                f"{path}: {prefix}intrinsics", numbers, one.resolution, lens
+            )
+        )
+        topic = _TOPIC.fullmatch(one.rostopic) if isinstance(one.rostopic, str) else None
+        names.append(f"cam{i}" if topic is None else topic["name"])
+        if i > 0:
+            if one.pose is None:
+                raise CalibrationError(f"{path}: lacks {prefix}T_cn_cnm1")
+            poses.append(one.pose * poses[-1])
+        left_out = [key for key in _NOT_HELD if key in values]
+        if left_out:
+            warn(f"{path}: cam{i}: {', '.join(left_out)} left out: a rig holds no IMU")
+    return rigs.assemble(path, reading, "Kalibr", names, cameras, poses)
+
+
+def write_kalibr(path: Path, rig: Rig) -> list[Path]:
+    """Write a chain of cameras in the order of the rig."""
+    names, chain = list(rig.cameras), {}
+    for i, (name, camera) in enumerate(rig.cameras.items()):
+        before = rig.cam_from_rig[names[max(i - 1, 0)]]
+        chain[f"cam{i}"] = _KalibrCamera(
+            pose=(rig.cam_from_rig[name] * before.inv()).as_matrix().tolist() if i else None,
+            cam_overlaps=tuple(other for other in range(len(names)) if other != i),
+            camera_model="pinhole",
+            distortion_coeffs=opencv_model.distortion(camera)[:4].tolist(),
+            distortion_model="equidistant" if opencv_model.is_fisheye(camera) else "radtan",
+            intrinsics=opencv_model.focal_and_centre(camera),
+            resolution=(camera.width_px, camera.height_px),
+            rostopic=f"/{name}/image_raw",
+        ).values()
+    fields.write_yaml(path, chain)
+    return [path]
+
+
+KALIBR = rigs.CalibrationFormat(
+    name="kalibr",
+    title="Kalibr camchain YAML",
+    holds=frozenset({rigs.FISHEYE}),
+    owns=lambda path: path.suffix.lower() in _YAML and "cam0" in fields.read_yaml(path),
+    read=read_kalibr,
+    write=write_kalibr,
+)
+
+
+_RosModel = Literal["plumb_bob", "rational_polynomial", "equidistant"]
+_ROS_COUNTS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (0, 8, 12, 14), "equidistant": (0, 4)}
+
+
+class _RosCamera(fields.FileModel):
+    image_width: fields.Pixels
+    image_height: fields.Pixels
+    camera_name: str | None = None
+    camera_matrix: fields.Matrix33
+    distortion_model: _RosModel = "plumb_bob"
+    distortion_coefficients: fields.Numbers
+    rectification_matrix: fields.Turn | None = None
+    projection_matrix: fields.Matrix34 | None = None
+
+    @property
+    def shift(self) -> Array:
+        """(3,) last column of the projection: 0 of a first or only camera."""
+        matrix = self.projection_matrix
+        return np.zeros(3) if matrix is None else matrix[:, 3]
+
+
+def read_ros(path: Path, reading: rigs.ReadOptions) -> Rig:
+    """Read a file of one camera, or a folder that holds those of a stereo pair.
+
+    Raises:
+        CalibrationError: a key is missing or wrong, or the folder does not hold one or two files.
+    """
+    files = [path]
+    if path.is_dir():
+        files = [file for file in sorted(path.iterdir()) if file.suffix.lower() in _YAML]
+        if not 1 <= len(files) <= 2:
+            raise CalibrationError(f"{path}: {len(files)} .yaml files; 1, or 2 of a pair, expected")
+    every = [(file, _RosCamera.check(file, fields.read_yaml(file))) for file in files]
+    moved = [bool(np.any(one.shift)) for _, one in every]
+    if len(every) == 1:
+        if moved[0]:
+            warn(f"{path}: baseline left out: give the folder of both files to read a pair")
+        ((file, one),) = every
+        names = [one.camera_name or "cam0"]
+        return rigs.assemble(path, reading, "ROS", names, [_ros_camera(file, one)], rigs.ONE)
+    if sum(moved) != 1:
+        raise CalibrationError(
+            f"{path}: one of two projection_matrix needs a baseline in its last column and the "
+            f"other none; {sum(moved)} have one"
+        )
+    every = every if moved[1] else every[::-1]
+    names = [one.camera_name or file.stem for file, one in every]
+    poses = [*rigs.ONE, _second_from_first(*every)]
+    return rigs.assemble(path, reading, "ROS", names, [_ros_camera(*one) for one in every], poses)
+
+
+def write_ros(path: Path, rig: Rig) -> list[Path]:
+    """Write a file of one camera, or into a folder those of a stereo pair, rectified as by OpenCV.
+
+    Raises:
+        CalibrationError: two cameras cannot be rectified.
+    """
+    names = list(rig.cameras)
+    if len(names) == 1:
+        camera = rig.cameras[names[0]]
+        projection = np.hstack([opencv_model.camera_matrix(camera), np.zeros((3, 1))])
+        fields.write_yaml(path, _ros_values(names[0], camera, np.eye(3), projection))
+        return [path]
+    files = rigs.file_each(path, rig)
+    first, second = rig.cameras.values()
+    size = (first.width_px, first.height_px)
+    second_from_first = rig.cam_from_rig[names[1]]
+    if size != (second.width_px, second.height_px):
+        raise CalibrationError(f"{path}: ROS rectifies pairs of one picture size only")
+    if float(np.linalg.norm(second_from_first.translation)) == 0.0:
+        raise CalibrationError(f"{path}: the cameras have no baseline to rectify along")
+    # A fisheye is rectified to the pinhole of its focal length: no such picture holds all of it.
+    k1, k2 = (
+        np.zeros(5) if opencv_model.is_fisheye(one) else opencv_model.distortion(one)
+        for one in (first, second)
+    )
+    _, _, p1, p2, *_ = cv2.stereoRectify(
+        opencv_model.camera_matrix(first), k1, opencv_model.camera_matrix(second), k2, size,
+        second_from_first.rotation.as_matrix(), second_from_first.translation[:, None],
+        flags=cv2.CALIB_ZERO_DISPARITY, alpha=0.0,
+    )  # fmt: skip
+    axis = int(np.argmax(np.abs(p2[:2, 3])))
+    r1, r2, line = _rectify(second_from_first, axis)
+    p2[:, 3] = p2[axis, axis] * line
+    pieces = zip(files, names, (first, second), (r1, r2), (p1, p2), strict=True)
+    for file, name, camera, rotation, projection in pieces:
+        fields.write_yaml(file, _ros_values(name, camera, rotation, projection))
+    return files
+
+
+def _ros_camera(file: Path, one: _RosCamera) -> Camera:
+    k, model = one.distortion_coefficients, one.distortion_model
+    if len(k) not in _ROS_COUNTS[model]:
+        raise CalibrationError(f"{file}: distortion_coefficients: {len(k)} are none of a {model}")
+    size, where = (one.image_width, one.image_height), f"{file}: camera_matrix"
+    return opencv_model.camera_of_matrix(
+        where, one.camera_matrix, k, size, opencv_model.LENS_NAMES[model]
+    )
+
+
+def _second_from_first(
+    first: tuple[Path, _RosCamera], second: tuple[Path, _RosCamera]
+) -> RigidTransform:
+    turns = []
+    for file, one in (first, second):
+        if one.rectification_matrix is None:
+            raise CalibrationError(f"{file}: lacks rectification_matrix")
+        turns.append(one.rectification_matrix)
+    matrix = second[1].projection_matrix
+    if matrix is None or min(matrix[0, 0], matrix[1, 1]) <= 0 or matrix[2, 3] != 0:
+        raise CalibrationError(
+            f"{second[0]}: projection_matrix is not of the form [f 0 cx fTx; 0 f cy fTy; 0 0 1 0]"
+        )
+    baseline = matrix[:, 3] / [matrix[0, 0], matrix[1, 1], 1.0]
+    back = turns[1].inv()
+    return RigidTransform.from_components(back.apply(baseline), back * turns[0])
+
+
+def _rectify(second_from_first: RigidTransform, axis: int) -> tuple[Array, Array, Array]:
+    """Rotations of both cameras to a pair with its baseline along x (0) or y (1), and that line.
+
+    Each takes half of the turn between the cameras, then both what is left to the axis, as
+    `cv2.stereoRectify` does; that one takes turns below 1e-5 rad for none, so that the pose could
+    not be recovered from its rotations.
+    """
+    half = Rotation.from_rotvec(-0.5 * second_from_first.rotation.as_rotvec())
+    shift = half.apply(second_from_first.translation)
+    length = float(np.linalg.norm(shift))
+    line = np.zeros(3)
+    line[axis] = np.sign(shift[axis])
+    across = np.cross(shift / length, line)
+    sine = float(np.linalg.norm(across))
+    angle = np.arctan2(sine, shift @ line / length)
+    level = Rotation.from_rotvec(across * (angle / sine if sine > 0 else 0.0))
+    second = level * half
+    first = second * second_from_first.rotation
+    return first.as_matrix(), second.as_matrix(), line * length
+
+
+def _ros_values(name: str, camera: Camera, rotation: Array, projection: Array) -> object:
+    k = opencv_model.distortion(camera)
+    models: dict[int, _RosModel] = {4: "equidistant", 5: "plumb_bob"}
+    values = _RosCamera(
+        image_width=camera.width_px,
+        image_height=camera.height_px,
+        camera_name=name,
+        camera_matrix=opencv_model.camera_matrix(camera).tolist(),
+        distortion_model=models.get(k.size, "rational_polynomial"),
+        distortion_coefficients=k.tolist(),
+        rectification_matrix=rotation.tolist(),
+        projection_matrix=projection.tolist(),
+    ).values()
+    # To the last bit, which the pose of a small turn needs: a rotation is made orthogonal.
+    values["rectification_matrix"] = fields.matrix_of(rotation)
+    return values | {"distortion_coefficients": fields.matrix_of(k)}
+
+
+def _is_ros(path: Path) -> bool:
+    if path.is_dir():
+        files = [file for file in sorted(path.iterdir()) if file.suffix.lower() in _YAML]
+        return bool(files) and all(_is_ros(file) for file in files)
+    if path.suffix.lower() not in _YAML:
+        return False
+    return {"camera_matrix", "image_width"} <= set(fields.read_yaml(path))
+
+
+ROS = rigs.CalibrationFormat(
+    name="ros",
+    title="ROS camera_info YAML",
+    holds=frozenset({rigs.K3, rigs.RATIONAL, rigs.FISHEYE}),
+    owns=_is_ros,
+    read=read_ros,
+    write=write_ros,
+    files=rigs.file_each,
+    max_cameras=2,
+)
+
+
+_CAMERAMODEL = ".cameramodel"
+_PACKED = (b": b'", b"'")
+"""Marks around all that was measured for a calibration."""
+_MrcalModel = Literal[
+    "LENSMODEL_PINHOLE", "LENSMODEL_OPENCV4", "LENSMODEL_OPENCV5", "LENSMODEL_OPENCV8",
+    "LENSMODEL_OPENCV12",
+]  # fmt: skip
+
+
+class _MrcalCamera(fields.FileModel):
+    lensmodel: _MrcalModel
+    intrinsics: fields.Numbers
+    extrinsics: fields.Vector6
+    imagersize: tuple[fields.Pixels, fields.Pixels]
+
+
+def read_mrcal(path: Path, reading: rigs.ReadOptions) -> Rig:
+    """Read a file of one camera, or a folder of those of a rig.
+
+    Raises:
+        CalibrationError: a key is missing or wrong, or a model is none of OpenCV's.
+    """
+    files = sorted(path.glob(f"*{_CAMERAMODEL}")) if path.is_dir() else [path]
+    if not files:
+        raise CalibrationError(f"{path}: holds no {_CAMERAMODEL}")
+    names = [file.stem for file in files] if path.is_dir() else ["cam0"]
+    cameras, poses = [], []
+    for file in files:
+        one = _MrcalCamera.check(file, fields.read_yaml(file, _PACKED))
+        expected = 4 + int(one.lensmodel.removeprefix("LENSMODEL_").strip("PINHOLECV") or 0)
+        if len(one.intrinsics) != expected:
+            found = len(one.intrinsics)
+            raise CalibrationError(f"{file}: intrinsics: {found} numbers; {expected} expected")
+        cameras.append(
+            opencv_model.camera_of_numbers(
+                f"{file}: intrinsics", one.intrinsics, one.imagersize, OpenCVLens
+            )
+        )
+        turn = Rotation.from_rotvec(one.extrinsics[:3])
+        poses.append(RigidTransform.from_components(one.extrinsics[3:], turn))
+    return rigs.assemble(path, reading, "mrcal", names, cameras, poses)
+
+
+def write_mrcal(path: Path, rig: Rig) -> list[Path]:
+    """Write a file of one camera, or into a folder those of a rig."""
+    files = rigs.file_each(path, rig, _CAMERAMODEL)
+    for file, (name, camera) in zip(files, rig.cameras.items(), strict=True):
+        k, pose = opencv_model.distortion(camera), rig.cam_from_rig[name]
+        k = k[: 0 if not np.any(k) else 4 if not np.any(k[4:]) else k.size]
+        values = {
+            "lensmodel": f"'LENSMODEL_OPENCV{k.size}'" if k.size else "'LENSMODEL_PINHOLE'",
+            "intrinsics": _line([*opencv_model.focal_and_centre(camera), *k.tolist()]),
+            "extrinsics": _line([*pose.rotation.as_rotvec(), *pose.translation]),
+            "imagersize": _line([camera.width_px, camera.height_px]),
+        }
+        lines = [f"    '{key}': {value}," for key, value in values.items()]
+        with atomic_path(file) as temporary:
+            temporary.write_text("\n".join(["{", *lines, "}", ""]), encoding="utf-8")
+    return files
+
+
+def _line(numbers: list[float]) -> str:
+    return f"[ {', '.join(map(str, numbers))} ]"
+
+
+def _is_mrcal(path: Path) -> bool:
+    return (
+        any(path.glob(f"*{_CAMERAMODEL}")) if path.is_dir() else path.suffix.lower() == _CAMERAMODEL
+    )
+
+
+MRCAL = rigs.CalibrationFormat(
+    name="mrcal",
+    title="mrcal .cameramodel",
+    holds=rigs.PINHOLE,
+    owns=_is_mrcal,
+    read=read_mrcal,
+    write=write_mrcal,
+    files=partial(rigs.file_each, suffix=_CAMERAMODEL),
+    suffix=_CAMERAMODEL,
+)
