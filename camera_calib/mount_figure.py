@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 
@@ -14,14 +13,10 @@ from alice_survey.kit.figure import (
     MARKS,
     SOFT,
     Axes,
-    figure_style,
-    new_figure,
     plain_name,
-    save_figure,
 )
 from camera_calib.rig import Rig
 
-_HEIGHT_IN, _WIDTH_IN = 4.4, 9.0
 _RAY_SHARE = 0.6
 """Length of rays over the size of what is drawn."""
 _MIN_M = 0.3
@@ -29,24 +24,6 @@ _FROM_ABOVE, _FROM_STARBOARD = [1, 0], [0, 2]
 """Axes of the vehicle (forward, right, down) that each drawing has to the right and upright."""
 
 _Field = tuple[Array, Array, Array]
-
-
-@figure_style()
-def plot_mount(rig: Rig, path: Path) -> None:
-    """Draw every camera's place, field of view and the top of its pictures on the vehicle.
-
-    Args:
-        rig: mounted.
-        path: of the figure.
-
-    Raises:
-        CalibrationError: its mount is unknown.
-    """
-    figure = new_figure(_HEIGHT_IN, _WIDTH_IN)
-    above, side = figure.subplots(1, 2)
-    paint_mount(above, side, rig)
-    figure.legend(*side.get_legend_handles_labels(), loc="outside lower center", ncols=4)
-    save_figure(figure, path)
 
 
 def paint_mount(above: Axes, side: Axes, rig: Rig) -> None:

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from camera_calib.judge.verdicts import verdicts
 
 from alice_survey.core.errors import CalibrationError
 from camera_calib.calibrate.detect_views import Detections
@@ -15,7 +14,7 @@ from camera_calib.calibrate.options import CalibrateOptions, task_of
 from camera_calib.calibrate.results import calibration_text
 from camera_calib.calibrate.solve import calibrate_in_air
 from camera_calib.calibration import Calibration
-from camera_calib.judge.judgement import judge
+from camera_calib.judge.judgement import judge, verdicts
 from camera_calib.ports.dome import DomePort
 from camera_calib.ports.flat import FlatPort
 from camera_calib.ports.values import PortValues
