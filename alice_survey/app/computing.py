@@ -1,36 +1,25 @@
 """Time, memory and disk that imaging and reconstruction will take: one table, and what ran here.
 
-The computing of a stage is a start, a time per picture and a time per megapixel (`COSTS`). The part
-that runs as tasks is shared out among workers. A short probe compares this machine with that of the
-table, and what stages of a survey have taken here corrects what is left.
+The computing of a stage is a start, a time per picture and a time per megapixel (`COSTS`), measured
+on an Intel Xeon at 2 GHz. The part that runs as tasks is shared out among workers. What stages of a
+survey have taken here corrects what is left.
 """
 
-import contextlib
-import json
-import math
-import os
-import sys
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from alice_survey.core.artefacts import StageRecord, read_json, write_json
-from alice_survey.core.config import SurveyConfig
+from alice_survey.core.artefacts import StageRecord, read_json
+from alice_survey.core.config import ReconstructConfig, SurveyConfig
 from alice_survey.core.executor import default_threads
 from alice_survey.core.manifest import read_manifest
 from alice_survey.core.run.resources import processor
-from alice_survey.kit.words import count, duration
+from alice_survey.kit.words import count, digits, duration
 from reconstruct.dense.scales import CELL_PIXELS, scale_for_cell
 
 OTHER_CORES = 16
 _CAMERAS = 2
-_COMPILE_S = 60
-"""Computing of the first run after an installation, which compiles kernels."""
-_PROBE_S = 0.2719
-"""What `probe_s` took on the machine of the table, an Intel Xeon at 2 GHz."""
 
 
 class _Cost(NamedTuple):
@@ -91,7 +80,7 @@ class SurveySize:
 def size_of(
     pictures: int,
     mpx: float,
-    config: SurveyConfig,
+    settings: ReconstructConfig,
     *,
     board_pictures: int = 0,
     pixel_m: float | None = None,
@@ -101,11 +90,11 @@ def size_of(
     Args:
         pictures: their number.
         mpx: megapixels of each.
-        config: settings of the survey.
+        settings: of the surface.
         board_pictures: those of a board, to calibrate from.
         pixel_m: side of a pixel on the ground, if known.
     """
-    cell_m, scale = config.reconstruct.dem_cell_m, config.reconstruct.dense_scale
+    cell_m, scale = settings.dem_cell_m, settings.dense_scale
     if scale is None:
         scale = 1.0 if pixel_m is None else scale_for_cell(cell_m, pixel_m)
     if pixel_m is not None:
@@ -137,11 +126,11 @@ def workspace_size(workspace: Path, config: SurveyConfig) -> SurveySize | None:
         plan = read_json(plan_file)
         scale = max(1, round(config.camera.width_px / width))
         return size_of(
-            len(rows) or _CAMERAS * plan["stations"], width * height / 1e6, config,
+            len(rows) or _CAMERAS * plan["stations"], width * height / 1e6, config.reconstruct,
             board_pictures=_CAMERAS * config.imaging.pool_views,
             pixel_m=scale * plan["details"]["imaging"]["pixel_m"],
         )  # fmt: skip
-    return size_of(len(rows), width * height / 1e6, config) if rows else None
+    return size_of(len(rows), width * height / 1e6, config.reconstruct) if rows else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,20 +167,15 @@ class StageCost:
         return replace(self, serial_s=factor * self.serial_s, tasks_s=factor * self.tasks_s)
 
 
-def stage_costs(size: SurveySize, slowness: float = 1.0) -> dict[str, StageCost]:
-    """What each stage takes.
-
-    Args:
-        size: of the survey.
-        slowness: time that this machine takes for what the machine of the table does in 1.
-    """
+def stage_costs(size: SurveySize) -> dict[str, StageCost]:
+    """What each stage takes of a survey of some size."""
     found = {}
     for stage, cost in COSTS.items():
         pictures = size.board_pictures if stage in _OF_BOARD else size.pictures
         mpx = pictures * (size.refined_mpx if stage in _OF_SURFACE else size.mpx)
-        work_s = slowness * (cost.picture_s * pictures + cost.mpx_s * mpx)
+        work_s = cost.picture_s * pictures + cost.mpx_s * mpx
         found[stage] = StageCost(
-            serial_s=slowness * cost.start_s + cost.serial * work_s,
+            serial_s=cost.start_s + cost.serial * work_s,
             tasks_s=(1.0 - cost.serial) * work_s,
             tasks=max(1, pictures),
             process_mib=cost.process_mib + cost.picture_mib * size.pictures,
@@ -240,9 +224,8 @@ class SurveyCost:
         return (
             f"about {duration(self.time_s(many))} on {count(many, unit)}"
             f"{'' if many == OTHER_CORES else other}, "
-            f"{_rounded(self.memory_mib(many) / 1024)} GiB of memory"
-            f"{' in all' if unit == 'worker' else ''}, "
-            f"{_rounded(self.disk_mb / 1e3)} GB of disk"
+            f"{digits(self.memory_mib(many) / 1024, 2)} GiB of memory"
+            f"{' in all' if unit == 'worker' else ''}, {digits(self.disk_mb / 1e3, 2)} GB of disk"
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -287,62 +270,6 @@ def correction(
     return ratio, ratio ** (len(ran) / (len(ran) + 1)), list(ran)
 
 
-def slowness() -> float:
-    """Time that a core of this machine takes for what that of the table does in 1.
-
-    Measured once for each kind of processor, in about a second, and kept in the user's cache.
-    """
-    file, here = _cache_folder() / "speed.json", processor()
-    known: dict[str, float] = {}
-    with contextlib.suppress(OSError, ValueError):
-        known = json.loads(file.read_text(encoding="utf-8"))
-    if here not in known:
-        known[here] = round(probe_s(), 4)
-        with contextlib.suppress(OSError):  # next time it is measured again
-            file.parent.mkdir(parents=True, exist_ok=True)
-            write_json(file, known)
-    return known[here] / _PROBE_S
-
-
-def probe_s() -> float:
-    """Processor time of a little work of the kinds that stages do, s: the least of two runs."""
-    import cv2
-    import numpy as np
-
-    rng = np.random.default_rng(0)
-    grey = cv2.GaussianBlur(rng.integers(0, 256, (480, 640), np.uint8), (0, 0), 2.0)
-    grey = cv2.normalize(grey, None, 0, 255, cv2.NORM_MINMAX)
-    rows = rng.random((1500, 128), np.float32)
-    grid = rng.random((700, 700))
-    matcher = cv2.StereoSGBM.create(0, 64, 5)
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        times = []
-        for _ in range(2):
-            began_s = time.thread_time()
-            cv2.SIFT.create().detectAndCompute(grey, None)
-            matcher.compute(grey, np.roll(grey, -9, axis=1))
-            (rows @ rows.T).argmax(axis=1)
-            np.sort(np.sqrt(grid * grid + 1.0), axis=1)
-            times.append(time.thread_time() - began_s)
-    finally:
-        cv2.setNumThreads(threads)
-    return min(times)
-
-
-def _cache_folder() -> Path:
-    """Where this program keeps what it can find again."""
-    name = "LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME"
-    return Path(os.environ.get(name) or Path.home() / ".cache") / "alice-survey"
-
-
-def kernels_are_compiled() -> bool:
-    """Whether there are kept kernels of the reconstruction; True where that is not known."""
-    folder = Path(os.environ.get("NUMBA_CACHE_DIR") or str(resources.files("reconstruct")))
-    return not os.access(folder, os.W_OK) or any(folder.rglob("*.nbi"))
-
-
 def summary(
     size: SurveySize,
     groups: Mapping[str, Sequence[str]],
@@ -358,7 +285,7 @@ def summary(
         workers: of a cluster; None for the cores at hand.
         records: of finished stages of this survey, whose measured cost corrects the rest.
     """
-    costs = stage_costs(size, slowness())
+    costs = stage_costs(size)
     ratio, factor, ran = correction(costs, records or {}, processor())
     found: dict[str, Any] = {}
     lines = []
@@ -374,13 +301,4 @@ def summary(
         lines[-1] += (
             f"; {', '.join(ran)} took {ratio:.2f} of what was predicted: corrected by {factor:.2f}"
         )
-    if lines and not kernels_are_compiled():
-        found["compile_s"] = _COMPILE_S
-        lines[-1] += f"; the first run also compiles for about {_COMPILE_S} s"
     return "\n".join(lines), found
-
-
-def _rounded(value: float) -> str:
-    """Two significant digits, without an exponent."""
-    digits = 1 - math.floor(math.log10(max(value, 0.01)))
-    return f"{round(value, digits):.{max(0, digits)}f}"

@@ -6,8 +6,8 @@ report says so, and how much light is missing.
 
 import glob
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,14 +49,10 @@ class PictureLevels:
     picture: str
     median: float
     """Median of the mean of its channels."""
-    dark: float
-    """0.5th percentile."""
     bright: float
     """99.5th percentile of the brightest of 5 x 5 zones, of any channel."""
     clipped: float
     """Share of its pixels with a channel at full scale."""
-    black: float
-    """Share of its pixels with all channels at zero."""
     falloff: float
     """Mean of the four corner zones over the middle zone (medians)."""
     noise: float
@@ -139,30 +135,39 @@ def gain_advice(
             levels.append(picture_levels(file.name, picture))
     if not levels:
         raise ImageError(f"none of {len(files)} control pictures can be read: take them again")
-    median, bright = (
-        float(np.median([getattr(p, k) for p in levels])) for k in ("median", "bright")
-    )
-    clipped = float(np.median([p.clipped for p in levels]))
-    _refuse_useless(levels, median, bright, clipped)
+    names = ("median", "bright", "clipped", "falloff", "noise")
+    rows = np.array([[getattr(level, name) for name in names] for level in levels])
+    median, bright, clipped, falloff, _ = np.median(rows, axis=0).tolist()
+    if bright <= 2 * _BLACK:
+        raise ImageError(
+            f"{len(levels)} control pictures are black ({bright:.2%} of full scale in their "
+            "brightest zone): check that the lens is uncovered and the strobe fires within the "
+            "exposure (triggers.csv), then take them again with 12 dB more gain"
+        )
+    if clipped > _MAX_CLIPPED or median >= _WHITE:
+        raise ImageError(
+            f"{len(levels)} control pictures are white ({clipped:.0%} of the pixels are clipped): "
+            "lower the gain by 12 dB, or the exposure to a quarter, and take them again"
+        )
     by_median, by_highlights = _db(MIDDLE_GREY / max(median, 1e-9)), _db(_HIGHLIGHT / bright)
-    change = min(by_median, by_highlights)
-    snr = float(np.median([p.median / max(p.noise, 1e-9) for p in levels]))
-    return GainAdvice(
+    change_db = min(by_median, by_highlights)
+    found = GainAdvice(
         pictures=len(levels),
         skipped=len(files) - len(levels),
         median=median,
         bright=bright,
         clipped=clipped,
-        falloff=float(np.median([p.falloff for p in levels])),
-        snr=snr,
-        change_db=change,
+        falloff=falloff,
+        snr=float(np.median(rows[:, 0] / np.maximum(rows[:, 4], 1e-9))),
+        change_db=change_db,
         present_gain_db=present_gain_db,
-        gain_db=None if present_gain_db is None else present_gain_db + change,
+        gain_db=None if present_gain_db is None else present_gain_db + change_db,
         target=MIDDLE_GREY,
         bound_by="median" if by_median <= by_highlights else "highlights",
-        advice=tuple(_advice(levels, change, by_median, snr, clipped, present_gain_db)),
+        advice=(),
         levels=tuple(levels),
     )
+    return replace(found, advice=tuple(_advice(found, by_median - change_db)))
 
 
 def read_linear(file: Path, *, linear: bool) -> Floats | None:
@@ -201,11 +206,8 @@ def _from_srgb(encoded: Array) -> Array:
 
 def _grey(picture: Floats) -> Floats:
     """Mean of the channels."""
-    channels = picture.shape[2]
-    total = picture[..., 0].copy()
-    for channel in range(1, channels):
-        total += picture[..., channel]
-    return total / np.float32(channels)
+    mean: Floats = picture.mean(axis=2, dtype=np.float32)
+    return mean
 
 
 def picture_levels(name: str, picture: Floats) -> PictureLevels:
@@ -226,10 +228,8 @@ def picture_levels(name: str, picture: Floats) -> PictureLevels:
     return PictureLevels(
         picture=name,
         median=median,
-        dark=float(np.percentile(grey, 0.5)),
         bright=float(np.percentile(brightest.max(axis=2), 99.5)),
         clipped=float((thin.max(axis=2) >= _WHITE).mean()),
-        black=float((thin.max(axis=2) <= _BLACK).mean()),
         falloff=float(corners / max(medians[_ZONES // 2, _ZONES // 2], 1e-9)),
         noise=noise_sigma(picture),
     )
@@ -253,111 +253,58 @@ def noise_sigma(picture: Floats) -> float:
     return float(np.percentile(sigma[light >= np.median(light)], 10.0))
 
 
-def _refuse_useless(
-    levels: Sequence[PictureLevels], median: float, bright: float, clipped: float
-) -> None:
-    """Stop where the pictures do not show the light.
-
-    Raises:
-        ImageError: they are black, or white.
-    """
-    if bright <= 2 * _BLACK:
-        raise ImageError(
-            f"{len(levels)} control pictures are black ({bright:.2%} of full scale in their "
-            "brightest zone): check that the lens is uncovered and the strobe fires within the "
-            "exposure (triggers.csv), then take them again with 12 dB more gain"
-        )
-    if clipped > _MAX_CLIPPED or median >= _WHITE:
-        raise ImageError(
-            f"{len(levels)} control pictures are white ({clipped:.0%} of the pixels are clipped): "
-            "how much too bright is not known: lower the gain by 12 dB, or the exposure to a "
-            "quarter, and take them again"
-        )
-
-
-def _advice(
-    levels: Sequence[PictureLevels],
-    change: float,
-    by_median: float,
-    snr: float,
-    clipped: float,
-    present_db: float | None,
-) -> list[str]:
+def _advice(found: GainAdvice, short_db: float) -> Iterator[str]:
     """What gain cannot correct."""
-    said = []
-    if by_median > change + 0.05:
-        said.append(
-            f"highlights allow {by_median - change:.1f} dB less than the median needs: light "
-            "is uneven; move the strobes apart or accept dark edges"
+    if short_db > 0.05:
+        yield (
+            f"highlights allow {short_db:.1f} dB less than the median needs: light is uneven; move "
+            "the strobes apart or accept dark edges"
         )
-    if snr < _ACCEPTABLE_SNR:
-        said.append(
-            f"signal to noise is {snr:.1f}, and gain cannot raise it: light is the limit. "
-            f"{_ACCEPTABLE_SNR:g} takes {(_ACCEPTABLE_SNR / snr) ** 2:.1f} times the light "
-            "(shot noise): open the aperture, expose longer, or go lower"
+    if found.snr < _ACCEPTABLE_SNR:
+        yield (
+            f"signal to noise is {found.snr:.1f}, and gain cannot raise it: {_ACCEPTABLE_SNR:g} "
+            f"takes {(_ACCEPTABLE_SNR / found.snr) ** 2:.1f} times the light: open the aperture, "
+            "expose longer, or go lower"
         )
-    if present_db is not None and present_db + change < 0:
-        said.append(
-            f"the gain would be {present_db + change:.1f} dB: set 0 dB, and the exposure to "
-            f"{10 ** ((present_db + change) / 20):.2f} of what it is, or close the aperture"
+    if found.gain_db is not None and found.gain_db < 0:
+        yield (
+            f"the gain would be {found.gain_db:.1f} dB: set 0 dB, and the exposure to "
+            f"{10 ** (found.gain_db / 20):.2f} of what it is, or close the aperture"
         )
-    if clipped > 0.01:
-        said.append(
-            f"{clipped:.1%} of the pixels are clipped: this gain may still be too high; "
-            "check it with new pictures"
-        )
-    spread = [p.median for p in levels]
-    if max(spread) > 2 * max(min(spread), 1e-9):
-        said.append(
-            f"medians go from {min(spread):.1%} to {max(spread):.1%}: the altitude or the ground "
+    if found.clipped > 0.01:
+        yield f"{found.clipped:.1%} of the pixels are clipped: check this gain with new pictures"
+    medians = [level.median for level in found.levels]
+    if max(medians) > 2 * max(min(medians), 1e-9):
+        yield (
+            f"medians go from {min(medians):.1%} to {max(medians):.1%}: the altitude or the ground "
             "varied; take pictures at the survey's altitude"
         )
-    return said
 
 
-def _text(advice: GainAdvice, *, linear: bool) -> str:
+def _text(found: GainAdvice, *, linear: bool) -> str:
     """The report as text."""
+
+    def then(level: float) -> str:
+        return f"{min(1.0, level * 10 ** (found.change_db / 20)):.1%}"
+
     curve = "linear" if linear else "sRGB curve undone"
-    skipped = f", {advice.skipped} left out" if advice.skipped else ""
-    table = text_table(
-        ("level", "now", "then"),
-        [
-            ("median", f"{advice.median:.2%}", f"{_then(advice.median, advice):.1%}"),
-            (
-                "brightest zone, 99.5 %",
-                f"{advice.bright:.2%}",
-                f"{_then(advice.bright, advice):.1%}",
-            ),
-            ("clipped", f"{advice.clipped:.2%}", "-"),
-            ("corners over middle", f"{advice.falloff:.2f}", "the same"),
-            ("signal to noise", f"{advice.snr:.1f}", "the same"),
-        ],
-    )
-    lines = [
-        f"{advice.pictures} control pictures{skipped} ({curve}; shares of full scale)",
-        table,
-        _verdict(advice),
-        *(f"  - {said}" for said in advice.advice),
+    skipped = f", {found.skipped} left out" if found.skipped else ""
+    change = f"change the gain by {found.change_db:+.1f} dB"
+    if found.gain_db is not None:
+        change = f"set the gain to {max(found.gain_db, 0.0):.1f} dB ({found.change_db:+.1f} dB)"
+    rows = [
+        ("median", f"{found.median:.2%}", then(found.median)),
+        ("brightest zone, 99.5 %", f"{found.bright:.2%}", then(found.bright)),
+        ("clipped", f"{found.clipped:.2%}", "-"),
+        ("corners over middle", f"{found.falloff:.2f}", "the same"),
+        ("signal to noise", f"{found.snr:.1f}", "the same"),
     ]
-    return "\n".join(lines)
-
-
-def _verdict(advice: GainAdvice) -> str:
-    why = (
-        f"the median comes to {advice.target:.0%}"
-        if advice.bound_by == "median"
-        else f"the brightest zone comes to {_HIGHLIGHT:.0%}"
-    )
-    if advice.gain_db is None:
-        return f"change the gain by {advice.change_db:+.1f} dB: {why}"
-    return (
-        f"set the gain to {max(advice.gain_db, 0.0):.1f} dB ({advice.change_db:+.1f} dB from "
-        f"{advice.present_gain_db:g}): {why}"
-    )
-
-
-def _then(level: float, advice: GainAdvice) -> float:
-    return float(min(1.0, level * 10 ** (advice.change_db / 20)))
+    return "\n".join([
+        f"{found.pictures} control pictures{skipped} ({curve}; shares of full scale)",
+        text_table(("level", "now", "then"), rows),
+        f"{change}, bound by the {found.bound_by}",
+        *(f"  - {line}" for line in found.advice),
+    ])  # fmt: skip
 
 
 def _db(ratio: float) -> float:

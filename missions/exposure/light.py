@@ -6,30 +6,50 @@ Each strobe sends `I(angle) = I_0 cos(angle)` within its cone, `I_0 = P / (pi si
 A level floor of reflectance rho (Lambert) at the distances d from a strobe and s along the pixel's
 ray gets `E = sum I cos(in) / d^2 exp(-k d)` and sends back `L = rho E / pi exp(-m s)`; of the
 scattering b, k = c - LIT_SHARE b and m = c - SEEN_SHARE b leave out what is scattered forward
-(`missions.exposure.forward_light`). Light that counts as detail is `L = rho E / pi exp(-c s)`. On
+(below). Light that counts as detail is `L = rho E / pi exp(-c s)`. On
 the way to the sensor L falls by `T_port / n^2`; it gives the irradiance `pi L T_lens / (4 N^2)
 cos^4`.
 
-Assumed: no daylight; each channel takes 100 nm of the LEDs' spectrum (`missions.exposure.lamp`),
-with the water of its middle, and has the whole quantum efficiency; sand as in the simulator. The
+Assumed: no daylight; each channel takes 100 nm of the LEDs' spectrum (`watts_per_lumen`), with the
+water of its middle, and has the whole quantum efficiency; sand as in the simulator. The
 simulator (`alice_survey.sim.seafloor`) computes by ray, with a soft edge of the cone, an even
 spectrum and all scattered light lost but for the veil: its pictures have the light of `c` both
 ways, and lack the blur of what is scattered on the way from the floor. Tests compare
 the two on these terms.
+
+Scattering forward turns most light by a few degrees only. Turned by the angle t on its way, it is
+lost to the point or the pixel that it was sent to, but neighbours' light arrives in its place. Of
+light scattered once, the share that arrives is, averaged over the place of the turn:
+
+- on a level floor, from a strobe that shines as the cosine of its angle: `pi integral p(t) (sin t +
+  t cos t) dt` from 0 to 90 degrees. In the plane through strobe, turn and point, with the angles u
+  and v of the light's two legs against the straight line between strobe and point, u + v = t, a
+  volume `dV / (r1^2 r2^2) = du dv dphi / d`, and intensity and incidence are weakened by cos u and
+  cos v on average over phi; the integral of cos u cos v over u is half the bracket.
+- in a camera that looks down on that floor, lit as cos^4 by a strobe at its side: `pi integral p(t)
+  cos t (sin t cos t + t) dt`, as the floor is darker where turned light comes from.
+
+Turns follow each other independently (small angles; Wells 1973, AGARD LS-61), so that n turns keep
+the n-th power, and a path x that has `exp(-c x)` of its light unscattered has `exp(-(c - share b)
+x)` in all: the form of Gordon's quasi-single scattering (1973, Applied Optics 12, 2803). Longer
+ways of turned light are left out. A Monte Carlo of photons judges it in `tests/missions/exposure`.
+
+What is turned on its way from the floor lights a pixel with its neighbours' light: it counts in
+electrons, and blurs; only what stays within the pixel's own cone is detail.
 """
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from alice_survey.core.config import CameraConfig, ImagingConfig
 from alice_survey.core.frames import Array
 from camera_calib.rig import Rig
-from camera_calib.water import WAVELENGTH_NM, WaterOptics, phase_per_sr
-from missions.exposure.forward_light import LIT_SHARE, SEEN_SHARE, share_within
-from missions.exposure.lamp import LAMP, Spectrum, watts_per_lumen
-from missions.exposure.settings_table import Setting, settings_of
+from camera_calib.water import ASYMMETRY, WAVELENGTH_NM, WaterOptics, phase_per_sr
+
+Spectrum = Literal["led", "even"]
 
 FLOOR_REFLECTANCE = np.array([0.40, 0.345, 0.255])
 """Red, green and blue of bare sand, as `alice_survey.sim.seafloor.texture.SAND_ALBEDO`."""
@@ -47,15 +67,63 @@ _PLANCK_J_S, _LIGHT_M_S = 6.62607015e-34, 299_792_458.0
 _GRID = (13, 11)
 _STEPS = 400
 """Pieces of a ray of which scattered light is summed."""
-_SOURCE = (
-    "missions.exposure.light; water: Jerlov 1976 and Kirk 1984 (camera_calib.water), light that is "
-    f"scattered forward kept; {LAMP}; sand; lens transmission 0.9 (inferred)"
+_LUMENS_PER_WATT = 683.0
+_BANDS_NM = ((600.0, 700.0), (500.0, 600.0), (400.0, 500.0))
+"""Bands of red, green and blue."""
+LED_NM = np.arange(380.0, 781.0, 5.0)
+LED_B3 = np.array([
+    0, 0, 0.01, 0.02, 0.05, 0.11, 0.25, 0.56, 1.2, 2.37, 4.24, 7.17,
+    12.11, 17.7, 18.87, 14.58, 9.9, 7.53, 6.02, 5.11, 5.17, 5.82, 6.77, 7.88,
+    8.94, 9.82, 10.52, 11.06, 11.51, 11.93, 12.37, 12.83, 13.31, 13.79, 14.26, 14.68,
+    15.08, 15.42, 15.72, 15.97, 16.18, 16.37, 16.5, 16.55, 16.5, 16.32, 16, 15.54,
+    14.96, 14.27, 13.48, 12.62, 11.71, 10.78, 9.85, 8.93, 8.04, 7.2, 6.42, 5.69,
+    5.02, 4.42, 3.88, 3.39, 2.95, 2.56, 2.22, 1.92, 1.65, 1.43, 1.23, 1.06,
+    0.91, 0.78, 0.68, 0.58, 0.5, 0.43, 0.37, 0.32, 0.28,
+])  # fmt: skip
+"""Relative power of CIE illuminant LED-B3, every 5 nm: white light of a blue LED under phosphor,
+4103 K (CIE 015:2018, Colorimetry, 4th edition), the nearest that CIE publishes to the 4000 K of
+ALICE's (Gutnik et al. 2021, section III.B). A LED of another maker differs by some per cent."""
+_ANGLES = np.linspace(0.0, math.pi / 2, 20_001)
+_PHASE = phase_per_sr(np.cos(_ANGLES))
+
+LIT_SHARE = float(
+    math.pi * np.trapezoid(_PHASE * (np.sin(_ANGLES) + _ANGLES * np.cos(_ANGLES)), _ANGLES)
 )
-_FORWARD_SOURCE = "missions.exposure.forward_light: Henyey-Greenstein 0.924 (Petzold)"
-_SCATTER_SOURCE = (
-    "missions.exposure.light: quasi-single scattering (Gordon 1973), Henyey-Greenstein 0.924 "
-    "(Petzold)"
+"""Share of the scattered light of a strobe that still lights the floor where it would have."""
+SEEN_SHARE = float(
+    math.pi
+    * np.trapezoid(
+        _PHASE * np.cos(_ANGLES) * (np.sin(_ANGLES) * np.cos(_ANGLES) + _ANGLES), _ANGLES
+    )
 )
+"""Share of the scattered light of the floor that a pixel's neighbours give it back."""
+
+
+def share_within(angle_rad: float) -> float:
+    """Share of scattered light that is turned by less than an angle (Henyey-Greenstein)."""
+    g = ASYMMETRY
+    # 1 + g^2 - 2 g cos without its cancellation at small angles.
+    far = math.sqrt((1.0 - g) ** 2 + 4.0 * g * math.sin(angle_rad / 2) ** 2)
+    return (1.0 - g * g) / (2.0 * g) * (far - (1.0 - g)) / (far * (1.0 - g))
+
+
+def watts_per_lumen(spectrum: Spectrum) -> Array:
+    """Radiant watts in red, green and blue for one lumen, (3,).
+
+    Lumens are `683 integral(P V)`, with the CIE photopic curve as V = 1.019 exp(-285.4 (um -
+    0.559)^2), which holds its integral to 0.1 %.
+
+    Args:
+        spectrum: of the LED, or even between 400 and 700 nm.
+    """
+    nm = np.linspace(380.0, 780.0, 801)
+    power = np.interp(nm, LED_NM, LED_B3)
+    if spectrum == "even":
+        power = np.where((nm >= 400.0) & (nm <= 700.0), 1.0, 0.0)
+    photopic = 1.019 * np.exp(-285.4 * (nm * 1e-3 - 0.559) ** 2)
+    lumens = _LUMENS_PER_WATT * np.trapezoid(power * photopic, nm)
+    bands = [(nm >= low) & (nm <= high) for low, high in _BANDS_NM]
+    return np.array([np.trapezoid(power[band], nm[band]) / lumens for band in bands])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,7 +169,7 @@ class FloorRadiance:
     """Radiance in water that the floor sends to pixels (...), W / (m^2 sr), by channel."""
 
     total: Array
-    """(..., 3) with what the water scatters on the way from neighbours of the pixel's spot."""
+    """(..., 3) with what the water scatters on the way from neighbours of the pixel's point."""
     sharp: Array
     """(..., 3) within the pixel's own cone."""
 
@@ -130,13 +198,13 @@ def floor_radiance(
     floor_z = float(camera.front_cam[2]) + altitude_m
     outer, directions = camera.unproject(pixels)
     path = (floor_z - outer[..., 2]) / directions[..., 2]
-    spots = outer + path[..., None] * directions
+    points = outer + path[..., None] * directions
     down = rig.body_from_cam(rig.reference).inv().rotation.apply([0.0, 0.0, 1.0])
     power = imaging.strobe_lumens * watts_per_lumen(spectrum)
     half_beam = math.radians(imaging.strobe_beam_deg) / 2
     irradiance = np.zeros((*path.shape, 3))
     for strobe in _strobes_cam(rig, imaging):
-        away = spots - strobe
+        away = points - strobe
         distance = np.linalg.norm(away, axis=-1)
         cos_beam = away @ down / distance
         # The floor is level: light meets it at the angle at which it leaves the strobe.
@@ -233,7 +301,7 @@ def signal_to_noise(electrons: Array, read_noise_e: float, sharp: Array | float)
     return ratio
 
 
-def too_dark(budget: LightBudget) -> str:
+def darkness(budget: LightBudget) -> str:
     """What to say where the median pixel is lost in noise; empty where it does not."""
     if budget.snr_median >= MIN_SNR:
         return ""
@@ -257,44 +325,6 @@ def _triple(values: Array) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def light_rows(
-    budget: LightBudget,
-    imaging: ImagingConfig,
-    limits: CameraConfig,
-    jerlov: str,
-    exposure_s: float,
-) -> list[Setting]:
-    """Electrons, signal to noise, gain, and the aperture or exposure that would fill the well."""
-    strobes = len(imaging.strobes_body_m)
-    dark = budget.gain_db > 0
-    return settings_of("light", [
-        ("electrons, centre", budget.centre_e, "e", "pi L T / (4 N^2 n^2) p^2 t QE / (h nu)",
-         _SOURCE, "exposure",
-         f"red / green / blue of a pixel over sand in Jerlov {jerlov} water, {strobes} "
-         f"strobes of {imaging.strobe_lumens:g} lm, F/{limits.f_number:g}; the brightest pixel "
-         f"fills {budget.full_share:.1%} of the well of {limits.full_well_e:g} e"),
-        ("electrons, corner", budget.corner_e, "e", "the same, with cos^4", _SOURCE, "lens, beam",
-         ""),
-        ("sharp light, centre", budget.sharp_share, "%", f"exp(-{SEEN_SHARE:.3f} b s)",
-         _FORWARD_SOURCE, "water",
-         "share of these electrons that is detail: the water scatters the rest by a few degrees "
-         "on its way from the floor, which blurs"),
-        ("signal to noise", budget.snr_centre, "", "sharp S / sqrt(S + read^2)",
-         "Poisson shot noise and read noise", "electrons",
-         f"at the centre; of the median pixel {budget.snr_median:.1f}, in the corner "
-         + " / ".join(f"{value:.1f}" for value in budget.snr_corner)),
-        ("gain", budget.gain_db, "dB", "20 log10(grey x well / median)", _SOURCE,
-         "light" if dark else "full well",
-         f"brings the median to {MIDDLE_GREY:.0%} of full scale (linear); 0 dB puts the "
-         "full well at full scale. Check it in the water: alice-survey plan gain PICTURES"),
-        ("f-number for half well", budget.half_full_f_number, "", "N sqrt(S / half well)", _SOURCE,
-         "depth of field",
-         f"for the brightest pixel in {exposure_s * 1e3:.3g} ms; or "
-         f"{budget.half_full_exposure_s * 1e3:.3g} ms at F/{limits.f_number:g}"
-         + ("; no common lens opens so far" if budget.half_full_f_number < 1.2 else "")),
-    ])  # fmt: skip
-
-
 @dataclass(frozen=True, kw_only=True)
 class Scatter:
     """What the water between strobes, camera and floor does to a picture's middle."""
@@ -303,8 +333,6 @@ class Scatter:
     """Light thrown back over all light, at the middle of the frame; red, green, blue."""
     lit_from_m: float
     """Distance below the glass from which any strobe lights the axis of the camera."""
-    seen_lit_from_m: float
-    """Distance below the glass from which any strobe lights any of the field of view."""
     lit_share: float
     """Share of the water column on the axis, from glass to floor, that a strobe lights."""
 
@@ -346,7 +374,6 @@ def scatter(rig: Rig, imaging: ImagingConfig, water: WaterOptics, altitude_m: fl
     return Scatter(
         veil_share=_triple(share),
         lit_from_m=max(0.0, min(reached)),
-        seen_lit_from_m=_field_lit_from_m(rig, strobes, half_beam, altitude_m),
         lit_share=float(np.sum(np.diff(path) * (lit[1:] & lit[:-1])) / altitude_m),
     )
 
@@ -394,29 +421,6 @@ def _axis_paths(altitude_m: float) -> Array:
     return paths
 
 
-def _field_lit_from_m(rig: Rig, strobes: Array, half_beam: float, altitude_m: float) -> float:
-    """First distance below the glass at which a cone of light meets the field of view."""
-    camera = rig.cameras[rig.reference]
-    outer, directions = camera.unproject(camera.border(16))
-    glass_z = float(camera.front_cam[2])
-    for below_m in np.linspace(0.0, altitude_m, 801):
-        z = glass_z + below_m
-        spots = outer + ((z - outer[:, 2]) / directions[:, 2])[:, None] * directions
-        for strobe in strobes:
-            radius = (z - strobe[2]) * math.tan(half_beam)
-            nearest = _nearest_in_frame(spots[:, :2], strobe[:2])
-            if radius > 0 and nearest <= radius:
-                return float(below_m)
-    return float(altitude_m)
-
-
-def _nearest_in_frame(border: Array, place: Array) -> float:
-    """Distance from a place to a frame that is given by points of its border; 0 inside."""
-    low, high = border.min(axis=0), border.max(axis=0)
-    outside = np.maximum(np.maximum(low - place, place - high), 0.0)
-    return float(np.hypot(*outside))
-
-
 def shadows(rig: Rig, imaging: ImagingConfig, altitude_m: float, height_m: float) -> Shadows:
     """Shadows of an object on a level floor below the camera.
 
@@ -456,19 +460,3 @@ def _strobes_cam(rig: Rig, imaging: ImagingConfig) -> Array:
 def _reach(strobe: Array) -> float:
     """Distance of a strobe from the camera's axis."""
     return float(np.hypot(strobe[0], strobe[1]))
-
-
-def scatter_rows(water: Scatter, shade: Shadows) -> list[Setting]:
-    """Veiling light and shadows."""
-    return settings_of("light", [
-        ("veil, centre", water.veil_share, "%", "B / (B + L)", _SCATTER_SOURCE, "strobe places",
-         "share of the light that the water throws back before it reached the floor, red / "
-         f"green / blue. Strobes light the axis from {water.lit_from_m:.2f} m below the glass "
-         f"on, the field of view from {water.seen_lit_from_m:.2f} m; {water.lit_share:.0%} of "
-         "the water on the axis is lit"),
-        ("shadows", shade.length_m, "m", "h r / (H - h)", "geometry of the strobes' places",
-         "strobe places",
-         f"of a thing {shade.height_m:g} m high below the camera, by each strobe; their "
-         f"light meets there at {shade.between_deg:.0f} deg"
-         + (" from both sides: each lights the other's shadow" if shade.opposite else "")),
-    ])  # fmt: skip

@@ -1,4 +1,4 @@
-"""Strobes as electric loads: pulse, duty cycle, energy, capacitor, heat.
+"""Strobes as electric loads (pulse, duty cycle, energy, capacitor, heat), and the data of pictures.
 
 Two arrays of 20 Cree XHP35 LEDs (Gutnik et al. 2021, section III.B), 1500 lm each. Of the LED:
 1354 lm at 1 A and 13.01 V, so 104 lm/W (measured on an XHP35.2 HI, 5000 K, by "koef3",
@@ -7,13 +7,11 @@ budgetlightforum.com, 2024; that ALICE's give the same is inferred), junction to
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 from alice_survey.core.config import ImagingConfig, PlanConfig
-from alice_survey.core.errors import PlanError
-from missions.exposure.settings_table import Setting, settings_of
-from missions.exposure.ways_out import Way, conflict, less_overlap
+from camera_calib.camera import Camera
+from missions.exposure.conflict import conflict
 
 LEDS = 20
 EFFICACY_LM_W = 1354.0 / 13.01
@@ -26,10 +24,11 @@ HOUSING_KELVIN_PER_WATT = 0.5
 """Inferred: 0.02 m^2 of metal in water at 100 W/(m^2 K), the low end of free convection in liquids
 (Incropera, Fundamentals of Heat and Mass Transfer, table 1.1)."""
 WARM_SEA_C, SOLDER_LIMIT_C = 30.0, 85.0
-_SOURCE = (
-    "Cree XHP35: 104 lm/W (koef3, 2024), 1.8 K/W and 85 C (data sheet); driver 0.9, bus 28 V, "
-    "housing 0.5 K/W are inferred (missions.exposure.strobe)"
-)
+LINK_BYTES_PER_S = 124e6
+"""Capacity of one Gigabit Ethernet cable: the cameras' `StreamBytesPerSecond` at full bandwidth
+(Allied Vision, Manta Technical Manual, notes on frame rates)."""
+DISK_BYTES_PER_S = 250e6
+"""Inferred: half of what a SATA disk on the recorder writes at best (about 500 MB/s)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,10 +68,15 @@ def strobe_load(
     """
     pulse_s = exposure_s + 2 * plan.strobe_lead_s
     lit_w = imaging.strobe_lumens / EFFICACY_LM_W
-    limit = duty_limit(imaging)
-    duty = pulse_s / interval_s
+    limit, duty = duty_limit(imaging), pulse_s / interval_s
     if duty > limit:
-        raise _too_long(imaging, plan, exposure_s, interval_s, limit)
+        share = (limit * interval_s - 2 * plan.strobe_lead_s) / exposure_s
+        raise conflict(
+            f"a strobe pulse of {pulse_s:.4f} s every {interval_s:.3f} s lights {duty:.0%} of the "
+            f"time; its LEDs bear {limit:.0%} in water of {WARM_SEA_C:g} C",
+            ("strobe pulse", "heat of the strobe"),
+            "plan.allowed_blur_px", math.floor(100 * plan.allowed_blur_px * share) / 100,
+        )  # fmt: skip
     count = len(imaging.strobes_body_m)
     frame_j = count * lit_w * pulse_s / DRIVER_EFFICIENCY
     solder_c = WARM_SEA_C + HOUSING_KELVIN_PER_WATT * lit_w * duty
@@ -103,64 +107,43 @@ def duty_limit(imaging: ImagingConfig) -> float:
     return min(1.0, (SOLDER_LIMIT_C - WARM_SEA_C) / (HOUSING_KELVIN_PER_WATT * lit_w))
 
 
-def _too_long(
-    imaging: ImagingConfig, plan: PlanConfig, exposure_s: float, interval_s: float, limit: float
-) -> PlanError:
-    """The pulse is too long for the interval."""
-    pulse_s, max_s = exposure_s + 2 * plan.strobe_lead_s, limit * interval_s
-    slower = pulse_s / max_s
+@dataclass(frozen=True, kw_only=True)
+class Storage:
+    """Data of one trigger and what limits their flow."""
 
-    def ways() -> Iterator[Way]:
-        if max_s > exposure_s:
-            lead_s = math.floor((max_s - exposure_s) / 2 * 1e5) / 1e5
-            yield Way(
-                change=f"strobe_lead_s {lead_s:g} instead of {plan.strobe_lead_s:g}",
-                price="the strobe has less time to reach its brightness",
-                cost=1.0 - lead_s / plan.strobe_lead_s,
-                settings={"plan.strobe_lead_s": lead_s},
-            )
-        if max_s > 2 * plan.strobe_lead_s:
-            share = (max_s - 2 * plan.strobe_lead_s) / exposure_s
-            blur_px = math.floor(100 * plan.allowed_blur_px * share) / 100
-            yield Way(
-                change=f"allowed_blur_px {blur_px:g} instead of {plan.allowed_blur_px:g}",
-                price=f"{share:.2f} of the light: {-20 * math.log10(share):.1f} dB more gain",
-                cost=1.0 - share,
-                settings={"plan.allowed_blur_px": blur_px},
-            )
-        yield from less_overlap(plan, 1.0 - (1.0 - plan.forward_overlap) * slower)
-        lumens = math.floor(imaging.strobe_lumens / slower / 100) * 100
-        yield Way(
-            change=f"strobe_lumens {lumens:g} instead of {imaging.strobe_lumens:g}",
-            price=f"{20 * math.log10(slower):.1f} dB more gain",
-            cost=1.0 - 1.0 / slower,
-            settings={"imaging.strobe_lumens": lumens},
-        )
+    frame_bytes: int
+    """Size of one picture, raw, one byte a pixel."""
+    station_bytes: int
+    """Size of all cameras' pictures of one trigger."""
+    bytes_per_s: float
+    """Data rate while a line is flown."""
+    own_link_hz: float
+    """Most triggers a second, each camera on its own cable."""
+    shared_link_hz: float
+    """Most triggers a second with all cameras on one cable."""
+    disk_hz: float
+    """Most triggers a second that the disk takes."""
 
-    return conflict(
-        f"a strobe pulse of {pulse_s:.4f} s (exposure {exposure_s:.4f} s, lead "
-        f"{plan.strobe_lead_s:g} s) every {interval_s:.3f} s lights {pulse_s / interval_s:.0%} of "
-        f"the time; its LEDs bear {limit:.0%} in water of {WARM_SEA_C:g} C",
-        ("strobe pulse", "heat of the strobe"),
-        ways(),
+
+def raw_bytes(camera: Camera, cameras: int, stations: int) -> int:
+    """Size of all pictures as the sensor gives them, one byte a pixel."""
+    return camera.width_px * camera.height_px * cameras * stations
+
+
+def storage_load(camera: Camera, cameras: int, interval_s: float) -> Storage:
+    """Data of a rig.
+
+    Args:
+        camera: the reference camera; all are taken for as large.
+        cameras: how many.
+        interval_s: between triggers.
+    """
+    frame, station = raw_bytes(camera, 1, 1), raw_bytes(camera, cameras, 1)
+    return Storage(
+        frame_bytes=frame,
+        station_bytes=station,
+        bytes_per_s=station / interval_s,
+        own_link_hz=LINK_BYTES_PER_S / frame,
+        shared_link_hz=LINK_BYTES_PER_S / station,
+        disk_hz=DISK_BYTES_PER_S / station,
     )
-
-
-def strobe_rows(load: StrobeLoad) -> list[Setting]:
-    """Pulse, duty cycle, energy, capacitor, heat."""
-    return settings_of("strobes", [
-        ("pulse", load.pulse_s * 1e3, "ms", "t + 2 lead", "strobe covers the exposure", "exposure",
-         f"lit {load.lead_s * 1e3:g} ms before the exposure, out as long after it "
-         "(strobe_lead_s)"),
-        ("duty cycle", load.duty, "%", "pulse / interval", _SOURCE, "interval",
-         f"LEDs bear {load.duty_limit:.0%} in water of {WARM_SEA_C:g} C"),
-        ("energy a trigger", load.frame_j, "J", "lm / (lm/W) x pulse / driver", _SOURCE, "pulse",
-         f"{load.count} strobes of {load.lit_w:.0f} W while lit, {load.peak_a:.1f} A from "
-         f"{BUS_V:g} V"),
-        ("capacitor, each", load.capacitor_f * 1e3, "mF", "2 E / (V^2 - V_low^2)", _SOURCE, "pulse",
-         f"feeds a pulse while its {BUS_V:g} V sag by {BUS_SAG:.0%}; "
-         "continuous drive needs none"),
-        ("mean power", load.mean_w, "W", "energy / interval", _SOURCE, "duty cycle",
-         f"from the battery, on lines; solder point {load.solder_c:.0f} C, junction "
-         f"{load.junction_c:.0f} C at most. Cameras and recorder are in vehicle.hotel_w"),
-    ])  # fmt: skip

@@ -2,11 +2,10 @@
 
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from alice_survey.core.config import SeaConfig, SurveyConfig
+from alice_survey.core.config import AreaConfig, CameraConfig, SeaConfig, WaterConfig
 from alice_survey.core.frames import Array
 from alice_survey.kit.figure import (
     INK,
@@ -26,9 +25,9 @@ from missions.coverage.drawing import draw_counts, draw_polygons, finish_map, ma
 from missions.coverage.stations import plan_pattern, stations_of_plan
 from missions.exports.geometry import footprint_outline, footprints_ne
 from missions.plan.planner import area_bathymetry
+from missions.values.line import LINE_KINDS
 from missions.values.plan_file import Plan, read_plan
 
-KINDS = ("survey", "cross", "closing", "fill", "tie")
 COLOURS = {
     "survey": "#1b4f72", "cross": "#6c3483", "closing": "#117a65", "fill": "#b9770e",
     "tie": "#c0392b",
@@ -45,13 +44,23 @@ _ALLOWED_BEYOND = 0.3
 """
 
 
-def map_report(plan_path: Path, config: SurveyConfig, out: Path) -> tuple[str, dict[str, Any]]:
+def map_report(
+    plan_path: Path,
+    out: Path,
+    camera: CameraConfig,
+    water: WaterConfig,
+    area: AreaConfig,
+    sea: SeaConfig,
+) -> tuple[str, dict[str, str]]:
     """Draw the map of a finished plan again, as PNG, PDF or SVG after the suffix.
 
     Args:
         plan_path: `plan.json`.
-        config: the survey, for its cameras, bathymetry and current.
         out: file to write.
+        camera: of the survey.
+        water: of the survey.
+        area: names the bathymetry.
+        sea: its current.
 
     Raises:
         PlanError: the file holds no plan.
@@ -59,40 +68,16 @@ def map_report(plan_path: Path, config: SurveyConfig, out: Path) -> tuple[str, d
     """
     check_figure_path(out)
     plan = read_plan(plan_path)
-    rig = design_rig(config.camera, config.water)
-    bathymetry = area_bathymetry(config.area, plan.area, plan.altitude_m)
+    rig = design_rig(camera, water)
+    bathymetry = area_bathymetry(area, plan.area, plan.altitude_m)
     floor_m = None
     if bathymetry is not None:
         floor_m = bathymetry.depth_at(np.vstack([line.stations_ne for line in plan.lines]))
     stations = stations_of_plan(plan, floor_m)
     seen = certificate(plan.area, rig, stations, plan_pattern(plan, rig))
     out.parent.mkdir(parents=True, exist_ok=True)
-    draw_plan(out, plan, rig, seen, bathymetry, config.sea)
+    save_figure(plan_figure(plan, rig, seen, bathymetry, sea), out)
     return f"map of {plan.name} in {out}", {"plan": plan.name, "file": str(out)}
-
-
-def draw_plan(
-    path: Path,
-    plan: Plan,
-    rig: Rig,
-    certificate: Certificate,
-    bathymetry: Bathymetry | None,
-    sea: SeaConfig,
-) -> None:
-    """Draw a plan, east to the right, north up.
-
-    Args:
-        path: PNG, PDF or SVG.
-        plan: what to draw.
-        rig: its first camera's footprints are drawn.
-        certificate: how many pictures see each place.
-        bathymetry: contours to draw, or None.
-        sea: its mean current near the sea floor is shown.
-
-    Raises:
-        ConfigError: the suffix is not known.
-    """
-    save_figure(plan_figure(plan, rig, certificate, bathymetry, sea), path)
 
 
 @figure_style()
@@ -103,7 +88,15 @@ def plan_figure(
     bathymetry: Bathymetry | None,
     sea: SeaConfig,
 ) -> Sheet:
-    """The map as a figure; arguments are those of `draw_plan`."""
+    """Draw a plan, east to the right, north up.
+
+    Args:
+        plan: what to draw.
+        rig: its first camera's footprints are drawn.
+        certificate: how many pictures see each place.
+        bathymetry: contours to draw, or None.
+        sea: its mean current near the sea floor is shown.
+    """
     outline = footprint_outline(plan, rig)
     shapes = [shape for line in plan.lines for shape in footprints_ne(line, outline)]
     ways = [
@@ -205,7 +198,7 @@ def _draw_lines(axes: Axes, plan: Plan) -> None:
     # Lines and dots leave two thirds of the space between lines to what they cover.
     widest = max(plan.line_spacing_m * _points_per_metre(axes) / 3.0, 0.25)
     size = min(size, widest**2)
-    for kind in KINDS:
+    for kind in LINE_KINDS:
         lines = [line for line in plan.lines if line.kind == kind]
         if not lines:
             continue

@@ -17,7 +17,7 @@ from shapely.geometry import Point
 
 from alice_survey.core.config import AreaConfig, PlanConfig, SurveyConfig
 from alice_survey.core.errors import PlanError, heard, warn
-from alice_survey.sim.vehicle.vehicle import POINT, Hull, Vehicle
+from alice_survey.sim.vehicle.vehicle import POINT, Hull
 from camera_calib.camera import Camera
 from camera_calib.rig import Rig
 from missions.areas.bathymetry import Bathymetry, mean_depth_m, read_bathymetry
@@ -30,15 +30,18 @@ from missions.coverage.stations import (
     sure_pattern,
 )
 from missions.exposure.settings import ImagingSettings, ImagingSetup, imaging_settings
-from missions.exposure.settings_table import Setting
-from missions.exposure.storage import raw_bytes
-from missions.exposure.ways_out import ConflictError
+from missions.exposure.strobe import raw_bytes
 from missions.lines.sweep import Sweep
 from missions.plan.parts import plan_parts
-from missions.plan.ready import check_depth, check_no_stops, check_turns, gap_m, with_tried_ways
-from missions.plan.rows import plan_rows
-from missions.plan.strength import survey_costs, turn_rate_deg_s, warn_of_swell
-from missions.route.energy import sound_craft_of, usable_wh
+from missions.plan.rows import Setting, imaging_rows, plan_rows
+from missions.plan.strength import (
+    check_no_stops,
+    check_turns,
+    survey_costs,
+    turn_rate_deg_s,
+    warn_of_swell,
+)
+from missions.route.energy import flight_conditions, sound_craft_of, usable_wh
 from missions.route.flyable import as_flown, without_stops
 from missions.route.terrain import (
     Reach,
@@ -71,6 +74,8 @@ class Planned:
     """How lines follow the bathymetry; empty without one."""
     warnings: tuple[str, ...]
     """Warnings of the plan."""
+    totals: dict[str, float]
+    """Main figures by name, as tables and pages show them."""
     rows: tuple[Setting, ...]
     """Every setting with its equation, source and limit."""
 
@@ -84,58 +89,44 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
         max_cells: of the certificate of a large area, for a quick look; all else stays the same.
 
     Raises:
-        PlanError: no plan meets the settings; the message names the numbers, and of ways out
-            those that were tried up to where lines are laid.
+        PlanError: no plan meets the settings; the message names the numbers and, where one setting
+            makes a plan possible, its value.
     """
-    try:
-        return _planned(config, rig, max_cells)
-    except ConflictError as found:
-        raise with_tried_ways(found, config, rig) from None
-
-
-def _planned(config: SurveyConfig, rig: Rig, max_cells: int | None) -> Planned:
     with heard() as warnings:
         config, as_set = as_flown(config), config.plan
-        wanted = config.plan
-        if wanted.turn_radius_m > as_set.arc_radius_m:
+        plan = config.plan
+        if plan.turn_radius_m > as_set.arc_radius_m:
             warn(
                 f"{config.vehicle.name} is steered by fins: turns are planned with a radius of "
-                f"{wanted.turn_radius_m:g} m and run-ins of {wanted.run_in_m:g} m; long lines suit "
+                f"{plan.turn_radius_m:g} m and run-ins of {plan.run_in_m:g} m; long lines suit "
                 "it better than short ones"
             )
-        imaging = imaging_settings(rig, ImagingSetup.of(config))
-        check_turns(wanted)
+        setup = ImagingSetup.of(config)
+        imaging = imaging_settings(rig, setup)
+        check_turns(plan)
         step_m = imaging.station_spacing_m
-        stereo = common_swath(rig, wanted.altitude_m, step_m)
-        pattern = sure_pattern(rig, wanted.altitude_m, imaging.line_spacing_m, step_m)
-        area = survey_area(
-            config.area, turn_margin_m=_turn_margin_m(wanted, pattern), margin_m=wanted.margin_m
-        )
-        bathymetry = area_bathymetry(config.area, area, wanted.altitude_m)
-        _check_smallest(area, imaging)
-        _warn_of_spacing(wanted, imaging, stereo)
-        craft, glass_body_m = sound_craft_of(config.vehicle), config.camera.position_body_m
-        hull = craft.hull
-        if hull == POINT:
-            warn(f"{craft.name} has no [hull]: distances to floor and zones are those of one point")
-        _warn_of_zones(area, config.area.no_go_clearance_m, hull, glass_body_m)
-        depth_m = _depth_m(config.area, area, bathymetry)
-        check_depth(wanted.altitude_m, depth_m)
-        home = _home(wanted.home_ne_m, area)
+        stereo = common_swath(rig, plan.altitude_m, step_m)
+        pattern = sure_pattern(rig, plan.altitude_m, imaging.line_spacing_m, step_m)
+        area, bathymetry, depth_m = _site(config.area, plan, pattern, imaging)
+        below_m = depth_m - plan.altitude_m
+        _warn_of_spacing(plan, imaging, stereo)
+        vehicle, glass_body_m = sound_craft_of(config.vehicle), config.camera.position_body_m
+        hull, clearance_m = vehicle.hull, config.area.no_go_clearance_m
+        _warn_of_hull(vehicle.name, area, clearance_m, hull, glass_body_m)
+        home = _home(plan.home_ne_m, area)
         costs = survey_costs(config, imaging_w=imaging.imaging_w)
-        warn_of_swell(config, depth_m)
+        warn_of_swell(flight_conditions(config), config.sea, depth_m, below_m)
         flown = plan_parts(
             area,
-            without_stops(wanted, craft),
+            without_stops(plan, vehicle),
             pattern,
             costs,
             home,
             usable_wh=usable_wh(config.vehicle),
-            depth_m=depth_m - wanted.altitude_m,
+            depth_m=below_m,
         )
         lines, dives, sweep = flown.lines, flown.dives, flown.sweep
-        if craft.fins:
-            check_no_stops(craft, wanted, dives)
+        check_no_stops(vehicle, plan, dives)
         reach = reach_of(
             hull,
             glass_body_m,
@@ -143,15 +134,20 @@ def _planned(config: SurveyConfig, rig: Rig, max_cells: int | None) -> Planned:
             max(stereo.ahead_m, stereo.astern_m),
         )
         camera = rig.cameras[rig.reference]
-        depths_m, terrain, figures = _terrain(lines, wanted, reach, pattern, camera, bathymetry)
-        _check_rating(craft, max([depth_m - wanted.altitude_m, *chain.from_iterable(depths_m)]))
-        plan = Plan(
+        depths_m, terrain, figures = _terrain(lines, plan, reach, pattern, camera, bathymetry)
+        deepest_m, rating_m = max([below_m, *chain.from_iterable(depths_m)]), vehicle.depth_rating_m
+        if rating_m is not None and deepest_m > rating_m:
+            raise PlanError(
+                f"{vehicle.name} is built for {rating_m:g} m and would fly at {deepest_m:.0f} m: "
+                "choose another vehicle.name, or check area.seafloor_depth_m"
+            )
+        laid = Plan(
             name=config.name,
             area=area,
             home_ne_m=home,
             seafloor_depth_m=depth_m,
-            altitude_m=wanted.altitude_m,
-            speed_mps=wanted.speed_mps,
+            altitude_m=plan.altitude_m,
+            speed_mps=plan.speed_mps,
             interval_s=imaging.interval_s,
             exposure_s=imaging.exposure_s,
             strobe_pulse_s=imaging.strobe_pulse_s,
@@ -163,8 +159,8 @@ def _planned(config: SurveyConfig, rig: Rig, max_cells: int | None) -> Planned:
             reached_side_overlap=imaging.spacing.mean_overlap,
             lines=lines,
             dives=dives,
-            turn_radius_m=wanted.arc_radius_m,
-            run_in_m=wanted.run_in_m,
+            turn_radius_m=plan.arc_radius_m,
+            run_in_m=plan.run_in_m,
             length_m=sum(dive.route.length_m for dive in dives),
             duration_s=sum(dive.duration_s for dive in dives),
             energy_wh=sum(dive.energy_wh for dive in dives),
@@ -172,7 +168,7 @@ def _planned(config: SurveyConfig, rig: Rig, max_cells: int | None) -> Planned:
             line_depths_m=depths_m,
             details={},
         )
-        stations = _stations(plan, bathymetry)
+        stations = _stations(laid, bathymetry)
         seen = certificate(area, rig, stations, pattern, max_cells=max_cells)
         if seen.share_at_overlap < _ENOUGH:
             warn(
@@ -180,10 +176,14 @@ def _planned(config: SurveyConfig, rig: Rig, max_cells: int | None) -> Planned:
                 f"and {1 - seen.every_camera_share:.2%} is not seen by every camera: look at "
                 "map.png, and give the vehicle more room, or raise the overlaps"
             )
-        about = _details(imaging, sweep, stereo, rig, wanted)
+        rows = imaging_rows(imaging, setup)
+        about = _details(imaging, sweep, stereo, rig, plan)
+        about["imaging"]["rows"] = [row.to_json() for row in rows]
         about |= {"terrain": figures, "warnings": warnings}
         details = json.loads(json.dumps(about))  # as they are read back
-        finished = replace(plan, coverage=seen.share_at_overlap, details=details)
+        finished = replace(laid, coverage=seen.share_at_overlap, details=details)
+        totals = _totals(finished, imaging, seen, rig)
+        totals |= {"usable_wh": usable_wh(config.vehicle), "aperture": config.camera.f_number}
         planned = Planned(
             plan=finished,
             imaging=imaging,
@@ -192,16 +192,83 @@ def _planned(config: SurveyConfig, rig: Rig, max_cells: int | None) -> Planned:
             bathymetry=bathymetry,
             warnings=(),
             terrain=terrain,
-            rows=(*imaging.rows, *plan_rows(finished, seen, sweep, config.vehicle, rig)),
+            totals=totals,
+            rows=(*rows, *plan_rows(finished, totals, seen, sweep, config.vehicle)),
         )
     return replace(planned, warnings=tuple(warnings))
 
 
-def _turn_margin_m(plan: PlanConfig, pattern: Pattern) -> float:
-    """Room around the area for the widest turn: run-out, and a loop of three quarters of a turn."""
-    outside = max(pattern.overhang_m, pattern.edge_m, 0.0)
-    outside += max(pattern.spacing_m, pattern.step_m) / 2
-    return outside + plan.run_in_m + 3.0 * plan.arc_radius_m
+def _totals(plan: Plan, imaging: ImagingSettings, seen: Certificate, rig: Rig) -> dict[str, float]:
+    """Main figures of a plan, but for those of its settings."""
+    cameras = len(rig.cameras)
+    return {
+        "area_m2": plan.area.survey.area,
+        "lines": len(plan.lines),
+        "heading_deg": math.degrees(plan.lines[0].heading_rad),
+        "lines_m": sum(line.length_m for line in plan.lines),
+        "stations": plan.stations,
+        "pictures": plan.stations * cameras,
+        "length_m": plan.length_m,
+        "duration_s": plan.duration_s,
+        "energy_wh": plan.energy_wh,
+        "longest_dive_wh": max(dive.energy_wh for dive in plan.dives),
+        "dives": len(plan.dives),
+        "data_gb": raw_bytes(rig.cameras[rig.reference], cameras, plan.stations) / 1e9,
+        "altitude_m": plan.altitude_m,
+        "speed_mps": plan.speed_mps,
+        "interval_s": plan.interval_s,
+        "exposure_s": plan.exposure_s,
+        "gain_db": imaging.light.gain_db,
+        "sharp_from_m": imaging.focus.near_altitude_m,
+        "sharp_to_m": imaging.focus.far_altitude_m,
+        "gsd_mm": 1e3 * imaging.pixel_m,
+        "line_spacing_m": plan.line_spacing_m,
+        "forward_overlap": plan.reached_forward_overlap,
+        "side_overlap": plan.reached_side_overlap,
+        "covered": seen.covered_share,
+        "stereo": seen.stereo_share,
+        "at_overlap": seen.share_at_overlap,
+    }
+
+
+def _site(
+    settings: AreaConfig, plan: PlanConfig, pattern: Pattern, imaging: ImagingSettings
+) -> tuple[Area, Bathymetry | None, float]:
+    """The area, its bathymetry where one is set, and the mean depth of the sea floor.
+
+    Raises:
+        PlanError: the area is smaller than a picture, or the vehicle would fly above the water.
+    """
+    outside_m = max(pattern.overhang_m, pattern.edge_m, 0.0)
+    outside_m += max(pattern.spacing_m, pattern.step_m) / 2
+    # Room for the widest turn: run-out, and a loop of three quarters of a turn.
+    turn_margin_m = outside_m + plan.run_in_m + 3.0 * plan.arc_radius_m
+    area = survey_area(settings, turn_margin_m=turn_margin_m, margin_m=plan.margin_m)
+    bathymetry = area_bathymetry(settings, area, plan.altitude_m)
+    across_m, along_m = imaging.footprint_across_m, imaging.footprint_along_m
+    north_0, east_0, north_1, east_1 = area.survey.bounds
+    diagonal_m = math.hypot(north_1 - north_0, east_1 - east_0)
+    if diagonal_m < min(across_m, along_m):
+        raise PlanError(
+            f"area: {diagonal_m:.2g} m across is less than one picture of {across_m:.2f} x "
+            f"{along_m:.2f} m: nothing to plan; plan.margin_m adds its surroundings"
+        )
+    depth_m = set_m = settings.seafloor_depth_m
+    if bathymetry is not None:
+        depth_m = mean_depth_m(bathymetry, area.survey)
+        is_set = "seafloor_depth_m" in settings.model_fields_set
+        if is_set and abs(depth_m - set_m) > max(0.5, 0.05 * set_m):
+            warn(
+                f"{bathymetry.name}: the sea floor of the area is {depth_m:.2f} m deep in the "
+                f"mean, area.seafloor_depth_m is {set_m:g}: the plan uses {depth_m:.2f}; set "
+                "area.seafloor_depth_m to it, for light and refraction"
+            )
+    if plan.altitude_m >= depth_m:
+        raise PlanError(
+            f"altitude_m {plan.altitude_m:g} is not below the surface over a sea floor at "
+            f"{depth_m:g} m: lower plan.altitude_m or check area.seafloor_depth_m"
+        )
+    return area, bathymetry, depth_m
 
 
 def _home(given: tuple[float, float] | None, area: Area) -> tuple[float, float]:
@@ -247,25 +314,9 @@ def area_bathymetry(settings: AreaConfig, area: Area, altitude_m: float) -> Bath
     )
 
 
-def _depth_m(settings: AreaConfig, area: Area, bathymetry: Bathymetry | None) -> float:
-    """Mean depth of the sea floor, as set or as the bathymetry has it."""
-    set_m = settings.seafloor_depth_m
-    if bathymetry is None:
-        return set_m
-    mean_m = mean_depth_m(bathymetry, area.survey)
-    is_set = "seafloor_depth_m" in settings.model_fields_set
-    if is_set and abs(mean_m - set_m) > max(0.5, 0.05 * set_m):
-        warn(
-            f"{bathymetry.name}: the sea floor of the area is {mean_m:.2f} m deep in the "
-            f"mean, area.seafloor_depth_m is {set_m:g}: the plan uses {mean_m:.2f}; set "
-            "area.seafloor_depth_m to it, for light and refraction"
-        )
-    return mean_m
-
-
 def _terrain(
     lines: Sequence[Line],
-    wanted: PlanConfig,
+    plan: PlanConfig,
     reach: Reach,
     pattern: Pattern,
     camera: Camera,
@@ -275,16 +326,16 @@ def _terrain(
     if bathymetry is None:
         return (), "", None
     limits = TerrainLimits(
-        altitude_m=wanted.altitude_m,
-        least_clearance_m=wanted.least_clearance_m,
-        steepest_rad=math.radians(wanted.steepest_deg),
+        altitude_m=plan.altitude_m,
+        least_clearance_m=plan.least_clearance_m,
+        steepest_rad=math.radians(plan.steepest_deg),
     )
     profiles = line_profiles(lines, bathymetry, reach, limits)
     text, figures = terrain_report(
         lines,
         profiles,
         limits,
-        relief_m=wanted.relief_m,
+        relief_m=plan.relief_m,
         spacing_m=pattern.spacing_m,
         step_m=pattern.step_m,
         extent_m=partial(footprint_size_m, camera),
@@ -311,30 +362,12 @@ def _stations(plan: Plan, bathymetry: Bathymetry | None) -> Stations:
     return stations.some(np.flatnonzero(near))
 
 
-def _check_rating(craft: Vehicle, deepest_m: float) -> None:
-    if craft.depth_rating_m is not None and deepest_m > craft.depth_rating_m:
-        raise PlanError(
-            f"{craft.name} is built for {craft.depth_rating_m:g} m and would fly at "
-            f"{deepest_m:.0f} m: choose another vehicle.name, or check area.seafloor_depth_m"
-        )
-
-
-def _check_smallest(area: Area, imaging: ImagingSettings) -> None:
-    min_m = min(imaging.footprint_across_m, imaging.footprint_along_m)
-    north_0, east_0, north_1, east_1 = area.survey.bounds
-    diagonal_m = math.hypot(north_1 - north_0, east_1 - east_0)
-    if diagonal_m < min_m:
-        raise PlanError(
-            f"area: {diagonal_m:.2g} m across is less than one picture of "
-            f"{imaging.footprint_across_m:.2f} x {imaging.footprint_along_m:.2f} m: nothing to "
-            "plan; plan.margin_m adds its surroundings"
-        )
-
-
-def _warn_of_zones(
-    area: Area, clearance_m: float, hull: Hull, glass_body_m: tuple[float, float, float]
+def _warn_of_hull(
+    name: str, area: Area, clearance_m: float, hull: Hull, glass_body_m: tuple[float, float, float]
 ) -> None:
     """The allowed area holds the camera: the hull behind it reaches farther."""
+    if hull == POINT:
+        warn(f"{name} has no [hull]: distances to floor and zones are those of one point")
     forward_m, right_m, _ = glass_body_m
     behind_m = math.hypot(hull.tail_m + forward_m, hull.half_breadth_m + abs(right_m))
     if not area.no_go.is_empty and clearance_m < behind_m:
@@ -347,7 +380,7 @@ def _warn_of_zones(
 
 def _warn_of_spacing(plan: PlanConfig, imaging: ImagingSettings, stereo: Swath) -> None:
     spacing_m, reached = imaging.line_spacing_m, imaging.spacing.mean_overlap
-    gap = gap_m(imaging, stereo)
+    gap = spacing_m - 2 * stereo.half_across_m
     if gap > 0:
         warn(
             f"lines {spacing_m:g} m apart leave gaps of {gap:.2f} m in stereo; at most "

@@ -1,4 +1,4 @@
-"""A plan at a glance, as JSON values for a page that plans while somebody draws.
+"""A plan at a glance, as JSON values for a page that plans while somebody draws, and played back.
 
 All totals are those of the plan itself. Only the certificate of a large area is counted on a
 coarser grid (`MAX_CELLS`): the shares that it gives, and the holes, are then estimates, and
@@ -9,14 +9,13 @@ import base64
 import io
 import math
 import time
-from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.core.artefacts import json_values
-from alice_survey.core.config import SurveyConfig
+from alice_survey.core.config import PlanConfig, SurveyConfig
 from alice_survey.core.errors import AliceError, collected_by
 from alice_survey.core.frames import Array
 from camera_calib.rig import Rig, design_rig
@@ -24,13 +23,11 @@ from missions.areas.bathymetry import Bathymetry
 from missions.coverage.certificate import Certificate
 from missions.coverage.holes import find_holes
 from missions.exports.geometry import dive_of_line, footprint_outline, rings_ne, route_ne
-from missions.exposure.settings_table import Setting
-from missions.exposure.storage import raw_bytes
-from missions.exposure.ways_out import ConflictError
+from missions.exposure.conflict import ConflictError
 from missions.plan.planner import Planned, plan_survey
-from missions.plan.playback import depths_along
-from missions.route.energy import craft_of, usable_wh
-from missions.values.plan_file import Plan
+from missions.plan.run import station_times_s
+from missions.values.costs import Costs, leg_costs
+from missions.values.plan_file import Dive, Plan
 
 MAX_CELLS = 400_000
 """Cells of the certificate of a large area."""
@@ -45,6 +42,8 @@ _DETAIL = 1 / 5000
 _FINEST_M = 0.005
 _BINDS = 0.01
 """A limit binds what is within this share of it."""
+_TURN_RAD = 0.2
+"""Angle of an arc from place to place of a playback."""
 
 
 def preview(config: SurveyConfig) -> dict[str, Any]:
@@ -54,45 +53,30 @@ def preview(config: SurveyConfig) -> dict[str, Any]:
         config: of the survey.
 
     Returns:
-        With `ok` true the plan, with `ok` false why there is none, and the ways out that work.
+        With `ok` true the plan, with `ok` false why there is none, and the setting that would help.
     """
     began = time.thread_time()
     try:
         with collected_by(lambda _, __: None):
             rig = design_rig(config.camera, config.water)
             planned = plan_survey(config, rig, max_cells=MAX_CELLS)
-            found = planned_json(planned, rig, config)
+            found = _plan_json(planned, rig, config.plan)
     except AliceError as error:
         found = refusal_json(error)
     return {**found, "cpu_s": round(time.thread_time() - began, 3)}
 
 
 def refusal_json(error: AliceError) -> dict[str, Any]:
-    """Why there is no plan, and what would help: each way out with the settings that it changes."""
-    if not isinstance(error, ConflictError):
-        return {"ok": False, "error": " ".join(str(error).splitlines()), "what": str(error),
-                "limits": [], "ways": []}  # fmt: skip
-    one, other = error.limits
-    return {
-        "ok": False,
-        "error": f"{error.what}: {one} conflicts with {other}",
-        "what": error.what,
-        "limits": [one, other],
-        "ways": [
-            {"change": way.change, "price": way.price, "changes": _by_section(way.settings)}
-            for way in error.ways
-        ],
-    }
+    """Why there is no plan, and the change of a setting that would help, or null."""
+    changes = None
+    if isinstance(error, ConflictError) and error.suggestion is not None:
+        name, value = error.suggestion
+        section, key = name.split(".")
+        changes = {section: {key: value}}
+    return {"ok": False, "error": " ".join(str(error).splitlines()), "suggestion": changes}
 
 
-def planned_json(planned: Planned, rig: Rig, config: SurveyConfig) -> dict[str, Any]:
-    """A plan as JSON values.
-
-    Args:
-        planned: the plan and what led to it.
-        rig: its cameras in water.
-        config: what it was planned from.
-    """
+def _plan_json(planned: Planned, rig: Rig, settings: PlanConfig) -> dict[str, Any]:
     plan, seen = planned.plan, planned.certificate
     dives = dive_of_line(plan)
     ends = np.array([(*line.start_ne_m, *line.end_ne_m) for line in plan.lines])
@@ -100,7 +84,7 @@ def planned_json(planned: Planned, rig: Rig, config: SurveyConfig) -> dict[str, 
     detail_m = max(_FINEST_M, max(north_1 - north_0, east_1 - east_0) * _DETAIL)
     return {
         "ok": True,
-        "totals": _totals(planned, rig, config),
+        "totals": planned.totals,
         "lines": [
             {"kind": line.kind, "from": place[:2], "to": place[2:], "stations": line.stations,
              "dive": dives[index]}
@@ -124,133 +108,55 @@ def planned_json(planned: Planned, rig: Rig, config: SurveyConfig) -> dict[str, 
         },
         "holes": _holes(seen),
         "profile": _profile(plan, planned.bathymetry),
-        "limits": list(_limits(planned, config)),
-        "rows": [[row.name, row.text, _reason(row)] for row in planned.rows],
+        "limits": _limits(planned, settings),
+        "rows": [
+            [row.name, row.text, "; ".join(filter(None, (row.bound_by, row.note)))]
+            for row in planned.rows
+        ],
         "warnings": list(planned.warnings),
     }  # fmt: skip
 
 
-def _totals(planned: Planned, rig: Rig, config: SurveyConfig) -> dict[str, Any]:
-    plan, imaging, seen = planned.plan, planned.imaging, planned.certificate
-    lines_m = sum(line.length_m for line in plan.lines)
-    return {
-        "area_m2": seen.area_m2,
-        "lines": len(plan.lines),
-        "heading_deg": math.degrees(plan.lines[0].heading_rad),
-        "lines_m": lines_m,
-        "stations": plan.stations,
-        "pictures": plan.stations * len(rig.cameras),
-        "length_m": plan.length_m,
-        "duration_s": plan.duration_s,
-        "energy_wh": plan.energy_wh,
-        "usable_wh": usable_wh(config.vehicle),
-        "longest_dive_wh": max(dive.energy_wh for dive in plan.dives),
-        "dives": len(plan.dives),
-        "data_gb": raw_bytes(rig.cameras[rig.reference], len(rig.cameras), plan.stations) / 1e9,
-        "altitude_m": plan.altitude_m,
-        "seafloor_depth_m": plan.seafloor_depth_m,
-        "interval_s": plan.interval_s,
-        "exposure_s": plan.exposure_s,
-        "gain_db": imaging.light.gain_db,
-        "aperture": config.camera.f_number,
-        "focus_air_m": imaging.focus.focus_air_m,
-        "sharp_from_m": imaging.focus.near_altitude_m,
-        "sharp_to_m": imaging.focus.far_altitude_m,
-        "gsd_mm": 1e3 * imaging.pixel_m,
-        "blur_px": imaging.blur_px,
-        "snr": imaging.light.snr_median,
-        "line_spacing_m": plan.line_spacing_m,
-        "station_spacing_m": plan.station_spacing_m,
-        "forward_overlap": plan.reached_forward_overlap,
-        "side_overlap": plan.reached_side_overlap,
-        "covered": seen.covered_share,
-        "stereo": seen.stereo_share,
-        "at_overlap": seen.share_at_overlap,
-        "speed_mps": plan.speed_mps,
-    }
-
-
-def _limits(planned: Planned, config: SurveyConfig) -> Iterator[dict[str, Any]]:
+def _limits(planned: Planned, settings: PlanConfig) -> list[dict[str, Any]]:
     """The limits of the plan: which keep it from being better, and how far off the others are."""
-    plan, imaging, wanted = planned.plan, planned.imaging, config.plan
-    maximum, minimum = _at_most, _at_least
-    longest = max(plan.dives, key=lambda dive: dive.energy_wh)
-    yield maximum(
-        "battery", longest.energy_wh, usable_wh(config.vehicle), "Wh",
-        "energy of the longest dive, of what the battery has above its reserve",
-        binds=len(plan.dives) > len(plan.homes_ne_m),
-    )  # fmt: skip
-    if wanted.dive_s is not None:
-        time_s = max(dive.duration_s for dive in plan.dives)
-        yield maximum("plan.dive_s", time_s, wanted.dive_s, "s", "time of the longest dive")
-    yield minimum(
-        "camera.shortest_interval_s", imaging.interval_s, imaging.shortest_interval_s, "s",
-        "time between pictures, of the least that cameras and trigger take",
-    )  # fmt: skip
-    yield maximum(
-        "plan.allowed_blur_px", imaging.blur_px, wanted.allowed_blur_px, "px",
-        "motion blur: it sets how long pictures are exposed",
-    )  # fmt: skip
-    yield maximum(
-        "plan.sharp_px", imaging.focus.blur_px, wanted.sharp_px, "px",
-        "blur out of focus at the ends of the relief",
-    )  # fmt: skip
-    yield maximum(
-        "light", imaging.light.needed_light, 1.0, "",
-        "light that is needed, as a share of what strobes and water give",
-    )  # fmt: skip
-    yield minimum(
-        "plan.least_clearance_m", wanted.altitude_m - wanted.relief_m, wanted.least_clearance_m,
-        "m", "height above the top of the relief",
-    )  # fmt: skip
-    if planned.plan.details["stereo_swath_m"]:
-        yield maximum(
-            "stereo swath", plan.line_spacing_m, plan.details["stereo_swath_m"], "m",
-            "distance between lines, of the width that all cameras see",
-        )  # fmt: skip
-    yield maximum(
-        "plan.turn_rate_limit_deg_s", plan.details["turn_rate_deg_s"],
-        wanted.turn_rate_limit_deg_s, "deg/s", "rate of turn in arcs",
-    )  # fmt: skip
-    yield maximum(
-        "strobe duty", imaging.strobe.duty, imaging.strobe.duty_limit, "",
-        "share of the time that LEDs are lit, of what they bear in warm water",
-    )  # fmt: skip
-    yield maximum(
-        "one cable", 1.0 / imaging.interval_s, imaging.storage.shared_link_hz, "Hz",
-        "triggers a second, of what one cable carries of all cameras",
-    )  # fmt: skip
-    rating_m = craft_of(config.vehicle).depth_rating_m
-    if rating_m is not None:
-        deepest = max((max(row) for row in plan.line_depths_m), default=math.nan)
-        depth_m = deepest if plan.line_depths_m else plan.seafloor_depth_m - plan.altitude_m
-        yield maximum(
-            "depth rating", depth_m, rating_m, "m", "depth, of what the hull is built for"
-        )
-
-
-def _at_most(
-    name: str, value: float, limit: float, unit: str, about: str, *, binds: bool | None = None
-) -> dict[str, Any]:
-    return _limit(name, value, limit, unit, about, value >= limit * (1 - _BINDS), binds)
-
-
-def _at_least(name: str, value: float, limit: float, unit: str, about: str) -> dict[str, Any]:
-    return _limit(name, value, limit, unit, about, value <= limit * (1 + _BINDS), None)
-
-
-def _limit(
-    name: str, value: float, limit: float, unit: str, about: str, near: bool, binds: bool | None
-) -> dict[str, Any]:
-    return {
-        "name": name, "value": float(value), "limit": float(limit), "unit": unit,
-        "binds": bool(near if binds is None else binds),
-        "text": f"{about}: {value:.4g} of {limit:.4g} {unit}".rstrip(),
-    }  # fmt: skip
-
-
-def _reason(row: Setting) -> str:
-    return "; ".join(filter(None, (row.bound_by, row.note)))
+    plan, imaging, totals = planned.plan, planned.imaging, planned.totals
+    dive_s = max(dive.duration_s for dive in plan.dives)
+    stereo_m = plan.details["stereo_swath_m"]
+    clearance_m = settings.altitude_m - settings.relief_m
+    rows: list[tuple[str, float, float | None, str, str]] = [
+        ("battery", totals["longest_dive_wh"], totals["usable_wh"], "Wh",
+         "energy of the longest dive, of what the battery has above its reserve"),
+        ("plan.dive_s", dive_s, settings.dive_s, "s", "time of the longest dive"),
+        ("camera.shortest_interval_s", 1 / imaging.interval_s, 1 / imaging.shortest_interval_s,
+         "Hz", "pictures a second, of the most that cameras and trigger take"),
+        ("plan.allowed_blur_px", imaging.blur_px, settings.allowed_blur_px, "px",
+         "motion blur: it sets how long pictures are exposed"),
+        ("plan.sharp_px", imaging.focus.blur_px, settings.sharp_px, "px",
+         "blur out of focus at the ends of the relief"),
+        ("light", imaging.light.needed_light, 1.0, "",
+         "light that is needed, as a share of what strobes and water give"),
+        ("plan.least_clearance_m", settings.least_clearance_m, clearance_m, "m",
+         "clearance requested, of the height above the top of the relief"),
+        ("stereo swath", plan.line_spacing_m, stereo_m or None, "m",
+         "distance between lines, of the width that all cameras see"),
+        ("plan.turn_rate_limit_deg_s", plan.details["turn_rate_deg_s"],
+         settings.turn_rate_limit_deg_s, "deg/s", "rate of turn in arcs"),
+        ("strobe duty", imaging.strobe.duty, imaging.strobe.duty_limit, "",
+         "share of the time that LEDs are lit, of what they bear in warm water"),
+        ("one cable", 1.0 / imaging.interval_s, imaging.storage.shared_link_hz, "Hz",
+         "triggers a second, of what one cable carries of all cameras"),
+    ]  # fmt: skip
+    return [
+        {
+            "name": name,
+            # A battery binds where it divides a survey.
+            "binds": len(plan.dives) > len(plan.homes_ne_m) if name == "battery"
+            else value >= limit * (1 - _BINDS),
+            "text": f"{about}: {value:.4g} of {limit:.4g} {unit}".rstrip(),
+        }
+        for name, value, limit, unit, about in rows
+        if limit is not None
+    ]  # fmt: skip
 
 
 def _holes(seen: Certificate) -> list[dict[str, Any]]:
@@ -292,14 +198,6 @@ def _profile(plan: Plan, bathymetry: Bathymetry | None) -> dict[str, Any]:
 def _rounded(points: Array) -> list[list[float]]:
     rows: list[list[float]] = (np.round(points, 3) + 0.0).tolist()
     return rows
-
-
-def _by_section(settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    result: dict[str, dict[str, Any]] = {}
-    for name, value in settings.items():
-        section, key = name.split(".")
-        result.setdefault(section, {})[key] = json_values(value)
-    return result
 
 
 def counts_picture(seen: Certificate) -> tuple[NDArray[np.uint8], tuple[float, float], float]:
@@ -360,3 +258,86 @@ def _png(pixels: NDArray[np.uint8]) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, format="PNG")
     return buffer.getvalue()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Playback:
+    """Moments of all dives, one after the other."""
+
+    time_s: Array
+    """(T,) seconds from the start of the first dive; a dive begins when the one before is up."""
+    glass_ne: Array
+    """(T, 2) the left port's glass."""
+    depth_m: Array
+    """(T,) of the glass."""
+    altitude_m: Array
+    """(T,) of the glass above the floor."""
+    heading_rad: Array
+    """(T,) of the vehicle, without jumps within a dive."""
+    pictures_s: Array
+    """(S,) when pictures are taken."""
+
+
+def play(plan: Plan, costs: Costs, bathymetry: Bathymetry | None) -> Playback:
+    """Play a plan back.
+
+    Args:
+        plan: it.
+        costs: of the vehicle, by which legs take their time.
+        bathymetry: of the sea floor; None: it is level.
+    """
+    times, places, headings, depths, floors, pictures = [], [], [], [], [], []
+    begin_s = 0.0
+    for dive in plan.dives:
+        time_s, along_m, heading_rad = _dive(dive, costs)
+        glass_m, floor_m = depths_along(plan, dive, along_m, bathymetry)
+        times.append(begin_s + time_s)
+        places.append(dive.route.places(along_m))
+        headings.append(heading_rad)
+        depths.append(glass_m)
+        floors.append(floor_m)
+        pictures.append(begin_s + np.array(station_times_s(plan, dive, costs)))
+        begin_s += dive.duration_s
+    return Playback(
+        time_s=np.concatenate(times),
+        glass_ne=np.vstack(places),
+        depth_m=np.concatenate(depths),
+        altitude_m=np.concatenate(floors) - np.concatenate(depths),
+        heading_rad=np.concatenate(headings),
+        pictures_s=np.concatenate(pictures),
+    )
+
+
+def depths_along(
+    plan: Plan, dive: Dive, along_m: Array, bathymetry: Bathymetry | None
+) -> tuple[Array, Array]:
+    """Depths of the glass and of the floor, (N,) both, at distances (N,) along a dive's way.
+
+    Between lines the vehicle goes evenly from the depth of one to that of the next.
+    """
+    floor = np.full(len(along_m), plan.seafloor_depth_m)
+    if bathymetry is not None:
+        floor = bathymetry.depth_at(dive.route.places(along_m))
+    if not plan.line_depths_m:
+        return np.full(len(along_m), plan.seafloor_depth_m - plan.altitude_m), floor
+    at, depths = [], []
+    for start_m, leg in zip(dive.route.starts_m, dive.route.legs, strict=False):
+        if leg.line >= 0:
+            row = plan.line_depths_m[leg.line]
+            at.append(start_m + np.linspace(0.0, leg.length_m, len(row)))
+            depths.append(np.array(row))
+    return np.interp(along_m, np.concatenate(at), np.concatenate(depths)), floor
+
+
+def _dive(dive: Dive, costs: Costs) -> tuple[Array, Array, Array]:
+    """Times from the dive's start, distances along its way, headings."""
+    _, took_s = leg_costs(dive.route, costs)
+    starts_s = costs.settle_s + np.concatenate([[0.0], np.cumsum(took_s)])
+    times, along, headings = [], [], []
+    for i, leg in enumerate(dive.route.legs):
+        turned = leg.curvature_per_m * leg.length_m
+        share = np.linspace(0.0, 1.0, max(1, math.ceil(abs(turned) / _TURN_RAD)) + 1)
+        times.append(starts_s[i] + share * took_s[i])
+        along.append(dive.route.starts_m[i] + share * leg.length_m)
+        headings.append(leg.heading_rad + leg.side_rad + share * (turned + leg.turn_rad))
+    return np.concatenate(times), np.concatenate(along), np.unwrap(np.concatenate(headings))

@@ -1,24 +1,39 @@
-"""The stage `plan`: a survey planned, and written for the next stages, for people, for vehicles."""
+"""The stage `plan`: a survey planned, and written for the next stages, for people, for vehicles.
 
+Also when the trigger controller opens cameras and lights strobes, in whole microseconds: a
+trigger's time is the middle of its exposure, as everywhere in a survey. The strobe is lit before
+the cameras open and goes out after they close, by its lead.
+"""
+
+import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from alice_survey.core.artefacts import write_json
+from alice_survey.core.artefacts import write_csv, write_json
 from alice_survey.core.config import SeaConfig, SurveyConfig
+from alice_survey.core.errors import PlanError
 from alice_survey.core.executor import Executor
 from alice_survey.core.run import progress
+from alice_survey.kit.figure import save_figure
 from camera_calib.rig import Rig, design_rig
 from missions.exports.options import Options, options_of
 from missions.exports.write import write_exports
-from missions.exposure.settings_table import settings_table
-from missions.exposure.timetable import trigger_table, write_timetable
-from missions.plan.map import draw_plan
+from missions.plan.map import plan_figure
 from missions.plan.planner import Planned, plan_survey
+from missions.plan.rows import settings_table
 from missions.values.costs import Costs, leg_costs
 from missions.values.plan_file import Dive, Plan
 
 _SAME_S = 1e-3
+_US = 1_000_000
+HEADER = (
+    "trigger", "trigger_us", "strobe_on_us", "camera_open_us", "camera_close_us", "strobe_off_us",
+    "strobe_on_rel_us", "camera_open_rel_us", "camera_close_rel_us", "strobe_off_rel_us",
+)  # fmt: skip
+"""Columns of the time table: times since the start, then the same relative to the trigger."""
 
 
 def run_plan(workspace: Path, folder: Path, executor: Executor, *, survey: SurveyConfig) -> None:
@@ -56,7 +71,8 @@ def write_planned(
     table = "\n\n".join(filter(None, (settings_table(planned.rows), planned.terrain)))
     (folder / "settings.txt").write_text(table + "\n", encoding="utf-8")
     write_triggers(folder, plan, planned.costs, planned.imaging.shortest_interval_s)
-    draw_plan(folder / "map.png", plan, rig, planned.certificate, planned.bathymetry, sea)
+    figure = plan_figure(plan, rig, planned.certificate, planned.bathymetry, sea)
+    save_figure(figure, folder / "map.png")
     write_exports(folder / "exports", plan, rig, options=options)
 
 
@@ -73,7 +89,7 @@ def write_triggers(folder: Path, plan: Plan, costs: Costs, shortest_interval_s: 
             plan.strobe_lead_s,
             shortest_interval_s,
         )
-        write_timetable(folder / name, rows)
+        write_csv(folder / name, HEADER, rows.tolist())
 
 
 def station_times_s(plan: Plan, dive: Dive, costs: Costs) -> list[float]:
@@ -91,3 +107,65 @@ def station_times_s(plan: Plan, dive: Dive, costs: Costs) -> list[float]:
             again = bool(times) and passed[0] - times[-1] < _SAME_S
             times += passed[1:] if again else passed
     return times
+
+
+def trigger_edges(exposure_s: float, lead_s: float) -> NDArray[np.int64]:
+    """Edges of one trigger: strobe on, camera open, camera close, strobe off; us from its time.
+
+    The exposure is a whole number of microseconds, the lead rounded up to one.
+
+    Raises:
+        PlanError: the exposure is shorter than 1 us or the lead negative.
+    """
+    exposure_us, lead_us = round(exposure_s * _US), math.ceil(lead_s * _US - 1e-6)
+    if exposure_us < 1 or lead_us < 0:
+        raise PlanError(
+            f"an exposure of {exposure_s:g} s with the strobe lit {lead_s:g} s before it: raise "
+            "the exposure above 1 us and strobe_lead_s to 0 or more"
+        )
+    before = exposure_us // 2
+    after = exposure_us - before
+    return np.array([-before - lead_us, -before, after, after + lead_us])
+
+
+def trigger_table(
+    times_s: Sequence[float], exposure_s: float, lead_s: float, shortest_interval_s: float
+) -> NDArray[np.int64]:
+    """The time table of some triggers, (T, 10) with the columns `HEADER`.
+
+    Args:
+        times_s: middles of the exposures since the start, rising.
+        exposure_s: of the cameras.
+        lead_s: of the strobes before the exposure and after it.
+        shortest_interval_s: of the cameras and the controller.
+
+    Raises:
+        PlanError: a trigger follows another too soon, overlaps it, or its strobe would have to be
+            lit before the start; the message names it.
+    """
+    relative = trigger_edges(exposure_s, lead_s)
+    trigger_us = np.round(np.asarray(times_s, dtype=np.float64) * _US).astype(np.int64)
+    edges = trigger_us[:, None] + relative
+    # Rounding moves each trigger by half a microsecond at most.
+    soon = np.flatnonzero(np.diff(trigger_us) < round(shortest_interval_s * _US) - 1)
+    if len(soon):
+        i = int(soon[0]) + 1
+        raise PlanError(
+            f"trigger {i} at {trigger_us[i] / _US:.6f} s follows the one before by "
+            f"{(trigger_us[i] - trigger_us[i - 1]) / _US:.6f} s; the shortest interval is "
+            f"{shortest_interval_s:g} s: lower speed_mps or forward_overlap"
+        )
+    lit = np.flatnonzero(edges[1:, 0] <= edges[:-1, 3])
+    if len(lit):
+        i = int(lit[0]) + 1
+        raise PlanError(
+            f"trigger {i}: its strobe would be lit at {edges[i, 0]} us, before it goes out at "
+            f"{edges[i - 1, 3]} us: lower strobe_lead_s or allowed_blur_px"
+        )
+    if len(edges) and edges[0, 0] < 0:
+        raise PlanError(
+            f"the first trigger, at {times_s[0]:.6f} s, needs its strobe {-edges[0, 0]} us before "
+            "the start: begin later"
+        )
+    count = len(edges)
+    return np.column_stack([np.arange(count), trigger_us, edges, np.tile(relative, (count, 1))])

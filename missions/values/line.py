@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from alice_survey.core.frames import Array
 LineKind = Literal["survey", "cross", "closing", "fill", "tie"]
 """survey: of the pattern. cross: across it. closing: back over the start, so that the block's end
 is tied to its beginning. fill: what the pattern could not reach."""
+LINE_KINDS: tuple[LineKind, ...] = get_args(LineKind)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -39,14 +39,17 @@ def read_and_check_survey(path: Path) -> object:
     """The settings, used up to where lines are laid; what planning refuses is one line here."""
     from alice_survey.core.config import load_config
     from alice_survey.core.errors import ConfigError, PlanError, VehicleError
-    from camera_calib.rig import design_rig
-    from missions.plan.ready import check_ready
+    from missions.exposure.settings import ImagingSetup, imaging_settings
+    from missions.plan.strength import check_turns, survey_costs
 
     config = load_config(path)
+    setup = ImagingSetup.of(config)
     try:
-        return check_ready(config, design_rig(config.camera, config.water), {})
+        check_turns(config.plan)
+        imaging = imaging_settings(setup.rig, setup)
+        return survey_costs(config, imaging_w=imaging.imaging_w)
     except (PlanError, VehicleError) as error:
-        said = str(error).split("; ways out")[0]
+        said = str(error)
         if re.search(r"\d{20}|\b(nan|inf)\b", said):
             raise ValueError(f"no number to read: {said}") from None
         raise ConfigError(f"{path}: {said}") from None

@@ -27,6 +27,8 @@ RENAMED = {
     "vehicle replay": "vehicle identify --validate",
     "camera water": "camera",
     "camera mount": "camera convert",
+    "plan map": "plan export --map",
+    "plan current": "plan",
 }
 """Commands of the last version, and what takes their arguments now."""
 

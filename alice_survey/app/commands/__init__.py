@@ -12,8 +12,8 @@ COMMANDS: tuple[type[Command], ...] = (
     reconstruct.MosaicTilesCommand, survey.ReportPageCommand, survey.RunCommand,
     survey.DemoCommand, survey.StatusCommand, vehicle.PilotCommand,
     plan.SolveCommand, plan.PrecisionCommand, plan.GainCommand, plan.CheckCommand,
-    plan.FollowCommand, plan.RevisitCommand, plan.ExportCommand, plan.MapCommand,
-    plan.CurrentCommand, camera.CameraCommand, camera.ConvertCommand, camera.UncertaintyCommand,
+    plan.FollowCommand, plan.RevisitCommand, plan.ExportCommand,
+    camera.CameraCommand, camera.ConvertCommand, camera.UncertaintyCommand,
     vehicle.CoefficientsCommand, vehicle.CompareCommand,
     vehicle.IdentifyCommand,
 )  # fmt: skip

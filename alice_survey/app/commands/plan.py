@@ -248,6 +248,7 @@ class ExportCommand(WorkspaceCommand, ReportCommand):
     examples = (
         "plan export -w reef",
         "plan export -w reef --format cola2 --format wpl -o to_vehicle",
+        "plan export -w reef --map -o map.pdf",
     )
     title = "Write the plan for vehicles"
     offered = ("formats",)
@@ -256,46 +257,22 @@ class ExportCommand(WorkspaceCommand, ReportCommand):
     )
     camera_on: str | None = option(None, "COLA2's service that starts pictures.")
     camera_off: str | None = option(None, "COLA2's service that stops them.")
+    map: bool = option(False, "Draw the map alone, into the .pdf, .svg or .png that -o names.")
     output: Path | None = OUTPUT
 
     def run(self) -> Result:
         """Write them."""
+        plan = self.workspace / "plan" / "plan.json"
+        if self.map:
+            from alice_survey.app.pipeline import settings
+            from missions.plan.map import map_report
+
+            config = settings(self.workspace, None, needed=False)
+            file = self.output or plan.with_name("map.pdf")
+            return map_report(plan, file, config.camera, config.water, config.area, config.sea)
         from missions.exports.write import export_report
 
         return export_report(
-            self.workspace / "plan" / "plan.json", self.formats, self.output,
+            plan, self.formats, self.output,
             camera_on=self.camera_on, camera_off=self.camera_off,
         )  # fmt: skip
-
-
-class MapCommand(SurveyCommand):
-    """Draw the map of a plan for print.
-
-    Area, zones, lines, footprints, how many pictures see each place, current, bathymetry.
-    """
-
-    name = "plan map"
-    examples = ("plan map -w reef -o map.pdf",)
-    output: Path = option(..., "A .pdf, .svg or .png file.", "-o", "--output", metavar="FILE")
-
-    def run(self) -> Result:
-        """Draw it."""
-        from missions.plan.map import map_report
-
-        return map_report(self.workspace / "plan" / "plan.json", self.settings(), self.output)
-
-
-class CurrentCommand(SurveyCommand):
-    """Show what the current costs.
-
-    Headings of lines that take least and most power, and how far the battery reaches.
-    """
-
-    name = "plan current"
-    examples = ("plan current -w reef",)
-
-    def run(self) -> Result:
-        """Compute the power by heading."""
-        from missions.plan.trade import current_report
-
-        return current_report(self.settings())

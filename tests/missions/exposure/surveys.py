@@ -1,17 +1,10 @@
 """Surveys that the tests of imaging plan."""
 
-import re
 from typing import Any
 
 from alice_survey.core.config import parse_config
 from camera_calib.rig import Rig
 from missions.exposure.settings import ImagingSetup
-
-
-def number_in(text: str, pattern: str) -> float:
-    """What the one group of a pattern holds."""
-    (found,) = re.findall(pattern, text)
-    return float(found)
 
 
 def survey(ideal_port: bool = False, **sections: Any) -> tuple[Rig, ImagingSetup]:

@@ -1,12 +1,10 @@
-import math
-
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from alice_survey.core.errors import PlanError
 from camera_calib.fov.table import fov_table
-from missions.exposure.focus import largest_f_number, needed_f_number, plan_focus, too_open
+from missions.exposure.conflict import ConflictError
+from missions.exposure.focus import aperture_warning, plan_focus
 from tests.missions.exposure.surveys import survey
 from tests.oracles_imaging import blur_circle_px
 
@@ -17,7 +15,6 @@ def test_the_papers_lens_focuses_at_one_and_a_half_metres_in_air() -> None:
     assert focus.focus_air_m == pytest.approx(2.0 / 1.33, rel=1e-12)
     assert round(focus.focus_air_m, 1) == 1.5
     # The paper's 2 m of depth of field at F/4 counts 3 px as sharp.
-    assert focus.papers_depth_px == pytest.approx(10.9 / 3.69, abs=0.02)
     assert focus.far_altitude_m - focus.near_altitude_m == pytest.approx(2.05, abs=0.06)
 
 
@@ -45,8 +42,8 @@ def test_blur_at_both_ends_of_the_relief_is_that_of_traced_images(
         plan={"altitude_m": altitude_m, "relief_m": relief * altitude_m, "sharp_px": 20.0},
     )
     camera = rig.cameras["left"]
-    assume(needed_f_number(camera, config.camera, config.plan) < f_number)
     focus = plan_focus(camera, config.camera, config.plan)
+    assume(focus.f_number_needed < f_number)
     for sign in (-1, 1):
         apparent = altitude_m * (1 + sign * relief) / 1.34
         blur = blur_circle_px(lens_mm * 1e-3, f_number, 3.69e-6, focus.focus_air_m, apparent)
@@ -55,14 +52,17 @@ def test_blur_at_both_ends_of_the_relief_is_that_of_traced_images(
     assert focus.far_altitude_m >= altitude_m * (1 + relief) - 1e-9
 
 
-def test_the_f_number_needed_just_fills_the_circle() -> None:
+def test_the_f_number_needed_just_fills_the_circle_and_is_what_a_warning_names() -> None:
     rig, config = survey(plan={"altitude_m": 1.2})
     camera = rig.cameras["left"]
-    needed = needed_f_number(camera, config.camera, config.plan)
-    closed = config.camera.model_copy(update={"f_number": needed})
-    focus = plan_focus(camera, closed, config.plan)
-    assert focus.blur_px == pytest.approx(config.plan.sharp_px, rel=1e-9)
-    assert focus.f_number_needed == pytest.approx(needed, rel=1e-9)
+    focus = plan_focus(camera, config.camera, config.plan)
+    named = f"camera.f_number to {focus.f_number_to_set:g}"
+    assert named in aperture_warning(focus, config.camera, config.plan)
+    closed = config.camera.model_copy(update={"f_number": focus.f_number_needed})
+    filled = plan_focus(camera, closed, config.plan)
+    assert filled.blur_px == pytest.approx(config.plan.sharp_px, rel=1e-9)
+    assert filled.f_number_needed == pytest.approx(focus.f_number_needed, rel=1e-9)
+    assert not aperture_warning(filled, closed, config.plan)
 
 
 def test_diffraction_of_green_light_at_f4() -> None:
@@ -70,30 +70,15 @@ def test_diffraction_of_green_light_at_f4() -> None:
     focus = plan_focus(rig.cameras["left"], config.camera, config.plan)
     assert focus.airy_px == pytest.approx(2.44 * 0.53 * 4 / 3.69, rel=0.01)
     assert focus.f_number_diffraction == pytest.approx(3.0 / focus.airy_px * 4, rel=1e-9)
-    assert largest_f_number(config.camera, 3.0) == pytest.approx(8.56, abs=0.01)
 
 
-def test_an_aperture_that_is_too_open_gets_the_f_number_to_set() -> None:
-    rig, config = survey(plan={"altitude_m": 1.2})
-    focus = plan_focus(rig.cameras["left"], config.camera, config.plan)
-    needed = math.ceil(10 * needed_f_number(rig.cameras["left"], config.camera, config.plan)) / 10
-    assert f"camera.f_number to {needed:g}" in too_open(focus, config.camera, config.plan)
-    closed = config.camera.model_copy(update={"f_number": needed})
-    assert not too_open(plan_focus(rig.cameras["left"], closed, config.plan), closed, config.plan)
-
-
-def test_a_lens_that_cannot_focus_gets_ways_out_that_work() -> None:
+def test_a_lens_that_cannot_focus_suggests_the_circle_that_just_fits() -> None:
     rig, config = survey(plan={"altitude_m": 0.8})
     camera = rig.cameras["left"]
-    with pytest.raises(PlanError) as fault:
+    with pytest.raises(ConflictError) as fault:
         plan_focus(camera, config.camera, config.plan)
-    text = str(fault.value)
-    assert len(text.splitlines()) == 4
-    for name in ("altitude_m", "sharp_px", "relief_m"):
-        value = float(text.split(f"- {name} ")[1].split(" instead")[0])
-        plan = config.plan.model_copy(update={name: value})
-        needed = needed_f_number(camera, config.camera, plan)
-        best = largest_f_number(config.camera, plan.sharp_px)
-        assert 0.9 * best < needed < best
-        closed = config.camera.model_copy(update={"f_number": math.ceil(10 * needed) / 10})
-        plan_focus(camera, closed, plan)
+    name, sharp_px = fault.value.suggestion
+    assert name == "plan.sharp_px"
+    plan = config.plan.model_copy(update={"sharp_px": sharp_px})
+    focus = plan_focus(camera, config.camera, plan)
+    assert 0.9 * focus.f_number_diffraction < focus.f_number_needed < focus.f_number_diffraction

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.geometry import Polygon
 
-from alice_survey.core.errors import PlanError
 from camera_calib.camera import Camera
+from missions.exposure.conflict import ConflictError
 from missions.exposure.footprints import (
     altitude_for_pixel_m,
     footprint_range,
@@ -141,31 +141,29 @@ def test_altitude_and_pixel_are_inverse(pixel_mm: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("plan", "first", "second"),
+    ("plan", "baseline_m", "limits", "setting"),
     [
-        ({"altitude_m": 0.5, "relief_m": 0.6}, "altitude_m", "relief_m"),
-        ({"altitude_m": 0.6, "relief_m": 0.35}, "altitude_m", "relief_m"),
-        ({"track_error_m": 0.6}, "side_overlap", "track_error_m"),
-        ({"altitude_m": 0.3, "relief_m": 0.0}, "camera.baseline_m", "altitude_m"),
+        ({"altitude_m": 0.5, "relief_m": 0.6}, 0.1, ("altitude_m", "relief_m"), "altitude_m"),
+        ({"altitude_m": 0.6, "relief_m": 0.35}, 0.1, ("altitude_m", "relief_m"), "altitude_m"),
+        ({"track_error_m": 0.6}, 0.1, ("side_overlap", "track_error_m"), "track_error_m"),
+        ({"altitude_m": 0.3, "relief_m": 0.0, "side_overlap": 0.0}, 0.4,
+         ("camera.baseline_m", "altitude_m"), "altitude_m"),
     ],
-)
-def test_what_cannot_be_names_both_limits_in_under_five_lines(
-    plan: dict[str, float], first: str, second: str
+)  # fmt: skip
+def test_what_cannot_be_names_both_limits_and_a_value_that_fits(
+    plan: dict[str, float], baseline_m: float, limits: tuple[str, str], setting: str
 ) -> None:
-    baseline = {"baseline_m": 0.4} if first == "camera.baseline_m" else {}
-    rig, config = survey(plan=plan, camera=baseline)
-    with pytest.raises(PlanError) as fault:
+    rig, config = survey(plan=plan, camera={"baseline_m": baseline_m})
+    with pytest.raises(ConflictError) as fault:
         line_spacing(rig, config.plan, STEP_M)
-    lines = str(fault.value).splitlines()
-    assert first in lines[0] and second in lines[0]
-    assert 2 <= len(lines) <= 4
-    assert all(line.startswith("  - ") for line in lines[1:])
+    assert fault.value.limits == limits
+    name, value = fault.value.suggestion
+    assert name == f"plan.{setting}"
+    line_spacing(rig, config.plan.model_copy(update={setting: value}), STEP_M)
 
 
-def test_the_altitude_of_the_error_lets_both_cameras_see() -> None:
-    rig, config = survey(plan={"altitude_m": 0.3, "relief_m": 0.0}, camera={"baseline_m": 0.4})
-    with pytest.raises(PlanError) as fault:
+def test_what_no_altitude_resolves_suggests_nothing() -> None:
+    rig, config = survey(camera={"baseline_m": 2.0, "focal_mm": 50.0})
+    with pytest.raises(ConflictError) as fault:
         line_spacing(rig, config.plan, STEP_M)
-    altitude_m = float(str(fault.value).split("altitude_m ")[-1].split(":")[0])
-    raised = config.plan.model_copy(update={"altitude_m": altitude_m, "side_overlap": 0.0})
-    line_spacing(rig, raised, STEP_M)
+    assert fault.value.suggestion is None and len(str(fault.value).splitlines()) == 1

@@ -12,9 +12,15 @@ from scipy.integrate import quad
 
 from alice_survey.core.config import Jerlov
 from camera_calib.water import ASYMMETRY, phase_per_sr, water_optics
-from missions.exposure.forward_light import LIT_SHARE, SEEN_SHARE, share_within
-from missions.exposure.lamp import watts_per_lumen
-from missions.exposure.light import floor_radiance, veil_radiance, weakened_per_m
+from missions.exposure.light import (
+    LIT_SHARE,
+    SEEN_SHARE,
+    floor_radiance,
+    share_within,
+    veil_radiance,
+    watts_per_lumen,
+    weakened_per_m,
+)
 from tests.missions.exposure.surveys import survey
 
 Arr = np.ndarray

@@ -2,11 +2,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from alice_survey.core.config import PlanConfig
-from alice_survey.core.errors import PlanError
-from missions.exposure.storage import raw_bytes, storage_load
-from missions.exposure.strobe import BUS_V, EFFICACY_LM_W, capacitor_f, duty_limit, strobe_load
-from tests.missions.exposure.surveys import number_in, survey
+from missions.exposure.conflict import ConflictError
+from missions.exposure.strobe import (
+    BUS_V,
+    EFFICACY_LM_W,
+    capacitor_f,
+    duty_limit,
+    raw_bytes,
+    storage_load,
+    strobe_load,
+)
+from tests.missions.exposure.surveys import survey
 
 
 def test_two_strobes_of_thirty_thousand_lumens() -> None:
@@ -42,24 +48,16 @@ def test_at_the_duty_limit_the_solder_point_is_at_85_degrees() -> None:
     assert small.strobe_lumens / EFFICACY_LM_W == pytest.approx(9.6, abs=0.1)
 
 
-def test_a_duty_cycle_that_is_too_high_gets_ways_out_that_work(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(PlanConfig, "strobe_lead_s", 0.03)
-    _, config = survey()
+def test_a_duty_cycle_that_is_too_high_suggests_the_blur_that_just_fits() -> None:
+    _, config = survey(imaging={"strobe_lumens": 1e6})
     exposure_s, interval_s = 2e-3, 0.12
-    with pytest.raises(PlanError) as fault:
+    with pytest.raises(ConflictError) as fault:
         strobe_load(config.imaging, config.plan, exposure_s, interval_s)
-    text = str(fault.value)
-    assert 2 <= len(text.splitlines()) <= 4
-    lead = number_in(text, r"strobe_lead_s ([\d.]+) instead")
-    with monkeypatch.context() as patch:
-        patch.setattr(PlanConfig, "strobe_lead_s", lead)
-        assert strobe_load(config.imaging, config.plan, exposure_s, interval_s).duty > 0.37
-    lumens = number_in(text, r"strobe_lumens (\d+) instead")
-    dimmed = config.imaging.model_copy(update={"strobe_lumens": lumens})
-    load = strobe_load(dimmed, config.plan, exposure_s, interval_s)
-    assert 0.98 * load.duty_limit < load.duty <= load.duty_limit
+    name, blur_px = fault.value.suggestion
+    assert name == "plan.allowed_blur_px"
+    shorter_s = exposure_s * blur_px / config.plan.allowed_blur_px
+    load = strobe_load(config.imaging, config.plan, shorter_s, interval_s)
+    assert 0.97 * load.duty_limit < load.duty <= load.duty_limit
 
 
 def test_storage_counts_every_pixel() -> None:

@@ -83,11 +83,12 @@ def test_a_finished_plan_is_drawn_again_for_print(tmp_path: Path) -> None:
     config = parse_config({"area": {"length_m": 4.0, "width_m": 3.0}}, "test")
     spec("plan").make(tmp_path, config, SERIAL)
     plan = tmp_path / "plan" / "plan.json"
+    sections = config.camera, config.water, config.area, config.sea
     for suffix, start in ((".pdf", b"%PDF"), (".svg", b"<?xml"), (".png", b"\x89PNG")):
         drawn = [tmp_path / name / f"map{suffix}" for name in "ab"]
         for out in drawn:
-            map_report(plan, config, out)
+            map_report(plan, out, *sections)
         assert drawn[0].read_bytes().startswith(start)
         assert drawn[0].read_bytes() == drawn[1].read_bytes()
     with pytest.raises(ConfigError):
-        map_report(plan, config, tmp_path / "map.bmp")
+        map_report(plan, tmp_path / "map.bmp", *sections)

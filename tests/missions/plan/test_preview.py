@@ -1,4 +1,4 @@
-"""Previews and playbacks: the plan's own totals, and ways out that work."""
+"""Previews and playbacks: the plan's own totals, and a suggestion that works."""
 
 import json
 import math
@@ -13,8 +13,7 @@ from camera_calib.rig import design_rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import plan_pattern, stations_of_plan
 from missions.plan.planner import Planned, plan_survey
-from missions.plan.playback import play
-from missions.plan.preview import counts_picture, preview
+from missions.plan.preview import counts_picture, play, preview
 from missions.route.ways import Ways
 from tests.missions.exports.plans import RIG, small_plan
 
@@ -61,21 +60,14 @@ def test_holes_are_where_the_area_is_not_covered() -> None:
     assert min(east for _, east in hole["outer"]) > 3.5
 
 
-def test_ways_out_of_a_conflict_work() -> None:
+def test_the_suggestion_of_a_conflict_works() -> None:
     config = changed(SMALL, "plan", forward_overlap=0.95, speed_mps=1.2)
     found = preview(config)
     assert not found["ok"] and len(found["error"].splitlines()) == 1
-    assert len(found["limits"]) == 2 and found["ways"]
-    for way in found["ways"]:
-        settings = {
-            f"{s}.{k}": v for s, values in way["changes"].items() for k, v in values.items()
-        }
-        assert preview(with_settings(config, settings))["ok"], way["change"]
-
-
-def test_an_error_without_ways_is_one_line() -> None:
+    ((section, values),) = found["suggestion"].items()
+    assert preview(changed(config, section, **values))["ok"]
     found = preview(changed(SMALL, "area", seafloor_depth_m=1.5))
-    assert not found["ok"] and found["ways"] == [] and "altitude_m" in found["error"]
+    assert not found["ok"] and found["suggestion"] is None and "altitude_m" in found["error"]
 
 
 @pytest.mark.parametrize("cells", [2_000, 20_000])

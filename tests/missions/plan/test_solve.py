@@ -1,5 +1,6 @@
 import json
 import math
+import re
 from typing import Any
 
 import pytest
@@ -7,10 +8,19 @@ import pytest
 from alice_survey.core.config import SurveyConfig, parse_config
 from alice_survey.core.errors import ConfigError, PlanError
 from camera_calib.rig import design_rig
-from missions.exposure.ways_out import ConflictError
+from missions.exposure.settings import ImagingSetup, imaging_settings
 from missions.plan.planner import plan_survey
-from missions.plan.solve import area_for_dive, solve_report, turn_s
+from missions.plan.solve import (
+    area_for_dive,
+    lenses_for_resolution,
+    solve_report,
+    speeds_for_rate,
+    turn_s,
+)
 from missions.values.costs import SETTLE_S
+from missions.values.footprint import footprint_size_m
+
+DEPTH_M = SurveyConfig().area.seafloor_depth_m
 
 
 def survey(**sections: Any) -> SurveyConfig:
@@ -61,19 +71,6 @@ def test_a_dive_that_is_too_short_is_refused() -> None:
         area_for_dive(survey(), 150.0)
 
 
-def test_the_planner_takes_about_as_long_for_the_area_of_a_dive() -> None:
-    config = survey(plan={"side_overlap": 0.45})
-    side_m = area_for_dive(config, 3600.0).side_m
-    square = SurveyConfig.model_validate(
-        {
-            "plan": {"side_overlap": 0.45, "closing_line": False},
-            "area": {"length_m": side_m, "width_m": side_m},
-        }
-    )
-    rig = design_rig(square.camera, square.water)
-    assert plan_survey(square, rig).plan.duration_s == pytest.approx(3600.0, rel=0.05)
-
-
 def test_the_report_has_a_part_for_each_question() -> None:
     config = survey(plan={"side_overlap": 0.45})
     data = solve_report(config, resolution_mm=0.5, dive_s=3600, rate_hz=0.25)[1]
@@ -108,8 +105,49 @@ def test_what_ends_a_dive_is_said() -> None:
         area_for_dive(survey(vehicle={"battery_wh": 1.0}), 3600.0)
 
 
-def test_ways_out_of_a_dive_that_cannot_be_are_tried() -> None:
-    with pytest.raises(ConflictError) as caught:
-        area_for_dive(survey(plan={"speed_mps": 2.0, "forward_overlap": 0.95}), 3600.0)
-    (way,) = caught.value.ways
-    assert list(way.settings) == ["plan.speed_mps"]
+def test_a_resolution_gives_the_altitude_whose_pixel_it_is() -> None:
+    setup = ImagingSetup.of(survey(plan={"side_overlap": 0.45}))
+    best, other = lenses_for_resolution(setup, DEPTH_M, 0.448, (25.0, 12.5))
+    assert best.lens_mm == 12.5
+    assert best.fits
+    assert best.altitude_m == pytest.approx(2.0, abs=0.005)
+    there = setup.with_plan(altitude_m=best.altitude_m)
+    settings = imaging_settings(there.rig, there)
+    assert settings.pixel_m * 1e3 <= 0.448
+    assert best.spacing_m == pytest.approx(settings.line_spacing_m)
+    assert best.exposure_ms == pytest.approx(settings.exposure_s * 1e3)
+    # The longer lens flies twice as high and is in the dark.
+    assert other.altitude_m == pytest.approx(4.03, abs=0.05)
+    assert not other.fits
+
+
+@pytest.mark.parametrize("resolution_mm", [0.001, 0.05, 0.22, 2.0, 5.0])
+def test_a_resolution_beyond_all_lenses_is_refused_with_the_nearest_that_fits(
+    resolution_mm: float,
+) -> None:
+    setup = ImagingSetup.of(survey())
+    with pytest.raises(PlanError) as fault:
+        lenses_for_resolution(setup, DEPTH_M, resolution_mm, (12.5, 25.0))
+    (text,) = str(fault.value).splitlines()
+    fits_mm, lens_mm = map(
+        float, re.search(r"; ([\d.]+) mm fits, with the ([\d.]+) mm", text).groups()
+    )
+    assert lenses_for_resolution(setup, DEPTH_M, fits_mm, (lens_mm,))[0].fits
+
+
+def test_a_fixed_rate_gives_the_speed_that_overlaps_as_requested() -> None:
+    setup = ImagingSetup.of(survey())
+    option = speeds_for_rate(setup, 0.25, (12.5,))[0]
+    along_m = footprint_size_m(setup.rig.cameras["left"], 2.0)[1]
+    assert option.speed_mps == pytest.approx(0.25 * along_m * 0.4, abs=1e-4)
+    # At the paper's 0.2 m/s its 0.25 Hz overlap by 31 to 32 %.
+    assert option.forward_overlap == pytest.approx(1 - 0.8 / along_m)
+    moved = setup.with_plan(speed_mps=option.speed_mps)
+    assert imaging_settings(moved.rig, moved).interval_s == pytest.approx(4.0, abs=0.005)
+
+
+def test_a_rate_beyond_the_trigger_is_refused_with_the_most_that_it_takes() -> None:
+    setup = ImagingSetup.of(survey())
+    with pytest.raises(PlanError, match="more than the 10 that"):
+        speeds_for_rate(setup, 14.0, (12.5,))
+    assert math.isfinite(speeds_for_rate(setup, 10.0, (12.5,))[0].exposure_ms)

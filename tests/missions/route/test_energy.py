@@ -1,8 +1,6 @@
-"""What flying takes by course: the vehicle's own equations, and the trade against the current."""
+"""What flying takes by course: the vehicle's own equations against the current."""
 
-import json
 import math
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -11,13 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from alice_survey.core.config import SurveyConfig
+from alice_survey.core.config import SurveyConfig, with_settings
 from alice_survey.core.errors import PlanError
 from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.steady import drag_power, steady_flight
-from missions.exposure.settings import ImagingSetup, imaging_settings
-from missions.plan.strength import arcs_fit, held_current_mps, survey_costs, too_strong
-from missions.plan.trade import current_report, energy_report
+from missions.exposure.conflict import ConflictError
+from missions.plan.strength import current_error, held_current_mps, survey_costs
 from missions.route.dives import split_dives
 from missions.route.energy import (
     FlightConditions,
@@ -36,10 +33,6 @@ from missions.values.line import Line
 def _config(current: float = 0.1, towards: float = 90.0, **sections: Any) -> SurveyConfig:
     sea = {"current_mps": current, "current_towards_deg": towards, **sections.pop("sea", {})}
     return SurveyConfig.model_validate({"sea": sea, **sections})
-
-
-def _report(config: SurveyConfig, **more: Any) -> tuple[str, dict[str, Any]]:
-    return energy_report(flight_conditions(config), usable_wh(config.vehicle), **more)
 
 
 def test_drag_along_and_across_a_current() -> None:
@@ -203,54 +196,27 @@ def test_a_descent_is_as_fast_as_three_quarters_of_the_thrust_allow() -> None:
     assert costs.dive_j(13.0) == pytest.approx(costs.dive_s(13.0) * costs.heave_w)
 
 
-def test_a_current_above_the_vehicles_strength_is_refused_with_ways_out() -> None:
-    with pytest.raises(PlanError) as caught:
-        survey_costs(_config(2.0))
-    text = str(caught.value)
-    current, held = map(float, re.findall(r"([\d.]+) m/s", text)[:2])
-    assert current == 2.0 and "090 deg" in text
-    assert 0.3 < held < 0.6  # turning, she is beam on: 300 N (m/s)^-2 against two T200
-    assert math.isfinite(survey_costs(_config(held)).spot_w)
-    with pytest.raises(PlanError, match=f"{held + 0.015:.2f} m/s"):
-        survey_costs(_config(held + 0.015))
-
-
-def _changed(config: SurveyConfig, way: str) -> SurveyConfig:
-    """The survey with the settings that a way out names."""
-    sections: dict[str, dict[str, Any]] = config.model_dump()
-    if waited := re.search(r"wait for a current of ([\d.]+) m/s", way):
-        sections["sea"]["current_mps"] = float(waited[1])
-    for section, key, value in re.findall(r"(\w+)\.(\w+) (?:= )?'?([\w.]+)", way):
-        if key in ("speed_mps", "line_heading_deg", "turn_radius_m"):
-            sections[section][key] = None if value == "out" else float(value)
-        elif section == "vehicle":
-            sections[section][key] = value
-    return SurveyConfig.model_validate(sections)
-
-
 @pytest.mark.parametrize(
-    ("config", "minimum"),
+    "config",
     [
-        (_config(0.5), 3),
-        (_config(0.9), 1),
-        (_config(0.3, 20.0, vehicle={"name": "sparus2"}), 3),
-        (_config(0.3, 0.0, vehicle={"name": "sparus2"}, plan={"line_heading_deg": 10.0}), 3),
-        (_config(0.3, vehicle={"controller": "los"}), 3),
+        _config(2.0),
+        _config(0.5),
+        _config(0.3, 20.0, vehicle={"name": "sparus2"}),
+        _config(0.3, 0.0, vehicle={"name": "sparus2"}, plan={"line_heading_deg": 10.0}),
+        _config(0.3, vehicle={"controller": "los"}),
     ],
 )
-def test_ways_out_of_a_current_work(config: SurveyConfig, minimum: int) -> None:
-    setup = ImagingSetup.of(config)
-    text = str(too_strong(flight_conditions(config), config.vehicle, setup, ""))
-    head, *ways = text.splitlines()
-    assert minimum <= len(ways) <= 3
-    assert f"{config.sea.current_mps:.2f} m/s" in head
-    for way in ways:
-        changed = _changed(config, way)
-        assert changed != config
-        costs = survey_costs(changed)
-        assert np.all(np.isfinite(costs.way_w))
-        assert np.any(np.isfinite(costs.line_w[:36]) & np.isfinite(costs.line_w[36:]))
-        assert arcs_fit(changed.plan)
+def test_a_current_above_the_vehicles_strength_is_refused_with_what_it_holds(
+    config: SurveyConfig,
+) -> None:
+    found = current_error(flight_conditions(config), "")
+    assert isinstance(found, ConflictError)
+    name, held_mps = found.suggestion
+    assert name == "sea.current_mps"
+    assert f"{held_mps:.2f} m/s" in found.limits[1]
+    held = with_settings(config, {name: held_mps})
+    assert flies_everywhere(flight_conditions(held))
+    assert math.isfinite(survey_costs(held).spot_w)
 
 
 def test_what_is_held_is_the_most_that_flies() -> None:
@@ -266,6 +232,11 @@ def test_what_is_held_is_the_most_that_flies() -> None:
     assert not flies_everywhere(flown(held + 0.02))
 
 
+def test_a_current_that_no_heading_bears_is_refused() -> None:
+    with pytest.raises(ConflictError, match="the current conflicts with"):
+        survey_costs(_config(2.0))
+
+
 def test_a_vehicle_without_thrust_gets_no_advice_on_the_current() -> None:
     with pytest.raises(PlanError, match=r"vehicle\.failures"):
         survey_costs(_config(0.0, vehicle={"failures": ["vertical"]}))
@@ -277,7 +248,7 @@ def test_a_heading_that_cannot_be_flown_is_refused_with_the_nearest_that_can() -
 
     with pytest.raises(PlanError, match=r"10 deg .* 50 deg"):
         survey_costs(config(10.0))  # 0.3 cos(48.2 deg) = 0.2
-    assert math.isfinite(survey_costs(config(55.0)).spot_w)
+    assert math.isfinite(survey_costs(config(50.0)).spot_w)
 
 
 def test_a_way_between_lines_that_cannot_be_flown_is_refused_with_the_current() -> None:
@@ -315,37 +286,6 @@ def test_endurance_agrees_with_the_makers() -> None:
     costs = survey_costs(config)
     assert 8.0 < config.vehicle.battery_wh / costs.way_w[0] < 10.0
     assert usable_wh(config.vehicle) == pytest.approx(0.8 * config.vehicle.battery_wh)
-
-
-def test_the_report_says_what_the_numbers_say() -> None:
-    _, data = _report(_config(0.1, 60.0), imaging_w=3.0)
-    assert data["best_heading_deg"] == 60.0
-    assert data["worst_heading_deg"] == 150.0
-    assert data["best_w"] < data["worst_w"]
-    assert data["hours"] == pytest.approx(1120.0 / data["best_w"])
-    json.dumps(data, allow_nan=False)
-
-
-def test_nothing_is_stated_where_nothing_can_be_flown() -> None:
-    data = _report(_config(2.0))[1]
-    assert data["headings_flyable"] == 0
-    assert data["best_w"] is data["hours"] is None
-    json.dumps(data, allow_nan=False)
-
-    some = _report(_config(0.3, 0.0, vehicle={"name": "sparus2"}))[1]
-    # Within 48.2 deg of the current it cannot go downstream: 0.3 cos(48.2 deg) = 0.2.
-    assert some["headings_flyable"] == 17
-    assert 50.0 <= some["best_heading_deg"] <= 130.0
-
-
-def test_the_current_is_reported_with_the_surveys_own_lights() -> None:
-    config = _config()
-    setup = ImagingSetup.of(config)
-    lights_w = imaging_settings(setup.rig, setup).imaging_w
-    assert lights_w > 0.1
-    _, data = current_report(config)
-    assert data["imaging_w"] == lights_w
-    assert data["best_w"] == pytest.approx(_report(config)[1]["best_w"] + lights_w)
 
 
 def test_costs_compile_nothing() -> None:

@@ -41,8 +41,7 @@ from missions.areas.files import SUFFIXES
 from missions.exports.registry import format_named, format_names
 from missions.plan.draft import Draft, drafted
 from missions.plan.planner import plan_survey
-from missions.plan.playback import play
-from missions.plan.preview import preview, refusal_json
+from missions.plan.preview import play, preview, refusal_json
 from missions.values.plan_file import read_plan
 from reconstruct.precision.candidates import Candidate, worst_bend
 from reconstruct.precision.predict import Precision

@@ -15,7 +15,6 @@ from alice_survey.app.computing import (
     StageCost,
     SurveyCost,
     correction,
-    slowness,
     stage_costs,
     workspace_size,
 )
@@ -115,7 +114,7 @@ def _costs(
     size = workspace_size(workspace, config)
     if size is None or all(state == UP_TO_DATE for state in states.values()):
         return {}
-    costs = stage_costs(size, slowness())
+    costs = stage_costs(size)
     done: dict[str, StageRecord] = {}
     for name, state in states.items():
         record = read_stage(workspace / spec(name).folder)

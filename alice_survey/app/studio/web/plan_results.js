@@ -1,10 +1,10 @@
 /* What a plan comes to: totals, warnings, limits that bind, settings and why; or why there is none,
-   and the ways out. */
+   and the setting that would help. */
 
 import {button, el, table} from "./core.js";
 import {keyFigures, totalRows} from "./plan_words.js";
 
-/* `apply(changes)` takes a way out. */
+/* `apply(changes)` takes a suggestion. */
 export function resultsPanel(apply) {
   const key = el("dl", {class: "plan-key plan-totals"});
   const totals = el("div", {class: "plan-totals"});
@@ -38,14 +38,14 @@ export function resultsPanel(apply) {
     rows.replaceChildren(table("Settings and why", ["setting", "value", "why"], preview.rows));
   }
 
-  function refuse({error, ways}) {
+  function refuse({error, suggestion}) {
+    const words = suggestion && Object.entries(suggestion).flatMap(([section, values]) =>
+      Object.entries(values).map(([key, value]) => section + "." + key + " = " + value));
     refused.replaceChildren(
       el("p", {class: "error"}, "No plan: " + error),
       el("p", {class: "note"}, "The map shows the last plan."),
-      ...(ways.length ? [el("h3", {}, "Ways out")] : []),
-      el("ul", {class: "plan-ways"}, ways.map((way) => el("li", {}, button(
-        [way.change, way.price ? el("small", {}, way.price) : null], () => apply(way.changes),
-      )))),
+      ...(words ? [el("div", {class: "plan-ways"},
+        button("Set " + words.join(", "), () => apply(suggestion)))] : []),
     );
   }
 

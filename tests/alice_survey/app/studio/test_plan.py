@@ -158,14 +158,12 @@ def test_what_cannot_be_planned_is_saved_and_said(workspace: Path, server: Serve
     assert get(server)["saved"] | {"cpu_s": 0} == saved["saved"] | {"cpu_s": 0}
 
 
-def test_a_conflict_comes_with_changes_that_solve_it(server: Server) -> None:
+def test_a_conflict_comes_with_a_change_that_solves_it(server: Server) -> None:
     changes = {"plan": {"forward_overlap": 0.95, "speed_mps": 1.2}}
     found = post(server, "preview", {"changes": changes})
-    assert not found["ok"] and found["ways"]
-    for way in found["ways"]:
-        both = {name: {**changes.get(name, {}), **way["changes"].get(name, {})}
-                for name in changes | way["changes"]}  # fmt: skip
-        assert post(server, "preview", {"changes": both})["ok"], way
+    assert not found["ok"]
+    changes["plan"] |= found["suggestion"]["plan"]
+    assert post(server, "preview", {"changes": changes})["ok"]
 
 
 @pytest.mark.parametrize(

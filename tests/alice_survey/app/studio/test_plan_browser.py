@@ -169,7 +169,7 @@ def test_a_survey_is_drawn_changed_and_saved(size: str, browser: Any, tmp_path: 
         assert before < raised < before + 1.0
         assert f"altitude_m = {raised:g}" in plan.text()
 
-        _way_out(plan)
+        _suggestion(plan)
         _zone_by_keyboard(plan)
         assert plan.violations() == []
         page.screenshot(path=tmp_path / f"{size}.png", full_page=True)
@@ -202,8 +202,8 @@ def _press_long(plan: PlanPage, handle: Any) -> None:
     plan.settled(before)
 
 
-def _way_out(plan: PlanPage) -> None:
-    """A speed that thrusters do not allow is refused, and the first way out leads to a plan."""
+def _suggestion(plan: PlanPage) -> None:
+    """A speed that thrusters do not allow is refused, and the suggested one leads to a plan."""
     page, before = plan.page, plan.plans
     box = page.get_by_role("spinbutton", name="Speed").first
     box.fill("3")
@@ -211,10 +211,10 @@ def _way_out(plan: PlanPage) -> None:
     plan.settled(before)
     assert page.get_by_text("No plan:").first.is_visible()
     before = plan.plans
-    page.locator(".plan-ways button").first.click()
+    page.locator(".plan-ways button").click()
     plan.settled(before)
-    assert not page.locator(".plan-ways button").first.is_visible()
-    assert "speed_mps = 1.5" in plan.text()
+    assert not page.locator(".plan-ways button").is_visible()
+    assert re.search(r"speed_mps = [12]\.\d", plan.text())
 
 
 def _zone_by_keyboard(plan: PlanPage) -> None:

@@ -1,6 +1,3 @@
-import csv
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -8,7 +5,7 @@ from hypothesis import strategies as st
 
 from alice_survey.core.errors import PlanError
 from missions.exposure.settings import imaging_settings
-from missions.exposure.timetable import HEADER, trigger_edges, trigger_table, write_timetable
+from missions.plan.run import HEADER, trigger_edges, trigger_table
 from tests.missions.exposure.surveys import survey
 
 
@@ -56,7 +53,7 @@ def test_what_a_controller_cannot_do_is_refused(
         trigger_table(times, exposure_s, lead_s, 0.1)
 
 
-def test_the_file_holds_absolute_and_relative_edges(tmp_path: Path) -> None:
+def test_the_table_holds_absolute_and_relative_edges() -> None:
     settings = imaging_settings(*survey())
     rows = trigger_table(
         [3600.0, 3602.35],
@@ -64,14 +61,11 @@ def test_the_file_holds_absolute_and_relative_edges(tmp_path: Path) -> None:
         settings.strobe_lead_s,
         settings.shortest_interval_s,
     )
-    write_timetable(tmp_path / "triggers.csv", rows)
-    with (tmp_path / "triggers.csv").open() as file:
-        read = list(csv.DictReader(file))
-    assert tuple(read[0]) == HEADER
-    assert read[1]["trigger_us"] == "3602350000"
-    for line in read:
-        open_us = int(line["camera_close_us"]) - int(line["camera_open_us"])
-        assert open_us == round(settings.exposure_s * 1e6)
-        for edge in ("strobe_on", "camera_open", "camera_close", "strobe_off"):
-            relative = int(line[f"{edge}_rel_us"])
-            assert int(line[f"{edge}_us"]) == int(line["trigger_us"]) + relative
+    table = dict(zip(HEADER, rows.T, strict=True))
+    assert table["trigger_us"].tolist() == [3_600_000_000, 3_602_350_000]
+    opened_us = table["camera_close_us"] - table["camera_open_us"]
+    assert (opened_us == round(settings.exposure_s * 1e6)).all()
+    for edge in ("strobe_on", "camera_open", "camera_close", "strobe_off"):
+        np.testing.assert_array_equal(
+            table[f"{edge}_us"], table["trigger_us"] + table[f"{edge}_rel_us"]
+        )
