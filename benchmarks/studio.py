@@ -35,7 +35,7 @@ from alice_survey.core.errors import collected_by
 from alice_survey.core.executor import SERIAL
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
-from missions.plan.draft import Draft, drafted
+from missions.plan.draft import Draft, draft_settings
 from missions.plan.preview import preview
 from missions.plan.run import run_plan
 
@@ -190,11 +190,12 @@ def _strip(swaths: int) -> dict[str, dict[str, Any]]:
 
 def replanned(name: str, settings: dict[str, dict[str, Any]], scale: float) -> Replan:
     """Plan an area again and again as the studio does, and once as the command line does."""
-    text = drafted(template_text(), Path("survey.toml"), settings).text
+    text = draft_settings(template_text(), Path("survey.toml"), settings).text
     times_s, draft, size = [], None, 0
     for altitude_m in (_ALTITUDES_M[0], *_ALTITUDES_M):
         began = time.process_time()
-        draft = drafted(text, Path("survey.toml"), {"plan": {"altitude_m": scale * altitude_m}})
+        changes = {"plan": {"altitude_m": scale * altitude_m}}
+        draft = draft_settings(text, Path("survey.toml"), changes)
         found = preview(draft.config)
         size = len(to_json(found, inf_nan_mode="null"))
         times_s.append(time.process_time() - began)

@@ -141,7 +141,7 @@ def lawnmower(
             end_ne_m=(south + steps * step_m, east),
             stations=steps + 1,
         )
-        lines.append(line.reversed() if i % 2 else line)
+        lines.append(line.reverse() if i % 2 else line)
     return lines
 
 

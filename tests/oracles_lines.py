@@ -179,7 +179,7 @@ def spot_by_hand(costs: Costs, turn_rad: float) -> float:
     turn = abs(math.remainder(turn_rad, 2 * math.pi))
     if turn < 1e-6:
         return 0.0
-    return costs.spot_w * (turn / costs.turn_rate_rad_s + costs.settle_s)
+    return costs.stop_w * (turn / costs.turn_rate_rad_s + costs.settle_s)
 
 
 def flight_by_hand(
@@ -208,7 +208,7 @@ def flight_by_hand(
             and length < straight + 1e-6
         ):
             aside = straight / costs.sway_mps * power_at(costs.sway_w, bearing)
-            aside += costs.spot_w * costs.settle_s + spot_by_hand(costs, after - before)
+            aside += costs.stop_w * costs.settle_s + spot_by_hand(costs, after - before)
             hop = min(hop, aside)
         total += hop
     for line in lines:

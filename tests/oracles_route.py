@@ -103,13 +103,13 @@ def route_cost_by_steps(route: Route, costs: Costs, step_m: float) -> tuple[floa
     joules = seconds = 0.0
     for leg in route.legs:
         if leg.turn_rad:
-            joules += costs.spot_j(leg.turn_rad)
+            joules += costs.stop_j(leg.turn_rad)
             seconds += abs(leg.turn_rad) / costs.turn_rate_rad_s + costs.settle_s
             continue
         if leg.side_rad:
             moving_s = leg.length_m / costs.sway_mps
             joules += moving_s * power_at(costs.sway_w, leg.heading_rad)
-            joules += costs.settle_s * costs.spot_w
+            joules += costs.settle_s * costs.stop_w
             seconds += leg.length_m / costs.sway_mps + costs.settle_s
             continue
         power_w = costs.line_w if leg.line >= 0 else costs.way_w
@@ -133,7 +133,7 @@ def lawn(count: int, length_m: float, spacing_m: float) -> list[Line]:
         )
         for i in range(count)
     ]
-    return [line if i % 2 == 0 else line.reversed() for i, line in enumerate(lines)]
+    return [line if i % 2 == 0 else line.reverse() for i, line in enumerate(lines)]
 
 
 def total_m(legs: Sequence[Leg]) -> float:

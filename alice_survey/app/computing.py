@@ -162,7 +162,7 @@ class StageCost:
         """Most memory at once; a single worker is the process itself."""
         return self.process_mib + min(workers, self.tasks) * self.worker_mib
 
-    def scaled(self, factor: float) -> "StageCost":
+    def scale(self, factor: float) -> "StageCost":
         """The same with more computing."""
         return replace(self, serial_s=factor * self.serial_s, tasks_s=factor * self.tasks_s)
 
@@ -290,7 +290,7 @@ def summary(
     found: dict[str, Any] = {}
     lines = []
     for name, stages in groups.items():
-        chosen = {stage: costs[stage].scaled(factor) for stage in stages}
+        chosen = {stage: costs[stage].scale(factor) for stage in stages}
         group = SurveyCost(stages=chosen, workers=workers or default_threads())
         found[name] = group.to_json()
         lines.append(f"{name}: {group.text('worker' if workers else 'core')}")

@@ -34,7 +34,6 @@ class PaperRule:
 
     rate_hz: float
     interval_s: float
-    wanted_forward_overlap: float
     forward_overlap: float
     """What it really gives with this footprint."""
 
@@ -45,7 +44,6 @@ def paper_rule(plan: PlanConfig, footprint_along_m: float) -> PaperRule:
     return PaperRule(
         rate_hz=rate_hz,
         interval_s=1.0 / rate_hz,
-        wanted_forward_overlap=plan.forward_overlap,
         forward_overlap=overlap(footprint_along_m, plan.speed_mps / rate_hz),
     )
 

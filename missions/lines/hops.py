@@ -41,7 +41,7 @@ def _spot_j(costs: Costs, turn_rad: float) -> float:
     turn = abs((turn_rad + math.pi) % (2 * math.pi) - math.pi)
     if turn < _SAME_RAD:
         return 0.0
-    energy: float = costs.spot_w * (turn / costs.turn_rate_rad_s + costs.settle_s)
+    energy: float = costs.stop_w * (turn / costs.turn_rate_rad_s + costs.settle_s)
     return energy
 
 
@@ -70,7 +70,7 @@ def hop_j(costs: Costs, leave: Array, enter: Array, way_m: float) -> float:
         energy += _spot_j(costs, enter[2] - bearing)
     if between and straight_m <= MAX_SWAY_M and way_m < straight_m + _SAME_M:
         aside = straight_m / costs.sway_mps * power_at(costs.sway_w, bearing)
-        aside += costs.spot_w * costs.settle_s + _spot_j(costs, enter[2] - leave[2])
+        aside += costs.stop_w * costs.settle_s + _spot_j(costs, enter[2] - leave[2])
         energy = min(energy, aside)
     total: float = energy
     return total

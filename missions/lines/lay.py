@@ -125,7 +125,7 @@ def ordered(
         inner[i, :2] = [hops.line_j(costs, line.length_m, x) for x in corners[i, :2, 2]]
     exits = np.tile([1, 0, 1, 0], (len(lines), 1))
     order = _tour(corners, exits, inner, ways, costs, home, None, len(lines))
-    flown = [lines[k // 4].reversed() if k % 4 == 1 else lines[k // 4] for k in order.tolist()]
+    flown = [lines[k // 4].reverse() if k % 4 == 1 else lines[k // 4] for k in order.tolist()]
     table = np.array([(*x.start_ne_m, *x.end_ne_m, x.heading_rad) for x in flown])
     _connected_m(*stops(table, home), ways)
     return flown

@@ -57,7 +57,9 @@ class Draft:
         _write(self.path, self.text)
 
 
-def drafted(text: str, path: Path, changes: Values, shapes: DrawnShapes | None = None) -> Draft:
+def draft_settings(
+    text: str, path: Path, changes: Values, shapes: DrawnShapes | None = None
+) -> Draft:
     """Change settings, and draw their area.
 
     Args:

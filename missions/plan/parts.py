@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
+import numpy as np
 import shapely
 import shapely.ops
 from shapely.geometry import MultiPolygon, Point
@@ -43,7 +44,7 @@ class PlannedDives:
 
 def plan_parts(
     area: Area,
-    wanted: PlanConfig,
+    settings: PlanConfig,
     pattern: Pattern,
     costs: Costs,
     home_ne: Place,
@@ -55,7 +56,7 @@ def plan_parts(
 
     Args:
         area: what must be seen, and where lines may be.
-        wanted: heading, turns and limits of a dive.
+        settings: heading, turns and limits of a dive.
         pattern: what lines see.
         costs: what to keep low.
         home_ne: where dives begin and end in its part; in others at the place nearest to the home
@@ -70,7 +71,7 @@ def plan_parts(
     parts = parts_of(area, home_ne)
     whole, tied = PlannedDives(lines=(), dives=(), sweep=None), True
     for number, (part, home) in enumerate(parts):
-        more = _plan_part(part, wanted, pattern, costs, home, usable_wh, depth_m)
+        more = _plan_part(part, settings, pattern, costs, home, usable_wh, depth_m)
         dives = (_from_line(dive, len(whole.lines)) for dive in more.dives)
         tied = tied and all(
             after.first_line == before.last_line + 1 and more.lines[after.first_line].kind == "tie"
@@ -85,9 +86,9 @@ def plan_parts(
         warn(
             f"{len(parts)} parts are surveyed by {len(whole.dives)} dives, each launched and "
             "recovered in its part: fly them one by one (vehicle.dive). "
-            + transit_text(whole.dives, costs, usable_wh)
+            + transit_text(whole.dives, costs)
         )
-    if len(whole.dives) > len(parts) and not (tied or wanted.cross_lines):
+    if len(whole.dives) > len(parts) and not (tied or settings.cross_lines):
         warn(
             f"{len(whole.dives)} dives are tied by the overlap of neighbouring lines "
             "alone: plan.cross_lines = 1 crosses the lines of all of them"
@@ -95,38 +96,21 @@ def plan_parts(
     return whole
 
 
-def transit_text(dives: Sequence[Dive], costs: Costs, usable_wh: float) -> str:
-    """What it takes to go from dive to dive at the surface, and how many charges all then need.
-
-    Each charge holds as many dives, one after the other, as fit with the ways between them; by the
-    power of ways between lines. Ascent and descent are in the dives.
+def transit_text(dives: Sequence[Dive], costs: Costs) -> str:
+    """What it takes to go from dive to dive at the surface, by the power of ways between lines.
 
     Args:
         dives: in order; where one begins elsewhere than the one before there is a way.
         costs: of the vehicle.
-        usable_wh: of the battery.
     """
-    ways_m, ways_wh = [], []
-    for before, after in pairwise(dives):
-        (north, east), (north_2, east_2) = before.home_ne_m, after.home_ne_m
-        way_m = math.hypot(north_2 - north, east_2 - east)
-        power_w = power_at(costs.way_w, math.atan2(east_2 - east, north_2 - north))
-        ways_m.append(way_m)
-        ways_wh.append(way_m / costs.speed_mps * power_w / 3600.0)
-    charges, spent_wh = 1, dives[0].energy_wh
-    for dive, way_wh in zip(dives[1:], ways_wh, strict=True):
-        spent_wh += way_wh + dive.energy_wh
-        if spent_wh > usable_wh:
-            charges, spent_wh = charges + 1, dive.energy_wh
-    total_m = sum(ways_m)
-    text = (
-        f"At the surface the {total_m:.0f} m between them take "
-        f"{total_m / costs.speed_mps / 60:.0f} min and {sum(ways_wh):.1f} Wh"
+    homes = np.array([dive.home_ne_m for dive in dives])
+    north_m, east_m = np.diff(homes, axis=0).T
+    ways_s = np.hypot(north_m, east_m) / costs.speed_mps
+    power_w = [power_at(costs.way_w, course) for course in np.arctan2(east_m, north_m)]
+    return (
+        f"At the surface the {ways_s.sum() * costs.speed_mps:.0f} m between them take "
+        f"{ways_s.sum() / 60:.0f} min and {ways_s @ power_w / 3600:.1f} Wh"
     )
-    if charges == len(dives):
-        return f"{text}, but no charge holds two dives and the way between: carry the vehicle"
-    held = "one charge holds" if charges == 1 else f"{charges} charges hold"
-    return f"{text}: {held} all dives without recovery between them"
 
 
 def parts_of(area: Area, home_ne: Place) -> list[tuple[Area, Place]]:
@@ -143,13 +127,13 @@ def parts_of(area: Area, home_ne: Place) -> list[tuple[Area, Place]]:
     groups = [group for group in groups if group.intersects(area.survey)]
     if len(groups) < 2:
         return [(area, home_ne)]
-    wanted = [[multipolygon(area.survey.intersection(group))] for group in groups]
+    surveys = [[multipolygon(area.survey.intersection(group))] for group in groups]
     for piece in multipolygon(area.survey.difference(area.allowed)).geoms:
         nearest = min(range(len(groups)), key=lambda i: groups[i].distance(piece))
-        wanted[nearest].append(MultiPolygon([piece]))
+        surveys[nearest].append(MultiPolygon([piece]))
     waiting = [
         replace(area, survey=multipolygon(shapely.union_all(pieces)), allowed=group)
-        for group, pieces in zip(groups, wanted, strict=True)
+        for group, pieces in zip(groups, surveys, strict=True)
         if any(not piece.is_empty for piece in pieces)
     ]
     ordered, place = [], home_ne
@@ -165,7 +149,7 @@ def parts_of(area: Area, home_ne: Place) -> list[tuple[Area, Place]]:
 
 def _plan_part(
     area: Area,
-    wanted: PlanConfig,
+    settings: PlanConfig,
     pattern: Pattern,
     costs: Costs,
     home_ne: Place,
@@ -174,14 +158,14 @@ def _plan_part(
 ) -> PlannedDives:
     """Lines and dives of one part; arguments as of `plan_parts`."""
     ways, sweep = Ways(area.allowed), None
-    cross_lines, closing_line = wanted.cross_lines, wanted.closing_line
-    if wanted.line_heading_deg is None:
+    cross_lines, closing_line = settings.cross_lines, settings.closing_line
+    if settings.line_heading_deg is None:
         sweep = best_heading(
             area, pattern, ways, costs, home_ne, cross_lines=cross_lines, closing_line=closing_line
         )
         heading = sweep.heading_rad
     else:
-        heading = math.radians(wanted.line_heading_deg)
+        heading = math.radians(settings.line_heading_deg)
     lines = lay_lines(
         area,
         heading,
@@ -197,11 +181,11 @@ def _plan_part(
         ways=ways,
         costs=costs,
         home_ne=home_ne,
-        turn_radius_m=wanted.arc_radius_m,
-        run_in_m=wanted.run_in_m,
-        turns=wanted.turns,
+        turn_radius_m=settings.arc_radius_m,
+        run_in_m=settings.run_in_m,
+        turns=settings.turns,
         usable_wh=usable_wh,
-        max_s=math.inf if wanted.dive_s is None else wanted.dive_s,
+        max_s=math.inf if settings.dive_s is None else settings.dive_s,
         depth_m=depth_m,
         split=True,
         tied=True,

@@ -89,12 +89,12 @@ def _plan_json(planned: Planned, rig: Rig, settings: PlanConfig) -> dict[str, An
             {"kind": line.kind, "from": place[:2], "to": place[2:], "stations": line.stations,
              "dive": dives[index]}
             for index, (line, place) in enumerate(
-                zip(plan.lines, _rounded(ends), strict=True))
+                zip(plan.lines, _round_points(ends), strict=True))
         ],
-        "routes": [_rounded(route_ne(dive.route, detail_m)) for dive in plan.dives],
+        "routes": [_round_points(route_ne(dive.route, detail_m)) for dive in plan.dives],
         "homes": [list(home) for home in plan.homes_ne_m],
         "area": {
-            name: [[_rounded(ring) for ring in rings_ne(part)] for part in shape.geoms]
+            name: [[_round_points(ring) for ring in rings_ne(part)] for part in shape.geoms]
             for name, shape in (
                 ("survey", plan.area.survey), ("allowed", plan.area.allowed),
                 ("no_go", plan.area.no_go),
@@ -165,7 +165,7 @@ def _holes(seen: Certificate) -> list[dict[str, Any]]:
         outer = max(hole.outline.geoms, key=lambda part: float(part.area)).exterior
         found.append(
             {
-                "outer": _rounded(np.asarray(outer.coords)[:-1]),
+                "outer": _round_points(np.asarray(outer.coords)[:-1]),
                 "area_m2": hole.area_m2,
                 "unseen_m2": hole.unseen_m2,
             }
@@ -195,7 +195,7 @@ def _profile(plan: Plan, bathymetry: Bathymetry | None) -> dict[str, Any]:
     }
 
 
-def _rounded(points: Array) -> list[list[float]]:
+def _round_points(points: Array) -> list[list[float]]:
     rows: list[list[float]] = (np.round(points, 3) + 0.0).tolist()
     return rows
 

@@ -220,7 +220,7 @@ def _rate_rows(found: ImagingSettings, setup: ImagingSetup) -> list[Row]:
         ("the paper's rule", rule.rate_hz, "Hz", "r = u / (H (1 - O))", _PAPER, "not used",
          f"it takes the altitude of {setup.plan.altitude_m:g} m for the footprint, which is "
          f"{prints.mean.along_m:.3f} m: {rule.forward_overlap:.0%} overlap instead of "
-         f"{rule.wanted_forward_overlap:.0%}"),
+         f"{setup.plan.forward_overlap:.0%}"),
     ]  # fmt: skip
 
 

@@ -307,7 +307,7 @@ def area_for_dive(config: SurveyConfig, dive_s: float) -> DiveArea:
     way_w = float(np.max(flying.way_w[np.isfinite(flying.way_w)]))
     turn_w = way_w + flying.arc_extra_w
     if plan.turns != "arcs":
-        turn_w = max(turn_w, flying.spot_w)
+        turn_w = max(turn_w, flying.stop_w)
     usable_j = usable_wh(config.vehicle) * 3600.0
 
     def needs(side_m: float) -> tuple[float, float]:
@@ -368,8 +368,8 @@ def turn_s(plan: PlanConfig, spacing_m: float) -> float:
         arcs = radius * (math.pi + 4 * math.acos((2 * radius + spacing_m) / (4 * radius)))
     run_in = plan.run_in_m / plan.speed_mps
     by_arcs = arcs / plan.speed_mps + run_in
-    by_spot = 2 * costs.spot_j(math.pi / 2) + spacing_m / plan.speed_mps + run_in
-    return {"arcs": by_arcs, "spot": by_spot}.get(plan.turns, min(by_arcs, by_spot))
+    by_stops = 2 * costs.stop_j(math.pi / 2) + spacing_m / plan.speed_mps + run_in
+    return {"arcs": by_arcs, "spot": by_stops}.get(plan.turns, min(by_arcs, by_stops))
 
 
 def _area_text(area: DiveArea, lens_mm: float, altitude_m: float, given_s: float) -> str:

@@ -151,8 +151,8 @@ def vehicle_costs(
     craft, current = conditions.craft, conditions.current_ne_mps
     courses = _courses()
     lines, between = course_powers(conditions)
-    spot_w, turn_rad_s = _spot(conditions)
-    if not np.any(_both_ways(lines)) or not math.isfinite(spot_w):
+    stop_w, turn_rad_s = _spot(conditions)
+    if not np.any(_both_ways(lines)) or not math.isfinite(stop_w):
         raise refused("")
     asked_deg = conditions.line_heading_deg
     if not _flies_heading(conditions) and asked_deg is not None:
@@ -173,7 +173,7 @@ def vehicle_costs(
         speed_mps=conditions.speed_mps,
         line_w=lines + hotel + imaging_w,
         way_w=between + hotel,
-        spot_w=spot_w + hotel,
+        stop_w=stop_w + hotel,
         arc_extra_w=(arc_w + hotel) / pace - _known_mean(between) - hotel,
         turn_rate_rad_s=turn_rad_s,
         settle_s=SETTLE_S,

@@ -156,16 +156,16 @@ def join(
     arcs_j, arcs = _by_arcs(fence, costs, end, goal, radius, run_in)
     if wanted == ARCS and arcs_j < np.inf:
         return ARCS, arcs, False
-    spot_j, spot = _on_the_spot(fence, costs, end, goal, run_in)
+    stop_j, spot = _on_the_spot(fence, costs, end, goal, run_in)
     sway_j, sway = _sideways(fence, costs, end, goal, run_in)
-    blocked = spot_j == np.inf
+    blocked = stop_j == np.inf
     if wanted == SPOT:
         return (NONE if blocked else SPOT), spot, blocked
     if wanted == SWAY and sway_j < np.inf:
         return SWAY, sway, False
-    if arcs_j < np.inf and arcs_j <= min(spot_j, sway_j):
+    if arcs_j < np.inf and arcs_j <= min(stop_j, sway_j):
         return ARCS, arcs, blocked
-    if not blocked and spot_j <= sway_j:
+    if not blocked and stop_j <= sway_j:
         return SPOT, spot, False
     if sway_j < np.inf:
         return SWAY, sway, blocked
@@ -350,10 +350,10 @@ def price(costs: Costs, legs: Array) -> float:
     for i in range(legs.shape[0]):
         course, length, curvature = legs[i, 2], legs[i, 3], legs[i, 4]
         if legs[i, 6] != 0.0:
-            total += costs.spot_w * (abs(legs[i, 6]) / costs.turn_rate_rad_s + costs.settle_s)
+            total += costs.stop_w * (abs(legs[i, 6]) / costs.turn_rate_rad_s + costs.settle_s)
         elif legs[i, 7] != 0.0:
             total += length / costs.sway_mps * power_at(costs.sway_w, course)
-            total += costs.spot_w * costs.settle_s
+            total += costs.stop_w * costs.settle_s
         else:
             mean = _mean_power(costs.way_w, course, course + curvature * length)
             if curvature != 0.0:

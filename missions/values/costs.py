@@ -32,7 +32,7 @@ class Costs(NamedTuple):
     spread evenly over a full turn from north; in between it is interpolated."""
     way_w: Array
     """(K,) the same power between lines."""
-    spot_w: float
+    stop_w: float
     """Power while it turns or waits on the spot."""
     arc_extra_w: float
     """What an arc takes beyond `way_w`: the hull behind the glass swings, and the yaw is damped."""
@@ -62,9 +62,9 @@ class Costs(NamedTuple):
         }
         return self._replace(**bounded, refused=None)
 
-    def spot_j(self, turn_rad: float) -> float:
+    def stop_j(self, turn_rad: float) -> float:
         """Energy of a turn on the spot, with its stop."""
-        return self.spot_w * (abs(turn_rad) / self.turn_rate_rad_s + self.settle_s)
+        return self.stop_w * (abs(turn_rad) / self.turn_rate_rad_s + self.settle_s)
 
     def dive_j(self, depth_m: float) -> float:
         """Energy of going down to a depth and up again."""
@@ -88,7 +88,7 @@ def time_costs(
         speed_mps=speed_mps,
         line_w=np.ones(4),
         way_w=np.ones(4),
-        spot_w=1.0,
+        stop_w=1.0,
         arc_extra_w=0.0,
         turn_rate_rad_s=turn_rate_rad_s,
         settle_s=settle_s,
@@ -141,8 +141,8 @@ def leg_row_costs(rows: Array, costs: Costs) -> tuple[Array, Array]:
     if not len(rows):
         return np.empty(0), np.empty(0)
     course, length, curvature, line, turn, side = rows.T
-    spot, sway = turn != 0.0, side != 0.0
-    seconds = length / np.where(sway, costs.sway_mps, costs.speed_mps)
+    stands, sways = turn != 0.0, side != 0.0
+    seconds = length / np.where(sways, costs.sway_mps, costs.speed_mps)
     seconds = seconds + np.abs(turn) / costs.turn_rate_rad_s
     end_course = course + curvature * length
     power = np.where(
@@ -151,12 +151,12 @@ def leg_row_costs(rows: Array, costs: Costs) -> tuple[Array, Array]:
         mean_power(costs.way_w, course, end_course),
     )
     power = power + np.where((line < 0) & (curvature != 0.0), costs.arc_extra_w, 0.0)
-    power = np.where(sway, mean_power(costs.sway_w, course, course), power)
-    power = np.where(spot, costs.spot_w, power)
-    settle = np.where(spot | sway, costs.settle_s, 0.0)
+    power = np.where(sways, mean_power(costs.sway_w, course, course), power)
+    power = np.where(stands, costs.stop_w, power)
+    settle = np.where(stands | sways, costs.settle_s, 0.0)
     moving = np.zeros_like(seconds)
     np.multiply(seconds, power, out=moving, where=seconds > 0.0)
-    return moving + settle * costs.spot_w, seconds + settle
+    return moving + settle * costs.stop_w, seconds + settle
 
 
 def mean_power(power_w: Array, start_rad: Array, end_rad: Array) -> Array:

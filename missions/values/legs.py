@@ -21,7 +21,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,21 +84,6 @@ class Leg:
     def end_heading_rad(self) -> float:
         """Course of the path at its end."""
         return self.heading_rad + self.curvature_per_m * self.length_m + self.turn_rad
-
-    def to_json(self) -> dict[str, Any]:
-        """The leg as `plan.json` holds it; what is 0 or no line is left out."""
-        data: dict[str, Any] = {
-            "start_ne_m": list(self.start_ne_m),
-            "heading_rad": self.heading_rad,
-            "length_m": self.length_m,
-        }
-        rest = {
-            "curvature_per_m": self.curvature_per_m,
-            "turn_rad": self.turn_rad,
-            "side_rad": self.side_rad,
-        }
-        data |= {key: value for key, value in rest.items() if value}
-        return data | ({"line": self.line} if self.line >= 0 else {})
 
 
 def _places(begins: Array, along_m: Array) -> Array:

@@ -44,7 +44,7 @@ class Line:
         places: Array = np.array(self.start_ne_m) * (1 - t) + np.array(self.end_ne_m) * t
         return places
 
-    def reversed(self) -> "Line":
+    def reverse(self) -> "Line":
         """The same line flown the other way."""
         return replace(self, start_ne_m=self.end_ne_m, end_ne_m=self.start_ne_m)
 

@@ -57,7 +57,7 @@ class Dive:
             "duration_s": self.duration_s,
             "energy_wh": self.energy_wh,
             "length_m": self.route.length_m,
-            "legs": [leg.to_json() for leg in self.route.legs],
+            "legs": _LEGS.dump_python(self.route.legs, mode="json", exclude_defaults=True),
         }
 
     @classmethod

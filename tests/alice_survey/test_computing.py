@@ -95,7 +95,7 @@ def test_what_has_run_here_corrects_what_is_left() -> None:
     ratio, factor, names = correction(costs, many, "this")
     assert ratio == 1.5 > factor > 1.4
     assert names == [*PREDICTED[:-1]]
-    assert COST.scaled(1.5).time_s(2) == 1.5 * COST.time_s(2)
+    assert COST.scale(1.5).time_s(2) == 1.5 * COST.time_s(2)
 
 
 def test_plan_and_status_say_what_is_left_to_pay(

@@ -13,7 +13,6 @@ def test_the_papers_rule_gives_28_percent_not_60() -> None:
     rule = paper_rule(config.plan, along_m)
 
     assert rule.rate_hz == pytest.approx(0.25)
-    assert rule.wanted_forward_overlap == 0.6
     assert rule.forward_overlap == pytest.approx(0.28, abs=0.005)
 
 

@@ -37,7 +37,7 @@ COURSES = np.arange(16) * 2 * np.pi / 16
 CURRENT = time_costs(0.2)._replace(
     line_w=80 + 40 * np.cos(COURSES - 1) ** 2 + 20 * np.cos(COURSES - 2),
     way_w=70 + 20 * np.cos(COURSES - 2),
-    spot_w=60.0,
+    stop_w=60.0,
     sway_w=90 + 30 * np.cos(COURSES - 2),
 )
 
@@ -164,7 +164,7 @@ def test_the_order_is_better_than_rows_one_after_the_other() -> None:
     ways, costs = Ways(area.allowed), comparable(time_costs(0.2))
     lines = lay(ELL_WITH_HOLES, 0.0, cross_lines=0, closing_line=False)
     rows = sorted(lines, key=lambda x: (round(across(x, 0.0), 6), x.start_ne_m))
-    plain = [line if i % 2 else line.reversed() for i, line in enumerate(rows)]
+    plain = [line if i % 2 else line.reverse() for i, line in enumerate(rows)]
     hops_j = []
     for some in (lines, plain):
         table = np.array([(*x.start_ne_m, *x.end_ne_m, x.heading_rad) for x in some])

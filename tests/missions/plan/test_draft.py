@@ -11,7 +11,7 @@ from alice_survey.app.pipeline import template_text
 from alice_survey.core.config import SurveyConfig, load_config, parse_settings
 from alice_survey.core.errors import AliceError, ConfigError, collected_by
 from missions.areas.drawn import FILES, DrawnPolygon, DrawnShapes, area_drawing
-from missions.plan.draft import drafted
+from missions.plan.draft import draft_settings
 from missions.plan.preview import preview
 
 TEMPLATE = template_text()
@@ -62,11 +62,11 @@ def changes(draw: Any) -> dict[str, dict[str, Any]]:
 def test_any_edit_gives_the_same_bytes_each_time_or_one_line(edit: Any, drawn: Any) -> None:
     with collected_by(lambda *_: None):
         try:
-            draft = drafted(TEMPLATE, PATH, edit, drawn)
+            draft = draft_settings(TEMPLATE, PATH, edit, drawn)
         except AliceError as error:
             assert len(str(error).splitlines()) == 1
             return
-        assert drafted(TEMPLATE, PATH, edit, drawn) == draft
+        assert draft_settings(TEMPLATE, PATH, edit, drawn) == draft
         assert parse_settings(draft.text, PATH) == draft.config
     for section, values in edit.items():
         for key, value in values.items():
@@ -85,7 +85,7 @@ def test_any_edit_is_planned_or_refused_in_one_line(
 ) -> None:
     with collected_by(lambda *_: None):
         try:
-            draft = drafted(TEMPLATE, PATH, edit, drawn)
+            draft = draft_settings(TEMPLATE, PATH, edit, drawn)
         except AliceError:
             return
         found = preview(draft.config_with(tmp_path_factory.mktemp("scratch")))
@@ -97,26 +97,28 @@ def test_any_edit_is_planned_or_refused_in_one_line(
 
 
 def test_numbers_are_written_as_the_settings_have_them() -> None:
-    text = drafted(TEMPLATE, PATH, {"plan": {"altitude_m": 3, "cross_lines": 2.0}}).text
+    text = draft_settings(TEMPLATE, PATH, {"plan": {"altitude_m": 3, "cross_lines": 2.0}}).text
     assert "\naltitude_m = 3.0 " in text and "\ncross_lines = 2 " in text
-    assert drafted(text, PATH, {"plan": {"altitude_m": 2, "cross_lines": 1}}).text == TEMPLATE
+    assert (
+        draft_settings(text, PATH, {"plan": {"altitude_m": 2, "cross_lines": 1}}).text == TEMPLATE
+    )
 
 
 def test_a_draft_is_written_whole_and_read_back(tmp_path: Path) -> None:
     path = tmp_path / "survey.toml"
-    draft = drafted(TEMPLATE, path, {}, DrawnShapes(survey=(HOLED,)))
+    draft = draft_settings(TEMPLATE, path, {}, DrawnShapes(survey=(HOLED,)))
     draft.write()
     assert sorted(file.name for file in tmp_path.iterdir()) == [FILES["survey"], "survey.toml"]
     assert path.read_bytes() == draft.text.encode()
     again = load_config(path)
     assert again == draft.config
     assert area_drawing(again.area).shapes.survey == (HOLED,)
-    assert drafted(draft.text, path, {}, area_drawing(again.area).shapes).text == draft.text
+    assert draft_settings(draft.text, path, {}, area_drawing(again.area).shapes).text == draft.text
 
 
 def test_shapes_move_with_the_datum_that_is_changed_with_them(tmp_path: Path) -> None:
     moved = {"area": {"latitude_deg": -10.0, "longitude_deg": 20.0}}
-    draft = drafted(TEMPLATE, tmp_path / "survey.toml", moved, DrawnShapes(survey=(HOLED,)))
+    draft = draft_settings(TEMPLATE, tmp_path / "survey.toml", moved, DrawnShapes(survey=(HOLED,)))
     drawing = area_drawing(draft.config_with(tmp_path).area)
     assert (drawing.datum.latitude_deg, drawing.datum.longitude_deg) == (-10.0, 20.0)
     assert drawing.shapes.survey == (HOLED,)
@@ -133,17 +135,17 @@ def test_files_elsewhere_are_refused_unless_they_are_named_already(
     section: str, key: str, name: str
 ) -> None:
     with pytest.raises(ConfigError, match="put the file into"):
-        drafted(TEMPLATE, PATH, {section: {key: name}})
+        draft_settings(TEMPLATE, PATH, {section: {key: name}})
     if "\0" not in name:
         text = f'[{section}]\n{key} = "{name}"\n'
-        assert drafted(text, PATH, {section: {key: name}}).text == text
+        assert draft_settings(text, PATH, {section: {key: name}}).text == text
 
 
 def test_a_section_that_is_none_is_refused() -> None:
     with pytest.raises(ConfigError, match="section"):
-        drafted("area = 3\n", PATH, {"area": {"file": "reef.kml"}})
+        draft_settings("area = 3\n", PATH, {"area": {"file": "reef.kml"}})
 
 
 def test_what_is_no_text_is_refused() -> None:
     with pytest.raises(ConfigError):
-        drafted(TEMPLATE, PATH, {"area": {"layer": "\ud800"}})
+        draft_settings(TEMPLATE, PATH, {"area": {"layer": "\ud800"}})

@@ -94,7 +94,7 @@ def test_costs_turn_with_the_current() -> None:
             getattr(other, name), np.roll(getattr(one, name), 8), rtol=1e-6, err_msg=name
         )
     assert other.heave_w == pytest.approx(one.heave_w)
-    assert other.spot_w == pytest.approx(one.spot_w, rel=1e-2)
+    assert other.stop_w == pytest.approx(one.stop_w, rel=1e-2)
 
 
 def test_costs_add_hotel_and_lights_where_they_burn() -> None:
@@ -103,7 +103,7 @@ def test_costs_add_hotel_and_lights_where_they_burn() -> None:
     np.testing.assert_allclose(lit.line_w, bare.line_w + 57.0)
     np.testing.assert_allclose(lit.way_w, bare.way_w + 50.0)
     np.testing.assert_allclose(lit.sway_w, bare.sway_w + 50.0)
-    assert lit.spot_w == pytest.approx(bare.spot_w + 50.0)
+    assert lit.stop_w == pytest.approx(bare.stop_w + 50.0)
     assert lit.heave_w == pytest.approx(bare.heave_w + 50.0)
 
 
@@ -142,7 +142,7 @@ def test_sparus_crabs_its_lines_and_cannot_step() -> None:
     assert flight_conditions(config).manner == "crab"
     np.testing.assert_allclose(costs.line_w, costs.way_w)
     assert np.all(np.isinf(costs.sway_w))
-    assert math.isfinite(costs.spot_w)
+    assert math.isfinite(costs.stop_w)
     assert flight_conditions(_config(vehicle={"controller": "los"})).manner == "crab"
     assert flight_conditions(_config()).manner == "held"
 
@@ -162,7 +162,7 @@ def test_where_it_cannot_crab_a_vehicle_with_sway_still_goes() -> None:
 def test_turning_on_the_spot_costs_more_in_a_current_and_about_the_glass() -> None:
     still, moved = survey_costs(_config(0.0)), survey_costs(_config(0.15))
     about_itself = survey_costs(_config(0.0, camera={"position_body_m": (0.0, 0.0, 0.08)}))
-    assert 60.0 < about_itself.spot_w < still.spot_w < moved.spot_w
+    assert 60.0 < about_itself.stop_w < still.stop_w < moved.stop_w
     assert still.turn_rate_rad_s == pytest.approx(math.radians(15.0))
     lame = survey_costs(_config(0.1, vehicle={"failures": ["bow"]}))
     assert 0.0 < lame.turn_rate_rad_s < still.turn_rate_rad_s
@@ -216,7 +216,7 @@ def test_a_current_above_the_vehicles_strength_is_refused_with_what_it_holds(
     assert f"{held_mps:.2f} m/s" in found.limits[1]
     held = with_settings(config, {name: held_mps})
     assert flies_everywhere(flight_conditions(held))
-    assert math.isfinite(survey_costs(held).spot_w)
+    assert math.isfinite(survey_costs(held).stop_w)
 
 
 def test_what_is_held_is_the_most_that_flies() -> None:
@@ -248,7 +248,7 @@ def test_a_heading_that_cannot_be_flown_is_refused_with_the_nearest_that_can() -
 
     with pytest.raises(PlanError, match=r"10 deg .* 50 deg"):
         survey_costs(config(10.0))  # 0.3 cos(48.2 deg) = 0.2
-    assert math.isfinite(survey_costs(config(50.0)).spot_w)
+    assert math.isfinite(survey_costs(config(50.0)).stop_w)
 
 
 def test_a_way_between_lines_that_cannot_be_flown_is_refused_with_the_current() -> None:
@@ -304,5 +304,5 @@ def test_costs_compile_nothing() -> None:
 
 def test_seconds_stand_for_joules() -> None:
     costs = time_costs(0.2, sway_mps=0.1, heave_mps=0.2)
-    assert costs.spot_j(-costs.turn_rate_rad_s) == pytest.approx(1.0 + costs.settle_s)
+    assert costs.stop_j(-costs.turn_rate_rad_s) == pytest.approx(1.0 + costs.settle_s)
     assert costs.dive_j(10.0) == costs.dive_s(10.0) == pytest.approx(100.0)

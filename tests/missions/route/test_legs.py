@@ -81,7 +81,7 @@ def uneven(seed: int, *, closed: bool = False) -> Costs:
     return time_costs(0.25)._replace(
         line_w=rng.uniform(50, 150, 36),
         way_w=way_w,
-        spot_w=40.0,
+        stop_w=40.0,
         arc_extra_w=30.0,
         sway_w=rng.uniform(50, 150, 12),
     )

@@ -137,7 +137,7 @@ def uneven_costs(rng: np.random.Generator, sway_w: float) -> Costs:
     return time_costs(0.2)._replace(
         line_w=rng.uniform(50, 150, 36),
         way_w=rng.uniform(50, 150, 36),
-        spot_w=float(rng.uniform(30, 100)),
+        stop_w=float(rng.uniform(30, 100)),
         sway_w=sway_w * rng.uniform(50, 150, 36),
     )
 

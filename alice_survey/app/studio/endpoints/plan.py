@@ -39,7 +39,7 @@ from camera_calib.rig import design_rig
 from missions.areas.drawn import AreaDrawing, DrawnShapes, area_drawing, drawing_of_file
 from missions.areas.files import SUFFIXES
 from missions.exports.registry import format_named, format_names
-from missions.plan.draft import Draft, drafted
+from missions.plan.draft import Draft, draft_settings
 from missions.plan.planner import plan_survey
 from missions.plan.preview import play, preview, refusal_json
 from missions.values.plan_file import read_plan
@@ -157,7 +157,7 @@ class _PlanTab:
     def draft(self, request: PlanRequest) -> Draft:
         """The settings with a page's changes."""
         with _quiet():
-            return drafted(self.settings().text, self.path, request.changes, request.shapes)
+            return draft_settings(self.settings().text, self.path, request.changes, request.shapes)
 
     def overview(self, call: Call) -> Content:
         """Settings, limits and shapes, and the plan that is saved."""

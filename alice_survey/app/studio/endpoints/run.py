@@ -121,7 +121,7 @@ def _costs(
         if state == UP_TO_DATE and record is not None:
             done[name] = record
     _, factor, _ = correction(costs, done, processor())
-    return {name: cost.scaled(factor) for name, cost in costs.items()}
+    return {name: cost.scale(factor) for name, cost in costs.items()}
 
 
 def _taken(costs: Mapping[str, StageCost]) -> dict[str, float]:
