@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from alice_survey.core.config import SurveyConfig, changed
+from alice_survey.core.text_table import text_table
 from alice_survey.sim.vehicle.sea import level_floor
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
@@ -154,21 +155,18 @@ def _sea(row: Row) -> str:
 
 
 def table(rows: list[Row]) -> str:
-    """The rows as a table in Markdown."""
-    lines = [
-        "| vehicle | format | current | cross-track rms m | line ends overshot | promised % | "
-        "said beforehand % | flown % |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for row in rows:
-        expected = f"{100 * row.expected:.1f}{', warned' if row.warned else ''}"
-        ended = "" if row.ending == "complete" else f" ({row.ending})"
-        lines.append(
-            f"| {row.vehicle} | `{row.format}` | {_sea(row)} | {row.cross_track_rms_m:.2f} | "
-            f"{row.overshot} of {row.line_ends} | {100 * row.promised:.1f} | {expected} | "
-            f"{100 * row.flown:.1f}{ended} |"
+    """The rows as a table."""
+    header = ("vehicle", "format", "current", "cross-track rms m", "line ends overshot",
+              "promised %", "said beforehand %", "flown %", "ending")  # fmt: skip
+    return text_table(header, [
+        (
+            row.vehicle, row.format, _sea(row), f"{row.cross_track_rms_m:.2f}",
+            f"{row.overshot} of {row.line_ends}", f"{100 * row.promised:.1f}",
+            f"{100 * row.expected:.1f}{', warned' if row.warned else ''}",
+            f"{100 * row.flown:.1f}", row.ending,
         )
-    return "\n".join(lines)
+        for row in rows
+    ])  # fmt: skip
 
 
 def _options() -> argparse.Namespace:

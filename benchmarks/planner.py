@@ -11,11 +11,13 @@ import argparse
 import math
 import sys
 import time
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
+from alice_survey.core.text_table import text_table
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
 from benchmarks.planner_areas import planned_area, shapes
@@ -37,8 +39,7 @@ from missions.values.costs import time_costs
 
 _ROWS = (100, 300, 3_000, 10_000)
 _MAX_PEER_ROWS = 300
-_ANGLE_ROWS = 30
-_ANGLES = 3600
+_ANGLE_ROWS, _ANGLES = 30, 3600
 _QUICK_ANGLE_ROWS, _QUICK_ANGLES = 12, 600
 _COVERED = 0.999
 _ANGLE_GOAL = 1.005
@@ -51,71 +52,25 @@ _GOALS_S = {
     ("quay, 24 piles", 100): 0.3,
 }
 _MAX_S = (10_000, 1.0)
-_HEAD = (
-    "| area | rows | planner | time, ms | path, m | turns | covered | outside, m | in holes, m "
-    "| time ratio | path ratio |\n" + "|---" * 11 + "|"
-)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Angle:
-    """The heading that is found next to the best of many."""
-
-    area: str
-    seconds: float
-    cost_s: float
-    best_s: float
-    """Of the sampled headings."""
-    width_m: float
-    sampled_width_m: float
-    """Least of the sampled headings."""
-    sampled: int
-    """Headings."""
-
-    @property
-    def ratio(self) -> float:
-        """Cost that is found over the best sampled."""
-        return self.cost_s / self.best_s
-
-    def figures(self) -> list[Figure]:
-        """Cost and width next to the best sampled ones, and the time of the search."""
-        peer = f"best of {self.sampled:,}"
-        return [
-            Figure(
-                name=f"{self.area}: cost at the heading found", value=self.cost_s, unit="s",
-                peer=peer, peer_value=self.best_s, goal=Goal(maximum=_ANGLE_GOAL, of="ratio"),
-            ),
-            Figure(
-                name=f"{self.area}: least total width", value=self.width_m, unit="m", peer=peer,
-                peer_value=self.sampled_width_m, goal=Goal(maximum=self.sampled_width_m + 1e-9),
-            ),
-            Figure(name=f"{self.area}: search for the heading", value=self.seconds, unit="s"),
-        ]  # fmt: skip
 
 
 def main() -> None:
     """Measure, print, and say which goals are missed."""
     options = _options()
-    packages = ("numpy", "numba", "shapely", "coverage-path-planner", "opencoverage")
-    about, report, figures = machine(packages), dict[str, Any](), list[Figure]()
+    about, figures = machine(("numpy", "numba", "shapely", "coverage-path-planner")), list[Figure]()
     print(heading(about), "\n", flush=True)
+    report: dict[str, Any] = {}
     if options.angles:
-        angles = (
-            _angles(_QUICK_ANGLE_ROWS, _QUICK_ANGLES)
-            if options.quick
-            else _angles(_ANGLE_ROWS, _ANGLES)
-        )
-        print(_angle_table(angles), "\n", flush=True)
-        report["angles"] = [asdict(row) for row in angles]
-        figures += [figure for row in angles for figure in row.figures()]
+        for name in shapes():
+            figures += (found := list(_angle_figures(name, quick=options.quick)))
+            print(*found, sep="\n", flush=True)
     else:
         table = {}
-        print(_HEAD, flush=True)
         for rows in _ROWS[: 2 if options.quick else None]:
             for name, shape in shapes().items():
-                results = _compared(planned_area(shape, rows, PATTERN.spacing_m, MARGIN_M), rows)
-                table[name, rows] = results
-                print(_rows_table(name, rows, results), flush=True)
+                area = planned_area(shape, rows, PATTERN.spacing_m, MARGIN_M)
+                table[name, rows] = results = _compare(area, rows)
+                print(f"{name}, {rows:,} rows\n{_results_table(results)}\n", flush=True)
                 figures += _figures(name, rows, results)
         report["plans"] = [
             {"area": name, "rows": rows, **asdict(row)}
@@ -123,133 +78,103 @@ def main() -> None:
             for row in results
         ]
         report["growth"] = growth = _growth(table)
-        print("\nTime grows as rows to the power of:", growth)
         figures += [
             Figure(
-                name=f"{name}: growth of time", value=g, unit="exponent of rows",
+                name=f"{name}: growth of time", value=exponent, unit="exponent of rows",
                 goal=Goal(maximum=_N_LOG_N),
             )
-            for name, g in growth.items()
+            for name, exponent in growth.items()
         ]  # fmt: skip
     sys.exit(hand_over(options, about, Findings(figures=tuple(figures)), report))
 
 
-def _compared(area: Any, rows: int) -> list[Measured]:
+def _compare(area: Any, rows: int) -> list[Measured]:
     repeats = 5 if rows <= _MAX_PEER_ROWS else 2
     planners = PLANNERS if rows <= _MAX_PEER_ROWS else {"alice-survey": own_plan}
     return [measured(name, plan(area, repeats), area) for name, plan in planners.items()]
 
 
-def _figures(name: str, rows: int, results: list[Measured]) -> list[Figure]:
+def _figures(name: str, rows: int, results: list[Measured]) -> Iterator[Figure]:
     own, where = results[0], f"{name}, {rows:,} rows"
     limit_s = _GOALS_S.get((name, rows), _MAX_S[1] if rows == _MAX_S[0] else math.inf)
     time_goal = Goal(maximum=1e3 * limit_s) if math.isfinite(limit_s) else None
     none = Goal(maximum=0.0)
-    alone = [
-        Figure(name=f"{where}: time", value=1e3 * own.seconds, unit="ms", goal=time_goal),
-        Figure(name=f"{where}: covered", value=own.covered, unit="1", goal=Goal(minimum=_COVERED)),
-        Figure(name=f"{where}: way outside", value=own.outside_m, unit="m", goal=none),
-        Figure(name=f"{where}: way in holes", value=own.holes_m, unit="m", goal=none),
-        Figure(name=f"{where}: way", value=own.path_m, unit="m"),
-    ]
-    compared = []
+    yield Figure(name=f"{where}: time", value=1e3 * own.seconds, unit="ms", goal=time_goal)
+    yield Figure(name=f"{where}: covered", value=own.covered, unit="1", goal=Goal(minimum=_COVERED))
+    yield Figure(name=f"{where}: way outside", value=own.outside_m, unit="m", goal=none)
+    yield Figure(name=f"{where}: way in holes", value=own.holes_m, unit="m", goal=none)
+    yield Figure(name=f"{where}: way", value=own.path_m, unit="m")
     for peer in results[1:]:
-        compared += [
-            Figure(
-                name=f"{where}: time", value=1e3 * own.seconds, unit="ms", peer=peer.planner,
-                peer_value=1e3 * peer.seconds,
-            ),
-            Figure(
-                name=f"{where}: way", value=own.path_m, unit="m", peer=peer.planner,
-                peer_value=peer.path_m,
-                goal=Goal(maximum=1.0, of="ratio") if _as_good(peer, own) else None,
-            ),
-        ]  # fmt: skip
-    return [*alone, *compared]
-
-
-def _as_good(peer: Measured, own: Measured) -> bool:
-    """Whether a peer's plan may be flown and sees as much, so that lengths may be compared.
-
-    Lines that end where their own middle meets the edge are shorter, and leave its corners unseen.
-    """
-    return peer.covered >= own.covered - SAME_SHARE and peer.outside_m + peer.holes_m == 0
+        yield Figure(
+            name=f"{where}: time", value=1e3 * own.seconds, unit="ms", peer=peer.planner,
+            peer_value=1e3 * peer.seconds,
+        )  # fmt: skip
+        # Lines that end where their own middle meets the edge are shorter, and leave its corners
+        # unseen: lengths are compared with peers that may be flown and see as much.
+        is_like = peer.covered >= own.covered - SAME_SHARE and peer.outside_m + peer.holes_m == 0
+        yield Figure(
+            name=f"{where}: way", value=own.path_m, unit="m", peer=peer.planner,
+            peer_value=peer.path_m, goal=Goal(maximum=1.0, of="ratio") if is_like else None,
+        )  # fmt: skip
 
 
 def _growth(table: dict[tuple[str, int], list[Measured]]) -> dict[str, float]:
     """Exponent of the time of the most rows over the fewest, by area."""
-    names = {name for name, _ in table}
     counts = sorted({rows for _, rows in table})
     few, many = counts[0], counts[-1]
+    ratios = {
+        name: table[name, many][0].seconds / table[name, few][0].seconds
+        for name in sorted({name for name, _ in table})
+    }
     return {
-        name: round(
-            math.log(table[name, many][0].seconds / table[name, few][0].seconds)
-            / math.log(many / few),
-            3,
-        )
-        for name in sorted(names)
+        name: round(math.log(ratio) / math.log(many / few), 3) for name, ratio in ratios.items()
     }
 
 
-def _angles(rows: int, sampled: int) -> list[Angle]:
-    costs = time_costs(0.2)
-    found = []
-    for name, shape in shapes().items():
-        area = planned_area(shape, rows, PATTERN.spacing_m, MARGIN_M)
-        ways = Ways(area.allowed)
-        north, east = area.rings_ne[0][0]
-        home = (float(north), float(east))
-        for _ in range(2):
-            began = time.perf_counter()
-            sweep = best_heading(area, PATTERN, ways, costs, home, cross_lines=1, closing_line=True)
-            seconds = time.perf_counter() - began
-        headings = np.arange(sampled) * math.pi / sampled
-        site, bounded = Site.of(area), comparable(costs)
-        costs_j = [
-            laid(site, h, PATTERN, ways, bounded, home, cross_lines=1, closing_line=True).energy_j
-            for h in headings
-        ]
-        edges = np.concatenate([np.diff(ring, axis=0) for ring in area.rings_ne])
-        across = np.abs(
-            edges[:, 1] * np.cos(headings)[:, None] - edges[:, 0] * np.sin(headings)[:, None]
-        )
-        found.append(
-            Angle(
-                area=name,
-                seconds=seconds,
-                cost_s=sweep.cost_j,
-                best_s=min(costs_j),
-                width_m=sweep.width_m,
-                sampled_width_m=float(across.sum(axis=1).min() / 2),
-                sampled=sampled,
-            )
-        )
-        print(f"{name}: {found[-1].ratio:.4f}", flush=True)
-    return found
-
-
-def _angle_table(rows: list[Angle]) -> str:
-    lines = [
-        f"| area | search, ms | cost, s | best of {rows[0].sampled:,}, s | ratio | width, m "
-        "| sampled, m |",
-        "|---|---|---|---|---|---|---|",
+def _angle_figures(name: str, *, quick: bool) -> Iterator[Figure]:
+    """Cost and width of the heading found next to the best sampled ones, and the search's time."""
+    rows, sampled = (_QUICK_ANGLE_ROWS, _QUICK_ANGLES) if quick else (_ANGLE_ROWS, _ANGLES)
+    costs, peer = time_costs(0.2), f"best of {sampled:,}"
+    area = planned_area(shapes()[name], rows, PATTERN.spacing_m, MARGIN_M)
+    ways = Ways(area.allowed)
+    north, east = area.rings_ne[0][0]
+    home = (float(north), float(east))
+    for _ in range(2):
+        began = time.perf_counter()
+        sweep = best_heading(area, PATTERN, ways, costs, home, cross_lines=1, closing_line=True)
+        seconds = time.perf_counter() - began
+    headings = np.arange(sampled) * math.pi / sampled
+    site, bounded = Site.of(area), comparable(costs)
+    costs_j = [
+        laid(site, h, PATTERN, ways, bounded, home, cross_lines=1, closing_line=True).energy_j
+        for h in headings
     ]
-    lines += [
-        f"| {row.area} | {1e3 * row.seconds:.0f} | {row.cost_s:.0f} | {row.best_s:.0f} "
-        f"| {row.ratio:.4f} | {row.width_m:.3f} | {row.sampled_width_m:.3f} |"
-        for row in rows
-    ]
-    return "\n".join(lines)
+    north_m, east_m = np.concatenate([np.diff(ring, axis=0) for ring in area.rings_ne]).T
+    across = np.abs(east_m * np.cos(headings)[:, None] - north_m * np.sin(headings)[:, None])
+    width_m = float(across.sum(axis=1).min() / 2)
+    yield Figure(
+        name=f"{name}: cost at the heading found", value=sweep.cost_j, unit="s", peer=peer,
+        peer_value=min(costs_j), goal=Goal(maximum=_ANGLE_GOAL, of="ratio"),
+    )  # fmt: skip
+    yield Figure(
+        name=f"{name}: least total width", value=sweep.width_m, unit="m", peer=peer,
+        peer_value=width_m, goal=Goal(maximum=width_m + 1e-9),
+    )  # fmt: skip
+    yield Figure(name=f"{name}: search for the heading", value=seconds, unit="s")
 
 
-def _rows_table(name: str, rows: int, results: list[Measured]) -> str:
+def _results_table(results: list[Measured]) -> str:
     own = results[0]
-    return "\n".join(
-        f"| {name} | {rows:,} | {row.planner} | {1e3 * row.seconds:.2f} | {row.path_m:,.0f} "
-        f"| {row.turns:,} | {row.covered:.3%} | {row.outside_m:.3g} | {row.holes_m:.3g} "
-        f"| {own.seconds / row.seconds:.2f} | {own.path_m / row.path_m:.4f} |"
+    header = ("planner", "time, ms", "path, m", "turns", "covered", "outside, m", "in holes, m",
+              "time ratio", "path ratio")  # fmt: skip
+    return text_table(header, [
+        (
+            row.planner, f"{1e3 * row.seconds:.2f}", f"{row.path_m:,.0f}", f"{row.turns:,}",
+            f"{row.covered:.3%}", f"{row.outside_m:.3g}", f"{row.holes_m:.3g}",
+            f"{own.seconds / row.seconds:.2f}", f"{own.path_m / row.path_m:.4f}",
+        )
         for row in results
-    )
+    ])  # fmt: skip
 
 
 def _options() -> argparse.Namespace:

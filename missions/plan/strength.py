@@ -16,6 +16,7 @@ from alice_survey.sim.vehicle.vehicle import Vehicle
 from missions.exposure.conflict import conflict, last_that_fits
 from missions.route.energy import (
     FlightConditions,
+    course_powers,
     flies_everywhere,
     flight_conditions,
     vehicle_costs,
@@ -59,7 +60,7 @@ def current_error(flown: FlightConditions, what: str, *, is_set: bool = True) ->
                 f"the {held_mps:.2f} m/s that {name} holds at {speed:g} m/s over ground, lines"
                 f"{on} {manner}",
             ),
-            "sea.current_mps", held_mps if is_set else None,
+            "sea.current_mps", held_mps if is_set and held_mps < size else None,
         )  # fmt: skip
     if flown.craft.fins and fin_flight(flown.craft, speed, 0.0, STEADY_SHARE) is None:
         min_mps = min_speed_mps(flown.craft, STEADY_SHARE) + size
@@ -74,7 +75,8 @@ def current_error(flown: FlightConditions, what: str, *, is_set: bool = True) ->
     )
 
     def flies(speed_mps: float) -> bool:
-        return flies_everywhere(replace(flown, speed_mps=speed_mps))
+        at = replace(flown, speed_mps=speed_mps)
+        return flies_everywhere(at) and bool(np.isfinite(course_powers(at)[0]).all())
 
     slow_mps = PlanConfig().speed_mps
     if speed > slow_mps and flies(slow_mps):

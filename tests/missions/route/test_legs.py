@@ -1,4 +1,3 @@
-import json
 import math
 
 import numpy as np
@@ -57,7 +56,8 @@ def leg(
 
 @given(one=legs())
 def test_a_leg_comes_back_from_json_as_it_was(one: Leg) -> None:
-    assert TypeAdapter(Leg).validate_json(json.dumps(one.to_json())) == one
+    adapter = TypeAdapter(Leg)
+    assert adapter.validate_json(adapter.dump_json(one, exclude_defaults=True)) == one
 
 
 @given(one=legs())
