@@ -16,11 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks import table
 from benchmarks.figures import Figure, Findings, Goal, hand_over
-from benchmarks.measured import Cost
-from benchmarks.parts import PARTS, Part, Settings, chosen
-from benchmarks.reconstruct_figures import against_peers
-from benchmarks.reconstruct_scores import Accuracy, bend_mm
-from benchmarks.runs import Run, run
+from benchmarks.parts import PARTS, Part
+from benchmarks.reconstruct_scores import bend_mm
+from benchmarks.runs import Run
 from reconstruct.placing.alignment import sag_weights
 
 ROOT = Path(__file__).parents[1]
@@ -69,34 +67,6 @@ def missing_packages(part: Part) -> str | None:
     return None
 
 
-def test_parts_have_names_of_their_own_and_commands_for_one_part() -> None:
-    assert len({part.name for part in PARTS}) == len(PARTS)
-    settings = Settings(
-        work=Path("W"), quick=True, demo=Path("D"), pyorthomosaic="P", aquacal="A", mitsuba="M"
-    )
-    commands = [part.command(settings) for part in PARTS]
-    assert len({tuple(command) for command in commands}) == len(PARTS)
-    assert all(command[-1] == "--quick" for command in commands)
-
-    by_name = {part.name: part.command(Settings(work=Path("W"), demo=Path("D"), aquacal="A"))
-               for part in PARTS}  # fmt: skip
-    assert by_name["camera-speed"] == ["-m", "benchmarks.camera", "--only", "speed",
-                                       "--aquacal", "A"]  # fmt: skip
-    assert by_name["reconstruct-peers"] == [
-        "-m", "benchmarks.reconstruct", "--work", "W/reconstruct-peers", "--only", "peers",
-        "--demo", "D",
-    ]  # fmt: skip
-
-
-def test_parts_are_chosen_by_name_or_module_in_their_order() -> None:
-    assert chosen([]) == list(PARTS)
-    assert [part.name for part in chosen(["vehicle", "camera"])] == [
-        "camera-speed", "camera-pose", "camera-calibration", "vehicle",
-    ]  # fmt: skip
-    with pytest.raises(ValueError):
-        chosen(["engine"])
-
-
 @pytest.mark.parametrize(
     ("value", "goal", "met"),
     [
@@ -116,15 +86,6 @@ def test_a_goal_bounds_a_value_or_a_ratio(
 ) -> None:
     figure = Figure(name="speed", value=value, unit="m/s", peer="p", peer_value=2.0, goal=goal)
     assert figure.met is met
-
-
-def test_figures_that_make_no_sense_are_refused() -> None:
-    with pytest.raises(ValueError):
-        Goal()
-    with pytest.raises(ValueError):
-        Figure(name="speed", value=1.0, unit="m/s", peer="p")
-    with pytest.raises(ValueError):
-        Figure(name="speed", value=1.0, unit="m/s", goal=Goal(maximum=1.0, of="ratio"))
 
 
 def handed_over(folder: Path, findings: Findings, **rows: Any) -> tuple[int, dict[str, Any]]:
@@ -241,35 +202,6 @@ def test_the_table_has_all_parts(tmp_path: Path) -> None:
     assert data["machine"]["cores"] == 2
 
 
-def a_cost(folder: Path, *, code: int = 0) -> Cost:
-    (folder / "cost.log").write_text("no model\n")
-    return Cost(wall_s=6.0, cpu_s=9.0, peak_mib=300.0, code=code, log=folder / "cost.log")
-
-
-def test_a_program_that_fails_or_is_missing_hides_no_figure_of_ours(tmp_path: Path) -> None:
-    cost, broken = a_cost(tmp_path), a_cost(tmp_path, code=1)
-    found = Accuracy(registered=16, cameras_mm=0.5, bend_mm=0.1, points_mm=2.0,
-                     points_median_mm=1.0, surface_mm=math.nan, surface_median_mm=3.0)  # fmt: skip
-    costs = {"sparse": cost, "dense": cost, "mosaic": cost}
-
-    all_ran = against_peers(16, costs, found, {"colmap": (cost, found), "other": (cost, found)})
-    alone = against_peers(16, costs, found, {"colmap": (broken, None), "other": (None, None)})
-
-    assert all(figure.peer is not None for figure in all_ran.figures)
-    assert [f.name for f in alone.figures] == [f.name for f in all_ran.figures]
-    assert [f.value for f in alone.figures] == [f.value for f in all_ran.figures]
-    assert all(figure.peer is None for figure in alone.figures)
-    assert alone.left_out == ("16 pictures to the sparse model, colmap: no model",)
-    times = {f.name: f.value for f in all_ran.figures if f.name.endswith(": time")}
-    assert times == {"16 pictures to the sparse model: time": 6.0,
-                     "16 pictures to the mosaic: time": 18.0}  # fmt: skip
-    assert not any("surface, rms" in figure.name for figure in all_ran.figures)
-
-    ours_broke = against_peers(16, {"sparse": broken}, None, {"colmap": (cost, found)})
-    assert ours_broke.figures == ()
-    assert ours_broke.failed == ("16 pictures, sparse: no model",)
-
-
 def test_bend_of_a_track_is_the_sag_of_its_heights_and_not_their_tilt() -> None:
     north, east = (axis.ravel() for axis in np.meshgrid(np.linspace(0, 8, 17), [0.0, 1.0, 2.0]))
     true = np.column_stack([north, east, np.full(north.shape, 13.0)])
@@ -278,16 +210,6 @@ def test_bend_of_a_track_is_the_sag_of_its_heights_and_not_their_tilt() -> None:
 
     assert bend_mm(true, tilted) == pytest.approx(0.0, abs=1e-9)
     assert bend_mm(true, tilted + lower[:, None] * [0, 0, 1]) == pytest.approx(5.0)
-
-
-def test_a_run_keeps_the_log_and_no_figures_of_an_earlier_one(tmp_path: Path) -> None:
-    (tmp_path / "part-1.json").write_text("{}")
-
-    found = run(["-c", "print('hello'); raise SystemExit(4)"], tmp_path, "part-1", lambda _: None)
-
-    assert (found.code, found.report) == (4, None)
-    assert found.log.read_text() == "hello\n"
-    assert found.trouble == "ended with exit code 4: hello"
 
 
 def test_one_part_runs_and_one_is_left_out(tmp_path: Path) -> None:
@@ -318,13 +240,6 @@ def test_sags_are_those_of_a_bent_and_tilted_block_whichever_way_it_lies() -> No
     np.testing.assert_allclose(
         sag_weights(places[:, :2]) @ heights.ravel(), (0.012, -0.003), atol=1e-12
     )
-
-
-def test_a_part_that_does_not_exist_is_an_error(tmp_path: Path) -> None:
-    ran = benchmarks("--work", tmp_path / "out", "--only", "engine")
-    assert ran.returncode == 2
-    assert "engine" in ran.stderr
-    assert not (tmp_path / "out").exists()
 
 
 def benchmarks(*arguments: object) -> subprocess.CompletedProcess[str]:

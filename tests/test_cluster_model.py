@@ -54,23 +54,6 @@ def test_sending_is_serial_and_waiting_is_not() -> None:
     assert makespan(heavy, 10_000, network) == pytest.approx(10 * 1.01 + 1.0 + 10.0, rel=0.1)
 
 
-def test_results_that_are_taken_in_order_hold_others_back() -> None:
-    """Of two workers one is long with the first task; the other gets no more than are in flight."""
-    times = [1000.0] + [1.0] * 140
-    more = 140 - (max_in_flight(2) - 1)
-    assert makespan(step(times), 2, FREE) == pytest.approx(1000.0 + more / 2, abs=1.0)
-
-
-def test_serial_work_bounds_what_workers_gain() -> None:
-    """Amdahl's law (1967)."""
-    stage = RecordedStage(name="stage", serial_s=10.0, steps=[step([1.0] * 90)])
-    assert stage.times(1, FREE) == pytest.approx(100.0)
-    assert stage.times(90, FREE) == pytest.approx(11.0)
-    twice = stage.scaled(60, 30, None)
-    assert twice.times(1, FREE) == pytest.approx(200.0)
-    assert twice.times(90, FREE) == pytest.approx(22.0)
-
-
 def test_what_a_smaller_survey_has_too_does_not_grow() -> None:
     stage = RecordedStage(name="stage", serial_s=10.0, steps=[step([1.0] * 90)])
     less = RecordedStage(name="stage", serial_s=8.0, steps=[step([1.0] * 50)])

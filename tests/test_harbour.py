@@ -11,22 +11,19 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.core.frames import Array
 from alice_survey.sim.seafloor.renderer import Scene, range_map
 from alice_survey.sim.seafloor.texture import Texture
-from benchmarks.harbour import figures, table
 from benchmarks.harbour_judge import (
     Truth,
     align_cameras,
     completeness,
-    face_points,
-    height_errors,
     overhangs,
     points_near,
     score_points,
     slope_class,
     true_harbour,
 )
-from benchmarks.harbour_masks import MaskTask, count_pixels, fish_along, fish_in, shadow_in, shares
-from benchmarks.harbour_meshes import moving_at, solid_mesh, still_harbour
-from benchmarks.harbour_scene import BOULDERS, FISH, HULL, PARTS, PILE, SOLIDS, Ellipsoid
+from benchmarks.harbour_masks import MaskTask, count_pixels, fish_in, shadow_in, shares
+from benchmarks.harbour_meshes import moving_at, still_harbour
+from benchmarks.harbour_scene import FISH, PARTS, Ellipsoid
 from benchmarks.harbour_sight import instants_that_see, surface_samples, trace
 from benchmarks.harbour_survey import (
     body_poses,
@@ -63,14 +60,6 @@ def test_meshes_lie_on_the_true_surface_and_face_the_water() -> None:
         assert len(chosen) > 30, item.name
         outside = distances(vertices[chosen] + 1e-3 * item.normals[chosen].astype(np.float64))[0]
         assert np.median(outside) > 0.5e-3, item.name
-
-
-def test_chords_of_solids_are_close_to_their_curves() -> None:
-    for solid in (HULL, PILE, BOULDERS[0], SOLIDS[4]):
-        vertices, triangles = solid_mesh(solid)
-        corners = vertices[triangles]
-        gap = solid_distance(solid, corners.mean(axis=1))
-        assert -1.5e-4 < gap.min() <= gap.max() < 1e-9
 
 
 def test_the_distance_from_an_ellipsoid_is_that_to_the_nearest_of_many_points() -> None:
@@ -214,16 +203,6 @@ def test_moving_meshes_are_where_the_judge_takes_them_to_be() -> None:
                 assert np.abs(weed).max() < 0.02
 
 
-def test_heights_are_measured_along_the_vertical() -> None:
-    points = np.array([[-2.0, 2.5, 5.5], [-2.0, 2.5, 3.0], [-0.16, 0.7, 3.39]])
-    points[0, 2] += trace(points[:1], np.array([[0.0, 0.0, 1.0]]), np.array([2.0]))[0] - 0.05
-    found = height_errors(points)
-    assert found[0] == pytest.approx(0.05, abs=1e-3)
-    assert found[1] == 0.3
-    # A rung's upper side is at 3.4 - 0.0175.
-    assert found[2] == pytest.approx(-0.0075, abs=1e-3)
-
-
 def test_cameras_are_aligned_and_their_scale_is_found() -> None:
     poses = body_poses(QUICK)
     truth = {str(k): poses[k] for k in range(len(poses))}
@@ -240,28 +219,6 @@ def test_cameras_are_aligned_and_their_scale_is_found() -> None:
     centred = poses.translation - poses.translation.mean(axis=0)
     expected = 1e-3 * np.sqrt((centred**2).sum(axis=1).mean())
     assert found["rms_mm"] == pytest.approx(1e3 * expected, rel=1e-3)
-
-
-def test_points_spread_evenly_over_triangles() -> None:
-    corners = np.array([[0, 0, 0], [3, 0, 0], [0, 1, 0], [10, 0, 0], [11, 0, 0], [10, 1, 0]], float)
-    points = face_points(corners, np.array([[0, 1, 2], [3, 4, 5]]), 40_000)
-    assert (points[:, 0] < 5).mean() == pytest.approx(0.75, abs=0.01)
-    np.testing.assert_allclose(points[points[:, 0] < 5].mean(axis=0), [1, 1 / 3, 0], atol=0.02)
-
-
-def test_a_table_and_figures_come_of_what_was_judged(truth: Truth) -> None:
-    near = points_near(truth.samples, truth)
-    cloud = score_points(truth.samples, np.full(len(truth.samples), 1e-3), truth)
-    cloud |= {"complete": completeness(near, truth), "overhangs": overhangs(near, truth)}
-    poses = {str(k): pose for k, pose in enumerate(body_poses(QUICK))}
-    found = {
-        "pixel_mm": 1e3 * truth.pixel_m, "pictures": 32, "cloud": cloud,
-        "cameras": align_cameras(poses, poses).figures, "left_out": ["dem", "mesh"],
-    }  # fmt: skip
-    assert "mesh: not made" in table(found)
-    met = {figure.name: figure.met for figure in figures(found, quick=False)}
-    assert met["cloud: complete"] is True
-    assert met["cloud: error over sigma"] is False  # far too small
 
 
 def snell_rays(camera: Camera, pixels: Array) -> tuple[Array, Array]:
@@ -328,16 +285,6 @@ def test_fish_of_the_judge_are_those_of_the_renderer() -> None:
     found = fish_in("left", 12, pose, time_of(station))
     assert (shown & found).sum() / (shown | found).sum() > 0.97
     assert abs(int(shown.sum()) - int(found.sum())) < 0.02 * shown.sum()
-
-
-def test_a_ray_to_the_middle_of_a_fish_ends_on_its_skin() -> None:
-    time_s = 7.0
-    fish = FISH[0]
-    ahead = fish.turn(time_s).apply([1.0, 0.0, 0.0])
-    start = fish.place(time_s) - 0.5 * ahead
-    path = fish_along(start[None], ahead[None], time_s)
-    np.testing.assert_allclose(path, 0.5 - fish.semi_axes[0], atol=1e-9)
-    assert np.isinf(fish_along(start[None], -ahead[None], time_s)).all()
 
 
 def test_masks_are_judged_by_what_moves_and_by_shadows(tmp_path: Path) -> None:

@@ -247,52 +247,6 @@ def test_without_port_and_water_it_is_opencvs_camera() -> None:
     np.testing.assert_allclose(camera.project(points), expected, atol=1e-9)
 
 
-def test_near_the_axis_water_magnifies_by_its_index() -> None:
-    camera = changed(MANTA, port_distance_m=0.0, glass_thickness_m=0.0)
-    point = np.array([1e-5, -2e-5, 2.0])
-
-    offset = camera.project(point) - [camera.cx_px, camera.cy_px]
-
-    np.testing.assert_allclose(offset, 1.34 * 3387.5 * point[:2] / 2.0, rtol=1e-8)
-
-
-@given(factor=st.floats(0.1, 10.0), x=st.floats(-0.5, 0.5), y=st.floats(-0.5, 0.5))
-def test_pixels_do_not_know_the_unit_of_length(factor: float, x: float, y: float) -> None:
-    point = np.array([x, y, 1.5])
-    camera = changed(MANTA, normal=tilted(4.0, 70.0))
-    larger = changed(camera, port_distance_m=0.02 * factor, glass_thickness_m=0.01 * factor)
-
-    np.testing.assert_allclose(larger.project(factor * point), camera.project(point), atol=1e-8)
-
-
-@given(angle=st.floats(-3.2, 3.2), x=st.floats(-0.5, 0.5), y=st.floats(-0.5, 0.5))
-def test_a_square_port_is_symmetric_about_its_axis(angle: float, x: float, y: float) -> None:
-    turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-    centre = np.array([MANTA.cx_px, MANTA.cy_px])
-
-    pixel = MANTA.project(np.array([x, y, 1.5])) - centre
-    turned = MANTA.project(np.array([*(turn @ [x, y]), 1.5])) - centre
-
-    np.testing.assert_allclose(turned, turn @ pixel, atol=1e-8)
-
-
-def test_two_tilts_that_agree_give_one_pixel() -> None:
-    point = np.array([0.3, -0.2, 2.0])
-    exact = changed(MANTA, normal=tilted(3.0, 30.0)).project(point)
-
-    rounded = tuple(value * (1 + 4e-7) for value in tilted(3.0, 30.0))
-
-    np.testing.assert_allclose(changed(MANTA, normal=rounded).project(point), exact, atol=1e-9)
-
-
-def test_points_outside_of_the_water_have_no_pixel() -> None:
-    points = np.array([[0.0, 0.0, z] for z in (-1.0, 0.0, 0.01, 0.02, 0.025, 0.03, 0.0301)])
-
-    seen = np.isfinite(MANTA.project(points)).all(axis=1)
-
-    assert seen.tolist() == [False] * 6 + [True]
-
-
 def test_light_beyond_the_critical_angle_never_reaches_a_pupil_on_the_glass() -> None:
     camera = changed(MANTA, port_distance_m=0.0, glass_thickness_m=0.0)
     critical = math.tan(math.asin(1 / 1.34))
@@ -336,15 +290,6 @@ def test_shapes_follow_the_argument() -> None:
     assert MANTA.project(points[0, 0]).shape == (2,)
 
 
-def test_at_depth_takes_a_depth_for_each_pixel() -> None:
-    pixels = MANTA.pixel_centres(step=1000)
-    depths = np.linspace(1.0, 3.0, 12).reshape(3, 4)
-
-    points = MANTA.at_depth(pixels, depths)
-
-    np.testing.assert_allclose(points[..., 2], depths)
-
-
 def test_a_reduced_camera_sees_the_same_points_at_smaller_pixels() -> None:
     small = MANTA.reduced(4)
     points = MANTA.at_depth(MANTA.pixel_centres(500), 2.0)
@@ -361,11 +306,6 @@ def test_the_border_goes_round_the_frame_once() -> None:
     closed = np.vstack([border, border[:1]])
     lengths = np.linalg.norm(np.diff(closed, axis=0), axis=1)
     assert lengths.sum() == pytest.approx(2 * (3384 + 2710))
-
-
-def test_json_keeps_every_parameter() -> None:
-    camera = changed(MANTA, k1=0.1, p2=1e-4, normal=tilted(2.0, 40.0))
-    assert camera_from_json(camera.to_json()) == camera
 
 
 @pytest.mark.parametrize(

@@ -12,9 +12,7 @@ from alice_survey.app.cli.main import app
 from alice_survey.core.config import SurveyConfig
 from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import BODY_FROM_NADIR_CAM, Array
-from alice_survey.kit.figure import new_figure
 from camera_calib.mount import mount_line, mount_rotation, with_mount
-from camera_calib.mount_figure import paint_mount
 from camera_calib.rig import Rig, design_rig, read_rig, write_rig
 
 RIGHT, BOTTOM, AHEAD = np.eye(3)
@@ -110,19 +108,3 @@ def test_a_mount_is_stated_shown_and_taken_from_another_rig(rig: Rig, tmp_path: 
     )
     assert "1.1 deg from forward+30" in mount_line(turned)
     assert "exists" in str(CliRunner().invoke(app, arguments).exception)
-
-
-def test_a_drawing_shows_all_of_eight_cameras(rig: Rig, tmp_path: Path) -> None:
-    names = [f"number{k}" for k in range(8)]
-    ring = RigidTransform.from_rotation(
-        Rotation.from_rotvec([[0, 0, k * np.pi / 4] for k in range(8)])
-    )
-    many = replace(
-        rig,
-        cameras=dict.fromkeys(names, rig.cameras["left"]),
-        cam_from_rig=dict(zip(names, ring, strict=True)),
-        body_from_rig=RigidTransform.from_rotation(mount_rotation("forward")),
-    )
-    above, side = new_figure(4.0, 9.0).subplots(1, 2)
-    paint_mount(above, side, many)
-    assert set(names) <= set(side.get_legend_handles_labels()[1])

@@ -83,22 +83,6 @@ def test_a_rig_in_other_water_forgets_only_how_well_the_index_was_known(rig: Rig
     np.testing.assert_array_equal(sea.covariance.matrix, (root @ root.T)[np.ix_([0, 2], [0, 2])])
 
 
-def test_a_rig_in_other_water_keeps_all_else(rig: Rig) -> None:
-    pool = rig.in_water(1.333)
-    assert {c.n_water for c in pool.cameras.values()} == {1.333}
-    assert changed(pool.cameras["left"], n_water=1.34) == rig.cameras["left"]
-    assert pool.baseline_m == rig.baseline_m
-
-
-def test_one_camera_has_no_baseline(rig: Rig) -> None:
-    mono = replace(
-        rig,
-        cameras={"left": rig.cameras["left"]},
-        cam_from_rig={"left": rig.cam_from_rig["left"]},
-    )
-    assert np.isnan(mono.baseline_m)
-
-
 def test_a_rig_file_gives_back_what_was_written(tmp_path: Path, rig: Rig) -> None:
     before = calibrated(rig)
     write_rig(tmp_path / "rig.json", before)
@@ -116,13 +100,6 @@ def test_a_rig_file_gives_back_what_was_written(tmp_path: Path, rig: Rig) -> Non
             before.body_from_cam(name).as_matrix(),
             atol=1e-15,
         )
-
-
-def test_a_rig_file_is_the_same_each_time(tmp_path: Path, rig: Rig) -> None:
-    write_rig(tmp_path / "a.json", calibrated(rig))
-    write_rig(tmp_path / "b.json", calibrated(rig))
-
-    assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
 
 
 @pytest.mark.parametrize("text", [None, "{", "[1, 2]"])
@@ -143,29 +120,15 @@ def test_every_camera_needs_a_pose(rig: Rig) -> None:
     ("place", "value", "words"),
     [
         (("cameras", "left", "fx_px"), "3387.5", "left: fx_px = '3387.5'"),
-        (("cameras", "left", "fx_px"), True, "left: fx_px = True"),
-        (("cameras", "left", "fx_px"), float("nan"), "left: fx_px = nan"),
         (("cameras", "left", "fx_px"), 1e300, "1e+07 px"),
         (("cameras", "left", "width_px"), 640.5, "width_px = 640.5"),
         (("cameras", "left", "n_water"), 5, "n_water = 5: 1 to 2"),
-        (("cameras", "left", "glass_thickness_m"), 1e9, "0 to 10 m"),
-        (("cameras", "left", "normal"), [0.0, 1.0], "normal"),
         (("cameras", "left", "normal"), [0.0, 0.0, 1.0, 0.0], "normal"),
-        (("cameras", "right", "cam_from_rig"), 5, "right.cam_from_rig"),
         (("cameras", "right", "cam_from_rig", "translation_m"), [0, 0, float("nan")], "right"),
-        (
-            ("cameras", "right", "cam_from_rig", "quaternion_xyzw"),
-            [[0, 0, 0, 1]],
-            "quaternion_xyzw",
-        ),
-        (("cameras",), [], "cameras"),
         (("version",), 1, "version"),
         (("covariance", "matrix"), [[0.1, 0.0], [0.0]], "covariance"),
         (("covariance", "parameters"), ["left.fx_px"], "covariance"),
-        (("format",), "something", "format"),
-        (("cameras", "left", "fx_px"), -1, "fx_px"),
         (("cameras", "left", "k9"), 0.1, "k9"),
-        (("cameras",), {"left": {}}, "cam_from_rig"),
         (("cameras",), {}, "camera"),
         (("body_from_rig",), {"quaternion_xyzw": [0, 0, 0, 1]}, "translation_m"),
         (("body_from_rig", "quaternion_xyzw"), [0, 0, 0, 0], "norm"),
@@ -189,10 +152,3 @@ def test_a_wrong_value_of_a_rig_file_is_named(
     assert str(error.value).startswith(f"{path}: ")
     assert words in str(error.value)
     assert "\n" not in str(error.value)
-
-
-def test_a_rig_file_saved_with_a_byte_order_mark_is_read(tmp_path: Path, rig: Rig) -> None:
-    write_rig(tmp_path / "rig.json", rig)
-    text = (tmp_path / "rig.json").read_text(encoding="utf-8")
-    (tmp_path / "rig.json").write_text(text, encoding="utf-8-sig")
-    assert read_rig(tmp_path / "rig.json").cameras == rig.cameras

@@ -1,6 +1,5 @@
 """The table of water; its scattering and absorption are tested with the light of the sea floor."""
 
-import json
 from typing import get_args
 
 import numpy as np
@@ -10,13 +9,9 @@ from hypothesis import strategies as st
 
 from alice_survey.core.config import Jerlov
 from alice_survey.core.errors import ConfigError
-from alice_survey.core.seawater import n_water
 from camera_calib.water import (
-    CHANNELS,
-    WAVELENGTH_NM,
     diffuse_attenuation_per_m,
     water_optics,
-    water_report,
 )
 
 JERLOV_1976_PER_M = {
@@ -72,27 +67,3 @@ def test_optics_of_any_wavelength_obey_kirks_relation(jerlov: Jerlov, nm: float)
 def test_attenuation_beyond_the_table_is_not_made_up(nm: float) -> None:
     with pytest.raises(ConfigError, match="400 to 700 nm"):
         water_optics("II", np.array([530.0, nm]))
-
-
-def test_the_table_holds_the_three_channels() -> None:
-    rows = water_report(20.0, 35.0, 15.0, "III")[1]["rows"]
-
-    assert tuple(row["channel"] for row in rows) == CHANNELS
-    optics = water_optics("III")
-    for i, row in enumerate(rows):
-        assert row["wavelength_nm"] == WAVELENGTH_NM[i]
-        assert row["n_water"] == float(n_water(20.0, 35.0, 15.0, WAVELENGTH_NM[i]))
-        assert row["beam_per_m"] == pytest.approx(optics.attenuation_per_m[i], rel=1e-12)
-        assert row["absorption_per_m"] + row["scattering_per_m"] == row["beam_per_m"]
-        assert row["beam_per_m"] > 0.9 * row["diffuse_per_m"]
-
-
-def test_the_report_says_what_the_table_holds() -> None:
-    text, data = water_report(20.0, 35.0, 15.0, "III")
-
-    assert json.loads(json.dumps(data)) == data
-    assert data["pressure_dbar"] == pytest.approx(15.13, abs=0.01)
-    for row in data["rows"]:
-        assert f"{row['n_water']:.5f}" in text
-    with pytest.raises(ConfigError, match="2C"):
-        water_report(20.0, 35.0, 15.0, "2C")

@@ -10,10 +10,8 @@ from alice_survey.kit.figure import (
     figure_style,
     map_axes,
     new_figure,
-    png_of,
     save_figure,
     scale_bar,
-    svg_of,
 )
 from alice_survey.kit.map_figure import flat_picture, map_figures, with_stills
 from alice_survey.kit.page import png_size
@@ -37,19 +35,6 @@ def test_the_same_numbers_give_the_same_bytes(tmp_path: Path, suffix: str) -> No
     assert paths[0].read_bytes() == paths[1].read_bytes()
 
 
-def test_the_style_ends_with_the_figure() -> None:
-    import matplotlib as mpl
-
-    before = dict(mpl.rcParams)
-    sine()
-    assert dict(mpl.rcParams) == before
-
-
-def test_vectors_keep_text_and_pixels_their_size() -> None:
-    assert b">x, m</text>" in svg_of(sine())
-    assert png_size(png_of(sine(), dpi=100)) == (400, 200)
-
-
 def test_a_scale_bar_is_as_long_as_it_says() -> None:
     sheet = new_figure(3.0)
     axes = sheet.subplots()
@@ -62,13 +47,6 @@ def test_a_scale_bar_is_as_long_as_it_says() -> None:
     map_axes(axes)
     assert axes.get_xlim() == (100.0, 137.0)
     assert "N" in [text.get_text() for text in axes.texts]
-
-
-def test_a_map_of_a_model_without_positions_has_no_north() -> None:
-    axes = new_figure(3.0).subplots()
-    map_axes(axes, "unit", names=("y", "x"))
-    assert (axes.get_xlabel(), axes.get_ylabel()) == ("y, unit", "x, unit")
-    assert "N" not in [text.get_text() for text in axes.texts]
 
 
 def test_a_scale_about_zero_shows_small_errors_next_to_few_large_ones() -> None:

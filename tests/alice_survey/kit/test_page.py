@@ -10,11 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from alice_survey.kit import map as kit_map
 from alice_survey.kit.document import Report, Table
-from alice_survey.kit.map import map_extent, round_length
+from alice_survey.kit.map import map_extent
 from alice_survey.kit.page import numeric_columns, render_html
-from tests.alice_survey.kit.sketch import RUDE, encoded, picture_layer, seafloor, sketch_report
+from tests.alice_survey.kit.sketch import RUDE, picture_layer, seafloor, sketch_report
 
 ROOT = Path(__file__).parents[3]
 ROOM = ROOT / "alice_survey" / "kit"
@@ -114,14 +113,6 @@ def test_contradictions_are_refused(report: Report) -> None:
             render_html(replace(report, **changes))
 
 
-def test_kinds_of_tiles() -> None:
-    picture = seafloor(8, 8)
-    for kind in ("JPEG", "PNG", "WEBP"):
-        assert kit_map.picture_kind(encoded(picture, kind)) == kind.lower()
-    with pytest.raises(ValueError):
-        kit_map.picture_kind(encoded(picture, "GIF"))
-
-
 def test_every_tile_lies_in_its_text(report: Report, text: str) -> None:
     assert report.map is not None
     mosaic = report.map.layers[0]
@@ -138,13 +129,6 @@ def test_extent_of_the_map(report: Report) -> None:
     assert report.map is not None
     # The mosaic goes from -2.2 m to 0.2 m east; the footprints reach farther east and south.
     assert map_extent(report.map) == pytest.approx((-2.2, -1.6 - 0.34, 1.7 + 0.42, 2.1))
-
-
-@pytest.mark.parametrize(
-    ("length", "expected"), [(1.0, 1.0), (0.99, 0.5), (4.9, 2.0), (0.0503, 0.05), (730.0, 500.0)]
-)
-def test_round_length(length: float, expected: float) -> None:
-    assert round_length(length) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 import io
 import re
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from alice_survey.kit.document import PictureLayer, Report
+from alice_survey.kit.document import Report
 from alice_survey.kit.page import render_html
 from tests.alice_survey.kit.browser import Heard, chromium
-from tests.alice_survey.kit.sketch import RUDE, encoded, seafloor, sketch_report
+from tests.alice_survey.kit.sketch import RUDE, sketch_report
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
 SIZES = {"desk": (1280, 900), "phone": (400, 800)}
@@ -195,14 +194,6 @@ def test_place_under_the_pointer(page: Any) -> None:
     assert (east, north) == pytest.approx((1.0, 0.5), abs=0.02)
 
 
-def test_scale_bar_is_true(page: Any) -> None:
-    bar = page.locator("#map .bar")
-    value, unit = bar.inner_text().split()
-    length_m = float(value) * {"m": 1, "cm": 0.01, "mm": 0.001}[unit]
-    px_per_m = 2 ** data(page, MAP, "zoom")
-    assert bar.bounding_box()["width"] == pytest.approx(length_m * px_per_m, abs=1)
-
-
 def test_popups(page: Any) -> None:
     page.mouse.click(*place_on_page(page, 0.6, -0.533))
     popup = page.locator(".leaflet-popup-content")
@@ -237,27 +228,6 @@ def test_mesh_is_drawn_and_turns(page: Any) -> None:
     distance = data(page, MESH, "distance")
     page.keyboard.press("+")
     assert settled(page, MESH, "distance", distance) == pytest.approx(distance / 1.2, rel=1e-4)
-
-
-def test_tab_reaches_every_control(page: Any) -> None:
-    page.evaluate("scrollTo({top: 0, behavior: 'instant'})")
-    wanted = page.evaluate(
-        """() => {
-          const all = [...document.querySelectorAll('a[href], button, input, [tabindex="0"]')];
-          const seen = all.filter((e) => e.checkVisibility());
-          seen.forEach((e, i) => { e.dataset.tabTest = i; });
-          return seen.filter((e) => e.type !== "radio" || e.checked).map((e) => e.dataset.tabTest);
-        }"""
-    )
-    page.evaluate("document.activeElement.blur()")
-    page.locator("body").evaluate("body => { body.tabIndex = -1; body.focus(); }")
-    reached = []
-    for _ in range(len(wanted) + 3):
-        page.keyboard.press("Tab")
-        reached.append(page.evaluate("document.activeElement.dataset.tabTest"))
-    page.locator("body").evaluate("body => body.removeAttribute('tabindex')")
-    assert len(wanted) > 20
-    assert [name for name in wanted if name not in reached] == []
 
 
 def test_no_fault_that_axe_finds(page: Any) -> None:
@@ -336,40 +306,3 @@ def test_without_scripts_stills(browser: Any, file: Path) -> None:
     assert page.locator(".map .still img").is_visible()
     assert not page.locator("#map").is_visible()
     context.close()
-
-
-def test_of_a_large_mosaic_few_tiles_are_decoded(
-    browser: Any, report: Report, tmp_path: Path
-) -> None:
-    """10,000 by 10,000 px: some 2,100 tiles and 30 MB, of which few are decoded."""
-    side, tile_px, levels = 10_000, 256, 7
-    grain = np.random.default_rng(5).normal(0, 8, (tile_px, tile_px, 1))
-    floor = np.asarray(seafloor(tile_px, tile_px), dtype=float) + grain
-    tile = encoded(Image.fromarray(np.clip(floor, 0, 255).astype(np.uint8)), "JPEG")
-    tiles = {
-        f"{level}/{x}/{y}": tile
-        for level in range(levels)
-        for count in [-(-side // (tile_px * 2 ** (levels - 1 - level)))]
-        for x in range(count)
-        for y in range(count)
-    }
-    mosaic = PictureLayer(
-        name="mosaic", title="Mosaic", about="", west_m=-5, north_m=5, pixel_m=10 / side,
-        width_px=side, height_px=side, tile_px=tile_px, levels=levels, tiles=tiles, shown=True,
-    )  # fmt: skip
-    assert report.map is not None
-    large = replace(report, map=replace(report.map, layers=[mosaic, *report.map.layers[1:]]))
-    path = tmp_path / "large.html"
-    path.write_text(render_html(large), encoding="utf-8")
-    assert path.stat().st_size > 35e6
-
-    page = browser.new_page(viewport={"width": 1280, "height": 900})
-    page.goto(path.as_uri())
-    page.wait_for_selector("#map[data-ready]", state="attached")
-    page.wait_for_function(
-        "() => [...document.querySelectorAll('#map-canvas img')].every((tile) => tile.complete)"
-    )
-    decoded = page.locator("#map-canvas img").count()
-    page.close()
-    assert len(tiles) > 2000
-    assert 0 < decoded < 60
