@@ -43,15 +43,9 @@ from alice_survey.core.executor import progress
 from alice_survey.core.frames import Array
 from alice_survey.core.run.progress import step as named_step
 from alice_survey.sim.vehicle.coefficients import MOTIONS
+from alice_survey.sim.vehicle.identification import sensitivity as term
 from alice_survey.sim.vehicle.identification.parameters import QUADRATICS, Parameters, place_of
 from alice_survey.sim.vehicle.identification.sensitivity import (
-    ADDED_MASS,
-    CHANNELS,
-    GAIN,
-    LIFT,
-    LINEAR,
-    START,
-    STATES,
     Physics,
     scratch_for,
     simulate,
@@ -184,8 +178,8 @@ class PriorSigmas:
     def of_kind(self, kind: int) -> float:
         """The sigma of a kind of parameter; infinite of kinds without prior."""
         known = {
-            LINEAR: self.damping, **dict.fromkeys(QUADRATICS, self.damping),
-            ADDED_MASS: self.added_mass, LIFT: self.lift, GAIN: self.gain,
+            term.LINEAR: self.damping, **dict.fromkeys(QUADRATICS, self.damping),
+            term.ADDED_MASS: self.added_mass, term.LIFT: self.lift, term.GAIN: self.gain,
         }  # fmt: skip
         return known.get(kind, math.inf)
 
@@ -261,12 +255,12 @@ def prior_of(
         relative = sigmas.of_kind(kind)
         if not math.isfinite(relative):
             continue
-        definite = kind == GAIN or (kind != LIFT and i == j)
+        definite = kind == term.GAIN or (kind != term.LIFT and i == j)
         if definite and start[k] != 0.0:
             sigma[k], logarithmic[k] = relative, True
             continue
         scale = abs(start[k])
-        if kind == LINEAR:
+        if kind == term.LINEAR:
             scale = max(scale, abs(known.get(f"{name}{name[2]}", 0.0)) * speeds[j])
         elif kind in QUADRATICS and speeds[j] > 0:
             scale = max(scale, abs(known.get(name[:3], 0.0)) / speeds[j])
@@ -313,7 +307,7 @@ _SAME = 0.02
 """Relative change of the noise that counts as zero."""
 _SAME_WEIGHT = 0.1
 """The same of the prior's weight."""
-_MIN_SIGMA = np.array([1e-6] * CHANNELS)
+_MIN_SIGMA = np.array([1e-6] * term.CHANNELS)
 """Noise cannot be estimated smaller: m/s, rad/s, rad."""
 _SINGULAR = 1e-12
 """Ratio of the information's least to greatest eigenvalue, in units of its diagonal."""
@@ -440,18 +434,19 @@ class _FitProblem:
         self.sigma = np.maximum(np.where(np.isfinite(sigma), sigma, 1.0), _MIN_SIGMA)
         self.count = len(parameters.names)
         self.measured = [
-            np.isfinite(residual_channels(w, _blank(w))) & np.ones(CHANNELS, bool) for w in windows
+            np.isfinite(residual_channels(w, _blank(w))) & np.ones(term.CHANNELS, bool)
+            for w in windows
         ]
         # Starts of the parameters whose slopes were last requested: a trial nearby begins there, so
         # that it comes back to the same residuals as its step goes to nothing.
         self.samples = sum(int(mask.sum()) for mask in self.measured)
         self.starts = [window.start.copy() for window in windows]
-        self.gains = [np.zeros((START, self.count)) for _ in windows]
+        self.gains = [np.zeros((term.START, self.count)) for _ in windows]
         self.at = parameters.start.copy()
         self.trial: tuple[Array, list[Array], list[Array], Array] | None = None
-        columns = self.count + START
+        columns = self.count + term.START
         self.scratch = scratch_for(columns, windows[0].record.rps.shape[1])
-        self.sensitivity = np.zeros((STATES, columns))
+        self.sensitivity = np.zeros((term.STATES, columns))
 
     def begin(self, values: Array) -> None:
         """Check that the simulation works where the fit starts."""
@@ -460,7 +455,7 @@ class _FitProblem:
                 "the simulation does not stay finite with the coefficients the fit starts from: "
                 "check signs and units of log and vehicle, or use shorter windows"
             )
-        rows = self.samples + START * len(self.windows)
+        rows = self.samples + term.START * len(self.windows)
         reach = np.linalg.norm(self.jacobian(values)[:rows], axis=0) * np.maximum(
             np.abs(values), 1.0
         )
@@ -472,7 +467,7 @@ class _FitProblem:
         """All residuals in sigmas, minus what the starts explain; infinite where there are none."""
         solved = self._solve(values)
         if solved is None:
-            size = self.samples + START * len(self.windows)
+            size = self.samples + term.START * len(self.windows)
             size += 0 if self.prior is None else self.count
             return np.full(size, np.inf)
         residuals, slopes, starts, gains = [], [], [], []
@@ -556,7 +551,7 @@ class _FitProblem:
         """Residuals and slopes by stretches of the logs; priors of starts with their window."""
         numbers = stretch_numbers([window.record.time_s for window in self.windows])
         rows = [
-            np.concatenate([number[np.nonzero(mask)[0]], np.full(START, number[0])])
+            np.concatenate([number[np.nonzero(mask)[0]], np.full(term.START, number[0])])
             for number, mask in zip(numbers, self.measured, strict=True)
         ]
         number = np.concatenate(rows)
@@ -608,8 +603,8 @@ class _FitProblem:
         self, window: Window, i: int, physics: Physics, start: Array
     ) -> tuple[Array, Array] | None:
         rows = len(window.record.time_s)
-        states, observed = np.empty((rows, STATES)), np.empty((rows, CHANNELS))
-        slopes = np.empty((rows, CHANNELS, self.count + START))
+        states, observed = np.empty((rows, term.STATES)), np.empty((rows, term.CHANNELS))
+        slopes = np.empty((rows, term.CHANNELS, self.count + term.START))
         simulate(
             physics, self.parameters.terms, window.record, start, self.how.max_step_s,
             self.scratch, self.sensitivity, states, observed, slopes,
@@ -619,27 +614,27 @@ class _FitProblem:
         if not np.all(np.isfinite(residual)):
             return None
         slope = (slopes / self.sigma[:, None])[mask]
-        prior = np.zeros((START, self.count + START))
+        prior = np.zeros((term.START, self.count + term.START))
         prior[:, self.count :] = np.diag(1.0 / _START_SIGMA)
         away = _between(window.start, start) / _START_SIGMA
         return np.concatenate([residual, away]), np.concatenate([slope, prior])
 
     def _by_channel(self, table: Array) -> list[list[Array]]:
         """Rows of residuals or slopes, by channel and window, without those of the priors."""
-        channels: list[list[Array]] = [[] for _ in range(CHANNELS)]
+        channels: list[list[Array]] = [[] for _ in range(term.CHANNELS)]
         begin = 0
         for mask in self.measured:
             size = int(mask.sum())
             part, place = table[begin : begin + size], np.nonzero(mask)[1]
-            for channel in range(CHANNELS):
+            for channel in range(term.CHANNELS):
                 channels[channel].append(part[place == channel])
-            begin += size + START
+            begin += size + term.START
         return channels
 
     def _freedom(self, runs: list[list[Array]]) -> float:
         """Samples over degrees of freedom: parameters and starts fit some of the noise."""
         samples = sum(len(run) for channel in runs for run in channel)
-        left = samples - self.count - START * len(self.windows)
+        left = samples - self.count - term.START * len(self.windows)
         if left < 0.1 * samples:
             raise VehicleError(
                 f"{samples} samples for {self.count} parameters and {len(self.windows)} windows "
@@ -649,7 +644,7 @@ class _FitProblem:
 
     def _channel_sigma(self, runs: list[list[Array]]) -> Array:
         spread = self._freedom(runs)
-        sigma = np.full(CHANNELS, np.nan)
+        sigma = np.full(term.CHANNELS, np.nan)
         for channel, series in enumerate(runs):
             values = np.concatenate(series)
             if len(values):
@@ -659,9 +654,9 @@ class _FitProblem:
 
 def _first_sigma(windows: Sequence[Window]) -> Array:
     """First sigma of each channel, (9,): the noise, or a share of the spread if larger."""
-    sigma = np.full(CHANNELS, np.nan)
+    sigma = np.full(term.CHANNELS, np.nan)
     attitude = [np.unwrap(_known_rows(attitude_of(w.record.attitude)), axis=0) for w in windows]
-    for channel in range(CHANNELS):
+    for channel in range(term.CHANNELS):
         table = (
             [w.measured[:, channel] for w in windows]
             if channel < 6
@@ -696,7 +691,7 @@ def _known_rows(angles: Array) -> Array:
 
 def _blank(window: Window) -> Array:
     """Observations that are unknown only where the attitude is, (T, 9)."""
-    blank = np.zeros((len(window.measured), CHANNELS))
+    blank = np.zeros((len(window.measured), term.CHANNELS))
     blank[:, 6:] = np.where(np.isfinite(window.record.attitude).all(axis=1), 0.0, np.nan)[:, None]
     return blank
 

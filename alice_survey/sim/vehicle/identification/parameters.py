@@ -10,21 +10,8 @@ import numpy as np
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.coefficients import FORCES, LIFTS, MOTIONS, Coefficients, both_ways
-from alice_survey.sim.vehicle.identification.sensitivity import (
-    ADDED_MASS,
-    BIAS,
-    BUOYANCY,
-    CURRENT,
-    GAIN,
-    LIFT,
-    LINEAR,
-    QUADRATIC,
-    QUADRATIC_NEG,
-    QUADRATIC_POS,
-    TRIM,
-    Physics,
-    Terms,
-)
+from alice_survey.sim.vehicle.identification import sensitivity as term
+from alice_survey.sim.vehicle.identification.sensitivity import Physics, Terms
 from alice_survey.sim.vehicle.vehicle import Vehicle
 
 CURRENTS = ("current_north_mps", "current_east_mps")
@@ -41,8 +28,8 @@ GROUPS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {"current": CURRENTS, "trim": TRIMS, "bias": BIASES, "buoyancy": (NET_BUOYANCY,), "gain": GAINS}
 )
 """Short names of several parameters."""
-QUADRATICS = (QUADRATIC, QUADRATIC_POS, QUADRATIC_NEG)
-_GREATEST: Mapping[int, float] = MappingProxyType({CURRENT: 5.0, TRIM: 1.0})
+QUADRATICS = (term.QUADRATIC, term.QUADRATIC_POS, term.QUADRATIC_NEG)
+_GREATEST: Mapping[int, float] = MappingProxyType({term.CURRENT: 5.0, term.TRIM: 1.0})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,9 +63,9 @@ class Parameters:
         lower, upper = np.full(len(self.names), -np.inf), np.full(len(self.names), np.inf)
         for k, name in enumerate(self.names):
             kind, i, j = place_of(name)
-            if kind in (LINEAR, *QUADRATICS, ADDED_MASS) and i == j:
+            if kind in (term.LINEAR, *QUADRATICS, term.ADDED_MASS) and i == j:
                 upper[k] = 0.0
-            elif kind == GAIN:
+            elif kind == term.GAIN:
                 lower[k] = 0.0
             elif kind in _GREATEST:
                 lower[k], upper[k] = -_GREATEST[kind], _GREATEST[kind]
@@ -147,7 +134,7 @@ def free_parameters(
     places: dict[tuple[int, int, int], str] = {}
     for name in flat:
         kind, i, j = place_of(name)
-        place = (kind, min(i, j), max(i, j)) if kind == ADDED_MASS else (kind, i, j)
+        place = (kind, min(i, j), max(i, j)) if kind == term.ADDED_MASS else (kind, i, j)
         if place in places:
             raise VehicleError(f"{places[place]} and {name} are one parameter: free it once")
         places[place] = name
@@ -172,15 +159,15 @@ def unit_of(name: str) -> str:
         VehicleError: the name is not known.
     """
     kind, i, j = place_of(name)
-    if kind == GAIN:
+    if kind == term.GAIN:
         return "1"
-    if kind in (CURRENT, TRIM, BUOYANCY, BIAS):
+    if kind in (term.CURRENT, term.TRIM, term.BUOYANCY, term.BIAS):
         suffix = name.split("_", 2)[2]
         return {"mps": "m/s", "rad_s": "rad/s", "m": "m", "n": "N"}[suffix]
     force, turning = ("N m" if i >= 3 else "N"), j >= 3
-    if kind == ADDED_MASS:
+    if kind == term.ADDED_MASS:
         return ("kg", "kg m", "kg m2")[int(i >= 3) + int(turning)]
-    if kind == LIFT:
+    if kind == term.LIFT:
         return f"{force} s2/m2"
     power = "2" if kind in QUADRATICS else ""
     return f"{force} s{power}" + ("" if turning else f"/m{power}")
@@ -192,16 +179,21 @@ def place_of(name: str) -> tuple[int, int, int]:
     Raises:
         VehicleError: the name is not known.
     """
-    for kind, group in ((CURRENT, CURRENTS), (TRIM, TRIMS), (BIAS, BIASES), (GAIN, GAINS)):
+    for kind, group in (
+        (term.CURRENT, CURRENTS),
+        (term.TRIM, TRIMS),
+        (term.BIAS, BIASES),
+        (term.GAIN, GAINS),
+    ):
         if name in group:
             return kind, group.index(name), 0
     if name == NET_BUOYANCY:
-        return BUOYANCY, 0, 0
+        return term.BUOYANCY, 0, 0
     if name in LIFTS:
-        return LIFT, FORCES.index(name[0]), MOTIONS.index(name[3])
+        return term.LIFT, FORCES.index(name[0]), MOTIONS.index(name[3])
     if len(name) > 2 and name[0] in FORCES and name[1] == "_" and name[2] in MOTIONS:
-        kinds = {"dot": ADDED_MASS, "": LINEAR, name[2]: QUADRATIC}
-        kinds |= {f"{name[2]}_pos": QUADRATIC_POS, f"{name[2]}_neg": QUADRATIC_NEG}
+        kinds = {"dot": term.ADDED_MASS, "": term.LINEAR, name[2]: term.QUADRATIC}
+        kinds |= {f"{name[2]}_pos": term.QUADRATIC_POS, f"{name[2]}_neg": term.QUADRATIC_NEG}
         if name[3:] in kinds:
             return kinds[name[3:]], FORCES.index(name[0]), MOTIONS.index(name[2])
     known = ", ".join((*GROUPS, *OTHERS))

@@ -34,20 +34,14 @@ from alice_survey.core.compiled import kernel
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.core.run.progress import step as named_step
+from alice_survey.sim.vehicle.identification import sensitivity as term
 from alice_survey.sim.vehicle.identification.output_error import (
     in_stretches,
     jackknife_covariance,
     stretch_numbers,
 )
 from alice_survey.sim.vehicle.identification.parameters import OTHERS, Parameters
-from alice_survey.sim.vehicle.identification.sensitivity import (
-    ADDED_MASS,
-    LIFT,
-    LINEAR,
-    STATES,
-    Physics,
-    force_on,
-)
+from alice_survey.sim.vehicle.identification.sensitivity import Physics, force_on
 from alice_survey.sim.vehicle.identification.windows import Mask, Window
 from alice_survey.sim.vehicle.propulsion import add_thrust
 from alice_survey.sim.vehicle.vehicle import Vehicle
@@ -260,7 +254,7 @@ def calibrate(windows: Sequence[Window], parameters: Parameters) -> TwoStep:
                 places = [k for k, name in enumerate(parameters.names) if name[0] == force]
                 for k in places:
                     steps[k] = step
-                inertial = [k for k in places if parameters.terms.kind[k] == ADDED_MASS]
+                inertial = [k for k in places if parameters.terms.kind[k] == term.ADDED_MASS]
                 damping = [k for k in places if k not in inertial]
                 for group, much in ((damping, False), (inertial, True)):
                     if group:
@@ -328,11 +322,11 @@ def _average(rows: _Rows, table: Array) -> Array:
 def _regressor(rows: _Rows, kind: int, force: int, motion: int) -> Array:
     """Factor of a coefficient, (T,): its force moved to the side of the inertia."""
     nu = rows.states[:, 4:]
-    if kind == ADDED_MASS:
+    if kind == term.ADDED_MASS:
         return rows.accelerations[:, motion]
-    if kind == LINEAR:
+    if kind == term.LINEAR:
         return nu[:, motion]
-    if kind == LIFT:
+    if kind == term.LIFT:
         first = np.abs(nu[:, 0]) if force < 3 else nu[:, 0]
         product: Array = first * nu[:, motion]
         return product
@@ -373,7 +367,7 @@ def _smooth(windows: Sequence[Window], parameters: Parameters) -> _Rows:
         motion[:, :3] -= attitude.inv().apply(drift)
         for k in range(6):
             rates[:, k] = savgol_filter(motion[:, k], length, 1, deriv=1, delta=step)
-        state = np.empty((len(even), STATES))
+        state = np.empty((len(even), term.STATES))
         state[:, :4], state[:, 4:] = attitude.as_quat(), motion
         inputs = [
             np.stack([np.interp(even, time_s, column) for column in table.T], axis=1)

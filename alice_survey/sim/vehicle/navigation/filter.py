@@ -28,7 +28,8 @@ from alice_survey.core.compiled import columns, kernel
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.estimate_vector import ESTIMATE
-from alice_survey.sim.vehicle.navigation.sensors import BEAMS, DVL, IMU, PRESSURE, Sensors
+from alice_survey.sim.vehicle.navigation import sensors as part
+from alice_survey.sim.vehicle.navigation.sensors import Sensors
 from alice_survey.sim.vehicle.rotations import matrix_of, rotate, rotate_back, turn, wrap_angle
 from alice_survey.sim.vehicle.sea import GRAVITY
 
@@ -145,7 +146,7 @@ def new_navigation(sensors: Sensors, truth: Array, rng: np.random.Generator) -> 
     hidden = hidden_sigma * rng.standard_normal(HIDDEN)
     bias_of = {i: hidden[i - GYRO_BIAS] for i in range(GYRO_BIAS, WATER)}
     attitude = Rotation.from_quat(truth[3:7])
-    rates, lever = truth[10:13], sensors.place[IMU]
+    rates, lever = truth[10:13], sensors.place[part.IMU]
 
     nominal = np.zeros(NOMINAL)
     fix_error = np.array([bias_of[GPS_BIAS], bias_of[GPS_BIAS + 1], bias_of[DEPTH_BIAS]])
@@ -500,9 +501,9 @@ def lever_row(nav: NavigationState, sensors: Sensors, place: int, axis: int) -> 
     h, turned, x = nav.scratch[ROW], nav.turns[BELIEVED], nav.nominal
     for j in range(ERROR):
         h[j] = 0.0
-    a = sensors.place[place, 0] - sensors.place[IMU, 0]
-    b = sensors.place[place, 1] - sensors.place[IMU, 1]
-    c = sensors.place[place, 2] - sensors.place[IMU, 2]
+    a = sensors.place[place, 0] - sensors.place[part.IMU, 0]
+    b = sensors.place[place, 1] - sensors.place[part.IMU, 1]
+    c = sensors.place[place, 2] - sensors.place[part.IMU, 2]
     n, e, d = rotate(turned, a, b, c)
     # A lever l turned by the error f moves by f x l; along an axis a that is f . (l x a).
     h[axis] = 1.0
@@ -519,7 +520,7 @@ def lever_row(nav: NavigationState, sensors: Sensors, place: int, axis: int) -> 
 @kernel
 def use_depth(nav: NavigationState, sensors: Sensors) -> bool:
     """Weigh the depth in `readings`."""
-    believed = lever_row(nav, sensors, PRESSURE, DOWN_AXIS)
+    believed = lever_row(nav, sensors, part.PRESSURE, DOWN_AXIS)
     nav.scratch[ROW, DEPTH_BIAS] = 1.0
     innovation = nav.readings[DEPTH] - believed - nav.nominal[DEPTH_BIAS + 1]
     noise = sensors.pressure.noise_m * sensors.pressure.noise_m
@@ -559,9 +560,9 @@ def use_beams(nav: NavigationState, sensors: Sensors, through_water: bool) -> in
     """
     x, readings, h, turned = nav.nominal, nav.readings, nav.scratch[ROW], nav.turns[BELIEVED]
     first, instrument = (WATER_BEAM, WATER_USE) if through_water else (BEAM, DVL_USE)
-    l0 = sensors.place[DVL, 0] - sensors.place[IMU, 0]
-    l1 = sensors.place[DVL, 1] - sensors.place[IMU, 1]
-    l2 = sensors.place[DVL, 2] - sensors.place[IMU, 2]
+    l0 = sensors.place[part.DVL, 0] - sensors.place[part.IMU, 0]
+    l1 = sensors.place[part.DVL, 1] - sensors.place[part.IMU, 1]
+    l2 = sensors.place[part.DVL, 2] - sensors.place[part.IMU, 2]
     p = readings[RATES] - x[GYRO_BIAS + 1]
     q = readings[RATES + 1] - x[GYRO_BIAS + 2]
     r = readings[RATES + 2] - x[GYRO_BIAS + 3]
@@ -587,7 +588,7 @@ def use_beams(nav: NavigationState, sensors: Sensors, through_water: bool) -> in
         return 0
     gyro_variance = sensors.imu.gyro_noise_rad_per_sqrt_s**2 / sensors.tick_s
     used = 0
-    for i in range(BEAMS):
+    for i in range(part.BEAMS):
         measured = readings[first + i]
         if not math.isfinite(measured):
             continue

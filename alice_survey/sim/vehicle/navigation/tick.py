@@ -16,6 +16,7 @@ from alice_survey.core.compiled import kernel
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.navigation import filter as slot
+from alice_survey.sim.vehicle.navigation import sensors as part
 from alice_survey.sim.vehicle.navigation.filter import (
     NavigationState,
     correct,
@@ -27,16 +28,7 @@ from alice_survey.sim.vehicle.navigation.filter import (
     use_fix,
     use_heading,
 )
-from alice_survey.sim.vehicle.navigation.sensors import (
-    BEAMS,
-    DVL,
-    FOLLOWED,
-    GPS,
-    IMU,
-    PRESSURE,
-    USBL,
-    Sensors,
-)
+from alice_survey.sim.vehicle.navigation.sensors import Sensors
 from alice_survey.sim.vehicle.rotations import (
     matrix_of,
     rotate,
@@ -134,7 +126,7 @@ def navigation_tick(
         )
         used |= use_heading(nav, suite)
     if suite.pressure_every > 0 and tick % suite.pressure_every == 0:
-        place = suite.place[PRESSURE]
+        place = suite.place[part.PRESSURE]
         nav.readings[slot.DEPTH_TIME] = time_s
         nav.readings[slot.DEPTH] = (
             now[2]
@@ -145,7 +137,7 @@ def navigation_tick(
         used |= use_depth(nav, suite)
     due = suite.gps_every > 0 and tick % suite.gps_every == 0
     if due and now[2] <= suite.gps.max_depth_m:  # the antenna is out of the water
-        place = suite.place[GPS]
+        place = suite.place[part.GPS]
         arm = rotate(truth, place[0], place[1], place[2])
         for i in range(2):
             drawn = suite.gps.noise_m * rng.standard_normal()
@@ -156,7 +148,7 @@ def navigation_tick(
             nav,
             suite,
             slot.GPS_USE,
-            GPS,
+            part.GPS,
             slot.GPS_FIX,
             suite.gps.noise_m * suite.gps.noise_m,
             slot.GPS_BIAS,
@@ -183,7 +175,7 @@ def _followed_depth(nav: NavigationState, suite: Sensors) -> float:
     """Believed depth of the followed point, metres."""
     turned, total = nav.turns[slot.BELIEVED], nav.nominal[2]
     for i in range(3):
-        total += turned[2, i] * (suite.place[FOLLOWED, i] - suite.place[IMU, i])
+        total += turned[2, i] * (suite.place[part.FOLLOWED, i] - suite.place[part.IMU, i])
     return float(total)
 
 
@@ -202,13 +194,13 @@ def _hear_floor(time_s: float, used: int, nav: NavigationState, suite: Sensors) 
     count = 0
     noise = sn = se = sd = snn = sne = see = snd = sed = sdd = 0.0
     highest = math.inf
-    for i in range(BEAMS):
+    for i in range(part.BEAMS):
         if used >> i & 1 == 0:
             continue
         reach = nav.readings[slot.RANGE + i]
-        a = reach * suite.beams[i, 0] + place[DVL, 0] - place[FOLLOWED, 0]
-        b = reach * suite.beams[i, 1] + place[DVL, 1] - place[FOLLOWED, 1]
-        c = reach * suite.beams[i, 2] + place[DVL, 2] - place[FOLLOWED, 2]
+        a = reach * suite.beams[i, 0] + place[part.DVL, 0] - place[part.FOLLOWED, 0]
+        b = reach * suite.beams[i, 1] + place[part.DVL, 1] - place[part.FOLLOWED, 1]
+        c = reach * suite.beams[i, 2] + place[part.DVL, 2] - place[part.FOLLOWED, 2]
         # Where the beam ends, from the followed point.
         n, e, d = rotate(turned, a, b, c)
         count += 1
@@ -263,8 +255,12 @@ def _hear_floor(time_s: float, used: int, nav: NavigationState, suite: Sensors) 
         if i < points:
             a, b, c = suite.hull[i, 0], suite.hull[i, 1], suite.hull[i, 2]
         else:
-            a, b, c = place[DVL, 0], place[DVL, 1], place[DVL, 2]
-        a, b, c = a - place[FOLLOWED, 0], b - place[FOLLOWED, 1], c - place[FOLLOWED, 2]
+            a, b, c = place[part.DVL, 0], place[part.DVL, 1], place[part.DVL, 2]
+        a, b, c = (
+            a - place[part.FOLLOWED, 0],
+            b - place[part.FOLLOWED, 1],
+            c - place[part.FOLLOWED, 2],
+        )
         n, e, d = rotate(turned, a, b, c)
         clearance = min(clearance, altitude + north * n + east * e - d)
         lowest = max(lowest, d)
@@ -291,7 +287,7 @@ def _write_estimate(time_s: float, nav: NavigationState, suite: Sensors, estimat
     off. Both are NaN when the ping is too long ago.
     """
     memory, x, turned = nav.memory, nav.nominal, nav.turns[slot.BELIEVED]
-    a, b, c = suite.place[IMU, 0], suite.place[IMU, 1], suite.place[IMU, 2]
+    a, b, c = suite.place[part.IMU, 0], suite.place[part.IMU, 1], suite.place[part.IMU, 2]
     for i in range(3):
         estimate[i] = x[i] - turned[i, 0] * a - turned[i, 1] * b - turned[i, 2] * c
         estimate[vector.P + i] = nav.readings[slot.RATES + i] - x[slot.GYRO_BIAS + 1 + i]
@@ -371,7 +367,7 @@ def log_row(nav: NavigationState, out: Array) -> None:
         _variance(nav, slot.ATTITUDE, -d * n / level2, -d * e / level2, 1.0)
     )
     out[LOG_SIGMA + 6] = nav.memory[slot.ALTITUDE_SIGMA]
-    for i in range(BEAMS):
+    for i in range(part.BEAMS):
         out[LOG_RANGE + i] = nav.readings[slot.RANGE + i]
     for i in range(6):
         out[LOG_USED + i] = nav.counts[i, slot.USED]
@@ -397,7 +393,7 @@ def measure_imu(
     a, b = nav.turns[slot.TRUTH_BEFORE], nav.turns[slot.TRUTH_NOW]
     matrix_of(before[3:7], a)
     turn_between(before[3:7], now[3:7], readings[slot.TURN : slot.TURN + 3])
-    x, y, z = sensors.place[IMU, 0], sensors.place[IMU, 1], sensors.place[IMU, 2]
+    x, y, z = sensors.place[part.IMU, 0], sensors.place[part.IMU, 1], sensors.place[part.IMU, 2]
     p, q, r = before[10], before[11], before[12]
     a0, a1, a2 = q * z - r * y, r * x - p * z, p * y - q * x
     p, q, r = now[10], now[11], now[12]
@@ -434,7 +430,7 @@ def _use_usbl(
     time_s: float, now: Array, sensors: Sensors, nav: NavigationState, rng: np.random.Generator
 ) -> bool:
     """Measure and weigh north and east of the transponder; whether there was an answer of use."""
-    place, turn, usbl = sensors.place[USBL], nav.turns[slot.TRUTH_NOW], sensors.usbl
+    place, turn, usbl = sensors.place[part.USBL], nav.turns[slot.TRUTH_NOW], sensors.usbl
     north, east, depth = rotate(turn, place[0], place[1], place[2])
     north, east, depth = now[0] + north, now[1] + east, now[2] + depth
     boat = usbl.boat_ned_m
@@ -452,12 +448,12 @@ def _use_usbl(
         nav.readings[slot.USBL_FIX + i] = value
     nav.readings[slot.USBL_TIME] = time_s
     # The filter takes the sigma of the distance that is estimated.
-    north = lever_row(nav, sensors, USBL, slot.NORTH_AXIS)
-    east = lever_row(nav, sensors, USBL, slot.EAST_AXIS)
-    depth = lever_row(nav, sensors, USBL, slot.DOWN_AXIS)
+    north = lever_row(nav, sensors, part.USBL, slot.NORTH_AXIS)
+    east = lever_row(nav, sensors, part.USBL, slot.EAST_AXIS)
+    depth = lever_row(nav, sensors, part.USBL, slot.DOWN_AXIS)
     reach2 = (north - boat[0]) ** 2 + (east - boat[1]) ** 2 + (depth - boat[2]) ** 2
     sigma = math.sqrt(noise2 + slope2 * reach2)
-    return use_fix(nav, sensors, slot.USBL_USE, USBL, slot.USBL_FIX, sigma * sigma, -1)
+    return use_fix(nav, sensors, slot.USBL_USE, part.USBL, slot.USBL_FIX, sigma * sigma, -1)
 
 
 @kernel
@@ -485,7 +481,7 @@ def measure_dvl(
             return
     if turn[2, 2] < sensors.min_cos_tilt or rng.random() < dvl.ping_loss:
         return
-    x, y, z = sensors.place[DVL, 0], sensors.place[DVL, 1], sensors.place[DVL, 2]
+    x, y, z = sensors.place[part.DVL, 0], sensors.place[part.DVL, 1], sensors.place[part.DVL, 2]
     p, q, r = now[10], now[11], now[12]
     spin0, spin1, spin2 = q * z - r * y, r * x - p * z, p * y - q * x
     north, east, depth = rotate(turn, x, y, z)
@@ -498,7 +494,7 @@ def measure_dvl(
     for i in range(sensors.bottom_dropouts_s.shape[0]):
         silent = sensors.bottom_dropouts_s[i]
         bottom &= not (silent[0] <= time_s < silent[1])
-    for i in range(BEAMS if bottom else 0):
+    for i in range(part.BEAMS if bottom else 0):
         b0, b1, b2 = sensors.beams[i, 0], sensors.beams[i, 1], sensors.beams[i, 2]
         beam_n, beam_e, down = rotate(turn, b0, b1, b2)
         reach = floor_range(floor, north, east, depth, beam_n, beam_e, down, dvl.max_range_m)
@@ -530,7 +526,7 @@ def measure_dvl(
     n, e = now[7] - water_ned[0], now[8] - water_ned[1]
     u, v, w = rotate_back(turn, n, e, now[9])
     u, v, w = u + spin0, v + spin1, w + spin2
-    for i in range(BEAMS):
+    for i in range(part.BEAMS):
         readings[slot.WATER_BEAM + i] = (
             _along_beam(sensors, nav.hidden, i, u, v, w)
             + dvl.water_noise_mps * rng.standard_normal()
@@ -565,7 +561,7 @@ def solve_beams(beams: Array, along: Array, out: Array) -> None:
     beam that is missing.
     """
     missing, which = 0, 0
-    for i in range(BEAMS):
+    for i in range(part.BEAMS):
         if not math.isfinite(along[i]):
             missing, which = missing + 1, i
     if missing > 1:
@@ -576,7 +572,7 @@ def solve_beams(beams: Array, along: Array, out: Array) -> None:
         given = along[(which + 1) % 4] + along[(which + 3) % 4] - along[(which + 2) % 4]
     for axis in range(3):
         total = square = 0.0
-        for i in range(BEAMS):
+        for i in range(part.BEAMS):
             total += beams[i, axis] * (given if i == which else along[i])
             square += beams[i, axis] * beams[i, axis]
         out[axis] = total / square

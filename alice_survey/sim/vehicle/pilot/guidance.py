@@ -22,18 +22,9 @@ import math
 from alice_survey.core.compiled import kernel
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import estimate_vector as vector
+from alice_survey.sim.vehicle.pilot import gains as g
 from alice_survey.sim.vehicle.pilot import memory as slot
-from alice_survey.sim.vehicle.pilot.gains import (
-    BANDWIDTH,
-    HEAVE,
-    INTEGRAL_SHARE,
-    LAG,
-    MIN_FORCE,
-    STEADY_SHARE,
-    SURGE,
-    WEIGHT,
-    Gains,
-)
+from alice_survey.sim.vehicle.pilot.gains import Gains
 from alice_survey.sim.vehicle.pilot.memory import PilotState
 from alice_survey.sim.vehicle.pilot.mission import (
     COLA2,
@@ -103,7 +94,7 @@ def go_to(goal_n: float, goal_e: float, heading: float, tick: Tick) -> tuple[flo
         pilot.report[slot.BY_SWAY] = 0.0
         return distance, wrap_angle(heading - now)
     ahead, abeam = math.cos(now) * dn + math.sin(now) * de, math.cos(now) * de - math.sin(now) * dn
-    speed = clamp(_HOVER_SHARE * gains.axes[SURGE, BANDWIDTH] * ahead, path.speed_mps)
+    speed = clamp(_HOVER_SHARE * gains.axes[g.SURGE, g.BANDWIDTH] * ahead, path.speed_mps)
     hover = guidance.sway > 0.0 and distance < _HOVER_M
     if hover:
         error = head_for(heading, 0.0, 0.0, tick)
@@ -183,7 +174,7 @@ def follow(leg: int, along: float, tick: Tick) -> None:
             # of the bandwidth of the path's loop.
             memory, s, c = pilot.memory, math.sin(beta), math.cos(beta)
             if curvature == 0.0 and abs(cross) < 0.5 * ahead:
-                step = -INTEGRAL_SHARE * path.speed_mps / (ahead * ahead) * cross * dt_s
+                step = -g.INTEGRAL_SHARE * path.speed_mps / (ahead * ahead) * cross * dt_s
                 lean_n, lean_e = memory[slot.LEAN_N] - s * step, memory[slot.LEAN_E] + c * step
                 cut = min(1.0, _MAX_LEAN_RAD / max(math.hypot(lean_n, lean_e), 1e-9))
                 memory[slot.LEAN_N], memory[slot.LEAN_E] = cut * lean_n, cut * lean_e
@@ -257,7 +248,7 @@ def steer(
         _enter(pilot, slot.ABORT)
     if report[slot.REASON] == NO_NAVIGATION:
         # Without an estimate of its motion the vehicle can only push itself up.
-        wrench[2] = STEADY_SHARE * gains.axes[HEAVE, MIN_FORCE]
+        wrench[2] = g.STEADY_SHARE * gains.axes[g.HEAVE, g.MIN_FORCE]
         return
 
     write_point(estimate, guidance, pilot)
@@ -430,13 +421,13 @@ def _on_path(tick: Tick) -> None:
             point[slot.POINT_EAST],
             _QUICKEST * path.speed_mps * dt_s,
         )
-        speed, lag_s = max(point[slot.SURGE_SPEED], 0.0), gains.axes[SURGE, LAG]
+        speed, lag_s = max(point[slot.SURGE_SPEED], 0.0), gains.axes[g.SURGE, g.LAG]
         braking = speed * speed / (2.0 * guidance.stop_mps2) + speed * lag_s
         if path.stop[leg] > 0.0 and path.length_m[leg] - along <= braking:
             # The reference starts where the vehicle is, as fast as it is. The integral of the speed
             # loop holds the share of the speed that its proportional part does not see (gains.py),
             # and what the current takes; only this is passed on to the place's.
-            held = memory[slot.SURGE_SUM] - (1.0 - gains.axes[SURGE, WEIGHT]) * speed
+            held = memory[slot.SURGE_SUM] - (1.0 - gains.axes[g.SURGE, g.WEIGHT]) * speed
             memory[slot.PLACE_SUM_N] = held * math.cos(estimate[vector.HEADING])
             memory[slot.PLACE_SUM_E] = held * math.sin(estimate[vector.HEADING])
             start_standing(along, speed, pilot)

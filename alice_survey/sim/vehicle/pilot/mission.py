@@ -57,8 +57,9 @@ from alice_survey.core.compiled import kernel
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.dynamics import add_coriolis, add_damping
+from alice_survey.sim.vehicle.pilot import gains as g
 from alice_survey.sim.vehicle.pilot import memory as slot
-from alice_survey.sim.vehicle.pilot.gains import FASTEST, PLACE, RATE, SURGE, WEIGHT, YAW, Gains
+from alice_survey.sim.vehicle.pilot.gains import Gains
 from alice_survey.sim.vehicle.pilot.memory import DIVE, FOLLOW
 from alice_survey.sim.vehicle.pilot.safety import mind_floor, restart_watch
 from alice_survey.sim.vehicle.pilot.settings import Tick
@@ -276,8 +277,8 @@ def turn_in_m(gains: Gains, speed_mps: float) -> float:
 
 def yaw_rad_s(gains: Gains, error_rad: float) -> float:
     """Rate at which a vehicle turns at a heading error."""
-    row = gains.axes[YAW]
-    return float(min(row[PLACE] / row[RATE] * error_rad, row[FASTEST]))
+    row = gains.axes[g.YAW]
+    return float(min(row[g.PLACE] / row[g.RATE] * error_rad, row[g.FASTEST]))
 
 
 def _circling(gains: Gains, speed_mps: float, error_rad: float) -> tuple[float, float, float]:
@@ -333,7 +334,7 @@ def manoeuvre(step: Array, heave_m: float, settings: Array, tick: Tick) -> bool:
         if done and parks:
             memory[slot.KEEPS] = 1.0
             heading, speed = estimate[vector.HEADING], pilot.point[slot.SURGE_SPEED]
-            held = memory[slot.SURGE_SUM] - (1.0 - gains.axes[SURGE, WEIGHT]) * speed
+            held = memory[slot.SURGE_SUM] - (1.0 - gains.axes[g.SURGE, g.WEIGHT]) * speed
             memory[slot.PLACE_SUM_N] = held * math.cos(heading)
             memory[slot.PLACE_SUM_E] = held * math.sin(heading)
         return bool(done and not parks)

@@ -17,28 +17,9 @@ import numpy as np
 from alice_survey.core.compiled import kernel
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
+from alice_survey.sim.vehicle.pilot import gains as g
 from alice_survey.sim.vehicle.pilot import memory as slot
-from alice_survey.sim.vehicle.pilot.gains import (
-    BANDWIDTH,
-    FASTEST,
-    INTEGRAL_SHARE,
-    LAG,
-    MASS,
-    MAX_FORCE,
-    MIN_FORCE,
-    PITCH,
-    PLACE,
-    RATE,
-    STEADY_SHARE,
-    SURGE,
-    SWAY,
-    VERTICAL,
-    YAW,
-    Gains,
-    coupled_pair,
-    damping_ratio,
-    heading_loop,
-)
+from alice_survey.sim.vehicle.pilot.gains import Gains, coupled_pair, damping_ratio, heading_loop
 from alice_survey.sim.vehicle.pilot.memory import PilotState
 from alice_survey.sim.vehicle.pilot.path import Path
 from alice_survey.sim.vehicle.pilot.safety import SafetyLimits
@@ -94,17 +75,17 @@ def dive_loop(gains: Gains, speed_mps: float, look_ahead_m: float) -> Array:
     Returns:
         (7, 7)
     """
-    row = gains.axes[PITCH]
+    row = gains.axes[g.PITCH]
     loop = np.zeros((7, 7))
-    loop[:5, :5] = heading_loop(gains.body, speed_mps, row, gains.fins, VERTICAL)
+    loop[:5, :5] = heading_loop(gains.body, speed_mps, row, gains.fins, g.VERTICAL)
     sink = np.array([0.0, -speed_mps, 1.0, 0.0, 0.0, 0.0, 0.0])
-    learns = INTEGRAL_SHARE * speed_mps / look_ahead_m**2
+    learns = g.INTEGRAL_SHARE * speed_mps / look_ahead_m**2
     loop[5], loop[6, 5] = sink, learns
     # Target pitch depth / look-ahead + integral, and its rate, without that of the integral.
     target, rate = np.zeros(7), sink / look_ahead_m
     target[5], target[6] = 1.0 / look_ahead_m, 1.0
     loop[0] -= target
-    loop[4] += (row[PLACE] * target + row[RATE] * rate) / row[LAG]
+    loop[4] += (row[g.PLACE] * target + row[g.RATE] * rate) / row[g.LAG]
     return loop
 
 
@@ -247,7 +228,7 @@ def pilot_guidance(
     """
     axes, speed = gains.axes, path.speed_mps
     by_sway = controller == "sway"
-    if by_sway and axes[SWAY, FASTEST] == 0.0:
+    if by_sway and axes[g.SWAY, g.FASTEST] == 0.0:
         raise VehicleError(
             "the vehicle has no lateral thrusters: fly it with the controller los, not sway"
         )
@@ -260,13 +241,13 @@ def pilot_guidance(
     if look_ahead_m is None:
         look_ahead_m = min_look_ahead_m(gains, speed, point_body_m[0])
     if gains.dives_by_pitch:
-        look_ahead_m = max(look_ahead_m, _gentle_m(gains, YAW, speed, 0.5 * CONTROL_LENGTH_M))
+        look_ahead_m = max(look_ahead_m, _gentle_m(gains, g.YAW, speed, 0.5 * CONTROL_LENGTH_M))
     if math.isnan(look_ahead_m) and not by_sway:
         raise VehicleError(
             f"no look-ahead from {CONTROL_LENGTH_M:g} to {_LOOK_AHEADS_M[-1]:g} m keeps los from "
             f"weaving at {speed:g} m/s: lower the speed, or check the vehicle's coefficients"
         )
-    weakest = min(-axes[SURGE, MIN_FORCE], axes[SURGE, MAX_FORCE])
+    weakest = min(-axes[g.SURGE, g.MIN_FORCE], axes[g.SURGE, g.MAX_FORCE])
     tightest = float(np.abs(path.curvature_per_m).max())
     under_way = HOVERS
     if gains.dives_by_pitch:
@@ -284,15 +265,15 @@ def pilot_guidance(
         lost_m=5.0 * CONTROL_LENGTH_M,
         capture_m=0.2 if by_sway else 1.0,
         way_in_m=CONTROL_LENGTH_M if by_sway else 3.0 * look_ahead_m,
-        smooth_m=min(speed, turning) / float(axes[YAW, BANDWIDTH]),
-        brake_mps2=STEADY_SHARE * weakest / float(axes[SURGE, MASS]),
+        smooth_m=min(speed, turning) / float(axes[g.YAW, g.BANDWIDTH]),
+        brake_mps2=g.STEADY_SHARE * weakest / float(axes[g.SURGE, g.MASS]),
         floor_rate_rad_s=2.0 * speed / _TERRAIN_SMOOTHING_M,
         surface_m=0.3,
-        stop_mps2=speed * float(axes[SURGE, BANDWIDTH]) / _RAMP_PERIODS,
+        stop_mps2=speed * float(axes[g.SURGE, g.BANDWIDTH]) / _RAMP_PERIODS,
         turn_in_place_rad_s=turn_in_place_rad_s,
-        turn_in_place_rad_s2=turn_in_place_rad_s * float(axes[YAW, BANDWIDTH]) / _RAMP_PERIODS,
+        turn_in_place_rad_s2=turn_in_place_rad_s * float(axes[g.YAW, g.BANDWIDTH]) / _RAMP_PERIODS,
         step_mps=step_mps,
-        step_mps2=step_mps * float(axes[SWAY, BANDWIDTH]) / _RAMP_PERIODS,
+        step_mps2=step_mps * float(axes[g.SWAY, g.BANDWIDTH]) / _RAMP_PERIODS,
         limits=limits or SafetyLimits(0.5 * path.altitude_m, max_depth_m),
         under_way=under_way,
     )
@@ -303,7 +284,7 @@ def _gentle_m(gains: Gains, axis: int, speed_mps: float, off_m: float) -> float:
 
     A path that closes as exp(-x / look-ahead) has a curvature of off / look-ahead^2.
     """
-    return math.sqrt(off_m * speed_mps / float(gains.axes[axis, FASTEST]))
+    return math.sqrt(off_m * speed_mps / float(gains.axes[axis, g.FASTEST]))
 
 
 def _under_way(gains: Gains, path: Path, tightest_per_m: float) -> UnderWay:
@@ -312,7 +293,7 @@ def _under_way(gains: Gains, path: Path, tightest_per_m: float) -> UnderWay:
     Raises:
         VehicleError: it cannot.
     """
-    speed, fastest = path.speed_mps, float(gains.axes[YAW, FASTEST])
+    speed, fastest = path.speed_mps, float(gains.axes[g.YAW, g.FASTEST])
     if np.any(path.stop > 0.0):
         raise VehicleError(
             "the route has turns on the spot or sway steps, and a vehicle that fins steer cannot "
@@ -333,7 +314,7 @@ def _under_way(gains: Gains, path: Path, tightest_per_m: float) -> UnderWay:
     return UnderWay(
         circle_m=radius_m,
         side=1.0,
-        dive_ahead_m=max(look_ahead_m, _gentle_m(gains, PITCH, speed, _DEPTH_OFF_M)),
+        dive_ahead_m=max(look_ahead_m, _gentle_m(gains, g.PITCH, speed, _DEPTH_OFF_M)),
         level_rad=gains.level_rad,
     )
 
@@ -357,10 +338,10 @@ def stop_speeds(
     Returns:
         The rate, no greater than target, and the speed, at most `STEP_MPS`, 0 without sway.
     """
-    rate = min(turn_in_place_rad_s, float(gains.axes[YAW, FASTEST]))
+    rate = min(turn_in_place_rad_s, float(gains.axes[g.YAW, g.FASTEST]))
     if not by_sway:
         return rate, 0.0
-    fastest = float(gains.axes[SWAY, FASTEST])
+    fastest = float(gains.axes[g.SWAY, g.FASTEST])
     if lever_m != 0.0:
         rate = min(rate, fastest / abs(lever_m))
     return rate, min(STEP_MPS, fastest)
@@ -383,9 +364,9 @@ def turning_speed_mps(gains: Gains, curvature_per_m: float, lever_m: float) -> f
     """
     if curvature_per_m < _STRAIGHT_PER_M:
         return math.inf
-    speed = gains.axes[YAW, FASTEST] / curvature_per_m
+    speed = gains.axes[g.YAW, g.FASTEST] / curvature_per_m
     if lever_m > 0.0:
-        speed = min(speed, gains.axes[SWAY, FASTEST] / (curvature_per_m * lever_m))
+        speed = min(speed, gains.axes[g.SWAY, g.FASTEST] / (curvature_per_m * lever_m))
     return float(speed)
 
 
@@ -405,17 +386,17 @@ def los_loop(gains: Gains, speed_mps: float, lever_m: float, look_ahead_m: float
         (5, 5)
     """
     pair, by_moment = coupled_pair(gains.body, speed_mps, gains.fins)
-    row = gains.axes[YAW]
+    row = gains.axes[g.YAW]
     loop = np.zeros((5, 5))
     loop[0, 1:4] = speed_mps, 1.0, lever_m
     loop[1, 3] = 1.0
     loop[2:4, 2:4] = pair
-    loop[2:4, 4] = by_moment * row[MASS]
+    loop[2:4, 4] = by_moment * row[g.MASS]
     # Target heading -offset / look-ahead, and its rate.
-    asked = -row[RATE] / look_ahead_m * loop[0]
-    asked[[0, 1, 3]] -= row[PLACE] / look_ahead_m, row[PLACE], row[RATE]
-    loop[4] = asked / row[LAG]
-    loop[4, 4] -= 1.0 / row[LAG]
+    asked = -row[g.RATE] / look_ahead_m * loop[0]
+    asked[[0, 1, 3]] -= row[g.PLACE] / look_ahead_m, row[g.PLACE], row[g.RATE]
+    loop[4] = asked / row[g.LAG]
+    loop[4, 4] -= 1.0 / row[g.LAG]
     return loop
 
 

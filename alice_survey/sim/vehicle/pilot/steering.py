@@ -31,29 +31,9 @@ from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.dynamics import add_coriolis, add_damping
 from alice_survey.sim.vehicle.fins import add_fins
+from alice_survey.sim.vehicle.pilot import gains as g
 from alice_survey.sim.vehicle.pilot import memory as slot
-from alice_survey.sim.vehicle.pilot.gains import (
-    FASTEST,
-    HEAVE,
-    INNER,
-    INTEGRAL,
-    INTEGRAL_SHARE,
-    KEPT_RAD,
-    LAG,
-    MASS,
-    MAX_FORCE,
-    MIN_FORCE,
-    PITCH,
-    PLACE,
-    RATE,
-    ROLL,
-    STEERED,
-    SURGE,
-    SWAY,
-    WEIGHT,
-    YAW,
-    Gains,
-)
+from alice_survey.sim.vehicle.pilot.gains import Gains
 from alice_survey.sim.vehicle.pilot.memory import PilotState
 from alice_survey.sim.vehicle.pilot.path import Path, place_at
 from alice_survey.sim.vehicle.pilot.safety import restart_watch
@@ -89,9 +69,9 @@ def place_demand(
         The speed that drag is to be expected at, and the acceleration.
     """
     row = gains.axes[axis]
-    inner = row[INNER]
-    steady = feed + clamp(row[PLACE] / inner * error, maximum)
-    derivative = (row[RATE] / inner - 1.0) * (feed - speed)
+    inner = row[g.INNER]
+    steady = feed + clamp(row[g.PLACE] / inner * error, maximum)
+    derivative = (row[g.RATE] / inner - 1.0) * (feed - speed)
     return steady, inner * (steady + total + derivative - speed)
 
 
@@ -108,16 +88,16 @@ def place_sum_step(gains: Gains, axis: int, error: float, full: float, dt_s: flo
     """
     if full * error > 0.0:
         return 0.0
-    return float(gains.axes[axis, INTEGRAL] / gains.axes[axis, INNER] * error * dt_s)
+    return float(gains.axes[axis, g.INTEGRAL] / gains.axes[axis, g.INNER] * error * dt_s)
 
 
 @kernel
 def sum_bound(gains: Gains, axis: int) -> float:
     """Integral, as a speed, beyond which it alone would exceed the available force."""
     row = gains.axes[axis]
-    if row[INNER] == 0.0:
+    if row[g.INNER] == 0.0:
         return 0.0
-    return float(max(-row[MIN_FORCE], row[MAX_FORCE]) / (row[MASS] * row[INNER]))
+    return float(max(-row[g.MIN_FORCE], row[g.MAX_FORCE]) / (row[g.MASS] * row[g.INNER]))
 
 
 @kernel
@@ -140,9 +120,9 @@ def speed_demand(
     """
     row, error = gains.axes[axis], target - speed
     if full * error <= 0.0:
-        step = row[PLACE] / row[RATE] * error * dt_s
+        step = row[g.PLACE] / row[g.RATE] * error * dt_s
         total = clamp(total + step, sum_bound(gains, axis))
-    return row[RATE] * (row[WEIGHT] * target - speed + total), total
+    return row[g.RATE] * (row[g.WEIGHT] * target - speed + total), total
 
 
 @kernel
@@ -177,38 +157,38 @@ def write_wrench(
             asked += body.mass[i, other if other < 3 else 5] * demand[slot.ACC_SURGE + other]
         if i == 2:
             asked -= body.weight_n - body.buoyancy_n
-        minimum, maximum = gains.axes[axis, MIN_FORCE], gains.axes[axis, MAX_FORCE]
+        minimum, maximum = gains.axes[axis, g.MIN_FORCE], gains.axes[axis, g.MAX_FORCE]
         demand[slot.FULL_SURGE + axis] = (
             1.0 if asked > maximum else (-1.0 if asked < minimum else 0.0)
         )
         wrench[i] = min(max(asked, minimum), maximum)
-    for axis in (ROLL, PITCH):
+    for axis in (g.ROLL, g.PITCH):
         row = gains.axes[axis]
-        if row[MASS] == 0.0:
+        if row[g.MASS] == 0.0:
             continue
-        i = 3 if axis == ROLL else 4
-        angle = estimate[vector.ROLL] if axis == ROLL else estimate[vector.PITCH]
-        rate = estimate[vector.P] if axis == ROLL else estimate[vector.Q]
-        if axis == PITCH:
+        i = 3 if axis == g.ROLL else 4
+        angle = estimate[vector.ROLL] if axis == g.ROLL else estimate[vector.PITCH]
+        rate = estimate[vector.P] if axis == g.ROLL else estimate[vector.Q]
+        if axis == g.PITCH:
             angle -= pilot.demand[slot.REF_PITCH]
             rate -= pilot.demand[slot.REF_PITCH_RATE]
-        place = slot.ROLL_SUM if axis == ROLL else slot.PITCH_SUM
+        place = slot.ROLL_SUM if axis == g.ROLL else slot.PITCH_SUM
         total = pilot.memory[place]
-        asked = -row[MASS] * (row[PLACE] * angle + row[RATE] * rate + total) - pilot.force[i]
-        for other in range(STEERED):
+        asked = -row[g.MASS] * (row[g.PLACE] * angle + row[g.RATE] * rate + total) - pilot.force[i]
+        for other in range(g.STEERED):
             k = other if other < 3 else 5
             asked += body.mass[i, k] * pilot.demand[slot.ACC_SURGE + other]
-        asked += body.weight_n * (-body.cg[1] if axis == ROLL else body.cg[0])
-        wrench[i] = min(max(asked, row[MIN_FORCE]), row[MAX_FORCE])
+        asked += body.weight_n * (-body.cg[1] if axis == g.ROLL else body.cg[0])
+        wrench[i] = min(max(asked, row[g.MIN_FORCE]), row[g.MAX_FORCE])
         if (asked - wrench[i]) * angle >= 0.0:  # not cut, or on the way back
-            step = row[INTEGRAL] * angle * dt_s
+            step = row[g.INTEGRAL] * angle * dt_s
             pilot.memory[place] = clamp(
-                total + step, max(-row[MIN_FORCE], row[MAX_FORCE]) / row[MASS]
+                total + step, max(-row[g.MIN_FORCE], row[g.MAX_FORCE]) / row[g.MASS]
             )
 
 
 DEPTH_KEPT_M = 0.2
-HEADING_KEPT_RAD = KEPT_RAD
+HEADING_KEPT_RAD = g.KEPT_RAD
 """Tolerances within which a depth or heading counts as kept."""
 _AT_REST = 0.1
 """Below this share of the greatest speed an axis is not on its way. Integrals learn while a depth
@@ -283,14 +263,14 @@ def sink_to(depth_m: float, feed_mps: float, tick: Tick) -> None:
         if kept == bent:
             demand[slot.REF_PITCH_RATE] = (pilot.point[slot.SINK_SPEED] - feed_mps) / ahead
         if abs(off) < DEPTH_KEPT_M:
-            learned = INTEGRAL_SHARE * path.speed_mps / (ahead * ahead) * off * dt_s
+            learned = g.INTEGRAL_SHARE * path.speed_mps / (ahead * ahead) * off * dt_s
             total = memory[slot.HEAVE_SUM] + learned
             memory[slot.HEAVE_SUM] = min(max(total, -0.5 * MAX_PITCH_RAD), 0.5 * MAX_PITCH_RAD)
         return
-    error, maximum = depth_m - estimate[vector.DEPTH], gains.axes[HEAVE, FASTEST]
+    error, maximum = depth_m - estimate[vector.DEPTH], gains.axes[g.HEAVE, g.FASTEST]
     demand[slot.REF_HEAVE], demand[slot.ACC_HEAVE] = place_demand(
         gains,
-        HEAVE,
+        g.HEAVE,
         error,
         pilot.point[slot.SINK_SPEED],
         clamp(feed_mps, 0.5 * maximum),
@@ -299,8 +279,8 @@ def sink_to(depth_m: float, feed_mps: float, tick: Tick) -> None:
     )
     if abs(error) < DEPTH_KEPT_M or abs(pilot.point[slot.SINK_SPEED]) < _AT_REST * maximum:
         near = clamp(error, DEPTH_KEPT_M)
-        step = place_sum_step(gains, HEAVE, near, demand[slot.FULL_HEAVE], dt_s)
-        memory[slot.HEAVE_SUM] = clamp(memory[slot.HEAVE_SUM] + step, sum_bound(gains, HEAVE))
+        step = place_sum_step(gains, g.HEAVE, near, demand[slot.FULL_HEAVE], dt_s)
+        memory[slot.HEAVE_SUM] = clamp(memory[slot.HEAVE_SUM] + step, sum_bound(gains, g.HEAVE))
 
 
 @kernel
@@ -318,16 +298,16 @@ def head_for(heading: float, feed: float, quicken: float, tick: Tick) -> float:
     """
     dt_s, estimate, _path, _guidance, gains, pilot = tick
     memory, demand = pilot.memory, pilot.demand
-    error, maximum = wrap_angle(heading - estimate[vector.HEADING]), gains.axes[YAW, FASTEST]
+    error, maximum = wrap_angle(heading - estimate[vector.HEADING]), gains.axes[g.YAW, g.FASTEST]
     demand[slot.REF_YAW], accelerate = place_demand(
-        gains, YAW, error, pilot.point[slot.TURN_SPEED], feed, memory[slot.YAW_SUM], maximum
+        gains, g.YAW, error, pilot.point[slot.TURN_SPEED], feed, memory[slot.YAW_SUM], maximum
     )
     demand[slot.ACC_YAW] = accelerate + quicken
     off = abs(pilot.point[slot.TURN_SPEED] - feed)
     if abs(error) < HEADING_KEPT_RAD or off < _AT_REST * maximum:
         near = clamp(error, HEADING_KEPT_RAD)
-        step = place_sum_step(gains, YAW, near, demand[slot.FULL_YAW], dt_s)
-        memory[slot.YAW_SUM] = clamp(memory[slot.YAW_SUM] + step, sum_bound(gains, YAW))
+        step = place_sum_step(gains, g.YAW, near, demand[slot.FULL_YAW], dt_s)
+        memory[slot.YAW_SUM] = clamp(memory[slot.YAW_SUM] + step, sum_bound(gains, g.YAW))
     pilot.report[slot.TARGET_HEADING] = heading
     return error
 
@@ -340,7 +320,7 @@ def surge_at(speed: float, tick: Tick) -> None:
     speed *= memory[slot.PACE]
     now = pilot.point[slot.SURGE_SPEED]
     demand[slot.ACC_SURGE], memory[slot.SURGE_SUM] = speed_demand(
-        gains, SURGE, speed, now, demand[slot.FULL_SURGE], memory[slot.SURGE_SUM], dt_s
+        gains, g.SURGE, speed, now, demand[slot.FULL_SURGE], memory[slot.SURGE_SUM], dt_s
     )
     demand[slot.REF_SURGE] = speed + demand[slot.REF_YAW] * guidance.point_body_m[1]
     pilot.report[slot.TARGET_SURGE] = speed
@@ -359,21 +339,21 @@ def sway_by(offset: float, feed: float, tick: Tick) -> None:
     total = c * memory[slot.SWAY_SUM_E] - s * memory[slot.SWAY_SUM_N]
     steady, accelerate = place_demand(
         gains,
-        SWAY,
+        g.SWAY,
         -offset,
         pilot.point[slot.SWAY_SPEED],
         feed,
         total,
-        gains.axes[SWAY, FASTEST],
+        gains.axes[g.SWAY, g.FASTEST],
     )
     lever = guidance.point_body_m[0]
     demand[slot.REF_SWAY] = steady - lever * demand[slot.REF_YAW]
     demand[slot.ACC_SWAY] = accelerate - lever * demand[slot.ACC_YAW]
     pilot.report[slot.TARGET_SWAY] = steady
     if abs(offset) < guidance.far_m:
-        step = place_sum_step(gains, SWAY, -offset, demand[slot.FULL_SWAY], dt_s)
+        step = place_sum_step(gains, g.SWAY, -offset, demand[slot.FULL_SWAY], dt_s)
         north, east = memory[slot.SWAY_SUM_N] - s * step, memory[slot.SWAY_SUM_E] + c * step
-        bound = sum_bound(gains, SWAY)
+        bound = sum_bound(gains, g.SWAY)
         cut = min(1.0, bound / max(math.hypot(north, east), 1e-9))
         memory[slot.SWAY_SUM_N], memory[slot.SWAY_SUM_E] = cut * north, cut * east
 
@@ -494,7 +474,7 @@ def stand(leg: int, tick: Tick) -> bool:
         behind = abs(wrap_angle(start + sense * memory[slot.REF] - estimate[vector.HEADING]))
         # A reference goes slower from this far ahead of the vehicle on, and waits at twice that.
         maximum = guidance.turn_in_place_rad_s * min(max(2.0 - behind / _BEHIND_RAD, 0.0), 1.0)
-        lag_s = gains.axes[YAW, LAG]
+        lag_s = gains.axes[g.YAW, g.LAG]
         quicken = sense * _move_on(goal, maximum, guidance.turn_in_place_rad_s2, lag_s, dt_s, pilot)
         heading, rate = start + sense * memory[slot.REF], sense * memory[slot.REF_SPEED]
         over = goal - memory[slot.REF] < 0.5 * STOP_RAD and memory[slot.RAMP] >= goal
@@ -507,7 +487,7 @@ def stand(leg: int, tick: Tick) -> bool:
         maximum = path.speed_mps if side == 0.0 else guidance.step_mps
         maximum *= memory[slot.PACE] * min(max(2.0 - behind / _BEHIND_M, 0.0), 1.0)
         acceleration = guidance.stop_mps2 if side == 0.0 else guidance.step_mps2
-        lag_s = gains.axes[SURGE if side == 0.0 else SWAY, LAG]
+        lag_s = gains.axes[g.SURGE if side == 0.0 else g.SWAY, g.LAG]
         quicken = _move_on(goal, maximum, acceleration, lag_s, dt_s, pilot)
         along, speed = memory[slot.REF], memory[slot.REF_SPEED]
         n, e, course, curvature = place_at(path, leg, along)
@@ -559,7 +539,7 @@ def keep_place(target: StopReference, tick: Tick) -> tuple[float, float]:
     total = c * memory[slot.PLACE_SUM_N] + s * memory[slot.PLACE_SUM_E]
     steady, accelerate = place_demand(
         gains,
-        SURGE,
+        g.SURGE,
         pulled,
         pilot.point[slot.SURGE_SPEED],
         target.speed_mps * cosine,
@@ -572,9 +552,9 @@ def keep_place(target: StopReference, tick: Tick) -> tuple[float, float]:
     )
     pilot.report[slot.TARGET_SURGE] = steady
     near = clamp(pulled, STOP_M)
-    step = place_sum_step(gains, SURGE, near, demand[slot.FULL_SURGE], dt_s)
+    step = place_sum_step(gains, g.SURGE, near, demand[slot.FULL_SURGE], dt_s)
     north, east = memory[slot.PLACE_SUM_N] + c * step, memory[slot.PLACE_SUM_E] + s * step
-    cut = min(1.0, sum_bound(gains, SURGE) / max(math.hypot(north, east), 1e-9))
+    cut = min(1.0, sum_bound(gains, g.SURGE) / max(math.hypot(north, east), 1e-9))
     memory[slot.PLACE_SUM_N], memory[slot.PLACE_SUM_E] = cut * north, cut * east
     if guidance.sway > 0.0:
         sway_by(-abeam, target.speed_mps * sine, tick)
