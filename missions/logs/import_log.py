@@ -504,7 +504,6 @@ VELOCITY, ATTITUDE = "velocity", "position_local"
 _MAX_LINE = 100_000
 _LOOKED_AT = 20
 """Lines at which a file is recognised: the first may be cut."""
-_MICRO, _MILLI = 1e-6, 1e-3
 
 
 def is_waterlinked(path: Path) -> bool:
@@ -515,7 +514,7 @@ def is_waterlinked(path: Path) -> bool:
     except OSError:
         return False
     return any(
-        (report := _report(line)) and report["type"] in (VELOCITY, ATTITUDE) for line in lines
+        (report := _parse_report(line)) and report["type"] in (VELOCITY, ATTITUDE) for line in lines
     )
 
 
@@ -533,12 +532,12 @@ def read_waterlinked(path: Path, requested: Mapping[str, str]) -> LoggedDive:
     velocities: list[list[float]] = []
     attitudes: list[list[float]] = []
     since_s, stamped = 0.0, True
-    for report in _reports(path, lost):
+    for report in _read_reports(path, lost):
         if report["type"] == ATTITUDE:
             attitudes.append([finite_number(report.get(k)) for k in ("ts", "roll", "pitch", "yaw")])
             continue
-        since_s += _MILLI * np.nan_to_num(finite_number(report.get("time")))
-        valid_s = _MICRO * finite_number(report.get("time_of_validity"))
+        since_s += 1e-3 * np.nan_to_num(finite_number(report.get("time")))
+        valid_s = 1e-6 * finite_number(report.get("time_of_validity"))
         stamped = stamped and math.isfinite(valid_s)
         row = [finite_number(report.get(k)) for k in ("vx", "vy", "vz", "altitude")]
         locked = report.get("velocity_valid") is True
@@ -570,11 +569,11 @@ def read_waterlinked(path: Path, requested: Mapping[str, str]) -> LoggedDive:
     )
 
 
-def _reports(path: Path, lost: Counter[str]) -> Iterator[dict[str, Any]]:
+def _read_reports(path: Path, lost: Counter[str]) -> Iterator[dict[str, Any]]:
     try:
         with path.open("rb") as file:
             while line := file.readline(_MAX_LINE):
-                report = _report(line)
+                report = _parse_report(line)
                 if report is None and line.strip():
                     lost["lines that are no report"] += 1
                 elif report is not None and report["type"] in (VELOCITY, ATTITUDE):
@@ -583,7 +582,7 @@ def _reports(path: Path, lost: Counter[str]) -> Iterator[dict[str, Any]]:
         raise NavigationError(f"{path}: cannot be read: {error.strerror}") from None
 
 
-def _report(line: bytes) -> dict[str, Any] | None:
+def _parse_report(line: bytes) -> dict[str, Any] | None:
     """The object of a line that names its type."""
     try:
         found = json.loads(line)

@@ -239,7 +239,7 @@ def gains_for(vehicle: Vehicle, speed_mps: float, navigation_hz: float = 5.0) ->
     rows = matrix[list(_DEGREE)]
     if fins:
         rolls = np.linalg.matrix_rank(matrix[3:, count:]) == 3
-        used = _BY_FINS if rolls else _BY_FINS[:-1]
+        used: tuple[int, ...] = _BY_FINS if rolls else _BY_FINS[:-1]
     else:
         used = tuple(range(6 if _holds(rows, lower, upper) else STEERED))
         rows = rows[list(used)]
