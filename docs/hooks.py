@@ -26,6 +26,7 @@ _GAP = '<mspace width="0.17em" />'
 _BAR = re.compile(r'<mo(?: stretchy="false")?>(&#x02016;|&#x0007C;)</mo>')
 _STAGES = "<!-- stages: a table, made when the site is built -->"
 _FORMATS = "<!-- export formats: a table, made when the site is built -->"
+_RASTERS = "<!-- rasters: a table, made when the site is built -->"
 _TIGHT_BAR = r'<mo stretchy="false" lspace="0" rspace="0">\1</mo>'
 
 
@@ -37,7 +38,7 @@ def on_page_content(content: str, *, page: Page, config: MkDocsConfig, files: Fi
 
 
 def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Put the tables of stages and of export formats where a page asks for them."""
+    """Put the tables of stages, export formats and rasters where a page asks for them."""
     if _STAGES in markdown:
         from alice_survey.app import stages
 
@@ -46,6 +47,10 @@ def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: 
         from missions.exports.registry import formats_table
 
         markdown = markdown.replace(_FORMATS, formats_table())
+    if _RASTERS in markdown:
+        from alice_survey.core.products import rasters_table
+
+        markdown = markdown.replace(_RASTERS, rasters_table())
     return markdown
 
 

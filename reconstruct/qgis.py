@@ -7,23 +7,21 @@ import numpy as np
 import rasterio
 
 from alice_survey.core.artefacts import atomic_path
+from alice_survey.kit.figure import palette_steps
 from reconstruct.raster import opened_raster
 
-_RAMPS = {
-    "viridis": ("#440154", "#3b528b", "#21918c", "#5ec962", "#fde725"),
-    "cividis": ("#00224e", "#434e6c", "#7d7c78", "#bcae6c", "#fee838"),
-}
+_COLOURS = 5
 _SHARES = (1.0, 99.0)
 """Percentiles at the ends of a ramp."""
 _SAMPLE = 1024
 
 
-def write_style(raster: Path, ramp: str, unit: str) -> None:
+def write_style(raster: Path, palette: str, unit: str) -> None:
     """Write the style of a raster's first band: a colour ramp over its own range of values.
 
     Args:
         raster: a GeoTIFF.
-        ramp: a name of `_RAMPS`.
+        palette: of matplotlib.
         unit: for the labels.
     """
     with opened_raster(raster) as file:
@@ -32,9 +30,9 @@ def write_style(raster: Path, ramp: str, unit: str) -> None:
     values = values[np.isfinite(values)]
     low, high = np.percentile(values, _SHARES) if values.size else (0.0, 1.0)
     high = max(float(high), float(low) + 1e-6)
-    stops = [(float(value), colour)
-             for value, colour in zip(np.linspace(low, high, len(_RAMPS[ramp])), _RAMPS[ramp],
-                                      strict=True)]  # fmt: skip
+    stops = zip(
+        np.linspace(low, high, _COLOURS).tolist(), palette_steps(palette, _COLOURS), strict=True
+    )
     root = ET.Element("qgis", version="3.28", styleCategories="Symbology")
     renderer = ET.SubElement(
         ET.SubElement(root, "pipe"), "rasterrenderer", type="singlebandpseudocolor", band="1",

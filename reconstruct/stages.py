@@ -10,6 +10,7 @@ from alice_survey.core import records
 from alice_survey.core.artefacts import read_stage
 from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.manifest import read_manifest
+from alice_survey.core.products import listed_in
 from alice_survey.core.stages import StageSpec, Summary, only, without
 
 CONTROL_FILES = ("control.csv", "picks.csv", "markers.csv")
@@ -211,8 +212,7 @@ DENSE = StageSpec(
     summary=_dense_summary,
     resumes=True,
     products={
-        "dem.tif": "elevation model (GeoTIFF)",
-        "sigma.tif": "sigma of its heights",
+        **listed_in("dense"),
         "planes": "the same over further planes",
         "cloud.copc.laz": "point cloud (COPC) with colour, normal, sigma",
         "moving": "masks of what moves",
@@ -240,7 +240,7 @@ MOSAIC = StageSpec(
     inputs=_mosaic_inputs,
     summary=_mosaic_summary,
     products={
-        "mosaic.tif": "orthomosaic (cloud-optimised GeoTIFF)",
+        **listed_in("mosaic"),
         "planes": "those of further planes",
         "footprints.geojson": "what each picture shows",
     },

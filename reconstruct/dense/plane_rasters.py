@@ -1,11 +1,12 @@
 """What the dense stage makes of confirmed depth: surface, cloud, and rasters over planes."""
 
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from rasterio.windows import Window
 
 from alice_survey.core.errors import ReconstructionError, warn
 from alice_survey.core.executor import Executor
+from alice_survey.core.products import LENGTH, rasters_in
 from reconstruct.dense.cloud import write_clouds
 from reconstruct.dense.dem import (
     FILL_CELLS,
@@ -187,14 +189,8 @@ class RasterTile:
     """A tile of the rasters of a plane."""
 
     window: Window
-    height: NDArray[np.float32]
-    sigma: NDArray[np.float32]
-    slope: NDArray[np.float32]
-    """Slope, degrees."""
-    count: NDArray[np.uint16]
-    stations: NDArray[np.uint8]
-    surfaces: NDArray[np.uint8]
-    lower: NDArray[np.float32]
+    bands: Mapping[str, NDArray[Any]]
+    """By the names of the rasters of `dense/`."""
 
 
 def _project(
@@ -223,8 +219,10 @@ def _project(
     _write_rasters(folder, grid, plane_frame(frame, plane), found, threads)
     write_plane(folder, plane, frame)
     preview_dem(folder / "dem.tif", folder / "dem.png")
-    for name, ramp in (("dem", "viridis"), ("sigma", "cividis")):
-        write_style(folder / f"{name}.tif", ramp, frame.unit)
+    for one in rasters_in("dense"):
+        if one.palette:
+            unit = frame.unit if one.unit == LENGTH else one.unit
+            write_style(folder / one.path.name, one.palette, unit)
     poses = confirmed.poses
     sigma = None if poses is None else float(f"{poses.median_along(plane.normal_world):.3g}")
     return Fused(plane=plane, grid=grid, pose_sigma=sigma)
@@ -247,16 +245,18 @@ def project_tile(
     cells = cells_over(grid.moved(-grid.west, -grid.north), surface)
     cells = cells.without(~without_strays(cells.height))
     height, sigma = fill_gaps(cells.height, cells.sigma, FILL_CELLS, grid.cell)
-    inner = (slice(_RIM, -_RIM), slice(_RIM, -_RIM))
+    bands = {
+        "dem": (height + up).astype(np.float32),
+        "sigma": sigma,
+        "slope": slope_deg(height, grid.cell),
+        "count": cells.count,
+        "stations": cells.stations,
+        "surfaces": cells.surfaces,
+        "lower": (cells.lower + up).astype(np.float32),
+    }
+    inner = slice(_RIM, -_RIM)
     return RasterTile(
-        window=window,
-        height=(height[inner] + up).astype(np.float32),
-        sigma=sigma[inner],
-        slope=slope_deg(height, grid.cell)[inner],
-        count=cells.count[inner],
-        stations=cells.stations[inner],
-        surfaces=cells.surfaces[inner],
-        lower=(cells.lower[inner] + up).astype(np.float32),
+        window=window, bands={name: band[inner, inner] for name, band in bands.items()}
     )
 
 
@@ -269,41 +269,24 @@ def _middle_up(setup: FuseSetup, plane: Plane) -> float:
 def _write_rasters(
     folder: Path, grid: DemGrid, frame: WorldFrame, tiles: Iterable[RasterTile], threads: int
 ) -> None:
-    unit, nan = frame.unit, float("nan")
     up = "towards its viewer" if frame.name == "plane" else "up"
-    over = f"above {frame.vertical_datum}, {up} ({unit})"
-    bands = {
-        "height": ("dem", "float32", nan, f"height {over}", unit),
-        "sigma": ("sigma", "float32", nan, f"standard deviation of the height ({unit})", unit),
-        "slope": ("slope", "float32", nan, "steepest slope (degrees)", "degrees"),
-        "count": (
-            "count", "uint16", None,
-            "views that the height rests on; 0 where a small gap was bridged", "",
-        ),
-        "stations": (
-            "stations", "uint8", None,
-            "stations that the height rests on (255: or more); 0 where a small gap was bridged",
-            "",
-        ),
-        "surfaces": (
-            "surfaces", "uint8", None,
-            "surfaces over each other, of which the height is the uppermost's; 0 where a small "
-            "gap was bridged", "",
-        ),
-        "lower": (
-            "lower", "float32", nan,
-            f"height of the lowest of several surfaces {over}; unknown where there is one", unit,
-        ),
-    }  # fmt: skip
+    over = f"above {frame.vertical_datum}, {up} ({frame.unit})"
     with ExitStack() as files:
-        rasters = {
-            name: files.enter_context(
+        written = {
+            one.name: files.enter_context(
                 tiled_raster(
-                    folder / f"{file}.tif", grid, frame, dtype, nodata, text, unit, threads
+                    folder / one.path.name,
+                    grid,
+                    frame,
+                    one.dtype,
+                    float("nan") if one.dtype == "float32" else None,
+                    one.band_text(frame.unit, over),
+                    frame.unit if one.unit == LENGTH else one.unit,
+                    threads,
                 )
             )
-            for name, (file, dtype, nodata, text, unit) in bands.items()
+            for one in rasters_in("dense")
         }
         for tile in tiles:
-            for name, raster in rasters.items():
-                raster.write(getattr(tile, name), 1, window=tile.window)
+            for name, raster in written.items():
+                raster.write(tile.bands[name], 1, window=tile.window)

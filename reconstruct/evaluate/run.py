@@ -16,6 +16,7 @@ from alice_survey.core.artefacts import read_stage, write_csv
 from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Array
 from alice_survey.core.manifest import read_manifest
+from alice_survey.core.products import ERROR
 from alice_survey.core.records import RegistrationRecord, ScoreRecord
 from alice_survey.sim.seafloor.terrain import read_terrain
 from alice_survey.sim.seafloor.texture import survey_texture
@@ -75,7 +76,7 @@ def run_evaluate(workspace: Path, folder: Path, executor: Executor, *, seed: int
     score["overlaps"] = {name: round(value, 4) for name, value in overlaps.items()}
     ScoreRecord.save(folder / "score.json", score)
     write_cameras(folder / "cameras.csv", cameras)
-    _write_errors(folder / "error.tif", dense / "dem.tif", surface.map_m)
+    _write_errors(folder / ERROR.path.name, dense / "dem.tif", surface.map_m)
     plot_track(folder / "track.png", flown, cameras)
     plot_errors(folder / "errors.png", surface, area)
     plot_sheet(folder / "sheet.png", workspace, cameras, surface, area)
@@ -87,7 +88,7 @@ def _write_errors(path: Path, dem: Path, errors: Array) -> None:
         profile = source.profile
     with rasterio.open(path, "w", **profile) as raster:
         raster.write(errors.astype(np.float32), 1)
-        raster.set_band_description(1, "height minus true height (m)")
+        raster.set_band_description(1, ERROR.band)
 
 
 def write_cameras(path: Path, cameras: CameraScore) -> None:

@@ -23,6 +23,7 @@ from rasterio.warp import calculate_default_transform
 from alice_survey.core.artefacts import Stage, atomic_path, run_stage, write_csv, write_json
 from alice_survey.core.errors import ConfigError, ReconstructionError
 from alice_survey.core.frames import Array
+from alice_survey.core.products import MOSAIC, rasters_in
 from alice_survey.core.records import MeshRecord, SurfaceRecord
 from alice_survey.core.run import progress
 from reconstruct.copc import PointSpool, write_copc
@@ -30,8 +31,6 @@ from reconstruct.raster import BLOCK, local_crs, opened_raster, small_cache, til
 from reconstruct.stages import DENSE, MESH, MOSAIC
 from reconstruct.views.model import WorldFrame, read_frame
 
-_SMOOTH = {"dem.tif", "sigma.tif", "slope.tif", "lower.tif"}
-_RASTERS = ("dem", "sigma", "slope", "lower", "count", "stations", "surfaces")
 _CHUNK = 1_000_000
 _TILE = 4 * BLOCK
 
@@ -130,12 +129,11 @@ def _projected(crs: str, frame: WorldFrame) -> pyproj.CRS:
 
 
 def _export(workspace: Path, target: Destination, folder: Path) -> None:
-    dense, mosaic = workspace / "dense", workspace / "mosaic"
-    for name in _RASTERS:
-        _resample(dense / f"{name}.tif", folder / f"{name}.tif", target)
-    for name in ("dem", "sigma"):
-        shutil.copy2(dense / f"{name}.qml", folder / f"{name}.qml")
-    _resample(mosaic / "mosaic.tif", folder / "mosaic.tif", target)
+    dense = workspace / "dense"
+    for one in (*rasters_in("dense"), MOSAIC):
+        _resample(workspace / one.path, folder / one.path.name, target)
+    for style in dense.glob("*.qml"):
+        shutil.copy2(style, folder / style.name)
     spacing = SurfaceRecord.read(dense / "surface.json").cell
     _cloud(dense / "cloud.copc.laz", folder / "cloud.copc.laz", spacing, target)
     offset = _mesh(workspace / "mesh", folder, target)
@@ -162,7 +160,7 @@ def _resample(source: Path, path: Path, target: Destination) -> None:
             raster.crs, target.crs.to_wkt(), raster.width, raster.height, *raster.bounds,
             resolution=raster.transform.a,
         )  # fmt: skip
-        smooth = source.name in _SMOOTH or raster.count > 1
+        smooth = raster.dtypes[0].startswith("float") or raster.count > 1
         options = {
             "crs": target.crs.to_wkt(),
             "transform": transform,

@@ -15,13 +15,14 @@ from shapely.geometry.base import BaseGeometry
 from alice_survey.core.artefacts import atomic_path
 from alice_survey.core.contents import one_line
 from alice_survey.core.errors import ConfigError, ReconstructionError, WorkspaceError
+from alice_survey.core.products import MOSAIC
 from alice_survey.core.run import progress
 from missions.areas.safe import DRIVERS, gis_files
 from reconstruct.measure.areas import SurfaceAreas, figures_of_all, surface_within
 from reconstruct.measure.errors import FigureSlopes, PackedSlopes, summed
 from reconstruct.measure.export import Measurement, as_csv, as_geojson
 from reconstruct.measure.figures import Measured, figure
-from reconstruct.measure.surface import MOSAIC, MeasuredSurface
+from reconstruct.measure.surface import MeasuredSurface
 from reconstruct.raster import crs_of, opened_raster
 
 _LABELS = ("label", "class", "species", "name")
@@ -284,7 +285,7 @@ def _corner_gain(polygon: BaseGeometry) -> float:
 
 def _pixel(surface: MeasuredSurface) -> float:
     """Side of a pixel of the mosaic, or of a cell where there is none."""
-    path = surface.workspace / MOSAIC
+    path = surface.workspace / MOSAIC.path
     if not path.is_file():
         return surface.grid.cell
     with opened_raster(path) as raster:

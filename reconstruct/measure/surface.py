@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 from alice_survey.core.artefacts import need_stage
 from alice_survey.core.errors import ReconstructionError
 from alice_survey.core.frames import Array
+from alice_survey.core.products import DEM, ERROR, RASTERS, SIGMA, Raster
 from alice_survey.kit.document import OWN_AXES
 from reconstruct.measure.errors import REACH_CELLS, SharedErrors, own_correlation, shared_errors
 from reconstruct.measure.sight import sight_lines
@@ -20,13 +21,6 @@ from reconstruct.planes import Plane, read_plane
 from reconstruct.raster import DemGrid, grid_of, opened_raster, read_cells, small_cache
 from reconstruct.views.model import WorldFrame, read_frame
 
-MOSAIC = "mosaic/mosaic.tif"
-DEM, ERROR = "dense/dem.tif", "evaluation/error.tif"
-RASTERS = (
-    DEM, "dense/sigma.tif", "dense/slope.tif", "dense/stations.tif", "dense/count.tif",
-    "dense/surfaces.tif", "dense/lower.tif", ERROR, "mosaic/coverage.tif", MOSAIC,
-)  # fmt: skip
-"""Rasters that a place has values in."""
 _PICKING = "not counted: how well a place was picked on the map"
 _RESOLVED = "not counted: relief finer than about two cells, which the surface smooths"
 _WINDOW_CELLS = 1024
@@ -110,8 +104,8 @@ class MeasuredSurface:
         errors = shared_errors(workspace, plane, frame, bounds)
         return cls(
             workspace=workspace,
-            dem=dense / "dem.tif",
-            sigma=dense / "sigma.tif",
+            dem=workspace / DEM.path,
+            sigma=workspace / SIGMA.path,
             grid=grid,
             frame=frame,
             plane=plane,
@@ -208,18 +202,20 @@ def _runs(cells: NDArray[np.int64]) -> Iterator[slice]:
         start = end
 
 
-def is_of_surface(workspace: Path, file: str) -> bool:
+def is_of_surface(workspace: Path, raster: Raster) -> bool:
     """Whether a raster is of the surface that is there now.
 
     Errors that were evaluated before the surface was made again, perhaps over another plane, have
     other cells.
     """
-    dem = workspace / DEM
-    return file != ERROR or not dem.is_file() or grid_of(workspace / file) == grid_of(dem)
+    dem = workspace / DEM.path
+    if raster != ERROR or not dem.is_file():
+        return True
+    return grid_of(workspace / raster.path) == grid_of(dem)
 
 
 def values_at(
-    workspace: Path, place: Sequence[float], files: Sequence[str] = RASTERS
+    workspace: Path, place: Sequence[float], rasters: Sequence[Raster] = RASTERS
 ) -> Mapping[str, tuple[float, ...]]:
     """Values of rasters of a workspace at a place, by their files; of a mosaic red, green, blue.
 
@@ -229,12 +225,12 @@ def values_at(
     Args:
         workspace: reconstructed.
         place: right (east) and up (north).
-        files: of the rasters.
+        rasters: to look at.
     """
     found = {}
-    for file in files:
-        path = workspace / file
-        if not path.is_file() or not is_of_surface(workspace, file):
+    for one in rasters:
+        path = workspace / one.path
+        if not path.is_file() or not is_of_surface(workspace, one):
             continue
         with small_cache(), opened_raster(path) as raster:
             row, column = raster.index(place[0], place[1])
@@ -245,5 +241,5 @@ def values_at(
             values = raster.read(bands, window=part)[:, 0, 0]
             seen = bool(raster.dataset_mask(window=part)[0, 0])
         if seen and np.isfinite(values).all():
-            found[file] = tuple(float(value) for value in values[:3])
+            found[one.file] = tuple(float(value) for value in values[:3])
     return found

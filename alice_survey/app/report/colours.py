@@ -1,6 +1,6 @@
 """Appearance of rasters on a map: labels, palettes and limits, the same wherever shown."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,15 +14,13 @@ from rasterio.transform import Affine
 from rasterio.windows import Window
 
 from alice_survey.core.frames import Array
+from alice_survey.core.products import RASTERS, Raster
 from alice_survey.kit.document import Scale
 from alice_survey.kit.figure import even_limit, palette_colours, palette_steps
 from reconstruct.raster import hillshade
 
 Rgba = NDArray[np.uint8]
 
-MOSAIC_FILE = "mosaic/mosaic.tif"
-MOSAIC_TITLE = "Mosaic"
-MOSAIC_ABOUT = "What the cameras saw, each spot from the picture that sees it best."
 TILE_PX = 512
 _SAMPLED = 2_000_000
 """Number of values of a raster that its limits are taken from; all of a smaller one."""
@@ -36,62 +34,28 @@ _QUALITY = 82
 
 @dataclass(frozen=True, kw_only=True)
 class Numbers:
-    """A raster of numbers and how to colour it."""
+    """A raster of numbers in the unit that people read."""
 
-    file: str
-    name: str
-    title: str
-    about: str
-    palette: str
-    """Palette of matplotlib that is safe for the colour-blind."""
-    limits: Callable[[Array], tuple[float, float]]
-    """Limits of the colours, from the known values."""
-    factor: float = 1.0
+    raster: Raster
+    factor: float
     """Factor from the raster's unit to the legend's."""
-    label: str = ""
-    shaded: bool = False
-    counted: bool = False
-    """Whether its numbers are counts: zero means unseen."""
+    unit: str
+    """Of the legend; none of counts."""
 
     def levels(self, values: Array) -> Array:
         """Values of the raster in the legend's unit; NaN where nothing is known."""
         level = self.factor * values.astype(np.float64)
-        return np.where(level > 0, level, np.nan) if self.counted else level
+        return np.where(level > 0, level, np.nan) if self.raster.limits == "counts" else level
 
 
 def number_rasters(unit: str) -> tuple[Numbers, ...]:
-    """The rasters of numbers that a workspace may hold.
+    """The rasters of numbers that are layers of a map.
 
     Args:
-        unit: unit of its lengths.
+        unit: unit of a workspace's lengths.
     """
-    small, label = (1e3, "mm") if unit == "m" else (1.0, unit)
-    return (
-        Numbers(
-            file="dense/dem.tif", name="height", title="Height", palette="viridis",
-            about="Height of the sea floor, shaded from the north-west.",
-            limits=_middle, label=f"height, {unit}", shaded=True,
-        ),
-        Numbers(
-            file="dense/sigma.tif", name="sigma", title="Sigma of height", palette="cividis",
-            about="How far off a height may be within the survey, one sigma.",
-            limits=_from_zero, factor=small, label=f"sigma, {label}",
-        ),
-        Numbers(
-            file="evaluation/error.tif", name="error", title="Error of height", palette="PuOr",
-            about="Height minus the true height, after a rigid alignment of the cameras.",
-            limits=_around_zero, factor=small, label=f"error, {label}",
-        ),
-        Numbers(
-            file="dense/slope.tif", name="slope", title="Slope", palette="magma",
-            about="Steepness of the sea floor.", limits=_from_zero, label="slope, degrees",
-        ),
-        Numbers(
-            file="dense/stations.tif", name="stations", title="Stations", palette="cividis",
-            about="Stations that see a spot: from 3 on, heights check one another.",
-            limits=_whole, label="stations", counted=True,
-        ),
-    )  # fmt: skip
+    layers = [(one, *one.shown_unit(unit)) for one in RASTERS if one.palette]
+    return tuple(Numbers(raster=one, factor=factor, unit=unit) for one, factor, unit in layers)
 
 
 def _middle(values: Array) -> tuple[float, float]:
@@ -112,6 +76,12 @@ def _whole(values: Array) -> tuple[float, float]:
     return 0.0, float(max(np.ceil(np.percentile(values, 99)), 1.0))
 
 
+_LIMITS: Mapping[str, Callable[[Array], tuple[float, float]]] = {
+    "middle": _middle, "from zero": _from_zero, "around zero": _around_zero, "counts": _whole,
+}  # fmt: skip
+"""Limits of colours from the known values, as `Raster.limits` names them."""
+
+
 def limits_of(raster: Any, numbers: Numbers) -> tuple[float, float]:
     """Limits of a raster's colours, in the legend's unit; 0 to 1 where no value is known.
 
@@ -125,7 +95,7 @@ def limits_of(raster: Any, numbers: Numbers) -> tuple[float, float]:
         count += len(kept[-1])
         if count >= _SAMPLED:
             break
-    return numbers.limits(np.concatenate(kept)) if count else (0.0, 1.0)
+    return _LIMITS[numbers.raster.limits](np.concatenate(kept)) if count else (0.0, 1.0)
 
 
 def _sample(raster: Any) -> Iterator[Array]:
@@ -186,8 +156,8 @@ def coloured(level: Array, numbers: Numbers, limits: tuple[float, float], pixel:
     low, high = limits
     known = np.isfinite(level)
     shares = np.clip((level - low) / (high - low), 0, 1)
-    picture: Rgba = palette_colours(numbers.palette, shares)
-    if numbers.shaded:
+    picture: Rgba = palette_colours(numbers.raster.palette, shares)
+    if numbers.raster.shaded:
         flat = np.sqrt(0.5)
         shade = hillshade(level, pixel) if min(level.shape) > 1 else np.full(level.shape, flat)
         tinted = picture[..., :3] * (0.25 + 1.05 * np.nan_to_num(shade, nan=flat)[..., None])
@@ -198,11 +168,12 @@ def coloured(level: Array, numbers: Numbers, limits: tuple[float, float], pixel:
 
 def scale_of(numbers: Numbers, limits: tuple[float, float]) -> Scale:
     """The legend."""
+    title = numbers.raster.title.lower()
     return Scale(
-        label=numbers.label,
+        label=f"{title}, {numbers.unit}" if numbers.unit else title,
         low=limits[0],
         high=limits[1],
-        colours=palette_steps(numbers.palette, _COLOURS),
+        colours=palette_steps(numbers.raster.palette, _COLOURS),
     )
 
 

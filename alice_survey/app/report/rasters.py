@@ -11,9 +11,6 @@ import rasterio
 from rasterio.transform import Affine
 
 from alice_survey.app.report.colours import (
-    MOSAIC_ABOUT,
-    MOSAIC_FILE,
-    MOSAIC_TITLE,
     TILE_PX,
     Numbers,
     Rgba,
@@ -25,6 +22,7 @@ from alice_survey.app.report.colours import (
     scale_of,
 )
 from alice_survey.app.report.held import Held
+from alice_survey.core.products import MOSAIC
 from alice_survey.kit.document import PictureLayer, Scale
 from reconstruct.measure.surface import is_of_surface
 
@@ -36,13 +34,13 @@ _MAX_COLOURED_PX = 2_000_000
 
 def picture_layers(held: Held) -> Iterator[PictureLayer]:
     """The mosaic and all rasters of numbers that a workspace holds."""
-    mosaic = held.file(MOSAIC_FILE)
+    mosaic = held.file(MOSAIC.file)
     if mosaic is not None:
         yield mosaic_layer(mosaic)
     first = mosaic is None
     for numbers in number_rasters(held.unit):
-        file = held.file(numbers.file)
-        if file is not None and is_of_surface(held.workspace, numbers.file):
+        file = held.file(numbers.raster.file)
+        if file is not None and is_of_surface(held.workspace, numbers.raster):
             yield _number_layer(file, numbers, shown=first)
             first = False
 
@@ -55,19 +53,21 @@ def mosaic_layer(path: Path, max_px: int = _MAX_PAINTED_PX) -> PictureLayer:
     picture = np.dstack([*np.ma.getdata(bands), np.where(opacity > 0, 255, 0)]).astype(np.uint8)
     shrunk = "" if transform.a == full else f" Shrunk {transform.a / full:.1f} times."
     return _layer(
-        picture, transform, name="mosaic", title=MOSAIC_TITLE, about=f"{MOSAIC_ABOUT}{shrunk}",
+        picture, transform, name=MOSAIC.name, title=MOSAIC.title,
+        about=f"{MOSAIC.about}{shrunk}",
         shown=True,
     )  # fmt: skip
 
 
 def _number_layer(path: Path, numbers: Numbers, *, shown: bool) -> PictureLayer:
-    with rasterio.open(path) as raster:
-        limits = limits_of(raster, numbers)
+    with rasterio.open(path) as opened:
+        limits = limits_of(opened, numbers)
     (values,), _, transform = read_shrunk(path, [1], _MAX_COLOURED_PX)
+    raster = numbers.raster
     level = numbers.levels(values.astype(np.float64).filled(np.nan))
     return _layer(
         coloured(level, numbers, limits, transform.a), transform,
-        name=numbers.name, title=numbers.title, about=numbers.about, shown=shown,
+        name=raster.name, title=raster.title, about=raster.about, shown=shown,
         scale=scale_of(numbers, limits),
     )  # fmt: skip
 

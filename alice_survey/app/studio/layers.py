@@ -22,9 +22,6 @@ from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
 from alice_survey.app.report.colours import (
-    MOSAIC_ABOUT,
-    MOSAIC_FILE,
-    MOSAIC_TITLE,
     TILE_PX,
     Numbers,
     Rgba,
@@ -39,6 +36,7 @@ from alice_survey.app.studio.files import Workspace, stale_page, token_of
 from alice_survey.core.contents import one_line
 from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.frames import Array
+from alice_survey.core.products import MOSAIC, RASTERS
 from alice_survey.kit.document import PictureLayer
 from reconstruct.measure.surface import is_of_surface
 
@@ -49,8 +47,8 @@ _ENDING_S = 3.0
 """Time to wait at the end for tiles in work."""
 _DAMAGES = (RasterioError, IndexError, MemoryError)
 """Errors on reading a damaged raster, or one with too few bands."""
-FILES = {"mosaic": MOSAIC_FILE} | {one.name: one.file for one in number_rasters("m")}
-"""Files of the layers by their names, in the order in which a page shows them."""
+_LAYERS = {one.name: one for one in (MOSAIC, *(one for one in RASTERS if one.palette))}
+"""In the order in which a page shows them."""
 _GDAL = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_CACHEMAX": 32 << 20}
 """GDAL options: no sidecar file of a raster is read, and the cache is small."""
 _OPAQUE = 128
@@ -183,10 +181,10 @@ class Layers:
     def picture_layers(self) -> Sequence[PictureLayer]:
         """The layers that are there, for a page that requests their tiles."""
         found: list[PictureLayer] = []
-        for name, file in FILES.items():
+        for name, raster in _LAYERS.items():
             try:
                 layer = self._picture_layer(name, shown=not found)
-                if is_of_surface(self._workspace.folder, file):
+                if is_of_surface(self._workspace.folder, raster):
                     found.append(layer)
             except FileNotFoundError:
                 continue
@@ -198,9 +196,9 @@ class Layers:
         Raises:
             FileNotFoundError: there is none.
         """
-        if name not in FILES:
+        if name not in _LAYERS:
             raise FileNotFoundError(name)
-        return self._workspace.file(FILES[name].split("/"))
+        return self._workspace.file(_LAYERS[name].path.parts)
 
     def _picture_layer(self, name: str, *, shown: bool) -> PictureLayer:
         with self._unchanged(name, None) as token:
@@ -208,8 +206,8 @@ class Layers:
         numbers, limits, full = pyramid.numbers, pyramid.limits, pyramid.levels[0]
         return PictureLayer(
             name=name,
-            title=MOSAIC_TITLE if numbers is None else numbers.title,
-            about=MOSAIC_ABOUT if numbers is None else numbers.about,
+            title=_LAYERS[name].title,
+            about=_LAYERS[name].about,
             base=True,
             west_m=pyramid.west, north_m=pyramid.north, pixel_m=pyramid.pixel,
             width_px=full.columns, height_px=full.rows, tile_px=TILE_PX,
@@ -262,7 +260,7 @@ class Layers:
 
     def _read_pyramid(self, name: str, token: str) -> Pyramid:
         unit = Held.of(self._workspace.folder).unit
-        numbers = next((one for one in number_rasters(unit) if one.name == name), None)
+        numbers = next((one for one in number_rasters(unit) if one.raster.name == name), None)
         return Pyramid(self._path(name), numbers)
 
     def _read_tile(self, name: str, token: str, level: int, x: int, y: int) -> bytes:

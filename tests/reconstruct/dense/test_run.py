@@ -11,6 +11,7 @@ from alice_survey.core.artefacts import read_json
 from alice_survey.core.config import ReconstructConfig, SurveyConfig
 from alice_survey.core.errors import ReconstructionError, WorkspaceError
 from alice_survey.core.executor import SERIAL, local_executor
+from alice_survey.core.products import rasters_in
 from reconstruct.dense import plane_rasters
 from reconstruct.dense.stereo_pairs import in_frame
 from tests.oracles_dense import (
@@ -144,20 +145,11 @@ def test_stations_and_slope(workspace: Path):
 
 def test_scratch_is_gone_and_files_are_there(workspace: Path):
     names = {path.name for path in (workspace / "dense").iterdir()}
-    bands = ("dem", "sigma", "slope", "count", "stations", "surfaces", "lower")
-    rasters = {f"{name}.tif" for name in bands}
+    rasters = {one.path.name for one in rasters_in("dense")}
+    styles = {f"{one.name}.qml" for one in rasters_in("dense") if one.palette}
     clouds = {"cloud.ply", "cloud.copc.laz", "cloud.json"}
-    others = {
-        "dem.png",
-        "dem.qml",
-        "sigma.qml",
-        "light.json",
-        "moving.csv",
-        "surface.json",
-        "plane.json",
-        "stage.json",
-    }
-    assert names == rasters | clouds | others
+    others = {"dem.png", "light.json", "moving.csv", "surface.json", "plane.json", "stage.json"}
+    assert names == rasters | styles | clouds | others
 
 
 def test_a_second_run_does_nothing(workspace: Path):

@@ -9,36 +9,32 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from alice_survey.app.report.colours import number_rasters
 from alice_survey.app.report.held import Held
 from alice_survey.app.report.mesh_copy import mesh_about, mesh_copy
 from alice_survey.app.studio.endpoints.base import Call, Content, Endpoint, KeptValue, Studio
 from alice_survey.app.studio.files import stale_page
 from alice_survey.core.config import Config
 from alice_survey.core.errors import AliceError
+from alice_survey.core.products import DEM, MOSAIC, RASTERS, SIGMA
 from alice_survey.core.records import MeshRecord
 from reconstruct.measure.errors import SharedErrors
 from reconstruct.measure.export import Measurement, as_csv, as_geojson
 from reconstruct.measure.figures import Measured
 from reconstruct.measure.lines import measure_line, measure_points, profile
 from reconstruct.measure.polygons import measure_polygon, quadrats
-from reconstruct.measure.surface import MOSAIC, RASTERS, MeasuredSurface, values_at
+from reconstruct.measure.surface import MeasuredSurface, values_at
 
 _MESH = "mesh/mesh.glb"
 _MAX_PLACES = 2000
 _MAX_MEASURES = 1000
-_READ = (*RASTERS, "mosaic/mosaic_source.tif", "sparse/frame.json", "sparse/covariance.npz",
-         "sparse/registration.json", "sparse/track.csv", "dense/surface.json", "dense/plane.json",
-         "dense/stage.json", "sparse/stage.json")  # fmt: skip
+_READ = (
+    *(one.file for one in RASTERS), "mosaic/mosaic_source.tif", "sparse/frame.json",
+    "sparse/covariance.npz", "sparse/registration.json", "sparse/track.csv",
+    "dense/surface.json", "dense/plane.json", "dense/stage.json", "sparse/stage.json",
+)  # fmt: skip
 """Files that figures are of."""
 _MAX_DRAWN = 1200
 """Samples of a profile that a page draws."""
-_OTHERS = {"dense/count.tif": ("Views", ""), "dense/surfaces.tif": ("Surfaces", ""),
-         "dense/lower.tif": ("Lowest surface", None),
-         "mosaic/coverage.tif": ("Pictures", ""),
-         MOSAIC: ("Colour", "red, green, blue")}  # fmt: skip
-"""Titles and units of rasters that are no layers of numbers; None is the unit of lengths."""
-
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
 """Metres, or units of a model without scale."""
 Place = tuple[Coordinate, Coordinate]
@@ -109,8 +105,8 @@ class _ModelTab:
     def _surface(self) -> Iterator[MeasuredSurface]:
         """The surface as it is now; what is replaced meanwhile is the page's to load again."""
         with self._unchanged() as state:
-            if not self.studio.workspace.has("dense/dem.tif"):
-                raise FileNotFoundError("dense/dem.tif")
+            if not self.studio.workspace.has(DEM.file):
+                raise FileNotFoundError(DEM.file)
             yield self._kept.of(state)
 
     @contextmanager
@@ -128,22 +124,19 @@ class _ModelTab:
         place = (call.number("east"), call.number("north"))
         workspace = self.studio.workspace
         with self._unchanged():
-            files = [path for path in RASTERS if workspace.has(path)]
-            found = values_at(workspace.folder, place, files)
+            there = [one for one in RASTERS if workspace.has(one.file)]
+            found = values_at(workspace.folder, place, there)
         unit = Held.of(workspace.folder).unit
-        numbers = {one.file: one for one in number_rasters(unit)}
         rows = []
-        for file, values in found.items():
-            if file in numbers:
-                one = numbers[file]
-                title, what = one.title, one.label.partition(", ")[2].replace("degrees", "°")
-                value: Any = one.factor * values[0]
-            else:
-                title, other = _OTHERS[file]
-                what = unit if other is None else other
-                value = [round(v) for v in values] if file == MOSAIC else values[0]
-            rows.append({"file": file, "title": title, "value": value, "unit": what})
-        height, sigma = (found.get(f"dense/{name}.tif") for name in ("dem", "sigma"))
+        for one in there:
+            if values := found.get(one.file):
+                factor, shown = one.shown_unit(unit)
+                value: Any = [round(v) for v in values] if one == MOSAIC else factor * values[0]
+                rows.append({
+                    "file": one.file, "title": one.title, "value": value,
+                    "unit": shown.replace("degrees", "°"),
+                })  # fmt: skip
+        height, sigma = (found.get(one.file) for one in (DEM, SIGMA))
         return {
             "values": rows,
             "height": None if height is None else height[0],

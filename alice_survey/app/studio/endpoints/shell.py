@@ -8,6 +8,7 @@ from typing import Any
 from alice_survey.app.report.held import Held
 from alice_survey.app.report.run import survey_map
 from alice_survey.app.report.shapes import shape_layers
+from alice_survey.app.stages import STAGES
 from alice_survey.app.studio.endpoints.base import Call, Content, Endpoint, Studio, scale_json
 from alice_survey.kit.document import EAST_NORTH, PictureLayer, ShapeLayer
 from alice_survey.kit.map import map_data, map_extent
@@ -48,6 +49,12 @@ class _Shell:
             "plane": None if held.plane is None else held.plane.name,
             "datum": None if datum is None else [datum.latitude_deg, datum.longitude_deg],
             "has": {name: workspace.has(path) for name, path in _PRODUCTS.items()},
+            "files": {
+                f"{stage.folder}/{path}": text
+                for stage in STAGES
+                for path, text in stage.products.items()
+                if workspace.has(f"{stage.folder}/{path}")
+            },
             "log": self.studio.log,
             "background": self.studio.background,
             "tabs": TABS,

@@ -18,13 +18,6 @@ const TOOLS = {
   rugosity: {title: "Rugosity", key: "r", kind: "polygon", main: "rugosity"},
 };
 const LAYERS = ["measured-line", "measured-polygon", "quadrats"];
-const FILES = [
-  ["report/report.html", "The report"], ["mosaic/mosaic.tif",
-    "The mosaic, cloud-optimised GeoTIFF"],
-  ["dense/dem.tif", "The elevation model, GeoTIFF"], ["dense/sigma.tif", "Its sigma, GeoTIFF"],
-  ["dense/cloud.copc.laz", "The point cloud, COPC"], ["mesh/mesh.glb", "The mesh, glTF"],
-  ["sparse/track.csv", "The cameras' track, CSV"],
-];
 
 export function tab(studio) {
   const {map, state} = studio;
@@ -317,14 +310,7 @@ export function tab(studio) {
 
   const links = el("ul", {});
   function fillFiles() {
-    const has = {
-      "report/report.html": state.has.report, "mosaic/mosaic.tif": state.has.mosaic,
-        "dense/dem.tif": state.has.dem,
-      "dense/sigma.tif": state.has.dem, "dense/cloud.copc.laz": state.has.cloud,
-        "mesh/mesh.glb": state.has.mesh,
-      "sparse/track.csv": state.has.sparse,
-    };
-    links.replaceChildren(...FILES.filter(([path]) => has[path]).map(
+    links.replaceChildren(...Object.entries(state.files).map(
       ([path, text]) => el("li", {}, el("a", {href: "/files/" + path}, text))),
       el("li", {}, el("a", {href: "/files/"}, "All files of this workspace")));
   }

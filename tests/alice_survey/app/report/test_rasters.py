@@ -102,15 +102,15 @@ def test_errors_of_an_earlier_surface_are_no_layer(columns: int, tmp_path: Path)
 
 def test_numbers_are_coloured_between_limits_of_the_legend(workspace: Path) -> None:
     layers = {layer.name: layer for layer in picture_layers(Held.of(workspace))}
-    assert list(layers) == ["mosaic", "height", "sigma", "slope", "stations"]
+    assert list(layers) == ["mosaic", "dem", "sigma", "slope", "stations"]
     assert [name for name, layer in layers.items() if layer.shown] == ["mosaic"]
     scale = layers["sigma"].scale
     assert scale is not None
-    assert scale.label == "sigma, mm"
+    assert scale.label == "sigma of height, mm"
     assert (scale.low, scale.high) == (0.0, pytest.approx(0.5))
     assert all(len(colour) == 7 for colour in scale.colours)
-    height = layers["height"].scale
+    height = layers["dem"].scale
     assert height is not None
     assert -10.0 <= height.low < height.high <= -10.0 + 0.25 * 0.8
-    hole = put_together(layers["height"], 0)[105:, :15]
+    hole = put_together(layers["dem"], 0)[105:, :15]
     assert (hole[..., 3] == 0).all()

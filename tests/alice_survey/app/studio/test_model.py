@@ -43,7 +43,7 @@ def test_a_place_has_the_value_of_every_raster(server: Server) -> None:
     found = {row["title"]: row for row in answer["values"]}
     assert found["Sigma of height"]["value"] == pytest.approx(1e3 * SIGMA_M)
     assert found["Sigma of height"]["unit"] == "mm"
-    assert len(found["Colour"]["value"]) == 3
+    assert len(found["Mosaic"]["value"]) == 3
     nothing = ask(server, "/api/model/value?east=5&north=0.6").json
     assert nothing["height"] is None
     assert nothing["values"] == []

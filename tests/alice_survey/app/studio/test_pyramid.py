@@ -18,7 +18,7 @@ from tests.alice_survey.app.report.tiny import tiny_workspace
 
 ROWS, COLUMNS = 1302, 1110
 """No multiples of a tile or of a pixel of the third level."""
-NUMBERS = {numbers.name: numbers for numbers in number_rasters("m")}
+NUMBERS = {numbers.raster.name: numbers for numbers in number_rasters("m")}
 Array = NDArray[Any]
 
 
@@ -64,7 +64,7 @@ def mean_of_known(values: Array, weight: Array, side: int) -> tuple[Array, Array
 def test_levels_are_means_of_what_is_known(tmp_path: Path) -> None:
     values = heights()
     path = written(tmp_path / "a.tif", values[None], nodata=np.nan)
-    pyramid = Pyramid(path, NUMBERS["height"])
+    pyramid = Pyramid(path, NUMBERS["dem"])
     assert [(s.columns, s.rows) for s in pyramid.levels] == [(1110, 1302), (555, 651), (278, 326)]
     for size in pyramid.levels:  # each covers the whole raster
         assert (size.columns * size.east, size.rows * size.north) == pytest.approx((11.10, 13.02))
@@ -135,12 +135,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return workspace
 
 
-@pytest.mark.parametrize("name", ["mosaic", "height", "error", "stations"])
+@pytest.mark.parametrize("name", ["mosaic", "dem", "error", "stations"])
 def test_tiles_make_the_whole_level(folder: Path, name: str) -> None:
     """Pixel by pixel before compression, shade included: no seams, no shift, one colour scale."""
     shown = {layer.name: layer for layer in Layers(Workspace(folder)).picture_layers()}[name]
     numbers = NUMBERS.get(name)
-    path = folder / ("mosaic/mosaic.tif" if numbers is None else numbers.file)
+    path = folder / ("mosaic/mosaic.tif" if numbers is None else numbers.raster.file)
     pyramid = Pyramid(path, numbers)
     for level, size in enumerate(pyramid.levels):
         assert shown.size(shown.levels - 1 - level) == (
@@ -188,7 +188,7 @@ def test_limits_of_a_large_raster_are_close_to_those_of_all_its_values(tmp_path:
     values += rng.normal(0, 0.1, values.shape).astype(np.float32)
     values[:1200, :900] = np.nan
     with rasterio.open(written(tmp_path / "a.tif", values[None], nodata=np.nan)) as raster:
-        limits = limits_of(raster, NUMBERS["height"])
+        limits = limits_of(raster, NUMBERS["dem"])
     expected = np.nanpercentile(values, [1, 99])
     assert limits == pytest.approx(tuple(expected), abs=0.15)
 
@@ -198,7 +198,7 @@ def test_a_raster_of_one_row_and_one_without_a_value(tmp_path: Path) -> None:
     written(workspace / "dense" / "dem.tif", np.full((1, 1, 700), -3, np.float32), nodata=np.nan)
     written(workspace / "dense" / "sigma.tif", np.full((1, 9, 7), np.nan, np.float32))
     dense = workspace / "dense"
-    assert Pyramid(dense / "dem.tif", NUMBERS["height"]).tile(1, 0, 0).shape == (1, 350, 4)
+    assert Pyramid(dense / "dem.tif", NUMBERS["dem"]).tile(1, 0, 0).shape == (1, 350, 4)
     assert not Pyramid(dense / "sigma.tif", NUMBERS["sigma"]).tile(0, 0, 0)[..., 3].any()
     layers = Layers(Workspace(workspace)).picture_layers()
     scale = {layer.name: layer.scale for layer in layers}["sigma"]
