@@ -11,7 +11,6 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +34,6 @@ from reconstruct.views.model import WorldFrame
 BLOCK = 256
 """Pixels a side of the blocks of a tiled TIFF."""
 _CACHE_MIB = 16
-_HELD_BLOCKS = 64
-"""Blocks of rasters of one band that were read last and are held: at most 16 MiB."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -223,8 +220,6 @@ def read_cells(path: Path, row: int, column: int, rows: int, columns: int, every
         columns: of the window.
         every: reads every so many-th cell only, the nearest to the middle of each square.
     """
-    if every == 1 and max(rows, columns) <= 2 * BLOCK:
-        return _from_blocks(path, row, column, rows, columns)
     found = np.full((rows // every, columns // every), np.nan)
     with opened_raster(path) as raster:
         # squares of which all cells are within the raster
@@ -238,40 +233,6 @@ def read_cells(path: Path, row: int, column: int, rows: int, columns: int, every
             )
             found[top:bottom, left:right] = raster.read(1, window=part, out_shape=shape)
     return found
-
-
-def _from_blocks(path: Path, row: int, column: int, rows: int, columns: int) -> Array:
-    """A small window, of which blocks that were read before are not read again."""
-    try:
-        about = path.stat()
-    except OSError:
-        raise WorkspaceError(f"{path}: no such file") from None
-    version = (about.st_ino, about.st_size, about.st_mtime_ns, about.st_ctime_ns)
-    found = np.full((rows, columns), np.nan)
-    for down in range(row // BLOCK, (row + rows - 1) // BLOCK + 1):
-        for right in range(column // BLOCK, (column + columns - 1) // BLOCK + 1):
-            block = _block(path, version, down, right)
-            top, left = down * BLOCK - row, right * BLOCK - column
-            here = np.s_[max(0, top) : top + BLOCK, max(0, left) : left + BLOCK]
-            part = block[max(0, -top) : rows - top, max(0, -left) : columns - left]
-            found[here][: part.shape[0], : part.shape[1]] = part
-    return found
-
-
-@lru_cache(_HELD_BLOCKS)
-def _block(path: Path, version: tuple[int, ...], down: int, right: int) -> NDArray[Any]:
-    """A block of a version of a raster, cut off where it ends."""
-    with opened_raster(path) as raster:
-        rows, columns = (
-            max(0, min(BLOCK, size - BLOCK * number))
-            for size, number in ((raster.height, down), (raster.width, right))
-        )
-        if min(down, right, rows - 1, columns - 1) < 0:
-            return np.zeros((0, 0))
-        found: NDArray[Any] = raster.read(
-            1, window=Window(right * BLOCK, down * BLOCK, columns, rows)
-        )
-        return found
 
 
 def tiles_of(grid: DemGrid, size: int) -> list[Window]:

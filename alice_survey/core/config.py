@@ -550,14 +550,8 @@ class ReconstructConfig(Config):
         "mesh_triangles": None, "mesh_tiles": "auto", "mesh_page_px": 8192, "dispersion": "auto",
     }  # fmt: skip
     mapper: ClassVar[str] = "auto"
-    """Only recorded, so that mappings of earlier versions stay up to date."""
-    dense_partners: ClassVar[int] = 4
-    """Pictures that each is matched with."""
-    mesh_triangles: ClassVar[int | None] = None
-    mesh_tiles: ClassVar[Literal["auto", "on", "off"]] = "auto"
-    mesh_page_px: ClassVar[int] = 8192
-    """Largest side of a page of the mesh's texture."""
-    dispersion: ClassVar[Literal["auto", "on", "off"]] = "auto"
+    dispersion: ClassVar[str] = "auto"
+    """Only recorded, so that models and mosaics of earlier versions stay up to date."""
 
     max_features: int = setting(8000, "per picture", ge=200, le=50_000)
     learned_features: bool = setting(

@@ -52,6 +52,8 @@ from reconstruct.light.solve import solve_light, write_light
 from reconstruct.planes import chosen_planes
 from reconstruct.views.model import SparseModel, read_model, scaled_view
 
+_PARTNERS = 4
+"""Pictures that each is matched with."""
 _WITNESSES = 8
 """Neighbouring views that a view's depth is checked against."""
 
@@ -69,7 +71,7 @@ def run_dense(
     planes = chosen_planes(parse_planes(reconstruct.planes), model)
     store = ViewStore(folder / "scratch")
     store.folder.mkdir(parents=True, exist_ok=True)
-    partners = choose_partners(model, reconstruct.dense_partners)
+    partners = choose_partners(model, _PARTNERS)
     points = PointsInSight(model)
     scales = _scales(workspace, model, partners, points, reconstruct, executor)
     views = [scaled_view(view, scales.depth) for view in model.views]

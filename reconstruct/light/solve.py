@@ -16,7 +16,7 @@ eliminated first (their block is sparse: a picture meets its neighbours alone), 
 dense system for the patterns and the fall-off: the Schur complement, as in bundle adjustment.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -33,7 +33,7 @@ from alice_survey.core.compiled import compiled
 from alice_survey.core.contents import taken_from
 from alice_survey.core.frames import Array
 from alice_survey.core.run import progress
-from reconstruct.light.parts import Histogram, Parts, percentiles, values_in
+from reconstruct.light.parts import Parts
 
 GRID = (9, 11)
 """Rows and columns of nodes over a picture, first and last on its edges."""
@@ -60,6 +60,8 @@ _MAX_GAIN = 8.0
 BRIGHT_PERCENT = 98.0
 """Share of a survey's spots that are no brighter than what counts as bright."""
 _WHITE_LEVEL, _GREY_LEVEL = 215.0, 128.0
+_WHITE_SAMPLES = 1_000_000
+"""Of a survey, that white is found from."""
 _NORM = 6.0
 _DENSE_PICTURES = 400
 """More are solved for with sparse matrices."""
@@ -491,66 +493,26 @@ def _white(
     parts: SampleParts, light: LightModel, images: Sequence[str], cameras: Sequence[str]
 ) -> Array:
     """Factors that make what is bright neutral, and the survey light without burning out."""
-    views = list(parts.map(_first_views_of))
-
-    def lit() -> Iterable[_LitViews]:
-        for own in views:
-            factors = [light.factors(cameras[n], images[n]).reshape(-1, 3) for n in own]
-            yield _LitViews(views=own, factors=np.array(factors).reshape(-1, GRID[0] * GRID[1], 3))
-
-    sums, counts = zip(*parts.map(_norm_sums, lit()), strict=True)
-    if not sum(counts):
+    kept = joined_samples(
+        list(parts.map(_thin, [_WHITE_SAMPLES // len(parts.items)] * len(parts.items)))
+    )
+    if not len(kept.views):
         return np.ones(3)
-    neutral = _neutral(np.sum(sums, axis=0) / sum(counts))
-
-    def wanted(bins: NDArray[np.int64]) -> Iterable[Array]:
-        return parts.map(_grey_in, ((one, neutral, bins) for one in lit()))
-
-    counted = parts.map(_grey_histogram, ((one, neutral) for one in lit()))
-    bright, middle = percentiles([BRIGHT_PERCENT, 50.0], counted, wanted)
-    return neutral * min(_WHITE_LEVEL / bright, _GREY_LEVEL / middle)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _LitViews:
-    """Factors that even the light of some views."""
-
-    views: NDArray[np.int64]
-    """(v,) ascending."""
-    factors: NDArray[np.float32]
-    """(v, nodes, 3)."""
-
-    def levels(self, samples: LightSamples) -> Array:
-        """(N, 3) even light of the first views of samples, all of which are here."""
-        nodes, weights = node_weights(samples.places[:, 0])
-        first = np.searchsorted(self.views, samples.views[:, 0])
-        lift = (self.factors[first[:, None], nodes] * weights[..., None]).sum(axis=1)
-        level: Array = np.exp(samples.levels[:, 0]) * lift
-        return level
+    nodes, weights = node_weights(kept.places[:, 0])
+    own, view = np.unique(kept.views[:, 0], return_inverse=True)
+    factors = np.stack([light.factors(cameras[n], images[n]).reshape(-1, 3) for n in own])
+    lift = (factors[view[:, None], nodes] * weights[..., None]).sum(axis=1)
+    level = np.exp(kept.levels[:, 0]) * lift
+    neutral = neutral_factors(level)
+    return neutral * brightening(level * neutral, _WHITE_LEVEL, _GREY_LEVEL)
 
 
-def _first_views_of(samples: LightSamples, _: None) -> NDArray[np.int64]:
-    found: NDArray[np.int64] = np.unique(samples.views[:, 0]).astype(np.int64)
-    return found
-
-
-def _norm_sums(samples: LightSamples, lit: _LitViews) -> tuple[Array, int]:
-    level = lit.levels(samples)
-    return (level**_NORM).sum(axis=0), len(level)
-
-
-def _grey(samples: LightSamples, lit: _LitViews, neutral: Array) -> Array:
-    found: Array = (lit.levels(samples) * neutral).mean(axis=1)
-    return found
-
-
-def _grey_histogram(samples: LightSamples, value: tuple[_LitViews, Array]) -> Histogram:
-    return Histogram.of(_grey(samples, *value))
-
-
-def _grey_in(samples: LightSamples, value: tuple[_LitViews, Array, NDArray[np.int64]]) -> Array:
-    lit, neutral, bins = value
-    return values_in(_grey(samples, lit, neutral), bins)
+def _thin(samples: LightSamples, maximum: int) -> LightSamples:
+    """Every so many-th of samples without ranges, as many as a number or fewer."""
+    chosen = slice(None, None, max(1, -(-len(samples.views) // maximum)))
+    return LightSamples(
+        views=samples.views[chosen], places=samples.places[chosen], levels=samples.levels[chosen]
+    )
 
 
 def neutral_factors(level: Array) -> Array:
@@ -559,12 +521,7 @@ def neutral_factors(level: Array) -> Array:
     The cast is the 6-norm of each colour, between the mean (grey world, which paints a lawn
     purple) and the largest value ("shades of gray", Finlayson & Trezzi 2004).
     """
-    return _neutral((level**_NORM).mean(axis=0))
-
-
-def _neutral(power: Array) -> Array:
-    """Factors (3,) that make the means (3,) of levels to the power of the norm equal."""
-    cast = power ** (1.0 / _NORM)
+    cast = (level**_NORM).mean(axis=0) ** (1.0 / _NORM)
     neutral: Array = cast.mean() / cast
     return neutral
 

@@ -23,7 +23,7 @@ from reconstruct.mesh.visibility import ray_scene
 
 MAX_CELL_TRIANGLES = 60_000
 """The error of a coarser cell grows until it has no more."""
-GROWTH = 1.3
+_GROWTH = 1.3
 """Factor by which the error grows until the triangles are few enough."""
 _GROWTHS = 20
 
@@ -156,7 +156,7 @@ def decimated(mesh: CellMesh, error: float, *, min_area: float = 0.0, maximum: i
     for _ in range(_GROWTHS):
         if not maximum or len(fewer.triangles) <= maximum:
             break
-        error *= GROWTH
+        error *= _GROWTH
         fewer = decimate(vertices, triangles, locked, error)
     distance = mesh.distance
     if maximum and len(fewer.triangles):

@@ -16,7 +16,6 @@ from reconstruct.light.solve import read_light
 from reconstruct.mesh.formats import GLB_AXES, render_oblique, write_mesh
 from reconstruct.mesh.labels import choose_views, make_charts
 from reconstruct.mesh.surface import (
-    MAX_TRIANGLES,
     TRIM_STEPS,
     TriangleMesh,
     coarser_level,
@@ -31,6 +30,8 @@ from reconstruct.ply import open_cloud
 from reconstruct.raster import write_png
 from reconstruct.views.model import WorldFrame, read_model
 
+_PAGE_PX = 8192
+"""Largest side of a page of texture."""
 _LIFT_STEPS = 0.5
 """Height over the surface, in spacings of the cloud, at which lines of sight start."""
 
@@ -58,7 +59,6 @@ def run_mesh(
         cloud,
         step,
         reconstruct.mesh_error_px * pixel,
-        reconstruct.mesh_triangles or MAX_TRIANGLES,
         scratch,
         executor,
     )
@@ -79,12 +79,11 @@ def run_mesh(
         light,
         colours_of_cloud(cloud, mesh.vertices, step),
         plain_pixel=pixel,
-        page_px=reconstruct.mesh_page_px,
+        page_px=_PAGE_PX,
         executor=executor,
     )
     facts = mesh_facts(mesh, textured, offset, step, model.frame)
-    thinned = len(levels) > 1 or textured.scale < 1.0
-    if reconstruct.mesh_tiles == "on" or (reconstruct.mesh_tiles == "auto" and thinned):
+    if len(levels) > 1 or textured.scale < 1.0:  # the mesh has not all of the detail
         while len(levels[-1].cells) > 1:
             levels.append(coarser_level(levels, step, scratch, executor))
         setup = TileSetup(
@@ -96,7 +95,7 @@ def run_mesh(
             step=step,
             lift=_LIFT_STEPS * step,
             pixel=pixel,
-            page_px=reconstruct.mesh_page_px,
+            page_px=_PAGE_PX,
         )
         facts["tiles"] = write_tiles(setup, levels, model.frame, views, light, executor)
     shutil.rmtree(scratch)

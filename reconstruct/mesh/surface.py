@@ -25,7 +25,6 @@ from alice_survey.core.errors import ReconstructionError
 from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Array
 from reconstruct.mesh.cells import (
-    GROWTH,
     Cell,
     CellLevel,
     CellMesh,
@@ -34,10 +33,8 @@ from reconstruct.mesh.cells import (
     part_of,
     without_pairs,
 )
-from reconstruct.mesh.decimate import decimate
 from reconstruct.mesh.topology import (
     Triangles,
-    clean,
     component_areas,
     split_fans,
     triangulated,
@@ -60,8 +57,8 @@ _MIN_PART_STEPS2 = 400.0
 """Parts with an area of fewer lattice squares are taken for strays."""
 _MAX_WEIGHT = 4.0
 """Largest weight of a point that is better known than the median."""
-MAX_TRIANGLES = 4_000_000
-"""Most triangles of a mesh that is held at once, where the settings name no number."""
+_MAX_TRIANGLES = 4_000_000
+"""Of a mesh that is held at once."""
 KERNEL_STEPS = 0.8
 """Standard deviation of the points' Gaussian weight, lattice steps."""
 REACH_STEPS = 2.5
@@ -84,7 +81,6 @@ def mesh_cloud(
     cloud: CloudFile,
     step: float,
     error: float,
-    max_triangles: int,
     folder: Path,
     executor: Executor,
 ) -> tuple[TriangleMesh, list[CellLevel]]:
@@ -94,7 +90,6 @@ def mesh_cloud(
         cloud: oriented points.
         step: of the lattice: the spacing of the points.
         error: that decimation may make, in the unit of the points.
-        max_triangles: the error is raised until there are no more.
         folder: for files.
         executor: where tasks run.
 
@@ -106,7 +101,7 @@ def mesh_cloud(
         ReconstructionError: no surface is left.
     """
     levels = [finest_level(cloud, step, error, folder, executor)]
-    while levels[-1].triangles > max(max_triangles, MAX_TRIANGLES) and len(levels[-1].cells) > 1:
+    while levels[-1].triangles > _MAX_TRIANGLES and len(levels[-1].cells) > 1:
         levels.append(coarser_level(levels, step, folder, executor))
     whole, error = levels[-1].whole(), levels[-1].error
     vertices = whole.vertices
@@ -119,7 +114,6 @@ def mesh_cloud(
             "thinly to carry a surface; the pictures need more overlap or sharper texture"
         )
     vertices, triangles, _ = split_fans(vertices, triangles[large])
-    vertices, triangles, error = _to_count(vertices, triangles, error, max_triangles)
     return TriangleMesh(vertices=vertices, triangles=triangles, error=error), levels
 
 
@@ -230,23 +224,6 @@ def mesh_tile(
         return None
     (i, j), mesh = tile[0], decimated(part_of(around, own[sound]), error)
     return mesh.save(folder / f"{i}_{j}.npz")
-
-
-def _to_count(
-    vertices: Array, triangles: Triangles, error: float, maximum: int
-) -> tuple[Array, Triangles, float]:
-    """Decimate with a growing error until few triangles are left."""
-    while len(triangles) > maximum:
-        before, error = len(triangles), GROWTH * error
-        free = np.zeros(len(vertices), np.bool_)
-        fewer = decimate(vertices, triangles, free, error)
-        vertices, triangles, _ = clean(fewer.vertices, fewer.triangles)
-        if len(triangles) == before and error > np.ptp(vertices, axis=0).max():
-            raise ReconstructionError(
-                f"the surface keeps {before} triangles where mesh_triangles asks for {maximum}: "
-                "raise it"
-            )
-    return vertices, triangles, error
 
 
 @compiled

@@ -84,11 +84,6 @@ def split_fans(vertices: Array, triangles: Triangles) -> tuple[Array, Triangles,
     return vertices[source[order]], split, source[order]
 
 
-def clean(vertices: Array, triangles: Triangles) -> tuple[Array, Triangles, NDArray[np.int64]]:
-    """Without folds, and with fans split; returns as `split_fans`."""
-    return split_fans(vertices, without_folds(vertices, triangles))
-
-
 def component_areas(vertices: Array, triangles: Triangles) -> tuple[NDArray[np.int32], Array]:
     """Number of the connected part of every triangle (through edges), and the parts' areas."""
     edges, edge = edges_of(triangles)

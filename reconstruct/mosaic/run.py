@@ -98,7 +98,7 @@ def run_mosaic(
     facts = list(executor.map(measure, model.views, label="measure pictures", task_mib=_TASK_MIB))
     grey = all(fact.grey for fact in facts)
     references = read_references(workspace, [fact.image for fact in facts])
-    sea, dispersion = _dispersion(workspace, reconstruct.dispersion, water, seafloor_depth_m, grey)
+    sea, dispersion = _dispersion(workspace, water, seafloor_depth_m, grey)
     painting = Painting(
         workspace=workspace,
         model=model,
@@ -324,19 +324,17 @@ def _part_of(colour: ColourModel, images: Sequence[str]) -> ColourModel:
 
 
 def _dispersion(
-    workspace: Path, wanted: str, config: WaterConfig, depth_m: float, grey: bool
+    workspace: Path, config: WaterConfig, depth_m: float, grey: bool
 ) -> tuple[Water | None, dict[str, Any]]:
     """The water through which colours are distinguished, or None, and what to say about it."""
     warps = read_warps(workspace / "sparse" / "cameras.json").values()
     about = workspace / "images" / "survey.json"
     reason = ""
-    if wanted == "off":
-        reason = "switched off"
-    elif all(warp.camera.n_water == 1 for warp in warps):
+    if all(warp.camera.n_water == 1 for warp in warps):
         reason = "no port"
     elif grey:
         reason = "grey pictures"
-    elif wanted == "auto" and PicturesRecord.read(about).source == "simulated":
+    elif PicturesRecord.read(about).source == "simulated":
         reason = "rendered pictures have none"
     if reason:
         return None, {"corrected": False, "reason": reason}

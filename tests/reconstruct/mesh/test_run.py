@@ -88,7 +88,7 @@ def mesh(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_dense(folder, [view.image for view in views])
     settings = SurveyConfig(reconstruct=ReconstructConfig(mesh_error_px=0.1))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ReconstructConfig, "mesh_page_px", 1024)
+        patch.setattr("reconstruct.mesh.run._PAGE_PX", 1024)
         assert spec("mesh").make(folder, settings, SERIAL)
     assert not spec("mesh").make(folder, settings, SERIAL)
     return folder / "mesh"

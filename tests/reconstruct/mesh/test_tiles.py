@@ -113,8 +113,8 @@ def survey(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(surface, "_TILE_STEPS", (12, 12))
         patch.setattr("reconstruct.mesh.tiles._LEVELS_OF_A_FILE", 2)
-        patch.setattr(ReconstructConfig, "mesh_page_px", PAGE_PX)
-        patch.setattr(ReconstructConfig, "mesh_tiles", "on")
+        patch.setattr("reconstruct.mesh.run._PAGE_PX", PAGE_PX)
+        patch.setattr(surface, "_MAX_TRIANGLES", 1)
         settings = SurveyConfig(reconstruct=ReconstructConfig(mesh_error_px=0.1))
         assert spec("mesh").make(folder, settings, SERIAL)
         yield folder
@@ -295,7 +295,7 @@ def test_a_survey_smaller_than_a_stray_is_meshed(tmp_path: Path):
     write_cloud(tmp_path / "cloud.ply", [points], OFFSET, FRAME)
 
     mesh, _ = surface.mesh_cloud(
-        open_cloud(tmp_path / "cloud.ply"), STEP_M, ERROR_M, 10_000, tmp_path, SERIAL
+        open_cloud(tmp_path / "cloud.ply"), STEP_M, ERROR_M, tmp_path, SERIAL
     )
 
     a, b, c = mesh.vertices[mesh.triangles].transpose(1, 0, 2)

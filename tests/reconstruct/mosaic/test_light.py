@@ -5,7 +5,7 @@ import pytest
 
 from alice_survey.core.artefacts import write_json
 from alice_survey.core.errors import WorkspaceError
-from reconstruct.light.parts import Histogram, Parts, percentiles, values_in
+from reconstruct.light.parts import Parts
 from reconstruct.light.solve import (
     GRID,
     LightSamples,
@@ -251,15 +251,3 @@ def test_samples_in_files_give_the_light_of_all_at_once(tmp_path):
             np.testing.assert_allclose(light.gains[image], at_once.gains[image], atol=1e-9)
         np.testing.assert_allclose(light.white, at_once.white, rtol=1e-9)
         np.testing.assert_array_equal(light.white, by_parts[0].white)
-
-
-@pytest.mark.parametrize("count", [1, 2, 999, 4000])
-def test_percentiles_of_parts_are_those_of_all(count: int):
-    values = np.random.default_rng(count).lognormal(0.0, 2.0, count)
-    parts = np.array_split(values, 3)
-    found = percentiles(
-        [0.0, 50.0, 98.0, 100.0],
-        [Histogram.of(part) for part in parts],
-        lambda bins: [values_in(part, bins) for part in parts],
-    )
-    np.testing.assert_allclose(found, np.percentile(values, [0.0, 50.0, 98.0, 100.0]), rtol=1e-12)

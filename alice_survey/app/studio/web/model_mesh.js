@@ -145,8 +145,7 @@ export function meshPart(studio, {colour, measured}) {
     lies = await get("/api/model/mesh");
     about.textContent = lies.about + (lies.tiles
       ? " Other viewers of 3D Tiles: " + window.location.origin + lies.tiles
-      : " There are no 3D Tiles of it, to draw it at full detail: mesh_tiles = \"on\" under"
-        + " [reconstruct] makes them with the mesh.");
+      : "");
     const context = document.createElement("canvas").getContext("webgl2");
     if (!context) {
       still("This browser has no WebGL, which turning the model needs");
