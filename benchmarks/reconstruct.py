@@ -215,9 +215,8 @@ def run_haltbrekken(work: Path, data: Path, interpreter: str | None, limit_s: fl
 
 def run_brighton(work: Path, data: Path, interpreter: str | None, limit_s: float) -> Findings:
     """Real drone pictures: distance from another tool's cloud."""
-    from reconstruct.evaluate.cloud_files import read_reference
-    from reconstruct.evaluate.cloud_registration import ReferenceSurface, distances, register_cloud
-    from reconstruct.evaluate.reference import evaluate_reference, lifted
+    from reconstruct.evaluate.reference import evaluate_reference, lifted, read_reference
+    from reconstruct.evaluate.registration import ReferenceSurface, distances, register_cloud
     from reconstruct.views.model import read_frame
 
     source, workspace = data / "brighton_beach", _emptied(work / "brighton_beach")

@@ -5,6 +5,8 @@ north and east of the NED frame are the map's axes, true to scale: within 1 km o
 tangent plane and the map differ by under 0.01 mm. UTM would turn the grid by the convergence of
 its meridian and stretch it by up to 0.04 % (0.4 mm a metre), so that either every height is
 resampled or lengths are wrong; any GIS reprojects on the fly.
+
+QGIS takes layer styles (.qml) next to rasters when it opens them.
 """
 
 import math
@@ -13,6 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree as ET
 
 import cv2
 import numpy as np
@@ -315,3 +318,49 @@ def write_png(path: Path, picture: NDArray[np.uint8]) -> None:
     """Write a BGR or BGRA picture; the same pixels give the same bytes."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
+
+
+_COLOURS = 5
+_SHARES = (1.0, 99.0)
+"""Percentiles at the ends of a ramp."""
+_SAMPLE = 1024
+
+
+def write_style(raster: Path, palette: str, unit: str) -> None:
+    """Write the style of a raster's first band: a colour ramp over its own range of values.
+
+    Args:
+        raster: a GeoTIFF.
+        palette: of matplotlib.
+        unit: for the labels.
+    """
+    from alice_survey.kit.figure import palette_steps  # here, for matplotlib
+
+    with opened_raster(raster) as file:
+        shape = tuple(min(side, _SAMPLE) for side in file.shape)
+        values = file.read(1, out_shape=shape, resampling=rasterio.enums.Resampling.nearest)
+    values = values[np.isfinite(values)]
+    low, high = np.percentile(values, _SHARES) if values.size else (0.0, 1.0)
+    high = max(float(high), float(low) + 1e-6)
+    stops = zip(
+        np.linspace(low, high, _COLOURS).tolist(), palette_steps(palette, _COLOURS), strict=True
+    )
+    root = ET.Element("qgis", version="3.28", styleCategories="Symbology")
+    renderer = ET.SubElement(
+        ET.SubElement(root, "pipe"), "rasterrenderer", type="singlebandpseudocolor", band="1",
+        opacity="1", alphaBand="-1",
+        classificationMin=f"{low:.6g}", classificationMax=f"{high:.6g}",
+    )  # fmt: skip
+    shader = ET.SubElement(
+        ET.SubElement(renderer, "rastershader"), "colorrampshader",
+        colorRampType="INTERPOLATED", classificationMode="1", clip="0",
+        minimumValue=f"{low:.6g}", maximumValue=f"{high:.6g}",
+    )  # fmt: skip
+    for value, colour in stops:
+        ET.SubElement(
+            shader, "item", value=f"{value:.6g}", color=colour, alpha="255",
+            label=f"{value:.3g} {unit}",
+        )  # fmt: skip
+    ET.indent(root)
+    with atomic_path(raster.with_suffix(".qml")) as path:
+        path.write_text(ET.tostring(root, encoding="unicode") + "\n")

@@ -16,7 +16,7 @@ from alice_survey.core.executor import default_threads
 from alice_survey.core.manifest import read_manifest
 from alice_survey.core.run.resources import processor
 from alice_survey.kit.words import count, digits, duration
-from reconstruct.dense.scales import CELL_PIXELS, scale_for_cell
+from reconstruct.dense.matching_trial import CELL_PIXELS, scale_for_cell
 
 OTHER_CORES = 16
 _CAMERAS = 2

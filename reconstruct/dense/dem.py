@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
 from reconstruct.dense.points import EDGE_ON
-from reconstruct.dense.surfaces import sorted_ranks
+from reconstruct.dense.surface_points import sorted_ranks
 from reconstruct.raster import DemGrid
 
 Float32 = NDArray[np.float32]

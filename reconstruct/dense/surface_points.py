@@ -8,6 +8,9 @@ What becomes of a cell depends on points in it alone, so that tiles agree where 
 
 What a single cell cannot show, its neighbours do. A wrong match makes a small patch apart from any
 surface; where a surface turns or ends within a cell, its neighbours contradict it beyond noise.
+
+A cell may hold several surfaces: an overhang above the floor, a ladder before a wall. The height of
+each is a robust mean of what several views of several stations claim.
 """
 
 import math
@@ -21,11 +24,219 @@ from scipy.spatial import cKDTree
 
 from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
+from alice_survey.core.robust import MAD_TO_SIGMA
 from reconstruct.dense.points import Points
-from reconstruct.dense.robust_fusion import robust_height
-from reconstruct.dense.surfaces import surfaces_of
 
 Float32 = NDArray[np.float32]
+
+_APART_SIGMAS = 5.0
+"""Noise in a gap between heights, in standard deviations of the points on its two sides."""
+_DIAGONAL = math.sqrt(2.0)
+_MIN_POINTS = 3
+_MIN_STATIONS = 2
+"""A surface is seen from as many; what fewer see may be one wrong match."""
+
+
+@compiled
+def sorted_ranks(values: NDArray[Any]) -> NDArray[np.int64]:
+    """Indices that sort values upwards (Shell's sort, which numba compiles in no time).
+
+    The order of equal values depends on the values alone, not on the machine.
+    """
+    count = values.size
+    ranks = np.arange(count)
+    gap = 1
+    while gap < count:
+        gap = 3 * gap + 1
+    while gap > 1:
+        gap //= 3
+        for i in range(gap, count):
+            moved = ranks[i]
+            j = i
+            while j >= gap and values[ranks[j - gap]] > values[moved]:
+                ranks[j] = ranks[j - gap]
+                j -= gap
+            ranks[j] = moved
+    return ranks
+
+
+@compiled
+def surfaces_of(
+    heights: Float32,
+    sigmas: Float32,
+    places: NDArray[np.int64],
+    steepness: Float32,
+    cell: float,
+) -> tuple[int, NDArray[np.int64]]:
+    """Which surface each point of a cell lies on.
+
+    Sorted heights fall apart where a gap is wider than noise and a continuous surface explain: five
+    standard deviations, and a cell's side, or the height that the surface's own slope gains over a
+    cell's diagonal. A surface is what three points from two stations or more show. Where fewer than
+    two are shown, all points are of one.
+
+    Args:
+        heights: (N,).
+        sigmas: (N,) of the heights.
+        places: (N,) stations.
+        steepness: (N,) tangent of the angle between normal and vertical; NaN where unknown.
+        cell: side of the cell.
+
+    Returns:
+        How many surfaces there are, and (N,) the surface of each point, 0 the uppermost; -1 of
+        points between several surfaces and on none of them.
+    """
+    count = heights.size
+    surface = np.zeros(count, np.int64)
+    if heights.max() - heights.min() <= cell:
+        return 1, surface
+    ranks = sorted_ranks(heights)
+    starts = np.empty(count + 1, np.int64)  # of parts, in the order of heights
+    starts[0], parts = 0, 1
+    for i in range(1, count):
+        below, above = ranks[i - 1], ranks[i]
+        noise = _APART_SIGMAS * math.hypot(sigmas[below], sigmas[above])
+        if heights[above] - heights[below] > cell + noise:
+            starts[parts] = i
+            parts += 1
+    starts[parts] = count
+    if parts == 1:
+        return 1, surface
+    slopes = np.empty(parts)
+    for part in range(parts):
+        slopes[part] = _median_known(steepness, ranks[starts[part] : starts[part + 1]])
+    kept = 1  # parts after those that a slope joins, whose starts move to the front
+    for part in range(1, parts):
+        below, above = ranks[starts[part] - 1], ranks[starts[part]]
+        noise = _APART_SIGMAS * math.hypot(sigmas[below], sigmas[above])
+        steep = np.nan
+        for side in (slopes[part - 1], slopes[part]):
+            if math.isnan(steep) or side > steep:
+                steep = side
+        # where no normal is known nothing tells a step from a steep slope
+        if heights[above] - heights[below] > noise + _DIAGONAL * cell * steep:
+            starts[kept] = starts[part]
+            kept += 1
+    starts[kept] = count
+    found = 0
+    surface[:] = -1
+    for part in range(kept - 1, -1, -1):
+        members = ranks[starts[part] : starts[part + 1]]
+        if members.size < _MIN_POINTS or _different(places, members) < _MIN_STATIONS:
+            continue
+        for member in members:
+            surface[member] = found
+        found += 1
+    if found < 2:
+        surface[:] = 0
+        return 1, surface
+    return found, surface
+
+
+@compiled
+def _median_known(values: Float32, members: NDArray[np.int64]) -> float:
+    """Median of those of some values that are known, the upper one of two; NaN of none."""
+    known = np.empty(members.size, np.float32)
+    count = 0
+    for member in members:
+        if not math.isnan(values[member]):
+            known[count] = values[member]
+            count += 1
+    if count == 0:
+        return np.nan
+    ranks = sorted_ranks(known[:count])
+    return float(known[ranks[count // 2]])
+
+
+@compiled
+def _different(values: NDArray[np.int64], members: NDArray[np.int64]) -> int:
+    """How many different values some members have, counted up to those needed."""
+    first = values[members[0]]
+    for member in members:
+        if values[member] != first:
+            return _MIN_STATIONS
+    return 1
+
+
+@compiled
+def robust_height(
+    heights: Float32,
+    sigmas: Float32,
+    views: NDArray[np.int32],
+    stations: NDArray[np.int64],
+    gate: float,
+    shared: float,
+) -> tuple[float, float, int, int]:
+    """Robust height of some points: the weighted mean of what lies near the median.
+
+    The gate around the median is `gate` times the larger of the scatter (from the MAD) and the
+    median's own sigma. The standard deviation adds the formal one to the scatter over the square
+    root of the number of views: pixels of one view share their errors, and so do views of which
+    one was refined by the other. Views of a single station count as one.
+
+    Args:
+        heights: (N,) sorted by view, one or more.
+        sigmas: (N,) of the heights.
+        views: (N,) of the heights.
+        stations: (V,) of every view, by its number.
+        gate: in standard deviations.
+        shared: views whose depths rest on the same pair of pictures, in the mean, 1 to 2.
+
+    Returns:
+        Height and sigma, and number of views and of stations used (255 stands for more).
+    """
+    order = sorted_ranks(heights)
+    half = 0.0
+    for i in range(heights.size):
+        half += 0.5 / sigmas[i] ** 2
+    median_at, below = order[-1], 0.0
+    for i in order:
+        below += 1.0 / sigmas[i] ** 2
+        if below >= half:
+            median_at = i
+            break
+    median = heights[median_at]
+    misses = np.empty(heights.size, np.float32)
+    for i in range(heights.size):
+        misses[i] = abs(heights[i] - median)
+    ranks = sorted_ranks(misses)
+    middle = heights.size // 2
+    scatter = MAD_TO_SIGMA * misses[ranks[middle]]
+    if heights.size % 2 == 0:
+        scatter = 0.5 * (scatter + MAD_TO_SIGMA * misses[ranks[middle - 1]])
+    reach = gate * max(scatter, sigmas[median_at])
+    total, weights, squares = 0.0, 0.0, 0.0
+    formal, in_view, view_weight, seen, last_view = 0.0, 0, 0.0, 0, -1
+    places, companions = np.empty(heights.size, np.int64), 0
+    for i in range(heights.size):
+        if abs(heights[i] - median) > reach:
+            continue
+        w = 1.0 / sigmas[i] ** 2
+        total += w * (heights[i] - median)
+        squares += w * (heights[i] - median) ** 2
+        weights += w
+        if views[i] != last_view:
+            if in_view > 0:
+                formal += view_weight / in_view
+            last_view, in_view, view_weight = views[i], 0, 0.0
+            seen += 1
+            place, known = stations[last_view], False
+            for k in range(companions):
+                known = known or places[k] == place
+            if not known:
+                places[companions] = place
+                companions += 1
+        in_view += 1
+        view_weight += w
+    formal += view_weight / in_view
+    if companions == 1:
+        formal /= seen  # one pair of pictures, however often looked at
+    elif seen > 1:
+        formal /= shared
+    mean = total / weights
+    variance = max(squares / weights - mean * mean, 0.0)
+    return median + mean, math.sqrt(1.0 / formal + variance / seen), seen, min(companions, 255)
+
 
 SURFACE_POINT = np.dtype(
     [

@@ -1,22 +1,205 @@
-"""Fusing the points of all views into the surface, tile by tile of the ground."""
+"""Fusing the points of all views into the surface, tile by tile of the ground.
 
+What stands in free space is no surface. Next to the outline of a body matching carries its depth on
+over what is behind or nothing, the same way in all views from about there, which confirm each
+other. Views from other sides see the body itself beyond such a point.
+
+Errors of poses are the share of the surface's error that fusing views leaves. Depths of one place
+from many views share errors, since they rest on the same poses. How much is known at every sparse
+point: its covariance from the adjustment (`sparse/covariance.npz`), which holds poses and pixels
+together, minus what its own observations leave with poses held. The rest is what the poses around
+it do to a surface there.
+"""
+
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from rasterio.windows import Window
+from scipy.spatial import cKDTree
 
+from alice_survey.core.compiled import compiled
+from alice_survey.core.errors import warn
 from alice_survey.core.frames import Array
-from reconstruct.dense.free_space import look_at_points
+from alice_survey.core.run import progress
 from reconstruct.dense.points import EDGE_ON, Points, joined, part_in_box, points_in_box
-from reconstruct.dense.pose_part import ErrorsOfPoses
 from reconstruct.dense.surface_points import PART_REACH_CELLS, SURFACE_POINT, fuse_surface, settled
-from reconstruct.dense.view_store import ViewStore
+from reconstruct.dense.view_store import StoredDepth, ViewStore
 from reconstruct.planes import Plane
 from reconstruct.raster import DemGrid, tiles_reached
-from reconstruct.views.model import View, enu_from_cam
+from reconstruct.views.model import SparseModel, View, enu_from_cam
+from reconstruct.views.range_shift import FAST, KernelLens, warped_at
+
+_COMPANY = 16
+"""Sparse points around a spot of which the median counts: a single one may be a wrong match."""
+_CHUNK = 50_000
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ErrorsOfPoses:
+    """What errors of poses do to sparse points."""
+
+    points_world: Array
+    """(P, 3)."""
+    covariances: Array
+    """(P, 3, 3)."""
+
+    def median_along(self, normal_world: Array) -> float:
+        """Standard deviation along a direction at half of the points or less."""
+        return float(np.sqrt(np.median(_along(self.covariances, normal_world))))
+
+    def around(self, low: Array, high: Array) -> "ErrorsOfPoses":
+        """Those of the points around a box, of south and west (2,) to north and east (2,)."""
+        margin = float(np.max(high - low))
+        while True:
+            reach = margin + float(np.max(high - low))
+            near = np.array(self._level_tree.query_ball_point(low, reach, p=np.inf), np.int64)
+            place = self.points_world[near, :2]
+            near = near[((place > low - margin) & (place < high + margin)).all(axis=1)]
+            if len(near) >= min(_COMPANY, len(self.points_world)):
+                near.sort()
+                return ErrorsOfPoses(
+                    points_world=self.points_world[near], covariances=self.covariances[near]
+                )
+            margin *= 2.0
+
+    def at(self, points_world: Array, normals_world: Array, block: float) -> Array:
+        """Standard deviations (N,) of a surface's points along its normals.
+
+        Args:
+            points_world: (N, 3).
+            normals_world: (N, 3) unit vectors.
+            block: side of cubes whose points share the sparse points around.
+        """
+        cubes, of_point = np.unique(np.floor(points_world / block), axis=0, return_inverse=True)
+        count = min(_COMPANY, len(self.points_world))
+        near = np.asarray(self._tree.query((cubes + 0.5) * block, k=count)[1])
+        near = near.reshape(len(cubes), count)[of_point.reshape(-1)]
+        found = np.empty(len(points_world))
+        for start in range(0, len(found), _CHUNK):
+            part = slice(start, start + _CHUNK)
+            covariances = self.covariances[near[part]]
+            found[part] = np.median(_along(covariances, normals_world[part, None]), axis=1)
+        sigmas: Array = np.sqrt(found)
+        return sigmas
+
+    @cached_property
+    def _level_tree(self) -> cKDTree:
+        return cKDTree(self.points_world[:, :2])
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.points_world)
+
+
+def _along(covariances: Array, directions: Array) -> Array:
+    """Variances (...,) along directions (..., 3) of covariances (..., 3, 3)."""
+    found = np.einsum("...i,...ij,...j->...", directions, covariances, directions)
+    variances: Array = np.maximum(found, 0.0)
+    return variances
+
+
+@progress.step("find what poses add to errors")
+def find_errors_of_poses(workspace: Path, model: SparseModel) -> ErrorsOfPoses | None:
+    """What poses do to points; None, with a warning, where it is not known."""
+    path = workspace / "sparse" / "covariance.npz"
+    if not path.is_file():
+        warn("no sparse/covariance.npz: sigma.tif leaves out what errors of poses do to heights")
+        return None
+    from reconstruct.adjustment.uncertainty import read_uncertainty
+
+    known = read_uncertainty(path)
+    if len(known.point_ids) != len(model.points_world):
+        warn("sparse/covariance.npz is not of this model: sigma.tif leaves out errors of poses")
+        return None
+    own = known.point_cov - known.point_noise
+    seen = np.isfinite(own).all(axis=(1, 2))
+    if not seen.any():
+        warn("sparse/covariance.npz knows no point: sigma.tif leaves out errors of poses")
+        return None
+    return ErrorsOfPoses(points_world=model.points_world[seen], covariances=own[seen])
+
+
+Float32 = NDArray[np.float32]
+
+_GATE = 3.0
+"""Depths that differ by no more than this many standard deviations of their difference agree."""
+_MIN_KNOWN = 5
+"""Of the nine pixels around a spot, for a view to see through it."""
+_FRAME = 1.2
+"""Times half a picture up to which a port may shift what is in the frame."""
+
+
+@compiled(error_model="numpy", fastmath=FAST)
+def look_at_points(
+    points: Float32,
+    sigmas: Float32,
+    cam_from_enu: Array,
+    depth: StoredDepth,
+    factor: float,
+    lens: KernelLens,
+    cell: float,
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Which points a view finds at their place, and which it sees through.
+
+    A view finds a point where any of the nine pixels around shows the point's depth, and sees
+    through it where all that are known show something beyond.
+
+    Args:
+        points: (N, 3) east, north, up from an offset.
+        sigmas: (N,) of the points.
+        cam_from_enu: (3, 4) transform of such points into the view's camera.
+        depth: (H, W) of the view.
+        factor: on its standard deviations.
+        lens: of the view.
+        cell: distance between neighbouring points of the surface.
+
+    Returns:
+        (N,) 1 where the view finds the point, and (N,) 1 where it sees through it.
+    """
+    levels, shares, depth_of, share_of = depth
+    height, width = levels.shape
+    found = np.zeros(points.shape[0], np.uint8)
+    through = np.zeros(points.shape[0], np.uint8)
+    pinhole, field, inverse_working = lens
+    t = cam_from_enu
+    for n in range(points.shape[0]):
+        e, m, u = points[n, 0], points[n, 1], points[n, 2]
+        z = t[2, 0] * e + t[2, 1] * m + t[2, 2] * u + t[2, 3]
+        if z <= 0.0:
+            continue
+        x = pinhole[0] * (t[0, 0] * e + t[0, 1] * m + t[0, 2] * u + t[0, 3]) / z + pinhole[2]
+        y = pinhole[1] * (t[1, 0] * e + t[1, 1] * m + t[1, 2] * u + t[1, 3]) / z + pinhole[3]
+        if abs(2.0 * x - width) > _FRAME * width or abs(2.0 * y - height) > _FRAME * height:
+            continue
+        x, y = warped_at(field, inverse_working, x, y, 1.0 / z)
+        column, row = math.floor(x), math.floor(y)
+        if column < 1 or row < 1 or column >= width - 1 or row >= height - 1:
+            continue
+        known, beyond, here = 0, 0, False
+        for i in range(row - 1, row + 2):
+            for j in range(column - 1, column + 2):
+                if levels[i, j] == 0:
+                    continue
+                known += 1
+                there = depth_of[levels[i, j]]
+                sigma = factor * there * share_of[shares[i, j]]
+                tolerance = cell + _GATE * math.sqrt(sigmas[n] ** 2 + sigma**2)
+                if abs(there - z) <= tolerance:
+                    here = True
+                elif there > z:
+                    beyond += 1
+        if here:
+            found[n] = 1
+        elif known >= _MIN_KNOWN and beyond == known:
+            through[n] = 1
+    return found, through
+
 
 _TILE_CELLS = 256
 _WORST_CELLS = 4.0

@@ -1,10 +1,11 @@
-"""What changed between two surveys: a map of differences, its significance, and volumes.
+"""A survey against an earlier one: a map of differences, its significance, and volumes.
 
 The sigma of a difference is that of both heights and of the registration. Single cells exceed 1.96
 sigma by chance in 5 % of all cases; a place counts as changed only where most cells around agree.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -15,11 +16,24 @@ from rasterio.features import shapes
 from rasterio.transform import Affine
 from scipy.ndimage import find_objects
 
+from alice_survey.core.artefacts import refuse_links
+from alice_survey.core.errors import ReconstructionError, WorkspaceError, warn
 from alice_survey.core.frames import Array
+from alice_survey.core.records import ChangeRecord
 from alice_survey.core.robust import MAD_TO_SIGMA
-from reconstruct.evaluate.elevation import Elevation
+from alice_survey.core.run import progress
+from alice_survey.kit.figure import (
+    Axes,
+    colour_bar,
+    figure_style,
+    map_axes,
+    new_figure,
+    save_figure,
+)
+from reconstruct.evaluate.elevation import Elevation, enu_from_enu, read_elevation
 from reconstruct.evaluate.figures import rms, rounded
-from reconstruct.evaluate.height_registration import HeightFit
+from reconstruct.evaluate.registration import HeightFit, refine_heights, register_heights
+from reconstruct.raster import DemGrid, hillshade, tiled_raster
 
 SIGNIFICANT = 1.96
 """Standard deviations: 95 % of errors of a normal distribution stay below."""
@@ -34,6 +48,8 @@ _RING_SIGMAS = 2.0
 _REGION_SIGMAS = 3.0
 _MIN_BLOCKS = 20
 _SIDES = (1, 2, 4, 8, 16, 32)
+_MAX_DRAWN = 1200
+_LABELLED = 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -297,3 +313,181 @@ def _region(region: Region) -> dict[str, Any]:
         "most_mm": round(1e3 * region.max_m, 2),
         "outlines": [[[round(e, 4), round(n, 4)] for e, n in ring] for ring in region.outlines],
     }
+
+
+@figure_style()
+def plot_change(path: Path, now: Elevation, change: Change) -> None:
+    """Difference over the relief, places that changed, and the significance with its histogram."""
+    step = max(1, max(now.height.shape) // _MAX_DRAWN)
+    difference = 1e3 * change.difference[::step, ::step]
+    ratio = change.significance[::step, ::step]
+    shade = hillshade(now.height[::step, ::step], now.cell * step)
+    rows, columns = now.height.shape
+    extent = (now.west, now.west + columns * now.cell, now.north - rows * now.cell, now.north)
+    known = np.isfinite(difference)
+    limit = max(float(np.percentile(np.abs(difference[known]), 99.5)), 1e-6) if known.any() else 1.0
+    figure = new_figure(5.2, 14)
+    left, middle, right = figure.subplots(1, 3, width_ratios=[1.2, 1.2, 0.8])
+    for axis, values, span, label, title in (
+        (left, difference, limit, "mm", "Height now minus before"),
+        (middle, ratio, 4.0, "standard deviations", "Significance"),
+    ):
+        axis.imshow(shade, extent=extent, cmap="gray", vmin=0, vmax=1.2)
+        image = axis.imshow(
+            values, extent=extent, cmap="RdBu_r", vmin=-span, vmax=span,
+            alpha=np.where(np.isfinite(values), 0.75, 0.0), interpolation="nearest",
+        )  # fmt: skip
+        axis.grid(visible=False)
+        axis.set_title(title)
+        colour_bar(image, axis, label)
+        map_axes(axis)
+    changed = change.changed[::step, ::step]
+    if changed.any():
+        for axis in (left, middle):
+            axis.contour(
+                changed, levels=[0.5], colors="k", linewidths=0.8, extent=extent, origin="upper"
+            )
+    for region in change.regions[:_LABELLED]:
+        left.annotate(
+            f"{1e3 * region.volume_m3:+.2f}±{1e3 * region.sigma_m3:.2f} l",
+            (region.east_m, region.north_m), ha="center", fontsize=7,
+            bbox={"boxstyle": "round", "fc": "white", "alpha": 0.8, "lw": 0},
+        )  # fmt: skip
+    _histogram(right, change)
+    save_figure(figure, path)
+
+
+def _histogram(axis: Axes, change: Change) -> None:
+    """Unchanged ground in standard deviations, and what chance would give."""
+    stable = np.isfinite(change.difference) & ~change.changed
+    ratio = change.significance[stable]
+    edges = np.linspace(-6, 6, 97)
+    axis.hist(np.clip(ratio, -6, 6), bins=edges, density=True, label="unchanged ground")
+    axis.plot(edges, np.exp(-(edges**2) / 2) / np.sqrt(2 * np.pi), "k-", label="chance")
+    for side in (-SIGNIFICANT, SIGNIFICANT):
+        axis.axvline(side, color="0.5", linestyle=":")
+    axis.set(xlabel="difference / sigma", ylabel="density", yscale="log", ylim=(1e-5, 2))
+    axis.set_title(f"{np.mean(np.abs(ratio) > SIGNIFICANT):.1%} beyond {SIGNIFICANT} sigma")
+    axis.legend(loc="upper right")
+
+
+_MUCH = 0.5
+"""Share of the ground that is rarely found changed between two surveys."""
+
+
+@progress.step("find what has changed")
+def compare_elevations(
+    now: Elevation, before: Elevation, now_from_before: Any
+) -> tuple[Change, HeightFit]:
+    """Register two surveys, find what changed, and register again without that.
+
+    Args:
+        now: later survey; its grid is that of the result.
+        before: earlier survey.
+        now_from_before: rigid transform that the georeferences give, east, north, up.
+    """
+    fit = register_heights(now, before, now_from_before)
+    change = find_change(now, before, fit)
+    if change.changed.any():
+        stable = replace(now, height=np.where(change.changed, np.nan, now.height))
+        try:
+            fit = refine_heights(stable, before, fit.fixed_from_moving)
+        except ReconstructionError:
+            warn("too little is unchanged to register on it alone: change may be underestimated")
+            return change, fit
+        change = find_change(now, before, fit)
+    return change, fit
+
+
+def evaluate_against(
+    workspace: Path, earlier: Path, out: Path | None = None
+) -> tuple[str, dict[str, Any]]:
+    """Compare the surface of a workspace with that of an earlier survey and write the change.
+
+    Writes `difference.tif` (height now minus before, m), `significance.tif` (in standard
+    deviations), `change.png` and `change.json` into `against/NAME` of the workspace, or `out`.
+
+    Args:
+        workspace: of the later survey.
+        earlier: workspace of the earlier one, or of another model of the same pictures.
+        out: folder to write to.
+
+    Returns:
+        A few lines of text, and figures as JSON values.
+
+    Raises:
+        WorkspaceError: a surface is missing or has no georeference or no scale.
+        ReconstructionError: the two do not overlap.
+    """
+    now, frame = read_elevation(workspace)
+    before, frame_before = read_elevation(earlier)
+    for folder, one in ((workspace, frame), (earlier, frame_before)):
+        if one.datum is None or not one.scaled:
+            raise WorkspaceError(
+                f"{folder} is not georeferenced: surveys are compared where the georeference puts "
+                "them; give positions in the manifest or control points"
+            )
+    assert frame.datum is not None  # noqa: S101 - for the type checker, said above
+    assert frame_before.datum is not None  # noqa: S101
+    georeferenced = enu_from_enu(frame.datum, frame_before.datum)
+    change, fit = compare_elevations(now, before, georeferenced)
+    share = change.changed.sum() / max(int(np.isfinite(change.difference).sum()), 1)
+    if share > _MUCH:
+        warn(
+            f"{share:.0%} of the common ground differs: if that is not so, one of the models is "
+            f"bent or wrongly scaled, or they are laid on each other wrongly; look at the maps"
+        )
+    folder = out or workspace / "against" / earlier.resolve().name
+    refuse_links(workspace, folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    figures = {
+        "format": "alice-survey change",
+        "version": 1,
+        "earlier": str(earlier),
+        "registration": _change_registration(fit, georeferenced),
+        **change.to_json(),
+    }
+    grid = DemGrid(
+        west=now.west, north=now.north, cell=now.cell,
+        rows=now.height.shape[0], columns=now.height.shape[1],
+    )  # fmt: skip
+    for name, values, text in (
+        ("difference", change.difference, "height now minus before (m)"),
+        ("significance", change.significance, "change over its sigma"),
+    ):
+        path = folder / f"{name}.tif"
+        with tiled_raster(path, grid, frame, "float32", np.nan, text) as raster:
+            raster.write(values.astype(np.float32), 1)
+    plot_change(folder / "change.png", now, change)
+    ChangeRecord.save(folder / "change.json", figures)
+    return _change_text(figures, folder), figures
+
+
+def _change_registration(fit: HeightFit, georeferenced: Any) -> dict[str, Any]:
+    """How far the surfaces were from where the georeferences put them, at their middle."""
+    moved = fit.fixed_from_moving * georeferenced.inv()
+    shift = moved.apply(fit.centre) - fit.centre
+    sigma = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
+    return {
+        "shift_east_north_up_m": [round(float(v), 5) for v in shift],
+        "shift_sigma_mm": [round(1e3 * float(v), 4) for v in sigma[3:]],
+        "turn_deg": [round(float(v), 5) for v in np.rad2deg(moved.rotation.as_rotvec())],
+        "turn_sigma_deg": [round(float(v), 6) for v in np.rad2deg(sigma[:3])],
+        "spread_mm": round(1e3 * fit.spread, 4),
+        "cells": fit.used,
+    }
+
+
+def _change_text(figures: dict[str, Any], folder: Path) -> str:
+    still, shift = figures["unchanged"], figures["registration"]["shift_east_north_up_m"]
+    return "\n".join([
+        f"gained {figures['gained']['volume_l']:.2f} +/- {figures['gained']['sigma_l']:.2f} l in "
+        f"{figures['gained']['regions']} places, lost {-figures['lost']['volume_l']:.2f} +/- "
+        f"{figures['lost']['sigma_l']:.2f} l in {figures['lost']['regions']}, on "
+        f"{figures['changed_m2']:.2f} of {figures['area_m2']:.2f} m2",
+        f"registered by {shift[0]:+.3f} east, {shift[1]:+.3f} north, {shift[2]:+.3f} m up of the "
+        f"georeferences; unchanged ground differs by {still['robust_sigma_mm']:.2f} mm "
+        f"({still['difference_over_sigma_rms']:.2f} of its sigma; "
+        f"{still['share_significant']:.1%} of it beyond {SIGNIFICANT} sigma)",
+        f"maps in {folder}",
+    ])  # fmt: skip

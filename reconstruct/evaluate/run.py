@@ -5,33 +5,132 @@ surface is moved by the same alignment and compared with the terrain's mesh, cel
 included; the mosaic is compared with the true sea floor painted at the same places.
 """
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import rasterio
+from scipy.spatial.transform import RigidTransform
+from shapely.geometry import MultiPolygon
 
 from alice_survey.core.artefacts import read_stage, write_csv
+from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Array
 from alice_survey.core.manifest import read_manifest
 from alice_survey.core.products import ERROR
 from alice_survey.core.records import RegistrationRecord, ScoreRecord
+from alice_survey.core.run import progress
+from alice_survey.kit.figure import (
+    Axes,
+    colour_bar,
+    even_limit,
+    figure_style,
+    map_axes,
+    new_figure,
+    save_figure,
+)
 from alice_survey.sim.seafloor.terrain import read_terrain
 from alice_survey.sim.seafloor.texture import survey_texture
 from camera_calib.rig import read_rig
-from missions.values.plan_file import read_plan
-from reconstruct.evaluate.cameras import CameraScore, score_cameras
+from missions.values.plan_file import Plan, read_plan
 from reconstruct.evaluate.elevation import elevation_in
-from reconstruct.evaluate.figures import compare_lengths
-from reconstruct.evaluate.mesh import read_mesh, score_mesh
+from reconstruct.evaluate.figures import compare_lengths, rms
 from reconstruct.evaluate.mosaic import score_mosaic
-from reconstruct.evaluate.overlap import overlaps_reached
-from reconstruct.evaluate.plots import plot_errors, plot_sheet, plot_track
-from reconstruct.evaluate.surface import score_surface
-from reconstruct.evaluate.truth import count_stations, ground_pixel_m, read_true_poses
+from reconstruct.evaluate.surface import SurfaceScore, read_mesh, score_mesh, score_surface
+from reconstruct.evaluate.truth import (
+    count_stations,
+    ground_pixel_m,
+    overlaps_reached,
+    read_true_poses,
+)
+from reconstruct.placing.alignment import align_rigid, align_similarity
 from reconstruct.placing.track import read_track_poses
+
+_WIDTH_IN = 11.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CameraScore:
+    """How well the cameras were placed."""
+
+    registered: int
+    total: int
+    truth_from_world: RigidTransform
+    """The rigid alignment; the surface and the mosaic are moved by it too."""
+    names: tuple[str, ...]
+    positions_ned: Array
+    """(N, 3) aligned entrance pupils."""
+    misses_m: Array
+    """(N, 3) aligned minus true position, north, east, down."""
+    turns_deg: Array
+    """(N,) angle between aligned and true attitude."""
+    scale_error: float
+    """Scale of a similarity alignment minus one, sign as of the model: positive when too large."""
+    georeference_m: Array
+    """(3,) mean miss before the alignment, north, east, down."""
+
+    @property
+    def rms_m(self) -> float:
+        """Root mean square distance."""
+        return float(np.sqrt((self.misses_m**2).sum(axis=1).mean()))
+
+    def to_json(self) -> dict[str, Any]:
+        """Figures in millimetres, degrees and parts per million."""
+        return {
+            "registered": self.registered,
+            "total": self.total,
+            "rms_mm": round(1e3 * self.rms_m, 3),
+            "max_mm": round(1e3 * float(np.linalg.norm(self.misses_m, axis=1).max()), 3),
+            "rms_north_east_down_mm": [
+                round(1e3 * rms(self.misses_m[:, axis]), 3) for axis in range(3)
+            ],
+            "attitude_rms_deg": round(rms(self.turns_deg), 4),
+            "scale_error_ppm": round(1e6 * self.scale_error, 1),
+            "georeference_north_east_down_m": [round(float(m), 4) for m in self.georeference_m],
+        }
+
+
+@progress.step("score the cameras")
+def score_cameras(
+    estimated: Mapping[str, RigidTransform], truth: Mapping[str, RigidTransform], total: int
+) -> CameraScore:
+    """Compare entrance pupils with the true poses of a simulated survey.
+
+    Args:
+        estimated: `world_from_cam` by picture, in metres.
+        truth: `ned_from_cam` by picture.
+        total: how many pictures there are.
+
+    Raises:
+        WorkspaceError: fewer than three pictures are registered.
+    """
+    names = tuple(sorted(estimated))
+    if len(names) < 3:
+        raise WorkspaceError(f"{len(names)} registered pictures; 3 or more are needed to align")
+    found = np.stack([estimated[name].translation for name in names])
+    true = np.stack([truth[name].translation for name in names])
+    alignment = align_rigid(found, true)
+    similarity = align_similarity(found, true)
+    turns = [
+        (truth[n].rotation.inv() * alignment.rotation * estimated[n].rotation).magnitude()
+        for n in names
+    ]
+    return CameraScore(
+        registered=len(names),
+        total=total,
+        truth_from_world=alignment,
+        names=names,
+        positions_ned=alignment.apply(found),
+        misses_m=alignment.apply(found) - true,
+        turns_deg=np.rad2deg(turns),
+        scale_error=1.0 / similarity.scale - 1.0,
+        georeference_m=(found - true).mean(axis=0),
+    )
+
 
 _SEED_STREAM = 6100
 
@@ -103,3 +202,119 @@ def write_cameras(path: Path, cameras: CameraScore) -> None:
             )
         ),
     )
+
+
+@progress.step("draw the track's errors")
+@figure_style()
+def plot_track(path: Path, plan: Plan, cameras: CameraScore) -> None:
+    """Planned lines, camera positions coloured by error, and the error of each picture."""
+    places, length_mm = cameras.positions_ned, 1e3 * np.linalg.norm(cameras.misses_m, axis=1)
+    south, west, north, east = plan.area.survey.bounds
+    figure = new_figure(_height_in(east - west, north - south), _WIDTH_IN)
+    plane, strips = figure.subplots(1, 2, width_ratios=[1, 1.2])
+    for line in plan.lines:
+        (n0, e0), (n1, e1) = line.start_ne_m, line.end_ne_m
+        plane.plot([e0, e1], [n0, n1], color="0.75", linewidth=3, zorder=1)
+    _draw_area(plane, plan.area.survey)
+    dots = plane.scatter(places[:, 1], places[:, 0], c=length_mm, s=14, cmap="viridis", zorder=2)
+    colour_bar(dots, plane, "position error (mm)")
+    plane.set_title("Camera positions over the plan")
+    map_axes(plane)
+    for axis, name in enumerate(("north", "east", "down")):
+        strips.plot(1e3 * cameras.misses_m[:, axis], ".", markersize=4, label=name)
+    strips.axhline(0, color="0.6", linewidth=0.8)
+    strips.set(xlabel="picture", ylabel="error (mm)")
+    strips.set_title(f"Error after a rigid alignment: {1e3 * cameras.rms_m:.2f} mm rms")
+    strips.legend(loc="upper right")
+    save_figure(figure, path)
+
+
+@progress.step("draw the errors")
+@figure_style()
+def plot_errors(path: Path, surface: SurfaceScore, area: MultiPolygon) -> None:
+    """Map and histogram of height errors of the surface."""
+    figures = surface.to_json()
+    limit = max(5.0, 3 * figures["height_median_mm"], figures["height_95_mm"])
+    shown = even_limit(1e3 * surface.map_m)
+    west, east, south, north = surface.extent_m
+    figure = new_figure(_height_in(east - west, north - south), _WIDTH_IN)
+    plane, bars = figure.subplots(1, 2, width_ratios=[1.3, 1])
+    image = plane.imshow(
+        1e3 * surface.map_m,
+        extent=(west, east, south, north),
+        vmin=-shown,
+        vmax=shown,
+        cmap="PuOr",
+        interpolation="nearest",
+    )
+    _draw_area(plane, area)
+    colour_bar(image, plane, "height error (mm)")
+    plane.set_title("Surface minus truth")
+    plane.grid(visible=False)
+    map_axes(plane)
+    plane.set_facecolor("0.85")
+    bars.hist(1e3 * surface.height_m, bins=np.linspace(-4 * limit, 4 * limit, 161), log=True)
+    bars.set(xlabel="height error (mm)", ylabel="cells")
+    bars.set_title(
+        f"rms {figures['height_rms_mm']:.2f} mm in height, {figures['distance_rms_mm']:.2f} mm "
+        f"in distance;\n{surface.completeness:.1%} complete",
+        fontsize=9,
+    )
+    save_figure(figure, path)
+
+
+@progress.step("draw the summary")
+@figure_style()
+def plot_sheet(
+    path: Path,
+    workspace: Path,
+    cameras: CameraScore,
+    surface: SurfaceScore,
+    area: MultiPolygon,
+) -> None:
+    """The picture nearest to the middle of the area, surface, mosaic and error on one sheet."""
+    middle = area.representative_point()
+    away = np.linalg.norm(cameras.positions_ned[:, :2] - [middle.x, middle.y], axis=1)
+    pictures = [
+        ("A picture", workspace / "images" / cameras.names[int(away.argmin())]),
+        ("Surface", workspace / "dense" / "dem.png"),
+        ("Mosaic", workspace / "mosaic" / "mosaic.png"),
+    ]
+    figure = new_figure(10, 12)
+    panels = figure.subplots(2, 2).ravel()
+    for panel, (title, file) in zip(panels, pictures, strict=False):
+        panel.set_title(title)
+        panel.axis("off")
+        panel.imshow(_read(file))
+    west, east, south, north = surface.extent_m
+    panels[3].set_title("Surface minus truth")
+    panels[3].grid(visible=False)
+    error_mm = 1e3 * surface.map_m
+    shown = even_limit(error_mm)
+    image = panels[3].imshow(
+        error_mm, extent=(west, east, south, north), vmin=-shown, vmax=shown, cmap="PuOr"
+    )
+    colour_bar(image, panels[3], "height error (mm)")
+    map_axes(panels[3])
+    save_figure(figure, path)
+
+
+def _height_in(width_m: float, height_m: float) -> float:
+    """Height of a figure with a map next to something else: higher where the map is."""
+    return 5.5 * min(max(0.9 * height_m / width_m, 1.0), 1.7)
+
+
+def _draw_area(axes: Axes, area: MultiPolygon) -> None:
+    """Edges of the survey area, holes too."""
+    for part in area.geoms:
+        for ring in (part.exterior, *part.interiors):
+            north, east = np.asarray(ring.coords)[:, :2].T
+            axes.plot(east, north, "k--", linewidth=1)
+
+
+def _read(path: Path) -> Any:
+    import cv2
+
+    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    order = cv2.COLOR_BGRA2RGBA if picture.shape[2] == 4 else cv2.COLOR_BGR2RGB
+    return cv2.cvtColor(picture, order)

@@ -20,10 +20,10 @@ from rasterio.enums import Resampling
 from rasterio.vrt import WarpedVRT
 from rasterio.warp import calculate_default_transform
 
+from alice_survey.core import products
 from alice_survey.core.artefacts import Stage, atomic_path, run_stage, write_csv, write_json
 from alice_survey.core.errors import ConfigError, ReconstructionError
 from alice_survey.core.frames import Array
-from alice_survey.core.products import MOSAIC, rasters_in
 from alice_survey.core.records import MeshRecord, SurfaceRecord
 from alice_survey.core.run import progress
 from reconstruct.copc import PointSpool, write_copc
@@ -130,7 +130,7 @@ def _projected(crs: str, frame: WorldFrame) -> pyproj.CRS:
 
 def _export(workspace: Path, target: Destination, folder: Path) -> None:
     dense = workspace / "dense"
-    for one in (*rasters_in("dense"), MOSAIC):
+    for one in (*products.rasters_in("dense"), products.MOSAIC):
         _resample(workspace / one.path, folder / one.path.name, target)
     for style in dense.glob("*.qml"):
         shutil.copy2(style, folder / style.name)

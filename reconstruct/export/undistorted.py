@@ -3,9 +3,14 @@
 A camera behind a flat port has no single centre: a picture that is warped to a pinhole is exact at
 one distance only. Here each pixel is taken from where the camera sees what the pinhole's ray meets
 of the surface, so that every picture is that of a pinhole, of this surface.
+
+nerfstudio's `transforms.json` holds poses, pinholes and first points of a splat or a radiance
+field. Its convention (docs.nerf.studio, "Data conventions"): camera to world, with the camera's x
+to the right, y up and z backwards (OpenGL); the world's z up.
 """
 
 import shutil
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -19,12 +24,59 @@ from scipy.ndimage import distance_transform_edt
 from alice_survey.core.artefacts import Stage, atomic_path, run_stage, write_json
 from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Array
-from reconstruct.evaluate.mesh import read_mesh
-from reconstruct.export.nerfstudio import write_nerfstudio
+from reconstruct.evaluate.surface import read_mesh
 from reconstruct.pictures.undistorted import Pictures
+from reconstruct.ply import write_ply
 from reconstruct.stages import MESH, PLACING
-from reconstruct.views.model import View, points_of_views, read_model
+from reconstruct.views.model import SparseModel, View, points_of_views, read_model
 from reconstruct.views.model_files import read_reconstruction
+
+_ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+_OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
+_POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"),
+                   ("red", "u1"), ("green", "u1"), ("blue", "u1")])  # fmt: skip
+_GREY = 128
+
+
+def write_nerfstudio(folder: Path, model: SparseModel, names: Mapping[str, str]) -> None:
+    """Write `transforms.json` and `points.ply` of exported pictures.
+
+    Args:
+        folder: with `images/` and `masks/`.
+        model: of the pictures.
+        names: of the exported pictures, by those of the views.
+    """
+    points = np.zeros(len(model.points_world), _POINT)
+    points["x"], points["y"], points["z"] = (model.points_world @ _ENU_FROM_NED.T).T
+    points["red"] = points["green"] = points["blue"] = _GREY
+    write_ply(folder / "points.ply", [points], ["sparse points: east, north, up"])
+    frames = [
+        {
+            "file_path": f"images/{names[view.image]}",
+            "mask_path": f"masks/{names[view.image]}.png",
+            "fl_x": view.pinhole.fx_px,
+            "fl_y": view.pinhole.fy_px,
+            "cx": view.pinhole.cx_px,
+            "cy": view.pinhole.cy_px,
+            "w": view.pinhole.width_px,
+            "h": view.pinhole.height_px,
+            "transform_matrix": world_from_gl(view).tolist(),
+        }
+        for view in model.views
+    ]
+    write_json(
+        folder / "transforms.json",
+        {"camera_model": "PINHOLE", "ply_file_path": "points.ply", "frames": frames},
+    )
+
+
+def world_from_gl(view: View) -> Array:
+    """(4, 4) pose of a view's camera in OpenGL's axes, in a world of east, north, up."""
+    pose = np.eye(4)
+    pose[:3, :3] = _ENU_FROM_NED @ view.world_from_cam.rotation.as_matrix() @ _OPENCV_FROM_OPENGL
+    pose[:3, 3] = _ENU_FROM_NED @ view.world_from_cam.translation
+    return pose
+
 
 FOLDER = "undistorted"
 _NODE_PX = 4

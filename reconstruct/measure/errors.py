@@ -6,9 +6,9 @@ go together. Poses and calibration move all of a surface, smoothly, by the motio
 is hardly touched by them. What the dense stage adds is a cell's own, and fades within about two
 cells. It is white noise of pixels under two kernels: the Gaussian window of 1.25 px in which
 pictures are compared (`dense.refine_depth`), half a cell where a cell is 2.5 px wide
-(`dense.scales.CELL_PIXELS`), and the bilinear shares by which points count for the cells around
-them (`dense.dem.cells_over`), whose variance is a sixth of a cell. Noise under a kernel of variance
-s² correlates by exp(-d² / 4s²), here 4s² = 4 (1/4 + 1/6) cells².
+(`dense.matching_trial.CELL_PIXELS`), and the bilinear shares by which points count for the cells
+around them (`dense.dem.cells_over`), whose variance is a sixth of a cell. Noise under a kernel of
+variance s² correlates by exp(-d² / 4s²), here 4s² = 4 (1/4 + 1/6) cells².
 """
 
 from collections.abc import Callable, Sequence

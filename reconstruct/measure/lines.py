@@ -8,7 +8,7 @@ import numpy as np
 
 from alice_survey.core.errors import ReconstructionError
 from alice_survey.core.frames import Array
-from reconstruct.measure.cells import not_more
+from reconstruct.measure.areas import not_more
 from reconstruct.measure.errors import FigureSlopes
 from reconstruct.measure.figures import (
     Measured,

@@ -20,8 +20,7 @@ from alice_survey.core.run import progress
 from missions.areas.safe import DRIVERS, gis_files
 from reconstruct.measure.areas import SurfaceAreas, figures_of_all, surface_within
 from reconstruct.measure.errors import FigureSlopes, PackedSlopes, summed
-from reconstruct.measure.export import Measurement, as_csv, as_geojson
-from reconstruct.measure.figures import Measured, figure
+from reconstruct.measure.figures import Measured, Measurement, as_csv, as_geojson, figure
 from reconstruct.measure.surface import MeasuredSurface
 from reconstruct.raster import crs_of, opened_raster
 

@@ -10,8 +10,11 @@ import shapely
 
 from alice_survey.core.errors import ReconstructionError
 from alice_survey.core.frames import Array
-from reconstruct.measure.areas import NOTHING_KNOWN, AreaSums, GridPart, PolygonOnGrid
-from reconstruct.measure.cells import (
+from reconstruct.measure.areas import (
+    NOTHING_KNOWN,
+    AreaSums,
+    GridPart,
+    PolygonOnGrid,
     lifted,
     mean_of_corners,
     plan_slopes,

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
 from alice_survey.core.run import progress
-from reconstruct.mesh.labels import Charts
 from reconstruct.mesh.topology import Triangles
+from reconstruct.mesh.visibility import Charts
 
 PADDING_PX = 8
 """Pixels around a patch that continue its picture: mipmaps down to an eighth mix nothing else."""

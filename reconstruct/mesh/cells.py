@@ -5,8 +5,17 @@ another cell is cut, and its ends stay where they are. A pass goes over squares 
 first shifted by one cell, whose triangles go back into four cells by their centroids, then in
 place, where the four become one cell of the next level. What is a border in one is inside the
 other, so that borders are decimated too, and once for both sides.
+
+Edges collapse where quadrics say that the surface is flat within an error: quadric error metrics
+(Garland & Heckbert 1997, "Surface simplification using quadric error metrics"), with what the usual
+libraries lack: vertices can be locked, so that tiles still meet after each was decimated by itself;
+no collapse changes the topology (link condition, Dey et al. 1999) or turns a face over; and the
+result does not depend on threads.
+
+Edges collapse in rounds: the cheapest first, none in the neighbourhood of another of its round.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -15,11 +24,297 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey.core.compiled import compiled
 from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Array
-from reconstruct.mesh.decimate import decimate
 from reconstruct.mesh.topology import Triangles, component_areas, edges_of, split_fans
 from reconstruct.mesh.visibility import ray_scene
+
+_MAX_ROUNDS = 60
+_ENOUGH = 0.004
+"""A round that removes less than this share of the vertices is the last."""
+_SHARE = 0.5
+"""Only this share of the edges, the cheapest, may collapse in one round."""
+_RIM_WEIGHT = 3.0
+"""Weight of the planes that hold the outline of a mesh, over that of its faces."""
+_MIN_COSINE = 0.3
+"""Least cosine between the normals of a face before and after a collapse."""
+_MIN_QUALITY = 0.06
+"""4 sqrt(3) area over the sum of squared sides (1 if equilateral) that a face must keep."""
+_SHORTNESS = 1e-4
+"""Share of an edge's squared length added to its cost: on a plane short edges go first."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Decimated:
+    """A mesh with fewer triangles."""
+
+    vertices: Array
+    triangles: Triangles
+    source: NDArray[np.int64]
+    """(V,) number of a vertex of the mesh before; a locked vertex keeps its own."""
+
+
+def decimate(
+    vertices: Array, triangles: Triangles, locked: NDArray[np.bool_], error: float
+) -> Decimated:
+    """Collapse edges while the surface moves less than an error (root mean square).
+
+    Args:
+        vertices: (V, 3).
+        triangles: (T, 3), every edge of one or two.
+        locked: (V,) vertices that stay where they are.
+        error: largest distance, in the unit of the vertices, of a vertex from the planes of the
+            faces it stands for.
+    """
+    centre = vertices.mean(axis=0) if len(vertices) else np.zeros(3)
+    place = vertices - centre
+    faces = triangles.astype(np.int32)
+    source = np.arange(len(vertices))
+    fixed = locked.copy()
+    quadrics = _quadrics(place, faces)
+    for _ in range(_MAX_ROUNDS):
+        if not len(faces):
+            break
+        edges, edge = edges_of(faces)
+        count = np.bincount(edge, minlength=len(edges))
+        rim_edge = count == 1
+        rim = np.zeros(len(place), np.bool_)
+        rim[edges[rim_edge]] = True
+        cost, spot = _costs(place, quadrics, edges, rim_edge, rim, fixed)
+        able = np.flatnonzero(cost <= error * error)
+        if not len(able):
+            break
+        order = able[np.argsort(cost[able], kind="stable")][: max(1, int(_SHARE * len(edges)))]
+        corners = np.argsort(faces.reshape(-1), kind="stable")
+        starts = np.searchsorted(faces.reshape(-1)[corners], np.arange(len(place) + 1))
+        gone = _collapse(
+            place, faces, quadrics, edges[order], spot[order], rim_edge[order], starts, corners // 3
+        )
+        faces = np.ascontiguousarray(faces[faces[:, 0] >= 0])
+        used = np.zeros(len(place), np.bool_)
+        used[faces] = True
+        number = np.cumsum(used, dtype=np.int32) - 1
+        before = len(place)
+        place, quadrics, source, fixed = place[used], quadrics[used], source[used], fixed[used]
+        faces = number[faces].astype(np.int32)
+        if gone < _ENOUGH * before:
+            break
+    return Decimated(
+        vertices=np.where(fixed[:, None], vertices[source], place + centre),
+        triangles=faces,
+        source=source,
+    )
+
+
+def _quadrics(vertices: Array, triangles: Triangles) -> Array:
+    """(V, 11): upper triangle of the sum of weighted plane quadrics, and the weight of the faces.
+
+    The planes of all faces around, weighted by area, and at the outline planes square to them.
+    """
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    cross = np.cross(b - a, c - a)
+    area = 0.5 * np.linalg.norm(cross, axis=1)
+    normal = cross / np.maximum(2.0 * area, 1e-30)[:, None]
+    rows = _plane(normal, -(normal * a).sum(axis=1)) * area[:, None]
+    rows = np.column_stack([rows, area])
+    edges, edge = edges_of(triangles)
+    lone = (np.bincount(edge, minlength=len(edges)) == 1)[edge]
+    side = np.flatnonzero(lone)
+    face = side // 3
+    start = triangles.reshape(-1)[side]
+    end = triangles.reshape(-1)[face * 3 + (side + 1) % 3]
+    along = vertices[end] - vertices[start]
+    length = np.linalg.norm(along, axis=1)
+    across = np.cross(along / np.maximum(length, 1e-30)[:, None], normal[face])
+    rim = _plane(across, -(across * vertices[start]).sum(axis=1))
+    rim = np.column_stack([rim * (_RIM_WEIGHT * length * length)[:, None], np.zeros(len(side))])
+    at = np.concatenate([triangles.reshape(-1), start, end])
+    values = np.concatenate([np.repeat(rows, 3, axis=0), rim, rim])
+    total = [np.bincount(at, values[:, k], len(vertices)) for k in range(11)]
+    return np.ascontiguousarray(np.stack(total, axis=1))
+
+
+def _plane(normal: Array, offset: Array) -> Array:
+    x, y, z, d = normal[:, 0], normal[:, 1], normal[:, 2], offset
+    return np.stack([x * x, x * y, x * z, x * d, y * y, y * z, y * d, z * z, z * d, d * d], axis=1)
+
+
+@compiled
+def quadric_error(q: Array, p: Array) -> float:
+    """Sum of weighted squared distances of a point from the planes of a quadric (11,)."""
+    x, y, z = p[0], p[1], p[2]
+    total: float = (
+        q[0] * x * x + q[4] * y * y + q[7] * z * z + q[9]
+        + 2.0 * (q[1] * x * y + q[2] * x * z + q[3] * x + q[5] * y * z + q[6] * y + q[8] * z)
+    )  # fmt: skip
+    return max(total, 0.0)
+
+
+@compiled
+def best_point(q: Array, out: Array) -> bool:
+    """The point of least error; False where the planes leave it open."""
+    a, b, c, d, e, f = q[0], q[1], q[2], q[4], q[5], q[7]
+    m0, m1, m2 = d * f - e * e, c * e - b * f, b * e - c * d
+    determinant = a * m0 + b * m1 + c * m2
+    trace = a + d + f
+    if not determinant > 1e-3 * (trace / 3.0) ** 3:
+        return False
+    g, h, i = -q[3], -q[6], -q[8]
+    m4, m5, m8 = a * f - c * c, b * c - a * e, a * d - b * b
+    out[0] = (m0 * g + m1 * h + m2 * i) / determinant
+    out[1] = (m1 * g + m4 * h + m5 * i) / determinant
+    out[2] = (m2 * g + m5 * h + m8 * i) / determinant
+    return True
+
+
+@compiled
+def _costs(
+    place: Array,
+    quadrics: Array,
+    edges: NDArray[np.int64],
+    rim_edge: NDArray[np.bool_],
+    rim: NDArray[np.bool_],
+    fixed: NDArray[np.bool_],
+) -> tuple[Array, Array]:
+    """Squared error of collapsing each edge (inf where it may not), and the spot to collapse to.
+
+    An edge of which one end must stay is turned so that this end comes first.
+    """
+    cost = np.full(edges.shape[0], np.inf)
+    spot = np.empty((edges.shape[0], 3))
+    q = np.empty(11)
+    for n in range(edges.shape[0]):
+        a, b = edges[n, 0], edges[n, 1]
+        if fixed[a] and fixed[b]:
+            continue
+        if rim[a] and rim[b] and not rim_edge[n]:
+            continue
+        length2 = 0.0
+        for k in range(11):
+            q[k] = quadrics[a, k] + quadrics[b, k]
+        for k in range(3):
+            length2 += (place[a, k] - place[b, k]) ** 2
+        keep_a = fixed[a] or (rim[a] and not rim[b])
+        keep_b = fixed[b] or (rim[b] and not rim[a])
+        if keep_a and keep_b:
+            continue
+        if keep_b:  # the first of an edge is the one that survives
+            a, b = b, a
+            edges[n, 0], edges[n, 1] = a, b
+        if keep_a or keep_b:
+            spot[n] = place[a]
+        else:
+            found = best_point(q, spot[n])
+            if found:
+                away = 0.0
+                for k in range(3):
+                    away += (spot[n, k] - 0.5 * (place[a, k] + place[b, k])) ** 2
+                found = away <= length2
+            if not found:
+                for k in range(3):
+                    spot[n, k] = 0.5 * (place[a, k] + place[b, k])
+        weight = max(q[10], 1e-30)
+        cost[n] = quadric_error(q, spot[n]) / weight + _SHORTNESS * length2
+    return cost, spot
+
+
+@compiled
+def _normal(a: Array, b: Array, c: Array, out: Array) -> float:
+    """Cross product of two sides; returns its length, and twice the area."""
+    u0, u1, u2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    v0, v1, v2 = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+    out[0], out[1], out[2] = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
+    return math.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
+
+
+@compiled
+def _turns_or_thins(
+    place: Array,
+    faces: NDArray[np.int32],
+    ring: NDArray[np.int64],
+    moving: int,
+    other: int,
+    spot: Array,
+) -> bool:
+    """Whether moving a vertex would turn a face of its ring over, or make a splinter of it."""
+    old, new, corner = np.empty(3), np.empty(3), np.empty((3, 3))
+    for i in range(ring.size):
+        face = faces[ring[i]]
+        if face[0] == other or face[1] == other or face[2] == other:
+            continue
+        before = _normal(place[face[0]], place[face[1]], place[face[2]], old)
+        for k in range(3):
+            corner[k] = spot if face[k] == moving else place[face[k]]
+        after = _normal(corner[0], corner[1], corner[2], new)
+        dot = old[0] * new[0] + old[1] * new[1] + old[2] * new[2]
+        if not dot > _MIN_COSINE * before * after:
+            return True
+        sides = 0.0
+        for k in range(3):
+            for axis in range(3):
+                sides += (corner[k, axis] - corner[(k + 1) % 3, axis]) ** 2
+        if not 2.0 * math.sqrt(3.0) * after > _MIN_QUALITY * sides:
+            return True
+    return False
+
+
+@compiled
+def _collapse(
+    place: Array,
+    faces: NDArray[np.int32],
+    quadrics: Array,
+    edges: NDArray[np.int64],
+    spot: Array,
+    rim_edge: NDArray[np.bool_],
+    starts: NDArray[np.int64],
+    around: NDArray[np.int64],
+) -> int:
+    """Collapse edges in order, in place, none next to another; returns how many."""
+    touched = np.zeros(place.shape[0], np.bool_)
+    mark = np.full(place.shape[0], -1, np.int64)
+    gone = 0
+    for n in range(edges.shape[0]):
+        a, b = edges[n, 0], edges[n, 1]
+        if touched[a] or touched[b]:
+            continue
+        ring_a, ring_b = around[starts[a] : starts[a + 1]], around[starts[b] : starts[b + 1]]
+        for i in range(ring_a.size):
+            for k in range(3):
+                mark[faces[ring_a[i], k]] = n
+        common = 0
+        for i in range(ring_b.size):
+            for k in range(3):
+                vertex = faces[ring_b[i], k]
+                if mark[vertex] == n and vertex != a and vertex != b:
+                    common += 1
+                    mark[vertex] = -1
+        if common != (1 if rim_edge[n] else 2):
+            continue
+        if _turns_or_thins(place, faces, ring_a, a, b, spot[n]):
+            continue
+        if _turns_or_thins(place, faces, ring_b, b, a, spot[n]):
+            continue
+        for i in range(ring_a.size):
+            for k in range(3):
+                touched[faces[ring_a[i], k]] = True
+        for i in range(ring_b.size):
+            for k in range(3):
+                touched[faces[ring_b[i], k]] = True
+        for i in range(ring_b.size):
+            face = ring_b[i]
+            if faces[face, 0] == a or faces[face, 1] == a or faces[face, 2] == a:
+                faces[face, 0] = -1
+                continue
+            for k in range(3):
+                if faces[face, k] == b:
+                    faces[face, k] = a
+        place[a] = spot[n]
+        for k in range(11):
+            quadrics[a, k] += quadrics[b, k]
+        gone += 1
+    return gone
+
 
 MAX_CELL_TRIANGLES = 60_000
 """The error of a coarser cell grows until it has no more."""

@@ -14,7 +14,6 @@ from alice_survey.core.records import CloudRecord, MeshRecord
 from alice_survey.core.run import progress
 from reconstruct.light.solve import read_light
 from reconstruct.mesh.formats import GLB_AXES, render_oblique, write_mesh
-from reconstruct.mesh.labels import choose_views, make_charts
 from reconstruct.mesh.surface import (
     TRIM_STEPS,
     TriangleMesh,
@@ -24,7 +23,7 @@ from reconstruct.mesh.surface import (
 from reconstruct.mesh.texture import Textured, colours_of_cloud, paint
 from reconstruct.mesh.tiles import TileSetup, write_tiles
 from reconstruct.mesh.topology import face_areas
-from reconstruct.mesh.visibility import find_candidates
+from reconstruct.mesh.visibility import choose_views, find_candidates, make_charts
 from reconstruct.mosaic.grid import mean_pixel
 from reconstruct.ply import open_cloud
 from reconstruct.raster import write_png

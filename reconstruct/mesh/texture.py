@@ -26,9 +26,8 @@ from alice_survey.core.frames import Array
 from alice_survey.core.run import progress
 from reconstruct.light.solve import LightModel
 from reconstruct.mesh.atlas import Atlas, Wedges, make_atlas, make_pages, make_wedges
-from reconstruct.mesh.labels import Charts
 from reconstruct.mesh.topology import Triangles, edges_of
-from reconstruct.mesh.visibility import to_world
+from reconstruct.mesh.visibility import Charts, to_world
 from reconstruct.pictures.undistorted import WHOLE, Part, Pictures
 from reconstruct.views.model import View
 

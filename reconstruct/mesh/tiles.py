@@ -35,7 +35,6 @@ from reconstruct.light.solve import LightModel
 from reconstruct.mesh.atlas import Wedges, make_pages, make_wedges
 from reconstruct.mesh.cells import Cell, CellLevel, CellMesh, Key, join
 from reconstruct.mesh.formats import write_glb
-from reconstruct.mesh.labels import choose_axes, choose_views, make_charts
 from reconstruct.mesh.texture import (
     Textured,
     colours_of_cloud,
@@ -50,7 +49,10 @@ from reconstruct.mesh.topology import Triangles
 from reconstruct.mesh.visibility import (
     CANDIDATES,
     blocks_near,
+    choose_axes,
+    choose_views,
     find_candidates,
+    make_charts,
     ray_scene,
     to_world,
 )

@@ -1,7 +1,12 @@
-"""Tasks of the mosaic: compare light, lay seams, paint tiles. Each works on one block."""
+"""Tasks of the mosaic: compare light, lay seams, paint tiles. Each works on one block.
 
+A process keeps lenses, small copies and a few pictures between tasks.
+"""
+
+import uuid
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import lru_cache, partial
 from itertools import combinations
 from pathlib import Path
 
@@ -14,17 +19,99 @@ from rasterio.windows import Window
 from alice_survey.core.artefacts import atomic_path
 from alice_survey.core.run.resources import release_memory
 from reconstruct.light.solve import LightSamples, at_places, joined_samples
-from reconstruct.mosaic.blend import Blend, ViewPart
-from reconstruct.mosaic.colour import ColourModel
-from reconstruct.mosaic.finish import finish_colours
+from reconstruct.mosaic.colour import ColourModel, curve_by_root, finish_colours
 from reconstruct.mosaic.grid import ALIGNED_PX, CELL_PX, Block, coarse, dem_around
-from reconstruct.mosaic.ortho import sample_lanczos
-from reconstruct.mosaic.picture_measures import DARKEST, well_exposed
-from reconstruct.mosaic.seams import candidates, choose_views
-from reconstruct.mosaic.tools import MosaicSetup, Tools, tools_of
-from reconstruct.mosaic.visibility import GridHeights, Ground, SeenCells, see
+from reconstruct.mosaic.ortho import lanczos_weights, sample_lanczos
+from reconstruct.mosaic.picture_measures import DARKEST, linear_table, read_small, well_exposed
+from reconstruct.mosaic.seams import Blend, ViewPart, candidates, choose_views
+from reconstruct.mosaic.visibility import (
+    CameraOptics,
+    GridHeights,
+    Ground,
+    SeenCells,
+    Water,
+    camera_optics,
+    channel_optics,
+    see,
+)
+from reconstruct.pictures.undistorted import Pictures
 from reconstruct.raster import opened_raster, small_cache
 from reconstruct.views.model import View
+
+_CACHED_BYTES = 100_000_000
+"""Pictures as taken that each process keeps."""
+_SMALL_COPIES = 40
+"""Small copies of pictures that each process keeps."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MosaicSetup:
+    """What all tasks share; it travels to each process once a task."""
+
+    workspace: Path
+    scratch: Path
+    """Folder of what is known of pictures."""
+    dem: Path
+    """The surface, in the frame of a plane."""
+    sights: Path
+    """Folder of what views see of it."""
+    scaled: bool
+    water: Water | None
+    """Water of the port's dispersion; None where channels are not distinguished."""
+    run: str = field(default_factory=lambda: uuid.uuid4().hex)
+    """Distinguishes runs in a process that works for several: files may have changed."""
+
+
+class Tools:
+    """What a process keeps between tasks."""
+
+    def __init__(self, survey: MosaicSetup) -> None:
+        self._pictures = Pictures.still(survey.workspace)
+        self.small = lru_cache(maxsize=_SMALL_COPIES)(partial(read_small, survey.scratch))
+        self.table = linear_table()
+        self.weights = lanczos_weights()
+        self.curve = curve_by_root()
+        self._water, self._scaled = survey.water, survey.scaled
+        self._optics: dict[str, CameraOptics] = {}
+        self._channels: dict[str, tuple[CameraOptics, ...]] = {}
+        self._kept: dict[str, NDArray[np.uint8]] = {}
+
+    def optics(self, view: View) -> CameraOptics:
+        """Optics of a view's camera (its green channel)."""
+        if view.camera not in self._optics:
+            self._optics[view.camera] = camera_optics(self._pictures.warp(view.image), self._scaled)
+        return self._optics[view.camera]
+
+    def channels(self, view: View) -> tuple[CameraOptics, ...] | None:
+        """Optics of a view's channels, BGR; None where they share one."""
+        warp = self._pictures.warp(view.image)
+        if self._water is None or warp.camera.n_water == 1:
+            return None
+        if view.camera not in self._channels:
+            self._channels[view.camera] = channel_optics(warp, self._water, self._scaled)
+        return self._channels[view.camera]
+
+    def usable(self, image: str) -> NDArray[np.bool_] | None:
+        """Mask of a picture as taken."""
+        return self._pictures.usable(image)
+
+    def picture(self, image: str) -> NDArray[np.uint8]:
+        """A picture as taken; the last few stay in memory."""
+        if image in self._kept:
+            self._kept[image] = self._kept.pop(image)  # now the last to go
+            return self._kept[image]
+        taken = self._pictures.taken(image)
+        while len(self._kept) >= max(1, _CACHED_BYTES // taken.nbytes):
+            del self._kept[next(iter(self._kept))]
+        self._kept[image] = taken
+        return taken
+
+
+@lru_cache(maxsize=1)
+def tools_of(survey: MosaicSetup) -> Tools:
+    """The tools of this process for a survey."""
+    return Tools(survey)
+
 
 Float32 = NDArray[np.float32]
 

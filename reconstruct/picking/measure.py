@@ -19,7 +19,7 @@ from alice_survey.core.errors import ReconstructionError
 from alice_survey.core.frames import Array
 from reconstruct.measure.figures import polygon_area, polyline
 from reconstruct.picking.lengths import Lengths, PickedFigure, PolylineFigure
-from reconstruct.picking.refine import refine
+from reconstruct.picking.matching import refine
 from reconstruct.picking.registered import RegisteredPictures
 from reconstruct.picking.surface import ModelSurface, SurfacePlace
 from reconstruct.pictures.undistorted import read_colour

@@ -156,7 +156,7 @@ def _reference_dem(folder: Path) -> None:
 
 
 def read_reference(path: Path) -> object:
-    from reconstruct.evaluate.cloud_files import read_reference
+    from reconstruct.evaluate.reference import read_reference
 
     return read_reference(path, _DATUM)
 

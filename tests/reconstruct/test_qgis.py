@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from reconstruct.qgis import write_style
-from reconstruct.raster import DemGrid, tiled_raster
+from reconstruct.raster import DemGrid, tiled_raster, write_style
 from tests.oracles_dense import FRAME
 
 GRID = DemGrid(west=0.0, north=3.0, cell=0.1, rows=30, columns=40)

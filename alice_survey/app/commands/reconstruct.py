@@ -217,7 +217,7 @@ class EvaluateCommand(SurveyCommand, ThreadsCommand):
                 self.workspace, self.reference, free_scale=self.free_scale, out=self.output
             )
         if self.against is not None:
-            from reconstruct.evaluate.against import evaluate_against
+            from reconstruct.evaluate.change import evaluate_against
 
             return evaluate_against(self.workspace, self.against, self.output)
         from alice_survey.app.pipeline import run

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from reconstruct.dense.free_space import look_at_points
+from reconstruct.dense.surface_tiles import look_at_points
 from reconstruct.dense.view_store import stored
 from reconstruct.views.model import View, enu_from_cam
 from tests.oracles_dense import Scene, hits, sloped_with_step, speckle, stereo_views

@@ -7,10 +7,15 @@ import pytest
 from alice_survey.core.executor import SERIAL
 from alice_survey.core.frames import Array
 from alice_survey.core.robust import MAD_TO_SIGMA
-from reconstruct.dense import scales
+from reconstruct.dense import matching_trial
 from reconstruct.dense.depth import enlarged
-from reconstruct.dense.matching_trial import Scales, find_scales, ground_pixel
-from reconstruct.dense.scales import matching_scale, scale_for_cell
+from reconstruct.dense.matching_trial import (
+    Scales,
+    find_scales,
+    ground_pixel,
+    matching_scale,
+    scale_for_cell,
+)
 from reconstruct.dense.stereo_pairs import choose_partners
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.dense.views import (
@@ -117,7 +122,7 @@ def test_scale_follows_from_the_cell_that_is_wanted(survey, cell, scale):
 
 def test_detail_below_the_scale_of_matching_is_kept_where_pictures_are_clear(survey, monkeypatch):
     workspace, model = survey
-    monkeypatch.setattr(scales, "MAX_PIXELS", 30_000)
+    monkeypatch.setattr(matching_trial, "MAX_PIXELS", 30_000)
     partners, points = choose_partners(model, 3), points_of_views(model).__getitem__
     found = find_scales(workspace, model.views, partners, points, 1.0, SERIAL)
     assert found == Scales(depth=1.0, matching=0.5)

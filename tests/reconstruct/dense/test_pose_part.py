@@ -8,8 +8,12 @@ import pytest
 from alice_survey.core.errors import heard
 from reconstruct.adjustment.soft_modes import no_modes
 from reconstruct.adjustment.uncertainty import Uncertainty, write_uncertainty
-from reconstruct.dense.pose_part import ErrorsOfPoses, find_errors_of_poses
-from reconstruct.dense.surface_tiles import ViewSummary, fuse_tasks
+from reconstruct.dense.surface_tiles import (
+    ErrorsOfPoses,
+    ViewSummary,
+    find_errors_of_poses,
+    fuse_tasks,
+)
 from reconstruct.raster import DemGrid
 from reconstruct.views.model import SparseModel, read_model
 from tests.oracles_dense import Scene, flat, position_code, sparse_model, stereo_views

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from camera_calib.approximation.pinhole_warp import Pinhole
-from reconstruct.dense.rectify import depth_in_reference, rectify
+from reconstruct.dense.depth import depth_in_reference, rectify
 from reconstruct.views.model import View, scaled_view
 from reconstruct.views.range_shift import no_shift
 from tests.oracles_dense import port_view

@@ -12,7 +12,7 @@ from alice_survey.core.config import ReconstructConfig, SurveyConfig
 from alice_survey.core.errors import ReconstructionError, WorkspaceError
 from alice_survey.core.executor import SERIAL, local_executor
 from alice_survey.core.products import rasters_in
-from reconstruct.dense import plane_rasters
+from reconstruct.dense import run
 from reconstruct.dense.stereo_pairs import in_frame
 from tests.oracles_dense import (
     DEPTH_M,
@@ -178,7 +178,7 @@ def test_an_interruption_while_a_plane_is_written_costs_nothing(
             assert dem.exists()
             raise KeyboardInterrupt
 
-        interrupted.setattr(plane_rasters, "preview_dem", stop)
+        interrupted.setattr(run, "preview_dem", stop)
         with pytest.raises(KeyboardInterrupt):
             spec("dense").make(tmp_path, CONFIG, SERIAL)
     assert (tmp_path / "dense.partial" / "dem.tif").exists()

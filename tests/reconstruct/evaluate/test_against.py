@@ -15,9 +15,9 @@ from shapely import Point, Polygon
 from alice_survey.core.artefacts import write_json
 from alice_survey.core.errors import ReconstructionError, WorkspaceError, heard
 from alice_survey.core.frames import Datum
-from reconstruct.evaluate.against import compare_elevations, evaluate_against
+from reconstruct.evaluate.change import compare_elevations, evaluate_against
 from reconstruct.evaluate.elevation import Elevation, enu_from_enu
-from reconstruct.evaluate.height_registration import register_heights, rough_shifts
+from reconstruct.evaluate.registration import register_heights, rough_shifts
 from reconstruct.views.model import WorldFrame, write_frame
 
 CELL, SIDE = 0.02, 200

@@ -14,15 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.core.errors import ReconstructionError, WorkspaceError
 from alice_survey.core.frames import Datum
-from reconstruct.evaluate.cloud_files import read_reference
-from reconstruct.evaluate.cloud_registration import (
+from reconstruct.evaluate.reference import lifted, read_reference
+from reconstruct.evaluate.registration import (
     ReferenceSurface,
     covers,
     distances,
     register_cloud,
 )
-from reconstruct.evaluate.plots import mean_map
-from reconstruct.evaluate.reference import lifted
+from reconstruct.evaluate.run import mean_map
 from reconstruct.placing.alignment import Similarity
 
 DATUM = Datum(46.8426, -91.9946)

@@ -16,12 +16,11 @@ from missions.values.area import Area
 from missions.values.legs import Leg, Route
 from missions.values.line import Line, LineKind
 from missions.values.plan_file import Dive, Plan
-from reconstruct.evaluate.cameras import score_cameras
 from reconstruct.evaluate.elevation import Elevation
 from reconstruct.evaluate.mosaic import area_in_world
-from reconstruct.evaluate.overlap import neighbours
+from reconstruct.evaluate.run import score_cameras
 from reconstruct.evaluate.surface import CountStations, SurfaceScore, score_surface
-from reconstruct.evaluate.truth import surface_depth, surface_distance
+from reconstruct.evaluate.truth import neighbours, surface_depth, surface_distance
 
 HOLE = [(1.0, 0.8), (1.6, 0.8), (1.6, 1.4), (1.0, 1.4)]
 AREA = MultiPolygon([

@@ -12,7 +12,7 @@ from alice_survey.core.config import CameraConfig, SeafloorConfig, WaterConfig
 from alice_survey.sim.seafloor.terrain import Terrain, build_terrain
 from camera_calib.rig import Rig, design_rig
 from missions.values.footprint import footprint_polygon, level_pose
-from reconstruct.evaluate.mesh import distance_from_mesh, score_mesh, spread_over
+from reconstruct.evaluate.surface import distance_from_mesh, score_mesh, spread_over
 from reconstruct.evaluate.truth import count_stations, ground_pixel_m, surface_depth
 
 DEPTH_M = 10.0

@@ -11,7 +11,7 @@ import pytest
 
 from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.executor import SERIAL
-from reconstruct.evaluate.mesh import read_mesh
+from reconstruct.evaluate.surface import read_mesh
 from reconstruct.export.undistorted import bilinear, export_undistorted, exported_name
 from reconstruct.views.model import View, read_model, read_warps
 

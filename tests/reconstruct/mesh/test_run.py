@@ -13,7 +13,7 @@ from alice_survey.core.executor import SERIAL
 from reconstruct.dense.cloud import VERTEX, write_cloud, write_cloud_json
 from reconstruct.light.solve import GRID, LightModel, write_light
 from reconstruct.mesh.atlas import pack
-from reconstruct.mesh.decimate import decimate
+from reconstruct.mesh.cells import decimate
 from reconstruct.mesh.surface import splat
 from reconstruct.mesh.texture import spread_corners
 from reconstruct.mesh.topology import edges_of

@@ -1,6 +1,6 @@
 import numpy as np
 
-from reconstruct.mosaic.blend import Blend, ViewPart
+from reconstruct.mosaic.seams import Blend, ViewPart
 
 
 def test_one_view_comes_out_as_it_went_in() -> None:

@@ -7,10 +7,19 @@ import numpy as np
 import pytest
 
 from reconstruct.light.solve import GRID, LightSamples
-from reconstruct.mosaic.colour import Colour, ColourModel, solve_colour
-from reconstruct.mosaic.finish import curve_by_root, finish_colours
-from reconstruct.mosaic.picture_measures import PictureMeasures, encoded, linear_table
-from reconstruct.mosaic.reference import ReferencePatch
+from reconstruct.mosaic.colour import (
+    Colour,
+    ColourModel,
+    curve_by_root,
+    finish_colours,
+    solve_colour,
+)
+from reconstruct.mosaic.picture_measures import (
+    PictureMeasures,
+    ReferencePatch,
+    encoded,
+    linear_table,
+)
 
 IMAGES = [f"left/{n:02d}.png" for n in range(24)]
 FALL_OFF = np.array([0.45, 0.5, 0.9])

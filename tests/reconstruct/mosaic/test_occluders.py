@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.executor import local_executor
 from camera_calib.approximation.pinhole_warp import Pinhole
-from reconstruct.mosaic.occluders import Occluders, find_occluders, hidden_by, read_occluders
+from reconstruct.mosaic.visibility import Occluders, find_occluders, hidden_by, read_occluders
 from reconstruct.planes import LEVEL_PLANE
 from reconstruct.ply import VERTEX, write_ply
 from reconstruct.views.model import View

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from alice_survey.core.errors import WorkspaceError
-from reconstruct.mosaic.picture_measures import linear_table
-from reconstruct.mosaic.reference import ReferencePatch, read_references
+from reconstruct.mosaic.picture_measures import ReferencePatch, linear_table, read_references
 from tests.oracles_dense import Scene, flat, sparse_model, stereo_views, write_workspace
 
 CARD = (60, 120, 180)

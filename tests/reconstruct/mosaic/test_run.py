@@ -17,8 +17,7 @@ from camera_calib.rig import design_rig
 from reconstruct.dense.cloud import write_cloud, write_cloud_json
 from reconstruct.mosaic import run
 from reconstruct.mosaic.picture_measures import encoded, linear_table
-from reconstruct.mosaic.run import _dispersion
-from reconstruct.mosaic.writers import write_tiles
+from reconstruct.mosaic.run import _dispersion, write_tiles
 from reconstruct.ply import VERTEX
 from reconstruct.raster import DemGrid, tiled_raster
 from reconstruct.views.model import View

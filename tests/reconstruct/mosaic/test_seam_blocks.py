@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from reconstruct.mosaic.grid import CELL_PX, Footprints, blocks_of, in_passes
-from reconstruct.mosaic.paint import PaintTask, label_path_of_core, settled_around
+from reconstruct.mosaic.paint import MosaicSetup, PaintTask, label_path_of_core, settled_around
 from reconstruct.mosaic.run import seam_blocks
-from reconstruct.mosaic.tools import MosaicSetup
 from reconstruct.raster import DemGrid
 
 GRID = DemGrid(north=0.0, west=0.0, cell=0.004, rows=4096, columns=6144)

@@ -14,7 +14,7 @@ from rasterio.windows import Window
 
 from reconstruct.mosaic.grid import Footprints, blocks_of, neighbours
 from reconstruct.mosaic.paint import Painted
-from reconstruct.mosaic.writers import cloud_optimised, thumbnail, write_tiles
+from reconstruct.mosaic.run import cloud_optimised, thumbnail, write_tiles
 from reconstruct.raster import DemGrid, small_cache, transform_of
 from tests.oracles_dense import FRAME
 

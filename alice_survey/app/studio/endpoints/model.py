@@ -18,8 +18,7 @@ from alice_survey.core.errors import AliceError
 from alice_survey.core.products import DEM, MOSAIC, RASTERS, SIGMA
 from alice_survey.core.records import MeshRecord
 from reconstruct.measure.errors import SharedErrors
-from reconstruct.measure.export import Measurement, as_csv, as_geojson
-from reconstruct.measure.figures import Measured
+from reconstruct.measure.figures import Measured, Measurement, as_csv, as_geojson
 from reconstruct.measure.lines import measure_line, measure_points, profile
 from reconstruct.measure.polygons import measure_polygon, quadrats
 from reconstruct.measure.surface import MeasuredSurface, values_at

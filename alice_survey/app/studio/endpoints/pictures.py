@@ -20,8 +20,8 @@ from alice_survey.core.frames import Array
 from alice_survey.core.manifest import ImageRecord, read_manifest
 from alice_survey.core.records import ControlRecord, MappingRecord
 from reconstruct.picking.lengths import Lengths, spot_residuals
+from reconstruct.picking.matching import refine
 from reconstruct.picking.preview import preview_control
-from reconstruct.picking.refine import refine
 from reconstruct.picking.registered import RegisteredPictures, Sight
 from reconstruct.picking.surface import ModelSurface, SurfacePlace
 from reconstruct.pictures.undistorted import Colour, read_colour
