@@ -14,14 +14,13 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.core.errors import ReconstructionError, WorkspaceError
 from alice_survey.core.frames import Datum
-from reconstruct.evaluate.reference import lifted, read_reference
+from reconstruct.evaluate.reference import lifted, mean_map, read_reference
 from reconstruct.evaluate.registration import (
     ReferenceSurface,
     covers,
     distances,
     register_cloud,
 )
-from reconstruct.evaluate.run import mean_map
 from reconstruct.placing.alignment import Similarity
 
 DATUM = Datum(46.8426, -91.9946)
