@@ -10,15 +10,12 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.config import SurveyConfig, changed
-from alice_survey.core.errors import ConfigError, ReconstructionError, heard
-from alice_survey.core.plane_settings import parse_plane, parse_planes
+from alice_survey.core.errors import ConfigError
 from reconstruct.planes import (
     LEVEL_PLANE,
     Plane,
     best_plane,
-    chosen_planes,
     facing,
-    fit_plane,
     read_plane,
     turned,
     write_plane,
@@ -144,11 +141,6 @@ def test_the_best_plane_is_the_wall_upright(facing_deg: float, tilt_deg: float):
     assert plane.plane_from_world.rotation.as_matrix()[1, 2] == pytest.approx(0.0, abs=1e-12)
 
 
-def test_a_gentle_slope_is_level_and_a_steep_one_is_not():
-    assert best_plane(wall_model(10.0, 65.0)).is_level
-    assert not best_plane(wall_model(10.0, 55.0)).is_level
-
-
 def test_without_gravity_the_pictures_say_what_is_up():
     floating = WorldFrame(name="model", datum=None, scaled=False, vertical_datum=MEAN_PLANE)
     model = replace(wall_model(180.0, 80.0), frame=floating)  # nearly the mean plane, as levelled
@@ -157,29 +149,6 @@ def test_without_gravity_the_pictures_say_what_is_up():
     up_in_pictures = model.views[0].world_from_cam.rotation.apply([0.0, -1.0, 0.0])
     turned_up = plane.plane_from_world.rotation.apply(up_in_pictures)
     np.testing.assert_allclose(turned_up, [1.0, 0.0, 0.0], atol=0.01)
-
-
-def test_points_on_a_line_span_no_plane():
-    line = np.outer(np.linspace(0, 5, 50), [1.0, 2.0, 0.5])
-    for points in (line, line[:2], np.empty((0, 3))):
-        with pytest.raises(ReconstructionError, match="span no plane"):
-            fit_plane(points, np.zeros((1, 3)))
-
-
-def test_planes_keep_their_order_and_auto_is_not_made_twice():
-    wanted = parse_planes(["wall=facing 180", "level", "auto"])
-    assert [plane.name for plane in chosen_planes(wanted, NADIR)] == ["wall", "level"]
-    unplaced = replace(NADIR, frame=replace(FRAME, name="model", datum=None))
-    with heard() as warnings:
-        chosen_planes(wanted, unplaced)
-    assert len(warnings) == 1
-
-
-def test_planes_are_read_as_written():
-    wall, hull = parse_planes(["wall=facing 180", "hull = facing 90.5  tilt -30"])
-    assert (wall.name, wall.facing_deg, wall.tilt_deg) == ("wall", 180.0, 0.0)
-    assert (hull.name, hull.facing_deg, hull.tilt_deg) == ("hull", 90.5, -30.0)
-    assert parse_plane("auto").facing_deg is None
 
 
 @pytest.mark.parametrize(

@@ -35,13 +35,3 @@ def test_the_ramp_spans_the_values_without_their_tails(tmp_path: Path):
     assert all(item.get("label", "").endswith(" m") for item in shader)
     with rasterio.open(path) as raster:
         assert raster.units == ("m",)
-
-
-@pytest.mark.parametrize("fill", [np.nan, -3.0])
-def test_rasters_of_one_value_and_of_none_have_a_style_too(tmp_path: Path, fill: float):
-    path = write(tmp_path / "dem.tif", np.full((30, 40), fill))
-    write_style(path, "cividis", "m")
-    root = ET.parse(tmp_path / "dem.qml").getroot()  # noqa: S314 - our own file
-    stops = [float(item.get("value", "nan")) for item in root.iter("item")]
-    assert len(stops) == 5
-    assert np.isfinite(stops).all()

@@ -1,4 +1,3 @@
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,7 +9,6 @@ from pyproj import Transformer
 from alice_survey.core.errors import WorkspaceError
 from reconstruct.raster import (
     DemGrid,
-    crs_of,
     hillshade,
     local_crs,
     opened_raster,
@@ -69,32 +67,6 @@ def test_map_axes_are_north_and_east_of_the_tangent_plane(distance_m: float):
     np.testing.assert_allclose(np.column_stack([north, east]), points[:, :2], atol=2e-5)
 
 
-def test_the_file_says_what_it_holds(tmp_path):
-    write(tmp_path / "dem.tif")
-    with rasterio.open(tmp_path / "dem.tif") as raster:
-        assert raster.tags()["VERTICAL_DATUM"] == "sea surface"
-        assert raster.tags()["FRAME"] == "ned"
-        assert raster.descriptions == ("height, positive up (m)",)
-        assert np.isnan(raster.nodata)
-        assert raster.block_shapes == [(256, 256)]
-
-
-def test_the_model_frame_has_no_crs(tmp_path):
-    frame = replace(FRAME, name="model", datum=None, scaled=False)
-    assert crs_of(frame) is None
-    write(tmp_path / "dem.tif", frame)
-    with rasterio.open(tmp_path / "dem.tif") as raster:
-        assert raster.crs is None
-        assert raster.tags()["UNIT"] == "model units"
-        assert raster.transform.a == 0.25
-
-
-def test_the_same_heights_give_the_same_bytes(tmp_path):
-    for name in ("a.tif", "b.tif"):
-        write(tmp_path / name)
-    assert (tmp_path / "a.tif").read_bytes() == (tmp_path / "b.tif").read_bytes()
-
-
 def test_hillshade_of_planes():
     rows, columns = np.mgrid[:20, :30].astype(float)
     level = hillshade(np.zeros((20, 30)), 1.0)
@@ -136,23 +108,6 @@ def test_tiles_are_reached_by_boxes_that_overlap_them() -> None:
             expected[key] = np.flatnonzero(over).tolist()
     assert list(found.items()) == list(expected.items())
     assert 10 < len(expected) <= 35
-
-
-def test_a_strip_over_a_box_of_40_gigapixels_reaches_few_tiles(tmp_path: Path) -> None:
-    grid = DemGrid(west=0.0, north=0.0, cell=0.001, rows=200_000, columns=200_000)
-    ends = np.arange(0.0, 199.0)
-    boxes = np.stack([ends, -ends - 1.0, ends + 1.0, -ends], axis=1)
-    reached = tiles_reached(grid, 512, boxes, 0.01)
-    assert 390 < len(reached) < 2400
-    with tiled_raster(tmp_path / "a.tif", grid, FRAME, "float32", np.nan, "height") as raster:
-        for window, _ in reached[::100]:
-            raster.write(np.ones((1, 512, 512), np.float32), window=window)
-    assert (tmp_path / "a.tif").stat().st_size < 3e7
-    with opened_raster(tmp_path / "a.tif") as raster:
-        for window, _ in reached[::100]:
-            assert (raster.read(1, window=window) == 1).all()
-        for window, _ in reached[1::100]:
-            assert np.isnan(raster.read(1, window=window)).all()
 
 
 def test_a_damaged_raster_is_reported_with_its_name(tmp_path: Path) -> None:

@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import laspy
 import numpy as np
 
@@ -9,9 +7,7 @@ from reconstruct.dense import cloud as cloud_module
 from reconstruct.dense.cloud import (
     VERTEX,
     vertices_of,
-    voxel_edge,
     write_cloud,
-    write_cloud_json,
     write_clouds,
 )
 from reconstruct.dense.surface_points import SURFACE_POINT
@@ -83,25 +79,6 @@ def test_ply_is_read_back_by_another_library(tmp_path):
     assert "comment offset_east_north_up 1.0 2.0 -12.0\n" in header
     assert VERTEX.itemsize * count < (tmp_path / "cloud.ply").stat().st_size
     assert list(tmp_path.iterdir()) == [tmp_path / "cloud.ply"]
-
-
-def test_cloud_json_names_frame_offset_and_datum(tmp_path):
-    write_cloud_json(tmp_path / "a.json", 5, (1.0, 2.0, -12.0), 0.004, FRAME)
-    data = read_json(tmp_path / "a.json")
-    assert data["points"] == 5
-    assert data["offset_east_north_up"] == [1.0, 2.0, -12.0]
-    assert "Azimuthal_Equidistant" in data["crs"]
-    assert data["vertical_datum"] == "sea surface"
-    free = replace(FRAME, name="model", datum=None, scaled=False)
-    write_cloud_json(tmp_path / "b.json", 5, (0.0, 0.0, 0.0), 0.004, free)
-    data = read_json(tmp_path / "b.json")
-    assert data["crs"] is None
-    assert data["unit"] == "model units"
-
-
-def test_cubes_grow_only_when_there_are_too_many():
-    assert voxel_edge(0.004, 1_000_000, 40_000_000) == 0.004
-    assert voxel_edge(0.001, 160_000_000, 40_000_000) == 0.002
 
 
 def test_the_overview_is_thinned_and_the_copc_is_not(tmp_path, monkeypatch):

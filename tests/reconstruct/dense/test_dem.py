@@ -3,7 +3,7 @@ import pytest
 
 from reconstruct.dense.dem import cells_over, fill_gaps, slope_deg, without_strays
 from reconstruct.dense.surface_points import SURFACE_POINT
-from reconstruct.raster import DemGrid, grid_over, round_cell
+from reconstruct.raster import DemGrid, grid_over
 from tests.oracles_dense import projected
 
 GRID = DemGrid(west=0.0, north=1.2, cell=0.1, rows=12, columns=15)
@@ -111,13 +111,6 @@ def test_grid_covers_its_boxes_on_whole_cells():
     moved = grid.moved(10.0, -5.0).window(3, 2, 4, 5)
     assert moved.west == pytest.approx(9.7)
     assert moved.north == pytest.approx(-3.3)
-
-
-@pytest.mark.parametrize(
-    ("length", "cell"), [(0.004417, 0.0044), (0.0996, 0.1), (2.345, 2.3), (123.4, 120.0)]
-)
-def test_cells_have_two_digits(length: float, cell: float):
-    assert round_cell(length) == pytest.approx(cell)
 
 
 def test_small_gaps_are_bridged_on_the_plane_and_large_ones_stay():

@@ -1,18 +1,12 @@
 from dataclasses import replace
 
 import numpy as np
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy.spatial.transform import RigidTransform
 
 from reconstruct.dense.depth import count_witnesses, merge_depths
 from reconstruct.dense.stereo_pairs import in_frame
 from reconstruct.dense.view_store import decoded, stored
 from reconstruct.views.range_shift import KernelLens, no_shift, slopes_of
 from tests.oracles_dense import merged, plane_depth, port_view
-
-LENS = (np.array([50.0, 50.0, 10.0, 8.0]), no_shift(20, 16).field, 0.0)
-NOWHERE = np.full((16, 20), np.nan, np.float32)
 
 
 def test_merge_depths_equals_its_slow_twin():
@@ -31,48 +25,6 @@ def test_merge_depths_equals_its_slow_twin():
             np.testing.assert_allclose(sigma[row, column], s, rtol=1e-4)
             assert agreeing[row, column] == n
     assert 0 < (agreeing == 0).sum() < agreeing.size
-
-
-@given(
-    true=st.floats(0.5, 10),
-    wrong=st.floats(0.5, 10),
-    sigma=st.floats(0.001, 0.02),
-)
-def test_majority_wins_over_one_wrong_match(true: float, wrong: float, sigma: float):
-    depths = np.array([true, wrong, true + sigma], np.float32).reshape(3, 1, 1)
-    sigmas = np.full((3, 1, 1), sigma, np.float32)
-    depth, _, agreeing = merge_depths(depths, sigmas, 3.0)
-    assert abs(depth[0, 0] - true) <= 6 * sigma
-    assert agreeing[0, 0] >= 2
-
-
-def witness(shift_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """The reference sees a plane 2 m away; the other, next to it, sees one `shift_m` farther."""
-    depth = np.full((16, 20), 2.0, np.float32)
-    sigma = np.full_like(depth, 0.005)
-    other_from_ref = RigidTransform.from_translation([-0.1, 0.0, 0.0]).as_matrix()[:3]
-    there = np.full_like(depth, 2.0 + shift_m)
-    return count_witnesses(
-        depth, sigma, slopes_of(depth, LENS), np.ascontiguousarray(other_from_ref),
-        stored(there, sigma), 1.0, LENS, 3.0,
-    )  # fmt: skip
-
-
-def test_the_same_plane_is_confirmed_where_the_other_sees_it():
-    confirmed, refuted = witness(0.0)
-    # 0.1 m at 2 m and 50 px of focal length moves the picture by 2.5 px
-    assert confirmed[:, 3:].all()
-    assert not confirmed[:, :2].any()
-    assert not refuted.any()
-
-
-def test_a_plane_behind_refutes_and_one_before_says_nothing():
-    confirmed, refuted = witness(0.1)
-    assert refuted[:, 3:].all()
-    assert not confirmed.any()
-    confirmed, refuted = witness(-0.1)
-    assert not refuted.any()
-    assert not confirmed.any()
 
 
 def test_witnesses_through_a_tilted_port_equal_their_slow_twin():

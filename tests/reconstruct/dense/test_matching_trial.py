@@ -7,13 +7,10 @@ import pytest
 from alice_survey.core.executor import SERIAL
 from alice_survey.core.frames import Array
 from alice_survey.core.robust import MAD_TO_SIGMA
-from reconstruct.dense import matching_trial
 from reconstruct.dense.depth import enlarged
 from reconstruct.dense.matching_trial import (
-    Scales,
     find_scales,
     ground_pixel,
-    matching_scale,
     scale_for_cell,
 )
 from reconstruct.dense.stereo_pairs import choose_partners
@@ -120,29 +117,6 @@ def test_scale_follows_from_the_cell_that_is_wanted(survey, cell, scale):
     assert scale_for_cell(cell, pixel) == pytest.approx(expected)
 
 
-def test_detail_below_the_scale_of_matching_is_kept_where_pictures_are_clear(survey, monkeypatch):
-    workspace, model = survey
-    monkeypatch.setattr(matching_trial, "MAX_PIXELS", 30_000)
-    partners, points = choose_partners(model, 3), points_of_views(model).__getitem__
-    found = find_scales(workspace, model.views, partners, points, 1.0, SERIAL)
-    assert found == Scales(depth=1.0, matching=0.5)
-
-
-def test_views_in_which_partners_were_compared_get_the_depth_of_any_other(survey, tmp_path):
-    workspace, model = survey
-    depths = []
-    for chosen in ([0], []):
-        found = matched(workspace, model, 1.0, tmp_path / f"store{len(chosen)}")
-        find_match_sigma(1.0, [found[n] for n in chosen], SERIAL)
-        store = found[0][0].store
-        assert store.has(0, "apart") == bool(chosen)
-        view_depth(1.0, 0.25, found[0])
-        assert not store.has(0, "apart") and not store.has(0, "apart.scales")
-        depths.append(store.load_depth(0, "depth"))
-    assert np.isfinite(depths[0][0]).mean() > 0.3
-    np.testing.assert_array_equal(depths[0], depths[1])
-
-
 def test_grainy_pictures_are_matched_at_a_lower_resolution_with_a_larger_sigma(survey, tmp_path):
     workspace, model = survey
     rng = np.random.default_rng(1)
@@ -157,9 +131,3 @@ def test_grainy_pictures_are_matched_at_a_lower_resolution_with_a_larger_sigma(s
     scale, sigma_px = conditions(tmp_path, model, tmp_path / "grainy")
     assert scale < 1.0
     assert conditions(workspace, model, tmp_path / "clear")[1] < sigma_px <= 1.5
-
-
-def test_large_pictures_are_halved_until_they_fit():
-    assert matching_scale(320 * 256) == 1.0
-    assert matching_scale(3384 * 2710) == 0.5
-    assert matching_scale(3384 * 2710, 0.6) == 0.3

@@ -5,10 +5,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import rasterio
 
 from alice_survey.app.stages import spec
-from alice_survey.core.artefacts import read_json
 from alice_survey.core.config import ReconstructConfig, SurveyConfig
 from alice_survey.core.executor import SERIAL
 from reconstruct.dense.moving import adapt, agreed, cells_at, draw, odd_ones, with_bounds
@@ -31,7 +29,6 @@ from tests.oracles_dense import (
 
 SCENE = Scene(depth_of=sloped_with_step, paint=speckle())
 CONFIG = SurveyConfig(reconstruct=ReconstructConfig())
-UNMASKED = SurveyConfig(reconstruct=ReconstructConfig(mask_moving=False))
 SEMI_AXES_M = (0.14, 0.06)
 
 
@@ -114,17 +111,6 @@ def test_a_body_that_crosses_is_masked(crossed: tuple[Path, dict[str, np.ndarray
     assert 0.6 < hit / either < 1.0  # rims are left out too
 
 
-def test_it_is_said_and_shown(crossed: tuple[Path, dict[str, np.ndarray]]):
-    folder, truth = crossed
-    about = read_json(folder / "dense" / "surface.json")["moving"]
-    assert about["pictures"] == len(truth)
-    assert about["masked"] >= sum(mask.sum() > 2000 for mask in truth.values())
-    assert cv2.imread(str(folder / "dense" / "moving.png")).shape[1] == 3 * 480
-    rows = (folder / "dense" / "moving.csv").read_text().splitlines()
-    assert rows[0] == "image,masked_share,compared_share"
-    assert len(rows) == 1 + len(truth)
-
-
 @pytest.fixture(scope="module")
 def still(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("still")
@@ -132,50 +118,10 @@ def still(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
-def unmasked(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("unmasked")
-    made(folder, True, UNMASKED)
-    return folder
-
-
 def test_a_still_survey_keeps_its_pictures_whole(still: Path):
     found = masks(still)
     assert np.mean([mask.mean() for mask in found.values()]) < 5e-4
     assert not (still / "dense" / "moving.png").exists() or any(m.any() for m in found.values())
-
-
-def test_switched_off_nothing_is_masked(unmasked: Path):
-    assert not any(mask.any() for mask in masks(unmasked).values())
-    assert read_json(unmasked / "dense" / "surface.json")["moving"]["pictures"] == 0
-    assert not (unmasked / "dense" / "moving.csv").exists()
-
-
-def mosaic(folder: Path, config: SurveyConfig) -> tuple[np.ndarray, rasterio.Affine]:
-    assert spec("mosaic").make(folder, config, SERIAL)
-    with rasterio.open(folder / "mosaic" / "mosaic.tif") as raster:
-        return raster.read().astype(np.float64), raster.transform
-
-
-def test_the_mosaic_shows_no_body(
-    crossed: tuple[Path, dict[str, np.ndarray]], still: Path, unmasked: Path
-):
-    truth, at = mosaic(still, CONFIG)
-    differing = []
-    for folder, config in ((crossed[0], CONFIG), (unmasked, UNMASKED)):
-        found, there = mosaic(folder, config)
-        column, row = (round(v) for v in ~there * (at.c, at.f))
-        rows = slice(max(row, 0), min(row + truth.shape[1], found.shape[1]))
-        columns = slice(max(column, 0), min(column + truth.shape[2], found.shape[2]))
-        same = truth[:, rows.start - row : rows.stop - row, columns.start - column :
-                     columns.stop - column]  # fmt: skip
-        part = found[:, rows, columns]
-        known = (part[3] > 0) & (same[3] > 0)
-        # Detail within a few pixels may shift; a body is broad.
-        apart = [cv2.blur(part[k] - same[k], (9, 9))[known] for k in range(3)]
-        differing.append(float((np.abs(apart).max(axis=0) > 25).mean()))
-    assert differing[1] > 0.004
-    assert differing[0] < 0.1 * differing[1]
 
 
 def test_the_nearest_depth_that_two_stations_share():

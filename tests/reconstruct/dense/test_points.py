@@ -6,14 +6,12 @@ import pytest
 
 from reconstruct.dense.points import (
     block_bounds,
-    joined,
     part_in_box,
     points_in_box,
     points_of_pixels,
 )
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.pictures.undistorted import WHOLE
-from reconstruct.views.model import enu_from_cam
 from reconstruct.views.range_shift import no_shift
 from tests.oracles_dense import (
     Scene,
@@ -21,7 +19,6 @@ from tests.oracles_dense import (
     plane_depth,
     port_view,
     position_code,
-    sloped_with_step,
     stereo_views,
 )
 
@@ -88,23 +85,6 @@ def test_boxes_share_no_point_and_miss_none():
     assert west.enu[:, 0].max() <= middle <= east.enu[:, 0].max()
 
 
-def test_a_small_box_has_all_its_points_in_the_same_order():
-    for view in (stereo_views(np.array([0.2]), np.array([0.1]))[0], tilted()):
-        depth = plane_depth(view, 1.6)
-        everything = gathered(view, depth=depth)
-        middle = np.median(everything.enu, axis=0)
-        box = (middle[0] - 0.1, middle[0] + 0.07, middle[1] - 0.03, middle[1] + 0.2)
-        part = gathered(view, box, depth=depth)
-        east, north = everything.enu[:, 0].astype(float), everything.enu[:, 1].astype(float)
-        inside = (east >= box[0]) & (east < box[1]) & (north > box[2]) & (north <= box[3])
-        assert 100 < inside.sum() < 0.5 * len(inside)
-        assert abs(len(part.enu) - inside.sum()) <= 2  # of float32 on the very edge
-        same = np.isin(everything.enu[:, 0], part.enu[:, 0])
-        np.testing.assert_array_equal(
-            everything.enu[same & inside], part.enu[: (same & inside).sum()]
-        )
-
-
 def tilted():
     return port_view([0.2, -0.1, 0.0], [2.0, -1.0, 40.0])
 
@@ -129,31 +109,6 @@ def test_colours_take_the_factors_of_their_place():
     np.testing.assert_allclose(colours[:, 0, 2], 100, atol=1)
     np.testing.assert_allclose(colours[:, -1, 2], 200, atol=1)
     np.testing.assert_allclose(colours[:, view.pinhole.width_px // 2, 0], 30, atol=1)
-
-
-def test_joined_keeps_order_and_nothing_joins_to_nothing():
-    view = stereo_views(np.array([0.2]), np.array([0.1]))[0]
-    part = gathered(view, (-100.0, float(np.median(gathered(view).enu[:, 0])), -100, 100))
-    both = joined([part, part])
-    assert len(both.enu) == 2 * len(part.enu)
-    np.testing.assert_array_equal(both.enu[len(part.enu) :], part.enu)
-    assert len(joined([]).enu) == 0
-
-
-def test_enu_turns_the_frame_right_side_up():
-    view = stereo_views(np.array([0.2]), np.array([0.1]))[0]
-    matrix = enu_from_cam(view, np.zeros(3))
-    np.testing.assert_allclose(np.linalg.det(matrix[:, :3]), 1.0)
-    centre = view.world_from_cam.translation
-    np.testing.assert_allclose(matrix[:, 3], [centre[1], centre[0], -centre[2]])
-    assert matrix[2, 2] < -0.99  # a nadir camera looks down
-
-
-def test_a_step_has_points_on_both_levels():
-    view = stereo_views(np.array([0.3]), np.array([0.35]))[0]
-    scene = Scene(depth_of=sloped_with_step, paint=position_code)
-    up = gathered(view, depth=depth_of(view, scene)).enu[:, 2]
-    assert np.ptp(up) > 0.1
 
 
 def test_points_through_a_tilted_port_lie_where_the_exact_rays_hit():

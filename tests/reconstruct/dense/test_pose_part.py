@@ -1,20 +1,14 @@
-import tracemalloc
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from alice_survey.core.errors import heard
 from reconstruct.adjustment.soft_modes import no_modes
 from reconstruct.adjustment.uncertainty import Uncertainty, write_uncertainty
 from reconstruct.dense.surface_tiles import (
     ErrorsOfPoses,
-    ViewSummary,
     find_errors_of_poses,
-    fuse_tasks,
 )
-from reconstruct.raster import DemGrid
 from reconstruct.views.model import SparseModel, read_model
 from tests.oracles_dense import Scene, flat, position_code, sparse_model, stereo_views
 from tests.oracles_dense import write_workspace as write
@@ -71,14 +65,6 @@ def test_a_wall_takes_what_is_unsure_along_its_normal(
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
-def test_a_covariance_of_another_model_is_not_taken(workspace: Path):
-    model = read_model(workspace / "sparse")
-    fewer = replace(model, points_world=model.points_world[:-1])
-    with heard() as warnings:
-        assert find_errors_of_poses(workspace, fewer) is None
-    assert len(warnings) == 1
-
-
 def test_a_point_takes_the_median_of_sparse_points_around_also_of_a_part_of_them():
     rng = np.random.default_rng(2)
     places = np.column_stack([rng.uniform(0, 1, (4000, 2)), np.zeros(4000)])
@@ -97,32 +83,3 @@ def test_a_point_takes_the_median_of_sparse_points_around_also_of_a_part_of_them
     np.testing.assert_array_equal(part.at(spots, up, 0.02), found)
     few = errors.around(np.array([9.0, 9.0]), np.array([9.1, 9.1]))  # far from all
     assert len(few.points_world) >= 16
-
-
-def test_what_is_around_a_tile_is_found_without_all_points_and_made_when_it_is_asked_for():
-    rng = np.random.default_rng(3)
-    low, high = np.array([1.0, 2.0]), np.array([1.2, 2.3])
-    taken = []
-    for side in (10.0, 80.0):  # of surveys of one density
-        count = int(100 * side * side)
-        places = rng.uniform(0, side, (count, 3))
-        errors = ErrorsOfPoses(points_world=places, covariances=np.ones((count, 3, 3)))
-        errors.around(low, high)
-        tracemalloc.start()
-        part = errors.around(low, high)
-        taken.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
-        inside = ((places[:, :2] > low - 0.3) & (places[:, :2] < high + 0.3)).all(axis=1)
-        np.testing.assert_array_equal(part.points_world, places[inside])
-    assert taken[1] < 3.0 * taken[0]
-
-    views = stereo_views(np.array([0.0]), np.array([0.0]))
-    box = ViewSummary(bounds=(0.0, 0.0, 79.0, 79.0), up=0.0, footprint=0.01, sigma=0.01)
-    grid = DemGrid(west=0.0, north=80.0, cell=0.02, rows=4000, columns=4000)
-    tracemalloc.start()
-    tasks = fuse_tasks(grid, views, [box] * len(views), errors)
-    first = next(iter(tasks))
-    memory = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert first.poses is not None and len(tasks) > 200
-    assert memory < 0.25 * errors.covariances.nbytes

@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from camera_calib.approximation.pinhole_warp import Pinhole
 from reconstruct.dense.depth import depth_in_reference, rectify
-from reconstruct.views.model import View, scaled_view
+from reconstruct.views.model import View
 from reconstruct.views.range_shift import no_shift
 from tests.oracles_dense import port_view
 
@@ -98,21 +98,6 @@ def test_no_pair_along_the_line_of_sight_or_face_to_face():
     points = np.array([[0.0, 0.0, 2.0], [0.1, 0.1, 2.1]])
     assert rectify(view([0, 0, 0], [0, 0, 0]), view([0, 0, 0.4], [0, 0, 0]), points) is None
     assert rectify(view([0, 0, 0], [0, 0, 0]), view([0.4, 0, 0], [0, np.pi, 0]), points) is None
-
-
-def test_scaled_view_sees_the_same_places_at_half_the_pixels():
-    full = view([0, 0, 0], [0.1, 0, 0])
-    points = np.array([[0.1, 0.2, 2.0], [-0.3, 0.1, 1.8]])
-    half = scaled_view(full, 0.5)
-    np.testing.assert_allclose(half.project(points), full.project(points) / 2, atol=1e-12)
-    assert half.pinhole.size_px == (160, 120)
-    assert scaled_view(full, 1.0) is full
-
-
-@pytest.mark.parametrize("behind", [-1.0, -0.1])
-def test_points_behind_the_reference_bound_nothing(behind: float):
-    pair = view([0, 0, 0], [0, 0, 0]), view([0.3, 0, 0], [0, 0, 0])
-    assert rectify(*pair, np.array([[0.0, 0.0, behind]])) is None
 
 
 def _pixels(one: View) -> np.ndarray:

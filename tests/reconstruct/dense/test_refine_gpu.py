@@ -137,19 +137,6 @@ def test_a_gpu_gives_what_the_processor_gives(tmp_path: Path, case: tuple[Any, .
     assert "simulated" in said
 
 
-def test_a_thread_for_each_pixel_blurs_as_opencv_does(tmp_path: Path) -> None:
-    planes = np.random.default_rng(1).normal(size=(2, 11, 37)).astype(np.float32)
-    np.save(tmp_path / "planes.npy", planes)
-    subprocess.run(
-        [sys.executable, "-c", BLURRED, tmp_path / "planes.npy", tmp_path / "blurred.npy"],
-        cwd=ROOT, env={**os.environ, "NUMBA_ENABLE_CUDASIM": "1"}, check=True,
-    )  # fmt: skip
-    expected = [
-        cv2.GaussianBlur(plane, (0, 0), 1.25, borderType=cv2.BORDER_REFLECT) for plane in planes
-    ]
-    np.testing.assert_allclose(np.load(tmp_path / "blurred.npy"), expected, atol=1e-6)
-
-
 def test_without_memory_of_the_gpu_the_processor_does_it_and_says_so(
     tmp_path: Path, case: tuple[Any, ...]
 ) -> None:

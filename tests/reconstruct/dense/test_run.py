@@ -4,21 +4,18 @@ import numpy as np
 import pytest
 import rasterio
 from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from alice_survey.app.stages import spec
 from alice_survey.core.artefacts import read_json
 from alice_survey.core.config import ReconstructConfig, SurveyConfig
-from alice_survey.core.errors import ReconstructionError, WorkspaceError
-from alice_survey.core.executor import SERIAL, local_executor
+from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.executor import SERIAL
 from alice_survey.core.products import rasters_in
 from reconstruct.dense import run
 from reconstruct.dense.stereo_pairs import in_frame
 from tests.oracles_dense import (
-    DEPTH_M,
     Scene,
     flat,
-    position_code,
     sloped_with_step,
     sparse_model,
     speckle,
@@ -70,16 +67,6 @@ def test_surface_agrees_with_the_truth_edges_included(workspace: Path):
     assert np.sqrt(np.mean(error**2)) < 0.012
 
 
-def test_heights_are_positive_up_and_the_block_stands_out(workspace: Path):
-    height, north, east = read(workspace / "dense" / "dem.tif")
-    top = (np.abs(north - 0.3) < 0.17) & (np.abs(east - 0.35) < 0.17)
-    foot = (np.abs(north - 0.3) < 0.17) & (np.abs(east - 0.65) < 0.06)
-    slope = -(0.08 * north - 0.05 * east)
-    rise = np.nanmedian((height - slope)[top]) - np.nanmedian((height - slope)[foot])
-    assert rise == pytest.approx(0.1, abs=0.0015)
-    assert np.nanmedian(height) == pytest.approx(-DEPTH_M, abs=0.1)
-
-
 def test_sigma_is_an_honest_bound(workspace: Path):
     height, north, east = read(workspace / "dense" / "dem.tif")
     sigma, _, _ = read(workspace / "dense" / "sigma.tif")
@@ -109,25 +96,6 @@ def test_cloud_lies_on_the_surface_with_normals_up(workspace: Path):
     assert cloud.point.sigma.numpy().min() > 0
 
 
-def test_copc_holds_the_points_of_the_ply_in_the_rasters_projection(workspace: Path):
-    import laspy
-    import open3d as o3d
-
-    about = read_json(workspace / "dense" / "cloud.json")
-    cloud = o3d.t.io.read_point_cloud(str(workspace / "dense" / "cloud.ply"))
-    with laspy.CopcReader.open(workspace / "dense" / "cloud.copc.laz") as reader:
-        laz, crs = reader.query(), reader.header.parse_crs()
-    enu = cloud.point.positions.numpy() + np.array(about["offset_east_north_up"])
-    found = np.column_stack([laz.x, laz.y, laz.z])
-    near, at = cKDTree(found).query(enu)
-    assert np.max(near) < 1e-4
-    np.testing.assert_array_equal(np.sort(at), np.arange(len(found)))
-    np.testing.assert_array_equal(laz.red[at] // 257, cloud.point.colors.numpy()[:, 0])
-    np.testing.assert_array_equal(laz["nz"][at], cloud.point.normals.numpy()[:, 2])
-    np.testing.assert_array_equal(laz["sigma"][at], cloud.point.sigma.numpy()[:, 0])
-    assert "Azimuthal Equidistant" in crs.to_wkt()
-
-
 def test_stations_and_slope(workspace: Path):
     _, north, east = read(workspace / "dense" / "dem.tif")
     count, _, _ = read(workspace / "dense" / "count.tif")
@@ -150,22 +118,6 @@ def test_scratch_is_gone_and_files_are_there(workspace: Path):
     clouds = {"cloud.ply", "cloud.copc.laz", "cloud.json"}
     others = {"dem.png", "light.json", "moving.csv", "surface.json", "plane.json", "stage.json"}
     assert names == rasters | styles | clouds | others
-
-
-def test_a_second_run_does_nothing(workspace: Path):
-    assert not spec("dense").make(workspace, CONFIG, SERIAL)
-
-
-@pytest.mark.slow
-def test_bytes_do_not_depend_on_the_number_of_processes(workspace: Path, tmp_path: Path):
-    other = tmp_path / "again"
-    other.mkdir()
-    for name in ("images", "sparse"):
-        (other / name).symlink_to(workspace / name)
-    assert spec("dense").make(other, CONFIG, local_executor(2))
-    for path in sorted((workspace / "dense").iterdir()):
-        if path.name != "stage.json":
-            assert (other / "dense" / path.name).read_bytes() == path.read_bytes(), path.name
 
 
 def test_an_interruption_while_a_plane_is_written_costs_nothing(
@@ -195,14 +147,6 @@ def test_pictures_without_texture_are_refused(tmp_path: Path):
     with pytest.raises(ReconstructionError):
         spec("dense").make(tmp_path, CONFIG, SERIAL)
     assert not (tmp_path / "dense").exists()
-
-
-def test_a_workspace_without_model_names_the_command_that_makes_one(tmp_path: Path):
-    scene = Scene(depth_of=flat, paint=position_code)
-    write_workspace(tmp_path, sparse_model(stereo_views(np.zeros(1), np.zeros(1)), scene), scene)
-    (tmp_path / "sparse" / "stage.json").unlink()
-    with pytest.raises(WorkspaceError, match="reconstruct"):
-        spec("dense").make(tmp_path, CONFIG, SERIAL)
 
 
 def test_what_one_stereo_pair_alone_sees_is_kept_with_an_honest_sigma(workspace: Path):

@@ -43,21 +43,6 @@ def test_rig_partner_comes_first_then_neighbours_ahead_and_astern():
     assert ((base_to_height[1:] > 0.15) & (base_to_height[1:] < 0.3)).all()
 
 
-def test_at_most_the_given_number_of_partners_and_none_twice():
-    model = sparse_model(line(), SCENE)
-    for maximum in (1, 2, 4):
-        for partners in choose_partners(model, per_view=maximum):
-            assert 1 <= len(partners) <= maximum
-            assert len(set(partners)) == len(partners)
-
-
-def test_points_of_views_are_those_observed():
-    model = sparse_model(line(3), SCENE)
-    for number, points in enumerate(points_of_views(model)):
-        own = [p for p, v in model.observations if v == number]
-        np.testing.assert_array_equal(points, model.points_world[own])
-
-
 def test_pictures_without_overlap_are_refused():
     views = sparse_model(line(2)[:2], SCENE).views
     away = RigidTransform.from_translation([30.0, 0.0, 0.0])

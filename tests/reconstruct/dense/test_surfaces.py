@@ -80,14 +80,6 @@ def test_an_overhang_above_the_floor_is_two_surfaces():
     assert (found.sigma < SIGMA_M).all()  # of the roof alone
 
 
-def test_three_surfaces_give_the_uppermost_and_the_lowest():
-    rng = np.random.default_rng(2)
-    found = fused(together(*(sheet(rng, up_m=up) for up in (-5.0, -4.8, -4.7))))
-    assert (found.surfaces == 3).all()
-    np.testing.assert_allclose(found.height, -4.7, atol=1e-3)
-    np.testing.assert_allclose(found.lower, -5.0, atol=1e-3)
-
-
 @pytest.mark.parametrize("slope_deg", [0.0, 30.0, 60.0, 75.0, 79.0])
 @pytest.mark.parametrize("per_view", [1, 6])
 def test_one_surface_is_one_however_steep_and_noisy(slope_deg: float, per_view: int):
@@ -122,16 +114,6 @@ def test_what_one_station_sees_is_no_second_surface():
     assert (found.surfaces == 1).all()
     np.testing.assert_allclose(found.height, -5.0, atol=1e-3)
     assert (found.count == 10).all()
-
-
-def test_stray_points_between_two_surfaces_change_neither():
-    rng = np.random.default_rng(7)
-    floor, roof = sheet(rng, up_m=-5.0), sheet(rng, up_m=-4.7)
-    strays = sheet(rng, up_m=-4.85, views=range(1), per_view=1)
-    found = fused(together(floor, roof, strays))
-    assert (found.surfaces == 2).all()
-    np.testing.assert_allclose(found.height, -4.7, atol=1e-3)
-    np.testing.assert_allclose(found.lower, -5.0, atol=1e-3)
 
 
 @pytest.mark.parametrize(("gap_m", "surfaces"), [(0.012, 1), (0.045, 2)])

@@ -40,15 +40,6 @@ def test_no_depth_of_a_view_along_the_floor_is_lost(tmp_path: Path):
     np.testing.assert_allclose(z.ravel()[4:], depth.ravel()[4:], rtol=4e-5)
 
 
-def test_nothing_known_stays_unknown(tmp_path: Path):
-    store = ViewStore(tmp_path)
-    nowhere = np.full((4, 5), np.nan, np.float32)
-    store.save_depth(0, "fine", nowhere, nowhere)
-    assert np.isnan(store.load_depth(0, "fine")).all()
-    store.drop(0, "fine")
-    assert not store.has(0, "fine")
-
-
 def test_colours_keep_brightness_and_masks_every_bit(tmp_path: Path):
     rng = np.random.default_rng(4)
     rows, columns = np.mgrid[:41, :53]

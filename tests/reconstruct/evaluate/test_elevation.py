@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import rasterio
 
-from alice_survey.core.errors import WorkspaceError
 from reconstruct.evaluate import elevation
 from reconstruct.evaluate.elevation import StoredElevation
 from reconstruct.raster import read_cells
@@ -65,25 +64,6 @@ def test_parts_say_what_the_whole_says(tmp_path: Path, monkeypatch: pytest.Monke
     bounded = [dem.met_by(s[None], w[None]) for s, w in zip(starts, ways, strict=True)]
     assert max(part.height.size for part, _ in bounded) <= 100_000
     np.testing.assert_allclose([met[0] for _, met in bounded], expected, atol=2e-2)
-
-
-def test_cells_are_those_of_the_file_that_is_there_now(tmp_path: Path) -> None:
-    """Blocks are held, and each window of them is that of the file, over several blocks too."""
-    rng = np.random.default_rng(8)
-    for _ in range(3):
-        values = rng.normal(size=(ROWS, COLUMNS))
-        stored(tmp_path, values)
-        wide = np.pad(values, 600, constant_values=np.nan)
-        for _ in range(20):
-            row, column = int(rng.integers(-300, ROWS)), int(rng.integers(-300, COLUMNS))
-            rows, columns = rng.integers(1, 500, 2).tolist()
-            found = read_cells(tmp_path / "dem.tif", row, column, rows, columns)
-            there = wide[row + 600 :, column + 600 :][:rows, :columns]
-            np.testing.assert_allclose(found[: len(there), : there.shape[1]], there, rtol=1e-6)
-            assert np.isnan(found[len(there) :]).all()
-    (tmp_path / "dem.tif").unlink()
-    with pytest.raises(WorkspaceError, match="no such file"):
-        read_cells(tmp_path / "dem.tif", 0, 0, 4, 4)
 
 
 def test_a_wall_hides_what_is_behind_it(tmp_path: Path) -> None:

@@ -54,14 +54,6 @@ def test_sigma_of_the_dome_holds_for_correlated_errors() -> None:
     assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.4
 
 
-def test_a_dome_of_too_little_is_unknown() -> None:
-    few = fit_doming(np.zeros((5, 2)), np.zeros(5))
-    assert math.isnan(few.dome_m)
-    assert few.to_json()["dome_mm"] is None
-    line = np.column_stack([np.linspace(0, 5, 500), np.zeros(500)])
-    assert math.isnan(fit_doming(line, np.zeros(500)).dome_m)
-
-
 def test_lengths_find_scale_and_noise_and_nothing_in_a_moved_model() -> None:
     rng = np.random.default_rng(4)
     true = rng.uniform(0, 5, (300, 3))

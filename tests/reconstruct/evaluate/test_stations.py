@@ -1,7 +1,5 @@
 """Stations that see a place, and the scores of a mesh, against closed forms."""
 
-import math
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
@@ -12,7 +10,7 @@ from alice_survey.core.config import CameraConfig, SeafloorConfig, WaterConfig
 from alice_survey.sim.seafloor.terrain import Terrain, build_terrain
 from camera_calib.rig import Rig, design_rig
 from missions.values.footprint import footprint_polygon, level_pose
-from reconstruct.evaluate.surface import distance_from_mesh, score_mesh, spread_over
+from reconstruct.evaluate.surface import score_mesh
 from reconstruct.evaluate.truth import count_stations, ground_pixel_m, surface_depth
 
 DEPTH_M = 10.0
@@ -49,13 +47,6 @@ def test_counts_are_those_of_the_exact_footprints(rig: Rig) -> None:
     assert (found == expected).mean() > 0.995  # the polygon has straight sides, the frame has not
 
 
-def test_both_cameras_of_a_station_count_once(rig: Rig) -> None:
-    poses = poses_at(rig, [0.0, 0.0])
-    pictures = {"left/0.png": ("left", 7), "left/1.png": ("left", 7)}
-    middle = np.array([[0.0, 0.0, DEPTH_M], [np.nan, 0, 0]])
-    np.testing.assert_array_equal(count_stations(middle, rig, pictures, poses, floor()), [1, 0])
-
-
 def test_what_an_object_hides_is_not_seen(rig: Rig) -> None:
     rocky = floor(rocks=3.0)
     poses = poses_at(rig, [0.0])
@@ -77,19 +68,6 @@ def test_the_ground_pixel_is_range_over_focal_length_in_water(rig: Rig) -> None:
 
 SQUARE = np.array([[-1.0, -1, 10], [1, -1, 10], [1, 1, 10], [-1, 1, 10]])
 FACES = np.array([[0, 1, 2], [0, 2, 3]])
-
-
-def test_points_are_spread_evenly_over_a_mesh() -> None:
-    points = spread_over(SQUARE, FACES, 40_000, np.random.default_rng(4))
-    counts, *_ = np.histogram2d(points[:, 0], points[:, 1], bins=4, range=[[-1, 1], [-1, 1]])
-    assert counts.sum() == 40_000
-    np.testing.assert_allclose(counts, 2500, rtol=0.1)
-
-
-def test_distance_from_a_square_is_exact() -> None:
-    points = np.array([[0.0, 0, 9.5], [2.0, 0, 10.0], [2, 2, 10]])
-    found = distance_from_mesh(SQUARE, FACES, points)
-    np.testing.assert_allclose(found, [0.5, 1.0, math.sqrt(2)], atol=1e-6)
 
 
 def test_a_lifted_half_of_a_mesh_scores_its_lift_and_half_complete() -> None:

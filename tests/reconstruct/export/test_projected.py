@@ -12,7 +12,6 @@ import pyproj
 import pytest
 import rasterio
 
-from alice_survey.core.errors import ConfigError, ReconstructionError
 from reconstruct.evaluate.elevation import elevation_in
 from reconstruct.export.projected import export_projected
 from reconstruct.views.model import read_frame
@@ -125,23 +124,3 @@ def test_cloud_and_mesh_lie_on_the_raster(workspace: Path):
         assert np.nanmedian(np.abs(gap)) < 0.005
     length = np.sqrt(np.square([cloud[name] for name in ("nx", "ny", "nz")]).sum(axis=0))
     np.testing.assert_allclose(length, 1.0, atol=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("crs", "why"),
-    [("EPSG:4326", "UTM"), ("EPSG:32636+5773", "horizontal"), ("EPSG:1", "unknown"),
-     ("EPSG:2263", "metres")],
-)  # fmt: skip
-def test_systems_that_do_not_fit_are_refused_in_one_line(workspace: Path, crs: str, why: str):
-    with pytest.raises(ConfigError, match=why) as refused:
-        export_projected(workspace, crs)
-    assert "\n" not in str(refused.value)
-
-
-def test_a_model_without_a_place_is_refused(workspace: Path, tmp_path: Path):
-    shutil.copytree(workspace, tmp_path / "w")
-    path = tmp_path / "w" / "sparse" / "frame.json"
-    frame = json.loads(path.read_text()) | {"name": "model", "datum": None}
-    path.write_text(json.dumps(frame))
-    with pytest.raises(ReconstructionError, match="no place"):
-        export_projected(tmp_path / "w", CRS)

@@ -9,10 +9,9 @@ import numpy as np
 import pycolmap
 import pytest
 
-from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.executor import SERIAL
 from reconstruct.evaluate.surface import read_mesh
-from reconstruct.export.undistorted import bilinear, export_undistorted, exported_name
+from reconstruct.export.undistorted import bilinear, export_undistorted
 from reconstruct.views.model import View, read_model, read_warps
 
 
@@ -108,26 +107,3 @@ def test_other_programs_read_what_was_written(workspace: Path):
         )
     shown = json.loads((folder / "export.json").read_text())["on_surface"]
     assert min(shown.values()) > 0.5
-
-
-def test_a_second_run_writes_nothing(workspace: Path):
-    picture = next((workspace / "undistorted" / "images").rglob("*.png"))
-    before = picture.stat().st_mtime_ns
-    text, values = export_undistorted(workspace, SERIAL)
-    assert picture.stat().st_mtime_ns == before
-    assert values["pictures"] == len(read_model(workspace / "sparse").views)
-    assert str(workspace / "undistorted") in text
-
-
-def test_without_a_mesh_the_command_that_makes_it_is_named(workspace: Path, tmp_path: Path):
-    (tmp_path / "sparse").symlink_to(workspace / "sparse")
-    with pytest.raises(WorkspaceError, match="reconstruct"):
-        export_undistorted(tmp_path, SERIAL)
-
-
-@pytest.mark.parametrize(
-    ("image", "name"),
-    [("left/7.png", "left/7.png"), ("DCIM/A.JPG", "DCIM/A.JPG"), ("a/b.webp", "a/b.png")],
-)
-def test_names_stay_where_the_format_can_be_written(image: str, name: str):
-    assert exported_name(image) == name

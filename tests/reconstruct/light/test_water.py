@@ -88,13 +88,6 @@ def test_growth_with_range_matters_where_ranges_differ_much() -> None:
     assert (np.abs(true - 1) > 0.14).all()
 
 
-def test_backscatter_starts_at_nothing_and_saturates() -> None:
-    near, far = grown(GROWTH, np.array([1e-6, 1e3]), MIDDLE_M)
-    assert (near < 1e-5).all()
-    np.testing.assert_allclose(far, 1.0 / (1.0 - np.exp(-GROWTH * MIDDLE_M)), rtol=1e-9)
-    np.testing.assert_array_equal(grown(GROWTH, np.array(MIDDLE_M), MIDDLE_M), 1.0)
-
-
 def test_what_overlaps_do_not_say_is_not_taken_away() -> None:
     samples, dark = survey(1.5, 2.6)
     few = LightSamples(

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from reconstruct.measure.areas import covered, figures_of_all, surface_within
 from tests.reconstruct.measure.synthetic import Drawn, Sigmas, grid, without_errors
-from tests.reconstruct.measure.test_figures import hills, ramp
+from tests.reconstruct.measure.test_figures import hills
 
 ROWS, COLUMNS = 12, 16
 
@@ -39,18 +39,6 @@ def test_squares_are_covered_as_shapely_cuts_them(seed: int, corners: int, whole
     np.testing.assert_allclose(covered(rings, (ROWS, COLUMNS)), cut, atol=1e-9)
 
 
-def test_areas_of_several_polygons_are_summed(tmp_path: Path) -> None:
-    surface = without_errors(tmp_path, grid(1.0, 0.01), ramp)
-    shapes = [shapely.box(-0.4, -0.4, 0.1, 0.1), shapely.Point(0.25, 0.25).buffer(0.15)]
-    parts = [surface_within(surface, shape)[0] for shape in shapes]
-    area, ratio = figures_of_all(surface, parts)
-    assert area.value == pytest.approx(np.sqrt(1.25) * sum(one.area for one in shapes), rel=1e-5)
-    assert ratio.value == pytest.approx(np.sqrt(1.25), rel=1e-5)
-    both, _ = surface_within(surface, shapely.union_all(shapes))
-    assert both.surface == pytest.approx(area.value, rel=1e-9)
-    assert figures_of_all(surface, parts[:1])[0].value == parts[0].surface
-
-
 @pytest.mark.parametrize(
     "sigmas", [Sigmas(own=0.0012), Sigmas(tilt=0.002, scale=0.002, bend=0.004)],
     ids=["own", "shared"],
@@ -74,10 +62,3 @@ def test_the_sigma_of_a_sum_is_that_of_draws(sigmas: Sigmas, tmp_path: Path) -> 
     assert 0.7 < ratio < 1.4  # 40 draws know a sigma to 11 %
     together = np.mean(stated) / np.mean(apart)
     assert together == pytest.approx(1.0 if sigmas.own else np.sqrt(2), abs=0.12)
-
-
-def test_the_slant_next_to_a_polygon_is_that_of_the_surface(tmp_path: Path) -> None:
-    surface = without_errors(tmp_path, grid(1.0, 0.01), ramp)
-    places = np.array([[0.1, 0.0], [-0.1, 0.05], [0.3, 0.3], [9.0, 9.0]])
-    slant = surface_within(surface, shapely.box(-0.1, -0.1, 0.1, 0.1), places)[1]
-    np.testing.assert_allclose(slant, [np.sqrt(1.25), np.sqrt(1.25), 0.0, 0.0], rtol=1e-3)

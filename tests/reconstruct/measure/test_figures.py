@@ -1,18 +1,14 @@
 """Figures of surfaces of known shape: closed forms, sigmas against draws of noise."""
 
-import tracemalloc
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import shapely
-from rasterio.windows import Window
 from scipy.special import ellipe
 
-from alice_survey.core.errors import ReconstructionError
 from alice_survey.core.frames import Array
 from reconstruct.measure.areas import surface_within
 from reconstruct.measure.errors import own_correlation
@@ -20,9 +16,7 @@ from reconstruct.measure.figures import Measured
 from reconstruct.measure.lines import measure_line, profile
 from reconstruct.measure.polygons import measure_polygon, quadrats
 from reconstruct.measure.surface import MeasuredSurface
-from reconstruct.raster import DemGrid, tiled_raster
 from tests.reconstruct.measure.synthetic import (
-    FRAME,
     Drawn,
     Sigmas,
     grid,
@@ -81,22 +75,6 @@ def test_a_tilted_plane_has_the_figures_of_geometry(tmp_path: Path) -> None:
         assert line[name].value == pytest.approx(0.5 * np.sqrt(1.16), rel=1e-5)
 
 
-def test_a_hole_has_no_surface(tmp_path: Path) -> None:
-    """Of a tilted plane, and of hills: the whole is the part without the hole and the hole."""
-    hole = shapely.Polygon([(-0.1, -0.13), (0.2, -0.05), (0.04, 0.17)])
-    whole = shapely.Polygon(SLANTED)
-    ring = shapely.Polygon(SLANTED, [hole.exterior.coords])
-    surface, ratio = roughness(without_errors(tmp_path, grid(1.0, 0.01), ramp), ring)
-    assert surface.value == pytest.approx(np.sqrt(1.25) * (whole.area - hole.area), rel=1e-6)
-    assert ratio.value == pytest.approx(np.sqrt(1.25), rel=1e-6)
-    hilly = without_errors(tmp_path, grid(1.0, 0.01), hills)
-    outer, inner, left = (roughness(hilly, one)[0].value for one in (whole, hole, ring))
-    assert left == pytest.approx(outer - inner, rel=1e-9)
-    assert outer == named(measure_polygon(hilly, SLANTED)[0])["surface_area"].value
-    with pytest.raises(ReconstructionError, match="no surface"):
-        roughness(hilly, shapely.box(5, 5, 6, 6))
-
-
 def test_a_hemisphere_has_its_area_and_volume(tmp_path: Path) -> None:
     def dome(x: Array, y: Array) -> Array:
         return np.sqrt(np.maximum(0.3**2 - x**2 - y**2, 0.0))
@@ -149,15 +127,6 @@ def test_noise_makes_no_floor_rougher(tmp_path: Path) -> None:
             line.append(found["surface_length"].value / 0.8 - 1)
         assert abs(np.mean(rough)) < 0.15 * noise, (sigma, np.mean(rough) / noise)
         assert abs(np.mean(line)) < 0.25 * noise, (sigma, np.mean(line) / noise)
-
-
-def test_a_sigma_that_is_too_large_takes_no_roughness_below_that_of_a_plane(tmp_path: Path) -> None:
-    drawn = Drawn(tmp_path, grid(1.0, 0.01), ramp, Sigmas(own=0.02))
-    surface = drawn.true
-    found = named(measure_polygon(surface, SQUARE, None)[0])
-    assert found["rugosity"].value == pytest.approx(np.sqrt(1.25), rel=1e-4)
-    line = named(measure_line(surface, [(0.0, -0.2), (0.0, 0.3)]))
-    assert line["surface_length"].value == pytest.approx(0.5 * np.sqrt(1.16), rel=1e-4)
 
 
 ALL = Sigmas(own=0.0012, shift=0.004, tilt=0.002, scale=0.002, bend=0.004)
@@ -220,34 +189,6 @@ def test_a_scale_known_apart_counts_by_the_dimension(tmp_path: Path) -> None:
         assert one.sigma == pytest.approx(0.01 * power * abs(one.value), rel=1e-9, abs=1e-12)
 
 
-def test_what_is_unknown_is_said(tmp_path: Path) -> None:
-    def holed(x: Array, y: Array) -> Array:
-        return np.where(np.hypot(x - 0.2, y) < 0.1, np.nan, 0.1 * x)
-
-    surface = without_errors(tmp_path, grid(1.0, 0.01), holed)
-    figures, notes = measure_polygon(surface, SQUARE, "rim")
-    found = named(figures)
-    known = 1 - np.pi * 0.1**2 / 0.64
-    assert found["surface_area"].value == pytest.approx(0.64 * known * np.sqrt(1.01), rel=2e-2)
-    assert found["rugosity"].value == pytest.approx(np.sqrt(1.01), rel=1e-6)
-    assert "95." in notes[0] or "94." in notes[0]
-    line = named(measure_line(surface, [(-0.3, 0.0), (0.4, 0.0)]))
-    assert np.isnan(line["surface_length"].value)
-    assert line["length"].value == pytest.approx(0.7 * np.sqrt(1.01), rel=1e-6)
-    for wrong in ([(0.2, 0.0), (0.4, 0.0)], [(0.0, 0.0), (0.0, 0.0)], [(0.0, 0.0), (3.0, 0.0)]):
-        with pytest.raises(ReconstructionError):
-            measure_line(surface, wrong)
-    for wrong in (SQUARE[:2], [SQUARE[k] for k in (0, 2, 1, 3)], [(x + 4, y) for x, y in SQUARE]):
-        with pytest.raises(ReconstructionError):
-            measure_polygon(surface, wrong, None)
-    hole = [(0.15, -0.05), (0.25, -0.05), (0.25, 0.05)]
-    with pytest.raises(ReconstructionError):
-        measure_polygon(surface, hole, None)
-    for side in (0.001, 0.021, 3.0):
-        with pytest.raises(ReconstructionError):
-            quadrats(surface, SQUARE, side)
-
-
 def test_parts_of_a_large_polygon_add_up(tmp_path: Path) -> None:
     """More blocks than one, against the same polygon cut in two."""
     drawn = Drawn(tmp_path, grid(12.0, 0.02), hills, Sigmas(own=0.001))
@@ -273,29 +214,3 @@ def test_a_profile_passes_its_corners(tmp_path: Path) -> None:
     assert np.diff(found.along).max() <= 0.01 + 1e-12
     true = hills(*found.samples.places.T)
     assert np.abs(found.samples.height - true).max() < 2e-4
-
-
-def test_memory_does_not_grow_with_the_raster(tmp_path: Path) -> None:
-    """Of a surface of a thousand million cells only what is measured is read."""
-    cells = DemGrid(west=0.0, north=400.0, cell=0.01, rows=40_000, columns=32_768)
-    heights = np.full((512, 512), 2.0, np.float32)
-    for name in ("dem", "sigma"):
-        with tiled_raster(tmp_path / f"{name}.tif", cells, FRAME, "float32", np.nan, "") as raster:
-            raster.write(heights if name == "dem" else 0.001 * heights, 1,
-                         window=Window(2048, 2048, 512, 512))  # fmt: skip
-    (tmp_path / "small").mkdir()
-    drawn = Drawn(tmp_path / "small", grid(1.0, 0.1), ramp, Sigmas(shift=0.001))
-    surface = replace(
-        drawn.true, dem=tmp_path / "dem.tif", sigma=tmp_path / "sigma.tif", grid=cells
-    )
-    west, north = 20.48, 400.0 - 20.48
-    corners = [(west + x, north - y) for x, y in ((0.5, 0.5), (0.5, 4.5), (4.5, 4.5), (4.5, 0.5))]
-    tracemalloc.start()
-    found = named(measure_polygon(surface, corners, 1.5)[0])
-    line = named(measure_line(surface, [corners[0], corners[2]]))
-    profile(surface, [(1.0, 1.0), (150.0, 100.0)])
-    maximum = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert found["volume"].value == pytest.approx(0.5 * 16.0, rel=1e-6)
-    assert line["length"].value == pytest.approx(4.0 * np.sqrt(2), rel=1e-6)
-    assert maximum < 400e6 < 4 * cells.rows * cells.columns / 10

@@ -22,7 +22,7 @@ from reconstruct.measure.polygon_files import (
 from reconstruct.measure.surface import MeasuredSurface
 from reconstruct.raster import local_crs
 from reconstruct.views.model import WorldFrame
-from tests.reconstruct.measure.synthetic import Drawn, Sigmas, grid, without_errors
+from tests.reconstruct.measure.synthetic import grid, without_errors
 from tests.reconstruct.measure.test_figures import ramp
 
 DATUM = Datum(32.8, 34.9, 0.0)
@@ -117,12 +117,6 @@ def test_the_sigma_of_an_area_is_that_of_drawn_corners(surface: MeasuredSurface)
         outer, hole = (ring + rng.normal(0, sigma, ring.shape) for ring in rings)
         draws.append(shapely.Polygon(outer, [hole]).area)
     assert np.std(draws) == pytest.approx(stated, rel=0.06)
-
-
-def test_a_scale_that_is_not_known_moves_areas_twice(tmp_path: Path) -> None:
-    drawn = Drawn(tmp_path, grid(1.0, 0.0125), ramp, Sigmas(scale=0.002))
-    found = figure(drawn.true, "", "", 1.0, plan_slopes_of(drawn.true, HOLED, 0.0), 0)
-    assert found.sigma == pytest.approx(2 * 0.002 * HOLED.area, rel=0.05)
 
 
 def test_files_that_are_no_polygons_are_refused(surface: MeasuredSurface, tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ import pytest
 import rasterio
 
 from alice_survey.core.artefacts import read_json, write_json
-from alice_survey.core.errors import ConfigError
 from reconstruct.mosaic.annotation import mosaic_tiles
 from reconstruct.mosaic.footprints import picture_footprint, surface_points, write_footprints
 from reconstruct.raster import DemGrid, crs_of, transform_of
@@ -104,19 +103,3 @@ def test_tiles_hold_the_mosaic_and_say_where_they_lie(tmp_path: Path, kind: str)
     np.testing.assert_allclose(values[:4], [0.01, 0, 0, -0.01], atol=1e-12)
     np.testing.assert_allclose(values[4:], [5 + 0.01 * (left + 0.5), 9 - 0.01 * (top + 0.5)])
     assert not list(out.glob("*.rough*"))
-
-
-def test_a_scale_bar_is_as_long_as_it_says(tmp_path: Path) -> None:
-    workspace_with_mosaic(tmp_path)
-    mosaic_tiles(tmp_path, tmp_path / "out", side_px=230, scale_bar=True)
-    picture = cv2.imread(str(tmp_path / "out" / "tile_000_000.png"))
-    white = (picture == 255).all(axis=2)
-    runs = [max(len(r) for r in "".join(map(str, row.astype(int))).split("0")) for row in white]
-    assert max(runs) == 20  # 0.2 m, the roundest below 0.46 m
-
-
-def test_sizes_out_of_range_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError):
-        mosaic_tiles(tmp_path, tmp_path / "out", side_px=40_000)
-    with pytest.raises(ConfigError):
-        mosaic_tiles(tmp_path, tmp_path / "out", side_px=100, overlap_px=100)

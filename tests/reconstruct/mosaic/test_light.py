@@ -3,20 +3,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.core.artefacts import write_json
-from alice_survey.core.errors import WorkspaceError
 from reconstruct.light.parts import Parts
 from reconstruct.light.solve import (
     GRID,
     LightSamples,
     as_rows,
-    at_nodes,
     at_places,
-    compare_light,
     from_rows,
     in_one_part,
     joined_samples,
-    low_pass,
     read_light,
     solve_light,
     solve_patterns,
@@ -165,31 +160,6 @@ def test_without_overlap_nothing_is_changed():
     np.testing.assert_allclose(light.factors("left", IMAGES[0]), 1.0)
 
 
-def test_low_pass_leaves_out_what_is_not_valid():
-    colour = np.full((270, 338, 3), 100, np.uint8)
-    valid = np.ones((270, 338), bool)
-    colour[:, :60], valid[:, :60] = 0, False
-    low = low_pass(colour, valid)
-    assert low.shape[1] == 108
-    np.testing.assert_allclose(low[:, 20:], 100, atol=1e-3)
-
-
-def test_places_run_from_edge_to_edge():
-    ramp = np.tile(np.arange(50, dtype=np.float32)[:, None, None] + 0.5, (1, 40, 3))
-    places = np.array([[0.5, 0.5], [0.5, 0.1]], np.float32)
-    np.testing.assert_allclose(at_places(ramp, places)[:, 0], [25.0, 5.0], atol=0.02)
-
-
-def test_dark_and_burnt_spots_are_left_out():
-    grey = np.full((40, 50, 3), 80, np.float32)
-    half = grey.copy()
-    half[:, :25] = 255
-    places = np.column_stack([np.linspace(0.05, 0.95, 50), np.full(50, 0.5)]).astype(np.float32)
-    compared = compare_light((3, 4), (grey, half), (places, places))
-    assert 20 <= len(compared.views) <= 26
-    assert (compared.places[:, 0, 0] > 0.45).all()
-
-
 def test_light_file_round_trip(tmp_path):
     _, found = samples()
     light = solve_light(in_one_part(found), UNKNOWN, IMAGES, ["left"] * len(IMAGES))
@@ -198,21 +168,6 @@ def test_light_file_round_trip(tmp_path):
     np.testing.assert_allclose(again.patterns["left"], light.patterns["left"], atol=1e-5)
     np.testing.assert_allclose(again.white, light.white, atol=1e-5)
     assert list(again.gains) == IMAGES
-
-
-def test_nodes_take_the_picture_and_leave_out_the_dark():
-    low = np.full((80, 108, 3), 90, np.float32)
-    low[:, :40] = 1.0
-    nodes = at_nodes(low)
-    assert nodes.shape == (*GRID, 3)
-    np.testing.assert_allclose(nodes[:, -3:], np.log(90), rtol=1e-6)
-    assert np.isnan(nodes[:, :3]).all()
-
-
-def test_a_light_file_that_lacks_a_value_names_itself(tmp_path):
-    write_json(tmp_path / "light.json", {"patterns": {}, "gains": {}})
-    with pytest.raises(WorkspaceError, match=r"light\.json"):
-        read_light(tmp_path / "light.json")
 
 
 def read_rows(path: Path) -> LightSamples:

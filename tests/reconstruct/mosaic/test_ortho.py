@@ -31,27 +31,6 @@ def test_visible_cells_equal_a_walk_along_the_sight_line(camera: tuple[float, fl
     assert 0.2 < visible.mean() < 0.98
 
 
-def seen_over_wall(height_m: float) -> np.ndarray:
-    """From 2 m over column 10 of level ground with a wall at column 30."""
-    height = np.zeros((21, 60), np.float32)
-    height[:, 30] = height_m
-    camera = np.array([1.05, -1.05, 2.0])
-    return visible_cells(height, camera, 0.0, 0.0, 0.1, 0.01, (0, 21, 0, 60))
-
-
-def test_a_wall_hides_what_is_behind_it_and_not_itself():
-    visible = seen_over_wall(1.0)  # the line over the wall reaches the ground 20 cells behind
-    assert visible[10, :31].all()
-    assert not visible[10, 31:49].any()
-    assert visible[10, 52:].all()
-
-
-def test_unknown_cells_are_neither_seen_nor_in_the_way():
-    visible = seen_over_wall(np.nan)
-    assert not visible[:, 30].any()
-    assert visible[:, 31:].all()
-
-
 def straight_nodes(view: View) -> np.ndarray:
     """A lens that changes nothing."""
     x, y = np.linspace(0, view.pinhole.width_px, 5), np.linspace(0, view.pinhole.height_px, 4)

@@ -1,6 +1,4 @@
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -10,19 +8,17 @@ import rasterio
 from alice_survey.app.stages import spec
 from alice_survey.core.artefacts import read_json, write_json
 from alice_survey.core.config import CameraConfig, ReconstructConfig, SurveyConfig, WaterConfig
-from alice_survey.core.errors import ReconstructionError
 from alice_survey.core.executor import SERIAL
 from camera_calib.approximation.pinhole_warp import best_warp
 from camera_calib.rig import design_rig
 from reconstruct.dense.cloud import write_cloud, write_cloud_json
 from reconstruct.mosaic import run
 from reconstruct.mosaic.picture_measures import encoded, linear_table
-from reconstruct.mosaic.run import _dispersion, write_tiles
+from reconstruct.mosaic.run import _dispersion
 from reconstruct.ply import VERTEX
 from reconstruct.raster import DemGrid, tiled_raster
 from reconstruct.views.model import View
 from tests.cameras import changed
-from tests.engines import PicklingThreads
 from tests.oracles_dense import (
     DEPTH_M,
     FRAME,
@@ -144,19 +140,6 @@ def test_source_names_the_picture_nearest_to_straight_above(workspace: Path):
     assert len(np.unique(source[source > 0])) >= 4
 
 
-def test_bytes_do_not_change_on_another_engine(workspace: Path, tmp_path: Path):
-    for name in ("images", "sparse", "dense"):
-        (tmp_path / name).symlink_to(workspace / name)
-    with PicklingThreads(1) as engine:
-        assert spec("mosaic").make(tmp_path, CONFIG, engine.executor)
-        assert engine.tasks > len(list((tmp_path / "images").rglob("*.png")))
-    names = ("mosaic.tif", "mosaic_source.tif", "coverage.tif", "mosaic.png", "mosaic.json")
-    for name in (*names, "footprints.csv", "footprints.geojson"):
-        same = (tmp_path / "mosaic" / name).read_bytes()
-        assert same == (workspace / "mosaic" / name).read_bytes()
-    assert not spec("mosaic").make(tmp_path, CONFIG, SERIAL)
-
-
 def grey_survey(folder: Path, north: list[float], east: list[float]) -> list[View]:
     """Stations at places over an evenly grey sea floor."""
     plain = Scene(depth_of=terraced, paint=lambda n, e: np.full((*n.shape, 3), 100.0))
@@ -223,13 +206,6 @@ def test_borders_of_blocks_and_tiles_show_no_step(
         assert inside < 1.0
 
 
-def test_no_picture_over_the_surface_is_refused(tmp_path: Path):
-    views = stereo_views(np.array([30.0, 30.4]), np.array([0.0, 0.0]))
-    make_workspace(tmp_path, views, SCENE)
-    with pytest.raises(ReconstructionError):
-        spec("mosaic").make(tmp_path, CONFIG, SERIAL)
-
-
 def test_a_single_grey_station_gives_a_grey_mosaic(tmp_path: Path):
     grey_survey(tmp_path, [0.2], [0.0])
     assert spec("mosaic").make(tmp_path, EVEN, SERIAL)
@@ -271,30 +247,3 @@ def test_what_a_mask_hides_is_not_painted_and_others_fill_it(tmp_path: Path):
     assert np.abs(rgba[:3][:, known] - 100).max() <= 3
     middle = (np.hypot(north - 0.2, east) < 0.1) & known
     assert middle.sum() > 500  # the other camera shows what the fish hides
-
-
-def test_labels_beyond_65535_stay_apart(
-    workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    """The same survey whose views are the last of 70,000 is painted the same, by other numbers."""
-    before = 70_000
-    views_of: Any = run._seen_views
-
-    def later_views(*arguments):
-        return [replace(entry, number=entry.number + before) for entry in views_of(*arguments)]
-
-    def write_all(rough, source, grid, frame, groups, names, threads):
-        every = [*map(str, range(before)), *names]
-        return write_tiles(rough, source, grid, frame, groups, every, threads)
-
-    monkeypatch.setattr(run, "_seen_views", later_views)
-    monkeypatch.setattr(run, "write_tiles", write_all)
-    for name in ("images", "sparse", "dense"):
-        (tmp_path / name).symlink_to(workspace / name)
-    assert spec("mosaic").make(tmp_path, CONFIG, SERIAL)
-    sources = []
-    for folder in (workspace, tmp_path):
-        with rasterio.open(folder / "mosaic" / "mosaic_source.tif") as raster:
-            sources.append(raster.read(1).astype(np.int64))
-            assert raster.dtypes == (("uint16",) if folder == workspace else ("uint32",))
-    np.testing.assert_array_equal(sources[1], sources[0] + before * (sources[0] > 0))

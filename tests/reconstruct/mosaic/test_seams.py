@@ -48,22 +48,6 @@ def test_a_seam_goes_around_what_two_views_show_differently() -> None:
     assert (plain == 0).mean() > 0.9
 
 
-def test_cells_that_no_view_sees_have_none_and_few_candidates_are_kept() -> None:
-    rng = np.random.default_rng(2)
-    qualities = rng.uniform(0, 1, (9, 6, 7)).astype(np.float32)
-    qualities[:, 2, 3] = 0
-    numbers = np.arange(20, 29, dtype=np.int32)
-    number, share, row_of = candidates(qualities, numbers)
-    assert number.shape == (6, 7, 6)
-    assert (number[2, 3] == -1).all()
-    known = number >= 0
-    assert share[known].min() >= 0.3
-    np.testing.assert_array_equal(numbers[row_of][known], number[known])
-    chosen = choose_views(number, share, np.zeros((*number.shape, 3), np.float32))
-    assert chosen[2, 3] == -1
-    assert (chosen >= 0).sum() == 41
-
-
 def test_seams_are_laid_up_to_views_that_are_settled() -> None:
     """Energy over both halves of a grid, the second laid with or without regard to the first."""
     gains = []
@@ -81,10 +65,3 @@ def test_seams_are_laid_up_to_views_that_are_settled() -> None:
         gains.append(before - after)
     assert min(gains) > 0
     assert np.mean(gains) > 5  # of some 150
-
-
-def test_a_settled_view_that_is_no_candidate_leaves_a_cell_free() -> None:
-    number, share, colours = random_problem(3, 5, 6, 2)
-    settled = np.full((5, 6), 77, np.int32)
-    free = choose_views(number, share, colours)
-    np.testing.assert_array_equal(choose_views(number, share, colours, settled), free)

@@ -79,13 +79,6 @@ def test_points_are_looked_up_where_the_camera_behind_a_tilted_port_shows_them()
     assert np.sqrt((error[inside] ** 2).mean()) < 0.008
 
 
-def test_forgetting_the_range_would_show() -> None:
-    view, (grid, height) = view_of(warp()), relief()
-    sight = see(view, camera_optics(warp(), False), Ground(height, grid).surface(grid))
-    inside = sight.quality > 0
-    assert misses_px(sight, CAMERA, view)[inside].max() > 0.1
-
-
 def test_each_channel_is_looked_up_where_its_own_light_falls() -> None:
     view, (grid, height) = view_of(warp()), relief()
     surface = Ground(height, grid).surface(grid)

@@ -1,6 +1,5 @@
 """The shift with distance that a warp to one pinhole leaves."""
 
-import pickle
 from dataclasses import replace
 from functools import cache
 
@@ -16,10 +15,9 @@ from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.lenses.values import LensValues
 from camera_calib.ports.dome import DomePort
 from camera_calib.rig import design_rig
-from reconstruct.views.model import View, scaled_view
+from reconstruct.views.model import View
 from reconstruct.views.range_shift import (
     RangeShift,
-    no_shift,
     range_shift,
 )
 from tests.cameras import changed
@@ -82,12 +80,6 @@ def test_rays_through_a_dome_that_is_centred_on_the_pupil_meet_there() -> None:
     assert warp.pinhole.fx_px == pytest.approx(warp.camera.fx_px)
 
 
-def test_without_a_port_nothing_shifts() -> None:
-    pixels = np.array([[3.0, 4.0], [900.0, 1.0]])
-    np.testing.assert_array_equal(no_shift(1000, 800).ideal(pixels, 1.3), pixels)
-    np.testing.assert_array_equal(no_shift(1000, 800).warped(pixels, 1.3), pixels)
-
-
 @cache
 def tilted_shift() -> RangeShift:
     return range_shift(warp_of(0.1, 2.0))
@@ -148,31 +140,3 @@ def test_the_contraction_is_the_fields_own_and_below_one_the_inverse_exists(
     ideal = warped + step * (warped - [400, 300]) @ slopes.T
     np.testing.assert_allclose(shift.ideal(warped, depth), ideal, atol=1e-9)
     np.testing.assert_allclose(shift.warped(ideal, depth), warped, atol=1e-4)
-
-
-def test_from_a_contraction_of_one_two_pixels_show_one_spot() -> None:
-    x, y = np.linspace(-400, 400, 33), np.linspace(-300, 300, 25)
-    nodes = np.stack(np.meshgrid(-3.0 * x, 0.0 * y), axis=-1)
-    shift = RangeShift(nodes=nodes, width_px=800.0, height_px=600.0, inverse_working=0.5)
-    far, near = shift.contraction(np.array([1.25, 1.2])).tolist()
-    assert far == pytest.approx(0.9)
-    assert near == pytest.approx(1.0)
-    shown = shift.ideal(np.array([[350.0, 300.0], [450.0, 300.0]]), 1.2)
-    np.testing.assert_allclose(shown[0], shown[1], atol=1e-6)
-
-
-def test_views_of_one_camera_in_shrunk_pictures_share_their_field() -> None:
-    warp = warp_of(0.02, 0.0)
-    shift = range_shift(warp)
-    views = [
-        View(
-            image=f"{n}.png", camera="left", station=n, pinhole=warp.pinhole,
-            world_from_cam=RigidTransform.identity(), shift=shift,
-        )
-        for n in range(8)
-    ]  # fmt: skip
-    shrunk = [scaled_view(view, 0.5) for view in views]
-    assert shrunk[0].shift.nodes.nbytes > 100_000
-    assert len(pickle.dumps(shrunk)) < 1.2 * len(pickle.dumps(shrunk[:1]))
-    other = scaled_view(replace(views[0], shift=replace(shift, nodes=2.0 * shift.nodes)), 0.5)
-    np.testing.assert_allclose(other.shift.nodes, 2.0 * shrunk[0].shift.nodes)
