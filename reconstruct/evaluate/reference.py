@@ -30,9 +30,10 @@ from reconstruct.evaluate.registration import (
     distances,
     register_cloud,
 )
+from reconstruct.mosaic.grid import mean_pixel
 from reconstruct.placing.alignment import Similarity
 from reconstruct.ply import read_ply_points
-from reconstruct.views.model import SparseModel, points_of_views, read_model
+from reconstruct.views.model import read_model
 
 _MAX_POINTS = 2_000_000
 _MAX_BLOCK = 64_000_000
@@ -236,16 +237,6 @@ _CELLS = 320
 """Cells of the map along its longer side."""
 
 
-def ground_pixel_of(model: SparseModel) -> float:
-    """Median side of a pixel on the surface, from the points that each view sees."""
-    pixels = []
-    for view, seen in zip(model.views, points_of_views(model), strict=True):
-        if len(seen):
-            depth = view.world_from_cam.inv().apply(seen)[:, 2]
-            pixels.append(depth / view.pinhole.focal_px)
-    return float(np.median(np.concatenate(pixels)))
-
-
 @progress.step("compare with the reference")
 def evaluate_reference(
     workspace: Path,
@@ -291,7 +282,7 @@ def evaluate_reference(
     start = lifted(own, surface)
     fit = register_cloud(own, surface, start, free_scale=free_scale, rng=rng)
     moved = fit.reference_from_cloud.apply(own)
-    pixel_m = ground_pixel_of(model) * fit.reference_from_cloud.scale
+    pixel_m = mean_pixel(model) * fit.reference_from_cloud.scale
     ours = distances(moved, surface, rng)
     back = distances(theirs, ReferenceSurface.of(moved), rng)
     figures = {

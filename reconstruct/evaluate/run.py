@@ -178,7 +178,6 @@ def run_evaluate(workspace: Path, folder: Path, executor: Executor, *, seed: int
     _write_errors(folder / ERROR.path.name, dense / "dem.tif", surface.map_m)
     plot_track(folder / "track.png", flown, cameras)
     plot_errors(folder / "errors.png", surface, area)
-    plot_sheet(folder / "sheet.png", workspace, cameras, surface, area)
 
 
 def _write_errors(path: Path, dem: Path, errors: Array) -> None:
@@ -263,42 +262,6 @@ def plot_errors(path: Path, surface: SurfaceScore, area: MultiPolygon) -> None:
     save_figure(figure, path)
 
 
-@progress.step("draw the summary")
-@figure_style()
-def plot_sheet(
-    path: Path,
-    workspace: Path,
-    cameras: CameraScore,
-    surface: SurfaceScore,
-    area: MultiPolygon,
-) -> None:
-    """The picture nearest to the middle of the area, surface, mosaic and error on one sheet."""
-    middle = area.representative_point()
-    away = np.linalg.norm(cameras.positions_ned[:, :2] - [middle.x, middle.y], axis=1)
-    pictures = [
-        ("A picture", workspace / "images" / cameras.names[int(away.argmin())]),
-        ("Surface", workspace / "dense" / "dem.png"),
-        ("Mosaic", workspace / "mosaic" / "mosaic.png"),
-    ]
-    figure = new_figure(10, 12)
-    panels = figure.subplots(2, 2).ravel()
-    for panel, (title, file) in zip(panels, pictures, strict=False):
-        panel.set_title(title)
-        panel.axis("off")
-        panel.imshow(_read(file))
-    west, east, south, north = surface.extent_m
-    panels[3].set_title("Surface minus truth")
-    panels[3].grid(visible=False)
-    error_mm = 1e3 * surface.map_m
-    shown = even_limit(error_mm)
-    image = panels[3].imshow(
-        error_mm, extent=(west, east, south, north), vmin=-shown, vmax=shown, cmap="PuOr"
-    )
-    colour_bar(image, panels[3], "height error (mm)")
-    map_axes(panels[3])
-    save_figure(figure, path)
-
-
 def _height_in(width_m: float, height_m: float) -> float:
     """Height of a figure with a map next to something else: higher where the map is."""
     return 5.5 * min(max(0.9 * height_m / width_m, 1.0), 1.7)
@@ -310,11 +273,3 @@ def _draw_area(axes: Axes, area: MultiPolygon) -> None:
         for ring in (part.exterior, *part.interiors):
             north, east = np.asarray(ring.coords)[:, :2].T
             axes.plot(east, north, "k--", linewidth=1)
-
-
-def _read(path: Path) -> Any:
-    import cv2
-
-    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    order = cv2.COLOR_BGRA2RGBA if picture.shape[2] == 4 else cv2.COLOR_BGR2RGB
-    return cv2.cvtColor(picture, order)

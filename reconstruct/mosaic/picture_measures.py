@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from rasterio.windows import Window
 
 from alice_survey.core.artefacts import atomic_path, read_csv
-from alice_survey.core.compiled import compiled
 from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.frames import Array
 from reconstruct.light.solve import GRID, at_places
@@ -145,7 +144,6 @@ def measure_picture(workspace: Path, folder: Path, view: View) -> PictureMeasure
     )
 
 
-@compiled
 def sharp_and_mean(grey: NDArray[np.uint8], usable: NDArray[np.bool_]) -> tuple[float, float]:
     """Mean size of the Laplacian, and mean level, of the inner pixels that may be used.
 
@@ -153,21 +151,11 @@ def sharp_and_mean(grey: NDArray[np.uint8], usable: NDArray[np.bool_]) -> tuple[
         grey: (H, W).
         usable: (H, W), or (1, 1) for all.
     """
-    rows, columns = grey.shape
-    whole = usable.shape[0] == 1
-    fine, total, count = 0.0, 0.0, 0  # whole numbers, exact as floats
-    for row in range(1, rows - 1):
-        for column in range(1, columns - 1):
-            if whole or usable[row, column]:
-                here = np.int64(grey[row, column])
-                around = (
-                    np.int64(grey[row - 1, column]) + np.int64(grey[row + 1, column])
-                    + np.int64(grey[row, column - 1]) + np.int64(grey[row, column + 1])
-                )  # fmt: skip
-                fine += float(abs(around - 4 * here))
-                total += float(here)
-                count += 1
-    return fine / max(count, 1), total / max(count, 1)
+    inner = np.s_[1:-1, 1:-1]
+    chosen = np.broadcast_to(usable, grey.shape)[inner]
+    fine = np.abs(cv2.Laplacian(grey, cv2.CV_16S)[inner][chosen])
+    count = max(len(fine), 1)
+    return int(fine.sum(dtype=np.int64)) / count, int(grey[inner][chosen].sum()) / count
 
 
 def _broad_nodes(copy: SmallCopy) -> Array:
@@ -196,11 +184,13 @@ def _dark(taken: NDArray[np.uint8], usable: NDArray[np.bool_] | None, table: Flo
     return np.where(np.isfinite(levels), np.interp(levels, np.arange(256), table), np.nan)
 
 
-@compiled
 def low_levels(
-    picture: NDArray[np.uint8], usable: NDArray[np.bool_], y: NDArray[np.int64],
-    x: NDArray[np.int64], percent: float,
-) -> Array:  # fmt: skip
+    picture: NDArray[np.uint8],
+    usable: NDArray[np.bool_],
+    y: NDArray[np.int64],
+    x: NDArray[np.int64],
+    percent: float,
+) -> Array:
     """A percentile of the levels in boxes of a picture, (rows, columns, 3).
 
     Args:
@@ -214,28 +204,14 @@ def low_levels(
         The level below which that share of pixels lies, as a step; NaN where fewer than 100 are
         usable.
     """
-    rows, columns = len(y) - 1, len(x) - 1
-    found = np.full((rows, columns, 3), np.nan)
-    whole = usable.shape[0] == 1
-    counts = np.zeros((3, 256), np.int64)
-    for row in range(rows):
-        for column in range(columns):
-            counts[:] = 0
-            for r in range(y[row], y[row + 1]):
-                for c in range(x[column], x[column + 1]):
-                    if whole or usable[r, c]:
-                        for k in range(3):
-                            counts[k, picture[r, c, k]] += 1
-            total = counts[0].sum()
-            if total < 100:
-                continue
-            for k in range(3):
-                below = 0
-                for level in range(256):
-                    below += counts[k, level]
-                    if below > percent / 100.0 * (total - 1):
-                        found[row, column, k] = level
-                        break
+    found = np.full((len(y) - 1, len(x) - 1, 3), np.nan)
+    usable = np.broadcast_to(usable, picture.shape[:2])
+    for row, column in np.ndindex(*found.shape[:2]):
+        box = np.s_[y[row] : y[row + 1], x[column] : x[column + 1]]
+        shown = picture[box][usable[box]]
+        if len(shown) >= 100:
+            rank = int(percent / 100.0 * (len(shown) - 1))
+            found[row, column] = np.partition(shown, rank, axis=0)[rank]
     return found
 
 

@@ -14,8 +14,7 @@ from scipy.spatial import KDTree
 from alice_survey.core.artefacts import read_stage
 from alice_survey.core.errors import ReconstructionError
 from alice_survey.core.frames import Array
-from reconstruct.evaluate.elevation import LEVEL, Elevation, StoredElevation
-from reconstruct.placing.control_points import RegisteredPicture
+from reconstruct.evaluate.elevation import LEVEL, StoredElevation
 from reconstruct.planes import read_plane
 from reconstruct.views.model_files import all_points
 
@@ -39,60 +38,6 @@ class SurfacePlace:
     """(3,) unit vector, upwards."""
     sigma: float
     """Of its height."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ShownPlaces:
-    """Places of a DEM that a picture shows at pixels, and what moves them."""
-
-    points: Array
-    """(N, 3) in the world; a row is NaN where a ray meets no known surface."""
-    sigma: Array
-    """(N,) of the surface's height there."""
-    by_height: Array
-    """(N, 3) how a place moves where the surface is higher by 1."""
-    by_pixel: Array
-    """(N, 3, 2) how it moves with the pixel."""
-
-
-def shown_places(dem: StoredElevation, picture: RegisteredPicture, pixels: Array) -> ShownPlaces:
-    """Places of a DEM that a picture shows at pixels (N, 2) as taken."""
-    starts, ways = picture.ray(pixels)
-    surface, points = dem.met_by(starts, ways)
-    places = points[:, [1, 0]]
-    square = _square(surface, places)
-    aside = []
-    for step in np.eye(2):
-        other, there = picture.ray(pixels + step)
-        reach = _dot(points - other, square) / _dot(there, square)
-        aside.append(other + reach[:, None] * there - points)
-    return ShownPlaces(
-        points=points, sigma=surface.at(surface.sigma, places),
-        by_height=-ways / _dot(ways, square)[:, None], by_pixel=np.stack(aside, axis=2),
-    )  # fmt: skip
-
-
-def hidden(dem: StoredElevation, points: Array, sigma: Array, centres: Array) -> NDArray[np.bool_]:
-    """Whether a DEM stands between places (N, 3) of it, of sigmas (N,), and cameras at (N, 3)."""
-    surface = dem.around(np.concatenate([points, centres])[:, [1, 0]])
-    clear = _CLEAR_CELLS * surface.cell + _CLEAR_SIGMAS * np.nan_to_num(sigma)
-    return surface.hides(points, clear, centres)
-
-
-def _square(surface: Elevation, places: Array) -> Array:
-    """(N, 3) of depth plus height by north, east, down: square to the surface."""
-    slopes = []
-    for axis in ([0.0, 1.0], [1.0, 0.0]):
-        step = surface.cell * np.array(axis)
-        ends = (surface.at(surface.height, places + sign * step) for sign in (1.0, -1.0))
-        slope = np.subtract(*ends) / (2 * surface.cell)
-        slopes.append(np.where(np.isfinite(slope), slope, 0.0))  # at an edge of what is known
-    return np.column_stack([*slopes, np.ones(len(places))])
-
-
-def _dot(a: Array, b: Array) -> Array:
-    found: Array = np.einsum("ni,ni->n", a, b)
-    return found
 
 
 class ModelSurface:
@@ -172,8 +117,10 @@ class ModelSurface:
         count = len(centres)
         if self._dem is None or not count:
             return np.zeros(count, np.bool_)
+        surface = self._dem.around(np.vstack([place.point, centres])[:, [1, 0]])
+        clear = _CLEAR_CELLS * surface.cell + _CLEAR_SIGMAS * place.sigma
         points = np.broadcast_to(place.point, (count, 3))
-        return hidden(self._dem, points, np.full(count, place.sigma), centres)
+        return surface.hides(points, np.full(count, clear), centres)
 
     def _reach(self, start: Array) -> float:
         """How far below a camera the middle of all heights is."""

@@ -43,14 +43,6 @@ FEW_THREADS = """
 from reconstruct.dense import refine_gpu
 refine_gpu.grid_of = lambda shape: ((2, 1), (2, 3))
 """
-BLURRED = """
-import sys
-import numpy as np
-from numba import cuda
-from reconstruct.dense import refine_gpu
-planes = np.load(sys.argv[1])
-np.save(sys.argv[2], refine_gpu._Gpu().blurred(cuda.to_device(planes), 1.25).copy_to_host())
-"""
 OUT_OF_MEMORY = """
 from reconstruct.dense import refine_gpu
 def fail(*_):
