@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.core.config import SurveyConfig, changed
+from alice_survey.core.config import SurveyConfig, change_section
 from alice_survey.core.text_table import text_table
 from alice_survey.sim.vehicle.sea import level_floor
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
@@ -97,7 +97,7 @@ def main() -> None:
 
 def measure(*, quick: bool) -> list[Row]:
     """Fly every format in every current."""
-    config = changed(SurveyConfig(), "sea", current_sigma_mps=0.0)
+    config = change_section(SurveyConfig(), "sea", current_sigma_mps=0.0)
     rig = design_rig(config.camera, config.water)
     plan = plan_survey(config, rig).plan
     along_deg = math.degrees(plan.lines[0].heading_rad) % 360.0
@@ -107,8 +107,8 @@ def measure(*, quick: bool) -> list[Row]:
         flown = ("cola2",) if vehicle == "sparus2" else (("cola2", "qgc") if quick else FORMATS)
         for current, across in seas:
             towards = (along_deg + (90.0 if across else 0.0)) % 360.0
-            at = changed(config, "sea", current_mps=current, current_towards_deg=towards)
-            at = changed(at, "vehicle", name=vehicle)
+            at = change_section(config, "sea", current_mps=current, current_towards_deg=towards)
+            at = change_section(at, "vehicle", name=vehicle)
             rows += [_fly(plan, rig, at, name, across=across) for name in flown]
     return rows
 
@@ -120,7 +120,7 @@ def _fly(plan: Plan, rig: Rig, config: SurveyConfig, name: str, *, across: bool)
     with tempfile.TemporaryDirectory() as folder:
         options = options_of(config.camera, config.plan, config.vehicle, config.sea)
         write_exports(Path(folder), plan, rig, formats=[name], options=options)
-        config = changed(config, "vehicle", mission_file=Path(folder) / FORMATS[name])
+        config = change_section(config, "vehicle", mission_file=Path(folder) / FORMATS[name])
         settings = flight_settings(config)
         floor = level_floor(config.area.seafloor_depth_m)
         flight = simulate_mission(plan, settings, floor, np.random.default_rng(7), label="")

@@ -171,7 +171,7 @@ def _adjust(work: StepWork) -> Prepared:
         prior = Prior.of_rig(work.rig, calibrated_parameters(work.rig, names))
         near, order = pixels.by_place(start.centres)
         state = replace(start, points=start.points[order])
-        with work.executor.started() as executor:
+        with work.executor.start() as executor:
             workers = Workers(executor=executor, folder=work.own / "parts")
             problem = SurveyProblem(near, state, prior, workers)
             found = minimise(problem, problem.start, settled=0.05, max_steps=20)
@@ -282,7 +282,7 @@ def _light(work: StepWork) -> Prepared:
     cameras = names * len(truth.centres)
 
     def run() -> int:
-        with work.executor.started() as executor:
+        with work.executor.start() as executor:
             solve_light(light_parts(store, counts, executor), nodes, images, cameras)
         shutil.rmtree(store.folder)
         return sum(counts)
@@ -360,7 +360,7 @@ def _map(work: StepWork) -> Prepared:
 
     def run() -> int:
         folder = work.own / "mapping"
-        with work.executor.started() as executor:
+        with work.executor.start() as executor:
             mapped = map_calibrated(seen, poses, folder, 1, executor=executor)
             mapped, _ = refract(mapped, seen, folder, poses, settle=False)
         mapped.model.write_binary(folder)

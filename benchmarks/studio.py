@@ -27,7 +27,7 @@ from rasterio.transform import Affine
 from rasterio.windows import Window
 
 from alice_survey.app.pipeline import template_text
-from alice_survey.app.report.colours import encoded
+from alice_survey.app.report.colours import encode_webp
 from alice_survey.app.studio.files import Workspace
 from alice_survey.app.studio.layers import Layers
 from alice_survey.core.config import SurveyConfig
@@ -156,7 +156,7 @@ def _twin(path: Path, halvings: int, x: int, y: int, tile_px: int) -> bytes:
         left, top = x * tile_px, y * tile_px
         window = Window(left, top, min(tile_px, raster.width - left),
                         min(tile_px, raster.height - top))  # fmt: skip
-        return encoded(np.moveaxis(raster.read(window=window), 0, -1))
+        return encode_webp(np.moveaxis(raster.read(window=window), 0, -1))
 
 
 def main() -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from alice_survey.core.config import SurveyConfig, changed
+from alice_survey.core.config import SurveyConfig, change_section
 from alice_survey.sim.vehicle.pilot.memory import DONE, PHASE, REASON
 from alice_survey.sim.vehicle.pilot.safety import NONE
 from alice_survey.sim.vehicle.sea import FloorGrid, level_floor
@@ -72,11 +72,11 @@ class Start:
 def measure(runs: int) -> list[Row]:
     """All missions, each a number of times."""
     calm = SurveyConfig()
-    across = changed(calm, "sea", current_mps=0.1, current_towards_deg=90.0)
-    rough = changed(
+    across = change_section(calm, "sea", current_mps=0.1, current_towards_deg=90.0)
+    rough = change_section(
         across, "sea", surface_current_mps=0.2, current_sigma_mps=0.03, gust_n=(2.0, 2.0, 1.0)
     )
-    sparus = changed(across, "vehicle", name="sparus2", controller="los")
+    sparus = change_section(across, "vehicle", name="sparus2", controller="los")
     level, waves = level_floor(calm.area.seafloor_depth_m), _waves(calm.area.seafloor_depth_m)
     missions = {
         "ALICE, sway controller, 0.1 m/s across": _setup(across, level),

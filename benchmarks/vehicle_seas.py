@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.core.config import SurveyConfig, changed
+from alice_survey.core.config import SurveyConfig, change_section
 from alice_survey.core.errors import VehicleError, collected_by
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.sea import level_floor
@@ -121,7 +121,7 @@ class SeaResult:
 
 def measure(seeds: int) -> list[SeaResult]:
     """Fly all cases."""
-    calm = changed(SurveyConfig(), "sea", current_mps=0.0)
+    calm = change_section(SurveyConfig(), "sea", current_mps=0.0)
     plan = plan_survey(calm, design_rig(calm.camera, calm.water)).plan
     return [_measured(sea, calm, plan, seeds) for sea in SEAS]
 
@@ -135,9 +135,9 @@ def settings_of(sea: Sea, calm: SurveyConfig, heading_deg: float) -> SurveyConfi
         height, period = sea.swell
         water |= {"swell_m": height, "swell_period_s": period,
                   "swell_towards_deg": (heading_deg + 90.0) % 360.0}  # fmt: skip
-    found = changed(calm, "sea", **water)
-    found = changed(found, "vehicle", **sea.vehicle)
-    return changed(found, "navigation", **sea.navigation)
+    found = change_section(calm, "sea", **water)
+    found = change_section(found, "vehicle", **sea.vehicle)
+    return change_section(found, "navigation", **sea.navigation)
 
 
 def _measured(sea: Sea, calm: SurveyConfig, plan: Plan, seeds: int) -> SeaResult:

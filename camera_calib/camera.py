@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 from pydantic import ConfigDict
 
-from alice_survey.core.artefacts import checked
+from alice_survey.core.artefacts import check_type
 from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import Array
 from camera_calib import optics
@@ -260,12 +260,12 @@ def camera_from_json(data: Mapping[str, Any]) -> Camera:
         port = _kind("port", values.pop("port", FlatPort.shape), optics.PORTS)
         of_lens = {f.name: values.pop(f.name) for f in fields(lens) if f.name in values}
         of_port = {f.name: values.pop(f.name) for f in fields(port) if f.name in values}
-        size = checked(_Size, values)
+        size = check_type(_Size, values)
         return Camera(
             width_px=size.width_px,
             height_px=size.height_px,
-            lens=checked(lens, of_lens),
-            port=checked(port, of_port),
+            lens=check_type(lens, of_lens),
+            port=check_type(port, of_port),
         )
     except (ValueError, CalibrationError) as error:
         raise CalibrationError(f"camera: {str(error).removeprefix('camera: ')}") from None

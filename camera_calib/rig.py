@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.core.artefacts import checked, read_json, write_json
+from alice_survey.core.artefacts import check_type, read_json, write_json
 from alice_survey.core.config import CameraConfig, WaterConfig
 from alice_survey.core.contents import one_line
 from alice_survey.core.errors import CalibrationError
@@ -276,7 +276,7 @@ def read_rig(path: str | Path) -> Rig:
                 f"is a rig file of version {data.get('version')}; this program reads version "
                 f"{_FORMAT['version']}: calibrate again, or change the file by docs/formats.md"
             )
-        file = checked(_RigFile, data)
+        file = check_type(_RigFile, data)
         return Rig(
             cameras={name: _camera(name, one) for name, one in file.cameras.items()},
             cam_from_rig={

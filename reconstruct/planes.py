@@ -290,7 +290,7 @@ def read_plane(folder: Path) -> Plane:
     Raises:
         WorkspaceError: it is damaged.
     """
-    found = PlaneRecord.made(folder / "plane.json")
+    found = PlaneRecord.read_existing(folder / "plane.json")
     if found is None or found.name == LEVEL:
         return LEVEL_PLANE
     up, right, out = (_ned(axis) for axis in (found.up_enu, found.right_enu, found.out_enu))

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.core.artefacts import atomic_path
-from alice_survey.core.contents import shown
+from alice_survey.core.contents import as_line
 from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.frames import Array
 
@@ -167,7 +167,7 @@ def read_header(path: Path) -> PlyHeader:
     kind = next((words[1] for words in lines if words[:1] == ["format"] and len(words) > 1), "")
     if kind not in _ORDERS:
         wanted = ", ".join(_ORDERS)
-        raise WorkspaceError(f"{path}: PLY of the format {shown(kind)!r}: {wanted} are read")
+        raise WorkspaceError(f"{path}: PLY of the format {as_line(kind)!r}: {wanted} are read")
     elements = [i for i, words in enumerate(lines) if words[:1] == ["element"]]
     first = lines[elements[0]] if elements else []
     number = first[2] if len(first) == 3 and first[1] == "vertex" else ""
@@ -179,7 +179,7 @@ def read_header(path: Path) -> PlyHeader:
         if words[:1] != ["property"]:
             continue
         if len(words) != 3 or words[1] not in _TYPES:
-            text = shown(" ".join(words[1:]))
+            text = as_line(" ".join(words[1:]))
             raise WorkspaceError(f"{path}: a point's property {text!r} is not read")
         fields.append((words[2], _TYPES[words[1]]))
     names = [name for name, _ in fields]

@@ -17,7 +17,7 @@ from alice_survey.app.stages import names, spec
 from alice_survey.core.artefacts import read_json, read_stage, refuse_links
 from alice_survey.core.config import (
     SurveyConfig,
-    changed,
+    change_section,
     load_config,
     parse_config,
     parse_current,
@@ -51,7 +51,7 @@ class FlightChanges:
     mission: Path | None = None
     """Mission file to fly instead of the plan's route."""
 
-    def applied(self, config: SurveyConfig) -> SurveyConfig:
+    def apply(self, config: SurveyConfig) -> SurveyConfig:
         """The survey with these changes.
 
         Raises:
@@ -61,8 +61,8 @@ class FlightChanges:
         if self.current is not None:  # instead of a measured one
             sea = config.sea.model_copy(update={"current_file": None})
             config = config.model_copy(update={"sea": sea})
-        config = changed(config, "sea", current_mps=speed, current_towards_deg=towards)
-        return changed(
+        config = change_section(config, "sea", current_mps=speed, current_towards_deg=towards)
+        return change_section(
             config, "vehicle",
             name=self.vehicle, controller=self.controller,
             failures=self.failed, dive=self.dive, mission_file=self.mission,
@@ -97,17 +97,17 @@ def run(
     simulated = all(spec(stage).simulated for stage in stages)
     config = settings(workspace, survey, needed=not imported, simulated=simulated)
     as_written = config
-    planned = config = changed(config, "imaging", scale=scale)
+    planned = config = change_section(config, "imaging", scale=scale)
     if planned.imaging.scale != as_written.imaging.scale:
         warn(
             f"--scale {scale} holds for this run alone, the next without it renders the pictures "
             f"again: to keep it, put scale = {scale} below [imaging] in survey.toml"
         )
     if flight is not None and flight != FlightChanges():
-        config = flight.applied(config)
+        config = flight.apply(config)
         warn("these options hold for this run alone: to keep them, put them into survey.toml")
     if planes:
-        config = changed(config, "reconstruct", planes=list(planes))
+        config = change_section(config, "reconstruct", planes=list(planes))
         if config.reconstruct.planes != planned.reconstruct.planes:
             warn(
                 "these planes hold for this run alone, the next without them makes the surface "
@@ -130,8 +130,8 @@ def run(
     with only_one(workspace):
         if "fly" in stages and "plan" not in stages:
             by = flight or FlightChanges()  # what a plan may have been made with
-            alike = [planned, changed(planned, "vehicle", name=by.vehicle)]
-            alike.append(changed(alike[1], "vehicle", controller=by.controller))
+            alike = [planned, change_section(planned, "vehicle", name=by.vehicle)]
+            alike.append(change_section(alike[1], "vehicle", controller=by.controller))
             states = [spec("plan").state(workspace, one, {}) for one in alike]
             if all(state.startswith("stale") for state in states):
                 warn(f"the plan is {states[0]}; 'alice-survey plan -w {workspace}' renews it")
@@ -164,7 +164,7 @@ def plan_report(
     from missions.plan.rows import main_settings
 
     text, found = run(["plan"], workspace, survey, flight=FlightChanges(vehicle=vehicle))
-    cost, found["cost"] = _predicted(workspace, survey, GROUPS)
+    cost, found["cost"] = _predict_cost(workspace, survey, GROUPS)
     folder = workspace / "plan"
     if every_setting:
         table = (folder / "settings.txt").read_text(encoding="utf-8")
@@ -173,7 +173,7 @@ def plan_report(
     return f"{table}\n{text}\n{cost}", found
 
 
-def _predicted(
+def _predict_cost(
     workspace: Path,
     survey: Path | None,
     groups: Mapping[str, Sequence[str]],
@@ -359,7 +359,7 @@ def status_report(
     if not left:
         return text, found
     done = [name for name, state in states.items() if state == "up to date"]
-    cost, found["cost"] = _predicted(workspace, survey, {"left": left}, workers, done)
+    cost, found["cost"] = _predict_cost(workspace, survey, {"left": left}, workers, done)
     return "\n".join(filter(None, (text, cost))), found
 
 

@@ -31,7 +31,7 @@ def names(*commands: str) -> list[str]:
     return [stage.name for stage in STAGES if not commands or stage.command in commands]
 
 
-def finished(workspace: Path) -> dict[str, StageRecord]:
+def finished_stages(workspace: Path) -> dict[str, StageRecord]:
     """Records of all finished stages, by their folders."""
     found = {stage.folder: read_stage(workspace / stage.folder) for stage in STAGES}
     return {folder: record for folder, record in found.items() if record is not None}
@@ -50,7 +50,7 @@ def table() -> str:
 
 
 def _report_inputs(workspace: Path) -> list[Path]:
-    if not finished(workspace):
+    if not finished_stages(workspace):
         raise WorkspaceError(
             f"{workspace} holds nothing to report on: run 'alice-survey plan' or 'import-images'"
         )

@@ -23,10 +23,10 @@ from typing import Any, ClassVar, Self, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic_core import to_jsonable_python
 
-from alice_survey.core.contents import first_fault, shown
+from alice_survey.core.contents import as_line, first_fault
 from alice_survey.core.errors import AliceError, NavigationError, WorkspaceError, why
 from alice_survey.core.run import progress
-from alice_survey.core.run.resources import Meter, Spent, processor, versions, watched
+from alice_survey.core.run.resources import Meter, Spent, processor, versions, watch_meter
 
 T = TypeVar("T")
 
@@ -79,7 +79,7 @@ class JsonRecord(BaseModel):
             ) from None
 
     @classmethod
-    def made(cls, path: Path) -> Self | None:
+    def read_existing(cls, path: Path) -> Self | None:
         """Read a file; None where it is missing."""
         return cls.read(path) if path.is_file() else None
 
@@ -147,7 +147,7 @@ def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], object]) -> 
     if previous is not None and previous.digest == digest:
         if partial.exists():
             shutil.rmtree(partial)
-        progress.skipped(stage.name)
+        progress.skip_stage(stage.name)
         return False
 
     marker = partial / ".digest"
@@ -160,7 +160,7 @@ def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], object]) -> 
         path.write_text(digest)
     how = {"resumed": True} if resumed else {}
     with progress.stage(stage.name, **how) as finish:
-        spent = _measured(partial, work).to_json()
+        spent = _measure_work(partial, work).to_json()
         _check_unchanged(inputs, workspace, stage.name)
         record = {
             "stage": stage.name,
@@ -210,7 +210,7 @@ def _first_link(root: Path, path: Path) -> Path | None:
     return next((one for one in chain(above, inside) if one.is_symlink()), None)
 
 
-def _measured(partial: Path, work: Callable[[Path], object]) -> Spent:
+def _measure_work(partial: Path, work: Callable[[Path], object]) -> Spent:
     """Do a stage's work; return the resources used, including those of an interrupted run."""
     try:
         earlier = Spent(**json.loads((partial / _SPENT_FILE).read_text(encoding="utf-8")))
@@ -222,7 +222,7 @@ def _measured(partial: Path, work: Callable[[Path], object]) -> Spent:
         with contextlib.suppress(OSError):  # on a full disk the work itself will say so
             write_json(partial / _SPENT_FILE, spent.after(earlier).to_json())
 
-    with watched(meter, keep):
+    with watch_meter(meter, keep):
         work(partial)
         return meter.look().after(earlier)
 
@@ -388,7 +388,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
 _adapter: Callable[[Any], TypeAdapter[Any]] = functools.cache(TypeAdapter)
 
 
-def checked(kind: type[T], data: Any) -> T:
+def check_type(kind: type[T], data: Any) -> T:
     """A value of a type from JSON values, which its fields must match.
 
     Raises:
@@ -476,7 +476,7 @@ def read_csv(
         )
     missing = [name for name in required if name not in names]
     if missing:
-        raise fault(f"{path}: column {missing[0]} is missing; it has {shown(', '.join(names))}")
+        raise fault(f"{path}: column {missing[0]} is missing; it has {as_line(', '.join(names))}")
     rows = [
         (line, {name: row[name] if exact else row[name].strip() for name in names})
         for line, row in numbered

@@ -289,10 +289,10 @@ class Problem(Protocol[Guess, Normal]):
     def cost(self, guess: Guess, noise: Array) -> float:
         """Half the robust sum of squares, in sigmas; inf where a guess loses an observation."""
 
-    def linearised(self, guess: Guess, noise: Array) -> Normal:
+    def linearise(self, guess: Guess, noise: Array) -> Normal:
         """Normal equations at a guess, weights and priors included."""
 
-    def moved(self, guess: Guess, equations: Normal, step: BlockStep) -> Guess:
+    def move(self, guess: Guess, equations: Normal, step: BlockStep) -> Guess:
         """The guess after a step that its equations gave; an `AliceError` beyond what can be."""
 
     def at_bound(self, guess: Guess) -> Flags:
@@ -337,14 +337,14 @@ def minimise(
     """
     guess, noise = start, problem.noise(start)
     for _ in range(max_steps):
-        equations, cost = problem.linearised(guess, noise), problem.cost(guess, noise)
+        equations, cost = problem.linearise(guess, noise), problem.cost(guess, noise)
         pinned = problem.at_bound(guess) & (equations.shared[:-1, -1] > 0)
         while True:
             step = equations.step(damping, pinned)
             short = step.length < settled
             tried, drop = guess, -math.inf
             with suppress(AliceError):
-                tried = problem.moved(guess, equations, step)
+                tried = problem.move(guess, equations, step)
                 drop = cost - problem.cost(tried, noise)
             if drop >= 0 or short:
                 break

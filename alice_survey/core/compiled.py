@@ -47,7 +47,7 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
         that its annotations do not limit what it takes.
     """
 
-    def decorated(plain: Callable[..., Any]) -> Any:
+    def decorate(plain: Callable[..., Any]) -> Any:
         # A copy of such a kernel in the code of its caller may round in another way than its own
         # code, and whichever is loaded first is called: results would depend on what was compiled
         # before. What is inlined is always that of the caller.
@@ -60,7 +60,7 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
             kernel.compile = _once_a_machine(kernel)
         return kernel
 
-    return decorated if function is None else decorated(function)
+    return decorate if function is None else decorate(function)
 
 
 def compiled_ieee(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
@@ -124,13 +124,13 @@ def _readable(load: Callable[[], dict[Any, str]]) -> Callable[[], dict[Any, str]
     It holds the classes of the arguments by their names, which an older version may have had.
     """
 
-    def loaded() -> dict[Any, str]:
+    def load_known() -> dict[Any, str]:
         try:
             return load()
         except (AttributeError, ImportError):
             return {}
 
-    return loaded
+    return load_known
 
 
 def _once_a_machine(kernel: Any) -> Callable[[Any], Any]:
@@ -190,7 +190,7 @@ def _closure(kernel: Any, seen: set[int]) -> Iterator[str]:
     yield repr(sorted((name, _text(value)) for name, value in kernel.targetoptions.items()))
     yield repr((plain.__defaults__, plain.__kwdefaults__))
     yield from _code(plain.__code__, plain.__doc__)
-    for name, value in _referenced(plain):
+    for name, value in _references(plain):
         if hasattr(value, "py_func"):
             yield from _closure(value, seen)
         elif isinstance(value, _CONSTANTS):
@@ -208,7 +208,7 @@ def _code(code: CodeType, doc: str | None) -> Iterator[str]:
             yield _text(constant)
 
 
-def _referenced(plain: Callable[..., Any]) -> Iterator[tuple[str, Any]]:
+def _references(plain: Callable[..., Any]) -> Iterator[tuple[str, Any]]:
     """Global and enclosed values that a function names, and those it names within modules."""
     code, known = plain.__code__, plain.__globals__
     for name, cell in zip(code.co_freevars, plain.__closure__ or (), strict=True):

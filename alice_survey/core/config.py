@@ -17,7 +17,7 @@ from pydantic import (
 )
 from pydantic.config import JsonDict
 
-from alice_survey.core.contents import one_line, shown
+from alice_survey.core.contents import as_line, one_line
 from alice_survey.core.errors import ConfigError
 from alice_survey.core.plane_settings import parse_planes
 from alice_survey.core.seawater import GREEN_NM, n_water, n_water_sigma
@@ -697,7 +697,7 @@ REMOVED = {
     "reconstruct.dispersion": "it is corrected where the rig shows it: leave it out",
 }
 """Settings of version 0.1 that are gone, and what to do; for one version."""
-_LONGEST = 1_000_000
+_MAX_LENGTH = 1_000_000
 _MAX_FAULTS = 8
 """Faults reported at once."""
 
@@ -750,7 +750,7 @@ def settings_in(text: str, origin: str) -> dict[str, Any]:
     Raises:
         ConfigError: it is not TOML.
     """
-    if len(text) > _LONGEST:
+    if len(text) > _MAX_LENGTH:
         raise ConfigError(
             f"{origin}: {len(text) / 1e6:.1f} million characters: no settings file is that long"
         )
@@ -820,7 +820,7 @@ def _without_constants(settings: Mapping[str, Any]) -> dict[str, Any]:
     return result
 
 
-def changed(config: SurveyConfig, section: str, **values: Any) -> SurveyConfig:
+def change_section(config: SurveyConfig, section: str, **values: Any) -> SurveyConfig:
     """A survey with some settings of a section changed; those that are None stay as they are.
 
     Raises:
@@ -919,7 +919,7 @@ def parse_failures(texts: Sequence[str]) -> Failures:
 def _one_line(error: ValidationError) -> str:
     faults = []
     for fault in error.errors()[:_MAX_FAULTS]:
-        key = shown(".".join(str(part) for part in fault["loc"])) or "settings"
+        key = as_line(".".join(str(part) for part in fault["loc"])) or "settings"
         if key in REMOVED:
             faults.append(f"{key} is gone: {REMOVED[key]}")
         elif fault["type"] == "extra_forbidden":
@@ -927,14 +927,16 @@ def _one_line(error: ValidationError) -> str:
         elif fault["type"] == "value_error":
             faults.append(f"{key}: {fault['ctx']['error']}")
         elif fault["loc"] == ("name",) and fault["type"] == "string_pattern_mismatch":
-            faults.append(f"name = {_shown(fault['input'])}: use letters, digits, spaces, . _ -")
+            faults.append(
+                f"name = {_show_value(fault['input'])}: use letters, digits, spaces, . _ -"
+            )
         else:
-            faults.append(f"{key} = {_shown(fault['input'])}: {_requirement(fault)}")
+            faults.append(f"{key} = {_show_value(fault['input'])}: {_requirement(fault)}")
     more = error.error_count() - len(faults)
     return "; ".join(faults) + (f"; and {more} more" if more else "")
 
 
-def _shown(value: object) -> str:
+def _show_value(value: object) -> str:
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     text = repr(value)

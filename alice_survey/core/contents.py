@@ -60,7 +60,7 @@ def read_arrays(
 
 def one_line(error: BaseException) -> str:
     """Message of an exception, on one printable line; its type where the message is empty."""
-    return shown(str(error)) or type(error).__name__
+    return as_line(str(error)) or type(error).__name__
 
 
 def first_fault(error: "ValidationError", whole: str = "") -> str:
@@ -72,11 +72,11 @@ def first_fault(error: "ValidationError", whole: str = "") -> str:
     """
     first = error.errors(include_url=False)[0]
     where = ".".join(map(str, first["loc"])) or whole
-    text = shown(first["msg"].removeprefix("Value error, "))
+    text = as_line(first["msg"].removeprefix("Value error, "))
     return f"{where}: {text}" if where else text
 
 
-def shown(text: str) -> str:
+def as_line(text: str) -> str:
     """External text made safe for a message: one line, printable, of limited length."""
     plain = " ".join("".join(c if c.isprintable() else " " for c in text).split())
     return plain if len(plain) <= _SHOWN else f"{plain[: _SHOWN - 3]}..."

@@ -7,7 +7,7 @@ from pathlib import Path
 from alice_survey.core.artefacts import atomic_path
 from alice_survey.core.errors import AliceError, WorkspaceError
 
-_LONGEST = 512 << 20
+_MAX_LENGTH = 512 << 20
 """Bytes of a file that is read whole."""
 
 
@@ -15,7 +15,7 @@ class StaleError(AliceError):
     """What is to be changed is no longer what was seen."""
 
 
-def content_of(path: Path, maximum: int = _LONGEST) -> bytes | None:
+def content_of(path: Path, maximum: int = _MAX_LENGTH) -> bytes | None:
     """The content of a file; None where there is none.
 
     Raises:
@@ -54,7 +54,7 @@ def check_token(name: str, content: bytes | None, token: str | None) -> None:
         )
 
 
-def replaced(path: Path, content: bytes, check: Callable[[Path], object]) -> str:
+def replace_file(path: Path, content: bytes, check: Callable[[Path], object]) -> str:
     """Replace the content of a file if what it will hold can be read, and return its token.
 
     Raises:

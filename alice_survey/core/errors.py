@@ -119,7 +119,7 @@ def is_in_task() -> bool:
 
 
 @contextlib.contextmanager
-def heard() -> Iterator[list[str]]:
+def keep_warnings() -> Iterator[list[str]]:
     """Also keep the warnings reported meanwhile, to write them down."""
     warnings: list[str] = []
     token = _listeners.set((*_listeners.get(), warnings))

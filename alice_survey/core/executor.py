@@ -105,7 +105,7 @@ class Executor:
                 counter.advance(spent=found.spent)
 
     @contextlib.contextmanager
-    def started(self) -> Iterator["Executor"]:
+    def start(self) -> Iterator["Executor"]:
         """Within this block all calls of `map` share their processes.
 
         Starting one and loading its libraries takes about two seconds of processor time. No more

@@ -54,7 +54,7 @@ def with_settings_changed(text: str, values: Values, origin: str = "settings") -
         ConfigError: it is not TOML, or a section is not a table.
     """
     before = settings_in(text, origin)
-    wanted = with_values(before, values)
+    requested = with_values(before, values)
     line_end = "\r\n" if "\r\n" in text else "\n"
     try:
         document = tomlkit.parse(text)
@@ -80,7 +80,7 @@ def with_settings_changed(text: str, values: Values, origin: str = "settings") -
     if added:
         gap = "" if result.endswith("\n") else line_end
         result = f"{result}{gap}{added}" if result else added.removeprefix(line_end)
-    if settings_in(result, origin) != wanted:
+    if settings_in(result, origin) != requested:
         raise ConfigError(f"{origin}: write each of its sections once, as [section]")
     return result
 
@@ -107,7 +107,7 @@ def _change(
                 del table[key]
         elif key in table:
             at = next(i for i, (name, _) in enumerate(body) if name is not None and name == key)
-            body[at : at + 1] = _replaced(body[at], value, line_end)
+            body[at : at + 1] = _replacement(body[at], value, line_end)
         else:
             _insert(body, key, value, line_end)
     if plain:
@@ -129,7 +129,7 @@ def _with_body(table: Table, body: _Body) -> Table:
     return result
 
 
-def _replaced(entry: tuple[Key | None, Item], value: Any, line_end: str) -> _Body:
+def _replacement(entry: tuple[Key | None, Item], value: Any, line_end: str) -> _Body:
     """A setting with another value; with None the comment that is left of it."""
     key, old = entry
     assert key is not None  # noqa: S101  -- of a setting, not of a comment
@@ -157,7 +157,7 @@ def _insert(body: _Body, key: str, value: Any, line_end: str) -> None:
     examples = [i for i, (name, item) in enumerate(body)
                 if name is None and example.match(item.as_string())]  # fmt: skip
     for i in examples:
-        again = _uncommented(body[i][1], key, value)
+        again = _uncomment(body[i][1], key, value)
         if again is not None:
             body[i] = again
             return
@@ -170,7 +170,7 @@ def _insert(body: _Body, key: str, value: Any, line_end: str) -> None:
     body.insert(at + 1, (SingleKey(key), item))
 
 
-def _uncommented(comment: Item, key: str, value: Any) -> tuple[Key, Item] | None:
+def _uncomment(comment: Item, key: str, value: Any) -> tuple[Key, Item] | None:
     """The setting that a comment was before it was taken out, if it was."""
     written = comment.as_string().lstrip().removeprefix("#").removeprefix(" ")
     try:

@@ -92,7 +92,7 @@ class StageSpec:
 
         def work(folder: Path) -> None:
             do: StageWork = getattr(import_module(module), function)
-            with executor.started() as started:
+            with executor.start() as started:
                 do(workspace, folder, started, **taken)
 
         return run_stage(workspace, self.stage(workspace, config), work)
@@ -151,23 +151,23 @@ def without(section: str, *names: str) -> SettingsPart:
     return SettingsPart(section=section, without=frozenset(names))
 
 
-def settings_of(wanted: Any, config: Config) -> Any:
+def settings_of(requested: Any, config: Config) -> Any:
     """Settings as JSON values: what a stage's digest is made of.
 
     Args:
-        wanted: a `SettingsPart`; the dotted name of a value or a section; a mapping of these; or
+        requested: a `SettingsPart`; the dotted name of a value or a section; a mapping of these; or
             a value that stands for itself.
         config: the settings of a survey.
 
     Returns:
-        Values in the form that `wanted` has; files by their names alone, so that a survey may be
+        Values in the form that `requested` has; files by their names alone, so that a survey may be
         moved.
     """
-    if isinstance(wanted, Mapping):
-        return {key: settings_of(value, config) for key, value in wanted.items()}
-    if not isinstance(wanted, str | SettingsPart):
-        return wanted
-    part = SettingsPart(section=wanted) if isinstance(wanted, str) else wanted
+    if isinstance(requested, Mapping):
+        return {key: settings_of(value, config) for key, value in requested.items()}
+    if not isinstance(requested, str | SettingsPart):
+        return requested
+    part = SettingsPart(section=requested) if isinstance(requested, str) else requested
     value = attrgetter(part.section)(config)
     if not isinstance(value, BaseModel):
         return list(value) if isinstance(value, tuple) else value
@@ -193,14 +193,14 @@ def _file_name(value: Any, as_json: Any) -> Any:
     return Path(value).name if is_file or isinstance(value, Path) else as_json
 
 
-def files_of(wanted: Sequence[str], config: Config) -> list[Path]:
+def files_of(requested: Sequence[str], config: Config) -> list[Path]:
     """The files that settings name; none for those that are not set."""
-    values = [attrgetter(name)(config) for name in wanted]
+    values = [attrgetter(name)(config) for name in requested]
     return [path for value in values for path in (value if isinstance(value, list) else [value])
             if path is not None]  # fmt: skip
 
 
 def is_imported(workspace: Path) -> bool:
     """Whether the pictures of a workspace are real ones."""
-    pictures = records.PicturesRecord.made(workspace / "images" / "survey.json")
+    pictures = records.PicturesRecord.read_existing(workspace / "images" / "survey.json")
     return pictures is not None and pictures.source == "imported"

@@ -130,12 +130,12 @@ class _Solver(CalibrationProblem):
         off = self.prior_residuals(guess.state)
         return float(loss.sum() + 0.5 * off @ self.prior_information @ off)
 
-    def linearised(self, guess: _TargetGuess, noise: Array) -> Equations:
+    def linearise(self, guess: _TargetGuess, noise: Array) -> Equations:
         """Normal equations with Huber's weights."""
         weights = self.weights(guess, noise)
         return self.equations(guess.state, weights / (noise * self.blur) ** 2)
 
-    def moved(self, guess: _TargetGuess, equations: Equations, step: BlockStep) -> _TargetGuess:
+    def move(self, guess: _TargetGuess, equations: Equations, step: BlockStep) -> _TargetGuess:
         """The guess after a step."""
         return self.seen_from(self.stepped(guess.state, step))
 

@@ -19,7 +19,7 @@ from typing import Any
 import pycolmap
 
 from alice_survey.core.artefacts import atomic_path
-from alice_survey.core.contents import shown
+from alice_survey.core.contents import as_line
 from alice_survey.core.errors import CalibrationError
 from camera_calib.camera import Camera
 from camera_calib.formats import fields, opencv_model
@@ -78,7 +78,7 @@ class CameraRecord:
             )
         if self.refraction is not None and self.refraction not in PORTS:
             raise CalibrationError(
-                f"port {shown(self.refraction)}: {' and '.join(PORTS)} can be read"
+                f"port {as_line(self.refraction)}: {' and '.join(PORTS)} can be read"
             )
         if self.refraction is not None and len(self.port) != _PORT_PARAMETERS:
             raise CalibrationError(
@@ -249,7 +249,7 @@ def _read_text(path: Path) -> list[CameraRecord]:
                 )
             )
         except (ValueError, CalibrationError) as error:
-            raise CalibrationError(f"{where}: {shown(str(error))}") from None
+            raise CalibrationError(f"{where}: {as_line(str(error))}") from None
     return records
 
 
@@ -308,6 +308,6 @@ def _is_number(text: str) -> bool:
 def _check_model(where: str, model: str) -> str:
     if model not in MODELS:
         raise CalibrationError(
-            f"{where}: model {shown(model)} is not held here: {', '.join(MODELS)} can be read"
+            f"{where}: model {as_line(model)} is not held here: {', '.join(MODELS)} can be read"
         )
     return model

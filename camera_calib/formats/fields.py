@@ -25,7 +25,7 @@ from pydantic import (
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.artefacts import atomic_path
-from alice_survey.core.contents import first_fault, shown
+from alice_survey.core.contents import as_line, first_fault
 from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import Array
 from alice_survey.core.untrusted import refuse_declarations
@@ -66,7 +66,7 @@ class FileModel(BaseModel):
             return cls.model_validate(values)
         except ValidationError as error:
             given = error.errors(include_url=False)[0]["input"]
-            value = "" if isinstance(given, dict | list) else f" ({shown(repr(given))[:60]})"
+            value = "" if isinstance(given, dict | list) else f" ({as_line(repr(given))[:60]})"
             raise CalibrationError(f"{path}: {prefix}{first_fault(error)}{value}") from None
 
     def values(self) -> dict[str, Any]:

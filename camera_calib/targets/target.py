@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict
 
-from alice_survey.core.artefacts import checked, read_json, write_json
+from alice_survey.core.artefacts import check_type, read_json, write_json
 from alice_survey.core.contents import one_line
 from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import Array
@@ -278,7 +278,7 @@ class Target:
             raise CalibrationError(f"target: version {data.get('version')}; {VERSION} is known")
         values = {key: value for key, value in data.items() if key not in ("format", "version")}
         try:
-            return checked(cls, values)
+            return check_type(cls, values)
         except ValueError as error:
             raise CalibrationError(f"target: its file is wrong: {error}") from None
 

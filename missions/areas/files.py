@@ -17,7 +17,7 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from alice_survey.core.contents import one_line, shown
+from alice_survey.core.contents import as_line, one_line
 from alice_survey.core.errors import PlanError, warn
 from alice_survey.core.frames import Array
 from missions.areas.crs import (
@@ -125,7 +125,7 @@ def read_wkt(origin: str, text: str, crs: str | None) -> RawShapes:
     try:
         geometry = _geometry(shapely.from_wkt, text.strip(), origin)
     except shapely.errors.ShapelyError as error:
-        what = shown(str(error)) or "it cannot be read"
+        what = as_line(str(error)) or "it cannot be read"
         raise PlanError(
             f"area: {origin}: not well-known text such as POLYGON ((0 0, 30 0, 30 20, 0 0)): {what}"
         ) from None

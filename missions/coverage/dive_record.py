@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.core.artefacts import read_csv
-from alice_survey.core.contents import shown
+from alice_survey.core.contents import as_line
 from alice_survey.core.errors import NavigationError, warn
 from alice_survey.core.frames import Array, rotation_from_attitude
 from alice_survey.core.manifest import read_manifest
@@ -187,7 +187,7 @@ def read_triggers(path: Path, nav: NavigationLog) -> Triggers:
     dated = "time_s" not in names
     if dated and "time_utc" not in names:
         raise NavigationError(
-            f"{path}: no column time_s or time_utc; it has {shown(', '.join(names))}"
+            f"{path}: no column time_s or time_utc; it has {as_line(', '.join(names))}"
         )
     start = nav.start_utc if dated else None
     if dated and start is None:
@@ -201,7 +201,7 @@ def read_triggers(path: Path, nav: NavigationLog) -> Triggers:
                 times.append(float(row["time_s"]))
             lines.append(_line_number(row["line"]) if "line" in names else -1)
         except ValueError as error:
-            raise NavigationError(f"{path} line {number}: {shown(str(error))}") from None
+            raise NavigationError(f"{path} line {number}: {as_line(str(error))}") from None
         if not math.isfinite(times[-1]) or (len(times) > 1 and times[-1] <= times[-2]):
             raise NavigationError(
                 f"{path} line {number}: time {times[-1]:g} s does not follow the one before"

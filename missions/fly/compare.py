@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.core.artefacts import write_csv, write_json
-from alice_survey.core.config import SurveyConfig, changed, parse_current
+from alice_survey.core.config import SurveyConfig, change_section, parse_current
 from alice_survey.core.errors import ConfigError, VehicleError
 from alice_survey.core.executor import Executor, local_executor
 from alice_survey.core.frames import Array
@@ -401,9 +401,9 @@ def compare_report(
     """
     variants = variants_of(vehicles)
     # Turns that all can fly.
-    config = changed(config, "plan", turns="arcs")
+    config = change_section(config, "plan", turns="arcs")
     if config.plan.line_spacing_m is None:
-        config = changed(config, "plan", line_spacing_m=_PAPER_SPACING_M)
+        config = change_section(config, "plan", line_spacing_m=_PAPER_SPACING_M)
     plan = plan_survey(config, design_rig(config.camera, config.water)).plan
     cases = [_case(text) for text in currents] or list(default_cases(plan))
     if swell is not None:

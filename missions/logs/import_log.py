@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from alice_survey.core.artefacts import read_csv
-from alice_survey.core.contents import shown
+from alice_survey.core.contents import as_line
 from alice_survey.core.errors import NavigationError, warn
 from alice_survey.core.frames import Array, Datum, rotation_from_attitude
 from missions.logs.dead_reckoning import TrackErrors, with_dead_reckoning
@@ -473,7 +473,7 @@ def read_tide(text: str, *, dated: bool) -> float | Signal:
     for name in (column, "height_m"):
         if name not in names:
             raise NavigationError(
-                f"{path}: column {name} is missing; it has {shown(', '.join(names))}"
+                f"{path}: column {name} is missing; it has {as_line(', '.join(names))}"
                 + ("" if dated else " (the log's times have no date)")
             )
     times, heights = [], []

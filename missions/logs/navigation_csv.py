@@ -10,7 +10,7 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 import numpy as np
 
 from alice_survey.core.artefacts import read_csv
-from alice_survey.core.contents import shown
+from alice_survey.core.contents import as_line
 from alice_survey.core.errors import NavigationError, warn
 from alice_survey.core.frames import Array
 from missions.values.navigation import COLUMNS
@@ -202,7 +202,7 @@ class RowParser:
         times = [name for name in ("time_s", "time_utc") if name in header]
         if not times:
             raise NavigationError(
-                f"{source}: no column time_s or time_utc; it has {shown(', '.join(header))}"
+                f"{source}: no column time_s or time_utc; it has {as_line(', '.join(header))}"
             )
         self._time, self._zone, self._needed = times[0], zone, len(needed)
         self.names = [*needed, *(name for name in COLUMNS if name in header and name not in needed)]

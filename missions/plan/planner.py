@@ -16,7 +16,7 @@ import shapely.ops
 from shapely.geometry import Point
 
 from alice_survey.core.config import AreaConfig, PlanConfig, SurveyConfig
-from alice_survey.core.errors import PlanError, heard, warn
+from alice_survey.core.errors import PlanError, keep_warnings, warn
 from alice_survey.sim.vehicle.vehicle import POINT, Hull
 from camera_calib.camera import Camera
 from camera_calib.rig import Rig
@@ -92,7 +92,7 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
         PlanError: no plan meets the settings; the message names the numbers and, where one setting
             makes a plan possible, its value.
     """
-    with heard() as warnings:
+    with keep_warnings() as warnings:
         config, as_set = as_flown(config), config.plan
         plan = config.plan
         if plan.turn_radius_m > as_set.arc_radius_m:

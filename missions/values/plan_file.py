@@ -12,7 +12,7 @@ from pydantic import TypeAdapter
 from shapely.errors import ShapelyError
 
 from alice_survey.core.artefacts import read_json
-from alice_survey.core.contents import one_line, shown
+from alice_survey.core.contents import as_line, one_line
 from alice_survey.core.errors import PlanError
 from alice_survey.core.frames import Datum
 from missions.values.area import Area
@@ -209,7 +209,7 @@ def read_plan(path: str | Path) -> Plan:
         )
     except PlanError as error:
         named = str(error).startswith(str(path))
-        raise PlanError(str(error) if named else f"{path}: {shown(str(error))}") from None
+        raise PlanError(str(error) if named else f"{path}: {as_line(str(error))}") from None
     except (
         KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError,
         RecursionError, ShapelyError,

@@ -428,7 +428,7 @@ class SurveyProblem:
         pixels = cauchy_cost(guess.miss, sigma) / variance
         return 0.5 * float(pixels + off @ self.information @ off)
 
-    def linearised(self, guess: _Guess, noise: Array) -> PointEquations:
+    def linearise(self, guess: _Guess, noise: Array) -> PointEquations:
         """Normal equations with the points eliminated."""
         found = self.reduced(guess, noise, self.fields)
         found.shared[:-1, :-1] += self.information
@@ -445,7 +445,7 @@ class SurveyProblem:
         found.free[self.held] = False
         return found
 
-    def moved(self, guess: _Guess, equations: PointEquations, step: BlockStep) -> _Guess:
+    def move(self, guess: _Guess, equations: PointEquations, step: BlockStep) -> _Guess:
         """The guess after a step."""
         state = guess.state
         return self._observations(

@@ -333,7 +333,7 @@ def _patches(
     workspace: Path, bounds: tuple[float, float, float, float]
 ) -> tuple[SharedErrors, str]:
     """Where only the usual size of the poses' part is known: it is shared within patches."""
-    surface = SurfaceRecord.made(workspace / SurfaceRecord.path)
+    surface = SurfaceRecord.read_existing(workspace / SurfaceRecord.path)
     sigma = None if surface is None else surface.pose_sigma
     rest = np.diag([0.0, 0.0, (sigma or 0.0) ** 2])
     found = _lattice(
@@ -350,6 +350,6 @@ def _patches(
 
 
 def _scale_sigma(workspace: Path) -> float:
-    record = RegistrationRecord.made(workspace / RegistrationRecord.path)
+    record = RegistrationRecord.read_existing(workspace / RegistrationRecord.path)
     place = None if record is None else record.georeference
     return 0.0 if place is None else place.sigma_scale

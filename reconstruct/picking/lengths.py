@@ -411,7 +411,7 @@ def _scale_sigma(workspace: Path) -> float:
     """Relative sigma of a scale that no rig gives."""
     if MappingRecord.read(workspace / "mapping" / "mapping.json").scaled:
         return 0.0
-    if ScaleRecord.made(workspace / SCALE_FILE) is not None:
+    if ScaleRecord.read_existing(workspace / SCALE_FILE) is not None:
         return LENGTH_SCALE_SIGMA
     placed = RegistrationRecord.read(workspace / "sparse" / "registration.json").georeference
     found = None if placed is None else placed.scale_of_navigation_sigma

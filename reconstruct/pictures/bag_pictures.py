@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.core.contents import shown
+from alice_survey.core.contents import as_line
 from alice_survey.core.errors import ImageError, warn
 from alice_survey.core.executor import progress
 from alice_survey.core.frames import Array
@@ -95,7 +95,7 @@ def _cameras(
     for camera, topic in chosen.items():
         if topic not in present:
             raise ImageError(
-                f"{bag}: {camera}: no pictures in {shown(topic)}; it has "
+                f"{bag}: {camera}: no pictures in {as_line(topic)}; it has "
                 f"{', '.join(present) or 'none at all'}"
             )
     if len(set(chosen.values())) < len(chosen):
@@ -162,7 +162,7 @@ def _write(stem: Path, message: Any, lost: Counter[str], topic: str) -> Path | N
     if not hasattr(message, "encoding"):  # a CompressedImage
         suffix = next((s for magic, s in _MAGIC.items() if data.startswith(magic)), "")
         if not suffix:
-            lost[f"{topic}: pictures left out whose format is {shown(message.format)!r}"] += 1
+            lost[f"{topic}: pictures left out whose format is {as_line(message.format)!r}"] += 1
             return None
     else:
         try:
@@ -194,7 +194,7 @@ def pixels_of(message: Any) -> NDArray[Any]:
     name = encoding.rstrip("0123456789")
     bits = encoding.removeprefix(name)
     if name not in _PLAIN or bits not in ("8", "16"):
-        raise ValueError(f"encoding {shown(message.encoding)!r} is not known")
+        raise ValueError(f"encoding {as_line(message.encoding)!r} is not known")
     channels, code = _PLAIN[name]
     order = ">" if message.is_bigendian else "<"
     kind = np.dtype(f"{order}u{int(bits) // 8}")

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.core.contents import one_line, shown
+from alice_survey.core.contents import as_line, one_line
 from alice_survey.core.errors import ImageError
 from camera_calib.picture_files import (
     PILLOW_FAULTS,
@@ -329,7 +329,7 @@ def _develop(path: Path) -> NDArray[Any]:
     except (rawpy.LibRawError, OSError, ValueError, MemoryError, RuntimeError) as error:
         text = error.args[0] if error.args else error
         text = text.decode(errors="replace") if isinstance(text, bytes) else str(text)
-        raise ImageError(f"RAW cannot be developed: {shown(text)}") from None
+        raise ImageError(f"RAW cannot be developed: {as_line(text)}") from None
     return np.ascontiguousarray(rgb[..., ::-1])
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import Field
 
 from alice_survey.core.artefacts import JsonRecord, Stage, run_stage
-from alice_survey.core.errors import ImageError, WorkspaceError, heard, warn
+from alice_survey.core.errors import ImageError, WorkspaceError, keep_warnings, warn
 from alice_survey.core.executor import SERIAL, Executor
 from alice_survey.core.manifest import read_manifest, write_manifest
 from alice_survey.core.records import PicturesRecord, PlaceRecord
@@ -285,7 +285,7 @@ def preview_import(
         AliceError: the import would be refused: a folder without pictures, a log that cannot be
             read, a rig of other cameras.
     """
-    with heard() as warnings:
+    with keep_warnings() as warnings:
         scan = scan_sources(
             folders, cameras or {}, videos, recursive=recursive, navigation=navigation,
             time_zone=time_zone, rig=rig,

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from alice_survey.core.artefacts import read_csv
-from alice_survey.core.contents import shown
+from alice_survey.core.contents import as_line
 from alice_survey.core.errors import CalibrationError, ImageError, warn
 from alice_survey.core.frames import Array
 from camera_calib.calibrate.picture_sets import pair_pictures
@@ -236,7 +236,7 @@ def _trigger_times(
     which = next((name for name in ("image", "number") if name in columns), None)
     if when is None or which is None:
         raise ImageError(
-            f"{triggers}: has {shown(', '.join(columns))}: a trigger log needs the columns image "
+            f"{triggers}: has {as_line(', '.join(columns))}: a trigger log needs the columns image "
             "(or number) and time_s (or time_utc), and camera where cameras are triggered apart"
         )
     logged: dict[tuple[str, str], float] = {}
@@ -244,10 +244,12 @@ def _trigger_times(
         key = row.get("camera", "").strip(), _key(row[which], which)
         time_s = _moment(row[when].strip(), when, zone)
         if not np.isfinite(time_s) or not key[1]:
-            raise ImageError(f"{triggers} line {line}: {shown(str(row))} states no picture or time")
+            raise ImageError(
+                f"{triggers} line {line}: {as_line(str(row))} states no picture or time"
+            )
         if logged.setdefault(key, time_s) != time_s:
             raise ImageError(
-                f"{triggers} line {line}: {which} {shown(row[which])} has two times; a column "
+                f"{triggers} line {line}: {which} {as_line(row[which])} has two times; a column "
                 "camera tells those of several cameras apart"
             )
     found, lost = {}, []
@@ -270,7 +272,7 @@ def _trigger_times(
     if not found:
         raise ImageError(
             f"{triggers}: holds none of the pictures, such as {list_names(lost, 2)}; its first is "
-            f"{shown(rows[0][1][which]) if rows else 'missing'}"
+            f"{as_line(rows[0][1][which]) if rows else 'missing'}"
         )
     if lost:
         warn(f"{len(lost)} pictures are not in {triggers} and are left out: {list_names(lost)}")

@@ -45,7 +45,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.artefacts import read_csv
-from alice_survey.core.edited_files import check_token, content_of, content_token, replaced
+from alice_survey.core.edited_files import check_token, content_of, content_token, replace_file
 from alice_survey.core.errors import WorkspaceError, warn, why
 from alice_survey.core.frames import Array, Datum
 from camera_calib.approximation.pinhole_warp import PinholeWarp
@@ -396,7 +396,7 @@ def _save(
         elif not meant(cells):
             lines.append(record.text)
     lines += [_line(row, names, end) for row in left.values()]
-    return replaced(path, "".join(lines).encode("utf-8"), read)
+    return replace_file(path, "".join(lines).encode("utf-8"), read)
 
 
 def _line(cells: Mapping[str, str], names: Sequence[str], end: str) -> str:

@@ -26,7 +26,7 @@ from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError, ProjError
 
 from alice_survey.core.artefacts import need_stage, write_csv
-from alice_survey.core.contents import one_line, shown
+from alice_survey.core.contents import as_line, one_line
 from alice_survey.core.errors import WorkspaceError, warn, why
 from alice_survey.core.manifest import read_manifest
 from alice_survey.core.untrusted import xml_root
@@ -106,7 +106,7 @@ class Coordinates:
         try:
             self._crs = CRS.from_user_input(system)
         except CRSError:
-            raise ValueError(f"{shown(system)!r} is no coordinate system that is known") from None
+            raise ValueError(f"{as_line(system)!r} is no coordinate system that is known") from None
         self.geodetic = not self._crs.is_engineering
         """Whether it says where on Earth a point is; else it is a local grid, metres."""
         self._to_wgs84 = (
@@ -129,7 +129,7 @@ class Coordinates:
         try:
             longitude, latitude = self._to_wgs84.transform(x, y, errcheck=True)
         except ProjError:
-            raise ValueError(f"{x}, {y} is not a place in {shown(self._crs.name)}") from None
+            raise ValueError(f"{x}, {y} is not a place in {as_line(self._crs.name)}") from None
         return float(latitude), float(longitude), height
 
 
@@ -226,7 +226,7 @@ def _bar(
         return None
     length_m = _number(reference, "distance", name)
     if length_m <= 0:
-        raise ValueError(f"distance of {shown(name)} is {length_m}: it must be more than 0")
+        raise ValueError(f"distance of {as_line(name)} is {length_m}: it must be more than 0")
     own = _sigma(reference.get("accuracy"), f"accuracy of {name}")
     return ForeignBar(
         name=name,
@@ -278,7 +278,7 @@ def _sigma(text: str | None, name: str) -> float | None:
         return None
     value = _finite(text, name)
     if value <= 0:
-        raise ValueError(f"{shown(name)} is {value}: it must be more than 0")
+        raise ValueError(f"{as_line(name)} is {value}: it must be more than 0")
     return value
 
 
@@ -288,7 +288,7 @@ def _finite(text: str, name: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise ValueError(f"{shown(name)} is {shown(text)!r}, not a number")
+        raise ValueError(f"{as_line(name)} is {as_line(text)!r}, not a number")
     return value
 
 
@@ -327,9 +327,9 @@ def read_gcp_list(text: str) -> ForeignControl:
         try:
             x, y, z, column, row = map(float, fields[:5])
         except ValueError:
-            raise ValueError(f"line {number}: {shown(line)!r} has no five numbers") from None
+            raise ValueError(f"line {number}: {as_line(line)!r} has no five numbers") from None
         if not all(map(math.isfinite, (x, y, column, row))):
-            raise ValueError(f"line {number}: {shown(line)!r} has a number that is not finite")
+            raise ValueError(f"line {number}: {as_line(line)!r} has a number that is not finite")
         if len(fields) > _MIN_FIELDS:
             name = fields[_MIN_FIELDS]
         else:
@@ -339,7 +339,7 @@ def read_gcp_list(text: str) -> ForeignControl:
         )
         first = points.setdefault(name, point)
         if first.place != point.place and not math.isnan(z):
-            raise ValueError(f"line {number}: point {shown(name)} has another place than before")
+            raise ValueError(f"line {number}: point {as_line(name)} has another place than before")
         picks.append(ForeignPick(picture=fields[5], point=name, x_px=column, y_px=row))
     return ForeignControl(points=tuple(points.values()), picks=tuple(picks))
 
@@ -475,7 +475,7 @@ def read_foreign(path: Path) -> ForeignControl:
                 raise WorkspaceError(f"{path}: {one_line(error)}") from None
             double = [n for n, k in Counter(p.name for p in found.points).items() if k > 1]
             if double:
-                raise WorkspaceError(f"{path}: point {shown(double[0])} is there twice")
+                raise WorkspaceError(f"{path}: point {as_line(double[0])} is there twice")
             return found
     raise WorkspaceError(
         f"{path}: neither a gcp_list.txt of ODM (its first line names the coordinate system) nor "
@@ -502,7 +502,7 @@ def _usable(
         known = point.with_sigmas(sigma_m, sigma_vertical_m)
         if known is None:
             raise WorkspaceError(
-                f"{path}: states no accuracy of point {shown(point.name)}: give --sigma, in metres"
+                f"{path}: has no accuracy of point {as_line(point.name)}: give --sigma, in metres"
             )
         found.append(known)
     return found
@@ -514,7 +514,7 @@ def _bars(path: Path, foreign: ForeignControl, sigma_m: float | None) -> list[Fo
     unknown = [bar.name for bar in bars if bar.sigma_m is None]
     if unknown:
         raise WorkspaceError(
-            f"{path}: states no accuracy of scale bar {shown(unknown[0])}: give --sigma, in metres"
+            f"{path}: has no accuracy of scale bar {as_line(unknown[0])}: give --sigma, in metres"
         )
     return bars
 
@@ -565,5 +565,5 @@ def _bar_row(bar: ForeignBar) -> tuple[object, ...]:
 
 
 def _some(names: Sequence[str]) -> str:
-    text = ", ".join(shown(name) for name in names[:_SHOWN_NAMES])
+    text = ", ".join(as_line(name) for name in names[:_SHOWN_NAMES])
     return text + (f" and {len(names) - _SHOWN_NAMES} more" if len(names) > _SHOWN_NAMES else "")

@@ -541,7 +541,7 @@ def _known_scale(workspace: Path, mapping: MappingRecord) -> _KnownScale | None:
     if mapping.scaled:
         return _KnownScale(scale=1.0, source="scale from the calibrated rig", sigma=RIG_SCALE_SIGMA)
     path = workspace / SCALE_FILE
-    measured = ScaleRecord.made(path)
+    measured = ScaleRecord.read_existing(path)
     if measured is None:
         return None
     if measured.gauge != mapping.gauge:

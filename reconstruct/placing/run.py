@@ -387,7 +387,7 @@ def run_sparse(
     rig = inputs.rig
     if rig is not None and not reconstruct.refine_port:  # that finds the index from far off
         rig = knowing_water(rig, index_sigma)
-    with executor.started() as started:
+    with executor.start() as started:
         workers = Workers(executor=started, folder=folder / "parts")
         adjusted = adjust_survey(
             known, inputs.records, rig, mapping.distances, reconstruct, workers=workers

@@ -16,9 +16,9 @@ import pytest
 from alice_survey.core.cluster import engine
 from alice_survey.core.cluster.connection import read_cluster_file
 from alice_survey.core.cluster.engine import ClusterExecutor, cluster_executor
-from alice_survey.core.cluster.shared_values import LARGE_BYTES, packed, packed_once, unpacked
+from alice_survey.core.cluster.shared_values import LARGE_BYTES, pack, pack_once, unpack
 from alice_survey.core.cluster.worker import code_and_versions
-from alice_survey.core.errors import AliceError, ConfigError, WorkspaceError, heard
+from alice_survey.core.errors import AliceError, ConfigError, WorkspaceError, keep_warnings
 from alice_survey.core.executor import SERIAL, Executor
 from alice_survey.core.run.resources import Meter
 from tests import dask_tasks
@@ -40,8 +40,8 @@ def test_large_arrays_are_files_and_come_back_as_they_were(kind: str, tmp_path: 
     }[kind]
     value.flags.writeable = kind != "read only" and value.flags.writeable
 
-    data = packed({"large": value, "small": array[0], "again": value}, tmp_path)
-    found = unpacked(data, tmp_path)
+    data = pack({"large": value, "small": array[0], "again": value}, tmp_path)
+    found = unpack(data, tmp_path)
 
     assert len(data) < 2000
     assert len(list(tmp_path.iterdir())) == 1
@@ -49,14 +49,14 @@ def test_large_arrays_are_files_and_come_back_as_they_were(kind: str, tmp_path: 
         np.testing.assert_array_equal(found[name], value)
         assert found[name].dtype == value.dtype
     found["large"][:] = found["large"][::-1]
-    np.testing.assert_array_equal(unpacked(data, tmp_path)["large"], value)  # not what a task wrote
+    np.testing.assert_array_equal(unpack(data, tmp_path)["large"], value)  # not what a task wrote
 
 
 def test_arrays_of_the_same_bytes_and_another_shape_are_others(tmp_path: Path) -> None:
     array = np.arange(LARGE_BYTES, dtype=np.int64)
     wide = array.reshape(2, -1)
     for value in (array, wide, wide.astype(np.float64), np.asfortranarray(wide), wide.view("u8")):
-        found = unpacked(packed(value, tmp_path), tmp_path)
+        found = unpack(pack(value, tmp_path), tmp_path)
         np.testing.assert_array_equal(found, value)
         assert (found.dtype, found.shape, found.strides) == (
             value.dtype, value.shape, value.strides,
@@ -65,10 +65,10 @@ def test_arrays_of_the_same_bytes_and_another_shape_are_others(tmp_path: Path) -
 
 def test_a_large_function_is_sent_by_name(tmp_path: Path) -> None:
     words = tuple(f"{n} words" for n in range(10_000))
-    assert isinstance(packed_once(words[:10], tmp_path), bytes)
-    name = packed_once(words, tmp_path)
+    assert isinstance(pack_once(words[:10], tmp_path), bytes)
+    name = pack_once(words, tmp_path)
     assert isinstance(name, str)
-    assert unpacked(name, tmp_path) == words
+    assert unpack(name, tmp_path) == words
 
 
 @pytest.mark.parametrize(
@@ -105,7 +105,7 @@ def executor(machines: Machines, tmp_path: Path) -> Iterator[ClusterExecutor]:
 def reported(executor: Executor) -> tuple[list[int], list[str], str]:
     """Results until a fault, the warnings, and the fault."""
     found = []
-    with heard() as warnings, pytest.raises(AliceError) as raised:
+    with keep_warnings() as warnings, pytest.raises(AliceError) as raised:
         for result in executor.map(dask_tasks.square, range(40), label="square"):
             found.append(result)  # noqa: PERF402 (until the fault)
     return found, warnings, str(raised.value)
@@ -201,7 +201,7 @@ def test_a_task_that_hangs_runs_elsewhere(
 ) -> None:
     monkeypatch.setattr(engine, "_PATIENCE_S", 2.0)
     tasks = [(tmp_path / "hung", n) for n in range(12)]
-    with heard() as warnings:
+    with keep_warnings() as warnings:
         found = list(executor.map(dask_tasks.hang_once, tasks, label="hang"))
     assert found == [n * n for n in range(12)]
     assert [text for text in warnings if "it hangs" in text]
@@ -218,7 +218,10 @@ def test_a_worker_that_loses_the_files_is_left_out(tmp_path: Path) -> None:
     (folder / "seven").write_text("7")
     with Machines(tmp_path / "machines", workers=0) as machines:
         hidden = machines.add("hidden", wrap=space)
-        with cluster_executor(folder, machines.address, None) as executor, heard() as warnings:
+        with (
+            cluster_executor(folder, machines.address, None) as executor,
+            keep_warnings() as warnings,
+        ):
             machines.add("sound")
             while len(executor.cluster.workers()) < 2:
                 time.sleep(0.1)

@@ -14,7 +14,7 @@ from alice_survey.core.config import (
     AreaConfig,
     PlanConfig,
     SurveyConfig,
-    changed,
+    change_section,
     load_config,
     parse_config,
     parse_current,
@@ -217,10 +217,13 @@ def test_a_current_that_is_none_is_refused(text: str) -> None:
 
 def test_a_changed_setting_is_checked_like_one_in_the_file() -> None:
     config = parse_config({}, "test")
-    assert changed(config, "sea", current_mps=0.3, current_towards_deg=None).sea.current_mps == 0.3
-    assert changed(config, "sea", current_mps=None) is config
+    assert (
+        change_section(config, "sea", current_mps=0.3, current_towards_deg=None).sea.current_mps
+        == 0.3
+    )
+    assert change_section(config, "sea", current_mps=None) is config
     with pytest.raises(ConfigError, match=r"sea\.current_mps = 9"):
-        changed(config, "sea", current_mps=9)
+        change_section(config, "sea", current_mps=9)
 
 
 def test_weak_thrusters_are_read_from_their_texts() -> None:
@@ -251,7 +254,7 @@ def test_a_key_that_is_gone_may_hold_what_now_always_holds() -> None:
 def test_a_new_file_holds_every_setting_with_its_default() -> None:
     text = settings_template()
     new = parse_config(tomllib.loads(text), "template")
-    assert new == changed(SurveyConfig(), "plan", line_spacing_m=1.0)
+    assert new == change_section(SurveyConfig(), "plan", line_spacing_m=1.0)
     lines = text.splitlines()
     for section, kind in sections().items():
         part = lines[next(i for i, x in enumerate(lines) if x.startswith(f"[{section}]")) :]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from alice_survey.core.contents import one_line, read_arrays, shown, taken_from
+from alice_survey.core.contents import as_line, one_line, read_arrays, taken_from
 from alice_survey.core.errors import PlanError, WorkspaceError
 
 FILE = Path("frame.json")
@@ -33,8 +33,8 @@ def test_known_faults_pass() -> None:
 
 
 def test_text_of_others_is_shown_on_one_line() -> None:
-    assert shown("a\x1b[31m\n b\u202e") == "a [31m b"
-    assert len(shown("x" * 10_000)) == 200
+    assert as_line("a\x1b[31m\n b\u202e") == "a [31m b"
+    assert len(as_line("x" * 10_000)) == 200
     assert one_line(EOFError()) == "EOFError"
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import psutil
 import pytest
 
-from alice_survey.core.errors import AliceError, heard, note, warn
+from alice_survey.core.errors import AliceError, keep_warnings, note, warn
 from alice_survey.core.executor import SERIAL, Executor, local_executor
 from alice_survey.core.run import progress
 from tests.engines import PicklingThreads
@@ -51,7 +51,7 @@ def _process(_: int) -> int:
 
 
 def test_kept_workers_are_the_same_from_call_to_call_and_end_with_their_block() -> None:
-    with local_executor(2).started() as started:
+    with local_executor(2).start() as started:
         first, second = (set(started.map(_process, range(8), label="ids")) for _ in range(2))
         with pytest.raises(TypeError):
             list(started.map(abs, [1, "a", 2], label="abs"))  # type: ignore[arg-type]
@@ -107,7 +107,7 @@ def looked_at(number: int) -> int:
 def reported(executor: Executor, capsys: pytest.CaptureFixture[str]) -> tuple[list[int], list[str]]:
     """Results until a fault, and all that a user saw."""
     results = []
-    with heard() as warnings, pytest.raises(AliceError):
+    with keep_warnings() as warnings, pytest.raises(AliceError):
         results.extend(executor.map(looked_at, [0, 1, 2], label="look"))
         results.extend(executor.map(looked_at, [3], label="look again"))
     assert warnings == ["0 is even", "1 is odd", "2 is even", "3 is odd"]
@@ -144,7 +144,7 @@ def test_no_more_processes_start_than_there_is_memory_for(
     monkeypatch.setattr(psutil, "virtual_memory", lambda: memory)
 
     def processes(task_mib: float) -> set[int]:
-        with replace(local_executor(3), task_mib=task_mib).started() as started:
+        with replace(local_executor(3), task_mib=task_mib).start() as started:
             return set(started.map(_process, range(12), label="ids"))
 
     assert processes(2000.0) == {os.getpid()}

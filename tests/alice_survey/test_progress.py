@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from alice_survey.core.artefacts import Stage, run_stage
-from alice_survey.core.errors import heard, warn
+from alice_survey.core.errors import keep_warnings, warn
 from alice_survey.core.executor import progress as counted
 from alice_survey.core.run import progress
 from alice_survey.core.run.display import Console
@@ -204,7 +204,7 @@ def test_a_display_of_warnings_alone(
     clock: Clock, kept: Kept, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = Run(Console(quiet=True, clock=clock), [kept], clock=clock, ticks=False)
-    with progress.reported_to(run), heard() as warnings, progress.step("long"):
+    with progress.reported_to(run), keep_warnings() as warnings, progress.step("long"):
         clock.turn(100.0)
         run.tick()
         warn("it is late")

@@ -325,7 +325,7 @@ def test_other_programs_handle_signals_as_usual(monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(signal, "getsignal", lambda _: signal.SIG_DFL)  # we may be deaf to one
     before = masks()
-    with interrupts.handled(lambda _: None):
+    with interrupts.handle_signals(lambda _: None):
         assert set(masks()) == {*before, *interrupts.SIGNALS}
         with interrupts.for_other_programs():
             assert masks() == before

@@ -23,7 +23,7 @@ from alice_survey.app.stages import STAGES, spec
 from alice_survey.core import records
 from alice_survey.core.artefacts import JsonRecord, read_stage
 from alice_survey.core.config import SurveyConfig, load_config
-from alice_survey.core.errors import WorkspaceError, heard
+from alice_survey.core.errors import WorkspaceError, keep_warnings
 from alice_survey.core.executor import Executor
 from alice_survey.core.stages import StageSpec, files_of, settings_of
 
@@ -280,11 +280,11 @@ def test_a_plan_made_for_a_vehicle_is_not_stale_when_that_flies(tmp_path: Path) 
         "[plan]\ncross_lines = 0\nclosing_line = false\n[seafloor]\ngrid_m = 0.05\n"
     )
     for_sparus = FlightChanges(vehicle="sparus2", controller="los")
-    with heard() as planning:
+    with keep_warnings() as planning:
         run(["plan"], tmp_path, None, flight=for_sparus)
-    with heard() as flying:
+    with keep_warnings() as flying:
         run(["fly"], tmp_path, None, flight=for_sparus)
     assert not any("stale" in text for text in [*planning, *flying])
-    with heard() as others:
+    with keep_warnings() as others:
         run(["fly"], tmp_path, None)
     assert sum("the plan is stale (changed: vehicle.name" in text for text in others) == 1

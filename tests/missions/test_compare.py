@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from alice_survey.app.cli.main import app
-from alice_survey.core.config import SurveyConfig, changed, parse_config
+from alice_survey.core.config import SurveyConfig, change_section, parse_config
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.executor import SERIAL
 from alice_survey.sim.vehicle import files
@@ -137,7 +137,7 @@ def test_the_original_settles_where_the_closed_form_has_it() -> None:
     """On a line long enough, in a steady current across it and without gusts."""
     config = survey(45.0, 0.8, current_sigma_mps=0.0, gust_n=[0.0, 0.0, 0.0])
     # Fixes from above would shift the line under the vehicle.
-    config = changed(config, "navigation", usbl_noise_m=0.0)
+    config = change_section(config, "navigation", usbl_noise_m=0.0)
     plan = planned(config)
     case = Case(current_mps=0.05, towards_deg=90.0)
     setup, _, flight = fly_variant(flight_settings(config), plan, BY_NAME[ORIGINAL], case, 1)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from alice_survey.core.config import SurveyConfig, changed, parse_config
+from alice_survey.core.config import SurveyConfig, change_section, parse_config
 from alice_survey.core.errors import PlanError, VehicleError
 from alice_survey.core.frames import Datum
 from alice_survey.sim.vehicle.pilot.gains import gains_for
@@ -79,7 +79,7 @@ def exported(plan: Plan, config: SurveyConfig, name: str, folder: Path) -> Surve
     """The survey with its mission written, to be flown."""
     options = options_of(config.camera, config.plan, config.vehicle, config.sea)
     write_exports(folder, plan, rig_of(config), formats=[name], options=options)
-    return changed(config, "vehicle", mission_file=folder / FILES[name])
+    return change_section(config, "vehicle", mission_file=folder / FILES[name])
 
 
 def fly(plan: Plan, config: SurveyConfig) -> Flight:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.core.config import SurveyConfig, changed
+from alice_survey.core.config import SurveyConfig, change_section
 from alice_survey.core.errors import ConfigError
 from reconstruct.planes import (
     LEVEL_PLANE,
@@ -166,7 +166,7 @@ def test_without_gravity_the_pictures_say_what_is_up():
 )
 def test_a_wrong_plane_is_one_line_that_says_what_to_write(planes: list[str], said: str):
     with pytest.raises(ConfigError) as caught:
-        changed(SurveyConfig(), "reconstruct", planes=planes)
+        change_section(SurveyConfig(), "reconstruct", planes=planes)
     assert said in str(caught.value)
     assert "reconstruct.planes" in str(caught.value)
     assert "\n" not in str(caught.value)

@@ -12,7 +12,7 @@ import typer
 from pydantic import ValidationError
 
 from alice_survey.app.commands import COMMANDS
-from alice_survey.app.commands.base import Command, WorkspaceCommand, option
+from alice_survey.app.commands.base import CommandModel, WorkspaceCommand, option
 from alice_survey.core.contents import first_fault
 from alice_survey.core.errors import ConfigError, known_fault, note
 
@@ -66,7 +66,7 @@ class StudioCommand(WorkspaceCommand):
         )  # fmt: skip
 
 
-def make_app(commands: Sequence[type[Command]] = (*COMMANDS, StudioCommand)) -> typer.Typer:
+def make_app(commands: Sequence[type[CommandModel]] = (*COMMANDS, StudioCommand)) -> typer.Typer:
     """The program of some commands; those of two words are below the group of the first."""
     app = typer.Typer(
         name="alice-survey",
@@ -108,7 +108,7 @@ def make_app(commands: Sequence[type[Command]] = (*COMMANDS, StudioCommand)) -> 
     return app
 
 
-def _callback(kind: type[Command], *, is_group: bool = False) -> Callable[..., None]:
+def _callback(kind: type[CommandModel], *, is_group: bool = False) -> Callable[..., None]:
     """What typer calls for a command: it reads the options, and works within a session."""
     has_folder = (
         not is_group
@@ -158,7 +158,7 @@ def _parameter(name: str, kind: Any, default: Any = inspect.Parameter.empty) -> 
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
 
 
-def _of_field(kind: type[Command], name: str) -> inspect.Parameter:
+def _of_field(kind: type[CommandModel], name: str) -> inspect.Parameter:
     """The parameter of a field: its help, metavar and bounds."""
     field, extra = kind.model_fields[name], kind.declaration(name)
     about: dict[str, Any] = {"help": field.description, "metavar": extra["metavar"]}

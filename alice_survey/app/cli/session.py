@@ -35,7 +35,7 @@ def session(arguments: Sequence[str], *, quiet: bool, files: Sequence[Path]) -> 
     command = shlex.join(["alice-survey", *arguments])
     packages = {"python": platform.python_version(), **versions()}
     first = _Once()
-    with interrupts.handled(lambda error: _finish(run, error, first)):
+    with interrupts.handle_signals(lambda error: _finish(run, error, first)):
         try:
             with reported_to(run):
                 run.report(

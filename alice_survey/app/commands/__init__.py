@@ -1,9 +1,9 @@
 """The commands of `alice-survey`: the command line and the studio read their arguments here."""
 
 from alice_survey.app.commands import camera, intake, plan, reconstruct, survey, vehicle
-from alice_survey.app.commands.base import Command
+from alice_survey.app.commands.base import CommandModel
 
-COMMANDS: tuple[type[Command], ...] = (
+COMMANDS: tuple[type[CommandModel], ...] = (
     survey.InitCommand, survey.FovCommand, plan.PlanCommand, survey.FlyCommand,
     survey.ImageCommand, survey.TargetCommand, survey.CalibrateCommand,
     intake.ImportImagesCommand, intake.ImportLogCommand, intake.ImportControlCommand,

@@ -45,7 +45,7 @@ def argument(default: Any, text: str, metavar: str | None = None) -> Any:
     return Field(default, description=text, json_schema_extra=extra)
 
 
-class Command(BaseModel):
+class CommandModel(BaseModel):
     """A command and its arguments."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
@@ -111,13 +111,13 @@ class Command(BaseModel):
         current().report("result", text)
 
 
-class ReportCommand(Command):
+class ReportCommand(CommandModel):
     """A command whose result is text or JSON."""
 
     as_json: bool = option(False, "Print machine-readable JSON.", "--json")
 
 
-class WorkspaceCommand(Command):
+class WorkspaceCommand(CommandModel):
     """A command that works in the workspace of a survey."""
 
     workspace: Path = option(
@@ -140,7 +140,7 @@ class SurveyCommand(WorkspaceCommand, ReportCommand):
         return settings(self.workspace, self.survey, needed=needed)
 
 
-class ThreadsCommand(Command):
+class ThreadsCommand(CommandModel):
     """A command that computes on cores of this machine."""
 
     threads: int | None = option(None, "Cores to use; all when not given.", ge=1, le=256)

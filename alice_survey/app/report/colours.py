@@ -144,7 +144,7 @@ def read_shrunk(
         return values, opacity, Affine(full.a * wide, 0.0, full.c, 0.0, full.e * high, full.f)
 
 
-def coloured(level: Array, numbers: Numbers, limits: tuple[float, float], pixel: float) -> Rgba:
+def colour_tile(level: Array, numbers: Numbers, limits: tuple[float, float], pixel: float) -> Rgba:
     """Numbers as colours; unknown values are transparent.
 
     Args:
@@ -177,7 +177,7 @@ def scale_of(numbers: Numbers, limits: tuple[float, float]) -> Scale:
     )
 
 
-def encoded(tile: Rgba) -> bytes:
+def encode_webp(tile: Rgba) -> bytes:
     """A tile as WebP."""
     bgra = cv2.cvtColor(tile, cv2.COLOR_RGBA2BGRA)
     data: bytes = cv2.imencode(".webp", bgra, [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])[1].tobytes()

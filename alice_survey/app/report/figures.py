@@ -120,7 +120,7 @@ def _surface(held: Held) -> Surface:
 
     dense = held.workspace / "dense"
     heights, sigmas, stations = [], [], []
-    known = wanted = reached = 0
+    known = requested = reached = 0
     area = planned_area(held) if held.plane is None else None
     with (
         rasterio.open(dense / "dem.tif") as dem,
@@ -132,15 +132,15 @@ def _surface(held: Held) -> Surface:
             block = dem.read(1, window=window)
             there = np.isfinite(block)
             known += int(there.sum())
-            heights.append(_thinned(block[there]))
-            sigmas.append(_thinned(sigma.read(1, window=window)[there]))
-            stations.append(_thinned(seen.read(1, window=window)[there]))
+            heights.append(_thin(block[there]))
+            sigmas.append(_thin(sigma.read(1, window=window)[there]))
+            stations.append(_thin(seen.read(1, window=window)[there]))
             if area is not None:
                 inside = _inside(area, dem.window_transform(window), block.shape)
-                wanted += int(inside.sum())
+                requested += int(inside.sum())
                 reached += int((inside & there).sum())
     if area is not None:  # what lies beyond the raster counts too
-        wanted = max(wanted, round(area.area / cell**2))
+        requested = max(requested, round(area.area / cell**2))
     height, spread = np.concatenate(heights), np.concatenate(sigmas)
     spread = spread[np.isfinite(spread)]
     low, high = np.percentile(height, [0.5, 99.5]) if len(height) else (np.nan, np.nan)
@@ -152,7 +152,7 @@ def _surface(held: Held) -> Surface:
         sigma_median=float(np.median(spread)) if len(spread) else np.nan,
         sigma_95=float(np.percentile(spread, 95)) if len(spread) else np.nan,
         stations_median=float(np.median(np.concatenate(stations))) if known else np.nan,
-        covered=reached / wanted if wanted else np.nan,
+        covered=reached / requested if requested else np.nan,
     )
 
 
@@ -160,7 +160,7 @@ _KEPT = 16
 """Step between the cells that enter medians: half a million of a DEM of 3,000 by 3,000."""
 
 
-def _thinned(values: Array) -> Array:
+def _thin(values: Array) -> Array:
     return values[::_KEPT].astype(np.float64)
 
 

@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 
 from alice_survey.app import stages
-from alice_survey.app.stages import finished
+from alice_survey.app.stages import finished_stages
 from alice_survey.core.artefacts import JsonRecord, StageRecord
 from alice_survey.core.frames import Array
 from alice_survey.core.plane_settings import LEVEL
@@ -38,7 +38,7 @@ class Held:
     @classmethod
     def of(cls, workspace: Path) -> "Held":
         """Read a workspace."""
-        found = finished(workspace)
+        found = finished_stages(workspace)
         found.pop("report", None)
         return cls(workspace=workspace, stages=found)
 

@@ -14,7 +14,6 @@ from alice_survey.app.report.colours import (
     TILE_PX,
     Numbers,
     Rgba,
-    coloured,
     encoded,
     limits_of,
     number_rasters,
@@ -66,7 +65,7 @@ def _number_layer(path: Path, numbers: Numbers, *, shown: bool) -> PictureLayer:
     raster = numbers.raster
     level = numbers.levels(values.astype(np.float64).filled(np.nan))
     return _layer(
-        coloured(level, numbers, limits, transform.a), transform,
+        colour_tile(level, numbers, limits, transform.a), transform,
         name=raster.name, title=raster.title, about=raster.about, shown=shown,
         scale=scale_of(numbers, limits),
     )  # fmt: skip
@@ -94,7 +93,7 @@ def _layer(
                 tile = picture[y : y + TILE_PX, x : x + TILE_PX]
                 if tile[..., 3].any():
                     tiles[f"{level}/{x // TILE_PX}/{y // TILE_PX}"] = encoded(tile)
-        picture = _halved(picture)
+        picture = _halve(picture)
     return PictureLayer(
         name=name, title=title, about=about,
         west_m=transform.c, north_m=transform.f, pixel_m=transform.a,
@@ -103,7 +102,7 @@ def _layer(
     )  # fmt: skip
 
 
-def _halved(picture: Rgba) -> Rgba:
+def _halve(picture: Rgba) -> Rgba:
     """Half the size, rounded up; transparent pixels add no colour to their neighbours."""
     height, width = picture.shape[:2]
     padded = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0))).astype(np.uint32)

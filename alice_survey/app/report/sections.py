@@ -86,7 +86,7 @@ def sections(figures: Figures, *, has_map: bool, has_mesh: bool) -> Iterator[Sec
     if figures.truth is not None:
         yield _truth(figures.truth, held)
     if figures.reference or held.earlier:
-        yield _compared(figures)
+        yield _comparison(figures)
     if figures.control is not None:
         yield _control(figures.control)
     if held.has("dense"):
@@ -180,7 +180,7 @@ def _truth(score: ScoreRecord, held: Held) -> Section:
     )  # fmt: skip
 
 
-def _compared(figures: Figures) -> Section:
+def _comparison(figures: Figures) -> Section:
     tables, stills = [], []
     found = figures.reference
     if found:
@@ -538,11 +538,11 @@ def _settings_table(held: Held) -> Table:
     if path.is_file():
         for key, value in tomllib.loads(path.read_text(encoding="utf-8")).items():
             inner = value.items() if isinstance(value, dict) else [("", value)]
-            rows += [(f"{key}.{name}".rstrip("."), _shortened(part)) for name, part in inner]
+            rows += [(f"{key}.{name}".rstrip("."), _shorten(part)) for name, part in inner]
     return Table(title="Settings in survey.toml", header=("setting", "value"), rows=rows)
 
 
-def _shortened(value: object) -> str:
+def _shorten(value: object) -> str:
     text = str(value)
     return text if len(text) <= 120 else f"{text[:117]}..."
 

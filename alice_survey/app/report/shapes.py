@@ -37,7 +37,7 @@ def shape_layers(held: Held) -> Iterator[ShapeLayer]:
             shapes=[_pairs(np.array(part.exterior.coords)) for part in area.geoms],
             colour=_BLACK, dashed=True,
         )  # fmt: skip
-    footprints, every = thinned(list(_footprints(held)), _MAX_OUTLINES)
+    footprints, every = thin_shapes(list(_footprints(held)), _MAX_OUTLINES)
     if footprints:
         yield ShapeLayer(
             name="footprints", title="Footprints", kind="polygon", colour=_GREEN, shown=False,
@@ -62,14 +62,14 @@ def shape_layers(held: Held) -> Iterator[ShapeLayer]:
             name="flown", title="Flown", about="Where the vehicle really was (simulated).",
             kind="line", shapes=[_pairs(places[::step])], colour=_ORANGE,
         )  # fmt: skip
-    cameras, every = thinned(_cameras(held), _MAX_POINTS)
+    cameras, every = thin_shapes(_cameras(held), _MAX_POINTS)
     if cameras:
         yield ShapeLayer(
             name="cameras", title="Cameras", kind="point", colour=_BLUE, shown=not flown,
             about=f"Where pictures were taken, from the model{every}.",
             shapes=[place for place, _ in cameras], texts=[text for _, text in cameras],
         )  # fmt: skip
-    lost, every = thinned(_lost(held), _MAX_POINTS)
+    lost, every = thin_shapes(_lost_pictures(held), _MAX_POINTS)
     if lost:
         yield ShapeLayer(
             name="lost", title="Lost pictures", kind="point", colour=_RED,
@@ -85,7 +85,7 @@ def camera_place(row: Mapping[str, str]) -> Array:
     return np.array([number(row, name) for name in names])
 
 
-def thinned(
+def thin_shapes(
     shapes: Sequence[tuple[Shape, str]], maximum: int
 ) -> tuple[Sequence[tuple[Shape, str]], str]:
     """At most this many shapes, evenly taken, and words on what was left out."""
@@ -110,7 +110,7 @@ def _cameras(held: Held) -> list[tuple[Shape, str]]:
     return found
 
 
-def _lost(held: Held) -> list[tuple[Shape, str]]:
+def _lost_pictures(held: Held) -> list[tuple[Shape, str]]:
     datum = _datum(held)
     if datum is None or not held.has("sparse"):
         return []

@@ -41,7 +41,7 @@ def verdicts(figures: Figures) -> list[Verdict]:
     return worst_first([verdict for maker in makers for verdict in maker(figures)])
 
 
-def _judged(text: str, action: str, *, good: bool, bad: bool = False) -> Verdict:
+def _verdict(text: str, action: str, *, good: bool, bad: bool = False) -> Verdict:
     """Good, or else bad or something to look at, with what to do."""
     level: Level = "good" if good else "bad" if bad else "look"
     return Verdict(level=level, text=text, action="" if good else action)
@@ -51,7 +51,7 @@ def _flight(figures: Figures) -> Iterator[Verdict]:
     flight = figures.held.read(FlightRecord)
     if flight is not None:
         whole = flight.ending == "complete"
-        yield _judged(
+        yield _verdict(
             f"flight: {flight.stations} of {flight.stations_planned} stations, "
             f"{share(flight.coverage.share_at_overlap)} of the area pictured as often as required"
             + ("" if whole else f"; it ended early: {flight.ending}"),
@@ -76,14 +76,14 @@ def _pictures(figures: Figures) -> Iterator[Verdict]:
     rows = figures.held.rows("quality/quality.csv")
     flagged = [f"{row['image']} ({row['reasons']})" for row in rows if row["reasons"]]
     if rows:
-        yield _judged(
-            f"pictures: {len(flagged)} of {len(rows)} stand out{_named(flagged)}",
+        yield _verdict(
+            f"pictures: {len(flagged)} of {len(rows)} stand out{_name_list(flagged)}",
             "Look at these pictures; quality/quality.csv lists them all.",
             good=not flagged,
         )
 
 
-def _named(names: Sequence[str]) -> str:
+def _name_list(names: Sequence[str]) -> str:
     more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
     return f": {'; '.join(names[:_NAMED])}{more}" if names else ""
 
@@ -93,7 +93,7 @@ def _model(figures: Figures) -> Iterator[Verdict]:
     if found is None:
         return
     lost = found.total - found.registered
-    yield _judged(
+    yield _verdict(
         f"pictures in the model: {found.registered} of {found.total}"
         + ("; the others share too little with their neighbours" if lost else ""),
         "Fly with more overlap where pictures were lost (see the map), or with more light if they "
@@ -151,7 +151,7 @@ def _scale(figures: Figures) -> Verdict:
         return Verdict(level="good" if "rig" in source else "look", text=source,
                        action="" if "rig" in source else "Measure a known length.")  # fmt: skip
     off = 1.0 / navigation - 1.0
-    return _judged(
+    return _verdict(
         f"{source}; navigation's differs by {parts_with_sigma(-off, sigma)}",
         "Measure a known length in the water: either the rig has moved since its calibration, or "
         "navigation's scale is off.",
@@ -164,7 +164,7 @@ def _surface(figures: Figures) -> Iterator[Verdict]:
     if surface is None:
         return
     if math.isfinite(surface.covered):
-        yield _judged(
+        yield _verdict(
             f"the surface covers {share(surface.covered)} of the planned area",
             f"{_FLY_HOLES} The map shows them.",
             good=surface.covered >= _WELL_COVERED,
@@ -190,7 +190,7 @@ def _checks(figures: Figures) -> Iterator[Verdict]:
     score, found, control = figures.truth, figures.reference, figures.control
     if score is not None:
         surface, cameras = score.surface, score.cameras
-        yield _judged(
+        yield _verdict(
             f"against the truth: surface {millimetres(surface.distance_rms_mm)} rms, cameras "
             f"{millimetres(cameras.rms_mm)} rms, scale {parts(1e-6 * cameras.scale_error_ppm)}, "
             f"domed by {millimetres(surface.doming.dome_mm)}",
@@ -200,14 +200,14 @@ def _checks(figures: Figures) -> Iterator[Verdict]:
         )
         ratio = None if surface.error_over_sigma is None else surface.error_over_sigma.rms
         if ratio is not None:
-            yield _judged(
+            yield _verdict(
                 f"errors of heights over their stated sigmas: {ratio:.2f} rms (1 is expected)",
                 "Multiply the stated sigmas by this factor where it matters.",
                 good=_HONEST[0] <= ratio <= _HONEST[1],
             )
     if found is not None:
         off = found.survey_to_reference
-        yield _judged(
+        yield _verdict(
             f"against {found.reference.rsplit('/', 1)[-1]}: {length(off.median_m)} median "
             f"({off.median_px:.1f} ground pixels), after a {found.registration.transform} "
             "registration",
@@ -238,7 +238,7 @@ def _checks(figures: Figures) -> Iterator[Verdict]:
     if control.not_found:
         yield Verdict(
             level="look",
-            text=f"not found in the pictures{_named(list(control.not_found))}",
+            text=f"not found in the pictures{_name_list(list(control.not_found))}",
             action="Pick these by hand in picks.csv.",
         )
 

@@ -89,7 +89,7 @@ class Workspace:
         Raises:
             FileNotFoundError: there is no such file, or it is a link or below one.
         """
-        path = self._unlinked(names)
+        path = self._real_path(names)
         if not path.is_file():
             raise FileNotFoundError(path)
         return path
@@ -108,7 +108,7 @@ class Workspace:
     def is_folder(self, names: Sequence[str]) -> bool:
         """Whether a folder, not a link to one, is there."""
         try:
-            return self._unlinked(names).is_dir()
+            return self._real_path(names).is_dir()
         except FileNotFoundError:
             return False
 
@@ -120,7 +120,7 @@ class Workspace:
         """
         if not self.is_folder(names):
             raise FileNotFoundError
-        with os.scandir(self._unlinked(names)) as entries:
+        with os.scandir(self._real_path(names)) as entries:
             found = sorted(
                 (
                     Entry(
@@ -141,7 +141,7 @@ class Workspace:
         return tuple(self.token(path) if self.has(path) else "" for path in files)
 
     @contextmanager
-    def unchanged(self, paths: Sequence[str] = ()) -> Iterator[tuple[str, ...]]:
+    def check_unchanged(self, paths: Sequence[str] = ()) -> Iterator[tuple[str, ...]]:
         """The state of finished stages and of some files, which are read within this block.
 
         Raises:
@@ -157,7 +157,7 @@ class Workspace:
         if self.state(paths) != before:
             raise stale_page()
 
-    def _unlinked(self, names: Sequence[str]) -> Path:
+    def _real_path(self, names: Sequence[str]) -> Path:
         path = self.folder.joinpath(*names)
         if path.resolve() != path:
             raise FileNotFoundError(path)

@@ -27,13 +27,13 @@ from filelock import FileLock
 from pydantic import Field, ValidationError
 
 from alice_survey.app.commands import COMMANDS
-from alice_survey.app.commands.base import Command
+from alice_survey.app.commands.base import CommandModel
 from alice_survey.app.pipeline import is_locked
 from alice_survey.app.stages import STAGES
 from alice_survey.core.artefacts import JsonRecord, refuse_links
-from alice_survey.core.contents import first_fault, shown
+from alice_survey.core.contents import as_line, first_fault
 from alice_survey.core.errors import AliceError, ConfigError, WorkspaceError, why
-from alice_survey.core.run.events import Event, described
+from alice_survey.core.run.events import Event, event_text
 from alice_survey.core.run.interrupts import for_other_programs
 
 RECORD, OUTPUT, ERRORS, EVENTS = "job.json", "output.txt", "errors.txt", "events.jsonl"
@@ -67,11 +67,11 @@ _MAX_LINE = 4000
 _CHUNK = 1 << 20
 
 Publish = Callable[[str, Any], None]
-OFFERED: Mapping[str, type[Command]] = {one.name: one for one in COMMANDS if one.title}
+OFFERED: Mapping[str, type[CommandModel]] = {one.name: one for one in COMMANDS if one.title}
 """The commands that the studio may start."""
 
 
-def command_of(name: str, arguments: Mapping[str, Any], workspace: Path) -> Command:
+def command_of(name: str, arguments: Mapping[str, Any], workspace: Path) -> CommandModel:
     """A command that a page asks for.
 
     Args:
@@ -94,7 +94,9 @@ def command_of(name: str, arguments: Mapping[str, Any], workspace: Path) -> Comm
     elif "output" in kind.offered:  # a file of the workspace
         file = str(given.get("output", "navigation.csv"))
         if not _NAVIGATION_FILE.fullmatch(file):
-            raise ConfigError(f"{name}: output: {shown(file)} is not a name like navigation-2.csv")
+            raise ConfigError(
+                f"{name}: output: {as_line(file)} is not a name like navigation-2.csv"
+            )
         given["output"] = str(workspace.resolve() / file)
     try:
         command = kind.model_validate(given)
@@ -104,7 +106,7 @@ def command_of(name: str, arguments: Mapping[str, Any], workspace: Path) -> Comm
         value = getattr(command, field)
         for one in value if isinstance(value, list) else [value]:
             if not str(one).isprintable():
-                raise ConfigError(f"{name}: {field}: {shown(str(one))} is not one printable line")
+                raise ConfigError(f"{name}: {field}: {as_line(str(one))} is not one printable line")
             if isinstance(one, Path) and field != "output":
                 if not one.is_absolute():
                     raise ConfigError(f"{name}: {field}: {one} is not a whole path")
@@ -179,7 +181,7 @@ class RunState:
                 return
             self._logged_s[number] = elapsed_s
         try:
-            text = described(event)
+            text = event_text(event)
         except (KeyError, TypeError, ValueError):  # of another version of the program
             text = text or str(name)
         kind = str(name) if name in ("warning", "error") else "note"
@@ -518,7 +520,7 @@ class Jobs:
         found = []
         for folder in self._folders():
             with contextlib.suppress(WorkspaceError):  # of one that is being written or is damaged
-                record = JobRecord.made(folder / RECORD)
+                record = JobRecord.read_existing(folder / RECORD)
                 if record is not None and folder.name == f"{record.number:04d}":
                     found.append(record)
         return found
@@ -550,7 +552,7 @@ class Jobs:
             time.sleep(_POLL_S)
         record = job.end_record()
         with contextlib.suppress(OSError, WorkspaceError):  # a full disk, a folder that was removed
-            known = None if job.is_own else JobRecord.made(job.folder / RECORD)
+            known = None if job.is_own else JobRecord.read_existing(job.folder / RECORD)
             if known is not None and known.ended_utc is not None:
                 record = known  # by the studio that has started it, which knows its exit code
             else:

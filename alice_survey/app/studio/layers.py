@@ -25,8 +25,8 @@ from alice_survey.app.report.colours import (
     TILE_PX,
     Numbers,
     Rgba,
-    coloured,
-    encoded,
+    colour_tile,
+    encode_webp,
     limits_of,
     number_rasters,
     scale_of,
@@ -86,7 +86,7 @@ class Pyramid:
             rasterio.errors.RasterioError: it cannot be read.
         """
         self._path, self.numbers = path, numbers
-        with self._opened() as raster:
+        with self._open() as raster:
             self.west, self.north = raster.transform.c, raster.transform.f
             self.pixel = raster.transform.a
             self.limits = None if numbers is None else limits_of(raster, numbers)
@@ -94,7 +94,7 @@ class Pyramid:
             factors = raster.overviews(1)
         while max(sizes[-1]) > TILE_PX:
             if 2 ** len(sizes) in factors:
-                with self._opened(overview_level=factors.index(2 ** len(sizes))) as raster:
+                with self._open(overview_level=factors.index(2 ** len(sizes))) as raster:
                     sizes.append((raster.width, raster.height))
             else:
                 sizes.append((-(-sizes[-1][0] // 2), -(-sizes[-1][1] // 2)))
@@ -105,7 +105,7 @@ class Pyramid:
         ]
 
     @contextmanager
-    def _opened(self, **options: int) -> Iterator[Any]:
+    def _open(self, **options: int) -> Iterator[Any]:
         with (
             rasterio.Env(**_GDAL),
             rasterio.open(self._path, driver="GTiff", sharing=False, **options) as raster,
@@ -128,18 +128,18 @@ class Pyramid:
         left, top = x * TILE_PX, y * TILE_PX
         right, bottom = min(left + TILE_PX, size.columns), min(top + TILE_PX, size.rows)
         if self.numbers is None or self.limits is None:
-            return self._painted(size, left, top, right, bottom)
+            return self._paint(size, left, top, right, bottom)
         # One pixel more on each side, so that the shade has no seams.
         west, north = min(left, 1), min(top, 1)
         east, south = min(size.columns - right, 1), min(size.rows - bottom, 1)
         values = self.values(size, left - west, top - north, right + east, bottom + south)
-        whole = coloured(self.numbers.levels(values), self.numbers, self.limits, size.east)
+        whole = colour_tile(self.numbers.levels(values), self.numbers, self.limits, size.east)
         return whole[north : whole.shape[0] - south, west : whole.shape[1] - east]
 
     def values(self, size: Level, left: int, top: int, right: int, bottom: int) -> Array:
         """Means of known numbers of a part of a level; NaN where none is known."""
         window, shape = _window(self.levels[0], size, left, top, right, bottom)
-        with self._opened() as raster:
+        with self._open() as raster:
             read = raster.read(
                 1, window=window, out_shape=shape, out_dtype="float32", masked=True,
                 resampling=Resampling.average,
@@ -147,10 +147,10 @@ class Pyramid:
         values: Array = read.filled(np.nan)
         return values
 
-    def _painted(self, size: Level, left: int, top: int, right: int, bottom: int) -> Rgba:
+    def _paint(self, size: Level, left: int, top: int, right: int, bottom: int) -> Rgba:
         window, shape = _window(self.levels[0], size, left, top, right, bottom)
         options = {"window": window, "resampling": Resampling.average}
-        with self._opened() as raster:
+        with self._open() as raster:
             bands = raster.read([1, 2, 3], out_shape=(3, *shape), **options)
             opacity = raster.dataset_mask(out_shape=shape, **options)
         picture: Rgba = np.dstack([*bands, np.where(opacity < _OPAQUE, 0, 255)]).astype(np.uint8)
@@ -201,7 +201,7 @@ class Layers:
         return self._workspace.file(_LAYERS[name].path.parts)
 
     def _picture_layer(self, name: str, *, shown: bool) -> PictureLayer:
-        with self._unchanged(name, None) as token:
+        with self._check_unchanged(name, None) as token:
             pyramid = self._pyramid(name, token)
         numbers, limits, full = pyramid.numbers, pyramid.limits, pyramid.levels[0]
         return PictureLayer(
@@ -232,7 +232,7 @@ class Layers:
             StaleError: there is another raster by now, or it is being written to.
             WorkspaceError: it is damaged.
         """
-        with self._unchanged(name, token) as now:
+        with self._check_unchanged(name, token) as now:
             return self._tile(name, now, level, x, y), now
 
     def close(self) -> None:
@@ -241,7 +241,7 @@ class Layers:
             self._renderers.acquire(timeout=_ENDING_S / self._max_renderers)
 
     @contextmanager
-    def _unchanged(self, name: str, token: str | None) -> Iterator[str]:
+    def _check_unchanged(self, name: str, token: str | None) -> Iterator[str]:
         """The token of a layer's file, which is read within this block."""
         now = token_of(self._path(name).stat())
         if token not in (None, now):
@@ -266,4 +266,4 @@ class Layers:
     def _read_tile(self, name: str, token: str, level: int, x: int, y: int) -> bytes:
         with self._renderers:
             pyramid = self._pyramid(name, token)
-            return encoded(pyramid.tile(len(pyramid.levels) - 1 - level, x, y))
+            return encode_webp(pyramid.tile(len(pyramid.levels) - 1 - level, x, y))

@@ -89,7 +89,7 @@ class Connection:
 
 
 @contextlib.contextmanager
-def connected(scheduler: str | None, file: Path | None) -> Iterator[Connection]:
+def connect(scheduler: str | None, file: Path | None) -> Iterator[Connection]:
     """Within this block, be a client of a scheduler; a cluster that was started ends with it.
 
     Args:
@@ -112,7 +112,7 @@ def connected(scheduler: str | None, file: Path | None) -> Iterator[Connection]:
     with contextlib.ExitStack() as stack:
         where: dict[str, Any]
         if config.start is not None:
-            cluster = stack.enter_context(_started(config))
+            cluster = stack.enter_context(_start_cluster(config))
             if config.workers is not None:
                 cluster.scale(config.workers)
             address, where = cluster.scheduler_address, {"address": cluster}
@@ -164,7 +164,7 @@ def read_cluster_file(path: Path) -> ClusterConfig:
 
 
 @contextlib.contextmanager
-def _started(config: ClusterConfig) -> Iterator[Any]:
+def _start_cluster(config: ClusterConfig) -> Iterator[Any]:
     module, _, name = str(config.start).rpartition(".")
     try:
         kind = getattr(import_module(module), name)

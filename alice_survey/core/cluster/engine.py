@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 from filelock import FileLock, Timeout
 
 from alice_survey.core.artefacts import refuse_links
-from alice_survey.core.cluster.connection import Connection, connected
+from alice_survey.core.cluster.connection import Connection, connect
 from alice_survey.core.cluster.worker import (
     Answer,
     RunSite,
@@ -79,7 +79,7 @@ def cluster_executor(
     """
     with (
         warnings.catch_warnings(),
-        connected(scheduler, file) as connection,
+        connect(scheduler, file) as connection,
         _store(workspace) as store,
     ):
         warnings.filterwarnings("ignore", "Sending large graph")
@@ -132,7 +132,7 @@ class ClusterExecutor(Executor):
     cluster: "Cluster"
 
     @contextlib.contextmanager
-    def started(self) -> Iterator[Executor]:
+    def start(self) -> Iterator[Executor]:
         """The same: its workers run already."""
         yield self
 
@@ -184,11 +184,11 @@ class Cluster:
                 reasons = waiting.map(self.why_unfit, found)
                 for (address, about), why_unfit in zip(found.items(), reasons, strict=True):
                     if why_unfit:
-                        raise WorkspaceError(f"worker {_named(address, about)}: {why_unfit}")
+                        raise WorkspaceError(f"worker {_worker_name(address, about)}: {why_unfit}")
                     if why_unfit is not None:
                         checked[address] = about
                     counter.advance()
-        with self.lost():
+        with self.report_loss():
             services = self.client.scheduler_info(n_workers=0)["services"]
         shown = f"; dashboard: {self.client.dashboard_link}" if "dashboard" in services else ""
         count = f"{len(checked)} worker{'s' if len(checked) > 1 else ''}"
@@ -216,18 +216,18 @@ class Cluster:
         if about is not None and why_threads(about):
             return why_threads(about)
         try:
-            if self._asked(address, import_module, check_worker.__module__) is None:
+            if self._ask(address, import_module, check_worker.__module__) is None:
                 return None
-            found: str | None = self._asked(address, check_worker, self.site, reply)
+            found: str | None = self._ask(address, check_worker, self.site, reply)
         except ImportError as error:
             return f"alice-survey cannot be imported ({error}): install the same version there"
         if found == "" and not (self.site.store / reply).exists():
             return f"{self.site.store} is another folder there"
         return found
 
-    def _asked(self, address: str, function: Callable[..., Any], *args: Any) -> Any:
+    def _ask(self, address: str, function: Callable[..., Any], *args: Any) -> Any:
         """Result of a function on one worker; None where it has ended."""
-        with self.lost():
+        with self.report_loss():
             future = self.client.submit(function, *args, workers=[address], pure=False)
             while address in self.workers():
                 with contextlib.suppress(TimeoutError):
@@ -237,7 +237,7 @@ class Cluster:
     def workers(self) -> dict[str, Any]:
         """What is known of each worker, by its address; a few seconds old at most."""
         if time.monotonic() - self._known_s > _LOOK_EVERY_S:
-            with self.lost():
+            with self.report_loss():
                 self._known = self.client.scheduler_info(n_workers=-1)["workers"]
             self._known_s = time.monotonic()
         return self._known
@@ -260,12 +260,12 @@ class Cluster:
         if address not in self._unfit:
             self._unfit.add(address)
             about = self.workers().get(address, {})
-            warn(f"worker {_named(address, about)} gets no more tasks: {reason}")
+            warn(f"worker {_worker_name(address, about)} gets no more tasks: {reason}")
 
     def retire(self, address: str, reason: str) -> None:
         """Have a worker ended; the scheduler gives its tasks to others."""
         self.exclude(address, reason)
-        with self.lost():
+        with self.report_loss():
             self.client.retire_workers([address])
 
     def begun(self, number: int) -> tuple[float, str] | None:
@@ -284,7 +284,7 @@ class Cluster:
             self._begun[facts["task"]] = time.monotonic(), facts["worker"]
 
     @contextlib.contextmanager
-    def lost(self) -> Iterator[None]:
+    def report_loss(self) -> Iterator[None]:
         """Report a scheduler that no longer answers.
 
         Raises:
@@ -311,7 +311,7 @@ def why_threads(about: dict[str, Any]) -> str:
     )
 
 
-def _named(address: str, about: dict[str, Any]) -> str:
+def _worker_name(address: str, about: dict[str, Any]) -> str:
     name = str(about.get("name", address))
     return address if name == address else f"{name} ({address})"
 
@@ -333,12 +333,12 @@ class _Tasks:
 
     def submit(self, function: Callable[..., Any], /, *args: Any) -> "_Submitted":
         """Send a task to the scheduler."""
-        from alice_survey.core.cluster.shared_values import packed, packed_once
+        from alice_survey.core.cluster.shared_values import pack, pack_once
 
         store = self.cluster.site.store
         if function is not self._function:
-            self._function, self._packed = function, packed_once(function, store)
-        return _Submitted(self, self._packed, packed(args, store))
+            self._function, self._packed = function, pack_once(function, store)
+        return _Submitted(self, self._packed, pack(args, store))
 
     def send(
         self, number: int, function: bytes | str, arguments: bytes
@@ -369,7 +369,7 @@ class _Tasks:
             return None
         if self._memory and large and all(_MEMORY in w["resources"] for w in large.values()):
             options["resources"] = {_MEMORY: self._memory}
-        with cluster.lost():
+        with cluster.report_loss():
             future = cluster.client.submit(
                 run_task, cluster.site, number, function, arguments,
                 key=f"{self.label}-{cluster.site.store.name}-{next(cluster.numbers)}",
@@ -438,7 +438,7 @@ class _Submitted:
             self._wait_for_worker()
             return None
         try:
-            with cluster.lost(), contextlib.suppress(TimeoutError):
+            with cluster.report_loss(), contextlib.suppress(TimeoutError):
                 found: Answer = self._future.result(timeout=_LOOK_EVERY_S)
                 return found
         except KilledWorker as error:

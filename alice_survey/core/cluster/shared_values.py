@@ -22,16 +22,16 @@ _KEPT_BYTES = 1 << 28
 """Arrays that a worker keeps."""
 
 
-def packed(value: Any, folder: Path) -> bytes:
+def pack(value: Any, folder: Path) -> bytes:
     """Pickle a value; its large arrays go into the folder."""
     data = io.BytesIO()
     _Pickler(data, folder).dump(value)
     return data.getvalue()
 
 
-def packed_once(value: Any, folder: Path) -> bytes | str:
+def pack_once(value: Any, folder: Path) -> bytes | str:
     """Pickle a value that many tasks take; a long pickle goes into the folder, and has a name."""
-    data = packed(value, folder)
+    data = pack(value, folder)
     if len(data) < LARGE_BYTES:
         return data
     name = f"{hashlib.blake2b(data, digest_size=16).hexdigest()}.pickle"
@@ -40,7 +40,7 @@ def packed_once(value: Any, folder: Path) -> bytes | str:
     return name
 
 
-def unpacked(data: bytes | str, folder: Path) -> Any:
+def unpack(data: bytes | str, folder: Path) -> Any:
     """The value again, which shares nothing with other tasks."""
     content = data if isinstance(data, bytes) else _content(folder / data)
     return _Unpickler(io.BytesIO(content), folder).load()

@@ -80,21 +80,21 @@ def run_task(site: RunSite, number: int, function: bytes | str, arguments: bytes
     why = why_unfit(site)
     if why:
         return Answer(worker.address, unfit=why)
-    from alice_survey.core.cluster.shared_values import unpacked
+    from alice_survey.core.cluster.shared_values import unpack
 
     worker.log_event(site.store.name, {"task": number, "worker": worker.address})
     began_s = time.monotonic()
     failed = False
     try:
         with contextlib.chdir(site.folder):
-            result = unpacked(function, site.store)(*unpacked(arguments, site.store))
+            result = unpack(function, site.store)(*unpack(arguments, site.store))
     except Exception as error:  # whatever the task raises is for the run to handle
         error.add_note("".join(traceback.format_exception(error)))
         error.__cause__ = error.__context__ = None
         failed, result = True, error
     return Answer(
         worker.address,
-        data=_pickled(result),
+        data=_pickle(result),
         failed=failed,
         took_s=time.monotonic() - began_s,
         is_below=_is_below(site.host, site.process),
@@ -126,17 +126,17 @@ def why_unfit(site: RunSite) -> str:
         )
     if seen != site.store.name:
         return f"{site.store} is another folder there"
-    here, wanted = dict(code_and_versions()), dict(site.code)
-    for name in sorted(here.keys() | wanted.keys()):
-        if here.get(name) != wanted.get(name):
+    here, requested = dict(code_and_versions()), dict(site.code)
+    for name in sorted(here.keys() | requested.keys()):
+        if here.get(name) != requested.get(name):
             return (
                 f"it has {name} {here.get(name, 'not at all')}, this machine has "
-                f"{wanted.get(name, 'none')}: install the same on both"
+                f"{requested.get(name, 'none')}: install the same on both"
             )
     return ""
 
 
-def _pickled(value: Any) -> bytes:
+def _pickle(value: Any) -> bytes:
     try:
         return pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
     except Exception as error:  # an error of a library may not be picklable

@@ -11,7 +11,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from rich.progress import TimeRemainingColumn as RemainingColumn
 
 from alice_survey.core.errors import outliving, say
-from alice_survey.core.run.events import Event, duration, event_of, finished, how_far
+from alice_survey.core.run.events import Event, duration, event_of, how_far, step_end_text
 
 _LONG_S = 2.0
 """A step or a stage that took less gets no line."""
@@ -69,7 +69,7 @@ def _line_of(event: Event, *, alive: bool) -> str | None:
         case "stage_runs" if alive:
             return f"{event['stage']}: working for {duration(event['elapsed_s'])}"
         case "step_finished" if event["elapsed_s"] > _LONG_S:
-            return finished(event) if event["complete"] else None
+            return step_end_text(event) if event["complete"] else None
         case "stage_finished" if event["took_s"] > _LONG_S:
             return f"{event['stage']}: done in {duration(event['took_s'])}"
     return None

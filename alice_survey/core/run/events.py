@@ -103,11 +103,11 @@ class LogFile(_LinesFile):
     def format(self, record: logging.LogRecord) -> str:
         """A line of time, level and text; details are indented."""
         event = event_of(record)
-        lines = described(event).splitlines() or [""]
+        lines = event_text(event).splitlines() or [""]
         return f"{event['time_utc']} {record.levelname} " + "\n    ".join(lines)
 
 
-def described(event: Event) -> str:
+def event_text(event: Event) -> str:
     """An event in words; further lines are details."""
     text = event.get("message", "")
     of_stage = f"{event['stage']}: " if "stage" in event else ""
@@ -131,7 +131,7 @@ def described(event: Event) -> str:
         case "step_progress":
             return f"{of_stage}{how_far(event)}"
         case "step_finished":
-            return f"{of_stage}{finished(event)}"
+            return f"{of_stage}{step_end_text(event)}"
         case "error" if "traceback" in event:
             return f"{text}\n{event['traceback'].rstrip()}"
     return str(text)
@@ -145,7 +145,7 @@ def how_far(event: Event) -> str:
     return f"{event['step']}{count}{total} after {duration(event['elapsed_s'])}{left}"
 
 
-def finished(event: Event) -> str:
+def step_end_text(event: Event) -> str:
     """A step that has ended, or was given up."""
     count = f"{event['done']} " if "done" in event else ""
     how = "done in" if event.get("complete", True) else "given up after"

@@ -53,7 +53,7 @@ def behind(error: BaseException) -> KeyboardInterrupt | None:
 
 
 @contextlib.contextmanager
-def handled(finish: Callable[[KeyboardInterrupt], None]) -> Iterator[None]:
+def handle_signals(finish: Callable[[KeyboardInterrupt], None]) -> Iterator[None]:
     """Within this block `SIGNALS` raise `Interrupted` in the main thread.
 
     A thread waits for them. They are blocked everywhere else, also in processes started within:

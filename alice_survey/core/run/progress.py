@@ -320,7 +320,7 @@ def stage(name: str, **facts: Any) -> Iterator[Callable[..., None]]:
         run.end_stage(last if complete else None)
 
 
-def skipped(name: str) -> None:
+def skip_stage(name: str) -> None:
     """A stage is up to date."""
     current().skip_stage(name)
 

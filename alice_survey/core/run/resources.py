@@ -96,7 +96,7 @@ class Meter:
 
 
 @contextlib.contextmanager
-def watched(meter: Meter, report: Callable[[Spent], None]) -> Iterator[None]:
+def watch_meter(meter: Meter, report: Callable[[Spent], None]) -> Iterator[None]:
     """Read a meter about once a second from a thread of its own, and report every few seconds.
 
     Memory that many files are mapped to takes long to count: then it is read less often.

@@ -22,7 +22,7 @@ from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
 
 from alice_survey.core.artefacts import write_json
 from alice_survey.core.config import VEHICLE_FILES, Config
-from alice_survey.core.contents import one_line, shown
+from alice_survey.core.contents import as_line, one_line
 from alice_survey.core.errors import VehicleError, why
 from alice_survey.sim.vehicle.coefficients import FORCES, Coefficients
 from alice_survey.sim.vehicle.fins import Fin
@@ -168,7 +168,7 @@ def _with_shape(table: dict[str, Any]) -> dict[str, Any]:
     shape = SHAPES.get(str(named))
     if shape is None:
         raise VehicleError(
-            f"geometry {shown(str(named))!r} is not known; known: {', '.join(SHAPES)}: leave "
+            f"geometry {as_line(str(named))!r} is not known; known: {', '.join(SHAPES)}: leave "
             "it out, and give [hull] and [coefficients]"
         )
     if not isinstance(body, dict):
@@ -261,7 +261,7 @@ def _coefficients(path: Path, name: str, values: Mapping[str, float]) -> Coeffic
     try:
         return Coefficients(name=name, values=values)
     except VehicleError as error:
-        raise VehicleError(f"{path}: {shown(str(error))}") from None
+        raise VehicleError(f"{path}: {as_line(str(error))}") from None
 
 
 def read_table(path: Path) -> dict[str, Any]:
@@ -302,7 +302,7 @@ def parse_table(path: Path, kind: type[_Kind], table: object) -> _Kind:
         return TypeAdapter(kind).validate_python(table)
     except ValidationError as error:
         faults = [
-            f"{shown('.'.join(map(str, fault['loc']))) or 'the table'}: {fault['msg']}"
+            f"{as_line('.'.join(map(str, fault['loc']))) or 'the table'}: {fault['msg']}"
             for fault in error.errors()[:_MAX_FAULTS]
         ]
         raise VehicleError(f"{path}: {'; '.join(faults)}") from None

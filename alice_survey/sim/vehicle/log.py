@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.core.artefacts import write_csv
 from alice_survey.core.config import Config
-from alice_survey.core.contents import shown
+from alice_survey.core.contents import as_line
 from alice_survey.core.errors import VehicleError, warn
 from alice_survey.core.frames import Array, attitude_from_rotation, rotation_from_attitude
 from alice_survey.sim.vehicle.files import parse_table, read_table
@@ -230,14 +230,14 @@ def read_number_columns(path: Path) -> dict[str, Array]:
         elif _is_used(name) or any(v is not None and math.isfinite(v) for v in values):
             line, row = rows[bad]
             raise VehicleError(
-                f"{path} line {line}: {shown(name)} is {row[i]!r:.60}, not a finite number"
+                f"{path} line {line}: {as_line(name)} is {row[i]!r:.60}, not a finite number"
             )
         else:
             text.append(name)
     if not columns:
         raise VehicleError(f"{path}: holds no column of numbers")
     if text:
-        warn(f"{path}: columns of text are left out: {shown(', '.join(text))}")
+        warn(f"{path}: columns of text are left out: {as_line(', '.join(text))}")
     return columns
 
 
@@ -418,7 +418,7 @@ def read_foreign_log(path: Path, columns: ColumnMap) -> VehicleLog:
 
     def one(name: str) -> Array:
         if name not in table:
-            raise VehicleError(f"{path}: column {shown(name)} is missing")
+            raise VehicleError(f"{path}: column {as_line(name)} is missing")
         return table[name]
 
     rows = len(next(iter(table.values())))
@@ -463,7 +463,7 @@ def read_foreign_log(path: Path, columns: ColumnMap) -> VehicleLog:
     for name, column in columns.pulses.items():
         pulses = one(column.removeprefix("-"))
         pulses = 2.0 * _NEUTRAL_US - pulses if column.startswith("-") else pulses
-        named[f"thrust_{name}_n"] = _thrust(pulses, columns, f"{path}: column {shown(column)}")
+        named[f"thrust_{name}_n"] = _thrust(pulses, columns, f"{path}: column {as_line(column)}")
     return log_of_columns(named, str(path))
 
 

@@ -106,7 +106,7 @@ class Curves:
         loss = np.where(size <= 1, 0.5 * size**2, size - 0.5)
         return float(loss.sum()) if inside else np.inf
 
-    def linearised(self, guess: Array, noise: Array) -> Equations:
+    def linearise(self, guess: Array, noise: Array) -> Equations:
         misses, fall = self.misses(guess), np.exp(-guess[-1] * self.time)
         weight = 1.0 / np.maximum(np.abs(misses), 1.0)
         by_shared = -guess[:-1, None] * self.time * fall
@@ -119,7 +119,7 @@ class Curves:
             shared=shared,
         )
 
-    def moved(self, guess: Array, equations: Equations, step: BlockStep) -> Array:
+    def move(self, guess: Array, equations: Equations, step: BlockStep) -> Array:
         rate = max(guess[-1] + step.shared[0], self.low)
         if rate > 50.0:
             raise AliceError("too fast")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from alice_survey.core.config import CameraConfig, PlanConfig, SeaConfig, VehicleConfig
-from alice_survey.core.errors import heard
+from alice_survey.core.errors import keep_warnings
 from alice_survey.sim.vehicle.pilot.mission import steady_drift
 from missions.coverage.stations import stations_of_plan
 from missions.exports.follower import (
@@ -28,7 +28,7 @@ def options(vehicle: str = "alice", **sea: Any) -> Options:
 
 
 def about(folder: Path, given: Options, formats: list[str] | None) -> tuple[str, list[str]]:
-    with heard() as warnings:
+    with keep_warnings() as warnings:
         write_exports(folder, small_plan(), RIG, formats=formats, options=given)
     return (folder / "about.txt").read_text(), list(warnings)
 

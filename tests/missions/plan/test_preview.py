@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from alice_survey.core.config import SurveyConfig, changed, parse_config, with_settings
+from alice_survey.core.config import SurveyConfig, change_section, parse_config, with_settings
 from alice_survey.core.errors import collected_by
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import certificate
@@ -61,18 +61,18 @@ def test_holes_are_where_the_area_is_not_covered() -> None:
 
 
 def test_the_suggestion_of_a_conflict_works() -> None:
-    config = changed(SMALL, "plan", forward_overlap=0.95, speed_mps=1.2)
+    config = change_section(SMALL, "plan", forward_overlap=0.95, speed_mps=1.2)
     found = preview(config)
     assert not found["ok"] and len(found["error"].splitlines()) == 1
     ((section, values),) = found["suggestion"].items()
-    assert preview(changed(config, section, **values))["ok"]
-    found = preview(changed(SMALL, "area", seafloor_depth_m=1.5))
+    assert preview(change_section(config, section, **values))["ok"]
+    found = preview(change_section(SMALL, "area", seafloor_depth_m=1.5))
     assert not found["ok"] and found["suggestion"] is None and "altitude_m" in found["error"]
 
 
 @pytest.mark.parametrize("cells", [2_000, 20_000])
 def test_a_quick_look_estimates_the_certificate(cells: int) -> None:
-    config = changed(SMALL, "plan", line_spacing_m=1.45)
+    config = change_section(SMALL, "plan", line_spacing_m=1.45)
     made, rig = planned(config), design_rig(config.camera, config.water)
     stations, pattern = stations_of_plan(made.plan), plan_pattern(made.plan, rig)
     quick = certificate(made.plan.area, rig, stations, pattern, max_cells=cells)

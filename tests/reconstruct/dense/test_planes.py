@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.app.stages import spec
 from alice_survey.core.artefacts import read_json, write_csv
 from alice_survey.core.config import ReconstructConfig, SurveyConfig
-from alice_survey.core.errors import heard
+from alice_survey.core.errors import keep_warnings
 from alice_survey.core.executor import SERIAL
 from reconstruct.views.model import SparseModel
 from tests.oracles_dense import (
@@ -75,7 +75,7 @@ def wall(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
     write_workspace(folder, model, SCENE, WORLD_FROM_SCENE)
     write_track(folder, views)
     planes = config("back=facing 0", "wall=facing 180")
-    with heard() as warnings:
+    with keep_warnings() as warnings:
         assert spec("dense").make(folder, planes, SERIAL)
         assert spec("mosaic").make(folder, planes, SERIAL)
     return folder, [str(warning) for warning in warnings]

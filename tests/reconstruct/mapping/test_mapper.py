@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.core.errors import heard
+from alice_survey.core.errors import keep_warnings
 from camera_calib.approximation.pinhole_warp import best_warp
 from reconstruct.mapping.database import Observations, write_database
 from reconstruct.mapping.mapper import (
@@ -196,7 +196,7 @@ def test_cameras_that_took_no_pictures_together_calibrate_themselves() -> None:
         taken=scene.pixels,
         pairs=scene.pairs,
     )
-    with TemporaryDirectory() as folder, heard() as warnings:
+    with TemporaryDirectory() as folder, keep_warnings() as warnings:
         mapped = map_self_calibrated(seen, (), Path(folder), 1)
     assert warnings == [] and "each calibrates itself" in mapped.notes[0]
     assert mapped.models[0] == len(alone) and set(mapped.warps) == set(names)

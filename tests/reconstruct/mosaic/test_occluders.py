@@ -57,7 +57,7 @@ def occluders(tmp_path_factory: pytest.TempPathFactory) -> Occluders:
         nodata=np.nan, transform=from_origin(-2.0, 2.0, CELL_M, CELL_M),
     ) as raster:  # fmt: skip
         raster.write(heights, 1)
-    with local_executor().started() as executor:
+    with local_executor().start() as executor:
         find_occluders(
             folder, LEVEL_PLANE, folder / "dem.tif", folder / "found", executor, "find occluders"
         )

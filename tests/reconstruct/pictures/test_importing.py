@@ -11,7 +11,7 @@ from PIL import Image
 
 from alice_survey.core.artefacts import read_json
 from alice_survey.core.config import CameraConfig, WaterConfig
-from alice_survey.core.errors import AliceError, ImageError, WorkspaceError, heard
+from alice_survey.core.errors import AliceError, ImageError, WorkspaceError, keep_warnings
 from alice_survey.core.executor import local_executor
 from alice_survey.core.manifest import read_manifest
 from camera_calib.rig import design_rig, read_rig, write_rig
@@ -148,7 +148,7 @@ def test_masks_and_workspace_in_the_folder_are_not_left_out(tmp_path: Path, draw
     cv2.imwrite(str(source / "1_mask.png"), mask)
     (source / "masks").mkdir()
     cv2.imwrite(str(source / "masks" / "2.png"), mask)
-    with heard() as warnings:
+    with keep_warnings() as warnings:
         found = import_images(source / "work", [source], masks=source / "masks")
     assert reasons(found) == {} and warnings == []
     assert not import_images(source / "work", [source], masks=source / "masks").changed
@@ -187,7 +187,7 @@ def test_a_camera_that_missed_a_moment_is_paired_by_number(tmp_path: Path, draw:
         for number in range(7, 12):
             if (side, number) != ("bow", 8):
                 draw(tmp_path / side / f"{side}_{number}.png", number)
-    with heard() as warnings:
+    with keep_warnings() as warnings:
         found = import_images(tmp_path / "w", [], cameras=cameras)
     assert str(found) == "14 pictures (14 PNG) of down, bow and port, 0 with a position"
     assert not warnings

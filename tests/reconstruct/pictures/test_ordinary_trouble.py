@@ -13,7 +13,7 @@ import pytest
 from PIL import Image, ImageFile, JpegImagePlugin
 
 from alice_survey.core.artefacts import read_json
-from alice_survey.core.errors import ImageError, heard
+from alice_survey.core.errors import ImageError, keep_warnings
 from alice_survey.core.manifest import read_manifest
 from camera_calib.picture_files import without_orientation
 from reconstruct.pictures.files import can_read_heic, decode, exif_focal_px, inspect
@@ -126,7 +126,7 @@ def test_copies_are_left_out_and_named(tmp_path: Path) -> None:
     (tmp_path / "in" / "2 (1).png").write_bytes(path.read_bytes())
     (tmp_path / "more").mkdir()
     (tmp_path / "more" / "IMG_2.png").write_bytes(path.read_bytes())
-    with heard() as warnings:
+    with keep_warnings() as warnings:
         found = import_images(tmp_path / "w", [tmp_path / "in", tmp_path / "more"])
     assert counts(found) == {"camera": 3} and reasons(found) == {"copies of others": 2}
     assert len(warnings) == 2 and "2 (1).png" in warnings[0] + warnings[1]
@@ -151,7 +151,7 @@ def test_folders_inside_are_taken_on_request(tmp_path: Path) -> None:
     save(source / "masks" / "G10.png", np.full((48, 64), 255, np.uint8))
     for name in ("100GOPRO/G2_mask.png", "101GOPRO/notes.txt"):
         (source / name).write_bytes((source / "masks" / "G10.png").read_bytes())
-    with heard() as warnings:
+    with keep_warnings() as warnings:
         import_images(tmp_path / "w", [source, source / "101GOPRO"])
     assert any("--recursive" in line for line in warnings)
     work = source / "work"
@@ -213,7 +213,7 @@ def test_heic_is_read_with_the_users_decoder(tmp_path: Path, heif: None) -> None
     for seed, orientation in enumerate(turns):
         heic(tmp_path / "in", f"IMG_{seed}.HEIC", seed, orientation)
     (tmp_path / "in" / "IMG_9.heic").write_bytes(b"HEIC, cut")
-    with heard() as warnings:
+    with keep_warnings() as warnings:
         found = import_images(tmp_path / "w", [tmp_path / "in"])
     assert found.kinds == {"HEIC": 4} and counts(found) == {"camera": 4}
     assert reasons(found) == {"cannot be decoded": 1}
@@ -234,7 +234,7 @@ def test_heic_without_a_decoder_is_one_line(
         for seed in range(2):
             save(tmp_path / "in" / f"{seed}.jpg", smooth(seed))
             (tmp_path / "in" / f"IMG_{seed}.heic").write_bytes(b"x")
-        with heard() as warnings:
+        with keep_warnings() as warnings:
             found = import_images(tmp_path / "w", [tmp_path / "in"])
         assert reasons(found) == {"HEIC": 2}
         (line,) = warnings

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from alice_survey.core.errors import ImageError, heard
+from alice_survey.core.errors import ImageError, keep_warnings
 from alice_survey.core.manifest import read_manifest
 from reconstruct.pictures.importing import import_images
 from reconstruct.pictures.pairing import pair_by_time
@@ -74,7 +74,7 @@ NAMES: dict[str, tuple[Name, bool]] = {
 def test_dropped_frames_shift_nothing(tmp_path: Path, how: str) -> None:
     name, exif = NAMES[how]
     sides = write(tmp_path, name, exif=exif)
-    with heard() as said:
+    with keep_warnings() as said:
         found = pair_by_time(sides, None, UTC)
     assert list(found.stations) == true_moments(sides)
     assert how == "numbers" or any("without one of another camera" in text for text in said)
@@ -90,7 +90,7 @@ def test_a_trigger_log_pairs_and_times(tmp_path: Path) -> None:
         ]
     log = tmp_path / "triggers.csv"
     log.write_text("\n".join(rows[:-1]))  # and none of the last picture
-    with heard() as said:
+    with keep_warnings() as said:
         import_images(tmp_path / "w", [], cameras={s: tmp_path / s for s in sides}, triggers=log)
     assert any("are not in" in text and sides["right"][-1].name in text for text in said)
     records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
@@ -114,7 +114,7 @@ def test_cameras_whose_clocks_differ_are_paired_by_number_and_said(tmp_path: Pat
     sides = write(
         tmp_path, lambda k, own, time: f"IMG_{k:04d}", exif=True, late_s={"right": 3600.0}
     )
-    with heard() as said:
+    with keep_warnings() as said:
         found = pair_by_time(sides, None, UTC)
     assert list(found.stations) == true_moments(sides)
     assert any("not of one clock" in text and "--triggers" in text for text in said)
@@ -122,7 +122,7 @@ def test_cameras_whose_clocks_differ_are_paired_by_number_and_said(tmp_path: Pat
 
 def test_a_camera_with_fewer_pictures_that_counts_its_own_is_doubtful(tmp_path: Path) -> None:
     sides = write(tmp_path, lambda k, own, time: f"{own:04d}", dropped={"left": (), "right": (5,)})
-    with heard() as said:
+    with keep_warnings() as said:
         pair_by_time(sides, None, UTC)
     assert any("only the last pictures have no partner (0011.jpg)" in text for text in said)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from alice_survey.core.artefacts import read_json
-from alice_survey.core.errors import ImageError, heard
+from alice_survey.core.errors import ImageError, keep_warnings
 from alice_survey.core.manifest import read_manifest
 from reconstruct.pictures.importing import import_images
 from reconstruct.pictures.telemetry import _content, _find, _payloads, read_mp4
@@ -39,7 +39,7 @@ def test_chapters_of_a_recording_run_on(tmp_path: Path, names: tuple[str, ...]) 
         gopro.film(tmp_path / name, levels(20 * i, 20), RATE_HZ, created=NOON)
         for i, name in enumerate(names)
     ]
-    with heard() as warnings:
+    with keep_warnings() as warnings:
         found = import_images(tmp_path / "w", [], videos=paths[::-1], every_s=0.5)
     assert warnings == []
     records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
@@ -61,12 +61,12 @@ def test_a_missing_chapter_is_named_and_its_time_is_kept(tmp_path: Path) -> None
         gopro.film(tmp_path / f"GX0{chapter}0042.MP4", levels(0, count), RATE_HZ)
         for chapter, count in lengths.items()
     ]
-    with heard() as warnings:
+    with keep_warnings() as warnings:
         (recording,) = read_recordings(paths, UTC)
     assert [file.start_s for file in recording.files] == pytest.approx([0.0, 6.0, 9.0])
     (warning,) = warnings
     assert "chapters 2 " in warning and "3.0 s" in warning
-    with heard() as warnings:
+    with keep_warnings() as warnings:
         (recording,) = read_recordings(paths[1:], UTC)
     assert recording.files[0].start_s == 0.0
     assert "chapters 1, 2 " in warnings[0] and "GX030042.MP4" in warnings[0]
@@ -89,7 +89,7 @@ def test_recordings_are_ordered_by_their_dates(tmp_path: Path) -> None:
 def test_a_clock_that_was_never_set_states_no_time(tmp_path: Path) -> None:
     reset = datetime(2016, 1, 1, 0, 42, tzinfo=UTC)
     path = gopro.film(tmp_path / "GX010001.MP4", levels(0, 20), RATE_HZ, created=reset)
-    with heard() as warnings:
+    with keep_warnings() as warnings:
         (recording,) = read_recordings([path], UTC)
     assert recording.start is None and "never set" in warnings[0]
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.core.errors import heard
+from alice_survey.core.errors import keep_warnings
 from reconstruct.placing.control import (
     ControlFit,
     describe,
@@ -64,7 +64,7 @@ def test_a_wrong_point_is_left_out_and_the_rest_has_its_real_sigma(
         places = POINTS + rng.normal(0, REAL_M, POINTS.shape)
         wrong = int(rng.integers(len(places)))
         places[wrong] += WRONG_M
-        with heard() as said:
+        with keep_warnings() as said:
             ties = without_wrong_points(tied(gauge, places), known_scale)
         assert [t.name for t in ties.ties if t.use == "left out"] == [f"p{wrong}"]
         assert len(said) == 1 and f"p{wrong} is " in said[0]
@@ -88,7 +88,7 @@ def test_good_control_is_left_as_it_is() -> None:
     for seed in range(6):
         gauge, rng = in_gauge(seed), np.random.default_rng(seed)
         places = POINTS + rng.normal(0, STATED_M, POINTS.shape)
-        with heard() as said:
+        with keep_warnings() as said:
             ties = without_wrong_points(tied(gauge, places), None)
         assert not said
         assert all(t.use == "control" for t in ties.ties)
@@ -108,7 +108,7 @@ def test_hasty_picks_count_with_what_they_are_worth() -> None:
         gauge = in_gauge(seed)
         picks = picks_of(POINTS, noise_px, seed)
         picks[seed] = replace(picks[seed], x_px=picks[seed].x_px + 150.0)
-        with heard() as said:
+        with keep_warnings() as said:
             spots, lost = triangulate_picks(picks, gauge.cameras)
         assert not lost and len(said) == 1 and "count with a sigma of" in said[0]
         stated = float(said[0].rsplit("sigma of ", 1)[1].split()[0])

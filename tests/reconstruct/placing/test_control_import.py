@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from alice_survey.core.artefacts import write_json
-from alice_survey.core.errors import WorkspaceError, collected_by, heard
+from alice_survey.core.errors import WorkspaceError, collected_by, keep_warnings
 from alice_survey.core.frames import Array
 from alice_survey.core.manifest import ImageRecord, write_manifest
 from reconstruct.placing.control_points import read_control, read_picks
@@ -265,7 +265,7 @@ def test_scale_bars_of_metashape_become_bars(workspace: Path, ends: str, placed:
     if not placed:  # a diver's reef: bars, and no place of any marker
         text = re.sub(r'<reference x="[^>]*/>', "", path.read_text())
         path.write_text(re.sub(r"<reference>.*?</reference>", "", text))
-    with heard() as said:
+    with keep_warnings() as said:
         found = import_control(workspace, path)
     assert (found.points, found.bars, found.checks) == ((3, 2, 2) if placed else (0, 2, 1))
     assert any("B_D, B_C" in text for text in said)

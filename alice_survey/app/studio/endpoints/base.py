@@ -44,7 +44,7 @@ class Content:
     """File name to save it by; empty for one to be shown."""
 
 
-def zipped(name: str, files: Mapping[str, bytes | Path]) -> Content:
+def zip_files(name: str, files: Mapping[str, bytes | Path]) -> Content:
     """Files by their names in a ZIP."""
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:

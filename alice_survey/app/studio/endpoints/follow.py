@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from alice_survey.app.studio.endpoints.base import Call, Content, Endpoint, Studio, zipped
+from alice_survey.app.studio.endpoints.base import Call, Content, Endpoint, Studio, zip_files
 from alice_survey.core.config import Config
 from alice_survey.core.contents import one_line
 from alice_survey.core.errors import AliceError, NavigationError, known_fault
@@ -86,7 +86,7 @@ class FollowTab:
                     self._fault = str(error)
             return self._dive
 
-    def _needed(self) -> FollowedDive:
+    def _require_dive(self) -> FollowedDive:
         dive = self._current()
         if dive is None:
             raise NavigationError(self._fault or "no dive is followed: choose its log first")
@@ -159,19 +159,19 @@ class FollowTab:
 
     def dive(self, call: Call) -> dict[str, Any]:
         """Fixes since one, lines with their states, and holes, worst first."""
-        dive = self._needed()
+        dive = self._require_dive()
         after_s = call.number("after") if "after" in call.query else -math.inf
         return {"fixes": dive.track(after_s), "lines": dive.lines(), "holes": dive.holes()}
 
     def coverage(self, call: Call) -> Content:
         """What is seen so far as a picture, north up."""
-        classes = self._needed().coverage_classes()
+        classes = self._require_dive().coverage_classes()
         bgra = cv2.cvtColor(_COLOURS[classes], cv2.COLOR_RGBA2BGRA)
         return Content(data=cv2.imencode(".png", bgra)[1].tobytes(), kind="image/png")
 
     def export(self, call: Call) -> Content:
         """The plan over the holes as missions for vehicles: one format or all, zipped."""
-        dive = self._needed()
+        dive = self._require_dive()
         requested = call.query.get("format", "")
         with dive.lock:
             plan = dive.proposal
@@ -185,7 +185,7 @@ class FollowTab:
                 formats=[requested] if requested else None, options=options,
             )  # fmt: skip
             name = f"holes{f'_{requested}' if requested else ''}.zip"
-            return zipped(name, {path.name: path for path in files})
+            return zip_files(name, {path.name: path for path in files})
 
 
 def _is_log(path: Path) -> bool:

@@ -103,26 +103,26 @@ class _ModelTab:
     @contextmanager
     def _surface(self) -> Iterator[MeasuredSurface]:
         """The surface as it is now; what is replaced meanwhile is the page's to load again."""
-        with self._unchanged() as state:
+        with self._check_files() as state:
             if not self.studio.workspace.has(DEM.file):
                 raise FileNotFoundError(DEM.file)
             yield self._kept.of(state)
 
     @contextmanager
-    def _unchanged(self) -> Iterator[tuple[str, ...]]:
+    def _check_files(self) -> Iterator[tuple[str, ...]]:
         """Tokens of the files that figures are of; a link among them is refused."""
         workspace = self.studio.workspace
         for path in _READ:
             if (workspace.folder / path).exists() and not workspace.has(path):
                 raise AliceError(f"{path} is, or lies behind, a link: files of a survey are none")
-        with workspace.unchanged(_READ) as state:
+        with workspace.check_unchanged(_READ) as state:
             yield state
 
     def value(self, call: Call) -> dict[str, Any]:
         """Value and sigma of every raster at a place."""
         place = (call.number("east"), call.number("north"))
         workspace = self.studio.workspace
-        with self._unchanged():
+        with self._check_files():
             there = [one for one in RASTERS if workspace.has(one.file)]
             found = values_at(workspace.folder, place, there)
         unit = Held.of(workspace.folder).unit

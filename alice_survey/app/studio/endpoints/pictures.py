@@ -240,7 +240,7 @@ class _Tab:
 
     # ---- Pictures ----
 
-    def listed(self, call: Call) -> dict[str, Any]:
+    def list_pictures(self, call: Call) -> dict[str, Any]:
         """Pictures in the order of the manifest, some at a time, and where they were taken."""
         records = list(self._taken.records().values())
         words = call.query.get("find", "").lower()
@@ -314,10 +314,12 @@ class _Tab:
     def _place(self, model: _OpenModel, call: Call) -> SurfacePlace:
         if "image" not in call.query:
             return model.surface.below(call.number("n"), call.number("e"))
-        return self._met(model, call.query["image"], call.number("x") + 0.5, call.number("y") + 0.5)
+        return self._surface_at(
+            model, call.query["image"], call.number("x") + 0.5, call.number("y") + 0.5
+        )
 
     @staticmethod
-    def _met(model: _OpenModel, image: str, x_px: float, y_px: float) -> SurfacePlace:
+    def _surface_at(model: _OpenModel, image: str, x_px: float, y_px: float) -> SurfacePlace:
         size = model.pictures.warp(image).size_px
         if not (0 <= x_px <= size[0] and 0 <= y_px <= size[1]):
             raise ReconstructionError(
@@ -335,7 +337,7 @@ class _Tab:
         """A pick found again in other pictures; nothing is written."""
         asked, model = call.read(_Refine), self._read_model()
         pick = asked.pick.pick
-        place = self._met(model, pick.image, pick.x_px, pick.y_px)
+        place = self._surface_at(model, pick.image, pick.x_px, pick.y_px)
         images = asked.images
         if images is None:
             images = [s.image for s in _unhidden(model, place)[0]][: _MAX_SEEING // 3]
@@ -389,8 +391,8 @@ class _Tab:
                     "residual": None if miss is None else miss.tolist(),
                 }
             )
-        record = ControlRecord.made(folder / ControlRecord.path)
-        mapped = MappingRecord.made(folder / MappingRecord.path)
+        record = ControlRecord.read_existing(folder / ControlRecord.path)
+        mapped = MappingRecord.read_existing(folder / MappingRecord.path)
         return {
             "token": table_token(folder / PICKS_FILE),
             "points": list(points.values()),
@@ -409,7 +411,7 @@ class _Tab:
         if strange:
             raise AliceError(f"{strange[0]!r} is no picture of this survey")
         picks = [one.pick for one in asked.picks]
-        return self._written(
+        return self._write_file(
             PICKS_FILE, lambda path: save_picks(path, asked.token, picks, set(asked.points))
         )
 
@@ -431,7 +433,7 @@ class _Tab:
     def save_control(self, call: Call) -> dict[str, Any]:
         """Replace rows of `control.csv` by kind and name."""
         asked = call.read(_SaveControl)
-        return self._written(
+        return self._write_file(
             CONTROL_FILE, lambda path: save_control(path, asked.token, asked.rows, asked.names)
         )
 
@@ -485,7 +487,7 @@ class _Tab:
 
     # ---- What all use ----
 
-    def _written(self, name: str, write: Callable[[Any], str]) -> dict[str, Any]:
+    def _write_file(self, name: str, write: Callable[[Any], str]) -> dict[str, Any]:
         path = self._studio.workspace.folder / name
         if path.is_symlink():
             raise AliceError(f"{name} is a link: the studio changes files of the survey alone")
@@ -547,7 +549,7 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
     """Pictures, picks, control, lengths and scale."""
     tab = _Tab(studio)
     return (
-        Endpoint(path="/api/pictures", answer=tab.listed),
+        Endpoint(path="/api/pictures", answer=tab.list_pictures),
         Endpoint(path="/api/pictures/seeing", answer=tab.seeing),
         Endpoint(path="/api/pictures/{name:path}/about", answer=tab.picture),
         Endpoint(path="/api/pictures/{name:path}/tile/{level}/{x}/{y}.webp", answer=tab.tile),

@@ -23,12 +23,12 @@ from alice_survey.app.studio.endpoints.base import (
     Content,
     Endpoint,
     Studio,
-    zipped,
+    zip_files,
 )
 from alice_survey.core.artefacts import json_values
 from alice_survey.core.config import AreaConfig, Config, SurveyConfig, parse_settings, settings_in
 from alice_survey.core.edited_files import check_token, content_of, content_token
-from alice_survey.core.errors import AliceError, ConfigError, PlanError, collected_by, heard
+from alice_survey.core.errors import AliceError, ConfigError, PlanError, collected_by, keep_warnings
 from alice_survey.core.executor import local_executor
 from alice_survey.core.frames import Array, Datum, attitude_from_rotation
 from alice_survey.core.settings_form import settings_form
@@ -193,10 +193,10 @@ class _PlanTab:
         except AliceError as error:
             common["error"] = str(error)
         common["stage"] = spec("plan").state(self.studio.workspace.folder, config, {})
-        common["saved"] = self.saved(found.token, config)
+        common["saved"] = self.preview_saved(found.token, config)
         return {**common, **_about(config, drawing)}
 
-    def saved(self, token: str, config: SurveyConfig) -> dict[str, Any]:
+    def preview_saved(self, token: str, config: SurveyConfig) -> dict[str, Any]:
         """The preview of the saved settings; kept while these and their files stay."""
         files = [path.stat() for path in config.area.files]
         key = f"{token} {[(status.st_mtime_ns, status.st_size) for status in files]}"
@@ -218,12 +218,12 @@ class _PlanTab:
             draft = self.draft(request)
         except AliceError as error:
             return {**refusal_json(error), "cpu_s": 0.0}
-        with _drawn(draft) as config:
+        with _draft_settings(draft) as config:
             return preview(config)
 
     def precision(self, call: Call) -> dict[str, Any]:
         """What the model of a plan is expected to be worth."""
-        with _drawn(self.draft(call.read(PlanRequest))) as config, _quiet():
+        with _draft_settings(self.draft(call.read(PlanRequest))) as config, _quiet():
             plan = plan_survey(config, design_rig(config.camera, config.water)).plan
             if plan.stations > _MAX_PRECISION:
                 raise PlanError(
@@ -256,15 +256,15 @@ class _PlanTab:
             )  # fmt: skip
         track = folder / "flight" / "truth" / "track.csv"
         if set(states.values()) == {"up to date"} and track.is_file():
-            return _flown(folder / "flight", draft.config)
-        with _drawn(draft) as config, _quiet():
+            return _true_dive(folder / "flight", draft.config)
+        with _draft_settings(draft) as config, _quiet():
             planned = plan_survey(config, design_rig(config.camera, config.water))
             played = play(planned.plan, planned.costs, planned.bathymetry)
         place = np.column_stack([played.glass_ne, played.depth_m])
         return _moments("planned", played.time_s, place, played.altitude_m, played.heading_rad,
                         played.pictures_s)  # fmt: skip
 
-    def dropped(self, call: Call) -> dict[str, Any]:
+    def read_dropped(self, call: Call) -> dict[str, Any]:
         """The shapes of a file that was dropped on the page."""
         name = Path(call.query.get("name", "")).name
         role: Any = call.query.get("role", "survey")
@@ -274,7 +274,7 @@ class _PlanTab:
             raise PlanError(f"{name[:60]!r} is not read; those that are: {', '.join(SUFFIXES)}")
         found = self.settings()
         config = parse_settings(found.text, self.path)
-        with tempfile.TemporaryDirectory() as scratch, heard() as warnings, _quiet():
+        with tempfile.TemporaryDirectory() as scratch, keep_warnings() as warnings, _quiet():
             file = Path(scratch) / f"dropped{Path(name).suffix.lower()}"
             file.write_bytes(call.body)
             try:
@@ -312,7 +312,7 @@ class _PlanTab:
             except AliceError as error:
                 fault = error
             config = parse_settings(draft.text, self.path)
-            shown = self.saved(token, config)
+            shown = self.preview_saved(token, config)
             if fault is not None and shown["ok"]:
                 shown = refusal_json(fault)
         return _json({"token": token, "saved": shown})
@@ -334,7 +334,7 @@ class _PlanTab:
                 data=paths[0].read_bytes(), kind="application/octet-stream", name=names[0]
             )
         exports = folder / "exports"
-        return zipped(f"{name}.zip", {str(one.relative_to(exports)): one for one in paths})
+        return zip_files(f"{name}.zip", {str(one.relative_to(exports)): one for one in paths})
 
 
 def _json(found: Mapping[str, Any]) -> Content:
@@ -362,7 +362,7 @@ def _datum_asked(call: Call, token: str, config: SurveyConfig) -> Datum | None:
 
 
 @contextmanager
-def _drawn(draft: Draft) -> Iterator[SurveyConfig]:
+def _draft_settings(draft: Draft) -> Iterator[SurveyConfig]:
     """The settings of a draft, with its files in a folder that lasts as long as this block."""
     with tempfile.TemporaryDirectory() as scratch:
         yield draft.config_with(Path(scratch))
@@ -418,7 +418,7 @@ def _heights_layer(found: Precision) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _flown(folder: Path, config: SurveyConfig) -> dict[str, Any]:
+def _true_dive(folder: Path, config: SurveyConfig) -> dict[str, Any]:
     """The simulated dive as it truly was, of the left port's glass; altitudes are its log's."""
     track = read_track(folder / "truth" / "track.csv")
     log = read_columns(folder / "navigation.csv", ("time_s", "altitude_m"))
@@ -468,7 +468,7 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
         post("preview", plan.preview),
         post("precision", plan.precision),
         post("play", plan.play),
-        post("import", plan.dropped, max_bytes=_MAX_FILE),
+        post("import", plan.read_dropped, max_bytes=_MAX_FILE),
         post("text", plan.text),
         post("save", plan.save, writes=True),
     )

@@ -98,7 +98,7 @@ def _stage(workspace: Path, stage: StageSpec, state: str, cost: StageCost | None
         "made_utc": made,
         "took_s": None if record is None else record.took_s,
         "peak_mib": None if record is None else record.peak_mib,
-        "cost": None if cost is None or state == UP_TO_DATE else _taken({stage.name: cost}),
+        "cost": None if cost is None or state == UP_TO_DATE else _cost_json({stage.name: cost}),
         "products": [
             {"path": f"{stage.folder}/{path}", "about": what}
             for path, what in stage.products.items()
@@ -124,7 +124,7 @@ def _costs(
     return {name: cost.scale(factor) for name, cost in costs.items()}
 
 
-def _taken(costs: Mapping[str, StageCost]) -> dict[str, float]:
+def _cost_json(costs: Mapping[str, StageCost]) -> dict[str, float]:
     cost = SurveyCost(stages=costs, workers=default_threads())
     return {
         "time_s": round(cost.time_s(cost.workers), 1),
@@ -150,7 +150,7 @@ def _commands(
                 "name": name, "title": command.title, "left": left,
                 "after": [n for n in states if n in needs and states[n] in _NOT_THERE],
                 "command": shlex.join(["alice-survey", name, "-w", str(workspace)]),
-                "cost": _taken(known) if known else None,
+                "cost": _cost_json(known) if known else None,
             }
         )  # fmt: skip
     return found

@@ -69,7 +69,7 @@ class _Shell:
 
     def map(self, call: Call) -> dict[str, Any]:
         """The layers of what the workspace holds, as the map's script takes them."""
-        with self.studio.workspace.unchanged():
+        with self.studio.workspace.check_unchanged():
             return self._map()
 
     def _map(self) -> dict[str, Any]:
@@ -84,11 +84,11 @@ class _Shell:
             extent = map_extent(page_map)
         found["extent"] = extent
         for described, layer in zip(found["layers"], layers, strict=True):
-            described |= _listed(layer)
+            described |= _layer_json(layer)
         return found
 
 
-def _listed(layer: PictureLayer | ShapeLayer) -> dict[str, Any]:
+def _layer_json(layer: PictureLayer | ShapeLayer) -> dict[str, Any]:
     """What the list of layers says of one."""
     is_base = isinstance(layer, PictureLayer) and layer.base
     return {

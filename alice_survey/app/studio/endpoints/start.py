@@ -63,7 +63,7 @@ class Folders:
         """Take the home, this user's if none is given."""
         self._roots = [(Path.home() if home is None else home).resolve()]
 
-    def listed(self, path: str, *, typed: bool) -> Listing:
+    def list_folder(self, path: str, *, typed: bool) -> Listing:
         """The folders inside one.
 
         Args:
@@ -93,9 +93,9 @@ class Folders:
         inside = [Path(e.path) for e in seen if e.is_dir(follow_symlinks=False)]
         files = [e for e in seen if e.is_file(follow_symlinks=False)]
         return Listing(
-            here=_counted(real),
+            here=_count_folder(real),
             above=str(above) if above != real and self._may_list(above) else None,
-            inside=[_counted(one) for one in inside[:_MAX_FOLDERS]],
+            inside=[_count_folder(one) for one in inside[:_MAX_FOLDERS]],
             files=[e.path for e in files if Path(e.name).suffix.lower() in _CHOSEN],
         )
 
@@ -107,7 +107,7 @@ def _is_shown(entry: os.DirEntry[str]) -> bool:
     return not entry.name.startswith(".") and entry.name.isprintable()
 
 
-def _counted(folder: Path) -> Folder:
+def _count_folder(folder: Path) -> Folder:
     """A folder with the numbers of its pictures, videos and folders; one that cannot be read, 0."""
     pictures = videos = folders = entries_n = 0
     try:
@@ -182,10 +182,10 @@ class _StartPage:
     studio: Studio
     folders: Folders = field(default_factory=Folders)
 
-    def listed(self, call: Call) -> Any:
+    def list_folder(self, call: Call) -> Any:
         """Folders inside one."""
         asked = call.read(_AskedFolder)
-        return asdict(self.folders.listed(asked.path, typed=asked.typed))
+        return asdict(self.folders.list_folder(asked.path, typed=asked.typed))
 
     def preview(self, call: Call) -> Any:
         """What an import would find, and whether folders inside look like those of a rig."""
@@ -212,7 +212,7 @@ class _StartPage:
         workspace = self.studio.workspace.folder
         area = ("latitude_deg", "longitude_deg", "length_m", "width_m", "seafloor_depth_m")
         values: dict[str, Mapping[str, Any]] = {
-            "area": _given(asked, area), "camera": _given(asked, ("focal_mm",)),
+            "area": _known_values(asked, area), "camera": _known_values(asked, ("focal_mm",)),
             **(_TRIAL if asked.trial else {}),
         }  # fmt: skip
         if (asked.latitude_deg is None) != (asked.longitude_deg is None):
@@ -280,7 +280,7 @@ class _StartPage:
                 toml.unlink()
 
 
-def _given(asked: _NewSurvey, names: Sequence[str]) -> dict[str, float]:
+def _known_values(asked: _NewSurvey, names: Sequence[str]) -> dict[str, float]:
     return {name: value for name in names if (value := getattr(asked, name)) is not None}
 
 
@@ -289,7 +289,7 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
     start = _StartPage(studio)
     post: dict[str, Any] = {"method": "POST", "writes": True}
     return (
-        Endpoint(path="/api/start/folders", answer=start.listed, **post),
+        Endpoint(path="/api/start/folders", answer=start.list_folder, **post),
         Endpoint(path="/api/start/preview", answer=start.preview, **post),
         Endpoint(path="/api/start/survey", answer=start.survey, max_bytes=_MAX_BYTES, **post),
         Endpoint(path="/api/start/pictures", answer=start.pictures, **post),

@@ -25,11 +25,11 @@ def home(tmp_path: Path) -> Path:
 
 def test_folders_are_listed_with_what_they_hold(home: Path) -> None:
     folders = Folders(home)
-    top = folders.listed("", typed=False)
+    top = folders.list_folder("", typed=False)
     assert [one.name for one in top.inside] == ["dive"]  # no link
     assert (top.above, top.inside[0].pictures, top.inside[0].videos) == (None, 2, 1)
     assert top.inside[0].folders == 1
-    dive = folders.listed(str(home / "dive"), typed=False)
+    dive = folders.list_folder(str(home / "dive"), typed=False)
     assert [one.name for one in dive.inside] == ["left"] and dive.above == str(home)
     assert [Path(path).name for path in dive.files] == ["nav.csv", "rig.json"]
 
@@ -39,19 +39,19 @@ def test_what_lies_outside_is_listed_only_where_it_was_typed(home: Path) -> None
     outside = home.parent / "secret"
     for path in (outside, home / "out", home / ".." / "secret", home / "out" / "inside", Path("/")):
         with pytest.raises(AliceError):
-            folders.listed(str(path), typed=False)
-    assert [one.name for one in folders.listed(str(outside), typed=True).inside] == ["inside"]
-    inside = folders.listed(str(outside / "inside"), typed=False)
+            folders.list_folder(str(path), typed=False)
+    assert [one.name for one in folders.list_folder(str(outside), typed=True).inside] == ["inside"]
+    inside = folders.list_folder(str(outside / "inside"), typed=False)
     assert inside.here.pictures == 1 and inside.above == str(outside)
-    assert folders.listed(str(outside), typed=False).above is None
+    assert folders.list_folder(str(outside), typed=False).above is None
     with pytest.raises(AliceError):
-        folders.listed(str(home.parent), typed=False)
+        folders.list_folder(str(home.parent), typed=False)
 
 
 @pytest.mark.parametrize("path", ["dive", "../secret", "/none/there", "dive\0", "a.jpg"])
 def test_what_is_no_folder(home: Path, path: str) -> None:
     for typed in (True, False):
         with pytest.raises(AliceError):
-            Folders(home).listed(path, typed=typed)
+            Folders(home).list_folder(path, typed=typed)
     with pytest.raises(AliceError):
-        Folders(home).listed(str(home / "dive" / "a.jpg"), typed=True)
+        Folders(home).list_folder(str(home / "dive" / "a.jpg"), typed=True)

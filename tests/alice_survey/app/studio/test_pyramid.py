@@ -10,7 +10,7 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.transform import Affine
 
-from alice_survey.app.report.colours import TILE_PX, coloured, limits_of, number_rasters
+from alice_survey.app.report.colours import TILE_PX, colour_tile, limits_of, number_rasters
 from alice_survey.app.studio.files import Workspace
 from alice_survey.app.studio.layers import Layers, Pyramid
 from alice_survey.core.edited_files import StaleError
@@ -154,12 +154,12 @@ def test_tiles_make_the_whole_level(folder: Path, name: str) -> None:
                 top, left = y * TILE_PX, x * TILE_PX
                 sheet[top : top + tile.shape[0], left : left + tile.shape[1]] = tile
         if numbers is None:
-            whole = pyramid._painted(size, 0, 0, size.columns, size.rows)
+            whole = pyramid._paint(size, 0, 0, size.columns, size.rows)
         else:
             assert shown.scale is not None and pyramid.limits is not None
             assert pyramid.limits == (shown.scale.low, shown.scale.high)
             values = numbers.levels(pyramid.values(size, 0, 0, size.columns, size.rows))
-            whole = coloured(values, numbers, pyramid.limits, size.east)
+            whole = colour_tile(values, numbers, pyramid.limits, size.east)
         # Means may differ in the last bits, and then a colour by one or two.
         assert np.abs(sheet.astype(int) - whole).max() <= 2
         assert (sheet == whole).mean() > 0.999
