@@ -14,7 +14,8 @@ from alice_survey.app.report.colours import (
     TILE_PX,
     Numbers,
     Rgba,
-    encoded,
+    colour_tile,
+    encode_webp,
     limits_of,
     number_rasters,
     read_shrunk,
@@ -92,7 +93,7 @@ def _layer(
             for x in range(0, picture.shape[1], TILE_PX):
                 tile = picture[y : y + TILE_PX, x : x + TILE_PX]
                 if tile[..., 3].any():
-                    tiles[f"{level}/{x // TILE_PX}/{y // TILE_PX}"] = encoded(tile)
+                    tiles[f"{level}/{x // TILE_PX}/{y // TILE_PX}"] = encode_webp(tile)
         picture = _halve(picture)
     return PictureLayer(
         name=name, title=title, about=about,
