@@ -38,15 +38,6 @@ def nearest(path: Path, leg: int, place: Array, count: int = 20001) -> float:
     return float(along[np.argmin(n**2 + e**2)])
 
 
-def mean_heading(path: Path, at_m: float, window_m: float, count: int = 20001) -> float:
-    """Heading averaged over a window about a distance along the whole path, by many samples."""
-    begins = np.append(path.begins_m, path.begins_m[-1] + path.length_m[-1])
-    at = np.clip(np.linspace(at_m - window_m, at_m + window_m, count), 0.0, begins[-1])
-    leg = np.clip(np.searchsorted(begins, at, side="right") - 1, 0, len(path.length_m) - 1)
-    headings = path.heading_rad[leg] + path.curvature_per_m[leg] * (at - begins[leg])
-    return float(headings.mean())
-
-
 def point_motion(estimate: Array, guidance: Guidance) -> tuple[Array, Array]:
     """Place in NED and level velocity (ahead, to starboard) of the followed point.
 

@@ -10,7 +10,6 @@ from alice_survey.sim.seafloor.as_built import true_rig
 from alice_survey.sim.seafloor.light import CameraLight, backscatter_at, camera_light
 from alice_survey.sim.seafloor.renderer import (
     Scene,
-    camera_rays,
     flat_floor_radiance,
     range_map,
     render,
@@ -142,14 +141,6 @@ def test_a_flat_floor_has_the_light_of_the_closed_form() -> None:
     assert np.all(picture[0, 0] < 0.7 * middle)  # cos^4 and the strobes' fall-off
 
 
-def test_vignetting_is_cosine_to_the_fourth_in_air() -> None:
-    camera = design_rig(CONFIG.camera, CONFIG.water, 16).cameras["left"]
-    rays = camera_rays(camera, 1, 0, camera.height_px)
-    offset = camera.pixel_centres().reshape(-1, 2) - [camera.cx_px, camera.cy_px]
-    tangent2 = (offset**2).sum(axis=1) / camera.fx_px**2
-    np.testing.assert_allclose(rays.vignetting, (1.0 + tangent2) ** -2, rtol=1e-5)
-
-
 @pytest.mark.parametrize("blur_px", [2.0, 5.0])
 def test_motion_blurs_by_speed_times_exposure_times_focal_length_over_range(blur_px: float) -> None:
     """An edge across the way is smeared over speed * exposure * f n / range pixels."""
@@ -174,17 +165,6 @@ def test_motion_blurs_by_speed_times_exposure_times_focal_length_over_range(blur
     moved = spread(moving(pose(), np.array([step_m, 0.0, 0.0])))
     assert np.sqrt(12.0 * moved - 2.0) == pytest.approx(blur_px, rel=0.015)
     assert spread(still(pose())) < 0.26
-
-
-def test_every_ray_of_a_pixel_has_its_share_of_the_exposure() -> None:
-    """A picture over a motion is the mean of the pictures along it."""
-    scene = Scene(terrain=flat(), texture=Stripes(seed=0, at_m=0.1, axis=1))
-    poses = moving(pose(), np.array([0.0, 0.05, 0.0]), 16)
-    blurred = render(scene, CAMERA, LIGHT, poses, 4)
-    mean = np.mean([render(scene, CAMERA, LIGHT, still(p), 4) for p in poses], axis=0)
-    difference = (blurred - mean)[..., 1] / mean[..., 1].max()
-    assert np.abs(difference.mean()) < 2e-4
-    assert difference.std() < 0.01
 
 
 def test_ranges_to_a_flat_floor_are_exact() -> None:

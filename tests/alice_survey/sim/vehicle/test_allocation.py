@@ -8,7 +8,6 @@ from alice_survey.sim.vehicle.allocation import (
     allocate_exact,
     allocate_rpi,
     allocation_scratch,
-    preference_weights,
 )
 from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.propulsion import add_thrust, speeds_for, thrust_limits
@@ -179,17 +178,3 @@ def test_the_pseudo_inverse_is_its_numpy_twin() -> None:
         got = solve(matrix, wanted, lower, upper, weights, solver=allocate_rpi)
         slow = oracles.redistributed(matrix, wanted, lower, upper, AXIS_WEIGHTS, weights)
         np.testing.assert_allclose(got, slow, rtol=1e-5, atol=1e-5)
-
-
-def test_laterals_turn_the_vehicle_on_a_line_and_the_pair_at_speed() -> None:
-    lower, upper = limits_of(ALICE)
-    matrix, weights = ALICE.configuration_matrix, np.zeros(5)
-    shares = []
-    for u in np.linspace(0.0, 2.0, 41):
-        preference_weights(ALICE.plant.propulsion, float(u), weights)
-        assert np.all(weights[:2] == 1.0) and np.all(weights[2:] >= 1.0)
-        thrust = solve(matrix, np.array([0, 0, 0, 0, 0, 2.0]), lower, upper, weights)
-        shares.append(matrix[YAW, :2] @ thrust[:2] / 2.0)
-    assert np.all(np.diff(shares) >= 0)
-    assert shares[0] < 0.05 and shares[4] < 0.05
-    assert shares[20] < 0.5 < shares[32] and shares[40] > 0.9

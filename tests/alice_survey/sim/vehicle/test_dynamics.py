@@ -1,6 +1,5 @@
 """The equations of motion at one instant: matrices, energy, signs, and the textbook's twin."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -16,18 +15,11 @@ from alice_survey.sim.vehicle.dynamics import (
     coriolis_matrix,
 )
 from alice_survey.sim.vehicle.files import SETS
-from alice_survey.sim.vehicle.sea import GRAVITY
 from tests import oracles_dynamics as oracle
 from tests.alice_survey.sim.vehicle.motions import (
     SHEAR_AND_TIDE,
-    K,
-    M,
-    N,
-    Y,
-    Z,
     alice,
     attitudes,
-    block,
     damping_matrix,
     rates,
     rotations,
@@ -173,26 +165,3 @@ def test_rates_match_newtons_law_over_ground(
     turned = (attitudes(later) - np.array(attitude)) / 1e-6
     assert np.allclose(np.sin(turned * 1e-6), np.sin(eta_rate[3:] * 1e-6), atol=1e-9)
     assert rate[3:7] @ state[3:7] == pytest.approx(0.0, abs=1e-12)
-
-
-def test_restoring_moments_by_hand() -> None:
-    """52 kg, centre of gravity 3 cm low: 5 degrees of roll and of pitch are pushed back."""
-    low = block(cg=(0.0, 0.0, 0.03), dry_kg=52.0, buoyancy_kg=52.0)
-    angle = math.radians(5.0)
-    moment = 52.0 * GRAVITY * 0.03 * math.sin(angle)
-    # Free to sway, the body turns about its centre of gravity.
-    for axis, attitude in ((0, (angle, 0.0, 0.0)), (1, (0.0, angle, 0.0))):
-        inertia = low.rigid_body.inertia_kg_m2[axis]
-        rate = rates(low, state_of(low, attitude_rad=attitude))
-        assert rate[K + axis] == pytest.approx(-moment / inertia, rel=1e-9)
-
-
-def test_body_lift_opposes_drift_and_weathercocks_going_ahead() -> None:
-    """The centre of lift lies 0.2 m behind the origin; astern the lift still opposes the drift."""
-    hull = block({"Y_uv": -40.0, "N_uv": 8.0, "Z_uw": -40.0, "M_uw": -8.0})
-    ahead = rates(hull, state_of(hull, np.array([1.0, 0.1, 0, 0, 0, 0])))
-    assert ahead[Y] == pytest.approx(-4.0 / 50.0) and ahead[N] == pytest.approx(0.8 / 7.0)
-    sinking = rates(hull, state_of(hull, np.array([1.0, 0, 0.1, 0, 0, 0])))
-    assert sinking[Z] == pytest.approx(-4.0 / 50.0) and sinking[M] == pytest.approx(-0.8 / 6.0)
-    astern = rates(hull, state_of(hull, np.array([-1.0, 0.1, 0, 0, 0, 0])))
-    assert astern[Y] == pytest.approx(-4.0 / 50.0) and astern[N] == pytest.approx(-0.8 / 7.0)

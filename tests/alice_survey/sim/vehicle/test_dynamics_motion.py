@@ -18,7 +18,6 @@ from tests.alice_survey.sim.vehicle.motions import (
     SHEAR_AND_TIDE,
     advance,
     alice,
-    attitudes,
     block,
     rates,
     rotations,
@@ -67,26 +66,6 @@ def test_terminal_speed_of_the_whole_vehicle(axis: int, newtons: float, coeffici
         np.testing.assert_allclose(np.delete(end[7:13], axis), 0.0, atol=0.02)
 
 
-@pytest.mark.parametrize("coefficients", SETS)
-@pytest.mark.parametrize("axis", [0, 1])
-def test_small_roll_and_pitch_swing_like_a_pendulum(axis: int, coefficients: str) -> None:
-    """Omega^2 = W BG (M^-1)_ii: with M^-1, as the body is free to sway and surge meanwhile."""
-    vehicle = alice(coefficients)
-    attitude = (1e-4, 0.0, 0.0) if axis == 0 else (0.0, 1e-4, 0.0)
-    states = advance(vehicle, state_of(vehicle, attitude_rad=attitude), 30.0, 0.01)
-    angle = attitudes(states)[:, axis]
-    time_s = np.arange(len(angle)) * 0.01
-    down = np.flatnonzero((angle[:-1] > 0) & (angle[1:] <= 0))
-    crossings = time_s[down] + 0.01 * angle[down] / (angle[down] - angle[down + 1])
-    low = vehicle.plant.body.weight_n * vehicle.rigid_body.cg_body_m[2]
-    stiffness = low * np.linalg.inv(vehicle.mass)[3 + axis, 3 + axis]
-    period = 2.0 * math.pi / math.sqrt(stiffness)
-    assert len(crossings) >= 3
-    np.testing.assert_allclose(np.diff(crossings), period, rtol=2e-4)
-    # Damping of higher order leaves small swings nearly alone.
-    assert 0.9e-4 < np.abs(angle[-round(period / 0.01) :]).max() <= 1.0001e-4
-
-
 @settings(max_examples=20, deadline=None)
 @given(
     speed=st.floats(0.0, 1.0),
@@ -108,27 +87,6 @@ def test_a_uniform_current_carries_the_motion_along(
     along = 5.0 * speed * np.array([math.cos(direction), math.sin(direction), 0.0])
     np.testing.assert_allclose(carried[:3] - along, still[:3], atol=1e-11)
     np.testing.assert_allclose(carried[3:], still[3:], atol=1e-12)
-
-
-@settings(max_examples=20, deadline=None)
-@given(attitude=st.tuples(st.floats(-3.0, 3.0), st.floats(-1.4, 1.4), st.floats(-3.0, 3.0)))
-def test_a_balanced_vehicle_follows_water_that_speeds_up(
-    attitude: tuple[float, float, float],
-) -> None:
-    """As heavy as the water it displaces and balanced, it moves as a drop of water: exactly."""
-    vehicle = block(
-        {"X_udot": -3.0, "Y_vdot": -70.0, "Z_wdot": -60.0, "Y_rdot": -9.0, "Y_vv": -200.0},
-        entrained_kg=20.0,
-    )
-    tide = Current(
-        np.array([0.0, 10.0, 20.0]),
-        np.array([0.0, 10.0]),
-        np.array([[[0.0, 0.0]] * 2, [[0.3, -0.1], [0.5, 0.1]], [[-0.2, 0.4], [0.0, 0.6]]]),
-    )
-    states = advance(vehicle, state_of(vehicle, attitude_rad=attitude), 20.0, 0.01, current=tide)
-    np.testing.assert_allclose(states[:, 7:13], 0.0, atol=1e-13)
-    # At 5 m, half way: (0.4, 0) after 10 s and (-0.1, 0.5) after 20 s, trapezoids between.
-    np.testing.assert_allclose(states[-1, :3], [2.0 + 1.5, 2.5, 5.0], atol=1e-10)
 
 
 def test_water_inside_the_nose_is_carried_where_it_is() -> None:

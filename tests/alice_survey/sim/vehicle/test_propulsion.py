@@ -95,19 +95,6 @@ def drag_of(n: float, u: float) -> float:
     return -float(wrench_of((BOW,), [n], np.array([u, 0, 0, 0, 0, 0]))[0])
 
 
-def test_jet_drag_is_that_of_delphin2() -> None:
-    """Its file at u = 0.5 m/s and jets of 0.883 m/s, by hand: C_d = 0.0416 of 0.1857 m^2."""
-    n = math.sqrt(0.883**2 * math.pi / 4 / (BOW.diameter_m**2 * BOW.kt_forward))
-    force = np.zeros(6)
-    kernels.add_thrust(
-        pack((BOW,), 1000.0, 80.0), np.array([n]), np.array([0.5, 0, 0, 0, 0, 0]), force
-    )
-    ratio = 0.5 / 0.883
-    by_hand = 0.565994 * math.exp(-7.608907 * ratio) + 0.056536 * math.exp(-0.896792 * ratio)
-    assert by_hand == pytest.approx(0.0416, abs=1e-4)
-    assert force[0] == pytest.approx(-0.5 * 1000 * 0.08 ** (2 / 3) * by_hand * 0.25, rel=1e-5)
-
-
 @settings(max_examples=200, deadline=None)
 @given(nu=velocities, share=st.tuples(*[st.floats(-1.0, 1.0)] * 5).map(np.array))
 def test_speeds_give_the_thrust_they_were_found_for(nu: Array, share: Array) -> None:
@@ -140,19 +127,6 @@ def test_a_t200_takes_what_its_maker_says() -> None:
     power = np.zeros(1)
     kernels.electrical_power(pack((BOW,), DENSITY, DISPLACED), np.array([56.55]), REST, power)
     assert power[0] == pytest.approx(390.0, rel=0.02)
-
-
-def test_power_at_any_speed_is_that_of_the_textbooks_torque() -> None:
-    rng = np.random.default_rng(5)
-    power = np.zeros(5)
-    for _ in range(50):
-        rps, nu = rng.uniform(-50, 50, 5), rng.uniform(-1, 1, 6)
-        kernels.electrical_power(PACKED, rps, nu, power)
-        slow = [
-            max(0.0, 2 * math.pi * n * oracles.torque_nm(t, DENSITY, n, nu)) / t.efficiency
-            for t, n in zip(EVERY, rps, strict=True)
-        ]
-        np.testing.assert_allclose(power, slow, rtol=1e-9)
 
 
 @pytest.mark.parametrize(

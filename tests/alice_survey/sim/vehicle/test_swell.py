@@ -32,14 +32,6 @@ def test_wave_numbers_obey_the_dispersion_relation(period_s: float, depth_m: flo
     assert GRAVITY * k * math.tanh(k * depth_m) == pytest.approx(omega**2, rel=1e-9)
 
 
-def test_deep_water_orbits_are_circles_that_shrink_with_depth() -> None:
-    """At the surface the speed is that of a circle of the wave's height, once a period."""
-    k = wave_number(5.0, 300.0)
-    speeds = orbital_speed_mps(1.0, 5.0, 300.0, np.array([0.0, 1.0 / k]))
-    assert speeds[0] == pytest.approx(math.pi / 5.0, rel=1e-9)
-    assert speeds[1] == pytest.approx(math.pi / 5.0 / math.e, rel=1e-9)
-
-
 def test_swell_is_added_to_the_current_along_its_way() -> None:
     depth_m, period_s, towards = 15.0, 6.0, math.radians(30.0)
     current = with_swell(constant_current(0.1, 90.0), 0.5, period_s, 30.0, depth_m, 60.0)

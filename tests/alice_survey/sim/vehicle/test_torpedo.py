@@ -17,20 +17,15 @@ from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.identification.report import IdentifyOptions, identify_report
 from alice_survey.sim.vehicle.pilot import gains as g
 from alice_survey.sim.vehicle.pilot.gains import (
-    LATERAL,
-    VERTICAL,
-    damping_ratio,
     gains_for,
-    heading_loop,
 )
-from alice_survey.sim.vehicle.pilot.settings import UnderWay, circle_course, dive_loop
+from alice_survey.sim.vehicle.pilot.settings import UnderWay, circle_course
 from alice_survey.sim.vehicle.steady import (
     MAX_DRIFT_RAD,
     balance_fins,
     fin_flight,
     min_radius_m,
     min_speed_mps,
-    steady_flight,
 )
 from tests import oracles_dynamics as oracle
 from tests.alice_survey.sim.vehicle.motions import STILL
@@ -101,23 +96,6 @@ def test_the_tightest_turn_is_one_that_fins_hold() -> None:
     assert fin_flight(REMUS, 1.0, 1.0 / (0.98 * radius), SHARE) is None
 
 
-@pytest.mark.parametrize("speed", SPEEDS)
-def test_loops_are_damped_and_within_the_strength_of_the_fins(speed: float) -> None:
-    gains = gains_for(REMUS, speed)
-    assert gains.dives_by_pitch and not gains.holds_level
-    assert not gains.axes[[g.SWAY, g.HEAVE, g.ROLL]].any()
-    for axis, plane in ((g.YAW, LATERAL), (g.PITCH, VERTICAL)):
-        row = gains.axes[axis]
-        loop = heading_loop(gains.body, speed, row, gains.fins, plane)
-        assert g.MIN_HEADING_DAMPING < damping_ratio(loop) < 1.0
-        poles = np.linalg.eigvals(loop)
-        assert poles.real.max() < -0.02
-        # An error of 10 deg takes about the moment that there is.
-        assert 0.3 < row[g.MASS] * row[g.PLACE] * g.KEPT_RAD / row[g.MAX_FORCE] < 1.5
-    depth = np.linalg.eigvals(dive_loop(gains, speed, 2.5))
-    assert depth.real.max() < -0.005
-
-
 def test_what_cannot_be_flown_by_fins_is_said() -> None:
     up = replace(
         REMUS.thrusters[0], name="vertical", direction_body=(0.0, 0.0, 1.0),
@@ -129,21 +107,6 @@ def test_what_cannot_be_flown_by_fins_is_said() -> None:
         gains_for(replace(REMUS, thrusters=()), 1.0)
     with pytest.raises(VehicleError, match="at no speed"):
         min_speed_mps(replace(REMUS, fins=REMUS.fins[1:]), SHARE)
-
-
-def test_power_is_that_of_drag_and_turns() -> None:
-    """At 1.5 m/s, nearly level: the propeller gives X_uu u^2 / (1 - t), by its open-water curve."""
-    nu = np.zeros((4, 6))
-    nu[:, 0], nu[1, 5], nu[2, 0], nu[3, 1] = 1.5, 0.2, 0.2, 0.1
-    flight = steady_flight(REMUS, nu, share=SHARE)
-    assert np.isnan(flight.power_w).tolist() == [False, False, True, True]
-    level = balance_fins(REMUS, 1.5)
-    assert level is not None
-    assert level.force_x_n == pytest.approx(2.94 * 1.5**2, rel=0.05)
-    n = flight.rps[0, 0]
-    thrust = RHO * 0.14**4 * 0.4566 * n**2 - RHO * 0.14**3 * 0.4174 * n * 0.944 * 1.5
-    assert 0.9 * thrust == pytest.approx(level.force_x_n, rel=1e-6)
-    assert flight.power_w[1] > flight.power_w[0]
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])

@@ -10,19 +10,16 @@ from alice_survey.sim.vehicle import rotations
 from alice_survey.sim.vehicle.navigation.filter import (
     BEAM,
     BELIEVED,
-    COMPASS_USE,
     DEPTH,
     DVL_SCALE,
     DVL_USE,
     GPS_FIX,
     HEADING,
-    HEADING_BIAS,
     PUSH,
     QUATERNION,
     RATES,
     REJECTED,
     ROW,
-    RUN,
     TRUTH_NOW,
     TURN,
     USBL_FIX,
@@ -45,8 +42,6 @@ from alice_survey.sim.vehicle.navigation.sensors import (
     CompassSpec,
     DvlSpec,
     GpsSpec,
-    ImuSpec,
-    PressureSpec,
     Sensors,
     SensorSuite,
     UsblSpec,
@@ -68,17 +63,6 @@ from tests.alice_survey.sim.vehicle.navigation.navigation_runs import (
 
 FLOOR = level_floor(15.0)
 TINY = 1e-9
-PERFECT_IMU = ImuSpec(
-    gyro_bias_sigma_radps=TINY, gyro_bias_walk_radps_per_sqrt_s=0.0,
-    accelerometer_bias_sigma_mps2=TINY, accelerometer_bias_walk_mps2_per_sqrt_s=0.0,
-    tilt_sigma_rad=TINY,
-)  # fmt: skip
-PERFECT_COMPASS = CompassSpec(noise_rad=1e-6, bias_sigma_rad=TINY)
-PERFECT_DVL = DvlSpec(
-    scale_sigma=TINY, bias_sigma_mps=TINY, misalignment_sigma_rad=TINY, ping_loss=0.0,
-    beam_loss=0.0, outlier_probability=0.0, beam_noise_per_speed=0.0,
-)  # fmt: skip
-PERFECT_GPS = GpsSpec(noise_m=1e-6, bias_sigma_m=TINY)
 
 
 def column(name: str) -> int:
@@ -246,27 +230,6 @@ def test_rows_equal_finite_differences(name: str) -> None:
     np.testing.assert_allclose(nav.scratch[ROW], expected, atol=1e-8)
 
 
-def test_noise_of_the_dvl_walks_with_the_root_of_time() -> None:
-    # Whatever the IMU does, a filter that follows white noise of velocity gathers all of it:
-    # sigma^2 = (noise of a ping)^2 (time between pings) (time).
-    suite = SensorSuite(
-        imu=PERFECT_IMU, compass=PERFECT_COMPASS, dvl=PERFECT_DVL, gps=PERFECT_GPS,
-        pressure=PressureSpec(bias_sigma_m=TINY),
-    )  # fmt: skip
-    sensors = suite.pack()
-    of_a_ping = PERFECT_DVL.beam_noise_mps / np.sqrt(np.sum(sensors.beams[:, 0] ** 2))
-    ends, truth = [], straight(300.0, 0.2)
-    for seed in range(60):
-        run = fly(sensors, truth, FLOOR, seed)
-        ends.append(run.log[[1500, 6000], :2] - truth[[1500, 6000], :2])
-    for i, time_s in enumerate((75.0, 300.0)):
-        walk = of_a_ping * np.sqrt(0.2 * time_s)
-        rms = np.sqrt(np.mean(np.array(ends)[:, i] ** 2))
-        # 120 draws: 6.5 % each way, and three of those.
-        assert rms == pytest.approx(walk, rel=0.2)
-        assert run.log[[1500, 6000][i], column("sigma_north_m")] == pytest.approx(walk, rel=0.03)
-
-
 def test_a_usbl_bounds_the_drift() -> None:
     truth = straight(600.0)
     compass = CompassSpec(bias_sigma_rad=np.deg2rad(2.0))
@@ -309,31 +272,6 @@ def true_velocity(truth: Array) -> Array:
 
     velocity: Array = Rotation.from_quat(truth[:, 3:7]).inv().apply(truth[:, 7:10])
     return velocity
-
-
-def test_a_disturbed_compass_is_rejected_first_and_then_widens_its_bias() -> None:
-    sensors, truth = SensorSuite().pack(), straight(60.0, 0.2)
-    rng = default_rng(2)
-    nav = new_navigation(sensors, truth[0], rng)
-    heading, sigma = [], []
-    for k in range(len(truth)):
-        if k == 400:
-            nav.hidden[HEADING_BIAS - 9] += np.deg2rad(30.0)
-        estimate = np.zeros(14)
-        navigation_tick(
-            k * TICK_S, k, TICK_S, truth[max(k - 1, 0)], truth[k], np.zeros(3), FLOOR, sensors,
-            nav, rng, estimate,
-        )  # fmt: skip
-        heading.append(estimate[5])
-        sigma.append(np.sqrt(nav.covariance[8, 8]))
-    counts = nav.counts[COMPASS_USE]
-    assert counts[WIDENED] == 1
-    assert counts[REJECTED] == 50
-    assert counts[RUN] == 0
-    # The gyroscopes hold the heading; the bias takes up the disturbance.
-    assert np.ptp(heading[390:]) < np.deg2rad(0.5)
-    assert np.rad2deg(nav.nominal[HEADING_BIAS + 1]) == pytest.approx(30.0, abs=3.0)
-    assert sigma[-1] >= 0.99 * sigma[399]
 
 
 def test_a_filter_that_is_sure_and_wrong_comes_back() -> None:

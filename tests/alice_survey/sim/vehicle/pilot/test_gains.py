@@ -183,27 +183,6 @@ def test_heading_is_damped_with_the_sway_that_it_brings(
     assert damping_ratio(slower) > g.MIN_HEADING_DAMPING - g.PASSING_DAMPING
 
 
-@pytest.mark.parametrize("name", ["alice", "sparus2"])
-@pytest.mark.parametrize("decay_share", [0.0, 0.5, 1.0])
-def test_a_wanted_speed_is_not_overshot(name: str, decay_share: float) -> None:
-    """Of the linear loop; with less drag than is fed forward, too."""
-    from scipy.signal import step
-
-    row = gains_of(name).axes[g.SURGE]
-    body = gains_of(name).body
-    decay = linear_damping(body, np.array([0.2, 0, 0, 0, 0, 0]))[0, 0] / row[g.MASS]
-    plant = [row[g.LAG], 1 + row[g.LAG] * decay * decay_share, decay * decay_share + row[g.RATE]]
-
-    def overshoot(weight: float) -> float:
-        top = [row[g.RATE] * weight + decay * decay_share, row[g.PLACE]]
-        _, out = step((top, [*plant, row[g.PLACE]]), N=4000)
-        return float(out.max()) - 1.0
-
-    assert overshoot(row[g.WEIGHT]) < 0.05
-    assert overshoot(1.0) > 0.1
-    assert 0.0 < row[g.WEIGHT] < 0.5
-
-
 @pytest.mark.parametrize(("name", "lost"), [("alice", "vertical"), ("sparus2", "port")])
 def test_a_vehicle_that_cannot_be_controlled_is_refused(name: str, lost: str) -> None:
     with pytest.raises(VehicleError):

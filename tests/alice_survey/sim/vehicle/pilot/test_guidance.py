@@ -21,7 +21,7 @@ from alice_survey.sim.vehicle.pilot.gains import (
 from alice_survey.sim.vehicle.pilot.guidance import steer
 from alice_survey.sim.vehicle.pilot.memory import PilotState, new_pilot
 from alice_survey.sim.vehicle.pilot.mission import NO_MISSION
-from alice_survey.sim.vehicle.pilot.path import Path, place_at
+from alice_survey.sim.vehicle.pilot.path import Path
 from alice_survey.sim.vehicle.pilot.settings import (
     CONTROL_LENGTH_M,
     LOS_DAMPING_RATIO,
@@ -33,7 +33,7 @@ from alice_survey.sim.vehicle.pilot.settings import (
 )
 from alice_survey.sim.vehicle.pilot.steering import hear_floor, write_point
 from tests import oracles_guidance as oracle
-from tests.alice_survey.sim.vehicle.pilot.pilot_runs import gains_of, lawnmower, straight
+from tests.alice_survey.sim.vehicle.pilot.pilot_runs import gains_of, straight
 from tests.oracles_guidance import los_offset_m
 
 TICK_S = 0.05
@@ -95,26 +95,6 @@ def test_a_tick_asks_for_what_its_twin_asks(
     if controller == "los":
         full[1] = 0.0
     np.testing.assert_allclose(wrench, full, atol=1e-9)
-
-
-@pytest.mark.parametrize("at", np.linspace(4.5, 9.5, 21))
-def test_turns_begin_before_the_arc_and_end_after_it(at: float) -> None:
-    path = lawnmower(2, 5.0)
-    gains, guidance = guide(path, "alice", "sway")
-    leg = int(np.searchsorted(path.begins_m, at, side="right") - 1)
-    along = at - path.begins_m[leg]
-    n, e, heading, _ = place_at(path, leg, along)
-    lever = guidance.point_body_m
-    estimate = np.zeros(vector.ESTIMATE)
-    estimate[0] = n - lever[0] * math.cos(heading) + lever[1] * math.sin(heading)
-    estimate[1] = e - lever[0] * math.sin(heading) - lever[1] * math.cos(heading)
-    estimate[[vector.HEADING, vector.U, vector.DEPTH]] = heading, 0.2, 13.0
-    pilot, wrench = pilot_on(path, leg, along), np.zeros(6)
-    steer(0.0, TICK_S, estimate, path, NO_MISSION, guidance, gains, pilot, wrench)
-    assert pilot.report[slot.CROSS] == pytest.approx(0.0, abs=1e-12)
-    # Simpson's rule across the kink of the heading.
-    expected = oracle.mean_heading(path, at, guidance.smooth_m)
-    assert pilot.report[slot.TARGET_HEADING] == pytest.approx(expected, abs=0.02)
 
 
 def test_the_floor_is_smoothed_as_its_transfer_function_says() -> None:

@@ -102,18 +102,6 @@ def test_speed_is_reached_without_overshoot(
     assert name != "alice" or np.argmax(surge > 0.9 * speed_mps) * 0.05 < 15.0
 
 
-def test_far_off_the_path_it_heads_for_it_and_near_it_sways() -> None:
-    flight = launch(straight(40.0), at_ned=(0.0, 3.0, 0.0), following=True)
-    rows = flight.fly(120.0)
-    by_sway = rows.report[:, slot.BY_SWAY]
-    assert np.count_nonzero(np.diff(by_sway)) == 1  # hysteresis: no chatter
-    near = np.argmax(by_sway)
-    assert abs(rows.cross_m[near]) == pytest.approx(flight.guidance.near_m, abs=0.02)
-    assert np.abs(rows.heading_error_rad[: near - 1]).max() > math.radians(20.0)
-    assert np.abs(rows.heading_error_rad[-400:]).max() < math.radians(0.5)
-    assert np.abs(rows.cross_m[-400:]).max() < 0.01
-
-
 def test_carried_off_it_goes_back_to_where_it_left_the_path() -> None:
     flight = launch(straight(40.0), following=True)
     left = flight.fly(60.0).report[-1, slot.ALONG]
@@ -134,17 +122,6 @@ def test_a_current_too_strong_for_the_vehicle_ends_in_an_explained_abort() -> No
     assert rows.phases()[-1] == ABORT
     assert rows.report[-1, slot.REASON] in (safety.NO_DIVE, safety.NO_APPROACH)
     assert rows.report[-1, slot.AT_SURFACE] == 1.0
-
-
-def test_a_blind_dive_goes_no_deeper_than_it_may_unseeing() -> None:
-    flight = launch(straight(40.0))
-    flight.guidance = flight.guidance._replace(
-        limits=flight.guidance.limits._replace(blind_depth_m=12.0)
-    )
-    flight.floor[2] = 0.0
-    rows = flight.fly(150.0)
-    assert rows.phases() == [DIVE, ABORT]
-    assert 11.9 < rows.estimate[:, vector.DEPTH].max() < 12.1
 
 
 @pytest.mark.parametrize("name", ["alice", "sparus2"])

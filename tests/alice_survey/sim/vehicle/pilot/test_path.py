@@ -73,35 +73,10 @@ def test_no_leg_is_skipped_however_wild_the_position(seed: int) -> None:
     assert over == (leg == len(seen) - 1 and total >= MOWER.begins_m[-1] + MOWER.length_m[-1])
 
 
-def test_headings_of_legs_are_continuous_however_they_are_wrapped() -> None:
-    wrapped = path_from_legs(
-        np.stack([MOWER.start_n, MOWER.start_e], axis=1),
-        np.mod(MOWER.heading_rad, 2 * math.pi),
-        MOWER.length_m,
-        MOWER.curvature_per_m,
-        MOWER.line,
-        2.0,
-        0.2,
-    )
-    np.testing.assert_allclose(np.diff(wrapped.heading_rad), np.diff(MOWER.heading_rad), atol=1e-9)
-
-
 STOPS = with_stops([
     ("go", 3.0, 0), ("spot", math.pi / 2), ("go", 1.0), ("step", 2.0), ("step", -1.0),
     ("spot", -2.0), ("go", 3.0, 1),
 ])  # fmt: skip
-
-
-def test_the_heading_goes_on_through_stops_though_the_course_kinks() -> None:
-    course = STOPS.heading_rad + STOPS.curvature_per_m * STOPS.length_m + STOPS.turn_rad
-    heading = STOPS.heading_rad + STOPS.side_rad
-    np.testing.assert_allclose(heading[1:], (course + STOPS.side_rad)[:-1], atol=1e-12)
-    assert STOPS.stop.tolist() == [1, 1, 1, 1, 1, 1, 0]
-    # A step to starboard is flown with the course to the right of the heading.
-    assert STOPS.side_rad[3] == pytest.approx(-math.pi / 2)
-    ends, _ = zip(*(oracle.walked(STOPS, i, STOPS.length_m[i]) for i in range(6)), strict=True)
-    starts = np.stack([STOPS.start_n, STOPS.start_e], axis=1)[1:]
-    np.testing.assert_allclose(ends, starts, atol=1e-9)
 
 
 def test_progress_does_not_pass_a_stop_and_headings_do_not_look_beyond() -> None:

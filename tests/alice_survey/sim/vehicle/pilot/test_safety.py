@@ -81,17 +81,6 @@ def test_without_bottom_lock_the_navigation_decides_if_it_may() -> None:
         assert reason == (safety.NONE if goes_on else safety.NO_BOTTOM)
 
 
-def test_false_echoes_and_gaps_do_not_end_a_mission() -> None:
-    pilot = pilot_in(slot.FOLLOW)
-    for k in range(100):
-        # 0.9 s of false echoes, a good one; 19 s without lock, a good one.
-        assert watched(pilot, calm(altitude_m=0.1), 0.9, time_s=40.0 * k)[0] == safety.NONE
-        assert watched(pilot, calm(), 0.1, time_s=40.0 * k + 10)[0] == safety.NONE
-        lost = watched(pilot, calm(altitude_m=math.nan), 19.0, time_s=40.0 * k + 15)
-        assert lost[0] == safety.NONE
-        assert watched(pilot, calm(), 0.1, time_s=40.0 * k + 35)[0] == safety.NONE
-
-
 def _steered(flight: Flight, estimate: Array) -> Array:
     wrench = np.full(6, math.nan)
     steer(
@@ -139,16 +128,6 @@ def test_an_abort_takes_the_vehicle_to_the_surface() -> None:
     rising = -np.diff(rows.estimate[:, vector.DEPTH]) / TICK_S
     assert 0.8 < rising.max() / flight.gains.axes[g.HEAVE, g.FASTEST] < 1.2
     assert np.abs(rows.estimate[:, vector.HEADING]).max() < math.radians(15.0)
-
-
-@pytest.mark.parametrize("part", [vector.ALTITUDE, vector.CLEARANCE])
-def test_either_too_low_stops_the_surge_and_raises_the_vehicle(part: int) -> None:
-    pilot, estimate = pilot_in(slot.FOLLOW), calm()
-    for clear_m, pace, rise_m in ((1.5, 1.0, 0.0), (1.125, 0.5, 0.125), (0.9, 0.0, 0.35)):
-        estimate[part] = clear_m
-        depth = safety.mind_floor(13.0, estimate, LIMITS, pilot)
-        assert depth == pytest.approx(13.0 - rise_m)
-        assert pilot.memory[slot.PACE] == pytest.approx(pace)
 
 
 def test_without_the_bottom_it_stops_rises_as_the_floor_did_and_goes_on_when_it_hears() -> None:

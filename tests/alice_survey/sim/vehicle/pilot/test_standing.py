@@ -8,7 +8,6 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.pilot import memory as slot
@@ -171,20 +170,6 @@ def test_alice_steps_aside_with_her_heading_held(current: tuple[float, float]) -
     assert 6.7 < on.sum() * TICK_S < 12.0
 
 
-def test_a_vehicle_without_sway_turns_and_goes_on_but_takes_no_steps() -> None:
-    flight = launch(SPOTS, "sparus2", "los", at_ned=(-1.2, 0.0, 0.0), following=True)
-    rows = flight.fly(120.0)
-    assert rows.phases()[-1] == slot.ASCEND
-    # It swings about its middle: along its heading the port is in its place again.
-    on = on_leg(rows, 1)
-    off = glass_of(flight, rows)[on][-1] - [3.0, 0.0]
-    heading = rows.estimate[on, vector.HEADING][-1]
-    assert abs(off @ [math.cos(heading), math.sin(heading)]) < 2 * STOP_M
-    assert np.linalg.norm(off) > 0.3
-    with pytest.raises(VehicleError, match=r"1 sway step.* los "):
-        guidance_of(STEPS, "sparus2")
-
-
 def test_a_stop_is_left_though_the_sea_does_not_let_the_vehicle_rest() -> None:
     path, guidance, gains = SPOTS, guidance_of(SPOTS), gains_of("alice")
     pilot, wrench = new_pilot(), np.zeros(6)
@@ -203,16 +188,3 @@ def test_a_stop_is_left_though_the_sea_does_not_let_the_vehicle_rest() -> None:
             break
     # 0.1 m (1 + t / 5 s) reaches 0.25 m after 7.5 s.
     assert left == pytest.approx(7.5, abs=0.2)
-
-
-def test_carried_off_a_stop_the_vehicle_comes_back_to_it() -> None:
-    flight = launch(SPOTS, at_ned=(-1.2, 0.0, 0.0), following=True)
-    flight.fly(30.0)
-    assert flight.pilot.report[slot.LEG] == 1.0
-    flight.state[0] -= 9.0
-    rows = flight.fly(200.0)
-    assert rows.phases() == [
-        slot.APPROACH, slot.FOLLOW, slot.ASCEND, slot.DONE,
-    ]  # fmt: skip
-    on = on_leg(rows, 2)
-    assert np.abs(rows.cross_m[on]).max() < 0.3
