@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from alice_survey.core.executor import local_executor
-from benchmarks import camera_calibration, camera_pose, camera_speed, target_calibration
+from benchmarks import camera_calibration, camera_speed, target_calibration
 from benchmarks.figures import Findings, add_options, hand_over
 from benchmarks.machine import heading, machine
 
-_PARTS = ("speed", "pose", "calibration", "target")
+_PARTS = ("speed", "calibration", "target")
 
 
 def main() -> None:
@@ -38,16 +38,6 @@ def main() -> None:
             findings += Findings(left_out=("AquaCal: give --aquacal PYTHON",))
         report["speed"] = [{**asdict(row), "ratio": row.ratio} for row in rows]
         findings += Findings(figures=tuple(f for row in rows for f in row.figures()))
-    if "pose" in options.only:
-        noise = (0.5, 2.0) if options.quick else tuple(camera_pose.PUBLISHED)
-        seeds = range(100 if options.quick else 1000)
-        levels = [camera_pose.run_level(n, seeds, local_executor(options.threads)) for n in noise]
-        print(
-            f"Absolute pose, {len(seeds)} trials a level: published by She et al. 2024, and ours."
-        )
-        print(camera_pose.table(levels), "\n", flush=True)
-        report["pose"] = [asdict(level) for level in levels]
-        findings += Findings(figures=tuple(f for level in levels for f in level.figures()))
     if "calibration" in options.only:
         count = 40 if options.quick else 200
         modes = [

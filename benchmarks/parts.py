@@ -141,16 +141,9 @@ PARTS = (
     Part(name="features", module="features", arguments=_features, needs=_need_features),
     Part(name="refraction", module="refraction"),
     Part(name="bend", module="bend", arguments=lambda _, work: ("--work", str(work))),
-    Part(name="bend-power", module="bend_power", arguments=lambda _, work: ("--work", str(work))),
     Part(
         name="precision",
         module="precision",
-        arguments=lambda _, work: ("--work", str(work)),
-        long=True,
-    ),
-    Part(
-        name="block-size",
-        module="block_size",
         arguments=lambda _, work: ("--work", str(work)),
         long=True,
     ),

@@ -1,13 +1,15 @@
-"""A workspace whose mapping is done, of synthetic tracks: what the placing stage starts from."""
+"""Synthetic tracks over a rough plane, and a workspace of them whose mapping is done."""
 
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pycolmap
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.core.frames import Array
+from alice_survey.core.frames import Array, Datum, attitude_from_rotation
 from alice_survey.core.manifest import ImageRecord, write_manifest
 from alice_survey.core.records import (
     CamerasRecord,
@@ -16,16 +18,122 @@ from alice_survey.core.records import (
     PlaceRecord,
     RangeRecord,
 )
-from benchmarks.block_size import ALTITUDE_M, DATUM, Block, near_start
+from benchmarks.bend_survey import NOISE_PX
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.rig import Rig, write_rig
-from reconstruct.adjustment.exact_observations import Pixels
+from reconstruct.adjustment.exact_observations import Pixels, RigState
 from reconstruct.mapping.arrays import Indices
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.refraction import Keypoints
 from reconstruct.matching.matches import as_seen
 from reconstruct.views.model_files import colmap_pinhole, rigid3d
+
+ALTITUDE_M, _STEP_M, _LINES_M, _DEPTH_M, _SPEED_MPS = 2.0, 0.4, 0.8, 10.0, 0.2
+_MATCHED = 0.5
+"""Share of the pictures that show a point in which it is matched."""
+_PLACE_M, _TURN_RAD = 0.002, 0.0005
+"""How far off the start is."""
+DATUM = Datum(32.8236, 34.9553)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Block:
+    """A survey of synthetic tracks."""
+
+    truth: RigState
+    pixels: Pixels
+
+
+def block(rig: Rig, stations: int, points: int) -> Block:
+    """Fly a rig, whose reference camera comes first, over a rough plane.
+
+    Args:
+        rig: cameras.
+        stations: how many.
+        points: on the sea floor, of each station.
+    """
+    rng = np.random.default_rng(stations)
+    names = list(rig.cameras)
+    reference = rig.cam_from_rig[names[0]]
+    rig = replace(
+        rig, cam_from_rig={n: pose * reference.inv() for n, pose in rig.cam_from_rig.items()}
+    )
+    long = int(np.sqrt(2.0 * stations))
+    line, along = np.divmod(np.arange(stations), long)
+    odd = line % 2 == 1
+    north = _STEP_M * np.where(odd, long - 1 - along, along)
+    centres = np.column_stack([north, _LINES_M * line, np.full(stations, _DEPTH_M)])
+    leaning = Rotation.from_euler("ZYX", rng.normal(0, 0.03, (stations, 3)))
+    ahead = Rotation.from_rotvec(np.pi * odd[:, None] * [0.0, 0.0, 1.0])
+    turns = (ahead * leaning * rig.body_from_cam(names[0]).rotation).as_matrix()
+    low, high = centres.min(axis=0)[:2] - 1.0, centres.max(axis=0)[:2] + 1.0
+    ground = rng.uniform(low, high, (points * stations, 2))
+    down = _DEPTH_M + ALTITUDE_M + 0.1 * np.sin(3.0 * ground).sum(axis=1)
+    floor = np.column_stack([ground, down])
+    near = cKDTree(ground).query_ball_point(centres[:, :2], 0.8 * ALTITUDE_M)
+    station = np.repeat(np.arange(stations), [len(row) for row in near])
+    point = np.concatenate([np.array(row, dtype=np.int64) for row in near])
+    arm = np.einsum("nij,ni->nj", turns[station], floor[point] - centres[station])
+    rows = []
+    for c, name in enumerate(names):
+        camera = rig.cameras[name]
+        at = camera.project(rig.cam_from_rig[name].apply(arm))
+        inside = np.all((at > 1) & (at < [camera.width_px - 1, camera.height_px - 1]), axis=1)
+        seen = np.flatnonzero(inside & (rng.uniform(size=len(at)) < _MATCHED))
+        rows.append((point[seen], station[seen], np.full(len(seen), c), at[seen]))
+    point, station, camera_of, taken = (
+        np.concatenate(column) for column in zip(*rows, strict=True)
+    )
+    enough = np.bincount(point, minlength=len(floor)) > 2
+    order = np.flatnonzero(enough[point])
+    order = order[np.argsort(point[order], kind="stable")]
+    kept, inverse, counts = np.unique(point[order], return_inverse=True, return_counts=True)
+    return Block(
+        truth=RigState(rig=rig, turns=turns, centres=centres, points=floor[kept]),
+        pixels=Pixels(
+            starts=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+            station=station[order],
+            camera=camera_of[order],
+            taken=taken[order] + rng.normal(0, NOISE_PX, (len(order), 2)),
+            point=inverse.astype(np.int64),
+        ),
+    )
+
+
+def near_start(truth: RigState) -> RigState:
+    """A state a little off the truth."""
+    rng, count = np.random.default_rng(1), len(truth.centres)
+    off = Rotation.from_rotvec(rng.normal(0, _TURN_RAD, (count, 3))).as_matrix()
+    return replace(
+        truth,
+        turns=off @ truth.turns,
+        centres=truth.centres + rng.normal(0, _PLACE_M, (count, 3)),
+        points=truth.points + rng.normal(0, _PLACE_M, truth.points.shape),
+    )
+
+
+def records_of(rig: Rig, truth: RigState) -> list[ImageRecord]:
+    """A log with a constant and a white error of depth and white errors of the rest."""
+    name, rng = next(iter(rig.cameras)), np.random.default_rng(2)
+    poses = RigidTransform.from_components(truth.centres, Rotation.from_matrix(truth.turns))
+    bodies = poses * rig.body_from_cam(name).inv()
+    ned = bodies.translation + rng.normal(0, [0.03, 0.03, 0.002], (len(poses), 3)) + [0, 0, 0.05]
+    places = DATUM.geodetic_from_ned(ned)
+    angles = np.rad2deg(attitude_from_rotation(bodies.rotation))
+    angles = angles + rng.normal(0, 0.02, angles.shape)
+    return [
+        ImageRecord(
+            image=f"{name}/{i:06d}.png", camera=name, station=i,
+            time_s=i * _STEP_M / _SPEED_MPS, latitude_deg=float(place[0]),
+            longitude_deg=float(place[1]), depth_m=float(place[2]), roll_deg=float(angle[0]),
+            pitch_deg=float(angle[1]), heading_deg=float(angle[2] % 360.0),
+            altitude_m=ALTITUDE_M, sigma_horizontal_m=0.03, sigma_depth_m=0.05,
+            sigma_attitude_deg=0.02, sigma_heading_deg=0.02,
+        )
+        for i, (place, angle) in enumerate(zip(places, angles, strict=True))
+    ]  # fmt: skip
+
 
 NEAR_M, FAR_M = 0.9 * ALTITUDE_M, 1.1 * ALTITUDE_M
 

@@ -27,8 +27,16 @@ from alice_survey.core.frames import Array
 from alice_survey.core.manifest import ImageRecord
 from alice_survey.core.records import RegistrationRecord
 from benchmarks.bend_survey import NOISE_PX, calibrated_rig
-from benchmarks.block_size import ALTITUDE_M, DATUM, Block, block, near_start, records_of
-from benchmarks.scale_model import pinhole_warps, write_mapped
+from benchmarks.scale_model import (
+    ALTITUDE_M,
+    DATUM,
+    Block,
+    block,
+    near_start,
+    pinhole_warps,
+    records_of,
+    write_mapped,
+)
 from camera_calib.freedom import Prior
 from camera_calib.rig import Rig, read_rig
 from reconstruct.adjustment.exact_observations import (

@@ -34,8 +34,8 @@ def test_every_benchmark_that_hands_figures_over_is_a_part() -> None:
     found = sorted(file.stem for file in files if "add_options(parser" in file.read_text())
 
     assert found == MODULES
-    assert {"camera", "planner", "vehicle", "features", "refraction", "bend", "bend_power",
-            "block_size", "cluster", "scale", "many_pictures", "refine_gpu", "precision",
+    assert {"camera", "planner", "vehicle", "features", "refraction", "bend",
+            "cluster", "scale", "many_pictures", "refine_gpu", "precision",
             "reconstruct", "missions", "mosaic", "harbour", "facade", "turbid", "colour",
             "real_pictures", "studio"} == {*MODULES}  # fmt: skip
 

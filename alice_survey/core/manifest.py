@@ -9,10 +9,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
+import numpy as np
 from pydantic import TypeAdapter, ValidationError
+from scipy.spatial.transform import Rotation
 
 from alice_survey.core.artefacts import read_csv, write_csv
 from alice_survey.core.errors import ImageError
+from alice_survey.core.frames import rotation_from_attitude
 
 NAN = math.nan
 
@@ -73,6 +76,13 @@ class ImageRecord:
     def has_attitude(self) -> bool:
         """Whether roll, pitch and heading are known."""
         return not math.isnan(self.roll_deg + self.pitch_deg + self.heading_deg)
+
+    @property
+    def ned_from_body(self) -> Rotation:
+        """Attitude; only where `has_attitude`."""
+        return rotation_from_attitude(
+            *np.deg2rad([self.roll_deg, self.pitch_deg, self.heading_deg])
+        )
 
 
 _COLUMNS = tuple(field.name for field in fields(ImageRecord))

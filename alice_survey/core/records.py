@@ -163,26 +163,42 @@ class BendRecord(JsonRecord):
     """Sag of a model along one direction, against navigation."""
 
     length_m: float
+    """Length of the block along the direction."""
     sag_m: float
+    """How far the middle is off against the ends."""
     sag_sigma_m: float
     straightened_per_m: float = 0.0
     """Curvature that navigation took out of the model before."""
+    curvature_per_m: float = 0.0
+    """Second derivative of the model's height error: positive where ends are too high."""
+    sigma_per_m: float = 0.0
+
+    def is_significant(self, pixel_m: float) -> bool:
+        """Whether it is beyond three sigmas and larger than a ground pixel."""
+        return abs(self.sag_m) > max(3.0 * self.sag_sigma_m, pixel_m)
 
 
 class ScaleOfPairs(JsonRecord):
-    """Scale of the stereo pairs over the survey."""
+    """Lengths of the model over those of its stations' own stereo, over the survey."""
 
     mean: float
+    """1 when they agree."""
     mean_sigma: float
+    range: float = 0.0
+    """Largest minus smallest value of the fitted paraboloid over the stations."""
+    range_sigma: float = 0.0
 
 
 class DomingRecord(JsonRecord):
-    """Bend of a model, as far as navigation shows it."""
+    """Evidence of a bent model; what could not be measured is None."""
 
     along: BendRecord | None = None
     across: BendRecord | None = None
+    """Perpendicular to the block's longest axis; None for a single line."""
     scale: ScaleOfPairs | None = None
     notes: Notes = ()
+    pixel_m: float | None = None
+    """Ground pixel, metres."""
 
     @property
     def bends(self) -> dict[str, BendRecord]:
@@ -191,10 +207,28 @@ class DomingRecord(JsonRecord):
         return {way: bend for way, bend in ways.items() if bend is not None}
 
 
+class FarStation(JsonRecord):
+    """A station that is not where navigation places it."""
+
+    station: int
+    image: str
+    off_m: float
+    sigmas: float
+    """Its distance over the usual one."""
+
+
 class AcceptanceRecord(JsonRecord):
-    """Whether the model agrees with rig and navigation."""
+    """Signs that a mapping is wrong: against its rig and navigation."""
 
     notes: Notes = ()
+    checked: int = 0
+    """Stations with a position."""
+    usual_m: float | None = None
+    """Usual distance from navigation, one standard deviation by axis, robustly."""
+    far: tuple[FarStation, ...] = ()
+    """Stations off navigation, the farthest first."""
+    rig_error: float | None = None
+    """Relative error of the rig in the finished model."""
 
 
 class WarpRecord(JsonRecord):
@@ -242,12 +276,25 @@ class PortRecord(JsonRecord):
     correlation: tuple[tuple[float, ...], ...]
     contradiction: str | None = None
     """What the pictures say against the calibration, in words."""
+    sigma_px: float | None = None
+    """Sigma of one coordinate of a keypoint."""
 
 
 class MountRecord(JsonRecord):
     """How the rig is mounted, where the survey found it."""
 
     words: str
+    body_from_rig: dict[str, Any] = Field(default_factory=dict)
+    turn_sigma_deg: tuple[float, ...] = ()
+    """About the vehicle's axes forward, right, down."""
+    lever_sigma_m: tuple[float, ...] = ()
+
+
+class NuisanceRecord(JsonRecord):
+    """What was found of an error of the installation or of navigation's own frame."""
+
+    value: float
+    sigma: float
 
 
 class GeoreferenceRecord(JsonRecord):
@@ -267,6 +314,28 @@ class GeoreferenceRecord(JsonRecord):
     sigma_scale: float = 0.0
     """Sigma of the logarithm of the scale that navigation gave; 0 where it is held."""
     mount: MountRecord | None = None
+    format: str = "alice-survey georeference"
+    version: int = 1
+    method: str = ""
+    stations: int = 0
+    left_out: dict[str, int] = Field(default_factory=dict)
+    """Readings that the rest contradicts, by group of channels."""
+    sigma_tilt_north_deg: float = 0.0
+    sigma_tilt_east_deg: float = 0.0
+    largest_tilt_deg: float = 0.0
+    largest_tilt_axis_deg: float = 0.0
+    mount_sigma_deg: float = 0.0
+    lever_sigma_m: float = 0.0
+    clock_sigma_s: float = 0.0
+    nuisances: dict[str, NuisanceRecord] = Field(default_factory=dict)
+    soft_modes: tuple[float, ...] = ()
+    """Sizes of the model's soft modes, in their sigmas."""
+    soft_modes_factor: float = 1.0
+    middle_ned_m: tuple[float, ...] = ()
+    covariance: tuple[tuple[float, ...], ...] = ()
+    covariance_order: tuple[str, ...] = ()
+    errors: dict[str, dict[str, float]] = Field(default_factory=dict)
+    """How navigation's errors are correlated, by group of channels."""
 
 
 class SimilarityRecord(JsonRecord):
@@ -331,6 +400,10 @@ class PointRow(ControlRow):
     north_m: float
     east_m: float
     down_m: float
+    left_out: tuple[str, ...] = ()
+    """Pictures whose picks are off the common point."""
+    reprojection_px: float | None = None
+    sigma_picks_m: float | None = None
 
 
 class BarRow(ControlRow):
@@ -339,6 +412,8 @@ class BarRow(ControlRow):
     known_m: float
     error_m: float
     error_relative: float
+    length_m: float | None = None
+    sigma_picks_m: float | None = None
 
 
 class ControlRms(JsonRecord):
@@ -350,6 +425,7 @@ class ControlRms(JsonRecord):
     down_m: float | None = None
     bars: int = 0
     length_m: float | None = None
+    length_relative: float | None = None
 
 
 class ControlRecord(JsonRecord):
@@ -364,6 +440,8 @@ class ControlRecord(JsonRecord):
     """How many times larger sigmas of points are than stated."""
     rms: dict[str, ControlRms]
     """Statistics by use."""
+    format: str = "alice-survey control"
+    version: int = 1
 
 
 class PictureCamera(JsonRecord):

@@ -22,7 +22,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import pycolmap
@@ -33,6 +33,7 @@ from alice_survey.core.block_solver import BlockStep, Flags, inverse_of, minimis
 from alice_survey.core.config import ReconstructConfig
 from alice_survey.core.errors import ReconstructionError, warn
 from alice_survey.core.frames import Array
+from alice_survey.core.records import PortRecord
 from alice_survey.core.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.freedom import POSE as TURN_AND_SHIFT
@@ -275,22 +276,23 @@ class SurveyFit:
             ),
         )
 
-    def to_json(self) -> dict[str, Any]:
+    @property
+    def record(self) -> PortRecord:
         """What `port.json` says."""
         known = Covariance(parameters=self.parameters, matrix=self.covariance)
         found = self.contradiction
-        return {
-            "contradiction": None if found is None else found.words,
-            "parameters": list(self.parameters),
-            "before": self.before.tolist(),
-            "after": self.after.tolist(),
-            "prior_sigmas": self.prior_sigmas.tolist(),
-            "sigmas": list(known.sigmas.values()),
-            "correlation": known.correlation.tolist(),
-            "sigma_px": self.sigma_px,
-            "observations": self.observations,
-            "stations": len(self.state.centres),
-        }
+        return PortRecord(
+            stations=len(self.state.centres),
+            observations=self.observations,
+            parameters=self.parameters,
+            before=tuple(self.before.tolist()),
+            after=tuple(self.after.tolist()),
+            prior_sigmas=tuple(self.prior_sigmas.tolist()),
+            sigmas=tuple(known.sigmas.values()),
+            correlation=tuple(map(tuple, known.correlation.tolist())),
+            contradiction=None if found is None else found.words,
+            sigma_px=self.sigma_px,
+        )
 
 
 @progress.step("adjust stations, points and rig")

@@ -21,10 +21,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.executor import Executor
-from alice_survey.core.frames import BODY_FROM_NADIR_CAM, Array, rotation_from_attitude
+from alice_survey.core.frames import BODY_FROM_NADIR_CAM, Array
 from alice_survey.core.manifest import ImageRecord
 from camera_calib.rig import Rig
 from reconstruct.matching.features import Features, load_features, save_features, spread
@@ -317,11 +316,8 @@ def quarter_turns(record: ImageRecord, rig: Rig | None) -> int:
     """
     if not record.has_attitude:
         return 0
-    attitude = np.deg2rad([record.roll_deg, record.pitch_deg, record.heading_deg])
-    ned_from_body = RigidTransform.from_rotation(rotation_from_attitude(*attitude))
-    mount = RigidTransform.from_rotation(BODY_FROM_NADIR_CAM)
-    body_from_cam = mount if rig is None else rig.body_from_cam(record.camera)
-    axes = (ned_from_body * body_from_cam).rotation.as_matrix()
+    mount = BODY_FROM_NADIR_CAM if rig is None else rig.body_from_cam(record.camera).rotation
+    axes = (record.ned_from_body * mount).as_matrix()
     if axes[2, 2] < _STEEP:
         return 0
     up = -axes[:, 1]  # the picture's y points down

@@ -26,7 +26,7 @@ from shapely import STRtree
 from shapely.geometry import Polygon
 
 from alice_survey.core.executor import Executor
-from alice_survey.core.frames import Array, Datum, rotation_from_attitude
+from alice_survey.core.frames import Array, Datum
 from alice_survey.core.manifest import ImageRecord
 from camera_calib.camera import Camera
 from camera_calib.rig import Rig
@@ -92,8 +92,7 @@ def frusta_of(
     geodetic = np.array([[r.latitude_deg, r.longitude_deg, r.depth_m] for r in records])
     poses, points, rays = [], [], []
     for record, place in zip(records, datum.ned_from_geodetic(geodetic), strict=True):
-        angles = np.deg2rad([record.roll_deg, record.pitch_deg, record.heading_deg])
-        body = RigidTransform.from_components(place, rotation_from_attitude(*angles))
+        body = RigidTransform.from_components(place, record.ned_from_body)
         pose = body * rig.body_from_cam(record.camera)
         starts, ways = lattices[record.camera]
         along = (depths[:, None] - starts[:, 2]) / ways[:, 2]
@@ -354,8 +353,7 @@ def footprints(records: Sequence[ImageRecord], rig: Rig, datum: Datum) -> list[P
     reference = rig.cameras[rig.reference]
     polygons = []
     for record, position in zip(records, positions, strict=True):
-        attitude = np.deg2rad([record.roll_deg, record.pitch_deg, record.heading_deg])
-        ned_from_body = RigidTransform.from_components(position, rotation_from_attitude(*attitude))
+        ned_from_body = RigidTransform.from_components(position, record.ned_from_body)
         outer_glass = (ned_from_body * rig.body_from_cam(rig.reference)).apply(reference.front_cam)
         floor = outer_glass[2] + record.altitude_m
         ned_from_cam = ned_from_body * rig.body_from_cam(record.camera)

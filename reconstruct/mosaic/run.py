@@ -65,7 +65,7 @@ from reconstruct.mosaic.picture_measures import (
 )
 from reconstruct.mosaic.seams import SUPPORT_PX
 from reconstruct.mosaic.visibility import Water, find_occluders, occluders_folder
-from reconstruct.placing.track_figure import plot_track_over
+from reconstruct.placing.track import plot_track_over
 from reconstruct.planes import PLANES, Plane, plane_folders, read_plane, turned, write_plane
 from reconstruct.raster import (
     BLOCK,

@@ -23,6 +23,7 @@ from reconstruct.picking.matching import refine
 from reconstruct.picking.registered import RegisteredPictures
 from reconstruct.picking.surface import ModelSurface, SurfacePlace
 from reconstruct.pictures.undistorted import read_colour
+from reconstruct.placing.control_command import note_scale
 from reconstruct.placing.control_points import PICK_SIGMA_PX, Pick
 
 _NUMBER = r"(-?\d+(?:\.\d+)?)"
@@ -71,6 +72,33 @@ def measure(
         ]
     places, figures = Lengths(workspace, pictures).figures(picks, lines)
     return _described(words, places, figures)
+
+
+def scale_model(workspace: Path, points: str, length_m: float) -> str:
+    """Note the true distance between two picked points of a model in `scale.json`.
+
+    Args:
+        workspace: folder with a finished `sparse/`.
+        points: two of them, as `measure` takes points.
+        length_m: their true distance.
+
+    Returns:
+        What was found, in one line.
+
+    Raises:
+        ReconstructionError: the points cannot be understood or found, or the scale is known from
+            the rig already.
+    """
+    marks, words = parse_picks(points.replace("+", "=")), points.split()
+    if len(words) != 2:
+        raise ReconstructionError(f"--points needs two points, got {len(words)}: {points!r}")
+    pictures = RegisteredPictures.read(workspace)
+    finder, lengths = _PickFinder(workspace, pictures), Lengths(workspace, pictures)
+    first, second = (
+        lengths.spot(finder.find(some) if len(some) == 1 else finder.checked(some)).model
+        for some in marks
+    )
+    return note_scale(workspace, (words[0], words[1]), first, second, length_m)
 
 
 def parse_picks(points: str, sigma_px: float = 0.0) -> list[tuple[Pick, ...]]:

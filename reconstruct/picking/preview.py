@@ -40,8 +40,8 @@ def preview_control(
     still = Similarity(scale=1.0, rotation=Rotation.identity(), translation=np.zeros(3))
     start = ties.start(1.0 if frame.scaled else None)
     return {
-        "now": ties.score(still, located=frame.name == "ned") if _says(ties) else None,
-        "fitted": None if start is None else ties.score(start, located=True),
+        "now": ties.score(still, located=frame.name == "ned").to_json() if _says(ties) else None,
+        "fitted": None if start is None else ties.score(start, located=True).to_json(),
         "not_found": dict(ties.lost),
     }
 

@@ -1,8 +1,4 @@
-"""Picture files as cameras write them: found, checked by decoding them whole, and copied.
-
-HEIC, the pictures of phones, needs `pillow-heif`, which is not a dependency: its wheels hold
-libraries under the GPL.
-"""
+"""Picture files as cameras write them: found, checked by decoding them whole, and copied."""
 
 import os
 import re
@@ -13,8 +9,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, tzinfo
 from fractions import Fraction
-from functools import cache
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -33,26 +27,6 @@ from camera_calib.picture_files import (
 )
 
 HEIC = (".heic", ".heif", ".hif", ".avif")
-_TURNS = {3: 2, 6: 1, 8: 3}
-"""Quarter turns, counter-clockwise, that undo a decoder's, by the EXIF orientation it took off."""
-
-
-@cache
-def can_read_heic() -> bool:
-    """Whether `pillow-heif` is installed; Pillow then knows its formats."""
-    try:
-        pillow_heif = import_module("pillow_heif")
-    except ImportError:
-        return False
-    pillow_heif.register_heif_opener()
-    return True
-
-
-def stored_turns(info: Mapping[str, Any]) -> int:
-    """Quarter turns, counter-clockwise, from a picture as decoded to its pixels as stored."""
-    return _TURNS.get(info.get("original_orientation") or 1, 0)
-
-
 PLAIN = (".jpg", ".jpeg", ".png")
 TIFF = (".tif", ".tiff")
 RAW = (
@@ -65,7 +39,7 @@ VIDEO = (
 )  # fmt: skip
 IN_FOLDERS = "in folders inside"
 ADVICE = {
-    "HEIC": "'pip install pillow-heif' makes them readable, or save them as JPEG",
+    "HEIC": "save them as JPEG",
     "video": "take its frames with --video, into a workspace of their own",
     IN_FOLDERS: "take them with --recursive, or give these folders too",
     "other files": "their names are not those of pictures",
@@ -174,13 +148,8 @@ def look_into(
 
 
 def kind_of(path: Path) -> str:
-    """`JPEG`, `PNG`, `TIFF`, `RAW` or `HEIC` by the name of a file; empty for all others.
-
-    HEIC counts where the user has installed a decoder of it.
-    """
+    """`JPEG`, `PNG`, `TIFF` or `RAW` by the name of a file; empty for all others."""
     kinds = {"PNG": (".png",), "JPEG": PLAIN, "TIFF": TIFF, "RAW": RAW}
-    if path.suffix.lower() in HEIC and can_read_heic():
-        return "HEIC"
     return next((kind for kind, names in kinds.items() if path.suffix.lower() in names), "")
 
 
@@ -252,13 +221,12 @@ def inspect(path: Path) -> PictureFacts:
 
 def read_header(path: Path) -> PictureFacts:
     """What a picture states, without decoding it; size 0 where only decoding can tell."""
-    heic = path.suffix.lower() in HEIC and can_read_heic()  # which makes Pillow know them
     facts = PictureFacts(path=path)
     try:
         with _pillow(path) as image:
             facts = PictureFacts(path=path, width_px=image.width, height_px=image.height)
     except ImageError as error:
-        fault = "" if path.suffix.lower() in RAW and not heic else str(error)
+        fault = "" if path.suffix.lower() in RAW else str(error)
         return PictureFacts(path=path, fault=fault)
     if path.suffix.lower() in RAW:  # Pillow sees the small picture inside
         facts = PictureFacts(path=path)
@@ -272,11 +240,8 @@ def decode(path: Path) -> NDArray[Any]:
         ImageError: it cannot be decoded to its end.
     """
     suffix = path.suffix.lower()
-    heic = suffix in HEIC and can_read_heic()  # which makes Pillow know them
     if maximum := pixels_too_many(path):
         raise ImageError(f"states over {maximum / 1e6:.0f} million pixels: make it smaller")
-    if heic:
-        return _decode_heic(path)
     if suffix in RAW:
         return _develop(path)
     if suffix in PLAIN:
@@ -290,13 +255,6 @@ def decode(path: Path) -> NDArray[Any]:
     if pixels.ndim == 3 and pixels.shape[2] not in (3, 4):
         raise ImageError(f"has {pixels.shape[2]} channels; 1, 3 or 4 can be read")
     return np.ascontiguousarray(pixels[..., :3] if pixels.ndim == 3 else pixels)
-
-
-def _decode_heic(path: Path) -> NDArray[Any]:
-    """Pixels as the sensor saw them: decoders turn HEIC upright, and state by how much."""
-    with _pillow(path) as image:
-        rgb = np.asarray(image.convert("RGB"))
-        return np.ascontiguousarray(np.rot90(rgb, stored_turns(image.info))[..., ::-1])
 
 
 @contextmanager

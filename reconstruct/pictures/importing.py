@@ -223,7 +223,9 @@ def scan_sources(
         raise ImageError(f"{twice[0]} is given twice")
     known_rig = None if rig is None else read_rig(rig)
     mono = "camera" if known_rig is None else known_rig.reference
-    named = {name: [path] for name, path in cameras.items()} or ({mono: folders} if folders else {})
+    named = {name: [path] for name, path in cameras.items()}
+    if folders:
+        named = {mono: [*folders]}
     return ImportScan(
         folders={
             name: [look_into(path, [*every, *apart], recursive=recursive) for path in paths]

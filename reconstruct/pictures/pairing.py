@@ -20,7 +20,7 @@ from camera_calib.calibrate.picture_sets import pair_pictures
 from camera_calib.picture_files import time_taken
 from missions.logs.dive import finite_number
 from missions.logs.navigation_csv import utc_date
-from reconstruct.pictures.files import can_read_heic, list_names, to_utc
+from reconstruct.pictures.files import list_names, to_utc
 
 _WITHIN_SHARE = 0.25
 """Pictures this share of the shortest usual interval apart are of one moment: a dropped picture
@@ -222,7 +222,6 @@ def _time_in_name(path: Path) -> float | None:
 
 
 def _time_in_exif(path: Path) -> float | None:
-    can_read_heic()  # which makes Pillow know them
     taken = time_taken(path)
     return None if taken is None else to_utc(taken, UTC).timestamp()
 

@@ -9,7 +9,6 @@ own yardstick to every station.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -17,18 +16,25 @@ import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.errors import warn
-from alice_survey.core.frames import Array, Datum, rotation_from_attitude
+from alice_survey.core.frames import Array, Datum
 from alice_survey.core.manifest import ImageRecord
+from alice_survey.core.records import (
+    AcceptanceRecord,
+    BendRecord,
+    DomingRecord,
+    FarStation,
+    ScaleOfPairs,
+)
 from alice_survey.core.robust import CAUCHY_TUNING, MAD_TO_SIGMA
 from alice_survey.core.run import progress
-from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import Observed, first_pictures, observed
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.working_range import ray_passes
 from reconstruct.matching.pairs import positions_ned
 from reconstruct.pictures.files import list_names
-from reconstruct.placing.alignment import MIN_STATIONS, Bend, quadratic
+from reconstruct.placing.alignment import MIN_STATIONS, align_rigid, quadratic
+from reconstruct.placing.navigation import body_from_pinhole
 from reconstruct.views.model_files import as_transform
 
 FAR_SIGMAS, FAR_M = 5.0, 0.5
@@ -44,69 +50,9 @@ _FIT_ROUNDS = 10
 _MIN_STEREO_POINTS = 20
 
 
-@dataclass(frozen=True, kw_only=True)
-class ScaleTrend:
-    """How the model's scale, against the rig's baseline, varies over a block."""
-
-    mean: float
-    """Lengths of the model over those of its stations' own stereo; 1 when they agree."""
-    mean_sigma: float
-    range: float
-    """Largest minus smallest value of the fitted paraboloid over the stations."""
-    range_sigma: float
-
-    @property
-    def significant(self) -> bool:
-        """Whether it is beyond its noise."""
-        return self.range > _SIGMAS * self.range_sigma
-
-    def off_by_more_than(self, bound: float) -> bool:
-        """Whether the mean is off by this much and beyond its noise."""
-        return abs(self.mean - 1.0) > max(bound, _SIGMAS * self.mean_sigma)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Doming:
-    """Evidence of a bent model; what could not be measured is None."""
-
-    along: Bend | None
-    across: Bend | None
-    """Perpendicular to the block's longest axis; None for a single line."""
-    scale: ScaleTrend | None
-    pixel_m: float
-    """Ground pixel, metres."""
-
-    def to_json(self) -> dict[str, object]:
-        """Figures for `mapping.json`."""
-        bends: dict[str, object] = {
-            name: None
-            if bend is None
-            else {**vars(bend), "sag_m": bend.sag_m, "sag_sigma_m": bend.sag_sigma_m}
-            for name, bend in (("along", self.along), ("across", self.across))
-        }
-        scale = None if self.scale is None else vars(self.scale)
-        return {
-            **bends,
-            "scale": scale,
-            "pixel_m": self.pixel_m if np.isfinite(self.pixel_m) else None,
-            "notes": self.notes(),
-        }
-
-    def notes(self) -> list[str]:
-        """A line for every significant bend."""
-        return [
-            f"the model is bent {name} the block: {1e3 * bend.sag_m:+.1f} +/- "
-            f"{1e3 * bend.sag_sigma_m:.1f} mm over {bend.length_m:.1f} m against navigation's "
-            "depth and attitude, which the calibration does not allow for: calibrate again, or fly "
-            "cross lines"
-            for name, bend in (("along", self.along), ("across", self.across))
-            if bend is not None and bend.significant(self.pixel_m)
-        ]
-
-
 def measure_doming(
-    model: pycolmap.Reconstruction, rotations: Mapping[int, Rotation], bends: Sequence[Bend]
-) -> Doming:
+    model: pycolmap.Reconstruction, rotations: Mapping[int, Rotation], bends: Sequence[BendRecord]
+) -> DomingRecord:
     """Bring together how bent a model is, and warn where that is significant.
 
     Args:
@@ -116,20 +62,29 @@ def measure_doming(
     """
     seen = observed(model)
     along, across = (*bends, None, None)[:2]
-    found = Doming(
+    pixel_m = ground_pixel(model, seen)
+    notes = [
+        f"the model is bent {name} the block: {1e3 * bend.sag_m:+.1f} +/- "
+        f"{1e3 * bend.sag_sigma_m:.1f} mm over {bend.length_m:.1f} m against navigation's "
+        "depth and attitude, which the calibration does not allow for: calibrate again, or fly "
+        "cross lines"
+        for name, bend in (("along", along), ("across", across))
+        if bend is not None and bend.is_significant(pixel_m)
+    ]
+    for note in notes:
+        warn(note)
+    return DomingRecord(
         along=along,
         across=across,
         scale=scale_trend(model, seen, first_pictures(model), down_of(model, rotations)),
-        pixel_m=ground_pixel(model, seen),
+        notes=tuple(notes),
+        pixel_m=pixel_m if np.isfinite(pixel_m) else None,
     )
-    for note in found.notes():
-        warn(note)
-    return found
 
 
 def scale_trend(
     model: pycolmap.Reconstruction, seen: Observed, reference: Mapping[int, int], down: Array
-) -> ScaleTrend | None:
+) -> ScaleOfPairs | None:
     """The model's scale at every station against that station's stereo, as a trend over the block.
 
     Args:
@@ -157,7 +112,7 @@ def scale_trend(
     values = design @ fitted
     between = design[np.argmax(values)] - design[np.argmin(values)]
     mean, mean_cov = _robust_fit(np.ones((len(scale), 1)), scale, sigma)
-    return ScaleTrend(
+    return ScaleOfPairs(
         mean=float(mean[0]),
         mean_sigma=float(np.sqrt(mean_cov[0, 0])),
         range=float(np.ptp(values)),
@@ -166,43 +121,32 @@ def scale_trend(
 
 
 def pinhole_positions(
-    records: Sequence[ImageRecord], rig: Rig, warps: Mapping[str, PinholeWarp], datum: Datum
+    records: Sequence[ImageRecord], mounts: Mapping[str, RigidTransform], datum: Datum
 ) -> tuple[Array, Array]:
     """The pinholes' centres by navigation.
+
+    Args:
+        records: pictures.
+        mounts: `body_from_pinhole` by camera.
+        datum: of the positions.
 
     Returns:
         (N, 3) positions in NED and their sigmas, both metres; NaN where position, attitude or a
         sigma is unknown.
     """
-    bodies = positions_ned(records, datum)
-    positions, sigmas = np.full((len(records), 3), np.nan), np.full((len(records), 3), np.nan)
+    positions = positions_ned(records, datum)
+    sigmas = np.full((len(records), 3), np.nan)
     for i, record in enumerate(records):
-        sigma = np.array(
-            [record.sigma_horizontal_m, record.sigma_horizontal_m, record.sigma_depth_m]
-        )
+        lever = mounts[record.camera].translation
         turn = np.deg2rad(max(record.sigma_attitude_deg, record.sigma_heading_deg))
-        if not (record.has_position and record.has_attitude and np.all(sigma > 0) and turn > 0):
-            continue
-        attitude = np.deg2rad([record.roll_deg, record.pitch_deg, record.heading_deg])
-        body_from_pinhole = (
-            rig.body_from_cam(record.camera) * warps[record.camera].pinhole_from_cam.inv()
-        )
-        lever = body_from_pinhole.translation
-        positions[i] = bodies[i] + rotation_from_attitude(*attitude).apply(lever)
-        sigmas[i] = np.hypot(sigma, turn * np.linalg.norm(lever))
+        level, depth = record.sigma_horizontal_m, record.sigma_depth_m
+        if record.has_attitude and min(level, depth, turn) > 0:
+            positions[i] += record.ned_from_body.apply(lever)
+            sigmas[i] = np.hypot([level, level, depth], turn * np.linalg.norm(lever))
+        else:
+            positions[i] = np.nan
+    sigmas[np.isnan(positions)] = np.nan
     return positions, sigmas
-
-
-def navigation_rotations(
-    records: Sequence[ImageRecord], rig: Rig, warps: Mapping[str, PinholeWarp]
-) -> dict[int, Rotation]:
-    """`ned_from_pinhole` by picture's index, where navigation has attitudes."""
-    return {
-        i: rotation_from_attitude(*np.deg2rad([r.roll_deg, r.pitch_deg, r.heading_deg]))
-        * (rig.body_from_cam(r.camera) * warps[r.camera].pinhole_from_cam.inv()).rotation
-        for i, r in enumerate(records)
-        if r.has_attitude
-    }
 
 
 def down_of(model: pycolmap.Reconstruction, rotations: Mapping[int, Rotation]) -> Array:
@@ -292,75 +236,14 @@ def _station_scale(
     return float(np.median(ratio)), max(1.2533 * spread / np.sqrt(len(ratio)), 1e-9)
 
 
-@dataclass(frozen=True, kw_only=True)
-class FarStation:
-    """A station that is not where navigation places it."""
-
-    station: int
-    image: str
-    off_m: float
-    sigmas: float
-    """Its distance over the usual one."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Acceptance:
-    """Signs that a mapping is wrong."""
-
-    checked: int
-    """Stations with a position."""
-    usual_m: float
-    """Usual distance from navigation, one standard deviation by axis, robustly; NaN without."""
-    far: tuple[FarStation, ...]
-    """Stations off navigation, the farthest first."""
-    rig_error: float
-    """Relative error of the rig in the finished model; NaN where there is no known rig."""
-    scale: ScaleTrend | None
-    """Scale of the model against its stations' own stereo."""
-
-    def notes(self) -> list[str]:
-        """A line for every fault."""
-        notes = []
-        if self.far:
-            names = list_names([f"{f.image} ({f.off_m:.2f} m)" for f in self.far])
-            notes.append(
-                f"{len(self.far)} of {self.checked} stations lie more than {FAR_SIGMAS:.0f} sigmas "
-                f"and {FAR_M} m from where navigation has them, which others miss by "
-                f"{self.usual_m:.2f} m: {names}; look at "
-                "these pictures and at navigation's log"
-            )
-        if abs(self.rig_error) > SCALE_BOUND:
-            notes.append(
-                f"the rig's baseline came out {100 * self.rig_error:+.2f} % off the calibrated "
-                "one: lengths are not to be trusted"
-            )
-        scale = self.scale
-        if scale is not None and scale.off_by_more_than(SCALE_BOUND):
-            notes.append(
-                f"lengths are {100 * (scale.mean - 1):+.2f} +/- {100 * scale.mean_sigma:.2f} % off "
-                "what every station's own stereo says: check the rig's calibration"
-            )
-        return notes
-
-    def to_json(self) -> dict[str, object]:
-        """Figures for `mapping.json`."""
-        return {
-            "checked": self.checked,
-            "usual_m": self.usual_m if np.isfinite(self.usual_m) else None,
-            "far": [vars(f) for f in self.far],
-            "rig_error": self.rig_error if np.isfinite(self.rig_error) else None,
-            "notes": self.notes(),
-        }
-
-
 @progress.step("judge the model")
 def judge_model(
     mapped: Mapped,
     records: Sequence[ImageRecord],
     rig: Rig,
     datum: Datum | None,
-    bends: Sequence[Bend] = (),
-) -> tuple[Doming, Acceptance]:
+    bends: Sequence[BendRecord] = (),
+) -> tuple[DomingRecord, AcceptanceRecord]:
     """How bent a model on a known rig is, and whether it is credible, by all that is known of it.
 
     Args:
@@ -373,9 +256,14 @@ def judge_model(
     positions = sigmas = np.full((len(records), 3), np.nan)
     rotations: dict[int, Rotation] = {}
     if rig.body_from_rig is not None:
-        rotations = navigation_rotations(records, rig, mapped.warps)
+        mounts = body_from_pinhole(rig, mapped.warps)
+        rotations = {
+            i: r.ned_from_body * mounts[r.camera].rotation
+            for i, r in enumerate(records)
+            if r.has_attitude
+        }
         if datum is not None:
-            positions, sigmas = pinhole_positions(records, rig, mapped.warps, datum)
+            positions, sigmas = pinhole_positions(records, mounts, datum)
     doming = measure_doming(mapped.model, rotations, bends)
     # What adjustments made of the rig, before its size was put back.
     rig_error = model_baseline(mapped.model) / (mapped.baseline * mapped.rig_factor) - 1.0
@@ -389,8 +277,8 @@ def check_mapping(
     positions: Array,
     sigmas: Array,
     rig_error: float,
-    scale: ScaleTrend | None,
-) -> Acceptance:
+    scale: ScaleOfPairs | None,
+) -> AcceptanceRecord:
     """Check a finished model on a known rig, and warn of what is wrong.
 
     Args:
@@ -403,10 +291,33 @@ def check_mapping(
         scale: of the model against its stations' own stereo.
     """
     checked, usual, far = _far_stations(model, records, positions, sigmas)
-    found = Acceptance(checked=checked, usual_m=usual, far=far, rig_error=rig_error, scale=scale)
-    for note in found.notes():
+    notes = []
+    if far:
+        names = list_names([f"{f.image} ({f.off_m:.2f} m)" for f in far])
+        notes.append(
+            f"{len(far)} of {checked} stations lie more than {FAR_SIGMAS:.0f} sigmas and {FAR_M} m "
+            f"from where navigation has them, which others miss by {usual:.2f} m: {names}; look at "
+            "these pictures and at navigation's log"
+        )
+    if abs(rig_error) > SCALE_BOUND:
+        notes.append(
+            f"the rig's baseline came out {100 * rig_error:+.2f} % off the calibrated one: lengths "
+            "are not to be trusted"
+        )
+    if scale is not None and abs(scale.mean - 1) > max(SCALE_BOUND, _SIGMAS * scale.mean_sigma):
+        notes.append(
+            f"lengths are {100 * (scale.mean - 1):+.2f} +/- {100 * scale.mean_sigma:.2f} % off "
+            "what every station's own stereo says: check the rig's calibration"
+        )
+    for note in notes:
         warn(note)
-    return found
+    return AcceptanceRecord(
+        notes=tuple(notes),
+        checked=checked,
+        usual_m=usual if np.isfinite(usual) else None,
+        far=far,
+        rig_error=rig_error if np.isfinite(rig_error) else None,
+    )
 
 
 def _far_stations(
@@ -452,18 +363,8 @@ def misses(centres: Array, given: Array, sigmas: Array) -> tuple[Array, Array]:
     off = np.zeros(len(centres))
     spread = 1.0
     for _ in range(_ROUNDS):
-        off = np.linalg.norm(_align_weighted(centres, given, weight / stated**2) - given, axis=1)
+        moved = align_rigid(centres, given, weight / stated**2).apply(centres)
+        off = np.linalg.norm(moved - given, axis=1)
         spread = max(float(np.median(off / stated)) / _MEDIAN_SIGMAS, 1e-9)
         weight = 1.0 / (1.0 + (off / (CAUCHY_TUNING * spread * stated)) ** 2)
     return off, stated * max(spread, 1.0)
-
-
-def _align_weighted(source: Array, target: Array, weight: Array) -> Array:
-    """The source where a rigid motion brings it nearest to the target (Kabsch 1976)."""
-    share = weight / weight.sum()
-    from_middle, to_middle = share @ source, share @ target
-    u, _, vt = np.linalg.svd((target - to_middle).T @ (share[:, None] * (source - from_middle)))
-    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    turn = Rotation.from_matrix(u @ flip @ vt)
-    move = RigidTransform.from_components(to_middle - turn.apply(from_middle), turn)
-    return np.asarray(move.apply(source), np.float64)

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.frames import Array
+from alice_survey.core.records import BendRecord
 
 _TRIMS = 5
 """Rounds of leaving out what is off the mean plane."""
@@ -30,29 +31,30 @@ class Similarity:
         return moved
 
 
-def align_rigid(source: Array, target: Array) -> RigidTransform:
+def align_rigid(source: Array, target: Array, weight: Array | None = None) -> RigidTransform:
     """The rigid transform that takes source to target with the least squares error (Kabsch).
 
     Args:
         source: (N, 3), N >= 3, not on one line.
         target: (N, 3).
+        weight: (N,) of the squares; equal if None.
 
     Returns:
         `target_from_source`.
     """
-    similarity = _align(source, target, with_scale=False)
+    similarity = _align(source, target, weight, with_scale=False)
     return RigidTransform.from_components(similarity.translation, similarity.rotation)
 
 
 def align_similarity(source: Array, target: Array) -> Similarity:
     """The same transform with a free scale (Umeyama 1991, equations 40 to 43)."""
-    return _align(source, target, with_scale=True)
+    return _align(source, target, None, with_scale=True)
 
 
-def _align(source: Array, target: Array, *, with_scale: bool) -> Similarity:
-    centre_source, centre_target = source.mean(axis=0), target.mean(axis=0)
+def _align(source: Array, target: Array, weight: Array | None, *, with_scale: bool) -> Similarity:
+    centre_source, centre_target = (np.average(p, axis=0, weights=weight) for p in (source, target))
     a, b = source - centre_source, target - centre_target
-    u, singular, vt = np.linalg.svd(b.T @ a)
+    u, singular, vt = np.linalg.svd(b.T @ (a if weight is None else weight[:, None] * a))
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
     rotation = Rotation.from_matrix(u @ np.diag(signs) @ vt)
     scale = float((singular * signs).sum() / (a**2).sum()) if with_scale else 1.0
@@ -94,36 +96,22 @@ def level(points: Array, centres: Array) -> Similarity:
 
 _THIN = 0.1
 """Width over length of a block below which it has no curvature across."""
-_SIGMAS = 3.0
 MIN_STATIONS = 8
 """A paraboloid has six coefficients."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Bend:
-    """Curvature of a block along one of its axes."""
-
-    curvature_per_m: float
-    """Second derivative of the model's height error: positive where ends are too high."""
-    sigma_per_m: float
-    length_m: float
-    """Length of the block along the axis."""
-    straightened_per_m: float = 0.0
-    """Curvature that was taken out of the model before."""
-
-    @property
-    def sag_m(self) -> float:
-        """How far the middle is off against the ends: `curvature * length^2 / 8`."""
-        return self.curvature_per_m * self.length_m**2 / 8.0
-
-    @property
-    def sag_sigma_m(self) -> float:
-        """Standard deviation of the sag."""
-        return self.sigma_per_m * self.length_m**2 / 8.0
-
-    def significant(self, pixel_m: float) -> bool:
-        """Whether it is beyond its noise and larger than a ground pixel."""
-        return abs(self.sag_m) > max(_SIGMAS * self.sag_sigma_m, pixel_m)
+def bend_of(
+    curvature_per_m: float, sigma_per_m: float, length_m: float, straightened_per_m: float = 0.0
+) -> BendRecord:
+    """The bend of a curvature: the middle is off against the ends by `curvature length^2 / 8`."""
+    return BendRecord(
+        length_m=length_m,
+        sag_m=curvature_per_m * length_m**2 / 8.0,
+        sag_sigma_m=sigma_per_m * length_m**2 / 8.0,
+        straightened_per_m=straightened_per_m,
+        curvature_per_m=curvature_per_m,
+        sigma_per_m=sigma_per_m,
+    )
 
 
 def quadratic(places: Array) -> tuple[Array, Array, Array]:

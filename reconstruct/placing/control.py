@@ -9,13 +9,13 @@ points at that placement give their real sigma.
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.optimize import brentq
 
 from alice_survey.core.errors import warn
 from alice_survey.core.frames import Array, Datum
+from alice_survey.core.records import BarRow, ControlRecord, ControlRms, PointRow
 from alice_survey.core.robust import MAD_TO_SIGMA
 from reconstruct.mapping.arrays import cross_matrices
 from reconstruct.placing.alignment import Similarity, align_rigid, align_similarity
@@ -194,30 +194,25 @@ class ControlFit:
         mean = float(weights @ np.array([factor for factor, _ in factors]) / weights.sum())
         return float(np.exp(mean)), float(weights.sum() ** -0.5)
 
-    def score(self, place: Similarity, *, located: bool) -> dict[str, Any]:
+    def score(self, place: Similarity, *, located: bool) -> ControlRecord:
         """What `control.json` says of a placed model.
 
         Args:
             place: `world_from_model`, metres.
             located: whether the world is the one in which the points are known.
         """
-        points = [_score_point(tie, place) for tie in self.ties] if located else []
-        bars = [_score_bar(bar, place.scale) for bar in self.bars]
-        return {
-            "format": "alice-survey control",
-            "version": 1,
-            "points": points,
-            "bars": bars,
-            "not_found": dict(self.lost),
-            "sigma_factor": self.sigma_factor,
-            "rms": {
-                use: {
-                    **_rms_points([p for p in points if p["use"] == use]),
-                    **_rms_bars([b for b in bars if b["use"] == use]),
-                }
+        points = tuple(_score_point(tie, place) for tie in self.ties) if located else ()
+        bars = tuple(_score_bar(bar, place.scale) for bar in self.bars)
+        return ControlRecord(
+            points=points,
+            bars=bars,
+            not_found=dict(self.lost),
+            sigma_factor=self.sigma_factor,
+            rms={
+                use: _rms_of([p for p in points if p.use == use], [b for b in bars if b.use == use])
                 for use in ("control", "check")
             },
-        }
+        )
 
 
 def aligned(model: Array, ned: Array, known_scale: float | None) -> Similarity | None:
@@ -269,36 +264,36 @@ def _sides(marker: str) -> list[tuple[str, str]]:
     return [(f"{marker}.{k}", f"{marker}.{(k + 1) % 4}") for k in range(4)]
 
 
-def warn_of_contradictions(score: Mapping[str, Any]) -> None:
+def warn_of_contradictions(score: ControlRecord) -> None:
     """Warn of control that the model contradicts, by what `ControlFit.score` says."""
-    for row in (*score["points"], *score["bars"]):
-        if row["use"] == "control" and row["misfit_sigmas"] > _CONTRADICTED_SIGMAS:
+    for row in (*score.points, *score.bars):
+        if row.use == "control" and row.misfit_sigmas > _CONTRADICTED_SIGMAS:
             warn(
-                f"control {row['name']} is {row['misfit_sigmas']:.1f} sigmas off the model: "
+                f"control {row.name} is {row.misfit_sigmas:.1f} sigmas off the model: "
                 "check its coordinates and picks, or set use to check"
             )
 
 
-def describe(score: Mapping[str, Any]) -> str:
+def describe(score: ControlRecord) -> str:
     """The score in a few lines."""
     lines = []
     for use, words in (("control", "used"), ("check", "held out")):
-        rms = score["rms"][use]
-        if rms["points"]:
+        rms = score.rms[use]
+        if rms.north_m is not None and rms.east_m is not None and rms.down_m is not None:
             lines.append(
-                f"{rms['points']} points {words}: rms north {1e3 * rms['north_m']:.1f}, east "
-                f"{1e3 * rms['east_m']:.1f}, down {1e3 * rms['down_m']:.1f} mm"
+                f"{rms.points} points {words}: rms north {1e3 * rms.north_m:.1f}, east "
+                f"{1e3 * rms.east_m:.1f}, down {1e3 * rms.down_m:.1f} mm"
             )
-        if rms["bars"]:
+        if rms.length_m is not None and rms.length_relative is not None:
             lines.append(
-                f"{rms['bars']} lengths {words}: rms {1e3 * rms['length_m']:.2f} mm, "
-                f"{100 * rms['length_relative']:.3f} %"
+                f"{rms.bars} lengths {words}: rms {1e3 * rms.length_m:.2f} mm, "
+                f"{100 * rms.length_relative:.3f} %"
             )
-    if score.get("sigma_factor", 1.0) > 1.0:
-        lines.append(f"sigmas of the points are {score['sigma_factor']:.2g} times those stated")
-    left_out = [row["name"] for row in score["points"] if row["use"] == "left out"]
+    if score.sigma_factor > 1.0:
+        lines.append(f"sigmas of the points are {score.sigma_factor:.2g} times those stated")
+    left_out = [row.name for row in score.points if row.use == "left out"]
     lines += [f"{name}: left out, for the others contradict it" for name in left_out]
-    lines += [f"{name}: {why}" for name, why in score["not_found"].items()]
+    lines += [f"{name}: {why}" for name, why in score.not_found.items()]
     return "\n".join(lines) if lines else "no control was found in the pictures"
 
 
@@ -308,56 +303,55 @@ def _log_factor(bar: _Bar) -> tuple[float, float]:
     return float(np.log(bar.known.length_m / bar.in_model)), float(relative)
 
 
-def _score_point(tie: _Tie, place: Similarity) -> dict[str, Any]:
-    miss = place.apply(tie.picked_point.model[None])[0] - tie.ned
+def _score_point(tie: _Tie, place: Similarity) -> PointRow:
+    residual = place.apply(tie.picked_point.model[None])[0] - tie.ned
     turn = place.rotation.as_matrix()
     spread = place.scale**2 * turn @ tie.picked_point.covariance @ turn.T
     sigmas = np.sqrt(np.diag(spread) + tie.sigma**2)
-    return {
-        "name": tie.name,
-        "use": tie.use,
-        "views": tie.picked_point.views,
-        "left_out": list(tie.picked_point.left_out),
-        "reprojection_px": tie.picked_point.rms_px,
-        "north_m": float(miss[0]),
-        "east_m": float(miss[1]),
-        "down_m": float(miss[2]),
-        "sigma_picks_m": float(np.sqrt(np.trace(spread))),
-        "misfit_sigmas": float(np.abs(miss / sigmas).max()),
-    }
+    north, east, down = residual.tolist()
+    return PointRow(
+        name=tie.name,
+        use=tie.use,
+        misfit_sigmas=float(np.abs(residual / sigmas).max()),
+        views=tie.picked_point.views,
+        north_m=north,
+        east_m=east,
+        down_m=down,
+        left_out=tie.picked_point.left_out,
+        reprojection_px=tie.picked_point.rms_px,
+        sigma_picks_m=float(np.sqrt(np.trace(spread))),
+    )
 
 
-def _score_bar(bar: _Bar, scale: float) -> dict[str, Any]:
+def _score_bar(bar: _Bar, scale: float) -> BarRow:
     length = scale * bar.in_model
-    miss = length - bar.known.length_m
+    error = length - bar.known.length_m
     sigma = float(np.hypot(bar.known.sigma_m, scale * bar.sigma_in_model))
-    return {
-        "name": bar.name,
-        "use": bar.use,
-        "length_m": length,
-        "known_m": bar.known.length_m,
-        "error_m": miss,
-        "error_relative": miss / bar.known.length_m,
-        "sigma_picks_m": scale * bar.sigma_in_model,
-        "misfit_sigmas": abs(miss) / sigma,
-    }
+    return BarRow(
+        name=bar.name,
+        use=bar.use,
+        misfit_sigmas=abs(error) / sigma,
+        known_m=bar.known.length_m,
+        error_m=error,
+        error_relative=error / bar.known.length_m,
+        length_m=length,
+        sigma_picks_m=scale * bar.sigma_in_model,
+    )
 
 
-def _rms(values: Sequence[float]) -> float | None:
-    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
+def _rms_of(points: Sequence[PointRow], bars: Sequence[BarRow]) -> ControlRms:
+    def rms(values: Sequence[float]) -> float | None:
+        return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
 
-
-def _rms_points(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    axes = ("north_m", "east_m", "down_m")
-    return {"points": len(rows), **{axis: _rms([row[axis] for row in rows]) for axis in axes}}
-
-
-def _rms_bars(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    return {
-        "bars": len(rows),
-        "length_m": _rms([row["error_m"] for row in rows]),
-        "length_relative": _rms([row["error_relative"] for row in rows]),
-    }
+    return ControlRms(
+        points=len(points),
+        north_m=rms([p.north_m for p in points]),
+        east_m=rms([p.east_m for p in points]),
+        down_m=rms([p.down_m for p in points]),
+        bars=len(bars),
+        length_m=rms([b.error_m for b in bars]),
+        length_relative=rms([b.error_relative for b in bars]),
+    )
 
 
 _TRIPLE = 3

@@ -1,43 +1,62 @@
-"""The command `control`: find coded markers, prepare picking, and note one known length.
+"""The commands `control` and `import-control`: markers, picking, one known length, other programs.
 
 One known length scales a model that no calibrated rig has scaled: `scale.json` in the workspace
 keeps it, and `sparse/` and all that follows are then redone.
+
+Control of other programs becomes `control.csv` and `picks.csv`:
+
+- Metashape and PhotoScan export markers as XML (File > Export > Export Markers). A chunk lists
+  `cameras` (labels by number), `markers` with `reference` coordinates (x, y, z, their accuracies;
+  unticked ones are check points), `scalebars` between two of them with a `reference` distance, and
+  by frame the `location` of each marker in pictures, in pixels from the outer corner of the first
+  one. Locations that no person pinned are predictions of the program, and are not used. A
+  scale bar that does not name its markers by their numbers has their labels in its own, `A_B`.
+- OpenDroneMap's `gcp_list.txt` names the coordinate system in its first line (`EPSG:32615`, a PROJ
+  string or `WGS84 UTM 16N`); each other line is a pick: `x y z im_x im_y picture [name]`, separated
+  by blanks. Picks of one name, or where there are no names of one place, are one point.
 """
 
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal
+from xml.etree import ElementTree as ET
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from pyproj import CRS, Transformer
+from pyproj.exceptions import CRSError, ProjError
 
 from alice_survey.core.artefacts import need_stage, read_stage, write_csv
-from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.contents import one_line, shown
+from alice_survey.core.errors import ReconstructionError, WorkspaceError, warn, why
 from alice_survey.core.executor import SERIAL, Executor
 from alice_survey.core.frames import Array, Datum
 from alice_survey.core.manifest import read_manifest
 from alice_survey.core.records import ControlRecord, MappingRecord, RegistrationRecord, ScaleRecord
-from camera_calib.approximation.pinhole_warp import PinholeWarp
+from alice_survey.core.untrusted import xml_root
+from reconstruct.pictures.files import list_names, safe_name
 from reconstruct.pictures.undistorted import Pictures, read_colour
 from reconstruct.placing.control import describe
 from reconstruct.placing.control_points import (
     CONTROL_FILE,
     MARKERS_FILE,
+    PICK_SIGMA_PX,
     PICKS_FILE,
+    KnownLength,
     KnownPoint,
     Pick,
-    RegisteredPicture,
+    Use,
     read_control,
     read_picks,
-    triangulate_picks,
+    write_control,
+    write_picks,
 )
 from reconstruct.stages import SCALE_FILE
-from reconstruct.views.model import SparseModel, View, read_frame, read_model, read_warps
+from reconstruct.views.model import SparseModel, read_frame, read_model
 
 MARKER_SIGMA_PX = 0.2
 """Sigma of a corner that the detector refined."""
@@ -134,7 +153,9 @@ def survey_control(
             f"{template} rows to fill in: {PICKS_FILE}; pixels count from 0 at the middle of the "
             "first, near_x and near_y say where to look; delete what is not to be seen"
         )
-    score = _score(workspace)
+    score = None
+    if read_stage(workspace / "sparse") is not None:
+        score = ControlRecord.made(workspace / ControlRecord.path)
     if score is not None:
         lines.append(describe(score))
     if (workspace / CONTROL_FILE).is_file():
@@ -146,7 +167,7 @@ def survey_control(
         "markers": {str(n): count for n, count in seen_often.items()},
         "detections": len(rows) // 4,
         "template_rows": template,
-        "score": score,
+        "score": score and score.to_json(),
     }
 
 
@@ -208,50 +229,6 @@ def _expected_in(
     return found
 
 
-def _score(workspace: Path) -> dict[str, Any] | None:
-    path = workspace / "sparse" / "control.json"
-    if read_stage(workspace / "sparse") is None or not path.is_file():
-        return None
-    return ControlRecord.read(path).to_json()
-
-
-_NEIGHBOURS = 15
-"""Model points from which the surface at a pixel is taken."""
-_MARK_SIGMA_PX = 1.0
-"""Marks of one spot in several pictures must agree to five of these."""
-
-
-def scale_model(workspace: Path, points: str, length_m: float) -> str:
-    """Note the true distance between two points of a model in `scale.json`.
-
-    Args:
-        workspace: folder with a finished `sparse/`.
-        points: two points, separated by a space. Each is `x,y,z` in the coordinates of the model
-            (as in `sparse/track.csv` and the clouds), or a spot in pictures: `IMAGE:x,y` with
-            pixels of the imported picture counted from 0, as viewers show them. A spot marked in
-            several pictures, joined by `+` (`left/001.png:52,80+left/002.png:31,82`), is
-            triangulated; one marked in one picture is taken on the surface through the model's
-            points nearest to it.
-        length_m: their true distance.
-
-    Returns:
-        What was found, in one line.
-
-    Raises:
-        ReconstructionError: the points cannot be understood or found, or the scale is known from
-            the rig already.
-    """
-    tokens = points.split()
-    if len(tokens) != 2:
-        raise ReconstructionError(
-            f"--points needs two points separated by a space, got {len(tokens)}: {points!r}"
-        )
-    sparse = need_stage(workspace, "sparse", "reconstruct")
-    model, warps = read_model(sparse), read_warps(sparse / "cameras.json")
-    first, second = (find_point(token, model, warps) for token in tokens)
-    return note_scale(workspace, (tokens[0], tokens[1]), first, second, length_m)
-
-
 def note_scale(
     workspace: Path, names: tuple[str, str], first: Array, second: Array, length_m: float
 ) -> str:
@@ -298,84 +275,408 @@ def note_scale(
     )
 
 
-def find_point(token: str, model: SparseModel, warps: Mapping[str, PinholeWarp]) -> Array:
-    """A point in world coordinates, (3,), as `scale_model` describes it.
+@dataclass(frozen=True, kw_only=True)
+class ForeignControl:
+    """All that a file of another program holds.
+
+    Heights are positive up and depths unknown; NaN stands for sigmas that it does not state, and
+    for places of points that have none. Pictures of picks are files, with or without folder and
+    suffix.
+    """
+
+    points: list[KnownPoint] = field(default_factory=list)
+    lengths: list[KnownLength] = field(default_factory=list)
+    picks: list[Pick] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    """What else it holds that is not used."""
+
+
+PlaceOf = Callable[[float, float], KnownPoint]
+"""A nameless point from x (easting or longitude) and y in the coordinates of a file."""
+
+
+def _coordinates(system: str) -> PlaceOf:
+    """Coordinates of a file from the name of their system: what pyproj takes.
 
     Raises:
-        ReconstructionError: it cannot be understood, or not be found in the model.
+        ValueError: it is no coordinate system; of a place, that it is beyond it.
     """
-    if ":" not in token:
-        cells = token.split(",")
-        try:
-            point = np.array([float(cell) for cell in cells])
-        except ValueError:
-            point = np.zeros(0)
-        if point.shape != (3,) or not np.isfinite(point).all():
-            raise ReconstructionError(f"{token!r} is not a point x,y,z")
-        return point
-    views = {view.image: view for view in model.views}
-    picks = [_read_pick(text, views, warps) for text in token.split("+")]
-    if len(picks) == 1:
-        view = views[picks[0].image]
-        pixel = np.array([[picks[0].x_px, picks[0].y_px]])
-        return _on_surface(token, view, warps[view.camera].to_pinhole(pixel)[0], model)
-    cameras = {
-        image: RegisteredPicture(warp=warps[view.camera], model_from_pinhole=view.world_from_cam)
-        for image, view in views.items()
-        if image in {pick.image for pick in picks}
-    }
-    found, lost = triangulate_picks(picks, cameras)
-    if not found:
-        raise ReconstructionError(f"{token!r}: {lost['spot']}; mark it again")
-    return found["spot"].model
-
-
-def _read_pick(text: str, views: Mapping[str, View], warps: Mapping[str, PinholeWarp]) -> Pick:
-    """The pick that `IMAGE:x,y` says."""
-    match = re.fullmatch(r"(.+):([-+.\deE]+),([-+.\deE]+)", text)
     try:
-        name, pixel = (
-            (match[1], np.array([float(match[2]), float(match[3])])) if match else ("", None)
+        crs = CRS.from_user_input(system)
+    except CRSError:
+        raise ValueError(f"{shown(system)!r} is no coordinate system that is known") from None
+    if crs.is_engineering:  # a local grid, metres
+        return lambda x, y: KnownPoint(name="", north_m=y, east_m=x)
+    to_wgs84 = Transformer.from_crs(crs.to_2d(), 4326, always_xy=True)
+
+    def place(x: float, y: float) -> KnownPoint:
+        try:
+            longitude, latitude = to_wgs84.transform(x, y, errcheck=True)
+        except ProjError:
+            raise ValueError(f"{x}, {y} is not a place in {shown(crs.name)}") from None
+        return KnownPoint(name="", latitude_deg=float(latitude), longitude_deg=float(longitude))
+
+    return place
+
+
+_ACCURACIES = ("accuracy_markers", "accuracy_projections", "accuracy_scalebars")
+"""Settings of a chunk: sigma of markers' coordinates (m), of their places in pictures (px) and of
+scale bars (m)."""
+
+
+def read_markers(text: str) -> ForeignControl:
+    """Read markers that Metashape exported.
+
+    Raises:
+        ValueError: it is not valid, or lacks something.
+    """
+    top = xml_root(text)
+    chunks = [top] if top.tag == "chunk" else list(top.iter("chunk"))
+    chunks = [chunk for chunk in chunks if chunk.find("markers") is not None]
+    if len(chunks) != 1:
+        raise ValueError(f"{len(chunks)} chunks have markers: export the markers of one")
+    (chunk,) = chunks
+    settings = {item.get("name"): item.get("value") for item in chunk.iter("property")}
+    sigma_m, sigma_px, sigma_bar_m = (_sigma(settings.get(name), name) for name in _ACCURACIES)
+    cameras = {camera.get("id"): str(camera.get("label")) for camera in chunk.iter("camera")}
+    labels = {
+        marker.get("id"): (marker.get("label") or f"marker {marker.get('id')}").strip()
+        for marker in chunk.findall("markers/marker")
+    }
+    found = ForeignControl()
+    systems = [chunk.findtext(tag) or "" for tag in ("markers_reference", "reference")]
+    system = next((text.strip() for text in systems if text.strip()), "")
+    placed = chunk.findall("markers/marker/reference[@x]")
+    if not system and (placed or chunk.find("scalebars/scalebar") is None):
+        raise ValueError(
+            "names no coordinate system: set one in Metashape's reference pane and export"
         )
-    except ValueError:
-        pixel = None
-    if pixel is None:
-        raise ReconstructionError(f"{text!r} is not a spot IMAGE:x,y")
-    if name not in views:
-        raise ReconstructionError(f"{text!r}: no picture {name} is in the model")
-    warp = warps[views[name].camera]
-    width, height = warp.size_px
-    if not (0 <= pixel[0] < width and 0 <= pixel[1] < height):
-        raise ReconstructionError(f"{text!r} is outside of the picture, {width} x {height} pixels")
-    if not np.isfinite(warp.to_pinhole(pixel[None] + 0.5)).all():
-        raise ReconstructionError(f"{text!r} is beyond the reach of the lens model")
-    x, y = (pixel + 0.5).tolist()
-    return Pick(image=name, point="spot", x_px=x, y_px=y, sigma_px=_MARK_SIGMA_PX)
-
-
-def _on_surface(token: str, view: View, pixel: Array, model: SparseModel) -> Array:
-    """Where the ray meets the plane through the nearest points that the picture saw."""
-    index = model.views.index(view)
-    seen = np.unique(model.observations[model.observations[:, 1] == index, 0])
-    cam_from_world: RigidTransform = view.world_from_cam.inv()
-    points = cam_from_world.apply(model.points_world[seen]).reshape(-1, 3)
-    points = points[points[:, 2] > 0]
-    slopes = points / points[:, 2:]
-    ray = np.append(view.pinhole.slopes(pixel), 1.0)
-    nearest = np.argsort(np.linalg.norm(slopes - ray, axis=1), kind="stable")[:_NEIGHBOURS]
-    if len(nearest) < 3:
-        raise ReconstructionError(f"{token!r}: the model has {len(nearest)} points in that picture")
-    # On a plane 1/z is linear in the slopes.
-    near, inverse = slopes[nearest], 1.0 / points[nearest, 2]
-    for _ in range(3):
-        plane = np.linalg.lstsq(near, inverse, rcond=None)[0]
-        miss = np.abs(near @ plane - inverse)
-        good = miss <= 3.0 * np.median(miss) + 1e-12
-        if good.sum() < 3:
-            break
-        near, inverse = near[good], inverse[good]
-    depth = 1.0 / float(ray @ plane)
-    if not depth > 0:
-        raise ReconstructionError(f"{token!r}: no surface of the model is there")
-    found: Array = view.world_from_cam.apply(depth * ray)
+    for marker in chunk.findall("markers/marker") if system else ():
+        reference = marker.find("reference")
+        if reference is not None:
+            name = labels[marker.get("id")]
+            found.points.append(_marker_point(name, reference, _coordinates(system), sigma_m))
+    for marker in chunk.findall("frames/frame/markers/marker"):
+        for location in marker.findall("location"):
+            if not _is_true(location, "pinned"):
+                continue
+            picture = cameras.get(location.get("camera_id"))
+            point = labels.get(marker.get("marker_id"))
+            if picture is None or point is None:
+                raise ValueError(
+                    f"a location names camera {location.get('camera_id')} and marker "
+                    f"{marker.get('marker_id')}, which it does not list"
+                )
+            x, y = (_finite(location.get(axis, ""), f"{axis} of {point}") for axis in "xy")
+            sigma = PICK_SIGMA_PX if math.isnan(sigma_px) else sigma_px
+            found.picks.append(Pick(image=picture, point=point, x_px=x, y_px=y, sigma_px=sigma))
+    lost = []
+    for number, item in enumerate(chunk.findall("scalebars/scalebar")):
+        bar = _bar(item, labels, sigma_bar_m)
+        if bar is None:
+            lost.append(item.get("label") or f"number {number}")
+        else:
+            found.lengths.append(bar)
+    if lost:
+        found.notes.append(
+            f"scale bars without a distance or two markers are left out: {', '.join(lost)}"
+        )
     return found
+
+
+def _bar(item: ET.Element, labels: Mapping[str | None, str], sigma_m: float) -> KnownLength | None:
+    """A scale bar; None where it has no distance, or does not lie between two known markers."""
+    reference = item.find("reference")
+    if reference is None or reference.get("distance") is None:
+        return None
+    name = (item.get("label") or f"bar {item.get('id')}").strip()
+    numbers = [
+        value
+        for part in item.iter()
+        for key, value in sorted(part.attrib.items())
+        if "marker" in key or (key == "id" and part.tag == "marker")
+    ]
+    ends = [labels[number] for number in numbers if number in labels]
+    if not numbers:
+        pairs = [(name[:k], name[k + 1 :]) for k, letter in enumerate(name) if letter == "_"]
+        known = set(labels.values())
+        ends = next(([*pair] for pair in pairs if known.issuperset(pair)), [])
+    if len(ends) != 2 or ends[0] == ends[1]:
+        return None
+    length_m = _finite(reference.get("distance", ""), f"distance of {name}")
+    if length_m <= 0:
+        raise ValueError(f"distance of {shown(name)} is {length_m}: it must be more than 0")
+    own = _sigma(reference.get("accuracy"), f"accuracy of {name}")
+    return KnownLength(
+        name=name,
+        ends=(ends[0], ends[1]),
+        length_m=length_m,
+        use="control" if _is_true(reference, "enabled") else "check",
+        sigma_m=sigma_m if math.isnan(own) else own,
+    )
+
+
+def _marker_point(
+    name: str, reference: ET.Element, place_of: PlaceOf, sigma_m: float
+) -> KnownPoint:
+    use: Use = "control" if _is_true(reference, "enabled") else "check"
+    if any(reference.get(axis) is None for axis in "xyz"):
+        return KnownPoint(name=name, use=use, sigma_m=sigma_m, sigma_vertical_m=sigma_m)
+    x, y, z = (_finite(reference.get(axis, ""), f"{axis} of {name}") for axis in "xyz")
+    sx, sy, sz = (_sigma(reference.get(axis), f"{axis} of {name}") for axis in ("sx", "sy", "sz"))
+    level = max((s for s in (sx, sy) if s > 0), default=sigma_m)
+    return replace(
+        place_of(x, y), name=name, use=use, height_m=z, sigma_m=level,
+        sigma_vertical_m=sigma_m if math.isnan(sz) else sz,
+    )  # fmt: skip
+
+
+def _is_true(element: ET.Element, key: str) -> bool:
+    return element.get(key, "true").lower() in ("true", "1")
+
+
+def _sigma(text: str | None, name: str) -> float:
+    """A positive number, or NaN where nothing is stated."""
+    if text is None or not text.strip():
+        return math.nan
+    value = _finite(text, name)
+    if value <= 0:
+        raise ValueError(f"{shown(name)} is {value}: it must be more than 0")
+    return value
+
+
+def _finite(text: str, name: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ValueError(f"{shown(name)} is {shown(text)!r}, not a number")
+    return value
+
+
+_UTM = re.compile(r"WGS84\s+UTM\s+(\d{1,2})\s*([NS])", re.IGNORECASE)
+_SYSTEM = re.compile(r"\s*(EPSG:|\+proj|WGS84\b)", re.IGNORECASE)
+_MIN_FIELDS = 6
+
+
+def read_gcp_list(text: str) -> ForeignControl:
+    """Read a list of ODM.
+
+    Raises:
+        ValueError: a line is wrong.
+    """
+    lines = [
+        (number, line.strip())
+        for number, line in enumerate(text.splitlines(), 1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    (_, system), *rows = lines
+    utm = _UTM.match(system)
+    if utm is not None:
+        system = f"EPSG:{(32700 if utm[2].upper() == 'S' else 32600) + int(utm[1])}"
+    place_of = _coordinates(system)
+    points: dict[str, KnownPoint] = {}
+    names: dict[tuple[float, ...], str] = {}
+    found = ForeignControl()
+    for number, line in rows:
+        fields = line.split()
+        if len(fields) < _MIN_FIELDS:
+            raise ValueError(
+                f"line {number}: {len(fields)} fields, not x y z im_x im_y picture [name]"
+            )
+        try:
+            x, y, z, column, row = map(float, fields[:5])
+        except ValueError:
+            raise ValueError(f"line {number}: {shown(line)!r} has no five numbers") from None
+        if not all(map(math.isfinite, (x, y, column, row))):
+            raise ValueError(f"line {number}: {shown(line)!r} has a number that is not finite")
+        if len(fields) > _MIN_FIELDS:
+            name = fields[_MIN_FIELDS]
+        else:
+            name = names.setdefault((x, y, z), f"P{len(names) + 1}")
+        point = replace(place_of(x, y), name=name, height_m=z)
+        first = points.setdefault(name, point)
+        if first.place != point.place and not math.isnan(z):
+            raise ValueError(f"line {number}: point {shown(name)} has another place than before")
+        found.picks.append(
+            Pick(image=fields[5], point=name, x_px=column, y_px=row, sigma_px=PICK_SIGMA_PX)
+        )
+    found.points.extend(points.values())
+    return found
+
+
+Heights = Literal["level", "ellipsoid"]
+_MAX_BYTES = 200_000_000
+_SHOWN_NAMES = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportedControl:
+    """What a workspace got."""
+
+    points: int
+    bars: int
+    checks: int
+    """Points and bars that only score the model."""
+    picks: int
+    pictures: int
+    """Pictures in which points are picked."""
+
+    def __str__(self) -> str:
+        """One line."""
+        held = f" ({self.checks} of them to check by)" if self.checks else ""
+        bars = f", {self.bars} scale bar{'s' * (self.bars > 1)}" if self.bars else ""
+        return f"{self.points} points{bars}{held}, {self.picks} picks in {self.pictures} pictures"
+
+
+def import_control(
+    workspace: Path,
+    path: Path,
+    *,
+    sigma_m: float | None = None,
+    sigma_vertical_m: float | None = None,
+    heights: Heights = "level",
+    overwrite: bool = False,
+) -> ImportedControl:
+    """Write `control.csv` and `picks.csv` from ODM's `gcp_list.txt` or Metashape's markers.
+
+    Args:
+        workspace: folder with finished `images/`.
+        path: the file.
+        sigma_m: standard deviation of north and of east where the file states none.
+        sigma_vertical_m: of heights; as `sigma_m` when None.
+        heights: what the file's heights count from: `level`, up from the level that depths of the
+            survey count from, or `ellipsoid`, that of WGS 84.
+        overwrite: replace files that are there.
+
+    Raises:
+        WorkspaceError: the file cannot be read or is of no known format, a point's sigma is not
+            known, no picture of it is in the workspace, or a file would be replaced.
+    """
+    images = need_stage(workspace, "images", "import-images")
+    targets = [workspace / CONTROL_FILE, workspace / PICKS_FILE]
+    there = [target for target in targets if target.exists()]
+    if there and not overwrite:
+        raise WorkspaceError(f"{there[0]} is there: move it away, or give --overwrite")
+    found = read_foreign(path)
+    placed = [point for point in found.points if not math.isnan(sum(point.place))]
+    if heights == "ellipsoid" and not all(point.geodetic for point in placed):
+        raise WorkspaceError(f"{path}: is of a local grid, which has no ellipsoid: --heights level")
+    ends = {end for bar in found.lengths for end in bar.ends or ()}
+    left = [p.name for p in found.points if p not in placed and p.name not in ends]
+    if left:
+        warn(f"{path}: points without a whole place are left out: {_name_some(left)}")
+    if not placed and not found.lengths:
+        raise WorkspaceError(f"{path}: no point has a place")
+    level = math.nan if sigma_m is None else sigma_m
+    vertical = math.nan if sigma_vertical_m is None else sigma_vertical_m
+    points = [_with_sigmas(point, level, vertical, heights) for point in placed]
+    lengths = [bar if bar.sigma_m > 0 else replace(bar, sigma_m=level) for bar in found.lengths]
+    every: list[KnownPoint | KnownLength] = [*points, *lengths]
+    for one in every:
+        if math.isnan(one.sigma_m):
+            raise WorkspaceError(
+                f"{path}: states no accuracy of {shown(one.name)}: give --sigma, in metres"
+            )
+    names = [record.image for record in read_manifest(images / "manifest.csv")]
+    picks, lost = _match_pictures(found.picks, {p.name for p in points} | ends, names)
+    if not picks:
+        raise WorkspaceError(
+            f"{path}: none of its {len(found.picks)} picks is in a picture of {images}: "
+            f"{_name_some(lost)}"
+            if lost
+            else f"{path}: no point of known place is picked in a picture"
+        )
+    if lost:
+        warn(
+            f"{path}: {_name_some(lost)}: not in {images}, or there more than once; picks in them "
+            "are left out"
+        )
+    write_control(targets[0], points, lengths)
+    write_picks(targets[1], picks)
+    for note in found.notes:
+        warn(f"{path}: {note}")
+    return ImportedControl(
+        points=len(points),
+        bars=len(lengths),
+        checks=[one.use for one in every].count("check"),
+        picks=len(picks),
+        pictures=len({pick.image for pick in picks}),
+    )
+
+
+def read_foreign(path: Path) -> ForeignControl:
+    """Read a file of any known format.
+
+    Raises:
+        WorkspaceError: it cannot be read or is of none.
+    """
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise WorkspaceError(f"{path}: is larger than {_MAX_BYTES // 1_000_000} MB")
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise WorkspaceError(f"{path}: cannot be read: {why(error)}") from None
+    try:
+        if text.lstrip().startswith("<") and "<markers" in text:
+            found = read_markers(text)
+        elif _SYSTEM.match(text) is not None:
+            found = read_gcp_list(text)
+        else:
+            raise WorkspaceError(
+                f"{path}: neither a gcp_list.txt of ODM (its first line names the coordinate "
+                "system) nor markers that Metashape exported as XML"
+            )
+    except (ValueError, OverflowError) as error:
+        raise WorkspaceError(f"{path}: {one_line(error)}") from None
+    twice = [n for n, k in Counter(p.name for p in found.points).items() if k > 1]
+    if twice:
+        raise WorkspaceError(f"{path}: point {shown(twice[0])} is there twice")
+    return found
+
+
+def _with_sigmas(
+    point: KnownPoint, level_m: float, vertical_m: float, heights: Heights
+) -> KnownPoint:
+    """A point with sigmas where it has none of its own, and its height as `control.csv` has it."""
+    level = point.sigma_m if point.sigma_m > 0 else level_m
+    vertical = next((s for s in (point.sigma_vertical_m, vertical_m) if s > 0), level)
+    point = replace(point, sigma_m=level, sigma_vertical_m=vertical)
+    if heights == "ellipsoid":
+        return point
+    return replace(point, depth_m=-point.height_m, height_m=math.nan)
+
+
+def _match_pictures(
+    picks: Sequence[Pick], requested: set[str], names: Sequence[str]
+) -> tuple[list[Pick], list[str]]:
+    """Picks in the workspace's pictures, and pictures of the file that it lacks or has twice."""
+    by_stem: dict[str, list[str]] = {}
+    for name in names:
+        by_stem.setdefault(PurePosixPath(name).stem.lower(), []).append(name)
+    found, lost = [], []
+    for pick in picks:
+        image = _picture_of(pick.image, by_stem)
+        if image is None:
+            lost.append(pick.image)
+        elif pick.point in requested:
+            found.append(replace(pick, image=image))
+    return found, list(dict.fromkeys(lost))
+
+
+def _picture_of(picture: str, by_stem: dict[str, list[str]]) -> str | None:
+    """The one picture of the workspace that has a file's name, which may have a folder."""
+    parts = PurePosixPath(picture.replace("\\", "/"))
+    # A label may lack the suffix and have dots of its own.
+    for stem in dict.fromkeys((parts.stem, parts.name)):
+        some = by_stem.get(safe_name(stem).lower(), [])
+        if len(some) > 1:
+            some = [n for n in some if PurePosixPath(n).parent.name == parts.parent.name]
+        if len(some) == 1:
+            return some[0]
+    return None
+
+
+def _name_some(names: Sequence[str]) -> str:
+    return list_names([shown(name) for name in names], _SHOWN_NAMES)

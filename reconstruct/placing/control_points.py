@@ -44,7 +44,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.core.artefacts import read_csv
+from alice_survey.core.artefacts import read_csv, write_csv
 from alice_survey.core.edited_files import check_token, content_of, content_token, replace_file
 from alice_survey.core.errors import WorkspaceError, warn, why
 from alice_survey.core.frames import Array, Datum
@@ -62,15 +62,22 @@ class KnownPoint:
     """A point whose place is known, in the coordinates of the row; NaN what was not given."""
 
     name: str
-    use: Use
-    latitude_deg: float
-    longitude_deg: float
-    north_m: float
-    east_m: float
-    depth_m: float
-    height_m: float
-    sigma_m: float
-    sigma_vertical_m: float
+    use: Use = "control"
+    latitude_deg: float = math.nan
+    longitude_deg: float = math.nan
+    north_m: float = math.nan
+    east_m: float = math.nan
+    depth_m: float = math.nan
+    height_m: float = math.nan
+    sigma_m: float = math.nan
+    sigma_vertical_m: float = math.nan
+
+    @property
+    def place(self) -> tuple[float, float, float]:
+        """Latitude and longitude, or north and east; then height or depth."""
+        level = (self.latitude_deg, self.longitude_deg)
+        vertical = self.depth_m if math.isnan(self.height_m) else self.height_m
+        return (*(level if self.geodetic else (self.north_m, self.east_m)), vertical)
 
     @property
     def geodetic(self) -> bool:
@@ -199,6 +206,32 @@ def read_picks(path: Path) -> list[Pick]:
             )
         )
     return picks
+
+
+_POINT_COLUMNS = (
+    "latitude_deg", "longitude_deg", "north_m", "east_m", "depth_m", "height_m", "sigma_m",
+    "sigma_vertical_m",
+)  # fmt: skip
+
+
+def write_control(path: Path, points: Sequence[KnownPoint], lengths: Sequence[KnownLength]) -> None:
+    """Write a new `control.csv` of points and bars."""
+    header = ("kind", "name", "use", *_POINT_COLUMNS, "from", "to", "length_m")
+    rows: list[Sequence[object]] = [
+        ("point", p.name, p.use, *(getattr(p, name) for name in _POINT_COLUMNS), *[None] * 3)
+        for p in points
+    ]
+    rows += [
+        ("bar", b.name, b.use, *[None] * 6, b.sigma_m, None, *(b.ends or ()), b.length_m)
+        for b in lengths
+    ]
+    write_csv(path, header, rows)
+
+
+def write_picks(path: Path, picks: Sequence[Pick]) -> None:
+    """Write a new `picks.csv`, whose pixels count from the middle of the first."""
+    rows = [(p.image, p.point, p.x_px - 0.5, p.y_px - 0.5, p.sigma_px) for p in picks]
+    write_csv(path, ("image", "point", "x", "y", "sigma_px"), rows)
 
 
 def _is_comment(row: dict[str, str]) -> bool:

@@ -8,16 +8,23 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.errors import ReconstructionError, warn
 from alice_survey.core.frames import Array, Datum, pose_to_json
 from alice_survey.core.manifest import ImageRecord
+from alice_survey.core.records import (
+    BendRecord,
+    GeoreferenceRecord,
+    MountRecord,
+    NuisanceRecord,
+)
 from camera_calib.mount import nearest_mount
-from reconstruct.placing.alignment import MIN_STATIONS, Bend, Similarity, bend_modes, quadratic
+from reconstruct.placing.alignment import MIN_STATIONS, Similarity, bend_modes, bend_of, quadratic
 from reconstruct.placing.correlated_fit import (
     Correlation,
     Estimate,
@@ -54,6 +61,12 @@ _METHOD = (
 )
 
 
+_ORDER = (
+    "rotation_north_rad", "rotation_east_rad", "rotation_down_rad", "north_m", "east_m", "down_m",
+    "log_scale",
+)  # fmt: skip
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FoundMount:
     """How the rig is mounted on the vehicle, found with the place."""
@@ -75,14 +88,15 @@ class FoundMount:
             f"{down} m down"
         )
 
-    def to_json(self) -> dict[str, Any]:
+    @property
+    def record(self) -> MountRecord:
         """What `georeference.json` says."""
-        return {
-            "words": self.words,
-            "body_from_rig": pose_to_json(self.body_from_rig),
-            "turn_sigma_deg": self.turn_sigma_deg.tolist(),
-            "lever_sigma_m": self.lever_sigma_m.tolist(),
-        }
+        return MountRecord(
+            words=self.words,
+            body_from_rig=pose_to_json(self.body_from_rig),
+            turn_sigma_deg=tuple(self.turn_sigma_deg.tolist()),
+            lever_sigma_m=tuple(self.lever_sigma_m.tolist()),
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -112,10 +126,10 @@ class PlacementFit:
     """How many times larger such modes are than the pictures' sigmas say, 1 or more."""
     joint: Array
     """(7 + K, 7 + K) covariance of the placement (as `covariance`) and the modes."""
-    bends: tuple[Bend, ...]
+    bends: tuple[BendRecord, ...]
     """How bent the model is still, along the block and, where it is wide, across; none where
     stations are too few."""
-    nuisances: Mapping[str, tuple[float, float]]
+    nuisances: Mapping[str, NuisanceRecord]
     """What was found of the errors of the lever arm (m), the clock (s), the mount (degrees) and
     navigation's own frame (turn in degrees, stretch), and their sigmas."""
     mount: FoundMount | None = None
@@ -150,53 +164,46 @@ class PlacementFit:
         """Sigma of the logarithm of the scale, 0 where it is held."""
         return float(np.sqrt(self.covariance[SCALE, SCALE]))
 
-    def to_json(self) -> dict[str, Any]:
+    @cached_property
+    def record(self) -> GeoreferenceRecord:
         """What `georeference.json` says."""
         tilts, axes = np.linalg.eigh(self.covariance[:2, :2])
-        axis = np.rad2deg(np.arctan2(axes[1, 1], axes[0, 1])) % 180.0
+        rms = [None if np.isnan(rms_m) else rms_m for rms_m in self.rms_m.tolist()]
         # What is the model's own by choice has no sigma.
         north, east, down = (sigma or None for sigma in self.sigma_position_m.tolist())
-        return {
-            "format": "alice-survey georeference",
-            "version": 1,
-            "method": _METHOD,
-            "stations": self.used,
-            "left_out": dict(self.left_out),
-            **{
-                f"rms_{axis}_m": None if np.isnan(rms_m) else float(rms_m)
-                for axis, rms_m in zip(("north", "east", "depth"), self.rms_m, strict=True)
-            },
-            "sigma_north_m": north,
-            "sigma_east_m": east,
-            "sigma_depth_m": down,
-            "sigma_heading_deg": self.sigma_heading_deg or None,
-            "sigma_tilt_deg": float(np.rad2deg(np.sqrt(tilts.mean()))) or None,
-            "sigma_tilt_north_deg": float(self.sigma_tilt_deg[0]),
-            "sigma_tilt_east_deg": float(self.sigma_tilt_deg[1]),
-            "largest_tilt_deg": float(np.rad2deg(np.sqrt(tilts[1]))),
-            "largest_tilt_axis_deg": float(axis),
-            "sigma_scale": self.sigma_scale,
-            "scale_of_navigation": self.free_scale,
-            "scale_of_navigation_sigma": self.free_scale_sigma,
-            "mount_sigma_deg": math.degrees(self.installed.mount_rad),
-            "lever_sigma_m": self.installed.lever_m,
-            "clock_sigma_s": self.installed.clock_s,
-            "nuisances": {
-                name: {"value": found, "sigma": sigma}
-                for name, (found, sigma) in self.nuisances.items()
-            },
-            "mount": None if self.mount is None else self.mount.to_json(),
-            "soft_modes": self.modes.tolist(),
-            "soft_modes_factor": self.mode_factor,
-            "middle_ned_m": self.middle_ned.tolist(),
-            "covariance": self.covariance.tolist(),
-            "covariance_order": [
-                "rotation_north_rad", "rotation_east_rad", "rotation_down_rad",
-                "north_m", "east_m", "down_m", "log_scale",
-            ],
-            "errors": {
+        unit = "s" if self.time_unit == "s" else "stations"
+        return GeoreferenceRecord(
+            rms_north_m=rms[0],
+            rms_east_m=rms[1],
+            rms_depth_m=rms[2],
+            sigma_north_m=north,
+            sigma_east_m=east,
+            sigma_depth_m=down,
+            sigma_heading_deg=self.sigma_heading_deg or None,
+            sigma_tilt_deg=float(np.rad2deg(np.sqrt(tilts.mean()))) or None,
+            scale_of_navigation=self.free_scale,
+            scale_of_navigation_sigma=self.free_scale_sigma,
+            sigma_scale=self.sigma_scale,
+            mount=None if self.mount is None else self.mount.record,
+            method=_METHOD,
+            stations=self.used,
+            left_out=dict(self.left_out),
+            sigma_tilt_north_deg=float(self.sigma_tilt_deg[0]),
+            sigma_tilt_east_deg=float(self.sigma_tilt_deg[1]),
+            largest_tilt_deg=float(np.rad2deg(np.sqrt(tilts[1]))),
+            largest_tilt_axis_deg=float(np.rad2deg(np.arctan2(axes[1, 1], axes[0, 1])) % 180.0),
+            mount_sigma_deg=math.degrees(self.installed.mount_rad),
+            lever_sigma_m=self.installed.lever_m,
+            clock_sigma_s=self.installed.clock_s,
+            nuisances=dict(self.nuisances),
+            soft_modes=tuple(self.modes.tolist()),
+            soft_modes_factor=self.mode_factor,
+            middle_ned_m=tuple(self.middle_ned.tolist()),
+            covariance=tuple(map(tuple, self.covariance.tolist())),
+            covariance_order=_ORDER,
+            errors={
                 group: {
-                    f"correlation_{'s' if self.time_unit == 's' else 'stations'}": how.tau,
+                    f"correlation_{unit}": how.tau,
                     "white_share": how.white,
                     "constant_share": how.constant,
                     "sigma_factor": how.factor,
@@ -204,7 +211,7 @@ class PlacementFit:
                 }
                 for group, how in self.correlation.items()
             },
-        }  # fmt: skip
+        )
 
 
 _LEVEL_SIGMA_DEG = 10.0
@@ -251,8 +258,21 @@ with soft modes of sizes (K,)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class _Guess:
+    """A placement on the way to the best."""
+
+    place: Similarity
+    sizes: Array
+    """(K,) of the soft modes, in their sigmas."""
+    factor: float = 1.0
+    """How many times larger modes are than pictures say."""
+    drift_m: float = 0.0
+    """Drift of depths that is free, as a sigma; 0 where it is held."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class NavigationTask:
-    """What a model's place is fitted to; arguments as of `georeference.fit_navigation`."""
+    """What a model's place is fitted to; arguments as of `fit_navigation`."""
 
     epochs: Epochs
     levelled: Similarity | None
@@ -269,14 +289,13 @@ class NavigationTask:
         Raises:
             ReconstructionError: the model shrinks to a point on the way, or grows without bound.
         """
-        start = place
-        epochs, sizes, factor = self.epochs, np.zeros(self.epochs.modes.shape[2]), 1.0
-        nuisances = np.zeros(PARAMETERS)
+        start, epochs = place, self.epochs
+        at = _Guess(place=place, sizes=np.zeros(epochs.modes.shape[2]))
         found = equations(epochs, place, self._middle(place))
         used = without_gross_errors(epochs.time, found.misfit, epochs.known)
         bounds = self._frame_bounds()
-        modes = range(PARAMETERS, PARAMETERS + len(sizes))
-        soft = len(sizes) - self.joints
+        modes = range(PARAMETERS, PARAMETERS + len(at.sizes))
+        soft = len(at.sizes) - self.joints
         solved_for = [*free, *(p for p, bound in bounds.items() if bound > _MIN_BOUND), *modes]
         if epochs.has_attitude:
             solved_for += range(LEVER.start, LEVER.stop)
@@ -286,82 +305,74 @@ class NavigationTask:
             solved_for.append(CLOCK)
         settling = [*free, *modes]
         widened: dict[str, float] = {}
-        drift_m = 0.0
         for _ in range(_STEPS):
-            middle = self._middle(place)
-            bent = epochs.deformed(sizes)
-            found = equations(bent, place, middle)
-            got = estimate(
-                epochs.time,
-                found,
-                used,
-                solved_for,
-                self._extra(place, middle, sizes, factor, drift_m),
-                frame_bounds=bounds,
-                widened=widened,
-            )
-            place = _move(place, _without_overshoot(got.change), middle)
+            got = self._estimate(at, used, solved_for, bounds, widened=widened)
+            place = _move(at.place, _without_overshoot(got.change), self._middle(at.place))
             if not SHRUNK < place.scale / start.scale < 1.0 / SHRUNK:
                 raise ReconstructionError("positions of navigation show no scale of the model")
-            sizes = sizes + got.change[PARAMETERS:]
-            nuisances = got.change[:PARAMETERS]
+            sizes = at.sizes + got.change[PARAMETERS:]
             sigma = np.sqrt(np.diag(got.covariance))
-            before = factor
-            factor = _mode_factor(sizes[:soft], sigma[PARAMETERS:][:soft], factor)
+            factor = _mode_factor(sizes[:soft], sigma[PARAMETERS:][:soft], at.factor)
             still = np.abs(got.change[settling]) <= _SETTLED_SIGMAS * sigma[settling]
-            if still.all() and abs(factor - before) <= _SETTLED_SIGMAS * factor:
+            settled = still.all() and abs(factor - at.factor) <= _SETTLED_SIGMAS * factor
+            at = replace(at, place=place, sizes=sizes, factor=factor)
+            if settled:
                 if widened:
                     break
-                drift_m = self._drift(place, middle, sizes, factor, got, solved_for, bounds)
-                widened = self._contradictions(nuisances[TURN], drift_m, bounds, got.correlation)
+                drift_m = self._drift(at, got, solved_for, bounds)
+                widened = self._contradictions(got.change[TURN], drift_m, bounds, got.correlation)
                 if not widened:
                     break
+                at = replace(at, drift_m=drift_m)
                 if drift_m:
                     solved_for.append(DRIFT)
-        middle = self._middle(place)
         scaled = got
         if SCALE not in free:
-            found = equations(epochs.deformed(sizes), place, middle)
             stiff = [p for p in solved_for if p not in modes[:soft]]
-            scaled = estimate(
-                epochs.time,
-                found,
-                got.used,
-                [*stiff, SCALE],
-                self._extra(place, middle, sizes, factor, drift_m),
-                frame_bounds=bounds,
-                correlation=got.correlation,
+            scaled = self._estimate(
+                at, got.used, [*stiff, SCALE], bounds, correlation=got.correlation
             )
-        return self._report(
-            place, middle, sizes, nuisances, got, scaled, free=solved_for, bounds=bounds,
-            mode_factor=factor,
+        return self._report(at, got, scaled, solved_for, bounds)
+
+    def _estimate(
+        self,
+        at: _Guess,
+        used: NDArray[np.bool_],
+        free: Sequence[int],
+        bounds: Mapping[int, float],
+        *,
+        widened: Mapping[str, float] | None = None,
+        correlation: Mapping[str, Correlation] | None = None,
+    ) -> Estimate:
+        """Solve the equations of navigation, and of all else, about a guess."""
+        found = equations(self.epochs.deformed(at.sizes), at.place, self._middle(at.place))
+        return estimate(
+            self.epochs.time, found, used, free, self._extra(at), frame_bounds=bounds,
+            widened=widened, correlation=correlation,
         )  # fmt: skip
 
     def _report(
         self,
-        place: Similarity,
-        middle: Array,
-        sizes: Array,
-        nuisances: Array,
+        at: _Guess,
         got: Estimate,
         scaled: Estimate,
-        *,
         free: Sequence[int],
         bounds: Mapping[int, float],
-        mode_factor: float,
     ) -> PlacementFit:
-        epochs = self.epochs.deformed(sizes)
+        epochs = self.epochs.deformed(at.sizes)
         kept = got.used[epochs.moment, :3].any(axis=1)
-        misses = (epochs.positions(place) - epochs.measured_ned)[kept]
-        misses = np.where(got.used[epochs.moment, :3][kept], misses, np.nan)
+        residuals = (epochs.positions(at.place) - epochs.measured_ned)[kept]
+        residuals = np.where(got.used[epochs.moment, :3][kept], residuals, np.nan)
         lost = epochs.known & ~got.used
         first = {group: k for k, group in zip((0, 2, 3, 5), GROUPS, strict=True)}
         joint = [*range(PLACE), *range(PARAMETERS, len(got.change))]
         sigmas = np.sqrt(np.diag(got.covariance))
         named = {
-            name: (float(unit * nuisances[at]), float(unit * sigmas[at]))
-            for name, (at, unit) in _NUISANCES.items()
-            if at in free
+            name: NuisanceRecord(
+                value=float(unit * got.change[column]), sigma=float(unit * sigmas[column])
+            )
+            for name, (column, unit) in _NUISANCES.items()
+            if column in free
         }
         self._warn_of_installation(named)
         for group, how in got.correlation.items():
@@ -372,31 +383,34 @@ class NavigationTask:
                     "is as unsure as that; correct the log of one, or add control points"
                 )
         return PlacementFit(
-            ned_from_model=place,
+            ned_from_model=at.place,
             used=int((got.used[:, 0] if got.used[:, 0].any() else got.used[:, 2]).sum()),
             left_out={group: int(lost[:, k].sum()) for group, k in first.items()},
-            rms_m=_rms(misses),
+            rms_m=_rms(residuals),
             free_scale=float(np.exp(scaled.change[SCALE])) if SCALE not in free else 1.0,
             free_scale_sigma=float(np.sqrt(scaled.covariance[SCALE, SCALE])),
-            middle_ned=middle,
+            middle_ned=self._middle(at.place),
             correlation=got.correlation,
             time_unit="s" if epochs.timed else "stations",
             installed=self.installed,
-            modes=sizes,
-            mode_factor=mode_factor,
+            modes=at.sizes,
+            mode_factor=at.factor,
             joint=got.covariance[np.ix_(joint, joint)],
-            bends=self._bends(place, middle, sizes, got, free, bounds),
+            bends=self._bends(at, got, free, bounds),
             nuisances=named,
         )
 
-    def _warn_of_installation(self, found: Mapping[str, tuple[float, float]]) -> None:
+    def _warn_of_installation(self, found: Mapping[str, NuisanceRecord]) -> None:
         """Name what is off by more than is likely, and what may be off in its place."""
         settings = [
             *((name, "lever_sigma_m", self.installed.lever_m) for name in _LEVERS),
             ("clock_s", "clock_sigma_s", self.installed.clock_s),
         ]
         off = [
-            (abs(found[name][0]) / sigma, f"{name} = {found[name][0]:+.3g} ({setting} = {sigma:g})")
+            (
+                abs(found[name].value) / sigma,
+                f"{name} = {found[name].value:+.3g} ({setting} = {sigma:g})",
+            )
             for name, setting, sigma in settings
             if name in found
         ]
@@ -408,56 +422,39 @@ class NavigationTask:
             )
 
     def _bends(
-        self,
-        place: Similarity,
-        middle: Array,
-        sizes: Array,
-        got: Estimate,
-        free: Sequence[int],
-        bounds: Mapping[int, float],
-    ) -> tuple[Bend, ...]:
+        self, at: _Guess, got: Estimate, free: Sequence[int], bounds: Mapping[int, float]
+    ) -> tuple[BendRecord, ...]:
         """How bent the placed model is by navigation alone, whatever its modes allow."""
-        epochs = self.epochs.deformed(sizes)
+        epochs, place = self.epochs.deformed(at.sizes), at.place
         if got.used[:, 2].sum() < MIN_STATIONS:
             return ()
         places = place.apply(epochs.centres)
         modes = _VAGUE_PER_M * bend_modes(places, place)
         count = modes.shape[2]
-        modes = np.concatenate([modes, epochs.modes[..., len(sizes) - self.joints :]], axis=2)
-        found = equations(replace(epochs, modes=modes), place, middle)
+        modes = np.concatenate([modes, epochs.modes[..., len(at.sizes) - self.joints :]], axis=2)
+        bending = replace(self, control=None, epochs=replace(epochs, modes=modes))
+        stiff = _Guess(place=place, sizes=np.zeros(modes.shape[2]))
         bent = estimate(
             epochs.time,
-            found,
+            equations(bending.epochs, place, self._middle(place)),
             got.used,
             [*(p for p in free if p < PARAMETERS), *range(PARAMETERS, PARAMETERS + modes.shape[2])],
-            replace(self, control=None)._extra(place, middle, np.zeros(modes.shape[2])),
+            bending._extra(stiff),
             frame_bounds=bounds,
             correlation=got.correlation,
         )
         values = _VAGUE_PER_M * bent.change[PARAMETERS:]
         sigmas = _VAGUE_PER_M * np.sqrt(np.diag(bent.covariance)[PARAMETERS:])
         design, lengths, _ = quadratic(places[:, :2])
-        moved = place.scale * place.rotation.apply((self.epochs.modes @ sizes)[:, :3])[:, 2]
+        moved = place.scale * place.rotation.apply((self.epochs.modes @ at.sizes)[:, :3])[:, 2]
         straightened = np.linalg.lstsq(design, moved, rcond=None)[0][2::2]
         return tuple(
-            Bend(
-                curvature_per_m=float(values[k]),
-                sigma_per_m=float(sigmas[k]),
-                length_m=float(lengths[k]),
-                straightened_per_m=float(straightened[k]),
-            )
+            bend_of(*map(float, (values[k], sigmas[k], lengths[k], straightened[k])))
             for k in range(min(count, 2))
         )
 
     def _drift(
-        self,
-        place: Similarity,
-        middle: Array,
-        sizes: Array,
-        factor: float,
-        got: Estimate,
-        free: Sequence[int],
-        bounds: Mapping[int, float],
+        self, at: _Guess, got: Estimate, free: Sequence[int], bounds: Mapping[int, float]
     ) -> float:
         """Drift of depths over the survey, metres, if it is more than is likely, else 0.
 
@@ -467,14 +464,8 @@ class NavigationTask:
         if not (epochs.timed and epochs.has_tilt and got.used[:, 2].sum() >= MIN_STATIONS):
             return 0.0
         usual = self._usual_sigma(2)
-        found = estimate(
-            epochs.time,
-            equations(epochs.deformed(sizes), place, middle),
-            got.used,
-            [*free, DRIFT],
-            self._extra(place, middle, sizes, factor, _VAGUE_DRIFT_SIGMAS * usual),
-            frame_bounds=bounds,
-        )
+        vague = replace(at, drift_m=_VAGUE_DRIFT_SIGMAS * usual)
+        found = self._estimate(vague, got.used, [*free, DRIFT], bounds)
         drift_m = float(found.change[DRIFT])
         likely = np.hypot(_DRIFT_SIGMAS * usual, np.sqrt(found.covariance[DRIFT, DRIFT]))
         return drift_m if abs(drift_m) > _CONTRADICTION_SIGMAS * likely else 0.0
@@ -545,14 +536,8 @@ class NavigationTask:
         bound = sigma / radius if radius > sigma else 1.0
         return {TURN: bound, STRETCH: min(bound, _STRETCH)}
 
-    def _extra(
-        self,
-        place: Similarity,
-        middle: Array,
-        sizes: Array,
-        mode_factor: float = 1.0,
-        drift_m: float = 0.0,
-    ) -> Extra:
+    def _extra(self, at: _Guess) -> Extra:
+        place, sizes = at.place, at.sizes
         columns = PARAMETERS + len(sizes)
         misfits, rows = [no_extra(columns).misfit], [no_extra(columns).jacobian]
         if self.levelled is not None and not self.epochs.has_tilt:
@@ -569,14 +554,14 @@ class NavigationTask:
             misfits.append(np.log([place.scale / self.known_scale]) / self.scale_sigma)
             rows.append(scale)
         known = self.installed.weights(columns)
-        if drift_m:
-            known[DRIFT] = 1.0 / abs(drift_m)
-        known[PARAMETERS : columns - self.joints] = 1.0 / mode_factor
+        if at.drift_m:
+            known[DRIFT] = 1.0 / abs(at.drift_m)
+        known[PARAMETERS : columns - self.joints] = 1.0 / at.factor
         at = np.flatnonzero(known)
         misfits.append((known * np.concatenate([np.zeros(columns - len(sizes)), sizes]))[at])
         rows.append(np.diag(known)[at])
         if self.control is not None:
-            more = self.control(place, middle, sizes)
+            more = self.control(place, self._middle(place), sizes)
             misfits.append(more.misfit)
             rows.append(more.jacobian)
         return Extra(misfit=np.concatenate(misfits), jacobian=np.concatenate(rows))
@@ -590,7 +575,7 @@ class NavigationTask:
         for _ in range(_ROBUST_STEPS):
             middle = self._middle(place)
             found = equations(self.epochs, place, middle)
-            extra = self._extra(place, middle, np.zeros(self.epochs.modes.shape[2]))
+            extra = self._extra(_Guess(place=place, sizes=np.zeros(self.epochs.modes.shape[2])))
             known = self.epochs.known
             misfit = np.concatenate([found.misfit[known], extra.misfit])
             rows_of = np.concatenate([found.jacobian[known], extra.jacobian])

@@ -27,7 +27,7 @@ from alice_survey.core.errors import (
     note,
     warn,
 )
-from alice_survey.core.frames import Array, Datum, rotation_from_attitude
+from alice_survey.core.frames import Array, Datum
 from alice_survey.core.manifest import ImageRecord
 from alice_survey.core.records import MappingRecord, PicturesRecord, ScaleRecord
 from alice_survey.core.robust import MAD_TO_SIGMA
@@ -160,8 +160,8 @@ def fit_with_mount(
             found, said = _collect_messages(navigate, mounts, known)
             if found is None:
                 break
-            turn_deg, turn_sigma_deg = np.array([found.nuisances[name] for name in _AXES]).T
-            arm_m, arm_sigma_m = np.array([found.nuisances[name] for name in _ARMS]).T
+            turn_deg, turn_sigma_deg = _nuisances(found, _AXES)
+            arm_m, arm_sigma_m = _nuisances(found, _ARMS)
             mount = RigidTransform.from_components(
                 mount.translation - arm_m,
                 Rotation.from_rotvec(-turn_deg, degrees=True) * mount.rotation,
@@ -177,6 +177,12 @@ def fit_with_mount(
     return fit
 
 
+def _nuisances(fit: PlacementFit, names: Sequence[str]) -> tuple[Array, Array]:
+    """Values and sigmas (3,) of what was found."""
+    found = [fit.nuisances[name] for name in names]
+    return np.array([one.value for one in found]), np.array([one.sigma for one in found])
+
+
 def _first_mount(
     records: Sequence[ImageRecord],
     model_from_cam: Sequence[RigidTransform],
@@ -185,7 +191,7 @@ def _first_mount(
 ) -> Rotation | None:
     """Rotation from rig to body by attitudes at a place; None where there are too few."""
     turns = [
-        rotation_from_attitude(*np.deg2rad([r.roll_deg, r.pitch_deg, r.heading_deg])).inv()
+        r.ned_from_body.inv()
         * fit.ned_from_model.rotation
         * pose.rotation
         * cam_from_rig[r.camera].rotation

@@ -17,7 +17,7 @@ picture correct it. How well that predicts is measured on pictures in the model,
 import math
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,17 +28,14 @@ from alice_survey.core.artefacts import read_csv, write_csv
 from alice_survey.core.config import ReconstructConfig
 from alice_survey.core.errors import WorkspaceError, collected_by, warn
 from alice_survey.core.executor import Executor
-from alice_survey.core.frames import Array, Datum, rotation_from_attitude
+from alice_survey.core.frames import Array, Datum
 from alice_survey.core.manifest import ImageRecord
 from alice_survey.core.records import (
     AcceptanceRecord,
     CamerasRecord,
-    ControlRecord,
     DomingRecord,
-    GeoreferenceRecord,
     JointRecord,
     MappingRecord,
-    PortRecord,
     RegistrationRecord,
     SimilarityRecord,
 )
@@ -52,8 +49,9 @@ from reconstruct.adjustment.uncertainty import Uncertainty, write_uncertainty
 from reconstruct.mapping.arrays import cross_matrices, frames_of, model_groups
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.run import UNREGISTERED, read_inputs
+from reconstruct.matching.pairs import positions_ned
 from reconstruct.pictures.files import list_names
-from reconstruct.placing.acceptance import Acceptance, Doming, judge_model
+from reconstruct.placing.acceptance import judge_model
 from reconstruct.placing.alignment import level
 from reconstruct.placing.control import warn_of_contradictions
 from reconstruct.placing.fit import PlacementFit, fit_navigation
@@ -82,19 +80,6 @@ _MIN_CORRECTING = 4
 """Pictures in the model from which navigation's error is known."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class NavigationPlaces:
-    """Where navigation puts cameras; arrays of N pictures."""
-
-    images: tuple[str, ...]
-    ned: Array
-    """(N, 3)."""
-    sigma: Array
-    """(N, 2) horizontal, each of north and east, and of depth."""
-    corrected: bool
-    """Whether by what the model finds navigation off before and after."""
-
-
 def read_reasons(mapping: Path) -> dict[str, str]:
     """Why pictures are not in the model, by name, as the mapping wrote it; empty if all are."""
     path = mapping / UNREGISTERED
@@ -110,50 +95,49 @@ def navigation_places(
     rows: Sequence[TrackRow],
     rig: Rig | None,
     datum: Datum,
-) -> NavigationPlaces:
+) -> tuple[Array, Array, bool]:
     """Place pictures by navigation, corrected by its misses at pictures in the model.
 
     Args:
-        lost: pictures that are not in the model, those with a position count.
+        lost: pictures that are not in the model.
         known: all pictures by name.
         rows: the track.
         rig: with its mount, or None.
         datum: of the model's frame.
+
+    Returns:
+        (N, 3) places in NED and (N, 2) sigmas, horizontal (each of north and east) and of depth,
+        NaN where navigation has no position; and whether they were corrected.
     """
-    lost = [record for record in lost if record.has_position]
     places = np.array([_place(record, rig, datum) for record in lost]).reshape(-1, 3)
     sigma = np.array([[r.sigma_horizontal_m, r.sigma_depth_m] for r in lost]).reshape(-1, 2)
-    names = tuple(record.image for record in lost)
     based = [row for row in rows if known[row.image].has_position]
-    corrected = len(based) >= _MIN_CORRECTING and bool(lost)
+    there = [n for n, record in enumerate(lost) if record.has_position]
+    corrected = len(based) >= _MIN_CORRECTING and bool(there)
     if corrected:
-        timed = bool(np.isfinite([one.time_s for one in lost]).all())
-        timed &= bool(np.isfinite([row.time_s for row in based]).all())
-        based = sorted(based, key=lambda row: row.time_s if timed else row.station)
+        timed = bool(np.isfinite([one.time_s for one in (*based, *(lost[n] for n in there))]).all())
         times = np.array([row.time_s if timed else float(row.station) for row in based])
+        order = np.argsort(times, kind="stable")
+        based, times = [based[k] for k in order], times[order]
         spacing = float(np.median(np.diff(np.unique(times)))) if np.ptp(times) else 0.0
         misses = np.array([
             row.world_from_cam.translation - _place(known[row.image], rig, datum) for row in based
         ])  # fmt: skip
-        when = np.array([one.time_s if timed else float(one.station) for one in lost])
-        for n, at in enumerate(when):
+        for n in there:
+            at = lost[n].time_s if timed else float(lost[n].station)
             places[n] += _between(times, misses, at, 0.0)
             apart = max(float(np.abs(times - at).min()), spacing)
             left = misses - np.array([_between(times, misses, t, apart) for t in times])
             rms = np.sqrt(np.nanmean(np.square(left), axis=0))
             sigma[n] = np.sqrt(np.mean(np.square(rms[:2]))), rms[2]
-    return NavigationPlaces(images=names, ned=places, sigma=sigma, corrected=corrected)
+    return places, np.where(np.isnan(places[:, :1]), np.nan, sigma), corrected
 
 
 def _place(record: ImageRecord, rig: Rig | None, datum: Datum) -> Array:
-    """(3,) where navigation puts a camera, NED."""
-    reading = np.array([[record.latitude_deg, record.longitude_deg, record.depth_m]])
-    place: Array = datum.ned_from_geodetic(reading)[0]
+    """(3,) where navigation puts a camera, NED; NaN where it does not know."""
+    place = positions_ned([record], datum)[0]
     if rig is not None and record.has_attitude:
-        angles = np.deg2rad([record.roll_deg, record.pitch_deg, record.heading_deg])
-        place = place + rotation_from_attitude(*angles).apply(
-            rig.body_from_cam(record.camera).translation
-        )
+        place = place + record.ned_from_body.apply(rig.body_from_cam(record.camera).translation)
     return place
 
 
@@ -170,35 +154,6 @@ def _between(times: Array, values: Array, at: float, apart: float) -> Array:
     span = times[last] - times[first]
     share = (at - times[first]) / span if span > 0 else 0.0
     return np.asarray(values[first] + share * (values[last] - values[first]))
-
-
-def write_unregistered(
-    path: Path,
-    lost: Sequence[ImageRecord],
-    words: Mapping[str, str],
-    places: NavigationPlaces | None,
-    datum: Datum | None,
-) -> None:
-    """Write pictures that are not in the model, why, and where navigation puts them."""
-    at = {} if places is None else {name: n for n, name in enumerate(places.images)}
-    lines = []
-    for record in lost:
-        cells = ["", *[""] * 7]
-        if places is not None and datum is not None and record.image in at:
-            n = at[record.image]
-            lat, lon, _ = datum.geodetic_from_ned(places.ned[n : n + 1])[0]
-            cells = [
-                "navigation, corrected" if places.corrected else "navigation",
-                *(f"{v:.4f}" for v in places.ned[n]),
-                f"{lat:.10f}", f"{lon:.10f}",
-                *("" if np.isnan(s) else f"{s:.4g}" for s in places.sigma[n]),
-            ]  # fmt: skip
-        lines.append([record.image, record.camera, record.station, words[record.image], *cells])
-    header = (
-        "image", "camera", "station", "reason", "placed_by", "north_m", "east_m", "depth_m",
-        "latitude_deg", "longitude_deg", "sigma_horizontal_m", "sigma_depth_m",
-    )  # fmt: skip
-    write_csv(path, header, lines)
 
 
 _MAX_TURN_RAD = 0.1
@@ -430,7 +385,7 @@ def run_sparse(
     cameras["images"] = {name: of for name, of in cameras["images"].items() if name in poses}
     CamerasRecord.save(folder / "cameras.json", cameras)
     if adjusted.exact is not None and adjusted.exact.fit.parameters:
-        PortRecord.save(folder / "port.json", adjusted.exact.fit.to_json())
+        adjusted.exact.fit.record.write(folder / "port.json")
         if adjusted.exact.fit.contradiction is not None:
             warn(adjusted.exact.fit.contradiction.words)
         write_rig(folder / "rig.json", adjusted.exact.fit.rig)
@@ -458,11 +413,11 @@ def run_sparse(
     if placed.frame.datum is not None:
         write_track_geojson(folder / "track.geojson", rows, placed.frame, sigmas)
     if placed.fit is not None:
-        GeoreferenceRecord.save(folder / "georeference.json", placed.fit.to_json())
+        placed.fit.record.write(folder / "georeference.json")
     if placed.control is not None:
         score = placed.control.score(move, located=placed.located)
         warn_of_contradictions(score)
-        ControlRecord.save(folder / "control.json", score)
+        score.write(folder / "control.json")
     doming = accepted = None
     if rig is not None and adjusted.mapped.scaled:
         bends = () if placed.fit is None else placed.fit.bends
@@ -482,26 +437,46 @@ def _report_unregistered(
     rig: Rig | None,
     placed: Placed,
 ) -> None:
-    """Say why pictures are not in the model, and place them by navigation where there is any."""
+    """Write which pictures are not in the model, why, and where navigation puts them."""
     registered = {row.image for row in rows}
     lost = [record for record in records if record.image not in registered]
     if not lost:
         return
     words = read_reasons(workspace / "mapping")
     mapped = CamerasRecord.read(workspace / "mapping" / "cameras.json").images
-    words = {
-        r.image: _LEFT_OUT if r.image in mapped else words.get(r.image, _UNKNOWN) for r in lost
-    }
-    datum, places = placed.frame.datum, None
+    datum, corrected = placed.frame.datum, False
+    places, sigmas = np.full((len(lost), 3), np.nan), np.full((len(lost), 2), np.nan)
+    geodetic = places
     if datum is not None and placed.fit is not None:
         of_name = {record.image: record for record in records}
-        places = navigation_places(lost, of_name, rows, rig, datum)
-        if places.images:
+        places, sigmas, corrected = navigation_places(lost, of_name, rows, rig, datum)
+        geodetic = datum.geodetic_from_ned(places)
+        count = int(np.isfinite(places[:, 0]).sum())
+        if count:
             warn(
-                f"{len(places.images)} of {len(lost)} pictures that are not in the model are "
-                f"placed by navigation alone: sparse/{UNREGISTERED}"
+                f"{count} of {len(lost)} pictures that are not in the model are placed by "
+                f"navigation alone: sparse/{UNREGISTERED}"
             )
-    write_unregistered(folder / UNREGISTERED, lost, words, places, datum)
+    lines = []
+    for record, ned, place, sigma in zip(lost, places, geodetic, sigmas, strict=True):
+        reason = words.get(record.image, _UNKNOWN)
+        cells = [""] * 8
+        if np.isfinite(ned[0]):
+            cells = [
+                "navigation, corrected" if corrected else "navigation",
+                *(f"{v:.4f}" for v in ned),
+                *(f"{v:.10f}" for v in place[:2]),
+                *("" if np.isnan(s) else f"{s:.4g}" for s in sigma),
+            ]
+        lines.append([
+            record.image, record.camera, record.station,
+            _LEFT_OUT if record.image in mapped else reason, *cells,
+        ])  # fmt: skip
+    header = (
+        "image", "camera", "station", "reason", "placed_by", "north_m", "east_m", "depth_m",
+        "latitude_deg", "longitude_deg", "sigma_horizontal_m", "sigma_depth_m",
+    )  # fmt: skip
+    write_csv(folder / UNREGISTERED, header, lines)
 
 
 def _read_mapping(workspace: Path, mapping: MappingRecord) -> Mapped:
@@ -545,8 +520,8 @@ def _registration(
     mapping: MappingRecord,
     placed: Placed,
     rows: Sequence[TrackRow],
-    doming: Doming | None,
-    accepted: Acceptance | None,
+    doming: DomingRecord | None,
+    accepted: AcceptanceRecord | None,
     joints: tuple[JointRecord, ...],
 ) -> RegistrationRecord:
     baseline = model_baseline(model)
@@ -570,9 +545,7 @@ def _registration(
             translation=tuple(placed.world_from_model.translation.tolist()),
         ),
         working_range=mapping.distances,
-        doming=None if doming is None else DomingRecord.model_validate(doming.to_json()),
-        acceptance=None
-        if accepted is None
-        else AcceptanceRecord.model_validate(accepted.to_json()),
-        georeference=None if fit is None else GeoreferenceRecord.model_validate(fit.to_json()),
+        doming=doming,
+        acceptance=accepted,
+        georeference=None if fit is None else fit.record,
     )

@@ -100,7 +100,7 @@ def _markers(folder: Path) -> None:
 
 
 def read_foreign_control(path: Path) -> object:
-    from reconstruct.placing.foreign_control import read_foreign
+    from reconstruct.placing.control_command import read_foreign
 
     return read_foreign(path)
 

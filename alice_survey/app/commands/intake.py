@@ -149,7 +149,7 @@ class ImportControlCommand(WorkspaceCommand):
 
     def run(self) -> None:
         """Convert them."""
-        from reconstruct.placing.foreign_control import import_control
+        from reconstruct.placing.control_command import import_control
 
         found = import_control(
             self.workspace, self.file, sigma_m=self.sigma, sigma_vertical_m=self.sigma_vertical,

@@ -131,7 +131,6 @@ class ControlCommand(WorkspaceCommand, ThreadsCommand, ReportCommand):
     examples = (
         "control -w reef",
         "control -w reef --dictionary DICT_5X5_250",
-        "control -w reef --points '0,0,0 1.2,0,0.1' --length 0.5",
         "control -w reef --points 'left/001.png:512,300 left/001.png:930,312' --length 0.5",
     )
     title = "Find coded markers, or scale a model"
@@ -140,8 +139,8 @@ class ControlCommand(WorkspaceCommand, ThreadsCommand, ReportCommand):
         None, "Dictionary of the coded markers; without it all are tried (slow).", metavar="NAME"
     )
     points: str | None = option(
-        None, "Two points of a known distance: 'x,y,z x,y,z' in the model, or 'IMAGE:x,y "
-        "IMAGE:x,y' in pictures.",
+        None, "Two points of a known distance, each as IMAGE:x,y or, in two pictures, as "
+        "IMAGE:x,y=IMAGE:x,y.",
         metavar="POINTS",
     )  # fmt: skip
     length: float | None = option(
@@ -150,7 +149,8 @@ class ControlCommand(WorkspaceCommand, ThreadsCommand, ReportCommand):
 
     def run(self) -> Result:
         """Do either."""
-        from reconstruct.placing.control_command import scale_model, survey_control
+        from reconstruct.picking.measure import scale_model
+        from reconstruct.placing.control_command import survey_control
 
         if self.points is None and self.length is None:
             return survey_control(

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
-from scipy.spatial import KDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.config import ReconstructConfig
@@ -16,7 +15,7 @@ from alice_survey.core.errors import ReconstructionError
 from alice_survey.core.records import RangeRecord
 from camera_calib.freedom import POSE, value
 from camera_calib.rig import Covariance, Rig
-from reconstruct.adjustment import exact_observations, survey_fit
+from reconstruct.adjustment import exact_observations
 from reconstruct.adjustment.adjusted import AdjustedSurvey, adjust_survey
 from reconstruct.adjustment.exact_observations import (
     Pixels,
@@ -25,22 +24,20 @@ from reconstruct.adjustment.exact_observations import (
     start_state,
 )
 from reconstruct.adjustment.normal_equations import PointEquations, reduce_parts
-from reconstruct.adjustment.pixel_parts import Linearised, PixelParts, Workers
+from reconstruct.adjustment.pixel_parts import Linearised, PixelParts
 from reconstruct.adjustment.survey_fit import SurveyFit, fit_survey, frees_poses
-from reconstruct.mapping.arrays import frames_of, observed
+from reconstruct.mapping.arrays import frames_of
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.refraction import refract
 from reconstruct.placing.alignment import align_rigid
 from tests.cameras import changed
-from tests.engines import PicklingThreads
 from tests.reconstruct.scenes import Scene, make_scene
 from tests.reconstruct.true_models import near_truth, pupils_and_points, warped_scene
 
 NOISE_PX = 0.3
 TURN_SIGMA = 3e-4
 PORT = ReconstructConfig(refine_port=True, refine_rig="off")
-RIG = ReconstructConfig(refine_rig="on")
 DISTANCES = RangeRecord(near_m=1.75, far_m=2.35, source="test")
 
 
@@ -127,21 +124,6 @@ def test_without_noise_port_water_and_rig_are_found_exactly(tmp_path: Path) -> N
     assert fit.sigma_px < 0.02
 
 
-def test_a_turned_camera_is_turned_back_and_the_baseline_stays(tmp_path: Path) -> None:
-    scene = noisy(3)
-    pose = scene.rig.cam_from_rig["right"]
-    turned = RigidTransform.from_components(
-        pose.translation, Rotation.from_rotvec([1e-3, -8e-4, 5e-4]) * pose.rotation
-    )
-    wrong = replace(scene.rig, cam_from_rig={**scene.rig.cam_from_rig, "right": turned})
-    mapped, seen = modelled(scene, wrong, tmp_path)
-    fit = fit_survey(mapped, seen, wrong, port=False, pose=True)
-    assert np.abs(errors_in_sigmas(fit, scene.rig)[[0, 1, 2, 4, 5]]).max() < 4.0
-    found = fit.rig.cam_from_rig["right"].rotation * pose.rotation.inv()
-    assert found.magnitude() < 0.3 * turned.rotation.magnitude()
-    assert fit.rig.baseline_m == pytest.approx(scene.rig.baseline_m, rel=1e-3)
-
-
 def test_calibrated_parameters_move_within_their_covariance(tmp_path: Path) -> None:
     """A principal point that calibration had wrong by one sigma is not blamed on the rig."""
     scene = noisy(4)
@@ -182,69 +164,13 @@ def test_the_model_is_built_again_on_the_refined_rig(tmp_path: Path) -> None:
     fit, refined = found.exact.fit, found.mapped
     assert found.rig.covariance is not None
     assert refined.baseline == pytest.approx(model_baseline(refined.model), rel=1e-9)
-    said = fit.to_json()
+    said = fit.record.to_json()
     assert said["parameters"][0] == "left.port_distance_m"
     assert found.rig.cameras["left"].parameter("port_distance_m") == pytest.approx(said["after"][0])
     assert refined.warps["left"].camera == found.rig.cameras["left"]
     assert np.diag(said["correlation"]) == pytest.approx(1.0)
     assert points_rms(refined, scene) < 3e-3
     assert refined.model.compute_mean_reprojection_error() < 0.45
-
-
-def test_keypoints_as_taken_come_back_from_the_model(tmp_path: Path) -> None:
-    scene = noisy(6)
-    mapped, seen = modelled(scene, scene.rig, tmp_path)
-    found = adjust_survey(mapped, scene.records, scene.rig, DISTANCES, ReconstructConfig())
-    assert found.exact is not None
-    at = observed(mapped.model)
-    for n, number in enumerate(at.pictures.tolist()):
-        rows = at.keypoint[at.of(n)]
-        again = found.exact.seen.taken[number - 1][rows]
-        np.testing.assert_allclose(again, seen.taken[number - 1][rows], atol=1e-3)
-
-
-def test_a_large_survey_is_adjusted_in_parts_as_a_whole(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rng = np.random.default_rng(8)
-    pixels = [p + rng.normal(0, 0.05, p.shape) for p in clean().pixels]
-    scene = replace(clean(), pixels=pixels)
-    wrong = right_turned(scene.rig, 6e-4, [4e-4, 8e-4, 4e-4, 1e-5, 1e-4, 1e-4])
-    mapped, seen = modelled(scene, wrong, tmp_path)
-    whole = fit_survey(mapped, seen, wrong, port=False, pose=True)
-    monkeypatch.setattr(exact_observations, "PART", -(-whole.observations // 7))
-    parts = fit_survey(mapped, seen, wrong, port=False, pose=True)
-    assert whole.calibration is not None and parts.calibration is not None
-    assert whole.observations == parts.observations
-    away, same = KDTree(whole.calibration.places).query(parts.calibration.places)
-    assert np.max(away) < 1e-6
-    for found, wanted in (
-        (parts.after, whole.after),
-        (parts.covariance, whole.covariance),
-        (parts.state.points, whole.state.points),
-        (parts.calibration.points, whole.calibration.points[same]),
-    ):
-        np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-9 * np.abs(wanted).max())
-    for workers in (1, 2, 3):
-        with PicklingThreads(workers) as engine:
-            folder = tmp_path / f"{workers}"
-            again = fit_survey(
-                mapped, seen, wrong, port=False, pose=True,
-                workers=Workers(executor=engine.executor, folder=folder),
-            )  # fmt: skip
-        assert engine.tasks > 3 * 7
-        assert len(list(folder.iterdir())) == 7
-        assert again.calibration is not None
-        np.testing.assert_array_equal(again.after, parts.after)
-        np.testing.assert_array_equal(again.state.points, parts.state.points)
-        np.testing.assert_array_equal(again.calibration.points, parts.calibration.points)
-    monkeypatch.setattr(survey_fit, "_MAX_PLACES", len(whole.point_ids) // 3)
-    some = fit_survey(mapped, seen, wrong, port=False, pose=True).calibration
-    assert some is not None
-    assert 0.2 < len(some.places) / len(whole.point_ids) < 0.35
-    every = round(len(whole.point_ids) / len(some.places))
-    np.testing.assert_array_equal(some.points, parts.calibration.points[::every])
-    np.testing.assert_array_equal(some.places, parts.calibration.places[::every])
 
 
 def test_parts_say_of_stations_and_points_what_all_observations_say(

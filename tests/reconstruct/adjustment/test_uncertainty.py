@@ -12,14 +12,12 @@ from scipy.spatial.transform import Rotation
 from alice_survey.core.block_solver import BlockStep
 from alice_survey.core.frames import Array
 from camera_calib.rig import Covariance, Rig
-from reconstruct.adjustment import exact_observations
 from reconstruct.adjustment.exact_observations import exact_observations as linearised
 from reconstruct.adjustment.normal_equations import (
     Gauge,
     LinearObservations,
     reduce_points,
 )
-from reconstruct.adjustment.pixel_parts import Workers
 from reconstruct.adjustment.soft_modes import Motions, spread
 from reconstruct.adjustment.survey_fit import fit_survey
 from reconstruct.adjustment.uncertainty import (
@@ -34,7 +32,6 @@ from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.refraction import refract
 from reconstruct.placing.alignment import align_rigid
-from tests.engines import PicklingThreads
 from tests.oracles_refraction import dense_normal_equations, dense_of, laid_onto
 from tests.reconstruct.scenes import Scene, make_scene
 from tests.reconstruct.true_models import near_truth, true_stations, warped_scene
@@ -102,39 +99,6 @@ def test_points_are_eliminated_as_dense_algebra_does(tmp_path: Path) -> None:
     np.testing.assert_allclose(moved.ravel(), wanted, atol=1e-9)
 
 
-def test_parts_of_a_large_survey_know_what_the_whole_knows(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    mapped, _ = points_with(noisy().rig, tmp_path)
-    records, part = noisy().records, part_of(mapped, warped_scene(noisy())[0], noisy().rig)
-    count = mapped.model.compute_num_observations()
-    whole = estimate(mapped, records, part)
-    monkeypatch.setattr(exact_observations, "PART", -(-count // 6))
-    parts = estimate(mapped, records, part)
-    for found, wanted in (
-        (parts.frame_cov, whole.frame_cov),
-        (parts.point_cov, whole.point_cov),
-        (parts.point_noise, whole.point_noise),
-        (np.array(parts.sigma_px), np.array(whole.sigma_px)),
-    ):
-        size = np.abs(wanted).max(axis=0)
-        np.testing.assert_allclose(found / size, wanted / size, rtol=1e-9, atol=1e-9)
-    for found, wanted in (
-        (parts.modes.stations, whole.modes.stations),
-        (parts.modes.points, whole.modes.points),
-        (parts.modes.calibration, whole.modes.calibration),
-    ):
-        np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-5 * np.abs(wanted).max())
-    for workers in (1, 3):
-        with PicklingThreads(workers) as engine:
-            given = Workers(executor=engine.executor, folder=tmp_path / f"{workers}")
-            again = estimate(mapped, records, part, workers=given)
-        assert engine.tasks >= 5 * 6
-        np.testing.assert_array_equal(again.frame_cov, parts.frame_cov)
-        np.testing.assert_array_equal(again.point_cov, parts.point_cov)
-        np.testing.assert_array_equal(again.modes.points, parts.modes.points)
-
-
 def test_the_file_gives_back_what_was_written(tmp_path: Path) -> None:
     scene, mapped = drawn(2, tmp_path)
     found = estimate(mapped, scene.records)
@@ -151,26 +115,6 @@ def test_the_file_gives_back_what_was_written(tmp_path: Path) -> None:
     for cov in (*found.frame_cov, *found.point_cov):
         np.testing.assert_allclose(cov, cov.T, atol=1e-9 * np.abs(cov).max())
         assert np.linalg.eigvalsh(cov)[0] > -1e-12
-
-
-def test_a_station_that_sees_next_to_nothing_has_no_covariance(tmp_path: Path) -> None:
-    scene, mapped = drawn(3, tmp_path)
-    for number in (9, 10):
-        for at in mapped.model.images[number].get_observation_point2D_idxs():
-            point = mapped.model.images[number].points2D[at].point3D_id
-            if len(mapped.model.points3D[point].track.elements) > 2:
-                mapped.model.delete_observation(number, at)
-    left = {p for n in (9, 10) for p in _points_of(mapped, n)}
-    for point in left:
-        mapped.model.delete_point3D(point)
-    found = estimate(mapped, scene.records)
-    assert np.isnan(found.frame_cov[4]).all()
-    rest = np.delete(found.frame_cov, 4, axis=0)
-    assert np.isfinite(rest).all()
-
-
-def _points_of(mapped: Mapped, number: int) -> list[int]:
-    return [p.point3D_id for p in mapped.model.images[number].get_observation_points2D()]
 
 
 def _observations(mapped: Mapped) -> LinearObservations:
@@ -332,12 +276,6 @@ def test_points_move_like_those_of_their_own_group() -> None:
     np.testing.assert_allclose(variances[group == 0], 1.0)
     np.testing.assert_allclose(variances[group == 1], 9.0)
     assert set(np.unique(variances[group == 2])) == {1.0, 9.0}
-
-
-def test_a_rig_without_covariance_adds_nothing(tmp_path: Path) -> None:
-    mapped, _ = points_with(noisy().rig, tmp_path)
-    unknown = replace(noisy().rig, covariance=None)
-    assert part_of(mapped, warped_scene(noisy())[0], unknown) is None
 
 
 def test_a_station_that_sees_next_to_nothing_stays(tmp_path: Path) -> None:

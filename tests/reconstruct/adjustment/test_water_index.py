@@ -12,7 +12,7 @@ from alice_survey.core.records import RangeRecord
 from camera_calib.freedom import knowing_water
 from camera_calib.rig import Covariance, Rig
 from reconstruct.adjustment.adjusted import AdjustedSurvey, adjust_survey
-from reconstruct.adjustment.survey_fit import calibrated_covariance, fit_survey
+from reconstruct.adjustment.survey_fit import fit_survey
 from reconstruct.mapping.refraction import refract
 from reconstruct.placing.alignment import align_similarity
 from tests.reconstruct.scenes import Scene, make_scene
@@ -22,7 +22,6 @@ DISTANCES = RangeRecord(near_m=1.75, far_m=2.35, source="test")
 POSES = {"right.rx_rad": 2e-5, "right.ry_rad": 2e-5, "right.rz_rad": 2e-5,
          "right.x_m": 2e-6, "right.y_m": 2e-6, "right.z_m": 2e-6}  # fmt: skip
 SIGMA = 1e-3
-WATER = ("left.n_water", "right.n_water")
 
 
 def adjusted(scene: Scene, believed: Rig, folder: Path) -> AdjustedSurvey:
@@ -71,41 +70,6 @@ def test_ranges_of_one_pair_follow_the_index_as_snells_law_says(tmp_path: Path) 
     spread = np.sqrt(np.diag(moved.of_points(moved.places[amid][:1])[0]))
     along = np.abs(ned_from_cam.rotation.inv().apply(spread))[2]
     assert along == pytest.approx(SIGMA * in_water[0] / (n * cos_sq[0]), rel=0.02)
-
-
-def test_an_index_that_was_calibrated_in_the_same_water_counts_as_calibrated(
-    tmp_path: Path,
-) -> None:
-    """With its correlations; one of a setting counts next to what is calibrated."""
-    scene = make_scene(lines=2, stations=5, points=600, noise_px=0.05, scale=2)
-    names = (*POSES, "left.fx_px", *WATER)
-    sigma = np.array([*POSES.values(), 0.5, SIGMA, SIGMA])
-    correlation = np.eye(len(names))
-    correlation[-3:, -3:] = [[1, -0.9, -0.9], [-0.9, 1, 0.9999], [-0.9, 0.9999, 1]]
-    matrix = correlation * np.outer(sigma, sigma)
-    whole = replace(scene.rig, covariance=Covariance(parameters=names, matrix=matrix))
-    assert knowing_water(whole, 5e-4) is whole
-    exact = adjusted(scene, whole, tmp_path).exact
-    assert exact is not None
-    assert exact.fit.parameters == names
-    prior = exact.fit.prior_sigmas[-2:]  # the keypoints' bias widens the focal length's alone
-    np.testing.assert_allclose(prior, SIGMA, rtol=1e-6)
-    added = calibrated_covariance(whole, names) - matrix
-    bias = np.zeros(len(names), dtype=bool)
-    bias[names.index("left.fx_px")] = True
-    np.testing.assert_allclose(added[~np.outer(bias, bias)], 0.0, atol=1e-20)
-
-    carried = whole.in_water(1.3412)
-    assert not set(WATER) & set(carried.sigmas)
-    other = knowing_water(carried, 5e-4)
-    assert [other.sigmas[name] for name in WATER] == [5e-4] * 2
-    assert other.covariance is not None
-    np.testing.assert_array_equal(other.covariance.matrix[:-2, :-2], matrix[:-2, :-2])
-    np.testing.assert_array_equal(other.covariance.matrix[:-2, -2:], 0.0)
-    assert other.covariance.correlation[-1, -2] == pytest.approx(1.0, abs=1e-6)
-    assert knowing_water(carried, 0.0) is carried
-    dry = replace(carried, cameras={n: c.in_air() for n, c in carried.cameras.items()})
-    assert knowing_water(dry, 5e-4) is dry
 
 
 def scale_error_and_sigma(found: AdjustedSurvey, scene: Scene) -> tuple[float, float]:

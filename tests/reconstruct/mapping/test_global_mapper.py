@@ -4,7 +4,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-import pycolmap
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -18,7 +17,7 @@ from reconstruct.mapping.global_mapper import (
     station_groups,
     stereo_points,
 )
-from reconstruct.mapping.mapper import Mapped, faults_of, map_calibrated
+from reconstruct.mapping.mapper import Mapped, map_calibrated
 from reconstruct.placing.alignment import align_rigid
 from tests.reconstruct.mapping.test_mapper import camera_rms, pupils, seen_by_pinholes
 from tests.reconstruct.scenes import Scene, make_scene
@@ -158,50 +157,6 @@ def test_threads_do_not_change_a_byte(tmp_path: Path) -> None:
         mapped_by(scene, threads).model.write_binary(tmp_path / str(threads))
     for file in sorted((tmp_path / "1").iterdir()):
         assert file.read_bytes() == (tmp_path / "2" / file.name).read_bytes()
-
-
-def test_a_model_that_lost_pictures_is_not_sound() -> None:
-    scene = make_scene(lines=1, stations=4, points=2500, noise_px=0.2)
-    model = mapped_by(scene).model
-    assert faults_of([model], 8) == []
-    model.deregister_frame(2)
-    (fault,) = faults_of([model], 8)
-    assert "2 of 8" in fault
-    assert len(faults_of([], 8)) == 1
-
-
-def test_the_scale_is_the_rigs_whatever_the_first_guess() -> None:
-    """COLMAP's own gauge keeps the length between two cameras, and so a wrong scale."""
-    from reconstruct.mapping.global_mapper import adjust
-    from reconstruct.mapping.mapper import _options
-
-    scene = make_scene(lines=2, stations=4, points=4000, noise_px=0.1)
-    mapped = mapped_by(scene)
-    model = pycolmap.Reconstruction(mapped.model)
-    for frame in model.frames.values():  # the same turn, but centres and points 3 % farther out
-        pose = frame.rig_from_world
-        frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, 1.03 * pose.translation)
-    for point in model.points3D.values():
-        point.xyz = 1.03 * point.xyz
-    adjust(model, _options(scene.rig.cam_from_rig, 1, "nothing"), tolerance=1e-8)
-    centres = [
-        np.array([m.images[n].projection_center() for n in sorted(m.images)])
-        for m in (mapped.model, model)
-    ]
-    spans = [np.linalg.norm(c[0] - c[-2]) for c in centres]
-    assert spans[1] == pytest.approx(spans[0], rel=2e-4)
-
-
-def test_pictures_without_matches_are_left_out_and_counted() -> None:
-    scene = make_scene(lines=1, stations=6, points=3500, noise_px=0.2)
-    seen = seen_by_pinholes(scene)
-    alone = {10, 11}
-    pairs = [p for p in seen.pairs if not (alone & {p[0], p[1]}) or {p[0], p[1]} == alone]
-    cut = replace(seen, pairs=pairs)
-    with TemporaryDirectory() as folder:
-        mapped = map_calibrated(cut, scene.rig.cam_from_rig, Path(folder), 1)
-    assert mapped.models[0] == 10
-    assert "2 of 12" in mapped.notes[0]
 
 
 def test_models_that_no_match_links_are_kept_apart() -> None:

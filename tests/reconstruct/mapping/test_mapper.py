@@ -9,7 +9,6 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.core.errors import keep_warnings
 from camera_calib.approximation.pinhole_warp import best_warp
 from reconstruct.mapping.database import Observations, write_database
 from reconstruct.mapping.mapper import (
@@ -17,11 +16,9 @@ from reconstruct.mapping.mapper import (
     _options,
     collapsed_frames,
     map_calibrated,
-    map_from_poses,
     merge_models,
     model_baseline,
     report_left_out,
-    scale_model,
     second_from_first,
 )
 from reconstruct.mapping.self_calibration import map_self_calibrated
@@ -179,35 +176,6 @@ def test_self_calibration_finds_focal_length_distortion_and_rig(names: tuple[str
         assert camera.model_name == "PINHOLE"
 
 
-def test_cameras_that_took_no_pictures_together_calibrate_themselves() -> None:
-    """Two divers: every picture is a station of its own, and nobody has a rig."""
-    rng = np.random.default_rng(2)
-    truth = pycolmap.Camera(
-        model="OPENCV", width=800, height=600,
-        params=[760.0, 760.0, 400.0, 300.0, -0.08, 0.03, 0.0, 0.0],
-    )  # fmt: skip
-    names = ("left", "right")
-    scene = oblique_scene(truth, rng, names)
-    alone = [replace(record, station=i) for i, record in enumerate(scene.records)]
-    start = pycolmap.Camera(model="RADIAL", width=800, height=600, params=[960.0, 400, 300, 0, 0])
-    seen = Observations(
-        images=alone,
-        cameras={name: pycolmap.Camera(start.todict()) for name in names},
-        taken=scene.pixels,
-        pairs=scene.pairs,
-    )
-    with TemporaryDirectory() as folder, keep_warnings() as warnings:
-        mapped = map_self_calibrated(seen, (), Path(folder), 1)
-    assert warnings == [] and "each calibrates itself" in mapped.notes[0]
-    assert mapped.models[0] == len(alone) and set(mapped.warps) == set(names)
-    assert np.isnan(mapped.baseline)
-    for warp in mapped.warps.values():
-        assert warp.camera.fx_px == pytest.approx(760, rel=0.01)
-    found, true = pupils(mapped, scene)
-    fit = align_similarity(found, true)
-    assert np.sqrt((np.linalg.norm(fit.apply(found) - true, axis=1) ** 2).mean()) < 0.01
-
-
 def oblique_scene(camera: pycolmap.Camera, rng: np.random.Generator, names: Sequence[str]) -> Scene:
     """Eight stations around a bumpy floor, looking at its middle; 0.2 m from left to right."""
     from alice_survey.core.manifest import ImageRecord
@@ -300,15 +268,6 @@ def test_a_station_that_collapsed_onto_another_is_registered_again(
     assert 1e-5 < camera_rms(mapped, scene) < 0.01
 
 
-def test_scaling_moves_rig_and_points_alike() -> None:
-    model = pycolmap.Reconstruction(block_mapped().model)
-    before = {i: p.xyz.copy() for i, p in model.points3D.items()}
-    scale_model(model, 2.5)
-    assert model_baseline(model) == pytest.approx(0.25, rel=1e-9)
-    for i, xyz in before.items():
-        np.testing.assert_allclose(model.points3D[i].xyz, 2.5 * xyz, rtol=1e-9, atol=1e-12)
-
-
 def part(model: pycolmap.Reconstruction, keep: set[int]) -> pycolmap.Reconstruction:
     """A model of some frames only."""
     found = pycolmap.Reconstruction(model)
@@ -352,23 +311,3 @@ def test_models_that_share_stations_become_one(
     assert "6 pictures" in notes[0] and "left/000006.png" in notes[0]
     assert notes[0] in capsys.readouterr().err
     assert report_left_out([first]) == report_left_out([]) == []
-
-
-def test_a_station_without_a_pose_is_added_to_a_model_from_poses(tmp_path: Path) -> None:
-    scene = make_scene(lines=1, stations=6, points=4000, noise_px=0.1)
-    seen = seen_by_pinholes(scene)
-    on_rig = {n: seen.warps[n].pinhole_from_cam * p for n, p in scene.rig.cam_from_rig.items()}
-    reference = on_rig["left"].inv()
-    poses = {
-        record.station: seen.warps["left"].pinhole_from_cam * pose.inv()
-        for record, pose in zip(scene.records, scene.ned_from_cam, strict=True)
-        if record.camera == "left" and record.station != 3
-    }
-    cam_from_left = {name: pose * reference for name, pose in on_rig.items()}
-    model = map_from_poses(seen, cam_from_left, poses, tmp_path, 1, free="nothing")
-
-    assert model.num_reg_images() == len(scene.records)
-    mapped = Mapped(
-        model=model, warps=seen.warps, models=(12,), scaled=True, baseline=0.1, rig_factor=1.0
-    )
-    assert 0.01e-3 < camera_rms(mapped, scene) < 2e-3

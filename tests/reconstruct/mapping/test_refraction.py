@@ -17,7 +17,6 @@ from reconstruct.mapping.refraction import SETTLED_PX, adjust_freely, refract
 from reconstruct.mapping.working_range import warp_record
 from reconstruct.placing.alignment import align_rigid, align_similarity
 from reconstruct.views.range_shift import range_shift
-from tests.cameras import changed
 from tests.oracles_refraction import adjust_through_ports
 from tests.reconstruct.scenes import Scene, make_scene
 from tests.reconstruct.true_models import near_truth, pupils_and_points, warped_scene
@@ -135,28 +134,6 @@ def test_keypoints_end_where_the_field_of_the_lens_says(tmp_path: Path) -> None:
         depth = np.array([(image.cam_from_world() * p)[2] for p in points])
         ideal = np.array([p.xy for p in image.get_observation_points2D()])
         np.testing.assert_allclose(ideal, shift.ideal(warped, depth), atol=2e-3)
-
-
-def test_a_camera_in_plain_air_is_left_as_it_is(tmp_path: Path) -> None:
-    """Zero distance, zero thickness: a pinhole. The same code, and no pixel moves."""
-    scene = make_scene(lines=1, stations=4, points=300, noise_px=0.2, port_distance_m=0.02)
-    cameras = {
-        name: changed(camera, port_distance_m=0.0, glass_thickness_m=0.0, n_water=1.0)
-        for name, camera in scene.rig.cameras.items()
-    }
-    scene = replace(scene, rig=replace(scene.rig, cameras=cameras))
-    pixels = [
-        cameras[r.camera].project(pose.inv().apply(scene.points_ned[ids]))
-        for r, pose, ids in zip(scene.records, scene.ned_from_cam, scene.ids, strict=True)
-    ]
-    scene = replace(scene, pixels=pixels)
-    seen, warps = warped_scene(scene)
-    start = near_truth(scene, seen, warps, np.random.default_rng(1))
-    mapped, found = refract(start, seen, tmp_path)
-    assert max(found.moved_px) < 1e-6
-    assert found.corrected_px < 1e-6
-    _, _, points, true_points = pupils_and_points(mapped, scene)
-    assert rigid_rms(points, true_points) < 1e-6
 
 
 def test_wrong_matches_go_and_right_ones_stay(tmp_path: Path) -> None:

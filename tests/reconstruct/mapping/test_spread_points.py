@@ -66,39 +66,6 @@ def test_points_move_to_the_minimum_of_their_own_errors(robust_px: float | None)
         assert found == pytest.approx(best.x, abs=2e-5)
 
 
-def test_a_part_keeps_what_every_cell_wants() -> None:
-    _, mapped = dense_block(50000, 0.0, (0.0, 0.0))
-    whole, part = mapped.model, spread_part(mapped.model)
-    assert part is not None
-    assert whole.num_points3D() == mapped.model.num_points3D()  # it stays as it was
-    assert part.compute_num_observations() < 0.5 * whole.compute_num_observations()
-    for number, image in whole.images.items():
-        counts = []
-        for model in (whole, part):
-            here = model.images[number]
-            xy = np.array([k.xy for k in here.points2D if k.has_point3D()]).reshape(-1, 2)
-            counts.append(
-                np.histogram2d(
-                    xy[:, 0],
-                    xy[:, 1],
-                    bins=8,
-                    range=((0, image.camera.width), (0, image.camera.height)),
-                )[0]
-            )
-        every, kept = counts
-        assert np.all(kept >= np.minimum(every, 12))
-    tracks = [
-        np.mean([point.track.length() for point in model.points3D.values()])
-        for model in (whole, part)
-    ]
-    assert tracks[1] > tracks[0]
-
-
-def test_a_model_of_few_points_is_not_thinned() -> None:
-    _, mapped = dense_block(800, 0.0, (0.0, 0.0))
-    assert spread_part(mapped.model) is None
-
-
 def test_poses_from_some_of_the_points_are_nearly_as_good() -> None:
     scene, start = dense_block(50000, 0.3, (2e-3, 5e-3))
     rough, full = adjust_roughly(start), adjust_freely(start, 1e-4)

@@ -1,14 +1,9 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from reconstruct.matching.features import (
     detection_scales,
     find_features,
-    load_features,
-    root_sift,
-    save_features,
     spread,
 )
 
@@ -103,17 +98,3 @@ def test_spread_takes_the_largest_of_every_cell_first() -> None:
     assert {500, 501} <= set(chosen)
     in_first_cell = [i for i in chosen if np.all(pixels[i] < 20)]
     assert int(np.argmax(sizes[:500])) in in_first_cell
-
-
-def test_root_sift_has_norm_512() -> None:
-    raw = np.random.default_rng(6).uniform(0, 80, (20, 128)).astype(np.float32)
-    norms = np.linalg.norm(root_sift(raw).astype(float), axis=1)
-    np.testing.assert_allclose(norms, 512.0, rtol=0.01)
-
-
-def test_features_survive_a_file(tmp_path: Path) -> None:
-    found = find_features(blobs(np.array([[60.0, 60.0]])), None, maximum=10)
-    save_features(tmp_path / "f.npz", found)
-    again = load_features(tmp_path / "f.npz")
-    for name in ("pixels", "scale_px", "descriptors"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(again, name))

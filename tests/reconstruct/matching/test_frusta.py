@@ -14,7 +14,6 @@ from camera_calib.rig import Rig
 from reconstruct.matching.pairs import (
     choose_pairs,
     frusta_of,
-    near_pairs,
     neighbours,
     placed_pictures,
     shared,
@@ -128,17 +127,6 @@ def test_pictures_of_a_wall_are_paired_with_all_around_and_no_others() -> None:
     assert not {(0, len(records) - 1)} & (set(sure) | set(maybe))
 
 
-def test_partners_do_not_grow_with_the_wall() -> None:
-    rig = forward_rig()
-    step = 0.35 * min(width_m(rig))
-    per_picture = []
-    for columns in (10, 30):
-        records = wall(columns, 2, step)
-        sure, maybe = choose_pairs(records, rig, DATUM, (), RANGE_M)
-        per_picture.append((len(sure) + len(maybe)) / len(records))
-    assert per_picture[1] < 1.3 * per_picture[0]
-
-
 def test_opposite_sides_of_a_pile_are_no_partners() -> None:
     rig = forward_rig()
     angles = np.deg2rad(np.arange(0, 360, 15))
@@ -155,30 +143,9 @@ def test_opposite_sides_of_a_pile_are_no_partners() -> None:
     assert all(apart[pair] <= 105 for pair in maybe)
 
 
-def test_uncertain_positions_widen_the_search() -> None:
-    rig = forward_rig()
-    wide, _ = width_m(rig)
-    far = records_at(np.array([[0, 0, 10], [0, 1.3 * wide, 10]]), [0.0, 0.0], ["left"])
-    assert choose_pairs(far, rig, DATUM, (), RANGE_M) == ([], [])
-    unsure = [replace(r, sigma_horizontal_m=0.3 * wide) for r in far]
-    assert choose_pairs(unsure, rig, DATUM, (), RANGE_M) == ([], [(0, 1)])
-
-
-def test_pictures_that_look_down_are_paired_as_before() -> None:
-    scene = make_scene(lines=2, stations=6, points=50)
-    assert choose_pairs(scene.records, scene.rig, DATUM, (), RANGE_M) == choose_pairs(
-        scene.records, scene.rig, DATUM
-    )
-
-
 def test_without_altitudes_pictures_that_look_down_are_paired_by_frusta() -> None:
     scene = make_scene(lines=2, stations=6, points=50)
     blind = [replace(r, altitude_m=np.nan) for r in scene.records]
     by_floor, _ = choose_pairs(scene.records, scene.rig, DATUM)
     sure, maybe = choose_pairs(blind, scene.rig, DATUM, (), RANGE_M)
     assert len(set(by_floor) & {*sure, *maybe}) > 0.9 * len(by_floor)
-
-
-def test_nothing_is_near_nothing() -> None:
-    frusta = frusta_of([], forward_rig(), DATUM, *RANGE_M)
-    assert near_pairs(frusta, np.zeros(0, np.bool_), np.zeros(0)) == []

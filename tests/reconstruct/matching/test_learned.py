@@ -199,13 +199,3 @@ def test_turns_bring_north_up(heading: float, turns: int) -> None:
     assert quarter_turns(known, None) == turns
     assert quarter_turns(record, None) == 0
     assert quarter_turns(replace(known, pitch_deg=80.0), None) == 0
-
-
-def test_masks_keep_learned_features_away(reference: dict[str, np.ndarray]) -> None:
-    mask = np.ones(reference["picture"].shape, bool)
-    mask[:, :60] = False
-    free = find_learned(reference["picture"], None, maximum=500)
-    kept = find_learned(reference["picture"], mask, maximum=500)
-    assert free.pixels[:, 0].min() < 30
-    assert 60 + 7 < kept.pixels[:, 0].min() < 60 + 30
-    assert len(kept.pixels) >= len(free.pixels) / 4

@@ -13,7 +13,6 @@ from reconstruct.matching.features import Features, load_features, save_features
 from reconstruct.matching.matches import (
     PairTask,
     apply_homography,
-    coarse_matches,
     fit_homography,
     match_descriptors,
     match_near,
@@ -39,18 +38,6 @@ def test_matches_equal_those_of_the_slow_twin(
     b[: min(n, m) // 2] = a[: min(n, m) // 2]  # some true matches
     found = match_descriptors(a, b, ratio, block)
     np.testing.assert_array_equal(found, match_slowly(a, b, ratio))
-
-
-def test_products_of_full_descriptors_are_exact() -> None:
-    """Blocks of any size must give the same matches: float32 sums of bytes have no rounding."""
-    rng = np.random.default_rng(1)
-    a = rng.integers(0, 256, (300, 128)).astype(np.uint8)
-    b = np.clip(a[::-1].astype(int) + rng.integers(-30, 31, a.shape), 0, 255).astype(np.uint8)
-    whole = match_descriptors(a, b, 0.9)
-    assert len(whole) > 250
-    np.testing.assert_array_equal(whole, match_descriptors(a, b, 0.9, block=13))
-    exact = (a.astype(np.int64) @ b.T.astype(np.int64)).astype(np.float64)
-    np.testing.assert_array_equal(a.astype(np.float32) @ b.T.astype(np.float32), exact)
 
 
 def pair_task(
@@ -102,14 +89,6 @@ def test_geometry_keeps_true_matches_and_drops_false_ones(tmp_path: Path) -> Non
     np.testing.assert_array_equal(found.matches, again.matches)
 
 
-def test_pictures_without_a_common_spot_share_nothing(tmp_path: Path) -> None:
-    rng = np.random.default_rng(7)
-    sides = [(rng.uniform(0, 600, (200, 2)), rng.integers(0, 90, (200, 128))) for _ in "ab"]
-    task = pair_task(tmp_path, pinhole(800, 600, 900), *sides)
-    assert coarse_matches(task) < 10
-    assert match_pair(task).geometry is None
-
-
 def random_features(rng: np.random.Generator, count: int, size: int = 8) -> Features:
     return Features(
         pixels=rng.uniform(0, 100, (count, 2)),
@@ -136,16 +115,6 @@ def test_narrowed_matches_equal_those_of_the_slow_twin(
     found = match_near(a, b, 0.9, predicted, radius, cell)
     slow = match_near_slowly(a.descriptors, b.descriptors, 0.9, searched)
     np.testing.assert_array_equal(found, slow)
-
-
-def test_a_search_without_bounds_is_the_full_one() -> None:
-    rng = np.random.default_rng(8)
-    a, b = random_features(rng, 200), random_features(rng, 180)
-    b.descriptors[:120] = a.descriptors[40:160]
-    found = match_near(a, b, 0.9, a.pixels, 1e4, 17.0)
-    full = match_descriptors(a.descriptors, b.descriptors, 0.9)
-    assert len(full) >= 100
-    np.testing.assert_array_equal(found, full)
 
 
 def test_homographies_come_back_from_exact_matches() -> None:

@@ -19,7 +19,6 @@ from reconstruct.matching.pairs import (
     make_codebook,
     neighbours,
     placed_pictures,
-    well_conditioned,
 )
 from tests.oracles_matching import vlad_slowly
 from tests.reconstruct.rig_survey import four_cameras
@@ -46,19 +45,6 @@ def test_neighbours_of_stereo_stations_cross_the_cameras() -> None:
     assert ("left/1.png", "right/0.png") in names
     assert not any({"left/0.png", "right/2.png"} == set(pair) for pair in names)
     assert len(names) == 3 + 2 * 4
-
-
-def test_few_pictures_without_navigation_are_all_looked_at() -> None:
-    sure, maybe = choose_pairs(mono(20), None, None)
-    assert set(sure) == neighbours(mono(20), NEIGHBOURS)
-    assert set(sure) | set(maybe) == set(itertools.combinations(range(20), 2))
-    assert not set(sure) & set(maybe)
-
-
-def test_many_pictures_without_navigation_are_matched_in_order_only() -> None:
-    sure, maybe = choose_pairs(mono(200), None, None)
-    assert len(sure) == sum(200 - d for d in range(1, NEIGHBOURS + 1))
-    assert maybe == []
 
 
 def test_many_pictures_with_positions_get_their_nearest() -> None:
@@ -167,15 +153,6 @@ def partners_each(records: list[ImageRecord]) -> tuple[float, int]:
     return float(count.mean()), int(count.max())
 
 
-def test_partners_of_a_picture_do_not_grow_with_the_survey() -> None:
-    mean = {
-        lines: partners_each(make_scene(lines=lines, stations=10, points=1).records)[0]
-        for lines in (5, 20)
-    }
-    assert 4 < mean[5] < 20
-    assert mean[20] < 1.1 * mean[5]
-
-
 def test_partners_of_a_picture_do_not_grow_with_visits_to_the_place() -> None:
     scene = make_scene(points=1)
     visits = [
@@ -188,19 +165,6 @@ def test_partners_of_a_picture_do_not_grow_with_visits_to_the_place() -> None:
     # six directions on lines along and across, two in each, chosen by either of the two
     assert once < often < 2 * (2 * 6 * 2 + 12)
     assert maximum < len(visits) / 4
-
-
-def test_every_direction_keeps_a_partner() -> None:
-    """In a crowd to the north, the one partner to the east must not be lost."""
-    rng = np.random.default_rng(8)
-    crowd = np.column_stack([rng.uniform(0.1, 0.8, 30), rng.uniform(-0.02, 0.02, 30)])
-    centres = np.concatenate([[[0.0, 0.0]], crowd, [[0.0, 0.5]]])
-    overlaps = {(0, j): 0.9 - 0.8 * float(np.hypot(*centres[j])) for j in range(1, 31)}
-    overlaps[0, 31] = 0.35
-    chosen = well_conditioned(overlaps, centres, np.zeros(32))
-    # what the others choose among one partner is kept as well, hence only picture 0 is checked
-    assert (0, 31) in chosen
-    assert max(overlaps, key=overlaps.__getitem__) in chosen
 
 
 def test_uncertain_navigation_widens_the_search() -> None:
@@ -251,14 +215,6 @@ def test_neighbours_look_most_alike(tmp_path: Path) -> None:
     assert len(near & set(found)) >= 0.9 * len(near)
     assert len(found) <= 2 * len(files)
     assert found == alike_pairs(files, range(len(files)), 2, seed=3, executor=SERIAL)
-
-
-def test_partners_are_sought_for_those_that_need_them(tmp_path: Path) -> None:
-    files = strip(tmp_path, pictures=12)
-    found = alike_pairs(files, [5], 3, seed=3, executor=SERIAL)
-    assert len(found) == 3
-    assert all(5 in pair for pair in found)
-    assert alike_pairs(files, [], 3, seed=3, executor=SERIAL) == []
 
 
 def test_vectors_equal_those_of_the_slow_twin(tmp_path: Path) -> None:

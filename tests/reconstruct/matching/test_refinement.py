@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 from alice_survey.core.executor import local_executor
 from reconstruct.matching.refinement import (
-    affine_from_neighbours,
     align_coarser,
     align_patches,
     refine_tracks,
@@ -62,22 +61,6 @@ def test_patches_are_aligned_to_hundredths_of_a_pixel() -> None:
     assert 1e-4 < miss < 0.04  # the noise leaves something
 
 
-@pytest.mark.parametrize("slope", [(0.012, 0.0), (0.0, -0.012)])
-def test_light_that_falls_off_across_a_patch_moves_nothing(slope: tuple[float, float]) -> None:
-    """A gain alone leaves a hundredth of a pixel towards the bright side, alike in all patches."""
-    texture, reference = Texture(0), spots(300)
-    first = texture.picture(np.eye(2), np.zeros(2))
-    x, y = np.meshgrid(*(np.arange(n) - n / 2 for n in SIZE))
-    fall = np.exp(slope[0] * x + slope[1] * y)
-    second = np.rint(100 * fall * first).astype(np.uint16)
-    same = np.broadcast_to(np.eye(2), (len(reference), 2, 2))
-    found = align_patches(first, second, reference, reference, same) - reference
-    kept = np.isfinite(found[:, 0])
-    assert kept.mean() > 0.95
-    assert np.abs(np.median(found[kept], axis=0)).max() < 2e-3
-    assert np.abs(found[kept]).max() < 0.05
-
-
 def test_alignment_equals_a_general_solver() -> None:
     texture, reference = Texture(4), spots(6)
     first = texture.picture(np.eye(2), np.zeros(2), noise=1.0)
@@ -108,14 +91,6 @@ def test_what_does_not_resemble_stays() -> None:
     far = align_patches(first, first, reference, guess, same)
     moved = np.linalg.norm(far - guess, axis=1)
     assert moved[np.isfinite(moved)].max(initial=0.0) <= 3.0
-
-
-def test_affine_maps_come_back_from_matches() -> None:
-    first = spots(40)
-    found = affine_from_neighbours(first, first @ AFFINE.T + SHIFT, first[:5])
-    np.testing.assert_allclose(found, np.broadcast_to(AFFINE, (5, 2, 2)), atol=0.01)
-    line = np.column_stack([np.arange(20.0), np.full(20, 3.0)])
-    assert np.isfinite(affine_from_neighbours(line, line + 1.0, line[:3])).all()
 
 
 @settings(deadline=None, max_examples=50)
@@ -180,17 +155,3 @@ def test_what_noise_hides_is_aligned_on_smaller_pictures() -> None:
     assert np.isfinite(whole[:, 0]).mean() < 0.3
     assert kept.mean() > 0.8
     assert 0.02 < np.sqrt(((found - truth)[kept] ** 2).mean()) < 0.35
-
-
-FIRST_AND_LATER = """
-import sys
-import numpy as np
-from reconstruct.matching.refinement import align_patches
-from tests.reconstruct.matching.test_refinement import AFFINE, SHIFT, Texture, spots
-texture, reference = Texture(0), spots(60)
-first = texture.picture(np.eye(2), np.zeros(2), noise=2.0)
-second = texture.picture(AFFINE, SHIFT, gain=0.7, noise=2.0)
-start = np.broadcast_to(AFFINE, (60, 2, 2))
-found = align_patches(first, second, reference, reference @ AFFINE.T + SHIFT, start)
-sys.stdout.buffer.write(found.tobytes())
-"""

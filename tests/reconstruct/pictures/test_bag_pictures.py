@@ -67,13 +67,6 @@ def test_a_mosaic_of_colours_shows_them(pattern: str) -> None:
     np.testing.assert_array_equal(found[4:-4, 4:-4].reshape(-1, 3).min(axis=0), [40, 120, 200])
 
 
-@pytest.mark.parametrize(("encoding", "luma"), [("yuv422", 1), ("yuv422_yuy2", 0)])
-def test_grey_of_yuv_is_grey(encoding: str, luma: int) -> None:
-    packed = np.full((*SHAPE, 2), 128, np.uint8)
-    packed[..., luma] = 235  # white of studio swing
-    np.testing.assert_array_equal(pixels_of(message(encoding, packed)), 255)
-
-
 @pytest.mark.parametrize(
     "changes",
     [{"encoding": "32FC1"}, {"encoding": ""}, {"height": 1000}, {"step": 3}, {"width": 0}],

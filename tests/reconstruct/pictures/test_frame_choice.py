@@ -12,9 +12,6 @@ from reconstruct.pictures.videos import (
     Frame,
     FrameCounts,
     OverlapChooser,
-    motion,
-    overlap_share,
-    small_grey,
 )
 
 WIDTH, HEIGHT = 320, 240
@@ -98,46 +95,6 @@ def test_blurred_frames_are_not_taken_where_sharp_ones_are_near() -> None:
     assert not blurred & set(taken[:-1])  # every window holds a sharp one
 
 
-def test_a_turn_on_the_spot_is_taken_by_overlap() -> None:
-    """90 deg of yaw: two equal rectangles about one middle, the other turned."""
-    ground = floor(5, 800, 800)
-    angles = np.linspace(0.0, 90.0, 60)
-    frames = []
-    for angle in angles:
-        turn = cv2.getRotationMatrix2D((400, 400), angle, 1.0)
-        turn[:, 2] += [WIDTH / 2 - 400, HEIGHT / 2 - 400]
-        frames.append(np.asarray(cv2.warpAffine(ground, turn, (WIDTH, HEIGHT)), np.uint8))
-    taken, _ = chosen(film(frames), 0.8)
-    found = [_turned_share(a) for a in np.diff(angles[taken])]
-    assert len(taken) >= 3
-    assert all(0.7 < share < 0.88 for share in found[:-1])
-
-
-def _turned_share(angle_deg: float) -> float:
-    """By counting points of a fine grid."""
-    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    angle = np.deg2rad(angle_deg)
-    dx, dy = x - WIDTH / 2, y - HEIGHT / 2
-    u = np.cos(angle) * dx - np.sin(angle) * dy
-    v = np.sin(angle) * dx + np.cos(angle) * dy
-    return float(np.mean((np.abs(u) < WIDTH / 2) & (np.abs(v) < HEIGHT / 2)))
-
-
-def test_a_jump_of_a_third_of_the_picture_is_followed() -> None:
-    ground = floor(6, 1000, HEIGHT + 60)
-    one, other = (small_grey(view(ground, *at)) for at in ((10.0, 5.0), (115.0, 25.0)))
-    found = motion(one, other)
-    assert found is not None
-    scale = max(one.shape) / WIDTH
-    np.testing.assert_allclose(found[:2, 2], [-105 * scale, -20 * scale], atol=0.3)
-    np.testing.assert_allclose(found[:2, :2], np.eye(2), atol=3e-3)
-
-
-def test_pictures_of_different_places_have_no_motion() -> None:
-    one, other = (small_grey(view(floor(seed, 600, HEIGHT), 0.0)) for seed in (7, 8))
-    assert motion(one, other) is None
-
-
 def test_a_cut_and_black_frames_are_reported() -> None:
     """The first scene, half a second of black in it, then another scene."""
     x = 6.0 * np.arange(80)
@@ -163,9 +120,3 @@ def test_open_water_gives_no_frames() -> None:
     taken, counts = chosen(film(blue), 0.7)
     assert taken == []
     assert counts.unfollowed == 40
-
-
-@pytest.mark.parametrize(("zoom", "expected"), [(1.0, 1.0), (2.0, 0.25), (0.5, 0.25)])
-def test_frames_at_two_heights_share_the_smaller_part(zoom: float, expected: float) -> None:
-    about = np.array([[zoom, 0, 100 * (1 - zoom)], [0, zoom, 50 * (1 - zoom)], [0, 0, 1]])
-    assert overlap_share(about, (200, 100)) == pytest.approx(expected, abs=1e-6)

@@ -130,16 +130,6 @@ def test_a_divers_folder_is_counted_by_kind_and_reason(
     assert not again.changed and again.model_copy(update={"changed": True}) == found
 
 
-def test_one_folder_does_not_serve_twice(tmp_path: Path, several: Several) -> None:
-    several(3)
-    (tmp_path / "link").symlink_to(tmp_path / "in")
-    pair = {"left": tmp_path / "in", "right": tmp_path / "link"}
-    with pytest.raises(ImageError, match="is given twice"):
-        import_images(tmp_path / "w", [], cameras=pair)
-    with pytest.raises(ImageError):
-        import_images(tmp_path / "w", [tmp_path / "in", tmp_path / "in"])
-
-
 def test_masks_and_workspace_in_the_folder_are_not_left_out(tmp_path: Path, draw: Draw) -> None:
     source = tmp_path / "in"
     for number in range(3):
@@ -167,18 +157,6 @@ def test_stereo_pictures_pair_in_order(tmp_path: Path, draw: Draw) -> None:
         for n in range(3)
         for side, letter, first in (("left", "p", 0), ("right", "s", 5))
     ]
-
-
-def test_cameras_of_a_rig_pair_in_order(tmp_path: Path, draw: Draw) -> None:
-    names = ("bow", "port", "down")
-    for side in names:
-        for number in range(2):
-            draw(tmp_path / side / f"{number}.png", number)
-    import_images(tmp_path / "w", [], cameras={name: tmp_path / name for name in names})
-    records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
-    assert {(r.camera, r.station) for r in records} == {(c, n) for c in names for n in range(2)}
-    with pytest.raises(ImageError, match="is given twice"):
-        import_images(tmp_path / "w", [], cameras=dict.fromkeys(names, tmp_path / "bow"))
 
 
 def test_a_camera_that_missed_a_moment_is_paired_by_number(tmp_path: Path, draw: Draw) -> None:
@@ -237,17 +215,6 @@ def test_a_corrupt_picture_is_left_out_and_its_partner_stays(
     records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
     kept = [(r.camera, r.station) for r in records]
     assert kept == [("left", 0), ("right", 0), ("right", 1), ("left", 2), ("left", 3)]
-
-
-def test_a_truncated_png_is_corrupt_too(
-    tmp_path: Path, draw: Draw, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for number in range(3):
-        path = draw(tmp_path / "in" / f"{number}.png", number, size=(200, 150))
-    path.write_bytes(path.read_bytes()[:-3000])
-    import_images(tmp_path / "w", [tmp_path / "in"])
-    assert "2.png" in capsys.readouterr().err
-    assert len(read_manifest(tmp_path / "w" / "images" / "manifest.csv")) == 2
 
 
 def test_sixteen_bits_become_eight_by_one_gain_per_camera(tmp_path: Path) -> None:
@@ -358,34 +325,6 @@ def test_a_log_of_any_one_reading_is_taken(
     assert "warning" not in capsys.readouterr().err
 
 
-def test_pictures_in_a_gap_of_positions_keep_their_depth(tmp_path: Path, draw: Draw) -> None:
-    for minute in range(4):
-        draw(tmp_path / "in" / f"{minute}.jpg", minute, time=f"2024:07:01 12:0{minute}:30")
-    rows = [
-        [f"2024-07-01T12:{s // 60:02d}:{s % 60:02d}Z",
-         *([60 + 1e-5 * s, 5.0] if s < 60 or s >= 180 else ["", ""]), 0.1 * s]
-        for s in range(240)
-    ]  # fmt: skip
-    nav = navigation(tmp_path / "nav.csv", rows, "time_utc,latitude_deg,longitude_deg,depth_m")
-    done = import_images(tmp_path / "w", [tmp_path / "in"], navigation=nav)
-    assert (done.positions, done.readings["depth"]) == (2, 4)
-    records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
-    assert [r.has_horizontal for r in records] == [True, False, False, True]
-    assert [r.depth_m for r in records] == pytest.approx([3.0, 9.0, 15.0, 21.0])
-
-
-def test_depths_in_the_air_are_warned_of(
-    tmp_path: Path, several: Several, capsys: pytest.CaptureFixture[str]
-) -> None:
-    source = several(3, dated=True)
-    rows = [[f"2024-07-01T12:00:{s:02d}Z", -12 - s] for s in range(9)]
-    nav = navigation(tmp_path / "nav.csv", rows, "time_utc,depth_m")
-    import_images(tmp_path / "w", [source], navigation=nav)
-    assert "above the sea surface, by 13.0 m: depth_m is positive down" in capsys.readouterr().err
-    import_images(tmp_path / "v", [source], navigation=nav, vertical_datum="lake")
-    assert "sea surface" not in capsys.readouterr().err
-
-
 def test_masks_come_along(tmp_path: Path, several: Several) -> None:
     several(3, suffix=".png")
     near, apart = np.full((48, 64), 255, np.uint8), np.zeros((48, 64), np.uint8)
@@ -421,20 +360,6 @@ def test_names_stay_inside_and_apart(tmp_path: Path, draw: Draw) -> None:
     assert not any(path.is_symlink() for path in images.rglob("*"))
     linked = (images / "camera" / "link.jpg").read_bytes()
     assert linked == (tmp_path / "far" / "away.jpg").read_bytes()
-
-
-def test_frames_of_a_video_are_taken_at_their_times(tmp_path: Path) -> None:
-    path = tmp_path / "dive.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10.0, (64, 48))
-    for frame in range(30):
-        writer.write(np.full((48, 64, 3), 8 * frame, np.uint8))
-    writer.release()
-    import_images(tmp_path / "w", [], videos=[path], every_s=0.5, clock_offset_s=100.0)
-    images = tmp_path / "w" / "images"
-    records = read_manifest(images / "manifest.csv")
-    assert [r.time_s for r in records] == pytest.approx([100, 100.5, 101, 101.5, 102, 102.5])
-    levels = [cv2.imread(str(images / r.image)).mean() for r in records]
-    assert levels == pytest.approx([0, 40, 80, 120, 160, 200], abs=6)
 
 
 def test_a_rig_must_be_that_of_the_pictures(tmp_path: Path, draw: Draw) -> None:

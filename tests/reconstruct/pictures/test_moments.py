@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from alice_survey.core.errors import ImageError, collected_by
+from alice_survey.core.errors import ImageError
 from reconstruct.pictures.pairing import moments_of
 
 RNG = np.random.default_rng(4)
@@ -35,19 +35,6 @@ def test_three_cameras_of_unlike_rates_meet_where_they_do() -> None:
     assert [m for m in found if "odd" in m] == [{"fast": 25, "slow": 5, "odd": 0}, {"odd": 1}]
 
 
-def test_what_is_apart_is_said() -> None:
-    times = np.arange(0, 5, 0.1)
-    said: list[str] = []
-    with collected_by(lambda _, text: said.append(text)):
-        moments_of({"left": times, "right": times[:-2] + 0.02})
-    assert any("2 of left" in line for line in said)
-    assert any("20 ms apart" in line for line in said)
-    said.clear()
-    with collected_by(lambda _, text: said.append(text)):
-        moments_of({"left": times, "right": times + 0.005})
-    assert said == []
-
-
 @pytest.mark.parametrize(
     ("right", "named"),
     [
@@ -58,11 +45,3 @@ def test_what_is_apart_is_said() -> None:
 def test_times_that_do_not_pair_are_refused(right: np.ndarray, named: str) -> None:
     with pytest.raises(ImageError, match=named):
         moments_of({"left": np.arange(0, 5, 0.1), "right": right})
-
-
-def test_one_camera_has_a_moment_for_each_picture() -> None:
-    assert moments_of({"down": np.array([1.0, 2.0, 9.0])}) == [
-        {"down": 0},
-        {"down": 1},
-        {"down": 2},
-    ]

@@ -1,22 +1,18 @@
 """Folders as divers bring them: turned, mixed, doubled, nested, of phones."""
 
-import io
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from PIL import Image, ImageFile, JpegImagePlugin
+from PIL import Image
 
 from alice_survey.core.artefacts import read_json
 from alice_survey.core.errors import ImageError, keep_warnings
 from alice_survey.core.manifest import read_manifest
-from camera_calib.picture_files import without_orientation
-from reconstruct.pictures.files import can_read_heic, decode, exif_focal_px, inspect
+from reconstruct.pictures.files import decode, exif_focal_px, inspect
 from reconstruct.pictures.importing import import_images
 from reconstruct.pictures.undistorted import read_colour
 from tests.reconstruct.pictures.dated import counts, reasons
@@ -80,18 +76,6 @@ def test_pixels_are_used_as_stored(tmp_path: Path, suffix: str, orientation: int
             assert np.abs(read[..., ::-1].astype(int) - pixels).max() < 12
         if suffix == ".jpg":
             assert exif_focal_px(copy, 64, 48) == pytest.approx(28 / 36 * 64)
-
-
-def test_taking_an_orientation_off_changes_two_bytes(tmp_path: Path) -> None:
-    for suffix in (".jpg", ".tif"):
-        turned = save(tmp_path / f"a{suffix}", smooth(1), orientation=6).read_bytes()
-        upright = without_orientation(turned)
-        changed = [i for i, (a, b) in enumerate(zip(turned, upright, strict=True)) if a != b]
-        assert len(upright) == len(turned) and len(changed) == 1
-        assert (turned[changed[0]], upright[changed[0]]) == (6, 1)
-    plain = save(tmp_path / "b.jpg", smooth(1)).read_bytes()
-    assert without_orientation(plain) == plain
-    assert without_orientation(turned[:20]) == turned[:20]
 
 
 def test_cameras_of_a_mixed_folder_are_told_apart_by_exif_and_size(tmp_path: Path) -> None:
@@ -166,78 +150,3 @@ def test_folders_inside_are_taken_on_request(tmp_path: Path) -> None:
     import_images(tmp_path / "v", [source], recursive=True)
     records = read_manifest(tmp_path / "v" / "images" / "manifest.csv")
     assert [r.image for r in records if r.mask] == ["camera/G2.jpg"]
-
-
-class _FakeHeif(ImageFile.ImageFile):
-    """A JPEG behind a mark, which stands for what a decoder of HEIC would open."""
-
-    format, format_description = "HEIF", "as pillow-heif opens it"
-
-    def _open(self) -> None:
-        assert self.fp is not None
-        if self.fp.read(4) != b"HEIC":
-            raise SyntaxError("not a HEIC")
-        with JpegImagePlugin.JpegImageFile(io.BytesIO(self.fp.read())) as inside:
-            inside.load()
-            orientation = inside.getexif().get(0x112, 1)
-            turned = Image.fromarray(DISPLAYED[orientation](np.asarray(inside)))
-        self._mode, self._size = "RGB", turned.size
-        self.info["original_orientation"] = orientation
-        self.im, self.tile = turned.im, []
-
-
-@pytest.fixture
-def heif(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    module: Any = ModuleType("pillow_heif")
-    module.register_heif_opener = lambda: Image.register_open(
-        "HEIF", _FakeHeif, lambda head: head[:4] == b"HEIC"
-    )
-    monkeypatch.setitem(sys.modules, "pillow_heif", module)
-    can_read_heic.cache_clear()
-    yield
-    can_read_heic.cache_clear()
-    Image.OPEN.pop("HEIF", None)
-    if "HEIF" in Image.ID:
-        Image.ID.remove("HEIF")
-
-
-def heic(folder: Path, name: str, seed: int, orientation: int) -> None:
-    jpeg = save(folder / "scratch.jpg", smooth(seed), orientation=orientation)
-    (folder / name).write_bytes(b"HEIC" + jpeg.read_bytes())
-    jpeg.unlink()
-
-
-def test_heic_is_read_with_the_users_decoder(tmp_path: Path, heif: None) -> None:
-    """Upright and sideways pictures of a phone are those of one sensor."""
-    turns = (1, 6, 8, 3)
-    for seed, orientation in enumerate(turns):
-        heic(tmp_path / "in", f"IMG_{seed}.HEIC", seed, orientation)
-    (tmp_path / "in" / "IMG_9.heic").write_bytes(b"HEIC, cut")
-    with keep_warnings() as warnings:
-        found = import_images(tmp_path / "w", [tmp_path / "in"])
-    assert found.kinds == {"HEIC": 4} and counts(found) == {"camera": 4}
-    assert reasons(found) == {"cannot be decoded": 1}
-    assert len(warnings) == 1 and "IMG_9.heic" in warnings[0]
-    images = tmp_path / "w" / "images"
-    for seed, record in enumerate(read_manifest(images / "manifest.csv")):
-        assert record.image == f"camera/IMG_{seed}.png"
-        pixels = read_colour(images / record.image)[..., ::-1].astype(int)
-        assert np.abs(pixels - smooth(seed)).max() < 12
-
-
-def test_heic_without_a_decoder_is_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "pillow_heif", None)
-    can_read_heic.cache_clear()
-    try:
-        for seed in range(2):
-            save(tmp_path / "in" / f"{seed}.jpg", smooth(seed))
-            (tmp_path / "in" / f"IMG_{seed}.heic").write_bytes(b"x")
-        with keep_warnings() as warnings:
-            found = import_images(tmp_path / "w", [tmp_path / "in"])
-        assert reasons(found) == {"HEIC": 2}
-        (line,) = warnings
-        assert "pip install pillow-heif" in line and "JPEG" in line
-    finally:
-        can_read_heic.cache_clear()

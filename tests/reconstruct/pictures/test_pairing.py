@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from alice_survey.core.errors import ImageError, keep_warnings
+from alice_survey.core.errors import keep_warnings
 from alice_survey.core.manifest import read_manifest
 from reconstruct.pictures.importing import import_images
 from reconstruct.pictures.pairing import pair_by_time
@@ -118,29 +118,3 @@ def test_cameras_whose_clocks_differ_are_paired_by_number_and_said(tmp_path: Pat
         found = pair_by_time(sides, None, UTC)
     assert list(found.stations) == true_moments(sides)
     assert any("not of one clock" in text and "--triggers" in text for text in said)
-
-
-def test_a_camera_with_fewer_pictures_that_counts_its_own_is_doubtful(tmp_path: Path) -> None:
-    sides = write(tmp_path, lambda k, own, time: f"{own:04d}", dropped={"left": (), "right": (5,)})
-    with keep_warnings() as said:
-        pair_by_time(sides, None, UTC)
-    assert any("only the last pictures have no partner (0011.jpg)" in text for text in said)
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("", "needs the columns"),
-        ("name,time\na,1\n", "needs the columns"),
-        ("image,time_s\n0001.jpg,soon\n", "line 2"),
-        ("image,time_s\n0001.jpg,1\n0001.tif,2\n", "two times"),
-        ("image,time_s\nother.png,1\n", "holds none of the pictures"),
-        ("number,time_s\n1,4\n2,4\n3,5\n", "have the same time"),
-    ],
-)
-def test_wrong_trigger_logs_end_in_one_line(tmp_path: Path, text: str, words: str) -> None:
-    sides = write(tmp_path, lambda k, own, time: f"{k:04d}")
-    (tmp_path / "t.csv").write_text(text)
-    with pytest.raises(ImageError, match=words) as caught:
-        pair_by_time(sides, tmp_path / "t.csv", UTC)
-    assert "\n" not in str(caught.value)

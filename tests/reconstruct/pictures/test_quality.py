@@ -59,15 +59,6 @@ def test_noise_is_measured_and_does_not_pass_for_detail() -> None:
     assert loud["sharpness"] < 0.7 * crisp
 
 
-def test_a_cone_of_light_changes_little() -> None:
-    light = sea_floor(4)
-    y, x = np.mgrid[-1 : 1 : light.shape[0] * 1j, -1 : 1 : light.shape[1] * 1j]
-    lamp = measure(taken(light * np.exp(-0.7 * (x**2 + y**2)), 0.002))
-    even = measure(taken(light, 0.002))
-    assert lamp["sharpness"] == pytest.approx(even["sharpness"], rel=0.15)
-    assert lamp["contrast"] == pytest.approx(even["contrast"], rel=0.25)
-
-
 def test_shares_of_clipped_pixels_are_exact() -> None:
     pixels = np.full((96, 200, 3), 120, np.uint8)
     pixels[:24] = 0

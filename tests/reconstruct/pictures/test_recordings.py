@@ -121,16 +121,6 @@ def test_a_gopros_local_time_ties_it_to_navigation(tmp_path: Path) -> None:
     assert [r.depth_m for r in records] == pytest.approx([15.0, 16.0, 17.0, 18.0])
 
 
-def test_navigation_needs_the_dates_of_several_recordings(tmp_path: Path) -> None:
-    videos = [gopro.film(tmp_path / f"{n}.mp4", levels(0, 30), RATE_HZ) for n in "ab"]
-    log = write_log(tmp_path / "log.csv", NOON, 60)
-    with pytest.raises(ImageError, match="a, b do not say when they began"):
-        import_images(tmp_path / "w", [], videos=videos, every_s=1.0, navigation=log)
-    import_images(tmp_path / "w", [], videos=videos, every_s=1.0)
-    records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
-    assert len(records) == 6 and all(np.isnan(r.time_s) for r in records)
-
-
 @pytest.mark.parametrize("telemetry", [gopro.gps5, gopro.gps9])
 def test_gps_of_a_gopro_gives_time_and_place(tmp_path: Path, telemetry: object) -> None:
     """A diver swims 18e-5 deg to the north in 2 s at the surface, then dives: no fix."""

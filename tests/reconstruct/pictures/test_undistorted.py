@@ -6,7 +6,7 @@ import pycolmap
 import pytest
 
 from alice_survey.core.artefacts import write_json
-from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp, warp_from_json
+from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from reconstruct.mapping.self_calibration import self_calibrated_warp
 from reconstruct.pictures.undistorted import Pictures, undistortion_maps
 from reconstruct.views.model_files import colmap_pinhole
@@ -43,14 +43,6 @@ def test_pixels_come_back(lens: PinholeWarp) -> None:
     np.testing.assert_allclose(lens.from_pinhole(lens.to_pinhole(taken)), taken, atol=1e-6)
 
 
-@LENSES
-def test_a_lens_survives_json(lens: PinholeWarp) -> None:
-    import json
-
-    again = warp_from_json(json.loads(json.dumps(lens.to_json())))
-    assert again == lens
-
-
 def test_the_port_lens_sees_points_at_the_working_range_as_its_pinhole() -> None:
     lens = port_lens()
     rng = np.random.default_rng(1)
@@ -60,14 +52,6 @@ def test_the_port_lens_sees_points_at_the_working_range_as_its_pinhole() -> None
     moved = lens.pinhole_from_cam.apply(points)
     expected = colmap_pinhole(lens.pinhole).img_from_cam(moved)
     np.testing.assert_allclose(ideal, expected, atol=1e-6)
-
-
-def test_a_barrel_lens_keeps_its_field_of_view() -> None:
-    lens = opencv_lens(-0.3)
-    assert lens.pinhole.width_px > WIDTH
-    middle = lens.to_pinhole(np.array([[0.0, 118.0], [WIDTH, 118.0]]))
-    assert middle[0, 0] > -1
-    assert middle[1, 0] < lens.pinhole.width_px + 1
 
 
 @LENSES

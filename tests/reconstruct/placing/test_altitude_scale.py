@@ -27,20 +27,6 @@ def test_altitudes_scale_a_model_within_their_sigma() -> None:
     assert 0.7 < np.sqrt(np.mean(np.square(errors))) < 1.4
 
 
-def test_relief_below_makes_the_scale_less_certain() -> None:
-    sigmas = []
-    for relief in (0.02, 0.3):
-        scene = make_scene(points=3000, relief_m=relief)
-        mono = [i for i, r in enumerate(scene.records) if r.camera == "left"]
-        centres = np.stack([scene.ned_from_cam[i].translation for i in mono])
-        records = [replace(scene.records[i], altitude_m=2.0, sigma_altitude_m=0.02) for i in mono]
-        found = scale_by_altitudes(records, centres, scene.points_ned)
-        assert found is not None
-        sigmas.append(found[1])
-    assert sigmas[1] > 1.5 * sigmas[0]
-    assert sigmas[0] < 0.1
-
-
 def test_a_model_without_altitudes_gets_no_scale_of_them() -> None:
     scene = make_scene(points=100)
     records = [replace(r, altitude_m=float("nan")) for r in scene.records]

@@ -7,7 +7,8 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.manifest import ImageRecord
-from reconstruct.placing.alignment import Bend, level
+from alice_survey.core.records import BendRecord
+from reconstruct.placing.alignment import level
 from reconstruct.placing.fit import fit_navigation
 from tests.reconstruct.placing.test_sigmas import (
     BODY_FROM_CAM,
@@ -19,7 +20,7 @@ from tests.reconstruct.placing.test_sigmas import (
 
 def bends_of(
     body: RigidTransform, records: list[ImageRecord], along: float, across: float, seed: int = 0
-) -> tuple[Bend, ...]:
+) -> tuple[BendRecord, ...]:
     """Of a model in a frame of its own whose heights err by these curvatures north and east."""
     rng = np.random.default_rng(seed)
     cameras = body * BODY_FROM_CAM["cam"]
@@ -51,7 +52,7 @@ def test_a_bent_block_shows_its_curvature(tau_s: float) -> None:
         assert along.sigma_per_m < 1e-3
         assert along.length_m == pytest.approx(19.5, rel=0.06)
         assert along.sag_m == pytest.approx(along.curvature_per_m * along.length_m**2 / 8)
-        assert along.significant(1e-3)
+        assert along.is_significant(1e-3)
 
 
 def test_straight_blocks_are_not_called_bent_and_sigmas_are_true() -> None:
@@ -60,7 +61,7 @@ def test_straight_blocks_are_not_called_bent_and_sigmas_are_true() -> None:
         tau_s = [1.0, 60.0, 4000.0][seed % 3]
         for bend in bends_of(body, flown(body, [8, seed], tau_s), 0.0, 0.0, seed):
             pulls.append(bend.curvature_per_m / bend.sigma_per_m)
-            called += bend.significant(1e-4)
+            called += bend.is_significant(1e-4)
     assert len(pulls) == 60
     assert 0.6 < np.sqrt(np.mean(np.square(pulls))) < 1.4
     assert called <= 2
@@ -72,7 +73,7 @@ def test_sigmas_that_are_stated_too_small_do_not_make_a_bend() -> None:
     boasted = bends_of(body, flown(body, 3, 1.0, factor=20.0), 0.0, 0.0)
     for sure, unsure in zip(honest, boasted, strict=True):
         assert unsure.sigma_per_m > 8.0 * sure.sigma_per_m
-        assert not unsure.significant(1e-4)
+        assert not unsure.is_significant(1e-4)
 
 
 def test_jumps_of_the_depth_sensor_do_not_make_a_bend() -> None:
@@ -82,7 +83,7 @@ def test_jumps_of_the_depth_sensor_do_not_make_a_bend() -> None:
         records[k] = replace(records[k], depth_m=records[k].depth_m + 1.5)
     for bend in bends_of(body, records, 0.0, 0.0):
         assert abs(bend.curvature_per_m) < 4.0 * bend.sigma_per_m
-        assert not bend.significant(1e-3)
+        assert not bend.is_significant(1e-3)
 
 
 def test_a_line_has_no_bend_across_and_a_few_stations_have_none() -> None:

@@ -12,8 +12,8 @@ from alice_survey.core.artefacts import write_json
 from alice_survey.core.errors import WorkspaceError, collected_by, keep_warnings
 from alice_survey.core.frames import Array
 from alice_survey.core.manifest import ImageRecord, write_manifest
+from reconstruct.placing.control_command import import_control
 from reconstruct.placing.control_points import read_control, read_picks
-from reconstruct.placing.foreign_control import import_control
 
 PLACES = {
     "A": (46.8426, -91.9946, -12.5),
@@ -198,17 +198,6 @@ def test_pictures_of_a_rig_are_told_apart_by_their_folder(tmp_path: Path) -> Non
         "left/1.png", "right/1.png", "left/2.png",
     ]  # fmt: skip
     assert any("1.png, 9.png" in line for line in warnings)
-
-
-def test_nothing_is_replaced_unasked(workspace: Path, tmp_path: Path) -> None:
-    path = gcp_list(tmp_path / "gcp_list.txt")
-    (workspace / "picks.csv").write_text("image,point,x,y\n")
-    with pytest.raises(WorkspaceError, match=r"picks.csv is there.*--overwrite"):
-        import_control(workspace, path, sigma_m=0.02)
-    assert (workspace / "picks.csv").read_text() == "image,point,x,y\n"
-    assert not (workspace / "control.csv").exists()
-    import_control(workspace, path, sigma_m=0.02, overwrite=True)
-    assert len(picks_of(workspace)) == len(PICKS)
 
 
 @pytest.mark.parametrize(

@@ -65,13 +65,6 @@ def test_of_two_writers_the_second_is_told(tmp_path: Path) -> None:
     assert {p.point for p in read_picks(path)} == {"p", "q"}
 
 
-def test_points_are_taken_out(tmp_path: Path) -> None:
-    path = tmp_path / "picks.csv"
-    token = save_picks(path, "", [pick("a.png", "p"), pick("b.png", "p"), pick("a.png", "q")], "pq")
-    save_picks(path, token, [], {"p"})
-    assert [(p.image, p.point) for p in read_picks(path)] == [("a.png", "q")]
-
-
 def test_a_wrong_table_is_left_alone_and_its_line_named(tmp_path: Path) -> None:
     path = tmp_path / "picks.csv"
     path.write_text("image,point,x,y\na.png,p,1,2\na.png,q,one,2\n")
@@ -79,22 +72,6 @@ def test_a_wrong_table_is_left_alone_and_its_line_named(tmp_path: Path) -> None:
     with pytest.raises(WorkspaceError, match="line 3"):
         save_picks(path, table_token(path), [pick("b.png", "p")], {"p"})
     assert path.read_bytes() == before
-
-
-@pytest.mark.parametrize(
-    "row",
-    [
-        {"kind": "point", "name": "p", "use": "control", "sigma_m": "0.01"},
-        {"kind": "bar", "name": "b", "use": "control", "from": "p", "to": "p", "length_m": "1",
-         "sigma_m": "0.001"},
-        {"kind": "point", "name": "p\nq", "use": "control"},
-    ],
-)  # fmt: skip
-def test_wrong_control_is_not_written(tmp_path: Path, row: dict[str, str]) -> None:
-    path = tmp_path / "control.csv"
-    with pytest.raises(WorkspaceError):
-        save_control(path, "", [row], [])
-    assert not path.exists() and list(tmp_path.iterdir()) == []
 
 
 def test_control_rows_are_replaced_by_kind_and_name(tmp_path: Path) -> None:

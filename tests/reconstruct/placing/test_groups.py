@@ -31,8 +31,6 @@ from tests.reconstruct.true_models import near_truth, warped_scene
 
 DISTANCES = RangeRecord(near_m=1.75, far_m=2.35, source="test")
 TWO = (range(5), range(9, 14))
-THREE = (range(5), range(9, 13), range(17, 20))
-"""Steps along the lines that each patch has."""
 TAU_S = 60.0
 
 
@@ -197,43 +195,6 @@ def test_patches_lie_to_each_other_as_well_as_is_stated(tmp_path: Path) -> None:
     assert 0.2e-3 < rms(shapes) < 2e-3
 
 
-def test_three_patches_are_joined(tmp_path: Path) -> None:
-    scene = patches(THREE, 1)
-    found = placed(scene, mapped_apart(scene, tmp_path, 1))
-    assert sorted(np.bincount(found.group).tolist()) == [9, 12, 15]
-    assert found.before.modes.groups is not None
-    of_point = found.before.modes.groups.point
-    known = found.after.moved(1.0, found.fit.ned_from_model.rotation, np.zeros(3)).point_cov[
-        :, 2, 2
-    ]
-    ratios = []
-    for group in (1, 2):
-        wrong, covariance = found.joint(group)
-        ratios.append(wrong / np.sqrt(np.diag(covariance)))
-        heights = np.sqrt(known[of_point == group] / covariance[5, 5])
-        assert 0.9 < heights.min() < np.median(heights) < 1.5
-    assert 1e-4 < np.sqrt(np.median(known[of_point == 0])) < 3e-3
-    assert 0.4 < rms(np.array(ratios)) < 1.8
-    assert max(found.shape_rms_m(group) for group in range(3)) < 3e-3
-
-
-def test_a_patch_is_turned_and_not_bent(tmp_path: Path) -> None:
-    """A log whose headings are off in one dive by 4 degrees, as it says."""
-    scene = patches(TWO, 2)
-    stations = max(step.stop for step in TWO)
-    wrong = replace(scene, records=[
-        replace(
-            record, heading_deg=record.heading_deg + 4.0, sigma_heading_deg=4.0,
-        )
-        if _patch(record.station, stations, TWO) == 2
-        else record
-        for record in scene.records
-    ])  # fmt: skip
-    right, turned = (placed(one, mapped_apart(one, tmp_path, 2)) for one in (scene, wrong))
-    for group in (0, 1):
-        assert turned.shape_rms_m(group) == pytest.approx(right.shape_rms_m(group), rel=0.3)
-
-
 def test_a_patch_that_navigation_does_not_place_is_left_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -252,13 +213,3 @@ def test_a_patch_that_navigation_does_not_place_is_left_out(
     assert len(join_groups(mapped, records, scene.rig, None).notes) == 1
     both = join_groups(mapped, scene.records, scene.rig, DATUM)
     assert len(frames_of(both.model)) == 20
-
-
-def test_a_linked_survey_has_one_group(tmp_path: Path) -> None:
-    scene = patches((range(6),), 4, lines=2)
-    mapped = mapped_apart(scene, tmp_path, 4)
-    assert join_groups(mapped, scene.records, scene.rig, DATUM) is mapped
-    found = adjust_survey(mapped, scene.records, scene.rig, DISTANCES, ReconstructConfig())
-    assert found.shape is not None
-    assert found.shape.modes.joints == 0
-    assert found.shape.modes.groups is None

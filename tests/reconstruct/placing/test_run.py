@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 from PIL import Image
 from pyproj import Transformer
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from alice_survey.app.stages import spec
 from alice_survey.core.artefacts import read_json
@@ -17,14 +17,13 @@ from alice_survey.core.config import ReconstructConfig, SurveyConfig
 from alice_survey.core.errors import AliceError, ReconstructionError
 from alice_survey.core.executor import SERIAL, Executor, local_executor
 from alice_survey.core.manifest import read_manifest, write_manifest
-from alice_survey.core.records import RegistrationRecord
+from reconstruct.picking.measure import scale_model
 from reconstruct.pictures.importing import import_images
 from reconstruct.pictures.undistorted import Pictures
-from reconstruct.placing.control_command import scale_model
+from reconstruct.placing.control_command import import_control
 from reconstruct.placing.control_points import RegisteredPicture
-from reconstruct.placing.foreign_control import import_control
 from reconstruct.placing.track import read_track_poses
-from reconstruct.views.model import read_model, read_warps
+from reconstruct.views.model import SparseModel, read_model, read_warps
 
 
 def reconstruct(workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
@@ -70,52 +69,6 @@ def test_a_drone_block_is_registered_scaled_and_placed_by_its_gps(drone: Path) -
         assert view.world_from_cam.rotation.apply([0, 0, 1])[2] > 0.95  # looks down
 
 
-def test_points_are_seen_where_the_model_says(drone: Path) -> None:
-    """Points of the model project into the pinholes' pictures onto the same texture."""
-    model, pictures = read_model(drone / "sparse"), Pictures.open(drone)
-    assert len(model.points_world) > 200
-    patches: dict[int, list[np.ndarray]] = {}
-    for index, view in enumerate(model.views):
-        grey = pictures.grey(view.image)
-        assert grey.shape == (view.pinhole.height_px, view.pinhole.width_px)
-        seen = model.observations[model.observations[:, 1] == index, 0]
-        for point, (x, y) in zip(seen, view.project(model.points_world[seen]), strict=True):
-            if 12 < x < view.pinhole.width_px - 12 and 12 < y < view.pinhole.height_px - 12:
-                patch = cv2.getRectSubPix(grey, (3, 3), (float(x) - 0.5, float(y) - 0.5))
-                patches.setdefault(int(point), []).append(patch.mean())
-    pairs = np.array([p[:2] for p in patches.values() if len(p) > 1], dtype=float)
-    assert np.corrcoef(pairs.T)[0, 1] > 0.8
-
-
-def test_the_place_is_written_as_it_moved_the_mapping(drone: Path) -> None:
-    """Points of `mapping/` through the similarity are those of `sparse/`, but for soft modes."""
-    move = RegistrationRecord.read(drone / "sparse" / "registration.json").world_from_mapping
-    mapped = pycolmap.Reconstruction(drone / "mapping" / "model").points3D
-    points = np.array([mapped[i].xyz for i in sorted(mapped)])
-    turned = Rotation.from_quat(move.quaternion_xyzw).apply(points)
-    np.testing.assert_allclose(
-        move.scale * turned + move.translation,
-        read_model(drone / "sparse").points_world,
-        atol=1e-4 * np.ptp(move.scale * turned),
-    )
-    assert abs(move.scale - 1.0) > 0.1
-
-
-def test_the_track_agrees_with_the_model(drone: Path) -> None:
-    model = read_model(drone / "sparse")
-    poses = read_track_poses(drone / "sparse" / "track.csv")
-    assert set(poses) == {view.image for view in model.views}
-    for view in model.views:
-        np.testing.assert_allclose(
-            poses[view.image].as_matrix(), view.world_from_cam.as_matrix(), atol=1e-6
-        )
-    lines = (drone / "sparse" / "track.tum").read_text().splitlines()
-    assert len(lines) == 6
-    assert all(len(line.split()) == 8 for line in lines)
-    times = [float(line.split()[0]) for line in lines]
-    assert times == sorted(times)
-
-
 def test_two_processes_give_the_same_bytes(drone: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
     import_images(other, [drone / "in"])
@@ -141,6 +94,27 @@ def nowhere(drone: Path, tmp_path: Path) -> Path:
     return folder
 
 
+ENDS = [3, 40]
+
+
+def length_of(model: SparseModel) -> float:
+    return float(np.linalg.norm(np.subtract(*model.points_world[ENDS])))
+
+
+def marks(workspace: Path) -> list[str]:
+    """Two points of the model, each as two pictures show it."""
+    model, pictures, found = read_model(workspace / "sparse"), Pictures.open(workspace), []
+    for point in model.points_world[ENDS]:
+        seen = []
+        for view in model.views:
+            pixel = pictures.warp(view.image).from_pinhole(view.project(point[None]))[0]
+            if np.all((pixel > 5) & (pixel < np.array(view.pinhole.size_px) - 20)):
+                seen.append(f"{view.image}:{pixel[0] - 0.5:.4f},{pixel[1] - 0.5:.4f}")
+        found.append("=".join(seen[:2]))
+    assert all("=" in one for one in found)
+    return found
+
+
 def test_without_positions_the_model_is_level_unscaled_and_says_so(nowhere: Path) -> None:
     model = read_model(nowhere / "sparse")
     assert (model.frame.name, model.frame.datum, model.frame.scaled) == ("model", None, False)
@@ -149,68 +123,34 @@ def test_without_positions_the_model_is_level_unscaled_and_says_so(nowhere: Path
     assert all(view.world_from_cam.translation[2] < 0 for view in model.views)
 
     # one known length scales it
-    first, second = model.points_world[[3, 40]]
-    tokens = [",".join(f"{v:.9f}" for v in p) for p in (first, second)]
-    stated = scale_model(nowhere, " ".join(tokens), 12.5)
-    assert "12.5 m" in stated
+    assert "12.5 m" in scale_model(nowhere, " ".join(marks(nowhere)), 12.5)
     before = (nowhere / "mapping" / "stage.json").stat().st_mtime_ns
     assert reconstruct(nowhere, QUICK, SERIAL)
     assert (nowhere / "mapping" / "stage.json").stat().st_mtime_ns == before  # not mapped again
     scaled = read_model(nowhere / "sparse")
     assert scaled.frame.scaled
     assert scaled.frame.notes != model.frame.notes
-    assert np.linalg.norm(scaled.points_world[3] - scaled.points_world[40]) == pytest.approx(12.5)
+    assert length_of(scaled) == pytest.approx(12.5, rel=1e-3)
     header = (nowhere / "sparse" / "track.csv").read_text().splitlines()[0]
     assert "x_m,y_m,z_m" in header
 
-    # scaling again starts from the metres now shown; a spot may be marked in pictures
-    view = scaled.views[2]
-    picks = []
-    for point in scaled.points_world[[3, 40]]:
-        marks = []
-        for other in scaled.views:
-            pixel = (
-                Pictures.open(nowhere).warp(other.image).from_pinhole(other.project(point[None]))[0]
-            )
-            if np.all((pixel > 5) & (pixel < np.array(other.pinhole.size_px) - 20)):
-                marks.append(f"{other.image}:{pixel[0] - 0.5:.4f},{pixel[1] - 0.5:.4f}")
-        picks.append("+".join(marks))
-    assert all("+" in pick for pick in picks)
+    # scaling again starts from the metres now shown
+    picks = marks(nowhere)
     scale_model(nowhere, " ".join(picks), 25.0)
     assert reconstruct(nowhere, QUICK, SERIAL)
-    doubled = read_model(nowhere / "sparse")
-    length = np.linalg.norm(doubled.points_world[3] - doubled.points_world[40])
-    assert length == pytest.approx(25.0, rel=1e-3)
-    assert view.image in {v.image for v in doubled.views}
-
-    spots = ("camera/x.jpg:5,5", f"{view.image}:9999,5", f"{view.image}:5;5", "1,2", "1,2,nan")
-    for first_point in (*spots, "", "1,2,3"):  # the last two: one point, and twice the same
+    assert length_of(read_model(nowhere / "sparse")) == pytest.approx(25.0, rel=1e-3)
+    one, image = picks[0], scaled.views[2].image
+    for wrong in ("camera/x.jpg:5,5", f"{image}:9999,5", f"{image}:5;5", "1,2,3", one, ""):
         with pytest.raises(ReconstructionError):
-            scale_model(nowhere, f"{first_point} 1,2,3", 1.0)
+            scale_model(nowhere, f"{wrong} {one}", 1.0)
     with pytest.raises(ReconstructionError, match="--length"):
-        scale_model(nowhere, "0,0,0 1,1,1", 0.0)
+        scale_model(nowhere, " ".join(picks), 0.0)
 
     # a scale measured on another model is refused
     scale = json.loads((nowhere / "scale.json").read_text())
     (nowhere / "scale.json").write_text(json.dumps(scale | {"gauge": "other"}))
     with pytest.raises(ReconstructionError, match=r"scale\.json"):
         reconstruct(nowhere, QUICK, SERIAL)
-
-
-def test_one_mark_is_taken_on_the_surface(drone: Path) -> None:
-    from reconstruct.placing.control_command import find_point
-
-    model, pictures = read_model(drone / "sparse"), Pictures.open(drone)
-    warps = read_warps(drone / "sparse" / "cameras.json")
-    view = model.views[1]
-    seen = model.observations[model.observations[:, 1] == 1, 0]
-    misses = []
-    for point in model.points_world[seen[::10]]:
-        pixel = pictures.warp(view.image).from_pinhole(view.project(point[None]))[0] - 0.5
-        found = find_point(f"{view.image}:{pixel[0]},{pixel[1]}", model, warps)
-        misses.append(np.linalg.norm(found - point))
-    height = np.median(view.world_from_cam.inv().apply(model.points_world[seen])[:, 2])
-    assert np.median(misses) < 0.02 * height
 
 
 def test_real_stereo_without_calibration_gets_one_rigid_rig(

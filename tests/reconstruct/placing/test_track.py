@@ -21,6 +21,7 @@ from reconstruct.placing.track import (
     SIGMAS,
     TrackRow,
     attitude_sigmas_deg,
+    plot_track_over,
     pose_covariances,
     read_track_poses,
     track_sigmas,
@@ -28,7 +29,6 @@ from reconstruct.placing.track import (
     write_track_csv,
     write_track_geojson,
 )
-from reconstruct.placing.track_figure import plot_track_over, split_lines
 from reconstruct.raster import DemGrid, crs_of, transform_of
 from reconstruct.views.model import WorldFrame
 
@@ -237,14 +237,6 @@ def test_geojson_is_where_the_cameras_are(tmp_path: Path) -> None:
         assert point["properties"]["heading_deg"] == pytest.approx(heading, abs=1e-5)
         assert point["properties"]["sigma_north_m"] is None
     assert points[2]["properties"]["time_s"] is None
-
-
-def test_lines_end_where_the_track_turns() -> None:
-    places = [(0.5 * k, 0.0) for k in range(5)] + [(2.0 - 0.5 * k, 1.0) for k in range(5)]
-    assert split_lines(np.array(places)).tolist() == [0] * 5 + [1] * 5
-    assert split_lines(np.array(places[:2])).tolist() == [0, 0]
-    straight = np.column_stack([np.arange(9.0), np.zeros(9)])
-    assert split_lines(straight).tolist() == [0] * 9
 
 
 def write_green(path: Path) -> None:
