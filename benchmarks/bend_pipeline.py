@@ -85,7 +85,7 @@ def adjusted(
     if fit is None:
         raise ReconstructionError("navigation does not place the model")
     place, left = fit.ned_from_model, fit.joint[PLACE:, PLACE:]
-    after = found.deformed(fit.modes, left)
+    after = found.deform(fit.modes, left)
     model = after.mapped.model
     model.transform(_as_sim3(place))
     frame = WorldFrame(name="ned", datum=datum, scaled=True, vertical_datum="", notes=())
@@ -99,7 +99,7 @@ def adjusted(
         raise ReconstructionError(f"only {len(rows)} stations are left")
     poses = RigidTransform.concatenate([row.world_from_cam for row in rows])
     stations = [int(np.flatnonzero(found.shape.stations == row.station)[0]) for row in rows]
-    moved = found.shape.moved(place.scale, place.rotation, place.translation)
+    moved = found.shape.move(place.scale, place.rotation, place.translation)
     down = moved.modes.stations[stations, 5]
     spreads = sag_weights(poses.translation[:, :2]) @ down
     scaling = _scale_weights(poses.translation) @ moved.modes.stations[stations, 3:].reshape(
@@ -111,7 +111,7 @@ def adjusted(
         covariances=pose_covariances(rows, fit, found.shape, place),
         shape=_positions_first(
             found.shape.knowing(left)
-            .moved(place.scale, place.rotation, place.translation)
+            .move(place.scale, place.rotation, place.translation)
             .frame_cov[stations]
         ),
         bend_sigmas_m=np.sqrt(np.einsum("ik,kl,il->i", spreads, left, spreads)),

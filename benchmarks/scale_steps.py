@@ -55,7 +55,7 @@ from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import map_calibrated
 from reconstruct.mapping.refraction import refract
 from reconstruct.matching.matches import PairMatches
-from reconstruct.matching.pairs import choose_pairs, most_alike
+from reconstruct.matching.pairs import choose_pairs, nearest_looks
 from reconstruct.placing.alignment import level
 from reconstruct.placing.fit import fit_navigation
 from reconstruct.placing.run import run_sparse
@@ -310,7 +310,7 @@ def _looks(work: StepWork) -> Prepared:
     blocks = [np.arange(n, min(n + 512, work.pictures)) for n in range(0, work.pictures, 512)]
 
     def run() -> int:
-        find = partial(most_alike, file, np.zeros(_LOOK, np.float32), 12)
+        find = partial(nearest_looks, file, np.zeros(_LOOK, np.float32), 12)
         for _ in work.executor.map(find, blocks, label="pictures that look alike"):
             pass
         file.unlink()

@@ -21,7 +21,7 @@ from reconstruct.adjustment.pixel_parts import ALONE, Workers
 from reconstruct.adjustment.soft_modes import SoftModes
 from reconstruct.adjustment.survey_fit import SurveyFit, fit_survey, frees_poses, on_pinholes
 from reconstruct.adjustment.uncertainty import Uncertainty, estimate
-from reconstruct.mapping.arrays import frames_of, observed, rig_poses
+from reconstruct.mapping.arrays import frames_of, observations, rig_poses
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.views.model_files import colmap_pinhole, rigid3d, stored_of
@@ -58,7 +58,7 @@ class AdjustedSurvey:
     shape: Uncertainty | None
     """How well its shape is known; None where it is not."""
 
-    def deformed(self, sizes: Array, left: Array) -> Self:
+    def deform(self, sizes: Array, left: Array) -> Self:
         """The same after measurements from outside have said how large its soft modes are.
 
         Args:
@@ -70,7 +70,7 @@ class AdjustedSurvey:
         shape, modes = self.shape.knowing(left), self.shape.modes
         if self.exact is None:
             return replace(self, mapped=_move_model(self.mapped, modes, sizes), shape=shape)
-        fit = self.exact.fit.deformed(modes, self.shape.point_ids, sizes, left)
+        fit = self.exact.fit.deform(modes, self.shape.point_ids, sizes, left)
         exact = replace(self.exact, fit=fit)
         return replace(self, mapped=exact.on_pinholes(), rig=fit.rig, exact=exact, shape=shape)
 
@@ -171,7 +171,7 @@ def taken_pixels(
         records: pictures.
         warps: by camera.
     """
-    seen, stored = observed(model), stored_of(model).keypoints
+    seen, stored = observations(model), stored_of(model).keypoints
     found = [np.zeros((0, 2))] * len(records)
     for number, rows in sorted(stored.items()):
         warp = warps[records[number - 1].camera]
@@ -179,8 +179,8 @@ def taken_pixels(
         if number in seen.pictures:
             mine = seen.of(seen.row(number))
             depths[seen.keypoint[mine]] = seen.in_cameras[mine, 2]
-        spots = np.column_stack([warp.pinhole.slopes(rows["xy"]), np.ones(len(rows))])
-        in_cam = spots * depths[:, None] + np.array(warp.centre_m)
+        points = np.column_stack([warp.pinhole.slopes(rows["xy"]), np.ones(len(rows))])
+        in_cam = points * depths[:, None] + np.array(warp.centre_m)
         found[number - 1] = warp.camera.project(in_cam)
     return found
 
@@ -188,9 +188,9 @@ def taken_pixels(
 def _move_model(mapped: Mapped, modes: SoftModes, sizes: Array) -> Mapped:
     """A model of pinholes with its soft modes (K,) of these sizes."""
     model = pycolmap.Reconstruction(mapped.model)
-    frames, seen = frames_of(model), observed(model)
+    frames, seen = frames_of(model), observations(model)
     poses = rig_poses(model, frames).inv()
-    turns, centres, points = modes.moved(sizes, poses.translation, seen.points, slice(None))
+    turns, centres, points = modes.move(sizes, poses.translation, seen.points, slice(None))
     stations = RigidTransform.from_components(centres, turns * poses.rotation)
     for frame, station in zip(frames.tolist(), stations, strict=True):
         model.frames[frame].rig_from_world = rigid3d(station.inv())

@@ -16,7 +16,7 @@ from alice_survey.core.frames import Array
 from camera_calib.freedom import chosen_slopes, wanted_slopes
 from camera_calib.rig import Rig
 from reconstruct.adjustment.normal_equations import LinearObservations
-from reconstruct.mapping.arrays import Indices, observed, rig_poses
+from reconstruct.mapping.arrays import Indices, observations, rig_poses
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
 
@@ -119,7 +119,7 @@ def choose_pixels(
         names: of the cameras.
         frames: ids of the stations, ascending.
     """
-    model, found = mapped.model, observed(mapped.model)
+    model, found = mapped.model, observations(mapped.model)
     camera, station = np.empty(len(found.point), np.int64), np.empty(len(found.point), np.int64)
     taken = np.empty((len(found.point), 2))
     for n, number in enumerate(found.pictures.tolist()):
@@ -169,15 +169,15 @@ def start_state(
     )
 
 
-def exact_misses(state: RigState, pixels: Pixels) -> Array:
+def exact_residuals(state: RigState, pixels: Pixels) -> Array:
     """(O, 2) computed pixels minus observed ones; NaN where no ray explains one."""
     arm = state.points[pixels.point] - state.centres[pixels.station]
-    misses = np.empty((len(arm), 2))
+    residuals = np.empty((len(arm), 2))
     for c, (name, pose) in enumerate(state.rig.cam_from_rig.items()):
         rows = np.flatnonzero(pixels.camera == c)
         in_rig = np.einsum("nij,ni->nj", state.turns[pixels.station[rows]], arm[rows])
-        misses[rows] = state.rig.cameras[name].project(pose.apply(in_rig)) - pixels.taken[rows]
-    return misses
+        residuals[rows] = state.rig.cameras[name].project(pose.apply(in_rig)) - pixels.taken[rows]
+    return residuals
 
 
 def exact_observations(

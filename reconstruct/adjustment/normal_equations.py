@@ -62,7 +62,7 @@ class LinearObservations:
         """(O,) index of the point."""
         return np.repeat(np.arange(len(self.starts) - 1), np.diff(self.starts))
 
-    def weighted(self, weights: Array) -> "LinearObservations":
+    def weigh(self, weights: Array) -> "LinearObservations":
         """The same observations with the squares of each weighted, (O,)."""
         root = np.sqrt(weights)[:, None, None]
         return replace(self, by_point=root * self.by_point, rest=root * self.rest)

@@ -19,8 +19,8 @@ from alice_survey.core.frames import Array
 from reconstruct.adjustment.exact_observations import (
     Pixels,
     RigState,
-    exact_misses,
     exact_observations,
+    exact_residuals,
 )
 from reconstruct.adjustment.normal_equations import (
     BlockPattern,
@@ -162,17 +162,19 @@ class PixelParts:
             self.kept[number] = path
         return self.kept[number]
 
-    def misses(self, state: RigState) -> Array:
+    def residuals(self, state: RigState) -> Array:
         """(O, 2) computed pixels minus observed ones; NaN where no ray explains one."""
-        return np.concatenate(list(self.map(_misses_of_part, state, repeat(None, len(self.runs)))))
+        return np.concatenate(
+            list(self.map(_residuals_of_part, state, repeat(None, len(self.runs))))
+        )
 
 
 def _pattern_of_part(pixels: Pixels, _: None, own: Indices) -> BlockPattern:
     return pattern_of(pixels.starts, pixels.station, len(own))
 
 
-def _misses_of_part(pixels: Pixels, state: RigState, _: None) -> Array:
-    return exact_misses(state, pixels)
+def _residuals_of_part(pixels: Pixels, state: RigState, _: None) -> Array:
+    return exact_residuals(state, pixels)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -224,7 +226,7 @@ class _How:
     def linear(self, pixels: Pixels, state: RigState) -> LinearObservations:
         sigma, variance = self.noise
         found = exact_observations(state, pixels, self.fields)
-        return found.weighted(cauchy_weights(found.miss, sigma) / variance)
+        return found.weigh(cauchy_weights(found.miss, sigma) / variance)
 
 
 def _on_linear(

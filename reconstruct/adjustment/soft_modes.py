@@ -42,7 +42,7 @@ class Groups:
     middles: Array
     """(N, 3) about which groups turn and grow."""
 
-    def carried(self, motions: Array, places: Array, group: Indices) -> Array:
+    def carry(self, motions: Array, places: Array, group: Indices) -> Array:
         """Places (M, 3) of groups (M,) that are moved relative to the first.
 
         Args:
@@ -89,7 +89,7 @@ class SoftModes:
         groups = self.groups and replace(self.groups, point=self.groups.point[rows])
         return replace(self, points=self.points[rows], groups=groups)
 
-    def moved(
+    def move(
         self, sizes: Array, centres: Array, points: Array, rows: Indices | slice
     ) -> tuple[Rotation, Array, Array]:
         """Turns (F,) of the stations, and where these and the points are, with modes of a size.
@@ -112,8 +112,8 @@ class SoftModes:
         every = np.concatenate([np.zeros((1, 3)), motions[:, :3]])[self.groups.station]
         return (
             Rotation.from_rotvec(every) * turns,
-            self.groups.carried(motions, centres, self.groups.station),
-            self.groups.carried(motions, points, self.groups.point[rows]),
+            self.groups.carry(motions, centres, self.groups.station),
+            self.groups.carry(motions, points, self.groups.point[rows]),
         )
 
 
@@ -199,7 +199,7 @@ def soft_modes(
     weigh = np.sqrt(gauge.weights)
     stations, width = equations.free.shape
 
-    def moved(weighed: Array) -> tuple[Array, Array, Array]:
+    def respond(weighed: Array) -> tuple[Array, Array, Array]:
         """Covariance times (F, 6): of stations in a fixed rig, in all, and of the rig."""
         kick = gauge.shape_weights(weigh * weighed)
         own = equations.covariance_times(kick[..., None])[..., 0]
@@ -211,7 +211,7 @@ def soft_modes(
         return own, own + calibration.stations @ rig, rig
 
     def product(flat: Array) -> Array:
-        step = moved(flat.reshape(stations, width))[1]
+        step = respond(flat.reshape(stations, width))[1]
         shape: Array = weigh * (step - gauge.motions @ gauge.motion_in(step))
         return shape.ravel()
 
@@ -223,7 +223,7 @@ def soft_modes(
     kept = np.flatnonzero(values > _MIN_MODE * values.max())[::-1]
     owns, shape, rigs, wholes = [], [], [], []
     for k in kept.tolist():
-        own, step, rig = moved(vectors[:, k].reshape(stations, width))
+        own, step, rig = respond(vectors[:, k].reshape(stations, width))
         whole, sigma = gauge.motion_in(step), np.sqrt(values[k])
         owns.append(own / sigma)
         wholes.append(whole / sigma)

@@ -249,7 +249,7 @@ class SurveyFit:
             covariance=Covariance(parameters=self.parameters, matrix=self.covariance),
         )
 
-    def deformed(self, modes: SoftModes, point_ids: Indices, sizes: Array, left: Array) -> Self:
+    def deform(self, modes: SoftModes, point_ids: Indices, sizes: Array, left: Array) -> Self:
         """The survey after measurements from outside have said how large its soft modes are.
 
         Args:
@@ -259,7 +259,7 @@ class SurveyFit:
             left: (K, K) covariance of these.
         """
         state, rows = self.state, np.searchsorted(point_ids, self.point_ids)
-        turns, centres, points = modes.moved(sizes, state.centres, state.points, rows)
+        turns, centres, points = modes.move(sizes, state.centres, state.points, rows)
         rig, covariance = state.rig, self.covariance
         if self.parameters:
             rig = moved(rig, self.parameters, modes.calibration @ sizes)
@@ -410,7 +410,7 @@ class SurveyProblem:
         return spare
 
     def _observations(self, state: RigState) -> _Guess:
-        miss = self.parts.misses(state)
+        miss = self.parts.residuals(state)
         lost = ~np.isfinite(miss).all(axis=1)
         miss[lost] = 0.0
         return _Guess(state=state, miss=miss, lost=int(lost.sum()))

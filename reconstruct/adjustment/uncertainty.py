@@ -50,7 +50,7 @@ from reconstruct.mapping.arrays import (
     Indices,
     frames_of,
     linked_groups,
-    observed,
+    observations,
     rig_poses,
 )
 from reconstruct.mapping.bundle import cauchy_weights, sigma_of, variance_of
@@ -123,7 +123,7 @@ class Uncertainty:
             shared=shared,
         )
 
-    def moved(self, scale: float, rotation: Rotation, translation: Array) -> Self:
+    def move(self, scale: float, rotation: Rotation, translation: Array) -> Self:
         """The same in the world; the arguments are those of `world_from_model`.
 
         Its modes are no longer to be found: they are by groups in the model.
@@ -183,7 +183,7 @@ def estimate(
     pixels, order = pixels.by_place(state.centres)
     state = replace(state, points=state.points[order])
     parts = PixelParts(pixels, len(frames), workers)
-    miss = np.nan_to_num(parts.misses(state), nan=0.0)
+    miss = np.nan_to_num(parts.residuals(state), nan=0.0)
     sigma = sigma_of(miss, pixels.seen_by, len(frames))
     weights = cauchy_weights(miss, sigma)
     variance = variance_of(miss, weights, spare / (2 * count))
@@ -410,7 +410,7 @@ def pinhole_survey(
         Its observations, its state, the ids (P,) of its points, and for every frame the picture of
         the reference camera, or else its first.
     """
-    seen = observed(model)
+    seen = observations(model)
     images = [model.images[number] for number in seen.pictures.tolist()]
     counts, order = np.diff(seen.starts), np.argsort(seen.point, kind="stable")
     numbers = sorted({image.camera_id for image in images})

@@ -146,7 +146,7 @@ def show_moving(workspace: Path, folder: Path, shares: Sequence[MovingShare]) ->
         return
     pictures, tiles = Pictures.open(workspace), []
     for one in maximum:
-        taken = pictures.taken(one.image)
+        taken = pictures.as_taken(one.image)
         mask = read_mask(moving_path(folder / MOVING, one.image), pictures.warp(one.image).size_px)
         size = (_SHOWN_PX, round(_SHOWN_PX * taken.shape[0] / taken.shape[1]))
         shown = cv2.resize(taken, size, interpolation=cv2.INTER_AREA)

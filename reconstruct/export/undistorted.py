@@ -182,7 +182,7 @@ def export_view(workspace: Path, folder: Path, task: tuple[View, float]) -> Expo
     if mask.exists():  # of a run that was interrupted; it is written last
         return Exported(on_surface=on_surface, size_px=(width, height))
     x, y = taken_at(pictures, view, _filled(surface, depth))
-    taken = pictures.taken(view.image)
+    taken = pictures.as_taken(view.image)
     inside = (x >= 0) & (x <= taken.shape[1] - 1) & (y >= 0) & (y <= taken.shape[0] - 1)
     x, y = np.where(inside, x, np.float32(-10.0)), np.where(inside, y, np.float32(-10.0))
     colour = cv2.remap(taken, x, y, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)

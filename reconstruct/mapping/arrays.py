@@ -47,7 +47,7 @@ class Observed:
         """Index among `pictures` of the one with this id; it must be there."""
         return int(np.searchsorted(self.pictures, picture))
 
-    def misses(self, model: pycolmap.Reconstruction) -> Array:
+    def residuals(self, model: pycolmap.Reconstruction) -> Array:
         """Where the cameras see the points minus where the keypoints are, (O, 2) pixels."""
         found = np.empty((len(self.point), 2))
         for n, number in enumerate(self.pictures.tolist()):
@@ -95,7 +95,7 @@ def linked_groups(station: Indices, point: Indices, stations: int) -> Indices:
 
 def model_groups(model: pycolmap.Reconstruction) -> Indices:
     """(F,) the group of linked stations (see `linked_groups`) of each of `frames_of`."""
-    frames, seen = frames_of(model), observed(model)
+    frames, seen = frames_of(model), observations(model)
     of_picture = [model.images[number].frame_id for number in seen.pictures.tolist()]
     station = np.repeat(np.searchsorted(frames, of_picture), np.diff(seen.starts))
     return linked_groups(station, seen.point, len(frames))
@@ -127,7 +127,7 @@ def cross_matrices(vectors: Array) -> Array:
     return found
 
 
-def observed(model: pycolmap.Reconstruction) -> Observed:
+def observations(model: pycolmap.Reconstruction) -> Observed:
     """The observations of a model as it is now."""
     poses = {n: i.cam_from_world().matrix() for n, i in model.images.items() if i.has_pose}
     pictures = np.array(sorted(poses), dtype=np.int64)

@@ -21,7 +21,7 @@ from alice_survey.core.block_solver import Flags
 from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
 from alice_survey.core.robust import CAUCHY_TUNING, RAYLEIGH_MEDIAN
-from reconstruct.mapping.arrays import Indices, Observed, observed
+from reconstruct.mapping.arrays import Indices, Observed, observations
 
 _MIN_SIGMA_PX = 1e-3
 _WELL_SEEN = 4
@@ -30,29 +30,31 @@ _MAX_ADAPTED = 0.9
 
 def pixel_sigma(model: pycolmap.Reconstruction) -> float:
     """Standard deviation of one coordinate of a keypoint, from a model's residuals."""
-    seen = observed(model)
+    seen = observations(model)
     counts = np.bincount(seen.point, minlength=len(seen.point_ids))[seen.point]
-    return sigma_of(seen.misses(model), counts, model.num_reg_frames())
+    return sigma_of(seen.residuals(model), counts, model.num_reg_frames())
 
 
-def sigma_of(misses: Array, counts: Indices, stations: int) -> float:
+def sigma_of(residuals: Array, counts: Indices, stations: int) -> float:
     """Standard deviation of one coordinate, from the median of residuals.
 
     Residuals are smaller than errors by what points and stations adapt to. Points seen only twice
     adapt so much that what is left is not normal: they do not count where there are others.
 
     Args:
-        misses: (O, 2) residuals.
+        residuals: (O, 2) residuals.
         counts: (O,) how many observations each one's point has.
         stations: how many there are.
     """
-    if not len(misses):
+    if not len(residuals):
         return _MIN_SIGMA_PX
     free = float((3.0 / counts).sum())  # unknowns of points
-    by_station = 1.0 - min(_MAX_ADAPTED, 6.0 * stations / max(2.0 * len(misses) - free, 1.0))
+    by_station = 1.0 - min(_MAX_ADAPTED, 6.0 * stations / max(2.0 * len(residuals) - free, 1.0))
     left = (1.0 - 1.5 / counts) * by_station
     well_seen = counts >= min(_WELL_SEEN, int(np.median(counts)))
-    median = float(np.median(np.linalg.norm(misses[well_seen], axis=1) / np.sqrt(left[well_seen])))
+    median = float(
+        np.median(np.linalg.norm(residuals[well_seen], axis=1) / np.sqrt(left[well_seen]))
+    )
     return max(median / RAYLEIGH_MEDIAN, _MIN_SIGMA_PX)
 
 
@@ -61,19 +63,19 @@ def loss_scale(sigma_px: float) -> float:
     return CAUCHY_TUNING * sigma_px
 
 
-def cauchy_weights(misses: Array, sigma_px: float) -> Array:
+def cauchy_weights(residuals: Array, sigma_px: float) -> Array:
     """Weights (O,) of observations that miss by (O, 2) pixels."""
-    weights: Array = 1.0 / (1.0 + (misses**2).sum(axis=1) / loss_scale(sigma_px) ** 2)
+    weights: Array = 1.0 / (1.0 + (residuals**2).sum(axis=1) / loss_scale(sigma_px) ** 2)
     return weights
 
 
-def cauchy_cost(misses: Array, sigma_px: float) -> float:
+def cauchy_cost(residuals: Array, sigma_px: float) -> float:
     """Cauchy's loss of (O, 2) residuals, px^2; the sum of squares where all are small."""
     squares = loss_scale(sigma_px) ** 2
-    return squares * float(np.log1p((misses**2).sum(axis=1) / squares).sum())
+    return squares * float(np.log1p((residuals**2).sum(axis=1) / squares).sum())
 
 
-def variance_of(misses: Array, weights: Array, share_left: float) -> float:
+def variance_of(residuals: Array, weights: Array, share_left: float) -> float:
     """Variance of one coordinate that makes `(J' W J)^-1` a covariance.
 
     Huber (1981), "Robust statistics", section 7.6: the estimate's covariance is K^2 E[psi^2] /
@@ -82,11 +84,11 @@ def variance_of(misses: Array, weights: Array, share_left: float) -> float:
     slope of psi, over both coordinates, is the square of the weight.
 
     Args:
-        misses: (O, 2) residuals.
+        residuals: (O, 2) residuals.
         weights: (O,) of `cauchy_weights`.
         share_left: of the observations' freedom, what an adjustment left.
     """
-    squares = float((weights**2 * (misses**2).sum(axis=1)).mean()) / (2.0 * share_left)
+    squares = float((weights**2 * (residuals**2).sum(axis=1)).mean()) / (2.0 * share_left)
     slope = float((weights**2).mean())
     few = 1.0 + (1.0 - share_left) * float((weights**2).var()) / slope**2
     return float(weights.mean()) * few**2 * squares / slope**2
@@ -155,7 +157,7 @@ def spread_part(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction | Non
     Args:
         model: with registered pictures.
     """
-    seen = observed(model)
+    seen = observations(model)
     order = np.argsort(seen.point, kind="stable")
     chosen = _spread(_starts(seen), _cells(model, seen)[order], len(seen.pictures) * _CELLS**2)
     kept = int(chosen[seen.point].sum())
@@ -180,7 +182,7 @@ def move_points(model: pycolmap.Reconstruction, robust_px: float | None = None) 
         model: of pinholes without distortion.
         robust_px: scale of a Cauchy loss; None: plain least squares.
     """
-    seen = observed(model)
+    seen = observations(model)
     focal, rays = np.empty((len(seen.point), 2)), np.empty((len(seen.point), 2))
     pose_of = np.repeat(np.arange(len(seen.pictures)), np.diff(seen.starts))
     poses = np.empty((len(seen.pictures), 3, 4))
@@ -270,12 +272,12 @@ def _settle(
             for o in range(first, end):
                 pose = poses[pose_of[o]]
                 depth = pose[2, 0] * to_x + pose[2, 1] * to_y + pose[2, 2] * to_z + pose[2, 3]
-                misses = 0.0
+                residuals = 0.0
                 for k in range(2):
                     at = pose[k, 0] * to_x + pose[k, 1] * to_y + pose[k, 2] * to_z + pose[k, 3]
-                    misses += (focal[o, k] * (at / depth - rays[o, k])) ** 2
-                now += misses if robust == np.inf else robust * np.log1p(misses / robust)
-                weight = 1.0 / (1.0 + misses / robust)
+                    residuals += (focal[o, k] * (at / depth - rays[o, k])) ** 2
+                now += residuals if robust == np.inf else robust * np.log1p(residuals / robust)
+                weight = 1.0 / (1.0 + residuals / robust)
                 for k in range(2):
                     at = pose[k, 0] * to_x + pose[k, 1] * to_y + pose[k, 2] * to_z + pose[k, 3]
                     slope = at / depth

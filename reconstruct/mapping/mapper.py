@@ -23,7 +23,7 @@ from alice_survey.core.frames import Array
 from alice_survey.core.manifest import ImageRecord
 from alice_survey.core.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp
-from reconstruct.mapping.arrays import observed
+from reconstruct.mapping.arrays import observations
 from reconstruct.mapping.database import Observations, new_folder, station_frames, write_database
 from reconstruct.mapping.global_mapper import adjust, map_globally, triangulate_and_adjust
 from reconstruct.pictures.files import list_names
@@ -409,7 +409,7 @@ def _continue_mapping(
 def collapsed_frames(model: pycolmap.Reconstruction) -> list[int]:
     """Frames many of whose points lie in their cameras' own centres."""
     depths: dict[int, list[Array]] = {}
-    seen = observed(model)
+    seen = observations(model)
     for n, number in enumerate(seen.pictures.tolist()):
         depth = seen.in_cameras[seen.of(n), 2]
         if len(depth):

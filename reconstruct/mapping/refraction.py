@@ -20,7 +20,7 @@ from alice_survey.core.errors import warn
 from alice_survey.core.frames import Array
 from alice_survey.core.records import RefractionRecord
 from alice_survey.core.run import progress
-from reconstruct.mapping.arrays import Indices, first_of, frames_of, model_groups, observed
+from reconstruct.mapping.arrays import Indices, first_of, frames_of, model_groups, observations
 from reconstruct.mapping.bundle import (
     FULLY,
     ROUGHLY,
@@ -82,7 +82,7 @@ class Keypoints:
     def metres_per_unit(self, model: pycolmap.Reconstruction) -> float:
         """Metres in a unit of a model without scale, whose median depth is the working depth."""
         working = [warp.working_depth_m for warp in self._warps.values()]
-        return float(np.median(working) / np.median(observed(model).in_cameras[:, 2]))
+        return float(np.median(working) / np.median(observations(model).in_cameras[:, 2]))
 
     def correct(
         self, model: pycolmap.Reconstruction, metres_per_unit: float
@@ -97,7 +97,7 @@ class Keypoints:
             The largest move, and the root mean square of the whole shift, pixels.
         """
         largest, squares, count = 0.0, 0.0, 0
-        seen = observed(model)
+        seen = observations(model)
         depths = metres_per_unit * seen.in_cameras[:, 2]
         for n, number in enumerate(seen.pictures.tolist()):
             rows = seen.of(n)
@@ -114,7 +114,7 @@ class Keypoints:
         """Move the keypoints that have no point by the depth of the nearest one that has."""
         from scipy.spatial import KDTree
 
-        seen = observed(model)
+        seen = observations(model)
         depths, stored = metres_per_unit * seen.in_cameras[:, 2], stored_of(model).keypoints
         for n, number in enumerate(seen.pictures.tolist()):
             rows, warped = seen.of(n), self._seen.pixels[number - 1]

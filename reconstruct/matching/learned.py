@@ -33,7 +33,7 @@ from reconstruct.matching.matches import (
     as_seen,
     kept_features,
     match_descriptors,
-    verified,
+    verify,
 )
 from reconstruct.pictures.normalise import normalise, read_deep
 from reconstruct.pictures.undistorted import read_mask
@@ -114,7 +114,7 @@ def find_learned(
     sizes = np.full(len(usable), _CELL * steps.mean())
     chosen = usable[spread(pixels[usable], sizes, strength[usable], (width, height), maximum)]
     there = (np.column_stack([columns, rows])[chosen] + 0.5) / _CELL - 0.5
-    found = sampled(descriptors, there)
+    found = sample(descriptors, there)
     found = found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), _EPSILON)
     return Features(
         pixels=pixels[chosen],
@@ -138,7 +138,7 @@ def match_learned(task: PairTask) -> PairMatches:
     width, height = (task.cameras[1][side] for side in ("width", "height"))
     way = np.linalg.norm(b.pixels[matches[:, 1]] - a.pixels[matches[:, 0]], axis=1)
     matches = matches[way > _STILL * max(width, height)]
-    pair = verified(task, seen, matches)
+    pair = verify(task, seen, matches)
     if pair.geometry is not None and (
         false_alarms(len(pair.matches), len(matches), (width, height)) > _MAX_FALSE_ALARMS
     ):
@@ -195,7 +195,7 @@ def dense_features(grey: NDArray[np.uint8]) -> tuple[Floats, Floats, Floats]:
     return found, likely, smooth
 
 
-def sampled(field: Floats, at: Array) -> Array:
+def sample(field: Floats, at: Array) -> Array:
     """Values (N, C) of a field (H, W, C) at places (N, 2), x and y, bilinear; held at its rim."""
     last = np.array([field.shape[1] - 1, field.shape[0] - 1])
     inside = np.clip(at, 0, last)

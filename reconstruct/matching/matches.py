@@ -217,7 +217,7 @@ def match_pair(task: PairTask) -> PairMatches:
         matches = _guided_matches(task, a, b, seen)
     if matches is None:
         matches = match_descriptors(a.descriptors, b.descriptors, task.ratio)
-    return verified(task, seen, matches)
+    return verify(task, seen, matches)
 
 
 def _guided_matches(
@@ -289,7 +289,7 @@ def apply_homography(homography: Array, pixels: Array) -> Array:
     return found
 
 
-def verified(task: PairTask, seen: tuple[Array, Array], matches: Matches) -> PairMatches:
+def verify(task: PairTask, seen: tuple[Array, Array], matches: Matches) -> PairMatches:
     """What one geometry explains of matches of features that the model's cameras see at `seen`."""
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = task.seed

@@ -110,7 +110,7 @@ def frusta_of(
     )
 
 
-def shared(
+def overlap_shares(
     frusta: Frusta, pairs: Iterable[Pair], slack_m: Array
 ) -> dict[Pair, tuple[float, float]]:
     """What pictures share: at the middle distance, and at that at which they share most.
@@ -429,7 +429,7 @@ def _sharing(
     pairs = [pair for pair in near_pairs(frusta, chosen, slack) if not linked_within(*pair)]
     sure: dict[Pair, float] = {}
     maybe: dict[Pair, float] = {}
-    for pair, (middle, maximum) in shared(frusta, pairs, slack).items():
+    for pair, (middle, maximum) in overlap_shares(frusta, pairs, slack).items():
         if middle >= _SURE_OVERLAP:
             sure[pair] = middle
         elif maximum >= _MIN_OVERLAP:
@@ -441,7 +441,7 @@ def _sharing(
 
 
 def _shared_middle(frusta: Frusta, i: int, j: int) -> float:
-    return shared(frusta, [(i, j)], np.zeros(len(frusta.cameras)))[i, j][0]
+    return overlap_shares(frusta, [(i, j)], np.zeros(len(frusta.cameras)))[i, j][0]
 
 
 def _slack_m(record: ImageRecord, distance_m: float) -> float:
@@ -576,7 +576,7 @@ def alike_pairs(
     rows = executor.map(partial(describe, words=words), features, label="looks of pictures")
     for number, row in enumerate(rows):
         looks[number] = row
-    find = partial(most_alike, file, looks.mean(axis=0), min(partners, len(features) - 1))
+    find = partial(nearest_looks, file, looks.mean(axis=0), min(partners, len(features) - 1))
     looks.flush()
     blocks = [np.asarray(requested[n : n + _BLOCK]) for n in range(0, len(requested), _BLOCK)]
     found = executor.map(find, blocks, label="pictures that look alike")
@@ -591,7 +591,7 @@ def alike_pairs(
     return sorted(pairs)
 
 
-def most_alike(
+def nearest_looks(
     file: Path, mean: NDArray[np.float32], count: int, some: NDArray[np.int64]
 ) -> NDArray[np.int64]:
     """The pictures (n, count) that look most like some pictures (n,), best first.

@@ -100,7 +100,7 @@ class Tools:
         if image in self._kept:
             self._kept[image] = self._kept.pop(image)  # now the last to go
             return self._kept[image]
-        taken = self._pictures.taken(image)
+        taken = self._pictures.as_taken(image)
         while len(self._kept) >= max(1, _CACHED_BYTES // taken.nbytes):
             del self._kept[next(iter(self._kept))]
         self._kept[image] = taken

@@ -112,7 +112,7 @@ def encoded(light: Float32) -> Float32:
 def measure_picture(workspace: Path, folder: Path, view: View) -> PictureMeasures:
     """Measure a picture of a workspace and write its small copy to a folder."""
     pictures = Pictures.still(workspace)
-    taken, usable = pictures.taken(view.image), pictures.usable(view.image)
+    taken, usable = pictures.as_taken(view.image), pictures.usable(view.image)
     height, width = taken.shape[:2]
     table = linear_table()
     shrink = max(_MIN_SHRINK, round(width / _SMALL_PX))
@@ -335,7 +335,7 @@ def _measured(where: str, row: dict[str, str], pictures: Pictures) -> ReferenceP
         raise WorkspaceError(f"{where}: {', '.join(_NUMBERS)} must be numbers") from None
     if not all(0.0 < value <= 1.0 for value in rgb):
         raise WorkspaceError(f"{where}: red, green, blue must be reflectances above 0, at most 1")
-    taken, usable = pictures.taken(row["image"]), pictures.usable(row["image"])
+    taken, usable = pictures.as_taken(row["image"]), pictures.usable(row["image"])
     height, width = taken.shape[:2]
     if not (radius > 0 and radius <= x + 0.5 <= width - radius and
             radius <= y + 0.5 <= height - radius):  # fmt: skip

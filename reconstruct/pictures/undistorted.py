@@ -177,7 +177,7 @@ class Pictures:
         except KeyError:
             raise WorkspaceError(f"no picture {image!r} in sparse/cameras.json") from None
 
-    def taken(self, image: str) -> Colour:
+    def as_taken(self, image: str) -> Colour:
         """A picture as taken, (H, W, 3) BGR.
 
         Raises:
@@ -219,7 +219,7 @@ class Pictures:
         Raises:
             ImageError: the file is missing, cannot be decoded or is of another size.
         """
-        taken = self.taken(image)
+        taken = self.as_taken(image)
         x, y = (axis[part] for axis in self._maps(self._cameras[image]))
         # OpenCV's cubic kernel misplaces fine texture by up to 0.045 px, Lanczos' by 0.009
         warped: Colour = cv2.remap(taken, x, y, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)

@@ -28,7 +28,7 @@ from alice_survey.core.records import (
 from alice_survey.core.robust import CAUCHY_TUNING, MAD_TO_SIGMA
 from alice_survey.core.run import progress
 from camera_calib.rig import Rig
-from reconstruct.mapping.arrays import Observed, first_pictures, observed
+from reconstruct.mapping.arrays import Observed, first_pictures, observations
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.working_range import ray_passes
 from reconstruct.matching.pairs import positions_ned
@@ -60,7 +60,7 @@ def measure_doming(
         rotations: `ned_from_pinhole` by picture's index, as navigation has it.
         bends: along and across, as navigation shows them.
     """
-    seen = observed(model)
+    seen = observations(model)
     along, across = (*bends, None, None)[:2]
     pixel_m = ground_pixel(model, seen)
     notes = [
@@ -330,7 +330,7 @@ def _far_stations(
     centres = np.array(
         [as_transform(model.images[n].cam_from_world()).inv().translation for n in numbers]
     )
-    off, sigma = misses(centres, positions[rows], sigmas[rows])
+    off, sigma = navigation_residuals(centres, positions[rows], sigmas[rows])
     over = off / sigma
     found = [
         FarStation(
@@ -346,7 +346,7 @@ def _far_stations(
     return len(numbers), float(np.median(off) / _MEDIAN_SIGMAS), ordered
 
 
-def misses(centres: Array, given: Array, sigmas: Array) -> tuple[Array, Array]:
+def navigation_residuals(centres: Array, given: Array, sigmas: Array) -> tuple[Array, Array]:
     """Distances between places and where navigation has them, after a robust rigid alignment.
 
     Args:

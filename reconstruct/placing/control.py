@@ -135,10 +135,10 @@ class ControlFit:
             rows.append(jacobian)
         return Extra(misfit=np.concatenate(misfits), jacobian=np.concatenate(rows))
 
-    def deformed(self, sizes: Array) -> "ControlFit":
+    def deform(self, sizes: Array) -> "ControlFit":
         """The same on the model after its soft modes (K,) have been found."""
 
-        def moved(picked_point: TriangulatedPoint) -> TriangulatedPoint:
+        def shift_point(picked_point: TriangulatedPoint) -> TriangulatedPoint:
             return replace(
                 picked_point,
                 model=picked_point.model + self._motion(picked_point, len(sizes)) @ sizes,
@@ -146,9 +146,11 @@ class ControlFit:
 
         return replace(
             self,
-            ties=tuple(replace(tie, picked_point=moved(tie.picked_point)) for tie in self.ties),
+            ties=tuple(
+                replace(tie, picked_point=shift_point(tie.picked_point)) for tie in self.ties
+            ),
             bars=tuple(
-                replace(bar, pairs=tuple((moved(a), moved(b)) for a, b in bar.pairs))
+                replace(bar, pairs=tuple((shift_point(a), shift_point(b)) for a, b in bar.pairs))
                 for bar in self.bars
             ),
             motion_at=None,
@@ -167,7 +169,7 @@ class ControlFit:
         if len(ties) < 3:
             return None
         model, ned = np.stack([t.picked_point.model for t in ties]), np.stack([t.ned for t in ties])
-        return aligned(model, ned, known_scale)
+        return align_points(model, ned, known_scale)
 
     def misfits(self, place: Similarity) -> list[tuple[Array, Array]]:
         """Misfit (3,) and its covariance (3, 3) of each used point, metres."""
@@ -215,7 +217,7 @@ class ControlFit:
         )
 
 
-def aligned(model: Array, ned: Array, known_scale: float | None) -> Similarity | None:
+def align_points(model: Array, ned: Array, known_scale: float | None) -> Similarity | None:
     """The placement of points (N, 3) of the model on known ones; None where they are on a line."""
     spread = np.linalg.svd(ned - ned.mean(axis=0), compute_uv=False)
     if spread[1] < _MIN_SPREAD * spread[0]:
@@ -244,7 +246,7 @@ def tie_control(
                 name=point.name,
                 use=point.use,
                 picked_point=picked[point.name],
-                ned=point.ned(datum),
+                ned=point.place_ned(datum),
                 sigma=sigma,
             )
         )
@@ -375,7 +377,7 @@ def without_wrong_points(control: ControlFit, known_scale: float | None) -> Cont
     model, ned = np.stack([t.picked_point.model for t in ties]), np.stack([t.ned for t in ties])
     best = np.full(count, np.inf)
     for triple in _triples(count):
-        place = aligned(model[triple], ned[triple], known_scale)
+        place = align_points(model[triple], ned[triple], known_scale)
         if place is None:
             continue
         off = _misfits(control, place)
@@ -388,16 +390,16 @@ def without_wrong_points(control: ControlFit, known_scale: float | None) -> Cont
         return control
     spread = MAD_TO_SIGMA * (1.0 + 5.0 / (count - _TRIPLE)) * float(np.median(best))
     inside = best <= max(_INSIDE_SIGMAS * max(1.0, spread), np.sort(best)[agreeing - 1])
-    place = aligned(model[inside], ned[inside], known_scale)
+    place = align_points(model[inside], ned[inside], known_scale)
     if place is None:
         return control
     off = _misfits(control, place)
     freedom = 3 * int(inside.sum()) - (7 if known_scale is None else 6)
     spread = np.sqrt(3.0 * float(np.square(off[inside]).sum()) / freedom)
-    misses = np.linalg.norm(place.apply(model) - ned, axis=1)
+    residuals = np.linalg.norm(place.apply(model) - ned, axis=1)
     wrong = {
         tie.name: float(miss)
-        for tie, sigmas, miss in zip(ties, off, misses, strict=True)
+        for tie, sigmas, miss in zip(ties, off, residuals, strict=True)
         if sigmas > _WRONG_SIGMAS * max(1.0, spread)
     }
     for name, miss in wrong.items():
@@ -445,7 +447,7 @@ def real_sigma_factor(control: ControlFit, place: Similarity, parameters: int) -
         return 1.0
 
     def excess(log_factor: float) -> float:
-        coarser = widened(control, float(np.exp(log_factor)))
+        coarser = widen(control, float(np.exp(log_factor)))
         return 3.0 * float(np.square(_misfits(coarser, place)).sum()) / freedom - 1.0
 
     ratio = 1.0 + excess(0.0)
@@ -457,7 +459,7 @@ def real_sigma_factor(control: ControlFit, place: Similarity, parameters: int) -
     return float(np.exp(brentq(excess, 0.0, maximum)))
 
 
-def widened(control: ControlFit, factor: float) -> ControlFit:
+def widen(control: ControlFit, factor: float) -> ControlFit:
     """The same with sigmas of its points that are larger by a factor."""
     ties = tuple(
         replace(tie, sigma=factor * tie.sigma) if tie.use == "control" else tie

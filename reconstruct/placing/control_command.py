@@ -219,7 +219,7 @@ def _expected_in(
     datum: Datum | None = model.frame.datum
     if datum is None:
         return []
-    place = point.ned(datum)[None]
+    place = point.place_ned(datum)[None]
     found = []
     for view in model.views:
         warp = pictures.warp(view.image)

@@ -84,7 +84,7 @@ class KnownPoint:
         """Whether it says where on Earth it is."""
         return not math.isnan(self.latitude_deg)
 
-    def ned(self, datum: Datum | None) -> Array:
+    def place_ned(self, datum: Datum | None) -> Array:
         """(3,) place in the local frame of a datum.
 
         Raises:
@@ -532,11 +532,11 @@ def triangulate_picks(
         if len({p.image for p in seen}) < 2:
             lost[name] = f"picked in {len(seen)} pictures of the model; two or more are needed"
             continue
-        spot = _triangulate(name, seen, cameras)
-        if isinstance(spot, str):
-            lost[name] = spot
+        found_point = _triangulate(name, seen, cameras)
+        if isinstance(found_point, str):
+            lost[name] = found_point
         else:
-            found[name] = spot
+            found[name] = found_point
     for name in sorted({n.rsplit(".", 1)[0] for n in found if "." in n} - set(found)):
         corners = [found.get(f"{name}.{k}") for k in range(4)]
         whole = [c for c in corners if c is not None]
@@ -694,8 +694,8 @@ def _without_one(
     """
     order = np.argsort(-np.linalg.norm(off, axis=1), kind="stable")[:_TRIED]
     choices = [[p for k, p in enumerate(picks) if k != out] for out in order]
-    misses = [_worst(_fit(point, choice, cameras)[0], choice) for choice in choices]
-    return choices[int(np.argmin(misses))]
+    offsets = [_worst(_fit(point, choice, cameras)[0], choice) for choice in choices]
+    return choices[int(np.argmin(offsets))]
 
 
 def _nearest(picks: Sequence[Pick], cameras: Mapping[str, RegisteredPicture]) -> Array | str:
@@ -719,23 +719,23 @@ def _fit(
     weight = np.repeat(usual / own, 2)
     unit = float(np.linalg.norm(start - cameras[picks[0].image].model_from_pinhole.translation))
 
-    def misses(x: Array) -> Array:
+    def offsets(x: Array) -> Array:
         point = start + unit * x
         seen = np.stack([cameras[p.image].project(point) for p in picks])
         return np.asarray(np.nan_to_num((seen - picked).ravel(), nan=1e6))
 
-    def weighted(x: Array) -> Array:
-        found: Array = weight * misses(x)
+    def weigh_offsets(x: Array) -> Array:
+        found: Array = weight * offsets(x)
         return found
 
     found = least_squares(
-        weighted, np.zeros(3), loss="soft_l1", f_scale=near_px, xtol=1e-12,
+        weigh_offsets, np.zeros(3), loss="soft_l1", f_scale=near_px, xtol=1e-12,
         ftol=1e-12, gtol=1e-12, jac="3-point",
     )  # fmt: skip
     jacobian = np.empty((2 * len(picks), 3))
     for axis in range(3):
         step = np.zeros(3)
         step[axis] = 1e-6
-        jacobian[:, axis] = (misses(found.x + step) - misses(found.x - step)) / (2e-6 * unit)
-    off = misses(found.x).reshape(-1, 2)
+        jacobian[:, axis] = (offsets(found.x + step) - offsets(found.x - step)) / (2e-6 * unit)
+    off = offsets(found.x).reshape(-1, 2)
     return np.where(np.abs(off) >= 1e6, np.nan, off), start + unit * found.x, jacobian

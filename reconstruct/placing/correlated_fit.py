@@ -273,12 +273,12 @@ class PlacementProblem:
         varying, constants = self.shares(channel, rows, correlation)
         misfit = self.found.misfit[:, channel]
         columns = np.column_stack([self.found.jacobian[:, channel][:, self.free], misfit])
-        even, log_det = self.whitened(
+        even, log_det = self.whiten_columns(
             channel, rows, correlation, varying, np.column_stack([columns, constants])
         )
         return even.T @ even, log_det + 2.0 * float(np.log(varying[rows]).sum()), int(rows.sum())
 
-    def whitened(
+    def whiten_columns(
         self,
         channel: int,
         rows: NDArray[np.bool_],
@@ -583,7 +583,7 @@ def _without_contradicted(
             varying, constants = problem.shares(channel, rows, how)
             sigma = varying * problem.found.sigma[:, channel]
             both = np.column_stack([misfit / how.factor, constants])
-            even = problem.whitened(channel, rows, how, varying, both)[0]
+            even = problem.whiten_columns(channel, rows, how, varying, both)[0]
             inner = np.eye(constants.shape[1]) + even[:, 1:].T @ even[:, 1:]
             steady = np.linalg.solve(inner, even[:, 1:].T @ even[:, 0])
             off = np.where(rows, (both[:, 0] - constants @ steady) / varying, 0.0)

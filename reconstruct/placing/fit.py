@@ -345,7 +345,7 @@ class NavigationTask:
         correlation: Mapping[str, Correlation] | None = None,
     ) -> Estimate:
         """Solve the equations of navigation, and of all else, about a guess."""
-        found = equations(self.epochs.deformed(at.sizes), at.place, self._middle(at.place))
+        found = equations(self.epochs.deform(at.sizes), at.place, self._middle(at.place))
         return estimate(
             self.epochs.time, found, used, free, self._extra(at), frame_bounds=bounds,
             widened=widened, correlation=correlation,
@@ -359,7 +359,7 @@ class NavigationTask:
         free: Sequence[int],
         bounds: Mapping[int, float],
     ) -> PlacementFit:
-        epochs = self.epochs.deformed(at.sizes)
+        epochs = self.epochs.deform(at.sizes)
         kept = got.used[epochs.moment, :3].any(axis=1)
         residuals = (epochs.positions(at.place) - epochs.measured_ned)[kept]
         residuals = np.where(got.used[epochs.moment, :3][kept], residuals, np.nan)
@@ -425,7 +425,7 @@ class NavigationTask:
         self, at: _Guess, got: Estimate, free: Sequence[int], bounds: Mapping[int, float]
     ) -> tuple[BendRecord, ...]:
         """How bent the placed model is by navigation alone, whatever its modes allow."""
-        epochs, place = self.epochs.deformed(at.sizes), at.place
+        epochs, place = self.epochs.deform(at.sizes), at.place
         if got.used[:, 2].sum() < MIN_STATIONS:
             return ()
         places = place.apply(epochs.centres)
@@ -557,9 +557,9 @@ class NavigationTask:
         if at.drift_m:
             known[DRIFT] = 1.0 / abs(at.drift_m)
         known[PARAMETERS : columns - self.joints] = 1.0 / at.factor
-        at = np.flatnonzero(known)
-        misfits.append((known * np.concatenate([np.zeros(columns - len(sizes)), sizes]))[at])
-        rows.append(np.diag(known)[at])
+        stated = np.flatnonzero(known)
+        misfits.append((known * np.concatenate([np.zeros(columns - len(sizes)), sizes]))[stated])
+        rows.append(np.diag(known)[stated])
         if self.control is not None:
             more = self.control(place, self._middle(place), sizes)
             misfits.append(more.misfit)
@@ -628,10 +628,10 @@ def _mode_factor(sizes: Array, sigmas: Array, factor: float) -> float:
     return max(1.0, float(np.sqrt(ratio)))
 
 
-def _rms(misses: Array) -> Array:
+def _rms(residuals: Array) -> Array:
     """(3,) root mean squares of (N, 3) that may be NaN; NaN where all are."""
-    known = np.isfinite(misses)
-    total = np.where(known, misses, 0.0) ** 2
+    known = np.isfinite(residuals)
+    total = np.where(known, residuals, 0.0) ** 2
     counts = known.sum(axis=0)
     return np.sqrt(np.where(counts > 0, total.sum(axis=0) / np.maximum(counts, 1), np.nan))
 

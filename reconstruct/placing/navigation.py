@@ -95,7 +95,7 @@ class Epochs:
     modes: Array
     """(N, 6, K) by the model's soft modes: motions of the centres, and turns about its axes."""
 
-    def deformed(self, sizes: Array) -> "Epochs":
+    def deform(self, sizes: Array) -> "Epochs":
         """The same of the model with its soft modes (K,) of these sizes."""
         steps = self.modes @ sizes
         return replace(
@@ -253,14 +253,14 @@ def without_navigation(
 
 
 def _sigmas(rows: Sequence[ImageRecord]) -> Array:
-    def stated(values: Sequence[float], default: float) -> Array:
+    def or_default(values: Sequence[float], default: float) -> Array:
         array = np.array(values)
         return np.where(array > 0, array, default)
 
-    level = stated([r.sigma_horizontal_m for r in rows], _SIGMA_HORIZONTAL_M)
-    depth = stated([r.sigma_depth_m for r in rows], _SIGMA_DEPTH_M)
-    tilt = np.deg2rad(stated([r.sigma_attitude_deg for r in rows], _SIGMA_ATTITUDE_DEG))
-    heading = np.deg2rad(stated([r.sigma_heading_deg for r in rows], _SIGMA_HEADING_DEG))
+    level = or_default([r.sigma_horizontal_m for r in rows], _SIGMA_HORIZONTAL_M)
+    depth = or_default([r.sigma_depth_m for r in rows], _SIGMA_DEPTH_M)
+    tilt = np.deg2rad(or_default([r.sigma_attitude_deg for r in rows], _SIGMA_ATTITUDE_DEG))
+    heading = np.deg2rad(or_default([r.sigma_heading_deg for r in rows], _SIGMA_HEADING_DEG))
     return np.stack([level, level, depth, tilt, tilt, heading], axis=1)
 
 

@@ -43,7 +43,7 @@ from reconstruct.placing.control import (
     real_sigma_factor,
     tie_control,
     warn_of_coarse,
-    widened,
+    widen,
     without_wrong_points,
 )
 from reconstruct.placing.control_points import (
@@ -302,10 +302,10 @@ def find_place(task: Placing) -> Placed:
         if fit is None or local is not None:
             break
         freely = PLACE if fit.sigma_scale > 0 else SCALE
-        factor = real_sigma_factor(ties.deformed(fit.modes), fit.ned_from_model, freely)
+        factor = real_sigma_factor(ties.deform(fit.modes), fit.ned_from_model, freely)
         if factor == 1.0:
             break
-        ties = widened(ties, factor)
+        ties = widen(ties, factor)
         fit, local = _fit(task, levelled, scale, known, ties, datum)
     warn_of_coarse(ties)
     notes = [*task.survey.notes, *task.mapping.notes]
@@ -346,7 +346,7 @@ def find_place(task: Placing) -> Placed:
         notes=tuple(notes),
     )
     if fit is not None:
-        ties = ties.deformed(fit.modes)
+        ties = ties.deform(fit.modes)
     return Placed(
         world_from_model=place,
         frame=frame,

@@ -115,19 +115,20 @@ def navigation_places(
     there = [n for n, record in enumerate(lost) if record.has_position]
     corrected = len(based) >= _MIN_CORRECTING and bool(there)
     if corrected:
-        timed = bool(np.isfinite([one.time_s for one in (*based, *(lost[n] for n in there))]).all())
+        stamps = [*(row.time_s for row in based), *(lost[n].time_s for n in there)]
+        timed = bool(np.isfinite(stamps).all())
         times = np.array([row.time_s if timed else float(row.station) for row in based])
         order = np.argsort(times, kind="stable")
         based, times = [based[k] for k in order], times[order]
         spacing = float(np.median(np.diff(np.unique(times)))) if np.ptp(times) else 0.0
-        misses = np.array([
+        residuals = np.array([
             row.world_from_cam.translation - _place(known[row.image], rig, datum) for row in based
         ])  # fmt: skip
         for n in there:
             at = lost[n].time_s if timed else float(lost[n].station)
-            places[n] += _between(times, misses, at, 0.0)
+            places[n] += _between(times, residuals, at, 0.0)
             apart = max(float(np.abs(times - at).min()), spacing)
-            left = misses - np.array([_between(times, misses, t, apart) for t in times])
+            left = residuals - np.array([_between(times, residuals, t, apart) for t in times])
             rms = np.sqrt(np.nanmean(np.square(left), axis=0))
             sigma[n] = np.sqrt(np.mean(np.square(rms[:2]))), rms[2]
     return places, np.where(np.isnan(places[:, :1]), np.nan, sigma), corrected
@@ -135,7 +136,7 @@ def navigation_places(
 
 def _place(record: ImageRecord, rig: Rig | None, datum: Datum) -> Array:
     """(3,) where navigation puts a camera, NED; NaN where it does not know."""
-    place = positions_ned([record], datum)[0]
+    place: Array = positions_ned([record], datum)[0]
     if rig is not None and record.has_attitude:
         place = place + record.ned_from_body.apply(rig.body_from_cam(record.camera).translation)
     return place
@@ -372,7 +373,7 @@ def run_sparse(
     )
     shape = adjusted.shape
     if placed.fit is not None and len(placed.fit.modes):
-        adjusted = adjusted.deformed(placed.fit.modes, placed.fit.joint[PLACE:, PLACE:])
+        adjusted = adjusted.deform(placed.fit.modes, placed.fit.joint[PLACE:, PLACE:])
     model, warps = pycolmap.Reconstruction(adjusted.mapped.model), adjusted.mapped.warps
     move = placed.world_from_model
     rotation = pycolmap.Rotation3d(move.rotation.as_quat())
@@ -405,7 +406,7 @@ def run_sparse(
     if adjusted.shape is not None:
         write_uncertainty(
             folder / "covariance.npz",
-            adjusted.shape.moved(move.scale, move.rotation, move.translation),
+            adjusted.shape.move(move.scale, move.rotation, move.translation),
         )
     sigmas = track_sigmas(rows, covariances)
     write_track_csv(folder / "track.csv", rows, placed.frame, sigmas)

@@ -31,7 +31,7 @@ from alice_survey.kit.figure import (
 )
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.adjustment.uncertainty import Uncertainty
-from reconstruct.mapping.arrays import cross_matrices, observed
+from reconstruct.mapping.arrays import cross_matrices, observations
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.fit import PlacementFit
 from reconstruct.placing.navigation import PLACE, SCALE, attitude_axes
@@ -90,15 +90,15 @@ def track_rows(
         frame: the world.
         body_from_cam: mount of every camera that has one.
     """
-    seen = observed(model)
-    missed = np.linalg.norm(seen.misses(model), axis=1)
+    seen = observations(model)
+    missed = np.linalg.norm(seen.residuals(model), axis=1)
     pupils = {
         name: warp.pinhole_from_cam if frame.scaled else RigidTransform.identity()
         for name, warp in warps.items()
     }
     rows = []
     for n, number in enumerate(seen.pictures.tolist()):
-        image, misses = model.images[number], missed[seen.of(n)]
+        image, residuals = model.images[number], missed[seen.of(n)]
         record = records[image.name]
         cam_from_world = as_transform(image.cam_from_world())
         pose = cam_from_world.inv() * pupils[record.camera]
@@ -110,8 +110,8 @@ def track_rows(
                 camera=record.camera,
                 time_s=record.time_s,
                 world_from_cam=pose,
-                points=len(misses),
-                reprojection_px=float(misses.mean()) if len(misses) else float("nan"),
+                points=len(residuals),
+                reprojection_px=float(residuals.mean()) if len(residuals) else float("nan"),
                 world_from_body=pose.rotation * mount.inv(),
             )
         )

@@ -91,7 +91,7 @@ def predict(
     fields = calibrated_parameters(rig, list(rig.cameras)) if calibration else ()
     linear = exact_observations(state, block.pixels, fields)
     linear.rest[..., -1] = 0.0
-    linear = linear.weighted(np.full(len(block.pixels.station), block.times / noise_px**2))
+    linear = linear.weigh(np.full(len(block.pixels.station), block.times / noise_px**2))
     motions = _calibration(linear, block, fields) if fields else None
     bare = LinearObservations(
         starts=linear.starts, station=linear.station, by_point=linear.by_point, arm=linear.arm,

@@ -73,7 +73,7 @@ def read_control(path: Path) -> object:
 
     control = read_control(path)
     datum = control.datum() or _DATUM
-    return [point.ned(datum) for point in control.points]
+    return [point.place_ned(datum) for point in control.points]
 
 
 def _picks(folder: Path) -> None:

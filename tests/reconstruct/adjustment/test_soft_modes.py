@@ -63,7 +63,7 @@ def hessian_of(survey: AdjustedSurvey) -> Array:
     weights = cauchy_weights(linear.miss, fit.sigma_px)
     count = len(fit.state.centres)
     hessian, _ = dense_normal_equations(
-        linear.weighted(weights / weights.mean() / fit.sigma_px**2), count
+        linear.weigh(weights / weights.mean() / fit.sigma_px**2), count
     )
     own = np.array([SIGMAS[name] for name in fit.parameters])
     hessian[-len(own) :, -len(own) :] += np.diag(own**-2)
@@ -108,7 +108,7 @@ def test_modes_and_navigation_end_where_all_unknowns_at_once_do(survey: Adjusted
     assert np.ptp(wanted[:, 5]) > 1e-3
     assert np.linalg.norm((found - wanted)[:, 3:]) < 0.05 * np.linalg.norm(wanted[:, 3:])
     fit = survey.exact.fit
-    moved = fit.deformed(modes, survey.shape.point_ids, sizes, np.eye(len(sizes)))
+    moved = fit.deform(modes, survey.shape.point_ids, sizes, np.eye(len(sizes)))
     off = moved.after - fit.after - solved[size - len(SIGMAS) : size]
     assert np.all(np.abs(off) < 0.1 * np.sqrt(np.diag(fit.covariance)))
 
@@ -228,7 +228,7 @@ def placed_alone(
         modes=picture_modes(found.shape, scene.records, pinholes),
     )  # fmt: skip
     assert fit is not None
-    after = found.deformed(fit.modes, fit.joint[PLACE:, PLACE:]).mapped.model
+    after = found.deform(fit.modes, fit.joint[PLACE:, PLACE:]).mapped.model
     true = np.array([
         (pose * warps["left"].pinhole_from_cam.inv()).translation for pose in scene.ned_from_cam
     ])  # fmt: skip

@@ -27,7 +27,7 @@ from reconstruct.adjustment.uncertainty import (
     read_uncertainty,
     write_uncertainty,
 )
-from reconstruct.mapping.arrays import frames_of, observed
+from reconstruct.mapping.arrays import frames_of, observations
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.refraction import refract
@@ -193,7 +193,7 @@ def points_with(rig: Rig, folder: Path, seed: int = 0) -> tuple[Mapped, Array]:
     believed = replace(noisy(seed), rig=rig)
     seen, lenses = warped_scene(believed)
     mapped, _ = refract(near_truth(believed, seen, lenses, np.random.default_rng(1)), seen, folder)
-    return mapped, observed(mapped.model).points
+    return mapped, observations(mapped.model).points
 
 
 def part_of(mapped: Mapped, seen: Observations, rig: Rig) -> Motions | None:

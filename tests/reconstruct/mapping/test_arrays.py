@@ -3,7 +3,7 @@
 import numpy as np
 import pycolmap
 
-from reconstruct.mapping.arrays import MIN_POINTS, first_of, linked_groups, observed
+from reconstruct.mapping.arrays import MIN_POINTS, first_of, linked_groups, observations
 from tests.reconstruct.mapping.test_mapper import block_mapped
 
 
@@ -11,12 +11,12 @@ def test_observations_are_those_of_the_model() -> None:
     model = pycolmap.Reconstruction(block_mapped().model)
     lost = max(model.reg_frame_ids())
     model.deregister_frame(lost)
-    seen = observed(model)
+    seen = observations(model)
     posed = sorted(n for n, image in model.images.items() if image.has_pose)
     assert seen.pictures.tolist() == posed and len(posed) < model.num_images()
     assert seen.point_ids.tolist() == sorted(model.points3D)
     assert len(seen.point) == model.compute_num_observations() == seen.starts[-1]
-    missed = seen.misses(model)
+    missed = seen.residuals(model)
     for n, number in enumerate(posed):
         image, rows = model.images[number], seen.of(n)
         assert seen.row(number) == n

@@ -21,17 +21,17 @@ def test_the_sigma_of_pixels_is_found_from_residuals(noise_px: float) -> None:
 
 def test_a_tenth_of_wrong_observations_hardly_moves_the_sigma() -> None:
     rng = np.random.default_rng(1)
-    misses, counts = rng.normal(0, 0.2, (20_000, 2)), np.full(20_000, 100_000)
-    clean = sigma_of(misses, counts, 0)
+    residuals, counts = rng.normal(0, 0.2, (20_000, 2)), np.full(20_000, 100_000)
+    clean = sigma_of(residuals, counts, 0)
     assert clean == pytest.approx(0.2, rel=0.02)
-    misses[::10] = rng.normal(3, 2, (2000, 2))
-    assert clean < sigma_of(misses, counts, 0) < 1.15 * clean
+    residuals[::10] = rng.normal(3, 2, (2000, 2))
+    assert clean < sigma_of(residuals, counts, 0) < 1.15 * clean
 
 
 def test_normal_residuals_keep_their_variance_and_most_of_their_efficiency() -> None:
-    misses = np.random.default_rng(2).normal(0, 0.3, (200_000, 2))
-    weights = cauchy_weights(misses, 0.3)
-    scaled = variance_of(misses, weights, 1.0) / weights.mean()
+    residuals = np.random.default_rng(2).normal(0, 0.3, (200_000, 2))
+    weights = cauchy_weights(residuals, 0.3)
+    scaled = variance_of(residuals, weights, 1.0) / weights.mean()
 
     def of(power: int) -> float:  # mean of weight^2 times (r / sigma)^(2 power) over the plane
         density = lambda e: np.exp(-e) * (1 + 2 * e / 2.385**2) ** -2 * e**power  # noqa: E731

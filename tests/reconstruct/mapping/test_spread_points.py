@@ -5,7 +5,7 @@ import pycolmap
 import pytest
 from scipy.optimize import minimize
 
-from reconstruct.mapping.arrays import observed
+from reconstruct.mapping.arrays import observations
 from reconstruct.mapping.bundle import move_points, spread_part
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.refraction import adjust_freely, adjust_roughly
@@ -43,7 +43,7 @@ def test_points_move_to_the_minimum_of_their_own_errors(robust_px: float | None)
 
     move_points(model, robust_px)
 
-    seen = observed(before)
+    seen = observations(before)
     for k in range(0, len(seen.point_ids), 23):
         rows = np.flatnonzero(seen.point == k)
         images = [before.images[int(seen.pictures[seen.starts[1:].searchsorted(r, "right")])]

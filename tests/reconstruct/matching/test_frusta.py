@@ -15,8 +15,8 @@ from reconstruct.matching.pairs import (
     choose_pairs,
     frusta_of,
     neighbours,
+    overlap_shares,
     placed_pictures,
-    shared,
 )
 from tests.reconstruct.scenes import DATUM, make_scene
 
@@ -82,7 +82,7 @@ def test_shares_are_those_of_the_wall() -> None:
         ["left"],
     )
     frusta = frusta_of(records, rig, DATUM, DISTANCE_M, DISTANCE_M * (1 + 1e-9))
-    found = shared(frusta, [(0, 1), (0, 2), (0, 3)], np.zeros(4))
+    found = overlap_shares(frusta, [(0, 1), (0, 2), (0, 3)], np.zeros(4))
     # A lattice of six rays a side counts in sixths.
     for pair, expected in {(0, 1): 0.7, (0, 2): 0.6, (0, 3): 0.42}.items():
         assert found[pair][0] == pytest.approx(expected, abs=0.13)

@@ -24,7 +24,7 @@ from reconstruct.matching.learned import (
     find_learned,
     match_learned,
     quarter_turns,
-    sampled,
+    sample,
     with_learned,
 )
 from reconstruct.matching.matches import PairTask, apply_homography, match_pair
@@ -46,7 +46,7 @@ def test_the_network_gives_what_the_original_gives(reference: dict[str, np.ndarr
     """Weights are halves, and we sample bilinearly where the original does bicubically."""
     descriptors, likely, reliable = dense_features(reference["picture"])
     at = reference["keypoints"].astype(int)
-    found = sampled(descriptors, (at + 0.5) / 8 - 0.5)
+    found = sample(descriptors, (at + 0.5) / 8 - 0.5)
     found /= np.linalg.norm(found, axis=1, keepdims=True)
     alike = (found * reference["descriptors"].astype(np.float64)).sum(axis=1)
     scores = (likely * reliable)[at[:, 1], at[:, 0]]
@@ -75,7 +75,7 @@ def test_sampling_equals_its_slow_twin() -> None:
     rng = np.random.default_rng(3)
     field = rng.normal(size=(6, 9, 4)).astype(np.float32)
     at = np.concatenate([rng.uniform(-1, 9, (50, 2)), [[0, 0], [8, 5], [7.999, 4.999]]])
-    np.testing.assert_allclose(sampled(field, at), sampled_slowly(field, at), atol=1e-6)
+    np.testing.assert_allclose(sample(field, at), sampled_slowly(field, at), atol=1e-6)
 
 
 @pytest.mark.parametrize(("agreeing", "matches"), [(8, 8), (17, 44), (40, 44), (60, 900)])

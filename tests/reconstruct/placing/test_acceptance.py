@@ -6,13 +6,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from alice_survey.core.records import ScaleOfPairs
-from reconstruct.mapping.arrays import observed
+from reconstruct.mapping.arrays import observations
 from reconstruct.placing.acceptance import (
     check_mapping,
     down_of,
     ground_pixel,
     measure_doming,
-    misses,
+    navigation_residuals,
     pinhole_positions,
     scale_trend,
 )
@@ -38,7 +38,7 @@ def survey(seed: int, count: int = 60) -> tuple[np.ndarray, np.ndarray]:
 def test_stations_that_jumped_stand_out_of_those_that_did_not(seed: int) -> None:
     centres, stated = survey(seed)
     stated[[7, 21, 22]] += [[0.0, 3.0, 0.0], [-9.0, 4.0, 0.0], [200.0, 0.0, 0.0]]
-    off, sigma = misses(centres, stated, np.full(stated.shape, 0.1))
+    off, sigma = navigation_residuals(centres, stated, np.full(stated.shape, 0.1))
     assert off[[7, 21, 22]] == pytest.approx([3.0, np.hypot(9, 4), 200.0], abs=0.5)
     rest = np.delete(off, [7, 21, 22])
     assert rest.max() < 0.5
@@ -115,7 +115,7 @@ def test_the_scale_shows_a_model_that_stretches_along_the_block() -> None:
     reference = {}
     for n in sorted(model.images):
         reference.setdefault(model.images[n].frame_id, n)
-    before = scale_trend(model, observed(model), reference, down)
+    before = scale_trend(model, observations(model), reference, down)
     assert before is not None
     assert before.range < 4 * before.range_sigma + 1e-3
     centres = np.array([model.images[n].projection_center() for n in sorted(model.images)])
@@ -127,8 +127,8 @@ def test_the_scale_shows_a_model_that_stretches_along_the_block() -> None:
         share = (point.xyz - middle) @ axis / span
         above = float(point.xyz @ down) - (height - ALTITUDE_M)
         point.xyz = point.xyz + 0.01 * share * above * down
-    after = scale_trend(model, observed(model), reference, down)
+    after = scale_trend(model, observations(model), reference, down)
     assert after is not None
     assert after.range == pytest.approx(0.01, rel=0.25)
     assert after.range > 3 * after.range_sigma
-    assert ground_pixel(model, observed(model)) > 0
+    assert ground_pixel(model, observations(model)) > 0

@@ -12,7 +12,7 @@ from reconstruct.placing.control import (
     describe,
     real_sigma_factor,
     tie_control,
-    widened,
+    widen,
     without_wrong_points,
 )
 from reconstruct.placing.control_points import Control, KnownPoint, triangulate_picks
@@ -71,7 +71,7 @@ def test_a_wrong_point_is_left_out_and_the_rest_has_its_real_sigma(
         fit = placed(gauge, ties, known_scale)
         parameters = 6 if known_scale else 7
         factor = real_sigma_factor(ties, fit.ned_from_model, parameters)
-        ties = widened(ties, factor)
+        ties = widen(ties, factor)
         fit = placed(gauge, ties, known_scale)
         middle = fit.ned_from_model.apply(gauge.points(fit.middle_ned[None]))[0]
         misses.append((middle - fit.middle_ned) / fit.sigma_position_m)

@@ -283,7 +283,7 @@ def test_control_points_straighten_a_bent_model(tmp_path: Path) -> None:
             site().records, poses, start, stiff.equations, known_scale=1.0, scale_sigma=0.0,
             modes=modes,
         )  # fmt: skip
-        score = stiff.deformed(fit.modes).score(fit.ned_from_model, located=True).to_json()
+        score = stiff.deform(fit.modes).score(fit.ned_from_model, located=True).to_json()
         off.append(abs(next(p for p in score["points"] if p["use"] == "check")["down_m"]))
     assert fit.modes[0] == pytest.approx(-4.0, abs=1.5)  # the prior of unit size pulls
     assert off[1] < 0.4 * off[0] and off[0] > 0.004, off

@@ -141,7 +141,7 @@ def placed(scene: Scene, mapped: Mapped) -> Found:
         joints=found.shape.modes.joints,
     )  # fmt: skip
     assert fit is not None
-    after = found.deformed(fit.modes, fit.joint[PLACE:, PLACE:])
+    after = found.deform(fit.modes, fit.joint[PLACE:, PLACE:])
     frame = WorldFrame(name="ned", datum=DATUM, scaled=True, vertical_datum="", notes=())
     of_name = {record.image: record for record in scene.records}
     rows = track_rows(after.mapped.model, of_name, after.mapped.warps, frame, {})
