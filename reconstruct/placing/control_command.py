@@ -31,7 +31,7 @@ from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError, ProjError
 
 from alice_survey.core.artefacts import need_stage, read_stage, write_csv
-from alice_survey.core.contents import one_line, shown
+from alice_survey.core.contents import as_line, one_line
 from alice_survey.core.errors import ReconstructionError, WorkspaceError, warn, why
 from alice_survey.core.executor import SERIAL, Executor
 from alice_survey.core.frames import Array, Datum
@@ -304,7 +304,7 @@ def _coordinates(system: str) -> PlaceOf:
     try:
         crs = CRS.from_user_input(system)
     except CRSError:
-        raise ValueError(f"{shown(system)!r} is no coordinate system that is known") from None
+        raise ValueError(f"{as_line(system)!r} is no coordinate system that is known") from None
     if crs.is_engineering:  # a local grid, metres
         return lambda x, y: KnownPoint(name="", north_m=y, east_m=x)
     to_wgs84 = Transformer.from_crs(crs.to_2d(), 4326, always_xy=True)
@@ -313,7 +313,7 @@ def _coordinates(system: str) -> PlaceOf:
         try:
             longitude, latitude = to_wgs84.transform(x, y, errcheck=True)
         except ProjError:
-            raise ValueError(f"{x}, {y} is not a place in {shown(crs.name)}") from None
+            raise ValueError(f"{x}, {y} is not a place in {as_line(crs.name)}") from None
         return KnownPoint(name="", latitude_deg=float(latitude), longitude_deg=float(longitude))
 
     return place
@@ -405,7 +405,7 @@ def _bar(item: ET.Element, labels: Mapping[str | None, str], sigma_m: float) -> 
         return None
     length_m = _finite(reference.get("distance", ""), f"distance of {name}")
     if length_m <= 0:
-        raise ValueError(f"distance of {shown(name)} is {length_m}: it must be more than 0")
+        raise ValueError(f"distance of {as_line(name)} is {length_m}: it must be more than 0")
     own = _sigma(reference.get("accuracy"), f"accuracy of {name}")
     return KnownLength(
         name=name,
@@ -441,7 +441,7 @@ def _sigma(text: str | None, name: str) -> float:
         return math.nan
     value = _finite(text, name)
     if value <= 0:
-        raise ValueError(f"{shown(name)} is {value}: it must be more than 0")
+        raise ValueError(f"{as_line(name)} is {value}: it must be more than 0")
     return value
 
 
@@ -451,7 +451,7 @@ def _finite(text: str, name: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise ValueError(f"{shown(name)} is {shown(text)!r}, not a number")
+        raise ValueError(f"{as_line(name)} is {as_line(text)!r}, not a number")
     return value
 
 
@@ -488,9 +488,9 @@ def read_gcp_list(text: str) -> ForeignControl:
         try:
             x, y, z, column, row = map(float, fields[:5])
         except ValueError:
-            raise ValueError(f"line {number}: {shown(line)!r} has no five numbers") from None
+            raise ValueError(f"line {number}: {as_line(line)!r} has no five numbers") from None
         if not all(map(math.isfinite, (x, y, column, row))):
-            raise ValueError(f"line {number}: {shown(line)!r} has a number that is not finite")
+            raise ValueError(f"line {number}: {as_line(line)!r} has a number that is not finite")
         if len(fields) > _MIN_FIELDS:
             name = fields[_MIN_FIELDS]
         else:
@@ -498,7 +498,7 @@ def read_gcp_list(text: str) -> ForeignControl:
         point = replace(place_of(x, y), name=name, height_m=z)
         first = points.setdefault(name, point)
         if first.place != point.place and not math.isnan(z):
-            raise ValueError(f"line {number}: point {shown(name)} has another place than before")
+            raise ValueError(f"line {number}: point {as_line(name)} has another place than before")
         found.picks.append(
             Pick(image=fields[5], point=name, x_px=column, y_px=row, sigma_px=PICK_SIGMA_PX)
         )
@@ -577,7 +577,7 @@ def import_control(
     for one in every:
         if math.isnan(one.sigma_m):
             raise WorkspaceError(
-                f"{path}: states no accuracy of {shown(one.name)}: give --sigma, in metres"
+                f"{path}: states no accuracy of {as_line(one.name)}: give --sigma, in metres"
             )
     names = [record.image for record in read_manifest(images / "manifest.csv")]
     picks, lost = _match_pictures(found.picks, {p.name for p in points} | ends, names)
@@ -632,7 +632,7 @@ def read_foreign(path: Path) -> ForeignControl:
         raise WorkspaceError(f"{path}: {one_line(error)}") from None
     twice = [n for n, k in Counter(p.name for p in found.points).items() if k > 1]
     if twice:
-        raise WorkspaceError(f"{path}: point {shown(twice[0])} is there twice")
+        raise WorkspaceError(f"{path}: point {as_line(twice[0])} is there twice")
     return found
 
 
@@ -679,4 +679,4 @@ def _picture_of(picture: str, by_stem: dict[str, list[str]]) -> str | None:
 
 
 def _name_some(names: Sequence[str]) -> str:
-    return list_names([shown(name) for name in names], _SHOWN_NAMES)
+    return list_names([as_line(name) for name in names], _SHOWN_NAMES)
