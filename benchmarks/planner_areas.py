@@ -1,11 +1,8 @@
-"""Areas to plan: a quad, two L-shapes, a star, a coast, harbours, a chart; each some rows wide."""
+"""Areas to plan: a quad, two L-shapes, a star, a coast, harbours; each some rows wide."""
 
 import math
-from pathlib import Path
 
 import numpy as np
-import rasterio
-import rasterio.features
 import shapely
 import shapely.affinity
 from shapely.geometry import MultiPoint, MultiPolygon, Point, Polygon, box
@@ -16,8 +13,6 @@ from missions.values.area import Area, multipolygon
 
 _COAST_SEED = 5
 _COAST_CORNERS = 500
-CHART = Path(__file__).parents[2] / "shared/data/bathymetry/JD211_public_Release_1-4_UTM.bag"
-"""A real survey's grid, which is not part of the project; left out where it is missing."""
 _PILE = 0.006
 """Radius of a pile: 0.6 m in a harbour 100 m wide."""
 
@@ -39,8 +34,6 @@ def shapes() -> dict[str, Polygon]:
         "marina, 44 piles": marina(4, 11),
         "quay, 24 piles": quay(24),
     }
-    if CHART.is_file():
-        named["chart, 17 gaps"] = chart(CHART)
     return {name: _one_wide(_whole(shape)) for name, shape in named.items()}
 
 
@@ -73,16 +66,6 @@ def quay(piles: int) -> Polygon:
     ]
     turned = shapely.affinity.rotate(MultiPoint(pairs), 17.0, origin=(0.5, 0.15))
     return _whole(strip.difference(turned.buffer(_PILE, 6)))
-
-
-def chart(raster: Path) -> Polygon:
-    """What a real survey has charted: the largest piece of a raster, with the holes it left."""
-    with rasterio.open(raster) as file:
-        depth = file.read(1)
-        known = (depth != file.nodata) & np.isfinite(depth)
-    pieces = rasterio.features.shapes(known.astype(np.uint8), mask=known)
-    largest = max((shapely.geometry.shape(piece) for piece, _ in pieces), key=lambda p: p.area)
-    return _whole(largest.simplify(1.0))
 
 
 def harbour(rows: int, columns: int) -> Polygon:

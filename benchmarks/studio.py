@@ -35,8 +35,7 @@ from alice_survey.core.errors import collected_by
 from alice_survey.core.executor import SERIAL
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
-from missions.plan.draft import Draft, draft_settings
-from missions.plan.preview import preview
+from missions.plan.preview import Draft, draft_settings, preview
 from missions.plan.run import run_plan
 
 _GOALS_S = {"tutorial": 0.5, "10,000 swaths": 2.0}

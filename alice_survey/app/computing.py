@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from alice_survey.core.artefacts import StageRecord, read_json
-from alice_survey.core.config import ReconstructConfig, SurveyConfig
+from alice_survey.core.config import CameraConfig, ImagingConfig, ReconstructConfig
 from alice_survey.core.executor import default_threads
 from alice_survey.core.manifest import read_manifest
 from alice_survey.core.run.resources import processor
@@ -105,18 +105,20 @@ def size_of(
     )  # fmt: skip
 
 
-def workspace_size(workspace: Path, config: SurveyConfig) -> SurveySize | None:
+def workspace_size(
+    workspace: Path, camera: CameraConfig, imaging: ImagingConfig, settings: ReconstructConfig
+) -> SurveySize | None:
     """The size of the survey of a workspace; None while it has neither a plan nor pictures.
 
     Args:
         workspace: folder of the survey.
-        config: its settings; the scale of imaging counts until there are pictures.
+        camera: its pictures as designed.
+        imaging: their scale, which counts until there are pictures.
+        settings: of the surface.
     """
     manifest, plan_file = workspace / "images" / "manifest.csv", workspace / "plan" / "plan.json"
     rows = read_manifest(manifest) if manifest.is_file() else []
-    width, height = (
-        side // config.imaging.scale for side in (config.camera.width_px, config.camera.height_px)
-    )
+    width, height = (side // imaging.scale for side in (camera.width_px, camera.height_px))
     if rows:
         from PIL import Image
 
@@ -124,13 +126,13 @@ def workspace_size(workspace: Path, config: SurveyConfig) -> SurveySize | None:
             width, height = picture.size
     if plan_file.is_file():
         plan = read_json(plan_file)
-        scale = max(1, round(config.camera.width_px / width))
+        scale = max(1, round(camera.width_px / width))
         return size_of(
-            len(rows) or _CAMERAS * plan["stations"], width * height / 1e6, config.reconstruct,
-            board_pictures=_CAMERAS * config.imaging.pool_views,
+            len(rows) or _CAMERAS * plan["stations"], width * height / 1e6, settings,
+            board_pictures=_CAMERAS * imaging.pool_views,
             pixel_m=scale * plan["details"]["imaging"]["pixel_m"],
         )  # fmt: skip
-    return size_of(len(rows), width * height / 1e6, config.reconstruct) if rows else None
+    return size_of(len(rows), width * height / 1e6, settings) if rows else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,10 +188,18 @@ def stage_costs(size: SurveySize) -> dict[str, StageCost]:
     return found
 
 
-def task_memory_mib(stage: str, workspace: Path, config: SurveyConfig) -> float:
+def task_memory_mib(
+    stage: str,
+    workspace: Path,
+    camera: CameraConfig,
+    imaging: ImagingConfig,
+    settings: ReconstructConfig,
+) -> float:
     """What a process that runs tasks of a stage takes; 0 where it is not known."""
+    if stage not in PREDICTED:
+        return 0.0
     try:
-        size = workspace_size(workspace, config) if stage in PREDICTED else None
+        size = workspace_size(workspace, camera, imaging, settings)
     except OSError:  # of a picture, which the stage reports
         size = None
     return 0.0 if size is None else stage_costs(size)[stage].worker_mib

@@ -139,7 +139,9 @@ def run(
             with part(stage.folder, number, len(stages)):
                 for needed in stage.needs:
                     spec(needed).need(workspace)
-                task_mib = task_memory_mib(stage.name, workspace, config)
+                task_mib = task_memory_mib(
+                    stage.name, workspace, config.camera, config.imaging, config.reconstruct
+                )
                 done = stage.make(workspace, config, replace(executor, task_mib=task_mib))
             text, data = stage.summary(workspace / stage.folder)
             found[stage.name] = {"done": done, **data}
@@ -184,7 +186,7 @@ def _predict_cost(
     from alice_survey.app.computing import summary, workspace_size
 
     config = settings(workspace, survey, needed=not is_imported(workspace))
-    size = workspace_size(workspace, config)
+    size = workspace_size(workspace, config.camera, config.imaging, config.reconstruct)
     if size is None:
         return "", {}
     records = {name: read_stage(workspace / spec(name).folder) for name in done}

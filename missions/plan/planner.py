@@ -31,14 +31,12 @@ from missions.coverage.stations import (
 )
 from missions.exposure.settings import ImagingSettings, ImagingSetup, imaging_settings
 from missions.exposure.strobe import raw_bytes
-from missions.lines.sweep import Sweep
 from missions.plan.parts import plan_parts
 from missions.plan.rows import Setting, imaging_rows, plan_rows
 from missions.plan.strength import (
     check_no_stops,
     check_turns,
     survey_costs,
-    turn_rate_deg_s,
     warn_of_swell,
 )
 from missions.route.energy import flight_conditions, sound_craft_of, usable_wh
@@ -52,7 +50,7 @@ from missions.route.terrain import (
 )
 from missions.values.area import Area
 from missions.values.costs import Costs
-from missions.values.footprint import Swath, common_swath, footprint_size_m, joint_swath
+from missions.values.footprint import Swath, common_swath, footprint_size_m
 from missions.values.line import Line
 from missions.values.pattern import Pattern
 from missions.values.plan_file import Plan
@@ -177,9 +175,18 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
                 "map.png, and give the vehicle more room, or raise the overlaps"
             )
         rows = imaging_rows(imaging, setup)
-        about = _details(imaging, sweep, stereo, rig, plan)
-        about["imaging"]["rows"] = [row.to_json() for row in rows]
-        about |= {"terrain": figures, "warnings": warnings}
+        about = {
+            "imaging": {**imaging.to_json(), "rows": [row.to_json() for row in rows]},
+            "heading": sweep
+            and {
+                "heading_deg": math.degrees(sweep.heading_rad),
+                "cost_j": sweep.cost_j,
+                "least_width_heading_deg": math.degrees(sweep.width_heading_rad),
+                "least_width_m": sweep.width_m,
+            },
+            "terrain": figures,
+            "warnings": warnings,
+        }
         details = json.loads(json.dumps(about))  # as they are read back
         finished = replace(laid, coverage=seen.share_at_overlap, details=details)
         totals = _totals(finished, imaging, seen, rig)
@@ -398,27 +405,3 @@ def _warn_of_spacing(plan: PlanConfig, imaging: ImagingSettings, stereo: Swath) 
             f"lines {spacing_m:g} m apart overlap by {reached:.1%}, less than the "
             f"{plan.side_overlap:.1%} requested, which needs {needed_m:.3f} m"
         )
-
-
-def _details(
-    imaging: ImagingSettings, sweep: Sweep | None, stereo: Swath, rig: Rig, plan: PlanConfig
-) -> dict[str, Any]:
-    camera = rig.cameras[rig.reference]
-    return {
-        "imaging": imaging.to_json(),
-        "heading": None
-        if sweep is None
-        else {
-            "heading_deg": math.degrees(sweep.heading_rad),
-            "cost_j": sweep.cost_j,
-            "least_width_heading_deg": math.degrees(sweep.width_heading_rad),
-            "least_width_m": sweep.width_m,
-        },
-        "wanted_forward_overlap": plan.forward_overlap,
-        "wanted_side_overlap": plan.side_overlap,
-        "stereo_swath_m": stereo.across_m,
-        "stereo_side_overlap": imaging.spacing.stereo_overlap,
-        "mosaic_swath_m": joint_swath(rig, plan.altitude_m, imaging.station_spacing_m).across_m,
-        "turn_rate_deg_s": turn_rate_deg_s(plan),
-        "raw_bytes_per_s": raw_bytes(camera, len(rig.cameras), 1) / imaging.interval_s,
-    }

@@ -2,8 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from functools import partial
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -15,63 +14,67 @@ from alice_survey.core.text_table import text_table
 from alice_survey.sim.vehicle.pilot.settings import turn_in_place_rate_rad_s
 from missions.exposure.conflict import MAX_ALTITUDE_M, last_that_fits
 from missions.exposure.focus import plan_focus
-from missions.exposure.footprints import altitude_for_pixel_m, footprint_at, pixel_on_floor_m
+from missions.exposure.footprints import altitude_for_pixel_m, pixel_on_floor_m
 from missions.exposure.light import darkness
-from missions.exposure.settings import ImagingSetup, imaging_settings
+from missions.exposure.settings import ImagingSettings, ImagingSetup, imaging_settings
 from missions.plan.strength import survey_costs
 from missions.route.energy import craft_of, usable_wh
 from missions.route.flyable import as_flown, without_stops
 from missions.values.costs import time_costs
+from missions.values.footprint import footprint_size_m, overlap
 
 LENSES_MM = (12.5, 25.0)
 """Of the paper."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class LensOption:
-    """One lens at the altitude that gives a resolution.
+class Option:
+    """One lens at the altitude that gives a resolution, or at the speed that gives a rate."""
 
-    What follows from the altitude is NaN where no settings can be made there.
-    """
-
-    lens_mm: float
-    altitude_m: float
-    pixel_mm: float
-    f_number: float = math.nan
-    """F-number as set, or as the depth of field needs."""
-    across_m: float = math.nan
-    stereo_m: float = math.nan
-    spacing_m: float = math.nan
-    interval_s: float = math.nan
-    exposure_ms: float = math.nan
-    gain_db: float = math.nan
-    snr: float = math.nan
-    """Signal to noise of the median pixel."""
-    needed_light: float = math.nan
-    """Times the light that the median pixel needs."""
-    hours_per_1000_m2: float = math.inf
-    """Time on lines alone, without turns."""
-    fits: bool = False
-    why: str
+    setup: ImagingSetup
+    """With its lens, altitude, speed, and the aperture as set or as the depth of field needs."""
+    settings: ImagingSettings | None
+    """None where none can be made."""
+    against: str
     """What is against it; empty where nothing is."""
 
+    @property
+    def is_possible(self) -> bool:
+        """Whether nothing is against it."""
+        return not self.against
 
-@dataclass(frozen=True, kw_only=True)
-class RateOption:
-    """The speed that a fixed frame rate needs, with one lens."""
+    @property
+    def values(self) -> dict[str, float]:
+        """Its figures by name; NaN where no settings can be made."""
+        plan, camera, found = self.setup.plan, self.setup.camera, self.settings
+        given = {
+            "lens_mm": camera.focal_mm,
+            "altitude_m": plan.altitude_m,
+            "speed_mps": plan.speed_mps,
+            "f_number": camera.f_number,
+        }
+        if found is None:
+            return given | dict.fromkeys(_FOLLOWING, math.nan)
+        hours = 1000.0 / found.line_spacing_m / plan.speed_mps / 3600.0
+        following = (
+            1e3 * found.pixel_m, found.footprint_across_m, found.footprints.mean.stereo_across_m,
+            found.line_spacing_m, found.interval_s, 1e3 * found.exposure_s, found.light.gain_db,
+            found.light.snr_median, found.light.needed_light, hours,
+        )  # fmt: skip
+        return given | dict(zip(_FOLLOWING, following, strict=True))
 
-    lens_mm: float
-    speed_mps: float
-    """Speed at which the forward overlap is as requested."""
-    forward_overlap: float
-    """Forward overlap at the speed of the plan instead."""
-    exposure_ms: float = math.nan
-    gain_db: float = math.nan
-    snr: float = math.nan
-    """Signal to noise of the median pixel; it and the two above are NaN where no settings can be
-    made."""
-    fits: bool = False
-    why: str
+    def to_json(self, **more: float) -> dict[str, Any]:
+        """Its figures as JSON values, and more of them."""
+        found: dict[str, Any] = json_values({**self.values, **more})
+        return {**found, "fits": self.is_possible, "why": self.against}
+
+
+_FOLLOWING = (
+    "pixel_mm", "across_m", "stereo_m", "spacing_m", "interval_s", "exposure_ms", "gain_db", "snr",
+    "needed_light", "hours_per_1000_m2",
+)  # fmt: skip
+"""Figures that follow from settings: signal to noise and light are of the median pixel, hours those
+on lines alone, without turns."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,20 +125,22 @@ def solve_report(
     if resolution_mm is not None:
         options = lenses_for_resolution(setup, config.area.seafloor_depth_m, resolution_mm, lenses)
         parts.append(_lens_text(options, resolution_mm))
-        data["lenses"] = json_values(options)
-        best = options[0]
-        taken = setup.with_camera(focal_mm=best.lens_mm, f_number=best.f_number).with_plan(
-            altitude_m=best.altitude_m, line_spacing_m=None
-        )
-        dived = config.model_copy(update={"camera": taken.camera, "plan": taken.plan})
+        data["lenses"] = [option.to_json() for option in options]
+        best = options[0].setup
+        dived = config.model_copy(update={"camera": best.camera, "plan": best.plan})
     if dive_s is not None:
         area = area_for_dive(dived, dive_s)
         parts.append(_area_text(area, dived.camera.focal_mm, dived.plan.altitude_m, dive_s))
         data["dive"] = asdict(area)
     if rate_hz is not None:
         rates = speeds_for_rate(setup, rate_hz, lenses)
-        parts.append(_rate_text(rates, rate_hz, setup.plan.speed_mps))
-        data["rates"] = json_values(rates)
+        kept = [overlap_at_rate(option, setup.plan.speed_mps, rate_hz) for option in rates]
+        name = f"overlap at {setup.plan.speed_mps:g} m/s"
+        shown = _option_table(_RATE_COLUMNS, rates, {name: [f"{share:.1%}" for share in kept]})
+        parts.append(f"{rate_hz:g} pictures a second\n{shown}")
+        data["rates"] = [
+            option.to_json(forward_overlap=share) for option, share in zip(rates, kept, strict=True)
+        ]
     if not parts:
         raise ConfigError("say what is given: a resolution (mm), a dive (s) or a rate (Hz)")
     return "\n\n".join(parts), data
@@ -143,7 +148,7 @@ def solve_report(
 
 def lenses_for_resolution(
     setup: ImagingSetup, seafloor_depth_m: float, resolution_mm: float, lenses: Sequence[float]
-) -> list[LensOption]:
+) -> list[Option]:
     """Altitude and what follows for each lens, the one that surveys fastest first.
 
     Args:
@@ -156,93 +161,70 @@ def lenses_for_resolution(
         PlanError: none fits; with the nearest resolution that does.
     """
     max_m = min(MAX_ALTITUDE_M, seafloor_depth_m)
-    options = [_lens_option(setup, max_m, resolution_mm, lens) for lens in lenses]
-    options.sort(key=lambda o: (not o.fits, o.hours_per_1000_m2, o.lens_mm))
-    if options[0].fits:
-        return options
-    reasons = "; ".join(f"{o.lens_mm:g} mm: {o.why}" for o in options)
-    found = [
-        near for option in options if (near := _nearest_that_fits(setup, max_m, option)) is not None
+    options = [
+        _lens_option(setup.with_camera(focal_mm=lens), max_m, resolution_mm) for lens in lenses
     ]
-    if not found:
-        raise PlanError(
-            f"no lens gives {resolution_mm:g} mm a pixel ({reasons}), and none fits at any "
-            "altitude: change relief_m or the light"
-        )
-    best = min(found, key=lambda o: abs(math.log(o.pixel_mm / resolution_mm)))
-    raise PlanError(
-        f"no lens gives {resolution_mm:g} mm a pixel ({reasons}); {best.pixel_mm:g} mm fits, with "
-        f"the {best.lens_mm:g} mm lens"
-    )
+    possible = [option for option in options if option.is_possible]
+    if possible:
+        possible.sort(key=lambda one: one.values["hours_per_1000_m2"])
+        return possible + [option for option in options if not option.is_possible]
+    reasons = "; ".join(f"{o.setup.camera.focal_mm:g} mm: {o.against}" for o in options)
+    fault = f"no lens gives {resolution_mm:g} mm a pixel ({reasons})"
+    near = [
+        (pixel_mm, option.setup.camera.focal_mm)
+        for option in options
+        if (pixel_mm := _nearest_resolution_mm(option.setup, max_m)) is not None
+    ]
+    if not near:
+        raise PlanError(f"{fault}, and none fits at any altitude: change relief_m or the light")
+    pixel_mm, lens = min(near, key=lambda one: abs(math.log(one[0] / resolution_mm)))
+    raise PlanError(f"{fault}; {pixel_mm:g} mm fits, with the {lens:g} mm lens")
 
 
-def _lens_option(
-    setup: ImagingSetup, max_m: float, resolution_mm: float, lens_mm: float
-) -> LensOption:
-    setup = setup.with_camera(focal_mm=lens_mm)
-    rig, plan = setup.rig, setup.plan
-    own = rig.cameras[rig.reference]
-    altitude = math.floor(altitude_for_pixel_m(own, resolution_mm * 1e-3) * 1000) / 1000
-    option = partial(LensOption, lens_mm=lens_mm, altitude_m=altitude)
-    min_m = plan.relief_m + plan.least_clearance_m
+def _lens_option(setup: ImagingSetup, max_m: float, resolution_mm: float) -> Option:
+    rig = setup.rig
+    altitude = altitude_for_pixel_m(rig.cameras[rig.reference], resolution_mm * 1e-3)
+    setup = setup.with_plan(altitude_m=math.floor(altitude * 1000) / 1000, line_spacing_m=None)
+    altitude, min_m = setup.plan.altitude_m, _min_altitude_m(setup.plan)
     if altitude < min_m:
-        why = f"{altitude:.2f} m is under the {min_m:.2f} m of relief_m and least_clearance_m"
-        return option(pixel_mm=resolution_mm, why=why)
+        against = f"{altitude:.2f} m is under the {min_m:.2f} m of relief_m and least_clearance_m"
+        return Option(setup=setup, settings=None, against=against)
     if altitude >= max_m:
-        return option(
-            pixel_mm=resolution_mm, why=f"{altitude:.2f} m is beyond the {max_m:g} m allowed"
-        )
-    changed = _in_focus(setup.with_plan(altitude_m=altitude, line_spacing_m=None))
-    try:
-        settings = imaging_settings(rig, changed, quiet=True)
-    except AliceError as error:
-        return option(pixel_mm=resolution_mm, why=str(error).split(": ")[0])
-    why = darkness(settings.light)
-    return option(
-        pixel_mm=pixel_on_floor_m(own, altitude) * 1e3,
-        f_number=changed.camera.f_number,
-        across_m=settings.footprint_across_m,
-        stereo_m=settings.footprints.mean.stereo_across_m,
-        spacing_m=settings.line_spacing_m,
-        interval_s=settings.interval_s,
-        exposure_ms=settings.exposure_s * 1e3,
-        gain_db=settings.light.gain_db,
-        snr=settings.light.snr_median,
-        needed_light=settings.light.needed_light,
-        hours_per_1000_m2=1000.0 / settings.line_spacing_m / plan.speed_mps / 3600.0,
-        fits=not why,
-        why=why,
-    )
+        against = f"{altitude:.2f} m is beyond the {max_m:g} m allowed"
+        return Option(setup=setup, settings=None, against=against)
+    return _option(setup)
 
 
-def _in_focus(setup: ImagingSetup) -> ImagingSetup:
-    """The same setup with the aperture closed as the relief needs, if diffraction allows it."""
+def _min_altitude_m(plan: PlanConfig) -> float:
+    return plan.relief_m + plan.least_clearance_m
+
+
+def _option(setup: ImagingSetup) -> Option:
+    """What follows from a setup, its aperture closed as the relief needs if diffraction allows."""
     limits, rig = setup.camera, setup.rig
     try:
         focus = plan_focus(rig.cameras[rig.reference], limits, setup.plan)
-    except PlanError:
-        return setup
-    if not limits.f_number < focus.f_number_to_set <= focus.f_number_diffraction:
-        return setup
-    return setup.with_camera(f_number=focus.f_number_to_set)
+        if limits.f_number < focus.f_number_to_set <= focus.f_number_diffraction:
+            setup = setup.with_camera(f_number=focus.f_number_to_set)
+        settings = imaging_settings(rig, setup, quiet=True)
+    except AliceError as error:
+        return Option(setup=setup, settings=None, against=str(error).split(": ")[0])
+    return Option(setup=setup, settings=settings, against=darkness(settings.light))
 
 
-def _nearest_that_fits(setup: ImagingSetup, max_m: float, option: LensOption) -> LensOption | None:
-    """The altitude nearest to an option's that its lens can be used at, to about a fiftieth."""
-    own = setup.with_camera(focal_mm=option.lens_mm).rig.cameras["left"]
-    tried = np.geomspace(setup.plan.relief_m + setup.plan.least_clearance_m, max_m, 50)
-    tried = tried[np.argsort(np.abs(np.log(tried / max(option.altitude_m, 1e-3))))]
+def _nearest_resolution_mm(setup: ImagingSetup, max_m: float) -> float | None:
+    """The resolution nearest to a setup's at which its lens can be used, to about a fiftieth."""
+    own = setup.rig.cameras["left"]
+    tried = np.geomspace(_min_altitude_m(setup.plan), max_m, 50)
+    tried = tried[np.argsort(np.abs(np.log(tried / max(setup.plan.altitude_m, 1e-3))))]
     for altitude in tried:
         pixel_mm = math.ceil(pixel_on_floor_m(own, float(altitude)) * 1e6) / 1e3
-        found = _lens_option(setup, max_m, pixel_mm, option.lens_mm)
-        if found.fits:
-            return replace(found, pixel_mm=pixel_mm)
+        if _lens_option(setup, max_m, pixel_mm).is_possible:
+            return pixel_mm
     return None
 
 
-def speeds_for_rate(
-    setup: ImagingSetup, rate_hz: float, lenses: Sequence[float]
-) -> list[RateOption]:
+def speeds_for_rate(setup: ImagingSetup, rate_hz: float, lenses: Sequence[float]) -> list[Option]:
     """Speed at which pictures at a fixed rate overlap as requested, u = r L (1 - O), for each lens.
 
     Raises:
@@ -254,32 +236,23 @@ def speeds_for_rate(
             f"{rate_hz:g} pictures a second are more than the {max_hz:g} that cameras and trigger "
             "take (camera.shortest_interval_s)"
         )
-    return [_rate_option(setup.with_camera(focal_mm=lens), rate_hz) for lens in lenses]
+    options = []
+    for lens in lenses:
+        own = setup.with_camera(focal_mm=lens)
+        step_m = _along_m(own) * (1 - setup.plan.forward_overlap)
+        # Intervals are whole milliseconds: the speed must not need a shorter one.
+        options.append(_option(own.with_plan(speed_mps=math.floor(rate_hz * step_m * 1e4) / 1e4)))
+    return options
 
 
-def _rate_option(setup: ImagingSetup, rate_hz: float) -> RateOption:
-    rig, plan = setup.rig, setup.plan
-    along_m = footprint_at(rig, plan.altitude_m, 1e-3).along_m
-    # Intervals are whole milliseconds: the speed must not need a shorter one.
-    speed = math.floor(rate_hz * along_m * (1 - plan.forward_overlap) * 1e4) / 1e4
-    option = partial(
-        RateOption,
-        lens_mm=setup.camera.focal_mm,
-        speed_mps=speed,
-        forward_overlap=max(0.0, 1.0 - plan.speed_mps / rate_hz / along_m),
-    )
-    try:
-        settings = imaging_settings(rig, _in_focus(setup.with_plan(speed_mps=speed)), quiet=True)
-    except AliceError as error:
-        return option(why=str(error).split(": ")[0])
-    why = darkness(settings.light)
-    return option(
-        exposure_ms=settings.exposure_s * 1e3,
-        gain_db=settings.light.gain_db,
-        snr=settings.light.snr_median,
-        fits=not why,
-        why=why,
-    )
+def _along_m(setup: ImagingSetup) -> float:
+    rig = setup.rig
+    return footprint_size_m(rig.cameras[rig.reference], setup.plan.altitude_m)[1]
+
+
+def overlap_at_rate(option: Option, speed_mps: float, rate_hz: float) -> float:
+    """Forward overlap of pictures at a fixed rate, with the lens of an option."""
+    return overlap(_along_m(option.setup), speed_mps / rate_hz)
 
 
 def area_for_dive(config: SurveyConfig, dive_s: float) -> DiveArea:
@@ -385,48 +358,39 @@ def _area_text(area: DiveArea, lens_mm: float, altitude_m: float, given_s: float
     )
 
 
-def _lens_text(options: list[LensOption], resolution_mm: float) -> str:
+_LENS_COLUMNS = {
+    "lens_mm": ":g", "altitude_m": ":.2f", "f_number": ":.1f", "across_m": ":.2f",
+    "stereo_m": ":.2f", "spacing_m": ":.2f", "interval_s": ":.2f", "exposure_ms": ":.2f",
+    "gain_db": ":.1f", "snr": ":.1f", "hours_per_1000_m2": ":.2f",
+}  # fmt: skip
+_RATE_COLUMNS = {
+    "lens_mm": ":g", "speed_mps": ":.3f", "exposure_ms": ":.2f", "gain_db": ":.1f", "snr": ":.1f"
+}  # fmt: skip
+
+
+def _lens_text(options: list[Option], resolution_mm: float) -> str:
     """A table of lenses, and the one to take."""
-    best = options[0]
-    columns = {
-        "lens mm": "lens_mm:g", "altitude m": "altitude_m:.2f", "F": "f_number:.1f",
-        "across m": "across_m:.2f", "stereo m": "stereo_m:.2f", "lines m": "spacing_m:.2f",
-        "every s": "interval_s:.2f", "expose ms": "exposure_ms:.2f", "gain dB": "gain_db:.1f",
-        "SNR": "snr:.1f", "h/1000 m2": "hours_per_1000_m2:.2f", "fits": "fits",
-    }  # fmt: skip
-    return "\n".join([
-        f"{resolution_mm:g} mm a pixel on the sea floor",
-        *_option_table(columns, options),
-        f"take the {best.lens_mm:g} mm lens at {best.altitude_m:.2f} m with F/{best.f_number:g}: "
-        f"set camera.focal_mm, plan.altitude_m, camera.f_number; lines {best.spacing_m:.2f} m "
-        "apart",
-    ])  # fmt: skip
-
-
-def _rate_text(options: list[RateOption], rate_hz: float, speed_mps: float) -> str:
-    """A table of speeds by lens."""
-    columns = {
-        "lens mm": "lens_mm:g", "largest m/s": "speed_mps:.3f",
-        f"overlap at {speed_mps:g} m/s": "forward_overlap:.1%", "expose ms": "exposure_ms:.2f",
-        "gain dB": "gain_db:.1f", "SNR": "snr:.1f", "fits": "fits",
-    }  # fmt: skip
-    return "\n".join([f"{rate_hz:g} pictures a second", *_option_table(columns, options)])
+    best = options[0].values
+    return (
+        f"{resolution_mm:g} mm a pixel on the sea floor\n"
+        f"{_option_table(_LENS_COLUMNS, options)}\n"
+        f"take the {best['lens_mm']:g} mm lens at {best['altitude_m']:.2f} m with "
+        f"F/{best['f_number']:g}: set camera.focal_mm, plan.altitude_m, camera.f_number; lines "
+        f"{best['spacing_m']:.2f} m apart"
+    )
 
 
 def _option_table(
-    columns: dict[str, str], options: Sequence[LensOption] | Sequence[RateOption]
-) -> list[str]:
-    """A table of options by header and `field:format`, and what is against each."""
-
-    def cell(option: LensOption | RateOption, column: str) -> str:
-        field, _, form = column.partition(":")
-        value = getattr(option, field)
-        if not form:
-            return "yes" if value else "no"
-        return format(value, form) if math.isfinite(value) else "-"
-
-    rows = [[cell(option, column) for column in columns.values()] for option in options]
-    return [
-        text_table(list(columns), rows),
-        *(f"{option.lens_mm:g} mm: {option.why}" for option in options if option.why),
-    ]
+    columns: dict[str, str], options: Sequence[Option], more: dict[str, list[str]] | None = None
+) -> str:
+    """A table of options by figure and its format, more columns, and what is against each."""
+    table = {
+        name.replace("_", " "): [
+            f"{{{form}}}".format(value) if math.isfinite(value) else "-"
+            for value in (option.values[name] for option in options)
+        ]
+        for name, form in columns.items()
+    }
+    table |= more or {}
+    table["fits"] = [option.against or "yes" for option in options]
+    return text_table(list(table), list(zip(*table.values(), strict=True)))

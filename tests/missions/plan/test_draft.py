@@ -11,8 +11,7 @@ from alice_survey.app.pipeline import template_text
 from alice_survey.core.config import SurveyConfig, load_config, parse_settings
 from alice_survey.core.errors import AliceError, ConfigError, collected_by
 from missions.areas.drawn import FILES, DrawnPolygon, DrawnShapes, area_drawing
-from missions.plan.draft import draft_settings
-from missions.plan.preview import preview
+from missions.plan.preview import draft_settings, preview
 
 TEMPLATE = template_text()
 PATH = Path("reef") / "survey.toml"

@@ -8,11 +8,12 @@ import pytest
 from alice_survey.core.config import SurveyConfig, parse_config
 from alice_survey.core.errors import ConfigError, PlanError
 from camera_calib.rig import design_rig
-from missions.exposure.settings import ImagingSetup, imaging_settings
+from missions.exposure.settings import ImagingSetup
 from missions.plan.planner import plan_survey
 from missions.plan.solve import (
     area_for_dive,
     lenses_for_resolution,
+    overlap_at_rate,
     solve_report,
     speeds_for_rate,
     turn_s,
@@ -108,17 +109,13 @@ def test_what_ends_a_dive_is_said() -> None:
 def test_a_resolution_gives_the_altitude_whose_pixel_it_is() -> None:
     setup = ImagingSetup.of(survey(plan={"side_overlap": 0.45}))
     best, other = lenses_for_resolution(setup, DEPTH_M, 0.448, (25.0, 12.5))
-    assert best.lens_mm == 12.5
-    assert best.fits
-    assert best.altitude_m == pytest.approx(2.0, abs=0.005)
-    there = setup.with_plan(altitude_m=best.altitude_m)
-    settings = imaging_settings(there.rig, there)
-    assert settings.pixel_m * 1e3 <= 0.448
-    assert best.spacing_m == pytest.approx(settings.line_spacing_m)
-    assert best.exposure_ms == pytest.approx(settings.exposure_s * 1e3)
+    assert best.values["lens_mm"] == 12.5
+    assert best.is_possible
+    assert best.values["altitude_m"] == pytest.approx(2.0, abs=0.005)
+    assert best.values["pixel_mm"] <= 0.448
     # The longer lens flies twice as high and is in the dark.
-    assert other.altitude_m == pytest.approx(4.03, abs=0.05)
-    assert not other.fits
+    assert other.values["altitude_m"] == pytest.approx(4.03, abs=0.05)
+    assert not other.is_possible
 
 
 @pytest.mark.parametrize("resolution_mm", [0.001, 0.05, 0.22, 2.0, 5.0])
@@ -132,22 +129,21 @@ def test_a_resolution_beyond_all_lenses_is_refused_with_the_nearest_that_fits(
     fits_mm, lens_mm = map(
         float, re.search(r"; ([\d.]+) mm fits, with the ([\d.]+) mm", text).groups()
     )
-    assert lenses_for_resolution(setup, DEPTH_M, fits_mm, (lens_mm,))[0].fits
+    assert lenses_for_resolution(setup, DEPTH_M, fits_mm, (lens_mm,))[0].is_possible
 
 
 def test_a_fixed_rate_gives_the_speed_that_overlaps_as_requested() -> None:
     setup = ImagingSetup.of(survey())
     option = speeds_for_rate(setup, 0.25, (12.5,))[0]
     along_m = footprint_size_m(setup.rig.cameras["left"], 2.0)[1]
-    assert option.speed_mps == pytest.approx(0.25 * along_m * 0.4, abs=1e-4)
+    assert option.values["speed_mps"] == pytest.approx(0.25 * along_m * 0.4, abs=1e-4)
     # At the paper's 0.2 m/s its 0.25 Hz overlap by 31 to 32 %.
-    assert option.forward_overlap == pytest.approx(1 - 0.8 / along_m)
-    moved = setup.with_plan(speed_mps=option.speed_mps)
-    assert imaging_settings(moved.rig, moved).interval_s == pytest.approx(4.0, abs=0.005)
+    assert overlap_at_rate(option, 0.2, 0.25) == pytest.approx(1 - 0.8 / along_m)
+    assert option.values["interval_s"] == pytest.approx(4.0, abs=0.005)
 
 
 def test_a_rate_beyond_the_trigger_is_refused_with_the_most_that_it_takes() -> None:
     setup = ImagingSetup.of(survey())
     with pytest.raises(PlanError, match="more than the 10 that"):
         speeds_for_rate(setup, 14.0, (12.5,))
-    assert math.isfinite(speeds_for_rate(setup, 10.0, (12.5,))[0].exposure_ms)
+    assert math.isfinite(speeds_for_rate(setup, 10.0, (12.5,))[0].values["exposure_ms"])

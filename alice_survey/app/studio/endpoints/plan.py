@@ -39,9 +39,8 @@ from camera_calib.rig import design_rig
 from missions.areas.drawn import AreaDrawing, DrawnShapes, area_drawing, drawing_of_file
 from missions.areas.files import SUFFIXES
 from missions.exports.registry import format_named, format_names
-from missions.plan.draft import Draft, draft_settings
 from missions.plan.planner import plan_survey
-from missions.plan.preview import play, preview, refusal_json
+from missions.plan.preview import Draft, draft_settings, play, preview, refusal_json
 from missions.values.plan_file import read_plan
 from reconstruct.precision.candidates import Candidate, worst_bend
 from reconstruct.precision.predict import Precision

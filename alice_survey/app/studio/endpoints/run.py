@@ -111,7 +111,7 @@ def _costs(
     workspace: Path, config: SurveyConfig, states: Mapping[str, str]
 ) -> dict[str, StageCost]:
     """What stages are predicted to take, as those that ran here correct it; empty where unknown."""
-    size = workspace_size(workspace, config)
+    size = workspace_size(workspace, config.camera, config.imaging, config.reconstruct)
     if size is None or all(state == UP_TO_DATE for state in states.values()):
         return {}
     costs = stage_costs(size)
