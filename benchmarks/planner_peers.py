@@ -17,7 +17,7 @@ from shapely.geometry import LineString, Polygon
 
 from alice_survey.core.frames import Array
 from missions.lines.lay import lay_lines
-from missions.route.turns import legs_through, line_table, route_of
+from missions.route.turns import Manoeuvre, legs_through, line_table, route_of
 from missions.route.ways import Ways
 from missions.values.area import Area
 from missions.values.costs import time_costs
@@ -79,10 +79,10 @@ def own_plan(area: Area, repeats: int) -> Way:
         lines = own_lines(area, ways)
         route_of(
             legs_through(
-                line_table(lines), _TURN_RADIUS_M, _RUN_IN_M, ways=ways,
-                costs=time_costs(_SPEED_MPS),
+                line_table(lines),
+                Manoeuvre(time_costs(_SPEED_MPS), _TURN_RADIUS_M, _RUN_IN_M, ways=ways),
             )
-        )  # fmt: skip
+        )
         best = min(best, time.process_time() - began)
     places = [lines[0].start_ne_m, lines[0].end_ne_m]
     for before, after in pairwise(lines):

@@ -198,7 +198,7 @@ def flight_by_hand(
             total += spot_by_hand(costs, after - before) if before is not None and after else 0.0
             continue
         bearing = math.atan2(there[1] - here[1], there[0] - here[0])
-        hop = length / costs.speed_mps * power_at(costs.way_w, bearing)
+        hop = length / costs.speed_mps * float(power_at(costs.way_w, bearing))
         hop += 0.0 if before is None else spot_by_hand(costs, bearing - before)
         hop += 0.0 if after is None else spot_by_hand(costs, after - bearing)
         if (
@@ -207,12 +207,12 @@ def flight_by_hand(
             and straight <= 5.0
             and length < straight + 1e-6
         ):
-            aside = straight / costs.sway_mps * power_at(costs.sway_w, bearing)
+            aside = straight / costs.sway_mps * float(power_at(costs.sway_w, bearing))
             aside += costs.stop_w * costs.settle_s + spot_by_hand(costs, after - before)
             hop = min(hop, aside)
         total += hop
     for line in lines:
-        total += line.length_m / costs.speed_mps * power_at(costs.line_w, line.heading_rad)
+        total += line.length_m / costs.speed_mps * float(power_at(costs.line_w, line.heading_rad))
     return total
 
 

@@ -9,7 +9,6 @@ import shapely
 from shapely.geometry import LineString, MultiPolygon
 
 from alice_survey.core.frames import Array
-from missions.route.fence import point_inside
 from missions.route.ways import Ways
 from missions.values.costs import Costs, leg_costs, power_at
 from missions.values.legs import Leg, Route
@@ -108,7 +107,7 @@ def route_cost_by_steps(route: Route, costs: Costs, step_m: float) -> tuple[floa
             continue
         if leg.side_rad:
             moving_s = leg.length_m / costs.sway_mps
-            joules += moving_s * power_at(costs.sway_w, leg.heading_rad)
+            joules += moving_s * float(power_at(costs.sway_w, leg.heading_rad))
             joules += costs.settle_s * costs.stop_w
             seconds += leg.length_m / costs.sway_mps + costs.settle_s
             continue
@@ -117,7 +116,9 @@ def route_cost_by_steps(route: Route, costs: Costs, step_m: float) -> tuple[floa
         for k in range(steps):
             course = leg.heading_rad + leg.curvature_per_m * leg.length_m * (k + 0.5) / steps
             extra_w = costs.arc_extra_w if leg.curvature_per_m and leg.line < 0 else 0.0
-            joules += leg.length_m / steps / costs.speed_mps * (power_at(power_w, course) + extra_w)
+            joules += (
+                leg.length_m / steps / costs.speed_mps * float(power_at(power_w, course) + extra_w)
+            )
         seconds += leg.length_m / costs.speed_mps
     return joules, seconds
 
@@ -148,4 +149,4 @@ def way_m(ways: Ways, a: tuple[float, float], b: tuple[float, float]) -> float:
 
 def inside(ways: Ways, places_ne: Array) -> list[bool]:
     """Which places, (N, 2), are inside the allowed area."""
-    return [point_inside(ways.fence, north, east) for north, east in places_ne.tolist()]
+    return ways.inside(places_ne).tolist()

@@ -8,27 +8,27 @@ Keys of plans are those of QGroundControl's developer guide, "Plan File Format":
 
 import re
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import shapely
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, ValidationError
 from shapely.geometry.base import BaseGeometry
 
-from alice_survey.core.contents import as_line, one_line
+from alice_survey.core.contents import as_line, first_fault, one_line
 from alice_survey.core.errors import PlanError, warn
 from alice_survey.core.frames import Array
 from missions.areas.crs import (
     LOCAL,
-    check_finite,
     check_latitudes,
     geographic_shapes,
     parse_crs,
     usable_crs,
 )
-from missions.areas.raw import RawLine, RawShapes, from_geometries, no_points
+from missions.areas.raw import RawLine, RawShapes, from_geometries, from_rings
 from missions.areas.safe import (
     DRIVERS,
     MAX_CORNERS,
@@ -47,6 +47,11 @@ SUFFIXES = (*DRIVERS, ".wkt", ".plan")
 LAYERS = ("mission", "inclusion", "exclusion")
 _CIRCLE_CORNERS = 64
 _MAX_M = 1e6
+_Place = Annotated[
+    tuple[float, float], BeforeValidator(lambda x: x[:2] if isinstance(x, list) else x)
+]
+"""Latitude and longitude; a height is left out."""
+_Places = tuple[_Place, ...]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -305,6 +310,69 @@ def _is_map(crs: Any) -> bool:
     return bool(flat.is_geographic or flat.is_projected)
 
 
+class _Json(BaseModel):
+    """A part of a plan; what is not read of it is not looked at."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+
+
+class _QgcItem(_Json):
+    kind: str | None = Field(None, alias="complexItemType")
+    polygon: _Places = ()
+    polyline: _Places = ()
+    width_m: float = Field(1.0, alias="CorridorWidth", gt=0, lt=_MAX_M)
+
+
+class _Circle(_Json):
+    centre: _Place = Field(alias="center")
+    radius: float = Field(gt=0, lt=_MAX_M)
+
+
+class _Zone(_Json):
+    inclusion: StrictBool
+    polygon: _Places = ()
+    circle: _Circle | None = None
+
+
+class _QgcMission(_Json):
+    items: tuple[_QgcItem, ...] = ()
+
+
+class _Fence(_Json):
+    polygons: tuple[_Zone, ...] = ()
+    circles: tuple[_Zone, ...] = ()
+
+
+class _QgcPlan(_Json):
+    file_type: Literal["Plan"] = Field(alias="fileType")
+    mission: _QgcMission = _QgcMission()
+    fence: _Fence = Field(_Fence(), alias="geoFence")
+
+    def layer(self, name: str, origin: str) -> RawShapes:
+        """The shapes of one of `LAYERS`."""
+        if name == "mission":
+            areas = [x.polygon for x in self.mission.items if x.kind in ("survey", "StructureScan")]
+            rings = [np.array(polygon).reshape(-1, 2) for polygon in areas]
+            lines = tuple(
+                RawLine(points=np.array(x.polyline).reshape(-1, 2), width_m=x.width_m)
+                for x in self.mission.items
+                if x.kind == "CorridorScan"
+            )
+        else:
+            inclusion, lines = name == "inclusion", ()
+            zones = [zone for zone in self.fence.polygons if zone.inclusion == inclusion]
+            rings = [np.array(zone.polygon).reshape(-1, 2) for zone in zones]
+            rings += [
+                _corners_of_circle(zone.circle, outside=not inclusion)
+                for zone in self.fence.circles
+                if zone.inclusion == inclusion and zone.circle is not None
+            ]
+        shapes = replace(from_rings(origin, rings, geographic=True), lines=lines)
+        for number, corners in enumerate([*rings, *(line.points for line in lines)], 1):
+            check_latitudes(corners, origin, f"{name} {number}")
+        return shapes
+
+
 def _read_qgc_plan(path: Path, layer: str | None, role: Role) -> RawShapes:
     """The shapes of one layer of a plan.
 
@@ -318,121 +386,37 @@ def _read_qgc_plan(path: Path, layer: str | None, role: Role) -> RawShapes:
     Raises:
         PlanError: it is not a plan, or holds nothing of that kind.
     """
-    data = read_json(path)
-    if not (isinstance(data, dict) and data.get("fileType") == "Plan"):
-        raise PlanError(f"area: {path}: not a QGroundControl plan: its fileType is not 'Plan'")
-    usual = {"survey": "mission", "no_go": "exclusion", "allowed": "inclusion"}[role]
-    chosen = layer or usual
+    try:
+        plan = _QgcPlan.model_validate(read_json(path))
+    except ValidationError as error:
+        fault = first_fault(error)
+        raise PlanError(f"area: {path}: not as QGroundControl writes it: {fault}") from None
+    chosen = layer or {"survey": "mission", "no_go": "exclusion", "allowed": "inclusion"}[role]
     if chosen not in LAYERS:
         raise PlanError(f"area: {path}: a plan has the layers {', '.join(LAYERS)}, not {layer!r}")
-    origin = path.name
-    layers = {
-        "mission": _mission(data, origin),
-        "inclusion": _fence(data, origin, inclusion=True),
-        "exclusion": _fence(data, origin, inclusion=False),
-    }
-    found = layers[chosen]
+    layers = {name: plan.layer(name, path.name) for name in LAYERS}
+    found, exclusion = layers[chosen], layers["exclusion"]
     if found.is_empty:
-        others = [name for name in LAYERS if not layers[name].is_empty]
+        others = " and ".join(name for name in LAYERS if not layers[name].is_empty)
         raise PlanError(
             f"area: {path}: no shapes in its layer {chosen!r}"
-            + (f"; there are some in {' and '.join(others)}" if others else "")
+            + (f"; there are some in {others}" if others else "")
         )
     if role != "survey":
         return found
     fence = ""
     if chosen == "mission" and not layers["inclusion"].is_empty:
         fence = "its inclusion fence is not used; to stay inside it set allowed_file to the file"
-    exclusion = layers["exclusion"]
     zones = exclusion if chosen != "exclusion" and not exclusion.is_empty else None
     return replace(found, no_go=zones, unused_fence=fence)
 
 
-def _mission(data: dict[str, Any], origin: str) -> RawShapes:
-    polygons = []
-    lines = []
-    for i, item in enumerate(_list(data, origin, "mission", "items"), 1):
-        if not isinstance(item, dict):
-            raise _broken(origin, f"mission item {i}")
-        kind = item.get("complexItemType")
-        name = f"item {i} ({kind})"
-        if kind in ("survey", "StructureScan"):
-            polygons.append((_corners(item.get("polygon"), origin, name),))
-        elif kind == "CorridorScan":
-            width_m = _number(item.get("CorridorWidth"), origin, f"{name}, CorridorWidth")
-            points = _corners(item.get("polyline"), origin, name)
-            lines.append(RawLine(points=points, width_m=width_m))
-    return RawShapes(
-        origin=origin,
-        geographic=True,
-        polygons=tuple(polygons),
-        lines=tuple(lines),
-        points=no_points(),
-    )
-
-
-def _fence(data: dict[str, Any], origin: str, *, inclusion: bool) -> RawShapes:
-    polygons = []
-    for name, fence in _fences(data, origin, "polygons", inclusion=inclusion):
-        polygons.append((_corners(fence.get("polygon"), origin, name),))
-    for name, fence in _fences(data, origin, "circles", inclusion=inclusion):
-        circle = fence.get("circle")
-        if not isinstance(circle, dict):
-            raise _broken(origin, name)
-        centre = _corners([circle.get("center")], origin, name)
-        radius_m = _number(circle.get("radius"), origin, f"{name}, radius")
-        polygons.append((_circle(centre[0], radius_m, outside=not inclusion),))
-    return RawShapes(origin=origin, geographic=True, polygons=tuple(polygons), points=no_points())
-
-
-def _fences(
-    data: dict[str, Any], origin: str, key: str, *, inclusion: bool
-) -> Iterator[tuple[str, dict[str, Any]]]:
-    if "geoFence" not in data:
-        return
-    for i, fence in enumerate(_list(data, origin, "geoFence", key), 1):
-        if not isinstance(fence, dict) or not isinstance(fence.get("inclusion"), bool):
-            raise _broken(origin, f"geoFence.{key} {i}")
-        if fence["inclusion"] == inclusion:
-            yield f"geoFence.{key} {i}", fence
-
-
-def _circle(centre_deg: Array, radius_m: float, *, outside: bool) -> Array:
+def _corners_of_circle(circle: _Circle, *, outside: bool) -> Array:
     """Corners (64, 2) of a polygon inside of a circle, or around it where that is the safe side."""
     from pyproj import Geod
 
-    reach_m = radius_m / np.cos(np.pi / _CIRCLE_CORNERS) if outside else radius_m
+    reach_m = circle.radius / np.cos(np.pi / _CIRCLE_CORNERS) if outside else circle.radius
     azimuths = np.arange(_CIRCLE_CORNERS) * 360.0 / _CIRCLE_CORNERS
-    lat, lon = (np.full(_CIRCLE_CORNERS, value) for value in centre_deg)
+    lat, lon = (np.full(_CIRCLE_CORNERS, value) for value in circle.centre)
     lon, lat, _ = Geod(ellps="WGS84").fwd(lon, lat, azimuths, np.full(_CIRCLE_CORNERS, reach_m))
     return np.column_stack([lat, lon])
-
-
-def _list(data: dict[str, Any], origin: str, section: str, key: str) -> list[Any]:
-    part = data.get(section)
-    found = part.get(key, []) if isinstance(part, dict) else None
-    if not isinstance(found, list):
-        raise _broken(origin, f"{section}.{key}")
-    return found
-
-
-def _corners(value: Any, origin: str, name: str) -> Array:
-    """(N, 2) latitudes and longitudes."""
-    try:
-        corners = np.array([[float(lat), float(lon)] for lat, lon, *_ in value])
-    except (TypeError, ValueError, OverflowError):
-        raise _broken(origin, name) from None
-    corners = corners.reshape(-1, 2)
-    check_finite(corners, origin, name)
-    check_latitudes(corners, origin, name)
-    return corners
-
-
-def _number(value: Any, origin: str, name: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < _MAX_M:
-        raise PlanError(f"area: {origin}: {name} is {value!r:.60}; it must be above 0")
-    return float(value)
-
-
-def _broken(origin: str, name: str) -> PlanError:
-    return PlanError(f"area: {origin}: {name} is not as QGroundControl writes it")

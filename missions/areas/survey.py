@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
+from scipy.sparse.csgraph import minimum_spanning_tree
 from shapely.geometry import LineString, MultiPolygon, Point, Polygon
 from shapely.geometry.base import BaseGeometry
 
@@ -25,7 +26,6 @@ _SLIGHT_M2 = 0.01
 """A loop of crossing edges up to this size is a slip of the hand; a larger one is a wrong order of
 corners. Parts and holes below it are left out."""
 _NO_SIZE_M2 = 1e-4
-_NAMED = 3
 GRID_M = 1e-6
 """Grid of corners where polygons are joined or cut: it closes the seams that rounding leaves."""
 _SHARP = 1e3
@@ -51,23 +51,21 @@ class Repaired:
 
 @dataclass(frozen=True, kw_only=True)
 class _Reporter:
-    """Names faults and their places."""
+    """Names a source and its places."""
 
     origin: str
     frame: LocalFrame
     geographic: bool
 
-    def at(self, point_ne: Array) -> str:
-        return self.frame.place(point_ne, geographic=self.geographic)
-
-    def line(self, name: str, text: str) -> str:
-        return f"area: {self.origin}: {name + ': ' if name else ''}{text}"
-
-    def refuse(self, name: str, text: str) -> PlanError:
-        return PlanError(self.line(name, text))
-
-    def warn(self, name: str, text: str) -> None:
-        warn(self.line(name, text))
+    def text(self, name: str, text: str, place: Array | BaseGeometry | None = None) -> str:
+        """A line on a ring of the source, and where."""
+        text = f"area: {self.origin}: {name + ': ' if name else ''}{text}"
+        if place is None:
+            return text
+        if isinstance(place, BaseGeometry):
+            point = place.representative_point()
+            place = np.array([point.x, point.y])
+        return f"{text} near {self.frame.place(place, geographic=self.geographic)}"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -188,7 +186,7 @@ def _polygons(raw: RawShapes, frame: LocalFrame, corridor_width_m: float) -> Rep
             f"area: {raw.origin}: it holds {_counted(raw)}; an area needs a polygon or a line"
         )
     local = frame.localised(raw)
-    shape = repaired(local, frame, geographic=raw.geographic)
+    shape = repair(local, frame, geographic=raw.geographic)
     if len(raw.points):
         warn(f"area: {raw.origin}: {_counted(replace(raw, polygons=(), lines=()))} left out")
     if not raw.lines:
@@ -218,7 +216,7 @@ def _zone(raw: RawShapes, frame: LocalFrame, clearance_m: float) -> MultiPolygon
             f"area: {raw.origin}: it holds {_counted(raw)}: set no_go_clearance_m, how far to keep "
             "from lines and points"
         )
-    shape = repaired(local, frame, geographic=raw.geographic, overlaps=False)
+    shape = repair(local, frame, geographic=raw.geographic, overlaps=False)
     around = [multipolygon(mark.buffer(clearance_m)) for mark in marks]
     return _union([widened(shape.solid, clearance_m), *around])
 
@@ -297,21 +295,9 @@ def _check_inside(area: Area, raw: RawShapes, frame: LocalFrame, given: str) -> 
 
 
 def _widest_gap_m(parts: Sequence[BaseGeometry]) -> float:
-    """The widest of the gaps to bridge to make all parts one.
-
-    That is the longest edge of their minimum spanning tree (Prim's algorithm).
-    """
-    nearest = np.full(len(parts), math.inf)
-    nearest[0] = 0.0
-    waiting = list(range(len(parts)))
-    widest = 0.0
-    while waiting:
-        i = min(waiting, key=lambda k: nearest[k])
-        waiting.remove(i)
-        widest = max(widest, float(nearest[i]))
-        for k in waiting:
-            nearest[k] = min(nearest[k], parts[i].distance(parts[k]))
-    return widest
+    """The widest of the gaps to bridge to make all parts one: of their minimum spanning tree."""
+    apart_m = np.array([[max(a.distance(b), 1e-9) for b in parts] for a in parts])
+    return float(minimum_spanning_tree(np.triu(apart_m, 1)).max())
 
 
 def corridor_strip(points: Array, width_m: float, origin: str, name: str) -> BaseGeometry:
@@ -404,10 +390,10 @@ def _rectangle(settings: AreaConfig) -> Array:
     return corners
 
 
-def repaired(
+def repair(
     raw: RawShapes, frame: LocalFrame, *, geographic: bool, overlaps: bool = True
 ) -> Repaired:
-    """Check the polygons of a source.
+    """Make the polygons of a source valid where it is clear what is meant.
 
     Args:
         raw: shapes in metres north and east; its lines and points do not count.
@@ -424,31 +410,31 @@ def repaired(
     """
     report = _Reporter(origin=raw.origin, frame=frame, geographic=geographic)
     solids: list[BaseGeometry] = []
-    names: list[str] = []
     holes: list[BaseGeometry] = []
     for i, rings in enumerate(raw.polygons):
-        name = raw.ring_name(i, 0)
-        shell = _ring_area(rings[0], name, report)
+        solid: BaseGeometry = _ring_area(rings[0], raw.ring_name(i, 0), report)
         cuts = []
         for j, ring in enumerate(rings[1:], 1):
-            hole = _hole(ring, shell, raw.ring_name(i, j), report)
-            if hole is not None:
-                cuts.append(hole)
+            name, corners = raw.ring_name(i, j), distinct(ring, closed=True)
+            if len(corners) < 3 or Polygon(corners).convex_hull.area < _SLIGHT_M2:
+                warn(report.text(name, "it is too small and left out", ring[0]))
+                continue
+            cuts.append(_ring_area(ring, name, report))
+            outside = cuts[-1].difference(solid)
+            if outside.area > _NO_SIZE_M2:
+                text = f"{outside.area:.3g} m2 of it lie outside of its polygon: kept out of, too,"
+                warn(report.text(name, text, outside))
         holes += cuts
-        solid: BaseGeometry = shell
         if cuts:
-            solid = shapely.difference(shell, shapely.union_all(cuts), grid_size=GRID_M)
+            solid = shapely.difference(solid, shapely.union_all(cuts), grid_size=GRID_M)
         if solid.area < _SLIGHT_M2 and len(raw.polygons) > 1:
-            report.warn(
-                name,
-                f"{solid.area:.2g} m2 at {report.at(rings[0][0])} is too small and left out",
-            )
-            continue
-        solids.append(solid)
-        names.append(name)
+            text = f"{solid.area:.2g} m2 are too small and left out"
+            warn(report.text(raw.ring_name(i, 0), text, rings[0][0]))
+        else:
+            solids.append(solid)
     if raw.polygons and not any(solid.area > 0 for solid in solids):
-        raise report.refuse("", "its holes, or its size, leave nothing")
-    solid = _joined(solids, names, report if overlaps else None)
+        raise PlanError(report.text("", "its holes, or its size, leave nothing"))
+    solid = _join(solids, report if overlaps else None)
     left: BaseGeometry = MultiPolygon()
     if holes:
         left = shapely.difference(shapely.union_all(holes), solid, grid_size=GRID_M)
@@ -464,20 +450,13 @@ def without_slivers(geometry: MultiPolygon) -> MultiPolygon:
 
 def distinct(corners: Array, *, closed: bool) -> Array:
     """Leave out points that repeat their predecessor (of a ring, the first one's is the last)."""
-    if len(corners) < 2:
-        return corners
-    steps = np.linalg.norm(np.diff(corners, axis=0), axis=1)
-    if steps.min() >= SAME_PLACE_M:
-        back_m = float(np.linalg.norm(corners[-1] - corners[0]))
-        return corners[:-1] if closed and back_m < SAME_PLACE_M else corners
-    kept = [0]
-    for i in range(1, len(corners)):
-        if np.linalg.norm(corners[i] - corners[kept[-1]]) >= SAME_PLACE_M:
-            kept.append(i)
-    if closed and len(kept) > 1 and np.linalg.norm(corners[kept[-1]] - corners[0]) < SAME_PLACE_M:
+    kept: list[Array] = []
+    for corner in corners:
+        if not kept or np.linalg.norm(corner - kept[-1]) >= SAME_PLACE_M:
+            kept.append(corner)
+    if closed and len(kept) > 1 and np.linalg.norm(kept[-1] - kept[0]) < SAME_PLACE_M:
         kept.pop()
-    left: Array = corners[kept]
-    return left
+    return np.array(kept).reshape(-1, 2)
 
 
 def _ring_area(ring: Array, name: str, report: _Reporter) -> Polygon | MultiPolygon:
@@ -490,138 +469,55 @@ def _ring_area(ring: Array, name: str, report: _Reporter) -> Polygon | MultiPoly
     Raises:
         PlanError: it encloses nothing, or its edges cross.
     """
-    closed = len(ring) > 1 and np.linalg.norm(ring[0] - ring[-1]) < SAME_PLACE_M
     corners = distinct(ring, closed=True)
     if len(corners) < 3:
-        raise report.refuse(name, f"{len(corners)} distinct corners; a polygon needs 3 or more")
-    hull_m2 = Polygon(corners).convex_hull.area
-    if hull_m2 < _NO_SIZE_M2:
-        raise report.refuse(
-            name,
-            f"{hull_m2:.2g} m2 is too small; its corners lie on one line through "
-            f"{report.at(corners[0])}",
-        )
-    repeats = len(ring) - len(corners) - int(closed)
-    if repeats > 0:
-        report.warn(name, f"corners that repeat the one before ({repeats}) are left out")
-    corners = _without_spikes(corners, name, report)
-    if len(corners) < 3:
-        raise report.refuse(name, f"its corners enclose nothing near {report.at(ring[0])}")
+        text = f"{len(corners)} distinct corners; a polygon needs 3 or more"
+        raise PlanError(report.text(name, text, ring[0] if len(ring) else None))
     polygon = Polygon(corners)
-    if polygon.is_valid:
+    if polygon.is_valid and polygon.area >= _NO_SIZE_M2:
         return polygon
-    reason, _, text = shapely.is_valid_reason(polygon).partition("[")
-    where = report.at(np.array([float(value) for value in text.rstrip("]").split()[:2]]))
     valid = multipolygon(shapely.make_valid(polygon, method="linework"))
     # Of the corners less the first: products of large coordinates round.
     north, east = (corners - corners[0]).T
     signed = 0.5 * float(np.sum(north * np.roll(east, -1) - np.roll(north, -1) * east))
-    wrong_m2 = abs(abs(signed) - valid.area)
-    if wrong_m2 > _SLIGHT_M2:
-        what = "edges cross" if "intersection" in reason.lower() else reason.lower()
-        raise report.refuse(name, f"{what} near {where}; list the corners in order round the edge")
+    reason, _, place = shapely.is_valid_reason(polygon).partition("[")
+    where = np.array([float(x) for x in place.rstrip("]").split()[:2]] or corners[0])
+    if abs(abs(signed) - valid.area) > _SLIGHT_M2:
+        text = f"{reason.lower()} (list the corners in order round the edge)"
+        raise PlanError(report.text(name, text, where))
     parts = [part for part in valid.geoms if part.area > _SLIGHT_M2]
     if not parts:
-        raise report.refuse(name, f"its edges enclose no size near {where}")
+        raise PlanError(report.text(name, "its corners enclose nothing", where))
     kept = multipolygon(
         MultiPolygon(
             [Polygon(p.exterior, [r for r in p.interiors if Polygon(r).area > 1e-6]) for p in parts]
         )
     )
-    report.warn(
-        name,
-        f"its edge meets itself near {where}: taken as {len(parts)} "
-        f"part{'s' if len(parts) > 1 else ''} of {kept.area:.4g} m2",
-    )
+    count = f"{len(parts)} part{'s' if len(parts) > 1 else ''}"
+    warn(report.text(name, f"taken as {count} of {kept.area:.4g} m2: its edge meets itself", where))
     return kept.geoms[0] if len(kept.geoms) == 1 else kept
 
 
-def _without_spikes(corners: Array, name: str, report: _Reporter) -> Array:
-    """Leave out corners where the edge runs straight back over itself."""
-    found = corners
-    while len(found) >= 3:
-        spikes_m = _spike_lengths_m(found)
-        if not spikes_m.any():
-            break
-        tip = int(spikes_m.argmax())
-        report.warn(
-            name,
-            f"a spike of {spikes_m[tip]:.3g} m without width at {report.at(found[tip])} is cut off",
-        )
-        found = distinct(np.delete(found, tip, axis=0), closed=True)
-    return found
-
-
-def _spike_lengths_m(corners: Array) -> Array:
-    """(N,) lengths of the shorter edges at corners whose two edges lie on one another, else 0."""
-    back = np.roll(corners, 1, axis=0) - corners
-    on = np.roll(corners, -1, axis=0) - corners
-    back_m, on_m = np.linalg.norm(back, axis=1), np.linalg.norm(on, axis=1)
-    off_m = np.abs(back[:, 0] * on[:, 1] - back[:, 1] * on[:, 0]) / np.maximum(back_m, on_m)
-    folded = ((back * on).sum(axis=1) > 0) & (off_m < SAME_PLACE_M)
-    lengths: Array = np.where(folded, np.minimum(back_m, on_m), 0.0)
-    return lengths
-
-
-def _hole(
-    ring: Array, shell: Polygon | MultiPolygon, name: str, report: _Reporter
-) -> Polygon | MultiPolygon | None:
-    """A hole of a polygon; None where it has no size."""
-    corners = distinct(ring, closed=True)
-    size_m2 = Polygon(corners).convex_hull.area if len(corners) > 2 else 0.0
-    if size_m2 < _SLIGHT_M2:
-        report.warn(name, f"{size_m2:.2g} m2 at {report.at(ring[0])} is too small and left out")
-        return None
-    hole = _ring_area(ring, name, report)
-    if not shell.contains_properly(hole):
-        outside = hole.difference(shell)
-        where = outside if outside.area > 1e-6 else hole.boundary.intersection(shell.boundary)
-        report.warn(
-            name,
-            f"{outside.area:.3g} m2 of it lie outside of its polygon, or it touches the edge, near "
-            f"{report.at(_inside(where))}: all of it is kept out of",
-        )
-    return hole
-
-
-def _joined(solids: list[BaseGeometry], names: list[str], report: _Reporter | None) -> MultiPolygon:
-    """The union of a source's polygons; overlaps are reported."""
+def _join(solids: list[BaseGeometry], report: _Reporter | None) -> MultiPolygon:
+    """The union of a source's polygons, gaps below `SLIVER_M` closed; overlaps are reported."""
     if len(solids) <= 1:
         return multipolygon(solids[0]) if solids else MultiPolygon()
     tree = shapely.STRtree(solids)
     near = tree.query(solids, predicate="dwithin", distance=SLIVER_M).T.tolist()
     if all(i == j for i, j in near):
         return multipolygon(MultiPolygon([p for s in solids for p in multipolygon(s).geoms]))
-    if report is not None:
-        _warn_of_overlaps(solids, names, near, report)
+    common = shapely.union_all([solids[i].intersection(solids[j]) for i, j in near if i < j])
+    if report is not None and common.area > _SLIGHT_M2:
+        text = f"its polygons overlap by {common.area:.3g} m2 and are taken together"
+        warn(report.text("", text, common))
     union = shapely.union_all(solids, grid_size=GRID_M)
     if all(solids[i].distance(solids[j]) <= GRID_M for i, j in near):
         return multipolygon(union)
     if report is not None:
-        report.warn("", f"gaps narrower than {SLIVER_M:g} m between its polygons are closed")
+        warn(report.text("", f"gaps narrower than {SLIVER_M:g} m between its polygons are closed"))
     wider = union.buffer(SLIVER_M / 2, join_style="mitre", mitre_limit=_SHARP)
     closed = wider.buffer(-SLIVER_M / 2, join_style="mitre", mitre_limit=_SHARP)
     return multipolygon(closed)
-
-
-def _warn_of_overlaps(
-    solids: list[BaseGeometry], names: list[str], pairs: list[list[int]], report: _Reporter
-) -> None:
-    common = [(solids[i].intersection(solids[j]), names[i], names[j]) for i, j in pairs if i < j]
-    overlaps = [overlap for overlap in common if overlap[0].area > _SLIGHT_M2]
-    for shared, one, other in overlaps[:_NAMED]:
-        report.warn(
-            "",
-            f"{one} and {other} overlap by {shared.area:.3g} m2 near {report.at(_inside(shared))}: "
-            "taken together",
-        )
-    if len(overlaps) > _NAMED:
-        report.warn("", f"{len(overlaps) - _NAMED} more overlaps of polygons: taken together")
-
-
-def _inside(geometry: BaseGeometry) -> Array:
-    point: Point = geometry.representative_point()
-    return np.array([point.x, point.y])
 
 
 def buffered_line(points: Array, width_m: float) -> Polygon | MultiPolygon:

@@ -2,14 +2,13 @@
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.core.compiled import compiled
 from alice_survey.core.errors import PlanError, warn
 from alice_survey.core.executor import SERIAL, Executor
 from alice_survey.core.frames import Array
@@ -164,17 +163,17 @@ class Certificate:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _GridTask:
+class _Tile:
     """A part of the area whose views are counted."""
 
     grid: Grid
     rays: tuple[Array, Array]
     stations: Stations
+    """Line by line, and none that is blind."""
     inside: NDArray[np.bool_]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TileSummary:
+class _TileViews(NamedTuple):
     """What was counted in a part of the area."""
 
     maps: dict[str, Counts]
@@ -182,67 +181,6 @@ class TileSummary:
     """For each camera: how many cells of the area are in 0, 1, ... pictures."""
     lines: list[NDArray[np.intp]]
     """For each camera: how many cells of the area are on 0, 1, ... lines."""
-
-
-@dataclass(kw_only=True, eq=False)
-class TileCounts:
-    """Views of each cell of a part of the area, counted station by station."""
-
-    grid: Grid
-    pictures: Counts
-    """(cameras, rows, columns)"""
-    lines: Counts
-    """(cameras, rows, columns)"""
-    pairs: Counts
-    """(rows, columns)"""
-    last: NDArray[np.int32]
-    """(cameras, rows, columns) the line that saw it last."""
-    stamp: NDArray[np.int32]
-    """(rows, columns) the picture that saw it last."""
-    stations: int = 0
-
-    @classmethod
-    def of(cls, grid: Grid, cameras: int) -> "TileCounts":
-        """Nothing seen yet."""
-        shape = (cameras, *grid.shape)
-        return cls(
-            grid=grid,
-            pictures=np.zeros(shape, np.uint16),
-            lines=np.zeros(shape, np.uint16),
-            pairs=np.zeros(grid.shape, np.uint16),
-            last=np.full(shape, -1, np.int32),
-            stamp=np.full(grid.shape, -1, np.int32),
-        )
-
-    def add(self, rays: tuple[Array, Array], stations: Stations) -> None:
-        """Count stations: all of one line before those of the next, and none that is blind."""
-        for rows in _chunks(len(stations)):
-            offsets, which = _offsets(rays, stations, rows)
-            count_pictures(
-                self.grid.cells_of(offsets + np.array(self.grid.origin_ne)), which,
-                np.ascontiguousarray(self.grid.cells_of(stations.glass_ne[rows])),
-                stations.line[rows], self.stations, self.pictures, self.lines, self.last,
-                self.stamp, self.pairs,
-            )  # fmt: skip
-            self.stations += len(which)
-
-    def summary(self, inside: NDArray[np.bool_]) -> TileSummary:
-        """The counts of all cameras together.
-
-        Args:
-            inside: (rows, columns) cells whose middle lies in the survey area.
-        """
-        total = self.pictures.sum(axis=0, dtype=np.uint32)
-        return TileSummary(
-            maps={
-                "pictures": np.minimum(total, 65535).astype(np.uint16),
-                "least_pictures": self.pictures.min(axis=0),
-                "least_lines": self.lines.min(axis=0),
-                "pairs": self.pairs,
-            },
-            pictures=[np.bincount(counts[inside]) for counts in self.pictures],
-            lines=[np.bincount(counts[inside]) for counts in self.lines],
-        )
 
 
 def certificate(
@@ -281,71 +219,45 @@ def certificate(
     stations = stations.some(order)
     coarse = max_cells is not None and grid.rows * grid.columns > _COARSE * max_cells
     rays = border_rays_body(rig, _FEW_POINTS) if coarse else border_rays_body(rig)
-    reach_m = reaches_m(rays, stations)
+    reach_m = _reaches_m(rays, stations)
     blind = int(np.count_nonzero(np.isnan(reach_m)))
     # Beyond its reach a place may be by rounding.
     glass, reach = grid.cells_of(stations.glass_ne), (reach_m + 1e-6) / grid.cell_m
     places, tasks = [], []
-    for here, part in tiles_of(grid, mask):
-        near = _near(glass, reach, here[0].start, here[1].start, part.rows, part.columns)
-        places.append(here)
-        tasks.append(
-            _GridTask(grid=part, rays=rays, stations=stations.some(near), inside=mask[here])
-        )
-    found = executor.map(
-        count_tile, tasks, label="count the views of each place", task_mib=_TILE_MIB
-    )
-    return assembled(
-        area, pattern, tuple(rig.cameras), grid, mask, zip(places, found, strict=True),
-        stations=len(stations), blind=blind, estimated=coarse,
-    )  # fmt: skip
-
-
-def tiles_of(grid: Grid, inside: NDArray[np.bool_]) -> Iterator[tuple[tuple[slice, slice], Grid]]:
-    """Parts of a grid that are worked on at once, where the area is: rows and columns, and grid."""
     for row, column in itertools.product(range(0, grid.rows, _TILE), range(0, grid.columns, _TILE)):
         part = grid.part(row, column, _TILE, _TILE)
         here = (slice(row, row + part.rows), slice(column, column + part.columns))
-        if inside[here].any():
-            yield here, part
-
-
-def assembled(
-    area: Area,
-    pattern: Pattern,
-    cameras: tuple[str, ...],
-    grid: Grid,
-    inside: NDArray[np.bool_],
-    tiles: Iterable[tuple[tuple[slice, slice], TileSummary]],
-    *,
-    stations: int,
-    blind: int,
-    estimated: bool = False,
-) -> Certificate:
-    """A certificate from what was counted in the parts of an area."""
-    result = {
+        if mask[here].any():
+            off = glass - np.clip(glass, (row, column), (row + part.rows, column + part.columns))
+            near = np.hypot(*off.T) <= reach
+            places.append(here)
+            tasks.append(
+                _Tile(grid=part, rays=rays, stations=stations.some(near), inside=mask[here])
+            )
+    maps = {
         name: np.zeros(grid.shape, np.uint16)
         for name in ("pictures", "least_pictures", "least_lines", "pairs")
     }
-    counted = []
-    for here, tile in tiles:
+    found = list(
+        executor.map(_count_views, tasks, label="count the views of each place", task_mib=_TILE_MIB)
+    )
+    for here, tile in zip(places, found, strict=True):
         for name, counts in tile.maps.items():
-            result[name][here] = counts
-        counted.append(tile)
+            maps[name][here] = counts
+    cameras = tuple(rig.cameras)
     return Certificate(
         area=area,
         pattern=pattern,
         cameras=cameras,
-        stations=stations,
+        stations=len(stations),
         blind=blind,
-        estimated=estimated,
+        estimated=coarse,
         grid=grid,
-        inside=inside,
-        histograms={n: _histogram([t.pictures[i] for t in counted]) for i, n in enumerate(cameras)},
-        line_histograms={n: _histogram([t.lines[i] for t in counted])
-                         for i, n in enumerate(cameras)},
-        **result,
-    )  # fmt: skip
+        inside=mask,
+        histograms={n: _histogram([t.pictures[i] for t in found]) for i, n in enumerate(cameras)},
+        line_histograms={n: _histogram([t.lines[i] for t in found]) for i, n in enumerate(cameras)},
+        **maps,
+    )
 
 
 def _cell_m(
@@ -411,54 +323,44 @@ def _chunks(count: int) -> Iterator[slice]:
     return (slice(start, start + _CHUNK) for start in range(0, count, _CHUNK))
 
 
-def reaches_m(rays: tuple[Array, Array], stations: Stations) -> Array:
+def _reaches_m(rays: tuple[Array, Array], stations: Stations) -> Array:
     """How far from the glass, (S,), a station sees; NaN where it looks past the sea floor."""
     reaches = [np.empty(0)]
     for rows in _chunks(len(stations)):
-        offsets, which = _offsets(rays, stations, rows)
+        offsets, which = footprint_offsets(
+            *rays, stations.altitude_m[rows], stations.attitude_rad[rows]
+        )
         reaches.append(np.sqrt((offsets**2).sum(axis=-1).max(axis=(1, 2)))[which])
     return np.concatenate(reaches)
 
 
-def _offsets(
-    rays: tuple[Array, Array], stations: Stations, rows: slice
-) -> tuple[Array, NDArray[np.intp]]:
-    offsets: tuple[Array, NDArray[np.intp]] = footprint_offsets(
-        *rays, stations.altitude_m[rows], stations.attitude_rad[rows]
-    )
-    return offsets
-
-
-@compiled
-def _near(
-    glass: Array, reach: Array, row: int, column: int, rows: int, columns: int
-) -> NDArray[np.intp]:
-    """Which stations, (N,), may see some of a part of a grid.
-
-    Args:
-        glass: (S, 2) their places, in rows and columns of the grid.
-        reach: (S,) how far they see, in cells; NaN of those that see nothing.
-        row: at which the part begins.
-        column: the same.
-        rows: of the part.
-        columns: of the part.
-    """
-    near = np.empty(len(glass), np.intp)
-    count = 0
-    for s in range(len(glass)):
-        up = max(row - glass[s, 0], glass[s, 0] - (row + rows), 0.0)
-        aside = max(column - glass[s, 1], glass[s, 1] - (column + columns), 0.0)
-        if up * up + aside * aside <= reach[s] * reach[s]:
-            near[count] = s
-            count += 1
-    return near[:count].copy()
-
-
-def count_tile(task: _GridTask) -> TileSummary:
+def _count_views(tile: _Tile) -> _TileViews:
     """Count the views of each cell of a part of the area."""
-    counts = TileCounts.of(task.grid, len(task.rays[0]))
-    counts.add(task.rays, task.stations)
-    return counts.summary(task.inside)
+    grid, stations = tile.grid, tile.stations
+    shape = (len(tile.rays[0]), *grid.shape)
+    pictures, lines = np.zeros(shape, np.uint16), np.zeros(shape, np.uint16)
+    last, stamp = np.full(shape, -1, np.int32), np.full(grid.shape, -1, np.int32)
+    pairs = np.zeros(grid.shape, np.uint16)
+    for rows in _chunks(len(stations)):
+        offsets, which = footprint_offsets(
+            *tile.rays, stations.altitude_m[rows], stations.attitude_rad[rows]
+        )
+        count_pictures(
+            grid.cells_of(offsets + np.array(grid.origin_ne)), which,
+            np.ascontiguousarray(grid.cells_of(stations.glass_ne[rows])), stations.line[rows],
+            rows.start, pictures, lines, last, stamp, pairs,
+        )  # fmt: skip
+    total = np.minimum(pictures.sum(axis=0, dtype=np.uint32), 65535).astype(np.uint16)
+    return _TileViews(
+        maps={
+            "pictures": total,
+            "least_pictures": pictures.min(axis=0),
+            "least_lines": lines.min(axis=0),
+            "pairs": pairs,
+        },
+        pictures=[np.bincount(counts[tile.inside]) for counts in pictures],
+        lines=[np.bincount(counts[tile.inside]) for counts in lines],
+    )
 
 
 def _histogram(counts: list[NDArray[np.intp]]) -> Array:

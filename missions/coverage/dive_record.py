@@ -5,7 +5,7 @@ rig. What cannot be used is left out and reported, never silently filled in.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -295,74 +295,89 @@ def _logged(path: Path, nav: NavigationLog, triggers: Triggers, plan: Plan, rig:
         )
     at = {name: values[kept] for name, values in at.items()}
     time_s = triggers.time_s[kept]
-
-    def courses(unknown: NDArray[np.bool_]) -> Array:
-        places = [nav.columns[name] for name in POSITION[:2]]
-        ned = plan.datum.ned_from_geodetic(np.column_stack([*places, np.zeros(len(nav.time_s))]))
-        return _courses(nav.time_s, ned[:, :2], time_s[unknown], plan)
-
-    attitude, assumed = _attitude_of(at, courses)
+    attitude, notes = _attitudes(nav, at, time_s, plan)
     glass_ned = glass_places(at, attitude, plan, rig)
-    altitude, unknown = _altitude_of(at, glass_ned[:, 2], plan)
-    assumed["no_altitude"] = unknown
-    notes = _notes_of(assumed, len(kept), plan)
+    no_altitude = ~np.isfinite(at["altitude_m"])
+    above_m = plan.seafloor_depth_m - glass_ned[:, 2]
+    if no_altitude.any():
+        notes.append(
+            f"{no_altitude.sum()} of {len(kept)} stations have no altitude: it is taken from their "
+            f"depth and a sea floor at {plan.seafloor_depth_m:g} m"
+        )
     stations = Stations(
         glass_ne=glass_ned[:, :2],
-        altitude_m=altitude,
+        altitude_m=np.where(no_altitude, above_m, at["altitude_m"]),
         attitude_rad=attitude,
         line=np.full(len(kept), -1) if triggers.line is None else triggers.line[kept],
         time_s=time_s,
     )
     _check_place(path, plan, stations)
-    high, below = _too_high(stations.altitude_m, plan), stations.altitude_m <= 0
+    max_m = MAX_ALTITUDES * plan.altitude_m
+    high, below = stations.altitude_m > max_m, stations.altitude_m <= 0
     stations = stations.some(~(high | below))
     if triggers.line is None:
         stations = replace(stations, line=assign_lines(stations, plan))
-    on_way = high & _outside_lines(time_s, stations)
-    most_m = MAX_ALTITUDES * plan.altitude_m
+    on_line_s = time_s[~(high | below)][stations.line >= 0]
+    first_s, last_s = (on_line_s[0], on_line_s[-1]) if len(on_line_s) else (-np.inf, np.inf)
+    on_way = high & ((time_s < first_s) | (time_s > last_s))
     _count(left_out, "at or below the sea floor, by their altitude", below)
-    _count(left_out, f"higher than {most_m:.2g} m above the sea floor", high & ~on_way)
-    record = DiveRecord(
+    _count(left_out, f"higher than {max_m:.2g} m above the sea floor", high & ~on_way)
+    steps = np.diff(nav.time_s)
+    long = np.flatnonzero(steps > nav.max_gap_s)
+    gaps = [(float(nav.time_s[i]), float(steps[i])) for i in long]
+    # What was left out or assumed is in the caller's report.
+    for start_s, length_s in gaps[:8]:
+        warn(f"{path}: a gap of {length_s:.1f} s from {start_s:.1f} s")
+    if len(gaps) > 8:
+        warn(f"{path}: {len(gaps) - 8} more gaps")
+    return DiveRecord(
         source=str(path),
         triggers=triggers.source,
         stations=stations,
         triggered=len(triggers.time_s),
         left_out=left_out,
         on_way=int(on_way.sum()),
-        notes=notes,
-        gaps=_gaps(nav),
+        notes=tuple(notes),
+        gaps=tuple(gaps),
     )
-    # What was left out or assumed is in the caller's report.
-    for start_s, length_s in record.gaps[:8]:
-        warn(f"{record.source}: a gap of {length_s:.1f} s from {start_s:.1f} s")
-    if len(record.gaps) > 8:
-        warn(f"{record.source}: {len(record.gaps) - 8} more gaps")
-    return record
 
 
-def _attitude_of(
-    at: Mapping[str, Array], courses: Callable[[NDArray[np.bool_]], Array]
-) -> tuple[Array, dict[str, int]]:
+def _attitudes(
+    nav: NavigationLog, at: Mapping[str, Array], time_s: Array, plan: Plan
+) -> tuple[Array, list[str]]:
     """Roll, pitch, heading, (S, 3) radians; level, and along the track, where they are unknown.
 
     Args:
-        at: columns of the log at the stations, (S,) each.
-        courses: courses made good, radians, of the stations of a mask (S,).
+        nav: the log.
+        at: its columns at the stations, (S,) each.
+        time_s: (S,) of the stations.
+        plan: what was to be flown.
 
     Returns:
-        The attitude, and how many stations had no tilt and no heading.
+        The attitude, and what was assumed, in words.
     """
-    nothing = np.full(len(at["depth_m"]), np.nan)
+    nothing = np.full(len(time_s), np.nan)
     degrees = np.column_stack([at.get(name, nothing) for name in READINGS[3:6]])
-    tilt_unknown = ~np.isfinite(degrees[:, :2]).all(axis=1)
-    heading_unknown = ~np.isfinite(degrees[:, 2])
-    degrees[tilt_unknown, :2] = 0.0
-    if heading_unknown.any():
-        degrees[heading_unknown, 2] = np.rad2deg(courses(heading_unknown))
-    attitude: Array = np.deg2rad(degrees)
-    return attitude, {
-        "no_tilt": int(tilt_unknown.sum()), "no_heading": int(heading_unknown.sum())
-    }  # fmt: skip
+    no_tilt, no_heading = ~np.isfinite(degrees[:, :2]).all(axis=1), ~np.isfinite(degrees[:, 2])
+    degrees[no_tilt, :2] = 0.0
+    notes = []
+    if no_tilt.any():
+        notes.append(f"{no_tilt.sum()} stations have no roll and pitch: taken as level")
+    if no_heading.any():
+        notes.append(
+            f"{no_heading.sum()} stations have no heading: taken as the course, without crab"
+        )
+        # Made good over the time between two pictures.
+        half_s = plan.interval_s / 2
+        places = [nav.columns[name] for name in POSITION[:2]]
+        ned = plan.datum.ned_from_geodetic(np.column_stack([*places, np.zeros(len(nav.time_s))]))
+        north_m, east_m = (
+            np.interp(time_s + half_s, nav.time_s, axis)
+            - np.interp(time_s - half_s, nav.time_s, axis)
+            for axis in ned[:, :2].T
+        )
+        degrees[no_heading, 2] = np.rad2deg(np.arctan2(east_m, north_m))[no_heading]
+    return np.deg2rad(degrees), notes
 
 
 def glass_places(at: Mapping[str, Array], attitude: Array, plan: Plan, rig: Rig) -> Array:
@@ -372,42 +387,6 @@ def glass_places(at: Mapping[str, Array], attitude: Array, plan: Plan, rig: Rig)
     glass_ned: Array = body_ned + rotation_from_attitude(*attitude.T).apply(lever)
     glass_ned[:, 2] = at["depth_m"] + (glass_ned[:, 2] - body_ned[:, 2])
     return glass_ned
-
-
-def _altitude_of(at: Mapping[str, Array], glass_depth_m: Array, plan: Plan) -> tuple[Array, int]:
-    """Altitude, (S,), from the plan's sea floor where the log has none; and how often that is."""
-    unknown = ~np.isfinite(at["altitude_m"])
-    altitude: Array = np.where(unknown, plan.seafloor_depth_m - glass_depth_m, at["altitude_m"])
-    return altitude, int(unknown.sum())
-
-
-def _too_high(altitude_m: Array, plan: Plan) -> NDArray[np.bool_]:
-    """(S,) whether pictures from altitudes are too coarse to count."""
-    high: NDArray[np.bool_] = altitude_m > MAX_ALTITUDES * plan.altitude_m
-    return high
-
-
-def _notes_of(assumed: Mapping[str, int], stations: int, plan: Plan) -> tuple[str, ...]:
-    """What was assumed of stations, in words."""
-    texts = {
-        "no_tilt": "stations have no roll and pitch: taken as level",
-        "no_heading": "stations have no heading: taken as the course, without crab",
-        "no_altitude": f"of {stations} stations have no altitude: it is taken from their depth and "
-        f"a sea floor at {plan.seafloor_depth_m:g} m",
-    }
-    return tuple(f"{assumed[key]} {text}" for key, text in texts.items() if assumed.get(key))
-
-
-def _courses(log_s: Array, place_ne: Array, time_s: Array, plan: Plan) -> Array:
-    """Course made good, (N,) radians, over the time between two pictures."""
-    half_s = plan.interval_s / 2
-    ends = [
-        np.column_stack([np.interp(t, log_s, axis) for axis in place_ne.T])
-        for t in (time_s - half_s, time_s + half_s)
-    ]
-    moved = ends[1] - ends[0]
-    course: Array = np.arctan2(moved[:, 1], moved[:, 0])
-    return course
 
 
 def _check_place(path: Path, plan: Plan, stations: Stations) -> None:
@@ -429,24 +408,9 @@ def _check_place(path: Path, plan: Plan, stations: Stations) -> None:
         )
 
 
-def _outside_lines(time_s: Array, stations: Stations) -> NDArray[np.bool_]:
-    """(N,) whether times are before the first or after the last station on a line."""
-    if stations.time_s is None or not np.any(stations.line >= 0):
-        return np.zeros(len(time_s), dtype=bool)
-    on_line_s = stations.time_s[stations.line >= 0]
-    outside: NDArray[np.bool_] = (time_s < on_line_s.min()) | (time_s > on_line_s.max())
-    return outside
-
-
 def _count(left_out: dict[str, int], reason: str, which: NDArray[np.bool_]) -> None:
     if which.any():
         left_out[reason] = int(which.sum())
-
-
-def _gaps(nav: NavigationLog) -> tuple[tuple[float, float], ...]:
-    steps = np.diff(nav.time_s)
-    long = np.flatnonzero(steps > nav.max_gap_s)
-    return tuple((float(nav.time_s[i]), float(steps[i])) for i in long)
 
 
 def assign_lines(stations: Stations, plan: Plan) -> NDArray[np.intp]:

@@ -15,7 +15,7 @@ import shapely
 from numpy.typing import NDArray
 
 from alice_survey.core.compiled import compiled
-from alice_survey.core.frames import Array
+from alice_survey.core.frames import Array, rotation_from_attitude
 from camera_calib.rig import Rig
 from missions.values.area import Area
 
@@ -111,10 +111,10 @@ def grid_over(area: Area, cell_m: float) -> Grid:
 
 def inside(area: Area, grid: Grid) -> NDArray[np.bool_]:
     """Which middles of cells, (rows, columns), lie in the survey area."""
-    rings = [grid.cells_of(ring) for ring in area.rings_ne]
-    edges = np.concatenate([np.hstack([ring[:-1], ring[1:]]) for ring in rings])
-    mask: NDArray[np.bool_] = _inside(np.ascontiguousarray(edges), grid.rows, grid.columns)
-    return mask
+    survey = shapely.transform(area.survey, grid.cells_of)
+    shapely.prepare(survey)
+    columns = np.arange(grid.columns) + 0.5
+    return np.array([shapely.contains_xy(survey, row + 0.5, columns) for row in range(grid.rows)])
 
 
 def border_rays_body(rig: Rig, points_per_side: int = _POINTS_PER_SIDE) -> tuple[Array, Array]:
@@ -138,7 +138,6 @@ def border_rays_body(rig: Rig, points_per_side: int = _POINTS_PER_SIDE) -> tuple
     return np.stack(points), np.stack(rays)
 
 
-@compiled(nogil=True)
 def footprints_ne(
     points_body: Array, rays_body: Array, glass_ne: Array, altitude_m: Array, attitude_rad: Array
 ) -> Array:
@@ -154,32 +153,16 @@ def footprints_ne(
     Returns:
         (S, C, P, 2) north and east; NaN where a ray never reaches the sea floor.
     """
-    cameras, points = points_body.shape[:2]
-    borders = np.full((len(glass_ne), cameras, points, 2), np.nan)
-    for s in range(len(glass_ne)):
-        cr, sr = math.cos(attitude_rad[s, 0]), math.sin(attitude_rad[s, 0])
-        cp, sp = math.cos(attitude_rad[s, 1]), math.sin(attitude_rad[s, 1])
-        ch, sh = math.cos(attitude_rad[s, 2]), math.sin(attitude_rad[s, 2])
-        # Fossen (2011), eq. 2.18: from body to North-East-Down.
-        nx, ny, nz = ch * cp, ch * sp * sr - sh * cr, ch * sp * cr + sh * sr
-        ex, ey, ez = sh * cp, sh * sp * sr + ch * cr, sh * sp * cr - ch * sr
-        dx, dy, dz = -sp, cp * sr, cp * cr
-        for c in range(cameras):
-            for p in range(points):
-                x, y, z = points_body[c, p, 0], points_body[c, p, 1], points_body[c, p, 2]
-                u, v, w = rays_body[c, p, 0], rays_body[c, p, 1], rays_body[c, p, 2]
-                descent = dx * u + dy * v + dz * w
-                height = altitude_m[s] - (dx * x + dy * y + dz * z)
-                if not (descent > 0.0 and height > 0.0):
-                    continue
-                reach = height / descent
-                x, y, z = x + reach * u, y + reach * v, z + reach * w
-                borders[s, c, p, 0] = glass_ne[s, 0] + nx * x + ny * y + nz * z
-                borders[s, c, p, 1] = glass_ne[s, 1] + ex * x + ey * y + ez * z
+    turn = rotation_from_attitude(*attitude_rad.T).as_matrix()
+    points = np.einsum("sij,cpj->scpi", turn, points_body)
+    rays = np.einsum("sij,cpj->scpi", turn, rays_body)
+    height = altitude_m[:, None, None] - points[..., 2]
+    reach = np.full(height.shape, np.nan)
+    np.divide(height, rays[..., 2], out=reach, where=(rays[..., 2] > 0.0) & (height > 0.0))
+    borders: Array = glass_ne[:, None, None] + points[..., :2] + reach[..., None] * rays[..., :2]
     return borders
 
 
-@compiled(nogil=True)
 def footprint_offsets(
     points_body: Array, rays_body: Array, altitude_m: Array, attitude_rad: Array
 ) -> tuple[Array, NDArray[np.intp]]:
@@ -194,18 +177,12 @@ def footprint_offsets(
     Returns:
         (K, C, P, 2) north and east, as of `footprints_ne`; and (S,) which of them each station has.
     """
-    which = np.zeros(len(altitude_m), np.intp)
-    for s in range(1, len(altitude_m)):
-        alike = altitude_m[s] == altitude_m[s - 1]
-        for axis in range(3):
-            alike = alike and attitude_rad[s, axis] == attitude_rad[s - 1, axis]
-        which[s] = which[s - 1] if alike else which[s - 1] + 1
-    first = np.flatnonzero(np.diff(which)) + 1
-    first = np.concatenate((np.zeros(min(len(which), 1), np.intp), first))
+    pose = np.column_stack([altitude_m, attitude_rad])
+    new = np.append(np.ones(min(len(pose), 1), bool), (pose[1:] != pose[:-1]).any(axis=1))
     offsets = footprints_ne(
-        points_body, rays_body, np.zeros((len(first), 2)), altitude_m[first], attitude_rad[first]
+        points_body, rays_body, np.zeros((new.sum(), 2)), altitude_m[new], attitude_rad[new]
     )
-    return offsets, which
+    return offsets, np.cumsum(new) - 1
 
 
 @compiled(nogil=True)
@@ -291,29 +268,3 @@ def count_pictures(
                             stamp[i, j] = before + 1
                             if c == cameras - 1 and pairs[i, j] < 65535:
                                 pairs[i, j] += 1
-
-
-@compiled(nogil=True)
-def _inside(edges: Array, rows: int, columns: int) -> NDArray[np.bool_]:
-    """Which middles of cells lie within closed rings, by the parity of edges to their left.
-
-    Args:
-        edges: (E, 4) row and column of both ends.
-        rows: of the grid.
-        columns: of the grid.
-    """
-    mask = np.zeros((rows, columns), np.bool_)
-    for e in range(len(edges)):
-        r0, c0, r1, c1 = edges[e]
-        if r1 < r0:
-            r0, c0, r1, c1 = r1, c1, r0, c0
-        start = math.ceil(max(r0, 0.0) - 0.5)
-        for i in range(start, math.ceil(min(r1, float(rows)) - 0.5)):
-            place = c0 + (i + 0.5 - r0) / (r1 - r0) * (c1 - c0)
-            column = math.ceil(min(max(place, 0.0), float(columns)) - 0.5)
-            if column < columns:
-                mask[i, column] = not mask[i, column]
-    for i in range(rows):
-        for j in range(1, columns):
-            mask[i, j] = mask[i, j] != mask[i, j - 1]
-    return mask

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array, attitude_from_rotation, interpolate_poses
 from camera_calib.rig import Rig
 from missions.values.footprint import common_swath
@@ -77,30 +76,14 @@ def stations_of_lines(lines: Sequence[Line], altitude_m: Array | float) -> Stati
     """
     counts = np.array([line.stations for line in lines], dtype=np.int64)
     headings = np.array([line.heading_rad for line in lines])
-    ends = np.array([(*line.start_ne_m, *line.end_ne_m) for line in lines]).reshape(-1, 4)
     attitude = np.zeros((int(counts.sum()), 3))
     attitude[:, 2] = np.repeat(headings, counts)
     return Stations(
-        glass_ne=_along(ends, counts),
+        glass_ne=np.concatenate([np.empty((0, 2)), *(line.stations_ne for line in lines)]),
         altitude_m=np.array(np.broadcast_to(altitude_m, len(attitude)), dtype=np.float64),
         attitude_rad=attitude,
         line=np.repeat(np.arange(len(lines)), counts),
     )
-
-
-@compiled
-def _along(ends: Array, counts: NDArray[np.int64]) -> Array:
-    """The `stations_ne` of lines from (L, 4) places of their ends and numbers of stations (L,)."""
-    places = np.empty((counts.sum(), 2))
-    s = 0
-    for i in range(len(counts)):
-        step = 1.0 / max(counts[i] - 1, 1)
-        for k in range(counts[i]):
-            share = 1.0 if 0 < k == counts[i] - 1 else k * step
-            for axis in range(2):
-                places[s, axis] = ends[i, axis] * (1 - share) + ends[i, 2 + axis] * share
-            s += 1
-    return places
 
 
 def stations_of_plan(plan: Plan, floor_depth_m: Array | None = None) -> Stations:

@@ -1,15 +1,23 @@
-"""The formats there are: the modules of `missions.exports.formats`, imported when they are used."""
+"""The formats there are: the modules of `missions.exports.formats`, imported when they are used.
 
+And missions read back from files, whichever of the formats they are in.
+"""
+
+import math
 import pkgutil
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from alice_survey.core.errors import PlanError
+from alice_survey.core.contents import one_line
+from alice_survey.core.errors import PlanError, why
 from missions.exports import formats
+from missions.values.mission import Mission, MissionStep
 
 if TYPE_CHECKING:
     from missions.exports.format import ExportFormat
 
+_MAX_BYTES = 64_000_000
 _REMOVED = {"cola2-v1": "cola2", "qgc-survey": "qgc"}
 
 
@@ -42,3 +50,62 @@ def formats_table() -> str:
         files = ", ".join(f"`{file.name.format(1)}`" for file in known.files)
         rows.append(f"| `{name}` | {files} | {known.read_by} |")
     return "\n".join(rows)
+
+
+def read_mission(path: Path) -> Mission:
+    """Read a mission as the vehicle that the file is for does.
+
+    Raises:
+        PlanError: the file cannot be read, or holds no mission that can be flown.
+    """
+    try:
+        with path.open("rb") as file:
+            raw = file.read(_MAX_BYTES + 1)
+    except OSError as error:
+        raise PlanError(f"{path}: cannot be read: {why(error)}") from None
+    if len(raw) > _MAX_BYTES:
+        raise PlanError(f"{path}: is larger than {_MAX_BYTES // 1_000_000} MB: no mission is")
+    readable = []
+    text = raw.decode("utf-8", errors="replace")
+    for name in format_names():
+        format_ = format_named(name)
+        if format_.read is None:
+            continue
+        readable.append(name)
+        try:
+            mission = format_.read(text)
+            if mission is not None:
+                _check(mission)
+                return mission
+        except ValueError as error:
+            raise PlanError(f"{path}: {one_line(error)}") from None
+    raise PlanError(f"{path}: holds no mission in any of the formats {', '.join(readable)}")
+
+
+def _check(mission: Mission) -> None:
+    """Raise a `ValueError` of what no vehicle can fly."""
+    if not mission.steps:
+        raise ValueError("the mission has no step")
+    for number, step in enumerate(mission.steps, start=1):
+        faults = [text for text, is_possible in _conditions(step).items() if not is_possible]
+        if faults:
+            raise ValueError(f"step {number} has {faults[0]}")
+
+
+def _conditions(step: MissionStep) -> dict[str, bool]:
+    """What must hold of a step, by what it has where it does not."""
+    latitudes, longitudes = zip((step.latitude_deg, step.longitude_deg),
+                                step.start_deg or (0.0, 0.0), strict=True)  # fmt: skip
+    return {
+        f"the place {step.latitude_deg:g}, {step.longitude_deg:g}, or start, beyond a pole": (
+            max(map(abs, latitudes)) <= 90.0 and max(map(abs, longitudes)) <= 180.0
+        ),
+        f"the speed {step.speed_mps:g} m/s": step.speed_mps > 0.0,
+        "a negative time or tolerance": not (step.hold_s < 0.0 or step.tolerance_m < 0.0),
+        f"the depth {step.depth_m:g} m": (
+            step.heave == "altitude" or (math.isfinite(step.depth_m) and step.depth_m >= 0.0)
+        ),
+        f"the altitude {step.altitude_m:g} m": (
+            step.heave == "depth" or (math.isfinite(step.altitude_m) and step.altitude_m > 0.0)
+        ),
+    }

@@ -23,7 +23,7 @@ from missions.coverage.stations import plan_pattern, stations_of_lines
 from missions.exports.advice import cola2_settings
 from missions.exports.follower import cola2_delta_m, sways
 from missions.exports.geometry import CameraMount
-from missions.exports.read import read_mission
+from missions.exports.registry import read_mission
 from missions.fly.flight_route import one_dive
 from missions.fly.simulation import (
     FlightSettings,

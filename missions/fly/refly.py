@@ -26,6 +26,7 @@ from missions.lines.lay import ordered
 from missions.route.dives import split_dives
 from missions.route.energy import craft_of, usable_wh
 from missions.route.flyable import without_stops
+from missions.route.turns import Manoeuvre
 from missions.route.ways import Ways
 from missions.values.area import Area, multipolygon
 from missions.values.costs import Costs
@@ -80,16 +81,11 @@ def refly_plan(
     lines = ordered(lines, ways, costs, plan.home_ne_m)
     dives = split_dives(
         lines,
-        ways=ways,
-        costs=costs,
+        Manoeuvre(costs, plan.turn_radius_m, plan.run_in_m, settings.turns, ways),
         home_ne=plan.home_ne_m,
-        turn_radius_m=plan.turn_radius_m,
-        run_in_m=plan.run_in_m,
-        turns=settings.turns,
         usable_wh=usable_wh,
         max_s=settings.dive_s,
         depth_m=plan.seafloor_depth_m - plan.altitude_m,
-        split=True,
     )
     again = again_over(plan, multipolygon(seen), lines, dives, name)
     seen_alone = certificate(again.area, rig, stations_of_plan(again), pattern)

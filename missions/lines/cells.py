@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
-from missions.lines.hops import hop_j, line_j
+from missions.lines import hops
 from missions.values.costs import Costs
 
 CORNERS = 4
@@ -61,7 +61,6 @@ def followers(pieces: Array) -> NDArray[np.int64]:
     return follower
 
 
-@compiled
 def chains(follower: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Sort pieces by cell.
 
@@ -71,28 +70,15 @@ def chains(follower: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.i
     Returns:
         (C + 1,) where each cell begins, and (P,) the pieces, cell after cell.
     """
-    count = follower.size
-    leads = np.ones(count, np.int64)
-    for i in range(count):
-        if follower[i] >= 0:
-            leads[follower[i]] = 0
-    begins = np.zeros(count + 1, np.int64)
-    listed = np.empty(count, np.int64)
-    cells, used = 0, 0
-    for i in range(count):
-        if leads[i] == 0:
-            continue
-        piece = i
+    after, begins, listed = follower.tolist(), [0], []
+    for piece in np.setdiff1d(np.arange(len(after)), follower).tolist():
         while piece >= 0:
-            listed[used] = piece
-            used += 1
-            piece = follower[piece]
-        cells += 1
-        begins[cells] = used
-    return begins[: cells + 1].copy(), listed
+            listed.append(piece)
+            piece = after[piece]
+        begins.append(len(listed))
+    return np.array(begins), np.array(listed, dtype=np.int64)
 
 
-@compiled
 def cell_corners(
     begins: NDArray[np.int64], listed: NDArray[np.int64], ends: Array, course: float
 ) -> tuple[Array, NDArray[np.int64]]:
@@ -108,25 +94,15 @@ def cell_corners(
         (C, 4, 3) north, east and course on entering at each corner; (C, 4) the corner where the
         cell is left after that.
     """
-    count = begins.size - 1
-    corners = np.empty((count, CORNERS, 3))
-    exits = np.empty((count, CORNERS), np.int64)
-    for c in range(count):
-        first, last = listed[begins[c]], listed[begins[c + 1] - 1]
-        size = begins[c + 1] - begins[c]
-        for k in range(CORNERS):
-            piece = first if k < 2 else last
-            at_end = k % 2
-            corners[c, k, 0] = ends[piece, 2 * at_end]
-            corners[c, k, 1] = ends[piece, 2 * at_end + 1]
-            corners[c, k, 2] = course + math.pi * at_end
-            # After an odd number of lines at the other end of them, else at the same.
-            side = 1 - at_end if size % 2 else at_end
-            exits[c, k] = side if size == 1 or k >= 2 else 2 + side
-    return corners, exits
+    both, sizes = ends.reshape(-1, 2, 2), np.diff(begins)
+    corners = np.empty((len(sizes), CORNERS, 3))
+    corners[:, :2, :2], corners[:, 2:, :2] = both[listed[begins[:-1]]], both[listed[begins[1:] - 1]]
+    corners[..., 2] = course + math.pi * np.array([0, 1, 0, 1])
+    # After an odd number of lines at the other end of them, else at the same.
+    sides = np.where(sizes[:, None] % 2, [1, 0, 1, 0], [0, 1, 0, 1])
+    return corners, sides + np.where(sizes[:, None] == 1, 0, [2, 2, 0, 0])
 
 
-@compiled
 def cell_costs(
     costs: Costs,
     begins: NDArray[np.int64],
@@ -148,38 +124,35 @@ def cell_costs(
     Returns:
         (C, 4) joules by the corner of entry; inf at corners 2 and 3 of a cell of one line.
     """
-    count = begins.size - 1
-    energies = np.zeros((count, CORNERS))
-    leave, enter = np.empty(3), np.empty(3)
-    for c in range(count):
-        size = begins[c + 1] - begins[c]
-        for k in range(CORNERS):
-            at_end = k % 2
-            if size == 1 and k >= 2:
-                energies[c, k] = np.inf
-                continue
-            for i in range(size):
-                place = begins[c] + (i if k < 2 else size - 1 - i)
-                piece = listed[place]
-                length = math.hypot(
-                    ends[piece, 2] - ends[piece, 0], ends[piece, 3] - ends[piece, 1]
-                )
-                here = course + math.pi * at_end
-                energies[c, k] += line_j(costs, length, here)
-                at_end = 1 - at_end
-                if i == size - 1:
-                    continue
-                following = listed[place + 1] if k < 2 else listed[place - 1]
-                side = slice(2 * at_end, 2 * at_end + 2)
-                leave[:2], leave[2] = ends[piece, side], here
-                enter[:2], enter[2] = ends[following, side], here + math.pi
-                way_m = links_m[piece if k < 2 else following, at_end]
-                energies[c, k] += hop_j(costs, leave, enter, way_m)
+    both, sizes = ends[listed].reshape(-1, 2, 2), np.diff(begins)
+    courses = course + math.pi * np.arange(2)
+    lengths: Array = np.hypot(*(both[:, 1] - both[:, 0]).T)[:, None]
+    lines = hops.line_j(costs, lengths, courses)
+    # Hops at a side, 0 where lines begin: on to the next piece, and back from it.
+    leaving = np.broadcast_to(courses[::-1, None], (len(both), 2, 1))
+    places = np.concatenate([both, leaving], axis=2)
+    entering = np.concatenate([both, leaving + math.pi], axis=2)
+    on, back = np.zeros((2, *lines.shape))
+    on[:-1] = hops.hop_j(costs, places[:-1], entering[1:], links_m[listed[:-1]])
+    back[:-1] = hops.hop_j(costs, places[1:], entering[:-1], links_m[listed[:-1]])
+    on[begins[1:] - 1] = back[begins[1:] - 1] = 0.0
+    # The first piece of a cell is flown from one side, its second from the other, and so on; a hop
+    # is at the side where the piece before it ends.
+    side = (np.arange(len(both)) - np.repeat(begins[:-1], sizes)) % 2
+    by_side = np.stack([side, 1 - side], axis=1)
+    energies = np.empty((len(sizes), CORNERS))
+    flown = np.take_along_axis(lines, by_side, axis=1)
+    ahead = flown + np.take_along_axis(on, 1 - by_side, axis=1)
+    astern = flown + np.take_along_axis(back, by_side, axis=1)
+    energies[:, :2] = np.add.reduceat(ahead, begins[:-1])
+    # From the last piece on: entered at the side that the first one is flown from in the end.
+    last = (np.arange(2) + sizes[:, None] - 1) % 2
+    energies[:, 2:] = np.take_along_axis(np.add.reduceat(astern, begins[:-1]), last, axis=1)
+    energies[sizes == 1, 2:] = np.inf
     return energies
 
 
-@compiled
-def flown(
+def flight_order(
     tour: NDArray[np.int64], begins: NDArray[np.int64], listed: NDArray[np.int64]
 ) -> NDArray[np.int64]:
     """The pieces in the order of flight.
@@ -192,13 +165,8 @@ def flown(
     Returns:
         (P, 2) piece, and 1 where it is flown from its end to its begin.
     """
-    order = np.empty((listed.size, 2), np.int64)
-    used = 0
-    for i in range(tour.size):
-        c, k = tour[i] // CORNERS, tour[i] % CORNERS
-        size = begins[c + 1] - begins[c]
-        for j in range(size):
-            order[used, 0] = listed[begins[c] + (j if k < 2 else size - 1 - j)]
-            order[used, 1] = (k + j) % 2
-            used += 1
-    return order
+    order = []
+    for cell, corner in zip(*(x.tolist() for x in divmod(tour, CORNERS)), strict=True):
+        pieces = listed[begins[cell] : begins[cell + 1]][:: 1 if corner < 2 else -1]
+        order.append(np.stack([pieces, (corner + np.arange(len(pieces))) % 2], axis=1))
+    return np.concatenate(order)

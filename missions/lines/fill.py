@@ -22,7 +22,7 @@ from shapely.geometry import MultiPolygon
 from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
 from missions.lines.rows import Site, rooms, stretches, to_uv, united
-from missions.route.fence import edges_of
+from missions.route.ways import edges_of
 from missions.values.area import Area
 from missions.values.line import Line
 from missions.values.pattern import Pattern

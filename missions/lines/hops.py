@@ -11,9 +11,8 @@ import math
 
 import numpy as np
 
-from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
-from missions.route.joins import MAX_SWAY_M
+from missions.route.turns import MAX_SWAY_M
 from missions.values.costs import Costs, power_at
 
 NOWHERE_J = 1e15
@@ -28,84 +27,43 @@ def comparable(costs: Costs) -> Costs:
     return costs.compilable(NOWHERE_J)
 
 
-@compiled
-def line_j(costs: Costs, length_m: float, course_rad: float) -> float:
-    """Energy of a straight line, J."""
-    energy: float = length_m / costs.speed_mps * power_at(costs.line_w, course_rad)
-    return energy
+def line_j(costs: Costs, length_m: Array | float, course_rad: Array | float) -> Array:
+    """Energy of straight lines, J."""
+    return length_m / costs.speed_mps * power_at(costs.line_w, course_rad)
 
 
-@compiled
-def _spot_j(costs: Costs, turn_rad: float) -> float:
-    """Energy of a turn on the spot, with its stop; 0 without a turn."""
-    turn = abs((turn_rad + math.pi) % (2 * math.pi) - math.pi)
-    if turn < _SAME_RAD:
-        return 0.0
-    energy: float = costs.stop_w * (turn / costs.turn_rate_rad_s + costs.settle_s)
-    return energy
+def _stop_j(costs: Costs, turn_rad: Array) -> Array:
+    """Energy of turns on the spot, with their stop; 0 without a turn or where a course is free."""
+    turn = np.abs(turn_rad - 2 * math.pi * np.round(turn_rad / (2 * math.pi)))
+    joules = costs.stop_w * (turn / costs.turn_rate_rad_s + costs.settle_s)
+    return np.where(turn >= _SAME_RAD, joules, 0.0)
 
 
-@compiled
-def hop_j(costs: Costs, leave: Array, enter: Array, way_m: float) -> float:
-    """Energy of a hop, J.
+def hop_j(costs: Costs, leave: Array, enter: Array, ways_m: Array) -> Array:
+    """Energy of hops, J.
 
     Args:
         costs: of the vehicle.
-        leave: (3,) north, east and course at the end of the line before; the course is NaN at home,
-            where any will do.
-        enter: (3,) the same at the start of the line after.
-        way_m: length of the shortest way inside the allowed area; inf where there is none.
+        leave: (..., 3) north, east and course at the end of the line before; the course is NaN at
+            home, where any will do.
+        enter: (..., 3) the same at the start of the line after.
+        ways_m: (...) length of the shortest way inside the allowed area; inf where there is none.
     """
-    if way_m == np.inf:
-        return NOWHERE_J
-    straight_m = math.hypot(enter[0] - leave[0], enter[1] - leave[1])
-    between = math.isfinite(leave[2]) and math.isfinite(enter[2])
-    if straight_m < _SAME_M:
-        return _spot_j(costs, enter[2] - leave[2]) if between else 0.0
-    bearing = math.atan2(enter[1] - leave[1], enter[0] - leave[0])
-    energy = way_m / costs.speed_mps * power_at(costs.way_w, bearing)
-    if math.isfinite(leave[2]):
-        energy += _spot_j(costs, bearing - leave[2])
-    if math.isfinite(enter[2]):
-        energy += _spot_j(costs, enter[2] - bearing)
-    if between and straight_m <= MAX_SWAY_M and way_m < straight_m + _SAME_M:
-        aside = straight_m / costs.sway_mps * power_at(costs.sway_w, bearing)
-        aside += costs.stop_w * costs.settle_s + _spot_j(costs, enter[2] - leave[2])
-        energy = min(energy, aside)
-    total: float = energy
-    return total
+    north, east = enter[..., 0] - leave[..., 0], enter[..., 1] - leave[..., 1]
+    straight_m, bearing = np.hypot(north, east), np.arctan2(east, north)
+    turn_j = _stop_j(costs, enter[..., 2] - leave[..., 2])
+    energy = ways_m / costs.speed_mps * power_at(costs.way_w, bearing)
+    energy += _stop_j(costs, bearing - leave[..., 2])
+    energy += _stop_j(costs, enter[..., 2] - bearing)
+    near = np.isfinite(leave[..., 2] + enter[..., 2])
+    near &= (straight_m <= MAX_SWAY_M) & (ways_m < straight_m + _SAME_M)
+    aside = straight_m[near] / costs.sway_mps * power_at(costs.sway_w, bearing[near])
+    aside = aside + costs.stop_w * costs.settle_s + turn_j[near]
+    energy[near] = np.minimum(energy[near], aside)
+    energy = np.where(straight_m < _SAME_M, turn_j, energy)
+    return np.where(np.isinf(ways_m), NOWHERE_J, energy)
 
 
-@compiled
-def hops_j(costs: Costs, leave: Array, enter: Array, ways_m: Array) -> Array:
-    """Energies of all hops from some ends to some starts.
-
-    Args:
-        costs: of the vehicle.
-        leave: (N, 3) north, east, course at the ends of lines; NaN at home.
-        enter: (M, 3) the same at the starts.
-        ways_m: (N, M) lengths of the ways.
-
-    Returns:
-        (N, M) joules.
-    """
-    energies = np.empty((leave.shape[0], enter.shape[0]))
-    for i in range(leave.shape[0]):
-        for j in range(enter.shape[0]):
-            energies[i, j] = hop_j(costs, leave[i], enter[j], ways_m[i, j])
-    return energies
-
-
-@compiled
-def chain_j(costs: Costs, leave: Array, enter: Array, ways_m: Array) -> Array:
-    """Energies of single hops, (N,) joules; arguments (N, 3), (N, 3) and (N,), as of `hops_j`."""
-    energies = np.empty(leave.shape[0])
-    for i in range(leave.shape[0]):
-        energies[i] = hop_j(costs, leave[i], enter[i], ways_m[i])
-    return energies
-
-
-@compiled
 def flight_j(costs: Costs, leave: Array, enter: Array, ways_m: Array) -> float:
     """Energy of flying lines in order, from home and home again, J.
 
@@ -115,11 +73,6 @@ def flight_j(costs: Costs, leave: Array, enter: Array, ways_m: Array) -> float:
         enter: (L + 1, 3) the same at the start of each line and at home.
         ways_m: (L + 1,) lengths of the ways before, between and after them.
     """
-    lines = hops = 0.0
-    for i in range(ways_m.size):
-        hops += hop_j(costs, leave[i], enter[i], ways_m[i])
-        if i > 0:
-            north, east = enter[i - 1, 0], enter[i - 1, 1]
-            length_m = math.hypot(leave[i, 0] - north, leave[i, 1] - east)
-            lines += line_j(costs, length_m, leave[i, 2])
-    return lines + hops
+    lengths_m = np.hypot(*(leave[1:] - enter[:-1])[:, :2].T)
+    lines = line_j(costs, lengths_m, leave[1:, 2]).sum()
+    return float(lines + hop_j(costs, leave, enter, ways_m).sum())

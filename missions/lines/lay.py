@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from alice_survey.core.compiled import note_compiling
 from alice_survey.core.errors import PlanError
@@ -122,7 +123,7 @@ def ordered(
     for i, line in enumerate(lines):
         corners[i] = [[*line.start_ne_m, line.heading_rad]] * cells.CORNERS
         corners[i, 1] = [*line.end_ne_m, line.heading_rad + math.pi]
-        inner[i, :2] = [hops.line_j(costs, line.length_m, x) for x in corners[i, :2, 2]]
+        inner[i, :2] = hops.line_j(costs, line.length_m, corners[i, :2, 2])
     exits = np.tile([1, 0, 1, 0], (len(lines), 1))
     order = _tour(corners, exits, inner, ways, costs, home, None, len(lines))
     flown = [lines[k // 4].reverse() if k % 4 == 1 else lines[k // 4] for k in order.tolist()]
@@ -133,7 +134,7 @@ def ordered(
 
 def note_planner() -> None:
     """Report that the first plan after an installation waits until the planner is compiled."""
-    note_compiling(hops.flight_j, "the planner, once: this takes 40 s to a minute")
+    note_compiling(rows.lay_rows, "the planner, once: this takes 40 s to a minute")
 
 
 def check_size(area: Area, pattern: Pattern, max_stations: int = MAX_STATIONS) -> None:
@@ -196,7 +197,7 @@ def laid(
     order = _tour(
         corners, exits, inner, ways, costs, home, closing if closes else None, survey_cells, quick
     )
-    flown = cells.flown(order, begins, listed)
+    flown = cells.flight_order(order, begins, listed)
     table = _table(ends, flown, heading_rad, survey_count)
     steps = steps[flown[:, 0]]
     kinds = np.where(flown[:, 0] < survey_count, SURVEY, CROSS).astype(np.int64)
@@ -362,9 +363,9 @@ def _tour(
     home_m, between_m = np.ascontiguousarray(all_m[:1, 1:]), np.ascontiguousarray(all_m[1:, 1:])
     useless = np.isinf(inner)  # the second line of a cell of one
     between_m[useless] = between_m[:, useless] = np.inf
-    start = hops.hops_j(costs, at_home, enter, home_m)[0]
-    over = hops.hops_j(costs, leave, enter, between_m)
-    plain = np.ascontiguousarray(hops.hops_j(costs, leave, at_home, home_m.T)[:, 0])
+    start = hops.hop_j(costs, at_home, enter, home_m[0])
+    over = hops.hop_j(costs, leave[:, None], enter, between_m)
+    plain = hops.hop_j(costs, leave, at_home, home_m[0])
     problem = tour.Cells(hops=over, exits=exits, inner=inner, start=start, finish=plain)
     if closing is None:
         if size <= tour.EXACT:
@@ -376,12 +377,10 @@ def _tour(
         """Cost after the last cell, (F, 4C), of flights that begin at corners (F,)."""
         line = closing[first]
         to_m = ways.distances_m(places, line[:, :2])
-        to = hops.hops_j(costs, leave, line[:, [0, 1, 4]], to_m)
-        on = hops.hops_j(costs, line[:, 2:5], at_home, home_m[:, first].T)
-        flown = np.array(
-            [hops.line_j(costs, math.dist(x[:2], x[2:4]), x[4]) for x in line.tolist()]
-        )
-        return np.ascontiguousarray(to.T + (flown[:, None] + on))
+        to = hops.hop_j(costs, leave[:, None], line[:, [0, 1, 4]], to_m)
+        on = hops.hop_j(costs, line[:, 2:5], at_home, home_m[0, first])
+        own = hops.line_j(costs, np.hypot(*(line[:, 2:4] - line[:, :2]).T), line[:, 4])
+        return np.ascontiguousarray(to.T + (own + on)[:, None])
 
     if size <= tour.EXACT:
         finish = np.zeros((len(enter), len(enter)))
@@ -416,12 +415,12 @@ def _inserted(
     ways_m = ways.lengths_m(leave[:, :2], enter[:, :2])
     for fill in fills:
         leave, enter = stops(table, home)
-        over_j = hops.chain_j(costs, leave, enter, ways_m)
+        over_j = hops.hop_j(costs, leave, enter, ways_m)
         both = np.array([fill[:5], [*fill[2:4], *fill[:2], fill[4] + math.pi]])
-        begins, ends = np.ascontiguousarray(both[:, [0, 1, 4]]), np.ascontiguousarray(both[:, 2:5])
+        begins, ends = both[:, [0, 1, 4]], both[:, 2:5]
         # No detour is less than one by straight ways, so the search ends early.
-        min_j = hops.hops_j(costs, leave, begins, _straights(leave, begins))
-        min_j = min_j + hops.hops_j(costs, ends, enter, _straights(ends, enter)).T
+        min_j = hops.hop_j(costs, leave[:, None], begins, cdist(leave[:, :2], begins[:, :2]))
+        min_j += hops.hop_j(costs, ends, enter[:, None], cdist(enter[:, :2], ends[:, :2]))
         min_j -= over_j[:, None]
         best_j, best, place, best_m = np.inf, both[0], 0, np.zeros(2)
         for index in np.argsort(min_j, axis=None, kind="stable").tolist():
@@ -430,7 +429,7 @@ def _inserted(
                 break
             there, then = np.stack([leave[i], ends[turned]]), np.stack([begins[turned], enter[i]])
             detour_m = ways.lengths_m(there[:, :2], then[:, :2])
-            detour_j = hops.chain_j(costs, there, then, detour_m).sum() - over_j[i]
+            detour_j = hops.hop_j(costs, there, then, detour_m).sum() - over_j[i]
             if detour_j < best_j:
                 best_j, best, place, best_m = detour_j, both[turned], i, detour_m
         table = np.insert(table, place, best, axis=0)
@@ -438,12 +437,6 @@ def _inserted(
         kinds = np.insert(kinds, place, FILL)
         ways_m = np.concatenate([ways_m[:place], best_m, ways_m[place + 1 :]])
     return table, steps, kinds
-
-
-def _straights(a: Array, b: Array) -> Array:
-    """Distances, (N, M), between places."""
-    distances: Array = np.hypot(a[:, None, 0] - b[:, 0], a[:, None, 1] - b[:, 1])
-    return distances
 
 
 def _too_many(area: Area, pattern: Pattern, stations: float, maximum: int) -> PlanError:

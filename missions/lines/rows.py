@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
-from missions.route.fence import edges_of
+from missions.route.ways import edges_of
 from missions.values.area import Area
 
 TOUCH_M = 1e-7

@@ -172,8 +172,8 @@ def _worthwhile(
 
 def _turn_j(pattern: Pattern, costs: Costs) -> float:
     """Energy from the end of a line to the start of the next."""
-    start, goal = np.zeros(3), np.array([0.0, pattern.spacing_m, math.pi])
-    return float(hops.hop_j(costs, start, goal, pattern.spacing_m))
+    start, goal = np.zeros((1, 3)), np.array([[0.0, pattern.spacing_m, math.pi]])
+    return float(hops.hop_j(costs, start, goal, np.array([pattern.spacing_m]))[0])
 
 
 def _some(count: int, share: float) -> int:
@@ -215,22 +215,18 @@ def min_width(edges: Array) -> tuple[float, float]:
     return float(directions[minimum]), float(widths[minimum])
 
 
-@compiled
 def widths_m(edges: Array, headings: Array) -> Array:
     """Total width, (H,), of all cells across directions (H,)."""
-    widths = np.zeros(headings.size)
-    for i in range(headings.size):
-        c, s = math.cos(headings[i]), math.sin(headings[i])
-        for e in range(edges.shape[0]):
-            widths[i] += abs(c * (edges[e, 3] - edges[e, 1]) - s * (edges[e, 2] - edges[e, 0])) / 2
-    return widths
+    spans = edges[:, 2:] - edges[:, :2]
+    widths = [np.abs(spans @ [-math.sin(x), math.cos(x)]).sum() / 2 for x in headings.tolist()]
+    return np.array(widths)
 
 
 def estimate_j(
     site: Site, headings: Array, pattern: Pattern, costs: Costs, cross_lines: int
 ) -> Array:
     """Energy, (H,), of all pieces of lines and of a turn to each, at headings (H,)."""
-    estimates: Array = _estimates(
+    length_m, across_m, turns = _totals(
         site.survey,
         site.allowed,
         headings,
@@ -240,15 +236,15 @@ def estimate_j(
         pattern.overhang_m,
         pattern.step_m,
         max(1, pattern.pictures - 1),
-        costs,
-        _turn_j(pattern, costs),
-        cross_lines,
     )
+    both = hops.line_j(costs, 1.0, headings) + hops.line_j(costs, 1.0, headings + math.pi)
+    across = hops.line_j(costs, across_m * cross_lines, headings + math.pi / 2)
+    estimates: Array = length_m * both / 2 + across + turns * _turn_j(pattern, costs)
     return estimates
 
 
 @compiled
-def _estimates(
+def _totals(
     survey: Array,
     allowed: Array,
     headings: Array,
@@ -258,30 +254,23 @@ def _estimates(
     overhang: float,
     step: float,
     min_steps: int,
-    costs: Costs,
-    turn_j: float,
-    cross_lines: int,
 ) -> Array:
-    result = np.empty(headings.size)
+    """(3, H) length of all pieces, width of the area, and turns between pieces, at headings."""
+    totals = np.zeros((3, headings.size))
     for i in range(headings.size):
-        heading = headings[i]
-        turned, room = rows.to_uv(survey, heading), rows.to_uv(allowed, heading)
+        turned, room = rows.to_uv(survey, headings[i]), rows.to_uv(allowed, headings[i])
         low, high = turned[:, 1].min(), turned[:, 1].max()
         offsets = rows.row_offsets(low, high, spacing, edge, passes)
         pieces, _ = rows.lay_rows(
             turned, room, offsets, passes * spacing / 2, overhang, step, min_steps
         )
-        ahead = hops.line_j(costs, 1.0, heading)
-        back = hops.line_j(costs, 1.0, heading + math.pi)
-        length = 0.0
-        for p in range(pieces.shape[0]):
-            length += pieces[p, 2] - pieces[p, 1]
-        parts = cells.chains(cells.followers(pieces))[0].size - 1
-        across = hops.line_j(costs, (high - low) * cross_lines, heading + math.pi / 2)
+        follower = cells.followers(pieces)
         # From cell to cell the way is some turns long.
-        turns = pieces.shape[0] + 2 * parts
-        result[i] = length * (ahead + back) / 2 + across + turns * turn_j
-    return result
+        totals[1, i], totals[2, i] = high - low, 3 * pieces.shape[0]
+        for p in range(pieces.shape[0]):
+            totals[0, i] += pieces[p, 2] - pieces[p, 1]
+            totals[2, i] -= 2 if follower[p] >= 0 else 0
+    return totals
 
 
 def _headings(area: Area, site: Site, pattern: Pattern) -> Array:

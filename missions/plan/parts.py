@@ -20,8 +20,8 @@ from alice_survey.core.errors import warn
 from missions.lines.lay import check_size, lay_lines
 from missions.lines.sweep import Sweep, best_heading
 from missions.route.dives import split_dives
-from missions.route.fence import TOUCH_M
-from missions.route.ways import Ways
+from missions.route.turns import Manoeuvre
+from missions.route.ways import TOUCH_M, Ways
 from missions.values.area import Area, multipolygon
 from missions.values.costs import Costs, power_at
 from missions.values.legs import Route
@@ -106,7 +106,7 @@ def transit_text(dives: Sequence[Dive], costs: Costs) -> str:
     homes = np.array([dive.home_ne_m for dive in dives])
     north_m, east_m = np.diff(homes, axis=0).T
     ways_s = np.hypot(north_m, east_m) / costs.speed_mps
-    power_w = [power_at(costs.way_w, course) for course in np.arctan2(east_m, north_m)]
+    power_w = power_at(costs.way_w, np.arctan2(east_m, north_m))
     return (
         f"At the surface the {ways_s.sum() * costs.speed_mps:.0f} m between them take "
         f"{ways_s.sum() / 60:.0f} min and {ways_s @ power_w / 3600:.1f} Wh"
@@ -178,16 +178,11 @@ def _plan_part(
     )
     dives = split_dives(
         lines,
-        ways=ways,
-        costs=costs,
+        Manoeuvre(costs, settings.arc_radius_m, settings.run_in_m, settings.turns, ways),
         home_ne=home_ne,
-        turn_radius_m=settings.arc_radius_m,
-        run_in_m=settings.run_in_m,
-        turns=settings.turns,
         usable_wh=usable_wh,
         max_s=math.inf if settings.dive_s is None else settings.dive_s,
         depth_m=depth_m,
-        split=True,
         tied=True,
     )
     return with_ties(PlannedDives(lines=tuple(lines), dives=dives, sweep=sweep))

@@ -13,7 +13,6 @@ done where it takes no dive more and little energy.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +21,7 @@ from alice_survey.core.compiled import compiled_ieee
 from alice_survey.core.errors import PlanError
 from alice_survey.core.frames import Array
 from alice_survey.core.run import progress
-from missions.route.turns import Turns, legs_alone, legs_through, line_table, route_of
-from missions.route.ways import Ways
+from missions.route.turns import Manoeuvre, legs_alone, legs_through, line_table, route_of
 from missions.values.costs import Costs, leg_row_costs
 from missions.values.line import Line
 from missions.values.plan_file import Dive
@@ -74,49 +72,34 @@ class _Sums:
 @progress.step("route the dives")
 def split_dives(
     lines: Sequence[Line],
+    how: Manoeuvre,
     *,
-    ways: Ways | None,
-    costs: Costs,
     home_ne: tuple[float, float],
-    turn_radius_m: float,
-    run_in_m: float,
-    turns: Turns,
     usable_wh: float,
     max_s: float | None,
     depth_m: float,
-    split: bool,
     tied: bool = False,
 ) -> tuple[Dive, ...]:
     """Divide lines into dives.
 
     Args:
         lines: in the order of flight.
-        ways: inside the allowed area; None: nothing is forbidden.
-        costs: of the vehicle.
+        how: turns, what the vehicle takes, and where it may be.
         home_ne: where each dive begins and ends at the surface.
-        turn_radius_m: of arcs.
-        run_in_m: straight before and after a line.
-        turns: how to turn.
         usable_wh: of the battery.
         max_s: of a dive, descent and ascent included; None: as long as the battery lasts.
         depth_m: that the vehicle goes down to and comes up from, once a dive.
-        split: whether there may be more than one.
         tied: whether each begins with the last line of the one before, which is not a fill line:
             their `first_line` is its `last_line`. They are not where that takes more dives, or
             more energy than `DEAREST_TIE` allows.
 
     Raises:
-        PlanError: a line does not fit a dive by itself; or all do not and may not be split; or a
-            course cannot be flown in the current.
+        PlanError: a line does not fit a dive by itself, or a course cannot be flown in the current.
     """
-    table = line_table(lines)
-    way: dict[str, Any] = {
-        "ways": ways, "costs": costs, "turns": turns, "home_ne": home_ne,
-        "turn_radius_m": turn_radius_m, "run_in_m": run_in_m,
-    }  # fmt: skip
+    table, costs = line_table(lines), how.costs
 
     def routed(first: int, last: int) -> Array:
-        return legs_through(table[first : last + 1], first_line=first, **way)
+        return legs_through(table[first : last + 1], how, home_ne=home_ne, first_line=first)
 
     limits = DiveLimits(energy_j=usable_wh * _J_PER_WH, time_s=math.inf if max_s is None else max_s)
     down_and_up = costs.dive_j(depth_m), costs.dive_s(depth_m)
@@ -127,9 +110,7 @@ def split_dives(
     if limits.hold(energy_j, time_s):
         return (_dive(0, len(lines) - 1, whole, float(energy_j), float(time_s)),)
 
-    sums = _sums(whole, spent, *legs_alone(table, **way), costs, depth_m)
-    if not split:
-        raise PlanError(_too_large(lines, sums, limits, float(energy_j), float(time_s)))
+    sums = _sums(whole, spent, *legs_alone(table, how, home_ne), costs, depth_m)
     parted = _min_dives(sums, limits)
     if parted is None:
         raise PlanError(_line_too_long(lines, sums, limits, depth_m))
@@ -313,30 +294,6 @@ def _line_too_long(lines: Sequence[Line], sums: _Sums, limits: DiveLimits, depth
         f"{_allowed(limits)}"
         + (f" ({len(over)} lines are too long)" if len(over) > 1 else "")
         + f": it needs {', or '.join(ways)}"
-    )
-
-
-def _too_large(
-    lines: Sequence[Line], sums: _Sums, limits: DiveLimits, energy_j: float, time_s: float
-) -> str:
-    """How much fits one dive, and the ways out."""
-    fitting = [i for i in range(len(lines)) if limits.hold(*sums.of(0, i))]
-    last = fitting[-1] if fitting else -1
-    done = sum(line.length_m for line in lines[: last + 1])
-    share = done / max(sum(line.length_m for line in lines), 1e-9)
-    parted = _min_dives(sums, limits)
-    ways = []
-    if parted is not None:
-        ways.append(f"split_dives = true ({len(parted)} dives)")
-    if energy_j > limits.energy_j:
-        ways.append(f"a battery with {_wh(energy_j)} above its reserve (vehicle.battery_wh)")
-    if time_s > limits.time_s:
-        ways.append(f"plan.dive_s = {math.ceil(time_s)}")
-    ways.append(f"survey no more than the {share:.0%} that fit")
-    return (
-        f"{len(lines)} lines take {_numbers(energy_j, time_s)}, but one dive has "
-        f"{_allowed(limits)}: the first {last + 1} lines fit ({done:.0f} m, {share:.0%}); "
-        + ", or ".join(ways)
     )
 
 

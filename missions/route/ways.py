@@ -1,4 +1,7 @@
-"""Ways inside a polygon with holes: whether a straight stays inside, and the shortest way.
+"""Ways inside a polygon with holes: what stays inside, and the shortest way.
+
+Touching is allowed: what is outside by no more than `TOUCH_M` counts as inside, so that rounding
+never keeps a vehicle from running along the edge.
 
 A shortest way bends only at corners that point into the allowed water, and there only round the
 corner (T. Lozano-Perez and M. A. Wesley 1979: visibility graph; H. Rohnert 1986: of it only the
@@ -15,52 +18,112 @@ import shapely
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
-from shapely.geometry import MultiPolygon, Polygon
+from scipy.spatial.distance import cdist
+from shapely.geometry import MultiPolygon, Polygon, box
 from shapely.geometry.polygon import orient
 
-from alice_survey.core.compiled import compiled_ieee
 from alice_survey.core.errors import PlanError
 from alice_survey.core.frames import Array
-from missions.route.fence import TOUCH_M, Fence, fence_of, point_inside, straight_inside
 from missions.values.area import multipolygon
 
 Place = tuple[float, float]
 
+TOUCH_M = 1e-6
+"""What is outside by less counts as inside: far below what any vehicle holds, far above rounding
+of coordinates of some kilometres."""
 COARSE_M = 0.05
 """How far ways that only order lines may cut corners: far less than a turn costs."""
 SMALL_M = 10.0
 """Girth of zones that ways for choosing a heading pass over: a detour round them is some 2 m."""
+_BLOCK = 1 << 20
+"""Pairs of places and corners that are looked at together."""
+
+
+class _Visibility(NamedTuple):
+    """The corners that places see: few of all."""
+
+    places: NDArray[np.intp]
+    """(K,) ascending."""
+    corners: NDArray[np.intp]
+    lengths_m: Array
 
 
 class Ways:
-    """The ways inside an allowed area.
-
-    What is outside by no more than `fence.TOUCH_M` counts as inside, so that ways may run along the
-    edge. Between parts that do not touch there is no way.
-    """
+    """The ways inside an allowed area; between parts that do not touch there is none."""
 
     def __init__(self, allowed: MultiPolygon) -> None:
-        """Sort the area's edges; no graph is built yet.
+        """Prepare the area; no graph is built yet.
 
         Args:
             allowed: x = north, y = east, metres; valid, not empty.
         """
         self.allowed = allowed
-        self.fence: Fence = fence_of(allowed)
-        self._from_node: dict[int, Array] = {}
+        self._water = shapely.buffer(allowed, TOUCH_M, join_style="mitre")
+        shapely.prepare(self._water)
+        self._convex = self._water.covers(allowed.convex_hull)
+        self._from_corner: dict[int, Array] = {}
+
+    def inside(self, places_ne: Array) -> NDArray[np.bool_]:
+        """Which places, (N, 2), are inside."""
+        return np.asarray(shapely.intersects_xy(self._water, *places_ne.T))
 
     def free(self, a: Place, b: Place) -> bool:
         """Whether the straight between two places is inside."""
-        return bool(straight_inside(self.fence, a[0], a[1], b[0], b[1]))
+        return bool(self.free_many(np.array([a]), np.array([b]))[0])
 
     def free_many(self, starts_ne: Array, ends_ne: Array) -> NDArray[np.bool_]:
         """Which straights from (N, 2) to (N, 2) are inside, (N,)."""
-        starts = np.ascontiguousarray(starts_ne, dtype=np.float64).reshape(-1, 2)
-        ends = np.ascontiguousarray(ends_ne, dtype=np.float64).reshape(-1, 2)
-        if starts.shape != ends.shape:
-            raise ValueError(f"{len(starts)} starts for {len(ends)} ends")
-        result: NDArray[np.bool_] = _straights_inside(self.fence, starts, ends)
-        return result
+        if len(starts_ne) != len(ends_ne):
+            raise ValueError(f"{len(starts_ne)} starts for {len(ends_ne)} ends")
+        if self._convex:
+            return self.inside(starts_ne) & self.inside(ends_ne)
+        straights = shapely.linestrings(np.stack([starts_ne, ends_ne], axis=1))
+        return np.asarray(shapely.covers(self._water, straights))
+
+    def arcs_free(
+        self, starts: Array, curvature_per_m: Array, length_m: Array
+    ) -> NDArray[np.bool_]:
+        """Which arcs and straights are inside, (N,): they begin inside and never meet the edge.
+
+        Args:
+            starts: (N, 3) north, east, heading.
+            curvature_per_m: (N,) positive to starboard.
+            length_m: (N,) at most one full turn.
+        """
+        free = self.inside(starts[:, :2])
+        bent = np.flatnonzero(free & (np.abs(curvature_per_m) * length_m >= 1e-12))
+        even = np.flatnonzero(free & (np.abs(curvature_per_m) * length_m < 1e-12))
+        ahead = np.stack([np.cos(starts[:, 2]), np.sin(starts[:, 2])], axis=1)
+        free[even] = self.free_many(
+            starts[even, :2], (starts[:, :2] + length_m[:, None] * ahead)[even]
+        )
+        radius, side = 1 / np.abs(curvature_per_m[bent]), np.sign(curvature_per_m[bent])
+        right = np.stack([-ahead[bent, 1], ahead[bent, 0]], axis=1)
+        centre = starts[bent, :2] + (side * radius)[:, None] * right
+        tree, edges = self._edges
+        arc, edge = tree.query(
+            shapely.box(*(centre - radius[:, None]).T, *(centre + radius[:, None]).T)
+        )
+        # Where the circle meets the edge: |begin + t span| = radius, a quadratic equation in t.
+        begin = edges[edge, :2] - centre[arc]
+        span = edges[edge, 2:] - edges[edge, :2]
+        square, along = (span**2).sum(axis=1), (begin * span).sum(axis=1)
+        inner = along**2 - square * ((begin**2).sum(axis=1) - radius[arc] ** 2)
+        root = np.sqrt(np.where(inner >= 0, inner, np.nan))
+        for share in ((-along - root) / square, (-along + root) / square):
+            north, east = (begin + share[:, None] * span).T
+            # From the centre the vehicle is a right angle to the side behind its heading.
+            turned = np.arctan2(east, north) - starts[bent[arc], 2] + side[arc] * math.pi / 2
+            swept = (side[arc] * turned) % (2 * math.pi) * radius[arc]
+            meets = (share >= 0) & (share <= 1) & (swept <= length_m[bent[arc]])
+            free[bent[arc[meets]]] = False
+        return free
+
+    @cached_property
+    def _edges(self) -> tuple[shapely.STRtree, Array]:
+        """The edges of what counts as inside, (E, 4), and a tree of them."""
+        edges = edges_of(multipolygon(self._water))
+        return shapely.STRtree(np.asarray(shapely.linestrings(edges.reshape(-1, 2, 2)))), edges
 
     @cached_property
     def coarse(self) -> "Ways":
@@ -69,12 +132,8 @@ class Ways:
         They may pass through up to `COARSE_M` of what is forbidden, never stop short of what is
         allowed; so they are as long or hardly shorter. None is flown.
         """
-        simple = self.allowed.simplify(COARSE_M)
-        corners = shapely.get_num_coordinates(self.allowed)
-        if shapely.get_num_coordinates(simple) == corners:
-            return self
-        joint = multipolygon(shapely.union(self.allowed, simple))
-        fewer = shapely.get_num_coordinates(joint) < corners
+        joint = multipolygon(shapely.union(self.allowed, self.allowed.simplify(COARSE_M)))
+        fewer = shapely.get_num_coordinates(joint) < shapely.get_num_coordinates(self.allowed)
         return Ways(joint) if fewer and len(joint.geoms) == len(self.allowed.geoms) else self
 
     @cached_property
@@ -93,39 +152,46 @@ class Ways:
         """Lengths of the shortest ways among places (N, 2), (N, N); inf where none is."""
         places, index = np.unique(places_ne, axis=0, return_inverse=True)
         index = index.ravel()
-        distances: Array = _straights_among(self.fence, places)
-        blocked = np.flatnonzero(np.isinf(distances).any(axis=1))
-        if len(blocked) and len(self._nodes):
-            self._round_corners(distances, blocked, blocked, places, places)
+        one, two = np.triu_indices(len(places))
+        distances = self._distances_m(places, places, one, two)
         return distances[index[:, None], index]
 
     def distances_m(self, a_ne: Array, b_ne: Array) -> Array:
         """Lengths of the shortest ways from places (N, 2) to (M, 2), (N, M); inf where none is."""
-        a = np.ascontiguousarray(a_ne, dtype=np.float64).reshape(-1, 2)
-        b = np.ascontiguousarray(b_ne, dtype=np.float64).reshape(-1, 2)
-        distances: Array = _straight_distances(self.fence, a, b)
-        if np.isfinite(distances).all() or len(self._nodes) == 0:
+        one, two = np.indices((len(a_ne), len(b_ne))).reshape(2, -1)
+        return self._distances_m(a_ne, b_ne, one, two)
+
+    def _distances_m(
+        self, a: Array, b: Array, one: NDArray[np.intp], two: NDArray[np.intp]
+    ) -> Array:
+        """(N, M) as of `distances_m`; of pairs that are not in (K,) lists the mirrored ones are."""
+        distances = cdist(a, b)
+        blocked = ~self.free_many(a[one], b[two])
+        distances[one[blocked], two[blocked]] = np.inf
+        if a is b:
+            distances[two[blocked], one[blocked]] = np.inf
+        if not blocked.any() or not len(self._nodes):
             return distances
-        blocked_a = np.flatnonzero(np.isinf(distances).any(axis=1))
-        blocked_b = np.flatnonzero(np.isinf(distances).any(axis=0))
-        self._round_corners(distances, blocked_a, blocked_b, a, b)
+        rows = np.flatnonzero(np.isinf(distances).any(axis=1))
+        columns = np.flatnonzero(np.isinf(distances).any(axis=0))
+        sight = self._sight(b[columns])
+        for block in np.array_split(rows, 1 + len(rows) * len(sight.places) // (16 * _BLOCK)):
+            through = self._through(a[block], sight.corners) + sight.lengths_m
+            over = _least(through.T, sight.places, len(columns)).T
+            here = np.ix_(block, columns)
+            distances[here] = np.where(np.isinf(distances[here]), over, distances[here])
         return distances
 
     def lengths_m(self, starts_ne: Array, ends_ne: Array) -> Array:
         """Lengths, (N,), of the shortest ways from (N, 2) to (N, 2); inf where none is."""
-        starts = np.ascontiguousarray(starts_ne, dtype=np.float64).reshape(-1, 2)
-        ends = np.ascontiguousarray(ends_ne, dtype=np.float64).reshape(-1, 2)
-        blocked = np.flatnonzero(~self.free_many(starts, ends))
-        lengths: Array = np.hypot(*(ends - starts).T)
+        blocked = np.flatnonzero(~self.free_many(starts_ne, ends_ne))
+        lengths: Array = np.hypot(*(ends_ne - starts_ne).T)
         lengths[blocked] = np.inf
-        if len(blocked) == 0 or len(self._nodes) == 0:
-            return lengths
-        seen_a, seen_b = self._seen(starts[blocked]), self._seen(ends[blocked])
-        used = np.flatnonzero(np.isfinite(seen_a).any(axis=0))
-        goals = np.flatnonzero(np.isfinite(seen_b).any(axis=0))
-        seen_a, seen_b = seen_a[:, used], seen_b[:, goals]
-        between = self._between(used, goals)
-        lengths[blocked] = _over_corners(_listed(seen_a), _listed(seen_b), between)
+        if len(blocked) and len(self._nodes):
+            sight = self._sight(ends_ne[blocked])
+            through = self._through(starts_ne[blocked], sight.corners)
+            over = through[sight.places, np.arange(len(sight.places))] + sight.lengths_m
+            lengths[blocked] = _least(over, sight.places, len(blocked))
         return lengths
 
     def path_ne(self, a: Place, b: Place) -> Array:
@@ -134,57 +200,40 @@ class Ways:
         Raises:
             PlanError: a place is outside, or they are in parts that are not connected.
         """
+        ends = np.array([a, b])
         if self.free(a, b):
-            return np.array([a, b])
-        for place in (a, b):
-            if not point_inside(self.fence, place[0], place[1]):
-                raise PlanError(
-                    f"the place {place[0]:.2f} m north, {place[1]:.2f} m east is outside of the "
-                    "allowed area: move it, or widen area.turn_margin_m or the allowed area"
-                )
-        best_m, chain = self._over_nodes(np.array([a]), np.array([b]))
-        if math.isinf(best_m):
+            return ends
+        for north, east in ends[~self.inside(ends)]:
+            raise PlanError(
+                f"the place {north:.2f} m north, {east:.2f} m east is outside of the allowed area: "
+                "move it, or widen area.turn_margin_m or the allowed area"
+            )
+        near, far = self._sight(ends[:1]), self._sight(ends[1:])
+        through, before = np.full((1, 1), np.inf), np.empty((0, 0), np.int32)
+        if len(near.corners) and len(far.corners):
+            between, before = dijkstra(
+                self._graph, directed=False, indices=near.corners, return_predecessors=True
+            )
+            through = near.lengths_m[:, None] + between[:, far.corners] + far.lengths_m
+        first, last = np.unravel_index(np.argmin(through), through.shape)
+        if math.isinf(through[first, last]):
             raise PlanError(
                 f"no way inside the allowed area from {a[0]:.2f} m north, {a[1]:.2f} m east to "
                 f"{b[0]:.2f} m north, {b[1]:.2f} m east: its parts are not connected; widen "
                 "the allowed area (area.turn_margin_m), or survey the parts one by one"
             )
-        path = np.concatenate([[a], self._nodes[chain, :2], [b]])
-        moved = np.linalg.norm(np.diff(path, axis=0), axis=1) > TOUCH_M
-        moved[-1] |= not moved.any()
-        kept = np.concatenate([[True], moved])
+        chain = [int(far.corners[last])]
+        while chain[-1] != near.corners[first]:
+            chain.append(int(before[first, chain[-1]]))
+        path = np.concatenate([ends[:1], self._nodes[chain[::-1], :2], ends[1:]])
+        moves = np.linalg.norm(np.diff(path, axis=0), axis=1) > TOUCH_M
+        moves[-1] |= not moves.any()
+        kept = np.concatenate([[True], moves])
         kept[-1] = True
-        if not moved[-1]:
+        if not moves[-1]:
             kept[np.flatnonzero(kept[:-1])[-1]] = False  # a corner that is the goal itself
         result: Array = path[kept]
         return result
-
-    def _over_nodes(self, a: Array, b: Array) -> tuple[float, list[int]]:
-        """The shortest way over corners between two places, (1, 2) each: length, and which."""
-        size = len(self._nodes)
-        if size == 0:
-            return math.inf, []
-        seen_a, seen_b = self._seen(a)[0], self._seen(b)[0]
-        near, graph = np.flatnonzero(np.isfinite(seen_a)), self._graph
-        # The place is one more corner; an edge of no length would be none.
-        joint = csr_array(
-            (
-                np.append(graph.data, np.maximum(seen_a[near], 1e-12)),
-                np.append(graph.indices, near),
-                np.append(graph.indptr, graph.nnz + len(near)),
-            ),
-            shape=(size + 1, size + 1),
-        )
-        found = dijkstra(joint, directed=False, indices=[size], return_predecessors=True)
-        far, before = found[0][0], found[1][0]
-        through = far[:size] + seen_b
-        node = int(np.argmin(through))
-        if math.isinf(through[node]):
-            return math.inf, []
-        chain = [node]
-        while before[chain[-1]] != size:
-            chain.append(int(before[chain[-1]]))
-        return float(through[node]), chain[::-1]
 
     @cached_property
     def _nodes(self) -> Array:
@@ -201,192 +250,81 @@ class Ways:
             arriving, leaving = corners - before, after - corners
             turn = arriving[:, 0] * leaving[:, 1] - arriving[:, 1] * leaving[:, 0]
             nodes.append(np.concatenate([corners, before, after], axis=1)[turn < 0])
-        return np.ascontiguousarray(np.concatenate(nodes))
+        return np.concatenate(nodes)
 
     @cached_property
     def _graph(self) -> csr_array:
-        rows, columns, lengths = _tangents(self.fence, self._nodes)
-        size = len(self._nodes)
-        return csr_array((lengths, (rows, columns)), shape=(size, size))
+        """Lengths of the straights between corners that are inside and touch at both."""
+        corners = self._nodes[:, :2]
+        passes = self._passes(corners)
+        one, two = np.nonzero(np.triu(passes & passes.T, 1))
+        free = self.free_many(corners[one], corners[two])
+        one, two = one[free], two[free]
+        # Corners of two rings at one place are joined by a way of almost no length.
+        lengths = np.maximum(np.hypot(*(corners[two] - corners[one]).T), 1e-12)
+        return csr_array((lengths, (one, two)), shape=(len(corners), len(corners)))
 
-    def _between(self, nodes: NDArray[np.intp], goals: NDArray[np.intp]) -> Array:
-        """(U, V) lengths of the shortest ways from corners to corners; ways to all are kept."""
-        new = [node for node in nodes.tolist() if node not in self._from_node]
-        if new:
-            distances = dijkstra(self._graph, directed=False, indices=new)
-            self._from_node |= dict(zip(new, distances, strict=True))
-        rows = [self._from_node[node][goals] for node in nodes.tolist()]
-        return np.array(rows).reshape(len(rows), len(goals))
-
-    def _round_corners(
-        self,
-        distances: Array,
-        blocked_a: NDArray[np.intp],
-        blocked_b: NDArray[np.intp],
-        a: Array,
-        b: Array,
-    ) -> None:
-        """Fill what is infinite of distances from (N, 2) to (M, 2) by ways over corners."""
-        seen_a = seen_b = self._seen(a[blocked_a])
-        if b is not a:
-            seen_b = self._seen(b[blocked_b])
-        used = np.flatnonzero(np.isfinite(seen_a).any(axis=0))
-        goals = np.flatnonzero(np.isfinite(seen_b).any(axis=0))
-        seen_a, seen_b = seen_a[:, used], seen_b[:, goals]
-        between = self._between(used, goals)
-        _shorten(distances, blocked_a, blocked_b, _listed(seen_a), _listed(seen_b), between)
-
-    def _seen(self, points_ne: Array) -> Array:
-        """(N, V) distances to the corners that can be seen and passed; inf of the others."""
-        seen: Array = _seen(self.fence, self._nodes, np.ascontiguousarray(points_ne))
-        return seen
-
-
-@compiled_ieee
-def _straights_inside(fence: Fence, starts: Array, ends: Array) -> NDArray[np.bool_]:
-    result = np.empty(starts.shape[0], dtype=np.bool_)
-    for i in range(starts.shape[0]):
-        result[i] = straight_inside(fence, starts[i, 0], starts[i, 1], ends[i, 0], ends[i, 1])
-    return result
-
-
-@compiled_ieee
-def _straight_distances(fence: Fence, a: Array, b: Array) -> Array:
-    """(N, M) lengths of the straights that are inside; inf of the others."""
-    result = np.full((a.shape[0], b.shape[0]), np.inf)
-    for i in range(a.shape[0]):
-        for j in range(b.shape[0]):
-            if straight_inside(fence, a[i, 0], a[i, 1], b[j, 0], b[j, 1]):
-                result[i, j] = math.hypot(b[j, 0] - a[i, 0], b[j, 1] - a[i, 1])
-    return result
-
-
-@compiled_ieee
-def _straights_among(fence: Fence, places: Array) -> Array:
-    """(N, N) lengths of the straights among places that are inside; inf of the others."""
-    result = np.full((places.shape[0], places.shape[0]), np.inf)
-    for i in range(places.shape[0]):
-        for j in range(i, places.shape[0]):
-            if straight_inside(fence, places[i, 0], places[i, 1], places[j, 0], places[j, 1]):
-                length = math.hypot(places[j, 0] - places[i, 0], places[j, 1] - places[i, 1])
-                result[i, j] = result[j, i] = length
-    return result
-
-
-@compiled_ieee
-def _passes(nodes: Array, i: int, north: float, east: float) -> bool:
-    """Whether a taut way from a place may bend at a corner: both its edges are on one side."""
-    u, v = nodes[i, 0] - north, nodes[i, 1] - east
-    length = math.hypot(u, v)
-    if length <= TOUCH_M:
-        return True
-    one = (u * (nodes[i, 3] - east) - v * (nodes[i, 2] - north)) / length
-    two = (u * (nodes[i, 5] - east) - v * (nodes[i, 4] - north)) / length
-    passes: bool = max(one, two) <= TOUCH_M or min(one, two) >= -TOUCH_M
-    return passes
-
-
-@compiled_ieee
-def _seen(fence: Fence, nodes: Array, points: Array) -> Array:
-    result = np.full((points.shape[0], nodes.shape[0]), np.inf)
-    for i in range(points.shape[0]):
-        n, e = points[i, 0], points[i, 1]
-        for j in range(nodes.shape[0]):
-            if _passes(nodes, j, n, e) and straight_inside(fence, n, e, nodes[j, 0], nodes[j, 1]):
-                result[i, j] = math.hypot(nodes[j, 0] - n, nodes[j, 1] - e)
-    return result
-
-
-@compiled_ieee
-def _tangents(fence: Fence, nodes: Array) -> tuple[NDArray[np.int32], NDArray[np.int32], Array]:
-    """Pairs of corners (each once) whose straight is inside and touches at both, with lengths."""
-    count, room = 0, 4 * nodes.shape[0] + 16
-    rows, columns = np.empty(room, dtype=np.int32), np.empty(room, dtype=np.int32)
-    lengths = np.empty(room)
-    for i in range(nodes.shape[0]):
-        for j in range(i + 1, nodes.shape[0]):
-            if not _passes(nodes, j, nodes[i, 0], nodes[i, 1]):
-                continue
-            if not _passes(nodes, i, nodes[j, 0], nodes[j, 1]):
-                continue
-            if not straight_inside(fence, nodes[i, 0], nodes[i, 1], nodes[j, 0], nodes[j, 1]):
-                continue
-            if count == room:
-                room *= 2
-                old = rows, columns, lengths
-                rows, columns = np.empty(room, dtype=np.int32), np.empty(room, dtype=np.int32)
-                lengths = np.empty(room)
-                for k in range(count):
-                    rows[k], columns[k], lengths[k] = old[0][k], old[1][k], old[2][k]
-            rows[count], columns[count] = i, j
-            # Corners of two rings at one place are joined by a way of almost no length.
-            lengths[count] = max(
-                math.hypot(nodes[j, 0] - nodes[i, 0], nodes[j, 1] - nodes[i, 1]), 1e-12
+    def _passes(self, places_ne: Array) -> NDArray[np.bool_]:
+        """Whether taut ways from places may bend at corners, (N, V): both edges are on one side."""
+        corner, before, after = self._nodes[:, :2], self._nodes[:, 2:4], self._nodes[:, 4:]
+        passes = np.empty((len(places_ne), len(corner)), dtype=np.bool_)
+        rows = max(_BLOCK // max(len(corner), 1), 1)
+        for first in range(0, len(places_ne), rows):
+            place = places_ne[first : first + rows, None]
+            ahead = corner - place
+            reach = TOUCH_M * np.hypot(ahead[..., 0], ahead[..., 1])
+            one, two = (
+                ahead[..., 0] * (x - place)[..., 1] - ahead[..., 1] * (x - place)[..., 0]
+                for x in (before, after)
             )
-            count += 1
-    return rows[:count], columns[:count], lengths[:count]
+            passes[first : first + rows] = (
+                (np.maximum(one, two) <= reach)
+                | (np.minimum(one, two) >= -reach)
+                | (reach <= TOUCH_M**2)
+            )
+        return passes
+
+    def _sight(self, places_ne: Array) -> _Visibility:
+        """The corners that places, (N, 2), see and may pass."""
+        corners = self._nodes[:, :2]
+        place, corner = np.nonzero(self._passes(places_ne))
+        free = self.free_many(places_ne[place], corners[corner])
+        place, corner = place[free], corner[free]
+        return _Visibility(place, corner, np.hypot(*(corners[corner] - places_ne[place]).T))
+
+    def _through(self, places_ne: Array, goals: NDArray[np.intp]) -> Array:
+        """Lengths, (N, G), of the shortest ways over corners from places to corners, all kept."""
+        sight = self._sight(places_ne)
+        new = [node for node in np.unique(sight.corners).tolist() if node not in self._from_corner]
+        if new:
+            found = dijkstra(self._graph, directed=False, indices=new)
+            self._from_corner |= dict(zip(new, found, strict=True))
+        if not len(sight.corners):
+            return np.full((len(places_ne), len(goals)), np.inf)
+        goals, column = np.unique(goals, return_inverse=True)
+        between = np.array([self._from_corner[node][goals] for node in sight.corners.tolist()])
+        lengths = _least(sight.lengths_m[:, None] + between, sight.places, len(places_ne))
+        return lengths[:, column]
 
 
-class _Listed(NamedTuple):
-    """The corners that places see: few of all."""
-
-    firsts: NDArray[np.intp]
-    """(N + 1,) start of each place's list."""
-    nodes: NDArray[np.intp]
-    lengths_m: Array
-
-
-def _listed(seen: Array) -> _Listed:
-    """The finite ones of distances (N, V) from places to corners."""
-    places, nodes = np.nonzero(np.isfinite(seen))
-    firsts = np.searchsorted(places, np.arange(len(seen) + 1))
-    return _Listed(firsts=firsts, nodes=nodes, lengths_m=seen[places, nodes])
+def _least(values: Array, owners: NDArray[np.intp], count: int) -> Array:
+    """The least of the rows, (K, ...), of each owner, ascending: (count, ...), inf of no rows."""
+    least = np.full((count, *values.shape[1:]), np.inf)
+    known, firsts = np.unique(owners, return_index=True)
+    if len(known):
+        least[known] = np.minimum.reduceat(values, firsts, axis=0)
+    return least
 
 
-@compiled_ieee
-def _shorten(
-    distances: Array,
-    blocked_a: NDArray[np.intp],
-    blocked_b: NDArray[np.intp],
-    seen_a: _Listed,
-    seen_b: _Listed,
-    between: Array,
-) -> None:
-    """Fill the blocked distances with those of the ways over corners.
-
-    Args:
-        distances: (N, M) to fill.
-        blocked_a: (A,) rows with something blocked.
-        blocked_b: (B,) columns the same way.
-        seen_a: from the A places to U corners.
-        seen_b: from the B places to V corners.
-        between: (U, V)
-    """
-    size = between.shape[1]
-    through = np.empty(size)
-    for i in range(blocked_a.shape[0]):
-        through[:] = np.inf
-        for k in range(seen_a.firsts[i], seen_a.firsts[i + 1]):
-            node, length = seen_a.nodes[k], seen_a.lengths_m[k]
-            for other in range(size):
-                through[other] = min(through[other], length + between[node, other])
-        for j in range(blocked_b.shape[0]):
-            if distances[blocked_a[i], blocked_b[j]] < np.inf:
-                continue
-            best = np.inf
-            for k in range(seen_b.firsts[j], seen_b.firsts[j + 1]):
-                best = min(best, through[seen_b.nodes[k]] + seen_b.lengths_m[k])
-            distances[blocked_a[i], blocked_b[j]] = best
+def edges_of(polygons: MultiPolygon) -> Array:
+    """Both ends, (E, 4) north and east, of every edge of every ring."""
+    coordinates, ring_of = shapely.get_coordinates(
+        shapely.get_rings(list(polygons.geoms)), return_index=True
+    )
+    both = np.concatenate([coordinates[:-1], coordinates[1:]], axis=1)
+    edges: Array = np.ascontiguousarray(both[ring_of[:-1] == ring_of[1:]], dtype=np.float64)
+    return edges
 
 
-@compiled_ieee
-def _over_corners(seen_a: _Listed, seen_b: _Listed, between: Array) -> Array:
-    """(N,) lengths of ways over corners; arguments as of `_shorten`, row by row."""
-    count = seen_a.firsts.size - 1
-    result = np.full(count, np.inf)
-    for i in range(count):
-        for k in range(seen_b.firsts[i], seen_b.firsts[i + 1]):
-            for m in range(seen_a.firsts[i], seen_a.firsts[i + 1]):
-                length = seen_a.lengths_m[m] + between[seen_a.nodes[m], seen_b.nodes[k]]
-                result[i] = min(result[i], length + seen_b.lengths_m[k])
-    return result
+OPEN_WATER = Ways(multipolygon(box(-1e7, -1e7, 1e7, 1e7)))
+"""Ways where nothing is forbidden."""

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from alice_survey.core.compiled import compiled_ieee
 from alice_survey.core.errors import PlanError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.pilot.settings import STEP_MPS, TURN_IN_PLACE_RAD_S
@@ -19,7 +18,7 @@ in the simulator with exact navigation: ALICE turns by 90 degrees at 15 deg/s in
 
 
 class Costs(NamedTuple):
-    """Electrical power by course, and what turns take; compiled code takes it as it is.
+    """Electrical power by course, and what turns take.
 
     Along a line the heading is held and a current from the side is met by sway; on the way between
     lines the vehicle may crab.
@@ -52,7 +51,7 @@ class Costs(NamedTuple):
     """The error that says, of a leg in words, that the current forbids it, with the ways out."""
 
     def compilable(self, max_w: float = math.inf) -> "Costs":
-        """The costs for compiled code.
+        """The costs with bounded powers.
 
         Args:
             max_w: powers by course are no higher; finite where totals have to be compared.
@@ -99,22 +98,23 @@ def time_costs(
     )
 
 
-@compiled_ieee
-def power_at(power_w: Array, course_rad: float) -> float:
-    """Power at a course, between the even samples of a full turn; infinite next to an infinite one.
+def power_at(power_w: Array, course_rad: Array | float) -> Array:
+    """Power at courses, between the even samples of a full turn.
 
     Args:
         power_w: (K,) from north on.
-        course_rad: any angle.
+        course_rad: any angles.
+
+    Returns:
+        As many powers; infinite next to an infinite one.
     """
-    count = power_w.size
-    place = course_rad / (2.0 * math.pi) * count
-    low = math.floor(place)
-    share = place - low
-    one, two = power_w[int(low) % count], power_w[(int(low) + 1) % count]
+    place = np.asarray(course_rad) / (2.0 * math.pi) * len(power_w)
+    finite = np.isfinite(power_w)
+    if finite.all():
+        return _at(power_w, place)
     # On a sample nothing of the next one counts, though it may be infinite.
-    power: float = one if share == 0.0 else (1.0 - share) * one + share * two
-    return power
+    power = _at(np.where(finite, power_w, 0.0), place)
+    return np.where(_at(np.where(finite, 0.0, 1.0), place) > 0.0, np.inf, power)
 
 
 def leg_costs(route: Route, costs: Costs) -> tuple[Array, Array]:

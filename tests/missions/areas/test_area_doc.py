@@ -7,8 +7,7 @@ import pyogrio.raw
 import pytest
 import shapely
 
-from alice_survey.core.config import AreaConfig, load_config
-from missions.areas.files import SUFFIXES
+from alice_survey.core.config import load_config
 from missions.areas.survey import survey_area
 
 DOC = (Path(__file__).parents[3] / "docs" / "areas.md").read_text(encoding="utf-8")
@@ -47,10 +46,3 @@ def test_an_example_gives_an_area_without_a_warning(
     assert area.survey.area > 100
     assert area.allowed.area > area.survey.area * 0.999
     assert capsys.readouterr().err == ""
-
-
-def test_the_doc_names_every_setting_and_kind_of_file() -> None:
-    settings = {name for name in AreaConfig.model_fields if not name.startswith("bathymetry")}
-    assert {name for name in settings if name not in DOC} == set()
-    assert [suffix for suffix in SUFFIXES if f"`{suffix}`" not in DOC] == []
-    assert len(EXAMPLES) >= 10

@@ -94,13 +94,6 @@ def test_a_shore_without_a_word_on_its_sign_is_refused(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_bathymetry(path, DATUM, sense="heights").depth_m, -depths)
 
 
-def test_a_sea_floor_above_water_is_warned_of(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    read_bathymetry(_written(tmp_path / "m.tif", _plane(), description="elevation"), DATUM)
-    assert "100%" in capsys.readouterr().err
-
-
 def test_depth_is_bilinear_between_centres_of_cells(tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
     values = rng.uniform(10, 20, (12, 17))
@@ -139,15 +132,6 @@ def test_next_to_a_gap_nothing_is_known_and_on_the_next_centre_all(tmp_path: Pat
     assert at(23.0, 19.0) == pytest.approx(values[19, 23], abs=1e-5)
 
 
-def test_offsets_are_looked_up_as_places(tmp_path: Path) -> None:
-    rng = np.random.default_rng(9)
-    found = read_bathymetry(_written(tmp_path / "o.tif", rng.uniform(10, 11, (20, 24))), DATUM)
-    places, offsets = rng.uniform(-14, 14, (30, 2)), rng.uniform(-2, 2, (30, 7, 2))
-    apart = found.depth_at(places[:, None] + offsets)
-    np.testing.assert_allclose(found.depth_about(places, offsets), apart, atol=1e-4)
-    assert np.isfinite(apart).mean() > 0.9
-
-
 @pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:3857", "EPSG:32635", "EPSG:2039"])
 def test_any_coordinate_system_gives_the_same_floor(tmp_path: Path, crs: str) -> None:
     """A plane of latitude and longitude, written in other systems on their own grids."""
@@ -171,23 +155,6 @@ def test_any_coordinate_system_gives_the_same_floor(tmp_path: Path, crs: str) ->
     expected = 20 + 3e3 * (geodetic[:, 1] - 34.9553) - 2e3 * (geodetic[:, 0] - 32.8236)
     np.testing.assert_allclose(depth, expected, atol=1e-5)
     assert 0.5 < found.cell_m < 3.0
-
-
-def test_a_raster_turned_on_its_side_reads_alike(tmp_path: Path) -> None:
-    x, y = DATUM_UTM
-    cos, sin = 1.5 * math.cos(math.radians(30)), 1.5 * math.sin(math.radians(30))
-    turned = Affine(cos, sin, x - 20 * (cos + sin), sin, -cos, y - 20 * (sin - cos))
-    column, row = np.meshgrid(np.arange(40) + 0.5, np.arange(40) + 0.5)
-    east, north = _xy(turned, column, row)
-    values = 12 + 0.1 * (np.asarray(east) - x) + 0.04 * (np.asarray(north) - y)
-    found = read_bathymetry(_written(tmp_path / "t.tif", values, transform=turned), DATUM)
-    points = np.random.default_rng(4).uniform(-12, 12, (60, 2))
-    geodetic = DATUM.geodetic_from_ned(np.column_stack([points, np.full(60, 12.0)]))
-    px, py = TO_UTM.transform(geodetic[:, 1], geodetic[:, 0])
-
-    np.testing.assert_allclose(
-        found.depth_at(points), 12 + 0.1 * (px - x) + 0.04 * (py - y), atol=1e-6
-    )
 
 
 def test_only_the_window_is_read_and_says_the_same(
@@ -251,17 +218,6 @@ def real(shared_data: Path) -> tuple[Path, Datum]:
     return path, Datum(lat, lon)
 
 
-def test_a_real_grid_reads_as_its_notes_say(real: tuple[Path, Datum]) -> None:
-    """1478 x 1707 cells of 2 m, 1,157,306 valid, -52.96 to -50.99 m."""
-    path, datum = real
-    whole = read_bathymetry(path, datum)
-    assert whole.depth_m.shape == (1478, 1707)
-    assert len(whole.known_m) == 1_157_306
-    assert whole.known_m.min() == pytest.approx(50.99, abs=0.005)
-    assert whole.known_m.max() == pytest.approx(52.96, abs=0.005)
-    assert whole.cell_m == pytest.approx(2.0, abs=0.002)
-
-
 def test_a_window_of_a_real_grid_equals_gdals_own_samples(real: tuple[Path, Datum]) -> None:
     path, datum = real
     window: Bathymetry = read_bathymetry(path, datum, bounds_ne=(-150.0, -150.0, 150.0, 150.0))
@@ -295,15 +251,3 @@ def test_points_that_span_far_more_than_they_fill(tmp_path: Path) -> None:
     path.write_text("\n".join([*rows, "900000 20 15"]) + "\n")
     with pytest.raises(PlanError, match=r"a\.xyz"):
         read_bathymetry(path, DATUM, crs=UTM, sense="depths")
-
-
-def test_an_area_that_lies_in_the_raster_when_swapped_is_said_to_be(tmp_path: Path) -> None:
-    path = _written(tmp_path / "d.tif", _plane())
-    for place, is_swapped in (
-        (Datum(DATUM.longitude_deg, DATUM.latitude_deg), True),
-        (Datum(34.9, 32.8236), False),
-        (Datum(-33.0, 151.0), False),
-    ):
-        with pytest.raises(PlanError, match="does not reach the survey area") as caught:
-            read_bathymetry(path, place, bounds_ne=(0.0, 0.0, 5.0, 5.0))
-        assert ("latitude and longitude swapped" in str(caught.value)) is is_swapped

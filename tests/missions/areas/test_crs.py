@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pyproj import CRS, Geod, Transformer
+from pyproj import Geod, Transformer
 from shapely.geometry import Polygon
 
 from alice_survey.core.config import AreaConfig
 from alice_survey.core.errors import PlanError
 from alice_survey.core.frames import Datum
-from missions.areas.crs import LocalFrame, geographic_shapes, parse_crs
-from missions.areas.raw import from_geometries
+from missions.areas.crs import LocalFrame
 from missions.areas.survey import survey_area
 from missions.values.area import Area
 
@@ -132,20 +131,6 @@ def test_coordinates_that_cannot_be_are_refused_with_the_corner(
         area_of(wkt, crs)
     assert named in str(fault.value)
     assert "\n" not in str(fault.value)
-
-
-def test_a_system_that_is_badly_tied_to_wgs84_is_warned_of(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    shape = from_geometries("old.wkt", [Polygon([(24.0, 38.0), (24.001, 38.0), (24.0, 38.001)])])
-    found = geographic_shapes(shape, parse_crs("EPSG:4230"))
-    # ED50 lies some 150 m off WGS 84 in Greece.
-    lat, lon = found.polygons[0][0][0]
-    off_m = WGS84.inv(lon, lat, 24.0, 38.0)[2]
-    assert 100 < off_m < 250
-    assert "ED50" in capsys.readouterr().err
-    geographic_shapes(shape, CRS("EPSG:4258"))
-    assert capsys.readouterr().err == ""
 
 
 def test_depth_moves_corners_together_as_the_earth_is_round() -> None:

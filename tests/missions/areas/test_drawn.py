@@ -151,13 +151,6 @@ def test_marks_that_cannot_be_drawn_are_carried_over(tmp_path: Path) -> None:
     assert zones[1].area > zones[0].area + 1.0
 
 
-def test_a_lost_file_is_drawn_again(tmp_path: Path) -> None:
-    before = AreaConfig(file=tmp_path / "gone.kml", latitude_deg=10.0, longitude_deg=20.0)
-    values, files = area_settings(DrawnShapes(survey=(SQUARE,)), before)
-    assert values == {"file": None, "polygon_ne_m": [[0, 0], [10, 0], [10, 10], [0, 10]]}
-    assert not files
-
-
 @pytest.mark.parametrize("corner", [(1e6, 0.0), (3e4, 0.0), (0.0, -2.1e4)])
 def test_corners_out_of_reach_are_refused(corner: tuple[float, float]) -> None:
     far = DrawnPolygon(outer=(*SQUARE.outer, corner), holes=(ZONE.outer,))

@@ -16,7 +16,6 @@ from shapely.geometry.base import BaseGeometry
 from alice_survey.core.config import AreaConfig
 from alice_survey.core.errors import PlanError
 from missions.areas import safe
-from missions.areas.files import read_area_file
 from missions.areas.survey import survey_area
 from missions.values.area import Area
 
@@ -155,21 +154,6 @@ def test_geojson_in_metres_that_does_not_say_so_needs_crs(tmp_path: Path, wanted
     file.write_text(shapely.to_geojson(SITE))
     assert "crs" in refusal(file=file)
     assert area_of(file=file, crs="EPSG:32636").survey.area == pytest.approx(wanted.survey.area)
-
-
-def test_a_crs_that_the_file_contradicts_is_warned_of(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    area_of(file=make("gpkg", tmp_path), crs="EPSG:32637")
-    assert "EPSG:32637" in capsys.readouterr().err
-
-
-def test_a_wrong_system_lands_far_from_the_datum(tmp_path: Path) -> None:
-    site = shapefile(tmp_path)
-    site.with_suffix(".prj").unlink()
-    assert "(32.88, 35.14)" in refusal(
-        file=site, crs="EPSG:32637", latitude_deg=32.88, longitude_deg=35.14
-    )
 
 
 def test_layers_are_chosen_by_name(tmp_path: Path, wanted: Area) -> None:
@@ -339,35 +323,3 @@ def test_too_many_corners_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "coast.wkt"
     file.write_text(ring.wkt)
     assert "200000" in refusal(file=file)
-
-
-def test_reading_gives_degrees_whatever_the_file(tmp_path: Path) -> None:
-    shapes = read_area_file(make("gpkg", tmp_path), None, None)
-    assert shapes.geographic
-    expected = shapely.get_coordinates(in_degrees(SITE))[:, ::-1]
-    np.testing.assert_allclose(shapes.coordinates, expected, atol=1e-9)
-
-
-def test_wkt_whose_srid_contradicts_crs_is_refused() -> None:
-    text = refusal(wkt="SRID=4326;POLYGON ((0 0, 1 0, 1 1, 0 0))", crs="EPSG:32636")
-    assert "SRID=4326" in text and "EPSG:32636" in text
-
-
-def test_files_whose_side_files_are_damaged(tmp_path: Path) -> None:
-    shp = shapefile(tmp_path)
-    prj = shp.with_suffix(".prj")
-    whole = prj.read_bytes()
-    for spoilt in (b"PROJCS[", b"\xff\xfe\0", whole.replace(b"6378137.0", b"-1")):
-        prj.write_bytes(spoilt)
-        assert "site.shp" in refusal(file=shp)
-
-
-def test_archives_packed_in_an_unknown_way(tmp_path: Path) -> None:
-    file = zipped(tmp_path / "a.kmz", {"doc.kml": b"<kml/>"})
-    whole = bytearray(file.read_bytes())
-    at = whole.find(b"PK\1\2")
-    for place, value in ((6, 99), (10, 77), (8, 0x801)):
-        spoilt = bytearray(whole)
-        spoilt[at + place : at + place + 2] = value.to_bytes(2, "little")
-        file.write_bytes(spoilt)
-        assert "a.kmz" in refusal(file=file)

@@ -108,12 +108,13 @@ def _mission(kind: str, **item: object) -> dict[str, Any]:
         ({"fileType": "Rally"}, "fileType"),
         ({"mission": {"items": []}}, "'mission'"),
         ({"mission": {"items": 3}}, "mission.items"),
-        (_mission("survey", polygon=[[1]]), "item 1 (survey)"),
-        (_mission("survey", polygon=[[135, 1]] * 3), "item 1 (survey), corner 1 "),
-        (_mission("survey", polygon=[[10**400, 35.0], *POLYGON[1:]]), "item 1"),
+        (_mission("survey", polygon=[[1]]), "mission.items.0.polygon"),
+        (_mission("survey"), "0 distinct corners"),
+        (_mission("survey", polygon=[[135, 1]] * 3), "mission 1, corner 1 "),
+        (_mission("survey", polygon=[[10**400, 35.0], *POLYGON[1:]]), "items.0.polygon.0"),
         (_mission("CorridorScan", polyline=POLYGON, CorridorWidth=0), "CorridorWidth"),
         (_mission("CorridorScan", polyline=POLYGON, CorridorWidth=1e300), "CorridorWidth"),
-        ({"geoFence": {"polygons": [{"polygon": POLYGON}]}}, "geoFence.polygons 1"),
+        ({"geoFence": {"polygons": [{"polygon": POLYGON}]}}, "geoFence.polygons.0"),
     ],
 )
 def test_a_plan_that_cannot_be_is_refused(write: Any, change: dict[str, Any], named: str) -> None:

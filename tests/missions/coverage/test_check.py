@@ -12,12 +12,11 @@ from shapely.geometry.base import BaseGeometry
 
 from alice_survey.core.artefacts import Stage, run_stage, write_json
 from alice_survey.core.config import SurveyConfig
-from alice_survey.core.errors import NavigationError, PlanError, WorkspaceError
 from alice_survey.kit.words import share
 from camera_calib.mount import mount_rotation
 from camera_calib.rig import Rig, design_rig, write_rig
 from missions.coverage.certificate import Certificate, certificate
-from missions.coverage.holes import Hole, find_holes
+from missions.coverage.holes import Hole
 from missions.coverage.stations import Stations, joined, plan_pattern, stations_of_plan
 from missions.fly.check import check_report, rig_of
 from missions.fly.refly import refly_plan, to_see
@@ -167,24 +166,6 @@ def test_the_plan_for_the_holes_is_whole_and_closes_them(
     assert (workspace / "check" / "refly" / "plan" / "exports" / "about.txt").is_file()
 
 
-def test_holes_by_a_no_go_zone_and_of_several_lines_are_closed() -> None:
-    shape = shapely.box(0, 0, 8, 6) - shapely.box(3.5, 2.0, 4.5, 3.6)
-    plan = survey(shape)
-    lines = stations_of_plan(plan).line
-    flown = stations_of_plan(plan).some((lines != 1) & (lines != 6))
-    pattern = plan_pattern(plan, RIG)
-    first = certificate(plan.area, RIG, flown, pattern)
-    holes = find_holes(first)
-    assert len(holes) == 2
-
-    again = refly(plan, first, holes)
-
-    both = certificate(plan.area, RIG, joined(flown, stations_of_plan(again)), pattern)
-    assert both.share_at_overlap >= 0.9995
-    with pytest.raises(PlanError):
-        refly(plan, first, ())
-
-
 def test_a_complete_dive_leaves_no_plan(tmp_path: Path) -> None:
     plan = survey(shapely.box(0, 0, 8, 6))
     workspace = dived(tmp_path, plan, stations_of_plan(plan))
@@ -232,13 +213,3 @@ def test_the_mount_is_the_calibrated_else_the_found_else_the_designed_one(tmp_pa
     mount, source = taken()
     assert same(mount, stated)
     assert "mounted" not in source
-
-
-def test_what_is_missing_is_named(tmp_path: Path) -> None:
-    with pytest.raises(WorkspaceError, match="alice-survey plan"):
-        check_report(tmp_path, CONFIG, tmp_path / "nav.csv")
-    workspace_of(tmp_path, survey(shapely.box(0, 0, 8, 6)))
-    with pytest.raises(WorkspaceError, match="alice-survey fly"):
-        check_report(tmp_path, CONFIG)
-    with pytest.raises(NavigationError, match=r"nav\.csv"):
-        check_report(tmp_path, CONFIG, tmp_path / "nav.csv")

@@ -189,15 +189,6 @@ def test_a_log_without_depth_uses_altitude(
     assert record.left_out == {"without a depth or an altitude": 9}
 
 
-def test_a_log_without_positions_does_not_say_what_a_dive_saw(
-    dive: tuple[Path, Path, Stations], tmp_path: Path
-) -> None:
-    bare = edited(dive[0], tmp_path / "bare.csv", {"longitude_deg": ""})
-    assert "no row with a latitude and a longitude" in refusal(bare)
-    (tmp_path / "depth.csv").write_text("time_s,depth_m\n0,5\n1,6\n")
-    assert "no row with a latitude and a longitude" in refusal(tmp_path / "depth.csv")
-
-
 def test_a_log_without_attitude_is_level_along_its_track(
     dive: tuple[Path, Path, Stations], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -214,20 +205,6 @@ def test_a_log_without_attitude_is_level_along_its_track(
     assert np.abs(np.angle(np.exp(1j * away[inner]))).max() < math.radians(6.0)
     assert len(record.notes) == 2
     assert capsys.readouterr().err == ""
-
-
-def test_nan_rows_are_left_out_by_their_line(
-    dive: tuple[Path, Path, Stations], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log, triggers, flown = dive
-    spoilt = edited(log, tmp_path / "spoilt.csv", {"latitude_deg": "nan"}, slice(12, 14))
-
-    record = record_of(spoilt, triggers=triggers)
-
-    # The log is interpolated over so short a stretch.
-    assert len(record.stations) == len(flown)
-    assert_alike(record.stations.some(np.arange(12)), flown.some(np.arange(12)))
-    assert "lines 14 to 15: latitude_deg" in capsys.readouterr().err
 
 
 def test_pictures_from_high_above_and_from_below_do_not_count(
@@ -260,16 +237,6 @@ def test_triggers_on_the_way_down_and_up_are_not_amiss(
     assert record.to_json()["on_way"] == 9
 
 
-@pytest.mark.parametrize("order", [slice(0, 1), slice(None, None, -1)])
-def test_a_log_without_two_rows_in_order_of_time_is_refused(
-    dive: tuple[Path, Path, Stations], tmp_path: Path, order: slice
-) -> None:
-    with dive[0].open(newline="") as file:
-        header, *rows = csv.reader(file)
-    write_csv(tmp_path / "few.csv", header, rows[order])
-    assert "few.csv" in refusal(tmp_path / "few.csv")
-
-
 def test_logs_of_elsewhere_or_another_time_are_refused(
     dive: tuple[Path, Path, Stations], tmp_path: Path
 ) -> None:
@@ -286,27 +253,6 @@ def test_logs_of_elsewhere_or_another_time_are_refused(
     assert "time_utc" in refusal(log, triggers=tmp_path / "none.csv")
     (tmp_path / "dates.csv").write_text("time_utc\n2024-05-01T12:00:00Z\n")
     assert "dates.csv" in refusal(log, triggers=tmp_path / "dates.csv")
-
-
-def test_dates_of_triggers_count_from_the_log(
-    dive: tuple[Path, Path, Stations], tmp_path: Path
-) -> None:
-    log, _, flown = dive
-    with log.open(newline="") as file:
-        rows = list(csv.reader(file))
-    start = np.datetime64("2024-05-01T12:00:00.000")
-    dates = [f"{start + np.timedelta64(2300 * i, 'ms')}Z" for i in range(len(flown))]
-    dated = tmp_path / "dated.csv"
-    write_csv(
-        dated, ["time_utc", *rows[0][1:]],
-        [[date, *row[1:]] for date, row in zip(dates, rows[1:], strict=True)],
-    )  # fmt: skip
-    lines = flown.line.tolist()
-    write_csv(tmp_path / "t.csv", ["time_utc", "line"], list(zip(dates, lines, strict=True)))
-
-    record = record_of(dated, triggers=tmp_path / "t.csv")
-
-    assert_alike(record.stations, flown)
 
 
 def test_a_simulated_flight_counts_by_its_true_track(tmp_path: Path) -> None:
@@ -348,23 +294,3 @@ def test_straight_runs_off_the_plan_are_separate_lines() -> None:
     np.testing.assert_array_equal(lines[: len(exact)], exact.line)
     np.testing.assert_array_equal(lines[-9:-4], len(plan().lines))
     np.testing.assert_array_equal(lines[-4:], -1)
-
-
-def test_logs_and_lines_beyond_all_measure(
-    dive: tuple[Path, Path, Stations], tmp_path: Path
-) -> None:
-    log = dive[0]
-    with log.open(newline="") as file:
-        header, *rows = csv.reader(file)
-    rows[-1][header.index("time_s")] = "1e300"
-    write_csv(tmp_path / "long.csv", header, rows)
-    assert "1e+300 s" in refusal(tmp_path / "long.csv")
-    (tmp_path / "t.csv").write_text(f"time_s,line\n1,{'9' * 30}\n")
-    assert "line 2" in refusal(log, triggers=tmp_path / "t.csv")
-    dated = tmp_path / "dated.csv"
-    start = "2024-05-01T12:00:0"
-    names = ["time_utc", *header[1:]]
-    assert header[0] == "time_s"
-    write_csv(dated, names, [[f"{start}{i}Z", *row[1:]] for i, row in enumerate(rows[:9])])
-    (tmp_path / "u.csv").write_text(f"line,time_utc\n0,{start}1Z\n0\n")
-    assert "u.csv line 3" in refusal(dated, triggers=tmp_path / "u.csv")

@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 
 from alice_survey.core.config import CameraConfig, WaterConfig
-from alice_survey.core.errors import PlanError
 from camera_calib.rig import Rig, design_rig
 from missions.coverage.stations import Stations, stations_of_lines
-from missions.values.footprint import footprint_size_m, step_for_overlap
 from tests.oracles_coverage import lawnmower, pinhole_rig
 from tests.oracles_overlap import measured_side_overlap
 
@@ -45,20 +43,6 @@ def test_lines_one_metre_apart_overlap_as_the_paper_should_have_said() -> None:
 
     assert measured_side_overlap(IDEAL, stations).mean == pytest.approx(0.293, abs=1e-3)
     assert 0.30 < measured_side_overlap(REAL, stations).mean < 0.32
-
-
-@pytest.mark.parametrize("rig", [IDEAL, REAL])
-@pytest.mark.parametrize(("asked", "altitude_m"), [(0.45, 2.0), (0.45, 3.0), (0.7, 1.2)])
-def test_the_spacing_for_an_overlap_yields_it(rig: Rig, asked: float, altitude_m: float) -> None:
-    """At least on the middle row, which is 3 % wider than what a picture surely shows."""
-    spacing_m = step_for_overlap(footprint_size_m(rig.cameras["left"], altitude_m)[0], asked)
-    stations = stations_of_lines(lawnmower(4, 5, spacing_m, 0.46), altitude_m)
-
-    measured = measured_side_overlap(rig, stations)
-
-    expected = 1 - spacing_m / middle_row_m(rig, altitude_m)
-    assert measured.mean == pytest.approx(expected, abs=0.0025)
-    assert asked < measured.minimum < asked + 0.02
 
 
 def test_a_vehicle_off_its_line_overlaps_less_on_one_side() -> None:
@@ -102,8 +86,3 @@ def test_a_rolled_vehicle_loses_overlap_on_the_side_it_looks_away_from() -> None
     lost = (before.shares - after.shares)[first].mean()
     width_m = middle_row_m(REAL, 2.0)
     assert lost == pytest.approx(2.0 * math.tan(math.radians(5.0)) / width_m, abs=0.02)
-
-
-def test_one_line_has_no_side_overlap() -> None:
-    with pytest.raises(PlanError):
-        measured_side_overlap(REAL, stations_of_lines(lawnmower(4, 2, 1.0, 0.46)[:1], 2.0))

@@ -13,9 +13,7 @@ from camera_calib.rig import design_rig
 from missions.coverage import certificate as module
 from missions.coverage.certificate import certificate
 from missions.coverage.raster import (
-    Grid,
     border_rays_body,
-    footprint_offsets,
     footprints_ne,
     grid_over,
     inside,
@@ -51,18 +49,6 @@ def test_footprints_are_those_of_poses_and_rays() -> None:
     for camera, name in enumerate(RIG.cameras):
         for border, polygon in zip(borders[:, camera], expected[name], strict=True):
             np.testing.assert_allclose(border, polygon.exterior.coords[:-1], atol=1e-9)
-
-
-def test_borders_of_stations_that_are_alike_are_traced_once() -> None:
-    stations = wandering(5, 3)
-    alike = stations.some(np.repeat(np.arange(5), [1, 3, 2, 1, 4]))
-    rays = border_rays_body(RIG)
-    offsets, which = footprint_offsets(*rays, alike.altitude_m, alike.attitude_rad)
-    assert len(offsets) == 5
-    expected = footprints_ne(*rays, alike.glass_ne, alike.altitude_m, alike.attitude_rad)
-    np.testing.assert_allclose(offsets[which] + alike.glass_ne[:, None, None], expected, atol=1e-12)
-    none, _ = footprint_offsets(*rays, alike.altitude_m[:0], alike.attitude_rad[:0])
-    assert none.shape == (0, *offsets.shape[1:])
 
 
 def test_counts_are_those_of_polygons_at_every_cell() -> None:
@@ -118,24 +104,6 @@ def test_cells_inside_are_those_whose_middle_is_inside(star: Polygon) -> None:
     cells = grid.cells_of(area.corners_ne)
     assert cells.min() >= -1e-6
     assert np.all(cells.max(axis=0) <= np.array(grid.shape) + 1e-6)
-
-
-@given(
-    heading=st.floats(0, 3.1), cell_m=st.floats(0.01, 1.0), row=st.integers(0, 5),
-    column=st.integers(0, 5), north=st.floats(-50, 50), east=st.floats(-50, 50),
-)  # fmt: skip
-def test_parts_of_a_grid_lie_on_it(
-    heading: float, cell_m: float, row: int, column: int, north: float, east: float
-) -> None:
-    grid = Grid(origin_ne=(3.0, -4.0), heading_rad=heading, cell_m=cell_m, rows=8, columns=7)
-    place = np.array([north, east])
-
-    np.testing.assert_allclose(grid.places_of(grid.cells_of(place)), place, atol=1e-9)
-    part = grid.part(row, column, 4, 4)
-    assert part.shape == (min(4, 8 - row), min(4, 7 - column))
-    np.testing.assert_allclose(
-        part.cells_of(place), grid.cells_of(place) - [row, column], atol=1e-6
-    )
 
 
 def test_tiles_chunks_and_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

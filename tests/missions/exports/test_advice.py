@@ -12,7 +12,6 @@ from alice_survey.core.errors import keep_warnings
 from alice_survey.sim.vehicle.pilot.mission import steady_drift
 from missions.coverage.stations import stations_of_plan
 from missions.exports.follower import (
-    end_tolerance_m,
     follower_of,
     line_offset_m,
     predicted_stations,
@@ -31,17 +30,6 @@ def about(folder: Path, given: Options, formats: list[str] | None) -> tuple[str,
     with keep_warnings() as warnings:
         write_exports(folder, small_plan(), RIG, formats=formats, options=given)
     return (folder / "about.txt").read_text(), list(warnings)
-
-
-def test_the_parameters_to_set_are_stated(tmp_path: Path) -> None:
-    text, warnings = about(tmp_path, options(current_mps=0.0), None)
-    follower = follower_of(VehicleConfig(), SeaConfig(current_mps=0.0), 0.2)
-    assert f"section/delta {follower.delta_m:.1f} m" in text
-    for name in ("section/tolerance_z", "section/min_surge_velocity", "WPNAV_RADIUS 12 cm",
-                 "WPNAV_SPEED 20 cm/s", "WP_YAW_BEHAVIOR"):  # fmt: skip
-        assert name in text
-    assert "in the expected current of 0 m/s" in text.lower()
-    assert not warnings
 
 
 @pytest.mark.parametrize(
@@ -101,13 +89,3 @@ def test_gusts_push_it_off_as_much_as_they_are_strong() -> None:
     # 0.14 m in the flights of `python -m benchmarks.missions`.
     assert 0.10 < strong.wander_m < 0.22
     assert strong.mode_per_s.real < 0.0
-
-
-def test_tolerances_grow_with_the_current() -> None:
-    calm, fast = (
-        end_tolerance_m(follower_of(VehicleConfig(), SeaConfig(current_mps=speed), 0.2))
-        for speed in (0.0, 0.1)
-    )
-    assert 0.34 < calm < 0.44
-    # 30 degrees a second is the most that a vehicle is asked to turn.
-    assert fast - calm == pytest.approx(0.1 / math.radians(30.0), rel=1e-6)

@@ -11,14 +11,11 @@ from shapely.geometry import MultiPolygon, Point, box
 from camera_calib.rig import Rig
 from missions.exports import options
 from missions.exports.follower import Follower
-from missions.exports.geometry import mount_of
 from missions.exports.options import Options, line_tolerance_m
 from missions.exports.write import write_exports
-from missions.values.costs import SETTLE_S
 from missions.values.footprint import common_swath
-from missions.values.legs import Route
 from missions.values.plan_file import Plan
-from tests.missions.exports.plans import RIG, golden_plan, line, plan_of, small_plan, straight
+from tests.missions.exports.plans import RIG, golden_plan, small_plan
 from tests.missions.exports.readers import (
     Step,
     local_ne,
@@ -91,30 +88,6 @@ def test_the_way_down_needs_no_altitude_and_the_way_up_ends_at_the_surface() -> 
     assert not last.values["no_altitude_goes_up"]
 
 
-def test_only_steps_sideways_are_parks() -> None:
-    plan = golden_plan()
-    steps = steps_of(plan, RIG)
-    (sway,) = (step for step in steps if step.kind == "park")
-
-    assert sway.values["use_yaw"]
-    assert abs(math.remainder(float(sway.values["final_yaw"]) - math.pi, 2 * math.pi)) < 1e-6
-    arm = turned((0.55, -0.05), math.pi)
-    np.testing.assert_allclose(place(plan, sway) + arm, (0.0, 1.8), atol=MM)
-    assert sway.values["time"] == pytest.approx(SETTLE_S, abs=0.05)
-
-
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(plan=plans())
-def test_gotos_are_not_done_where_the_one_before_is(plan: Plan) -> None:
-    for given_plan in (plan, golden_plan()):
-        steps = steps_of(given_plan, RIG)
-        for before, step, after in zip(steps, steps[1:], steps[2:], strict=False):
-            leads_in = after.kind == "section" or bool(step.actions)
-            if before.kind == step.kind == "goto" and not leads_in and after is not steps[-1]:
-                away_m = math.dist(place(given_plan, before), place(given_plan, step))
-                assert away_m >= 2 * float(step.values["tolerance_xy"]) - MM
-
-
 FOLLOWER = Follower(
     name="hull", sways=True, delta_m=3.0, circle_m=0.4, turn_in_m=0.3, turn_rad_s=0.5, wander_m=0.1,
     mode_per_s=-0.03 + 0.1j,
@@ -180,20 +153,6 @@ def test_the_tolerance_keeps_neighbouring_lines_together(
     assert written == pytest.approx([error_m] * len(written), abs=1e-4)
 
 
-def test_names_of_actions_are_the_vehicles_own() -> None:
-    named = Options(camera_on="/rig/start", camera_off="/rig/stop & wait")
-    with tempfile.TemporaryDirectory() as folder:
-        write_exports(Path(folder), small_plan(), RIG, formats=["cola2"], options=named)
-        steps = read_cola2(Path(folder) / "mission_dive1.xml")
-    calls = [action for step in steps for action in step.actions]
-    assert calls == ["/rig/start", "/rig/stop & wait"] * 3
-
-
-def test_a_name_that_would_end_the_comment_does_not(tmp_path: Path) -> None:
-    write_exports(tmp_path, small_plan(name='a<b&"c--> -- -'), RIG, formats=["cola2"])
-    assert len(read_cola2(tmp_path / "mission_dive1.xml")) > 10
-
-
 def test_lines_that_follow_a_bathymetry_bend_where_the_floor_does() -> None:
     plan = small_plan()
     ramps = [np.full(line.stations, 13.0) for line in plan.lines]
@@ -210,23 +169,3 @@ def test_lines_that_follow_a_bathymetry_bend_where_the_floor_does() -> None:
     )
     assert second[1].values["initial_depth"] == pytest.approx(12.0 - 0.08, abs=MM)
     assert [bool(s.actions) for s in second] == [True, False, True]
-
-
-def test_dives_of_one_line_without_a_run_in() -> None:
-    only = line((0.0, 0.0), (3.0, 0.0))
-    route = Route(legs=(straight((0.0, 0.0), (3.0, 0.0), 0),))
-    steps = steps_of(plan_of([only], [(0, 0)], routes=[route]), RIG)
-    assert [step.kind for step in steps] == ["goto", "section", "goto"]
-    assert steps[0].actions == ["camera_trigger/enable"]
-    assert steps[1].actions == ["camera_trigger/disable"]
-
-
-@settings(max_examples=25, deadline=None)
-@given(rig=rigs())
-def test_the_mount_is_where_the_glass_was_designed(rig: Rig) -> None:
-    mount = mount_of(rig, (0.0, 0.0, 0.11))
-    forward, right = mount.glass_body_m[:2]
-    for heading in (0.0, 1.0, math.pi, -2.0):
-        vehicle = mount.vehicle_ne(np.array([[3.0, 4.0]]), np.array([heading]))[0]
-        np.testing.assert_allclose(vehicle + turned((forward, right), heading), [3, 4], atol=1e-12)
-    assert mount.reach_m == pytest.approx(math.hypot(forward, right))

@@ -88,9 +88,3 @@ def test_floors_within_thirty_centimetres_are_exported(
         return
     files = write_exports(tmp_path / "out", plan, RIG, formats=list(VEHICLES))
     assert len(files) == 7
-
-
-def test_a_plan_that_does_not_say_is_planned_again(tmp_path: Path) -> None:
-    depths = plan_over(tmp_path, 0.0).line_depths_m
-    with pytest.raises(PlanError, match="plan again"):
-        write_exports(tmp_path, small_plan(line_depths_m=depths), RIG, formats=["wpl"])

@@ -71,20 +71,6 @@ def test_kml_in_fastkml(plan: Plan) -> None:
         assert length == pytest.approx(dive.route.length_m, rel=1e-4, abs=0.02)
 
 
-def test_kml_has_areas_with_their_holes(tmp_path: Path) -> None:
-    plan = small_plan()
-    write_exports(tmp_path, plan, RIG, formats=["kml"])
-    marks = {mark.name: mark for mark in placemarks(tmp_path / "plan.kml", "Areas")}
-    area = marks["survey area"].geometry
-    (wanted,) = plan.area.survey.geoms
-    read = shapely.Polygon(
-        ne(plan, area.exterior.coords), [ne(plan, hole.coords) for hole in area.interiors]
-    )
-    assert read.symmetric_difference(wanted).area < MM
-    assert len(read.interiors) == 1
-    np.testing.assert_allclose(ne(plan, marks["home"].geometry.coords), [[-2, -2]], atol=MM)
-
-
 @WIDE
 @given(plan=plans())
 def test_gpx_in_gpxpy(plan: Plan) -> None:

@@ -22,7 +22,7 @@ from camera_calib.rig import Rig
 from missions.exports.options import line_tolerance_m
 from missions.exports.write import write_exports
 from missions.values.plan_file import Plan
-from tests.missions.exports.plans import RIG, golden_plan, line, plan_of, small_plan
+from tests.missions.exports.plans import RIG, line, plan_of, small_plan
 from tests.missions.exports.readers import local_ne, plans, rigs, turned
 
 MM = 1e-3
@@ -121,24 +121,6 @@ def test_plans_in_mavsdk(import_plan: Importer, plan: Plan, rig: Rig) -> None:
             check_lines(plan, rig, dive, items, 0.0058)
 
 
-def test_a_plan_and_the_wpl_say_the_same(tmp_path: Path, import_plan: Importer) -> None:
-    plan = small_plan()
-    written(plan, RIG, ["qgc", "wpl"], tmp_path)
-    for dive in (1, 2):
-        simple = import_plan(str(tmp_path / f"mission_dive{dive}.plan")).mission_items
-        rows = read_wpl(tmp_path / f"mission_dive{dive}.waypoints")
-        # The first item is home in all; MAVSDK says it in integers.
-        assert [item.command for item in simple] == [row.command for row in rows]
-        for item, row in list(zip(simple, rows, strict=True))[1:]:
-            assert item.frame == row.frame
-            params = [row.param1, row.param2, row.param3, row.param4, row.z]
-            read = [item.param1, item.param2, item.param3, item.param4, item.z]
-            assert read == pytest.approx(params, abs=2e-5)
-            assert (item.x, item.y) == (
-                pytest.approx(row.x * 1e7, abs=1.01), pytest.approx(row.y * 1e7, abs=1.01)
-            )  # fmt: skip
-
-
 def test_the_way_down_is_by_depth_and_stops_short_of_the_charted_floor(tmp_path: Path) -> None:
     written(small_plan(), RIG, ["wpl"], tmp_path)
     ways = [
@@ -170,14 +152,6 @@ def test_a_turn_on_the_spot_has_its_heading_and_sense(tmp_path: Path) -> None:
     for before, row in itertools.pairwise(rows):
         if row.command == mavutil.mavlink.MAV_CMD_CONDITION_YAW:
             assert before.command != mavutil.mavlink.MAV_CMD_NAV_WAYPOINT
-
-
-def test_a_step_sideways_keeps_the_heading(tmp_path: Path) -> None:
-    written(golden_plan(), RIG, ["wpl"], tmp_path)
-    rows = read_wpl(tmp_path / "mission_dive1.waypoints")
-    yaws = [row for row in rows if row.command == mavutil.mavlink.MAV_CMD_CONDITION_YAW]
-    assert [row.param1 for row in yaws] == pytest.approx([180.0, 90.0], abs=1e-6)
-    assert [row.param3 for row in yaws] == [1, -1]
 
 
 def test_the_fence_holds_the_vehicle_and_keeps_it_out(
@@ -220,13 +194,3 @@ def test_a_zone_that_the_reference_point_must_cut_is_shrunk_or_left_out(
     data = json.loads((tmp_path / "mission_dive1.plan").read_text())
     assert [p["inclusion"] for p in data["geoFence"]["polygons"]] == [True]
     assert "0.12 m2" in capsys.readouterr().err
-
-
-def test_a_plan_has_what_qgroundcontrol_needs(tmp_path: Path) -> None:
-    written(small_plan(name='a<b&"c'), RIG, ["qgc"], tmp_path)
-    data = json.loads((tmp_path / "mission_dive1.plan").read_text())
-    assert (data["fileType"], data["version"], data["mission"]["version"]) == ("Plan", 1, 2)
-    assert (data["mission"]["firmwareType"], data["mission"]["vehicleType"]) == (3, 12)
-    assert data["aliceSurvey"]["name"] == 'a<b&"c'
-    numbers = [item["doJumpId"] for item in data["mission"]["items"]]
-    assert numbers == list(range(1, len(numbers) + 1))

@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
-from pymavlink import mavwp
 
 from alice_survey.core.errors import PlanError
-from missions.exports.read import read_mission
+from missions.exports.registry import read_mission
 from missions.exports.write import write_exports
 from missions.values.mission import Mission
 from missions.values.plan_file import Plan
-from tests.missions.exports.plans import RIG, golden_plan, small_plan
+from tests.missions.exports.plans import RIG, golden_plan
 from tests.missions.exports.readers import local_ne, plans, read_cola2, turned
 
 MM = 1e-3
@@ -90,25 +89,6 @@ def test_cola2_is_read_as_a_strict_parser_reads_it(tmp_path: Path) -> None:
         assert (step.camera is not None) == bool(raw.actions)
 
 
-def test_waypoints_are_read_as_pymavlink_reads_them(tmp_path: Path) -> None:
-    plan = golden_plan()
-    path = files_of(plan, tmp_path)["wpl"]
-    loader = mavwp.MAVWPLoader()
-    loader.load(str(path))
-    rows = [loader.wp(i) for i in range(1, loader.count()) if loader.wp(i).command == 16]
-    mission = read_mission(path)
-    ends = mission.ends_ne(plan.datum)
-
-    assert len(mission.steps) == len(rows) > 5
-    for step, row, end in zip(mission.steps, rows, ends, strict=True):
-        np.testing.assert_allclose(end, local_ne(plan.datum, row.x, row.y), atol=MM)
-        assert step.hold_s == row.param1
-        assert step.tolerance_m == pytest.approx(row.param2, abs=1e-6)
-        height = step.altitude_m if row.frame == 10 else -step.depth_m
-        assert height == pytest.approx(row.z, abs=1e-4)
-        assert step.speed_mps == pytest.approx(plan.speed_mps)
-
-
 def test_plans_of_qgroundcontrol_and_the_waypoints_are_one_mission(tmp_path: Path) -> None:
     paths = files_of(golden_plan(), tmp_path)
     first = read_mission(paths["qgc"])
@@ -165,21 +145,3 @@ def test_what_is_no_mission_is_refused_in_one_line(tmp_path: Path, text: str, sa
         read_mission(path)
     assert "\n" not in str(caught.value)
     assert str(path) in str(caught.value)
-
-
-def test_values_that_no_vehicle_can_fly_are_refused(tmp_path: Path) -> None:
-    text = files_of(small_plan(), tmp_path)["cola2"].read_text()
-    path = tmp_path / "changed.xml"
-    for old, new, said in (
-        ("<surge_velocity>0.2000<", "<surge_velocity>0<", "speed"),
-        ("<final_depth>12", "<final_depth>-12", "depth"),
-        ("<final_latitude>32", "<final_latitude>132", "latitude"),
-        ("<heave_mode>1<", "<heave_mode>7<", "heave_mode"),
-        ("camera_trigger/disable", "lights/on", "two services"),
-    ):
-        assert old in text
-        path.write_text(text.replace(old, new, 1))
-        with pytest.raises(PlanError, match=said):
-            read_mission(path)
-    with pytest.raises(PlanError, match="cannot be read"):
-        read_mission(tmp_path / "none")

@@ -1,5 +1,4 @@
 import csv
-import importlib.util
 import math
 import subprocess
 import sys
@@ -12,14 +11,11 @@ from alice_survey.core.artefacts import write_json
 from alice_survey.core.config import parse_config
 from alice_survey.core.errors import PlanError
 from missions.exports import formats
-from missions.exports.options import Options
-from missions.exports.registry import format_named, format_names, formats_table
+from missions.exports.registry import format_names, formats_table
 from missions.exports.waypoints import DEPTH_STEP_M, bends
 from missions.exports.write import export_report, write_exports
 from tests.missions.exports.plans import RIG, small_plan
 from tests.missions.exports.readers import local_ne
-
-DOCS = Path(__file__).parents[3] / "docs"
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -40,24 +36,6 @@ def test_every_format_is_written_the_same_twice(tmp_path: Path) -> None:
     assert names == {path.name for path in (tmp_path / "a").iterdir()}
     for one, two in zip(first, second, strict=True):
         assert one.read_bytes() == two.read_bytes()
-
-
-@pytest.mark.parametrize("format_", format_names())
-def test_a_format_comes_alone_with_its_description(tmp_path: Path, format_: str) -> None:
-    files = write_exports(tmp_path, small_plan(), RIG, formats=[format_])
-    *written, about = files
-    assert about.name == "about.txt"
-    text = about.read_text()
-    assert all(f"{file.name}: {files[file]}" in text for file in written)
-    assert 1 <= len(files) - 1 <= 3
-
-
-def test_an_unknown_format_names_those_that_are_known(tmp_path: Path) -> None:
-    with pytest.raises(PlanError, match="no longer written: use 'cola2'"):
-        write_exports(tmp_path / "none", small_plan(), RIG, formats=["cola2-v1"])
-    with pytest.raises(PlanError, match="dxf"):
-        write_exports(tmp_path / "none", small_plan(), RIG, formats=["cola2", "dxf"])
-    assert not (tmp_path / "none").exists()
 
 
 def test_stations_and_waypoints_in_tables(tmp_path: Path) -> None:
@@ -115,12 +93,6 @@ def test_the_report_takes_the_mount_from_the_settings_of_the_plan(tmp_path: Path
     assert "/rig/go" in named and "camera_trigger/disable" in named
 
 
-def test_depths_that_do_not_fit_the_lines_are_refused(tmp_path: Path) -> None:
-    plan = small_plan(line_depths_m=((13.0,) * 5,))
-    with pytest.raises(PlanError, match="1 lines with 5 stations"):
-        write_exports(tmp_path, plan, RIG)
-
-
 _TOY = '''
 """Lines as a list of their lengths."""
 
@@ -159,23 +131,6 @@ def test_names_of_formats_are_known_without_importing_them() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
-
-
-def test_the_documentation_lists_all_formats() -> None:
-    spec = importlib.util.spec_from_file_location("hooks", DOCS / "hooks.py")
-    assert spec is not None and spec.loader is not None
-    hooks = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(hooks)
-    page = (DOCS / "exports.md").read_text()
-    shown = hooks.on_page_markdown(page, page=None, config=None, files=None)
-    for name in format_names():
-        assert f"| `{name}` |" in shown
-        assert format_named(name).read_by in shown
-
-
-def test_services_need_names() -> None:
-    with pytest.raises(PlanError):
-        Options(camera_on="")
 
 
 def test_bends_keep_every_depth_within_the_tolerance() -> None:

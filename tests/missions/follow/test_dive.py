@@ -148,17 +148,6 @@ def test_a_log_is_read_again_where_it_grew_and_not_too_often(reef: Path) -> None
     assert state["silent_s"] == pytest.approx(60.0)
 
 
-def test_a_log_is_replayed_at_its_pace(reef: Path) -> None:
-    dive = followed(reef, ROWS, replay=4.0)
-    times = []
-    for wall_s in (10.0, 20.0, 30.0):
-        assert dive.update(wall_s)
-        state = dive.snapshot(wall_s)
-        times.append(state["fix"]["dive_s"])
-        assert not state["is_silent"]
-    np.testing.assert_allclose(times, [40.0, 80.0, 120.0], atol=0.6)
-
-
 def test_what_cannot_be_followed_is_said_in_a_line(reef: Path, tmp_path: Path) -> None:
     config = settings(reef, None, needed=False)
     for name, error, words in (

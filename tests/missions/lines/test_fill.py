@@ -15,7 +15,6 @@ from missions.values.area import multipolygon
 from missions.values.line import Line
 from missions.values.pattern import Pattern
 from tests.oracles_lines import (
-    ELL_WITH_HOLES,
     PATTERNS,
     STEREO,
     area_of,
@@ -80,14 +79,6 @@ def test_corners_left_unseen_of_an_oblique_strip_are_found_whatever_the_size_of_
         assert found_m2 == pytest.approx(lacking_m2, rel=0.03)
 
 
-def test_an_area_without_cuts_is_not_filled() -> None:
-    area = area_of(box(0, 0, 12, 9))
-    site = Site.of(area)
-    pieces, offsets, cuts = survey_pieces(site, 0.3, STEREO)
-    assert len(cuts) == 0
-    assert len(fill_table(site, 0.3, STEREO, pieces, offsets, cuts)) == 0
-
-
 def test_a_strip_next_to_a_no_go_zone_is_filled_with_one_line() -> None:
     """Rows run at offsets 0.5, 1.5, ...; the zone's side at 3.2 cuts the row of 3.5 off."""
     area = area_of(box(0, 0, 20, 10).difference(box(6, 3.2, 14, 6.8)))
@@ -105,14 +96,6 @@ def test_a_strip_next_to_a_no_go_zone_is_filled_with_one_line() -> None:
         length = abs(north_1 - north_0)
         assert 6.5 < length < 9.5
         assert length / steps <= STEREO.step_m + 1e-9
-
-
-def test_a_pattern_with_gaps_of_its_own_is_not_filled() -> None:
-    sparse = Pattern(spacing_m=2.0, step_m=0.47, half_across_m=0.6, half_along_m=0.57)
-    site = Site.of(area_of(ELL_WITH_HOLES))
-    pieces, offsets, cuts = survey_pieces(site, 0.0, sparse)
-    assert len(cuts) > 0
-    assert len(fill_table(site, 0.0, sparse, pieces, offsets, cuts)) == 0
 
 
 @settings(deadline=None, max_examples=25)
@@ -143,18 +126,3 @@ def test_lines_over_pieces_see_them(seed: int, pattern: Pattern, turn: float) ->
     assert unseen < 0.02
     assert all(line.length_m <= (line.stations - 1) * pattern.step_m + 1e-9 for line in lines)
     assert sum(line.length_m for line in lines) < 60 * pattern.passes
-
-
-def test_lines_over_a_long_strip_are_one_line_along_it() -> None:
-    area = area_of(box(0, 0, 30, 30))
-    strip = shapely.affinity.rotate(box(5, 14, 25, 14.8), 30)
-    lines = lines_over(multipolygon(strip), area, STEREO)
-    assert len(lines) == 1
-    assert abs(math.sin(lines[0].heading_rad - math.radians(30))) < 1e-3
-    assert lines[0].length_m == pytest.approx(20, abs=0.8)
-
-
-def test_nothing_is_laid_over_nothing_or_where_nothing_may_be() -> None:
-    area = area_of(box(0, 0, 10, 10))
-    assert lines_over(MultiPolygon(), area, STEREO) == []
-    assert lines_over(MultiPolygon([box(50, 50, 52, 52)]), area, STEREO) == []

@@ -1,5 +1,3 @@
-import math
-
 import numpy as np
 import pytest
 import shapely
@@ -10,7 +8,7 @@ from shapely.geometry import MultiPolygon, box
 
 from alice_survey.core.frames import Array
 from missions.lines.rows import lay_rows, reaches, rooms, row_offsets, to_uv
-from missions.route.fence import edges_of
+from missions.route.ways import edges_of
 from missions.values.area import multipolygon
 from tests.oracles_lines import areas, reaches_by_shapely
 
@@ -66,24 +64,6 @@ def test_a_row_may_follow_the_edge_of_the_allowed_area_on_either_side() -> None:
     assert counts.tolist() == [0, 0]
 
 
-@given(
-    width=st.floats(0, 100),
-    edge=st.floats(-1, 2),
-    spacing=st.floats(0.2, 3),
-    passes=st.integers(1, 4),
-)
-def test_rows_are_the_fewest_that_reach_over_both_sides(
-    width: float, edge: float, spacing: float, passes: int
-) -> None:
-    offsets = row_offsets(-width / 2 + 7, width / 2 + 7, spacing, edge, passes)
-    assert offsets.mean() == pytest.approx(7, abs=1e-9)
-    np.testing.assert_allclose(np.diff(offsets), spacing, atol=1e-12)
-    span = offsets[-1] - offsets[0]
-    assert len(offsets) >= passes
-    assert len(offsets) == passes or span - spacing < width + 2 * edge
-    assert span >= width + 2 * edge - 1e-6
-
-
 def lay(
     survey: shapely.Geometry, allowed: shapely.Geometry, **changes: float
 ) -> tuple[Array, Array]:
@@ -121,11 +101,6 @@ def test_pieces_less_than_two_steps_apart_become_one_where_that_is_allowed() -> 
     assert len(lay(survey, wide, step_m=0.3)[0]) == 2
 
 
-def test_the_least_piece_is_as_long_as_its_pictures_ask_for() -> None:
-    pieces, _ = lay(box(0, 0, 0.1, 1), box(-5, -5, 20, 5), overhang_m=-0.2, min_steps=3)
-    np.testing.assert_allclose(pieces, [[0, 0.05 - 0.75, 0.05 + 0.75, 3]], atol=1e-9)
-
-
 def test_a_wish_for_a_single_place_that_cannot_be_met_is_a_cut() -> None:
     """Two spots, each to be seen by one picture; one of them lies in a no-go zone."""
     survey = box(0, 0, 0.2, 1).union(box(8, 0, 8.2, 1))
@@ -133,10 +108,3 @@ def test_a_wish_for_a_single_place_that_cannot_be_met_is_a_cut() -> None:
     pieces, cuts = lay(survey, allowed, overhang_m=-0.2)
     assert len(pieces) == 1
     np.testing.assert_allclose(cuts, [[0, 0.1, 0.1]], atol=1e-9)
-
-
-def test_lines_at_a_distance_do_not_count_what_only_touches_their_strip() -> None:
-    edges = turned(box(0, 1.0, 10, 3), 0.0)
-    _, counts, _ = reaches(edges, np.array([0.5, 3.5]), 0.5)
-    assert counts.tolist() == [0, 0]
-    assert math.isclose(reaches(edges, np.array([0.6]), 0.5)[2][0, 1], 10)

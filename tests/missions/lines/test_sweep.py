@@ -1,20 +1,15 @@
-import itertools
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from shapely.geometry import MultiPolygon, Point, Polygon, box
+from shapely.geometry import MultiPolygon, Polygon, box
 
 from alice_survey.core.errors import PlanError
-from missions.lines import sweep as sweep_module
-from missions.lines.lay import Laid, laid
 from missions.lines.sweep import best_heading, min_width, widths_m
-from missions.route.fence import edges_of
-from missions.route.ways import Ways
+from missions.route.ways import Ways, edges_of
 from missions.values.costs import Costs, time_costs
 from tests.oracles_lines import ELL, ELL_WITH_HOLES, STEREO, area_of, areas, full_cost_j
 
@@ -36,13 +31,6 @@ def test_no_direction_is_narrower_than_the_least_width(
     sampled = widths_m(edges, np.append(np.arange(720) * math.pi / 720, heading))
     assert width <= sampled.min() + 1e-9
     assert widths_m(edges, np.array([best]))[0] == pytest.approx(width, abs=1e-9)
-
-
-def test_the_width_of_a_convex_area_is_that_between_its_outermost_corners() -> None:
-    edges, corners = edges_of(MultiPolygon([QUAD])), np.array(QUAD.exterior.coords)
-    for heading in np.linspace(0, math.pi, 50):
-        across = corners @ np.array([-math.sin(heading), math.cos(heading)])
-        assert widths_m(edges, np.array([heading]))[0] == pytest.approx(np.ptp(across), abs=1e-12)
 
 
 @pytest.mark.parametrize("costs", [time_costs(0.2), NORTHWARD])
@@ -95,65 +83,3 @@ def test_the_search_over_areas_with_fill_lines_finds_as_good_a_heading() -> None
     ]
     assert sweep.cost_j <= 1.005 * min(sampled)
     assert max(sampled) > 1.02 * sweep.cost_j
-
-
-def test_a_search_that_takes_long_shows_how_far_it_is(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    area = area_of(QUAD)
-    arguments = area, STEREO, Ways(area.allowed), time_costs(0.2), (0.0, 0.0)
-    monkeypatch.setattr("missions.lines.sweep.time.monotonic", _ticks(1e-6).__next__)
-    best_heading(*arguments, cross_lines=0, closing_line=False)
-    assert not capsys.readouterr().err
-    monkeypatch.setattr("missions.lines.sweep.time.monotonic", _ticks(5.0).__next__)
-    best_heading(*arguments, cross_lines=0, closing_line=False)
-    assert capsys.readouterr().err
-
-
-def _ticks(step_s: float) -> Iterator[float]:
-    return itertools.count(0.0, step_s)
-
-
-def _counted(monkeypatch: pytest.MonkeyPatch) -> list[Laid]:
-    """What the search lays, as it goes on."""
-    done: list[Laid] = []
-
-    def counted(*args: Any, **options: Any) -> Laid:
-        done.append(laid(*args, **options))
-        return done[-1]
-
-    monkeypatch.setattr(sweep_module, "laid", counted)
-    return done
-
-
-def test_a_harbour_with_piles_is_searched_at_few_headings(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    rows = itertools.product((6, 14, 22, 30, 38), (5, 11, 17, 23))
-    piles = [Point(north, east).buffer(0.6, 6) for north, east in rows]
-    area = area_of(box(0, 0, 44, 30).difference(MultiPolygon(piles)))
-    ways, costs, home = Ways(area.allowed), time_costs(0.2), (0.0, 0.0)
-    kinds: dict[str, Any] = {"cross_lines": 1, "closing_line": True}
-    done = _counted(monkeypatch)
-
-    found = best_heading(area, STEREO, ways, costs, home, **kinds)
-
-    assert 10 <= len(done) <= 60
-    sampled = [
-        full_cost_j(area, h, STEREO, ways, costs, home, **kinds)
-        for h in (np.arange(60) + 0.123) * math.pi / 60
-    ]
-    assert found.cost_j <= 1.005 * min(sampled)
-
-
-def test_no_lines_are_laid_across_a_long_strip(monkeypatch: pytest.MonkeyPatch) -> None:
-    area = area_of(box(0, 0, 1000, 3))
-    done = _counted(monkeypatch)
-
-    found = best_heading(
-        area, STEREO, Ways(area.allowed), time_costs(0.2), (0.0, 0.0),
-        cross_lines=1, closing_line=True,
-    )  # fmt: skip
-
-    assert abs(math.sin(found.heading_rad)) < 1e-6
-    assert max(len(one.table) for one in done) <= 100

@@ -62,14 +62,6 @@ def test_many_cells_are_toured_well_and_each_once(fixed: int) -> None:
         assert np.mean(ratios) < 1.03
 
 
-def test_two_hundred_cells_are_toured() -> None:
-    some = problem(200, 3)[0]
-    first = nearest_tour(some)
-    order = good_tour(first, some, 0)
-    assert sorted(order // 4) == list(range(200))
-    assert tour_cost(order, some) < tour_cost(first, some)
-
-
 def pieces_of(*rows: list[tuple[float, float]]) -> np.ndarray:
     return np.array([(i, a, b, 1.0) for i, row in enumerate(rows) for a, b in row])
 

@@ -3,13 +3,32 @@
 from collections.abc import Sequence
 from typing import Any
 
-from missions.route.turns import legs_through, line_table, route_of
+from missions.route.turns import (
+    PAPER_SPEED_MPS,
+    Manoeuvre,
+    Turns,
+    legs_through,
+    line_table,
+    route_of,
+)
+from missions.route.ways import OPEN_WATER, Ways
+from missions.values.costs import Costs, time_costs
 from missions.values.legs import Route
 from missions.values.line import Line
 
+PAPER_COSTS = time_costs(PAPER_SPEED_MPS)
+
 
 def route_through(
-    lines: Sequence[Line], turn_radius_m: float, run_in_m: float, **how: Any
+    lines: Sequence[Line],
+    turn_radius_m: float,
+    run_in_m: float,
+    *,
+    ways: Ways = OPEN_WATER,
+    costs: Costs = PAPER_COSTS,
+    turns: Turns = "auto",
+    **ends: Any,
 ) -> Route:
-    """The route along all lines in order; arguments as of `legs_through`."""
-    return route_of(legs_through(line_table(lines), turn_radius_m, run_in_m, **how))
+    """The route along all lines in order; other arguments as of `legs_through`."""
+    how = Manoeuvre(costs, turn_radius_m, run_in_m, turns, ways)
+    return route_of(legs_through(line_table(lines), how, **ends))

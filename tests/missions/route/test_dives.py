@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from alice_survey.core.errors import PlanError
 from missions.route.dives import DEAREST_TIE, split_dives
-from missions.route.turns import legs_alone, line_table, route_of
+from missions.route.turns import Manoeuvre, legs_alone, line_table, route_of
 from missions.route.ways import Ways
 from missions.values.area import multipolygon
 from missions.values.costs import Costs, time_costs
@@ -38,11 +38,9 @@ def _lines(count: int, length_m: float = 12.0, spacing_m: float = 1.0) -> list[L
 
 
 def _split(lines: list[Line], usable_wh: float, **options: Any) -> tuple[Dive, ...]:
-    settings: dict[str, Any] = {
-        "ways": WAYS, "costs": COSTS, "home_ne": HOME, "turn_radius_m": 0.5, "run_in_m": 0.5,
-        "turns": "auto", "max_s": None, "depth_m": 3.0, "split": True,
-    }  # fmt: skip
-    return split_dives(lines, usable_wh=usable_wh, **(settings | options))
+    how = Manoeuvre(options.pop("costs", COSTS), 0.5, 0.5, ways=options.pop("ways", WAYS))
+    settings: dict[str, Any] = {"home_ne": HOME, "max_s": None, "depth_m": 3.0} | options
+    return split_dives(lines, how, usable_wh=usable_wh, **settings)
 
 
 def _of_dive(lines: list[Line], first: int, last: int, costs: Costs = COSTS) -> tuple[float, float]:
@@ -167,34 +165,12 @@ def test_a_line_that_fits_no_dive_is_named() -> None:
         _split(lines, 1e6, max_s=300.0)
 
 
-def test_without_splitting_it_says_how_much_fits() -> None:
-    lines = _lines(12)
-    whole, part = _of_dive(lines, 0, 11), _of_dive(lines, 0, 4)
-    with pytest.raises(PlanError) as caught:
-        _split(lines, 1.001 * part[0] / 3600, split=False, costs=COSTS)
-    text = str(caught.value)
-    dives = len(_split(lines, 1.001 * part[0] / 3600))
-    for number in ("5 lines", "60 m", "42%", "split_dives = true", f"{dives} dives"):
-        assert number in text
-    with pytest.raises(PlanError, match=rf"plan\.dive_s = {int(np.ceil(whole[1]))}"):
-        _split(lines, 1e6, max_s=part[1] + 1, split=False)
-
-
 def test_a_course_against_too_much_current_is_refused() -> None:
     line_w = np.ones(8)
     line_w[1:4] = np.inf  # eastwards
     costs = COSTS._replace(line_w=line_w)
     with pytest.raises(PlanError, match=r"line 0 .* 90 deg"):
         _split(_lines(4), 10.0, costs=costs)
-
-
-def test_thousands_of_lines_are_parted() -> None:
-    """2,000 lines in some six dives."""
-    ways = Ways(shapely.MultiPolygon([shapely.box(-6, -6, 2010, 40)]))
-    lines = _lines(2000)
-    dives = _split(lines, 10.0, ways=ways)
-    assert 5 <= len(dives) <= 12
-    assert sum(d.last_line - d.first_line + 1 for d in dives) == 2000
 
 
 @pytest.mark.parametrize("turns", ["auto", "arcs", "spot", "sway"])
@@ -205,7 +181,7 @@ def test_ways_along_single_lines_are_the_routes_through_them(turns: Any) -> None
         (n, e), (n_2, e_2) = line.start_ne_m, line.end_ne_m
         lines.append(replace(line, start_ne_m=(n, e + 6.0), end_ne_m=(n_2, e_2 + 6.0)))
     how: dict[str, Any] = {"ways": ways, "costs": COSTS, "turns": turns, "home_ne": HOME}
-    legs, begins = legs_alone(line_table(lines), 0.5, 0.5, **how)
+    legs, begins = legs_alone(line_table(lines), Manoeuvre(COSTS, 0.5, 0.5, turns, ways), HOME)
     assert (len(begins), begins[0], begins[-1]) == (2 * len(lines) + 1, 0, len(legs))
     corners = 0
     for i, line in enumerate(lines):

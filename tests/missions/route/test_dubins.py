@@ -8,9 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.geometry import box
 
-from missions.route.dubins import min_turn, moved
-from missions.route.fence import OPEN_WATER, Fence
-from missions.route.ways import Ways
+from missions.route.turns import ends_of, turns_inside
+from missions.route.ways import OPEN_WATER, Ways
 from missions.values.area import multipolygon
 from missions.values.legs import Leg
 
@@ -24,9 +23,10 @@ def turn(
     goal: tuple[float, float],
     last: float,
     radius_m: float,
-    fence: Fence = OPEN_WATER,
+    ways: Ways = OPEN_WATER,
 ) -> list[Leg]:
-    pieces = min_turn(fence, np.array([*start, first]), np.array([*goal, last]), radius_m)
+    ends = np.array([[*start, first]]), np.array([[*goal, last]])
+    pieces = np.concatenate(turns_inside(ways, *ends, radius_m)).T
     legs, heading = [], first
     for curvature, length_m in pieces.tolist():
         leg = Leg(
@@ -34,8 +34,8 @@ def turn(
             line=-1,
         )  # fmt: skip
         legs.append(leg)
-        *_, heading = moved(*start, heading, curvature, length_m)
-        start = leg.end_ne_m
+        here = np.array([[*start, heading]]), np.array([curvature]), np.array([length_m])
+        heading, start = float(ends_of(*here)[0, 2]), leg.end_ne_m
     return legs
 
 
@@ -124,13 +124,13 @@ def test_a_turn_keeps_out_of_forbidden_water() -> None:
     assert length(free) == pytest.approx(math.pi)
 
     rock = box(0.8, 0.8, 1.2, 1.2)
-    water = Ways(multipolygon(box(-9, -9, 9, 9).difference(rock))).fence
+    water = Ways(multipolygon(box(-9, -9, 9, 9).difference(rock)))
     other = turn((0.0, 0.0), 0.0, (0.0, 2.0), math.pi, 1.0, water)
     assert length(other) > length(free)
     places = np.concatenate([leg.places(np.linspace(0, leg.length_m, 500)) for leg in other])
     assert shapely.distance(rock, shapely.points(places)).min() > 0
     assert math.dist(other[-1].end_ne_m, (0.0, 2.0)) < 1e-9
 
-    tight = Ways(multipolygon(box(-0.5, -0.5, 0.5, 2.5))).fence
-    none = min_turn(tight, np.zeros(3), np.array([0.0, 2.0, math.pi]), 1.0)
-    assert np.isinf(none[:, 1]).all()
+    tight = Ways(multipolygon(box(-0.5, -0.5, 0.5, 2.5)))
+    _, none = turns_inside(tight, np.zeros((1, 3)), np.array([[0.0, 2.0, math.pi]]), 1.0)
+    assert np.isinf(none).all()

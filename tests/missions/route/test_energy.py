@@ -1,8 +1,6 @@
 """What flying takes by course: the vehicle's own equations against the current."""
 
 import math
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +22,9 @@ from missions.route.energy import (
     flies_everywhere,
     flight_conditions,
     motion,
-    usable_wh,
 )
-from missions.values.costs import power_at, time_costs
+from missions.route.turns import Manoeuvre
+from missions.values.costs import power_at
 from missions.values.line import Line
 
 
@@ -79,13 +77,6 @@ def test_motion_keeps_its_course_over_ground() -> None:
             assert np.abs(moved.crab_rad).max() == 0.0
 
 
-def test_crabbing_ends_where_the_current_along_outruns_the_vehicle() -> None:
-    courses = np.radians([0.0, 59.0, 61.0, 180.0])
-    possible = motion(courses, 0.2, np.array([0.4, 0.0]), "crab").possible
-    # 0.4 cos(60 deg) = 0.2.
-    assert np.isnan(possible).tolist() == [True, True, False, False]
-
-
 def test_costs_turn_with_the_current() -> None:
     """Costs do not depend on north: turning the current by 40 deg turns the costs by 8 samples."""
     one, other = survey_costs(_config(towards=90.0)), survey_costs(_config(towards=130.0))
@@ -95,16 +86,6 @@ def test_costs_turn_with_the_current() -> None:
         )
     assert other.heave_w == pytest.approx(one.heave_w)
     assert other.stop_w == pytest.approx(one.stop_w, rel=1e-2)
-
-
-def test_costs_add_hotel_and_lights_where_they_burn() -> None:
-    bare = survey_costs(_config(vehicle={"hotel_w": 0.0}))
-    lit = survey_costs(_config(vehicle={"hotel_w": 50.0}), imaging_w=7.0)
-    np.testing.assert_allclose(lit.line_w, bare.line_w + 57.0)
-    np.testing.assert_allclose(lit.way_w, bare.way_w + 50.0)
-    np.testing.assert_allclose(lit.sway_w, bare.sway_w + 50.0)
-    assert lit.stop_w == pytest.approx(bare.stop_w + 50.0)
-    assert lit.heave_w == pytest.approx(bare.heave_w + 50.0)
 
 
 def test_without_a_current_all_courses_are_alike_and_ways_are_as_lines() -> None:
@@ -237,11 +218,6 @@ def test_a_current_that_no_heading_bears_is_refused() -> None:
         survey_costs(_config(2.0))
 
 
-def test_a_vehicle_without_thrust_gets_no_advice_on_the_current() -> None:
-    with pytest.raises(PlanError, match=r"vehicle\.failures"):
-        survey_costs(_config(0.0, vehicle={"failures": ["vertical"]}))
-
-
 def test_a_heading_that_cannot_be_flown_is_refused_with_the_nearest_that_can() -> None:
     def config(heading: float) -> SurveyConfig:
         return _config(0.3, 0.0, vehicle={"name": "sparus2"}, plan={"line_heading_deg": heading})
@@ -256,8 +232,8 @@ def test_a_way_between_lines_that_cannot_be_flown_is_refused_with_the_current() 
     line = Line(kind="survey", start_ne_m=(0.0, 0.0), end_ne_m=(0.0, 5.0), stations=5)
     with pytest.raises(PlanError, match=r"0\.30 m/s .* 0\.19 m/s"):
         split_dives(
-            [line], ways=None, costs=costs, home_ne=(-5.0, 0.0), turn_radius_m=0.5, run_in_m=0.5,
-            turns="auto", usable_wh=1000.0, max_s=None, depth_m=10.0, split=True,
+            [line], Manoeuvre(costs, 0.5, 0.5), home_ne=(-5.0, 0.0), usable_wh=1000.0, max_s=None,
+            depth_m=10.0,
         )  # fmt: skip
 
 
@@ -278,31 +254,3 @@ def test_a_measured_current_counts_by_its_mean_at_depth(tmp_path: Path) -> None:
     config = _config(sea={"current_file": str(path)}, area={"seafloor_depth_m": 12.0})
     # At 10 m, half way: mean of 0.3 and 0.1 + ... north, 0.04 east.
     np.testing.assert_allclose(flight_conditions(config).current_ne_mps, [0.3, 0.04], atol=1e-12)
-
-
-def test_endurance_agrees_with_the_makers() -> None:
-    """8 to 10 hours are published of SPARUS II; at 1 m/s the whole battery lasts as long."""
-    config = _config(0.0, vehicle={"name": "sparus2"}, plan={"speed_mps": 1.0})
-    costs = survey_costs(config)
-    assert 8.0 < config.vehicle.battery_wh / costs.way_w[0] < 10.0
-    assert usable_wh(config.vehicle) == pytest.approx(0.8 * config.vehicle.battery_wh)
-
-
-def test_costs_compile_nothing() -> None:
-    """A cold start pays for no kernel of the simulator."""
-    code = (
-        "from numba.core import event\n"
-        "from alice_survey.core.config import SurveyConfig\n"
-        "from missions.plan.strength import survey_costs\n"
-        "with event.install_recorder('numba:compile') as seen:\n"
-        "    survey_costs(SurveyConfig())\n"
-        "import sys; print(len(seen.buffer), 'missions.fly.simulation' in sys.modules)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["0", "False"]
-
-
-def test_seconds_stand_for_joules() -> None:
-    costs = time_costs(0.2, sway_mps=0.1, heave_mps=0.2)
-    assert costs.stop_j(-costs.turn_rate_rad_s) == pytest.approx(1.0 + costs.settle_s)
-    assert costs.dive_j(10.0) == costs.dive_s(10.0) == pytest.approx(100.0)

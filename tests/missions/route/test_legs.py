@@ -6,11 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
-from missions.route.joins import COLUMNS, price
+from missions.route.turns import COLUMNS, prices_j
 from missions.values.costs import Costs, leg_costs, mean_power, time_costs
 from missions.values.legs import Leg, Route
-from tests.missions.route.routes import route_through
-from tests.oracles_route import lawn, route_cost, route_cost_by_steps, sampled_leg, turn_counts
+from tests.oracles_route import route_cost, route_cost_by_steps, sampled_leg
 
 angles = st.floats(-7.0, 7.0)
 lengths = st.floats(0.01, 30.0)
@@ -111,18 +110,7 @@ def test_a_route_costs_what_its_legs_do(many: list[Leg], seed: int) -> None:
         ]
     ).reshape(-1, COLUMNS)  # fmt: skip
     expected = route_cost(Route(legs=tuple(ways)), costs)[0]
-    assert price(costs, table) == pytest.approx(expected, rel=1e-9)
-
-
-def test_time_is_what_even_costs_count() -> None:
-    route = route_through(lawn(4, 10.0, 1.0), 0.5, 0.5, turns="sway")
-    joules, seconds = route_cost(route, time_costs(0.2, turn_rate_rad_s=0.5, settle_s=3.0))
-    assert joules == pytest.approx(seconds)
-    sway_mps = time_costs(0.2).sway_mps
-    # Four lines with run-in and run-out; three steps of 1 m and half turns, two stops each.
-    expected = 4 * 11.0 / 0.2 + 3 * (1.0 / sway_mps + math.pi / 0.5 + 2 * 3.0)
-    assert seconds == pytest.approx(expected)
-    assert route_cost(Route(legs=()), time_costs(0.2)) == (0.0, 0.0)
+    assert prices_j(costs, table[None])[0] == pytest.approx(expected, rel=1e-9)
 
 
 def test_no_way_on_a_course_that_cannot_be_flown() -> None:
@@ -131,19 +119,3 @@ def test_no_way_on_a_course_that_cannot_be_flown() -> None:
     for start, end, open_water in ((shut, shut, False), (0.0, 0.5, True), (0.0, 2.0, False)):
         mean = mean_power(costs.way_w, np.array([start]), np.array([end]))[0]
         assert math.isfinite(mean) == open_water
-
-
-def test_turns_and_steps_are_counted() -> None:
-    turns = [
-        leg((0, 0), 0, 1.0, line=0),
-        leg((1, 0), 0, 0.0, turn=1.0),
-        leg((1, 0), 1.0 + math.pi / 2, 2.0, side=-math.pi / 2),
-        leg((1, 0), 1.0, 0.5, curvature=1.0),
-        leg((1, 0), 1.5, 0.5, curvature=-1.0),
-        leg((1, 0), 1.0, 0.5),
-        leg((1, 0), 1.0, 0.5, curvature=2.0),
-    ]
-    route = Route(legs=tuple(turns))
-    assert turn_counts(route) == (2, 1, 1)
-    assert [one.kind for one in turns[:4]] == ["straight", "spot", "sway", "arc"]
-    assert route.length_m == pytest.approx(5.0)

@@ -1,7 +1,6 @@
 """The profile of the glass over a known sea floor."""
 
 import math
-from dataclasses import astuple
 from pathlib import Path
 
 import numpy as np
@@ -13,17 +12,14 @@ from pyproj import Transformer
 from alice_survey.core.errors import PlanError
 from alice_survey.core.frames import Array, Datum
 from alice_survey.sim.vehicle.files import vehicle_from
-from alice_survey.sim.vehicle.vehicle import Hull
 from missions.areas.bathymetry import Bathymetry, read_bathymetry
 from missions.route.terrain import (
-    Reach,
     TerrainLimits,
     depth_profile,
     envelope,
     highest_floor,
     line_profiles,
     reach_of,
-    terrain_report,
 )
 from missions.values.line import Line
 from tests.oracles_energy import envelope as slow_envelope
@@ -89,14 +85,6 @@ def test_the_envelope_is_the_deepest_that_keeps_depth_and_slope(
     assert np.all((reached & held[None]).any(axis=1))
 
 
-def test_a_level_floor_is_followed_at_the_altitude() -> None:
-    floor = _floor(np.full((160, 160), 12.0))
-    profile = line_profiles([_line((0.0, -20.0), (0.0, 20.0))], floor, REACH, LIMITS)[0]
-    np.testing.assert_allclose(profile.depth_m, 10.0, atol=1e-12)
-    np.testing.assert_allclose(profile.altitude_m, 2.0, atol=1e-12)
-    np.testing.assert_allclose(profile.slopes_rad, 0.0, atol=1e-12)
-
-
 def test_a_slope_is_followed_above_its_highest_within_reach() -> None:
     """Along a slope of 0.2 the hull's nose or tail is over the highest floor."""
     floor = _floor(14.0 - 0.2 * _eastings())  # shoaling to the east
@@ -109,15 +97,6 @@ def test_a_slope_is_followed_above_its_highest_within_reach() -> None:
     assert up.clearance_m == pytest.approx(2.0, abs=1e-9)
     assert np.degrees(up.slopes_rad) == pytest.approx(-math.degrees(math.atan(0.2)), abs=0.05)
     assert np.degrees(down.slopes_rad) == pytest.approx(math.degrees(math.atan(0.2)), abs=0.05)
-
-
-@pytest.mark.parametrize(("hull", "tail_m"), [(ALICE, 0.90), (SPARUS2, 0.734)])
-def test_down_a_slope_the_vehicles_own_tail_is_kept_clear(hull: Hull, tail_m: float) -> None:
-    floor = _floor(14.0 - 0.2 * _eastings())
-    reach = reach_of(hull, (0.55, -0.05, 0.08), 0.1, 0.1)
-    (down,) = line_profiles([_line((0.0, 15.0), (0.0, -15.0))], floor, reach, LIMITS)
-    raised_m = (down.altitude_m - LIMITS.altitude_m) / 0.2 - 0.55
-    assert raised_m == pytest.approx(tail_m, abs=0.03)
 
 
 def test_before_a_cliff_the_glass_climbs_at_the_steepest_slope() -> None:
@@ -196,56 +175,11 @@ def test_limits_that_cannot_be_kept_name_the_place() -> None:
         TerrainLimits(altitude_m=0.8, least_clearance_m=1.0, steepest_rad=0.3)
 
 
-def test_depths_are_one_a_station() -> None:
-    lines = [_line((0.0, -20.0), (0.0, 20.0), 81), _line((1.0, 20.0), (1.0, -20.0), 7)]
-    found = line_profiles(lines, _floor(14.0 + 0.05 * _eastings()), REACH, LIMITS)
-    assert [len(profile.depth_m) for profile in found] == [81, 7]
-
-
 def test_stations_far_apart_see_all_between_them() -> None:
     """A ridge between two stations 10 m apart is flown over by both."""
     ridge = np.where(np.abs(_eastings()) < 1.0, 9.0, 12.0)
     sparse = line_profiles([_line((0.0, -15.0), (0.0, 15.0), 4)], _floor(ridge), REACH, LIMITS)[0]
     np.testing.assert_allclose(sparse.depth_m, [10.0, 7.0, 7.0, 10.0], atol=1e-9)
-
-
-def test_the_report_names_where_pictures_are_taken_from_too_high(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    lines = [_line((5.0, -30.0), (5.0, 30.0), 121), _line((0.0, -30.0), (0.0, 30.0), 121)]
-    values = np.full((160, 160), 9.0)
-    values[76:90, :80] = 14.0  # a hole west of the middle, under the second line
-    floor = _floor(values)
-    profiles = line_profiles(lines, floor, REACH, LIMITS)
-
-    _, data = terrain_report(
-        lines, profiles, LIMITS, relief_m=0.35, spacing_m=1.0, step_m=0.46,
-        extent_m=lambda altitude: (0.71 * altitude, 0.58 * altitude),
-    )  # fmt: skip
-
-    assert data["highest"]["line"] == 1
-    assert data["altitude_m"][0] == pytest.approx(2.0, abs=1e-9)
-    assert 2.4 < data["altitude_m"][1] <= 7.0
-    assert data["least_side_overlap"] == pytest.approx(1 - 1.0 / 1.42, abs=1e-9)
-    assert 70 < data["steepest_floor_deg"] < 90
-    assert data["steepest_deg"] == pytest.approx(20.0, abs=1e-6)
-    assert data["lines"][0]["raised_stations"] == 0 < data["lines"][1]["raised_stations"]
-    assert "line 1, " in capsys.readouterr().err
-    # Allowing for that relief, nothing is to be warned of.
-    terrain_report(
-        lines, profiles, LIMITS, relief_m=10.0, spacing_m=1.0, step_m=0.46,
-        extent_m=lambda altitude: (0.71 * altitude, 0.58 * altitude),
-    )  # fmt: skip
-    assert not capsys.readouterr().err
-
-
-def test_the_reach_is_of_hull_or_pictures_whichever_is_farther() -> None:
-    glass = 0.55, -0.05, 0.08
-    far = reach_of(ALICE, glass, 2.0, 3.0)
-    for hull, ahead_m, astern_m in ((ALICE, 0.51, 1.45), (SPARUS2, 0.305, 1.284)):
-        near = reach_of(hull, glass, 0.1, 0.1)
-        assert astuple(near) == pytest.approx((ahead_m, astern_m, 0.276))
-    assert far == Reach(ahead_m=3.0, astern_m=3.0, aside_m=2.0)
 
 
 def test_a_real_sea_floor_is_followed(shared_data: Path) -> None:

@@ -8,10 +8,8 @@ from hypothesis import strategies as st
 from shapely.geometry import MultiPolygon, box
 
 from alice_survey.core.errors import PlanError
-from missions.route.fence import TOUCH_M
-from missions.route.joins import MAX_SWAY_M
-from missions.route.turns import Turns
-from missions.route.ways import Ways
+from missions.route.turns import MAX_SWAY_M, Turns
+from missions.route.ways import TOUCH_M, Ways
 from missions.values.area import multipolygon
 from missions.values.costs import Costs, time_costs
 from missions.values.legs import Route
@@ -22,7 +20,6 @@ from tests.oracles_route import (
     lawn,
     line_starts_m,
     route_cost,
-    total_m,
     turn_counts,
     way_m,
 )
@@ -230,16 +227,6 @@ def test_the_way_between_lines_goes_round_a_hole() -> None:
     assert turn_counts(route_through(lines, 0.5, 0.5))[1] == 0
 
 
-def test_home_is_left_towards_the_first_line_and_come_back_to() -> None:
-    lines = lawn(2, 10.0, 1.0)
-    route = route_through(lines, 0.5, 0.5, home_ne=(-5.0, 0.0))
-
-    assert route.legs[0].start_ne_m == (-5.0, 0.0)
-    assert route.legs[0].heading_rad == pytest.approx(0.0)
-    assert math.dist(route.legs[-1].end_ne_m, (-5.0, 0.0)) < 1e-9
-    assert total_m([leg for leg in route.legs if leg.line < 0][:2]) == pytest.approx(5.0)
-
-
 def test_what_cannot_be_flown_is_refused() -> None:
     apart = multipolygon(box(-1, -1, 11, 3)).union(box(-1, 5, 11, 9))
     ways = Ways(multipolygon(apart))
@@ -263,47 +250,9 @@ def test_ten_thousand_lines_have_a_route() -> None:
     assert route.length_m == pytest.approx(21.0 * count + (count - 1) * math.pi / 2)
 
 
-def test_a_route_is_continuous_and_keeps_its_lines() -> None:
-    lines = [
-        line((0.0, 0.0), (0.0, 5.0)),
-        line((1.0, 5.0), (1.0, 0.0)),
-        line((1.6, 0.0), (1.6, 5.0)),
-    ]
-    route = route_through(lines, 0.5, 0.5)
-
-    along = np.linspace(0.0, route.length_m, 20_001)
-    places_ne = route.places(along)
-    steps = np.linalg.norm(np.diff(places_ne, axis=0), axis=1)
-    assert np.abs(steps / np.diff(along) - 1).max() < 1e-4
-    assert max(abs(leg.curvature_per_m) for leg in route.legs) <= 2.0 * (1 + 1e-6)
-
-    starts = line_starts_m(route)
-    assert list(starts) == [0, 1, 2]
-    for index, start_m in starts.items():
-        on_line = route.places(start_m + np.linspace(0.0, 5.0, 11))
-        expected = np.linspace(lines[index].start_ne_m, lines[index].end_ne_m, 11)
-        np.testing.assert_allclose(on_line, expected, atol=1e-5)
-        run_in = route.places(np.array([start_m - 0.5]))[0]
-        ahead = np.subtract(lines[index].end_ne_m, lines[index].start_ne_m) / 5.0
-        np.testing.assert_allclose(run_in, lines[index].start_ne_m - 0.5 * ahead, atol=1e-5)
-
-
-def test_a_route_goes_on_straight_beyond_its_ends() -> None:
-    route = route_through([line((0.0, 0.0), (3.0, 0.0))], 0.5, 0.5)
-    assert route.length_m == pytest.approx(4.0)
-    np.testing.assert_allclose(
-        route.places(np.array([-1.0, 0.0, 5.0])), [[-1.5, 0], [-0.5, 0], [4.5, 0]], atol=1e-12
-    )
-
-
 def test_parts_of_one_line_are_joined_straight() -> None:
     parts = [line((0.0, 0.0), (3.0, 0.0)), line((3.6, 0.0), (8.0, 0.0))]
     route = route_through(parts, 0.5, 0.5)
 
     assert route.length_m == pytest.approx(8.0 + 2 * 0.5)
     assert all(leg.curvature_per_m == 0 for leg in route.legs)
-
-
-def test_without_lines_there_is_no_route() -> None:
-    with pytest.raises(PlanError):
-        route_through([], 0.5, 0.5)
