@@ -352,16 +352,16 @@ class _QgcPlan(_Json):
         """The shapes of one of `LAYERS`."""
         if name == "mission":
             areas = [x.polygon for x in self.mission.items if x.kind in ("survey", "StructureScan")]
-            rings = [np.array(polygon).reshape(-1, 2) for polygon in areas]
+            rings = [np.array(polygon).reshape(-1, 2) for polygon in areas if polygon]
             lines = tuple(
                 RawLine(points=np.array(x.polyline).reshape(-1, 2), width_m=x.width_m)
                 for x in self.mission.items
-                if x.kind == "CorridorScan"
+                if x.kind == "CorridorScan" and x.polyline
             )
         else:
             inclusion, lines = name == "inclusion", ()
             zones = [zone for zone in self.fence.polygons if zone.inclusion == inclusion]
-            rings = [np.array(zone.polygon).reshape(-1, 2) for zone in zones]
+            rings = [np.array(zone.polygon).reshape(-1, 2) for zone in zones if zone.polygon]
             rings += [
                 _corners_of_circle(zone.circle, outside=not inclusion)
                 for zone in self.fence.circles

@@ -109,7 +109,7 @@ def _mission(kind: str, **item: object) -> dict[str, Any]:
         ({"mission": {"items": []}}, "'mission'"),
         ({"mission": {"items": 3}}, "mission.items"),
         (_mission("survey", polygon=[[1]]), "mission.items.0.polygon"),
-        (_mission("survey"), "0 distinct corners"),
+        (_mission("survey"), "'mission'"),
         (_mission("survey", polygon=[[135, 1]] * 3), "mission 1, corner 1 "),
         (_mission("survey", polygon=[[10**400, 35.0], *POLYGON[1:]]), "items.0.polygon.0"),
         (_mission("CorridorScan", polyline=POLYGON, CorridorWidth=0), "CorridorWidth"),
