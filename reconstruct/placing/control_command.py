@@ -155,7 +155,7 @@ def survey_control(
         )
     score = None
     if read_stage(workspace / "sparse") is not None:
-        score = ControlRecord.made(workspace / ControlRecord.path)
+        score = ControlRecord.read_existing(workspace / ControlRecord.path)
     if score is not None:
         lines.append(describe(score))
     if (workspace / CONTROL_FILE).is_file():
