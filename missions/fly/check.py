@@ -11,6 +11,7 @@ from alice_survey.core.artefacts import need_stage, refuse_links, write_json
 from alice_survey.core.config import CameraConfig, SurveyConfig, WaterConfig
 from alice_survey.core.errors import PlanError, warn
 from alice_survey.core.executor import SERIAL, Executor, local_executor
+from alice_survey.core.text_table import text_table
 from alice_survey.kit.words import share
 from camera_calib.rig import Rig, design_rig, mounted, read_rig
 from missions.coverage.certificate import Certificate, certificate
@@ -205,48 +206,42 @@ def _write(folder: Path, check: Check, data: dict[str, Any]) -> None:
 
 def _check_text(check: Check) -> str:
     record, planned, flown = check.record, check.planned, check.flown
-    pattern = flown.pattern
-    pictures = pattern.passes * pattern.pictures
-    pattern_text = f"{counted(pattern.passes, 'line')}, {pictures} pictures of each camera"
-    rows = [
-        ("in at least one picture", planned.covered_share, flown.covered_share),
-        ("in stereo", planned.stereo_share, flown.stereo_share),
-        (
-            f"at the requested overlap ({pattern_text})",
-            planned.share_at_overlap,
-            flown.share_at_overlap,
-        ),
-    ]
-    width = max(len(name) for name, _, _ in rows)
+    pattern, triggered = flown.pattern, record.triggered
+    overlap = f"{counted(pattern.passes, 'line')}, {pattern.passes * pattern.pictures} pictures"
     altitude = record.stations.altitude_m
     above = f", {altitude.min():.2f} to {altitude.max():.2f} m above it" if len(altitude) else ""
     lines = [
-        f"{record.source}: {len(record.stations)} of {record.triggered} triggers over the sea "
+        f"{record.source}: {len(record.stations)} of {triggered} triggers over the sea "
         f"floor{above}; triggers: {record.triggers}",
-        *(
-            f"  left out: {count} ({count / record.triggered:.1%}) {reason}"
-            for reason, count in record.left_out.items()
-        ),
-        *(
-            [
-                f"  on the way down and up: {record.on_way} "
-                f"({record.on_way / record.triggered:.1%}), before the first and after the last "
-                "picture on a line"
-            ]
-            if record.on_way
-            else []
-        ),
-        *(f"  {note}" for note in record.notes),
-        f"{check.plan.name}: {flown.area_m2:.1f} m2, cameras {', '.join(flown.cameras)} "
-        f"({check.rig.source}), judged every {100 * flown.grid.cell_m:.1f} cm",
-        f"  {'':<{width}}  {'planned':>9}  {'flown':>9}",
-        *(f"  {name:<{width}}  {share(a, 2):>9}  {share(b, 2):>9}" for name, a, b in rows),
-        f"  {'pictures':<{width}}  {planned.taken:>9}  {flown.taken:>9}",
-        f"  {'fewest pictures of a camera':<{width}}  {planned.fewest_pictures:>9}  "
-        f"{flown.fewest_pictures:>9}",
-        *_hole_rows(check.holes),
     ]
-    return "\n".join(lines)
+    lines += [
+        f"  left out: {count} ({count / triggered:.1%}) {reason}"
+        for reason, count in record.left_out.items()
+    ]
+    if record.on_way:
+        lines.append(
+            f"  on the way down and up: {record.on_way} ({record.on_way / triggered:.1%}), before "
+            "the first and after the last picture on a line"
+        )
+    lines += [f"  {note}" for note in record.notes]
+    lines.append(
+        f"{check.plan.name}: {flown.area_m2:.1f} m2, cameras {', '.join(flown.cameras)} "
+        f"({check.rig.source}), judged every {100 * flown.grid.cell_m:.1f} cm"
+    )
+    shares = {
+        "in at least one picture": "covered_share", "in stereo": "stereo_share",
+        f"at the requested overlap ({overlap} of each camera)": "share_at_overlap",
+    }  # fmt: skip
+    numbers = {"pictures": "taken", "fewest pictures of a camera": "fewest_pictures"}
+    rows = [
+        (name, *(share(getattr(each, field), 2) for each in (planned, flown)))
+        for name, field in shares.items()
+    ] + [
+        (name, *(str(getattr(each, field)) for each in (planned, flown)))
+        for name, field in numbers.items()
+    ]
+    lines.append(text_table(("", "planned", "flown"), rows))
+    return "\n".join([*lines, *_hole_rows(check.holes)])
 
 
 def _hole_rows(holes: Sequence[Hole]) -> list[str]:
@@ -257,16 +252,19 @@ def _hole_rows(holes: Sequence[Hole]) -> list[str]:
     rows = [
         f"{counted(len(holes), 'hole')}, {whole:.2f} m2 short of that overlap, of which "
         f"{unseen:.2f} m2 in no picture; worst first:",
-        f"  {'':>3}  {'area m2':>8}  {'unseen m2':>9}  {'size m':>13}  {'latitude':>12}  "
-        f"{'longitude':>13}  {'north m':>8}  {'east m':>8}",
-    ]
-    for number, hole in enumerate(holes[:_LISTED], 1):
-        size = f"{hole.length_m:.2f} x {hole.width_m:.2f}"
-        rows.append(
-            f"  {number:>3}  {hole.area_m2:>8.2f}  {hole.unseen_m2:>9.2f}  {size:>13}  "
-            f"{hole.latitude_deg:>12.7f}  {hole.longitude_deg:>13.7f}  {hole.place_ne[0]:>8.2f}  "
-            f"{hole.place_ne[1]:>8.2f}"
-        )
+        text_table(
+            ("", "area m2", "unseen m2", "size m", "latitude", "longitude", "north m", "east m"),
+            [
+                (
+                    str(number), f"{hole.area_m2:.2f}", f"{hole.unseen_m2:.2f}",
+                    f"{hole.length_m:.2f} x {hole.width_m:.2f}", f"{hole.latitude_deg:.7f}",
+                    f"{hole.longitude_deg:.7f}", f"{hole.place_ne[0]:.2f}",
+                    f"{hole.place_ne[1]:.2f}",
+                )
+                for number, hole in enumerate(holes[:_LISTED], 1)
+            ],
+        ),
+    ]  # fmt: skip
     if len(holes) > _LISTED:
         rest = sum(hole.area_m2 for hole in holes[_LISTED:])
         rows.append(f"  and {len(holes) - _LISTED} more, {rest:.2f} m2 in all (certificate.json)")

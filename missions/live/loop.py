@@ -287,17 +287,11 @@ class PilotLoop:
 
     def _off(self, now_s: float) -> Command:
         """No thrust."""
-        count = len(self.pilot.allocation.thrust)
+        none = np.zeros(len(self.pilot.allocation.thrust))
         return Command(
-            time_s=now_s,
-            state=self.state,
-            why=self._ending or self._why,
-            wrench=np.zeros(6),
-            thrust_n=np.zeros(count),
-            rps=np.zeros(count),
-            velocity_body=np.zeros(3),
-            heading_rad=math.nan,
-        )
+            time_s=now_s, state=self.state, why=self._ending or self._why, wrench=np.zeros(6),
+            thrust_n=none, rps=none.copy(), velocity_body=np.zeros(3), heading_rad=math.nan,
+        )  # fmt: skip
 
     def _refuse(self, why: str) -> None:
         self.refused[why] += 1

@@ -20,6 +20,10 @@ from alice_survey.core.errors import NavigationError, warn
 from alice_survey.core.frames import Array, Datum
 from missions.logs.dive import DATED_AFTER_S, LoggedDive
 from missions.logs.message_sources import (
+    AT_SURFACE,
+    DOWN,
+    FIX_3D,
+    HEARD_BY,
     Keep,
     LogTable,
     Mask,
@@ -27,6 +31,7 @@ from missions.logs.message_sources import (
     Tables,
     dive_from,
     first_bytes,
+    hears_bottom,
     read_by,
     take,
     with_time,
@@ -45,9 +50,6 @@ _WEEK_S = 604800.0
 _LEAPS = ((1167264018.0, 18.0), (1119744017.0, 17.0), (1025136016.0, 16.0), (0.0, 15.0))
 """GPS seconds from which GPS led UTC by this many seconds (IERS Bulletin C: 1 January 2017,
 1 July 2015, 1 July 2012)."""
-_FIX_3D = 3
-_DOWN = 25
-"""ROTATION_PITCH_270: a range finder that looks down."""
 _GOOD = 4
 """RangeFinder status: in range."""
 _SUBMARINE = 12
@@ -84,28 +86,17 @@ def _from_origin(table: LogTable, tables: Tables) -> tuple[Array, Array] | str:
 
 
 def _has_fix(field: str) -> Keep:
-    return Keep((field,), lambda table: table.columns[field] >= _FIX_3D)
+    return Keep((field,), lambda table: table.columns[field] >= FIX_3D)
 
 
 def _sees_down(table: LogTable) -> Mask:
     """Rows of a range finder that looks down and is in range."""
     good: Mask = table.columns["Stat"] == _GOOD
     if "Orient" in table.columns:
-        good &= table.columns["Orient"] == _DOWN
+        good &= table.columns["Orient"] == DOWN
     return good
 
 
-def _hears_bottom(table: LogTable) -> Mask:
-    """Rows of DISTANCE_SENSOR that look down and are within what the sensor measures."""
-    distance = table.columns["current_distance"]
-    inside = (distance >= table.columns["min_distance"]) & (
-        distance < table.columns["max_distance"]
-    )
-    good: Mask = inside & (table.columns["orientation"] == _DOWN)
-    return good
-
-
-_SURFACE = "positions are GPS: they hold at the surface only"
 _BACKUP = "positions are those of the backup attitude filter"
 _DEGREES = float(np.rad2deg(1.0))
 _BIN: Mapping[str, tuple[Source, ...]] = {
@@ -114,7 +105,7 @@ _BIN: Mapping[str, tuple[Source, ...]] = {
         Source("XKF1", _from_origin),
         Source("NKF1", _from_origin),
         Source("AHR2", take("Lat", "Lng"), _BACKUP),
-        Source("GPS", take("Lat", "Lng", keep=_has_fix("Status")), _SURFACE),
+        Source("GPS", take("Lat", "Lng", keep=_has_fix("Status")), AT_SURFACE),
     ),
     "depth": (
         Source("POS", take("RelHomeAlt", scale=-1.0)),
@@ -135,7 +126,9 @@ _BIN: Mapping[str, tuple[Source, ...]] = {
 _TLOG: Mapping[str, tuple[Source, ...]] = {
     "navigation": (
         Source("GLOBAL_POSITION_INT", take("lat", "lon", scale=1e-7)),
-        Source("GPS_RAW_INT", take("lat", "lon", scale=1e-7, keep=_has_fix("fix_type")), _SURFACE),
+        Source(
+            "GPS_RAW_INT", take("lat", "lon", scale=1e-7, keep=_has_fix("fix_type")), AT_SURFACE
+        ),
     ),
     "depth": (
         Source("GLOBAL_POSITION_INT", take("relative_alt", scale=-1e-3)),
@@ -145,11 +138,7 @@ _TLOG: Mapping[str, tuple[Source, ...]] = {
     "altitude": (
         Source(
             "DISTANCE_SENSOR",
-            take(
-                "current_distance",
-                scale=1e-2,
-                keep=Keep(("orientation", "min_distance", "max_distance"), _hears_bottom),
-            ),
+            take("current_distance", scale=1e-2, keep=Keep(HEARD_BY, hears_bottom)),
         ),
         Source("RANGEFINDER", take("distance", absent=0.0)),
     ),
@@ -226,7 +215,7 @@ def _since_1970(tables: Tables) -> tuple[float, bool]:
     gps = tables.get("GPS")
     if gps is None or not gps.has("TimeUS", "GMS", "GWk", "Status"):
         return 0.0, False
-    fixed = gps.rows((gps.columns["Status"] >= _FIX_3D) & (gps.columns["GWk"] > 0))
+    fixed = gps.rows((gps.columns["Status"] >= FIX_3D) & (gps.columns["GWk"] > 0))
     if not len(fixed):
         return 0.0, False
     seconds = fixed.columns["GWk"] * _WEEK_S + fixed.columns["GMS"] * 1e-3

@@ -78,6 +78,28 @@ class Keep:
     rows: Callable[[LogTable], Mask]
 
 
+FIX_3D = 3
+"""Least type of a GPS fix with a place."""
+DOWN = 25
+"""ROTATION_PITCH_270: a range finder that looks down."""
+AT_SURFACE = "positions are GPS: they hold at the surface only"
+
+
+def hears_bottom(table: LogTable) -> Mask:
+    """Rows of a distance sensor that looks down and is within what it measures."""
+    distance = table.columns["current_distance"]
+    good: Mask = (
+        (table.columns["orientation"] == DOWN)
+        & (distance >= table.columns["min_distance"])
+        & (distance < table.columns["max_distance"])
+    )
+    return good
+
+
+HEARD_BY = ("orientation", "min_distance", "max_distance")
+"""Fields that `hears_bottom` needs."""
+
+
 def take(
     *fields: str, scale: float = 1.0, keep: Keep | None = None, absent: float | None = None
 ) -> Reader:

@@ -18,13 +18,16 @@ from alice_survey.core.errors import NavigationError
 from alice_survey.core.frames import Array, Datum, attitude_from_rotation
 from missions.logs.dive import LoggedDive, Signal, clean_signal
 from missions.logs.message_sources import (
+    AT_SURFACE,
+    FIX_3D,
+    HEARD_BY,
     Keep,
     LogTable,
-    Mask,
     Source,
     Tables,
     dive_from,
     first_bytes,
+    hears_bottom,
     read_by,
     take,
     with_time,
@@ -35,9 +38,6 @@ _HEADER = 16
 _MAX_DEPTH, _MAX_FIELDS = 8, 4096
 _MAX_READS = 8
 """Times that a log may be read over."""
-_FIX_3D = 3
-_DOWN = 25
-"""ROTATION_PITCH_270: a range finder that looks down."""
 _GPS = ("sensor_gps", "vehicle_gps_position")
 """Receivers by the names of new and of old versions."""
 _LOCAL, _GLOBAL = "vehicle_local_position", "vehicle_global_position"
@@ -80,28 +80,18 @@ def _attitude(table: LogTable, _: Tables) -> tuple[Array, Array] | str:
     return table.columns["time_s"], angles
 
 
-def _hears_bottom(table: LogTable) -> Mask:
-    distance = table.columns["current_distance"]
-    good: Mask = (
-        (table.columns["orientation"] == _DOWN)
-        & (distance >= table.columns["min_distance"])
-        & (distance < table.columns["max_distance"])
-    )
-    if "signal_quality" in table.columns:  # 0 is invalid, -1 not known
-        good &= table.columns["signal_quality"] != 0
-    return good
-
-
-_SURFACE = "positions are GPS: they hold at the surface only"
-_FIX = Keep(("fix_type",), lambda table: table.columns["fix_type"] >= _FIX_3D)
+_BOTTOM = Keep(  # a quality of 0 is invalid, one of -1 not known
+    HEARD_BY, lambda table: hears_bottom(table) & (table.columns.get("signal_quality", 1) != 0)
+)
+_FIX = Keep(("fix_type",), lambda table: table.columns["fix_type"] >= FIX_3D)
 _SOURCES: Mapping[str, tuple[Source, ...]] = {
     "navigation": (
         Source(_GLOBAL, take("lat", "lon")),
         Source(_LOCAL, _from_origin),
-        Source(_GPS[0], take("latitude_deg", "longitude_deg", keep=_FIX), _SURFACE),
-        Source(_GPS[0], take("lat", "lon", scale=1e-7, keep=_FIX), _SURFACE),
-        Source(_GPS[1], take("latitude_deg", "longitude_deg", keep=_FIX), _SURFACE),
-        Source(_GPS[1], take("lat", "lon", scale=1e-7, keep=_FIX), _SURFACE),
+        Source(_GPS[0], take("latitude_deg", "longitude_deg", keep=_FIX), AT_SURFACE),
+        Source(_GPS[0], take("lat", "lon", scale=1e-7, keep=_FIX), AT_SURFACE),
+        Source(_GPS[1], take("latitude_deg", "longitude_deg", keep=_FIX), AT_SURFACE),
+        Source(_GPS[1], take("lat", "lon", scale=1e-7, keep=_FIX), AT_SURFACE),
     ),
     "depth": (
         Source(
@@ -112,15 +102,7 @@ _SOURCES: Mapping[str, tuple[Source, ...]] = {
         ),
     ),
     "attitude": (Source("vehicle_attitude", _attitude),),
-    "altitude": (
-        Source(
-            "distance_sensor",
-            take(
-                "current_distance",
-                keep=Keep(("orientation", "min_distance", "max_distance"), _hears_bottom),
-            ),
-        ),
-    ),
+    "altitude": (Source("distance_sensor", take("current_distance", keep=_BOTTOM)),),
     "velocity": (Source(_LOCAL, take("vx", "vy", "vz", keep=_valid("v_xy_valid", "v_z_valid"))),),
     "rates": (Source("vehicle_angular_velocity", take(*(f"xyz[{i}]" for i in range(3)))),),
     "pwm": (Source("actuator_outputs", take(*(f"output[{i}]" for i in range(8)))),),
@@ -172,7 +154,7 @@ def _since_1970(tables: Tables) -> float | None:
         table = tables.get(name)
         if table is None or not table.has("timestamp", "time_utc_usec", "fix_type"):
             continue
-        good = (table.columns["fix_type"] >= _FIX_3D) & (table.columns["time_utc_usec"] > 0)
+        good = (table.columns["fix_type"] >= FIX_3D) & (table.columns["time_utc_usec"] > 0)
         if good.any():
             apart = table.columns["time_utc_usec"][good] - table.columns["timestamp"][good]
             return float(np.median(apart)) * 1e-6
