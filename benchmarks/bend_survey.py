@@ -31,7 +31,7 @@ from alice_survey.core.manifest import ImageRecord
 from alice_survey.core.records import RangeRecord
 from alice_survey.core.trajectory import Trajectory, read_columns, read_track
 from alice_survey.sim.seafloor.terrain import Terrain, survey_terrain
-from camera_calib.freedom import moved
+from camera_calib.freedom import move_rig
 from camera_calib.rig import Covariance, Rig, read_rig
 from missions.logs.navigation_csv import NavigationLog, read_navigation
 from missions.values.plan_file import read_plan
@@ -143,7 +143,7 @@ def calibrated_rig(
     matrix = rig.covariance.matrix * np.outer(unit, unit)
     return replace(
         rig,
-        cameras={name: camera.reduced(by) for name, camera in rig.cameras.items()},
+        cameras={name: camera.downscale(by) for name, camera in rig.cameras.items()},
         covariance=Covariance(parameters=names, matrix=matrix),
     )
 
@@ -183,7 +183,7 @@ def wrong_rig(rig: Rig, times: float, seed: int, *, bias_px: float = 0.0) -> Rig
     step = times * scale * (factor @ rng.normal(size=len(scale)))
     parts, axes = np.linalg.eigh(bias_covariance(rig, names, bias_px) / np.outer(scale, scale))
     step += scale * (axes @ (np.sqrt(np.maximum(parts, 0.0)) * rng.normal(size=len(scale))))
-    return moved(rig, names, step)
+    return move_rig(rig, names, step)
 
 
 @dataclass(frozen=True, kw_only=True)

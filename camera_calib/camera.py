@@ -16,7 +16,7 @@ from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import Array
 from camera_calib import optics
 from camera_calib.lenses.opencv import OpenCVLens
-from camera_calib.lenses.values import MOST_PX, LensValues
+from camera_calib.lenses.values import MAX_PX, LensValues
 from camera_calib.ports.flat import FlatPort
 from camera_calib.ports.none import NO_PORT
 from camera_calib.ports.values import PortValues
@@ -49,8 +49,8 @@ class Camera:
     def __post_init__(self) -> None:
         if min(self.width_px, self.height_px) < 1:
             raise CalibrationError("camera: width_px, height_px, fx_px and fy_px must be positive")
-        if max(self.width_px, self.height_px) > MOST_PX:
-            raise CalibrationError(f"camera: a size or focal length exceeds {MOST_PX:g} px")
+        if max(self.width_px, self.height_px) > MAX_PX:
+            raise CalibrationError(f"camera: a size or focal length exceeds {MAX_PX:g} px")
 
     @property
     def optics(self) -> optics.Optics:
@@ -193,13 +193,13 @@ class Camera:
         """The same camera without its port."""
         return replace(self, port=NO_PORT)
 
-    def reduced(self, scale: int) -> "Camera":
+    def downscale(self, scale: int) -> "Camera":
         """The same camera with pixels `scale` times as large; partial ones are cut off."""
         return replace(
             self,
             width_px=self.width_px // scale,
             height_px=self.height_px // scale,
-            lens=self.lens.reduced(scale),
+            lens=self.lens.downscale(scale),
         )
 
     def pixel_centres(self, step: int = 1) -> Array:

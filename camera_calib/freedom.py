@@ -93,7 +93,7 @@ def value(rig: Rig, name: str) -> float:
     return float(pose.rotation.as_rotvec()[_TURN.index(field)])
 
 
-def wanted_slopes(rig: Rig, names: Sequence[str], camera: str) -> tuple[Indices, Indices]:
+def slope_columns(rig: Rig, names: Sequence[str], camera: str) -> tuple[Indices, Indices]:
     """Which slopes of a camera's pixels are by one of the names, ascending, and which name that is.
 
     The slopes are those by the camera's own parameters, then by its pose on the rig.
@@ -105,19 +105,19 @@ def wanted_slopes(rig: Rig, names: Sequence[str], camera: str) -> tuple[Indices,
     return columns, at
 
 
-def chosen_slopes(wanted: Indices, by_camera: Array, by_point: Array, turned: Array) -> Array:
-    """Slopes (..., 2, K) of a camera's pixels by what `wanted_slopes` lists.
+def select_slopes(columns: Indices, by_camera: Array, by_point: Array, turned: Array) -> Array:
+    """Slopes (..., 2, K) of a camera's pixels by what `slope_columns` lists.
 
     Args:
-        wanted: (K,).
+        columns: (K,).
         by_camera: (..., 2, P) slopes by the camera's own parameters.
         by_point: (..., 2, 3) slopes by the point.
         turned: (..., 3) the point along the camera's axes, from the rig's origin.
     """
-    own = wanted[wanted < by_camera.shape[-1]]
-    if len(own) == len(wanted):
+    own = columns[columns < by_camera.shape[-1]]
+    if len(own) == len(columns):
         return by_camera[..., own]
-    by_pose = pose_jacobian(by_point, turned)[..., wanted[len(own) :] - by_camera.shape[-1]]
+    by_pose = pose_jacobian(by_point, turned)[..., columns[len(own) :] - by_camera.shape[-1]]
     return np.concatenate([by_camera[..., own], by_pose], axis=-1)
 
 
@@ -132,7 +132,7 @@ def at_bound(rig: Rig, names: Sequence[str]) -> Flags:
     return np.array([bound(name) for name in names], dtype=np.bool_)
 
 
-def moved(rig: Rig, names: Sequence[str], step: Array) -> Rig:
+def move_rig(rig: Rig, names: Sequence[str], step: Array) -> Rig:
     """A rig after a step of some parameters; bounded ones stop at their bound.
 
     Raises:
@@ -316,13 +316,13 @@ class Freedom:
         Raises:
             CalibrationError: a name is not a parameter of the rig.
         """
-        wanted = {*self.free, *self.prior.parameters}
+        adjusted = {*self.free, *self.prior.parameters}
         known = all_names(rig)
-        if wanted - set(known):
+        if adjusted - set(known):
             raise CalibrationError(
-                f"the rig has no parameter {', '.join(sorted(wanted - set(known)))}"
+                f"the rig has no parameter {', '.join(sorted(adjusted - set(known)))}"
             )
-        return tuple(name for name in known if name in wanted)
+        return tuple(name for name in known if name in adjusted)
 
 
 HELD = Freedom()

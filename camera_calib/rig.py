@@ -139,7 +139,7 @@ class Rig:
         return replace(self, cameras=cameras, covariance=covariance)
 
 
-def mounted(rig: Rig | None) -> Rig | None:
+def rig_with_mount(rig: Rig | None) -> Rig | None:
     """The rig where its place on the vehicle is known, else None."""
     return None if rig is None or rig.body_from_rig is None else rig
 
@@ -166,8 +166,8 @@ def design_rig(camera: CameraConfig, water: WaterConfig, scale: int = 1) -> Rig:
         width_px=camera.width_px,
         height_px=camera.height_px,
         lens=LENSES[camera.lens](fx_px=focal_px, fy_px=focal_px, **middle),
-        port=PORTS[camera.port].designed(camera, water.n_water),
-    ).reduced(scale)
+        port=PORTS[camera.port].from_design(camera, water.n_water),
+    ).downscale(scale)
     ahead, right, down = camera.position_body_m
     pupil = (ahead, right, down - float(one.front_cam[2]))
     return Rig(

@@ -85,12 +85,12 @@ class TargetShape:
             spread = np.sqrt(np.diag(self.covariance))
         return dict(zip(self.parameters, spread.tolist(), strict=True))
 
-    def known(self, name: str) -> tuple[float, float]:
+    def value_and_sigma(self, name: str) -> tuple[float, float]:
         """Value and sigma of one mode."""
         at = self.parameters.index(name)
         return float(self.values[at]), self.sigmas[name]
 
-    def found(self, values: Array, covariance: Array | None = None) -> "TargetShape":
+    def with_values(self, values: Array, covariance: Array | None = None) -> "TargetShape":
         """The same modes with other values."""
         return replace(self, values=values, covariance=covariance)
 

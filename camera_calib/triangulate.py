@@ -189,11 +189,11 @@ def _equations(
     ):
         found, by_point, _ = camera.project_jacobian(pose.apply(points_world))
         seen = np.isfinite(measured).all(axis=1)
-        misses = np.where(seen[:, None], found - measured, 0.0)
+        residuals = np.where(seen[:, None], found - measured, 0.0)
         slopes = np.where(seen[:, None, None], by_point @ pose.rotation.as_matrix(), 0.0)
-        cost += weight * (misses**2).sum(axis=1)
+        cost += weight * (residuals**2).sum(axis=1)
         matrix += weight * np.einsum("nki,nkj->nij", slopes, slopes)
-        right -= weight * np.einsum("nki,nk->ni", slopes, misses)
+        right -= weight * np.einsum("nki,nk->ni", slopes, residuals)
     return np.where(np.isnan(cost), np.inf, cost), matrix, right
 
 

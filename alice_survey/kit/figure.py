@@ -51,9 +51,9 @@ __all__ = [
     "BAND", "GRID", "INK", "INKS", "MARKS", "SOFT", "WIDTH_IN", "Axes", "BoundaryNorm", "Circle",
     "Ellipse", "EllipseCollection", "LineCollection", "LinearSegmentedColormap", "ListedColormap",
     "LogNorm", "MaxNLocator", "Outline", "PathPatch", "PolyCollection", "Polygon", "Rectangle",
-    "Sheet", "check_figure_path", "colour_bar", "drawn", "even_limit", "figure_style", "map_axes",
-    "new_figure",
-    "north_arrow", "palette_colours", "palette_steps", "plain_name", "png_of", "save_figure",
+    "Sheet", "check_figure_path", "colour_bar", "draw_figure", "even_limit", "figure_style",
+    "map_axes", "new_figure", "north_arrow", "palette_colours", "palette_steps", "plain_name",
+    "png_of", "save_figure",
     "scale_bar", "shrunk_png", "svg_of", "withStroke",
 ]  # fmt: skip
 
@@ -128,12 +128,12 @@ def new_figure(height_in: float, width_in: float = WIDTH_IN, layout: str | None 
 
 def png_of(sheet: Any, dpi: float = _DPI, **options: Any) -> bytes:
     """A figure's pixels."""
-    return _saved(sheet, "png", dpi, options)
+    return _save_bytes(sheet, "png", dpi, options)
 
 
 def svg_of(sheet: Any, dpi: float = _DPI, **options: Any) -> bytes:
     """A figure's vectors, with text as text."""
-    return _saved(sheet, "svg", dpi, options)
+    return _save_bytes(sheet, "svg", dpi, options)
 
 
 def check_figure_path(path: Path) -> None:
@@ -160,7 +160,7 @@ def save_figure(sheet: Any, path: Path, dpi: float = _DPI, **options: Any) -> No
         ConfigError: the name has another ending, or the file cannot be written.
     """
     check_figure_path(path)
-    content = _saved(sheet, path.suffix.removeprefix(".").lower(), dpi, options)
+    content = _save_bytes(sheet, path.suffix.removeprefix(".").lower(), dpi, options)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as temporary:
@@ -169,7 +169,7 @@ def save_figure(sheet: Any, path: Path, dpi: float = _DPI, **options: Any) -> No
         raise ConfigError(f"{path}: cannot be written: {error.strerror}") from None
 
 
-def _saved(sheet: Any, kind: str, dpi: float, options: dict[str, Any]) -> bytes:
+def _save_bytes(sheet: Any, kind: str, dpi: float, options: dict[str, Any]) -> bytes:
     content = io.BytesIO()
     with figure_style(), warnings.catch_warnings():
         # The name of a picture may have letters that the font lacks.
@@ -178,7 +178,7 @@ def _saved(sheet: Any, kind: str, dpi: float, options: dict[str, Any]) -> bytes:
     return content.getvalue()
 
 
-def drawn(
+def draw_figure(
     paint: Callable[[Sequence[Any]], None],
     height_in: float,
     *,

@@ -37,7 +37,7 @@ def map_data(survey_map: SurveyMap) -> tuple[str, list[tuple[str, str]]]:
         elif layer.address is not None:
             described.append(picture_json(layer) | {"address": layer.address})
         else:
-            found, text = _packed(layer.tiles)
+            found, text = _pack_tiles(layer.tiles)
             described.append(picture_json(layer) | {"block": f"tiles-{index}", "tiles": found})
             tiles.append((f"tiles-{index}", text))
     data = {
@@ -73,7 +73,7 @@ def map_extent(survey_map: SurveyMap) -> tuple[float, float, float, float]:
     return min(east), min(north), max(east), max(north)
 
 
-def _packed(tiles: Mapping[str, bytes]) -> tuple[dict[str, list[Any]], str]:
+def _pack_tiles(tiles: Mapping[str, bytes]) -> tuple[dict[str, list[Any]], str]:
     """Where each tile lies in the text of all, and that text."""
     found: dict[str, list[Any]] = {}
     texts: list[str] = []

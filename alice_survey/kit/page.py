@@ -48,7 +48,7 @@ def render_html(report: Report) -> str:
             report lacks, a map or a mesh has no section, or a picture is of an unknown kind.
     """
     _check(report)
-    styles, scripts = _carried(report)
+    styles, scripts = _embedded_files(report)
     map_json, map_tiles = ("", []) if report.map is None else map_data(report.map)
     carried = report.mesh is not None and report.mesh.address is None
     page: str = (
@@ -99,7 +99,7 @@ def _check(report: Report) -> None:
             raise ValueError(f"{shown} sections show the {scene}, {int(held is not None)} expected")
 
 
-def _carried(report: Report) -> tuple[list[str], list[str]]:
+def _embedded_files(report: Report) -> tuple[list[str], list[str]]:
     """Styles and scripts that the page embeds."""
     styles, scripts = [_read("page.css")], list[str]()
     if report.map is not None:
@@ -121,7 +121,7 @@ def page_policy(report: Report) -> str:
     A texture of the mesh is a `blob:` of the page itself. A page that a server gives may load
     from that server too.
     """
-    styles, scripts = _carried(report)
+    styles, scripts = _embedded_files(report)
     layers = report.map.layers if report.map is not None else ()
     tiled = any(isinstance(layer, PictureLayer) and layer.address for layer in layers)
     fetched = report.mesh is not None and report.mesh.address is not None

@@ -66,7 +66,7 @@ def _fonts() -> Path:
 
 
 def _data(report: Report, folder: Path) -> dict[str, Any]:
-    files = _Files(folder)
+    files = _FigureFiles(folder)
     return {
         "title": report.title,
         "subtitle": report.subtitle,
@@ -105,7 +105,7 @@ def _figures(report: Report, section: Section) -> Iterator[Figure]:
     yield from section.figures
 
 
-class _Files:
+class _FigureFiles:
     """Figures as files next to the template."""
 
     def __init__(self, folder: Path) -> None:

@@ -43,12 +43,12 @@ def millimetres(value: float | None) -> str:
     return length(None if value is None else 1e-3 * value)
 
 
-def digits(value: float, wanted: int = 3) -> str:
+def digits(value: float, significant: int = 3) -> str:
     """A number with this many digits and never an exponent."""
     if value == 0 or not math.isfinite(value):
         return f"{value:g}"
-    rounded = float(f"{value:.{wanted - 1}e}")  # 99.96 has one digit more than it seems
-    places = max(0, wanted - 1 - math.floor(math.log10(abs(rounded))))
+    rounded = float(f"{value:.{significant - 1}e}")  # 99.96 has one digit more than it seems
+    places = max(0, significant - 1 - math.floor(math.log10(abs(rounded))))
     return f"{value:.{places}f}"
 
 

@@ -75,7 +75,7 @@ class Pinhole:
         z = np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
         return self.pixels(points[..., :2] / z)
 
-    def resized(self, width_px: int, height_px: int) -> "Pinhole":
+    def resize(self, width_px: int, height_px: int) -> "Pinhole":
         """The same view in a picture of another size."""
         sx, sy = width_px / self.width_px, height_px / self.height_px
         return Pinhole(
@@ -247,8 +247,8 @@ def residual_px(warp: PinholeWarp, depths_m: Array) -> Array:
         (D, 15, 15) distances over the frame in pixels of the pinhole.
     """
     pixels = warp.camera.frame_grid(_GRID, _GRID)
-    misses = [warp.to_pinhole(pixels, d) - warp.to_pinhole(pixels) for d in depths_m]
-    lengths: Array = np.linalg.norm(np.stack(misses), axis=-1)
+    residuals = [warp.to_pinhole(pixels, d) - warp.to_pinhole(pixels) for d in depths_m]
+    lengths: Array = np.linalg.norm(np.stack(residuals), axis=-1)
     return lengths
 
 

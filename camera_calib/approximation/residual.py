@@ -70,13 +70,13 @@ class Residual:
     """(D,) from the entrance pupil along the axis."""
     pixels: Array
     """(rows, columns, 2) places in the picture, corners included."""
-    misses_px: Array
+    errors_px: Array
     """(D, rows, columns, 2): pixel of the stand-in minus pixel of the (warped) picture."""
 
     @property
     def sizes_px(self) -> Array:
         """(D, rows, columns) lengths of the errors."""
-        lengths: Array = np.linalg.norm(self.misses_px, axis=-1)
+        lengths: Array = np.linalg.norm(self.errors_px, axis=-1)
         return lengths
 
     @property
@@ -162,11 +162,11 @@ def approximations(
     distances = np.linspace(near_m, far_m, 9) if distances_m is None else np.array(distances_m)
     best = best_warp(camera, near_m, far_m, working_range_m)
     at_pupil = replace(best, centre_m=(0.0, 0.0, 0.0))
-    pixels, points = _seen(camera, distances, _GRID)
+    pixels, points = _visible_points(camera, distances, _GRID)
     stand_ins = [
-        _warped("pinhole at the pupil, warped", at_pupil),
-        _warped("pinhole at the best point, warped", best),
-        *(_fitted(model, camera, pixels, points, turned) for model in models),
+        _warp_pinhole("pinhole at the pupil, warped", at_pupil),
+        _warp_pinhole("pinhole at the best point, warped", best),
+        *(_fit_model(model, camera, pixels, points, turned) for model in models),
     ]
     return [residual(camera, one, distances) for one in stand_ins]
 
@@ -183,7 +183,7 @@ def residual(camera: Camera, stand_in: StandIn, distances_m: Array, grid: int = 
     Raises:
         CalibrationError: a part of the frame sees nothing.
     """
-    pixels, points = _seen(camera, distances_m, grid)
+    pixels, points = _visible_points(camera, distances_m, grid)
     shown = pixels
     if stand_in.warped_at_m is not None:
         shown = stand_in.project(camera.at_depth(pixels, stand_in.warped_at_m))
@@ -191,7 +191,7 @@ def residual(camera: Camera, stand_in: StandIn, distances_m: Array, grid: int = 
         stand_in=stand_in,
         distances_m=distances_m,
         pixels=pixels,
-        misses_px=stand_in.project(points) - shown,
+        errors_px=stand_in.project(points) - shown,
     )
 
 
@@ -225,7 +225,7 @@ def colmap_pixels(model: str, params: Sequence[float] | Array, points: Array) ->
     return pixels
 
 
-def _warped(name: str, warp: PinholeWarp) -> StandIn:
+def _warp_pinhole(name: str, warp: PinholeWarp) -> StandIn:
     return StandIn(
         name=name,
         model="PINHOLE",
@@ -236,7 +236,7 @@ def _warped(name: str, warp: PinholeWarp) -> StandIn:
     )
 
 
-def _fitted(model: str, camera: Camera, pixels: Array, points: Array, turned: bool) -> StandIn:
+def _fit_model(model: str, camera: Camera, pixels: Array, points: Array, turned: bool) -> StandIn:
     """Least squares over shift along the port's axis (m), turn (rotation vector) and intrinsics."""
     axis = np.array(camera.port.axis_cam)
     names = COLMAP_PARAMETERS[model]
@@ -258,8 +258,8 @@ def _fitted(model: str, camera: Camera, pixels: Array, points: Array, turned: bo
     def cost(unknowns: Array) -> Array:
         one = stand_in(unknowns)
         coefficients = np.array(one.params)[is_distortion]
-        misses = (one.project(points) - pixels) * scale
-        return np.concatenate([misses.ravel(), _CANCELLING_PX * coefficients])
+        residuals = (one.project(points) - pixels) * scale
+        return np.concatenate([residuals.ravel(), _CANCELLING_PX * coefficients])
 
     start = {
         "f": camera.focal_in_water_px,
@@ -272,7 +272,7 @@ def _fitted(model: str, camera: Camera, pixels: Array, points: Array, turned: bo
     return stand_in(least_squares(cost, first, x_scale="jac", max_nfev=200).x)
 
 
-def _seen(camera: Camera, distances: Array, grid: int) -> tuple[Array, Array]:
+def _visible_points(camera: Camera, distances: Array, grid: int) -> tuple[Array, Array]:
     """Places in the frame, (grid, grid, 2), and what they see at each distance, (D, ..., 3)."""
     pixels = camera.frame_grid(grid, grid)
     points = np.stack([camera.at_depth(pixels, float(z)) for z in distances])

@@ -208,7 +208,7 @@ class _Solver(CalibrationProblem):
         of_shape = covariance.marginal(self.shape.parameters)
         return Adjustment(
             rig=replace(state.rig, covariance=covariance.marginal(self.rig_names)),
-            shape=self.shape.found(state.bend, of_shape.matrix),
+            shape=self.shape.with_values(state.bend, of_shape.matrix),
             covariance=covariance,
             rig_from_target=RigidTransform.from_components(
                 state.places, Rotation.from_matrix(state.turns)

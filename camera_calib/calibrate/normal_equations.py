@@ -16,7 +16,7 @@ from alice_survey.core.block_solver import BlockStep, Equations, Flags, Indices
 from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import Array
 from camera_calib.camera import pose_jacobian
-from camera_calib.freedom import POSE, Freedom, chosen_slopes, moved, wanted_slopes
+from camera_calib.freedom import POSE, Freedom, move_rig, select_slopes, slope_columns
 from camera_calib.rig import Covariance, Rig
 from camera_calib.target_shape import AS_DRAWN, TargetShape
 
@@ -87,7 +87,7 @@ class CalibrationProblem:
 
     def target_points(self, state: State) -> Array:
         """(N, 3) points of the target in the guessed shape."""
-        return self.points + self.shape.found(state.bend).offsets_m
+        return self.points + self.shape.with_values(state.bend).offsets_m
 
     def stepped(self, state: State, step: BlockStep) -> State:
         """Another guess; bounded parameters stop at their bound.
@@ -98,7 +98,7 @@ class CalibrationProblem:
         count = len(self.rig_names)
         turn = Rotation.from_rotvec(step.poses[:, :_TURNS]).as_matrix()
         return State(
-            rig=moved(state.rig, self.rig_names, step.shared[:count]),
+            rig=move_rig(state.rig, self.rig_names, step.shared[:count]),
             turns=turn @ state.turns,
             places=state.places + step.poses[:, _TURNS:],
             bend=state.bend + step.shared[count:],
@@ -146,8 +146,8 @@ class CalibrationProblem:
             turn = pose.rotation.as_matrix()
             by_rig = (turned[v] + state.places[v, None]) @ turn.T
             pixels, by_point, by_parameter = camera.project_jacobian(by_rig + pose.translation)
-            columns, at = wanted_slopes(self.rig, self.rig_names, name)
-            rows = [chosen_slopes(columns, by_parameter, by_point, by_rig)]
+            columns, at = slope_columns(self.rig, self.rig_names, name)
+            rows = [select_slopes(columns, by_parameter, by_point, by_rig)]
             by_turned = by_point @ turn
             by_place = by_turned @ state.turns[v, None]
             if self.shape_at.size:

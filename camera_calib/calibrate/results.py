@@ -194,7 +194,7 @@ def _shape_lines(calibration: Calibration) -> Iterator[str]:
     shape = calibration.shape
 
     def stated(name: str, scale: float) -> str:
-        number, sigma = shape.known(name)
+        number, sigma = shape.value_and_sigma(name)
         return with_sigma(scale * number, scale * sigma)
 
     if shape.parameters:

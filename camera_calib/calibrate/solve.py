@@ -133,7 +133,7 @@ def calibrate(
         covariance=spread.covariance.marginal(freedom.names(start)),
     )
     of_shape = spread.covariance.marginal(shape.parameters).matrix
-    found_shape = adjusted.shape.found(adjusted.shape.values, of_shape)
+    found_shape = adjusted.shape.with_values(adjusted.shape.values, of_shape)
     return Calibration(
         rig=rig,
         target_points=points + found_shape.offsets_m,

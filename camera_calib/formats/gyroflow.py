@@ -72,7 +72,7 @@ def read_gyroflow(path: Path, reading: rigs.ReadOptions) -> Rig:
             raise CalibrationError(
                 f"{path}: is of {size[0]} x {size[1]} px: {width} x {height} has another shape"
             )
-        smaller = camera.lens.reduced(size[0] / width)
+        smaller = camera.lens.downscale(size[0] / width)
         camera = replace(camera, width_px=width, height_px=height, lens=smaller)
     rig = rigs.assemble(path, reading, "Gyroflow", ["cam0"], [camera], rigs.ONE)
     words = f"{profile.camera_brand} {profile.camera_model} {profile.lens_model}".split()

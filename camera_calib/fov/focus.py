@@ -118,8 +118,8 @@ def altitude_of_apparent_m(camera: Camera, apparent_m: float) -> float:
 
 def axial_pixel_m(camera: Camera) -> tuple[float, float]:
     """Size of a pixel on the sea floor at altitude 0, and its growth for a metre (paraxial)."""
-    spots = np.array([0.0, 0.0, float(camera.front_cam[2])]) + np.array([[0, 0, 1.0], [0, 0, 2.0]])
-    slopes = replace(camera, lens=_TANGENTS).project_jacobian(spots)[1]
+    points = np.array([0.0, 0.0, float(camera.front_cam[2])]) + np.array([[0, 0, 1.0], [0, 0, 2.0]])
+    slopes = replace(camera, lens=_TANGENTS).project_jacobian(points)[1]
     first, second = (2.0 / (slopes[:, 0, 0] + slopes[:, 1, 1]) / camera.fx_px).tolist()
     return 2.0 * first - second, second - first
 

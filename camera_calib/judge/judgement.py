@@ -243,7 +243,7 @@ def verdicts(judged: Judgement) -> tuple[Verdict, ...]:
     return tuple(worst_first(found))
 
 
-def _graded(ratio: float, limits: tuple[float, float], text: str, advice: str = "") -> Verdict:
+def _grade(ratio: float, limits: tuple[float, float], text: str, advice: str = "") -> Verdict:
     """A verdict on a ratio; advice is added where it is not good."""
     level: Level = "good" if ratio <= limits[0] else "look" if ratio <= limits[1] else "bad"
     return Verdict(level=level, text=text if level == "good" else text + advice)
@@ -286,7 +286,7 @@ def _fit_verdicts(judged: Judgement) -> Iterator[Verdict]:
     for name, camera in judged.cameras.items():
         test = camera.homography
         if test is not None and np.isfinite(test.outer_px):
-            yield _graded(
+            yield _grade(
                 test.excess_px / max(test.inner_px, 1e-12), _TREND_LIMITS,
                 f"{name}: homographies leave {test.inner_px:.3f} px within and "
                 f"{test.outer_px:.3f} px beyond {test.outer_from_px:.0f} px from the centre",
@@ -346,7 +346,7 @@ def _prior_verdicts(calibration: Calibration) -> Iterator[Verdict]:
     spread = np.sqrt(np.where(after < _LEARNT * before, before - after, before + after))
     moved = np.abs(prior.misfit(calibration.rig) / spread)
     largest = int(moved.argmax())
-    yield _graded(
+    yield _grade(
         float(moved[largest]), _MOVED_LIMITS,
         f"the views move {prior.parameters[largest]} by {moved[largest]:.1f} sigmas from its prior,"
         " more than any other parameter",
@@ -362,7 +362,7 @@ def _hold_out_verdicts(judged: Judgement) -> Iterator[Verdict]:
         yield _look("no views were held out: the fit is not tested")
         return
     ratio = score.rms_px / score.expected_px
-    yield _graded(
+    yield _grade(
         ratio, _HELD_OUT_LIMITS,
         f"{score.views} held-out views fit to {score.rms_px:.3f} px rms, {ratio:.2f} times what "
         f"noise and covariance predict ({score.expected_px:.3f} px); used views to "
@@ -372,14 +372,14 @@ def _hold_out_verdicts(judged: Judgement) -> Iterator[Verdict]:
     for name, camera in judged.cameras.items():
         if camera.halves is not None:
             ratio = camera.halves.rms_px / camera.halves.expected_px
-            yield _graded(
+            yield _grade(
                 ratio, _HALVES_LIMITS,
                 f"{name}: calibrations from either half of the views differ by "
                 f"{camera.halves.rms_px:.3f} px rms, {ratio:.2f} times what their covariances "
                 "predict",
             )  # fmt: skip
     if halves is not None:
-        yield _graded(
+        yield _grade(
             -np.log(max(halves.p_value, 1e-300)), (-np.log(_P_LOOK), -np.log(_P_BAD)),
             f"parameters from either half of the views differ by chi2 {halves.chi2:.1f} for "
             f"{halves.parameters} (p = {halves.p_value:.2g})",
@@ -393,7 +393,7 @@ def _target_verdicts(judged: Judgement) -> Iterator[Verdict]:
     for name, along in ((BOW_X, "width"), (BOW_Y, "height")):
         if name not in shape.parameters:
             continue
-        bow_m, sigma_m = shape.known(name)
+        bow_m, sigma_m = shape.value_and_sigma(name)
         prior_m = float(shape.prior_sigmas[shape.parameters.index(name)])
         known = f"{with_sigma(1e3 * bow_m, 1e3 * sigma_m)} mm over its {along}"
         if sigma_m > _OPEN * prior_m:
@@ -437,7 +437,7 @@ def _uncertainty_verdicts(judged: Judgement) -> Iterator[Verdict]:
     noise_px, range_m = judged.calibration.noise_px, judged.working_range_m
     for name, camera in judged.cameras.items():
         median, high, worst = np.nanquantile(camera.sigma.compensated_px, [0.5, 0.9, 1.0]).tolist()
-        yield _graded(
+        yield _grade(
             high / noise_px, _SIGMA_LIMITS,
             f"{name}: at {range_m:.3g} m the calibration lets a projection err by {median:.3f} "
             f"px (median of the frame), {high:.3f} px (nine tenths of it stay below) to "

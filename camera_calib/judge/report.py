@@ -209,7 +209,7 @@ def _target_rows(calibration: Calibration) -> Iterator[tuple[str, ...]]:
     """The target's shape as it was adjusted with the cameras."""
     for name in calibration.shape.parameters:
         scale, unit = (1e3, "mm") if name.endswith("_m") else (1e2, "%")
-        value, sigma = calibration.shape.known(name)
+        value, sigma = calibration.shape.value_and_sigma(name)
         label = f"target {short_label(name.rpartition('.')[2])}"
         yield label, with_sigma(scale * value, scale * sigma), unit, "views, prior", ""
 

@@ -12,7 +12,7 @@ from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import Array
 
 FOCAL_AND_CENTRE = ("fx_px", "fy_px", "cx_px", "cy_px")
-MOST_PX = 1e7
+MAX_PX = 1e7
 """Largest size of a picture, and largest focal length."""
 
 
@@ -45,8 +45,8 @@ class LensValues(ABC):
                 )
         if min(self.fx_px, self.fy_px) <= 0:
             raise CalibrationError("camera: width_px, height_px, fx_px and fy_px must be positive")
-        if max(self.fx_px, self.fy_px) > MOST_PX:
-            raise CalibrationError(f"camera: a size or focal length exceeds {MOST_PX:g} px")
+        if max(self.fx_px, self.fy_px) > MAX_PX:
+            raise CalibrationError(f"camera: a size or focal length exceeds {MAX_PX:g} px")
 
     @property
     @abstractmethod
@@ -61,6 +61,6 @@ class LensValues(ABC):
         """The same lens with some parameters set to other values."""
         return replace(self, **{name: float(value) for name, value in values.items()})
 
-    def reduced(self, scale: float) -> Self:
+    def downscale(self, scale: float) -> Self:
         """The same lens with pixels `scale` times as large."""
         return replace(self, **{name: getattr(self, name) / scale for name in FOCAL_AND_CENTRE})

@@ -78,7 +78,7 @@ class DomePort(PortValues):
         return cls(outer_radius_m=0.08)
 
     @classmethod
-    def designed(cls, camera: CameraConfig, n_water: float) -> Self:
+    def from_design(cls, camera: CameraConfig, n_water: float) -> Self:
         """The port of a design, in water of an index."""
         return cls(
             **dict(zip(_CENTRE, camera.dome_centre_m, strict=True)),
@@ -176,7 +176,7 @@ def _bend(inner: float, outer: float, reach: float, n_glass: float, n_water: flo
 
 
 @compiled_ieee
-def _turned(sin: float, cos: float, of: float, more: bool) -> tuple[float, float, float]:
+def _turn(sin: float, cos: float, of: float, more: bool) -> tuple[float, float, float]:
     """Sine and cosine of an angle plus or minus asin(of), and the cosine of that."""
     side = math.sqrt(1.0 - of * of)
     if more:
@@ -202,11 +202,11 @@ def _step(
     by_a, by_c = 1.0 / (port[3] - port[4]), 1.0 / (port[5] * port[3])
     by_b, by_d = by_a / port[5], 1.0 / (port[6] * port[3])
     by_e = 1.0 / (port[6] * reach)
-    s, k, cos_a = _turned(sin, cos, h * by_a, False)
-    s, k, cos_b = _turned(s, k, h * by_b, True)
-    s, k, cos_c = _turned(s, k, h * by_c, False)
-    s, k, cos_d = _turned(s, k, h * by_d, True)
-    s, k, cos_e = _turned(s, k, h * by_e, False)
+    s, k, cos_a = _turn(sin, cos, h * by_a, False)
+    s, k, cos_b = _turn(s, k, h * by_b, True)
+    s, k, cos_c = _turn(s, k, h * by_c, False)
+    s, k, cos_d = _turn(s, k, h * by_d, True)
+    s, k, cos_e = _turn(s, k, h * by_e, False)
     bend = by_b / cos_b - by_a / cos_a + by_d / cos_d - by_c / cos_c - by_e / cos_e
     return s, 1.0 + bend * (along * cos + aside * sin)
 
@@ -290,17 +290,17 @@ def dome_leave(rays: Array, port: Array, points: Array, directions: Array) -> No
         reach = ahead + math.sqrt(ahead * ahead - off2 + inner * inner)
         # Position from the centre, and its unit vector: the normal.
         x, y, z = reach * dx - cx, reach * dy - cy, reach * dz - cz
-        dx, dy, dz = _bent(dx, dy, dz, x / inner, y / inner, z / inner, 1.0 / n_glass)
+        dx, dy, dz = _refract(dx, dy, dz, x / inner, y / inner, z / inner, 1.0 / n_glass)
         ahead = dx * x + dy * y + dz * z
         reach = math.sqrt(ahead * ahead - inner * inner + outer * outer) - ahead
         x, y, z = x + reach * dx, y + reach * dy, z + reach * dz
-        dx, dy, dz = _bent(dx, dy, dz, x / outer, y / outer, z / outer, n_glass / n_water)
+        dx, dy, dz = _refract(dx, dy, dz, x / outer, y / outer, z / outer, n_glass / n_water)
         points[j, 0], points[j, 1], points[j, 2] = x + cx, y + cy, z + cz
         directions[j, 0], directions[j, 1], directions[j, 2] = dx, dy, dz
 
 
 @compiled_ieee
-def _bent(
+def _refract(
     dx: float, dy: float, dz: float, nx: float, ny: float, nz: float, ratio: float
 ) -> tuple[float, float, float]:
     """A unit ray behind a surface, by Snell's law; NaN where it is totally reflected."""

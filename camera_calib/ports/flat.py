@@ -80,7 +80,7 @@ class FlatPort(PortValues):
         return cls(port_distance_m=0.02)
 
     @classmethod
-    def designed(cls, camera: CameraConfig, n_water: float) -> Self:
+    def from_design(cls, camera: CameraConfig, n_water: float) -> Self:
         """The port of a design, in water of an index."""
         x, y = (float(np.sin(np.deg2rad(tilt))) for tilt in camera.port_tilt_deg)
         return cls(

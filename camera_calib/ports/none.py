@@ -25,7 +25,7 @@ class NoPort(PortValues):
         return cls()
 
     @classmethod
-    def designed(cls, camera: CameraConfig, n_water: float) -> Self:
+    def from_design(cls, camera: CameraConfig, n_water: float) -> Self:
         """The only one."""
         return cls()
 

@@ -62,7 +62,7 @@ class PortValues(ABC):
 
     @classmethod
     @abstractmethod
-    def designed(cls, camera: CameraConfig, n_water: float) -> Self:
+    def from_design(cls, camera: CameraConfig, n_water: float) -> Self:
         """The port of a design, in water of an index."""
 
     @property

@@ -13,7 +13,7 @@ from alice_survey.core.errors import PlanError, warn
 from alice_survey.core.executor import SERIAL, Executor, local_executor
 from alice_survey.core.text_table import text_table
 from alice_survey.kit.words import share
-from camera_calib.rig import Rig, design_rig, mounted, read_rig
+from camera_calib.rig import Rig, design_rig, read_rig, rig_with_mount
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.dive_record import DiveRecord, read_dive_record
 from missions.coverage.geofiles import write_coverage_tif, write_outlines
@@ -112,7 +112,7 @@ def rig_of(workspace: Path, camera: CameraConfig, water: WaterConfig) -> Rig:
         path = workspace / folder / "rig.json"
         if path.is_file():
             rig = read_rig(path).in_water(water.n_water)
-            if mounted(rig) is not None:
+            if rig_with_mount(rig) is not None:
                 return rig
             mount, how = designed.body_from_rig, "as designed"
             found = _found_mount(workspace, rig)

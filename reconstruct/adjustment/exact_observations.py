@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 
 from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
-from camera_calib.freedom import chosen_slopes, wanted_slopes
+from camera_calib.freedom import select_slopes, slope_columns
 from camera_calib.rig import Rig
 from reconstruct.adjustment.normal_equations import LinearObservations
 from reconstruct.mapping.arrays import Indices, observations, rig_poses
@@ -189,7 +189,7 @@ def exact_observations(
     rest = np.zeros((len(arm), 2, len(fields) + 1))
     for c, (name, pose) in enumerate(state.rig.cam_from_rig.items()):
         camera, turn = state.rig.cameras[name], pose.rotation.as_matrix()
-        source, target = wanted_slopes(state.rig, fields, name)
+        source, target = slope_columns(state.rig, fields, name)
         target = np.append(target, -1)
         every = np.flatnonzero(pixels.camera == c)
         for first in range(0, len(every), _BLOCK):
@@ -197,7 +197,7 @@ def exact_observations(
             world_from_rig = state.turns[pixels.station[rows]]
             turned = np.einsum("nij,ni->nj", world_from_rig, arm[rows]) @ turn.T
             at, by_cam, by_camera = camera.project_jacobian(turned + pose.translation)
-            slopes = chosen_slopes(source, by_camera, by_cam, turned)
+            slopes = select_slopes(source, by_camera, by_cam, turned)
             miss = (at - pixels.taken[rows])[:, :, None]
             _put(
                 rows, by_cam @ turn, world_from_rig, np.concatenate([slopes, miss], axis=2),

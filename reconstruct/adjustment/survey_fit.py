@@ -37,7 +37,7 @@ from alice_survey.core.records import PortRecord
 from alice_survey.core.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.freedom import POSE as TURN_AND_SHIFT
-from camera_calib.freedom import Prior, at_bound, moved, pose_names, value
+from camera_calib.freedom import Prior, at_bound, move_rig, pose_names, value
 from camera_calib.rig import Covariance, Rig
 from reconstruct.adjustment.exact_observations import (
     Pixels,
@@ -262,7 +262,7 @@ class SurveyFit:
         turns, centres, points = modes.move(sizes, state.centres, state.points, rows)
         rig, covariance = state.rig, self.covariance
         if self.parameters:
-            rig = moved(rig, self.parameters, modes.calibration @ sizes)
+            rig = move_rig(rig, self.parameters, modes.calibration @ sizes)
             gain = np.diag(modes.known) - left
             covariance = covariance - modes.calibration @ gain @ modes.calibration.T
         return replace(
@@ -452,7 +452,7 @@ class SurveyProblem:
         state = guess.state
         return self._observations(
             RigState(
-                rig=moved(state.rig, self.fields, step.shared),
+                rig=move_rig(state.rig, self.fields, step.shared),
                 turns=Rotation.from_rotvec(step.poses[:, :3]).as_matrix() @ state.turns,
                 centres=state.centres + step.poses[:, 3:],
                 points=state.points + equations.point_steps(step),

@@ -30,7 +30,7 @@ from alice_survey.core.records import (
     RefractionRecord,
 )
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
-from camera_calib.rig import Rig, mounted, read_rig
+from camera_calib.rig import Rig, read_rig, rig_with_mount
 from reconstruct.mapping.database import Observations, VerifiedPair
 from reconstruct.mapping.mapper import Mapped, map_calibrated
 from reconstruct.mapping.refraction import refract
@@ -303,7 +303,7 @@ def _match_all(
     seed: int,
     executor: Executor,
 ) -> list[VerifiedPair]:
-    rig = mounted(inputs.rig)
+    rig = rig_with_mount(inputs.rig)
     range_m = None if distances is None else (distances.near_m, distances.far_m)
     everything = set(range(len(inputs.records)))
     lost = everything - placed_pictures(inputs.records, rig, inputs.datum, range_m)

@@ -33,7 +33,7 @@ from alice_survey.core.records import MappingRecord, PicturesRecord, ScaleRecord
 from alice_survey.core.robust import MAD_TO_SIGMA
 from alice_survey.core.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp
-from camera_calib.rig import Rig, mounted
+from camera_calib.rig import Rig, rig_with_mount
 from reconstruct.adjustment.soft_modes import SoftModes
 from reconstruct.adjustment.uncertainty import Uncertainty
 from reconstruct.pictures.files import list_names
@@ -379,7 +379,7 @@ def _fit(
         modes = picture_modes(task.shape, task.records, task.pinholes)
         if task.shape.modes.calibration.size:  # the rig's scale is one of them
             sigma = 0.0
-    rig, installed = mounted(task.rig), Installation.of(task.settings)
+    rig, installed = rig_with_mount(task.rig), Installation.of(task.settings)
     fit_to = partial(
         fit_navigation,
         task.records,
@@ -440,7 +440,7 @@ def _turn_by_attitudes(task: Placing, levelled: Similarity) -> tuple[Similarity,
     records = [
         replace(record, latitude_deg=nan, longitude_deg=nan, depth_m=nan) for record in task.records
     ]
-    rig = mounted(task.rig)
+    rig = rig_with_mount(task.rig)
     if rig is None or not any(_is_turned(record) for record in records):
         return None
     fit = fit_navigation(

@@ -40,7 +40,7 @@ from alice_survey.core.records import (
     SimilarityRecord,
 )
 from camera_calib.freedom import knowing_water
-from camera_calib.rig import Rig, mounted, write_rig
+from camera_calib.rig import Rig, rig_with_mount, write_rig
 from reconstruct.adjustment.adjusted import adjust_survey
 from reconstruct.adjustment.normal_equations import POSE
 from reconstruct.adjustment.pixel_parts import Workers
@@ -187,7 +187,7 @@ def join_groups(
     model, notes = pycolmap.Reconstruction(mapped.model), []
     of_name = {record.image: record for record in records}
     members = [frames[groups == group].tolist() for group in range(int(groups.max()) + 1)]
-    rig = mounted(rig)
+    rig = rig_with_mount(rig)
     mounts = None if rig is None else body_from_pinhole(rig, mapped.warps)
     fits = [
         _place_group(model, of_frames, of_name, mounts, datum if mapped.scaled else None, installed)
@@ -395,7 +395,7 @@ def run_sparse(
     if rig is not None and placed.fit is not None and placed.fit.mount is not None:
         rig = replace(rig, body_from_rig=placed.fit.mount.body_from_rig)
         write_rig(folder / "rig.json", rig)
-    known_mount = mounted(rig)
+    known_mount = rig_with_mount(rig)
     mounts = (
         {}
         if known_mount is None

@@ -226,7 +226,7 @@ def scaled_view(view: View, scale: float) -> View:
     width, height = (round(side * scale) for side in old.size_px)
     return replace(
         view,
-        pinhole=old.resized(width, height),
+        pinhole=old.resize(width, height),
         shift=view.shift.scaled(width / old.width_px, height / old.height_px),
     )
 

@@ -291,7 +291,7 @@ def test_shapes_follow_the_argument() -> None:
 
 
 def test_a_reduced_camera_sees_the_same_points_at_smaller_pixels() -> None:
-    small = MANTA.reduced(4)
+    small = MANTA.downscale(4)
     points = MANTA.at_depth(MANTA.pixel_centres(500), 2.0)
 
     assert (small.width_px, small.height_px) == (846, 677)

@@ -19,7 +19,7 @@ def test_bows_are_those_of_mrcal() -> None:
     shape = usual_shape(points)
     values = np.zeros(len(shape.parameters))
     values[[shape.parameters.index(name) for name in (BOW_X, BOW_Y)]] = 2e-3, -1e-3
-    z = shape.found(values).offsets_m.reshape(5, 7, 3)
+    z = shape.with_values(values).offsets_m.reshape(5, 7, 3)
     assert z[..., 2][0, 0] == z[..., 2][-1, -1] == 0.0
     assert z[2, 3, 2] == pytest.approx(1e-3)
     assert z[0, 3, 2] == pytest.approx(2e-3)
@@ -34,7 +34,7 @@ def test_stretch_is_the_ratio_of_lengths_and_shear_the_loss_of_a_right_angle() -
     at = shape.parameters.index
     values = np.zeros(len(shape.parameters))
     values[at(STRETCH)], values[at(SHEAR)] = 1e-3, 2e-4
-    moved = (points + shape.found(values).offsets_m).reshape(5, 7, 3)
+    moved = (points + shape.with_values(values).offsets_m).reshape(5, 7, 3)
     along, down = moved[0, -1] - moved[0, 0], moved[-1, 0] - moved[0, 0]
     ratio = np.linalg.norm(along) / 0.18 / (np.linalg.norm(down) / 0.12)
     assert ratio == pytest.approx(1.001, abs=1e-6)

@@ -1,6 +1,7 @@
 """Plots of a report: readable in print and by the colour-blind, each with an explanation."""
 
 from collections.abc import Iterator, Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -10,13 +11,15 @@ from alice_survey.app.report.colours import read_shrunk
 from alice_survey.app.report.held import Held, number
 from alice_survey.core.frames import Array
 from alice_survey.kit.document import Figure
-from alice_survey.kit.figure import INKS, MARKS, drawn
+from alice_survey.kit.figure import INK, INKS, MARKS, SOFT, draw_figure, plain_name
 from alice_survey.kit.words import digits, share
 from camera_calib.mount import mount_line
-from camera_calib.mount_figure import paint_mount
 from camera_calib.rig import Rig
 
 _MAX_VALUES_PX = 4e6
+_RAY_SHARE = 0.6
+"""Length of a mount's rays over the size of what is drawn."""
+_MIN_M = 0.3
 
 
 def camera_sigmas(held: Held) -> Iterator[Figure]:
@@ -34,7 +37,7 @@ def camera_sigmas(held: Held) -> Iterator[Figure]:
         axes[0].set(xlabel="station", ylabel=f"sigma {where}, cm", ylim=(0, None))
         axes[0].legend()
 
-    yield drawn(
+    yield draw_figure(
         paint, 2.9,
         title="How well each camera is placed",
         alt="Standard deviations of camera positions by station",
@@ -71,7 +74,7 @@ def pictures_used(held: Held) -> Iterator[Figure]:
         )  # fmt: skip
         axes[1].set(xlabel="mean reprojection error, px", ylabel="pictures")
 
-    yield drawn(
+    yield draw_figure(
         paint, 2.6, columns=2,
         title="What each picture gives to the model",
         alt="Points by picture, and a histogram of reprojection errors",
@@ -101,7 +104,7 @@ def sigma_test(held: Held) -> Iterator[Figure]:
         axes[0].legend()
 
     one, two = (share(float((np.abs(ratio) <= sigmas).mean())) for sigmas in (1, 2))
-    yield drawn(
+    yield draw_figure(
         paint, 2.3,
         title="Test of the stated sigmas",
         alt="Histogram of errors of heights over their stated sigmas, next to the normal curve",
@@ -129,7 +132,7 @@ def overlap(held: Held) -> Iterator[Figure]:
         axes[0].bar(range(1, maximum + 1), percent[1:], color=inks)
         axes[0].set(xlabel="stations that see a point", ylabel="% of the surface")
 
-    yield drawn(
+    yield draw_figure(
         paint, 2.3,
         title="Overlap reached",
         alt="Share of the surface by the number of stations that see it",
@@ -144,10 +147,14 @@ def mount(rig: Rig) -> Figure:
     """A rig with a known mount on its vehicle."""
 
     def paint(axes: Sequence[Any]) -> None:
-        paint_mount(axes[0], axes[1], rig)
+        _paint_mount(axes[0], rig, [1, 0])
+        _paint_mount(axes[1], rig, [0, 2])
+        axes[0].set(title="from above", xlabel="right (m)", ylabel="forward (m)")
+        axes[1].set(title="from starboard", xlabel="forward (m)", ylabel="down (m)")
+        axes[1].invert_yaxis()
         axes[1].legend()
 
-    return drawn(
+    return draw_figure(
         paint, 3.4, columns=2,
         title="How the cameras are mounted",
         alt="Cameras, their fields of view and the tops of their pictures on the vehicle",
@@ -156,6 +163,33 @@ def mount(rig: Rig) -> Figure:
         otherwise="Positions are off by the error of the lever, headings by that of the mount: "
         "state it with 'alice-survey camera convert --mount'.",
     )  # fmt: skip
+
+
+def _paint_mount(axes: Any, rig: Rig, shown: list[int]) -> None:
+    """Draw a rig's cameras by two axes of the vehicle (forward, right, down): across, and up."""
+    poses = [rig.body_from_cam(name) for name in rig.cameras]
+    places = [
+        pose.apply(one.front_cam) for pose, one in zip(poses, rig.cameras.values(), strict=True)
+    ]
+    reach = _RAY_SHARE * max(float(np.abs(places).max()), _MIN_M)
+    styles = product(MARKS, INKS)  # so that cameras of the same ink differ
+    for (mark, ink), name, pose, place in zip(styles, rig.cameras, poses, places, strict=False):
+        camera, at = rig.cameras[name], place[shown]
+        size = np.array([camera.width_px, camera.height_px])
+        corners = size * [[0, 0], [1, 0], [1, 1], [0, 1], [0.5, 0]]
+        rays = reach * pose.rotation.apply(camera.unproject(corners)[1])
+        *rim, top = (place + rays)[:, shown]
+        axes.plot(*np.vstack([*rim, rim[0]]).T, color=ink, lw=1.0)
+        for corner in rim:
+            axes.plot(*np.stack([at, corner]).T, color=ink, lw=0.6)
+        axes.plot(*at, mark, color=ink, ms=5, label=plain_name(name))
+        axes.annotate("top", top, color=ink, ha="center", va="center", fontsize=8)
+    axes.plot(0, 0, "+", color=INK, ms=11, mew=1.5)
+    axes.annotate("navigation", (0, 0), xytext=(6, -12), textcoords="offset points", color=INK)
+    bow = np.array([0.8 * reach, 0.0, 0.0])[shown]
+    axes.annotate("", bow, (0, 0), arrowprops={"arrowstyle": "->", "color": SOFT})
+    axes.annotate("bow", bow, xytext=(4, 4), textcoords="offset points", color=SOFT)
+    axes.set_aspect("equal")
 
 
 def _raster(held: Held, path: str) -> Array | None:

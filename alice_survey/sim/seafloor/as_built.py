@@ -45,7 +45,7 @@ def true_rig(camera: CameraConfig, water: WaterConfig, *, scale: int, seed: int)
     """
     rng = np.random.default_rng([seed, _SEED_STREAM])
     design = design_rig(camera, water)
-    cameras = {name: _build(drawn, rng).reduced(scale) for name, drawn in design.cameras.items()}
+    cameras = {name: _build(drawn, rng).downscale(scale) for name, drawn in design.cameras.items()}
     turn = Rotation.from_rotvec(rng.uniform(-TURN_TOLERANCE_RAD, TURN_TOLERANCE_RAD, 3))
     shift = rng.uniform(-BASELINE_TOLERANCE_M, BASELINE_TOLERANCE_M, 3)
     cameras = {name: _tilt(built, rng) for name, built in cameras.items()}

@@ -21,7 +21,7 @@ from alice_survey.kit.document import (
     Table,
     Verdict,
 )
-from alice_survey.kit.figure import drawn
+from alice_survey.kit.figure import draw_figure
 from alice_survey.kit.map_figure import with_stills
 
 PIXEL_M = 0.004
@@ -189,7 +189,7 @@ def sketch_figure(title: str, width: int = 1210, height: int = 629) -> Figure:
         axes[0].hist(rng.standard_normal(4000), 60, color="#0072b2")
         axes[0].set(xlabel="residual, px", ylabel="observations")
 
-    return drawn(
+    return draw_figure(
         paint,
         height / 130,
         width_in=width / 130,

@@ -116,7 +116,7 @@ def test_colmap_itself_finds_the_same_residual(tilt_deg: float) -> None:
         colmap = pycolmap.Camera(
             model=stand_in.model, width=3384, height=2710, params=list(stand_in.params)
         )
-        for z, misses in zip(one.distances_m, one.misses_px, strict=True):
+        for z, misses in zip(one.distances_m, one.errors_px, strict=True):
             points = camera.at_depth(one.pixels.reshape(-1, 2), float(z))
             seen = stand_in.approx_from_cam.apply(points - np.array(stand_in.centre_m))
             miss = colmap.img_from_cam(seen) - one.pixels.reshape(-1, 2)

@@ -30,7 +30,7 @@ BOARD = "chessboard 9x6 1m"
 def small(rig: Rig) -> Rig:
     """The same rig at a sixth of the resolution."""
     return Rig(
-        cameras={name: camera.reduced(6) for name, camera in rig.cameras.items()},
+        cameras={name: camera.downscale(6) for name, camera in rig.cameras.items()},
         cam_from_rig=rig.cam_from_rig,
         body_from_rig=rig.body_from_rig,
         source="truth",

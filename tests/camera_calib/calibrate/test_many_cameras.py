@@ -15,7 +15,7 @@ from camera_calib.calibrate.options import CalibrateOptions, task_of
 from camera_calib.calibrate.solve import calibrate_in_air
 from camera_calib.calibration import Calibration, TargetView
 from camera_calib.camera import Camera
-from camera_calib.freedom import POSE, moved, part_of_rig
+from camera_calib.freedom import POSE, move_rig, part_of_rig
 from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.ports.dome import DomePort
@@ -112,7 +112,9 @@ def test_a_part_of_a_rig_has_the_covariance_of_its_own_poses() -> None:
     assert part.body_from_cam("side").as_matrix() == pytest.approx(
         rig.body_from_cam("side").as_matrix()
     )
-    off = differences(part_of_rig(replace(moved(rig, fields, step), covariance=known), names), part)
+    off = differences(
+        part_of_rig(replace(move_rig(rig, fields, step), covariance=known), names), part
+    )
     assert list(off) == ["side.cx_px", *(f"side.{axis}" for axis in POSE)]
     assert part.covariance is not None
     np.testing.assert_allclose(

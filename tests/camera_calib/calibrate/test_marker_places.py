@@ -93,7 +93,7 @@ def test_kinds_of_shapes() -> None:
     shape = shape_of(board, "markers")
     assert len(shape.parameters) == len(usual_shape(board.points).parameters) + 2 * 20
     at = shape.parameters.index(f"{MARKER}7_y_m")
-    moved = shape.found(np.eye(len(shape.parameters))[at]).offsets_m
+    moved = shape.with_values(np.eye(len(shape.parameters))[at]).offsets_m
     assert moved[7].tolist() == [0.0, 1.0, 0.0] and np.abs(np.delete(moved, 7, axis=0)).max() == 0.0
 
 
