@@ -1,7 +1,7 @@
 """All benchmarks in one run, and one table of their figures.
 
     .venv/bin/python -m benchmarks --work FOLDER [--quick] [--repeat N] [--only NAME ...]
-        [--data ../shared/data] [--demo WORKSPACE] [--pyorthomosaic PYTHON] [--aquacal PYTHON]
+        [--data ../shared/data] [--demo WORKSPACE] [--pyorthomosaic PYTHON]
         [--mitsuba PYTHON]
 
 Each part runs in a process of its own, in a fixed order: three times where that takes less than
@@ -37,7 +37,6 @@ def main() -> int:
         data=options.data,
         demo=options.demo,
         pyorthomosaic=options.pyorthomosaic,
-        aquacal=options.aquacal,
         mitsuba=options.mitsuba,
     )
     about: dict[str, Any] = {
@@ -121,7 +120,6 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--data", type=Path, default=Settings.data, help="real pictures")
     parser.add_argument("--demo", type=Path, help="workspace with the demo's rendered pictures")
     parser.add_argument("--pyorthomosaic", metavar="PYTHON", help="a Python that has pyOrthomosaic")
-    parser.add_argument("--aquacal", metavar="PYTHON", help="a Python that has AquaCal")
     parser.add_argument("--mitsuba", metavar="PYTHON", help="a Python that has Mitsuba")
     options = parser.parse_args()
     try:

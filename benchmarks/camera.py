@@ -3,16 +3,11 @@
     .venv/bin/python -m benchmarks.camera [--quick] [--json FILE] [--only PART ...]
 
 Everything that is compared is measured in this run. Ends with exit code 1 when a goal is missed.
-AquaCal needs an environment of its own, as it pins an OpenCV whose files clash with ours:
-
-    python3 -m venv aquacal && aquacal/bin/pip install aquacal
-    .venv/bin/python -m benchmarks.camera --aquacal aquacal/bin/python
 """
 
 import argparse
 import sys
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 from alice_survey.core.executor import local_executor
@@ -31,11 +26,9 @@ def main() -> None:
     print(heading(about), "\n", flush=True)
     if "speed" in options.only:
         rows = camera_speed.measure(
-            20_000 if options.quick else 100_000, 10 if options.quick else 40, options.aquacal
+            20_000 if options.quick else 100_000, 10 if options.quick else 40
         )
         print(camera_speed.table(rows), "\n", flush=True)
-        if options.aquacal is None:
-            findings += Findings(left_out=("AquaCal: give --aquacal PYTHON",))
         report["speed"] = [{**asdict(row), "ratio": row.ratio} for row in rows]
         findings += Findings(figures=tuple(f for row in rows for f in row.figures()))
     if "calibration" in options.only:
@@ -72,7 +65,6 @@ def _options() -> argparse.Namespace:
     add_options(parser, quick="fewer points and trials")
     parser.add_argument("--only", nargs="+", choices=_PARTS, default=list(_PARTS))
     parser.add_argument("--threads", type=int, default=1, help="processes for the trials")
-    parser.add_argument("--aquacal", type=Path, help="a Python that can import AquaCal")
     return parser.parse_args()
 
 

@@ -5,21 +5,16 @@ Peers do less than `project` does (no port), so equal work is compared where the
   the slopes by the lens and the pose too, so it stands next to `project` and `project_jacobian`.
 - COLMAP's OPENCV camera projects and unprojects through a lens without a port, and nothing else.
 - `cv2.undistortPoints` inverts the lens, set to iterate until a pixel is right to 1e-9.
-- AquaCal projects through one flat interface: next to `project` with glass of thickness 0.
 All get the same float64 points and the same distortion, after a run each to warm up; runs alternate
 and the best of each counts, so that what else the machine does slows nobody alone.
 """
 
-import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
@@ -34,8 +29,6 @@ from camera_calib.rig import design_rig
 _CORES = 2
 _POOL = ThreadPoolExecutor(_CORES)
 _SAME_PX = 1e-9
-_SAME_AS_AQUACAL_PX = 1e-4
-"""AquaCal stops at 1e-9 m on the interface: some 1e-6 px here."""
 _UNTIL = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
 
 
@@ -48,8 +41,7 @@ class Row:
     ours_two_cores: float
     peer: str
     theirs: float
-    theirs_two_cores: float | None
-    """None where the peer is another program."""
+    theirs_two_cores: float
     goals: tuple[float, ...] = ()
     """The least ratios on one core that are requested."""
 
@@ -59,23 +51,18 @@ class Row:
         return self.ours / self.theirs
 
     def figures(self) -> list[Figure]:
-        """On one core, and on two where the peer was measured there."""
+        """On one core, and on two."""
         goal = Goal(minimum=max(self.goals), of="ratio") if self.goals else None
-        unit = "M points/s"
-        found = [
+        return [
             Figure(
-                name=self.what, value=self.ours, unit=unit, peer=self.peer,
+                name=self.what, value=self.ours, unit="M points/s", peer=self.peer,
                 peer_value=self.theirs, goal=goal,
-            )
+            ),
+            Figure(
+                name=f"{self.what}, two cores", value=self.ours_two_cores, unit="M points/s",
+                peer=self.peer, peer_value=self.theirs_two_cores,
+            ),
         ]  # fmt: skip
-        if self.theirs_two_cores is not None:
-            found.append(
-                Figure(
-                    name=f"{self.what}, two cores", value=self.ours_two_cores, unit=unit,
-                    peer=self.peer, peer_value=self.theirs_two_cores,
-                )
-            )  # fmt: skip
-        return found
 
 
 def lens_camera() -> Camera:
@@ -84,13 +71,12 @@ def lens_camera() -> Camera:
     return camera.with_parameters({"k1": -0.12, "k2": 0.08, "p1": 2e-4, "p2": -3e-4, "k3": 0.01})
 
 
-def measure(points_count: int, runs: int, aquacal: Path | None) -> list[Row]:
+def measure(points_count: int, runs: int) -> list[Row]:
     """All rows.
 
     Args:
         points_count: how many points each run takes.
         runs: how many runs of each; the best counts.
-        aquacal: a Python interpreter that can import AquaCal.
     """
     camera = lens_camera()
     rng = np.random.default_rng(1)
@@ -151,82 +137,13 @@ def measure(points_count: int, runs: int, aquacal: Path | None) -> list[Row]:
             goals=goals,
         )
 
-    rows = [
+    return [
         row("project", "project", "cv2.projectPoints", 1.0, 2.0),
         row("project", "project", "COLMAP's img_from_cam"),
         row("project with slopes", "project_jacobian", "cv2.projectPoints"),
         row("unproject", "unproject", "cv2.undistortPoints"),
         row("unproject", "unproject", "COLMAP's cam_from_img"),
     ]
-    if aquacal is not None:
-        rows.append(
-            against_aquacal(
-                camera.with_parameters({"glass_thickness_m": 0.0}), points, runs, aquacal
-            )
-        )
-    return rows
-
-
-def against_aquacal(camera: Camera, points: Array, runs: int, python: Path) -> Row:
-    """Projection through one interface, in turns with AquaCal in a process of its own."""
-    some = points[: min(len(points), 20_000)]
-    with TemporaryDirectory() as folder:
-        case = Path(folder) / "case.npz"
-        np.savez(
-            case,
-            points=some,
-            matrix=_matrix(camera),
-            distortion=[camera.parameter(name) for name in ("k1", "k2", "p1", "p2", "k3")],
-            size=[camera.width_px, camera.height_px],
-            port_distance_m=camera.parameter("port_distance_m"),
-            n_water=camera.n_water,
-        )
-        with _peer(python, case) as (name, run):
-            pixels = np.load(case.with_suffix(".pixels.npy"))
-            _same(name, pixels, camera.project(some), _SAME_AS_AQUACAL_PX)
-            ours, both = partial(camera.project, some), _shared(camera.project, some)
-            for work in (ours, both):
-                work()
-            seconds = [np.inf, np.inf, np.inf]
-            for _ in range(max(runs // 3, 3)):
-                for i, timed in enumerate((lambda: _timed(ours), lambda: _timed(both), run)):
-                    seconds[i] = min(seconds[i], timed())
-    speed = [len(some) / s / 1e6 for s in seconds]
-    return Row(
-        what="project, no glass",
-        ours=speed[0],
-        ours_two_cores=speed[1],
-        peer=f"refractive_project_batch ({name})",
-        theirs=speed[2],
-        theirs_two_cores=None,
-        goals=(20.0,),
-    )
-
-
-@contextmanager
-def _peer(python: Path, case: Path) -> Iterator[tuple[str, Callable[[], float]]]:
-    """AquaCal's name, and a function that has it run once and returns the seconds it took."""
-    script = Path(__file__).with_name("aquacal_peer.py")
-    with subprocess.Popen(
-        [str(python), str(script), str(case)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as process:
-        if process.stdin is None or process.stdout is None:
-            raise RuntimeError("the pipes to AquaCal are missing")
-        to_peer, from_peer = process.stdin, process.stdout
-
-        def run() -> float:
-            to_peer.write("run\n")
-            to_peer.flush()
-            return float(from_peer.readline())
-
-        name = from_peer.readline().strip()
-        if not name:
-            raise SystemExit(f"{python} cannot run AquaCal: install it there, or give --aquacal")
-        yield name, run
-        to_peer.close()
 
 
 def race(works: Mapping[str, Callable[[], object]], runs: int) -> dict[str, float]:
@@ -264,14 +181,10 @@ def _same(what: str, found: Array, expected: Array, limit_px: float) -> None:
 
 def table(rows: list[Row]) -> str:
     """The rows in Markdown."""
+    head = "| work | M points/s, one core | two | peer | M points/s, one core | two | ratio |"
     lines = [
-        "| work | M points/s, one core | two | peer | M points/s, one core | two | ratio |",
-        "|---|---|---|---|---|---|---|",
+        f"| {row.what} | {row.ours:.3g} | {row.ours_two_cores:.3g} | {row.peer} "
+        f"| {row.theirs:.3g} | {row.theirs_two_cores:.3g} | {row.ratio:.3g} |"
+        for row in rows
     ]
-    for row in rows:
-        theirs_two = "-" if row.theirs_two_cores is None else f"{row.theirs_two_cores:.3g}"
-        lines.append(
-            f"| {row.what} | {row.ours:.3g} | {row.ours_two_cores:.3g} | {row.peer} "
-            f"| {row.theirs:.3g} | {theirs_two} | {row.ratio:.3g} |"
-        )
-    return "\n".join(lines)
+    return "\n".join([head, "|---|---|---|---|---|---|---|", *lines])

@@ -22,8 +22,6 @@ class Settings:
     """A workspace with the demo's rendered pictures; rendered again where there is none."""
     pyorthomosaic: str | None = None
     """A Python that has pyOrthomosaic."""
-    aquacal: str | None = None
-    """A Python that has AquaCal."""
     mitsuba: str | None = None
     """A Python that has Mitsuba."""
 
@@ -61,11 +59,6 @@ class Part:
         if lacking:
             return f"{', '.join(lacking)} missing: install the extra `bench`"
         return self.needs(settings)
-
-
-def _speed(settings: Settings, _: Path) -> Sequence[str]:
-    peer = () if settings.aquacal is None else ("--aquacal", settings.aquacal)
-    return ("--only", "speed", *peer)
 
 
 def _pictures_in(folder: Path) -> list[Path]:
@@ -120,7 +113,7 @@ def _need_mitsuba(settings: Settings) -> str | None:
 
 
 PARTS = (
-    Part(name="camera-speed", module="camera", arguments=_speed),
+    Part(name="camera-speed", module="camera", arguments=lambda _, __: ("--only", "speed")),
     Part(name="camera-pose", module="camera", arguments=lambda _, __: ("--only", "pose")),
     Part(
         name="camera-calibration",

@@ -19,7 +19,7 @@ from alice_survey.core.config import Jerlov
 from alice_survey.core.errors import ConfigError
 from alice_survey.core.frames import Array
 from alice_survey.core.seawater import n_water, pressure_dbar
-from alice_survey.core.text_table import text_table
+from alice_survey.core.text_table import field_table
 
 CHANNELS = ("red", "green", "blue")
 WAVELENGTH_NM = np.array([600.0, 530.0, 460.0])
@@ -44,6 +44,15 @@ _DIFFUSE_PER_M: dict[Jerlov, tuple[float, ...]] = {
 _SCATTERED_SHARE: dict[Jerlov, float] = {
     "I": 0.35, "II": 0.70, "III": 0.75, "1C": 0.75, "3C": 0.80, "5C": 0.83, "7C": 0.85, "9C": 0.86,
 }  # fmt: skip
+_COLUMNS = {
+    "channel": "{channel}",
+    "wavelength": "{wavelength_nm:g} nm",
+    "n_water": "{n_water:.5f}",
+    "daylight K_d": "{diffuse_per_m:.3f} /m",
+    "absorption": "{absorption_per_m:.3f} /m",
+    "scattering": "{scattering_per_m:.3f} /m",
+    "beam c": "{beam_per_m:.3f} /m",
+}
 _MEAN_COSINE = 0.9
 _KIRK = 0.256
 
@@ -139,29 +148,14 @@ def water_report(
         for i, name in enumerate(CHANNELS)
     ]
     pressure = float(pressure_dbar(depth_m))
-    table = text_table(
-        ("channel", "wavelength", "n_water", "daylight K_d", "absorption", "scattering", "beam c"),
-        [
-            (
-                row["channel"],
-                f"{row['wavelength_nm']:g} nm",
-                f"{row['n_water']:.5f}",
-                f"{row['diffuse_per_m']:.3f} /m",
-                f"{row['absorption_per_m']:.3f} /m",
-                f"{row['scattering_per_m']:.3f} /m",
-                f"{row['beam_per_m']:.3f} /m",
-            )
-            for row in rows
-        ],
-    )
-    head = (
+    text = field_table(
         f"{temperature_c:g} C, {salinity_psu:g} psu, {depth_m:g} m deep ({pressure:.1f} dbar), "
-        f"Jerlov {jerlov}"
-    )
-    sources = (
-        "n relative to air: Quan & Fry 1995, pressure after Millard & Seaver 1990; "
-        "K_d: Jerlov 1976; a and b from K_d after Kirk 1984"
-    )
+        f"Jerlov {jerlov}",
+        _COLUMNS,
+        rows,
+        ["n relative to air: Quan & Fry 1995, pressure after Millard & Seaver 1990; K_d: Jerlov "
+         "1976; a and b from K_d after Kirk 1984"],
+    )  # fmt: skip
     data = {
         "temperature_c": temperature_c,
         "salinity_psu": salinity_psu,
@@ -170,4 +164,4 @@ def water_report(
         "jerlov": jerlov,
         "rows": rows,
     }
-    return "\n".join([head, table, sources]), data
+    return text, data
