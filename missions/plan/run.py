@@ -109,29 +109,12 @@ def station_times_s(plan: Plan, dive: Dive, costs: Costs) -> list[float]:
     return times
 
 
-def trigger_edges(exposure_s: float, lead_s: float) -> NDArray[np.int64]:
-    """Edges of one trigger: strobe on, camera open, camera close, strobe off; us from its time.
-
-    The exposure is a whole number of microseconds, the lead rounded up to one.
-
-    Raises:
-        PlanError: the exposure is shorter than 1 us or the lead negative.
-    """
-    exposure_us, lead_us = round(exposure_s * _US), math.ceil(lead_s * _US - 1e-6)
-    if exposure_us < 1 or lead_us < 0:
-        raise PlanError(
-            f"an exposure of {exposure_s:g} s with the strobe lit {lead_s:g} s before it: raise "
-            "the exposure above 1 us and strobe_lead_s to 0 or more"
-        )
-    before = exposure_us // 2
-    after = exposure_us - before
-    return np.array([-before - lead_us, -before, after, after + lead_us])
-
-
 def trigger_table(
     times_s: Sequence[float], exposure_s: float, lead_s: float, shortest_interval_s: float
 ) -> NDArray[np.int64]:
     """The time table of some triggers, (T, 10) with the columns `HEADER`.
+
+    An exposure is a whole number of microseconds, the lead rounded up to one.
 
     Args:
         times_s: middles of the exposures since the start, rising.
@@ -140,32 +123,24 @@ def trigger_table(
         shortest_interval_s: of the cameras and the controller.
 
     Raises:
-        PlanError: a trigger follows another too soon, overlaps it, or its strobe would have to be
-            lit before the start; the message names it.
+        PlanError: a trigger follows another too soon, or while its strobe is lit.
     """
-    relative = trigger_edges(exposure_s, lead_s)
+    exposure_us, lead_us = round(exposure_s * _US), math.ceil(lead_s * _US - 1e-6)
+    opens_us = -(exposure_us // 2)
+    closes_us = exposure_us + opens_us
+    relative = np.array([opens_us - lead_us, opens_us, closes_us, closes_us + lead_us])
     trigger_us = np.round(np.asarray(times_s, dtype=np.float64) * _US).astype(np.int64)
-    edges = trigger_us[:, None] + relative
     # Rounding moves each trigger by half a microsecond at most.
-    soon = np.flatnonzero(np.diff(trigger_us) < round(shortest_interval_s * _US) - 1)
+    min_us = max(round(shortest_interval_s * _US) - 1, exposure_us + 2 * lead_us + 1)
+    soon = np.flatnonzero(np.diff(trigger_us) < min_us)
     if len(soon):
         i = int(soon[0]) + 1
         raise PlanError(
             f"trigger {i} at {trigger_us[i] / _US:.6f} s follows the one before by "
-            f"{(trigger_us[i] - trigger_us[i - 1]) / _US:.6f} s; the shortest interval is "
-            f"{shortest_interval_s:g} s: lower speed_mps or forward_overlap"
+            f"{(trigger_us[i] - trigger_us[i - 1]) / _US:.6f} s; cameras and strobes take "
+            f"{min_us / _US:.6f} s: lower speed_mps, forward_overlap or allowed_blur_px"
         )
-    lit = np.flatnonzero(edges[1:, 0] <= edges[:-1, 3])
-    if len(lit):
-        i = int(lit[0]) + 1
-        raise PlanError(
-            f"trigger {i}: its strobe would be lit at {edges[i, 0]} us, before it goes out at "
-            f"{edges[i - 1, 3]} us: lower strobe_lead_s or allowed_blur_px"
-        )
-    if len(edges) and edges[0, 0] < 0:
-        raise PlanError(
-            f"the first trigger, at {times_s[0]:.6f} s, needs its strobe {-edges[0, 0]} us before "
-            "the start: begin later"
-        )
-    count = len(edges)
-    return np.column_stack([np.arange(count), trigger_us, edges, np.tile(relative, (count, 1))])
+    count = len(trigger_us)
+    return np.column_stack([
+        np.arange(count), trigger_us, trigger_us[:, None] + relative, np.tile(relative, (count, 1)),
+    ])  # fmt: skip

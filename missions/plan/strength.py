@@ -21,7 +21,7 @@ from missions.route.energy import (
     flight_conditions,
     vehicle_costs,
 )
-from missions.route.flyable import as_flown
+from missions.route.flyable import as_flown, plan_as_flown
 from missions.values.costs import Costs
 from missions.values.plan_file import Dive
 
@@ -63,11 +63,10 @@ def current_error(flown: FlightConditions, what: str, *, is_set: bool = True) ->
             "sea.current_mps", held_mps if is_set and held_mps < size else None,
         )  # fmt: skip
     if flown.craft.fins and fin_flight(flown.craft, speed, 0.0, STEADY_SHARE) is None:
-        min_mps = min_speed_mps(flown.craft, STEADY_SHARE) + size
         return conflict(
             too_slow(flown.craft, speed, STEADY_SHARE),
             ("plan.speed_mps", "the lift of its fins and hull"),
-            "plan.speed_mps", math.ceil(100.0 * min_mps) / 100.0,
+            "plan.speed_mps", _min_fin_speed_mps(flown, size),
         )  # fmt: skip
     said = (
         f"{name} cannot fly lines{on} {manner}, ways between in all directions and turns at "
@@ -84,6 +83,24 @@ def current_error(flown: FlightConditions, what: str, *, is_set: bool = True) ->
         limits = "plan.speed_mps", "the thrust of the vehicle"
         return conflict(said, limits, "plan.speed_mps", max_mps)
     return PlanError(f"{said} with the thrust it has left: check vehicle.failures")
+
+
+def _min_fin_speed_mps(flown: FlightConditions, current_mps: float) -> float | None:
+    """The lowest speed over ground at which fins hold a vehicle everywhere; None if unknown."""
+
+    def flies(speed_mps: float) -> bool:
+        settings = PlanConfig(speed_mps=speed_mps, turn_radius_m=flown.turn_radius_m)
+        radius_m = plan_as_flown(settings, flown.craft).arc_radius_m
+        return flies_everywhere(replace(flown, speed_mps=speed_mps, turn_radius_m=radius_m))
+
+    slow_mps = min_speed_mps(flown.craft, STEADY_SHARE)
+    fast_mps = min(2.0 * (slow_mps + current_mps), 3.0)
+    if not flies(fast_mps):
+        return None
+    low = math.ceil(100.0 * last_that_fits(flies, fast_mps, slow_mps, 1e-3))
+    # Radii go by steps, so that a little faster may not do.
+    tried = (step / 100.0 for step in range(low, math.ceil(100.0 * fast_mps)))
+    return next(filter(flies, tried), fast_mps)
 
 
 def held_current_mps(conditions: FlightConditions) -> float:

@@ -48,14 +48,7 @@ def test_one_metre_lines_at_two_metres_surely_overlap_by_27_percent_not_45() -> 
     assert overlap_of_row(here, there, 0.0) == pytest.approx(0.293, abs=1e-3)
 
 
-@pytest.mark.parametrize("distance_m", [0.01, 0.02, 0.03])
-def test_through_real_ports_they_overlap_by_28_to_29_percent(distance_m: float) -> None:
-    rig, config = survey(plan={"line_spacing_m": 1.0}, camera={"port_distance_m": distance_m})
-    assert 0.279 <= line_spacing(rig, config.plan, STEP_M).mean_overlap <= 0.29
-
-
-@pytest.mark.parametrize("ideal", [False, True])
-@pytest.mark.parametrize("wanted", [0.29, 0.45, 0.7])
+@pytest.mark.parametrize(("ideal", "wanted"), [(False, 0.29), (True, 0.45), (False, 0.7)])
 def test_the_spacing_yields_the_overlap_on_traced_footprints(ideal: bool, wanted: float) -> None:
     rig, config = survey(ideal_port=ideal, plan={"side_overlap": wanted})
     spacing = line_spacing(rig, config.plan, STEP_M)
@@ -75,7 +68,7 @@ def test_the_spacing_yields_the_overlap_on_traced_footprints(ideal: bool, wanted
     assert wanted < spacing.swath_overlap < shares[0]
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     altitude_m=st.floats(1.2, 6.0),
     wanted=st.floats(0.3, 0.7),

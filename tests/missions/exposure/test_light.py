@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from alice_survey.sim.seafloor.light import LUMENS_PER_WATT, camera_light, make_sensor, nominal_gain
+from alice_survey.sim.seafloor.light import camera_light, make_sensor, nominal_gain
 from alice_survey.sim.seafloor.renderer import flat_floor_radiance
 from alice_survey.sim.seafloor.texture import SAND_ALBEDO
 from camera_calib.water import WaterOptics, water_optics
@@ -67,12 +67,6 @@ def test_electrons_agree_with_the_simulators_sensor() -> None:
     sensor = make_sensor(config.camera, 1.34, 2e-3, 1)
     gain = nominal_gain(np.full((2, 2, 3), 100.0), sensor)
     assert gain * 100 == pytest.approx(MIDDLE_GREY)
-
-
-def test_an_even_spectrum_has_the_lumens_of_the_simulators() -> None:
-    assert watts_per_lumen("even").sum() == pytest.approx(1 / LUMENS_PER_WATT, rel=2e-3)
-    even = watts_per_lumen("even")
-    np.testing.assert_allclose(even, even[0], rtol=0.01)
 
 
 def lobe(nm: np.ndarray, middle: float, below: float, above: float) -> np.ndarray:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from alice_survey.core.errors import PlanError
 from missions.exposure.settings import imaging_settings
-from missions.plan.rows import WIDTH, Setting, imaging_rows, settings_table
+from missions.plan.rows import WIDTH, imaging_rows, settings_table
 from tests.missions.exposure.surveys import survey
 
 
@@ -74,20 +74,6 @@ def test_rows_name_equation_source_and_limit_and_fit_a_hundred_columns() -> None
     assert data["spacing"]["spacing_m"] == planned.line_spacing_m
 
 
-@pytest.mark.parametrize(
-    ("value", "unit", "shown"),
-    [
-        (0.42812, "Hz", "0.428 Hz"),
-        (0.306, "%", "30.6 %"),
-        ((1.65, 2.0, 2.345678), "m", "1.65 / 2 / 2.35 m"),
-        (float("inf"), "m", "infinity m"),
-        (12345678.0, "", "1.23e+07"),
-    ],
-)
-def test_numbers_are_short(value: float | tuple[float, ...], unit: str, shown: str) -> None:
-    assert Setting("group", "name", value, unit, "equation", "source", "limit").text == shown
-
-
 def test_an_exposure_too_short_is_refused() -> None:
     with pytest.raises(PlanError, match=r"allowed_blur_px 0\.001"):
         imaging_settings(*survey(plan={"allowed_blur_px": 0.001}))
@@ -112,11 +98,3 @@ def test_what_will_be_poor_is_warned_of(
     assert capsys.readouterr().err == ""
     imaging_settings(*survey(**sections))
     assert named in capsys.readouterr().err
-
-
-def test_exposure_grows_with_altitude() -> None:
-    low, high = (
-        imaging_settings(*survey(plan={"altitude_m": a, "relief_m": 0.1})) for a in (1.0, 3.0)
-    )
-    assert high.exposure_s > 2 * low.exposure_s
-    assert low.blur_px == pytest.approx(1.0, abs=0.02)
