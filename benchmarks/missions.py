@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from alice_survey.core.config import SurveyConfig, change_section
-from alice_survey.core.text_table import text_table
+from alice_survey.kit.words import text_table
 from alice_survey.sim.vehicle.sea import level_floor
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine

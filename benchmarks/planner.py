@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.core.text_table import text_table
+from alice_survey.kit.words import text_table
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
 from benchmarks.planner_areas import planned_area, shapes

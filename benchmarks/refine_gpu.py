@@ -28,7 +28,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from alice_survey.core.device import is_gpu_chosen
+from alice_survey.app.commands.base import is_gpu_chosen
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
 from reconstruct.dense.refine_depth import ComparedView, Float32, RefinedDepth, prepared, refine

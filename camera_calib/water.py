@@ -19,7 +19,7 @@ from alice_survey.core.config import Jerlov
 from alice_survey.core.errors import ConfigError
 from alice_survey.core.frames import Array
 from alice_survey.core.seawater import n_water, pressure_dbar
-from alice_survey.core.text_table import field_table
+from alice_survey.kit.words import field_table
 
 CHANNELS = ("red", "green", "blue")
 WAVELENGTH_NM = np.array([600.0, 530.0, 460.0])

@@ -16,7 +16,7 @@ from pydantic import BaseModel
 
 from alice_survey.core import artefacts, records
 from alice_survey.core.artefacts import Stage, read_stage, run_stage, why_stale
-from alice_survey.core.config import VEHICLE_FILES, Config, SurveyConfig
+from alice_survey.core.config import VEHICLE_FILES, Config
 from alice_survey.core.errors import AliceError
 from alice_survey.core.executor import Executor
 
@@ -68,7 +68,7 @@ class StageSpec:
     reported: Sequence[str] = ()
     """Files that a report reads: paths below its folder, `.` for all of it."""
 
-    def stage(self, workspace: Path, config: SurveyConfig) -> Stage:
+    def stage(self, workspace: Path, config: Config) -> Stage:
         """Dependencies of the stage, in a workspace."""
         return Stage(
             name=self.folder,
@@ -78,7 +78,7 @@ class StageSpec:
             resumes=self.resumes,
         )
 
-    def make(self, workspace: Path, config: SurveyConfig, executor: Executor) -> bool:
+    def make(self, workspace: Path, config: Config, executor: Executor) -> bool:
         """Run the stage unless it is up to date.
 
         Returns:
@@ -107,7 +107,7 @@ class StageSpec:
         command = self.command if planned or self.name != "image" else "import-images"
         return artefacts.need_stage(workspace, self.folder, command)
 
-    def state(self, workspace: Path, config: SurveyConfig, before: Mapping[str, str]) -> str:
+    def state(self, workspace: Path, config: Config, before: Mapping[str, str]) -> str:
         """Whether the stage is up to date, or why it is not.
 
         Args:

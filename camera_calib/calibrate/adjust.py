@@ -13,10 +13,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.core.block_solver import BlockStep, Equations, Flags, Minimum, minimise
+from alice_survey.core.block_solver import (
+    RAYLEIGH_MEDIAN,
+    BlockStep,
+    Equations,
+    Flags,
+    Minimum,
+    minimise,
+)
 from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import Array
-from alice_survey.core.robust import RAYLEIGH_MEDIAN
 from camera_calib.calibrate.normal_equations import CalibrationProblem, State
 from camera_calib.calibration import TargetView, stack_views
 from camera_calib.freedom import Freedom, at_bound

@@ -25,10 +25,9 @@ from pydantic import (
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.artefacts import atomic_path
-from alice_survey.core.contents import as_line, first_fault
+from alice_survey.core.contents import as_line, first_fault, refuse_declarations
 from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import Array
-from alice_survey.core.untrusted import refuse_declarations
 
 _MAX_BYTES = 1 << 20
 _MAX_SKIPPED_BYTES = 1 << 26

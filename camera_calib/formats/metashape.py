@@ -18,8 +18,8 @@ from typing import Literal
 from xml.etree import ElementTree as ET
 
 from alice_survey.core.artefacts import atomic_path
+from alice_survey.core.contents import xml_root
 from alice_survey.core.errors import CalibrationError
-from alice_survey.core.untrusted import xml_root
 from camera_calib.camera import Camera
 from camera_calib.formats import fields, opencv_model, rigs
 from camera_calib.lenses.fisheye import FisheyeLens

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from alice_survey.core.artefacts import json_values
-from alice_survey.core.text_table import field_table
+from alice_survey.kit.words import field_table
 from camera_calib.fov.paper import PAPER_RULE, RELIEF, PaperCheck, PaperClaim, PaperValidation
 from camera_calib.fov.table import FISHEYE_FOV_DEG, TRUSTED_FOV_DEG, BlurRow, FovRow
 

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from alice_survey.core.artefacts import json_values
 from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import Array
-from alice_survey.core.text_table import text_table
-from alice_survey.kit.words import with_sigma
+from alice_survey.kit.words import text_table, with_sigma
 from camera_calib.camera import Camera, pose_jacobian
 from camera_calib.freedom import POSE, all_names, value
 from camera_calib.rig import Covariance, Rig, read_rig

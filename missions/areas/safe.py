@@ -10,8 +10,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from alice_survey.core.config import SHAPEFILE_SIDES, sides_of
+from alice_survey.core.contents import archive_member, opened_archive, xml_root_name
 from alice_survey.core.errors import PlanError
-from alice_survey.core.untrusted import archive_member, opened_archive, xml_root_name
 
 MAX_BYTES = 100_000_000
 """Size limit of a file, and of all that is unpacked from an archive."""

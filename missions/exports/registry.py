@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 from alice_survey.core.contents import one_line
 from alice_survey.core.errors import PlanError, why
 from missions.exports import formats
-from missions.values.mission import Mission, MissionStep
 
 if TYPE_CHECKING:
     from missions.exports.format import ExportFormat
+    from missions.values.mission import Mission
 
 _MAX_BYTES = 64_000_000
 _REMOVED = {"cola2-v1": "cola2", "qgc-survey": "qgc"}
@@ -52,7 +52,7 @@ def formats_table() -> str:
     return "\n".join(rows)
 
 
-def read_mission(path: Path) -> Mission:
+def read_mission(path: Path) -> "Mission":
     """Read a mission as the vehicle that the file is for does.
 
     Raises:
@@ -82,7 +82,7 @@ def read_mission(path: Path) -> Mission:
     raise PlanError(f"{path}: holds no mission in any of the formats {', '.join(readable)}")
 
 
-def _check(mission: Mission) -> None:
+def _check(mission: "Mission") -> None:
     """Raise a `ValueError` of what no vehicle can fly."""
     if not mission.steps:
         raise ValueError("the mission has no step")

@@ -6,7 +6,7 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 from alice_survey.core.artefacts import atomic_path
-from alice_survey.core.untrusted import xml_root
+from alice_survey.core.contents import xml_root
 
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 """What XML 1.0 cannot hold in any way (W3C, section 2.2)."""

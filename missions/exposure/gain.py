@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from alice_survey.core.errors import ImageError, warn
 from alice_survey.core.executor import progress
 from alice_survey.core.frames import Array
-from alice_survey.core.text_table import text_table
+from alice_survey.kit.words import text_table
 from camera_calib.picture_files import is_cut_short, read_pixels
 from missions.exposure.light import MIDDLE_GREY
 

@@ -23,7 +23,7 @@ from alice_survey.core.config import SurveyConfig, change_section, parse_current
 from alice_survey.core.errors import ConfigError, VehicleError
 from alice_survey.core.executor import Executor, local_executor
 from alice_survey.core.frames import Array
-from alice_survey.core.text_table import text_table
+from alice_survey.kit.words import text_table
 from alice_survey.sim.vehicle.files import vehicle_to_fly
 from alice_survey.sim.vehicle.pilot.gains import gains_for
 from alice_survey.sim.vehicle.pilot.memory import CROSS, FOLLOW, PHASE

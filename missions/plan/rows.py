@@ -7,8 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from alice_survey.core.config import VehicleConfig
-from alice_survey.core.text_table import text_table
-from alice_survey.kit.words import share
+from alice_survey.kit.words import share, text_table
 from missions.coverage.certificate import Certificate
 from missions.exposure.light import MIDDLE_GREY, SEEN_SHARE
 from missions.exposure.settings import ImagingSettings, ImagingSetup

@@ -10,7 +10,7 @@ import numpy as np
 from alice_survey.core.artefacts import json_values
 from alice_survey.core.config import PlanConfig, SurveyConfig
 from alice_survey.core.errors import AliceError, ConfigError, PlanError
-from alice_survey.core.text_table import text_table
+from alice_survey.kit.words import text_table
 from alice_survey.sim.vehicle.pilot.settings import turn_in_place_rate_rad_s
 from missions.exposure.conflict import MAX_ALTITUDE_M, last_that_fits
 from missions.exposure.focus import plan_focus

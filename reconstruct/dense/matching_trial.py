@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Array
-from alice_survey.core.robust import MAD_TO_SIGMA
 from reconstruct.dense.depth import MATCH_SIGMA_PX, Look, PartnerDepth, pair_depth, rectify
 from reconstruct.pictures.normalise import normalise
 from reconstruct.pictures.undistorted import Pictures

@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.core.artefacts import atomic_path, write_csv
+from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
-from alice_survey.core.robust import MAD_TO_SIGMA
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.dense.views import ViewTask

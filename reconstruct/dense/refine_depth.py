@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
-from alice_survey.core.robust import MAD_TO_SIGMA
 from reconstruct.views.interpolation import spline_slopes, spline_weights
 from reconstruct.views.model import View
 from reconstruct.views.range_shift import FAST, KernelLens, line_of, warped_at

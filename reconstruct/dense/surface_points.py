@@ -22,9 +22,9 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
-from alice_survey.core.robust import MAD_TO_SIGMA
 from reconstruct.dense.points import Points
 
 Float32 = NDArray[np.float32]

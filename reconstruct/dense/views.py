@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Array
-from alice_survey.core.robust import MAD_TO_SIGMA
 from reconstruct.dense.depth import (
     GATE_SIGMAS,
     Look,

@@ -17,10 +17,10 @@ from rasterio.transform import Affine
 from scipy.ndimage import find_objects
 
 from alice_survey.core.artefacts import refuse_links
+from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.errors import ReconstructionError, WorkspaceError, warn
 from alice_survey.core.frames import Array
 from alice_survey.core.records import ChangeRecord
-from alice_survey.core.robust import MAD_TO_SIGMA
 from alice_survey.core.run import progress
 from alice_survey.kit.figure import (
     Axes,

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.frames import Array
-from alice_survey.core.robust import MAD_TO_SIGMA
 
 _BLOCKS = 10
 """Blocks along the longer side over which errors are averaged before a bend is fitted."""

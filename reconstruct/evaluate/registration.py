@@ -19,9 +19,9 @@ from scipy.signal import fftconvolve
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.errors import ReconstructionError, WorkspaceError
 from alice_survey.core.frames import Array
-from alice_survey.core.robust import MAD_TO_SIGMA
 from reconstruct.evaluate.elevation import Elevation
 from reconstruct.evaluate.figures import mean_grid, rms, rounded, tukey_weights
 from reconstruct.placing.alignment import Similarity

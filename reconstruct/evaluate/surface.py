@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 from shapely.geometry import MultiPolygon
 
+from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.frames import Array
 from alice_survey.core.records import MeshRecord
-from alice_survey.core.robust import MAD_TO_SIGMA
 from alice_survey.core.run import progress
 from alice_survey.sim.seafloor.terrain import Terrain
 from reconstruct.evaluate.elevation import Elevation

@@ -17,10 +17,9 @@ other points follow, one by one, with poses held.
 import numpy as np
 import pycolmap
 
-from alice_survey.core.block_solver import Flags
+from alice_survey.core.block_solver import CAUCHY_TUNING, RAYLEIGH_MEDIAN, Flags
 from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
-from alice_survey.core.robust import CAUCHY_TUNING, RAYLEIGH_MEDIAN
 from reconstruct.mapping.arrays import Indices, Observed, observations
 
 _MIN_SIGMA_PX = 1e-3

@@ -36,9 +36,9 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.core.block_solver import CAUCHY_TUNING
 from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Array
-from alice_survey.core.robust import CAUCHY_TUNING
 from alice_survey.core.run import progress
 from reconstruct.mapping.arrays import Indices, cross_matrices
 from reconstruct.mapping.bundle import (

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 
 from alice_survey.core.artefacts import read_stage, refuse_links, write_csv
+from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.errors import ImageError, why
 from alice_survey.core.executor import Executor
 from alice_survey.core.manifest import ImageRecord, read_manifest
-from alice_survey.core.robust import MAD_TO_SIGMA
 from alice_survey.kit.figure import INKS, figure_style, new_figure, save_figure
 from reconstruct.pictures.files import decode
 from reconstruct.pictures.normalise import even_light

@@ -15,6 +15,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.core.block_solver import CAUCHY_TUNING, MAD_TO_SIGMA
 from alice_survey.core.errors import warn
 from alice_survey.core.frames import Array, Datum
 from alice_survey.core.manifest import ImageRecord
@@ -25,7 +26,6 @@ from alice_survey.core.records import (
     FarStation,
     ScaleOfPairs,
 )
-from alice_survey.core.robust import CAUCHY_TUNING, MAD_TO_SIGMA
 from alice_survey.core.run import progress
 from camera_calib.rig import Rig
 from reconstruct.mapping.arrays import Observed, first_pictures, observations

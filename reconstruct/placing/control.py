@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import brentq
 
+from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.errors import warn
 from alice_survey.core.frames import Array, Datum
 from alice_survey.core.records import BarRow, ControlRecord, ControlRms, PointRow
-from alice_survey.core.robust import MAD_TO_SIGMA
 from reconstruct.mapping.arrays import cross_matrices
 from reconstruct.placing.alignment import Similarity, align_rigid, align_similarity
 from reconstruct.placing.control_points import Control, KnownLength, TriangulatedPoint

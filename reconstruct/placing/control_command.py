@@ -31,13 +31,12 @@ from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError, ProjError
 
 from alice_survey.core.artefacts import need_stage, read_stage, write_csv
-from alice_survey.core.contents import as_line, one_line
+from alice_survey.core.contents import as_line, one_line, xml_root
 from alice_survey.core.errors import ReconstructionError, WorkspaceError, warn, why
 from alice_survey.core.executor import SERIAL, Executor
 from alice_survey.core.frames import Array, Datum
 from alice_survey.core.manifest import read_manifest
 from alice_survey.core.records import ControlRecord, MappingRecord, RegistrationRecord, ScaleRecord
-from alice_survey.core.untrusted import xml_root
 from reconstruct.pictures.files import list_names, safe_name
 from reconstruct.pictures.undistorted import Pictures, read_colour
 from reconstruct.placing.control import describe

@@ -44,8 +44,14 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.core.artefacts import read_csv, write_csv
-from alice_survey.core.edited_files import check_token, content_of, content_token, replace_file
+from alice_survey.core.artefacts import (
+    check_token,
+    content_of,
+    content_token,
+    read_csv,
+    replace_file,
+    write_csv,
+)
 from alice_survey.core.errors import WorkspaceError, warn, why
 from alice_survey.core.frames import Array, Datum
 from camera_calib.approximation.pinhole_warp import PinholeWarp

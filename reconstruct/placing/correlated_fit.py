@@ -26,9 +26,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
-from alice_survey.core.robust import MAD_TO_SIGMA
 from reconstruct.placing.navigation import GROUP_OF, GROUPS, PARAMETERS, NavigationEquations
 
 MIN_WHITE = 1e-4

@@ -18,6 +18,7 @@ import pycolmap
 from scipy.spatial import KDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.config import ReconstructConfig
 from alice_survey.core.errors import (
     Level,
@@ -30,7 +31,6 @@ from alice_survey.core.errors import (
 from alice_survey.core.frames import Array, Datum
 from alice_survey.core.manifest import ImageRecord
 from alice_survey.core.records import MappingRecord, PicturesRecord, ScaleRecord
-from alice_survey.core.robust import MAD_TO_SIGMA
 from alice_survey.core.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.rig import Rig, rig_with_mount

@@ -10,7 +10,6 @@ from alice_survey.core.artefacts import atomic_path, need_stage, write_json
 from alice_survey.core.config import SurveyConfig
 from alice_survey.core.errors import ConfigError
 from alice_survey.core.frames import Array
-from alice_survey.core.text_table import text_table
 from alice_survey.kit.figure import (
     check_figure_path,
     colour_bar,
@@ -19,6 +18,7 @@ from alice_survey.kit.figure import (
     new_figure,
     save_figure,
 )
+from alice_survey.kit.words import text_table
 from missions.values.plan_file import Plan, read_plan
 from reconstruct.precision.candidates import (
     Candidate,

@@ -34,7 +34,7 @@ from alice_survey.app.studio.files import (
     WorkspaceFiles,
 )
 from alice_survey.app.studio.jobs import BusyError
-from alice_survey.core.edited_files import StaleError
+from alice_survey.core.artefacts import StaleError
 from alice_survey.core.errors import AliceError, WorkspaceError, known_fault
 
 HOSTS = ("127.0.0.1", "localhost")

@@ -22,8 +22,7 @@ from starlette.staticfiles import NotModifiedResponse, StaticFiles
 from starlette.types import Scope
 
 from alice_survey.app.stages import LOOSE_FOLDERS, STAGES
-from alice_survey.core.artefacts import STAGE_FILE
-from alice_survey.core.edited_files import StaleError
+from alice_survey.core.artefacts import STAGE_FILE, StaleError
 from alice_survey.core.errors import AliceError
 from alice_survey.kit.document import Link, Report, Section
 from alice_survey.kit.page import page_policy, render_html

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from alice_survey.core.errors import ConfigError
-from alice_survey.core.text_table import text_table
+from alice_survey.kit.words import text_table
 from alice_survey.sim.vehicle.coefficients import LIFTS, Coefficients
 
 SHAPES: dict[str, dict[str, Any]] = tomllib.loads(

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 import typer
 
+from alice_survey.app.commands import base as device
 from alice_survey.app.commands.base import DeviceCommand
-from alice_survey.core import device
 from alice_survey.core.errors import ConfigError, collected_by
 
 Chosen = Callable[[device.Choice], tuple[bool, list[str]]]
@@ -72,7 +72,8 @@ def test_a_cluster_takes_no_gpu(tmp_path: Path) -> None:
 
 def test_the_processor_needs_no_cuda() -> None:
     code = (
-        "import sys, reconstruct.dense.run; from alice_survey.core.device import is_gpu_chosen; "
+        "import sys, reconstruct.dense.run\n"
+        "from alice_survey.app.commands.base import is_gpu_chosen\n"
         "assert not is_gpu_chosen('cpu'); print(*sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
+from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.executor import SERIAL
 from alice_survey.core.frames import Array
-from alice_survey.core.robust import MAD_TO_SIGMA
 from reconstruct.dense.depth import enlarged
 from reconstruct.dense.matching_trial import (
     find_scales,

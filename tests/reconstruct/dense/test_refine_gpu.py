@@ -31,7 +31,7 @@ SCENE = Scene(
 
 REFINED = """
 import pickle, sys
-from alice_survey.core.device import is_gpu_chosen
+from alice_survey.app.commands.base import is_gpu_chosen
 from reconstruct.dense.refine_gpu import refine_on_gpu
 assert is_gpu_chosen("gpu")
 with open(sys.argv[1], "rb") as file:

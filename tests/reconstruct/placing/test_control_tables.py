@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from alice_survey.core.edited_files import StaleError
+from alice_survey.core.artefacts import StaleError
 from alice_survey.core.errors import WorkspaceError
 from reconstruct.placing.control_points import (
     Pick,

@@ -25,9 +25,8 @@ from alice_survey.app.studio.endpoints.base import (
     Studio,
     zip_files,
 )
-from alice_survey.core.artefacts import json_values
+from alice_survey.core.artefacts import check_token, content_of, content_token, json_values
 from alice_survey.core.config import AreaConfig, Config, SurveyConfig, parse_settings, settings_in
-from alice_survey.core.edited_files import check_token, content_of, content_token
 from alice_survey.core.errors import AliceError, ConfigError, PlanError, collected_by, keep_warnings
 from alice_survey.core.executor import local_executor
 from alice_survey.core.frames import Array, Datum, attitude_from_rotation

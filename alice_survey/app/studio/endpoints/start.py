@@ -15,9 +15,8 @@ from alice_survey.app.commands.intake import ImportImagesCommand
 from alice_survey.app.pipeline import init_survey
 from alice_survey.app.studio.endpoints.base import Call, Endpoint, Studio
 from alice_survey.app.studio.jobs import command_of
-from alice_survey.core.artefacts import json_values, refuse_links
+from alice_survey.core.artefacts import StaleError, json_values, refuse_links
 from alice_survey.core.config import Config, load_config
-from alice_survey.core.edited_files import StaleError
 from alice_survey.core.errors import AliceError, WorkspaceError, why
 from alice_survey.core.settings_text import Values
 from missions.areas.files import SUFFIXES

@@ -22,8 +22,8 @@ from scipy.spatial.transform import Rotation
 from alice_survey.core.config import DEFAULT_VEHICLE
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
-from alice_survey.core.text_table import text_table
 from alice_survey.kit.figure import INKS, SOFT, figure_style, new_figure, save_figure
+from alice_survey.kit.words import text_table
 from alice_survey.sim.vehicle.files import (
     coefficients_from_file,
     parse_table,

@@ -14,7 +14,7 @@ from pydantic import BaseModel
 from alice_survey.app.studio import app as studio_app
 from alice_survey.app.studio.endpoints.base import Call, Content, Endpoint, Studio
 from alice_survey.app.studio.server import Server
-from alice_survey.core.edited_files import StaleError
+from alice_survey.core.artefacts import StaleError
 from alice_survey.core.errors import AliceError, WorkspaceError
 from tests.alice_survey.app.report.tiny import tiny_workspace
 from tests.alice_survey.app.studio.client import ask, call, serving

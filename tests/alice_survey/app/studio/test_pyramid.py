@@ -13,7 +13,7 @@ from rasterio.transform import Affine
 from alice_survey.app.report.colours import TILE_PX, colour_tile, limits_of, number_rasters
 from alice_survey.app.studio.files import Workspace
 from alice_survey.app.studio.layers import Layers, Pyramid
-from alice_survey.core.edited_files import StaleError
+from alice_survey.core.artefacts import StaleError
 from tests.alice_survey.app.report.tiny import tiny_workspace
 
 ROWS, COLUMNS = 1302, 1110
