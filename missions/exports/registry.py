@@ -15,7 +15,7 @@ from missions.exports import formats
 
 if TYPE_CHECKING:
     from missions.exports.format import ExportFormat
-    from missions.values.mission import Mission
+    from missions.values.mission import Mission, MissionStep
 
 _MAX_BYTES = 64_000_000
 _REMOVED = {"cola2-v1": "cola2", "qgc-survey": "qgc"}
@@ -92,7 +92,7 @@ def _check(mission: "Mission") -> None:
             raise ValueError(f"step {number} has {faults[0]}")
 
 
-def _conditions(step: MissionStep) -> dict[str, bool]:
+def _conditions(step: "MissionStep") -> dict[str, bool]:
     """What must hold of a step, by what it has where it does not."""
     latitudes, longitudes = zip((step.latitude_deg, step.longitude_deg),
                                 step.start_deg or (0.0, 0.0), strict=True)  # fmt: skip
