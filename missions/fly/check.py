@@ -11,8 +11,7 @@ from alice_survey.core.artefacts import need_stage, refuse_links, write_json
 from alice_survey.core.config import CameraConfig, SurveyConfig, WaterConfig
 from alice_survey.core.errors import PlanError, warn
 from alice_survey.core.executor import SERIAL, Executor, local_executor
-from alice_survey.core.text_table import text_table
-from alice_survey.kit.words import share
+from alice_survey.kit.words import share, text_table
 from camera_calib.rig import Rig, design_rig, read_rig, rig_with_mount
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.dive_record import DiveRecord, read_dive_record
