@@ -31,7 +31,7 @@ from benchmarks.planner_peers import (
     own_plan,
 )
 from missions.lines.hops import comparable
-from missions.lines.lay import laid
+from missions.lines.lay import lay_pattern
 from missions.lines.rows import Site
 from missions.lines.sweep import best_heading
 from missions.route.ways import Ways
@@ -146,7 +146,9 @@ def _angle_figures(name: str, *, quick: bool) -> Iterator[Figure]:
     headings = np.arange(sampled) * math.pi / sampled
     site, bounded = Site.of(area), comparable(costs)
     costs_j = [
-        laid(site, h, PATTERN, ways, bounded, home, cross_lines=1, closing_line=True).energy_j
+        lay_pattern(
+            site, h, PATTERN, ways, bounded, home, cross_lines=1, closing_line=True
+        ).energy_j
         for h in headings
     ]
     north_m, east_m = np.concatenate([np.diff(ring, axis=0) for ring in area.rings_ne]).T

@@ -15,7 +15,7 @@ from shapely.geometry.base import BaseGeometry
 
 from alice_survey.core.frames import Array, Datum
 from missions.lines.hops import comparable
-from missions.lines.lay import laid, lay_lines
+from missions.lines.lay import lay_lines, lay_pattern
 from missions.lines.rows import Site
 from missions.route.ways import Ways
 from missions.values.area import Area, multipolygon
@@ -221,6 +221,6 @@ def full_cost_j(
     home: tuple[float, float], **kinds: Any,
 ) -> float:  # fmt: skip
     """Energy of the flight through all lines of a heading, as the planner counts it."""
-    return laid(
+    return lay_pattern(
         Site.of(area), heading_rad, pattern, ways, comparable(costs), home, **kinds
     ).energy_j

@@ -98,7 +98,7 @@ class Bathymetry:
         pixel = np.clip(np.where(inside[:, None], pixel, 0.0), 0.0, last)
         col = np.minimum(pixel[:, 0].astype(np.intp), max(columns - 2, 0))
         row = np.minimum(pixel[:, 1].astype(np.intp), max(rows - 2, 0))
-        along, down = _snapped(pixel[:, 0] - col), _snapped(pixel[:, 1] - row)
+        along, down = _snap(pixel[:, 0] - col), _snap(pixel[:, 1] - row)
         total = np.zeros(len(pixel))
         for d_row, d_col, weight in (
             (0, 0, (1 - along) * (1 - down)),
@@ -262,7 +262,7 @@ def _check_filled(path: Path, file: Any) -> None:
         )
 
 
-def _snapped(share: Array) -> Array:
+def _snap(share: Array) -> Array:
     """Places between two centres, with those on a centre by rounding put on it."""
     ends = np.where(share > 1.0 - _SAME_CELL, 1.0, share)
     return np.where(share < _SAME_CELL, 0.0, ends)

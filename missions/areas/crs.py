@@ -58,7 +58,7 @@ class LocalFrame:
         lat, lon = self.latlon_from_ne(np.array([[north, east]]))[0]
         return f"{text} ({lat:.7f}, {lon:.7f})"
 
-    def localised(self, raw: RawShapes) -> RawShapes:
+    def localise(self, raw: RawShapes) -> RawShapes:
         """Shapes in metres north and east of the datum.
 
         Raises:
@@ -71,7 +71,7 @@ class LocalFrame:
             self._check_near(corners, points_ne, raw, name)
             return points_ne
 
-        return raw.mapped(change, geographic=False)
+        return raw.change(change, geographic=False)
 
     def _check_near(self, corners: Array, points_ne: Array, raw: RawShapes, name: str) -> None:
         if not len(points_ne):
@@ -179,7 +179,7 @@ def geographic_shapes(raw: RawShapes, crs: Any) -> RawShapes:
         check_latitudes(lat_lon, raw.origin, name)
         return lat_lon
 
-    moved = raw.mapped(change, geographic=True)
+    moved = raw.change(change, geographic=True)
     worst_m = max(accuracy_m, default=0.0)
     if worst_m > _WGS84_ACCURACY_M:
         warn(
@@ -266,7 +266,7 @@ def usable_crs(crs: Any, origin: str) -> Any:
 def middle(raw: RawShapes) -> Datum:
     """The middle of the bounds of geographic shapes, rounded so that it can be read and typed."""
     lat_lon = raw.coordinates
-    lat, lon = lat_lon[:, 0], unwrapped(lat_lon[:, 1], float(lat_lon[0, 1]))
+    lat, lon = lat_lon[:, 0], unwrap_longitudes(lat_lon[:, 1], float(lat_lon[0, 1]))
     centre_lat = (lat.min() + lat.max()) / 2
     centre_lon = (lon.min() + lon.max()) / 2
     return Datum(
@@ -275,7 +275,7 @@ def middle(raw: RawShapes) -> Datum:
     )
 
 
-def unwrapped(lon_deg: Array, near_deg: float) -> Array:
+def unwrap_longitudes(lon_deg: Array, near_deg: float) -> Array:
     """Longitudes within half a turn of one, so that none jumps at the date line."""
     turned: Array = near_deg + (np.asarray(lon_deg) - near_deg + 180.0) % 360.0 - 180.0
     return turned

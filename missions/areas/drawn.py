@@ -142,7 +142,7 @@ def area_settings(
     if no_go or (survey and given is not None and given.survey.no_go is not None):
         values |= _left_out("no_go", settings) | _no_go(shapes.no_go, now.marks, frame, files)
     if allowed:
-        values |= _left_out("allowed", settings) | _allowed(shapes.allowed, frame, files)
+        values |= _left_out("allowed", settings) | _allowed_settings(shapes.allowed, frame, files)
     if not values:
         return {}, {}
     if len(settings.datum_given) < 2 and (not frame.datum_is_given or "file" in values):
@@ -193,26 +193,26 @@ def drawing_of_file(
 
 def _drawing(given: GivenShapes, settings: AreaConfig) -> AreaDrawing:
     frame, width_m = given.frame, settings.corridor_width_m
-    survey = frame.localised(given.survey)
+    survey = frame.localise(given.survey)
     plain = [line for line in survey.lines if line.width_m in (None, width_m)]
     wide = [line for line in survey.lines if line.width_m not in (None, width_m)]
     strips = [
         corridor_strip(line.points, line.width_m or width_m, survey.origin, "corridor")
         for line in wide
     ]
-    zones = [frame.localised(zone) for zone in given.no_go]
+    zones = [frame.localise(zone) for zone in given.no_go]
     room: list[DrawnPolygon] = []
     if given.allowed is not None:
-        allowed = frame.localised(given.allowed)
+        allowed = frame.localise(given.allowed)
         ways = [corridor_strip(x.points, width_m, allowed.origin, "line") for x in allowed.lines]
-        room = [*_polygons(allowed), *_covered(ways)]
+        room = [*_polygons(allowed), *_polygons_of_strips(ways)]
     points = [zone.points for zone in zones if len(zone.points)]
     return AreaDrawing(
         shapes=DrawnShapes(
-            survey=(*_polygons(survey), *_covered(strips)),
+            survey=(*_polygons(survey), *_polygons_of_strips(strips)),
             no_go=tuple(polygon for zone in zones for polygon in _polygons(zone)),
             allowed=tuple(room),
-            corridors=tuple(_rounded(line.points) for line in plain),
+            corridors=tuple(_round(line.points) for line in plain),
         ),
         datum=frame.datum,
         marks=(
@@ -230,7 +230,7 @@ def _polygons(raw: RawShapes) -> Iterator[DrawnPolygon]:
             yield DrawnPolygon(outer=outer, holes=tuple(hole for hole in holes if len(hole) >= 3))
 
 
-def _covered(strips: Iterable[Any]) -> Iterator[DrawnPolygon]:
+def _polygons_of_strips(strips: Iterable[Any]) -> Iterator[DrawnPolygon]:
     for strip in strips:
         for part in getattr(strip, "geoms", [strip]):
             outer, *holes = (_open(np.asarray(r.coords)) for r in (part.exterior, *part.interiors))
@@ -239,10 +239,10 @@ def _covered(strips: Iterable[Any]) -> Iterator[DrawnPolygon]:
 
 def _open(ring: Array) -> Open:
     closed = len(ring) > 1 and np.allclose(ring[0], ring[-1], atol=1e-9, rtol=0.0)
-    return _rounded(ring[:-1] if closed else ring)
+    return _round(ring[:-1] if closed else ring)
 
 
-def _rounded(points: Array) -> Open:
+def _round(points: Array) -> Open:
     rows = (np.round(np.asarray(points)[:, :2], _DECIMALS) + 0.0).tolist()
     return tuple((north, east) for north, east in rows)
 
@@ -273,9 +273,9 @@ def _inline(polygons: Sequence[DrawnPolygon]) -> bool:
 def _survey(shapes: DrawnShapes, frame: LocalFrame, files: dict[str, str]) -> dict[str, Any]:
     polygons, corridors = shapes.survey, shapes.corridors
     if len(polygons) == 1 and not corridors and _inline(polygons):
-        return {"polygon_ne_m": _listed(polygons[0].outer)}
+        return {"polygon_ne_m": _as_lists(polygons[0].outer)}
     if len(corridors) == 1 and not polygons and len(corridors[0]) <= _MAX_INLINE:
-        return {"corridor_ne_m": _listed(corridors[0])}
+        return {"corridor_ne_m": _as_lists(corridors[0])}
     name = FILES["survey"]
     files[name] = _geojson(frame, polygons, [np.array(line) for line in corridors])
     return {"file": name, **({"closed_lines": "corridor"} if corridors else {})}
@@ -289,20 +289,20 @@ def _no_go(
 ) -> dict[str, Any]:
     lines, points = marks
     if _inline(polygons) and not len(lines) and not len(points):
-        rings = [_listed(polygon.outer) for polygon in polygons]
+        rings = [_as_lists(polygon.outer) for polygon in polygons]
         return {"no_go_ne_m": rings} if rings else {}
     name = FILES["no_go"]
     files[name] = _geojson(frame, polygons, lines, points)
     return {"no_go_file": name}
 
 
-def _allowed(
+def _allowed_settings(
     polygons: Sequence[DrawnPolygon], frame: LocalFrame, files: dict[str, str]
 ) -> dict[str, Any]:
     if not polygons:
         return {}
     if len(polygons) == 1 and _inline(polygons):
-        return {"allowed_ne_m": _listed(polygons[0].outer)}
+        return {"allowed_ne_m": _as_lists(polygons[0].outer)}
     name = FILES["allowed"]
     files[name] = _geojson(frame, polygons)
     return {"allowed_file": name}
@@ -314,8 +314,8 @@ def _needs_crs(settings: AreaConfig, values: Mapping[str, Any]) -> bool:
     return any(value is not None and value not in FILES.values() for value in kept)
 
 
-def _listed(places: Open) -> list[list[float]]:
-    return [list(place) for place in _rounded(np.array(places))]
+def _as_lists(places: Open) -> list[list[float]]:
+    return [list(place) for place in _round(np.array(places))]
 
 
 def _geojson(

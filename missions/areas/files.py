@@ -98,7 +98,7 @@ def read_area_file(
             raise PlanError(f"area: {path}: it is not text") from None
         return read_wkt(path.name, text, crs)
     chosen = _choose(path, _layers(path), layer, role)
-    return _placed(path, chosen, crs, role)
+    return _in_wgs84(path, chosen, crs, role)
 
 
 def read_wkt(origin: str, text: str, crs: str | None) -> RawShapes:
@@ -280,7 +280,7 @@ def _choose(path: Path, layers: list[_Layer], layer: str | None, role: Role) -> 
     return usable[0]
 
 
-def _placed(path: Path, layer: _Layer, crs: str | None, role: Role) -> RawShapes:
+def _in_wgs84(path: Path, layer: _Layer, crs: str | None, role: Role) -> RawShapes:
     """The shapes of a layer in WGS 84, by the file's own system or, without one, by `crs`."""
     from pyproj import CRS
     from pyproj.exceptions import CRSError

@@ -65,7 +65,7 @@ class RawShapes:
         """Whether there is neither a polygon, a line nor a point."""
         return not (self.polygons or self.lines or len(self.points))
 
-    def mapped(self, change: Callable[[Array, str], Array], *, geographic: bool) -> "RawShapes":
+    def change(self, change: Callable[[Array, str], Array], *, geographic: bool) -> "RawShapes":
         """The shapes with other coordinates.
 
         Args:

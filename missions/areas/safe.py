@@ -121,7 +121,7 @@ def gis_files(path: Path) -> Iterator[list[Path]]:
                     unpack = _unpacked_kml if suffix == ".kmz" else _unpacked_shapefiles
                     files = unpack(archive, folder)
             else:
-                files = [_linked(path, suffix, folder)]
+                files = [_link(path, suffix, folder)]
             if DRIVERS[suffix] == "KML":
                 root = xml_root_name(read_bytes(files[0]))
                 if root != "kml":
@@ -131,7 +131,7 @@ def gis_files(path: Path) -> Iterator[list[Path]]:
         yield files
 
 
-def _linked(path: Path, suffix: str, folder: Path) -> Path:
+def _link(path: Path, suffix: str, folder: Path) -> Path:
     """A link to a file, and to its side files, after a look at how it begins."""
     start = _STARTS.get(suffix, b"")
     with path.open("rb") as file:

@@ -113,10 +113,10 @@ def survey_area(settings: AreaConfig, *, turn_margin_m: float, margin_m: float =
     raw, allowed_raw, frame = given.survey, given.allowed, given.frame
     shape = _polygons(raw, frame, settings.corridor_width_m)
     clearance_m = settings.no_go_clearance_m
-    zones = [(raw.origin, widened(shape.holes, clearance_m))]
+    zones = [(raw.origin, widen(shape.holes, clearance_m))]
     zones += [(zone.origin, _zone(zone, frame, clearance_m)) for zone in given.no_go]
     no_go = _union([zone for _, zone in zones])
-    wanted = widened(shape.solid, margin_m)
+    wanted = widen(shape.solid, margin_m)
     survey = _less(wanted, no_go)
     if survey.is_empty:
         names = " and ".join(name for name, zone in zones if not zone.is_empty)
@@ -126,7 +126,7 @@ def survey_area(settings: AreaConfig, *, turn_margin_m: float, margin_m: float =
         )
     if allowed_raw is None:
         margin = settings.turn_margin_m if settings.turn_margin_m is not None else turn_margin_m
-        allowed = _less(widened(wanted, margin), no_go)
+        allowed = _less(widen(wanted, margin), no_go)
         if raw.unused_fence:
             warn(f"area: {raw.origin}: {raw.unused_fence}")
     else:
@@ -183,12 +183,12 @@ def _polygons(raw: RawShapes, frame: LocalFrame, corridor_width_m: float) -> Rep
     """The polygons of a source and the corridors along its lines."""
     if raw.is_empty or not (raw.polygons or raw.lines):
         raise PlanError(
-            f"area: {raw.origin}: it holds {_counted(raw)}; an area needs a polygon or a line"
+            f"area: {raw.origin}: it holds {_contents(raw)}; an area needs a polygon or a line"
         )
-    local = frame.localised(raw)
+    local = frame.localise(raw)
     shape = repair(local, frame, geographic=raw.geographic)
     if len(raw.points):
-        warn(f"area: {raw.origin}: {_counted(replace(raw, polygons=(), lines=()))} left out")
+        warn(f"area: {raw.origin}: {_contents(replace(raw, polygons=(), lines=()))} left out")
     if not raw.lines:
         return shape
     widths_m = [line.width_m or corridor_width_m for line in local.lines]
@@ -199,7 +199,7 @@ def _polygons(raw: RawShapes, frame: LocalFrame, corridor_width_m: float) -> Rep
     if raw.polygons:
         widths = " and ".join(f"{width_m:g} m" for width_m in sorted(set(widths_m)))
         warn(
-            f"area: {raw.origin}: it holds {_counted(raw)}: lines become corridors of {widths} "
+            f"area: {raw.origin}: it holds {_contents(raw)}: lines become corridors of {widths} "
             "width next to the polygons"
         )
     solid = _union([shape.solid, *(multipolygon(strip) for strip in strips)])
@@ -208,17 +208,17 @@ def _polygons(raw: RawShapes, frame: LocalFrame, corridor_width_m: float) -> Rep
 
 def _zone(raw: RawShapes, frame: LocalFrame, clearance_m: float) -> MultiPolygon:
     """Where not to be: polygons, lines and points with the clearance around them."""
-    local = frame.localised(raw)
+    local = frame.localise(raw)
     marks: list[BaseGeometry] = [LineString(line.points) for line in local.lines]
     marks += [Point(*point) for point in local.points.tolist()]
     if marks and clearance_m == 0.0:
         raise PlanError(
-            f"area: {raw.origin}: it holds {_counted(raw)}: set no_go_clearance_m, how far to keep "
-            "from lines and points"
+            f"area: {raw.origin}: it holds {_contents(raw)}: set no_go_clearance_m, how far to "
+            "keep from lines and points"
         )
     shape = repair(local, frame, geographic=raw.geographic, overlaps=False)
     around = [multipolygon(mark.buffer(clearance_m)) for mark in marks]
-    return _union([widened(shape.solid, clearance_m), *around])
+    return _union([widen(shape.solid, clearance_m), *around])
 
 
 def _union(shapes: Sequence[MultiPolygon]) -> MultiPolygon:
@@ -238,7 +238,7 @@ def _less(shape: MultiPolygon, taken: MultiPolygon) -> MultiPolygon:
     return without_slivers(multipolygon(shapely.difference(shape, taken, grid_size=GRID_M)))
 
 
-def _counted(raw: RawShapes) -> str:
+def _contents(raw: RawShapes) -> str:
     counts = {"polygon": len(raw.polygons), "line": len(raw.lines), "point": len(raw.points)}
     parts = [f"{n} {what}{'s' if n > 1 else ''}" for what, n in counts.items() if n]
     return " and ".join(parts) or "nothing"
@@ -531,7 +531,7 @@ def buffered_line(points: Array, width_m: float) -> Polygon | MultiPolygon:
     return strip
 
 
-def widened(geometry: MultiPolygon, by_m: float) -> MultiPolygon:
+def widen(geometry: MultiPolygon, by_m: float) -> MultiPolygon:
     """All places within a distance, with sharp corners kept sharp up to `MITRE_LIMIT`."""
     if by_m == 0.0 or geometry.is_empty:
         return geometry

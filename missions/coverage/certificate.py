@@ -157,8 +157,8 @@ class Certificate:
             "fewest_pictures_of_a_camera": self.fewest_pictures,
             "fewest_lines": self.fewest_lines,
             "mean_pictures": self.mean_pictures,
-            "share_by_pictures": {name: _rounded(h) for name, h in self.histograms.items()},
-            "share_by_lines": {name: _rounded(h) for name, h in self.line_histograms.items()},
+            "share_by_pictures": {name: _round_shares(h) for name, h in self.histograms.items()},
+            "share_by_lines": {name: _round_shares(h) for name, h in self.line_histograms.items()},
         }
 
 
@@ -372,5 +372,5 @@ def _histogram(counts: list[NDArray[np.intp]]) -> Array:
     return shares
 
 
-def _rounded(shares: Array) -> list[float]:
+def _round_shares(shares: Array) -> list[float]:
     return [round(share, 6) for share in shares.tolist()]

@@ -106,12 +106,12 @@ def read_dive_record(
     if triggers is not None and manifest is not None:
         raise NavigationError("give triggers or a manifest, not both")
     if log.is_dir():
-        return _simulated(log, plan, rig, triggers)
-    nav = _located(log, read_navigation(log, find_zone("UTC"), ()))
+        return _record_of_flight(log, plan, rig, triggers)
+    nav = _rows_with_positions(log, read_navigation(log, find_zone("UTC"), ()))
     if manifest is not None:
-        return _logged(log, nav, _triggers_of_manifest(manifest, rig), plan, rig)
+        return _record_of(log, nav, _triggers_of_manifest(manifest, rig), plan, rig)
     if triggers is not None:
-        return _logged(log, nav, read_triggers(triggers, nav), plan, rig)
+        return _record_of(log, nav, read_triggers(triggers, nav), plan, rig)
     return record_of_log(log, nav, plan, rig)
 
 
@@ -121,7 +121,7 @@ def read_growing_log(path: Path) -> NavigationLog:
     Raises:
         NavigationError: as `read_dive_record`.
     """
-    return _located(path, read_navigation(path, find_zone("UTC"), (), is_growing=True))
+    return _rows_with_positions(path, read_navigation(path, find_zone("UTC"), (), is_growing=True))
 
 
 def record_of_log(path: Path, nav: NavigationLog, plan: Plan, rig: Rig) -> DiveRecord:
@@ -149,10 +149,10 @@ def record_of_log(path: Path, nav: NavigationLog, plan: Plan, rig: Rig) -> DiveR
         time_s=time_s[time_s < end_s],
         line=None,
     )
-    return _logged(path, nav, when, plan, rig)
+    return _record_of(path, nav, when, plan, rig)
 
 
-def _located(path: Path, nav: NavigationLog) -> NavigationLog:
+def _rows_with_positions(path: Path, nav: NavigationLog) -> NavigationLog:
     """The rows with positions of a log that spans some time.
 
     Raises:
@@ -242,15 +242,15 @@ def _triggers_of_manifest(path: Path, rig: Rig) -> Triggers:
     return Triggers(source=str(path), time_s=np.unique(times), line=None)
 
 
-def _simulated(folder: Path, plan: Plan, rig: Rig, triggers: Path | None) -> DiveRecord:
+def _record_of_flight(folder: Path, plan: Plan, rig: Rig, triggers: Path | None) -> DiveRecord:
     """The true stations of a simulated flight; the altitude is what its DVL measured."""
-    nav = _located(
+    nav = _rows_with_positions(
         folder / "navigation.csv", read_navigation(folder / "navigation.csv", find_zone("UTC"), ())
     )
     when = read_triggers(triggers or folder / "triggers.csv", nav)
     truth = folder / "truth" / "track.csv"
     if not truth.is_file():
-        return _logged(folder / "navigation.csv", nav, when, plan, rig)
+        return _record_of(folder / "navigation.csv", nav, when, plan, rig)
     track = read_track(truth)
     positions, rotation = track.ned_from_body.translation, track.ned_from_body.rotation
     angles = np.rad2deg(rotation.as_euler("ZYX"))[:, ::-1]
@@ -266,10 +266,12 @@ def _simulated(folder: Path, plan: Plan, rig: Rig, triggers: Path | None) -> Div
     true = NavigationLog(
         time_s=track.time_s, columns=columns | {"altitude_m": altitude}, start_utc=nav.start_utc
     )
-    return _logged(truth, true, when, plan, rig)
+    return _record_of(truth, true, when, plan, rig)
 
 
-def _logged(path: Path, nav: NavigationLog, triggers: Triggers, plan: Plan, rig: Rig) -> DiveRecord:
+def _record_of(
+    path: Path, nav: NavigationLog, triggers: Triggers, plan: Plan, rig: Rig
+) -> DiveRecord:
     """Stations of a log at the times of its triggers."""
     at = nav.at(triggers.time_s)
     left_out: dict[str, int] = {}

@@ -28,7 +28,7 @@ from alice_survey.kit.figure import (
 )
 from alice_survey.kit.words import share
 from missions.coverage.certificate import Certificate
-from missions.coverage.geofiles import NO_DATA, sampled
+from missions.coverage.geofiles import NO_DATA, sample_counts
 from missions.coverage.holes import Hole
 from missions.coverage.raster import Grid
 from missions.coverage.stations import Stations
@@ -177,15 +177,15 @@ def _north_up(
 ) -> tuple[Any, tuple[float, float, float, float]]:
     """Counts on a grid with north up, masked outside of the area, and its extent for imshow."""
     places, extent = _pixels(certificate.area, certificate.grid.cell_m)
-    found = sampled(certificate, values, places)
+    found = sample_counts(certificate, values, places)
     return np.ma.masked_equal(found, NO_DATA), extent
 
 
-def _resampled(
+def _resample(
     area: Area, grid: Grid, values: Array
 ) -> tuple[Any, tuple[float, float, float, float]]:
     places, extent = _pixels(area, grid.cell_m)
-    return np.ma.masked_invalid(grid.sampled(values, places, math.nan)), extent
+    return np.ma.masked_invalid(grid.sample(values, places, math.nan)), extent
 
 
 def _pixels(area: Area, cell_m: float) -> tuple[Array, tuple[float, float, float, float]]:

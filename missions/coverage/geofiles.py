@@ -64,7 +64,7 @@ def write_coverage_tif(path: Path, certificate: Certificate) -> None:
                 corners = places_ne(ends[0].astype(np.float64), ends[1].astype(np.float64))
                 places = _between(corners, height, width)
                 for band, (name, _) in enumerate(_BANDS, 1):
-                    values = sampled(certificate, getattr(certificate, name), places)
+                    values = sample_counts(certificate, getattr(certificate, name), places)
                     window = rasterio.windows.Window(column, row, width, height)
                     raster.write(values, band, window=window)
         for band, (_, text) in enumerate(_BANDS, 1):
@@ -89,12 +89,12 @@ def write_outlines(path: Path, datum: Datum, places: Sequence[Outlined]) -> None
         temporary.write_text(text + "\n", encoding="utf-8")
 
 
-def sampled(
+def sample_counts(
     certificate: Certificate, values: NDArray[np.uint16], places_ne: Array
 ) -> NDArray[np.uint16]:
     """Values of the cells that hold places (..., 2); `NO_DATA` outside of the area."""
-    inside = certificate.grid.sampled(certificate.inside, places_ne, False)
-    found = certificate.grid.sampled(values, places_ne, NO_DATA)
+    inside = certificate.grid.sample(certificate.inside, places_ne, False)
+    found = certificate.grid.sample(values, places_ne, NO_DATA)
     return np.where(inside, np.minimum(found, NO_DATA - 1), np.uint16(NO_DATA))
 
 

@@ -63,7 +63,7 @@ class Grid:
         places: Array = np.array(self.origin_ne) + self.cell_m * (cells @ self.axes)
         return places
 
-    def sampled(self, values: NDArray[Any], places_ne: Array, outside: float) -> NDArray[Any]:
+    def sample(self, values: NDArray[Any], places_ne: Array, outside: float) -> NDArray[Any]:
         """Values, (rows, columns), of the cells that hold places (..., 2), or a value outside."""
         cells = np.floor(self.cells_of(places_ne)).astype(np.int64)
         row, column = cells[..., 0], cells[..., 1]

@@ -124,7 +124,7 @@ def at_once(parts: Sequence[Stations]) -> Stations:
     )
 
 
-def joined(first: Stations, second: Stations) -> Stations:
+def join(first: Stations, second: Stations) -> Stations:
     """The stations of two dives, without times; lines of the second count on."""
     after = int(first.line.max(initial=-1)) + 1
     counted_on = np.where(second.line < 0, -1, second.line + after)

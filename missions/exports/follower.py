@@ -17,7 +17,7 @@ from alice_survey.sim.vehicle.pilot.gains import FASTEST, SWAY, Gains, gains_for
 from alice_survey.sim.vehicle.pilot.mission import circling_m, steady_drift, turn_in_m, yaw_rad_s
 from alice_survey.sim.vehicle.pilot.settings import los_loop, min_look_ahead_m
 from missions.coverage.stations import Stations, stations_of_plan
-from missions.route.energy import craft_of
+from missions.route.energy import planned_vehicle
 from missions.values.line import Line
 from missions.values.plan_file import Plan
 
@@ -71,7 +71,7 @@ def follower_of(vehicle: VehicleConfig, sea: SeaConfig, speed_mps: float) -> Fol
     Raises:
         VehicleError: no vehicle that is controllable is described.
     """
-    craft = craft_of(vehicle)
+    craft = planned_vehicle(vehicle)
     gains = gains_for(craft, speed_mps)
     towards = math.radians(sea.current_towards_deg)
     delta_m = cola2_delta_m(gains, speed_mps)

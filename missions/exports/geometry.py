@@ -54,7 +54,7 @@ def line_depths_m(plan: Plan, index: int) -> tuple[float, ...]:
     return (plan.seafloor_depth_m - plan.altitude_m,) * plan.lines[index].stations
 
 
-def grown(geometry: MultiPolygon, by_m: float) -> list[Polygon]:
+def grow(geometry: MultiPolygon, by_m: float) -> list[Polygon]:
     """The parts of a geometry grown by a distance, sharp corners kept; shrunk where negative."""
     parts: list[Polygon] = [
         part

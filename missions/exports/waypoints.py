@@ -87,7 +87,7 @@ def waypoints(
     depths = line_depths(plan)
     if not dive.route.legs:
         raise PlanError("a dive has no legs: plan again")
-    points = _switched(list(_points(plan, dive, turn_rate_rad_s, depths)))
+    points = _switch_camera(list(_points(plan, dive, turn_rate_rad_s, depths)))
     points = _with_depths(points, plan, depths)
     glass_ne = np.array([point.place_ne_m for point in points])
     headings = np.array([point.heading_rad for point in points])
@@ -229,7 +229,7 @@ def _leads_to_line(leg: Leg, following: Leg | None) -> bool:
     return abs(math.remainder(leg.heading_rad - following.heading_rad, 2 * math.pi)) < _STRAIGHT_RAD
 
 
-def _switched(points: list[_Point]) -> list[_Point]:
+def _switch_camera(points: list[_Point]) -> list[_Point]:
     """Way-points with the camera on where a line begins and off where it ends."""
     result = list(points)
     for i, point in enumerate(points):
@@ -302,7 +302,7 @@ def gone_on(plan: Plan, point: Waypoint, tolerance_m: float) -> Waypoint:
     line = plan.lines[point.line]
     ahead = np.array([math.cos(line.heading_rad), math.sin(line.heading_rad)])
     by_m = tolerance_m + plan.station_spacing_m
-    return moved(plan, point, room_m(plan, np.array(line.end_ne_m), by_m * ahead) * ahead)
+    return move(plan, point, room_m(plan, np.array(line.end_ne_m), by_m * ahead) * ahead)
 
 
 def room_m(plan: Plan, place_ne: Array, way_ne: Array) -> float:
@@ -313,7 +313,7 @@ def room_m(plan: Plan, place_ne: Array, way_ne: Array) -> float:
     return min(way.length, max((float(part.length) for part in parts), default=0.0))
 
 
-def moved(plan: Plan, point: Waypoint, by_ne: Array) -> Waypoint:
+def move(plan: Plan, point: Waypoint, by_ne: Array) -> Waypoint:
     """A way-point of the reference point at another place."""
     vehicle_ne = np.array(point.vehicle_ne_m) + by_ne
     place = np.array([[*vehicle_ne, point.depth_m]])

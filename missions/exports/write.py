@@ -146,8 +146,8 @@ def export_report(
     tolerance_m = line_tolerance_m(plan, rig)
     text = "\n".join(
         [
-            f"{folder}: {counted(len(files), 'file')} of {counted(plan.stations, 'station')} in "
-            f"{counted(len(plan.dives), 'dive')}, tolerance {tolerance_m:.3f} m",
+            f"{folder}: {count_text(len(files), 'file')} of {count_text(plan.stations, 'station')} "
+            f"in {count_text(len(plan.dives), 'dive')}, tolerance {tolerance_m:.3f} m",
             *(f"  {file.name:<24}{file.stat().st_size / 1000:>9.1f} kB" for file in files),
         ]
     )
@@ -159,7 +159,7 @@ def export_report(
     return text, about
 
 
-def counted(number: int, what: str) -> str:
+def count_text(number: int, what: str) -> str:
     """A number of things, in the singular where it is one."""
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
@@ -170,8 +170,8 @@ def _write_about(
     """What the files are, of which point of the vehicle, and what to set on it."""
     plan, options = export.plan, export.options
     text = [
-        f"{plan.name}: plan of {counted(len(plan.lines), 'line')}, "
-        f"{counted(plan.stations, 'station')}, {counted(len(plan.dives), 'dive')}",
+        f"{plan.name}: plan of {count_text(len(plan.lines), 'line')}, "
+        f"{count_text(plan.stations, 'station')}, {count_text(len(plan.dives), 'dive')}",
         "",
         f"Missions (.xml, .plan, .waypoints): {export.mount.about}",
         "Maps and tables (.kml, .gpx, .geojson, .csv): places are of the left port's glass; "

@@ -18,7 +18,7 @@ from missions.coverage.dive_record import DiveRecord, read_dive_record
 from missions.coverage.geofiles import write_coverage_tif, write_outlines
 from missions.coverage.holes import Hole, find_holes
 from missions.coverage.stations import plan_pattern, stations_of_plan
-from missions.exports.write import counted
+from missions.exports.write import count_text
 from missions.fly.refly import holes_plan, write_refly
 from missions.plan.strength import survey_costs
 from missions.values.plan_file import Plan, read_plan
@@ -86,8 +86,8 @@ def check_log(
     )
     if flown.blind:
         warn(
-            f"{counted(flown.blind, 'station')} without the sea floor in view: counted as seeing "
-            "nothing"
+            f"{count_text(flown.blind, 'station')} without the sea floor in view: counted as "
+            "seeing nothing"
         )
     return Check(
         plan=plan, rig=rig, record=record, planned=planned, flown=flown, holes=find_holes(flown)
@@ -206,7 +206,7 @@ def _write(folder: Path, check: Check, data: dict[str, Any]) -> None:
 def _check_text(check: Check) -> str:
     record, planned, flown = check.record, check.planned, check.flown
     pattern, triggered = flown.pattern, record.triggered
-    overlap = f"{counted(pattern.passes, 'line')}, {pattern.passes * pattern.pictures} pictures"
+    overlap = f"{count_text(pattern.passes, 'line')}, {pattern.passes * pattern.pictures} pictures"
     altitude = record.stations.altitude_m
     above = f", {altitude.min():.2f} to {altitude.max():.2f} m above it" if len(altitude) else ""
     lines = [
@@ -249,7 +249,7 @@ def _hole_rows(holes: Sequence[Hole]) -> list[str]:
     whole = sum(hole.area_m2 for hole in holes)
     unseen = sum(hole.unseen_m2 for hole in holes)
     rows = [
-        f"{counted(len(holes), 'hole')}, {whole:.2f} m2 short of that overlap, of which "
+        f"{count_text(len(holes), 'hole')}, {whole:.2f} m2 short of that overlap, of which "
         f"{unseen:.2f} m2 in no picture; worst first:",
         text_table(
             ("", "area m2", "unseen m2", "size m", "latitude", "longitude", "north m", "east m"),

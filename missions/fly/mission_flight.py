@@ -32,7 +32,7 @@ from missions.fly.simulation import (
     max_mission_s,
     mission_setup,
 )
-from missions.route.energy import sound_craft_of
+from missions.route.energy import sound_vehicle
 from missions.values.flight import Flight
 from missions.values.mission import Mission
 from missions.values.plan_file import Plan
@@ -165,7 +165,7 @@ def _mount(camera: CameraConfig) -> CameraMount:
 
 
 def _sways(vehicle: VehicleConfig, speed_mps: float) -> bool:
-    return sways(gains_for(sound_craft_of(vehicle), speed_mps))
+    return sways(gains_for(sound_vehicle(vehicle), speed_mps))
 
 
 def pilot_mission(
@@ -183,7 +183,7 @@ def pilot_mission(
             lacks.
     """
     mission, plan = known.mission, known.plan
-    gains = gains_for(sound_craft_of(vehicle), plan.speed_mps)
+    gains = gains_for(sound_vehicle(vehicle), plan.speed_mps)
     steps = _rows(known, mount)
     if mission.autopilot == "ardusub":
         if not sways(gains):

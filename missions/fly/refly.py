@@ -20,11 +20,11 @@ from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.holes import Hole
 from missions.coverage.stations import stations_of_plan
 from missions.exports.options import options_of
-from missions.exports.write import counted, write_exports
+from missions.exports.write import count_text, write_exports
 from missions.lines.fill import lines_over
-from missions.lines.lay import ordered
+from missions.lines.lay import order_lines
 from missions.route.dives import split_dives
-from missions.route.energy import craft_of, usable_wh
+from missions.route.energy import planned_vehicle, usable_wh
 from missions.route.flyable import without_stops
 from missions.route.turns import Manoeuvre
 from missions.route.ways import Ways
@@ -78,7 +78,7 @@ def refly_plan(
     ]
     seen = pieces if pieces.area else shapely.union_all(swaths).intersection(plan.area.survey)
     ways = Ways(plan.area.allowed)
-    lines = ordered(lines, ways, costs, plan.home_ne_m)
+    lines = order_lines(lines, ways, costs, plan.home_ne_m)
     dives = split_dives(
         lines,
         Manoeuvre(costs, plan.turn_radius_m, plan.run_in_m, settings.turns, ways),
@@ -120,7 +120,7 @@ def holes_plan(
         seen.pattern,
         name=f"{plan.name} holes",
         costs=costs,
-        settings=without_stops(config.plan, craft_of(config.vehicle)),
+        settings=without_stops(config.plan, planned_vehicle(config.vehicle)),
         usable_wh=usable_wh(config.vehicle),
     )
 
@@ -214,9 +214,9 @@ def write_refly(
 
     run_stage(folder, stage, work)
     words = (
-        f"{counted(len(plan.lines), 'line')}, {counted(plan.stations, 'station')}, "
+        f"{count_text(len(plan.lines), 'line')}, {count_text(plan.stations, 'station')}, "
         f"{plan.length_m:.0f} m, {plan.duration_s / 60:.0f} min in "
-        f"{counted(len(plan.dives), 'dive')}"
+        f"{count_text(len(plan.dives), 'dive')}"
     )
     return words, {
         "folder": str(folder),

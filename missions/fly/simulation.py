@@ -52,7 +52,7 @@ from alice_survey.sim.vehicle.sea import (
 from alice_survey.sim.vehicle.simulator import Failure, Flown, Setup, simulate
 from alice_survey.sim.vehicle.vehicle import Vehicle
 from missions.fly.flight_route import path_of, room_behind_m, roomier_side, turns_in_place
-from missions.route.energy import sound_craft_of
+from missions.route.energy import sound_vehicle
 from missions.values.flight import Flight, trigger_times
 from missions.values.navigation import BelievedNavigation
 from missions.values.plan_file import Plan
@@ -183,7 +183,7 @@ def piloting_of(
     Raises:
         VehicleError: a setting does not fit the vehicle, or it cannot fly the plan's sway steps.
     """
-    vehicle = sound_craft_of(settings.vehicle)
+    vehicle = sound_vehicle(settings.vehicle)
     diverging_mps = math.inf if vehicle.fins else pitch_divergence_speed_mps(vehicle)
     if plan.speed_mps > _PITCH_MARGIN * diverging_mps:
         warn(

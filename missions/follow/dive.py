@@ -38,7 +38,7 @@ from missions.coverage.stations import (
     stations_of_lines,
     stations_of_plan,
 )
-from missions.exports.write import counted
+from missions.exports.write import count_text
 from missions.fly.check import rig_of
 from missions.fly.refly import holes_plan, write_refly
 from missions.logs.navigation_csv import READINGS, NavigationLog
@@ -283,7 +283,7 @@ class FollowedDive:
     def _look(self, wall_s: float, warnings: list[str]) -> DiveView:
         nav = read_growing_log(self.log)
         if self.replay is not None:
-            nav = self._replayed(nav, wall_s, self.replay)
+            nav = self._rows_to_replay(nav, wall_s, self.replay)
         self._patience_s = nav.max_gap_s + _MIN_UPDATE_S + _SILENT_S
         plan = self.plan
         record = record_of_log(self.log, nav, plan, self.rig)
@@ -311,7 +311,7 @@ class FollowedDive:
             warnings=tuple(warnings),
         )
 
-    def _replayed(self, nav: NavigationLog, wall_s: float, pace: float) -> NavigationLog:
+    def _rows_to_replay(self, nav: NavigationLog, wall_s: float, pace: float) -> NavigationLog:
         if self._replay_start_s is None:
             self._replay_start_s = wall_s
         until_s = nav.time_s[0] + pace * (wall_s - self._replay_start_s)
@@ -376,7 +376,7 @@ class FollowedDive:
             bits = SEEN * (seen.pictures > 0) + STEREO * (seen.pairs > 0)
             bits = bits + AT_OVERLAP * seen.at_overlap
             classes = np.where(seen.inside, bits.astype(np.uint8), np.uint8(OUTSIDE))
-        return grid.sampled(classes, self._frame[0], OUTSIDE)
+        return grid.sample(classes, self._frame[0], OUTSIDE)
 
     def snapshot(self, wall_s: float | None = None) -> dict[str, Any]:
         """All figures as JSON values; numbers that are not finite are None."""
@@ -584,7 +584,7 @@ def state_text(state: dict[str, Any]) -> str:
         rows.append(f"  {state['fault']}")
     if proposal is not None:
         rows.append(
-            f"  to fly the holes again: {counted(len(proposal['lines']), 'line')}, "
+            f"  to fly the holes again: {count_text(len(proposal['lines']), 'line')}, "
             f"{_minutes(proposal['time_s'])} and {proposal['energy_wh']:.1f} Wh from home to home; "
             f"then {share(proposal['holes_share'], 1)} of them are at that overlap"
         )

@@ -21,7 +21,7 @@ from shapely.geometry import MultiPolygon
 
 from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
-from missions.lines.rows import Site, rooms, stretches, to_uv, united
+from missions.lines.rows import Site, rooms, stretches, to_uv, unite
 from missions.route.ways import edges_of
 from missions.values.area import Area
 from missions.values.line import Line
@@ -154,10 +154,10 @@ def _offer(
 ) -> None:
     """Queue the best line for a cluster, if there is any."""
     best_score, best = 0.0, np.empty(0)
-    places = _turned(patches[:, [U, V]], -heading_rad)
+    places = _turn(patches[:, [U, V]], -heading_rad)
     for course in courses.tolist():
         local = np.concatenate(
-            [_turned(places, course), (patches[:, LENGTH] * patches[:, WIDTH])[:, None]], axis=1
+            [_turn(places, course), (patches[:, LENGTH] * patches[:, WIDTH])[:, None]], axis=1
         )
         reach = _patch_reach(patches, heading_rad - course)
         score, offset, begin, end, steps = _best_line(
@@ -173,7 +173,7 @@ def _offer(
             max(1, pattern.pictures - 1),
         )
         if score > best_score:
-            ends = _turned(np.array([[begin, offset], [end, offset]]), -course).ravel()
+            ends = _turn(np.array([[begin, offset], [end, offset]]), -course).ravel()
             best_score, best = score, np.array([*ends, course, steps])
     if best_score > 0.0:
         heapq.heappush(queue, (-best_score, number, best))
@@ -194,7 +194,7 @@ def _patch_reach(patches: Array, turn_rad: float) -> Array:
     return np.array([float((c * length + s * width).max()), float((s * length + c * width).max())])
 
 
-def _turned(points: Array, heading_rad: float) -> Array:
+def _turn(points: Array, heading_rad: float) -> Array:
     """Points (N, 2) in the frame of lines of a heading."""
     c, s = math.cos(heading_rad), math.sin(heading_rad)
     result: Array = points @ np.array([[c, -s], [s, c]])
@@ -203,13 +203,13 @@ def _turned(points: Array, heading_rad: float) -> Array:
 
 def _line_uv(line: Array, heading_rad: float) -> Array:
     """Ends of a line, (4,), in the frame of lines of a heading, and its steps, (5,)."""
-    return np.append(_turned(line[:4].reshape(2, 2), heading_rad).ravel(), line[5])
+    return np.append(_turn(line[:4].reshape(2, 2), heading_rad).ravel(), line[5])
 
 
 def _seen_by(patches: Array, line: Array, pattern: Pattern) -> NDArray[np.int64]:
     """How many pictures of a line see patches, (N,): all of their width, and both their ends."""
     ahead = math.atan2(line[3] - line[1], line[2] - line[0])
-    local = _turned(patches[:, [U, V]] - line[:2], ahead)
+    local = _turn(patches[:, [U, V]] - line[:2], ahead)
     length = math.hypot(line[2] - line[0], line[3] - line[1])
     c, s = abs(math.cos(ahead)), abs(math.sin(ahead))
     along = (c * patches[:, LENGTH] + s * patches[:, WIDTH]) / 2
@@ -509,7 +509,7 @@ def _patches(
         for k in range(count):
             windows[k, 0] = cuts[cut_firsts[row_0] + k, 1] - half_along
             windows[k, 1] = cuts[cut_firsts[row_0] + k, 2] + half_along
-        count = united(windows, 0, count)
+        count = unite(windows, 0, count)
         k = 0
         for j in range(starts[i], starts[i + 1]):
             while k < count and windows[k, 1] <= inside[j, 0]:

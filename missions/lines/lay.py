@@ -92,7 +92,7 @@ def lay_lines(
     """
     note_planner()
     check_size(area, pattern, max_stations)
-    result = laid(
+    result = lay_pattern(
         Site.of(area),
         heading_rad,
         pattern,
@@ -108,7 +108,7 @@ def lay_lines(
     return result.lines()
 
 
-def ordered(
+def order_lines(
     lines: Sequence[Line], ways: Ways, costs: Costs, home_ne: tuple[float, float]
 ) -> list[Line]:
     """Any lines in the order, and each in the direction, that costs least.
@@ -148,7 +148,7 @@ def check_size(area: Area, pattern: Pattern, max_stations: int = MAX_STATIONS) -
         raise _too_many(area, pattern, stations, max_stations)
 
 
-def laid(
+def lay_pattern(
     site: Site,
     heading_rad: float,
     pattern: Pattern,
@@ -172,7 +172,7 @@ def laid(
         )
     ends = _ends_ne(pieces, offsets, heading_rad)
     follower = cells.followers(pieces)
-    follower, links_m = _linked(ends, follower, ways, pattern.spacing_m)
+    follower, links_m = _link(ends, follower, ways, pattern.spacing_m)
     begins, listed = cells.chains(follower)
     corners, exits = cells.cell_corners(begins, listed, ends, heading_rad)
     inner = cells.cell_costs(costs, begins, listed, ends, heading_rad, links_m)
@@ -207,7 +207,7 @@ def laid(
         kinds = np.append(kinds, CLOSING)
     fills = cuts[:0] if quick else fill_table(site, heading_rad, pattern, pieces, offsets, cuts)
     if len(fills):
-        table, steps, kinds = _inserted(fills, table, steps, kinds, home, ways, costs)
+        table, steps, kinds = _insert(fills, table, steps, kinds, home, ways, costs)
     leave, enter = stops(table, home)
     energy_j = hops.flight_j(costs, leave, enter, _connected_m(leave, enter, ways))
     return Laid(table=table, steps=steps, kinds=kinds, energy_j=energy_j)
@@ -265,7 +265,7 @@ def _ends_ne(pieces: Array, offsets: Array, heading_rad: float) -> Array:
     return turned
 
 
-def _linked(
+def _link(
     ends: Array, follower: NDArray[np.int64], ways: Ways, spacing_m: float
 ) -> tuple[NDArray[np.int64], Array]:
     """Ways between pieces and their followers; cells are cut where they go far round.
@@ -401,7 +401,7 @@ def _table(ends: Array, flown: NDArray[np.int64], heading_rad: float, survey_cou
     return np.concatenate([places, (course + np.where(back, math.pi, 0.0))[:, None]], axis=1)
 
 
-def _inserted(
+def _insert(
     fills: Array,
     table: Array,
     steps: NDArray[np.int64],

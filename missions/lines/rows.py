@@ -104,7 +104,7 @@ def sort_pairs(pairs: Array, first: int, last: int) -> None:
 
 
 @compiled
-def united(pairs: Array, first: int, last: int) -> int:
+def unite(pairs: Array, first: int, last: int) -> int:
     """Unite intervals in rows first to last - 1 of (N, 2), in place; returns how many are left."""
     if last <= first:
         return 0
@@ -218,7 +218,7 @@ def reaches(
             filled[i] += 1
     counts = np.zeros(count, np.int64)
     for i in range(count):
-        counts[i] = united(found, begins[i], begins[i + 1])
+        counts[i] = unite(found, begins[i], begins[i + 1])
     return begins, counts, found
 
 
@@ -247,7 +247,7 @@ def rooms(edges: Array, offsets: Array) -> tuple[NDArray[np.int64], NDArray[np.i
         for j in range(right_starts[i], right_starts[i + 1]):
             found[k] = right[j]
             k += 1
-        counts[i] = united(found, begins[i], begins[i + 1])
+        counts[i] = unite(found, begins[i], begins[i + 1])
     return begins, counts, found
 
 
@@ -298,7 +298,7 @@ def lay_rows(
             if begin > end:
                 begin = end = (begin + end) / 2
             reach[k, 0], reach[k, 1] = begin, end
-        wished = united(reach, first_wish, last_wish)
+        wished = unite(reach, first_wish, last_wish)
         k = first_wish
         for r in range(room_begins[i], room_begins[i] + room_counts[i]):
             room_begin, room_end = room[r, 0], room[r, 1]

@@ -28,7 +28,7 @@ from alice_survey.core.executor import progress
 from alice_survey.core.frames import Array
 from alice_survey.core.run.progress import step
 from missions.lines import cells, hops, rows
-from missions.lines.lay import check_size, laid, note_planner, survey_pieces
+from missions.lines.lay import check_size, lay_pattern, note_planner, survey_pieces
 from missions.lines.rows import Site
 from missions.route.ways import Ways
 from missions.values.area import Area
@@ -109,7 +109,7 @@ def best_heading(
             if heading in costs_j:
                 continue
             try:
-                costs_j[heading] = laid(
+                costs_j[heading] = lay_pattern(
                     site,
                     heading,
                     pattern,

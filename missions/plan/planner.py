@@ -39,7 +39,7 @@ from missions.plan.strength import (
     survey_costs,
     warn_of_swell,
 )
-from missions.route.energy import flight_conditions, sound_craft_of, usable_wh
+from missions.route.energy import flight_conditions, sound_vehicle, usable_wh
 from missions.route.flyable import as_flown, without_stops
 from missions.route.terrain import (
     Reach,
@@ -108,7 +108,7 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
         area, bathymetry, depth_m = _site(config.area, plan, pattern, imaging)
         below_m = depth_m - plan.altitude_m
         _warn_of_spacing(plan, imaging, stereo)
-        vehicle, glass_body_m = sound_craft_of(config.vehicle), config.camera.position_body_m
+        vehicle, glass_body_m = sound_vehicle(config.vehicle), config.camera.position_body_m
         hull, clearance_m = vehicle.hull, config.area.no_go_clearance_m
         _warn_of_hull(vehicle.name, area, clearance_m, hull, glass_body_m)
         home = _home(plan.home_ne_m, area)

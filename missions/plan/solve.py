@@ -18,7 +18,7 @@ from missions.exposure.footprints import altitude_for_pixel_m, pixel_on_floor_m
 from missions.exposure.light import darkness
 from missions.exposure.settings import ImagingSettings, ImagingSetup, imaging_settings
 from missions.plan.strength import survey_costs
-from missions.route.energy import craft_of, usable_wh
+from missions.route.energy import planned_vehicle, usable_wh
 from missions.route.flyable import as_flown, without_stops
 from missions.values.costs import time_costs
 from missions.values.footprint import footprint_size_m, overlap
@@ -271,7 +271,10 @@ def area_for_dive(config: SurveyConfig, dive_s: float) -> DiveArea:
         PlanError: the dive or the battery is too short for one line of one picture's length.
     """
     config = as_flown(config)
-    setup, plan = ImagingSetup.of(config), without_stops(config.plan, craft_of(config.vehicle))
+    setup, plan = (
+        ImagingSetup.of(config),
+        without_stops(config.plan, planned_vehicle(config.vehicle)),
+    )
     settings = imaging_settings(setup.rig, setup, quiet=True)
     flying = survey_costs(config, imaging_w=settings.imaging_w)
     depth_m, spacing = config.area.seafloor_depth_m - plan.altitude_m, settings.line_spacing_m

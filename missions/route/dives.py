@@ -115,7 +115,7 @@ def split_dives(
     if parted is None:
         raise PlanError(_line_too_long(lines, sums, limits, depth_m))
     if tied:
-        parted = _tied(lines, sums, limits, parted)
+        parted = _tie(lines, sums, limits, parted)
     dives = []
     for first, last in parted:
         legs = routed(first, last)
@@ -124,7 +124,7 @@ def split_dives(
     return tuple(dives)
 
 
-def _tied(
+def _tie(
     lines: Sequence[Line], sums: _Sums, limits: DiveLimits, parted: list[tuple[int, int]]
 ) -> list[tuple[int, int]]:
     """Dives that share a line each, or those given where these would be more or dear."""
@@ -209,7 +209,7 @@ def _min_dives(
     count = sums.until.shape[1]
     may_begin = np.ones(count + 1, dtype=np.bool_)
     may_begin[list(not_at)] = False
-    begins, dives = _parted(
+    begins, dives = _part(
         sums.home_to, sums.until, sums.through, sums.back, may_begin[:count], overlap,
         limits.energy_j, limits.time_s,
     )  # fmt: skip
@@ -224,7 +224,7 @@ def _min_dives(
 
 
 @compiled_ieee
-def _parted(
+def _part(
     home_to: Array,
     until: Array,
     through: Array,
@@ -291,7 +291,7 @@ def _line_too_long(lines: Sequence[Line], sums: _Sums, limits: DiveLimits, depth
     return (
         f"line {worst}, {line.length_m:.0f} m long, takes {_numbers(energy, time)} by itself, with "
         f"the way from home and back and {depth_m:.0f} m down and up, but a dive has "
-        f"{_allowed(limits)}"
+        f"{_allowance(limits)}"
         + (f" ({len(over)} lines are too long)" if len(over) > 1 else "")
         + f": it needs {', or '.join(ways)}"
     )
@@ -301,7 +301,7 @@ def _numbers(energy_j: float, time_s: float) -> str:
     return f"{_wh(energy_j)} and {time_s / 3600.0:.2f} h"
 
 
-def _allowed(limits: DiveLimits) -> str:
+def _allowance(limits: DiveLimits) -> str:
     longest = f" and {limits.time_s / 3600.0:.2f} h" if math.isfinite(limits.time_s) else ""
     return f"{_wh(limits.energy_j)}{longest}"
 

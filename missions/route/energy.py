@@ -84,9 +84,9 @@ class FlightConditions:
         """The same conditions for another vehicle or controller.
 
         Raises:
-            VehicleError: as `sound_craft_of`.
+            VehicleError: as `sound_vehicle`.
         """
-        craft = craft_of(settings)
+        craft = planned_vehicle(settings)
         return replace(
             self, craft=craft, manner=_manner(craft, settings), hotel_w=hotel_w(settings)
         )
@@ -99,7 +99,7 @@ def flight_conditions(config: SurveyConfig) -> FlightConditions:
         VehicleError: the vehicle is described wrongly.
         NavigationError: the file of the current cannot be read.
     """
-    craft, plan = craft_of(config.vehicle), config.plan
+    craft, plan = planned_vehicle(config.vehicle), config.plan
     return FlightConditions(
         craft=craft,
         manner=_manner(craft, config.vehicle),
@@ -151,7 +151,7 @@ def vehicle_costs(
     craft, current = conditions.craft, conditions.current_ne_mps
     courses = _courses()
     lines, between = course_powers(conditions)
-    stop_w, turn_rad_s = _spot(conditions)
+    stop_w, turn_rad_s = _stop_power(conditions)
     if not np.any(_both_ways(lines)) or not math.isfinite(stop_w):
         raise refused("")
     asked_deg = conditions.line_heading_deg
@@ -222,7 +222,7 @@ def battery_wh(settings: VehicleConfig) -> float:
     Raises:
         VehicleError: neither the settings nor the vehicle state it.
     """
-    return _stated("battery_wh", settings)
+    return _own_value("battery_wh", settings)
 
 
 def hotel_w(settings: VehicleConfig) -> float:
@@ -231,14 +231,14 @@ def hotel_w(settings: VehicleConfig) -> float:
     Raises:
         VehicleError: neither the settings nor the vehicle state it.
     """
-    return _stated("hotel_w", settings)
+    return _own_value("hotel_w", settings)
 
 
-def _stated(field: str, settings: VehicleConfig) -> float:
+def _own_value(field: str, settings: VehicleConfig) -> float:
     if field in settings.model_fields_set:
         stated: float = getattr(settings, field)
         return stated
-    own: float | None = getattr(sound_craft_of(settings), field)
+    own: float | None = getattr(sound_vehicle(settings), field)
     if own is None:
         raise VehicleError(f"{settings.name}: states no {field}: add it, or set vehicle.{field}")
     return own
@@ -249,7 +249,7 @@ def usable_wh(settings: VehicleConfig) -> float:
     return battery_wh(settings) * (1.0 - settings.battery_reserve)
 
 
-def sound_craft_of(settings: VehicleConfig) -> Vehicle:
+def sound_vehicle(settings: VehicleConfig) -> Vehicle:
     """The vehicle of a survey with all its thrust, a named set of coefficients or those of a file.
 
     Raises:
@@ -261,13 +261,13 @@ def sound_craft_of(settings: VehicleConfig) -> Vehicle:
     return vehicle_to_fly(settings.name).with_coefficients(coefficients_from_file(file))
 
 
-def craft_of(settings: VehicleConfig) -> Vehicle:
+def planned_vehicle(settings: VehicleConfig) -> Vehicle:
     """The vehicle that a plan counts on: without the thrust that is known to be lost.
 
     Raises:
-        VehicleError: as `sound_craft_of`.
+        VehicleError: as `sound_vehicle`.
     """
-    craft = sound_craft_of(settings)
+    craft = sound_vehicle(settings)
     left = craft.weaken(settings.impaired)
     if not left.thrusters:
         raise VehicleError(f"{craft.name} has no thruster left: check vehicle.failures")
@@ -407,7 +407,7 @@ def _turning_power(conditions: FlightConditions, speeds_mps: Array, rates_rad_s:
     return means
 
 
-def _spot(conditions: FlightConditions) -> tuple[float, float]:
+def _stop_power(conditions: FlightConditions) -> tuple[float, float]:
     """Power on the spot, of turning through a quarter and settling; and the rate of turning.
 
     A vehicle that fins steer cannot: it costs so much that a plan has it for want of room alone,
@@ -508,4 +508,4 @@ def flies_everywhere(conditions: FlightConditions) -> bool:
         return False
     if conditions.needs_arcs and not math.isfinite(_arc(conditions)[0]):
         return False
-    return math.isfinite(_spot(conditions)[0])
+    return math.isfinite(_stop_power(conditions)[0])

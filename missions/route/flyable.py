@@ -7,7 +7,7 @@ from alice_survey.core.errors import PlanError
 from alice_survey.sim.vehicle.pilot.gains import STEADY_SHARE
 from alice_survey.sim.vehicle.steady import fin_flight, min_radius_m
 from alice_survey.sim.vehicle.vehicle import Vehicle
-from missions.route.energy import craft_of
+from missions.route.energy import planned_vehicle
 
 _ROOM = 1.25
 """Radius of turns over the tightest that fins hold (inferred): room to come back to the path."""
@@ -19,7 +19,7 @@ def as_flown(config: SurveyConfig) -> SurveyConfig:
     Raises:
         PlanError: turns are set that it cannot fly.
     """
-    plan = plan_as_flown(config.plan, craft_of(config.vehicle))
+    plan = plan_as_flown(config.plan, planned_vehicle(config.vehicle))
     return config if plan is config.plan else config.model_copy(update={"plan": plan})
 
 

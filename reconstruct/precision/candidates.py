@@ -161,7 +161,7 @@ def single_measures(base: Candidate) -> list[Candidate]:
         base: the survey as set.
     """
     wanted = [level for levels in _levels(base.config.plan) for level in levels]
-    found = [one for level in wanted if (one := _changed(base, [level])) is not None]
+    found = [one for level in wanted if (one := _change(base, [level])) is not None]
     return sorted(found, key=lambda one: -gain_per_minute(base, one))
 
 
@@ -191,7 +191,7 @@ def sets_of_measures(base: Candidate) -> Iterator[Candidate]:
         one
         for chosen in itertools.product(*kinds)
         if (levels := [level for level in chosen if level is not None])
-        and (one := _changed(base, levels)) is not None
+        and (one := _change(base, levels)) is not None
     ]
     yield from sorted(made, key=lambda one: one.minutes)
 
@@ -243,7 +243,7 @@ def _levels(plan: PlanConfig) -> Iterator[Sequence[_PlanChange]]:
     ]
 
 
-def _changed(base: Candidate, levels: Sequence[_PlanChange]) -> Candidate | None:
+def _change(base: Candidate, levels: Sequence[_PlanChange]) -> Candidate | None:
     """The survey planned with some measures; None where no plan meets them."""
     update = {level.setting: level.value for level in levels}
     plan = base.config.plan.model_copy(update=update)

@@ -101,7 +101,7 @@ def predict(
         OnePart(linear=bare, stations=[np.arange(len(state.centres))]), block.pixels,
         state.centres, state.points, motions, scale_free=len(rig.cameras) < 2,
     )  # fmt: skip
-    joint, middle = _placed(block, shape, navigation, control, control_sigma_m)
+    joint, middle = _place(block, shape, navigation, control, control_sigma_m)
     return _precision(block, shape, joint, middle)
 
 
@@ -116,7 +116,7 @@ def _calibration(
     return motions_of(found, block.state.points, inverse_of(found.information))
 
 
-def _placed(
+def _place(
     block: ExpectedBlock,
     shape: BlockShape,
     navigation: NavigationErrors,

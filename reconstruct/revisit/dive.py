@@ -13,7 +13,7 @@ from alice_survey.core.block_solver import Flags
 from alice_survey.core.config import PlanConfig
 from alice_survey.core.frames import Array
 from missions.coverage.certificate import certificate
-from missions.coverage.stations import Stations, joined, stations_of_lines, stations_of_plan
+from missions.coverage.stations import Stations, join, stations_of_lines, stations_of_plan
 from missions.fly.refly import refly_plan
 from missions.plan.strength import survey_costs
 from missions.values.area import multipolygon
@@ -140,7 +140,7 @@ def predict(found: Found, again: Plan) -> tuple[tuple[Prediction, ...], Flags]:
     """
     new = stations_of_plan(again)
     old = found.pictured.good
-    both = joined(old, new)
+    both = join(old, new)
     grid = found.seen.grid
     after = certificate(found.plan.area, found.rig, both, found.pattern, cell_m=grid.cell_m)
     alone = certificate(found.plan.area, found.rig, new, found.pattern, cell_m=grid.cell_m)

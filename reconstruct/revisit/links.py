@@ -74,7 +74,7 @@ def pieces(linked: sp.csr_array, minimum: float) -> Indices:
     while first < nodes.shape[0]:
         heavy = nodes.multiply(nodes >= minimum)
         label = _by_first(connected_components(heavy, directed=False)[1])
-        piece, nodes = label[piece], _merged(nodes, label)
+        piece, nodes = label[piece], _merge(nodes, label)
         other = _firmly_linked(nodes, first, minimum)
         if other is None:  # nodes before `first` stand apart from all others, and keep their place
             first += 1
@@ -82,7 +82,7 @@ def pieces(linked: sp.csr_array, minimum: float) -> Indices:
             label = np.arange(nodes.shape[0])
             label[other] = first
             label = _by_first(label)
-            piece, nodes = label[piece], _merged(nodes, label)
+            piece, nodes = label[piece], _merge(nodes, label)
     sizes = np.bincount(piece)
     rank = np.empty(len(sizes), np.int64)
     rank[np.argsort(-sizes, kind="stable")] = np.arange(len(sizes))
@@ -115,7 +115,7 @@ def _by_first(label: NDArray[Any]) -> Indices:
     return np.asarray(rank[of])
 
 
-def _merged(nodes: sp.csr_array, label: Indices) -> sp.csr_array:
+def _merge(nodes: sp.csr_array, label: Indices) -> sp.csr_array:
     count = int(label.max(initial=-1)) + 1
     gather = sp.csr_array((np.ones(len(label)), (label, np.arange(len(label)))),
                           shape=(count, len(label)))  # fmt: skip

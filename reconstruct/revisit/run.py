@@ -18,11 +18,11 @@ from missions.coverage.drawing import (
     number_place,
 )
 from missions.coverage.geofiles import write_outlines
-from missions.exports.write import counted
+from missions.exports.write import count_text
 from missions.fly.check import rig_of
 from missions.fly.refly import write_refly
 from missions.plan.strength import survey_costs
-from missions.route.energy import craft_of, usable_wh
+from missions.route.energy import planned_vehicle, usable_wh
 from missions.route.flyable import without_stops
 from missions.values.plan_file import Plan
 from reconstruct.precision.candidates import Candidate
@@ -72,7 +72,7 @@ def revisit_report(
         try:
             again = plan_revisit(
                 found, costs=survey_costs(config),
-                settings=without_stops(config.plan, craft_of(config.vehicle)),
+                settings=without_stops(config.plan, planned_vehicle(config.vehicle)),
                 usable_wh=usable_wh(config.vehicle),
             )  # fmt: skip
         except PlanError as error:
@@ -134,7 +134,7 @@ def _text(found: Found, cures: Sequence[Prediction]) -> str:
     good, spoilt = len(found.pictured.good), len(found.pictured.spoilt)
     lines = [
         f"{found.plan.name}: {found.record.registered} of {found.record.total} pictures in the "
-        f"model; {good} of {counted(good + spoilt, 'station')} of use, they see "
+        f"model; {good} of {count_text(good + spoilt, 'station')} of use, they see "
         f"{share(found.seen.covered_share, 2)} and {share(found.seen.share_at_overlap, 2)} at the "
         "overlap asked for"
     ]
@@ -144,7 +144,7 @@ def _text(found: Found, cures: Sequence[Prediction]) -> str:
     if not found.places:
         return "\n".join([*lines, "nothing is weak"])
     lines += [
-        f"{counted(len(found.places), 'weak place')}, worst first:",
+        f"{count_text(len(found.places), 'weak place')}, worst first:",
         f"  {'':>3}  {'cause':<8} {'area m2':>8}  {'north m':>8}  {'east m':>8}  reason",
     ]
     for number, place in enumerate(found.places[:_LISTED], 1):
@@ -197,6 +197,6 @@ def _draw(path: Path, found: Found, again: Plan | None) -> None:
         places = line.stations_ne
         label = "_nolegend_" if index else "dive over them"
         axes.plot(places[:, 1], places[:, 0], "-o", ms=3, lw=1.2, color="#117864", label=label)
-    text = f"{counted(len(found.places), 'weak place')} of {found.plan.name}"
+    text = f"{count_text(len(found.places), 'weak place')} of {found.plan.name}"
     finish_map(figure, axes, area.datum, "Weak places", text)
     save_figure(figure, path)

@@ -166,7 +166,7 @@ def find_weak(
         shape=(len(pictured.good), len(model.points_world)),
     )
     views.data[:] = 1.0  # two cameras of a station may see a point
-    found = measured(
+    found = measure_survey(
         plan, rig, pictured, views, sigma_goal_m or pair_sigma_m(plan, rig),
         RegistrationRecord.read(sparse / "registration.json"), executor,
     )  # fmt: skip
@@ -193,7 +193,7 @@ def weak_places(
     return tuple(sorted(places, key=lambda place: -place.severity_m2))
 
 
-def measured(
+def measure_survey(
     plan: Plan,
     rig: Rig,
     pictured: Pictured,

@@ -32,7 +32,7 @@ from missions.fly.mission_flight import (
     simulate_mission,
 )
 from missions.fly.simulation import flight_settings
-from missions.route.energy import craft_of
+from missions.route.energy import planned_vehicle
 from missions.values.flight import Flight
 from missions.values.plan_file import Plan
 from tests.missions.flown_plans import plan_of, planned, walk
@@ -163,7 +163,7 @@ def test_a_tolerance_within_the_turning_circle_is_circled_for_ever(
 ) -> None:
     plan = small_plan()
     config = exported(plan, calm(vehicle={"name": vehicle}), "cola2", tmp_path)
-    circle = circling_m(gains_for(craft_of(config.vehicle), 0.2), 0.2)
+    circle = circling_m(gains_for(planned_vehicle(config.vehicle), 0.2), 0.2)
     path = tmp_path / FILES["cola2"]
     text = path.read_text()
     assert min(map(float, re.findall("tolerance_xy>([0-9.]+)", text))) > 0.999 * circle

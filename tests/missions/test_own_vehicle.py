@@ -12,7 +12,7 @@ from alice_survey.core.config import SurveyConfig, load_config, parse_config, wi
 from alice_survey.core.errors import AliceError, PlanError, VehicleError
 from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.pilot.gains import gains_for
-from missions.route.energy import battery_wh, craft_of, hotel_w
+from missions.route.energy import battery_wh, hotel_w, planned_vehicle
 from missions.values.flight import Flight, rms
 from tests.missions.flown_plans import flown, planned
 
@@ -115,7 +115,7 @@ def test_no_vehicle_dives_deeper_than_it_is_built_for() -> None:
 )
 def test_what_is_not_known_is_named(vehicle: dict[str, object], named: str) -> None:
     with pytest.raises(AliceError, match=re.escape(named)):
-        craft_of(survey(vehicle).vehicle)
+        planned_vehicle(survey(vehicle).vehicle)
 
 
 def test_a_vehicle_is_named_for_one_plan(tmp_path: Path) -> None:

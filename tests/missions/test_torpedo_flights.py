@@ -14,7 +14,7 @@ from alice_survey.sim.vehicle.steady import min_radius_m, min_speed_mps
 from missions.exposure.conflict import ConflictError
 from missions.fly.flight_records import true_log
 from missions.fly.flight_route import path_of, roomier_side
-from missions.route.energy import craft_of
+from missions.route.energy import planned_vehicle
 from missions.values.flight import rms
 from tests.missions.flown_plans import flown, planned
 
@@ -40,7 +40,7 @@ def survey(
 def test_a_survey_is_planned_with_turns_that_it_holds_and_flown_on_its_lines() -> None:
     config = survey()
     plan = planned(config)
-    craft = craft_of(config.vehicle)
+    craft = planned_vehicle(config.vehicle)
     legs = [leg for dive in plan.dives for leg in dive.route.legs]
     min_m = min_radius_m(craft, 1.0, STEADY_SHARE)
     curved = [abs(leg.curvature_per_m) for leg in legs if leg.curvature_per_m != 0.0]
@@ -112,7 +112,7 @@ def test_a_speed_below_the_lowest_is_refused_with_one_that_does() -> None:
         planned(config)
     name, speed_mps = found.value.suggestion
     assert name == "plan.speed_mps"
-    assert speed_mps > min_speed_mps(craft_of(config.vehicle), STEADY_SHARE)
+    assert speed_mps > min_speed_mps(planned_vehicle(config.vehicle), STEADY_SHARE)
     assert planned(survey({"speed_mps": speed_mps})).coverage > 0.999
 
 

@@ -28,7 +28,7 @@ import numpy as np
 
 from missions.exports.format import Export, ExportFile, ExportFormat
 from missions.exports.options import MIN_TOLERANCE_M, Options
-from missions.exports.waypoints import Waypoint, gone_on, moved, room_m
+from missions.exports.waypoints import Waypoint, gone_on, move, room_m
 from missions.exports.xml_text import (
     child,
     degrees,
@@ -114,7 +114,7 @@ def _set_back(export: Export, point: Waypoint, start: Waypoint) -> Waypoint:
     reach_m = max(requested_m, plan.run_in_m) + follower.circle_m
     free_m = room_m(plan, np.array(line.start_ne_m), reach_m * back) - follower.circle_m
     by_m = free_m - math.dist(point.vehicle_ne_m, start.vehicle_ne_m)
-    return moved(plan, point, max(by_m, 0.0) * back)
+    return move(plan, point, max(by_m, 0.0) * back)
 
 
 def _led_beyond(
@@ -127,7 +127,7 @@ def _led_beyond(
     if follower is None or length_m < _TOUCH_M:
         return point
     by_m = max(tolerance_m - follower.turn_in_m, -length_m)
-    return moved(export.plan, point, by_m / length_m * way)
+    return move(export.plan, point, by_m / length_m * way)
 
 
 def write_cola2(path: Path, export: Export, dive: int) -> None:

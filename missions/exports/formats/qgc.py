@@ -15,7 +15,7 @@ from shapely.geometry import Polygon
 from alice_survey.core.artefacts import write_json
 from alice_survey.core.errors import warn
 from missions.exports.format import Export, ExportFile, ExportFormat
-from missions.exports.geometry import CameraMount, grown, lat_lon
+from missions.exports.geometry import CameraMount, grow, lat_lon
 from missions.exports.mavlink import (
     FRAME_ABOVE_HOME,
     FRAME_ABOVE_TERRAIN,
@@ -88,7 +88,7 @@ def _fence(plan: Plan, points: Sequence[Waypoint], mount: CameraMount) -> list[d
     reference point has to cut its corner to bring the glass along its edge: then it shrinks by the
     lever arm, which the reference point surely keeps out of.
     """
-    outer = [Polygon(part.exterior) for part in grown(plan.area.allowed, mount.reach_m)]
+    outer = [Polygon(part.exterior) for part in grow(plan.area.allowed, mount.reach_m)]
     zones: list[Polygon] = []
     holes = [Polygon(hole) for part in plan.area.allowed.geoms for hole in part.interiors]
     for zone in (*holes, *plan.area.no_go.geoms):
@@ -100,7 +100,7 @@ def _fence(plan: Plan, points: Sequence[Waypoint], mount: CameraMount) -> list[d
     for zone in zones:
         parts = [zone]
         if zone.intersects(track):
-            parts = grown(shapely.MultiPolygon([zone]), -mount.reach_m)
+            parts = grow(shapely.MultiPolygon([zone]), -mount.reach_m)
             if not parts:
                 warn(
                     f"a no-go zone of {zone.area:.2f} m2 is left out of the fence: the vehicle's "

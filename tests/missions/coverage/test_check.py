@@ -17,7 +17,7 @@ from camera_calib.mount import mount_rotation
 from camera_calib.rig import Rig, design_rig, write_rig
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.holes import Hole
-from missions.coverage.stations import Stations, joined, plan_pattern, stations_of_plan
+from missions.coverage.stations import Stations, join, plan_pattern, stations_of_plan
 from missions.fly.check import check_report, rig_of
 from missions.fly.refly import refly_plan, to_see
 from missions.plan.strength import survey_costs
@@ -160,7 +160,7 @@ def test_the_plan_for_the_holes_is_whole_and_closes_them(
         places = dive.route.places(np.arange(0.0, dive.route.length_m, 0.02))
         assert all(inside(ways, places))
     # Both dives together leave nothing.
-    both = joined(without(plan, MISSING), stations_of_plan(again))
+    both = join(without(plan, MISSING), stations_of_plan(again))
     seen = certificate(plan.area, RIG, both, plan_pattern(plan, RIG))
     assert seen.share_at_overlap >= 0.9999
     assert (workspace / "check" / "refly" / "plan" / "exports" / "about.txt").is_file()

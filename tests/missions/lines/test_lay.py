@@ -10,7 +10,7 @@ from shapely.geometry import MultiPolygon, box
 
 from alice_survey.core.errors import PlanError
 from missions.lines.hops import comparable, hop_j
-from missions.lines.lay import lay_lines, ordered, stops
+from missions.lines.lay import lay_lines, order_lines, stops
 from missions.route.ways import Ways
 from missions.values.costs import Costs, time_costs
 from missions.values.line import Line
@@ -172,7 +172,7 @@ def test_any_lines_are_put_in_order() -> None:
         for a, b, c in rng.uniform(2, 15, (12, 3)).tolist()
     ]
     for some in (lines[:5], lines):
-        sorted_lines = ordered(some, ways, costs, home)
+        sorted_lines = order_lines(some, ways, costs, home)
         ends = {frozenset([x.start_ne_m, x.end_ne_m]) for x in sorted_lines}
         assert ends == {frozenset([x.start_ne_m, x.end_ne_m]) for x in some}
         mine = flight_by_hand(sorted_lines, partial(way_m, ways), costs, home)

@@ -18,10 +18,10 @@ from missions.route.energy import (
     FlightConditions,
     Manner,
     course_power,
-    craft_of,
     flies_everywhere,
     flight_conditions,
     motion,
+    planned_vehicle,
 )
 from missions.route.turns import Manoeuvre
 from missions.values.costs import power_at
@@ -100,7 +100,7 @@ def test_without_a_current_all_courses_are_alike_and_ways_are_as_lines() -> None
 
 def test_power_between_samples_is_near_that_of_its_own_course() -> None:
     config = _config()
-    costs, craft = survey_costs(config), craft_of(config.vehicle)
+    costs, craft = survey_costs(config), planned_vehicle(config.vehicle)
     courses = np.random.default_rng(1).uniform(0, 2 * np.pi, 50)
     exact = (
         course_power(craft, courses, 0.2, flight_conditions(config).current_ne_mps, "held") + 60.0

@@ -15,7 +15,7 @@ from alice_survey.core.config import SurveyConfig
 from alice_survey.core.records import RegistrationRecord
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import certificate
-from missions.coverage.stations import Stations, joined, stations_of_plan
+from missions.coverage.stations import Stations, join, stations_of_plan
 from missions.plan.strength import survey_costs
 from missions.route.energy import usable_wh
 from missions.values.plan_file import Plan
@@ -24,7 +24,7 @@ from reconstruct.precision.candidates import Candidate
 from reconstruct.precision.instruments import usual_rig
 from reconstruct.revisit.dive import plan_revisit, predict, predict_precision
 from reconstruct.revisit.links import cut_around, footprints, links, pieces
-from reconstruct.revisit.weak import Found, Pictured, measured, pair_sigma_m, weak_places
+from reconstruct.revisit.weak import Found, Pictured, measure_survey, pair_sigma_m, weak_places
 from tests.oracles_coverage import area_of, lawnmower, plan_of
 
 CONFIG = SurveyConfig()
@@ -66,7 +66,7 @@ def surveyed(
         spoilt=FLOWN.some(spoilt),
         faults=("not in the model (blurred)",) * int(spoilt.sum()),
     )
-    found = measured(PLAN, RIG, pictured, tracks(pictured.good), GOAL_M, RECORD)
+    found = measure_survey(PLAN, RIG, pictured, tracks(pictured.good), GOAL_M, RECORD)
     sigma = np.full((100, 100), 0.5 * GOAL_M)
     sigma[rough] = 4 * GOAL_M
     surface = Elevation(height=0 * sigma, sigma=sigma, west=-1.0, north=9.0, cell=0.1)
@@ -141,7 +141,7 @@ def test_a_hole_a_strip_of_blur_and_a_loose_corner_are_cured_by_the_dive() -> No
     assert in_model[len(found.pictured.good) :].all()
     assert max(cure.left for cure in cures) <= 0.01
     # What is predicted happens: to coverage, and to tracks that are drawn again.
-    both = joined(found.pictured.good, stations_of_plan(again))
+    both = join(found.pictured.good, stations_of_plan(again))
     after = certificate(PLAN.area, RIG, both, found.pattern)
     assert found.seen.share_at_overlap < 0.85
     assert after.share_at_overlap >= 0.999

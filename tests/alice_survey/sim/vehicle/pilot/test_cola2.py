@@ -22,7 +22,7 @@ from alice_survey.sim.vehicle.pilot.mission import (
     steady_drift,
     timeout_s,
 )
-from missions.route.energy import craft_of
+from missions.route.energy import planned_vehicle
 
 FAR = 1000.0
 
@@ -81,7 +81,7 @@ def test_the_circle_is_that_of_a_simulated_vehicle(
     name: str, minimum: float, maximum: float
 ) -> None:
     """Bounds: 10 % about what `test_mission_flight` measures."""
-    vehicle = craft_of(VehicleConfig(name=name))
+    vehicle = planned_vehicle(VehicleConfig(name=name))
     circle = circling_m(gains_for(vehicle, 0.2), 0.2)
     assert minimum < circle < maximum
     assert circling_m(gains_for(vehicle, 0.4), 0.4) > circle
