@@ -155,13 +155,45 @@ def fit_corners(
         light = cv2.GaussianBlur(light, (0, 0), _BLUR_PX)
         which = np.flatnonzero(inside)
         bent = np.zeros((len(which), 2, 3)) if bends is None else bends[inside]
+        steps = np.ascontiguousarray(pixels_per_square[inside])
+        which = which if len(around.lines) > 1 else 0 * which
         fits[inside], states[inside] = _fit_corners(
-            light, seen - low, np.ascontiguousarray(pixels_per_square[inside]),
-            np.ascontiguousarray(bent), around.lines, around.shades,
-            which if len(around.lines) > 1 else 0 * which, reach, arm, noise,
+            light, seen - low, steps, np.ascontiguousarray(bent), _windows(steps, bent, reach, arm),
+            around.lines, around.shades, which, _lines_in_window(steps, around.lines[which]), noise,
         )  # fmt: skip
         fits[inside, :2] += low
     return Corners(pixels=fits[:, :2], sigma_px=fits[:, 2], contrast=fits[:, 3], states=states)
+
+
+def _windows(steps: Array, bends: Array, reach: float, arm: float) -> Array:
+    """(N, 2, 4) squares along both edges by pixel, then half the window and half its arms.
+
+    The latter in squares; all NaN where the edges are one.
+    """
+    area = np.linalg.det(steps)
+    swapped = np.stack([steps[:, ::-1, 1], -steps[:, ::-1, 0]], axis=1) * [1.0, -1.0]
+    by_pixel = swapped / np.where(np.abs(area) < 1.0, np.nan, area)[:, None, None]
+    per_px = np.hypot(by_pixel[..., 0], by_pixel[..., 1])
+    bend_px = np.maximum(np.abs(bends).max(axis=(1, 2)), 1e-9)[:, None]
+    straight = np.maximum(
+        np.sqrt(_MAX_BENT_PX / bend_px), 4.0 * np.sqrt(per_px.prod(axis=1))[:, None]
+    )
+    half, arms = (
+        np.maximum(to - np.minimum(_CLEAR_PX * per_px, _CLEAR * to), _MIN_PX * per_px)
+        for to in (reach, arm)
+    )
+    half = np.minimum(np.minimum(_REACH, half), straight)
+    return np.concatenate([by_pixel, half[..., None], arms[..., None]], axis=2)
+
+
+def _lines_in_window(steps: Array, lines: Array) -> Array:
+    """(N, 2, 3) pixels per square across the lines, and which of them show: first, last but one."""
+    lengths = np.hypot(steps[:, 0], steps[:, 1])[:, ::-1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        per_square = np.linalg.det(steps)[:, None] / lengths
+        at = lines * per_square[..., None]
+    first, last = (at < -_MAX_LINE_PX).sum(axis=2), (at < _MAX_LINE_PX).sum(axis=2)
+    return np.stack([per_square, first, last], axis=2)
 
 
 def _noise_variance(light: Array) -> float:
@@ -177,11 +209,11 @@ def _fit_corners(
     near: Array,
     steps: Array,
     bends: Array,
+    windows: Array,
     lines: Array,
     shades: Array,
     which: NDArray[np.intp],
-    reach: float,
-    arm: float,
+    shown: Array,
     noise: float,
 ) -> tuple[Array, NDArray[np.intp]]:
     out, states = np.full((near.shape[0], 4), np.nan), np.zeros(near.shape[0], np.intp)
@@ -190,22 +222,18 @@ def _fit_corners(
     places = np.empty((side, side, 2))
     for i in range(near.shape[0]):
         column, row = int(near[i, 0]), int(near[i, 1])
-        states[i] = _cut(
-            picture, column, row, near[i], steps[i], bends[i], reach, arm, window, used, places
-        )
+        states[i] = _cut(picture, near[i], bends[i], windows[i], window, used, places)
         if states[i] != FITTED:
             continue
-        area = steps[i, 0, 0] * steps[i, 1, 1] - steps[i, 0, 1] * steps[i, 1, 0]
-        along_px = area / math.hypot(steps[i, 0, 1], steps[i, 1, 1])
-        down_px = area / math.hypot(steps[i, 0, 0], steps[i, 1, 0])
-        left, right = _in_window(lines[which[i], 0], along_px)
-        top, bottom = _in_window(lines[which[i], 1], down_px)
-        edges = lines[which[i], 1, top:bottom] * down_px, lines[which[i], 0, left:right] * along_px
+        left, right = int(shown[i, 0, 1]), int(shown[i, 0, 2])
+        top, bottom = int(shown[i, 1, 1]), int(shown[i, 1, 2])
+        edges = (
+            lines[which[i], 1, top:bottom] * shown[i, 1, 0],
+            lines[which[i], 0, left:right] * shown[i, 0, 0],
+        )
         shade = shades[which[i], top : bottom + 1, left : right + 1]
-        start = near[i] - np.array([column, row])
-        best = _start(window, used, places, edges, shade, start, steps[i])
-        x, y = best[0], best[1]
-        best, cost, normal = _descend(window, used, places, edges, shade, best)
+        x, y = near[i, 0] - column, near[i, 1] - row
+        best, cost, normal = _descend(window, used, places, edges, shade, x, y, steps[i])
         count = used.sum()
         area = abs(steps[i, 0, 0] * steps[i, 1, 1] - steps[i, 0, 1] * steps[i, 1, 0])
         farthest = max(_MAX_PX, _FARTHEST * math.sqrt(area))
@@ -230,44 +258,26 @@ def _fit_corners(
 
 
 @compiled
-def _clear(distance: float, per_px: float) -> float:
-    """Length of a window up to an edge at a distance, in squares."""
-    kept = min(_CLEAR_PX * per_px, _CLEAR * distance)
-    return max(distance - kept, _MIN_PX * per_px)
-
-
-@compiled
 def _cut(
     picture: Array,
-    column: int,
-    row: int,
     centre: Array,
-    steps: Array,
     bends: Array,
-    reach: float,
-    arm: float,
+    size: Array,
     window: Array,
     used: NDArray[np.bool_],
     places: Array,
 ) -> int:
     """Fill the window with the pixels around a corner; report which of them show its edges only.
 
-    `places` are those of the pixels in a picture in which the lens curves no edge near the corner.
+    `size` is of `_windows`; `places` are those of the pixels in a picture in which the lens curves
+    no edge near the corner.
     """
     rows, columns = picture.shape
+    column, row = int(centre[0]), int(centre[1])
     used[:] = False
-    area = steps[0, 0] * steps[1, 1] - steps[0, 1] * steps[1, 0]
-    if abs(area) < 1.0:
+    if np.isnan(size[0, 0]):
         return NOT_SETTLED
-    # Squares along the two edges per pixel across; steps are columns.
-    ux, uy = steps[1, 1] / area, -steps[0, 1] / area
-    vx, vy = -steps[1, 0] / area, steps[0, 0] / area
-    u_px, v_px = math.hypot(ux, uy), math.hypot(vx, vy)
-    u_reach, v_reach = min(_REACH, _clear(reach, u_px)), min(_REACH, _clear(reach, v_px))
-    u_arm, v_arm = _clear(arm, u_px), _clear(arm, v_px)
-    bend_px = max(np.abs(bends).max(), 1e-9)
-    straight = max(math.sqrt(_MAX_BENT_PX / bend_px), 4.0 * math.sqrt(u_px * v_px))
-    u_reach, v_reach = min(u_reach, straight), min(v_reach, straight)
+    (ux, uy, u_reach, u_arm), (vx, vy, v_reach, v_arm) = size[0], size[1]
     count = 0
     for j in range(-_HALF_PX, _HALF_PX + 1):
         for i in range(-_HALF_PX, _HALF_PX + 1):
@@ -290,27 +300,20 @@ def _cut(
 
 
 @compiled
-def _in_window(lines: Array, pixels_per_square: float) -> tuple[int, int]:
-    """First and last but one of the lines that can be seen in a window."""
-    low, high = 0, 0
-    for k in range(lines.shape[0]):
-        at = lines[k] * pixels_per_square
-        low += at < -_MAX_LINE_PX
-        high += at < _MAX_LINE_PX
-    return low, high
-
-
-@compiled
-def _start(
+def _descend(
     window: Array,
     used: NDArray[np.bool_],
     places: Array,
     edges: tuple[Array, Array],
     shades: Array,
-    centre: Array,
+    x: float,
+    y: float,
     steps: Array,
-) -> Array:
-    """Centre, normals of both edges, blur, contrast, level and its slopes, to begin with."""
+) -> tuple[Array, float, Array]:
+    """Levenberg-Marquardt from a start; returns what fits, the cost and the normal matrix.
+
+    What fits are the centre, normals of both edges, blur, contrast, level and its two slopes.
+    """
     low, high, total, count = np.inf, -np.inf, 0.0, 0
     for j in range(window.shape[0]):
         for i in range(window.shape[1]):
@@ -318,28 +321,13 @@ def _start(
                 low, high = min(low, window[j, i]), max(high, window[j, i])
                 total += window[j, i]
                 count += 1
-    one = math.atan2(steps[0, 0], -steps[1, 0])
-    two = math.atan2(-steps[0, 1], steps[1, 1])
-    contrast = 0.5 * (high - low)
-    start = np.array([centre[0], centre[1], one, two, 1.5, contrast, total / count, 0.0, 0.0])
-    cost = _equations(window, used, places, edges, shades, start)[0]
-    start[5] = -start[5]
-    if _equations(window, used, places, edges, shades, start)[0] > cost:
-        start[5] = -start[5]
-    return start
-
-
-@compiled
-def _descend(
-    window: Array,
-    used: NDArray[np.bool_],
-    places: Array,
-    edges: tuple[Array, Array],
-    shades: Array,
-    start: Array,
-) -> tuple[Array, float, Array]:
-    """Levenberg-Marquardt on what `_start` lists; returns the cost and the normal matrix too."""
-    q, damping = start.copy(), 1e-3
+    one, two = math.atan2(steps[0, 0], -steps[1, 0]), math.atan2(-steps[0, 1], steps[1, 1])
+    q = np.array([x, y, one, two, 1.5, 0.5 * (high - low), total / count, 0.0, 0.0])
+    damping = 1e-3
+    cost = _equations(window, used, places, edges, shades, q)[0]
+    q[5] = -q[5]
+    if _equations(window, used, places, edges, shades, q)[0] > cost:
+        q[5] = -q[5]
     cost, normal, right = _equations(window, used, places, edges, shades, q)
     for _ in range(_STEPS):
         damped = normal.copy()

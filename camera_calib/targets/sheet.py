@@ -1,4 +1,4 @@
-"""Print a target at true scale: PDF, SVG or PNG, with a bar to check the printer."""
+"""Print a target at true scale: a PDF, with a bar to check the printer."""
 
 import io
 import math
@@ -6,8 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
 from reportlab.lib.units import mm
 
 from alice_survey.core.artefacts import atomic_path
@@ -24,7 +22,6 @@ PAPERS_MM = {
     "A0": (841.0, 1189.0),
     "letter": (215.9, 279.4),
 }
-SUFFIXES = (".pdf", ".svg", ".png")
 BAR_MM = 100.0
 _MARGIN_MM = 8.0
 """White margin around the pattern; printers leave about 5 mm blank themselves."""
@@ -33,7 +30,6 @@ _STRIP_MM = 11.0
 _TICK_MM, _LINE_MM, _TEXT_MM = 3.0, 0.3, 2.6
 _MAX_PAGE_MM = 5080.0
 """A PDF page is at most 200 inches."""
-_MAX_PIXELS = 600_000_000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -160,83 +156,27 @@ def to_pdf(sheet: Sheet) -> bytes:
     return file.getvalue()
 
 
-def to_svg(sheet: Sheet) -> str:
-    """The page as an SVG whose unit is the millimetre."""
-    width, height = f"{sheet.width_mm:.10g}", f"{sheet.height_mm:.10g}"
-    path = "".join(
-        f"M{x0:.10g} {y0:.10g}H{x1:.10g}V{y1:.10g}H{x0:.10g}Z"
-        for x0, y0, x1, y1 in sheet.rectangles_mm.round(7)
-    )
-    x, y = sheet.words_at_mm
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}mm" height="{height}mm" '
-        f'viewBox="0 0 {width} {height}">\n'
-        f'<rect width="{width}" height="{height}" fill="white"/>\n'
-        f'<path d="{path}" fill="black" shape-rendering="crispEdges"/>\n'
-        f'<text x="{x:.10g}" y="{y:.10g}" font-family="Helvetica, Arial, sans-serif" '
-        f'font-size="{_TEXT_MM}">{sheet.words}</text>\n</svg>\n'
-    )
-
-
-def to_pixels(sheet: Sheet, dpi: float) -> NDArray[np.uint8]:
-    """The page without its words as grey values; a pixel that an edge cuts is grey by its share.
-
-    Raises:
-        CalibrationError: the picture would be too large.
-    """
-    per_mm = dpi / 25.4
-    width, height = (math.ceil(s * per_mm) for s in (sheet.width_mm, sheet.height_mm))
-    if width * height > _MAX_PIXELS:
-        raise CalibrationError(
-            f"a picture of {width} x {height} px: lower --dpi, or write a PDF or SVG, whose lines "
-            "have no pixels"
-        )
-    black = np.zeros((height, width), dtype=np.float32)
-    for x0, y0, x1, y1 in sheet.rectangles_mm * per_mm:
-        rows, down = _shares(y0, y1)
-        columns, across = _shares(x0, x1)
-        black[rows, columns] += down[:, None] * across[None, :]
-    return np.rint(255.0 * (1.0 - np.minimum(black, 1.0))).astype(np.uint8)
-
-
-def _shares(low: float, high: float) -> tuple[slice, NDArray[np.float32]]:
-    """Which pixels an interval meets, and how much of each it covers."""
-    first, last = math.floor(low), math.ceil(high)
-    edges = np.arange(first, last + 1)
-    covered = np.minimum(edges[1:], high) - np.maximum(edges[:-1], low)
-    return slice(first, last), covered.astype(np.float32)
-
-
-def write_sheet(
-    target: Target, path: Path, paper: str | None = None, dpi: float = 300.0
-) -> tuple[Path, Sheet]:
+def write_sheet(target: Target, path: Path, paper: str | None = None) -> tuple[Path, Sheet]:
     """Write a page to print, and next to it the target's JSON file, for calibrations.
 
     Args:
         target: what to print.
-        path: where to; its suffix, .pdf, .svg or .png, says how.
+        path: of the PDF.
         paper: a name in `PAPERS_MM`, or as large as needed.
-        dpi: pixels per inch of a PNG.
 
     Returns:
         The path of the JSON file, and the page.
 
     Raises:
-        CalibrationError: the suffix or the paper is unknown, the target does not fit, or the JSON
-            file is there and describes something else.
+        CalibrationError: the paper is unknown, the target does not fit, or the JSON file is there
+            and describes something else.
     """
-    suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise CalibrationError(f"{path}: write to a name that ends in {', '.join(SUFFIXES)}")
+    if path.suffix.lower() != ".pdf":
+        raise CalibrationError(f"{path}: write to a name that ends in .pdf")
     sheet, described = lay_out(target, paper), path.with_suffix(".json")
     _check_description(described, target)
     with atomic_path(path) as temporary:
-        if suffix == ".pdf":
-            temporary.write_bytes(to_pdf(sheet))
-        elif suffix == ".svg":
-            temporary.write_text(to_svg(sheet), encoding="utf-8")
-        else:
-            _write_png(sheet, temporary, dpi)
+        temporary.write_bytes(to_pdf(sheet))
     write_target(described, target)
     return described, sheet
 
@@ -255,20 +195,10 @@ def _check_description(path: Path, target: Target) -> None:
         )
 
 
-def _write_png(sheet: Sheet, path: Path, dpi: float) -> None:
-    picture = Image.fromarray(to_pixels(sheet, dpi))
-    x, y = (place * dpi / 25.4 for place in sheet.words_at_mm)
-    font = ImageFont.load_default(size=max(_TEXT_MM * dpi / 25.4, 8.0))
-    ImageDraw.Draw(picture).text((x, y), sheet.words, fill=0, font=font, anchor="ls")
-    picture.save(path, format="PNG", dpi=(dpi, dpi))
-
-
-def print_target(
-    text: str, path: Path, paper: str | None, dpi: float
-) -> tuple[str, dict[str, object]]:
+def print_target(text: str, path: Path, paper: str | None) -> tuple[str, dict[str, object]]:
     """Run `alice-survey target`; return its result as text and as JSON values."""
     target = parse_target(text)
-    described, sheet = write_sheet(target, path, paper, dpi)
+    described, sheet = write_sheet(target, path, paper)
     lines = [
         f"wrote {path}, {sheet.width_mm:.1f} x {sheet.height_mm:.1f} mm, and {described}",
         "print it at 100 % (no fitting to the page), glue it flat, and measure the bar of "

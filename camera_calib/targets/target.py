@@ -40,10 +40,10 @@ TAG_FAMILY = "DICT_APRILTAG_36h11"
 TAG_BITS, TAG_BORDER_BITS = 10, 2
 """Bits along a tag with its border, and the width of the border."""
 _DEFAULT_DICTIONARY = "DICT_5X5_1000"
-_FEWEST, _MOST = 3, 100
+_MIN_COUNT, _MAX_COUNT = 3, 100
 _MIN_M, _MAX_M = 1e-4, 10.0
-_WIDEST_SPACING = 1.0
-_NARROWEST_SPACING = 0.1
+_MIN_SPACING, _MAX_SPACING = 0.1, 1.0
+_LENGTH = r"(?:\d+\.?\d*|\.\d+)(?:mm|cm|m)"
 _UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 _GRAMMAR = (
     "write 'chessboard 9x6 25mm' (inner corners, square), 'charuco 12x9 40mm 30mm' (squares, "
@@ -89,65 +89,48 @@ class Target:
     """Gap between tags over the side of a tag (AprilTag)."""
 
     def __post_init__(self) -> None:
-        if self.kind not in ("chessboard", "charuco", "apriltag"):
+        if self.kind not in _KINDS:
             raise CalibrationError(f"target: no kind '{self.kind}'; {_GRAMMAR}")
-        minimum = 1 if self.kind == "apriltag" else _FEWEST
-        if not (minimum <= self.columns <= _MOST and minimum <= self.rows <= _MOST):
+        counted, sized, minimum, own = _KINDS[self.kind]
+        fields = {"marker_m", "dictionary", "spacing"}
+        given = {name for name in fields if getattr(self, name) is not None}
+        if given != set(own) or (self.legacy and self.kind != "charuco"):
             raise CalibrationError(
-                f"target: {self.columns}x{self.rows} {_COUNTED[self.kind]}: each count must be "
-                f"{minimum} to {_MOST}"
+                f"target: a {self.kind} has {', '.join(own) or 'no more than counts and a size'}; "
+                f"{_GRAMMAR}"
+            )
+        if not (minimum <= self.columns <= _MAX_COUNT and minimum <= self.rows <= _MAX_COUNT):
+            raise CalibrationError(
+                f"target: {self.columns}x{self.rows} {counted}: each count must be {minimum} to "
+                f"{_MAX_COUNT}"
             )
         if not _MIN_M <= self.size_m <= _MAX_M:
             raise CalibrationError(
-                f"target: {self.size_m * 1e3:g} mm for a {_SIZED[self.kind]}: it must be "
-                f"{_MIN_M * 1e3:g} to {_MAX_M * 1e3:g} mm; check the unit"
+                f"target: {self.size_m * 1e3:g} mm for a {sized}: it must be {_MIN_M * 1e3:g} to "
+                f"{_MAX_M * 1e3:g} mm; check the unit"
             )
-        self._check_charuco()
-        self._check_apriltag()
-
-    def _check_charuco(self) -> None:
-        if self.kind != "charuco":
-            if self.marker_m is not None or self.dictionary is not None or self.legacy:
-                raise CalibrationError(
-                    f"target: a {self.kind} has no marker size, dictionary or legacy layout; "
-                    + _GRAMMAR
-                )
-            return
-        if self.marker_m is None or self.dictionary is None:
-            raise CalibrationError(f"target: a charuco needs its markers; {_GRAMMAR}")
-        if not 0.3 * self.size_m <= self.marker_m <= 0.95 * self.size_m:
+        if self.marker_m is not None and not 0.3 <= self.marker_m / self.size_m <= 0.95:
             raise CalibrationError(
                 f"target: markers of {self.marker_m * 1e3:g} mm in squares of "
                 f"{self.size_m * 1e3:g} mm: a marker must be 30 to 95 % of its square"
             )
-        if self.dictionary not in dictionary_names():
-            raise CalibrationError(
-                f"target: no dictionary '{self.dictionary}'; take one of "
-                + ", ".join(dictionary_names())
-            )
-        held, needed = len(aruco_dictionary(self.dictionary).bytesList), len(self._white_squares)
-        if held < needed:
-            raise CalibrationError(
-                f"target: {self.columns}x{self.rows} squares need {needed} markers, "
-                f"{self.dictionary} has {held}: take a larger dictionary or fewer squares"
-            )
-
-    def _check_apriltag(self) -> None:
-        if self.kind != "apriltag":
-            if self.spacing is not None:
-                raise CalibrationError(f"target: a {self.kind} has no spacing; {_GRAMMAR}")
-            return
-        if self.spacing is None:
-            raise CalibrationError(f"target: an apriltag grid needs its spacing; {_GRAMMAR}")
-        if not _NARROWEST_SPACING <= self.spacing <= _WIDEST_SPACING:
+        if self.spacing is not None and not _MIN_SPACING <= self.spacing <= _MAX_SPACING:
             raise CalibrationError(
                 f"target: spacing {self.spacing:g}: it is the gap over the tag, "
-                f"{_NARROWEST_SPACING} to {_WIDEST_SPACING} (Kalibr's tagSpacing, such as 0.3)"
+                f"{_MIN_SPACING} to {_MAX_SPACING} (Kalibr's tagSpacing, such as 0.3)"
             )
-        held = len(aruco_dictionary(TAG_FAMILY).bytesList)
-        if self.columns * self.rows > held:
+        if self.kind == "chessboard":
+            return
+        family = TAG_FAMILY if self.dictionary is None else self.dictionary
+        if family not in dictionary_names():
             raise CalibrationError(
-                f"target: {self.columns}x{self.rows} tags; the family 36h11 has {held}"
+                f"target: no dictionary '{family}'; take one of {', '.join(dictionary_names())}"
+            )
+        held, needed = len(aruco_dictionary(family).bytesList), len(self.marker_places)
+        if held < needed:
+            raise CalibrationError(
+                f"target: {self.columns}x{self.rows} {counted} need {needed} markers, {family} "
+                f"has {held}: take a larger dictionary or fewer {counted}"
             )
 
     @property
@@ -283,8 +266,18 @@ class Target:
             raise CalibrationError(f"target: its file is wrong: {error}") from None
 
 
-_COUNTED = {"chessboard": "inner corners", "charuco": "squares", "apriltag": "tags"}
-_SIZED = {"chessboard": "square", "charuco": "square", "apriltag": "tag"}
+_KINDS: dict[str, tuple[str, str, int, tuple[str, ...]]] = {
+    "chessboard": ("inner corners", "square", _MIN_COUNT, ()),
+    "charuco": ("squares", "square", _MIN_COUNT, ("marker_m", "dictionary")),
+    "apriltag": ("tags", "tag", 1, ("spacing",)),
+}
+"""What is counted, what has the size, the least count, and the fields of its own."""
+_WORDS = re.compile(
+    r"(?P<kind>chessboard|charuco|apriltag) (?P<columns>\d{1,6})x(?P<rows>\d{1,6}) "
+    rf"(?P<size>{_LENGTH})(?: (?P<marker>{_LENGTH})(?: (?P<dictionary>DICT_\w+))?"
+    r"(?P<legacy> legacy)?| (?P<spacing>\d*\.?\d+))?",
+    re.IGNORECASE,
+)
 
 
 def parse_target(text: str) -> Target:
@@ -294,37 +287,23 @@ def parse_target(text: str) -> Target:
         CalibrationError: the words or the file are wrong; the message shows how they must be.
         WorkspaceError: the file is missing or no JSON.
     """
-    words = text.split()
     if text.strip().lower().endswith(".json"):
         return read_target(Path(text.strip()))
-    kind = words[0].lower() if words else ""
-    if kind == "chessboard" and len(words) == 3:
-        columns, rows = _counts(words[1])
-        return Target(kind="chessboard", columns=columns, rows=rows, size_m=_length_m(words[2]))
-    if kind == "apriltag" and len(words) == 4:
-        columns, rows = _counts(words[1])
-        return Target(
-            kind="apriltag",
-            columns=columns,
-            rows=rows,
-            size_m=_length_m(words[2]),
-            spacing=_number(words[3], "spacing"),
-        )
-    if kind == "charuco" and 4 <= len(words) <= 6:
-        columns, rows = _counts(words[1])
-        legacy = words[-1].lower() == "legacy"
-        names = words[4:-1] if legacy else words[4:]
-        if len(names) <= 1:
-            return Target(
-                kind="charuco",
-                columns=columns,
-                rows=rows,
-                size_m=_length_m(words[2]),
-                marker_m=_length_m(words[3]),
-                dictionary=_dictionary_called(names[0]) if names else _DEFAULT_DICTIONARY,
-                legacy=legacy,
-            )
-    raise CalibrationError(f"target '{text}' is not understood: {_GRAMMAR}")
+    found = _WORDS.fullmatch(" ".join(text.split()))
+    if found is None:
+        raise CalibrationError(f"target '{text}' is not understood: {_GRAMMAR}")
+    marker, word = found["marker"], found["dictionary"] or _DEFAULT_DICTIONARY
+    known = {name.upper(): name for name in dictionary_names()}
+    return Target(
+        kind=found["kind"].lower(),  # type: ignore[arg-type]  # one of them, by the pattern
+        columns=int(found["columns"]),
+        rows=int(found["rows"]),
+        size_m=_length_m(found["size"]),
+        marker_m=None if marker is None else _length_m(marker),
+        dictionary=None if marker is None else known.get(word.upper(), word),
+        legacy=found["legacy"] is not None,
+        spacing=None if found["spacing"] is None else float(found["spacing"]),
+    )
 
 
 def read_target(path: Path) -> Target:
@@ -356,27 +335,6 @@ def aruco_dictionary(name: str) -> Any:
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 
-def _dictionary_called(word: str) -> str:
-    """OpenCV's own spelling of a dictionary's name; the word itself when there is none."""
-    return {name.upper(): name for name in dictionary_names()}.get(word.upper(), word)
-
-
-def _counts(word: str) -> tuple[int, int]:
-    match = re.fullmatch(r"(\d{1,6})[xX](\d{1,6})", word)
-    if match is None:
-        raise CalibrationError(f"target: '{word}' is not a pair of counts such as 9x6")
-    return int(match[1]), int(match[2])
-
-
 def _length_m(word: str) -> float:
-    match = re.fullmatch(r"(\d+\.?\d*|\.\d+)(mm|cm|m)", word)
-    if match is None:
-        raise CalibrationError(f"target: '{word}' is not a length with its unit, such as 25mm")
-    return round(float(match[1]) * _UNITS_M[match[2]], 12)
-
-
-def _number(word: str, name: str) -> float:
-    try:
-        return float(word)
-    except ValueError:
-        raise CalibrationError(f"target: {name} '{word}' is not a number") from None
+    number = word.rstrip("cmCM")
+    return round(float(number) * _UNITS_M[word[len(number) :].lower()], 12)

@@ -183,20 +183,19 @@ class TargetCommand(ReportCommand):
     name = "target"
     examples = (
         'target "charuco 12x9 40mm 30mm" -o board.pdf',
-        'target "chessboard 9x6 25mm" -o chess.svg --paper A4',
+        'target "chessboard 9x6 25mm" -o chess.pdf --paper A4',
         'target "apriltag 6x6 70mm 0.3" -o grid.pdf --paper A1',
-        'target "charuco 12x9 40mm 30mm DICT_5X5_250 legacy" -o old.png --dpi 600',
+        'target "charuco 12x9 40mm 30mm DICT_5X5_250 legacy" -o old.pdf',
     )
     what: str = argument(..., "In words, as below, or a target's JSON file.", "TARGET")
-    output: Path = option(..., "A .pdf, .svg or .png file.", "-o", "--output", metavar="FILE")
+    output: Path = option(..., "The PDF to write.", "-o", "--output", metavar="FILE")
     paper: str | None = option(None, "A4, A3, A2, A1, A0 or letter; as needed if not given.")
-    dpi: float = option(300.0, "Resolution of a PNG.", ge=50, le=2400)
 
     def run(self) -> Result:
         """Draw it."""
         from camera_calib.targets.sheet import print_target
 
-        return print_target(self.what, self.output, self.paper, self.dpi)
+        return print_target(self.what, self.output, self.paper)
 
 
 class CalibrateCommand(SurveyCommand, ThreadsCommand):
