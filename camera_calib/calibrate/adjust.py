@@ -143,7 +143,7 @@ class _Solver(CalibrationProblem):
 
     def move(self, guess: _TargetGuess, equations: Equations, step: BlockStep) -> _TargetGuess:
         """The guess after a step."""
-        return self.seen_from(self.stepped(guess.state, step))
+        return self.seen_from(self.take_step(guess.state, step))
 
     def at_bound(self, guess: _TargetGuess) -> Flags:
         """Parameters that have their least value."""

@@ -41,7 +41,7 @@ class _Part:
     in_all: bool
     """Whether all cameras of a view err alike: the board bends in a hand, or moves."""
 
-    def smoothed(self, values: Array, seen: Array) -> Array:
+    def smooth(self, values: Array, seen: Array) -> Array:
         """The correlation applied to (V, C, N, 2, m), with (V, C, N) of 0 where unseen."""
         base = values.sum(axis=1, keepdims=True) if self.in_all else values
         spread = self.kernel @ base.reshape(*base.shape[:3], -1)
@@ -136,9 +136,9 @@ class _Products:
         views, size = len(rows.seen), len(root)
         self.rows, self.parts = rows, parts
         by_rig = rows.by_rig @ root
-        smoothed = np.stack([part.smoothed(by_rig, rows.seen) for part in parts])
-        poses = np.stack([part.smoothed(rows.poses, rows.seen) for part in parts])
-        self.smoothed, self.poses = smoothed, poses
+        smoothed = np.stack([part.smooth(by_rig, rows.seen) for part in parts])
+        poses = np.stack([part.smooth(rows.poses, rows.seen) for part in parts])
+        self.smooth, self.poses = smoothed, poses
         self.by_rig = by_rig.reshape(-1, size).T @ smoothed.reshape(len(parts), -1, size)
         """(K, P, P) slopes' products under every part within pictures."""
         self.by_place = np.einsum("vcnai,vcnap->nip", rows.by_place, by_rig, optimize=True)
@@ -158,7 +158,7 @@ class _Products:
         pulled = np.einsum("vcnai,vcna->ni", rows.by_place, rows.missed)
         for i, part in enumerate(self.parts):
             table[i, count:] = table[count:, i] = self._of_both(i)
-            smooth = part.smoothed(rows.missed[..., None], rows.seen)
+            smooth = part.smooth(rows.missed[..., None], rows.seen)
             seen[i] = float((rows.missed * smooth[..., 0]).sum())
         for i, axes in enumerate(_AXES, start=count):
             seen[i] = float((pulled[:, axes] ** 2).sum())
@@ -181,7 +181,7 @@ class _Products:
                     seen = seen.sum(axis=1, keepdims=True)
                 both = one.kernel * other.kernel
                 table[i, j] = table[j, i] = 2.0 * float(((seen @ both) * seen).sum())
-        table -= 2.0 * (_inner(self.poses) + _inner(self.smoothed) - _inner(self.crossed))
+        table -= 2.0 * (_inner(self.poses) + _inner(self.smooth) - _inner(self.crossed))
         total: Array = table + _inner(self.overlap) + _inner(self.by_rig)
         return total
 
@@ -190,7 +190,7 @@ class _Products:
         rows, posed = self.rows, self.place_of_pose
         alike = rows.by_place.sum(axis=1) if self.parts[i].in_all else rows.by_place
         of_pose = np.einsum("vcnai,vcnak->vnik", rows.by_place, self.poses[i], optimize=True)
-        through = np.einsum("vcnai,vcnap->nip", rows.by_place, self.smoothed[i], optimize=True)
+        through = np.einsum("vcnai,vcnap->nip", rows.by_place, self.smooth[i], optimize=True)
         through -= np.einsum("vnik,vkp->nip", posed, self.crossed[i], optimize=True)
         found = []
         for axes in _AXES:

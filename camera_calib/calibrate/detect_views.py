@@ -55,7 +55,7 @@ def detect_views(sets: Sequence[PictureSet], target: Target, executor: Executor)
         CalibrationError: a camera has pictures of different sizes, or none that shows the target.
     """
     jobs = [
-        (path, target, i in _checked(len(sets)))
+        (path, target, i in _measured_numbers(len(sets)))
         for i, one in enumerate(sets)
         for path in one.paths.values()
     ]
@@ -82,7 +82,7 @@ def detect_views(sets: Sequence[PictureSet], target: Target, executor: Executor)
     return Detections(views=tuple(views), sizes=sizes, rejections=tuple(rejections))
 
 
-def _checked(count: int) -> set[int]:
+def _measured_numbers(count: int) -> set[int]:
     """Numbers of the views in which the size of the board is measured."""
     return {(2 * i + 1) * count // (2 * _CHECKED) for i in range(_CHECKED)}
 
@@ -127,9 +127,9 @@ def _one_size(
 
 def _check_board(target: Target, seen: Sequence[_Seen]) -> None:
     """A part of a larger chessboard looks like a smaller one, but not always the same part."""
-    wanted = max(target.columns, target.rows), min(target.columns, target.rows)
+    expected = max(target.columns, target.rows), min(target.columns, target.rows)
     boards = [what.board for what in seen if what.board is not None]
-    larger = [b for b in boards if b[0] >= wanted[0] and b[1] >= wanted[1] and b != wanted]
+    larger = [b for b in boards if b[0] >= expected[0] and b[1] >= expected[1] and b != expected]
     if len(larger) > len(boards) / 2:
         (columns, rows), count = Counter(larger).most_common(1)[0]
         raise CalibrationError(

@@ -89,7 +89,7 @@ class CalibrationProblem:
         """(N, 3) points of the target in the guessed shape."""
         return self.points + self.shape.with_values(state.bend).offsets_m
 
-    def stepped(self, state: State, step: BlockStep) -> State:
+    def take_step(self, state: State, step: BlockStep) -> State:
         """Another guess; bounded parameters stop at their bound.
 
         Raises:

@@ -160,7 +160,7 @@ def advice(
     if views < FEW_VIEWS:
         lines.append(f"only {views} views: take {FEW_VIEWS} or more, 25 is good")
     for c, camera in enumerate(rig.cameras):
-        lines += _uncovered(camera, rig, measured[:, c].reshape(-1, 2))
+        lines += _coverage(camera, rig, measured[:, c].reshape(-1, 2))
     adjusted = set() if rig.covariance is None else set(rig.covariance.parameters)
     if any(name.split(".")[1] in _USEFUL for name in adjusted):
         lines += _tilts(rig_from_target)
@@ -172,7 +172,7 @@ def advice(
     return tuple(lines)
 
 
-def _uncovered(camera: str, rig: Rig, pixels: Array) -> list[str]:
+def _coverage(camera: str, rig: Rig, pixels: Array) -> list[str]:
     model = rig.cameras[camera]
     seen = pixels[np.isfinite(pixels).all(axis=1)]
     counts, _, _ = np.histogram2d(

@@ -193,15 +193,15 @@ def _shape_lines(calibration: Calibration) -> Iterator[str]:
     """How the target differs from its drawing, and how much of the noise goes together."""
     shape = calibration.shape
 
-    def stated(name: str, scale: float) -> str:
+    def in_words(name: str, scale: float) -> str:
         number, sigma = shape.value_and_sigma(name)
         return with_sigma(scale * number, scale * sigma)
 
     if shape.parameters:
         yield (
-            f"target: bow over its width {stated(BOW_X, 1e3)} mm, over its height "
-            f"{stated(BOW_Y, 1e3)} mm, twist {stated(TWIST, 1e3)} mm; x over y longer by "
-            f"{stated(STRETCH, 1e2)} %, shear {stated(SHEAR, 1e2)} %"
+            f"target: bow over its width {in_words(BOW_X, 1e3)} mm, over its height "
+            f"{in_words(BOW_Y, 1e3)} mm, twist {in_words(TWIST, 1e3)} mm; x over y longer by "
+            f"{in_words(STRETCH, 1e2)} %, shear {in_words(SHEAR, 1e2)} %"
         )
     yield from marker_lines(shape)
     if calibration.spread is not None:
@@ -248,17 +248,17 @@ def _housing_lines(housing: HousingJudgement) -> list[str]:
 def _camera_lines(rig: Rig, name: str) -> Iterator[str]:
     camera, sigmas = rig.cameras[name], rig.sigmas
 
-    def stated(field: str, unit: str, scale: float = 1.0) -> str:
+    def in_words(field: str, unit: str, scale: float = 1.0) -> str:
         number, sigma = scale * camera.parameter(field), sigmas.get(f"{name}.{field}")
         if sigma is None:
             return f"{number:.6g}{unit} (held)"
         return f"{with_sigma(number, scale * sigma)}{unit}"
 
-    yield f"{name}: focal lengths {stated('fx_px', ' px')}, {stated('fy_px', ' px')}"
+    yield f"{name}: focal lengths {in_words('fx_px', ' px')}, {in_words('fy_px', ' px')}"
     if not camera.port.parameters:
         return
     parts = [
-        label.format(stated(field, " mm", 1e3) if field.endswith("_m") else stated(field, ""))
+        label.format(in_words(field, " mm", 1e3) if field.endswith("_m") else in_words(field, ""))
         for field, label in camera.port.labels.items()
     ]
     if camera.port.tilts:

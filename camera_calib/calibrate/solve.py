@@ -111,7 +111,7 @@ def calibrate(
     adjusted, kept, alive_views = _adjust_without_outliers(
         usable, pixels, points, start, poses, freedom, shape
     )
-    rejections += _rejected(usable, pixels, kept, start, adjusted)
+    rejections += _rejections(usable, pixels, kept, start, adjusted)
     _check_focal(adjusted.rig, adjusted.rig_from_target)
     used = np.where(kept[..., None], pixels, np.nan)[alive_views]
     left_out = np.where(kept[..., None], np.nan, pixels)[alive_views]
@@ -325,12 +325,12 @@ def _alone(
         body_from_rig=None,
         source="first values",
     )
-    wanted = intrinsics(lens)
-    for fields in (PINHOLE, [*PINHOLE, "k1"], wanted):
+    terms = intrinsics(lens)
+    for fields in (PINHOLE, [*PINHOLE, "k1"], terms):
         found = zip(mine, locate_all(rig, mine, points), strict=True)
         located = [(view, pose) for view, pose in found if pose is not None]
         poses = RigidTransform.concatenate([pose for _, pose in located])
-        freedom = Freedom(free=of_cameras(rig, [f for f in fields if f in wanted]))
+        freedom = Freedom(free=of_cameras(rig, [f for f in fields if f in terms]))
         rig = adjust(
             [v for v, _ in located], points, rig, poses, freedom, _ROUGHLY, at_most=_STEPS
         ).rig
@@ -392,7 +392,7 @@ def _adjust_without_outliers(
     kept, alive = measured, np.ones(len(views), dtype=bool)
     blur = np.ones(measured.shape[:2])
     for _ in range(_ROUNDS):
-        trimmed = [_trimmed(view, kept[v], rig) for v, view in enumerate(views) if alive[v]]
+        trimmed = [_trim(view, kept[v], rig) for v, view in enumerate(views) if alive[v]]
         adjusted = adjust(
             trimmed, points, rig, poses, freedom, at_most=_STEPS, blur=blur[alive], shape=shape
         )
@@ -409,7 +409,7 @@ def _adjust_without_outliers(
         _check_enough(int(still.sum()), len(views))
         poses = adjusted.rig_from_target[np.flatnonzero(still[alive])]
         rig, kept, alive, blur, shape = adjusted.rig, fitting, still, found, adjusted.shape
-    trimmed = [_trimmed(view, kept[v], rig) for v, view in enumerate(views) if alive[v]]
+    trimmed = [_trim(view, kept[v], rig) for v, view in enumerate(views) if alive[v]]
     last = adjust(trimmed, points, rig, poses, freedom, blur=blur[alive], shape=shape)
     return last, kept, alive
 
@@ -453,7 +453,7 @@ def _blur(adjusted: Adjustment) -> Array:
     return blur
 
 
-def _trimmed(view: TargetView, kept: Flags, rig: Rig) -> TargetView:
+def _trim(view: TargetView, kept: Flags, rig: Rig) -> TargetView:
     pixels = {
         name: np.where(kept[c, :, None], view.pixels[name], np.nan)
         for c, name in enumerate(rig.cameras)
@@ -465,11 +465,11 @@ def _trimmed(view: TargetView, kept: Flags, rig: Rig) -> TargetView:
 def _lengths(adjusted: Adjustment, pixels: Array, points: Array) -> Array:
     """(V, cameras, N) residual lengths of all measured points, also of those left out; px."""
     missed = residuals_px(adjusted.rig, adjusted.rig_from_target, points, pixels)
-    misses = np.linalg.norm(missed, axis=-1)
-    return np.where(np.isfinite(misses), misses, np.inf)
+    lengths = np.linalg.norm(missed, axis=-1)
+    return np.where(np.isfinite(lengths), lengths, np.inf)
 
 
-def _rejected(
+def _rejections(
     views: Sequence[TargetView], pixels: Array, kept: Flags, rig: Rig, adjusted: Adjustment
 ) -> list[Rejection]:
     """Pictures and points that the adjustment left out."""

@@ -76,20 +76,20 @@ def locate_all(
     """
     guesses = [_guesses(rig, view, points) for view in views]
     found: list[RigidTransform | None] = [None] * len(views)
-    misses = np.full(len(views), np.inf)
+    residuals = np.full(len(views), np.inf)
     for attempt in range(2):
         at = [v for v, guess in enumerate(guesses) if len(guess) > attempt]
         if not at:
             continue
         start = RigidTransform.concatenate([guesses[v][attempt] for v in at])
-        poses, lengths = _refined(rig, [views[v] for v in at], points, start, settled)
+        poses, lengths = _refine(rig, [views[v] for v in at], points, start, settled)
         for i, v in enumerate(at):
-            if lengths[i] < misses[v]:
-                found[v], misses[v] = poses[i], lengths[i]
+            if lengths[i] < residuals[v]:
+                found[v], residuals[v] = poses[i], lengths[i]
     return found
 
 
-def _refined(
+def _refine(
     rig: Rig,
     views: Sequence[TargetView],
     points: Array,
@@ -143,14 +143,14 @@ def _pinhole_poses(tangents: Array, points: Array, centre: Array) -> list[RigidT
     points = points * [1.0, 1.0, 0.0] if planar else points
     flag = cv2.SOLVEPNP_IPPE if planar else cv2.SOLVEPNP_SQPNP
     try:
-        _, turns, shifts, misses = cv2.solvePnPGeneric(
+        _, turns, shifts, residuals = cv2.solvePnPGeneric(
             points, np.ascontiguousarray(tangents), np.eye(3), None, flags=flag
         )
     except cv2.error:
         return []
     poses: list[RigidTransform] = []
-    for turn, shift, miss in zip(turns, shifts, np.ravel(misses), strict=True):
-        clear = poses and miss > _CLEAR * float(np.ravel(misses)[0])
+    for turn, shift, residual in zip(turns, shifts, np.ravel(residuals), strict=True):
+        clear = poses and residual > _CLEAR * float(np.ravel(residuals)[0])
         if not clear and np.all(np.isfinite(turn)) and np.all(np.isfinite(shift)):
             place = shift.ravel() + centre
             poses.append(RigidTransform.from_components(place, Rotation.from_rotvec(turn.ravel())))
@@ -175,23 +175,23 @@ def first_focal_px(pixels: Sequence[Array], points: Array, size: tuple[int, int]
     if not usable:
         raise CalibrationError("no view shows enough of the target to start from")
     middle = np.array(size) / 2.0
-    misses = [
+    residuals = [
         np.mean([_homography_miss(seen - middle, points, share * size[0]) for seen in usable])
         for share in _FOCALS
     ]
-    return float(_FOCALS[int(np.argmin(misses))] * size[0])
+    return float(_FOCALS[int(np.argmin(residuals))] * size[0])
 
 
 def _homography_miss(centred: Array, points: Array, focal_px: float) -> float:
     """Mean squared residual, px^2, of the best pose under one focal length."""
     known = np.isfinite(centred).all(axis=1)
     tangents = centred[known] / focal_px
-    misses = [np.inf]
+    residuals = [np.inf]
     for pose in _pinhole_poses(tangents, points[known], np.zeros(3)):
         cam = pose.apply(points[known])
-        miss = cam[:, :2] / cam[:, 2:] - tangents
-        misses.append(float((miss**2).sum(axis=1).mean()) * focal_px**2)
-    return min(misses)
+        residual = cam[:, :2] / cam[:, 2:] - tangents
+        residuals.append(float((residual**2).sum(axis=1).mean()) * focal_px**2)
+    return min(residuals)
 
 
 def first_cam_from_rig(

@@ -189,7 +189,7 @@ def write_records(path: Path, records: Sequence[CameraRecord]) -> None:
     with atomic_path(path) as temporary:
         if path.suffix.lower() == ".bin":
             temporary.write_bytes(
-                struct.pack("<Q", len(records)) + b"".join(_packed(record) for record in records)
+                struct.pack("<Q", len(records)) + b"".join(_pack(record) for record in records)
             )
         else:
             head = [
@@ -214,7 +214,7 @@ def _digits(value: float) -> str:
     return f"{value:.17g}"
 
 
-def _packed(record: CameraRecord) -> bytes:
+def _pack(record: CameraRecord) -> bytes:
     number, params = MODELS[record.model][0], record.params
     start = struct.pack("<IiQQ", record.camera_id, number, record.width_px, record.height_px)
     end = struct.pack("<i", _NO_REFRACTION)

@@ -33,7 +33,7 @@ _BLUR_PX = 0.8
 _WHITE_NOISE = 4.0 * math.pi * _BLUR_PX**2
 """Variance of white noise over its variance after the blur."""
 _STEPS = 30
-_MAX_PX, _FARTHEST = 1.5, 0.1
+_MAX_PX, _MAX_SHIFT = 1.5, 0.1
 """Largest distance of a corner from its start: the greater of this and of these squares."""
 _NARROWEST_PX, _WIDEST_PX = 0.2, 8.0
 _HALF_PX = 12
@@ -77,13 +77,13 @@ class Corners:
 
     def take(self, order: NDArray[np.intp]) -> Self:
         """These corners in another order."""
-        return self._changed(lambda values: values[order])
+        return self._change(lambda values: values[order])
 
-    def joined(self, more: Self) -> Self:
+    def join(self, more: Self) -> Self:
         """These corners and then more."""
-        return self._changed(lambda *both: np.concatenate(both), more)
+        return self._change(lambda *both: np.concatenate(both), more)
 
-    def _changed(self, change: Callable[..., Any], *others: Self) -> Self:
+    def _change(self, change: Callable[..., Any], *others: Self) -> Self:
         """All fields changed in the same way."""
         names = [field.name for field in fields(self)]
         return replace(
@@ -236,7 +236,7 @@ def _fit_corners(
         best, cost, normal = _descend(window, used, places, edges, shade, x, y, steps[i])
         count = used.sum()
         area = abs(steps[i, 0, 0] * steps[i, 1, 1] - steps[i, 0, 1] * steps[i, 1, 0])
-        farthest = max(_MAX_PX, _FARTHEST * math.sqrt(area))
+        farthest = max(_MAX_PX, _MAX_SHIFT * math.sqrt(area))
         settled = math.hypot(best[0] - x, best[1] - y) < farthest
         if not settled or not _NARROWEST_PX < best[4] < _WIDEST_PX:
             states[i] = NOT_SETTLED

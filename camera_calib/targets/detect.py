@@ -125,7 +125,7 @@ def detect_with_reasons(target: Target, picture: Picture) -> Detection:
         near, why = find_markers_near(target, grey)
     if near is None:
         return Detection(pixels=None, refused=why or _no_chessboard(target, grey))
-    return _refined(target, grey, near)
+    return _refine(target, grey, near)
 
 
 def as_grey(picture: Picture) -> Grey:
@@ -160,11 +160,11 @@ def as_grey(picture: Picture) -> Grey:
 
 def _no_chessboard(target: Target, grey: Grey) -> str:
     """What was found in place of the whole chessboard."""
-    board = largest_chessboard(reduced(grey, SMALL_PX).picture)
+    board = largest_chessboard(reduce_picture(grey, SMALL_PX).picture)
     if board is None:
         return f"no chessboard is found, of {target.columns}x{target.rows} inner corners or another"
-    sides, wanted = sorted(board.shape[:2]), sorted(target.shape)
-    if sides[0] <= wanted[0] and sides[1] <= wanted[1]:
+    sides, expected = sorted(board.shape[:2]), sorted(target.shape)
+    if sides[0] <= expected[0] and sides[1] <= expected[1]:
         return _in_part(target, np.isfinite(board[..., 0]), {})
     return (
         f"a chessboard of {sides[1]}x{sides[0]} inner corners is seen, or a part of one, not one "
@@ -185,9 +185,9 @@ def _in_part(target: Target, seen: NDArray[np.bool_], dropped: Mapping[str, int]
     )
 
 
-def _refined(target: Target, grey: Grey, near: Array) -> Detection:
+def _refine(target: Target, grey: Grey, near: Array) -> Detection:
     """Fit all points, coarse to fine, number them, and leave out what does not fit."""
-    part = reduced(grey, LARGE_PX)
+    part = reduce_picture(grey, LARGE_PX)
     if (part.scale > 1.2).any():
         coarse = _fit(target, part.picture, near / part.scale).pixels * part.scale
         near = np.where(np.isfinite(coarse), coarse, near)
@@ -262,7 +262,7 @@ def _second_look(target: Target, grey: Grey, corners: Corners) -> Corners:
         again = _fit_with(target, grey, near, steps, shrink)
         found = again.states == FITTED
         order = np.where(found, np.arange(len(used)) + len(used), np.arange(len(used)))
-        corners = _without_astray(target, corners.joined(again).take(order))
+        corners = _without_astray(target, corners.join(again).take(order))
     return corners
 
 
@@ -278,7 +278,7 @@ def _last_look(target: Target, grey: Grey, corners: Corners) -> Corners:
     again = _fit_with(target, grey, near, steps, bends=bends)
     found = again.states == FITTED
     order = np.where(found, np.arange(len(used)) + len(used), np.arange(len(used)))
-    return corners.joined(again).take(order)
+    return corners.join(again).take(order)
 
 
 def _without_astray(target: Target, corners: Corners) -> Corners:
@@ -341,12 +341,12 @@ class Reduced:
         return pixels * self.scale
 
 
-def reduced(grey: Grey, max_px: int) -> Reduced:
+def reduce_picture(grey: Grey, max_px: int) -> Reduced:
     """The picture, made so small that its longer side is at most this."""
-    return resized(grey, min(max_px, max(grey.shape)))
+    return resize_picture(grey, min(max_px, max(grey.shape)))
 
 
-def resized(grey: Grey, max_px: int) -> Reduced:
+def resize_picture(grey: Grey, max_px: int) -> Reduced:
     """The picture, made so small or large that its longer side is this."""
     height, width = grey.shape
     scale = max_px / max(height, width)
@@ -365,7 +365,7 @@ def unusable(grey: Grey) -> str | None:
     """Reason why a picture is unusable, if it is."""
     if min(grey.shape) < _MIN_PX:
         return f"only {grey.shape[1]} x {grey.shape[0]} px"
-    low, high = np.percentile(reduced(grey, SMALL_PX).picture, [0.1, 99.9])
+    low, high = np.percentile(reduce_picture(grey, SMALL_PX).picture, [0.1, 99.9])
     if high < _DARK:
         return f"too dark: 99.9 % of its pixels are at most {high:.0f} of 255"
     if high - low < _FLAT:
@@ -391,7 +391,7 @@ def find_chessboard_near(target: Target, grey: Grey) -> Array | None:
 def _chessboard_tries(target: Target, grey: Grey) -> Iterator[Array | None]:
     """Detectors, the fast one first, then more thorough ones."""
     size = (target.columns, target.rows)
-    small, large = reduced(grey, SMALL_PX), reduced(grey, LARGE_PX)
+    small, large = reduce_picture(grey, SMALL_PX), reduce_picture(grey, LARGE_PX)
     found, corners = cv2.findChessboardCornersSB(small.picture, size, flags=0)
     yield small.whole(corners) if found else None
     for part in (small, large) if large.picture.size > small.picture.size else (small,):
@@ -404,7 +404,7 @@ def _chessboard_tries(target: Target, grey: Grey) -> Iterator[Array | None]:
     found, corners = cv2.findChessboardCorners(small.picture, size, flags=classic)
     yield small.whole(corners) if found else None
     if max(grey.shape) > 1.2 * LARGE_PX:
-        whole = reduced(grey, max(grey.shape))
+        whole = reduce_picture(grey, max(grey.shape))
         found, corners = cv2.findChessboardCornersSB(whole.picture, size, flags=0)
         yield whole.whole(corners) if found else None
 
@@ -419,7 +419,7 @@ def find_markers_near(target: Target, grey: Grey) -> tuple[Array | None, str]:
     board, pixels, why = np.empty((0, 2)), np.empty((0, 2)), ""
     sizes = {min(LARGE_PX, side), side} if side > SMALL_PX else {_ENLARGED * side}
     for longest in sorted(sizes):
-        found = _read_markers(target, resized(grey, longest))
+        found = _read_markers(target, resize_picture(grey, longest))
         if len(found[0]) >= len(board):
             board, pixels, why = found
         if len(board) == 4 * len(target.marker_places):
@@ -453,9 +453,9 @@ def _read_markers(target: Target, part: Reduced) -> tuple[Array, Array, str]:
     places = target.marker_places / target.size_m
     once = [i for i in range(len(ids)) if ids[i] < len(places) and np.sum(ids == ids[i]) == 1]
     family = "36h11" if tags else target.dictionary
-    none, wanted = np.empty((0, 2)), f"of the {len(places)} markers of {family}"
+    none, expected = np.empty((0, 2)), f"of the {len(places)} markers of {family}"
     if len(once) < 2:
-        return none, none, f"{len(once)} {wanted} read, 2 are needed"
+        return none, none, f"{len(once)} {expected} read, 2 are needed"
     square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     # Kalibr's tags stand upside down against OpenCV's.
     square = np.roll(square, 2, axis=0) if tags else square * float(target.marker_m or 0.0)
@@ -469,6 +469,6 @@ def _read_markers(target: Target, part: Reduced) -> tuple[Array, Array, str]:
     if agree is not None:
         whole = agree.reshape(-1, 4).all(axis=1)
     if whole.sum() < max(2.0, _AGREED * len(once)):
-        why = f"{len(once)} {wanted} read, but not where the target has them: check its counts"
+        why = f"{len(once)} {expected} read, but not where the target has them: check its counts"
         return none, none, why + (" and layout (legacy?)" if target.kind == "charuco" else "")
     return board[np.repeat(whole, 4)], pixels[np.repeat(whole, 4)], ""

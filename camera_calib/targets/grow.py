@@ -43,8 +43,8 @@ _WEAKEST = 0.1
 """Contrast of a grown corner over the middle one of those near it; a shadow may lie between."""
 _ALIKE_NEAR = 6
 """Known corners whose contrast is compared with."""
-_FEWEST = 9
-_LONGEST = 100
+_MIN_CORNERS = 9
+_MAX_SIDE = 100
 _MIN_SHARE = 0.5
 """Share of the corners that must be fitted."""
 _MIN_OUTER_SHARE = 0.25
@@ -108,7 +108,7 @@ def largest_chessboard(picture: NDArray[np.uint8]) -> Array | None:
 
     NaN where a corner was not found; None: there is none.
     """
-    boards = [_spread(known) for known in _boards(picture, _LONGEST)]
+    boards = [_spread(known) for known in _boards(picture, _MAX_SIDE)]
     return max(boards, key=lambda board: math.prod(board.shape[:2]), default=None)
 
 
@@ -132,7 +132,7 @@ def _boards(picture: NDArray[np.uint8], longest: int) -> Iterator[Places]:
         if np.any(apart < _APART_PX):
             continue
         known = _grow(picture, start, longest)
-        if len(known) >= _FEWEST:
+        if len(known) >= _MIN_CORNERS:
             taken = np.concatenate([taken, np.array(list(known.values()))[:, :2]])
             yield known
 
@@ -244,7 +244,7 @@ def _next_to(picture: NDArray[np.uint8], known: Places, tries: Counter[Place]) -
     Their contrast must alternate as that of the known ones near them. A place is tried a limited
     number of times, counted in `tries`.
     """
-    far = 2 if len(known) >= _FEWEST else 1
+    far = 2 if len(known) >= _MIN_CORNERS else 1
     moves = [(a, b) for a in range(-far, far + 1) for b in range(-far, far + 1)]
     moves = [(a, b) for a, b in moves if abs(a) + abs(b) <= far]
     around = {(x + a, y + b) for x, y in known for a, b in moves} - set(known)
@@ -269,17 +269,17 @@ def _next_to(picture: NDArray[np.uint8], known: Places, tries: Counter[Place]) -
 
 
 def from_neighbours(
-    board: Array, pixels: Array, wanted: Array, others: bool = False
+    board: Array, pixels: Array, places: Array, others: bool = False
 ) -> tuple[Array, Array]:
     """Predict positions of the board's points in the picture, and the size of a square there.
 
-    A homography through all known points, plus a quadratic of its misses near each point: so a lens
-    may bend the board.
+    A homography through all known points, plus a quadratic of its residuals near each point: so a
+    lens may bend the board.
 
     Args:
         board: (M, 2) known points, in squares.
         pixels: (M, 2) their pixels.
-        wanted: (K, 2) points to predict, in squares.
+        places: (K, 2) points to predict, in squares.
         others: ignore a known point at exactly the place of a predicted one.
 
     Returns:
@@ -288,26 +288,26 @@ def from_neighbours(
     """
     homography = _homography(board, pixels)
     if homography is None:
-        return np.full((len(wanted), 2), np.nan), np.full((len(wanted), 2, 2), np.nan)
-    predicted, slopes, _ = through(homography, wanted)
-    misses = pixels - through(homography, board)[0]
-    distance, index = cKDTree(board).query(wanted, k=min(_MAX_NEIGHBOURS, len(board)))
+        return np.full((len(places), 2), np.nan), np.full((len(places), 2, 2), np.nan)
+    predicted, slopes, _ = through(homography, places)
+    residuals = pixels - through(homography, board)[0]
+    distance, index = cKDTree(board).query(places, k=min(_MAX_NEIGHBOURS, len(board)))
     weight = np.exp(-0.5 * (distance / _NEIGHBOUR_WIDTH) ** 2)
     if others:
         weight = np.where(distance < 1e-6, 0.0, weight)
-    x, y = (board[index] - wanted[:, None]).transpose(2, 0, 1)
+    x, y = (board[index] - places[:, None]).transpose(2, 0, 1)
     terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=2)
     weighted = (terms * weight[..., None]).transpose(0, 2, 1)
     normal = weighted @ terms + np.diag([1e-3, *[_STIFFNESS] * 5])
-    change = np.linalg.solve(normal, weighted @ misses[index])
+    change = np.linalg.solve(normal, weighted @ residuals[index])
     return predicted + change[:, 0], slopes + change[:, 1:3].transpose(0, 2, 1)
 
 
 def board_map(board: Array, pixels: Array) -> tuple[Array, Array]:
     """Steps and bends of a board's picture at each of its points, from all of them.
 
-    A homography and a polynomial of its misses, of a degree such that two points or more serve each
-    of its terms, and two lines of points each power of x or y.
+    A homography and a polynomial of its residuals, of a degree such that two points or more serve
+    each of its terms, and two lines of points each power of x or y.
 
     Args:
         board: (M, 2) points, in squares; 4 or more that are not on a line.
