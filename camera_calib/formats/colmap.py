@@ -51,7 +51,7 @@ _Sensor = tuple[int, int, tuple[float, ...]]
 _REFERENCE = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-class _Entry(fields.FileModel):
+class _ConfigCamera(fields.FileModel):
     """A camera of a rig configuration."""
 
     camera_id: int | None = None
@@ -71,7 +71,7 @@ class _Entry(fields.FileModel):
 
 class _RigConfig(fields.FileModel):
     ref_camera_id: int | None = None
-    cameras: list[_Entry]
+    cameras: list[_ConfigCamera]
 
 
 def read_colmap(path: Path, reading: rigs.ReadOptions) -> Rig:
@@ -136,7 +136,7 @@ def write_colmap(path: Path, rig: Rig) -> list[Path]:
             )
             sensors.add_sensor(colmap.sensor_id, rigid)
         entries.append(
-            _Entry(
+            _ConfigCamera(
                 image_prefix=f"{name}/",
                 ref_sensor=True if i == 1 else None,
                 **({} if i == 1 else _pose_values(pose)),
@@ -158,7 +158,7 @@ def write_refractive(path: Path, rig: Rig) -> list[Path]:
     folder, file = _target(path)
     records = [record_of(i, c, port=True) for i, c in enumerate(rig.cameras.values(), start=1)]
     entries = [
-        _Entry(camera_id=i, image_prefix=f"{name}/", **_pose_values(pose)).values()
+        _ConfigCamera(camera_id=i, image_prefix=f"{name}/", **_pose_values(pose)).values()
         for i, (name, pose) in enumerate(rig.cam_from_rig.items(), start=1)
     ]
     write_records(file, records)
@@ -247,7 +247,7 @@ def _from_config_alone(path: Path, reading: rigs.ReadOptions) -> Rig:
     return rigs.assemble(file, reading, "COLMAP", [entry.name for entry in entries], cameras, poses)
 
 
-def _read_config(path: Path) -> list[_Entry]:
+def _read_config(path: Path) -> list[_ConfigCamera]:
     """Cameras of a rig configuration, the reference first."""
     rigs = fields.read_json_values(path)
     if not isinstance(rigs, list) or len(rigs) != 1:
@@ -266,7 +266,7 @@ def _read_config(path: Path) -> list[_Entry]:
     return [references[0], *(entry for entry in rig.cameras if entry is not references[0])]
 
 
-def _lens_of(path: Path, entry: _Entry) -> tuple[str, tuple[float, ...]]:
+def _lens_of(path: Path, entry: _ConfigCamera) -> tuple[str, tuple[float, ...]]:
     model, params = entry.camera_model_name, entry.camera_params
     if model not in MODELS:
         raise CalibrationError(
@@ -277,7 +277,7 @@ def _lens_of(path: Path, entry: _Entry) -> tuple[str, tuple[float, ...]]:
     return model, tuple(params.tolist())
 
 
-def _pose_of(path: Path, entry: _Entry) -> RigidTransform:
+def _pose_of(path: Path, entry: _ConfigCamera) -> RigidTransform:
     if entry.ref_sensor:
         return RigidTransform.identity()
     if entry.turn is None or abs(np.linalg.norm(entry.turn) - 1.0) > 1e-3:

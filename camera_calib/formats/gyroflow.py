@@ -24,7 +24,7 @@ over the width, of distortion terms. Far wider than any calibration."""
 _KNOWN = {FisheyeLens.model: intrinsics("fisheye"), OpenCVLens.model: intrinsics("opencv5")}
 
 
-class _Size(fields.FileModel):
+class _Dimension(fields.FileModel):
     w: fields.Pixels
     h: fields.Pixels
 
@@ -34,8 +34,8 @@ class _Lens(fields.FileModel):
     distortion_coeffs: fields.Numbers
 
 
-class _Profile(fields.FileModel):
-    calib_dimension: _Size
+class _LensProfile(fields.FileModel):
+    calib_dimension: _Dimension
     fisheye_params: _Lens
     distortion_model: Literal["opencv_fisheye", "opencv_standard"] = "opencv_fisheye"
     digital_lens: Any = None
@@ -52,7 +52,7 @@ def read_gyroflow(path: Path, reading: rigs.ReadOptions) -> Rig:
     Raises:
         CalibrationError: a key is missing or wrong, or the camera's software bends the picture.
     """
-    profile = _Profile.check(path, fields.read_json_values(path))
+    profile = _LensProfile.check(path, fields.read_json_values(path))
     if profile.digital_lens:
         raise CalibrationError(
             f"{path}: digital_lens bends the picture (SuperView, HyperView): use another"

@@ -39,7 +39,7 @@ _KINDS: Mapping[str, tuple[type[LensValues], Mapping[str, str]]] = {
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b2")
 
 
-class _Calibration(fields.FileModel):
+class _MetashapeCamera(fields.FileModel):
     projection: Literal["frame", "fisheye", "equidistant_fisheye"]
     width: fields.Pixels
     height: fields.Pixels
@@ -90,7 +90,7 @@ def write_metashape(path: Path, rig: Rig) -> list[Path]:
     """Write a calibration file of one camera."""
     (camera,) = rig.cameras.values()
     kind: Literal["fisheye", "frame"] = "fisheye" if opencv_model.is_fisheye(camera) else "frame"
-    values = _Calibration(
+    values = _MetashapeCamera(
         projection=kind,
         width=camera.width_px,
         height=camera.height_px,
@@ -115,7 +115,7 @@ def _camera(path: Path, element: ET.Element) -> Camera:
     values |= {} if resolution is None else resolution.attrib
     if element.get("type"):
         values["projection"] = element.get("type")
-    found = _Calibration.check(path, values)
+    found = _MetashapeCamera.check(path, values)
     lens, names = _KINDS[found.projection]
     lost = [n for n in _COEFFICIENTS if n not in names and getattr(found, n) != 0.0]
     if lost:

@@ -39,7 +39,7 @@ _OF_BOTH = ("distortion_model", "image_width", "image_height")
 """May be stated once for both."""
 
 
-class _Camera(fields.FileModel):
+class _OpenCVCamera(fields.FileModel):
     camera_matrix: fields.Matrix33
     distortion_coefficients: fields.Numbers | None = None
     distortion_model: str | None = None
@@ -148,7 +148,7 @@ def _camera(
             f"{path}: lacks camera_matrix, or M{number or 1} of a stereo pair: is it a calibration?"
         )
     prefix = f"camera {number}: " if number else ""
-    found = _Camera.check(path, own, prefix)
+    found = _OpenCVCamera.check(path, own, prefix)
     k, model, width, height = (
         found.distortion_coefficients, found.distortion_model, found.image_width,
         found.image_height,
