@@ -267,7 +267,7 @@ def table(modes: Sequence[Mode]) -> str:
     """The parameters of ports and rig in Markdown; the lens's are in the JSON."""
     lines = ["| parameter |", "|---|"]
     for mode in modes:
-        lines[0] += f" {mode.value_and_sigma}: bound | rms / bound | without luck | error / sigma |"
+        lines[0] += f" {mode.known}: bound | rms / bound | without luck | error / sigma |"
         lines[1] += "---|---|---|---|"
     for name in RIG:
         line = f"| {name} |"

@@ -147,8 +147,6 @@ def convert(task: Conversion) -> tuple[str, dict[str, Any]]:
     target = (
         of_target(task.target) if task.target_format is None else format_named(task.target_format)
     )
-    if target.write is None:
-        raise CalibrationError(f"{task.target}: {target.title}s are read only: choose another --to")
     rig = _change(_read(source, task.source, task.reading), task)
     prices: Mapping[str, Residual] = {}
     if task.water is not None:

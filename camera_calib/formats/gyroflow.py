@@ -96,6 +96,10 @@ def _spread(rig: Rig) -> Covariance:
     )
 
 
+def _refuse(path: Path, _: Rig) -> list[Path]:
+    raise CalibrationError(f"{path}: lens profiles are read only: choose another --to")
+
+
 def _owns(path: Path) -> bool:
     return path.suffix.lower() == ".json" and '"fisheye_params"' in fields.read_text(path)
 
@@ -106,5 +110,5 @@ FORMAT = rigs.CalibrationFormat(
     holds=frozenset(),
     owns=_owns,
     read=read_gyroflow,
-    write=None,
+    write=_refuse,
 )

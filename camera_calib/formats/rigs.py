@@ -67,8 +67,7 @@ class CalibrationFormat:
     owns: Callable[[Path], bool]
     """Whether a file or folder is of this format."""
     read: Callable[[Path, ReadOptions], Rig]
-    write: Callable[[Path, Rig], list[Path]] | None
-    """None: it is only read."""
+    write: Callable[[Path, Rig], list[Path]]
     files: Callable[[Path, Rig], list[Path]] = _itself
     """The files that writing a rig to a path would replace."""
     suffix: str = ""
