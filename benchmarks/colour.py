@@ -36,7 +36,7 @@ from benchmarks.colour_peers import grey_world, sea_thru
 from benchmarks.colour_survey import ColourSurvey, card_rows, from_above, write_survey
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
-from reconstruct.mosaic.picture_measures import encoded, linear_table
+from reconstruct.mosaic.picture_measures import encode_srgb, linear_table
 
 PIXEL_M, CELL_PX = 0.004, 4
 OURS = ("raw", "even", "water")
@@ -95,7 +95,7 @@ def judge(mosaic: Path, survey: ColourSurvey, clip: Path) -> Difference:
     known = whole[..., 0]
     found = compared(shown[known].astype(np.float64), wanted[known].astype(np.float64))
     both = np.concatenate([light, true.reshape(rows, columns, 3) * (light.mean() / true.mean())], 1)
-    cv2.imwrite(str(clip), np.clip(encoded(both), 0, 255).astype(np.uint8)[..., ::-1])
+    cv2.imwrite(str(clip), np.clip(encode_srgb(both), 0, 255).astype(np.uint8)[..., ::-1])
     return found
 
 
@@ -117,7 +117,7 @@ def paint(base: Path, survey: ColourSurvey, method: str, folder: Path) -> Path:
         ranges = [np.load(path) for path in sorted(base.glob("range*.npy"))]
         for name, light in zip(survey.images, PEERS[method](pictures, ranges), strict=True):
             bright = light * (_MIDDLE / np.median(light)) if method != "grey world" else light
-            levels = np.clip(np.rint(encoded(bright.astype(np.float32))), 0, 255)
+            levels = np.clip(np.rint(encode_srgb(bright.astype(np.float32))), 0, 255)
             cv2.imwrite(str(folder / "images" / name), levels.astype(np.uint8))
     if method == CARD:
         header = ("image", "x", "y", "radius_px", "red", "green", "blue")

@@ -215,7 +215,7 @@ def run_haltbrekken(work: Path, data: Path, interpreter: str | None, limit_s: fl
 
 def run_brighton(work: Path, data: Path, interpreter: str | None, limit_s: float) -> Findings:
     """Real drone pictures: distance from another tool's cloud."""
-    from reconstruct.evaluate.reference import evaluate_reference, lifted, read_reference
+    from reconstruct.evaluate.reference import evaluate_reference, first_placement, read_reference
     from reconstruct.evaluate.registration import ReferenceSurface, distances, register_cloud
     from reconstruct.views.model import read_frame
 
@@ -243,7 +243,9 @@ def run_brighton(work: Path, data: Path, interpreter: str | None, limit_s: float
     surface = ReferenceSurface.of(read_reference(source / "model.laz", datum)[0])
     theirs, placed = read_reference(out / "dsm.tif", datum)
     rng = np.random.default_rng(1)
-    fit = register_cloud(theirs, surface, lifted(theirs, surface), free_scale=True, rng=rng)
+    fit = register_cloud(
+        theirs, surface, first_placement(theirs, surface), free_scale=True, rng=rng
+    )
     away = distances(fit.reference_from_cloud.apply(theirs), surface, rng)
     median_m = float(np.median(np.abs(away.signed_m)))
     print(f"its elevation model to the reference: median {median_m:.4f} m, "

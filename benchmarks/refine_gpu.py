@@ -31,7 +31,7 @@ import numpy as np
 from alice_survey.app.commands.base import is_gpu_chosen
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
-from reconstruct.dense.refine_depth import ComparedView, Float32, RefinedDepth, prepared, refine
+from reconstruct.dense.refine_depth import ComparedView, Float32, RefinedDepth, prepare, refine
 from reconstruct.views.model import View, scaled_view
 from tests.oracles_dense import Scene, hits, port_view, speckle
 
@@ -74,7 +74,7 @@ def _looked(view: View) -> tuple[ComparedView, Float32]:
     """A picture without noise, and its true depth."""
     points = hits(view, Scene(depth_of=_depth_of, paint=speckle()))
     grey = speckle()(points[..., 0], points[..., 1])[..., 0]
-    contrast, spline, valid = prepared(np.rint(grey).astype(np.uint8), np.ones(grey.shape, bool))
+    contrast, spline, valid = prepare(np.rint(grey).astype(np.uint8), np.ones(grey.shape, bool))
     depth = view.world_from_cam.inv().apply(points.reshape(-1, 3))[:, 2].reshape(grey.shape)
     one = ComparedView(view=view, contrast=contrast, spline=spline, valid=valid)
     return one, depth.astype(np.float32)

@@ -224,7 +224,7 @@ def _make_cube(
         def grow(level: int, points: Records) -> Records:
             if len(points) <= _LEAF_POINTS or grid.bits(level) <= _GRID_BITS:
                 return points
-            divided = grid.divided(level + 1, points)
+            divided = grid.divide(level + 1, points)
             rising = [(child, grow(level + 1, part)) for child, part in divided]
             return grid.shared_out(level, rising, put)
 
@@ -315,7 +315,7 @@ class _OctreeGrid:
         spacing = 2 * half / 2**_GRID_BITS
         return _INFO.pack(*centre, half, spacing, pages_at, pages_size, 0.0, 0.0)
 
-    def divided(self, level: int, points: Records) -> list[tuple[Key, Records]]:
+    def divide(self, level: int, points: Records) -> list[tuple[Key, Records]]:
         """Points by their node at a level."""
         nodes = self._steps(points) >> self.bits(level)
         octant = (nodes & 1) @ np.array([1, 2, 4])
@@ -324,13 +324,13 @@ class _OctreeGrid:
     def shared_out(self, level: int, rising: Sequence[tuple[Key, Records]], put: _Put) -> Records:
         """The points that a node takes from its children, after these are put with the others."""
         points = np.concatenate([part for _, part in rising])
-        taken = self._sampled(level, points)
+        taken = self._sample(level, points)
         stay = np.split(~taken, np.cumsum([len(part) for _, part in rising])[:-1])
         for (child, part), left in zip(rising, stay, strict=True):
             put(level + 1, child, part[left])
         return points[taken]
 
-    def _sampled(self, level: int, points: Records) -> NDArray[np.bool_]:
+    def _sample(self, level: int, points: Records) -> NDArray[np.bool_]:
         """Which points are nearest to the middle of their cell of a node's grid."""
         edge = 1 << (self.bits(level) - _GRID_BITS)
         cells, within = np.divmod(self._steps(points), edge)

@@ -73,18 +73,18 @@ def facing(facing_deg: float, tilt_deg: float) -> Rotation:
     return Rotation.from_matrix(np.stack([np.cross(right, into), right, into]))
 
 
-def chosen_planes(wanted: Sequence[WantedPlane], model: SparseModel) -> tuple[Plane, ...]:
+def chosen_planes(requested: Sequence[WantedPlane], model: SparseModel) -> tuple[Plane, ...]:
     """The planes that settings name, in their order; `auto` is found from the model's points.
 
     Raises:
         ReconstructionError: the model has too few points for `auto`.
     """
-    if model.frame.name == "model" and any(plane.facing_deg is not None for plane in wanted):
+    if model.frame.name == "model" and any(plane.facing_deg is not None for plane in requested):
         warn(
             "the model has no place in the world: the directions that planes face count from its "
             "own first axis"
         )
-    planes = [_plane(one, model) for one in wanted]
+    planes = [_plane(one, model) for one in requested]
     found: list[Plane] = []
     for plane in planes:
         if all(plane.name != other.name for other in found):  # auto may be level too
@@ -92,15 +92,15 @@ def chosen_planes(wanted: Sequence[WantedPlane], model: SparseModel) -> tuple[Pl
     return tuple(found)
 
 
-def _plane(wanted: WantedPlane, model: SparseModel) -> Plane:
-    if wanted.name == AUTO:
+def _plane(requested: WantedPlane, model: SparseModel) -> Plane:
+    if requested.name == AUTO:
         return best_plane(model)
-    if wanted.facing_deg is None:
+    if requested.facing_deg is None:
         return LEVEL_PLANE
-    rotation = facing(wanted.facing_deg, wanted.tilt_deg)
+    rotation = facing(requested.facing_deg, requested.tilt_deg)
     return Plane(
-        name=wanted.name,
-        about=_words(wanted.facing_deg, wanted.tilt_deg),
+        name=requested.name,
+        about=_words(requested.facing_deg, requested.tilt_deg),
         plane_from_world=RigidTransform.from_rotation(rotation),
     )
 
@@ -164,10 +164,10 @@ def fit_plane(points: Array, viewers: Array) -> tuple[Array, Array]:
     Raises:
         ReconstructionError: the points span no plane.
     """
-    spots, edge = _thinned(points)
+    shown, edge = _thin(points)
     band = _BAND_VOXELS * edge
     rng = np.random.default_rng(0)
-    corners = spots[rng.integers(0, max(len(spots), 1), (_TRIALS if len(spots) else 0, 3))]
+    corners = shown[rng.integers(0, max(len(shown), 1), (_TRIALS if len(shown) else 0, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1)
     wide = lengths > edge * edge
@@ -177,15 +177,15 @@ def fit_plane(points: Array, viewers: Array) -> tuple[Array, Array]:
         )
     normals, starts = normals[wide] / lengths[wide, None], corners[wide, 0]
     costs = [
-        float(np.minimum(((spots - start) @ normal) ** 2, band**2).sum())
+        float(np.minimum(((shown - start) @ normal) ** 2, band**2).sum())
         for normal, start in zip(normals, starts, strict=True)
     ]
     best = int(np.argmin(costs))
     normal, middle = normals[best], starts[best]
     for _ in range(_REFINEMENTS):
-        misses = np.abs((spots - middle) @ normal)
-        scatter = MAD_TO_SIGMA * float(np.median(misses[misses <= band]))
-        near = spots[misses <= min(band, max(3.0 * scatter, 1e-3 * band))]
+        residuals = np.abs((shown - middle) @ normal)
+        scatter = MAD_TO_SIGMA * float(np.median(residuals[residuals <= band]))
+        near = shown[residuals <= min(band, max(3.0 * scatter, 1e-3 * band))]
         middle = near.mean(axis=0)
         normal = np.linalg.svd(near - middle, full_matrices=False)[2][2]
     if np.median((viewers - middle) @ normal) < 0:
@@ -193,7 +193,7 @@ def fit_plane(points: Array, viewers: Array) -> tuple[Array, Array]:
     return middle, normal
 
 
-def _thinned(points: Array) -> tuple[Array, float]:
+def _thin(points: Array) -> tuple[Array, float]:
     """One mean point for every voxel, and the voxels' edge."""
     if len(points) < 3:
         return points[:0], 0.0
@@ -206,8 +206,8 @@ def _thinned(points: Array) -> tuple[Array, float]:
     _, voxel = np.unique(np.floor(inside / edge), axis=0, return_inverse=True)
     voxel = voxel.ravel()
     count = np.bincount(voxel)
-    spots = np.stack([np.bincount(voxel, inside[:, k]) for k in range(3)], axis=1)
-    return spots / count[:, None], edge
+    shown = np.stack([np.bincount(voxel, inside[:, k]) for k in range(3)], axis=1)
+    return shown / count[:, None], edge
 
 
 def turned_view(view: View, plane: Plane) -> View:
@@ -217,7 +217,7 @@ def turned_view(view: View, plane: Plane) -> View:
     return replace(view, world_from_cam=plane.plane_from_world * view.world_from_cam)
 
 
-def turned(model: SparseModel, plane: Plane) -> SparseModel:
+def turn_model(model: SparseModel, plane: Plane) -> SparseModel:
     """A model in a plane's frame; unchanged in the level one."""
     if plane.is_level:
         return model
@@ -293,18 +293,20 @@ def read_plane(folder: Path) -> Plane:
     found = PlaneRecord.read_existing(folder / "plane.json")
     if found is None or found.name == LEVEL:
         return LEVEL_PLANE
-    up, right, out = (_ned(axis) for axis in (found.up_enu, found.right_enu, found.out_enu))
+    up, right, out = (
+        _ned_from_enu(axis) for axis in (found.up_enu, found.right_enu, found.out_enu)
+    )
     rotation = Rotation.from_matrix(np.stack([up, right, -out]))
     return Plane(
         name=found.name,
         about=found.about,
         plane_from_world=RigidTransform.from_components(
-            -rotation.apply(_ned(found.origin_enu)), rotation
+            -rotation.apply(_ned_from_enu(found.origin_enu)), rotation
         ),
     )
 
 
-def _ned(enu: Direction) -> Array:
+def _ned_from_enu(enu: Direction) -> Array:
     return np.array([enu[1], enu[0], -enu[2]])
 
 

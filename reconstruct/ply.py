@@ -132,7 +132,7 @@ def _coordinates(rows: NDArray[Any]) -> Array:
 
 def _text(header: PlyHeader, step: int) -> Array:
     names = [name for name, _ in header.fields]
-    wanted = [names.index(axis) for axis in "xyz"]
+    chosen = [names.index(axis) for axis in "xyz"]
     points = []
     with header.path.open("rb") as file:
         file.seek(header.start)
@@ -142,7 +142,7 @@ def _text(header: PlyHeader, step: int) -> Array:
             if len(cells) != len(names):
                 raise _short(header.path, header.count)
             if i % step == 0:
-                points.append([float(cells[column]) for column in wanted])
+                points.append([float(cells[column]) for column in chosen])
     return np.array(points, dtype=np.float64).reshape(-1, 3)
 
 
@@ -166,8 +166,8 @@ def read_header(path: Path) -> PlyHeader:
     lines = [line.decode("ascii", "replace").split() for line in content[:end].splitlines()]
     kind = next((words[1] for words in lines if words[:1] == ["format"] and len(words) > 1), "")
     if kind not in _ORDERS:
-        wanted = ", ".join(_ORDERS)
-        raise WorkspaceError(f"{path}: PLY of the format {as_line(kind)!r}: {wanted} are read")
+        known = ", ".join(_ORDERS)
+        raise WorkspaceError(f"{path}: PLY of the format {as_line(kind)!r}: {known} are read")
     elements = [i for i, words in enumerate(lines) if words[:1] == ["element"]]
     first = lines[elements[0]] if elements else []
     number = first[2] if len(first) == 3 and first[1] == "vertex" else ""

@@ -64,10 +64,10 @@ class DemGrid:
 
     def window(self, row: int, column: int, rows: int, columns: int) -> "DemGrid":
         """A part of the grid, clipped to it only where the caller does."""
-        moved = self.moved(column * self.cell, -row * self.cell)
+        moved = self.translate(column * self.cell, -row * self.cell)
         return replace(moved, rows=rows, columns=columns)
 
-    def moved(self, east: float, north: float) -> "DemGrid":
+    def translate(self, east: float, north: float) -> "DemGrid":
         """The same cells, in coordinates in which they lie elsewhere."""
         return replace(self, west=self.west + east, north=self.north + north)
 

@@ -305,7 +305,7 @@ def match(left: NDArray[np.uint8], right: NDArray[np.uint8], disparities_px: int
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )
     fixed = matcher.compute(left, right)
-    disparity = unrounded(fixed) / np.float32(_STEPS)
+    disparity = undo_rounding(fixed) / np.float32(_STEPS)
     at_end = (disparity < 1) | (disparity > disparities_px - 2)  # the true one may lie beyond
     return np.where(at_end | ~has_texture(left), np.float32(np.nan), disparity)
 
@@ -322,7 +322,7 @@ def has_texture(grey: NDArray[np.uint8]) -> NDArray[np.bool_]:
     return np.asarray(mean >= _MIN_SLOPE)
 
 
-def unrounded(fixed: NDArray[np.int16]) -> Float32:
+def undo_rounding(fixed: NDArray[np.int16]) -> Float32:
     """The mean value, in steps of 1/16 px, of what OpenCV rounds to each step.
 
     OpenCV adds half a step to the offset from the best whole disparity and truncates towards
@@ -384,7 +384,7 @@ def pair_depth(
     return PartnerDepth(depth=depth, focal_baseline=pair.focal_px * pair.baseline)
 
 
-def enlarged(depth: Float32, size_px: tuple[int, int]) -> Float32:
+def enlarge(depth: Float32, size_px: tuple[int, int]) -> Float32:
     """Depth, or a standard deviation of it, (H, W) on a picture of a larger size.
 
     Between four known pixels it is bilinear in the inverse, in which a plane is linear; next to an
@@ -470,7 +470,7 @@ def merge_depths(
 
 
 @compiled(error_model="numpy", fastmath=FAST)
-def count_witnesses(
+def count_confirming(
     depth: Float32,
     sigma: Float32,
     slopes: Float32,

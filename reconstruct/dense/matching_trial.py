@@ -91,7 +91,7 @@ def pixels_of(view: View) -> int:
     return view.pinhole.width_px * view.pinhole.height_px
 
 
-def probed(partners: Sequence[Sequence[int]]) -> list[int]:
+def choose_probes(partners: Sequence[Sequence[int]]) -> list[int]:
     """A few views with partners, spread over the survey."""
     able = [number for number, found in enumerate(partners) if found]
     return able[:: max(1, len(able) // _PROBES)][:_PROBES]
@@ -117,7 +117,7 @@ def find_scales(
         finest: scale of depth where pictures are clear.
         executor: where tasks run.
     """
-    chosen = probed(partners)
+    chosen = choose_probes(partners)
     tasks = [
         ((views[number], *(views[n] for n in partners[number])), points_of(number))
         for number in chosen
@@ -143,14 +143,14 @@ def match_sigma(spreads: Sequence[float]) -> float:
     return round(float(np.clip(sigma, *_SIGMA_LIMITS_PX)), 3)
 
 
-def shrunk(
+def shrink(
     pictures: Pictures, image: str, size_px: tuple[int, int]
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Colour and validity of a picture at a size (width, height)."""
-    return resized(pictures.colour(image), pictures.valid(image), size_px)
+    return resize(pictures.colour(image), pictures.valid(image), size_px)
 
 
-def resized(
+def resize(
     colour: NDArray[np.uint8], valid: NDArray[np.bool_], size_px: tuple[int, int]
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """A picture and its validity at a size (width, height), no larger: valid where all of it is."""
@@ -194,7 +194,7 @@ def _looks(workspace: Path, view: View, scales: Sequence[float]) -> list[Look]:
     found = []
     for scale in scales:
         small = scaled_view(view, scale)
-        part, usable = resized(colour, valid, small.pinhole.size_px)
+        part, usable = resize(colour, valid, small.pinhole.size_px)
         found.append((normalise(part), usable))
     return found
 

@@ -290,7 +290,7 @@ def still_depth(look: Look, others: Sequence[Look]) -> Float32:
             stack[k],
         )
     stations = np.array([other.view.station for other in others], np.int64)
-    return agreed(stack, stations, _SAME_DEPTH)
+    return shared_depth(stack, stations, _SAME_DEPTH)
 
 
 @compiled(error_model="numpy", fastmath=FAST)
@@ -339,7 +339,7 @@ def draw(
 
 
 @compiled
-def agreed(stack: Float32, stations: NDArray[np.int64], tolerance: float) -> Float32:
+def shared_depth(stack: Float32, stations: NDArray[np.int64], tolerance: float) -> Float32:
     """The nearest depth of each cell that views of two or more stations share.
 
     Args:

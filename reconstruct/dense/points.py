@@ -186,7 +186,7 @@ def _widen(bounds: Array, chosen: NDArray[np.bool_], world: Array) -> None:
                 i += 1
 
 
-def joined(parts: list[Points]) -> Points:
+def join_points(parts: list[Points]) -> Points:
     """Points of several views as one."""
     empty = np.empty((0, 3), np.float32)
     none = Points(
@@ -309,12 +309,12 @@ def _normal(
     left, right = column - _REACH, column + _REACH
     if up < 0 or left < 0 or down >= depth.shape[0] or right >= depth.shape[1]:
         return 0.0
-    _spot(depth, slopes, row, right, a)
-    _spot(depth, slopes, row, left, normal)
+    _write_point(depth, slopes, row, right, a)
+    _write_point(depth, slopes, row, left, normal)
     for k in range(3):
         a[k] -= normal[k]
-    _spot(depth, slopes, down, column, b)
-    _spot(depth, slopes, up, column, normal)
+    _write_point(depth, slopes, down, column, b)
+    _write_point(depth, slopes, up, column, normal)
     for k in range(3):
         b[k] -= normal[k]
     n0 = b[1] * a[2] - b[2] * a[1]
@@ -325,7 +325,7 @@ def _normal(
 
 
 @compiled(error_model="numpy", fastmath=FAST)
-def _spot(depth: Float32, slopes: Float32, row: int, column: int, spot: Array) -> None:
-    """Write the point (3,) of a pixel, in the camera, into `spot`; NaN where unknown."""
+def _write_point(depth: Float32, slopes: Float32, row: int, column: int, point: Array) -> None:
+    """Write the point (3,) of a pixel, in the camera, into `point`; NaN where unknown."""
     z = depth[row, column]
-    spot[0], spot[1], spot[2] = slopes[row, column, 0] * z, slopes[row, column, 1] * z, z
+    point[0], point[1], point[2] = slopes[row, column, 0] * z, slopes[row, column, 1] * z, z

@@ -79,7 +79,7 @@ class ComparedView:
     """(H, W) which pixels may be used."""
 
 
-def prepared(
+def prepare(
     grey: NDArray[np.uint8], valid: NDArray[np.bool_]
 ) -> tuple[Float32, Float32, NDArray[np.bool_]]:
     """Contrast, spline and validity of a picture (H, W), as `ComparedView` has them."""
@@ -238,7 +238,7 @@ class Device(Protocol):
     def run(self, kernel: Callable[..., None], shape: tuple[int, ...], *arguments: Any) -> None:
         """Run a kernel that takes its share of (H, W) pixels, then these arguments."""
 
-    def blurred(self, planes: Any, sigma_px: float) -> Any:
+    def blur(self, planes: Any, sigma_px: float) -> Any:
         """Planes (N, H, W), each as `_blur` gives it."""
 
 
@@ -257,7 +257,7 @@ class _Processor:
     def run(self, kernel: Callable[..., None], _: tuple[int, ...], *arguments: Any) -> None:
         kernel(ALL, *arguments)
 
-    def blurred(self, planes: Any, sigma_px: float) -> Any:
+    def blur(self, planes: Any, sigma_px: float) -> Any:
         for plane in planes:
             plane[:] = _blur(plane, sigma_px)
         return planes
@@ -349,7 +349,7 @@ def _refine_band(
 ) -> RefinedDepth:
     inverse = (1.0 / depth).astype(np.float32)
     first = _sums_of(one, inverse, others, spare)
-    moved, step_px = _stepped(inverse, first)
+    moved, step_px = _step(inverse, first)
     sums = first
     far = (step_px > _CONVERGED_PX).astype(np.uint8)
     if far.any():  # elsewhere a second round would change little
@@ -357,8 +357,8 @@ def _refine_band(
         part = np.where(cv2.dilate(far, window) > 0, moved, np.float32(np.nan))
         second = _sums_of(one, part, others, spare)
         again = np.isfinite(part) & (second.curvature > 0)
-        sums = _chosen(again, second, first)
-        moved = np.where(again, _stepped(part, second)[0], moved)
+        sums = _choose(again, second, first)
+        moved = np.where(again, _step(part, second)[0], moved)
     alike = (sums.curvature > 0) & (sums.likeness >= _ALIKE)
     kept = alike & _has_step(inverse, first.speed)
     unknown = np.float32(np.nan)
@@ -380,12 +380,12 @@ def _has_step(inverse: Float32, speed: Float32) -> NDArray[np.bool_]:
     return np.asarray(known & ((high - low) * speed > _STEP_PX))
 
 
-def _chosen(mask: NDArray[np.bool_], yes: _NeighbourSums, no: _NeighbourSums) -> _NeighbourSums:
+def _choose(mask: NDArray[np.bool_], yes: _NeighbourSums, no: _NeighbourSums) -> _NeighbourSums:
     names = [field.name for field in fields(yes)]
     return _NeighbourSums(**{n: np.where(mask, getattr(yes, n), getattr(no, n)) for n in names})
 
 
-def _stepped(inverse: Float32, sums: _NeighbourSums) -> tuple[Float32, Float32]:
+def _step(inverse: Float32, sums: _NeighbourSums) -> tuple[Float32, Float32]:
     """Inverse depths moved to where the pictures agree best, and by how many pixels at most.
 
     Where little pulls they are held back, by a prior of one pixel's deviation along the longest
@@ -409,7 +409,7 @@ def _sums_of(
     if not spare or unseen.mean() < _MIN_UNSEEN:
         return sums
     alone = _sums(one, np.where(unseen, inverse, np.float32(np.nan)), spare)
-    return _chosen(unseen, alone, sums)
+    return _choose(unseen, alone, sums)
 
 
 def _sums(one: _Reference, inverse: Float32, others: Sequence[_Look]) -> _NeighbourSums:
@@ -432,7 +432,7 @@ def _sums(one: _Reference, inverse: Float32, others: Sequence[_Look]) -> _Neighb
         used = device.put(known)
         products, outlying = device.empty(6, *shape), noise * np.float32(_OUTLYING)
         device.run(weigh, shape, there, slope, used, outlying, products)
-        products = device.blurred(products, WINDOW_SIGMA_PX)
+        products = device.blur(products, WINDOW_SIGMA_PX)
         device.run(add, shape, products, one.spread, fast, used, noise, samples, *totals)
     pull, curvature, speed, likeness, seen = map(device.get, totals)
     with np.errstate(invalid="ignore"):

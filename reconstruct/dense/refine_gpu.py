@@ -79,9 +79,9 @@ class _Gpu:
         return cuda.device_array(shape, np.float32)
 
     def run(self, kernel: Callable[..., None], shape: tuple[int, ...], *arguments: Any) -> None:
-        launched(kernel)[grid_of(shape)](arguments)
+        launcher(kernel)[grid_of(shape)](arguments)
 
-    def blurred(self, planes: Any, sigma_px: float) -> Any:
+    def blur(self, planes: Any, sigma_px: float) -> Any:
         side = 2 * round(_REACH_SIGMAS * sigma_px) + 1
         weights = cuda.to_device(cv2.getGaussianKernel(side, sigma_px, cv2.CV_32F)[:, 0])
         between = cuda.device_array_like(planes)
@@ -97,7 +97,7 @@ def grid_of(shape: tuple[int, ...]) -> tuple[tuple[int, int], tuple[int, int]]:
 
 
 @cache
-def launched(kernel: Callable[..., None]) -> Any:
+def launcher(kernel: Callable[..., None]) -> Any:
     """A kernel that takes a share of the pixels, for the GPU: each thread has its own.
 
     It is compiled without the options of the processor's, which numba-cuda would take as leave to

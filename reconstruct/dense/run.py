@@ -35,11 +35,11 @@ from reconstruct.dense.dem import (
 from reconstruct.dense.matching_trial import (
     CELL_PIXELS,
     Scales,
+    choose_probes,
     find_scales,
     ground_pixel,
     matching_scale,
     pixels_of,
-    probed,
     scale_for_cell,
 )
 from reconstruct.dense.moving import COMPARED, clear_moving, keep_look, mask_moving, show_moving
@@ -280,7 +280,7 @@ def project_tile(
     up = _middle_up(setup, plane)
     origin = np.array([grid.west, grid.north, up])
     surface = on_plane(setup, tiles, plane, origin)
-    cells = cells_over(grid.moved(-grid.west, -grid.north), surface)
+    cells = cells_over(grid.translate(-grid.west, -grid.north), surface)
     cells = cells.without(~without_strays(cells.height))
     height, sigma = fill_gaps(cells.height, cells.sigma, FILL_CELLS, grid.cell)
     bands = {
@@ -332,7 +332,7 @@ def _write_rasters(
 
 _PARTNERS = 4
 """Pictures that each is matched with."""
-_WITNESSES = 8
+_CHECKING = 8
 """Neighbouring views that a view's depth is checked against."""
 
 
@@ -364,7 +364,7 @@ def run_dense(
     prepare = partial(prepare_view, workspace)
     _drain(executor.map(prepare, tasks([()] * len(views)), label="even out pictures"))
     to_match = tasks(partners)
-    probes = [(to_match[n], points.of(n)) for n in probed(partners)]
+    probes = [(to_match[n], points.of(n)) for n in choose_probes(partners)]
     match_sigma_px = find_match_sigma(matching, probes, executor)
     match = partial(view_depth, matching, match_sigma_px)
     matched = ((task, points.of(task.index)) for task in to_match)
@@ -372,7 +372,7 @@ def run_dense(
     looks = [looked_at(views, n, chosen) for n, chosen in enumerate(partners)]
     refine = partial(refine_view, matching, on_gpu=executor.uses_gpu)
     _drain(executor.map(refine, tasks(looks), label="refine"))
-    checks = tasks(neighbours(model, _WITNESSES))
+    checks = tasks(neighbours(model, _CHECKING))
     sigma_factor = find_sigma_factor(checks, executor)
     check = partial(check_view, sigma_factor)
     nodes, samples = zip(*executor.map(check, checks, label="cross-check"), strict=True)
@@ -444,9 +444,9 @@ def _scales(
 ) -> Scales:
     """As settings want them; what they leave open is tried out."""
     if reconstruct.dense_scale is not None:
-        wanted = reconstruct.dense_scale
-        smallest = min(matching_scale(pixels_of(view), wanted) for view in model.views)
-        return Scales(depth=wanted, matching=smallest)
+        requested = reconstruct.dense_scale
+        smallest = min(matching_scale(pixels_of(view), requested) for view in model.views)
+        return Scales(depth=requested, matching=smallest)
     finest = scale_for_cell(reconstruct.dem_cell_m, ground_pixel(model.views, points.of))
     return find_scales(workspace, model.views, partners, points.of, finest, executor)
 

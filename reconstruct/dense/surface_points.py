@@ -196,14 +196,14 @@ def robust_height(
             median_at = i
             break
     median = heights[median_at]
-    misses = np.empty(heights.size, np.float32)
+    residuals = np.empty(heights.size, np.float32)
     for i in range(heights.size):
-        misses[i] = abs(heights[i] - median)
-    ranks = sorted_ranks(misses)
+        residuals[i] = abs(heights[i] - median)
+    ranks = sorted_ranks(residuals)
     middle = heights.size // 2
-    scatter = MAD_TO_SIGMA * misses[ranks[middle]]
+    scatter = MAD_TO_SIGMA * residuals[ranks[middle]]
     if heights.size % 2 == 0:
-        scatter = 0.5 * (scatter + MAD_TO_SIGMA * misses[ranks[middle - 1]])
+        scatter = 0.5 * (scatter + MAD_TO_SIGMA * residuals[ranks[middle - 1]])
     reach = gate * max(scatter, sigmas[median_at])
     total, weights, squares = 0.0, 0.0, 0.0
     formal, in_view, view_weight, seen, last_view = 0.0, 0, 0.0, 0, -1
@@ -487,7 +487,7 @@ def fuse_cells(
     )  # fmt: skip
 
 
-def settled(surface: NDArray[Any], cell: float, low: Array, high: Array) -> NDArray[Any]:
+def settle(surface: NDArray[Any], cell: float, low: Array, high: Array) -> NDArray[Any]:
     """Leave out small parts of a surface, and raise sigmas at rims and where neighbours contradict.
 
     The squared distance of neighbours from a point's tangent plane, beyond the variance of both,

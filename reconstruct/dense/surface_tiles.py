@@ -27,8 +27,8 @@ from alice_survey.core.compiled import compiled
 from alice_survey.core.errors import warn
 from alice_survey.core.frames import Array
 from alice_survey.core.run import progress
-from reconstruct.dense.points import EDGE_ON, Points, joined, part_in_box, points_in_box
-from reconstruct.dense.surface_points import PART_REACH_CELLS, SURFACE_POINT, fuse_surface, settled
+from reconstruct.dense.points import EDGE_ON, Points, join_points, part_in_box, points_in_box
+from reconstruct.dense.surface_points import PART_REACH_CELLS, SURFACE_POINT, fuse_surface, settle
 from reconstruct.dense.view_store import StoredDepth, ViewStore
 from reconstruct.planes import Plane
 from reconstruct.raster import DemGrid, tiles_reached
@@ -311,18 +311,18 @@ def _corners(grid: DemGrid) -> tuple[Array, Array]:
 def fuse_tile(setup: FuseSetup, task: FuseTask) -> SurfaceTile:
     """Fuse the points of all views in a tile, and keep them in the store."""
     offset = np.array(setup.offset_enu)
-    grid = task.grid.moved(-offset[0], -offset[1])
+    grid = task.grid.translate(-offset[0], -offset[1])
     low, high = _corners(grid)
     rim = _RIM_CELLS * grid.cell
     points = _points_over(setup, task, offset, (low - rim, high + rim))
     origin = np.array([grid.west, grid.north, 0.0])
     surface = fuse_surface(points, setup.stations, grid.cell, origin, setup.shared)
     surface = surface[~_seen_through(setup, task, offset, surface)]
-    surface = settled(surface, grid.cell, low - rim, high + rim)
+    surface = settle(surface, grid.cell, low - rim, high + rim)
     place = surface["enu"][:, :2].astype(np.float64)
     surface = surface[((place >= low) & (place < high)).all(axis=1)]
     enu = surface["enu"] + offset
-    ned, normals = (_swapped(one) for one in (enu, surface["normal"].astype(np.float64)))
+    ned, normals = (_swap_axes(one) for one in (enu, surface["normal"].astype(np.float64)))
     if task.poses is not None and len(surface):
         surface["shared"] = task.poses.at(ned, normals, _RIM_CELLS * grid.cell)
     setup.store.save(task.number, _NAME, surface)
@@ -340,7 +340,7 @@ def fuse_tile(setup: FuseSetup, task: FuseTask) -> SurfaceTile:
     return SurfaceTile(number=task.number, count=len(surface), corners_enu=corners, bounds=bounds)
 
 
-def _swapped(enu: Array) -> Array:
+def _swap_axes(enu: Array) -> Array:
     """North, east, down of east, north, up, or the other way round."""
     swapped: Array = enu[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
     return swapped
@@ -353,17 +353,17 @@ def on_plane(
     surface = np.concatenate(
         [np.empty(0, SURFACE_POINT), *(tile.points(setup.store) for tile in tiles)]
     )
-    ned = _swapped(surface["enu"] + np.array(setup.offset_enu))
-    turned = plane.plane_from_world.rotation.apply(_swapped(surface["normal"].astype(np.float64)))
-    surface["enu"] = _swapped(plane.plane_from_world.apply(ned)) - origin
-    surface["normal"] = _swapped(turned)
+    ned = _swap_axes(surface["enu"] + np.array(setup.offset_enu))
+    turned = plane.plane_from_world.rotation.apply(_swap_axes(surface["normal"].astype(np.float64)))
+    surface["enu"] = _swap_axes(plane.plane_from_world.apply(ned)) - origin
+    surface["normal"] = _swap_axes(turned)
     return surface
 
 
 def boxes_on(tiles: Sequence[SurfaceTile], plane: Plane) -> Array:
     """(T, 4) least and most right and up in a plane of the points of tiles; NaN of none."""
     corners = np.concatenate([tile.corners_enu for tile in tiles])
-    places = _swapped(plane.plane_from_world.apply(_swapped(corners)))[:, :2].reshape(-1, 8, 2)
+    places = _swap_axes(plane.plane_from_world.apply(_swap_axes(corners)))[:, :2].reshape(-1, 8, 2)
     return np.concatenate([places.min(axis=1), places.max(axis=1)], axis=1)
 
 
@@ -416,4 +416,4 @@ def _points_over(
                 part,
             )
         )
-    return joined(found)
+    return join_points(found)

@@ -92,7 +92,7 @@ class ViewStore:
         self, view: int, name: str, part: Part = WHOLE
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Depth (H, W) and its standard deviation, NaN where unknown."""
-        return decoded(self.stored_depth(view, name, part))
+        return decode_depth(self.stored_depth(view, name, part))
 
     def save_colour(self, view: int, colour: NDArray[np.uint8]) -> None:
         """Keep a picture (H, W, 3) BGR: brightness in full, colour at half the resolution."""
@@ -132,13 +132,13 @@ class ViewStore:
         return bits[:, columns].astype(np.bool_)
 
 
-def stored(depth: NDArray[np.float32], sigma: NDArray[np.float32]) -> StoredDepth:
+def encode_depth(depth: NDArray[np.float32], sigma: NDArray[np.float32]) -> StoredDepth:
     """Depth (H, W) and its standard deviation as a store keeps them."""
     level, share, (minimum, step) = _codes(depth, sigma)
     return level, share, _depths(float(minimum), float(step)), _shares()
 
 
-def decoded(depth: StoredDepth) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def decode_depth(depth: StoredDepth) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Depth (H, W) and its standard deviation, NaN where unknown."""
     level, share, depths, shares = depth
     found = depths[level]

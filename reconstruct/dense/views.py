@@ -23,14 +23,14 @@ from reconstruct.dense.depth import (
     GATE_SIGMAS,
     Look,
     PartnerDepth,
-    count_witnesses,
-    enlarged,
+    count_confirming,
+    enlarge,
     merge_depths,
     pair_depth,
 )
-from reconstruct.dense.matching_trial import match_sigma, resized, shrunk, spread
+from reconstruct.dense.matching_trial import match_sigma, resize, shrink, spread
 from reconstruct.dense.points import block_bounds, points_of_pixels
-from reconstruct.dense.refine_depth import ComparedView, prepared, refine
+from reconstruct.dense.refine_depth import ComparedView, prepare, refine
 from reconstruct.dense.stereo_pairs import in_frame
 from reconstruct.dense.surface_tiles import ViewSummary
 from reconstruct.dense.view_store import ViewStore
@@ -84,7 +84,7 @@ def prepare_view(workspace: Path, task: ViewTask) -> None:
     if store.has(task.index, "low"):
         return
     size_px = view.pinhole.size_px
-    colour, valid = shrunk(Pictures.open(workspace), view.image, size_px)
+    colour, valid = shrink(Pictures.open(workspace), view.image, size_px)
     store.save_colour(task.index, colour)
     store.save_mask(task.index, "valid", valid)
     store.save(task.index, "low", low_pass(colour, valid))
@@ -94,23 +94,23 @@ Size = tuple[int, int]
 """Width and height of a picture."""
 
 
-def _shown(store: ViewStore, index: int, kept_px: Size, size_px: Size) -> Look:
+def _brightness(store: ViewStore, index: int, kept_px: Size, size_px: Size) -> Look:
     """Brightness of a picture and which of its pixels may be used, at a size."""
     valid = store.load_mask(index, "valid", kept_px[0])
-    return resized(store.load_bright(index), valid, size_px)
+    return resize(store.load_bright(index), valid, size_px)
 
 
 @lru_cache(maxsize=8)
-def _evened(store: ViewStore, index: int, kept_px: Size, size_px: Size) -> Look:
+def _even_picture(store: ViewStore, index: int, kept_px: Size, size_px: Size) -> Look:
     """A picture of even light and contrast, at a size."""
-    bright, valid = _shown(store, index, kept_px, size_px)
+    bright, valid = _brightness(store, index, kept_px, size_px)
     return normalise(bright), valid
 
 
 @lru_cache(maxsize=8)
 def _look(store: ViewStore, index: int, kept_px: Size, size_px: Size) -> tuple[NDArray[Any], ...]:
     """Contrast, spline and validity of a picture, at a size."""
-    return prepared(*_shown(store, index, kept_px, size_px))
+    return prepare(*_brightness(store, index, kept_px, size_px))
 
 
 def find_match_sigma(
@@ -159,7 +159,7 @@ def _pair_depths(scale: float, task: ViewTask, points_world: Array) -> list[Part
         for number, view in ((task.index, task.view), *task.others)
     ]
     looks = (
-        _evened(store, number, view.pinhole.size_px, small.pinhole.size_px)
+        _even_picture(store, number, view.pinhole.size_px, small.pinhole.size_px)
         for number, view, small in every
     )
     look, reference = next(looks), every[0][2]
@@ -198,7 +198,7 @@ def view_depth(scale: float, match_sigma_px: float, matched: tuple[ViewTask, Arr
     store.drop(task.index, "apart.scales")
 
 
-def _compared(store: ViewStore, scale: float, number: int, view: View) -> ComparedView:
+def _compared_view(store: ViewStore, scale: float, number: int, view: View) -> ComparedView:
     small = scaled_view(view, scale)
     shown = _look(store, number, view.pinhole.size_px, small.pinhole.size_px)
     contrast, spline, valid = shown
@@ -237,15 +237,15 @@ def refine_view(scale: float, task: ViewTask, *, on_gpu: bool = False) -> None:
     else:
         refined_by = refine
     for factor in refining_scales(scale):
-        reference = _compared(store, factor, task.index, task.view)
-        depth, sigma = (enlarged(of, reference.view.pinhole.size_px) for of in (depth, sigma))
+        reference = _compared_view(store, factor, task.index, task.view)
+        depth, sigma = (enlarge(of, reference.view.pinhole.size_px) for of in (depth, sigma))
         start = depth
         refined = refined_by(
             reference,
             depth,
             sigma,
-            [_compared(store, factor, *other) for other in first],
-            [_compared(store, factor, *other) for other in spare],
+            [_compared_view(store, factor, *other) for other in first],
+            [_compared_view(store, factor, *other) for other in spare],
         )
         depth, sigma = refined.depth, refined.sigma
     agreeing = np.asarray(store.load(task.index, "agreeing"))
@@ -323,7 +323,7 @@ def check_view(sigma_factor: float, task: ViewTask) -> tuple[Array, int]:
     slopes = slopes_of(depth, view.kernel_lens)
     for number, other in task.others:
         other_from_ref = other.world_from_cam.inv() * view.world_from_cam
-        seen, through = count_witnesses(
+        seen, through = count_confirming(
             depth,
             sigma,
             slopes,
@@ -400,13 +400,13 @@ def _shared_light(
     step = max(1, task.view.pinhole.width_px // _LIGHT_LATTICE)
     chosen = np.zeros_like(kept)
     chosen[::step, ::step] = kept[::step, ::step]
-    spots = points_of_pixels(task.view, depth, chosen)
+    ground = points_of_pixels(task.view, depth, chosen)
     here = (np.argwhere(chosen)[:, ::-1] + 0.5) / task.view.pinhole.size_px
     own = np.asarray(task.store.load(task.index, "low"))
     parts = []
     for number, other in task.others:
-        seen = in_frame(other, spots)
-        there = other.project(spots[seen]) / other.pinhole.size_px
+        seen = in_frame(other, ground)
+        there = other.project(ground[seen]) / other.pinhole.size_px
         parts.append(
             compare_light(
                 (task.index, number),

@@ -31,7 +31,7 @@ from alice_survey.kit.figure import (
     save_figure,
 )
 from reconstruct.evaluate.elevation import Elevation, enu_from_enu, read_elevation
-from reconstruct.evaluate.figures import rms, rounded
+from reconstruct.evaluate.figures import json_number, rms
 from reconstruct.evaluate.registration import HeightFit, refine_heights, register_heights
 from reconstruct.raster import DemGrid, hillshade, tiled_raster
 
@@ -42,7 +42,7 @@ _WINDOW = 7
 """Cells a side of the square in which most must have changed significantly, the same way."""
 _RING = 3
 """Cells a changed place grows by at a time, while the ring around it has changed on average."""
-_FARTHEST = 120
+_MAX_GROWTH = 120
 """Cells it may grow by."""
 _RING_SIGMAS = 2.0
 _REGION_SIGMAS = 3.0
@@ -108,12 +108,12 @@ class Change:
             "lost": _total(lost),
             "regions": [_region(region) for region in self.regions],
             "unchanged": {
-                "share_significant": rounded(float(np.mean(np.abs(ratio) > SIGNIFICANT)), 4),
-                "difference_over_sigma_rms": rounded(rms(ratio), 3),
-                "median_mm": rounded(float(np.median(level)), 4),
-                "robust_sigma_mm": rounded(MAD_TO_SIGMA * float(np.median(np.abs(level))), 4),
-                "registration_sigma_mm": rounded(1e3 * self.registration_sigma, 4),
-                "errors_go_together_over_mm": rounded(1e3 * float(np.sqrt(self.noise_area)), 2),
+                "share_significant": json_number(float(np.mean(np.abs(ratio) > SIGNIFICANT)), 4),
+                "difference_over_sigma_rms": json_number(rms(ratio), 3),
+                "median_mm": json_number(float(np.median(level)), 4),
+                "robust_sigma_mm": json_number(MAD_TO_SIGMA * float(np.median(np.abs(level))), 4),
+                "registration_sigma_mm": json_number(1e3 * self.registration_sigma, 4),
+                "errors_go_together_over_mm": json_number(1e3 * float(np.sqrt(self.noise_area)), 2),
             },
         }
 
@@ -160,14 +160,14 @@ def find_change(now: Elevation, before: Elevation, fit: HeightFit) -> Change:
         own, other = now.sigma[row, columns], before.at(before.sigma, there[:, :2])
         sigma[row, columns] = np.sqrt(own**2 + other**2 + registration[row, columns] ** 2)
     difference = np.where(np.isfinite(sigma), difference, np.nan)
-    labels = _changed(difference / sigma)
+    labels = _label_changes(difference / sigma)
     noise_area = _noise_area(difference, sigma, labels == 0, now.cell)
     regions, changed = [], np.zeros(shape, dtype=np.bool_)
     maps = _Maps(difference, sigma, registration)
     for label, box in enumerate(find_objects(labels), 1):
-        window = _padded(box, shape)
+        window = _pad(box, shape)
         free = (labels[window] == 0) & ~changed[window]
-        inside = _followed(labels[window] == label, free, maps.part(window), now.cell, noise_area)
+        inside = _follow(labels[window] == label, free, maps.part(window), now.cell, noise_area)
         region = _measure(inside, maps.part(window), window, now, noise_area)
         if abs(region.volume_m3) > _REGION_SIGMAS * region.sigma_m3:
             regions.append(region)
@@ -183,7 +183,7 @@ def find_change(now: Elevation, before: Elevation, fit: HeightFit) -> Change:
     )
 
 
-def _changed(significance: Array) -> NDArray[np.int32]:
+def _label_changes(significance: Array) -> NDArray[np.int32]:
     """Labels of places, 0 where nothing changed: most cells of a window exceed their sigma."""
     known = np.isfinite(significance).astype(np.float32)
     ratio = np.nan_to_num(significance)
@@ -220,16 +220,16 @@ def _noise_area(difference: Array, sigma: Array, stable: NDArray[np.bool_], cell
     return maximum * cell**2
 
 
-def _padded(box: tuple[slice, ...], shape: tuple[int, ...]) -> tuple[slice, slice]:
+def _pad(box: tuple[slice, ...], shape: tuple[int, ...]) -> tuple[slice, slice]:
     """The window of a place with room to grow."""
     rows, columns = (
-        slice(max(part.start - _FARTHEST, 0), min(part.stop + _FARTHEST, size))
+        slice(max(part.start - _MAX_GROWTH, 0), min(part.stop + _MAX_GROWTH, size))
         for part, size in zip(box, shape, strict=True)
     )
     return rows, columns
 
 
-def _followed(
+def _follow(
     inside: NDArray[np.bool_], free: NDArray[np.bool_], maps: _Maps, cell: float, noise_area: float
 ) -> NDArray[np.bool_]:
     """A place and the rings around it, as far as they have changed on average."""
@@ -237,7 +237,7 @@ def _followed(
     known = np.isfinite(maps.difference)
     sign = np.sign(maps.difference[inside & known].sum())
     reach, looked = 0.0, 0.0
-    while looked < min(reach + 3 * _RING, _FARTHEST):  # past rings that look still by chance
+    while looked < min(reach + 3 * _RING, _MAX_GROWTH):  # past rings that look still by chance
         ring = known & free & (away > looked) & (away <= looked + _RING)
         looked += _RING
         count = int(ring.sum())

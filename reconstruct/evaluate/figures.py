@@ -39,9 +39,9 @@ def percentile(values: Array, percent: float) -> float:
 def spread(name: str, values_mm: Array) -> dict[str, float | None]:
     """Root mean square, median and 95th percentile of errors, by name."""
     return {
-        f"{name}_rms_mm": rounded(rms(values_mm), 3),
-        f"{name}_median_mm": rounded(median(values_mm), 3),
-        f"{name}_95_mm": rounded(percentile(values_mm, 95), 3),
+        f"{name}_rms_mm": json_number(rms(values_mm), 3),
+        f"{name}_median_mm": json_number(median(values_mm), 3),
+        f"{name}_95_mm": json_number(percentile(values_mm, 95), 3),
     }
 
 
@@ -52,10 +52,10 @@ def shares_within(distances_m: Array, pixel_m: float, total: float) -> dict[str,
     }
 
 
-def tukey_weights(misses: Array) -> tuple[Array, float]:
+def tukey_weights(residuals: Array) -> tuple[Array, float]:
     """(N,) weights that are 0 for what lies beyond Tukey's limit, and the robust scatter."""
-    scatter = max(MAD_TO_SIGMA * float(np.median(np.abs(misses))), 1e-12)
-    weights: Array = np.clip(1 - (misses / (_TUKEY * scatter)) ** 2, 0, None) ** 2
+    scatter = max(MAD_TO_SIGMA * float(np.median(np.abs(residuals))), 1e-12)
+    weights: Array = np.clip(1 - (residuals / (_TUKEY * scatter)) ** 2, 0, None) ** 2
     return weights, scatter
 
 
@@ -72,7 +72,7 @@ def mean_grid(places_en: Array, values: Array, side: float) -> tuple[Array, floa
     return mean.reshape(shape), float(west), float(north)
 
 
-def rounded(value: float, digits: int) -> float | None:
+def json_number(value: float, digits: int) -> float | None:
     """A number for JSON, which has no NaN: None instead."""
     return round(float(value), digits) if math.isfinite(value) else None
 
@@ -92,10 +92,10 @@ class ModelBend:
     def to_json(self) -> dict[str, Any]:
         """Figures in millimetres."""
         return {
-            "dome_mm": rounded(1e3 * self.dome_m, 3),
-            "sigma_mm": rounded(1e3 * self.sigma_m, 3),
-            "strongest_bend_mm": rounded(1e3 * self.bend_m, 3),
-            "radius_m": rounded(self.radius_m, 3),
+            "dome_mm": json_number(1e3 * self.dome_m, 3),
+            "sigma_mm": json_number(1e3 * self.sigma_m, 3),
+            "strongest_bend_mm": json_number(1e3 * self.bend_m, 3),
+            "radius_m": json_number(self.radius_m, 3),
         }
 
 
@@ -193,6 +193,6 @@ def compare_volumes(height_m: Array, true_height_m: Array, cell_m2: float) -> di
     return {
         "true_l": round(1e3 * true, 3),
         "error_l": round(1e3 * error, 3),
-        "error_percent": rounded(100 * error / true if true > 0 else math.nan, 4),
+        "error_percent": json_number(100 * error / true if true > 0 else math.nan, 4),
         "mean_height_error_mm": round(1e3 * error / (len(height_m) * cell_m2), 4),
     }

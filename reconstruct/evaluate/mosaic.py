@@ -93,7 +93,7 @@ def score_mosaic(
             if points is None:
                 continue
             places = truth_from_world.apply(points)[:, :2]
-            true = _painted(terrain, texture, places, transform.a)
+            true = _true_reflectance(terrain, texture, places, transform.a)
             shift = _shift_px(picture[:-1].mean(axis=0), true)
             if shift is None:
                 continue
@@ -121,11 +121,11 @@ def area_in_world(
     """The survey area where the model has it: navigation may have shifted and turned the model."""
     world_from_truth, depth_m = truth_from_world.inv(), terrain.offset_ned[2]
 
-    def moved(corners_ne: Array) -> Array:
+    def in_world(corners_ne: Array) -> Array:
         corners = np.column_stack([corners_ne, np.full(len(corners_ne), depth_m)])
         return np.asarray(world_from_truth.apply(corners)[:, :2])
 
-    return MultiPolygon(shapely.transform(area, moved))
+    return MultiPolygon(shapely.transform(area, in_world))
 
 
 def _patches(rows: int, columns: int, transform: Any, area: MultiPolygon) -> list[Window]:
@@ -161,7 +161,7 @@ def _points(window: Window, transform: Any, heights: Any) -> Array | None:
     return np.column_stack([north.ravel(), east.ravel(), -height])
 
 
-def _painted(terrain: Terrain, texture: Texture, places: Array, pixel_m: float) -> Array:
+def _true_reflectance(terrain: Terrain, texture: Texture, places: Array, pixel_m: float) -> Array:
     """True reflectance, grey, (patch, patch), straight below or above (N, 2) north and east."""
     points, material = surface_material(terrain, places)
     footprint = np.full(len(points), pixel_m, dtype=np.float32)

@@ -21,7 +21,7 @@ from alice_survey.core.frames import Array, Datum
 from alice_survey.core.records import ReferenceRecord, RegistrationRecord
 from alice_survey.core.run import progress
 from alice_survey.kit.figure import colour_bar, figure_style, map_axes, new_figure, save_figure
-from reconstruct.evaluate.figures import WITHIN_PX, fit_doming, mean_grid, rounded
+from reconstruct.evaluate.figures import WITHIN_PX, fit_doming, json_number, mean_grid
 from reconstruct.evaluate.registration import (
     CloudDistances,
     CloudFit,
@@ -279,7 +279,7 @@ def evaluate_reference(
     own = read_own_cloud(workspace)
     theirs, placed = read_reference(reference, model.frame.datum)
     surface = ReferenceSurface.of(theirs)
-    start = lifted(own, surface)
+    start = first_placement(own, surface)
     fit = register_cloud(own, surface, start, free_scale=free_scale, rng=rng)
     moved = fit.reference_from_cloud.apply(own)
     pixel_m = mean_pixel(model) * fit.reference_from_cloud.scale
@@ -290,7 +290,7 @@ def evaluate_reference(
         "version": 1,
         "reference": str(reference),
         "reference_has_coordinate_system": placed,
-        "ground_pixel_m": rounded(pixel_m, 6),
+        "ground_pixel_m": json_number(pixel_m, 6),
         "registration": _registration(fit, own, free_scale=free_scale, source=source),
         "survey_to_reference": ours.to_json(pixel_m),
         "reference_to_survey": back.to_json(pixel_m),
@@ -306,7 +306,7 @@ def evaluate_reference(
     return _text(figures, folder), figures
 
 
-def lifted(own: Array, surface: ReferenceSurface) -> Similarity:
+def first_placement(own: Array, surface: ReferenceSurface) -> Similarity:
     """Where both cover the ground their median heights are made equal: datums often differ.
 
     Where they share no ground the middles are laid on each other.

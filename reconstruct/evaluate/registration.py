@@ -23,7 +23,7 @@ from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.errors import ReconstructionError, WorkspaceError
 from alice_survey.core.frames import Array
 from reconstruct.evaluate.elevation import Elevation
-from reconstruct.evaluate.figures import mean_grid, rms, rounded, tukey_weights
+from reconstruct.evaluate.figures import json_number, mean_grid, rms, tukey_weights
 from reconstruct.placing.alignment import Similarity
 
 _ROUNDS = 40
@@ -124,7 +124,7 @@ def rough_shifts(
     one, *corner = mean_grid(points[:, :2], points[:, 2], cell)
     two, *other = mean_grid(moved[:, :2], moved[:, 2], cell)
     mask1, mask2 = np.isfinite(one).astype(float), np.isfinite(two).astype(float)
-    one, two = _levelled(one), _levelled(two)
+    one, two = _level(one), _level(two)
     flipped, mask_flipped = two[::-1, ::-1], mask2[::-1, ::-1]
     count = np.maximum(np.rint(fftconvolve(mask1, mask_flipped)), 1e-9)
     sum1, sum2 = fftconvolve(one, mask_flipped), fftconvolve(mask1, flipped)
@@ -147,7 +147,7 @@ def rough_shifts(
     return shifts
 
 
-def _levelled(height: Array) -> Array:
+def _level(height: Array) -> Array:
     """Heights minus the best plane; 0 where unknown."""
     rows, columns = np.nonzero(np.isfinite(height))
     design = np.column_stack([np.ones(len(rows)), rows, columns])
@@ -432,16 +432,16 @@ class CloudDistances:
         figures: dict[str, Any] = {
             "points": len(away),
             "covered_share": round(self.covered_share, 4),
-            "median_signed_m": rounded(float(np.median(self.signed_m)), 5),
-            "nearest_point_median_m": rounded(float(np.median(self.nearest_m)), 5),
+            "median_signed_m": json_number(float(np.median(self.signed_m)), 5),
+            "nearest_point_median_m": json_number(float(np.median(self.nearest_m)), 5),
         }
         for name, value in (
             ("median", float(np.median(away))),
             ("rms", rms(away)),
             ("95", float(np.percentile(away, 95))),
         ):
-            figures[f"{name}_m"] = rounded(value, 5)
-            figures[f"{name}_px"] = rounded(value / pixel_m, 3)
+            figures[f"{name}_m"] = json_number(value, 5)
+            figures[f"{name}_px"] = json_number(value / pixel_m, 3)
         return figures
 
 

@@ -64,7 +64,7 @@ class CameraScore:
     names: tuple[str, ...]
     positions_ned: Array
     """(N, 3) aligned entrance pupils."""
-    misses_m: Array
+    errors_m: Array
     """(N, 3) aligned minus true position, north, east, down."""
     turns_deg: Array
     """(N,) angle between aligned and true attitude."""
@@ -76,7 +76,7 @@ class CameraScore:
     @property
     def rms_m(self) -> float:
         """Root mean square distance."""
-        return float(np.sqrt((self.misses_m**2).sum(axis=1).mean()))
+        return float(np.sqrt((self.errors_m**2).sum(axis=1).mean()))
 
     def to_json(self) -> dict[str, Any]:
         """Figures in millimetres, degrees and parts per million."""
@@ -84,9 +84,9 @@ class CameraScore:
             "registered": self.registered,
             "total": self.total,
             "rms_mm": round(1e3 * self.rms_m, 3),
-            "max_mm": round(1e3 * float(np.linalg.norm(self.misses_m, axis=1).max()), 3),
+            "max_mm": round(1e3 * float(np.linalg.norm(self.errors_m, axis=1).max()), 3),
             "rms_north_east_down_mm": [
-                round(1e3 * rms(self.misses_m[:, axis]), 3) for axis in range(3)
+                round(1e3 * rms(self.errors_m[:, axis]), 3) for axis in range(3)
             ],
             "attitude_rms_deg": round(rms(self.turns_deg), 4),
             "scale_error_ppm": round(1e6 * self.scale_error, 1),
@@ -125,7 +125,7 @@ def score_cameras(
         truth_from_world=alignment,
         names=names,
         positions_ned=alignment.apply(found),
-        misses_m=alignment.apply(found) - true,
+        errors_m=alignment.apply(found) - true,
         turns_deg=np.rad2deg(turns),
         scale_error=1.0 / similarity.scale - 1.0,
         georeference_m=(found - true).mean(axis=0),
@@ -197,7 +197,7 @@ def write_cameras(path: Path, cameras: CameraScore) -> None:
         (
             [name, *(f"{v:.6f}" for v in miss), f"{turn:.5f}"]
             for name, miss, turn in zip(
-                cameras.names, cameras.misses_m, cameras.turns_deg, strict=True
+                cameras.names, cameras.errors_m, cameras.turns_deg, strict=True
             )
         ),
     )
@@ -207,7 +207,7 @@ def write_cameras(path: Path, cameras: CameraScore) -> None:
 @figure_style()
 def plot_track(path: Path, plan: Plan, cameras: CameraScore) -> None:
     """Planned lines, camera positions coloured by error, and the error of each picture."""
-    places, length_mm = cameras.positions_ned, 1e3 * np.linalg.norm(cameras.misses_m, axis=1)
+    places, length_mm = cameras.positions_ned, 1e3 * np.linalg.norm(cameras.errors_m, axis=1)
     south, west, north, east = plan.area.survey.bounds
     figure = new_figure(_height_in(east - west, north - south), _WIDTH_IN)
     plane, strips = figure.subplots(1, 2, width_ratios=[1, 1.2])
@@ -220,7 +220,7 @@ def plot_track(path: Path, plan: Plan, cameras: CameraScore) -> None:
     plane.set_title("Camera positions over the plan")
     map_axes(plane)
     for axis, name in enumerate(("north", "east", "down")):
-        strips.plot(1e3 * cameras.misses_m[:, axis], ".", markersize=4, label=name)
+        strips.plot(1e3 * cameras.errors_m[:, axis], ".", markersize=4, label=name)
     strips.axhline(0, color="0.6", linewidth=0.8)
     strips.set(xlabel="picture", ylabel="error (mm)")
     strips.set_title(f"Error after a rigid alignment: {1e3 * cameras.rms_m:.2f} mm rms")

@@ -21,10 +21,10 @@ from reconstruct.evaluate.elevation import Elevation
 from reconstruct.evaluate.figures import (
     compare_volumes,
     fit_doming,
+    json_number,
     median,
     percentile,
     rms,
-    rounded,
     shares_within,
     spread,
 )
@@ -87,10 +87,10 @@ class SurfaceScore:
             "completeness": round(self.completeness, 4),
             "accurate_share": round(float((self.distance_m < GOOD_M).sum() / self.cells), 4),
             **spread("distance", distance),
-            "distance_max_mm": rounded(percentile(distance, 100), 3),
-            "height_rms_mm": rounded(rms(height), 3),
-            "height_median_mm": rounded(median(height), 3),
-            "height_95_mm": rounded(percentile(np.abs(height), 95), 3),
+            "distance_max_mm": json_number(percentile(distance, 100), 3),
+            "height_rms_mm": json_number(rms(height), 3),
+            "height_median_mm": json_number(median(height), 3),
+            "height_95_mm": json_number(percentile(np.abs(height), 95), 3),
             "doming": fit_doming(self.places_ne, self.height_m).to_json(),
             "volume": compare_volumes(
                 self.true_height_m + self.height_m, self.true_height_m, self.cell_m**2
@@ -102,15 +102,15 @@ class SurfaceScore:
             f"seen_from_{MIN_STATIONS}_stations": {
                 "cells": self.cells_seen_well,
                 "share": round(self.cells_seen_well / self.cells, 4),
-                "completeness": rounded(float(well.sum()) / max(self.cells_seen_well, 1), 4),
+                "completeness": json_number(float(well.sum()) / max(self.cells_seen_well, 1), 4),
                 **spread("distance", distance[well]),
             },
             "error_over_sigma": {
-                "rms": rounded(rms(ratio), 3),
-                "robust": rounded(MAD_TO_SIGMA * median(np.abs(ratio)), 3),
-                "within_1_sigma": rounded(float(np.mean(np.abs(ratio) < 1)), 4),
-                "within_2_sigma": rounded(float(np.mean(np.abs(ratio) < 2)), 4),
-                "median_sigma_mm": rounded(1e3 * median(self.sigma_m[stated]), 3),
+                "rms": json_number(rms(ratio), 3),
+                "robust": json_number(MAD_TO_SIGMA * median(np.abs(ratio)), 3),
+                "within_1_sigma": json_number(float(np.mean(np.abs(ratio) < 1)), 4),
+                "within_2_sigma": json_number(float(np.mean(np.abs(ratio) < 2)), 4),
+                "median_sigma_mm": json_number(1e3 * median(self.sigma_m[stated]), 3),
             },
         }
 
@@ -153,20 +153,20 @@ def score_surface(
         part = slice(start, start + _STRIP_CELLS)
         depth[part] = surface_depth(terrain, points[used[part], :2])
         distance[part] = surface_distance(terrain, points[used[part]])
-    misses = np.full(filled.shape, np.nan)
-    misses[used] = depth - points[used, 2]
+    errors = np.full(filled.shape, np.nan)
+    errors[used] = depth - points[used, 2]
     seen = _stations_of_cells(place[:, :2], inside, (rows, columns), terrain, stations)
     return SurfaceScore(
         cells=max(round(area.area / cell**2), int(inside.sum())),
         cell_m=cell,
         places_ne=points[used, :2],
         distance_m=distance,
-        height_m=misses[used],
+        height_m=errors[used],
         true_height_m=-depth,
         sigma_m=surface.sigma.ravel()[used],
         stations=seen[used],
         cells_seen_well=int((seen[inside] >= MIN_STATIONS).sum()),
-        map_m=misses.reshape(heights.shape),
+        map_m=errors.reshape(heights.shape),
         extent_m=(
             surface.west + shift_ne[1],
             surface.west + columns * cell + shift_ne[1],

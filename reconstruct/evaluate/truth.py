@@ -233,7 +233,7 @@ def overlaps_reached(
     ]
     swaths = {i: unary_union(polygons) for i, polygons in lines.items()}
     side = [
-        _shared(swaths[one].intersection(strip), swaths[other].intersection(strip))
+        _shared_share(swaths[one].intersection(strip), swaths[other].intersection(strip))
         for one, other, strip in neighbours(plan)
         if one in swaths and other in swaths
         # A line that was aborted may have left nothing there.
@@ -274,6 +274,6 @@ def neighbours(plan: Plan) -> Iterator[tuple[int, int, Polygon]]:
         ])  # fmt: skip
 
 
-def _shared(one: BaseGeometry, other: BaseGeometry) -> float:
+def _shared_share(one: BaseGeometry, other: BaseGeometry) -> float:
     """Share of the smaller of two swaths that both see."""
     return float(one.intersection(other).area / min(one.area, other.area))

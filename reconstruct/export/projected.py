@@ -56,7 +56,7 @@ class Destination:
         found: Array = np.column_stack(self._transformer.transform(east, north, errcheck=True))
         return found
 
-    def turned(self, normals: Array, east_north: Array) -> Array:
+    def turn_normals(self, normals: Array, east_north: Array) -> Array:
         """Directions (N, 3) at a place (2,): by the convergence of its meridians."""
         at = self.places(np.array([east_north, east_north + np.array([0.0, 1.0])]))
         x, y = (at[1] - at[0]) / np.linalg.norm(at[1] - at[0])
@@ -91,7 +91,7 @@ def export_projected(workspace: Path, crs: str) -> tuple[str, dict[str, Any]]:
             "import navigation with positions, or control points"
         )
     local = pyproj.CRS.from_wkt(local_crs(frame.datum).to_wkt())
-    target = Destination(frame=frame, local=local, crs=_projected(crs, frame), name=crs)
+    target = Destination(frame=frame, local=local, crs=_projected_crs(crs, frame), name=crs)
     folder = "".join(c if c.isalnum() else "-" for c in crs)[:60].strip("-")
     stage = Stage(
         name=folder,
@@ -110,7 +110,7 @@ def export_projected(workspace: Path, crs: str) -> tuple[str, dict[str, Any]]:
     }
 
 
-def _projected(crs: str, frame: WorldFrame) -> pyproj.CRS:
+def _projected_crs(crs: str, frame: WorldFrame) -> pyproj.CRS:
     try:
         found = pyproj.CRS.from_user_input(crs)
     except pyproj.exceptions.CRSError:
@@ -210,7 +210,7 @@ def _cloud(source: Path, path: Path, spacing: float, target: Destination) -> Non
             at = target.places(np.column_stack([part.x, part.y]))
             points.x, points.y, points.z = at[:, 0], at[:, 1], np.asarray(part.z)
             normals = np.column_stack([part["nx"], part["ny"], part["nz"]])
-            turned = target.turned(normals, middle[:2])
+            turned = target.turn_normals(normals, middle[:2])
             points["nx"], points["ny"], points["nz"] = turned.T
             parts.append(spool.add(f"{number}", points.array))
     write_copc(path, header, spool, parts)

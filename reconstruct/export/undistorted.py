@@ -181,7 +181,7 @@ def export_view(workspace: Path, folder: Path, task: tuple[View, float]) -> Expo
     on_surface = float(np.isfinite(surface).mean())
     if mask.exists():  # of a run that was interrupted; it is written last
         return Exported(on_surface=on_surface, size_px=(width, height))
-    x, y = taken_at(pictures, view, _filled(surface, depth))
+    x, y = taken_at(pictures, view, _fill(surface, depth))
     taken = pictures.as_taken(view.image)
     inside = (x >= 0) & (x <= taken.shape[1] - 1) & (y >= 0) & (y <= taken.shape[0] - 1)
     x, y = np.where(inside, x, np.float32(-10.0)), np.where(inside, y, np.float32(-10.0))
@@ -237,7 +237,7 @@ def taken_at(
     """
     width, height = view.pinhole.size_px
     pixels = _nodes(width, height)
-    warped = view.shift.warped(pixels.reshape(-1, 2), depth.reshape(-1)).reshape(pixels.shape)
+    warped = view.shift.warp(pixels.reshape(-1, 2), depth.reshape(-1)).reshape(pixels.shape)
     rows, columns = pixels.shape[:2]
     across, down = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     at = across / width * (columns - 1), down / height * (rows - 1)
@@ -275,7 +275,7 @@ def bilinear(values: NDArray[Any], x: Array, y: Array) -> Array:
     return found
 
 
-def _filled(depth: Array, otherwise: float) -> Array:
+def _fill(depth: Array, otherwise: float) -> Array:
     """Depths whose holes have that of the nearest known node."""
     known = np.isfinite(depth)
     if not known.any():

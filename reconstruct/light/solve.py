@@ -634,11 +634,11 @@ class _LightSums:
             self.own[channel] + prior.gain, np.concatenate(self.pairs),
             np.concatenate([shared[channel] for shared in self.shared]),
         )  # fmt: skip
-        wanted = np.column_stack([mixed.T, self.right_gains[channel] + prior.gain_right])
+        sides = np.column_stack([mixed.T, self.right_gains[channel] + prior.gain_right])
         if pictures <= _DENSE_PICTURES:
-            solved = solve_symmetric(block.toarray(), wanted)
+            solved = solve_symmetric(block.toarray(), sides)
         else:
-            solved = splu(block).solve(wanted)
+            solved = splu(block).solve(sides)
         taken = _product(mixed, np.ascontiguousarray(solved))
         last = np.zeros(len(right))
         last[-1] = 1.0

@@ -96,7 +96,7 @@ class WaterLight:
     middle_range: float
 
 
-def grown(growth: Array, ranges: NDArray[np.floating[Any]], middle_range: float) -> Array:
+def growth_at(growth: Array, ranges: NDArray[np.floating[Any]], middle_range: float) -> Array:
     """(..., 3) light added up to ranges (...) over that up to the middle one."""
     found: Array = np.expm1(-np.asarray(ranges)[..., None] * growth)
     return found / np.expm1(-middle_range * growth)
@@ -140,7 +140,7 @@ def _solve(samples: LightSamples, dark: Mapping[str, Array], cameras: Sequence[s
     solution = np.zeros((3, count + pictures))
     noise, gain_sigma = np.array([0.05, 0.01]), _GAIN_SIGMA
     for turn in range(_ROUNDS):
-        step = _linearised(light, ranges, middle, at, gain, level, u, log_b, solution, turn == 0)
+        step = _linearise(light, ranges, middle, at, gain, level, u, log_b, solution, turn == 0)
         rest = step.target - np.stack(
             [step.dense[c] @ x[:count] + gain @ x[count:] for c, x in enumerate(solution)], axis=1
         )
@@ -151,7 +151,7 @@ def _solve(samples: LightSamples, dark: Mapping[str, Array], cameras: Sequence[s
         gains = np.full(3 * pictures, gain_sigma**-2)
         prior = _prior(len(names), middle, spread)
         held = None if turn in _GAIN_ROUNDS else solution[:, count:].ravel()
-        solution, sigmas = _solved(dense, right, prior, gains, held, 3 * count)
+        solution, sigmas = _solve_normal(dense, right, prior, gains, held, 3 * count)
         part = _STEP if turn < _ROUNDS - 2 else 1.0
         found = np.clip(solution[:, nodes : 2 * nodes].T, 0.0, 1.0)
         u = u + part * (found - u)
@@ -187,14 +187,14 @@ class _PairEquations:
     """(N,)."""
 
 
-def _linearised(
+def _linearise(
     light: Array, ranges: Array, middle: float, at: tuple[csr_array, ...], gain: csr_array,
     level: Array, u: Array, log_b: Array, solution: Array, first: bool,
 ) -> _PairEquations:  # fmt: skip
     nodes = len(level)
     count = 2 * nodes + 3
     growth = np.exp(log_b)
-    h = grown(growth, ranges, middle)
+    h = growth_at(growth, ranges, middle)
     beyond = np.log(ranges / middle)
     dense, targets, sizes = [], [], []
     usable = np.ones(len(light), np.bool_)
@@ -210,8 +210,8 @@ def _linearised(
             model -= x[:count][_B] * (ranges - middle) + x[:count][_SPREAD] * beyond
             # half of the gains' difference each way, about the spot's mean light
             model += 0.5 * (gain @ x[count:])[:, None] * [1.0, -1.0]
-            spot = (np.log(left) - model).mean(axis=1, keepdims=True)
-            expected = np.exp(spot + model)
+            ground = (np.log(left) - model).mean(axis=1, keepdims=True)
+            expected = np.exp(ground + model)
         scale = h[..., c] / expected
         by_u = sum(
             sign * (diags_array(scale[:, k]) @ at[k] @ diags_array(level[:, c]))
@@ -283,7 +283,7 @@ def _normal(step: _PairEquations, gain: csr_array, weights: Array) -> tuple[csr_
     return block_array(blocks.tolist(), format="csr")[order][:, order], right.ravel()[order]
 
 
-def _solved(
+def _solve_normal(
     matrix: csr_array, right: Array, prior: tuple[Array, Array], gains: Array,
     held: Array | None, dense: int,
 ) -> tuple[Array, tuple[Array, Array, Array]]:  # fmt: skip

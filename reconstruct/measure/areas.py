@@ -24,7 +24,7 @@ from reconstruct.measure.errors import (
     FigureSlopes,
     PackedSlopes,
     own_correlation,
-    summed,
+    sum_slopes,
 )
 from reconstruct.measure.figures import Measured, figure
 from reconstruct.measure.surface import MeasuredSurface
@@ -200,7 +200,7 @@ def plan_slopes(weight: Array, cell: float) -> Array:
     return slopes
 
 
-def lifted(distance: Array, sigma: Array) -> Array:
+def noise_lift(distance: Array, sigma: Array) -> Array:
     """How much noise lifts the mean of max(distance, 0), at a true distance."""
     t = np.abs(distance) / np.maximum(sigma, 1e-300)
     t = np.minimum(t, _FAR)
@@ -306,7 +306,7 @@ class PolygonOnGrid:
         grid = self.surface.grid
         corner = np.array([grid.east_of(column + 0.5), grid.north_of(row + 0.5)])
         places = (shapely.get_coordinates(ring) for ring in self._rings)
-        return covered([(ring - corner) * [1.0, -1.0] / grid.cell for ring in places], shape)
+        return covered_shares([(ring - corner) * [1.0, -1.0] / grid.cell for ring in places], shape)
 
     def add(self, slopes: FigureSlopes, block: GridPart, by_motion: Array) -> None:
         """Add a block's derivatives (rows, columns, 3)."""
@@ -318,7 +318,7 @@ class PolygonOnGrid:
         slopes.add_grid(east[block.core[1]], north[block.core[0]], by_motion[block.core], own)
 
 
-def covered(rings: Sequence[Array], shape: tuple[int, int]) -> Array:
+def covered_shares(rings: Sequence[Array], shape: tuple[int, int]) -> Array:
     """Shares (rows, columns) of unit squares that polygons cover.
 
     Edges are cut where they cross sides of squares. A piece that goes down by dv covers, seen to
@@ -390,9 +390,9 @@ def figures_of_all(
     """
     area, plan = math.fsum(p.surface for p in parts), math.fsum(p.plan for p in parts)
     ratio = area / plan
-    by_area = summed([(1.0, part.by_surface) for part in parts])
-    by_plan = summed([(1.0, part.by_plan) for part in parts])
-    by_ratio = summed([(1.0 / plan, by_area), (-ratio / plan, by_plan)])
+    by_area = sum_slopes([(1.0, part.by_surface) for part in parts])
+    by_plan = sum_slopes([(1.0, part.by_plan) for part in parts])
+    by_ratio = sum_slopes([(1.0 / plan, by_area), (-ratio / plan, by_plan)])
     return (
         figure(surface, "surface_area", "Area of the surface", area, by_area, 2),
         figure(surface, "rugosity", "Rugosity, surface over plan", ratio, by_ratio, 0),

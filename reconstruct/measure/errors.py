@@ -171,7 +171,7 @@ class PackedSlopes:
         return Variance(own=max(self.own, 0.0), shared=max(shared, 0.0))
 
 
-def summed(terms: Sequence[tuple[float, PackedSlopes]]) -> PackedSlopes:
+def sum_slopes(terms: Sequence[tuple[float, PackedSlopes]]) -> PackedSlopes:
     """A sum of figures, each times a factor, which know different own errors."""
     slopes = [one for _, one in terms]
     nodes, at = np.unique(np.concatenate([one.nodes for one in slopes]), return_inverse=True)

@@ -175,12 +175,12 @@ def as_geojson(measurements: Sequence[Measurement], datum: Datum | None, unit: s
         unit: of lengths.
     """
 
-    def placed(places: Any) -> Any:
+    def to_lon_lat(places: Any) -> Any:
         return places if datum is None else np.round(datum.lon_lat_from_en(places), 11)
 
     features = []
     for one in measurements:
-        geometry = shapely.transform(shapely.force_2d(one.geometry), placed)
+        geometry = shapely.transform(shapely.force_2d(one.geometry), to_lon_lat)
         figures = {}
         for figure in one.figures:
             figures[figure["name"]] = figure["value"]

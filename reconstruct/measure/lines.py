@@ -104,7 +104,7 @@ def measure_points(
     if len(given) < 2:
         raise ReconstructionError("a line needs two points")
     # the mesh is painted by other pictures than the mosaic, from about as far aside
-    there = surface.picked(given[:, :2])
+    there = surface.at_picks(given[:, :2])
     apart = np.abs(there.height - given[:, 2]) > surface.grid.cell + 3.0 * there.sigma
     unlike = int((apart | ~np.isfinite(there.height)).sum())
     notes = () if not unlike else (

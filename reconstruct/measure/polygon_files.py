@@ -19,7 +19,7 @@ from alice_survey.core.products import MOSAIC
 from alice_survey.core.run import progress
 from missions.areas.safe import DRIVERS, gis_files
 from reconstruct.measure.areas import SurfaceAreas, figures_of_all, surface_within
-from reconstruct.measure.errors import FigureSlopes, PackedSlopes, summed
+from reconstruct.measure.errors import FigureSlopes, PackedSlopes, sum_slopes
 from reconstruct.measure.figures import Measured, Measurement, as_csv, as_geojson, figure
 from reconstruct.measure.surface import MeasuredSurface
 from reconstruct.raster import crs_of, opened_raster
@@ -172,7 +172,7 @@ def _layers(
                     yield LabelledPolygon(
                         name=f"polygon {number + 1}",
                         label=texts[number] if texts else shown.stem,
-                        geometry=_placed(polygon, about["crs"], surface, shown),
+                        geometry=_place_polygon(polygon, about["crs"], surface, shown),
                     )
 
 
@@ -199,7 +199,9 @@ def _polygons_of(geometry: BaseGeometry | None) -> BaseGeometry | None:
     return shapely.union_all(areal) if areal else None
 
 
-def _placed(polygon: BaseGeometry, crs: str | None, surface: MeasuredSurface, shown: Path) -> Any:
+def _place_polygon(
+    polygon: BaseGeometry, crs: str | None, surface: MeasuredSurface, shown: Path
+) -> Any:
     """A polygon in the plane of the rasters."""
     from pyproj import CRS, Transformer
     from pyproj.exceptions import CRSError, ProjError
@@ -243,7 +245,7 @@ def plan_slopes_of(surface: MeasuredSurface, polygon: BaseGeometry, sigma: float
             places = shapely.get_coordinates(ring)[:-1]
             chord = np.roll(places, -1, axis=0) - np.roll(places, 1, axis=0)
             slopes = 0.5 * np.column_stack([chord[:, 1], -chord[:, 0], np.zeros(len(chord))])
-            found = surface.picked(places)
+            found = surface.at_picks(places)
             known = np.isfinite(found.height)[:, None]
             samples = replace(
                 found, own=np.where(known, found.own, 0.0), sight=np.where(known, found.sight, 0.0)
@@ -261,7 +263,7 @@ def _figures(
     Where corners were drawn wrongly the surface gains as the plan does, times its mean rugosity.
     """
     area = math.fsum(float(one.polygon.geometry.area) for one in parts)
-    by_plan = summed([(1.0, one.by_plan) for one in parts])
+    by_plan = sum_slopes([(1.0, one.by_plan) for one in parts])
     plan = figure(surface, "plan_area", "Area in plan", area, by_plan, 2)
     known = [one.surface for one in parts if one.surface is not None]
     if not known:

@@ -15,8 +15,8 @@ from reconstruct.measure.areas import (
     AreaSums,
     GridPart,
     PolygonOnGrid,
-    lifted,
     mean_of_corners,
+    noise_lift,
     plan_slopes,
     sigma_of_means,
     spread_to_cells,
@@ -136,7 +136,7 @@ def _outline(points: Array) -> float:
 
 def _ring(surface: MeasuredSurface, places: Array) -> Samples:
     """Corners and the first again; own errors count where heights are known."""
-    found = surface.picked(np.concatenate([places, places[:1]]))
+    found = surface.at_picks(np.concatenate([places, places[:1]]))
     known = np.isfinite(found.height)
     height, own = np.where(known, found.height, 0.0), np.where(known[:, None], found.own, 0.0)
     return replace(found, height=height, own=own)
@@ -231,7 +231,9 @@ class _PolygonSums:
             if rim is not None:
                 over = np.nan_to_num(mean_of_corners(block.height - upright @ rim.plane))
                 lift += float(
-                    (block.weight * lifted(over, np.nan_to_num(sigma_of_means(block.own)))).sum()
+                    (
+                        block.weight * noise_lift(over, np.nan_to_num(sigma_of_means(block.own)))
+                    ).sum()
                 )
                 parts = (np.ones_like(over), 1.0 * (over > 0), -1.0 * (over < 0))
                 for name, part in zip(self._by_volume, parts, strict=True):

@@ -54,8 +54,8 @@ def sight_lines(workspace: Path, plane: Plane, points: Array) -> Array | None:
             row, column = raster.index(x, y)
             if 0 <= row < raster.height and 0 <= column < raster.width:
                 numbers[n] = raster.read(1, window=Window(int(column), int(row), 1, 1))[0, 0]
-    wanted = {names[n - 1] for n in numbers.tolist() if 0 < n <= len(names)}
-    centres = camera_centres(track, plane, wanted)
+    used_names = {names[n - 1] for n in numbers.tolist() if 0 < n <= len(names)}
+    centres = camera_centres(track, plane, used_names)
     lines = np.zeros((len(points), 2))
     for n, point in enumerate(points):
         if 0 < numbers[n] <= len(names) and names[numbers[n] - 1] in centres:
@@ -64,7 +64,7 @@ def sight_lines(workspace: Path, plane: Plane, points: Array) -> Array | None:
     return lines
 
 
-def camera_centres(track: Path, plane: Plane, wanted: set[str]) -> dict[str, Array]:
+def camera_centres(track: Path, plane: Plane, used_names: set[str]) -> dict[str, Array]:
     """Centres (3,) of cameras, right, up and out, by picture."""
     header, rows = read_csv(track)
     axes = next((axes for axes in _AXES if axes[0] in header), _AXES[0])
@@ -72,7 +72,7 @@ def camera_centres(track: Path, plane: Plane, wanted: set[str]) -> dict[str, Arr
         places = {
             row["image"]: np.array([float(row[axis]) for axis in axes])
             for _, row in rows
-            if row["image"] in wanted
+            if row["image"] in used_names
         }
     centres = {}
     for name, place in places.items():
@@ -228,7 +228,7 @@ class MeasuredSurface:
             sight=np.zeros((len(places), 2)),
         )  # fmt: skip
 
-    def picked(self, places: Array) -> Samples:
+    def at_picks(self, places: Array) -> Samples:
         """Spots that were picked where the mosaic shows them; see `sight_lines`."""
         found = self.at(places)
         lines = sight_lines(self.workspace, self.plane, found.points)
@@ -240,7 +240,7 @@ class MeasuredSurface:
         Raises:
             ReconstructionError: one has none.
         """
-        found = self.picked(places)
+        found = self.at_picks(places)
         lost = np.flatnonzero(~np.isfinite(found.height))
         if len(lost):
             x, y = places[lost[0]]

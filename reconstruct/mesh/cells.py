@@ -81,7 +81,7 @@ def decimate(
         rim_edge = count == 1
         rim = np.zeros(len(place), np.bool_)
         rim[edges[rim_edge]] = True
-        cost, spot = _costs(place, quadrics, edges, rim_edge, rim, fixed)
+        cost, target_place = _costs(place, quadrics, edges, rim_edge, rim, fixed)
         able = np.flatnonzero(cost <= error * error)
         if not len(able):
             break
@@ -89,7 +89,14 @@ def decimate(
         corners = np.argsort(faces.reshape(-1), kind="stable")
         starts = np.searchsorted(faces.reshape(-1)[corners], np.arange(len(place) + 1))
         gone = _collapse(
-            place, faces, quadrics, edges[order], spot[order], rim_edge[order], starts, corners // 3
+            place,
+            faces,
+            quadrics,
+            edges[order],
+            target_place[order],
+            rim_edge[order],
+            starts,
+            corners // 3,
         )
         faces = np.ascontiguousarray(faces[faces[:, 0] >= 0])
         used = np.zeros(len(place), np.bool_)
@@ -182,7 +189,7 @@ def _costs(
     An edge of which one end must stay is turned so that this end comes first.
     """
     cost = np.full(edges.shape[0], np.inf)
-    spot = np.empty((edges.shape[0], 3))
+    target_place = np.empty((edges.shape[0], 3))
     q = np.empty(11)
     for n in range(edges.shape[0]):
         a, b = edges[n, 0], edges[n, 1]
@@ -203,20 +210,20 @@ def _costs(
             a, b = b, a
             edges[n, 0], edges[n, 1] = a, b
         if keep_a or keep_b:
-            spot[n] = place[a]
+            target_place[n] = place[a]
         else:
-            found = best_point(q, spot[n])
+            found = best_point(q, target_place[n])
             if found:
                 away = 0.0
                 for k in range(3):
-                    away += (spot[n, k] - 0.5 * (place[a, k] + place[b, k])) ** 2
+                    away += (target_place[n, k] - 0.5 * (place[a, k] + place[b, k])) ** 2
                 found = away <= length2
             if not found:
                 for k in range(3):
-                    spot[n, k] = 0.5 * (place[a, k] + place[b, k])
+                    target_place[n, k] = 0.5 * (place[a, k] + place[b, k])
         weight = max(q[10], 1e-30)
-        cost[n] = quadric_error(q, spot[n]) / weight + _SHORTNESS * length2
-    return cost, spot
+        cost[n] = quadric_error(q, target_place[n]) / weight + _SHORTNESS * length2
+    return cost, target_place
 
 
 @compiled
@@ -235,7 +242,7 @@ def _turns_or_thins(
     ring: NDArray[np.int64],
     moving: int,
     other: int,
-    spot: Array,
+    target_place: Array,
 ) -> bool:
     """Whether moving a vertex would turn a face of its ring over, or make a splinter of it."""
     old, new, corner = np.empty(3), np.empty(3), np.empty((3, 3))
@@ -245,7 +252,7 @@ def _turns_or_thins(
             continue
         before = _normal(place[face[0]], place[face[1]], place[face[2]], old)
         for k in range(3):
-            corner[k] = spot if face[k] == moving else place[face[k]]
+            corner[k] = target_place if face[k] == moving else place[face[k]]
         after = _normal(corner[0], corner[1], corner[2], new)
         dot = old[0] * new[0] + old[1] * new[1] + old[2] * new[2]
         if not dot > _MIN_COSINE * before * after:
@@ -265,7 +272,7 @@ def _collapse(
     faces: NDArray[np.int32],
     quadrics: Array,
     edges: NDArray[np.int64],
-    spot: Array,
+    target_place: Array,
     rim_edge: NDArray[np.bool_],
     starts: NDArray[np.int64],
     around: NDArray[np.int64],
@@ -291,9 +298,9 @@ def _collapse(
                     mark[vertex] = -1
         if common != (1 if rim_edge[n] else 2):
             continue
-        if _turns_or_thins(place, faces, ring_a, a, b, spot[n]):
+        if _turns_or_thins(place, faces, ring_a, a, b, target_place[n]):
             continue
-        if _turns_or_thins(place, faces, ring_b, b, a, spot[n]):
+        if _turns_or_thins(place, faces, ring_b, b, a, target_place[n]):
             continue
         for i in range(ring_a.size):
             for k in range(3):
@@ -309,7 +316,7 @@ def _collapse(
             for k in range(3):
                 if faces[face, k] == b:
                     faces[face, k] = a
-        place[a] = spot[n]
+        place[a] = target_place[n]
         for k in range(11):
             quadrics[a, k] += quadrics[b, k]
         gone += 1
@@ -404,8 +411,8 @@ def join(parts: Sequence[CellMesh]) -> CellMesh:
     """Join meshes where they were cut; the triangles are those of the parts, in order."""
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     vertices = np.concatenate([np.empty((0, 3)), *(part.vertices for part in parts)])
-    triangles = _numbered([part.triangles for part in parts], starts)
-    cut = _numbered([part.cut for part in parts], starts).reshape(-1, 2)
+    triangles = _number_vertices([part.triangles for part in parts], starts)
+    cut = _number_vertices([part.cut for part in parts], starts).reshape(-1, 2)
     target = np.arange(len(vertices))
     ends = np.unique(cut)
     _, first, group = np.unique(vertices[ends], axis=0, return_index=True, return_inverse=True)
@@ -422,12 +429,16 @@ def join(parts: Sequence[CellMesh]) -> CellMesh:
     )
 
 
-def _numbered(parts: Sequence[NDArray[np.int32]], starts: NDArray[np.int64]) -> NDArray[np.int64]:
+def _number_vertices(
+    parts: Sequence[NDArray[np.int32]], starts: NDArray[np.int64]
+) -> NDArray[np.int64]:
     moved = [part.astype(np.int64) + start for part, start in zip(parts, starts, strict=False)]
     return np.concatenate([np.empty((0, parts[0].shape[1]), np.int64), *moved])
 
 
-def decimated(mesh: CellMesh, error: float, *, min_area: float = 0.0, maximum: int = 0) -> CellMesh:
+def decimate_cell(
+    mesh: CellMesh, error: float, *, min_area: float = 0.0, maximum: int = 0
+) -> CellMesh:
     """Decimate all but the ends of cut edges.
 
     Args:
@@ -530,12 +541,12 @@ def decimate_square(
     Args:
         folder: to write into.
         error: that decimation may make.
-        min_area: see `decimated`.
-        maximum: see `decimated`.
+        min_area: see `decimate_cell`.
+        maximum: see `decimate_cell`.
         task: the square.
     """
     whole = join([cell.mesh() for cell in task.paths])
-    mesh = decimated(whole, error, min_area=min_area, maximum=maximum)
+    mesh = decimate_cell(whole, error, min_area=min_area, maximum=maximum)
     (x, y), part = task.key, np.zeros(len(mesh.triangles), np.int64)
     if task.middle is not None:
         part = mesh.vertices[mesh.triangles, :2].mean(axis=1) >= task.middle

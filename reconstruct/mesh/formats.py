@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from alice_survey.core.artefacts import atomic_path
 from alice_survey.core.frames import Array
 from alice_survey.core.run import progress
-from reconstruct.mesh.texture import Textured, remapped
+from reconstruct.mesh.texture import Textured, remap
 from reconstruct.mesh.topology import face_normals, vertex_normals
 from reconstruct.mesh.visibility import ray_scene
 from reconstruct.ply import VERTEX, write_ply
@@ -219,6 +219,6 @@ def _shade(
         mine = mesh.page[face] == number
         height, width = page.shape[:2]
         at = np.column_stack([uv[mine, 0] * width, (1 - uv[mine, 1]) * height])
-        found = remapped(page, at, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
+        found = remap(page, at, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
         colour[seen[mine]] = np.clip(found * lit[mine][:, None], 0, 255)
     return colour

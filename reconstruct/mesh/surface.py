@@ -29,16 +29,16 @@ from reconstruct.mesh.cells import (
     CellLevel,
     CellMesh,
     coarser,
-    decimated,
+    decimate_cell,
     part_of,
     without_pairs,
 )
 from reconstruct.mesh.topology import (
     Triangles,
     component_areas,
+    find_unfolded,
     split_fans,
-    triangulated,
-    unfolded,
+    triangulate,
     without_folds,
 )
 from reconstruct.ply import CloudFile
@@ -215,14 +215,14 @@ def mesh_tile(
     quads = quads[kept[quads].all(axis=1)]
     start = cells[quads, :2].max(axis=1)  # the cell at whose edge a quadrilateral is
     own = np.repeat(((start >= 2) & (start < np.array([nx, ny]) + 2)).all(axis=1), 2)
-    triangles = triangulated(vertices, quads)
-    sound = unfolded(vertices, triangles)
+    triangles = triangulate(vertices, quads)
+    sound = find_unfolded(vertices, triangles)
     around = CellMesh(
         vertices=vertices * step, triangles=triangles[sound], cut=np.empty((0, 2), np.int32)
     )
     if not own[sound].any():
         return None
-    (i, j), mesh = tile[0], decimated(part_of(around, own[sound]), error)
+    (i, j), mesh = tile[0], decimate_cell(part_of(around, own[sound]), error)
     return mesh.save(folder / f"{i}_{j}.npz")
 
 

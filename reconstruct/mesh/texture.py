@@ -239,7 +239,7 @@ def seam_colours(workspace: Path, task: tuple[View, Float32, Array]) -> Float32:
     total = cv2.GaussianBlur(even, (0, 0), _SEAM_SIGMA_PX)
     share = cv2.GaussianBlur(weight, (0, 0), _SEAM_SIGMA_PX)
     sums, shares = (
-        remapped(
+        remap(
             picture, pixels - (part[1].start, part[0].start), cv2.INTER_LINEAR, cv2.BORDER_REPLICATE
         )
         for picture in (total, share)
@@ -250,7 +250,7 @@ def seam_colours(workspace: Path, task: tuple[View, Float32, Array]) -> Float32:
     return found
 
 
-def remapped(picture: NDArray[Any], pixels: Array, interpolation: int, border: int) -> NDArray[Any]:
+def remap(picture: NDArray[Any], pixels: Array, interpolation: int, border: int) -> NDArray[Any]:
     """What OpenCV finds in a picture (H, W, ...) at pixels (N, 2), (N, ...).
 
     Beyond the picture it is what the border's mode says, NaN for a constant one.

@@ -40,7 +40,7 @@ from reconstruct.mesh.texture import (
     colours_of_cloud,
     nearest_covered,
     paint,
-    remapped,
+    remap,
     spread_corners,
     wedge_pixels,
     write_jpeg,
@@ -263,7 +263,7 @@ def paint_region(setup: TileSetup, task: RegionTask) -> None:
         triangles=triangles,
         offset=setup.offset,
         occluder_vertices=np.concatenate([part.vertices for part in beyond]),
-        occluder_triangles=_stacked(beyond),
+        occluder_triangles=_stack(beyond),
     )
     candidates = find_candidates(
         folder / "mesh.npz", len(triangles), setup.workspace, task.views, setup.lift, SERIAL
@@ -292,7 +292,7 @@ def paint_region(setup: TileSetup, task: RegionTask) -> None:
     shutil.rmtree(folder)
 
 
-def _stacked(parts: Sequence[CellMesh]) -> Triangles:
+def _stack(parts: Sequence[CellMesh]) -> Triangles:
     """(T, 3) triangles of meshes whose vertices follow one another."""
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     moved = [part.triangles + start for part, start in zip(parts, starts, strict=False)]
@@ -398,7 +398,7 @@ def _colours_next_to(
             raise FileNotFoundError(skin.with_suffix(".jpg"))
         pages.append(cv2.resize(page, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
     owner = np.repeat(np.arange(len(parts)), [len(part.triangles) for part in parts])
-    scene = ray_scene(np.concatenate([part.vertices for part in parts]), _stacked(parts))
+    scene = ray_scene(np.concatenate([part.vertices for part in parts]), _stack(parts))
     found = scene.compute_closest_points(o3d.core.Tensor(points), 1)
     face = found["primitive_ids"].numpy().astype(np.int64)
     share = found["primitive_uvs"].numpy().astype(np.float64)
@@ -409,7 +409,7 @@ def _colours_next_to(
         mine = owner[face] == number
         size = page.shape[1::-1]
         pixels = np.column_stack([at[mine, 0], 1.0 - at[mine, 1]]) * size
-        colours[mine] = remapped(page, pixels, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
+        colours[mine] = remap(page, pixels, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
     return colours
 
 

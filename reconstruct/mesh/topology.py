@@ -32,7 +32,7 @@ def twin_sides(edge: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.in
     return order[first], order[first + 1]
 
 
-def triangulated(vertices: Array, quads: NDArray[np.int32]) -> Triangles:
+def triangulate(vertices: Array, quads: NDArray[np.int32]) -> Triangles:
     """Quadrilaterals cut along their shorter diagonal."""
     corners = vertices[quads]
     first = np.linalg.norm(corners[:, 0] - corners[:, 2], axis=1)
@@ -42,11 +42,11 @@ def triangulated(vertices: Array, quads: NDArray[np.int32]) -> Triangles:
 
 
 def without_folds(vertices: Array, triangles: Triangles) -> Triangles:
-    """Triangles without those that `unfolded` leaves out."""
-    return triangles[unfolded(vertices, triangles)]
+    """Triangles without those that `find_unfolded` leaves out."""
+    return triangles[find_unfolded(vertices, triangles)]
 
 
-def unfolded(vertices: Array, triangles: Triangles) -> NDArray[np.bool_]:
+def find_unfolded(vertices: Array, triangles: Triangles) -> NDArray[np.bool_]:
     """Triangles (T,) that have an area and are at no edge that more than two share."""
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)

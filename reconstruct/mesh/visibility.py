@@ -191,11 +191,11 @@ def _quality(
     area = face_areas(vertices, triangles[faces])
     facing = (cosine > _MIN_COSINE) & (area > 0)
     towards = middle[:, None] * (1 - _SHRINK) + corners * _SHRINK
-    spots = np.concatenate([middle[:, None], towards], axis=1)
-    spots = spots[facing] + lift * normal[facing][:, None]
-    away = camera - spots
+    ends = np.concatenate([middle[:, None], towards], axis=1)
+    ends = ends[facing] + lift * normal[facing][:, None]
+    away = camera - ends
     reach = np.linalg.norm(away, axis=2, keepdims=True)
-    rays = np.concatenate([spots, away / reach], axis=2).astype(np.float32)
+    rays = np.concatenate([ends, away / reach], axis=2).astype(np.float32)
     hidden = np.zeros(rays.shape[:2], np.bool_)
     if len(rays):
         hit = shape.scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy()
@@ -431,20 +431,20 @@ def give_away(
                     continue
                 if size[chart[other]] < size[c] or (tried == label[other]).any():
                     continue
-                wanted = label[other]
-                tried = np.append(tried, wanted)
+                candidate = label[other]
+                tried = np.append(tried, candidate)
                 length = 0.0
                 able = True
                 for j in range(mine.size):
-                    if not (views[mine[j]] == wanted).any():
+                    if not (views[mine[j]] == candidate).any():
                         able = False
                         break
                     for s in range(3):
                         near = neighbours[mine[j], s]
-                        if near >= 0 and chart[near] != c and label[near] == wanted:
+                        if near >= 0 and chart[near] != c and label[near] == candidate:
                             length += lengths[mine[j], s]
                 if able and length > longest:
-                    best, longest = wanted, length
+                    best, longest = candidate, length
         if best < 0:
             continue
         for i in range(mine.size):

@@ -148,9 +148,9 @@ def _scale_bar(
     width: int, height: int, pixel: float, unit: str
 ) -> tuple[NDArray[np.uint8], int, int]:
     """A bar of a round length with its text, (h, w, 4) RGBA, and where its first pixel goes."""
-    wanted = _BAR_SHARE * width * pixel
-    decade = 10.0 ** math.floor(math.log10(wanted))
-    length = max(digit * decade for digit in (1, 2, 5) if digit * decade <= wanted * (1 + 1e-9))
+    requested = _BAR_SHARE * width * pixel
+    decade = 10.0 ** math.floor(math.log10(requested))
+    length = max(digit * decade for digit in (1, 2, 5) if digit * decade <= requested * (1 + 1e-9))
     bar_px = max(2, round(length / pixel))
     size = max(0.4, min(width, height) / 1500)
     thick = max(1, round(2 * size))

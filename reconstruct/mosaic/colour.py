@@ -37,8 +37,8 @@ from reconstruct.light.solve import (
     node_weights,
     solve_patterns,
 )
-from reconstruct.light.water import GREEN, MIN_LEFT, WaterLight, grown, solve_water
-from reconstruct.mosaic.picture_measures import PictureMeasures, ReferencePatch, encoded
+from reconstruct.light.water import GREEN, MIN_LEFT, WaterLight, growth_at, solve_water
+from reconstruct.mosaic.picture_measures import PictureMeasures, ReferencePatch, encode_srgb
 
 Float32 = NDArray[np.float32]
 
@@ -55,7 +55,7 @@ def curve_by_root() -> Float32:
     within 0.01 levels of it.
     """
     root = np.arange(int(_BRIGHTEST_ROOT * _ROOT_STEPS) + 2) / float(_ROOT_STEPS)
-    return encoded((root**2).astype(np.float32))
+    return encode_srgb((root**2).astype(np.float32))
 
 
 @compiled
@@ -73,7 +73,7 @@ def finish_colours(
 ) -> None:
     """Turn the light that a picture shows into levels of the mosaic, in place.
 
-    What `ColourModel.corrected` and `encoded` do to whole pictures, and the factors by which broad
+    What `ColourModel.correct` and `encode_srgb` do to whole pictures, and factors by which broad
     tones are made to meet, in one go.
 
     Args:
@@ -233,7 +233,7 @@ class ColourModel:
         ]  # fmt: skip
         return np.array(values, np.float32)
 
-    def corrected(
+    def correct(
         self, light: Float32, camera: str, image: str, places: Float32, ranges: Float32
     ) -> Float32:
         """The sea floor's light, (H, W, 3) BGR, where black is not yet taken away.
@@ -251,7 +251,7 @@ class ColourModel:
         ranges = np.where(np.isfinite(ranges), ranges, np.float32(model.middle_range))
         added = found[..., 3:]
         if self.growth.any():
-            added = added * grown(self.growth, ranges, model.middle_range).astype(np.float32)
+            added = added * growth_at(self.growth, ranges, model.middle_range).astype(np.float32)
         result: Float32 = np.maximum(light - added, MIN_LEFT * light) * found[..., :3]
         if model.fall_off.any():
             back = np.exp(-self.weakening(ranges)).astype(np.float32)
@@ -280,7 +280,7 @@ class ColourModel:
 
 @progress.step("even the light")
 def solve_colour(
-    wanted: Colour,
+    requested: Colour,
     samples: LightSamples,
     facts: Sequence[PictureMeasures],
     references: Sequence[ReferencePatch] = (),
@@ -288,7 +288,7 @@ def solve_colour(
     """Find the model from spots that two views see.
 
     Args:
-        wanted: `raw`: pictures as they are; `even`: without m, g and b; `water`: without A too.
+        requested: `raw`: pictures as they are; `even`: without m, g and b; `water`: without A too.
         samples: linear light; its logarithm and ranges.
         facts: of all pictures.
         references: patches of known reflectance; where there are any, light is reflectance.
@@ -300,10 +300,10 @@ def solve_colour(
         water=None,
         notes=("colours: as the pictures show them",),
     )
-    if wanted == "raw":
+    if requested == "raw":
         return model
     notes = ["colours: light of lamp, lens and range evened out over the survey"]
-    if wanted == "water" and samples.ranges is not None and len(samples.views):
+    if requested == "water" and samples.ranges is not None and len(samples.views):
         water, note = _water(samples, facts)
         model = replace(
             model,
@@ -382,7 +382,7 @@ def _patterns(
     if water is not None:
         ranges = _node_ranges(cleaned, len(facts))
         added = np.stack([water.added[fact.camera] for fact in facts])
-        added = added * grown(water.growth, ranges, water.middle_range)
+        added = added * growth_at(water.growth, ranges, water.middle_range)
         weaker = np.exp(model.weakening(ranges))
         nodes, added = nodes / weaker, added / weaker
         levels = cleaned.levels - model.weakening(np.asarray(cleaned.ranges))
@@ -442,8 +442,8 @@ def _brighter(
     # factor f with (f level - f dark) / (1 - f dark) = wanted
     return float(
         min(
-            wanted / max(found - dark + wanted * dark, 1e-6)
-            for found, wanted in ((bright, _BRIGHT_LIGHT), (middle, _MIDDLE_LIGHT))
+            requested / max(found - dark + requested * dark, 1e-6)
+            for found, requested in ((bright, _BRIGHT_LIGHT), (middle, _MIDDLE_LIGHT))
         )
     )
 
@@ -451,7 +451,7 @@ def _brighter(
 def _levels(samples: LightSamples, model: ColourModel, facts: Sequence[PictureMeasures]) -> Array:
     """(N, 3) light of the first views of samples, evened out, white not yet balanced."""
     gains = np.stack([model.light.gains[fact.image] for fact in facts])
-    factor = sampled(samples, model.light.patterns, facts)[:, 0] + gains[samples.views[:, 0]]
+    factor = sample_maps(samples, model.light.patterns, facts)[:, 0] + gains[samples.views[:, 0]]
     if samples.ranges is not None:
         factor = factor + model.weakening(samples.ranges[:, 0])
     return np.asarray(np.exp(samples.levels[:, 0] - factor))
@@ -468,8 +468,8 @@ def _without_water(
     if model.water is None:
         return samples, np.ones((len(samples.views), 3))
     light = np.exp(samples.levels.astype(np.float64))
-    beyond = grown(model.growth, np.asarray(samples.ranges), model.light.middle_range)
-    left = light - sampled(samples, model.water.added, facts) * beyond
+    beyond = growth_at(model.growth, np.asarray(samples.ranges), model.light.middle_range)
+    left = light - sample_maps(samples, model.water.added, facts) * beyond
     kept = (left > MIN_LEFT * light).all(axis=(1, 2))
     loss = np.diff(model.weakening(np.asarray(samples.ranges)[kept]), axis=1)[:, 0]
     unsure = np.hypot((light[kept] / left[kept]).mean(axis=1), loss)
@@ -487,7 +487,7 @@ def _part(samples: LightSamples, chosen: Any) -> LightSamples:
     )
 
 
-def sampled(
+def sample_maps(
     samples: LightSamples, maps: Mapping[str, Array], facts: Sequence[PictureMeasures]
 ) -> Array:
     """(N, 2, 3) values of maps over the pictures where both views see the spots."""
@@ -530,7 +530,7 @@ def _reference_white(
         near = _range_near(samples, numbers[patch.image], patch.place)
         if near is None:
             continue
-        shown = model.corrected(
+        shown = model.correct(
             patch.light[None, None].astype(np.float32), cameras[patch.image], patch.image,
             patch.place[None], np.full((1, 1), near, np.float32),
         )  # fmt: skip

@@ -103,8 +103,8 @@ def blocks_of(grid: DemGrid, seen: Footprints, size: int, margin: int) -> list[B
         window = Window(
             core.col_off - margin,
             core.row_off - margin,
-            _aligned(core.width) + 2 * margin,
-            _aligned(core.height) + 2 * margin,
+            _align(core.width) + 2 * margin,
+            _align(core.height) + 2 * margin,
         )
         part = grid.window(window.row_off, window.col_off, window.height, window.width)
         east, south = float(part.east_of(part.columns)), float(part.north_of(part.rows))
@@ -167,7 +167,7 @@ def coarse(grid: DemGrid, side_px: int = CELL_PX) -> DemGrid:
     )
 
 
-def _aligned(pixels: int) -> int:
+def _align(pixels: int) -> int:
     return -(-int(pixels) // ALIGNED_PX) * ALIGNED_PX
 
 

@@ -79,7 +79,7 @@ def visible_cells(
 @compiled(error_model="numpy", fastmath=FAST)
 def look_up(
     height: Float32,
-    wanted: tuple[NDArray[np.bool_], int],
+    requested: tuple[NDArray[np.bool_], int],
     visible: NDArray[np.bool_],
     first_cell: tuple[float, float],
     cells_per_pixel: float,
@@ -101,7 +101,7 @@ def look_up(
 
     Args:
         height: (H, W) up at the pixels' centres, NaN where unknown.
-        wanted: (h, w) whether to look at squares of pixels, and their side; beyond the last
+        requested: (h, w) whether to look at squares of pixels, and their side; beyond the last
             square the last one sees.
         visible: cells of the DEM that the view sees.
         first_cell: row and column of the first pixel's centre in `visible` (cell centres whole).
@@ -127,7 +127,7 @@ def look_up(
     ranges = np.full((rows, columns), np.nan, np.float32)
     t = cam_from_enu
     half = 0.5 * min(size[0], size[1])
-    squares, side = wanted
+    squares, side = requested
     pinhole, field, inverse_working = lens  # out of the loop: taking it apart costs time
     for row in range(rows):
         north = first_enu[1] - row * pixel

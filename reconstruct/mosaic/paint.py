@@ -204,7 +204,7 @@ class _Shown:
     """Spots of a lattice that a view shows; arrays of N rows."""
 
     number: int
-    spots: NDArray[np.intp]
+    lattice: NDArray[np.intp]
     places: Float32
     levels: Float32
     ranges: Float32
@@ -213,7 +213,7 @@ class _Shown:
         """Those of the spots that are kept."""
         return _Shown(
             number=self.number,
-            spots=self.spots[kept],
+            lattice=self.lattice[kept],
             places=self.places[kept],
             levels=self.levels[kept],
             ranges=self.ranges[kept],
@@ -235,22 +235,24 @@ def compare_block(task: LightTask) -> LightSamples:
         optics = tools.optics(entry.view)
         sight = see(entry.view, optics, surface)
         copy = tools.small(entry.view.image)
-        spots = np.flatnonzero(sight.quality.ravel() > 0)
-        places = sight.places(optics.size_px)[spots]
+        lattice = np.flatnonzero(sight.quality.ravel() > 0)
+        places = sight.places(optics.size_px)[lattice]
         levels = at_places(copy.broad, places)
         usable = well_exposed(levels) & (at_places(copy.valid[..., None], places, 1)[:, 0] > 0.9)
         shown = _Shown(
             number=entry.number,
-            spots=spots,
+            lattice=lattice,
             places=places,
             levels=np.log(np.maximum(levels, DARKEST)),
-            ranges=sight.range.ravel()[spots],
+            ranges=sight.range.ravel()[lattice],
         )
         seen.append(shown.part(usable))
-    seen = _thinned(seen, surface.height.size, task)
+    seen = _thin(seen, surface.height.size, task)
     parts = []
     for one, other in combinations(seen, 2):
-        _, a, b = np.intersect1d(one.spots, other.spots, assume_unique=True, return_indices=True)
+        _, a, b = np.intersect1d(
+            one.lattice, other.lattice, assume_unique=True, return_indices=True
+        )
         if not len(a):
             continue
         parts.append(
@@ -264,19 +266,19 @@ def compare_block(task: LightTask) -> LightSamples:
     return joined_samples(parts)
 
 
-def _thinned(seen: list[_Shown], spots: int, task: LightTask) -> list[_Shown]:
+def _thin(seen: list[_Shown], lattice: int, task: LightTask) -> list[_Shown]:
     """Views with as many of the spots, drawn at random, as give no more samples than allowed."""
-    times = np.zeros(spots, np.int64)
+    times = np.zeros(lattice, np.int64)
     for shown in seen:
-        times[shown.spots] += 1
+        times[shown.lattice] += 1
     pairs = times * (times - 1) // 2
     if pairs.sum() <= task.maximum:
         return seen
     rng = np.random.default_rng([task.block.core.row_off, task.block.core.col_off])
     order = rng.permutation(np.flatnonzero(pairs))
-    kept = np.zeros(spots, np.bool_)
+    kept = np.zeros(lattice, np.bool_)
     kept[order[np.cumsum(pairs[order]) <= task.maximum]] = True
-    return [shown.part(kept[shown.spots]) for shown in seen]
+    return [shown.part(kept[shown.lattice]) for shown in seen]
 
 
 @small_cache()
@@ -374,10 +376,10 @@ def paint_tile(task: PaintTask) -> Painted:
     seen_by = {}
     for entry in used:  # pixels of a cell that its view does not see go to the best that does
         value = entry.number + 1
-        wanted = cv2.dilate((label == value).astype(np.uint8), _AROUND) > 0
-        part, box = _box(wanted)
-        sight = _sight_of(task, entry, surface.part(*part), wanted[box])
-        seen_by[value] = (entry, part, sight, wanted[box])
+        requested = cv2.dilate((label == value).astype(np.uint8), _AROUND) > 0
+        part, box = _box(requested)
+        sight = _sight_of(task, entry, surface.part(*part), requested[box])
+        seen_by[value] = (entry, part, sight, requested[box])
         source[part][(named[part] == value) & (sight.quality > 0)] = value
     left = (named > 0) & (source == 0)
     if left.any():
@@ -387,13 +389,13 @@ def paint_tile(task: PaintTask) -> Painted:
             best[part][better] = sight.quality[better]
             source[part][better] = value
     blend = Blend(grid.rows, grid.columns)
-    for value, (entry, part, sight, wanted) in seen_by.items():
+    for value, (entry, part, sight, requested) in seen_by.items():
         taken = source[part] == value
         if not taken.any():
             continue
         local = surface.part(*part)
         change = changes.get(entry.number)
-        colour = _colours(task, tools, entry, sight, (local, part, wanted), change)
+        colour = _colours(task, tools, entry, sight, (local, part, requested), change)
         blend.add(
             ViewPart(
                 row=part[0].start,
@@ -489,7 +491,7 @@ def _small_light(task: PaintTask, tools: Tools, found: _ViewOfCells, *, broad: b
     places = sight.places(tools.optics(view).size_px)
     shape = (*sight.quality.shape, 3)
     shown = at_places(copy.broad if broad else copy.detail, places).reshape(shape)
-    return task.colour.corrected(shown, view.camera, view.image, places, sight.range)
+    return task.colour.correct(shown, view.camera, view.image, places, sight.range)
 
 
 def _logarithm(light: Float32) -> Float32:
@@ -532,11 +534,11 @@ def _changes(
 
 
 def _sight_of(
-    task: PaintTask, entry: SeenView, surface: GridHeights, wanted: NDArray[np.bool_]
+    task: PaintTask, entry: SeenView, surface: GridHeights, requested: NDArray[np.bool_]
 ) -> SeenCells:
     """How a view sees the pixels of cells, its mask applied exactly."""
     tools = tools_of(task.survey)
-    sight = see(entry.view, tools.optics(entry.view), surface, (wanted, CELL_PX))
+    sight = see(entry.view, tools.optics(entry.view), surface, (requested, CELL_PX))
     usable = tools.usable(entry.view.image)
     if usable is not None and sight.quality.any():
         # as far as the kernel reaches, what is masked would colour its surroundings
@@ -558,7 +560,7 @@ def _colours(
     change: tuple[Float32, tuple[slice, slice]] | None,
 ) -> Float32:
     """Corrected colours of a view at the pixels of a box, levels, BGR."""
-    view, (local, part, wanted) = entry.view, at
+    view, (local, part, requested) = entry.view, at
     picture = tools.picture(view.image)
     light = np.zeros((*sight.quality.shape, 3), np.float32)
     x = np.where(sight.quality > 0, sight.x, np.float32(-1))
@@ -567,7 +569,7 @@ def _colours(
         sample_lanczos(picture, tools.table, tools.weights, x, sight.y, 0, 3, light)
     else:
         for channel, optics in enumerate(channels):
-            own = see(view, optics, local, (wanted, CELL_PX))
+            own = see(view, optics, local, (requested, CELL_PX))
             seen = (own.quality > 0) & (sight.quality > 0)
             own_x = np.where(seen, own.x, x)
             own_y = np.where(seen, own.y, sight.y)

@@ -98,7 +98,7 @@ def linear_table() -> Float32:
     return table
 
 
-def encoded(light: Float32) -> Float32:
+def encode_srgb(light: Float32) -> Float32:
     """Levels, 0 to 255 where light is 0 to 1, by the sRGB curve; brighter light goes on beyond."""
     light = np.maximum(light, np.float32(0.0))
     curve = np.float32(1.055) * light ** np.float32(1 / 2.4) - np.float32(0.055)
@@ -125,7 +125,7 @@ def measure_picture(workspace: Path, folder: Path, view: View) -> PictureMeasure
         light = light if usable is None else light * usable
         total = cv2.resize(light, size, interpolation=cv2.INTER_AREA)
         small[..., channel] = total / np.maximum(small[..., 3], 1e-3)
-    levels = np.rint(np.minimum(encoded(small[..., :3]), 255)).astype(np.uint8)
+    levels = np.rint(np.minimum(encode_srgb(small[..., :3]), 255)).astype(np.uint8)
     content = np.dstack([levels, np.rint(255 * small[..., 3]).astype(np.uint8)])
     copy = _small_copy(content)
     path = _small_path(folder, view.image)
@@ -322,13 +322,13 @@ def read_references(workspace: Path, images: Sequence[str]) -> tuple[ReferencePa
         where = f"{path} line {line}"
         if row["image"] not in known:
             raise WorkspaceError(f"{where}: the model has no picture {row['image']!r}")
-        found.append(_measured(where, row, pictures))
+        found.append(_measure_patch(where, row, pictures))
     if not found:
         raise WorkspaceError(f"{path}: has no patch; fill it or take it away")
     return tuple(found)
 
 
-def _measured(where: str, row: dict[str, str], pictures: Pictures) -> ReferencePatch:
+def _measure_patch(where: str, row: dict[str, str], pictures: Pictures) -> ReferencePatch:
     try:
         x, y, radius, *rgb = (float(row[name]) for name in _NUMBERS)
     except ValueError:

@@ -66,7 +66,7 @@ from reconstruct.mosaic.picture_measures import (
 from reconstruct.mosaic.seams import SUPPORT_PX
 from reconstruct.mosaic.visibility import Water, find_occluders, occluders_folder
 from reconstruct.placing.track import plot_track_over
-from reconstruct.planes import PLANES, Plane, plane_folders, read_plane, turned, write_plane
+from reconstruct.planes import PLANES, Plane, plane_folders, read_plane, turn_model, write_plane
 from reconstruct.raster import (
     BLOCK,
     DemGrid,
@@ -295,7 +295,7 @@ def paint_plane(painting: Painting, plane: Plane, dem: Path, folder: Path) -> bo
         WorkspaceError: it is damaged.
     """
     reconstruct, executor = painting.reconstruct, painting.executor
-    model = turned(painting.model, plane)
+    model = turn_model(painting.model, plane)
     sights = painting.scratch / plane.name
     sights.mkdir()
     with opened_raster(dem) as raster:
@@ -436,9 +436,9 @@ def _solve(
     label: str,
 ) -> ColourModel:
     """The survey's light from spots that two views see."""
-    wanted, facts = painting.reconstruct.colour, painting.facts
-    if wanted == "raw":
-        return solve_colour(wanted, joined_samples([]), facts)
+    requested, facts = painting.reconstruct.colour, painting.facts
+    if requested == "raw":
+        return solve_colour(requested, joined_samples([]), facts)
     width = float(np.median([view.pinhole.width_px for view in model.views]))
     step_px = max(CELL_PX, round(width * mean_pixel(model) / blocks[0].grid.cell / _LIGHT_LATTICE))
     compare = [
@@ -453,7 +453,7 @@ def _solve(
     ]
     found = painting.executor.map(compare_block, compare, label=label, task_mib=_TASK_MIB)
     parts = [part for part in found if len(part.views)]
-    return solve_colour(wanted, joined_samples(parts), facts, painting.references)
+    return solve_colour(requested, joined_samples(parts), facts, painting.references)
 
 
 def _part_of(colour: ColourModel, images: Sequence[str]) -> ColourModel:

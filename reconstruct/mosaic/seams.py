@@ -233,7 +233,7 @@ class Blend:
             mean = total / np.maximum(share, _NOTHING)[..., None]
             if level < LEVELS:
                 share_next, total_next = cv2.pyrDown(share), cv2.pyrDown(total)
-                band = mean - _expanded(total_next, share_next, (width, height))
+                band = mean - _expand(total_next, share_next, (width, height))
                 share, total = share_next, total_next
             else:
                 band = mean
@@ -248,14 +248,14 @@ class Blend:
         for level in reversed(range(LEVELS)):
             weight = self._weights[level]
             height, width = weight.shape
-            broad = _expanded(colour, known, (width, height))
+            broad = _expand(colour, known, (width, height))
             known = (weight > _NOTHING).astype(np.float32)
             mean = self._bands[level] / np.maximum(weight, _NOTHING)[..., None]
             colour = ((mean + broad) * known[..., None]).astype(np.float32)
         return colour
 
 
-def _expanded(total: Float32, share: Float32, size: tuple[int, int]) -> Float32:
+def _expand(total: Float32, share: Float32, size: tuple[int, int]) -> Float32:
     """Means total / share at twice the size, of what is known alone."""
     known = (share > _NOTHING).astype(np.float32)
     mean = total / np.maximum(share, _NOTHING)[..., None] * known[..., None]

@@ -189,7 +189,7 @@ def hidden_by(occluders: Occluders, view: View, points: Array) -> NDArray[np.boo
     low, high = view.pinhole.slopes(np.array([(0, 0), (width, height)]))
     focal_px = width / float(high[0] - low[0])
     depth = view.world_from_cam.inv().apply(standing)[:, 2]
-    drawn = _drawn(
+    drawn = _draw(
         view.project(standing) / _SHRINK,
         depth,
         _COVER * occluders.spacing * focal_px / _SHRINK,
@@ -205,7 +205,7 @@ def hidden_by(occluders: Occluders, view: View, points: Array) -> NDArray[np.boo
 
 
 @compiled
-def _drawn(pixels: Array, depth: Array, cover: float, shape: tuple[int, int]) -> Float32:
+def _draw(pixels: Array, depth: Array, cover: float, shape: tuple[int, int]) -> Float32:
     """(H, W) depth of the nearest point at each pixel, infinite where there is none.
 
     Args:
@@ -344,7 +344,7 @@ def visible_over(view: View, dem: Float32, around: DemGrid, stored: Path | None 
     known = np.isfinite(dem)
     part = (0, 0, 0, 0)
     if known.any():
-        part = _reached(view, (float(dem[known].min()), float(dem[known].max())), around)
+        part = _reach(view, (float(dem[known].min()), float(dem[known].max())), around)
     cells = visible_cells(
         dem,
         enu_from_cam(view, np.zeros(3))[:, 3],
@@ -363,9 +363,7 @@ def visible_over(view: View, dem: Float32, around: DemGrid, stored: Path | None 
     return Visible(cells=cells, west=around.west, north=around.north)
 
 
-def _reached(
-    view: View, heights: tuple[float, float], around: DemGrid
-) -> tuple[int, int, int, int]:
+def _reach(view: View, heights: tuple[float, float], around: DemGrid) -> tuple[int, int, int, int]:
     """Rows and columns of a DEM that a view may see."""
     west, east, south, north = footprints((view,), heights).boxes[0]
     edge = 2.0 * around.cell
@@ -454,7 +452,7 @@ def see(
     view: View,
     optics: CameraOptics,
     surface: GridHeights,
-    wanted: tuple[NDArray[np.bool_], int] = _ALL,
+    requested: tuple[NDArray[np.bool_], int] = _ALL,
 ) -> SeenCells:
     """Look at a surface with a view; what the surface itself hides is not seen.
 
@@ -462,7 +460,7 @@ def see(
         view: the view.
         optics: of its camera, or of a channel of it.
         surface: heights.
-        wanted: squares of the surface's grid to look at, and their side in its cells.
+        requested: squares of the surface's grid to look at, and their side in its cells.
     """
     grid, cell = surface.grid, surface.ground.around.cell
     visible = surface.ground.visible_from(view)
@@ -473,7 +471,7 @@ def see(
     lens = replace(view, shift=optics.shift).kernel_lens
     x, y, quality, ranges = look_up(
         surface.height,
-        wanted,
+        requested,
         visible.cells,
         ((visible.north - north) / cell - 0.5, (east - visible.west) / cell - 0.5),
         grid.cell / cell,

@@ -59,7 +59,7 @@ _MAX_OBSERVATIONS = 400_000
 class SpotErrors:
     """How a spot errs."""
 
-    spot: TriangulatedPoint
+    target: TriangulatedPoint
     picks: Array
     """(3, 3) covariance by its own picks."""
     by_poses: Array
@@ -160,10 +160,10 @@ class StationBlock:
         )  # fmt: skip
 
     def errors(
-        self, spot: TriangulatedPoint, picks: Sequence[Pick], pictures: RegisteredPictures
+        self, target: TriangulatedPoint, picks: Sequence[Pick], pictures: RegisteredPictures
     ) -> SpotErrors:
         """How a spot errs that was found from picks in pictures of the block."""
-        kept = [p for p in picks if p.image in pictures and p.image not in spot.left_out]
+        kept = [p for p in picks if p.image in pictures and p.image not in target.left_out]
         rows = [pictures.row(p.image) for p in kept]
         station = np.searchsorted(self.numbers, pictures.station[rows])
         names, own = list(self.state.rig.cameras), list(pictures.warps)
@@ -172,7 +172,9 @@ class StationBlock:
             camera=np.array([names.index(own[pictures.camera[row]]) for row in rows], np.int64),
             taken=np.array([[p.x_px, p.y_px] for p in kept]), point=np.zeros(len(kept), np.int64),
         )  # fmt: skip
-        linear = exact_observations(replace(self.state, points=spot.model[None]), seen, self.fields)
+        linear = exact_observations(
+            replace(self.state, points=target.model[None]), seen, self.fields
+        )
         jacobian = linear.by_point.reshape(-1, 3)
         sigma = np.repeat(own_sigmas(kept), 2)
         gain = gain_of(jacobian, sigma)
@@ -182,7 +184,7 @@ class StationBlock:
             by_pose(linear.by_point[n], linear.arm[n], slopes)
             by_poses[:, station[n]] -= gain[:, 2 * n : 2 * n + 2] @ slopes
         return SpotErrors(
-            spot=spot,
+            target=target,
             picks=gain @ covariance_of_picks(kept, jacobian, max(1.0, chi)) @ gain.T,
             by_poses=by_poses,
             by_rig=-gain @ linear.rest[..., :-1].reshape(2 * len(kept), -1),
@@ -236,12 +238,12 @@ class Lengths:
             ReconstructionError: a point is not found, two that follow each other are one, or
                 their distances are not determined.
         """
-        spots = [self.spot(some) for some in picks]
-        points = np.stack([spot.model for spot in spots])
+        targets = [self.target(some) for some in picks]
+        points = np.stack([target.model for target in targets])
         if not (np.linalg.norm(np.diff(points, axis=0), axis=1) > 0).all():
             raise ReconstructionError("the two spots are one and the same")
         block = self._block([pick for some in picks for pick in some])
-        errors = [block.errors(s, p, self._pictures) for s, p in zip(spots, picks, strict=True)]
+        errors = [block.errors(s, p, self._pictures) for s, p in zip(targets, picks, strict=True)]
         by_picks, by_poses, by_rig = (
             np.stack([getattr(one, name) for one in errors])
             for name in ("picks", "by_poses", "by_rig")
@@ -267,7 +269,7 @@ class Lengths:
             )  # fmt: skip
         return points, found
 
-    def spot(self, picks: Sequence[Pick]) -> TriangulatedPoint:
+    def target(self, picks: Sequence[Pick]) -> TriangulatedPoint:
         """The spot that picks show.
 
         Raises:
@@ -299,15 +301,15 @@ class Lengths:
         return self._kept[1]
 
 
-def spot_residuals(
-    spots: Mapping[str, TriangulatedPoint], picks: Sequence[Pick], pictures: RegisteredPictures
+def point_residuals(
+    targets: Mapping[str, TriangulatedPoint], picks: Sequence[Pick], pictures: RegisteredPictures
 ) -> list[Array | None]:
     """(2,) pixels by which each pick misses its spot; None where that is not known."""
     found: list[Array | None] = []
     for pick in picks:
-        known = pick.point in spots and pick.image in pictures
+        known = pick.point in targets and pick.image in pictures
         cameras = {pick.image: pictures.picture(pick.image)} if known else {}
-        found.append(residuals(spots[pick.point].model, [pick], cameras)[0] if known else None)
+        found.append(residuals(targets[pick.point].model, [pick], cameras)[0] if known else None)
     return found
 
 

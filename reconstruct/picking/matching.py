@@ -292,7 +292,7 @@ class Refined:
     matches: tuple[Match, ...]
     """One for each of the other picks, with the sigma that these state."""
     refused: tuple[NoMatch, ...]
-    spot: TriangulatedPoint | None
+    meeting: TriangulatedPoint | None
     """The point that they have in common."""
     factor: float
     """By which sigmas were enlarged."""
@@ -329,29 +329,29 @@ def refine(
     cameras = {image: picture(image) for image in (pick.image, *found)}
     while True:
         picks = [pick, *(_pick_of(match, pick) for match in found.values())]
-        spot = triangulate_picks(picks, cameras)[0].get(pick.point) if found else None
-        if spot is None:
+        meeting = triangulate_picks(picks, cameras)[0].get(pick.point) if found else None
+        if meeting is None:
             break
-        factor = _factor(spot, picks, cameras)
-        worst, off = _worst(spot, picks, cameras, factor)
+        factor = _factor(meeting, picks, cameras)
+        worst, off = _worst(meeting, picks, cameras, factor)
         if len(found) < 3 or off <= _WRONG_SIGMAS:
             break
         del found[worst]
         refused.append(
             NoMatch(image=worst, why=f"{off:.0f} sigmas off the point that the others show")
         )
-    if spot is None:
+    if meeting is None:
         refused += [
             NoMatch(image=image, why="it does not meet the pick in one point") for image in found
         ]
         return Refined(
-            picks=(pick,), matches=(), refused=tuple(refused), spot=None, factor=_USUAL_FACTOR
+            picks=(pick,), matches=(), refused=tuple(refused), meeting=None, factor=_USUAL_FACTOR
         )
     matches = [replace(m, sigma_px=factor * m.sigma_px) for m in found.values()]
     picks = [pick, *(_pick_of(match, pick) for match in matches)]
     return Refined(
         picks=tuple(picks), matches=tuple(matches), refused=tuple(refused), factor=factor,
-        spot=triangulate_picks(picks, cameras)[0].get(pick.point),
+        meeting=triangulate_picks(picks, cameras)[0].get(pick.point),
     )  # fmt: skip
 
 
@@ -363,10 +363,10 @@ def _pick_of(match: Match, pick: Pick) -> Pick:
 
 
 def _factor(
-    spot: TriangulatedPoint, picks: Sequence[Pick], cameras: Mapping[str, RegisteredPicture]
+    meeting: TriangulatedPoint, picks: Sequence[Pick], cameras: Mapping[str, RegisteredPicture]
 ) -> float:
     """By which matches are worse than they state, at least 1."""
-    off = residuals(spot.model, picks, cameras) / own_sigmas(picks)[:, None]
+    off = residuals(meeting.model, picks, cameras) / own_sigmas(picks)[:, None]
     spare = 2 * len(picks) - 3
     total = float((np.minimum(np.abs(off), 2 * _WRONG_SIGMAS) ** 2).sum())
     mean = (total + _USUAL_WEIGHT * _USUAL_FACTOR**2) / (spare + _USUAL_WEIGHT)
@@ -374,12 +374,16 @@ def _factor(
 
 
 def _worst(
-    spot: TriangulatedPoint,
+    meeting: TriangulatedPoint,
     picks: Sequence[Pick],
     cameras: Mapping[str, RegisteredPicture],
     factor: float,
 ) -> tuple[str, float]:
     """The match that is farthest off the common point, and by how many of its sigmas."""
-    off = np.linalg.norm(residuals(spot.model, picks, cameras), axis=1) / own_sigmas(picks) / factor
+    off = (
+        np.linalg.norm(residuals(meeting.model, picks, cameras), axis=1)
+        / own_sigmas(picks)
+        / factor
+    )
     worst = 1 + int(np.argmax(off[1:]))
     return picks[worst].image, float(off[worst])

@@ -63,7 +63,7 @@ def measure(
     if not pictures.frame.scaled:
         raise ReconstructionError("the model has no scale: lengths in it are not metres")
     finder = _PickFinder(workspace, pictures)
-    picks = [finder.find(some) if len(some) == 1 else finder.checked(some) for some in marks]
+    picks = [finder.find(some) if len(some) == 1 else finder.check(some) for some in marks]
     lines = [PolylineFigure(value=partial(_segment, n), power=1) for n in range(len(picks) - 1)]
     if len(picks) > 2:
         lines += [
@@ -71,7 +71,7 @@ def measure(
             PolylineFigure(value=polygon_area, power=2),
         ]
     places, figures = Lengths(workspace, pictures).figures(picks, lines)
-    return _described(words, places, figures)
+    return _describe(words, places, figures)
 
 
 def scale_model(workspace: Path, points: str, length_m: float) -> str:
@@ -139,7 +139,7 @@ class _PickFinder:
     def _read(self, image: str) -> Any:
         return cv2.cvtColor(read_colour(self._images / image), cv2.COLOR_BGR2GRAY)
 
-    def checked(self, picks: Sequence[Pick]) -> Sequence[Pick]:
+    def check(self, picks: Sequence[Pick]) -> Sequence[Pick]:
         """Picks that lie in their pictures.
 
         Raises:
@@ -159,14 +159,14 @@ class _PickFinder:
         Raises:
             ReconstructionError: it meets no known surface, or no other picture shows it.
         """
-        (pick,) = self.checked(picks)
+        (pick,) = self.check(picks)
         place = self._surface.met_by(
             *self._pictures.picture(pick.image).ray(np.array([pick.x_px, pick.y_px]))
         )
         seen = self._pictures.seeing(place.point, place.normal)[:_MAX_LOOKED_IN]
         images = [one.image for one in seen if one.image != pick.image]
         found = refine(pick, images, place, self._pictures.picture, self._grey)
-        if found.spot is not None:
+        if found.meeting is not None:
             return found.picks
         if images and self._surface.is_dense:
             return pick, self._by_surface(pick, place, images[0])
@@ -199,7 +199,7 @@ def _segment(number: int, points: Array) -> float:
     return polyline(points[number : number + 2])
 
 
-def _described(
+def _describe(
     words: Sequence[str], places: Array, figures: Sequence[PickedFigure]
 ) -> tuple[str, dict[str, Any]]:
     def entry(figure: PickedFigure, unit: str) -> dict[str, float]:

@@ -19,7 +19,7 @@ from reconstruct.views.model import WorldFrame
 
 def preview_control(
     control: Control,
-    spots: Mapping[str, TriangulatedPoint],
+    points: Mapping[str, TriangulatedPoint],
     lost: Mapping[str, str],
     frame: WorldFrame,
 ) -> dict[str, Any]:
@@ -27,7 +27,7 @@ def preview_control(
 
     Args:
         control: what is known.
-        spots: where the model has its points.
+        points: where the model has its points.
         lost: why it has not others.
         frame: of the model.
 
@@ -36,7 +36,7 @@ def preview_control(
         such placement, and `not_found` by name.
     """
     datum = frame.datum if frame.datum is not None else control.datum()
-    ties = tie_control(control, spots, lost, datum)
+    ties = tie_control(control, points, lost, datum)
     still = Similarity(scale=1.0, rotation=Rotation.identity(), translation=np.zeros(3))
     start = ties.start(1.0 if frame.scaled else None)
     return {

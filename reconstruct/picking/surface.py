@@ -24,7 +24,7 @@ _CLEAR_CELLS, _CLEAR_SIGMAS = 2.0, 4.0
 """The surface must stand this much above a way to hide what is at its end."""
 _NEIGHBOURS = 15
 _ROUNDS, _SETTLED = 50, 1e-6
-_FARTHEST = 3.0
+_MAX_APART = 3.0
 """Times the usual distance of neighbours within which points of a sparse model make a surface."""
 
 
@@ -112,7 +112,7 @@ class ModelSurface:
             "picture by hand"
         )
 
-    def hidden(self, place: SurfacePlace, centres: Array) -> NDArray[np.bool_]:
+    def hides(self, place: SurfacePlace, centres: Array) -> NDArray[np.bool_]:
         """(N,) whether the surface stands between a place and cameras at (N, 3)."""
         count = len(centres)
         if self._dem is None or not count:
@@ -134,7 +134,7 @@ class ModelSurface:
         away, rows = (np.asarray(one) for one in self._tree.query(at, _NEIGHBOURS))
         near = self._points[rows]
         usual = float(np.median(np.asarray(self._tree.query(near[:, :2], _NEIGHBOURS)[0])[:, -1]))
-        if away[0] > _FARTHEST * usual:
+        if away[0] > _MAX_APART * usual:
             raise ReconstructionError(
                 f"no point of the model is near {at[0]:.3f} north, {at[1]:.3f} east"
             )

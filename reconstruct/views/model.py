@@ -65,7 +65,7 @@ class View:
     def project(self, points_world: Array) -> Array:
         """Pixels (N, 2) at which the warped picture shows points (N, 3); NaN behind the camera."""
         points = self.world_from_cam.inv().apply(points_world)
-        return self.shift.warped(self.pinhole.project(points), points[:, 2])
+        return self.shift.warp(self.pinhole.project(points), points[:, 2])
 
     def at_depth(self, pixels: Array, depth: Array) -> Array:
         """World points (N, 3) that the warped picture shows at pixels (N, 2) and depths (N,)."""
@@ -227,7 +227,7 @@ def scaled_view(view: View, scale: float) -> View:
     return replace(
         view,
         pinhole=old.resize(width, height),
-        shift=view.shift.scaled(width / old.width_px, height / old.height_px),
+        shift=view.shift.scale(width / old.width_px, height / old.height_px),
     )
 
 

@@ -59,7 +59,7 @@ class RangeShift:
         """
         return self._move_all(warped, depth, inverse=False)
 
-    def warped(self, ideal: Array, depth: Array | float) -> Array:
+    def warp(self, ideal: Array, depth: Array | float) -> Array:
         """The inverse of `ideal`."""
         return self._move_all(ideal, depth, inverse=True)
 
@@ -77,7 +77,7 @@ class RangeShift:
         found: Array = steepest * np.abs(1.0 / depth - self.inverse_working)
         return found
 
-    def scaled(self, sx: float, sy: float) -> "RangeShift":
+    def scale(self, sx: float, sy: float) -> "RangeShift":
         """The same field for a picture that is made smaller by a factor along x and y.
 
         Views that share a field share the smaller one, in memory and in what goes to processes.

@@ -17,7 +17,7 @@ from reconstruct.planes import (
     best_plane,
     facing,
     read_plane,
-    turned,
+    turn_model,
     write_plane,
 )
 from reconstruct.raster import crs_of, frame_tags
@@ -98,12 +98,12 @@ def test_a_turned_model_shows_the_same_pixels():
         about="",
         plane_from_world=RigidTransform.from_components([1.0, -2.0, 3.0], facing(77.0, 12.0)),
     )
-    moved = turned(NADIR, plane)
+    moved = turn_model(NADIR, plane)
     for before, after in zip(NADIR.views, moved.views, strict=True):
         np.testing.assert_allclose(
             after.project(moved.points_world), before.project(NADIR.points_world), atol=1e-9
         )
-    assert turned(NADIR, LEVEL_PLANE) is NADIR
+    assert turn_model(NADIR, LEVEL_PLANE) is NADIR
     assert crs_of(NADIR.frame) is not None
     assert crs_of(moved.frame) is None
     with pytest.raises(ValueError, match=r"frame\.json"):
@@ -127,7 +127,7 @@ def test_plane_json_turns_a_pixel_into_a_point(tmp_path: Path):
     np.testing.assert_allclose(
         again.plane_from_world.as_matrix(), plane.plane_from_world.as_matrix(), atol=1e-12
     )
-    tags = frame_tags(turned(NADIR, plane).frame)
+    tags = frame_tags(turn_model(NADIR, plane).frame)
     origin = [float(value) for value in tags["PLANE_ORIGIN_ENU"].split()]
     np.testing.assert_allclose(origin, about["origin_enu"])
     assert read_plane(tmp_path / "none").is_level

@@ -108,7 +108,7 @@ def test_grid_covers_its_boxes_on_whole_cells():
     assert (grid.rows, grid.columns) == (33, 15)
     assert grid.east_of(grid.columns) == pytest.approx(1.0)
     assert grid.north_of(grid.rows) == pytest.approx(-1.3)
-    moved = grid.moved(10.0, -5.0).window(3, 2, 4, 5)
+    moved = grid.translate(10.0, -5.0).window(3, 2, 4, 5)
     assert moved.west == pytest.approx(9.7)
     assert moved.north == pytest.approx(-3.3)
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from reconstruct.dense.surface_tiles import look_at_points
-from reconstruct.dense.view_store import stored
+from reconstruct.dense.view_store import encode_depth
 from reconstruct.views.model import View, enu_from_cam
 from tests.oracles_dense import Scene, hits, sloped_with_step, speckle, stereo_views
 
@@ -22,7 +22,7 @@ def looks(view: View, world: np.ndarray, sigma_m: float = 1e-4) -> tuple[np.ndar
     to_cam = np.linalg.inv(np.vstack([enu_from_cam(view, OFFSET), [0, 0, 0, 1]]))[:3]
     return look_at_points(
         enu, np.full(len(enu), sigma_m, np.float32), np.ascontiguousarray(to_cam),
-        stored(depth, np.full(shape, sigma_m, np.float32)), 1.0, view.kernel_lens, CELL_M,
+        encode_depth(depth, np.full(shape, sigma_m, np.float32)), 1.0, view.kernel_lens, CELL_M,
     )  # fmt: skip
 
 

@@ -2,9 +2,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from reconstruct.dense.depth import count_witnesses, merge_depths
+from reconstruct.dense.depth import count_confirming, merge_depths
 from reconstruct.dense.stereo_pairs import in_frame
-from reconstruct.dense.view_store import decoded, stored
+from reconstruct.dense.view_store import decode_depth, encode_depth
 from reconstruct.views.range_shift import KernelLens, no_shift, slopes_of
 from tests.oracles_dense import merged, plane_depth, port_view
 
@@ -35,8 +35,8 @@ def test_witnesses_through_a_tilted_port_equal_their_slow_twin():
     there = plane_depth(other, 1.2)
     there += rng.normal(0, 0.05, there.shape).astype(np.float32)
     sigma = np.full(depth.shape, 0.01, np.float32)
-    factor, other_depth = 2.0, stored(there, 0.5 * sigma)
-    there, there_sigma = decoded(other_depth)
+    factor, other_depth = 2.0, encode_depth(there, 0.5 * sigma)
+    there, there_sigma = decode_depth(other_depth)
     move = other.world_from_cam.inv() * one.world_from_cam
     rows, columns = np.mgrid[: one.pinhole.height_px, : one.pinhole.width_px]
     pixels = np.column_stack([columns.ravel(), rows.ravel()]) + 0.5
@@ -48,7 +48,7 @@ def test_witnesses_through_a_tilted_port_equal_their_slow_twin():
     reach = 3 * np.hypot(0.01, factor * there_sigma[at[seen][:, 1], at[seen][:, 0]])
 
     def right(first: KernelLens, second: KernelLens) -> float:
-        confirmed, refuted = count_witnesses(
+        confirmed, refuted = count_confirming(
             depth, sigma, slopes_of(depth, first), np.ascontiguousarray(move.as_matrix()[:3]),
             other_depth, factor, second, 3.0,
         )  # fmt: skip

@@ -3,11 +3,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from alice_survey.core.robust import MAD_TO_SIGMA
 
 from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.executor import SERIAL
 from alice_survey.core.frames import Array
-from reconstruct.dense.depth import enlarged
+from reconstruct.dense.depth import enlarge
 from reconstruct.dense.matching_trial import (
     find_scales,
     ground_pixel,
@@ -96,7 +97,7 @@ def test_enlarged_depth_of_a_plane_is_that_plane_and_unknown_stays_unknown():
     rows, columns = np.mgrid[:60, :80] + 0.5
     small = (1 / (0.4 + 0.001 * columns - 0.0007 * rows)).astype(np.float32)
     small[20:30, 30:50] = np.nan
-    large = enlarged(small, (160, 120))
+    large = enlarge(small, (160, 120))
     rows, columns = (np.mgrid[:120, :160] + 0.5) / 2
     plane = 1 / (0.4 + 0.001 * columns - 0.0007 * rows)
     unknown = np.isnan(large)
@@ -105,7 +106,7 @@ def test_enlarged_depth_of_a_plane_is_that_plane_and_unknown_stays_unknown():
     away = ~cv2.dilate(unknown.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
     np.testing.assert_allclose(large[inside][away[inside]], plane[inside][away[inside]], rtol=2e-6)
     np.testing.assert_allclose(large[~unknown], plane[~unknown], rtol=0.002)
-    assert enlarged(small, (80, 60)) is small
+    assert enlarge(small, (80, 60)) is small
 
 
 @pytest.mark.parametrize(("cell", "scale"), [(None, 1.0), (0.01, 1.0), (0.1, None), (9.0, 0.05)])

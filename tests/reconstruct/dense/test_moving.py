@@ -9,7 +9,7 @@ import pytest
 from alice_survey.app.stages import spec
 from alice_survey.core.config import ReconstructConfig, SurveyConfig
 from alice_survey.core.executor import SERIAL
-from reconstruct.dense.moving import adapt, agreed, cells_at, draw, odd_ones, with_bounds
+from reconstruct.dense.moving import adapt, cells_at, draw, odd_ones, shared_depth, with_bounds
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.views.model import View
 from tests.oracles_dense import (
@@ -127,9 +127,9 @@ def test_a_still_survey_keeps_its_pictures_whole(still: Path):
 def test_the_nearest_depth_that_two_stations_share():
     nan = np.nan
     stack = np.array([[1.0, 1.0, 2.0, nan], [1.01, 1.01, 2.02, 3.0], [1.5, 0.5, 2.5, nan]])
-    found = agreed(stack[:, None].astype(np.float32), np.array([0, 0, 1]), 0.02)
+    found = shared_depth(stack[:, None].astype(np.float32), np.array([0, 0, 1]), 0.02)
     assert np.isnan(found).all()  # the first two share a station
-    found = agreed(stack[:, None].astype(np.float32), np.array([0, 1, 1]), 0.02)[0]
+    found = shared_depth(stack[:, None].astype(np.float32), np.array([0, 1, 1]), 0.02)[0]
     np.testing.assert_allclose(found[:3], [1.005, 1.005, 2.01], rtol=1e-6)
     assert np.isnan(found[3])
 

@@ -10,7 +10,7 @@ from reconstruct.dense.refine_depth import (
     ComparedView,
     compare,
     pixel_lines,
-    prepared,
+    prepare,
     refine,
 )
 from reconstruct.dense.stereo_pairs import in_frame
@@ -29,7 +29,7 @@ def looks(*, far: bool = False) -> list[ComparedView]:
     found = []
     for view in FAR_VIEWS if far else VIEWS:
         grey = cv2.cvtColor(render(view, SCENE), cv2.COLOR_BGR2GRAY)
-        contrast, spline, valid = prepared(grey, np.ones(grey.shape, bool))
+        contrast, spline, valid = prepare(grey, np.ones(grey.shape, bool))
         found.append(ComparedView(view=view, contrast=contrast, spline=spline, valid=valid))
     return found
 

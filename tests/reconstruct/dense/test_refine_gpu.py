@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import pytest
 
-from reconstruct.dense.refine_depth import ComparedView, prepared, refine
+from reconstruct.dense.refine_depth import ComparedView, prepare, refine
 from reconstruct.views.model import scaled_view
 from tests.oracles_dense import Scene, port_view, render, speckle
 
@@ -83,7 +83,7 @@ def case() -> tuple[Any, ...]:
         grey = cv2.resize(grey, view.pinhole.size_px, interpolation=cv2.INTER_AREA)
         valid = np.ones(grey.shape, bool)
         valid[5:9, 30:36] = number != 1
-        contrast, spline, valid = prepared(grey, valid)
+        contrast, spline, valid = prepare(grey, valid)
         looks.append(ComparedView(view=view, contrast=contrast, spline=spline, valid=valid))
     shape = looks[0].contrast.shape
     assert 30 < shape[0] < 50

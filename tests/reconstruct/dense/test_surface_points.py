@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from reconstruct.dense.points import Points
-from reconstruct.dense.surface_points import SURFACE_POINT, fuse_surface, settled, stable_order
+from reconstruct.dense.surface_points import SURFACE_POINT, fuse_surface, settle, stable_order
 from tests.oracles_dense import fused
 
 CELL_M, SIGMA_M = 0.01, 0.001
@@ -75,7 +75,7 @@ def test_a_ball_is_covered_from_all_sides_without_gaps():
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     radius = 0.25
     found = fuse_surface(seen(radius * normals, normals, rng), STATIONS, CELL_M, np.zeros(3), 1.4)
-    found = settled(found, CELL_M, *NO_BOUND)
+    found = settle(found, CELL_M, *NO_BOUND)
     off = np.linalg.norm(found["enu"], axis=1) - radius
     assert np.sqrt(np.mean(off**2)) < 0.6 * SIGMA_M  # many points a cell
     assert abs(np.mean(off)) < 0.1 * SIGMA_M
@@ -155,22 +155,22 @@ def test_small_patches_off_the_surface_go_unless_they_may_go_on_elsewhere():
     floor, stray = fused_floor(rng), fused_floor(rng, 0.1)
     stray["enu"][:, 2] += 0.2
     both = np.concatenate([floor, stray])
-    found = settled(both, CELL_M, *NO_BOUND)
+    found = settle(both, CELL_M, *NO_BOUND)
     assert len(found) == len(floor)
     np.testing.assert_array_equal(found["enu"], floor["enu"])
-    near = settled(both, CELL_M, np.array([-0.06, -1.0]), np.array([1.0, 1.0]))
+    near = settle(both, CELL_M, np.array([-0.06, -1.0]), np.array([1.0, 1.0]))
     assert len(near) == len(both)
-    assert len(settled(both[:0], CELL_M, *NO_BOUND)) == 0
+    assert len(settle(both[:0], CELL_M, *NO_BOUND)) == 0
 
 
 def test_sigmas_grow_where_neighbours_contradict_and_nowhere_else():
     rng = np.random.default_rng(7)
     floor = fused_floor(rng)
-    flat = settled(floor, CELL_M, *NO_BOUND)
+    flat = settle(floor, CELL_M, *NO_BOUND)
     np.testing.assert_allclose(np.median(flat["sigma"] / floor["sigma"]), 1.0, atol=0.02)
     east = floor["enu"][:, 0] > 0
     floor["enu"][east, 2] += 0.006  # half a cell
-    found = settled(floor, CELL_M, *NO_BOUND)
+    found = settle(floor, CELL_M, *NO_BOUND)
     rim = np.abs(floor["enu"][:, 0]) < CELL_M
     away = np.abs(floor["enu"][:, 0]) > 3 * CELL_M
     assert 0.001 < np.median(found["sigma"][rim]) < 0.006
@@ -204,7 +204,7 @@ def test_rims_are_as_unsure_as_their_neighbours_lie_to_one_side() -> None:
     surface["sigma"] = 1e-4
     surface["views"], surface["stations"] = 4, 2
 
-    found = settled(surface, cell, np.array([-1.0, -1.0]), np.array([2.0, 2.0]))
+    found = settle(surface, cell, np.array([-1.0, -1.0]), np.array([2.0, 2.0]))
 
     sigma = np.full(inside.shape, np.nan)
     sigma[inside] = found["sigma"]

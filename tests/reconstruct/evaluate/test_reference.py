@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.frames import Datum
-from reconstruct.evaluate.reference import lifted, read_reference
+from reconstruct.evaluate.reference import first_placement, read_reference
 from reconstruct.evaluate.registration import (
     ReferenceSurface,
     covers,
@@ -54,7 +54,9 @@ def test_a_known_motion_and_scale_are_found(scale: float) -> None:
     reference = ReferenceSurface.of(ground(rng, 40_000))
     true = moved(scale)
     own = undone(true, ground(rng, 30_000))
-    fit = register_cloud(own, reference, lifted(own, reference), free_scale=scale != 1.0, rng=rng)
+    fit = register_cloud(
+        own, reference, first_placement(own, reference), free_scale=scale != 1.0, rng=rng
+    )
     left = np.linalg.norm(fit.reference_from_cloud.apply(own) - true.apply(own), axis=1)
     assert left.max() < 0.01
     assert fit.reference_from_cloud.scale == pytest.approx(scale, abs=4e-4)
@@ -66,11 +68,11 @@ def test_the_rigid_fit_is_that_of_open3d() -> None:
     points, own = ground(rng, 20_000), undone(moved(1.0), ground(rng, 8_000))
     points[:, 2] += 0.01 * rng.normal(size=len(points))
     reference = ReferenceSurface.of(points)
-    fit = register_cloud(own, reference, lifted(own, reference), free_scale=False, rng=rng)
+    fit = register_cloud(own, reference, first_placement(own, reference), free_scale=False, rng=rng)
     target, source = (o3d.geometry.PointCloud(o3d.utility.Vector3dVector(p)) for p in (points, own))
     target.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(12))
     start = np.eye(4)
-    start[:3, 3] = lifted(own, reference).translation
+    start[:3, 3] = first_placement(own, reference).translation
     theirs = o3d.pipelines.registration.registration_icp(
         source, target, 1.0, start,
         o3d.pipelines.registration.TransformationEstimationPointToPlane(),
@@ -86,7 +88,7 @@ def test_what_differs_does_not_pull_the_fit() -> None:
     own = ground(rng, 30_000)
     changed = (own[:, 0] > 4) & (own[:, 1] > 4)  # 9 %
     own[changed, 2] += 0.7
-    fit = register_cloud(own, reference, lifted(own, reference), free_scale=True, rng=rng)
+    fit = register_cloud(own, reference, first_placement(own, reference), free_scale=True, rng=rng)
     still = own[~changed]
     assert np.abs(fit.reference_from_cloud.apply(still) - still).max() < 0.02
 

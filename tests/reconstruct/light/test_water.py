@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from reconstruct.light.solve import GRID, LightSamples
-from reconstruct.light.water import grown, solve_water
+from reconstruct.light.water import growth_at, solve_water
 
 CAMERAS = ["left"] * 12 + ["right"] * 12
 FALL_OFF = np.array([0.8, 0.5, 0.7])
@@ -39,7 +39,7 @@ def survey(
     light = albedo * direct(x, y) * np.exp(-(ranges - MIDDLE_M)[..., None] * FALL_OFF)
     light *= ((MIDDLE_M / ranges) ** spread)[..., None]
     light *= np.exp(rng.normal(0, shade, (count, 2, 1)))
-    light += veil(x, y) * grown(GROWTH, ranges, MIDDLE_M)
+    light += veil(x, y) * growth_at(GROWTH, ranges, MIDDLE_M)
     light *= np.exp(rng.normal(0, 0.004, light.shape))
     samples = LightSamples(
         views=views,
@@ -80,8 +80,8 @@ def test_growth_with_range_matters_where_ranges_differ_much() -> None:
     samples, dark = survey(0.5, 4.0)
     found = solve_water(samples, dark, CAMERAS)
     ranges = np.array([0.7, 3.5])
-    true = grown(GROWTH, ranges, MIDDLE_M)
-    here = grown(found.growth, ranges, found.middle_range) / grown(
+    true = growth_at(GROWTH, ranges, MIDDLE_M)
+    here = growth_at(found.growth, ranges, found.middle_range) / growth_at(
         found.growth, np.array(MIDDLE_M), found.middle_range
     )
     np.testing.assert_allclose(here, true, rtol=0.12)

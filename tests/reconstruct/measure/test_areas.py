@@ -9,7 +9,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from reconstruct.measure.areas import covered, figures_of_all, surface_within
+from reconstruct.measure.areas import covered_shares, figures_of_all, surface_within
 from tests.reconstruct.measure.synthetic import Drawn, Sigmas, grid, without_errors
 from tests.reconstruct.measure.test_figures import hills
 
@@ -36,7 +36,7 @@ def test_squares_are_covered_as_shapely_cuts_them(seed: int, corners: int, whole
         return
     y, x = np.mgrid[:ROWS, :COLUMNS]
     cut = sum(shapely.area(shapely.intersection(shapely.box(x, y, x + 1, y + 1), p)) for p in parts)
-    np.testing.assert_allclose(covered(rings, (ROWS, COLUMNS)), cut, atol=1e-9)
+    np.testing.assert_allclose(covered_shares(rings, (ROWS, COLUMNS)), cut, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from reconstruct.mosaic.colour import (
 from reconstruct.mosaic.picture_measures import (
     PictureMeasures,
     ReferencePatch,
-    encoded,
+    encode_srgb,
     linear_table,
 )
 
@@ -77,7 +77,7 @@ def ratios(model: ColourModel, relief_m: float) -> np.ndarray:
     albedo = rng.uniform(0.08, 0.5, (500, 1)) * rng.uniform(0.8, 1.2, (500, 3))
     light = shown(albedo, place, ranges).astype(np.float32)[None]
     at = place.astype(np.float32)
-    found = model.corrected(light, "left", IMAGES[0], at, ranges[None].astype(np.float32))[0]
+    found = model.correct(light, "left", IMAGES[0], at, ranges[None].astype(np.float32))[0]
     ratio = np.log(found / albedo)
     return ratio - ratio.mean(axis=0)
 
@@ -116,7 +116,7 @@ def test_a_card_makes_light_its_reflectance(wanted: Colour) -> None:
     light = shown(card[None], place[None].astype(np.float64), np.asarray(near))[0]
     patch = ReferencePatch(image=IMAGES[number], place=place, light=light, reflectance=card)
     model = solve_colour(wanted, samples, facts, [patch])
-    found = model.corrected(
+    found = model.correct(
         light[None, None].astype(np.float32), "left", IMAGES[number], place[None],
         np.asarray(near, np.float32)[None],
     )  # fmt: skip
@@ -133,7 +133,7 @@ def test_a_card_makes_light_its_reflectance(wanted: Colour) -> None:
     ]
     even = replace(samples, ranges=np.full_like(samples.ranges, MIDDLE_M))
     model = solve_colour(wanted, even, facts, several)
-    found = model.corrected(
+    found = model.correct(
         seen, "left", IMAGES[0], places.astype(np.float32), ranges[None].astype(np.float32)
     )
     np.testing.assert_allclose(np.median(found[0], axis=0), card, rtol=0.04)
@@ -163,12 +163,12 @@ def test_raw_changes_nothing() -> None:
     raw = solve_colour("raw", samples, facts)
     light = np.random.default_rng(1).uniform(0, 1, (4, 5, 3)).astype(np.float32)
     at = np.tile(np.array([0.3, 0.9], np.float32), (20, 1))
-    same = raw.corrected(light, "left", IMAGES[0], at, np.full((4, 5), 3.0, np.float32))
+    same = raw.correct(light, "left", IMAGES[0], at, np.full((4, 5), 3.0, np.float32))
     np.testing.assert_allclose(same, light, rtol=1e-6)
 
 
 def test_the_srgb_curve_and_its_inverse_agree() -> None:
-    np.testing.assert_allclose(encoded(linear_table()), np.arange(256), atol=0.02)
+    np.testing.assert_allclose(encode_srgb(linear_table()), np.arange(256), atol=0.02)
 
 
 @pytest.mark.parametrize("wanted", ["even", "water"])
@@ -183,8 +183,8 @@ def test_one_pass_over_pixels_equals_the_steps_over_pictures(wanted: Colour) -> 
     ranges[2, 3] = np.nan
     factor = np.full((3, 3, 3), 1.3, np.float32)
     places = np.column_stack([(x.ravel() + 0.5) / 640, (y.ravel() + 0.5) / 480]).astype(np.float32)
-    lifted = model.corrected(light, "left", IMAGES[3], places, ranges) * 1.3
-    expected = np.minimum(encoded(((lifted - model.black) / (1 - model.black)).clip(0, 4)), 600)
+    lifted = model.correct(light, "left", IMAGES[3], places, ranges) * 1.3
+    expected = np.minimum(encode_srgb(((lifted - model.black) / (1 - model.black)).clip(0, 4)), 600)
     found = light.copy()
     finish_colours(
         found, (x, y), ranges, model.nodes("left", IMAGES[3]), model.law, (640, 480), factor,

@@ -13,7 +13,7 @@ from camera_calib.approximation.pinhole_warp import best_warp
 from camera_calib.rig import design_rig
 from reconstruct.dense.cloud import write_cloud, write_cloud_json
 from reconstruct.mosaic import run
-from reconstruct.mosaic.picture_measures import encoded, linear_table
+from reconstruct.mosaic.picture_measures import encode_srgb, linear_table
 from reconstruct.mosaic.run import _dispersion
 from reconstruct.ply import VERTEX
 from reconstruct.raster import DemGrid, tiled_raster
@@ -187,7 +187,7 @@ def test_borders_of_blocks_and_tiles_show_no_step(
             picture = linear_table()[cv2.imread(str(path))]
             x = np.linspace(-1.0, 1.0, picture.shape[1])[:, None]
             lit = picture * np.exp(-0.5 * x**2) * [0.6, 1.0, 0.9] + np.array([0.02, 0.015, 0.01])
-            cv2.imwrite(str(path), np.rint(encoded(lit.astype(np.float32))).astype(np.uint8))
+            cv2.imwrite(str(path), np.rint(encode_srgb(lit.astype(np.float32))).astype(np.uint8))
         monkeypatch.setattr(run, "_LABEL_PX", block_px)
         monkeypatch.setattr(run, "_TILE_PX", block_px)
         monkeypatch.setattr(run, "_LABEL_MARGIN_PX", 64)
@@ -226,7 +226,7 @@ def test_only_refraction_parts_the_colours(tmp_path: Path, n_water: float, corre
         tmp_path / "sparse" / "cameras.json", {"cameras": {"left": warp.to_json()}, "images": {}}
     )
     write_json(tmp_path / "images" / "survey.json", {"source": "imported"})
-    water, stated = _dispersion(tmp_path, "auto", CONFIG.water, 2.0, grey=False)
+    water, stated = _dispersion(tmp_path, CONFIG.water, 2.0, grey=False)
     assert stated["corrected"] is corrected and (water is not None) is corrected
 
 

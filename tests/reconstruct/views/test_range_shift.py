@@ -69,7 +69,7 @@ def test_the_shift_is_exact_at_every_distance(warp: PinholeWarp) -> None:
         np.testing.assert_allclose(warp.to_pinhole(taken, depth_m), ideal, atol=1e-8)
         moved = np.abs(ideal - warped).max()
         np.testing.assert_allclose(shift.ideal(warped, depth), ideal, atol=2e-3 * moved + 1e-9)
-        np.testing.assert_allclose(shift.warped(ideal, depth), warped, atol=3e-3 * moved + 1e-9)
+        np.testing.assert_allclose(shift.warp(ideal, depth), warped, atol=3e-3 * moved + 1e-9)
 
 
 def test_rays_through_a_dome_that_is_centred_on_the_pupil_meet_there() -> None:
@@ -90,8 +90,8 @@ def test_kernels_and_scales_agree(x: float, y: float, depth: float) -> None:
     shift = tilted_shift()
     pixel = np.array([[x, y]])
     ideal = shift.ideal(pixel, depth)[0]
-    np.testing.assert_allclose(shift.warped(ideal[None], depth)[0], [x, y], atol=1e-5)
-    half = shift.scaled(0.5, 0.25).ideal(pixel * [0.5, 0.25], depth)[0]
+    np.testing.assert_allclose(shift.warp(ideal[None], depth)[0], [x, y], atol=1e-5)
+    half = shift.scale(0.5, 0.25).ideal(pixel * [0.5, 0.25], depth)[0]
     np.testing.assert_allclose(half, ideal * [0.5, 0.25], atol=1e-9)
 
 
@@ -139,4 +139,4 @@ def test_the_contraction_is_the_fields_own_and_below_one_the_inverse_exists(
     warped = np.random.default_rng(0).uniform([100, 100], [700, 500], (40, 2))
     ideal = warped + step * (warped - [400, 300]) @ slopes.T
     np.testing.assert_allclose(shift.ideal(warped, depth), ideal, atol=1e-9)
-    np.testing.assert_allclose(shift.warped(ideal, depth), warped, atol=1e-4)
+    np.testing.assert_allclose(shift.warp(ideal, depth), warped, atol=1e-4)

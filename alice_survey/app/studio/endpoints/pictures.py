@@ -19,7 +19,7 @@ from alice_survey.core.errors import AliceError, ReconstructionError, WorkspaceE
 from alice_survey.core.frames import Array
 from alice_survey.core.manifest import ImageRecord, read_manifest
 from alice_survey.core.records import ControlRecord, MappingRecord
-from reconstruct.picking.lengths import Lengths, spot_residuals
+from reconstruct.picking.lengths import Lengths, point_residuals
 from reconstruct.picking.matching import refine
 from reconstruct.picking.preview import preview_control
 from reconstruct.picking.registered import RegisteredPictures, Sight
@@ -352,7 +352,7 @@ class _Tab:
             ],
             "refused": [{"name": one.image, "why": one.why} for one in found.refused],
             "factor": found.factor,
-            "spot": None if found.spot is None else _spot_json(found.spot),
+            "spot": None if found.meeting is None else _spot_json(found.meeting),
         }
 
     def picks(self, call: Call) -> dict[str, Any]:
@@ -369,7 +369,7 @@ class _Tab:
             known = {p.image for p in picks if p.image in model.pictures}
             cameras = {name: model.pictures.picture(name) for name in known}
             spots, lost = triangulate_picks(picks, cameras)
-            off = spot_residuals(spots, picks, model.pictures)
+            off = point_residuals(spots, picks, model.pictures)
         points: dict[str, dict[str, Any]] = {}
         for number, (pick, miss) in enumerate(zip(picks, off, strict=True)):
             spot = spots.get(pick.point)
@@ -443,8 +443,8 @@ class _Tab:
         """The spot that picks show and how far each misses it; nothing is written."""
         asked, model = call.read(_AskedSpot), self._read_model()
         picks = [p.pick for p in asked.picks]
-        found = model.lengths.spot(picks)
-        off = spot_residuals({p.point: found for p in picks}, picks, model.pictures)
+        found = model.lengths.target(picks)
+        off = point_residuals({p.point: found for p in picks}, picks, model.pictures)
         return {
             "spot": _spot_json(found),
             "residuals": [
@@ -473,7 +473,7 @@ class _Tab:
         """Note a known length in `scale.json`."""
         asked, model = call.read(_AskedScale), self._read_model()
         ends = [[p.pick for p in one] for one in (asked.first, asked.second)]
-        places = [model.lengths.spot(picks).model for picks in ends]
+        places = [model.lengths.target(picks).model for picks in ends]
         names = [
             "+".join(f"{p.image}:{p.x},{p.y}" for p in one) for one in (asked.first, asked.second)
         ]
@@ -519,7 +519,7 @@ def _unhidden(model: _OpenModel, place: SurfacePlace) -> tuple[list[Sight], int]
     """Pictures that see a place with nothing between, and how many it is hidden from."""
     found = model.pictures.seeing(place.point, place.normal)[: 4 * _MAX_SEEING]
     centres = np.array([model.pictures.centres[model.pictures.row(s.image)] for s in found])
-    hidden = model.surface.hidden(place, centres.reshape(-1, 3))
+    hidden = model.surface.hides(place, centres.reshape(-1, 3))
     return [s for s, out in zip(found, hidden, strict=True) if not out], int(hidden.sum())
 
 
