@@ -66,7 +66,7 @@ for kernel, arguments in (
     (refine_depth.add, (six, f, f, b, one, one, f, f, f, f, b.view(np.uint8))),
     (refine_gpu.blur, (six, f[0], (0, 1), six)),
 ):
-    launch = refine_gpu.launched(kernel).py_func
+    launch = refine_gpu.launcher(kernel).py_func
     code, _ = cuda.compile_ptx(launch, (numba.typeof(arguments),), cc=(7, 5))
     print(code.count(".visible .entry"), code.count(".approx"))
 """
