@@ -3,7 +3,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from alice_survey.core.robust import MAD_TO_SIGMA
 
 from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.executor import SERIAL
