@@ -1,7 +1,7 @@
 """A flight as logs that other tools read, and as summary figures."""
 
 import math
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -30,7 +30,7 @@ _BAG_EVERY = 2
 def true_log(flight: Flight) -> VehicleLog:
     """How the vehicle truly moved, and what its thrusters and fins did."""
     flown = flight.flown
-    log = vehicle_log(
+    return vehicle_log(
         flown.time_s,
         source="truth",
         position_ned=flown.truth[:, :3],
@@ -38,15 +38,15 @@ def true_log(flight: Flight) -> VehicleLog:
         velocity_body=true_velocity(flown)[:, :3],
         rates_body=flown.truth[:, 10:13],
         rpm=rpm_of(flown),
+        others=_fin_columns(flight),
     )
-    return replace(log, others=_fin_columns(flight))
 
 
 def believed_log(flight: Flight) -> VehicleLog:
     """What the vehicle's own computer knows of its motion, thrusters and fins."""
     flown, log = flight.flown, flight.log
     believed = believed_velocity(flown)
-    known = vehicle_log(
+    return vehicle_log(
         flown.time_s,
         source="navigation",
         position_ned=log.position_ned,
@@ -55,8 +55,8 @@ def believed_log(flight: Flight) -> VehicleLog:
         rates_body=believed[:, 3:],
         altitude_m=log.altitude_m,
         rpm=rpm_of(flown),
+        others=_fin_columns(flight),
     )
-    return replace(known, others=_fin_columns(flight))
 
 
 def _fin_columns(flight: Flight) -> dict[str, Array]:

@@ -363,8 +363,9 @@ def _write_vehicle_log(path: Path, dive: LoggedDive, at_s: Array, options: Impor
         rates_body=None if dive.rates is None else dive.rates.at(at_s),
         altitude_m=columns["altitude_m"],
         rpm=rpm,
+        others=others,
     )
-    write_vehicle_log(path, replace(log, others=others))
+    write_vehicle_log(path, log)
 
 
 def _report(

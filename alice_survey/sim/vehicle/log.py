@@ -102,6 +102,7 @@ def vehicle_log(
     rpm: Mapping[str, Array] | None = None,
     thrust_n: Mapping[str, Array] | None = None,
     wrench: Array | None = None,
+    others: Mapping[str, Array] | None = None,
 ) -> VehicleLog:
     """A log of what is known; the rest is NaN. Fields as in `VehicleLog`."""
 
@@ -112,7 +113,7 @@ def vehicle_log(
         source=source, time_s=np.asarray(time_s, float), position_ned=fill(position_ned, 3),
         quaternion_xyzw=fill(quaternion_xyzw, 4), velocity_body=fill(velocity_body, 3),
         rates_body=fill(rates_body, 3), altitude_m=fill(altitude_m), rpm=dict(rpm or {}),
-        thrust_n=dict(thrust_n or {}), wrench=fill(wrench, 6),
+        thrust_n=dict(thrust_n or {}), wrench=fill(wrench, 6), others=dict(others or {}),
     )  # fmt: skip
 
 

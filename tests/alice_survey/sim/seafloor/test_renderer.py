@@ -7,7 +7,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.core.config import SeafloorConfig, SurveyConfig
 from alice_survey.core.frames import rotation_from_attitude
 from alice_survey.sim.seafloor.as_built import true_rig
-from alice_survey.sim.seafloor.light import CameraLight, backscatter_at, camera_light
+from alice_survey.sim.seafloor.light import CameraLight, camera_light
 from alice_survey.sim.seafloor.renderer import (
     Scene,
     flat_floor_radiance,
@@ -211,28 +211,3 @@ def test_an_amphora_hides_strobes_from_the_sand_next_to_it() -> None:
     assert shaded.max() < 1.0 + 1e-4
     assert 0.003 < (shaded < 0.9).mean() < 0.3
     assert np.median(shaded) == pytest.approx(1.0, abs=1e-4)
-
-
-def test_a_level_camera_sees_the_floor_below_the_horizon_and_backscatter_above() -> None:
-    scene = Scene(terrain=flat(), texture=Even(seed=0))
-    level = pose(pitch_deg=90.0, altitude_m=0.5)
-    rotation = level.rotation.as_matrix()
-    found = range_map(scene, CAMERA, level, reach_m=2.5)
-    origins, directions = CAMERA.unproject(CAMERA.pixel_centres())
-    down = directions @ rotation[2]
-    start = level.translation[2] + origins @ rotation[2]
-    path = np.where(down > 0, (FLOOR_M - start) / np.where(down > 0, down, 1.0), np.inf)
-    expected = origins[..., 2] + path * directions[..., 2]
-    near = path < 2.5
-    assert near.sum() > 100
-    np.testing.assert_allclose(found[near], expected[near], rtol=3e-6)
-    assert np.isnan(found[down <= 0]).all()
-
-    lit = render(scene, CAMERA, LIGHT, still(level), 1)
-    row, column = 3, CAMERA.width_px // 2
-    place = np.array([column + 0.5, row + 0.5]) / (CAMERA.width_px, CAMERA.height_px)
-    veil = np.empty(3)
-    last = np.array(LIGHT.backscatter.shape[1::-1]) - 1
-    backscatter_at(LIGHT.backscatter, LIGHT.reach_m, *(place * last), LIGHT.reach_m, veil)
-    cosine = CAMERA.in_air().unproject(np.array([column + 0.5, row + 0.5]))[1][2]
-    np.testing.assert_allclose(lit[row, column], veil * cosine**4, rtol=1e-5)

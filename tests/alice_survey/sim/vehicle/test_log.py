@@ -10,7 +10,6 @@ from alice_survey.core.frames import rotation_from_attitude
 from alice_survey.sim.vehicle.log import (
     VehicleLog,
     read_vehicle_log,
-    segments,
     vehicle_log,
     write_vehicle_log,
 )
@@ -63,12 +62,6 @@ def test_attitude_reads_from_angles_and_from_quaternions(tmp_path: Path) -> None
     np.testing.assert_allclose(
         read_vehicle_log(written(tmp_path, text)).attitude_rad[0], [0, 0, np.pi / 2], atol=1e-12
     )
-
-
-def test_segments_split_at_gaps_and_hold_every_row() -> None:
-    time_s = np.concatenate([np.arange(30) * 0.1, 10 + np.arange(20) * 0.1, [20.0]])
-    parts = segments(vehicle_log(time_s))
-    assert [(p.start, p.stop) for p in parts] == [(0, 30), (30, 50), (50, 51)]
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.core.errors import VehicleError
 from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.identification.two_step import fit_pulls, read_pulls, with_thrust
 from alice_survey.sim.vehicle.propulsion import add_thrust
@@ -52,23 +51,3 @@ def test_sigmas_are_those_of_the_readings(tmp_path: Path) -> None:
         scores.append([(found[0].factor - 0.8) * found[0].model / found[0].sigma])
     # Student's t of three degrees of freedom: a median of its absolute value of 0.765.
     assert np.median(np.abs(scores)) == pytest.approx(0.765, abs=0.12)
-
-
-@pytest.mark.parametrize(
-    ("rows", "message"),
-    [
-        ("thruster,rpm\nport,100\n", "force_n"),
-        ("thruster,rpm,force_n\n", "pull.csv"),
-        ("thruster,rpm,force_n\nport,fast,3\n", "line 2: rpm"),
-        ("thruster,rpm,force_n\nport,900,-3\n", "line 2: -3 N"),
-        ("thruster,rpm,force_n\n,900,3\n", "line 2: thruster"),
-        ("thruster,rpm,force_n\nrudder,900,3\n", "'rudder'"),
-        ("thruster,rpm,force_n\nport,900,3\nport+starboard,900,6\n", "port"),
-    ],
-)
-def test_faults_are_named(tmp_path: Path, rows: str, message: str) -> None:
-    path = tmp_path / "pull.csv"
-    path.write_text(rows)
-    with pytest.raises(VehicleError) as raised:
-        fit_pulls(read_pulls(path), KNOWN)
-    assert message in str(raised.value)

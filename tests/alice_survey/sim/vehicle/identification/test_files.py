@@ -127,24 +127,6 @@ def test_foreign_axes_become_ours(tmp_path: Path) -> None:
     assert log.thrust_n["main"].tolist() == [7, 7]
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ('velocity = ["u", "v", "w"]\n', "time_step_s"),
-        ("time_step_s = 0\n", "time_step_s"),
-        ('time = "t"\nspeed = "u"\n', "speed"),
-        ('time = "t"\nworld = "enu"\nangles_deg = ["a", "b", "c"]\n', "angles_deg"),
-        ('time = "t"\nvelocity = ["u", "v", "w"]\n', "column v "),
-    ],
-)
-def test_faults_of_column_maps_are_named(tmp_path: Path, text: str, message: str) -> None:
-    (tmp_path / "map.toml").write_text(text)
-    (tmp_path / "log.csv").write_text("t,u\n0,1\n")
-    with pytest.raises(VehicleError) as raised:
-        read_foreign_log(tmp_path / "log.csv", read_column_map(tmp_path / "map.toml"))
-    assert message in str(raised.value)
-
-
 def test_missing_inputs_are_held_but_not_for_long(capsys: pytest.CaptureFixture[str]) -> None:
     known, time_s = vehicle_from("alice"), np.arange(60.0) * 0.1
     rpm = {t.name: np.full(60, 600.0) for t in known.thrusters}

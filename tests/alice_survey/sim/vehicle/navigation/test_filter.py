@@ -62,7 +62,6 @@ from tests.alice_survey.sim.vehicle.navigation.navigation_runs import (
 )
 
 FLOOR = level_floor(15.0)
-TINY = 1e-9
 
 
 def column(name: str) -> int:

@@ -8,7 +8,6 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.files import vehicle_from
@@ -25,7 +24,6 @@ from alice_survey.sim.vehicle.pilot.path import Path
 from alice_survey.sim.vehicle.pilot.settings import (
     CONTROL_LENGTH_M,
     LOS_DAMPING_RATIO,
-    SWAY_LOOK_AHEAD_M,
     Guidance,
     los_loop,
     min_look_ahead_m,
@@ -149,14 +147,3 @@ def test_look_ahead_hangs_on_the_coefficients_as_documented(
     assert min_look_ahead_m(gains, 0.2, 0.0) == pytest.approx(expected_m, abs=0.006)
     with_port = min_look_ahead_m(gains, 0.2, 0.55)
     assert with_port == pytest.approx(2.23 if coefficients == "calibrated" else 1.6, abs=0.006)
-
-
-def test_where_no_look_ahead_will_do_los_is_refused_and_sway_has_another() -> None:
-    gains = gains_of("alice", 1.0)
-    loose = gains._replace(axes=gains.axes.copy())
-    loose.axes[g.YAW, [g.RATE, g.INNER]] = 0.1  # hardly damps the heading
-    path = straight(20.0, speed_mps=1.0)
-    with pytest.raises(VehicleError, match="1 m/s"):
-        pilot_guidance(loose, path, "los", max_depth_m=40.0)
-    guidance = pilot_guidance(loose, path, "sway", max_depth_m=40.0)
-    assert guidance.look_ahead_m == SWAY_LOOK_AHEAD_M == 2.5 * CONTROL_LENGTH_M
