@@ -28,7 +28,6 @@ def main() -> None:
         rows = camera_speed.measure(
             20_000 if options.quick else 100_000, 10 if options.quick else 40
         )
-        print(camera_speed.table(rows), "\n", flush=True)
         report["speed"] = [{**asdict(row), "ratio": row.ratio} for row in rows]
         findings += Findings(figures=tuple(f for row in rows for f in row.figures()))
     if "calibration" in options.only:
@@ -37,8 +36,6 @@ def main() -> None:
             camera_calibration.run_mode(mode, range(count), local_executor(options.threads))
             for mode in camera_calibration.MODES
         ]
-        print(f"Calibration through ports, {count} trials a mode: rms error / Cramer-Rao bound.")
-        print(camera_calibration.table(modes), "\n", flush=True)
         report["calibration"] = [asdict(mode) for mode in modes]
         # With fewer trials the figures themselves scatter too much for the goals.
         judged = not options.quick
@@ -51,12 +48,13 @@ def main() -> None:
             target_calibration.run_case(name, range(count), local_executor(options.threads))
             for name in target_calibration.TARGETS
         ]
-        print(f"Calibration from real targets, {count} trials each.")
-        print(target_calibration.table(cases), "\n", flush=True)
         report["target"] = [asdict(case) for case in cases]
         findings += Findings(
             figures=tuple(f for case in cases for f in case.figures(judged=not options.quick))
         )
+    for figure in findings.figures:
+        peer = "" if figure.peer_value is None else f" ({figure.peer} {figure.peer_value:.4g})"
+        print(f"{figure.name}: {figure.value:.4g} {figure.unit}{peer}")
     sys.exit(hand_over(options, about, findings, report))
 
 

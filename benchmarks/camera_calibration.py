@@ -263,29 +263,7 @@ def run_mode(known: Intrinsics, seeds: Sequence[int], executor: Executor = SERIA
     )
 
 
-def table(modes: Sequence[Mode]) -> str:
-    """The parameters of ports and rig in Markdown; the lens's are in the JSON."""
-    lines = ["| parameter |", "|---|"]
-    for mode in modes:
-        lines[0] += f" {mode.known}: bound | rms / bound | without luck | error / sigma |"
-        lines[1] += "---|---|---|---|"
-    for name in RIG:
-        line = f"| {name} |"
-        for mode in modes:
-            p = next(p for p in mode.parameters if p.name == name)
-            line += f" {_in_words(p.name, p.bound)} | {p.ratio:.3f} | {p.ratio_without_luck:.3f} |"
-            line += f" {p.by_sigma:.3f} |"
-        lines.append(line)
-    return "\n".join(lines)
-
-
 def _unit(name: str) -> str:
     """Of a parameter, which ends in it."""
     last = name.rsplit("_", 1)[-1]
     return last if last in ("m", "rad", "px") else "1"
-
-
-def _in_words(name: str, size: float) -> str:
-    if name.endswith("_m"):
-        return f"{1e3 * size:.3g} mm"
-    return f"{np.rad2deg(size):.2g} deg"

@@ -177,14 +177,3 @@ def _same(what: str, found: Array, expected: Array, limit_px: float) -> None:
     miss = np.abs(found - expected).max()
     if not miss < limit_px:
         sys.exit(f"{what} does other work: its pixels differ by {miss:.3g}")
-
-
-def table(rows: list[Row]) -> str:
-    """The rows in Markdown."""
-    head = "| work | M points/s, one core | two | peer | M points/s, one core | two | ratio |"
-    lines = [
-        f"| {row.what} | {row.ours:.3g} | {row.ours_two_cores:.3g} | {row.peer} "
-        f"| {row.theirs:.3g} | {row.theirs_two_cores:.3g} | {row.ratio:.3g} |"
-        for row in rows
-    ]
-    return "\n".join([head, "|---|---|---|---|---|---|---|", *lines])

@@ -221,18 +221,3 @@ def run_case(name: str, seeds: Sequence[int], executor: Executor = SERIAL) -> Tr
         fx_rms_px=float(np.sqrt(np.mean(error**2))),
         fx_as_drawn_rms_px=float(np.sqrt(np.mean(error_drawn**2))),
     )
-
-
-def table(cases: Sequence[Trials]) -> str:
-    """All cases in Markdown."""
-    lines = [
-        "| board | sigma of fx, px | error of fx, rms px | taken as drawn | error / sigma, rms, "
-        f"least to most of {len(NAMES)} |",
-        "|---|---|---|---|---|",
-    ]
-    lines += [
-        f"| {c.name} | {c.sigma_fx_px:.2f} | {c.fx_rms_px:.2f} | {c.fx_as_drawn_rms_px:.2f} | "
-        f"{min(c.by_sigma):.2f} to {max(c.by_sigma):.2f} |"
-        for c in cases
-    ]
-    return "\n".join(lines)

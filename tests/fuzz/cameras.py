@@ -254,18 +254,9 @@ TARGETS = (
         read=_read_folder,
     ),
     _calibration(
-        "FLATPORT cameras.bin", "binary", "m/cameras.bin",
-        _write("refractive", "m/cameras.bin", small_rig), read=_read_folder,
-    ),
-    _calibration(
-        "DOMEPORT cameras.txt", "text", "m/cameras.txt", _write("refractive", "m", _domes),
-        read=_read_folder,
-    ),
-    _calibration(
         "DOMEPORT cameras.bin", "binary", "m/cameras.bin",
         _write("refractive", "m/cameras.bin", _domes), read=_read_folder,
     ),
-    _calibration("OpenCV YAML, fisheye", "text", "a.yaml", _write("opencv", "a.yaml", _domes)),
     _calibration("Metashape XML", "text", "a.xml", _write("metashape", "a.xml", _one)),
     _calibration(
         "mrcal cameramodel", "text", "m/left.cameramodel", _write("mrcal", "m", _in_air),
@@ -274,23 +265,16 @@ TARGETS = (
     _calibration("Gyroflow profile", "json", "a.json", _profile),
     _calibration("target JSON", "json", "board.json", _board, read=read_board),
     _image("JPEG", "a.jpg", partial(_picture, name="a.jpg", mode="RGB")),
-    _image("JPEG, CMYK", "a.jpg", partial(_picture, name="a.jpg", mode="CMYK")),
     _image("PNG, 8 bits", "a.png", partial(_picture, name="a.png", mode="RGBA")),
-    _image("PNG, grey and alpha", "a.png", partial(_picture, name="a.png", mode="LA")),
-    _image("PNG, palette", "a.png", partial(_picture, name="a.png", mode="P")),
     _image("PNG, 16 bits", "a.png", partial(_deep, name="a.png")),
     _image(
         "TIFF, LZW", "a.tif",
         partial(_picture, name="a.tif", mode="RGB", compression="tiff_lzw"),
     ),
-    _image("TIFF, 16 bits", "a.tif", partial(_deep, name="a.tif")),
     _image("DNG", "a.dng", dng),
     _image(
         "picture to match, JPEG", "a.jpg", partial(_picture, name="a.jpg", mode="RGB"),
         read=read_for_matching,
-    ),
-    _image(
-        "picture to match, PNG", "a.png", partial(_deep, name="a.png"), read=read_for_matching
     ),
     _image("mask", "a.png", partial(_picture, name="a.png", mode="L"), read=read_mask),
     _image("picture of a board", "a.png", _chessboard, read=look_for_board, examples=2),

@@ -94,14 +94,3 @@ def test_opencv_holds_all_that_a_rig_has(rig: Rig, seed: int) -> None:
     assert after.covariance is not None
     assert after.covariance.parameters == full.covariance.parameters
     np.testing.assert_array_equal(after.covariance.matrix, full.covariance.matrix)
-
-
-@pytest.mark.parametrize("suffix", [".yml", ".xml"])
-@QUICK
-@given(rig=rigs(**ALL))
-def test_the_same_rig_gives_the_same_bytes(suffix: str, rig: Rig) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        files = [Path(folder) / f"{name}{suffix}" for name in "ab"]
-        for file in files:
-            FORMATS["opencv"].write(file, rig)
-        assert files[0].read_bytes() == files[1].read_bytes()
