@@ -221,10 +221,14 @@ def stay(folder):
 
 
 @pytest.mark.parametrize(
-    ("number", "times"),
-    [(signal.SIGINT, 1), (signal.SIGINT, 2), (signal.SIGTERM, 1), (signal.SIGHUP, 1)],
+    ("kind", "workers", "number", "times"),
+    [
+        ("parallel", 2, signal.SIGINT, 1),
+        ("deep", 1, signal.SIGINT, 2),
+        ("parallel", 2, signal.SIGTERM, 1),
+        ("deep", 1, signal.SIGHUP, 1),
+    ],
 )
-@pytest.mark.parametrize(("kind", "workers"), [("parallel", 2), ("deep", 1)])
 def test_a_signal_ends_all_processes_and_says_how_to_go_on(
     kind: str, workers: int, number: signal.Signals, times: int, tmp_path: Path
 ) -> None:

@@ -191,25 +191,3 @@ def test_a_server_ends_with_pages_open(tmp_path: Path) -> None:
         began_s = time.monotonic()
     assert time.monotonic() - began_s < 30  # it does not wait for a stream that never ends
     page.close()
-
-
-def test_what_is_dropped_at_the_end_is_not_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    begun, go_on = threading.Event(), threading.Event()
-
-    def wait(_: Call) -> None:
-        begun.set()
-        go_on.wait(30)
-
-    slow = Endpoint(path="/api/test/slow", answer=wait)
-    monkeypatch.setattr(studio_app, "all_endpoints", lambda _: [slow])
-    monkeypatch.setattr("alice_survey.app.studio.server._ENDING_S", 1)
-    with serving(tiny_workspace(tmp_path)) as started:
-        page = socket.create_connection(("127.0.0.1", started.port), timeout=20)
-        head = f"GET /api/test/slow HTTP/1.1\r\nHost: 127.0.0.1:{started.port}\r\n\r\n"
-        page.sendall(head.encode())
-        assert begun.wait(20)
-    go_on.set()
-    page.close()
-    assert caplog.records == []

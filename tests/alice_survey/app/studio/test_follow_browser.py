@@ -12,7 +12,6 @@ from alice_survey.core.frames import Array
 from missions.values.plan_file import read_plan
 from tests.alice_survey.app.studio.client import ask, serving
 from tests.alice_survey.app.studio.journey_page import (
-    NARROW,
     WIDE,
     begun_page,
     button,
@@ -86,7 +85,7 @@ def opaque(page: Any) -> int:
     )
 
 
-@pytest.mark.parametrize("size", [WIDE, NARROW], ids=["1280", "400"])
+@pytest.mark.parametrize("size", [WIDE], ids=["1280"])
 def test_a_dive_is_followed_and_its_hole_closed(tmp_path: Path, size: dict[str, int]) -> None:
     reef = tmp_path / "reef"
     with serving(reef) as server, begun_page(size) as (page, heard):

@@ -5,7 +5,6 @@ import json
 import os
 import signal
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -107,21 +106,6 @@ def test_progress_is_published_and_the_end_kept(tmp_path: Path) -> None:
     assert texts[1] == "stage plan" and texts[-1].startswith("run finished: exit code 0")
 
 
-def test_at_most_four_are_published_in_a_second(tmp_path: Path) -> None:
-    told = Published()
-    with jobs_in(tmp_path, told) as jobs:
-        jobs.start("plan")
-        until(lambda: any(data["job"] and data["job"]["steps"] for _, data in told))
-        before, began_s = len(told), time.monotonic()
-        time.sleep(1.5)
-        count, lasted_s = len(told) - before, time.monotonic() - began_s
-        assert 2 <= count <= 4 * lasted_s + 1
-        (step,) = told[-1][1]["job"]["steps"]
-        assert step["total"] == 600 and 0 < step["done"] < 600 and step["remaining_s"] > 0
-        jobs.stop()
-        until(lambda: jobs.running() is None)
-
-
 def test_stop_ends_its_whole_group_as_ctrl_c_does(tmp_path: Path) -> None:
     with jobs_in(tmp_path) as jobs:
         jobs.start("plan")
@@ -135,37 +119,6 @@ def test_stop_ends_its_whole_group_as_ctrl_c_does(tmp_path: Path) -> None:
         assert not jobs.stop()
     assert (ended["state"], ended["exit_code"]) == ("stopped", 130)
     until(lambda: not psutil.pid_exists(worker))
-
-
-def test_a_deaf_job_is_ended_in_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("alice_survey.app.studio.jobs._HARDER_S", (0.3, 0.3))
-    with jobs_in(tmp_path) as jobs:
-        jobs.start("image")
-        until(lambda: any(line["text"] == "deaf" for line in jobs.log(1)["lines"]))
-        jobs.stop()
-        until(lambda: jobs.running() is None)
-        (ended,) = jobs.history()
-    assert ended["state"] == "stopped" and ended["exit_code"] == -signal.SIGKILL
-
-
-def test_a_studio_in_the_background_of_a_script_stops_jobs_as_soon(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A shell lets such programs, and so their jobs, ignore Ctrl-C."""
-    monkeypatch.setattr("alice_survey.app.studio.jobs._HARDER_S", (600.0, 600.0))
-    usual = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    sleeping = [sys.executable, "-c", "import time; time.sleep(600)"]
-    try:
-        jobs = Jobs(tmp_path, Published(), sleeping)
-        jobs.start("plan")
-        jobs.stop()
-        until(lambda: jobs.running() is None)
-        jobs.start("plan")
-        jobs.close()
-        until(lambda: jobs.running() is None)
-    finally:
-        signal.signal(signal.SIGINT, usual)
-    assert [one["state"] for one in jobs.history()] == ["stopped", "stopped"]
 
 
 def test_a_killed_job_says_so(tmp_path: Path) -> None:
@@ -318,28 +271,6 @@ def test_only_folders_of_recorded_jobs_are_removed(
     assert (folder_of(tmp_path, 1999) / "job.json").is_file()
     assert [path.name for path in folder_of(tmp_path).iterdir()] == ["notes.txt"]
     assert not folder_of(tmp_path, 2001).exists()
-
-
-@pytest.mark.parametrize(
-    ("name", "arguments"),
-    [
-        ("rm", {}),
-        ("plan; rm -rf", {}),
-        ("plan", {"survey": "/etc/passwd"}),
-        ("run", {"threads": "2 --json"}),
-        ("import-images", {"folders": ["--help"]}),
-        ("import-images", {"cameras": {"--rig": "/"}}),
-        ("import-log", {"log": "/", "output": "../x.csv"}),
-        ("import-log", {"log": "/", "output": "control.csv"}),
-    ],
-)
-def test_what_is_no_argument_is_refused(
-    name: str, arguments: dict[str, Any], tmp_path: Path
-) -> None:
-    with jobs_in(tmp_path) as jobs:
-        with pytest.raises(AliceError):
-            jobs.start(name, arguments)
-        assert jobs.running() is None and not jobs.history()
 
 
 def test_a_log_is_bounded_and_damaged_lines_are_left_out(tmp_path: Path) -> None:

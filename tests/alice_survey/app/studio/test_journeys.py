@@ -43,7 +43,8 @@ from tests.docs import given_divers as dive
 
 Point = NDArray[np.float64]
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
-AT_BOTH = pytest.mark.parametrize("journey", [WIDE, NARROW], indirect=True, ids=["1280", "400"])
+AT_1280 = pytest.mark.parametrize("journey", [WIDE], indirect=True, ids=["1280"])
+AT_400 = pytest.mark.parametrize("journey", [NARROW], indirect=True, ids=["400"])
 
 
 @pytest.fixture
@@ -53,7 +54,7 @@ def journey(request: pytest.FixtureRequest) -> Iterator[tuple[Any, Heard]]:
         yield page_and_heard
 
 
-@AT_BOTH
+@AT_1280
 def test_a_survey_is_drawn_saved_and_flown(journey: tuple[Any, Heard], tmp_path: Path) -> None:
     page, heard = journey
     reef = tmp_path / "reef"
@@ -144,7 +145,7 @@ def pictures_shown(page: Any, modelled: Path, folder: Path) -> Iterator[tuple[Se
         yield server, workspace
 
 
-@AT_BOTH
+@AT_400
 def test_a_stereo_dive_gives_a_length_beside_its_truth(
     journey: tuple[Any, Heard], modelled: Path, tmp_path: Path
 ) -> None:
@@ -158,7 +159,7 @@ def test_a_stereo_dive_gives_a_length_beside_its_truth(
         assert heard.complaints == []
 
 
-@AT_BOTH
+@AT_1280
 def test_control_points_are_picked_and_their_residuals_shown(
     journey: tuple[Any, Heard], modelled: Path, tmp_path: Path
 ) -> None:

@@ -2,9 +2,7 @@
 
 import base64
 import json
-import os
 import shutil
-import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -121,13 +119,6 @@ def test_what_is_not_of_the_list_is_refused(server: Server, body: Any) -> None:
     assert not ask(server, "/api/run/history").json["jobs"]
 
 
-def test_a_log_that_is_not_there(server: Server) -> None:
-    for query in ("job=7", "job=-1", "job=99999999999"):
-        assert ask(server, f"/api/run/log?{query}").status == 404
-    for query in ("", "job=x", "job=nan"):
-        assert ask(server, f"/api/run/log?{query}").status == 400
-
-
 def test_the_stages_of_a_survey_and_what_they_need(server: Server, tmp_path: Path) -> None:
     found = run_state(server)
     assert found["new"] and found["disk"]["free_gb"] > 0 and not found["stages"]
@@ -167,14 +158,6 @@ def test_a_survey_is_begun_from_its_place_and_depth(server: Server, tmp_path: Pa
     assert (made.imaging.scale, made.reconstruct.max_features) == (1, 8000)
     assert call(server, "/api/start/survey", values).status == 409  # there is one now
     assert load_config(tmp_path / "reef" / "survey.toml") == made
-
-
-def test_a_small_survey_to_try_has_small_pictures(server: Server, tmp_path: Path) -> None:
-    values = {"name": "Try", "length_m": 2, "width_m": 2, "trial": True}
-    assert call(server, "/api/start/survey", values).status == 200
-    made = load_config(tmp_path / "reef" / "survey.toml")
-    assert (made.imaging.scale, made.reconstruct.max_features) == (6, 1200)
-    assert (made.area.length_m, made.camera.width_px) == (2.0, 3384)
 
 
 def test_a_survey_is_begun_from_a_file_that_was_dropped(server: Server, tmp_path: Path) -> None:
@@ -265,41 +248,3 @@ def test_a_failed_import_may_be_begun_again(home: Path, tmp_path: Path) -> None:
         assert call(server, "/api/start/pictures", body).status == 200
         assert ended(server)["state"] == "done"
     assert not (tmp_path / "w" / "survey.toml").exists()
-
-
-@pytest.mark.slow
-def test_a_survey_is_planned_stopped_resumed_and_flown(tmp_path: Path) -> None:
-    file = settings_in(tmp_path / "reef") / "survey.toml"
-    small = file.read_text()
-    file.write_text(small.replace("_m = 1.3", "_m = 150.0").replace("_m = 1.5", "_m = 150.0"))
-    with serving(tmp_path / "reef") as server:  # a plan that takes long enough to be stopped
-        assert started(server, "plan").status == 200
-        until(lambda: (run_state(server)["job"] or {}).get("steps"), 60.0)
-        assert started(server, "fly").status == 409
-        call(server, "/api/run/stop")
-        assert ended(server)["state"] == "stopped"
-        states = {one["name"]: one["state"] for one in run_state(server)["stages"]}
-        assert states["plan"] == "interrupted"
-        file.write_text(small)
-        assert started(server, "fly").status == 200
-        failed = ended(server)
-        assert failed["state"] == "failed" and failed["ways"][0]["name"] == "plan"
-        for name in ("plan", "fly"):
-            assert started(server, name).status == 200
-            last = ended(server)
-            assert last["state"] == "done", last
-            assert last["line"].startswith(f"{name}: ")
-        found = run_state(server)
-        states = {one["name"]: one["state"] for one in found["stages"]}
-        assert states["plan"] == states["fly"] == "up to date" and states["pool"] == "missing"
-        commands = {one["name"]: one for one in found["commands"]}
-        assert 1 < commands["image"]["cost"]["time_s"] < 1000
-        assert commands["run"]["cost"]["disk_mb"] > commands["image"]["cost"]["disk_mb"] > 1
-        assert started(server, "image").status == 200
-        until(lambda: (run_state(server)["job"] or {}).get("steps"), 60.0)
-        number = run_state(server)["job"]["number"]
-        process = json.loads(
-            (tmp_path / "reef" / ".studio" / "jobs" / f"{number:04d}" / "job.json").read_text()
-        )["process"]
-        os.kill(process, signal.SIGKILL)
-        assert ended(server)["state"] == "killed"
