@@ -126,7 +126,7 @@ def test_a_format_is_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 def test_names_of_formats_are_known_without_importing_them() -> None:
     code = (
-        "import sys, alice_survey.app.commands.plan\n"
+        "import sys, alice_survey.app.commands.missions\n"
         "print([name for name in sys.modules if name.startswith('missions.exports.formats.')])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, cast
 
 from pydantic import Field, RootModel
 
-from alice_survey.app.commands.intake import ImportImagesCommand
+from alice_survey.app.commands.pictures import ImportImagesCommand
 from alice_survey.app.pipeline import init_survey
 from alice_survey.app.studio.endpoints.base import Call, Endpoint, Studio
 from alice_survey.app.studio.jobs import command_of
