@@ -98,7 +98,7 @@ _NO_DATES: dict[str, dict[str, None]] = {
 _MAX_PX = 1600
 
 
-class _NotebookSheet(Sheet):  # type: ignore[misc]  # matplotlib has no types
+class _ShownSheet(Sheet):  # type: ignore[misc]  # matplotlib has no types
     """A figure that a notebook shows without set-up."""
 
     def _repr_png_(self) -> bytes:
@@ -121,7 +121,7 @@ def new_figure(height_in: float, width_in: float = WIDTH_IN, layout: str | None 
         layout: of matplotlib; None is "constrained".
     """
     with figure_style():
-        sheet = _NotebookSheet(figsize=(width_in, height_in), dpi=_DPI, layout=layout or "constrained")
+        sheet = _ShownSheet(figsize=(width_in, height_in), dpi=_DPI, layout=layout or "constrained")
         FigureCanvasAgg(sheet)
     return sheet
 
