@@ -155,7 +155,18 @@ class PaperValidation:
                     asdict(check) | {name: getattr(check, name) for name in computed}
                     for check in self.table
                 ],
-                "claims": [asdict(claim) | {"passed": claim.passed} for claim in self.claims],
+                "claims": [
+                    {
+                        "claim": one.claim,
+                        "assumption": one.assumption,
+                        "computed": one.computed,
+                        "unit": one.unit,
+                        "least": one.minimum,
+                        "most": one.maximum,
+                        "passed": one.passed,
+                    }
+                    for one in self.claims
+                ],
                 "angles": self.angles,
             }
         )
