@@ -14,7 +14,6 @@ from alice_survey.core.frames import Array
 from camera_calib.rig import Covariance, Rig
 from reconstruct.adjustment.exact_observations import exact_observations as linearised
 from reconstruct.adjustment.normal_equations import (
-    Gauge,
     LinearObservations,
     reduce_points,
 )
@@ -243,21 +242,6 @@ def test_with_random_errors_of_calibration_the_block_is_as_good_as_stated(tmp_pa
     for ratios in (stations, points, apart):
         assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.4
     assert np.sqrt(np.mean(np.square(too_sure))) > 1.8, "then the calibration would not matter"
-
-
-def test_a_motion_of_the_whole_block_is_no_change_of_shape() -> None:
-    rng = np.random.default_rng(6)
-    centres, points = rng.normal(0, 2, (7, 3)), rng.normal(0, 2, (30, 3))
-    gauge = Gauge(centres, 2.0, scale_free=False)
-    motion = rng.normal(0, 1, (6, 2))
-    part = Motions(
-        stations=gauge.motions @ motion,
-        places=points,
-        points=gauge.of_points(points) @ motion,
-        covariance=np.eye(2),
-    ).without(gauge)
-    assert np.abs(part.of_stations()).max() < 1e-20
-    assert np.abs(part.of_points(points)).max() < 1e-20
 
 
 def test_points_move_like_those_of_their_own_group() -> None:

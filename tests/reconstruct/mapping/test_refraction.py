@@ -171,19 +171,3 @@ def test_with_matches_lost_observations_come_back(tmp_path: Path) -> None:
     )
     assert found.added == pytest.approx(lost, abs=0.1 * lost)
     assert not list(tmp_path.iterdir()), "scratch is cleared"
-
-
-def test_a_model_without_scale_takes_it_from_the_working_range(tmp_path: Path) -> None:
-    """Lengths in units of 3 m, said to be unscaled: the same shape comes out, and a note."""
-    scene, start = scene_at(0.05, 0.0, 0.0), started(0.05, 0.0, 0.0)
-    model = pycolmap.Reconstruction(start[0].model)
-    model.transform(pycolmap.Sim3d(1.0 / 3.0, pycolmap.Rotation3d(), np.zeros(3)))
-    unscaled = replace(start[0], model=model, scaled=False)
-    mapped, found = refract(unscaled, start[1], tmp_path)
-    assert found.settled
-    assert mapped.notes
-    _, _, points, true_points = pupils_and_points(mapped, scene)
-    fit = align_similarity(points, true_points)
-    misses = np.linalg.norm(fit.apply(points) - true_points, axis=1)
-    assert np.sqrt((misses**2).mean()) < 0.3e-3, "the median depth is near the working range"
-    assert fit.scale == pytest.approx(3.0, rel=1e-3)

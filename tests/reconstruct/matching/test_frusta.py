@@ -141,11 +141,3 @@ def test_opposite_sides_of_a_pile_are_no_partners() -> None:
     # Rays meet under 70 degrees at most; those of a frame are up to 25 degrees off its axis.
     assert all(apart[pair] <= 75 for pair in sure)
     assert all(apart[pair] <= 105 for pair in maybe)
-
-
-def test_without_altitudes_pictures_that_look_down_are_paired_by_frusta() -> None:
-    scene = make_scene(lines=2, stations=6, points=50)
-    blind = [replace(r, altitude_m=np.nan) for r in scene.records]
-    by_floor, _ = choose_pairs(scene.records, scene.rig, DATUM)
-    sure, maybe = choose_pairs(blind, scene.rig, DATUM, (), RANGE_M)
-    assert len(set(by_floor) & {*sure, *maybe}) > 0.9 * len(by_floor)

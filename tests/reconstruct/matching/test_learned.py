@@ -62,15 +62,6 @@ def test_the_network_gives_what_the_original_gives(reference: dict[str, np.ndarr
     np.testing.assert_allclose(np.linalg.norm(descriptors, axis=2), 1.0, atol=1e-4)
 
 
-def test_bytes_of_descriptors_keep_their_distances(reference: dict[str, np.ndarray]) -> None:
-    found = find_learned(reference["picture"], None, maximum=200)
-    assert 60 <= len(found.pixels) <= 200
-    vectors = (found.descriptors.astype(np.float64) - 128) / 256
-    lengths = np.linalg.norm(vectors, axis=1)
-    assert 0.98 < np.median(lengths) < 1.02
-    assert (found.descriptors == 255).mean() < 0.01
-
-
 def test_sampling_equals_its_slow_twin() -> None:
     rng = np.random.default_rng(3)
     field = rng.normal(size=(6, 9, 4)).astype(np.float32)

@@ -145,28 +145,6 @@ def test_pictures_without_navigation_are_tied_to_their_neighbours() -> None:
     assert partners >= set(range(lost - NEIGHBOURS, lost + NEIGHBOURS + 1))
 
 
-def partners_each(records: list[ImageRecord]) -> tuple[float, int]:
-    """Mean and largest number of partners of a picture, coarse looks included."""
-    scene = make_scene(points=1)
-    sure, maybe = choose_pairs(records, scene.rig, DATUM)
-    count = np.bincount(np.ravel([*sure, *maybe]), minlength=len(records))
-    return float(count.mean()), int(count.max())
-
-
-def test_partners_of_a_picture_do_not_grow_with_visits_to_the_place() -> None:
-    scene = make_scene(points=1)
-    visits = [
-        replace(r, station=r.station + 1000 * visit, image=f"{visit}/{r.image}")
-        for visit in range(6)
-        for r in scene.records
-    ]
-    once, _ = partners_each(scene.records)
-    often, maximum = partners_each(visits)
-    # six directions on lines along and across, two in each, chosen by either of the two
-    assert once < often < 2 * (2 * 6 * 2 + 12)
-    assert maximum < len(visits) / 4
-
-
 def test_uncertain_navigation_widens_the_search() -> None:
     scene = make_scene(points=1)
     found = []

@@ -130,20 +130,6 @@ def test_a_divers_folder_is_counted_by_kind_and_reason(
     assert not again.changed and again.model_copy(update={"changed": True}) == found
 
 
-def test_masks_and_workspace_in_the_folder_are_not_left_out(tmp_path: Path, draw: Draw) -> None:
-    source = tmp_path / "in"
-    for number in range(3):
-        draw(source / f"{number}.png", number)
-    mask = np.full((48, 64), 255, np.uint8)
-    cv2.imwrite(str(source / "1_mask.png"), mask)
-    (source / "masks").mkdir()
-    cv2.imwrite(str(source / "masks" / "2.png"), mask)
-    with keep_warnings() as warnings:
-        found = import_images(source / "work", [source], masks=source / "masks")
-    assert reasons(found) == {} and warnings == []
-    assert not import_images(source / "work", [source], masks=source / "masks").changed
-
-
 def test_stereo_pictures_pair_in_order(tmp_path: Path, draw: Draw) -> None:
     for number in range(3):
         draw(tmp_path / "port" / f"p{number}.png", number)
@@ -393,21 +379,15 @@ def test_every_fault_names_its_cause(tmp_path: Path, draw: Draw) -> None:
         ([tmp_path / "empty"], {}, "empty"),
         ([tmp_path / "one"], {}, "1"),
         ([], {"cameras": {"down": tmp_path / "sizes"}}, "64 x 49 .* 64 x 48"),
-        ([tmp_path / "absent"], {}, "absent"),
-        ([tmp_path / "nav.csv"], {}, "nav.csv"),
-        ([], {}, "--left and --right"),
         ([three], {"cameras": {"left": three, "right": three}}, "--left and --right"),
         ([], {"cameras": {"left": three, "right": tmp_path / "one"}}, "3 of left .* 1 of right"),
         ([], {"videos": [tmp_path / "no.mp4"]}, "no.mp4"),
         ([], {"videos": [tmp_path / "no.mp4"], "every_s": 1.0, "overlap": 0.7}, "exclude"),
         ([three], {"overlap": 0.7}, "--video too"),
         ([], {"videos": [tmp_path / "no.mp4"] * 2}, "given twice"),
-        ([], {"videos": [three]}, "no videos"),
         ([three], {"navigation": nav}, "DateTimeOriginal"),
-        ([three], {"time_zone": "Nowhere"}, "Nowhere"),
         ([three], {"clock_offset_s": float("nan")}, "--clock-offset"),
         ([three], {"vertical_datum": "LAT"}, "--navigation"),
-        ([three], {"navigation": nav, "vertical_datum": " "}, "--vertical-datum"),
         ([three], {"navigation": nav, "vertical_datum": "a\nb"}, "--vertical-datum"),
     ]
     for folders, given, named in faults:

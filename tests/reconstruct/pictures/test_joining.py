@@ -112,19 +112,6 @@ def test_the_plan_of_both_dives_holds_all_lines(tmp_path: Path) -> None:
     assert (assign_lines(stations, whole) == stations.line).all()
 
 
-def test_the_level_of_depths_is_that_of_the_dives_that_have_some(tmp_path: Path) -> None:
-    nan = float("nan")
-    flat = dive(tmp_path / "flat", 2, level="none", depth_m=nan)
-    deep = dive(tmp_path / "deep", 2, level="NN2000", placed=False)
-    join_dives(tmp_path / "both", [flat, deep])
-    joined = PicturesRecord.read(tmp_path / "both" / "images" / "survey.json")
-    assert joined.vertical_datum == "NN2000"
-    assert joined.datum is not None
-    surface = dive(tmp_path / "surface", 2)
-    with pytest.raises(ImageError, match="--vertical-datum"):
-        join_dives(tmp_path / "other", [deep, surface])
-
-
 def test_dives_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     one, two = dive(tmp_path / "one", 2), dive(tmp_path / "two", 2, level="NN2000")
     with pytest.raises(ImageError, match="--vertical-datum"):

@@ -75,23 +75,6 @@ def test_exact_depths_alone_level_a_rigs_model_and_give_its_depth() -> None:
     assert said["sigma_depth_m"] == found.sigma_position_m[2]
 
 
-def test_headings_alone_leave_the_level_of_the_sea_floor() -> None:
-    scene, truth = make_scene(points=400), gauge(8, 1.0)
-    start = level(
-        points_in_model(scene.points_ned, truth),
-        np.stack([in_model(pose, truth).translation for pose in scene.ned_from_cam]),
-    )
-    found = local_fit(scene, with_only(scene.records, "heading_deg"), truth, known=True)
-    assert found is not None
-    lean = (found.ned_from_model.rotation * start.rotation.inv()).apply(DOWN)
-    assert lean[2] == pytest.approx(1.0, abs=1e-9)
-    turn = (found.ned_from_model.rotation * truth.rotation.inv()).as_euler("ZYX", degrees=True)[0]
-    assert 1e-6 < abs(turn) < 0.3
-    said = found.record.to_json()
-    assert said["sigma_tilt_deg"] is None
-    assert 0.1 < said["sigma_heading_deg"] < 1.1
-
-
 def placed_by_one_camera(
     workspace: Path, truth: Similarity, readings: tuple[str, ...], datum: Datum | None
 ) -> Placed:

@@ -80,21 +80,3 @@ def test_modes_larger_than_stated_are_found_and_their_sigmas_are_true(factor: fl
     found, off = whitened(factor)
     assert 0.85 * factor < np.median(found) < 1.2 * factor
     assert 0.75 < np.sqrt((off**2).mean()) < 1.3
-
-
-@pytest.mark.parametrize(("apart_m", "unit_m"), [(0.2, 1e-3), (1.0, 0.1)])
-def test_half_a_model_apart_is_no_sign_of_larger_modes(apart_m: float, unit_m: float) -> None:
-    """Nothing is known of where it is: neither a prior shrinks its motions nor do they count.
-
-    A prior of one unit would shrink 200 mm in units of 1 mm. 1 m in units of 0.1 m, known to less
-    than one unit, would count as modes ten times as large as stated.
-    """
-    found, off, sigmas = [], [], []
-    for seed in range(12):
-        fit, error = fitted(seed, 1.0, apart_m=apart_m, unit_m=unit_m)
-        found.append(fit.mode_factor)
-        sigmas.append(np.sqrt(np.diag(fit.joint)[_FIRST + _MODES :]))
-        off.append(error[_MODES:] / sigmas[-1])
-    assert np.count_nonzero(np.array(found) > 1.0) <= 1
-    assert 0.6 < np.sqrt(np.mean(np.square(off))) < 1.4
-    assert np.all((unit_m * np.array(sigmas) > 2e-3) & (unit_m * np.array(sigmas) < 0.06))
