@@ -13,7 +13,7 @@ from alice_survey.core.errors import ReconstructionError
 from alice_survey.core.frames import Array, Datum
 from alice_survey.core.records import RangeRecord
 from camera_calib.rig import Rig
-from reconstruct.adjustment.adjusted import adjust_survey
+from reconstruct.adjustment.survey_fit import adjust_survey
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.refraction import refract

@@ -33,11 +33,12 @@ from alice_survey.core.block_solver import BlockStep, Flags, inverse_of, minimis
 from alice_survey.core.config import ReconstructConfig
 from alice_survey.core.errors import ReconstructionError, warn
 from alice_survey.core.frames import Array
-from alice_survey.core.records import PortRecord
+from alice_survey.core.manifest import ImageRecord
+from alice_survey.core.records import PortRecord, RangeRecord
 from alice_survey.core.run import progress
-from camera_calib.approximation.pinhole_warp import PinholeWarp
+from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.freedom import POSE as TURN_AND_SHIFT
-from camera_calib.freedom import Prior, at_bound, move_rig, pose_names, value
+from camera_calib.freedom import Prior, at_bound, move_rig, part_of_rig, pose_names, value
 from camera_calib.rig import Covariance, Rig
 from reconstruct.adjustment.exact_observations import (
     Pixels,
@@ -49,7 +50,16 @@ from reconstruct.adjustment.exact_observations import (
 from reconstruct.adjustment.normal_equations import POSE, PointEquations, reduce_parts
 from reconstruct.adjustment.pixel_parts import ALONE, Linearised, PixelParts, Workers
 from reconstruct.adjustment.soft_modes import Motions, SoftModes
-from reconstruct.mapping.arrays import MIN_POINTS, Indices, first_of, frames_of, linked_groups
+from reconstruct.adjustment.uncertainty import Uncertainty, estimate
+from reconstruct.mapping.arrays import (
+    MIN_POINTS,
+    Indices,
+    first_of,
+    frames_of,
+    linked_groups,
+    observations,
+    rig_poses,
+)
 from reconstruct.mapping.bundle import (
     cauchy_cost,
     cauchy_weights,
@@ -61,7 +71,7 @@ from reconstruct.mapping.bundle import (
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.refraction import Keypoints
-from reconstruct.views.model_files import colmap_pinhole, rigid3d
+from reconstruct.views.model_files import colmap_pinhole, rigid3d, stored_of
 
 BIAS_PX = 0.01
 """Sigma of the bias, root mean square over a picture: in rendered surveys it is 0.005 to 0.007."""
@@ -336,7 +346,7 @@ def fit_survey(
         fields = calibrated_parameters(rig, names)
         if rig.covariance is not None:
             known = calibrated_covariance(rig, fields)
-        equations = problem.reduced(guess, found.noise, fields)
+        equations = problem.reduce(guess, found.noise, fields)
     sigma_px, variance = found.noise.tolist()
     weights = cauchy_weights(guess.miss, sigma_px)
     return SurveyFit(
@@ -432,12 +442,12 @@ class SurveyProblem:
 
     def linearise(self, guess: _Guess, noise: Array) -> PointEquations:
         """Normal equations with the points eliminated."""
-        found = self.reduced(guess, noise, self.fields)
+        found = self.reduce(guess, noise, self.fields)
         found.shared[:-1, :-1] += self.information
         found.shared[:-1, -1] += self.information @ self.prior.misfit(guess.state.rig)
         return found
 
-    def reduced(self, guess: _Guess, noise: Array, fields: Sequence[str]) -> PointEquations:
+    def reduce(self, guess: _Guess, noise: Array, fields: Sequence[str]) -> PointEquations:
         """The same without what is known before the pictures, for any fields of the rig."""
         sigma, variance = noise.tolist()
         parts = Linearised(
@@ -565,3 +575,176 @@ def on_pinholes(
     keypoints.correct(model, 1.0)
     model.update_point_3d_errors()
     return found
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ExactSurvey:
+    """A survey adjusted on exact rays."""
+
+    mapped: Mapped
+    """As it was mapped."""
+    seen: Observations
+    distances: RangeRecord
+    """For which the pinholes are the best."""
+    fit: SurveyFit
+
+    def on_pinholes(self) -> Mapped:
+        """As a model of the pinholes of its rig."""
+        warps = self.mapped.warps
+        if self.fit.parameters:
+            near, far = self.distances.near_m, self.distances.far_m
+            warps = {name: best_warp(self.fit.rig.cameras[name], near, far) for name in warps}
+        return on_pinholes(self.mapped, self.seen, self.fit, warps)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AdjustedSurvey:
+    """A model of pinholes after the last adjustment."""
+
+    mapped: Mapped
+    rig: Rig | None
+    exact: ExactSurvey | None
+    """What the model stands for; None where lenses or scale are not known beforehand."""
+    shape: Uncertainty | None
+    """How well its shape is known; None where it is not."""
+
+    def deform(self, sizes: Array, left: Array) -> Self:
+        """The same after measurements from outside have said how large its soft modes are.
+
+        Args:
+            sizes: (K,) of every mode of the `shape`, in its sigmas.
+            left: (K, K) covariance of these.
+        """
+        if self.shape is None:
+            raise ValueError("a model of unknown shape has no modes")
+        shape, modes = self.shape.knowing(left), self.shape.modes
+        if self.exact is None:
+            return replace(self, mapped=_move_model(self.mapped, modes, sizes), shape=shape)
+        fit = self.exact.fit.deform(modes, self.shape.point_ids, sizes, left)
+        exact = replace(self.exact, fit=fit)
+        return replace(self, mapped=exact.on_pinholes(), rig=fit.rig, exact=exact, shape=shape)
+
+
+def adjust_survey(
+    mapped: Mapped,
+    records: Sequence[ImageRecord],
+    rig: Rig | None,
+    distances: RangeRecord | None,
+    settings: ReconstructConfig,
+    workers: Workers = ALONE,
+) -> AdjustedSurvey:
+    """Adjust a mapped survey a last time by its pictures and its calibration.
+
+    Args:
+        mapped: exact model; picture i of `records` has the id i + 1.
+        records: pictures.
+        rig: as calibrated; None where the cameras calibrated themselves.
+        distances: for which the model's pinholes are the best.
+        settings: `refine_port` and `refine_rig`.
+        workers: where parts of a large survey are worked on.
+
+    Raises:
+        ReconstructionError: the settings insist on a refinement of the rig, and the model has no
+            scale or does not determine it.
+    """
+    exact, notes = None, mapped.notes
+    if rig is not None and list(rig.cameras) != list(mapped.warps):
+        rig = part_of_rig(rig, list(mapped.warps))
+    try:
+        if rig is not None and distances is not None and mapped.scaled:
+            exact = _exact(mapped, records, rig, distances, settings, workers)
+        elif settings.refine_port or settings.refine_rig == "on":
+            raise ReconstructionError(
+                "refine_port and refine_rig need two cameras, whose known baseline gives the "
+                'scale: set refine_port = false and refine_rig = "off" in survey.toml'
+            )
+    except ReconstructionError as error:
+        if settings.refine_port or settings.refine_rig == "on":
+            raise
+        notes = (*notes, f"rig as calibrated: {error}")
+    found = replace(mapped, notes=notes) if exact is None else exact.on_pinholes()
+    shape = None
+    try:
+        shape = _shape(found, records, exact, workers)
+    except ReconstructionError as error:
+        warn(f"no covariance: {error}")
+    if exact is not None:
+        rig = exact.fit.rig
+    return AdjustedSurvey(mapped=found, rig=rig, exact=exact, shape=shape)
+
+
+def _exact(
+    mapped: Mapped,
+    records: Sequence[ImageRecord],
+    rig: Rig,
+    distances: RangeRecord,
+    settings: ReconstructConfig,
+    workers: Workers,
+) -> ExactSurvey:
+    names = list(mapped.warps)
+    seen = Observations(
+        images=records,
+        cameras={name: colmap_pinhole(warp.pinhole) for name, warp in mapped.warps.items()},
+        taken=taken_pixels(mapped.model, records, mapped.warps),
+        pairs=(),
+        warps=mapped.warps,
+    )
+    pose = frees_poses(settings, rig, names)
+    fit = fit_survey(mapped, seen, rig, port=settings.refine_port, pose=pose, workers=workers)
+    return ExactSurvey(mapped=mapped, seen=seen, distances=distances, fit=fit)
+
+
+@progress.step("covariance of the model")
+def _shape(
+    mapped: Mapped, records: Sequence[ImageRecord], exact: ExactSurvey | None, workers: Workers
+) -> Uncertainty:
+    workers = workers.apart("covariance")
+    if exact is None:
+        return estimate(mapped, records, workers=workers)
+    return estimate(
+        mapped, records, exact.fit.calibration, held=not exact.fit.parameters, workers=workers
+    )
+
+
+def taken_pixels(
+    model: pycolmap.Reconstruction,
+    records: Sequence[ImageRecord],
+    warps: Mapping[str, PinholeWarp],
+) -> list[Array]:
+    """The keypoints of all pictures as taken, (N, 2) each.
+
+    A keypoint that has a point is where its pinhole sees that spot, at the point's depth; others
+    are as at the working range.
+
+    Args:
+        model: exact, in metres; picture i of `records` has the id i + 1.
+        records: pictures.
+        warps: by camera.
+    """
+    seen, stored = observations(model), stored_of(model).keypoints
+    found = [np.zeros((0, 2))] * len(records)
+    for number, rows in sorted(stored.items()):
+        warp = warps[records[number - 1].camera]
+        depths = np.full(len(rows), warp.working_depth_m)
+        if number in seen.pictures:
+            mine = seen.of(seen.row(number))
+            depths[seen.keypoint[mine]] = seen.in_cameras[mine, 2]
+        points = np.column_stack([warp.pinhole.slopes(rows["xy"]), np.ones(len(rows))])
+        in_cam = points * depths[:, None] + np.array(warp.centre_m)
+        found[number - 1] = warp.camera.project(in_cam)
+    return found
+
+
+def _move_model(mapped: Mapped, modes: SoftModes, sizes: Array) -> Mapped:
+    """A model of pinholes with its soft modes (K,) of these sizes."""
+    model = pycolmap.Reconstruction(mapped.model)
+    frames, seen = frames_of(model), observations(model)
+    poses = rig_poses(model, frames).inv()
+    turns, centres, points = modes.move(sizes, poses.translation, seen.points, slice(None))
+    stations = RigidTransform.from_components(centres, turns * poses.rotation)
+    for frame, station in zip(frames.tolist(), stations, strict=True):
+        model.frames[frame].rig_from_world = rigid3d(station.inv())
+    for point, xyz in zip(seen.point_ids.tolist(), points, strict=True):
+        model.points3D[point].xyz = xyz
+    model.update_point_3d_errors()
+    return replace(mapped, model=model)

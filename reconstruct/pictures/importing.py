@@ -27,7 +27,6 @@ from alice_survey.core.records import PicturesRecord, PlaceRecord
 from camera_calib.freedom import part_of_rig
 from camera_calib.rig import Rig, read_rig, write_rig
 from missions.logs.navigation_csv import NavigationLog, find_zone, read_navigation
-from reconstruct.pictures.bag_pictures import take_bag
 from reconstruct.pictures.files import (
     ADVICE,
     VIDEO,
@@ -57,7 +56,7 @@ from reconstruct.pictures.incoming import (
     unique_names,
     with_time,
 )
-from reconstruct.pictures.pairing import pair_by_time
+from reconstruct.pictures.pairing import pair_by_time, take_bag
 from reconstruct.pictures.videos import (
     DEFAULT_OVERLAP,
     Recording,

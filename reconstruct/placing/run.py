@@ -41,10 +41,10 @@ from alice_survey.core.records import (
 )
 from camera_calib.freedom import knowing_water
 from camera_calib.rig import Rig, rig_with_mount, write_rig
-from reconstruct.adjustment.adjusted import adjust_survey
 from reconstruct.adjustment.normal_equations import POSE
 from reconstruct.adjustment.pixel_parts import Workers
 from reconstruct.adjustment.soft_modes import SoftModes
+from reconstruct.adjustment.survey_fit import adjust_survey
 from reconstruct.adjustment.uncertainty import Uncertainty, write_uncertainty
 from reconstruct.mapping.arrays import cross_matrices, frames_of, model_groups
 from reconstruct.mapping.mapper import Mapped, model_baseline

@@ -15,9 +15,9 @@ from alice_survey.core.frames import Array
 from alice_survey.core.records import RangeRecord
 from benchmarks.bend_pipeline import Adjusted, adjusted
 from camera_calib.rig import Covariance
-from reconstruct.adjustment.adjusted import AdjustedSurvey, adjust_survey
 from reconstruct.adjustment.exact_observations import choose_pixels, exact_observations
 from reconstruct.adjustment.normal_equations import Gauge
+from reconstruct.adjustment.survey_fit import AdjustedSurvey, adjust_survey
 from reconstruct.mapping.arrays import cross_matrices, frames_of
 from reconstruct.mapping.bundle import cauchy_weights
 from reconstruct.mapping.refraction import adjust_freely, refract

@@ -16,7 +16,6 @@ from alice_survey.core.records import RangeRecord
 from camera_calib.freedom import POSE, value
 from camera_calib.rig import Covariance, Rig
 from reconstruct.adjustment import exact_observations
-from reconstruct.adjustment.adjusted import AdjustedSurvey, adjust_survey
 from reconstruct.adjustment.exact_observations import (
     Pixels,
     RigState,
@@ -25,7 +24,13 @@ from reconstruct.adjustment.exact_observations import (
 )
 from reconstruct.adjustment.normal_equations import PointEquations, reduce_parts
 from reconstruct.adjustment.pixel_parts import Linearised, PixelParts
-from reconstruct.adjustment.survey_fit import SurveyFit, fit_survey, frees_poses
+from reconstruct.adjustment.survey_fit import (
+    AdjustedSurvey,
+    SurveyFit,
+    adjust_survey,
+    fit_survey,
+    frees_poses,
+)
 from reconstruct.mapping.arrays import frames_of
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped, model_baseline

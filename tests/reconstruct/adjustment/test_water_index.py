@@ -11,8 +11,7 @@ from alice_survey.core.frames import Array
 from alice_survey.core.records import RangeRecord
 from camera_calib.freedom import knowing_water
 from camera_calib.rig import Covariance, Rig
-from reconstruct.adjustment.adjusted import AdjustedSurvey, adjust_survey
-from reconstruct.adjustment.survey_fit import fit_survey
+from reconstruct.adjustment.survey_fit import AdjustedSurvey, adjust_survey, fit_survey
 from reconstruct.mapping.refraction import refract
 from reconstruct.placing.alignment import align_similarity
 from tests.reconstruct.scenes import Scene, make_scene

@@ -12,8 +12,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.core.config import ReconstructConfig
 from alice_survey.core.frames import Array
 from alice_survey.core.records import RangeRecord
-from reconstruct.adjustment.adjusted import adjust_survey
 from reconstruct.adjustment.normal_equations import Gauge
+from reconstruct.adjustment.survey_fit import adjust_survey
 from reconstruct.adjustment.uncertainty import Uncertainty
 from reconstruct.mapping.arrays import Indices, frames_of, model_groups
 from reconstruct.mapping.mapper import Mapped

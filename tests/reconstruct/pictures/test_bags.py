@@ -10,8 +10,8 @@ import pytest
 
 from alice_survey.core.errors import AliceError, ImageError, collected_by
 from alice_survey.core.manifest import read_manifest
-from reconstruct.pictures.bag_pictures import pixels_of
 from reconstruct.pictures.importing import import_images
+from reconstruct.pictures.pairing import pixels_of
 from tests.missions.logs.log_files import Bag
 from tests.reconstruct.pictures.dated import counts
 
