@@ -16,6 +16,7 @@ from alice_survey.app import stages as survey_stages
 from alice_survey.app.stages import names, spec
 from alice_survey.core.artefacts import read_json, read_stage, refuse_links
 from alice_survey.core.config import (
+    Config,
     SurveyConfig,
     change_section,
     load_config,
@@ -315,7 +316,7 @@ def run_demo(workspace: Path, executor: Executor | None) -> tuple[str, dict[str,
     return "\n".join([text, "", "To look at:", *rows, page]), found
 
 
-def stage_states(workspace: Path, config: SurveyConfig) -> dict[str, str]:
+def stage_states(workspace: Path, config: Config) -> dict[str, str]:
     """State of each stage that the survey of a workspace has, as `StageSpec.state` gives it."""
     imported = is_imported(workspace)
     states: dict[str, str] = {}

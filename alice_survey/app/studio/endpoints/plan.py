@@ -254,7 +254,7 @@ class _PlanTab:
             )  # fmt: skip
         track = folder / "flight" / "truth" / "track.csv"
         if set(states.values()) == {"up to date"} and track.is_file():
-            return _true_dive(folder / "flight", draft.config)
+            return _true_dive(folder / "flight", draft.config.camera.position_body_m)
         with _draft_settings(draft) as config, _quiet():
             planned = plan_survey(config, design_rig(config.camera, config.water))
             played = play(planned.plan, planned.costs, planned.bathymetry)
@@ -279,7 +279,7 @@ class _PlanTab:
                 drawing = drawing_of_file(
                     file, config.area, role=role, layer=call.query.get("layer"),
                     crs=call.query.get("crs"),
-                    datum=_datum_asked(call, found.token, config),
+                    datum=_datum_asked(call, found.token, config.area),
                 )  # fmt: skip
             except PlanError as error:
                 text = str(error).replace(str(file), name).replace(file.name, name)
@@ -340,7 +340,7 @@ def _json(found: Mapping[str, Any]) -> Content:
     return Content(data=to_json(found, inf_nan_mode="null"), kind=_JSON)
 
 
-def _datum_asked(call: Call, token: str, config: SurveyConfig) -> Datum | None:
+def _datum_asked(call: Call, token: str, area: AreaConfig) -> Datum | None:
     """The datum that a dropped file is to count to; None for its own middle.
 
     `datum` of the query is `middle`, or latitude and longitude with a comma between; where it is
@@ -350,13 +350,13 @@ def _datum_asked(call: Call, token: str, config: SurveyConfig) -> Datum | None:
     if asked == "middle":
         return None
     if not asked:
-        return area_drawing(config.area).datum
+        return area_drawing(area).datum
     try:
         latitude_deg, longitude_deg = map(float, asked.split(","))
-        area = AreaConfig(latitude_deg=latitude_deg, longitude_deg=longitude_deg)
+        place = AreaConfig(latitude_deg=latitude_deg, longitude_deg=longitude_deg)
     except ValueError:
         raise PlanError(f"datum {asked[:40]!r}: it is 'middle' or LATITUDE,LONGITUDE") from None
-    return Datum(area.latitude_deg, area.longitude_deg)
+    return Datum(place.latitude_deg, place.longitude_deg)
 
 
 @contextmanager
@@ -416,7 +416,7 @@ def _heights_layer(found: Precision) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _true_dive(folder: Path, config: SurveyConfig) -> dict[str, Any]:
+def _true_dive(folder: Path, glass_body_m: Sequence[float]) -> dict[str, Any]:
     """The simulated dive as it truly was, of the left port's glass; altitudes are its log's."""
     track = read_track(folder / "truth" / "track.csv")
     log = read_columns(folder / "navigation.csv", ("time_s", "altitude_m"))
@@ -426,7 +426,7 @@ def _true_dive(folder: Path, config: SurveyConfig) -> dict[str, Any]:
     if known.any():
         altitude_m = np.interp(track.time_s, log["time_s"][known], log["altitude_m"][known])
     return _moments(
-        "flown", track.time_s, poses.apply(np.array(config.camera.position_body_m)), altitude_m,
+        "flown", track.time_s, poses.apply(np.array(glass_body_m)), altitude_m,
         np.unwrap(attitude_from_rotation(poses.rotation)[:, 2]), pictures_s,
     )  # fmt: skip
 

@@ -23,7 +23,7 @@ from alice_survey.app.stages import spec
 from alice_survey.app.studio.endpoints.base import Call, Endpoint, Studio
 from alice_survey.app.studio.jobs import OFFERED
 from alice_survey.core.artefacts import STAGE_FILE, StageRecord, read_stage
-from alice_survey.core.config import Config, SurveyConfig
+from alice_survey.core.config import Config
 from alice_survey.core.errors import AliceError
 from alice_survey.core.executor import default_threads
 from alice_survey.core.run.resources import processor
@@ -58,7 +58,8 @@ def survey_state(workspace: Path) -> dict[str, Any]:
         imported = found["imported"] = is_imported(workspace)
         config = settings(workspace, None, needed=not imported)
         states = stage_states(workspace, config)
-        costs = _costs(workspace, config, states)
+        size = workspace_size(workspace, config.camera, config.imaging, config.reconstruct)
+        costs = {} if size is None else _costs(workspace, stage_costs(size), states)
     except AliceError as error:
         return found | {"fault": str(error), "ways": ways_on(str(error))}
     found["stages"] = [
@@ -108,13 +109,11 @@ def _stage(workspace: Path, stage: StageSpec, state: str, cost: StageCost | None
 
 
 def _costs(
-    workspace: Path, config: SurveyConfig, states: Mapping[str, str]
+    workspace: Path, costs: Mapping[str, StageCost], states: Mapping[str, str]
 ) -> dict[str, StageCost]:
-    """What stages are predicted to take, as those that ran here correct it; empty where unknown."""
-    size = workspace_size(workspace, config.camera, config.imaging, config.reconstruct)
-    if size is None or all(state == UP_TO_DATE for state in states.values()):
+    """Costs of stages as those that ran here correct them; none where nothing is left."""
+    if all(state == UP_TO_DATE for state in states.values()):
         return {}
-    costs = stage_costs(size)
     done: dict[str, StageRecord] = {}
     for name, state in states.items():
         record = read_stage(workspace / spec(name).folder)
