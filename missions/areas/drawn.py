@@ -343,12 +343,12 @@ def _geojson(
         rows: list[list[float]] = np.round(lat_lon[:, ::-1], _DEGREE_DECIMALS).tolist()
         return rows
 
-    def closed(ring: Open) -> list[list[float]]:
+    def close(ring: Open) -> list[list[float]]:
         corners = degrees(ring)
         return [*corners, corners[0]]
 
     geometries = [
-        *({"type": "Polygon", "coordinates": [closed(r) for r in p.rings]} for p in polygons),
+        *({"type": "Polygon", "coordinates": [close(r) for r in p.rings]} for p in polygons),
         *({"type": "LineString", "coordinates": degrees(line)} for line in lines),
         *({"type": "Point", "coordinates": degrees(point)[0]} for point in points),
     ]

@@ -116,17 +116,17 @@ def survey_area(settings: AreaConfig, *, turn_margin_m: float, margin_m: float =
     zones = [(raw.origin, widen(shape.holes, clearance_m))]
     zones += [(zone.origin, _zone(zone, frame, clearance_m)) for zone in given.no_go]
     no_go = _union([zone for _, zone in zones])
-    wanted = widen(shape.solid, margin_m)
-    survey = _less(wanted, no_go)
+    requested = widen(shape.solid, margin_m)
+    survey = _less(requested, no_go)
     if survey.is_empty:
         names = " and ".join(name for name, zone in zones if not zone.is_empty)
         raise PlanError(
-            f"area: the zones to keep out of ({names}) leave nothing of the {wanted.area:.4g} m2 "
-            "to survey: shrink them or lower no_go_clearance_m"
+            f"area: the zones to keep out of ({names}) leave nothing of the {requested.area:.4g} "
+            "m2 to survey: shrink them or lower no_go_clearance_m"
         )
     if allowed_raw is None:
         margin = settings.turn_margin_m if settings.turn_margin_m is not None else turn_margin_m
-        allowed = _less(widen(wanted, margin), no_go)
+        allowed = _less(widen(requested, margin), no_go)
         if raw.unused_fence:
             warn(f"area: {raw.origin}: {raw.unused_fence}")
     else:

@@ -55,10 +55,10 @@ def mission_items(
 
 def trigger_m(plan: Plan, line: int) -> float:
     """Distance from picture to picture, at least 0.1 mm short so that a line's last is not lost."""
-    wanted = plan.lines[line]
-    if wanted.stations < 2:
+    requested = plan.lines[line]
+    if requested.stations < 2:
         return plan.station_spacing_m
-    return (math.ceil(wanted.length_m / (wanted.stations - 1) * 1e4 - 1e-6) - 1) / 1e4
+    return (math.ceil(requested.length_m / (requested.stations - 1) * 1e4 - 1e-6) - 1) / 1e4
 
 
 def _items(

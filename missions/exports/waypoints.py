@@ -280,11 +280,11 @@ def line_depths(plan: Plan) -> list[Array] | None:
     if not plan.line_depths_m:
         return None
     depths = [np.asarray(row, dtype=np.float64) for row in plan.line_depths_m]
-    stations, wanted = [len(row) for row in depths], [line.stations for line in plan.lines]
-    if stations != wanted:
+    stations, requested = [len(row) for row in depths], [line.stations for line in plan.lines]
+    if stations != requested:
         raise PlanError(
             f"depths of {len(stations)} lines with {sum(stations)} stations do not fit a plan of "
-            f"{len(wanted)} lines with {sum(wanted)} stations: plan again"
+            f"{len(requested)} lines with {sum(requested)} stations: plan again"
         )
     return depths
 

@@ -126,8 +126,8 @@ def cell_costs(
     """
     both, sizes = ends[listed].reshape(-1, 2, 2), np.diff(begins)
     courses = course + math.pi * np.arange(2)
-    lengths: Array = np.hypot(*(both[:, 1] - both[:, 0]).T)[:, None]
-    lines = hops.line_j(costs, lengths, courses)
+    lengths = np.asarray(np.hypot(*(both[:, 1] - both[:, 0]).T), np.float64)
+    lines = hops.line_j(costs, lengths[:, None], courses)
     # Hops at a side, 0 where lines begin: on to the next piece, and back from it.
     leaving = np.broadcast_to(courses[::-1, None], (len(both), 2, 1))
     places = np.concatenate([both, leaving], axis=2)

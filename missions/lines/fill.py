@@ -430,8 +430,8 @@ def _strips(sides: Array, low: Array, high: Array, finest_m: float) -> tuple[Arr
     widths = np.diff(sides)
     middles = sides[:-1] + widths / 2
     row = np.searchsorted(low, middles) - 1
-    wanted = (row >= 0) & (middles < high[np.maximum(row, 0)]) & (widths > _TINY_M)
-    begins, widths = sides[:-1][wanted], widths[wanted]
+    requested = (row >= 0) & (middles < high[np.maximum(row, 0)]) & (widths > _TINY_M)
+    begins, widths = sides[:-1][requested], widths[requested]
     parts = np.ceil(widths / finest_m - _TINY_M).astype(np.intp)
     part = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
     thin = np.repeat(widths / parts, parts)

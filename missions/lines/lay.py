@@ -347,7 +347,7 @@ def _tour(
 ) -> NDArray[np.int64]:
     """The order of cells: corners of entry, counted through."""
 
-    def improved(first: NDArray[np.int64], problem: tour.Cells, fixed: int) -> NDArray[np.int64]:
+    def improve(first: NDArray[np.int64], problem: tour.Cells, fixed: int) -> NDArray[np.int64]:
         better = tour.improved_tour if quick else tour.good_tour
         order: NDArray[np.int64] = better(first, problem, fixed)
         return order
@@ -370,7 +370,7 @@ def _tour(
     if closing is None:
         if size <= tour.EXACT:
             return np.asarray(tour.exact_tour(problem, plain[None], False)[1])
-        return improved(tour.nearest_tour(problem), problem, 0)
+        return improve(tour.nearest_tour(problem), problem, 0)
     start[cells.CORNERS * survey_cells :] = np.inf
 
     def finishes(first: NDArray[np.int64]) -> Array:
@@ -389,7 +389,7 @@ def _tour(
         return np.asarray(tour.exact_tour(problem, finish, True)[1])
     order = tour.improved_tour(tour.nearest_tour(problem), problem, 0)
     # Now that it is known where the flight begins, so is where it ends.
-    return improved(order, problem._replace(finish=finishes(order[:1])[0]), 1)
+    return improve(order, problem._replace(finish=finishes(order[:1])[0]), 1)
 
 
 def _table(ends: Array, flown: NDArray[np.int64], heading_rad: float, survey_count: int) -> Array:

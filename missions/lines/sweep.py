@@ -51,7 +51,7 @@ _FEW_TENTHS = (-1.0, 1.0)
 """The same, where cells are many."""
 _FULL = 16
 """Best close costs at which the full cost is taken."""
-_MOST = _SPREAD + 1 + _BEST + _REFINED * (_REFINED + len(_TENTHS)) + _FULL
+_MAX_HEADINGS = _SPREAD + 1 + _BEST + _REFINED * (_REFINED + len(_TENTHS)) + _FULL
 _TIMED = 10
 """Costs after which is known how long all will take."""
 _PROMISING = 1.15
@@ -196,8 +196,8 @@ def _run(search: Iterator[float]) -> None:
     """Go through a search; one that will take long shows how far it is."""
     began = time.monotonic()
     done = sum(1 for _ in islice(search, _TIMED))
-    if (time.monotonic() - began) * _MOST / _TIMED > _WORTH_SHOWING_S:
-        search = progress(search, "headings tried", _MOST - done)
+    if (time.monotonic() - began) * _MAX_HEADINGS / _TIMED > _WORTH_SHOWING_S:
+        search = progress(search, "headings tried", _MAX_HEADINGS - done)
     for _ in search:
         pass
 

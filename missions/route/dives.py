@@ -98,12 +98,12 @@ def split_dives(
     """
     table, costs = line_table(lines), how.costs
 
-    def routed(first: int, last: int) -> Array:
+    def route(first: int, last: int) -> Array:
         return legs_through(table[first : last + 1], how, home_ne=home_ne, first_line=first)
 
     limits = DiveLimits(energy_j=usable_wh * _J_PER_WH, time_s=math.inf if max_s is None else max_s)
     down_and_up = costs.dive_j(depth_m), costs.dive_s(depth_m)
-    whole = routed(0, len(lines) - 1)
+    whole = route(0, len(lines) - 1)
     spent = np.stack(leg_row_costs(whole[:, 2:], costs))
     _check_flyable(whole, spent[0], lines, costs)
     energy_j, time_s = spent.sum(axis=1) + down_and_up
@@ -118,7 +118,7 @@ def split_dives(
         parted = _tie(lines, sums, limits, parted)
     dives = []
     for first, last in parted:
-        legs = routed(first, last)
+        legs = route(first, last)
         energy_j, time_s = np.stack(leg_row_costs(legs[:, 2:], costs)).sum(axis=1) + down_and_up
         dives.append(_dive(first, last, legs, float(energy_j), float(time_s)))
     return tuple(dives)

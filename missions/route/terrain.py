@@ -6,7 +6,7 @@ whose slope is never steeper than the vehicle can follow is
 
     z(s) = min over t of (w(t) + g |s - t|)
 
-with the wanted depth w and the slope g: the lower envelope of cones. A pass forward and a pass back
+with the requested depth w and the slope g: the lower envelope of cones. A pass forward and one back
 find it exactly on the samples (P. F. Felzenszwalb and D. P. Huttenlocher, Distance Transforms of
 Sampled Functions, Theory of Computing 8, 2012). Where the floor is steeper than the vehicle can
 follow, the altitude rises.
@@ -112,20 +112,20 @@ def reach_of(
     )
 
 
-def envelope(along_m: Array, wanted_m: Array, slope: float) -> Array:
-    """The deepest profile that is never deeper than wanted and never steeper than a slope.
+def envelope(along_m: Array, requested_m: Array, slope: float) -> Array:
+    """The deepest profile that is never deeper than requested and never steeper than a slope.
 
     Args:
         along_m: (S,) increasing.
-        wanted_m: (S,) depths.
+        requested_m: (S,) depths.
         slope: metres down per metre along, positive.
 
     Returns:
         (S,) depths.
     """
     # A cone from the left, w(t) + g (s - t), is least where w(t) - g t is.
-    from_left = np.minimum.accumulate(wanted_m - slope * along_m) + slope * along_m
-    back = np.minimum.accumulate((wanted_m + slope * along_m)[::-1])[::-1]
+    from_left = np.minimum.accumulate(requested_m - slope * along_m) + slope * along_m
+    back = np.minimum.accumulate((requested_m + slope * along_m)[::-1])[::-1]
     profile: Array = np.minimum(from_left, back - slope * along_m)
     return profile
 
@@ -300,7 +300,7 @@ def terrain_report(
             "raise plan.steepest_deg or plan.relief_m, or turn the lines along the slope"
         )
     text = (
-        f"terrain: altitude {low:.2f} to {high:.2f} m above the floor (wanted "
+        f"terrain: altitude {low:.2f} to {high:.2f} m above the floor (requested "
         f"{limits.altitude_m:g} m above the highest within reach), steepest floor "
         f"{data['steepest_floor_deg']:.1f} deg, steepest way {data['steepest_deg']:.1f} deg of "
         f"{math.degrees(limits.steepest_rad):g}; {data['raised_stations']} of {len(altitude)} "

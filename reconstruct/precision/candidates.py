@@ -160,8 +160,8 @@ def single_measures(base: Candidate) -> list[Candidate]:
     Args:
         base: the survey as set.
     """
-    wanted = [level for levels in _levels(base.config.plan) for level in levels]
-    found = [one for level in wanted if (one := _change(base, [level])) is not None]
+    requested = [level for levels in _levels(base.config.plan) for level in levels]
+    found = [one for level in requested if (one := _change(base, [level])) is not None]
     return sorted(found, key=lambda one: -gain_per_minute(base, one))
 
 

@@ -326,12 +326,12 @@ def _logged_pose(record: ImageRecord, datum: Datum) -> RigidTransform | None:
 
 def _short_places(found: Found) -> list[WeakPlace]:
     """Where good pictures are fewer than asked for."""
-    wanted = found.pattern.passes * found.pattern.pictures
+    requested = found.pattern.passes * found.pattern.pictures
     shapes = footprints(found.rig, found.pictured.spoilt)
     places = []
     seen = found.seen
     short = seen.inside & ~seen.at_overlap
-    reached = np.minimum(seen.least_pictures / wanted, seen.least_lines / found.pattern.passes)
+    reached = np.minimum(seen.least_pictures / requested, seen.least_lines / found.pattern.passes)
     lacking_m2 = (1 - np.minimum(reached, 1.0)) * seen.grid.cell_m**2
     for hole in find_holes(seen, max_of_patches(found, short)):
         spoilt = Counter(
@@ -340,7 +340,7 @@ def _short_places(found: Found) -> list[WeakPlace]:
             if shape.intersects(hole.outline)
         )
         why = ", ".join(f"{count} stations {fault}" for fault, count in spoilt.most_common())
-        some = f"{hole.fewest_pictures} of {wanted} pictures of each camera at its thinnest"
+        some = f"{hole.fewest_pictures} of {requested} pictures of each camera at its thinnest"
         minimum = "in no good picture" if hole.unseen_m2 == hole.area_m2 else some
         places.append(
             WeakPlace(
