@@ -14,7 +14,7 @@ and not by pycolmap, which needs the whole model and accepts a file that is cut 
 import math
 import struct
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,9 +46,7 @@ _TYPES = {"CAMERA": _CAMERA, "IMU": 1}
 _POSE = 7
 PosesById = Mapping[int, RigidTransform]
 """Poses sensor_from_rig by CAMERA_ID, the reference's first; cameras without a pose are absent."""
-_Sensor = tuple[int, int, tuple[float, ...]]
-"""Type, number, and the seven numbers of its pose; none when it has no pose."""
-_REFERENCE = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+_REFERENCE: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class _ConfigCamera(fields.FileModel):
@@ -304,70 +302,55 @@ def read_rigs(path: Path) -> list[PosesById]:
     Raises:
         CalibrationError: the file is malformed.
     """
+    is_binary = path.suffix == ".bin"
+    content = fields.read_bytes(path) if is_binary else b""
+    lines = [] if is_binary else fields.read_text(path).splitlines()
+    words = [word for line in lines if line.strip()[:1] != "#" for word in line.split()]
+    at = 0
+
+    def take(form: str) -> tuple[Any, ...]:
+        """The next values: `I` numbers, `i` a type of sensor, `B` a flag, `d` floats."""
+        nonlocal at
+        if is_binary:
+            values = struct.unpack_from(f"<{form}", content, at)
+            at += struct.calcsize(f"<{form}")
+            return values
+        kinds = _POSE * "d" if form == f"{_POSE}d" else form
+        read: Mapping[str, Callable[[str], float]] = {"d": float, "i": _TYPES.__getitem__}
+        values = tuple(read.get(kind, int)(words[at + i]) for i, kind in enumerate(kinds))
+        at += len(kinds)
+        return values
+
     try:
-        rows = _binary_rows(path) if path.suffix == ".bin" else _text_rows(path)
-        return [_poses(row) for row in rows]
+        left = take("Q")[0] if is_binary else None
+        rigs: list[PosesById] = []
+        while at < len(words) if left is None else len(rigs) < left:
+            rigs.append(_take_rig(take))
+        if is_binary and at != len(content):
+            raise ValueError("more bytes than rigs")
     except (struct.error, ValueError, IndexError, KeyError, OverflowError):
         raise CalibrationError(f"{path}: is not a {path.name} of COLMAP") from None
+    return rigs
 
 
-def _poses(sensors: list[_Sensor]) -> PosesById:
+def _take_rig(take: Callable[[str], tuple[Any, ...]]) -> PosesById:
+    """The cameras of the next rig that have a pose, the reference first."""
     poses: dict[int, RigidTransform] = {}
-    for kind, number, pose in sensors:
+    _, count = take("II")
+    for i in range(count):
+        kind, number = take("iI")
+        pose = _REFERENCE
+        if i > 0:
+            pose = take(f"{_POSE}d") if take("B")[0] else ()
         if kind != _CAMERA or not pose:
             continue
-        w, x, y, z, *shift = pose
-        if not all(map(math.isfinite, pose)) or abs(math.hypot(w, x, y, z) - 1.0) > 1e-3:
+        turn, shift = pose[:4], pose[4:]
+        if not all(map(math.isfinite, pose)) or abs(math.hypot(*turn) - 1.0) > 1e-3:
             raise ValueError("no pose")
         poses[number] = RigidTransform.from_components(
-            np.array(shift), Rotation.from_quat([x, y, z, w])
+            np.array(shift), Rotation.from_quat(turn, scalar_first=True)
         )
     return poses
-
-
-def _text_rows(path: Path) -> list[list[_Sensor]]:
-    rows: list[list[_Sensor]] = []
-    for line in fields.read_text(path).splitlines():
-        items = line.split()
-        if not items or items[0].startswith("#"):
-            continue
-        count = int(items[1])
-        sensors: list[_Sensor] = [(_TYPES[items[2]], int(items[3]), _REFERENCE)] if count else []
-        at = 4
-        for _ in range(min(count, len(items)) - 1):
-            length = _POSE if items[at + 2] == "1" else 0
-            pose = tuple(map(float, items[at + 3 : at + 3 + length]))
-            if len(pose) != length:
-                raise ValueError("pose cut short")
-            sensors.append((_TYPES[items[at]], int(items[at + 1]), pose))
-            at += 3 + length
-        rows.append(sensors)
-    return rows
-
-
-def _binary_rows(path: Path) -> list[list[_Sensor]]:
-    content = fields.read_bytes(path)
-    (rigs,) = struct.unpack_from("<Q", content)
-    at = 8
-    rows: list[list[_Sensor]] = []
-    for _ in range(min(rigs, len(content))):
-        _, count = struct.unpack_from("<II", content, at)
-        at += 8
-        sensors: list[_Sensor] = []
-        for i in range(min(count, len(content))):
-            kind, number = struct.unpack_from("<iI", content, at)
-            at += 8
-            pose: tuple[float, ...] = _REFERENCE
-            if i > 0:
-                has_pose = content[at]
-                at += 1
-                pose = struct.unpack_from(f"<{_POSE}d", content, at) if has_pose else ()
-                at += 8 * len(pose)
-            sensors.append((kind, number, pose))
-        rows.append(sensors)
-    if at != len(content):
-        raise ValueError("more bytes than rigs")
-    return rows
 
 
 def _owns(path: Path) -> bool:
