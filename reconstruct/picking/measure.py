@@ -95,7 +95,7 @@ def scale_model(workspace: Path, points: str, length_m: float) -> str:
     pictures = RegisteredPictures.read(workspace)
     finder, lengths = _PickFinder(workspace, pictures), Lengths(workspace, pictures)
     first, second = (
-        lengths.spot(finder.find(some) if len(some) == 1 else finder.check(some)).model
+        lengths.target(finder.find(some) if len(some) == 1 else finder.check(some)).model
         for some in marks
     )
     return note_scale(workspace, (words[0], words[1]), first, second, length_m)
