@@ -73,7 +73,7 @@ def test_a_board_taken_as_flat_gives_another_focal_length(
 ) -> None:
     """The table in docs/cameras.md; both calibrations are of the same pictures."""
     dot = cv2.imencode(".png", np.zeros((1, 1), np.uint8))[1].tobytes()
-    monkeypatch.setattr("camera_calib.judge.plots.png_of", lambda _: dot)  # plots take seconds
+    monkeypatch.setattr("camera_calib.judge.report.png_of", lambda _: dot)  # plots take seconds
     shoot(tmp_path / "pictures")
     off, sigma, rms_px = {}, {}, {}
     kinds: tuple[ShapeKind, ...] = ("flat", "sheet")

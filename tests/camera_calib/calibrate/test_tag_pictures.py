@@ -152,7 +152,8 @@ def test_tag_pictures_calibrate_to_their_bound(
     def without_plots(folder: Path, *_: object) -> None:
         (folder / "report.json").write_text('{"verdicts": []}')
 
-    monkeypatch.setattr("camera_calib.calibrate.files._write_report", without_plots)
+    monkeypatch.setattr("camera_calib.calibrate.results.write_report", without_plots)
+    monkeypatch.setattr("camera_calib.calibrate.results.hold_out", lambda *_: None)
     stereo, rng = RIGS[name], np.random.default_rng(1)
     truth, poses = stereo.rig, poses_before(stereo, rng)
     light = [
