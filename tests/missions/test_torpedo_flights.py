@@ -110,6 +110,7 @@ def test_a_speed_below_the_lowest_is_refused_with_one_that_does() -> None:
     config = survey({"speed_mps": 0.2})
     with pytest.raises(ConflictError, match=r"held level by its fins from 0\.4\d m/s") as found:
         planned(config)
+    assert found.value.suggestion is not None
     name, speed_mps = found.value.suggestion
     assert name == "plan.speed_mps"
     assert speed_mps > min_speed_mps(planned_vehicle(config.vehicle), STEADY_SHARE)

@@ -77,6 +77,7 @@ def test_a_lens_that_cannot_focus_suggests_the_circle_that_just_fits() -> None:
     camera = rig.cameras["left"]
     with pytest.raises(ConflictError) as fault:
         plan_focus(camera, config.camera, config.plan)
+    assert fault.value.suggestion is not None
     name, sharp_px = fault.value.suggestion
     assert name == "plan.sharp_px"
     plan = config.plan.model_copy(update={"sharp_px": sharp_px})

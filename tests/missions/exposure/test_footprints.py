@@ -150,6 +150,7 @@ def test_what_cannot_be_names_both_limits_and_a_value_that_fits(
     with pytest.raises(ConflictError) as fault:
         line_spacing(rig, config.plan, STEP_M)
     assert fault.value.limits == limits
+    assert fault.value.suggestion is not None
     name, value = fault.value.suggestion
     assert name == f"plan.{setting}"
     line_spacing(rig, config.plan.model_copy(update={setting: value}), STEP_M)

@@ -53,6 +53,7 @@ def test_a_duty_cycle_that_is_too_high_suggests_the_blur_that_just_fits() -> Non
     exposure_s, interval_s = 2e-3, 0.12
     with pytest.raises(ConflictError) as fault:
         strobe_load(config.imaging, config.plan, exposure_s, interval_s)
+    assert fault.value.suggestion is not None
     name, blur_px = fault.value.suggestion
     assert name == "plan.allowed_blur_px"
     shorter_s = exposure_s * blur_px / config.plan.allowed_blur_px

@@ -22,6 +22,7 @@ def test_a_camera_that_is_too_slow_suggests_the_speed_that_just_fits() -> None:
         imaging_settings(rig, config)
     along_m = footprint_size_m(rig.cameras["left"], 2.0)[1]
     assert f"{1.32 / (0.08 * along_m):.3g} " in str(fault.value)  # 14 fps
+    assert fault.value.suggestion is not None
     name, speed_mps = fault.value.suggestion
     assert name == "plan.speed_mps"
     slower = survey(plan={"forward_overlap": 0.92, "speed_mps": speed_mps})

@@ -38,6 +38,7 @@ def planned(config: SurveyConfig) -> Planned:
 def test_the_setting_that_is_suggested_plans(config: SurveyConfig, setting: str) -> None:
     with pytest.raises(ConflictError) as caught:
         planned(config)
+    assert caught.value.suggestion is not None
     name, value = caught.value.suggestion
     assert name == setting
     assert f"; {name} = {value:g} fits" in str(caught.value)

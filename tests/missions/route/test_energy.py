@@ -192,6 +192,7 @@ def test_a_current_above_the_vehicles_strength_is_refused_with_what_it_holds(
 ) -> None:
     found = current_error(flight_conditions(config), "")
     assert isinstance(found, ConflictError)
+    assert found.suggestion is not None
     name, held_mps = found.suggestion
     assert name == "sea.current_mps"
     assert f"{held_mps:.2f} m/s" in found.limits[1]
