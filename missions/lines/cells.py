@@ -125,8 +125,8 @@ def cell_costs(
         (C, 4) joules by the corner of entry; inf at corners 2 and 3 of a cell of one line.
     """
     both, sizes = ends[listed].reshape(-1, 2, 2), np.diff(begins)
-    courses = course + math.pi * np.arange(2)
-    lengths = np.asarray(np.hypot(*(both[:, 1] - both[:, 0]).T), np.float64)
+    courses = np.array([course, course + math.pi])
+    lengths: Array = np.hypot(*(both[:, 1] - both[:, 0]).T)
     lines = hops.line_j(costs, lengths[:, None], courses)
     # Hops at a side, 0 where lines begin: on to the next piece, and back from it.
     leaving = np.broadcast_to(courses[::-1, None], (len(both), 2, 1))

@@ -22,8 +22,8 @@ from missions.values.plan_file import Plan
 from reconstruct.evaluate.elevation import Elevation
 from reconstruct.precision.candidates import Candidate
 from reconstruct.precision.instruments import usual_rig
-from reconstruct.revisit.dive import plan_revisit, predict, predict_precision
 from reconstruct.revisit.links import cut_around, footprints, links, pieces
+from reconstruct.revisit.run import plan_revisit, predict, predict_precision
 from reconstruct.revisit.weak import Found, Pictured, measure_survey, pair_sigma_m, weak_places
 from tests.oracles_coverage import area_of, lawnmower, plan_of
 
