@@ -449,7 +449,7 @@ def _planned_lines(stations: Stations, plan: Plan) -> NDArray[np.intp]:
     return line
 
 
-def _runs(line: NDArray[np.intp], stations: Stations, longest_m: float) -> list[list[int]]:
+def _runs(line: NDArray[np.intp], stations: Stations, max_m: float) -> list[list[int]]:
     """Consecutive stations of no line, near one another and on one heading."""
     places: Array = stations.glass_ne
     heading = stations.attitude_rad[:, 2]
@@ -459,7 +459,7 @@ def _runs(line: NDArray[np.intp], stations: Stations, longest_m: float) -> list[
         if (
             last is not None
             and last[-1] == i - 1
-            and math.dist(places[i], places[i - 1]) <= longest_m
+            and math.dist(places[i], places[i - 1]) <= max_m
             and math.cos(heading[i] - heading[last[0]]) >= math.cos(_ALIKE_RAD)
         ):
             last.append(i)

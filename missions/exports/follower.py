@@ -71,14 +71,14 @@ def follower_of(vehicle: VehicleConfig, sea: SeaConfig, speed_mps: float) -> Fol
     Raises:
         VehicleError: no vehicle that is controllable is described.
     """
-    craft = planned_vehicle(vehicle)
-    gains = gains_for(craft, speed_mps)
+    flown_by = planned_vehicle(vehicle)
+    gains = gains_for(flown_by, speed_mps)
     towards = math.radians(sea.current_towards_deg)
     delta_m = cola2_delta_m(gains, speed_mps)
     gust_n, correlation_s = sea.gust_n[1], sea.gust_correlation_s
     wander_m, mode_per_s = path_loop(gains, speed_mps, delta_m, gust_n, correlation_s)
     return Follower(
-        name=craft.name,
+        name=flown_by.name,
         sways=sways(gains),
         delta_m=delta_m,
         wander_m=wander_m,

@@ -127,7 +127,7 @@ def cell_costs(
     both, sizes = ends[listed].reshape(-1, 2, 2), np.diff(begins)
     courses = np.array([course, course + math.pi])
     lengths: Array = np.hypot(*(both[:, 1] - both[:, 0]).T)
-    lines = hops.line_j(costs, lengths[:, None], courses)
+    lines: Array = hops.line_j(costs, lengths.reshape(-1, 1), courses)
     # Hops at a side, 0 where lines begin: on to the next piece, and back from it.
     leaving = np.broadcast_to(courses[::-1, None], (len(both), 2, 1))
     places = np.concatenate([both, leaving], axis=2)

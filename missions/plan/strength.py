@@ -46,7 +46,7 @@ def current_error(flown: FlightConditions, what: str, *, is_set: bool = True) ->
         what: cannot be flown, in words; empty where nothing can.
         is_set: whether the current is a setting, and not of a file.
     """
-    current, speed, name = flown.current_ne_mps, flown.speed_mps, flown.craft.name
+    current, speed, name = flown.current_ne_mps, flown.speed_mps, flown.vehicle.name
     size, towards_deg = math.hypot(*current), math.degrees(math.atan2(current[1], current[0])) % 360
     held_mps = held_current_mps(flown)
     manner = "held by sway" if flown.manner == "held" else "crabbing"
@@ -62,9 +62,9 @@ def current_error(flown: FlightConditions, what: str, *, is_set: bool = True) ->
             ),
             "sea.current_mps", held_mps if is_set and held_mps < size else None,
         )  # fmt: skip
-    if flown.craft.fins and fin_flight(flown.craft, speed, 0.0, STEADY_SHARE) is None:
+    if flown.vehicle.fins and fin_flight(flown.vehicle, speed, 0.0, STEADY_SHARE) is None:
         return conflict(
-            too_slow(flown.craft, speed, STEADY_SHARE),
+            too_slow(flown.vehicle, speed, STEADY_SHARE),
             ("plan.speed_mps", "the lift of its fins and hull"),
             "plan.speed_mps", _min_fin_speed_mps(flown, size),
         )  # fmt: skip
@@ -90,10 +90,10 @@ def _min_fin_speed_mps(flown: FlightConditions, current_mps: float) -> float | N
 
     def flies(speed_mps: float) -> bool:
         settings = PlanConfig(speed_mps=speed_mps, turn_radius_m=flown.turn_radius_m)
-        radius_m = plan_as_flown(settings, flown.craft).arc_radius_m
+        radius_m = plan_as_flown(settings, flown.vehicle).arc_radius_m
         return flies_everywhere(replace(flown, speed_mps=speed_mps, turn_radius_m=radius_m))
 
-    slow_mps = min_speed_mps(flown.craft, STEADY_SHARE)
+    slow_mps = min_speed_mps(flown.vehicle, STEADY_SHARE)
     fast_mps = min(2.0 * (slow_mps + current_mps), 3.0)
     if not flies(fast_mps):
         return None
@@ -139,7 +139,7 @@ def warn_of_swell(flown: FlightConditions, sea: SeaConfig, depth_m: float, below
         return
     warn(
         f"swell of {sea.swell_m:g} m every {sea.swell_period_s:g} s moves the water by up to "
-        f"{swell_mps:.2f} m/s where {flown.craft.name} flies, more than it holds: it is carried "
+        f"{swell_mps:.2f} m/s where {flown.vehicle.name} flies, more than it holds: it is carried "
         "off its lines and back by every wave; wait for less swell, or raise side_overlap"
     )
 

@@ -61,7 +61,7 @@ _HEAVES_MPS = np.linspace(0.5, 0.01, 50)
 class FlightConditions:
     """What the power of flying follows from: a vehicle, how it flies, and the current."""
 
-    craft: Vehicle
+    vehicle: Vehicle
     manner: Manner
     """How lines are flown."""
     speed_mps: float
@@ -71,7 +71,7 @@ class FlightConditions:
     current_ne_mps: Array
     """(2,) mean of the current that is expected."""
     turn_radius_m: float
-    max_spot_rad_s: float
+    max_turn_rad_s: float
     """Rate of turns on the spot, if the vehicle has the thrust for it."""
     glass_body_m: tuple[float, float, float]
     """The left port's outer glass, about which a vehicle with sway turns."""
@@ -86,9 +86,9 @@ class FlightConditions:
         Raises:
             VehicleError: as `sound_vehicle`.
         """
-        craft = planned_vehicle(settings)
+        vehicle = planned_vehicle(settings)
         return replace(
-            self, craft=craft, manner=_manner(craft, settings), hotel_w=hotel_w(settings)
+            self, vehicle=vehicle, manner=_manner(vehicle, settings), hotel_w=hotel_w(settings)
         )
 
 
@@ -99,18 +99,18 @@ def flight_conditions(config: SurveyConfig) -> FlightConditions:
         VehicleError: the vehicle is described wrongly.
         NavigationError: the file of the current cannot be read.
     """
-    craft, plan = planned_vehicle(config.vehicle), config.plan
+    vehicle, plan = planned_vehicle(config.vehicle), config.plan
     return FlightConditions(
-        craft=craft,
-        manner=_manner(craft, config.vehicle),
+        vehicle=vehicle,
+        manner=_manner(vehicle, config.vehicle),
         speed_mps=plan.speed_mps,
         line_heading_deg=plan.line_heading_deg,
         current_ne_mps=expected_current(config.sea, config.area.seafloor_depth_m - plan.altitude_m),
         turn_radius_m=plan.arc_radius_m,
-        max_spot_rad_s=turn_in_place_rate_rad_s(plan.turn_rate_limit_deg_s),
+        max_turn_rad_s=turn_in_place_rate_rad_s(plan.turn_rate_limit_deg_s),
         glass_body_m=config.camera.position_body_m,
         hotel_w=hotel_w(config.vehicle),
-        needs_arcs=plan.turns == "arcs" or bool(craft.fins),
+        needs_arcs=plan.turns == "arcs" or bool(vehicle.fins),
     )
 
 
@@ -148,7 +148,7 @@ def vehicle_costs(
         PlanError: lines cannot be flown both ways on any heading, or not on the one requested, or
             the vehicle cannot turn from one line to the next.
     """
-    craft, current = conditions.craft, conditions.current_ne_mps
+    vehicle, current = conditions.vehicle, conditions.current_ne_mps
     courses = _courses()
     lines, between = course_powers(conditions)
     stop_w, turn_rad_s = _stop_power(conditions)
@@ -167,7 +167,7 @@ def vehicle_costs(
     arc_w, pace = _arc(conditions)
     if conditions.needs_arcs and not math.isfinite(arc_w):
         raise refused(f"arcs of {conditions.turn_radius_m:g} m radius cannot be flown")
-    step_mps, step_w = _sway_step(craft, courses, current, conditions.manner)
+    step_mps, step_w = _sway_step(vehicle, courses, current, conditions.manner)
     heave_mps, heave_w = _heave(conditions)
     return Costs(
         speed_mps=conditions.speed_mps,
@@ -195,7 +195,7 @@ def course_powers(conditions: FlightConditions) -> tuple[Array, Array]:
 
 def _line_power(conditions: FlightConditions, courses: Array) -> Array:
     return course_power(
-        conditions.craft, courses, conditions.speed_mps, conditions.current_ne_mps,
+        conditions.vehicle, courses, conditions.speed_mps, conditions.current_ne_mps,
         conditions.manner,
     )  # fmt: skip
 
@@ -267,21 +267,21 @@ def planned_vehicle(settings: VehicleConfig) -> Vehicle:
     Raises:
         VehicleError: as `sound_vehicle`.
     """
-    craft = sound_vehicle(settings)
-    left = craft.weaken(settings.impaired)
+    vehicle = sound_vehicle(settings)
+    left = vehicle.weaken(settings.impaired)
     if not left.thrusters:
-        raise VehicleError(f"{craft.name} has no thruster left: check vehicle.failures")
+        raise VehicleError(f"{vehicle.name} has no thruster left: check vehicle.failures")
     return left
 
 
-def has_sway(craft: Vehicle) -> bool:
+def has_sway(vehicle: Vehicle) -> bool:
     """Whether any of its thrusters pushes a vehicle sideways."""
-    return bool(np.any(np.abs(craft.configuration_matrix[1]) > 0))
+    return bool(np.any(np.abs(vehicle.configuration_matrix[1]) > 0))
 
 
-def _manner(craft: Vehicle, settings: VehicleConfig) -> Manner:
+def _manner(vehicle: Vehicle, settings: VehicleConfig) -> Manner:
     """Manner of flying lines: by sway if the vehicle has it and its controller uses it."""
-    return "held" if has_sway(craft) and settings.controller == "sway" else "crab"
+    return "held" if has_sway(vehicle) and settings.controller == "sway" else "crab"
 
 
 def expected_current(sea: SeaConfig, depth_m: float) -> Array:
@@ -332,22 +332,22 @@ def motion(courses_rad: Array, speed_mps: float, current_ne_mps: Array, manner: 
 
 
 def course_power(
-    craft: Vehicle, courses_rad: Array, speed_mps: float, current_ne_mps: Array, manner: Manner
+    vehicle: Vehicle, courses_rad: Array, speed_mps: float, current_ne_mps: Array, manner: Manner
 ) -> Array:
     """Electrical power of the thrusters, (N,) W; infinite at courses that cannot be kept."""
     moved = motion(courses_rad, speed_mps, current_ne_mps, manner)
-    return _power(craft, moved.nu, moved.possible)
+    return _power(vehicle, moved.nu, moved.possible)
 
 
 def _power(
-    craft: Vehicle,
+    vehicle: Vehicle,
     nu: Array,
     possible: Array | float = 1.0,
     nu_rate: Array | None = None,
     *,
     slips: bool = False,
 ) -> Array:
-    flight = steady_flight(craft, nu, nu_rate, share=STEADY_SHARE, slips=slips)
+    flight = steady_flight(vehicle, nu, nu_rate, share=STEADY_SHARE, slips=slips)
     power: Array = flight.power_w * possible
     return np.where(np.isnan(power), np.inf, power)
 
@@ -402,7 +402,7 @@ def _turning_power(conditions: FlightConditions, speeds_mps: Array, rates_rad_s:
         np.repeat(rates_rad_s, _HEADINGS),
     )
     slips = conditions.manner == "crab"
-    power = _power(conditions.craft, nu, nu_rate=nu_rate, slips=slips)
+    power = _power(conditions.vehicle, nu, nu_rate=nu_rate, slips=slips)
     means: Array = power.reshape(-1, _HEADINGS).mean(axis=1)
     return means
 
@@ -413,13 +413,13 @@ def _stop_power(conditions: FlightConditions) -> tuple[float, float]:
     A vehicle that fins steer cannot: it costs so much that a plan has it for want of room alone,
     and is refused for it.
     """
-    if conditions.craft.fins:
-        return _DEAR * _arc(conditions)[0], conditions.max_spot_rad_s
-    rates = conditions.max_spot_rad_s * np.append(_RATES, 0.0)
+    if conditions.vehicle.fins:
+        return _DEAR * _arc(conditions)[0], conditions.max_turn_rad_s
+    rates = conditions.max_turn_rad_s * np.append(_RATES, 0.0)
     power = _turning_power(conditions, np.zeros(len(rates)), rates)
     can = np.flatnonzero(np.isfinite(power[:-1]))
     if not len(can):
-        return math.inf, conditions.max_spot_rad_s
+        return math.inf, conditions.max_turn_rad_s
     rate = float(rates[can[0]])
     turning_s = math.pi / 2 / rate
     joules = power[can[0]] * turning_s + power[-1] * SETTLE_S
@@ -432,7 +432,7 @@ def _arc(conditions: FlightConditions) -> tuple[float, float]:
     Mean of both senses and all courses.
     """
     # Fins need the whole speed.
-    speeds = conditions.speed_mps * (_RATES[:1] if conditions.craft.fins else _RATES)
+    speeds = conditions.speed_mps * (_RATES[:1] if conditions.vehicle.fins else _RATES)
     rates = speeds / conditions.turn_radius_m
     both = np.concatenate([rates, -rates])
     power = _turning_power(conditions, np.tile(speeds, 2), both)
@@ -448,14 +448,14 @@ def _known_mean(power_w: Array) -> float:
 
 
 def _sway_step(
-    craft: Vehicle, courses: Array, current: Array, manner: Manner
+    vehicle: Vehicle, courses: Array, current: Array, manner: Manner
 ) -> tuple[float, Array]:
     """Speed of a sway step, and its power by course, mean of a step to port and to starboard."""
     if manner == "crab":
         return STEP_MPS, np.full(len(courses), np.inf)
     still = np.zeros((len(_RATES), 6))
     still[:, 1] = STEP_MPS * _RATES
-    can = np.flatnonzero(np.isfinite(_power(craft, still)))
+    can = np.flatnonzero(np.isfinite(_power(vehicle, still)))
     if not len(can):
         return STEP_MPS, np.full(len(courses), np.inf)
     step_mps = float(STEP_MPS * _RATES[can[0]])
@@ -466,7 +466,7 @@ def _sway_step(
         nu = np.zeros((len(courses), 6))
         nu[:, 0] = np.cos(heading) * relative[:, 0] + np.sin(heading) * relative[:, 1]
         nu[:, 1] = np.cos(heading) * relative[:, 1] - np.sin(heading) * relative[:, 0]
-        powers.append(_power(craft, nu))
+        powers.append(_power(vehicle, nu))
     return step_mps, (powers[0] + powers[1]) / 2
 
 
@@ -475,17 +475,18 @@ def _heave(conditions: FlightConditions) -> tuple[float, float]:
 
     A vehicle that fins steer pitches, and goes round.
     """
-    craft, current = conditions.craft, conditions.current_ne_mps
-    if craft.fins:
+    vehicle, current = conditions.vehicle, conditions.current_ne_mps
+    if vehicle.fins:
         return conditions.speed_mps * math.sin(MAX_PITCH_RAD), _arc(conditions)[0]
     rates = np.concatenate([_HEAVES_MPS, -_HEAVES_MPS])
     nu = np.zeros((len(rates), 6))
     nu[:, 0], nu[:, 2] = math.hypot(*current), rates
-    power = _power(craft, nu).reshape(2, -1).mean(axis=0)
+    power = _power(vehicle, nu).reshape(2, -1).mean(axis=0)
     can = np.flatnonzero(np.isfinite(power))
     if not len(can):
         raise PlanError(
-            f"{craft.name} cannot dive with the vertical thrust it has left: check vehicle.failures"
+            f"{vehicle.name} cannot dive with the vertical thrust it has left: "
+            "check vehicle.failures"
         )
     return float(_HEAVES_MPS[can[0]]), float(power[can[0]])
 

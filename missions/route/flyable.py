@@ -23,12 +23,12 @@ def as_flown(config: SurveyConfig) -> SurveyConfig:
     return config if plan is config.plan else config.model_copy(update={"plan": plan})
 
 
-def without_stops(plan: PlanConfig, craft: Vehicle) -> PlanConfig:
+def without_stops(plan: PlanConfig, vehicle: Vehicle) -> PlanConfig:
     """Settings for laying routes: of a vehicle that fins steer, by arcs alone."""
-    return plan.model_copy(update={"turns": "arcs"}) if craft.fins else plan
+    return plan.model_copy(update={"turns": "arcs"}) if vehicle.fins else plan
 
 
-def plan_as_flown(plan: PlanConfig, craft: Vehicle) -> PlanConfig:
+def plan_as_flown(plan: PlanConfig, vehicle: Vehicle) -> PlanConfig:
     """Settings with arcs that fins hold and run-ins as long as their radius.
 
     They are widened where `turns = "auto"`. At a speed at which it does not fly at all they are
@@ -37,16 +37,16 @@ def plan_as_flown(plan: PlanConfig, craft: Vehicle) -> PlanConfig:
     Raises:
         PlanError: turns are set that it cannot fly.
     """
-    if not craft.fins:
+    if not vehicle.fins:
         return plan
     if plan.turns not in ("auto", "arcs"):
         raise PlanError(
-            f"{craft.name} is steered by fins and cannot stop: plan.turns = {plan.turns!r} cannot "
-            "be flown; set 'arcs', or leave it out"
+            f"{vehicle.name} is steered by fins and cannot stop: plan.turns = {plan.turns!r} "
+            "cannot be flown; set 'arcs', or leave it out"
         )
-    if fin_flight(craft, plan.speed_mps, 0.0, STEADY_SHARE) is None:
+    if fin_flight(vehicle, plan.speed_mps, 0.0, STEADY_SHARE) is None:
         return plan
-    min_m = min_radius_m(craft, plan.speed_mps, STEADY_SHARE)
+    min_m = min_radius_m(vehicle, plan.speed_mps, STEADY_SHARE)
     if plan.turns == "auto":
         radius_m = max(plan.arc_radius_m, math.ceil(10.0 * _ROOM * min_m) / 10.0)
         run_in_m = max(plan.run_in_m, radius_m)
@@ -54,6 +54,7 @@ def plan_as_flown(plan: PlanConfig, craft: Vehicle) -> PlanConfig:
     if plan.turn_radius_m < min_m:
         raise PlanError(
             f"turn_radius_m {plan.turn_radius_m:g} is tighter than the {min_m:.2f} m that the "
-            f"fins of {craft.name} hold at {plan.speed_mps:g} m/s: raise it, or set turns = 'auto'"
+            f"fins of {vehicle.name} hold at {plan.speed_mps:g} m/s: raise it, or "
+            "set turns = 'auto'"
         )
     return plan

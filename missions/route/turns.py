@@ -34,9 +34,9 @@ MAX_SWAY_M = 5.0
 lateral thrusters and its side's drag are made for correction, not for transit."""
 COLUMNS = 8
 """Columns of a leg: north, east, course, length, curvature, line, turn, side."""
-_NONE, _AHEAD, _ARCS, _SPOT, _SWAY = range(5)
+_NONE, _AHEAD, _ARCS, _IN_PLACE, _SWAY = range(5)
 """How two lines are joined; round corners, and straight on."""
-_REQUESTED = {"auto": _NONE, "arcs": _ARCS, "spot": _SPOT, "sway": _SWAY}
+_REQUESTED = {"auto": _NONE, "arcs": _ARCS, "spot": _IN_PLACE, "sway": _SWAY}
 _SENSES = np.array([[1, 0, 1], [1, -1, 1], [1, 0, -1], [-1, 0, -1], [-1, 1, -1], [-1, 0, 1]])
 """The six kinds of turns: to starboard, straight, to port."""
 _FULL = 2 * math.pi
@@ -248,13 +248,13 @@ def _hops(ends: Array, goals: Array, how: Manoeuvre) -> tuple[list[Array], NDArr
     on = _goes_on(ends, goals) & how.ways.free_many(ends[:, :2], goals[:, :2])
     gap = np.hypot(*(goals - ends)[:, :2].T)
     choices = [_leg(ends, ends[:, 2], gap)[:, None], _by_arcs(ends, goals, how),
-               _on_the_spot(ends, goals, how), _sideways(ends, goals, how)]  # fmt: skip
+               _turn_in_place(ends, goals, how), _sideways(ends, goals, how)]  # fmt: skip
     joules = np.stack([prices_j(how.costs, legs) for legs in choices])
     joules[0] = np.where(on, -np.inf, np.inf)
     blocked = np.isinf(joules[2])
     if requested != _NONE:
         as_requested = np.isfinite(joules[requested - 1])
-        if requested == _SPOT:
+        if requested == _IN_PLACE:
             as_requested = np.ones(len(ends), dtype=np.bool_)
         others = np.arange(1, 4) != requested - 1
         joules[1:][np.outer(others, as_requested & ~on)] = np.inf
@@ -303,7 +303,7 @@ def _by_arcs(ends: Array, goals: Array, how: Manoeuvre) -> Array:
     return legs
 
 
-def _on_the_spot(ends: Array, goals: Array, how: Manoeuvre) -> Array:
+def _turn_in_place(ends: Array, goals: Array, how: Manoeuvre) -> Array:
     """Turn, straight, turn, run-in, (N, 4, 8); NaN if it leaves the allowed area."""
     arrivals = _run_in_starts(goals, how)
     course = np.arctan2(*(arrivals - ends[:, :2])[:, ::-1].T)

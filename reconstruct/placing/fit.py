@@ -258,7 +258,7 @@ with soft modes of sizes (K,)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Guess:
+class _FitGuess:
     """A placement on the way to the best."""
 
     place: Similarity
@@ -290,7 +290,7 @@ class NavigationTask:
             ReconstructionError: the model shrinks to a point on the way, or grows without bound.
         """
         start, epochs = place, self.epochs
-        at = _Guess(place=place, sizes=np.zeros(epochs.modes.shape[2]))
+        at = _FitGuess(place=place, sizes=np.zeros(epochs.modes.shape[2]))
         found = equations(epochs, place, self._middle(place))
         used = without_gross_errors(epochs.time, found.misfit, epochs.known)
         bounds = self._frame_bounds()
@@ -336,7 +336,7 @@ class NavigationTask:
 
     def _estimate(
         self,
-        at: _Guess,
+        at: _FitGuess,
         used: NDArray[np.bool_],
         free: Sequence[int],
         bounds: Mapping[int, float],
@@ -353,7 +353,7 @@ class NavigationTask:
 
     def _report(
         self,
-        at: _Guess,
+        at: _FitGuess,
         got: Estimate,
         scaled: Estimate,
         free: Sequence[int],
@@ -422,7 +422,7 @@ class NavigationTask:
             )
 
     def _bends(
-        self, at: _Guess, got: Estimate, free: Sequence[int], bounds: Mapping[int, float]
+        self, at: _FitGuess, got: Estimate, free: Sequence[int], bounds: Mapping[int, float]
     ) -> tuple[BendRecord, ...]:
         """How bent the placed model is by navigation alone, whatever its modes allow."""
         epochs, place = self.epochs.deform(at.sizes), at.place
@@ -433,7 +433,7 @@ class NavigationTask:
         count = modes.shape[2]
         modes = np.concatenate([modes, epochs.modes[..., len(at.sizes) - self.joints :]], axis=2)
         bending = replace(self, control=None, epochs=replace(epochs, modes=modes))
-        stiff = _Guess(place=place, sizes=np.zeros(modes.shape[2]))
+        stiff = _FitGuess(place=place, sizes=np.zeros(modes.shape[2]))
         bent = estimate(
             epochs.time,
             equations(bending.epochs, place, self._middle(place)),
@@ -454,7 +454,7 @@ class NavigationTask:
         )
 
     def _drift(
-        self, at: _Guess, got: Estimate, free: Sequence[int], bounds: Mapping[int, float]
+        self, at: _FitGuess, got: Estimate, free: Sequence[int], bounds: Mapping[int, float]
     ) -> float:
         """Drift of depths over the survey, metres, if it is more than is likely, else 0.
 
@@ -536,7 +536,7 @@ class NavigationTask:
         bound = sigma / radius if radius > sigma else 1.0
         return {TURN: bound, STRETCH: min(bound, _STRETCH)}
 
-    def _extra(self, at: _Guess) -> Extra:
+    def _extra(self, at: _FitGuess) -> Extra:
         place, sizes = at.place, at.sizes
         columns = PARAMETERS + len(sizes)
         misfits, rows = [no_extra(columns).misfit], [no_extra(columns).jacobian]
@@ -575,7 +575,7 @@ class NavigationTask:
         for _ in range(_ROBUST_STEPS):
             middle = self._middle(place)
             found = equations(self.epochs, place, middle)
-            extra = self._extra(_Guess(place=place, sizes=np.zeros(self.epochs.modes.shape[2])))
+            extra = self._extra(_FitGuess(place=place, sizes=np.zeros(self.epochs.modes.shape[2])))
             known = self.epochs.known
             misfit = np.concatenate([found.misfit[known], extra.misfit])
             rows_of = np.concatenate([found.jacobian[known], extra.jacobian])

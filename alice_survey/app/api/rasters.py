@@ -15,7 +15,7 @@ from reconstruct.raster import opened_raster
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Placed:
+class _MapRaster:
     west: float
     """Left edge, in the raster's coordinates (metres where the model is scaled)."""
     north: float
@@ -40,7 +40,7 @@ class _Placed:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class Dem(_Placed):
+class Dem(_MapRaster):
     """Heights of the surface, with their standard deviations.
 
     Example:
@@ -86,7 +86,7 @@ class Dem(_Placed):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class Mosaic(_Placed):
+class Mosaic(_MapRaster):
     """The orthomosaic.
 
     Example:

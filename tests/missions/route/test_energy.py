@@ -41,7 +41,7 @@ def test_drag_along_and_across_a_current() -> None:
     """
     flown = flight_conditions(_config())
     towards = math.atan2(*flown.current_ne_mps[::-1])
-    body = flown.craft.plant.body
+    body = flown.vehicle.plant.body
     bare = body._replace(lift=np.zeros(4))
 
     def drag_w(off: float, manner: Manner) -> tuple[float, float, float]:
