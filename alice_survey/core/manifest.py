@@ -8,14 +8,16 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
-from scipy.spatial.transform import Rotation
 
 from alice_survey.core.artefacts import read_csv, write_csv
 from alice_survey.core.errors import ImageError
-from alice_survey.core.frames import rotation_from_attitude
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 NAN = math.nan
 
@@ -78,8 +80,10 @@ class ImageRecord:
         return not math.isnan(self.roll_deg + self.pitch_deg + self.heading_deg)
 
     @property
-    def ned_from_body(self) -> Rotation:
+    def ned_from_body(self) -> "Rotation":
         """Attitude; only where `has_attitude`."""
+        from alice_survey.core.frames import rotation_from_attitude  # so that status stays quick
+
         return rotation_from_attitude(
             *np.deg2rad([self.roll_deg, self.pitch_deg, self.heading_deg])
         )

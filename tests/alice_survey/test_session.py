@@ -184,11 +184,11 @@ import typer
 from alice_survey.core.run import interrupts
 from alice_survey.core.artefacts import Stage, run_stage
 from alice_survey.app.cli.main import make_app
-from alice_survey.app.commands.base import Command, argument
+from alice_survey.app.commands.base import CommandModel, argument
 from alice_survey.core.executor import local_executor
 import sleeping
 
-class Run(Command):
+class Run(CommandModel):
     name = "run"
     kind: str = argument(..., "")
     folder: Path = argument(..., "")
@@ -387,7 +387,7 @@ import time
 import typer
 from alice_survey.core.run import progress
 from alice_survey.app.cli.main import make_app
-from alice_survey.app.commands.base import Command
+from alice_survey.app.commands.base import CommandModel
 from alice_survey.core.errors import warn
 
 def run(self):
@@ -402,7 +402,7 @@ def run(self):
         finish(took_s=125.0, cpu_s=1.0, peak_mib=1.0)
     return "the result", {}
 
-make_app([type("Run", (Command,), {"name": "run", "run": run})])()
+make_app([type("Run", (CommandModel,), {"name": "run", "run": run})])()
 """
 
 
