@@ -76,9 +76,9 @@ def test_a_wrong_point_is_left_out_and_the_rest_has_its_real_sigma(
         middle = fit.ned_from_model.apply(gauge.points(fit.middle_ned[None]))[0]
         misses.append((middle - fit.middle_ned) / fit.sigma_position_m)
         factors.append(factor)
-        score = ties.score(fit.ned_from_model, located=True).to_json()
-        assert score["sigma_factor"] == factor
-        assert score["rms"]["control"]["points"] == len(places) - 1
+        score = ties.score(fit.ned_from_model, located=True)
+        assert score.sigma_factor == factor
+        assert score.rms["control"].points == len(places) - 1
         assert "left out" in describe(score) and "times those stated" in describe(score)
     assert REAL_M / STATED_M * 0.85 < np.sqrt(np.mean(np.square(factors))) < REAL_M / STATED_M * 1.1
     assert 0.7 < np.sqrt(np.mean(np.square(misses))) < 1.4

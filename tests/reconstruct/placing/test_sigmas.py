@@ -169,8 +169,8 @@ def test_the_mount_adds_its_sigma_and_a_turning_vehicle_shows_it() -> None:
     plain, _, exact = place(body, records, 1)
     installed = replace(USUAL_INSTALLATION, mount_rad=np.deg2rad(2.0))
     mounted, _, loose = place(body, records, 1, installed=installed)
-    assert plain.to_json()["mount_sigma_deg"] == 0.0
-    assert mounted.to_json()["mount_sigma_deg"] == pytest.approx(2.0)
+    assert plain.record.mount_sigma_deg == 0.0
+    assert mounted.record.mount_sigma_deg == pytest.approx(2.0)
     # Heading: its mount error is the same on all lines, only positions determine it.
     assert loose[5] > 1.5 * exact[5]
     # Tilt: lines flown to and fro show it, and depths do.
