@@ -1,4 +1,4 @@
-"""The studio's pictures: which show a place, picks and control in them, lengths between spots."""
+"""The studio's pictures: which show a place, picks and control in them, lengths between points."""
 
 import threading
 from collections import OrderedDict
@@ -172,7 +172,7 @@ class _AskedPick(Config):
     """Pixels count from 0 at the middle of the first, as in `picks.csv`."""
 
     image: Name
-    point: Annotated[str, Field(max_length=200)] = "spot"
+    point: Annotated[str, Field(max_length=200)] = "point"
     x: Pixel
     y: Pixel
     sigma_px: Annotated[float, Field(gt=0, le=100)] = 0.5
@@ -189,7 +189,7 @@ class _AskedPick(Config):
 class _Refine(Config):
     pick: _AskedPick
     images: Annotated[list[Name], Field(max_length=_MAX_SEEING)] | None = None
-    """The best of those that see the spot where they are not named."""
+    """The best of those that see the point where they are not named."""
 
 
 class _SavePicks(Config):
@@ -211,7 +211,7 @@ class _AskedSpot(Config):
 
 
 class _AskedEnds(Config):
-    """Two spots, each by the picks of it."""
+    """Two points, each by the picks of it."""
 
     first: Annotated[list[_AskedPick], Field(min_length=1, max_length=200)]
     second: Annotated[list[_AskedPick], Field(min_length=1, max_length=200)]
@@ -352,27 +352,27 @@ class _Tab:
             ],
             "refused": [{"name": one.image, "why": one.why} for one in found.refused],
             "factor": found.factor,
-            "spot": None if found.meeting is None else _spot_json(found.meeting),
+            "position": None if found.meeting is None else _position_json(found.meeting),
         }
 
     def picks(self, call: Call) -> dict[str, Any]:
-        """All picks, the spots that they show, residuals, and what control says to them."""
+        """All picks, the points that they show, residuals, and what control says to them."""
         folder = self._studio.workspace.folder
         own, coded = self._read(PICKS_FILE, read_picks), self._read(MARKERS_FILE, read_picks)
         picks = [*(own or []), *(coded or [])]
         control = self._read(CONTROL_FILE, read_control) or Control()
         model = self._read_model() if self._has_model() else None
-        spots: dict[str, TriangulatedPoint] = {}
+        found_points: dict[str, TriangulatedPoint] = {}
         lost: dict[str, str] = {}
         off: list[Array | None] = [None] * len(picks)
         if model is not None:
             known = {p.image for p in picks if p.image in model.pictures}
             cameras = {name: model.pictures.picture(name) for name in known}
-            spots, lost = triangulate_picks(picks, cameras)
-            off = point_residuals(spots, picks, model.pictures)
+            found_points, lost = triangulate_picks(picks, cameras)
+            off = point_residuals(found_points, picks, model.pictures)
         points: dict[str, dict[str, Any]] = {}
         for number, (pick, miss) in enumerate(zip(picks, off, strict=True)):
-            spot = spots.get(pick.point)
+            position = found_points.get(pick.point)
             about = points.setdefault(
                 pick.point,
                 {
@@ -380,10 +380,10 @@ class _Tab:
                     "picks": [],
                     "why": lost.get(pick.point, ""),
                     "coded": number >= len(own or []),
-                    "spot": None if spot is None else _spot_json(spot),
+                    "position": None if position is None else _position_json(position),
                 },
             )
-            left_out = spot is not None and pick.image in spot.left_out
+            left_out = position is not None and pick.image in position.left_out
             about["picks"].append(
                 {
                     **_pick_json(pick),
@@ -397,7 +397,7 @@ class _Tab:
             "token": table_token(folder / PICKS_FILE),
             "points": list(points.values()),
             "control": None if model is None
-            else preview_control(control, spots, lost, model.pictures.frame),
+            else preview_control(control, found_points, lost, model.pictures.frame),
             "last": None if record is None else record.to_json(),
             "unit": "m" if model is None else model.pictures.frame.unit,
             "scaled_by_rig": mapped is not None and mapped.scaled,
@@ -439,14 +439,14 @@ class _Tab:
 
     # ---- Spots and lengths ----
 
-    def spot(self, call: Call) -> dict[str, Any]:
-        """The spot that picks show and how far each misses it; nothing is written."""
+    def position(self, call: Call) -> dict[str, Any]:
+        """The point that picks show and how far each misses it; nothing is written."""
         asked, model = call.read(_AskedSpot), self._read_model()
         picks = [p.pick for p in asked.picks]
         found = model.lengths.target(picks)
         off = point_residuals({p.point: found for p in picks}, picks, model.pictures)
         return {
-            "spot": _spot_json(found),
+            "position": _position_json(found),
             "residuals": [
                 {
                     "image": pick.image, "left_out": pick.image in found.left_out,
@@ -457,7 +457,7 @@ class _Tab:
         }  # fmt: skip
 
     def length(self, call: Call) -> dict[str, Any]:
-        """The distance between two spots and its sigma; nothing is written."""
+        """The distance between two points and its sigma; nothing is written."""
         asked, model = call.read(_AskedEnds), self._read_model()
         with model.lock:
             found = model.lengths.between(
@@ -530,11 +530,11 @@ def _pick_json(pick: Pick) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _spot_json(spot: TriangulatedPoint) -> dict[str, Any]:
+def _position_json(position: TriangulatedPoint) -> dict[str, Any]:
     return {
-        "n": spot.model[0], "e": spot.model[1], "down": spot.model[2],
-        "sigma": np.sqrt(np.diag(spot.covariance)).tolist(), "views": spot.views,
-        "rms_px": spot.rms_px,
+        "n": position.model[0], "e": position.model[1], "down": position.model[2],
+        "sigma": np.sqrt(np.diag(position.covariance)).tolist(), "views": position.views,
+        "rms_px": position.rms_px,
     }  # fmt: skip
 
 
@@ -557,7 +557,7 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
         Endpoint(path="/api/picks/refine", answer=tab.refine, method="POST"),
         Endpoint(path="/api/picks/save", answer=tab.save, method="POST", writes=True,
                  max_bytes=8 << 20),
-        Endpoint(path="/api/picks/spot", answer=tab.spot, method="POST"),
+        Endpoint(path="/api/picks/position", answer=tab.position, method="POST"),
         Endpoint(path="/api/picks/length", answer=tab.length, method="POST"),
         Endpoint(path="/api/control", answer=tab.control),
         Endpoint(path="/api/control/save", answer=tab.save_control, method="POST", writes=True,

@@ -147,12 +147,12 @@ export function tab(studio) {
         ? "Picked in one picture; two are needed." : "No spot yet.";
       return;
     }
-    const found = await send("/api/picks/spot", {picks: views.map(asPick)});
+    const found = await send("/api/picks/position", {picks: views.map(asPick)});
     if (mine !== checking) return;
-    const {spot} = found;
-    spotText.textContent = counted(spot.views, "picture") + ", " + number(spot.rms_px, "px", 2)
+    const {position} = found;
+    spotText.textContent = counted(position.views, "picture") + ", " + number(position.rms_px, "px", 2)
       + " rms; sigma north "
-      + mm(spot.sigma[0]) + ", east " + mm(spot.sigma[1]) + ", down " + mm(spot.sigma[2])
+      + mm(position.sigma[0]) + ", east " + mm(position.sigma[1]) + ", down " + mm(position.sigma[2])
         + (held.unit === "m" ? " mm" : " thousandths");
     found.residuals.forEach((one) => {
       const view = wall.of(one.image);
@@ -225,10 +225,10 @@ export function tab(studio) {
       point.picks.length);
     point.picks.forEach((one) => wall.of(one.image).set({...one}));
     attempt(look);
-    if (point.spot) {
+    if (point.position) {
       attempt(async () => {
         const found = await get("/api/pictures/seeing", {
-          n: point.spot.n, e: point.spot.e, count: 40});
+          n: point.position.n, e: point.position.e, count: 40});
         wall.waiting = found.pictures.filter((one) => !wall.of(one.name));
         wall.showMore(0);
       });
@@ -258,8 +258,8 @@ export function tab(studio) {
         onchange: (event) => choose(point.name, event.target.checked)});
       return [
         el("label", {}, box, " " + point.name),
-        point.spot ? String(point.spot.views) : String(point.picks.length),
-        point.spot ? point.spot.sigma.map(mm)
+        point.position ? String(point.position.views) : String(point.picks.length),
+        point.position ? point.position.sigma.map(mm)
           .join(", ") : el("span", {class: "warn"}, point.why || "no model yet"),
         el("span", {class: bad ? "error" : null},
           worst.size < 0 ? "" : number(worst.size, "", 2) + (bad ? " BAD: " + worst.image : "")),
@@ -271,15 +271,15 @@ export function tab(studio) {
     })), el("div", {class: "buttons"}, button("Export CSV", exportPoints)));
     studio.map.put({
       kind: "point", name: "picked", title: "Picked points", colour: ORANGE, group: "Pictures",
-      shapes: held.points.filter((point) => point.spot)
-        .map((point) => [[point.spot.e, point.spot.n]]),
-      texts: held.points.filter((point) => point.spot).map((point) => point.name),
+      shapes: held.points.filter((point) => point.position)
+        .map((point) => [[point.position.e, point.position.n]]),
+      texts: held.points.filter((point) => point.position).map((point) => point.name),
     });
   }
 
   function exportPoints() {
-    const rows = held.points.filter((point) => point.spot).map(({name: of, spot}) => [
-      of, spot.n, spot.e, spot.down, ...spot.sigma, spot.views, spot.rms_px]);
+    const rows = held.points.filter((point) => point.position).map(({name: of, position}) => [
+      of, position.n, position.e, position.down, ...position.sigma, position.views, position.rms_px]);
     const header = ["name", "north", "east", "down", "sigma_north", "sigma_east", "sigma_down",
       "views", "rms_px"];
     download("points.csv", csv(header, rows), "text/csv");

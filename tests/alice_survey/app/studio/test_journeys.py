@@ -194,7 +194,7 @@ def test_control_points_are_picked_and_their_residuals_shown(
                 np.array([float(text) for text in re.split(", ", one.strip())])
                 for one in re.findall(r"(?:now|fitted) ([-\d., ]+)", row.replace("−", "-"))
             )
-            off = np.array([spot["spot"][axis] for axis in ("n", "e", "down")]) - place
+            off = np.array([spot["position"][axis] for axis in ("n", "e", "down")]) - place
             np.testing.assert_allclose(np.abs(now), 1000 * np.abs(off), rtol=0.01, atol=0.2)
             assert np.abs(fitted).max() < 5.0
             assert "BAD" not in row

@@ -231,13 +231,13 @@ def test_control_is_scored_at_once(server: Server, workspace: Path) -> None:
         points = {one["name"]: one for one in asked(server, "/api/picks")["points"]}
         for point in points.values():
             assert all(abs(r) < 1.0 for p in point["picks"] for r in p["residual"])
-            assert min(point["spot"]["sigma"]) > 1e-5 and point["spot"]["views"] > 2
+            assert min(point["position"]["sigma"]) > 1e-5 and point["position"]["views"] > 2
         rows = [
             {
                 "kind": "point", "name": name, "use": "control", "sigma_m": "0.002",
-                "north_m": f"{points[name]['spot']['n']:.4f}",
-                "east_m": f"{points[name]['spot']['e']:.4f}",
-                "depth_m": f"{points[name]['spot']['down'] + 0.05 * (name == 'P0'):.4f}",
+                "north_m": f"{points[name]['position']['n']:.4f}",
+                "east_m": f"{points[name]['position']['e']:.4f}",
+                "depth_m": f"{points[name]['position']['down'] + 0.05 * (name == 'P0'):.4f}",
             }
             for name in names
         ]  # fmt: skip
@@ -306,7 +306,7 @@ def test_what_cannot_be_asked_is_said_in_a_line(server: Server) -> None:
         ("/api/picks/refine", {"pick": {**good, "image": "no.png"}}),
         ("/api/picks/refine", {"pick": {**good, "sigma_px": -1}}),
         ("/api/picks/length", {"first": [good], "second": [good]}),
-        ("/api/picks/spot", {"picks": [good]}),
+        ("/api/picks/position", {"picks": [good]}),
     ):
         refused(call(server, path, body))
     refused(ask(server, "/api/pictures/seeing?n=500&e=500"))
