@@ -29,28 +29,28 @@ PACKAGES = ("alice_survey", "camera_calib", "missions", "reconstruct")
 WORDS = Path(__file__).with_name("structure_words.toml")
 """Words that are not used, and where each of them counts."""
 BOUNDS = {
-    "code lines of the packages": 84_900,  # goal: 68_000
-    "code lines of the tests": 61_000,  # goal: 48_000
-    "code lines of the benchmarks": 9_860,  # goal: 8_000
-    "lines of our own JavaScript": 6_430,  # goal: 5_000
-    "modules": 521,  # goal: 400
-    "modules with a single importer": 134,  # goal: 90
-    "kernels": 355,  # goal: 260
-    "commands": 39,  # goal: 38
-    "options of commands": 418,  # goal: 380
+    "code lines of the packages": 79_050,  # goal: 68_000
+    "code lines of the tests": 54_400,  # goal: 48_000
+    "code lines of the benchmarks": 8_850,  # goal: 8_000
+    "lines of our own JavaScript": 6_420,  # goal: 5_000
+    "modules": 449,  # goal: 400
+    "modules with a single importer": 97,  # goal: 90
+    "kernels": 281,  # goal: 260
+    "commands": 36,  # goal: 38
+    "options of commands": 348,  # goal: 380
     "settings": 125,
-    "functions that take the whole SurveyConfig": 49,  # goal: 20
+    "functions that take the whole SurveyConfig": 28,  # goal: 20
     "layers of the import contract": 8,
     "modules without a layer": 0,
     "circles of imports": 0,
-    "class names with two meanings": 3,
+    "class names with two meanings": 0,
     "modules that import matplotlib": 2,
     "pages begun by hand (<!DOCTYPE)": 2,
     "modules that name the flat port": 11,
-    "identifiers with an avoided word": 194,  # goal: 0
-    "functions named by a participle": 291,  # goal: 0
+    "identifiers with an avoided word": 0
+    "functions named by a participle": 0
     "help texts with an avoided phrase": 0,
-    "lines of docs with an avoided phrase": 25,  # goal: 0
+    "lines of docs with an avoided phrase": 0
 }
 """How large each count may be: these go down, never up."""
 _KERNEL = re.compile(r"(\w+\.)*(compiled|compiled_ieee|kernel|njit|jit)(\(.*)?", re.DOTALL)
