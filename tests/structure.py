@@ -36,8 +36,8 @@ BOUNDS = {
     "modules": 449,  # goal: 400
     "modules with a single importer": 97,  # goal: 90
     "kernels": 281,  # goal: 260
-    "commands": 36,  # goal: 38
-    "options of commands": 348,  # goal: 380
+    "commands": 36,
+    "options of commands": 348,
     "settings": 125,
     "functions that take the whole SurveyConfig": 28,  # goal: 20
     "layers of the import contract": 8,
@@ -47,10 +47,10 @@ BOUNDS = {
     "modules that import matplotlib": 2,
     "pages begun by hand (<!DOCTYPE)": 2,
     "modules that name the flat port": 11,
-    "identifiers with an avoided word": 0
-    "functions named by a participle": 0
+    "identifiers with an avoided word": 0,
+    "functions named by a participle": 0,
     "help texts with an avoided phrase": 0,
-    "lines of docs with an avoided phrase": 0
+    "lines of docs with an avoided phrase": 0,
 }
 """How large each count may be: these go down, never up."""
 _KERNEL = re.compile(r"(\w+\.)*(compiled|compiled_ieee|kernel|njit|jit)(\(.*)?", re.DOTALL)
