@@ -283,7 +283,7 @@ def project_tile(
     cells = cells_over(grid.translate(-grid.west, -grid.north), surface)
     cells = cells.without(~without_strays(cells.height))
     height, sigma = fill_gaps(cells.height, cells.sigma, FILL_CELLS, grid.cell)
-    bands = {
+    bands: dict[str, NDArray[Any]] = {
         "dem": (height + up).astype(np.float32),
         "sigma": sigma,
         "slope": slope_deg(height, grid.cell),

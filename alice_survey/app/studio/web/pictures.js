@@ -150,9 +150,10 @@ export function tab(studio) {
     const found = await send("/api/picks/position", {picks: views.map(asPick)});
     if (mine !== checking) return;
     const {position} = found;
-    spotText.textContent = counted(position.views, "picture") + ", " + number(position.rms_px, "px", 2)
-      + " rms; sigma north "
-      + mm(position.sigma[0]) + ", east " + mm(position.sigma[1]) + ", down " + mm(position.sigma[2])
+    const [north, east, down] = position.sigma.map(mm);
+    spotText.textContent = counted(position.views, "picture") + ", "
+      + number(position.rms_px, "px", 2)
+      + " rms; sigma north " + north + ", east " + east + ", down " + down
         + (held.unit === "m" ? " mm" : " thousandths");
     found.residuals.forEach((one) => {
       const view = wall.of(one.image);
@@ -279,7 +280,8 @@ export function tab(studio) {
 
   function exportPoints() {
     const rows = held.points.filter((point) => point.position).map(({name: of, position}) => [
-      of, position.n, position.e, position.down, ...position.sigma, position.views, position.rms_px]);
+      of, position.n, position.e, position.down, ...position.sigma, position.views,
+      position.rms_px]);
     const header = ["name", "north", "east", "down", "sigma_north", "sigma_east", "sigma_down",
       "views", "rms_px"];
     download("points.csv", csv(header, rows), "text/csv");

@@ -89,7 +89,7 @@ def test_a_large_raster_in_little_memory_until_ctrl_c(tmp_path: Path) -> None:
                 opaque = np.asarray(tile.convert("RGBA"))[..., 3] == 255
             # A level covers the whole raster, so that coarse pixels are not quite 2**h wide.
             assert (spot, opaque.sum()) == (spot, pytest.approx(expected, rel=0.3))
-        assert b"/tiles/height/{}.webp" in loaded(f"{url}api/map")
+        assert b"/tiles/dem/{}.webp" in loaded(f"{url}api/map")
         grown = max_mib(started.pid) - before
         started.send_signal(signal.SIGINT)
         out, shown = started.communicate(timeout=20)

@@ -314,7 +314,7 @@ def test_a_gis_reads_the_mosaic_by_parts(server: Server, folder: Path) -> None:
 
 def test_many_at_once(server: Server) -> None:
     paths = [
-        "/tiles/mosaic/1/0/0.webp", "/tiles/mosaic/1/0/1.webp", "/tiles/height/0/0/0.webp",
+        "/tiles/mosaic/1/0/0.webp", "/tiles/mosaic/1/0/1.webp", "/tiles/dem/0/0/0.webp",
         "/tiles/sigma/0/0/0.webp", "/files/dense/dem.tif", "/files/", "/none", "/", "/api/map",
     ]  # fmt: skip
     expected = {path: ask(server, path).body for path in paths}
@@ -359,13 +359,13 @@ def test_a_stage_made_again_while_it_is_served(tmp_path: Path) -> None:
 
     worker = threading.Thread(target=work)
     with serving(workspace) as server:
-        same = ask(server, "/tiles/height/0/0/0.webp").body
+        same = ask(server, "/tiles/dem/0/0/0.webp").body
         worker.start()
         replies: list[Reply] = []
         try:
             for _ in range(12):
                 replies += [
-                    ask(server, "/tiles/height/0/0/0.webp"),
+                    ask(server, "/tiles/dem/0/0/0.webp"),
                     ask(server, "/api/map"),
                 ]
         finally:
@@ -391,11 +391,11 @@ def test_an_old_page_has_to_be_loaded_again(tmp_path: Path) -> None:
         assert ask(server, after.replace("{}", "0/0/0")).status == 200
         shutil.rmtree(workspace / "dense")
         assert ask(server, after.replace("{}", "0/0/0")).status == 404
-        assert "/tiles/height/" not in ask(server, "/api/map").text
+        assert "/tiles/dem/" not in ask(server, "/api/map").text
 
 
 def address_of_tiles(page: str) -> str:
-    start = page.index("/tiles/height/")
+    start = page.index("/tiles/dem/")
     return page[start : page.index('"', start)]
 
 
@@ -410,7 +410,7 @@ def test_damaged_files_are_reported_in_a_line(tmp_path: Path) -> None:
             reply = ask(server, path)
             assert reply.status == 500
             assert len(reply.text.splitlines()) == 1
-        assert ask(server, "/tiles/height/0/0/0.webp").status == 200
+        assert ask(server, "/tiles/dem/0/0/0.webp").status == 200
 
 
 def test_a_workspace_that_goes_away(tmp_path: Path) -> None:
@@ -419,7 +419,7 @@ def test_a_workspace_that_goes_away(tmp_path: Path) -> None:
         assert ask(server, "/").status == 200
         workspace.rename(tmp_path / "gone")
         assert ask(server, "/files/dense/dem.tif").status == 404
-        assert ask(server, "/tiles/height/0/0/0.webp").status == 404
+        assert ask(server, "/tiles/dem/0/0/0.webp").status == 404
         (tmp_path / "gone").rename(workspace)
         write_json(workspace / "dense" / "stage.json", {"stage": "dense", "digest": "1"})
         assert ask(server, "/").status == 200

@@ -80,7 +80,7 @@ def test_the_map_loads_tiles_and_zooms(folder: Path) -> None:
 
         page.get_by_label("Height", exact=True).check()
         page.wait_for_function(
-            "() => document.querySelector('img[src*=\"/tiles/height/\"]')?.naturalWidth > 0",
+            "() => document.querySelector('img[src*=\"/tiles/dem/\"]')?.naturalWidth > 0",
             timeout=60_000,
         )
         assert page.get_by_text("height, m").first.is_visible()
