@@ -419,8 +419,9 @@ def assign_lines(stations: Stations, plan: Plan) -> NDArray[np.intp]:
     """The line of each station, (S,).
 
     A station belongs to the plan's line that it is nearest to, if it is within half a spacing of
-    it, beyond its ends by no more than a step, and along it either way. Of what is left, runs of
-    three pictures or more on one course without a pause count as separate lines, numbered on
+    it, beyond its ends by no more than a step, and along it either way. A closing line goes back
+    along another: its own are the pictures in its direction after the line before it. Of what is
+    left, runs of three pictures or more on one course without a pause count as separate lines, numbered on
     from the plan's; the rest is -1: seen, but on no line.
     """
     line = _planned_lines(stations, plan)
@@ -437,13 +438,20 @@ def _planned_lines(stations: Stations, plan: Plan) -> NDArray[np.intp]:
     nearest_m = np.full(len(stations), plan.line_spacing_m / 2 + 1e-9)
     heading = stations.attitude_rad[:, 2]
     step_m = plan.station_spacing_m
+    number = np.arange(len(stations))
+    moved = np.diff(stations.glass_ne, axis=0, prepend=stations.glass_ne[:1])
     for index, planned in enumerate(plan.lines):
         ahead = np.array([math.cos(planned.heading_rad), math.sin(planned.heading_rad)])
         off = stations.glass_ne - planned.start_ne_m
         along, across = off @ ahead, np.abs(off @ np.array([-ahead[1], ahead[0]]))
         here = (along >= -step_m) & (along <= planned.length_m + step_m)
         here &= np.abs(np.cos(heading - planned.heading_rad)) >= math.cos(_ALIKE_RAD)
-        here &= across < nearest_m
+        before = number[line == index - 1]
+        if planned.kind == "closing" and len(before):
+            goes_back = (number > np.median(before)) & (moved @ ahead > 0.0)
+            here &= goes_back & (across < plan.line_spacing_m / 2)
+        else:
+            here &= across < nearest_m
         line[here] = index
         nearest_m[here] = across[here]
     return line

@@ -294,3 +294,17 @@ def test_straight_runs_off_the_plan_are_separate_lines() -> None:
     np.testing.assert_array_equal(lines[: len(exact)], exact.line)
     np.testing.assert_array_equal(lines[-9:-4], len(plan().lines))
     np.testing.assert_array_equal(lines[-4:], -1)
+
+
+def test_a_closing_line_back_along_the_first_has_pictures_of_its_own() -> None:
+    lines = lawnmower(6.0, 3.0, 1.0, 0.46, over_m=0.5)
+    back = replace(
+        lines[0], kind="closing", start_ne_m=lines[0].end_ne_m, end_ne_m=lines[0].start_ne_m
+    )
+    closed = plan_of(area_of(shapely.box(0, 0, 6, 3)), [*lines, back])
+    exact = stations_of_plan(closed)
+    found = assign_lines(exact, closed)
+    off = found != exact.line
+    np.testing.assert_array_equal(found[~off], exact.line[~off])
+    assert not off[exact.line < len(lines)].any()
+    assert off.sum() <= 1  # the first: where it came from is on another line
