@@ -421,8 +421,8 @@ def assign_lines(stations: Stations, plan: Plan) -> NDArray[np.intp]:
     A station belongs to the plan's line that it is nearest to, if it is within half a spacing of
     it, beyond its ends by no more than a step, and along it either way. A closing line goes back
     along another: its own are the pictures in its direction after the line before it. Of what is
-    left, runs of three pictures or more on one course without a pause count as separate lines, numbered on
-    from the plan's; the rest is -1: seen, but on no line.
+    left, runs of three pictures or more on one course without a pause count as separate lines,
+    numbered on from the plan's; the rest is -1: seen, but on no line.
     """
     line = _planned_lines(stations, plan)
     runs = _runs(line, stations, _RUN_STEPS * plan.station_spacing_m)

@@ -81,9 +81,9 @@ def test_a_large_raster_in_little_memory_until_ctrl_c(tmp_path: Path) -> None:
         loaded(f"{url}tiles/sigma/0/0/0.webp")  # what it needs anyway is loaded
         before = max_mib(started.pid)
         for spot, expected in {
-            "height/6/1/0": 0, "height/6/0/0": 512**2, "height/6/37/37": 512**2,
-            "height/5/10/10": 256**2, "height/3/2/2": 64**2, "height/1/0/0": 2 * 16**2,
-            "height/0/0/0": 3 * 8**2, "mosaic/6/20/20": 512**2, "mosaic/4/5/5": 128**2,
+            "dem/6/1/0": 0, "dem/6/0/0": 512**2, "dem/6/37/37": 512**2,
+            "dem/5/10/10": 256**2, "dem/3/2/2": 64**2, "dem/1/0/0": 2 * 16**2,
+            "dem/0/0/0": 3 * 8**2, "mosaic/6/20/20": 512**2, "mosaic/4/5/5": 128**2,
         }.items():  # fmt: skip
             with Image.open(io.BytesIO(loaded(f"{url}tiles/{spot}.webp"))) as tile:
                 opaque = np.asarray(tile.convert("RGBA"))[..., 3] == 255
