@@ -1,5 +1,6 @@
 """The sparse model as the later stages see it: views through ideal pinholes, and points."""
 
+import copyreg
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -40,6 +41,16 @@ class WorldFrame:
     def unit(self) -> str:
         """Name of the unit of length for labels."""
         return "m" if self.scaled else "model units"
+
+
+def as_given(matrix: Array) -> RigidTransform:
+    """A transform of a matrix (4, 4), to the last bit."""
+    return RigidTransform(matrix, normalize=False)
+
+
+# scipy normalizes what it unpickles, which changes last bits: a task would not compute the same in
+# another process.
+copyreg.pickle(RigidTransform, lambda one: (as_given, (one.as_matrix(),)))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,13 +1,15 @@
 """The shift with distance that a warp to one pinhole leaves."""
 
+import pickle
 from dataclasses import replace
 from functools import cache
 
+import cloudpickle
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.config import CameraConfig, WaterConfig
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
@@ -140,3 +142,13 @@ def test_the_contraction_is_the_fields_own_and_below_one_the_inverse_exists(
     ideal = warped + step * (warped - [400, 300]) @ slopes.T
     np.testing.assert_allclose(shift.ideal(warped, depth), ideal, atol=1e-9)
     np.testing.assert_allclose(shift.warp(ideal, depth), warped, atol=1e-4)
+
+
+def test_poses_reach_other_processes_to_the_last_bit() -> None:
+    rng = np.random.default_rng(4)
+    for _ in range(200):
+        pose = RigidTransform.from_components(rng.normal(size=3), Rotation.random(rng=rng)).inv()
+        for form in (pickle, cloudpickle):
+            copy = form.loads(form.dumps(pose))
+            np.testing.assert_array_equal(copy.as_matrix(), pose.as_matrix())
+            np.testing.assert_array_equal(copy.rotation.as_quat(), pose.rotation.as_quat())
