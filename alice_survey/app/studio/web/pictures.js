@@ -114,7 +114,7 @@ export function tab(studio) {
 
   const used = () => (wall ? wall.views.filter((view) => view.pick && view.use) : []);
   const asPick = (view) => ({
-    image: view.name, point: name.value.trim() || "spot", x: view.pick.x, y: view.pick.y,
+    image: view.name, point: name.value.trim() || "point", x: view.pick.x, y: view.pick.y,
     sigma_px: view.pick.sigma_px || Number(sigma.value) || 0.5,
     matched_to: used().some((one) => one.name === view.pick.matched_to) ? view.pick.matched_to : "",
   });

@@ -63,8 +63,8 @@ def test_nothing_is_required_but_what_a_command_cannot_do_without(
         ({"folders": ["relative"]}, "whole path"),
         ({"folders": ["/none/at/all"]}, "no such"),
         ({"time_zone": "a\nb"}, "printable"),
-        ({"log_file": ["/tmp/log"]}, "log_file"),  # noqa: S108
-        ({"workspace": "/tmp"}, "workspace"),  # noqa: S108
+        ({"log_file": ["events.jsonl"]}, "log_file"),
+        ({"workspace": "other"}, "workspace"),
     ],
 )
 def test_a_wrong_value_is_named_in_one_line(
