@@ -1,5 +1,6 @@
 """Thrusters and allocation a second time: slow, obvious, from the named values of each thruster."""
 
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -109,3 +110,24 @@ def redistributed(
         c[over] = -np.clip(f, lower, upper)[over]
         b[:, over] = 0.0
         held |= over
+
+
+def best_thrust(
+    matrix: Array, wanted: Array, lower: Array, upper: Array, axes: Array, weights: Array
+) -> Array:
+    """Least miss, then least weighted thrust, by trying every set of thrusters at their bounds."""
+    asked, scale = axes > 0, 1 / np.sqrt(weights)
+    a, b = (axes[:, None] * matrix)[asked] * scale, (axes * wanted)[asked]
+    low, high = lower / scale, upper / scale
+    candidates = []
+    for pattern in itertools.product((0, 1, 2), repeat=len(scale)):
+        state = np.array(pattern)
+        x = np.where(state == 1, low, np.where(state == 2, high, 0.0))
+        free = state == 0
+        if free.any():
+            x[free] = np.linalg.pinv(a[:, free], rcond=1e-10) @ (b - a @ x)
+        if np.all(x >= low - 1e-9) and np.all(x <= high + 1e-9):
+            candidates.append(x)
+    misses = np.array([np.linalg.norm(a @ x - b) for x in candidates])
+    good = [x for x, miss in zip(candidates, misses, strict=True) if miss < misses.min() + 1e-8]
+    return np.asarray(min(good, key=lambda x: float(np.linalg.norm(x))) * scale)

@@ -1,20 +1,23 @@
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.config import SeafloorConfig, SurveyConfig
+from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.frames import rotation_from_attitude
 from alice_survey.sim.seafloor.as_built import true_rig
-from alice_survey.sim.seafloor.light import CameraLight, camera_light
+from alice_survey.sim.seafloor.light import CameraLight, backscatter_at, camera_light
 from alice_survey.sim.seafloor.renderer import (
     Scene,
+    camera_rays,
     flat_floor_radiance,
     range_map,
     render,
 )
-from alice_survey.sim.seafloor.terrain import Terrain, build_terrain
+from alice_survey.sim.seafloor.terrain import Terrain, TerrainObject, build_terrain
 from alice_survey.sim.seafloor.texture import Texture
 from camera_calib.rig import Rig, design_rig
 from camera_calib.water import water_optics
@@ -211,3 +214,92 @@ def test_an_amphora_hides_strobes_from_the_sand_next_to_it() -> None:
     assert shaded.max() < 1.0 + 1e-4
     assert 0.003 < (shaded < 0.9).mean() < 0.3
     assert np.median(shaded) == pytest.approx(1.0, abs=1e-4)
+
+
+def test_vignetting_is_cosine_to_the_fourth_in_air() -> None:
+    camera = design_rig(CONFIG.camera, CONFIG.water, 16).cameras["left"]
+    rays = camera_rays(camera, 1, 0, camera.height_px)
+    offset = camera.pixel_centres().reshape(-1, 2) - [camera.cx_px, camera.cy_px]
+    tangent2 = (offset**2).sum(axis=1) / camera.fx_px**2
+    np.testing.assert_allclose(rays.vignetting, (1.0 + tangent2) ** -2, rtol=1e-5)
+
+
+def test_every_ray_of_a_pixel_has_its_share_of_the_exposure() -> None:
+    """A picture over a motion is the mean of the pictures along it."""
+    scene = Scene(terrain=flat(), texture=Stripes(seed=0, at_m=0.1, axis=1))
+    poses = moving(pose(), np.array([0.0, 0.05, 0.0]), 16)
+    blurred = render(scene, CAMERA, LIGHT, poses, 4)
+    mean = np.mean([render(scene, CAMERA, LIGHT, still(p), 4) for p in poses], axis=0)
+    difference = (blurred - mean)[..., 1] / mean[..., 1].max()
+    assert np.abs(difference.mean()) < 2e-4
+    assert difference.std() < 0.01
+
+
+def test_pictures_do_not_depend_on_where_the_survey_is() -> None:
+    """Far from the datum, in deep water, nothing is lost to single precision."""
+    near = range_map(Scene(terrain=flat(), texture=Even(seed=0)), CAMERA, pose())
+    far_bounds = tuple(b + 40_000.0 for b in BOUNDS)
+    config = SeafloorConfig(relief_m=0.0, rocks_per_m2=0.0, amphora=False, grid_m=0.25)
+    deep = build_terrain(config, far_bounds, 5000.0, np.random.default_rng(0))  # type: ignore[arg-type]
+    view = RigidTransform.from_translation([40_000.0, 40_000.0, 4985.0]) * pose()
+    far = range_map(Scene(terrain=deep, texture=Even(seed=0)), CAMERA, view)
+    np.testing.assert_allclose(far, near, atol=2e-6)
+
+
+def test_a_level_camera_sees_the_floor_below_the_horizon_and_backscatter_above() -> None:
+    scene = Scene(terrain=flat(), texture=Even(seed=0))
+    level = pose(pitch_deg=90.0, altitude_m=0.5)
+    rotation = level.rotation.as_matrix()
+    found = range_map(scene, CAMERA, level, reach_m=2.5)
+    origins, directions = CAMERA.unproject(CAMERA.pixel_centres())
+    down = directions @ rotation[2]
+    start = level.translation[2] + origins @ rotation[2]
+    path = np.where(down > 0, (FLOOR_M - start) / np.where(down > 0, down, 1.0), np.inf)
+    expected = origins[..., 2] + path * directions[..., 2]
+    near = path < 2.5
+    assert near.sum() > 100
+    np.testing.assert_allclose(found[near], expected[near], rtol=3e-6)
+    assert np.isnan(found[down <= 0]).all()
+
+    lit = render(scene, CAMERA, LIGHT, still(level), 1)
+    row, column = 3, CAMERA.width_px // 2
+    place = np.array([column + 0.5, row + 0.5]) / (CAMERA.width_px, CAMERA.height_px)
+    veil = np.empty(3)
+    last = np.array(LIGHT.backscatter.shape[1::-1]) - 1
+    backscatter_at(LIGHT.backscatter, LIGHT.reach_m, *(place * last), LIGHT.reach_m, veil)
+    cosine = CAMERA.in_air().unproject(np.array([column + 0.5, row + 0.5]))[1][2]
+    np.testing.assert_allclose(lit[row, column], veil * cosine**4, rtol=1e-5)
+
+
+def test_a_texture_moves_with_its_object() -> None:
+    box_m = np.array([[-0.4, -0.4, 3.9], [0.4, -0.4, 3.9], [0.4, 0.4, 3.9], [-0.4, 0.4, 3.9]])
+    sheet = np.array([[0, 2, 1], [0, 3, 2]], dtype=np.int32)
+    shift = np.array([0.0, 0.23, 0.0])
+    below = np.array([0.0, 0.0, FLOOR_M])
+    views = []
+    for moved in (np.zeros(3), shift):
+        item = TerrainObject(
+            name="fish", vertices=(box_m - below + moved).astype(np.float32), triangles=sheet,
+            material=2.0, at_rest=(box_m - below).astype(np.float32),
+        )  # fmt: skip
+        terrain = replace(flat(), objects=(item,))
+        scene = Scene(terrain=terrain, texture=Texture(seed=4))
+        follow = pose(east_m=float(moved[1]), altitude_m=FLOOR_M - 3.0)
+        views.append(render(scene, CAMERA, LIGHT, still(follow), 1))
+    inside = np.s_[60:110, 80:130]
+    assert views[0][inside].std() > 0.05 * views[0][inside].mean()
+    np.testing.assert_allclose(views[1][inside], views[0][inside], rtol=2e-2)
+    with pytest.raises(WorkspaceError, match="moves"):
+        terrain.write(Path("never.ply"))
+
+
+def test_pixels_are_sampled_evenly_over_their_area() -> None:
+    """The mean of a pixel's rays is the ray of its centre, and no two share a row or column."""
+    for samples in (1, 2, 3, 4):
+        rays = camera_rays(CAMERA, samples, 60, 61)
+        mean = rays.directions.reshape(CAMERA.width_px, samples**2, 3).mean(axis=1)
+        pixels = np.column_stack([np.arange(CAMERA.width_px) + 0.5, np.full(CAMERA.width_px, 60.5)])
+        np.testing.assert_allclose(mean, CAMERA.unproject(pixels)[1], atol=2e-6)
+        first = rays.directions[: samples**2]
+        assert len(np.unique(np.round(first[:, 0], 6))) == samples**2
+        assert len(np.unique(np.round(first[:, 1], 6))) == samples**2

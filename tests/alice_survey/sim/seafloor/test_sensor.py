@@ -76,3 +76,21 @@ def test_the_gain_puts_the_nominal_median_at_middle_grey() -> None:
     gain = nominal_gain(nominal, plain())
     assert np.median(nominal.mean(axis=-1)) * gain == pytest.approx(MIDDLE_GREY)
     assert nominal_gain(1e6 * nominal, plain()) == 1e-5  # never beyond the full well
+
+
+def test_the_noise_hardly_depends_on_how_a_machine_rounds() -> None:
+    """Draws of a Poisson number are rejected by what it counts: one more shifts all that follow."""
+    rng = np.random.default_rng(3)
+    light = rng.uniform(0.05, 3.0, (240, 320, 3)).astype(np.float32)
+    rounded = light * (1.0 + 1e-5 * rng.standard_normal(light.shape)).astype(np.float32)
+    assert np.any(rounded != light)
+    one, other = (expose(some, plain(5.0), np.random.default_rng(7)) for some in (light, rounded))
+    far = np.abs(one - other) > 1.5
+    assert far.mean() < 0.15
+    assert far.any(axis=(1, 2)).mean() < 0.5
+
+
+def test_channels_come_as_opencv_has_them() -> None:
+    red = np.zeros((1, 1, 3), dtype=np.float32)
+    red[..., 0] = 1.0
+    assert develop(red, 1.0).tolist() == [[[0, 0, 255]]]

@@ -159,3 +159,42 @@ def test_broken_and_missing_files_are_refused(terrain: Terrain, tmp_path: Path) 
     path.write_bytes(path.read_bytes()[:500])
     with pytest.raises(WorkspaceError, match=r"terrain\.ply"):
         read_terrain(path)
+
+
+def test_sand_holds_nothing_finer_than_its_grid_can_carry() -> None:
+    sand = build(grid_m=0.01, relief_m=0.35, rocks_per_m2=0.0, amphora=False).depths
+    window = np.outer(np.hanning(sand.shape[0]), np.hanning(sand.shape[1]))
+    power = np.abs(np.fft.fft2((sand - sand.mean()) * window)) ** 2
+    north, east = (np.fft.fftfreq(n, 0.01) for n in sand.shape)
+    fine = np.hypot(north[:, None], east) > 1.0 / (5 * 0.01)
+    ripples = (np.hypot(north[:, None], east) > 4.0) & ~fine
+    assert power[fine].sum() < 1e-4 * power.sum()
+    assert power[ripples].sum() > 1e-5 * power.sum()
+
+
+def test_normals_point_into_the_water(terrain: Terrain) -> None:
+    patch = terrain.patch()
+    np.testing.assert_allclose(np.linalg.norm(patch.normals, axis=1), 1.0, atol=1e-5)
+    ground = slice(0, terrain.depths.size)
+    assert patch.normals[ground, 2].max() < 0.0
+    corners = patch.vertices[patch.triangles].astype(float)
+    faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    field = 2 * (terrain.depths.shape[0] - 1) * (terrain.depths.shape[1] - 1)
+    assert faces[:field, 2].max() < 0.0
+
+
+def test_depth_beyond_the_edge_is_nan(terrain: Terrain) -> None:
+    south, north, west, east = terrain.bounds_ne_m
+    inside = [[south, west], [north, east], [12.0, 0.0]]
+    outside = [[south - 0.01, 0.0], [12.0, east + 0.01], [np.nan, 0.0]]
+    assert np.all(np.isfinite(terrain.depth_at(np.array(inside))))
+    assert np.all(np.isnan(terrain.depth_at(np.array(outside))))
+
+
+def test_written_depths_are_good_to_a_hundredth_of_a_millimetre_in_deep_water() -> None:
+    config = SeafloorConfig(grid_m=0.02, amphora=False)
+    shallow, deep = (
+        build_terrain(config, BOUNDS, depth, np.random.default_rng(1)) for depth in (15.0, 5999.0)
+    )
+    rise = deep.vertices[:, 2] - shallow.vertices[:, 2]
+    np.testing.assert_allclose(rise, 5984.0, atol=1e-6)

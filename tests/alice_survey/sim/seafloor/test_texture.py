@@ -3,10 +3,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alice_survey.sim.seafloor.terrain import SAND
+from alice_survey.sim.seafloor.terrain import CERAMIC, ROCK, SAND
 from alice_survey.sim.seafloor.texture import (
     SAND_ALBEDO,
     Texture,
+    add_octave,
     noise,
     speck,
 )
@@ -91,3 +92,54 @@ def test_samples_do_not_alias(step_m: float) -> None:
     power = np.abs(spectra[0]) ** 2
     assert power[frequency > 0.45].sum() < 0.03 * power.sum()
     assert power[(frequency > 0.1) & (frequency < 0.3)].sum() > 0.02 * power.sum()
+
+
+@pytest.mark.parametrize(
+    ("footprint_m", "left"), [(0.0025, 1.0), (0.00333, 0.5), (0.005, 0.0), (0.02, 0.0)]
+)
+def test_octaves_fade_before_samples_are_too_far_apart(footprint_m: float, left: float) -> None:
+    total, waves = np.zeros(4, dtype=np.float32), np.full(4, 0.8, dtype=np.float32)
+    add_octave(total, waves, 0.01, 0.5, np.full(4, footprint_m, dtype=np.float32))
+    np.testing.assert_allclose(total, 0.4 * left, atol=2e-3)
+
+
+def test_specks_end_smoothly_within_their_cell() -> None:
+    cell_m, n = 0.03, 60
+    faces = []
+    for axis in range(3):
+        at = np.random.default_rng(axis).uniform(-1.0, 1.0, (n * n, 3))
+        at[:, axis] = cell_m * np.round(at[:, axis] / cell_m) + 1e-9
+        faces.append([speck(*p, cell_m, 1.0, 1e-4, 0.0, 5)[0] for p in at])
+    inside = [
+        speck(*p, cell_m, 1.0, 1e-4, 0.0, 5)[0]
+        for p in np.random.default_rng(9).uniform(-1, 1, (3000, 3))
+    ]
+    assert np.max(faces) == 0.0
+    assert 0.005 < np.mean(inside) < 0.2
+
+
+def test_a_place_has_one_colour_in_any_order_of_evaluation() -> None:
+    points = plane(0.0018, 80)
+    order = np.random.default_rng(0).permutation(len(points))
+    straight, shuffled = albedo(points, 0.0018), albedo(points[order], 0.0018)
+    np.testing.assert_allclose(shuffled, straight[order], atol=2e-6)
+    np.testing.assert_array_equal(albedo(points, 0.0018), straight)
+    material, footprint = (np.full(len(points), v, np.float32) for v in (0.0, 0.0018))
+    other = Texture(seed=1).albedo(points, material, footprint)
+    assert np.abs(other - straight).max() > 0.05
+
+
+@pytest.mark.parametrize("material", [SAND, ROCK, CERAMIC])
+def test_reflectances_are_possible_and_vary(material: float) -> None:
+    colours = albedo(plane(0.0018, 300), 0.0009, material)
+    assert colours.min() >= 0.01
+    assert colours.max() <= 0.95
+    assert np.all(colours.std(axis=0) > 0.02)
+
+
+def test_detail_goes_on_below_a_pixel_of_the_full_resolution() -> None:
+    """Within one pixel of 0.42 mm reflectance varies by a few percent."""
+    pixels = np.random.default_rng(4).uniform(-2, 2, (300, 1, 3)) + plane(PIXEL_M / 8, 8, (0, 0, 0))
+    colours = albedo(pixels.reshape(-1, 3), PIXEL_M / 8).reshape(300, 64, 3)
+    within = colours.std(axis=1).mean() / colours.mean()
+    assert 0.01 < within < 0.2

@@ -155,3 +155,20 @@ def test_the_table_of_backscatter_gives_the_integral_of_any_ray(camera: Camera) 
             light.beam_rad, light.peak_w_per_sr, water,
         )[-1]  # fmt: skip
         np.testing.assert_allclose(out, exact, rtol=0.01)
+
+
+@settings(deadline=None)
+@given(near=st.floats(0.3, 5.0), factor=st.floats(1.1, 5.0))
+def test_light_falls_with_the_square_of_the_distance(near: float, factor: float) -> None:
+    np.testing.assert_allclose(irradiance(near), irradiance(near * factor) * factor**2, rtol=1e-9)
+    np.testing.assert_allclose(irradiance(near), 5.0 / near**2, rtol=1e-12)
+
+
+def test_a_surface_that_faces_away_or_is_in_shadow_is_dark() -> None:
+    for normal, lit in ((DOWN, 1.0), (UP, 0.0)):
+        out = np.zeros(3)
+        strobe = np.array([[0.0, 0.0, -2.0]])
+        add_direct(
+            0.0, 0.0, 0.0, normal, 0.0, np.array([lit]), strobe, DOWN, 1.0, 1.0, NO_LOSS, out
+        )
+        assert np.all(out == 0.0)

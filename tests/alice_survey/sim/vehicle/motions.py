@@ -152,3 +152,15 @@ def rotations(states: Array) -> Rotation:
 def quaternion(attitude_rad: Array) -> Array:
     quaternion: Array = rotation_from_attitude(*attitude_rad).as_quat()
     return quaternion
+
+
+def ground_velocity(states: Array, times: Array, current: Current) -> Array:
+    """(N, 3) NED velocity over ground of states."""
+    from tests.oracles_dynamics import water
+
+    return np.array(
+        [
+            rotations(state).apply(state[7:10]) + water(current, time, state[2])[0]
+            for state, time in zip(states, times, strict=True)
+        ]
+    )

@@ -1,5 +1,6 @@
 """The equations of motion at one instant: matrices, energy, signs, and the textbook's twin."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -15,11 +16,26 @@ from alice_survey.sim.vehicle.dynamics import (
     coriolis_matrix,
 )
 from alice_survey.sim.vehicle.files import SETS
+from alice_survey.sim.vehicle.sea import GRAVITY
+from alice_survey.sim.vehicle.vehicle import Vehicle
 from tests import oracles_dynamics as oracle
 from tests.alice_survey.sim.vehicle.motions import (
     SHEAR_AND_TIDE,
+    K,
+    M,
+    N,
+    P,
+    Q,
+    R,
+    U,
+    V,
+    W,
+    Y,
+    Z,
+    advance,
     alice,
     attitudes,
+    block,
     damping_matrix,
     rates,
     rotations,
@@ -165,3 +181,102 @@ def test_rates_match_newtons_law_over_ground(
     turned = (attitudes(later) - np.array(attitude)) / 1e-6
     assert np.allclose(np.sin(turned * 1e-6), np.sin(eta_rate[3:] * 1e-6), atol=1e-9)
     assert rate[3:7] @ state[3:7] == pytest.approx(0.0, abs=1e-12)
+
+
+@settings(max_examples=25, deadline=None)
+@given(nu=VELOCITIES, attitude=ATTITUDES, net_kg=st.sampled_from([-1.0, 0.0, 1.0]))
+@pytest.mark.parametrize("coefficients", SETS)
+def test_no_motion_gains_energy(
+    coefficients: str, nu: Array, attitude: tuple[float, float, float], net_kg: float
+) -> None:
+    plain = alice(coefficients)
+    heavy = replace(plain.rigid_body, dry_kg=plain.rigid_body.dry_kg + net_kg)
+    vehicle = replace(plain, rigid_body=heavy)
+    states = advance(vehicle, state_of(vehicle, nu, attitude), 3.0, 0.005)
+    angles = attitudes(states)
+    energies = np.array([
+        oracle.energy(vehicle, np.concatenate([state[:3], angle]), state[7:13])
+        for state, angle in zip(states[::10], angles[::10], strict=True)
+    ])  # fmt: skip
+    assert np.all(np.isfinite(energies))
+    assert np.max(np.diff(energies)) < 1e-6 * (1.0 + np.ptp(energies))
+
+
+def test_neutral_vehicle_stays_at_rest_when_level() -> None:
+    """No acceleration at any heading: weight and buoyancy in one line."""
+    for heading in np.linspace(-3.0, 3.0, 7):
+        rate = rates(alice(), state_of(alice(), attitude_rad=(0.0, 0.0, heading)))
+        np.testing.assert_allclose(rate, 0.0, atol=1e-14)
+
+
+def test_weight_above_buoyancy_sinks_by_both_inertias() -> None:
+    """1 kg too heavy: Z = g, over mass with the water inside and added mass."""
+    vehicle = block({"Z_wdot": -40.0}, dry_kg=51.0, entrained_kg=9.0)
+    rate = rates(vehicle, state_of(vehicle))
+    assert rate[Z] == pytest.approx(GRAVITY / (51.0 + 9.0 + 40.0), rel=1e-12)
+    np.testing.assert_allclose(np.delete(rate, Z), 0.0, atol=1e-15)
+
+
+def pushed(vehicle: Vehicle, axis: Array, newtons: float = 1.0) -> Array:
+    return advance(vehicle, state_of(vehicle), 2.0, load=newtons * axis)[-1]
+
+
+def test_each_push_moves_the_vehicle_its_way() -> None:
+    """X north, Y to starboard (east), Z down, K starboard side down, M nose up, N to starboard."""
+    vehicle = block(cg=(0.0, 0.0, 0.01))
+    assert pushed(vehicle, U)[0] > 0.01
+    assert pushed(vehicle, V)[1] > 0.01
+    assert pushed(vehicle, W)[2] > 5.01
+    rolled, pitched, turned = (pushed(vehicle, axis) for axis in (P, Q, R))
+    assert rotations(rolled).apply([0.0, 1.0, 0.0])[2] > 0.01  # the starboard side is lower
+    assert attitudes(rolled)[0] > 0.01
+    assert rotations(pitched).apply([1.0, 0.0, 0.0])[2] < -0.01  # the nose is higher
+    assert attitudes(pitched)[1] > 0.01
+    assert rotations(turned).apply([1.0, 0.0, 0.0])[1] > 0.01  # the bow is east of north
+    assert attitudes(turned)[2] > 0.01
+
+
+def test_restoring_moments_by_hand() -> None:
+    """52 kg, centre of gravity 3 cm low: 5 degrees of roll and of pitch are pushed back."""
+    low = block(cg=(0.0, 0.0, 0.03), dry_kg=52.0, buoyancy_kg=52.0)
+    angle = math.radians(5.0)
+    moment = 52.0 * GRAVITY * 0.03 * math.sin(angle)
+    # Free to sway, the body turns about its centre of gravity.
+    for axis, attitude in ((0, (angle, 0.0, 0.0)), (1, (0.0, angle, 0.0))):
+        inertia = low.rigid_body.inertia_kg_m2[axis]
+        rate = rates(low, state_of(low, attitude_rad=attitude))
+        assert rate[K + axis] == pytest.approx(-moment / inertia, rel=1e-9)
+
+
+def test_heavier_nose_pitches_down_and_heavier_starboard_rolls_to_it() -> None:
+    nose = block(cg=(0.02, 0.0, 0.0))
+    assert rates(nose, state_of(nose))[M] == pytest.approx(-50.0 * GRAVITY * 0.02 / 6.0, rel=1e-9)
+    starboard = block(cg=(0.0, 0.02, 0.0))
+    rate = rates(starboard, state_of(starboard))
+    assert rate[K] == pytest.approx(50.0 * GRAVITY * 0.02 / 1.0, rel=1e-9)
+
+
+def test_munk_moment_turns_the_body_broadside() -> None:
+    """u = 1, v = 0.1 (a drift to starboard): N = (Y_vdot - X_udot) u v turns the bow away, to port.
+
+    Added mass 3 and 70 kg: N = (3 - 70) 0.1 = -6.7 N m on 7 + 1 kg m^2; in pitch the bow turns
+    away from a heave to below, upwards.
+    """
+    slender = block(
+        {"X_udot": -3.0, "Y_vdot": -70.0, "Z_wdot": -70.0, "N_rdot": -1.0, "M_qdot": -1.0}
+    )
+    rate = rates(slender, state_of(slender, np.array([1.0, 0.1, 0, 0, 0, 0])))
+    assert rate[N] == pytest.approx(-6.7 / 8.0, rel=1e-12)
+    rate = rates(slender, state_of(slender, np.array([1.0, 0, 0.1, 0, 0, 0])))
+    assert rate[M] == pytest.approx(6.7 / 7.0, rel=1e-12)
+
+
+def test_body_lift_opposes_drift_and_weathercocks_going_ahead() -> None:
+    """The centre of lift lies 0.2 m behind the origin; astern the lift still opposes the drift."""
+    hull = block({"Y_uv": -40.0, "N_uv": 8.0, "Z_uw": -40.0, "M_uw": -8.0})
+    ahead = rates(hull, state_of(hull, np.array([1.0, 0.1, 0, 0, 0, 0])))
+    assert ahead[Y] == pytest.approx(-4.0 / 50.0) and ahead[N] == pytest.approx(0.8 / 7.0)
+    sinking = rates(hull, state_of(hull, np.array([1.0, 0, 0.1, 0, 0, 0])))
+    assert sinking[Z] == pytest.approx(-4.0 / 50.0) and sinking[M] == pytest.approx(-0.8 / 6.0)
+    astern = rates(hull, state_of(hull, np.array([-1.0, 0.1, 0, 0, 0, 0])))
+    assert astern[Y] == pytest.approx(-4.0 / 50.0) and astern[N] == pytest.approx(-0.8 / 7.0)

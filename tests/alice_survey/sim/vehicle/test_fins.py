@@ -120,3 +120,26 @@ def test_a_drive_lags_and_is_limited_in_rate_and_angle() -> None:
     )
     np.testing.assert_allclose(angles[:, 0], expected, atol=0.05)
     np.testing.assert_allclose(angles[:, 1], -(1.0 - np.exp(-time_s / 0.1)), atol=1e-3)
+
+
+def test_a_fin_square_to_the_flow_is_a_plate() -> None:
+    force = wrench(PLANE, 0.0, np.array([0, 0, 1.5, 0, 0, 0]))
+    assert force[2] == pytest.approx(-0.5 * 1000 * 0.01 * 1.5**2 * (0.56 + 0.01))
+    assert abs(force[0]) < 1e-12
+
+
+def test_lift_rises_to_the_stall_and_falls_smoothly_beyond() -> None:
+    alpha = np.radians(np.linspace(-180.0, 180.0, 3601))
+    lift = np.array([-wrench(PLANE, a, np.array([1.0, 0, 0, 0, 0, 0]))[2] for a in alpha]) / 5.0
+    assert np.degrees(abs(alpha[np.argmax(lift)])) == pytest.approx(21.0, abs=2.0)
+    assert 0.9 < lift.max() < 1.2
+    assert np.abs(np.diff(lift)).max() < 0.025
+    np.testing.assert_allclose(lift, -lift[::-1], atol=1e-12)
+
+
+@settings(max_examples=40, deadline=None)
+@given(nu=st.tuples(*[SPEEDS] * 6))
+def test_fins_that_are_not_turned_take_energy_out(nu: tuple[float, ...]) -> None:
+    force, motion = np.zeros(6), np.array(nu)
+    add_fins(REMUS.plant.fins, np.zeros(2), motion, force)
+    assert force @ motion <= 1e-12

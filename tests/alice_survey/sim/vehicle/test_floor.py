@@ -79,3 +79,24 @@ def test_a_beam_ends_on_the_near_side_of_a_ridge() -> None:
     assert found == pytest.approx(expected, abs=1e-6)
     beyond = floor_range(level_floor(10.0), 2.0, 0.5, 9.0, beam[0], beam[1], beam[2], 60.0)
     assert beyond == pytest.approx(1.0 / beam[2], abs=1e-6)
+
+
+@settings(deadline=None)
+@given(
+    north=st.floats(-49.0, 49.0),
+    east=st.floats(-49.0, 49.0),
+    slopes=st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)),
+)
+def test_depths_of_a_plane(north: float, east: float, slopes: tuple[float, float]) -> None:
+    depth = floor_depth(tilted(20.0, *slopes), north, east)
+    assert depth == pytest.approx(20.0 + slopes[0] * north + slopes[1] * east, abs=1e-9)
+
+
+def test_no_echo_is_nan() -> None:
+    floor = level_floor(10.0)
+    assert floor_range(floor, 0.0, 0.0, 8.0, 0.0, 0.0, 1.0, 5.0) == pytest.approx(2.0, abs=1e-6)
+    assert math.isnan(floor_range(floor, 0.0, 0.0, 8.0, 0.0, 0.0, 1.0, 1.9))  # too far
+    assert math.isnan(floor_range(floor, 0.0, 0.0, 8.0, 1.0, 0.0, 0.0, 50.0))  # level
+    assert math.isnan(floor_range(floor, 0.0, 0.0, 8.0, 0.0, 0.0, -1.0, 50.0))  # upwards
+    assert math.isnan(floor_range(floor, 0.0, 0.0, 10.1, 0.0, 0.0, 1.0, 50.0))  # below the floor
+    assert math.isnan(floor_range(floor, 0.0, 0.0, 10.0, 0.0, 0.0, 1.0, 50.0))  # on the floor

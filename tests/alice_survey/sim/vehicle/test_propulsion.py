@@ -10,9 +10,11 @@ from hypothesis import strategies as st
 from alice_survey.core.errors import VehicleError
 from alice_survey.sim.vehicle import propulsion as kernels
 from alice_survey.sim.vehicle.files import vehicle_from
-from alice_survey.sim.vehicle.propulsion import Thruster, pack
+from alice_survey.sim.vehicle.propulsion import Thruster, pack, with_health
 from tests import oracles_propulsion as oracles
 from tests.oracles_propulsion import Array
+
+DENSITY, DISPLACED = 1025.0, 75.0
 
 DENSITY, DISPLACED = 1025.0, 75.0
 ALICE = vehicle_from("alice")
@@ -148,3 +150,117 @@ def test_thrusters_that_make_no_sense_are_refused(change: dict[str, object]) -> 
     (field,) = change
     words = {"direction_body": "direction", "kq_forward": "k_q", "kq_reverse": "k_q|kq_reverse"}
     assert re.search(words.get(field, field), str(caught.value))
+
+
+def test_the_pair_rolls_the_vehicle_only_when_its_propellers_work_against_each_other() -> None:
+    together = wrench_of((STARBOARD, PORT), [20.0, 20.0])
+    against = wrench_of((STARBOARD, PORT), [20.0, -20.0])
+    torque = DENSITY * 0.08**5 * 400.0
+    np.testing.assert_allclose(together[3:], 0.0, atol=1e-12)
+    assert against[3] == pytest.approx(torque * (STARBOARD.kq_forward + PORT.kq_reverse))
+    # Astern is weaker: the paper's unexplained surge in turns.
+    kept = 1 - STARBOARD.thrust_deduction
+    assert against[0] == pytest.approx(kept * DENSITY * 0.08**4 * 400.0 * (0.698 - 0.293))
+    assert against[5] < 0
+
+
+@pytest.mark.parametrize(("n", "u"), [(20.0, 1.0), (20.0, -1.0), (-20.0, 1.0), (-20.0, -1.0)])
+def test_water_along_the_axis_takes_the_same_off_whichever_way_it_turns(n: float, u: float) -> None:
+    still, moving = thrust_of(PORT, n), thrust_of(PORT, n, np.array([u, 0, 0, 0, 0, 0]))
+    kept, inflow = 1 - PORT.thrust_deduction, (1 - PORT.wake_fraction) * u
+    loss = kept * DENSITY * 0.08**3 * PORT.advance_slope * 20.0 * inflow
+    assert moving == pytest.approx(still - loss, rel=1e-12)
+
+
+def test_a_jet_drags_against_the_way_and_not_at_all_when_the_thruster_stops() -> None:
+    assert drag_of(20.0, 0.5) == -drag_of(20.0, -0.5) > 0
+    assert drag_of(-20.0, 0.5) > 0
+    assert drag_of(0.0, 0.5) == 0.0
+    assert drag_of(20.0, 0.0) == 0.0
+    falling = [drag_of(n, 0.5) for n in (50.0, 20.0, 5.0, 1.0, 0.1)]
+    assert falling == sorted(falling, reverse=True)
+    # No step where it starts: all slopes vanish.
+    assert drag_of(0.05, 0.5) < 1e-6 * drag_of(20.0, 0.5)
+
+
+def test_jet_drag_is_that_of_delphin2() -> None:
+    """Its file at u = 0.5 m/s and jets of 0.883 m/s, by hand: C_d = 0.0416 of 0.1857 m^2."""
+    n = math.sqrt(0.883**2 * math.pi / 4 / (BOW.diameter_m**2 * BOW.kt_forward))
+    force = np.zeros(6)
+    kernels.add_thrust(
+        pack((BOW,), 1000.0, 80.0), np.array([n]), np.array([0.5, 0, 0, 0, 0, 0]), force
+    )
+    ratio = 0.5 / 0.883
+    by_hand = 0.565994 * math.exp(-7.608907 * ratio) + 0.056536 * math.exp(-0.896792 * ratio)
+    assert by_hand == pytest.approx(0.0416, abs=1e-4)
+    assert force[0] == pytest.approx(-0.5 * 1000 * 0.08 ** (2 / 3) * by_hand * 0.25, rel=1e-5)
+
+
+def test_more_thrust_takes_more_speed_and_limits_are_those_of_full_speed() -> None:
+    nu = np.array([0.8, 0.2, -0.1, 0.1, 0.05, 0.2])
+    lower, upper = np.zeros(5), np.zeros(5)
+    kernels.thrust_limits(PACKED, np.ones(5), nu, lower, upper)
+    grid = np.linspace(lower, upper, 201)
+    rps = np.array([[0.0] * 5 for _ in grid])
+    for thrust, row in zip(grid, rps, strict=True):
+        kernels.speeds_for(PACKED, thrust, nu, row)
+    assert np.all(np.diff(rps, axis=0) > 0)
+    maximum = PACKED.table[:, kernels.MAX_RPS]
+    np.testing.assert_allclose(rps[[0, -1]], [-maximum, maximum], rtol=1e-9)
+
+
+def test_health_is_the_share_of_bollard_thrust_that_is_left() -> None:
+    health = np.array([1.0, 0.25, 0.0, 0.5, 1.0])
+    full, weak = np.zeros((2, 5)), np.zeros((2, 5))
+    kernels.thrust_limits(PACKED, np.ones(5), REST, full[0], full[1])
+    kernels.thrust_limits(PACKED, health, REST, weak[0], weak[1])
+    np.testing.assert_allclose(weak, health * full, rtol=1e-12)
+    kernels.thrust_limits(with_health(PACKED, health), np.ones(5), REST, full[0], full[1])
+    np.testing.assert_allclose(full, weak, rtol=1e-12)
+
+
+def test_a_failed_thruster_runs_down_whatever_is_asked() -> None:
+    rates = np.zeros(5)
+    failed = with_health(PACKED, np.array([1.0, 0.0, 1.0, 1.0, 1.0]))
+    kernels.add_speed_rates(failed, np.full(5, 10.0), np.full(5, 40.0), rates)
+    assert rates[1] == pytest.approx(-10.0 / PORT.time_constant_s)
+    assert np.all(np.delete(rates, 1) > 0)
+    with pytest.raises(VehicleError):
+        with_health(PACKED, np.array([1.0, 2.0, 1.0, 1.0, 1.0]))
+
+
+def test_speeds_follow_what_is_asked_with_a_first_order_lag() -> None:
+    rps, asked, rates = np.zeros(5), np.array([10.0, -10.0, 1.9, 99.0, 4.0]), np.zeros(5)
+    step = 1e-4
+    for _ in range(8000):
+        kernels.add_speed_rates(PACKED, rps, asked, rates)
+        rps += step * rates
+    # The third and fifth lie in their dead bands; the fourth is beyond what it can.
+    ends = np.array([10.0, -10.0, 0.0, BOW.most_rps, 0.0])
+    lags = np.array([t.time_constant_s for t in EVERY])
+    np.testing.assert_allclose(rps, ends * (1 - np.exp(-0.8 / lags)), atol=2e-3)
+
+
+def test_power_at_any_speed_is_that_of_the_textbooks_torque() -> None:
+    rng = np.random.default_rng(5)
+    power = np.zeros(5)
+    for _ in range(50):
+        rps, nu = rng.uniform(-50, 50, 5), rng.uniform(-1, 1, 6)
+        kernels.electrical_power(PACKED, rps, nu, power)
+        slow = [
+            max(0.0, 2 * math.pi * n * oracles.torque_nm(t, DENSITY, n, nu)) / t.efficiency
+            for t, n in zip(EVERY, rps, strict=True)
+        ]
+        np.testing.assert_allclose(power, slow, rtol=1e-9)
+
+
+@pytest.mark.parametrize("thruster", ALICE.thrusters, ids=lambda t: t.name)
+@pytest.mark.parametrize("n", [10.0, -10.0])
+def test_no_thruster_beats_momentum_theory_nor_is_hopeless(thruster: Thruster, n: float) -> None:
+    """At bollard the jet of a duct of full area carries T^1.5 / (2 sqrt(rho A))."""
+    power = np.zeros(1)
+    kernels.electrical_power(pack((thruster,), DENSITY, DISPLACED), np.array([n]), REST, power)
+    thrust = abs(thrust_of(replace(thruster, thrust_deduction=0.0), n))
+    area = math.pi * thruster.diameter_m**2 / 4
+    jet = thrust**1.5 / (2 * math.sqrt(DENSITY * area))
+    assert jet < power[0] * thruster.efficiency < 4 * jet

@@ -1,12 +1,14 @@
 """Currents: directions, interpolation and its slopes, random series, files."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from alice_survey.core.errors import AliceError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.sea import (
     Current,
@@ -16,6 +18,8 @@ from alice_survey.sim.vehicle.sea import (
     sheared_current,
     varying_current,
 )
+
+TIMES, DEPTHS = np.array([0.0, 7.0, 10.0, 31.0]), np.array([-1.0, 2.0, 2.5, 20.0, 21.0])
 
 TIMES, DEPTHS = np.array([0.0, 7.0, 10.0, 31.0]), np.array([-1.0, 2.0, 2.5, 20.0, 21.0])
 GRID = Current(TIMES, DEPTHS, np.random.default_rng(2).normal(0.0, 0.3, (4, 5, 2)))
@@ -100,3 +104,30 @@ def test_a_file_gives_its_values_in_whatever_order(
     np.testing.assert_array_equal(current.velocity_ne_mps, values)
     np.testing.assert_array_equal(current.time_s, 10.0 * np.arange(times))
     np.testing.assert_array_equal(current.depth_m, 2.5 * np.arange(depths) + 1)
+
+
+def test_shear_is_linear_between_and_constant_beyond() -> None:
+    shear = sheared_current(np.array([2.0, 12.0]), np.array([[0.1, 0.0], [0.4, 90.0]]))
+    np.testing.assert_allclose(at(shear, 3.0, 0.0), [0.1, 0.0, 0, 0, 0, 0], atol=1e-16)
+    np.testing.assert_allclose(at(shear, 3.0, 99.0), [0.0, 0.4, 0, 0, 0, 0], atol=1e-16)
+    middle = at(shear, 3.0, 7.0)
+    np.testing.assert_allclose(middle, [0.05, 0.2, 0.0, 0.0, -0.01, 0.04], atol=1e-15)
+
+
+@settings(deadline=None)
+@given(time_s=st.floats(-5.0, 40.0), depth_m=st.floats(-5.0, 30.0))
+def test_interpolation_is_numpys_along_either_axis(time_s: float, depth_m: float) -> None:
+    value = at(GRID, time_s, depth_m)
+    for axis in range(2):
+        by_depth = [np.interp(depth_m, DEPTHS, row) for row in GRID.velocity_ne_mps[:, :, axis]]
+        assert value[axis] == pytest.approx(np.interp(time_s, TIMES, by_depth), abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    "rows", ["", "0,1,0.1", "0,1,0.1,x", "0,1,0.1,0\n0,2,0.1,0\n9,1,0.1,0", "0,1,0.1,0\n0,1,0.1,0"]
+)
+def test_a_file_with_gaps_is_refused(tmp_path: Path, rows: str) -> None:
+    path = tmp_path / "current.csv"
+    path.write_text(f"time_s,depth_m,north_mps,east_mps\n{rows}\n")
+    with pytest.raises(AliceError, match=r"current\.csv"):
+        read_current(path)

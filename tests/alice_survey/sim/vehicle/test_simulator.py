@@ -1,5 +1,7 @@
 """The closed loop as a whole: what it records must be one motion, and the same each time."""
 
+import math
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -89,3 +91,16 @@ def test_the_same_seed_flies_the_same_way_and_another_does_not(gusty: Flown) -> 
     np.testing.assert_array_equal(again.navigation, gusty.navigation)
     rows = min(len(other.state), len(gusty.state))
     assert np.abs(other.state[:rows, :3] - gusty.state[:rows, :3]).max() > 1e-3
+
+
+def test_velocity_over_ground_is_that_through_water_and_the_current(calm: Flown) -> None:
+    to_ned = Rotation.from_quat(calm.state[:, 3:7])
+    water = calm.truth[:, 7:10] - to_ned.apply(calm.state[:, 7:10])
+    expected = [0.1 * math.cos(math.radians(60)), 0.1 * math.sin(math.radians(60)), 0.0]
+    np.testing.assert_allclose(water, np.tile(expected, (len(water), 1)), atol=1e-12)
+
+
+def test_a_mission_that_takes_too_long_is_broken_off_where_it_is() -> None:
+    flown = simulate(setup(), np.random.default_rng(1), max_s=10.0, label="test")
+    assert len(flown.time_s) == 200
+    assert flown.report[-1, PHASE] == DIVE

@@ -1,5 +1,7 @@
 """Steady motion against the equations of motion."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,8 @@ from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.propulsion import add_thrust
 from alice_survey.sim.vehicle.sea import constant_current
 from alice_survey.sim.vehicle.steady import BALANCED, drag_power, steady_flight
+
+ALICE, SPARUS = vehicle_from("alice"), vehicle_from("sparus2")
 
 ALICE, SPARUS = vehicle_from("alice"), vehicle_from("sparus2")
 RNG = np.random.default_rng(1)
@@ -76,3 +80,23 @@ def test_turning_while_the_water_stands_still_over_ground_takes_its_acceleration
     derivative(0.0, state, flight.rps[0], np.zeros(6), plant, still, scratch_for(5), out)
     left = plant.body.mass @ (out[7:13] - rate[0])
     assert np.abs(left[list(BALANCED)]).max() < 1e-6
+
+
+def test_a_share_of_thrust_bounds_the_load() -> None:
+    nu = np.zeros((60, 6))
+    nu[:, 1] = np.linspace(0.01, 0.6, 60)
+    whole, part = steady_flight(ALICE, nu), steady_flight(ALICE, nu, share=0.5)
+    kept = np.isfinite(part.power_w)
+    assert 10 < kept.sum() < np.isfinite(whole.power_w).sum() < 60
+    assert np.all(part.load[kept] <= 0.5 + 1e-9)
+    assert np.all(whole.load[~kept & np.isfinite(whole.load)] > 0.5 - 1e-9)
+    # Speeds squared are thrust but for the drag of the flow: at the bound the share is used up.
+    assert part.load[kept].max() > 0.45
+
+
+def test_one_lateral_thruster_is_made_up_for_by_the_pair_astern() -> None:
+    nu = np.zeros((1, 6))
+    nu[0, :2] = 0.2, 0.08
+    sound, lame = steady_flight(ALICE, nu), steady_flight(ALICE.without(["bow"]), nu)
+    assert lame.power_w[0] > 2 * sound.power_w[0]
+    assert math.isfinite(lame.power_w[0])

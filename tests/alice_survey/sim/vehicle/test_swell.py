@@ -55,3 +55,18 @@ def test_a_varying_current_is_kept_under_the_waves() -> None:
             np.testing.assert_allclose(
                 at(calm, time_s, depth_m), at(varying, time_s, depth_m), atol=1e-12
             )
+
+
+def test_deep_and_shallow_water_are_the_known_limits() -> None:
+    omega = 2 * math.pi / 4.0
+    assert wave_number(4.0, 200.0) == pytest.approx(omega**2 / GRAVITY, rel=1e-12)
+    long = 2 * math.pi / 60.0
+    assert wave_number(60.0, 2.0) == pytest.approx(long / math.sqrt(GRAVITY * 2.0), rel=2e-3)
+
+
+def test_deep_water_orbits_are_circles_that_shrink_with_depth() -> None:
+    """At the surface the speed is that of a circle of the wave's height, once a period."""
+    k = wave_number(5.0, 300.0)
+    speeds = orbital_speed_mps(1.0, 5.0, 300.0, np.array([0.0, 1.0 / k]))
+    assert speeds[0] == pytest.approx(math.pi / 5.0, rel=1e-9)
+    assert speeds[1] == pytest.approx(math.pi / 5.0 / math.e, rel=1e-9)

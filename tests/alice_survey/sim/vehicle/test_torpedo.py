@@ -6,6 +6,7 @@ shape of the hull.
 
 import math
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -17,18 +18,25 @@ from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.identification.report import IdentifyOptions, identify_report
 from alice_survey.sim.vehicle.pilot import gains as g
 from alice_survey.sim.vehicle.pilot.gains import (
+    LATERAL,
+    VERTICAL,
+    damping_ratio,
     gains_for,
+    heading_loop,
 )
-from alice_survey.sim.vehicle.pilot.settings import UnderWay, circle_course
+from alice_survey.sim.vehicle.pilot.settings import UnderWay, circle_course, dive_loop
 from alice_survey.sim.vehicle.steady import (
     MAX_DRIFT_RAD,
     balance_fins,
     fin_flight,
     min_radius_m,
     min_speed_mps,
+    steady_flight,
 )
 from tests import oracles_dynamics as oracle
 from tests.alice_survey.sim.vehicle.motions import STILL
+
+RHO, FIN_M2, FIN_X = 1030.0, 0.00665, -0.638
 
 Array = NDArray[np.float64]
 REMUS = vehicle_from("remus100")
@@ -132,3 +140,112 @@ def test_the_circle_leads_through_its_goal_with_its_heading(side: float) -> None
 def test_logs_of_it_are_not_identified_as_if_it_had_no_fins(tmp_path: Path) -> None:
     with pytest.raises(VehicleError, match="steered by fins"):
         identify_report([], tmp_path, IdentifyOptions(vehicle="remus100"))
+
+
+@cache
+def myring() -> tuple[Array, Array]:
+    """(K,) x from the centre of buoyancy, forward, and radius: nose 0.191, middle 0.654, tail 0.541
+    m with an angle of 0.436 rad, of which 0.0165 and 0.0368 m are cut off; 0.191 m across."""
+    a, b, c, angle, d = 0.191, 0.654, 0.541, 0.436, 0.191
+    aft = np.linspace(0.0, a + b + c - 0.0165 - 0.0368, 20001)
+    t = np.maximum(aft + 0.0165 - (a + b), 0.0)
+    nose = d / 2 * np.sqrt(np.clip(1 - ((aft + 0.0165 - a) / a) ** 2, 0.0, 1.0))
+    tail = d / 2 - (1.5 * d / c**2 - math.tan(angle) / c) * t**2
+    tail += (d / c**3 - math.tan(angle) / c**2) * t**3
+    radius = np.where(aft + 0.0165 < a, nose, tail)
+    volume = np.trapezoid(math.pi * radius**2, aft)
+    return np.trapezoid(math.pi * radius**2 * aft, aft) / volume - aft, radius
+
+
+def along(values: Array) -> float:
+    """Integral along the hull."""
+    return float(np.trapezoid(values, -myring()[0]))
+
+
+def test_the_hull_displaces_what_the_vehicle_weighs_and_some_water_inside() -> None:
+    x, radius = myring()
+    assert x[0] == pytest.approx(REMUS.hull.nose_m, abs=0.01)
+    assert -x[-1] == pytest.approx(REMUS.hull.tail_m, abs=0.01)
+    displaced = along(RHO * math.pi * radius**2)
+    assert 1.0 < displaced / REMUS.rigid_body.buoyancy_kg < 1.1
+    # Its mass spread as its volume.
+    spread = along(math.pi * radius**2 * x**2) / along(math.pi * radius**2)
+    pitch = REMUS.rigid_body.dry_kg * (spread + 0.191**2 / 16)
+    assert REMUS.rigid_body.inertia_kg_m2[1] == pytest.approx(pitch, rel=0.03)
+    assert REMUS.rigid_body.inertia_kg_m2[0] == pytest.approx(30.49 * 0.191**2 / 8, rel=0.25)
+
+
+def test_added_masses_are_those_of_its_sections() -> None:
+    """Circles, and circles with four fins (Blevins), strip by strip; an ellipsoid ahead."""
+    x, radius = myring()
+    reach = 0.151
+    finned = np.abs(x - FIN_X) < 0.0747 / 2
+    section = np.where(finned, reach**2 - radius**2 + radius**4 / reach**2, radius**2)
+    strip = RHO * math.pi * section
+    named = REMUS.coefficients.values
+    assert named["Y_vdot"] == pytest.approx(-along(strip), rel=0.06)
+    assert named["N_rdot"] == pytest.approx(-along(strip * x**2), rel=0.12)
+    assert 0.0 < named["Y_rdot"] < 1.1 * -along(strip * x) * 1.0 + 1.0
+    e = math.sqrt(1 - (0.191 / 1.33) ** 2)
+    alpha = 2 * (1 - e**2) / e**3 * (0.5 * math.log((1 + e) / (1 - e)) - e)
+    surge = alpha / (2 - alpha) * 4 / 3 * math.pi * RHO * 0.665 * 0.0955**2
+    assert named["X_udot"] == pytest.approx(-surge, rel=0.03)
+    assert named["X_uu"] == pytest.approx(-0.5 * RHO * 0.2 * 0.0285, rel=0.01)
+
+
+def test_the_tables_have_ten_times_the_drag_across_that_their_equations_give() -> None:
+    """C_D 1.1 of strips and 0.558 of fins: what the file says of the thesis holds."""
+    x, radius = myring()
+    strip, fins = 0.5 * RHO * 1.1 * 2 * radius, RHO * FIN_M2 * 0.558
+    named = REMUS.coefficients.values
+    derived = along(strip) + fins
+    assert derived == pytest.approx(132.0, abs=2.0)
+    assert -named["Y_vv"] / derived == pytest.approx(10.0, rel=0.02)
+    turning = along(strip * np.abs(x) ** 3) + fins * abs(FIN_X) ** 3
+    assert turning == pytest.approx(8.5, abs=0.3)
+    assert -named["N_rr"] / turning == pytest.approx(11.0, abs=0.6)
+    assert -named["M_qq"] / turning == pytest.approx(22.0, abs=1.2)
+
+
+@pytest.mark.parametrize("speed", SPEEDS)
+def test_loops_are_damped_and_within_the_strength_of_the_fins(speed: float) -> None:
+    gains = gains_for(REMUS, speed)
+    assert gains.dives_by_pitch and not gains.holds_level
+    assert not gains.axes[[g.SWAY, g.HEAVE, g.ROLL]].any()
+    for axis, plane in ((g.YAW, LATERAL), (g.PITCH, VERTICAL)):
+        row = gains.axes[axis]
+        loop = heading_loop(gains.body, speed, row, gains.fins, plane)
+        assert g.MIN_HEADING_DAMPING < damping_ratio(loop) < 1.0
+        poles = np.linalg.eigvals(loop)
+        assert poles.real.max() < -0.02
+        # An error of 10 deg takes about the moment that there is.
+        assert 0.3 < row[g.MASS] * row[g.PLACE] * g.KEPT_RAD / row[g.MAX_FORCE] < 1.5
+    depth = np.linalg.eigvals(dive_loop(gains, speed, 2.5))
+    assert depth.real.max() < -0.005
+
+
+def test_four_fins_that_turn_apart_hold_roll_too() -> None:
+    planes, rudders = REMUS.fins
+    apart = tuple(
+        replace(fin, name=f"{fin.name} {i}", positions_body_m=(place,))
+        for fin in (planes, rudders)
+        for i, place in enumerate(fin.positions_body_m)
+    )
+    gains = gains_for(replace(REMUS, fins=apart), 1.0)
+    assert gains.holds_level and gains.dives_by_pitch
+    assert gains.axes[g.ROLL, g.MAX_FORCE] > 0.5
+
+
+def test_power_is_that_of_drag_and_turns() -> None:
+    """At 1.5 m/s, nearly level: the propeller gives X_uu u^2 / (1 - t), by its open-water curve."""
+    nu = np.zeros((4, 6))
+    nu[:, 0], nu[1, 5], nu[2, 0], nu[3, 1] = 1.5, 0.2, 0.2, 0.1
+    flight = steady_flight(REMUS, nu, share=SHARE)
+    assert np.isnan(flight.power_w).tolist() == [False, False, True, True]
+    level = balance_fins(REMUS, 1.5)
+    assert level is not None
+    assert level.force_x_n == pytest.approx(2.94 * 1.5**2, rel=0.05)
+    n = flight.rps[0, 0]
+    thrust = RHO * 0.14**4 * 0.4566 * n**2 - RHO * 0.14**3 * 0.4174 * n * 0.944 * 1.5
+    assert 0.9 * thrust == pytest.approx(level.force_x_n, rel=1e-6)
+    assert flight.power_w[1] > flight.power_w[0]

@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alice_survey.core.errors import VehicleError
+from alice_survey.sim.vehicle.coefficients import Coefficients
 from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.propulsion import add_thrust
 from alice_survey.sim.vehicle.sea import GRAVITY
@@ -76,3 +77,29 @@ def test_configuration_matrix_is_the_thrusters_at_work(name: str) -> None:
         assert push > 0.5
         np.testing.assert_allclose(wrench, matrix[:, i] * push, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(matrix[:3, i], thruster.direction_body)
+
+
+def test_rigid_inertia_of_two_weights_by_hand() -> None:
+    """2 kg, 1 m ahead of the origin: 2 kg m^2 about y and z, and the coupling of v to r."""
+    point = RigidBody(
+        dry_kg=2.0,
+        buoyancy_kg=2.0,
+        entrained_kg=0.0,
+        cg_body_m=(1.0, 0.0, 0.0),
+        inertia_kg_m2=(0.0, 0.0, 0.0),
+    )
+    expected = np.diag([2.0, 2.0, 2.0, 0.0, 2.0, 2.0])
+    expected[1, 5] = expected[5, 1] = 2.0  # turning to starboard moves the weight to starboard
+    expected[2, 4] = expected[4, 2] = -2.0  # nose up moves it up
+    np.testing.assert_array_equal(point.mass_matrix, expected)
+
+
+def test_thrusters_and_coefficients_can_be_exchanged() -> None:
+    full = vehicle_from("alice")
+    failed = full.without(["bow"])
+    assert [t.name for t in failed.thrusters] == [t.name for t in full.thrusters if t.name != "bow"]
+    assert failed.configuration_matrix.shape == (6, 4)
+    assert len(full.thrusters) == 5
+    other = full.with_coefficients(Coefficients(name="light", values={"X_udot": -1.0}))
+    assert other.mass[0, 0] == pytest.approx(full.rigid_body.mass_matrix[0, 0] + 1.0)
+    assert other.thrusters == full.thrusters

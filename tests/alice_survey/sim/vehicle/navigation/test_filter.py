@@ -10,16 +10,19 @@ from alice_survey.sim.vehicle import rotations
 from alice_survey.sim.vehicle.navigation.filter import (
     BEAM,
     BELIEVED,
+    COMPASS_USE,
     DEPTH,
     DVL_SCALE,
     DVL_USE,
     GPS_FIX,
     HEADING,
+    HEADING_BIAS,
     PUSH,
     QUATERNION,
     RATES,
     REJECTED,
     ROW,
+    RUN,
     TRUTH_NOW,
     TURN,
     USBL_FIX,
@@ -42,6 +45,8 @@ from alice_survey.sim.vehicle.navigation.sensors import (
     CompassSpec,
     DvlSpec,
     GpsSpec,
+    ImuSpec,
+    PressureSpec,
     Sensors,
     SensorSuite,
     UsblSpec,
@@ -60,6 +65,19 @@ from tests.alice_survey.sim.vehicle.navigation.navigation_runs import (
     straight,
     track,
 )
+
+TINY = 1e-9
+PERFECT_IMU = ImuSpec(
+    gyro_bias_sigma_radps=TINY, gyro_bias_walk_radps_per_sqrt_s=0.0,
+    accelerometer_bias_sigma_mps2=TINY, accelerometer_bias_walk_mps2_per_sqrt_s=0.0,
+    tilt_sigma_rad=TINY,
+)  # fmt: skip
+PERFECT_COMPASS = CompassSpec(noise_rad=1e-6, bias_sigma_rad=TINY)
+PERFECT_DVL = DvlSpec(
+    scale_sigma=TINY, bias_sigma_mps=TINY, misalignment_sigma_rad=TINY, ping_loss=0.0,
+    beam_loss=0.0, outlier_probability=0.0, beam_noise_per_speed=0.0,
+)  # fmt: skip
+PERFECT_GPS = GpsSpec(noise_m=1e-6, bias_sigma_m=TINY)
 
 FLOOR = level_floor(15.0)
 
@@ -303,3 +321,83 @@ def test_nothing_that_is_no_number_enters() -> None:
     correct(nav)
     np.testing.assert_array_equal(nav.covariance, before)
     np.testing.assert_allclose(nav.nominal, nominal, rtol=1e-15)
+
+
+def test_noise_of_the_dvl_walks_with_the_root_of_time() -> None:
+    # Whatever the IMU does, a filter that follows white noise of velocity gathers all of it:
+    # sigma^2 = (noise of a ping)^2 (time between pings) (time).
+    suite = SensorSuite(
+        imu=PERFECT_IMU, compass=PERFECT_COMPASS, dvl=PERFECT_DVL, gps=PERFECT_GPS,
+        pressure=PressureSpec(bias_sigma_m=TINY),
+    )  # fmt: skip
+    sensors = suite.pack()
+    of_a_ping = PERFECT_DVL.beam_noise_mps / np.sqrt(np.sum(sensors.beams[:, 0] ** 2))
+    ends, truth = [], straight(300.0, 0.2)
+    for seed in range(60):
+        run = fly(sensors, truth, FLOOR, seed)
+        ends.append(run.log[[1500, 6000], :2] - truth[[1500, 6000], :2])
+    for i, time_s in enumerate((75.0, 300.0)):
+        walk = of_a_ping * np.sqrt(0.2 * time_s)
+        rms = np.sqrt(np.mean(np.array(ends)[:, i] ** 2))
+        # 120 draws: 6.5 % each way, and three of those.
+        assert rms == pytest.approx(walk, rel=0.2)
+        assert run.log[[1500, 6000][i], column("sigma_north_m")] == pytest.approx(walk, rel=0.03)
+
+
+def test_a_heading_bias_leads_astray_by_distance_times_bias() -> None:
+    suite = SensorSuite(
+        imu=PERFECT_IMU, dvl=PERFECT_DVL, gps=PERFECT_GPS,
+        compass=CompassSpec(bias_sigma_rad=np.deg2rad(1.0), bias_correlation_s=1e9),
+    )  # fmt: skip
+    sensors, truth = suite.pack(), straight(300.0)
+    run = fly(sensors, truth, FLOOR, 4)
+    bias = run.hidden[-1, HEADING_BIAS - 9]
+    distance_m = truth[-1, 0]
+    assert abs(bias) > np.deg2rad(0.3)
+    # Walked noise of the DVL, 0.04 m, and the compass's, which averages out.
+    assert run.log[-1, 1] == pytest.approx(distance_m * bias, abs=0.25)
+    sigma = run.log[-1, column("sigma_east_m")]
+    assert sigma == pytest.approx(distance_m * np.deg2rad(1.0), rel=0.03)
+
+
+def test_without_the_dvl_a_level_imu_falls_off_as_integrated_noise() -> None:
+    # Angle noise tilts gravity: variance g^2 n^2 t^5 / 20; velocity noise adds m^2 t^3 / 3.
+    imu = PERFECT_IMU._replace(gyro_noise_rad_per_sqrt_s=2e-4)
+    suite = SensorSuite(
+        imu=imu, compass=PERFECT_COMPASS, gps=PERFECT_GPS, dvl=PERFECT_DVL._replace(rate_hz=0.0)
+    )
+    sensors, time_s = suite.pack(), 40.0
+    nav = new_navigation(sensors, straight(time_s)[0], default_rng(0))
+    nav.covariance[3:6] = nav.covariance[:, 3:6] = 0.0
+    nav.covariance[3:6, 3:6] = 1e-12 * np.eye(3)
+    run = fly(sensors, straight(time_s), FLOOR, 0, start=nav)
+    m = imu.accelerometer_noise_mps_per_sqrt_s
+    expected = np.sqrt((9.80665 * 2e-4) ** 2 * time_s**5 / 20 + m**2 * time_s**3 / 3)
+    # The compass takes away nothing that leads north or east.
+    assert run.log[-1, column("sigma_north_m")] == pytest.approx(expected, rel=0.01)
+    assert run.log[-1, column("sigma_east_m")] == pytest.approx(expected, rel=0.01)
+
+
+def test_a_disturbed_compass_is_rejected_first_and_then_widens_its_bias() -> None:
+    sensors, truth = SensorSuite().pack(), straight(60.0, 0.2)
+    rng = default_rng(2)
+    nav = new_navigation(sensors, truth[0], rng)
+    heading, sigma = [], []
+    for k in range(len(truth)):
+        if k == 400:
+            nav.hidden[HEADING_BIAS - 9] += np.deg2rad(30.0)
+        estimate = np.zeros(14)
+        navigation_tick(
+            k * TICK_S, k, TICK_S, truth[max(k - 1, 0)], truth[k], np.zeros(3), FLOOR, sensors,
+            nav, rng, estimate,
+        )  # fmt: skip
+        heading.append(estimate[5])
+        sigma.append(np.sqrt(nav.covariance[8, 8]))
+    counts = nav.counts[COMPASS_USE]
+    assert counts[WIDENED] == 1
+    assert counts[REJECTED] == 50
+    assert counts[RUN] == 0
+    # The gyroscopes hold the heading; the bias takes up the disturbance.
+    assert np.ptp(heading[390:]) < np.deg2rad(0.5)
+    assert np.rad2deg(nav.nominal[HEADING_BIAS + 1]) == pytest.approx(30.0, abs=3.0)
+    assert sigma[-1] >= 0.99 * sigma[399]

@@ -26,12 +26,15 @@ from alice_survey.sim.vehicle.navigation.sensors import (
     IMU,
     Sensors,
     SensorSuite,
+    janus_beams,
 )
-from alice_survey.sim.vehicle.navigation.tick import measure_dvl, measure_imu
+from alice_survey.sim.vehicle.navigation.tick import measure_dvl, measure_imu, solve_beams
 from alice_survey.sim.vehicle.sea import FloorGrid, level_floor
 from tests.alice_survey.sim.vehicle.navigation.navigation_runs import (
     TICK_S,
     Array,
+    fly,
+    straight,
     track,
 )
 
@@ -157,3 +160,45 @@ def test_the_dvl_hears_what_is_in_its_reach(
     heard = ping(silent(), truth, level_floor(15.0), count=0).readings
     assert np.isfinite(heard[BEAM : BEAM + 4]).sum() == beams
     assert np.isfinite(heard[WATER_VELOCITY]) == water
+
+
+def test_an_imu_at_rest_feels_its_weight_upwards() -> None:
+    sensors, truth = silent(), at_depth(3.0, Rotation.from_euler("ZYX", [1.0, 0.0, np.pi / 2]))
+    nav = new_navigation(sensors, truth, np.random.default_rng(0))
+    rotations.matrix_of(truth[3:7], nav.turns[TRUTH_NOW])
+    measure_imu(TICK_S, truth, truth, sensors, nav, np.random.default_rng(0))
+    # Rolled to starboard, port is up: -y.
+    push = nav.readings[PUSH : PUSH + 3] / TICK_S
+    np.testing.assert_allclose(push, [0.0, -9.80665, 0.0], atol=1e-9)
+
+
+def test_over_a_deep_floor_the_dvl_hears_the_water_alone() -> None:
+    heard = ping(silent(), at_depth(8.0), level_floor(200.0)).readings
+    assert np.all(np.isnan(heard[RANGE : RANGE + 4]))
+    np.testing.assert_allclose(
+        heard[WATER_VELOCITY : WATER_VELOCITY + 3], [-0.1, 0.2, 0.0], atol=1e-9
+    )
+
+
+@given(velocity=vectors, missing=st.integers(0, 4))
+def test_three_beams_give_the_velocity_as_four_do(velocity: Array, missing: int) -> None:
+    beams = janus_beams(np.deg2rad(30.0))
+    along, out = beams @ velocity, np.zeros(3)
+    if missing < 4:
+        along[missing] = np.nan
+    solve_beams(beams, along, out)
+    np.testing.assert_allclose(out, velocity, atol=1e-9)
+    along[(missing + 1) % 4] = np.nan
+    along[(missing + 2) % 4] = np.nan
+    solve_beams(beams, along, out)
+    assert np.all(np.isnan(out))
+
+
+def test_no_echo_comes_in_a_drop_out() -> None:
+    suite = SensorSuite(dvl_dropouts_s=((2.0, 3.0), (5.0, 5.5)))
+    run = fly(suite.pack(), straight(8.0), level_floor(15.0), 0)
+    heard = np.any(np.isfinite(run.innovations[::4, 2:6]), axis=1)
+    time_s = np.arange(len(heard)) * 0.2
+    silent_then = ((time_s > 1.99) & (time_s < 2.99)) | ((time_s > 4.99) & (time_s < 5.49))
+    assert not heard[silent_then].any()
+    assert heard[~silent_then].mean() > 0.9

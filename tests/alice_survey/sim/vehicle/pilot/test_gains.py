@@ -187,3 +187,50 @@ def test_heading_is_damped_with_the_sway_that_it_brings(
 def test_a_vehicle_that_cannot_be_controlled_is_refused(name: str, lost: str) -> None:
     with pytest.raises(VehicleError):
         gains_for(vehicle_from(name).weaken({lost: 0.0}), 0.2)
+
+
+@pytest.mark.parametrize(("name", "axis"), AXES)
+def test_greatest_speed_takes_three_quarters_of_the_force(name: str, axis: int) -> None:
+    gains = gains_of(name)
+    row, nu, force = gains.axes[axis], np.zeros(6), np.zeros(6)
+    nu[DEGREES[axis]] = row[g.FASTEST]
+    add_damping(gains.body, nu, force)
+    share = -force[DEGREES[axis]] / min(-row[g.MIN_FORCE], row[g.MAX_FORCE])
+    if axis == g.YAW and row[g.FASTEST] == pytest.approx(math.radians(30.0)):
+        assert share < g.STEADY_SHARE  # bounded by the rate, not by the thrusters
+    else:
+        assert share == pytest.approx(g.STEADY_SHARE, rel=1e-9)
+
+
+def test_without_lateral_thrusters_sway_has_no_gains() -> None:
+    row = gains_of("sparus2").axes[g.SWAY]
+    assert row[g.MASS] > 0
+    assert not np.any(row[[g.RATE, g.PLACE, g.INTEGRAL, g.FASTEST]])
+
+
+@pytest.mark.parametrize("name", ["alice", "sparus2"])
+@pytest.mark.parametrize("decay_share", [0.0, 0.5, 1.0])
+def test_a_wanted_speed_is_not_overshot(name: str, decay_share: float) -> None:
+    """Of the linear loop; with less drag than is fed forward, too."""
+    from scipy.signal import step
+
+    row = gains_of(name).axes[g.SURGE]
+    body = gains_of(name).body
+    decay = linear_damping(body, np.array([0.2, 0, 0, 0, 0, 0]))[0, 0] / row[g.MASS]
+    plant = [row[g.LAG], 1 + row[g.LAG] * decay * decay_share, decay * decay_share + row[g.RATE]]
+
+    def overshoot(weight: float) -> float:
+        top = [row[g.RATE] * weight + decay * decay_share, row[g.PLACE]]
+        _, out = step((top, [*plant, row[g.PLACE]]), N=4000)
+        return float(out.max()) - 1.0
+
+    assert overshoot(row[g.WEIGHT]) < 0.05
+    assert overshoot(1.0) > 0.1
+    assert 0.0 < row[g.WEIGHT] < 0.5
+
+
+def test_a_lost_lateral_thruster_makes_sway_as_slow_as_the_pair_that_helps_it() -> None:
+    whole, lame = vehicle_from("alice"), vehicle_from("alice").weaken({"bow": 0.0})
+    slow = gains_for(lame, 0.2).axes[g.SWAY]
+    assert slow[g.LAG] > 2.0 * gains_for(whole, 0.2).axes[g.SWAY, g.LAG]
+    assert slow[g.LAG] < 0.85
