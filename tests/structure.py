@@ -30,7 +30,7 @@ WORDS = Path(__file__).with_name("structure_words.toml")
 """Words that are not used, and where each of them counts."""
 BOUNDS = {
     "code lines of the packages": 79_050,  # goal: 68_000
-    "code lines of the tests": 55_350,  # goal: 48_000
+    "code lines of the tests": 55_900,  # goal: 48_000
     "code lines of the benchmarks": 8_850,  # goal: 8_000
     "lines of our own JavaScript": 6_420,  # goal: 5_000
     "modules": 449,  # goal: 400

@@ -327,3 +327,21 @@ def test_json_with_an_unknown_or_a_missing_key_is_refused() -> None:
         camera_from_json({**data, "k9": 0.1})
     with pytest.raises(CalibrationError, match="fx_px"):
         camera_from_json({key: value for key, value in data.items() if key != "fx_px"})
+
+
+def test_near_the_axis_water_magnifies_by_its_index() -> None:
+    camera = changed(MANTA, port_distance_m=0.0, glass_thickness_m=0.0)
+    point = np.array([1e-5, -2e-5, 2.0])
+
+    offset = camera.project(point) - [camera.cx_px, camera.cy_px]
+
+    np.testing.assert_allclose(offset, 1.34 * 3387.5 * point[:2] / 2.0, rtol=1e-8)
+
+
+@given(factor=st.floats(0.1, 10.0), x=st.floats(-0.5, 0.5), y=st.floats(-0.5, 0.5))
+def test_pixels_do_not_know_the_unit_of_length(factor: float, x: float, y: float) -> None:
+    point = np.array([x, y, 1.5])
+    camera = changed(MANTA, normal=tilted(4.0, 70.0))
+    larger = changed(camera, port_distance_m=0.02 * factor, glass_thickness_m=0.01 * factor)
+
+    np.testing.assert_allclose(larger.project(factor * point), camera.project(point), atol=1e-8)

@@ -185,3 +185,32 @@ def test_bad_input_is_one_clear_line(pixels: Array, poses: int, sigma: float, na
     with pytest.raises(CalibrationError) as error:
         triangulate([UNDERWATER] * 2, stereo(poses), pixels, sigma)
     assert named in str(error.value) and "\n" not in str(error.value)
+
+
+def test_least_squares_is_never_worse_than_the_midpoint() -> None:
+    rng = np.random.default_rng(4)
+    points, poses = seafloor(rng, 2000), stereo()
+    pixels = reproject([UNDERWATER] * 2, poses, points) + rng.normal(0.0, 5.0, (2, 2000, 2))
+
+    found = triangulate([UNDERWATER] * 2, poses, pixels)
+
+    best = (found.residuals_px**2).sum(axis=(0, 2))
+    middle = (found.nearest_residuals_px**2).sum(axis=(0, 2))
+    assert np.all(best <= middle + 1e-9)
+    assert np.any(best < 0.99 * middle)
+
+
+def test_parallel_rays_have_no_solution() -> None:
+    same = RigidTransform.identity()
+    pixels = np.full((2, 3, 2), 1500.0)
+
+    found = triangulate([UNDERWATER] * 2, [same, same], pixels)
+
+    assert np.isnan(found.points_world).all()
+
+
+def test_nearest_point_to_two_rays_is_the_middle_of_their_gap() -> None:
+    origins = np.array([[[0.0, 0.0, 0.0]], [[0.0, 1.0, 5.0]]])
+    directions = np.array([[[1.0, 0.0, 0.0]], [[0.0, 0.0, -1.0]]])
+
+    np.testing.assert_allclose(nearest_to_rays(origins, directions), [[0.0, 0.5, 0.0]], atol=1e-15)

@@ -12,6 +12,7 @@ from alice_survey.core.config import SurveyConfig, load_config, parse_config, wi
 from alice_survey.core.errors import AliceError, PlanError, VehicleError
 from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.pilot.gains import gains_for
+from missions.plan.strength import survey_costs
 from missions.route.energy import battery_wh, hotel_w, planned_vehicle
 from missions.values.flight import Flight, rms
 from tests.missions.flown_plans import flown, planned
@@ -135,3 +136,12 @@ def test_a_vehicle_is_named_for_one_plan(tmp_path: Path) -> None:
     assert abs(heavy - own) > 0.02 * own
     with pytest.raises(VehicleError, match="'nautilus' is not known"):
         plan_report(tmp_path, None, vehicle="nautilus")
+
+
+def test_energy_is_that_of_the_vehicle() -> None:
+    """Drag of the ROV at 0.2 m/s: 13.7 x 0.2 + 141 x 0.04 N, by four thrusters at 45 deg."""
+    costs = survey_costs(survey({"name": "bluerov2_heavy", "hotel_w": 0.0}, sea={"current_mps": 0}))
+    drag_w = (13.7 * 0.2 + 141.0 * 0.04) * 0.2
+    assert 1.5 * drag_w < float(np.min(costs.way_w)) < 30.0 * drag_w
+    ours = survey_costs(survey({"hotel_w": 0.0}, sea={"current_mps": 0}))
+    assert float(np.min(costs.way_w)) > 1.5 * float(np.min(ours.way_w))

@@ -1,5 +1,6 @@
 """COPC files of `reconstruct.copc`, read by laspy as COPC and as plain LAZ."""
 
+import tracemalloc
 from collections.abc import Iterable
 from datetime import date
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 from laspy.copc import Bounds
 
 from alice_survey.core.executor import SERIAL, Executor, local_executor
+from reconstruct import copc
 from reconstruct.copc import PointSpool, write_copc
 
 STEP_M = 1e-4
@@ -155,3 +157,23 @@ def test_workers_make_the_same_bytes(tmp_path: Path):
         (tmp_path / name).mkdir()
         files.append(write(tmp_path / name, parts, executor=executor)[0].read_bytes())
     assert files[0] == files[1]
+
+
+def test_memory_does_not_hold_the_cloud(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(copc, "_GRID_BITS", 5)
+    monkeypatch.setattr(copc, "_LEAF_POINTS", 1500)
+    header, count = new_header(), 0
+    tracemalloc.start()
+    try:
+        spool, spooled = PointSpool.of(tmp_path / "scratch", header, SPACING_M / 8), []
+        for n in range(50):
+            places = floor(2.0, 2.0) + np.array([2.0 * (n % 10), 2.0 * (n // 10), 0.0])
+            spooled.append(spool.add(f"{n}", points_at(places, header).array))
+            count += len(places)
+        write_copc(tmp_path / "c.laz", header, spool, spooled)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert header.point_count == count == 500_000
+    size = count * header.point_format.size
+    assert 0.01 * size < peak < 0.2 * size

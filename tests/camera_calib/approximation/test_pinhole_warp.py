@@ -105,3 +105,18 @@ def test_the_pinhole_sees_what_the_camera_sees(x: float, y: float, depth_m: floa
 @cache
 def leaning_warp() -> PinholeWarp:
     return best_warp(behind_port(50, 15, tilt_deg=2.0), 1.5, 2.5)
+
+
+def test_the_warp_is_exact_at_the_working_range() -> None:
+    warp = best_warp(behind_port(50, 15, tilt_deg=1.0), 1.5, 2.5)
+
+    assert warp.working_range_m == pytest.approx(1.875)
+    assert residual_px(warp, np.array([1.875])).max() < 1e-9
+
+
+def test_a_port_of_no_thickness_on_the_pupil_moves_only_by_refraction() -> None:
+    warp = best_warp(behind_port(0, 0), 1.5, 2.5)
+
+    # All rays meet in the pupil: any range fits without parallax.
+    np.testing.assert_allclose(warp.centre_m, 0.0, atol=1e-9)
+    assert residual_px(warp, DEPTHS_M).max() < 0.01

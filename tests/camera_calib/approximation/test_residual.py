@@ -1,11 +1,13 @@
 """The price of approximations: the design study's table, COLMAP's own projection, invariants."""
 
 import math
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 import pycolmap
 import pytest
+from scipy.spatial.transform import Rotation
 
 from alice_survey.core.errors import CalibrationError, ConfigError
 from camera_calib.approximation.residual import (
@@ -150,3 +152,23 @@ def test_an_impossible_interval_is_refused(near_m: float, far_m: float) -> None:
 def test_a_lens_that_does_not_reach_the_corners_is_refused() -> None:
     with pytest.raises(CalibrationError):
         approximations(changed(behind_port(20, 10), k1=-2.0), 1.5, 2.5)
+
+
+def test_no_neighbour_of_a_fit_is_better() -> None:
+    camera = changed(behind_port(50, 15, 1.0), k1=-0.15, k2=0.06, p1=4e-4)
+    for one in approximations(camera, 1.0, 3.0)[2:4]:
+        fit = one.stand_in
+        for i in range(len(fit.params)):
+            for sign in (-1, 1):
+                params = list(fit.params)
+                params[i] += sign * (0.5 if params[i] > 10 else 1e-3)
+                other = residual(camera, replace(fit, params=tuple(params)), one.distances_m)
+                assert other.rms_px > one.rms_px
+        for axis in range(3):
+            turn = Rotation.from_rotvec(1e-4 * np.eye(3)[axis]) * fit.approx_from_cam
+            other = residual(camera, replace(fit, approx_from_cam=turn), one.distances_m)
+            assert other.rms_px > one.rms_px
+        for factor in (0.9, 1.1):
+            x, y, z = (factor * c for c in fit.centre_m)
+            other = residual(camera, replace(fit, centre_m=(x, y, z)), one.distances_m)
+            assert other.rms_px > one.rms_px

@@ -167,3 +167,8 @@ def test_a_port_farther_off_leaves_more() -> None:
 def test_impossible_angles_are_refused() -> None:
     with pytest.raises(ConfigError, match="angle 180"):
         angle_table(PORT, 1.34, angles_deg=[180.0])
+
+
+def test_one_pixel_gives_a_quarter_of_the_claimed_depth() -> None:
+    row = fov_table([12.5], [2.0], 1.33, NO_PORT)[0]
+    assert row.depth_of_field_m == pytest.approx(0.57, abs=0.005)

@@ -21,6 +21,7 @@ from camera_calib.judge.uncertainty import (
     rig_slopes,
     shape_sigmas_m,
     stereo_sigma,
+    taken_up,
 )
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.ports.flat import FlatPort
@@ -191,3 +192,10 @@ def test_what_is_unknown_is_refused() -> None:
             point_sigmas_m(with_one_error(DESIGN, {name: 1.0}), POINTS)
     with pytest.raises(CalibrationError, match="2 points"):
         compensation(usual().rig, "left", POINTS[:2])
+
+
+def test_what_a_pose_takes_up_is_the_least_squares_fit() -> None:
+    rng = np.random.default_rng(5)
+    slopes, moved = rng.normal(size=(40, 6)), rng.normal(size=(40, 3))
+    expected = np.linalg.lstsq(slopes, moved, rcond=None)[0]
+    np.testing.assert_allclose(taken_up(slopes, moved), expected, rtol=1e-9)

@@ -228,3 +228,19 @@ def test_neighbours_of_a_grid_are_a_square_apart_and_the_farthest_its_corners() 
     assert apart.max() == pytest.approx(SQUARE_M * 5.0)
     some = farthest(points, np.array([0, 1, 2]))
     np.testing.assert_array_equal(some, [[0, 1], [0, 2]])
+
+
+def test_a_wrong_baseline_is_a_wrong_scale() -> None:
+    found = usual()
+    longer = moved_rig(found.rig, {"right.x_m": -0.001 * 0.1001})
+    scale, sigma = lengths_of(replace(found, rig=longer)).scale_ppm()
+    before, _ = lengths_of(found).scale_ppm()
+    assert scale - before == pytest.approx(1000.0, abs=60.0)
+    assert sigma < 1000.0
+
+
+def test_a_wrong_target_size_is_a_wrong_scale() -> None:
+    found = usual()
+    true = lengths_of(found)
+    wrong = lengths_of(replace(found, target_points=0.998 * found.target_points))
+    assert wrong.scale_ppm()[0] - true.scale_ppm()[0] == pytest.approx(2000.0, abs=60.0)

@@ -10,7 +10,7 @@ from shapely.geometry import Polygon
 from shapely.geometry.base import BaseGeometry
 from shapely.ops import unary_union
 
-from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.config import CameraConfig, SurveyConfig, WaterConfig
 from alice_survey.core.errors import PlanError
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import Certificate, certificate
@@ -18,8 +18,10 @@ from missions.coverage.holes import find_holes
 from missions.coverage.stations import (
     Stations,
     stations_of_lines,
+    stations_of_plan,
     sure_pattern,
 )
+from missions.plan.planner import plan_survey
 from missions.values.footprint import footprint_size_m
 from missions.values.pattern import Pattern
 from tests.oracles_coverage import (
@@ -258,3 +260,35 @@ def test_shares_do_not_alias_with_steps_and_lines() -> None:
     assert found == pytest.approx(shares, abs=6e-3)
     (by_lines,) = seen.line_histograms.values()
     assert by_lines == pytest.approx([0.0, *lines.values()], abs=6e-3)
+
+
+@pytest.mark.parametrize(("spacing_m", "step_m"), [(0.5, 0.25), (0.4, 0.2), (1.0, 0.5)])
+def test_rectangles_are_seen_exactly_as_often_as_they_fit(spacing_m: float, step_m: float) -> None:
+    """Of 2 x 1 m footprints without bulge: passes = 2 / spacing, pictures = 1 / step."""
+    rig = pinhole_rig(2.0, 1.0)
+    asked = sure_pattern(rig, 1.0, spacing_m, step_m)
+    assert (asked.passes, asked.pictures) == (round(2 / spacing_m), round(1 / step_m))
+    stations = stations_of_lines(lawnmower(3, 4, spacing_m, step_m, over_m=2.0), 1.0)
+    stations = shifted(stations, 0.0123, 0.0171)  # off the grid, so that no middle lies on an edge
+
+    seen = certificate(area_of(shapely.box(0, 0, 3, 4)), rig, stations, asked)
+
+    assert seen.share_at_overlap == 1.0
+    assert np.all(seen.least_lines[seen.inside] == asked.passes)
+    assert np.all(seen.least_pictures[seen.inside] == asked.passes * asked.pictures)
+
+
+def test_shares_of_the_papers_mission_are_those_of_a_finer_grid() -> None:
+    config = SurveyConfig()
+    planned = plan_survey(config, RIG)
+    seen, stations = planned.certificate, stations_of_plan(planned.plan)
+    fine = certificate(
+        planned.plan.area, RIG, stations, seen.pattern, cell_m=seen.grid.cell_m / 7.37
+    )
+
+    assert seen.inside.sum() < 1.05 * 80_000
+    for kind in ("histograms", "line_histograms"):
+        for name, shares in getattr(fine, kind).items():
+            ours = getattr(seen, kind)[name]
+            assert ours == pytest.approx(shares[: len(ours)], abs=3e-3)
+    assert seen.mean_pictures == pytest.approx(fine.mean_pictures, abs=0.01)

@@ -194,3 +194,21 @@ def test_a_zone_that_the_reference_point_must_cut_is_shrunk_or_left_out(
     data = json.loads((tmp_path / "mission_dive1.plan").read_text())
     assert [p["inclusion"] for p in data["geoFence"]["polygons"]] == [True]
     assert "0.12 m2" in capsys.readouterr().err
+
+
+def test_a_plan_and_the_wpl_say_the_same(tmp_path: Path, import_plan: Importer) -> None:
+    plan = small_plan()
+    written(plan, RIG, ["qgc", "wpl"], tmp_path)
+    for dive in (1, 2):
+        simple = import_plan(str(tmp_path / f"mission_dive{dive}.plan")).mission_items
+        rows = read_wpl(tmp_path / f"mission_dive{dive}.waypoints")
+        # The first item is home in all; MAVSDK says it in integers.
+        assert [item.command for item in simple] == [row.command for row in rows]
+        for item, row in list(zip(simple, rows, strict=True))[1:]:
+            assert item.frame == row.frame
+            params = [row.param1, row.param2, row.param3, row.param4, row.z]
+            read = [item.param1, item.param2, item.param3, item.param4, item.z]
+            assert read == pytest.approx(params, abs=2e-5)
+            assert (item.x, item.y) == (
+                pytest.approx(row.x * 1e7, abs=1.01), pytest.approx(row.y * 1e7, abs=1.01)
+            )  # fmt: skip

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
+from pymavlink import mavwp
 
 from alice_survey.core.errors import PlanError
 from missions.exports.registry import read_mission
@@ -145,3 +146,22 @@ def test_what_is_no_mission_is_refused_in_one_line(tmp_path: Path, text: str, sa
         read_mission(path)
     assert "\n" not in str(caught.value)
     assert str(path) in str(caught.value)
+
+
+def test_waypoints_are_read_as_pymavlink_reads_them(tmp_path: Path) -> None:
+    plan = golden_plan()
+    path = files_of(plan, tmp_path)["wpl"]
+    loader = mavwp.MAVWPLoader()
+    loader.load(str(path))
+    rows = [loader.wp(i) for i in range(1, loader.count()) if loader.wp(i).command == 16]
+    mission = read_mission(path)
+    ends = mission.ends_ne(plan.datum)
+
+    assert len(mission.steps) == len(rows) > 5
+    for step, row, end in zip(mission.steps, rows, ends, strict=True):
+        np.testing.assert_allclose(end, local_ne(plan.datum, row.x, row.y), atol=MM)
+        assert step.hold_s == row.param1
+        assert step.tolerance_m == pytest.approx(row.param2, abs=1e-6)
+        height = step.altitude_m if row.frame == 10 else -step.depth_m
+        assert height == pytest.approx(row.z, abs=1e-4)
+        assert step.speed_mps == pytest.approx(plan.speed_mps)

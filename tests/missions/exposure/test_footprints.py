@@ -161,3 +161,9 @@ def test_what_no_altitude_resolves_suggests_nothing() -> None:
     with pytest.raises(ConflictError) as fault:
         line_spacing(rig, config.plan, STEP_M)
     assert fault.value.suggestion is None and len(str(fault.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("distance_m", [0.01, 0.02, 0.03])
+def test_through_real_ports_they_overlap_by_28_to_29_percent(distance_m: float) -> None:
+    rig, config = survey(plan={"line_spacing_m": 1.0}, camera={"port_distance_m": distance_m})
+    assert 0.279 <= line_spacing(rig, config.plan, STEP_M).mean_overlap <= 0.29

@@ -98,3 +98,11 @@ def test_what_will_be_poor_is_warned_of(
     assert capsys.readouterr().err == ""
     imaging_settings(*survey(**sections))
     assert named in capsys.readouterr().err
+
+
+def test_exposure_grows_with_altitude() -> None:
+    low, high = (
+        imaging_settings(*survey(plan={"altitude_m": a, "relief_m": 0.1})) for a in (1.0, 3.0)
+    )
+    assert high.exposure_s > 2 * low.exposure_s
+    assert low.blur_px == pytest.approx(1.0, abs=0.02)

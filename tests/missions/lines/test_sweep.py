@@ -83,3 +83,10 @@ def test_the_search_over_areas_with_fill_lines_finds_as_good_a_heading() -> None
     ]
     assert sweep.cost_j <= 1.005 * min(sampled)
     assert max(sampled) > 1.02 * sweep.cost_j
+
+
+def test_the_width_of_a_convex_area_is_that_between_its_outermost_corners() -> None:
+    edges, corners = edges_of(MultiPolygon([QUAD])), np.array(QUAD.exterior.coords)
+    for heading in np.linspace(0, math.pi, 50):
+        across = corners @ np.array([-math.sin(heading), math.cos(heading)])
+        assert widths_m(edges, np.array([heading]))[0] == pytest.approx(np.ptp(across), abs=1e-12)

@@ -185,3 +185,12 @@ def test_thruster_that_stands_still_is_found(following: LoopFlight) -> None:
     assert [one.thruster for one in following.loop.failures] == ["stern"]
     assert following.command.rps[stern] == 0.0
     assert following.command.state == LinkState.FLYING
+
+
+def test_drift_leaves_the_thrusters_off() -> None:
+    flight = LoopFlight(on_loss="drift")
+    flight.until("follow")
+    for _ in range(10 + GRACE_TICKS + 200):
+        flight.tick(odometry="none")
+    assert flight.command.state == LinkState.GIVEN_UP
+    assert is_off(flight)

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -374,3 +375,12 @@ def test_lost_odometry_stops_then_surfaces(
     assert diving.returncode == 1
     assert diving.stdout is not None
     assert diving.stdout.read().startswith("given up: ")
+
+
+@pytest.mark.slow
+def test_interrupted_pilot_leaves_the_thrusters_off(
+    diving: subprocess.Popen[str], navigator: Navigator
+) -> None:
+    diving.send_signal(signal.SIGTERM)
+    ends_without_thrust(diving, navigator, 1.0)
+    assert diving.returncode == 128 + signal.SIGTERM

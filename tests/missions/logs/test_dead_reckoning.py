@@ -167,3 +167,15 @@ def test_what_is_missing_is_named(lacks: str) -> None:
     words = {"velocity_body": "velocity", "attitude": "attitude", "start": "--start-at"}[lacks]
     with pytest.raises(NavigationError, match=words):
         with_dead_reckoning(dive, TrackErrors(), None)
+
+
+def test_sigma_grows_away_from_a_fix_and_shrinks_towards_the_next() -> None:
+    time_s, velocity = lawnmower()
+    signal = Signal(source="dvl", time_s=time_s, values=velocity)
+    true = np.vstack([[0, 0], moves_of(time_s, velocity).cumsum(axis=0)])
+    one = dead_reckoned(signal, (time_s[:1], true[:1], np.array([0.1])), ERRORS)
+    two = dead_reckoned(signal, (time_s[[0, -1]], true[[0, -1]], np.array([0.1, 0.1])), ERRORS)
+    assert one.sigma_m[0] == pytest.approx(0.1, rel=1e-3)
+    assert one.sigma_m[-1] > 0.6
+    assert two.sigma_m[-1] < 0.11
+    assert 0.2 < two.sigma_m.max() < 0.7 * one.sigma_m.max()

@@ -256,3 +256,28 @@ def test_parts_of_one_line_are_joined_straight() -> None:
 
     assert route.length_m == pytest.approx(8.0 + 2 * 0.5)
     assert all(leg.curvature_per_m == 0 for leg in route.legs)
+
+
+def test_a_route_is_continuous_and_keeps_its_lines() -> None:
+    lines = [
+        line((0.0, 0.0), (0.0, 5.0)),
+        line((1.0, 5.0), (1.0, 0.0)),
+        line((1.6, 0.0), (1.6, 5.0)),
+    ]
+    route = route_through(lines, 0.5, 0.5)
+
+    along = np.linspace(0.0, route.length_m, 20_001)
+    places_ne = route.places(along)
+    steps = np.linalg.norm(np.diff(places_ne, axis=0), axis=1)
+    assert np.abs(steps / np.diff(along) - 1).max() < 1e-4
+    assert max(abs(leg.curvature_per_m) for leg in route.legs) <= 2.0 * (1 + 1e-6)
+
+    starts = line_starts_m(route)
+    assert list(starts) == [0, 1, 2]
+    for index, start_m in starts.items():
+        on_line = route.places(start_m + np.linspace(0.0, 5.0, 11))
+        expected = np.linspace(lines[index].start_ne_m, lines[index].end_ne_m, 11)
+        np.testing.assert_allclose(on_line, expected, atol=1e-5)
+        run_in = route.places(np.array([start_m - 0.5]))[0]
+        ahead = np.subtract(lines[index].end_ne_m, lines[index].start_ne_m) / 5.0
+        np.testing.assert_allclose(run_in, lines[index].start_ne_m - 0.5 * ahead, atol=1e-5)

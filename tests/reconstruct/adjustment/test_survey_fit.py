@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
+from scipy.spatial import KDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.config import ReconstructConfig
@@ -15,7 +16,7 @@ from alice_survey.core.errors import ReconstructionError
 from alice_survey.core.records import RangeRecord
 from camera_calib.freedom import POSE, value
 from camera_calib.rig import Covariance, Rig
-from reconstruct.adjustment import exact_observations
+from reconstruct.adjustment import exact_observations, survey_fit
 from reconstruct.adjustment.exact_observations import (
     Pixels,
     RigState,
@@ -23,7 +24,7 @@ from reconstruct.adjustment.exact_observations import (
     start_state,
 )
 from reconstruct.adjustment.normal_equations import PointEquations, reduce_parts
-from reconstruct.adjustment.pixel_parts import Linearised, PixelParts
+from reconstruct.adjustment.pixel_parts import Linearised, PixelParts, Workers
 from reconstruct.adjustment.survey_fit import (
     AdjustedSurvey,
     SurveyFit,
@@ -37,6 +38,7 @@ from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.refraction import refract
 from reconstruct.placing.alignment import align_rigid
 from tests.cameras import changed
+from tests.engines import PicklingThreads
 from tests.reconstruct.scenes import Scene, make_scene
 from tests.reconstruct.true_models import near_truth, pupils_and_points, warped_scene
 
@@ -244,3 +246,47 @@ def test_a_calibration_with_sigmas_lets_the_survey_refine_the_rig(tmp_path: Path
     assert any("12 points" in note for note in refined(wrong, few).mapped.notes)
     with pytest.raises(ReconstructionError, match="12 points"):
         refined(wrong, few, refine_rig="on")
+
+
+def test_a_large_survey_is_adjusted_in_parts_as_a_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(8)
+    pixels = [p + rng.normal(0, 0.05, p.shape) for p in clean().pixels]
+    scene = replace(clean(), pixels=pixels)
+    wrong = right_turned(scene.rig, 6e-4, [4e-4, 8e-4, 4e-4, 1e-5, 1e-4, 1e-4])
+    mapped, seen = modelled(scene, wrong, tmp_path)
+    whole = fit_survey(mapped, seen, wrong, port=False, pose=True)
+    monkeypatch.setattr(exact_observations, "PART", -(-whole.observations // 7))
+    parts = fit_survey(mapped, seen, wrong, port=False, pose=True)
+    assert whole.calibration is not None and parts.calibration is not None
+    assert whole.observations == parts.observations
+    away, same = KDTree(whole.calibration.places).query(parts.calibration.places)
+    assert np.max(away) < 1e-6
+    for found, wanted in (
+        (parts.after, whole.after),
+        (parts.covariance, whole.covariance),
+        (parts.state.points, whole.state.points),
+        (parts.calibration.points, whole.calibration.points[same]),
+    ):
+        np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-9 * np.abs(wanted).max())
+    for workers in (1, 2, 3):
+        with PicklingThreads(workers) as engine:
+            folder = tmp_path / f"{workers}"
+            again = fit_survey(
+                mapped, seen, wrong, port=False, pose=True,
+                workers=Workers(executor=engine.executor, folder=folder),
+            )  # fmt: skip
+        assert engine.tasks > 3 * 7
+        assert len(list(folder.iterdir())) == 7
+        assert again.calibration is not None
+        np.testing.assert_array_equal(again.after, parts.after)
+        np.testing.assert_array_equal(again.state.points, parts.state.points)
+        np.testing.assert_array_equal(again.calibration.points, parts.calibration.points)
+    monkeypatch.setattr(survey_fit, "_MAX_PLACES", len(whole.point_ids) // 3)
+    some = fit_survey(mapped, seen, wrong, port=False, pose=True).calibration
+    assert some is not None
+    assert 0.2 < len(some.places) / len(whole.point_ids) < 0.35
+    every = round(len(whole.point_ids) / len(some.places))
+    np.testing.assert_array_equal(some.points, parts.calibration.points[::every])
+    np.testing.assert_array_equal(some.places, parts.calibration.places[::every])

@@ -12,11 +12,13 @@ from scipy.spatial.transform import Rotation
 from alice_survey.core.block_solver import BlockStep
 from alice_survey.core.frames import Array
 from camera_calib.rig import Covariance, Rig
+from reconstruct.adjustment import exact_observations
 from reconstruct.adjustment.exact_observations import exact_observations as linearised
 from reconstruct.adjustment.normal_equations import (
     LinearObservations,
     reduce_points,
 )
+from reconstruct.adjustment.pixel_parts import Workers
 from reconstruct.adjustment.soft_modes import Motions, spread
 from reconstruct.adjustment.survey_fit import fit_survey
 from reconstruct.adjustment.uncertainty import (
@@ -31,6 +33,7 @@ from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.refraction import refract
 from reconstruct.placing.alignment import align_rigid
+from tests.engines import PicklingThreads
 from tests.oracles_refraction import dense_normal_equations, dense_of, laid_onto
 from tests.reconstruct.scenes import Scene, make_scene
 from tests.reconstruct.true_models import near_truth, true_stations, warped_scene
@@ -311,3 +314,36 @@ def test_what_points_share_is_nearly_all_that_poses_do(tmp_path: Path) -> None:
         shares.append(float(np.median(share)))
     assert 0.6 < shares[0] < 1.001, shares
     assert 0.8 < shares[1] < 1.05, shares
+
+
+def test_parts_of_a_large_survey_know_what_the_whole_knows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mapped, _ = points_with(noisy().rig, tmp_path)
+    records, part = noisy().records, part_of(mapped, warped_scene(noisy())[0], noisy().rig)
+    count = mapped.model.compute_num_observations()
+    whole = estimate(mapped, records, part)
+    monkeypatch.setattr(exact_observations, "PART", -(-count // 6))
+    parts = estimate(mapped, records, part)
+    for found, wanted in (
+        (parts.frame_cov, whole.frame_cov),
+        (parts.point_cov, whole.point_cov),
+        (parts.point_noise, whole.point_noise),
+        (np.array(parts.sigma_px), np.array(whole.sigma_px)),
+    ):
+        size = np.abs(wanted).max(axis=0)
+        np.testing.assert_allclose(found / size, wanted / size, rtol=1e-9, atol=1e-9)
+    for found, wanted in (
+        (parts.modes.stations, whole.modes.stations),
+        (parts.modes.points, whole.modes.points),
+        (parts.modes.calibration, whole.modes.calibration),
+    ):
+        np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-5 * np.abs(wanted).max())
+    for workers in (1, 3):
+        with PicklingThreads(workers) as engine:
+            given = Workers(executor=engine.executor, folder=tmp_path / f"{workers}")
+            again = estimate(mapped, records, part, workers=given)
+        assert engine.tasks >= 5 * 6
+        np.testing.assert_array_equal(again.frame_cov, parts.frame_cov)
+        np.testing.assert_array_equal(again.point_cov, parts.point_cov)
+        np.testing.assert_array_equal(again.modes.points, parts.modes.points)

@@ -101,3 +101,11 @@ def test_masked_pixels_get_no_depth():
     assert not np.isfinite(here[:, :200]).any()
     assert np.isfinite(here[:, 210:]).any()
     assert np.isfinite(there).sum() < 0.7 * np.isfinite(free).sum()
+
+
+@pytest.mark.parametrize("shift_px", [7.0, 7.25, 7.5, 7.75])
+def test_match_finds_a_shift_to_a_twentieth_of_a_pixel(shift_px: float):
+    left, right = shifted(shift_px)
+    found = match(left, right, 16)[10:-10, 40:-20]
+    assert np.isfinite(found).mean() > 0.9
+    assert abs(np.nanmedian(found) - shift_px) < 0.1

@@ -9,7 +9,7 @@ from alice_survey.app.stages import spec
 from alice_survey.core.artefacts import read_json
 from alice_survey.core.config import ReconstructConfig, SurveyConfig
 from alice_survey.core.errors import ReconstructionError
-from alice_survey.core.executor import SERIAL
+from alice_survey.core.executor import SERIAL, local_executor
 from alice_survey.core.products import rasters_in
 from reconstruct.dense import run
 from reconstruct.dense.stereo_pairs import in_frame
@@ -164,3 +164,15 @@ def test_what_one_stereo_pair_alone_sees_is_kept_with_an_honest_sigma(workspace:
     ratio = (height + true)[known] / sigma[known]
     assert known.sum() > 0.9 * alone.sum()
     assert 0.5 < np.sqrt(np.mean(ratio**2)) < 1.3
+
+
+@pytest.mark.slow
+def test_bytes_do_not_depend_on_the_number_of_processes(workspace: Path, tmp_path: Path):
+    other = tmp_path / "again"
+    other.mkdir()
+    for name in ("images", "sparse"):
+        (other / name).symlink_to(workspace / name)
+    assert spec("dense").make(other, CONFIG, local_executor(2))
+    for path in sorted((workspace / "dense").iterdir()):
+        if path.name != "stage.json":
+            assert (other / "dense" / path.name).read_bytes() == path.read_bytes(), path.name

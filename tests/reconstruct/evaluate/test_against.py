@@ -19,6 +19,8 @@ from reconstruct.evaluate.elevation import Elevation, enu_from_enu
 from reconstruct.evaluate.registration import register_heights, rough_shifts
 from reconstruct.views.model import WorldFrame, write_frame
 
+MOUND_M, WIDTH_M, AT = 0.02, 0.15, (1.5, 2.2)
+
 CELL, SIDE = 0.02, 200
 MOUND_M, WIDTH_M, AT = 0.02, 0.15, (1.5, 2.2)
 MOUND_M3 = MOUND_M * 2 * math.pi * WIDTH_M**2
@@ -146,3 +148,22 @@ def test_the_command_writes_maps_of_the_figures(tmp_path: Path) -> None:
     bare = write_survey(tmp_path / "bare", survey(12, STILL, 0.0), None)
     with pytest.raises(WorkspaceError):
         evaluate_against(now, bare)
+
+
+def test_what_was_dug_away_is_lost_not_gained() -> None:
+    change, _ = compare_elevations(survey(3, STILL, 0.0), survey(4, STILL, MOUND_M), STILL)
+    figures = change.to_json()
+    assert figures["gained"]["regions"] == 0
+    assert figures["lost"]["volume_l"] == pytest.approx(-1e3 * MOUND_M3, rel=0.05)
+
+
+def test_heights_between_cells_are_exact_on_a_plane() -> None:
+    rows, columns = np.mgrid[:20, :30]
+    plane = Elevation(
+        height=0.1 * columns - 0.2 * rows, sigma=np.ones((20, 30)), west=5.0, north=7.0, cell=0.5
+    )
+    rng = np.random.default_rng(9)
+    places = np.column_stack([rng.uniform(5.25, 19.7, 50), rng.uniform(-2.7, 6.75, 50)])
+    expected = 0.1 * ((places[:, 0] - 5) / 0.5 - 0.5) - 0.2 * ((7 - places[:, 1]) / 0.5 - 0.5)
+    np.testing.assert_allclose(plane.at(plane.height, places), expected, atol=1e-12)
+    assert np.isnan(plane.at(plane.height, np.array([[4.9, 5.0], [6.0, 7.4]]))).all()

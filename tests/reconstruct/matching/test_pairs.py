@@ -215,3 +215,34 @@ def test_pictures_that_see_the_horizon_are_paired_by_order_and_looks(off_nadir_d
     assert set(sure) == neighbours(scene.records, NEIGHBOURS)
     assert maybe == [(0, 60)]
     assert len(placed_pictures(scene.records, scene.rig, DATUM)) == len(scene.records)
+
+
+def partners_each(records: list[ImageRecord]) -> tuple[float, int]:
+    """Mean and largest number of partners of a picture, coarse looks included."""
+    scene = make_scene(points=1)
+    sure, maybe = choose_pairs(records, scene.rig, DATUM)
+    count = np.bincount(np.ravel([*sure, *maybe]), minlength=len(records))
+    return float(count.mean()), int(count.max())
+
+
+def test_partners_of_a_picture_do_not_grow_with_the_survey() -> None:
+    mean = {
+        lines: partners_each(make_scene(lines=lines, stations=10, points=1).records)[0]
+        for lines in (5, 20)
+    }
+    assert 4 < mean[5] < 20
+    assert mean[20] < 1.1 * mean[5]
+
+
+def test_partners_of_a_picture_do_not_grow_with_visits_to_the_place() -> None:
+    scene = make_scene(points=1)
+    visits = [
+        replace(r, station=r.station + 1000 * visit, image=f"{visit}/{r.image}")
+        for visit in range(6)
+        for r in scene.records
+    ]
+    once, _ = partners_each(scene.records)
+    often, maximum = partners_each(visits)
+    # six directions on lines along and across, two in each, chosen by either of the two
+    assert once < often < 2 * (2 * 6 * 2 + 12)
+    assert maximum < len(visits) / 4

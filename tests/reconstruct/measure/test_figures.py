@@ -1,12 +1,15 @@
 """Figures of surfaces of known shape: closed forms, sigmas against draws of noise."""
 
+import tracemalloc
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import shapely
+from rasterio.windows import Window
 from scipy.special import ellipe
 
 from alice_survey.core.frames import Array
@@ -16,7 +19,9 @@ from reconstruct.measure.figures import Measured
 from reconstruct.measure.lines import measure_line, profile
 from reconstruct.measure.polygons import measure_polygon, quadrats
 from reconstruct.measure.surface import MeasuredSurface
+from reconstruct.raster import DemGrid, tiled_raster
 from tests.reconstruct.measure.synthetic import (
+    FRAME,
     Drawn,
     Sigmas,
     grid,
@@ -214,3 +219,29 @@ def test_a_profile_passes_its_corners(tmp_path: Path) -> None:
     assert np.diff(found.along).max() <= 0.01 + 1e-12
     true = hills(*found.samples.places.T)
     assert np.abs(found.samples.height - true).max() < 2e-4
+
+
+def test_memory_does_not_grow_with_the_raster(tmp_path: Path) -> None:
+    """Of a surface of a thousand million cells only what is measured is read."""
+    cells = DemGrid(west=0.0, north=400.0, cell=0.01, rows=40_000, columns=32_768)
+    heights = np.full((512, 512), 2.0, np.float32)
+    for name in ("dem", "sigma"):
+        with tiled_raster(tmp_path / f"{name}.tif", cells, FRAME, "float32", np.nan, "") as raster:
+            raster.write(heights if name == "dem" else 0.001 * heights, 1,
+                         window=Window(2048, 2048, 512, 512))  # fmt: skip
+    (tmp_path / "small").mkdir()
+    drawn = Drawn(tmp_path / "small", grid(1.0, 0.1), ramp, Sigmas(shift=0.001))
+    surface = replace(
+        drawn.true, dem=tmp_path / "dem.tif", sigma=tmp_path / "sigma.tif", grid=cells
+    )
+    west, north = 20.48, 400.0 - 20.48
+    corners = [(west + x, north - y) for x, y in ((0.5, 0.5), (0.5, 4.5), (4.5, 4.5), (4.5, 0.5))]
+    tracemalloc.start()
+    found = named(measure_polygon(surface, corners, 1.5)[0])
+    line = named(measure_line(surface, [corners[0], corners[2]]))
+    profile(surface, [(1.0, 1.0), (150.0, 100.0)])
+    maximum = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert found["volume"].value == pytest.approx(0.5 * 16.0, rel=1e-6)
+    assert line["length"].value == pytest.approx(4.0 * np.sqrt(2), rel=1e-6)
+    assert maximum < 400e6 < 4 * cells.rows * cells.columns / 10

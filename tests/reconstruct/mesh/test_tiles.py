@@ -1,5 +1,6 @@
 import json
 import struct
+import tracemalloc
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations
@@ -14,7 +15,7 @@ import pytest
 
 from alice_survey.app.stages import spec
 from alice_survey.core.config import ReconstructConfig, SurveyConfig
-from alice_survey.core.executor import SERIAL
+from alice_survey.core.executor import SERIAL, local_executor
 from reconstruct.dense.cloud import VERTEX, write_cloud
 from reconstruct.mesh import surface
 from reconstruct.mesh.cells import CellLevel
@@ -262,3 +263,42 @@ def test_a_survey_smaller_than_a_stray_is_meshed(tmp_path: Path):
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
     assert 9**2 < area / STEP_M**2 < 15**2
     assert np.abs(mesh.vertices[:, 2]).max() < ERROR_M
+
+
+def test_cells_are_the_same_bytes_with_two_workers(survey: Path, levels: list[CellLevel]):
+    cloud, again = open_cloud(survey / "dense" / "cloud.ply"), survey / "again"
+    with local_executor(2).start() as two:
+        made = [finest_level(cloud, STEP_M, ERROR_M, again, two)]
+        made.append(coarser_level(made, STEP_M, again, two))
+    for level, other in zip(levels, made, strict=False):
+        assert len(level.cells) == len(other.cells) > 4
+        for key, cell in level.cells.items():
+            assert cell.path.read_bytes() == other.cells[key].path.read_bytes()
+
+
+def test_memory_of_a_pass_is_that_of_a_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(surface, "_TILE_STEPS", (12, 12))
+    peaks = []
+    for length_m in (1.2, 4.8):
+        folder = tmp_path / str(length_m)
+        folder.mkdir()
+        write_ripples(folder / "cloud.ply", length_m)
+        levels = [finest_level(open_cloud(folder / "cloud.ply"), STEP_M, ERROR_M, folder, SERIAL)]
+        tracemalloc.start()
+        levels.append(coarser_level(levels, STEP_M, folder, SERIAL))
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert len(levels[1].cells) > 7
+    assert 0.7 * peaks[0] < peaks[1] < 2.0 * peaks[0]  # of an area four times as large
+
+
+def write_ripples(path: Path, length_m: float) -> None:
+    """A cloud of waves, so long and as wide as two of the finest tiles."""
+    north, east = (a.ravel() for a in np.mgrid[0:length_m:STEP_M, 0:0.5:STEP_M])
+    points = np.zeros(len(north), VERTEX)
+    points["x"], points["y"] = east, north
+    points["z"] = 0.01 * np.sin(2 * np.pi * north / 0.15)
+    slope = 0.01 * 2 * np.pi / 0.15 * np.cos(2 * np.pi * north / 0.15)
+    points["ny"], points["nz"] = -slope / np.hypot(slope, 1), 1 / np.hypot(slope, 1)
+    points["sigma"] = 1e-3
+    write_cloud(path, [points], OFFSET, FRAME)

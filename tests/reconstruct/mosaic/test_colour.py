@@ -1,6 +1,7 @@
 """Known lamp, water and range, and whether the survey's pictures determine them."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +20,8 @@ from reconstruct.mosaic.picture_measures import (
     encode_srgb,
     linear_table,
 )
+
+NODE_X, NODE_Y = np.meshgrid(np.linspace(0, 1, GRID[1]), np.linspace(0, 1, GRID[0]))
 
 IMAGES = [f"left/{n:02d}.png" for n in range(24)]
 FALL_OFF = np.array([0.45, 0.5, 0.9])
@@ -200,3 +203,59 @@ def test_black_leaves_the_order_of_light_and_takes_less_than_the_dark() -> None:
     assert (model.black > 0).all()
     assert (model.black < 0.08).all()
     assert (model.law[7:10] > 1).all()
+
+
+def oblique_chain() -> tuple[LightSamples, list[PictureMeasures]]:
+    """Pictures along a line that look 40 deg ahead: range follows the row, and far meets near."""
+    rng = np.random.default_rng(6)
+    count = 2 * len(IMAGES)
+    heights = 1.5 + 0.08 * np.sin(np.arange(count)) + rng.normal(0, 0.02, count)
+    tilts = np.radians(50 + rng.normal(0, 2, count))
+
+    def seen(view: int, ahead: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows, over the height of a picture of 46 deg, and ranges of spots on the floor."""
+        angle = np.arctan2(ahead - 0.25 * view, heights[view]) - tilts[view]
+        return 0.5 - 0.5 * np.tan(angle) / np.tan(np.radians(23)), np.hypot(
+            ahead - 0.25 * view, heights[view]
+        )
+
+    rows: list[tuple[Any, ...]] = []
+    facts = []
+    for view in range(count):
+        for other in range(view + 1, min(view + 5, count)):
+            ahead = 0.25 * view + rng.uniform(0.5, 5, 400)
+            sides = [seen(which, ahead) for which in (view, other)]
+            inside = np.all([(y > 0) & (y < 1) for y, _ in sides], axis=0)
+            rows.append((view, other, *(side[inside] for pair in sides for side in pair)))
+        angle = tilts[view] + np.arctan((0.5 - NODE_Y.ravel()) * 2 * np.tan(np.radians(23)))
+        place = np.column_stack([NODE_X.ravel(), NODE_Y.ravel()])
+        mean = shown(np.full((place.shape[0], 3), 0.27), place, heights[view] / np.cos(angle))
+        facts.append(
+            PictureMeasures(
+                image=f"left/{view:02d}.png", camera="left", sharpness=1.0, grey=False,
+                nodes=np.log(mean.reshape(*GRID, 3) * rng.lognormal(0, 0.05)),
+                dark=haze(NODE_X, NODE_Y) + 0.004 * rng.uniform(0, 1, (*GRID, 1)),
+            )
+        )  # fmt: skip
+    views = np.concatenate([np.tile([[a, b]], (len(y), 1)) for a, b, y, *_ in rows])
+    x = rng.uniform(0, 1, (len(views), 2))
+    y = np.stack([np.concatenate([row[k] for row in rows]) for k in (2, 4)], axis=1)
+    ranges = np.stack([np.concatenate([row[k] for row in rows]) for k in (3, 5)], axis=1)
+    places = np.stack([x, y], axis=2)
+    albedo = rng.uniform(0.08, 0.5, (len(views), 1)) * rng.uniform(0.8, 1.2, (len(views), 3))
+    light = np.stack([shown(albedo, places[:, k], ranges[:, k]) for k in range(2)], axis=1)
+    light *= np.exp(rng.normal(0, 0.02, light.shape))
+    samples = LightSamples(
+        views=views.astype(np.int32), places=places.astype(np.float32),
+        levels=np.log(light).astype(np.float32), ranges=ranges.astype(np.float32),
+    )  # fmt: skip
+    return samples, facts
+
+
+def test_light_does_not_drift_along_a_chain_of_oblique_pictures() -> None:
+    samples, facts = oblique_chain()
+    model = solve_colour("water", samples, facts)
+    gains = np.stack([model.light.gains[fact.image] for fact in facts])
+    assert np.abs(gains).max() < 0.5
+    drift = np.polyfit(np.linspace(0, 1, len(gains)), gains, 1)[0]
+    assert np.abs(drift).max() < 0.8

@@ -19,6 +19,7 @@ from reconstruct.ply import VERTEX
 from reconstruct.raster import DemGrid, tiled_raster
 from reconstruct.views.model import View
 from tests.cameras import changed
+from tests.engines import PicklingThreads
 from tests.oracles_dense import (
     DEPTH_M,
     FRAME,
@@ -247,3 +248,16 @@ def test_what_a_mask_hides_is_not_painted_and_others_fill_it(tmp_path: Path):
     assert np.abs(rgba[:3][:, known] - 100).max() <= 3
     middle = (np.hypot(north - 0.2, east) < 0.1) & known
     assert middle.sum() > 500  # the other camera shows what the fish hides
+
+
+def test_bytes_do_not_change_on_another_engine(workspace: Path, tmp_path: Path):
+    for name in ("images", "sparse", "dense"):
+        (tmp_path / name).symlink_to(workspace / name)
+    with PicklingThreads(1) as engine:
+        assert spec("mosaic").make(tmp_path, CONFIG, engine.executor)
+        assert engine.tasks > len(list((tmp_path / "images").rglob("*.png")))
+    names = ("mosaic.tif", "mosaic_source.tif", "coverage.tif", "mosaic.png", "mosaic.json")
+    for name in (*names, "footprints.csv", "footprints.geojson"):
+        same = (tmp_path / "mosaic" / name).read_bytes()
+        assert same == (workspace / "mosaic" / name).read_bytes()
+    assert not spec("mosaic").make(tmp_path, CONFIG, SERIAL)

@@ -111,3 +111,10 @@ def test_lanczos_equals_its_definition_inside_and_at_edges(seed: int) -> None:
     light = table[picture].astype(float)
     expected = np.stack([lanczos_at(light, a, b) for a, b in zip(x[0], y[0], strict=True)])
     np.testing.assert_allclose(found[0, 1:], expected[1:], atol=4e-3)
+
+
+def test_forgetting_the_range_would_show() -> None:
+    view, (grid, height) = view_of(warp()), relief()
+    sight = see(view, camera_optics(warp(), False), Ground(height, grid).surface(grid))
+    inside = sight.quality > 0
+    assert misses_px(sight, CAMERA, view)[inside].max() > 0.1

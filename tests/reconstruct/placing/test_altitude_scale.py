@@ -32,3 +32,17 @@ def test_a_model_without_altitudes_gets_no_scale_of_them() -> None:
     records = [replace(r, altitude_m=float("nan")) for r in scene.records]
     centres = np.stack([p.translation for p in scene.ned_from_cam])
     assert scale_by_altitudes(records, centres, scene.points_ned) is None
+
+
+def test_relief_below_makes_the_scale_less_certain() -> None:
+    sigmas = []
+    for relief in (0.02, 0.3):
+        scene = make_scene(points=3000, relief_m=relief)
+        mono = [i for i, r in enumerate(scene.records) if r.camera == "left"]
+        centres = np.stack([scene.ned_from_cam[i].translation for i in mono])
+        records = [replace(scene.records[i], altitude_m=2.0, sigma_altitude_m=0.02) for i in mono]
+        found = scale_by_altitudes(records, centres, scene.points_ned)
+        assert found is not None
+        sigmas.append(found[1])
+    assert sigmas[1] > 1.5 * sigmas[0]
+    assert sigmas[0] < 0.1

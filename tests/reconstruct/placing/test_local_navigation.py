@@ -180,3 +180,25 @@ def test_scale_and_level_of_one_camera_lie_within_their_sigmas(reading: str) -> 
         leans.append(lean / found.sigma_tilt_deg)
     assert 0.7 < np.sqrt(np.mean(np.square(errors))) < 1.4
     assert 0.6 < np.sqrt(np.mean(np.square(leans))) < 1.4
+
+
+@pytest.mark.parametrize("sigma_m", [0.001])
+def test_headings_and_depths_turn_a_model_to_north(sigma_m: float) -> None:
+    scene, truth = make_scene(points=400), gauge(5, 1.0)
+    records = [
+        replace(r, sigma_depth_m=sigma_m) for r in with_only(exact(scene), "depth_m", "heading_deg")
+    ]
+    found = local_fit(scene, records, truth, known=True)
+    assert found is not None
+    turn = found.ned_from_model.rotation * truth.rotation.inv()
+    assert np.rad2deg(turn.magnitude()) < 0.2
+    assert found.sigma_heading_deg > 0
+
+
+def test_roll_and_pitch_alone_level_a_model() -> None:
+    scene, truth = make_scene(points=400), gauge(6, 1.0)
+    found = local_fit(
+        scene, with_only(exact(scene), "roll_deg", "pitch_deg"), truth, known=True, tilt_deg=5
+    )
+    assert found is not None
+    assert tilt_deg(found.ned_from_model, truth) < 0.01

@@ -1,6 +1,7 @@
 """The sigmas that a placement states are those of its errors, however correlated errors are."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -285,3 +286,36 @@ def test_twenty_flights_are_placed_within_their_sigmas() -> None:
     position, tilt, heading = np.split(np.array(ratios), [3, 5], axis=1)
     for part in (position, tilt, heading):
         assert 0.7 < np.sqrt(np.mean(part**2)) < 1.4
+
+
+def test_sigmas_that_are_stated_too_small_are_enlarged() -> None:
+    body = flight()
+    fit, _, _ = place(body, flown(body, 4, 1.0, factor=5.0), 1)
+    for group in ("horizontal", "depth", "heading"):
+        assert 3.5 < fit.correlation[group].factor < 7.0
+    honest, _, _ = place(body, flown(body, 4, 1.0), 1)
+    assert all(how.factor < 1.3 for how in honest.correlation.values())
+
+
+def test_a_single_line_without_attitude_does_not_know_its_roll() -> None:
+    body = flight(1, 20)
+    unknown: dict[str, Any] = dict.fromkeys(("roll_deg", "pitch_deg", "heading_deg"), np.nan)
+    records = [replace(r, **unknown) for r in flown(body, 6, 1.0)]
+    fit, error, sigma = place(body, records, 1)
+    about_line, about_slope, heading = np.rad2deg(sigma[3:6])
+    assert 8.0 < about_line < 10.5  # what the level sea floor says
+    assert about_slope < 2.0
+    assert heading < 2.0
+    assert fit.record.largest_tilt_deg == pytest.approx(about_line, rel=0.02)
+    axis = fit.record.largest_tilt_axis_deg
+    assert axis is not None
+    assert min(axis, 180 - axis) < 3.0
+    assert np.abs(error[3]) < 3 * sigma[3]
+
+
+def test_a_free_scale_has_a_sigma_that_holds_its_error() -> None:
+    body, ratios = flight(), []
+    for seed in range(5):
+        _, error, sigma = place(body, flown(body, [6, seed], 20.0), seed, known_scale=None)
+        ratios.append(error[6] / sigma[6])
+    assert 0.4 < np.sqrt(np.mean(np.square(ratios))) < 1.5
