@@ -163,3 +163,20 @@ def test_the_port_bends_the_field_so_that_no_altitude_is_sharp_everywhere() -> N
     assert row.corner_blur_px == pytest.approx(3.83, abs=0.01)
     softer = fov_table([12.5], [1.0], 1.34, PORT, 5.0)[0]
     assert softer.frame_near_altitude_m < 1.0 < softer.frame_far_altitude_m
+
+
+def test_the_hyperfocal_distance_is_the_nearest_that_reaches_infinity() -> None:
+    at = LENS.hyperfocal_m(1.0)
+    assert math.isinf(replace(LENS, focus_m=at * 1.001).sharp_depths_m(1.0)[1])
+    near, far = replace(LENS, focus_m=at * 0.999).sharp_depths_m(1.0)
+    assert math.isfinite(far)
+    assert near == pytest.approx(at / 2, rel=0.01)
+
+
+def test_traced_rays_at_the_limits_blur_by_the_circle_of_confusion() -> None:
+    row = fov_table([12.5], [2.0], 1.34, PORT, 2.0)[0]
+    lens = replace(LENS, focus_m=row.focus_set_m)
+    for altitude_m in (row.near_altitude_m, row.far_altitude_m):
+        point = np.array([0.0, 0.0, 0.03 + altitude_m])
+        traced = traced_blur_px(CAMERA, lens, point, np.array([1.0, 0.0]))
+        assert traced == pytest.approx(2.0, rel=1e-3)
