@@ -1,19 +1,10 @@
-"""`import-log`: a vehicle's own log becomes the navigation CSV that `import-images` reads.
-
-Reports of a Water Linked DVL (A50, A125) are read here: one JSON object a line, as its TCP port
-sends them. `velocity` reports hold vx, vy, vz (m/s; forward, right, down of the transducer), the
-range along its axis and when they were valid (`time_of_validity`, microseconds since 1970);
-`position_local` reports hold roll, pitch and yaw (degrees) at `ts` (seconds since 1970). Their own
-x, y and z count from the last reset and are not read. The maker's page "DVL protocol" describes
-formats json_v2 to json_v3.1.
-"""
+"""`import-log`: a vehicle's own log becomes the navigation CSV that `import-images` reads."""
 
 import itertools
-import json
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -21,22 +12,30 @@ from typing import Any
 import numpy as np
 
 from alice_survey.core.artefacts import read_csv
-from alice_survey.core.contents import as_line
 from alice_survey.core.errors import NavigationError, warn
 from alice_survey.core.frames import Array, Datum, rotation_from_attitude
+from missions.logs.autopilot_logs import (
+    MAGIC,
+    first_bytes,
+    read_ardusub_bin,
+    read_ardusub_tlog,
+    read_px4_ulog,
+)
 from missions.logs.dead_reckoning import TrackErrors, with_dead_reckoning
-from missions.logs.dive import DATED_AFTER_S, ROLES, LoggedDive, Signal, clean_signal, finite_number
+from missions.logs.dive import DATED_AFTER_S, ROLES, LoggedDive, Signal
 from missions.logs.navigation_csv import READINGS, max_gap_s, utc_date
+from missions.logs.ros_bag import is_bag, read_ros_bag
 from missions.values.navigation import COLUMNS, write_navigation_rows
 
 _NAMED = 8
-_JSON = (".json", ".jsonl", ".log", ".txt", "")
-"""What files of JSON reports are called."""
 _NOT_READ = {
     ".csv": "a CSV is not a vehicle's log: give a navigation CSV to import-images --navigation; of "
     "QGroundControl import the .tlog",
     ".log": "text logs of ArduSub are not read: give the .BIN that the text was made of",
-    ".pd0": "PD0 is no longer read: export velocities and ranges as a navigation CSV",
+    **dict.fromkeys(
+        (".pd0", ".json", ".jsonl"),
+        "files of a DVL are not read: import the vehicle's own log, or export a navigation CSV",
+    ),
 }
 _MAX_OUT_OF_WATER_M = 2.0
 """A vehicle on deck, or a barometer that is off, seldom is higher."""
@@ -64,8 +63,6 @@ class ImportOptions:
     """Vehicle log to write, too."""
     dead_reckon: TrackErrors | None = None
     """How velocities err: positions are those of velocities and attitudes between fixes."""
-    flip_velocity: bool = False
-    """Turn velocities over ground round: those of a DVL whose file states the other sign."""
     start_at: tuple[float, float, float] | None = None
     """Latitude, longitude and its sigma in metres of the first velocity, for dead reckoning."""
 
@@ -98,7 +95,7 @@ def import_log(
     is counted, by reason, in warnings and in the result.
 
     Args:
-        path: a bag of ROS 1 or 2, ArduSub's .BIN or .tlog, PX4's .ulg, or the reports of a DVL.
+        path: a bag of ROS 1 or 2, ArduSub's .BIN or .tlog, or PX4's .ulg.
         out: CSV to write.
         options: what to change, and what to choose.
 
@@ -114,7 +111,14 @@ def import_log(
     for file in written:
         if file.resolve() == path.resolve() or written.count(file) > 1:
             raise NavigationError(f"{file} would be written over: choose another name")
-    dive = dead_reckoned(path, read_dive(path, options), options)
+    dive = read_dive(path, options)
+    if options.dead_reckon is not None:
+        try:
+            dive = with_dead_reckoning(
+                dive, options.dead_reckon, options.start_at, options.declination_deg
+            )
+        except NavigationError as error:
+            raise NavigationError(f"{path}: {error}") from None
     tide = read_tide(options.tide, dated=dive.dated)
     _warn_of_declination(dive, options.declination_deg)
     columns = navigation_table(dive, dive.row_times, options, tide)
@@ -144,40 +148,12 @@ def import_log(
     return _report(path, out, dive, time_s, columns, lost, tidal=tidal)
 
 
-def dead_reckoned(path: Path, dive: LoggedDive, options: ImportOptions) -> LoggedDive:
-    """A log's dive with positions by dead reckoning and velocities turned, as the options ask.
-
-    Raises:
-        NavigationError: the log holds too little; the message names it.
-    """
-    if options.flip_velocity:
-        velocities = {"velocity_ned": dive.velocity_ned, "velocity_body": dive.velocity_body}
-        turned: dict[str, Any] = {
-            name: replace(signal, values=-signal.values)
-            for name, signal in velocities.items()
-            if signal is not None
-        }
-        if not turned:
-            raise NavigationError(f"{path}: holds no velocity that --flip-velocity could turn")
-        dive = replace(dive, **turned)
-    if options.dead_reckon is None:
-        return dive
-    try:
-        return with_dead_reckoning(
-            dive, options.dead_reckon, options.start_at, options.declination_deg
-        )
-    except NavigationError as error:
-        raise NavigationError(f"{path}: {error}") from None
-
-
 def _nothing_of_use(path: Path, dive: LoggedDive, lost: Mapping[str, int]) -> str:
-    why = "; ".join(f"{count} times {reason}" for reason, count in sorted(lost.items()))
-    text = f"{path}: no row holds a position, depth, attitude or altitude"
-    if why:
-        text += f" ({why})"
+    reasons = [f"{count} times {reason}" for reason, count in sorted(lost.items())]
     if dive.altitude is not None and dive.altitude_slant:
-        text += f"; ranges of {dive.altitude.source} are of use with an attitude only"
-    return text
+        reasons.append(f"ranges of {dive.altitude.source} are of use with an attitude only")
+    text = f"{path}: no row holds a position, depth, attitude or altitude"
+    return f"{text} ({'; '.join(reasons)})" if reasons else text
 
 
 def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
@@ -186,11 +162,6 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
     Raises:
         NavigationError: it is missing, of no known format, or cannot be used.
     """
-    from missions.logs.ardusub import read_ardusub_bin, read_ardusub_tlog
-    from missions.logs.bag_reader import is_bag
-    from missions.logs.px4_ulog import is_ulog, read_px4_ulog
-    from missions.logs.ros_bag import read_ros_bag
-
     if not path.exists():
         raise NavigationError(f"{path}: no such file or folder")
     if not (path.is_file() or path.is_dir()):  # a pipe would be waited on for ever
@@ -204,9 +175,7 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
         )
     if path.is_dir() or is_bag(path):
         return read_ros_bag(path, chosen, datum)
-    if suffix in _JSON and is_waterlinked(path):
-        return read_waterlinked(path, chosen)
-    if suffix in (".ulg", ".ulog") or is_ulog(path):
+    if suffix in (".ulg", ".ulog") or first_bytes(path, len(MAGIC)) == MAGIC:
         return read_px4_ulog(path, chosen)
     if suffix == ".bin":
         return read_ardusub_bin(path, chosen, datum)
@@ -216,7 +185,7 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
         raise NavigationError(f"{path}: {_NOT_READ[suffix]}")
     raise NavigationError(
         f"{path}: not a known log: a ROS bag (.bag, .mcap, .db3 or a folder), ArduSub's .BIN "
-        "or .tlog, PX4's .ulg, or JSON reports of a Water Linked DVL"
+        "or .tlog, or PX4's .ulg"
     )
 
 
@@ -242,15 +211,11 @@ def _roles(topics: Sequence[str]) -> dict[str, str]:
 
 def _warn_of_declination(dive: LoggedDive, declination_deg: float) -> None:
     known = dive.declination_in_log_deg
-    if known is None or not declination_deg:
-        return
-    if math.isnan(known):
-        warn("the vehicle added a declination itself (COMPASS_AUTODEC): yours comes on top")
-    elif known:
-        warn(
-            f"the vehicle added a declination of {known:.2f} degrees (COMPASS_DEC): yours comes on "
-            "top"
-        )
+    if known and declination_deg:
+        how = "itself (COMPASS_AUTODEC)"
+        if not math.isnan(known):
+            how = f"of {known:.2f} degrees (COMPASS_DEC)"
+        warn(f"the vehicle added a declination {how}: yours comes on top")
 
 
 def navigation_table(
@@ -461,37 +426,29 @@ def read_tide(text: str, *, dated: bool) -> float | Signal:
     try:
         metres = float(text)
     except ValueError:
-        path = Path(text)
+        pass
     else:
         if not math.isfinite(metres):
             raise NavigationError(f"--tide {text}: give a finite number")
         return metres
     column = "time_utc" if dated else "time_s"
     try:
-        names, rows = read_csv(path)
+        rows = read_csv(Path(text), (column, "height_m"))[1]
     except NavigationError as error:
-        raise NavigationError(f"--tide is neither metres nor a CSV: {error}") from None
-    for name in (column, "height_m"):
-        if name not in names:
-            raise NavigationError(
-                f"{path}: column {name} is missing; it has {as_line(', '.join(names))}"
-                + ("" if dated else " (the log's times have no date)")
-            )
-    times, heights = [], []
-    for line, row in rows:
-        try:
-            cell = row[column]
-            times.append(utc_date(cell).timestamp() if dated else float(cell))
-            heights.append(float(row["height_m"]))
-        except ValueError:
-            raise NavigationError(
-                f"{path} line {line}: {row[column]!r}, {row['height_m']!r}: not a time and a height"
-            ) from None
-    if not times or not np.all(np.isfinite([*times, *heights])):
-        raise NavigationError(f"{path}: holds no tides, or heights that are not numbers")
-    if not np.all(np.diff(times) > 0):
-        raise NavigationError(f"{path}: the times must increase")
-    return Signal(source=text, time_s=np.array(times), values=np.array(heights)[:, None])
+        raise NavigationError(f"--tide is neither metres nor a CSV of tides: {error}") from None
+    try:
+        table = np.array(
+            [
+                [utc_date(row[column]).timestamp() if dated else float(row[column]),
+                 float(row["height_m"])]
+                for _, row in rows
+            ]
+        )  # fmt: skip
+    except ValueError as error:
+        raise NavigationError(f"{text}: {error}") from None
+    if not len(table) or not np.isfinite(table).all() or not np.all(np.diff(table[:, 0]) > 0):
+        raise NavigationError(f"{text}: needs finite heights at times that increase")
+    return Signal(source=text, time_s=table[:, 0], values=table[:, 1:])
 
 
 def _moment(time_s: float) -> str:
@@ -499,94 +456,3 @@ def _moment(time_s: float) -> str:
     if time_s < DATED_AFTER_S:
         return f"{time_s:.1f} s"
     return datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%d %H:%M:%S")
-
-
-VELOCITY, ATTITUDE = "velocity", "position_local"
-_MAX_LINE = 100_000
-_LOOKED_AT = 20
-"""Lines at which a file is recognised: the first may be cut."""
-
-
-def is_waterlinked(path: Path) -> bool:
-    """Whether a file holds such reports."""
-    try:
-        with path.open("rb") as file:
-            lines = [file.readline(_MAX_LINE) for _ in range(_LOOKED_AT)]
-    except OSError:
-        return False
-    return any(
-        (report := _parse_report(line)) and report["type"] in (VELOCITY, ATTITUDE) for line in lines
-    )
-
-
-def read_waterlinked(path: Path, requested: Mapping[str, str]) -> LoggedDive:
-    """Read a file of reports.
-
-    Raises:
-        NavigationError: it cannot be read, holds no velocity, or a topic is chosen.
-    """
-    if requested:
-        raise NavigationError(
-            f"--topic {next(iter(requested))}: reports of a DVL have nothing to choose from"
-        )
-    lost: Counter[str] = Counter()
-    velocities: list[list[float]] = []
-    attitudes: list[list[float]] = []
-    since_s, stamped = 0.0, True
-    for report in _read_reports(path, lost):
-        if report["type"] == ATTITUDE:
-            attitudes.append([finite_number(report.get(k)) for k in ("ts", "roll", "pitch", "yaw")])
-            continue
-        since_s += 1e-3 * np.nan_to_num(finite_number(report.get("time")))
-        valid_s = 1e-6 * finite_number(report.get("time_of_validity"))
-        stamped = stamped and math.isfinite(valid_s)
-        row = [finite_number(report.get(k)) for k in ("vx", "vy", "vz", "altitude")]
-        locked = report.get("velocity_valid") is True
-        if not locked:
-            lost["velocity reports without bottom lock"] += 1
-            row[:3] = [math.nan] * 3
-        if not row[3] > 0:
-            row[3] = math.nan
-        velocities.append([valid_s, since_s, *row])
-    if not velocities:
-        raise NavigationError(f"{path}: holds no velocity report of a Water Linked DVL")
-    table, turns = np.array(velocities), np.array(attitudes).reshape(-1, 4)
-    times = table[:, 0] if stamped else table[:, 1]
-    if not stamped and len(turns):
-        raise NavigationError(
-            f"{path}: velocity reports have no time_of_validity, so attitudes cannot be tied to "
-            "them: set the DVL's output to json_v3 or later"
-        )
-    return LoggedDive(
-        kind="reports of a Water Linked DVL",
-        clock="the DVL's clock",
-        dated=bool(np.nanmedian(times) > DATED_AFTER_S),
-        attitude=clean_signal(ATTITUDE, turns[:, 0], turns[:, 1:], lost),
-        altitude=clean_signal(VELOCITY, times, table[:, 5], Counter()),
-        altitude_slant=True,
-        velocity_body=clean_signal(VELOCITY, times, table[:, 2:5], lost),
-        lost=dict(lost),
-        notes=("velocities are of the transducer: forward, right and down have to be the body's",),
-    )
-
-
-def _read_reports(path: Path, lost: Counter[str]) -> Iterator[dict[str, Any]]:
-    try:
-        with path.open("rb") as file:
-            while line := file.readline(_MAX_LINE):
-                report = _parse_report(line)
-                if report is None and line.strip():
-                    lost["lines that are no report"] += 1
-                elif report is not None and report["type"] in (VELOCITY, ATTITUDE):
-                    yield report
-    except OSError as error:
-        raise NavigationError(f"{path}: cannot be read: {error.strerror}") from None
-
-
-def _parse_report(line: bytes) -> dict[str, Any] | None:
-    """The object of a line that names its type."""
-    try:
-        found = json.loads(line)
-    except (ValueError, RecursionError):
-        return None
-    return found if isinstance(found, dict) and isinstance(found.get("type"), str) else None

@@ -24,9 +24,9 @@ from alice_survey.core.executor import progress
 from alice_survey.core.frames import Array
 from camera_calib.calibrate.picture_sets import pair_pictures
 from camera_calib.picture_files import time_taken
-from missions.logs.bag_reader import opened_bag
 from missions.logs.dive import finite_number
 from missions.logs.navigation_csv import utc_date
+from missions.logs.ros_bag import opened_bag
 from reconstruct.pictures.files import list_names, safe_name, to_utc
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from missions.logs import bag_reader
+from missions.logs import ros_bag
 from tests.fuzz import areas, cameras, logs, workspace
 from tests.fuzz.judge import Sandbox, Verdict, judge
 
@@ -350,7 +350,7 @@ def test_rasters_that_name_other_files_are_not_followed(sandbox: Sandbox, source
 def test_bags_whose_chunks_swell(
     sandbox: Sandbox, tmp_path: Path, packed: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bag_reader, "MAX_BYTES", 8 << 20)
+    monkeypatch.setattr(ros_bag, "MAX_BYTES", 8 << 20)
     path = logs.swelling_bag(tmp_path, packed, 10 << 20)
     data = path.read_bytes()
     assert len(data) < 100_000
