@@ -53,9 +53,6 @@ class ErrorBudget:
     shared: Array
     """(P, M) factor of the part of it that other views of the same target have in common: errors of
     the priors' means and of the places of corners. The product with its transpose is that part."""
-    of_places: Array
-    """(N, 3, N, 3) information of the views, over that of independent noise, on offsets of the
-    target's points, with poses, rig and shape adjusted to them."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -121,7 +121,6 @@ def spread_of(problem: CalibrationProblem, found: Adjustment) -> ErrorBudget:
         ),
         covariance=Covariance(parameters=problem.names, matrix=0.5 * (matrix + matrix.T)),
         shared=factor,
-        of_places=products.of_places,
     )
 
 
@@ -147,7 +146,6 @@ class _Products:
         turned = rows.poses.reshape(views, -1, 6).transpose(0, 2, 1)
         self.crossed = turned @ smoothed.reshape(len(parts), views, -1, size)
         self.overlap = turned @ poses.reshape(len(parts), views, -1, 6)
-        self.of_places = self._of_places()
 
     def variances(self) -> Array:
         """Variances of the parts within pictures, then of places by axes (square metres)."""
@@ -160,10 +158,11 @@ class _Products:
             table[i, count:] = table[count:, i] = self._of_both(i)
             smooth = part.smooth(rows.missed[..., None], rows.seen)
             seen[i] = float((rows.missed * smooth[..., 0]).sum())
+        of_places = self._of_places()
         for i, axes in enumerate(_AXES, start=count):
             seen[i] = float((pulled[:, axes] ** 2).sum())
             for j, others in enumerate(_AXES, start=count):
-                table[i, j] = float((self.of_places[:, axes][..., others] ** 2).sum())
+                table[i, j] = float((of_places[:, axes][..., others] ** 2).sum())
         scale = 1.0 / np.sqrt(np.diag(table))
         # Under independent errors the products' covariance is twice the table.
         root = np.linalg.cholesky(table * np.outer(scale, scale) + 1e-12 * np.eye(size))

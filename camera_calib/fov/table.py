@@ -80,8 +80,6 @@ class FovRow:
     f_number: float
     coc_px: float
     """Largest blur circle that counts as sharp."""
-    focus_set_m: float
-    """Distance in air that the limits below are for."""
     hyperfocal_air_m: float
     """Least focus distance in air for which everything beyond is sharp."""
     hyperfocal_altitude_m: float
@@ -285,7 +283,6 @@ def _row(
         focus_air_m=focus_air_m,
         f_number=config.f_number,
         coc_px=coc_px,
-        focus_set_m=focus_air_m,
         hyperfocal_air_m=hyperfocal,
         hyperfocal_altitude_m=float(np.mean(at_centre.altitudes_m(hyperfocal))),
         near_altitude_m=near,

@@ -20,13 +20,11 @@ from camera_calib.judge.residuals import (
     HomographyTest,
     PictureFit,
     Profile,
-    TargetFrame,
     camera_residuals,
     coverage,
     homography_test,
     incidence_profile,
     picture_fits,
-    target_frame,
 )
 from camera_calib.judge.uncertainty import (
     Parameter,
@@ -42,12 +40,10 @@ from camera_calib.judge.uncertainty import (
 )
 from camera_calib.judge.validation import (
     HalvesAgreement,
-    HalvesDifference,
     HeldOut,
     HoldOutScore,
     LengthErrors,
     halves_agreement,
-    halves_difference,
     length_errors,
     score_hold_out,
 )
@@ -65,8 +61,6 @@ _MAX_OUTLIERS = 0.01
 """Share of the points."""
 _HELD_OUT_LIMITS = 1.2, 2.0
 """Ratios above which a verdict is `look` and `bad`, here as in all pairs of limits."""
-_HALVES_LIMITS = 2.0, 3.5
-"""One difference is a single draw from what is expected."""
 _P_LOOK, _P_BAD = 1e-2, 1e-6
 """Probabilities of the difference of two halves."""
 _FRESH_WATER = 1.33
@@ -79,8 +73,8 @@ _OPEN = 0.5
 """Share of its prior's sigma above which the views do not show a bow."""
 _VERY_BENT = 2.0
 """Bow over its prior's sigma."""
-_RETURNING = 0.5
-"""Residuals that return in the target's frame, over the noise of a coordinate."""
+_UNEVEN = 0.5
+"""Errors of the places of corners on the target, in the pictures, over the noise of a corner."""
 _SIGMAS = 3.0
 _MOVED_LIMITS = 3.5, 6.0
 """Sigmas by which views may move a parameter from its prior."""
@@ -89,11 +83,6 @@ _LEARNT = 0.99
 _TREND_LIMITS = 0.35, 1.0
 _SIGMA_LIMITS = 3.0, 10.0
 """Projection sigma that nine tenths of the frame keep below, over the noise."""
-_CAUSES = {
-    "shape": "the target is bent or stretched, and its shape was not adjusted",
-    "corners": "a few of its corners are displaced or damaged",
-    "uneven": "its print or paper is uneven",
-}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -108,7 +97,6 @@ class CameraJudgement:
     sigma: ProjectionSigma
     """(R, C) at the working range."""
     by_range: tuple[RangeSigma, ...]
-    halves: HalvesDifference | None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -131,7 +119,6 @@ class Judgement:
     hold_out: HoldOutScore | None
     halves: HalvesAgreement | None
     """All parameters of two calibrations, from either half of the views."""
-    target_frame: TargetFrame | None
 
     @property
     def stereo_at_work(self) -> StereoSigma | None:
@@ -176,13 +163,12 @@ def judge(
         parameters=parameters,
         baselines_m=baselines_m(rig),
         pictures=tuple(picture_fits(calibration)),
-        cameras={name: _camera(calibration, held, name, range_m, ranges) for name in rig.cameras},
+        cameras={name: _camera(calibration, name, range_m, ranges) for name in rig.cameras},
         stereo=tuple(stereo_sigma(rig, r, calibration.noise_px) for r in ranges) if stereo else (),
         lengths=lengths,
         held_lengths=held_lengths,
         hold_out=None if held is None else score_hold_out(held),
         halves=None if held is None or held.halves is None else halves_agreement(held.halves),
-        target_frame=target_frame(calibration),
     )
 
 
@@ -207,21 +193,11 @@ def anchors_cam(calibration: Calibration, camera: str) -> Array:
 
 
 def _camera(
-    calibration: Calibration,
-    held: HeldOut | None,
-    name: str,
-    range_m: float,
-    ranges: tuple[float, ...],
+    calibration: Calibration, name: str, range_m: float, ranges: tuple[float, ...]
 ) -> CameraJudgement:
     rig, model = calibration.rig, calibration.rig.cameras[name]
-    seen, anchors = camera_residuals(calibration, name), anchors_cam(calibration, name)
-    pixels, compensating = (
-        model.frame_grid(_MAP_COLUMNS, _MAP_ROWS),
-        compensation(rig, name, anchors),
-    )
-    halves = None
-    if held is not None and held.halves is not None:
-        halves = halves_difference(held.halves, name, pixels, range_m, anchors)
+    seen, pixels = camera_residuals(calibration, name), model.frame_grid(_MAP_COLUMNS, _MAP_ROWS)
+    compensating = compensation(rig, name, anchors_cam(calibration, name))
     return CameraJudgement(
         seen=seen,
         by_incidence=incidence_profile(model, seen),
@@ -229,7 +205,6 @@ def _camera(
         homography=homography_test(calibration, name),
         sigma=projection_sigma(rig, name, pixels, range_m, compensating),
         by_range=sigmas_by_range(rig, name, pixels[::2, ::2], ranges, compensating),
-        halves=halves,
     )
 
 
@@ -277,12 +252,6 @@ def _fit_verdicts(judged: Judgement) -> Iterator[Verdict]:
         yield Verdict(level="good", text=f"all pictures fit alike (median {median:.3f} px rms)")
     outliers, points = (sum(getattr(p, n) for p in judged.pictures) for n in ("outliers", "points"))
     yield from _outlier_verdicts(outliers, points, "points")
-    frame, noise_px = judged.target_frame, judged.calibration.noise_px
-    cause = "the model of lens or port does not fit"
-    if frame is not None and frame.likely == "shape":
-        cause = "the target departs from its drawing"
-    elif frame is not None and frame.likely and frame.returning_px > _RETURNING * noise_px:
-        cause = f"the target is uneven, or {cause}"
     for name, camera in judged.cameras.items():
         test = camera.homography
         if test is not None and np.isfinite(test.outer_px):
@@ -290,7 +259,7 @@ def _fit_verdicts(judged: Judgement) -> Iterator[Verdict]:
                 test.excess_px / max(test.inner_px, 1e-12), _TREND_LIMITS,
                 f"{name}: homographies leave {test.inner_px:.3f} px within and "
                 f"{test.outer_px:.3f} px beyond {test.outer_from_px:.0f} px from the centre",
-                f"; {cause}",
+                "; the model of lens or port does not fit",
             )  # fmt: skip
 
 
@@ -369,15 +338,6 @@ def _hold_out_verdicts(judged: Judgement) -> Iterator[Verdict]:
         f"{score.used_rms_px:.3f} px",
     )  # fmt: skip
     yield from _outlier_verdicts(score.outliers, score.points + score.outliers, "held-out points")
-    for name, camera in judged.cameras.items():
-        if camera.halves is not None:
-            ratio = camera.halves.rms_px / camera.halves.expected_px
-            yield _grade(
-                ratio, _HALVES_LIMITS,
-                f"{name}: calibrations from either half of the views differ by "
-                f"{camera.halves.rms_px:.3f} px rms, {ratio:.2f} times what their covariances "
-                "predict",
-            )  # fmt: skip
     if halves is not None:
         yield _grade(
             -np.log(max(halves.p_value, 1e-300)), (-np.log(_P_LOOK), -np.log(_P_BAD)),
@@ -388,8 +348,9 @@ def _hold_out_verdicts(judged: Judgement) -> Iterator[Verdict]:
 
 
 def _target_verdicts(judged: Judgement) -> Iterator[Verdict]:
-    """The target's bend, and what returns in its frame in view after view."""
-    shape, frame = judged.calibration.shape, judged.target_frame
+    """The target's bend, and places of its corners that are off in view after view."""
+    calibration = judged.calibration
+    shape = calibration.shape
     for name, along in ((BOW_X, "width"), (BOW_Y, "height")):
         if name not in shape.parameters:
             continue
@@ -402,19 +363,17 @@ def _target_verdicts(judged: Judgement) -> Iterator[Verdict]:
             yield _look(
                 f"the target is bent by {known}: it is taken into account; use a stiffer one"
             )
-    if frame is None:
+    if calibration.spread is None:
         return
-    if frame.likely is None:
-        yield Verdict(level="good", text="residuals average to nothing in the target's frame")
-        return
-    small = frame.returning_px <= _RETURNING * judged.calibration.noise_px
-    yield Verdict(
-        level="good" if small and frame.likely != "shape" else "look",
-        text=f"in the target's frame {frame.returning_px:.3f} px of the residuals return in every "
-        f"view (p = {frame.p_value:.1g}), {1e3 * frame.in_plane_m:.2f} mm rms in its plane: "
-        f"likely {_CAUSES[frame.likely]}"
-        + ("; the sigmas include it" if small else "; use a better target"),
-    )
+    off_m = calibration.spread.noise.place_sigmas_m[0]
+    focal_px = np.mean([one.focal_in_water_px for one in calibration.rig.cameras.values()])
+    range_m = np.median([picture.range_m for picture in judged.pictures])
+    yield _grade(
+        float(off_m * focal_px / range_m) / calibration.noise_px, (_UNEVEN, np.inf),
+        f"corners lie {1e3 * off_m:.3f} mm off their places in the target's plane, which the "
+        "sigmas include",
+        ": use a target of even print, or let markers move with --target-shape markers",
+    )  # fmt: skip
 
 
 def _length_verdicts(judged: Judgement) -> Iterator[Verdict]:

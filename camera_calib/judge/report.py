@@ -84,7 +84,6 @@ def report_json(judged: Judgement, found: Sequence[Verdict]) -> dict[str, Any]:
             "rejections": calibration.rejections,
             "parameters": judged.parameters,
             "baselines_m": judged.baselines_m,
-            "target_frame": judged.target_frame,
             "pictures": judged.pictures,
             "cameras": {
                 name: {
@@ -92,7 +91,6 @@ def report_json(judged: Judgement, found: Sequence[Verdict]) -> dict[str, Any]:
                     "residuals_by_incidence_deg": camera.by_incidence,
                     "projection_sigma": camera.by_range,
                     "homography": camera.homography,
-                    "halves": camera.halves,
                 }
                 for name, camera in judged.cameras.items()
             },

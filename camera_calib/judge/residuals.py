@@ -1,4 +1,4 @@
-"""What the residuals of a calibration show: pictures, trends, coverage, homographies, the target.
+"""What the residuals of a calibration show: pictures, trends, coverage, homographies.
 
 - By picture, over the frame and against the angle at the port.
 - Homographies: through a perfect model a flat target is seen as a plane by a pinhole, so its
@@ -8,28 +8,19 @@
   error of 1 cm moves such a pixel by about 0.001 px (20 mm port, 12.5 mm lens). No truth is needed;
   residuals that grow outwards are an error of the model. What the found shape of a bent target
   moves is taken off first.
-- In the target's frame: noise differs from view to view, and an error of lens or port stays in the
-  picture while the board moves through it. What returns at the same place of the board in view
-  after view is the board's own: bent, stretched by the printer, a corner out of its place.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
-from scipy.stats import norm
 
 from alice_survey.core.frames import Array
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.calibration import Calibration, stack_views
 from camera_calib.camera import Camera
-from camera_calib.target_shape import usual_shape
-
-Cause = Literal["shape", "corners", "uneven"]
 
 GATE_SIGMAS = 5.0
 """Residuals longer than this many times the noise are outliers: counted, and kept out of the
@@ -55,12 +46,6 @@ _OUTLYING = 6.0
 _HALF_STEP_PX = 0.5
 _OUTER_SHARE = 0.7
 """Residuals beyond this share of the largest radius with points are compared with the others."""
-_MIN_VIEWS = 4
-_FEW = 0.05
-"""Share of a target's corners that are `a few`."""
-_BY_CHANCE = 1e-3
-_MAX_OF = 0.5
-"""Share of what returns that makes a cause the likely one."""
 
 
 def within_gate(residuals_px: Array, noise_px: Array | float) -> NDArray[np.bool_]:
@@ -402,104 +387,3 @@ def _map(h: Array, plane: Array) -> tuple[Array, Array]:
     slopes[:, 0, :3] = slopes[:, 1, 3:6] = row
     slopes[:, :, 6:] = -image[:, :, None] * row[:, None, :2]
     return image, slopes
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TargetFrame:
-    """What returns in the target's frame."""
-
-    returning_px: float
-    """Root mean square length of what returns, a residual of every view; 0 if nothing does."""
-    p_value: float
-    """Probability of as much by chance, if views are independent of each other."""
-    in_plane_m: float
-    """Root mean square offset in the target's plane, beyond what noise gives."""
-    likely: Cause | None
-    """Bends and stretch that were not adjusted, a few corners, or neither; None if nothing returns
-    but by chance."""
-
-
-def target_frame(calibration: Calibration) -> TargetFrame | None:
-    """Average the residuals of all pictures at every place of the target.
-
-    With D the slopes of a corner's pixels by its place and r their residuals, over their sigmas,
-    view v pulls at place n by g_nv = D^T r. Products of the pulls of two views with errors of their
-    own are 0 on average, and their scatter is known from the products themselves, as any view's
-    errors might have had the other sign.
-
-    Returns:
-        None with fewer than four views, or without the noise of the corners.
-    """
-    if len(calibration.views) < _MIN_VIEWS or calibration.spread is None:
-        return None
-    count = calibration.target_points.size
-    information = calibration.spread.of_places.reshape(count, count)
-    pulls, weight, points = _pulls(calibration)
-    known = np.linalg.matrix_rank(weight, hermitian=True) == 3
-    inverse = np.zeros_like(weight)
-    inverse[known] = np.linalg.inv(weight[known])
-    moved = np.einsum("nij,vnj->vni", inverse, pulls)
-    products = np.einsum("vni,wni->vw", pulls, moved)
-    own = float(np.trace(products))
-    apart = products - np.diag(np.diag(products))
-    scatter, excess = float(np.sqrt(2.0 * (apart**2).sum())), float(apart.sum())
-    offsets = -moved.sum(axis=0)
-    # Every view's own pull, squared, is what noise adds to the square of their sum.
-    plane = (offsets[:, :2] ** 2 - (moved[..., :2] ** 2).sum(axis=0))[known]
-    sigma_px = float(np.sqrt(np.mean(calibration.sigma_px**2)))
-
-    def left(modes: Array) -> float:
-        """Excess after offsets along modes (K, N, 3) and all unknowns were adjusted."""
-        rows = modes.reshape(-1, count) @ information
-        pull = pulls.sum(axis=0).ravel()
-        table, pulled = rows @ modes.reshape(-1, count).T, modes.reshape(-1, count) @ pull
-        values = np.linalg.lstsq(table, pulled, rcond=1e-10)[0]
-        rest = (pull - values @ rows).reshape(-1, 3)
-        return float(np.einsum("ni,nij,nj->", rest, inverse, rest)) - own
-
-    p_value = float(norm.sf(excess / scatter)) if scatter > 0.0 else 1.0
-    squares = np.einsum("ni,nij,nj->n", offsets, weight, offsets)
-    returns = p_value < _BY_CHANCE
-    return TargetFrame(
-        returning_px=sigma_px * float(np.sqrt(max(excess, 0.0) / points)),
-        p_value=p_value,
-        in_plane_m=float(np.sqrt(max(plane.sum(axis=1).mean(), 0.0))) if known.any() else 0.0,
-        likely=_cause(calibration.drawn_points, squares, excess, left) if returns else None,
-    )
-
-
-def _pulls(calibration: Calibration) -> tuple[Array, Array, int]:
-    """(V, N, 3) pulls of the views, (N, 3, 3) their weight, and the number of points."""
-    rig, target = calibration.rig, calibration.target_points
-    pulls = np.zeros((len(calibration.views), *target.shape))
-    weight, count = np.zeros((len(target), 3, 3)), 0
-    weights = np.nan_to_num(calibration.weights)
-    for v, c in np.ndindex(*calibration.sigma_px.shape):
-        residuals = calibration.residuals_px[v, c]
-        seen = np.isfinite(residuals).all(axis=1)
-        if not seen.any():
-            continue
-        name = list(rig.cameras)[c]
-        pose = rig.cam_from_rig[name] * calibration.rig_from_target[v]
-        _, by_point, _ = rig.cameras[name].project_jacobian(pose.apply(target[seen]))
-        slopes = by_point @ pose.rotation.as_matrix() / calibration.sigma_px[v, c]
-        scaled = residuals[seen] * weights[v, c, seen, None] / calibration.sigma_px[v, c]
-        pulls[v, seen] += np.einsum("nai,na->ni", slopes, scaled)
-        weight[seen] += np.einsum("nai,naj->nij", slopes, slopes)
-        count += int(seen.sum())
-    return pulls, weight, count
-
-
-def _cause(drawn: Array, squares: Array, excess: float, left: Callable[[Array], float]) -> Cause:
-    """What takes most of the excess away."""
-    count = len(drawn)
-    few = np.argsort(squares)[-max(round(_FEW * count), 1) :]
-    axes = np.zeros((len(few), 3, count, 3))
-    axes[np.arange(len(few))[:, None], np.arange(3), few[:, None], np.arange(3)] = 1.0
-    modes: dict[Cause, Array] = {"corners": axes.reshape(-1, count, 3)}
-    shape = usual_shape(drawn)
-    if shape.parameters:
-        modes["shape"] = shape.modes
-    rest = {cause: left(some) for cause, some in modes.items()}
-    cause = min(rest, key=lambda name: rest[name])
-    return cause if rest[cause] < _MAX_OF * excess else "uneven"

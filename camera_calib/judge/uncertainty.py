@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from alice_survey.core.artefacts import json_values
 from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import Array
-from alice_survey.kit.words import text_table, with_sigma
+from alice_survey.kit.words import field_table, with_sigma
 from camera_calib.camera import Camera, pose_jacobian
 from camera_calib.freedom import POSE, all_names, value
 from camera_calib.rig import Covariance, Rig, read_rig
@@ -29,6 +29,19 @@ _READER_UNITS = (("_px", 1.0, "px"), ("_m", 1e3, "mm"), ("_rad", math.degrees(1.
 """Endings of parameters, and the factors to the units in which they are shown."""
 RANGES_M = (0.5, 1.0, 2.0, 4.0, 8.0)
 _GRID = 11
+_PARAMETERS = {
+    "parameter": "{name}", "value": "{known} {unit}",
+    "correlates most with": "{most_alike} {correlation:+.2f}",
+}  # fmt: skip
+_PROJECTIONS = {
+    "camera": "{camera}", "at": "{range_m:g} m",
+    "best pose, median/worst": "{compensated_median_px:.3f} / {compensated_worst_px:.3f} px",
+    "fixed pose, median/worst": "{plain_median_px:.3f} / {plain_worst_px:.3f} px",
+}  # fmt: skip
+_STEREO = {
+    "at": "{range_m:g} m", "depth": "{depth_mm:.3g} mm", "shape": "{shape_mm:.3g} mm",
+    "noise": "{noise_mm:.3g} mm", "a length": "{length_mm:.3g} mm of {length_m:.2f} m",
+}  # fmt: skip
 
 
 def covariance_of(rig: Rig) -> Covariance:
@@ -456,54 +469,38 @@ def uncertainty_report(
             "the near one not beyond the far one"
         )
     parameters = [p for p in rig_parameters(rig) if p.sigma is not None]
-    baselines = baselines_m(rig)
     between = tuple(np.geomspace(near_m, far_m, 4).tolist())
-    maps = {
-        name: sigmas_by_range(
-            rig, name, camera.frame_grid(_GRID, _GRID), ranges,
-            compensation(rig, name, frame_points(camera, between)),
-        )
-        for name, camera in rig.cameras.items()
-    }  # fmt: skip
-    stereo = [stereo_sigma(rig, r, noise_px) for r in ranges] if baselines else []
-    data = {"parameters": parameters, "baselines_m": baselines, "projection_sigma": maps}
-    parts = [
-        text_table(
-            ("parameter", "value", "unit", "correlates most with"),
-            [
-                (p.name, with_sigma(p.value, p.sigma or 0.0), p.unit,
-                 f"{p.most_alike} {p.correlation:+.2f}")
-                for p in parameters
-            ],
-        ),
-        *(
-            f"{rig.reference} to {name}: {with_sigma(1e3 * length, 1e3 * sigma)} mm"
-            for name, (length, sigma) in baselines.items()
-        ),
-        "one sigma of a projection over the frame\n"
-        + text_table(
-            ("camera", "at m", "best pose px", "worst", "fixed pose px", "worst"),
-            [
-                (name, f"{s.range_m:g}", f"{s.compensated_median_px:.3f}",
-                 f"{s.compensated_worst_px:.3f}", f"{s.plain_median_px:.3f}",
-                 f"{s.plain_worst_px:.3f}")
-                for name, sigmas in maps.items() for s in sigmas
-            ],
-        ),
-    ]  # fmt: skip
-    if stereo:
-        data["stereo"] = stereo
-        lengths_m = [
-            (s.point_m[2], s.worst_shape_m, s.noise_m[2], s.length_sigma_m) for s in stereo
-        ]
-        parts.append(
-            "one sigma of stereo by calibration alone, mm\n"
-            + text_table(
-                ("at m", "depth", "shape", f"{noise_px:g} px noise", "length", "length m"),
-                [
-                    (f"{s.range_m:g}", *(f"{1e3 * m:.3g}" for m in row), f"{s.length_m:.2f}")
-                    for s, row in zip(stereo, lengths_m, strict=True)
-                ],
+    data: dict[str, Any] = {
+        "parameters": parameters,
+        "baselines_m": baselines_m(rig),
+        "projection_sigma": {
+            name: sigmas_by_range(
+                rig, name, camera.frame_grid(_GRID, _GRID), ranges,
+                compensation(rig, name, frame_points(camera, between)),
             )
-        )
-    return "\n\n".join(parts), json_values(data)
+            for name, camera in rig.cameras.items()
+        },
+    }  # fmt: skip
+    if len(rig.cameras) > 1:
+        data["stereo"] = [stereo_sigma(rig, r, noise_px) for r in ranges]
+    shown = [vars(p) | {"known": with_sigma(p.value, p.sigma or 0.0)} for p in parameters]
+    projections = [
+        vars(one) | {"camera": name}
+        for name, sigmas in data["projection_sigma"].items()
+        for one in sigmas
+    ]
+    stereo = [
+        {
+            "range_m": s.range_m, "length_m": s.length_m, "depth_mm": 1e3 * s.point_m[2],
+            "shape_mm": 1e3 * s.worst_shape_m, "noise_mm": 1e3 * s.noise_m[2],
+            "length_mm": 1e3 * s.length_sigma_m,
+        }
+        for s in data.get("stereo", ())
+    ]  # fmt: skip
+    tables = (
+        ("Parameters", _PARAMETERS, shown),
+        ("One sigma of a projection over the frame", _PROJECTIONS, projections),
+        (f"One sigma of stereo by calibration alone, and by {noise_px:g} px of noise", _STEREO,
+         stereo),
+    )  # fmt: skip
+    return "\n\n".join(field_table(*table) for table in tables if table[2]), json_values(data)

@@ -14,19 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 from scipy.stats import chi2
 
 from alice_survey.core.errors import CalibrationError, warn
 from alice_survey.core.frames import Array
 from alice_survey.core.run import progress
 from camera_calib.calibration import Calibration, TargetView, residuals_px, stack_views
-from camera_calib.camera import Camera, pose_jacobian
+from camera_calib.camera import pose_jacobian
 from camera_calib.freedom import POSE, value
 from camera_calib.judge.residuals import rms_length_px, within_gate
 from camera_calib.judge.uncertainty import (
-    camera_slopes,
-    compensation,
     covariance_of,
     rig_slopes,
     taken_up,
@@ -153,16 +151,6 @@ def score_hold_out(held: HeldOut) -> HoldOutScore:
 
 
 @dataclass(frozen=True, kw_only=True)
-class HalvesDifference:
-    """Difference of projections of two calibrations of one camera, after the best pose."""
-
-    rms_px: float
-    """Root mean square length over the frame."""
-    expected_px: float
-    """What both covariances predict of it."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class HalvesAgreement:
     """Difference of the parameters of two calibrations, by their covariances."""
 
@@ -173,22 +161,12 @@ class HalvesAgreement:
     """Probability of as large a difference, if the covariances are true."""
 
 
-def _difference_covariance(halves: tuple[Calibration, Calibration]) -> Array:
-    """(P, P) covariance of the difference of both rigs' parameters.
+def halves_agreement(halves: tuple[Calibration, Calibration]) -> HalvesAgreement:
+    """Compare all calibrated parameters of two calibrations of one rig, turns as small turns.
 
     Errors of what both took as known, and of the one target that both saw, are the same in both:
     only the difference of their effects shows.
     """
-    first, second = (half.shared for half in halves)
-    apart = first - second
-    matrix = apart @ apart.T
-    for half, shared in zip(halves, (first, second), strict=True):
-        matrix = matrix + covariance_of(half.rig).matrix - shared @ shared.T
-    return matrix
-
-
-def halves_agreement(halves: tuple[Calibration, Calibration]) -> HalvesAgreement:
-    """Compare all calibrated parameters of two calibrations of one rig, turns as small turns."""
     first, second = (half.rig for half in halves)
     names = covariance_of(first).parameters
     apart = np.array([value(second, name) - value(first, name) for name in names])
@@ -197,61 +175,16 @@ def halves_agreement(halves: tuple[Calibration, Calibration]) -> HalvesAgreement
         if set(turns) <= set(names):
             turn = second.cam_from_rig[camera].rotation * first.cam_from_rig[camera].rotation.inv()
             apart[[names.index(name) for name in turns]] = turn.as_rotvec()
-    matrix = _difference_covariance(halves)
+    between = halves[0].shared - halves[1].shared
+    matrix = between @ between.T
+    for half in halves:
+        matrix = matrix + covariance_of(half.rig).matrix - half.shared @ half.shared.T
     scale = 1.0 / np.sqrt(np.diag(matrix))
     values, vectors = np.linalg.eigh(matrix * np.outer(scale, scale))
     known = values > _MIN_KNOWN * values[-1]
     along = vectors[:, known].T @ (scale * apart)
     total, count = float((along**2 / values[known]).sum()), int(known.sum())
     return HalvesAgreement(chi2=total, parameters=count, p_value=float(chi2.sf(total, count)))
-
-
-def halves_difference(
-    halves: tuple[Calibration, Calibration],
-    camera: str,
-    pixels: Array,
-    range_m: float,
-    anchors_cam: Array,
-) -> HalvesDifference:
-    """Compare two calibrations as mrcal does: over the frame, after the best pose.
-
-    Args:
-        halves: from different views of the same target.
-        camera: which camera.
-        pixels: (..., 2) where to evaluate.
-        range_m: distance of the points along the axis.
-        anchors_cam: (A, 3) points in the camera's frame that fix the pose between both.
-    """
-    rig, second = halves[0].rig, halves[1].rig.cameras[camera]
-    first = rig.cameras[camera]
-    pose = _best_pose(first, second, anchors_cam)
-    flat = pixels.reshape(-1, 2)
-    points = first.at_depth(flat, range_m)
-    _, by_point, plain = camera_slopes(rig, camera, points)
-    moved = plain + pose_jacobian(by_point, points) @ compensation(rig, camera, anchors_cam)
-    variance = np.einsum("nap,pq,naq->n", moved, _difference_covariance(halves), moved)
-    square = ((second.project(pose.apply(points)) - flat) ** 2).sum(axis=-1)
-    return HalvesDifference(
-        rms_px=float(np.sqrt(np.nanmean(square))),
-        expected_px=float(np.sqrt(np.nanmean(np.maximum(variance, 0.0)))),
-    )
-
-
-def _best_pose(first: Camera, second: Camera, anchors_cam: Array) -> RigidTransform:
-    """`second_from_first` that makes both project the anchors most alike (Gauss-Newton)."""
-    target = first.project(anchors_cam)
-    pose = RigidTransform.identity()
-    for _ in range(10):
-        moved = pose.apply(anchors_cam)
-        pixels, by_point, _ = second.project_jacobian(moved)
-        off, slopes = target - pixels, pose_jacobian(by_point, moved)
-        known = np.isfinite(off).all(axis=1)
-        step = np.linalg.lstsq(slopes[known].reshape(-1, 6), off[known].ravel(), rcond=None)[0]
-        small = RigidTransform.from_components(step[3:], Rotation.from_rotvec(step[:3]))
-        pose = small * pose
-        if np.abs(step).max() < 1e-12:
-            break
-    return pose
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -9,9 +9,15 @@ from alice_survey.core.artefacts import json_values, write_csv
 from alice_survey.core.config import CameraConfig, SurveyConfig, load_config, parse_config
 from alice_survey.core.errors import ConfigError, warn
 from camera_calib.formats.rigs import led_by
+from camera_calib.fov.display import (
+    draw_fov,
+    fov_csv_rows,
+    fov_text,
+    validation_rows,
+    validation_text,
+)
 from camera_calib.fov.paper import paper_settings, validate_paper
 from camera_calib.fov.table import FovRow, blur_table, fov_table, rig_fov_table
-from camera_calib.fov.text import fov_csv_rows, fov_text, validation_csv_rows, validation_text
 from camera_calib.rig import Rig, port_settings, read_rig
 
 PAPER_LENSES_MM = (12.5, 25.0)
@@ -49,10 +55,10 @@ def fov_report(options: FovOptions, output: Output) -> tuple[str, Any]:
         camera, n_water = _sensor_of(rig, settings.camera)
     lenses = options.lens_mm or ((camera.focal_mm,) if options.survey else PAPER_LENSES_MM)
 
-    def table(altitudes_m: Sequence[float], coc_px: float = 1.0) -> list[FovRow]:
+    def table(altitudes_m: Sequence[float]) -> list[FovRow]:
         if rig is not None:
-            return rig_fov_table(rig, altitudes_m, camera, coc_px)
-        return fov_table(lenses, altitudes_m, n_water, camera, coc_px)
+            return rig_fov_table(rig, altitudes_m, camera)
+        return fov_table(lenses, altitudes_m, n_water, camera)
 
     altitudes = options.altitude_m or (settings.plan.altitude_m,)
     speeds = options.speed_mps or (settings.plan.speed_mps,)
@@ -63,12 +69,7 @@ def fov_report(options: FovOptions, output: Output) -> tuple[str, Any]:
     if output.csv is not None:
         _write(output.csv, fov_csv_rows(rows, blur))
     if output.plot is not None:
-        from camera_calib.fov.plot import draw_fov
-
-        draw_fov(
-            output.plot, table, altitudes, speeds_mps=speeds, exposures_s=exposures,
-            allowed_px=allowed, paper=rig is None and _is_papers(camera),
-        )  # fmt: skip
+        draw_fov(output.plot, table, altitudes)
     data = {
         "source": "design values" if rig is None else rig.source,
         "rows": json_values(rows),
@@ -90,17 +91,14 @@ def validation_report(options: FovOptions, output: Output) -> tuple[str, Any]:
         )
     validation = validate_paper()
     if output.csv is not None:
-        _write(output.csv, validation_csv_rows(validation))
+        _write(output.csv, validation_rows(validation))
     if output.plot is not None:
-        from camera_calib.fov.plot import draw_fov
-
         camera, n_water, altitude = paper_settings()
         draw_fov(
             output.plot,
-            lambda heights, coc_px: fov_table(PAPER_LENSES_MM, heights, n_water, camera, coc_px),
-            [altitude], speeds_mps=[0.2, 0.5],
-            exposures_s=[PAPER_EXPOSURE_MS * 1e-3], allowed_px=1.0, paper=True,
-        )  # fmt: skip
+            lambda heights: fov_table(PAPER_LENSES_MM, heights, n_water, camera),
+            [altitude],
+        )
     return validation_text(validation), validation.to_json()
 
 
@@ -147,12 +145,6 @@ def _sensor_of(rig: Rig, camera: CameraConfig) -> tuple[CameraConfig, float]:
         **port_settings(own),
     }
     return camera.model_copy(update=update), own.n_water
-
-
-def _is_papers(camera: CameraConfig) -> bool:
-    """The sensor is the one of the paper's table."""
-    sensor = ("width_px", "height_px", "pixel_um")
-    return all(getattr(camera, key) == CameraConfig.model_fields[key].default for key in sensor)
 
 
 def _write(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -175,7 +175,7 @@ def test_the_hyperfocal_distance_is_the_nearest_that_reaches_infinity() -> None:
 
 def test_traced_rays_at_the_limits_blur_by_the_circle_of_confusion() -> None:
     row = fov_table([12.5], [2.0], 1.34, PORT, 2.0)[0]
-    lens = replace(LENS, focus_m=row.focus_set_m)
+    lens = replace(LENS, focus_m=row.focus_air_m)
     for altitude_m in (row.near_altitude_m, row.far_altitude_m):
         point = np.array([0.0, 0.0, 0.03 + altitude_m])
         traced = traced_blur_px(CAMERA, lens, point, np.array([1.0, 0.0]))

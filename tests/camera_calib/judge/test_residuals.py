@@ -1,4 +1,4 @@
-"""What residuals show: of pictures, over the frame, by homographies, in the target's frame."""
+"""What residuals show: of pictures, over the frame, by homographies."""
 
 from dataclasses import replace
 
@@ -8,14 +8,12 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.artefacts import json_values
-from benchmarks.target_calibration import SOUND, TARGETS, run_trial
 from camera_calib.approximation.pinhole_warp import best_warp
 from camera_calib.calibration import Calibration, TargetView
 from camera_calib.freedom import Freedom, intrinsics, of_cameras, pose_names
 from camera_calib.judge.residuals import (
     CORNERS,
     HomographyTest,
-    TargetFrame,
     camera_residuals,
     coverage,
     homography_residuals,
@@ -26,9 +24,7 @@ from camera_calib.judge.residuals import (
     picture_fits,
     profile,
     rms_length_px,
-    target_frame,
 )
-from camera_calib.target_shape import AS_DRAWN
 from tests.cameras import changed
 from tests.oracles_report import (
     DESIGN,
@@ -240,51 +236,3 @@ def test_a_target_that_is_not_flat_is_not_tested() -> None:
     bent = found.target_points.copy()
     bent[::7, 2] = 0.02
     assert homography_test(replace(found, target_points=bent), "left") is None
-
-
-def frame_of(calibration: Calibration) -> TargetFrame:
-    found = target_frame(calibration)
-    assert found is not None
-    return found
-
-
-def test_noise_does_not_return() -> None:
-    """The probability is that of chance: it is small as often as it says."""
-    far = replace(SOUND, together_px=0.15)
-    values = [frame_of(run_trial(seed, t)).p_value for seed in range(12) for t in (SOUND, far)]
-    assert min(values) > 1e-3
-    assert 0.3 < np.mean(values) < 0.8
-
-
-@pytest.mark.parametrize("bow_m", [2.5e-4, 5e-4])
-def test_a_bend_that_was_not_adjusted_returns_and_is_named(bow_m: float) -> None:
-    for seed in range(3):
-        target = replace(SOUND, bow_m=bow_m)
-        assert frame_of(run_trial(seed, target, AS_DRAWN)).likely == "shape"
-        assert frame_of(run_trial(seed, target)).likely is None
-
-
-def test_an_uneven_print_returns_with_its_size() -> None:
-    for seed in range(3):
-        found = frame_of(run_trial(seed, replace(TARGETS["correlated"], place_m=6e-5)))
-        assert found.likely == "uneven"
-        # Two axes; poses take up a part of so few places.
-        assert found.in_plane_m == pytest.approx(6e-5 * 2**0.5, rel=0.25)
-        assert found.returning_px > 0.08
-
-
-def test_a_few_bad_corners_are_named() -> None:
-    sound = run_trial(1, SOUND)
-    assert sound.spread is not None
-    # Three of 63 corners lie 0.3 mm to the right of where the calibration has them.
-    by_corner = np.zeros_like(sound.residuals_px)
-    bad = [10, 31, 50]
-    for v, pose in enumerate(sound.rig_from_target):
-        moved = sound.target_points + np.array([3e-4, 0.0, 0.0])
-        camera = sound.rig.cameras["camera"]
-        both = [camera.project(pose.apply(p)) for p in (sound.target_points, moved)]
-        by_corner[v, 0, bad] = (both[0] - both[1])[bad]
-    found = frame_of(replace(sound, residuals_px=sound.residuals_px + by_corner))
-    assert found.likely == "corners"
-    rms_m = 3e-4 * (len(bad) / len(sound.target_points)) ** 0.5
-    assert found.in_plane_m == pytest.approx(rms_m, rel=0.3)

@@ -5,10 +5,15 @@ import pytest
 
 from alice_survey.core.config import CameraConfig
 from alice_survey.core.errors import ConfigError
+from camera_calib.fov.display import (
+    draw_fov,
+    fov_csv_rows,
+    fov_text,
+    validation_rows,
+    validation_text,
+)
 from camera_calib.fov.paper import validate_paper
-from camera_calib.fov.plot import draw_fov
 from camera_calib.fov.table import blur_table, fov_table
-from camera_calib.fov.text import fov_csv_rows, fov_text, validation_csv_rows, validation_text
 
 PORT = CameraConfig()
 
@@ -50,7 +55,7 @@ def test_csv_has_each_lens_altitude_speed_and_exposure_once() -> None:
 
 def test_the_validation_has_a_verdict_for_each_check() -> None:
     validation = validate_paper()
-    rows = validation_csv_rows(validation)
+    rows = validation_rows(validation)
     assert len(rows) == 6 + len(validation.claims)
     assert {row["verdict"] for row in rows} == {"pass"}
     lines = validation_text(validation).splitlines()
@@ -58,15 +63,7 @@ def test_the_validation_has_a_verdict_for_each_check() -> None:
 
 
 def draw(path: Path) -> bytes:
-    draw_fov(
-        path,
-        lambda altitudes, coc_px: fov_table([12.5, 16.0], altitudes, 1.34, PORT, coc_px),
-        [2.0],
-        speeds_mps=[0.2],
-        exposures_s=[3e-3],
-        allowed_px=1.0,
-        paper=True,
-    )
+    draw_fov(path, lambda altitudes: fov_table([12.5, 16.0], altitudes, 1.34, PORT), [2.0])
     return path.read_bytes()
 
 

@@ -1,8 +1,11 @@
-"""Tables of fields of view as plain text, and as rows of a CSV file."""
+"""What `fov` shows: tables as plain text, rows of a CSV file, and one figure of three panels."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from alice_survey.core.artefacts import json_values
 from alice_survey.kit.words import field_table
@@ -33,22 +36,7 @@ _BLUR = _LENS | {
     "blur": "{blur_px:.2f} px",
     "longest exposure": "{longest_exposure_ms:.3f} ms for {allowed_px:g} px",
 }
-_CHECKS = {
-    "lens": "{lens_mm:g} mm",
-    "quantity": "{quantity}",
-    "computed": "{computed:.4f} {unit}",
-    "paper": "{paper} {unit}",
-    "difference": "{difference:+.4f}",
-    "allowed": "{tolerance:g}",
-    "": "{verdict}",
-}
-_CLAIMS = {
-    "claim": "{claim}",
-    "verdict": "{verdict}",
-    "computed": "{computed:.4g} {unit}",
-    "allowed": "{bounds}",
-    "if": "{assumption}",
-}
+_CLAIMS = {name: f"{{{name}}}" for name in ("claim", "verdict", "computed", "allowed", "if")}
 _ANGLES = {
     "in air": "{fov_air_deg:g} deg",
     "lens": "{lens_mm:.2f} mm",
@@ -60,6 +48,15 @@ _ANGLES = {
     "blue - red": "{chromatic_px:.1f} px",
     "corner blur": "{corner_blur_px:.2f} px",
 }
+
+
+_PANELS = (
+    ("Footprint", "m", {"horizontal_m": "wide", "vertical_m": "high"}),
+    ("Pixel on the sea floor", "mm", {"pixel_centre_mm": "centre", "pixel_corner_mm": "corner"}),
+    ("Sharp at the centre", "m", {"near_altitude_m": "from", "far_altitude_m": "to"}),
+)
+"""Title, unit, and fields with their names in the legend."""
+_CURVE_POINTS = 30
 
 
 def fov_text(rows: Sequence[FovRow], blur: Sequence[BlurRow] = ()) -> str:
@@ -115,16 +112,13 @@ def _footprint_notes(rows: Sequence[FovRow]) -> Iterator[str]:
 def validation_text(validation: PaperValidation) -> str:
     """The paper's table, its claims, and the flat port against the angle."""
     first = validation.angles[0]
-    table = [
-        vars(c) | {"difference": c.difference, "tolerance": c.tolerance, "verdict": _verdict(c)}
-        for c in validation.table
-    ]
-    claims = [vars(c) | {"bounds": _bounds(c), "verdict": _verdict(c)} for c in validation.claims]
     tables = (
-        field_table("The paper's table of fields of view at 2 m", _CHECKS, table,
-                    [f"rule: {PAPER_RULE}"]),
-        field_table("The paper's further claims", _CLAIMS, claims,
-                    ["other readings of these claims, and why they differ: docs/paper-optics.md"]),
+        field_table(
+            "The paper's table of fields of view at 2 m, and its further claims", _CLAIMS,
+            validation_rows(validation),
+            [f"rule of the table: {PAPER_RULE}",
+             "other readings of these claims, and why they differ: docs/paper-optics.md"],
+        ),
         field_table(
             f"A flat port against the lens's angle: n {first.n_water:g}, {first.port}, "
             f"{first.altitude_m:g} m",
@@ -145,26 +139,75 @@ def fov_csv_rows(rows: Sequence[FovRow], blur: Sequence[BlurRow]) -> list[dict[s
     return [json_values(rows[i // per_row]) | json_values(one) for i, one in enumerate(blur)]
 
 
-def validation_csv_rows(validation: PaperValidation) -> list[dict[str, Any]]:
-    """Every check and claim, flat."""
-    rule = PAPER_RULE.partition(";")[0]
+def validation_rows(validation: PaperValidation) -> list[dict[str, str]]:
+    """Every check and claim in words, flat."""
     checks: list[tuple[PaperCheck | PaperClaim, str, str, str]] = [
-        (c, f"{c.quantity} of the {c.lens_mm:g} mm lens: {c.paper} {c.unit}", rule,
+        (c, f"{c.quantity} of the {c.lens_mm:g} mm lens: {c.paper} {c.unit}", "rule of the table",
          f"within {c.tolerance:g} {c.unit}")
         for c in validation.table
     ]  # fmt: skip
-    checks += [(c, c.claim, c.assumption, _bounds(c)) for c in validation.claims]
+    checks += [
+        (c, c.claim, c.assumption,
+         (f"{c.minimum:g} to " if c.minimum else "at most ") + f"{c.maximum:g} {c.unit}")
+        for c in validation.claims
+    ]  # fmt: skip
     return [
-        {"claim": claim, "verdict": _verdict(c), "computed": f"{c.computed:.4f} {c.unit}",
-         "assumption": assumption, "rule": bound}
-        for c, claim, assumption, bound in checks
+        {
+            "claim": claim, "verdict": "pass" if c.passed else "FAIL",
+            "computed": f"{c.computed:.4f} {c.unit}", "allowed": allowed, "if": assumption,
+        }
+        for c, claim, assumption, allowed in checks
     ]  # fmt: skip
 
 
-def _bounds(claim: PaperClaim) -> str:
-    bounds = f"at most {claim.maximum:g} {claim.unit}"
-    return f"{claim.minimum:g} to {claim.maximum:g} {claim.unit}" if claim.minimum else bounds
+def draw_fov(
+    path: Path, table: Callable[[Sequence[float]], list[FovRow]], altitudes_m: Sequence[float]
+) -> None:
+    """Draw footprint, pixel and depth of field of lenses against altitude.
+
+    Args:
+        path: ends in .png, .svg or .pdf; the same input gives the same bytes.
+        table: rows of all lenses at given altitudes.
+        altitudes_m: altitudes of interest; the curves go some way beyond them.
+
+    Raises:
+        ConfigError: another suffix, or the file cannot be written.
+    """
+    from alice_survey.kit.figure import (
+        INKS,
+        check_figure_path,
+        figure_style,
+        new_figure,
+        save_figure,
+    )
+
+    check_figure_path(path)
+    high = 1.5 * max(altitudes_m)
+    heights = np.linspace(max(0.25 * min(altitudes_m), 0.01), high, _CURVE_POINTS).tolist()
+    curves, marked = (_by_lens(table(at)) for at in (heights, altitudes_m))
+    with figure_style():
+        figure = new_figure(4.4, 13.0)
+        for axes, (title, unit, fields) in zip(figure.subplots(1, 3), _PANELS, strict=True):
+            for i, (lens_mm, rows) in enumerate(curves.items()):
+                for style, (field, label) in zip(("-", "--"), fields.items(), strict=True):
+                    ink = INKS[i % len(INKS)]
+                    shown = np.minimum([getattr(row, field) for row in rows], 2.0 * high)
+                    axes.plot(heights, shown, style, color=ink, label=f"{lens_mm:.4g} mm {label}")
+                    points = [getattr(row, field) for row in marked[lens_mm]]
+                    axes.plot(altitudes_m, points, "o", ms=4, color=ink)
+            axes.set(title=title, ylabel=unit, xlabel="altitude of the outer glass, m")
+            axes.set_xlim(left=0)
+            axes.set_ylim(bottom=0)
+            axes.legend(fontsize=9)
+        first = next(iter(marked.values()))[0]
+        figure.suptitle(
+            f"n {first.n_water:.4g}, {first.port}; F/{first.f_number:g} focused on the sea floor"
+        )
+        save_figure(figure, path, dpi=120)
 
 
-def _verdict(check: PaperCheck | PaperClaim) -> str:
-    return "pass" if check.passed else "FAIL"
+def _by_lens(rows: Sequence[FovRow]) -> Mapping[float, list[FovRow]]:
+    lenses: dict[float, list[FovRow]] = {}
+    for row in rows:
+        lenses.setdefault(round(row.lens_mm, 6), []).append(row)
+    return lenses
