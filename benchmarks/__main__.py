@@ -13,32 +13,29 @@ when a part failed or missed a goal.
 
 import argparse
 import datetime as dt
+import json
+import math
 import shlex
 import shutil
 import signal
 import subprocess
 import sys
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.machine import machine
+from benchmarks.machine import load, machine
+from benchmarks.measured import measured, python
 from benchmarks.parts import PARTS, SHORT_REPEATS, Part, Settings, chosen
-from benchmarks.runs import report, run
-from benchmarks.table import Outcome, left_out, outcome, write
+from benchmarks.table import LEFT_OUT, Outcome, Run, outcome, write
 
 
 def main() -> int:
     """Run what is requested, write the table, return whether all is well."""
     options = _options()
-    settings = Settings(
-        work=options.work / "work",
-        quick=options.quick,
-        data=options.data,
-        demo=options.demo,
-        pyorthomosaic=options.pyorthomosaic,
-        mitsuba=options.mitsuba,
-    )
+    passed = ("quick", "data", "demo", "pyorthomosaic", "mitsuba")
+    given = {name: getattr(options, name) for name in passed}
+    settings = Settings(work=options.work / "work", **given)
     about: dict[str, Any] = {
         "date": dt.datetime.now().astimezone().isoformat(timespec="seconds"),
         "command": shlex.join(["python", "-m", "benchmarks", *sys.argv[1:]]),
@@ -54,7 +51,7 @@ def main() -> int:
             outcomes.append(_outcome(part, settings, options, where))
             write(options.work, about, outcomes)
     except KeyboardInterrupt:
-        report(f"broken off; {len(outcomes)} of {len(options.parts)} parts are in {options.work}")
+        _say(f"broken off; {len(outcomes)} of {len(options.parts)} parts are in {options.work}")
         return 130
     print(options.work / "table.md")
     return 0 if all(part.good for part in outcomes) else 1
@@ -66,27 +63,34 @@ def _outcome(part: Part, settings: Settings, options: argparse.Namespace, where:
     alone = shlex.join(["python", *command])
     reason = part.reason_to_leave_out(settings)
     if reason is not None:
-        report(f"{where}: left out: {reason}")
-        return left_out(part.name, alone, reason)
+        _say(f"{where}: left out: {reason}")
+        return Outcome(name=part.name, command=alone, state=LEFT_OUT, reason=reason)
     (settings.work / part.name).mkdir(parents=True, exist_ok=True)
-    repeats = options.repeat or (1 if settings.quick else part.repeats)
-    runs = []
+    repeats = options.repeat or (1 if settings.quick or part.long else SHORT_REPEATS)
+    runs: list[Run] = []
     for repeat in range(1, repeats + 1):
-        label = f"{where}, run {repeat} of {repeats}"
-        report(f"{label}: begun", passing=True)
-        on_wait = partial(_say_how_long, label)
-        runs.append(run(command, options.work / "logs", f"{part.name}-{repeat}", on_wait))
-        report(f"{label}: ended after {runs[-1].wall_s:.0f} s")
+        log = options.work / "logs" / f"{part.name}-{repeat}.log"
+        _say(f"{where}, run {repeat} of {repeats}: what it says is in {log}")
+        runs.append(_run(command, log))
+        _say(f"{where}, run {repeat} of {repeats}: ended after {runs[-1].cost.wall_s:.0f} s")
         if runs[-1].trouble is not None:
             break
     found = outcome(part.name, alone, runs)
-    reason = "" if found.reason is None else f": {found.reason}"
-    report(f"{where}: {found.state}{reason}")
+    _say(f"{where}: {found.state}" + ("" if found.reason is None else f": {found.reason}"))
     return found
 
 
-def _say_how_long(label: str, seconds: float) -> None:
-    report(f"{label}: {seconds:.0f} s so far", passing=True)
+def _run(command: Sequence[str], log: Path) -> Run:
+    """Run a benchmark and read what it hands over."""
+    figures, before = log.with_suffix(".json"), load()
+    figures.unlink(missing_ok=True)
+    cost = measured(python(*command, "--json", str(figures)), log, timeout_s=math.inf)
+    report = json.loads(figures.read_text()) if figures.exists() else None
+    return Run(cost=cost, load_before=before, report=report)
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
 
 
 def _commit() -> str | None:

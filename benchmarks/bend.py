@@ -114,7 +114,6 @@ def main() -> None:
         for k in range(min(options.flights, options.seeds))
     ]
     print(f"{', '.join(str(len(flight.taken_s)) for flight in flights)} stations\n")
-    print(_HEADER)
     figures: list[Figure] = []
     failed: list[str] = []
     rows = {(log, case): Outcome() for log in options.log for case in options.cases}
@@ -127,7 +126,7 @@ def main() -> None:
         if outcome.scores:
             row = over_seeds(outcome.scores)
             seconds = outcome.seconds / options.seeds
-            print(_line(name, row, len(outcome.refused), seconds), flush=True)
+            print(f"{name}: {seconds:.1f} s a seed, {len(outcome.refused)} refused", flush=True)
             figures += _figures(name, row)
     sys.exit(hand_over(options, about, Findings(figures=tuple(figures), failed=tuple(failed))))
 
@@ -214,28 +213,6 @@ def over_seeds(scores: Sequence[Score]) -> Score:
 
 
 _MM, _PPM = 1e3, 1e6
-_HEADER = (
-    f"{'rms over seeds (stated)':<42}{'along mm':>14}{'across mm':>14}{'cameras mm':>14}"
-    f"{'scale ppm':>12}   error over sigma: along across shape | north  east depth  tilt heading"
-)
-
-
-def _line(name: str, row: Score, refused: int, seconds: float) -> str:
-    def pair(value: float, sigma: float, width: int, digits: int = 1) -> str:
-        stated = f"({sigma:.{digits}f})" if np.isfinite(sigma) else "(-)"
-        return f"{value:.{digits}f} {stated}".rjust(width)
-
-    return (
-        f"{name:<42}"
-        f"{pair(_MM * row.along, _MM * row.along_sigma, 14)}"
-        f"{pair(_MM * row.across, _MM * row.across_sigma, 14)}"
-        f"{pair(_MM * row.cameras, _MM * row.cameras_sigma, 14)}"
-        f"{pair(_PPM * row.scale, _PPM * row.scale_sigma, 12, 0)}"
-        f"{row.along_ratio:25.2f}{row.across_ratio:7.2f}{row.cameras_ratio:6.2f} |"
-        f"{row.north_ratio:6.2f}{row.east_ratio:6.2f}{row.depth_ratio:6.2f}"
-        f"{row.tilt_ratio:6.2f}{row.heading_ratio:8.2f}   {seconds:.1f} s a seed"
-        + (f", {refused} refused" if refused else "")
-    )
 
 
 def _figures(name: str, row: Score) -> list[Figure]:

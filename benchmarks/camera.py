@@ -52,9 +52,6 @@ def main() -> None:
         findings += Findings(
             figures=tuple(f for case in cases for f in case.figures(judged=not options.quick))
         )
-    for figure in findings.figures:
-        peer = "" if figure.peer_value is None else f" ({figure.peer} {figure.peer_value:.4g})"
-        print(f"{figure.name}: {figure.value:.4g} {figure.unit}{peer}")
     sys.exit(hand_over(options, about, findings, report))
 
 

@@ -138,12 +138,7 @@ def measure(work: Path, survey: ColourSurvey, methods: Sequence[str]) -> dict[st
         name = f"{where}-{method.replace(', ', '-').replace(' ', '-')}"
         mosaic = paint(base, survey, method, work / name)
         found[method] = judge(mosaic, survey, work / f"{name}.png")
-        one = found[method]
-        print(
-            f"{survey.jerlov:3} {survey.relief_m:4.2f} m {method:12} {one.median:7.2f} "
-            f"{one.percentile_90:7.2f} {one.median_at_true_lightness:9.2f}",
-            flush=True,
-        )
+        print(f"{where}, {method}: painted", flush=True)
     return found
 
 
@@ -182,7 +177,6 @@ def main() -> int:
     options = parser.parse_args()
     about = machine(("numpy", "opencv-contrib-python-headless"))
     print(f"{heading(about)}\n")
-    print(f"{'':23} {'dE2000':>7} {'90 %':>7} {'at true L':>9}")
     findings = Findings()
     cases = [(jerlov, relief_m) for relief_m in options.relief for jerlov in options.water]
     for jerlov, relief_m in cases[:1] if options.quick else cases:

@@ -1,18 +1,16 @@
 """Speed of features, pairs and matches, next to COLMAP and simpler ways, in the same run.
 
-    .venv/bin/python -m benchmarks.features PICTURE PICTURE... [--quick] [--json FILE]
+    .venv/bin/python -m benchmarks.features [--data FOLDER] [--quick] [--json FILE]
 
 Each time is the median of several alternating runs, so that a busy machine slows both alike.
-Pictures named one after the other are matched. `--quick` takes one run of each and short surveys.
+Two pictures of a real survey are matched. `--quick` takes one run of each and short surveys.
 """
 
 import argparse
-import itertools
 import statistics
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -25,7 +23,6 @@ from benchmarks.figures import Figure, Findings, add_options, hand_over
 from benchmarks.machine import heading, machine
 
 Array = np.ndarray
-_SURVEYS = [(5, 10, 1), (10, 10, 1), (10, 20, 1), (20, 20, 1), (5, 10, 8)]
 """Lines, stations on each, and visits."""
 
 
@@ -120,10 +117,6 @@ def matches(first: Path, second: Path, runs: int) -> list[Figure]:
         spent, _ = compare(align, lambda: None, runs)
         share = np.isfinite(kept["aligned"][:, 0]).mean()
         move = np.linalg.norm(kept["aligned"] - guess, axis=1)
-        print(
-            f"alignment of {name}: {1e3 * spent:.0f} ms, {1e6 * spent / len(pair):.0f} us a match, "
-            f"{share:.0%} aligned, by a median of {np.nanmedian(move):.2f} px"
-        )
         where = f"alignment of {name}"
         rows += [
             Figure(name=f"{where}: time a match", value=1e6 * spent / len(pair), unit="us"),
@@ -141,57 +134,22 @@ def _pinhole(height_px: int, width_px: int) -> dict[str, Any]:
     return fields
 
 
-def growth(surveys: list[tuple[int, int, int]]) -> list[Figure]:
-    """Pairs of a picture in longer surveys, and in surveys that come back to a place."""
-    from reconstruct.matching.pairs import choose_pairs
-    from tests.reconstruct.scenes import DATUM, make_scene
-
-    figures = []
-    print("stations  visits  partners  coarse looks  choosing, ms a picture")
-    for lines, stations, visits in surveys:
-        scenes = [make_scene(lines=lines, stations=stations, points=1, seed=k)
-                  for k in range(visits)]  # fmt: skip
-        records = [
-            replace(r, station=r.station + 10_000 * k, image=f"{k}/{r.image}")
-            for k, scene in enumerate(scenes)
-            for r in scene.records
-        ]
-        started = time.perf_counter()
-        sure, maybe = choose_pairs(records, scenes[0].rig, DATUM)
-        spent = time.perf_counter() - started
-        print(
-            f"{lines * stations * visits:8}{visits:8}{2 * len(sure) / len(records):10.1f}"
-            f"{2 * len(maybe) / len(records):14.1f}{1e3 * spent / len(records):14.2f}"
-        )
-        where = f"{lines * stations * visits} stations in {visits} visits"
-        count = len(records)
-        figures += [
-            Figure(name=f"{where}: partners of a picture", value=2 * len(sure) / count, unit="1"),
-            Figure(name=f"{where}: coarse looks", value=2 * len(maybe) / count, unit="1"),
-            Figure(name=f"{where}: choosing, a picture", value=1e3 * spent / count, unit="ms"),
-        ]
-    return figures
-
-
 def main() -> int:
     """Print a row for each picture and each two in a row, then how pairs grow."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("pictures", nargs="+", type=Path, metavar="PICTURE")
+    parser.add_argument("--data", type=Path, default=Path("../shared/data"), help="real pictures")
     add_options(parser, quick="one run of each, short surveys")
     options = parser.parse_args()
     about = machine(("numpy", "numba", "opencv-contrib-python-headless", "pycolmap"))
     print(f"{heading(about)}\n", flush=True)
     runs = 1 if options.quick else 3
-    figures = [figure for path in options.pictures for figure in features(path, runs)]
-    for first, second in itertools.pairwise(options.pictures):
-        figures += matches(first, second, runs)
-    print(f"{'what':48} {'ours':>9} {'peer':>20} {'its':>9}  ratio")
-    for row in figures:
-        if row.peer is not None:
-            print(f"{row.name:48} {row.value:9.1f} {row.peer:>20} {row.peer_value:9.1f}  "
-                  f"{row.ratio:.3f}")  # fmt: skip
-    figures += growth(_SURVEYS[:2] if options.quick else _SURVEYS)
-    return hand_over(options, about, Findings(figures=tuple(figures)))
+    folder = options.data / ("opencv_stereo" if options.quick else "haltbrekken/left")
+    pictures = sorted(path for path in folder.glob("*") if path.suffix.lower() in (".jpg", ".png"))
+    missing = () if len(pictures) > 1 else (f"no pictures in {folder}",)
+    figures = [figure for path in pictures[:2] for figure in features(path, runs)]
+    if not missing:
+        figures += matches(pictures[0], pictures[1], runs)
+    return hand_over(options, about, Findings(figures=tuple(figures), left_out=missing))
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ import argparse
 import dataclasses
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -120,7 +120,7 @@ def hand_over(
     findings: Findings,
     rows: Mapping[str, Any] | None = None,
 ) -> int:
-    """Print the load, what was left out, missed and failed; write the figures where requested.
+    """Print load, figures, what was left out, missed and failed; write the JSON where requested.
 
     Args:
         options: with those of `add_options`.
@@ -143,6 +143,19 @@ def hand_over(
             **(rows or {}),
         }
         options.json.write_text(json.dumps(plain(report), indent=2, allow_nan=False) + "\n")
+    rows_of_figures = [
+        {
+            "figure": figure.name,
+            "value": number(figure.value),
+            "unit": figure.unit,
+            "peer": figure.peer or "",
+            "its value": number(figure.peer_value),
+            "ratio": number(figure.ratio),
+            "goal": "" if figure.goal is None else str(figure.goal),
+        }
+        for figure in findings.figures
+    ]
+    print(*markdown(rows_of_figures), sep="\n")
     for what in findings.left_out:
         print(f"left out: {what}")
     for miss in findings.missed:
@@ -172,3 +185,19 @@ def plain(data: Any) -> Any:
     if isinstance(data, float) and not math.isfinite(data):
         return None
     return data
+
+
+def markdown(rows: Sequence[Mapping[str, str]]) -> list[str]:
+    """Rows of the same keys in Markdown, an empty line after them; nothing for no row."""
+    if not rows:
+        return []
+    cells = [[value.replace("|", "\\|").replace("\n", " ") or "-" for value in row.values()]
+             for row in rows]  # fmt: skip
+    return [f"| {' | '.join(row)} |" for row in ([*rows[0]], ["---"] * len(rows[0]), *cells)] + [""]
+
+
+def number(value: float | None) -> str:
+    """Four digits; whole numbers in full."""
+    if value is None or not math.isfinite(value):
+        return "-"
+    return f"{value:,.0f}" if value == 0 or 1e4 <= abs(value) < 1e12 else f"{value:.4g}"

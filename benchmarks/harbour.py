@@ -63,7 +63,6 @@ def main() -> None:
     if not findings.failed or (workspace / "sparse" / "track.csv").exists():
         found = judge(workspace, true_harbour(planned, scale))
         (options.work / "judged.json").write_text(json.dumps(plain(found), indent=1) + "\n")
-        print(table(found))
         findings += Findings(
             figures=figures(found, quick=options.quick),
             left_out=tuple(f"{name}: not made" for name in found["left_out"]),
@@ -125,68 +124,6 @@ def figures(found: dict[str, Any], *, quick: bool) -> tuple[Figure, ...]:
         if name in found:
             add(f"{name}: shift, rms in pixels", found[name]["all"].get("rms_px"), "mosaic")
     return tuple(made)
-
-
-def table(found: dict[str, Any]) -> str:
-    """All figures by part, slope and instants as text."""
-    cameras = found["cameras"]
-    lines = [
-        f"{cameras['registered']} of {found['pictures']} pictures; "
-        f"cameras {cameras['rms_mm']:.2f} mm rms, {cameras['max_mm']:.2f} at most, "
-        f"{cameras['attitude_rms_deg']:.3f} deg, scale {cameras['scale_error_ppm']:+.0f} ppm; "
-        f"pixel {found['pixel_mm']:.2f} mm"
-    ]
-    for product in ("cloud", "dem", "mesh"):
-        if product not in found:
-            lines.append(f"\n{product}: not made")
-            continue
-        one = found[product]
-        points = {"cloud": one, "dem": one.get("distance"), "mesh": one.get("faces")}[product]
-        lines.append(
-            f"\n{product}: on fish {points['on_fish']:.2%}, on weed {points['on_weed']:.2%}; "
-            f"overhangs {one.get('overhangs', '')}"
-        )
-        lines.append(
-            f"{'':22}{'count':>7}{'rms mm':>9}{'robust':>8}{'signed':>8}{'>20 mm':>8}"
-            f"{'e/s rms':>9}{'robust':>8}{'>5 s':>8}{'complete':>10}{'m2':>7}"
-        )
-        complete = one.get("complete", {})
-        groups = {"all": points["all"], **points["by"]}
-        if product == "dem":
-            groups = {"heights": one["height"], **groups}
-        lines += [_row(name, spread, complete.get(name)) for name, spread in groups.items()]
-        lines += [
-            _row(name, {"count": 0}, share)
-            for name, share in complete.items()
-            if name not in groups
-        ]
-    if "masks" in found:
-        shares = {name: value for name, value in found["masks"].items() if name != "fish_pixels"}
-        lines.append("\nmasks: " + ", ".join(f"{n} {v:.2%}" for n, v in shares.items()))
-    for name in ("mosaic", "mosaic of the wall"):
-        if name not in found:
-            lines.append(f"\n{name}: not made")
-            continue
-        lines.append(f"\n{name}: pixels of {found[name]['pixel_mm']:.2f} mm")
-        for part, one in {"all": found[name]["all"], **found[name]["by"]}.items():
-            rms = one.get("rms_px", float("nan"))
-            lines.append(
-                f"{part:22}{rms:7.2f} px rms in {one['clear']} of {one['patches']} patches"
-            )
-    return "\n".join(lines)
-
-
-def _row(name: str, spread: dict[str, float], complete: dict[str, Any] | None) -> str:
-    row = f"{name:22}{spread['count']:7d}"
-    for key, form, width in (
-        ("rms_mm", ".2f", 9), ("robust_mm", ".2f", 8), ("median_signed_mm", ".2f", 8),
-        ("beyond_20_mm", ".2%", 8), ("over_sigma_rms", ".2f", 9), ("over_sigma_robust", ".2f", 8),
-        ("beyond_5_sigma", ".2%", 8),
-    ):  # fmt: skip
-        row += f"{spread[key]:{width}{form}}" if key in spread else " " * width
-    if complete is None or complete["complete"] is None:
-        return row
-    return row + f"{complete['complete']:10.1%}{complete['area_m2']:7.2f}"
 
 
 if __name__ == "__main__":

@@ -200,19 +200,11 @@ def main() -> int:
     options = parser.parse_args()
     about, findings = machine(_PACKAGES), Findings()
     print(f"{heading(about)}\n")
-    print(f"{'Mpx':>7} {'pictures':>9} {'wall s':>8} {'cpu s':>8} {'cpu s/Mpx':>10} {'MiB':>7}")
     for megapixels in [50.0] if options.quick else options.megapixels:
         found = measure(options.work, megapixels, options.threads)
         findings += found.findings()
-        cost = found.cost
-        if not cost.ok:
-            print(f"{megapixels:7.0f} failed: {cost.last_line()}")
+        if not found.cost.ok:
             break
-        print(
-            f"{megapixels:7.0f} {found.pictures:9} {cost.wall_s:8.1f} {cost.cpu_s:8.1f} "
-            f"{cost.cpu_s / megapixels:10.2f} {cost.peak_mib:7.0f}",
-            flush=True,
-        )
     return hand_over(options, about, findings)
 
 

@@ -1,7 +1,7 @@
 """All benchmarks, in the order in which they run, and what each needs."""
 
 import importlib.util
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,192 +31,112 @@ class Part:
     """A benchmark, or what of it runs by itself."""
 
     name: str
-    module: str
-    """Of `benchmarks`."""
-    arguments: Callable[[Settings, Path], Sequence[str]] = lambda _, __: ()
-    """From settings and the part's own folder; without `--quick` and `--json`."""
+    module: str = ""
+    """Of `benchmarks`; the part's name if empty."""
+    arguments: str = ""
+    """Without `--quick` and `--json`."""
+    passes: Sequence[str] = ()
+    """Options passed on where they are given; `work` is the part's own folder."""
     long: bool = False
     """Whether it takes more than ten minutes on two cores."""
     packages: Sequence[str] = ()
     """Of the extra `bench`, by the names that are imported, that it cannot do without."""
-    needs: Callable[[Settings], str | None] = lambda _: None
-    """Why it cannot run; None where it can."""
+    pictures: str = ""
+    """Folder of real pictures without which it cannot run; not with `--quick`."""
+    needs_mitsuba: bool = False
 
     @property
-    def repeats(self) -> int:
-        """How often it runs by default."""
-        return 1 if self.long else SHORT_REPEATS
+    def file(self) -> str:
+        """The module's name in `benchmarks`."""
+        return self.module or self.name.replace("-", "_")
 
     def command(self, settings: Settings) -> list[str]:
         """What runs this part alone, for a Python."""
-        arguments = self.arguments(settings, settings.work / self.name)
+        values = {**vars(settings), "work": settings.work / self.name}
+        passed = [
+            word
+            for name in self.passes
+            if values[name] is not None
+            for word in (f"--{name}", str(values[name]))
+        ]
         quick = ["--quick"] if settings.quick else []
-        return ["-m", f"benchmarks.{self.module}", *arguments, *quick]
+        return ["-m", f"benchmarks.{self.file}", *self.arguments.split(), *passed, *quick]
 
     def reason_to_leave_out(self, settings: Settings) -> str | None:
         """Why it cannot run here; None where it can."""
-        lacking = [name for name in self.packages if importlib.util.find_spec(name) is None]
-        if lacking:
-            return f"{', '.join(lacking)} missing: install the extra `bench`"
-        return self.needs(settings)
-
-
-def _pictures_in(folder: Path) -> list[Path]:
-    files = folder.iterdir() if folder.is_dir() else iter(())
-    return sorted(file for file in files if file.suffix.lower() in (".jpg", ".png"))
-
-
-def _feature_folder(settings: Settings) -> Path:
-    return settings.data / ("opencv_stereo" if settings.quick else "haltbrekken/left")
-
-
-def _features(settings: Settings, _: Path) -> Sequence[str]:
-    return [str(picture) for picture in _pictures_in(_feature_folder(settings))[:2]]
-
-
-def _need_features(settings: Settings) -> str | None:
-    folder = _feature_folder(settings)
-    return None if len(_pictures_in(folder)) > 1 else f"no pictures in {folder}"
-
-
-def _reconstruct(only: str) -> Callable[[Settings, Path], Sequence[str]]:
-    def arguments(settings: Settings, work: Path) -> Sequence[str]:
-        found = ["--work", str(work), "--only", only]
-        if only not in ("growth", "peers"):
-            found += ["--data", str(settings.data)]
-        if only == "peers" and settings.demo is not None and not settings.quick:
-            found += ["--demo", str(settings.demo)]
-        if only != "growth" and settings.pyorthomosaic is not None:
-            found += ["--pyorthomosaic", settings.pyorthomosaic]
-        return found
-
-    return arguments
-
-
-def _real(folder: str) -> Callable[[Settings], str | None]:
-    def needs(settings: Settings) -> str | None:
-        if settings.quick:
+        missing = [name for name in self.packages if importlib.util.find_spec(name) is None]
+        if missing:
+            return f"{', '.join(missing)} missing: install the extra `bench`"
+        if self.pictures and settings.quick:
             return "--quick: takes minutes at its smallest; real-pictures has a smaller set"
-        there = (settings.data / folder).is_dir()
-        return None if there else f"no pictures in {settings.data / folder}"
-
-    return needs
-
-
-def _facade(settings: Settings, work: Path) -> Sequence[str]:
-    python = () if settings.mitsuba is None else ("--mitsuba", settings.mitsuba)
-    return ("--work", str(work), *python)
+        if self.pictures and not (settings.data / self.pictures).is_dir():
+            return f"no pictures in {settings.data / self.pictures}"
+        if self.needs_mitsuba and settings.mitsuba is None:
+            return "no --mitsuba PYTHON to render it with"
+        return None
 
 
-def _need_mitsuba(settings: Settings) -> str | None:
-    return None if settings.mitsuba is not None else "no --mitsuba PYTHON to render it with"
-
-
+_WORK = ("work",)
+_SURVEY = ("work", "data", "pyorthomosaic")
 PARTS = (
-    Part(name="camera-speed", module="camera", arguments=lambda _, __: ("--only", "speed")),
-    Part(name="camera-pose", module="camera", arguments=lambda _, __: ("--only", "pose")),
-    Part(
-        name="camera-calibration",
-        module="camera",
-        arguments=lambda _, __: ("--only", "calibration", "target"),
-    ),
-    Part(name="planner", module="planner", packages=("coverage_path_planner",)),
+    Part(name="camera-speed", module="camera", arguments="--only speed"),
+    Part(name="camera-pose", module="camera", arguments="--only pose"),
+    Part(name="camera-calibration", module="camera", arguments="--only calibration target"),
+    Part(name="planner", packages=("coverage_path_planner",)),
     Part(
         name="planner-angles",
         module="planner",
-        arguments=lambda _, __: ("--angles",),
+        arguments="--angles",
         long=True,
         packages=("coverage_path_planner",),
     ),
-    Part(name="studio", module="studio"),
-    Part(name="vehicle", module="vehicle"),
-    Part(name="missions", module="missions"),
-    Part(name="features", module="features", arguments=_features, needs=_need_features),
-    Part(name="refraction", module="refraction"),
-    Part(name="bend", module="bend", arguments=lambda _, work: ("--work", str(work))),
-    Part(
-        name="precision",
-        module="precision",
-        arguments=lambda _, work: ("--work", str(work)),
-        long=True,
-    ),
-    Part(
-        name="cluster",
-        module="cluster",
-        arguments=lambda _, work: ("--work", str(work)),
-        long=True,
-        packages=("distributed",),
-    ),
-    Part(
-        name="scale",
-        module="scale",
-        arguments=lambda _, work: ("--work", str(work)),
-        long=True,
-    ),
-    Part(
-        name="many-pictures",
-        module="many_pictures",
-        arguments=lambda _, work: ("--work", str(work)),
-        long=True,
-    ),
-    Part(name="refine-gpu", module="refine_gpu", packages=("numba_cuda",)),
+    Part(name="studio"),
+    Part(name="vehicle"),
+    Part(name="missions"),
+    Part(name="features", passes=("data",)),
+    Part(name="refraction"),
+    Part(name="bend", passes=_WORK),
+    Part(name="precision", passes=_WORK, long=True),
+    Part(name="cluster", passes=_WORK, long=True, packages=("distributed",)),
+    Part(name="scale", passes=_WORK, long=True),
+    Part(name="many-pictures", passes=_WORK, long=True),
+    Part(name="refine-gpu", packages=("numba_cuda",)),
     Part(
         name="reconstruct-peers",
         module="reconstruct",
-        arguments=_reconstruct("peers"),
+        arguments="--only peers",
+        passes=("work", "demo", "pyorthomosaic"),
         long=True,
     ),
     Part(
         name="reconstruct-growth",
         module="reconstruct",
-        arguments=_reconstruct("growth"),
+        arguments="--only growth",
+        passes=_WORK,
         long=True,
     ),
     Part(
         name="reconstruct-haltbrekken",
         module="reconstruct",
-        arguments=_reconstruct("haltbrekken"),
+        arguments="--only haltbrekken",
+        passes=_SURVEY,
         long=True,
-        needs=_real("haltbrekken"),
+        pictures="haltbrekken",
     ),
     Part(
         name="reconstruct-brighton",
         module="reconstruct",
-        arguments=_reconstruct("brighton"),
+        arguments="--only brighton",
+        passes=_SURVEY,
         long=True,
-        needs=_real("brighton_beach"),
+        pictures="brighton_beach",
     ),
-    Part(
-        name="harbour",
-        module="harbour",
-        arguments=lambda _, work: ("--work", str(work)),
-        long=True,
-    ),
-    Part(name="facade", module="facade", arguments=_facade, long=True, needs=_need_mitsuba),
-    Part(
-        name="turbid",
-        module="turbid",
-        arguments=lambda _, work: ("--work", str(work)),
-        long=True,
-    ),
-    Part(
-        name="mosaic",
-        module="mosaic",
-        arguments=lambda _, work: ("--work", str(work)),
-        long=True,
-    ),
-    Part(
-        name="colour",
-        module="colour",
-        arguments=lambda _, work: ("--work", str(work)),
-        long=True,
-    ),
-    Part(
-        name="real-pictures",
-        module="real_pictures",
-        arguments=lambda settings, work: (str(settings.data), str(work)),
-        long=True,
-    ),
+    Part(name="harbour", passes=_WORK, long=True),
+    Part(name="facade", passes=("work", "mitsuba"), long=True, needs_mitsuba=True),
+    Part(name="turbid", passes=_WORK, long=True),
+    Part(name="mosaic", passes=_WORK, long=True),
+    Part(name="colour", passes=_WORK, long=True),
+    Part(name="real-pictures", passes=("data", "work"), long=True),
 )
 
 
@@ -226,7 +146,7 @@ def chosen(names: Sequence[str]) -> list[Part]:
     Raises:
         ValueError: there is no such part.
     """
-    known = {part.name for part in PARTS} | {part.module for part in PARTS}
+    known = {part.name for part in PARTS} | {part.file for part in PARTS}
     if unknown := sorted(set(names) - known):
         raise ValueError(f"no part {', '.join(unknown)}; there are {', '.join(sorted(known))}")
-    return [part for part in PARTS if not names or {part.name, part.module} & {*names}]
+    return [part for part in PARTS if not names or {part.name, part.file} & {*names}]

@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.kit.words import text_table
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
 from benchmarks.planner_areas import planned_area, shapes
@@ -62,15 +61,14 @@ def main() -> None:
     report: dict[str, Any] = {}
     if options.angles:
         for name in shapes():
-            figures += (found := list(_angle_figures(name, quick=options.quick)))
-            print(*found, sep="\n", flush=True)
+            figures += _angle_figures(name, quick=options.quick)
     else:
         table = {}
         for rows in _ROWS[: 2 if options.quick else None]:
             for name, shape in shapes().items():
                 area = planned_area(shape, rows, PATTERN.spacing_m, MARGIN_M)
                 table[name, rows] = results = _compare(area, rows)
-                print(f"{name}, {rows:,} rows\n{_results_table(results)}\n", flush=True)
+                print(f"{name}, {rows:,} rows: planned", flush=True)
                 figures += _figures(name, rows, results)
         report["plans"] = [
             {"area": name, "rows": rows, **asdict(row)}
@@ -163,20 +161,6 @@ def _angle_figures(name: str, *, quick: bool) -> Iterator[Figure]:
         peer_value=width_m, goal=Goal(maximum=width_m + 1e-9),
     )  # fmt: skip
     yield Figure(name=f"{name}: search for the heading", value=seconds, unit="s")
-
-
-def _results_table(results: list[Measured]) -> str:
-    own = results[0]
-    header = ("planner", "time, ms", "path, m", "turns", "covered", "outside, m", "in holes, m",
-              "time ratio", "path ratio")  # fmt: skip
-    return text_table(header, [
-        (
-            row.planner, f"{1e3 * row.seconds:.2f}", f"{row.path_m:,.0f}", f"{row.turns:,}",
-            f"{row.covered:.3%}", f"{row.outside_m:.3g}", f"{row.holes_m:.3g}",
-            f"{own.seconds / row.seconds:.2f}", f"{own.path_m / row.path_m:.4f}",
-        )
-        for row in results
-    ])  # fmt: skip
 
 
 def _options() -> argparse.Namespace:

@@ -1,6 +1,6 @@
 """Real pictures through the two commands a user types, and how the result compares.
 
-    .venv/bin/python -m benchmarks.real_pictures ../shared/data WORKSPACES [--quick] [--json FILE]
+    .venv/bin/python -m benchmarks.real_pictures --data FOLDER --work FOLDER [--quick] [--json FILE]
 
 For the drone block the surface is compared with another tool's cloud (`model.laz`) after a
 similarity alignment, since neither has a measured scale. Workspaces of the same names are made
@@ -129,8 +129,8 @@ def against_cloud(drone: Path, workspace: Path) -> Findings:
 def main() -> int:
     """Run the sets that are there and print the figures."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("data", type=Path, help="folder of the sets")
-    parser.add_argument("workspaces", type=Path, help="folder to work in")
+    parser.add_argument("--data", type=Path, required=True, help="folder of the sets")
+    parser.add_argument("--work", type=Path, required=True, help="folder to work in")
     add_options(parser, quick=f"{_QUICK_PICTURES} pictures of the smallest set")
     options = parser.parse_args()
     about = machine(_PACKAGES)
@@ -141,7 +141,7 @@ def main() -> int:
     findings = Findings()
     for name, run in sets.items():
         if (options.data / name).is_dir():
-            findings += run(options.data / name, options.workspaces)
+            findings += run(options.data / name, options.work)
         else:
             findings += Findings(left_out=(f"{name}: no pictures in {options.data}",))
     return hand_over(options, about, findings)

@@ -1,6 +1,6 @@
 """What refraction through a flat port costs, by how it is taken: tracks whose truth is known.
 
-    python -m benchmarks.refraction [--stations 48] [--points 6000] [--oracle] [--quick]
+    python -m benchmarks.refraction [--stations 48] [--points 6000] [--quick]
         [--json FILE]
 
 For port distances of 20 and 50 mm and tilts of 0 and 2 degrees it states the rms of points and
@@ -28,7 +28,6 @@ from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.refraction import adjust_freely, refract
 from reconstruct.mapping.self_calibration import self_calibrated_warp
 from reconstruct.placing.alignment import align_rigid
-from tests.oracles_refraction import adjust_through_ports
 from tests.reconstruct.scenes import Scene, make_scene
 from tests.reconstruct.true_models import near_truth, pupils_and_points, warped_scene
 
@@ -41,13 +40,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--stations", type=int, default=48)
     parser.add_argument("--points", type=int, default=6000)
-    parser.add_argument("--oracle", action="store_true")
     add_options(parser, quick=f"{_QUICK_STATIONS} stations and {_QUICK_POINTS} points")
     asked = parser.parse_args()
     stations = _QUICK_STATIONS if asked.quick else asked.stations
     about, figures = machine(("numpy", "scipy", "pycolmap")), list[Figure]()
     print(f"{heading(about)}\n", flush=True)
-    print(f"{'port mm':>8}{'tilt':>6}  {'method':<12}{'points mm':>10}{'cameras mm':>12}{'s':>7}")
     for port_m in (0.02, 0.05):
         for tilt_deg in (0.0, 2.0):
             lines = 4
@@ -61,14 +58,8 @@ def main() -> None:
                 scale=1,
                 relief_m=RELIEF_M,
             )
-            found = rows(scene, with_oracle=asked.oracle)
+            found = rows(scene)
             figures += _figures(f"port at {1e3 * port_m:g} mm, tilt {tilt_deg:g} deg", found)
-            for method, points, cameras, seconds in found:
-                print(
-                    f"{1e3 * port_m:8.0f}{tilt_deg:6.0f}  {method:<12}{1e3 * points:10.3f}"
-                    f"{1e3 * cameras:12.3f}{seconds:7.1f}",
-                    flush=True,
-                )
     sys.exit(hand_over(asked, about, Findings(figures=tuple(figures))))
 
 
@@ -86,7 +77,7 @@ def _figures(where: str, found: Sequence[tuple[str, float, float, float]]) -> li
     ]  # fmt: skip
 
 
-def rows(scene: Scene, *, with_oracle: bool) -> Sequence[tuple[str, float, float, float]]:
+def rows(scene: Scene) -> Sequence[tuple[str, float, float, float]]:
     """Method, rms of points and of cameras, metres, and seconds."""
     seen, warps = warped_scene(scene)
     start = near_truth(scene, seen, warps, np.random.default_rng(1))
@@ -95,9 +86,6 @@ def rows(scene: Scene, *, with_oracle: bool) -> Sequence[tuple[str, float, float
     with TemporaryDirectory() as folder:
         ours, _ = refract(start, seen, Path(folder))
     found.append(_row("ours", ours, scene, began))
-    if with_oracle:
-        began = time.monotonic()
-        found.append(_oracle_row(ours, scene, began))
     began = time.monotonic()
     found.append(_row("warp only", adjust_freely(start), scene, began))
     began = time.monotonic()
@@ -145,28 +133,6 @@ def _row(name: str, mapped: Mapped, scene: Scene, began: float) -> tuple[str, fl
     seconds = time.monotonic() - began
     pupils, true_pupils, points, true_points = pupils_and_points(mapped, scene)
     return name, rigid_rms(points, true_points), rigid_rms(pupils, true_pupils), seconds
-
-
-def _oracle_row(ours: Mapped, scene: Scene, began: float) -> tuple[str, float, float, float]:
-    ids = np.array(sorted(ours.model.points3D)) - 1
-    rig = scene.rig
-    references = [
-        pose
-        for pose, record in zip(scene.ned_from_cam, scene.records, strict=True)
-        if record.camera == rig.reference
-    ]
-    poses, points = adjust_through_ports(scene, references, scene.points_ned[ids], ids)
-    pupils = np.array(
-        [(poses[r.station] * rig.cam_from_rig[r.camera].inv()).translation for r in scene.records]
-    )
-    truth = np.array([pose.translation for pose in scene.ned_from_cam])
-    seconds = time.monotonic() - began
-    return (
-        "exact",
-        rigid_rms(points, scene.points_ned[ids]),
-        rigid_rms(pupils, truth),
-        seconds,
-    )
 
 
 def rigid_rms(found: Array, true: Array) -> float:

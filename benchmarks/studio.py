@@ -165,13 +165,7 @@ def main() -> None:
     print(heading(about), "\n", flush=True)
     swaths = 1_000 if options.quick else 10_000
     rows = [replanned("tutorial", {}, 2.5), replanned(f"{swaths:,} swaths", _strip(swaths), 1.0)]
-    print(_table(rows), flush=True)
     tiles = tiles_of(4_096 if options.quick else 16_384)
-    print(
-        f"\n{tiles.tiles} tiles of a mosaic of {tiles.megapixels:,.0f} Mpx: {tiles.cpu_ms:.1f} ms "
-        f"each, {tiles.worst_ms:.1f} at most; reading and encoding alone {tiles.twin_ms:.1f} ms",
-        flush=True,
-    )
     figures = (*(figure for row in rows for figure in row.figures()), *tiles.figures())
     values = {"replans": [asdict(row) for row in rows], "tiles": asdict(tiles)}
     sys.exit(hand_over(options, about, Findings(figures=figures), values))
@@ -218,19 +212,6 @@ def _whole_s(config: SurveyConfig) -> float:
         began = time.process_time()
         run_plan(Path(folder), Path(folder), SERIAL, survey=config)
         return time.process_time() - began
-
-
-def _table(rows: list[Replan]) -> str:
-    lines = [
-        "| area | swaths | stations | re-plan, s | first, s | JSON, MB | whole plan, s | ratio |"
-    ]
-    lines.append("|---" * 8 + "|")
-    lines += [
-        f"| {row.area} | {row.swaths:,} | {row.stations:,} | {row.cpu_s:.3f} | {row.first_s:.2f} "
-        f"| {row.megabytes:.2f} | {row.whole_s:.2f} | {row.cpu_s / row.whole_s:.3f} |"
-        for row in rows
-    ]
-    return "\n".join(lines)
 
 
 def _options() -> argparse.Namespace:

@@ -69,8 +69,6 @@ def main() -> int:
     about = machine(("numpy", "opencv-contrib-python-headless", "pycolmap"))
     print(f"{heading(about)}\n", flush=True)
     findings = Findings()
-    print(f"{'water and light':16}{'features':>10}{'registered':>12}{'largest':>9}{'rms mm':>9}"
-          f"{'max mm':>9}{'cpu s':>8}")  # fmt: skip
     for level in LEVELS[2:3] if options.quick else LEVELS:
         rendered = options.work / level.name / "rendered"
         render(rendered, survey_toml(level))
@@ -99,20 +97,19 @@ def _compared(level: Level, rendered: Path, *, learned: bool) -> Findings:
     cost = measured(line, workspace.with_suffix(".log"))
     name = f"{level.name}, {word}"
     if not cost.ok:
-        print(f"{level.name:16}{word:>10}  {cost.last_line()}", flush=True)
         if not learned or level.registered is None:
             return Findings(left_out=(f"{name}: {cost.last_line()}",))
         return Findings(failed=(f"{name}: {cost.last_line()}",))
     share, largest, misses_m = judged(workspace)
-    rms_mm, most_mm = 1e3 * rms(misses_m), 1e3 * float(misses_m.max())
-    print(f"{level.name:16}{word:>10}{share:12.0%}{largest:9.0%}{rms_mm:9.1f}{most_mm:9.1f}"
-          f"{cost.cpu_s:8.0f}", flush=True)  # fmt: skip
+    rms_mm, max_mm = 1e3 * rms(misses_m), 1e3 * float(misses_m.max())
+    print(f"{name}: judged", flush=True)
     return Findings(
         figures=(
             Figure(name=f"{name}: registered", value=share, unit="1",
                    goal=level.registered if learned else None),
             Figure(name=f"{name}: in the largest part", value=largest, unit="1"),
             Figure(name=f"{name}: cameras, rms", value=rms_mm, unit="mm"),
+            Figure(name=f"{name}: cameras, largest", value=max_mm, unit="mm"),
             Figure(name=f"{name}: computing", value=cost.cpu_s, unit="s"),
         )
     )  # fmt: skip

@@ -1,85 +1,125 @@
-"""The vehicle: equations of motion, allocation next to a peer, and whole missions.
+"""The vehicle: whole missions, and the paper's mission in other seas.
 
     .venv/bin/python -m benchmarks.vehicle [--quick] [--json FILE] [--only PART ...]
 
-Ends with exit code 1 when a goal is missed. All code is compiled afresh, into a folder of its own,
-so that no kernel is older than the sources.
+`loop`: how many times faster than real time a mission is simulated. It is the paper's: 15 x 17 m,
+lines 1 m apart, some half an hour. Each tick of 0.05 s has the sensors and the navigation filter,
+guidance and control, the exact allocation, and five Runge-Kutta steps of 10 ms; every tick is
+recorded. One core; the best run of several counts. `seas`: see `vehicle_seas`.
+Ends with exit code 1 when a goal is missed.
 """
 
 import argparse
-import os
+import math
 import sys
-from dataclasses import asdict
-from pathlib import Path
-from tempfile import TemporaryDirectory
+import time
+from dataclasses import asdict, dataclass
 from typing import Any
 
-from benchmarks.figures import Findings, add_options, hand_over
+import numpy as np
+
+from alice_survey.core.config import SurveyConfig, change_section
+from alice_survey.sim.vehicle.pilot.memory import DONE, PHASE, REASON
+from alice_survey.sim.vehicle.pilot.safety import NONE
+from alice_survey.sim.vehicle.sea import FloorGrid, level_floor
+from alice_survey.sim.vehicle.simulator import Setup, simulate
+from benchmarks import vehicle_seas
+from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
+from camera_calib.rig import design_rig
+from missions.fly.simulation import flight_settings, mission_setup
+from missions.plan.planner import plan_survey
 
-_PARTS = ("start", "dynamics", "accuracy", "allocation", "loop", "seas")
+_MAX_S = 7200.0
+_PARTS = ("loop", "seas")
 
 
-def main() -> None:
+def main() -> int:
     """Measure, print, and say which goals are missed."""
-    options = _options()
-    with TemporaryDirectory() as cache:
-        # Before numba is imported, which reads it once.
-        os.environ["NUMBA_CACHE_DIR"] = cache
-        code = _measure(options, Path(cache))
-    sys.exit(code)
-
-
-def _measure(options: argparse.Namespace, cache: Path) -> int:
-    from benchmarks import vehicle_allocation, vehicle_dynamics, vehicle_loop, vehicle_seas
-
-    quick = options.quick
+    parser = argparse.ArgumentParser(description="Benchmarks of the vehicle.")
+    add_options(parser, quick="fewer and shorter runs")
+    parser.add_argument("--only", nargs="+", choices=_PARTS, default=list(_PARTS))
+    options = parser.parse_args()
     about, report, findings = machine(("numpy", "numba", "scipy")), dict[str, Any](), Findings()
     print(heading(about), "\n", flush=True)
-    if "start" in options.only:
-        starts = vehicle_loop.starts(cache)
-        print(f"A fresh process waits:\n{vehicle_loop.starts_table(starts)}\n", flush=True)
-        report["start"] = [asdict(row) for row in starts]
-        findings += Findings(figures=tuple(f for row in starts for f in row.figures()))
-    if "dynamics" in options.only:
-        rows = vehicle_dynamics.measure(20_000 if quick else 200_000, 3 if quick else 10)
-        print(f"Equations of motion:\n{vehicle_dynamics.table(rows)}\n", flush=True)
-        report["dynamics"] = [asdict(row) for row in rows]
-        findings += Findings(figures=tuple(vehicle_dynamics.figures(rows)))
-    if "accuracy" in options.only:
-        seconds = 12 if quick else 60
-        errors = vehicle_dynamics.accuracy(seconds)
-        print(f"Largest errors of Runge-Kutta steps over {seconds} s, all thrusters at work:")
-        print(vehicle_dynamics.accuracy_table(errors), "\n", flush=True)
-        report["accuracy"] = [asdict(row) for row in errors]
-        findings += Findings(figures=tuple(f for row in errors for f in row.figures()))
-    if "allocation" in options.only:
-        solves = vehicle_allocation.measure(2 if quick else 10)
-        print(f"Allocation:\n{vehicle_allocation.table(solves)}\n", flush=True)
-        report["allocation"] = [asdict(row) for row in solves]
-        findings += Findings(figures=tuple(vehicle_allocation.figures(solves)))
     if "loop" in options.only:
-        flights = vehicle_loop.measure(1 if quick else 5)
-        print(f"Whole missions:\n{vehicle_loop.table(flights)}\n", flush=True)
+        flights = measure(1 if options.quick else 5)
         report["loop"] = [{**asdict(row), "factor": row.factor} for row in flights]
         findings += Findings(
             figures=tuple(flight.figure() for flight in flights),
             failed=tuple(f"{f.mission}: was broken off" for f in flights if not f.complete),
         )
     if "seas" in options.only:
-        seas = vehicle_seas.measure(1 if quick else 5)
+        seas = vehicle_seas.measure(1 if options.quick else 5)
         print(f"The paper's mission in other seas:\n{vehicle_seas.table(seas)}\n", flush=True)
         report["seas"] = [asdict(row) for row in seas]
         findings += Findings(figures=tuple(vehicle_seas.figures(seas)))
     return hand_over(options, about, findings, report)
 
 
-def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="Benchmarks of the vehicle.")
-    add_options(parser, quick="fewer and shorter runs")
-    parser.add_argument("--only", nargs="+", choices=_PARTS, default=list(_PARTS))
-    return parser.parse_args()
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """One mission."""
+
+    mission: str
+    simulated_s: float
+    wall_s: float
+    complete: bool
+    goal: float = 1000.0
+    """The least factor that is requested; 2,000 is hoped for."""
+
+    @property
+    def factor(self) -> float:
+        """Real-time factor."""
+        return self.simulated_s / self.wall_s
+
+    def figure(self) -> Figure:
+        """The factor and its goal."""
+        goal = Goal(minimum=self.goal)
+        return Figure(name=self.mission, value=self.factor, unit="times real time", goal=goal)
+
+
+def measure(runs: int) -> list[Row]:
+    """All missions, each a number of times."""
+    calm = SurveyConfig()
+    across = change_section(calm, "sea", current_mps=0.1, current_towards_deg=90.0)
+    rough = change_section(
+        across, "sea", surface_current_mps=0.2, current_sigma_mps=0.03, gust_n=(2.0, 2.0, 1.0)
+    )
+    sparus = change_section(across, "vehicle", name="sparus2", controller="los")
+    level, waves = level_floor(calm.area.seafloor_depth_m), _waves(calm.area.seafloor_depth_m)
+    missions = {
+        "ALICE, sway controller, 0.1 m/s across": _setup(across, level),
+        "the same, shear, gusts, waves of sand": _setup(rough, waves),
+        "SPARUS II, heading controller, 0.1 m/s across": _setup(sparus, level),
+    }
+    return [_fly(name, setup, runs) for name, setup in missions.items()]
+
+
+def _setup(config: SurveyConfig, floor: FloorGrid) -> Setup:
+    plan = plan_survey(config, design_rig(config.camera, config.water)).plan
+    return mission_setup(plan, flight_settings(config), floor, _MAX_S, np.random.default_rng(1))
+
+
+def _waves(depth_m: float) -> FloorGrid:
+    places = np.arange(-15.0, 35.0, 0.1)
+    waves = 0.15 * np.sin(places[:, None] / 1.3) * np.sin(places[None, :] / 0.9)
+    return FloorGrid(-15.0, -15.0, 0.1, depth_m + waves)
+
+
+def _fly(name: str, setup: Setup, runs: int) -> Row:
+    best = math.inf
+    for _ in range(runs + 1):
+        started = time.perf_counter()
+        flown = simulate(setup, np.random.default_rng(2), max_s=_MAX_S, label=name)
+        best = min(best, time.perf_counter() - started)
+    return Row(
+        mission=name,
+        simulated_s=float(flown.time_s[-1]),
+        wall_s=best,
+        complete=bool(flown.report[-1, PHASE] == DONE and flown.report[-1, REASON] == NONE),
+    )
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
