@@ -4,7 +4,7 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from missions.logs.dead_reckoning import TrackErrors, with_dead_reckoning
 from missions.logs.dive import DATED_AFTER_S, ROLES, LoggedDive, Signal
 from missions.logs.navigation_csv import READINGS, max_gap_s, utc_date
 from missions.logs.ros_bag import is_bag, read_ros_bag
+from missions.logs.waterlinked import is_waterlinked, read_waterlinked
 from missions.values.navigation import COLUMNS, write_navigation_rows
 
 _NAMED = 8
@@ -32,10 +33,7 @@ _NOT_READ = {
     ".csv": "a CSV is not a vehicle's log: give a navigation CSV to import-images --navigation; of "
     "QGroundControl import the .tlog",
     ".log": "text logs of ArduSub are not read: give the .BIN that the text was made of",
-    **dict.fromkeys(
-        (".pd0", ".json", ".jsonl"),
-        "files of a DVL are not read: import the vehicle's own log, or export a navigation CSV",
-    ),
+    ".pd0": "PD0 is no longer read: export velocities and ranges as a navigation CSV",
 }
 _MAX_OUT_OF_WATER_M = 2.0
 """A vehicle on deck, or a barometer that is off, seldom is higher."""
@@ -63,6 +61,8 @@ class ImportOptions:
     """Vehicle log to write, too."""
     dead_reckon: TrackErrors | None = None
     """How velocities err: positions are those of velocities and attitudes between fixes."""
+    flip_velocity: bool = False
+    """Turn velocities over ground round: those of a DVL whose file states the other sign."""
     start_at: tuple[float, float, float] | None = None
     """Latitude, longitude and its sigma in metres of the first velocity, for dead reckoning."""
 
@@ -95,7 +95,7 @@ def import_log(
     is counted, by reason, in warnings and in the result.
 
     Args:
-        path: a bag of ROS 1 or 2, ArduSub's .BIN or .tlog, or PX4's .ulg.
+        path: a bag of ROS 1 or 2, ArduSub's .BIN or .tlog, PX4's .ulg, or reports of a DVL.
         out: CSV to write.
         options: what to change, and what to choose.
 
@@ -112,6 +112,15 @@ def import_log(
         if file.resolve() == path.resolve() or written.count(file) > 1:
             raise NavigationError(f"{file} would be written over: choose another name")
     dive = read_dive(path, options)
+    if options.flip_velocity:
+        flipped: dict[str, Any] = {
+            name: replace(signal, values=-signal.values)
+            for name in ("velocity_ned", "velocity_body")
+            if (signal := getattr(dive, name)) is not None
+        }
+        if not flipped:
+            raise NavigationError(f"{path}: holds no velocity that --flip-velocity could turn")
+        dive = replace(dive, **flipped)
     if options.dead_reckon is not None:
         try:
             dive = with_dead_reckoning(
@@ -175,6 +184,8 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
         )
     if path.is_dir() or is_bag(path):
         return read_ros_bag(path, chosen, datum)
+    if is_waterlinked(path):
+        return read_waterlinked(path)
     if suffix in (".ulg", ".ulog") or first_bytes(path, len(MAGIC)) == MAGIC:
         return read_px4_ulog(path, chosen)
     if suffix == ".bin":
@@ -185,7 +196,7 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
         raise NavigationError(f"{path}: {_NOT_READ[suffix]}")
     raise NavigationError(
         f"{path}: not a known log: a ROS bag (.bag, .mcap, .db3 or a folder), ArduSub's .BIN "
-        "or .tlog, or PX4's .ulg"
+        "or .tlog, PX4's .ulg, or JSON reports of a Water Linked DVL"
     )
 
 

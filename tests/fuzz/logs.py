@@ -39,6 +39,29 @@ def _bag(folder: Path, version: int, storage: str = "MCAP") -> None:
     bag.write(folder / ("a.bag" if version == 1 else "bag"), getattr(StoragePlugin, storage))
 
 
+def _dvl(folder: Path) -> None:
+    lines = []
+    for i in range(12):
+        micro = 1_714_564_800_000_000 + 100_000 * i
+        lines += [
+            '{"time": 100.0, "vx": 0.4, "vy": -0.01, "vz": 0.02, "fom": 0.001, "altitude": 2.5, '
+            f'"velocity_valid": true, "status": 0, "time_of_validity": {micro}, '
+            '"type": "velocity"}',
+            f'{{"ts": {micro / 1e6}, "x": 1, "y": 2, "z": 3, "std": 0.01, "roll": 1.5, '
+            f'"pitch": -2, "yaw": {i}, "type": "position_local", "status": 0}}',
+        ]
+    (folder / "a.json").write_text("\n".join(lines) + "\n")
+
+
+def read_dead_reckoned(path: Path) -> object:
+    """As `import-log --dead-reckon`."""
+    from missions.logs.dead_reckoning import TrackErrors, with_dead_reckoning
+    from missions.logs.import_log import ImportOptions, read_dive
+
+    dive = read_dive(path, ImportOptions())
+    return with_dead_reckoning(dive, TrackErrors(), (43.0, 5.0, 2.0), 0.0)
+
+
 def _dive() -> list[tuple[object, ...]]:
     rows: list[tuple[object, ...]] = [
         ("GPS", 5 * 10**7, 0, 3, 302_418_000, 2312, 12, 0.8, 60.1, 5.25, 3.0, 0.1, 0.0, 0.0, 0.0, 1)
@@ -301,6 +324,9 @@ TARGETS = (
     Target(
         name="ROS 2 bag, metadata", syntax="text", file="bag/metadata.yaml",
         build=partial(_bag, version=2), read=read_any_log,
+    ),
+    Target(
+        name="reports of a DVL", syntax="json", file="a.json", build=_dvl, read=read_dead_reckoned
     ),
     Target(name="ULog", syntax="binary", file="a.ulg", build=_ulog, read=read_any_log),
     Target(

@@ -166,8 +166,8 @@ class ImportControlCommand(WorkspaceCommand):
 class ImportLogCommand(ReportCommand):
     """Turn a vehicle's own log into the navigation CSV of import-images.
 
-    ROS 1 and ROS 2 bags (COLA2 and common messages), ArduSub's DataFlash and telemetry logs, and
-    PX4's .ulg.
+    ROS 1 and ROS 2 bags (COLA2 and common messages), ArduSub's DataFlash and telemetry logs, PX4's
+    .ulg, and JSON of Water Linked's DVLs.
     """
 
     name = "import-log"
@@ -176,10 +176,11 @@ class ImportLogCommand(ReportCommand):
         "import-log 00000042.BIN --declination 3.4 --tide tides.csv -o navigation.csv",
         "import-log dive.tlog --topic depth=VFR_HUD --vehicle-log vehicle.csv -o navigation.csv",
         "import-log dvl.bag --dead-reckon --start-at 43.05 5.92 10 -o navigation.csv",
+        "import-log dvl.json --dead-reckon --start-at 43.05 5.92 10 -o navigation.csv",
     )
     title = "Import a vehicle's log"
     offered = ("log", "output", "declination", "dead_reckon")
-    log: Path = argument(..., "ROS bag, or log of ArduSub or PX4.")
+    log: Path = argument(..., "ROS bag, log of ArduSub or PX4, or JSON of a Water Linked DVL.")
     output: Path = option(..., "CSV to write.", "-o", "--output", metavar="FILE")
     declination: float = option(0.0, "Add this declination to headings, degrees; east is positive.")
     tide: str = option("0", "Height of the water above the level of depths: metres, or a CSV.")
@@ -201,6 +202,7 @@ class ImportLogCommand(ReportCommand):
         metavar="LATITUDE LONGITUDE SIGMA",
     )  # fmt: skip
     heading_sigma: float = option(1.0, "Constant error of headings in dead reckoning, degrees.")
+    flip_velocity: bool = option(False, "Turn the velocities of a DVL round.")
 
     def run(self) -> Result:
         """Read it and write the CSV."""
@@ -211,7 +213,7 @@ class ImportLogCommand(ReportCommand):
             declination_deg=self.declination, tide=self.tide, topics=self.topic or (),
             datum_deg=self.datum, lever_body_m=self.lever_arm,
             altitude_offset_m=self.altitude_offset, vehicle_log=self.vehicle_log,
-            start_at=self.start_at,
+            start_at=self.start_at, flip_velocity=self.flip_velocity,
             dead_reckon=TrackErrors(heading_deg=self.heading_sigma) if self.dead_reckon else None,
         )  # fmt: skip
         return import_log(self.log, self.output, options)

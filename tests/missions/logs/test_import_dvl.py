@@ -1,5 +1,6 @@
 """Logs of Doppler logs and attitudes become navigation whose sigma grows."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -90,6 +91,39 @@ def test_loss_of_bottom_lock_ends_the_track(tmp_path: Path) -> None:
     assert len(track(tmp_path / "n.csv")) == 100
     assert data["left_out"]["velocities in stretches without a fix"] == COUNT - 200
     assert any("1 gaps in the velocity" in note for note in data["notes"])
+
+
+def reports(*, stamped: bool = True) -> list[str]:
+    """The same circle as a Water Linked DVL reports it, with noise between the lines."""
+    time_s, heading, _ = circle()
+    crab, lines = np.deg2rad(-10.0), ['{"type": "veloc', '{"type": "config", "x": 1}']
+    for t, course in zip(time_s, heading, strict=True):
+        valid = START / 1e9 + t
+        turn = rotation_from_attitude(np.deg2rad(5.0), 0.0, course + crab)
+        v = turn.inv().apply(SPEED_MPS * np.array([np.cos(course), np.sin(course), 0.0]))
+        yaw = (np.rad2deg(course + crab) + 180.0) % 360.0 - 180.0
+        report = {"time": 1e3 * STEP_S, "vx": v[0], "vy": v[1], "vz": v[2], "altitude": 2.0,
+                  "velocity_valid": True, "status": 0, "type": "velocity"}  # fmt: skip
+        if stamped:
+            report["time_of_validity"] = round(valid * 1e6)
+        lines.append(json.dumps(report))
+        place = {"ts": valid, "x": 99, "y": 99, "z": 9, "roll": 5.0, "pitch": 0.0, "yaw": yaw}
+        lines.append(json.dumps({**place, "type": "position_local", "status": 0}))
+    return lines
+
+
+def test_reports_of_a_water_linked_dvl_close_the_circle(tmp_path: Path) -> None:
+    log = tmp_path / "dvl.json"
+    log.write_text("\n".join(reports()))
+    options = ImportOptions(dead_reckon=TrackErrors(), start_at=(*FIX[:2], 2.0))
+    _, data = import_log(log, tmp_path / "n.csv", options)
+    place = numbers(tmp_path / "n.csv", "latitude_deg", "longitude_deg")
+    found = DATUM.ned_from_geodetic(np.column_stack([place, np.zeros(len(place))]))
+    np.testing.assert_allclose(found[:, :2], circle()[2], atol=2e-3)
+    altitude = numbers(tmp_path / "n.csv", "altitude_m")[:, 0]
+    np.testing.assert_allclose(altitude, 2.0 * np.cos(np.deg2rad(5.0)), atol=1e-6)
+    assert data["dated"]
+    assert data["left_out"] == {"lines that are no report": 1}
 
 
 def test_velocities_of_the_world_are_refused(tmp_path: Path) -> None:
