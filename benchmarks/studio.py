@@ -27,7 +27,7 @@ from rasterio.transform import Affine
 from rasterio.windows import Window
 
 from alice_survey.app.pipeline import template_text
-from alice_survey.app.report.colours import encode_webp
+from alice_survey.app.report.rasters import encode_webp
 from alice_survey.app.studio.files import Workspace
 from alice_survey.app.studio.layers import Layers
 from alice_survey.core.config import SurveyConfig

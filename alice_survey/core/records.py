@@ -661,6 +661,11 @@ class ReferenceRecord(JsonRecord):
     survey_to_reference: Distances
     reference_to_survey: Distances
 
+    @property
+    def name(self) -> str:
+        """Name of the file."""
+        return self.reference.rsplit("/", 1)[-1]
+
 
 class ChangeRecord(JsonRecord):
     """`against/NAME/change.json`: figures of a comparison with an earlier survey."""

@@ -15,7 +15,6 @@ from typer.testing import CliRunner
 from alice_survey.app import stages
 from alice_survey.app.cli.main import app
 from alice_survey.app.pipeline import FlightChanges, run, workspace_status
-from alice_survey.app.report.figures import Figures
 from alice_survey.app.report.held import Held
 from alice_survey.app.report.sections import sections
 from alice_survey.app.report.verdicts import verdicts
@@ -122,11 +121,11 @@ def test_a_report_reads_what_version_0_1_0_wrote(old: Path) -> None:
     (old / "dense" / "dem.tif").unlink()  # they are cut short
     (old / "mosaic" / "mosaic.tif").unlink()
     (old / "plan" / "map.png").unlink()
-    figures = Figures(held=Held.of(old))
-    assert (figures.registered, figures.total, figures.held.simulated) == (116, 116, True)
-    assert figures.held.name == "demo"
-    assert len(verdicts(figures)) > 5
-    found = list(sections(figures, has_map=False, has_mesh=True))
+    held = Held.of(old)
+    assert held.registration is not None
+    assert (held.registration.registered, held.simulated, held.name) == (116, True, "demo")
+    assert len(verdicts(held)) > 5
+    found = list(sections(held, has_map=False, has_mesh=True))
     assert {"mesh", "truth", "camera", "mission"} <= {section.name for section in found}
     assert len(found[-1].tables[0].rows) == len(STAGES) - 1
 
@@ -255,10 +254,10 @@ def test_a_stage_added_in_one_file_is_run_shown_reported_and_documented(
     assert state() == "up to date"
     assert run(["toy"], tmp_path, None)[1]["toy"]["done"] is False
     held = Held.of(tmp_path)
-    *_, last = sections(Figures(held=held), has_map=False, has_mesh=False)
+    *_, last = sections(held, has_map=False, has_mesh=False)
     tables = {table.title: table.rows for table in last.tables}
     assert [row[0] for row in tables["Stages"]] == ["toys"]
-    assert [row[:2] for row in tables["Files"]] == [("toys/lines.txt", "how many lines there are")]
+    assert list(tables["Files"]) == [("toys/lines.txt", "how many lines there are")]
     assert tmp_path / "toys" / "lines.txt" in spec("report").inputs(tmp_path)
     assert "| `toy` | `toys/` | `run` | counts the lines of a note |" in stages.table()
     assert stages.names("run") == ["toy"]

@@ -1,4 +1,4 @@
-"""Contents of a workspace, read once and unchanged."""
+"""Contents of a workspace, read once and unchanged, and the key figures in them."""
 
 import csv
 import math
@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -18,10 +18,13 @@ from alice_survey.core.plane_settings import LEVEL
 from alice_survey.core.records import (
     ChangeRecord,
     FrameRecord,
+    MosaicRecord,
     PicturesRecord,
     PlaceRecord,
     PlaneRecord,
+    RegistrationRecord,
 )
+from alice_survey.kit.words import count
 from missions.values.plan_file import Plan, read_plan
 
 R = TypeVar("R", bound=JsonRecord)
@@ -111,6 +114,109 @@ class Held:
         """Comparisons with earlier surveys, by their names."""
         files = sorted((self.workspace / "against").glob("*/change.json"))
         return [(file.parent.name, ChangeRecord.read(file)) for file in files]
+
+    @cached_property
+    def registration(self) -> RegistrationRecord | None:
+        """Which pictures are in the model, and how it got its place."""
+        return self.read(RegistrationRecord)
+
+    @property
+    def pictures(self) -> str:
+        """Pictures of the model, and the places at which they were taken."""
+        number = 0 if self.registration is None else self.registration.registered
+        stations = len({row["station"] for row in self.track})
+        return f"{count(number, 'picture')} taken at {count(stations, 'station')}"
+
+    @cached_property
+    def surface(self) -> "Surface | None":
+        """The DEM, block by block; None without one."""
+        return None if self.file("dense/dem.tif") is None else _surface(self)
+
+    @property
+    def pixel_m(self) -> float:
+        """Pixel of the mosaic, in the model's unit; NaN without one."""
+        mosaic = self.read(MosaicRecord)
+        return math.nan if mosaic is None else mosaic.pixel
+
+    @property
+    def place_sigma_m(self) -> float:
+        """Horizontal sigma of a camera on the Earth, root mean square; NaN of a model elsewhere."""
+        names = ("sigma_north_m", "sigma_east_m")
+        rows = [] if self.frame.datum is None else self.track
+        level = np.array([[number(row, name) for name in names] for row in rows]).reshape(-1, 2)
+        known = level[np.isfinite(level).all(axis=1)]
+        return float(np.sqrt((known**2).sum(axis=1).mean())) if len(known) else math.nan
+
+
+@dataclass(frozen=True, kw_only=True)
+class Surface:
+    """Figures of the DEM."""
+
+    area: float
+    """Area of its known cells, square units."""
+    cell: float
+    low: float
+    high: float
+    sigma_median: float
+    """Sigma of the heights; NaN where none is stated."""
+    sigma_95: float
+    stations_median: float
+    """Stations that see a cell."""
+    covered: float
+    """Share of the planned area with a height; NaN without a plan."""
+
+
+def _surface(held: Held) -> Surface:
+    import rasterio
+    import shapely
+
+    dense = held.workspace / "dense"
+    kept = []
+    known = requested = reached = 0
+    area = planned_area(held) if held.plane is None else None
+    with (
+        rasterio.open(dense / "dem.tif") as dem,
+        rasterio.open(dense / "sigma.tif") as sigma,
+        rasterio.open(dense / "stations.tif") as seen,
+    ):
+        cell = float(dem.transform.a)
+        for _, window in dem.block_windows(1):
+            blocks = [raster.read(1, window=window) for raster in (dem, sigma, seen)]
+            there = np.isfinite(blocks[0])
+            known += int(there.sum())
+            kept.append(np.stack([block[there][::_KEPT].astype(np.float64) for block in blocks]))
+            if area is not None:
+                rows, columns = np.mgrid[: there.shape[0], : there.shape[1]] + 0.5
+                cells = dem.window_transform(window)
+                east, north = cells.c + cells.a * columns, cells.f + cells.e * rows
+                inside = shapely.contains_xy(area, east, north)
+                requested += int(inside.sum())
+                reached += int((inside & there).sum())
+    if area is not None:  # what lies beyond the raster counts too
+        requested = max(requested, round(area.area / cell**2))
+    height, spread, stations = np.concatenate(kept, axis=1)
+    low, high = np.percentile(height, [0.5, 99.5]) if known else (math.nan, math.nan)
+    spread = spread[np.isfinite(spread)]
+    middle, most = np.percentile(spread, [50, 95]) if len(spread) else (math.nan, math.nan)
+    return Surface(
+        area=known * cell**2, cell=cell, low=float(low), high=float(high),
+        sigma_median=float(middle), sigma_95=float(most),
+        stations_median=float(np.median(stations)) if known else math.nan,
+        covered=reached / requested if requested else math.nan,
+    )  # fmt: skip
+
+
+_KEPT = 16
+"""Step between the cells that enter medians: half a million of a DEM of 3,000 by 3,000."""
+
+
+def planned_area(held: Held) -> Any | None:
+    """The area that the plan is to cover, on the map's axes (east, north); None without a plan."""
+    import shapely
+
+    if held.plan is None:
+        return None
+    return shapely.transform(held.plan.area.survey, lambda rows: rows[:, ::-1])
 
 
 def known_column(rows: Sequence[Mapping[str, str]], start: str) -> Array:

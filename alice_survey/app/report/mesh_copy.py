@@ -12,8 +12,8 @@ import numpy as np
 import rasterio
 from rasterio.enums import Resampling
 
-from alice_survey.app.report.colours import read_shrunk
 from alice_survey.app.report.held import Held
+from alice_survey.app.report.rasters import read_shrunk
 from alice_survey.core.frames import Array
 from alice_survey.core.records import MeshRecord
 from alice_survey.core.run import progress

@@ -6,14 +6,13 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from alice_survey.app.report.figures import Figures
 from alice_survey.app.report.held import Held
 from alice_survey.app.report.mesh_copy import mesh_copy
 from alice_survey.app.report.rasters import picture_layers
 from alice_survey.app.report.sections import sections
 from alice_survey.app.report.shapes import shape_layers
 from alice_survey.app.report.verdicts import facts, summary, verdicts
-from alice_survey.core.artefacts import STAGE_FILE, atomic_path
+from alice_survey.core.artefacts import STAGE_FILE, atomic_path, json_values
 from alice_survey.core.executor import Executor
 from alice_survey.core.records import ReportRecord
 from alice_survey.core.run import progress
@@ -43,19 +42,18 @@ def build_report(held: Held, folder: Path) -> tuple[Report, dict[str, Any]]:
         held: the workspace.
         folder: for the mesh's light copy.
     """
-    figures = Figures(held=held)
-    found = verdicts(figures)
-    said, known = summary(figures, found), facts(figures)
+    found = verdicts(held)
+    said, known = summary(held, found), facts(held)
     with progress.step("draw the maps"):
         layers: list[PictureLayer | ShapeLayer] = [*picture_layers(held), *shape_layers(held)]
-        chart = None
-        if layers:
-            chart = with_stills(survey_map(held, layers))
+        chart = with_stills(survey_map(held, layers)) if layers else None
     mesh = mesh_copy(held, folder / "mesh.glb")
-    parts = list(sections(figures, has_map=chart is not None, has_mesh=mesh is not None))
+    parts = list(sections(held, has_map=chart is not None, has_mesh=mesh is not None))
+    kind = "simulated survey" if held.simulated else "survey"
+    when = f"{last_worked_on(held):%Y-%m-%d %H:%M UTC}"
     report = Report(
         title=held.name,
-        subtitle=_subtitle(held),
+        subtitle="; ".join(filter(None, (kind, _place(held), f"last worked on {when}"))),
         summary=said,
         facts=known,
         verdicts=found,
@@ -64,14 +62,7 @@ def build_report(held: Held, folder: Path) -> tuple[Report, dict[str, Any]]:
         mesh=mesh,
         citation=_title_block(held),
     )
-    return report, _data(figures, found, said, known)
-
-
-def _subtitle(held: Held) -> str:
-    kind = "simulated survey" if held.simulated else "survey"
-    when = f"{last_worked_on(held):%Y-%m-%d %H:%M UTC}"
-    place = _place(held)
-    return f"{kind}; {place}; last worked on {when}" if place else f"{kind}; last worked on {when}"
+    return report, _data(held, found, said, known)
 
 
 def last_worked_on(held: Held) -> datetime:
@@ -91,14 +82,10 @@ def _place(held: Held) -> str:
 def _title_block(held: Held) -> list[tuple[str, str]]:
     """Citation details of the report."""
     program = f"alice-survey {version('alice-survey')}"
-    rows = [
-        ("Survey", "simulated" if held.simulated else "of pictures that were taken"),
-        ("Last worked on", f"{last_worked_on(held):%Y-%m-%d %H:%M UTC}"),
-        ("Position", _place(held)),
+    return [
         ("Software", f"{program}; versions of its libraries are in the last section"),
         ("Cite as", f"{held.name}, survey report, {program}, {last_worked_on(held):%Y-%m-%d}"),
     ]
-    return [row for row in rows if row[1]]
 
 
 def survey_map(held: Held, layers: Sequence[PictureLayer | ShapeLayer]) -> SurveyMap:
@@ -115,23 +102,18 @@ def survey_map(held: Held, layers: Sequence[PictureLayer | ShapeLayer]) -> Surve
     return SurveyMap(layers=layers, unit=held.unit, origin=f"metres east and north of {place}")
 
 
-def _data(figures: Figures, found: Any, said: Any, known: Any) -> dict[str, Any]:
-    surface = figures.surface
+def _data(held: Held, found: Any, said: Any, known: Any) -> dict[str, Any]:
     return {
         "format": "alice-survey report",
         "version": 1,
-        "name": figures.held.name,
-        "unit": figures.held.unit,
+        "name": held.name,
+        "unit": held.unit,
         "summary": dict(said),
         "facts": dict(known),
         "verdicts": [vars(verdict) for verdict in found],
-        "surface": None if surface is None else _finite(vars(surface)),
+        "surface": json_values(held.surface),
         "stages": {
             name: {"version": stage.version, "digest": stage.digest, "took_s": stage.took_s}
-            for name, stage in figures.held.stages.items()
+            for name, stage in held.stages.items()
         },
     }
-
-
-def _finite(values: dict[str, float]) -> dict[str, float | None]:
-    return {name: value if value == value else None for name, value in values.items()}

@@ -3,36 +3,34 @@
 A number that the summary, the facts or a verdict says is not said again in a table.
 """
 
-import math
 import platform
 import tomllib
-from collections.abc import Iterator
-from importlib.metadata import version
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
+from rasterio.enums import Resampling
 
 from alice_survey.app import stages
-from alice_survey.app.report import plots
-from alice_survey.app.report.figures import Figures
-from alice_survey.app.report.held import Held, known_column
+from alice_survey.app.report.held import Held, number
+from alice_survey.app.report.rasters import read_shrunk
 from alice_survey.core.records import (
     CalibrationReportRecord,
     CamerasRecord,
     ControlRecord,
-    DomingRecord,
     FlightRecord,
     MeshRecord,
     MosaicRecord,
     PlaneRecord,
     PortRecord,
+    ReferenceRecord,
     RegistrationRecord,
     ScoreRecord,
     SurfaceRecord,
 )
 from alice_survey.kit.document import Figure, Section, Table
-from alice_survey.kit.figure import shrunk_png
+from alice_survey.kit.figure import INKS, MARKS, draw_figure, shrunk_png
 from alice_survey.kit.words import (
     count,
     digits,
@@ -45,36 +43,25 @@ from alice_survey.kit.words import (
     share,
 )
 from camera_calib.camera import camera_from_json
+from camera_calib.mount import mount_line
 from camera_calib.rig import Rig, read_rig
 from missions.values.plan_file import Plan
 from reconstruct.stages import rig_file as rig_file_of
 
 _MAX_LOST = 20
 """Pictures that are not in the model, of which more are only counted."""
-_PACKAGES = (
-    "alice-survey", "numpy", "scipy", "numba", "opencv-contrib-python-headless", "pycolmap",
-    "open3d", "rasterio", "shapely", "pyproj",
-)  # fmt: skip
-_SETTINGS = "survey.toml"
+_MAX_VALUES_PX = 4e6
+_MAX_SETTING = 120
+"""Characters of a setting's value that are shown."""
 _DIGEST_CHARACTERS = 12
 
 
-class _Still(NamedTuple):
-    """A picture that a stage has drawn."""
-
-    path: str
-    title: str
-    shows: str
-    good: str = ""
-    otherwise: str = ""
-
-
-def sections(figures: Figures, *, has_map: bool, has_mesh: bool) -> Iterator[Section]:
+def sections(held: Held, *, has_map: bool, has_mesh: bool) -> Iterator[Section]:
     """All parts for which there is something, and what is needed to reproduce the survey."""
-    held = figures.held
     mesh, plan = held.read(MeshRecord), held.plan
+    score, control = held.read(ScoreRecord), held.read(ControlRecord)
     if has_map:
-        yield _map(held)
+        yield Section(name="map", title="Map", scene="map")
     if plan is not None and not held.has("dense"):  # the plan is the result so far
         yield _mission(held, plan)
     if has_mesh and mesh is not None:
@@ -83,30 +70,26 @@ def sections(figures: Figures, *, has_map: bool, has_mesh: bool) -> Iterator[Sec
             f"{share(mesh.textured_share)} of it with texture. The files are in mesh/."
         )
         yield Section(name="mesh", title="Mesh", text=[text], scene="mesh")
-    if figures.truth is not None:
-        yield _truth(figures.truth, held)
-    if figures.reference or held.earlier:
-        yield _comparison(figures)
-    if figures.control is not None:
-        yield _control(figures.control)
+    if score is not None:
+        yield _truth(score, held)
+    if held.file(ReferenceRecord.path) or held.earlier:
+        yield _comparison(held)
+    if control is not None:
+        yield _control(control)
     if held.has("dense"):
-        yield _surface(figures)
+        yield _surface(held)
     planes = list(_planes(held))
     if planes:
-        text = (
-            "The same surface as someone sees it who faces each plane. plane.json next to the "
-            "rasters in dense/planes/ and mosaic/planes/ says where a pixel lies in space."
-        )
+        text = "plane.json next to the rasters of a plane says where a pixel lies in space."
         yield Section(name="planes", title="Planes", text=[text], figures=planes)
-    if figures.registration is not None:
-        yield _model(figures, figures.registration)
+    if held.registration is not None:
+        yield _model(held, held.registration)
     if held.has("mapping") or held.has("calibration"):
         yield _camera(held)
     if held.rows("quality/quality.csv"):
-        still = _Still("quality/quality.png", "Quality along the survey",
-                       "Sharpness, contrast, brightness and veil of each picture.",
-                       "An even band.", "Look at the pictures named.")  # fmt: skip
-        yield Section(name="quality", title="Quality of the pictures", figures=_stills(held, still))
+        about = "Sharpness, contrast, brightness and veil of each picture along the survey."
+        still = _stills(held, ("quality/quality.png", "Quality of the pictures", about))
+        yield Section(name="quality", title="Quality of the pictures", figures=still)
     if plan is not None and held.has("dense"):
         yield _mission(held, plan)
     yield _reproduce(held)
@@ -118,19 +101,13 @@ def _table(title: str, *rows: tuple[str, str | None]) -> Table:
     return Table(title=title, header=("what", "value"), rows=known)
 
 
-def _map(held: Held) -> Section:
-    footprints = held.rows("mosaic/footprints.csv")
-    areas, pixels = (known_column(footprints, name) for name in ("area_", "ground_pixel_"))
-    tables = []
-    if len(areas) and len(pixels):
-        rows = [
-            ("area of a picture", *(f"{f(areas):.2f} {held.unit}²" for f in (min, np.median, max))),
-            ("pixel on the floor", *(length(float(f(pixels)), held.unit)
-                                     for f in (min, np.median, max))),
-        ]  # fmt: skip
-        header = ("", "least", "median", "most")
-        tables.append(Table(title="Footprints", header=header, rows=rows))
-    return Section(name="map", title="Map", tables=tables, scene="map")
+def _stills(held: Held, *stills: tuple[str, str, str]) -> list[Figure]:
+    """Pictures that stages have drawn, by path, title and what they show; those that are there."""
+    return [
+        Figure(png=shrunk_png(file), title=title, alt=shows, shows=shows)
+        for path, title, shows in stills
+        if (file := held.file(path)) is not None
+    ]
 
 
 def _truth(score: ScoreRecord, held: Held) -> Section:
@@ -145,111 +122,78 @@ def _truth(score: ScoreRecord, held: Held) -> Section:
          f"{share(None if seen is None else seen.share)} of the area"),
         ("mesh", None if mesh is None else mesh.distance_rms_mm, None, "distance from the truth"),
     ]  # fmt: skip
-    within = surface.completeness_within_px
+    shown = [
+        (name, *("" if mm is None else millimetres(mm) for mm in (rms, most)), of)
+        for name, rms, most, of in rows
+        if rms is not None or most is not None
+    ]
+    text = "The model was moved and rotated onto the truth by its cameras, and not scaled."
+    about = "Map and histogram of height errors: those at the rim come from few pictures, a dome "
+    about += "from calibration."
     return Section(
         name="truth",
         title="Error against the truth",
-        text=[
-            "The sea floor was simulated, so that every error is known. The model was moved and "
-            "rotated onto the truth by its cameras; its scale was not fitted."
-        ],
-        tables=[
-            Table(
-                title="Errors",
-                header=("what", "rms", "largest", "of"),
-                rows=[
-                    (name, *("" if mm is None else millimetres(mm) for mm in (rms, most)), of)
-                    for name, rms, most, of in rows
-                    if rms is not None or most is not None
-                ],
-            ),
-            Table(
-                title="Share of the area within so many ground pixels "
-                f"({millimetres(surface.ground_pixel_mm)}) of the truth",
-                header=[f"{pixels} px" for pixels in within],
-                rows=[[share(value) for value in within.values()]],
-            ),
-        ],
-        figures=[
-            *_stills(held, _Still(
-                "evaluation/errors.png", "Where the surface errs",
-                "Map and histogram of height errors.", "Without a slope or a dome.",
-                "Errors at the rim come from few pictures; a dome from calibration.",
-            )),
-        ],
-    )  # fmt: skip
+        text=[text],
+        tables=[Table(title="Errors", header=("what", "rms", "largest", "of"), rows=shown)],
+        figures=_stills(held, ("evaluation/errors.png", "Where the surface errs", about)),
+    )
 
 
-def _comparison(figures: Figures) -> Section:
+def _comparison(held: Held) -> Section:
     tables, stills = [], []
-    found = figures.reference
-    if found:
+    found = held.read(ReferenceRecord)
+    if found is not None:
         rows = [
-            (what, length(part.median_m), length(part.rms_m), length(part.within_95_m),
-             share(part.covered_share))
+            (what, length(part.rms_m), length(part.within_95_m), share(part.covered_share))
             for what, part in (
                 ("survey to reference", found.survey_to_reference),
                 ("reference to survey", found.reference_to_survey),
             )
-        ]  # fmt: skip
-        title = f"Distances from {found.reference.rsplit('/', 1)[-1]}"
-        header = ("", "median", "rms", "95 %", "covered")
-        tables.append(Table(title=title, header=header, rows=rows))
-        stills.append(
-            _Still("reference/reference.png", "Distance from the reference",
-                   "Signed distance after the registration.", "No slope, no dome.",
-                   "A dome or a slope is the survey's, or the registration's.")
-        )  # fmt: skip
-    for name, change in figures.held.earlier:
-        plain = change.plain.items()
-        rows_of = [(key.replace("_", " "), _plain(value)) for key, value in plain]
-        tables.append(_table(f"Change since {name}", *rows_of))
-        stills.append(
-            _Still(f"against/{name}/change.png", f"Change since {name}",
-                   "Height minus that of the earlier survey, and how sure it is.",
-                   "Where nothing has changed, nothing is coloured.")
-        )  # fmt: skip
+        ]
+        header = ("", "rms", "95 %", "covered")
+        tables.append(Table(title=f"Distances from {found.name}", header=header, rows=rows))
+        about = "Signed distance after the registration."
+        stills.append(("reference/reference.png", "Distance from the reference", about))
+    for name, change in held.earlier:
+        values = [
+            (key.replace("_", " "), digits(value) if isinstance(value, float) else str(value))
+            for key, value in change.plain.items()
+        ]
+        tables.append(_table(f"Change since {name}", *values))
+        about = "Height minus that of the earlier survey, and how sure it is."
+        stills.append((f"against/{name}/change.png", f"Change since {name}", about))
     return Section(
         name="compared",
         title="Against other data",
         tables=tables,
-        figures=_stills(figures.held, *stills),
+        figures=_stills(held, *stills),
     )
 
 
-def _plain(value: float | str) -> str:
-    return digits(float(value)) if isinstance(value, float) else str(value)
-
-
 def _control(score: ControlRecord) -> Section:
-    points = [
-        (row.name, row.use, str(row.views), length(row.north_m), length(row.east_m),
-         length(row.down_m), digits(row.misfit_sigmas, 2))
+    rows = [
+        (row.name, row.use, f"{row.views} pictures",
+         ", ".join(map(length, (row.north_m, row.east_m, row.down_m))),
+         digits(row.misfit_sigmas, 2))
         for row in score.points
     ]  # fmt: skip
-    bars = [
-        (row.name, row.use, length(row.known_m), length(row.error_m),
-         parts(row.error_relative), digits(row.misfit_sigmas, 2))
+    rows += [
+        (row.name, row.use, length(row.known_m),
+         f"{length(row.error_m)}, {parts(row.error_relative)}", digits(row.misfit_sigmas, 2))
         for row in score.bars
     ]  # fmt: skip
-    tables = [
-        Table(title="Points", rows=points,
-              header=("point", "use", "pictures", "north", "east", "down", "in sigmas")),
-        Table(title="Scale bars", rows=bars,
-              header=("bar", "use", "length", "error", "relative", "in sigmas")),
-    ]  # fmt: skip
+    header = ("point or bar", "use", "of", "error (of a point north, east, down)", "in sigmas")
     return Section(
         name="control",
         title="Control and check points",
         text=["Those used as check took no part in placing the model."],
-        tables=[table for table in tables if table.rows],
+        tables=[Table(title="Points and scale bars", header=header, rows=rows)],
     )
 
 
-def _surface(figures: Figures) -> Section:
-    held = figures.held
+def _surface(held: Held) -> Section:
     found = held.read(SurfaceRecord)
-    if figures.surface is None or found is None:
+    if held.surface is None or found is None:
         return Section(name="surface", title="Surface")
     moving = found.moving
     masked = None
@@ -264,18 +208,51 @@ def _surface(figures: Figures) -> Section:
         ("heights count from", found.vertical_datum),
         ("masked since it moves", masked),
     ]
-    still = _Still(
-        "dense/moving.png", "What moves",
-        "Masked parts of the pictures in which they are largest, outlined.",
-        "Fish, weed, divers, shadows.",
-        "Look at dense/moving; mask_moving = false below [reconstruct] keeps all.",
-    )  # fmt: skip
+    about = "Masked parts of the pictures in which they are largest, outlined."
     return Section(
         name="surface",
         title="Surface",
         tables=[_table("Elevation model", *rows)],
-        figures=[*plots.sigma_test(held), *plots.overlap(held), *_stills(held, still)],
+        figures=[*_sigma_test(held), *_stills(held, ("dense/moving.png", "What moves", about))],
     )
+
+
+def _sigma_test(held: Held) -> Iterator[Figure]:
+    """True errors of the heights over their stated sigmas."""
+    files = [held.file(path) for path in ("evaluation/error.tif", "dense/sigma.tif")]
+    errors, sigmas = (
+        np.ma.getdata(read_shrunk(file, [1], _MAX_VALUES_PX, Resampling.nearest)[0][0])
+        if file is not None
+        else np.empty((0, 0))
+        for file in files
+    )
+    if not errors.size or errors.shape != sigmas.shape:
+        return
+    known = np.isfinite(errors) & (sigmas > 0)
+    ratio = errors[known].astype(np.float64) / sigmas[known]
+    if not len(ratio):
+        return
+
+    def paint(axes: Sequence[Any]) -> None:
+        grid = np.linspace(-4, 4, 161)
+        axes[0].hist(ratio, bins=81, range=(-4, 4), density=True, color=INKS[0], label="found")
+        normal = np.exp(-(grid**2) / 2) / np.sqrt(2 * np.pi)
+        axes[0].plot(grid, normal, color=INKS[1], label="as stated")
+        axes[0].set(xlabel="error over its stated sigma", ylabel="share", yticks=[])
+        axes[0].legend()
+
+    one, two = (share(float((np.abs(ratio) <= sigmas).mean())) for sigmas in (1, 2))
+    yield draw_figure(
+        paint, 2.3,
+        title="Test of the stated sigmas",
+        alt="Histogram of errors of heights over their stated sigmas, next to the normal curve",
+        shows="The true errors of the heights in units of their stated sigmas: median "
+        f"{float(np.median(ratio)):+.2f}; {one} lie within one sigma (68 % expected) and {two} "
+        "within two (95 %).",
+        good="The bars follow the line.",
+        otherwise="Bars wider than the line: multiply the sigmas by the rms. A median off zero: "
+        "neighbouring heights share an error, such as of one camera's position.",
+    )  # fmt: skip
 
 
 def _planes(held: Held) -> Iterator[Figure]:
@@ -304,61 +281,78 @@ def _plane(held: Held, folder: Path, what: str) -> Figure:
     return Figure(png=png, title=f"Plane {plane.name}", alt=shows, shows=shows)
 
 
-def _model(figures: Figures, found: RegistrationRecord) -> Section:
+def _model(held: Held, found: RegistrationRecord) -> Section:
     rows: list[tuple[str, str | None]] = [
         ("points", f"{found.points:,}"),
         ("pictures that see a point, mean", digits(found.mean_track_length)),
     ]
-    doming = found.doming or DomingRecord()
-    for way, bend in doming.bends.items():
-        removed = bend.straightened_per_m * bend.length_m**2 / 8.0
-        rows.append((f"sag {way} the lines", length_with_sigma(bend.sag_m, bend.sag_sigma_m)))
-        rows.append((f"sag {way} the lines that navigation took out", length(removed)))
-    if doming.scale is not None:
+    doming, place = found.doming, found.georeference
+    for way, bend in ({} if doming is None else doming.bends).items():
+        removed = length(bend.straightened_per_m * bend.length_m**2 / 8.0)
+        sag = length_with_sigma(bend.sag_m, bend.sag_sigma_m)
+        rows.append((f"sag {way} the lines", f"{sag}; {removed} that navigation took out"))
+    if doming is not None and doming.scale is not None:
         own = parts_with_sigma(doming.scale.mean - 1.0, doming.scale.mean_sigma)
         rows.append(("scale by what each station sees alone", own))
-    place = found.georeference
     if place is not None:
         for axis in ("north", "east", "depth"):
-            rms, sigma = (getattr(place, f"{kind}_{axis}_m") for kind in ("rms", "sigma"))
-            rows.append((f"navigation's residual {axis}, rms", length(rms)))
-            rows.append((f"sigma of the whole survey, {axis}", length(sigma)))
-        rows.append(("sigma of its heading", _degrees(place.sigma_heading_deg)))
-        rows.append(("sigma of its level", _degrees(place.sigma_tilt_deg)))
+            rms, sigma = (length(getattr(place, f"{kind}_{axis}_m")) for kind in ("rms", "sigma"))
+            rows.append((f"navigation {axis}", f"residuals {rms} rms, sigma of the survey {sigma}"))
+        turns = (place.sigma_heading_deg, place.sigma_tilt_deg)
+        heading, tilt = ("unknown" if t is None else f"{digits(t, 2)} deg" for t in turns)
+        rows.append(("sigma of the survey's heading, level", f"{heading}, {tilt}"))
         rows.append(("mount of the rig", None if place.mount is None else place.mount.words))
-    rows += [
-        (f"sigma of heading of {count(joint.stations, 'station')} that navigation alone joins",
-         _degrees(joint.sigma_heading_deg))
-        for joint in found.joints
-    ]  # fmt: skip
     tables = [_table("Model", *rows)]
     lost = [
         (row["image"], row["reason"], row["placed_by"] or "not placed")
-        for row in figures.held.rows("sparse/unregistered.csv")
+        for row in held.rows("sparse/unregistered.csv")
     ]
     if lost:
         more = len(lost) - _MAX_LOST
         rest = [(f"{more} more in sparse/unregistered.csv", "", "")] if more > 0 else []
         header, shown = ("picture", "why", "placed by"), [*lost[:_MAX_LOST], *rest]
         tables.append(Table(title="Pictures not in the model", header=header, rows=shown))
-    notes = figures.held.frame.notes
+    notes = held.frame.notes
     return Section(
         name="model",
         title="Camera track and points",
         text=[f"How it was made: {'; '.join(notes)}."] if notes else [],
         tables=tables,
-        figures=[*plots.camera_sigmas(figures.held), *plots.pictures_used(figures.held)],
+        figures=[*_camera_sigmas(held)],
     )
 
 
-def _degrees(value: float | None) -> str | None:
-    return None if value is None else f"{digits(value, 2)} deg"
+def _camera_sigmas(held: Held) -> Iterator[Figure]:
+    """Stated sigmas of the cameras along the survey."""
+    rows = [r for r in held.track if number(r, "sigma_north_m") > 0]
+    if not rows:
+        return
+    station = np.array([number(row, "station") for row in rows])
+    where = "in the survey" if held.frame.datum is None else "on the Earth"
+
+    def paint(axes: Sequence[Any]) -> None:
+        for axis, ink, mark in zip(("north", "east", "depth"), INKS, MARKS, strict=False):
+            sigma = [1e2 * number(row, f"sigma_{axis}_m") for row in rows]
+            axes[0].plot(station, sigma, mark, ms=3, color=ink, label=axis)
+        axes[0].set(xlabel="station", ylabel=f"sigma {where}, cm", ylim=(0, None))
+        axes[0].legend()
+
+    yield draw_figure(
+        paint, 2.9,
+        title="How well each camera is placed",
+        alt="Standard deviations of camera positions by station",
+        shows="The model's own standard deviation of every camera, by station. What all cameras "
+        "share is navigation's error of the whole survey.",
+        good="No station stands out.",
+        otherwise="A rise at the ends of lines asks for a line across them; a single station that "
+        "stands out has too few points.",
+    )  # fmt: skip
 
 
 def _camera(held: Held) -> Section:
     calibrated, refined = held.read(CalibrationReportRecord), held.read(PortRecord)
     cameras = held.read(CamerasRecord)
-    text, tables, drawn = [], [], list[Figure]()
+    text, tables = [], []
     if calibrated is not None:
         text.append(
             f"Calibrated from {count(calibrated.views, 'view')}: "
@@ -376,16 +370,12 @@ def _camera(held: Held) -> Section:
             refined.parameters, refined.before, refined.after, refined.prior_sigmas,
             refined.sigmas, strict=True,
         )  # fmt: skip
-        tables.append(
-            Table(
-                title="Rig refined by the survey",
-                header=("parameter", "calibrated", "refined", "sigma before", "sigma after"),
-                rows=[
-                    (name, f"{a:.8g}", f"{b:.8g}", _sigma(before), _sigma(after))
-                    for name, a, b, before, after in values
-                ],
-            )
-        )
+        rows = [
+            (name, f"{a:.8g}", f"{b:.8g}", *(f"{s:.2g}" if s else "fixed" for s in sigmas))
+            for name, a, b, *sigmas in values
+        ]
+        header = ("parameter", "calibrated", "refined", "sigma before", "sigma after")
+        tables.append(Table(title="Rig refined by the survey", header=header, rows=rows))
     if cameras is not None:
         rig_file = held.file("sparse/rig.json") or rig_file_of(held.workspace)
         rig = None if rig_file is None else read_rig(rig_file)
@@ -393,118 +383,79 @@ def _camera(held: Held) -> Section:
             text.append("The cameras calibrated themselves from the survey's pictures.")
         elif calibrated is None and refined is None:
             text.append(f"The rig is as imported with the pictures: {rig.source}.")
-        tables += _cameras(cameras, rig)
         if rig is not None and rig.body_from_rig is not None:
-            drawn.append(plots.mount(rig))
-    return Section(name="camera", title="Camera and rig", text=text, tables=tables, figures=drawn)
+            text.append(f"The {mount_line(rig)}.")
+        tables.append(_cameras(cameras, rig))
+    return Section(name="camera", title="Camera and rig", text=text, tables=tables)
 
 
-def _cameras(cameras: CamerasRecord, rig: Rig | None) -> list[Table]:
-    """Lens and housing of every camera and, where the rig is known, its place on it."""
-    lenses, housings = [], []
+def _cameras(cameras: CamerasRecord, rig: Rig | None) -> Table:
+    """Lens of every camera and, where the rig is known, its housing and its place on it."""
+    rows = list[Sequence[str]]()
     for name, warp in cameras.cameras.items():
         one = camera_from_json(warp["camera"])
-        values = {key: one.parameter(key) for key in one.lens.parameters}
-        terms = ", ".join(f"{key} {value:.6g}" for key, value in values.items() if value)
-        lenses.append((name, f"{one.width_px} x {one.height_px}", one.lens.model, terms))
-        if rig is not None:
-            first = rig.cam_from_rig[next(iter(cameras.cameras))]
-            pose = first * rig.cam_from_rig[name].inv()
-            tilt = np.rad2deg(np.arccos(np.clip(pose.rotation.as_matrix()[2, 2], -1.0, 1.0)))
-            shift = ", ".join(f"{1e3 * value:z.1f}" for value in pose.translation)
-            housings.append((name, one.port.words, f"{shift} mm", f"{tilt:.1f} deg"))
-    header = ("camera", "housing", "right, down, forward", "off the first's axis")
-    tables = [
-        Table(title="Cameras", header=("camera", "pixels", "lens", "parameters"), rows=lenses),
-        Table(title="Housings and places", header=header, rows=housings),
-    ]
-    return [table for table in tables if table.rows]
-
-
-def _sigma(value: float | None) -> str:
-    if value is None or not math.isfinite(value) or value == 0.0:
-        return "fixed"
-    return f"{value:.2g}"
+        lens = f"{one.lens.model}, {one.width_px} x {one.height_px} px"
+        if rig is None:
+            values = {key: one.parameter(key) for key in one.lens.parameters}
+            terms = ", ".join(f"{key} {value:.6g}" for key, value in values.items() if value)
+            rows.append((name, f"{lens}: {terms}"))
+            continue
+        pose = rig.cam_from_rig[next(iter(cameras.cameras))] * rig.cam_from_rig[name].inv()
+        tilt = np.rad2deg(np.arccos(np.clip(pose.rotation.as_matrix()[2, 2], -1.0, 1.0)))
+        shift = ", ".join(f"{1e3 * value:z.1f}" for value in pose.translation)
+        rows.append((name, lens, one.port.words, f"{shift} mm", f"{tilt:.1f} deg"))
+    header = ("camera", "lens", "housing", "right, down, forward", "off the first's axis")
+    return Table(title="Cameras", header=header[: 2 if rig is None else None], rows=rows)
 
 
 def _mission(held: Held, plan: Plan) -> Section:
-    overlap = f"{plan.reached_forward_overlap:.0%} forward, {plan.reached_side_overlap:.0%} side"
-    dives = f"{len(plan.dives)}, {duration(plan.duration_s)}, {plan.energy_wh:.1f} Wh"
     rows = [
         ("altitude, speed", f"{plan.altitude_m:g} m, {plan.speed_mps:g} m/s"),
         ("lines", f"{len(plan.lines)}, {plan.line_spacing_m:.2f} m apart"),
         ("stations", f"{plan.stations}, {plan.station_spacing_m:.2f} m apart"),
-        ("overlap", overlap),
         ("covered as requested", share(plan.coverage)),
-        ("a picture every", f"{plan.interval_s:.2f} s"),
-        ("exposure", f"{1e3 * plan.exposure_s:.2g} ms"),
-        ("motion blur", f"{plan.blur_px:.2f} px"),
-        ("pixel on the floor", length(plan.pixel_m)),
-        ("dives, time, energy", dives),
-    ]
+        ("dives, time, energy",
+         f"{len(plan.dives)}, {duration(plan.duration_s)}, {plan.energy_wh:.1f} Wh"),
+    ]  # fmt: skip
     tables = [_table("Plan", *rows)]
     flight = held.read(FlightRecord)
     if flight is not None:
-        line = flight.on_lines
-        tables.append(
-            _table(
-                "Flight",
-                ("time", duration(flight.duration_s)),
-                ("energy", f"{sum(flight.energy_wh.values()):.1f} Wh"),
-                ("off the line, rms", length(line.cross_track_rms_m)),
-                ("of that the control's part", length(line.believed_cross_track_rms_m)),
-                ("error of navigation, rms", length(flight.navigation_error_rms_m)),
-            )
-        )
-    settings = held.file("plan/settings.txt")
-    text = ["Every setting with its equation, source and limit is in plan/settings.txt."]
+        line, energy_wh = flight.on_lines, sum(flight.energy_wh.values())
+        own = length(line.believed_cross_track_rms_m)
+        rows = [
+            ("time, energy", f"{duration(flight.duration_s)}, {energy_wh:.1f} Wh"),
+            ("off the line, rms", f"{length(line.cross_track_rms_m)}; the control's part {own}"),
+            ("error of navigation, rms", length(flight.navigation_error_rms_m)),
+        ]
+        tables.append(_table("Flight", *rows))
+    text = "Every setting with its equation, source and limit is in plan/settings.txt."
     return Section(
         name="mission",
         title="Mission",
-        text=text if settings is not None else [],
+        text=[text] if held.file("plan/settings.txt") is not None else [],
         tables=tables,
         figures=_stills(
             held,
-            _Still("plan/map.png", "The plan", "Area, lines, turns and stations."),
-            _Still("flight/track.png", "Plan and flown track", "Where the vehicle flew, and how "
-                   "far it was off its lines; navigation's error is part of that.",
-                   "The track lies on the lines.",
-                   "Check the current, the thrusters and navigation."),
+            ("plan/map.png", "The plan", "Area, lines, turns and stations."),
+            ("flight/track.png", "Plan and flown track", "Where the vehicle flew, and how far it "
+             "was off its lines; navigation's error is part of that."),
         ),
     )  # fmt: skip
 
 
-def _stills(held: Held, *stills: _Still) -> list[Figure]:
-    """Those that are there."""
-    found = []
-    for still in stills:
-        file = held.file(still.path)
-        if file is not None:
-            found.append(
-                Figure(
-                    png=shrunk_png(file), title=still.title, alt=still.shows, shows=still.shows,
-                    good=still.good, otherwise=still.otherwise,
-                )
-            )  # fmt: skip
-    return found
-
-
 def _reproduce(held: Held) -> Section:
     """Stages, versions, settings and files."""
-    text = []
-    if held.simulated:
-        text.append("Everything is seeded: 'alice-survey run' with the same settings repeats it.")
-    makers = (_stage_table, _version_table, _settings_table, _file_table)
-    tables = [table_of(held) for table_of in makers]
+    seeded = "Everything is seeded: 'alice-survey run' with the same settings repeats it."
+    tables = [table_of(held) for table_of in (_stages, _versions, _settings, _files)]
     return Section(
         name="reproduce",
         title="Time, versions and settings",
-        text=text,
+        text=[seeded] if held.simulated else [],
         tables=[table for table in tables if table.rows],
     )
 
 
-def _stage_table(held: Held) -> Table:
+def _stages(held: Held) -> Table:
     rows = [
         (
             name,
@@ -512,47 +463,40 @@ def _stage_table(held: Held) -> Table:
             duration(stage.took_s),
             "" if stage.cpu_s is None else duration(stage.cpu_s),
             "" if stage.peak_mib is None else f"{stage.peak_mib:.0f} MiB",
-            f"{len(stage.inputs)}",
             stage.digest[:_DIGEST_CHARACTERS],
         )
         for name, stage in held.stages.items()
     ]
-    header = ("stage", "version", "time", "CPU time", "memory", "input files", "digest")
+    header = ("stage", "version", "time", "CPU time", "memory", "digest")
     return Table(title="Stages", header=header, rows=rows)
 
 
-def _version_table(held: Held) -> Table:
-    recorded: dict[str, str] = {}
-    for stage in held.stages.values():
-        recorded |= stage.versions
-    rows = [(name, recorded.get(name) or version(name)) for name in _PACKAGES]
-    rows.append(("Python", platform.python_version()))
-    rows.append(("machine", f"{platform.system()} {platform.machine()}"))
-    return Table(title="Versions", header=("package", "version"), rows=rows)
+def _versions(held: Held) -> Table:
+    found = {name: text for stage in held.stages.values() for name, text in stage.versions.items()}
+    found |= {"Python": platform.python_version()}
+    found |= {"machine": f"{platform.system()} {platform.machine()}"}
+    return Table(title="Versions", header=("package", "version"), rows=list(found.items()))
 
 
-def _settings_table(held: Held) -> Table:
+def _settings(held: Held) -> Table:
     """Settings as in the file; missing ones have their defaults."""
-    path = held.workspace / _SETTINGS
+    path = held.workspace / "survey.toml"
     rows: list[tuple[str, str]] = []
     if path.is_file():
         for key, value in tomllib.loads(path.read_text(encoding="utf-8")).items():
             inner = value.items() if isinstance(value, dict) else [("", value)]
-            rows += [(f"{key}.{name}".rstrip("."), _shorten(part)) for name, part in inner]
+            for name, part in inner:
+                text = str(part)
+                short = text if len(text) <= _MAX_SETTING else f"{text[: _MAX_SETTING - 3]}..."
+                rows.append((f"{key}.{name}".rstrip("."), short))
     return Table(title="Settings in survey.toml", header=("setting", "value"), rows=rows)
 
 
-def _shorten(value: object) -> str:
-    text = str(value)
-    return text if len(text) <= 120 else f"{text[:117]}..."
-
-
-def _file_table(held: Held) -> Table:
-    rows = []
-    for stage in stages.STAGES:
-        for path, about in stage.products.items():
-            whole = held.workspace / stage.folder / path
-            if stage.folder in held.stages and whole.exists():
-                size = f"{whole.stat().st_size / 1e6:.1f} MB" if whole.is_file() else ""
-                rows.append((f"{stage.folder}/{path}", about, size))
-    return Table(title="Files", header=("file", "what it is", "size"), rows=rows)
+def _files(held: Held) -> Table:
+    rows = [
+        (f"{stage.folder}/{path}", about)
+        for stage in stages.STAGES
+        for path, about in stage.products.items()
+        if stage.folder in held.stages and (held.workspace / stage.folder / path).exists()
+    ]
+    return Table(title="Files", header=("file", "what it is"), rows=rows)

@@ -4,8 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from alice_survey.app.report.figures import planned_area
-from alice_survey.app.report.held import Held, known_column, number
+from alice_survey.app.report.held import Held, known_column, number, planned_area
 from alice_survey.core.artefacts import read_json
 from alice_survey.core.frames import Array, Datum
 from alice_survey.core.records import FrameRecord

@@ -21,7 +21,8 @@ from rasterio.enums import Resampling
 from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
-from alice_survey.app.report.colours import (
+from alice_survey.app.report.held import Held
+from alice_survey.app.report.rasters import (
     TILE_PX,
     Numbers,
     Rgba,
@@ -31,7 +32,6 @@ from alice_survey.app.report.colours import (
     number_rasters,
     scale_of,
 )
-from alice_survey.app.report.held import Held
 from alice_survey.app.studio.files import Workspace, stale_page, token_of
 from alice_survey.core.contents import one_line
 from alice_survey.core.errors import WorkspaceError

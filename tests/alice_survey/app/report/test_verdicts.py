@@ -3,7 +3,6 @@ from typing import Any
 
 import pytest
 
-from alice_survey.app.report.figures import Figures
 from alice_survey.app.report.held import Held
 from alice_survey.app.report.verdicts import facts, summary, verdicts
 from alice_survey.core.artefacts import write_json
@@ -11,9 +10,9 @@ from alice_survey.kit.document import Verdict
 from tests.alice_survey.app.report.tiny import tiny_workspace
 
 
-def judged(workspace: Path) -> tuple[Figures, list[Verdict]]:
-    figures = Figures(held=Held.of(workspace))
-    return figures, verdicts(figures)
+def judged(workspace: Path) -> tuple[Held, list[Verdict]]:
+    held = Held.of(workspace)
+    return held, verdicts(held)
 
 
 def level_of(found: list[Verdict], word: str) -> str:
@@ -23,9 +22,9 @@ def level_of(found: list[Verdict], word: str) -> str:
 
 
 def test_a_hole_in_the_planned_area_is_seen_and_named(tmp_path: Path) -> None:
-    figures, found = judged(tiny_workspace(tmp_path))
+    held, found = judged(tiny_workspace(tmp_path))
     assert level_of(found, "95.8 % of the planned area") == "look"
-    assert "plan check" in summary(figures, found)["What to do next"]
+    assert "plan check" in summary(held, found)["What to do next"]
 
 
 @pytest.mark.parametrize(("registered", "level"), [(4, "good"), (3, "bad")])
@@ -37,10 +36,10 @@ def test_lost_pictures_are_judged(tmp_path: Path, registered: int, level: str) -
 def test_parts_that_navigation_alone_joins_are_named_with_their_sigma(tmp_path: Path) -> None:
     joint = {"stations": 7, "sigma_north_m": 0.03, "sigma_east_m": 0.04, "sigma_depth_m": 0.0,
              "sigma_tilt_deg": 0.1, "sigma_heading_deg": 0.2}  # fmt: skip
-    figures, found = judged(tiny_workspace(tmp_path, sparse={"joints": [joint]}))
+    held, found = judged(tiny_workspace(tmp_path, sparse={"joints": [joint]}))
     assert level_of(found, "7 stations show nothing that the others show") == "look"
     assert any("sigma of 5" in verdict.text for verdict in found)
-    assert "across the gap" in summary(figures, found)["What to do next"]
+    assert "across the gap" in summary(held, found)["What to do next"]
 
 
 @pytest.mark.parametrize(("scale", "level"), [(0.99, "look"), (0.999, "good"), (1.01, "look")])
@@ -56,15 +55,15 @@ def test_navigation_that_contradicts_the_rig_is_judged(
 
 
 def test_a_model_without_scale_is_bad_and_says_what_to_do(tmp_path: Path) -> None:
-    figures, found = judged(
+    held, found = judged(
         tiny_workspace(
             tmp_path, frame={"scaled": False}, sparse={"scale_source": "the model has no scale"}
         )
     )
     assert found[0].level == "bad"
     assert "no scale" in found[0].text
-    assert "scale bar" in summary(figures, found)["What to do next"]
-    assert any("unit" in value for _, value in facts(figures))
+    assert "scale bar" in summary(held, found)["What to do next"]
+    assert any("unit" in value for _, value in facts(held))
 
 
 @pytest.mark.parametrize(

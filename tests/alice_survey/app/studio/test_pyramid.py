@@ -10,7 +10,7 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.transform import Affine
 
-from alice_survey.app.report.colours import TILE_PX, colour_tile, limits_of, number_rasters
+from alice_survey.app.report.rasters import TILE_PX, colour_tile, limits_of, number_rasters
 from alice_survey.app.studio.files import Workspace
 from alice_survey.app.studio.layers import Layers, Pyramid
 from alice_survey.core.artefacts import StaleError

@@ -3,18 +3,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.app.report.figures import Figures
 from alice_survey.app.report.held import Held
 from tests.alice_survey.app.report.tiny import CELL_M, COLUMNS, ROWS, SIGMA_M, SLOPE, tiny_workspace
 
 
 @pytest.fixture(scope="module")
-def figures(tmp_path_factory: pytest.TempPathFactory) -> Figures:
-    return Figures(held=Held.of(tiny_workspace(tmp_path_factory.mktemp("tiny"))))
+def held(tmp_path_factory: pytest.TempPathFactory) -> Held:
+    return Held.of(tiny_workspace(tmp_path_factory.mktemp("tiny")))
 
 
-def test_area_relief_and_cover_are_those_of_the_plane(figures: Figures) -> None:
-    surface = figures.surface
+def test_area_relief_and_cover_are_those_of_the_plane(held: Held) -> None:
+    surface = held.surface
     assert surface is not None
     cells = ROWS * COLUMNS
     assert surface.area == pytest.approx((cells - 400) * CELL_M**2)
@@ -24,24 +23,21 @@ def test_area_relief_and_cover_are_those_of_the_plane(figures: Figures) -> None:
     assert surface.stations_median == 4
 
 
-def test_place_on_earth_is_the_rms_of_the_cameras_level_sigmas(figures: Figures) -> None:
-    assert figures.place_sigma_m == pytest.approx(0.05)
-    assert (figures.registered, figures.total, figures.stations) == (4, 4, 2)
+def test_place_on_earth_is_the_rms_of_the_cameras_level_sigmas(held: Held) -> None:
+    assert held.place_sigma_m == pytest.approx(0.05)
+    assert held.pictures == "4 pictures taken at 2 stations"
 
 
 def test_a_model_without_positions_is_nowhere_on_earth(tmp_path: Path) -> None:
     local = tiny_workspace(tmp_path, frame={"name": "model", "datum": None})
-    found = Figures(held=Held.of(local))
-    assert np.isfinite(found.camera_sigmas).all()
-    assert np.isnan(found.place_sigma_m)
+    assert np.isnan(Held.of(local).place_sigma_m)
 
 
 def test_an_empty_workspace_holds_nothing(tmp_path: Path) -> None:
-    figures = Figures(held=Held.of(tmp_path))
-    assert figures.surface is None
-    assert figures.registered == 0
-    assert np.isnan(figures.place_sigma_m)
-    assert not figures.held.stages
+    held = Held.of(tmp_path)
+    assert held.surface is None
+    assert np.isnan(held.place_sigma_m)
+    assert not held.stages
 
 
 def test_a_half_written_stage_is_not_held(tmp_path: Path) -> None:
@@ -50,4 +46,4 @@ def test_a_half_written_stage_is_not_held(tmp_path: Path) -> None:
     held = Held.of(workspace)
     assert not held.has("dense")
     assert held.file("dense/dem.tif") is None
-    assert Figures(held=held).surface is None
+    assert held.surface is None
