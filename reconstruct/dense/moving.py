@@ -25,6 +25,7 @@ from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.dense.views import ViewTask
 from reconstruct.pictures.undistorted import MOVING, Pictures, moving_path, read_mask
+from reconstruct.raster import write_png
 from reconstruct.views.model import View
 from reconstruct.views.range_shift import FAST, KernelLens, line_of, shown_at
 
@@ -54,8 +55,8 @@ _GAP_CELLS, _RIM_CELLS = 5, 3
 """Gaps in a part that are closed; and around it, where its rim is blended with what is behind."""
 _MAX_SHARE = 0.5
 """A view that differs in more of what is compared differs otherwise."""
-_SHOWN, _SHOWN_ACROSS, _SHOWN_PX = 6, 3, 480
-"""Pictures on the sheet, across it, and their width."""
+_SHOWN, _SHOWN_ACROSS, _SHOWN_SHAPE = 6, 3, (360, 480)
+"""Pictures on the sheet, across it, and rows and columns of each."""
 _ABOUT = ("moving.csv", "moving.png")
 _LOGARITHMS = np.log(np.maximum(np.arange(256, dtype=np.float32), np.float32(_DARKEST)))
 """Of grey levels."""
@@ -139,31 +140,20 @@ def show_moving(workspace: Path, folder: Path, shares: Sequence[MovingShare]) ->
     rows = [(one.image, f"{one.masked:.5f}", f"{one.compared:.3f}") for one in shares]
     table, sheet_png = (folder / name for name in _ABOUT)
     write_csv(table, ("image", "masked_share", "compared_share"), rows)
-    maximum = sorted((one for one in shares if one.masked > 0), key=lambda one: -one.masked)[
-        :_SHOWN
-    ]
-    if not maximum:
+    shown = sorted((one for one in shares if one.masked > 0), key=lambda one: -one.masked)[:_SHOWN]
+    if not shown:
         return
-    pictures, tiles = Pictures.open(workspace), []
-    for one in maximum:
-        taken = pictures.as_taken(one.image)
+    pictures = Pictures.open(workspace)
+    tiles = np.zeros((-(-len(shown) // _SHOWN_ACROSS) * _SHOWN_ACROSS, *_SHOWN_SHAPE, 3), np.uint8)
+    for tile, one in zip(tiles, shown, strict=False):
         mask = read_mask(moving_path(folder / MOVING, one.image), pictures.warp(one.image).size_px)
-        size = (_SHOWN_PX, round(_SHOWN_PX * taken.shape[0] / taken.shape[1]))
-        shown = cv2.resize(taken, size, interpolation=cv2.INTER_AREA)
-        left_out = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) == 0
-        outlines, _ = cv2.findContours(left_out.astype(np.uint8), cv2.RETR_EXTERNAL,
-                                       cv2.CHAIN_APPROX_NONE)  # fmt: skip
-        cv2.drawContours(shown, outlines, -1, _OUTLINE_BGR, 2)
-        tiles.append(shown)
-    height = max(tile.shape[0] for tile in tiles)
-    sheet = np.zeros((-(-len(tiles) // _SHOWN_ACROSS) * height, _SHOWN_ACROSS * _SHOWN_PX, 3),
-                     np.uint8)  # fmt: skip
-    for number, tile in enumerate(tiles):
-        row, column = divmod(number, _SHOWN_ACROSS)
-        at = slice(row * height, row * height + tile.shape[0])
-        sheet[at, column * _SHOWN_PX : (column + 1) * _SHOWN_PX] = tile
-    with atomic_path(sheet_png) as path:
-        path.write_bytes(cv2.imencode(".png", sheet)[1].tobytes())
+        size = _SHOWN_SHAPE[::-1]
+        tile[:] = cv2.resize(pictures.as_taken(one.image), size, interpolation=cv2.INTER_AREA)
+        left_out = cv2.resize((~mask).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+        outlines = cv2.findContours(left_out, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+        cv2.drawContours(tile, outlines, -1, _OUTLINE_BGR, 2)
+    lines = tiles.reshape(-1, _SHOWN_ACROSS, *tiles.shape[1:])
+    write_png(sheet_png, np.vstack([np.hstack(list(line)) for line in lines]))
 
 
 @lru_cache(maxsize=16)
@@ -227,48 +217,33 @@ def moving_parts(look: Look, others: Sequence[Look]) -> tuple[Mask, float]:
     Returns:
         (h, w) mask, and the share of the cells that could be compared.
     """
-    shape = look.shape
     still = still_depth(look, others)
     rows, columns = np.nonzero(np.isfinite(still) & look.usable)
-    nothing = np.zeros(shape, np.bool_)
-    if len(rows) < _MIN_CELLS:
-        return nothing, 0.0
-    pixels: Array = np.column_stack([columns, rows]).astype(np.float64)
-    pixels = (pixels + 0.5) * look.step
-    points = look.view.at_depth(pixels, still[rows, columns].astype(np.float64))
-    own = look.light[rows, columns]
-    places = pixels / look.view.pinhole.size_px
-    shown = np.empty((len(others), *own.shape), np.float32)
-    stations: list[int] = []
-    sigmas: list[Array] = []
+    nothing = np.zeros(still.shape, np.bool_)
+    depth = still[rows, columns]
+    pixels = (np.column_stack([columns, rows]) + 0.5) * look.step
+    points = look.view.at_depth(pixels, depth.astype(np.float64))
+    own, places = look.light[rows, columns], pixels / look.view.pinhole.size_px
+    shown, stations, sigmas = [], [], []
     for other in others:
-        cells, log_ratio = cells_at(
-            points,
-            still[rows, columns],
-            np.ascontiguousarray(other.view.world_from_cam.inv().as_matrix()[:3]),
-            other.view.kernel_lens,
-            float(other.step),
-            other.depth,
-            other.usable,
-        )
+        cells, log_ratio = cells_at(points, depth, other)
         known = np.flatnonzero(cells >= 0)
         if len(known) < _MIN_CELLS:
             continue
+        there = other.light.reshape(-1, 3, 3)[cells]
+        there[cells < 0] = np.nan
+        features = _smooth(places, log_ratio)
         chosen = known[:: max(1, len(known) // _FITTED_CELLS)]
-        there = other.light.reshape(-1, 3, 3)[cells[chosen], 0]
-        fit, sigma = _smooth_difference(
-            _smooth(places[chosen], log_ratio[chosen]), own[chosen, 0] - there
-        )
-        adapt(other.light, cells, places, log_ratio, fit, shown[len(stations)])
+        fit, sigma = _smooth_difference(features[chosen], own[chosen, 0] - there[chosen, 0])
+        there += np.einsum("nk,kc->nc", features, fit)[:, None].astype(np.float32)
+        shown.append(there)
         sigmas.append(sigma)
         stations.append(other.view.station)
     if len(set(stations)) < 2:
         return nothing, 0.0
     sigma = np.median(sigmas, axis=0).astype(np.float32)
-    misfit, votes = odd_ones(
-        own, shown[: len(stations)], np.array(stations, np.int64), sigma, _GROWN
-    )
-    field = np.full(shape, np.nan, np.float32)
+    misfit, votes = find_odd(own, np.stack(shown), np.array(stations), sigma, _GROWN)
+    field = np.full(still.shape, np.nan, np.float32)
     field[rows, columns] = np.where(votes >= 2, misfit, np.nan)
     compared = np.isfinite(field)
     found = _parts(np.nan_to_num(field))
@@ -338,7 +313,6 @@ def draw(
                         onto[row, column] = deep
 
 
-@compiled
 def shared_depth(stack: Float32, stations: NDArray[np.int64], tolerance: float) -> Float32:
     """The nearest depth of each cell that views of two or more stations share.
 
@@ -347,99 +321,36 @@ def shared_depth(stack: Float32, stations: NDArray[np.int64], tolerance: float) 
         stations: (K,) of the views.
         tolerance: relative difference.
     """
-    views, height, width = stack.shape
-    found = np.full((height, width), np.nan, np.float32)
-    for row in range(height):
-        for column in range(width):
-            for k in range(views):
-                z = stack[k, row, column]
-                if math.isnan(z) or z >= found[row, column]:
-                    continue
-                total, count, apart = 0.0, 0, False
-                for j in range(views):
-                    other = stack[j, row, column]
-                    if abs(other - z) <= tolerance * z:
-                        total += other
-                        count += 1
-                        apart = apart or stations[j] != stations[k]
-                if apart:
-                    found[row, column] = total / count
+    found, nearest = np.full((2, *stack.shape[1:]), np.nan, np.float32)
+    for depth, station in zip(stack, stations, strict=True):
+        near = np.abs(stack - depth) <= np.float32(tolerance) * depth
+        apart = near[stations != station].any(axis=0) & ~(depth >= nearest)
+        mean = np.where(near, stack, 0).sum(axis=0, dtype=np.float64) / np.maximum(near.sum(0), 1)
+        found[apart], nearest[apart] = mean[apart], depth[apart]
     return found
 
 
-@compiled(error_model="numpy", fastmath=FAST)
-def cells_at(
-    points: Array,
-    depth_here: Float32,
-    cam_from_world: Array,
-    lens: KernelLens,
-    step: float,
-    depth: Float32,
-    usable: Mask,
-) -> tuple[NDArray[np.int64], Array]:
+def cells_at(points: Array, depth_here: Float32, other: Look) -> tuple[NDArray[np.int64], Array]:
     """Cells of a view that show points (N, 3) which have some depth (N,) in another.
 
     Returns:
         (N,) cells, counted by rows, -1 where none shows the point; and (N,) the logarithm of the
-        point's depth in the other view over that in this one.
+        point's depth in the other view over that in this one, 0 where none does.
     """
-    height, width = depth.shape
-    cells = np.full(len(points), -1, np.int64)
-    log_ratio = np.zeros(len(points))
-    t = cam_from_world
-    for n in range(len(points)):
-        e, m, d = points[n, 0], points[n, 1], points[n, 2]
-        z = t[2, 0] * e + t[2, 1] * m + t[2, 2] * d + t[2, 3]
-        if z <= 0.0:
-            continue
-        a = t[0, 0] * e + t[0, 1] * m + t[0, 2] * d + t[0, 3]
-        b = t[1, 0] * e + t[1, 1] * m + t[1, 2] * d + t[1, 3]
-        u, v = shown_at(lens, a, b, z)
-        column, row = math.floor(u / step), math.floor(v / step)
-        if column < 0 or row < 0 or column >= width or row >= height or not usable[row, column]:
-            continue
-        if abs(depth[row, column] - z) <= _SAME_DEPTH * z:
-            cells[n], log_ratio[n] = row * width + column, math.log(depth_here[n] / z)
-    return cells, log_ratio
+    z = other.view.world_from_cam.inv().apply(points)[:, 2]
+    at = np.nan_to_num(other.view.project(points) / other.step, nan=-1.0)
+    inside = ((at >= 0) & (at < other.shape[::-1])).all(axis=1)
+    column, row = np.where(inside, at.T, 0).astype(np.int64)
+    inside &= other.usable[row, column]
+    inside &= np.abs(other.depth[row, column] - z) <= _SAME_DEPTH * z
+    log_ratio = np.log(np.where(inside, depth_here / z, 1.0))
+    return np.where(inside, row * other.shape[1] + column, -1), log_ratio
 
 
 def with_bounds(light: Float32) -> Float32:
     """Light (h, w, 3) with its lowest and highest in the 3 x 3 cells around, (h, w, 3, 3)."""
     kernel = np.ones((3, 3), np.uint8)
     return np.stack([light, cv2.erode(light, kernel), cv2.dilate(light, kernel)], axis=2)
-
-
-@compiled
-def adapt(
-    light: Float32,
-    cells: NDArray[np.int64],
-    places: Array,
-    log_ratio: Array,
-    fit: Array,
-    shown: Float32,
-) -> None:
-    """Write what a view shows as another would see it, (N, 3, 3); NaN where it shows nothing.
-
-    Args:
-        light: (h, w, 3, 3) of the view.
-        cells: (N,) of the view, see `cells_at`.
-        places: (N, 2) in the other, as shares of its size.
-        log_ratio: (N,) see `cells_at`.
-        fit: (7, 3) coefficients of `_smooth`.
-        shown: to write to.
-    """
-    width = light.shape[1]
-    for n in range(len(cells)):
-        if cells[n] < 0:
-            shown[n] = np.nan
-            continue
-        row, column = cells[n] // width, cells[n] % width
-        x, y = places[n, 0] - 0.5, places[n, 1] - 0.5
-        for c in range(3):
-            change = fit[0, c] + x * fit[1, c] + y * fit[2, c] + log_ratio[n] * fit[6, c]
-            change += x * x * fit[3, c] + x * y * fit[4, c] + y * y * fit[5, c]
-            for kind in range(3):
-                shown[n, kind, c] = light[row, column, kind, c] + change
 
 
 def _smooth(places: Array, log_ratio: Array) -> Array:
@@ -466,13 +377,8 @@ def _smooth_difference(features: Array, apart: Float32) -> tuple[Array, Array]:
     return fit, np.maximum(MAD_TO_SIGMA * np.median(np.abs(rest), axis=0), _MIN_SIGMA)
 
 
-@compiled
-def odd_ones(
-    own: Float32,
-    shown: Float32,
-    stations: NDArray[np.int64],
-    sigma: Float32,
-    agreeing: float,
+def find_odd(
+    own: Float32, shown: Float32, stations: NDArray[np.int64], sigma: Float32, agreeing: float
 ) -> tuple[Float32, NDArray[np.int64]]:
     """How far each cell differs from what others agree on.
 
@@ -488,58 +394,28 @@ def odd_ones(
         within the bounds of either; and how many stations agree, 0 where fewer than half of the
         views do.
     """
-    views, count = shown.shape[0], own.shape[0]
-    misfit = np.full(count, np.nan, np.float32)
-    votes = np.zeros(count, np.int64)
-    values, at, met = np.empty(views), np.empty(views, np.int64), np.empty(views, np.int64)
-    middle, low, high = np.empty(3), np.empty(3), np.empty(3)
-    for n in range(count):
-        known = 0
-        for k in range(views):
-            if not math.isnan(shown[k, n, 0, 0]):
-                at[known] = k
-                known += 1
-        if known < 2:
-            continue
-        for c in range(3):
-            for kind in range(3):
-                for i in range(known):
-                    value, place = shown[at[i], n, kind, c], i
-                    while place > 0 and values[place - 1] > value:
-                        values[place] = values[place - 1]
-                        place -= 1
-                    values[place] = value
-                value = 0.5 * (values[(known - 1) // 2] + values[known // 2])
-                if kind == 0:
-                    middle[c] = value
-                elif kind == 1:
-                    low[c] = value
-                else:
-                    high[c] = value
-        near, places = 0, 0
-        for i in range(known):
-            square = 0.0
-            for c in range(3):
-                off = max(shown[at[i], n, 1, c] - middle[c], middle[c] - shown[at[i], n, 2, c], 0.0)
-                square += (off / sigma[c]) ** 2
-            if math.sqrt(square / 3.0) > agreeing:
-                continue
-            near += 1
-            station, first = stations[at[i]], True
-            for j in range(places):
-                first = first and met[j] != station
-            if first:
-                met[places] = station
-                places += 1
-        square = 0.0
-        for c in range(3):
-            there = max(low[c] - own[n, 0, c], own[n, 0, c] - high[c], 0.0)
-            here = max(own[n, 1, c] - middle[c], middle[c] - own[n, 2, c], 0.0)
-            square += (min(there, here) / sigma[c]) ** 2
-        misfit[n] = math.sqrt(square / 3.0)
-        if 2 * near >= known:
-            votes[n] = places
-    return misfit, votes
+    known = np.isfinite(shown[:, :, 0, 0]).sum(axis=0)
+    ranked, rank = np.sort(shown, axis=0), known[None, :, None, None]  # NaN comes last
+    below, above = (
+        np.take_along_axis(ranked, np.maximum(at, 0), axis=0)[0]
+        for at in ((rank - 1) // 2, np.minimum(rank // 2, len(shown) - 1))
+    )
+    middle, low, high = (0.5 * (below + above)).transpose(1, 0, 2)
+
+    def beyond(value: Float32, low: Float32, high: Float32) -> Float32:
+        off: Float32 = np.maximum(np.maximum(low - value, value - high), np.float32(0))
+        return off
+
+    near = _rms(beyond(middle, shown[:, :, 1], shown[:, :, 2]), sigma) <= agreeing
+    votes = sum(near[stations == one].any(axis=0).astype(np.int64) for one in np.unique(stations))
+    apart = np.minimum(beyond(own[:, 0], low, high), beyond(middle, own[:, 1], own[:, 2]))
+    misfit = np.where(known < 2, np.float32(np.nan), _rms(apart, sigma))
+    return misfit, np.where((2 * near.sum(axis=0) >= known) & (known >= 2), votes, 0)
+
+
+def _rms(apart: Float32, sigma: Float32) -> Float32:
+    rms: Float32 = np.sqrt(np.mean(np.square(apart / sigma), axis=-1))
+    return rms
 
 
 def _parts(misfit: Float32) -> Mask:
