@@ -25,7 +25,7 @@ from benchmarks.harbour_sight import box_of_interest, instants_that_see, surface
 from benchmarks.harbour_survey import DISTANCE_M, Station, body_poses, harbour_rig, time_of
 from benchmarks.harbour_truth import clearance, distances, moving_distance, normals
 from camera_calib.camera import Camera
-from reconstruct.evaluate.elevation import elevation_in
+from reconstruct.elevation import elevation_in
 from reconstruct.evaluate.surface import read_mesh
 from reconstruct.pictures.undistorted import MOVING
 from reconstruct.placing.track import read_track_poses

@@ -26,7 +26,7 @@ from alice_survey.core.records import RegistrationRecord
 from alice_survey.sim.seafloor.terrain import read_terrain
 from missions.values.area import multipolygon
 from missions.values.plan_file import read_plan
-from reconstruct.evaluate.elevation import elevation_in
+from reconstruct.elevation import elevation_in
 from reconstruct.evaluate.run import score_cameras
 from reconstruct.evaluate.surface import score_surface
 from reconstruct.evaluate.truth import read_true_poses

@@ -1,7 +1,7 @@
 """The digital elevation model: a surface projected on a grid, heights up, with their sigmas."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import cv2
@@ -34,7 +34,7 @@ _DIAGONAL = math.sqrt(2.0)
 _MIN_STATIONS = 2
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class FusedCells:
     """What a surface shows in the cells of a grid, (rows, columns) each."""
 
@@ -52,15 +52,10 @@ class FusedCells:
 
     def without(self, cells: NDArray[np.bool_]) -> "FusedCells":
         """The same with some cells emptied."""
-        nan, none = np.float32(np.nan), np.uint8(0)
-        return FusedCells(
-            height=np.where(cells, nan, self.height),
-            sigma=np.where(cells, nan, self.sigma),
-            count=np.where(cells, np.uint16(0), self.count),
-            stations=np.where(cells, none, self.stations),
-            surfaces=np.where(cells, none, self.surfaces),
-            lower=np.where(cells, nan, self.lower),
-        )
+        bands: list[Any] = [getattr(self, field.name) for field in fields(self)]
+        nothing = [band.dtype.type(np.nan if band.dtype.kind == "f" else 0) for band in bands]
+        pairs = zip(nothing, bands, strict=True)
+        return FusedCells(*(np.where(cells, empty, band) for empty, band in pairs))
 
 
 def cells_over(grid: DemGrid, surface: NDArray[Any]) -> FusedCells:
@@ -99,20 +94,12 @@ def cells_over(grid: DemGrid, surface: NDArray[Any]) -> FusedCells:
     order = np.argsort(cells, kind="stable")
     order = order[~walls.reshape(-1)[cells[order]]]
     starts = np.searchsorted(cells[order], np.arange(grid.rows * grid.columns + 1))
-    height, sigma, count, stations, surfaces, lower = project_cells(
+    found: tuple[Any, ...] = project_cells(
         starts, points[order], weights[order], surface["enu"], surface["normal"],
         surface["sigma"], surface["shared"], surface["views"], surface["stations"],
         grid.west, grid.north, grid.cell, grid.columns,
     )  # fmt: skip
-    shape = (grid.rows, grid.columns)
-    return FusedCells(
-        height=height.reshape(shape),
-        sigma=sigma.reshape(shape),
-        count=count.reshape(shape),
-        stations=stations.reshape(shape),
-        surfaces=surfaces.reshape(shape),
-        lower=lower.reshape(shape),
-    )
+    return FusedCells(*(band.reshape(grid.rows, grid.columns) for band in found))
 
 
 @compiled

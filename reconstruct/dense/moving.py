@@ -221,7 +221,7 @@ def moving_parts(look: Look, others: Sequence[Look]) -> tuple[Mask, float]:
     rows, columns = np.nonzero(np.isfinite(still) & look.usable)
     nothing = np.zeros(still.shape, np.bool_)
     depth = still[rows, columns]
-    pixels = (np.column_stack([columns, rows]) + 0.5) * look.step
+    pixels: Array = (np.column_stack([columns, rows]).astype(np.float64) + 0.5) * look.step
     points = look.view.at_depth(pixels, depth.astype(np.float64))
     own, places = look.light[rows, columns], pixels / look.view.pinhole.size_px
     shown, stations, sigmas = [], [], []
@@ -241,8 +241,8 @@ def moving_parts(look: Look, others: Sequence[Look]) -> tuple[Mask, float]:
         stations.append(other.view.station)
     if len(set(stations)) < 2:
         return nothing, 0.0
-    sigma = np.median(sigmas, axis=0).astype(np.float32)
-    misfit, votes = find_odd(own, np.stack(shown), np.array(stations), sigma, _GROWN)
+    usual: Float32 = np.median(sigmas, axis=0).astype(np.float32)
+    misfit, votes = find_odd(own, np.stack(shown), np.array(stations), usual, _GROWN)
     field = np.full(still.shape, np.nan, np.float32)
     field[rows, columns] = np.where(votes >= 2, misfit, np.nan)
     compared = np.isfinite(field)
@@ -321,12 +321,12 @@ def shared_depth(stack: Float32, stations: NDArray[np.int64], tolerance: float) 
         stations: (K,) of the views.
         tolerance: relative difference.
     """
-    found, nearest = np.full((2, *stack.shape[1:]), np.nan, np.float32)
+    found: Float32 = np.full(stack.shape[1:], np.nan, np.float32)
     for depth, station in zip(stack, stations, strict=True):
         near = np.abs(stack - depth) <= np.float32(tolerance) * depth
-        apart = near[stations != station].any(axis=0) & ~(depth >= nearest)
+        apart = near[stations != station].any(axis=0) & ~(depth >= found)
         mean = np.where(near, stack, 0).sum(axis=0, dtype=np.float64) / np.maximum(near.sum(0), 1)
-        found[apart], nearest[apart] = mean[apart], depth[apart]
+        found[apart] = mean[apart]
     return found
 
 

@@ -150,15 +150,18 @@ def block_bounds(chosen: NDArray[np.bool_], world: Array) -> Float32:
         world: (N, 3) their points, row by row: north, east, down.
 
     Returns:
-        (h, w, 4) west, east, south, north, a little wide; west beyond east in an empty block.
+        (h, w, 4) west, east, south, north, a little wide; NaN of an empty block.
     """
-    height, width = chosen.shape
-    bounds = np.empty((-(-height // _BLOCK), -(-width // _BLOCK), 4))
-    bounds[..., 0::2], bounds[..., 1::2] = np.inf, -np.inf
-    _widen(bounds, chosen, world)
+    height, width = (-(-size // _BLOCK) for size in chosen.shape)
+    bounds = []
     margin = _ROUNDING * float(np.abs(world[:, :2]).max(initial=1.0))
-    wide: Float32 = (bounds + margin * np.array([-1.0, 1.0, -1.0, 1.0])).astype(np.float32)
-    return wide
+    for axis in (1, 0):
+        values = np.full((height * _BLOCK, width * _BLOCK), np.nan)
+        values[: chosen.shape[0], : chosen.shape[1]][chosen] = world[:, axis]
+        blocks = values.reshape(height, _BLOCK, width, _BLOCK)
+        bounds.append(np.fmin.reduce(blocks, axis=(1, 3)) - margin)
+        bounds.append(np.fmax.reduce(blocks, axis=(1, 3)) + margin)
+    return np.stack(bounds, axis=-1).astype(np.float32)
 
 
 def _meeting(
@@ -171,19 +174,6 @@ def _meeting(
         (west <= box[1]) & (east >= box[0]) & (south <= box[3]) & (north >= box[2])
     )
     return meeting
-
-
-@compiled
-def _widen(bounds: Array, chosen: NDArray[np.bool_], world: Array) -> None:
-    """Widen blocks' bounds by points, in place."""
-    i = 0
-    for row in range(chosen.shape[0]):
-        for column in range(chosen.shape[1]):
-            if chosen[row, column]:
-                block = bounds[row // _BLOCK, column // _BLOCK]
-                block[0], block[1] = min(block[0], world[i, 1]), max(block[1], world[i, 1])
-                block[2], block[3] = min(block[2], world[i, 0]), max(block[3], world[i, 0])
-                i += 1
 
 
 def join_points(parts: list[Points]) -> Points:

@@ -8,7 +8,7 @@ each plane, fuse tiles.
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -59,6 +59,7 @@ from reconstruct.dense.surface_tiles import (
     fuse_tasks,
     fuse_tile,
     on_plane,
+    reach_tiles,
 )
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.dense.views import (
@@ -91,44 +92,26 @@ _TILE_CELLS = 256
 _RIM = FILL_CELLS + STRAY_CELLS
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Confirmed:
-    """Confirmed depth of all views, and what is known of the survey."""
-
-    store: ViewStore
-    model: SparseModel
-    """Views at the size of their depth, in the world."""
-    sigma_factor: float
-    """On the standard deviations of refined depths."""
-    shared: float
-    """Views whose depths rest on the same pair of pictures, in the mean, 1 to 2."""
-    poses: ErrorsOfPoses | None
-    executor: Executor
-
-
-@dataclass(frozen=True, kw_only=True)
-class Fused:
-    """A plane whose rasters are written."""
-
-    plane: Plane
-    grid: DemGrid
-    pose_sigma: float | None
-    """Standard deviation of heights from errors of poses, median."""
-
-
 def fuse_planes(
-    confirmed: Confirmed, folder: Path, planes: Sequence[Plane], cell_m: float | None
-) -> list[Fused]:
+    setup: FuseSetup,
+    model: SparseModel,
+    poses: ErrorsOfPoses | None,
+    folder: Path,
+    cell_m: float | None,
+    executor: Executor,
+) -> list[tuple[Plane, DemGrid]]:
     """Fuse the surface, and write the cloud and the rasters of planes.
 
     The first plane on which something is seen has its rasters in the folder itself, the others
     below `planes`.
 
     Args:
-        confirmed: depth of all views.
+        setup: confirmed depth of all views, and the planes.
+        model: views at the size of their depth, in the world.
+        poses: what their errors do to points.
         folder: of the stage.
-        planes: to project on.
         cell_m: side of a cell; None takes it from the pictures' resolution.
+        executor: runs the tiles.
 
     Returns:
         The planes on which something is seen, one or more; a warning names the others.
@@ -136,32 +119,30 @@ def fuse_planes(
     Raises:
         ReconstructionError: no depth was confirmed, or nothing is seen on any plane.
     """
-    model = confirmed.model
-    summaries = _lay_out(confirmed)
+    views = [
+        ViewTask(store=setup.store, index=n, view=view, others=())
+        for n, view in enumerate(model.views)
+    ]
+    lay_out = partial(lay_out_view, setup.sigma_factor)
+    summaries = list(executor.map(lay_out, views, label="lay out"))
     bounds = [summary.bounds for summary in summaries if summary.bounds is not None]
-    if not bounds:
-        raise no_depth(len(model.views))
-    cell = surface_cell(summaries, cell_m, model.frame)
-    grid = grid_over(bounds, cell)
-    setup = FuseSetup(
-        store=confirmed.store,
-        stations=np.array([view.station for view in model.views], dtype=np.int64),
-        planes=tuple(planes),
-        offset_enu=_offset(grid, summaries),
-        sigma_factor=confirmed.sigma_factor,
-        shared=confirmed.shared,
-    )
-    tasks = fuse_tasks(grid, model.views, summaries, confirmed.poses)
-    tiles = list(confirmed.executor.map(partial(fuse_tile, setup), tasks, label="fuse"))
+    tiles: list[SurfaceTile] = []
+    if bounds:
+        cell = _surface_cell(summaries, cell_m, model.frame)
+        grid = grid_over(bounds, cell)
+        setup = replace(setup, offset_enu=_offset(grid, summaries))
+        reached = reach_tiles(grid, summaries)
+        tasks, fuse = fuse_tasks(grid, reached, model.views, poses), partial(fuse_tile, setup)
+        tiles = list(executor.map(fuse, tasks, label="fuse", total=len(reached)))
     if not any(tile.count for tile in tiles):
-        raise no_depth(len(model.views))
-    write_clouds(
-        folder, setup.store, tiles, setup.offset_enu, model.frame, cell, confirmed.executor
-    )
-    if (folder / PLANES).exists():  # of a run that was interrupted
-        shutil.rmtree(folder / PLANES)
-    made: list[Fused] = []
-    for plane in planes:
+        raise ReconstructionError(
+            f"no depth was confirmed by a second view in {len(views)} pictures; they need more "
+            "overlap, sharper texture or better positions"
+        )
+    write_clouds(folder, setup.store, tiles, setup.offset_enu, model.frame, cell, executor)
+    shutil.rmtree(folder / PLANES, ignore_errors=True)  # of a run that was interrupted
+    made: list[tuple[Plane, DemGrid]] = []
+    for plane in setup.planes:
         on_it = [tile.bounds[plane.name] for tile in tiles if plane.name in tile.bounds]
         if not on_it:
             warn(
@@ -171,16 +152,9 @@ def fuse_planes(
             continue
         below = folder / PLANES / plane.name if made else folder
         below.mkdir(parents=True, exist_ok=True)
-        made.append(
-            _project(
-                confirmed,
-                setup,
-                tiles,
-                below,
-                plane,
-                grid_over(on_it, cell),
-            )
-        )
+        grid = grid_over(on_it, cell)
+        _project(setup, tiles, below, plane, grid, model.frame, executor)
+        made.append((plane, grid))
     if not made:
         raise ReconstructionError(
             'nothing is seen on any of the planes: reconstruct.planes = ["auto"] finds the best'
@@ -188,30 +162,13 @@ def fuse_planes(
     return made
 
 
-def no_depth(pictures: int) -> ReconstructionError:
-    """What to say where no depth was confirmed."""
-    return ReconstructionError(
-        f"no depth was confirmed by a second view in {pictures} pictures; they need more overlap, "
-        "sharper texture or better positions"
-    )
-
-
-def surface_cell(summaries: Sequence[ViewSummary], cell: float | None, frame: WorldFrame) -> float:
-    """Side of a cell of all planes: as wanted, else as pictures and depths resolve."""
+def _surface_cell(summaries: Sequence[ViewSummary], cell: float | None, frame: WorldFrame) -> float:
+    """Side of a cell of all planes: as requested, else as pictures and depths resolve."""
     if cell is not None and not frame.scaled:
         warn("reconstruct.dem_cell_m is taken in model units: the model has no scale")
     footprint = float(np.nanmedian([s.footprint for s in summaries]))
     sigma = float(np.nanmedian([s.sigma for s in summaries]))
     return cell or round_cell(max(CELL_PIXELS * footprint, 1.5 * sigma))
-
-
-def _lay_out(confirmed: Confirmed) -> list[ViewSummary]:
-    tasks = [
-        ViewTask(store=confirmed.store, index=n, view=view, others=())
-        for n, view in enumerate(confirmed.model.views)
-    ]
-    lay_out = partial(lay_out_view, confirmed.sigma_factor)
-    return list(confirmed.executor.map(lay_out, tasks, label="lay out"))
 
 
 def _offset(grid: DemGrid, summaries: Sequence[ViewSummary]) -> tuple[float, float, float]:
@@ -222,64 +179,52 @@ def _offset(grid: DemGrid, summaries: Sequence[ViewSummary]) -> tuple[float, flo
     return (float(np.round(east)), float(np.round(north)), float(np.round(up)))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class RasterTile:
-    """A tile of the rasters of a plane."""
-
-    window: Window
-    bands: Mapping[str, NDArray[Any]]
-    """By the names of the rasters of `dense/`."""
-
-
 def _project(
-    confirmed: Confirmed,
     setup: FuseSetup,
     tiles: Sequence[SurfaceTile],
     folder: Path,
     plane: Plane,
     grid: DemGrid,
-) -> Fused:
+    frame: WorldFrame,
+    executor: Executor,
+) -> None:
     """Write one plane's rasters."""
-    frame = confirmed.model.frame
     tasks = []
     margin = (_RIM + 1) * grid.cell
     for window, over in tiles_reached(grid, _TILE_CELLS, boxes_on(tiles, plane), margin):
-        part = grid.window(
-            int(window.row_off) - _RIM,
-            int(window.col_off) - _RIM,
-            int(window.height) + 2 * _RIM,
-            int(window.width) + 2 * _RIM,
+        row, column, rows, columns = (
+            int(v) for v in (window.row_off, window.col_off, window.height, window.width)
         )
+        part = grid.window(row - _RIM, column - _RIM, rows + 2 * _RIM, columns + 2 * _RIM)
         tasks.append((window, part, [tiles[n] for n in over]))
     label = "project" if plane.is_level else f"project {plane.name}"
-    found = confirmed.executor.map(partial(project_tile, setup, plane), tasks, label=label)
-    threads = confirmed.executor.local_cores
-    _write_rasters(folder, grid, plane_frame(frame, plane), found, threads)
+    found = executor.map(partial(project_tile, setup, plane), tasks, label=label)
+    _write_rasters(folder, grid, plane_frame(frame, plane), found, executor.local_cores)
     write_plane(folder, plane, frame)
     preview_dem(folder / "dem.tif", folder / "dem.png")
     for one in rasters_in("dense"):
         if one.palette:
             unit = frame.unit if one.unit == LENGTH else one.unit
             write_style(folder / one.path.name, one.palette, unit)
-    poses = confirmed.poses
-    sigma = None if poses is None else float(f"{poses.median_along(plane.normal_world):.3g}")
-    return Fused(plane=plane, grid=grid, pose_sigma=sigma)
 
 
 def project_tile(
     setup: FuseSetup, plane: Plane, task: tuple[Window, DemGrid, Sequence[SurfaceTile]]
-) -> RasterTile:
+) -> tuple[Window, dict[str, NDArray[Any]]]:
     """Project the surface on a tile of a plane's grid.
 
     Args:
         setup: of the surface.
         plane: to project on.
         task: the tile, the grid of it with a rim, and tiles of the surface over it.
+
+    Returns:
+        The tile, and its bands by the names of the rasters of `dense/`.
     """
     window, grid, tiles = task
-    up = _middle_up(setup, plane)
-    origin = np.array([grid.west, grid.north, up])
-    surface = on_plane(setup, tiles, plane, origin)
+    east, north, up = setup.offset_enu  # a whole number near the survey's height over the plane
+    up = float(np.round(-plane.plane_from_world.apply(np.array([north, east, -up]))[2]))
+    surface = on_plane(setup, tiles, plane, np.array([grid.west, grid.north, up]))
     cells = cells_over(grid.translate(-grid.west, -grid.north), surface)
     cells = cells.without(~without_strays(cells.height))
     height, sigma = fill_gaps(cells.height, cells.sigma, FILL_CELLS, grid.cell)
@@ -293,19 +238,15 @@ def project_tile(
         "lower": (cells.lower + up).astype(np.float32),
     }
     inner = slice(_RIM, -_RIM)
-    return RasterTile(
-        window=window, bands={name: band[inner, inner] for name, band in bands.items()}
-    )
-
-
-def _middle_up(setup: FuseSetup, plane: Plane) -> float:
-    """A whole number near the height of the survey's middle over a plane."""
-    east, north, up = setup.offset_enu
-    return float(np.round(-plane.plane_from_world.apply(np.array([north, east, -up]))[2]))
+    return window, {name: band[inner, inner] for name, band in bands.items()}
 
 
 def _write_rasters(
-    folder: Path, grid: DemGrid, frame: WorldFrame, tiles: Iterable[RasterTile], threads: int
+    folder: Path,
+    grid: DemGrid,
+    frame: WorldFrame,
+    tiles: Iterable[tuple[Window, Mapping[str, NDArray[Any]]]],
+    threads: int,
 ) -> None:
     up = "towards its viewer" if frame.name == "plane" else "up"
     over = f"above {frame.vertical_datum}, {up} ({frame.unit})"
@@ -325,9 +266,9 @@ def _write_rasters(
             )
             for one in rasters_in("dense")
         }
-        for tile in tiles:
+        for window, bands in tiles:
             for name, raster in written.items():
-                raster.write(tile.bands[name], 1, window=tile.window)
+                raster.write(bands[name], 1, window=window)
 
 
 _PARTNERS = 4
@@ -389,20 +330,20 @@ def run_dense(
         others = tasks(neighbours(model, COMPARED))
         moving = list(executor.map(mask, others, label="mask what moves"))
         show_moving(workspace, folder, moving)
-    confirmed = Confirmed(
+    stations = np.array([view.station for view in views], dtype=np.int64)
+    apart = [[m for m in chosen if stations[m] != stations[n]] for n, chosen in enumerate(looks)]
+    setup = FuseSetup(
         store=store,
-        model=replace(model, views=tuple(views)),
+        stations=stations,
+        planes=tuple(planes),
         sigma_factor=sigma_factor,
-        shared=depths_per_pair(
-            [
-                [m for m in chosen if views[m].station != views[n].station]
-                for n, chosen in enumerate(looks)
-            ]
-        ),
-        poses=find_errors_of_poses(workspace, model),
-        executor=executor,
+        shared=depths_per_pair(apart),
     )
-    made = fuse_planes(confirmed, folder, planes, reconstruct.dem_cell_m)
+    poses = find_errors_of_poses(workspace, model)
+    placed = replace(model, views=tuple(views))
+    made = fuse_planes(setup, placed, poses, folder, reconstruct.dem_cell_m, executor)
+    (plane, grid), *_ = made
+    pose_sigma = None if poses is None else poses.median_along(plane.normal_world)
     SurfaceRecord.save(
         folder / "surface.json",
         {
@@ -413,14 +354,14 @@ def run_dense(
             "match_sigma_px": match_sigma_px,
             "refined_with": LOOKS,
             "sigma_factor": round(sigma_factor, 3),
-            "pose_sigma": made[0].pose_sigma,
-            "cell": made[0].grid.cell,
+            "pose_sigma": None if pose_sigma is None else float(f"{pose_sigma:.3g}"),
+            "cell": grid.cell,
             "unit": model.frame.unit,
-            "rows": made[0].grid.rows,
-            "columns": made[0].grid.columns,
+            "rows": grid.rows,
+            "columns": grid.columns,
             "frame": model.frame.name,
             "vertical_datum": model.frame.vertical_datum,
-            "planes": [fused.plane.name for fused in made],
+            "planes": [one.name for one, _ in made],
             "pairs": sum(len(chosen) for chosen in partners),
             "moving": {
                 "pictures": len(moving),

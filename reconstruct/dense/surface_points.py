@@ -305,11 +305,16 @@ def _fuse_along(
     sign: float,
 ) -> NDArray[Any]:
     across = [k for k in range(3) if k != axis]
-    order, starts, cells = by_cell(
-        points.enu, points.normals, (across[0], across[1], axis), sign, origin[across], cell
-    )
+    order = np.flatnonzero(sign * points.normals[:, axis] >= _MIN_ALONG)
     if not len(order):
         return np.empty(0, SURFACE_POINT)
+    at = [np.floor((points.enu[order, k] - origin[k]) / cell).astype(np.int64) for k in across]
+    for k in (1, 0):  # by cell, points of a cell in their order; small numbers are sorted fast
+        key = at[k] - at[k].min()
+        sort = np.argsort(key.astype(np.min_scalar_type(key.max())), kind="stable")
+        order, at = order[sort], [one[sort] for one in at]
+    starts = np.flatnonzero(np.concatenate([[True], np.any(np.diff(at), axis=0), [True]]))
+    cells = np.stack(at, axis=1)[starts[:-1]]
     ranked = points.part(order)
     found = fuse_cells(
         starts, origin[across] + (cells + 0.5) * cell, ranked.enu,
@@ -321,72 +326,6 @@ def _fuse_along(
     for name, values in zip(names, found, strict=True):
         records[name] = values
     return records
-
-
-@compiled
-def by_cell(
-    enu: Float32,
-    normals: Float32,
-    axes: tuple[int, int, int],
-    sign: float,
-    origin: Array,
-    cell: float,
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Sort the points that face a direction by the cells that they lie in across it.
-
-    Args:
-        enu: (N, 3) places.
-        normals: (N, 3); NaN where unknown.
-        axes: the two axes of the cells, and that of the direction.
-        sign: 1 or -1, of the direction along its axis.
-        origin: (2,) of the cells.
-        cell: side of a cell.
-
-    Returns:
-        (M,) numbers of the points, by cell and in their order, (C + 1,) where each cell starts in
-        these, and (C, 2) numbers of the cells.
-    """
-    first, second, along = axes
-    order = np.empty(len(enu), np.int64)
-    at = np.empty((2, len(enu)), np.int64)
-    count = 0
-    for i in range(len(enu)):
-        if sign * normals[i, along] >= _MIN_ALONG:
-            order[count] = i
-            at[0, count] = math.floor((enu[i, first] - origin[0]) / cell)
-            at[1, count] = math.floor((enu[i, second] - origin[1]) / cell)
-            count += 1
-    order, at = order[:count], at[:, :count]
-    if count == 0:
-        return order, np.zeros(1, np.int64), np.empty((0, 2), np.int64)
-    for k in (1, 0):
-        sort = stable_order(at[k])
-        order, at = order[sort], at[:, sort]
-    starts, cells, found = np.empty(count + 1, np.int64), np.empty((count, 2), np.int64), 0
-    for i in range(count):
-        if i == 0 or at[0, i] != at[0, i - 1] or at[1, i] != at[1, i - 1]:
-            starts[found], cells[found, 0], cells[found, 1] = i, at[0, i], at[1, i]
-            found += 1
-    starts[found] = count
-    return order, starts[: found + 1], cells[:found]
-
-
-@compiled
-def stable_order(keys: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(N,) that sorts keys (N,) and keeps the order of equal ones.
-
-    It counts, in time and memory of N plus the range of the keys.
-    """
-    minimum = keys.min()
-    starts = np.zeros(keys.max() - minimum + 2, np.int64)
-    for key in keys:
-        starts[key - minimum + 1] += 1
-    starts = np.cumsum(starts)
-    order = np.empty_like(keys)
-    for i, key in enumerate(keys):
-        order[starts[key - minimum]] = i
-        starts[key - minimum] += 1
-    return order
 
 
 @compiled

@@ -231,7 +231,7 @@ class FuseSetup:
     stations: NDArray[np.int64]
     """(V,) station of every view."""
     planes: tuple[Plane, ...]
-    offset_enu: tuple[float, float, float]
+    offset_enu: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Origin near the points."""
     sigma_factor: float
     """On the standard deviations of refined depths."""
@@ -267,39 +267,26 @@ class SurfaceTile:
         return np.asarray(store.load(self.number, _NAME))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class FuseTasks:
-    """Tasks of all tiles, each made when it is asked for: what is around a tile is a copy."""
-
-    grid: DemGrid
-    reached: Sequence[tuple[Window, Sequence[int]]]
-    """Tiles, and the numbers of the views whose points may fall in each."""
-    views: Sequence[View]
-    poses: ErrorsOfPoses | None
-
-    def __len__(self) -> int:
-        return len(self.reached)
-
-    def __iter__(self) -> Iterator[FuseTask]:
-        for number, (window, seeing) in enumerate(self.reached):
-            row, column = int(window.row_off), int(window.col_off)
-            tile = self.grid.window(row, column, int(window.height), int(window.width))
-            low, high = _corners(tile)
-            near = None if self.poses is None else self.poses.around(low[::-1], high[::-1])
-            pairs = tuple((index, self.views[index]) for index in seeing)
-            yield FuseTask(number=number, grid=tile, views=pairs, poses=near)
+def reach_tiles(grid: DemGrid, summaries: Sequence[ViewSummary]) -> list[tuple[Window, list[int]]]:
+    """Tiles of a grid, in rows, and the views whose points may fall in each."""
+    boxes = np.array([summary.bounds or (np.nan,) * 4 for summary in summaries])[:, [1, 0, 3, 2]]
+    return tiles_reached(grid, _TILE_CELLS, boxes, _RIM_CELLS * grid.cell)
 
 
 def fuse_tasks(
     grid: DemGrid,
+    reached: Sequence[tuple[Window, Sequence[int]]],
     views: Sequence[View],
-    summaries: Sequence[ViewSummary],
     poses: ErrorsOfPoses | None,
-) -> FuseTasks:
-    """Tiles of a grid that points of views may fall in, in rows."""
-    boxes = np.array([summary.bounds or (np.nan,) * 4 for summary in summaries])[:, [1, 0, 3, 2]]
-    reached = tiles_reached(grid, _TILE_CELLS, boxes, _RIM_CELLS * grid.cell)
-    return FuseTasks(grid=grid, reached=reached, views=views, poses=poses)
+) -> Iterator[FuseTask]:
+    """Tasks of `reach_tiles`, each made when it is asked for: what is around a tile is a copy."""
+    for number, (window, seeing) in enumerate(reached):
+        row, column = int(window.row_off), int(window.col_off)
+        tile = grid.window(row, column, int(window.height), int(window.width))
+        low, high = _corners(tile)
+        near = None if poses is None else poses.around(low[::-1], high[::-1])
+        pairs = tuple((index, views[index]) for index in seeing)
+        yield FuseTask(number=number, grid=tile, views=pairs, poses=near)
 
 
 def _corners(grid: DemGrid) -> tuple[Array, Array]:
@@ -332,9 +319,7 @@ def fuse_tile(setup: FuseSetup, task: FuseTask) -> SurfaceTile:
         if facing.any():
             on_plane = plane.plane_from_world.apply(ned[facing])[:, :2]
             minimum, maximum = on_plane.min(axis=0), on_plane.max(axis=0)
-            bounds[plane.name] = (
-                float(minimum[0]), float(minimum[1]), float(maximum[0]), float(maximum[1])
-            )  # fmt: skip
+            bounds[plane.name] = (*minimum.tolist(), *maximum.tolist())
     box = np.array([enu.min(axis=0), enu.max(axis=0)]) if len(enu) else np.full((2, 3), np.nan)
     corners = np.stack(np.meshgrid(*box.T, indexing="ij"), axis=-1).reshape(-1, 3)
     return SurfaceTile(number=task.number, count=len(surface), corners_enu=corners, bounds=bounds)

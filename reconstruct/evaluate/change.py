@@ -6,34 +6,33 @@ sigma by chance in 5 % of all cases; a place counts as changed only where most c
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-import shapely
 from numpy.typing import NDArray
-from rasterio.features import shapes
-from rasterio.transform import Affine
 from scipy.ndimage import find_objects
+from scipy.spatial.transform import RigidTransform
 
-from alice_survey.core.artefacts import refuse_links
+from alice_survey.core.artefacts import need_stage, refuse_links
 from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.errors import ReconstructionError, WorkspaceError, warn
-from alice_survey.core.frames import Array
+from alice_survey.core.frames import Array, Datum
 from alice_survey.core.records import ChangeRecord
 from alice_survey.core.run import progress
 from alice_survey.kit.figure import (
-    Axes,
     colour_bar,
     figure_style,
     map_axes,
     new_figure,
     save_figure,
 )
-from reconstruct.evaluate.elevation import Elevation, enu_from_enu, read_elevation
+from reconstruct.elevation import Elevation, elevation_in
 from reconstruct.evaluate.figures import json_number, rms
 from reconstruct.evaluate.registration import HeightFit, refine_heights, register_heights
+from reconstruct.placing.alignment import align_rigid
 from reconstruct.raster import DemGrid, hillshade, tiled_raster
+from reconstruct.views.model import WorldFrame, read_frame
 
 SIGNIFICANT = 1.96
 """Standard deviations: 95 % of errors of a normal distribution stay below."""
@@ -49,11 +48,9 @@ _REGION_SIGMAS = 3.0
 _MIN_BLOCKS = 20
 _SIDES = (1, 2, 4, 8, 16, 32)
 _MAX_DRAWN = 1200
-_LABELLED = 8
 
 
-@dataclass(frozen=True, kw_only=True)
-class Region:
+class Region(NamedTuple):
     """One place that changed."""
 
     east_m: float
@@ -64,8 +61,17 @@ class Region:
     sigma_m3: float
     max_m: float
     """Largest change of height (95 % of the cells are below)."""
-    outlines: tuple[tuple[tuple[float, float], ...], ...]
-    """Rings of east and north around its cells, the outer one of each part and its holes."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Figures in millimetres and litres."""
+        return {
+            "east_m": round(self.east_m, 3),
+            "north_m": round(self.north_m, 3),
+            "area_m2": round(self.area_m2, 4),
+            "volume_l": round(1e3 * self.volume_m3, 4),
+            "sigma_l": round(1e3 * self.sigma_m3, 4),
+            "most_mm": round(1e3 * self.max_m, 2),
+        }
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -96,25 +102,31 @@ class Change:
         """Figures in millimetres and litres."""
         known = np.isfinite(self.difference)
         stable = known & ~self.changed
-        ratio = self.significance[stable]
-        gained = [r for r in self.regions if r.volume_m3 > 0]
-        lost = [r for r in self.regions if r.volume_m3 < 0]
-        level = 1e3 * self.difference[stable]
-        return {
+        ratio, level = self.significance[stable], 1e3 * self.difference[stable]
+        figures: dict[str, Any] = {
             "cells": int(known.sum()),
             "area_m2": round(float(known.sum()) * self.cell**2, 4),
             "changed_m2": round(float(self.changed.sum()) * self.cell**2, 4),
-            "gained": _total(gained),
-            "lost": _total(lost),
-            "regions": [_region(region) for region in self.regions],
-            "unchanged": {
-                "share_significant": json_number(float(np.mean(np.abs(ratio) > SIGNIFICANT)), 4),
-                "difference_over_sigma_rms": json_number(rms(ratio), 3),
-                "median_mm": json_number(float(np.median(level)), 4),
-                "robust_sigma_mm": json_number(MAD_TO_SIGMA * float(np.median(np.abs(level))), 4),
-                "registration_sigma_mm": json_number(1e3 * self.registration_sigma, 4),
-                "errors_go_together_over_mm": json_number(1e3 * float(np.sqrt(self.noise_area)), 2),
-            },
+        }
+        for name, sign in (("gained", 1), ("lost", -1)):
+            # volumes of places add up; so do errors of the registration, and the rest is smaller
+            mine = np.array([r[3:5] for r in self.regions if sign * r.volume_m3 > 0]).reshape(-1, 2)
+            figures[name] = {
+                "regions": len(mine),
+                "volume_l": round(1e3 * float(mine[:, 0].sum()), 4),
+                "sigma_l": round(1e3 * float(np.linalg.norm(mine[:, 1])), 4),
+            }
+        unchanged = {
+            "share_significant": np.mean(np.abs(ratio) > SIGNIFICANT),
+            "difference_over_sigma_rms": rms(ratio),
+            "median_mm": np.median(level),
+            "robust_sigma_mm": MAD_TO_SIGMA * np.median(np.abs(level)),
+            "registration_sigma_mm": 1e3 * self.registration_sigma,
+            "errors_go_together_over_mm": 1e3 * np.sqrt(self.noise_area),
+        }
+        return figures | {
+            "regions": [region.to_json() for region in self.regions],
+            "unchanged": {name: json_number(value, 4) for name, value in unchanged.items()},
         }
 
 
@@ -273,102 +285,40 @@ def _measure(
         volume_m3=float(values.sum()) * now.cell**2,
         sigma_m3=float(np.hypot(random, shared)),
         max_m=float(sign * np.percentile(sign * values, 95)),
-        outlines=_outlines(inside, window, now),
     )
-
-
-def _outlines(
-    inside: NDArray[np.bool_], window: tuple[slice, slice], now: Elevation
-) -> tuple[tuple[tuple[float, float], ...], ...]:
-    """Rings around cells, corners of single cells cut off."""
-    west = now.west + window[1].start * now.cell
-    north = now.north - window[0].start * now.cell
-    to_plane = Affine(now.cell, 0.0, west, 0.0, -now.cell, north)
-    found = []
-    for part, value in shapes(inside.astype(np.uint8), transform=to_plane):
-        if value == 1:
-            outer, *holes = part["coordinates"]
-            outline = shapely.simplify(shapely.Polygon(outer, holes), now.cell)
-            rings = (outline.exterior, *outline.interiors)
-            found += [tuple((x, y) for x, y in ring.coords[:-1]) for ring in rings]
-    return tuple(found)
-
-
-def _total(regions: list[Region]) -> dict[str, float]:
-    """Volumes of places add up; so do errors of the registration, and the rest is smaller."""
-    return {
-        "regions": len(regions),
-        "volume_l": round(1e3 * sum(r.volume_m3 for r in regions), 4),
-        "sigma_l": round(1e3 * float(np.sqrt(sum(r.sigma_m3**2 for r in regions))), 4),
-    }
-
-
-def _region(region: Region) -> dict[str, Any]:
-    return {
-        "east_m": round(region.east_m, 3),
-        "north_m": round(region.north_m, 3),
-        "area_m2": round(region.area_m2, 4),
-        "volume_l": round(1e3 * region.volume_m3, 4),
-        "sigma_l": round(1e3 * region.sigma_m3, 4),
-        "most_mm": round(1e3 * region.max_m, 2),
-        "outlines": [[[round(e, 4), round(n, 4)] for e, n in ring] for ring in region.outlines],
-    }
 
 
 @figure_style()
 def plot_change(path: Path, now: Elevation, change: Change) -> None:
-    """Difference over the relief, places that changed, and the significance with its histogram."""
+    """Difference over the relief, its significance, and places that changed."""
     step = max(1, max(now.height.shape) // _MAX_DRAWN)
     difference = 1e3 * change.difference[::step, ::step]
-    ratio = change.significance[::step, ::step]
     shade = hillshade(now.height[::step, ::step], now.cell * step)
     rows, columns = now.height.shape
     extent = (now.west, now.west + columns * now.cell, now.north - rows * now.cell, now.north)
-    known = np.isfinite(difference)
-    limit = max(float(np.percentile(np.abs(difference[known]), 99.5)), 1e-6) if known.any() else 1.0
-    figure = new_figure(5.2, 14)
-    left, middle, right = figure.subplots(1, 3, width_ratios=[1.2, 1.2, 0.8])
-    for axis, values, span, label, title in (
-        (left, difference, limit, "mm", "Height now minus before"),
-        (middle, ratio, 4.0, "standard deviations", "Significance"),
+    known = difference[np.isfinite(difference)]
+    limit = max(float(np.percentile(np.abs(known), 99.5)), 1e-6) if known.size else 1.0
+    figure = new_figure(5.2, 11)
+    for axis, values, span, label, title in zip(
+        figure.subplots(1, 2),
+        (difference, change.significance[::step, ::step]),
+        (limit, 4.0),
+        ("mm", "standard deviations"),
+        ("Height now minus before", "Significance"),
+        strict=True,
     ):
         axis.imshow(shade, extent=extent, cmap="gray", vmin=0, vmax=1.2)
-        image = axis.imshow(
-            values, extent=extent, cmap="RdBu_r", vmin=-span, vmax=span,
-            alpha=np.where(np.isfinite(values), 0.75, 0.0), interpolation="nearest",
-        )  # fmt: skip
+        opacity = np.where(np.isfinite(values), 0.75, 0.0)
+        colours = {"cmap": "RdBu_r", "vmin": -span, "vmax": span, "interpolation": "nearest"}
+        image = axis.imshow(values, extent=extent, alpha=opacity, **colours)
         axis.grid(visible=False)
         axis.set_title(title)
         colour_bar(image, axis, label)
         map_axes(axis)
-    changed = change.changed[::step, ::step]
-    if changed.any():
-        for axis in (left, middle):
-            axis.contour(
-                changed, levels=[0.5], colors="k", linewidths=0.8, extent=extent, origin="upper"
-            )
-    for region in change.regions[:_LABELLED]:
-        left.annotate(
-            f"{1e3 * region.volume_m3:+.2f}±{1e3 * region.sigma_m3:.2f} l",
-            (region.east_m, region.north_m), ha="center", fontsize=7,
-            bbox={"boxstyle": "round", "fc": "white", "alpha": 0.8, "lw": 0},
-        )  # fmt: skip
-    _histogram(right, change)
+        if change.changed.any():
+            outline = change.changed[::step, ::step]
+            axis.contour(outline, levels=[0.5], colors="k", extent=extent, origin="upper")
     save_figure(figure, path)
-
-
-def _histogram(axis: Axes, change: Change) -> None:
-    """Unchanged ground in standard deviations, and what chance would give."""
-    stable = np.isfinite(change.difference) & ~change.changed
-    ratio = change.significance[stable]
-    edges = np.linspace(-6, 6, 97)
-    axis.hist(np.clip(ratio, -6, 6), bins=edges, density=True, label="unchanged ground")
-    axis.plot(edges, np.exp(-(edges**2) / 2) / np.sqrt(2 * np.pi), "k-", label="chance")
-    for side in (-SIGNIFICANT, SIGNIFICANT):
-        axis.axvline(side, color="0.5", linestyle=":")
-    axis.set(xlabel="difference / sigma", ylabel="density", yscale="log", ylim=(1e-5, 2))
-    axis.set_title(f"{np.mean(np.abs(ratio) > SIGNIFICANT):.1%} beyond {SIGNIFICANT} sigma")
-    axis.legend(loc="upper right")
 
 
 _MUCH = 0.5
@@ -419,17 +369,9 @@ def evaluate_against(
         WorkspaceError: a surface is missing or has no georeference or no scale.
         ReconstructionError: the two do not overlap.
     """
-    now, frame = read_elevation(workspace)
-    before, frame_before = read_elevation(earlier)
-    for folder, one in ((workspace, frame), (earlier, frame_before)):
-        if one.datum is None or not one.scaled:
-            raise WorkspaceError(
-                f"{folder} is not georeferenced: surveys are compared where the georeference puts "
-                "them; give positions in the manifest or control points"
-            )
-    assert frame.datum is not None  # noqa: S101 - for the type checker, said above
-    assert frame_before.datum is not None  # noqa: S101
-    georeferenced = enu_from_enu(frame.datum, frame_before.datum)
+    now, frame, datum = _read_survey(workspace)
+    before, _, datum_before = _read_survey(earlier)
+    georeferenced = enu_from_enu(datum, datum_before)
     change, fit = compare_elevations(now, before, georeferenced)
     share = change.changed.sum() / max(int(np.isfinite(change.difference).sum()), 1)
     if share > _MUCH:
@@ -461,6 +403,29 @@ def evaluate_against(
     plot_change(folder / "change.png", now, change)
     ChangeRecord.save(folder / "change.json", figures)
     return _change_text(figures, folder), figures
+
+
+def _read_survey(workspace: Path) -> tuple[Elevation, WorldFrame, Datum]:
+    """The DEM of a workspace, and the frame and datum that it lies in; raises as said above."""
+    dense = need_stage(workspace, "dense", "reconstruct")
+    frame = read_frame(need_stage(workspace, "sparse", "reconstruct") / "frame.json")
+    elevation = elevation_in(dense)
+    if not elevation.known.any():
+        raise ReconstructionError(f"{dense / 'dem.tif'}: holds no height")
+    if frame.datum is None or not frame.scaled:
+        raise WorkspaceError(
+            f"{workspace} is not georeferenced: surveys are compared where the georeference puts "
+            "them; give positions in the manifest or control points"
+        )
+    return elevation, frame, frame.datum
+
+
+def enu_from_enu(target: Datum, source: Datum) -> RigidTransform:
+    """Local east, north, up of one datum from that of another: rigid, both are tangent planes."""
+    corners = 100.0 * np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    ned = corners[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
+    moved = target.ned_from_geodetic(source.geodetic_from_ned(ned))
+    return align_rigid(corners, moved[:, [1, 0, 2]] * [1.0, 1.0, -1.0])
 
 
 def _change_registration(fit: HeightFit, georeferenced: Any) -> dict[str, Any]:

@@ -175,24 +175,3 @@ def compare_lengths(found: Array, true: Array, rng: np.random.Generator) -> dict
         "rms_ppm_of_length": round(1e6 * rms(error / np.maximum(truth, 1e-9)), 1),
         "mean_length_m": round(float(truth.mean()), 3),
     }
-
-
-def compare_volumes(height_m: Array, true_height_m: Array, cell_m2: float) -> dict[str, Any]:
-    """Volume between the surface and a level plane near its lowest point, over the same cells.
-
-    Args:
-        height_m: (N,) of the model.
-        true_height_m: (N,).
-        cell_m2: area of a cell.
-    """
-    if not len(height_m):
-        return {}
-    plane = float(np.percentile(true_height_m, 1))
-    true = float((true_height_m - plane).sum()) * cell_m2
-    error = float((height_m - true_height_m).sum()) * cell_m2
-    return {
-        "true_l": round(1e3 * true, 3),
-        "error_l": round(1e3 * error, 3),
-        "error_percent": json_number(100 * error / true if true > 0 else math.nan, 4),
-        "mean_height_error_mm": round(1e3 * error / (len(height_m) * cell_m2), 4),
-    }

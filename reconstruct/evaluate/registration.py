@@ -22,7 +22,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.errors import ReconstructionError, WorkspaceError
 from alice_survey.core.frames import Array
-from reconstruct.evaluate.elevation import Elevation
+from reconstruct.elevation import Elevation
 from reconstruct.evaluate.figures import json_number, mean_grid, rms, tukey_weights
 from reconstruct.placing.alignment import Similarity
 

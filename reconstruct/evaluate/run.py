@@ -25,7 +25,6 @@ from alice_survey.core.products import ERROR
 from alice_survey.core.records import RegistrationRecord, ScoreRecord
 from alice_survey.core.run import progress
 from alice_survey.kit.figure import (
-    Axes,
     colour_bar,
     even_limit,
     figure_style,
@@ -36,8 +35,8 @@ from alice_survey.kit.figure import (
 from alice_survey.sim.seafloor.terrain import read_terrain
 from alice_survey.sim.seafloor.texture import survey_texture
 from camera_calib.rig import read_rig
-from missions.values.plan_file import Plan, read_plan
-from reconstruct.evaluate.elevation import elevation_in
+from missions.values.plan_file import read_plan
+from reconstruct.elevation import elevation_in
 from reconstruct.evaluate.figures import compare_lengths, rms
 from reconstruct.evaluate.mosaic import score_mosaic
 from reconstruct.evaluate.surface import SurfaceScore, read_mesh, score_mesh, score_surface
@@ -49,8 +48,6 @@ from reconstruct.evaluate.truth import (
 )
 from reconstruct.placing.alignment import align_rigid, align_similarity
 from reconstruct.placing.track import read_track_poses
-
-_WIDTH_IN = 11.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -137,30 +134,24 @@ _SEED_STREAM = 6100
 
 def run_evaluate(workspace: Path, folder: Path, executor: Executor, *, seed: int) -> None:
     """Score what `reconstruct` made of a simulated survey."""
-    folders = ("plan", "images", "sparse", "dense", "mosaic", "mesh")
-    plan, images, sparse, dense, mosaic, mesh = (workspace / name for name in folders)
+    images, sparse, dense, mesh = (
+        workspace / name for name in ("images", "sparse", "dense", "mesh")
+    )
     truth = images / "truth"
-    flown = read_plan(plan / "plan.json")
+    flown = read_plan(workspace / "plan" / "plan.json")
     area = flown.area.survey
     terrain = read_terrain(truth / "terrain.ply")
     rig, poses = read_rig(truth / "rig.json"), read_true_poses(truth / "poses.csv")
     records = read_manifest(images / "manifest.csv")
     total = RegistrationRecord.read(sparse / "registration.json").total
-    track = read_track_poses(sparse / "track.csv")
-    cameras = score_cameras(track, poses, total)
+    cameras = score_cameras(read_track_poses(sparse / "track.csv"), poses, total)
     moved = cameras.truth_from_world
     pixel_m = ground_pixel_m(rig, {r.image: r.camera for r in records}, poses, terrain)
-    counter = partial(
-        count_stations,
-        rig=rig,
-        pictures={r.image: (r.camera, r.station) for r in records},
-        poses=poses,
-        terrain=terrain,
-    )
+    pictures = {r.image: (r.camera, r.station) for r in records}
+    counter = partial(count_stations, rig=rig, pictures=pictures, poses=poses, terrain=terrain)
     surface = score_surface(elevation_in(dense), area, terrain, moved, pixel_m, counter)
-    painted = score_mosaic(
-        mosaic / "mosaic.tif", dense / "dem.tif", area, terrain, survey_texture(seed), moved
-    )
+    mosaic, texture = workspace / "mosaic" / "mosaic.tif", survey_texture(seed)
+    painted = score_mosaic(mosaic, dense / "dem.tif", area, terrain, texture, moved)
     rng = np.random.default_rng([seed, _SEED_STREAM])
     score: dict[str, Any] = {
         "cameras": cameras.to_json(),
@@ -176,7 +167,6 @@ def run_evaluate(workspace: Path, folder: Path, executor: Executor, *, seed: int
     ScoreRecord.save(folder / "score.json", score)
     write_cameras(folder / "cameras.csv", cameras)
     _write_errors(folder / ERROR.path.name, dense / "dem.tif", surface.map_m)
-    plot_track(folder / "track.png", flown, cameras)
     plot_errors(folder / "errors.png", surface, area)
 
 
@@ -203,31 +193,6 @@ def write_cameras(path: Path, cameras: CameraScore) -> None:
     )
 
 
-@progress.step("draw the track's errors")
-@figure_style()
-def plot_track(path: Path, plan: Plan, cameras: CameraScore) -> None:
-    """Planned lines, camera positions coloured by error, and the error of each picture."""
-    places, length_mm = cameras.positions_ned, 1e3 * np.linalg.norm(cameras.errors_m, axis=1)
-    south, west, north, east = plan.area.survey.bounds
-    figure = new_figure(_height_in(east - west, north - south), _WIDTH_IN)
-    plane, strips = figure.subplots(1, 2, width_ratios=[1, 1.2])
-    for line in plan.lines:
-        (n0, e0), (n1, e1) = line.start_ne_m, line.end_ne_m
-        plane.plot([e0, e1], [n0, n1], color="0.75", linewidth=3, zorder=1)
-    _draw_area(plane, plan.area.survey)
-    dots = plane.scatter(places[:, 1], places[:, 0], c=length_mm, s=14, cmap="viridis", zorder=2)
-    colour_bar(dots, plane, "position error (mm)")
-    plane.set_title("Camera positions over the plan")
-    map_axes(plane)
-    for axis, name in enumerate(("north", "east", "down")):
-        strips.plot(1e3 * cameras.errors_m[:, axis], ".", markersize=4, label=name)
-    strips.axhline(0, color="0.6", linewidth=0.8)
-    strips.set(xlabel="picture", ylabel="error (mm)")
-    strips.set_title(f"Error after a rigid alignment: {1e3 * cameras.rms_m:.2f} mm rms")
-    strips.legend(loc="upper right")
-    save_figure(figure, path)
-
-
 @progress.step("draw the errors")
 @figure_style()
 def plot_errors(path: Path, surface: SurfaceScore, area: MultiPolygon) -> None:
@@ -236,17 +201,16 @@ def plot_errors(path: Path, surface: SurfaceScore, area: MultiPolygon) -> None:
     limit = max(5.0, 3 * figures["height_median_mm"], figures["height_95_mm"])
     shown = even_limit(1e3 * surface.map_m)
     west, east, south, north = surface.extent_m
-    figure = new_figure(_height_in(east - west, north - south), _WIDTH_IN)
+    figure = new_figure(5.5 * min(max(0.9 * (north - south) / (east - west), 1.0), 1.7), 11.0)
     plane, bars = figure.subplots(1, 2, width_ratios=[1.3, 1])
+    colours: dict[str, Any] = {"vmin": -shown, "vmax": shown, "cmap": "PuOr"}
     image = plane.imshow(
-        1e3 * surface.map_m,
-        extent=(west, east, south, north),
-        vmin=-shown,
-        vmax=shown,
-        cmap="PuOr",
-        interpolation="nearest",
+        1e3 * surface.map_m, extent=surface.extent_m, interpolation="nearest", **colours
     )
-    _draw_area(plane, area)
+    for part in area.geoms:
+        for ring in (part.exterior, *part.interiors):
+            ring_ne = np.asarray(ring.coords)
+            plane.plot(ring_ne[:, 1], ring_ne[:, 0], "k--", linewidth=1)
     colour_bar(image, plane, "height error (mm)")
     plane.set_title("Surface minus truth")
     plane.grid(visible=False)
@@ -254,22 +218,5 @@ def plot_errors(path: Path, surface: SurfaceScore, area: MultiPolygon) -> None:
     plane.set_facecolor("0.85")
     bars.hist(1e3 * surface.height_m, bins=np.linspace(-4 * limit, 4 * limit, 161), log=True)
     bars.set(xlabel="height error (mm)", ylabel="cells")
-    bars.set_title(
-        f"rms {figures['height_rms_mm']:.2f} mm in height, {figures['distance_rms_mm']:.2f} mm "
-        f"in distance;\n{surface.completeness:.1%} complete",
-        fontsize=9,
-    )
+    bars.set_title(f"rms {figures['height_rms_mm']:.2f} mm; {surface.completeness:.1%} complete")
     save_figure(figure, path)
-
-
-def _height_in(width_m: float, height_m: float) -> float:
-    """Height of a figure with a map next to something else: higher where the map is."""
-    return 5.5 * min(max(0.9 * height_m / width_m, 1.0), 1.7)
-
-
-def _draw_area(axes: Axes, area: MultiPolygon) -> None:
-    """Edges of the survey area, holes too."""
-    for part in area.geoms:
-        for ring in (part.exterior, *part.interiors):
-            north, east = np.asarray(ring.coords)[:, :2].T
-            axes.plot(east, north, "k--", linewidth=1)

@@ -17,9 +17,8 @@ from alice_survey.core.frames import Array
 from alice_survey.core.records import MeshRecord
 from alice_survey.core.run import progress
 from alice_survey.sim.seafloor.terrain import Terrain
-from reconstruct.evaluate.elevation import Elevation
+from reconstruct.elevation import Elevation
 from reconstruct.evaluate.figures import (
-    compare_volumes,
     fit_doming,
     json_number,
     median,
@@ -49,15 +48,13 @@ class SurfaceScore:
 
     cells: int
     """Cells in the area, filled or not."""
-    cell_m: float
     places_ne: Array
     """(N, 2) aligned north and east of each filled cell."""
     distance_m: Array
     """(N,) distance of each filled cell from the nearest point of the true surface."""
     height_m: Array
     """(N,) height of each filled cell minus the true height straight below or above it."""
-    true_height_m: Array
-    """(N,) that true height, positive up."""
+
     sigma_m: Array
     """(N,) standard deviation that the model states; NaN where it states none."""
     stations: NDArray[np.int64]
@@ -92,9 +89,6 @@ class SurfaceScore:
             "height_median_mm": json_number(median(height), 3),
             "height_95_mm": json_number(percentile(np.abs(height), 95), 3),
             "doming": fit_doming(self.places_ne, self.height_m).to_json(),
-            "volume": compare_volumes(
-                self.true_height_m + self.height_m, self.true_height_m, self.cell_m**2
-            ),
             "ground_pixel_mm": round(1e3 * self.ground_pixel_m, 4),
             "completeness_within_px": shares_within(
                 self.distance_m, self.ground_pixel_m, self.cells
@@ -158,11 +152,9 @@ def score_surface(
     seen = _stations_of_cells(place[:, :2], inside, (rows, columns), terrain, stations)
     return SurfaceScore(
         cells=max(round(area.area / cell**2), int(inside.sum())),
-        cell_m=cell,
         places_ne=points[used, :2],
         distance_m=distance,
         height_m=errors[used],
-        true_height_m=-depth,
         sigma_m=surface.sigma.ravel()[used],
         stations=seen[used],
         cells_seen_well=int((seen[inside] >= MIN_STATIONS).sum()),

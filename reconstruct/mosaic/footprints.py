@@ -15,16 +15,14 @@ from rasterio.warp import transform as to_crs
 from alice_survey.core.artefacts import write_csv, write_json
 from alice_survey.core.frames import Array
 from alice_survey.core.run import progress
+from reconstruct.elevation import Elevation
 from reconstruct.raster import DemGrid, crs_of
 from reconstruct.views.model import View, WorldFrame
 
-Float32 = NDArray[np.float32]
-
+_MAX_CELLS = 512
+"""Cells along the longer side of the part of a DEM that rays are followed to."""
 _NODES = 17
 """Rays along the width and along the height of a picture."""
-_STEPS = 96
-"""Depths tried along a ray before the crossing is refined."""
-_HALVINGS = 20
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,106 +41,54 @@ class PictureFootprint:
     """Share of the rays over the picture that meet the surface."""
 
 
-def picture_footprint(view: View, dem: Float32, grid: DemGrid) -> PictureFootprint:
+def picture_footprint(view: View, dem: NDArray[np.float32], grid: DemGrid) -> PictureFootprint:
     """Follow a picture's rays to the surface.
 
     Args:
         view: the picture, as warped.
-        dem: heights, NaN where unknown.
+        dem: heights, NaN where unknown; of many only every second, third, ... is looked at.
         grid: its cells.
     """
-    x = np.linspace(0.0, view.pinhole.width_px, _NODES)
-    y = np.linspace(0.0, view.pinhole.height_px, _NODES)
-    pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    met, ranges = surface_points(view, pixels, dem, grid)
+    size = view.pinhole.size_px
+    x, y = np.meshgrid(*(np.linspace(0.0, side, _NODES) for side in size))
+    met, ranges = hits_of(view, np.column_stack([x.ravel(), y.ravel()]), dem, grid)
     met = met.reshape(_NODES, _NODES, 2)
     edge = np.concatenate([met[0], met[1:, -1], met[-1, -2::-1], met[-2:0:-1, 0]])
-    one, two, three, four = met[:-1, :-1], met[:-1, 1:], met[1:, 1:], met[1:, :-1]
-    first, second = three - one, four - two
+    first, second = met[1:, 1:] - met[:-1, :-1], met[1:, :-1] - met[:-1, 1:]
     cells = 0.5 * np.abs(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
-    whole = np.isfinite(cells)
-    area = float(cells[whole].sum())
-    pixels_per_cell = view.pinhole.width_px * view.pinhole.height_px / (_NODES - 1) ** 2
-    found = np.isfinite(ranges)
+    cells, known = cells[np.isfinite(cells)], ranges[np.isfinite(ranges)]
+    cell_px = size[0] * size[1] / (_NODES - 1) ** 2
     return PictureFootprint(
         outline=edge[np.isfinite(edge).all(axis=1)],
-        area=area,
-        ground_pixel=float(np.sqrt(area / (whole.sum() * pixels_per_cell)))
-        if whole.any()
-        else float("nan"),
-        mean_range=float(ranges[found].mean()) if found.any() else float("nan"),
-        seen=float(found.mean()),
+        area=float(cells.sum()),
+        ground_pixel=float(np.sqrt(cells.mean() / cell_px)) if len(cells) else float("nan"),
+        mean_range=float(known.mean()) if len(known) else float("nan"),
+        seen=len(known) / len(ranges),
     )
 
 
-def surface_points(view: View, pixels: Array, dem: Float32, grid: DemGrid) -> tuple[Array, Array]:
-    """Where the rays of pixels first meet a DEM.
-
-    Args:
-        view: the view.
-        pixels: (N, 2) of its warped picture.
-        dem: heights, NaN where unknown.
-        grid: its cells.
+def hits_of(
+    view: View, pixels: Array, dem: NDArray[np.float32], grid: DemGrid
+) -> tuple[Array, Array]:
+    """Where the rays of pixels (N, 2) of a view first meet a DEM; arguments as above.
 
     Returns:
         (N, 2) east and north, and (N,) distances from the pinhole's centre; NaN where no known
         cell is met.
     """
-    known = dem[np.isfinite(dem)]
-    nothing = np.full((len(pixels), 2), np.nan), np.full(len(pixels), np.nan)
-    if not known.size:
-        return nothing
-    centre = view.world_from_cam.translation
-    steepness = view.at_depth(pixels, np.ones(len(pixels)))[:, 2] - centre[2]
-    low, high = float(known.min()), float(known.max())
-    with np.errstate(divide="ignore", invalid="ignore"):
-        down = np.where(steepness > 1e-6, steepness, np.nan)
-        nearest = np.maximum((-high - centre[2]) / down * 0.9, 1e-6)
-        farthest = np.maximum((-low - centre[2]) / down * 1.1, 2e-6)
-    at = np.full(len(pixels), np.nan)
-    before = nearest.copy()
-    shares = np.linspace(0.0, 1.0, _STEPS)[:, None]
-    depths = nearest + shares * (farthest - nearest)
-    above = _above(view, np.tile(pixels, (_STEPS, 1)), depths.ravel(), dem, grid)
-    below = above.reshape(depths.shape) <= 0  # NaN compares as False
-    first, met = below.argmax(axis=0), below.any(axis=0)
-    rays = np.arange(len(pixels))
-    at[met] = depths[first, rays][met]
-    before = np.where(met & (first > 0), depths[np.maximum(first - 1, 0), rays], before)
-    under = at.copy()
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (before + under)
-        below = _above(view, pixels, middle, dem, grid) <= 0
-        under = np.where(below, middle, under)
-        before = np.where(below, before, middle)
-    points = view.at_depth(pixels, under)
-    missed = ~np.isfinite(under)
-    points[missed] = np.nan
-    return points[:, [1, 0]], np.linalg.norm(points - centre, axis=1)
-
-
-def _above(view: View, pixels: Array, depth: Array, dem: Float32, grid: DemGrid) -> Array:
-    """Height of rays over the DEM at depths; NaN where that is unknown."""
-    safe = np.where(np.isfinite(depth), depth, 1.0)
-    points = view.at_depth(pixels, safe)
-    column = (points[:, 1] - grid.west) / grid.cell - 0.5
-    row = (grid.north - points[:, 0]) / grid.cell - 0.5
-    inside = (
-        np.isfinite(depth)
-        & (column > -0.5) & (column < grid.columns - 0.5)
-        & (row > -0.5) & (row < grid.rows - 0.5)
-    )  # fmt: skip
-    column = np.clip(np.where(inside, column, 0.0), 0.0, grid.columns - 1.0)
-    row = np.clip(np.where(inside, row, 0.0), 0.0, grid.rows - 1.0)
-    left = np.minimum(column.astype(int), max(grid.columns - 2, 0))
-    top = np.minimum(row.astype(int), max(grid.rows - 2, 0))
-    right, bottom = np.minimum(left + 1, grid.columns - 1), np.minimum(top + 1, grid.rows - 1)
-    p, q = column - left, row - top
-    height = (
-        (dem[top, left] * (1 - p) + dem[top, right] * p) * (1 - q)
-        + (dem[bottom, left] * (1 - p) + dem[bottom, right] * p) * q
-    )  # fmt: skip
-    return np.where(inside, -points[:, 2] - height, np.nan)
+    every = 1 + max(dem.shape) // _MAX_CELLS
+    corner = 0.5 * (1 - every) * grid.cell
+    surface = Elevation(
+        height=dem[::every, ::every].astype(np.float64),
+        sigma=np.empty(0),
+        west=grid.west + corner,
+        north=grid.north - corner,
+        cell=every * grid.cell,
+    )
+    near, far = (view.at_depth(pixels, np.full(len(pixels), depth)) for depth in (1.0, 2.0))
+    ways = (far - near) / np.linalg.norm(far - near, axis=1, keepdims=True)  # straight in the water
+    points = surface.met_by(2.0 * near - far, ways)
+    return points[:, [1, 0]], np.linalg.norm(points - view.world_from_cam.translation, axis=1)
 
 
 @progress.step("outline the pictures")

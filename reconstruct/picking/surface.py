@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from alice_survey.core.artefacts import read_stage
 from alice_survey.core.errors import ReconstructionError
 from alice_survey.core.frames import Array
-from reconstruct.evaluate.elevation import LEVEL, StoredElevation
+from reconstruct.elevation import LEVEL, StoredElevation
 from reconstruct.planes import read_plane
 from reconstruct.views.model_files import all_points
 

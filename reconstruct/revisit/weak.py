@@ -32,7 +32,7 @@ from missions.values.footprint import footprint_size_m
 from missions.values.pattern import Pattern
 from missions.values.plan_file import Plan, read_plan
 from reconstruct.adjustment.uncertainty import read_uncertainty
-from reconstruct.evaluate.elevation import Elevation, elevation_in
+from reconstruct.elevation import Elevation, elevation_in
 from reconstruct.pictures.quality import MeasureTask, judge, measure_file
 from reconstruct.placing.track import read_track_poses
 from reconstruct.revisit.links import cut_around, footprints, links, pieces, views_of_floor

@@ -41,7 +41,7 @@ from camera_calib.ports.dome import DomePort
 from camera_calib.ports.flat import FlatPort
 from camera_calib.rig import Rig, write_rig
 from camera_calib.water import water_optics
-from reconstruct.evaluate.elevation import elevation_in
+from reconstruct.elevation import elevation_in
 from reconstruct.evaluate.mosaic import MosaicScore, score_mosaic
 from reconstruct.evaluate.run import CameraScore, score_cameras
 from reconstruct.evaluate.surface import SurfaceScore, score_surface

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from reconstruct.dense.points import Points
-from reconstruct.dense.surface_points import SURFACE_POINT, fuse_surface, settle, stable_order
+from reconstruct.dense.surface_points import SURFACE_POINT, fuse_surface, settle
 from tests.oracles_dense import fused
 
 CELL_M, SIGMA_M = 0.01, 0.001
@@ -33,12 +33,6 @@ def seen(
         sigmas=np.full(count, SIGMA_M, np.float32),
         views=order.astype(np.int32),
     )
-
-
-@given(st.lists(st.integers(-50, 70), min_size=1, max_size=200))
-def test_keys_are_put_in_order_and_equal_ones_stay_in_theirs(keys):
-    keys = np.array(keys)
-    np.testing.assert_array_equal(stable_order(keys), np.argsort(keys, kind="stable"))
 
 
 def patch(normal: np.ndarray, rng: np.random.Generator, count: int = 20_000) -> Points:

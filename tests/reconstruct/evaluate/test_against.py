@@ -9,17 +9,14 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 from scipy.spatial.transform import RigidTransform, Rotation
-from shapely import Point, Polygon
 
 from alice_survey.core.artefacts import write_json
 from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.frames import Datum
-from reconstruct.evaluate.change import compare_elevations, evaluate_against
-from reconstruct.evaluate.elevation import Elevation, enu_from_enu
+from reconstruct.elevation import Elevation
+from reconstruct.evaluate.change import compare_elevations, enu_from_enu, evaluate_against
 from reconstruct.evaluate.registration import register_heights, rough_shifts
 from reconstruct.views.model import WorldFrame, write_frame
-
-MOUND_M, WIDTH_M, AT = 0.02, 0.15, (1.5, 2.2)
 
 CELL, SIDE = 0.02, 200
 MOUND_M, WIDTH_M, AT = 0.02, 0.15, (1.5, 2.2)
@@ -64,9 +61,7 @@ def test_a_mound_is_measured_within_its_sigma_and_nothing_else_changes() -> None
         (region,) = change.regions
         assert (region.east_m, region.north_m) == pytest.approx(AT, abs=0.03)
         assert region.volume_m3 == pytest.approx(MOUND_M3, rel=0.05)
-        outer, *holes = (Polygon(ring) for ring in region.outlines)
-        assert outer.area - sum(one.area for one in holes) == pytest.approx(region.area_m2, rel=0.1)
-        assert outer.contains(Point(AT))
+        assert change.changed.sum() * CELL**2 == pytest.approx(region.area_m2, rel=1e-9)
         ratios.append((region.volume_m3 - MOUND_M3) / region.sigma_m3)
         figures = change.to_json()
         # Heights between cells are means of noisy cells: fewer than 5 % exceed what cells would.

@@ -1,7 +1,5 @@
 """The score measures the error that was put in, and nothing else."""
 
-import math
-
 import numpy as np
 import pytest
 import shapely
@@ -9,17 +7,12 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from shapely.geometry import MultiPolygon, Polygon
 
 from alice_survey.core.config import SeafloorConfig
-from alice_survey.core.frames import Datum
 from alice_survey.sim.seafloor.terrain import Terrain, build_terrain
-from missions.values.area import Area
-from missions.values.legs import Leg, Route
-from missions.values.line import Line, LineKind
-from missions.values.plan_file import Dive, Plan
-from reconstruct.evaluate.elevation import Elevation
+from reconstruct.elevation import Elevation
 from reconstruct.evaluate.mosaic import area_in_world
 from reconstruct.evaluate.run import score_cameras
 from reconstruct.evaluate.surface import CountStations, SurfaceScore, score_surface
-from reconstruct.evaluate.truth import neighbours, surface_depth
+from reconstruct.evaluate.truth import surface_depth
 
 HOLE = [(1.0, 0.8), (1.6, 0.8), (1.6, 1.4), (1.0, 1.4)]
 AREA = MultiPolygon([
@@ -93,7 +86,7 @@ def test_sigmas_stations_and_ground_pixels_are_compared_with_the_error(terrain: 
     figures = score.to_json()
     assert figures["error_over_sigma"]["rms"] == pytest.approx(2.0, abs=0.01)
     assert figures["error_over_sigma"]["within_1_sigma"] == 0
-    assert figures["volume"]["mean_height_error_mm"] == pytest.approx(4.0, abs=0.01)
+    assert figures["height_median_mm"] == pytest.approx(4.0, abs=0.01)
     assert abs(figures["doming"]["dome_mm"]) < 0.01
     well = figures["seen_from_3_stations"]
     west = shapely.intersection(AREA, shapely.box(0, 0, 4, 1.25)).area
@@ -112,56 +105,6 @@ def test_the_area_moves_with_the_model(terrain: Terrain) -> None:
                            strict=True):  # fmt: skip
         back = SHIFT.apply([there[0], there[1], terrain.offset_ned[2]])[:2]
         np.testing.assert_allclose(back, here, atol=1e-9)
-
-
-def plan_with(lines: list[Line]) -> Plan:
-    area = Area(
-        datum=Datum(latitude_deg=32.8, longitude_deg=34.9), survey=AREA, allowed=AREA,
-        no_go=MultiPolygon(),
-    )  # fmt: skip
-    leg = Leg(
-        start_ne_m=(0.0, 0.0), heading_rad=0.0, length_m=1.0, curvature_per_m=0.0, line=0
-    )  # fmt: skip
-    dive = Dive(
-        first_line=0, last_line=len(lines) - 1, route=Route(legs=(leg,)), duration_s=5.0,
-        energy_wh=1.0,
-    )  # fmt: skip
-    return Plan(
-        name="lines", area=area, home_ne_m=(0.0, 0.0), seafloor_depth_m=10.0, altitude_m=2.0,
-        speed_mps=0.2, interval_s=1.0, exposure_s=0.003, strobe_pulse_s=0.003, strobe_lead_s=0.0,
-        footprint_m=(1.4, 1.15), line_spacing_m=1.0, station_spacing_m=0.4,
-        reached_forward_overlap=0.6, reached_side_overlap=0.3, lines=tuple(lines), dives=(dive,),
-        turn_radius_m=0.5, run_in_m=0.5, length_m=1.0, duration_s=5.0,
-        energy_wh=1.0, coverage=1.0, details={},
-    )  # fmt: skip
-
-
-def line_at(
-    along: tuple[float, float], across_m: float, heading_rad: float, kind: LineKind = "survey"
-) -> Line:
-    ahead = np.array([math.cos(heading_rad), math.sin(heading_rad)])
-    start, end = (a * ahead + across_m * np.array([-ahead[1], ahead[0]]) for a in along)
-    return Line(
-        kind=kind, start_ne_m=(start[0], start[1]), end_ne_m=(end[0], end[1]), stations=20
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize("heading_rad", [0.0, 1.1, 4.0])
-def test_neighbours_are_the_adjacent_lines_not_the_next_ones(heading_rad: float) -> None:
-    lines = [
-        line_at((0.0, 10.0), 0.0, heading_rad),
-        line_at((12.0, 20.0), 1.0, heading_rad),  # of another cell, ahead
-        line_at((0.0, 10.0), 2.0, heading_rad),
-        line_at((9.0, 2.0), 1.0, heading_rad),  # between, the other way
-        line_at((0.0, 10.0), 1.0, heading_rad, "fill"),
-        line_at((0.0, 10.0), -1.0, heading_rad + math.pi / 2, "cross"),
-    ]
-    found = {(i, j): strip for i, j, strip in neighbours(plan_with(lines))}
-    assert set(found) == {(0, 3), (2, 3)}
-    ahead = np.array([math.cos(heading_rad), math.sin(heading_rad)])
-    for strip in found.values():
-        along = np.array(strip.exterior.coords) @ ahead
-        np.testing.assert_allclose([along.min(), along.max()], [2.0, 9.0], atol=1e-9)
 
 
 def test_cameras_are_aligned_without_scale() -> None:

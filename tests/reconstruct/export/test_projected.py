@@ -12,7 +12,7 @@ import pyproj
 import pytest
 import rasterio
 
-from reconstruct.evaluate.elevation import elevation_in
+from reconstruct.elevation import elevation_in
 from reconstruct.export.projected import export_projected
 from reconstruct.views.model import read_frame
 

@@ -7,7 +7,7 @@ import rasterio
 
 from alice_survey.core.artefacts import read_json, write_json
 from reconstruct.mosaic.annotation import mosaic_tiles
-from reconstruct.mosaic.footprints import picture_footprint, surface_points, write_footprints
+from reconstruct.mosaic.footprints import hits_of, picture_footprint, write_footprints
 from reconstruct.raster import DemGrid, crs_of, transform_of
 from tests.oracles_dense import ALTITUDE_M, FOCAL, FRAME, HEIGHT, WIDTH, stereo_views
 
@@ -24,7 +24,7 @@ def test_rays_end_on_the_surface_where_the_view_projects_it() -> None:
     view = stereo_views(np.array([0.1]), np.array([-0.1]))[0]
     x, y = np.meshgrid(np.linspace(5, WIDTH - 5, 6), np.linspace(5, HEIGHT - 5, 5))
     pixels = np.column_stack([x.ravel(), y.ravel()])
-    met, ranges = surface_points(view, pixels, slope(), GRID)
+    met, ranges = hits_of(view, pixels, slope(), GRID)
     depth = 12.0 - 0.2 * met[:, 1] + 0.1 * met[:, 0]
     world = np.column_stack([met[:, 1], met[:, 0], depth])
     np.testing.assert_allclose(view.project(world), pixels, atol=0.02)

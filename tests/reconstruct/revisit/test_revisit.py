@@ -19,7 +19,7 @@ from missions.coverage.stations import Stations, join, stations_of_plan
 from missions.plan.strength import survey_costs
 from missions.route.energy import usable_wh
 from missions.values.plan_file import Plan
-from reconstruct.evaluate.elevation import Elevation
+from reconstruct.elevation import Elevation
 from reconstruct.precision.candidates import Candidate
 from reconstruct.precision.instruments import usual_rig
 from reconstruct.revisit.links import cut_around, footprints, links, pieces

@@ -7,15 +7,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import RigidTransform
+from scipy.ndimage import map_coordinates
 
-from alice_survey.core.artefacts import need_stage
 from alice_survey.core.errors import ReconstructionError
-from alice_survey.core.frames import Array, Datum
-from reconstruct.placing.alignment import align_rigid
+from alice_survey.core.frames import Array
 from reconstruct.planes import read_plane
 from reconstruct.raster import DemGrid, grid_of, read_cells
-from reconstruct.views.model import WorldFrame, read_frame
 
 _CELL_STEPS = 0.5
 """Steps of a ray's march over the grid, in cells."""
@@ -66,19 +63,11 @@ class Elevation:
         Returns:
             (...,) bilinear between the four cells around; NaN where one of them is unknown.
         """
-        rows, columns = field.shape
         x = (places_en[..., 0] - self.west) / self.cell - 0.5
         y = (self.north - places_en[..., 1]) / self.cell - 0.5
-        with np.errstate(invalid="ignore"):
-            inside = (x >= 0) & (y >= 0) & (x <= columns - 1) & (y <= rows - 1)
-        x, y = np.where(inside, x, 0.0), np.where(inside, y, 0.0)
-        column = np.minimum(x.astype(np.int64), max(columns - 2, 0))
-        row = np.minimum(y.astype(np.int64), max(rows - 2, 0))
-        right, down = np.minimum(column + 1, columns - 1), np.minimum(row + 1, rows - 1)
-        x, y = x - column, y - row
-        upper = (1 - x) * field[row, column] + x * field[row, right]
-        lower = (1 - x) * field[down, column] + x * field[down, right]
-        between: Array = np.where(inside, (1 - y) * upper + y * lower, np.nan)
+        between: Array = map_coordinates(
+            field, [y, x], np.float64, order=1, mode="constant", cval=np.nan
+        )
         return between
 
     def met_by(self, starts: Array, ways: Array) -> Array:
@@ -220,21 +209,6 @@ class StoredElevation:
         return float(known.min()) - spare, float(known.max()) + spare
 
 
-def read_elevation(workspace: Path) -> tuple[Elevation, WorldFrame]:
-    """The DEM of a workspace and the frame it lies in.
-
-    Raises:
-        WorkspaceError: the surface is not there.
-        ReconstructionError: it is empty.
-    """
-    dense = need_stage(workspace, "dense", "reconstruct")
-    frame = read_frame(need_stage(workspace, "sparse", "reconstruct") / "frame.json")
-    elevation = elevation_in(dense)
-    if not elevation.known.any():
-        raise ReconstructionError(f"{dense / 'dem.tif'}: holds no height")
-    return elevation, frame
-
-
 def elevation_in(dense: Path) -> Elevation:
     """The level DEM and its standard deviation in a folder.
 
@@ -243,11 +217,3 @@ def elevation_in(dense: Path) -> Elevation:
         WorkspaceError: a file is missing or damaged.
     """
     return StoredElevation.of(dense).whole
-
-
-def enu_from_enu(target: Datum, source: Datum) -> RigidTransform:
-    """Local east, north, up of one datum from that of another: rigid, both are tangent planes."""
-    corners = 100.0 * np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
-    ned = corners[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
-    moved = target.ned_from_geodetic(source.geodetic_from_ned(ned))
-    return align_rigid(corners, moved[:, [1, 0, 2]] * [1.0, 1.0, -1.0])

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import rasterio
 
-from reconstruct.evaluate import elevation
-from reconstruct.evaluate.elevation import StoredElevation
+from reconstruct import elevation
+from reconstruct.elevation import StoredElevation
 from reconstruct.raster import read_cells
 
 CELL, ROWS, COLUMNS = 0.02, 500, 400
