@@ -85,10 +85,7 @@ def figures_of(
     }
     areas = {"weak": multipolygon(weak), "area": plan.area.survey}
     for name, area in areas.items():
-        score = score_surface(
-            elevation, area, terrain, cameras.truth_from_world, 1.0,
-            lambda points: np.zeros(len(points), dtype=np.int64),
-        )  # fmt: skip
+        score = score_surface(elevation, area, terrain, cameras.truth_from_world, 1.0)
         found[name] = {
             "m2": round(area.area, 2),
             "completeness": round(score.completeness, 4),

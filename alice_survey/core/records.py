@@ -578,13 +578,6 @@ class Dome(JsonRecord):
     dome_mm: float | None
 
 
-class PartOfSurface(JsonRecord):
-    """Errors of a part of the surface."""
-
-    share: float
-    distance_rms_mm: float | None
-
-
 class ErrorOverSigma(JsonRecord):
     """Errors of heights over their stated sigmas."""
 
@@ -600,7 +593,7 @@ class SurfaceErrors(JsonRecord):
     ground_pixel_mm: float
     completeness_within_px: dict[str, float]
     """Share of the area, by ground pixels."""
-    seen_from_3_stations: PartOfSurface | None = None
+
     error_over_sigma: ErrorOverSigma | None = None
 
 

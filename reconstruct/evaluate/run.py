@@ -7,7 +7,6 @@ included; the mosaic is compared with the true sea floor painted at the same pla
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +40,6 @@ from reconstruct.evaluate.figures import compare_lengths, rms
 from reconstruct.evaluate.mosaic import score_mosaic
 from reconstruct.evaluate.surface import SurfaceScore, read_mesh, score_mesh, score_surface
 from reconstruct.evaluate.truth import (
-    count_stations,
     ground_pixel_m,
     overlaps_reached,
     read_true_poses,
@@ -147,9 +145,7 @@ def run_evaluate(workspace: Path, folder: Path, executor: Executor, *, seed: int
     cameras = score_cameras(read_track_poses(sparse / "track.csv"), poses, total)
     moved = cameras.truth_from_world
     pixel_m = ground_pixel_m(rig, {r.image: r.camera for r in records}, poses, terrain)
-    pictures = {r.image: (r.camera, r.station) for r in records}
-    counter = partial(count_stations, rig=rig, pictures=pictures, poses=poses, terrain=terrain)
-    surface = score_surface(elevation_in(dense), area, terrain, moved, pixel_m, counter)
+    surface = score_surface(elevation_in(dense), area, terrain, moved, pixel_m)
     mosaic, texture = workspace / "mosaic" / "mosaic.tif", survey_texture(seed)
     painted = score_mosaic(mosaic, dense / "dem.tif", area, terrain, texture, moved)
     rng = np.random.default_rng([seed, _SEED_STREAM])

@@ -1,13 +1,11 @@
 """How well surface and mesh of a simulated survey fit the true sea floor, and what is missing."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 from shapely.geometry import MultiPolygon
 
@@ -31,15 +29,8 @@ from reconstruct.evaluate.truth import surface_depth, surface_distance
 
 GOOD_M = 0.01
 """A cell counts as accurate when its distance from the true surface is below this."""
-MIN_STATIONS = 3
-"""Cells seen from this many stations are also scored separately."""
 
-_LATTICE = 4
-"""Stations are counted for every fourth cell of every fourth row; the cells around take that."""
 _STRIP_CELLS = 400_000
-
-CountStations = Callable[[Array], NDArray[np.int64]]
-"""Stations that see (N, 3) points of the true surface."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -57,10 +48,7 @@ class SurfaceScore:
 
     sigma_m: Array
     """(N,) standard deviation that the model states; NaN where it states none."""
-    stations: NDArray[np.int64]
-    """(N,) stations that see the true surface there."""
-    cells_seen_well: int
-    """Cells in the area, filled or not, that `MIN_STATIONS` see."""
+
     map_m: Array
     """(rows, columns) of `height_m`; NaN where there is no cell."""
     extent_m: tuple[float, float, float, float]
@@ -76,7 +64,7 @@ class SurfaceScore:
     def to_json(self) -> dict[str, Any]:
         """Figures in millimetres and ground pixels."""
         distance, height = 1e3 * self.distance_m, 1e3 * self.height_m
-        well = self.stations >= MIN_STATIONS
+
         stated = self.sigma_m > 0
         ratio = self.height_m[stated] / self.sigma_m[stated]
         return {
@@ -93,12 +81,6 @@ class SurfaceScore:
             "completeness_within_px": shares_within(
                 self.distance_m, self.ground_pixel_m, self.cells
             ),
-            f"seen_from_{MIN_STATIONS}_stations": {
-                "cells": self.cells_seen_well,
-                "share": round(self.cells_seen_well / self.cells, 4),
-                "completeness": json_number(float(well.sum()) / max(self.cells_seen_well, 1), 4),
-                **spread("distance", distance[well]),
-            },
             "error_over_sigma": {
                 "rms": json_number(rms(ratio), 3),
                 "robust": json_number(MAD_TO_SIGMA * median(np.abs(ratio)), 3),
@@ -116,7 +98,6 @@ def score_surface(
     terrain: Terrain,
     truth_from_world: RigidTransform,
     ground_pixel_m: float,
-    stations: CountStations,
 ) -> SurfaceScore:
     """Compare every DEM cell of the survey area with the true mesh.
 
@@ -126,7 +107,7 @@ def score_surface(
         terrain: the truth.
         truth_from_world: alignment from the model's to the true NED.
         ground_pixel_m: side of a picture's pixel on the sea floor.
-        stations: counts the stations that see points of the true surface.
+
     """
     heights, cell = surface.height, surface.cell
     rows, columns = heights.shape
@@ -149,15 +130,13 @@ def score_surface(
         distance[part] = surface_distance(terrain, points[used[part]])
     errors = np.full(filled.shape, np.nan)
     errors[used] = depth - points[used, 2]
-    seen = _stations_of_cells(place[:, :2], inside, (rows, columns), terrain, stations)
+
     return SurfaceScore(
         cells=max(round(area.area / cell**2), int(inside.sum())),
         places_ne=points[used, :2],
         distance_m=distance,
         height_m=errors[used],
         sigma_m=surface.sigma.ravel()[used],
-        stations=seen[used],
-        cells_seen_well=int((seen[inside] >= MIN_STATIONS).sum()),
         map_m=errors.reshape(heights.shape),
         extent_m=(
             surface.west + shift_ne[1],
@@ -167,29 +146,6 @@ def score_surface(
         ),
         ground_pixel_m=ground_pixel_m,
     )
-
-
-def _stations_of_cells(
-    places_ne: Array,
-    inside: NDArray[np.bool_],
-    shape: tuple[int, int],
-    terrain: Terrain,
-    stations: CountStations,
-) -> NDArray[np.int64]:
-    """(cells,) stations that see the true surface at each cell, from a lattice of cells."""
-    row, column = np.divmod(np.flatnonzero(inside), shape[1])
-    across = -(-shape[1] // _LATTICE)
-    node = (row // _LATTICE) * across + column // _LATTICE
-    nodes, first, of_cell = np.unique(node, return_index=True, return_inverse=True)
-    places = places_ne[inside][first]
-    found = np.zeros(len(nodes), dtype=np.int64)
-    for start in range(0, len(nodes), _STRIP_CELLS):
-        part = slice(start, start + _STRIP_CELLS)
-        depth = surface_depth(terrain, places[part])
-        found[part] = stations(np.column_stack([places[part], depth]))
-    seen = np.zeros(len(inside), dtype=np.int64)
-    seen[inside] = found[of_cell]
-    return seen
 
 
 _SAMPLES = 200_000

@@ -3,14 +3,12 @@
 Poses and cameras also give the overlaps that a flight reached.
 """
 
-from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 from shapely.geometry import Polygon
 
@@ -21,17 +19,12 @@ from alice_survey.core.manifest import ImageRecord
 from alice_survey.core.run import progress
 from alice_survey.core.trajectory import read_columns
 from alice_survey.sim.seafloor.terrain import Floats, Terrain
-from camera_calib.camera import Camera
 from camera_calib.rig import Rig
 from missions.values.footprint import footprint_polygon
 from missions.values.plan_file import Plan
 
 _ABOVE_M = 8.0
 """Rays start this far above the mean sea floor: far enough, and near enough for float32."""
-_MAX_RAYS = 500_000
-"""Rays that are cast at once."""
-_CLEAR_M = 0.004
-"""Height above the surface at which a ray to the camera starts, so as not to hit its own facet."""
 
 
 def read_true_poses(path: Path) -> dict[str, RigidTransform]:
@@ -107,84 +100,6 @@ def ground_pixel_m(rig: Rig, cameras: Mapping[str, str], poses: Mapping[str, Rig
     below = surface_depth(terrain, pupils[:, :2]) - pupils[:, 2]
     focal = np.array([rig.cameras[cameras[name]].focal_in_water_px for name in names])
     return float(np.nanmedian(below / focal))
-
-
-def count_stations(
-    points_ned: Array,
-    rig: Rig,
-    pictures: Mapping[str, tuple[str, int]],
-    poses: Mapping[str, RigidTransform],
-    terrain: Terrain,
-) -> NDArray[np.int64]:
-    """Stations that see each point of the true surface, exactly through their ports.
-
-    A station sees what one of its cameras has in its frame with nothing between; the way to the
-    camera is followed in the water up to the outer glass.
-
-    Args:
-        points_ned: (N, 3) on the true surface; rows of NaN are seen by none.
-        rig: true cameras.
-        pictures: camera and station by picture.
-        poses: true `ned_from_cam` by picture.
-        terrain: what may stand in the way.
-
-    Returns:
-        (N,) counts.
-    """
-    import open3d as o3d
-
-    count = np.zeros(len(points_ned), dtype=np.int64)
-    by_station: dict[int, list[str]] = defaultdict(list)
-    for name, (_, station) in pictures.items():
-        if name in poses:
-            by_station[station].append(name)
-    known = np.isfinite(points_ned).all(axis=1)
-    scene = terrain.raycasting_scene()
-    for names in by_station.values():
-        seen = np.zeros(len(points_ned), dtype=np.bool_)
-        for name in names:
-            camera, pose = rig.cameras[pictures[name][0]], poses[name]
-            near = np.flatnonzero(known & ~seen & _near(points_ned, camera, pose))
-            if not near.size:
-                continue
-            points_cam = pose.inv().apply(points_ned[near])
-            pixels = camera.project(points_cam)
-            size = np.array([camera.width_px, camera.height_px])
-            with np.errstate(invalid="ignore"):
-                inside = np.all((pixels >= 0) & (pixels < size), axis=1)
-            near, pixels = near[inside], pixels[inside]
-            if not near.size:
-                continue
-            glass = pose.apply(camera.unproject(pixels)[0])
-            ray = glass - points_ned[near]
-            length = np.linalg.norm(ray, axis=1)
-            start = points_ned[near] - terrain.offset_ned
-            rays = np.column_stack([start, ray / length[:, None]]).astype(np.float32)
-            rays[:, :3] += np.float32(_CLEAR_M) * rays[:, 3:]
-            hidden = np.zeros(len(near), dtype=np.bool_)
-            for first in range(0, len(near), _MAX_RAYS):
-                part = slice(first, first + _MAX_RAYS)
-                hits = scene.cast_rays(o3d.core.Tensor(rays[part]))["t_hit"].numpy()
-                hidden[part] = hits < length[part] - 2 * _CLEAR_M
-            seen[near[~hidden]] = True
-        count += seen
-    return count
-
-
-def _near(points_ned: Array, camera: Camera, pose: RigidTransform) -> NDArray[np.bool_]:
-    """Whether points lie in a cone about the axis that is wider than the frame."""
-    half_px = np.hypot(
-        max(camera.cx_px, camera.width_px - camera.cx_px),
-        max(camera.cy_px, camera.height_px - camera.cy_px),
-    )
-    slope = 1.3 * half_px / min(camera.fx_px, camera.fy_px)
-    offset = points_ned - pose.translation
-    axis = pose.rotation.apply([0.0, 0.0, 1.0])
-    with np.errstate(invalid="ignore"):
-        along = offset @ axis
-        away = np.linalg.norm(offset, axis=1)
-        near: NDArray[np.bool_] = (along > 0) & (away < along * np.hypot(1.0, slope))
-    return near
 
 
 def overlaps_reached(

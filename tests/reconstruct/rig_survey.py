@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +45,7 @@ from reconstruct.elevation import elevation_in
 from reconstruct.evaluate.mosaic import MosaicScore, score_mosaic
 from reconstruct.evaluate.run import CameraScore, score_cameras
 from reconstruct.evaluate.surface import SurfaceScore, score_surface
-from reconstruct.evaluate.truth import count_stations, ground_pixel_m
+from reconstruct.evaluate.truth import ground_pixel_m
 from reconstruct.placing.track import read_track_poses
 from tests.cameras import rig_of
 
@@ -222,13 +222,10 @@ def score(workspace: Path, lines: int = LINES) -> RigScore:
     cameras = score_cameras(read_track_poses(workspace / "sparse" / "track.csv"), truth, total)
     terrain = scene().terrain
     pixel_m = ground_pixel_m(rig, {r.image: r.camera for r in records}, truth, terrain)
-    counter = partial(
-        count_stations, rig=rig, pictures={r.image: (r.camera, r.station) for r in records},
-        poses=truth, terrain=terrain,
-    )  # fmt: skip
+
     moved = cameras.truth_from_world
     dense = workspace / "dense"
-    surface = score_surface(elevation_in(dense), area(lines), terrain, moved, pixel_m, counter)
+    surface = score_surface(elevation_in(dense), area(lines), terrain, moved, pixel_m)
     mosaic = score_mosaic(
         workspace / "mosaic" / "mosaic.tif", dense / "dem.tif", area(lines), terrain,
         scene().texture, moved,

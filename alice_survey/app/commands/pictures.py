@@ -442,7 +442,6 @@ class MosaicTilesCommand(WorkspaceCommand, ReportCommand):
     side: int = option(8192, "Side of a tile, px.", ge=256, le=32_767)
     overlap: int = option(0, "Overlap of neighbours, px.", ge=0)
     kind: Literal["png", "jpg", "tif"] = option("png", "Format.")
-    scale_bar: bool = option(False, "Draw one into every tile.")
 
     def run(self) -> Result:
         """Cut it."""
@@ -450,5 +449,5 @@ class MosaicTilesCommand(WorkspaceCommand, ReportCommand):
 
         return mosaic_tiles(
             self.workspace, self.output, side_px=self.side, overlap_px=self.overlap,
-            kind=self.kind, scale_bar=self.scale_bar,
+            kind=self.kind,
         )  # fmt: skip

@@ -112,14 +112,13 @@ def _stills(held: Held, *stills: tuple[str, str, str]) -> list[Figure]:
 
 def _truth(score: ScoreRecord, held: Held) -> Section:
     cameras, surface, mosaic = score.cameras, score.surface, score.mosaic
-    seen, mesh = surface.seen_from_3_stations, score.mesh
+    mesh = score.mesh
     rows = [
         ("cameras", None, cameras.max_mm, "position"),
         ("surface", None, surface.distance_max_mm, "distance from the true surface"),
         ("mosaic", mosaic.position_rms_mm, mosaic.position_95_mm, "position; the larger: 95 %"),
         ("lengths", score.lengths.rms_mm, None, f"over {length(score.lengths.mean_length_m)}"),
-        ("surface, 3 stations and more", None if seen is None else seen.distance_rms_mm, None,
-         f"{share(None if seen is None else seen.share)} of the area"),
+
         ("mesh", None if mesh is None else mesh.distance_rms_mm, None, "distance from the truth"),
     ]  # fmt: skip
     shown = [

@@ -11,7 +11,7 @@ from alice_survey.sim.seafloor.terrain import Terrain, build_terrain
 from reconstruct.elevation import Elevation
 from reconstruct.evaluate.mosaic import area_in_world
 from reconstruct.evaluate.run import score_cameras
-from reconstruct.evaluate.surface import CountStations, SurfaceScore, score_surface
+from reconstruct.evaluate.surface import SurfaceScore, score_surface
 from reconstruct.evaluate.truth import surface_depth
 
 HOLE = [(1.0, 0.8), (1.6, 0.8), (1.6, 1.4), (1.0, 1.4)]
@@ -30,18 +30,12 @@ def terrain() -> Terrain:
     return build_terrain(config, (-1.0, 4.0, -1.0, 4.0), 10.0, np.random.default_rng(1))
 
 
-def everywhere(points_ned: np.ndarray) -> np.ndarray:
-    """Three stations see every point."""
-    return np.full(len(points_ned), 3)
-
-
 def scored(
     terrain: Terrain,
     error_m: float,
     *,
     holes: float = 0.0,
     elsewhere_m: float | None = None,
-    stations: CountStations = everywhere,
 ) -> SurfaceScore:
     """The true surface as a model sees it whose world is shifted by SHIFT, with an error.
 
@@ -59,7 +53,7 @@ def scored(
     model = Elevation(
         height=heights, sigma=np.full(heights.shape, 0.002), west=-0.6, north=3.4, cell=CELL
     )
-    return score_surface(model, AREA, terrain, SHIFT, 0.0015, stations)
+    return score_surface(model, AREA, terrain, SHIFT, 0.0015)
 
 
 def test_a_true_surface_scores_zero(terrain: Terrain) -> None:
@@ -78,20 +72,13 @@ def test_an_error_and_holes_are_measured(terrain: Terrain) -> None:
     assert np.all(score.distance_m <= np.abs(score.height_m) + 1e-5)  # depths are of 32 bits
 
 
-def test_sigmas_stations_and_ground_pixels_are_compared_with_the_error(terrain: Terrain) -> None:
-    def western_half(points_ned: np.ndarray) -> np.ndarray:
-        return np.where(points_ned[:, 1] < 1.25, 3, 2)
-
-    score = scored(terrain, 0.004, stations=western_half)
-    figures = score.to_json()
+def test_sigmas_and_ground_pixels_are_compared_with_the_error(terrain: Terrain) -> None:
+    figures = scored(terrain, 0.004).to_json()
     assert figures["error_over_sigma"]["rms"] == pytest.approx(2.0, abs=0.01)
     assert figures["error_over_sigma"]["within_1_sigma"] == 0
     assert figures["height_median_mm"] == pytest.approx(4.0, abs=0.01)
     assert abs(figures["doming"]["dome_mm"]) < 0.01
-    well = figures["seen_from_3_stations"]
-    west = shapely.intersection(AREA, shapely.box(0, 0, 4, 1.25)).area
-    assert well["share"] == pytest.approx(west / AREA.area, abs=0.04)
-    assert well["completeness"] > 0.98
+
     # 4 mm in height are less in distance where the surface is steep, and 2.67 ground pixels.
     assert figures["completeness_within_px"]["3"] > 0.98
     assert figures["completeness_within_px"]["1"] < 0.1

@@ -1,17 +1,16 @@
-"""Stations that see a place, and the scores of a mesh, against closed forms."""
+"""The ground pixel and the scores of a mesh against closed forms."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
-from shapely import contains_xy
 from shapely.geometry import MultiPolygon, box
 
 from alice_survey.core.config import CameraConfig, SeafloorConfig, WaterConfig
 from alice_survey.sim.seafloor.terrain import Terrain, build_terrain
 from camera_calib.rig import Rig, design_rig
-from missions.values.footprint import footprint_polygon, level_pose
+from missions.values.footprint import level_pose
 from reconstruct.evaluate.surface import score_mesh
-from reconstruct.evaluate.truth import count_stations, ground_pixel_m, surface_depth
+from reconstruct.evaluate.truth import ground_pixel_m
 
 DEPTH_M = 10.0
 
@@ -32,30 +31,6 @@ def poses_at(rig: Rig, norths: list[float]) -> dict[str, RigidTransform]:
         f"left/{i}.png": level_pose(camera, np.array([n, 0.0]), 2.0, DEPTH_M, 0.0)
         for i, n in enumerate(norths)
     }
-
-
-def test_counts_are_those_of_the_exact_footprints(rig: Rig) -> None:
-    terrain = floor()
-    poses = poses_at(rig, [-0.6, 0.0, 0.6])
-    pictures = {name: ("left", i) for i, name in enumerate(poses)}
-    ne = np.random.default_rng(2).uniform(-1.8, 1.8, (4000, 2))
-    points = np.column_stack([ne, np.full(len(ne), DEPTH_M)])
-    found = count_stations(points, rig, pictures, poses, terrain)
-    polygons = [footprint_polygon(rig.cameras["left"], pose, DEPTH_M) for pose in poses.values()]
-    expected = sum(contains_xy(p, ne[:, 0], ne[:, 1]).astype(int) for p in polygons)
-    assert set(found) == {0, 1, 2}
-    assert (found == expected).mean() > 0.995  # the polygon has straight sides, the frame has not
-
-
-def test_what_an_object_hides_is_not_seen(rig: Rig) -> None:
-    rocky = floor(rocks=3.0)
-    poses = poses_at(rig, [0.0])
-    pictures = {"left/0.png": ("left", 0)}
-    ne = np.random.default_rng(3).uniform(-0.4, 0.4, (3000, 2))
-    above = np.column_stack([ne, surface_depth(rocky, ne)])
-    below = above + np.array([0, 0, 0.05])  # under the surface: the surface itself stands before it
-    assert count_stations(above, rig, pictures, poses, rocky).mean() > 0.95
-    assert count_stations(below, rig, pictures, poses, rocky).mean() == 0
 
 
 def test_the_ground_pixel_is_range_over_focal_length_in_water(rig: Rig) -> None:
