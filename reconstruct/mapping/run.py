@@ -54,7 +54,7 @@ from reconstruct.views.model import datum_of
 from reconstruct.views.model_files import colmap_pinhole
 
 UNREGISTERED = "unregistered.csv"
-"""In `mapping` with reasons, in `sparse` with places too."""
+"""In `mapping` and in `sparse`."""
 FEW_FEATURES = 100
 """Features of a picture below which that is why it has no matches."""
 

@@ -65,7 +65,6 @@ from reconstruct.mosaic.picture_measures import (
 )
 from reconstruct.mosaic.seams import SUPPORT_PX
 from reconstruct.mosaic.visibility import Water, find_occluders, occluders_folder
-from reconstruct.placing.track import plot_track_over
 from reconstruct.planes import PLANES, Plane, plane_folders, read_plane, turn_model, write_plane
 from reconstruct.raster import (
     BLOCK,
@@ -372,9 +371,6 @@ def paint_plane(painting: Painting, plane: Plane, dem: Path, folder: Path) -> bo
         return False
     cloud_optimised(rough, folder / "mosaic.tif", executor.local_cores)
     thumbnail(folder / "mosaic.tif", folder / "mosaic.png")
-    if plane.is_level:
-        track = painting.workspace / "sparse" / "track.csv"
-        plot_track_over(folder / "mosaic.tif", track, folder / "track.png")
     shutil.rmtree(sights)
     write_footprints(folder, model.views, outlines, model.frame)
     write_plane(folder, plane, painting.model.frame)

@@ -43,6 +43,12 @@ class _Tie:
     sigma: Array
     """(3,) sigma of `ned`."""
 
+    def residual(self, place: Similarity) -> tuple[Array, Array]:
+        """At a placement, model minus known point, (3,) metres, and what picks add, (3, 3)."""
+        turn = place.rotation.as_matrix()
+        spread = place.scale**2 * turn @ self.picked_point.covariance @ turn.T
+        return place.apply(self.picked_point.model[None])[0] - self.ned, spread
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Bar:
@@ -171,17 +177,14 @@ class ControlFit:
         model, ned = np.stack([t.picked_point.model for t in ties]), np.stack([t.ned for t in ties])
         return align_points(model, ned, known_scale)
 
-    def misfits(self, place: Similarity) -> list[tuple[Array, Array]]:
-        """Misfit (3,) and its covariance (3, 3) of each used point, metres."""
-        turn = place.rotation.as_matrix()
-        return [
-            (
-                place.apply(tie.picked_point.model[None])[0] - tie.ned,
-                place.scale**2 * turn @ tie.picked_point.covariance @ turn.T
-                + np.diag(tie.sigma**2),
-            )
-            for tie in self.used_points
-        ]
+    def misfits(self, place: Similarity) -> Array:
+        """(N,) misfits of the used points, in sigmas: root mean square of the three axes."""
+        found = []
+        for tie in self.used_points:
+            miss, spread = tie.residual(place)
+            root = np.linalg.cholesky(spread + np.diag(tie.sigma**2))
+            found.append(np.linalg.norm(np.linalg.solve(root, miss)) / np.sqrt(3.0))
+        return np.array(found)
 
     def bar_scale(
         self, known_scale: float | None, scale_sigma: float
@@ -276,29 +279,6 @@ def warn_of_contradictions(score: ControlRecord) -> None:
             )
 
 
-def describe(score: ControlRecord) -> str:
-    """The score in a few lines."""
-    lines = []
-    for use, words in (("control", "used"), ("check", "held out")):
-        rms = score.rms[use]
-        if rms.north_m is not None and rms.east_m is not None and rms.down_m is not None:
-            lines.append(
-                f"{rms.points} points {words}: rms north {1e3 * rms.north_m:.1f}, east "
-                f"{1e3 * rms.east_m:.1f}, down {1e3 * rms.down_m:.1f} mm"
-            )
-        if rms.length_m is not None and rms.length_relative is not None:
-            lines.append(
-                f"{rms.bars} lengths {words}: rms {1e3 * rms.length_m:.2f} mm, "
-                f"{100 * rms.length_relative:.3f} %"
-            )
-    if score.sigma_factor > 1.0:
-        lines.append(f"sigmas of the points are {score.sigma_factor:.2g} times those stated")
-    left_out = [row.name for row in score.points if row.use == "left out"]
-    lines += [f"{name}: left out, for the others contradict it" for name in left_out]
-    lines += [f"{name}: {why}" for name, why in score.not_found.items()]
-    return "\n".join(lines) if lines else "no control was found in the pictures"
-
-
 def _log_factor(bar: _Bar) -> tuple[float, float]:
     """Logarithm of the scale that a bar gives, and its sigma."""
     relative = np.hypot(bar.known.sigma_m / bar.known.length_m, bar.sigma_in_model / bar.in_model)
@@ -306,9 +286,7 @@ def _log_factor(bar: _Bar) -> tuple[float, float]:
 
 
 def _score_point(tie: _Tie, place: Similarity) -> PointRow:
-    residual = place.apply(tie.picked_point.model[None])[0] - tie.ned
-    turn = place.rotation.as_matrix()
-    spread = place.scale**2 * turn @ tie.picked_point.covariance @ turn.T
+    residual, spread = tie.residual(place)
     sigmas = np.sqrt(np.diag(spread) + tie.sigma**2)
     north, east, down = residual.tolist()
     return PointRow(
@@ -380,7 +358,7 @@ def without_wrong_points(control: ControlFit, known_scale: float | None) -> Cont
         place = align_points(model[triple], ned[triple], known_scale)
         if place is None:
             continue
-        off = _misfits(control, place)
+        off = control.misfits(place)
         if (
             np.partition(off, agreeing - 1)[agreeing - 1]
             < np.partition(best, agreeing - 1)[agreeing - 1]
@@ -393,7 +371,7 @@ def without_wrong_points(control: ControlFit, known_scale: float | None) -> Cont
     place = align_points(model[inside], ned[inside], known_scale)
     if place is None:
         return control
-    off = _misfits(control, place)
+    off = control.misfits(place)
     freedom = 3 * int(inside.sum()) - (7 if known_scale is None else 6)
     spread = np.sqrt(3.0 * float(np.square(off[inside]).sum()) / freedom)
     residuals = np.linalg.norm(place.apply(model) - ned, axis=1)
@@ -422,16 +400,6 @@ def _triples(count: int) -> list[list[int]]:
     return [every[k] for k in rng.choice(len(every), _MAX_TRIPLES, replace=False)]
 
 
-def _misfits(control: ControlFit, place: Similarity) -> Array:
-    """(N,) misfits of the used points, in sigmas: root mean square of the three axes."""
-    return np.array(
-        [
-            np.linalg.norm(np.linalg.solve(np.linalg.cholesky(spread), miss)) / np.sqrt(3.0)
-            for miss, spread in control.misfits(place)
-        ]
-    )
-
-
 def real_sigma_factor(control: ControlFit, place: Similarity, parameters: int) -> float:
     """Factor that sigmas of points need for what they miss by, 1 or more.
 
@@ -448,7 +416,7 @@ def real_sigma_factor(control: ControlFit, place: Similarity, parameters: int) -
 
     def excess(log_factor: float) -> float:
         coarser = widen(control, float(np.exp(log_factor)))
-        return 3.0 * float(np.square(_misfits(coarser, place)).sum()) / freedom - 1.0
+        return 3.0 * float(np.square(coarser.misfits(place)).sum()) / freedom - 1.0
 
     ratio = 1.0 + excess(0.0)
     if ratio <= 1.0 + _CHI_SIGMAS * np.sqrt(2.0 / freedom):

@@ -21,6 +21,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 from xml.etree import ElementTree as ET
@@ -30,16 +31,15 @@ import numpy as np
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError, ProjError
 
-from alice_survey.core.artefacts import need_stage, read_stage, write_csv
+from alice_survey.core.artefacts import need_stage, write_csv
 from alice_survey.core.contents import as_line, one_line, xml_root
 from alice_survey.core.errors import ReconstructionError, WorkspaceError, warn, why
 from alice_survey.core.executor import SERIAL, Executor
-from alice_survey.core.frames import Array, Datum
+from alice_survey.core.frames import Array
 from alice_survey.core.manifest import read_manifest
-from alice_survey.core.records import ControlRecord, MappingRecord, RegistrationRecord, ScaleRecord
+from alice_survey.core.records import MappingRecord, RegistrationRecord, ScaleRecord
 from reconstruct.pictures.files import list_names, safe_name
-from reconstruct.pictures.undistorted import Pictures, read_colour
-from reconstruct.placing.control import describe
+from reconstruct.pictures.undistorted import read_colour
 from reconstruct.placing.control_points import (
     CONTROL_FILE,
     MARKERS_FILE,
@@ -49,13 +49,11 @@ from reconstruct.placing.control_points import (
     KnownPoint,
     Pick,
     Use,
-    read_control,
-    read_picks,
     write_control,
     write_picks,
 )
 from reconstruct.stages import SCALE_FILE
-from reconstruct.views.model import SparseModel, read_frame, read_model
+from reconstruct.views.model import read_frame
 
 MARKER_SIGMA_PX = 0.2
 """Sigma of a corner that the detector refined."""
@@ -65,7 +63,6 @@ DICTIONARIES = (
 )  # fmt: skip
 """Dictionaries tried one after the other where none is named."""
 _HEADER = ("image", "point", "x", "y", "sigma_px")
-_TEMPLATE = ("image", "point", "x", "y", "sigma_px", "near_x", "near_y")
 _MIN_VIEWS = 2
 
 
@@ -76,12 +73,6 @@ class Marker:
     number: int
     corners: Array
     """(4, 2) clockwise from its own upper left; pixels from 0 at the first one's middle."""
-
-
-@dataclass(frozen=True)
-class _MarkerTask:
-    path: Path
-    dictionaries: tuple[str, ...]
 
 
 def find_markers(picture: Any, dictionary: str) -> list[Marker]:
@@ -104,10 +95,7 @@ def find_markers(picture: Any, dictionary: str) -> list[Marker]:
 def survey_control(
     workspace: Path, *, dictionary: str | None = None, executor: Executor = SERIAL
 ) -> tuple[str, dict[str, Any]]:
-    """Find coded markers in all pictures and prepare the picking of control points by hand.
-
-    Writes `markers.csv` (replaced), and `picks.csv` where there is none yet: a row for every point
-    of `control.csv` and every picture of a placed model that should show it, x and y left empty.
+    """Find coded markers in all pictures, and write `markers.csv`.
 
     Args:
         workspace: folder with finished `images/`.
@@ -115,8 +103,8 @@ def survey_control(
         executor: where tasks run.
 
     Returns:
-        What was found, in words and as JSON values: `dictionary`, `markers` (pictures by number),
-        `detections`, `template_rows`, and `score` of the present model if there is one.
+        What was found, as text and as JSON values: `dictionary`, `markers` (pictures by number)
+        and `detections`.
 
     Raises:
         ReconstructionError: there is no such dictionary.
@@ -128,8 +116,8 @@ def survey_control(
             f"no dictionary {dictionary!r}; there are {', '.join(_known_dictionaries())}"
         )
     tried = DICTIONARIES if dictionary is None else (dictionary,)
-    tasks = [_MarkerTask(images / name, tried) for name in names]
-    found = list(executor.map(_look, tasks, label="markers"))
+    look = partial(_look, dictionaries=tried)
+    found = list(executor.map(look, [images / name for name in names], label="markers"))
     best, views = _best_dictionary(tried, found)
     rows = [
         (name, f"{marker.number}.{k}", f"{x:.4f}", f"{y:.4f}", MARKER_SIGMA_PX)
@@ -146,17 +134,6 @@ def survey_control(
         if seen_often
         else f"no marker is in two of the {len(names)} pictures"
     ]
-    template = _write_template(workspace)
-    if template:
-        lines.append(
-            f"{template} rows to fill in: {PICKS_FILE}; pixels count from 0 at the middle of the "
-            "first, near_x and near_y say where to look; delete what is not to be seen"
-        )
-    score = None
-    if read_stage(workspace / "sparse") is not None:
-        score = ControlRecord.read_existing(workspace / ControlRecord.path)
-    if score is not None:
-        lines.append(describe(score))
     if (workspace / CONTROL_FILE).is_file():
         lines.append("run 'alice-survey reconstruct' to place the model again")
     else:
@@ -165,8 +142,6 @@ def survey_control(
         "dictionary": best if seen_often else None,
         "markers": {str(n): count for n, count in seen_often.items()},
         "detections": len(rows) // 4,
-        "template_rows": template,
-        "score": score and score.to_json(),
     }
 
 
@@ -174,9 +149,9 @@ def _known_dictionaries() -> tuple[str, ...]:
     return tuple(sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_")))
 
 
-def _look(task: _MarkerTask) -> dict[str, list[Marker]]:
-    picture = cv2.cvtColor(read_colour(task.path), cv2.COLOR_BGR2GRAY)
-    return {name: find_markers(picture, name) for name in task.dictionaries}
+def _look(path: Path, dictionaries: Sequence[str]) -> dict[str, list[Marker]]:
+    picture = cv2.cvtColor(read_colour(path), cv2.COLOR_BGR2GRAY)
+    return {name: find_markers(picture, name) for name in dictionaries}
 
 
 def _best_dictionary(
@@ -189,43 +164,6 @@ def _best_dictionary(
     }
     best = max(tried, key=lambda name: (detections[name], -tried.index(name)))
     return best, views[best]
-
-
-def _write_template(workspace: Path) -> int:
-    """Rows of a new `picks.csv`; 0 where there is one, nothing to pick, or no placed model."""
-    picks, control = workspace / PICKS_FILE, workspace / CONTROL_FILE
-    sparse = workspace / "sparse"
-    if picks.exists() or not control.is_file() or read_stage(sparse) is None:
-        return 0
-    known = read_control(control).points
-    coded = {p.point.rsplit(".", 1)[0] for p in read_picks(workspace / MARKERS_FILE)}
-    model, pictures = read_model(sparse), Pictures.open(workspace)
-    rows = [
-        (view, point.name, None, None, None, round(x - 0.5), round(y - 0.5))
-        for point in known
-        if point.name not in coded
-        for view, x, y in _expected_in(point, model, pictures)
-    ]
-    if rows:
-        write_csv(picks, _TEMPLATE, rows)
-    return len(rows)
-
-
-def _expected_in(
-    point: KnownPoint, model: SparseModel, pictures: Pictures
-) -> list[tuple[str, float, float]]:
-    """Pictures that should show a point, and where; none where the model has no CRS."""
-    datum: Datum | None = model.frame.datum
-    if datum is None:
-        return []
-    place = point.place_ned(datum)[None]
-    found = []
-    for view in model.views:
-        warp = pictures.warp(view.image)
-        x, y = warp.from_pinhole(view.project(place))[0]
-        if 0 <= x < warp.size_px[0] and 0 <= y < warp.size_px[1]:
-            found.append((view.image, float(x), float(y)))
-    return found
 
 
 def note_scale(
@@ -510,25 +448,6 @@ _MAX_BYTES = 200_000_000
 _SHOWN_NAMES = 4
 
 
-@dataclass(frozen=True, kw_only=True)
-class ImportedControl:
-    """What a workspace got."""
-
-    points: int
-    bars: int
-    checks: int
-    """Points and bars that only score the model."""
-    picks: int
-    pictures: int
-    """Pictures in which points are picked."""
-
-    def __str__(self) -> str:
-        """One line."""
-        held = f" ({self.checks} of them to check by)" if self.checks else ""
-        bars = f", {self.bars} scale bar{'s' * (self.bars > 1)}" if self.bars else ""
-        return f"{self.points} points{bars}{held}, {self.picks} picks in {self.pictures} pictures"
-
-
 def import_control(
     workspace: Path,
     path: Path,
@@ -537,8 +456,8 @@ def import_control(
     sigma_vertical_m: float | None = None,
     heights: Heights = "level",
     overwrite: bool = False,
-) -> ImportedControl:
-    """Write `control.csv` and `picks.csv` from ODM's `gcp_list.txt` or Metashape's markers.
+) -> str:
+    """Write `control.csv` and `picks.csv` from a file of another program (`_FORMATS`).
 
     Args:
         workspace: folder with finished `images/`.
@@ -548,6 +467,9 @@ def import_control(
         heights: what the file's heights count from: `level`, up from the level that depths of the
             survey count from, or `ellipsoid`, that of WGS 84.
         overwrite: replace files that are there.
+
+    Returns:
+        What the workspace got, in one line.
 
     Raises:
         WorkspaceError: the file cannot be read or is of no known format, a point's sigma is not
@@ -568,41 +490,54 @@ def import_control(
         warn(f"{path}: points without a whole place are left out: {_name_some(left)}")
     if not placed and not found.lengths:
         raise WorkspaceError(f"{path}: no point has a place")
-    level = math.nan if sigma_m is None else sigma_m
-    vertical = math.nan if sigma_vertical_m is None else sigma_vertical_m
-    points = [_with_sigmas(point, level, vertical, heights) for point in placed]
-    lengths = [bar if bar.sigma_m > 0 else replace(bar, sigma_m=level) for bar in found.lengths]
+    stated = [(point.sigma_m, point.sigma_vertical_m) for point in placed]
+    points = []
+    for point, (level, vertical) in zip(placed, stated, strict=True):
+        level = _first_above_0(level, sigma_m)
+        point = replace(
+            point, sigma_m=level,
+            sigma_vertical_m=_first_above_0(vertical, sigma_vertical_m, level),
+        )  # fmt: skip
+        if heights == "level":
+            point = replace(point, depth_m=-point.height_m, height_m=math.nan)
+        points.append(point)
+    lengths = [replace(bar, sigma_m=_first_above_0(bar.sigma_m, sigma_m)) for bar in found.lengths]
     every: list[KnownPoint | KnownLength] = [*points, *lengths]
-    for one in every:
-        if math.isnan(one.sigma_m):
-            raise WorkspaceError(
-                f"{path}: states no accuracy of {as_line(one.name)}: give --sigma, in metres"
-            )
+    unsure = next((one.name for one in every if math.isnan(one.sigma_m)), None)
+    if unsure is not None:
+        raise WorkspaceError(
+            f"{path}: states no accuracy of {as_line(unsure)}: give --sigma, in metres"
+        )
     names = [record.image for record in read_manifest(images / "manifest.csv")]
     picks, lost = _match_pictures(found.picks, {p.name for p in points} | ends, names)
+    lost_names = f"{_name_some(lost)}: not in {images}, or there more than once"
     if not picks:
         raise WorkspaceError(
-            f"{path}: none of its {len(found.picks)} picks is in a picture of {images}: "
-            f"{_name_some(lost)}"
-            if lost
-            else f"{path}: no point of known place is picked in a picture"
+            f"{path}: no point of known place is picked in a picture"
+            + (f"; {lost_names}" if lost else "")
         )
     if lost:
-        warn(
-            f"{path}: {_name_some(lost)}: not in {images}, or there more than once; picks in them "
-            "are left out"
-        )
+        warn(f"{path}: {lost_names}; picks in them are left out")
     write_control(targets[0], points, lengths)
     write_picks(targets[1], picks)
     for note in found.notes:
         warn(f"{path}: {note}")
-    return ImportedControl(
-        points=len(points),
-        bars=len(lengths),
-        checks=[one.use for one in every].count("check"),
-        picks=len(picks),
-        pictures=len({pick.image for pick in picks}),
-    )
+    checks = [one.use for one in every].count("check")
+    held = f" ({checks} of them to check by)" if checks else ""
+    bars = f", {len(lengths)} scale bar{'s' * (len(lengths) > 1)}" if lengths else ""
+    pictures = len({pick.image for pick in picks})
+    return f"{len(points)} points{bars}{held}, {len(picks)} picks in {pictures} pictures"
+
+
+def _first_above_0(*values: float | None) -> float:
+    return next((value for value in values if value is not None and value > 0), math.nan)
+
+
+_FORMATS: tuple[tuple[Callable[[str], object], Callable[[str], ForeignControl]], ...] = (
+    (lambda text: text.lstrip().startswith("<") and "<markers" in text, read_markers),
+    (_SYSTEM.match, read_gcp_list),
+)
+"""What a text of each known format looks like, and what reads it."""
 
 
 def read_foreign(path: Path) -> ForeignControl:
@@ -617,34 +552,20 @@ def read_foreign(path: Path) -> ForeignControl:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise WorkspaceError(f"{path}: cannot be read: {why(error)}") from None
+    read = next((read for looks_right, read in _FORMATS if looks_right(text)), None)
+    if read is None:
+        raise WorkspaceError(
+            f"{path}: neither a gcp_list.txt of ODM (its first line names the coordinate system) "
+            "nor markers that Metashape exported as XML"
+        )
     try:
-        if text.lstrip().startswith("<") and "<markers" in text:
-            found = read_markers(text)
-        elif _SYSTEM.match(text) is not None:
-            found = read_gcp_list(text)
-        else:
-            raise WorkspaceError(
-                f"{path}: neither a gcp_list.txt of ODM (its first line names the coordinate "
-                "system) nor markers that Metashape exported as XML"
-            )
+        found = read(text)
     except (ValueError, OverflowError) as error:
         raise WorkspaceError(f"{path}: {one_line(error)}") from None
     twice = [n for n, k in Counter(p.name for p in found.points).items() if k > 1]
     if twice:
         raise WorkspaceError(f"{path}: point {as_line(twice[0])} is there twice")
     return found
-
-
-def _with_sigmas(
-    point: KnownPoint, level_m: float, vertical_m: float, heights: Heights
-) -> KnownPoint:
-    """A point with sigmas where it has none of its own, and its height as `control.csv` has it."""
-    level = point.sigma_m if point.sigma_m > 0 else level_m
-    vertical = next((s for s in (point.sigma_vertical_m, vertical_m) if s > 0), level)
-    point = replace(point, sigma_m=level, sigma_vertical_m=vertical)
-    if heights == "ellipsoid":
-        return point
-    return replace(point, depth_m=-point.height_m, height_m=math.nan)
 
 
 def _match_pictures(

@@ -34,7 +34,8 @@ matches alone says how well they agree; the covariance of the point holds both (
 import csv
 import io
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -158,28 +159,13 @@ def read_control(path: Path) -> Control:
         WorkspaceError: it cannot be read, or a row is wrong; the message names the line.
     """
     points, lengths = [], []
-    for line, row in read_csv(path, ("kind", "name", "use"), fault=WorkspaceError)[1]:
-        if _is_comment(row):
-            continue
-        kind, name, use = row["kind"], row["name"], row["use"]
-        if use not in ("control", "check"):
-            raise WorkspaceError(f"{path} line {line}: use is {use!r}, not control or check")
-        if not name:
-            raise WorkspaceError(f"{path} line {line}: a name is missing")
-        which: Use = "control" if use == "control" else "check"
-        sigma = _positive(path, line, row, "sigma_m")
-        if kind == "point":
-            points.append(_point(path, line, row, name, which, sigma))
-        elif kind in ("bar", "marker"):
-            ends = (row.get("from", ""), row.get("to", "")) if kind == "bar" else None
-            if ends is not None and (not all(ends) or ends[0] == ends[1]):
-                raise WorkspaceError(f"{path} line {line}: a bar needs two points, from and to")
-            length = _positive(path, line, row, "length_m")
-            lengths.append(
-                KnownLength(name=name, use=which, ends=ends, length_m=length, sigma_m=sigma)
-            )
+    for row, fault in _rows(path, ("kind", "name", "use")):
+        with fault:
+            known = _known(row)
+        if isinstance(known, KnownPoint):
+            points.append(known)
         else:
-            raise WorkspaceError(f"{path} line {line}: kind is {kind!r}, not point, bar or marker")
+            lengths.append(known)
     names = [p.name for p in points]
     if len(set(names)) < len(names):
         double = next(n for n in names if names.count(n) > 1)
@@ -194,13 +180,13 @@ def read_picks(path: Path) -> list[Pick]:
         WorkspaceError: it cannot be read, or a row is wrong.
     """
     picks = []
-    for line, row in read_csv(path, ("image", "point", "x", "y"), fault=WorkspaceError)[1]:
-        if _is_comment(row) or (not row["x"] and not row["y"]):
+    for row, fault in _rows(path, ("image", "point", "x", "y")):
+        if not row["x"] and not row["y"]:
             continue
-        x, y = _number(path, line, row, "x"), _number(path, line, row, "y")
-        sigma = _number(path, line, row, "sigma_px")
-        if math.isnan(x + y) or sigma <= 0:
-            raise WorkspaceError(f"{path} line {line}: x, y and sigma_px must be numbers")
+        with fault:
+            x, y, sigma = (_number(row, name) for name in ("x", "y", "sigma_px"))
+            if math.isnan(x + y) or sigma <= 0:
+                raise ValueError("x, y and sigma_px must be numbers")
         picks.append(
             Pick(
                 image=row["image"],
@@ -212,6 +198,47 @@ def read_picks(path: Path) -> list[Pick]:
             )
         )
     return picks
+
+
+def _rows(
+    path: Path, required: Sequence[str]
+) -> Iterator[tuple[dict[str, str], AbstractContextManager[None]]]:
+    """Rows that are not comments, each with a context in which a fault names its line."""
+    for line, row in read_csv(path, required, fault=WorkspaceError)[1]:
+        if not next(iter(row.values()), "").startswith("# "):
+            yield row, _fault_of(f"{path} line {line}")
+
+
+@contextmanager
+def _fault_of(place: str) -> Iterator[None]:
+    try:
+        yield
+    except ValueError as error:
+        raise WorkspaceError(f"{place}: {error}") from None
+
+
+def _known(row: dict[str, str]) -> KnownPoint | KnownLength:
+    """What a row of `control.csv` says.
+
+    Raises:
+        ValueError: it is wrong.
+    """
+    kind, name = row["kind"], row["name"]
+    if row["use"] not in ("control", "check"):
+        raise ValueError(f"use is {row['use']!r}, not control or check")
+    if not name:
+        raise ValueError("a name is missing")
+    use: Use = "control" if row["use"] == "control" else "check"
+    sigma = _positive(row, "sigma_m")
+    if kind == "point":
+        return _point(row, name, use, sigma)
+    if kind not in ("bar", "marker"):
+        raise ValueError(f"kind is {kind!r}, not point, bar or marker")
+    ends = (row.get("from", ""), row.get("to", "")) if kind == "bar" else None
+    if ends is not None and (not all(ends) or ends[0] == ends[1]):
+        raise ValueError("a bar needs two points, from and to")
+    length = _positive(row, "length_m")
+    return KnownLength(name=name, use=use, ends=ends, length_m=length, sigma_m=sigma)
 
 
 _POINT_COLUMNS = (
@@ -240,80 +267,59 @@ def write_picks(path: Path, picks: Sequence[Pick]) -> None:
     write_csv(path, ("image", "point", "x", "y", "sigma_px"), rows)
 
 
-def _is_comment(row: dict[str, str]) -> bool:
-    return next(iter(row.values()), "").startswith("# ")
-
-
-def _point(
-    path: Path, line: int, row: dict[str, str], name: str, use: Use, sigma: float
-) -> KnownPoint:
-    keys = ("latitude_deg", "longitude_deg", "north_m", "east_m", "easting_m", "northing_m",
-            "epsg", "depth_m", "height_m", "sigma_vertical_m")  # fmt: skip
-    at = {key: _number(path, line, row, key) for key in keys}
-    known = [
-        not math.isnan(at[a] + at[b])
-        for a, b in (
-            ("latitude_deg", "longitude_deg"),
-            ("north_m", "east_m"),
-            ("easting_m", "northing_m"),
-        )
-    ]
+def _point(row: dict[str, str], name: str, use: Use, sigma: float) -> KnownPoint:
+    at = {key: _number(row, key) for key in _POINT_COLUMNS}
+    easting, northing, epsg = (_number(row, key) for key in ("easting_m", "northing_m", "epsg"))
+    places = (
+        (at["latitude_deg"], at["longitude_deg"]), (at["north_m"], at["east_m"]),
+        (easting, northing),
+    )  # fmt: skip
+    known = [not math.isnan(sum(place)) for place in places]
     if sum(known) != 1:
-        raise WorkspaceError(
-            f"{path} line {line}: point {name} needs either latitude_deg and longitude_deg, or "
-            "north_m and east_m, or easting_m, northing_m and epsg"
+        raise ValueError(
+            f"point {name} needs either latitude_deg and longitude_deg, or north_m and east_m, or "
+            "easting_m, northing_m and epsg"
         )
     if math.isnan(at["depth_m"]) == math.isnan(at["height_m"]):
-        raise WorkspaceError(f"{path} line {line}: point {name} needs either depth_m or height_m")
-    latitude, longitude = at["latitude_deg"], at["longitude_deg"]
+        raise ValueError(f"point {name} needs either depth_m or height_m")
     if known[2]:
-        longitude, latitude = _unproject(path, line, at["epsg"], at["easting_m"], at["northing_m"])
-    if known[0] and not (abs(latitude) <= 90 and abs(longitude) <= 360):
-        raise WorkspaceError(f"{path} line {line}: {latitude}, {longitude} is not a place on Earth")
-    vertical = at["sigma_vertical_m"]
-    if vertical <= 0:
-        raise WorkspaceError(f"{path} line {line}: sigma_vertical_m must be more than 0")
-    return KnownPoint(
-        name=name,
-        use=use,
-        latitude_deg=latitude,
-        longitude_deg=longitude,
-        north_m=at["north_m"],
-        east_m=at["east_m"],
-        depth_m=at["depth_m"],
-        height_m=at["height_m"],
-        sigma_m=sigma,
-        sigma_vertical_m=sigma if math.isnan(vertical) else vertical,
-    )
+        at["longitude_deg"], at["latitude_deg"] = _unproject(epsg, easting, northing)
+    if known[0] and not (abs(at["latitude_deg"]) <= 90 and abs(at["longitude_deg"]) <= 360):
+        raise ValueError(f"{places[0][0]}, {places[0][1]} is not a place on Earth")
+    if at["sigma_vertical_m"] <= 0:
+        raise ValueError("sigma_vertical_m must be more than 0")
+    if math.isnan(at["sigma_vertical_m"]):
+        at["sigma_vertical_m"] = sigma
+    return KnownPoint(name=name, use=use, **at)
 
 
-def _unproject(path: Path, line: int, epsg: float, x: float, y: float) -> tuple[float, float]:
+def _unproject(epsg: float, x: float, y: float) -> tuple[float, float]:
     from pyproj import Transformer
     from pyproj.exceptions import CRSError, ProjError
 
     try:
-        code = int(epsg)
-        place = Transformer.from_crs(code, 4326, always_xy=True).transform(x, y, errcheck=True)
+        to_wgs84 = Transformer.from_crs(int(epsg), 4326, always_xy=True)
+        longitude, latitude = to_wgs84.transform(x, y, errcheck=True)
     except (ValueError, CRSError, ProjError) as error:
-        raise WorkspaceError(f"{path} line {line}: epsg {epsg}: {error}") from None
-    return float(place[0]), float(place[1])
+        raise ValueError(f"epsg {epsg}: {error}") from None
+    return float(longitude), float(latitude)
 
 
-def _number(path: Path, line: int, row: dict[str, str], key: str) -> float:
+def _number(row: dict[str, str], key: str) -> float:
     cell = row.get(key, "")
     try:
         value = float(cell) if cell else math.nan
     except ValueError:
-        raise WorkspaceError(f"{path} line {line}: {key} is {cell!r}, not a number") from None
+        value = math.inf
     if math.isinf(value) or (cell and math.isnan(value)):
-        raise WorkspaceError(f"{path} line {line}: {key} is {cell!r}, not a number")
+        raise ValueError(f"{key} is {cell!r}, not a number")
     return value
 
 
-def _positive(path: Path, line: int, row: dict[str, str], key: str) -> float:
-    value = _number(path, line, row, key)
+def _positive(row: dict[str, str], key: str) -> float:
+    value = _number(row, key)
     if not value > 0:
-        raise WorkspaceError(f"{path} line {line}: {key} must be more than 0")
+        raise ValueError(f"{key} must be more than 0")
     return value
 
 

@@ -78,21 +78,14 @@ class FoundMount:
     """(3,) forward, right, down."""
 
     @property
-    def words(self) -> str:
-        """What was found, with its sigmas."""
-        arm = zip(self.body_from_rig.translation, self.lever_sigma_m, strict=True)
-        forward, right, down = (f"{value:+.2f} (sigma {sigma:.2g})" for value, sigma in arm)
-        return (
-            f"mount found: {nearest_mount(self.body_from_rig.rotation)}, sigma "
-            f"{self.turn_sigma_deg.max():.2g} deg; pupil {forward} m forward, {right} m right, "
-            f"{down} m down"
-        )
-
-    @property
     def record(self) -> MountRecord:
         """What `georeference.json` says."""
+        arm = zip(self.body_from_rig.translation, self.lever_sigma_m, strict=True)
+        forward, right, down = (f"{value:+.2f} (sigma {sigma:.2g})" for value, sigma in arm)
         return MountRecord(
-            words=self.words,
+            words=f"mount found: {nearest_mount(self.body_from_rig.rotation)}, sigma "
+            f"{self.turn_sigma_deg.max():.2g} deg; pupil {forward} m forward, {right} m right, "
+            f"{down} m down",
             body_from_rig=pose_to_json(self.body_from_rig),
             turn_sigma_deg=tuple(self.turn_sigma_deg.tolist()),
             lever_sigma_m=tuple(self.lever_sigma_m.tolist()),

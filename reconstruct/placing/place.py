@@ -489,8 +489,8 @@ def picks_of_model(workspace: Path, images: Collection[str]) -> list[Pick]:
     picks = [pick for path in files if path.is_file() for pick in read_picks(path)]
     if not picks:
         warn(
-            f"{CONTROL_FILE} is not used: no point is picked in {PICKS_FILE} or {MARKERS_FILE}; "
-            "'alice-survey control' finds markers and prepares picking"
+            f"{CONTROL_FILE} is not used: no point is picked in {PICKS_FILE} or {MARKERS_FILE}: "
+            "mark them in the studio's tab Pictures, or find markers with 'alice-survey control'"
         )
     strange = sorted({pick.image for pick in picks} - set(images))
     found = [pick for pick in picks if pick.image in images]

@@ -8,10 +8,6 @@ such groups are relative to each other. Each is placed by its own navigation fir
 near enough for the adjustment's linear motions of groups (see
 `reconstruct.adjustment.soft_modes.SoftModes`); the model's place then finds these motions, with
 navigation's errors correlated between groups as along the track.
-
-Pictures that are not in the model are listed with their reasons and with the place that navigation
-gives them. Navigation errs slowly: its residuals at the model just before and just after such a
-picture correct it. How well that predicts is measured on pictures in the model, across such gaps.
 """
 
 import math
@@ -24,7 +20,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.core.artefacts import read_csv, write_csv
+from alice_survey.core.artefacts import read_csv
 from alice_survey.core.config import ReconstructConfig
 from alice_survey.core.errors import WorkspaceError, collected_by, warn
 from alice_survey.core.executor import Executor
@@ -48,8 +44,7 @@ from reconstruct.adjustment.survey_fit import adjust_survey
 from reconstruct.adjustment.uncertainty import Uncertainty, write_uncertainty
 from reconstruct.mapping.arrays import cross_matrices, frames_of, model_groups
 from reconstruct.mapping.mapper import Mapped, model_baseline
-from reconstruct.mapping.run import UNREGISTERED, read_inputs
-from reconstruct.matching.pairs import positions_ned
+from reconstruct.mapping.run import UNREGISTERED, read_inputs, write_reasons
 from reconstruct.pictures.files import list_names
 from reconstruct.placing.acceptance import judge_model
 from reconstruct.placing.alignment import level
@@ -76,9 +71,6 @@ from reconstruct.placing.track import (
 from reconstruct.views.model import read_warps, write_frame
 from reconstruct.views.model_files import as_transform, read_reconstruction, rigid3d
 
-_MIN_CORRECTING = 4
-"""Pictures in the model from which navigation's error is known."""
-
 
 def read_reasons(mapping: Path) -> dict[str, str]:
     """Why pictures are not in the model, by name, as the mapping wrote it; empty if all are."""
@@ -87,74 +79,6 @@ def read_reasons(mapping: Path) -> dict[str, str]:
         return {}
     rows = read_csv(path, ("image", "reason"), exact=True, fault=WorkspaceError)[1]
     return {row["image"]: row["reason"] for _, row in rows}
-
-
-def navigation_places(
-    lost: Sequence[ImageRecord],
-    known: Mapping[str, ImageRecord],
-    rows: Sequence[TrackRow],
-    rig: Rig | None,
-    datum: Datum,
-) -> tuple[Array, Array, bool]:
-    """Place pictures by navigation, corrected by its misses at pictures in the model.
-
-    Args:
-        lost: pictures that are not in the model.
-        known: all pictures by name.
-        rows: the track.
-        rig: with its mount, or None.
-        datum: of the model's frame.
-
-    Returns:
-        (N, 3) places in NED and (N, 2) sigmas, horizontal (each of north and east) and of depth,
-        NaN where navigation has no position; and whether they were corrected.
-    """
-    places = np.array([_place(record, rig, datum) for record in lost]).reshape(-1, 3)
-    sigma = np.array([[r.sigma_horizontal_m, r.sigma_depth_m] for r in lost]).reshape(-1, 2)
-    based = [row for row in rows if known[row.image].has_position]
-    there = [n for n, record in enumerate(lost) if record.has_position]
-    corrected = len(based) >= _MIN_CORRECTING and bool(there)
-    if corrected:
-        stamps = [*(row.time_s for row in based), *(lost[n].time_s for n in there)]
-        timed = bool(np.isfinite(stamps).all())
-        times = np.array([row.time_s if timed else float(row.station) for row in based])
-        order = np.argsort(times, kind="stable")
-        based, times = [based[k] for k in order], times[order]
-        spacing = float(np.median(np.diff(np.unique(times)))) if np.ptp(times) else 0.0
-        residuals = np.array([
-            row.world_from_cam.translation - _place(known[row.image], rig, datum) for row in based
-        ])  # fmt: skip
-        for n in there:
-            at = lost[n].time_s if timed else float(lost[n].station)
-            places[n] += _between(times, residuals, at, 0.0)
-            apart = max(float(np.abs(times - at).min()), spacing)
-            left = residuals - np.array([_between(times, residuals, t, apart) for t in times])
-            rms = np.sqrt(np.nanmean(np.square(left), axis=0))
-            sigma[n] = np.sqrt(np.mean(np.square(rms[:2]))), rms[2]
-    return places, np.where(np.isnan(places[:, :1]), np.nan, sigma), corrected
-
-
-def _place(record: ImageRecord, rig: Rig | None, datum: Datum) -> Array:
-    """(3,) where navigation puts a camera, NED; NaN where it does not know."""
-    place: Array = positions_ned([record], datum)[0]
-    if rig is not None and record.has_attitude:
-        place = place + record.ned_from_body.apply(rig.body_from_cam(record.camera).translation)
-    return place
-
-
-def _between(times: Array, values: Array, at: float, apart: float) -> Array:
-    """(3,) values at a time from those just before and after it, at least so far apart from it.
-
-    At the ends, where there is one side alone, that counts.
-    """
-    before, after = np.flatnonzero(times <= at - apart), np.flatnonzero(times >= at + apart)
-    if not len(before) and not len(after):
-        return np.full(values.shape[1], np.nan)
-    first = before[-1] if len(before) else after[0]
-    last = after[0] if len(after) else before[-1]
-    span = times[last] - times[first]
-    share = (at - times[first]) / span if span > 0 else 0.0
-    return np.asarray(values[first] + share * (values[last] - values[first]))
 
 
 _MAX_TURN_RAD = 0.1
@@ -424,60 +348,25 @@ def run_sparse(
         bends = () if placed.fit is None else placed.fit.bends
         doming, accepted = judge_model(adjusted.mapped, inputs.records, rig, inputs.datum, bends)
     joints = () if shape is None or placed.fit is None else joints_of(placed.fit, shape.modes)
-    _report_unregistered(workspace, folder, inputs.records, rows, known_mount, placed)
+    _report_unregistered(workspace, folder, inputs.records, rows)
     _registration(model, mapping, placed, rows, doming, accepted, joints).write(
         folder / "registration.json"
     )
 
 
 def _report_unregistered(
-    workspace: Path,
-    folder: Path,
-    records: Sequence[ImageRecord],
-    rows: Sequence[TrackRow],
-    rig: Rig | None,
-    placed: Placed,
+    workspace: Path, folder: Path, records: Sequence[ImageRecord], rows: Sequence[TrackRow]
 ) -> None:
-    """Write which pictures are not in the model, why, and where navigation puts them."""
+    """Write which pictures are not in the model, and why."""
     registered = {row.image for row in rows}
-    lost = [record for record in records if record.image not in registered]
-    if not lost:
-        return
-    words = read_reasons(workspace / "mapping")
     mapped = CamerasRecord.read(workspace / "mapping" / "cameras.json").images
-    datum, corrected = placed.frame.datum, False
-    places, sigmas = np.full((len(lost), 3), np.nan), np.full((len(lost), 2), np.nan)
-    geodetic = places
-    if datum is not None and placed.fit is not None:
-        of_name = {record.image: record for record in records}
-        places, sigmas, corrected = navigation_places(lost, of_name, rows, rig, datum)
-        geodetic = datum.geodetic_from_ned(places)
-        count = int(np.isfinite(places[:, 0]).sum())
-        if count:
-            warn(
-                f"{count} of {len(lost)} pictures that are not in the model are placed by "
-                f"navigation alone: sparse/{UNREGISTERED}"
-            )
-    lines = []
-    for record, ned, place, sigma in zip(lost, places, geodetic, sigmas, strict=True):
-        reason = words.get(record.image, _UNKNOWN)
-        cells = [""] * 8
-        if np.isfinite(ned[0]):
-            cells = [
-                "navigation, corrected" if corrected else "navigation",
-                *(f"{v:.4f}" for v in ned),
-                *(f"{v:.10f}" for v in place[:2]),
-                *("" if np.isnan(s) else f"{s:.4g}" for s in sigma),
-            ]
-        lines.append([
-            record.image, record.camera, record.station,
-            _LEFT_OUT if record.image in mapped else reason, *cells,
-        ])  # fmt: skip
-    header = (
-        "image", "camera", "station", "reason", "placed_by", "north_m", "east_m", "depth_m",
-        "latitude_deg", "longitude_deg", "sigma_horizontal_m", "sigma_depth_m",
-    )  # fmt: skip
-    write_csv(folder / UNREGISTERED, header, lines)
+    words = read_reasons(workspace / "mapping")
+    lost = {
+        record.image: _LEFT_OUT if record.image in mapped else words.get(record.image, _UNKNOWN)
+        for record in records
+        if record.image not in registered
+    }
+    write_reasons(folder / UNREGISTERED, records, lost)
 
 
 def _read_mapping(workspace: Path, mapping: MappingRecord) -> Mapped:

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rasterio
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.artefacts import atomic_path, read_csv, write_csv, write_json
@@ -20,15 +19,6 @@ from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.frames import BODY_FROM_NADIR_CAM, Array, attitude_from_rotation
 from alice_survey.core.manifest import ImageRecord
 from alice_survey.core.run import progress
-from alice_survey.kit.document import EAST_NORTH, OWN_AXES
-from alice_survey.kit.figure import (
-    INKS,
-    EllipseCollection,
-    figure_style,
-    map_axes,
-    new_figure,
-    save_figure,
-)
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.adjustment.uncertainty import Uncertainty
 from reconstruct.mapping.arrays import cross_matrices, observations
@@ -286,39 +276,30 @@ def write_track_geojson(
     points: list[dict[str, Any]] = []
     line: dict[int, list[float]] = {}
     for row, (latitude, longitude, depth), sigma in zip(rows, places, sigmas, strict=True):
-        height = round(frame.datum.height_m - float(depth), 5)
-        at = [round(float(longitude), 10), round(float(latitude), 10), height]
+        at = [
+            round(float(longitude), 10), round(float(latitude), 10),
+            round(frame.datum.height_m - float(depth), 5),
+        ]  # fmt: skip
         line.setdefault(row.station, at)
         roll, pitch, heading = np.rad2deg(attitude_from_rotation(row.world_from_body))
+        names = ("time_s", "depth_m", "roll_deg", "pitch_deg", "heading_deg", *SIGMAS)
+        values = (row.time_s, depth, roll, pitch, heading % 360.0, *sigma)
         numbers = {
-            "time_s": row.time_s,
-            "depth_m": float(depth),
-            "roll_deg": float(roll),
-            "pitch_deg": float(pitch),
-            "heading_deg": float(heading % 360.0),
-            **dict(zip(SIGMAS, sigma.tolist(), strict=True)),
+            name: None if np.isnan(value) else round(float(value), 6)
+            for name, value in zip(names, values, strict=True)
         }
-        points.append(
-            {
-                "type": "Feature",
-                "geometry": {"type": "Point", "coordinates": at},
-                "properties": {
-                    "image": row.image,
-                    "station": row.station,
-                    "camera": row.camera,
-                    **{n: round(v, 6) if v == v else None for n, v in numbers.items()},
-                },
-            }
-        )
+        what = {"image": row.image, "station": row.station, "camera": row.camera, **numbers}
+        points.append(_feature("Point", at, what))
     features = points
     if len(line) > 1:
-        track = {
-            "type": "Feature",
-            "geometry": {"type": "LineString", "coordinates": list(line.values())},
-            "properties": {"stations": len(line), "vertical_datum": frame.vertical_datum},
-        }
-        features = [track, *points]
+        what = {"stations": len(line), "vertical_datum": frame.vertical_datum}
+        features = [_feature("LineString", list(line.values()), what), *points]
     write_json(path, {"type": "FeatureCollection", "features": features})
+
+
+def _feature(kind: str, coordinates: Sequence[Any], properties: dict[str, Any]) -> dict[str, Any]:
+    geometry = {"type": kind, "coordinates": coordinates}
+    return {"type": "Feature", "geometry": geometry, "properties": properties}
 
 
 def write_track_tum(path: Path, rows: Sequence[TrackRow]) -> None:
@@ -356,109 +337,3 @@ def read_track_poses(path: Path) -> dict[str, RigidTransform]:
         except (KeyError, ValueError) as error:
             raise WorkspaceError(f"{path} line {line}: no pose: {one_line(error)}") from None
     return poses
-
-
-_MAX_PX = 1800
-_MAX_IN = 7.0
-_TWO_SIGMA = 2.0
-
-
-@progress.step("draw the track")
-@figure_style()
-def plot_track_over(mosaic_tif: Path, track_csv: Path, path: Path) -> None:
-    """Draw the stations of a track over its mosaic, with 2-sigma ellipses.
-
-    The ellipses are of the horizontal position in the world, from `track_covariance.npz` by the
-    track where that is; they are drawn true to scale and left out where nothing places the model.
-
-    Args:
-        mosaic_tif: a mosaic of the same survey, of any size: it is read reduced.
-        track_csv: `sparse/track.csv`.
-        path: of the PNG.
-
-    Raises:
-        WorkspaceError: a file is missing or holds no track.
-    """
-    rows = [row for _, row in read_csv(track_csv, exact=True, fault=WorkspaceError)[1]]
-    if not rows:
-        raise WorkspaceError(f"{track_csv} has no picture")
-    timed = all(row["time_s"] for row in rows)
-    rows.sort(key=lambda r: (float(r["time_s"]) if timed else 0.0, int(r["station"]), r["image"]))
-    first = {int(row["station"]): row["image"] for row in reversed(rows)}
-    names = [row["image"] for row in rows if first[int(row["station"])] == row["image"]]
-    poses = read_track_poses(track_csv)
-    places = np.stack([poses[name].translation for name in names])[:, :2]
-    picture, extent, tags = _read_mosaic(mosaic_tif)
-    wide, high = extent[1] - extent[0], extent[3] - extent[2]
-    scale = _MAX_IN / max(wide, high, 1e-9)
-    figure = new_figure(max(3.0, high * scale) + 0.8, max(4.0, wide * scale) + 2.4)
-    axes = figure.subplots()
-    axes.imshow(picture, extent=extent, interpolation="bilinear")
-    axes.plot(
-        places[:, 1], places[:, 0], "o-", color=INKS[1], markersize=3.5, linewidth=0.8,
-        markeredgecolor="black", markeredgewidth=0.4, label="stations",
-    )  # fmt: skip
-    axes.plot(
-        places[0, 1], places[0, 0], "^", color="white", markeredgecolor="black", label="start"
-    )
-    ellipses = _ellipses(track_csv.with_name("track_covariance.npz"), names)
-    if ellipses is not None:
-        sizes, angle = ellipses
-        axes.add_collection(
-            EllipseCollection(
-                sizes[:, 1], sizes[:, 0], angle, units="xy", offsets=places[:, ::-1],
-                offset_transform=axes.transData, facecolor="none", edgecolor="white",
-                linewidth=0.7, alpha=0.8, zorder=3
-            )
-        )  # fmt: skip
-        largest = f"2-sigma ellipses, up to {sizes.max() / 2.0:.2g} m"
-        axes.plot([], [], "o", markerfacecolor="none", markeredgecolor="0.5", label=largest)
-    margin = 0.02 * max(wide, high)
-    axes.set_xlim(min(extent[0], places[:, 1].min()) - margin,
-                  max(extent[1], places[:, 1].max()) + margin)  # fmt: skip
-    axes.set_ylim(min(extent[2], places[:, 0].min()) - margin,
-                  max(extent[3], places[:, 0].max()) + margin)  # fmt: skip
-    axes.set_facecolor("0.15")
-    axes.grid(visible=False)
-    map_axes(
-        axes, tags.get("UNIT", "m"), names=OWN_AXES if tags.get("FRAME") == "model" else EAST_NORTH
-    )
-    axes.set_title(
-        f"Camera positions over the mosaic: {len(rows)} pictures at {len(names)} stations"
-    )
-    axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))
-    save_figure(figure, path, bbox_inches="tight")
-
-
-def _ellipses(path: Path, names: Sequence[str]) -> tuple[Array, Array] | None:
-    """Whole axes (N, 2) of 2-sigma ellipses, ascending, and their angle from east in degrees."""
-    if not path.is_file():
-        return None
-    with np.load(path, allow_pickle=False) as data:
-        if not str(data["parts"]).startswith("place"):
-            return None
-        at = {str(image): k for k, image in enumerate(data["image"])}
-        covariances = data["covariance"][[at[name] for name in names]][:, :2, :2]
-    squares, axes = np.linalg.eigh(np.nan_to_num(covariances))
-    sizes: Array = 2.0 * _TWO_SIGMA * np.sqrt(np.maximum(squares, 0.0))
-    return sizes, np.rad2deg(np.arctan2(axes[:, 0, 1], axes[:, 1, 1]))
-
-
-def _read_mosaic(path: Path) -> tuple[Array, tuple[float, float, float, float], dict[str, str]]:
-    """A mosaic reduced, (H, W, 3) from 0 to 1, dark where empty; west, east, south, north; tags."""
-    try:
-        with rasterio.open(path) as raster:
-            shrink = max(1.0, max(raster.width, raster.height) / _MAX_PX)
-            shape = (max(1, int(raster.height / shrink)), max(1, int(raster.width / shrink)))
-            bands = list(range(1, min(raster.count, 3) + 1))
-            resampling = rasterio.enums.Resampling.average
-            colour = raster.read(bands, out_shape=(len(bands), *shape), resampling=resampling)
-            valid = raster.dataset_mask(out_shape=shape) > 0
-            bounds, tags = raster.bounds, raster.tags()
-    except rasterio.errors.RasterioIOError as error:
-        raise WorkspaceError(f"{path}: no mosaic: {error}") from None
-    whole = float(np.iinfo(colour.dtype).max) if colour.dtype.kind == "u" else 1.0
-    picture = np.moveaxis(colour.astype(np.float64) / whole, 0, -1)
-    picture = np.repeat(picture, 3, axis=-1) if picture.shape[-1] == 1 else picture
-    picture = np.where(valid[..., None], np.clip(picture[..., :3], 0, 1), 0.15)
-    return picture, (bounds.left, bounds.right, bounds.bottom, bounds.top), tags

@@ -48,7 +48,7 @@ def renew(made: Path, out: Path) -> None:
     png(out / "flight.png", to_width(read(reef / "flight/track.png"), 1400))
     pair = [read(reef / f"images/{side}/{STATION:06d}.png") for side in ("left", "right")]
     jpeg(out / "pictures.jpg", side_by_side([*pair, read(reef / "pool/left/03.png")], 338))
-    surface = [cut(read(reef / "dense/dem.png")), read(reef / "mosaic/track.png")]
+    surface = [cut(read(reef / "dense/dem.png")), read(reef / "mosaic/mosaic.png")]
     jpeg(out / "surface.jpg", side_by_side(surface, 620))
     jpeg(out / "mesh.jpg", to_width(cut(read(reef / "mesh/mesh.png")), 1000))
     png(out / "errors.png", read(reef / "evaluation/errors.png"))

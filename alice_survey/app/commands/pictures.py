@@ -322,7 +322,7 @@ class MeasureCommand(WorkspaceCommand, ReportCommand):
 
 
 class ControlCommand(WorkspaceCommand, ThreadsCommand, ReportCommand):
-    """Find coded markers and prepare the picking of control points, or scale by a known length.
+    """Find coded markers in the pictures, or scale a model by a known length.
 
     Known points, bars and markers stand in WORKSPACE/control.csv; the next 'reconstruct' places
     and scales the model by those for control, and scores those for check. One length between two

@@ -302,14 +302,11 @@ def _model(held: Held, found: RegistrationRecord) -> Section:
         rows.append(("sigma of the survey's heading, level", f"{heading}, {tilt}"))
         rows.append(("mount of the rig", None if place.mount is None else place.mount.words))
     tables = [_table("Model", *rows)]
-    lost = [
-        (row["image"], row["reason"], row["placed_by"] or "not placed")
-        for row in held.rows("sparse/unregistered.csv")
-    ]
+    lost = [(row["image"], row["reason"]) for row in held.rows("sparse/unregistered.csv")]
     if lost:
         more = len(lost) - _MAX_LOST
-        rest = [(f"{more} more in sparse/unregistered.csv", "", "")] if more > 0 else []
-        header, shown = ("picture", "why", "placed by"), [*lost[:_MAX_LOST], *rest]
+        rest = [(f"{more} more in sparse/unregistered.csv", "")] if more > 0 else []
+        header, shown = ("picture", "why"), [*lost[:_MAX_LOST], *rest]
         tables.append(Table(title="Pictures not in the model", header=header, rows=shown))
     notes = held.frame.notes
     return Section(

@@ -142,7 +142,7 @@ def test_odm_lists_give_points_where_they_are_and_picks_to_the_pixel(
     found = import_control(workspace, gcp_list(tmp_path / "gcp_list.txt"), sigma_m=0.02)
     check_places(workspace)
     np.testing.assert_allclose(picks_of(workspace), [[x, y] for _, _, x, y in PICKS], atol=1e-9)
-    assert (found.points, found.checks, found.picks, found.pictures) == (3, 0, 5, 2)
+    assert found == "3 points, 5 picks in 2 pictures"
     assert {p.sigma_m for p in points_of(workspace).values()} == {0.02}
 
 
@@ -160,7 +160,8 @@ def test_metashape_markers_keep_their_accuracies_and_checks(
     found = import_control(workspace, markers_xml(tmp_path / "markers.xml"))
     check_places(workspace)
     np.testing.assert_allclose(picks_of(workspace), [[x, y] for _, _, x, y in PICKS], atol=1e-9)
-    assert (found.points, found.checks, found.picks) == (3, 1, 5)  # what is not pinned is no pick
+    # What is not pinned is no pick.
+    assert found == "3 points (1 of them to check by), 5 picks in 2 pictures"
     points = points_of(workspace)
     assert [points[n].use for n in "ABC"] == ["control", "check", "control"]
     assert [points[n].sigma_m for n in "ABC"] == [0.01, 0.01, 0.03]
@@ -251,7 +252,8 @@ def test_scale_bars_of_metashape_become_bars(workspace: Path, ends: str, placed:
         path.write_text(re.sub(r"<reference>.*?</reference>", "", text))
     with keep_warnings() as said:
         found = import_control(workspace, path)
-    assert (found.points, found.bars, found.checks) == ((3, 2, 2) if placed else (0, 2, 1))
+    counts = (3, 2) if placed else (0, 1)
+    assert found.startswith("{} points, 2 scale bars ({} of them to check by)".format(*counts))
     assert any("B_D, B_C" in text for text in said)
     lengths = {bar.name: bar for bar in read_control(workspace / "control.csv").lengths}
     assert set(lengths) == {"short", "A_C"}

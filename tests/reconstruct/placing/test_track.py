@@ -4,13 +4,10 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
-import rasterio
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.frames import Array, Datum, attitude_from_rotation, rotation_from_attitude
 from reconstruct.adjustment.soft_modes import SoftModes, no_modes
 from reconstruct.adjustment.uncertainty import Uncertainty
@@ -21,15 +18,12 @@ from reconstruct.placing.track import (
     SIGMAS,
     TrackRow,
     attitude_sigmas_deg,
-    plot_track_over,
     pose_covariances,
     read_track_poses,
     track_sigmas,
-    write_covariances,
     write_track_csv,
     write_track_geojson,
 )
-from reconstruct.raster import DemGrid, crs_of, transform_of
 from reconstruct.views.model import WorldFrame
 
 DATUM = Datum(32.8236, 34.9553)
@@ -237,35 +231,3 @@ def test_geojson_is_where_the_cameras_are(tmp_path: Path) -> None:
         assert point["properties"]["heading_deg"] == pytest.approx(heading, abs=1e-5)
         assert point["properties"]["sigma_north_m"] is None
     assert points[2]["properties"]["time_s"] is None
-
-
-def write_green(path: Path) -> None:
-    """A mosaic of one colour."""
-    grid = DemGrid(west=-6.0, north=6.0, cell=0.02, columns=600, rows=600)
-    profile = {
-        "driver": "GTiff", "width": 600, "height": 600, "count": 3, "dtype": "uint8",
-        "crs": crs_of(FRAME), "transform": transform_of(grid),
-    }  # fmt: skip
-    with rasterio.open(path, "w", **profile) as raster:
-        raster.write(np.full((3, 600, 600), [[[40]], [[120]], [[60]]], np.uint8))
-
-
-def test_the_figure_shows_the_mosaic_and_the_stations_on_it(tmp_path: Path) -> None:
-    write_green(tmp_path / "mosaic.tif")
-    track = rows()
-    covariances = np.stack([np.diag([0.25, 0.04, 0.01, 0, 0, 0])] * 3)
-    write_track_csv(tmp_path / "track.csv", track, FRAME, track_sigmas(track, covariances))
-    figures = []
-    for stated in (True, False):
-        path = tmp_path / "track_covariance.npz"
-        if stated:
-            write_covariances(path, [row.image for row in track], covariances, "place")
-        else:
-            path.unlink()
-        plot_track_over(tmp_path / "mosaic.tif", tmp_path / "track.csv", tmp_path / "t.png")
-        figures.append(cv2.imread(str(tmp_path / "t.png")))
-    green = np.all(np.abs(figures[0].astype(int) - [60, 120, 40]) < 6, axis=2).mean()
-    assert 0.2 < green < 0.95
-    assert figures[0].shape != figures[1].shape or (figures[0] != figures[1]).any()  # ellipses
-    with pytest.raises(WorkspaceError):
-        plot_track_over(tmp_path / "none.tif", tmp_path / "track.csv", tmp_path / "t.png")
