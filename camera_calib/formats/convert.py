@@ -5,23 +5,34 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from scipy.optimize import least_squares
+from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.core.errors import CalibrationError, warn
-from camera_calib.approximation.residual import COLMAP_PARAMETERS, Residual, approximations
+from alice_survey.core.errors import CalibrationError, ConfigError, warn
+from alice_survey.core.frames import Array
 from camera_calib.camera import Camera
 from camera_calib.formats import colmap, gyroflow, metashape, opencv, rigs, yaml_files
+from camera_calib.formats.camera_files import MODELS
 from camera_calib.formats.fields import camera_name, read_text
 from camera_calib.formats.opencv_model import distorts, is_fisheye
 from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.lenses.opencv import OpenCVLens
+from camera_calib.lenses.values import FOCAL_AND_CENTRE
 from camera_calib.mount import mount_line, with_mount
 from camera_calib.ports.dome import DomePort
 from camera_calib.ports.none import NO_PORT
 from camera_calib.rig import Rig, read_rig, write_rig
 
 _TERMS = {rigs.K3: ("k3",), rigs.RATIONAL: ("k4", "k5", "k6"), rigs.PRISM: ("s1", "s2", "s3", "s4")}
+
+
+_GRID, _DISTANCES = 15, 9
+"""Places along each side of the frame, and distances, at which a camera without port is fitted."""
+_CANCELLING_PX = 0.01
+"""Penalty of a distortion coefficient of 1: of coefficients that cancel in FULL_OPENCV's fraction,
+the smallest are taken; the residual grows by less than 1 % for it."""
 
 
 def _read_own(path: Path, _: rigs.ReadOptions) -> Rig:
@@ -148,7 +159,7 @@ def convert(task: Conversion) -> tuple[str, dict[str, Any]]:
         of_target(task.target) if task.target_format is None else format_named(task.target_format)
     )
     rig = _change(_read(source, task.source, task.reading), task)
-    prices: Mapping[str, Residual] = {}
+    prices: Mapping[str, StandIn] = {}
     if task.water is not None:
         if task.drop_port:
             raise CalibrationError("--water and --drop-port: one of them, cameras in water or air")
@@ -175,7 +186,7 @@ def convert(task: Conversion) -> tuple[str, dict[str, Any]]:
     for name, price in prices.items():
         near_m, far_m = task.water or (0.0, 0.0)
         lines.append(
-            f"{name}: {price.stand_in.model} for {near_m:g} to {far_m:g} m of water misses the "
+            f"{name}: {price.model} for {near_m:g} to {far_m:g} m of water misses the "
             f"exact camera by {price.rms_px:.3f} px rms, {price.max_px:.3f} px at most"
         )
     if len(rig.cameras) > 1:
@@ -188,7 +199,7 @@ def convert(task: Conversion) -> tuple[str, dict[str, Any]]:
         "written": [str(path) for path in written],
         "cameras": {name: camera.to_json() for name, camera in rig.cameras.items()},
         "price": {
-            name: {"model": one.stand_in.model, "rms_px": one.rms_px, "max_px": one.max_px}
+            name: {"model": one.model, "rms_px": one.rms_px, "max_px": one.max_px}
             for name, one in prices.items()
         },
         "baseline_m": rig.baseline_m if len(rig.cameras) > 1 else None,
@@ -296,9 +307,24 @@ def _best_model(camera: Camera, target: rigs.CalibrationFormat) -> str:
     return "OPENCV_FISHEYE" if rigs.FISHEYE in target.holds else "FULL_OPENCV"
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StandIn:
+    """A camera without port that stands in for one behind a port, and what it leaves."""
+
+    model: str
+    """COLMAP's name of its lens model."""
+    camera: Camera
+    approx_from_cam: RigidTransform
+    """From the exact camera's frame to its own."""
+    rms_px: float
+    """Error over the frame's area and the distances."""
+    max_px: float
+    """Largest error in the frame, its corners included, at any of the distances."""
+
+
 def in_water(
     rig: Rig, near_m: float, far_m: float, models: Mapping[str, str]
-) -> tuple[Rig, Mapping[str, Residual]]:
+) -> tuple[Rig, Mapping[str, StandIn]]:
     """The rig for other software under water that has no port model.
 
     Each camera is the best fit, over the frame and the interval of distances, of a camera with
@@ -309,40 +335,97 @@ def in_water(
         rig: exact.
         near_m: nearest distance from the entrance pupil along the axis.
         far_m: farthest.
-        models: by camera, each a name of `COLMAP_PARAMETERS`.
+        models: by camera, each a name of `MODELS`.
 
     Returns:
-        The rig, whose cameras are as in air and without covariance, and by camera what the fit
-        leaves.
+        The rig, whose cameras are as in air and without covariance, and by camera the fit.
 
     Raises:
         CalibrationError: a part of a frame sees nothing, or the fit is no lens over all of it.
         ConfigError: the interval is empty or reaches into a port.
     """
     fits = {
-        name: approximations(camera, near_m, far_m, models=(models[name],))[-1]
-        for name, camera in rig.cameras.items()
+        name: fit_in_water(one, near_m, far_m, models[name]) for name, one in rig.cameras.items()
     }
-    cameras = {name: _stand_in(rig.cameras[name], fit) for name, fit in fits.items()}
-    for name, one in cameras.items():
-        if not np.isfinite(one.unproject(one.border())[1]).all():
+    for name, fit in fits.items():
+        if not np.isfinite(fit.camera.unproject(fit.camera.border())[1]).all():
             raise CalibrationError(
                 f"the best {models[name]} of {name} folds back inside the frame: choose a format "
                 "that holds fisheyes"
             )
-    poses = {}
-    for name, fit in fits.items():
-        turn = fit.stand_in.approx_from_cam
-        place = -turn.apply(fit.stand_in.centre_m)
-        poses[name] = RigidTransform.from_components(place, turn) * rig.cam_from_rig[name]
     words = ", ".join(dict.fromkeys(models.values()))
-    source = f"{rig.source}; best {words} in water, {near_m:g} to {far_m:g} m"
-    return replace(rig, cameras=cameras, cam_from_rig=poses, source=source, covariance=None), fits
+    fitted = replace(
+        rig,
+        cameras={name: fit.camera for name, fit in fits.items()},
+        cam_from_rig={n: fit.approx_from_cam * rig.cam_from_rig[n] for n, fit in fits.items()},
+        source=f"{rig.source}; best {words} in water, {near_m:g} to {far_m:g} m",
+        covariance=None,
+    )
+    return fitted, fits
 
 
-def _stand_in(camera: Camera, fit: Residual) -> Camera:
-    stand_in = fit.stand_in
-    values = dict(zip(COLMAP_PARAMETERS[stand_in.model], stand_in.params, strict=True))
-    focal = {f"{name}_px": values.pop(name) for name in ("fx", "fy", "cx", "cy")}
-    kind = FisheyeLens if stand_in.model == "OPENCV_FISHEYE" else OpenCVLens
-    return replace(camera, lens=kind(**focal, **values), port=NO_PORT)
+def fit_in_water(camera: Camera, near_m: float, far_m: float, model: str) -> StandIn:
+    """Fit a camera without port to the exact rays of one behind a port, by least squares.
+
+    Unknown are a shift along the port's axis, a turn (as bundle adjustment finds with a tilted
+    port) and the model's parameters; nine distances count alike.
+
+    Args:
+        camera: exact.
+        near_m: nearest distance from the entrance pupil along the axis.
+        far_m: farthest.
+        model: OPENCV, FULL_OPENCV or OPENCV_FISHEYE.
+
+    Raises:
+        ConfigError: the interval is empty or reaches into the port.
+        CalibrationError: a part of the frame sees nothing.
+    """
+    glass = float(np.nanmax(camera.unproject(camera.border(8))[0][:, 2], initial=0.0))
+    glass = max(float(camera.front_cam[2]), glass)
+    if not glass < near_m < far_m < np.inf:
+        raise ConfigError(
+            f"distances {near_m:g} to {far_m:g} m: give near < far, both beyond the port's outer "
+            f"glass, {glass:g} m from the entrance pupil"
+        )
+    pixels = camera.frame_grid(_GRID, _GRID)
+    points = np.stack([camera.at_depth(pixels, z) for z in np.linspace(near_m, far_m, _DISTANCES)])
+    if not np.all(np.isfinite(points)):
+        raise CalibrationError(
+            "a part of the frame sees nothing: the lens model or the port does not reach the "
+            "corners"
+        )
+    side = np.r_[0.5, np.ones(_GRID - 2), 0.5] / (_GRID - 1)
+    weights = np.sqrt(np.outer(side, side) / _DISTANCES)[..., None]
+    axis = np.array(camera.port.axis_cam)
+    kind = FisheyeLens if model == "OPENCV_FISHEYE" else OpenCVLens
+    names = MODELS[model][1]
+
+    def pose(unknowns: Array) -> RigidTransform:
+        turn = Rotation.from_rotvec(unknowns[1:4])
+        return RigidTransform.from_components(-turn.apply(unknowns[0] * axis), turn)
+
+    def errors(unknowns: Array) -> Array:
+        fx, fy, cx, cy, *terms = unknowns[4:]
+        matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        project = cv2.fisheye.projectPoints if kind is FisheyeLens else cv2.projectPoints
+        seen = pose(unknowns).apply(points.reshape(-1, 3))[:, None]
+        found = project(seen, np.zeros(3), np.zeros(3), matrix, np.array(terms))[0]
+        misses: Array = found.reshape(_DISTANCES, _GRID, _GRID, 2) - pixels
+        return misses
+
+    def cost(unknowns: Array) -> Array:
+        return np.append(errors(unknowns) * weights, _CANCELLING_PX * unknowns[8:])
+
+    stretch = camera.port.magnification
+    start = [stretch * camera.fx_px, stretch * camera.fy_px, camera.cx_px, camera.cy_px]
+    first = np.array([0.0] * 4 + start + [0.0] * (len(names) - 4))
+    found = least_squares(cost, first, x_scale="jac", max_nfev=200).x
+    sizes = np.linalg.norm(errors(found), axis=-1)
+    values = dict(zip((*FOCAL_AND_CENTRE, *names[4:]), found[4:].tolist(), strict=True))
+    return StandIn(
+        model=model,
+        camera=replace(camera, lens=kind(**values), port=NO_PORT),
+        approx_from_cam=pose(found),
+        rms_px=float(np.sqrt(np.sum((sizes * weights[..., 0]) ** 2))),
+        max_px=float(sizes.max()),
+    )
