@@ -6,15 +6,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
-import numpy as np
 
 from alice_survey.core.errors import CalibrationError
 from alice_survey.core.executor import Executor
 from camera_calib.calibrate.picture_sets import PictureSet
 from camera_calib.calibration import TargetView
 from camera_calib.picture_files import is_cut_short, read_pixels
-from camera_calib.targets.detect import Detection, detect_with_reasons
-from camera_calib.targets.grow import chessboard_size
+from camera_calib.targets.detect import (
+    Detection,
+    as_grey,
+    chessboard_size,
+    detect_with_reasons,
+)
 from camera_calib.targets.target import Rejection, Target
 
 _CHECKED = 3
@@ -102,8 +105,7 @@ def _look(job: tuple[Path, Target, bool]) -> _Seen:
         detection = Detection(pixels=None, refused=str(error))
     board = None
     if check and target.kind == "chessboard" and detection.pixels is not None:
-        grey = picture if picture.dtype == np.uint8 else (picture >> 8).astype(np.uint8)
-        board = chessboard_size(grey)
+        board = chessboard_size(as_grey(picture))
     return _Seen(size=(width, height), detection=detection, board=board)
 
 

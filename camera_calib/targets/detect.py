@@ -29,7 +29,6 @@ from camera_calib.targets.grow import (
     board_map,
     from_neighbours,
     grown_chessboard,
-    largest_chessboard,
     spans_board,
 )
 from camera_calib.targets.pattern import surroundings
@@ -44,7 +43,7 @@ from camera_calib.targets.target import (
 
 Picture = NDArray[np.uint8] | NDArray[np.uint16]
 
-_MIN_POINTS, _MIN_AROUND = 6, 16
+_MIN_POINTS, _MIN_AROUND, _MIN_SIDE = 6, 16, 4
 _MAX_OFF, _ALWAYS_NEAR, _NEAR_AT_RIM = 0.2, 0.02, 0.1
 """Largest distance of a point from its prediction by its neighbours, in squares; those that are
 always allowed, amidst the neighbours and where they are on one side."""
@@ -158,30 +157,30 @@ def as_grey(picture: Picture) -> Grey:
     return linear
 
 
+def chessboard_size(grey: Grey) -> tuple[int, int] | None:
+    """How many inner corners a chessboard has along its longer and its shorter side.
+
+    Of one that is hidden in part, or larger than the picture, those of a part of it; None where
+    there is none.
+    """
+    picture = reduce_picture(grey, SMALL_PX).picture
+    least = (_MIN_SIDE, _MIN_SIDE)
+    found, _, colours = cv2.findChessboardCornersSBWithMeta(picture, least, cv2.CALIB_CB_LARGER)
+    if not found:
+        return None
+    shorter, longer = sorted(colours.shape)
+    return longer, shorter
+
+
 def _no_chessboard(target: Target, grey: Grey) -> str:
     """What was found in place of the whole chessboard."""
-    board = largest_chessboard(reduce_picture(grey, SMALL_PX).picture)
-    if board is None:
+    size = chessboard_size(grey)
+    if size is None:
         return f"no chessboard is found, of {target.columns}x{target.rows} inner corners or another"
-    sides, expected = sorted(board.shape[:2]), sorted(target.shape)
-    if sides[0] <= expected[0] and sides[1] <= expected[1]:
-        return _in_part(target, np.isfinite(board[..., 0]), {})
     return (
-        f"a chessboard of {sides[1]}x{sides[0]} inner corners is seen, or a part of one, not one "
-        f"of {target.columns}x{target.rows}"
-    )
-
-
-def _in_part(target: Target, seen: NDArray[np.bool_], dropped: Mapping[str, int]) -> str:
-    """Why a chessboard of which only some corners are found, (rows, columns), is not used."""
-    sides = sorted(np.ptp(at) + 1 if len(at) else 0 for at in np.nonzero(seen))
-    counts = "" if sides == sorted(target.shape) else "its counts are others, or "
-    why = "; ".join(f"{count}: {reason}" for reason, count in dropped.items())
-    return (
-        f"{int(seen.sum())} inner corners are found, in {sides[1]}x{sides[0]}, of the "
-        f"{target.columns}x{target.rows} of the target, of which half and a quarter of each outer "
-        f"row and column are needed: {counts}glare, shadow, a hand or the picture's border hides "
-        "the others" + (f" ({why})" if why else "")
+        f"a chessboard of {size[0]}x{size[1]} inner corners is seen, or a part of one, not one of "
+        f"{target.columns}x{target.rows}: its counts are others, or glare, shadow, a hand or the "
+        "picture's border hides too much"
     )
 
 
@@ -215,7 +214,12 @@ def _refine(target: Target, grey: Grey, near: Array) -> Detection:
         refused = f"only {int(used.sum())} of {len(used)} points, {needed}"
         return Detection(pixels=None, refused=f"{refused} ({why})" if why else refused)
     if target.kind == "chessboard" and not spans_board(used.reshape(target.shape)):
-        return Detection(pixels=None, refused=_in_part(target, used.reshape(target.shape), dropped))
+        rows, columns = (int(np.ptp(at)) + 1 for at in np.nonzero(used.reshape(target.shape)))
+        why = (
+            f"{int(used.sum())} of {len(used)} inner corners are found, in {columns}x{rows}; half "
+            "of all and a quarter of each outer row and column are needed"
+        )
+        return Detection(pixels=None, refused=why)
     return Detection(pixels=corners.pixels, sigma_px=corners.sigma_px, dropped=dropped)
 
 

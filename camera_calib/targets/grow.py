@@ -6,7 +6,6 @@ known ones are added until none does. A board whose outer rows and columns are s
 many corners as they must, is known whole, whatever is hidden in between.
 """
 
-import math
 from collections import Counter
 from collections.abc import Iterator
 
@@ -44,7 +43,6 @@ _WEAKEST = 0.1
 _ALIKE_NEAR = 6
 """Known corners whose contrast is compared with."""
 _MIN_CORNERS = 9
-_MAX_SIDE = 100
 _MIN_SHARE = 0.5
 """Share of the corners that must be fitted."""
 _MIN_OUTER_SHARE = 0.25
@@ -69,13 +67,18 @@ def grown_chessboard(picture: NDArray[np.uint8], shape: tuple[int, int]) -> Arra
         (rows * columns, 2) pixels from the outer corner of the first pixel, in any numbering; NaN
         rows were not found. None when the board was not found.
     """
-    for known in _boards(picture, max(shape)):
-        grid = _spread(known)
-        if grid.shape[:2] != shape:
-            grid = np.swapaxes(grid, 0, 1)
-        if grid.shape[:2] != shape:
+    taken = np.empty((0, 2))
+    for start in _starts(picture):
+        apart = np.linalg.norm(taken[:, None] - np.array(list(start.values())), axis=-1)
+        if np.any(apart < _APART_PX):
             continue
-        if spans_board(np.isfinite(grid[..., 0])):
+        known = _grow(picture, start, max(shape))
+        if len(known) < _MIN_CORNERS:
+            continue
+        taken = np.concatenate([taken, np.array(list(known.values()))[:, :2]])
+        grid = _spread(known)
+        grid = grid if grid.shape[:2] == shape else np.swapaxes(grid, 0, 1)
+        if grid.shape[:2] == shape and spans_board(np.isfinite(grid[..., 0])):
             return grid.reshape(-1, 2)
     return None
 
@@ -87,31 +90,6 @@ def spans_board(seen: NDArray[np.bool_]) -> bool:
     return bool(seen.mean() >= _MIN_SHARE and outer >= _MIN_OUTER_SHARE)
 
 
-def chessboard_size(picture: NDArray[np.uint8]) -> tuple[int, int] | None:
-    """How many inner corners, along the longer and the shorter side, a chessboard has.
-
-    Args:
-        picture: (H, W) grey values of 8 bits.
-
-    Returns:
-        The size of the largest chessboard, or part of one, in the picture; None: there is none.
-    """
-    board = largest_chessboard(picture)
-    if board is None:
-        return None
-    shorter, longer = sorted(board.shape[:2])
-    return longer, shorter
-
-
-def largest_chessboard(picture: NDArray[np.uint8]) -> Array | None:
-    """(rows, columns, 2) corners of the largest chessboard, or part of one, in a picture.
-
-    NaN where a corner was not found; None: there is none.
-    """
-    boards = [_spread(known) for known in _boards(picture, _MAX_SIDE)]
-    return max(boards, key=lambda board: math.prod(board.shape[:2]), default=None)
-
-
 def _spread(known: Places) -> Array:
     """(rows, columns, 2) the known corners on their grid, NaN where none is known."""
     places = np.array(list(known))
@@ -121,20 +99,6 @@ def _spread(known: Places) -> Array:
     for (x, y), corner in known.items():
         grid[y - low[1], x - low[0]] = corner[:2]
     return grid
-
-
-def _boards(picture: NDArray[np.uint8], longest: int) -> Iterator[Places]:
-    """Boards grown from the starts in a picture, each found once."""
-    taken = np.empty((0, 2))
-    for start in _starts(picture):
-        corners = np.array(list(start.values()))
-        apart = np.linalg.norm(taken[:, None] - corners[None], axis=-1)
-        if np.any(apart < _APART_PX):
-            continue
-        known = _grow(picture, start, longest)
-        if len(known) >= _MIN_CORNERS:
-            taken = np.concatenate([taken, np.array(list(known.values()))[:, :2]])
-            yield known
 
 
 def _starts(picture: NDArray[np.uint8]) -> Iterator[Places]:

@@ -1,8 +1,7 @@
 """Print a target at true scale: a PDF, with a bar to check the printer."""
 
 import io
-import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -53,8 +52,7 @@ def lay_out(target: Target, paper: str | None = None) -> Sheet:
         paper: a name in `PAPERS_MM`; without it the page is as large as the target needs.
 
     Raises:
-        CalibrationError: the paper is unknown, or the target does not fit; then the message says
-            how large it could be.
+        CalibrationError: the paper is unknown, or the target does not fit.
     """
     left, top, right, bottom = (1e3 * side for side in target.outline)
     width, height = right - left, bottom - top
@@ -83,43 +81,17 @@ def lay_out(target: Target, paper: str | None = None) -> Sheet:
 
 
 def _on_paper(target: Target, needed: tuple[float, float], paper: str) -> tuple[float, float]:
-    known = {name.lower(): name for name in PAPERS_MM}
+    known = {name.lower(): size for name, size in PAPERS_MM.items()}
     if paper.lower() not in known:
         raise CalibrationError(f"no paper '{paper}'; take one of {', '.join(PAPERS_MM)}")
-    name = known[paper.lower()]
-    upright = PAPERS_MM[name]
-    pages = [upright, upright[::-1]]
-    for page in pages:
+    width, height = known[paper.lower()]
+    for page in ((width, height), (height, width)):
         if needed[0] <= page[0] and needed[1] <= page[1]:
             return page
     raise CalibrationError(
-        f"{target.description} needs a page of {needed[0]:.0f} x {needed[1]:.0f} mm, {name} has "
-        f"{upright[0]:g} x {upright[1]:g} mm: {_advice(target, pages)}"
+        f"{target.description} needs a page of {needed[0]:.0f} x {needed[1]:.0f} mm, {paper} has "
+        f"{width:g} x {height:g} mm: take larger paper, or fewer or smaller squares"
     )
-
-
-def _advice(target: Target, pages: list[tuple[float, float]]) -> str:
-    """Largest possible target on one of the pages."""
-    left, top, right, bottom = (1e3 * side for side in target.outline)
-    scale = max(
-        min(
-            (page[0] - 2.0 * _MARGIN_MM) / (right - left),
-            (page[1] - 2.0 * _MARGIN_MM - _STRIP_MM) / (bottom - top),
-        )
-        for page in pages
-    )
-    size_mm = math.floor(scale * target.size_m * 1e4) / 10.0
-    larger = "take larger paper, fewer squares"
-    if size_mm < 1.0:
-        return larger
-    fitting = replace(
-        target,
-        size_m=size_mm * 1e-3,
-        marker_m=None
-        if target.marker_m is None
-        else math.floor(target.marker_m / target.size_m * size_mm * 10.0) * 1e-4,
-    )
-    return f"{larger}, or at the most '{fitting.description}'"
 
 
 def _bar(x: float, y: float) -> Array:

@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from camera_calib.targets.grow import chessboard_size, grown_chessboard, spans_board
+from camera_calib.targets.detect import chessboard_size
+from camera_calib.targets.grow import grown_chessboard, spans_board
 from camera_calib.targets.target import parse_target
 from tests.oracles_targets import picture_light, seen_from, to_srgb, true_pixels
 
