@@ -147,7 +147,7 @@ def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], object]) -> 
     if previous is not None and previous.digest == digest:
         if partial.exists():
             shutil.rmtree(partial)
-        progress.skip_stage(stage.name)
+        progress.current().report("stage_skipped", stage=stage.name)
         return False
 
     marker = partial / ".digest"

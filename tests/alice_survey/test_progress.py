@@ -13,8 +13,7 @@ from alice_survey.core.artefacts import Stage, run_stage
 from alice_survey.core.errors import keep_warnings, warn
 from alice_survey.core.executor import progress as counted
 from alice_survey.core.run import progress
-from alice_survey.core.run.display import Console
-from alice_survey.core.run.events import Event, LogFile, event_of
+from alice_survey.core.run.events import Console, Event, EventFile, event_of
 from alice_survey.core.run.progress import Run
 
 
@@ -185,10 +184,10 @@ def test_lines_say_what_took_long_and_stay_alive(
     assert shown.err.splitlines() == [
         "sparse (2 of 5): mapping",
         "mapping: matching 29 of 100 after 29 s, about 1 min 12 s left",
-        "matching: 50 done in 50.0 s",
-        "adjustment: done in 3.0 s",
+        "mapping: matching: 50 done in 50 s",
+        "mapping: adjustment: done in 3.0 s",
         "mapping: working for 1 min 25 s",
-        "mapping: done in 2 min 05 s",
+        "mapping: done in 2 min 05 s, 1 MiB at most",
     ]
 
 
@@ -245,7 +244,7 @@ class Full(io.StringIO):
 def test_a_full_disk_of_the_log_costs_one_warning(
     room: int, clock: Clock, kept: Kept, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    log = LogFile(tmp_path / "run.log")
+    log = EventFile(tmp_path / "run.log")
     log.setStream(Full(room))  # type: ignore[arg-type]
     with progress.reported_to(Run(Console(clock=clock), [log, kept], clock=clock, ticks=False)):
         for name in ("one", "two"):

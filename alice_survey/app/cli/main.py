@@ -3,6 +3,7 @@
 import gc
 import inspect
 import os
+import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,7 +15,7 @@ from pydantic import ValidationError
 from alice_survey.app.commands import COMMANDS
 from alice_survey.app.commands.base import CommandModel, WorkspaceCommand, option
 from alice_survey.core.contents import first_fault
-from alice_survey.core.errors import ConfigError, known_fault, note
+from alice_survey.core.errors import known_fault, note
 
 CONTEXT = {"help_option_names": ["-h", "--help"]}
 _SHARED = ("workspace", "survey", "threads", "scheduler", "cluster", "device", "as_json", "quiet",
@@ -237,12 +238,6 @@ def main() -> None:
 
 def _with_log_files(arguments: list[str]) -> list[str]:
     """Arguments with `--log-file` for `--events`, which it was in the last version."""
-    found = list(arguments)
-    for i, argument in enumerate(arguments):
-        name, equals, value = argument.partition("=")
-        if name == "--events":
-            note("--events FILE is now --log-file FILE.jsonl, and is gone in the next version")
-            if not (value if equals else "".join(arguments[i + 1 : i + 2])).endswith(".jsonl"):
-                raise ConfigError("--events: give the file a name that ends in .jsonl")
-            found[i] = f"--log-file{equals}{value}"
-    return found
+    if any(one.partition("=")[0] == "--events" for one in arguments):
+        note("--events is now --log-file, and is gone in the next version")
+    return [re.sub(r"^--events(?=$|=)", "--log-file", one) for one in arguments]

@@ -63,7 +63,7 @@ class CommandModel(BaseModel):
     """Fields that a page of the studio may set."""
     quiet: bool = option(False, "Show warnings, errors and the result alone.", "-q", "--quiet")
     log_file: list[Path] | None = option(
-        None, "Add all that happens, with times, to this file; as JSON lines to a .jsonl.",
+        None, "Add all that happens to this file, as lines of JSON.",
         metavar="FILE",
     )  # fmt: skip
 

@@ -1,7 +1,7 @@
-"""Events of a run, and the files that record them.
+"""Events of a run, and where they go: lines on standard error, and a file of JSON lines.
 
-An events file holds one JSON object a line, a log file one line of text an event; both are only
-ever added to, and a file that can no longer be written costs a warning, never the run.
+A file holds one JSON object a line and is only ever added to; one that can no longer be written
+costs a warning, never the run.
 """
 
 import contextlib
@@ -10,12 +10,16 @@ import logging
 import os
 import sys
 import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
-from alice_survey.core.errors import WorkspaceError, warn, why
+from alice_survey.core.errors import WorkspaceError, say, warn, why
 
-_LOGGED_EVERY_S = 30.0
+_LONG_S = 2.0
+"""A step or a stage that took less gets no line."""
+_ALIVE_EVERY_S = 30.0
 _LOCK = threading.RLock()
 """Lock of all files: one that cannot be written warns, and the others record that."""
 
@@ -30,10 +34,47 @@ def event_of(record: logging.LogRecord) -> Event:
     return event
 
 
-class _LinesFile(logging.FileHandler):
-    """A file to whose end whole lines are written, at once."""
+class Console(logging.Handler):
+    """Plain lines on standard error: warnings, notes, stages, and steps that took long."""
 
-    kind: ClassVar[str]
+    def __init__(
+        self, *, quiet: bool = False, clock: Callable[[], float] = lambda: time.monotonic()
+    ) -> None:
+        """Begin.
+
+        Args:
+            quiet: show warnings alone.
+            clock: monotonic, s.
+        """
+        super().__init__(logging.WARNING if quiet else logging.INFO)
+        self.quiet = quiet
+        self.has_bars = not quiet and sys.stderr.isatty()
+        self._clock = clock
+        self._last_s = clock()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write the line of an event, if it has one."""
+        event, now_s = event_of(record), self._clock()
+        silent = now_s - self._last_s >= _ALIVE_EVERY_S
+        match event["event"]:
+            case "note":
+                has_line = not event.get("shown")
+            case "step_progress" | "stage_runs":
+                has_line = silent and not self.has_bars
+            case "step_finished":
+                has_line = event["complete"] and event["elapsed_s"] > _LONG_S
+            case "stage_finished":
+                has_line = event["took_s"] > _LONG_S
+            case name:
+                has_line = name in ("warning", "stage_started")
+        if has_line:
+            say(("warning: " if event["event"] == "warning" else "") + event_text(event))
+        if has_line or (silent and event["event"] == "step_started"):
+            self._last_s = now_s  # before such a step nothing was running
+
+
+class EventFile(logging.FileHandler):
+    """A file to whose end events are written at once, each as a line of JSON."""
 
     def __init__(self, path: Path) -> None:
         """Open it.
@@ -44,7 +85,7 @@ class _LinesFile(logging.FileHandler):
         self.path = path
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            super().__init__(path, encoding="utf-8", errors="backslashreplace")
+            super().__init__(path, encoding="utf-8")
             with contextlib.suppress(OSError), path.open("rb") as file:
                 file.seek(-1, os.SEEK_END)
                 if file.read(1) != b"\n" and self.stream:  # a line that a full disk has cut
@@ -56,6 +97,10 @@ class _LinesFile(logging.FileHandler):
         """Share one lock."""
         self.lock = _LOCK
 
+    def format(self, record: logging.LogRecord) -> str:
+        """One line."""
+        return json.dumps(event_of(record), allow_nan=False)
+
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 (a name of logging)
         """Write no further."""
         error = sys.exception()
@@ -63,7 +108,7 @@ class _LinesFile(logging.FileHandler):
             super().handleError(record)
             return
         self.setLevel(logging.CRITICAL + 1)
-        warn(f"the {self.kind} file {self.path} is written no further: {why(error)}")
+        warn(f"the log file {self.path} is written no further: {why(error)}")
 
     def close(self) -> None:
         """Close it; what a full disk could not take is lost."""
@@ -71,93 +116,45 @@ class _LinesFile(logging.FileHandler):
             super().close()
 
 
-class EventFile(_LinesFile):
-    """Events as JSON lines."""
-
-    kind = "events"
-
-    def format(self, record: logging.LogRecord) -> str:
-        """One line."""
-        return json.dumps(event_of(record), allow_nan=False)
-
-
-class LogFile(_LinesFile):
-    """Events as lines of time, level and text."""
-
-    kind = "log"
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(path)
-        self._last_s: dict[int, float] = {}
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Write the events that matter to a reader."""
-        event = event_of(record)
-        if event["event"] == "step_progress":
-            number, elapsed_s = event["step_number"], event["elapsed_s"]
-            if elapsed_s - self._last_s.get(number, 0.0) < _LOGGED_EVERY_S:
-                return
-            self._last_s[number] = elapsed_s
-        super().emit(record)
-
-    def format(self, record: logging.LogRecord) -> str:
-        """A line of time, level and text; details are indented."""
-        event = event_of(record)
-        lines = event_text(event).splitlines() or [""]
-        return f"{event['time_utc']} {record.levelname} " + "\n    ".join(lines)
-
-
 def event_text(event: Event) -> str:
-    """An event in words; further lines are details."""
-    text = event.get("message", "")
-    of_stage = f"{event['stage']}: " if "stage" in event else ""
+    """An event in words."""
+    text, stage = str(event.get("message", "")), event.get("stage", "")
+    of_stage = f"{stage}: " if stage else ""
+    took_s = float(event.get("took_s", event.get("elapsed_s", 0.0)))
     match event["event"]:
         case "run_started":
-            versions = ", ".join(f"{name} {number}" for name, number in event["versions"].items())
-            return f"run started: {event['command']}\nin {event['folder']}, with {versions}"
+            return f"run started: {event['command']}"
         case "run_finished":
-            return f"run finished: exit code {event['exit_code']} after {event['elapsed_s']:.1f} s"
+            return f"run finished: exit code {event['exit_code']} after {duration(took_s)}"
         case "stage_started":
-            return f"stage {text}" + (", resumed" if event.get("resumed") else "")
+            return text + (", resumed" if event.get("resumed") else "")
         case "stage_skipped":
             return f"{of_stage}up to date"
+        case "stage_runs":
+            return f"{of_stage}working for {duration(took_s)}"
         case "stage_finished":
-            return (
-                f"{of_stage}finished in {event['took_s']:.1f} s, {event['cpu_s']:.1f} s of "
-                f"processor time, {event['peak_mib']:.0f} MiB at most"
-            )
-        case "step_started":
-            return f"{of_stage}{event['step']} ..."
-        case "step_progress":
-            return f"{of_stage}{how_far(event)}"
-        case "step_finished":
-            return f"{of_stage}{step_end_text(event)}"
-        case "error" if "traceback" in event:
-            return f"{text}\n{event['traceback'].rstrip()}"
-    return str(text)
+            return f"{of_stage}done in {duration(took_s)}, {event['peak_mib']:.0f} MiB at most"
+        case "step_started" | "step_progress" | "step_finished":
+            return of_stage + _step_text(event)
+    return text
 
 
-def how_far(event: Event) -> str:
-    """Progress of a running step, its elapsed time and its remaining time."""
+def _step_text(event: Event) -> str:
+    """How far a step is, with its elapsed and its remaining time, or how it has ended."""
+    step, took = event["step"], duration(event["elapsed_s"])
     count = f" {event['done']}" if "done" in event else ""
     total = f" of {event['total']}" if count and "total" in event else ""
     left = f", about {duration(event['remaining_s'])} left" if "remaining_s" in event else ""
-    return f"{event['step']}{count}{total} after {duration(event['elapsed_s'])}{left}"
-
-
-def step_end_text(event: Event) -> str:
-    """A step that has ended, or was given up."""
-    count = f"{event['done']} " if "done" in event else ""
-    how = "done in" if event.get("complete", True) else "given up after"
-    return f"{event['step']}: {count}{how} {event['elapsed_s']:.1f} s"
+    if event["event"] == "step_finished":
+        return f"{step}:{count} {'done in' if event['complete'] else 'given up after'} {took}"
+    return f"{step}{count}{total} after {took}{left}"
 
 
 def duration(seconds: float) -> str:
     """A duration in words."""
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    minutes, rest = divmod(whole, 60)
+    if seconds < 9.95:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
     if minutes < 60:
-        return f"{minutes} min {rest:02} s"
+        return f"{minutes} min {rest:02} s" if minutes else f"{rest} s"
     return f"{minutes // 60} h {minutes % 60:02} min"

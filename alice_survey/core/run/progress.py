@@ -1,31 +1,42 @@
 """Progress of a run: what it is doing, how much is done and the remaining time.
 
 Work is reported through three context managers, `part`, `stage` and `step`, wherever it is done.
-Reports become events, records of the package's logger, which the screen, a log and an events file
-take from there.
+Reports become events, records of the package's logger, which the screen and an events file take
+from there.
 """
 
 import contextlib
 import logging
+import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, TextIO, cast
 
-from rich.progress import Task
+from rich.console import Console as Terminal
+from rich.progress import (
+    BarColumn,
+    Progress,
+    SpinnerColumn,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
-from alice_survey.core.errors import LOG, is_in_task
-from alice_survey.core.run.display import Console, progress_bars
-from alice_survey.core.run.events import Event
+from alice_survey.core.errors import LOG, is_in_task, outliving
+from alice_survey.core.run.events import Console, Event
 
 _REPORTED_EVERY_S = 0.5
 """Time between two progress events of a step."""
 _ALIVE_EVERY_S = 5.0
 """Time between two such events where nothing changes."""
 _TICK_S = 1.0
+_PACE_S = 300.0
+"""Recent time that the remaining time of a step is estimated from."""
 _LEVELS = {"warning": logging.WARNING, "error": logging.ERROR}
 
 _QUANTILES = 101
@@ -112,7 +123,7 @@ class Run:
         self.stages_begun = 0
         self._console, self._log = console, log
         self._handlers = [*([console] if console else []), *files]
-        self._bars = progress_bars(clock, shown=console is not None and console.has_bars)
+        self._bars = _progress_bars(clock, shown=console is not None and console.has_bars)
         self._started_s = clock()
         self._stages: list[tuple[str, Task]] = []
         self._steps: list[Step] = []
@@ -140,32 +151,33 @@ class Run:
                 handler.close()
 
     def report(self, name: str, message: str | None = None, **facts: Any) -> None:
-        """Report something that is neither a stage nor a step."""
-        elapsed_s = self.clock() - self._started_s
-        self._emit(self._event(name, elapsed_s=elapsed_s, message=message, **facts))
-
-    def skip_stage(self, name: str) -> None:
-        """A stage is up to date."""
-        elapsed_s = self.clock() - self._started_s
-        self._emit({**self._event("stage_skipped", elapsed_s=elapsed_s), "stage": name})
-
-    def begin_stage(self, name: str, title: str, facts: Mapping[str, Any]) -> None:
-        """A stage begins; the user sees its title."""
+        """Report an event; its time is that of the run unless the facts say otherwise."""
         with self._lock:
-            self._stages.append((name, self.begin_task(name, None)))
+            event = self._event(name, message, **facts)
+            text = event.get("message", "")
+            self._log.log(_LEVELS.get(name, logging.INFO), text, extra={"event": event})
+
+    @contextlib.contextmanager
+    def stage(self, name: str, title: str, **facts: Any) -> Iterator[Callable[..., None]]:
+        """A stage is worked on; the user sees its title. It has failed without facts at its end."""
+        last = dict[str, Any]()
+        with self._lock:
+            task = self.begin_task(name, None)
+            self._stages.append((name, task))
             self.stages_begun += 1
-            self._emit(self._event("stage_started", elapsed_s=0.0, message=title, **facts))
-
-    def end_stage(self, facts: Mapping[str, Any] | None) -> None:
-        """It ends; without facts it has failed."""
-        with self._lock:
-            for step in list(self._steps):  # of generators that nobody went on with
-                self.end_step(step, complete=False)
-            _, task = self._stages[-1]
-            if facts is not None:
-                self._emit(self._event("stage_finished", elapsed_s=task.elapsed, **facts))
-            self._stages.pop()
-            self._end_task(task)
+            self.report("stage_started", title, elapsed_s=0.0, **facts)
+        complete = False
+        try:
+            yield last.update
+            complete = True
+        finally:
+            with self._lock:
+                for step in list(self._steps):  # of generators that nobody went on with
+                    self.end_step(step, complete=False)
+                if complete:
+                    self.report("stage_finished", elapsed_s=task.elapsed, **last)
+                self._stages.pop()
+                self._end_task(task)
 
     def begin_step(self, label: str, total: int | None) -> Step:
         """A step begins."""
@@ -173,7 +185,7 @@ class Run:
             self._steps_begun += 1
             step = Step(self, label, self._steps_begun, total)
             self._steps.append(step)
-            self._emit_step("step_started", step)
+            self._report_step("step_started", step)
             return step
 
     def advance(self, step: Step, items: int) -> None:
@@ -183,23 +195,22 @@ class Run:
             if step in self._steps:
                 self._bars.update(step.task.id, advance=items, count=count)
             if self.clock() - step.reported_s >= _REPORTED_EVERY_S:
-                self._emit_step("step_progress", step)
+                self._report_step("step_progress", step)
 
     def end_step(self, step: Step, *, complete: bool) -> None:
         """End it, successful or not; a second call has no effect."""
         with self._lock:
-            if step not in self._steps:
-                return
-            self._emit_step("step_finished", step, complete=complete, **step.cost)
-            self._steps.remove(step)
-            self._end_task(step.task)
+            if step in self._steps:
+                self._report_step("step_finished", step, complete=complete, **step.cost)
+                self._steps.remove(step)
+                self._end_task(step.task)
 
     def tick(self) -> None:
         """Report steps, or a stage without one, that have been silent for a while."""
         with self._lock:
             for step in self._steps:
                 if self.clock() - step.reported_s >= _ALIVE_EVERY_S:
-                    self._emit_step("step_progress", step)
+                    self._report_step("step_progress", step)
             if self._stages and not self._steps and self._console and not self.is_quiet:
                 event = self._event("stage_runs", elapsed_s=self._stages[-1][1].elapsed)
                 self._console.emit(logging.makeLogRecord({"event": event}))
@@ -218,45 +229,70 @@ class Run:
         if not self._bars.tasks and not self._bars.disable:
             self._bars.stop()
 
-    def _event(self, name: str, **known: Any) -> Event:
+    def _event(self, name: str, message: str | None = None, **facts: Any) -> Event:
         utc = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
         stage = self._stages[-1][0] if self._stages else None
-        if known.get("elapsed_s") is not None:
-            known["elapsed_s"] = round(known["elapsed_s"], 3)
-        event = {"time_utc": utc, "event": name, "stage": stage, **known}
-        return {key: value for key, value in event.items() if value is not None}
+        elapsed_s = facts.pop("elapsed_s", self.clock() - self._started_s)
+        known = {"time_utc": utc, "event": name, "stage": stage} | facts
+        known |= {"elapsed_s": round(elapsed_s, 3), "message": message}
+        return {key: value for key, value in known.items() if value is not None}
 
-    def _emit_step(self, name: str, step: Step, **facts: Any) -> None:
+    def _report_step(self, name: str, step: Step, **facts: Any) -> None:
         step.reported_s = self.clock()
-        self._emit(
-            self._event(
-                name,
-                step=step.label,
-                step_number=step.number,
-                done=step.done,
-                total=step.total,
-                elapsed_s=step.task.elapsed,
-                remaining_s=step.remaining_s if name == "step_progress" else None,
-                **facts,
-            )
-        )
-
-    def _emit(self, event: Event) -> None:
-        level = _LEVELS.get(event["event"], logging.INFO)
-        with self._lock:
-            self._log.log(level, event.get("message", ""), extra={"event": event})
+        remaining_s = step.remaining_s if name == "step_progress" else None
+        self.report(
+            name, step=step.label, step_number=step.number, done=step.done, total=step.total,
+            elapsed_s=step.task.elapsed, remaining_s=remaining_s, **facts,
+        )  # fmt: skip
 
     def _complete(self, record: logging.LogRecord) -> bool:
         """Convert a record that is only a message, a note or a warning, to an event."""
         if "event" not in vars(record):
             name = "note" if record.levelno < logging.WARNING else "warning"
-            elapsed_s = self.clock() - self._started_s
-            record.event = self._event(name, elapsed_s=elapsed_s, message=record.getMessage())
+            record.event = self._event(name, record.getMessage())
         return True
 
     def _tick_often(self) -> None:
         while not self._closed.wait(_TICK_S):
             self.tick()
+
+
+class _OutlivedTerminal:
+    """A terminal that may close while the work goes on."""
+
+    def __init__(self, file: TextIO) -> None:
+        self._file = file
+
+    def write(self, text: str) -> int:
+        with outliving():
+            self._file.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with outliving():
+            self._file.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+
+def _progress_bars(clock: Clock, *, shown: bool) -> Progress:
+    """Progress of running stages and steps, each a bar at the foot of a terminal if shown."""
+    return Progress(
+        SpinnerColumn(),
+        TextColumn("{task.description}", markup=False),
+        BarColumn(bar_width=30),
+        TextColumn("{task.fields[count]}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(compact=True),
+        console=Terminal(file=cast(TextIO, _OutlivedTerminal(sys.stderr))),
+        transient=True,
+        redirect_stdout=False,
+        refresh_per_second=8,
+        speed_estimate_period=_PACE_S,
+        get_time=clock,
+        disable=not shown,
+    )
 
 
 _runs: list[Run] = []
@@ -300,8 +336,7 @@ def part(name: str, number: int, of: int) -> Iterator[None]:
         _part.reset(token)
 
 
-@contextlib.contextmanager
-def stage(name: str, **facts: Any) -> Iterator[Callable[..., None]]:
+def stage(name: str, **facts: Any) -> contextlib.AbstractContextManager[Callable[..., None]]:
     """A stage is worked on; what is yielded takes the facts to report at its end.
 
     Args:
@@ -310,19 +345,7 @@ def stage(name: str, **facts: Any) -> Iterator[Callable[..., None]]:
     """
     whole = _part.get()
     title = whole if whole.split(" (")[0] == name else f"{whole}: {name}" if whole else name
-    run, last = current(), dict[str, Any]()
-    run.begin_stage(name, title, facts)
-    complete = False
-    try:
-        yield last.update
-        complete = True
-    finally:
-        run.end_stage(last if complete else None)
-
-
-def skip_stage(name: str) -> None:
-    """A stage is up to date."""
-    current().skip_stage(name)
+    return current().stage(name, title, **facts)
 
 
 @contextlib.contextmanager

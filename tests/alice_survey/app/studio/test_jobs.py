@@ -103,7 +103,7 @@ def test_progress_is_published_and_the_end_kept(tmp_path: Path) -> None:
     with jobs_in(tmp_path) as later:
         assert later.history() == [ended]
         texts = [line["text"] for line in later.log(1)["lines"]]
-    assert texts[1] == "stage plan" and texts[-1].startswith("run finished: exit code 0")
+    assert texts[1] == "plan" and texts[-1].startswith("run finished: exit code 0")
 
 
 def test_stop_ends_its_whole_group_as_ctrl_c_does(tmp_path: Path) -> None:
