@@ -30,7 +30,7 @@ from reconstruct.elevation import elevation_in
 from reconstruct.evaluate.run import score_cameras
 from reconstruct.evaluate.surface import score_surface
 from reconstruct.evaluate.truth import read_true_poses
-from reconstruct.pictures.joining import join_dives
+from reconstruct.pictures.importing import join_dives
 from reconstruct.placing.track import read_track_poses
 from reconstruct.revisit.run import revisit_report
 

@@ -10,7 +10,7 @@ import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime, timedelta, tzinfo
+from datetime import timedelta, tzinfo
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -19,14 +19,29 @@ from typing import ClassVar
 import numpy as np
 from pydantic import Field
 
-from alice_survey.core.artefacts import JsonRecord, Stage, run_stage
-from alice_survey.core.errors import ImageError, WorkspaceError, keep_warnings, warn
+from alice_survey.core.artefacts import (
+    JsonRecord,
+    Stage,
+    need_stage,
+    read_stage,
+    run_stage,
+    write_json,
+)
+from alice_survey.core.errors import (
+    CalibrationError,
+    ImageError,
+    PlanError,
+    WorkspaceError,
+    keep_warnings,
+)
 from alice_survey.core.executor import SERIAL, Executor
-from alice_survey.core.manifest import read_manifest, write_manifest
-from alice_survey.core.records import PicturesRecord, PlaceRecord
+from alice_survey.core.manifest import ImageRecord, read_manifest, write_manifest
+from alice_survey.core.records import PicturesRecord
 from camera_calib.freedom import part_of_rig
 from camera_calib.rig import Rig, read_rig, write_rig
 from missions.logs.navigation_csv import NavigationLog, find_zone, read_navigation
+from missions.values.legs import Route
+from missions.values.plan_file import Plan, read_plan
 from reconstruct.pictures.files import (
     ADVICE,
     VIDEO,
@@ -42,7 +57,6 @@ from reconstruct.pictures.incoming import (
     COPIES,
     MIRRORED,
     UNDECODABLE,
-    Incoming,
     camera_names,
     check_entries,
     check_rig,
@@ -50,13 +64,14 @@ from reconstruct.pictures.incoming import (
     find_entries,
     level_of_log,
     mask_of,
+    pair_by_time,
     place_records,
     readings_of,
     record_of,
+    take_bag,
     unique_names,
     with_time,
 )
-from reconstruct.pictures.pairing import pair_by_time, take_bag
 from reconstruct.pictures.videos import (
     DEFAULT_OVERLAP,
     Recording,
@@ -64,8 +79,11 @@ from reconstruct.pictures.videos import (
     read_recordings,
     take_frames,
 )
+from reconstruct.stages import rig_file
 
+_NO_HEADER = "headers that cannot be read"
 _ADVICE = {
+    _NO_HEADER: "copy them from the camera again",
     UNDECODABLE: "copy them from the camera again",
     MIRRORED: "save them as they are seen, without an EXIF orientation",
     COPIES: "each file counts once",
@@ -119,11 +137,19 @@ class ImportRecord(JsonRecord):
     left_out: dict[str, tuple[str, ...]]
     """Names by reason, of what folders hold and is not imported."""
     positions: int = 0
-    """Number of pictures with a known position."""
+    """Number of pictures with a known position; of a preview, of the headers with GPS."""
     readings: dict[str, int] = Field(default_factory=dict)
     """Pictures by what navigation measured of them."""
     changed: bool = Field(False, exclude=True)
     """False when all was there already."""
+
+    @property
+    def omissions(self) -> list[str]:
+        """A line for each reason: how many were left out, such as which, and what to do."""
+        return [
+            f"left out: {len(names)} {reason} ({list_names(names, _NAMED)}); {_ADVICE[reason]}"
+            for reason, names in self.left_out.items()
+        ]
 
     @property
     def lines(self) -> list[str]:
@@ -134,10 +160,7 @@ class ImportRecord(JsonRecord):
         return [
             *(f"{name}: {row}" for name, row in self.cameras.items() if known),
             *(f"{name}: {row}" for name, row in self.recordings.items()),
-            *(
-                f"left out: {len(names)} {reason} ({list_names(names, _NAMED)}); {_ADVICE[reason]}"
-                for reason, names in self.left_out.items()
-            ),
+            *self.omissions,
         ]
 
     def __str__(self) -> str:
@@ -150,6 +173,24 @@ class ImportRecord(JsonRecord):
         for name, count in self.readings.items():
             text += f", {count} with {name}" if count > self.positions else ""
         return "\n".join([text, *self.lines])
+
+
+class Preview(ImportRecord):
+    """What an import would find."""
+
+    pictures: int
+    looked_at: int
+    """How many headers were read."""
+    size_mb: float
+    """On disk; a workspace holds a copy."""
+    videos: int
+    video_s: float
+    first_utc: str | None
+    last_utc: str | None
+    """Times of the first and the last picture that states one, ISO 8601."""
+    navigation: str
+    """What a navigation log holds and how many of the times fall into it; empty without one."""
+    warnings: tuple[str, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,6 +230,34 @@ class ImportScan:
         if self.navigation is None:
             return None
         return read_navigation(self.navigation, self.zone, ())
+
+    def record(
+        self,
+        cameras: Mapping[str, CameraRow],
+        kinds: Mapping[str, int],
+        frames: Mapping[str, int],
+        left_out: Mapping[str, Sequence[str]],
+    ) -> ImportRecord:
+        """What came in, and what did not: by its content, then by what folders hold besides."""
+        lost = {reason: list(names) for reason, names in left_out.items() if names}
+        for folder in self.every_folder:
+            for reason, paths in folder.left_out.items():
+                lost.setdefault(reason, []).extend(str(p.relative_to(folder.folder)) for p in paths)
+        return ImportRecord(
+            cameras=dict(cameras),
+            kinds=dict(kinds),
+            recordings={
+                recording.name: RecordingRow(
+                    files=tuple(file.path.name for file in recording.files),
+                    frames=frames.get(recording.name, 0),
+                    duration_s=recording.duration_s,
+                    start=recording.start and recording.start.isoformat(" ", "seconds"),
+                    clock=recording.clock,
+                )
+                for recording in self.recordings
+            },
+            left_out={reason: tuple(names) for reason, names in lost.items()},
+        )
 
 
 def scan_sources(
@@ -245,30 +314,6 @@ _DROPPED_SHARE = 0.02
 """Folders of a rig's cameras hold equally many pictures, but for this share that one dropped."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Preview:
-    """What an import would find."""
-
-    cameras: Mapping[str, CameraRow]
-    pictures: int
-    looked_at: int
-    """How many headers were read."""
-    kinds: Mapping[str, int]
-    size_mb: float
-    """On disk; a workspace holds a copy."""
-    masks: int
-    videos: int
-    video_s: float
-    first_utc: str | None
-    last_utc: str | None
-    """Times of the first and the last picture that states one, ISO 8601."""
-    with_gps: int
-    """Of those looked at."""
-    navigation: str
-    """What a navigation log holds and how many of the times fall into it; empty without one."""
-    warnings: tuple[str, ...]
-
-
 def preview_import(
     folders: Sequence[Path] = (),
     *,
@@ -292,7 +337,6 @@ def preview_import(
             time_zone=time_zone, rig=rig,
         )  # fmt: skip
         log, recordings = scan.log, scan.recordings
-    warnings += [line for folder in scan.every_folder for line in folder.warnings()]
     rows, facts = dict[str, CameraRow](), list[PictureFacts]()
     for name, paths in scan.pictures.items():
         # Some headers, evenly spread, with the first and the last.
@@ -309,30 +353,41 @@ def preview_import(
             )  # fmt: skip
     if scan.rig is not None:
         check_rig({name: (row.width_px, row.height_px) for name, row in rows.items()}, scan.rig)
-    faulty = [one.path.name for one in facts if one.fault]
-    if faulty:
-        names_of = list_names(faulty, _NAMED)
-        warnings.append(f"{len(faulty)} of {len(facts)} headers cannot be read: {names_of}")
     times = [to_utc(one.time_local, scan.zone) for one in facts if one.time_local is not None]
     began = [(to_utc(r.start, scan.zone), r.duration_s) for r in recordings if r.start is not None]
     spans = [*times, *(t for t, _ in began), *(t + timedelta(seconds=s) for t, s in began)]
     pictures = [path for paths in scan.pictures.values() for path in paths]
     files = [*pictures, *(file.path for r in recordings for file in r.files)]
+    text = ""
+    if log is not None:
+        known = [name for name, values in log.columns.items() if np.isfinite(values).any()]
+        text = f"{len(log.time_s)} rows with {', '.join(known)}"
+        if log.start_utc is not None:
+            last = log.start_utc + timedelta(seconds=float(log.time_s[-1]))
+            offset = timedelta(seconds=clock_offset_s)
+            inside = sum(log.start_utc <= time + offset <= last for time in times)
+            text += (
+                f", {log.start_utc:%Y-%m-%d %H:%M:%S} to {last:%H:%M:%S} UTC; {inside} of "
+                f"{len(times)} picture times fall into it"
+            )
+    record = scan.record(
+        rows, Counter(kind_of(path) for path in pictures), Counter(),
+        {_NO_HEADER: [one.path.name for one in facts if one.fault]},
+    )  # fmt: skip
     return Preview(
-        cameras=rows,
-        pictures=len(pictures),
-        looked_at=len(facts),
-        kinds=dict(Counter(kind_of(path) for path in pictures)),
-        size_mb=sum(path.stat().st_size for path in files) / 1e6,
-        masks=sum(len(folder.masks) for folder in scan.every_folder),
-        videos=len(recordings),
-        video_s=sum(r.duration_s for r in recordings),
-        first_utc=min(spans).isoformat(timespec="seconds") if spans else None,
-        last_utc=max(spans).isoformat(timespec="seconds") if spans else None,
-        with_gps=sum(one.latitude_deg is not None for one in facts),
-        navigation="" if log is None else _describe_log(log, times, spans, clock_offset_s),
-        warnings=tuple(warnings),
-    )
+        **dict(record) | {
+            "positions": sum(one.latitude_deg is not None for one in facts),
+            "pictures": len(pictures),
+            "looked_at": len(facts),
+            "size_mb": sum(path.stat().st_size for path in files) / 1e6,
+            "videos": len(recordings),
+            "video_s": sum(r.duration_s for r in recordings),
+            "first_utc": min(spans).isoformat(timespec="seconds") if spans else None,
+            "last_utc": max(spans).isoformat(timespec="seconds") if spans else None,
+            "navigation": text,
+            "warnings": (*warnings, *record.omissions),
+        }
+    )  # fmt: skip
 
 
 def cameras_in(folder: Path) -> dict[str, Path]:
@@ -342,14 +397,15 @@ def cameras_in(folder: Path) -> dict[str, Path]:
         Folders by name, in order; empty where there are not 2 to 8 of them, where the folder
         holds pictures of its own, or where their numbers differ.
     """
-    counts: dict[str, int] = {}
     try:
         inside = sorted(p for p in folder.iterdir() if not p.name.startswith("."))
-        for path in inside:
-            if path.is_file() and kind_of(path):
-                return {}
-            if path.is_dir() and not path.is_symlink():
-                counts[path.name] = sum(1 for p in path.iterdir() if kind_of(p))
+        if any(path.is_file() and kind_of(path) for path in inside):
+            return {}
+        counts = {
+            path.name: sum(1 for p in path.iterdir() if kind_of(p))
+            for path in inside
+            if path.is_dir() and not path.is_symlink()
+        }
     except OSError as error:
         raise ImageError(f"{folder}: cannot be read: {error.strerror}") from None
     counts = {name: count for name, count in counts.items() if count}
@@ -358,32 +414,6 @@ def cameras_in(folder: Path) -> dict[str, Path]:
     maximum, minimum = max(counts.values()), min(counts.values())
     equal = maximum - minimum <= _DROPPED_SHARE * maximum
     return {name: folder / name for name in counts} if equal else {}
-
-
-def _describe_log(
-    log: NavigationLog,
-    times: Sequence[datetime],
-    spans: Sequence[datetime],
-    clock_offset_s: float,
-) -> str:
-    """What a log holds, and how many picture times fall into it."""
-    known = [name for name, values in log.columns.items() if np.isfinite(values).any()]
-    text = f"{len(log.time_s)} rows with {', '.join(known)}"
-    if log.start_utc is None:
-        return f"{text}, on a clock without dates: the first picture counts as second 0 of it"
-    first, last = log.start_utc, log.start_utc + timedelta(seconds=float(log.time_s[-1]))
-    text += f", {first:%Y-%m-%d %H:%M:%S} to {last:%H:%M:%S} UTC"
-    if not spans:
-        return f"{text}; the pictures state no times, so it cannot be tied to them"
-    offset = timedelta(seconds=clock_offset_s)
-    if max(spans) + offset < first or min(spans) + offset > last:
-        raise ImageError(
-            f"no picture was taken while navigation was logged: pictures from "
-            f"{min(spans):%Y-%m-%d %H:%M:%S} to {max(spans):%H:%M:%S} UTC, log from "
-            f"{first:%Y-%m-%d %H:%M:%S} to {last:%H:%M:%S}: check time zone and clock offset"
-        )
-    inside = sum(first <= time + offset <= last for time in times)
-    return f"{text}; {inside} of {len(times)} picture times fall into it" if times else text
 
 
 _SCRATCH = "bag"
@@ -470,23 +500,18 @@ def import_images(
     frame_overlap = DEFAULT_OVERLAP if overlap is None else overlap
     stage = Stage(
         name="images",
-        version=4,
+        version=5,
         settings={
             "folders": len(folders),
-            "stereo": bool(cameras),
-            **({} if bag is None else {"topics": dict(topics)}),
-            **({} if set(cameras) in (set(), {"left", "right"}) else {"cameras": list(cameras)}),
+            "cameras": list(cameras),
+            "topics": dict(topics),
             "every_s": every_s,
             "overlap": frame_overlap if videos else None,
-            "videos": [path.name for path in scan.videos],
             "recursive": recursive,
-            "navigation": navigation is not None,
             "clock_offset_s": clock_offset_s,
             "time_zone": time_zone,
             "vertical_datum": vertical_datum,
-            "rig": rig is not None,
-            "masks": masks is not None,
-            **({} if triggers is None else {"triggers": True}),
+            "given": [one is not None for one in (bag, navigation, rig, masks, triggers)],
         },
         inputs=[
             *(file for each in scan.every_folder for file in (*each.pictures, *each.masks)),
@@ -503,9 +528,6 @@ def import_images(
             names = one_camera if scan.rig else _cameras_by_size(scan.recordings, scan.mono)
             entries = take_frames(scan.recordings, names, partial, frame_overlap, every_s)
         else:
-            for each in scan.every_folder:
-                for line in each.warnings():
-                    warn(line)
             if bag is None:
                 found = pair_by_time(scan.pictures, triggers, scan.zone)
             else:
@@ -536,11 +558,25 @@ def import_images(
             taken = {entry.camera for entry in entries}
             names = [name for name in scan.rig.cameras if name in taken]
             write_rig(partial / "rig.json", part_of_rig(scan.rig, names))
-        record = _import_record(entries, scan, left_out)
+        counted = Counter(entry.camera for entry in entries)
+        some = {entry.camera: entry.facts for entry in entries}
+        record = scan.record(
+            {
+                name: CameraRow(
+                    pictures=counted[name], width_px=some[name].width_px,
+                    height_px=some[name].height_px, device=some[name].device,
+                )
+                for name in dict.fromkeys([*scan.folders, *sorted(counted)])
+                if counted[name]
+            },
+            Counter(FRAMES if e.recording else kind_of(e.source) for e in entries),
+            Counter(entry.recording for entry in entries),
+            left_out,
+        )  # fmt: skip
         record.write(partial / Path(ImportRecord.path).name)
         PicturesRecord(
             source="imported",
-            datum=None if datum is None else PlaceRecord(**datum),
+            datum=datum,
             vertical_datum=level,
             notes=(*notes, *record.lines),
         ).write(partial / "survey.json")
@@ -554,41 +590,6 @@ def import_images(
             "readings": dict(readings_of(records)),
         }
     )
-
-
-def _import_record(
-    entries: Sequence[Incoming], scan: ImportScan, left_out: Mapping[str, Sequence[str]]
-) -> ImportRecord:
-    """Count what came in, and what did not: by decoding, then by folders."""
-    counts = Counter(entry.camera for entry in entries)
-    some = {entry.camera: entry.facts for entry in entries}
-    frames = Counter(entry.recording for entry in entries)
-    lost = {reason: list(names) for reason, names in left_out.items()}
-    for folder in scan.every_folder:
-        for reason, paths in folder.left_out.items():
-            lost.setdefault(reason, []).extend(str(p.relative_to(folder.folder)) for p in paths)
-    return ImportRecord(
-        cameras={
-            name: CameraRow(
-                pictures=counts[name], width_px=some[name].width_px,
-                height_px=some[name].height_px, device=some[name].device,
-            )
-            for name in dict.fromkeys([*scan.folders, *sorted(counts)])
-            if counts[name]
-        },
-        kinds=dict(Counter(FRAMES if e.recording else kind_of(e.source) for e in entries)),
-        recordings={
-            recording.name: RecordingRow(
-                files=tuple(file.path.name for file in recording.files),
-                frames=frames[recording.name],
-                duration_s=recording.duration_s,
-                start=recording.start and recording.start.isoformat(" ", "seconds"),
-                clock=recording.clock,
-            )
-            for recording in scan.recordings
-        },
-        left_out={reason: tuple(names) for reason, names in lost.items()},
-    )  # fmt: skip
 
 
 def _cameras_by_size(recordings: Sequence[Recording], mono: str) -> list[str]:
@@ -633,3 +634,168 @@ def _check_paths(workspace: Path, given: Sequence[Path]) -> None:
                 f"{workspace} holds a simulated survey, whose rig is not that of real pictures: "
                 "choose another workspace with -w"
             )
+
+
+_APART_S = 86_400.0
+"""Between the end of a dive and the start of the next: their clocks are their own, and errors of
+navigation do not last from one to the other."""
+
+
+def join_dives(workspace: Path, dives: Sequence[Path]) -> str:
+    """Write `images/` with the pictures of several dives, and `plan/` with the lines of all.
+
+    Settings are those of the first dive, and so are datum and area. Pictures of a dive lie in a
+    folder of its own; stations count on from dive to dive.
+
+    Args:
+        workspace: to write; none of the dives.
+        dives: workspaces with pictures, in the order of diving.
+
+    Returns:
+        What there is now, in words.
+
+    Raises:
+        WorkspaceError: there are fewer than two dives, one lacks pictures, or is the workspace.
+        ImageError: depths of the dives count from different levels.
+        CalibrationError: rigs of the dives differ.
+        PlanError: plans of the dives have different datums.
+    """
+    places = [dive.resolve() for dive in dives]
+    if len(set(places)) < 2 or len(set(places)) < len(places):
+        raise WorkspaceError("give two dives or more, each once")
+    if workspace.resolve() in places:
+        raise WorkspaceError(f"{workspace} is one of the dives: choose another with -w")
+    if (workspace / "images" / "truth").exists():
+        raise WorkspaceError(f"{workspace} holds a simulated survey: choose another with -w")
+    folders = [need_stage(dive, "images", "import-images") for dive in dives]
+    rig = _same_rig(dives)
+    surveys = [PicturesRecord.read(folder / "survey.json") for folder in folders]
+    rows = [read_manifest(folder / "manifest.csv") for folder in folders]
+    levels = {
+        survey.vertical_datum
+        for survey, records in zip(surveys, rows, strict=True)
+        if any(record.readings["depth"] for record in records)
+    }
+    if len(levels) > 1:
+        raise ImageError(
+            f"depths of the dives count from different levels ({', '.join(map(repr, levels))}): "
+            "import them with one --vertical-datum"
+        )
+    inputs = [
+        folder / name
+        for folder, records in zip(folders, rows, strict=True)
+        for name in ("manifest.csv", "survey.json", *(r.image for r in records))
+    ]
+    stage = Stage(
+        name="images",
+        version=2,
+        settings={"joined": len(dives)},
+        inputs=[*inputs, *([rig] if rig else [])],
+    )
+
+    def work(partial: Path) -> None:
+        records: list[ImageRecord] = []
+        for number, (folder, own) in enumerate(zip(folders, rows, strict=True), 1):
+            for name in [name for r in own for name in (r.image, r.mask) if name]:
+                target = partial / f"dive{number}" / name
+                target.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(folder / name, target)
+            records += _append_dive(own, f"dive{number}", records)
+        write_manifest(partial / "manifest.csv", records)
+        if rig is not None:
+            write_rig(partial / "rig.json", read_rig(rig))
+        first = next((s for s in surveys if s.datum is not None), surveys[0])
+        notes = tuple(dict.fromkeys(note for s in surveys for note in s.notes))
+        level = next(iter(levels), first.vertical_datum)
+        first.model_copy(
+            update={"source": "imported", "notes": notes, "vertical_datum": level}
+        ).write(partial / "survey.json")
+
+    _join_plans(workspace, dives)
+    run_stage(workspace, stage, work)
+    if (dives[0] / "survey.toml").is_file() and not (workspace / "survey.toml").exists():
+        shutil.copyfile(dives[0] / "survey.toml", workspace / "survey.toml")
+    counts = [len(records) for records in rows]
+    return f"{' and '.join(map(str, counts))} pictures of {len(dives)} dives"
+
+
+def _same_rig(dives: Sequence[Path]) -> Path | None:
+    """The rig of the dives that have one."""
+    files = [path for path in map(rig_file, dives) if path is not None]
+    for path in files[1:]:
+        if path.read_bytes() != files[0].read_bytes():
+            raise CalibrationError(
+                f"{files[0]} and {path} are not one rig: import the pictures of both dives with "
+                "the same --rig"
+            )
+    return files[0] if files else None
+
+
+def _append_dive(
+    records: Sequence[ImageRecord], folder: str, before: Sequence[ImageRecord]
+) -> list[ImageRecord]:
+    """A dive's pictures in a folder, after those of earlier dives in stations and in time."""
+    after = 1 + max((r.station for r in before), default=-1)
+    late_s = np.nan_to_num(np.array([r.time_s for r in before]))
+    start_s = np.nan_to_num(np.array([r.time_s for r in records]))
+    shift_s = float(late_s.max() - start_s.min()) + _APART_S if before else 0.0
+    return [
+        replace(
+            r,
+            image=f"{folder}/{r.image}",
+            mask=f"{folder}/{r.mask}" if r.mask else "",
+            station=r.station + after,
+            time_s=r.time_s + shift_s,
+        )
+        for r in records
+    ]
+
+
+def _join_plans(workspace: Path, dives: Sequence[Path]) -> None:
+    """Write the plan of all lines over the first plan's area, where the dives were planned."""
+    folders = [dive / "plan" for dive in dives if read_stage(dive / "plan") is not None]
+    if not folders or folders[0] != dives[0] / "plan":
+        return
+    plans = [read_plan(folder / "plan.json") for folder in folders]
+    whole = plans[0]
+    for plan in plans[1:]:
+        if plan.datum != whole.datum:
+            raise PlanError(
+                f"plans {whole.name!r} and {plan.name!r} have different datums: join dives of one "
+                "survey"
+            )
+        whole = _with_lines(whole, plan)
+    stage = Stage(
+        name="plan",
+        version=1,
+        settings={"refly_of": whole.name},
+        inputs=[folder / "plan.json" for folder in folders],
+    )
+    run_stage(workspace, stage, lambda part: write_json(part / "plan.json", whole.to_json()))
+
+
+def _with_lines(first: Plan, second: Plan) -> Plan:
+    count = len(first.lines)
+    dives = tuple(
+        replace(
+            dive,
+            first_line=dive.first_line + count,
+            last_line=dive.last_line + count,
+            route=Route(
+                legs=tuple(
+                    replace(leg, line=leg.line + count if leg.line >= 0 else -1)
+                    for leg in dive.route.legs
+                )
+            ),
+        )
+        for dive in second.dives
+    )
+    return replace(
+        first,
+        lines=first.lines + second.lines,
+        dives=first.dives + dives,
+        line_depths_m=(),
+        length_m=first.length_m + second.length_m,
+        duration_s=first.duration_s + second.duration_s,
+        energy_wh=first.energy_wh + second.energy_wh,
+    )

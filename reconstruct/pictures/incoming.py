@@ -1,23 +1,37 @@
-"""Pictures on their way into a workspace: checked, named, masked, copied, timed and located."""
+"""Pictures on their way into a workspace: paired, checked, named, masked, copied, timed, located.
+
+Which pictures of several cameras, in folders or in bags, are of one moment: times are those of a
+trigger log, else moments in the names of files, else EXIF's. Without them numbers in the names say
+which pictures belong together (`pair_pictures`). Bags of ROS 1 and ROS 2 hold `Image` and
+`CompressedImage`, with their times.
+"""
 
 import hashlib
+import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from alice_survey.core.errors import ImageError, NavigationError, warn
-from alice_survey.core.executor import Executor
+from alice_survey.core.artefacts import read_csv
+from alice_survey.core.contents import as_line
+from alice_survey.core.errors import CalibrationError, ImageError, NavigationError, warn
+from alice_survey.core.executor import Executor, progress
 from alice_survey.core.frames import Array
 from alice_survey.core.manifest import ImageRecord
+from alice_survey.core.records import PlaceRecord
+from camera_calib.calibrate.picture_sets import pair_pictures
+from camera_calib.picture_files import time_taken
 from camera_calib.rig import Rig
-from missions.logs.dive import DATED_AFTER_S
-from missions.logs.navigation_csv import READINGS, NavigationLog, warn_of_gaps
+from missions.logs.dive import DATED_AFTER_S, finite_number
+from missions.logs.navigation_csv import READINGS, NavigationLog, utc_date, warn_of_gaps
+from missions.logs.ros_bag import opened_bag
 from reconstruct.pictures.files import (
     PictureFacts,
     bits_used,
@@ -29,6 +43,399 @@ from reconstruct.pictures.files import (
     to_utc,
 )
 from reconstruct.pictures.undistorted import read_mask
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+
+_WITHIN_SHARE = 0.25
+"""Pictures this share of the shortest usual interval apart are of one moment: a dropped picture
+leaves a gap of a whole interval, and no trigger jitters by so much."""
+_WORST_SHARE = 0.1
+"""Pairs that are further apart than this share of the interval are worth a warning."""
+
+
+def moments_of(times_s: Mapping[str, Array]) -> list[dict[str, int]]:
+    """Group pictures by their times.
+
+    The earliest picture that is left opens a moment; of every other camera its next picture joins
+    it if it is within a quarter of the shortest of the cameras' median intervals.
+
+    Args:
+        times_s: by camera (N,) increasing times on one clock.
+
+    Returns:
+        For each moment, in order, the index of the picture of each camera that has one.
+
+    Raises:
+        ImageError: times do not increase, or no moment has two cameras.
+    """
+    for camera, times in times_s.items():
+        if not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
+            raise ImageError(f"times of the pictures of {camera} do not increase")
+    intervals = [float(np.median(np.diff(t))) for t in times_s.values() if len(t) > 1]
+    interval_s = min(intervals, default=np.inf)
+    within_s = _WITHIN_SHARE * min(intervals, default=0.0)
+    found: list[dict[str, int]] = []
+    start = -np.inf
+    order = sorted((float(t), name, n) for name, own in times_s.items() for n, t in enumerate(own))
+    for time, name, n in order:
+        if time - start > within_s or name in found[-1]:
+            found.append({})
+            start = time
+        found[-1][name] = n
+    if len(times_s) < 2:
+        return found
+    apart = [np.ptp([times_s[c][i] for c, i in m.items()]) for m in found if len(m) > 1]
+    if not apart:
+        raise ImageError(
+            f"no pictures of {' and '.join(times_s)} are within {1e3 * within_s:.3g} ms of each "
+            "other: are their times of one clock?"
+        )
+    alone = Counter(next(iter(moment)) for moment in found if len(moment) == 1)
+    if alone:
+        counts = ", ".join(f"{alone[name]} of {name}" for name in times_s if alone[name])
+        warn(f"pictures without one of another camera at the same moment: {counts}")
+    if np.median(apart) > _WORST_SHARE * interval_s:
+        warn(
+            f"pictures of one moment are {1e3 * np.median(apart):.3g} ms apart in the median, and "
+            f"pictures of one camera {1e3 * interval_s:.3g} ms: a rig counts them as taken at once"
+        )
+    return found
+
+
+_EPOCH = re.compile(r"(?<!\d)(1\d{9})(?:\.(\d{1,9})|_(\d{9})|(\d{3}|\d{6}|\d{9}))?(?!\d)")
+"""Seconds since 1970 after September 2001, with or without a fraction, as robots write them."""
+_DATE = re.compile(
+    r"(?<!\d)(20\d\d)-?(\d\d)-?(\d\d)[T_ -]?(\d\d)[-:_]?(\d\d)[-:_]?(\d\d)"
+    r"(?:\.(\d{1,9})|_?(\d{6})|(\d{3}))?(?!\d)"
+)
+"""A date and a time of day. Fewer digits behind a dash are a counter, not a fraction."""
+_MIN_PAIRED = 0.5
+"""Share of the pictures of the camera with fewest that times must pair."""
+_WHOLE_SECONDS_S = 4.0
+"""Times in whole seconds tell pictures apart that are this far from each other."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairedPictures:
+    """Pictures by moment."""
+
+    stations: tuple[Mapping[str, Path], ...]
+    """Picture of each camera, by moment."""
+    time_s: Mapping[Path, float] = field(default_factory=dict)
+    """When pictures were taken by the trigger log or the bag, on its clock."""
+
+
+def pair_by_time(
+    sides: Mapping[str, Sequence[Path]], triggers: Path | None, zone: tzinfo
+) -> PairedPictures:
+    """Group the pictures of cameras by moment.
+
+    Args:
+        sides: pictures of each camera, in the order of their names.
+        triggers: CSV with `time_s` or `time_utc` and `image` or `number`, and `camera` where
+            cameras are triggered apart.
+        zone: of its dates that name none.
+
+    Raises:
+        ImageError: the trigger log is wrong or holds none of the pictures, or pictures do not pair.
+    """
+    if triggers is not None:
+        logged = _trigger_times(triggers, sides, zone)
+        known = {
+            side: sorted((p for p in paths if p in logged), key=logged.__getitem__)
+            for side, paths in sides.items()
+        }
+        moments = moments_of(
+            {side: np.array([logged[p] for p in paths]) for side, paths in known.items() if paths}
+        )
+        found = [{side: known[side][i] for side, i in moment.items()} for moment in moments]
+        return PairedPictures(stations=tuple(found), time_s=logged)
+    if len(sides) <= 1:
+        return PairedPictures(stations=tuple({s: p} for s, paths in sides.items() for p in paths))
+    return PairedPictures(stations=tuple(_pair_by_times(sides) or _pair_by_numbers(sides)))
+
+
+def _pair_by_times(sides: Mapping[str, Sequence[Path]]) -> list[dict[str, Path]] | None:
+    """Moments by names or EXIF; None where these give no times, or not of one clock."""
+    for source, read in (("their names", _time_in_name), ("EXIF", _time_in_exif)):
+        known = {side: [read(p) for p in paths] for side, paths in sides.items()}
+        if any(t is None for times in known.values() for t in times):
+            continue
+        times = {side: np.array(own, dtype=np.float64) for side, own in known.items()}
+        orders = {side: np.argsort(own, kind="stable") for side, own in times.items()}
+        times = {side: own[orders[side]] for side, own in times.items()}
+        if not _distinct(times):
+            continue
+        try:
+            moments = moments_of(times)
+        except ImageError:
+            moments = []
+        minimum = min(len(own) for own in times.values())
+        if sum(len(moment) > 1 for moment in moments) < _MIN_PAIRED * minimum:
+            warn(
+                f"times in {source} are not of one clock: pictures are paired by numbers or order, "
+                "by which a picture that a camera dropped can shift the pairs after it; a trigger "
+                "log (--triggers) pairs them by time"
+            )
+            continue
+        return [
+            {side: sides[side][orders[side][i]] for side, i in moment.items()} for moment in moments
+        ]
+    return None
+
+
+def _distinct(times: Mapping[str, Array]) -> bool:
+    """Whether times are fine enough to tell one picture of a camera from the next."""
+    steps = [np.diff(own) for own in times.values() if len(own) > 1]
+    if not steps or any((own <= 0).any() for own in steps):
+        return False
+    if any((own % 1.0).any() for own in times.values()):
+        return True
+    return min(float(np.median(own)) for own in steps) >= _WHOLE_SECONDS_S
+
+
+def _pair_by_numbers(sides: Mapping[str, Sequence[Path]]) -> list[Mapping[str, Path]]:
+    """Moments by numbers in names, else by order."""
+    try:
+        sets = pair_pictures(sides)
+    except CalibrationError as error:
+        raise ImageError(f"{error}; or give a trigger log with --triggers") from None
+    whole = [len(one.paths) == len(sides) for one in sets]
+    paired = [k for k, all_there in enumerate(whole) if all_there]
+    if paired and not all(whole) and all(whole[: paired[-1] + 1]):
+        rest = [path.name for one in sets[paired[-1] + 1 :] for path in one.paths.values()]
+        warn(
+            f"only the last pictures have no partner ({list_names(rest)}): a camera that counts "
+            "its own pictures and dropped one shifts the pairs after it; a trigger log "
+            "(--triggers) pairs by time"
+        )
+    return [one.paths for one in sets]
+
+
+def _time_in_name(path: Path) -> float | None:
+    """Seconds since 1970 by the name of a file; None where it holds no moment."""
+    stamp = _EPOCH.search(path.stem)
+    if stamp is not None:
+        return float(f"{stamp[1]}.{stamp[2] or stamp[3] or stamp[4] or 0}")
+    date = _DATE.search(path.stem)
+    if date is None:
+        return None
+    try:
+        whole = datetime(*(int(part) for part in date.groups()[:6]), tzinfo=UTC)  # type: ignore[arg-type,misc]
+    except ValueError:
+        return None
+    return whole.timestamp() + float(f"0.{date[7] or date[8] or date[9] or 0}")
+
+
+def _time_in_exif(path: Path) -> float | None:
+    taken = time_taken(path)
+    return None if taken is None else to_utc(taken, UTC).timestamp()
+
+
+def _trigger_times(
+    triggers: Path, sides: Mapping[str, Sequence[Path]], zone: tzinfo
+) -> dict[Path, float]:
+    """Times of the pictures that a trigger log holds; the others are named in a warning."""
+    columns, rows = read_csv(triggers, exact=True, fault=ImageError)
+    when = next((name for name in ("time_s", "time_utc") if name in columns), None)
+    which = next((name for name in ("image", "number") if name in columns), None)
+    if when is None or which is None:
+        raise ImageError(
+            f"{triggers}: has {as_line(', '.join(columns))}: a trigger log needs the columns image "
+            "(or number) and time_s (or time_utc), and camera where cameras are triggered apart"
+        )
+    logged: dict[tuple[str, str], float] = {}
+    for line, row in rows:
+        key = row.get("camera", "").strip(), _key(row[which], which)
+        try:
+            text = row[when].strip()
+            time_s = finite_number(text) if when == "time_s" else utc_date(text, zone).timestamp()
+        except ValueError:
+            time_s = np.nan
+        if not np.isfinite(time_s) or not key[1] or logged.setdefault(key, time_s) != time_s:
+            raise ImageError(
+                f"{triggers} line {line}: {as_line(str(row))} states no picture or time, or a "
+                "second time; a column camera distinguishes pictures of several cameras"
+            )
+    found: dict[Path, float] = {}
+    for side, paths in sides.items():
+        for path in paths:
+            digits = re.findall(r"\d+", path.stem)
+            text = path.name if which == "image" else next(iter(digits[-1:]), "")
+            own = _key(text, which)
+            time = logged.get((side, own), logged.get(("", own)))
+            if time is not None:
+                found[path] = time
+        times = [found[path] for path in paths if path in found]
+        if len(set(times)) < len(times):
+            raise ImageError(
+                f"{triggers}: two pictures of {side} have the same time: give pictures by name, in "
+                "a column image"
+            )
+    lost = [path.name for paths in sides.values() for path in paths if path not in found]
+    if not found:
+        raise ImageError(f"{triggers}: holds none of the pictures, such as {list_names(lost, 2)}")
+    if lost:
+        warn(f"{len(lost)} pictures are not in {triggers} and are left out: {list_names(lost)}")
+    return found
+
+
+def _key(text: str, which: str) -> str:
+    """How a picture is found: by its name without folder and suffix, or by its number."""
+    if which == "image":
+        return Path(text.strip().replace("\\", "/")).stem.lower()
+    return text.strip().lstrip("0") or "0" if text.strip().isdecimal() else ""
+
+
+_MAGIC = {b"\xff\xd8\xff": ".jpg", b"\x89PNG": ".png"}
+"""How files begin that a CompressedImage may hold, and their suffixes."""
+_CHANNELS: Mapping[str, tuple[int, int | None]] = {
+    "mono": (1, None), "bgr": (3, None), "rgb": (3, cv2.COLOR_RGB2BGR),
+    "bgra": (4, cv2.COLOR_BGRA2BGR), "rgba": (4, cv2.COLOR_RGBA2BGR),
+    "bayer_rggb": (1, cv2.COLOR_BayerRGGB2BGR), "bayer_bggr": (1, cv2.COLOR_BayerBGGR2BGR),
+    "bayer_gbrg": (1, cv2.COLOR_BayerGBRG2BGR), "bayer_grbg": (1, cv2.COLOR_BayerGRBG2BGR),
+}  # fmt: skip
+"""Channels of encodings without their number of bits, and how they become BGR."""
+_OPENCV = {"8UC1": "mono8", "8UC3": "bgr8", "8UC4": "bgra8", "16UC1": "mono16", "16UC3": "bgr16"}
+
+
+def take_bag(
+    bag: Path, topics: Mapping[str, str], mono: str, folder: Path, every_s: float | None
+) -> PairedPictures:
+    """Write the pictures of a bag to files, as they are or as PNG.
+
+    Args:
+        bag: a ROS 1 file, a ROS 2 folder, or the .mcap or .db3 of one.
+        topics: by camera; empty for the one topic of pictures, or for those of a left and a right.
+        mono: name of the camera of a single topic.
+        folder: for the files.
+        every_s: seconds between moments at least; None for all.
+
+    Raises:
+        ImageError: the bag has no such topic or no pictures, or those of cameras do not pair.
+        NavigationError: it is no bag, or damaged.
+    """
+    lost: Counter[str] = Counter()
+    files: dict[tuple[str, int], Path] = {}
+    with opened_bag(bag) as reader:
+        cameras = _cameras(bag, reader, topics, mono)
+        times: dict[str, list[int]] = {camera: [] for camera in cameras.values()}
+        for camera, time_ns, _ in _messages(reader, cameras, "times of pictures"):
+            if times[camera] and time_ns <= times[camera][-1]:
+                lost[f"pictures of {camera} are left out: their times repeat or go back"] += 1
+            else:
+                times[camera].append(time_ns)
+        if not any(times.values()):
+            raise ImageError(f"{bag}: no pictures in {', '.join(cameras)}")
+        moments, last_s = [], -np.inf
+        for moment in moments_of({c: 1e-9 * np.array(own) for c, own in times.items() if own}):
+            start_s = 1e-9 * min(times[c][i] for c, i in moment.items())
+            if every_s is None or start_s - last_s >= every_s - 1e-6:
+                moments.append({c: (c, times[c][i]) for c, i in moment.items()})
+                last_s = start_s
+        requested = {key for moment in moments for key in moment.values()}
+        for camera, time_ns, message in _messages(reader, cameras, "pictures of the bag"):
+            key = camera, time_ns
+            if key in requested and key not in files:
+                try:
+                    suffix, data = _content(message)
+                except ValueError as error:
+                    lost[f"pictures of {camera} are left out: {error}"] += 1
+                    continue
+                stem = f"{time_ns // 10**9}_{time_ns % 10**9:09d}"
+                files[key] = folder / safe_name(camera) / f"{stem}{suffix}"
+                files[key].parent.mkdir(parents=True, exist_ok=True)
+                files[key].write_bytes(data)
+    for reason, count in sorted(lost.items()):
+        warn(f"{bag}: {count} {reason}")
+    if not files:
+        raise ImageError(f"{bag}: no picture could be taken")
+    stations = [{c: files[key] for c, key in m.items() if key in files} for m in moments]
+    return PairedPictures(
+        stations=tuple(station for station in stations if station),
+        time_s={path: 1e-9 * time_ns for (_, time_ns), path in files.items()},
+    )
+
+
+def _cameras(
+    bag: Path, reader: "AnyReader", topics: Mapping[str, str], mono: str
+) -> dict[str, str]:
+    """Camera of each topic; where none are named, that of the only one, or of left and right."""
+    kinds = {c.topic: c.msgtype.split("/")[-1] for c in reader.connections}
+    present = sorted(t for t, kind in kinds.items() if kind in ("Image", "CompressedImage"))
+    sides = {side: [t for t in present if side in t.lower()] for side in ("left", "right")}
+    chosen = dict(topics)
+    if not topics and len(present) == 1:
+        chosen = {mono: present[0]}
+    elif not topics and len(present) == 2 and all(len(one) == 1 for one in sides.values()):
+        chosen = {side: one[0] for side, one in sides.items()}
+    if not present:
+        raise ImageError(f"{bag}: holds no topic of Image or CompressedImage")
+    if not chosen or not set(chosen.values()) <= set(present) or (
+        len(set(chosen.values())) < len(chosen)
+    ):  # fmt: skip
+        raise ImageError(
+            f"{bag}: choose its topics with --camera NAME=TOPIC, one for each camera: "
+            f"{', '.join(present)}"
+        )
+    return {topic: camera for camera, topic in chosen.items()}
+
+
+def _messages(
+    reader: "AnyReader", cameras: Mapping[str, str], label: str
+) -> Iterator[tuple[str, int, Any]]:
+    """Camera, time (ns; of the recording where the header has none) and message of each."""
+    connections = [c for c in reader.connections if c.topic in cameras]
+    total = sum(c.msgcount for c in connections)
+    for connection, recorded_ns, raw in progress(reader.messages(connections), label, total):
+        message: Any = reader.deserialize(raw, connection.msgtype)
+        stamp = message.header.stamp
+        time_ns = stamp.sec * 10**9 + stamp.nanosec or recorded_ns
+        yield cameras[connection.topic], time_ns, message
+
+
+def _content(message: Any) -> tuple[str, bytes]:
+    """Suffix and bytes of a picture's file.
+
+    Raises:
+        ValueError: the message holds none that can be read.
+    """
+    if hasattr(message, "encoding"):
+        png = cv2.imencode(".png", pixels_of(message), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
+        return ".png", png.tobytes()
+    data = bytes(message.data)
+    for magic, suffix in _MAGIC.items():
+        if data.startswith(magic):
+            return suffix, data
+    raise ValueError(f"format {as_line(message.format)!r} is not known")
+
+
+def pixels_of(message: Any) -> NDArray[Any]:
+    """Pixels of a sensor_msgs/Image: (H, W) or (H, W, 3) BGR of 8 or 16 bits.
+
+    Raises:
+        ValueError: its encoding is not known, or it has fewer bytes than it states.
+    """
+    encoding = _OPENCV.get(message.encoding, message.encoding.lower())
+    name = encoding.rstrip("0123456789")
+    bits = encoding.removeprefix(name)
+    if name not in _CHANNELS or bits not in ("8", "16"):
+        raise ValueError(f"encoding {as_line(message.encoding)!r} is not known")
+    channels, code = _CHANNELS[name]
+    kind = np.dtype(f"{'>' if message.is_bigendian else '<'}u{int(bits) // 8}")
+    rows, columns, step = int(message.height), int(message.width), int(message.step)
+    width = columns * channels * kind.itemsize
+    data = np.frombuffer(bytes(message.data), np.uint8)
+    if rows <= 0 or columns <= 0 or step < width or len(data) < rows * step - (step - width):
+        raise ValueError("they have fewer bytes than they state")
+    padded = np.zeros(rows * step, np.uint8)  # the last line may end at its last pixel
+    padded[: len(data)] = data[: rows * step]
+    lines = np.ascontiguousarray(padded.reshape(rows, step)[:, :width]).view(kind)
+    shape = (rows, columns) if channels == 1 else (rows, columns, channels)
+    pixels = lines.astype(kind.newbyteorder("=")).reshape(shape)
+    return np.asarray(pixels if code is None else cv2.cvtColor(pixels, code))
+
 
 UNDECODABLE = "cannot be decoded"
 MIRRORED = "mirror images"
@@ -75,17 +482,13 @@ def find_entries(
     listed = [one for one in listed if one[2] not in copies]
     facts = executor.map(inspect, [path for _, _, path in listed], label="checking pictures")
     entries = []
-    left_out: dict[str, list[str]] = {}
-    for copy, first in copies.items():
-        warn(f"{copy} is left out: it is the same file as {first}")
-        left_out.setdefault(COPIES, []).append(copy.name)
+    left_out = {COPIES: [copy.name for copy in copies], MIRRORED: [], UNDECODABLE: []}
     for (camera, station, path), known in zip(listed, facts, strict=True):
         if known.fault:
             warn(f"{path} is left out: {known.fault}")
-            reason = MIRRORED if known.width_px else UNDECODABLE
-            left_out.setdefault(reason, []).append(path.name)
-            continue
-        entries.append(Incoming(source=path, camera=camera, station=station, facts=known))
+            left_out[MIRRORED if known.width_px else UNDECODABLE].append(path.name)
+        else:
+            entries.append(Incoming(source=path, camera=camera, station=station, facts=known))
     return entries, left_out
 
 
@@ -246,14 +649,10 @@ def level_of_log(name: str | None, navigation: Path | None) -> str:
     """What to call the level of logged depths; files that state it give it one line."""
     if name is None:
         return _LOGGED_LEVEL
-    if navigation is None:
+    if navigation is None or not name.strip() or not name.isprintable():
         raise NavigationError(
-            f"--vertical-datum {name!r} names the level that a navigation log's depths count from: "
-            "give --navigation too"
-        )
-    if not name.strip() or not name.isprintable():
-        raise NavigationError(
-            f"--vertical-datum {name!r} is not a name of one line, such as 'NN2000'"
+            f"--vertical-datum {name!r}: give --navigation, and one line with the name of the "
+            "level that its depths count from, such as 'NN2000'"
         )
     return name.strip()
 
@@ -271,22 +670,28 @@ def place_records(
     clock_offset_s: float,
     zone: tzinfo,
     notes: list[str],
-) -> tuple[list[ImageRecord], dict[str, float] | None, str]:
+) -> tuple[list[ImageRecord], PlaceRecord | None, str]:
     """Give records their times and positions; also the datum and the level of depths."""
-    times, from_first = _times(entries, log, clock_offset_s, zone)
+    times, origin = _times(entries, log, clock_offset_s, zone)
     records = [replace(r, time_s=float(t)) for r, t in zip(records, times, strict=True)]
-    if log is not None:
-        if not np.isfinite(times).any():
-            raise ImageError(_without_times(entries))
-        if from_first:
-            notes.append(f"picture times count from {from_first}, plus the clock offset")
-        records = _with_navigation(records, times, log)
-        level = logged_level
-        if level == _LOGGED_LEVEL:
-            _warn_of_heights(records)
+    if log is None:
+        records, level = _with_gps(records, entries), "EXIF GPS altitude"
     else:
-        records = _with_gps(records, entries)
-        level = f"{_gps_of(entries)} altitude"
+        if not np.isfinite(times).any():
+            raise ImageError(
+                "no time of a picture is known (EXIF DateTimeOriginal, a recording's start), so "
+                "navigation cannot be tied: give times of pictures with --triggers; import each "
+                "video into a workspace of its own with --clock-offset, then 'join' them"
+            )
+        if origin:
+            notes.append(f"picture times count from {origin}, plus the clock offset")
+        records, level = _with_navigation(records, times, log), logged_level
+        depths = np.array([r.depth_m for r in records if r.readings["depth"]])
+        if level == _LOGGED_LEVEL and len(depths) and np.median(depths) < -_ABOVE_M:
+            warn(
+                f"most pictures are above the sea surface, by {-np.median(depths):.1f} m: depth_m "
+                "is positive down; --vertical-datum names another level that depths count from"
+            )
     counted = readings_of(records)
     if not counted:
         if log is not None:
@@ -296,45 +701,17 @@ def place_records(
                 f"to {log.time_s[-1]:.1f} s; check --clock-offset and --time-zone"
             )
         notes.append("no positions: no CRS, and unscaled unless a rig or a known length scales it")
-        return list(records), None, "none"
+        return records, None, "none"
     if log is None:
-        notes.append(f"positions from {_gps_of(entries)}, of unknown accuracy")
-    complete = {name for name, count in counted.items() if count == len(records)}
-    if complete != set(records[0].readings):
+        notes.append("positions from EXIF GPS, of unknown accuracy")
+    if any(counted[name] < len(records) for name in records[0].readings):
         counts = ", ".join(f"{name} of {counted[name]}" for name in records[0].readings)
         notes.append(f"navigation of {len(records)} pictures: {counts}")
     first = next((r for r in records if r.has_horizontal), None)
     if first is None:
-        return list(records), None, level
-    datum = {"latitude_deg": first.latitude_deg, "longitude_deg": first.longitude_deg}
-    return list(records), datum, level
-
-
-def _warn_of_heights(records: Sequence[ImageRecord]) -> None:
-    """Say when depths look like heights."""
-    depths = np.array([r.depth_m for r in records if r.readings["depth"]])
-    if len(depths) and np.median(depths) < -_ABOVE_M:
-        warn(
-            f"most pictures are above the sea surface, by {-np.median(depths):.1f} m: depth_m is "
-            "positive down; --vertical-datum names another level that depths count from"
-        )
-
-
-def _gps_of(entries: Sequence[Incoming]) -> str:
-    return "the video's GPS" if entries[0].recording else "EXIF GPS"
-
-
-def _without_times(entries: Sequence[Incoming]) -> str:
-    recordings = list(dict.fromkeys(e.recording for e in entries if e.recording))
-    if recordings:
-        return (
-            f"{list_names(recordings)} do not say when they began, so navigation cannot be tied: "
-            "import each into a workspace of its own with --clock-offset, then 'join' them"
-        )
-    return (
-        "no picture carries a time (EXIF DateTimeOriginal), so navigation cannot be tied: give "
-        "their times with --triggers"
-    )
+        return records, None, level
+    place = PlaceRecord(latitude_deg=first.latitude_deg, longitude_deg=first.longitude_deg)
+    return records, place, level
 
 
 def _times(
@@ -366,34 +743,27 @@ def _with_navigation(
     found = log.at(times)
     has_reading = np.any([np.isfinite(found[name]) for name in READINGS if name in found], axis=0)
     warn_of_gaps([r.image for r in records], times, np.where(has_reading, 1.0, np.nan), log)
-    placed = []
-    for i, record in enumerate(records):
-        values: dict[str, Any] = {name: float(column[i]) for name, column in found.items()}
-        placed.append(replace(record, **values) if has_reading[i] else record)
-    return placed
+    rows = zip(*(column.tolist() for column in found.values()), strict=True)
+    return [
+        replace(record, **dict(zip(found, row, strict=True))) if known else record
+        for record, row, known in zip(records, rows, has_reading, strict=True)
+    ]
 
 
 def _with_gps(records: Sequence[ImageRecord], entries: Sequence[Incoming]) -> list[ImageRecord]:
     placed, lost = [], []
     for record, entry in zip(records, entries, strict=True):
         facts = entry.facts
-        place = (facts.latitude_deg, facts.longitude_deg, facts.altitude_m)
-        if any(value is None for value in place):
+        place = np.array([facts.latitude_deg, facts.longitude_deg, facts.altitude_m], np.float64)
+        if np.isnan(place).any():
             lost.append(record.image)
-        if all(value is None for value in place):
-            placed.append(record)
-            continue
-        latitude, longitude, altitude = (np.nan if v is None else float(v) for v in place)
-        placed.append(
-            replace(
-                record,
-                latitude_deg=latitude,
-                longitude_deg=longitude,
-                depth_m=-altitude,
-                sigma_horizontal_m=_EXIF_SIGMA_M[0],
+        if not np.isnan(place).all():
+            record = replace(
+                record, latitude_deg=float(place[0]), longitude_deg=float(place[1]),
+                depth_m=-float(place[2]), sigma_horizontal_m=_EXIF_SIGMA_M[0],
                 sigma_depth_m=_EXIF_SIGMA_M[1],
-            )
-        )
-    if lost and len(lost) < len(records) and not entries[0].recording:
+            )  # fmt: skip
+        placed.append(record)
+    if 0 < len(lost) < len(records):
         warn(f"{len(lost)} pictures have no complete GPS in EXIF: {list_names(lost)}")
     return placed

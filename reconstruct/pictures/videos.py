@@ -5,11 +5,12 @@ frame is a similarity fitted to tracked corners. It is exact for a camera that l
 flat floor, and near enough elsewhere to say how much two frames share.
 """
 
+import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import struct
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta, tzinfo
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +24,15 @@ from alice_survey.core.frames import Array
 from reconstruct.pictures.files import VIDEO, PictureFacts, natural_key, safe_name, to_utc
 from reconstruct.pictures.incoming import Incoming
 from reconstruct.pictures.quality import sharpness
-from reconstruct.pictures.telemetry import Mp4Facts, read_mp4
 
 _CHAPTER = re.compile(r"(?P<kind>G[HLX])(?P<chapter>\d\d)(?P<number>\d{4})", re.I)
-_OLD_FIRST = re.compile(r"GOPR(?P<number>\d{4})", re.I)
-_OLD_CHAPTER = re.compile(r"GP(?P<chapter>\d\d)(?P<number>\d{4})", re.I)
 _PREVIEW = ".lrv"
-_CLOCK_NEVER_SET = timedelta(days=1)
-"""A date so soon after a new year's midnight, of years before, is that of a clock without power."""
-_STARTS_OF_CLOCKS = range(2000, 2020)
+_MP4_EPOCH = datetime(1904, 1, 1, tzinfo=UTC)
+_YEARS = range(2000, 2200)
+"""Years in which a digital camera can have made a video."""
+_MAX_INDEX = 64 << 20
+"""Bytes of the index of a video: a day of it takes less."""
+_MAX_BOXES = 4096
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,10 +40,9 @@ class VideoFile:
     """One file of a recording."""
 
     path: Path
-    width_px: int
-    height_px: int
+    size: tuple[int, int]
+    """Width and height of its frames."""
     duration_s: float
-    facts: Mp4Facts
     start_s: float = 0.0
     """Since the start of the recording."""
 
@@ -63,20 +63,12 @@ class Recording:
     @property
     def size(self) -> tuple[int, int]:
         """Width and height of its frames."""
-        return self.files[0].width_px, self.files[0].height_px
+        return self.files[0].size
 
     @property
     def duration_s(self) -> float:
         """From its start to the end of its last file."""
         return self.files[-1].start_s + self.files[-1].duration_s
-
-    def place_at(self, time_s: float) -> tuple[float, float, float] | None:
-        """Latitude, longitude and altitude at a time of the recording, if its GPS had a fix."""
-        for file in self.files:
-            fixes = file.facts.fixes
-            if fixes is not None and (place := fixes.at(time_s - file.start_s)):
-                return place
-        return None
 
 
 def find_videos(places: Sequence[Path]) -> list[Path]:
@@ -115,75 +107,99 @@ def read_recordings(paths: Sequence[Path], zone: tzinfo) -> list[Recording]:
     Raises:
         ImageError: a file is no video that can be read, or chapters are of different sizes.
     """
-    groups: dict[tuple[Path, str, int], list[tuple[int, Path]]] = {}
-    for position, path in enumerate(paths):
-        family, number, chapter = _chapter_of(path) or ("", position, 0)
-        groups.setdefault((path.parent, family, number), []).append((chapter, path))
-    found = [_recording(family, sorted(group)) for (_, family, _), group in groups.items()]
+    groups: dict[tuple[Path, str], dict[int, Path]] = {}
+    for path in paths:
+        named = _CHAPTER.fullmatch(path.stem)
+        name = path.name if named is None else (named["kind"] + named["number"]).upper()
+        chapters = groups.setdefault((path.parent, name), {})
+        if chapters.setdefault(0 if named is None else int(named["chapter"]), path) != path:
+            raise ImageError(f"{path}: this chapter of its recording is given twice")
+    found = [_recording(dict(sorted(chapters.items()))) for chapters in groups.values()]
+    starts = [to_utc(r.start, zone) for r in found if r.start is not None]
     if len(found) == 1:
         return found
-    starts = [to_utc(r.start, zone) for r in found if r.start is not None]
     if len(starts) < len(found):
         return [replace(r, start_s=np.nan) for r in found]
-    first = min(starts)
     placed = [
-        replace(r, start_s=(start - first).total_seconds())
+        replace(r, start_s=(start - min(starts)).total_seconds())
         for r, start in zip(found, starts, strict=True)
     ]
     return sorted(placed, key=lambda r: r.start_s)
 
 
-def _chapter_of(path: Path) -> tuple[str, int, int] | None:
-    """Family, number and chapter of a GoPro's name; None of any other."""
-    if named := _CHAPTER.fullmatch(path.stem):
-        return named["kind"].upper(), int(named["number"]), int(named["chapter"])
-    if named := _OLD_FIRST.fullmatch(path.stem):
-        return "GP", int(named["number"]), 0
-    if named := _OLD_CHAPTER.fullmatch(path.stem):
-        return "GP", int(named["number"]), int(named["chapter"])
-    return None
-
-
-def _recording(family: str, chapters: Sequence[tuple[int, Path]]) -> Recording:
+def _recording(chapters: dict[int, Path]) -> Recording:
     """Chapters one after the other; one that is missing is taken for as long as the longest."""
-    files = {chapter: _open(path) for chapter, path in chapters}
-    if len(files) < len(chapters):
-        names = ", ".join(path.name for _, path in chapters)
-        raise ImageError(f"{names}: chapters of one recording are given twice")
-    first, last = min(files), max(files)
-    _check_sizes(list(files.values()))
-    longest = max(files.values(), key=lambda file: file.duration_s)
-    if family:
-        _warn_of_missing(family, files, longest)
-    placed, start_s = [], 0.0
-    for chapter in range(first, last + 1):
-        file = files.get(chapter)
-        if file is not None:
-            placed.append(replace(file, start_s=start_s))
-        start_s += longest.duration_s if file is None else file.duration_s
-    start, clock = _began(placed)
-    return Recording(name=placed[0].path.stem, files=tuple(placed), start=start, clock=clock)
-
-
-def _warn_of_missing(family: str, files: Mapping[int, VideoFile], longest: VideoFile) -> None:
-    first, last = min(files), max(files)
-    lost = [str(c) for c in range(0 if family == "GP" else 1, last) if c not in files]
+    files = {chapter: _open(path) for chapter, path in chapters.items()}
+    first = next(iter(files.values()))
+    for file in files.values():
+        if file.size != first.size:
+            raise ImageError(
+                f"{file.path} has {file.size[0]} x {file.size[1]} pixels, but {first.path.name} "
+                f"of the same recording {first.size[0]} x {first.size[1]}: import them apart"
+            )
+    longest_s = max(file.duration_s for file in files.values())
+    lost = [str(chapter) for chapter in range(1, max(files)) if chapter not in files]
     if lost:
         warn(
             f"chapters {', '.join(lost)} of the recording are missing: its times count from the "
-            f"start of {files[first].path.name}, and run on as if each missing one after it were "
-            f"as long as {longest.path.name}, {longest.duration_s:.1f} s"
+            f"start of {first.path.name}, and run on as if each missing one after it lasted "
+            f"{longest_s:.1f} s"
         )
+    placed, start_s = [], 0.0
+    for chapter in range(min(files), max(files) + 1):
+        if chapter in files:
+            placed.append(replace(files[chapter], start_s=start_s))
+        start_s += files[chapter].duration_s if chapter in files else longest_s
+    start, clock = video_start(first.path)
+    return Recording(name=first.path.stem, files=tuple(placed), start=start, clock=clock)
 
 
-def _check_sizes(files: Sequence[VideoFile]) -> None:
-    first = files[0]
-    for file in files:
-        if (file.width_px, file.height_px) != (first.width_px, first.height_px):
-            raise ImageError(
-                f"{file.path} has {file.width_px} x {file.height_px} pixels, but {first.path.name} "
-                f"of the same recording {first.width_px} x {first.height_px}: import them apart"
-            )
+def video_start(path: Path) -> tuple[datetime | None, str]:
+    """When a video began by the index of its MP4 (ISO/IEC 14496-12), and on which clock.
+
+    A GoPro writes its local time as if it were UTC: then the time has no zone. None of other files
+    and damaged ones, whose pictures OpenCV may read all the same.
+
+    Raises:
+        ImageError: the file cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            index = _index_of(file, file.seek(0, os.SEEK_END))
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
+    at = index.find(b"mvhd") + 4
+    form = ">Q" if index[at : at + 1] == b"\1" else ">I"
+    if at < 4 or len(index) < at + 4 + struct.calcsize(form):
+        return None, "unknown"
+    (seconds,) = struct.unpack_from(form, index, at + 4)
+    if seconds > 1 << 34 or (made := _MP4_EPOCH + timedelta(seconds=seconds)).year not in _YEARS:
+        return None, "unknown"
+    if b"GoPro" in index:
+        return made.replace(tzinfo=None), "the camera's local time, in the video"
+    return made, "UTC in the video"
+
+
+def _index_of(file: Any, total: int) -> bytes:
+    """The content of the box `moov`; empty without one."""
+    at = 0
+    for _ in range(_MAX_BOXES):
+        file.seek(at)
+        head = file.read(16)
+        if len(head) < 16:
+            break
+        size, kind = struct.unpack(">I4s", head[:8])
+        begin = at + 8
+        if size == 1:
+            size, begin = struct.unpack(">Q", head[8:])[0], at + 16
+        end = total if size == 0 else min(at + size, total)
+        if kind == b"moov":
+            file.seek(begin)
+            return bytes(file.read(max(0, min(end - begin, _MAX_INDEX))))
+        if end < begin:
+            break
+        at = end
+    return b""
 
 
 def open_video(path: Path) -> cv2.VideoCapture:
@@ -199,13 +215,13 @@ def open_video(path: Path) -> cv2.VideoCapture:
     return capture
 
 
-def frame_rate(capture: cv2.VideoCapture) -> float:
+def _frame_rate(capture: cv2.VideoCapture) -> float:
     """Frames per second; 0 where the video does not say."""
     rate = capture.get(cv2.CAP_PROP_FPS)
     return float(rate) if np.isfinite(rate) and 0 < rate < 10_000 else 0.0
 
 
-def frame_count(capture: cv2.VideoCapture) -> int:
+def _frame_count(capture: cv2.VideoCapture) -> int:
     """Number of frames; 0 where the video does not say."""
     return max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
 
@@ -213,36 +229,12 @@ def frame_count(capture: cv2.VideoCapture) -> int:
 def _open(path: Path) -> VideoFile:
     capture = open_video(path)
     try:
-        rate, count = frame_rate(capture), frame_count(capture)
-        width = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
-        height = int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        rate, count = _frame_rate(capture), _frame_count(capture)
+        size = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
+        width, height = (int(capture.get(side)) for side in size)
     finally:
         capture.release()
-    return VideoFile(
-        path=path, width_px=width, height_px=height, duration_s=count / rate if rate else 0.0,
-        facts=read_mp4(path),
-    )  # fmt: skip
-
-
-def _began(files: Sequence[VideoFile]) -> tuple[datetime | None, str]:
-    """When a recording began, and by what: GPS, else the container of its first file."""
-    for file in files:
-        start = None if file.facts.fixes is None else file.facts.fixes.start_utc()
-        if start is not None:
-            return start - timedelta(seconds=file.start_s), "GPS in the video"
-    created, is_gopro = files[0].facts.created, files[0].facts.is_gopro
-    if created is None:
-        return None, "unknown"
-    midnight = datetime(created.year, 1, 1, tzinfo=UTC)
-    if created - midnight < _CLOCK_NEVER_SET and created.year in _STARTS_OF_CLOCKS:
-        warn(
-            f"{files[0].path}: its date {created:%Y-%m-%d %H:%M:%S} is that of a clock that was "
-            "never set: its time is taken as unknown"
-        )
-        return None, "unknown"
-    if is_gopro:
-        return created.replace(tzinfo=None), "the camera's local time, in the video"
-    return created, "UTC in the video"
+    return VideoFile(path=path, size=(width, height), duration_s=count / rate if rate else 0.0)
 
 
 Grey = NDArray[np.uint8]
@@ -525,14 +517,6 @@ _MAX_HZ = 15.0
 _TOUCH_S = 1e-6
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Grabbed:
-    """A frame that is decoded only on request."""
-
-    time_s: float
-    retrieve: Callable[[], NDArray[Any] | None]
-
-
 def take_frames(
     recordings: Sequence[Recording],
     cameras: Sequence[str],
@@ -560,92 +544,64 @@ def take_frames(
         name = safe_name(recording.name)
         if any(safe_name(other.name) == name for other in recordings[:number]):
             name = f"{name}_{number + 1}"
-        grabbed = _grab_frames(recording)
         counts = FrameCounts()
         if every_s is None:
-            frames = _by_overlap(grabbed, overlap, counts)
+            frames = _by_overlap(recording, overlap, counts)
         else:
-            frames = _by_interval(grabbed, every_s)
+            frames = _frames(recording, every_s, even=True)
         for taken, frame in enumerate(frames):
             image = f"{safe_name(camera)}/{name}_{taken:06d}.png"
-            _write(folder / image, frame.pixels)
+            (folder / image).parent.mkdir(parents=True, exist_ok=True)
+            if not cv2.imwrite(str(folder / image), frame.pixels):
+                raise ImageError(f"{folder / image}: cannot be written")
             entries.append(_entry(recording, camera, frame, image, len(entries)))
         _report_counts(recording, counts)
     return entries
 
 
-def _write(path: Path, pixels: NDArray[Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(path), pixels):
-        raise ImageError(f"{path}: cannot be written")
-
-
 def _entry(recording: Recording, camera: str, frame: Frame, image: str, station: int) -> Incoming:
-    place = recording.place_at(frame.time_s)
-    taken: datetime | None = None
-    if recording.start is not None:
-        taken = recording.start + timedelta(seconds=frame.time_s)
+    source, start = recording.files[0].path, recording.start
     facts = PictureFacts(
-        path=recording.files[0].path, width_px=frame.pixels.shape[1],
-        height_px=frame.pixels.shape[0], time_local=taken,
+        path=source, width_px=frame.pixels.shape[1], height_px=frame.pixels.shape[0],
+        time_local=None if start is None else start + timedelta(seconds=frame.time_s),
     )  # fmt: skip
-    if place is not None:
-        latitude, longitude, altitude = place
-        facts = replace(facts, latitude_deg=latitude, longitude_deg=longitude, altitude_m=altitude)
     return Incoming(
-        source=recording.files[0].path.with_name(Path(image).name), camera=camera,
-        station=station, facts=facts, image=image,
-        video_time_s=recording.start_s + frame.time_s, recording=recording.name,
+        source=source.with_name(Path(image).name), camera=camera, station=station, facts=facts,
+        image=image, video_time_s=recording.start_s + frame.time_s, recording=recording.name,
     )  # fmt: skip
 
 
-def _grab_frames(recording: Recording) -> Iterator[_Grabbed]:
-    """Frames of all chapters, at times since the start of the recording."""
+def _frames(recording: Recording, step_s: float, *, even: bool) -> Iterator[Frame]:
+    """Frames of all chapters a step or more apart, or at every multiple of it where `even`."""
+    due_s, taken = -np.inf, 0
     for file in recording.files:
         capture = open_video(file.path)
         try:
-            total, rate = frame_count(capture), frame_rate(capture)
+            total, rate = _frame_count(capture), _frame_rate(capture)
             label = f"frames of {file.path.name}"
             grabs = progress(iter(capture.grab, False), label, total or None)
             for count, _ in enumerate(grabs):
                 time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
                 if count and not time_s > 0 and rate:
                     time_s = count / rate
-                yield _Grabbed(time_s=file.start_s + time_s, retrieve=partial(_pixels, capture))
+                time_s += file.start_s
+                if time_s + _TOUCH_S < due_s:
+                    continue
+                good, pixels = capture.retrieve()
+                if not good:
+                    warn(f"the frame at {time_s:.2f} s is left out: it cannot be decoded")
+                    continue
+                taken += 1
+                due_s = step_s * taken if even else time_s + step_s
+                yield Frame(time_s=time_s, pixels=pixels)
         finally:
             capture.release()
 
 
-def _pixels(capture: cv2.VideoCapture) -> NDArray[Any] | None:
-    good, pixels = capture.retrieve()
-    return pixels if good else None
-
-
-def _by_interval(grabbed: Iterator[_Grabbed], every_s: float) -> Iterator[Frame]:
-    taken = 0
-    for one in grabbed:
-        if one.time_s + _TOUCH_S < taken * every_s:
-            continue
-        pixels = one.retrieve()
-        if pixels is None:
-            warn(f"the frame at {one.time_s:.2f} s is left out: it cannot be decoded")
-            continue
-        taken += 1
-        yield Frame(time_s=one.time_s, pixels=pixels)
-
-
-def _by_overlap(
-    grabbed: Iterator[_Grabbed], overlap: float, counts: FrameCounts
-) -> Iterator[Frame]:
+def _by_overlap(recording: Recording, overlap: float, counts: FrameCounts) -> Iterator[Frame]:
     chooser = OverlapChooser(overlap, counts)
-    last_s = -1.0
-    for one in grabbed:
-        if one.time_s - last_s < (1.0 - 0.1) / _MAX_HZ:
-            continue
-        last_s = one.time_s
-        pixels = one.retrieve()
-        if pixels is not None:
-            yield from chooser.take(Frame(time_s=one.time_s, pixels=pixels))
+    for frame in _frames(recording, (1.0 - 0.1) / _MAX_HZ, even=False):
+        yield from chooser.take(frame)
     yield from chooser.rest()
 
 

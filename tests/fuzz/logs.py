@@ -86,7 +86,7 @@ def _ulog(folder: Path) -> None:
 
 def read_pairing(path: Path) -> object:
     """As `import-images --triggers`."""
-    from reconstruct.pictures.pairing import pair_by_time
+    from reconstruct.pictures.incoming import pair_by_time
 
     sides = {side: [Path(f"{side}/{k}.jpg") for k in range(5)] for side in ("left", "right")}
     return pair_by_time(sides, path, UTC)

@@ -121,7 +121,7 @@ class JoinCommand(WorkspaceCommand):
 
     def run(self) -> None:
         """Join them."""
-        from reconstruct.pictures.joining import join_dives
+        from reconstruct.pictures.importing import join_dives
 
         found = join_dives(self.workspace, self.dives)
         typer.echo(

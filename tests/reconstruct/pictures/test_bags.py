@@ -11,7 +11,7 @@ import pytest
 from alice_survey.core.errors import AliceError, ImageError, collected_by
 from alice_survey.core.manifest import read_manifest
 from reconstruct.pictures.importing import import_images
-from reconstruct.pictures.pairing import pixels_of
+from reconstruct.pictures.incoming import pixels_of
 from tests.missions.logs.log_files import Bag
 from tests.reconstruct.pictures.dated import counts
 

@@ -18,7 +18,7 @@ from camera_calib.rig import design_rig, read_rig, write_rig
 from missions.coverage.dive_record import assign_lines
 from missions.coverage.stations import stations_of_plan
 from missions.values.plan_file import Plan, read_plan
-from reconstruct.pictures.joining import join_dives
+from reconstruct.pictures.importing import join_dives
 from reconstruct.stages import rig_file
 from tests.oracles_coverage import area_of, lawnmower, plan_of
 

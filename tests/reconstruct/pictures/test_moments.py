@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from alice_survey.core.errors import ImageError
-from reconstruct.pictures.pairing import moments_of
+from reconstruct.pictures.incoming import moments_of
 
 RNG = np.random.default_rng(4)
 

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from alice_survey.core.artefacts import read_json
-from alice_survey.core.errors import ImageError, keep_warnings
+from alice_survey.core.errors import ImageError
 from alice_survey.core.manifest import read_manifest
 from reconstruct.pictures.files import decode, exif_focal_px, inspect
 from reconstruct.pictures.importing import import_images
@@ -110,11 +110,9 @@ def test_copies_are_left_out_and_named(tmp_path: Path) -> None:
     (tmp_path / "in" / "2 (1).png").write_bytes(path.read_bytes())
     (tmp_path / "more").mkdir()
     (tmp_path / "more" / "IMG_2.png").write_bytes(path.read_bytes())
-    with keep_warnings() as warnings:
-        found = import_images(tmp_path / "w", [tmp_path / "in", tmp_path / "more"])
+    found = import_images(tmp_path / "w", [tmp_path / "in", tmp_path / "more"])
     assert counts(found) == {"camera": 3} and reasons(found) == {"copies of others": 2}
-    assert len(warnings) == 2 and "2 (1).png" in warnings[0] + warnings[1]
-    assert "left out: 2 copies of others" in found.lines[-1] and "IMG_2.png" in found.lines[-1]
+    assert set(found.left_out["copies of others"]) == {"2 (1).png", "IMG_2.png"}
     (tmp_path / "other").mkdir()
     for number, name in enumerate("abc"):
         source = tmp_path / "in" / f"{number}.png"
@@ -135,9 +133,8 @@ def test_folders_inside_are_taken_on_request(tmp_path: Path) -> None:
     save(source / "masks" / "G10.png", np.full((48, 64), 255, np.uint8))
     for name in ("100GOPRO/G2_mask.png", "101GOPRO/notes.txt"):
         (source / name).write_bytes((source / "masks" / "G10.png").read_bytes())
-    with keep_warnings() as warnings:
-        import_images(tmp_path / "w", [source, source / "101GOPRO"])
-    assert any("--recursive" in line for line in warnings)
+    found = import_images(tmp_path / "w", [source, source / "101GOPRO"])
+    assert any("--recursive" in line for line in found.omissions)
     work = source / "work"
     for _ in range(2):  # what it wrote itself is not taken
         found = import_images(work, [source], recursive=True, masks=source / "masks")

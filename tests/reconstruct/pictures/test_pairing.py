@@ -11,7 +11,7 @@ from PIL import Image
 from alice_survey.core.errors import keep_warnings
 from alice_survey.core.manifest import read_manifest
 from reconstruct.pictures.importing import import_images
-from reconstruct.pictures.pairing import pair_by_time
+from reconstruct.pictures.incoming import pair_by_time
 
 START = datetime(2024, 7, 1, 12, 0, 0, 250_000, tzinfo=UTC)
 COUNT = 12

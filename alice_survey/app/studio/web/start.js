@@ -270,8 +270,8 @@ function picturesForm(started, disk) {
     const size = seen.size_mb / 1000;
     const times = seen.first_utc
       ? `from ${minuteOf(seen.first_utc)} to ${minuteOf(seen.last_utc)} UTC` : "no times";
-    const gps = seen.with_gps
-      ? `GPS in ${Math.round(100 * seen.with_gps / seen.looked_at)} % of them` : "no GPS";
+    const gps = seen.positions
+      ? `GPS in ${Math.round(100 * seen.positions / seen.looked_at)} % of them` : "no GPS";
     const what = [seen.pictures ? counted(seen.pictures, "picture") : null,
       seen.videos ? `${counted(seen.videos, "video")}, ${duration(seen.video_s)}` : null].filter(
       Boolean).join(" and ");
@@ -281,7 +281,7 @@ function picturesForm(started, disk) {
         ([name, one]) => el("li", {}, el("strong", {}, name), ` ${one.pictures} pictures`,
           one.width_px ? ` of ${one.width_px} × ${one.height_px} pixels` : "",
           one.device ? ", " + one.device : "")),
-        el("li", {}, `${times}, ${gps}${seen.masks ? `, ${seen.masks} masks` : ""}`),
+        el("li", {}, `${times}, ${gps}`),
         seen.navigation ? el("li", {}, `navigation: ${seen.navigation}`) : null,
         el("li", {}, gigabytes(seen.size_mb),
           seen.pictures ? " are copied" : " of videos, of which frames are taken",
