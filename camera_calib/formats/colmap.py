@@ -4,17 +4,10 @@ A folder holds `cameras.txt` (or `.bin`) and `rig_config.json`, which gives name
 pictures) and poses; for COLMAP also the other files of a model without pictures, so that it opens
 there. `rig_config.json` is https://colmap.github.io/rigs.html; Refractive COLMAP, a fork of 3.10,
 has that version's: cameras by `camera_id`, the reference by `ref_camera_id`.
-
-Without it the model's own `rigs.txt` or `rigs.bin` say which cameras form a rig
-(https://colmap.github.io/format.html): `RIG_ID NUM_SENSORS REF_SENSOR_TYPE REF_SENSOR_ID`, then
-for each other sensor `SENSOR_TYPE SENSOR_ID HAS_POSE [QW QX QY QZ TX TY TZ]`. They are read here
-and not by pycolmap, which needs the whole model and accepts a file that is cut short.
 """
 
-import math
-import struct
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,12 +34,6 @@ from camera_calib.rig import Rig
 CAMERA_FILES = ("cameras.bin", "cameras.txt")
 RIG_CONFIG = "rig_config.json"
 _Tie = tuple[CameraRecord, str, RigidTransform]
-_CAMERA = 0
-_TYPES = {"CAMERA": _CAMERA, "IMU": 1}
-_POSE = 7
-PosesById = Mapping[int, RigidTransform]
-"""Poses sensor_from_rig by CAMERA_ID, the reference's first; cameras without a pose are absent."""
-_REFERENCE: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class _ConfigCamera(fields.FileModel):
@@ -76,19 +63,17 @@ def read_colmap(path: Path, reading: rigs.ReadOptions) -> Rig:
     """Read a model's cameras, of COLMAP or Refractive COLMAP, and what ties them to a rig.
 
     Args:
-        path: folder of a model, its cameras.txt or cameras.bin, or a rig_config.json.
-        reading: picture size, for a rig_config.json without a model, and the camera to read.
+        path: folder of a model, or its cameras.txt, cameras.bin or rig_config.json.
+        reading: the camera to read, of several without a common rig.
 
     Raises:
         CalibrationError: a file is malformed, or several cameras have no common rig.
     """
     file = _camera_file(path)
-    if file is None:
-        return _from_config_alone(path, reading)
     folder = file.parent
     records = read_records(file)
     config = folder / RIG_CONFIG
-    ties = _config_ties(config, records) if config.exists() else _model_ties(file, records)
+    ties = _config_ties(config, records) if config.exists() else []
     if not ties:
         chosen = [r for r in records if str(r.camera_id) == reading.camera or len(records) == 1]
         if len(chosen) != 1:
@@ -184,14 +169,14 @@ def _target(path: Path) -> tuple[Path, Path]:
     return folder, file
 
 
-def _camera_file(path: Path) -> Path | None:
-    if path.is_dir() or path.name == RIG_CONFIG:
-        folder = path if path.is_dir() else path.parent
-        found = [folder / name for name in CAMERA_FILES if (folder / name).is_file()]
-        if not found and path.is_dir() and not (path / RIG_CONFIG).is_file():
-            raise CalibrationError(f"{path}: holds neither {' nor '.join(CAMERA_FILES)}")
-        return found[0] if found else None
-    return path
+def _camera_file(path: Path) -> Path:
+    if not path.is_dir() and path.name != RIG_CONFIG:
+        return path
+    folder = path if path.is_dir() else path.parent
+    found = [folder / name for name in CAMERA_FILES if (folder / name).is_file()]
+    if not found:
+        raise CalibrationError(f"{path}: no {' or '.join(CAMERA_FILES)} in the folder")
+    return found[0]
 
 
 def _config_ties(path: Path, records: Sequence[CameraRecord]) -> list[_Tie]:
@@ -216,33 +201,6 @@ def _config_ties(path: Path, records: Sequence[CameraRecord]) -> list[_Tie]:
     if len(records) > 1 and any(e.camera_id is None and e.camera_params is None for e in entries):
         warn(f"{path}: its cameras carry no numbers: taken in the order of their CAMERA_ID")
     return ties
-
-
-def _model_ties(file: Path, records: Sequence[CameraRecord]) -> list[_Tie]:
-    """The same after the model's own rigs; empty when none holds all cameras with poses."""
-    rigs = file.with_stem("rigs")
-    if len(records) == 1 or not rigs.exists():
-        return []
-    by_id = {record.camera_id: record for record in records}
-    for poses in read_rigs(rigs):
-        if set(poses) == set(by_id):
-            return [(by_id[i], f"cam{i}", pose) for i, pose in poses.items()]
-    return []
-
-
-def _from_config_alone(path: Path, reading: rigs.ReadOptions) -> Rig:
-    file = path / RIG_CONFIG if path.is_dir() else path
-    entries = _read_config(file)
-    width, height = reading.size(file)
-    cameras = []
-    for i, entry in enumerate(entries, start=1):
-        model, params = _lens_of(file, entry)
-        record = CameraRecord(
-            camera_id=i, model=model, width_px=width, height_px=height, params=params
-        )
-        cameras.append(camera_of_record(file, record))
-    poses = [_pose_of(file, entry) for entry in entries]
-    return rigs.assemble(file, reading, "COLMAP", [entry.name for entry in entries], cameras, poses)
 
 
 def _read_config(path: Path) -> list[_ConfigCamera]:
@@ -291,66 +249,6 @@ def _pose_of(path: Path, entry: _ConfigCamera) -> RigidTransform:
 def _pose_values(pose: RigidTransform) -> dict[str, Any]:
     turn = pose.rotation.as_quat(canonical=True, scalar_first=True)
     return {"turn": turn.tolist(), "shift": pose.translation.tolist()}
-
-
-def read_rigs(path: Path) -> list[PosesById]:
-    """The rigs of a model.
-
-    Args:
-        path: rigs.txt or rigs.bin.
-
-    Raises:
-        CalibrationError: the file is malformed.
-    """
-    is_binary = path.suffix == ".bin"
-    content = fields.read_bytes(path) if is_binary else b""
-    lines = [] if is_binary else fields.read_text(path).splitlines()
-    words = [word for line in lines if line.strip()[:1] != "#" for word in line.split()]
-    at = 0
-
-    def take(form: str) -> tuple[Any, ...]:
-        """The next values: `I` numbers, `i` a type of sensor, `B` a flag, `d` floats."""
-        nonlocal at
-        if is_binary:
-            values = struct.unpack_from(f"<{form}", content, at)
-            at += struct.calcsize(f"<{form}")
-            return values
-        kinds = _POSE * "d" if form == f"{_POSE}d" else form
-        read: Mapping[str, Callable[[str], float]] = {"d": float, "i": _TYPES.__getitem__}
-        values = tuple(read.get(kind, int)(words[at + i]) for i, kind in enumerate(kinds))
-        at += len(kinds)
-        return values
-
-    try:
-        left = take("Q")[0] if is_binary else None
-        rigs: list[PosesById] = []
-        while at < len(words) if left is None else len(rigs) < left:
-            rigs.append(_take_rig(take))
-        if is_binary and at != len(content):
-            raise ValueError("more bytes than rigs")
-    except (struct.error, ValueError, IndexError, KeyError, OverflowError):
-        raise CalibrationError(f"{path}: is not a {path.name} of COLMAP") from None
-    return rigs
-
-
-def _take_rig(take: Callable[[str], tuple[Any, ...]]) -> PosesById:
-    """The cameras of the next rig that have a pose, the reference first."""
-    poses: dict[int, RigidTransform] = {}
-    _, count = take("II")
-    for i in range(count):
-        kind, number = take("iI")
-        pose = _REFERENCE
-        if i > 0:
-            pose = take(f"{_POSE}d") if take("B")[0] else ()
-        if kind != _CAMERA or not pose:
-            continue
-        turn, shift = pose[:4], pose[4:]
-        if not all(map(math.isfinite, pose)) or abs(math.hypot(*turn) - 1.0) > 1e-3:
-            raise ValueError("no pose")
-        poses[number] = RigidTransform.from_components(
-            np.array(shift), Rotation.from_quat(turn, scalar_first=True)
-        )
-    return poses
 
 
 def _owns(path: Path) -> bool:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.core.errors import CalibrationError, ConfigError, warn
 from alice_survey.core.frames import Array
 from camera_calib.camera import Camera
-from camera_calib.formats import colmap, gyroflow, metashape, opencv, rigs, yaml_files
+from camera_calib.formats import colmap, metashape, opencv, rigs, yaml_files
 from camera_calib.formats.camera_files import MODELS
 from camera_calib.formats.fields import camera_name, read_text
 from camera_calib.formats.opencv_model import distorts, is_fisheye
@@ -56,7 +56,7 @@ _OWN = rigs.CalibrationFormat(
 FORMATS = {
     each.name: each
     for each in (
-        gyroflow.FORMAT, _OWN, metashape.FORMAT, yaml_files.MRCAL, colmap.FORMAT, colmap.REFRACTIVE,
+        _OWN, metashape.FORMAT, yaml_files.MRCAL, colmap.FORMAT, colmap.REFRACTIVE,
         opencv.FORMAT, yaml_files.KALIBR, yaml_files.ROS,
     )
 }  # fmt: skip

@@ -316,26 +316,18 @@ def _plain(path: Path, node: Any) -> Any:
 
 
 def write_storage(path: Path, values: Mapping[str, Any]) -> None:
-    """Write what `read_storage` reads: arrays, numbers, texts, lists of texts, and mappings."""
+    """Write what `read_storage` reads: arrays, numbers, texts and lists of texts."""
     suffix = ".xml" if path.suffix.lower() == ".xml" else ".yml"
     storage = cv2.FileStorage(suffix, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
 
-    def write(key: str, value: Any) -> None:
-        if isinstance(value, Mapping):
-            storage.startWriteStruct(key, cv2.FileNode_MAP)
-            for inner, part in value.items():
-                write(inner, part)
-            storage.endWriteStruct()
-        elif isinstance(value, list):
+    for key, value in values.items():
+        if isinstance(value, list):
             storage.startWriteStruct(key, cv2.FileNode_SEQ)
             for text in value:
                 storage.write("", text)
             storage.endWriteStruct()
         else:
-            storage.write(key, np.array([value]) if isinstance(value, tuple) else value)
-
-    for key, value in values.items():
-        write(key, value)
+            storage.write(key, value)
     with atomic_path(path) as temporary:
         temporary.write_text(storage.releaseAndGetString(), encoding="utf-8")
 

@@ -2,15 +2,12 @@
 
 One camera has `camera_matrix` and `distortion_coefficients` (also of ROS and of MATLAB's exports),
 two have `M1 D1 M2 D2` and the second's pose `R T` in the first (x2 = R x1 + T), as the sample
-`stereo_calib.cpp` names them. What OpenCV lacks has keys of our own, so that nothing is lost:
-`port`, `port1`, `port2`, `camera_names`, `body_from_rig`, `source`, `covariance`. Four coefficients
+`stereo_calib.cpp` names them; `camera_names` is a key of our own. Four coefficients
 are k1 k2 p1 p2 of a pinhole or k1 to k4 of `cv2.fisheye`: `distortion_model` (with 1 or 2 where the
 lenses of a pair differ) or the caller says which; without either it is a pinhole.
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, replace
-from dataclasses import fields as fields_of
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +17,7 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.core.errors import CalibrationError, warn
 from camera_calib.camera import Camera
 from camera_calib.formats import fields, opencv_model, rigs
-from camera_calib.optics import PORTS
-from camera_calib.ports.flat import FlatPort
-from camera_calib.rig import Covariance, Rig
+from camera_calib.rig import Rig
 
 _KEYS: Mapping[str, tuple[str, ...]] = {
     "camera_matrix": ("camera_matrix", "cameraMatrix", "Camera_Matrix", "M", "K"),
@@ -32,7 +27,6 @@ _KEYS: Mapping[str, tuple[str, ...]] = {
     "distortion_model": ("distortion_model",),
     "image_width": ("image_width", "image_Width"),
     "image_height": ("image_height", "image_Height"),
-    "port": ("port",),
 }  # fmt: skip
 """Other keys of what a camera has; of a pair they end in the camera's number."""
 _OF_BOTH = ("distortion_model", "image_width", "image_height")
@@ -45,7 +39,6 @@ class _OpenCVCamera(fields.FileModel):
     distortion_model: str | None = None
     image_width: fields.Pixels | None = None
     image_height: fields.Pixels | None = None
-    port: dict[str, Any] | None = None
 
 
 class _PairPose(fields.FileModel):
@@ -57,10 +50,6 @@ class _Names(fields.FileModel):
     camera_name: str | None = None
     camera_names: list[str] | str | None = None
     """OpenCV's XML has no other way to write a list of one than its text."""
-    source: str | None = None
-    body_from_rig: fields.Pose | None = None
-    covariance_parameters: tuple[str, ...] = ()
-    covariance: fields.Numbers | None = None
 
 
 def read_opencv(path: Path, reading: rigs.ReadOptions) -> Rig:
@@ -70,6 +59,11 @@ def read_opencv(path: Path, reading: rigs.ReadOptions) -> Rig:
         CalibrationError: a key is missing or wrong; the message names file and key.
     """
     values = fields.read_storage(path)
+    if {"port", "port1", "port2", "covariance"} & set(values):
+        raise CalibrationError(
+            f"{path}: holds ports or a covariance, as versions before 0.2 wrote them: use "
+            "rig.json, or remove these keys and state the port with --port-distance and --glass"
+        )
     single = any(key in values for key in _KEYS["camera_matrix"])
     numbers = [""] if single else ["1", "2"]
     cameras = [_camera(path, values, number, reading) for number in numbers]
@@ -92,16 +86,7 @@ def read_opencv(path: Path, reading: rigs.ReadOptions) -> Rig:
         raise CalibrationError(
             f"{path}: camera_names has {len(names)} names for {len(cameras)} cameras"
         )
-    rig = rigs.assemble(path, reading, "OpenCV", names, cameras, poses)
-    rig = replace(rig, body_from_rig=found.body_from_rig, source=found.source or rig.source)
-    if found.covariance is None:
-        return rig
-    parameters = found.covariance_parameters
-    strange = {name.rsplit(".", 1)[0] for name in parameters} - set(rig.cameras)
-    if strange or len(found.covariance) != len(parameters) ** 2:
-        raise CalibrationError(f"{path}: covariance_parameters are not those of its covariance")
-    matrix = found.covariance.reshape(len(parameters), -1)
-    return replace(rig, covariance=Covariance(parameters=parameters, matrix=matrix))
+    return rigs.assemble(path, reading, "OpenCV", names, cameras, poses)
 
 
 def write_opencv(path: Path, rig: Rig) -> list[Path]:
@@ -119,17 +104,10 @@ def write_opencv(path: Path, rig: Rig) -> list[Path]:
         values |= {f"{k}{number}": opencv_model.distortion(camera)[None]}
         if opencv_model.is_fisheye(camera):
             values[f"distortion_model{number}"] = opencv_model.FISHEYE
-        if camera.port.parameters:
-            values[f"port{number}"] = {"shape": camera.port.shape, **asdict(camera.port)}
     if not single:
         pose = list(rig.cam_from_rig.values())[1]
         values |= {"R": pose.rotation.as_matrix(), "T": pose.translation[:, None]}
-    values |= {"camera_names": list(rig.cameras), "source": rig.source}
-    if rig.body_from_rig is not None:
-        values["body_from_rig"] = rig.body_from_rig.as_matrix()
-    if rig.covariance is not None:
-        values["covariance_parameters"] = list(rig.covariance.parameters)
-        values["covariance"] = rig.covariance.matrix
+    values["camera_names"] = list(rig.cameras)
     fields.write_storage(path, values)
     return [path]
 
@@ -163,29 +141,9 @@ def _camera(
         warn(f"{where}4 coefficients taken for k1 k2 p1 p2: a fisheye needs --lens fisheye")
     size = reading.size(path) if width is None or height is None else (width, height)
     lens = opencv_model.LENS_NAMES[name]
-    camera = opencv_model.camera_of_matrix(
+    return opencv_model.camera_of_matrix(
         f"{where}camera_matrix", found.camera_matrix, k, size, lens
     )
-    return camera if found.port is None else _behind_port(f"{where}port", camera, found.port)
-
-
-def _behind_port(where: str, camera: Camera, values: Mapping[str, Any]) -> Camera:
-    """A camera behind a port whose fields are by our names."""
-    shape = values.get("shape", FlatPort.shape)
-    if shape not in PORTS:
-        raise CalibrationError(f"{where}.shape is {shape}; {' or '.join(PORTS)} expected")
-    port: dict[str, Any] = {}
-    for name in (each.name for each in fields_of(PORTS[shape])):
-        try:
-            count = 3 if name == "normal" else 1
-            numbers = fields.read_vector((count,), values.get(name)).tolist()
-        except ValueError as error:
-            raise CalibrationError(f"{where}.{name} {error}") from None
-        port[name] = tuple(numbers) if name == "normal" else numbers[0]
-    try:
-        return replace(camera, port=PORTS[shape](**port))
-    except CalibrationError as error:
-        raise CalibrationError(f"{where} is not a port: {error}") from None
 
 
 def _owns(path: Path) -> bool:
@@ -199,7 +157,7 @@ def _owns(path: Path) -> bool:
 FORMAT = rigs.CalibrationFormat(
     name="opencv",
     title="OpenCV YAML or XML",
-    holds=rigs.ALL,
+    holds=rigs.PINHOLE | {rigs.FISHEYE},
     owns=_owns,
     read=read_opencv,
     write=write_opencv,

@@ -56,17 +56,6 @@ def _one() -> Rig:
     return only(in_air(_domes()), "left")
 
 
-def _profile(folder: Path) -> None:
-    import json
-
-    lens = {
-        "camera_matrix": [[300.0, 0.0, 320.0], [0.0, 301.0, 240.0], [0.0, 0.0, 1.0]],
-        "distortion_coeffs": [0.02, 0.0, 0.0, 0.001],
-    }
-    profile = {"camera_model": "HERO", "calib_dimension": {"w": 640, "h": 480}}
-    (folder / "a.json").write_text(json.dumps(profile | {"fisheye_params": lens}))
-
-
 def _write(name: str, file: str, rig: Callable[[], Rig]) -> Callable[[Path], None]:
     def build(folder: Path) -> None:
         from camera_calib.formats.convert import FORMATS
@@ -262,7 +251,6 @@ TARGETS = (
         "mrcal cameramodel", "text", "m/left.cameramodel", _write("mrcal", "m", _in_air),
         read=_read_folder,
     ),
-    _calibration("Gyroflow profile", "json", "a.json", _profile),
     _calibration("target JSON", "json", "board.json", _board, read=read_board),
     _image("JPEG", "a.jpg", partial(_picture, name="a.jpg", mode="RGB")),
     _image("PNG, 8 bits", "a.png", partial(_picture, name="a.png", mode="RGBA")),

@@ -29,17 +29,17 @@ class CameraCommand(ReportCommand):
 class ConvertCommand(ReportCommand):
     """Convert between tools.
 
-    OpenCV, COLMAP, Refractive COLMAP, Kalibr, ROS, Metashape, mrcal, rig.json, and Gyroflow's lens
-    profiles as starts; nothing is lost silently.
+    OpenCV, COLMAP, Refractive COLMAP, Kalibr, ROS, Metashape, mrcal and rig.json; nothing is lost
+    silently.
     """
 
     name = "camera convert"
     examples = (
-        "camera convert rig.json cameras.xml",
+        "camera convert rig.json cameras.xml --drop-port --drop-covariance",
         "camera convert rig.json model --to colmap --water 1.5 3 --drop-covariance",
         "camera convert rig.json model --to refractive --drop-covariance",
         "camera convert camchain.yaml rig.json --port-distance 20 --glass 10 --n-water 1.34",
-        "camera convert gopro.json rig.json --dome-radius 60 --dome-centre 0 0 5 --n-water 1.34",
+        "camera convert gopro.yml rig.json --dome-radius 60 --dome-centre 0 0 5 --n-water 1.34",
         "camera convert intrinsics.yml rig.json --extrinsics extrinsics.yml --image-size 640 480",
         "camera convert rig.json left.yaml --to ros --camera left --drop-port --drop-covariance",
         "camera convert rig.json mounted.json --mount nadir-bow-up --lever 0.55 -0.05 0.08",
@@ -54,9 +54,7 @@ class ConvertCommand(ReportCommand):
         None, "rig, opencv, colmap, refractive, kalibr, ros, metashape, mrcal.", "--to",
         metavar="FORMAT",
     )  # fmt: skip
-    image_size: tuple[int, int] | None = option(
-        None, "Pixels, when IN states none; of a lens profile, others.", metavar="W H"
-    )
+    image_size: tuple[int, int] | None = option(None, "Pixels, when IN states none.", metavar="W H")
     extrinsics: Path | None = option(None, "OpenCV file of R and T.", metavar="FILE")
     unit_m: float = option(1.0, "Metres in one unit of IN's translations.")
     camera: str | None = option(None, "Convert this camera alone.")

@@ -141,36 +141,6 @@ def test_colmap_applies_the_rig_to_a_database_of_pictures(tmp_path: Path) -> Non
     assert applied["OPENCV"].params[4] == -0.125
 
 
-def test_a_model_that_colmap_wrote_gives_its_rig(tmp_path: Path) -> None:
-    """Poses come from the model's own rigs where there is no rig_config.json."""
-    rig = pair(AIR)
-    for kind in ("cameras.txt", "cameras.bin"):
-        folder = tmp_path / kind[-3:]
-        write_colmap(folder / kind, rig)
-        (folder / "rig_config.json").unlink()
-        after = read_colmap(folder, ReadOptions())
-        assert list(after.cameras) == ["cam1", "cam2"]
-        np.testing.assert_allclose(
-            after.cam_from_rig["cam2"].as_matrix(), rig.cam_from_rig["right"].as_matrix(),
-            atol=1e-14,
-        )  # fmt: skip
-
-
-def test_rigs_that_are_malformed_or_hold_too_little_are_refused(tmp_path: Path) -> None:
-    for kind, cut in (("cameras.txt", 20), ("cameras.bin", 1)):
-        folder = tmp_path / kind[-3:]
-        write_colmap(folder / kind, pair(AIR))
-        (folder / "rig_config.json").unlink()
-        rigs_file = folder / f"rigs{kind[-4:]}"
-        good = rigs_file.read_bytes()
-        for bad in (good[:-cut], good + b"1 2", good.replace(b"CAMERA 2", b"LIDAR 2") + b"\0"):
-            rigs_file.write_bytes(bad)
-            with pytest.raises(CalibrationError, match=r"rigs\.(txt|bin)"):
-                read_colmap(folder, ReadOptions())
-        rigs_file.write_bytes(struct.pack("<Q", 0) if kind.endswith("bin") else b"# none\n")
-        fault(folder)
-
-
 def test_cameras_without_a_rig_are_read_one_by_one(tmp_path: Path) -> None:
     path = tmp_path / "cameras.txt"
     path.write_text(
@@ -184,13 +154,11 @@ def test_cameras_without_a_rig_are_read_one_by_one(tmp_path: Path) -> None:
     assert camera.n_water == 1.0
 
 
-def test_a_rig_configuration_alone_needs_the_picture_size(tmp_path: Path) -> None:
-    rig = pair(AIR)
-    write_colmap(tmp_path / "model", rig)
+def test_a_rig_configuration_needs_its_model(tmp_path: Path) -> None:
+    write_colmap(tmp_path / "model", pair(AIR))
     alone = tmp_path / "rig_config.json"
     alone.write_text((tmp_path / "model" / "rig_config.json").read_text())
-    assert "--image-size" in fault(alone)
-    assert_same_geometry(read_colmap(alone, ReadOptions(image_size=(1920, 1200))), rig)
+    assert "cameras.txt" in fault(alone)
 
 
 def test_a_rig_configuration_without_cameras_takes_them_in_order_and_says_so(

@@ -168,9 +168,6 @@ def test_a_tilted_sensor_is_refused_and_a_level_one_read(tmp_path: Path) -> None
 def test_faults_name_file_and_key(tmp_path: Path) -> None:
     path = tmp_path / "bad.yml"
     matrix = "[ 530., 0., 319.5, 0., 531., 239.5, 0., 0., 1. ]"
-    port = (
-        "port:\n   normal: [ 0., 0., 1. ]\n   port_distance_m: 0.02\n   glass_thickness_m: 0.01\n"
-    )
     bent = f"M2: {MATRIX}{matrix}\nR: {MATRIX}[ 1., 0., 0., 0., 2., 0., 0., 0., 1. ]\n"
     for text, named in (
         (GOOD.replace("640", "6.5"), "image_width"),
@@ -181,8 +178,7 @@ def test_faults_name_file_and_key(tmp_path: Path) -> None:
         (GOOD.replace(", 1. ]", " ]"), "9"),
         (GOOD.replace("319.5", ".Nan"), "camera_matrix"),
         (GOOD + "distortion_coefficients: [ 1., 2. ]\n", "distortion_coefficients"),
-        (GOOD + port, "port.n_glass"),
-        (GOOD + port + "   n_glass: 1.5\n   n_water: many\n", "n_water"),
+        (GOOD + "port:\n   port_distance_m: 0.02\n", "--port-distance"),
         (GOOD.replace("camera_matrix", "M1") + bent + "T: [ 1., 0., 0. ]\n", "rotation"),
         (GOOD + "image_width: 3\n", "image_width twice"),
         ("%YAML:1.0\n---\na: 1\n", "camera_matrix"),
@@ -190,8 +186,6 @@ def test_faults_name_file_and_key(tmp_path: Path) -> None:
         ("%YAML:1.0\n---\na: [ 1., 2.\n", "line 3"),
         ("hello\n", "FileStorage"),
         ("\n", "empty"),
-        (GOOD + port + "   shape: cube\n", "shape"),
-        (GOOD + port + "   shape: dome\n", "port.dome_x_m"),
         (GOOD + "camera_names: [ a, b ]\n", "camera_names"),
         (GOOD + "camera_names: [ ../up ]\n", "../up"),
     ):
