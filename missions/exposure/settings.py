@@ -9,7 +9,6 @@ from alice_survey.core.config import (
     CameraConfig,
     ImagingConfig,
     PlanConfig,
-    SurveyConfig,
     WaterConfig,
 )
 from alice_survey.core.errors import warn
@@ -54,11 +53,6 @@ class ImagingSetup:
     camera: CameraConfig
     water: WaterConfig
     imaging: ImagingConfig
-
-    @classmethod
-    def of(cls, survey: SurveyConfig) -> Self:
-        """The setup of a survey."""
-        return cls(**{field.name: getattr(survey, field.name) for field in fields(cls)})
 
     @property
     def rig(self) -> Rig:

@@ -19,7 +19,7 @@ from missions.coverage.geofiles import write_coverage_tif, write_outlines
 from missions.coverage.holes import Hole, find_holes
 from missions.coverage.stations import plan_pattern, stations_of_plan
 from missions.exports.write import count_text
-from missions.fly.refly import holes_plan, write_refly
+from missions.fly.refly import dive_means, holes_plan, write_refly
 from missions.plan.strength import survey_costs
 from missions.values.plan_file import Plan, read_plan
 
@@ -172,9 +172,8 @@ def check_report(
     text = _check_text(check)
     if check.holes:
         try:
-            plan = holes_plan(
-                check.plan, check.rig, check.flown, check.holes, config, survey_costs(config)
-            )
+            means = dive_means(config.plan, config.vehicle, survey_costs(config))
+            plan = holes_plan(check.plan, check.rig, check.flown, check.holes, means)
         except PlanError as error:
             warn(f"the holes cannot be planned again: {error}")
         else:

@@ -4,7 +4,7 @@ import hashlib
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import shapely
 from shapely.geometry import MultiPolygon
 
 from alice_survey.core.artefacts import Stage, run_stage, write_json
-from alice_survey.core.config import CameraConfig, PlanConfig, SurveyConfig, WaterConfig
+from alice_survey.core.config import CameraConfig, PlanConfig, VehicleConfig, WaterConfig
 from alice_survey.core.errors import PlanError
 from camera_calib.rig import Rig
 from missions.coverage.certificate import Certificate, certificate
@@ -24,50 +24,72 @@ from missions.exports.write import count_text, write_exports
 from missions.lines.fill import lines_over
 from missions.lines.lay import order_lines
 from missions.route.dives import split_dives
-from missions.route.energy import planned_vehicle, usable_wh
-from missions.route.flyable import without_stops
-from missions.route.turns import Manoeuvre
+from missions.route.energy import planned_vehicle, usable_wh, without_stops
+from missions.route.turns import Manoeuvre, Turns
 from missions.route.ways import Ways
-from missions.values.area import Area, multipolygon
+from missions.values.area import multipolygon
 from missions.values.costs import Costs
 from missions.values.line import Line
 from missions.values.pattern import Pattern
-from missions.values.plan_file import Dive, Plan
+from missions.values.plan_file import Plan
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiveMeans:
+    """What a dive takes, and what it may take."""
+
+    costs: Costs
+    """What flying takes."""
+    turns: Turns
+    """How the vehicle turns: as of `Manoeuvre`."""
+    dive_s: float | None
+    """How long a dive may be; None: as long as the battery lasts."""
+    usable_wh: float
+    """What a dive may take of a battery."""
+
+
+def dive_means(plan: PlanConfig, vehicle: VehicleConfig, costs: Costs) -> DiveMeans:
+    """The means of a survey's settings."""
+    flown = without_stops(plan, planned_vehicle(vehicle))
+    return DiveMeans(
+        costs=costs, turns=flown.turns, dive_s=flown.dive_s, usable_wh=usable_wh(vehicle)
+    )
 
 
 def refly_plan(
     plan: Plan,
     rig: Rig,
-    pieces: MultiPolygon,
+    outlines: Sequence[MultiPolygon],
+    cell_m: float,
     pattern: Pattern,
-    *,
+    means: DiveMeans,
     name: str,
-    costs: Costs,
-    settings: PlanConfig,
-    usable_wh: float,
+    *,
     ties: Sequence[Line] = (),
     overrun_m: float = 0.0,
 ) -> Plan:
     """Plan short lines over parts of a survey, at the overlap of its plan.
 
     The new plan is whole: `fly`, exports and `plan check` take it as any other. Its survey area is
-    the parts (what the ties show, where there are none), its allowed area the plan's.
+    the parts (what the ties show, where there are none), its allowed area the plan's. Where a part
+    ends between two middles of cells is not known: the whole step counts as missed.
 
     Args:
         plan: what was flown.
         rig: the cameras.
-        pieces: what to see again; x = north, y = east, metres.
+        outlines: of the parts to see again; x = north, y = east, metres.
+        cell_m: side of the cells of which they consist.
         pattern: what lines see, and how often a place must be seen.
-        name: of the new plan.
-        costs: what flying takes.
-        settings: how the vehicle turns and how long a dive may be.
-        usable_wh: what a dive may take of a battery.
+        means: of the dives.
+        name: what the new plan is, after the name of the old one.
         ties: lines to fly as they are.
-        overrun_m: how far lines over the pieces go on at both ends, where they may.
+        overrun_m: how far lines over the parts go on at both ends, where they may.
 
     Raises:
         PlanError: there is nothing to see, or lines over it leave the allowed area.
     """
+    grown = shapely.union_all(outlines).buffer(cell_m / math.sqrt(2.0), join_style="mitre")
+    pieces = multipolygon(grown.intersection(plan.area.survey))
     lines = lines_over(pieces, replace(plan.area, survey=pieces), pattern) if pieces.area else []
     lines = [*(_longer(line, overrun_m, plan) for line in lines), *ties]
     if not lines:
@@ -78,77 +100,37 @@ def refly_plan(
     ]
     seen = pieces if pieces.area else shapely.union_all(swaths).intersection(plan.area.survey)
     ways = Ways(plan.area.allowed)
-    lines = order_lines(lines, ways, costs, plan.home_ne_m)
+    lines = order_lines(lines, ways, means.costs, plan.home_ne_m)
     dives = split_dives(
         lines,
-        Manoeuvre(costs, plan.turn_radius_m, plan.run_in_m, settings.turns, ways),
+        Manoeuvre(means.costs, plan.turn_radius_m, plan.run_in_m, means.turns, ways),
         home_ne=plan.home_ne_m,
-        usable_wh=usable_wh,
-        max_s=settings.dive_s,
+        usable_wh=means.usable_wh,
+        max_s=means.dive_s,
         depth_m=plan.seafloor_depth_m - plan.altitude_m,
     )
-    again = again_over(plan, multipolygon(seen), lines, dives, name)
-    seen_alone = certificate(again.area, rig, stations_of_plan(again), pattern)
-    return replace(again, coverage=seen_alone.share_at_overlap)
-
-
-def holes_plan(
-    plan: Plan,
-    rig: Rig,
-    seen: Certificate,
-    holes: Sequence[Hole],
-    config: SurveyConfig,
-    costs: Costs,
-) -> Plan:
-    """Plan the holes of a dive again.
-
-    Args:
-        plan: what was flown.
-        rig: the cameras.
-        seen: what the dive saw, or will have seen.
-        holes: of it.
-        config: the survey.
-        costs: what flying takes.
-
-    Raises:
-        PlanError: as `refly_plan`.
-    """
-    return refly_plan(
+    again = replace(
         plan,
-        rig,
-        to_see(plan.area, seen, holes),
-        seen.pattern,
-        name=f"{plan.name} holes",
-        costs=costs,
-        settings=without_stops(config.plan, planned_vehicle(config.vehicle)),
-        usable_wh=usable_wh(config.vehicle),
-    )
-
-
-def again_over(
-    plan: Plan, seen: MultiPolygon, lines: Sequence[Line], dives: tuple[Dive, ...], name: str
-) -> Plan:
-    """A plan of other lines over a part of the survey area, with all else as it was.
-
-    Args:
-        plan: what was flown.
-        seen: the part, the new survey area.
-        lines: in the order of flight.
-        dives: along them.
-        name: of the new plan.
-    """
-    return replace(
-        plan,
-        name=name,
-        area=replace(plan.area, survey=seen),
+        name=f"{plan.name} {name}",
+        area=replace(plan.area, survey=multipolygon(seen)),
         lines=tuple(lines),
         dives=dives,
         length_m=sum(dive.route.length_m for dive in dives),
         duration_s=sum(dive.duration_s for dive in dives),
         energy_wh=sum(dive.energy_wh for dive in dives),
         line_depths_m=(),
-        details={"refly_of": plan.name, "area_m2": seen.area},
+        details={"refly_of": plan.name, "area_m2": multipolygon(seen).area},
     )
+    seen_alone = certificate(again.area, rig, stations_of_plan(again), pattern)
+    return replace(again, coverage=seen_alone.share_at_overlap)
+
+
+def holes_plan(
+    plan: Plan, rig: Rig, seen: Certificate, holes: Sequence[Hole], means: DiveMeans
+) -> Plan:
+    """Plan the holes of a dive again, by what it saw or will have seen; as `refly_plan`."""
+    outlines = [hole.outline for hole in holes]
+    return refly_plan(plan, rig, outlines, seen.grid.cell_m, seen.pattern, means, "holes")
 
 
 def _longer(line: Line, overrun_m: float, plan: Plan) -> Line:
@@ -168,17 +150,6 @@ def _longer(line: Line, overrun_m: float, plan: Plan) -> Line:
             stations=line.stations + 2,
         )
     return line
-
-
-def to_see(area: Area, flown: Certificate, holes: Sequence[Hole]) -> MultiPolygon:
-    """The holes, and half a cell's diagonal round them, inside of the survey area.
-
-    Where a hole ends between two middles of cells is not known: the whole step counts as missed.
-    """
-    grown = shapely.union_all([hole.outline for hole in holes]).buffer(
-        flown.grid.cell_m / np.sqrt(2.0), join_style="mitre"
-    )
-    return multipolygon(grown.intersection(area.survey))
 
 
 def write_refly(

@@ -40,7 +40,7 @@ from missions.coverage.stations import (
 )
 from missions.exports.write import count_text
 from missions.fly.check import rig_of
-from missions.fly.refly import holes_plan, write_refly
+from missions.fly.refly import dive_means, holes_plan, write_refly
 from missions.logs.navigation_csv import READINGS, NavigationLog
 from missions.plan.strength import survey_costs
 from missions.route.energy import usable_wh
@@ -345,8 +345,10 @@ class FollowedDive:
             if view is not None and view.holes:
                 try:
                     with collected_by(lambda *_: None):
+                        config = self.config
+                        means = dive_means(config.plan, config.vehicle, self.costs)
                         self.proposal = holes_plan(
-                            self.plan, self.rig, view.expected, view.holes, self.config, self.costs
+                            self.plan, self.rig, view.expected, view.holes, means
                         )
                 except PlanError:
                     return None

@@ -39,14 +39,20 @@ from missions.plan.strength import (
     survey_costs,
     warn_of_swell,
 )
-from missions.route.energy import flight_conditions, sound_vehicle, usable_wh
-from missions.route.flyable import as_flown, without_stops
+from missions.route.energy import (
+    flight_conditions,
+    plan_as_flown,
+    planned_vehicle,
+    sound_vehicle,
+    usable_wh,
+    without_stops,
+)
 from missions.route.terrain import (
     Reach,
     TerrainLimits,
     line_profiles,
     reach_of,
-    terrain_report,
+    terrain_figures,
 )
 from missions.values.area import Area
 from missions.values.costs import Costs
@@ -68,8 +74,6 @@ class Planned:
     costs: Costs
     certificate: Certificate
     bathymetry: Bathymetry | None
-    terrain: str
-    """How lines follow the bathymetry; empty without one."""
     warnings: tuple[str, ...]
     """Warnings of the plan."""
     totals: dict[str, float]
@@ -91,15 +95,16 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
             makes a plan possible, its value.
     """
     with keep_warnings() as warnings:
-        config, as_set = as_flown(config), config.plan
-        plan = config.plan
-        if plan.turn_radius_m > as_set.arc_radius_m:
+        plan = plan_as_flown(config.plan, planned_vehicle(config.vehicle))
+        if plan.turn_radius_m > config.plan.arc_radius_m:
             warn(
                 f"{config.vehicle.name} is steered by fins: turns are planned with a radius of "
                 f"{plan.turn_radius_m:g} m and run-ins of {plan.run_in_m:g} m; long lines suit "
                 "it better than short ones"
             )
-        setup = ImagingSetup.of(config)
+        setup = ImagingSetup(
+            plan=plan, camera=config.camera, water=config.water, imaging=config.imaging
+        )
         imaging = imaging_settings(rig, setup)
         check_turns(plan)
         step_m = imaging.station_spacing_m
@@ -113,7 +118,13 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
         _warn_of_hull(vehicle.name, area, clearance_m, hull, glass_body_m)
         home = _home(plan.home_ne_m, area)
         costs = survey_costs(config, imaging_w=imaging.imaging_w)
-        warn_of_swell(flight_conditions(config), config.sea, depth_m, below_m)
+        set_depth_m = config.area.seafloor_depth_m - plan.altitude_m
+        warn_of_swell(
+            flight_conditions(plan, config.vehicle, config.sea, set_depth_m, glass_body_m),
+            config.sea,
+            depth_m,
+            below_m,
+        )
         flown = plan_parts(
             area,
             without_stops(plan, vehicle),
@@ -132,7 +143,7 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
             max(stereo.ahead_m, stereo.astern_m),
         )
         camera = rig.cameras[rig.reference]
-        depths_m, terrain, figures = _terrain(lines, plan, reach, pattern, camera, bathymetry)
+        depths_m, figures = _terrain(lines, plan, reach, pattern, camera, bathymetry)
         deepest_m, rating_m = max([below_m, *chain.from_iterable(depths_m)]), vehicle.depth_rating_m
         if rating_m is not None and deepest_m > rating_m:
             raise PlanError(
@@ -198,7 +209,6 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
             certificate=seen,
             bathymetry=bathymetry,
             warnings=(),
-            terrain=terrain,
             totals=totals,
             rows=(*rows, *plan_rows(finished, totals, seen, sweep, config.vehicle)),
         )
@@ -328,17 +338,17 @@ def _terrain(
     pattern: Pattern,
     camera: Camera,
     bathymetry: Bathymetry | None,
-) -> tuple[tuple[tuple[float, ...], ...], str, dict[str, Any] | None]:
-    """How lines follow a bathymetry: depths of the glass at each station, in words, in figures."""
+) -> tuple[tuple[tuple[float, ...], ...], dict[str, Any] | None]:
+    """How lines follow a bathymetry: depths of the glass at each station, and figures."""
     if bathymetry is None:
-        return (), "", None
+        return (), None
     limits = TerrainLimits(
         altitude_m=plan.altitude_m,
         least_clearance_m=plan.least_clearance_m,
         steepest_rad=math.radians(plan.steepest_deg),
     )
     profiles = line_profiles(lines, bathymetry, reach, limits)
-    text, figures = terrain_report(
+    figures = terrain_figures(
         lines,
         profiles,
         limits,
@@ -348,7 +358,7 @@ def _terrain(
         extent_m=partial(footprint_size_m, camera),
     )
     depths = tuple(tuple(round(float(d), 4) for d in p.depth_m) for p in profiles)
-    return depths, text, figures
+    return depths, figures
 
 
 def _stations(plan: Plan, bathymetry: Bathymetry | None) -> Stations:

@@ -68,8 +68,7 @@ def write_planned(
     plan = planned.plan
     write_json(folder / "plan.json", plan.to_json())
     write_json(folder / "certificate.json", planned.certificate.to_json())
-    table = "\n\n".join(filter(None, (settings_table(planned.rows), planned.terrain)))
-    (folder / "settings.txt").write_text(table + "\n", encoding="utf-8")
+    (folder / "settings.txt").write_text(settings_table(planned.rows) + "\n", encoding="utf-8")
     write_triggers(folder, plan, planned.costs, planned.imaging.shortest_interval_s)
     figure = plan_figure(plan, rig, planned.certificate, planned.bathymetry, sea)
     save_figure(figure, folder / "map.png")

@@ -19,9 +19,10 @@ from missions.route.energy import (
     course_powers,
     flies_everywhere,
     flight_conditions,
+    plan_as_flown,
+    planned_vehicle,
     vehicle_costs,
 )
-from missions.route.flyable import as_flown, plan_as_flown
 from missions.values.costs import Costs
 from missions.values.plan_file import Dive
 
@@ -33,7 +34,10 @@ def survey_costs(config: SurveyConfig, *, imaging_w: float = 0.0) -> Costs:
         config: of the survey.
         imaging_w: mean power of strobes while on lines.
     """
-    flown = flight_conditions(as_flown(config))
+    plan = plan_as_flown(config.plan, planned_vehicle(config.vehicle))
+    depth_m = config.area.seafloor_depth_m - plan.altitude_m
+    glass_body_m = config.camera.position_body_m
+    flown = flight_conditions(plan, config.vehicle, config.sea, depth_m, glass_body_m)
     refused = partial(current_error, flown, is_set=config.sea.current_file is None)
     return vehicle_costs(flown, refused=refused, imaging_w=imaging_w)
 

@@ -30,7 +30,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.core.config import SeaConfig, SurveyConfig, VehicleConfig
+from alice_survey.core.config import PlanConfig, SeaConfig, VehicleConfig
 from alice_survey.core.errors import PlanError, VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.files import coefficients_from_file, vehicle_to_fly
@@ -40,7 +40,7 @@ from alice_survey.sim.vehicle.pilot.settings import (
     STEP_MPS,
     turn_in_place_rate_rad_s,
 )
-from alice_survey.sim.vehicle.steady import steady_flight
+from alice_survey.sim.vehicle.steady import fin_flight, min_radius_m, steady_flight
 from alice_survey.sim.vehicle.vehicle import Vehicle
 from missions.values.costs import SETTLE_S, Costs
 
@@ -51,6 +51,8 @@ _HEADINGS = 24
 """Number of headings over which a turn on the spot in a current is averaged."""
 _RATES = np.linspace(1.0, 1.0 / 16.0, 16)
 """Shares of a greatest rate that are tried, downwards."""
+_ROOM = 1.25
+"""Radius of turns over the tightest that fins hold (inferred): room to come back to the path."""
 _DEAR = 100.0
 """Price of what cannot be flown, over that of an arc."""
 _HEAVES_MPS = np.linspace(0.5, 0.01, 50)
@@ -92,26 +94,76 @@ class FlightConditions:
         )
 
 
-def flight_conditions(config: SurveyConfig) -> FlightConditions:
+def flight_conditions(
+    plan: PlanConfig,
+    settings: VehicleConfig,
+    sea: SeaConfig,
+    depth_m: float,
+    glass_body_m: tuple[float, float, float],
+) -> FlightConditions:
     """The conditions that a survey expects.
+
+    Args:
+        plan: speed, heading and turns, as its vehicle can fly them.
+        settings: of the vehicle.
+        sea: its current.
+        depth_m: at which it is flown.
+        glass_body_m: the left port's outer glass.
 
     Raises:
         VehicleError: the vehicle is described wrongly.
         NavigationError: the file of the current cannot be read.
     """
-    vehicle, plan = planned_vehicle(config.vehicle), config.plan
+    vehicle = planned_vehicle(settings)
     return FlightConditions(
         vehicle=vehicle,
-        manner=_manner(vehicle, config.vehicle),
+        manner=_manner(vehicle, settings),
         speed_mps=plan.speed_mps,
         line_heading_deg=plan.line_heading_deg,
-        current_ne_mps=expected_current(config.sea, config.area.seafloor_depth_m - plan.altitude_m),
+        current_ne_mps=expected_current(sea, depth_m),
         turn_radius_m=plan.arc_radius_m,
         max_turn_rad_s=turn_in_place_rate_rad_s(plan.turn_rate_limit_deg_s),
-        glass_body_m=config.camera.position_body_m,
-        hotel_w=hotel_w(config.vehicle),
+        glass_body_m=glass_body_m,
+        hotel_w=hotel_w(settings),
         needs_arcs=plan.turns == "arcs" or bool(vehicle.fins),
     )
+
+
+def without_stops(plan: PlanConfig, vehicle: Vehicle) -> PlanConfig:
+    """Settings for laying routes: of a vehicle that fins steer, by arcs alone."""
+    return plan.model_copy(update={"turns": "arcs"}) if vehicle.fins else plan
+
+
+def plan_as_flown(plan: PlanConfig, vehicle: Vehicle) -> PlanConfig:
+    """Settings with arcs that fins hold and run-ins as long as their radius.
+
+    They are widened where `turns = "auto"`. At a speed at which it does not fly at all they are
+    left: the speed is refused elsewhere.
+
+    Raises:
+        PlanError: turns are set that it cannot fly.
+    """
+    if not vehicle.fins:
+        return plan
+    if plan.turns not in ("auto", "arcs"):
+        raise PlanError(
+            f"{vehicle.name} is steered by fins and cannot stop: plan.turns = {plan.turns!r} "
+            "cannot be flown; set 'arcs', or leave it out"
+        )
+    if fin_flight(vehicle, plan.speed_mps, 0.0, STEADY_SHARE) is None:
+        return plan
+    min_m = min_radius_m(vehicle, plan.speed_mps, STEADY_SHARE)
+    if plan.turns == "auto":
+        radius_m = max(plan.arc_radius_m, math.ceil(10.0 * _ROOM * min_m) / 10.0)
+        run_in_m = max(plan.run_in_m, radius_m)
+        return plan.model_copy(update={"turn_radius_m": radius_m, "run_in_m": run_in_m})
+    if plan.turn_radius_m < min_m:
+        raise PlanError(
+            f"turn_radius_m {plan.turn_radius_m:g} is tighter than the {min_m:.2f} m that the "
+            f"fins of {vehicle.name} hold at {plan.speed_mps:g} m/s: raise it, or "
+            "set turns = 'auto'"
+        )
+    return plan
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

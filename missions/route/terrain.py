@@ -57,10 +57,6 @@ class TerrainLimits:
                 f"altitude_m {self.altitude_m:g} is less than least_clearance_m "
                 f"{self.least_clearance_m:g}: raise plan.altitude_m or lower plan.least_clearance_m"
             )
-        if not 0 < self.steepest_rad < math.pi / 2:
-            raise PlanError(
-                f"a slope of {math.degrees(self.steepest_rad):g} deg cannot be followed"
-            )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -238,7 +234,7 @@ def line_profiles(
     ]
 
 
-def terrain_report(
+def terrain_figures(
     lines: Sequence[Line],
     profiles: Sequence[DepthProfile],
     limits: TerrainLimits,
@@ -247,7 +243,7 @@ def terrain_report(
     spacing_m: float,
     step_m: float,
     extent_m: Callable[[float], tuple[float, float]],
-) -> tuple[str, dict[str, Any]]:
+) -> dict[str, Any]:
     """The figures of following the terrain, and a warning where pictures suffer.
 
     Args:
@@ -299,15 +295,7 @@ def terrain_report(
             f"{high:.2f} m, beyond altitude_m + relief_m = {limits.altitude_m + relief_m:g} m: "
             "raise plan.steepest_deg or plan.relief_m, or turn the lines along the slope"
         )
-    text = (
-        f"terrain: altitude {low:.2f} to {high:.2f} m above the floor (requested "
-        f"{limits.altitude_m:g} m above the highest within reach), steepest floor "
-        f"{data['steepest_floor_deg']:.1f} deg, steepest way {data['steepest_deg']:.1f} deg of "
-        f"{math.degrees(limits.steepest_rad):g}; {data['raised_stations']} of {len(altitude)} "
-        f"stations higher for the slope; least side overlap {data['least_side_overlap']:.1%}, "
-        f"coarsest pixels {data['coarsest_pixel']:.2f} times those at altitude_m"
-    )
-    return text, data
+    return data
 
 
 def _at_constant_altitude(profiles: Sequence[DepthProfile], altitude_m: float) -> dict[str, float]:

@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 import shapely
-from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.artefacts import refuse_links, write_json
 from alice_survey.core.block_solver import Flags
-from alice_survey.core.config import PlanConfig, SurveyConfig
+from alice_survey.core.config import SurveyConfig
 from alice_survey.core.errors import PlanError, warn
 from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Array
@@ -31,24 +30,10 @@ from missions.coverage.geofiles import write_outlines
 from missions.coverage.stations import Stations, join, stations_of_lines, stations_of_plan
 from missions.exports.write import count_text
 from missions.fly.check import rig_of
-from missions.fly.refly import refly_plan, write_refly
+from missions.fly.refly import DiveMeans, dive_means, refly_plan, write_refly
 from missions.plan.strength import survey_costs
-from missions.route.energy import planned_vehicle, usable_wh
-from missions.route.flyable import without_stops
-from missions.values.area import multipolygon
-from missions.values.costs import Costs
 from missions.values.line import Line
 from missions.values.plan_file import Plan
-from reconstruct.precision.candidates import (
-    BETWEEN_DIVES_S,
-    Candidate,
-    ned_from_stations,
-    stations_and_times,
-)
-from reconstruct.precision.instruments import NavigationErrors, expected_rig
-from reconstruct.precision.predict import Precision
-from reconstruct.precision.predict import predict as predicted
-from reconstruct.precision.run import summary, to_json
 from reconstruct.revisit.links import cut_around, footprints, links, pieces, views_of_floor
 from reconstruct.revisit.weak import LOOSE_SHARE, Found, WeakPlace, cells_in, find_weak
 
@@ -68,7 +53,7 @@ class Prediction:
     """The same in words."""
 
 
-def plan_revisit(found: Found, *, costs: Costs, settings: PlanConfig, usable_wh: float) -> Plan:
+def plan_revisit(found: Found, means: DiveMeans) -> Plan:
     """Plan the dive over all weak places of a survey.
 
     Lines over what pictures or the surface lack are one picture longer at both ends, so that the
@@ -76,21 +61,16 @@ def plan_revisit(found: Found, *, costs: Costs, settings: PlanConfig, usable_wh:
 
     Args:
         found: the survey.
-        costs: what flying takes.
-        settings: how the vehicle turns and how long a dive may be.
-        usable_wh: what a dive may take of a battery.
+        means: of the dives.
 
     Raises:
         PlanError: there is no weak place, or lines over them leave the allowed area.
     """
     plan = found.plan
-    grown_m = found.seen.grid.cell_m / math.sqrt(2.0)
     outlines = [place.outline for place in found.places if not place.stations]
-    lacking = shapely.union_all(outlines).buffer(grown_m, join_style="mitre")
     ties = (tie_line(found, place) for place in found.places if place.stations)
     return refly_plan(
-        plan, found.rig, multipolygon(lacking.intersection(plan.area.survey)), found.pattern,
-        name=f"{plan.name} revisit", costs=costs, settings=settings, usable_wh=usable_wh,
+        plan, found.rig, outlines, found.seen.grid.cell_m, found.pattern, means, "revisit",
         ties=[tie for tie in ties if tie is not None], overrun_m=plan.station_spacing_m,
     )  # fmt: skip
 
@@ -187,37 +167,6 @@ def predict(found: Found, again: Plan) -> tuple[tuple[Prediction, ...], Flags]:
     return tuple(found_left), piece == core
 
 
-def predict_precision(
-    found: Found, dive: Candidate, in_model: Flags
-) -> tuple[Precision, Precision | None]:
-    """Expected sigmas of the stations that now hang together, and of those that will.
-
-    Args:
-        found: the survey.
-        dive: the dive over it, as its plan.
-        in_model: (S + D,) as of `predict`.
-
-    Returns:
-        Before and after; None after a dive that does not join.
-    """
-    good, plan, rig = found.pictured.good, found.plan, dive.rig
-    poses = ned_from_stations(good, plan, rig)
-    time_s = found.pictured.numbers * (plan.station_spacing_m / plan.speed_mps)
-    new, new_s = stations_and_times(
-        dive.plan, rig, survey_costs(dive.config), float(time_s.max()) + BETWEEN_DIVES_S
-    )
-    errors = NavigationErrors.of(dive.config.navigation, dive.config.reconstruct)
-
-    def sigmas(stations: Flags) -> Precision:
-        chosen = RigidTransform.concatenate([poses, new])[stations]
-        at = np.concatenate([time_s, new_s])[stations]
-        order = np.argsort(at, kind="stable")
-        return predicted(dive.block_at(chosen[order], at[order]), errors)
-
-    now = np.concatenate([found.piece == 0, np.zeros(len(new), bool)])
-    return sigmas(now), sigmas(in_model) if in_model[len(good) :].any() else None
-
-
 def _links_after(found: Found, both: Stations) -> Any:
     """Tracks between the stations of a survey, as found, and those of a dive, as expected."""
     expected = found.tracks_per_point * links(
@@ -266,31 +215,17 @@ def revisit_report(
     cures: tuple[Prediction, ...] = ()
     if found.places:
         try:
-            again = plan_revisit(
-                found, costs=survey_costs(config),
-                settings=without_stops(config.plan, planned_vehicle(config.vehicle)),
-                usable_wh=usable_wh(config.vehicle),
-            )  # fmt: skip
+            means = dive_means(config.plan, config.vehicle, survey_costs(config))
+            again = plan_revisit(found, means)
         except PlanError as error:
             warn(f"the weak places cannot be planned again: {error}")
         else:
             cures, in_model = predict(found, again)
-            joining = int(in_model[len(found.pictured.good) :].sum())
-            used = expected_rig(workspace, config.camera, config.water, config.imaging)
-            before, after = predict_precision(
-                found, Candidate(config=config, rig=used, made=again), in_model
-            )
             words, dive = write_refly(
                 folder / "dive", again, rig, config.camera, config.water, config.plan
             )
-            dive |= {
-                "joining_stations": joining,
-                "expected_before": to_json(before),
-                "expected_after": None if after is None else to_json(after),
-            }
+            dive["joining_stations"] = int(in_model[len(found.pictured.good) :].sum())
             words = _dive_text(workspace, found, dive, words, cures)
-            if after is not None:
-                words += f"\nexpected sigmas, before: {summary(before)}; after: {summary(after)}"
     elif (folder / "dive").exists():
         warn(f"{folder / 'dive'} is of an earlier revisit: nothing is weak now")
     data = {**_json(found, cures), "dive": dive}

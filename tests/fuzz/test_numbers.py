@@ -20,8 +20,8 @@ pytestmark = pytest.mark.slow
 
 ODD = ("inf", "nan", "-inf", "1e308", "-1", "0", "5e-324", "1e-300", "true")
 OPTIONS = (
-    *(("plan", "solve", f"--{name}") for name in ("resolution", "dive", "rate")),
-    ("plan", "solve", "--rate", "0.5", "--lens"),
+    ("plan", "solve", "--resolution"),
+    ("plan", "solve", "--resolution", "0.5", "--lens"),
     *(
         ("fov", f"--{name}")
         for name in (

@@ -43,7 +43,9 @@ def read_and_check_survey(path: Path) -> object:
     from missions.plan.strength import check_turns, survey_costs
 
     config = load_config(path)
-    setup = ImagingSetup.of(config)
+    setup = ImagingSetup(
+        plan=config.plan, camera=config.camera, water=config.water, imaging=config.imaging
+    )
     try:
         check_turns(config.plan)
         imaging = imaging_settings(setup.rig, setup)

@@ -53,7 +53,9 @@ def limits(section: str, key: str, kind: type) -> list[float]:
 
 def table_of(config: SurveyConfig) -> str:
     """What the settings come to, in words."""
-    setup = ImagingSetup.of(config)
+    setup = ImagingSetup(
+        plan=config.plan, camera=config.camera, water=config.water, imaging=config.imaging
+    )
     imaging = imaging_settings(setup.rig, setup)
     costs = survey_costs(config, imaging_w=imaging.imaging_w)
     assert np.all(np.asarray(costs.line_w) >= 0)

@@ -62,45 +62,30 @@ class PlanCommand(SurveyCommand):
 
 
 class SolveCommand(SurveyCommand):
-    """Find settings from what is given.
+    """Find altitude and lens for a resolution on the sea floor.
 
-    Altitude and lens for a resolution, the area that fits a dive, the speed for a frame rate, or
-    the cross lines, closing line and overlaps that keep a model from bending.
+    For each lens the altitude and what follows: swath, lines, exposure, light and time.
     """
 
     name = "plan solve"
     examples = (
         "plan solve -w reef --resolution 0.5",
-        "plan solve -w reef --dive 3600",
-        "plan solve -w reef --rate 0.25 --lens 12.5 --lens 25 --json",
-        "plan solve -w reef --bend 5mm",
+        "plan solve -w reef --resolution 0.5 --lens 12.5 --lens 25 --json",
     )
-    resolution: float | None = option(
-        None, "Size of a pixel on the sea floor, mm.", ge=1e-3, le=1e3
-    )
-    dive: float | None = option(None, "Length of a dive, s.", ge=1, le=1e6)
-    rate: float | None = option(None, "Fixed frame rate, Hz.", ge=1e-3, le=1e4)
+    resolution: float = option(..., "Size of a pixel on the sea floor, mm.", ge=1e-3, le=1e3)
     lens: list[float] | None = option(None, "Focal lengths at hand, mm.")
-    bend: str | None = option(
-        None, "Sigma of the model's bend (5mm, 0.5cm, or mm): the measures it takes."
-    )
 
     def run(self) -> Result:
-        """Solve for what is not given."""
-        from alice_survey.core.errors import ConfigError
+        """Solve for altitude and lens."""
+        from missions.exposure.settings import ImagingSetup
         from missions.plan.solve import solve_report
 
         config = self.settings()
-        if self.bend is not None:
-            from reconstruct.precision.run import bend_report, length_m
-
-            if not self.resolution is self.dive is self.rate is None:
-                raise ConfigError("--bend goes alone: solve for the rest first, and set it")
-            return bend_report(self.workspace, config, length_m(self.bend))
-        return solve_report(
-            config, resolution_mm=self.resolution, dive_s=self.dive, rate_hz=self.rate,
-            lenses=self.lens or (12.5, 25.0),
-        )  # fmt: skip
+        setup = ImagingSetup(
+            plan=config.plan, camera=config.camera, water=config.water, imaging=config.imaging
+        )
+        depth_m = config.area.seafloor_depth_m
+        return solve_report(setup, depth_m, self.resolution, self.lens or (12.5, 25.0))
 
 
 class PrecisionCommand(SurveyCommand):
@@ -113,21 +98,18 @@ class PrecisionCommand(SurveyCommand):
     name = "plan precision"
     examples = (
         "plan precision -w reef",
-        "plan precision -w reef --plot precision.png --no-measures --json",
+        "plan precision -w reef --no-measures --json",
     )
     measures: bool = option(
         True, "Also plan more cross lines, overlap and more, and rank them.",
         "--measures/--no-measures",
     )  # fmt: skip
-    plot: Path | None = option(None, "PNG, PDF or SVG to draw.", metavar="FILE")
 
     def run(self) -> Result:
         """Compute the covariances."""
         from reconstruct.precision.run import precision_report
 
-        return precision_report(
-            self.workspace, self.settings(), measures=self.measures, plot=self.plot
-        )
+        return precision_report(self.workspace, self.settings(), measures=self.measures)
 
 
 class GainCommand(ReportCommand):

@@ -19,9 +19,8 @@ from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.holes import Hole
 from missions.coverage.stations import Stations, join, plan_pattern, stations_of_plan
 from missions.fly.check import check_report, rig_of
-from missions.fly.refly import refly_plan, to_see
+from missions.fly.refly import dive_means, holes_plan
 from missions.plan.strength import survey_costs
-from missions.route.energy import usable_wh
 from missions.route.ways import Ways
 from missions.values.line import Line
 from missions.values.navigation import write_navigation
@@ -35,10 +34,8 @@ RIG = design_rig(CONFIG.camera, CONFIG.water)
 
 
 def refly(plan: Plan, flown: Certificate, holes: Sequence[Hole]) -> Plan:
-    return refly_plan(
-        plan, RIG, to_see(plan.area, flown, holes), flown.pattern, name="holes",
-        costs=survey_costs(CONFIG), settings=CONFIG.plan, usable_wh=usable_wh(CONFIG.vehicle),
-    )  # fmt: skip
+    means = dive_means(CONFIG.plan, CONFIG.vehicle, survey_costs(CONFIG))
+    return holes_plan(plan, RIG, flown, holes, means)
 
 
 MISSING = 3

@@ -12,7 +12,7 @@ from rasterio.transform import from_origin
 from alice_survey.core.errors import PlanError
 from missions.areas.bathymetry import read_bathymetry
 from missions.exports.write import write_exports
-from missions.route.terrain import Reach, TerrainLimits, line_profiles, terrain_report
+from missions.route.terrain import Reach, TerrainLimits, line_profiles, terrain_figures
 from missions.values.plan_file import Plan
 from tests.missions.exports.plans import DATUM, RIG, small_plan
 
@@ -38,7 +38,7 @@ def plan_over(folder: Path, wall_m: float, slope: float = 0.0) -> Plan:
     lines = small_plan().lines
     limits = TerrainLimits(altitude_m=2.0, least_clearance_m=1.0, steepest_rad=np.deg2rad(30.0))
     profiles = line_profiles(lines, bathymetry, REACH, limits)
-    _, figures = terrain_report(
+    figures = terrain_figures(
         lines, profiles, limits,
         relief_m=10.0, spacing_m=1.0, step_m=0.46, extent_m=lambda m: (0.7 * m, 0.6 * m),
     )  # fmt: skip

@@ -12,5 +12,8 @@ def survey(ideal_port: bool = False, **sections: Any) -> tuple[Rig, ImagingSetup
     if ideal_port:
         port = {"port_distance_m": 0.0, "glass_thickness_m": 0.0}
         sections["camera"] = {**port, **sections.get("camera", {})}
-    setup = ImagingSetup.of(parse_config(sections, "test"))
+    config = parse_config(sections, "test")
+    setup = ImagingSetup(
+        plan=config.plan, camera=config.camera, water=config.water, imaging=config.imaging
+    )
     return setup.rig, setup

@@ -33,13 +33,19 @@ def _config(current: float = 0.1, towards: float = 90.0, **sections: Any) -> Sur
     return SurveyConfig.model_validate({"sea": sea, **sections})
 
 
+def conditions(config: SurveyConfig) -> FlightConditions:
+    depth_m = config.area.seafloor_depth_m - config.plan.altitude_m
+    glass_body_m = config.camera.position_body_m
+    return flight_conditions(config.plan, config.vehicle, config.sea, depth_m, glass_body_m)
+
+
 def test_drag_along_and_across_a_current() -> None:
     """0.2 m/s over ground in 0.1 m/s, calibrated coefficients: the figures that are known.
 
     Drag by X_uu 15.23 and Y_vv 321.6 alone: mean of 0.1 and 0.3 m/s; 0.2 ahead and 0.1 across; and
     the hypotenuse, with the heading 26.6 deg into the current.
     """
-    flown = flight_conditions(_config())
+    flown = conditions(_config())
     towards = math.atan2(*flown.current_ne_mps[::-1])
     body = flown.vehicle.plant.body
     bare = body._replace(lift=np.zeros(4))
@@ -102,9 +108,7 @@ def test_power_between_samples_is_near_that_of_its_own_course() -> None:
     config = _config()
     costs, craft = survey_costs(config), planned_vehicle(config.vehicle)
     courses = np.random.default_rng(1).uniform(0, 2 * np.pi, 50)
-    exact = (
-        course_power(craft, courses, 0.2, flight_conditions(config).current_ne_mps, "held") + 60.0
-    )
+    exact = course_power(craft, courses, 0.2, conditions(config).current_ne_mps, "held") + 60.0
     near = [power_at(costs.line_w, course) for course in courses]
     np.testing.assert_allclose(near, exact, rtol=3e-3)
 
@@ -120,12 +124,12 @@ def test_power_next_to_a_course_that_cannot_be_kept_is_infinite() -> None:
 def test_sparus_crabs_its_lines_and_cannot_step() -> None:
     config = _config(vehicle={"name": "sparus2"})
     costs = survey_costs(config)
-    assert flight_conditions(config).manner == "crab"
+    assert conditions(config).manner == "crab"
     np.testing.assert_allclose(costs.line_w, costs.way_w)
     assert np.all(np.isinf(costs.sway_w))
     assert math.isfinite(costs.stop_w)
-    assert flight_conditions(_config(vehicle={"controller": "los"})).manner == "crab"
-    assert flight_conditions(_config()).manner == "held"
+    assert conditions(_config(vehicle={"controller": "los"})).manner == "crab"
+    assert conditions(_config()).manner == "held"
 
 
 def test_where_it_cannot_crab_a_vehicle_with_sway_still_goes() -> None:
@@ -190,14 +194,14 @@ def test_a_descent_is_as_fast_as_three_quarters_of_the_thrust_allow() -> None:
 def test_a_current_above_the_vehicles_strength_is_refused_with_what_it_holds(
     config: SurveyConfig,
 ) -> None:
-    found = current_error(flight_conditions(config), "")
+    found = current_error(conditions(config), "")
     assert isinstance(found, ConflictError)
     assert found.suggestion is not None
     name, held_mps = found.suggestion
     assert name == "sea.current_mps"
     assert f"{held_mps:.2f} m/s" in found.limits[1]
     held = with_settings(config, {name: held_mps})
-    assert flies_everywhere(flight_conditions(held))
+    assert flies_everywhere(conditions(held))
     assert math.isfinite(survey_costs(held).stop_w)
 
 
@@ -205,7 +209,7 @@ def test_what_is_held_is_the_most_that_flies() -> None:
     """A vehicle that crabs holds less than its speed: going downstream it would turn its back."""
 
     def flown(current: float, name: str = "alice") -> FlightConditions:
-        return flight_conditions(_config(current, math.degrees(0.3), vehicle={"name": name}))
+        return conditions(_config(current, math.degrees(0.3), vehicle={"name": name}))
 
     assert held_current_mps(flown(0.9, "sparus2")) == pytest.approx(0.2, abs=0.0101)
     assert held_current_mps(flown(0.1, "sparus2")) == pytest.approx(0.1)
@@ -254,4 +258,4 @@ def test_a_measured_current_counts_by_its_mean_at_depth(tmp_path: Path) -> None:
     path.write_text("\n".join(rows) + "\n")
     config = _config(sea={"current_file": str(path)}, area={"seafloor_depth_m": 12.0})
     # At 10 m, half way: mean of 0.3 and 0.1 + ... north, 0.04 east.
-    np.testing.assert_allclose(flight_conditions(config).current_ne_mps, [0.3, 0.04], atol=1e-12)
+    np.testing.assert_allclose(conditions(config).current_ne_mps, [0.3, 0.04], atol=1e-12)

@@ -8,12 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-from PIL import Image
 
 from alice_survey.app.pipeline import run
 from alice_survey.core.artefacts import json_values, read_json
 from alice_survey.core.config import NavigationConfig, ReconstructConfig, SurveyConfig, load_config
-from alice_survey.core.errors import ConfigError, PlanError
 from alice_survey.core.executor import SERIAL
 from benchmarks import bend_survey
 from benchmarks.precision import errors, errors_of_drawn_logs, swayed
@@ -22,10 +20,8 @@ from missions.plan.planner import plan_survey
 from missions.plan.strength import survey_costs
 from missions.values.plan_file import Plan, read_plan
 from reconstruct.placing.alignment import sag_weights
-from reconstruct.precision import candidates
 from reconstruct.precision.candidates import (
     Candidate,
-    cheapest,
     single_measures,
     stations_and_times,
     with_control,
@@ -33,7 +29,7 @@ from reconstruct.precision.candidates import (
 )
 from reconstruct.precision.instruments import NavigationErrors, usual_rig
 from reconstruct.precision.predict import Precision, predict
-from reconstruct.precision.run import bend_report, length_m, precision_report
+from reconstruct.precision.run import precision_report
 from reconstruct.precision.tracks import ExpectedBlock, TrackModel
 from tests.small_survey import settings_in
 
@@ -200,30 +196,11 @@ def test_measures_are_ranked_by_what_a_minute_buys() -> None:
     assert gains[0] > 0
 
 
-def test_the_cheapest_set_reaches_the_bend_or_it_says_how_near_it_comes(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(candidates, "_MORE_CROSS_LINES", (1, 4))
-    monkeypatch.setattr(candidates, "_MORE_OVERLAP", ())
-    base = Candidate(config=settings(), rig=rig())
-    assert cheapest(base, 1.01 * worst_bend(base.precision)) is base
-    wanted = 0.8 * worst_bend(base.precision)
-    found = cheapest(base, wanted)
-    assert worst_bend(found.precision) <= wanted
-    assert found.minutes > base.minutes
-    text, data = bend_report(Path("nowhere"), settings(), wanted)
-    assert "[plan]" in text
-    assert data["changes"] and data["minutes"] == pytest.approx(found.minutes)
-    with pytest.raises(PlanError, match=r"no lines reach .* control points") as error:
-        cheapest(base, 1e-7)
-    assert "\n" not in str(error.value)
-
-
-def test_the_report_of_a_planned_workspace_draws_what_it_says(tmp_path: Path) -> None:
+def test_the_report_of_a_planned_workspace_writes_what_it_says(tmp_path: Path) -> None:
     workspace = settings_in(tmp_path / "w")
     run(["plan"], workspace, None, executor=SERIAL)
     config = load_config(workspace / "survey.toml")
-    text, data = precision_report(workspace, config, measures=False, plot=tmp_path / "p.png")
+    text, data = precision_report(workspace, config, measures=False)
     assert "without errors of calibration" in text
     assert 0 < data["heights_rms_m"] < 0.01
     assert 0 < data["without"]["calibration"]["scale"] < data["scale"] < 1e-3
@@ -239,16 +216,3 @@ def test_the_report_of_a_planned_workspace_draws_what_it_says(tmp_path: Path) ->
     assert np.all(area[:, :2].min(axis=0) > [south - 0.5, west - 0.5])
     assert np.all(area[:, :2].max(axis=0) < [north + 0.5, east + 0.5])
     assert "up to date" in str(run(["plan"], workspace, None, executor=SERIAL))
-    with Image.open(tmp_path / "p.png") as picture:
-        assert len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 50
-
-
-@pytest.mark.parametrize(("text", "metres"), [("5mm", 5e-3), ("0.5cm", 5e-3), (" 5 ", 5e-3)])
-def test_a_bend_is_read_in_its_unit(text: str, metres: float) -> None:
-    assert length_m(text) == pytest.approx(metres)
-
-
-@pytest.mark.parametrize("text", ["", "mm", "5 px", "-3", "0", "nan"])
-def test_what_is_no_length_is_refused(text: str) -> None:
-    with pytest.raises(ConfigError, match="5mm"):
-        length_m(text)

@@ -16,14 +16,12 @@ from alice_survey.core.records import RegistrationRecord
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import Stations, join, stations_of_plan
+from missions.fly.refly import dive_means
 from missions.plan.strength import survey_costs
-from missions.route.energy import usable_wh
 from missions.values.plan_file import Plan
 from reconstruct.elevation import Elevation
-from reconstruct.precision.candidates import Candidate
-from reconstruct.precision.instruments import usual_rig
 from reconstruct.revisit.links import cut_around, footprints, links, pieces
-from reconstruct.revisit.run import plan_revisit, predict, predict_precision
+from reconstruct.revisit.run import plan_revisit, predict
 from reconstruct.revisit.weak import Found, Pictured, measure_survey, pair_sigma_m, weak_places
 from tests.oracles_coverage import area_of, lawnmower, plan_of
 
@@ -75,10 +73,7 @@ def surveyed(
 
 
 def dive_over(found: Found) -> Plan:
-    return plan_revisit(
-        found, costs=survey_costs(CONFIG), settings=CONFIG.plan,
-        usable_wh=usable_wh(CONFIG.vehicle),
-    )  # fmt: skip
+    return plan_revisit(found, dive_means(CONFIG.plan, CONFIG.vehicle, survey_costs(CONFIG)))
 
 
 def test_one_station_is_cut_off_at_the_price_of_its_tracks() -> None:
@@ -146,16 +141,6 @@ def test_a_hole_a_strip_of_blur_and_a_loose_corner_are_cured_by_the_dive() -> No
     assert found.seen.share_at_overlap < 0.85
     assert after.share_at_overlap >= 0.999
     assert pieces(links(tracks(both, seed=1)), found.least_tracks).max() == 0
-    # The mended survey is as good as one that lacked nothing.
-    rig = usual_rig(CONFIG.camera, CONFIG.water, CONFIG.imaging)
-    before, mended = predict_precision(
-        found, Candidate(config=CONFIG, rig=rig, made=again), in_model
-    )
-    whole = Candidate(config=CONFIG, rig=rig, made=PLAN).precision
-    assert mended is not None
-    np.testing.assert_array_less(1.4 * mended.bend_m, before.bend_m)
-    ratios = [*mended.bend_m / whole.bend_m, mended.heights_rms_m / whole.heights_rms_m]
-    assert 0.9 < min(ratios) <= max(ratios) < 1.3
 
 
 def test_a_rough_patch_of_the_surface_is_flown_again() -> None:
