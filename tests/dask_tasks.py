@@ -44,13 +44,6 @@ def stop_worker_once(task: tuple[Path, int]) -> int:
     return number * number
 
 
-def hang_once(task: tuple[Path, int]) -> int:
-    mark, number = task
-    if number == 3 and is_first(mark):
-        time.sleep(3600.0)
-    return number * number
-
-
 def read_when_allowed(task: tuple[Path, Path, int]) -> int:
     folder, file, number = task
     (folder / f"{os.getpid()}.begun").touch()

@@ -14,8 +14,11 @@ import numpy as np
 import pytest
 
 from alice_survey.core.cluster import engine
-from alice_survey.core.cluster.connection import read_cluster_file
-from alice_survey.core.cluster.engine import ClusterExecutor, cluster_executor
+from alice_survey.core.cluster.engine import (
+    ClusterExecutor,
+    cluster_executor,
+    read_cluster_file,
+)
 from alice_survey.core.cluster.shared_values import LARGE_BYTES, pack, pack_once, unpack
 from alice_survey.core.cluster.worker import code_and_versions
 from alice_survey.core.errors import AliceError, ConfigError, WorkspaceError, keep_warnings
@@ -196,18 +199,6 @@ def test_a_task_that_ends_every_worker_is_a_fault(executor: ClusterExecutor) -> 
 
 
 @pytest.mark.slow
-def test_a_task_that_hangs_runs_elsewhere(
-    executor: ClusterExecutor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(engine, "_PATIENCE_S", 2.0)
-    tasks = [(tmp_path / "hung", n) for n in range(12)]
-    with keep_warnings() as warnings:
-        found = list(executor.map(dask_tasks.hang_once, tasks, label="hang"))
-    assert found == [n * n for n in range(12)]
-    assert [text for text in warnings if "it hangs" in text]
-
-
-@pytest.mark.slow
 def test_a_worker_that_loses_the_files_is_left_out(tmp_path: Path) -> None:
     """It sees the workspace in a name space of its own, where the test hides it."""
     space = ("unshare", "--mount", "--propagation", "slave")
@@ -266,7 +257,7 @@ def test_what_is_wrong_with_a_cluster_is_said_before_work(
         return str(raised.value)
 
     monkeypatch.setattr(engine, "_WAIT_S", 1.0)
-    monkeypatch.setattr("alice_survey.core.cluster.connection._CONNECT_S", 2)
+    monkeypatch.setattr(engine, "_CONNECT_S", 2)
     address = "tcp://127.0.0.1:9"
     assert "does not answer" in fault()
     with Machines(tmp_path / "machines", workers=0) as machines:

@@ -1,38 +1,35 @@
 """An executor whose tasks run on the workers of a Dask scheduler.
 
-A task that its worker cannot do, because the worker died, no longer sees the files or hangs, runs
-again on another: tasks are pure functions that write their files whole, so that results are the
-same. Dask moves tasks of workers that it misses; the rest is here.
+A task that its worker cannot do, because the worker died or no longer sees the files, runs again on
+another: tasks are pure functions that write their files whole, so that results are the same. Dask
+moves tasks of workers that it misses; those that are unfit for a run are left out here.
 """
 
 import contextlib
 import itertools
+import logging
 import os
 import pickle
 import shutil
 import socket
-import threading
 import time
+import tomllib
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import CancelledError, ThreadPoolExecutor
+from concurrent.futures import CancelledError
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 from filelock import FileLock, Timeout
+from pydantic import Field, ValidationError, model_validator
 
 from alice_survey.core.artefacts import refuse_links
-from alice_survey.core.cluster.connection import Connection, connect
-from alice_survey.core.cluster.worker import (
-    Answer,
-    RunSite,
-    check_worker,
-    code_and_versions,
-    run_task,
-)
-from alice_survey.core.errors import AliceError, WorkspaceError, note, warn, why
+from alice_survey.core.cluster.worker import Answer, RunSite, code_and_versions, run_task, why_unfit
+from alice_survey.core.config import Config
+from alice_survey.core.contents import first_fault
+from alice_survey.core.errors import AliceError, ConfigError, WorkspaceError, note, warn, why
 from alice_survey.core.executor import Executor, Item, Result, TaskResult, default_threads, in_order
 from alice_survey.core.run import progress
 from alice_survey.core.run.resources import count_elsewhere
@@ -44,16 +41,131 @@ STORE = ".cluster"
 """Folder of a workspace for values that tasks share, while a run lasts."""
 _LOCK = ".lock"
 """Ending of the file next to these that a run locks."""
+_CONNECT_S = 20
 _WAIT_S = 30.0
 """For the first worker of a scheduler, and before a missing worker is reported."""
 _LOOK_EVERY_S = 2.0
-_CHECKED_AT_ONCE = 32
-"""Workers that are asked at once, before the work."""
-_PATIENCE_S, _TIMES_LONGEST = 600.0, 20.0
-"""A task hangs that takes longer than this, and than so many times the longest of its kind."""
 _GOES_ON = "the same command goes on from here"
 _MEMORY = "MEMORY"
 """Resource of workers that Dask's documentation gives that name, in bytes."""
+_LOOPBACK = {"dashboard_address": "127.0.0.1:0", "worker_dashboard_address": "127.0.0.1:0"}
+"""Options of a local cluster without which its pages can be opened from other machines."""
+
+
+class TlsConfig(Config):
+    """Files of a connection that is encrypted and authenticated."""
+
+    ca: Path
+    """Certificate of the authority that signed those of scheduler and workers."""
+    certificate: Path
+    key: Path
+
+
+class ClusterConfig(Config):
+    """A cluster file: one of the first three."""
+
+    address: str | None = None
+    """Of a scheduler that runs."""
+    scheduler_file: Path | None = None
+    """Dask's own JSON file of such a scheduler."""
+    start: str | None = None
+    """Class of a cluster to start, such as `dask_jobqueue.SLURMCluster`."""
+    workers: int | None = Field(None, ge=1)
+    """With `start`: how many workers to ask for."""
+    options: dict[str, Any] = Field(default_factory=dict)
+    """With `start`: arguments of the class."""
+    tls: TlsConfig | None = None
+
+    @model_validator(mode="after")
+    def _one_cluster(self) -> Self:
+        given = [self.address, self.scheduler_file, self.start]
+        if sum(value is not None for value in given) != 1:
+            raise ValueError("give one of address, scheduler_file and start")
+        if self.start is None and (self.workers or self.options):
+            raise ValueError("workers and options are of a cluster to start: give start too")
+        return self
+
+    @property
+    def security(self) -> dict[str, Any]:
+        """How to connect, as an argument of clients and clusters; none for Dask's own settings."""
+        from distributed.security import Security
+
+        if self.tls is None:
+            return {}
+        files = {
+            "tls_ca_file": str(self.tls.ca),
+            "tls_client_cert": str(self.tls.certificate),
+            "tls_client_key": str(self.tls.key),
+        }
+        return {"security": Security(require_encryption=True, **files)}
+
+
+def read_cluster_file(path: Path) -> ClusterConfig:
+    """Read a cluster file; one that ends with `.json` is Dask's file of a scheduler.
+
+    Raises:
+        ConfigError: it is missing, not TOML, or describes no cluster.
+    """
+    if path.suffix.lower() == ".json":
+        return ClusterConfig(scheduler_file=path)
+    try:
+        return ClusterConfig.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+    except ValidationError as error:
+        raise ConfigError(f"{path}: {first_fault(error)}") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {why(error)}") from None
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}") from None
+
+
+@contextlib.contextmanager
+def _connect(config: ClusterConfig) -> Iterator["Client"]:
+    """Within this block, be a client of a scheduler; a cluster that was started ends with it."""
+    try:
+        from distributed import Client
+    except ImportError:
+        raise WorkspaceError(
+            "a cluster needs Dask: pip install 'alice-survey[cluster]', here and on the workers"
+        ) from None
+    for name in ("distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # what ends a run is reported here
+    with contextlib.ExitStack() as stack:
+        where: Any = config.address or config.scheduler_file
+        given: dict[str, Any] = {"address": where}
+        if config.start is not None:
+            where = config.start
+            given = {"address": stack.enter_context(_start_cluster(config))}
+        elif config.scheduler_file is not None:
+            given = {"scheduler_file": str(config.scheduler_file)}
+            if not config.scheduler_file.is_file():
+                raise ConfigError(f"{where}: no such file; 'dask scheduler' writes one")
+        given |= {"timeout": _CONNECT_S, "set_as_default": False} | config.security
+        try:
+            client = stack.enter_context(Client(**given))
+        except (OSError, ValueError, TypeError, KeyError) as error:
+            raise WorkspaceError(
+                f"the scheduler at {where} does not answer ({why(error)}): start it with 'dask "
+                "scheduler', or give the address that it prints"
+            ) from None
+        yield client
+
+
+@contextlib.contextmanager
+def _start_cluster(config: ClusterConfig) -> Iterator[Any]:
+    module, _, name = str(config.start).rpartition(".")
+    local = _LOOPBACK if name == "LocalCluster" else {}
+    try:
+        kind = getattr(import_module(module), name)
+        cluster = kind(**local | config.options | config.security)
+    except (ImportError, AttributeError, TypeError, ValueError, OSError, RuntimeError) as error:
+        raise ConfigError(
+            f"start = {config.start!r}: {why(error)}; give a class that can be imported here, such "
+            "as 'dask_jobqueue.SLURMCluster' or 'distributed.LocalCluster', and its options"
+        ) from None
+    with cluster:
+        if config.workers is not None:
+            cluster.scale(config.workers)
+        yield cluster
 
 
 def max_in_flight(workers: int) -> int:
@@ -70,18 +182,15 @@ def cluster_executor(
     Args:
         workspace: folder that the tasks read and write, and that all workers see.
         scheduler: address of the scheduler.
-        file: a cluster file instead of it.
+        file: a cluster file instead of it, or Dask's JSON file of a scheduler.
 
     Raises:
         ConfigError: the cluster file is wrong.
         WorkspaceError: Dask is missing, no scheduler or worker answers, or a worker does not see
             the workspace, has other code, or runs several tasks at a time.
     """
-    with (
-        warnings.catch_warnings(),
-        connect(scheduler, file) as connection,
-        _store(workspace) as store,
-    ):
+    config = ClusterConfig(address=scheduler) if file is None else read_cluster_file(file)
+    with warnings.catch_warnings(), _connect(config) as client, _store(workspace) as store:
         warnings.filterwarnings("ignore", "Sending large graph")
         site = RunSite(
             folder=str(Path.cwd()),
@@ -90,8 +199,8 @@ def cluster_executor(
             process=os.getpid(),
             code=code_and_versions(),
         )
-        cluster = Cluster(connection, site)
-        cluster.check()
+        cluster = Cluster(client, site)
+        cluster.check(max_wait_s=None if config.start else _WAIT_S)
         yield ClusterExecutor(workers=default_threads(), cluster=cluster)
 
 
@@ -151,88 +260,44 @@ class ClusterExecutor(Executor):
 class Cluster:
     """Workers of a scheduler that take the tasks of one run."""
 
-    def __init__(self, connection: Connection, site: RunSite) -> None:
-        self.client: Client = connection.client
-        self.site = site
+    def __init__(self, client: "Client", site: RunSite) -> None:
+        self.client, self.site = client, site
         self.numbers = itertools.count()
-        self._connection = connection
-        self._unfit: set[str] = set()
+        self.unfit: set[str] = set()
+        """Addresses of workers that may get no tasks."""
         self._known: dict[str, Any] = {}
         self._known_s = -1e9
-        self._begun: dict[int, tuple[float, str]] = {}
-        self._lock = threading.Lock()
-        self.client.subscribe_topic(site.store.name, self._note_begin)
 
     @property
     def where(self) -> str:
         """Address of the scheduler."""
-        return self._connection.address
+        scheduler: Any = self.client.scheduler
+        return str(scheduler.address)
 
-    def check(self) -> None:
+    def check(self, max_wait_s: float | None) -> None:
         """Wait for workers, check each, and report them.
 
         Raises:
             WorkspaceError: there are none, or one is unfit.
         """
-        checked: dict[str, Any] = {}
-        while not checked:
-            found = self._first_workers()
-            with (
-                progress.step("checking workers", len(found)) as counter,
-                ThreadPoolExecutor(_CHECKED_AT_ONCE) as waiting,
-            ):
-                reasons = waiting.map(self.why_unfit, found)
-                for (address, about), why_unfit in zip(found.items(), reasons, strict=True):
-                    if why_unfit:
-                        raise WorkspaceError(f"worker {_worker_name(address, about)}: {why_unfit}")
-                    if why_unfit is not None:
-                        checked[address] = about
-                    counter.advance()
-        with self.report_loss():
-            services = self.client.scheduler_info(n_workers=0)["services"]
-        shown = f"; dashboard: {self.client.dashboard_link}" if "dashboard" in services else ""
-        count = f"{len(checked)} worker{'s' if len(checked) > 1 else ''}"
-        note(f"{count} at {self.where}{shown}")
-
-    def _first_workers(self) -> dict[str, Any]:
-        with progress.step("waiting for workers"):
-            began_s = time.monotonic()
-            while not self.workers():
-                if not self._connection.is_own and time.monotonic() - began_s > _WAIT_S:
-                    raise WorkspaceError(
-                        f"no worker is connected to the scheduler at {self.where}: start some, one "
-                        f"for each core: dask worker {self.where} --nthreads 1 --nworkers -1"
-                    )
-                time.sleep(0.2)
-        return self.workers()
-
-    def why_unfit(self, address: str) -> str | None:
-        """Why a worker is unfit, empty where it is fit; None where it has ended.
-
-        Its answer waits for whatever it is doing.
-        """
-        reply = f"reply{next(self.numbers)}"
-        about = self.workers().get(address)
-        if about is not None and why_threads(about):
-            return why_threads(about)
-        try:
-            if self._ask(address, import_module, check_worker.__module__) is None:
-                return None
-            found: str | None = self._ask(address, check_worker, self.site, reply)
-        except ImportError as error:
-            return f"alice-survey cannot be imported ({error}): install the same version there"
-        if found == "" and not (self.site.store / reply).exists():
-            return f"{self.site.store} is another folder there"
-        return found
-
-    def _ask(self, address: str, function: Callable[..., Any], *args: Any) -> Any:
-        """Result of a function on one worker; None where it has ended."""
-        with self.report_loss():
-            future = self.client.submit(function, *args, workers=[address], pure=False)
-            while address in self.workers():
-                with contextlib.suppress(TimeoutError):
-                    return future.result(timeout=_LOOK_EVERY_S)
-        return None
+        with progress.step("waiting for workers"), self.report_loss():
+            try:
+                self.client.wait_for_workers(1, timeout=max_wait_s)
+            except TimeoutError:
+                raise WorkspaceError(
+                    f"no worker is connected to the scheduler at {self.where}: start some, one "
+                    f"for each core: dask worker {self.where} --nthreads 1 --nworkers -1"
+                ) from None
+        with progress.step("checking workers"), self.report_loss():
+            found = self.client.run(why_unfit, self.site, on_error="return")
+        for address, fault in found.items():
+            if isinstance(fault, ImportError):
+                fault = f"alice-survey cannot be imported ({fault}): install the same version there"
+            elif isinstance(fault, OSError):  # it has ended
+                continue
+            if fault:
+                raise WorkspaceError(f"worker {self._name(address)}: {fault}")
+        note(f"{len(found)} worker{'s' if len(found) > 1 else ''} at {self.where}")
 
     def workers(self) -> dict[str, Any]:
         """What is known of each worker, by its address; a few seconds old at most."""
@@ -244,44 +309,17 @@ class Cluster:
 
     def fit(self) -> dict[str, Any]:
         """Those that may get tasks."""
-        for address, about in self.workers().items():
-            why_unfit = why_threads(about)
-            if why_unfit:
-                self.exclude(address, why_unfit)
-        return {a: about for a, about in self.workers().items() if a not in self._unfit}
-
-    @property
-    def is_any_unfit(self) -> bool:
-        """Whether a worker may get none."""
-        return bool(self._unfit)
+        return {a: about for a, about in self.workers().items() if a not in self.unfit}
 
     def exclude(self, address: str, reason: str) -> None:
         """Give a worker no more tasks."""
-        if address not in self._unfit:
-            self._unfit.add(address)
-            about = self.workers().get(address, {})
-            warn(f"worker {_worker_name(address, about)} gets no more tasks: {reason}")
+        if address not in self.unfit:
+            self.unfit.add(address)
+            warn(f"worker {self._name(address)} gets no more tasks: {reason}")
 
-    def retire(self, address: str, reason: str) -> None:
-        """Have a worker ended; the scheduler gives its tasks to others."""
-        self.exclude(address, reason)
-        with self.report_loss():
-            self.client.retire_workers([address])
-
-    def begun(self, number: int) -> tuple[float, str] | None:
-        """When a task has begun, and the worker; None while it waits for one."""
-        with self._lock:
-            return self._begun.get(number)
-
-    def forget(self, number: int) -> None:
-        """A task is done."""
-        with self._lock:
-            self._begun.pop(number, None)
-
-    def _note_begin(self, event: tuple[float, dict[str, Any]]) -> None:
-        _, facts = event
-        with self._lock:
-            self._begun[facts["task"]] = time.monotonic(), facts["worker"]
+    def _name(self, address: str) -> str:
+        name = str(self.workers().get(address, {}).get("name", address))
+        return address if name == address else f"{name} ({address})"
 
     @contextlib.contextmanager
     def report_loss(self) -> Iterator[None]:
@@ -292,28 +330,13 @@ class Cluster:
         """
         try:
             yield
+        except TimeoutError:
+            raise
         except (CancelledError, OSError) as error:
             raise AliceError(
                 f"the scheduler at {self.where} was lost ({type(error).__name__}): start it and "
                 f"its workers again; {_GOES_ON}"
             ) from None
-
-
-def why_threads(about: dict[str, Any]) -> str:
-    """Why a worker runs more than one task at a time; empty where it does not."""
-    threads = about["nthreads"]
-    if threads == 1:
-        return ""
-    return (
-        f"it runs {threads} tasks in one process, which share libraries that need one each: start "
-        "it with --nthreads 1 (and --nworkers for its cores; threads_per_worker or processes in a "
-        "cluster file)"
-    )
-
-
-def _worker_name(address: str, about: dict[str, Any]) -> str:
-    name = str(about.get("name", address))
-    return address if name == address else f"{name} ({address})"
 
 
 class _Tasks:
@@ -322,7 +345,6 @@ class _Tasks:
     def __init__(self, cluster: Cluster, label: str, task_mib: float) -> None:
         self.cluster = cluster
         self.label = label
-        self.max_s = 0.0
         self._memory = task_mib * 2**20
         self._function: Any = None
         self._packed: bytes | str = b""
@@ -340,21 +362,20 @@ class _Tasks:
             self._function, self._packed = function, pack_once(function, store)
         return _Submitted(self, self._packed, pack(args, store))
 
-    def send(
-        self, number: int, function: bytes | str, arguments: bytes
-    ) -> "tuple[Future[Any], set[str]] | None":
-        """Send a task to workers that are fit for it.
-
-        Returns:
-            Its future, and the addresses that it may go to, all of which may end (none where any
-            may have it); None where no worker is fit now.
+    def send(self, function: bytes | str, arguments: bytes) -> "Future[Any]":
+        """Send a task to workers that are fit for it, once there are any.
 
         Raises:
-            AliceError: none has the memory.
+            AliceError: none has the memory, or none is fit.
         """
         cluster = self.cluster
-        options: dict[str, Any] = {}
-        fit = cluster.fit()
+        fit, waited_s = cluster.fit(), 0.0
+        while cluster.unfit and not fit:
+            if waited_s > _WAIT_S:
+                raise AliceError(f"no worker at {cluster.where} is fit any more; {_GOES_ON}")
+            time.sleep(_LOOK_EVERY_S)
+            waited_s += _LOOK_EVERY_S
+            fit = cluster.fit()
         large = {a: w for a, w in fit.items() if not 0 < w["memory_limit"] < self._memory}
         if fit and not large:
             maximum = max(about["memory_limit"] for about in fit.values())
@@ -362,20 +383,16 @@ class _Tasks:
                 f"{self.label!r} takes {self._memory / 2**20:.0f} MiB a task, and no worker has "
                 f"more than {maximum / 2**20:.0f} MiB: start fewer workers on each machine"
             )
-        allowed = set(large) if cluster.is_any_unfit or len(large) < len(fit) else set()
-        if allowed:
-            options["workers"] = sorted(allowed)
-        elif cluster.is_any_unfit:
-            return None
+        options: dict[str, Any] = {}
+        if cluster.unfit or len(large) < len(fit):
+            options = {"workers": sorted(large), "allow_other_workers": True}  # once these ended
         if self._memory and large and all(_MEMORY in w["resources"] for w in large.values()):
             options["resources"] = {_MEMORY: self._memory}
+        key = f"{self.label}-{cluster.site.store.name}-{next(cluster.numbers)}"
         with cluster.report_loss():
-            future = cluster.client.submit(
-                run_task, cluster.site, number, function, arguments,
-                key=f"{self.label}-{cluster.site.store.name}-{next(cluster.numbers)}",
-                pure=False, **options,
-            )  # fmt: skip
-        return future, allowed
+            return cluster.client.submit(
+                run_task, cluster.site, function, arguments, key=key, pure=False, **options
+            )
 
 
 class _Submitted:
@@ -384,18 +401,12 @@ class _Submitted:
     def __init__(self, tasks: _Tasks, function: bytes | str, arguments: bytes) -> None:
         self._tasks = tasks
         self._function, self._arguments = function, arguments
-        self._number = next(tasks.cluster.numbers)
-        self._future: Future[Any] | None = None
-        self._allowed: set[str] = set()
-        self._missing_s: float | None = None
-        self._is_reported = False
-        self._send()
+        self._future = tasks.send(function, arguments)
 
     def cancel(self) -> None:
         """Forget it; a worker that is doing it goes on to its end."""
-        if self._future is not None:
-            with contextlib.suppress(CancelledError, OSError):
-                self._future.cancel()
+        with contextlib.suppress(CancelledError, OSError):
+            self._future.cancel()
 
     def result(self) -> Any:
         """Wait for the result, or raise what the task raised.
@@ -403,93 +414,36 @@ class _Submitted:
         Raises:
             AliceError: the scheduler was lost, the task ends every worker, or none is fit.
         """
-        cluster = self._tasks.cluster
-        while True:
+        answer = self._answer()
+        while answer.unfit:
+            self._tasks.cluster.exclude(answer.worker, answer.unfit)
+            self._future = self._tasks.send(self._function, self._arguments)
             answer = self._answer()
-            if answer is None:
-                continue
-            if answer.failed:
-                answer = replace(answer, unfit=self._recheck(answer.worker))
-            if answer.unfit:
-                cluster.exclude(answer.worker, answer.unfit)
-                self._send()
-                continue
-            cluster.forget(self._number)
-            self._tasks.max_s = max(self._tasks.max_s, answer.took_s)
-            value = pickle.loads(answer.data)  # noqa: S301 (its own)
-            if answer.failed:
-                raise value
-            if not answer.is_below:
-                count_elsewhere(value.spent.cpu_s)
-            sent = len(self._arguments)
-            spent = replace(value.spent, sent_bytes=sent, received_bytes=len(answer.data))
-            return replace(value, spent=spent)
+        value = pickle.loads(answer.data)  # noqa: S301 (its own)
+        if answer.failed:
+            raise value
+        if not answer.is_below:
+            count_elsewhere(value.spent.cpu_s)
+        sent, received = len(self._arguments), len(answer.data)
+        return replace(value, spent=replace(value.spent, sent_bytes=sent, received_bytes=received))
 
-    def _send(self) -> None:
-        sent = self._tasks.send(self._number, self._function, self._arguments)
-        self._future, self._allowed = sent or (None, set())
-
-    def _answer(self) -> Answer | None:
-        """The answer, or None where it is not there yet."""
+    def _answer(self) -> Answer:
+        """The answer of a worker; a warning says that it waits since there is none."""
         from distributed.scheduler import KilledWorker
 
-        cluster = self._tasks.cluster
-        if self._future is None:
-            self._wait_for_worker()
-            return None
-        try:
-            with cluster.report_loss(), contextlib.suppress(TimeoutError):
-                found: Answer = self._future.result(timeout=_LOOK_EVERY_S)
-                return found
-        except KilledWorker as error:
-            raise AliceError(
-                f"{self._tasks.label!r}: {error.allowed_failures + 1} workers ended at this task, "
-                "most likely because their memory ran out: start fewer workers on each machine; "
-                f"{_GOES_ON}"
-            ) from None
-        self._look_after()
-        return None
-
-    def _wait_for_worker(self) -> None:
-        """Send the task as soon as a worker is fit for it.
-
-        Raises:
-            AliceError: there are workers, but for a while none that is fit.
-        """
-        cluster, now_s = self._tasks.cluster, time.monotonic()
-        self._missing_s = now_s if self._missing_s is None else self._missing_s
-        if now_s - self._missing_s > _WAIT_S:
-            if cluster.workers():
-                raise AliceError(f"no worker at {cluster.where} is fit any more; {_GOES_ON}")
-            if not self._is_reported:
-                self._is_reported = True
-                warn(f"no worker is left at {cluster.where}: waiting for one")
-        self._send()
-        if self._future is None:
-            time.sleep(_LOOK_EVERY_S)
-        else:
-            self._missing_s = None
-
-    def _look_after(self) -> None:
-        """Look why the answer takes long."""
-        cluster, tasks = self._tasks.cluster, self._tasks
-        workers = cluster.workers()
-        if not workers or (self._allowed and not self._allowed & set(workers)):
-            self.cancel()
-            self._future = None
-            return
-        begun = cluster.begun(self._number)
-        if begun is None or begun[1] not in cluster.fit():
-            return
-        took_s = time.monotonic() - begun[0]
-        if took_s > max(_PATIENCE_S, _TIMES_LONGEST * tasks.max_s):
-            cluster.retire(
-                begun[1],
-                f"it hangs, {took_s:.0f} s in a task of {tasks.label!r}, others took "
-                f"{tasks.max_s:.0f} s at most",
-            )
-
-    def _recheck(self, address: str) -> str:
-        """Why a worker whose task failed is unfit, if it is."""
-        found = self._tasks.cluster.why_unfit(address)
-        return "it has ended" if found is None else found
+        cluster, missing_s = self._tasks.cluster, 0.0
+        while True:
+            try:
+                with cluster.report_loss():
+                    found: Answer = self._future.result(timeout=_LOOK_EVERY_S)
+                    return found
+            except KilledWorker as error:
+                raise AliceError(
+                    f"{self._tasks.label!r}: {error.allowed_failures + 1} workers ended at this "
+                    "task, most likely because their memory ran out: start fewer workers on each "
+                    f"machine; {_GOES_ON}"
+                ) from None
+            except TimeoutError:
+                missing_s = 0.0 if cluster.workers() else missing_s + _LOOK_EVERY_S
+                if _WAIT_S <= missing_s < _WAIT_S + _LOOK_EVERY_S:
+                    warn(f"no worker is left at {cluster.where}: waiting for one")

@@ -8,7 +8,6 @@ import platform
 import socket
 import sys
 import tempfile
-import time
 import traceback
 from dataclasses import dataclass
 from functools import cache
@@ -52,8 +51,7 @@ class Answer:
     """Pickle of the result, or of the error."""
     failed: bool = False
     unfit: str = ""
-    """Why the task was not run there."""
-    took_s: float = 0.0
+    """Why the worker cannot do it."""
     is_below: bool = False
     """Whether the worker is a process below that of the run, whose computing counts as its own."""
 
@@ -72,18 +70,16 @@ def code_and_versions() -> tuple[tuple[str, str], ...]:
     return tuple(sorted(found.items()))
 
 
-def run_task(site: RunSite, number: int, function: bytes | str, arguments: bytes) -> Answer:
+def run_task(site: RunSite, function: bytes | str, arguments: bytes) -> Answer:
     """Run a task on this worker; whatever it raises is part of the answer."""
     from distributed import get_worker
 
     worker = get_worker()
-    why = why_unfit(site)
-    if why:
-        return Answer(worker.address, unfit=why)
+    unfit = why_unfit(site, worker)
+    if unfit:
+        return Answer(worker.address, unfit=unfit)
     from alice_survey.core.cluster.shared_values import unpack
 
-    worker.log_event(site.store.name, {"task": number, "worker": worker.address})
-    began_s = time.monotonic()
     failed = False
     try:
         with contextlib.chdir(site.folder):
@@ -92,29 +88,26 @@ def run_task(site: RunSite, number: int, function: bytes | str, arguments: bytes
         error.add_note("".join(traceback.format_exception(error)))
         error.__cause__ = error.__context__ = None
         failed, result = True, error
+        unfit = why_unfit(site, worker)  # it may have lost the files meanwhile
     return Answer(
         worker.address,
         data=_pickle(result),
         failed=failed,
-        took_s=time.monotonic() - began_s,
+        unfit=unfit,
         is_below=_is_below(site.host, site.process),
     )
 
 
-def check_worker(site: RunSite, reply: str) -> str:
-    """Check this worker, and write a file that the run can look for; why it is unfit, if it is."""
-    why = why_unfit(site)
-    if not why:
-        try:
-            (site.store / reply).write_text(site.store.name)
-        except OSError as error:
-            return f"it cannot write in {site.store}: {error.strerror}"
-    return why
-
-
-def why_unfit(site: RunSite) -> str:
+def why_unfit(site: RunSite, dask_worker: Any) -> str:
     """Why this worker cannot run the tasks of a run; empty where it can."""
     _prepare(site.host)
+    threads = dask_worker.state.nthreads
+    if threads != 1:
+        return (
+            f"it runs {threads} tasks in one process, which share libraries that need one each: "
+            "start it with --nthreads 1 (and --nworkers for its cores; threads_per_worker or "
+            "processes in a cluster file)"
+        )
     try:
         seen = site.mark.read_text()
         with contextlib.chdir(site.folder):
@@ -126,6 +119,8 @@ def why_unfit(site: RunSite) -> str:
         )
     if seen != site.store.name:
         return f"{site.store} is another folder there"
+    if not os.access(site.store, os.W_OK):
+        return f"it cannot write in {site.store}"
     here, requested = dict(code_and_versions()), dict(site.code)
     for name in sorted(here.keys() | requested.keys()):
         if here.get(name) != requested.get(name):

@@ -120,7 +120,7 @@ def event_text(event: Event) -> str:
     """An event in words."""
     text, stage = str(event.get("message", "")), event.get("stage", "")
     of_stage = f"{stage}: " if stage else ""
-    took_s = float(event.get("took_s", event.get("elapsed_s", 0.0)))
+    took_s: Any = event.get("took_s", event.get("elapsed_s", 0.0))
     match event["event"]:
         case "run_started":
             return f"run started: {event['command']}"
