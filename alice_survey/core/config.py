@@ -119,7 +119,7 @@ class AreaConfig(Config):
     file: Path | None = setting(
         None, "holes are no-go zones; leave out the datum above: it is its middle",
         example='"reef.geojson"',
-        above="... or a file: GeoJSON, KML, KMZ, GeoPackage, shapefile, WKT, QGroundControl .plan",
+        above="... or a file: GeoJSON, KML, KMZ, GeoPackage, shapefile, WKT",
     )  # fmt: skip
     layer: str | None = setting(None, "of a file that holds several", example='"survey"')
     crs: str | None = setting(

@@ -28,8 +28,8 @@ _EMPTIEST = 5
 _PAD_CELLS = 2
 _SAME_CELL = 1e-6
 """A place so near a centre, in cells, is on it."""
-_EDGE_POINTS = 32
-"""Points on each side of the bounds, whose straight sides are curves in the raster."""
+_EDGE_POINTS = 128
+"""Points round the bounds, whose straight sides are curves in the raster."""
 _ONE_SIGN = 0.99
 """Share of cells of one sign from which a raster without a word on it is taken to be of that sign.
 """
@@ -281,17 +281,6 @@ def _pixels_at(file: Any, crs: str, lat_lon: Array) -> Array:
     return _pixels(tuple(file.transform)[:6], np.asarray(x), np.asarray(y))
 
 
-def _if_swapped(file: Any, crs: str, datum: Datum) -> str:
-    """What speaks for it that an area is off because its latitude and longitude are swapped."""
-    if abs(datum.longitude_deg) > 90.0:
-        return ""
-    swapped = np.array([[datum.longitude_deg, datum.latitude_deg]])
-    ((column, row),) = _pixels_at(file, crs, swapped)
-    if not (0.0 <= column <= file.width and 0.0 <= row <= file.height):
-        return ""
-    return "; with latitude and longitude swapped the area lies in it"
-
-
 def _transformer(crs: str) -> Any:
     from pyproj import Transformer
 
@@ -325,22 +314,14 @@ def _window(
     if bounds_ne is None:
         window = (0, 0, int(file.width), int(file.height))
     else:
-        north_0, east_0, north_1, east_1 = bounds_ne
-        t = np.linspace(0.0, 1.0, _EDGE_POINTS)
-        north, east = north_0 + t * (north_1 - north_0), east_0 + t * (east_1 - east_0)
-        edge = np.vstack([
-            np.column_stack([north, np.full_like(t, east_0)]),
-            np.column_stack([north, np.full_like(t, east_1)]),
-            np.column_stack([np.full_like(t, north_0), east]),
-            np.column_stack([np.full_like(t, north_1), east]),
-        ])  # fmt: skip
+        box = shapely.box(*bounds_ne)
+        edge = shapely.get_coordinates(
+            shapely.segmentize(box.exterior, max(box.length / _EDGE_POINTS, 1e-9))
+        )
         geodetic = datum.geodetic_from_ned(np.hstack([edge, np.zeros((len(edge), 1))]))
         columns, rows = _pixels_at(file, crs, geodetic[:, :2]).T
         if not (np.all(np.isfinite(columns)) and np.all(np.isfinite(rows))):
-            raise PlanError(
-                f"{path}: its coordinate system does not reach the survey area"
-                f"{_if_swapped(file, crs, datum)}"
-            )
+            raise PlanError(f"{path}: its coordinate system does not reach the survey area")
         first_c = max(math.floor(columns.min()) - _PAD_CELLS, 0)
         first_r = max(math.floor(rows.min()) - _PAD_CELLS, 0)
         last_c = min(math.ceil(columns.max()) + _PAD_CELLS, file.width)
@@ -350,7 +331,7 @@ def _window(
                 f"{path}: does not reach the survey area, which is at columns "
                 f"{columns.min():.0f} to {columns.max():.0f} and rows {rows.min():.0f} to "
                 f"{rows.max():.0f} of its {file.width} x {file.height}: check the "
-                f"area's datum and area.bathymetry_file{_if_swapped(file, crs, datum)}"
+                "area's datum and area.bathymetry_file"
             )
         window = (first_c, first_r, last_c - first_c, last_r - first_r)
     cells = window[2] * window[3]

@@ -83,32 +83,14 @@ class LocalFrame:
         if far.max() <= MAX_M:
             return
         worst = int(far.argmax())
-        datum = f"({self.datum.latitude_deg:g}, {self.datum.longitude_deg:g})"
-        where = (
-            "" if not raw.geographic else f" at ({corners[worst][0]:.6g}, {corners[worst][1]:.6g})"
-        )
-        swapped = (
-            raw.geographic
-            and far.min() > MAX_M
-            and _distance_m(corners[:, ::-1], self.datum).max() <= MAX_M
-        )
-        if swapped and self.datum_is_given:
+        advice = "move the datum (latitude_deg, longitude_deg), or check the corner and its crs"
+        if raw.geographic and _distance_m(corners[:, ::-1], self.datum).max() <= MAX_M:
             advice = "latitude and longitude are swapped"
-        elif swapped:
-            advice = "latitude and longitude are swapped here or in the area"
-        elif raw.geographic and not self.datum_is_given:
-            advice = "the area is too large, or a corner is wrong"
-        elif raw.geographic:
-            advice = (
-                "move the datum (latitude_deg, longitude_deg) or leave it out, or check the corner "
-                "and its crs"
-            )
-        else:
-            advice = "move the datum or check the corner"
         raise PlanError(
-            f"{corner_name(raw.origin, name, worst)}{where} is "
-            f"{far.max() / 1e3:.0f} km from the datum {datum}; at most {MAX_M / 1e3:.0f} km: "
-            f"{advice}"
+            f"{corner_name(raw.origin, name, worst)} at ({corners[worst][0]:.6g}, "
+            f"{corners[worst][1]:.6g}) is {far.max() / 1e3:.0f} km from the datum "
+            f"({self.datum.latitude_deg:g}, {self.datum.longitude_deg:g}); at most "
+            f"{MAX_M / 1e3:.0f} km: {advice}"
         )
 
 
@@ -215,15 +197,9 @@ def _check_degrees(lat_lon: Array, origin: str, name: str, crs: Any) -> None:
         return
     first = int(bad.argmax())
     lat, lon = lat_lon[first]
-    metres = max(abs(lon), abs(lat)) > 360.0
-    advice = (
-        "these are no degrees: set crs to the system they are in"
-        if metres
-        else "are latitude and longitude swapped?"
-    )
     raise PlanError(
-        f"{corner_name(origin, name, first)} has longitude {lon:.10g} "
-        f"and latitude {lat:.10g} in {crs.name}: {advice}"
+        f"{corner_name(origin, name, first)} has longitude {lon:.10g} and latitude {lat:.10g} in "
+        f"{crs.name}: set crs to the system they are in, or swap the two"
     )
 
 

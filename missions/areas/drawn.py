@@ -28,10 +28,11 @@ FILES = {
 }  # fmt: skip
 """Names of the files that hold drawn shapes."""
 _KEYS = {
-    "survey": ("polygon_ne_m", "polygon_latlon_deg", "corridor_ne_m", "wkt", "file", "layer"),
+    "survey": ("polygon_ne_m", "polygon_latlon_deg", "corridor_ne_m", "wkt", "layer", "file"),
     "no_go": ("no_go_ne_m", "no_go_file"),
     "allowed": ("allowed_ne_m", "allowed_file"),
 }  # fmt: skip
+"""Settings of each role: the first holds plain polygons, the last names a file."""
 _NEED_CRS = ("file", "wkt", "no_go_file", "allowed_file")
 _MAX_INLINE = 100
 """Corners of the shapes that one setting holds; a file holds more."""
@@ -87,8 +88,7 @@ def area_drawing(settings: AreaConfig) -> AreaDrawing:
     """The shapes of an area's settings.
 
     Args:
-        settings: of the area. Corridors of a width of their own, and lines in an allowed area, are
-            the polygons that they cover.
+        settings: of the area. Lines in an allowed area are the polygons that they cover.
 
     Raises:
         PlanError: a file or text cannot be read.
@@ -119,30 +119,25 @@ def area_settings(
         given = given_shapes(settings)
         now, frame = _drawing(given, settings), given.frame
     except PlanError:  # whatever was there before cannot be read: all is drawn again
-        datum = Datum(settings.latitude_deg, settings.longitude_deg)
-        now = AreaDrawing(shapes=DrawnShapes(), datum=datum)
+        own = Datum(settings.latitude_deg, settings.longitude_deg)
+        now = AreaDrawing(shapes=DrawnShapes(), datum=own)
         frame = LocalFrame(
-            datum=datum, seafloor_depth_m=settings.seafloor_depth_m, datum_is_given=True
+            datum=own, seafloor_depth_m=settings.seafloor_depth_m, datum_is_given=True
         )
-        given = None
     if datum is not None:
         frame = replace(frame, datum=datum, datum_is_given=True)
-    no_go = not _same(shapes.no_go, now.shapes.no_go)
-    survey = not (
-        _same(shapes.survey, now.shapes.survey)
-        and _same_lines(shapes.corridors, now.shapes.corridors)
-    )
-    # A file that holds zones, too, is left out as a whole.
-    survey |= no_go and given is not None and given.survey.no_go is not None
-    allowed = not _same(shapes.allowed, now.shapes.allowed)
     values: dict[str, Any] = {}
     files: dict[str, str] = {}
-    if survey:
-        values |= _left_out("survey", settings) | _survey(shapes, frame, files)
-    if no_go or (survey and given is not None and given.survey.no_go is not None):
-        values |= _left_out("no_go", settings) | _no_go(shapes.no_go, now.marks, frame, files)
-    if allowed:
-        values |= _left_out("allowed", settings) | _allowed_settings(shapes.allowed, frame, files)
+    lines = {"survey": shapes.corridors, "no_go": now.marks[0], "allowed": ()}
+    for role, keys in _KEYS.items():
+        polygons = getattr(shapes, role)
+        same = _same(polygons, getattr(now.shapes, role))
+        if role == "survey":
+            same = same and _same_lines(shapes.corridors, now.shapes.corridors)
+        if not same:
+            points = now.marks[1] if role == "no_go" else ()
+            values |= {key: None for key in keys if key in settings.model_fields_set}
+            values |= _stored(role, polygons, lines[role], points, frame, files)
     if not values:
         return {}, {}
     if len(settings.datum_given) < 2 and (not frame.datum_is_given or "file" in values):
@@ -182,9 +177,7 @@ def drawing_of_file(
     frame = LocalFrame(datum=datum, seafloor_depth_m=settings.seafloor_depth_m, datum_is_given=True)
     given = GivenShapes(
         survey=raw if role == "survey" else replace(raw, polygons=(), lines=()),
-        no_go=tuple(
-            zone for zone in (raw if role == "no_go" else None, raw.no_go) if zone is not None
-        ),
+        no_go=(raw,) if role == "no_go" else (),
         allowed=raw if role == "allowed" else None,
         frame=frame,
     )
@@ -194,29 +187,23 @@ def drawing_of_file(
 def _drawing(given: GivenShapes, settings: AreaConfig) -> AreaDrawing:
     frame, width_m = given.frame, settings.corridor_width_m
     survey = frame.localise(given.survey)
-    plain = [line for line in survey.lines if line.width_m in (None, width_m)]
-    wide = [line for line in survey.lines if line.width_m not in (None, width_m)]
-    strips = [
-        corridor_strip(line.points, line.width_m or width_m, survey.origin, "corridor")
-        for line in wide
-    ]
     zones = [frame.localise(zone) for zone in given.no_go]
     room: list[DrawnPolygon] = []
     if given.allowed is not None:
         allowed = frame.localise(given.allowed)
-        ways = [corridor_strip(x.points, width_m, allowed.origin, "line") for x in allowed.lines]
+        ways = [corridor_strip(x, width_m, allowed.origin, "line") for x in allowed.lines]
         room = [*_polygons(allowed), *_polygons_of_strips(ways)]
     points = [zone.points for zone in zones if len(zone.points)]
     return AreaDrawing(
         shapes=DrawnShapes(
-            survey=(*_polygons(survey), *_polygons_of_strips(strips)),
+            survey=tuple(_polygons(survey)),
             no_go=tuple(polygon for zone in zones for polygon in _polygons(zone)),
             allowed=tuple(room),
-            corridors=tuple(_round(line.points) for line in plain),
+            corridors=tuple(_round(line) for line in survey.lines),
         ),
         datum=frame.datum,
         marks=(
-            [line.points for zone in zones for line in zone.lines],
+            [line for zone in zones for line in zone.lines],
             np.concatenate([np.empty((0, 2)), *points]),
         ),
     )
@@ -260,52 +247,26 @@ def _same_lines(one: Sequence[Open], other: Sequence[Open]) -> bool:
     )
 
 
-def _left_out(role: str, settings: AreaConfig) -> dict[str, Any]:
-    """The settings of a role, which are taken out."""
-    return {key: None for key in _KEYS[role] if key in settings.model_fields_set}
-
-
-def _inline(polygons: Sequence[DrawnPolygon]) -> bool:
-    corners = sum(len(polygon.outer) for polygon in polygons)
-    return corners <= _MAX_INLINE and not any(polygon.holes for polygon in polygons)
-
-
-def _survey(shapes: DrawnShapes, frame: LocalFrame, files: dict[str, str]) -> dict[str, Any]:
-    polygons, corridors = shapes.survey, shapes.corridors
-    if len(polygons) == 1 and not corridors and _inline(polygons):
-        return {"polygon_ne_m": _as_lists(polygons[0].outer)}
-    if len(corridors) == 1 and not polygons and len(corridors[0]) <= _MAX_INLINE:
-        return {"corridor_ne_m": _as_lists(corridors[0])}
-    name = FILES["survey"]
-    files[name] = _geojson(frame, polygons, [np.array(line) for line in corridors])
-    return {"file": name, **({"closed_lines": "corridor"} if corridors else {})}
-
-
-def _no_go(
+def _stored(
+    role: str,
     polygons: Sequence[DrawnPolygon],
-    marks: tuple[Sequence[Array], Array],
+    lines: Sequence[Any],
+    points: Sequence[Array] | Array,
     frame: LocalFrame,
     files: dict[str, str],
 ) -> dict[str, Any]:
-    lines, points = marks
-    if _inline(polygons) and not len(lines) and not len(points):
-        rings = [_as_lists(polygon.outer) for polygon in polygons]
-        return {"no_go_ne_m": rings} if rings else {}
-    name = FILES["no_go"]
-    files[name] = _geojson(frame, polygons, lines, points)
-    return {"no_go_file": name}
-
-
-def _allowed_settings(
-    polygons: Sequence[DrawnPolygon], frame: LocalFrame, files: dict[str, str]
-) -> dict[str, Any]:
-    if not polygons:
-        return {}
-    if len(polygons) == 1 and _inline(polygons):
-        return {"allowed_ne_m": _as_lists(polygons[0].outer)}
-    name = FILES["allowed"]
-    files[name] = _geojson(frame, polygons)
-    return {"allowed_file": name}
+    """Settings that hold the shapes of a role, or name a file that does, which is added."""
+    key, file_key = _KEYS[role][0], _KEYS[role][-1]
+    rings = [_as_lists(polygon.outer) for polygon in polygons]
+    corners = sum(map(len, (*rings, *lines)))
+    if corners <= _MAX_INLINE and not (any(p.holes for p in polygons) or len(points)):
+        if not lines and (role == "no_go" or len(rings) < 2):
+            return {key: rings if role == "no_go" else rings[0]} if rings else {}
+        if role == "survey" and not rings and len(lines) == 1:
+            return {"corridor_ne_m": _as_lists(lines[0])}
+    files[FILES[role]] = _geojson(frame, polygons, [np.array(line) for line in lines], points)
+    more = {"closed_lines": "corridor"} if role == "survey" and lines else {}
+    return {file_key: FILES[role], **more}
 
 
 def _needs_crs(settings: AreaConfig, values: Mapping[str, Any]) -> bool:

@@ -1,57 +1,40 @@
-"""Areas in files: GeoJSON, KML, KMZ, GeoPackage, shapefile, well-known text, QGroundControl's plan.
+"""Areas in files: GeoJSON, KML, KMZ, GeoPackage, shapefile, well-known text.
 
 GDAL, through pyogrio, reads them; it is loaded only when a file is read. Heights are left out.
-Keys of plans are those of QGroundControl's developer guide, "Plan File Format": complex items hold
-`polygon`, or `polyline` and `CorridorWidth`; a geofence holds `polygons` and `circles`, each with
-`inclusion`.
 """
 
 import re
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import shapely
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, ValidationError
 from shapely.geometry.base import BaseGeometry
 
-from alice_survey.core.contents import as_line, first_fault, one_line
+from alice_survey.core.contents import as_line, one_line
 from alice_survey.core.errors import PlanError, warn
-from alice_survey.core.frames import Array
 from missions.areas.crs import (
     LOCAL,
-    check_latitudes,
     geographic_shapes,
     parse_crs,
     usable_crs,
 )
-from missions.areas.raw import RawLine, RawShapes, from_geometries, from_rings
+from missions.areas.raw import RawShapes, from_geometries
 from missions.areas.safe import (
     DRIVERS,
     MAX_CORNERS,
     gis_files,
     read_bytes,
     read_geojson,
-    read_json,
 )
 
 Role = Literal["survey", "no_go", "allowed"]
 _DEEPEST = 20
 _SRID = re.compile(r"\s*SRID\s*=\s*(\d+)\s*;", re.IGNORECASE)
-SUFFIXES = (*DRIVERS, ".wkt", ".plan")
-
-
-LAYERS = ("mission", "inclusion", "exclusion")
-_CIRCLE_CORNERS = 64
-_MAX_M = 1e6
-_Place = Annotated[
-    tuple[float, float], BeforeValidator(lambda x: x[:2] if isinstance(x, list) else x)
-]
-"""Latitude and longitude; a height is left out."""
-_Places = tuple[_Place, ...]
+SUFFIXES = (*DRIVERS, ".wkt")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -87,8 +70,6 @@ def read_area_file(
             f"area: {path}: {suffix or 'no ending'!r} files are not read; those that are: "
             f"{', '.join(SUFFIXES)}"
         )
-    if suffix == ".plan":
-        return _read_qgc_plan(path, layer, role)
     if suffix == ".wkt":
         if layer is not None:
             raise PlanError(f"area: {path}: it has no layers: leave out layer")
@@ -308,115 +289,3 @@ def _in_wgs84(path: Path, layer: _Layer, crs: str | None, role: Role) -> RawShap
 def _is_map(crs: Any) -> bool:
     flat = crs.to_2d()
     return bool(flat.is_geographic or flat.is_projected)
-
-
-class _Json(BaseModel):
-    """A part of a plan; what is not read of it is not looked at."""
-
-    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
-
-
-class _QgcItem(_Json):
-    kind: str | None = Field(None, alias="complexItemType")
-    polygon: _Places = ()
-    polyline: _Places = ()
-    width_m: float = Field(1.0, alias="CorridorWidth", gt=0, lt=_MAX_M)
-
-
-class _Circle(_Json):
-    centre: _Place = Field(alias="center")
-    radius: float = Field(gt=0, lt=_MAX_M)
-
-
-class _Zone(_Json):
-    inclusion: StrictBool
-    polygon: _Places = ()
-    circle: _Circle | None = None
-
-
-class _QgcMission(_Json):
-    items: tuple[_QgcItem, ...] = ()
-
-
-class _Fence(_Json):
-    polygons: tuple[_Zone, ...] = ()
-    circles: tuple[_Zone, ...] = ()
-
-
-class _QgcPlan(_Json):
-    file_type: Literal["Plan"] = Field(alias="fileType")
-    mission: _QgcMission = _QgcMission()
-    fence: _Fence = Field(_Fence(), alias="geoFence")
-
-    def layer(self, name: str, origin: str) -> RawShapes:
-        """The shapes of one of `LAYERS`."""
-        if name == "mission":
-            areas = [x.polygon for x in self.mission.items if x.kind in ("survey", "StructureScan")]
-            rings = [np.array(polygon).reshape(-1, 2) for polygon in areas if polygon]
-            lines = tuple(
-                RawLine(points=np.array(x.polyline).reshape(-1, 2), width_m=x.width_m)
-                for x in self.mission.items
-                if x.kind == "CorridorScan" and x.polyline
-            )
-        else:
-            inclusion, lines = name == "inclusion", ()
-            zones = [zone for zone in self.fence.polygons if zone.inclusion == inclusion]
-            rings = [np.array(zone.polygon).reshape(-1, 2) for zone in zones if zone.polygon]
-            rings += [
-                _corners_of_circle(zone.circle, outside=not inclusion)
-                for zone in self.fence.circles
-                if zone.inclusion == inclusion and zone.circle is not None
-            ]
-        shapes = replace(from_rings(origin, rings, geographic=True), lines=lines)
-        for number, corners in enumerate([*rings, *(line.points for line in lines)], 1):
-            check_latitudes(corners, origin, f"{name} {number}")
-        return shapes
-
-
-def _read_qgc_plan(path: Path, layer: str | None, role: Role) -> RawShapes:
-    """The shapes of one layer of a plan.
-
-    Args:
-        path: the `.plan` file.
-        layer: one of `LAYERS`; None takes what fits the role: the mission's items for the survey
-            area (and the exclusion fences as zones to keep out of), the inclusion fences for the
-            allowed area, the exclusion fences for zones.
-        role: what the shapes are for.
-
-    Raises:
-        PlanError: it is not a plan, or holds nothing of that kind.
-    """
-    try:
-        plan = _QgcPlan.model_validate(read_json(path))
-    except ValidationError as error:
-        fault = first_fault(error)
-        raise PlanError(f"area: {path}: not as QGroundControl writes it: {fault}") from None
-    chosen = layer or {"survey": "mission", "no_go": "exclusion", "allowed": "inclusion"}[role]
-    if chosen not in LAYERS:
-        raise PlanError(f"area: {path}: a plan has the layers {', '.join(LAYERS)}, not {layer!r}")
-    layers = {name: plan.layer(name, path.name) for name in LAYERS}
-    found, exclusion = layers[chosen], layers["exclusion"]
-    if found.is_empty:
-        others = " and ".join(name for name in LAYERS if not layers[name].is_empty)
-        raise PlanError(
-            f"area: {path}: no shapes in its layer {chosen!r}"
-            + (f"; there are some in {others}" if others else "")
-        )
-    if role != "survey":
-        return found
-    fence = ""
-    if chosen == "mission" and not layers["inclusion"].is_empty:
-        fence = "its inclusion fence is not used; to stay inside it set allowed_file to the file"
-    zones = exclusion if chosen != "exclusion" and not exclusion.is_empty else None
-    return replace(found, no_go=zones, unused_fence=fence)
-
-
-def _corners_of_circle(circle: _Circle, *, outside: bool) -> Array:
-    """Corners (64, 2) of a polygon inside of a circle, or around it where that is the safe side."""
-    from pyproj import Geod
-
-    reach_m = circle.radius / np.cos(np.pi / _CIRCLE_CORNERS) if outside else circle.radius
-    azimuths = np.arange(_CIRCLE_CORNERS) * 360.0 / _CIRCLE_CORNERS
-    lat, lon = (np.full(_CIRCLE_CORNERS, value) for value in circle.centre)
-    lon, lat, _ = Geod(ellps="WGS84").fwd(lon, lat, azimuths, np.full(_CIRCLE_CORNERS, reach_m))
-    return np.column_stack([lat, lon])

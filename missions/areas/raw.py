@@ -16,21 +16,11 @@ Ring = Array
 """(N, 2) corners; the first may or may not be repeated as the last."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class RawLine:
-    """A line that stands for a corridor."""
-
-    points: Array
-    """(N, 2) points."""
-    width_m: float | None = None
-    """Width; None where its source does not give it."""
-
-    @property
-    def is_closed(self) -> bool:
-        """Whether it goes round something: its ends are near to each other for its length."""
-        steps = np.linalg.norm(np.diff(self.points, axis=0), axis=1)
-        gap = float(np.linalg.norm(self.points[-1] - self.points[0]))
-        return len(self.points) > 3 and gap <= _CLOSED * float(steps.sum())
+def is_closed(line: Array) -> bool:
+    """Whether a line (N, 2) goes round something: for its length its ends are near."""
+    steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
+    gap = float(np.linalg.norm(line[-1] - line[0]))
+    return len(line) > 3 and gap <= _CLOSED * float(steps.sum())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -46,19 +36,16 @@ class RawShapes:
     geographic: bool
     polygons: tuple[tuple[Ring, ...], ...] = ()
     """For each polygon its outer ring, then its holes."""
-    lines: tuple[RawLine, ...] = ()
+    lines: tuple[Array, ...] = ()
+    """Each (N, 2): what stands for a corridor."""
     points: Array
     """(N, 2) points."""
-    no_go: "RawShapes | None" = None
-    """Zones to keep out of that came in the same file."""
-    unused_fence: str = ""
-    """What to report of a fence in the same file where no allowed area is set."""
 
     @property
     def coordinates(self) -> Array:
-        """(N, 2) coordinates of everything but the zones to keep out of."""
+        """(N, 2) coordinates of everything."""
         rings = [ring for polygon in self.polygons for ring in polygon]
-        return np.concatenate([*rings, *(line.points for line in self.lines), self.points])
+        return np.concatenate([*rings, *self.lines, self.points])
 
     @property
     def is_empty(self) -> bool:
@@ -79,10 +66,7 @@ class RawShapes:
                 tuple(change(ring, self.ring_name(i, j)) for j, ring in enumerate(rings))
                 for i, rings in enumerate(self.polygons)
             ),
-            lines=tuple(
-                replace(line, points=change(line.points, self.line_name(i)))
-                for i, line in enumerate(self.lines)
-            ),
+            lines=tuple(change(line, self.line_name(i)) for i, line in enumerate(self.lines)),
             points=change(self.points, "points"),
         )
 
@@ -121,7 +105,7 @@ def from_geometries(origin: str, geometries: Iterable[BaseGeometry]) -> RawShape
         PlanError: a geometry of another kind.
     """
     polygons: list[tuple[Ring, ...]] = []
-    lines: list[RawLine] = []
+    lines: list[Array] = []
     points: list[Array] = []
 
     def corners(geometry: BaseGeometry) -> Array:
@@ -137,7 +121,7 @@ def from_geometries(origin: str, geometries: Iterable[BaseGeometry]) -> RawShape
             rings = shapely.get_rings(geometry).tolist()
             polygons.append(tuple(corners(ring) for ring in rings))
         elif geometry.geom_type in ("LineString", "LinearRing"):
-            lines.append(RawLine(points=corners(geometry)))
+            lines.append(corners(geometry))
         elif geometry.geom_type == "Point":
             points.append(corners(geometry))
         elif hasattr(geometry, "geoms"):

@@ -15,7 +15,7 @@ from alice_survey.core.errors import PlanError, warn
 from alice_survey.core.frames import Array, Datum
 from missions.areas.crs import LocalFrame, middle
 from missions.areas.files import read_area_file, read_wkt
-from missions.areas.raw import RawLine, RawShapes, from_rings, no_points
+from missions.areas.raw import RawShapes, from_rings, is_closed, no_points
 from missions.values.area import Area, multipolygon
 
 SAME_PLACE_M = 1e-3
@@ -88,7 +88,7 @@ def given_shapes(settings: AreaConfig) -> GivenShapes:
     survey = _with_closed_lines(_survey_shapes(settings), settings)
     return GivenShapes(
         survey=survey,
-        no_go=(*_no_go_shapes(settings), *([] if survey.no_go is None else [survey.no_go])),
+        no_go=_no_go_shapes(settings),
         allowed=_allowed_shapes(settings),
         frame=_local_frame(settings, survey),
     )
@@ -127,8 +127,6 @@ def survey_area(settings: AreaConfig, *, turn_margin_m: float, margin_m: float =
     if allowed_raw is None:
         margin = settings.turn_margin_m if settings.turn_margin_m is not None else turn_margin_m
         allowed = _less(widen(requested, margin), no_go)
-        if raw.unused_fence:
-            warn(f"area: {raw.origin}: {raw.unused_fence}")
     else:
         if settings.turn_margin_m is not None:
             warn(f"area: turn_margin_m is not used: {allowed_raw.origin} says where to be")
@@ -191,16 +189,14 @@ def _polygons(raw: RawShapes, frame: LocalFrame, corridor_width_m: float) -> Rep
         warn(f"area: {raw.origin}: {_contents(replace(raw, polygons=(), lines=()))} left out")
     if not raw.lines:
         return shape
-    widths_m = [line.width_m or corridor_width_m for line in local.lines]
     strips = [
-        corridor_strip(line.points, width_m, local.origin, local.line_name(i))
-        for i, (line, width_m) in enumerate(zip(local.lines, widths_m, strict=True))
+        corridor_strip(line, corridor_width_m, local.origin, local.line_name(i))
+        for i, line in enumerate(local.lines)
     ]
     if raw.polygons:
-        widths = " and ".join(f"{width_m:g} m" for width_m in sorted(set(widths_m)))
         warn(
-            f"area: {raw.origin}: it holds {_contents(raw)}: lines become corridors of {widths} "
-            "width next to the polygons"
+            f"area: {raw.origin}: it holds {_contents(raw)}: lines become corridors of "
+            f"{corridor_width_m:g} m width next to the polygons"
         )
     solid = _union([shape.solid, *(multipolygon(strip) for strip in strips)])
     return Repaired(solid=solid, holes=_less(shape.holes, solid))
@@ -209,7 +205,7 @@ def _polygons(raw: RawShapes, frame: LocalFrame, corridor_width_m: float) -> Rep
 def _zone(raw: RawShapes, frame: LocalFrame, clearance_m: float) -> MultiPolygon:
     """Where not to be: polygons, lines and points with the clearance around them."""
     local = frame.localise(raw)
-    marks: list[BaseGeometry] = [LineString(line.points) for line in local.lines]
+    marks: list[BaseGeometry] = [LineString(line) for line in local.lines]
     marks += [Point(*point) for point in local.points.tolist()]
     if marks and clearance_m == 0.0:
         raise PlanError(
@@ -323,7 +319,7 @@ def _survey_shapes(settings: AreaConfig) -> RawShapes:
     if settings.wkt is not None:
         return read_wkt("wkt", settings.wkt, settings.crs)
     if settings.corridor_ne_m is not None:
-        line = RawLine(points=np.asarray(settings.corridor_ne_m, dtype=np.float64))
+        line = np.asarray(settings.corridor_ne_m, dtype=np.float64)
         return RawShapes(
             origin="corridor_ne_m", geographic=False, lines=(line,), points=no_points()
         )
@@ -336,15 +332,13 @@ def _survey_shapes(settings: AreaConfig) -> RawShapes:
 
 def _with_closed_lines(raw: RawShapes, settings: AreaConfig) -> RawShapes:
     """Shapes whose closed lines are polygons where that is set; warns where nothing is."""
-    ours = [line for line in raw.lines if line.width_m is None and line.is_closed]
+    ours = [line for line in raw.lines if is_closed(line)]
     drawn = settings.file is not None or settings.wkt is not None
     if not (ours and drawn) or settings.closed_lines == "corridor":
         return raw
     if settings.closed_lines == "inside":
-        lines = tuple(line for line in raw.lines if not any(line is one for one in ours))
-        return replace(
-            raw, lines=lines, polygons=(*raw.polygons, *((line.points,) for line in ours))
-        )
+        lines = tuple(line for line in raw.lines if not is_closed(line))
+        return replace(raw, lines=lines, polygons=(*raw.polygons, *((line,) for line in ours)))
     what = "a line that closes is" if len(ours) == 1 else f"{len(ours)} lines that close are"
     warn(
         f"area: {raw.origin}: {what} surveyed as a corridor of {settings.corridor_width_m:g} m "
@@ -354,7 +348,7 @@ def _with_closed_lines(raw: RawShapes, settings: AreaConfig) -> RawShapes:
     return raw
 
 
-def _no_go_shapes(settings: AreaConfig) -> list[RawShapes]:
+def _no_go_shapes(settings: AreaConfig) -> tuple[RawShapes, ...]:
     """The zones to keep out of, by source.
 
     Raises:
@@ -365,7 +359,7 @@ def _no_go_shapes(settings: AreaConfig) -> list[RawShapes]:
         zones.append(from_rings("no_go_ne_m", settings.no_go_ne_m, geographic=False))
     if settings.no_go_file is not None:
         zones.append(read_area_file(settings.no_go_file, None, settings.crs, role="no_go"))
-    return zones
+    return tuple(zones)
 
 
 def _allowed_shapes(settings: AreaConfig) -> RawShapes | None:

@@ -69,24 +69,6 @@ def kml(extra: str = "", head: str = "") -> str:
     )
 
 
-def qgc_plan() -> str:
-    corners = [[y, x] for x, y in _DEGREES.exterior.coords][:-1]
-    items = [
-        {"type": "ComplexItem", "complexItemType": "survey", "polygon": corners},
-        {
-            "type": "ComplexItem", "complexItemType": "CorridorScan", "CorridorWidth": 3,
-            "polyline": corners[:3],
-        },
-    ]  # fmt: skip
-    fence = {
-        "circles": [{"circle": {"center": corners[0], "radius": 2.0}, "inclusion": False}],
-        "polygons": [{"polygon": corners, "inclusion": True}],
-        "version": 2,
-    }
-    mission = {"items": items, "version": 2}
-    return json.dumps({"fileType": "Plan", "version": 1, "geoFence": fence, "mission": mission})
-
-
 def _by_gdal(folder: Path, name: str, driver: str, geometry_type: str = "Polygon") -> Path:
     import pyogrio.raw
 
@@ -182,7 +164,6 @@ TARGETS = (
     _target("KML", "a.kml", _of_text("a.kml", kml), syntax="text"),
     _target("KMZ", "a.kmz", _kmz),
     _target("WKT", "a.wkt", _of_text("a.wkt", _wkt), syntax="text"),
-    _target("QGC plan", "a.plan", _of_text("a.plan", qgc_plan), syntax="json"),
     _target("GeoPackage", "a.gpkg", _geopackage),
     _target("shapefile", "a.shp", build_shapefile),
     *(

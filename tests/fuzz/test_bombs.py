@@ -126,7 +126,7 @@ def test_links_in_archives_are_not_followed(sandbox: Sandbox) -> None:
 
 
 _JSON = {
-    "a.geojson": areas.read_area, "a.plan": areas.read_area, "rig.json": cameras.read_rig,
+    "a.geojson": areas.read_area, "rig.json": cameras.read_rig,
     "v.json": logs.read_vehicle, "board.json": cameras.read_board,
 }  # fmt: skip
 

@@ -33,7 +33,7 @@ class InitCommand(WorkspaceCommand):
         "init harbour --example caesarea",
     )
     area: Path | None = option(
-        None, "GeoJSON, KML, KMZ, GeoPackage, shapefile, WKT or .plan of the area.", metavar="FILE"
+        None, "GeoJSON, KML, KMZ, GeoPackage, shapefile or WKT of the area.", metavar="FILE"
     )
     example: Literal["demo", "caesarea"] | None = option(None, "A ready survey instead.")
 

@@ -1,4 +1,3 @@
-import json
 import re
 from pathlib import Path
 
@@ -25,15 +24,6 @@ def site(tmp_path: Path) -> Path:
             driver="GPKG", layer=layer, append=layer != "reef",
         )  # fmt: skip
     (tmp_path / "wreck.geojson").write_text('{"type": "Point", "coordinates": [34.9554, 32.8238]}')
-    polygon = [[lat, lon] for lon, lat in corners]
-    fence = {"inclusion": True, "polygon": polygon, "version": 1}
-    item = {"type": "ComplexItem", "complexItemType": "survey", "polygon": polygon}
-    plan = {
-        "fileType": "Plan",
-        "geoFence": {"polygons": [fence], "circles": [], "version": 2},
-        "mission": {"items": [item]},
-    }
-    (tmp_path / "site.plan").write_text(json.dumps(plan))
     return tmp_path
 
 

@@ -165,7 +165,7 @@ def test_an_allowed_area_may_leave_out_some_but_not_all(
             r"corner 2 at \(10, 20\.001\) is \d+ km",
         ),
         ({"polygon_latlon_deg": ((10, 20), (10, 21), (11, 20))}, r"corner \d at .* km"),
-        ({"polygon_ne_m": ((0, 0), (10, 0), (10, 1e6))}, "corner 3 is 1000 km"),
+        ({"polygon_ne_m": ((0, 0), (10, 0), (10, 1e6))}, r"corner 3 .* is 1000 km"),
     ],
 )
 def test_areas_with_nothing_left_or_far_from_their_datum_are_refused(

@@ -4,7 +4,7 @@ import {attempt, button, el, field, mayWrite, say, send} from "./core.js";
 import {fileDrop} from "./file_drop.js";
 import {counted, duration, gigabytes, number} from "./words.js";
 
-const AREA_FILES = ".geojson,.json,.kml,.kmz,.gpkg,.zip,.wkt,.plan";
+const AREA_FILES = ".geojson,.json,.kml,.kmz,.gpkg,.zip,.wkt";
 
 /* The page of an empty workspace; `started` is called where a job has begun. */
 export function startPage(studio, {started, disk, others}) {
