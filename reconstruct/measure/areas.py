@@ -241,8 +241,6 @@ class GridPart:
     y: Array
     """(rows, columns) places of its cells, from the polygon's middle."""
     core: tuple[slice, slice]
-    corner: tuple[int, int]
-    """Row and column of its first cell in the grid."""
 
 
 class PolygonOnGrid:
@@ -298,7 +296,6 @@ class PolygonOnGrid:
         return GridPart(
             height=height, own=own, weight=inner, all_weight=weight,
             x=east - self.middle[0], y=north - self.middle[1], core=core,
-            corner=(row, column),
         )  # fmt: skip
 
     def _shares(self, row: int, column: int, shape: tuple[int, int]) -> Array:
@@ -402,22 +399,11 @@ def figures_of_all(
 class AreaSums:
     """The areas within a polygon, gathered block by block."""
 
-    def __init__(self, region: PolygonOnGrid, places: Array | None = None) -> None:
-        """Begin.
-
-        Args:
-            region: the polygon.
-            places: (M, 2) where the slant of the surface is asked for.
-        """
+    def __init__(self, region: PolygonOnGrid) -> None:
+        """Begin."""
         self._region = region
         self._surface = self._plan = self._added = self._scatter = 0.0
         self._by_surface, self._by_plan = (FigureSlopes(region.surface.errors) for _ in range(2))
-        grid, at = region.surface.grid, np.zeros((0, 2)) if places is None else places
-        column = np.floor((at[:, 0] - grid.west) / grid.cell - 0.5)
-        row = np.floor((grid.north - at[:, 1]) / grid.cell - 0.5)
-        self._squares = np.column_stack([row, column]).astype(np.int64)
-        self.slant = np.zeros(len(at))
-        """(M,) area of the surface over that of its plan; 0 where it is not known."""
 
     def add(self, block: GridPart) -> None:
         """Add the squares that begin in the core of a block."""
@@ -430,11 +416,6 @@ class AreaSums:
         self._scatter += found.scatter(block.weight)
         region.add(self._by_surface, block, found.slopes)
         region.add(self._by_plan, block, plan_slopes(block.all_weight, cell))
-        here = self._squares - block.corner
-        rows, columns = block.core
-        inside = (here >= [rows.start, columns.start]) & (here < [rows.stop, columns.stop])
-        used = np.flatnonzero(inside.all(axis=1))
-        self.slant[used] = area[tuple(here[used].T)] / cell**2
 
     def total(self) -> SurfaceAreas:
         """What was gathered, once all blocks are in.
@@ -452,25 +433,14 @@ class AreaSums:
         )  # fmt: skip
 
 
-def surface_within(
-    surface: MeasuredSurface, polygon: BaseGeometry, places: Array | None = None
-) -> tuple[SurfaceAreas, Array]:
+def surface_within(surface: MeasuredSurface, polygon: BaseGeometry) -> SurfaceAreas:
     """Areas of the surface within a polygon that may have holes, and of its plan.
-
-    Args:
-        surface: that it is on.
-        polygon: or several.
-        places: (M, 2) next to it.
-
-    Returns:
-        The areas, and (M,) area of the surface over that of its plan at each place, 0 where it is
-        not known and at places that are farther off than the polygon's bounds.
 
     Raises:
         ReconstructionError: it is too large, or no surface is known in it.
     """
     region = PolygonOnGrid(surface, polygon)
-    sums = AreaSums(region, places)
+    sums = AreaSums(region)
     for block in region.blocks():
         sums.add(block)
-    return sums.total(), sums.slant
+    return sums.total()

@@ -11,26 +11,23 @@ around them (`dense.dem.cells_over`), whose variance is a sixth of a cell. Noise
 variance s² correlates by exp(-d² / 4s²), here 4s² = 4 (1/4 + 1/6) cells².
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from alice_survey.core.frames import Array
-from alice_survey.core.records import RegistrationRecord, SurfaceRecord
+from alice_survey.core.records import RegistrationRecord
 from reconstruct.adjustment.uncertainty import SharedMotions, read_uncertainty
 from reconstruct.planes import Plane
 from reconstruct.views.model import WorldFrame
 
 _NODES = 33
 """Nodes of the lattice along its longer side: motions that points share are smooth."""
-_PATCHES = 3
-"""The same where only the size of the poses' part is known: it is shared within patches."""
 _COMPANY = 8
 """Points around a node of which the mean counts."""
 REACH_CELLS = 3
@@ -131,21 +128,6 @@ class SharedErrors:
         return smooth, np.eye(count)[np.rint(at).astype(np.int64)]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Variance:
-    """Variance of a figure, by what it comes from."""
-
-    own: float
-    """Of the cells' own errors."""
-    shared: float
-    """Of what poses and calibration do to all."""
-
-    @property
-    def sigma(self) -> float:
-        """Standard deviation of both together."""
-        return float(np.sqrt(self.own + self.shared))
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PackedSlopes:
     """Derivatives of a figure by the motions of the few nodes that move it."""
@@ -161,14 +143,13 @@ class PackedSlopes:
     """Variance by own errors."""
 
     @property
-    def variance(self) -> Variance:
-        """Of the figure."""
+    def shared(self) -> float:
+        """Variance by what poses and calibration do to all."""
         errors, nodes = self.errors, self.nodes
         motions = errors.motions.reshape(errors.nodes, 3, -1)[nodes]
         by_motion = np.einsum("ni,nik->k", self.smooth, motions)
         rest = np.einsum("ni,nij,nj->", self.near, errors.rest.reshape(-1, 3, 3)[nodes], self.near)
-        shared = float(by_motion @ errors.covariance @ by_motion) + float(rest)
-        return Variance(own=max(self.own, 0.0), shared=max(shared, 0.0))
+        return max(float(by_motion @ errors.covariance @ by_motion) + float(rest), 0.0)
 
 
 def sum_slopes(terms: Sequence[tuple[float, PackedSlopes]]) -> PackedSlopes:
@@ -253,13 +234,17 @@ def shared_errors(
     notes = ["counted: own errors of cells, which go together within about two cells"]
     path = workspace / "sparse" / "covariance.npz"
     shared = read_uncertainty(path).shared if path.is_file() else None
-    if shared is not None:
-        notes.append("counted: shape and scale of the model, by its poses and its calibration")
-        found = on_lattice(in_plane(shared, plane), bounds, _NODES)
+    if shared is None:
+        notes.append("not counted: errors of poses and calibration, which are not known here")
+        shared = SharedMotions(
+            np.zeros((1, 3)), np.zeros((1, 3, 0)), np.zeros((0, 0)), np.zeros((1, 3, 3))
+        )
     else:
-        found, note = _patches(workspace, bounds)
-        notes.append(note)
-    scale = _scale_sigma(workspace)
+        notes.append("counted: shape and scale of the model, by its poses and its calibration")
+    found = on_lattice(in_plane(shared, plane), bounds, _NODES)
+    record = RegistrationRecord.read_existing(workspace / RegistrationRecord.path)
+    place = None if record is None else record.georeference
+    scale = 0.0 if place is None else place.sigma_scale
     if not frame.scaled:
         notes.append("not counted: the model has no scale, figures are in its own units")
     elif scale > 0.0:
@@ -291,29 +276,9 @@ def on_lattice(
         bounds: west, south, east and north of the raster.
         nodes: along its longer side.
     """
-    company = min(_COMPANY, len(shared.places))
-    tree = KDTree(shared.places[:, :2])
-
-    def mean(field: NDArray[Any], places: Array) -> Array:
-        near = np.asarray(tree.query(places, k=company)[1]).reshape(len(places), company)
-        return np.asarray(field[near].mean(axis=1))
-
     # A variance that rounding left below zero is none.
     values, axes = np.linalg.eigh((shared.rest + shared.rest.swapaxes(1, 2)) / 2)
     rest = np.einsum("nij,nj,nkj->nik", axes, np.maximum(values, 0.0), axes)
-    return _lattice(
-        bounds, nodes, lambda places: mean(shared.motions, places),
-        shared.covariance, lambda places: mean(rest, places),
-    )  # fmt: skip
-
-
-def _lattice(
-    bounds: tuple[float, float, float, float],
-    nodes: int,
-    motions: Callable[[Array], Array],
-    covariance: Array,
-    rest: Callable[[Array], Array],
-) -> SharedErrors:
     west, south, east, north = bounds
     pitch = max(east - west, north - south) / (nodes - 1)
     columns, rows = (
@@ -321,35 +286,10 @@ def _lattice(
     )
     y, x = np.mgrid[:rows, :columns]
     places = np.column_stack([west + pitch * x.ravel(), south + pitch * y.ravel()])
+    company = np.arange(1, min(_COMPANY, len(shared.places)) + 1)
+    near = np.asarray(KDTree(shared.places[:, :2]).query(places, k=company)[1])
     return SharedErrors(
-        west=west, south=south, pitch=pitch,
-        motions=motions(places).reshape(rows, columns, 3, -1),
-        covariance=covariance,
-        rest=rest(places).reshape(rows, columns, 3, 3),
+        west=west, south=south, pitch=pitch, covariance=shared.covariance,
+        motions=shared.motions[near].mean(axis=1).reshape(rows, columns, 3, -1),
+        rest=rest[near].mean(axis=1).reshape(rows, columns, 3, 3),
     )  # fmt: skip
-
-
-def _patches(
-    workspace: Path, bounds: tuple[float, float, float, float]
-) -> tuple[SharedErrors, str]:
-    """Where only the usual size of the poses' part is known: it is shared within patches."""
-    surface = SurfaceRecord.read_existing(workspace / SurfaceRecord.path)
-    sigma = None if surface is None else surface.pose_sigma
-    rest = np.diag([0.0, 0.0, (sigma or 0.0) ** 2])
-    found = _lattice(
-        bounds, _PATCHES, lambda places: np.zeros((len(places), 3, 1)), np.eye(1),
-        lambda places: np.broadcast_to(rest, (len(places), 3, 3)),
-    )  # fmt: skip
-    if sigma is None:
-        return found, "not counted: errors of poses and calibration, which are not known here"
-    return found, (
-        "counted in patches of a third of the model: errors of poses and calibration; its "
-        "covariance is of an earlier version: delete sparse/ and run 'alice-survey reconstruct' "
-        "for how they go together"
-    )
-
-
-def _scale_sigma(workspace: Path) -> float:
-    record = RegistrationRecord.read_existing(workspace / RegistrationRecord.path)
-    place = None if record is None else record.georeference
-    return 0.0 if place is None else place.sigma_scale

@@ -59,12 +59,11 @@ def figure(
         power: of a length that it is: it grows so with the scale.
         unit: where it is no power of a length.
     """
-    found = slopes.variance
     scale = power * value * surface.errors.scale_sigma
     lengths = surface.unit + ("", "", "²", "³")[power] if power else ""
     return Measured(
-        name=name, title=title, value=value, own=math.sqrt(found.own),
-        shared=math.hypot(math.sqrt(found.shared), scale),
+        name=name, title=title, value=value, own=math.sqrt(max(slopes.own, 0.0)),
+        shared=math.hypot(math.sqrt(slopes.shared), scale),
         unit=lengths if unit is None else unit,
     )  # fmt: skip
 
@@ -130,23 +129,18 @@ class Measurement:
     name: str
     kind: str
     """`point`, `line`, `points` in space, or `polygon`."""
-    places: Sequence[Sequence[float]]
+    geometry: BaseGeometry
     """Right (east) and up (north), of points in space also out (height)."""
     figures: Sequence[Mapping[str, Any]]
     """As `Measured.to_json`; values that are not known are None."""
     notes: Sequence[str] = ()
-    shape: BaseGeometry | None = None
-    """Of a polygon with holes or of several parts, in the same coordinates."""
 
-    @property
-    def geometry(self) -> BaseGeometry:
-        """As shapely has it."""
-        if self.shape is not None:
-            return self.shape
-        if len(self.places) == 1:
-            return shapely.Point(self.places[0])
-        make = shapely.Polygon if self.kind == "polygon" else shapely.LineString
-        return make(self.places)
+
+def geometry_of(kind: str, places: Sequence[Sequence[float]]) -> BaseGeometry:
+    """What was drawn, as shapely has it."""
+    if len(places) == 1:
+        return shapely.Point(places[0])
+    return (shapely.Polygon if kind == "polygon" else shapely.LineString)(places)
 
 
 def as_csv(measurements: Sequence[Measurement]) -> str:

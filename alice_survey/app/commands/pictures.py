@@ -310,7 +310,7 @@ class MeasureCommand(WorkspaceCommand, ReportCommand):
         if (self.points is None) == (self.polygons is None):
             raise ConfigError("measure takes either --points or --polygons")
         if self.polygons is not None:
-            from reconstruct.measure.polygon_files import measure_polygon_file
+            from reconstruct.measure.shapes import measure_polygon_file
 
             return measure_polygon_file(
                 self.workspace, self.polygons, label=self.label, pick_sigma_px=self.pick_sigma,

@@ -48,12 +48,12 @@ def test_the_sigma_of_a_sum_is_that_of_draws(sigmas: Sigmas, tmp_path: Path) -> 
     drawn, rng = Drawn(tmp_path, grid(1.0, 0.0125), hills, sigmas), np.random.default_rng(3)
     shapes = [shapely.box(-0.4, -0.35, -0.1, 0.3), shapely.box(0.1, -0.3, 0.4, 0.4)]
     exact = without_errors(tmp_path, drawn.cells, hills)
-    true = sum(surface_within(exact, one)[0].surface for one in shapes)
+    true = sum(surface_within(exact, one).surface for one in shapes)
     missed, stated, apart = [], [], []
     for _ in range(40):
         surface, moved = drawn.draw(rng)
         there = [shapely.Polygon(moved(shapely.get_coordinates(one))) for one in shapes]
-        parts = [surface_within(surface, one)[0] for one in there]
+        parts = [surface_within(surface, one) for one in there]
         area = figures_of_all(surface, parts)[0]
         missed.append(area.value - true)
         stated.append(area.sigma)

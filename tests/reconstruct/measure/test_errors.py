@@ -9,12 +9,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.core.artefacts import write_json
 from reconstruct.adjustment.soft_modes import no_modes
 from reconstruct.adjustment.uncertainty import SharedMotions, Uncertainty, write_uncertainty
-from reconstruct.measure.errors import FigureSlopes, in_plane, own_correlation, shared_errors
-from reconstruct.measure.lines import measure_line
+from reconstruct.measure.errors import in_plane, own_correlation
+from reconstruct.measure.shapes import measure_line
 from reconstruct.measure.surface import MeasuredSurface
 from reconstruct.planes import LEVEL_PLANE, Plane, facing
 from tests.alice_survey.app.report.tiny import SIGMA_M, SLOPE, tiny_workspace
-from tests.reconstruct.measure.synthetic import FRAME
 
 BOUNDS = (0.0, 0.0, 0.8, 1.2)
 
@@ -65,20 +64,6 @@ def test_what_all_heights_share_is_no_cells_own(tmp_path: Path) -> None:
     rise = measure_line(surface, [(0.205, 0.605), (0.605, 0.605)])[-2]
     assert rise.name == "height_difference"
     assert rise.sigma == pytest.approx(np.sqrt(2) * 0.6 * SIGMA_M, rel=1e-3)
-
-
-def test_an_earlier_file_counts_poses_in_patches_and_says_so(tmp_path: Path) -> None:
-    folder = tiny_workspace(tmp_path)
-    known(folder, None)
-    errors = shared_errors(folder, LEVEL_PLANE, FRAME, BOUNDS)
-    assert any("earlier version" in note for note in errors.notes)
-    np.testing.assert_allclose(errors.variance_of_heights(np.array([[0.3, 0.4]])), 0.0002**2)
-    near, far = FigureSlopes(errors), FigureSlopes(errors)
-    down = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
-    near.add(np.array([[0.2, 0.2], [0.21, 0.2]]), down, 0.0)
-    far.add(np.array([[0.1, 0.1], [0.7, 1.1]]), down, 0.0)
-    assert near.packed.variance.shared == 0.0
-    assert far.packed.variance.sigma == pytest.approx(np.sqrt(2) * 0.0002)
 
 
 def test_a_scale_of_navigation_is_counted(tmp_path: Path) -> None:

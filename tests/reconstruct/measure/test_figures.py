@@ -16,8 +16,7 @@ from alice_survey.core.frames import Array
 from reconstruct.measure.areas import surface_within
 from reconstruct.measure.errors import own_correlation
 from reconstruct.measure.figures import Measured
-from reconstruct.measure.lines import measure_line, profile
-from reconstruct.measure.polygons import measure_polygon, quadrats
+from reconstruct.measure.shapes import measure_line, measure_polygon, profile
 from reconstruct.measure.surface import MeasuredSurface
 from reconstruct.raster import DemGrid, tiled_raster
 from tests.reconstruct.measure.synthetic import (
@@ -38,7 +37,7 @@ def named(figures: Sequence[Measured]) -> dict[str, Measured]:
 
 
 def roughness(surface: MeasuredSurface, polygon: shapely.Polygon) -> tuple[Measured, Measured]:
-    return surface_within(surface, polygon)[0].figures(surface)
+    return surface_within(surface, polygon).figures(surface)
 
 
 def ramp(x: Array, y: Array) -> Array:
@@ -111,11 +110,9 @@ def test_waves_are_as_rough_as_their_arc_is_long(tmp_path: Path) -> None:
     assert found["rugosity"].value == pytest.approx(arc, rel=1e-3)
     line = named(measure_line(surface, [(-0.4, 0.01), (0.4, 0.01)]))
     assert line["surface_length"].value == pytest.approx(arc * 0.8, rel=2e-3)
-    squares = quadrats(surface, SQUARE, 0.2)
-    assert len(squares) == 16
-    for square in squares:
-        assert named(square.figures)["rugosity"].value == pytest.approx(arc, rel=2e-3)
-        assert named(square.figures)["plan_area"].value == pytest.approx(0.04, rel=1e-9)
+    square = named(measure_polygon(surface, [(0, 0), (0.2, 0), (0.2, 0.2), (0, 0.2)], None)[0])
+    assert square["rugosity"].value == pytest.approx(arc, rel=2e-3)
+    assert square["plan_area"].value == pytest.approx(0.04, rel=1e-9)
 
 
 def test_noise_makes_no_floor_rougher(tmp_path: Path) -> None:

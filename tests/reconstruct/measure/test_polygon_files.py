@@ -14,7 +14,7 @@ from pyproj import Transformer
 from alice_survey.core.errors import AliceError, ConfigError, WorkspaceError
 from alice_survey.core.frames import Datum
 from reconstruct.measure.figures import figure
-from reconstruct.measure.polygon_files import (
+from reconstruct.measure.shapes import (
     measure_polygon_file,
     plan_slopes_of,
     read_polygons,

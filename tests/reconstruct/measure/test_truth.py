@@ -11,7 +11,7 @@ from alice_survey.core.frames import Array
 from alice_survey.sim.seafloor.terrain import read_terrain
 from camera_calib.rig import read_rig
 from reconstruct.evaluate.truth import read_true_poses
-from reconstruct.measure.lines import measure_line
+from reconstruct.measure.shapes import measure_line
 from reconstruct.measure.surface import SOURCE, MeasuredSurface
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.views.model import read_model

@@ -18,9 +18,8 @@ from alice_survey.core.errors import AliceError
 from alice_survey.core.products import DEM, MOSAIC, RASTERS, SIGMA
 from alice_survey.core.records import MeshRecord
 from reconstruct.measure.errors import SharedErrors
-from reconstruct.measure.figures import Measured, Measurement, as_csv, as_geojson
-from reconstruct.measure.lines import measure_line, measure_points, profile
-from reconstruct.measure.polygons import measure_polygon, quadrats
+from reconstruct.measure.figures import Measured, Measurement, as_csv, as_geojson, geometry_of
+from reconstruct.measure.shapes import measure_line, measure_points, measure_polygon, profile
 from reconstruct.measure.surface import MeasuredSurface, values_at
 
 _MESH = "mesh/mesh.glb"
@@ -52,8 +51,6 @@ class AskedMeasure(Config):
     places: list[tuple[Coordinate, ...]] = Field(min_length=2, max_length=_MAX_PLACES)
     base: float | Literal["rim"] | None = None
     """Plane of a polygon's volume."""
-    quadrat: float | None = Field(None, gt=0)
-    """Side of quadrats within a polygon."""
 
 
 class ExportedFigure(Config):
@@ -183,7 +180,6 @@ class _ModelTab:
         if any(len(place) != size for place in asked.places):
             raise AliceError(f"the request: places of {asked.kind!r} have {size} numbers")
         notes: tuple[str, ...] = ()
-        squares: list[dict[str, Any]] = []
         figures: tuple[Measured, ...]
         with self._surface() as surface:
             if asked.kind == "line":
@@ -192,19 +188,9 @@ class _ModelTab:
                 figures, notes = measure_points(surface, asked.places)
             else:
                 figures, notes = measure_polygon(surface, asked.places, asked.base)
-                if asked.quadrat is not None:
-                    found = quadrats(surface, asked.places, asked.quadrat)
-                    squares = [
-                        {
-                            "places": square.vertices,
-                            "figures": [one.to_json() for one in square.figures],
-                        }
-                        for square in found
-                    ]
             return {
                 "figures": [one.to_json() for one in figures],
                 "notes": notes,
-                "quadrats": squares,
                 "unit": surface.unit,
             }
 
@@ -213,7 +199,8 @@ class _ModelTab:
         asked = call.read(AskedExport)
         measurements = [
             Measurement(
-                name=one.name, kind=one.kind, places=one.places, notes=one.notes,
+                name=one.name, kind=one.kind, notes=one.notes,
+                geometry=geometry_of(one.kind, one.places),
                 figures=[figure.model_dump() for figure in one.figures],
             )
             for one in asked.measures

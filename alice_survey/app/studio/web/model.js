@@ -2,7 +2,7 @@
 
 import {attempt, button, el, field, get, save, say, send, table} from "./core.js";
 import {missing} from "./missing.js";
-import {PINK, RED} from "./palette.js";
+import {RED} from "./palette.js";
 import {counted, number, withSigma} from "./words.js";
 import {drawingTool} from "./drawing.js";
 import {meshPart} from "./model_mesh.js";
@@ -17,7 +17,7 @@ const TOOLS = {
   volume: {title: "Volume", key: "v", kind: "polygon", main: "volume"},
   rugosity: {title: "Rugosity", key: "r", kind: "polygon", main: "rugosity"},
 };
-const LAYERS = ["measured-line", "measured-polygon", "quadrats"];
+const LAYERS = ["measured-line", "measured-polygon"];
 
 export function tab(studio) {
   const {map, state} = studio;
@@ -100,10 +100,7 @@ export function tab(studio) {
     el("option", {value: "level"}, "level, at a height"));
   const level = el("input", {type: "number", step: "any"});
   const levelField = field("Height of the plane, " + state.unit, level);
-  const quadrat = el("input", {type: "number", step: "any", min: "0"});
   const forVolume = el("div", {hidden: true}, field("Plane of the volume", base), levelField);
-  const forRugosity = el("div", {hidden: true},
-    field("Side of quadrats, " + state.unit, quadrat, "Empty: the polygon as a whole."));
   base.addEventListener("change", () => { levelField.hidden = base.value !== "level"; });
   levelField.hidden = true;
 
@@ -128,7 +125,6 @@ export function tab(studio) {
       "aria-pressed", String(one.dataset.tool === name)));
     if (!name) return;
     forVolume.hidden = name !== "volume";
-    forRugosity.hidden = name !== "rugosity";
   }
 
   function hasPlane() {
@@ -141,7 +137,6 @@ export function tab(studio) {
   async function finish(name, places) {
     const asked = {kind: TOOLS[name].kind, places};
     if (name === "volume") asked.base = base.value === "level" ? level.valueAsNumber : "rim";
-    if (name === "rugosity" && quadrat.value) asked.quadrat = quadrat.valueAsNumber;
     await measure(name, asked);
   }
 
@@ -196,21 +191,7 @@ export function tab(studio) {
       if (about.shapes.length) map.put(about);
       else map.remove(about.name);
     });
-    const squares = measures.find((one) => one.id === chosen)?.quadrats || [];
-    map.remove("quadrats");
-    if (squares.length) {
-      map.put({
-        kind: "polygon", name: "quadrats", title: "Quadrats", colour: PINK, dashed: false,
-          fill: 0.1, width: 1.5, group: "Measures",
-        shapes: squares.map((one) => one.places),
-        texts: squares.map(
-          (one) => figureText(one.figures.find((figure) => figure.name === "rugosity"))),
-      });
-    }
   }
-
-  const figureText = (figure) => figure.title + " " + withSigma(figure.value, figure.sigma,
-    figure.unit);
 
   function showResults() {
     if (!measures.length) {
@@ -264,27 +245,12 @@ export function tab(studio) {
     details.replaceChildren(
       table(one.name, ["Figure", "Value ± sigma"], rows),
       ...one.notes.map((note) => el("p", {class: "note"}, note)),
-      one.quadrats.length ? squaresTable(one) : "",
       one.kind === "polygon" ? "" : profile.element,
     );
     if (one.kind === "polygon") return;
     const places = one.places.map(([east, north]) => [east, north]);
     const found = await attempt(() => send("/api/model/profile", {places}));
     if (found && chosen === one.id) profile.show(found);
-  }
-
-  function squaresTable(one) {
-    const rough = one.quadrats.map((square) => square.figures.find(
-      (figure) => figure.name === "rugosity"));
-    const mean = rough.reduce((sum, figure) => sum + figure.value, 0) / rough.length;
-    const spread = Math.sqrt(
-      rough.reduce((sum, figure) => sum + (figure.value - mean) ** 2, 0) / Math.max(
-      1, rough.length - 1));
-    return el("details", {},
-      el("summary", {}, rough.length + " quadrats: rugosity " + number(mean, "", 4) + ", scatter "
-      + number(spread, "", 2)),
-      table("Quadrats, from south-west", ["Quadrat", "Rugosity"],
-        rough.map((figure, i) => [String(i + 1), withSigma(figure.value, figure.sigma)])));
   }
 
   async function exported(form) {
@@ -326,7 +292,7 @@ export function tab(studio) {
   const content = el("div", {},
     el("h2", {}, "Look and measure"),
     el("div", {class: "buttons", role: "group", "aria-label": "Measure on the map"}, toolButtons),
-    drawing.element, forVolume, forRugosity, under, results, details, mesh.element, about);
+    drawing.element, forVolume, under, results, details, mesh.element, about);
   const lack = missing(studio, content, () => (state.has.dem ? null
     : ["There is no model of the sea floor to look at yet: make it in Run, from a simulated dive "
       + "or from pictures.", "run", "Open Run"]));

@@ -56,13 +56,10 @@ def test_a_line_a_polygon_and_points_are_measured(server: Server) -> None:
     assert line["height_difference"]["value"] == pytest.approx(0.4 * SLOPE, abs=1e-5)
     assert 0.5 * SIGMA_M < line["height_difference"]["sigma"] < 2 * SIGMA_M
     corners = [[0.3, 0.3], [0.7, 0.3], [0.7, 0.8], [0.3, 0.8]]
-    answer = measured(server, kind="polygon", places=corners, base=-10.0, quadrat=0.2)
-    area = named(answer)
+    area = named(measured(server, kind="polygon", places=corners, base=-10.0))
     assert area["rugosity"]["value"] == pytest.approx(RISE, rel=1e-4)
     assert area["volume"]["value"] == pytest.approx(0.2 * 0.5 * SLOPE, rel=1e-4)
     assert area["aspect"]["value"] == pytest.approx(270.0, abs=0.1)
-    assert len(answer["quadrats"]) == 6  # the last row is half outside
-    assert named(answer["quadrats"][0])["rugosity"]["value"] == pytest.approx(RISE, rel=1e-4)
     assert "volume" not in named(measured(server, kind="polygon", places=corners))
     assert (
         abs(named(measured(server, kind="polygon", places=corners, base="rim"))["volume"]["value"])
@@ -83,7 +80,6 @@ def test_what_cannot_be_measured_is_one_line(server: Server) -> None:
         {"kind": "line", "places": [[0.2, 0.6, 1.0], [0.3, 0.6, 1.0]]},
         {"kind": "points", "places": [[0.2, 0.6], [0.3, 0.6]]},
         {"kind": "polygon", "places": [[0.2, 0.2], [0.4, 0.4], [0.4, 0.2], [0.2, 0.4]]},
-        {"kind": "polygon", "places": [[0.2, 0.2], [0.4, 0.2], [0.4, 0.4]], "quadrat": 0.001},
         {"kind": "circle", "places": [[0.2, 0.6], [0.3, 0.6]]},
         {"kind": "line", "places": [[0.2, None], [0.3, 0.6]]},
     ):

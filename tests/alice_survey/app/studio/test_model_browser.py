@@ -314,12 +314,10 @@ def test_damaged_tiles_of_a_wall(tmp_path: Path) -> None:
 def test_it_is_accessible(width: int, tmp_path: Path) -> None:
     with opened(with_mesh(tmp_path / "reef"), width) as (page, _):
         page.get_by_role("button", name="Rugosity", exact=True).click()
-        page.get_by_label("Side of quadrats, m").fill("0.2")
         click(page, (0.3, 0.3), (0.7, 0.3), (0.7, 0.8), (0.3, 0.8))
         assert Axe().run(page).violations_count == 0
         page.keyboard.press("f")
-        (area,) = measured(page, 1)
-        assert 4 <= len(area["quadrats"]) <= 6  # a row that is half outside
+        measured(page, 1)
         page.get_by_role("button", name="Profile", exact=True).click()
         click(page, (0.2, 0.5), (0.6, 0.5), (0.6, 0.9))
         page.keyboard.press("f")

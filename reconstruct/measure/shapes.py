@@ -1,0 +1,731 @@
+"""Figures of lines, points and polygons on a surface, drawn by a person or read from a GIS file."""
+
+import math
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from alice_survey.core.artefacts import atomic_path
+from alice_survey.core.contents import one_line
+from alice_survey.core.errors import ConfigError, ReconstructionError, WorkspaceError
+from alice_survey.core.frames import Array
+from alice_survey.core.products import MOSAIC
+from alice_survey.core.run import progress
+from missions.areas.safe import DRIVERS, gis_files
+from reconstruct.measure.areas import (
+    NOTHING_KNOWN,
+    AreaSums,
+    GridPart,
+    PolygonOnGrid,
+    SurfaceAreas,
+    figures_of_all,
+    mean_of_corners,
+    noise_lift,
+    not_more,
+    plan_slopes,
+    sigma_of_means,
+    spread_to_cells,
+    surface_within,
+)
+from reconstruct.measure.errors import FigureSlopes, PackedSlopes, sum_slopes
+from reconstruct.measure.figures import (
+    Measured,
+    Measurement,
+    as_csv,
+    as_geojson,
+    as_places,
+    figure,
+    of_points,
+    plan_area,
+    polyline,
+)
+from reconstruct.measure.surface import MeasuredSurface, Samples
+from reconstruct.raster import crs_of, opened_raster
+
+_MAX_SAMPLES = 20_000
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SurfaceProfile:
+    """Heights along a line."""
+
+    samples: Samples
+    along: Array
+    """(N,) distance from the start in plan."""
+    corners: tuple[int, ...]
+    """Samples that are the line's vertices."""
+
+
+def profile(surface: MeasuredSurface, vertices: Sequence[Sequence[float]]) -> SurfaceProfile:
+    """Heights along a line, a cell apart or less.
+
+    Args:
+        surface: to follow.
+        vertices: two or more places, right (east) and up (north).
+
+    Raises:
+        ReconstructionError: it is too short or too long.
+    """
+    corners = as_places(vertices)
+    if len(corners) < 2:
+        raise ReconstructionError("a line needs two places that differ")
+    sides = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+    steps = np.ceil(sides / surface.grid.cell - 1e-9).astype(np.int64)
+    if steps.sum() > _MAX_SAMPLES:
+        raise ReconstructionError(
+            f"a line over {steps.sum():,} cells: at most {_MAX_SAMPLES:,} are followed; "
+            "measure it in parts"
+        )
+    parts = [
+        start + (np.arange(count) / count)[:, None] * (end - start)
+        for start, end, count in zip(corners[:-1], corners[1:], steps, strict=True)
+    ]
+    places = np.concatenate([*parts, corners[-1:]])
+    along = np.concatenate([[0.0], np.cumsum(np.repeat(sides / steps, steps))])
+    return SurfaceProfile(
+        samples=surface.at(places),
+        along=along,
+        corners=(0, *np.cumsum(steps).tolist()),
+    )
+
+
+def measure_line(
+    surface: MeasuredSurface, vertices: Sequence[Sequence[float]]
+) -> tuple[Measured, ...]:
+    """Figures of a line through places of a surface.
+
+    Args:
+        surface: that it is on.
+        vertices: two or more places, right (east) and up (north).
+
+    Raises:
+        ReconstructionError: a vertex has no height, or the line is too short or too long.
+    """
+    along = surface_length(surface, profile(surface, vertices))
+    figures = _of_ends(surface, surface.known_at(as_places(vertices)))
+    return (*figures[:-3], along, *figures[-3:])
+
+
+def measure_points(
+    surface: MeasuredSurface, points: Sequence[Sequence[float]]
+) -> tuple[tuple[Measured, ...], tuple[str, ...]]:
+    """Figures of a line through points in space, such as of the mesh of a surface.
+
+    Args:
+        surface: whose errors the points share; a point has the own error of the surface there.
+        points: two or more: right (east), up (north) and out (height).
+
+    Returns:
+        Figures, and what a reader must know of them.
+
+    Raises:
+        ReconstructionError: fewer than two points.
+    """
+    given = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    if len(given) < 2:
+        raise ReconstructionError("a line needs two points")
+    # the mesh is painted by other pictures than the mosaic, from about as far aside
+    there = surface.at_picks(given[:, :2])
+    apart = np.abs(there.height - given[:, 2]) > surface.grid.cell + 3.0 * there.sigma
+    unlike = int((apart | ~np.isfinite(there.height)).sum())
+    notes = () if not unlike else (
+        f"{unlike} of {len(given)} points are not on the elevation model (a wall, an overhang, a "
+        "filled gap): their own errors are not known, and not counted",
+    )  # fmt: skip
+    own = np.where(np.isfinite(there.own), there.own, 0.0)
+    ends = replace(there, height=given[:, 2], own=own)
+    return tuple(_of_ends(surface, ends)), notes
+
+
+def _of_ends(surface: MeasuredSurface, ends: Samples) -> list[Measured]:
+    figures = {
+        "length": ("Length, from vertex to vertex", polyline, 1, None),
+        "straight": ("Straight from start to end", lambda p: polyline(p[[0, -1]]), 1, None),
+        "plan_length": ("Length in plan", _plan_length, 1, None),
+        "height_difference": (
+            "Height difference, end minus start", lambda p: float(p[-1, 2] - p[0, 2]), 1, None,
+        ),
+        "slope": ("Slope from start to end", _slope_deg, 0, "°"),
+    }  # fmt: skip
+    if len(ends.places) == 2:
+        figures.pop("straight")
+    return [of_points(surface, ends, name, *rest) for name, rest in figures.items()]
+
+
+def surface_length(surface: MeasuredSurface, line: SurfaceProfile) -> Measured:
+    """Length along the surface; NaN where a part of it is unknown.
+
+    A step of length t in plan and a rise r is L = √(t² + r²) long. Noise of variance v in the rise
+    makes it longer by v/2 d²L/dr² = v t² / (2 L³) in the mean, which is taken away.
+    """
+    samples = line.samples
+    steps = np.diff(samples.points, axis=0)
+    plan = np.linalg.norm(steps[:, :2], axis=1)
+    lengths = np.linalg.norm(steps, axis=1)
+    own, next_to = samples.own_covariances(0), samples.own_covariances(1)
+    noise = np.maximum(own[:-1] + own[1:] - 2.0 * next_to, 0.0)
+    noise *= not_more((steps[:, 2],), noise)
+    added = noise * plan**2 / (2.0 * lengths**3)
+    value = float((lengths - added).sum())
+    slopes = np.zeros_like(samples.points)
+    along = steps / lengths[:, None]
+    slopes[:-1] -= along
+    slopes[1:] += along
+    name, title, nan = "surface_length", "Length along the surface", math.nan
+    if not math.isfinite(value):
+        return Measured(name=name, title=title, value=nan, own=nan, shared=nan, unit=surface.unit)
+    gathered = FigureSlopes(surface.errors)
+    gathered.add(samples.places, slopes, samples.own_variance(slopes))
+    gathered.count_once(2.0 * float((added**2).sum()))
+    return figure(surface, name, title, value, gathered.packed, 1)
+
+
+def _plan_length(points: Array) -> float:
+    return polyline(points[:, :2])
+
+
+def _slope_deg(points: Array) -> float:
+    """Steepness from the first to the last point; upwards is positive."""
+    away = points[-1] - points[0]
+    return math.degrees(math.atan2(away[2], math.hypot(away[0], away[1])))
+
+
+_MAX_RIM_SAMPLES = 4000
+_MIN_SHARE = 0.5
+"""Share of a rim that must be there."""
+
+Base = float | Literal["rim"]
+"""Plane of a volume: level at a height, or fitted to the heights along the polygon's rim."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _PolygonMoments:
+    """Sums over the known squares of a polygon, about its middle."""
+
+    share: float
+    """Known, of the polygon's area."""
+    area: float
+    first: Array
+    """(3,) sum of area times 1, x and y."""
+    second: Array
+    """(3, 3) sum over cells of weights times the products of 1, x and y."""
+    heights: Array
+    """(3,) the same of heights."""
+
+    @property
+    def fit(self) -> Array:
+        """(3,) height in the middle, and slopes to the right and up, of the plane that fits."""
+        return np.asarray(np.linalg.solve(self.second, self.heights), dtype=np.float64)
+
+
+def _upright(block: GridPart) -> Array:
+    """(rows, columns, 3) 1, x and y of cells."""
+    return np.stack([np.ones_like(block.x), block.x, block.y], axis=-1)
+
+
+def _moments(region: PolygonOnGrid) -> _PolygonMoments:
+    cell = region.surface.grid.cell
+    first, second, heights = np.zeros(3), np.zeros((3, 3)), np.zeros(3)
+    for block in region.blocks():
+        upright = _upright(block)
+        middles = np.stack([mean_of_corners(upright[..., k]) for k in range(3)], axis=-1)
+        first += cell**2 * (block.weight[..., None] * middles).sum(axis=(0, 1))
+        weight = spread_to_cells(block.weight)
+        used = weight > 0
+        second += (weight[used, None] * upright[used]).T @ upright[used]
+        heights += (weight[used] * block.height[used]) @ upright[used]
+    return _PolygonMoments(
+        share=first[0] / region.polygon.area, area=first[0], first=first, second=second,
+        heights=heights,
+    )  # fmt: skip
+
+
+def measure_polygon(
+    surface: MeasuredSurface, vertices: Sequence[Sequence[float]], base: Base | None = "rim"
+) -> tuple[tuple[Measured, ...], tuple[str, ...]]:
+    """Figures of the surface within a polygon.
+
+    Args:
+        surface: that it is on.
+        vertices: three or more places, right (east) and up (north).
+        base: plane of the volume; None for no volume.
+
+    Returns:
+        Figures, and what a reader must know of them.
+
+    Raises:
+        ReconstructionError: it crosses itself, is too large, or no surface is known in it.
+    """
+    places = as_places(vertices)
+    if len(places) < 3:
+        raise ReconstructionError("a polygon needs three places that differ")
+    polygon = shapely.Polygon(places)
+    if not polygon.is_valid or not polygon.area > 0:
+        raise ReconstructionError(
+            "the polygon crosses itself or has no area: draw its corners in order"
+        )
+    region = PolygonOnGrid(surface, polygon)
+    moments = _moments(region)
+    if not moments.area > 0:
+        raise ReconstructionError(NOTHING_KNOWN)
+    notes = []
+    if moments.share < 0.999:
+        notes.append(
+            f"{moments.share:.1%} of the polygon is known: area of the surface, volume, slope and "
+            "rugosity are of that part"
+        )
+    ring = _ring(surface, places)
+    rim = None if base is None else _VolumePlane.of(surface, region, base)
+    sums = _PolygonSums(region, moments, rim)
+    figures = [
+        of_points(surface, ring, "plan_area", "Area in plan", plan_area, 2),
+        *sums.areas.figures(surface),
+        *sums.slope,
+        figure(surface, "mean_height", "Mean height", sums.mean, sums.by_mean.packed, 1),
+        of_points(surface, ring, "perimeter", "Perimeter in plan", _plan_length, 1),
+        *sums.volumes,
+    ]
+    if sums.areas.noise > 0.1:
+        notes.append(
+            f"noise adds {sums.areas.noise:.0%} to the area of the surface, which is taken away "
+            "but for about as large a share of that: it is large for such small cells"
+        )
+    return tuple(figures), tuple(notes)
+
+
+def _ring(surface: MeasuredSurface, places: Array) -> Samples:
+    """Corners and the first again; own errors count where heights are known."""
+    found = surface.at_picks(np.concatenate([places, places[:1]]))
+    known = np.isfinite(found.height)
+    height, own = np.where(known, found.height, 0.0), np.where(known[:, None], found.own, 0.0)
+    return replace(found, height=height, own=own)
+
+
+class _VolumePlane:
+    """The plane of a volume."""
+
+    def __init__(self, plane: Array, samples: Samples | None, by_height: Array) -> None:
+        self.plane = plane
+        """(3,) height in the middle, and slopes."""
+        self._samples, self._by_height = samples, by_height
+
+    @classmethod
+    def of(cls, surface: MeasuredSurface, region: PolygonOnGrid, base: Base) -> "_VolumePlane":
+        """At a height, or fitted to the rim."""
+        if base != "rim":
+            return cls(np.array([float(base), 0.0, 0.0]), None, np.zeros((3, 0)))
+        ring = region.polygon.exterior
+        step = max(surface.grid.cell, ring.length / _MAX_RIM_SAMPLES)
+        count = max(3, math.ceil(ring.length / step))
+        places = shapely.get_coordinates(
+            shapely.line_interpolate_point(ring, np.arange(count) / count, normalized=True)
+        )
+        known = np.isfinite(surface.at(places).height)
+        if known.mean() < _MIN_SHARE or known.sum() < 3:
+            raise ReconstructionError(
+                f"only {known.mean():.0%} of the polygon's rim has a height, too little to fit the "
+                "plane of the volume to it: give the plane's height, or draw the rim on the surface"
+            )
+        samples = surface.at(places[known])
+        x, y = (samples.places - region.middle).T
+        by_height = np.linalg.pinv(np.column_stack([np.ones(len(x)), x, y]))
+        return cls(by_height @ samples.height, samples, by_height)
+
+    def moves(self, slopes: FigureSlopes, by_plane: Array) -> None:
+        """Add to a figure what moves the plane, from derivatives (3,) by its parameters."""
+        if self._samples is None:
+            return
+        up = by_plane @ self._by_height
+        motion = np.column_stack([np.zeros((len(up), 2)), up])
+        slopes.add(self._samples.places, motion, self._samples.own_variance(motion))
+
+
+class _PolygonSums:
+    """All sums over a polygon, in one pass."""
+
+    def __init__(
+        self, region: PolygonOnGrid, moments: _PolygonMoments, rim: _VolumePlane | None
+    ) -> None:
+        surface = self._surface = region.surface
+        errors, cell = surface.errors, surface.grid.cell
+        self._rim = rim
+        gathered, self.by_mean = AreaSums(region), FigureSlopes(errors)
+        self._by_slopes = [FigureSlopes(errors) for _ in range(2)]
+        self._by_volume = {name: FigureSlopes(errors) for name in ("volume", "above", "below")}
+        self._volume = dict.fromkeys(self._by_volume, 0.0)
+        by_plane = {name: np.zeros(3) for name in self._by_volume}
+        lift = 0.0
+        fit = moments.fit
+        inverse = np.linalg.inv(moments.second)
+        steep = float(np.hypot(fit[1], fit[2]))
+        # steepness in degrees and the way down, by the slopes to the right and up
+        turn = np.array([[fit[1], fit[2]], [-fit[2], fit[1]]]) / max(steep, 1e-300)
+        turn[0] /= 1.0 + steep**2
+        turn[1] /= -max(steep, 1e-300)
+        turn = np.rad2deg(turn)
+        for block in region.blocks():
+            gathered.add(block)
+            upright = _upright(block)
+            weight = spread_to_cells(block.all_weight)
+            by_fit = weight[..., None] * upright @ inverse
+            region.add(self.by_mean, block, _by_height(by_fit[..., 0]))
+            for slopes, way in zip(self._by_slopes, turn, strict=True):
+                region.add(slopes, block, _by_height(by_fit[..., 1:] @ way))
+            if rim is not None:
+                over = np.nan_to_num(mean_of_corners(block.height - upright @ rim.plane))
+                lift += float(
+                    (
+                        block.weight * noise_lift(over, np.nan_to_num(sigma_of_means(block.own)))
+                    ).sum()
+                )
+                parts = (np.ones_like(over), 1.0 * (over > 0), -1.0 * (over < 0))
+                for name, part in zip(self._by_volume, parts, strict=True):
+                    self._volume[name] += cell**2 * float((block.weight * part * over).sum())
+                    moved = _by_height(cell**2 * spread_to_cells(block.all_weight * part))
+                    wider = plan_slopes(block.all_weight * part * over, cell)
+                    region.add(self._by_volume[name], block, moved + wider)
+                    middles = np.stack([mean_of_corners(upright[..., k]) for k in range(3)], -1)
+                    share = (block.weight * part)[..., None] * middles
+                    by_plane[name] -= cell**2 * share.sum(axis=(0, 1))
+        self.areas = gathered.total()
+        if rim is not None:
+            for name, slopes in self._by_volume.items():
+                rim.moves(slopes, by_plane[name])
+        self._lift, self._fit, self._steep = cell**2 * lift, fit, steep
+        self.mean = float(moments.heights[0] / moments.second[0, 0])
+
+    @property
+    def slope(self) -> tuple[Measured, Measured]:
+        """Steepness of the plane that fits best, and the direction down it."""
+        down = math.degrees(math.atan2(-self._fit[1], -self._fit[2])) % 360.0
+        steep = math.degrees(math.atan(self._steep))
+        names = (("slope", "Slope of the plane that fits", steep),
+                 ("aspect", "Aspect, the way down from north or up", down))  # fmt: skip
+        first, second = (
+            figure(self._surface, name, title, value, slopes.packed, 0, "°")
+            for (name, title, value), slopes in zip(names, self._by_slopes, strict=True)
+        )
+        return first, second
+
+    @property
+    def volumes(self) -> tuple[Measured, ...]:
+        """Volume over the plane, and its parts above and below, which noise near it lifts."""
+        if self._rim is None:
+            return ()
+        titles = {"volume": "Volume above minus below the plane",
+                  "above": "Volume above the plane", "below": "Volume below the plane"}  # fmt: skip
+        found = []
+        for name, title in titles.items():
+            by_volume = self._by_volume[name].packed
+            one = figure(self._surface, name, title, self._volume[name], by_volume, 3)
+            if name != "volume":
+                one = Measured(**{**vars(one), "own": math.hypot(one.own, self._lift)})
+            found.append(one)
+        return tuple(found)
+
+
+def _by_height(slopes: Array) -> Array:
+    """Derivatives by motions, of a figure that heights alone move."""
+    found = np.zeros((*slopes.shape, 3))
+    found[..., 2] = slopes
+    return found
+
+
+_LABELS = ("label", "class", "species", "name")
+"""Attributes that are looked for, in this order and in any case, where none is named."""
+_MAX_CORNERS = 200_000
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LabelledPolygon:
+    """A polygon of a file, or several that are one thing, in the plane of the rasters."""
+
+    name: str
+    label: str
+    geometry: Any
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _PolygonAreas:
+    polygon: LabelledPolygon
+    by_plan: PackedSlopes
+    """What moves its area in plan."""
+    surface: SurfaceAreas | None
+    """None where no surface is known in it."""
+
+
+def measure_polygon_file(
+    workspace: Path,
+    file: Path,
+    *,
+    label: str | None = None,
+    pick_sigma_px: float = 0.0,
+    output: Path | None = None,
+) -> tuple[str, dict[str, Any]]:
+    """Measure the polygons of a GIS file, one by one and by label.
+
+    Args:
+        workspace: with a surface.
+        file: GeoJSON, GeoPackage, shapefile or KML, in any coordinate system; without one in the
+            coordinates of the workspace's rasters.
+        label: attribute with the label of each polygon; one of `_LABELS` when None.
+        pick_sigma_px: standard deviation of a corner, pixels of the mosaic.
+        output: `.csv` or `.geojson` to write the polygons and their figures to.
+
+    Returns:
+        A table as text, and the figures as JSON values.
+
+    Raises:
+        ConfigError: the ending of output is another one.
+        PlanError, WorkspaceError: the file cannot be read, or holds no polygon.
+    """
+    if output is not None and output.suffix.lower() not in (".csv", ".geojson"):
+        raise ConfigError(f"{output}: results are written to a .csv or a .geojson")
+    surface = MeasuredSurface.of(workspace)
+    polygons = read_polygons(file, surface, label)
+    sigma, notes = pick_sigma_px * _pixel(surface), list(surface.errors.notes)
+    if pick_sigma_px:
+        notes = [n for n in notes if "place was picked" not in n]
+        notes.insert(0, f"counted: sigma of a corner, {pick_sigma_px:g} pixels of the mosaic")
+    measured, faults = [], []
+    with progress.step("measure polygons", len(polygons)) as step:
+        for polygon in polygons:
+            areas = None
+            try:
+                areas = surface_within(surface, polygon.geometry)
+                if areas.share < 0.999:
+                    faults.append(
+                        f"{polygon.name}: the surface is known in {areas.share:.1%} of it"
+                    )
+            except ReconstructionError as error:
+                faults.append(f"{polygon.name}: {error}")
+            by_plan = plan_slopes_of(surface, polygon.geometry, sigma)
+            measured.append(_PolygonAreas(polygon=polygon, by_plan=by_plan, surface=areas))
+            step.advance()
+    notes = [*faults, *notes]
+    lines, each, labels = [], [], []
+    for one in measured:
+        figures = _figures(surface, [one], sigma)
+        lines.append(_line(f"{one.polygon.name} ({one.polygon.label})", figures))
+        each.append([figure.to_json() for figure in figures])
+    known = _known_area(surface)
+    for name, group in groupby(sorted(measured, key=_label), _label):
+        same = list(group)
+        figures = _figures(surface, same, sigma)
+        covered = float(shapely.union_all([one.polygon.geometry for one in same]).area) / known
+        figures += (
+            Measured(
+                name="cover", title="Share of the known surface, in plan", value=covered,
+                own=figures[0].own / known, shared=figures[0].shared / known, unit="",
+            ),
+        )  # fmt: skip
+        lines.append(_line(f"all of {name!r}, {len(same)}", figures))
+        values = [figure.to_json() for figure in figures]
+        labels.append({"label": name, "count": len(same), "figures": values})
+    if output is not None:
+        _write(output, surface, polygons, each, notes)
+    data = {
+        "format": "alice-survey measure polygons",
+        "version": 1,
+        "file": str(file),
+        "polygons": [
+            {"name": polygon.name, "label": polygon.label, "figures": values}
+            for polygon, values in zip(polygons, each, strict=True)
+        ],
+        "labels": labels,
+        "notes": notes,
+    }
+    return "\n".join([*lines, *(f"note: {note}" for note in notes)]), data
+
+
+def read_polygons(
+    file: Path, surface: MeasuredSurface, label: str | None = None
+) -> list[LabelledPolygon]:
+    """The polygons of a file, in the plane of a surface's rasters.
+
+    Raises:
+        PlanError: the file is damaged, too large or of another kind.
+        WorkspaceError: it holds no polygon, or has no such attribute.
+    """
+    if file.suffix.lower() not in DRIVERS:
+        raise WorkspaceError(f"{file}: polygons are read from {', '.join(DRIVERS)}")
+    with gis_files(file) as parts:
+        found = [one for part in parts for one in _layers(part, file, surface, label)]
+    if not found:
+        raise WorkspaceError(f"{file}: it holds no polygon")
+    corners = sum(int(shapely.get_num_coordinates(one.geometry)) for one in found)
+    if corners > _MAX_CORNERS:
+        raise WorkspaceError(f"{file}: {corners} corners; at most {_MAX_CORNERS}: simplify it")
+    return found
+
+
+def _layers(
+    part: Path, shown: Path, surface: MeasuredSurface, label: str | None
+) -> Iterator[LabelledPolygon]:
+    """The polygons of all layers of a file that the user knows as `shown`."""
+    import pyogrio
+    import pyogrio.raw
+    from pyogrio.errors import DataLayerError, DataSourceError
+    from pyproj.exceptions import CRSError, ProjError
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # rings that are not closed are closed below
+        try:
+            layers = [
+                pyogrio.raw.read(part, layer=number, force_2d=True)
+                for number, (_, kind) in enumerate(pyogrio.list_layers(part).tolist())
+                if kind is not None
+            ]
+        except (DataSourceError, DataLayerError, UnicodeDecodeError, ValueError) as error:
+            raise WorkspaceError(f"{shown}: cannot be read: {one_line(error)}") from None
+        for about, _, shapes, columns in layers:
+            fields = {field.lower(): n for n, field in enumerate(about["fields"].tolist())}
+            if label is not None and label.lower() not in fields:
+                known = ", ".join(fields) or "none"
+                raise WorkspaceError(f"{shown}: no attribute {label!r}; there are {known}")
+            names = _LABELS if label is None else (label.lower(),)
+            column = next((columns[fields[name]] for name in names if name in fields), None)
+            read = shapely.make_valid(shapely.from_wkb(shapes, on_invalid="fix"))
+            for number, geometry in enumerate(read):
+                parts = shapely.get_parts(shapely.get_parts(geometry))
+                areal = [one for one in parts if one.geom_type == "Polygon" and one.area > 0]
+                if not areal:
+                    continue
+                text = shown.stem if column is None else column[number]
+                try:
+                    placed = _place_polygon(shapely.union_all(areal), about["crs"], surface)
+                except (CRSError, ProjError) as error:
+                    raise WorkspaceError(
+                        f"{shown}: its coordinate system cannot be used: {one_line(error)}"
+                    ) from None
+                if not np.isfinite(shapely.get_coordinates(placed)).all():
+                    raise WorkspaceError(
+                        f"{shown}: a corner has no place in the survey's coordinates"
+                    )
+                yield LabelledPolygon(
+                    name=f"polygon {number + 1}",
+                    label="" if text is None else str(text),
+                    geometry=placed,
+                )
+
+
+def _place_polygon(polygon: BaseGeometry, crs: str | None, surface: MeasuredSurface) -> Any:
+    """A polygon in the plane of the rasters."""
+    from pyproj import CRS, Transformer
+
+    own = crs_of(surface.frame) if surface.plane.is_level else None
+    if crs is None or own is None:
+        return polygon
+    to = Transformer.from_crs(CRS.from_user_input(crs), own.to_wkt(), always_xy=True)
+    return shapely.transform(polygon, lambda xy: np.column_stack(to.transform(*xy.T)))
+
+
+def plan_slopes_of(surface: MeasuredSurface, polygon: BaseGeometry, sigma: float) -> PackedSlopes:
+    """What moves the area in plan of a polygon, whose corners a picture of the surface showed.
+
+    Args:
+        surface: that it is on.
+        polygon: or several, with holes or without.
+        sigma: of a corner in each axis.
+    """
+    gathered = FigureSlopes(surface.errors)
+    for part in shapely.get_parts(shapely.orient_polygons(polygon)):
+        for ring in shapely.get_rings(part):
+            places = shapely.get_coordinates(ring)[:-1]
+            chord = np.roll(places, -1, axis=0) - np.roll(places, 1, axis=0)
+            slopes = 0.5 * np.column_stack([chord[:, 1], -chord[:, 0], np.zeros(len(chord))])
+            found = surface.at_picks(places)
+            known = np.isfinite(found.height)[:, None]
+            samples = replace(
+                found, own=np.where(known, found.own, 0.0), sight=np.where(known, found.sight, 0.0)
+            )
+            own = samples.own_variance(slopes) + sigma**2 * float((slopes**2).sum())
+            gathered.add(places, slopes, own)
+    return gathered.packed
+
+
+def _figures(
+    surface: MeasuredSurface, parts: Sequence[_PolygonAreas], sigma: float
+) -> tuple[Measured, ...]:
+    """Area in plan of polygons together, and where it is known that of the surface, and rugosity.
+
+    Where corners were drawn wrongly the surface gains as the plan does, times its mean rugosity.
+    """
+    area = math.fsum(float(one.polygon.geometry.area) for one in parts)
+    by_plan = sum_slopes([(1.0, one.by_plan) for one in parts])
+    plan = figure(surface, "plan_area", "Area in plan", area, by_plan, 2)
+    known = [one.surface for one in parts if one.surface is not None]
+    if not known:
+        return (plan,)
+    slanted, rugosity = figures_of_all(surface, known)
+    drawn = sigma * math.sqrt(sum(_corner_gain(one.polygon.geometry) for one in parts))
+    own = math.hypot(slanted.own, rugosity.value * drawn)
+    return plan, replace(slanted, own=own), rugosity
+
+
+def _corner_gain(polygon: BaseGeometry) -> float:
+    """Variance of a polygon's area where each corner has a variance of 1 in each axis."""
+    total = 0.0
+    for part in shapely.get_parts(polygon):
+        for ring in shapely.get_rings(part):
+            places = shapely.get_coordinates(ring)[:-1]
+            total += float(((np.roll(places, -1, axis=0) - np.roll(places, 1, axis=0)) ** 2).sum())
+    return total / 4.0
+
+
+def _pixel(surface: MeasuredSurface) -> float:
+    """Side of a pixel of the mosaic, or of a cell where there is none."""
+    path = surface.workspace / MOSAIC.path
+    if not path.is_file():
+        return surface.grid.cell
+    with opened_raster(path) as raster:
+        return float(raster.transform.a)
+
+
+def _known_area(surface: MeasuredSurface) -> float:
+    """Area in plan of the cells that have a height."""
+    known = 0
+    with opened_raster(surface.dem) as raster:
+        for _, window in raster.block_windows(1):
+            known += int(np.isfinite(raster.read(1, window=window)).sum())
+    return max(known, 1) * surface.grid.cell**2
+
+
+def _label(one: _PolygonAreas) -> str:
+    return one.polygon.label
+
+
+def _line(what: str, figures: Sequence[Measured]) -> str:
+    texts = []
+    for one in figures:
+        scale, unit = (100.0, " %") if one.name == "cover" else (1.0, f" {one.unit}".rstrip())
+        value, sigma = (f"{scale * number:.4g}" for number in (one.value, one.sigma))
+        texts.append(f"{one.name.replace('_', ' ')} {value} +/- {sigma}{unit}")
+    return f"{what}: {', '.join(texts)}"
+
+
+def _write(
+    output: Path,
+    surface: MeasuredSurface,
+    polygons: Sequence[LabelledPolygon],
+    figures: Sequence[Sequence[dict[str, Any]]],
+    notes: Sequence[str],
+) -> None:
+    rows = [
+        Measurement(
+            name=f"{one.name} ({one.label})", kind="polygon", geometry=one.geometry,
+            figures=values, notes=notes,
+        )
+        for one, values in zip(polygons, figures, strict=True)
+    ]  # fmt: skip
+    datum = surface.frame.datum if surface.plane.is_level else None
+    csv = output.suffix.lower() == ".csv"
+    with atomic_path(output) as path:
+        path.write_text(as_csv(rows) if csv else as_geojson(rows, datum, surface.unit))
