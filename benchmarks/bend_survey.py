@@ -134,7 +134,13 @@ def calibrated_rig(
     """
     port, settings = ("-far-port", _FAR_PORT) if far_port else ("", "")
     workspace = _workspace(folder, f"pool-{pool_scale}{port}", example, None, settings)
-    run(["pool", "calibrate"], workspace, None, pool_scale, local_executor(1))
+    run(
+        ["pool", "calibrate"],
+        workspace,
+        None,
+        local_executor(1),
+        {"imaging": {"scale": pool_scale}},
+    )
     rig = read_rig(workspace / "calibration" / "rig.json")
     assert rig.covariance is not None
     by = scale // pool_scale

@@ -272,7 +272,7 @@ def correction(
     ran = {
         name: record.cpu_s
         for name, record in records.items()
-        if name in costs and record.processor == here and record.cpu_s
+        if name in costs and record.processor == here and record.cpu_s and not record.resumed
     }
     if not ran:
         return 1.0, 1.0, []

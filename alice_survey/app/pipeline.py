@@ -5,7 +5,7 @@ import json
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +21,6 @@ from alice_survey.core.config import (
     change_section,
     load_config,
     parse_config,
-    parse_current,
     settings_in,
 )
 from alice_survey.core.errors import ConfigError, WorkspaceError, warn
@@ -36,48 +35,12 @@ if TYPE_CHECKING:
 _VIDEOS = (".avi", ".mkv", ".mov", ".mp4")
 
 
-@dataclass(frozen=True, kw_only=True)
-class FlightChanges:
-    """Flight settings that the command line may override; None leaves the setting."""
-
-    vehicle: str | None = None
-    controller: str | None = None
-    current: str | None = None
-    """SPEED@DIRECTION."""
-    failed: Sequence[str] | None = None
-    """NAME of a thruster that has failed, NAME=SHARE that is left of it, NAME:propeller of
-    one that turns on, either @SECONDS."""
-    dive: int | None = None
-    """Number of the dive to fly, from 1."""
-    mission: Path | None = None
-    """Mission file to fly instead of the plan's route."""
-
-    def apply(self, config: SurveyConfig) -> SurveyConfig:
-        """The survey with these changes.
-
-        Raises:
-            ConfigError: a value is not allowed.
-        """
-        speed, towards = parse_current(self.current)
-        if self.current is not None:  # instead of a measured one
-            sea = config.sea.model_copy(update={"current_file": None})
-            config = config.model_copy(update={"sea": sea})
-        config = change_section(config, "sea", current_mps=speed, current_towards_deg=towards)
-        return change_section(
-            config, "vehicle",
-            name=self.vehicle, controller=self.controller,
-            failures=self.failed, dive=self.dive, mission_file=self.mission,
-        )  # fmt: skip
-
-
 def run(
     stages: Sequence[str],
     workspace: Path,
     survey: Path | None,
-    scale: int | None = None,
     executor: Executor | None = None,
-    flight: FlightChanges | None = None,
-    planes: Sequence[str] | None = None,
+    changes: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> tuple[str, dict[str, Any]]:
     """Run stages one after the other; those that are up to date are skipped.
 
@@ -85,10 +48,8 @@ def run(
         stages: names in order.
         workspace: folder of the survey.
         survey: settings file; None looks for survey.toml in the workspace, then here.
-        scale: overrides `imaging.scale`.
         executor: where tasks run; None for all cores of this machine.
-        flight: overrides vehicle and sea.
-        planes: overrides `reconstruct.planes`.
+        changes: settings by section for this run alone; those that are None stay as they are.
 
     Returns:
         Results of each stage, as text and as JSON values.
@@ -96,24 +57,14 @@ def run(
     stages = [spec(stage).name for stage in stages]
     imported = is_imported(workspace)
     simulated = all(spec(stage).simulated for stage in stages)
-    config = settings(workspace, survey, needed=not imported, simulated=simulated)
-    as_written = config
-    planned = config = change_section(config, "imaging", scale=scale)
-    if planned.imaging.scale != as_written.imaging.scale:
-        warn(
-            f"--scale {scale} holds for this run alone, the next without it renders the pictures "
-            f"again: to keep it, put scale = {scale} below [imaging] in survey.toml"
-        )
-    if flight is not None and flight != FlightChanges():
-        config = flight.apply(config)
-        warn("these options hold for this run alone: to keep them, put them into survey.toml")
-    if planes:
-        config = change_section(config, "reconstruct", planes=list(planes))
-        if config.reconstruct.planes != planned.reconstruct.planes:
+    config = as_written = settings(workspace, survey, needed=not imported, simulated=simulated)
+    for section, values in (changes or {}).items():
+        config = change_section(config, section, **values)
+        if getattr(config, section) != getattr(as_written, section):
+            given = ", ".join(k for k, value in values.items() if value is not None)
             warn(
-                "these planes hold for this run alone, the next without them makes the surface "
-                f"again: to keep them, put planes = {json.dumps(list(planes))} below "
-                "[reconstruct] in survey.toml"
+                f"{given} below [{section}] holds for this run alone; the next without it makes "
+                "again what depends on it: to keep it, put it into survey.toml"
             )
     if imported:
         if len(stages) > 1:  # a rig of real pictures comes with them
@@ -130,9 +81,10 @@ def run(
     executor = executor or local_executor()
     with only_one(workspace):
         if "fly" in stages and "plan" not in stages:
-            by = flight or FlightChanges()  # what a plan may have been made with
-            alike = [planned, change_section(planned, "vehicle", name=by.vehicle)]
-            alike.append(change_section(alike[1], "vehicle", controller=by.controller))
+            vehicle = (changes or {}).get("vehicle", {})  # what a plan may have been made with
+            alike = [as_written, change_section(as_written, "vehicle", name=vehicle.get("name"))]
+            steered = {"controller": vehicle.get("controller")}
+            alike.append(change_section(alike[1], "vehicle", **steered))
             states = [spec("plan").state(workspace, one, {}) for one in alike]
             if all(state.startswith("stale") for state in states):
                 warn(f"the plan is {states[0]}; 'alice-survey plan -w {workspace}' renews it")
@@ -166,7 +118,7 @@ def plan_report(
     from alice_survey.app.computing import GROUPS
     from missions.plan.rows import main_settings
 
-    text, found = run(["plan"], workspace, survey, flight=FlightChanges(vehicle=vehicle))
+    text, found = run(["plan"], workspace, survey, changes={"vehicle": {"name": vehicle}})
     cost, found["cost"] = _predict_cost(workspace, survey, GROUPS)
     folder = workspace / "plan"
     if every_setting:
@@ -306,7 +258,7 @@ def run_demo(workspace: Path, executor: Executor | None) -> tuple[str, dict[str,
     """Run the whole loop on the built-in survey, and report where its pictures are."""
     if not (workspace / "survey.toml").exists():
         init_survey(workspace, "demo.toml")
-    text, found = run(names(), workspace, None, None, executor)
+    text, found = run(names(), workspace, None, executor)
     rows = [
         f"  {stage.name:12} {workspace / stage.folder / stage.picture}"
         for stage in survey_stages.STAGES

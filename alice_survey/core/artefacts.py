@@ -26,13 +26,11 @@ from pydantic_core import to_jsonable_python
 from alice_survey.core.contents import as_line, first_fault
 from alice_survey.core.errors import AliceError, NavigationError, WorkspaceError, why
 from alice_survey.core.run import progress
-from alice_survey.core.run.resources import Meter, Spent, processor, versions, watch_meter
+from alice_survey.core.run.resources import processor, versions, watch_meter
 
 T = TypeVar("T")
 
 STAGE_FILE = "stage.json"
-_SPENT_FILE = ".spent"
-"""In an unfinished stage: the resources used so far."""
 _TEMPORARY = re.compile(r"\..+\.tmp[0-9a-f]+(\..*)?")
 """Names that `atomic_path` gives, and those that libraries derive from them."""
 
@@ -112,6 +110,8 @@ class StageRecord(JsonRecord):
     took_s: float = 0.0
     cpu_s: float | None = None
     peak_mib: float | None = None
+    resumed: bool = False
+    """Whether these are of the last run alone, which went on from what an earlier one left."""
     processor: str = ""
     """What it was made on; empty where an older version of the program made it."""
     versions: dict[str, str] = Field(default_factory=dict)
@@ -160,7 +160,9 @@ def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], object]) -> 
         path.write_text(digest)
     how = {"resumed": True} if resumed else {}
     with progress.stage(stage.name, **how) as finish:
-        spent = _measure_work(partial, work).to_json()
+        with watch_meter() as meter:
+            work(partial)
+            spent = meter.look()
         _check_unchanged(inputs, workspace, stage.name)
         record = {
             "stage": stage.name,
@@ -174,7 +176,6 @@ def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], object]) -> 
             "versions": versions(),
         }
         write_json(partial / STAGE_FILE, record)
-        (partial / _SPENT_FILE).unlink(missing_ok=True)
         marker.unlink()
         if final.exists():
             final.rename(replaced)
@@ -208,23 +209,6 @@ def _first_link(root: Path, path: Path) -> Path | None:
     above = itertools.takewhile(lambda one: one != root, (path, *path.parents))
     inside = (Path(folder, name) for folder, *both in os.walk(path) for name in chain(*both))
     return next((one for one in chain(above, inside) if one.is_symlink()), None)
-
-
-def _measure_work(partial: Path, work: Callable[[Path], object]) -> Spent:
-    """Do a stage's work; return the resources used, including those of an interrupted run."""
-    try:
-        earlier = Spent(**json.loads((partial / _SPENT_FILE).read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError):  # a kill may have come before the first
-        earlier = Spent()
-    meter = Meter()
-
-    def keep(spent: Spent) -> None:
-        with contextlib.suppress(OSError):  # on a full disk the work itself will say so
-            write_json(partial / _SPENT_FILE, spent.after(earlier).to_json())
-
-    with watch_meter(meter, keep):
-        work(partial)
-        return meter.look().after(earlier)
 
 
 def why_stale(workspace: Path, stage: Stage) -> str | None:

@@ -823,34 +823,19 @@ def _without_constants(settings: Mapping[str, Any]) -> dict[str, Any]:
 def change_section(config: SurveyConfig, section: str, **values: Any) -> SurveyConfig:
     """A survey with some settings of a section changed; those that are None stay as they are.
 
-    Raises:
-        ConfigError: a value is out of range.
-    """
-    return with_settings(
-        config, {f"{section}.{key}": value for key, value in values.items() if value is not None}
-    )
-
-
-def with_settings(
-    config: SurveyConfig, values: Mapping[str, Any], origin: str = "command line"
-) -> SurveyConfig:
-    """A survey with settings changed.
-
-    Args:
-        config: of the survey.
-        values: by names such as `plan.speed_mps`.
-        origin: of the values, in messages.
+    A current takes the place of a measured one.
 
     Raises:
         ConfigError: a value is out of range.
     """
-    if not values:
+    given = {key: value for key, value in values.items() if value is not None}
+    if not given:
         return config
+    if "current_mps" in given:
+        given = {"current_file": None, **given}
     settings = config.model_dump(mode="json", exclude_unset=True)
-    for name, value in values.items():
-        section, key = name.split(".")
-        settings[section] = {**settings.get(section, {}), key: value}
-    return parse_config(settings, origin)
+    settings[section] = settings.get(section, {}) | given
+    return parse_config(settings, "command line")
 
 
 def parse_current(text: str | None) -> tuple[float | None, float | None]:
@@ -919,60 +904,26 @@ def parse_failures(texts: Sequence[str]) -> Failures:
 def _one_line(error: ValidationError) -> str:
     faults = []
     for fault in error.errors()[:_MAX_FAULTS]:
-        key = as_line(".".join(str(part) for part in fault["loc"])) or "settings"
+        key = as_line(".".join(map(str, fault["loc"]))) or "settings"
         if key in REMOVED:
             faults.append(f"{key} is gone: {REMOVED[key]}")
         elif fault["type"] == "extra_forbidden":
-            faults.append(f"{key} is not a known setting{_nearest(fault['loc'])}")
+            faults.append(f"{key} is not a known setting{_nearest(*map(str, fault['loc']))}")
         elif fault["type"] == "value_error":
             faults.append(f"{key}: {fault['ctx']['error']}")
-        elif fault["loc"] == ("name",) and fault["type"] == "string_pattern_mismatch":
-            faults.append(
-                f"name = {_show_value(fault['input'])}: use letters, digits, spaces, . _ -"
-            )
         else:
-            faults.append(f"{key} = {_show_value(fault['input'])}: {_requirement(fault)}")
+            faults.append(f"{key} = {fault['input']!r:.60}: {fault['msg']}")
     more = error.error_count() - len(faults)
     return "; ".join(faults) + (f"; and {more} more" if more else "")
 
 
-def _show_value(value: object) -> str:
-    if isinstance(value, float) and not math.isfinite(value):
-        return str(value)
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def _requirement(fault: Any) -> str:
-    message = str(fault["msg"])
-    section: type[BaseModel] = SurveyConfig
-    for part in fault["loc"]:
-        if not (isinstance(part, str) and part in section.model_fields):
-            return message
-        field = section.model_fields[part]
-        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
-            section = field.annotation
-            continue
-        signs = {"Gt": (">", "gt"), "Ge": (">=", "ge"), "Lt": ("<", "lt"), "Le": ("<=", "le")}
-        bounds = [
-            f"{signs[type(limit).__name__][0]} {getattr(limit, signs[type(limit).__name__][1])}"
-            for limit in field.metadata
-            if type(limit).__name__ in signs
-        ]
-        return f"{message} (allowed: {' and '.join(bounds)})" if bounds else message
-    return message
-
-
-def _nearest(location: tuple[str | int, ...]) -> str:
+def _nearest(*location: str) -> str:
     import difflib
 
-    section: type[BaseModel] = SurveyConfig
-    for part in location[:-1]:
-        annotation = section.model_fields[str(part)].annotation
-        if not (isinstance(annotation, type) and issubclass(annotation, BaseModel)):
-            return ""
-        section = annotation
-    close = difflib.get_close_matches(str(location[-1]), section.model_fields, n=1)
+    section: Any = SurveyConfig
+    for name in location[:-1]:
+        section = section.model_fields[name].annotation
+    close = difflib.get_close_matches(location[-1], section.model_fields, n=1)
     return (
         f"; did you mean {close[0]}?" if close else f"; known are {', '.join(section.model_fields)}"
     )

@@ -2,8 +2,7 @@
 
 A setting that is there keeps its place and its comment. A new one stands below the commented
 example of its name, where the file has one (`# side_overlap = 0.28`), else behind the last of its
-section. One that is taken out leaves its comment: the line becomes a commented one, and comes back
-as it was when the same value is set again.
+section. One that is taken out becomes a comment.
 """
 
 import re
@@ -64,18 +63,11 @@ def with_settings_changed(text: str, values: Values, origin: str = "settings") -
     for section, changed in values.items():
         if section in document:
             there = before[section]
-            _change(
-                document,
-                section,
-                {
-                    key: value
-                    for key, value in changed.items()
-                    if not same_value(there.get(key), value)
-                },
-                line_end,
-            )
-        elif lines := [_line(k, v) for k, v in changed.items() if v is not None]:
-            added += line_end.join(["", f"[{section}]", *lines, ""])
+            new = {k: v for k, v in changed.items() if not same_value(there.get(k), v)}
+            _change(document, section, new, line_end)
+        elif new := {key: value for key, value in changed.items() if value is not None}:
+            lines = tomlkit.dumps({section: new}).splitlines()
+            added += line_end.join(["", *lines, ""])
     result: str = document.as_string()
     if added:
         gap = "" if result.endswith("\n") else line_end
@@ -130,7 +122,7 @@ def _with_body(table: Table, body: _Body) -> Table:
 
 
 def _replacement(entry: tuple[Key | None, Item], value: Any, line_end: str) -> _Body:
-    """A setting with another value; with None the comment that is left of it."""
+    """A setting with another value; with None what it was, as a comment."""
     key, old = entry
     assert key is not None  # noqa: S101  -- of a setting, not of a comment
     trivia = old.trivia
@@ -139,16 +131,9 @@ def _replacement(entry: tuple[Key | None, Item], value: Any, line_end: str) -> _
         for name in ("indent", "comment_ws", "comment", "trail"):
             setattr(item.trivia, name, getattr(trivia, name))
         return [(key, item)]
-    written = f"{key.as_string()}{key.sep}{old.as_string()}"
-    if not trivia.comment and not ("\n" in written and "#" in written):
-        return []
-    written += f"{trivia.comment_ws}{trivia.comment}"
-    lines = [f"# {line}" for line in written.splitlines()]
-    ends = [*[line_end] * (len(lines) - 1), trivia.trail]
-    return [
-        (None, Comment(Trivia(trivia.indent, "", line, end)))
-        for line, end in zip(lines, ends, strict=True)
-    ]
+    written = f"{key.as_string()}{key.sep}{old.as_string()}{trivia.comment_ws}{trivia.comment}"
+    comments = [Comment(Trivia("", "", f"# {line}", line_end)) for line in written.splitlines()]
+    return [(None, comment) for comment in comments]
 
 
 def _insert(body: _Body, key: str, value: Any, line_end: str) -> None:
@@ -156,11 +141,6 @@ def _insert(body: _Body, key: str, value: Any, line_end: str) -> None:
     example = re.compile(rf"\s*#\s*{re.escape(key)}\s*=")
     examples = [i for i, (name, item) in enumerate(body)
                 if name is None and example.match(item.as_string())]  # fmt: skip
-    for i in examples:
-        again = _uncomment(body[i][1], key, value)
-        if again is not None:
-            body[i] = again
-            return
     settings = [i for i, (name, _) in enumerate(body) if name is not None]
     at = max(examples or settings, default=-1)
     if at >= 0 and not body[at][1].trivia.trail.endswith("\n"):
@@ -168,22 +148,3 @@ def _insert(body: _Body, key: str, value: Any, line_end: str) -> None:
     item = tomlkit.item(value)
     item.trivia.trail = line_end
     body.insert(at + 1, (SingleKey(key), item))
-
-
-def _uncomment(comment: Item, key: str, value: Any) -> tuple[Key, Item] | None:
-    """The setting that a comment was before it was taken out, if it was."""
-    written = comment.as_string().lstrip().removeprefix("#").removeprefix(" ")
-    try:
-        [(name, item)] = tomlkit.parse(written).body
-    except (TOMLKitError, ValueError):
-        return None
-    if name is None or name != key or not item.trivia.comment:
-        return None
-    if not same_value(item.unwrap(), value):
-        return None
-    item.trivia.indent = comment.trivia.indent
-    return name, item
-
-
-def _line(key: str, value: Any) -> str:
-    return tomlkit.dumps({key: value}).rstrip("\n")

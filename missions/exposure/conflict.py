@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from alice_survey.core.config import SurveyConfig, with_settings
+from alice_survey.core.config import SurveyConfig, change_section
 from alice_survey.core.errors import ConfigError, PlanError
 
 MIN_ALTITUDE_M, MAX_ALTITUDE_M = 0.3, 10.0
@@ -40,7 +40,8 @@ def conflict(
 
 def _is_allowed(setting: str, value: float) -> bool:
     try:
-        with_settings(SurveyConfig(), {setting: value})
+        section, key = setting.split(".")
+        change_section(SurveyConfig(), section, **{key: value})
     except ConfigError:
         return False
     return True

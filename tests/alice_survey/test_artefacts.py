@@ -183,48 +183,6 @@ def test_a_stage_records_what_it_took_outside_of_its_digest(tmp_path: Path) -> N
     assert "resumed" not in one
 
 
-def test_a_resumed_stage_counts_what_was_spent_before(
-    tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("alice_survey.core.run.resources._EVERY_S", 0.01)
-    monkeypatch.setattr("alice_survey.core.run.resources._REPORTED_EVERY_S", 0.01)
-    spent = tmp_path / "made.partial" / ".spent"
-
-    def broken(folder: Path) -> None:
-        for _ in range(500):
-            if spent.exists():
-                break
-            time.sleep(0.01)
-        raise RuntimeError("broke")
-
-    with pytest.raises(RuntimeError):
-        run_stage(tmp_path, stage([source], resumes=True), broken)
-    before = json.loads(spent.read_text())
-    assert before["took_s"] > 0
-    spent.write_text(json.dumps({**before, "took_s": 1000.0, "cpu_s": 900.0, "peak_mib": 1e6}))
-    run_stage(tmp_path, stage([source], resumes=True), Work())
-    record = json.loads((tmp_path / "made" / "stage.json").read_text())
-    assert record["resumed"] is True
-    assert 1000.0 < record["took_s"] < 1100.0
-    assert 900.0 <= record["cpu_s"] < 1000.0
-    assert record["peak_mib"] == 1e6
-    assert [p.name for p in sorted((tmp_path / "made").iterdir())] == ["result.txt", "stage.json"]
-
-
-@pytest.mark.parametrize("text", ["", "{", '{"took_s": 1}'])
-def test_a_record_of_what_was_spent_that_is_cut_does_no_harm(
-    text: str, tmp_path: Path, source: Path
-) -> None:
-    made = stage([source], resumes=True)
-    with pytest.raises(ZeroDivisionError):
-        run_stage(tmp_path, made, lambda folder: (folder / "a").write_text(str(1 // 0)) and None)
-    (tmp_path / "made.partial" / ".spent").write_text(text)
-    run_stage(tmp_path, made, Work())
-    record = json.loads((tmp_path / "made" / "stage.json").read_text())
-    assert record["resumed"] is True
-    assert record["took_s"] < 100
-
-
 KILLED = """
 import os, signal, sys
 from pathlib import Path

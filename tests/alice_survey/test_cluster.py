@@ -121,7 +121,7 @@ def test_a_cluster_gives_what_this_process_gives(executor: ClusterExecutor, tmp_
     assert list(executor.map(str, iter([b"x" * 10_000_000]), label="long")) == [
         str(b"x" * 10_000_000)
     ]
-    assert meter.look().cpu_s > 0.0
+    assert meter.look()["cpu_s"] > 0.0
     with pytest.raises(TypeError) as raised:
         list(executor.map(abs, ["a"], label="abs"))  # type: ignore[arg-type]
     assert "run_task" in "".join(raised.value.__notes__)  # where it happened
@@ -164,7 +164,7 @@ def test_computing_of_workers_below_this_process_counts_once(tmp_path: Path) -> 
         list(executor.map(dask_tasks.compute, [0.0], label="load"))
         meter = Meter()
         list(executor.map(dask_tasks.compute, [1.0] * 4, label="compute"))
-        assert 3.9 < meter.look().cpu_s < 7.0
+        assert 3.9 < meter.look()["cpu_s"] < 7.0
 
 
 @pytest.mark.slow

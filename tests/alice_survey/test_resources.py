@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-from alice_survey.core.run.resources import Meter, Spent, cpu_s, family, memory_mib, versions
+from alice_survey.core.run.resources import Meter, cpu_s, family, memory_mib, versions
 
 BUSY = """
 import sys, time
@@ -28,22 +28,16 @@ def test_descendants_count_while_they_run_and_after_they_ended() -> None:
     (process,) = (found for found in family() if found.pid == child.pid)
     during = meter.look()
     assert 100 < memory_mib(process) < 200
-    assert during.peak_mib > memory_mib(process)
-    assert 0.3 <= during.cpu_s < 5
+    assert during["peak_mib"] > memory_mib(process)
+    assert 0.3 <= during["cpu_s"] < 5
     child.communicate()
     assert process not in family()
     after = meter.look()
-    assert after.cpu_s >= during.cpu_s
-    assert after.peak_mib >= during.peak_mib
-    assert after.took_s > during.took_s
+    assert after["cpu_s"] >= during["cpu_s"]
+    assert after["peak_mib"] >= during["peak_mib"]
+    assert after["took_s"] > during["took_s"]
     assert (memory_mib(process), cpu_s(process)) == (0.0, 0.0)
     assert family(child.pid) == []
-
-
-def test_what_was_spent_twice_adds_up_but_for_memory() -> None:
-    both = Spent(took_s=1, cpu_s=2, peak_mib=30).after(Spent(took_s=4, cpu_s=5, peak_mib=6))
-    assert both == Spent(took_s=5, cpu_s=7, peak_mib=30)
-    assert Spent(**both.to_json()) == both
 
 
 def test_versions_are_those_that_are_imported() -> None:

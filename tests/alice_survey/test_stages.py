@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from alice_survey.app import stages
 from alice_survey.app.cli.main import app
-from alice_survey.app.pipeline import FlightChanges, run, workspace_status
+from alice_survey.app.pipeline import run, workspace_status
 from alice_survey.app.report.held import Held
 from alice_survey.app.report.sections import sections
 from alice_survey.app.report.verdicts import verdicts
@@ -278,11 +278,11 @@ def test_a_plan_made_for_a_vehicle_is_not_stale_when_that_flies(tmp_path: Path) 
         "[area]\nlength_m = 1.0\nwidth_m = 1.2\nseafloor_depth_m = 5.0\n"
         "[plan]\ncross_lines = 0\nclosing_line = false\n[seafloor]\ngrid_m = 0.05\n"
     )
-    for_sparus = FlightChanges(vehicle="sparus2", controller="los")
+    for_sparus = {"vehicle": {"name": "sparus2", "controller": "los"}}
     with keep_warnings() as planning:
-        run(["plan"], tmp_path, None, flight=for_sparus)
+        run(["plan"], tmp_path, None, changes=for_sparus)
     with keep_warnings() as flying:
-        run(["fly"], tmp_path, None, flight=for_sparus)
+        run(["fly"], tmp_path, None, changes=for_sparus)
     assert not any("stale" in text for text in [*planning, *flying])
     with keep_warnings() as others:
         run(["fly"], tmp_path, None)

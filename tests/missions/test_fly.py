@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
-from alice_survey.app.pipeline import FlightChanges, run
+from alice_survey.app.pipeline import run
 from alice_survey.app.stages import spec
 from alice_survey.core.config import SurveyConfig, parse_config
 from alice_survey.core.errors import PlanError, VehicleError
@@ -155,7 +155,7 @@ def test_a_stale_plan_is_flown_with_a_warning_and_options_are_said_to_be_for_onc
     (tmp_path / "survey.toml").write_text(small)
     run(["plan"], tmp_path, None)
     (tmp_path / "survey.toml").write_text(small + "[plan]\nspeed_mps = 0.25\n")
-    run(["fly"], tmp_path, None, flight=FlightChanges(current="0.1@90"))
+    run(["fly"], tmp_path, None, changes={"sea": {"current_mps": 0.1, "current_towards_deg": 90.0}})
     warned = capsys.readouterr().err
     assert "stale" in warned
     assert "survey.toml" in warned
@@ -169,7 +169,7 @@ def test_an_exported_mission_is_flown_next_to_its_certificate(
         "[area]\nlength_m = 3.0\nwidth_m = 2.5\nseafloor_depth_m = 6.0\n[seafloor]\ngrid_m = 0.05\n"
     )
     file = tmp_path / "plan" / "exports" / "mission_dive1.plan"
-    text, data = run(["fly"], tmp_path, None, flight=FlightChanges(mission=file))
+    text, data = run(["fly"], tmp_path, None, changes={"vehicle": {"mission_file": file}})
     found = data["fly"]
     mission = json.loads((tmp_path / "flight" / "flight.json").read_text())["mission"]
 
@@ -184,5 +184,5 @@ def test_an_exported_mission_is_flown_next_to_its_certificate(
     # Another file is another flight; one that holds no mission is refused in a line.
     (tmp_path / "notes.txt").write_text("nothing")
     with pytest.raises(PlanError, match="no mission") as caught:
-        run(["fly"], tmp_path, None, flight=FlightChanges(mission=tmp_path / "notes.txt"))
+        run(["fly"], tmp_path, None, changes={"vehicle": {"mission_file": tmp_path / "notes.txt"}})
     assert "\n" not in str(caught.value)

@@ -261,9 +261,8 @@ class ReconstructCommand(DeviceCommand):
         from alice_survey.app.pipeline import run
 
         with self.started_executor(self.device) as executor:
-            text, values = run(
-                self.stages(), self.workspace, self.survey, None, executor, planes=self.plane
-            )
+            changes = {"reconstruct": {"planes": self.plane}}
+            text, values = run(self.stages(), self.workspace, self.survey, executor, changes)
             if self.export is not None:
                 from reconstruct.export.undistorted import export_undistorted
 
@@ -424,7 +423,7 @@ class EvaluateCommand(SurveyCommand, ThreadsCommand):
             return evaluate_against(self.workspace, self.against, self.output)
         from alice_survey.app.pipeline import run
 
-        return run(["evaluate"], self.workspace, self.survey, None, self.executor())
+        return run(["evaluate"], self.workspace, self.survey, self.executor())
 
 
 class MosaicTilesCommand(WorkspaceCommand, ReportCommand):

@@ -141,13 +141,18 @@ class FlyCommand(SurveyCommand):
 
     def run(self) -> Result:
         """Run the stage with these changes."""
-        from alice_survey.app.pipeline import FlightChanges, run
+        from alice_survey.app.pipeline import run
+        from alice_survey.core.config import parse_current
 
-        changes = FlightChanges(
-            vehicle=self.vehicle, controller=self.controller, current=self.current,
-            failed=self.fail, dive=self.dive, mission=self.mission,
-        )  # fmt: skip
-        return run(["fly"], self.workspace, self.survey, flight=changes)
+        current_mps, towards_deg = parse_current(self.current)
+        changes: dict[str, dict[str, Any]] = {
+            "sea": {"current_mps": current_mps, "current_towards_deg": towards_deg},
+            "vehicle": {
+                "name": self.vehicle, "controller": self.controller, "failures": self.fail,
+                "dive": self.dive, "mission_file": self.mission,
+            },
+        }  # fmt: skip
+        return run(["fly"], self.workspace, self.survey, changes=changes)
 
 
 class ImageCommand(ClusterCommand):
@@ -170,7 +175,8 @@ class ImageCommand(ClusterCommand):
         from alice_survey.app.pipeline import run
 
         with self.started_executor() as executor:
-            return run(self.stages(), self.workspace, self.survey, self.scale, executor)
+            changes = {"imaging": {"scale": self.scale}}
+            return run(self.stages(), self.workspace, self.survey, executor, changes)
 
 
 class TargetCommand(ReportCommand):
@@ -276,7 +282,7 @@ class CalibrateCommand(SurveyCommand, ThreadsCommand):
             return calibrate_pictures(options, self.executor())
         from alice_survey.app.pipeline import run
 
-        return run(["calibrate"], self.workspace, self.survey, None, self.executor())
+        return run(["calibrate"], self.workspace, self.survey, self.executor())
 
 
 class RunCommand(DeviceCommand):
@@ -304,7 +310,8 @@ class RunCommand(DeviceCommand):
         from alice_survey.app.pipeline import run
 
         with self.started_executor(self.device) as executor:
-            return run(self.stages(), self.workspace, self.survey, self.scale, executor)
+            changes = {"imaging": {"scale": self.scale}}
+            return run(self.stages(), self.workspace, self.survey, executor, changes)
 
 
 class DemoCommand(WorkspaceCommand, ThreadsCommand, ReportCommand):
@@ -360,4 +367,4 @@ class ReportPageCommand(SurveyCommand, ThreadsCommand):
         """Run the stage."""
         from alice_survey.app.pipeline import run
 
-        return run(["report"], self.workspace, self.survey, None, self.executor())
+        return run(["report"], self.workspace, self.survey, self.executor())

@@ -7,8 +7,7 @@ import platform
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
     import psutil
 
 _EVERY_S = 1.0
-_REPORTED_EVERY_S = 5.0
 _MAX_SHARE = 0.01
 """Of a core's time, for reading."""
 _PACKAGES = {
@@ -47,33 +45,6 @@ def count_elsewhere(cpu_s: float) -> None:
     _elsewhere_s += cpu_s
 
 
-@dataclass(frozen=True, kw_only=True)
-class Spent:
-    """Resources used so far."""
-
-    took_s: float = 0.0
-    cpu_s: float = 0.0
-    """User and system time of this process, of those it has started, and of tasks elsewhere."""
-    peak_mib: float = 0.0
-    """Largest sum of their proportional memory, seen about once a second."""
-
-    def after(self, earlier: "Spent") -> "Spent":
-        """Sum of two uses, one after the other."""
-        return Spent(
-            took_s=self.took_s + earlier.took_s,
-            cpu_s=self.cpu_s + earlier.cpu_s,
-            peak_mib=max(self.peak_mib, earlier.peak_mib),
-        )
-
-    def to_json(self) -> dict[str, float]:
-        """Rounded, for files."""
-        return {
-            "took_s": round(self.took_s, 3),
-            "cpu_s": round(self.cpu_s, 2),
-            "peak_mib": round(self.peak_mib, 1),
-        }
-
-
 class Meter:
     """Meter of the resources this process and its descendants use since its creation."""
 
@@ -82,46 +53,44 @@ class Meter:
         self._peak_mib = 0.0
         self._lock = threading.Lock()
 
-    def look(self) -> Spent:
-        """Resources used until now."""
+    def look(self) -> dict[str, float]:
+        """Time, processor time and most memory until now, as files hold them.
+
+        User and system time of this process, of those it has started, and of tasks elsewhere; the
+        largest sum of their proportional memory that a look has seen.
+        """
         processes = family()
         memory = sum(map(memory_mib, processes))
         with self._lock:
             self._peak_mib = max(self._peak_mib, memory)
-            return Spent(
-                took_s=time.monotonic() - self._started_s,
-                cpu_s=max(0.0, sum(map(cpu_s, processes)) + _elsewhere_s - self._cpu_s),
-                peak_mib=self._peak_mib,
-            )
+            return {
+                "took_s": round(time.monotonic() - self._started_s, 3),
+                "cpu_s": round(
+                    max(0.0, sum(map(cpu_s, processes)) + _elsewhere_s - self._cpu_s), 2
+                ),
+                "peak_mib": round(self._peak_mib, 1),
+            }
 
 
 @contextlib.contextmanager
-def watch_meter(meter: Meter, report: Callable[[Spent], None]) -> Iterator[None]:
-    """Read a meter about once a second from a thread of its own, and report every few seconds.
+def watch_meter() -> Iterator[Meter]:
+    """A meter that a thread of its own reads about once a second.
 
     Memory that many files are mapped to takes long to count: then it is read less often.
-
-    Args:
-        meter: the meter to read.
-        report: called from that thread.
     """
-    stop = threading.Event()
+    stop, meter = threading.Event(), Meter()
 
     def look() -> None:
-        since_s, wait_s = 0.0, _EVERY_S
+        wait_s = _EVERY_S
         while not stop.wait(wait_s):
             began_s = time.thread_time()
-            spent = meter.look()
-            since_s += wait_s
+            meter.look()
             wait_s = max(_EVERY_S, (time.thread_time() - began_s) / _MAX_SHARE)
-            if since_s >= _REPORTED_EVERY_S:
-                since_s = 0.0
-                report(spent)
 
     thread = threading.Thread(target=look, name="meter", daemon=True)
     thread.start()
     try:
-        yield
+        yield meter
     finally:
         stop.set()
         thread.join()
