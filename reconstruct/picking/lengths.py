@@ -1,4 +1,6 @@
-"""Lengths between spots, with sigmas of picks, of poses and of the scale.
+"""Lengths and areas between spots picked in pictures, with sigmas of picks, poses and the scale.
+
+A pixel of one picture is found again in the others that see it; the exact rays give the point.
 
 Two spots that the same pictures show share the errors of these: the block around them is adjusted
 once more, to first order, and tells how stations err together. With a point of slopes J by its
@@ -11,14 +13,17 @@ the rig, as the survey refined it, moves both. Only stations around the spots co
 out knows less, never more.
 """
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 from scipy.spatial import KDTree
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.contents import read_arrays
 from alice_survey.core.errors import ReconstructionError
@@ -34,9 +39,17 @@ from reconstruct.adjustment.exact_observations import (
 from reconstruct.adjustment.normal_equations import Gauge, PointEquations, by_pose, reduce_parts
 from reconstruct.adjustment.pixel_parts import Linearised, PixelParts
 from reconstruct.mapping.arrays import MIN_POINTS, Indices, first_of, linked_groups
-from reconstruct.measure.figures import polyline, slopes_of
+from reconstruct.measure.figures import polygon_area, polyline, slopes_of
+from reconstruct.picking.matching import refine
 from reconstruct.picking.registered import RegisteredPictures
+from reconstruct.picking.surface import ModelSurface, SurfacePlace
+from reconstruct.pictures.undistorted import read_colour
+from reconstruct.placing.alignment import Similarity
+from reconstruct.placing.control import tie_control
+from reconstruct.placing.control_command import note_scale
 from reconstruct.placing.control_points import (
+    PICK_SIGMA_PX,
+    Control,
     Pick,
     TriangulatedPoint,
     covariance_of_picks,
@@ -47,8 +60,11 @@ from reconstruct.placing.control_points import (
 )
 from reconstruct.placing.place import LENGTH_SCALE_SIGMA
 from reconstruct.stages import SCALE_FILE
+from reconstruct.views.model import WorldFrame
 from reconstruct.views.model_files import ImagesFile, points_of
 
+PolylineFigure = tuple[Callable[[Array], float], int]
+"""A figure of points (N, 3), and the power of a length that it is."""
 MAX_STATIONS = 120
 """Stations that are adjusted: the nearest to the spots."""
 _MAX_OBSERVATIONS = 400_000
@@ -66,16 +82,6 @@ class SpotErrors:
     """(3, F, 6) how it moves with the stations of a block."""
     by_rig: Array
     """(3, G) how it moves with the rig, the stations held."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PolylineFigure:
-    """A figure of points in space."""
-
-    value: Callable[[Array], float]
-    """Of (N, 3) points."""
-    power: int
-    """Of a length that it is."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,7 +233,7 @@ class Lengths:
         Raises:
             ReconstructionError: one is not found, or the distance is not determined.
         """
-        return self.figures([first, second], [PolylineFigure(value=polyline, power=1)])[1][0]
+        return self.figures([first, second], [(polyline, 1)])[1][0]
 
     def figures(
         self, picks: Sequence[Sequence[Pick]], figures: Sequence[PolylineFigure]
@@ -249,25 +255,21 @@ class Lengths:
             for name in ("picks", "by_poses", "by_rig")
         )
         centred = points - points.mean(axis=0)
-        slopes = np.stack([slopes_of(figure.value, centred) for figure in figures])
+        slopes = np.stack([slopes_of(value, centred) for value, _ in figures])
         own = np.einsum("kni,nij,knj->k", slopes, by_picks, slopes)
         poses, rig = block.variances(
             np.einsum("kni,nifj->kfj", slopes, by_poses), np.einsum("kni,nig->kg", slopes, by_rig)
         )
-        scale = _scale_sigma(self._workspace)
-        found = []
-        for n, figure in enumerate(figures):
-            value = figure.value(centred)
-            found.append(
-                PickedFigure(
-                    value=value, sigma_picks=float(np.sqrt(max(own[n], 0.0))),
-                    sigma_poses=float(np.sqrt(max(poses[n, n], 0.0))),
-                    sigma_scale=float(np.hypot(
-                        np.sqrt(max(rig[n, n], 0.0)), figure.power * value * scale
-                    )),
-                )
-            )  # fmt: skip
-        return points, found
+        values = np.array([value(centred) for value, _ in figures])
+        scale = np.array([power for _, power in figures]) * values * _scale_sigma(self._workspace)
+        by_picks, by_poses, by_rig = (
+            np.sqrt(np.maximum(one, 0.0)) for one in (own, np.diag(poses), np.diag(rig))
+        )
+        rows = np.column_stack([values, by_picks, by_poses, np.hypot(by_rig, scale)]).tolist()
+        return points, [
+            PickedFigure(value=value, sigma_picks=pixels, sigma_poses=moved, sigma_scale=grown)
+            for value, pixels, moved, grown in rows
+        ]
 
     def target(self, picks: Sequence[Pick]) -> TriangulatedPoint:
         """The spot that picks show.
@@ -418,3 +420,242 @@ def _scale_sigma(workspace: Path) -> float:
     placed = RegistrationRecord.read(workspace / "sparse" / "registration.json").georeference
     found = None if placed is None else placed.scale_of_navigation_sigma
     return LENGTH_SCALE_SIGMA if found is None else found
+
+
+def preview_control(
+    control: Control,
+    points: Mapping[str, TriangulatedPoint],
+    lost: Mapping[str, str],
+    frame: WorldFrame,
+) -> dict[str, Any]:
+    """Residuals of control points and bars, before the model is placed again.
+
+    What navigation and soft modes take of a misfit shows in the next reconstruction only.
+
+    Args:
+        control: what is known.
+        points: where the model has its points.
+        lost: why it has not others.
+        frame: of the model.
+
+    Returns:
+        JSON values: `now`, where the model lies, and `fitted`, where the control points put it (a
+        shift, a rotation and a scale, fixed where a rig gave it), each as `sparse/control.json` or
+        None where there is no such placement, and `not_found` by name.
+    """
+    datum = frame.datum if frame.datum is not None else control.datum()
+    ties = tie_control(control, points, lost, datum)
+    still = Similarity(scale=1.0, rotation=Rotation.identity(), translation=np.zeros(3))
+    start, tied = ties.start(1.0 if frame.scaled else None), ties.ties or ties.bars
+    return {
+        "now": ties.score(still, located=frame.name == "ned").to_json() if tied else None,
+        "fitted": None if start is None else ties.score(start, located=True).to_json(),
+        "not_found": dict(ties.lost),
+    }
+
+
+_NUMBER = r"(-?\d+(?:\.\d+)?)"
+_PIXEL = re.compile(rf"(?P<image>[^=]+?):{_NUMBER},{_NUMBER}")
+_MAX_LOOKED_IN = 16
+"""Pictures in which a pick is looked for again, the best ones."""
+_KEPT = 32
+"""Pictures that are kept in memory."""
+_EXACT_PX = 1e-3
+"""Sigma of a pixel that is taken as it is, and least one of what the surface says."""
+
+
+def measure(
+    workspace: Path, points: str, *, pick_sigma_px: float = 0.0
+) -> tuple[str, dict[str, Any]]:
+    """Measure between picked pixels.
+
+    Args:
+        workspace: reconstructed.
+        points: two or more, with blanks between: `IMAGE:x,y`, which is found again in other
+            pictures, or `IMAGE:x,y=IMAGE:x,y` where two pictures show the point. Pixels count from
+            0 at the centre of the first, as viewers show them.
+        pick_sigma_px: standard deviation with which pixels were picked; where two pictures were
+            picked in by hand, 0 stands for the usual one.
+
+    Returns:
+        Text for the terminal, and figures: distances from point to point, their sum, and with
+        three or more points the closed polygon's area.
+
+    Raises:
+        ReconstructionError: the points cannot be read, or one is not found.
+        WorkspaceError: there is no model.
+    """
+    words = points.split()
+    marks = parse_picks(points, pick_sigma_px)
+    pictures = RegisteredPictures.read(workspace)
+    if not pictures.frame.scaled:
+        raise ReconstructionError("the model has no scale: lengths in it are not metres")
+    finder = _PickFinder(workspace, pictures)
+    picks = [finder.find(some) for some in marks]
+    lines: list[PolylineFigure] = [(partial(_segment, n), 1) for n in range(len(picks) - 1)]
+    if len(picks) > 2:
+        lines += [(polyline, 1), (polygon_area, 2)]
+    places, figures = Lengths(workspace, pictures).figures(picks, lines)
+    return _describe(words, places, figures)
+
+
+def scale_model(workspace: Path, points: str, length_m: float) -> str:
+    """Note the true distance between two picked points of a model in `scale.json`.
+
+    Args:
+        workspace: folder with a finished `sparse/`.
+        points: two of them, as `measure` takes points.
+        length_m: their true distance.
+
+    Returns:
+        What was found, in one line.
+
+    Raises:
+        ReconstructionError: the points cannot be understood or found, or the scale is known from
+            the rig already.
+    """
+    marks, words = parse_picks(points.replace("+", "=")), points.split()
+    if len(words) != 2:
+        raise ReconstructionError(f"--points needs two points, got {len(words)}: {points!r}")
+    pictures = RegisteredPictures.read(workspace)
+    finder, lengths = _PickFinder(workspace, pictures), Lengths(workspace, pictures)
+    first, second = (lengths.target(finder.find(some)).model for some in marks)
+    return note_scale(workspace, (words[0], words[1]), first, second, length_m)
+
+
+def parse_picks(points: str, sigma_px: float = 0.0) -> list[tuple[Pick, ...]]:
+    """Read points as `measure` takes them, each with its one or two picks.
+
+    Raises:
+        ReconstructionError: fewer than two, or one of another form.
+    """
+    found = []
+    for word in points.split():
+        parts = [_PIXEL.fullmatch(part) for part in word.split("=")]
+        matches = [match for match in parts if match is not None]
+        if len(matches) < len(parts) or len(parts) > 2:
+            raise ReconstructionError(f"point {word!r}: give IMAGE:x,y or IMAGE:x,y=IMAGE:x,y")
+        sigma = sigma_px or (PICK_SIGMA_PX if len(parts) == 2 else _EXACT_PX)
+        found.append(
+            tuple(
+                Pick(
+                    image=match["image"], point=word, x_px=float(match[2]) + 0.5,
+                    y_px=float(match[3]) + 0.5, sigma_px=sigma,
+                )
+                for match in matches
+            )
+        )  # fmt: skip
+    if len(found) < 2:
+        raise ReconstructionError(f"{len(found)} points; two or more are needed to measure")
+    return found
+
+
+class _PickFinder:
+    """Finds picks of one picture in the others of a workspace."""
+
+    def __init__(self, workspace: Path, pictures: RegisteredPictures) -> None:
+        self._pictures, self._images = pictures, workspace / "images"
+        self._surface = ModelSurface(workspace)
+        self._grey = lru_cache(_KEPT)(self._read)
+
+    def _read(self, image: str) -> Any:
+        return cv2.cvtColor(read_colour(self._images / image), cv2.COLOR_BGR2GRAY)
+
+    def find(self, picks: Sequence[Pick]) -> Sequence[Pick]:
+        """Two picks as they are; one with those that were found from it in other pictures.
+
+        Where nothing there looks like it, its ray is cut with the elevation model.
+
+        Raises:
+            ReconstructionError: one is outside of its picture, meets no known surface, or no other
+                picture shows it.
+        """
+        for pick in picks:
+            width, height = self._pictures.warp(pick.image).size_px
+            if not (0 <= pick.x_px <= width and 0 <= pick.y_px <= height):
+                raise ReconstructionError(f"{_text(pick)} is outside of its {width} x {height}")
+        if len(picks) > 1:
+            return picks
+        pick = picks[0]
+        place = self._surface.met_by(
+            *self._pictures.picture(pick.image).ray(np.array([pick.x_px, pick.y_px]))
+        )
+        seen = self._pictures.seeing(place.point, place.normal)[:_MAX_LOOKED_IN]
+        images = [one.image for one in seen if one.image != pick.image]
+        found = refine(pick, images, place, self._pictures.picture, self._grey)
+        if found.meeting is not None:
+            return found.picks
+        if images and self._surface.is_dense:
+            return pick, self._by_surface(pick, place, images[0])
+        why = f": {found.refused[0].why}" if found.refused else ""
+        raise ReconstructionError(
+            f"{_text(pick)} is not found in another picture{why}; pick another pixel, or the "
+            "point in two pictures as IMAGE:x,y=IMAGE:x,y"
+        )
+
+    def _by_surface(self, pick: Pick, place: SurfacePlace, image: str) -> Pick:
+        """Where another picture sees what the ray of a pick meets, as well as that is known."""
+        picture, near = self._pictures.picture(image), self._pictures.picture(pick.image)
+        seen = picture.project(place.point)
+        _, way = near.ray(np.array([pick.x_px, pick.y_px]))
+        along = place.sigma * way / abs(way @ place.normal)
+        sigma = float(np.linalg.norm(picture.project(place.point + along) - seen))
+        x, y = seen.tolist()
+        return replace(
+            pick, image=image, x_px=x, y_px=y, sigma_px=max(sigma, _EXACT_PX),
+            matched_to=pick.image,
+        )  # fmt: skip
+
+
+def _text(pick: Pick) -> str:
+    return f"{pick.image}:{pick.x_px - 0.5:g},{pick.y_px - 0.5:g}"
+
+
+def _segment(number: int, points: Array) -> float:
+    """Length of one segment of the line through points."""
+    return polyline(points[number : number + 2])
+
+
+def _describe(
+    words: Sequence[str], places: Array, figures: Sequence[PickedFigure]
+) -> tuple[str, dict[str, Any]]:
+    def entry(figure: PickedFigure, unit: str) -> dict[str, float]:
+        return {
+            f"value_{unit}": figure.value,
+            f"sigma_{unit}": figure.sigma,
+            f"sigma_of_pixels_{unit}": figure.sigma_picks,
+            f"sigma_of_poses_{unit}": figure.sigma_poses,
+            f"sigma_of_calibration_{unit}": figure.sigma_scale,
+        }
+
+    count = len(words) - 1
+    segments = [
+        {"from": words[n], "to": words[n + 1], **entry(figures[n], "m")} for n in range(count)
+    ]
+    lines = [
+        f"{words[n]} to {words[n + 1]}: {_millimetres(figures[n])} "
+        f"({1e3 * figures[n].sigma_picks:.2f} of pixels, {1e3 * figures[n].sigma_poses:.2f} of "
+        f"poses, {1e3 * figures[n].sigma_scale:.2f} of calibration)"
+        for n in range(count)
+    ]
+    data: dict[str, Any] = {
+        "format": "alice-survey measure",
+        "version": 2,
+        "points": [
+            {"pixel": word, "east_m": float(east), "north_m": float(north), "up_m": -float(down)}
+            for word, (north, east, down) in zip(words, places, strict=True)
+        ],
+        "distances": segments,
+    }
+    if count > 1:
+        length, area = figures[-2:]
+        data["length"], data["area"] = entry(length, "m"), entry(area, "m2")
+        lines.append(f"length of the line: {_millimetres(length)}")
+        lines.append(
+            f"area of the polygon: {1e4 * area.value:.3f} cm2, sigma {1e4 * area.sigma:.3f} cm2"
+        )
+    return "\n".join(lines), data
+
+
+def _millimetres(length: PickedFigure) -> str:
+    return f"{1e3 * length.value:.2f} mm, sigma {1e3 * length.sigma:.2f} mm"

@@ -264,12 +264,12 @@ class ReconstructCommand(DeviceCommand):
             changes = {"reconstruct": {"planes": self.plane}}
             text, values = run(self.stages(), self.workspace, self.survey, executor, changes)
             if self.export is not None:
-                from reconstruct.export.undistorted import export_undistorted
+                from reconstruct.export import export_undistorted
 
                 more, values[self.export] = export_undistorted(self.workspace, executor)
                 text = f"{text}\n{more}"
         if self.crs is not None:
-            from reconstruct.export.projected import export_projected
+            from reconstruct.export import export_projected
 
             more, values["crs"] = export_projected(self.workspace, self.crs)
             text = f"{text}\n{more}"
@@ -315,7 +315,7 @@ class MeasureCommand(WorkspaceCommand, ReportCommand):
                 self.workspace, self.polygons, label=self.label, pick_sigma_px=self.pick_sigma,
                 output=self.output,
             )  # fmt: skip
-        from reconstruct.picking.measure import measure
+        from reconstruct.picking.lengths import measure
 
         return measure(self.workspace, self.points or "", pick_sigma_px=self.pick_sigma)
 
@@ -350,7 +350,7 @@ class ControlCommand(WorkspaceCommand, ThreadsCommand, ReportCommand):
 
     def run(self) -> Result:
         """Do either."""
-        from reconstruct.picking.measure import scale_model
+        from reconstruct.picking.lengths import scale_model
         from reconstruct.placing.control_command import survey_control
 
         if self.points is None and self.length is None:

@@ -13,7 +13,7 @@ import pytest
 import rasterio
 
 from reconstruct.elevation import elevation_in
-from reconstruct.export.projected import export_projected
+from reconstruct.export import export_projected
 from reconstruct.views.model import read_frame
 
 CRS = "EPSG:32636"

@@ -11,7 +11,7 @@ import pytest
 
 from alice_survey.core.executor import SERIAL
 from reconstruct.evaluate.surface import read_mesh
-from reconstruct.export.undistorted import bilinear, export_undistorted
+from reconstruct.export import bilinear, export_undistorted
 from reconstruct.views.model import View, read_model, read_warps
 
 
@@ -48,7 +48,7 @@ def test_the_colmap_model_projects_to_where_the_exact_rays_land(workspace: Path)
     warps = read_warps(workspace / "sparse" / "cameras.json")
     exported = pycolmap.Reconstruction(workspace / "undistorted" / "sparse" / "0")
     images = {image.name: image for image in exported.images.values()}
-    from reconstruct.export import undistorted
+    from reconstruct import export
     from reconstruct.pictures.undistorted import Pictures
 
     for view in (model.views[0], model.views[-1]):
@@ -56,9 +56,9 @@ def test_the_colmap_model_projects_to_where_the_exact_rays_land(workspace: Path)
         at = np.array([images[view.image].project_point(p) for p in points])
         warp = warps[view.camera]
         exact = warp.camera.project(warp.pinhole_from_cam.inv().apply(local))
-        scene = undistorted.scene_of(workspace / "mesh")
-        depth = undistorted.surface_depth(view, *scene)
-        maps = undistorted.taken_at(Pictures.open(workspace), view, depth)
+        scene = export.scene_of(workspace / "mesh")
+        depth = export.surface_depth(view, *scene)
+        maps = export.taken_at(Pictures.open(workspace), view, depth)
         found = 0.5 + np.stack(
             [bilinear(one, at[:, 0] - 0.5, at[:, 1] - 0.5) for one in maps], axis=1
         )

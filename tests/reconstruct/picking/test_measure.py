@@ -12,7 +12,7 @@ from alice_survey.core.errors import ImageError, ReconstructionError
 from camera_calib.freedom import POSE
 from camera_calib.rig import Covariance, Rig, write_rig
 from reconstruct.measure.figures import polygon_area, polyline
-from reconstruct.picking.measure import measure, parse_picks
+from reconstruct.picking.lengths import measure, parse_picks
 from reconstruct.pictures.importing import import_images
 from tests.oracles_mesh import SIZE, port_rig, station_pictures, surface_points
 

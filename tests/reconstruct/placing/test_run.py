@@ -17,7 +17,7 @@ from alice_survey.core.config import ReconstructConfig, SurveyConfig
 from alice_survey.core.errors import AliceError, ReconstructionError
 from alice_survey.core.executor import SERIAL, Executor, local_executor
 from alice_survey.core.manifest import read_manifest, write_manifest
-from reconstruct.picking.measure import scale_model
+from reconstruct.picking.lengths import scale_model
 from reconstruct.pictures.importing import import_images
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.placing.control_command import import_control

@@ -19,9 +19,8 @@ from alice_survey.core.errors import AliceError, ReconstructionError, WorkspaceE
 from alice_survey.core.frames import Array
 from alice_survey.core.manifest import ImageRecord, read_manifest
 from alice_survey.core.records import ControlRecord, MappingRecord
-from reconstruct.picking.lengths import Lengths, point_residuals
+from reconstruct.picking.lengths import Lengths, point_residuals, preview_control
 from reconstruct.picking.matching import refine
-from reconstruct.picking.preview import preview_control
 from reconstruct.picking.registered import RegisteredPictures, Sight
 from reconstruct.picking.surface import ModelSurface, SurfacePlace
 from reconstruct.pictures.undistorted import Colour, read_colour

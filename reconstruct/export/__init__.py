@@ -1,1 +1,0 @@
-"""Roads out: the model and its pictures as other programs take them."""
