@@ -24,9 +24,15 @@ from alice_survey.core.frames import Array
 from reconstruct.pictures.files import VIDEO, PictureFacts, natural_key, safe_name, to_utc
 from reconstruct.pictures.incoming import Incoming
 from reconstruct.pictures.quality import sharpness
+from reconstruct.pictures.telemetry import Fixes, read_fixes
 
-_CHAPTER = re.compile(r"(?P<kind>G[HLX])(?P<chapter>\d\d)(?P<number>\d{4})", re.I)
+_CHAPTER = re.compile(r"(?:(?P<kind>G[HLXP])(?P<chapter>\d\d)|GOPR)(?P<number>\d{4})", re.I)
+"""Names of a GoPro's videos; until the HERO5 `GOPR0042`, `GP010042`, `GP020042` ..."""
+_OLD = "GP"
 _PREVIEW = ".lrv"
+_CLOCK_NEVER_SET = timedelta(days=1)
+"""A date so soon after a new year's midnight, of years before, is that of a clock without power."""
+_STARTS_OF_CLOCKS = range(2000, 2020)
 _MP4_EPOCH = datetime(1904, 1, 1, tzinfo=UTC)
 _YEARS = range(2000, 2200)
 """Years in which a digital camera can have made a video."""
@@ -43,6 +49,8 @@ class VideoFile:
     size: tuple[int, int]
     """Width and height of its frames."""
     duration_s: float
+    fixes: Fixes
+    """Of the GPS in the video."""
     start_s: float = 0.0
     """Since the start of the recording."""
 
@@ -69,6 +77,11 @@ class Recording:
     def duration_s(self) -> float:
         """From its start to the end of its last file."""
         return self.files[-1].start_s + self.files[-1].duration_s
+
+    def place_at(self, time_s: float) -> tuple[float, float, float] | None:
+        """Latitude, longitude and altitude at a time of the recording, if its GPS had a fix."""
+        places = (file.fixes.at(time_s - file.start_s) for file in self.files)
+        return next((place for place in places if place is not None), None)
 
 
 def find_videos(places: Sequence[Path]) -> list[Path]:
@@ -110,9 +123,12 @@ def read_recordings(paths: Sequence[Path], zone: tzinfo) -> list[Recording]:
     groups: dict[tuple[Path, str], dict[int, Path]] = {}
     for path in paths:
         named = _CHAPTER.fullmatch(path.stem)
-        name = path.name if named is None else (named["kind"] + named["number"]).upper()
+        name, chapter = path.name, 0
+        if named is not None:
+            name = ((named["kind"] or _OLD) + named["number"]).upper()
+            chapter = int(named["chapter"] or 0)
         chapters = groups.setdefault((path.parent, name), {})
-        if chapters.setdefault(0 if named is None else int(named["chapter"]), path) != path:
+        if chapters.setdefault(chapter, path) != path:
             raise ImageError(f"{path}: this chapter of its recording is given twice")
     found = [_recording(dict(sorted(chapters.items()))) for chapters in groups.values()]
     starts = [to_utc(r.start, zone) for r in found if r.start is not None]
@@ -138,7 +154,8 @@ def _recording(chapters: dict[int, Path]) -> Recording:
                 f"of the same recording {first.size[0]} x {first.size[1]}: import them apart"
             )
     longest_s = max(file.duration_s for file in files.values())
-    lost = [str(chapter) for chapter in range(1, max(files)) if chapter not in files]
+    old = first.path.name.upper().startswith(("GOPR", _OLD))
+    lost = [str(chapter) for chapter in range(0 if old else 1, max(files)) if chapter not in files]
     if lost:
         warn(
             f"chapters {', '.join(lost)} of the recording are missing: its times count from the "
@@ -150,8 +167,17 @@ def _recording(chapters: dict[int, Path]) -> Recording:
         if chapter in files:
             placed.append(replace(files[chapter], start_s=start_s))
         start_s += files[chapter].duration_s if chapter in files else longest_s
-    start, clock = video_start(first.path)
+    start, clock = _began(placed)
     return Recording(name=first.path.stem, files=tuple(placed), start=start, clock=clock)
+
+
+def _began(files: Sequence[VideoFile]) -> tuple[datetime | None, str]:
+    """When a recording began, and by what: GPS, else the container of its first file."""
+    for file in files:
+        start = file.fixes.start_utc()
+        if start is not None:
+            return start - timedelta(seconds=file.start_s), "GPS in the video"
+    return video_start(files[0].path)
 
 
 def video_start(path: Path) -> tuple[datetime | None, str]:
@@ -174,6 +200,13 @@ def video_start(path: Path) -> tuple[datetime | None, str]:
         return None, "unknown"
     (seconds,) = struct.unpack_from(form, index, at + 4)
     if seconds > 1 << 34 or (made := _MP4_EPOCH + timedelta(seconds=seconds)).year not in _YEARS:
+        return None, "unknown"
+    midnight = made.replace(month=1, day=1, hour=0, minute=0, second=0)
+    if made - midnight < _CLOCK_NEVER_SET and made.year in _STARTS_OF_CLOCKS:
+        warn(
+            f"{path}: its date {made:%Y-%m-%d %H:%M:%S} is that of a clock that was never set: its "
+            "time is taken as unknown"
+        )
         return None, "unknown"
     if b"GoPro" in index:
         return made.replace(tzinfo=None), "the camera's local time, in the video"
@@ -234,7 +267,9 @@ def _open(path: Path) -> VideoFile:
         width, height = (int(capture.get(side)) for side in size)
     finally:
         capture.release()
-    return VideoFile(path=path, size=(width, height), duration_s=count / rate if rate else 0.0)
+    duration_s = count / rate if rate else 0.0
+    fixes = read_fixes(path, duration_s)
+    return VideoFile(path=path, size=(width, height), duration_s=duration_s, fixes=fixes)
 
 
 Grey = NDArray[np.uint8]
@@ -565,6 +600,9 @@ def _entry(recording: Recording, camera: str, frame: Frame, image: str, station:
         path=source, width_px=frame.pixels.shape[1], height_px=frame.pixels.shape[0],
         time_local=None if start is None else start + timedelta(seconds=frame.time_s),
     )  # fmt: skip
+    if (place := recording.place_at(frame.time_s)) is not None:
+        latitude, longitude, altitude = place
+        facts = replace(facts, latitude_deg=latitude, longitude_deg=longitude, altitude_m=altitude)
     return Incoming(
         source=source.with_name(Path(image).name), camera=camera, station=station, facts=facts,
         image=image, video_time_s=recording.start_s + frame.time_s, recording=recording.name,

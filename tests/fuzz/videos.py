@@ -1,4 +1,4 @@
-"""Videos of cameras: the index of an MP4, and tags of pictures."""
+"""Videos of cameras: the index of an MP4, telemetry in it, and tags of pictures."""
 
 from datetime import UTC, datetime
 from pathlib import Path
@@ -10,19 +10,22 @@ from tests.fuzz.target import Target
 from tests.reconstruct.pictures import gopro
 
 _WHEN = datetime(2024, 7, 1, 12, tzinfo=UTC)
+_PLACES = [(60.0, 5.0, 1.0)] * 3
 
 
-def _film(folder: Path) -> None:
+def _film(folder: Path, payload: bytes) -> None:
     """A short film of a GoPro."""
     frames = [np.full((16, 16, 3), level, np.uint8) for level in range(3)]
-    gopro.film(folder / "GX010042.MP4", frames, 1.0, created=_WHEN)
+    gopro.film(folder / "GX010042.MP4", frames, 1.0, created=_WHEN, payloads=[payload] * 3)
 
 
 def read_video(path: Path) -> object:
     """As `import-images` does next to the decoder of its frames."""
+    from reconstruct.pictures.telemetry import read_fixes
     from reconstruct.pictures.videos import video_start
 
-    return video_start(path)
+    fixes = read_fixes(path, 3.0)
+    return video_start(path), fixes.start_utc(), fixes.at(0.5)
 
 
 def _turned(folder: Path, name: str) -> None:
@@ -39,7 +42,14 @@ def take_orientation_off(path: Path) -> object:
 
 TARGETS = (
     Target(
-        name="MP4", syntax="binary", file="GX010042.MP4", build=_film, read=read_video, examples=60,
+        name="MP4 with GPS5", syntax="binary", file="GX010042.MP4",
+        build=lambda folder: _film(folder, gopro.gps5(_PLACES, _WHEN)), read=read_video,
+        examples=60,
+    ),
+    Target(
+        name="MP4 with GPS9", syntax="binary", file="GX010042.MP4",
+        build=lambda folder: _film(folder, gopro.gps9(_PLACES, _WHEN)), read=read_video,
+        examples=60,
     ),
     Target(
         name="JPEG with an orientation", syntax="binary", file="a.jpg",

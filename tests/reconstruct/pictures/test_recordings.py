@@ -1,4 +1,4 @@
-"""Chapters and times of videos, written after the public specifications."""
+"""Chapters, times and places of videos, written after the public specifications."""
 
 import struct
 from datetime import UTC, datetime, timedelta
@@ -12,6 +12,7 @@ from alice_survey.core.artefacts import read_json
 from alice_survey.core.errors import ImageError, keep_warnings
 from alice_survey.core.manifest import read_manifest
 from reconstruct.pictures.importing import import_images
+from reconstruct.pictures.telemetry import read_fixes
 from reconstruct.pictures.videos import find_videos, read_recordings, video_start
 from tests.reconstruct.pictures import gopro
 from tests.reconstruct.pictures.dated import counts
@@ -26,8 +27,14 @@ def levels(first: int, count: int, size: tuple[int, int] = (64, 48)) -> list[np.
     return [np.full((size[1], size[0], 3), 3 * i, np.uint8) for i in range(first, first + count)]
 
 
-def test_chapters_of_a_recording_run_on(tmp_path: Path) -> None:
-    names = ("GX010042.MP4", "gx020042.mp4", "GX030042.MP4")
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("GX010042.MP4", "GX020042.MP4", "GX030042.MP4"),
+        ("GOPR0042.MP4", "GP010042.MP4", "gp020042.mp4"),
+    ],
+)  # fmt: skip
+def test_chapters_of_a_recording_run_on(tmp_path: Path, names: tuple[str, ...]) -> None:
     paths = [
         gopro.film(tmp_path / name, levels(20 * i, 20), RATE_HZ, created=NOON)
         for i, name in enumerate(names)
@@ -147,3 +154,53 @@ def test_frames_come_as_they_are_stored(tmp_path: Path) -> None:
     assert counts(found) == {"camera": 2}
     record = read_json(tmp_path / "w" / "images" / "imported.json")["cameras"]["camera"]
     assert (record["width_px"], record["height_px"]) == (64, 48)
+
+
+def test_a_clock_that_was_never_set_states_no_time(tmp_path: Path) -> None:
+    reset = datetime(2016, 1, 1, 0, 42, tzinfo=UTC)
+    path = gopro.film(tmp_path / "GX010001.MP4", levels(0, 20), RATE_HZ, created=reset)
+    with keep_warnings() as warnings:
+        (recording,) = read_recordings([path], UTC)
+    assert recording.start is None and "never set" in warnings[0]
+
+
+@pytest.mark.parametrize("telemetry", [gopro.gps5, gopro.gps9])
+def test_gps_of_a_gopro_gives_time_and_place(tmp_path: Path, telemetry: object) -> None:
+    """A diver swims 18e-5 deg to the north in 2 s at the surface, then dives: no fix."""
+    began = NOON + timedelta(seconds=0.5)
+    data = []
+    for second in range(4):
+        places = [(60.0 + (18 * second + i) * 5e-6, -5.25, 0.5) for i in range(18)]
+        when = began + timedelta(seconds=second)
+        data.append(telemetry(places, when, fix=3 if second < 2 else 0))  # type: ignore[operator]
+    path = gopro.film(
+        tmp_path / "GX010042.MP4", levels(0, 40), RATE_HZ, payloads=data,
+        created=NOON - timedelta(days=300),
+    )  # fmt: skip
+    found = import_images(tmp_path / "w", [], videos=[path], every_s=0.5)
+    (recording,) = read_recordings([path], OSLO)
+    assert recording.start is not None
+    assert abs((recording.start - began).total_seconds()) < 2e-3
+    records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
+    known = [r for r in records if r.has_position]
+    assert [r.time_s for r in known] == pytest.approx(np.arange(6) * 0.5)
+    for r in known[:4]:
+        assert r.latitude_deg == pytest.approx(60.0 + 18 * 5e-6 * r.time_s, abs=2e-7)
+        assert (r.longitude_deg, r.depth_m) == pytest.approx((-5.25, -0.5), abs=1e-7)
+    assert found.positions == 6
+    assert any("GPS in the video" in line for line in found.lines)
+
+
+def test_telemetry_that_states_too_much_counts_as_none(tmp_path: Path) -> None:
+    good = gopro.gps5([(60.0, 5.0, 1.0)] * 3, NOON)
+    scale = good.index(b"SCAL")
+    for broken in (
+        good[: scale + 8] + b"\0" * 20 + good[scale + 28 :],  # divided by zero
+        good.replace(b"GPS5l", b"GPS5?"),
+        good.replace(b"GPS5l\x14\0\x03", b"GPS5l\x14\xff\xff"),
+        good[:30],
+    ):
+        path = gopro.film(tmp_path / "a.mp4", levels(0, 5), RATE_HZ, payloads=[broken])
+        assert len(read_fixes(path, 1.0).time_s) == 0
+    path = gopro.film(tmp_path / "a.mp4", levels(0, 5), RATE_HZ, payloads=[good])
+    assert len(read_fixes(path, 1.0).time_s) == 3
