@@ -79,7 +79,7 @@ PLAN = StageSpec(
     folder="plan",
     command="plan",
     about="lines, stations and camera settings that image the area",
-    version=8,
+    version=9,
     work="missions.plan.run:run_plan",
     takes=(WHOLE,),
     settings={
@@ -104,7 +104,7 @@ PLAN = StageSpec(
     simulated=True,
     products={
         "plan.json": "the plan, for the next stages",
-        "settings.txt": "every setting with its equation, source and limit",
+        "settings.txt": "every setting with its equation and limit",
         "exports": "the plan for vehicles",
     },
     picture="map.png",

@@ -109,7 +109,7 @@ def plan_report(
     every_setting: bool = False,
     vehicle: str | None = None,
 ) -> tuple[str, dict[str, Any]]:
-    """Plan a survey, and show its main settings; or every one with its equation and source.
+    """Plan a survey, and show its main settings; or every one with its equation and limit.
 
     A vehicle by name or file counts for this plan instead of the survey's.
 

@@ -17,7 +17,6 @@ from alice_survey.core.artefacts import read_csv
 from alice_survey.core.contents import as_line
 from alice_survey.core.errors import NavigationError, warn
 from alice_survey.core.frames import Array, rotation_from_attitude
-from alice_survey.core.manifest import read_manifest
 from alice_survey.core.trajectory import read_track
 from camera_calib.rig import Rig
 from missions.coverage.stations import MAX_ALTITUDES, Stations
@@ -89,7 +88,7 @@ class DiveRecord:
 
 
 def read_dive_record(
-    log: Path, plan: Plan, rig: Rig, *, triggers: Path | None = None, manifest: Path | None = None
+    log: Path, plan: Plan, rig: Rig, *, triggers: Path | None = None
 ) -> DiveRecord:
     """Where the pictures of a dive were taken.
 
@@ -98,18 +97,13 @@ def read_dive_record(
         plan: what was to be flown.
         rig: the cameras.
         triggers: CSV with `time_s` of each station's pictures, and `line` where it is known.
-        manifest: `images/manifest.csv` in place of triggers.
 
     Raises:
         NavigationError: the log or the triggers cannot be used, or are of another place or time.
     """
-    if triggers is not None and manifest is not None:
-        raise NavigationError("give triggers or a manifest, not both")
     if log.is_dir():
         return _record_of_flight(log, plan, rig, triggers)
     nav = _rows_with_positions(log, read_navigation(log, find_zone("UTC"), ()))
-    if manifest is not None:
-        return _record_of(log, nav, _triggers_of_manifest(manifest, rig), plan, rig)
     if triggers is not None:
         return _record_of(log, nav, read_triggers(triggers, nav), plan, rig)
     return record_of_log(log, nav, plan, rig)
@@ -220,26 +214,6 @@ def _line_number(cell: str) -> int:
     if abs(number) > _MAX_TRIGGERS:
         raise ValueError(f"line is {cell:.60}")
     return number
-
-
-def _triggers_of_manifest(path: Path, rig: Rig) -> Triggers:
-    """When each station's pictures were taken, of stations with a picture of every camera."""
-    taken: dict[int, dict[str, float]] = {}
-    for record in read_manifest(path):
-        taken.setdefault(record.station, {})[record.camera] = record.time_s
-    whole = [times for times in taken.values() if set(rig.cameras) <= set(times)]
-    if not whole:
-        raise NavigationError(
-            f"{path}: no station has a picture of each of {', '.join(rig.cameras)}"
-        )
-    if len(whole) < len(taken):
-        lacking = len(taken) - len(whole)
-        they = "station lacks" if lacking == 1 else "stations lack"
-        warn(f"{path}: {lacking} {they} a camera: left out")
-    times = np.array([float(np.mean(list(times.values()))) for times in whole])
-    if np.isnan(times).any():
-        raise NavigationError(f"{path}: {int(np.isnan(times).sum())} stations have no time_s")
-    return Triggers(source=str(path), time_s=np.unique(times), line=None)
 
 
 def _record_of_flight(folder: Path, plan: Plan, rig: Rig, triggers: Path | None) -> DiveRecord:

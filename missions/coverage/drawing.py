@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from shapely.geometry import MultiPolygon
 
-from alice_survey.core.frames import Array, Datum
+from alice_survey.core.frames import Datum
 from alice_survey.core.run import progress
 from alice_survey.kit.figure import (
     Axes,
@@ -30,14 +29,13 @@ from alice_survey.kit.words import share
 from missions.coverage.certificate import Certificate
 from missions.coverage.geofiles import NO_DATA, sample_counts
 from missions.coverage.holes import Hole
-from missions.coverage.raster import Grid
+from missions.coverage.raster import north_up
 from missions.coverage.stations import Stations
 from missions.values.area import Area
 
 _AREA, _HOLE, _TRACK = "#17202a", "#c0392b", "#17202a"
 _NONE = "#f5b7b1"
 _SEEN = LinearSegmentedColormap.from_list("seen", ["#d6eaf8", "#5dade2", "#1f618d", "#0b2239"])
-_RISK = LinearSegmentedColormap.from_list("risk", ["#e8f8f5", "#f7dc6f", "#e67e22", "#78281f"])
 _MAX_PX = 1400
 _NUMBERED = 12
 _WIDTH_IN, _MIN_WIDTH_IN, _AROUND_IN = 9.0, 6.6, (1.5, 1.7)
@@ -148,9 +146,11 @@ def draw_counts(axes: Axes, certificate: Certificate, opacity: float = 1.0) -> N
     steps = np.arange(1, maximum + 2 * width, width)
     colours = [_NONE, *(_SEEN(i / max(len(steps) - 2, 1)) for i in range(len(steps) - 1))]
     colour_map = ListedColormap(colours).with_extremes(bad=(0, 0, 0, 0), over=colours[-1])
-    image, extent = _north_up(certificate, certificate.pictures)
+    pixel_m = certificate.grid.cell_m / 2
+    places, (south, west, north, east) = north_up(certificate.area, pixel_m, _MAX_PX)
+    image = np.ma.masked_equal(sample_counts(certificate, certificate.pictures, places), NO_DATA)
     drawn = axes.imshow(
-        image, extent=extent, origin="lower", cmap=colour_map, interpolation="nearest",
+        image, extent=(west, east, south, north), cmap=colour_map, interpolation="nearest",
         norm=BoundaryNorm([0, *steps], len(colours)), alpha=opacity, zorder=0.6,
     )  # fmt: skip
     ticks = [0.5, *(steps[:-1] + steps[1:]) / 2]
@@ -170,37 +170,6 @@ def draw_polygons(axes: Axes, shape: MultiPolygon, label: str, **style: Any) -> 
         whole = Outline.make_compound_path(*rings)
         given = {"facecolor": "none", "zorder": 4, "label": label or "_nolegend_"} | style
         axes.add_patch(PathPatch(whole, **given))
-
-
-def _north_up(
-    certificate: Certificate, values: NDArray[np.uint16]
-) -> tuple[Any, tuple[float, float, float, float]]:
-    """Counts on a grid with north up, masked outside of the area, and its extent for imshow."""
-    places, extent = _pixels(certificate.area, certificate.grid.cell_m)
-    found = sample_counts(certificate, values, places)
-    return np.ma.masked_equal(found, NO_DATA), extent
-
-
-def _resample(
-    area: Area, grid: Grid, values: Array
-) -> tuple[Any, tuple[float, float, float, float]]:
-    places, extent = _pixels(area, grid.cell_m)
-    return np.ma.masked_invalid(grid.sample(values, places, math.nan)), extent
-
-
-def _pixels(area: Area, cell_m: float) -> tuple[Array, tuple[float, float, float, float]]:
-    """Middles of pixels, (rows, columns, 2), from the south-west corner of an area."""
-    south, west, north, east = area.survey.bounds
-    pixel_m = max(cell_m / 2, max(north - south, east - west) / _MAX_PX)
-    rows, columns = (
-        max(1, math.ceil((high - low) / pixel_m)) for low, high in ((south, north), (west, east))
-    )
-    at = np.meshgrid(
-        south + pixel_m * (np.arange(rows) + 0.5), west + pixel_m * (np.arange(columns) + 0.5),
-        indexing="ij",
-    )  # fmt: skip
-    extent = (west, west + pixel_m * columns, south, south + pixel_m * rows)
-    return np.stack(at, axis=-1), extent
 
 
 def number_place(axes: Axes, place_ne: tuple[float, float], number: int, colour: str) -> None:

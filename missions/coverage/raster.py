@@ -109,6 +109,30 @@ def grid_over(area: Area, cell_m: float) -> Grid:
     )
 
 
+def north_up(
+    area: Area, pixel_m: float, max_px: int
+) -> tuple[Array, tuple[float, float, float, float]]:
+    """Pixels of a picture of the survey area with north up.
+
+    Args:
+        area: it.
+        pixel_m: side of a pixel, if no side of the picture has more than `max_px` of them.
+        max_px: on the longer side.
+
+    Returns:
+        Their middles, (rows, columns, 2), and south, west, north and east of the picture.
+    """
+    south, west, north, east = area.survey.bounds  # x is north
+    pixel_m = max(pixel_m, max(north - south, east - west) / max_px)
+    rows, columns = (max(1, math.ceil(m / pixel_m - 1e-6)) for m in (north - south, east - west))
+    places = np.meshgrid(
+        north - pixel_m * (np.arange(rows) + 0.5), west + pixel_m * (np.arange(columns) + 0.5),
+        indexing="ij",
+    )  # fmt: skip
+    bounds = (north - rows * pixel_m, west, north, west + columns * pixel_m)
+    return np.stack(places, axis=-1), bounds
+
+
 def inside(area: Area, grid: Grid) -> NDArray[np.bool_]:
     """Which middles of cells, (rows, columns), lie in the survey area."""
     survey = shapely.transform(area.survey, grid.cells_of)

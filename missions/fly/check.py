@@ -60,7 +60,6 @@ def check_log(
     log: Path,
     *,
     triggers: Path | None = None,
-    manifest: Path | None = None,
     executor: Executor = SERIAL,
 ) -> Check:
     """Certify a dive by its log.
@@ -70,7 +69,6 @@ def check_log(
         rig: the cameras in the survey's water.
         log: navigation CSV, or the folder of a simulated flight.
         triggers: CSV with the times of the pictures.
-        manifest: `images/manifest.csv` in its place.
         executor: where tasks run, of a large area.
 
     Raises:
@@ -78,7 +76,7 @@ def check_log(
         NavigationError: the log or the triggers cannot be used.
     """
     plan = read_plan(need_stage(workspace, "plan", "plan") / "plan.json")
-    record = read_dive_record(log, plan, rig, triggers=triggers, manifest=manifest)
+    record = read_dive_record(log, plan, rig, triggers=triggers)
     pattern = plan_pattern(plan, rig)
     planned = certificate(plan.area, rig, stations_of_plan(plan), pattern, executor=executor)
     flown = certificate(
@@ -136,7 +134,6 @@ def check_report(
     log: Path | None = None,
     *,
     triggers: Path | None = None,
-    manifest: Path | None = None,
     out: Path | None = None,
     executor: Executor | None = None,
 ) -> tuple[str, dict[str, Any]]:
@@ -150,7 +147,6 @@ def check_report(
         config: the survey.
         log: navigation CSV or folder of a simulated flight; left out, the workspace's flight.
         triggers: as of `check_log`.
-        manifest: as of `check_log`.
         out: folder to write; left out, `check` in the workspace.
         executor: where tasks run; all cores of this machine when left out.
 
@@ -163,7 +159,7 @@ def check_report(
     executor = executor or local_executor()
     path = need_stage(workspace, "flight", "fly") if log is None else log
     rig = rig_of(workspace, config.camera, config.water)
-    check = check_log(workspace, rig, path, triggers=triggers, manifest=manifest, executor=executor)
+    check = check_log(workspace, rig, path, triggers=triggers, executor=executor)
     folder = workspace / "check" if out is None else out
     refuse_links(workspace, folder)
     if not check.holes and (folder / "refly").exists():

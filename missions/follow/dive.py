@@ -31,6 +31,7 @@ from missions.coverage.dive_record import (
     record_of_log,
 )
 from missions.coverage.holes import Hole, find_holes
+from missions.coverage.raster import north_up
 from missions.coverage.stations import (
     Stations,
     at_once,
@@ -357,16 +358,7 @@ class FollowedDive:
     @cached_property
     def _frame(self) -> tuple[Array, tuple[float, float, float, float]]:
         """Places, (H, W, 2), of pixels of the coverage, and south, west, north, east, metres."""
-        south, west, north, east = self.plan.area.survey.bounds  # x is north
-        pixel_m = max(self._planned.grid.cell_m, max(north - south, east - west) / _MAX_SIDE_PX)
-        rows, columns = math.ceil((north - south) / pixel_m), math.ceil((east - west) / pixel_m)
-        north_m, east_m = np.meshgrid(
-            north - (np.arange(rows) + 0.5) * pixel_m,
-            west + (np.arange(columns) + 0.5) * pixel_m,
-            indexing="ij",
-        )
-        bounds = (north - rows * pixel_m, west, north, west + columns * pixel_m)
-        return np.stack([north_m, east_m], axis=-1), bounds
+        return north_up(self.plan.area, self._planned.grid.cell_m, _MAX_SIDE_PX)
 
     def coverage_classes(self) -> NDArray[np.uint8]:
         """What is seen so far, north up: (H, W) bits."""

@@ -79,7 +79,7 @@ class Planned:
     totals: dict[str, float]
     """Main figures by name, as tables and pages show them."""
     rows: tuple[Setting, ...]
-    """Every setting with its equation, source and limit."""
+    """Every setting with its equation and limit."""
 
 
 def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None) -> Planned:

@@ -6,7 +6,6 @@ are then estimates, and `certificate.estimated` says so.
 """
 
 import base64
-import io
 import math
 import time
 from collections.abc import Mapping
@@ -14,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
@@ -21,7 +21,6 @@ from pydantic import ValidationError
 from alice_survey.core.artefacts import atomic_path
 from alice_survey.core.config import (
     AreaConfig,
-    PlanConfig,
     SurveyConfig,
     checked_settings,
     parse_settings,
@@ -36,18 +35,18 @@ from missions.areas.bathymetry import Bathymetry
 from missions.areas.drawn import DrawnShapes, area_settings
 from missions.coverage.certificate import Certificate
 from missions.coverage.holes import find_holes
+from missions.coverage.raster import north_up
 from missions.exports.geometry import dive_of_line, footprint_outline, rings_ne, route_ne
 from missions.exposure.conflict import ConflictError
 from missions.plan.planner import Planned, plan_survey
 from missions.plan.run import station_times_s
-from missions.plan.strength import turn_rate_deg_s
 from missions.values.costs import Costs, leg_costs
 from missions.values.plan_file import Dive, Plan
 
 MAX_CELLS = 400_000
 """Cells of the certificate of a large area."""
-_MAX_PICTURE_CELLS = 420
-"""Most cells on a side of the picture of counts."""
+_MAX_PICTURE_PX = 840
+"""Most pixels on a side of the picture of counts."""
 _MAX_COUNT = 254
 """Highest number of pictures in the picture of counts, where 255 is outside of the area."""
 _MAX_HOLES = 60
@@ -55,8 +54,6 @@ _PROFILE_POINTS = 600
 _DETAIL = 1 / 5000
 """Of the plan's width: what a way may lie off its drawing."""
 _FINEST_M = 0.005
-_BINDS = 0.01
-"""A limit binds what is within this share of it."""
 _TURN_RAD = 0.2
 """Angle of an arc from place to place of a playback."""
 
@@ -204,7 +201,7 @@ def preview(config: SurveyConfig) -> dict[str, Any]:
         with collected_by(lambda _, __: None):
             rig = design_rig(config.camera, config.water)
             planned = plan_survey(config, rig, max_cells=MAX_CELLS)
-            found = _plan_json(planned, rig, config.plan)
+            found = _plan_json(planned, rig)
     except AliceError as error:
         found = refusal_json(error)
     return {**found, "cpu_s": round(time.thread_time() - began, 3)}
@@ -220,7 +217,7 @@ def refusal_json(error: AliceError) -> dict[str, Any]:
     return {"ok": False, "error": " ".join(str(error).splitlines()), "suggestion": changes}
 
 
-def _plan_json(planned: Planned, rig: Rig, settings: PlanConfig) -> dict[str, Any]:
+def _plan_json(planned: Planned, rig: Rig) -> dict[str, Any]:
     plan, seen = planned.plan, planned.certificate
     dives = dive_of_line(plan)
     ends = np.array([(*line.start_ne_m, *line.end_ne_m) for line in plan.lines])
@@ -245,62 +242,19 @@ def _plan_json(planned: Planned, rig: Rig, settings: PlanConfig) -> dict[str, An
             )
         },
         "outline": np.round(footprint_outline(plan, rig), 4).tolist(),
-        "counts": counts_data(seen),
+        "counts": _counts_json(seen),
         "certificate": {
             "cell_m": seen.grid.cell_m,
             "estimated": seen.estimated,
         },
         "holes": _holes(seen),
         "profile": _profile(plan, planned.bathymetry),
-        "limits": _limits(planned, settings),
         "rows": [
             [row.name, row.text, "; ".join(filter(None, (row.bound_by, row.note)))]
             for row in planned.rows
         ],
         "warnings": list(planned.warnings),
     }  # fmt: skip
-
-
-def _limits(planned: Planned, settings: PlanConfig) -> list[dict[str, Any]]:
-    """The limits of the plan: which keep it from being better, and how far off the others are."""
-    plan, imaging, totals = planned.plan, planned.imaging, planned.totals
-    dive_s = max(dive.duration_s for dive in plan.dives)
-    clearance_m = settings.altitude_m - settings.relief_m
-    rows: list[tuple[str, float, float | None, str, str]] = [
-        ("battery", totals["longest_dive_wh"], totals["usable_wh"], "Wh",
-         "energy of the longest dive, of what the battery has above its reserve"),
-        ("plan.dive_s", dive_s, settings.dive_s, "s", "time of the longest dive"),
-        ("camera.shortest_interval_s", 1 / imaging.interval_s, 1 / imaging.shortest_interval_s,
-         "Hz", "pictures a second, of the most that cameras and trigger take"),
-        ("plan.allowed_blur_px", imaging.blur_px, settings.allowed_blur_px, "px",
-         "motion blur: it sets how long pictures are exposed"),
-        ("plan.sharp_px", imaging.focus.blur_px, settings.sharp_px, "px",
-         "blur out of focus at the ends of the relief"),
-        ("light", imaging.light.needed_light, 1.0, "",
-         "light that is needed, as a share of what strobes and water give"),
-        ("plan.least_clearance_m", settings.least_clearance_m, clearance_m, "m",
-         "clearance requested, of the height above the top of the relief"),
-        ("stereo swath", plan.line_spacing_m,
-         imaging.footprints.mean.stereo_across_m, "m",
-         "distance between lines, of the width that all cameras see"),
-        ("plan.turn_rate_limit_deg_s", turn_rate_deg_s(settings),
-         settings.turn_rate_limit_deg_s, "deg/s", "rate of turn in arcs"),
-        ("strobe duty", imaging.strobe.duty, imaging.strobe.duty_limit, "",
-         "share of the time that LEDs are lit, of what they bear in warm water"),
-        ("one cable", 1.0 / imaging.interval_s, imaging.storage.shared_link_hz, "Hz",
-         "triggers a second, of what one cable carries of all cameras"),
-    ]  # fmt: skip
-    return [
-        {
-            "name": name,
-            # A battery binds where it divides a survey.
-            "binds": len(plan.dives) > len(plan.homes_ne_m) if name == "battery"
-            else value >= limit * (1 - _BINDS),
-            "text": f"{about}: {value:.4g} of {limit:.4g} {unit}".rstrip(),
-        }
-        for name, value, limit, unit, about in rows
-        if limit is not None
-    ]  # fmt: skip
 
 
 def _holes(seen: Certificate) -> list[dict[str, Any]]:
@@ -347,61 +301,26 @@ def _round_points(points: Array) -> list[list[float]]:
 def counts_picture(seen: Certificate) -> tuple[NDArray[np.uint8], tuple[float, float], float]:
     """Counts with north up: red pictures, green lines, blue 1 at the requested overlap.
 
-    Cells become larger ones that show the worst of them.
-
     Returns:
         The (H, W, 3) picture, red 255 outside of the area; north and east of its upper left
         corner; and the side of a pixel, metres.
     """
     grid = seen.grid
-    block = max(1, math.ceil(max(grid.rows, grid.columns) / _MAX_PICTURE_CELLS))
-    inside = _blocks(seen.inside, block, fill=False)
-    pictures = np.where(inside, _blocks(seen.pictures, block, fill=0), 65535).min(axis=(1, 3))
-    lines = np.where(inside, _blocks(seen.least_lines, block, fill=0), 65535).min(axis=(1, 3))
-    met = (_blocks(seen.at_overlap, block, fill=True) | ~inside).all(axis=(1, 3))
-    within = inside.any(axis=(1, 3))
-    cells = np.zeros((*within.shape, 3), dtype=np.uint8)
-    cells[..., 0] = np.where(within, np.minimum(pictures, _MAX_COUNT), 255)
-    cells[..., 1] = np.where(within, np.minimum(lines, _MAX_COUNT), 0)
-    cells[..., 2] = np.where(within, met, 0)
-    corners = grid.places_of(block * np.array([[0, 0], [0, 1], [1, 0], [1, 1]]) * within.shape)
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    # Half the side of a cell that lies diagonally: no cell falls between pixels.
-    aslant = abs(math.sin(2.0 * grid.heading_rad)) > 1e-9
-    pixel_m = grid.cell_m * block / (2.0 if aslant else 1.0)
-    rows, columns = np.maximum(np.ceil((high - low) / pixel_m - 1e-6).astype(int), 1)
-    norths = high[0] - pixel_m * (np.arange(rows) + 0.5)
-    easts = low[1] + pixel_m * (np.arange(columns) + 0.5)
-    places = np.stack(np.meshgrid(norths, easts, indexing="ij"), axis=-1)
-    row, column = np.moveaxis(np.floor(grid.cells_of(places) / block).astype(int), -1, 0)
-    on = (row >= 0) & (column >= 0) & (row < within.shape[0]) & (column < within.shape[1])
-    rgb = np.zeros((rows, columns, 3), dtype=np.uint8)
-    rgb[..., 0] = 255
-    rgb[on] = cells[row[on], column[on]]
-    return rgb, (float(high[0]), float(low[1])), pixel_m
+    places, (south, west, north, _) = north_up(seen.area, grid.cell_m / 2, _MAX_PICTURE_PX)
+    within = grid.sample(seen.inside, places, False)
+    rgb = np.zeros((*within.shape, 3), dtype=np.uint8)
+    for channel, counts in enumerate((seen.pictures, seen.least_lines, seen.at_overlap)):
+        rgb[..., channel] = np.minimum(grid.sample(counts, places, 0), _MAX_COUNT) * within
+    rgb[..., 0][~within] = 255
+    return rgb, (north, west), (north - south) / len(rgb)
 
 
-def counts_data(seen: Certificate) -> dict[str, Any]:
+def _counts_json(seen: Certificate) -> dict[str, Any]:
     """The counts for the page's script, which reads those under the pointer."""
     rgb, (north, west), pixel_m = counts_picture(seen)
-    png = base64.b64encode(_png(rgb)).decode("ascii")
-    return {"png": f"data:image/png;base64,{png}", "north": north, "west": west, "pixel": pixel_m}
-
-
-def _blocks(cells: NDArray[Any], block: int, *, fill: int | bool) -> NDArray[Any]:
-    """Cells in blocks, (rows, block, columns, block); beyond the last cell stands `fill`."""
-    rows, columns = (-(-size // block) for size in cells.shape)
-    padded = np.full((rows * block, columns * block), fill, dtype=cells.dtype)
-    padded[: cells.shape[0], : cells.shape[1]] = cells
-    return padded.reshape(rows, block, columns, block)
-
-
-def _png(pixels: NDArray[np.uint8]) -> bytes:
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, format="PNG")
-    return buffer.getvalue()
+    _, png = cv2.imencode(".png", rgb[..., ::-1])
+    data = base64.b64encode(png.tobytes()).decode("ascii")
+    return {"png": f"data:image/png;base64,{data}", "north": north, "west": west, "pixel": pixel_m}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

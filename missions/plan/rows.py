@@ -1,4 +1,4 @@
-"""The table of a plan's settings: each number with its equation, its source and what bounds it."""
+"""The table of a plan's settings: each number with its equation and what bounds it."""
 
 import math
 import textwrap
@@ -21,29 +21,6 @@ from missions.values.plan_file import Plan
 WIDTH = 100
 _COLUMNS = (23, 24, 31, 16)
 _GAP = "  "
-_PORT = (
-    "exact flat port: Snell's law at both faces of the glass (camera_calib.camera); paraxial "
-    "pixel: D = d + g/n_glass + a/n_water"
-)
-_LEVEL = "geometry of level footprints"
-_PAPER = "Gutnik et al. 2021, section VII.A"
-_MOTION = "rigid-body motion through camera_calib.camera's slopes"
-_LENS = "thin lens behind the port: camera_calib.fov.focus (Coddington; Born & Wolf 4.6)"
-_AIRY = "Airy disc: Born & Wolf, section 8.5.2, at 530 nm"
-_LIGHT = (
-    "missions.exposure.light; water: Jerlov 1976 and Kirk 1984 (camera_calib.water), light that is "
-    "scattered forward kept; phosphor LED of 4100 K (CIE LED-B3); sand; lens transmission 0.9 "
-    "(inferred)"
-)
-_SCATTER = (
-    "missions.exposure.light: quasi-single scattering (Gordon 1973), Henyey-Greenstein 0.924 "
-    "(Petzold)"
-)
-_STROBE = (
-    "Cree XHP35: 104 lm/W (koef3, 2024), 1.8 K/W and 85 C (data sheet); driver 0.9, bus 28 V, "
-    "housing 0.5 K/W are inferred (missions.exposure.strobe)"
-)
-_DATA = "Allied Vision, Manta Technical Manual (124 MB/s a link); disk 250 MB/s is inferred"
 _MAIN = (
     "footprint across", "footprint along", "pixel on the floor", "stereo swath", "line spacing",
     "side overlap", "interval", "forward overlap", "exposure", "blur", "focus, set in air",
@@ -52,7 +29,7 @@ _MAIN = (
 )  # fmt: skip
 """Settings that a person sets or checks before a dive."""
 
-Row = tuple[str, float | tuple[float, ...], str, str, str, str, str]
+Row = tuple[str, float | tuple[float, ...], str, str, str, str]
 """Fields of a `Setting` from its name on, in order."""
 
 
@@ -68,7 +45,7 @@ class Setting:
     unit: str
     """Unit of the value; `%` shows a share as percent."""
     equation: str
-    source: str
+    """docs/imaging.md has its source."""
     bound_by: str
     """The setting or limit that a better value would break; empty where nothing does."""
     note: str = ""
@@ -96,22 +73,15 @@ class Setting:
 
 def settings_table(rows: Sequence[Setting]) -> str:
     """Rows under the headings of their groups, with notes below each; no line exceeds `WIDTH`."""
-    lines = _line("setting", "value", "equation [source]", "bound by")
+    lines = _line("setting", "value", "equation", "bound by")
     lines += _line(*("-" * width for width in _COLUMNS))
-    sources: list[str] = []
     group = ""
     for row in rows:
         if row.group != group:
             group = row.group
             lines += ["", group.upper()]
-        if row.source not in sources:
-            sources.append(row.source)
-        equation = f"{row.equation} [{sources.index(row.source) + 1}]".strip()
-        lines += _line(row.name, row.text, equation, row.bound_by or "-")
+        lines += _line(row.name, row.text, row.equation, row.bound_by or "-")
         lines += textwrap.wrap(row.note, WIDTH, initial_indent="    ", subsequent_indent="    ")
-    lines += ["", "SOURCES"]
-    for number, source in enumerate(sources, 1):
-        lines += textwrap.wrap(f"[{number}] {source}", WIDTH, subsequent_indent="    ")
     return "\n".join(lines)
 
 
@@ -156,7 +126,7 @@ def main_settings(plan_json: dict[str, Any]) -> str:
     rows = map(Setting.from_json, plan_json["details"]["imaging"]["rows"])
     shown = {row.name: (row.name, row.text, row.bound_by) for row in rows}
     table = text_table(("setting", "value", "bound by"), [shown[n] for n in _MAIN if n in shown])
-    return f"{table}\nEvery setting with its equation and source: plan/settings.txt, or --all\n"
+    return f"{table}\nEvery setting with its equation: plan/settings.txt, or --all\n"
 
 
 def imaging_rows(found: ImagingSettings, setup: ImagingSetup) -> tuple[Setting, ...]:
@@ -186,24 +156,24 @@ def _footprint_rows(found: ImagingSettings, setup: ImagingSetup) -> list[Row]:
         needed_m = step_for_overlap(prints.mean.across_m, plan.side_overlap)
         note = f"{plan.side_overlap:.0%} needs {needed_m - 2 * plan.track_error_m:.3f} m"
     return [
-        ("footprint across", tuple(p.across_m for p in over), "m", "traced", _PORT,
+        ("footprint across", tuple(p.across_m for p in over), "m", "traced",
          "altitude_m", "over the top, mean and bottom of the relief, from "
          f"{' / '.join(f'{p.altitude_m:.3g}' for p in over)} m: the rectangle between the corners"),
-        ("footprint along", tuple(p.along_m for p in over), "m", "traced", _PORT,
+        ("footprint along", tuple(p.along_m for p in over), "m", "traced",
          "altitude_m", ""),
-        ("pixel on the floor", tuple(p.pixel_m * 1e3 for p in over), "mm", "D / f", _PORT,
+        ("pixel on the floor", tuple(p.pixel_m * 1e3 for p in over), "mm", "D / f",
          "altitude_m", ""),
-        ("stereo swath", tuple(p.stereo_across_m for p in over), "m", "seen by every camera", _PORT,
+        ("stereo swath", tuple(p.stereo_across_m for p in over), "m", "seen by every camera",
          "baseline_m", ""),
         ("line spacing", spacing.spacing_m, "m", "as set" if is_given else "W (1 - O) - 2 e",
-         _LEVEL, spacing.bound_by, note),
+         spacing.bound_by, note),
         ("side overlap", (spacing.mean_overlap, spacing.top_overlap, spacing.off_track_overlap),
-         "%", "1 - (s + 2 e) / W", _LEVEL, "line spacing",
+         "%", "1 - (s + 2 e) / W", "line spacing",
          "at the mean / over the top of the relief / there with lines each "
          f"{plan.track_error_m:g} m off; by area whole pictures share {spacing.area_overlap:.1%}, "
          f"swaths of lines {spacing.swath_overlap:.1%}, at the mean"),
         ("stereo side overlap", spacing.stereo_overlap, "%", "(2 half swath - s) / swath",
-         _LEVEL, "line spacing", "of neighbouring stereo swaths, the smaller side"),
+         "line spacing", "of neighbouring stereo swaths, the smaller side"),
     ]  # fmt: skip
 
 
@@ -211,12 +181,12 @@ def _rate_rows(found: ImagingSettings, setup: ImagingSetup) -> list[Row]:
     rule, prints, step_m = found.paper_rule, found.footprints, found.station_spacing_m
     top_overlap = 1.0 - step_m / prints.top.along_m
     return [
-        ("interval", found.interval_s, "s", "L (1 - O) / u", _LEVEL, "forward_overlap",
+        ("interval", found.interval_s, "s", "L (1 - O) / u", "forward_overlap",
          f"{1 / found.interval_s:.3g} pictures a second, one every {step_m:.3g} m; the trigger "
          f"and the cameras take {1 / found.shortest_interval_s:.3g}"),
         ("forward overlap", (found.forward_overlap, max(0.0, top_overlap)), "%", "1 - u T / L",
-         _LEVEL, "interval", "at the mean / over the top of the relief"),
-        ("the paper's rule", rule.rate_hz, "Hz", "r = u / (H (1 - O))", _PAPER, "not used",
+         "interval", "at the mean / over the top of the relief"),
+        ("the paper's rule", rule.rate_hz, "Hz", "r = u / (H (1 - O))", "not used",
          f"it takes the altitude of {setup.plan.altitude_m:g} m for the footprint, which is "
          f"{prints.mean.along_m:.3f} m: {rule.forward_overlap:.0%} overlap instead of "
          f"{setup.plan.forward_overlap:.0%}"),
@@ -226,10 +196,10 @@ def _rate_rows(found: ImagingSettings, setup: ImagingSetup) -> list[Row]:
 def _exposure_rows(found: ImagingSettings, setup: ImagingSetup) -> list[Row]:
     plan, rates, exposure_s = setup.plan, found.blur, found.exposure_s
     return [
-        ("exposure", exposure_s * 1e3, "ms", "blur allowed / |image motion|", _MOTION,
+        ("exposure", exposure_s * 1e3, "ms", "blur allowed / |image motion|",
          "allowed_blur_px", f"for {plan.allowed_blur_px:g} px; at night only the strobe exposes"),
         ("blur", rates.combined * exposure_s, "px", "sqrt(speed^2 + roll^2 + pitch^2 + yaw^2)",
-         _MOTION, "allowed_blur_px",
+         "allowed_blur_px",
          f"in the worst pixel. From {plan.speed_mps:g} m/s {rates.speed * exposure_s:.2f} at the "
          f"centre, {rates.speed_worst * exposure_s:.2f} in a corner; "
          f"{rates.roll_pitch * exposure_s:.2f} from roll and pitch at "
@@ -243,20 +213,20 @@ def _focus_rows(found: ImagingSettings, setup: ImagingSetup) -> list[Row]:
     plan, focus, f_number = setup.plan, found.focus, setup.camera.f_number
     is_enough = focus.f_number_needed <= f_number
     return [
-        ("focus, set in air", focus.focus_air_m, "m", "2 / (1/D_top + 1/D_bottom)", _LENS,
+        ("focus, set in air", focus.focus_air_m, "m", "2 / (1/D_top + 1/D_bottom)",
          "relief_m",
          "equal blur at the top and the bottom of the relief; sharpest "
          f"{focus.focus_altitude_m:.2f} m below the glass. For the mean altitude alone it is "
          f"{focus.focus_mean_air_m:.2f} m from the pupil"),
         ("sharp from, to", (focus.near_altitude_m, focus.far_altitude_m), "m",
-         "1 / (1/s +- c N / (f f'))", _LENS, "sharp_px",
+         "1 / (1/s +- c N / (f f'))", "sharp_px",
          f"altitudes in focus to {plan.sharp_px:g} px at F/{f_number:g}; the relief takes "
          f"{plan.altitude_m - plan.relief_m:.3g} to {plan.altitude_m + plan.relief_m:.3g} m"),
-        ("blur at relief's ends", focus.blur_px, "px", "f f' / (N p) |1/D - 1/s|", _LENS,
+        ("blur at relief's ends", focus.blur_px, "px", "f f' / (N p) |1/D - 1/s|",
          "f_number" if is_enough else "sharp_px", ""),
-        ("f-number needed", focus.f_number_needed, "", "N blur / sharp_px", _LENS, "relief_m",
+        ("f-number needed", focus.f_number_needed, "", "N blur / sharp_px", "relief_m",
          f"F/{f_number:g} is set" + ("" if is_enough else ", which is too open")),
-        ("diffraction", focus.airy_px, "px", "2.44 lambda N (f'/f) / p", _AIRY, "f_number",
+        ("diffraction", focus.airy_px, "px", "2.44 lambda N (f'/f) / p", "f_number",
          f"beyond F/{focus.f_number_diffraction:.3g} it exceeds {plan.sharp_px:g} px"),
     ]  # fmt: skip
 
@@ -266,29 +236,28 @@ def _light_rows(found: ImagingSettings, setup: ImagingSetup) -> list[Row]:
     corner = " / ".join(f"{value:.1f}" for value in light.snr_corner)
     return [
         ("electrons, centre", light.centre_e, "e", "pi L T / (4 N^2 n^2) p^2 t QE / (h nu)",
-         _LIGHT, "exposure",
+         "exposure",
          f"red / green / blue of a pixel over sand in Jerlov {setup.water.jerlov} water, "
          f"{len(strobes.strobes_body_m)} strobes of {strobes.strobe_lumens:g} lm, "
          f"F/{limits.f_number:g}; the brightest pixel fills {light.full_share:.1%} of the well"),
-        ("electrons, corner", light.corner_e, "e", "the same, with cos^4", _LIGHT, "lens, beam",
+        ("electrons, corner", light.corner_e, "e", "the same, with cos^4", "lens, beam",
          ""),
-        ("sharp light, centre", light.sharp_share, "%", f"exp(-{SEEN_SHARE:.3f} b s)",
-         _SCATTER, "water", "share of these electrons that is detail: the rest was scattered"),
-        ("signal to noise", light.snr_centre, "", "sharp S / sqrt(S + read^2)",
-         "Poisson shot noise and read noise", "electrons",
+        ("sharp light, centre", light.sharp_share, "%", f"exp(-{SEEN_SHARE:.3f} b s)", "water",
+         "share of these electrons that is detail: the rest was scattered"),
+        ("signal to noise", light.snr_centre, "", "sharp S / sqrt(S + read^2)", "electrons",
          f"at the centre; of the median pixel {light.snr_median:.1f}, in the corner {corner}"),
-        ("gain", light.gain_db, "dB", "20 log10(grey x well / median)", _LIGHT,
+        ("gain", light.gain_db, "dB", "20 log10(grey x well / median)",
          "light" if light.gain_db > 0 else "full well",
          f"brings the median to {MIDDLE_GREY:.0%} of full scale (linear). Check it in the water: "
          "alice-survey plan gain PICTURES"),
-        ("f-number for half well", light.half_full_f_number, "", "N sqrt(S / half well)", _LIGHT,
+        ("f-number for half well", light.half_full_f_number, "", "N sqrt(S / half well)",
          "depth of field", f"for the brightest pixel; or {light.half_full_exposure_s * 1e3:.3g} ms "
          f"at F/{limits.f_number:g}"),
-        ("veil, centre", found.scatter.veil_share, "%", "B / (B + L)", _SCATTER, "strobe places",
+        ("veil, centre", found.scatter.veil_share, "%", "B / (B + L)", "strobe places",
          "share of the light that the water throws back before it reached the floor. Strobes "
          f"light the axis from {found.scatter.lit_from_m:.2f} m below the glass on, "
          f"{found.scatter.lit_share:.0%} of it"),
-        ("shadows", shade.length_m, "m", "h r / (H - h)", "geometry of the strobes' places",
+        ("shadows", shade.length_m, "m", "h r / (H - h)",
          "strobe places",
          f"of a thing {shade.height_m:g} m high below the camera, by each strobe; their light "
          f"meets there at {shade.between_deg:.0f} deg{' from both sides' if shade.opposite else ''}"
@@ -299,16 +268,16 @@ def _light_rows(found: ImagingSettings, setup: ImagingSetup) -> list[Row]:
 def _strobe_rows(found: ImagingSettings) -> list[Row]:
     load = found.strobe
     return [
-        ("pulse", load.pulse_s * 1e3, "ms", "t + 2 lead", "strobe covers the exposure", "exposure",
+        ("pulse", load.pulse_s * 1e3, "ms", "t + 2 lead", "exposure",
          f"lit {load.lead_s * 1e3:g} ms before the exposure, out as long after it"),
-        ("duty cycle", load.duty, "%", "pulse / interval", _STROBE, "interval",
+        ("duty cycle", load.duty, "%", "pulse / interval", "interval",
          f"LEDs bear {load.duty_limit:.0%} in water of {WARM_SEA_C:g} C"),
-        ("energy a trigger", load.frame_j, "J", "lm / (lm/W) x pulse / driver", _STROBE, "pulse",
+        ("energy a trigger", load.frame_j, "J", "lm / (lm/W) x pulse / driver", "pulse",
          f"{load.count} strobes of {load.lit_w:.0f} W while lit, {load.peak_a:.1f} A from "
          f"{BUS_V:g} V"),
-        ("capacitor, each", load.capacitor_f * 1e3, "mF", "2 E / (V^2 - V_low^2)", _STROBE, "pulse",
+        ("capacitor, each", load.capacitor_f * 1e3, "mF", "2 E / (V^2 - V_low^2)", "pulse",
          f"feeds a pulse while its {BUS_V:g} V sag by {BUS_SAG:.0%}"),
-        ("mean power", load.mean_w, "W", "energy / interval", _STROBE, "duty cycle",
+        ("mean power", load.mean_w, "W", "energy / interval", "duty cycle",
          f"from the battery, on lines; solder point {load.solder_c:.0f} C, junction "
          f"{load.junction_c:.0f} C at most. Cameras and recorder are in vehicle.hotel_w"),
     ]  # fmt: skip
@@ -323,9 +292,9 @@ def _data_rows(found: ImagingSettings, setup: ImagingSetup) -> list[Row]:
     }
     tightest = min(limits, key=lambda name: limits[name])
     return [
-        ("one trigger", storage.station_bytes / 1e6, "MB", "width x height x cameras",
-         "raw, one byte a pixel", "sensor", ""),
-        ("write rate on a line", storage.bytes_per_s / 1e6, "MB/s", "bytes / interval", _DATA,
+        ("one trigger", storage.station_bytes / 1e6, "MB", "width x height x cameras", "sensor",
+         ""),
+        ("write rate on a line", storage.bytes_per_s / 1e6, "MB/s", "bytes / interval",
          "interval",
          f"{rate_hz:.3g} triggers a second of at most {limits[tightest]:.3g} ({tightest}); all "
          f"cameras on one cable take {storage.shared_link_hz:.3g}"),
@@ -360,23 +329,23 @@ def plan_rows(
         load += ", and is inferred: measure it with the thrusters at rest, and set vehicle.hotel_w"
     passes, pictures = seen.pattern.passes, seen.pattern.pictures
     rows: list[Row] = [
-        ("area", totals["area_m2"], "m2", "as given, with margin_m", "this plan", "[area]", ""),
-        ("line heading", totals["heading_deg"], "deg", "least energy of all headings", "this plan",
+        ("area", totals["area_m2"], "m2", "as given, with margin_m", "[area]", ""),
+        ("line heading", totals["heading_deg"], "deg", "least energy of all headings",
          "line_heading_deg" if sweep is None else "energy", why),
-        ("lines", totals["lines"], "", "width / spacing", "this plan", "line spacing", kinds),
-        ("way", totals["length_m"], "m", "lines, turns, ways from home and back", "this plan",
+        ("lines", totals["lines"], "", "width / spacing", "line spacing", kinds),
+        ("way", totals["length_m"], "m", "lines, turns, ways from home and back",
          "lines", f"{totals['lines_m']:.0f} m on lines; {stops} turns on the spot"),
-        ("duration", totals["duration_s"] / 60, "min", "way / speed + stops + dive", "this plan",
+        ("duration", totals["duration_s"] / 60, "min", "way / speed + stops + dive",
          "speed_mps", ""),
-        ("dives", totals["dives"], "", "least number that the battery holds", "this plan",
+        ("dives", totals["dives"], "", "least number that the battery holds",
          "battery_wh", f"the longest takes {totals['longest_dive_wh']:.0f} of "
          f"{totals['usable_wh']:.0f} Wh ({vehicle.battery_reserve:.0%} of "
          f"{battery_wh(vehicle):.0f} Wh are kept)"),
-        ("energy", energy_wh, "Wh", "sum of power x time", "this plan", "hotel_w, drag, current",
+        ("energy", energy_wh, "Wh", "sum of power x time", "hotel_w, drag, current",
          load),
-        ("data", totals["data_gb"], "GB", "stations x cameras x pixels", "this plan", "stations",
+        ("data", totals["data_gb"], "GB", "stations x cameras x pixels", "stations",
          f"{totals['stations']} stations, {totals['pictures']} pictures"),
-        ("covered as requested", totals["at_overlap"], "%", "union of real footprints", "this plan",
+        ("covered as requested", totals["at_overlap"], "%", "union of real footprints",
          "lines", f"by every camera on {passes} line{'s'[: passes > 1]} and in {passes * pictures} "
          f"pictures or more; {share(totals['covered'], 2)} is in some picture, "
          f"{share(totals['stereo'], 2)} in stereo; the place seen least is in "

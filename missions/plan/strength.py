@@ -148,21 +148,17 @@ def warn_of_swell(flown: FlightConditions, sea: SeaConfig, depth_m: float, below
     )
 
 
-def turn_rate_deg_s(plan: PlanConfig) -> float:
-    """Rate of the turns that a plan's arcs need."""
-    return math.degrees(plan.speed_mps / plan.arc_radius_m)
-
-
 def check_turns(plan: PlanConfig) -> None:
     """Refuse arcs that are too quick; warn where they are wider than set.
 
     Raises:
         PlanError: the plan asks for arcs of a radius that its rate of turn does not allow.
     """
-    if plan.turns == "arcs" and turn_rate_deg_s(plan) > plan.turn_rate_limit_deg_s:
+    rate_deg_s = math.degrees(plan.speed_mps / plan.arc_radius_m)
+    if plan.turns == "arcs" and rate_deg_s > plan.turn_rate_limit_deg_s:
         raise PlanError(
             f"turns of {plan.turn_radius_m:g} m radius at {plan.speed_mps:g} m/s need "
-            f"{turn_rate_deg_s(plan):.0f} deg/s; turn_rate_limit_deg_s is "
+            f"{rate_deg_s:.0f} deg/s; turn_rate_limit_deg_s is "
             f"{plan.turn_rate_limit_deg_s:g}: raise turn_radius_m, lower speed_mps or set "
             "turns = 'auto'"
         )

@@ -47,9 +47,7 @@ class PlanCommand(SurveyCommand):
     )
     title = "Plan the survey"
     offered = ("vehicle",)
-    every_setting: bool = option(
-        False, "Print every setting with its equation, source and limit.", "--all"
-    )
+    every_setting: bool = option(False, "Print every setting with its equation and limit.", "--all")
     vehicle: str | None = option(None, "A known vehicle, or its TOML file.", metavar="NAME|FILE")
 
     def run(self) -> Result:

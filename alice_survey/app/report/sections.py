@@ -424,7 +424,7 @@ def _mission(held: Held, plan: Plan) -> Section:
             ("error of navigation, rms", length(flight.navigation_error_rms_m)),
         ]
         tables.append(_table("Flight", *rows))
-    text = "Every setting with its equation, source and limit is in plan/settings.txt."
+    text = "Every setting with its equation and limit is in plan/settings.txt."
     return Section(
         name="mission",
         title="Mission",

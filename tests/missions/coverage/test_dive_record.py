@@ -13,7 +13,6 @@ from alice_survey.core.artefacts import write_csv
 from alice_survey.core.config import CameraConfig, WaterConfig
 from alice_survey.core.errors import NavigationError
 from alice_survey.core.frames import Array, rotation_from_attitude
-from alice_survey.core.manifest import ImageRecord, write_manifest
 from alice_survey.core.trajectory import Trajectory, write_track
 from camera_calib.rig import Rig, design_rig
 from missions.coverage.dive_record import DiveRecord, assign_lines, read_dive_record
@@ -112,29 +111,6 @@ def test_lines_are_found_where_triggers_name_none(
     record = record_of(log)
     assert "interval" in record.triggers
     assert_alike(record.stations, flown.some(np.arange(len(flown) - 1)))
-
-
-def test_a_manifest_stands_for_triggers(
-    dive: tuple[Path, Path, Stations],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    log, _, flown = dive
-    assert flown.time_s is not None
-    records = [
-        ImageRecord(image=f"{camera}/{i}.png", camera=camera, station=i, time_s=time)
-        for i, time in enumerate(flown.time_s.tolist())
-        for camera in ("left", "right")
-        if (camera, i) != ("right", 4)
-    ]
-    write_manifest(tmp_path / "manifest.csv", records)
-
-    record = record_of(log, manifest=tmp_path / "manifest.csv")
-
-    kept = np.delete(np.arange(len(flown)), 4)
-    assert_alike(record.stations, flown.some(kept))
-    assert "1 station" in capsys.readouterr().err
-    assert "manifest" in refusal(log, triggers=log, manifest=log)
 
 
 def test_triggers_in_a_gap_and_beyond_the_log_are_counted(

@@ -1,4 +1,4 @@
-/* What a plan comes to: totals, warnings, limits that bind, settings and why; or why there is none,
+/* What a plan comes to: totals, warnings, settings and why; or why there is none,
    and the setting that would help. */
 
 import {button, el, table} from "./core.js";
@@ -10,9 +10,7 @@ export function resultsPanel(apply) {
   const totals = el("div", {class: "plan-totals"});
   const refused = el("div", {hidden: true});
   const warnings = el("ul", {class: "warn", hidden: true});
-  const limits = el("div", {class: "plan-limits"});
   const rows = el("div");
-  const limitsBox = el("details", {hidden: true}, el("summary", {}, "Limits"), limits);
   const rowsBox = el("details", {hidden: true}, el("summary", {}, "Settings and why"), rows);
 
   function show(preview) {
@@ -26,14 +24,6 @@ export function resultsPanel(apply) {
     totals.replaceChildren(table("Totals", [], totalRows(preview.totals)));
     warnings.hidden = !preview.warnings.length;
     warnings.replaceChildren(...preview.warnings.map((text) => el("li", {}, text)));
-    const binding = preview.limits.filter((limit) => limit.binds);
-    limitsBox.hidden = !preview.limits.length;
-    limitsBox.querySelector("summary").textContent = "Limits: " + (binding.length
-      ? binding.map((limit) => limit.name).join(", ")
-        + (binding.length > 1 ? " bind" : " binds") : "none binds");
-    limits.replaceChildren(
-      el("ul", {}, preview.limits.map((limit) => el("li", limit.binds ? {class: "binds"} : {},
-      (limit.binds ? "Binds: " : "") + limit.text, el("small", {}, limit.name)))));
     rowsBox.hidden = !preview.rows.length;
     rows.replaceChildren(table("Settings and why", ["setting", "value", "why"], preview.rows));
   }
@@ -51,5 +41,5 @@ export function resultsPanel(apply) {
 
   const totalsBox = el("details", {}, el("summary", {}, "All figures"), totals);
   return {key, top: el("div", {}, refused, warnings),
-    below: el("div", {}, totalsBox, limitsBox, rowsBox), show};
+    below: el("div", {}, totalsBox, rowsBox), show};
 }
