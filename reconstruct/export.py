@@ -1,21 +1,15 @@
 """Products for other programs: in another coordinate system, and pictures without refraction.
 
 A workspace is in a projection about its own datum, true to scale (`reconstruct.raster`). A map grid
-such as UTM turns and stretches it: rasters are resampled, cloud, mesh and track are exact. Heights
+such as UTM turns and stretches it: rasters are resampled, cloud and mesh are exact. Heights
 stay above the model's vertical datum, whose name every file carries.
 
 A camera behind a flat port has no single centre: a picture that is warped to a pinhole is exact at
 one distance only. Exported pictures take each pixel from where the camera sees what the pinhole's
 ray meets of the surface, so that every picture is that of a pinhole, of this surface.
-
-nerfstudio's `transforms.json` holds poses, pinholes and first points of a splat or a radiance
-field. Its convention (docs.nerf.studio, "Data conventions"): camera to world, with the camera's x
-to the right, y up and z backwards (OpenGL); the world's z up.
 """
 
-import csv
 import shutil
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import groupby, islice
@@ -33,7 +27,7 @@ from rasterio.warp import calculate_default_transform
 from scipy.ndimage import distance_transform_edt
 
 from alice_survey.core import products
-from alice_survey.core.artefacts import Stage, atomic_path, run_stage, write_csv, write_json
+from alice_survey.core.artefacts import Stage, atomic_path, run_stage, write_json
 from alice_survey.core.errors import ConfigError, ReconstructionError
 from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Array
@@ -42,11 +36,9 @@ from alice_survey.core.run import progress
 from reconstruct.copc import PointSpool, write_copc
 from reconstruct.evaluate.surface import read_mesh
 from reconstruct.pictures.undistorted import Pictures
-from reconstruct.ply import write_ply
 from reconstruct.raster import BLOCK, local_crs, opened_raster, small_cache, tiles_of_shape
 from reconstruct.stages import DENSE, MESH, MOSAIC, PLACING
 from reconstruct.views.model import (
-    SparseModel,
     View,
     WorldFrame,
     points_of_views,
@@ -105,21 +97,13 @@ def export_projected(workspace: Path, crs: str) -> tuple[str, dict[str, Any]]:
     for needed in (DENSE, MOSAIC, MESH):
         needed.need(workspace)
     frame = read_frame(workspace / "sparse" / "frame.json")
-    if frame.datum is None or frame.name != "ned":
-        raise ReconstructionError(
-            f"{workspace}: the model has no place in the world, so that it has none in {crs}: "
-            "import navigation with positions, or control points"
-        )
-    local = pyproj.CRS.from_wkt(local_crs(frame.datum).to_wkt())
-    found = _projected_crs(crs, frame)
-    to = pyproj.Transformer.from_crs(local, found, always_xy=True)
-    target = Destination(frame=frame, crs=found, name=crs, transformer=to)
+    target = destination(crs, frame)
     folder = "".join(c if c.isalnum() else "-" for c in crs)[:60].strip("-")
     stage = Stage(
         name=folder,
-        version=2,
+        version=3,
         settings={"crs": target.crs.to_wkt()},
-        inputs=[workspace / name for name in ("dense", "mosaic", "mesh", "sparse/track.csv")],
+        inputs=[workspace / name for name in ("dense", "mosaic", "mesh")],
     )
     run_stage(workspace, stage, partial(_write_projected, workspace, target))
     text = (
@@ -132,22 +116,31 @@ def export_projected(workspace: Path, crs: str) -> tuple[str, dict[str, Any]]:
     }
 
 
-def _projected_crs(crs: str, frame: WorldFrame) -> pyproj.CRS:
+def destination(crs: str, frame: WorldFrame) -> Destination:
+    """A projected system that products of a frame go to.
+
+    Raises:
+        ConfigError: it is no projected system in metres.
+        ReconstructionError: the frame has no place in the world.
+    """
+    if frame.datum is None or frame.name != "ned":
+        raise ReconstructionError(
+            f"the model has no place in the world, so that it has none in {crs}: import navigation "
+            "with positions, or control points"
+        )
     try:
         found = pyproj.CRS.from_user_input(crs)
     except pyproj.exceptions.CRSError:
         raise ConfigError(f"--crs {crs}: unknown; write it as EPSG:32636") from None
-    if found.is_compound or found.is_vertical:
+    flat = found.is_projected and not found.is_compound
+    if not flat or any(axis.unit_name != "metre" for axis in found.axis_info):
         raise ConfigError(
-            f"--crs {crs}: give the horizontal system alone: heights stay above "
-            f"{frame.vertical_datum}, since nothing here knows where that lies in another datum"
+            f"--crs {crs}: {found.name} is not a projected system in metres, horizontal alone: "
+            f"take the UTM zone, such as EPSG:32636; heights stay above {frame.vertical_datum}"
         )
-    if not found.is_projected or any(axis.unit_name != "metre" for axis in found.axis_info):
-        raise ConfigError(
-            f"--crs {crs}: {found.name} is no projected system in metres, which rasters and "
-            "meshes need: take the UTM zone, EPSG:326NN north of the equator, EPSG:327NN south"
-        )
-    return found
+    local = pyproj.CRS.from_wkt(local_crs(frame.datum).to_wkt())
+    to = pyproj.Transformer.from_crs(local, found, always_xy=True)
+    return Destination(frame=frame, crs=found, name=crs, transformer=to)
 
 
 def _write_projected(workspace: Path, target: Destination, folder: Path) -> None:
@@ -159,7 +152,6 @@ def _write_projected(workspace: Path, target: Destination, folder: Path) -> None
     spacing = SurfaceRecord.read(dense / "surface.json").cell
     _cloud(dense / "cloud.copc.laz", folder / "cloud.copc.laz", spacing, target)
     offset = _mesh(workspace / "mesh", folder, target)
-    _track(workspace / "sparse" / "track.csv", folder / "track.csv", target)
     write_json(
         folder / "projected.json",
         {
@@ -268,71 +260,6 @@ def _mesh(source: Path, folder: Path, target: Destination) -> list[float]:
     return [float(v) for v in offset]
 
 
-def _track(source: Path, path: Path, target: Destination) -> None:
-    with source.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    local = np.array([[row["east_m"], row["north_m"]] for row in rows], np.float64)
-    at = target.places(local.reshape(-1, 2))
-    write_csv(
-        path,
-        ("image", "station", "time_s", "easting_m", "northing_m", "height_m",
-         "sigma_north_m", "sigma_east_m", "sigma_depth_m"),
-        [
-            (row["image"], row["station"], row["time_s"], f"{x:.6f}", f"{y:.6f}",
-             f"{-float(row['depth_m']):.6f}", row.get("sigma_north_m", ""),
-             row.get("sigma_east_m", ""), row.get("sigma_depth_m", ""))
-            for row, (x, y) in zip(rows, at, strict=True)
-        ],
-    )  # fmt: skip
-
-
-_ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-_OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
-_POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"),
-                   ("red", "u1"), ("green", "u1"), ("blue", "u1")])  # fmt: skip
-_GREY = 128
-
-
-def write_nerfstudio(folder: Path, model: SparseModel, names: Mapping[str, str]) -> None:
-    """Write `transforms.json` and `points.ply` of exported pictures.
-
-    Args:
-        folder: with `images/` and `masks/`.
-        model: of the pictures.
-        names: of the exported pictures, by those of the views.
-    """
-    points = np.zeros(len(model.points_world), _POINT)
-    points["x"], points["y"], points["z"] = (model.points_world @ _ENU_FROM_NED.T).T
-    points["red"] = points["green"] = points["blue"] = _GREY
-    write_ply(folder / "points.ply", [points], ["sparse points: east, north, up"])
-    frames = [
-        {
-            "file_path": f"images/{names[view.image]}",
-            "mask_path": f"masks/{names[view.image]}.png",
-            "fl_x": view.pinhole.fx_px,
-            "fl_y": view.pinhole.fy_px,
-            "cx": view.pinhole.cx_px,
-            "cy": view.pinhole.cy_px,
-            "w": view.pinhole.width_px,
-            "h": view.pinhole.height_px,
-            "transform_matrix": world_from_gl(view).tolist(),
-        }
-        for view in model.views
-    ]
-    write_json(
-        folder / "transforms.json",
-        {"camera_model": "PINHOLE", "ply_file_path": "points.ply", "frames": frames},
-    )
-
-
-def world_from_gl(view: View) -> Array:
-    """(4, 4) pose of a view's camera in OpenGL's axes, in a world of east, north, up."""
-    pose = np.eye(4)
-    pose[:3, :3] = _ENU_FROM_NED @ view.world_from_cam.rotation.as_matrix() @ _OPENCV_FROM_OPENGL
-    pose[:3, 3] = _ENU_FROM_NED @ view.world_from_cam.translation
-    return pose
-
-
 FOLDER = "undistorted"
 _NODE_PX = 4
 """Pixels between places at which a ray's way to the surface is computed."""
@@ -341,7 +268,7 @@ _QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 97]
 
 
 def export_undistorted(workspace: Path, executor: Executor) -> tuple[str, dict[str, Any]]:
-    """Write pictures, masks, COLMAP's model and nerfstudio's `transforms.json` of a workspace.
+    """Write pictures, masks and COLMAP's model of a workspace.
 
     They go into `undistorted/`; what is there and up to date stays.
 
@@ -356,7 +283,7 @@ def export_undistorted(workspace: Path, executor: Executor) -> tuple[str, dict[s
     sparse = workspace / "sparse"
     stage = Stage(
         name=FOLDER,
-        version=1,
+        version=2,
         settings={},
         inputs=[sparse / "model", sparse / "cameras.json", sparse / "frame.json",
                 workspace / "mesh" / "mesh.ply", workspace / "images"],
@@ -366,8 +293,8 @@ def export_undistorted(workspace: Path, executor: Executor) -> tuple[str, dict[s
     folder = workspace / FOLDER
     pictures = sum(1 for path in (folder / "images").rglob("*") if path.is_file())
     text = (
-        f"undistorted: {pictures} pictures with masks, COLMAP model (sparse/, sparse/0/) and "
-        f"transforms.json in {folder}"
+        f"undistorted: {pictures} pictures with masks and COLMAP model (sparse/, sparse/0/) in "
+        f"{folder}"
     )
     return text, {"pictures": pictures, "folder": str(folder)}
 
@@ -383,7 +310,6 @@ def _write_undistorted(workspace: Path, executor: Executor, folder: Path) -> Non
     done = list(executor.map(write, tasks, label="undistort pictures"))
     names = {view.image: exported_name(view.image) for view in model.views}
     _write_colmap(workspace / "sparse" / "model", folder / "sparse", names)
-    write_nerfstudio(folder, model, names)
     write_json(
         folder / "export.json",
         {
@@ -393,7 +319,6 @@ def _write_undistorted(workspace: Path, executor: Executor, folder: Path) -> Non
             "unit": model.frame.unit,
             "vertical_datum": model.frame.vertical_datum,
             "axes_of_sparse": ["north", "east", "down"],
-            "axes_of_transforms": ["east", "north", "up"],
             "pictures": len(done),
             "on_surface": {
                 names[view.image]: round(on_surface, 4)

@@ -13,9 +13,10 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree as ET
+from xml.sax.saxutils import escape
 
 import cv2
 import numpy as np
@@ -37,6 +38,8 @@ from reconstruct.views.model import WorldFrame
 BLOCK = 256
 """Pixels a side of the blocks of a tiled TIFF."""
 _CACHE_MIB = 16
+_SHARES = (1.0, 99.0)
+"""Percentiles at the ends of a ramp of colours."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -273,11 +276,11 @@ def tiles_reached(
     reached: dict[tuple[int, int], list[int]] = {}
     for number in np.flatnonzero(known).tolist():
         left, top, right, bottom = np.clip(spans[number], 0, maximum).astype(int).tolist()
-        for row in range(top, bottom + 1):
-            for column in range(left, right + 1):
-                reached.setdefault((row * size, column * size), []).append(number)
+        for tile in product(range(top, bottom + 1), range(left, right + 1)):
+            reached.setdefault(tile, []).append(number)
+    tiles = tiles_of(grid, size)
     return [
-        (Window(column, row, min(size, grid.columns - column), min(size, grid.rows - row)), numbers)
+        (tiles[row * (int(maximum[0]) + 1) + column], numbers)
         for (row, column), numbers in sorted(reached.items())
     ]
 
@@ -302,16 +305,12 @@ def preview_dem(dem: Path, picture: Path, max_px: int = 1600) -> None:
         height = raster.read(1, out_shape=shape, resampling=resampling).astype(np.float64)
         cell = raster.transform.a * raster.width / shape[1]
     known = np.isfinite(height)
-    low, high = np.percentile(height[known], [1, 99]) if known.any() else (0.0, 1.0)
-    level = np.clip((height - low) / max(high - low, 1e-9), 0, 1)
-    tint = cv2.applyColorMap(
-        (np.nan_to_num(level) * 255).astype(np.uint8), cv2.COLORMAP_VIRIDIS
-    ).astype(np.float64)
+    low, high = np.percentile(height[known], _SHARES) if known.any() else (0.0, 1.0)
+    level = np.nan_to_num(np.clip((height - low) / max(high - low, 1e-9), 0, 1))
+    tint = cv2.applyColorMap((level * 255).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
     shade = np.nan_to_num(hillshade(height, cell), nan=np.sqrt(0.5))
-    colour = np.where(
-        known[..., None], np.clip(tint * (0.25 + 1.05 * shade[..., None]), 0, 255), 255
-    )
-    write_png(picture, colour.astype(np.uint8))
+    lit = np.clip(tint * (0.25 + 1.05 * shade[..., None]), 0, 255)
+    write_png(picture, np.where(known[..., None], lit, 255).astype(np.uint8))
 
 
 def write_png(path: Path, picture: NDArray[np.uint8]) -> None:
@@ -321,8 +320,6 @@ def write_png(path: Path, picture: NDArray[np.uint8]) -> None:
 
 
 _COLOURS = 5
-_SHARES = (1.0, 99.0)
-"""Percentiles at the ends of a ramp."""
 _SAMPLE = 1024
 
 
@@ -342,25 +339,19 @@ def write_style(raster: Path, palette: str, unit: str) -> None:
     values = values[np.isfinite(values)]
     low, high = np.percentile(values, _SHARES) if values.size else (0.0, 1.0)
     high = max(float(high), float(low) + 1e-6)
-    stops = zip(
-        np.linspace(low, high, _COLOURS).tolist(), palette_steps(palette, _COLOURS), strict=True
+    stops = np.linspace(low, high, _COLOURS).tolist()
+    items = "\n".join(
+        f'<item value="{value:.6g}" color="{colour}" alpha="255" '
+        f'label="{value:.3g} {escape(unit)}"/>'
+        for value, colour in zip(stops, palette_steps(palette, _COLOURS), strict=True)
     )
-    root = ET.Element("qgis", version="3.28", styleCategories="Symbology")
-    renderer = ET.SubElement(
-        ET.SubElement(root, "pipe"), "rasterrenderer", type="singlebandpseudocolor", band="1",
-        opacity="1", alphaBand="-1",
-        classificationMin=f"{low:.6g}", classificationMax=f"{high:.6g}",
-    )  # fmt: skip
-    shader = ET.SubElement(
-        ET.SubElement(renderer, "rastershader"), "colorrampshader",
-        colorRampType="INTERPOLATED", classificationMode="1", clip="0",
-        minimumValue=f"{low:.6g}", maximumValue=f"{high:.6g}",
-    )  # fmt: skip
-    for value, colour in stops:
-        ET.SubElement(
-            shader, "item", value=f"{value:.6g}", color=colour, alpha="255",
-            label=f"{value:.3g} {unit}",
-        )  # fmt: skip
-    ET.indent(root)
     with atomic_path(raster.with_suffix(".qml")) as path:
-        path.write_text(ET.tostring(root, encoding="unicode") + "\n")
+        path.write_text(
+            '<qgis version="3.28" styleCategories="Symbology"><pipe>\n'
+            '<rasterrenderer type="singlebandpseudocolor" band="1" opacity="1" alphaBand="-1" '
+            f'classificationMin="{low:.6g}" classificationMax="{high:.6g}">\n'
+            '<rastershader><colorrampshader colorRampType="INTERPOLATED" classificationMode="1" '
+            f'clip="0" minimumValue="{low:.6g}" maximumValue="{high:.6g}">\n'
+            f"{items}\n"
+            "</colorrampshader></rastershader></rasterrenderer></pipe></qgis>\n"
+        )

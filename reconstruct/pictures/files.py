@@ -1,5 +1,6 @@
 """Picture files as cameras write them: found, checked by decoding them whole, and copied."""
 
+import math
 import os
 import re
 import shutil
@@ -8,7 +9,6 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, tzinfo
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +44,6 @@ ADVICE = {
     IN_FOLDERS: "take them with --recursive, or give these folders too",
     "other files": "their names are not those of pictures",
 }
-_NAMED = 3
 _GPS, _EXIF, _FOCAL_35 = 0x8825, 0x8769, 0xA405
 _MAKE, _MODEL, _SERIAL, _ORIENTATION = 0x010F, 0x0110, 0xA431, 0x0112
 _MIRRORED = (2, 4, 5, 7)
@@ -90,13 +89,6 @@ class PictureFolder:
     left_out: Mapping[str, tuple[Path, ...]]
     """What is not a picture that can be read, by reason."""
 
-    def warnings(self) -> list[str]:
-        """A line for each reason: how many, such as which, and what to do."""
-        return [
-            f"{self.folder}: {_name_some(reason, paths)} left out; {ADVICE[reason]}"
-            for reason, paths in self.left_out.items()
-        ]
-
 
 def look_into(
     folder: Path, apart: Collection[Path] = (), *, recursive: bool = False
@@ -112,39 +104,46 @@ def look_into(
         ImageError: it is not a folder that can be read, or it holds no picture.
     """
     known = {path.resolve() for path in apart}
+    inside: list[Path] = []
     try:
-        inside = _walk(folder, known) if recursive else list(folder.iterdir())
+        for top, folders, names in os.walk(folder, onerror=_raise):
+            for some in (folders, names):
+                some[:] = [
+                    name for name in some
+                    if not name.startswith(".") and Path(top, name).resolve() not in known
+                ]  # fmt: skip
+            inside += [Path(top, name) for name in names]
     except OSError as error:
         raise ImageError(f"{folder}: cannot be read: {error.strerror}") from None
-    inside = [p for p in inside if not p.name.startswith(".")]
     inside.sort(key=lambda p: [(natural_key(part), part) for part in p.relative_to(folder).parts])
-    files = [p for p in inside if not p.is_dir() and kind_of(p)]
-    stems = {p.with_suffix("") for p in files}
-    masks = tuple(p for p in files if _is_mask(p, stems))
-    pictures = tuple(p for p in files if p not in masks)
-    left_out: dict[str, list[Path]] = {}
+    stems = {p.with_suffix("") for p in inside if kind_of(p)}
+    pictures: list[Path] = []
+    masks: list[Path] = []
+    left_out: dict[str, list[Path]] = {reason: [] for reason in ADVICE}
     for path in inside:
-        if path in files or path.resolve() in known:
-            continue
-        if path.is_dir():
-            deeper = [p for p in sorted(path.rglob("*")) if kind_of(p) and p.is_file()]
-            if deeper and not any(other.is_relative_to(path.resolve()) for other in known):
-                left_out.setdefault(IN_FOLDERS, []).extend(deeper)
-            continue
-        suffix = path.suffix.lower()
-        reason = "HEIC" if suffix in HEIC else "video" if suffix in VIDEO else "other files"
-        left_out.setdefault(reason, []).append(path)
-    found = PictureFolder(
-        folder=folder,
-        pictures=pictures,
-        masks=masks,
-        left_out={reason: tuple(left_out[reason]) for reason in ADVICE if reason in left_out},
-    )
+        suffix, is_picture = path.suffix.lower(), bool(kind_of(path))
+        if not recursive and path.parent != folder:
+            left_out[IN_FOLDERS] += [path] if is_picture else []
+        elif not is_picture:
+            reason = "HEIC" if suffix in HEIC else "video" if suffix in VIDEO else "other files"
+            left_out[reason].append(path)
+        else:
+            own = path.stem.removesuffix("_mask")
+            is_mask = own != path.stem and path.with_name(own) in stems
+            (masks if is_mask else pictures).append(path)
     if not pictures:
-        held = [_name_some(reason, paths) for reason, paths in found.left_out.items()]
-        but = f", but {', '.join(held)}: {ADVICE[next(iter(found.left_out))]}" if held else ""
-        raise ImageError(f"{folder}: holds no pictures (JPEG, PNG, TIFF or camera RAW){but}")
-    return found
+        held = [f"{len(paths)} {reason}; {ADVICE[reason]}" for reason, paths in left_out.items()
+                if paths]  # fmt: skip
+        raise ImageError(
+            f"{folder}: holds no pictures (JPEG, PNG, TIFF or camera RAW)"
+            + (f", but {', '.join(held)}" if held else "")
+        )
+    return PictureFolder(
+        folder=folder,
+        pictures=tuple(pictures),
+        masks=tuple(masks),
+        left_out={reason: tuple(paths) for reason, paths in left_out.items() if paths},
+    )
 
 
 def kind_of(path: Path) -> str:
@@ -153,40 +152,14 @@ def kind_of(path: Path) -> str:
     return next((kind for kind, names in kinds.items() if path.suffix.lower() in names), "")
 
 
-def _name_some(reason: str, paths: Sequence[Path]) -> str:
-    """Such as `2 HEIC (a.heic, b.heic)`; of folders inside, their names."""
-    names = [p.name for p in paths]
-    if reason == IN_FOLDERS:
-        names = list(dict.fromkeys(p.parent.name for p in paths))
-    more = ", ..." if len(names) > _NAMED else ""
-    return f"{len(paths)} {reason} ({', '.join(names[:_NAMED])}{more})"
-
-
 def list_names(names: Sequence[str], maximum: int = 8) -> str:
     """The first few of some names, and how many more there are."""
     rest = len(names) - maximum
     return ", ".join(names[:maximum]) + (f" and {rest} more" if rest > 0 else "")
 
 
-def _walk(folder: Path, apart: Collection[Path]) -> list[Path]:
-    """Files of a folder and of those inside, without hidden folders and those apart."""
-    found = []
-    for top, folders, names in os.walk(folder, onerror=_raise):
-        place = Path(top)
-        folders[:] = [
-            f for f in folders if not f.startswith(".") and (place / f).resolve() not in apart
-        ]
-        found += [place / name for name in names]
-    return found
-
-
 def _raise(error: OSError) -> None:
     raise error
-
-
-def _is_mask(path: Path, stems: set[Path]) -> bool:
-    name = path.stem
-    return name.endswith("_mask") and path.with_name(name.removesuffix("_mask")) in stems
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
@@ -209,10 +182,8 @@ def inspect(path: Path) -> PictureFacts:
     except (ImageError, OSError) as error:
         return PictureFacts(path=path, fault=str(error))
     height, width = pixels.shape[:2]
-    facts = PictureFacts(
-        path=path, width_px=width, height_px=height, highest=int(pixels.max(initial=0))
-    )
-    facts = _with_exif(facts)
+    highest = int(pixels.max(initial=0))
+    facts = _with_exif(PictureFacts(path=path, width_px=width, height_px=height, highest=highest))
     if facts.orientation in _MIRRORED:
         fault = f"a mirror image by its EXIF orientation {facts.orientation}: save it as it is seen"
         return replace(facts, fault=f"{fault}, without that tag")
@@ -221,16 +192,14 @@ def inspect(path: Path) -> PictureFacts:
 
 def read_header(path: Path) -> PictureFacts:
     """What a picture states, without decoding it; size 0 where only decoding can tell."""
-    facts = PictureFacts(path=path)
+    size, raw = (0, 0), path.suffix.lower() in RAW
     try:
         with _pillow(path) as image:
-            facts = PictureFacts(path=path, width_px=image.width, height_px=image.height)
+            size = image.size
     except ImageError as error:
-        fault = "" if path.suffix.lower() in RAW else str(error)
-        return PictureFacts(path=path, fault=fault)
-    if path.suffix.lower() in RAW:  # Pillow sees the small picture inside
-        facts = PictureFacts(path=path)
-    return _with_exif(facts)
+        return PictureFacts(path=path, fault="" if raw else str(error))
+    width, height = (0, 0) if raw else size  # of RAW Pillow sees the small picture inside
+    return _with_exif(PictureFacts(path=path, width_px=width, height_px=height))
 
 
 def decode(path: Path) -> NDArray[Any]:
@@ -305,8 +274,8 @@ def _with_exif(facts: PictureFacts) -> PictureFacts:
         time_local=time_local,
         device=device,
         orientation=orientation if orientation in range(1, 9) else 1,
-        latitude_deg=_angle(gps, 2, 1, "S"),
-        longitude_deg=_angle(gps, 4, 3, "W"),
+        latitude_deg=_angle(gps, 2, 90.0),
+        longitude_deg=_angle(gps, 4, 180.0),
         altitude_m=_altitude(gps),
     )
 
@@ -322,30 +291,28 @@ def _device(exif: Any) -> str:
     return " ".join([*words, *([f"#{serial}"] if serial else [])]).strip()
 
 
-def _number(value: Any) -> float | None:
+def _number(value: Any) -> float:
+    """A number of EXIF; NaN where it is none."""
     try:
-        number = float(Fraction(*value) if isinstance(value, tuple) else value)
+        return float(value)
     except (TypeError, ValueError, ZeroDivisionError, OverflowError):
-        return None
-    return number if np.isfinite(number) else None
+        return math.nan
 
 
-def _angle(gps: Any, key: int, reference: int, negative: str) -> float | None:
+def _angle(gps: Any, key: int, maximum: float) -> float | None:
+    """Degrees from degrees, minutes and seconds; the key before names the hemisphere."""
     stored = gps.get(key)
     parts = [_number(p) for p in stored] if isinstance(stored, tuple) else []
-    if len(parts) != 3 or any(p is None for p in parts):
+    angle = parts[0] + parts[1] / 60.0 + parts[2] / 3600.0 if len(parts) == 3 else math.nan
+    if not 0 <= angle <= maximum:
         return None
-    degrees, minutes, seconds = (float(p or 0.0) for p in parts)
-    angle = degrees + minutes / 60.0 + seconds / 3600.0
-    if not 0 <= angle <= (90 if key == 2 else 180):
-        return None
-    return -angle if str(gps.get(reference, "")).upper().startswith(negative) else angle
+    return -angle if str(gps.get(key - 1, "")).upper()[:1] in ("S", "W") else angle
 
 
 def _altitude(gps: Any) -> float | None:
     altitude = _number(gps.get(6))
     below = gps.get(5) in (1, b"\x01")
-    return None if altitude is None else -altitude if below else altitude
+    return None if not math.isfinite(altitude) else -altitude if below else altitude
 
 
 def exif_focal_px(path: Path, width_px: int, height_px: int) -> float:
@@ -359,7 +326,7 @@ def exif_focal_px(path: Path, width_px: int, height_px: int) -> float:
             stated = _number(image.getexif().get_ifd(_EXIF).get(_FOCAL_35))
     except ImageError:
         return float("nan")
-    if stated is None or not 5 <= stated <= 1000:
+    if not 5 <= stated <= 1000:
         return float("nan")
     return stated / 36.0 * max(width_px, height_px)
 

@@ -1,4 +1,4 @@
-"""How good the pictures of a survey are: sharpness, exposure, contrast, noise and overlap.
+"""How good the pictures of a survey are: sharpness, exposure, contrast and noise.
 
 Every picture is measured by itself, then compared with the survey: what lies far from the median of
 all is listed with the reason. Nothing is left out of the reconstruction because of it.
@@ -14,9 +14,8 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
 
-from alice_survey.core.artefacts import read_stage, refuse_links, write_csv
+from alice_survey.core.artefacts import refuse_links, write_csv
 from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.errors import ImageError, why
 from alice_survey.core.executor import Executor
@@ -39,15 +38,13 @@ OUTLIER_FACTOR = 1.6
 _BLOCK_PX = 48
 _SMOOTHEST_PERCENT = 10
 """Blocks so smooth show hardly anything but noise."""
-_SHARED_POINTS = 15
-"""Common points of the model from which two pictures count as overlapping."""
 _FINE_PX, _MID_PX, _COARSE_PX = 1.0, 2.0, 5.0
 _JUDGED = ("sharpness", "contrast", "brightness", "veil")
 
 
 @dataclass(frozen=True, kw_only=True)
 class PictureQuality:
-    """One picture. NaN (an empty cell) where it could not be read or there is no model."""
+    """One picture. NaN (an empty cell) where it could not be read."""
 
     image: str
     camera: str
@@ -66,12 +63,6 @@ class PictureQuality:
     """Share of pixels that are burnt out in a channel."""
     noise: float = NAN
     """Standard deviation of the grey level where the picture is smoothest, 0 to 1."""
-    points: float = NAN
-    """Points of the sparse model that it shows; 0 when it is not registered."""
-    partners: float = NAN
-    """Pictures of other stations that show enough of the same points."""
-    overlap: float = NAN
-    """Share of its points that the best of those shows too."""
     reasons: tuple[str, ...] = field(default=())
 
     @property
@@ -243,34 +234,7 @@ def _reasons(quality: PictureQuality, spreads: dict[str, tuple[float, float]]) -
         below = middle - math.log(max(getattr(quality, name), 1e-6))
         if below > max(OUTLIER_SIGMAS * sigma, math.log(OUTLIER_FACTOR)):
             reasons.append(f"{word}: {name} is {math.exp(-below):.2f} of the survey's median")
-    if quality.points == 0:
-        reasons.append("not registered in the model")
-    elif quality.partners == 0:
-        reasons.append("overlaps no picture of another station")
     return tuple(reasons)
-
-
-def add_overlap(found: Sequence[PictureQuality], sparse: Path) -> list[PictureQuality]:
-    """Add what the sparse model says about points and overlap with other stations."""
-    from reconstruct.views.model import read_model
-
-    model = read_model(sparse)
-    point, view = model.observations.T
-    size = (int(point.max(initial=0)) + 1, len(model.views))
-    sees = coo_array((np.ones(len(point), np.int64), (point, view)), shape=size).tocsr()
-    station = np.array([one.station for one in model.views])
-    shared = np.where(station[:, None] == station, 0, (sees.T @ sees).toarray())
-    points = np.bincount(view, minlength=len(station))
-    partners = (shared >= _SHARED_POINTS).sum(axis=1)
-    overlap = shared.max(axis=1, initial=0) / np.maximum(points, 1)
-    index = {one.image: i for i, one in enumerate(model.views)}
-    table = np.column_stack([points, partners, overlap])
-    filled = []
-    for quality in found:
-        i = index.get(quality.image)
-        row = np.zeros(3) if i is None else table[i]
-        filled.append(replace(quality, points=row[0], partners=row[1], overlap=row[2]))
-    return filled
 
 
 _NUMBERS = tuple(f.name for f in fields(PictureQuality) if f.type in (float, "float"))
@@ -310,7 +274,7 @@ def quality_report(workspace: Path, executor: Executor) -> tuple[str, dict[str, 
     """Measure all pictures of a workspace and write `quality/quality.csv` and `quality.png`.
 
     Args:
-        workspace: with `images/manifest.csv`; a finished `sparse/` adds the overlaps.
+        workspace: with `images/manifest.csv`.
         executor: where tasks run that read pictures.
 
     Returns:
@@ -326,8 +290,6 @@ def quality_report(workspace: Path, executor: Executor) -> tuple[str, dict[str, 
         raise ImageError(f"{images / 'manifest.csv'} names no picture")
     tasks = [MeasureTask(images=images, record=record) for record in records]
     found = list(executor.map(measure_file, tasks, label="picture quality"))
-    if read_stage(workspace / "sparse") is not None:
-        found = add_overlap(found, workspace / "sparse")
     found = judge(found)
     folder = workspace / "quality"
     write_csv(folder / "quality.csv", _HEADER, (_row(quality) for quality in found))

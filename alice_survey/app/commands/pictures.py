@@ -242,10 +242,10 @@ class ReconstructCommand(DeviceCommand):
     )  # fmt: skip
     export: Literal["undistorted"] | None = option(
         None, "Then write for other programs: pictures without refraction and distortion, with "
-        "the COLMAP model and nerfstudio's transforms.json.",
+        "the COLMAP model.",
     )  # fmt: skip
     crs: str | None = option(
-        None, "Then write rasters, cloud, mesh and track in this projected system too.",
+        None, "Then write rasters, cloud and mesh in this projected system too.",
         metavar="EPSG:N",
     )  # fmt: skip
 

@@ -78,32 +78,12 @@ def test_other_programs_read_what_was_written(workspace: Path):
         == binary.num_reg_images()
         == len(read_model(workspace / "sparse").views)
     )
-    points = np.array([p.xyz for p in binary.points3D.values()])[::10]
-    enu = points[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
-    about = json.loads((folder / "transforms.json").read_text())
-    images = {image.name: image for image in text.images.values()}
-    assert about["camera_model"] == "PINHOLE"
-    assert len(about["frames"]) == len(images)
-    for frame in about["frames"]:
-        picture = cv2.imread(str(folder / frame["file_path"]))
-        mask = cv2.imread(str(folder / frame["mask_path"]), cv2.IMREAD_GRAYSCALE)
-        assert picture.shape[:2] == mask.shape == (frame["h"], frame["w"])
+    for image in text.images.values():
+        picture = cv2.imread(str(folder / "images" / image.name))
+        mask = cv2.imread(str(folder / "masks" / f"{image.name}.png"), cv2.IMREAD_GRAYSCALE)
+        assert picture.shape[:2] == mask.shape == (image.camera.height, image.camera.width)
         assert (picture[mask == 0] == 0).all()
         assert 0.5 < (mask == 255).mean() <= 1.0
         assert picture[mask > 0].std() > 5
-        # OpenGL: x right, y up, looking along -z
-        pose = np.array(frame["transform_matrix"])
-        local = (enu - pose[:3, 3]) @ pose[:3, :3]
-        u = frame["cx"] + frame["fl_x"] * local[:, 0] / -local[:, 2]
-        v = frame["cy"] - frame["fl_y"] * local[:, 1] / -local[:, 2]
-        image = images[frame["file_path"].removeprefix("images/")]
-        expected = [image.project_point(p) for p in points]
-        ahead = np.array([one is not None for one in expected])
-        np.testing.assert_allclose(
-            np.column_stack([u, v])[ahead],
-            np.array([e for e in expected if e is not None]),
-            atol=1e-3,
-            rtol=1e-6,
-        )
     shown = json.loads((folder / "export.json").read_text())["on_surface"]
     assert min(shown.values()) > 0.5
