@@ -55,29 +55,6 @@ class ErrorBudget:
     the priors' means and of the places of corners. The product with its transpose is that part."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class HousingTrial:
-    """How well the views fit one kind of port."""
-
-    port: str
-    noise_px: float
-    criterion: float
-    """Schwarz's: the lower, the likelier."""
-    why: str
-    """Why it could not be calibrated; empty if it could."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class HousingJudgement:
-    """What views under water show of the housing."""
-
-    focal_ratios: Mapping[str, float] = field(default_factory=dict)
-    """Focal lengths as if without a housing, over those in air, by camera."""
-    trials: tuple[HousingTrial, ...] = ()
-    chosen: str = ""
-    """The likeliest of the trials."""
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Calibration:
     """A calibrated rig, with all that is needed to assess it."""
@@ -108,7 +85,8 @@ class Calibration:
     """(V, cameras) noise of each picture over `noise_px`; None if all are equal."""
     shape: TargetShape = AS_DRAWN
     """How the target differs from its drawing: part of `target_points`."""
-    housing: HousingJudgement = HousingJudgement()
+    focal_ratios: Mapping[str, float] = field(default_factory=dict)
+    """Of views under water as if without a housing, over those in air, by camera."""
     spread: ErrorBudget | None = None
     """Noise of the corners and what follows of it; None if it was taken as independent."""
 

@@ -6,30 +6,21 @@ Printers and paper stretch: a sheet longer by 0.1 % along one side moves fx agai
 
 Bends are polynomials over the target's plane; those of degree 2 are mrcal's (`calobject_warp`: each
 parabola is 0 at its edges) and a twist, higher degrees take up what a real plate leaves of them. In
-the plane there are a stretch of x over y and a shear; the size as such is the target's. Of a sheet
-that was printed or glued in pieces every marker may also lie off its place.
+the plane there are a stretch of x over y and a shear; the size as such is the target's.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 from numpy.polynomial import legendre
 
 from alice_survey.core.frames import Array
-from alice_survey.kit.words import with_sigma
 from camera_calib.freedom import NO_PRIOR, Prior
-from camera_calib.targets.target import Target
-
-ShapeKind = Literal["sheet", "markers", "flat"]
-"""What is free: bends, stretch and shear; the place of every marker too; nothing."""
 
 OWNER = "target"
 """Stands in the place of a camera in the names of a target's parameters."""
 BOW_X, BOW_Y, TWIST = f"{OWNER}.bow_x_m", f"{OWNER}.bow_y_m", f"{OWNER}.twist_m"
-MARKER = f"{OWNER}.marker_"
 STRETCH, SHEAR = f"{OWNER}.stretch", f"{OWNER}.shear"
 _BEND_SHARE = 1.0 / 300.0
 """Prior sigma of a bow over the target's diagonal: 1 mm for 300 mm, as of boards on plates."""
@@ -38,8 +29,6 @@ _PER_DEGREE = 0.25
 _DEGREES = 4
 _IN_PLANE = 1e-3
 """Prior sigma of stretch and shear, as of paper and office printers."""
-_OFF_SHARE = 1.0 / 2000.0
-"""Prior sigma of a marker's offset along an axis over the diagonal: 0.2 mm on a sheet of A4."""
 _FLAT_SHARE = 0.02
 """Largest depth over diagonal of a target that can bend as one sheet."""
 
@@ -139,45 +128,4 @@ def usual_shape(points: Array) -> TargetShape:
         modes=np.concatenate([bend, plane]),
         prior_sigmas=np.array([*sigmas, _IN_PLANE, _IN_PLANE]),
         values=np.zeros(len(sigmas) + 2),
-    )
-
-
-def shape_of(target: Target, kind: ShapeKind) -> TargetShape:
-    """How a target may differ from its drawing.
-
-    Its markers are the tags of a grid, and the corners of boards.
-    """
-    if kind == "flat":
-        return AS_DRAWN
-    sheet, points = usual_shape(target.points), target.points
-    if kind == "sheet":
-        return sheet
-    numbers = target.markers
-    of_point = numbers[:, None] == np.unique(numbers)
-    offsets = np.zeros((of_point.shape[1], 2, len(points), 3))
-    for axis in range(2):
-        offsets[:, axis, :, axis] = of_point.T
-    sigma_m = _OFF_SHARE * float(np.linalg.norm(np.ptp(points, axis=0)))
-    names = [f"{MARKER}{number}_{axis}_m" for number in range(len(offsets)) for axis in "xy"]
-    return TargetShape(
-        parameters=(*sheet.parameters, *names),
-        modes=np.concatenate([sheet.modes, offsets.reshape(-1, len(points), 3)]),
-        prior_sigmas=np.concatenate([sheet.prior_sigmas, np.full(len(names), sigma_m)]),
-        values=np.zeros(len(sheet.parameters) + len(names)),
-    )
-
-
-def marker_lines(shape: TargetShape) -> Iterator[str]:
-    """How far markers lie off their places, and the farthest, where they may."""
-    at = [i for i, name in enumerate(shape.parameters) if name.startswith(MARKER)]
-    if not at:
-        return
-    off_mm = 1e3 * shape.values[at].reshape(-1, 2)
-    sigma_mm = 1e3 * np.array([shape.sigmas[shape.parameters[i]] for i in at]).reshape(-1, 2)
-    far = np.linalg.norm(off_mm, axis=1)
-    maximum = int(far.argmax())
-    x, y = (with_sigma(float(off_mm[maximum, k]), float(sigma_mm[maximum, k])) for k in range(2))
-    yield (
-        f"markers: {len(far)} lie {np.sqrt(np.mean(far**2)):.2g} mm rms off their places; the "
-        f"farthest, number {maximum}, by {x} mm along x and {y} mm along y"
     )

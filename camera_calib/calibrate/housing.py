@@ -1,21 +1,17 @@
-"""The calibration of a task: in air, or through the housing that is stated or that fits best.
+"""The calibration of a task: in air, or through the housing that is stated.
 
 A flat port makes focal lengths the water's index times longer than in air, a dome about its pupil
-leaves them as they are. Where both calibrations exist, their ratio shows the housing at once. Else
-each housing is calibrated in turn, and the noise that each leaves is compared, with a price for
-every parameter (G. Schwarz 1978, "Estimating the dimension of a model").
+leaves them as they are. Where both calibrations exist, their ratio shows a wrong housing at once.
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-import numpy as np
-
-from alice_survey.core.errors import AliceError, CalibrationError
+from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import Array
 from camera_calib.calibrate.detect_views import Detections
-from camera_calib.calibrate.options import AUTO, CalibrationTask
+from camera_calib.calibrate.options import CalibrationTask
 from camera_calib.calibrate.solve import (
     blank_camera,
     calibrate_in_air,
@@ -23,14 +19,11 @@ from camera_calib.calibrate.solve import (
     calibrate_through_ports,
     first_cameras,
 )
-from camera_calib.calibrate.start import same_numbering
-from camera_calib.calibration import Calibration, HousingTrial, TargetView
-from camera_calib.camera import Camera
+from camera_calib.calibration import Calibration, TargetView
 from camera_calib.freedom import LensNames, lens_of
-from camera_calib.optics import PORTS, likely_port
+from camera_calib.optics import likely_port
 from camera_calib.ports.flat import FlatPort
 from camera_calib.rig import Rig
-from camera_calib.target_shape import shape_of
 
 
 def calibrate_task(task: CalibrationTask, found: Detections) -> Calibration:
@@ -45,23 +38,18 @@ def calibrate_task(task: CalibrationTask, found: Detections) -> Calibration:
     """
     _check_sizes(task, found)
     if not task.water:
-        cameras = task.cameras(found.sizes, task.ports)
+        cameras = task.cameras(found.sizes)
         start = None if task.start is None else replace(task.start, cameras=cameras)
-        shape = shape_of(task.target, task.target_shape)
-        views = _number_alike(task, found, cameras)
-        return calibrate_in_air(views, task.target.points, found.sizes, task.lenses, start, shape)
+        points = task.target.points
+        return calibrate_in_air(found.views, points, found.sizes, task.lenses, start, task.shape)
     ratios: dict[str, float] = {}
     if task.start is not None:
-        views = _number_alike(task, found, task.start.cameras)
-        ratios = focal_ratios(views, task.target.points, task.start, task.lenses)
-    if AUTO in task.ports.values():
-        calibration = _likeliest(task, found)
-    else:
-        try:
-            calibration = _through(task, found, task.ports)
-        except CalibrationError as error:
-            raise CalibrationError(f"{error}{_other_housing(ratios, task.ports)}") from None
-    return replace(calibration, housing=replace(calibration.housing, focal_ratios=ratios))
+        ratios = focal_ratios(found.views, task.target.points, task.start, task.lenses)
+    try:
+        calibration = _through(task, found)
+    except CalibrationError as error:
+        raise CalibrationError(f"{error}{_other_housing(ratios, task.ports)}") from None
+    return replace(calibration, focal_ratios=ratios)
 
 
 def _check_sizes(task: CalibrationTask, found: Detections) -> None:
@@ -79,55 +67,15 @@ def _check_sizes(task: CalibrationTask, found: Detections) -> None:
             )
 
 
-def _number_alike(
-    task: CalibrationTask, found: Detections, cameras: Mapping[str, Camera]
-) -> Sequence[TargetView]:
-    """Views whose points all cameras number alike."""
-    if not task.target.is_ambiguous or len(cameras) < 2:
-        return found.views
-    points = task.target.points
-    if task.start is None:
-        cameras = first_cameras(found.views, points, cameras, task.lenses)
-    return same_numbering(cameras, found.views, points, task.target.symmetries)
-
-
-def _through(task: CalibrationTask, found: Detections, kinds: Mapping[str, str]) -> Calibration:
-    """The calibration under water through ports of the named kinds."""
-    points, shape = task.target.points, shape_of(task.target, task.target_shape)
-    cameras = task.cameras(found.sizes, kinds)
-    views, sigmas = _number_alike(task, found, cameras), task.sigmas_of(cameras)
+def _through(task: CalibrationTask, found: Detections) -> Calibration:
+    """The calibration under water."""
+    points, views, shape = task.target.points, found.views, task.shape
+    cameras = task.cameras(found.sizes)
+    sigmas = task.sigmas_of(cameras)
     if task.start is None:
         return calibrate_in_water_alone(views, points, cameras, task.lenses, sigmas, shape)
     start = replace(task.start, cameras=cameras)
     return calibrate_through_ports(views, points, start, task.known, task.lenses, sigmas, shape)
-
-
-def _likeliest(task: CalibrationTask, found: Detections) -> Calibration:
-    """The calibration through the likeliest housing, with how the others did."""
-    trials, calibrations = [], {}
-    for kind in PORTS:
-        try:
-            calibrations[kind] = _through(task, found, dict.fromkeys(found.sizes, kind))
-        except AliceError as error:
-            trials.append(
-                HousingTrial(port=kind, noise_px=math.nan, criterion=math.inf, why=str(error))
-            )
-            continue
-        trials.append(judge_housing(kind, calibrations[kind]))
-    best = min(trials, key=lambda trial: trial.criterion).port
-    if best not in calibrations:
-        reasons = "; ".join(f"{trial.port}: {trial.why}" for trial in trials)
-        raise CalibrationError(f"no housing fits the views: {reasons}")
-    chosen = calibrations[best]
-    return replace(chosen, housing=replace(chosen.housing, trials=tuple(trials), chosen=best))
-
-
-def judge_housing(kind: str, found: Calibration) -> HousingTrial:
-    """How well views fit one kind of port; fewer parameters are likelier at the same noise."""
-    coordinates = 2 * int(np.isfinite(found.residuals_px[..., 0]).sum())
-    parameters = 0 if found.rig.covariance is None else len(found.rig.covariance.parameters)
-    criterion = 2.0 * coordinates * math.log(found.noise_px) + parameters * math.log(coordinates)
-    return HousingTrial(port=kind, noise_px=found.noise_px, criterion=criterion, why="")
 
 
 def focal_ratios(

@@ -3,6 +3,7 @@
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
+from typing import Literal
 
 from alice_survey.core.errors import CalibrationError, WorkspaceError
 from camera_calib.calibrate.solve import Intrinsics, blank_camera
@@ -16,11 +17,9 @@ from camera_calib.ports.flat import FlatPort
 from camera_calib.ports.none import NO_PORT, NoPort
 from camera_calib.ports.values import PortValues
 from camera_calib.rig import Rig, read_rig
-from camera_calib.target_shape import ShapeKind
+from camera_calib.target_shape import AS_DRAWN, TargetShape, usual_shape
 from camera_calib.targets.target import Target, parse_target
 
-AUTO = "auto"
-"""The port that is found by trying all."""
 WRITTEN = (
     "rig.json", "rig_carried.json", "calibration.json", "corners.csv", "report.html", "report.json",
 )  # fmt: skip
@@ -46,7 +45,7 @@ class CalibrateOptions:
     cameras: tuple[str, ...] = ()
     """`NAME=PLACE` of each, the reference first."""
     target: str | None = None
-    target_shape: ShapeKind = "sheet"
+    target_shape: Literal["sheet", "flat"] = "sheet"
     output: Path | None = None
     lens: str | None = None
     water: bool = False
@@ -73,7 +72,7 @@ class CalibrationTask:
     lenses: Mapping[str, str]
     """Lens model by camera, of `freedom.LENSES`."""
     ports: Mapping[str, str]
-    """Kind of port by camera, of `optics.PORTS`, or `AUTO` for all; in air none has a port."""
+    """Kind of port by camera, of `optics.PORTS`; in air none has a port."""
     port_values: Mapping[str, Mapping[str, float]]
     """Known parameters of the ports by camera; of those that are found, first values."""
     port_sigmas: Mapping[str, Mapping[str, float]]
@@ -84,32 +83,31 @@ class CalibrationTask:
     """These cameras as calibrated in air, or earlier."""
     known: Intrinsics = "free"
     """Treatment of the start's intrinsics."""
-    target_shape: ShapeKind = "sheet"
+    target_shape: Literal["sheet", "flat"] = "sheet"
     mount: str | None = None
     """How the rig sits on the vehicle, as `with_mount` reads it; None: as of the start."""
     lever_m: tuple[float, float, float] | None = None
 
-    def cameras(
-        self, sizes: Mapping[str, tuple[int, int]], kinds: Mapping[str, str]
-    ) -> dict[str, Camera]:
-        """Cameras of the start, or blank ones, behind ports of some kinds.
+    @property
+    def shape(self) -> TargetShape:
+        """How the target may differ from its drawing."""
+        return AS_DRAWN if self.target_shape == "flat" else usual_shape(self.target.points)
 
-        Args:
-            sizes: width and height of each camera's pictures.
-            kinds: of port, by camera.
-        """
+    def cameras(self, sizes: Mapping[str, tuple[int, int]]) -> dict[str, Camera]:
+        """Cameras of the start, or blank ones of pictures of some sizes, behind their ports."""
         if self.start is None:
             return {
-                name: blank_camera(size, self.lenses[name], self._port(name, kinds[name], NO_PORT))
+                name: blank_camera(size, self.lenses[name], self._port(name, NO_PORT))
                 for name, size in sizes.items()
             }
         return {
-            name: replace(camera, port=self._port(name, kinds[name], camera.port))
+            name: replace(camera, port=self._port(name, camera.port))
             for name, camera in self.start.cameras.items()
         }
 
-    def _port(self, name: str, kind: str, old: PortValues) -> PortValues:
+    def _port(self, name: str, old: PortValues) -> PortValues:
         """First values of a port: those of the start, or usual ones, or as given."""
+        kind = self.ports[name]
         port = old if old.shape == kind else PORTS[kind].guess()
         given = self.port_values[name].items()
         return port.with_parameters({k: v for k, v in given if k in port.parameters})
@@ -282,10 +280,7 @@ def _ports(
     if not options.water:
         return dict.fromkeys(cameras, NoPort.shape)
     if options.port is not None:
-        kinds = _kinds(options.port, cameras, "--port", (*PORTS, AUTO))
-        if AUTO in kinds.values() and len(set(kinds.values())) > 1:
-            raise CalibrationError(f"--port {options.port}: auto is for all cameras alike")
-        return kinds
+        return _kinds(options.port, cameras, "--port", PORTS)
     old = {} if start is None else start.cameras
     known = {name: one.port.shape for name, one in old.items() if one.port.parameters}
     return dict.fromkeys(cameras, FlatPort.shape) | known
@@ -296,7 +291,7 @@ def _check_ports(
 ) -> None:
     """Reject ports of which something is neither given nor known from the start."""
     for name, kind in ports.items():
-        port = PORTS[FlatPort.shape if kind == AUTO else kind]
+        port = PORTS[kind]
         if start is not None and start.cameras[name].port.shape == port.shape:
             continue
         needed = {field.name for field in fields(port) if field.default is MISSING}

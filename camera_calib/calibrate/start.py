@@ -1,12 +1,8 @@
-"""First values of a calibration: target poses, focal lengths, camera poses, one numbering.
+"""First values of a calibration: target poses, focal lengths, camera poses.
 
 Poses come from the closed form for planar targets (T. Collins, A. Bartoli 2014, "Infinitesimal
 plane-based pose estimation", in OpenCV), with every pixel's exact ray in water in place of a
 pinhole's, and are then refined through the ports.
-
-A chessboard of two odd or two even counts looks the same when turned by half a turn, so that two
-cameras may number its corners differently. The rig decides: only with one numbering do the
-cameras stand to each other in the same way in all views.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,7 +10,6 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.errors import CalibrationError
@@ -25,8 +20,6 @@ from camera_calib.camera import Camera
 from camera_calib.freedom import HELD
 from camera_calib.rig import Rig
 from camera_calib.target_shape import is_sheet
-
-Indices = NDArray[np.intp]
 
 MIN_POINTS = 6
 """Fewest points that give a pose: six coordinates and some to spare."""
@@ -272,61 +265,3 @@ def poses_apart(poses: RigidTransform, scale: float) -> Array:
     places = np.linalg.norm(poses.translation[:, None] - poses.translation, axis=-1)
     apart: Array = np.arccos(np.clip(cosines, -1.0, 1.0)) + places / scale
     return apart
-
-
-def same_numbering(
-    cameras: Mapping[str, Camera],
-    views: Sequence[TargetView],
-    points: Array,
-    symmetries: Sequence[Indices],
-) -> list[TargetView]:
-    """Number points in every camera as in the first camera of a view.
-
-    Args:
-        cameras: near the truth.
-        views: what they saw.
-        points: (N, 3) of the target, metres.
-        symmetries: other numberings (`Target.symmetries`).
-    """
-    names = list(cameras)
-    poses = {name: poses_alone(name, cameras[name], views, points) for name in names}
-    turns = [RigidTransform.identity(), *(_motion(points, entry) for entry in symmetries)]
-    numbered = list(views)
-    for c, name in enumerate(names):
-        # The first camera before this one that sees a view is the measure, pair by pair.
-        for other in names[:c]:
-            both = [
-                v for v in poses[name]
-                if next(n for n in names if v in poses[n]) == other
-            ]  # fmt: skip
-            for v, choice in _choices(both, poses[name], poses[other], turns).items():
-                if choice:
-                    pixels = np.empty_like(views[v].pixels[name])
-                    pixels[symmetries[choice - 1]] = views[v].pixels[name]
-                    numbered[v] = replace(numbered[v], pixels={**numbered[v].pixels, name: pixels})
-    return numbered
-
-
-def _motion(points: Array, entry: Indices) -> RigidTransform:
-    """The turn of the target that takes every point i to the place of point entry[i]."""
-    middle = points.mean(axis=0)
-    turn, _ = Rotation.align_vectors(points[entry] - middle, points - middle)
-    return RigidTransform.from_components(middle - turn.apply(middle), turn)
-
-
-def _choices(
-    views: Sequence[int],
-    poses: Mapping[int, RigidTransform],
-    reference: Mapping[int, RigidTransform],
-    turns: Sequence[RigidTransform],
-) -> dict[int, int]:
-    """Which of the turns of the target makes one camera agree with the reference, by view."""
-    if not views:
-        return {}
-    between = RigidTransform.concatenate(
-        [poses[v] * turn.inv() * reference[v].inv() for v in views for turn in turns]
-    )
-    scale = float(np.median([np.linalg.norm(reference[v].translation) for v in views]))
-    distance = poses_apart(between, scale).reshape(len(between), len(views), len(turns))
-    best = distance[int(np.argmin(distance.min(axis=2).sum(axis=1)))]
-    return dict(zip(views, best.argmin(axis=1).tolist(), strict=True))

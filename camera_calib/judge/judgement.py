@@ -35,6 +35,7 @@ from camera_calib.judge.uncertainty import (
     compensation,
     projection_sigma,
     rig_parameters,
+    shape_parameters,
     sigmas_by_range,
     stereo_sigma,
 )
@@ -142,7 +143,7 @@ def judge(
         CalibrationError: the rig has no covariance.
     """
     rig, found = calibration.rig, calibration
-    parameters = rig_parameters(rig, calibration.freedom.prior.parameters)
+    of_rig = rig_parameters(rig, calibration.freedom.prior.parameters)
     range_m = working_range_m or _working_range_m(calibration)
     ranges = tuple(float(r) for r in range_m * _RANGE_STEPS)
     stereo = len(rig.cameras) > 1
@@ -160,7 +161,7 @@ def judge(
     return Judgement(
         calibration=calibration,
         working_range_m=range_m,
-        parameters=parameters,
+        parameters=(*of_rig, *shape_parameters(calibration.shape)),
         baselines_m=baselines_m(rig),
         pictures=tuple(picture_fits(calibration)),
         cameras={name: _camera(calibration, name, range_m, ranges) for name in rig.cameras},
@@ -276,7 +277,7 @@ def _port_verdicts(judged: Judgement) -> Iterator[Verdict]:
                 "and --right, unless the cameras hang upside down",
             )
     for name, camera in rig.cameras.items():
-        ratio = calibration.housing.focal_ratios.get(name)
+        ratio = calibration.focal_ratios.get(name)
         if ratio is not None:
             fits = abs(ratio / camera.port.magnification - 1.0) < _RATIO_OFF
             yield Verdict(
@@ -285,7 +286,7 @@ def _port_verdicts(judged: Judgement) -> Iterator[Verdict]:
                 f"{max(camera.n_water, _FRESH_WATER):.3g} behind a flat port, near 1 behind a dome "
                 "or without a port"
                 + ("" if fits
-                   else f"; calibrate with --port {likely_port(ratio)}, or --port auto"),
+                   else f"; calibrate with --port {likely_port(ratio)}"),
             )  # fmt: skip
         spread_m = _SIGMAS * rig.sigmas.get(f"{name}.port_distance_m", np.inf)
         if np.isfinite(spread_m):
@@ -295,7 +296,7 @@ def _port_verdicts(judged: Judgement) -> Iterator[Verdict]:
                     level="bad",
                     text=f"the flat port of {name} ended {distance_m * 1e3:.2g} mm before the "
                     "pupil, where no housing has glass: the pictures are through a dome, without a "
-                    "port, or in air; try --port auto",
+                    "port, or in air: state its --port",
                 )
     yield from _prior_verdicts(calibration)
 
@@ -319,8 +320,8 @@ def _prior_verdicts(calibration: Calibration) -> Iterator[Verdict]:
         float(moved[largest]), _MOVED_LIMITS,
         f"the views move {prior.parameters[largest]} by {moved[largest]:.1f} sigmas from its prior,"
         " more than any other parameter",
-        ": port, lens or water differ from the prior; try --port auto, or --intrinsics free if the "
-        "focus changed",
+        ": port, lens or water differ from the prior: state the right --port, or --intrinsics free "
+        "if the focus changed",
     )  # fmt: skip
 
 
@@ -372,7 +373,7 @@ def _target_verdicts(judged: Judgement) -> Iterator[Verdict]:
         float(off_m * focal_px / range_m) / calibration.noise_px, (_UNEVEN, np.inf),
         f"corners lie {1e3 * off_m:.3f} mm off their places in the target's plane, which the "
         "sigmas include",
-        ": use a target of even print, or let markers move with --target-shape markers",
+        ": use a target of even print",
     )  # fmt: skip
 
 

@@ -30,7 +30,7 @@ from alice_survey.kit.words import with_sigma
 from camera_calib.calibration import Calibration
 from camera_calib.judge.judgement import Judgement, judge, verdicts
 from camera_calib.judge.residuals import COVERED_REACH, GATE_SIGMAS
-from camera_calib.judge.uncertainty import short_label
+from camera_calib.judge.uncertainty import parameter_cells
 from camera_calib.judge.validation import HeldOut, LengthErrors
 
 _FORMAT = {"format": "alice-survey calibration report", "version": 1}
@@ -150,6 +150,7 @@ def _facts(judged: Judgement) -> Iterator[tuple[str, str]]:
 
 
 def _sections(judged: Judgement) -> Iterator[Section]:
+    shown = [one for one in judged.parameters if one.sigma is not None or one.value != 0.0]
     yield Section(
         title="Parameters",
         text=(
@@ -161,8 +162,8 @@ def _sections(judged: Judgement) -> Iterator[Section]:
         tables=[
             Table(
                 title="Cameras and target",
-                header=("parameter", "value", "unit", "known from", "correlates most with"),
-                rows=[*_camera_rows(judged), *_target_rows(judged.calibration)],
+                header=("parameter", "value", "unit", "correlates most with"),
+                rows=[tuple(row.values()) for row in parameter_cells(shown)],
             )
         ],
     )
@@ -189,27 +190,6 @@ def _sections(judged: Judgement) -> Iterator[Section]:
     ]
     if rejections:
         yield Section(title="Rejected", text=rejections)
-
-
-def _camera_rows(judged: Judgement) -> Iterator[tuple[str, ...]]:
-    for one in judged.parameters:
-        owner, _, field = one.name.rpartition(".")
-        name = f"{owner} {short_label(field)}"
-        if one.sigma is None and one.value != 0.0:
-            yield name, f"{one.value:.6g}", one.unit, "fixed", ""
-        elif one.sigma is not None:
-            known = "views, prior" if one.prior else "views"
-            other = f"{one.most_alike} ({one.correlation:+.2f})" if one.most_alike else ""
-            yield name, with_sigma(one.value, one.sigma), one.unit, known, other
-
-
-def _target_rows(calibration: Calibration) -> Iterator[tuple[str, ...]]:
-    """The target's shape as it was adjusted with the cameras."""
-    for name in calibration.shape.parameters:
-        scale, unit = (1e3, "mm") if name.endswith("_m") else (1e2, "%")
-        value, sigma = calibration.shape.value_and_sigma(name)
-        label = f"target {short_label(name.rpartition('.')[2])}"
-        yield label, with_sigma(scale * value, scale * sigma), unit, "views, prior", ""
 
 
 def _residual_figures(judged: Judgement) -> list[Figure]:

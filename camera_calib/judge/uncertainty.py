@@ -5,6 +5,7 @@ so the pixel's is J S J^T. The derivatives J are the analytic ones of `Camera`.
 """
 
 import math
+import re
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ from alice_survey.kit.words import field_table, with_sigma
 from camera_calib.camera import Camera, pose_jacobian
 from camera_calib.freedom import POSE, all_names, value
 from camera_calib.rig import Covariance, Rig, read_rig
+from camera_calib.target_shape import TargetShape
 
 _OVERLAP_GRID = 25
 """Pixels a side of the reference frame at which the overlap of the cameras is evaluated."""
@@ -30,8 +32,8 @@ _READER_UNITS = (("_px", 1.0, "px"), ("_m", 1e3, "mm"), ("_rad", math.degrees(1.
 RANGES_M = (0.5, 1.0, 2.0, 4.0, 8.0)
 _GRID = 11
 _PARAMETERS = {
-    "parameter": "{name}", "value": "{known} {unit}",
-    "correlates most with": "{most_alike} {correlation:+.2f}",
+    "parameter": "{name}", "value": "{known}", "unit": "{unit}",
+    "correlates most with": "{other}",
 }  # fmt: skip
 _PROJECTIONS = {
     "camera": "{camera}", "at": "{range_m:g} m",
@@ -384,6 +386,42 @@ def rig_parameters(rig: Rig, with_prior: Collection[str] = ()) -> tuple[Paramete
     return tuple(rows)
 
 
+def shape_parameters(shape: TargetShape) -> tuple[Parameter, ...]:
+    """Modes of a target's shape that were adjusted with the cameras."""
+    rows = []
+    for name in shape.parameters:
+        value, sigma = shape.value_and_sigma(name)
+        shown, factor, unit = _reader_unit(name, value)
+        rows.append(
+            Parameter(
+                name=name, value=shown, sigma=sigma * factor, unit=unit, most_alike="",
+                correlation=0.0, prior=True,
+            )
+        )  # fmt: skip
+    return tuple(rows)
+
+
+def parameter_cells(parameters: Collection[Parameter]) -> list[dict[str, str]]:
+    """Names, values with their sigmas, units and strongest correlations as text."""
+    return [
+        {
+            "name": re.sub(r"_(px|m|rad)$", "", one.name),
+            "known": (
+                f"{one.value:.6g} (fixed)" if one.sigma is None
+                else with_sigma(one.value, one.sigma)
+            ),
+            "unit": one.unit,
+            "other": f"{one.most_alike} {one.correlation:+.2f}" if one.most_alike else "",
+        }
+        for one in parameters
+    ]  # fmt: skip
+
+
+def parameter_table(parameters: Collection[Parameter]) -> str:
+    """Parameters and their sigmas as a plain table."""
+    return field_table("Parameters", _PARAMETERS, parameter_cells(parameters))
+
+
 def _reader_unit(name: str, number: float) -> tuple[float, float, str]:
     """Value, factor of its sigma and unit: mm and degrees, not m, radians and sines of tilts."""
     if name.endswith(("normal_x", "normal_y")):
@@ -393,13 +431,6 @@ def _reader_unit(name: str, number: float) -> tuple[float, float, str]:
         if name.endswith(ending):
             return number * factor, factor, unit
     return number, 1.0, ""
-
-
-def short_label(field: str) -> str:
-    """A parameter's name without its unit: `fx_px` as `fx`."""
-    for ending, _, _ in _READER_UNITS:
-        field = field.removesuffix(ending)
-    return field.replace("_", " ")
 
 
 def baselines_m(rig: Rig) -> dict[str, tuple[float, float]]:
@@ -483,7 +514,6 @@ def uncertainty_report(
     }  # fmt: skip
     if len(rig.cameras) > 1:
         data["stereo"] = [stereo_sigma(rig, r, noise_px) for r in ranges]
-    shown = [vars(p) | {"known": with_sigma(p.value, p.sigma or 0.0)} for p in parameters]
     projections = [
         vars(one) | {"camera": name}
         for name, sigmas in data["projection_sigma"].items()
@@ -498,9 +528,9 @@ def uncertainty_report(
         for s in data.get("stereo", ())
     ]  # fmt: skip
     tables = (
-        ("Parameters", _PARAMETERS, shown),
         ("One sigma of a projection over the frame", _PROJECTIONS, projections),
         (f"One sigma of stereo by calibration alone, and by {noise_px:g} px of noise", _STEREO,
          stereo),
     )  # fmt: skip
-    return "\n\n".join(field_table(*table) for table in tables if table[2]), json_values(data)
+    texts = [parameter_table(parameters), *(field_table(*table) for table in tables if table[2])]
+    return "\n\n".join(texts), json_values(data)

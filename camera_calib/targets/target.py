@@ -158,17 +158,6 @@ class Target:
             places = (index // 2 * (1.0 + self.spacing) + index % 2) * self.size_m
         return places
 
-    @cached_property
-    def markers(self) -> Indices:
-        """(N,) number of the tag that a point belongs to; of boards each corner is its own."""
-        rows, columns = self.shape
-        if self.kind != "apriltag":
-            return np.arange(rows * columns)
-        y, x = np.mgrid[:rows, :columns] // 2
-        # Tags count from the bottom left.
-        numbers: Indices = ((self.rows - 1 - y) * self.columns + x).ravel()
-        return numbers
-
     @property
     def outline(self) -> tuple[float, float, float, float]:
         """Least x, least y, greatest x, greatest y of the pattern in the target's frame, metres.

@@ -231,8 +231,8 @@ class CalibrateCommand(SurveyCommand, ThreadsCommand):
         None, "NAME=FOLDER of a camera, for each of up to 8; the reference first."
     )
     target: str | None = option(None, "A target in words, or target.json.")
-    target_shape: Literal["sheet", "markers", "flat"] = option(
-        "sheet", "Found with the cameras: bends and stretch; markers' places too; none."
+    target_shape: Literal["sheet", "flat"] = option(
+        "sheet", "Found with the cameras: bends and stretch; flat: none."
     )
     output: Path | None = OUTPUT
     lens: str | None = option(
@@ -245,8 +245,8 @@ class CalibrateCommand(SurveyCommand, ThreadsCommand):
         None, "Treatment of the intrinsics of --start; prior where it has sigmas."
     )
     port: str | None = option(
-        None, "flat, dome or none, and other ones of some cameras: flat,side=dome; auto: the "
-        "likeliest. That of --start, or flat.",
+        None, "flat, dome or none, and other ones of some cameras: flat,side=dome. Of --start, "
+        "or flat.",
     )  # fmt: skip
     dome_radius: str | None = option(None, "Outer radius of a dome, mm, and others: 80,bow=60.")
     port_distance: str | None = option(None, "Pupil to glass, first value, mm: 20, or 20,tele=45.")

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from camera_calib.calibrate.options import CalibrateOptions
 from camera_calib.camera import Camera
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.rig import read_rig
-from camera_calib.target_shape import BOW_X, ShapeKind
+from camera_calib.target_shape import BOW_X
 from camera_calib.targets.target import parse_target
 from tests.oracles_targets import picture_light, to_srgb
 
@@ -76,7 +77,7 @@ def test_a_board_taken_as_flat_gives_another_focal_length(
     monkeypatch.setattr("camera_calib.judge.report.png_of", lambda _: dot)  # plots take seconds
     shoot(tmp_path / "pictures")
     off, sigma, rms_px = {}, {}, {}
-    kinds: tuple[ShapeKind, ...] = ("flat", "sheet")
+    kinds: tuple[Literal["flat", "sheet"], ...] = ("flat", "sheet")
     for kind in kinds:
         options = CalibrateOptions(
             cameras=(f"camera={tmp_path / 'pictures'}",), target=TARGET.description,

@@ -164,8 +164,8 @@ def test_four_lenses_behind_four_ports_are_found_in_air_and_then_in_water() -> N
     ("given", "fault"),
     [({"port": "flat,stern=dome"}, "no camera is called stern"),
      ({"port": "bow=dome"}, "there is none for left"),
-     ({"port": "cube"}, "'cube' for left; choose none, flat, dome, auto"),
-     ({"port": "flat,dome"}, "two are for all"), ({"port": "auto,bow=dome"}, "auto is for all"),
+     ({"port": "cube"}, "'cube' for left; choose none, flat, dome"),
+     ({"port": "flat,dome"}, "two are for all"),
      ({"glass_mm": "5,bow=thick"}, "'thick' for bow is not a number from 0 to 500"),
      ({"dome_radius_mm": "80,bow=2"}, "--dome-radius 80,bow=2: '2' for bow is not a number from 5"),
      ({"n_glass": "stern=1.5"}, "--n-glass stern=1.5: no camera is called stern"),
@@ -190,7 +190,7 @@ def test_numbers_of_ports_have_sigmas_where_they_are_found_again() -> None:
     assert task.ports["bow"] == "none" and task.ports["side"] == "flat"
     assert task.port_values["left"] == pytest.approx({"glass_thickness_m": 0.005, "n_water": 1.34})
     sizes = {name: (one.width_px, one.height_px) for name, one in rig.cameras.items()}
-    sigmas = task.sigmas_of(task.cameras(sizes, task.ports))
+    sigmas = task.sigmas_of(task.cameras(sizes))
     glass = {f"{n}.glass_thickness_m": 1e-4 for n in ("left", "right")}
     index = {f"{n}.n_glass": 0.01 for n in ("left", "right", "side")}
     assert sigmas == pytest.approx(glass | index)
