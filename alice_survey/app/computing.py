@@ -5,7 +5,7 @@ on an Intel Xeon at 2 GHz. The part that runs as tasks is shared out among worke
 survey have taken here corrects what is left.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -188,67 +188,29 @@ def stage_costs(size: SurveySize) -> dict[str, StageCost]:
     return found
 
 
-def task_memory_mib(
-    stage: str,
-    workspace: Path,
-    camera: CameraConfig,
-    imaging: ImagingConfig,
-    settings: ReconstructConfig,
-) -> float:
-    """What a process that runs tasks of a stage takes; 0 where it is not known."""
-    if stage not in PREDICTED:
-        return 0.0
+def task_memory_mib(stage: str, *survey: Any) -> float:
+    """What a process that runs tasks of a stage takes, of a survey as `workspace_size` has it.
+
+    0 where it is not known.
+    """
     try:
-        size = workspace_size(workspace, camera, imaging, settings)
+        size = workspace_size(*survey) if stage in PREDICTED else None
     except OSError:  # of a picture, which the stage reports
         size = None
     return 0.0 if size is None else stage_costs(size)[stage].worker_mib
 
 
-@dataclass(frozen=True, kw_only=True)
-class SurveyCost:
-    """What some stages of a survey take together."""
+def total_cost(costs: Iterable[StageCost], workers: int) -> dict[str, float]:
+    """Time of stages one after the other, the most memory that one takes, and their disk.
 
-    stages: Mapping[str, StageCost]
-    workers: int
-    """Cores at hand, or workers of a cluster."""
-
-    def time_s(self, workers: int) -> float:
-        """How long they take, one after the other."""
-        return sum(cost.time_s(workers) for cost in self.stages.values())
-
-    def memory_mib(self, workers: int) -> float:
-        """The most that one of them takes."""
-        return max(cost.memory_mib(workers) for cost in self.stages.values())
-
-    @property
-    def disk_mb(self) -> float:
-        """All products, with the most that a stage removes at its end."""
-        kept = sum(cost.product_mb for cost in self.stages.values())
-        return kept + max(cost.scratch_mb for cost in self.stages.values())
-
-    def text(self, unit: str = "core") -> str:
-        """In a line, by the name of what works."""
-        many = self.workers
-        other = f" ({duration(self.time_s(OTHER_CORES))} on {OTHER_CORES})"
-        return (
-            f"about {duration(self.time_s(many))} on {count(many, unit)}"
-            f"{'' if many == OTHER_CORES else other}, "
-            f"{digits(self.memory_mib(many) / 1024, 2)} GiB of memory"
-            f"{' in all' if unit == 'worker' else ''}, {digits(self.disk_mb / 1e3, 2)} GB of disk"
-        )
-
-    def to_json(self) -> dict[str, Any]:
-        """As commands print it."""
-        workers = sorted({self.workers, OTHER_CORES})
-        return {
-            "stages": list(self.stages),
-            "workers": self.workers,
-            "cpu_s": round(sum(cost.cpu_s for cost in self.stages.values())),
-            "time_s": {str(n): round(self.time_s(n)) for n in workers},
-            "memory_mib": {str(n): round(self.memory_mib(n)) for n in workers},
-            "disk_mb": round(self.disk_mb),
-        }
+    The disk holds all products, with the most that a stage removes at its end.
+    """
+    costs = list(costs)
+    return {
+        "time_s": sum(cost.time_s(workers) for cost in costs),
+        "memory_mib": max(cost.memory_mib(workers) for cost in costs),
+        "disk_mb": sum(cost.product_mb for cost in costs) + max(cost.scratch_mb for cost in costs),
+    }
 
 
 def correction(
@@ -299,16 +261,28 @@ def summary(
     ratio, factor, ran = correction(costs, records or {}, processor())
     found: dict[str, Any] = {}
     lines = []
+    many = workers or default_threads()
     for name, stages in groups.items():
-        chosen = {stage: costs[stage].scale(factor) for stage in stages}
-        group = SurveyCost(stages=chosen, workers=workers or default_threads())
-        found[name] = group.to_json()
-        lines.append(f"{name}: {group.text('worker' if workers else 'core')}")
+        chosen = [costs[stage].scale(factor) for stage in stages]
+        all_of = {n: total_cost(chosen, n) for n in sorted({many, OTHER_CORES})}
+        found[name] = {
+            "stages": list(stages),
+            "workers": many,
+            "cpu_s": round(sum(cost.cpu_s for cost in chosen)),
+            "time_s": {str(n): round(one["time_s"]) for n, one in all_of.items()},
+            "memory_mib": {str(n): round(one["memory_mib"]) for n, one in all_of.items()},
+            "disk_mb": round(all_of[many]["disk_mb"]),
+        }
+        here, others = all_of[many], duration(all_of[OTHER_CORES]["time_s"])
+        whose = count(many, "worker" if workers else "core")
+        lines.append(
+            f"{name}: about {duration(here['time_s'])} on {whose} "
+            f"({others} on {OTHER_CORES}), {digits(here['memory_mib'] / 1024, 2)} GiB of memory, "
+            f"{digits(here['disk_mb'] / 1e3, 2)} GB of disk"
+        )
     if lines and size.pixel_m is not None and size.cell_m is not None:
         lines[-1] += f"; {1e3 * size.pixel_m:.2g} mm pixels, {1e3 * size.cell_m:.2g} mm surface"
     if lines and ran:
         found |= {"measured_over_predicted": round(ratio, 3), "corrected_by": round(factor, 3)}
-        lines[-1] += (
-            f"; {', '.join(ran)} took {ratio:.2f} of what was predicted: corrected by {factor:.2f}"
-        )
+        lines[-1] += f"; corrected by {factor:.2f}, since {', '.join(ran)} took {ratio:.2f} of it"
     return "\n".join(lines), found

@@ -219,12 +219,16 @@ def init_survey(
     if name is not None:
         line = f"name = {json.dumps(name)}"  # the first, before all sections
         text = re.sub(r'^name = ".*"', lambda _: line, text, count=1, flags=re.M)
+    if area is not None:
+        rectangle = ("latitude_deg", "longitude_deg", "length_m", "width_m", "heading_deg")
+        named = Path(os.path.relpath(area.resolve(), folder.resolve())).as_posix()
+        values = {"area": dict.fromkeys(rectangle, None) | {"file": named}, **(values or {})}
     if values:
         text = with_settings_changed(text, values)
     parse_config(settings_in(text, "the new survey"), "the new survey")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        path.write_text(text if area is None else _with_area(text, area, folder), encoding="utf-8")
+        path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise WorkspaceError(f"{path}: cannot be written: {error.strerror}") from None
     return path
@@ -235,23 +239,6 @@ def template_text(template: str = "survey.toml") -> str:
     if template == "survey.toml":
         return settings_template()
     return (resources.files("alice_survey") / template).read_text(encoding="utf-8")
-
-
-def _with_area(text: str, area: Path, folder: Path) -> str:
-    """Settings whose rectangle is replaced by the area of a file, named from the folder."""
-    rectangle = ("latitude_deg", "longitude_deg", "length_m", "width_m", "heading_deg")
-    own = re.compile(rf"^(?=({'|'.join(rectangle)}) = )", re.MULTILINE)
-    try:
-        named = Path(os.path.relpath(area.resolve(), folder.resolve())).as_posix()
-    except ValueError:  # on another drive
-        named = area.resolve().as_posix()
-    return re.sub(
-        r"^# file = .*$",
-        lambda _: f"file = {json.dumps(named)}",
-        own.sub("# ", text),
-        count=1,
-        flags=re.M,
-    )
 
 
 def run_demo(workspace: Path, executor: Executor | None) -> tuple[str, dict[str, Any]]:

@@ -13,10 +13,10 @@ from alice_survey.app.cli.main import app
 from alice_survey.app.computing import (
     PREDICTED,
     StageCost,
-    SurveyCost,
     correction,
     size_of,
     stage_costs,
+    total_cost,
 )
 from alice_survey.core.artefacts import StageRecord
 from alice_survey.core.config import ReconstructConfig
@@ -42,12 +42,12 @@ def test_tasks_are_shared_out_and_the_rest_is_not() -> None:
 
 def test_memory_is_of_the_largest_stage_and_disk_of_all() -> None:
     other = replace(COST, worker_mib=100.0, process_mib=1500.0, product_mb=100.0, scratch_mb=50.0)
-    both = SurveyCost(stages={"mapping": COST, "dense": other}, workers=2)
-
-    assert both.memory_mib(2) == 1700.0
-    assert both.memory_mib(16) == 300.0 + 16 * 500.0
-    assert both.disk_mb == 7.0 + 100.0 + 50.0
-    assert both.time_s(2) == COST.time_s(2) + other.time_s(2)
+    assert total_cost([COST, other], 2) == {
+        "time_s": COST.time_s(2) + other.time_s(2),
+        "memory_mib": 1700.0,
+        "disk_mb": 7.0 + 100.0 + 50.0,
+    }
+    assert total_cost([COST, other], 16)["memory_mib"] == 300.0 + 16 * 500.0
 
 
 def test_a_survey_that_was_not_learned_from_costs_what_it_did() -> None:

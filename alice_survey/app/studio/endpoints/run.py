@@ -13,9 +13,9 @@ from pydantic import Field
 
 from alice_survey.app.computing import (
     StageCost,
-    SurveyCost,
     correction,
     stage_costs,
+    total_cost,
     workspace_size,
 )
 from alice_survey.app.pipeline import settings, stage_states
@@ -124,12 +124,8 @@ def _costs(
 
 
 def _cost_json(costs: Mapping[str, StageCost]) -> dict[str, float]:
-    cost = SurveyCost(stages=costs, workers=default_threads())
-    return {
-        "time_s": round(cost.time_s(cost.workers), 1),
-        "memory_mib": round(cost.memory_mib(cost.workers)),
-        "disk_mb": round(cost.disk_mb, 1),
-    }
+    total = total_cost(costs.values(), default_threads())
+    return {name: round(value, 1) for name, value in total.items()}
 
 
 def _commands(
