@@ -61,10 +61,13 @@ def run(
     for section, values in (changes or {}).items():
         config = change_section(config, section, **values)
         if getattr(config, section) != getattr(as_written, section):
-            given = ", ".join(k for k, value in values.items() if value is not None)
+            given = {key: value for key, value in values.items() if value is not None}
+            lines = ", ".join(
+                f"{k} = {json.dumps(value, default=str)}" for k, value in given.items()
+            )
             warn(
-                f"{given} below [{section}] holds for this run alone; the next without it makes "
-                "again what depends on it: to keep it, put it into survey.toml"
+                f"{lines} holds for this run alone, and the next without it makes what depends on "
+                f"it again: to keep it, put it below [{section}] in survey.toml"
             )
     if imported:
         if len(stages) > 1:  # a rig of real pictures comes with them

@@ -52,11 +52,6 @@ class Config(BaseModel):
     """A settings section: immutable, and an unknown key is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-    constants: ClassVar[Mapping[str, Any]] = {}
-    """Settings that are gone, and their values: files may still hold these, for one version, and
-    stages record them, so that those of earlier versions stay up to date."""
-    unrecorded: ClassVar[frozenset[str]] = frozenset()
-    """Those of them that stages do not record."""
 
     @field_validator("*", mode="before")
     @classmethod
@@ -79,12 +74,6 @@ class AreaConfig(Config):
     or a file. The datum is the origin of the local North-East-Down frame, on the sea surface; of a
     shape in geographic or projected coordinates it is the middle unless it is given.
     """
-
-    constants: ClassVar[Mapping[str, Any]] = {
-        "datum_at": "corner", "corridor_latlon_deg": None, "no_go_latlon_deg": [],
-        "allowed_latlon_deg": None, "no_go_layer": None, "allowed_layer": None,
-        "bathymetry_crs": None,
-    }  # fmt: skip
 
     latitude_deg: Latitude = setting(
         32.8236, "the datum: origin of local north, east, down, on the sea surface"
@@ -252,8 +241,6 @@ class WaterConfig(Config):
     `SurveyConfig` sets `n_water` for the depth of its sea floor.
     """
 
-    constants: ClassVar[Mapping[str, Any]] = {"wavelength_nm": None}
-
     n_water: float = setting(
         1.34, "index of refraction; or leave it out and give the next keys:", ge=1, le=1.4
     )
@@ -289,10 +276,6 @@ class WaterConfig(Config):
 class PlanConfig(Config):
     """Settings of the plan: altitude, speed, overlap, lines and turns."""
 
-    constants: ClassVar[Mapping[str, Any]] = {
-        "strobe_lead_s": 0.0002, "split_dives": True, "tie_dives": True,
-    }  # fmt: skip
-    unrecorded: ClassVar[frozenset[str]] = frozenset({"tie_dives"})
     strobe_lead_s: ClassVar[float] = 0.0002
     """The strobe lights so long before the exposure and after it."""
 
@@ -372,11 +355,6 @@ class VehicleConfig(Config):
     Battery and hotel load are ALICE's; of another vehicle its own, where they are not set.
     """
 
-    constants: ClassVar[Mapping[str, Any]] = {
-        "thruster_health": dict.fromkeys(("starboard", "port", "vertical", "bow", "stern"), 1.0),
-        "health_known": True, "coefficients_file": None, "finds_failures": True,
-    }  # fmt: skip
-    unrecorded: ClassVar[frozenset[str]] = frozenset({"finds_failures"})
     finds_failures: ClassVar[bool] = True
     """Whether the vehicle watches how its thrusters turn, and what they push."""
 
@@ -454,9 +432,6 @@ class SeaConfig(Config):
     Swell comes on top.
     """
 
-    constants: ClassVar[Mapping[str, Any]] = {
-        "current_correlation_s": 300.0, "gust_correlation_s": 2.0
-    }  # fmt: skip
     current_correlation_s: ClassVar[float] = 300.0
     gust_correlation_s: ClassVar[float] = 2.0
     """How long slow changes of the current and random forces last."""
@@ -484,7 +459,6 @@ class SeaConfig(Config):
 class NavigationConfig(Config):
     """Navigation sensors of the vehicle; the rest as in `vehicle.navigation.sensors`."""
 
-    constants: ClassVar[Mapping[str, Any]] = {"gps_noise_m": 0.02, "usbl": True}
     gps_noise_m: ClassVar[float] = 0.02
 
     gps_bias_m: float = setting(
@@ -525,9 +499,6 @@ class SeafloorConfig(Config):
 class ImagingConfig(Config):
     """Settings of taking and rendering pictures."""
 
-    constants: ClassVar[Mapping[str, Any]] = {
-        "image_format": "png", "samples": 2, "noise": True, "range_maps": False
-    }  # fmt: skip
     samples: ClassVar[int] = 2
     """Rays a pixel, along x and along y."""
 
@@ -545,10 +516,6 @@ class ImagingConfig(Config):
 class ReconstructConfig(Config):
     """Settings of the reconstruction."""
 
-    constants: ClassVar[Mapping[str, Any]] = {
-        "feature_scale": None, "working_range_m": None, "mapper": "auto", "dense_partners": 4,
-        "mesh_triangles": None, "mesh_tiles": "auto", "mesh_page_px": 8192, "dispersion": "auto",
-    }  # fmt: skip
     mapper: ClassVar[str] = "auto"
     dispersion: ClassVar[str] = "auto"
     """Only recorded, so that models and mosaics of earlier versions stay up to date."""
@@ -659,44 +626,68 @@ class SurveyConfig(Config):
 
 
 _GEO = "give the corners as 'wkt', longitude before latitude, with crs = \"EPSG:4326\", or a file"
+_HEALTHY = dict.fromkeys(("starboard", "port", "vertical", "bow", "stern"), 1.0)
 _ALWAYS = "it is always so: leave it out"
-REMOVED = {
-    "area.datum_at": "the datum is the first corner: move it there",
-    "area.corridor_latlon_deg": _GEO,
-    "area.no_go_latlon_deg": "give the corners in a no_go_file",
-    "area.allowed_latlon_deg": "give the corners in an allowed_file",
-    "area.no_go_layer": "save the layer as a file of its own",
-    "area.allowed_layer": "save the layer as a file of its own",
-    "area.bathymetry_crs": "set 'crs', which counts for the raster too",
-    "water.wavelength_nm": "the index is that of green light; set n_water for another colour",
-    "plan.strobe_lead_s": "it is 0.0002 s: leave it out",
-    "plan.split_dives": _ALWAYS,
-    "plan.tie_dives": _ALWAYS,
-    "vehicle.thruster_health": 'write failures = ["NAME=SHARE"]',
-    "vehicle.health_known": 'a failure from 0 s on is unknown: failures = ["NAME=SHARE@0"]',
-    "vehicle.lost_propellers": 'write failures = ["NAME:propeller@SECONDS"]',
-    "vehicle.finds_failures": _ALWAYS,
-    "vehicle.coefficients_file": "write the file's name as 'coefficients'",
-    "vehicle.follower": "a mission file is flown by the autopilot that it is for",
-    "vehicle.cola2_delta_m": "it is what about.txt of the exports says",
-    "sea.current_correlation_s": "it is 300 s: leave it out",
-    "sea.gust_correlation_s": "it is 2 s: leave it out",
-    "navigation.gps_noise_m": "a fix is noisy by 0.02 m: leave it out",
-    "navigation.usbl": "usbl_noise_m = 0 means that there is none",
-    "imaging.samples": "pictures have 2 x 2 rays a pixel: leave it out",
-    "imaging.noise": _ALWAYS,
-    "imaging.range_maps": "the truth holds the sea floor and every pose: leave it out",
-    "imaging.image_format": "rendered pictures are PNG: leave it out",
-    "reconstruct.feature_scale": "it follows from the pictures: leave it out",
-    "reconstruct.working_range_m": "it follows from navigation and the model: leave it out",
-    "reconstruct.mapper": "it is chosen by the pictures: leave it out",
-    "reconstruct.dense_partners": "each picture is matched with 4: leave it out",
-    "reconstruct.mesh_triangles": "raise mesh_error_px for fewer triangles",
-    "reconstruct.mesh_tiles": "they are made where mesh.glb lacks detail: leave it out",
-    "reconstruct.mesh_page_px": "it is 8192: leave it out",
-    "reconstruct.dispersion": "it is corrected where the rig shows it: leave it out",
+REMOVED: Mapping[str, tuple[Any, str]] = {
+    "area.datum_at": ("corner", "the datum is the first corner: move it there"),
+    "area.corridor_latlon_deg": (None, _GEO),
+    "area.no_go_latlon_deg": ([], "give the corners in a no_go_file"),
+    "area.allowed_latlon_deg": (None, "give the corners in an allowed_file"),
+    "area.no_go_layer": (None, "save the layer as a file of its own"),
+    "area.allowed_layer": (None, "save the layer as a file of its own"),
+    "area.bathymetry_crs": (None, "set 'crs', which counts for the raster too"),
+    "water.wavelength_nm": (
+        None,
+        "the index is that of green light; else set n_water",
+    ),
+    "plan.strobe_lead_s": (0.0002, "it is 0.0002 s: leave it out"),
+    "plan.split_dives": (True, _ALWAYS),
+    "plan.tie_dives": (True, _ALWAYS),
+    "vehicle.thruster_health": (
+        dict.fromkeys(("starboard", "port", "vertical", "bow", "stern"), 1.0),
+        'write failures = ["NAME=SHARE"]',
+    ),
+    "vehicle.health_known": (True, 'a failure from 0 s on is unknown: failures = ["NAME=SHARE@0"]'),
+    "vehicle.lost_propellers": (..., 'write failures = ["NAME:propeller@SECONDS"]'),
+    "vehicle.finds_failures": (True, _ALWAYS),
+    "vehicle.coefficients_file": (None, "write the file's name as 'coefficients'"),
+    "vehicle.follower": (..., "a mission file is flown by the autopilot that it is for"),
+    "vehicle.cola2_delta_m": (..., "it is what about.txt of the exports says"),
+    "sea.current_correlation_s": (300.0, "it is 300 s: leave it out"),
+    "sea.gust_correlation_s": (2.0, "it is 2 s: leave it out"),
+    "navigation.gps_noise_m": (0.02, "a fix is noisy by 0.02 m: leave it out"),
+    "navigation.usbl": (True, "usbl_noise_m = 0 means that there is none"),
+    "imaging.samples": (2, "pictures have 2 x 2 rays a pixel: leave it out"),
+    "imaging.noise": (True, _ALWAYS),
+    "imaging.range_maps": (False, "the truth holds the sea floor and every pose: leave it out"),
+    "imaging.image_format": ("png", "rendered pictures are PNG: leave it out"),
+    "reconstruct.feature_scale": (None, "it follows from the pictures: leave it out"),
+    "reconstruct.working_range_m": (None, "it follows from navigation and the model: leave it out"),
+    "reconstruct.mapper": ("auto", "it is chosen by the pictures: leave it out"),
+    "reconstruct.dense_partners": (4, "each picture is matched with 4: leave it out"),
+    "reconstruct.mesh_triangles": (None, "raise mesh_error_px for fewer triangles"),
+    "reconstruct.mesh_tiles": ("auto", "they are made where mesh.glb lacks detail: leave it out"),
+    "reconstruct.mesh_page_px": (8192, "it is 8192: leave it out"),
+    "reconstruct.dispersion": ("auto", "it is corrected where the rig shows it: leave it out"),
 }
-"""Settings of version 0.1 that are gone, and what to do; for one version."""
+"""Settings of version 0.1 that are gone: what now always holds, if anything, and what to do.
+
+Files may still hold that value, for one version, and stages record it, so that those of earlier
+versions stay up to date.
+"""
+UNRECORDED = frozenset({"plan.tie_dives", "vehicle.finds_failures"})
+"""Those of them that stages do not record."""
+
+
+def constants_of(section: str) -> dict[str, Any]:
+    """Values that settings of a section which are gone now always have."""
+    return {
+        key: value
+        for name, (value, _) in REMOVED.items()
+        if value is not ... and (key := name.removeprefix(f"{section}.")) != name
+    }
+
+
 _MAX_LENGTH = 1_000_000
 _MAX_FAULTS = 8
 """Faults reported at once."""
@@ -810,13 +801,9 @@ def _without_constants(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Settings without those that are gone and had the value that now always holds."""
     result = dict(settings)
     for section, values in settings.items():
-        field = SurveyConfig.model_fields.get(section)
-        kind = None if field is None else field.annotation
-        if isinstance(values, dict) and isinstance(kind, type) and issubclass(kind, Config):
-            gone = kind.constants
-            result[section] = {
-                key: value for key, value in values.items() if key not in gone or gone[key] != value
-            }  # fmt: skip
+        if isinstance(values, dict):
+            gone = constants_of(section)
+            result[section] = {k: v for k, v in values.items() if k not in gone or gone[k] != v}
     return result
 
 
@@ -906,7 +893,7 @@ def _one_line(error: ValidationError) -> str:
     for fault in error.errors()[:_MAX_FAULTS]:
         key = as_line(".".join(map(str, fault["loc"]))) or "settings"
         if key in REMOVED:
-            faults.append(f"{key} is gone: {REMOVED[key]}")
+            faults.append(f"{key} is gone: {REMOVED[key][1]}")
         elif fault["type"] == "extra_forbidden":
             faults.append(f"{key} is not a known setting{_nearest(*map(str, fault['loc']))}")
         elif fault["type"] == "value_error":

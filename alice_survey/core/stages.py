@@ -16,7 +16,7 @@ from pydantic import BaseModel
 
 from alice_survey.core import artefacts, records
 from alice_survey.core.artefacts import Stage, read_stage, run_stage, why_stale
-from alice_survey.core.config import VEHICLE_FILES, Config
+from alice_survey.core.config import UNRECORDED, VEHICLE_FILES, Config, constants_of
 from alice_survey.core.errors import AliceError
 from alice_survey.core.executor import Executor
 
@@ -176,14 +176,13 @@ def settings_of(requested: Any, config: Config) -> Any:
         include=None if part.only is None else set(part.only),
         exclude=set(part.without),
     )
-    kept = {}
-    if isinstance(value, Config):
-        left_out = part.without | value.unrecorded
-        kept = {
-            name: constant
-            for name, constant in value.constants.items()
-            if name not in left_out and (part.only is None or name in part.only)
-        }
+    kept = {
+        name: constant
+        for name, constant in constants_of(part.section).items()
+        if name not in part.without
+        and (part.only is None or name in part.only)
+        and f"{part.section}.{name}" not in UNRECORDED
+    }
     return kept | {name: _file_name(getattr(value, name), values[name]) for name in values}
 
 

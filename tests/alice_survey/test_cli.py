@@ -215,35 +215,31 @@ def test_a_plane_that_cannot_be_read_is_one_line(
     assert "two planes are named 'level'" in said
 
 
-def test_planes_of_the_command_line_hold_for_one_run(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("words", "line", "template"),
+    [
+        (["reconstruct", "--plane", "wall=facing 180"], 'planes = ["wall=facing 180"]', "# planes"),
+        (["image", "--scale", "4"], "scale = 4", "scale"),
+    ],
+)
+def test_a_setting_of_the_command_line_holds_for_one_run(
+    words: list[str],
+    line: str,
+    template: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     path = init_survey(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["alice-survey", "reconstruct", "-w", str(tmp_path),
-                                      "--plane", "wall=facing 180"])  # fmt: skip
+    monkeypatch.setattr(sys, "argv", ["alice-survey", *words, "-w", str(tmp_path)])
     with pytest.raises(SystemExit):
-        main()  # there are no pictures
-    shown = capsys.readouterr().err
-    assert 'planes = ["wall=facing 180"]' in shown
-    text = path.read_text().replace("# planes = [", 'planes = ["wall=facing 180"]  # [')
+        main()  # there are no pictures, and there is no flight
+    assert line in capsys.readouterr().err
+    text = re.sub(rf"^{template} = \S+", line, path.read_text(), flags=re.MULTILINE)
     path.write_text(text)
     with pytest.raises(SystemExit):
         main()
-    assert "hold for this run" not in capsys.readouterr().err
-
-
-def test_a_scale_of_the_command_line_holds_for_one_run(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = init_survey(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["alice-survey", "image", "-w", str(tmp_path), "--scale", "4"])
-    with pytest.raises(SystemExit):
-        main()  # there is no flight
-    assert "put scale = 4 below [imaging]" in capsys.readouterr().err
-    path.write_text(re.sub("^scale = 1 ", "scale = 4 ", path.read_text(), flags=re.MULTILINE))
-    with pytest.raises(SystemExit):
-        main()
-    assert "holds for this run" not in capsys.readouterr().err
+    assert "for this run" not in capsys.readouterr().err
 
 
 def test_status_names_the_next_command(tmp_path: Path) -> None:

@@ -8,16 +8,14 @@ import pytest
 from typer.testing import CliRunner
 
 from alice_survey.app.cli.main import app
-from alice_survey.app.commands.fov_tables import FovOptions, Output, fov_report, validation_report
+from alice_survey.app.commands.fov_tables import FovOptions, fov_report, validation_report
 from alice_survey.core.config import CameraConfig, WaterConfig
 from alice_survey.core.errors import AliceError, ConfigError
 from camera_calib.rig import design_rig, write_rig
 
-QUIET = Output()
-
 
 def rows(**options: Any) -> list[dict[str, float]]:
-    return fov_report(FovOptions(**options), QUIET)[1]["rows"]
+    return fov_report(FovOptions(**options))[1]["rows"]
 
 
 def test_options_reach_the_rows() -> None:
@@ -32,7 +30,7 @@ def test_a_survey_s_settings_are_taken_unless_said_otherwise(tmp_path: Path) -> 
         "[camera]\nfocal_mm = 16.0\nport_distance_m = 0.05\n[water]\nn_water = 1.337\n"
         "[plan]\naltitude_m = 1.7\nspeed_mps = 0.3\nallowed_blur_px = 0.5\n"
     )
-    _, data = fov_report(FovOptions(survey=survey), QUIET)
+    _, data = fov_report(FovOptions(survey=survey))
     [row] = data["rows"]
     assert (row["lens_mm"], row["altitude_m"], row["n_water"]) == (16.0, 1.7, 1.337)
     assert row["port"] == "port 50 mm + glass 10 mm"
@@ -72,22 +70,20 @@ def test_a_rig_brings_lens_and_port_and_may_change_its_water(
 )
 def test_faults_are_one_line(options: dict[str, object], named: str) -> None:
     with pytest.raises(AliceError, match=named) as fault:
-        fov_report(FovOptions(**options), QUIET)  # type: ignore[arg-type]
+        fov_report(FovOptions(**options))  # type: ignore[arg-type]
     assert "\n" not in str(fault.value)
 
 
 def test_files_are_written_or_refused(tmp_path: Path) -> None:
-    fov_report(FovOptions(), Output(csv=tmp_path / "a.csv", plot=tmp_path / "a.png"))
+    fov_report(FovOptions(csv=tmp_path / "a.csv", plot=tmp_path / "a.png"))
     assert len((tmp_path / "a.csv").read_text().splitlines()) == 3
     assert (tmp_path / "a.png").stat().st_size > 50_000
     with pytest.raises(ConfigError):
-        fov_report(FovOptions(), Output(csv=tmp_path / "a.png" / "a.csv"))
+        fov_report(FovOptions(csv=tmp_path / "a.png" / "a.csv"))
 
 
 def test_validation_has_checks_claims_and_angles(tmp_path: Path) -> None:
-    _, data = validation_report(
-        FovOptions(), Output(csv=tmp_path / "v.csv", plot=tmp_path / "v.svg")
-    )
+    _, data = validation_report(FovOptions(csv=tmp_path / "v.csv", plot=tmp_path / "v.svg"))
     assert data["passed"]
     assert set(data) == {"passed", "rule", "table", "claims", "angles"}
     assert len((tmp_path / "v.csv").read_text().splitlines()) > len(data["claims"])
@@ -112,4 +108,4 @@ def test_a_failed_check_exits_with_1(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_papers_claims_take_no_options() -> None:
     with pytest.raises(ConfigError):
-        validation_report(FovOptions(lens_mm=[8.0]), Output())
+        validation_report(FovOptions(lens_mm=[8.0]))

@@ -25,14 +25,6 @@ PAPER_EXPOSURE_MS = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Output:
-    """Output options of a table."""
-
-    csv: Path | None = None
-    plot: Path | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
 class FovOptions:
     """Options of `fov`; None or empty is the survey's, or else the paper's."""
 
@@ -44,9 +36,12 @@ class FovOptions:
     rig: Path | None = None
     rig_camera: str | None = None
     n_water: float | None = None
+    csv: Path | None = None
+    plot: Path | None = None
+    """Files to write the rows and draw the curves to."""
 
 
-def fov_report(options: FovOptions, output: Output) -> tuple[str, Any]:
+def fov_report(options: FovOptions) -> tuple[str, Any]:
     """FOV, resolution, focus, stereo and blur as text and JSON values."""
     settings = _settings(options)
     rig = _rig(options, settings.water.n_water)
@@ -66,10 +61,10 @@ def fov_report(options: FovOptions, output: Output) -> tuple[str, Any]:
     allowed = settings.plan.allowed_blur_px
     rows = table(altitudes)
     blur = blur_table(rows, speeds, exposures, allowed)
-    if output.csv is not None:
-        _write(output.csv, fov_csv_rows(rows, blur))
-    if output.plot is not None:
-        draw_fov(output.plot, table, altitudes)
+    if options.csv is not None:
+        _write(options.csv, fov_csv_rows(rows, blur))
+    if options.plot is not None:
+        draw_fov(options.plot, table, altitudes)
     data = {
         "source": "design values" if rig is None else rig.source,
         "rows": json_values(rows),
@@ -78,24 +73,24 @@ def fov_report(options: FovOptions, output: Output) -> tuple[str, Any]:
     return fov_text(rows, blur), data
 
 
-def validation_report(options: FovOptions, output: Output) -> tuple[str, Any]:
+def validation_report(options: FovOptions) -> tuple[str, Any]:
     """The paper's claims on optics, with `passed`: whether every check that has a rule does.
 
     Raises:
         ConfigError: an option was given: the claims bring their own lenses, water and altitude.
     """
-    if options != FovOptions():
+    if options != FovOptions(csv=options.csv, plot=options.plot):
         raise ConfigError(
             "--validate checks the paper's own lenses, water and altitude: leave out all options "
             "but --plot, --csv and --json"
         )
     validation = validate_paper()
-    if output.csv is not None:
-        _write(output.csv, validation_rows(validation))
-    if output.plot is not None:
+    if options.csv is not None:
+        _write(options.csv, validation_rows(validation))
+    if options.plot is not None:
         camera, n_water, altitude = paper_settings()
         draw_fov(
-            output.plot,
+            options.plot,
             lambda heights: fov_table(PAPER_LENSES_MM, heights, n_water, camera),
             [altitude],
         )

@@ -85,20 +85,14 @@ class FovCommand(ReportCommand):
 
     def run(self) -> Result:
         """Compute and write the tables."""
-        from alice_survey.app.commands.fov_tables import (
-            FovOptions,
-            Output,
-            fov_report,
-            validation_report,
-        )
+        from alice_survey.app.commands.fov_tables import FovOptions, fov_report, validation_report
 
-        output = Output(csv=self.csv, plot=self.plot)
         options = FovOptions(
             lens_mm=self.lens or (), altitude_m=self.altitude or (), speed_mps=self.speed or (),
             exposure_ms=self.exposure or (), survey=self.survey, rig=self.rig,
-            rig_camera=self.camera, n_water=self.n_water,
+            rig_camera=self.camera, n_water=self.n_water, csv=self.csv, plot=self.plot,
         )  # fmt: skip
-        return validation_report(options, output) if self.validates else fov_report(options, output)
+        return validation_report(options) if self.validates else fov_report(options)
 
     def is_passed(self, data: Any) -> bool:
         """Whether every claim of the paper that was checked holds."""

@@ -17,9 +17,8 @@ from alice_survey.core.executor import Executor
 from alice_survey.core.records import ReportRecord
 from alice_survey.core.run import progress
 from alice_survey.kit.document import OWN_AXES, PictureLayer, Report, ShapeLayer, SurveyMap
-from alice_survey.kit.map_figure import with_stills
 from alice_survey.kit.page import render_html
-from alice_survey.kit.paper import render_pdf
+from alice_survey.kit.paper import render_pdf, with_stills
 
 
 def run_report(workspace: Path, folder: Path, executor: Executor) -> None:

@@ -22,7 +22,7 @@ from alice_survey.kit.document import (
     Verdict,
 )
 from alice_survey.kit.figure import draw_figure
-from alice_survey.kit.map_figure import with_stills
+from alice_survey.kit.paper import with_stills
 
 PIXEL_M = 0.004
 TILE_PX = 256

@@ -13,8 +13,8 @@ from alice_survey.kit.figure import (
     save_figure,
     scale_bar,
 )
-from alice_survey.kit.map_figure import flat_picture, map_figures, with_stills
 from alice_survey.kit.page import png_size
+from alice_survey.kit.paper import flat_picture, map_figures, with_stills
 from tests.alice_survey.kit.sketch import picture_layer, seafloor, sketch_map
 
 
