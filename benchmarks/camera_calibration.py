@@ -36,7 +36,7 @@ from camera_calib.freedom import (
     pose_names,
     value,
 )
-from camera_calib.judge.uncertainty import baseline_sigma_m
+from camera_calib.judge.uncertainty import baselines_m
 from camera_calib.rig import Covariance, Rig
 from camera_calib.target_shape import AS_DRAWN, TargetShape, usual_shape
 from tests.camera_calib.calibration_scenes import (
@@ -221,7 +221,7 @@ def run_trial(seed: int, known: Intrinsics) -> Trial:
     return Trial(
         errors=np.append(errors, found.baseline_m - _TRUTH.baseline_m),
         first_order=np.append(linear, along),
-        sigmas=np.array([*found.sigmas.values(), baseline_sigma_m(found, "right")]),
+        sigmas=np.array([*found.sigmas.values(), baselines_m(found)["right"][1]]),
     )
 
 
@@ -241,7 +241,7 @@ def run_mode(known: Intrinsics, seeds: Sequence[int], executor: Executor = SERIA
     bound = bound_of(known)
     names = (*bound.parameters, _BASELINE)
     truth = replace(_TRUTH, covariance=bound)
-    bounds = np.array([*bound.sigmas.values(), baseline_sigma_m(truth, "right")])
+    bounds = np.array([*bound.sigmas.values(), baselines_m(truth)["right"][1]])
     square = np.mean([trial.errors**2 for trial in found], axis=0)
     by_sigma = np.mean([(trial.errors / trial.sigmas) ** 2 for trial in found], axis=0)
     luck = np.mean([(trial.first_order / bounds) ** 2 for trial in found], axis=0) - 1.0

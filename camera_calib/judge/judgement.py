@@ -229,6 +229,10 @@ def _look(text: str) -> Verdict:
     return Verdict(level="look", text=text)
 
 
+def _bad(text: str) -> Verdict:
+    return Verdict(level="bad", text=text)
+
+
 def _outlier_verdicts(outliers: int, points: int, which: str) -> Iterator[Verdict]:
     if outliers > _MAX_OUTLIERS * points:
         yield _look(f"{outliers} of {points} {which} are outliers")
@@ -271,32 +275,28 @@ def _port_verdicts(judged: Judgement) -> Iterator[Verdict]:
     if set(rig.cameras) == {"left", "right"}:
         x, y, z = (1e3 * rig.cam_from_rig["right"].inv().translation).tolist()
         if x < -max(abs(y), abs(z)):
-            yield Verdict(
-                level="bad",
-                text=f"the right camera is {-x:.0f} mm to the left of the left one: swap --left "
-                "and --right, unless the cameras hang upside down",
+            yield _bad(
+                f"the right camera is {-x:.0f} mm to the left of the left one: swap --left and "
+                "--right, unless the cameras hang upside down"
             )
     for name, camera in rig.cameras.items():
         ratio = calibration.focal_ratios.get(name)
         if ratio is not None:
-            fits = abs(ratio / camera.port.magnification - 1.0) < _RATIO_OFF
-            yield Verdict(
-                level="good" if fits else "bad",
-                text=f"focal lengths of {name} under water are {ratio:.3f} times those in air: "
+            yield _grade(
+                abs(ratio / camera.port.magnification - 1.0), (_RATIO_OFF, _RATIO_OFF),
+                f"focal lengths of {name} under water are {ratio:.3f} times those in air: "
                 f"{max(camera.n_water, _FRESH_WATER):.3g} behind a flat port, near 1 behind a dome "
-                "or without a port"
-                + ("" if fits
-                   else f"; calibrate with --port {likely_port(ratio)}"),
+                "or without a port",
+                f"; calibrate with --port {likely_port(ratio)}",
             )  # fmt: skip
         spread_m = _SIGMAS * rig.sigmas.get(f"{name}.port_distance_m", np.inf)
         if np.isfinite(spread_m):
             distance_m = camera.parameter("port_distance_m")
             if not _NEAREST_GLASS_M - spread_m < distance_m <= _MAX_GLASS_M + spread_m:
-                yield Verdict(
-                    level="bad",
-                    text=f"the flat port of {name} ended {distance_m * 1e3:.2g} mm before the "
-                    "pupil, where no housing has glass: the pictures are through a dome, without a "
-                    "port, or in air: state its --port",
+                yield _bad(
+                    f"the flat port of {name} ended {distance_m * 1e3:.2g} mm before the pupil, "
+                    "where no housing has glass: the pictures are through a dome, without a port, "
+                    "or in air: state its --port"
                 )
     yield from _prior_verdicts(calibration)
 

@@ -1,7 +1,7 @@
 """The calibration report: one self-contained page with four figures, and its numbers as JSON."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -46,12 +46,9 @@ _STRONG = 3.0
 """Mean length over noise of the mean from which an arrow is in colour: 1 % of cells by chance."""
 
 
-def write_report(
-    folder: Path,
-    calibration: Calibration,
-    held_out: HeldOut | None,
-) -> None:
-    """Write `report.html` and `report.json` into a folder.
+@progress.step("draw the calibration's report")
+def write_report(folder: Path, calibration: Calibration, held_out: HeldOut | None) -> None:
+    """Write `report.html` and `report.json` into a folder; unknown numbers are null.
 
     Args:
         folder: an existing folder.
@@ -62,46 +59,47 @@ def write_report(
         CalibrationError: the rig has no covariance.
     """
     judged = judge(calibration, held_out)
-    found = verdicts(judged)
-    CalibrationReportRecord.save(folder / "report.json", report_json(judged, found))
-    with atomic_path(folder / "report.html") as path:
-        path.write_text(render(judged, found), encoding="utf-8")
-
-
-def report_json(judged: Judgement, found: Sequence[Verdict]) -> dict[str, Any]:
-    """All numbers as JSON values; what is not known is null."""
-    calibration = judged.calibration
-    data: dict[str, Any] = json_values(
-        {
-            **_FORMAT,
-            "source": calibration.rig.source,
-            "views": len(calibration.views),
-            "rms_px": calibration.rms_px,
-            "noise_px": calibration.noise_px,
-            "working_range_m": judged.working_range_m,
-            "warnings": calibration.warnings,
-            "verdicts": [{"level": v.level, "text": v.text} for v in found],
-            "rejections": calibration.rejections,
-            "parameters": judged.parameters,
-            "baselines_m": judged.baselines_m,
-            "pictures": judged.pictures,
-            "cameras": {
-                name: {
-                    "coverage": camera.coverage,
-                    "residuals_by_incidence_deg": camera.by_incidence,
-                    "projection_sigma": camera.by_range,
-                    "homography": camera.homography,
-                }
-                for name, camera in judged.cameras.items()
-            },
-            "stereo": judged.stereo,
-            "lengths": _length_numbers(judged.lengths),
-            "held_out": judged.hold_out,
-            "halves": judged.halves,
-            "held_out_lengths": _length_numbers(judged.held_lengths),
-        }
+    found, source = verdicts(judged), calibration.rig.source
+    data = {
+        **_FORMAT,
+        "source": source,
+        "views": len(calibration.views),
+        "rms_px": calibration.rms_px,
+        "noise_px": calibration.noise_px,
+        "working_range_m": judged.working_range_m,
+        "warnings": calibration.warnings,
+        "verdicts": [{"level": v.level, "text": v.text} for v in found],
+        "rejections": calibration.rejections,
+        "parameters": judged.parameters,
+        "baselines_m": judged.baselines_m,
+        "pictures": judged.pictures,
+        "cameras": {
+            name: {
+                "coverage": camera.coverage,
+                "residuals_by_incidence_deg": camera.by_incidence,
+                "projection_sigma": camera.by_range,
+                "homography": camera.homography,
+            }
+            for name, camera in judged.cameras.items()
+        },
+        "stereo": judged.stereo,
+        "lengths": _length_numbers(judged.lengths),
+        "held_out": judged.hold_out,
+        "halves": judged.halves,
+        "held_out_lengths": _length_numbers(judged.held_lengths),
+    }
+    CalibrationReportRecord.save(folder / "report.json", json_values(data))
+    cameras = " and ".join(judged.cameras) if len(judged.cameras) < 3 else f"{len(judged.cameras)}"
+    warnings = [Verdict(level="look", text=text) for text in calibration.warnings]
+    report = Report(
+        title="Camera calibration",
+        subtitle=f"{source}; cameras: {cameras}",
+        facts=list(_facts(judged)),
+        verdicts=worst_first([*warnings, *found]),
+        sections=list(_sections(judged)),
     )
-    return data
+    with atomic_path(folder / "report.html") as path:
+        path.write_text(render_html(report), encoding="utf-8")
 
 
 def _length_numbers(lengths: LengthErrors | None) -> dict[str, Any] | None:
@@ -114,22 +112,6 @@ def _length_numbers(lengths: LengthErrors | None) -> dict[str, Any] | None:
         count = int((lengths.long == long).sum())
         found[key] = {"count": count, "rms_m": rms, "expected_m": expected}
     return found
-
-
-@progress.step("draw the calibration's report")
-def render(judged: Judgement, found: tuple[Verdict, ...]) -> str:
-    """The page as text; the same judgement gives the same bytes."""
-    calibration = judged.calibration
-    cameras = " and ".join(judged.cameras) if len(judged.cameras) < 3 else f"{len(judged.cameras)}"
-    warnings = [Verdict(level="look", text=text) for text in calibration.warnings]
-    report = Report(
-        title="Camera calibration",
-        subtitle=f"{calibration.rig.source}; cameras: {cameras}",
-        facts=list(_facts(judged)),
-        verdicts=worst_first([*warnings, *found]),
-        sections=list(_sections(judged)),
-    )
-    return render_html(report)
 
 
 def _facts(judged: Judgement) -> Iterator[tuple[str, str]]:

@@ -321,22 +321,6 @@ def stereo_sigma(rig: Rig, range_m: float, noise_px: float) -> StereoSigma:
     )
 
 
-def baseline_sigma_m(rig: Rig, camera: str) -> float:
-    """Standard deviation of a camera's distance from the reference camera.
-
-    The distance is the length of the translation of `cam_from_rig`, so rotations do not count.
-    """
-    covariance = covariance_of(rig)
-    translation = rig.cam_from_rig[camera].translation
-    along = translation / np.linalg.norm(translation)
-    slopes = np.zeros(len(covariance.parameters))
-    for column, name in enumerate(covariance.parameters):
-        owner, _, field = name.rpartition(".")
-        if owner == camera and field in POSE[3:]:
-            slopes[column] = along[POSE[3:].index(field)]
-    return float(_sigmas(rig, slopes))
-
-
 @dataclass(frozen=True, kw_only=True)
 class Parameter:
     """One calibrated or fixed number, in units for readers."""
@@ -434,12 +418,19 @@ def _reader_unit(name: str, number: float) -> tuple[float, float, str]:
 
 
 def baselines_m(rig: Rig) -> dict[str, tuple[float, float]]:
-    """Distance from the reference camera and its sigma, by camera."""
-    return {
-        name: (float(np.linalg.norm(pose.translation)), baseline_sigma_m(rig, name))
-        for name, pose in rig.cam_from_rig.items()
-        if name != rig.reference
-    }
+    """Distance from the reference camera and its sigma, by camera.
+
+    The distance is the length of the translation of `cam_from_rig`, so rotations do not count.
+    """
+    covariance, found = covariance_of(rig), {}
+    for name, pose in rig.cam_from_rig.items():
+        if name == rig.reference:
+            continue
+        length = float(np.linalg.norm(pose.translation))
+        along = dict(zip((f"{name}.{axis}" for axis in POSE[3:]), pose.translation, strict=True))
+        slopes = np.array([along.get(one, 0.0) for one in covariance.parameters]) / length
+        found[name] = length, float(_sigmas(rig, slopes))
+    return found
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -457,22 +448,21 @@ def sigmas_by_range(
     rig: Rig, camera: str, pixels: Array, ranges_m: Collection[float], compensating: Array
 ) -> tuple[RangeSigma, ...]:
     """Median and largest of `projection_sigma` over pixels, at each distance; NaN: unknown."""
-
-    def over_frame(values: Array) -> tuple[float, float]:
-        known = values[np.isfinite(values)]
-        return (float(np.median(known)), float(known.max())) if len(known) else (np.nan, np.nan)
-
     found = []
     for range_m in ranges_m:
         sigma = projection_sigma(rig, camera, pixels, range_m, compensating)
-        plain, compensated = over_frame(sigma.plain_px), over_frame(sigma.compensated_px)
+        (plain, plain_worst), (best, best_worst) = (
+            np.quantile(values[np.isfinite(values)], [0.5, 1.0])
+            if np.isfinite(values).any() else (np.nan, np.nan)
+            for values in (sigma.plain_px, sigma.compensated_px)
+        )  # fmt: skip
         found.append(
             RangeSigma(
                 range_m=range_m,
-                plain_median_px=plain[0],
-                plain_worst_px=plain[1],
-                compensated_median_px=compensated[0],
-                compensated_worst_px=compensated[1],
+                plain_median_px=float(plain),
+                plain_worst_px=float(plain_worst),
+                compensated_median_px=float(best),
+                compensated_worst_px=float(best_worst),
             )
         )
     return tuple(found)
