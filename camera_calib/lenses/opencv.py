@@ -104,18 +104,6 @@ def radial(r2: float, k: Array) -> tuple[float, float, float]:
     return ratio, (top_slope - ratio * bottom_slope) / bottom, bottom
 
 
-@compiled_ieee
-def distort(u: float, v: float, k: Array) -> tuple[float, float]:
-    """(x, y) of the ray with tangents (u, v)."""
-    r2 = u * u + v * v
-    top = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
-    ratio = top / (1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7])))
-    uv2 = 2.0 * u * v
-    x = u * ratio + k[2] * uv2 + k[3] * (r2 + 2.0 * u * u) + r2 * (k[8] + r2 * k[9])
-    y = v * ratio + k[2] * (r2 + 2.0 * v * v) + k[3] * uv2 + r2 * (k[10] + r2 * k[11])
-    return x, y
-
-
 @compiled(error_model="numpy")  # a tuple of terms does as well as an array
 def distort_slopes(u: float, v: float, k: Array) -> tuple[float, float, float, float, float, float]:
     """(x, y) and their derivatives dx/du, dx/dv, dy/du, dy/dv."""
@@ -170,14 +158,41 @@ def undistort(x: float, y: float, k: Array, fold2: float) -> tuple[float, float]
 
 
 @compiled_ieee
-def undistort_block(x: Array, y: Array, k: Array, fold2: float, u: Array, v: Array) -> None:
-    """`undistort` for some (x, y) at a time, into (u, v).
+def opencv_pixels(rays: Array, lens: Array, pixels: Array) -> None:
+    """Pixels (B, 2), to be filled in, of rays in air (B, 3) of any length."""
+    fx, fy, cx, cy, fold2 = lens[0], lens[1], lens[2], lens[3], lens[_COUNT]
+    k = lens[4:_COUNT]
+    for j in range(len(rays)):
+        pixels[j, 0] = pixels[j, 1] = math.nan
+        dz = rays[j, 2]
+        if not dz > 0.0:
+            continue
+        u, v = rays[j, 0] / dz, rays[j, 1] / dz
+        r2 = u * u + v * v
+        if r2 < fold2:
+            top = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
+            ratio = top / (1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7])))
+            uv2 = 2.0 * u * v
+            x = u * ratio + k[2] * uv2 + k[3] * (r2 + 2.0 * u * u) + r2 * (k[8] + r2 * k[9])
+            y = v * ratio + k[2] * (r2 + 2.0 * v * v) + k[3] * uv2 + r2 * (k[10] + r2 * k[11])
+            pixels[j, 0], pixels[j, 1] = fx * x + cx, fy * y + cy
+
+
+@compiled_ieee
+def opencv_rays(pixels: Array, lens: Array, rays: Array) -> None:
+    """Unit rays in air (B, 3), to be filled in, that pixels (B, 2) see; at most 128 at a time.
 
     Newton's method takes four steps without a branch, so that they become vector instructions;
     where the last one was not tiny yet, `undistort` takes over.
     """
+    count, fold2 = len(pixels), lens[_COUNT]
+    k = lens[4:_COUNT]
     terms = k[0], k[1], k[2], k[3], k[4], k[5], k[6], k[7], k[8], k[9], k[10], k[11]
-    for j in range(len(x)):
+    x, y, u, v = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
+    for j in range(count):
+        x[j] = (pixels[j, 0] - lens[2]) / lens[0]
+        y[j] = (pixels[j, 1] - lens[3]) / lens[1]
+    for j in range(count):
         a, b, minimum, last = x[j], y[j], 1.0, 0.0
         for _ in range(4):
             found_x, found_y, x_u, x_v, y_u, y_v = distort_slopes(a, b, terms)
@@ -192,37 +207,9 @@ def undistort_block(x: Array, y: Array, k: Array, fold2: float, u: Array, v: Arr
         settled = (minimum > 0.0) & (last <= _SETTLED) & (a * a + b * b < fold2)
         u[j] = a if settled else math.nan
         v[j] = b if settled else math.nan
-    for j in range(len(x)):
+    for j in range(count):
         if not math.isfinite(u[j]):
             u[j], v[j] = undistort(x[j], y[j], k, fold2)
-
-
-@compiled_ieee
-def opencv_pixels(rays: Array, lens: Array, pixels: Array) -> None:
-    """Pixels (B, 2), to be filled in, of rays in air (B, 3) of any length."""
-    fx, fy, cx, cy, fold2 = lens[0], lens[1], lens[2], lens[3], lens[_COUNT]
-    k = lens[4:_COUNT]
-    for j in range(len(rays)):
-        pixels[j, 0] = pixels[j, 1] = math.nan
-        dz = rays[j, 2]
-        if not dz > 0.0:
-            continue
-        u, v = rays[j, 0] / dz, rays[j, 1] / dz
-        if u * u + v * v < fold2:
-            x, y = distort(u, v, k)
-            pixels[j, 0], pixels[j, 1] = fx * x + cx, fy * y + cy
-
-
-@compiled_ieee
-def opencv_rays(pixels: Array, lens: Array, rays: Array) -> None:
-    """Unit rays in air (B, 3), to be filled in, that pixels (B, 2) see; at most 128 at a time."""
-    count = len(pixels)
-    x, y, u, v = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
-    for j in range(count):
-        x[j] = (pixels[j, 0] - lens[2]) / lens[0]
-        y[j] = (pixels[j, 1] - lens[3]) / lens[1]
-    undistort_block(x[:count], y[:count], lens[4:_COUNT], lens[_COUNT], u[:count], v[:count])
-    for j in range(count):
         length = math.sqrt(u[j] * u[j] + v[j] * v[j] + 1.0)
         rays[j, 0], rays[j, 1], rays[j, 2] = u[j] / length, v[j] / length, 1.0 / length
 

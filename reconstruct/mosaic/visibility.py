@@ -22,9 +22,8 @@ from alice_survey.core.compiled import compiled
 from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Array
 from alice_survey.core.records import CloudRecord
-from camera_calib.approximation.dispersion import channel_cameras
 from camera_calib.approximation.pinhole_warp import PinholeWarp
-from camera_calib.water import CHANNELS
+from camera_calib.water import CHANNELS, channel_cameras
 from reconstruct.mosaic.grid import Float32, footprints, height_at_pixels
 from reconstruct.mosaic.ortho import look_up, visible_cells
 from reconstruct.pictures.undistorted import taken_nodes

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from alice_survey.core.errors import ConfigError
-from camera_calib.approximation.dispersion import GLASSES, n_glass
+from camera_calib.water import GLASSES, n_glass
 
 LINES_NM = [486.13, 587.56, 656.27]
 

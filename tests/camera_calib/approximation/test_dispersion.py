@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from alice_survey.core.seawater import n_water
-from camera_calib.approximation.dispersion import (
+from camera_calib.camera import Camera
+from camera_calib.water import (
     channel_cameras,
     n_glass,
 )
-from camera_calib.camera import Camera
 from tests.cameras import changed, flat_port_camera
 
 ALICE = flat_port_camera(

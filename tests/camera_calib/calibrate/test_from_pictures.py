@@ -16,8 +16,7 @@ from alice_survey.core.executor import SERIAL
 from alice_survey.sim.seafloor.board import PoolBoard, board_records, pool_poses, render_board
 from camera_calib.calibrate import from_pictures
 from camera_calib.calibrate.detect_views import detect_views
-from camera_calib.calibrate.from_pictures import calibrate_pictures
-from camera_calib.calibrate.housing import calibrate_task
+from camera_calib.calibrate.from_pictures import calibrate_pictures, calibrate_task
 from camera_calib.calibrate.options import CalibrateOptions
 from camera_calib.calibrate.picture_sets import find_pictures, pair_pictures
 from camera_calib.rig import Rig, read_rig, write_rig

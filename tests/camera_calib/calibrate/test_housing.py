@@ -10,7 +10,7 @@ import pytest
 
 from alice_survey.core.errors import CalibrationError
 from camera_calib.calibrate.detect_views import Detections
-from camera_calib.calibrate.housing import calibrate_task
+from camera_calib.calibrate.from_pictures import calibrate_task
 from camera_calib.calibrate.options import CalibrateOptions, task_of
 from camera_calib.calibrate.results import calibration_text
 from camera_calib.calibrate.solve import calibrate_in_air

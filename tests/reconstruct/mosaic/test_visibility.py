@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.frames import BODY_FROM_NADIR_CAM
-from camera_calib.approximation.dispersion import channel_cameras
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.camera import Camera
+from camera_calib.water import channel_cameras
 from reconstruct.mosaic.ortho import lanczos_weights, sample_lanczos
 from reconstruct.mosaic.visibility import (
     Ground,
