@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from camera_calib.lenses.opencv import (
     COEFFICIENTS,
-    distort,
     distort_slopes,
     fold,
+    opencv_pixels,
     radial,
     undistort,
 )
@@ -35,6 +35,14 @@ def opencv(u: float, v: float, k: Array) -> Array:
     ray = np.array([[[u, v, 1.0]]])
     seen, _ = cv2.projectPoints(ray, np.zeros(3), np.zeros(3), np.eye(3), k)
     return np.asarray(seen, dtype=np.float64).reshape(2)
+
+
+def distort(u: float, v: float, k: Array) -> tuple[float, float]:
+    """(x, y) of the ray with tangents (u, v): pixels of a lens of focal length 1."""
+    pixels = np.empty((1, 2))
+    lens = np.array([1.0, 1.0, 0.0, 0.0, *k, np.inf])
+    opencv_pixels(np.array([[u, v, 1.0]]), lens, pixels)
+    return float(pixels[0, 0]), float(pixels[0, 1])
 
 
 @given(k=lenses(), u=st.floats(-0.7, 0.7), v=st.floats(-0.6, 0.6))
