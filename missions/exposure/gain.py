@@ -6,10 +6,10 @@ report says so, and how much light is missing.
 
 import glob
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -42,11 +42,9 @@ _LAPLACE_GAIN = 6.0
 _TILE = 32
 
 
-@dataclass(frozen=True, kw_only=True)
-class PictureLevels:
+class PictureLevels(NamedTuple):
     """Levels of one control picture, linear, as shares of full scale."""
 
-    picture: str
     median: float
     """Median of the mean of its channels."""
     bright: float
@@ -61,7 +59,7 @@ class PictureLevels:
 
 @dataclass(frozen=True, kw_only=True)
 class GainAdvice:
-    """The gain to set, and what it cannot correct."""
+    """The gain to set, and what it cannot correct; levels are medians over the pictures."""
 
     pictures: int
     skipped: int
@@ -72,14 +70,11 @@ class GainAdvice:
     snr: float
     """Median over noise."""
     change_db: float
-    present_gain_db: float | None
     gain_db: float | None
     """Present gain and change; None where the present one is not known."""
-    target: float
     bound_by: str
     """`median`, or `highlights` where these allow no more."""
     advice: tuple[str, ...]
-    levels: tuple[PictureLevels, ...]
 
 
 def gain_report(
@@ -128,15 +123,11 @@ def gain_advice(
     linear: bool = False,
 ) -> GainAdvice:
     """The gain to set for pictures like these; as `gain_report`."""
-    levels = []
-    for file in progress(files, "control pictures"):
-        picture = read_linear(file, linear=linear)
-        if picture is not None:
-            levels.append(picture_levels(file.name, picture))
+    read = (read_linear(file, linear=linear) for file in progress(files, "control pictures"))
+    levels = [picture_levels(picture) for picture in read if picture is not None]
     if not levels:
         raise ImageError(f"none of {len(files)} control pictures can be read: take them again")
-    names = ("median", "bright", "clipped", "falloff", "noise")
-    rows = np.array([[getattr(level, name) for name in names] for level in levels])
+    rows = np.array(levels)
     median, bright, clipped, falloff, _ = np.median(rows, axis=0).tolist()
     if bright <= 2 * _BLACK:
         raise ImageError(
@@ -151,23 +142,38 @@ def gain_advice(
         )
     by_median, by_highlights = _db(MIDDLE_GREY / max(median, 1e-9)), _db(_HIGHLIGHT / bright)
     change_db = min(by_median, by_highlights)
-    found = GainAdvice(
+    gain_db = None if present_gain_db is None else present_gain_db + change_db
+    snr = float(np.median(rows[:, 0] / np.maximum(rows[:, 4], 1e-9)))
+    advice = []
+    if by_median - change_db > 0.05:
+        advice.append(
+            f"highlights allow {by_median - change_db:.1f} dB less than the median needs: light is "
+            "uneven; move the strobes apart or accept dark edges"
+        )
+    if snr < _ACCEPTABLE_SNR:
+        advice.append(
+            f"signal to noise is {snr:.1f}, and gain cannot raise it: {_ACCEPTABLE_SNR:g} takes "
+            f"{(_ACCEPTABLE_SNR / snr) ** 2:.1f} times the light: open the aperture, expose "
+            "longer, or go lower"
+        )
+    if gain_db is not None and gain_db < 0:
+        advice.append(
+            f"the gain would be {gain_db:.1f} dB: set 0 dB, and the exposure to "
+            f"{10 ** (gain_db / 20):.2f} of what it is, or close the aperture"
+        )
+    return GainAdvice(
         pictures=len(levels),
         skipped=len(files) - len(levels),
         median=median,
         bright=bright,
         clipped=clipped,
         falloff=falloff,
-        snr=float(np.median(rows[:, 0] / np.maximum(rows[:, 4], 1e-9))),
+        snr=snr,
         change_db=change_db,
-        present_gain_db=present_gain_db,
-        gain_db=None if present_gain_db is None else present_gain_db + change_db,
-        target=MIDDLE_GREY,
+        gain_db=gain_db,
         bound_by="median" if by_median <= by_highlights else "highlights",
-        advice=(),
-        levels=tuple(levels),
+        advice=tuple(advice),
     )
-    return replace(found, advice=tuple(_advice(found, by_median - change_db)))
 
 
 def read_linear(file: Path, *, linear: bool) -> Floats | None:
@@ -204,17 +210,11 @@ def _from_srgb(encoded: Array) -> Array:
     return linear
 
 
-def _grey(picture: Floats) -> Floats:
-    """Mean of the channels."""
-    mean: Floats = picture.mean(axis=2, dtype=np.float32)
-    return mean
-
-
-def picture_levels(name: str, picture: Floats) -> PictureLevels:
+def picture_levels(picture: Floats) -> PictureLevels:
     """Levels of a linear picture (H, W, C)."""
     step = max(1, math.isqrt(picture.shape[0] * picture.shape[1] // _SAMPLES))
     thin = picture[::step, ::step]
-    grey = _grey(thin)
+    grey = thin.mean(axis=2, dtype=np.float32)
     zones = [
         [np.percentile(zone, [50.0, 99.5]) for zone in np.array_split(band, _ZONES, axis=1)]
         for band in np.array_split(grey, _ZONES)
@@ -226,7 +226,6 @@ def picture_levels(name: str, picture: Floats) -> PictureLevels:
     corners = medians[[0, 0, last, last], [0, last, 0, last]].mean()
     median = float(np.median(grey))
     return PictureLevels(
-        picture=name,
         median=median,
         bright=float(np.percentile(brightest.max(axis=2), 99.5)),
         clipped=float((thin.max(axis=2) >= _WHITE).mean()),
@@ -242,7 +241,7 @@ def noise_sigma(picture: Floats) -> float:
     texture out, which would pass for noise. Shot noise grows with light, so tiles darker than the
     picture's median are left out.
     """
-    grey = _grey(picture)
+    grey = picture.mean(axis=2, dtype=np.float32)
     rough: Floats = cv2.filter2D(grey, cv2.CV_32F, _LAPLACE)[1:-1, 1:-1]
     rows, columns = (size // _TILE * _TILE for size in rough.shape)
     if min(rows, columns) == 0:
@@ -253,55 +252,23 @@ def noise_sigma(picture: Floats) -> float:
     return float(np.percentile(sigma[light >= np.median(light)], 10.0))
 
 
-def _advice(found: GainAdvice, short_db: float) -> Iterator[str]:
-    """What gain cannot correct."""
-    if short_db > 0.05:
-        yield (
-            f"highlights allow {short_db:.1f} dB less than the median needs: light is uneven; move "
-            "the strobes apart or accept dark edges"
-        )
-    if found.snr < _ACCEPTABLE_SNR:
-        yield (
-            f"signal to noise is {found.snr:.1f}, and gain cannot raise it: {_ACCEPTABLE_SNR:g} "
-            f"takes {(_ACCEPTABLE_SNR / found.snr) ** 2:.1f} times the light: open the aperture, "
-            "expose longer, or go lower"
-        )
-    if found.gain_db is not None and found.gain_db < 0:
-        yield (
-            f"the gain would be {found.gain_db:.1f} dB: set 0 dB, and the exposure to "
-            f"{10 ** (found.gain_db / 20):.2f} of what it is, or close the aperture"
-        )
-    if found.clipped > 0.01:
-        yield f"{found.clipped:.1%} of the pixels are clipped: check this gain with new pictures"
-    medians = [level.median for level in found.levels]
-    if max(medians) > 2 * max(min(medians), 1e-9):
-        yield (
-            f"medians go from {min(medians):.1%} to {max(medians):.1%}: the altitude or the ground "
-            "varied; take pictures at the survey's altitude"
-        )
-
-
 def _text(found: GainAdvice, *, linear: bool) -> str:
     """The report as text."""
-
-    def then(level: float) -> str:
-        return f"{min(1.0, level * 10 ** (found.change_db / 20)):.1%}"
-
-    curve = "linear" if linear else "sRGB curve undone"
-    skipped = f", {found.skipped} left out" if found.skipped else ""
     change = f"change the gain by {found.change_db:+.1f} dB"
     if found.gain_db is not None:
         change = f"set the gain to {max(found.gain_db, 0.0):.1f} dB ({found.change_db:+.1f} dB)"
     rows = [
-        ("median", f"{found.median:.2%}", then(found.median)),
-        ("brightest zone, 99.5 %", f"{found.bright:.2%}", then(found.bright)),
-        ("clipped", f"{found.clipped:.2%}", "-"),
-        ("corners over middle", f"{found.falloff:.2f}", "the same"),
-        ("signal to noise", f"{found.snr:.1f}", "the same"),
+        ("median", f"{found.median:.2%}"),
+        ("brightest zone, 99.5 %", f"{found.bright:.2%}"),
+        ("clipped", f"{found.clipped:.2%}"),
+        ("corners over middle", f"{found.falloff:.2f}"),
+        ("signal to noise", f"{found.snr:.1f}"),
     ]
+    curve = "linear" if linear else "sRGB curve undone"
     return "\n".join([
-        f"{found.pictures} control pictures{skipped} ({curve}; shares of full scale)",
-        text_table(("level", "now", "then"), rows),
+        f"{found.pictures} control pictures, {found.skipped} left out ({curve}; shares of full "
+        "scale)",
+        text_table(("level", "now"), rows),
         f"{change}, bound by the {found.bound_by}",
         *(f"  - {line}" for line in found.advice),
     ])  # fmt: skip
