@@ -17,6 +17,9 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 from shapely.geometry import MultiPolygon
 
 from alice_survey.core.compiled import compiled
@@ -229,22 +232,9 @@ def _clusters(points: Array, size_m: float) -> list[NDArray[np.intp]]:
     cell = np.floor(points / size_m).astype(np.int64)
     cells, owner = np.unique(cell, axis=0, return_inverse=True)
     owner = owner.ravel()
-    number = {(int(a), int(b)): i for i, (a, b) in enumerate(cells)}
-    group = np.full(len(cells), -1)
-    groups = 0
-    for first in range(len(cells)):
-        if group[first] >= 0:
-            continue
-        group[first], todo = groups, [first]
-        while todo:
-            a, b = (int(x) for x in cells[todo.pop()])
-            for c in (-1, 0, 1):
-                for d in (-1, 0, 1):
-                    other = number.get((a + c, b + d), -1)
-                    if other >= 0 and group[other] < 0:
-                        group[other] = groups
-                        todo.append(other)
-        groups += 1
+    pairs = cKDTree(cells).query_pairs(1.5, p=np.inf, output_type="ndarray")
+    graph = csr_array((np.ones(len(pairs)), pairs.T), shape=(len(cells), len(cells)))
+    groups, group = connected_components(graph, directed=False)
     order = np.argsort(group[owner], kind="stable")
     return np.split(order, np.searchsorted(group[owner][order], np.arange(1, groups)))
 
@@ -438,7 +428,6 @@ def _strips(sides: Array, low: Array, high: Array, finest_m: float) -> tuple[Arr
     return np.repeat(begins, parts) + (part + 0.5) * thin, thin
 
 
-@compiled
 def _corners(
     survey: Array, offsets: Array, cuts: Array, half_across: float, half_along: float
 ) -> Array:
@@ -446,23 +435,14 @@ def _corners(
 
     There what is unseen has a corner: without them the middle of a strip may miss most of it.
     """
-    found = np.empty(64)
-    used = 0
-    for c in range(cuts.shape[0]):
-        middle = offsets[int(cuts[c, 0])]
-        for u in (cuts[c, 1] + half_along, cuts[c, 2] - half_along):
-            for e in range(survey.shape[0]):
-                u0, v0, u1, v1 = survey[e]
-                if (u0 < u) == (u1 < u):
-                    continue
-                v = v0 + (u - u0) / (u1 - u0) * (v1 - v0)
-                if abs(v - middle) >= half_across:
-                    continue
-                if used == found.size:
-                    found = np.concatenate((found, np.empty_like(found)))
-                found[used] = v
-                used += 1
-    return found[:used].copy()
+    u0, v0, u1, v1 = survey.T
+    found = [np.empty(0)]
+    for row, begin, end in cuts:
+        for u in (begin + half_along, end - half_along):
+            at = (u0 < u) != (u1 < u)
+            v = v0[at] + (u - u0[at]) / (u1[at] - u0[at]) * (v1[at] - v0[at])
+            found.append(v[np.abs(v - offsets[int(row)]) < half_across])
+    return np.concatenate(found)
 
 
 @compiled

@@ -14,10 +14,8 @@ cost at the best of those.
 """
 
 import math
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice
 
 import numpy as np
 import shapely
@@ -52,15 +50,12 @@ _FEW_TENTHS = (-1.0, 1.0)
 _FULL = 16
 """Best close costs at which the full cost is taken."""
 _MAX_HEADINGS = _SPREAD + 1 + _BEST + _REFINED * (_REFINED + len(_TENTHS)) + _FULL
-_TIMED = 10
-"""Costs after which is known how long all will take."""
 _PROMISING = 1.15
 """A spread heading is taken if its estimate is at most this times the least."""
 _FEW_CELLS = 20
 """With more cells, which take longer to order, proportionally fewer headings are tried."""
 _FEW_EDGES = 300
 """With more edges of the area, fewer headings are estimated."""
-_WORTH_SHOWING_S = 2.0
 _NEAR_RAD = math.radians(2.0)
 _OFF_JUMP_RAD = 1e-9
 """A jump is left on the side of fewer lines by this."""
@@ -144,7 +139,8 @@ def best_heading(
             yield from take(close, heading + math.radians(0.1) * np.array(tenths))
         yield from take(found, np.array(_minimum(close, _some(_FULL, share))))
 
-    _run(search())
+    for _ in progress(search(), "headings tried", _MAX_HEADINGS):
+        pass
     if not found:
         raise faults[0]
     best = _minimum(found, 1)[0]
@@ -190,16 +186,6 @@ def _count_cells(site: Site, heading_rad: float, pattern: Pattern) -> int:
 def _minimum(costs_j: dict[float, float], count: int) -> list[float]:
     """The cheapest headings."""
     return sorted(costs_j, key=lambda x: (costs_j[x], x))[:count]
-
-
-def _run(search: Iterator[float]) -> None:
-    """Go through a search; one that will take long shows how far it is."""
-    began = time.monotonic()
-    done = sum(1 for _ in islice(search, _TIMED))
-    if (time.monotonic() - began) * _MAX_HEADINGS / _TIMED > _WORTH_SHOWING_S:
-        search = progress(search, "headings tried", _MAX_HEADINGS - done)
-    for _ in search:
-        pass
 
 
 def min_width(edges: Array) -> tuple[float, float]:

@@ -104,36 +104,24 @@ def _link(tour: NDArray[np.int64], i: int, j: int, problem: Cells) -> float:
     return cost
 
 
-@compiled
 def tour_cost(tour: NDArray[np.int64], problem: Cells) -> float:
     """Cost of a tour."""
-    cost = 0.0
-    for i in range(-1, tour.size):
-        cost += _link(tour, i, i + 1, problem)
-        if i >= 0:
-            cost += problem.inner[tour[i]]
-    return cost
+    links = problem.hops[problem.exits[tour[:-1]], tour[1:]]
+    links = np.append(links, problem.finish[problem.exits[tour[-1]]])
+    return float(problem.start[tour[0]] + links.sum() + problem.inner[tour].sum())
 
 
-@compiled
 def nearest_tour(problem: Cells) -> NDArray[np.int64]:
     """Tour from home always on to the cell reached at least cost."""
     hops, exits, inner, start, _ = problem
-    corners = inner.size
-    cells = corners // CORNERS
-    flown = np.zeros(cells, np.int64)
-    tour = np.zeros(cells, np.int64)
-    for i in range(cells):
-        best, chosen = np.inf, -1
-        for y in range(corners):
-            if flown[y // CORNERS] or inner[y] == np.inf:
-                continue
-            cost = start[y] if i == 0 else hops[exits[tour[i - 1]], y]
-            if cost < best:
-                best, chosen = cost, y
-        tour[i] = chosen
-        flown[chosen // CORNERS] = 1
-    return tour
+    free = np.where(np.isinf(inner), np.inf, 0.0)
+    cost, tour = start, []
+    for _ in range(inner.size // CORNERS):
+        chosen = int(np.argmin(cost + free))
+        tour.append(chosen)
+        free[chosen // CORNERS * CORNERS :][:CORNERS] = np.inf
+        cost = hops[exits[chosen]]
+    return np.array(tour, dtype=np.int64)
 
 
 @compiled
@@ -253,7 +241,6 @@ def improved_tour(tour: NDArray[np.int64], problem: Cells, fixed: int) -> NDArra
     return tour
 
 
-@compiled
 def good_tour(first: NDArray[np.int64], problem: Cells, fixed: int) -> NDArray[np.int64]:
     """A good tour of many cells: improved, shaken and improved again, the best is kept.
 
