@@ -28,7 +28,7 @@ from camera_calib.rig import Rig, design_rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import plan_pattern, stations_of_flight
 from missions.exports.advice import cola2_outlook
-from missions.exports.options import options_of
+from missions.exports.format import options_of
 from missions.exports.write import write_exports
 from missions.fly.mission_flight import PASSED_M, mission_of_settings, overshoot_m, simulate_mission
 from missions.fly.simulation import flight_settings

@@ -37,9 +37,9 @@ from missions.plan.planner import plan_survey
 from missions.plan.strength import survey_costs
 from missions.values.plan_file import Plan
 from reconstruct.placing.alignment import align_rigid
-from reconstruct.precision.candidates import Candidate, stations_and_times
 from reconstruct.precision.instruments import ChannelErrors, NavigationErrors
 from reconstruct.precision.predict import Precision, by_cell, predict
+from reconstruct.precision.run import Candidate, stations_and_times
 from reconstruct.precision.tracks import TrackModel
 
 NAMES = ("bend along, mm", "bend across, mm", "scale, ppm", "heights, mm")

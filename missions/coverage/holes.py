@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from shapely.geometry import MultiPolygon, mapping
+from shapely.geometry import MultiPolygon
 
 from alice_survey.core.frames import Array, Datum
 from missions.coverage.certificate import Certificate
@@ -48,14 +48,6 @@ class Hole:
             "east_m": round(self.place_ne[1], 3),
             "fewest_pictures": self.fewest_pictures,
             "fewest_lines": self.fewest_lines,
-        }
-
-    def feature(self, datum: Datum) -> dict[str, Any]:
-        """The hole as a GeoJSON feature, WGS 84."""
-        return {
-            "type": "Feature",
-            "properties": self.to_json(),
-            "geometry": mapping(geodetic(self.outline, datum)),
         }
 
 

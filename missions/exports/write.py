@@ -12,8 +12,7 @@ from alice_survey.core.errors import PlanError, warn
 from alice_survey.core.run import progress
 from camera_calib.rig import Rig, design_rig
 from missions.exports.advice import advice
-from missions.exports.format import Export, ExportFormat
-from missions.exports.options import Options, line_tolerance_m, options_of
+from missions.exports.format import Export, ExportFormat, Options, line_tolerance_m, options_of
 from missions.exports.registry import format_named, format_names
 from missions.exports.waypoints import line_depths
 from missions.values.plan_file import Plan, read_plan

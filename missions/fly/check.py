@@ -15,7 +15,6 @@ from alice_survey.kit.words import share, text_table
 from camera_calib.rig import Rig, design_rig, read_rig, rig_with_mount
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.dive_record import DiveRecord, read_dive_record
-from missions.coverage.geofiles import write_coverage_tif, write_outlines
 from missions.coverage.holes import Hole, find_holes
 from missions.coverage.stations import plan_pattern, stations_of_plan
 from missions.exports.write import count_text
@@ -186,10 +185,11 @@ def check_report(
 
 
 def _write(folder: Path, check: Check, data: dict[str, Any]) -> None:
-    from missions.coverage.drawing import draw_certificate
+    from missions.coverage.drawing import draw_certificate, write_coverage_tif, write_outlines
 
     folder.mkdir(parents=True, exist_ok=True)
-    write_outlines(folder / "holes.geojson", check.plan.datum, check.holes)
+    outlines = [(hole.outline, hole.to_json()) for hole in check.holes]
+    write_outlines(folder / "holes.geojson", check.plan.datum, outlines)
     write_coverage_tif(folder / "coverage.tif", check.flown)
     draw_certificate(
         folder / "coverage.png", check.flown, check.holes, f"{check.plan.name}: as flown",

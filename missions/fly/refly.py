@@ -19,7 +19,7 @@ from camera_calib.rig import Rig
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.holes import Hole
 from missions.coverage.stations import stations_of_plan
-from missions.exports.options import options_of
+from missions.exports.format import options_of
 from missions.exports.write import count_text, write_exports
 from missions.lines.fill import lines_over
 from missions.lines.lay import order_lines

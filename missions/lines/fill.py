@@ -233,7 +233,8 @@ def _clusters(points: Array, size_m: float) -> list[NDArray[np.intp]]:
     cells, owner = np.unique(cell, axis=0, return_inverse=True)
     owner = owner.ravel()
     pairs = cKDTree(cells).query_pairs(1.5, p=np.inf, output_type="ndarray")
-    graph = csr_array((np.ones(len(pairs)), pairs.T), shape=(len(cells), len(cells)))
+    joined = pairs[:, 0], pairs[:, 1]
+    graph = csr_array((np.ones(len(pairs)), joined), shape=(len(cells), len(cells)))
     groups, group = connected_components(graph, directed=False)
     order = np.argsort(group[owner], kind="stable")
     return np.split(order, np.searchsorted(group[owner][order], np.arange(1, groups)))

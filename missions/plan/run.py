@@ -19,7 +19,7 @@ from alice_survey.core.executor import Executor
 from alice_survey.core.run import progress
 from alice_survey.kit.figure import save_figure
 from camera_calib.rig import Rig, design_rig
-from missions.exports.options import Options, options_of
+from missions.exports.format import Options, options_of
 from missions.exports.write import write_exports
 from missions.plan.map import plan_figure
 from missions.plan.planner import Planned, plan_survey

@@ -25,8 +25,8 @@ from missions.coverage.drawing import (
     finish_map,
     map_sheet,
     number_place,
+    write_outlines,
 )
-from missions.coverage.geofiles import write_outlines
 from missions.coverage.stations import Stations, join, stations_of_lines, stations_of_plan
 from missions.exports.write import count_text
 from missions.fly.check import rig_of
@@ -230,7 +230,8 @@ def revisit_report(
         warn(f"{folder / 'dive'} is of an earlier revisit: nothing is weak now")
     data = {**_json(found, cures), "dive": dive}
     folder.mkdir(parents=True, exist_ok=True)
-    write_outlines(folder / "weak.geojson", found.plan.datum, found.places)
+    outlines = [(place.outline, place.to_json()) for place in found.places]
+    write_outlines(folder / "weak.geojson", found.plan.datum, outlines)
     write_json(folder / "revisit.json", data)
     _draw(folder / "weak.png", found, again)
     text = f"{_text(found, cures)}{words}\n{folder}: weak.geojson, weak.png, revisit.json"

@@ -14,7 +14,7 @@ import shapely
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import RigidTransform, Rotation
-from shapely.geometry import MultiPolygon, mapping
+from shapely.geometry import MultiPolygon
 
 from alice_survey.core.artefacts import need_stage
 from alice_survey.core.errors import ReconstructionError
@@ -25,7 +25,7 @@ from alice_survey.core.records import RegistrationRecord
 from camera_calib.rig import Rig
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.dive_record import assign_lines
-from missions.coverage.holes import find_holes, geodetic
+from missions.coverage.holes import find_holes
 from missions.coverage.stations import Stations, plan_pattern, stations_of_plan
 from missions.values.area import multipolygon
 from missions.values.footprint import footprint_size_m
@@ -76,11 +76,6 @@ class WeakPlace:
             "north_m": round(self.place_ne[0], 3),
             "east_m": round(self.place_ne[1], 3),
         }
-
-    def feature(self, datum: Datum) -> dict[str, Any]:
-        """The place as a GeoJSON feature, WGS 84."""
-        outline = mapping(geodetic(self.outline, datum))
-        return {"type": "Feature", "properties": self.to_json(), "geometry": outline}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

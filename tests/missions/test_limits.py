@@ -6,8 +6,7 @@ import pytest
 
 from alice_survey.core.config import SurveyConfig, parse_config
 from camera_calib.rig import design_rig
-from missions.exports.format import Export
-from missions.exports.options import options_of
+from missions.exports.format import Export, options_of
 from missions.values.costs import SETTLE_S
 from missions.values.plan_file import Plan
 from tests.missions.flown_plans import flown, planned

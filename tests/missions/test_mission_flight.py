@@ -21,7 +21,7 @@ from camera_calib.rig import Rig, design_rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import plan_pattern, stations_of_flight
 from missions.exports.follower import follower_of
-from missions.exports.options import options_of
+from missions.exports.format import options_of
 from missions.exports.write import write_exports
 from missions.fly.mission_flight import (
     PASSED_M,

@@ -26,8 +26,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from missions.exports.format import Export, ExportFile, ExportFormat
-from missions.exports.options import MIN_TOLERANCE_M, Options
+from missions.exports.format import MIN_TOLERANCE_M, Export, ExportFile, ExportFormat, Options
 from missions.exports.waypoints import Waypoint, gone_on, move, room_m
 from missions.exports.xml_text import (
     child,

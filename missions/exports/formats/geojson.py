@@ -11,8 +11,13 @@ import shapely
 from alice_survey.core.artefacts import atomic_path
 from alice_survey.core.executor import progress
 from missions.exports.format import Export, ExportFile, ExportFormat
-from missions.exports.geometry import dive_of_line, footprint_outline, footprints_ne
-from missions.exports.map_features import lon_lat, map_features
+from missions.exports.geometry import (
+    dive_of_line,
+    footprint_outline,
+    footprints_ne,
+    lon_lat,
+    map_features,
+)
 
 
 def write_geojson(path: Path, export: Export, _dive: int) -> None:

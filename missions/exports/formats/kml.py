@@ -7,7 +7,7 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from missions.exports.format import Export, ExportFile, ExportFormat
-from missions.exports.map_features import map_features
+from missions.exports.geometry import map_features
 from missions.exports.xml_text import child, degrees, metres, write_xml
 
 _KML = "http://www.opengis.net/kml/2.2"

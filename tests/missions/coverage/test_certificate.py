@@ -14,7 +14,7 @@ from alice_survey.core.config import CameraConfig, SurveyConfig, WaterConfig
 from alice_survey.core.errors import PlanError
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import Certificate, certificate
-from missions.coverage.holes import find_holes
+from missions.coverage.holes import find_holes, geodetic
 from missions.coverage.stations import (
     Stations,
     stations_of_lines,
@@ -228,8 +228,7 @@ def test_holes_come_worst_first_and_touching_cells_are_one() -> None:
     squares = [shapely.box(0, 0, 2, 2) | shapely.box(2, 2, 4, 4), shapely.box(6, 4, 8, 8)]
     for wkt, expected in zip(shapes, squares, strict=True):
         assert shapely.from_wkt(wkt).symmetric_difference(expected).area < 1e-9
-    feature = holes[0].feature(area.datum)
-    assert shapely.geometry.shape(feature["geometry"]).is_valid
+    assert geodetic(holes[0].outline, area.datum).is_valid
 
 
 def test_faults_name_the_numbers() -> None:

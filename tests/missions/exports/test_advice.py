@@ -16,7 +16,7 @@ from missions.exports.follower import (
     line_offset_m,
     predicted_stations,
 )
-from missions.exports.options import Options, options_of
+from missions.exports.format import Options, options_of
 from missions.exports.write import write_exports
 from tests.missions.exports.plans import RIG, small_plan
 

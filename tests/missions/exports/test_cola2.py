@@ -11,7 +11,7 @@ from shapely.geometry import MultiPolygon, Point, box
 from camera_calib.rig import Rig
 from missions.exports import options
 from missions.exports.follower import Follower
-from missions.exports.options import Options, line_tolerance_m
+from missions.exports.format import Options, line_tolerance_m
 from missions.exports.write import write_exports
 from missions.values.footprint import common_swath
 from missions.values.plan_file import Plan

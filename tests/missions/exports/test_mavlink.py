@@ -19,7 +19,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from shapely.geometry import Point, Polygon
 
 from camera_calib.rig import Rig
-from missions.exports.options import line_tolerance_m
+from missions.exports.format import line_tolerance_m
 from missions.exports.write import write_exports
 from missions.values.plan_file import Plan
 from tests.missions.exports.plans import RIG, line, plan_of, small_plan

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from missions.exposure.footprints import pixel_on_floor_m
-from missions.exposure.trigger import blur_rates, exposure_for_rate
+from missions.exposure.settings import blur_rates, exposure_for_rate
 from tests.missions.exposure.surveys import survey
 from tests.oracles_imaging import moved_pixel
 

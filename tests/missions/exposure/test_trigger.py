@@ -1,8 +1,7 @@
 import pytest
 
 from missions.exposure.conflict import ConflictError
-from missions.exposure.settings import imaging_settings
-from missions.exposure.trigger import paper_rule
+from missions.exposure.settings import imaging_settings, paper_rule
 from missions.values.footprint import footprint_size_m
 from tests.missions.exposure.surveys import survey
 

@@ -20,16 +20,16 @@ from missions.plan.planner import plan_survey
 from missions.plan.strength import survey_costs
 from missions.values.plan_file import Plan, read_plan
 from reconstruct.placing.alignment import sag_weights
-from reconstruct.precision.candidates import (
+from reconstruct.precision.instruments import NavigationErrors, usual_rig
+from reconstruct.precision.predict import Precision, predict
+from reconstruct.precision.run import (
     Candidate,
+    precision_report,
     single_measures,
     stations_and_times,
     with_control,
     worst_bend,
 )
-from reconstruct.precision.instruments import NavigationErrors, usual_rig
-from reconstruct.precision.predict import Precision, predict
-from reconstruct.precision.run import precision_report
 from reconstruct.precision.tracks import ExpectedBlock, TrackModel
 from tests.small_survey import settings_in
 

@@ -17,7 +17,7 @@ from alice_survey.app.studio.endpoints.base import Call, Content, Endpoint, Stud
 from alice_survey.core.config import Config
 from alice_survey.core.contents import one_line
 from alice_survey.core.errors import AliceError, NavigationError, known_fault
-from missions.exports.options import options_of
+from missions.exports.format import options_of
 from missions.exports.registry import format_names
 from missions.exports.write import write_exports
 from missions.follow.dive import FollowedDive

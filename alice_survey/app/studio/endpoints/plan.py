@@ -41,9 +41,8 @@ from missions.exports.registry import format_named, format_names
 from missions.plan.planner import plan_survey
 from missions.plan.preview import Draft, draft_settings, play, preview, refusal_json
 from missions.values.plan_file import read_plan
-from reconstruct.precision.candidates import Candidate, worst_bend
 from reconstruct.precision.predict import Precision
-from reconstruct.precision.run import heights_raster, summary
+from reconstruct.precision.run import Candidate, heights_raster, summary, worst_bend
 
 SETTINGS = "survey.toml"
 _MAX_REQUEST = 8 << 20
