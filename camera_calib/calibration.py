@@ -1,5 +1,6 @@
 """Input and result of a calibration, as values and as arrays over all views."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -55,6 +56,18 @@ class ErrorBudget:
     the priors' means and of the places of corners. The product with its transpose is that part."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class HousingTrial:
+    """How well the views fit one kind of port."""
+
+    port: str
+    noise_px: float = math.nan
+    criterion: float = math.inf
+    """Schwarz's: the lower, the likelier."""
+    why: str = ""
+    """Why it could not be calibrated; empty if it could."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Calibration:
     """A calibrated rig, with all that is needed to assess it."""
@@ -87,6 +100,8 @@ class Calibration:
     """How the target differs from its drawing: part of `target_points`."""
     focal_ratios: Mapping[str, float] = field(default_factory=dict)
     """Of views under water as if without a housing, over those in air, by camera."""
+    housing_trials: tuple[HousingTrial, ...] = ()
+    """All kinds of ports that were compared, if they were."""
     spread: ErrorBudget | None = None
     """Noise of the corners and what follows of it; None if it was taken as independent."""
 

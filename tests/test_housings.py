@@ -12,6 +12,7 @@ from alice_survey.core.artefacts import read_json
 from benchmarks.reconstruct_surveys import demo_like
 from camera_calib.calibrate.from_pictures import calibrate_pictures
 from camera_calib.calibrate.options import CalibrateOptions
+from camera_calib.rig import read_rig
 
 pytestmark = pytest.mark.slow
 
@@ -62,7 +63,9 @@ def check(score: dict[str, Any], length_m: float, width_m: float) -> None:
 def pool_as(workspace: Path, output: Path, port: str | None, **more: Any) -> list[str]:
     """What is bad in a calibration from the pool's pictures."""
     pool = workspace / "pool" if port else workspace / "pool" / "air"
-    glass: dict[str, Any] = {"glass_mm": "6", "n_glass": "1.49"} if port in ("flat", "dome") else {}
+    glass: dict[str, Any] = (
+        {"glass_mm": "6", "n_glass": "1.49"} if port in ("flat", "dome", "auto") else {}
+    )
     calibrate_pictures(
         CalibrateOptions(
             cameras=(f"left={pool / 'left'}", f"right={pool / 'right'}"), target=BOARD,
@@ -84,6 +87,9 @@ def test_a_dome_off_its_centre_is_surveyed_and_no_other_port_passes_for_it(tmp_p
     assert any("flat port of" in text for text in pool_as(workspace, tmp_path / "flat", "flat"))
     bare = pool_as(workspace, tmp_path / "bare", "none", **start)
     assert any("from its prior" in text for text in bare)
+    pool_as(workspace, tmp_path / "auto", "auto", **dome)
+    found = read_rig(tmp_path / "auto" / "rig.json")
+    assert {camera.port.shape for camera in found.cameras.values()} == {"dome"}
 
 
 def test_a_fisheye_of_120_degrees_is_surveyed(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 A flat port makes focal lengths the water's index times longer than in air, a dome about its pupil
 leaves them as they are. Where both calibrations exist, their ratio shows a wrong housing at once.
+Else each housing is calibrated in turn, and the noise that each leaves is compared, with a price
+for every parameter (G. Schwarz 1978, "Estimating the dimension of a model").
 """
 
 import contextlib
@@ -13,12 +15,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from alice_survey.core.artefacts import read_json
-from alice_survey.core.errors import CalibrationError
+from alice_survey.core.errors import AliceError, CalibrationError
 from alice_survey.core.executor import Executor, local_executor
 from alice_survey.core.frames import Array
 from camera_calib.calibrate.detect_views import Detections, detect_views
-from camera_calib.calibrate.options import CalibrateOptions, CalibrationTask, read_task
+from camera_calib.calibrate.options import AUTO, CalibrateOptions, CalibrationTask, read_task
 from camera_calib.calibrate.picture_sets import check_own, find_pictures, pair_pictures
 from camera_calib.calibrate.results import calibration_text, warn_of_unseen, write_results
 from camera_calib.calibrate.solve import (
@@ -28,10 +32,10 @@ from camera_calib.calibrate.solve import (
     calibrate_through_ports,
     first_cameras,
 )
-from camera_calib.calibration import Calibration, TargetView
+from camera_calib.calibration import Calibration, HousingTrial, TargetView
 from camera_calib.freedom import LensNames, lens_of
 from camera_calib.mount import mount_line, with_mount
-from camera_calib.optics import likely_port
+from camera_calib.optics import PORTS, likely_port
 from camera_calib.ports.flat import FlatPort
 from camera_calib.rig import Rig
 
@@ -145,7 +149,8 @@ def calibrate_task(task: CalibrationTask, found: Detections) -> Calibration:
     if task.start is not None:
         ratios = focal_ratios(found.views, task.target.points, task.start, task.lenses)
     try:
-        calibration = _through(task, found)
+        through = _likeliest if AUTO in task.ports.values() else _through
+        calibration = through(task, found)
     except CalibrationError as error:
         raise CalibrationError(f"{error}{_other_housing(ratios, task.ports)}") from None
     return replace(calibration, focal_ratios=ratios)
@@ -175,6 +180,27 @@ def _through(task: CalibrationTask, found: Detections) -> Calibration:
         return calibrate_in_water_alone(views, points, cameras, task.lenses, sigmas, shape)
     start = replace(task.start, cameras=cameras)
     return calibrate_through_ports(views, points, start, task.known, task.lenses, sigmas, shape)
+
+
+def _likeliest(task: CalibrationTask, found: Detections) -> Calibration:
+    """The calibration through the likeliest housing, with how the others did."""
+    trials, calibrations = [], {}
+    for kind in PORTS:
+        try:
+            one = _through(replace(task, ports=dict.fromkeys(found.sizes, kind)), found)
+        except AliceError as error:
+            trials.append(HousingTrial(port=kind, why=str(error)))
+            continue
+        calibrations[kind] = one
+        coordinates = 2 * int(np.isfinite(one.residuals_px[..., 0]).sum())
+        parameters = 0 if one.rig.covariance is None else len(one.rig.covariance.parameters)
+        criterion = 2.0 * coordinates * math.log(one.noise_px) + parameters * math.log(coordinates)
+        trials.append(HousingTrial(port=kind, noise_px=one.noise_px, criterion=criterion))
+    best = min(trials, key=lambda trial: trial.criterion).port
+    if best not in calibrations:
+        reasons = "; ".join(f"{trial.port}: {trial.why}" for trial in trials)
+        raise CalibrationError(f"no housing fits the views: {reasons}")
+    return replace(calibrations[best], housing_trials=tuple(trials))
 
 
 def focal_ratios(

@@ -20,6 +20,8 @@ from camera_calib.rig import Rig, read_rig
 from camera_calib.target_shape import AS_DRAWN, TargetShape, usual_shape
 from camera_calib.targets.target import Target, parse_target
 
+AUTO = "auto"
+"""The port that is found by trying all."""
 WRITTEN = (
     "rig.json", "rig_carried.json", "calibration.json", "corners.csv", "report.html", "report.json",
 )  # fmt: skip
@@ -72,7 +74,7 @@ class CalibrationTask:
     lenses: Mapping[str, str]
     """Lens model by camera, of `freedom.LENSES`."""
     ports: Mapping[str, str]
-    """Kind of port by camera, of `optics.PORTS`; in air none has a port."""
+    """Kind of port by camera, of `optics.PORTS`, or `AUTO` for all; in air none has a port."""
     port_values: Mapping[str, Mapping[str, float]]
     """Known parameters of the ports by camera; of those that are found, first values."""
     port_sigmas: Mapping[str, Mapping[str, float]]
@@ -280,7 +282,10 @@ def _ports(
     if not options.water:
         return dict.fromkeys(cameras, NoPort.shape)
     if options.port is not None:
-        return _kinds(options.port, cameras, "--port", PORTS)
+        kinds = _kinds(options.port, cameras, "--port", (*PORTS, AUTO))
+        if AUTO in kinds.values() and len(set(kinds.values())) > 1:
+            raise CalibrationError(f"--port {options.port}: auto is for all cameras alike")
+        return kinds
     old = {} if start is None else start.cameras
     known = {name: one.port.shape for name, one in old.items() if one.port.parameters}
     return dict.fromkeys(cameras, FlatPort.shape) | known
@@ -291,7 +296,7 @@ def _check_ports(
 ) -> None:
     """Reject ports of which something is neither given nor known from the start."""
     for name, kind in ports.items():
-        port = PORTS[kind]
+        port = PORTS[FlatPort.shape if kind == AUTO else kind]
         if start is not None and start.cameras[name].port.shape == port.shape:
             continue
         needed = {field.name for field in fields(port) if field.default is MISSING}

@@ -29,6 +29,8 @@ from camera_calib.judge.uncertainty import (
     shape_parameters,
 )
 from camera_calib.judge.validation import hold_out
+from camera_calib.ports.dome import DomePort
+from camera_calib.ports.none import NoPort
 from camera_calib.rig import Rig, write_rig
 from camera_calib.targets.target import Target
 
@@ -36,6 +38,8 @@ _CORNERS = (
     "view", "camera", "point", "x_px", "y_px", "residual_x_px", "residual_y_px", "weight",
 )  # fmt: skip
 _LEVELS = ("bad", "look", "good")
+_ALIKE = 1.01
+"""Noise over the least one, below which a housing explains the views as well."""
 
 
 def warn_of_unseen(found: Detections) -> None:
@@ -163,6 +167,7 @@ def calibration_text(
             f"{len(calibration.views)} views, {int(np.isfinite(square).sum())} points, "
             f"{calibration.rms_px:.3f} px rms (noise {calibration.noise_px:.3f} px)",
             *_baseline_lines(rig, target),
+            *_trial_lines(calibration),
             parameter_table([*shown, *bends]),
             *_verdict_lines(verdicts, len(calibration.warnings)),
         ]
@@ -178,6 +183,23 @@ def _baseline_lines(rig: Rig, target: Target) -> Iterator[str]:
             f"{with_sigma(length_m / target.size_m, sigma_m / target.size_m)} {unit} of "
             f"{1e3 * target.size_m:g} mm"
         )
+
+
+def _trial_lines(calibration: Calibration) -> Iterator[str]:
+    """Housings that were compared, and which fit alike."""
+    trials = calibration.housing_trials
+    if not trials:
+        return
+    shown = [f"{one.port} {one.noise_px:.4g} px" if not one.why else f"{one.port}: {one.why}"
+             for one in trials]  # fmt: skip
+    chosen = min(trials, key=lambda one: one.criterion)
+    yield f"housing {chosen.port}: noise with {', '.join(shown)}"
+    minimum = min(one.noise_px for one in trials if not one.why)
+    alike = [one.port for one in trials if one.noise_px < _ALIKE * minimum]
+    if set(alike) == {NoPort.shape, DomePort.shape}:
+        yield "a dome about the pupil and no port are the same camera: both fit alike"
+    elif len(alike) > 1:
+        yield f"{', '.join(alike)} fit alike: --start with a calibration in air tells them apart"
 
 
 def _verdict_lines(verdicts: Sequence[Mapping[str, str]], warnings: int) -> Iterator[str]:

@@ -287,7 +287,7 @@ def _port_verdicts(judged: Judgement) -> Iterator[Verdict]:
                 f"focal lengths of {name} under water are {ratio:.3f} times those in air: "
                 f"{max(camera.n_water, _FRESH_WATER):.3g} behind a flat port, near 1 behind a dome "
                 "or without a port",
-                f"; calibrate with --port {likely_port(ratio)}",
+                f"; calibrate with --port {likely_port(ratio)}, or --port auto",
             )  # fmt: skip
         spread_m = _SIGMAS * rig.sigmas.get(f"{name}.port_distance_m", np.inf)
         if np.isfinite(spread_m):
@@ -296,7 +296,7 @@ def _port_verdicts(judged: Judgement) -> Iterator[Verdict]:
                 yield _bad(
                     f"the flat port of {name} ended {distance_m * 1e3:.2g} mm before the pupil, "
                     "where no housing has glass: the pictures are through a dome, without a port, "
-                    "or in air: state its --port"
+                    "or in air; try --port auto"
                 )
     yield from _prior_verdicts(calibration)
 
@@ -320,8 +320,8 @@ def _prior_verdicts(calibration: Calibration) -> Iterator[Verdict]:
         float(moved[largest]), _MOVED_LIMITS,
         f"the views move {prior.parameters[largest]} by {moved[largest]:.1f} sigmas from its prior,"
         " more than any other parameter",
-        ": port, lens or water differ from the prior: state the right --port, or --intrinsics free "
-        "if the focus changed",
+        ": port, lens or water differ from the prior; try --port auto, or --intrinsics free if the "
+        "focus changed",
     )  # fmt: skip
 
 

@@ -239,8 +239,8 @@ class CalibrateCommand(SurveyCommand, ThreadsCommand):
         None, "Treatment of the intrinsics of --start; prior where it has sigmas."
     )
     port: str | None = option(
-        None, "flat, dome or none, and other ones of some cameras: flat,side=dome. Of --start, "
-        "or flat.",
+        None, "flat, dome or none, and other ones of some cameras: flat,side=dome; auto: the "
+        "likeliest. That of --start, or flat.",
     )  # fmt: skip
     dome_radius: str | None = option(None, "Outer radius of a dome, mm, and others: 80,bow=60.")
     port_distance: str | None = option(None, "Pupil to glass, first value, mm: 20, or 20,tele=45.")

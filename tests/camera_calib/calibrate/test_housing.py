@@ -3,7 +3,6 @@
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -63,10 +62,9 @@ def calibrated(options: CalibrateOptions, found: Detections) -> Calibration:
 @pytest.mark.parametrize(
     ("port", "kind", "ratio"), [(FLAT, "flat", 1.34), (CENTRED, "none", 1.0), (OFF, "dome", 0.98)]
 )
-def test_focal_lengths_show_the_housing(port: PortValues, kind: str, ratio: float) -> None:
-    glass: dict[str, Any] = {} if kind == "none" else {"glass_mm": "6"}
-    radius: dict[str, Any] = {"dome_radius_mm": "80"} if kind == "dome" else {}
-    found = calibrated(CalibrateOptions(water=True, port=kind, **glass, **radius), through(port))
+def test_the_housing_is_found(port: PortValues, kind: str, ratio: float) -> None:
+    found = calibrated(CalibrateOptions(water=True, port="auto", glass_mm="6"), through(port))
+    assert {camera.port.shape for camera in found.rig.cameras.values()} == {kind}
     for value in found.focal_ratios.values():
         assert value == pytest.approx(ratio, abs=0.01)
     assert 0.8 * NOISE_PX < found.noise_px < 1.2 * NOISE_PX
@@ -75,6 +73,7 @@ def test_focal_lengths_show_the_housing(port: PortValues, kind: str, ratio: floa
             for name, sigma_most in (("dome_x_m", 3e-4), ("dome_z_m", 3e-4)):
                 assert camera.parameter(name) == pytest.approx(getattr(port, name), abs=sigma_most)
     text = calibration_text(found, parse_target("chessboard 9x6 25mm"), [])
+    assert ("same camera" in text) == (kind == "none")
     fixed = [line for line in text.splitlines() if line.split()[1:3] == ["6", "(fixed)"]]
     assert len(fixed) == (0 if kind == "none" else len(TRUTH.cameras))
     said = verdicts(judge(found, None))
