@@ -301,14 +301,14 @@ class GeoreferenceRecord(JsonRecord):
     """`sparse/georeference.json`: residuals of navigation, and sigmas of the placing."""
 
     path: ClassVar = "sparse/georeference.json"
-    rms_north_m: float | None
-    rms_east_m: float | None
-    rms_depth_m: float | None
-    sigma_north_m: float | None
-    sigma_east_m: float | None
-    sigma_depth_m: float | None
-    sigma_heading_deg: float | None
-    sigma_tilt_deg: float | None
+    rms_north_m: float | None = None
+    rms_east_m: float | None = None
+    rms_depth_m: float | None = None
+    sigma_north_m: float | None = None
+    sigma_east_m: float | None = None
+    sigma_depth_m: float | None = None
+    sigma_heading_deg: float | None = None
+    sigma_tilt_deg: float | None = None
     scale_of_navigation: float | None = None
     scale_of_navigation_sigma: float | None = None
     sigma_scale: float = 0.0

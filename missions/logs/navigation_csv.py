@@ -153,23 +153,42 @@ def read_navigation(
     """
     header, rows = read_csv(path, needed)
     rows = rows[:-1] if is_growing else rows
-    parser = RowParser(header, zone, needed, str(path))
+    clocks = [name for name in ("time_s", "time_utc") if name in header]
+    if not clocks:
+        raise NavigationError(
+            f"{path}: no column time_s or time_utc; it has {as_line(', '.join(header))}"
+        )
+    others = [name for name in COLUMNS if name in header and name not in needed]
+    names = [*needed, *others]
+    if not set(names) & set(READINGS):
+        raise NavigationError(f"{path}: none of the columns {', '.join(READINGS)}")
+    start_utc: datetime | None = None
     times: list[float] = []
     table: list[list[float]] = []
     faults: list[tuple[int, str]] = []
     for line, row in rows:
         try:
-            time, values, wrong = parser.parse(row)
+            if clocks[0] == "time_utc":
+                date = _date(row["time_utc"], zone)
+                start_utc = start_utc or date
+                time = (date - start_utc).total_seconds()
+            else:
+                time = _number(row, "time_s")
+            values = [_number(row, name) for name in needed]
         except ValueError as error:
             faults.append((line, str(error)))
             continue
         if times and time <= times[-1]:
             faults.append((line, "time does not follow that of the row before"))
             continue
-        faults += [(line, f"{fault} (that value only)") for fault in wrong]
+        for name in others:
+            try:
+                values.append(_number(row, name) if row[name] else math.nan)
+            except ValueError as error:
+                values.append(math.nan)
+                faults.append((line, f"{error} (that value only)"))
         times.append(time)
         table.append(values)
-    names = parser.names
     if faults:
         texts = _by_ranges(faults)
         more = f" and {len(texts) - _NAMED} more" if len(texts) > _NAMED else ""
@@ -179,60 +198,7 @@ def read_navigation(
     if not any(np.isfinite(columns[name]).any() for name in READINGS if name in columns):
         what = "a position" if needed else "a reading"
         raise NavigationError(f"{path}: no row with a time and {what}")
-    return NavigationLog(time_s=np.array(times), columns=columns, start_utc=parser.start_utc)
-
-
-class RowParser:
-    """Rows of a navigation CSV as numbers, one by one."""
-
-    def __init__(
-        self, header: Sequence[str], zone: tzinfo, needed: Sequence[str], source: str
-    ) -> None:
-        """A parser of the rows below a header.
-
-        Args:
-            header: names of the columns.
-            zone: of dates that name none.
-            needed: columns without which a row is of no use.
-            source: the file, in words.
-
-        Raises:
-            NavigationError: there is no column of times, or none of readings.
-        """
-        times = [name for name in ("time_s", "time_utc") if name in header]
-        if not times:
-            raise NavigationError(
-                f"{source}: no column time_s or time_utc; it has {as_line(', '.join(header))}"
-            )
-        self._time, self._zone, self._needed = times[0], zone, len(needed)
-        self.names = [*needed, *(name for name in COLUMNS if name in header and name not in needed)]
-        """Columns of values."""
-        if not set(self.names) & set(READINGS):
-            raise NavigationError(f"{source}: none of the columns {', '.join(READINGS)}")
-        self.start_utc: datetime | None = None
-        """Date of the first row, from which seconds count; None of a log without dates."""
-
-    def parse(self, row: Mapping[str, str]) -> tuple[float, list[float], list[str]]:
-        """Seconds, values by `names`, and what is wrong with values that are not needed.
-
-        Raises:
-            ValueError: the row is of no use.
-        """
-        if self._time == "time_utc":
-            date = _date(row["time_utc"], self._zone)
-            self.start_utc = self.start_utc or date
-            time = (date - self.start_utc).total_seconds()
-        else:
-            time = _number(row, "time_s")
-        values = [_number(row, name) for name in self.names[: self._needed]]
-        wrong = []
-        for name in self.names[self._needed :]:
-            try:
-                values.append(_number(row, name) if row[name] else math.nan)
-            except ValueError as error:
-                wrong.append(str(error))
-                values.append(math.nan)
-        return time, values, wrong
+    return NavigationLog(time_s=np.array(times), columns=columns, start_utc=start_utc)
 
 
 def _by_ranges(faults: Sequence[tuple[int, str]]) -> list[str]:

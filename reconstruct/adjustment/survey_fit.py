@@ -116,13 +116,6 @@ _UNLIKELY = 1e-4
 _FAR = 2.0
 """Prior sigmas from which a parameter is named."""
 _MAX_NAMED = 4
-_NAMES = {
-    "port_distance_m": "distance of the port",
-    "normal_x": "tilt of the port",
-    "normal_y": "tilt of the port",
-    "n_water": "index of the water",
-}
-_MOTIONS = ("rx_rad", "ry_rad", "rz_rad", "x_m", "y_m", "z_m")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,7 +134,7 @@ class Contradiction:
     def words(self) -> str:
         """What to tell, in one line."""
         moved = ", ".join(
-            f"{_about(name)} by {pull:+.1f} sigmas"
+            f"{name} by {pull:+.1f} sigmas"
             for name, pull in zip(self.named, self.pulls, strict=True)
         )
         return (
@@ -185,13 +178,6 @@ def contradiction(
         named=tuple(parameters[k] for k in far),
         pulls=tuple(float(pulls[k]) for k in far),
     )
-
-
-def _about(name: str) -> str:
-    camera, field = name.split(".", 1)
-    if field in _MOTIONS:
-        return f"the place of {camera!r} on the rig ({name})"
-    return f"the {_NAMES.get(field, 'lens')} of {camera!r} ({name})"
 
 
 _RIG_SIGMAS = dict(zip(TURN_AND_SHIFT, [0.02] * 3 + [0.005] * 3, strict=True))
@@ -525,58 +511,6 @@ def frees_poses(settings: ReconstructConfig, rig: Rig, names: Sequence[str]) -> 
     return settings.refine_rig == "on"
 
 
-def on_pinholes(
-    mapped: Mapped, seen: Observations, fit: SurveyFit, warps: Mapping[str, PinholeWarp]
-) -> Mapped:
-    """The adjusted survey as a model of pinholes, with its keypoints where these see them.
-
-    Args:
-        mapped: the model that was adjusted.
-        seen: its keypoints.
-        fit: the adjusted survey.
-        warps: of the cameras of its rig.
-    """
-    model = pycolmap.Reconstruction(mapped.model)
-    names = list(seen.cameras)
-    pinholes = {name: colmap_pinhole(warps[name].pinhole) for name in names}
-    seen = replace(seen, warps=warps, cameras=pinholes)
-    pinhole_from_rig: dict[str, RigidTransform] = {
-        name: warps[name].pinhole_from_cam * fit.rig.cam_from_rig[name] for name in names
-    }
-    rig_from_reference = pinhole_from_rig[names[0]].inv()
-    for number, name in enumerate(names, 1):
-        camera = model.cameras[number]
-        camera.width, camera.height = warps[name].pinhole.size_px
-        camera.params = pinholes[name].params
-        if number > 1:
-            for rig in model.rigs.values():
-                rig.set_sensor_from_rig(
-                    camera.sensor_id, rigid3d(pinhole_from_rig[name] * rig_from_reference)
-                )
-    stations = RigidTransform.from_components(
-        fit.state.centres, Rotation.from_matrix(fit.state.turns)
-    )
-    pinhole_from_cam = warps[names[0]].pinhole_from_cam
-    for frame, station in zip(frames_of(model).tolist(), stations, strict=True):
-        model.frames[frame].rig_from_world = rigid3d(pinhole_from_cam * station.inv())
-    for point, xyz in zip(fit.point_ids.tolist(), fit.state.points, strict=True):
-        model.points3D[point].xyz = xyz
-    for number, image in model.images.items():
-        for point, xy in zip(image.points2D, seen.pixels[number - 1], strict=True):
-            point.xy = xy
-    notes = mapped.notes
-    if fit.parameters:
-        notes = (*notes, "rig refined from the survey's own pictures")
-    found = replace(mapped, model=model, warps=warps, baseline=model_baseline(model), notes=notes)
-    keypoints = Keypoints(found, seen)
-    if len(fit.point_ids) < len(model.points3D):  # the others lie where the old rig had them
-        keypoints.correct(model, 1.0)
-        move_points(model, loss_scale(fit.sigma_px))
-    keypoints.correct(model, 1.0)
-    model.update_point_3d_errors()
-    return found
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ExactSurvey:
     """A survey adjusted on exact rays."""
@@ -589,12 +523,52 @@ class ExactSurvey:
     fit: SurveyFit
 
     def on_pinholes(self) -> Mapped:
-        """As a model of the pinholes of its rig."""
-        warps = self.mapped.warps
-        if self.fit.parameters:
+        """A model of the pinholes of its rig, with keypoints where these see them."""
+        fit, warps = self.fit, self.mapped.warps
+        if fit.parameters:
             near, far = self.distances.near_m, self.distances.far_m
-            warps = {name: best_warp(self.fit.rig.cameras[name], near, far) for name in warps}
-        return on_pinholes(self.mapped, self.seen, self.fit, warps)
+            warps = {name: best_warp(fit.rig.cameras[name], near, far) for name in warps}
+        model = pycolmap.Reconstruction(self.mapped.model)
+        names = list(self.seen.cameras)
+        pinholes = {name: colmap_pinhole(warps[name].pinhole) for name in names}
+        seen = replace(self.seen, warps=warps, cameras=pinholes)
+        pinhole_from_rig: dict[str, RigidTransform] = {
+            name: warps[name].pinhole_from_cam * fit.rig.cam_from_rig[name] for name in names
+        }
+        rig_from_reference = pinhole_from_rig[names[0]].inv()
+        for number, name in enumerate(names, 1):
+            camera = model.cameras[number]
+            camera.width, camera.height = warps[name].pinhole.size_px
+            camera.params = pinholes[name].params
+            if number > 1:
+                for rig in model.rigs.values():
+                    rig.set_sensor_from_rig(
+                        camera.sensor_id, rigid3d(pinhole_from_rig[name] * rig_from_reference)
+                    )
+        stations = RigidTransform.from_components(
+            fit.state.centres, Rotation.from_matrix(fit.state.turns)
+        )
+        pinhole_from_cam = warps[names[0]].pinhole_from_cam
+        for frame, station in zip(frames_of(model).tolist(), stations, strict=True):
+            model.frames[frame].rig_from_world = rigid3d(pinhole_from_cam * station.inv())
+        for point, xyz in zip(fit.point_ids.tolist(), fit.state.points, strict=True):
+            model.points3D[point].xyz = xyz
+        for number, image in model.images.items():
+            for point, xy in zip(image.points2D, seen.pixels[number - 1], strict=True):
+                point.xy = xy
+        notes = self.mapped.notes
+        if fit.parameters:
+            notes = (*notes, "rig refined from the survey's own pictures")
+        found = replace(
+            self.mapped, model=model, warps=warps, baseline=model_baseline(model), notes=notes
+        )
+        keypoints = Keypoints(found, seen)
+        if len(fit.point_ids) < len(model.points3D):  # the others lie where the old rig had them
+            keypoints.correct(model, 1.0)
+            move_points(model, loss_scale(fit.sigma_px))
+        keypoints.correct(model, 1.0)
+        model.update_point_3d_errors()
+        return found
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

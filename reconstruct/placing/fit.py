@@ -97,26 +97,12 @@ class PlacementFit:
     """A model placed by navigation, and how well."""
 
     ned_from_model: Similarity
-    used: int
-    """Stations with a position (without any, with a depth) that took part."""
-    left_out: Mapping[str, int]
-    """For each group of channels, how many readings the rest contradicts."""
-    rms_m: Array
-    """(3,) north, east, down misses of the positions that took part, root mean square; NaN where
-    none did."""
-    free_scale: float
-    """Scale that a similarity would choose: 1 where navigation agrees with the known scale."""
-    free_scale_sigma: float
     middle_ned: Array
     """(3,) middle of the camera track, about which the covariance's rotation and scale act."""
     correlation: Mapping[str, Correlation]
     """For each group, how navigation's errors are correlated."""
-    time_unit: str
-    installed: Installation
     modes: Array
     """(K,) sizes of the model's soft modes, in their sigmas."""
-    mode_factor: float
-    """How many times larger such modes are than the pictures' sigmas say, 1 or more."""
     joint: Array
     """(7 + K, 7 + K) covariance of the placement (as `covariance`) and the modes."""
     bends: tuple[BendRecord, ...]
@@ -125,6 +111,8 @@ class PlacementFit:
     nuisances: Mapping[str, NuisanceRecord]
     """What was found of the errors of the lever arm (m), the clock (s), the mount (degrees) and
     navigation's own frame (turn in degrees, stretch), and their sigmas."""
+    stated: GeoreferenceRecord
+    """What `georeference.json` says but for the covariance and the mount."""
     mount: FoundMount | None = None
     """The mount, where it was not known."""
 
@@ -161,50 +149,23 @@ class PlacementFit:
     def record(self) -> GeoreferenceRecord:
         """What `georeference.json` says."""
         tilts, axes = np.linalg.eigh(self.covariance[:2, :2])
-        rms = [None if np.isnan(rms_m) else rms_m for rms_m in self.rms_m.tolist()]
         # What is the model's own by choice has no sigma.
         north, east, down = (sigma or None for sigma in self.sigma_position_m.tolist())
-        unit = "s" if self.time_unit == "s" else "stations"
-        return GeoreferenceRecord(
-            rms_north_m=rms[0],
-            rms_east_m=rms[1],
-            rms_depth_m=rms[2],
-            sigma_north_m=north,
-            sigma_east_m=east,
-            sigma_depth_m=down,
-            sigma_heading_deg=self.sigma_heading_deg or None,
-            sigma_tilt_deg=float(np.rad2deg(np.sqrt(tilts.mean()))) or None,
-            scale_of_navigation=self.free_scale,
-            scale_of_navigation_sigma=self.free_scale_sigma,
-            sigma_scale=self.sigma_scale,
-            mount=None if self.mount is None else self.mount.record,
-            method=_METHOD,
-            stations=self.used,
-            left_out=dict(self.left_out),
-            sigma_tilt_north_deg=float(self.sigma_tilt_deg[0]),
-            sigma_tilt_east_deg=float(self.sigma_tilt_deg[1]),
-            largest_tilt_deg=float(np.rad2deg(np.sqrt(tilts[1]))),
-            largest_tilt_axis_deg=float(np.rad2deg(np.arctan2(axes[1, 1], axes[0, 1])) % 180.0),
-            mount_sigma_deg=math.degrees(self.installed.mount_rad),
-            lever_sigma_m=self.installed.lever_m,
-            clock_sigma_s=self.installed.clock_s,
-            nuisances=dict(self.nuisances),
-            soft_modes=tuple(self.modes.tolist()),
-            soft_modes_factor=self.mode_factor,
-            middle_ned_m=tuple(self.middle_ned.tolist()),
-            covariance=tuple(map(tuple, self.covariance.tolist())),
-            covariance_order=_ORDER,
-            errors={
-                group: {
-                    f"correlation_{unit}": how.tau,
-                    "white_share": how.white,
-                    "constant_share": how.constant,
-                    "sigma_factor": how.factor,
-                    "dive_constants": how.restart,
-                }
-                for group, how in self.correlation.items()
-            },
-        )
+        found = {
+            "sigma_north_m": north,
+            "sigma_east_m": east,
+            "sigma_depth_m": down,
+            "sigma_heading_deg": self.sigma_heading_deg or None,
+            "sigma_tilt_deg": float(np.rad2deg(np.sqrt(tilts.mean()))) or None,
+            "sigma_scale": self.sigma_scale,
+            "mount": None if self.mount is None else self.mount.record,
+            "sigma_tilt_north_deg": float(self.sigma_tilt_deg[0]),
+            "sigma_tilt_east_deg": float(self.sigma_tilt_deg[1]),
+            "largest_tilt_deg": float(np.rad2deg(np.sqrt(tilts[1]))),
+            "largest_tilt_axis_deg": float(np.rad2deg(np.arctan2(axes[1, 1], axes[0, 1])) % 180.0),
+            "covariance": tuple(map(tuple, self.covariance.tolist())),
+        }
+        return self.stated.model_copy(update=found)
 
 
 _LEVEL_SIGMA_DEG = 10.0
@@ -375,22 +336,48 @@ class NavigationTask:
                     f"dives disagree on {group}, by {off:.0f} times the stated sigmas: the place "
                     "is as unsure as that; correct the log of one, or add control points"
                 )
+        middle = self._middle(at.place)
+        north, east, depth = (None if np.isnan(v) else v for v in _rms(residuals).tolist())
+        unit = "s" if epochs.timed else "stations"
+        stated = GeoreferenceRecord(
+            method=_METHOD,
+            # With a position (without any, with a depth) that took part.
+            stations=int((got.used[:, 0] if got.used[:, 0].any() else got.used[:, 2]).sum()),
+            left_out={group: int(lost[:, k].sum()) for group, k in first.items()},
+            rms_north_m=north,
+            rms_east_m=east,
+            rms_depth_m=depth,
+            # That a similarity would choose: 1 where navigation agrees with the known scale.
+            scale_of_navigation=float(np.exp(scaled.change[SCALE])) if SCALE not in free else 1.0,
+            scale_of_navigation_sigma=float(np.sqrt(scaled.covariance[SCALE, SCALE])),
+            mount_sigma_deg=math.degrees(self.installed.mount_rad),
+            lever_sigma_m=self.installed.lever_m,
+            clock_sigma_s=self.installed.clock_s,
+            nuisances=named,
+            soft_modes=tuple(at.sizes.tolist()),
+            soft_modes_factor=at.factor,
+            middle_ned_m=tuple(middle.tolist()),
+            covariance_order=_ORDER,
+            errors={
+                group: {
+                    f"correlation_{unit}": how.tau,
+                    "white_share": how.white,
+                    "constant_share": how.constant,
+                    "sigma_factor": how.factor,
+                    "dive_constants": how.restart,
+                }
+                for group, how in got.correlation.items()
+            },
+        )
         return PlacementFit(
             ned_from_model=at.place,
-            used=int((got.used[:, 0] if got.used[:, 0].any() else got.used[:, 2]).sum()),
-            left_out={group: int(lost[:, k].sum()) for group, k in first.items()},
-            rms_m=_rms(residuals),
-            free_scale=float(np.exp(scaled.change[SCALE])) if SCALE not in free else 1.0,
-            free_scale_sigma=float(np.sqrt(scaled.covariance[SCALE, SCALE])),
-            middle_ned=self._middle(at.place),
+            middle_ned=middle,
             correlation=got.correlation,
-            time_unit="s" if epochs.timed else "stations",
-            installed=self.installed,
             modes=at.sizes,
-            mode_factor=at.factor,
             joint=got.covariance[np.ix_(joint, joint)],
             bends=self._bends(at, got, free, bounds),
             nuisances=named,
+            stated=stated,
         )
 
     def _warn_of_installation(self, found: Mapping[str, NuisanceRecord]) -> None:

@@ -66,7 +66,6 @@ from reconstruct.placing.track import (
     write_covariances,
     write_track_csv,
     write_track_geojson,
-    write_track_tum,
 )
 from reconstruct.views.model import read_warps, write_frame
 from reconstruct.views.model_files import as_transform, read_reconstruction, rigid3d
@@ -334,7 +333,6 @@ def run_sparse(
         )
     sigmas = track_sigmas(rows, covariances)
     write_track_csv(folder / "track.csv", rows, placed.frame, sigmas)
-    write_track_tum(folder / "track.tum", rows)
     if placed.frame.datum is not None:
         write_track_geojson(folder / "track.geojson", rows, placed.frame, sigmas)
     if placed.fit is not None:

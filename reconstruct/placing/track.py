@@ -302,25 +302,6 @@ def _feature(kind: str, coordinates: Sequence[Any], properties: dict[str, Any]) 
     return {"type": "Feature", "geometry": geometry, "properties": properties}
 
 
-def write_track_tum(path: Path, rows: Sequence[TrackRow]) -> None:
-    """Write the track in TUM's format; without times the station number stands for the time.
-
-    Of every station one row is kept: that of its first camera.
-    """
-    lines, stations = [], set()
-    timed = all(row.time_s == row.time_s for row in rows)
-    for row in rows:
-        if row.station in stations:
-            continue
-        stations.add(row.station)
-        pose = row.world_from_cam
-        values = [*pose.translation, *pose.rotation.as_quat(canonical=True)]
-        time = f"{row.time_s if timed else row.station:.6f}"
-        lines.append(" ".join([time, *(f"{v:.9f}" for v in values)]))
-    with atomic_path(path) as temporary:
-        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
 def read_track_poses(path: Path) -> dict[str, RigidTransform]:
     """Read `world_from_cam` (entrance pupils) by picture from `track.csv`.
 

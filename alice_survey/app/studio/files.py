@@ -49,7 +49,7 @@ _TYPES = {
     ".geojson": "application/geo+json", ".glb": "model/gltf-binary", ".html": PAGE,
     ".jpg": "image/jpeg", ".js": "text/javascript; charset=utf-8", ".json": "application/json",
     ".md": _TEXT, ".pdf": "application/pdf", ".png": "image/png", ".svg": "image/svg+xml",
-    ".tif": "image/tiff", ".toml": _TEXT, ".tum": _TEXT, ".txt": _TEXT, ".webp": "image/webp",
+    ".tif": "image/tiff", ".toml": _TEXT, ".txt": _TEXT, ".webp": "image/webp",
     ".xml": "text/xml",
 }  # fmt: skip
 """What browsers show; all other files are bytes to save."""

@@ -61,7 +61,7 @@ def test_dives_that_contradict_each_other_leave_the_place_that_unsure(jump_m: fl
     ratios = []
     for seed in range(8):
         fit, errors, sigma = place(BODY, two_dives(seed, jump_m), seed)
-        assert not any(fit.left_out.values())
+        assert not any(fit.record.left_out.values())
         assert fit.correlation["horizontal"].restart * SIGMA[0] > 0.1 * jump_m
         assert fit.correlation["horizontal"].factor < 1.5
         assert sigma[2] < SIGMA[2]  # depths do not suffer

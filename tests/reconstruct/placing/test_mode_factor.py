@@ -64,7 +64,7 @@ def whitened(factor: float) -> tuple[Array, Array]:
     found, off = [], []
     for seed in range(12):
         fit, error = fitted(seed, factor)
-        found.append(fit.mode_factor)
+        found.append(fit.record.soft_modes_factor)
         off.append(error / np.sqrt(np.diag(fit.joint)[_FIRST:]))
     return np.array(found), np.array(off)
 

@@ -126,7 +126,7 @@ def test_correlation_is_found() -> None:
             how = fit.correlation[group]
             decay = how.tau if how.white < 0.5 else 0.5
             assert low / 2 <= decay <= high, (group, how)
-        assert fit.time_unit == "s"
+        assert all("correlation_s" in how for how in fit.record.errors.values())
 
 
 def test_a_heading_that_turns_the_reckoned_track_too_is_one_error_not_two() -> None:
@@ -153,14 +153,14 @@ def test_bad_fixes_are_left_out_and_gaps_do_no_harm() -> None:
         records[k] = replace(records[k], latitude_deg=records[k].latitude_deg + miss / 110_900)
     records[12] = replace(records[12], heading_deg=(records[12].heading_deg + 90) % 360)
     hurt, error_hurt, _ = place(body, records, 1)
-    assert hurt.left_out["horizontal"] == 3
-    assert hurt.left_out["heading"] == 1
-    assert hurt.left_out["depth"] == clean.left_out["depth"] == 0
+    assert hurt.record.left_out["horizontal"] == 3
+    assert hurt.record.left_out["heading"] == 1
+    assert hurt.record.left_out["depth"] == clean.record.left_out["depth"] == 0
     assert np.all(np.abs(error_hurt - error)[:6] < 0.3 * sigma[:6])
     for k in range(15, 30):
         records[k] = replace(records[k], latitude_deg=np.nan)
     gap, error_gap, sigma_gap = place(body, records, 1)
-    assert gap.used == len(body) - 15 - 2
+    assert gap.record.stations == len(body) - 15 - 2
     assert np.all(np.abs(error_gap[:6]) < 4.0 * sigma_gap[:6])
 
 

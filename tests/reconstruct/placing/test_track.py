@@ -9,11 +9,12 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.frames import Array, Datum, attitude_from_rotation, rotation_from_attitude
+from alice_survey.core.records import GeoreferenceRecord
 from reconstruct.adjustment.soft_modes import SoftModes, no_modes
 from reconstruct.adjustment.uncertainty import Uncertainty
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.fit import PlacementFit
-from reconstruct.placing.navigation import USUAL_INSTALLATION, attitude_axes
+from reconstruct.placing.navigation import attitude_axes
 from reconstruct.placing.track import (
     SIGMAS,
     TrackRow,
@@ -75,10 +76,8 @@ def rows_of(poses: RigidTransform, station: int = 0) -> list[TrackRow]:
 def placed(middle: Array, covariance: Array) -> PlacementFit:
     """A place of this covariance."""
     return PlacementFit(
-        ned_from_model=HERE, used=1, left_out={}, rms_m=np.zeros(3), free_scale=1.0,
-        free_scale_sigma=0.0, middle_ned=middle, correlation={},
-        time_unit="s", installed=USUAL_INSTALLATION, modes=np.zeros(0), mode_factor=1.0,
-        joint=covariance, bends=(), nuisances={},
+        ned_from_model=HERE, middle_ned=middle, correlation={}, modes=np.zeros(0),
+        joint=covariance, bends=(), nuisances={}, stated=GeoreferenceRecord(),
     )  # fmt: skip
 
 
