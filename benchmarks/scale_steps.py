@@ -40,11 +40,13 @@ from benchmarks.scale_model import (
 from camera_calib.freedom import Prior
 from camera_calib.rig import Rig, read_rig
 from reconstruct.adjustment.exact_observations import (
+    Linearised,
+    PixelParts,
     Pixels,
     RigState,
+    Workers,
     calibrated_parameters,
 )
-from reconstruct.adjustment.pixel_parts import Linearised, PixelParts, Workers
 from reconstruct.adjustment.survey_fit import SurveyProblem
 from reconstruct.adjustment.uncertainty import shape_of_block
 from reconstruct.dense.stereo_pairs import PointsInSight, choose_partners, neighbours

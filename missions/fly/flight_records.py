@@ -18,7 +18,7 @@ from camera_calib.rig import Rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import plan_pattern, stations_of_flight
 from missions.fly.flight_route import stations_of_dives
-from missions.logs.bag import BagRecord
+from missions.logs.ros_builder import BagRecord
 from missions.values.flight import Flight, rms
 
 _RANGES = ("range_1_m", "range_2_m", "range_3_m", "range_4_m")

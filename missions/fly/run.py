@@ -48,7 +48,7 @@ from missions.fly.flight_records import (
 from missions.fly.flight_route import one_dive, stations_of_dives, whole_route
 from missions.fly.mission_flight import mission_of_settings, mission_summary, simulate_mission
 from missions.fly.simulation import flight_settings, floor_grid, simulate_plan
-from missions.logs.bag import write_bag
+from missions.logs.ros_builder import write_bag
 from missions.values.flight import Flight, rms
 from missions.values.navigation import write_navigation
 from missions.values.plan_file import Plan, read_plan

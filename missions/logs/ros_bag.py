@@ -14,7 +14,7 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -108,7 +108,10 @@ def read_ros_bag(path: Path, requested: Mapping[str, str], datum: Datum | None) 
         lost: Counter[str] = Counter()
         notes: list[str] = []
         series = _collect(reader, {*chosen.values(), *origin, *joints}, lost, notes)
-    return _BagReading(path, datum, chosen, series, lost, notes).dive(origin, joints)
+    reading = _BagReading(
+        path=path, datum=datum, chosen=chosen, series=series, lost=lost, notes=notes
+    )
+    return reading.dive(origin, joints)
 
 
 def _choose(
@@ -250,21 +253,18 @@ def _collect(
     return found
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _BagReading:
     """The parts of a dive out of the topics of a bag."""
 
-    def __init__(
-        self,
-        path: Path,
-        datum: Datum | None,
-        chosen: Mapping[str, _Topic],
-        series: Mapping[_Topic, _Series],
-        lost: Counter[str],
-        notes: list[str],
-    ) -> None:
-        self.path, self.datum, self.chosen = path, datum, chosen
-        self.series, self.lost, self.notes = series, lost, notes
-        self._counted: set[_Topic] = set()
+    path: Path
+    datum: Datum | None
+    chosen: Mapping[str, _Topic]
+    series: Mapping[_Topic, _Series]
+    lost: Counter[str]
+    notes: list[str]
+    counted: set[_Topic] = field(default_factory=set)
+    """Topics whose lost rows are in `lost`."""
 
     def dive(self, origin: Sequence[_Topic], joints: Sequence[_Topic]) -> LoggedDive:
         """Everything that the bag holds."""
@@ -308,8 +308,8 @@ class _BagReading:
 
     def _clean_series(self, series: _Series, values: Array) -> Signal | None:
         """A signal; what its times cost is counted once for a topic."""
-        lost = Counter() if series.topic in self._counted else self.lost
-        self._counted.add(series.topic)
+        lost = Counter() if series.topic in self.counted else self.lost
+        self.counted.add(series.topic)
         return clean_signal(series.topic.name, series.time_s, values, lost)
 
     def _of(self, role: str) -> _Series | None:

@@ -41,14 +41,17 @@ from camera_calib.freedom import POSE as TURN_AND_SHIFT
 from camera_calib.freedom import Prior, at_bound, move_rig, part_of_rig, pose_names, value
 from camera_calib.rig import Covariance, Rig
 from reconstruct.adjustment.exact_observations import (
+    ALONE,
+    Linearised,
+    PixelParts,
     Pixels,
     RigState,
+    Workers,
     calibrated_parameters,
     choose_pixels,
     start_state,
 )
 from reconstruct.adjustment.normal_equations import POSE, PointEquations, reduce_parts
-from reconstruct.adjustment.pixel_parts import ALONE, Linearised, PixelParts, Workers
 from reconstruct.adjustment.soft_modes import Motions, SoftModes
 from reconstruct.adjustment.uncertainty import Uncertainty, estimate
 from reconstruct.mapping.arrays import (

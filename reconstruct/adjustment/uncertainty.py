@@ -35,7 +35,14 @@ from alice_survey.core.manifest import ImageRecord
 from camera_calib.camera import Camera
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.rig import Rig
-from reconstruct.adjustment.exact_observations import Pixels, RigState
+from reconstruct.adjustment.exact_observations import (
+    ALONE,
+    Linearised,
+    PixelParts,
+    Pixels,
+    RigState,
+    Workers,
+)
 from reconstruct.adjustment.normal_equations import (
     POSE,
     Gauge,
@@ -43,7 +50,6 @@ from reconstruct.adjustment.normal_equations import (
     PointEquations,
     reduce_parts,
 )
-from reconstruct.adjustment.pixel_parts import ALONE, Linearised, PixelParts, Workers
 from reconstruct.adjustment.soft_modes import Motions, SoftModes, no_modes, soft_modes, spread
 from reconstruct.mapping.arrays import (
     MIN_POINTS,

@@ -24,10 +24,11 @@ stereo pixels say of them, and are eliminated (Schur complement; Triggs et al. 2
 adjustment: a modern synthesis", section 6).
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -67,9 +68,8 @@ _PARTNERS = 6
 """Stations that each is linked with: those that share most with it. Others add time, not shape."""
 _BLOCK = 32
 """Pairs of stations in one task, so that sending them costs little."""
-_LinkAnswer = tuple[Array, Array, int, Array]
-"""The second station's rig as the first sees it: quaternion, shift, inliers, covariance of turn,
-then shift."""
+_LinkAnswer = tuple[Array, Array, int, float, float]
+"""The second station's rig as the first sees it: quaternion, shift, inliers, variances of both."""
 _LINK_ROUNDS = 10
 _SETTLED = 1e-7
 """Radians, or metres, below which a step ends the search."""
@@ -199,9 +199,20 @@ def link_stations(
         seed=seed,
     )
     found = executor.map(resect, blocks, label="linking stations")
-    answers = [answer for block in found for answer in block]
-    links = [_link(*pair) for pair in zip(tasks, answers, strict=True)]
-    return [link for link in links if link is not None]
+    answers = zip(tasks, (answer for block in found for answer in block), strict=True)
+    return [
+        StationLink(
+            first=task.first,
+            second=task.second,
+            second_from_first=RigidTransform.from_components(shift, Rotation.from_quat(turn)),
+            inliers=inliers,
+            turn_variance=turn_variance,
+            shift_variance=shift_variance,
+        )
+        for task, answer in answers
+        if answer is not None
+        for turn, shift, inliers, turn_variance, shift_variance in (answer,)
+    ]
 
 
 def _rays(
@@ -310,23 +321,29 @@ def _resect_all(
     pinholes = _pinholes(cameras, cam_from_rig)
     made = [pycolmap.Camera(dict(camera)) for camera in cameras]
     poses = [pycolmap.Rigid3d(pycolmap.Rotation3d(quat), shift) for quat, shift in cam_from_rig]
-    answers: list[_LinkAnswer | None] = []
-    for task in tasks:
-        found = pycolmap.estimate_and_refine_generalized_absolute_pose(
-            task.pixels, task.points, task.cameras, poses, made, ransac, refine
-        )
-        if found is None:
-            answers.append(None)
-            continue
-        start = as_transform(found["rig_from_world"])
-        refined = refine_link(task.points, task.pixels, np.array(task.cameras), pinholes, start)
-        if refined is None:
-            answers.append(None)
-            continue
-        pose, covariance = refined
-        place = pose.rotation.as_quat(), np.asarray(pose.translation)
-        answers.append((*place, int(found["num_inliers"]), covariance))
-    return answers
+    estimate = partial(
+        pycolmap.estimate_and_refine_generalized_absolute_pose,
+        cams_from_rig=poses, cameras=made, estimation_options=ransac, refinement_options=refine,
+    )  # fmt: skip
+    return [_resect(task, estimate, pinholes) for task in tasks]
+
+
+def _resect(
+    task: _Resection, estimate: Callable[..., Any], pinholes: RigPinholes
+) -> _LinkAnswer | None:
+    found = estimate(task.pixels, task.points, task.cameras)
+    if found is None or found["num_inliers"] < max(_MIN_INLIERS, _MIN_SHARE * len(task.points)):
+        return None
+    start = as_transform(found["rig_from_world"])
+    refined = refine_link(task.points, task.pixels, np.array(task.cameras), pinholes, start)
+    if refined is None:
+        return None
+    pose, covariance = refined
+    turns, shifts = float(np.trace(covariance[:3, :3])), float(np.trace(covariance[3:, 3:]))
+    if not (turns > 0 and shifts > 0 and np.isfinite(turns + shifts)):
+        return None
+    shift = np.asarray(pose.translation)
+    return pose.rotation.as_quat(), shift, int(found["num_inliers"]), turns, shifts
 
 
 def _pinholes(
@@ -338,24 +355,6 @@ def _pinholes(
         centre_px=params[:, 2:],
         turn=np.array([Rotation.from_quat(quat).as_matrix() for quat, _ in cam_from_rig]),
         shift=np.array([shift for _, shift in cam_from_rig]),
-    )
-
-
-def _link(task: _Resection, found: _LinkAnswer | None) -> StationLink | None:
-    if found is None:
-        return None
-    quaternion, shift, inliers, covariance = found
-    turns, shifts = np.trace(covariance[:3, :3]), np.trace(covariance[3:, 3:])
-    known = turns > 0 and shifts > 0 and np.isfinite(turns + shifts)
-    if inliers < max(_MIN_INLIERS, _MIN_SHARE * len(task.points)) or not known:
-        return None
-    return StationLink(
-        first=task.first,
-        second=task.second,
-        second_from_first=RigidTransform.from_components(shift, Rotation.from_quat(quaternion)),
-        inliers=inliers,
-        turn_variance=float(turns),
-        shift_variance=float(shifts),
     )
 
 
@@ -477,8 +476,12 @@ def triangulate_and_adjust(
         cache_options = pycolmap.DatabaseCacheOptions()
         cache_options.min_num_matches = options.min_num_matches
         cache = pycolmap.DatabaseCache.create(opened, cache_options)
-    rough = _triangulate(cache, rig_from_world, _wide(options))
-    rough.filter_points(_filter(options, _FIRST_ERROR_PX))
+    wide, loose = options.get_triangulation(), options.get_mapper()
+    wide.create_max_angle_error = wide.continue_max_angle_error = _FIRST_ANGLE_DEG
+    wide.complete_max_reproj_error = wide.merge_max_reproj_error = _FIRST_ERROR_PX
+    loose.filter_max_reproj_error = _FIRST_ERROR_PX
+    rough = _triangulate(cache, rig_from_world, wide)
+    rough.filter_points(loose)
     model = rough.reconstruction
     adjust(model, options, tolerance=1e-2, robust_px=_ROBUST_PX)
     # Again, since the first poses joined what they should not, and left out what they should not.
@@ -553,23 +556,6 @@ def _triangulate(
         mapper.triangulate_image(options, number)
     mapper.complete_and_merge_tracks(options)
     return mapper
-
-
-def _wide(
-    options: pycolmap.IncrementalPipelineOptions,
-) -> pycolmap.IncrementalTriangulatorOptions:
-    wide = options.get_triangulation()
-    wide.create_max_angle_error = wide.continue_max_angle_error = _FIRST_ANGLE_DEG
-    wide.complete_max_reproj_error = wide.merge_max_reproj_error = _FIRST_ERROR_PX
-    return wide
-
-
-def _filter(
-    options: pycolmap.IncrementalPipelineOptions, error_px: float
-) -> pycolmap.IncrementalMapperOptions:
-    wide = options.get_mapper()
-    wide.filter_max_reproj_error = error_px
-    return wide
 
 
 def _frame_poses(

@@ -446,8 +446,12 @@ def _shared_middle(frusta: Frusta, i: int, j: int) -> float:
 
 def _slack_m(record: ImageRecord, distance_m: float) -> float:
     """How far a picture's middle may be from where navigation has it; 0 where no sigma is known."""
+    return _SIGMAS * _sigma_m(record, distance_m)
+
+
+def _sigma_m(record: ImageRecord, distance_m: float) -> float:
     tilt = np.deg2rad(np.nan_to_num(record.sigma_attitude_deg)) * distance_m
-    return float(_SIGMAS * np.hypot(np.nan_to_num(record.sigma_horizontal_m), tilt))
+    return float(np.hypot(np.nan_to_num(record.sigma_horizontal_m), tilt))
 
 
 def joined_cameras(
@@ -485,10 +489,7 @@ def _reach_m(record: ImageRecord) -> float:
 
     Two together make up the uncertainty of their distance, the root of two of that of one.
     """
-    tilt = np.deg2rad(record.sigma_attitude_deg) * record.altitude_m
-    return float(
-        _SIGMAS / np.sqrt(2.0) * np.hypot(*np.nan_to_num([record.sigma_horizontal_m, tilt]))
-    )
+    return float(_SIGMAS / np.sqrt(2.0) * _sigma_m(record, record.altitude_m))
 
 
 def well_conditioned(

@@ -31,13 +31,14 @@ from alice_survey.core.frames import Array
 from alice_survey.core.records import MappingRecord, RegistrationRecord, ScaleRecord
 from camera_calib.rig import Rig, read_rig
 from reconstruct.adjustment.exact_observations import (
+    Linearised,
+    PixelParts,
     Pixels,
     RigState,
     calibrated_parameters,
     exact_observations,
 )
 from reconstruct.adjustment.normal_equations import Gauge, PointEquations, by_pose, reduce_parts
-from reconstruct.adjustment.pixel_parts import Linearised, PixelParts
 from reconstruct.mapping.arrays import MIN_POINTS, Indices, first_of, linked_groups
 from reconstruct.measure.figures import polygon_area, polyline, slopes_of
 from reconstruct.picking.matching import refine

@@ -290,7 +290,11 @@ def find_place(task: Placing) -> Placed:
     levelled = level(points, centres)
     known = _known_scale(task.workspace, task.mapping)
     if known is None and task.datum is None:
-        known = _altitude_scale(task, levelled, points)
+        stations = levelled.apply(np.stack([pose.translation for pose in task.pinholes]))
+        found = scale_by_altitudes(task.records, stations, levelled.apply(points))
+        if found is not None:
+            source = f"scale from altitudes, sigma {found[1]:.1%}"
+            known = _KnownScale(scale=found[0], source=source, sigma=found[1], held=False)
     scale = None if known is None else known.scale
     path = task.workspace / CONTROL_FILE
     control = read_control(path) if path.is_file() else Control()
@@ -560,17 +564,6 @@ def _known_scale(workspace: Path, mapping: MappingRecord) -> _KnownScale | None:
         source="scaled by one known length",
         sigma=LENGTH_SCALE_SIGMA,
     )
-
-
-def _altitude_scale(task: Placing, levelled: Similarity, points: Array) -> _KnownScale | None:
-    """The scale by altitudes, where neither a rig nor positions give one."""
-    centres = levelled.apply(np.stack([pose.translation for pose in task.pinholes]))
-    found = scale_by_altitudes(task.records, centres, levelled.apply(points))
-    if found is None:
-        return None
-    scale, sigma = found
-    source = f"scale from altitudes, sigma {sigma:.1%}"
-    return _KnownScale(scale=scale, source=source, sigma=sigma, held=False)
 
 
 def _by_station(

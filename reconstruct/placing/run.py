@@ -24,7 +24,7 @@ from alice_survey.core.artefacts import read_csv
 from alice_survey.core.config import ReconstructConfig
 from alice_survey.core.errors import WorkspaceError, collected_by, warn
 from alice_survey.core.executor import Executor
-from alice_survey.core.frames import Array, Datum
+from alice_survey.core.frames import Datum
 from alice_survey.core.manifest import ImageRecord
 from alice_survey.core.records import (
     AcceptanceRecord,
@@ -37,11 +37,11 @@ from alice_survey.core.records import (
 )
 from camera_calib.freedom import knowing_water
 from camera_calib.rig import Rig, rig_with_mount, write_rig
+from reconstruct.adjustment.exact_observations import Workers
 from reconstruct.adjustment.normal_equations import POSE
-from reconstruct.adjustment.pixel_parts import Workers
 from reconstruct.adjustment.soft_modes import SoftModes
 from reconstruct.adjustment.survey_fit import adjust_survey
-from reconstruct.adjustment.uncertainty import Uncertainty, write_uncertainty
+from reconstruct.adjustment.uncertainty import write_uncertainty
 from reconstruct.mapping.arrays import cross_matrices, frames_of, model_groups
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.run import UNREGISTERED, read_inputs, write_reasons
@@ -325,13 +325,19 @@ def run_sparse(
         else {n: known_mount.body_from_cam(n).rotation for n in known_mount.cameras}
     )
     rows = track_rows(model, of_name, warps, placed.frame, mounts)
-    covariances = _covariances(folder, placed, rows, shape)
+    covariances = None
+    if placed.fit is not None or shape is not None:
+        covariances = pose_covariances(rows, placed.fit, shape, move)
+        parts = ["place"] * (placed.fit is not None)
+        parts.append("no model covariance" if shape is None else "shape of the model")
+        names = [row.image for row in rows]
+        write_covariances(folder / "track_covariance.npz", names, covariances, "; ".join(parts))
     if adjusted.shape is not None:
         write_uncertainty(
             folder / "covariance.npz",
             adjusted.shape.move(move.scale, move.rotation, move.translation),
         )
-    sigmas = track_sigmas(rows, covariances)
+    sigmas = track_sigmas(rows, None if placed.fit is None else covariances)
     write_track_csv(folder / "track.csv", rows, placed.frame, sigmas)
     if placed.frame.datum is not None:
         write_track_geojson(folder / "track.geojson", rows, placed.frame, sigmas)
@@ -378,29 +384,6 @@ def _read_mapping(workspace: Path, mapping: MappingRecord) -> Mapped:
         rig_factor=1.0 if mapping.rig_factor is None else mapping.rig_factor,
         notes=mapping.notes,
     )
-
-
-def _covariances(
-    folder: Path, placed: Placed, rows: Sequence[TrackRow], shape: Uncertainty | None
-) -> Array | None:
-    """Covariances of all poses in the world; written as far as known, None where unknown.
-
-    Args:
-        folder: to write into.
-        placed: place of the model.
-        rows: the track.
-        shape: of the model before its soft modes were found.
-    """
-    if placed.fit is None and shape is None:
-        return None
-    total = pose_covariances(rows, placed.fit, shape, placed.world_from_model)
-    parts = [
-        *(["place"] if placed.fit is not None else []),
-        "no model covariance" if shape is None else "shape of the model",
-    ]
-    names = [row.image for row in rows]
-    write_covariances(folder / "track_covariance.npz", names, total, "; ".join(parts))
-    return None if placed.fit is None else total
 
 
 def _registration(

@@ -9,8 +9,13 @@ from mcap_ros2.decoder import DecoderFactory
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.frames import Datum, rotation_from_attitude
-from missions.logs.bag import BagRecord, write_bag
-from missions.logs.ros_builder import flipped_body, flipped_quaternion, flipped_world
+from missions.logs.ros_builder import (
+    BagRecord,
+    flipped_body,
+    flipped_quaternion,
+    flipped_world,
+    write_bag,
+)
 
 ENU_FROM_NED = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 FRD_FROM_FLU = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))

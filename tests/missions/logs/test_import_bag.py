@@ -12,10 +12,9 @@ from rosbags.rosbag2 import StoragePlugin
 from alice_survey.core.errors import NavigationError
 from alice_survey.core.frames import Datum, attitude_from_rotation, rotation_from_attitude
 from alice_survey.sim.vehicle.log import read_vehicle_log
-from missions.logs.bag import write_bag
 from missions.logs.import_log import ImportOptions, import_log
 from missions.logs.navigation_csv import read_navigation
-from missions.logs.ros_builder import flipped_quaternion, flipped_world
+from missions.logs.ros_builder import flipped_quaternion, flipped_world, write_bag
 from tests.missions.logs.log_files import Bag
 from tests.missions.logs.test_bag import flight
 

@@ -18,13 +18,15 @@ from camera_calib.freedom import POSE, value
 from camera_calib.rig import Covariance, Rig
 from reconstruct.adjustment import exact_observations, survey_fit
 from reconstruct.adjustment.exact_observations import (
+    Linearised,
+    PixelParts,
     Pixels,
     RigState,
+    Workers,
     choose_pixels,
     start_state,
 )
 from reconstruct.adjustment.normal_equations import PointEquations, reduce_parts
-from reconstruct.adjustment.pixel_parts import Linearised, PixelParts, Workers
 from reconstruct.adjustment.survey_fit import (
     AdjustedSurvey,
     SurveyFit,

@@ -13,12 +13,12 @@ from alice_survey.core.block_solver import BlockStep
 from alice_survey.core.frames import Array
 from camera_calib.rig import Covariance, Rig
 from reconstruct.adjustment import exact_observations
+from reconstruct.adjustment.exact_observations import Workers
 from reconstruct.adjustment.exact_observations import exact_observations as linearised
 from reconstruct.adjustment.normal_equations import (
     LinearObservations,
     reduce_points,
 )
-from reconstruct.adjustment.pixel_parts import Workers
 from reconstruct.adjustment.soft_modes import Motions, spread
 from reconstruct.adjustment.survey_fit import fit_survey
 from reconstruct.adjustment.uncertainty import (
