@@ -4,6 +4,7 @@ Descriptors are bytes, so that every dot product is a whole number below 2^24 an
 float32 matrix products exactly: matches depend neither on the number of threads nor on the blocks.
 """
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -45,7 +46,7 @@ _MIN_RADIUS = 0.02
 @compiled
 def _best_two(
     products: Any, norms_a: Any, norms_b: Any, best: Any, first: Any, second: Any, best_b: Any,
-    nearest_b: Any, offset: int,
+    nearest_b: Any,
 ) -> None:  # fmt: skip
     """Fold one block of products into the nearest neighbours of both sides.
 
@@ -53,10 +54,9 @@ def _best_two(
     nearest row. The first of equals wins.
     """
     for i in range(products.shape[0]):
-        row = offset + i
-        minimum, next_least, index = first[row], second[row], best[row]
+        minimum, next_least, index = first[i], second[i], best[i]
         for j in range(products.shape[1]):
-            distance = norms_a[row] + norms_b[j] - 2.0 * products[i, j]
+            distance = norms_a[i] + norms_b[j] - 2.0 * products[i, j]
             if distance < minimum:
                 next_least = minimum
                 minimum = distance
@@ -65,8 +65,8 @@ def _best_two(
                 next_least = distance
             if distance < nearest_b[j]:
                 nearest_b[j] = distance
-                best_b[j] = row
-        first[row], second[row], best[row] = minimum, next_least, index
+                best_b[j] = i
+        first[i], second[i], best[i] = minimum, next_least, index
 
 
 def match_descriptors(
@@ -83,21 +83,45 @@ def match_descriptors(
     Returns:
         (K, 2) indices into a and b, by rising index into a.
     """
+    every = np.arange(len(b))
+    blocks = (np.arange(start, min(start + block, len(a))) for start in range(0, len(a), block))
+    return _mutual(a, b, ratio, ((rows, every) for rows in blocks))
+
+
+def _mutual(
+    a: NDArray[np.uint8],
+    b: NDArray[np.uint8],
+    ratio: float,
+    searches: Iterable[tuple[NDArray[np.intp], NDArray[np.intp]]],
+) -> Matches:
+    """As `match_descriptors`, where some rows of a are compared with some of b, in turn."""
     if not len(a) or len(b) < 2:
         return np.zeros((0, 2), np.uint32)
-    left, right = a.astype(np.float32), b.astype(np.float32)
-    norms_a, norms_b = (left**2).sum(axis=1), (right**2).sum(axis=1)
+    right = b.astype(np.float32)
+    norms_b = (right**2).sum(axis=1)
     best = np.zeros(len(a), np.int64)
     first = np.full(len(a), np.inf, np.float32)
     second = np.full(len(a), np.inf, np.float32)
-    best_b = np.zeros(len(b), np.int64)
+    best_b = np.full(len(b), -1, np.int64)
     nearest_b = np.full(len(b), np.inf, np.float32)
-    for start in range(0, len(a), block):
-        products = left[start : start + block] @ right.T
-        _best_two(products, norms_a, norms_b, best, first, second, best_b, nearest_b, start)
-    rows = np.arange(len(a))
-    clear = first < ratio * ratio * second
-    good = rows[clear & (best_b[best] == rows)]
+    for rows, near in searches:
+        left = a[rows].astype(np.float32)
+        own_best, own_best_b = np.zeros(len(rows), np.int64), best_b[near]
+        own_first, own_second = first[rows], second[rows]
+        own_nearest = nearest_b[near]
+        before = own_nearest.copy()
+        _best_two(
+            left @ right[near].T, (left**2).sum(axis=1), norms_b[near], own_best, own_first,
+            own_second, own_best_b, own_nearest,
+        )  # fmt: skip
+        best[rows], first[rows], second[rows] = near[own_best], own_first, own_second
+        closer = own_nearest < before
+        best_b[near[closer]] = rows[own_best_b[closer]]
+        nearest_b[near] = own_nearest
+    every = np.arange(len(a))
+    # without a second to compare with, nothing stands out
+    clear = (first < ratio * ratio * second) & np.isfinite(second)
+    good = every[clear & (best_b[best] == every)]
     return np.stack([good, best[good]], axis=1).astype(np.uint32)
 
 
@@ -122,42 +146,24 @@ def match_near(
     """
     if not len(a.pixels) or len(b.pixels) < 2:
         return np.zeros((0, 2), np.uint32)
-    right = b.descriptors.astype(np.float32)
-    norms_b = (right**2).sum(axis=1)
-    best = np.zeros(len(a.pixels), np.int64)
-    first = np.full(len(a.pixels), np.inf, np.float32)
-    second = np.full(len(a.pixels), np.inf, np.float32)
-    best_b = np.full(len(b.pixels), -1, np.int64)
-    nearest_b = np.full(len(b.pixels), np.inf, np.float32)
+    if not len(a.pixels):
+        return np.zeros((0, 2), np.uint32)
     across = np.argsort(b.pixels[:, 0], kind="stable")
     x, y = b.pixels[across].T
     cells = (a.pixels // cell_px).astype(np.int64)
     number = cells[:, 1] * (cells[:, 0].max() + 1) + cells[:, 0]
     order = np.argsort(number, kind="stable")
-    for rows in np.split(order, np.flatnonzero(np.diff(number[order])) + 1):
-        low, high = predicted[rows].min(axis=0) - radius_px, predicted[rows].max(axis=0) + radius_px
-        strip = slice(np.searchsorted(x, low[0], "left"), np.searchsorted(x, high[0], "right"))
-        near = np.sort(across[strip][(y[strip] >= low[1]) & (y[strip] <= high[1])])
-        if not len(near):
-            continue
-        left = a.descriptors[rows].astype(np.float32)
-        cell_best, cell_best_b = np.zeros(len(rows), np.int64), best_b[near]
-        cell_first, cell_second = first[rows], second[rows]
-        cell_nearest = nearest_b[near]
-        before = cell_nearest.copy()
-        _best_two(
-            left @ right[near].T, (left**2).sum(axis=1), norms_b[near], cell_best, cell_first,
-            cell_second, cell_best_b, cell_nearest, 0,
-        )  # fmt: skip
-        best[rows], first[rows], second[rows] = near[cell_best], cell_first, cell_second
-        closer = cell_nearest < before
-        best_b[near[closer]] = rows[cell_best_b[closer]]
-        nearest_b[near] = cell_nearest
-    rows = np.arange(len(a.pixels))
-    clear = first < ratio * ratio * second
-    # without a second to compare with, nothing stands out
-    good = rows[clear & (best_b[best] == rows) & np.isfinite(second)]
-    return np.stack([good, best[good]], axis=1).astype(np.uint32)
+
+    def searches() -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+        for rows in np.split(order, np.flatnonzero(np.diff(number[order])) + 1):
+            low, high = predicted[rows].min(axis=0), predicted[rows].max(axis=0)
+            low, high = low - radius_px, high + radius_px
+            strip = slice(np.searchsorted(x, low[0], "left"), np.searchsorted(x, high[0], "right"))
+            near = np.sort(across[strip][(y[strip] >= low[1]) & (y[strip] <= high[1])])
+            if len(near):
+                yield rows, near
+
+    return _mutual(a.descriptors, b.descriptors, ratio, searches())
 
 
 @dataclass(frozen=True, kw_only=True)

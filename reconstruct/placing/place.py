@@ -536,14 +536,7 @@ def _scale_source(known: _KnownScale | None, ties: ControlFit) -> str:
     source = "scale from navigation" if known is None else known.source
     if not ties.informs_scale:
         return source
-    bars, points = len(ties.used_bars), len(ties.used_points)
-    found = " and ".join(
-        [
-            *([f"{points} control points"] if points > 1 else []),
-            *([f"{bars} known length{'s' * (bars > 1)}"] if bars else []),
-        ]
-    )
-    return f"scale from {found}" if known is None else f"{source}, corrected by {found}"
+    return "scale from control" if known is None else f"{source}, corrected by control"
 
 
 def _known_scale(workspace: Path, mapping: MappingRecord) -> _KnownScale | None:
