@@ -95,8 +95,7 @@ def read_ros_bag(path: Path, requested: Mapping[str, str], datum: Datum | None) 
                          key=lambda topic: topic.name)  # fmt: skip
         chosen = _choose(path, present, requested)
         origin = [
-            topic for topic in present
-            if topic.kind == FIX and topic.name.rsplit("/", 1)[-1] in _ORIGIN
+            topic for topic in present if topic.kind == FIX and _last_name(topic) in _ORIGIN
         ]  # fmt: skip
         navigation = chosen.get("navigation")
         if navigation is not None and navigation.kind == ODOMETRY and not (datum or origin):
@@ -129,32 +128,22 @@ def _choose(
                 f"{path}: {name} is {topic.kind}; {role} can come from {', '.join(_TAKES[role])}"
             )
         chosen[role] = topic
-    if "navigation" not in chosen and (navigation := _navigation(path, present)) is not None:
-        chosen["navigation"] = navigation
-    kind = chosen["navigation"].kind if "navigation" in chosen else None
-    if kind in (FIX, None):
-        for role, kinds in (("depth", (PRESSURE,)), ("attitude", (IMU,))):
-            found = [t for t in present if t.kind in kinds]
-            if role not in chosen and len(found) == 1:
-                chosen[role] = found[0]
-            elif role not in chosen and found:
-                raise NavigationError(
-                    f"{path}: {_list_topics(found)} could give {role}: choose with --topic "
-                    f"{role}=NAME"
-                )
-    velocities = [
-        t for t in present
-        if t.kind in (DVL, TWIST_COVARIANCE, TWIST)
-        and not any(word in t.name.lower() for word in (*_TRUTH, "cmd", "command"))
-    ]  # fmt: skip
+    for kind in () if "navigation" in chosen else _TAKES["navigation"]:
+        found = [t for t in _of_kind(present, (kind,), _TRUTH) if _last_name(t) not in _ORIGIN]
+        named = [t for t in found if "navig" in t.name.lower()]
+        if found:
+            chosen["navigation"] = _only(path, "navigation", named if len(named) == 1 else found)
+            break
+    main = chosen["navigation"].kind if "navigation" in chosen else None
+    for role, kind in (("depth", PRESSURE), ("attitude", IMU)) if main in (FIX, None) else ():
+        if role not in chosen and (found := _of_kind(present, (kind,))):
+            chosen[role] = _only(path, role, found)
+    velocities = _of_kind(present, (DVL, TWIST_COVARIANCE, TWIST), (*_TRUTH, "cmd", "command"))
     dvls = [t for t in velocities if t.kind == DVL]
     if "velocity" not in chosen and len(dvls or velocities) == 1:
         chosen["velocity"] = (dvls or velocities)[0]
-    if "altitude" not in chosen and kind != NAV_STS:
-        ranges = [
-            t for t in present
-            if t.kind == RANGE and not any(word in t.name.lower() for word in _NOT_ALTITUDE)
-        ]  # fmt: skip
+    if "altitude" not in chosen and main != NAV_STS:
+        ranges = _of_kind(present, (RANGE,), _NOT_ALTITUDE)
         if len(ranges) == 1 or (not ranges and len(dvls) == 1):
             chosen["altitude"] = (ranges or dvls)[0]
     if not chosen:
@@ -166,24 +155,32 @@ def _choose(
     return chosen
 
 
-def _navigation(path: Path, present: Sequence[_Topic]) -> _Topic | None:
-    """The one topic that navigation comes from when none is requested; None without one."""
-    for kind in _TAKES["navigation"]:
-        found = [
-            t for t in present
-            if t.kind == kind
-            and not any(word in t.name.lower() for word in _TRUTH)
-            and t.name.rsplit("/", 1)[-1] not in _ORIGIN
-        ]  # fmt: skip
-        named = [t for t in found if "navig" in t.name.lower()]
-        if len(found) == 1 or len(named) == 1:
-            return found[0] if len(found) == 1 else named[0]
-        if found:
-            raise NavigationError(
-                f"{path}: {_list_topics(found)} could all be navigation: choose one with "
-                "--topic navigation=NAME"
-            )
-    return None
+def _of_kind(
+    present: Sequence[_Topic], kinds: Sequence[str], but: Sequence[str] = ()
+) -> list[_Topic]:
+    """Topics of some types whose names hold none of some words."""
+    return [
+        topic for topic in present
+        if topic.kind in kinds and not any(word in topic.name.lower() for word in but)
+    ]  # fmt: skip
+
+
+def _last_name(topic: _Topic) -> str:
+    return topic.name.rsplit("/", 1)[-1]
+
+
+def _only(path: Path, role: str, found: Sequence[_Topic]) -> _Topic:
+    """The one topic that there is.
+
+    Raises:
+        NavigationError: there are several.
+    """
+    if len(found) > 1:
+        raise NavigationError(
+            f"{path}: {_list_topics(found)} could all be {role}: choose one with --topic "
+            f"{role}=NAME"
+        )
+    return found[0]
 
 
 def _list_topics(topics: Sequence[_Topic]) -> str:
