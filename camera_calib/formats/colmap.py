@@ -273,7 +273,7 @@ def _owns_refractive(path: Path) -> bool:
 FORMAT = rigs.CalibrationFormat(
     name="colmap",
     title="COLMAP model and rig_config.json",
-    holds=frozenset({rigs.K3, rigs.RATIONAL, rigs.FISHEYE}),
+    holds=frozenset({rigs.K3, rigs.RATIONAL}),
     owns=_owns,
     read=read_colmap,
     write=write_colmap,

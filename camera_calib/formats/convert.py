@@ -56,7 +56,7 @@ _OWN = rigs.CalibrationFormat(
 FORMATS = {
     each.name: each
     for each in (
-        _OWN, metashape.FORMAT, yaml_files.MRCAL, colmap.FORMAT, colmap.REFRACTIVE,
+        _OWN, metashape.FORMAT, colmap.FORMAT, colmap.REFRACTIVE,
         opencv.FORMAT, yaml_files.KALIBR, yaml_files.ROS,
     )
 }  # fmt: skip
@@ -164,8 +164,7 @@ def convert(task: Conversion) -> tuple[str, dict[str, Any]]:
         if task.drop_port:
             raise CalibrationError("--water and --drop-port: one of them, cameras in water or air")
         _may_lose_covariance(rig, task, f"{task.target}: cameras fitted in water have no longer")
-        models = {name: _best_model(camera, target) for name, camera in rig.cameras.items()}
-        rig, prices = in_water(rig, *task.water, models)
+        rig, prices = in_water(rig, *task.water)
     for name in rig.cameras:  # they become names of files and folders
         if camera_name(task.source, name) != name:
             raise CalibrationError(f"{task.source}: camera name {name!r} has a slash: give --names")
@@ -255,8 +254,6 @@ def fit_to_format(
         for terms, names in _TERMS.items()
         if terms not in target.holds
     }
-    if rigs.FISHEYE not in target.holds:
-        lost["the fisheye lens"] = [name for name, one in rig.cameras.items() if is_fisheye(one)]
     for what, cameras in lost.items():
         if cameras:
             raise CalibrationError(
@@ -301,12 +298,6 @@ def _port_words(camera: Camera) -> str:
     return f"{camera.port.words}, water {camera.n_water:g}"
 
 
-def _best_model(camera: Camera, target: rigs.CalibrationFormat) -> str:
-    if not is_fisheye(camera):
-        return "OPENCV"
-    return "OPENCV_FISHEYE" if rigs.FISHEYE in target.holds else "FULL_OPENCV"
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StandIn:
     """A camera without port that stands in for one behind a port, and what it leaves."""
@@ -322,9 +313,7 @@ class StandIn:
     """Largest error in the frame, its corners included, at any of the distances."""
 
 
-def in_water(
-    rig: Rig, near_m: float, far_m: float, models: Mapping[str, str]
-) -> tuple[Rig, Mapping[str, StandIn]]:
+def in_water(rig: Rig, near_m: float, far_m: float) -> tuple[Rig, Mapping[str, StandIn]]:
     """The rig for other software under water that has no port model.
 
     Each camera is the best fit, over the frame and the interval of distances, of a camera with
@@ -335,7 +324,6 @@ def in_water(
         rig: exact.
         near_m: nearest distance from the entrance pupil along the axis.
         far_m: farthest.
-        models: by camera, each a name of `MODELS`.
 
     Returns:
         The rig, whose cameras are as in air and without covariance, and by camera the fit.
@@ -345,15 +333,16 @@ def in_water(
         ConfigError: the interval is empty or reaches into a port.
     """
     fits = {
-        name: fit_in_water(one, near_m, far_m, models[name]) for name, one in rig.cameras.items()
+        name: fit_in_water(one, near_m, far_m, "OPENCV_FISHEYE" if is_fisheye(one) else "OPENCV")
+        for name, one in rig.cameras.items()
     }
     for name, fit in fits.items():
         if not np.isfinite(fit.camera.unproject(fit.camera.border())[1]).all():
             raise CalibrationError(
-                f"the best {models[name]} of {name} folds back inside the frame: choose a format "
-                "that holds fisheyes"
+                f"the best {fit.model} of {name} folds back inside the frame: choose a format "
+                "that holds its port"
             )
-    words = ", ".join(dict.fromkeys(models.values()))
+    words = ", ".join(dict.fromkeys(fit.model for fit in fits.values()))
     fitted = replace(
         rig,
         cameras={name: fit.camera for name, fit in fits.items()},

@@ -241,13 +241,13 @@ class _PlainLoader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no type
         return values
 
 
-def read_yaml(path: Path, skipped: tuple[bytes, bytes] | None = None) -> dict[str, Any]:
-    """A YAML file whose top is a mapping; `skipped` as for `read_text`.
+def read_yaml(path: Path) -> dict[str, Any]:
+    """A YAML file whose top is a mapping.
 
     Raises:
         CalibrationError: the file is missing, not YAML, or not a mapping of text keys.
     """
-    text = read_text(path, skipped)
+    text = read_text(path)
     try:
         value = yaml.load(text, Loader=_PlainLoader)  # noqa: S506 - a SafeLoader
     except (yaml.YAMLError, RecursionError, ValueError, TypeError) as error:

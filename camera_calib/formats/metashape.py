@@ -143,7 +143,7 @@ def _owns(path: Path) -> bool:
 FORMAT = rigs.CalibrationFormat(
     name="metashape",
     title="Metashape calibration XML",
-    holds=frozenset({rigs.K3, rigs.FISHEYE}),
+    holds=frozenset({rigs.K3}),
     owns=_owns,
     read=read_metashape,
     write=write_metashape,

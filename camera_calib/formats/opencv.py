@@ -157,7 +157,7 @@ def _owns(path: Path) -> bool:
 FORMAT = rigs.CalibrationFormat(
     name="opencv",
     title="OpenCV YAML or XML",
-    holds=rigs.PINHOLE | {rigs.FISHEYE},
+    holds=rigs.PINHOLE,
     owns=_owns,
     read=read_opencv,
     write=write_opencv,

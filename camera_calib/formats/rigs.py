@@ -12,16 +12,14 @@ from alice_survey.core.errors import CalibrationError
 from camera_calib.camera import Camera
 from camera_calib.formats.fields import camera_name
 from camera_calib.freedom import part_of_rig
-from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.optics import PORTS
 from camera_calib.ports.dome import DomePort
 from camera_calib.ports.flat import FlatPort
 from camera_calib.rig import Covariance, Rig
 
 K3, RATIONAL, PRISM, COVARIANCE, MOUNT = "k3", "rational", "prism", "covariance", "mount"
-FISHEYE = FisheyeLens.model
 PINHOLE = frozenset({K3, RATIONAL, PRISM})
-ALL = PINHOLE | {FISHEYE, COVARIANCE, MOUNT, *PORTS}
+ALL = PINHOLE | {COVARIANCE, MOUNT, *PORTS}
 ONE = (RigidTransform.identity(),)
 """Pose of a camera alone."""
 
@@ -63,7 +61,7 @@ class CalibrationFormat:
     name: str
     title: str
     holds: frozenset[str]
-    """More than cameras with k1 k2 p1 p2: terms, lenses, ports, and what belongs to the rig."""
+    """More than fisheyes and k1 k2 p1 p2: terms, ports, and what belongs to the rig."""
     owns: Callable[[Path], bool]
     """Whether a file or folder is of this format."""
     read: Callable[[Path, ReadOptions], Rig]

@@ -1,4 +1,4 @@
-"""YAML files of calibrations: Kalibr's chain, ROS's camera_info and mrcal's cameramodel.
+"""YAML files of calibrations: Kalibr's chain and ROS's camera_info.
 
 Kalibr's camchain YAML: pinhole cameras with radtan or equidistant distortion, in a chain.
 
@@ -12,17 +12,9 @@ Keys are those of http://wiki.ros.org/camera_calibration_parsers, their meaning 
 `sensor_msgs/CameraInfo`. A stereo pair has no pose as such: each camera has the rotation R to the
 rectified pair (`rectification_matrix`), and the second's projection P has -f B in its last column.
 From both follows the second camera's pose in the first, R2^T R1 and R2^T (P2[:, 3] / f).
-
-mrcal's .cameramodel: a file for each camera, with its pose in a common frame.
-
-https://mrcal.secretsauce.net/cameramodels.html: a Python literal, which without the packed
-`optimization_inputs` is YAML too. The pinhole models are read and written: intrinsics fx fy cx cy
-and OpenCV's coefficients, pixels counted from the centre of the first one. `extrinsics` is a
-rotation vector and a translation that take points of the reference to the camera.
 """
 
 import re
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,12 +23,10 @@ import numpy as np
 from pydantic import Field
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.core.artefacts import atomic_path
 from alice_survey.core.errors import CalibrationError, warn
 from alice_survey.core.frames import Array
 from camera_calib.camera import Camera
 from camera_calib.formats import fields, opencv_model, rigs
-from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.rig import Rig
 
 _NOT_HELD = ("T_cam_imu", "T_imu_cam", "timeshift_cam_imu")
@@ -113,7 +103,7 @@ def write_kalibr(path: Path, rig: Rig) -> list[Path]:
 KALIBR = rigs.CalibrationFormat(
     name="kalibr",
     title="Kalibr camchain YAML",
-    holds=frozenset({rigs.FISHEYE}),
+    holds=frozenset(),
     owns=lambda path: path.suffix.lower() in _YAML and "cam0" in fields.read_yaml(path),
     read=read_kalibr,
     write=write_kalibr,
@@ -289,93 +279,10 @@ def _is_ros(path: Path) -> bool:
 ROS = rigs.CalibrationFormat(
     name="ros",
     title="ROS camera_info YAML",
-    holds=frozenset({rigs.K3, rigs.RATIONAL, rigs.FISHEYE}),
+    holds=frozenset({rigs.K3, rigs.RATIONAL}),
     owns=_is_ros,
     read=read_ros,
     write=write_ros,
     files=rigs.file_each,
     max_cameras=2,
-)
-
-
-_CAMERAMODEL = ".cameramodel"
-_PACKED = (b": b'", b"'")
-"""Marks around all that was measured for a calibration."""
-_MrcalModel = Literal[
-    "LENSMODEL_PINHOLE", "LENSMODEL_OPENCV4", "LENSMODEL_OPENCV5", "LENSMODEL_OPENCV8",
-    "LENSMODEL_OPENCV12",
-]  # fmt: skip
-
-
-class _MrcalCamera(fields.FileModel):
-    lensmodel: _MrcalModel
-    intrinsics: fields.Numbers
-    extrinsics: fields.Vector6
-    imagersize: tuple[fields.Pixels, fields.Pixels]
-
-
-def read_mrcal(path: Path, reading: rigs.ReadOptions) -> Rig:
-    """Read a file of one camera, or a folder of those of a rig.
-
-    Raises:
-        CalibrationError: a key is missing or wrong, or a model is none of OpenCV's.
-    """
-    files = sorted(path.glob(f"*{_CAMERAMODEL}")) if path.is_dir() else [path]
-    if not files:
-        raise CalibrationError(f"{path}: holds no {_CAMERAMODEL}")
-    names = [file.stem for file in files] if path.is_dir() else ["cam0"]
-    cameras, poses = [], []
-    for file in files:
-        one = _MrcalCamera.check(file, fields.read_yaml(file, _PACKED))
-        expected = 4 + int(one.lensmodel.removeprefix("LENSMODEL_").strip("PINHOLECV") or 0)
-        if len(one.intrinsics) != expected:
-            found = len(one.intrinsics)
-            raise CalibrationError(f"{file}: intrinsics: {found} numbers; {expected} expected")
-        cameras.append(
-            opencv_model.camera_of_numbers(
-                f"{file}: intrinsics", one.intrinsics, one.imagersize, OpenCVLens
-            )
-        )
-        turn = Rotation.from_rotvec(one.extrinsics[:3])
-        poses.append(RigidTransform.from_components(one.extrinsics[3:], turn))
-    return rigs.assemble(path, reading, "mrcal", names, cameras, poses)
-
-
-def write_mrcal(path: Path, rig: Rig) -> list[Path]:
-    """Write a file of one camera, or into a folder those of a rig."""
-    files = rigs.file_each(path, rig, _CAMERAMODEL)
-    for file, (name, camera) in zip(files, rig.cameras.items(), strict=True):
-        k, pose = opencv_model.distortion(camera), rig.cam_from_rig[name]
-        k = k[: 0 if not np.any(k) else 4 if not np.any(k[4:]) else k.size]
-        values = {
-            "lensmodel": f"'LENSMODEL_OPENCV{k.size}'" if k.size else "'LENSMODEL_PINHOLE'",
-            "intrinsics": _line([*opencv_model.focal_and_centre(camera), *k.tolist()]),
-            "extrinsics": _line([*pose.rotation.as_rotvec(), *pose.translation]),
-            "imagersize": _line([camera.width_px, camera.height_px]),
-        }
-        lines = [f"    '{key}': {value}," for key, value in values.items()]
-        with atomic_path(file) as temporary:
-            temporary.write_text("\n".join(["{", *lines, "}", ""]), encoding="utf-8")
-    return files
-
-
-def _line(numbers: list[float]) -> str:
-    return f"[ {', '.join(map(str, numbers))} ]"
-
-
-def _is_mrcal(path: Path) -> bool:
-    return (
-        any(path.glob(f"*{_CAMERAMODEL}")) if path.is_dir() else path.suffix.lower() == _CAMERAMODEL
-    )
-
-
-MRCAL = rigs.CalibrationFormat(
-    name="mrcal",
-    title="mrcal .cameramodel",
-    holds=rigs.PINHOLE,
-    owns=_is_mrcal,
-    read=read_mrcal,
-    write=write_mrcal,
-    files=partial(rigs.file_each, suffix=_CAMERAMODEL),
-    suffix=_CAMERAMODEL,
 )

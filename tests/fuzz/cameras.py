@@ -247,10 +247,6 @@ TARGETS = (
         _write("refractive", "m/cameras.bin", _domes), read=_read_folder,
     ),
     _calibration("Metashape XML", "text", "a.xml", _write("metashape", "a.xml", _one)),
-    _calibration(
-        "mrcal cameramodel", "text", "m/left.cameramodel", _write("mrcal", "m", _in_air),
-        read=_read_folder,
-    ),
     _calibration("target JSON", "json", "board.json", _board, read=read_board),
     _image("JPEG", "a.jpg", partial(_picture, name="a.jpg", mode="RGB")),
     _image("PNG, 8 bits", "a.png", partial(_picture, name="a.png", mode="RGBA")),

@@ -29,8 +29,7 @@ class CameraCommand(ReportCommand):
 class ConvertCommand(ReportCommand):
     """Convert between tools.
 
-    OpenCV, COLMAP, Refractive COLMAP, Kalibr, ROS, Metashape, mrcal and rig.json; nothing is lost
-    silently.
+    OpenCV, COLMAP, Refractive COLMAP, Kalibr, ROS, Metashape, rig.json; nothing is lost silently.
     """
 
     name = "camera convert"
@@ -51,7 +50,7 @@ class ConvertCommand(ReportCommand):
         None, "Found from the file if not given.", "--from", metavar="FORMAT"
     )
     target_format: str | None = option(
-        None, "rig, opencv, colmap, refractive, kalibr, ros, metashape, mrcal.", "--to",
+        None, "rig, opencv, colmap, refractive, kalibr, ros or metashape.", "--to",
         metavar="FORMAT",
     )  # fmt: skip
     image_size: tuple[int, int] | None = option(None, "Pixels, when IN states none.", metavar="W H")

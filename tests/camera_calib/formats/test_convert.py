@@ -15,7 +15,14 @@ from alice_survey.app.cli.main import main
 from alice_survey.core.config import CameraConfig, WaterConfig
 from alice_survey.core.errors import AliceError
 from camera_calib.camera import Camera
-from camera_calib.formats.convert import FORMATS, Conversion, convert, detect, in_water
+from camera_calib.formats.convert import (
+    FORMATS,
+    Conversion,
+    convert,
+    detect,
+    fit_in_water,
+    in_water,
+)
 from camera_calib.formats.rigs import ReadOptions, in_air, only, rename_cameras, with_port
 from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.ports.dome import DomePort
@@ -57,7 +64,6 @@ CHANNELS = {
     "refractive": "flat",
     "kalibr": "c.yaml",
     "ros": "r",
-    "mrcal": "m",
 }
 
 
@@ -85,7 +91,7 @@ def refused(source: Path, target: Path, **options: Any) -> str:
     return shown
 
 
-@pytest.mark.parametrize("name", ["opencv", "colmap", "kalibr", "ros", "mrcal"])
+@pytest.mark.parametrize("name", ["opencv", "colmap", "kalibr", "ros"])
 def test_a_port_is_not_lost_unasked(own: Path, tmp_path: Path, name: str) -> None:
     shown = refused(own, tmp_path / CHANNELS[name], target_format=name, drop_covariance=True)
     assert "--drop-port" in shown and "--water" in shown
@@ -119,16 +125,11 @@ def test_a_dome_is_not_lost_unasked(own: Path, tmp_path: Path, name: str) -> Non
     assert "dome of 60 mm" in shown and "--drop-port" in shown and "--water" in shown
 
 
-def test_a_fisheye_goes_only_where_its_lens_is_known(tmp_path: Path) -> None:
+def test_a_fisheye_goes_everywhere(tmp_path: Path) -> None:
     write_rig(tmp_path / "rig.json", in_air(DOMES))
-    shown = refused(tmp_path / "rig.json", tmp_path / "m", target_format="mrcal")
-    assert "fisheye" in shown and "left, right" in shown and "--water" in shown
     for name, target in CHANNELS.items():
-        if name != "mrcal":
-            convert_files(tmp_path / "rig.json", tmp_path / target, target_format=name)
-            assert_same_geometry(
-                FORMATS[name].read(tmp_path / target, ReadOptions()), in_air(DOMES)
-            )
+        convert_files(tmp_path / "rig.json", tmp_path / target, target_format=name)
+        assert_same_geometry(FORMATS[name].read(tmp_path / target, ReadOptions()), in_air(DOMES))
 
 
 def test_formats_take_as_many_cameras_as_they_hold(tmp_path: Path) -> None:
@@ -165,13 +166,16 @@ def test_a_fisheye_behind_a_dome_has_a_stand_in_at_a_stated_price(
     assert np.abs(missed).max() < 1.5
 
 
-def test_a_stand_in_that_folds_back_inside_the_frame_is_refused(tmp_path: Path) -> None:
+def test_a_stand_in_that_folds_back_inside_the_frame_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """No fraction of polynomials stands in for 120 degrees across the corners of a fisheye."""
-    write_rig(tmp_path / "rig.json", only(DOMES, "left"))
-    shown = refused(
-        tmp_path / "rig.json", tmp_path / "a.cameramodel", target_format="mrcal", water=(1.0, 3.0)
+    monkeypatch.setattr(
+        "camera_calib.formats.convert.fit_in_water",
+        lambda camera, near_m, far_m, _: fit_in_water(camera, near_m, far_m, "FULL_OPENCV"),
     )
-    assert "FULL_OPENCV" in shown and "left" in shown and "folds" in shown
+    with pytest.raises(AliceError, match="FULL_OPENCV of left folds"):
+        in_water(only(DOMES, "left"), 1.0, 3.0)
 
 
 def test_a_dome_given_with_cameras_in_air_makes_the_rig(tmp_path: Path) -> None:
@@ -187,7 +191,7 @@ def test_a_dome_given_with_cameras_in_air_makes_the_rig(tmp_path: Path) -> None:
     assert read_rig(tmp_path / "sea.json").cameras["left"].n_water == 1.342
 
 
-@pytest.mark.parametrize("name", ["colmap", "kalibr", "ros", "mrcal"])
+@pytest.mark.parametrize("name", ["colmap", "kalibr", "ros"])
 def test_a_dropped_port_leaves_the_cameras_in_air_and_a_warning(
     own: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -218,7 +222,7 @@ def test_the_price_in_water_is_what_colmap_misses_the_exact_camera_by(
     opened = pycolmap.Reconstruction(tmp_path / "model")
     (sensors,) = opened.rigs.values()
     after = FORMATS["colmap"].read(tmp_path / "model", ReadOptions())
-    mount, _ = in_water(FULL, 1.5, 3.0, dict.fromkeys(FULL.cameras, "OPENCV"))
+    mount, _ = in_water(FULL, 1.5, 3.0)
     for i, (name, camera) in enumerate(BENT.cameras.items(), start=1):
         colmap = opened.cameras[i]
         assert colmap.model.name == "OPENCV"
@@ -243,7 +247,7 @@ def test_the_price_in_water_is_what_colmap_misses_the_exact_camera_by(
 
 
 def test_centres_follow_the_fit_onto_the_vehicle() -> None:
-    fitted, _ = in_water(FULL, 1.5, 3.0, dict.fromkeys(FULL.cameras, "OPENCV"))
+    fitted, _ = in_water(FULL, 1.5, 3.0)
     for name in FULL.cameras:
         moved = (FULL.body_from_cam(name).inv() * fitted.body_from_cam(name)).translation
         # Through this port the best centre is some 7 mm behind the pupil.
