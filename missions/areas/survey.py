@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
-from scipy.sparse.csgraph import minimum_spanning_tree
 from shapely.geometry import LineString, MultiPolygon, Point, Polygon
 from shapely.geometry.base import BaseGeometry
 
@@ -133,11 +132,8 @@ def survey_area(settings: AreaConfig, *, turn_margin_m: float, margin_m: float =
         reach = _polygons(allowed_raw, frame, settings.corridor_width_m)
         allowed = _less(reach.solid, no_go)
     area = Area(datum=frame.datum, survey=survey, allowed=allowed, no_go=no_go)
-    if allowed_raw is None:
-        _check_parts(area, margin_m=margin)
-    else:
+    if allowed_raw is not None:
         _check_inside(area, raw, frame, allowed_raw.origin)
-        _check_parts(area, given=allowed_raw.origin)
     return area
 
 
@@ -240,34 +236,6 @@ def _contents(raw: RawShapes) -> str:
     return " and ".join(parts) or "nothing"
 
 
-def _check_parts(area: Area, *, margin_m: float = 0.0, given: str = "") -> None:
-    """Warn of parts of the allowed area that are out of reach of each other.
-
-    Args:
-        area: to check.
-        margin_m: by which the allowed area is wider than the survey area.
-        given: what says where the vehicle may be, where it is not that margin.
-    """
-    parts = [part for part in area.allowed.geoms if part.intersects(area.survey)]
-    if len(parts) > 1:
-        gap_m = _widest_gap_m(parts)
-        advice = (
-            f"join them in {given} for one dive"
-            if given
-            else f"turn_margin_m = {_joining_m(margin_m, gap_m):g} joins them where no zone to "
-            "keep out of lies between, or set an allowed shape"
-        )
-        warn(
-            f"area: the vehicle may be in {len(parts)} parts up to {gap_m:.3g} m apart and cannot "
-            f"pass between them: each has dives of its own; {advice}"
-        )
-
-
-def _joining_m(margin_m: float, gap_m: float) -> float:
-    """The margin at which parts that are a gap apart meet, up to the next decimetre."""
-    return math.ceil(10.0 * (margin_m + gap_m / 2) - 1e-6) / 10.0
-
-
 def _check_inside(area: Area, raw: RawShapes, frame: LocalFrame, given: str) -> None:
     """Warn of parts of the survey area outside of the allowed one.
 
@@ -288,12 +256,6 @@ def _check_inside(area: Area, raw: RawShapes, frame: LocalFrame, given: str) -> 
             f"area: {share:.2%} of the area to survey lie outside of {given}, most of it near "
             f"{place}: only what is seen from inside is covered there"
         )
-
-
-def _widest_gap_m(parts: Sequence[BaseGeometry]) -> float:
-    """The widest of the gaps to bridge to make all parts one: of their minimum spanning tree."""
-    apart_m = np.array([[max(a.distance(b), 1e-9) for b in parts] for a in parts])
-    return float(minimum_spanning_tree(np.triu(apart_m, 1)).max())
 
 
 def corridor_strip(points: Array, width_m: float, origin: str, name: str) -> BaseGeometry:

@@ -1,35 +1,15 @@
 """What to set on a vehicle so that it flies an exported mission, and what to expect of it."""
 
 import math
-from dataclasses import dataclass
 
 from alice_survey.core.errors import warn
-from alice_survey.kit.words import share
 from alice_survey.sim.vehicle.pilot.mission import MIN_RADIUS_M, MIN_SPEED_MPS, Cola2Settings
-from camera_calib.rig import Rig
-from missions.coverage.certificate import certificate
-from missions.coverage.stations import plan_pattern
-from missions.exports.follower import Follower, line_offset_m, predicted_stations
+from missions.exports.follower import line_offset_m
 from missions.exports.format import Export
 from missions.values.plan_file import Plan
 
 COLA2_TOLERANCE_Z_M = 0.3
 """A step down is done this near to its depth; COLA2's own 1 m begins a line a metre too high."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Cola2Outlook:
-    """How COLA2 will fly a plan in the expected current."""
-
-    offset_m: float
-    """Greatest steady offset of the glass from lines of the pattern."""
-    allowed_m: float
-    """Half of what neighbouring pictures overlap: two lines so far off, apart, just meet."""
-    share_at_overlap: float
-    """Share of the area that will be seen as requested."""
-    at_most: bool
-    """Whether turns, which are not predicted, will leave less of it: the current is more than half
-    as fast as the vehicle."""
 
 
 def cola2_settings(delta_m: float, speed_mps: float) -> Cola2Settings:
@@ -45,29 +25,9 @@ def cola2_settings(delta_m: float, speed_mps: float) -> Cola2Settings:
     )
 
 
-def cola2_outlook(plan: Plan, rig: Rig, follower: Follower, lever_m: float) -> Cola2Outlook:
-    """What is to be expected of COLA2.
-
-    Args:
-        plan: what is exported.
-        rig: its cameras.
-        follower: vehicle and current.
-        lever_m: how far the glass is ahead of the vehicle's reference point.
-    """
-    offsets = [
-        abs(line_offset_m(follower, line.heading_rad, plan.speed_mps, lever_m))
-        for line in plan.lines
-        if line.kind in ("survey", "fill")
-    ]
-    seen = certificate(
-        plan.area, rig, predicted_stations(plan, follower, lever_m), plan_pattern(plan, rig)
-    )
-    return Cola2Outlook(
-        offset_m=max(offsets, default=0.0),
-        allowed_m=0.5 * (plan.footprint_m[0] - plan.line_spacing_m),
-        share_at_overlap=seen.share_at_overlap,
-        at_most=follower.current_mps > 0.5 * plan.speed_mps,
-    )
+def allowed_offset_m(plan: Plan) -> float:
+    """Half of what neighbouring pictures overlap: two lines so far off, apart, just meet."""
+    return 0.5 * (plan.footprint_m[0] - plan.line_spacing_m)
 
 
 def advice(export: Export, formats: list[str], *, chosen: bool) -> list[str]:
@@ -96,15 +56,20 @@ def _cola2(export: Export, *, chosen: bool) -> list[str]:
     if not math.isfinite(follower.delta_m):
         return [f"COLA2: no section/delta keeps {follower.name} from weaving: lower the speed."]
     own, default = cola2_settings(follower.delta_m, plan.speed_mps), Cola2Settings()
-    outlook = cola2_outlook(plan, export.rig, follower, export.mount.glass_body_m[0])
+    lever_m, allowed_m = export.mount.glass_body_m[0], allowed_offset_m(plan)
+    offsets = [
+        abs(line_offset_m(follower, line.heading_rad, plan.speed_mps, lever_m))
+        for line in plan.lines
+        if line.kind in ("survey", "fill")
+    ]
+    offset_m = max(offsets, default=0.0)
     expected = (
         f"in the expected current of {follower.current_mps:g} m/s COLA2 holds {follower.name} up "
-        f"to {outlook.offset_m:.2f} m off lines {plan.line_spacing_m:.2f} m apart, which allow "
-        f"{outlook.allowed_m:.2f} m, and gusts {follower.wander_m:.2f} m rms; "
-        f"{'at most ' if outlook.at_most else ''}{share(outlook.share_at_overlap)} of the area is "
-        "expected to be seen at the requested overlap"
+        f"to {offset_m:.2f} m off lines {plan.line_spacing_m:.2f} m apart, which allow "
+        f"{allowed_m:.2f} m; turns and gusts come on top"
     )
-    exceeds = outlook.offset_m > outlook.allowed_m or outlook.at_most
+    # Beyond half of its speed turns leave more of the area unseen.
+    exceeds = offset_m > allowed_m or follower.current_mps > 0.5 * plan.speed_mps
     if exceeds and (chosen or not follower.sways):
         towards_deg = math.degrees(math.atan2(*follower.current_ne_mps[::-1])) % 180.0
         warn(

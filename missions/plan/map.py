@@ -1,6 +1,5 @@
 """The map of a plan as a figure: area, no-go zones, lines, footprints, overlap, current, depth."""
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -32,11 +31,11 @@ COLOURS = {
     "survey": "#1b4f72", "cross": "#6c3483", "closing": "#117a65", "fill": "#b9770e",
     "tie": "#c0392b",
     "area": "#c8553d", "allowed": "#566573", "no_go": "#b03a2e", "way": "#7f8c8d",
-    "footprint": "#2e86c1", "contour": "#5d6d7e", "current": "#2471a3", "missed": "#d35400",
+    "footprint": "#2e86c1", "contour": "#5d6d7e", "missed": "#d35400",
     "home": "#1e8449",
 }  # fmt: skip
 """Colours of all maps of a plan."""
-_MAX_ARROWS = 500
+_ARROWS = 60
 _MAX_FOOTPRINTS = 3000
 """Most footprints drawn one by one; beyond, the count of pictures shows what they cover."""
 _ALLOWED_BEYOND = 0.3
@@ -114,20 +113,21 @@ def plan_figure(
     _draw_lines(axes, plan)
     if bathymetry is not None:
         _draw_bathymetry(axes, bathymetry)
-    if sea.current_mps > 0 and sea.current_file is None:
-        _draw_current(axes, sea)
-    finish_map(figure, axes, plan.datum, plan.name, _summary(plan))
+    finish_map(figure, axes, plan.datum, plan.name, _summary(plan, sea))
     return figure
 
 
-def _summary(plan: Plan) -> str:
+def _summary(plan: Plan, sea: SeaConfig) -> str:
+    current = ""
+    if sea.current_mps > 0 and sea.current_file is None:
+        current = f", current {sea.current_mps:g} m/s towards {sea.current_towards_deg:03.0f} deg"
     dives = f"{len(plan.dives)} dives, " if len(plan.dives) > 1 else ""
     return (
         f"{plan.stations} stations every {plan.interval_s:.2f} s, {plan.length_m:.0f} m, {dives}"
         f"{plan.duration_s / 60:.0f} min at {plan.speed_mps:g} m/s, {plan.energy_wh:.0f} Wh\n"
         f"altitude {plan.altitude_m:g} m, overlap {plan.reached_forward_overlap:.0%} forward, "
         f"{plan.reached_side_overlap:.0%} side, lines {plan.line_spacing_m:.2f} m apart, "
-        f"{share(plan.coverage)} covered as requested"
+        f"{share(plan.coverage)} covered as requested{current}"
     )
 
 
@@ -209,26 +209,20 @@ def _draw_lines(axes: Axes, plan: Plan) -> None:
         )
         places = np.vstack([line.stations_ne for line in lines])
         axes.scatter(places[:, 1], places[:, 0], s=size, color=colour, zorder=5, lw=0)
-    if len(plan.lines) <= _MAX_ARROWS:
-        axes.add_collection(PolyCollection(_arrows(plan), facecolors=INK, zorder=6))
+    (north, east), (ahead_n, ahead_e) = (pair.T for pair in _arrows(plan))
+    axes.quiver(
+        east, north, ahead_e, ahead_n, color=INK, pivot="mid", scale=60, width=0.003,
+        headlength=4, headaxislength=4, zorder=6,
+    )  # fmt: skip
 
 
-def _arrows(plan: Plan) -> list[Array]:
-    """An arrow head at a third of each line, so that the direction of travel is seen."""
-    north_0, east_0, north_1, east_1 = plan.area.survey.bounds
-    size = 0.011 * max(north_1 - north_0, east_1 - east_0)
+def _arrows(plan: Plan) -> tuple[Array, Array]:
+    """Places (N, 2) at a third of lines and their ways, so that the direction of travel is seen."""
     # Of many lines every n-th, an odd number: neighbours fly opposite ways.
-    apart = 2 * int(size / plan.line_spacing_m) + 1
-    heads = []
-    for index, line in enumerate(plan.lines):
-        if line.kind == "survey" and index % apart:
-            continue
-        ahead = np.array([math.sin(line.heading_rad), math.cos(line.heading_rad)])
-        right = np.array([ahead[1], -ahead[0]])
-        tip = np.array(line.start_ne_m[::-1]) + ahead * (line.length_m / 3 + size)
-        back = tip - 1.6 * size * ahead
-        heads.append(np.array([tip, back + 0.6 * size * right, back - 0.6 * size * right]))
-    return heads
+    shown = plan.lines[:: 2 * int(len(plan.lines) / _ARROWS / 2) + 1]
+    ends = np.array([(line.start_ne_m, line.end_ne_m) for line in shown])
+    ways = ends[:, 1] - ends[:, 0]
+    return ends[:, 0] + ways / 3, ways / np.linalg.norm(ways, axis=1)[:, None]
 
 
 def _draw_bathymetry(axes: Axes, bathymetry: Bathymetry) -> None:
@@ -242,30 +236,6 @@ def _draw_bathymetry(axes: Axes, bathymetry: Bathymetry) -> None:
         colour = COLOURS["contour"]
         lines = axes.contour(easts, norths, depth, 10, colors=colour, linewidths=0.6, zorder=1.5)
         axes.clabel(lines, fontsize=7, fmt="%g m")
-
-
-def _draw_current(axes: Axes, sea: SeaConfig) -> None:
-    """An arrow below the area that points where the current flows."""
-    (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
-    # In metres: in shares of the axes, which are rarely square, it would point elsewhere.
-    size = max(east - west, north - south)
-    towards = math.radians(sea.current_towards_deg)
-    half = 0.035 * size * np.array([math.sin(towards), math.cos(towards)])
-    middle = np.array([east - 0.06 * size, south + 0.05 * size])
-    axes.annotate(
-        "",
-        xy=tuple((middle + half).tolist()),
-        xytext=tuple((middle - half).tolist()),
-        arrowprops={
-            "arrowstyle": "-|>", "color": COLOURS["current"], "lw": 2.2, "mutation_scale": 15
-        },
-        zorder=9,
-    )  # fmt: skip
-    axes.text(
-        middle[0] - 0.045 * size, middle[1], f"current\n{sea.current_mps:g} m/s", ha="right",
-        va="center", fontsize=7.5, color=COLOURS["current"], zorder=9,
-        bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.7},
-    )  # fmt: skip
 
 
 def _points_per_metre(axes: Axes) -> float:

@@ -6,11 +6,9 @@ its part: between them the vehicle is carried, or goes at the surface.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
-import numpy as np
 import shapely
 import shapely.ops
 from shapely.geometry import MultiPolygon, Point
@@ -23,7 +21,7 @@ from missions.route.dives import split_dives
 from missions.route.turns import Manoeuvre
 from missions.route.ways import TOUCH_M, Ways
 from missions.values.area import Area, multipolygon
-from missions.values.costs import Costs, power_at
+from missions.values.costs import Costs
 from missions.values.legs import Route
 from missions.values.line import Line
 from missions.values.pattern import Pattern
@@ -84,9 +82,9 @@ def plan_parts(
         )
     if len(parts) > 1:
         warn(
-            f"{len(parts)} parts are surveyed by {len(whole.dives)} dives, each launched and "
-            "recovered in its part: fly them one by one (vehicle.dive). "
-            + transit_text(whole.dives, costs)
+            f"{len(parts)} parts that the vehicle cannot pass between are surveyed by "
+            f"{len(whole.dives)} dives, each launched and recovered in its part: fly them one by "
+            "one (vehicle.dive), or join the parts (area.turn_margin_m, or an allowed shape)"
         )
     if len(whole.dives) > len(parts) and not (tied or settings.cross_lines):
         warn(
@@ -94,23 +92,6 @@ def plan_parts(
             "alone: plan.cross_lines = 1 crosses the lines of all of them"
         )
     return whole
-
-
-def transit_text(dives: Sequence[Dive], costs: Costs) -> str:
-    """What it takes to go from dive to dive at the surface, by the power of ways between lines.
-
-    Args:
-        dives: in order; where one begins elsewhere than the one before there is a way.
-        costs: of the vehicle.
-    """
-    homes = np.array([dive.home_ne_m for dive in dives])
-    north_m, east_m = np.diff(homes, axis=0).T
-    ways_s = np.hypot(north_m, east_m) / costs.speed_mps
-    power_w = power_at(costs.way_w, np.arctan2(east_m, north_m))
-    return (
-        f"At the surface the {ways_s.sum() * costs.speed_mps:.0f} m between them take "
-        f"{ways_s.sum() / 60:.0f} min and {ways_s @ power_w / 3600:.1f} Wh"
-    )
 
 
 def parts_of(area: Area, home_ne: Place) -> list[tuple[Area, Place]]:

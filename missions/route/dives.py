@@ -17,7 +17,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.core.compiled import compiled_ieee
 from alice_survey.core.errors import PlanError
 from alice_survey.core.frames import Array
 from alice_survey.core.run import progress
@@ -209,10 +208,7 @@ def _min_dives(
     count = sums.until.shape[1]
     may_begin = np.ones(count + 1, dtype=np.bool_)
     may_begin[list(not_at)] = False
-    begins, dives = _part(
-        sums.home_to, sums.until, sums.through, sums.back, may_begin[:count], overlap,
-        limits.energy_j, limits.time_s,
-    )  # fmt: skip
+    begins, dives = _part(sums, may_begin[:count], overlap, limits)
     if not math.isfinite(dives[count]):
         return None
     parted, end = [], count
@@ -223,56 +219,42 @@ def _min_dives(
     return parted[::-1]
 
 
-@compiled_ieee
 def _part(
-    home_to: Array,
-    until: Array,
-    through: Array,
-    back: Array,
-    may_begin: NDArray[np.bool_],
-    overlap: int,
-    energy_j: float,
-    time_s: float,
+    sums: _Sums, may_begin: NDArray[np.bool_], overlap: int, limits: DiveLimits
 ) -> tuple[NDArray[np.int64], Array]:
     """Where the last dive begins of the best division of lines up to each, and how many dives.
 
     Args:
-        home_to: (2, N) as the fields of `_Sums`.
-        until: the same.
-        through: the same.
-        back: the same.
+        sums: along the lines.
         may_begin: (N,) lines that a dive may begin with.
         overlap: how many lines of the dive before each dive flies first.
-        energy_j: of a dive at most.
-        time_s: of a dive at most.
+        limits: of each dive.
 
     Returns:
         (N + 1,) both; infinitely many where no division holds all lines.
     """
-    count = until.shape[1]
-    dives, spent = np.zeros(count + 1), np.zeros(count + 1)
+    count = sums.until.shape[1]
+    dives, spent = np.full(count + 1, np.inf), np.full(count + 1, np.inf)
+    dives[0] = spent[0] = 0.0
     begins = np.zeros(count + 1, dtype=np.int64)
+    limit = np.array([[limits.energy_j], [limits.time_s]])
     earliest = 0
     for last in range(count):
         # Beyond the first line that is too far back all earlier ones are: until only grows.
-        while earliest < last and (
-            through[0, last] - until[0, earliest] > energy_j
-            or through[1, last] - until[1, earliest] > time_s
+        while earliest < last and not limits.hold(
+            *(sums.through[:, last] - sums.until[:, earliest])
         ):
             earliest += 1
-        minimum, total = np.inf, np.inf
-        for first in range(earliest, last + 1):
-            flown = max(first - overlap, 0)
-            dive_j = home_to[0, flown] + (through[0, last] + back[0, last]) - until[0, flown]
-            dive_s = home_to[1, flown] + (through[1, last] + back[1, last]) - until[1, flown]
-            if not (may_begin[first] and dive_j <= energy_j and dive_s <= time_s):
-                continue
-            if dives[first] < minimum or (
-                dives[first] == minimum and spent[first] + dive_j < total
-            ):
-                minimum, total = dives[first], spent[first] + dive_j
-                begins[last + 1] = first
-        dives[last + 1], spent[last + 1] = minimum + 1.0, total
+        first = np.arange(earliest, last + 1)
+        flown = np.maximum(first - overlap, 0)
+        there = sums.through[:, [last]] + sums.back[:, [last]]
+        dive = sums.home_to[:, flown] + there - sums.until[:, flown]
+        first = first[may_begin[first] & (dive <= limit).all(axis=0)]
+        if len(first):
+            total = spent[first] + dive[0, first - earliest]
+            best = np.lexsort((total, dives[first]))[0]
+            begins[last + 1] = first[best]
+            dives[last + 1], spent[last + 1] = dives[first[best]] + 1.0, total[best]
     return begins, dives
 
 
@@ -281,31 +263,12 @@ def _line_too_long(lines: Sequence[Line], sums: _Sums, limits: DiveLimits, depth
     each = [sums.of(i, i) for i in range(len(lines))]
     over = [i for i, (energy, time) in enumerate(each) if not limits.hold(energy, time)]
     worst = max(over, key=lambda i: each[i][0])
-    line, (energy, time) = lines[worst], each[worst]
-    ways = []
-    if energy > limits.energy_j:
-        ways.append(f"a battery with {_wh(energy)} above its reserve (vehicle.battery_wh)")
-    if time > limits.time_s:
-        ways.append(f"plan.dive_s of {time:.0f} s")
-    ways += ["plan.home_ne_m nearer to it", "shorter lines (plan.line_heading_deg, or parts)"]
+    energy_j, time_s = each[worst]
+    longest = f" and {limits.time_s:.0f} s" if math.isfinite(limits.time_s) else ""
     return (
-        f"line {worst}, {line.length_m:.0f} m long, takes {_numbers(energy, time)} by itself, with "
-        f"the way from home and back and {depth_m:.0f} m down and up, but a dive has "
-        f"{_allowance(limits)}"
-        + (f" ({len(over)} lines are too long)" if len(over) > 1 else "")
-        + f": it needs {', or '.join(ways)}"
+        f"line {worst}, {lines[worst].length_m:.0f} m long, takes {energy_j / _J_PER_WH:.3g} Wh "
+        f"and {time_s:.0f} s by itself, with the way from home and back and {depth_m:.0f} m down "
+        f"and up, but a dive has {limits.energy_j / _J_PER_WH:.3g} Wh{longest}: raise "
+        "vehicle.battery_wh or plan.dive_s, set plan.home_ne_m nearer to it, or lay shorter lines "
+        "(plan.line_heading_deg, or parts)"
     )
-
-
-def _numbers(energy_j: float, time_s: float) -> str:
-    return f"{_wh(energy_j)} and {time_s / 3600.0:.2f} h"
-
-
-def _allowance(limits: DiveLimits) -> str:
-    longest = f" and {limits.time_s / 3600.0:.2f} h" if math.isfinite(limits.time_s) else ""
-    return f"{_wh(limits.energy_j)}{longest}"
-
-
-def _wh(energy_j: float) -> str:
-    value = energy_j / _J_PER_WH
-    return f"{value:.0f} Wh" if value >= 100.0 else f"{value:.3g} Wh"

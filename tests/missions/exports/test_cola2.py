@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from shapely.geometry import MultiPolygon, Point, box
 
 from camera_calib.rig import Rig
-from missions.exports import options
+from missions.exports import format as options
 from missions.exports.follower import Follower
 from missions.exports.format import Options, line_tolerance_m
 from missions.exports.write import write_exports
@@ -89,8 +89,7 @@ def test_the_way_down_needs_no_altitude_and_the_way_up_ends_at_the_surface() -> 
 
 
 FOLLOWER = Follower(
-    name="hull", sways=True, delta_m=3.0, circle_m=0.4, turn_in_m=0.3, turn_rad_s=0.5, wander_m=0.1,
-    mode_per_s=-0.03 + 0.1j,
+    name="hull", sways=True, delta_m=3.0, circle_m=0.4, turn_in_m=0.3, turn_rad_s=0.5,
     current_ne_mps=(0.03, 0.04),
 )  # fmt: skip
 

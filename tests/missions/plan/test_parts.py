@@ -16,8 +16,7 @@ from alice_survey.core.errors import PlanError
 from camera_calib.rig import Rig, design_rig
 from missions.exports.geometry import footprint_outline, footprints_ne
 from missions.fly.flight_route import one_dive, path_of
-from missions.plan.parts import parts_of, transit_text
-from missions.values.costs import time_costs
+from missions.plan.parts import parts_of
 from missions.values.line import Line
 from missions.values.plan_file import Dive, Plan
 from tests.missions.flown_plans import planned
@@ -62,15 +61,6 @@ def test_dives_of_parts_are_flown_one_by_one(plan: Plan) -> None:
     assert set(path_of(one_dive(plan, 2)).line) - {-1} == set(
         range(plan.dives[1].first_line, plan.dives[1].last_line + 1)
     )
-
-
-def test_the_way_between_parts_at_the_surface(plan: Plan) -> None:
-    """At 1 W and 0.2 m/s, from the end of a part to the nearest place of the next."""
-    costs = time_costs(0.2)
-    way_m = sum(math.dist(a, b) for a, b in pairwise(plan.homes_ne_m))
-    assert 70.0 < way_m < 90.0
-    expected = f"{way_m:.0f} m between them take {way_m / 12.0:.0f} min and 0.1 Wh"
-    assert expected in transit_text(plan.dives, costs)
 
 
 def test_parts_that_touch_are_one() -> None:

@@ -1,6 +1,5 @@
-"""The map: the sheet fits the area, the current points where it flows, lines stay thin."""
+"""The map: the sheet fits the area, lines stay thin."""
 
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,26 +32,11 @@ def rows(count: int, length_m: float) -> Plan:
     return plan_of(lines, [(0, count - 1)])
 
 
-def figure_of(plan: Plan, **sea: float) -> Sheet:
+def figure_of(plan: Plan) -> Sheet:
     """The map of a plan, its coverage counted on a coarse grid."""
     pattern = plan_pattern(plan, RIG)
     seen = certificate(plan.area, RIG, stations_of_plan(plan), pattern, cell_m=0.25)
-    return plan_figure(plan, RIG, seen, None, SeaConfig(**sea))
-
-
-@pytest.mark.parametrize("towards_deg", [0.0, 30.0, 135.0, 250.0])
-def test_the_current_points_where_it_flows_on_a_map_of_any_shape(towards_deg: float) -> None:
-    figure = figure_of(rows(4, 40.0), current_mps=0.1, current_towards_deg=towards_deg)
-    figure.draw_without_rendering()
-    axes = figure.axes[0]
-    (arrow,) = (t for t in axes.texts if t.get_text() == "" and hasattr(t, "xyann"))
-    tip, tail = axes.transData.transform([arrow.xy, arrow.xyann])
-    east, north = tip - tail
-    assert math.degrees(math.atan2(east, north)) % 360 == pytest.approx(towards_deg, abs=1e-6)
-    (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
-    for x, y in (arrow.xy, arrow.xyann):
-        assert west < x < east
-        assert south < y < north
+    return plan_figure(plan, RIG, seen, None, SeaConfig())
 
 
 @pytest.mark.parametrize("count", [5, 120])

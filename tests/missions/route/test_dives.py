@@ -155,7 +155,7 @@ def test_a_line_that_fits_no_dive_is_named() -> None:
         _split(lines, 0.09)
     text = str(caught.value)
     alone = _of_dive(lines, 3, 3)[0] / 3600
-    found = re.match(r"line 3, 36 m .* ([\d.]+) Wh", text)
+    found = re.match(r"line 3, 36 m long, takes ([\d.]+) Wh", text)
     assert found is not None
     assert float(found[1]) == pytest.approx(alone, abs=1e-3)
     for named in ("0.09 Wh", "home_ne_m", "vehicle.battery_wh"):
