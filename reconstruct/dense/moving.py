@@ -27,7 +27,7 @@ from reconstruct.dense.views import ViewTask
 from reconstruct.pictures.undistorted import MOVING, Pictures, moving_path, read_mask
 from reconstruct.raster import write_png
 from reconstruct.views.model import View
-from reconstruct.views.range_shift import FAST, KernelLens, line_of, shown_at
+from reconstruct.views.range_shift import FAST, KernelLens, line_of, warped_at
 
 Float32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -286,7 +286,7 @@ def draw(
         onto: (h, w) depth of the other's cells, changed in place; NaN where nothing is drawn yet.
     """
     (pinhole, field, inverse_working), step = lattice
-    onto_lens, onto_step = onto_lattice
+    (onto_pinhole, onto_field, onto_working), onto_step = onto_lattice
     height, width = onto.shape
     t = onto_from_cam
     for i in range(depth.shape[0]):
@@ -305,7 +305,10 @@ def draw(
                 t[0, 0] * a + t[0, 1] * b + t[0, 2] * z + t[0, 3],
                 t[1, 0] * a + t[1, 1] * b + t[1, 2] * z + t[1, 3],
             )
-            u, v = shown_at(onto_lens, a, b, deep)
+            inverse = 1.0 / deep
+            u = onto_pinhole[0] * a * inverse + onto_pinhole[2]
+            v = onto_pinhole[1] * b * inverse + onto_pinhole[3]
+            u, v = warped_at(onto_field, onto_working, u, v, inverse)
             left, top = math.floor(u / onto_step - 0.5), math.floor(v / onto_step - 0.5)
             for row in range(max(top, 0), min(top + 2, height)):
                 for column in range(max(left, 0), min(left + 2, width)):

@@ -25,7 +25,6 @@ from alice_survey.core.compiled import compiled
 from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Array
 from reconstruct.matching.matches import Matches
-from reconstruct.views.interpolation import cubic_level, is_inside
 from reconstruct.views.range_shift import FAST
 
 _RADIUS = 7
@@ -242,13 +241,54 @@ def align_patches(
     return found
 
 
+_NEXT = np.uint64(1)
+
+
+@compiled(error_model="numpy", fastmath=FAST)
+def _across(picture: Any, left: Any, row: Any, a: float, b: float, c: float, d: float) -> float:
+    """Four pixels of a row, weighted."""
+    level: float = a * picture[row, left] + b * picture[row, left + _NEXT]
+    left += _NEXT + _NEXT
+    level += c * picture[row, left] + d * picture[row, left + _NEXT]
+    return level
+
+
+@compiled(error_model="numpy", fastmath=FAST)
+def _cubic_level(picture: Any, x: float, y: float) -> float:
+    """Grey level by cubic convolution (Keys 1981); the first pixel's centre is 0, 0."""
+    column, row = math.floor(x), math.floor(y)
+    p, q = x - column, y - row
+    a = ((-0.5 * p + 1.0) * p - 0.5) * p
+    b = (1.5 * p - 2.5) * p * p + 1.0
+    c = ((-1.5 * p + 2.0) * p + 0.5) * p
+    d = (0.5 * p - 0.5) * p * p
+    left, top = np.uint64(column - 1), np.uint64(row - 1)  # unsigned: never counted from the end
+    level = (((-0.5 * q + 1.0) * q - 0.5) * q) * _across(picture, left, top, a, b, c, d)
+    level += ((1.5 * q - 2.5) * q * q + 1.0) * _across(picture, left, top + _NEXT, a, b, c, d)
+    top += _NEXT + _NEXT
+    level += (((-1.5 * q + 2.0) * q + 0.5) * q) * _across(picture, left, top, a, b, c, d)
+    level += ((0.5 * q - 0.5) * q * q) * _across(picture, left, top + _NEXT, a, b, c, d)
+    return level
+
+
+@compiled
+def _is_inside(picture: Any, x: float, y: float, margin: float) -> bool:
+    """Whether a place lies in a picture, this many pixels from its rim or more."""
+    return bool(
+        x >= margin
+        and y >= margin
+        and x < picture.shape[1] - margin - 1
+        and y < picture.shape[0] - margin - 1
+    )
+
+
 @compiled(error_model="numpy", fastmath=FAST)
 def _template(picture: Any, x: float, y: float, patch: Any, levels: Any, slopes: Any) -> None:
     """Grey levels of the reference's patch, and how they change with the unknowns."""
     side = 2 * _RADIUS + 3
     for i in range(side):
         for j in range(side):
-            patch[i, j] = cubic_level(picture, x + j - _RADIUS - 1, y + i - _RADIUS - 1)
+            patch[i, j] = _cubic_level(picture, x + j - _RADIUS - 1, y + i - _RADIUS - 1)
     k = 0
     for i in range(1, side - 1):
         for j in range(1, side - 1):
@@ -293,8 +333,8 @@ def _compare(
     reach_x = _RADIUS * (abs(m[0, 0]) + abs(m[0, 1]))
     reach_y = _RADIUS * (abs(m[1, 0]) + abs(m[1, 1]))
     if not (
-        is_inside(picture, x - reach_x, y - reach_y, 2.0)
-        and is_inside(picture, x + reach_x, y + reach_y, 2.0)
+        _is_inside(picture, x - reach_x, y - reach_y, 2.0)
+        and _is_inside(picture, x + reach_x, y + reach_y, 2.0)
     ):
         return -2.0
     k = 0
@@ -302,7 +342,7 @@ def _compare(
         for j in range(-_RADIUS, _RADIUS + 1):
             at_x = x + m[0, 0] * j + m[0, 1] * i
             at_y = y + m[1, 0] * j + m[1, 1] * i
-            seen[k] = cubic_level(picture, at_x, at_y)
+            seen[k] = _cubic_level(picture, at_x, at_y)
             k += 1
     for n in range(_UNKNOWNS):
         total = 0.0
@@ -337,7 +377,7 @@ def _align(first: Any, second: Any, reference: Any, pixels: Any, affine: Any) ->
     found = np.full(pixels.shape, np.nan)
     for point in range(len(pixels)):
         x, y = reference[point, 0] - 0.5, reference[point, 1] - 0.5
-        if not is_inside(first, x, y, _RADIUS + 3.0):
+        if not _is_inside(first, x, y, _RADIUS + 3.0):
             continue
         _template(first, x, y, patch, levels, slopes)
         _weighted_sum(weights, slopes, weighted, square)

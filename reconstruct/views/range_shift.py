@@ -203,15 +203,6 @@ def warped_at(
 
 
 @compiled(error_model="numpy", fastmath=FAST)
-def shown_at(lens: KernelLens, a: float, b: float, z: float) -> tuple[float, float]:
-    """The warped picture's pixel of a point (a, b, z) before the camera, z > 0."""
-    pinhole, field, inverse_working = lens
-    inverse = 1.0 / z
-    u, v = pinhole[0] * a * inverse + pinhole[2], pinhole[1] * b * inverse + pinhole[3]
-    return warped_at(field, inverse_working, u, v, inverse)
-
-
-@compiled(error_model="numpy", fastmath=FAST)
 def line_of(
     pinhole: Array, field: Nodes, inverse_working: float, x: float, y: float
 ) -> tuple[float, float, float, float]:
