@@ -107,7 +107,6 @@ PLAN = StageSpec(
         "settings.txt": "every setting with its equation and limit",
         "exports": "the plan for vehicles",
     },
-    picture="map.png",
     reported=("plan.json",),
 )
 
@@ -147,7 +146,6 @@ FLY = StageSpec(
         "vehicle.csv": "log of the vehicle",
         "bag": "the same as a ROS 2 bag",
     },
-    picture="track.png",
     reported=("flight.json",),
 )
 
@@ -171,7 +169,6 @@ POOL = StageSpec(
     resumes=True,
     simulated=True,
     products={"manifest.csv": "the pictures", "board.json": "the board"},
-    picture="left/00.png",
 )
 
 
@@ -206,7 +203,6 @@ IMAGE = StageSpec(
     resumes=True,
     simulated=True,
     products={"manifest.csv": "the pictures, with time and navigation"},
-    picture="left/000000.png",
     reported=("manifest.csv",),
 )
 

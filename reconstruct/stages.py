@@ -217,7 +217,6 @@ DENSE = StageSpec(
         "cloud.copc.laz": "point cloud (COPC) with colour, normal, sigma",
         "moving": "masks of what moves",
     },
-    picture="dem.png",
     reported=("dem.tif", "sigma.tif", "plane.json", "planes", "moving.png"),
 )
 
@@ -244,7 +243,6 @@ MOSAIC = StageSpec(
         "planes": "those of further planes",
         "footprints.geojson": "what each picture shows",
     },
-    picture="mosaic.png",
     reported=("mosaic.tif", "planes"),
 )
 
@@ -265,7 +263,6 @@ MESH = StageSpec(
         "mesh.glb": "textured mesh",
         "tiles/tileset.json": "the same in full detail as 3D Tiles, where it is large",
     },
-    picture="mesh.png",
     reported=("mesh.glb",),
 )
 
@@ -285,7 +282,6 @@ EVALUATE = StageSpec(
     summary=_evaluate_summary,
     simulated=True,
     products={"score.json": "errors against the truth"},
-    picture="errors.png",
     reported=(".",),
 )
 

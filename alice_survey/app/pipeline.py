@@ -62,11 +62,11 @@ def run(
         config = change_section(config, section, **values)
         if getattr(config, section) != getattr(as_written, section):
             given = {key: value for key, value in values.items() if value is not None}
-            lines = ", ".join(
+            words = ", ".join(
                 f"{k} = {json.dumps(value, default=str)}" for k, value in given.items()
             )
             warn(
-                f"{lines} holds for this run alone, and the next without it makes what depends on "
+                f"{words} holds for this run alone, and the next without it makes what depends on "
                 f"it again: to keep it, put it below [{section}] in survey.toml"
             )
     if imported:
@@ -245,17 +245,11 @@ def template_text(template: str = "survey.toml") -> str:
 
 
 def run_demo(workspace: Path, executor: Executor | None) -> tuple[str, dict[str, Any]]:
-    """Run the whole loop on the built-in survey, and report where its pictures are."""
+    """Run the whole loop on the built-in survey, and say where its report is."""
     if not (workspace / "survey.toml").exists():
         init_survey(workspace, "demo.toml")
     text, found = run(names(), workspace, None, executor)
-    rows = [
-        f"  {stage.name:12} {workspace / stage.folder / stage.picture}"
-        for stage in survey_stages.STAGES
-        if stage.picture
-    ]
-    page = f"  {'all of it':12} {workspace / 'report' / 'report.html'}"
-    return "\n".join([text, "", "To look at:", *rows, page]), found
+    return f"{text}\n\nAll of it: {workspace / 'report' / 'report.html'}", found
 
 
 def stage_states(workspace: Path, config: Config) -> dict[str, str]:

@@ -643,10 +643,7 @@ REMOVED: Mapping[str, tuple[Any, str]] = {
     "plan.strobe_lead_s": (0.0002, "it is 0.0002 s: leave it out"),
     "plan.split_dives": (True, _ALWAYS),
     "plan.tie_dives": (True, _ALWAYS),
-    "vehicle.thruster_health": (
-        dict.fromkeys(("starboard", "port", "vertical", "bow", "stern"), 1.0),
-        'write failures = ["NAME=SHARE"]',
-    ),
+    "vehicle.thruster_health": (_HEALTHY, 'write failures = ["NAME=SHARE"]'),
     "vehicle.health_known": (True, 'a failure from 0 s on is unknown: failures = ["NAME=SHARE@0"]'),
     "vehicle.lost_propellers": (..., 'write failures = ["NAME:propeller@SECONDS"]'),
     "vehicle.finds_failures": (True, _ALWAYS),

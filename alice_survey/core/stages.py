@@ -63,8 +63,6 @@ class StageSpec:
     """It is for simulated surveys: imported pictures have no such stage."""
     products: Mapping[str, str] = field(default_factory=dict)
     """Its products for users: paths below its folder, and descriptions."""
-    picture: str = ""
-    """A product to look at first."""
     reported: Sequence[str] = ()
     """Files that a report reads: paths below its folder, `.` for all of it."""
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 Level = Literal["good", "look", "bad"]
 LEVELS: tuple[Level, ...] = ("bad", "look", "good")
@@ -123,8 +123,6 @@ class PictureLayer:
     """Whether it is shown at first; only one base layer can be."""
     base: bool = True
     """Base layers exclude one another; others lie over them."""
-    group: str = "Overlays"
-    """Heading in the list of layers of one that is not a base layer."""
 
     def size(self, level: int) -> tuple[int, int, float, float]:
         """Columns, rows and a pixel's width and height, metres, of a level."""
@@ -151,26 +149,6 @@ class ShapeLayer:
     colour: str = "#0072b2"
     dashed: bool = False
     shown: bool = True
-    fill: float = 0.03
-    """Opacity of the inside of an outline."""
-    width: float | None = None
-    """Width of its lines, px; None is the default of its kind."""
-    group: str = "Overlays"
-    """Heading in the list of layers."""
-    extends: bool = True
-    """Whether the map's first view has to hold it."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class MapScript:
-    """An extension of a page's map."""
-
-    text: str
-    """Defines `extendMap(map, layers, data)`: Leaflet's map, the groups of shapes by the name of
-    their layer, and the data below. It returns a function from a place to what the line below the
-    map adds for it. The map fires `layerschanged` when a layer is switched."""
-    data: Mapping[str, Any]
-    """JSON values."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,13 +162,9 @@ class SurveyMap:
     """Where (0, 0) is, in words."""
     axes: tuple[str, str] = EAST_NORTH
     """What its axes are called, across and up."""
-    geodetic: tuple[Sequence[float], Sequence[float]] | None = None
-    """Degrees of latitude and longitude as quadratics of metres north n and east e: coefficients
-    of 1, n, e, n², ne and e²; the map then shows them under the pointer."""
     stills: Sequence[Figure] = ()
     """The map for print and for browsers without scripts: all of them in print, the first on the
     page; where there are none, the interactive map itself is printed."""
-    script: MapScript | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,7 +196,5 @@ class Report:
     sections: Sequence[Section] = ()
     map: SurveyMap | None = None
     mesh: Mesh | None = None
-    footer: str = ""
-    """Last line of the page."""
     citation: Sequence[tuple[str, str]] = ()
     """Labels and values of the title block in print: date, software and its version."""

@@ -1,7 +1,6 @@
 /* What vendor_map.js, vendor_mesh.js and the kit's classic scripts put into the global scope. */
 declare const leaflet: any;
 declare const three: any;
-declare const extendMap: any;
 declare const module: any;
 declare function aroundStation(line: any, station: any, outline: any): any;
 declare function drawStations(...parts: any[]): any;

@@ -74,7 +74,7 @@ function startMap(data, root) {
         : many(places(shape), {
           color: about.colour,
           weight: about.width || (about.kind === "line" ? 2.6 : rimmed ? 1.8 : 1),
-          fillOpacity: about.fill, ...dashes,
+          fillOpacity: about.fill ?? 0.03, ...dashes,
         });
       drawn.survey = {title: about.title, text: about.texts[index] || ""};
       drawn.on("click", (event) => { if (!tool) describe(drawn, event.latlng); });
@@ -170,7 +170,6 @@ function startMap(data, root) {
     const [e, n] = [place.lng, place.lat].map((v) => v.toFixed(decimals()).replace("-", "−"));
     let text = word + e + " " + data.unit + " " + data.axes[0] + ", " + n + " " + data.unit + " "
       + data.axes[1];
-    if (data.geodetic) text += "; " + latLon(data.geodetic, place.lat, place.lng);
     if (tool && tool.text) text += tool.text(place);
     readout.textContent = text + more.map((add) => add(place)).join("");
   }
@@ -208,7 +207,6 @@ function startMap(data, root) {
   data.layers.forEach(put);
   extend(data.extent);
   fit(false);
-  if (typeof extendMap === "function") more.push(extendMap(map, layers, data.more));
 
   root.querySelectorAll("input").forEach((input) => {
     if (input.checked) show(input.value, true);
@@ -242,15 +240,6 @@ function startMap(data, root) {
       release,
     data, moreAt: (add) => more.push(add), refresh: readCentre,
   };
-}
-
-/* Latitude and longitude are quadratic in metres north and east. */
-function latLon(geodetic, n, e) {
-  const terms = [1, n, e, n * n, n * e, e * e];
-  const [lat, lon] = geodetic.map((c) => terms.reduce((sum, term, i) => sum + c[i] * term, 0));
-  const degrees = (value, ahead, astern) => Math.abs(value).toFixed(7) + "° " + (
-    value < 0 ? astern : ahead);
-  return degrees(lat, "N", "S") + " " + degrees((lon + 540) % 360 - 180, "E", "W");
 }
 
 /* 0.02 m reads as 2 cm. */

@@ -45,8 +45,6 @@ def map_data(survey_map: SurveyMap) -> tuple[str, list[tuple[str, str]]]:
         "axes": list(survey_map.axes),
         "extent": [_short(value) for value in map_extent(survey_map)],
         "layers": described,
-        "more": None if survey_map.script is None else survey_map.script.data,
-        "geodetic": survey_map.geodetic,
     }
     held = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     return held, tiles
@@ -58,10 +56,9 @@ def map_extent(survey_map: SurveyMap) -> tuple[float, float, float, float]:
     Raises:
         ValueError: nothing is on the map.
     """
-    layers = [a for a in survey_map.layers if isinstance(a, PictureLayer) or a.extends]
     east: list[float] = []
     north: list[float] = []
-    for layer in layers or survey_map.layers:
+    for layer in survey_map.layers:
         if isinstance(layer, PictureLayer):
             east += [layer.west_m, layer.west_m + layer.width_px * layer.pixel_m]
             north += [layer.north_m, layer.north_m - layer.height_px * layer.pixel_m]
@@ -127,8 +124,6 @@ def _shapes(layer: ShapeLayer) -> dict[str, Any]:
         "title": layer.title,
         "colour": layer.colour,
         "dashed": layer.dashed,
-        "fill": layer.fill,
-        "width": layer.width,
         "shapes": [
             [[_short(east), _short(north)] for east, north in shape] for shape in layer.shapes
         ],

@@ -104,8 +104,7 @@ def _embedded_files(report: Report) -> tuple[list[str], list[str]]:
     styles, scripts = [_read("page.css")], list[str]()
     if report.map is not None:
         styles.insert(0, _read("web/vendor_map.css"))
-        more = [] if report.map.script is None else [report.map.script.text]
-        scripts += [*map(_read, _MAP_SCRIPTS[:-1]), *more, _read(_MAP_SCRIPTS[-1])]
+        scripts += map(_read, _MAP_SCRIPTS)
     if report.mesh is not None:
         scripts += map(_read, _MESH_SCRIPTS)
     return styles, scripts
@@ -151,14 +150,11 @@ def _anchor(section: Section) -> str:
 
 def _layer_groups(survey_map: SurveyMap) -> list[tuple[str, str, list[Any]]]:
     """Heading, kind of control and layers of each group in the map's list."""
-    groups: dict[tuple[str, str], list[Any]] = {("Base layer", "radio"): []}
+    groups: dict[bool, list[Any]] = {True: [], False: []}
     for layer in survey_map.layers:
-        if isinstance(layer, PictureLayer):
-            key = ("Base layer", "radio") if layer.base else (layer.group, "checkbox")
-        else:
-            key = (layer.group, "checkbox")
-        groups.setdefault(key, []).append(layer)
-    return [(title, kind, layers) for (title, kind), layers in groups.items() if layers]
+        groups[isinstance(layer, PictureLayer) and layer.base].append(layer)
+    named = [("Base layer", "radio", groups[True]), ("Overlays", "checkbox", groups[False])]
+    return [group for group in named if group[2]]
 
 
 def png_size(png: bytes) -> tuple[int, int]:

@@ -114,7 +114,6 @@ def _data(report: Report, folder: Path) -> dict[str, Any]:
         "facts": [list(fact) for fact in report.facts],
         "verdicts": [[verdict.level, verdict.text] for verdict in report.verdicts],
         "citation": [list(row) for row in report.citation],
-        "footer": report.footer,
         "sections": [
             {
                 "title": section.title,

@@ -4,13 +4,11 @@ Small meshes keep their triangles and get a smaller texture. Of large ones the p
 elevation model under the mosaic instead: as many cells as a browser turns smoothly.
 """
 
+import io
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-import rasterio
-from rasterio.enums import Resampling
 
 from alice_survey.app.report.held import Held
 from alice_survey.app.report.rasters import read_shrunk
@@ -25,7 +23,6 @@ _MAX_TRIANGLES = 250_000
 _MAX_TEXTURE_PX = 3072
 _MAX_CELLS = 90_000
 _QUALITY = 80
-_MAX_STILL_PX = 1600
 
 
 @progress.step("thin the mesh")
@@ -40,21 +37,13 @@ def mesh_copy(held: Held, glb: Path) -> Mesh | None:
     offset = np.array(mesh.offset_east_north_up)
     scene = _shrunk(held.workspace / "mesh" / "mesh.glb") if whole else _relief(held, offset)
     glb.write_bytes(scene.export(file_type="glb"))
-    return Mesh(
-        glb=glb,
-        about=mesh_about(mesh),
-        still=mesh_still(held.workspace / "mesh" / "mesh.png"),
-    )
-
-
-def mesh_still(picture: Path, max_px: int = _MAX_STILL_PX) -> Figure:
-    """Image of the mesh for print."""
-    return Figure(
-        png=shrunk_png(picture, max_px),
+    still = Figure(
+        png=shrunk_png(held.workspace / "mesh" / "mesh.png"),
         title="Mesh",
         alt="The mesh seen from above and from the side",
         shows="The mesh from above and from the side.",
     )
+    return Mesh(glb=glb, about=mesh_about(mesh), still=still)
 
 
 def mesh_about(mesh: MeshRecord) -> str:
@@ -98,18 +87,11 @@ def _relief(held: Held, offset: Array) -> Any:
     north = cell.f + cell.e * (np.arange(rows) + 0.5)
     points, faces, used = grid_mesh(east, north, heights.astype(np.float64).filled(np.nan))
     points -= offset[[0, 2, 1]] * [1.0, 1.0, -1.0]
-    with rasterio.open(held.workspace / "mosaic" / "mosaic.tif") as raster:
-        shrink = max(1.0, max(raster.width, raster.height) / _MAX_TEXTURE_PX)
-        size = (max(1, round(raster.height / shrink)), max(1, round(raster.width / shrink)))
-        bands = raster.read([1, 2, 3], out_shape=(3, *size), resampling=Resampling.average)
-        over = raster.bounds
-    uv = np.column_stack(
-        [
-            (used[:, 0] - over.left) / (over.right - over.left),
-            (used[:, 1] - over.bottom) / (over.top - over.bottom),
-        ]
-    )
-    picture = _as_jpeg(Image.fromarray(np.moveaxis(bands, 0, -1)))
+    path = held.workspace / "mosaic" / "mosaic.tif"
+    bands, _, at = read_shrunk(path, [1, 2, 3], _MAX_TEXTURE_PX**2)
+    high, wide = bands.shape[1:]
+    uv = (used - [at.c, at.f + at.e * high]) / [at.a * wide, -at.e * high]
+    picture = _as_jpeg(Image.fromarray(np.moveaxis(np.ma.getdata(bands), 0, -1)))
     material = trimesh.visual.material.PBRMaterial(
         baseColorTexture=picture, metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
     )
@@ -136,12 +118,8 @@ def grid_mesh(east: Array, north: Array, heights: Array) -> tuple[Array, Array, 
     there = [known[:-1, :-1], known[:-1, 1:], known[1:, :-1], known[1:, 1:]]
     first = there[0] & there[2] & there[1]
     second = there[1] & there[2] & there[3]
-    faces = np.concatenate(
-        [
-            np.stack([a, c, b], axis=-1)[first],
-            np.stack([b, c, d], axis=-1)[second],
-        ]
-    )
+    upper, lower = np.stack([a, c, b], axis=-1), np.stack([b, c, d], axis=-1)
+    faces = np.concatenate([upper[first], lower[second]])
     easts, norths = np.meshgrid(east, north)
     places = np.column_stack([easts[known], norths[known]])
     up = heights[known]
@@ -150,10 +128,8 @@ def grid_mesh(east: Array, north: Array, heights: Array) -> tuple[Array, Array, 
 
 def _as_jpeg(picture: Any) -> Any:
     """A picture that exporters write as JPEG."""
-    import io
-
     from PIL import Image
 
-    bgr = cv2.cvtColor(np.asarray(picture), cv2.COLOR_RGB2BGR)
-    data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
-    return Image.open(io.BytesIO(data))
+    data = io.BytesIO()
+    picture.save(data, "JPEG", quality=_QUALITY)
+    return Image.open(data)

@@ -1,6 +1,7 @@
 """Lines, outlines and points of a survey for its map: plan, flight, cameras, footprints."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Literal
 
 import numpy as np
 
@@ -16,10 +17,12 @@ _BLUE, _ORANGE, _GREEN, _RED, _BLACK = "#0072b2", "#e69f00", "#009e73", "#d55e00
 """Okabe and Ito's palette, safe for the colour-blind."""
 _MAX_VERTICES = 4000
 """Most points of a track on the map."""
-_MAX_OUTLINES, _MAX_POINTS = 4000, 20_000
-"""Most shapes on the map: some 4 MB of the page each."""
+_MAX_SHAPES = {"polygon": 4000, "line": 4000, "point": 20_000}
+"""Most shapes of a layer: some 4 MB of the page each."""
 
 Shape = Sequence[tuple[float, float]]
+Named = Sequence[tuple[Shape, str]]
+"""Shapes, and what is shown when one is chosen."""
 
 
 def shape_layers(held: Held) -> Iterator[ShapeLayer]:
@@ -30,51 +33,51 @@ def shape_layers(held: Held) -> Iterator[ShapeLayer]:
     if held.plane is not None:
         return
     area = planned_area(held)
-    if area is not None:
-        yield ShapeLayer(
-            name="area", title="Area to survey", about="As given in the plan.", kind="polygon",
-            shapes=[_pairs(np.array(part.exterior.coords)) for part in area.geoms],
-            colour=_BLACK, dashed=True,
-        )  # fmt: skip
-    footprints, every = thin_shapes(list(_footprints(held)), _MAX_OUTLINES)
-    if footprints:
-        yield ShapeLayer(
-            name="footprints", title="Footprints", kind="polygon", colour=_GREEN, shown=False,
-            about=f"Sea floor that each picture shows{every}.",
-            shapes=[outline for outline, _ in footprints], texts=[text for _, text in footprints],
-        )  # fmt: skip
+    rings = [] if area is None else [np.array(part.exterior.coords) for part in area.geoms]
     lines = () if held.plan is None else held.plan.lines
-    if lines:
-        yield ShapeLayer(
-            name="plan", title="Plan", about="Survey lines as planned.", kind="line",
-            shapes=[
-                _pairs(np.array([line.start_ne_m, line.end_ne_m])[:, ::-1]) for line in lines
-            ],
-            texts=[f"line {n}, {line.stations} stations" for n, line in enumerate(lines, 1)],
-            colour=_BLUE, dashed=True,
-        )  # fmt: skip
-    flown = held.rows("flight/truth/track.csv")
-    if flown:
-        places = np.array([[number(row, "east_m"), number(row, "north_m")] for row in flown])
-        step = max(1, len(places) // _MAX_VERTICES)
-        yield ShapeLayer(
-            name="flown", title="Flown", about="Where the vehicle really was (simulated).",
-            kind="line", shapes=[_pairs(places[::step])], colour=_ORANGE,
-        )  # fmt: skip
-    cameras, every = thin_shapes(_cameras(held), _MAX_POINTS)
-    if cameras:
-        yield ShapeLayer(
-            name="cameras", title="Cameras", kind="point", colour=_BLUE, shown=not flown,
-            about=f"Where pictures were taken, from the model{every}.",
-            shapes=[place for place, _ in cameras], texts=[text for _, text in cameras],
-        )  # fmt: skip
-    lost, every = thin_shapes(_lost_pictures(held), _MAX_POINTS)
-    if lost:
-        yield ShapeLayer(
-            name="lost", title="Lost pictures", kind="point", colour=_RED,
-            about=f"Pictures that are not in the model, where navigation has them{every}.",
-            shapes=[place for place, _ in lost], texts=[text for _, text in lost],
-        )  # fmt: skip
+    planned: Named = [
+        (_pairs(np.array([line.start_ne_m, line.end_ne_m])[:, ::-1]),
+         f"line {n}, {line.stations} stations")
+        for n, line in enumerate(lines, 1)
+    ]  # fmt: skip
+    track = held.rows("flight/truth/track.csv")
+    places = np.array([[number(row, "east_m"), number(row, "north_m")] for row in track])
+    flown = [(_pairs(places[:: max(1, len(places) // _MAX_VERTICES)]), "")] if track else []
+    made = (
+        _layer("area", "Area to survey", "As given in the plan.", "polygon",
+               [(_pairs(ring), "") for ring in rings], colour=_BLACK, dashed=True),
+        _layer("footprints", "Footprints", "Sea floor that each picture shows.", "polygon",
+               list(_footprints(held)), colour=_GREEN, shown=False),
+        _layer("plan", "Plan", "Survey lines as planned.", "line", planned, colour=_BLUE,
+               dashed=True),
+        _layer("flown", "Flown", "Where the vehicle really was (simulated).", "line", flown,
+               colour=_ORANGE),
+        _layer("cameras", "Cameras", "Where pictures were taken, from the model.", "point",
+               _cameras(held), colour=_BLUE, shown=not track),
+        _layer("lost", "Lost pictures",
+               "Pictures that are not in the model, where navigation has them.", "point",
+               _lost_pictures(held), colour=_RED),
+    )  # fmt: skip
+    yield from (layer for layer in made if layer.shapes)
+
+
+def _layer(
+    name: str,
+    title: str,
+    about: str,
+    kind: Literal["line", "polygon", "point"],
+    found: Named,
+    **how: Any,
+) -> ShapeLayer:
+    """A layer of at most so many shapes, evenly taken; it says what was left out."""
+    step = -(-len(found) // _MAX_SHAPES[kind])
+    kept = found[:: max(step, 1)]
+    if step > 1:
+        about = f"{about} One of {step} is shown."
+    return ShapeLayer(
+        name=name, title=title, about=about, kind=kind, shapes=[shape for shape, _ in kept],
+        texts=[text for _, text in kept], **how,
+    )  # fmt: skip
 
 
 def camera_place(row: Mapping[str, str]) -> Array:
@@ -82,14 +85,6 @@ def camera_place(row: Mapping[str, str]) -> Array:
     columns = (("east_m", "north_m"), ("y_m", "x_m"), ("y", "x"))
     names = next(names for names in columns if names[0] in row)
     return np.array([number(row, name) for name in names])
-
-
-def thin_shapes(
-    shapes: Sequence[tuple[Shape, str]], maximum: int
-) -> tuple[Sequence[tuple[Shape, str]], str]:
-    """At most this many shapes, evenly taken, and words on what was left out."""
-    step = -(-len(shapes) // maximum)
-    return (shapes, "") if step <= 1 else (shapes[::step], f"; one of {step} is shown")
 
 
 def _pairs(east_north: Array) -> list[tuple[float, float]]:

@@ -95,7 +95,7 @@ def _layer_json(layer: PictureLayer | ShapeLayer) -> dict[str, Any]:
         "title": layer.title,
         "about": layer.about,
         "shown": layer.shown,
-        "group": "Base layer" if is_base else layer.group,
+        "group": "Base layer" if is_base else "Overlays",
         "scale": scale_json(layer) if isinstance(layer, PictureLayer) else None,
     }
 

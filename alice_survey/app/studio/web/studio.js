@@ -9,7 +9,7 @@ document.getElementById("title").textContent = state.name;
 
 const held = await attempt(() => get("/api/map"));
 const mapData = {
-  unit: state.unit, axes: state.axes, extent: [-50, -50, 50, 50], layers: [], geodetic: null,
+  unit: state.unit, axes: state.axes, extent: [-50, -50, 50, 50], layers: [],
     ...held,
 };
 const described = mapData.layers;
