@@ -14,9 +14,9 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.block_solver import MAD_TO_SIGMA
+from alice_survey.core.config import AUTO, LEVEL, WantedPlane
 from alice_survey.core.errors import ReconstructionError, warn
 from alice_survey.core.frames import Array
-from alice_survey.core.plane_settings import AUTO, LEVEL, WantedPlane
 from alice_survey.core.records import Direction, PlaceRecord, PlaneRecord
 from reconstruct.views.model import MEAN_PLANE, SparseModel, View, WorldFrame
 

@@ -26,19 +26,17 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import EllipseCollection, LineCollection, PolyCollection
+from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import (
     BoundaryNorm,
     LinearSegmentedColormap,
     ListedColormap,
-    LogNorm,
     to_hex,
 )
 from matplotlib.figure import Figure as Sheet
-from matplotlib.patches import Circle, Ellipse, PathPatch, Polygon, Rectangle
+from matplotlib.patches import PathPatch, Rectangle
 from matplotlib.path import Path as Outline
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from alice_survey.core.artefacts import atomic_path
@@ -48,9 +46,9 @@ from alice_survey.kit.document import EAST_NORTH, Figure
 from alice_survey.kit.map import round_length
 
 __all__ = [
-    "BAND", "GRID", "INK", "INKS", "MARKS", "SOFT", "WIDTH_IN", "Axes", "BoundaryNorm", "Circle",
-    "Ellipse", "EllipseCollection", "LineCollection", "LinearSegmentedColormap", "ListedColormap",
-    "LogNorm", "MaxNLocator", "Outline", "PathPatch", "PolyCollection", "Polygon", "Rectangle",
+    "BAND", "GRID", "INK", "INKS", "MARKS", "SOFT", "WIDTH_IN", "Axes", "BoundaryNorm",
+    "LineCollection", "LinearSegmentedColormap", "ListedColormap",
+    "Outline", "PathPatch", "PolyCollection", "Rectangle",
     "Sheet", "check_figure_path", "colour_bar", "draw_figure", "even_limit", "figure_style",
     "map_axes", "new_figure", "north_arrow", "palette_colours", "palette_steps", "plain_name",
     "png_of", "save_figure",

@@ -17,10 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rasterio.windows import Window
 
-from alice_survey.core.config import ReconstructConfig
+from alice_survey.core.config import ReconstructConfig, parse_planes
 from alice_survey.core.errors import ReconstructionError, warn
 from alice_survey.core.executor import Executor
-from alice_survey.core.plane_settings import parse_planes
 from alice_survey.core.products import LENGTH, rasters_in
 from alice_survey.core.records import SurfaceRecord
 from reconstruct.dense.cloud import write_clouds

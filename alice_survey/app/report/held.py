@@ -13,8 +13,8 @@ import numpy as np
 from alice_survey.app import stages
 from alice_survey.app.stages import finished_stages
 from alice_survey.core.artefacts import JsonRecord, StageRecord
+from alice_survey.core.config import LEVEL
 from alice_survey.core.frames import Array
-from alice_survey.core.plane_settings import LEVEL
 from alice_survey.core.records import (
     ChangeRecord,
     FrameRecord,

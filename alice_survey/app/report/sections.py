@@ -358,20 +358,11 @@ def _camera(held: Held) -> Section:
     if refined is not None:
         text.append(
             f"The survey's own pictures refined the rig from {refined.observations:,} "
-            f"observations at {refined.stations} stations, within what calibration knew."
+            f"observations at {refined.stations} stations, within what calibration knew; "
+            "sparse/port.json has every parameter before and after, with its sigmas."
         )
         if refined.contradiction is not None:
             text.append(f"But {refined.contradiction}.")
-        values = zip(
-            refined.parameters, refined.before, refined.after, refined.prior_sigmas,
-            refined.sigmas, strict=True,
-        )  # fmt: skip
-        rows = [
-            (name, f"{a:.8g}", f"{b:.8g}", *(f"{s:.2g}" if s else "fixed" for s in sigmas))
-            for name, a, b, *sigmas in values
-        ]
-        header = ("parameter", "calibrated", "refined", "sigma before", "sigma after")
-        tables.append(Table(title="Rig refined by the survey", header=header, rows=rows))
     if cameras is not None:
         rig_file = held.file("sparse/rig.json") or rig_file_of(held.workspace)
         rig = None if rig_file is None else read_rig(rig_file)
