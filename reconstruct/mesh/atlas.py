@@ -1,19 +1,24 @@
 """Where every patch of a mesh lies in the pages of its texture."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
-from alice_survey.core.run import progress
 from reconstruct.mesh.topology import Triangles
 from reconstruct.mesh.visibility import Charts
 
 PADDING_PX = 8
 """Pixels around a patch that continue its picture: mipmaps down to an eighth mix nothing else."""
+
+
+PAGE_PX = 8192
+"""Largest side of a page."""
+_MAX_PAGES, _FILLED = 16, 0.85
+"""Pages of a mesh, and the share of a page that patches fill."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -50,6 +55,11 @@ class Atlas:
         placed: Array = pixels * self.scale - self.source[chart] + self.corner[chart]
         return placed
 
+    def part(self, mine: NDArray[np.int64]) -> "Atlas":
+        """The same pages with some of the patches."""
+        names = ("page", "corner", "source", "box")
+        return replace(self, **{name: getattr(self, name)[mine] for name in names})
+
     def uv(self, placed: Array, chart: NDArray[np.int32]) -> Array:
         """Pixels (W, 2) of pages as u to the right and v upwards, 0 to 1."""
         size = np.array(self.sizes, dtype=np.float64)[self.page[chart]]
@@ -70,56 +80,22 @@ def make_wedges(triangles: Triangles, charts: Charts) -> Wedges:
     )
 
 
-@progress.step("pack patches")
-def make_atlas(pixels: Array, wedges: Wedges, count: int, page_px: int, max_pages: int) -> Atlas:
-    """Pack the boxes of all patches into pages.
+def make_pages(pixels: Array, wedges: Wedges, page: NDArray[np.int32] | None, count: int) -> Atlas:
+    """Pack the boxes of patches into pages, each as small as it goes.
+
+    The texture is made coarser until no page is larger than `PAGE_PX`.
 
     Args:
         pixels: (W, 2) of every wedge in its picture.
         wedges: of the mesh.
+        page: (C,) that every patch is to be on, those of -1 on none; None for few full ones.
         count: of patches.
-        page_px: side of a page.
-        max_pages: the texture is made coarser until it needs no more.
     """
-    low, high = _bounds(pixels, wedges, count)
-    widest = float((high - low).max(initial=1.0))
-    scale = min(1.0, (page_px - 2 * PADDING_PX - 2) / widest)
-    while True:
-        source = np.floor(low * scale).astype(np.int64) - PADDING_PX
-        box = np.ceil(high * scale).astype(np.int64) + PADDING_PX - source
-        page, corner = pack(box, page_px)
-        pages = int(page.max(initial=0)) + 1
-        if pages <= max_pages:
-            break
-        scale *= 0.95 * float(np.sqrt(max_pages / pages))
-    if pages == 1:  # the smallest page that does
-        side = 256
-        while side < page_px:
-            if side >= box.max(initial=0):
-                trial_page, trial = pack(box, side)
-                if trial_page.max(initial=0) == 0:
-                    page, corner, page_px = trial_page, trial, side
-                    break
-            side *= 2
-    sizes = []
-    for number in range(pages):
-        mine = page == number
-        used = int((corner[mine, 1] + box[mine, 1]).max(initial=1))
-        sizes.append((page_px, -(-used // 4) * 4))
-    return Atlas(sizes=tuple(sizes), page=page, corner=corner, source=source, box=box, scale=scale)
-
-
-def make_pages(pixels: Array, wedges: Wedges, page: NDArray[np.int32], page_px: int) -> Atlas:
-    """Pack the boxes of patches into the pages that they are to have, each as small as it goes.
-
-    Args:
-        pixels: (W, 2) of every wedge in its picture.
-        wedges: of the mesh.
-        page: (C,) of every patch; those of -1 are in none.
-        page_px: largest side of a page; the texture is made coarser until all fit.
-    """
-    low, high = _bounds(pixels, wedges, len(page))
-    corner, scale = np.zeros((len(page), 2), np.int64), 1.0
+    low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+    np.minimum.at(low, wedges.chart, pixels)
+    np.maximum.at(high, wedges.chart, pixels)
+    page = _share_out(high - low + 2 * PADDING_PX) if page is None else page
+    corner, scale = np.zeros((count, 2), np.int64), 1.0
     while True:
         source = np.floor(low * scale).astype(np.int64) - PADDING_PX
         box = np.ceil(high * scale).astype(np.int64) + PADDING_PX - source
@@ -127,48 +103,43 @@ def make_pages(pixels: Array, wedges: Wedges, page: NDArray[np.int32], page_px: 
         for number in range(int(page.max(initial=-1)) + 1):
             mine = np.flatnonzero(page == number)
             side = max(int(box[mine].max(initial=4)), math.isqrt(int(box[mine].prod(1).sum())))
-            while True:
-                side = -(-side // 4) * 4
-                at, corner[mine] = pack(box[mine], side)
-                if at.max(initial=0) == 0:
-                    break
-                side = math.ceil(1.05 * side)
-            used = int((corner[mine, 1] + box[mine, 1]).max(initial=4))
+            side = -(-side // 4) * 4
+            while ((at := pack(box[mine], side)) < 0).any():
+                side = -(-math.ceil(1.05 * side) // 4) * 4
+            corner[mine] = at
+            used = int((at[:, 1] + box[mine, 1]).max(initial=4))
             sizes.append((side, -(-used // 4) * 4))
         widest = max((side for side, _ in sizes), default=0)
-        if widest <= page_px:
+        if widest <= PAGE_PX:
             break
-        scale *= 0.95 * page_px / widest
+        scale *= 0.95 * PAGE_PX / widest
     return Atlas(sizes=tuple(sizes), page=page, corner=corner, source=source, box=box, scale=scale)
 
 
-def _bounds(pixels: Array, wedges: Wedges, count: int) -> tuple[Array, Array]:
-    """Least and greatest pixels (C, 2) of every patch."""
-    low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
-    np.minimum.at(low, wedges.chart, pixels)
-    np.maximum.at(high, wedges.chart, pixels)
-    return low, high
+def _share_out(box: Array) -> NDArray[np.int32]:
+    """Pages (C,) for boxes (C, 2), as few as may hold them, those of one height together."""
+    order = np.lexsort((-box[:, 0], -box[:, 1]))
+    filled = np.cumsum(box[order].prod(axis=1)) / (_FILLED * PAGE_PX**2)
+    pages = min(math.ceil(filled.max(initial=0.0)), _MAX_PAGES)
+    page = np.zeros(len(box), np.int32)
+    page[order] = np.minimum(filled * (pages / filled.max(initial=1e-9)), pages - 1).astype(int)
+    return page
 
 
-def pack(boxes: NDArray[np.int64], side: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Put boxes onto square pages along their skyline, tallest first, each as low as it goes.
+def pack(boxes: NDArray[np.int64], side: int) -> NDArray[np.int64]:
+    """Put boxes onto a square page along its skyline, tallest first, each as low as it goes.
 
     Args:
-        boxes: (C, 2) widths and heights, none over `side`.
-        side: of a page.
+        boxes: (C, 2) widths and heights.
+        side: of the page.
 
     Returns:
-        Page (C,) and corner (C, 2) of every box; no two of a page overlap.
+        Corner (C, 2) of every box, no two of which overlap; -1 of those that do not fit.
     """
-    left = np.lexsort((np.arange(len(boxes)), -boxes[:, 0], -boxes[:, 1]))
-    page, corner = np.zeros(len(boxes), np.int32), np.zeros((len(boxes), 2), np.int64)
-    number = 0
-    while len(left):  # each page takes what fits, in order
-        at = _fill_page(boxes[left].astype(np.int64), side)
-        taken = at[:, 0] >= 0
-        page[left[taken]], corner[left[taken]] = number, at[taken]
-        left, number = left[~taken], number + 1
-    return page, corner
+    order = np.lexsort((np.arange(len(boxes)), -boxes[:, 0], -boxes[:, 1]))
+    corner = np.empty((len(boxes), 2), np.int64)
+    corner[order] = _fill_page(boxes[order].astype(np.int64), side)
+    return corner
 
 
 @compiled

@@ -9,7 +9,6 @@ import numpy as np
 from alice_survey.core.config import ReconstructConfig
 from alice_survey.core.errors import warn
 from alice_survey.core.executor import Executor
-from alice_survey.core.frames import Array
 from alice_survey.core.records import CloudRecord, MeshRecord
 from alice_survey.core.run import progress
 from reconstruct.light.solve import read_light
@@ -20,19 +19,13 @@ from reconstruct.mesh.surface import (
     coarser_level,
     mesh_cloud,
 )
-from reconstruct.mesh.texture import Textured, colours_of_cloud, paint
+from reconstruct.mesh.texture import MeshSetup, Textured, make_texture
 from reconstruct.mesh.tiles import TileSetup, write_tiles
 from reconstruct.mesh.topology import face_areas
-from reconstruct.mesh.visibility import choose_views, find_candidates, make_charts
 from reconstruct.mosaic.grid import mean_pixel
 from reconstruct.ply import open_cloud
 from reconstruct.raster import write_png
 from reconstruct.views.model import WorldFrame, read_model
-
-_PAGE_PX = 8192
-"""Largest side of a page of texture."""
-_LIFT_STEPS = 0.5
-"""Height over the surface, in spacings of the cloud, at which lines of sight start."""
 
 
 def run_mesh(
@@ -48,55 +41,25 @@ def run_mesh(
     dense = workspace / "dense"
     about = CloudRecord.read(dense / "cloud.json")
     light = read_light(dense / "light.json")
-    offset, step = np.array(about.offset_east_north_up), about.thinned_to
-    pixel = mean_pixel(model)
+    setup = MeshSetup(
+        workspace=workspace,
+        cloud=open_cloud(dense / "cloud.ply"),
+        offset=np.array(about.offset_east_north_up),
+        step=about.thinned_to,
+        pixel=mean_pixel(model),
+    )
     views = [view for view in model.views if view.image in light.gains]
-    cloud = open_cloud(dense / "cloud.ply")
     scratch = folder / "scratch"
     scratch.mkdir()
-    mesh, levels = mesh_cloud(
-        cloud,
-        step,
-        reconstruct.mesh_error_px * pixel,
-        scratch,
-        executor,
-    )
-    np.savez(scratch / "mesh.npz", vertices=mesh.vertices, triangles=mesh.triangles, offset=offset)
-    candidates = find_candidates(
-        scratch / "mesh.npz", len(mesh.triangles), workspace, views, _LIFT_STEPS * step, executor
-    )
-    label = choose_views(mesh.vertices, mesh.triangles, candidates)
-    del candidates
-    textured = paint(
-        folder,
-        mesh.vertices,
-        mesh.triangles,
-        offset,
-        make_charts(mesh.vertices, mesh.triangles, label),
-        views,
-        workspace,
-        light,
-        colours_of_cloud(cloud, mesh.vertices, step),
-        plain_pixel=pixel,
-        page_px=_PAGE_PX,
-        executor=executor,
-    )
-    facts = mesh_facts(mesh, textured, offset, step, model.frame)
+    error = reconstruct.mesh_error_px * setup.pixel
+    mesh, levels = mesh_cloud(setup.cloud, setup.step, error, scratch, executor)
+    textured = make_texture(setup, folder, mesh.vertices, mesh.triangles, views, light, executor)
+    facts = mesh_facts(mesh, textured, setup, model.frame)
     if len(levels) > 1 or textured.scale < 1.0:  # the mesh has not all of the detail
         while len(levels[-1].cells) > 1:
-            levels.append(coarser_level(levels, step, scratch, executor))
-        setup = TileSetup(
-            folder=folder / "tiles",
-            scratch=scratch / "tiles",
-            workspace=workspace,
-            cloud=cloud,
-            offset=offset,
-            step=step,
-            lift=_LIFT_STEPS * step,
-            pixel=pixel,
-            page_px=_PAGE_PX,
-        )
-        facts["tiles"] = write_tiles(setup, levels, model.frame, views, light, executor)
+            levels.append(coarser_level(levels, setup.step, scratch, executor))
+        tiles = TileSetup(mesh=setup, folder=folder / "tiles", scratch=scratch / "tiles")
+        facts["tiles"] = write_tiles(tiles, levels, model.frame, views, light, executor)
     shutil.rmtree(scratch)
     if facts["textured_share"] < 0.5:
         warn(
@@ -121,7 +84,7 @@ def _write_results(folder: Path, mesh: Textured, facts: dict[str, Any]) -> None:
 
 
 def mesh_facts(
-    mesh: TriangleMesh, textured: Textured, offset_enu: Array, step: float, frame: WorldFrame
+    mesh: TriangleMesh, textured: Textured, setup: MeshSetup, frame: WorldFrame
 ) -> dict[str, Any]:
     """What the files cannot say."""
     area = face_areas(mesh.vertices, mesh.triangles)
@@ -135,13 +98,13 @@ def mesh_facts(
         "patches": int(textured.wedges.chart.max()) + 1,
         "pages": [page.name for page in textured.pages],
         "texture_scale": round(textured.scale, 6),
-        "spacing": step,
-        "gaps_bridged": 2 * TRIM_STEPS * step,
+        "spacing": setup.step,
+        "gaps_bridged": 2 * TRIM_STEPS * setup.step,
         "decimation_error": mesh.error,
         "unit": frame.unit,
         "frame": frame.name,
         "vertical_datum": frame.vertical_datum,
         "axes": {"obj_ply": ["east", "north", "up"], "glb": GLB_AXES},
-        "offset_east_north_up": [float(value) for value in offset_enu],
+        "offset_east_north_up": setup.offset.tolist(),
         "notes": list(frame.notes),
     }

@@ -8,7 +8,7 @@ Ivanov 2007, eq. 5; Waechter et al. 2014, "Let there be color!", eq. 3).
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,16 +25,18 @@ from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Array
 from alice_survey.core.run import progress
 from reconstruct.light.solve import LightModel
-from reconstruct.mesh.atlas import Atlas, Wedges, make_atlas, make_pages, make_wedges
+from reconstruct.mesh.atlas import Atlas, Wedges, make_pages, make_wedges
 from reconstruct.mesh.topology import Triangles, edges_of
-from reconstruct.mesh.visibility import Charts, to_world
+from reconstruct.mesh.visibility import Charts, choose_views, find_candidates, make_charts, to_world
 from reconstruct.pictures.undistorted import WHOLE, Part, Pictures
+from reconstruct.ply import CloudFile
 from reconstruct.views.model import View
 
 Float32 = NDArray[np.float32]
 _SEAM_SIGMA_PX = 4.0
 """Sigma of the average around a seam's vertices by which both sides are compared."""
-_MAX_PAGES = 16
+_LIFT_STEPS = 0.5
+"""Height over the surface, in spacings of the cloud, at which lines of sight start."""
 _JPEG_QUALITY = 93
 _MAX_ROWS = 30_000
 """Most rows for `cv2.remap`, which takes at most 32767."""
@@ -83,55 +85,87 @@ class PagePaintTask:
     """Per patch (T, 3) of its own wedges."""
 
 
-def paint(
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MeshSetup:
+    """What a mesh and all its tiles share."""
+
+    workspace: Path
+    """With the pictures."""
+    cloud: CloudFile
+    offset: Array
+    """(3,) of its coordinates: east, north, up."""
+    step: float
+    """Spacing of its points."""
+    pixel: float
+    """Side of a texture's pixel where no view sees the mesh."""
+
+
+def make_texture(
+    setup: MeshSetup,
     folder: Path,
     vertices: Array,
     triangles: Triangles,
-    offset_enu: Array,
-    charts: Charts,
     views: Sequence[View],
-    workspace: Path,
     light: LightModel,
-    cloud_colours: NDArray[np.uint8],
-    *,
-    plain_pixel: float,
-    page_px: int,
     executor: Executor,
-    page: NDArray[np.int32] | None = None,
+    tile: NDArray[np.int32] | None = None,
+    **occluders: Any,
 ) -> Textured:
-    """Make the texture of a mesh.
+    """Choose the views that paint a mesh, and paint it.
 
     Args:
+        setup: of the survey.
         folder: for the pages, `texture_0.jpg` and on.
         vertices: (V, 3) east, north, up from the offset.
         triangles: (T, 3).
-        offset_enu: (3,).
-        charts: patches and their views.
-        views: by label.
-        workspace: with the pictures.
+        views: to choose from.
         light: of the survey.
-        cloud_colours: (V, 3) RGB that paint what no view sees.
-        plain_pixel: side of a texture's pixel there.
-        page_px: largest side of a page.
         executor: where tasks run.
-        page: (C,) of every patch, -1 for those that only help to level the colours; None where
+        tile: (T,) page of every face, -1 for those that only help to level the colours; None where
             patches go onto as few pages as they can.
+        occluders: of `find_candidates`.
     """
+    path = folder / "sights.npz"
+    np.savez(path, vertices=vertices, triangles=triangles, offset=setup.offset, **occluders)
+    lift, count = _LIFT_STEPS * setup.step, len(triangles)
+    candidates = find_candidates(path, count, setup.workspace, views, lift, executor)
+    path.unlink()
+    label = choose_views(vertices, triangles, candidates)
+    del candidates
+    charts = make_charts(vertices, triangles, label, tile)
+    page = None
+    if tile is not None:
+        page = np.empty(len(charts.views), np.int32)
+        page[charts.chart] = tile
+    return paint(setup, folder, vertices, triangles, charts, page, views, light, executor)
+
+
+def paint(
+    setup: MeshSetup,
+    folder: Path,
+    vertices: Array,
+    triangles: Triangles,
+    charts: Charts,
+    page: NDArray[np.int32] | None,
+    views: Sequence[View],
+    light: LightModel,
+    executor: Executor,
+) -> Textured:
+    """Paint the patches of a mesh; arguments as `make_texture` takes them."""
     wedges = make_wedges(triangles, charts)
-    pixels = wedge_pixels(vertices, wedges, charts, views, offset_enu, plain_pixel)
-    if page is None:
-        atlas = make_atlas(pixels, wedges, len(charts.views), page_px, _MAX_PAGES)
-    else:
-        atlas = make_pages(pixels, wedges, page, page_px)
-    corrections = _corrections(pixels, wedges, charts, views, workspace, light, executor)
+    pixels = wedge_pixels(vertices, wedges, charts, views, setup.offset, setup.pixel)
+    atlas = make_pages(pixels, wedges, page, len(charts.views))
+    corrections = _corrections(pixels, wedges, charts, views, setup.workspace, light, executor)
     unseen = charts.views[wedges.chart] < 0
+    cloud_colours = colours_of_cloud(setup.cloud, vertices, setup.step)
     corrections[unseen] = cloud_colours[wedges.vertex[unseen]][:, ::-1]
     scratch = tuple(folder / f"page_{number}.raw" for number in range(len(atlas.sizes)))
     for path, (width, height) in zip(scratch, atlas.sizes, strict=True):
         np.memmap(path, np.uint8, "w+", shape=(height, width, 3)).flush()
     placed = pixels * atlas.scale
     tasks = _paint_tasks(atlas, wedges, charts, views, light, placed, corrections)
-    for _ in executor.map(partial(paint_view, workspace, scratch), tasks, label="paint"):
+    work = partial(paint_view, setup.workspace, scratch)
+    for _ in executor.map(work, tasks, label="paint"):
         pass
     on_page = atlas.place(pixels, wedges.chart)
     pages, colours = [], np.zeros((len(vertices), 3))
@@ -156,6 +190,14 @@ def paint(
         label=charts.label,
         scale=atlas.scale,
     )
+
+
+def read_page(path: Path) -> NDArray[np.uint8]:
+    """A picture that `write_jpeg` wrote, BGR."""
+    picture = cv2.imread(str(path))
+    if picture is None:
+        raise FileNotFoundError(path)
+    return np.asarray(picture, np.uint8)
 
 
 def write_jpeg(path: Path, picture: NDArray[np.uint8]) -> None:
@@ -350,36 +392,24 @@ def _paint_tasks(
     corrections: Array,
 ) -> list[PagePaintTask]:
     """One task for each view with patches; the last for what no view sees."""
-    count = len(charts.views)
-    by_chart = np.argsort(wedges.chart, kind="stable")
-    wedge_starts = np.searchsorted(wedges.chart[by_chart], np.arange(count + 1))
-    local = np.empty(len(by_chart), np.int32)
-    local[by_chart] = np.arange(len(by_chart)) - wedge_starts[wedges.chart[by_chart]]
-    face_order = np.argsort(charts.chart, kind="stable")
-    face_starts = np.searchsorted(charts.chart[face_order], np.arange(count + 1))
+    members = by_value(wedges.chart, np.arange(len(wedges.chart)))
+    faces = by_value(charts.chart, np.arange(len(charts.chart)))
+    local = np.empty(len(wedges.chart), np.int32)
+    for mine in members:
+        local[mine] = np.arange(len(mine))
     tasks = []
     shown = np.maximum(charts.views, -1)
     for mine in by_value(shown, np.flatnonzero(atlas.page >= 0)):
         number = int(shown[mine[0]])
         view = views[number] if number >= 0 else None
-        members = [by_chart[wedge_starts[c] : wedge_starts[c + 1]] for c in mine]
         tasks.append(
             PagePaintTask(
                 view=view,
                 factors=None if view is None else light.factors(view.camera, view.image),
-                atlas=replace(
-                    atlas,
-                    page=atlas.page[mine],
-                    corner=atlas.corner[mine],
-                    source=atlas.source[mine],
-                    box=atlas.box[mine],
-                ),
-                pixels=tuple(placed[m] for m in members),
-                corrections=tuple(corrections[m].astype(np.float32) for m in members),
-                triangles=tuple(
-                    local[wedges.triangles[face_order[face_starts[c] : face_starts[c + 1]]]]
-                    for c in mine
-                ),
+                atlas=atlas.part(mine),
+                pixels=tuple(placed[members[c]] for c in mine),
+                corrections=tuple(corrections[members[c]].astype(np.float32) for c in mine),
+                triangles=tuple(local[wedges.triangles[faces[c]]] for c in mine),
             )
         )
     return tasks
@@ -409,10 +439,7 @@ def paint_view(workspace: Path, files: tuple[Path, ...], task: PagePaintTask) ->
         picture = even_colour(pictures, task.view, task.factors, part)
         valid = pictures.valid(task.view.image, part).astype(np.uint8)
         if atlas.scale < 1.0:
-            size = (
-                max(1, round(picture.shape[1] * atlas.scale)),
-                max(1, round(picture.shape[0] * atlas.scale)),
-            )
+            size = [max(1, round(side * atlas.scale)) for side in picture.shape[1::-1]]
             picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
             valid = cv2.resize(valid, size, interpolation=cv2.INTER_NEAREST)
     for i, (corners, values, triangles) in enumerate(

@@ -36,10 +36,11 @@ from reconstruct.mesh.atlas import Wedges, make_pages, make_wedges
 from reconstruct.mesh.cells import Cell, CellLevel, CellMesh, Key, join
 from reconstruct.mesh.formats import write_glb
 from reconstruct.mesh.texture import (
+    MeshSetup,
     Textured,
-    colours_of_cloud,
+    make_texture,
     nearest_covered,
-    paint,
+    read_page,
     remap,
     spread_corners,
     wedge_pixels,
@@ -50,13 +51,10 @@ from reconstruct.mesh.visibility import (
     CANDIDATES,
     blocks_near,
     choose_axes,
-    choose_views,
-    find_candidates,
     make_charts,
     ray_scene,
     to_world,
 )
-from reconstruct.ply import CloudFile
 from reconstruct.views.model import View, WorldFrame
 
 REGION_LEVEL = 2
@@ -76,20 +74,11 @@ _LEVELS_OF_A_FILE = 4
 class TileSetup:
     """What all tiles share."""
 
+    mesh: MeshSetup
+    """Of the survey; its pixel is the side of a texel of the finest tiles."""
     folder: Path
     """Of the tiles."""
     scratch: Path
-    workspace: Path
-    cloud: CloudFile
-    offset: Array
-    """(3,) of the cloud's coordinates."""
-    step: float
-    """Spacing of the cloud's points."""
-    lift: float
-    """Height over the surface at which lines of sight start."""
-    pixel: float
-    """Side of a texel of the finest tiles."""
-    page_px: int
 
     def skin(self, level: int, key: Key) -> Path:
         """File of the texture coordinates of a tile; its picture is next to it."""
@@ -194,12 +183,12 @@ def region_tasks(
         low = np.min([tile.low for tile in tiles.values()], axis=0)
         high = np.max([tile.high for tile in tiles.values()], axis=0)
         middle, radius = 0.5 * (low + high), np.array([0.5 * np.linalg.norm(high - low)])
-        away = np.linalg.norm(eyes - to_world(middle, setup.offset), axis=1)
+        away = np.linalg.norm(eyes - to_world(middle, setup.mesh.offset), axis=1)
         reach = _FAR * (float(np.sort(away)[:CANDIDATES].max(initial=0.0)) + float(radius[0]))
         seeing = tuple(
             views[n]
             for n in np.flatnonzero(away <= reach).tolist()
-            if len(blocks_near(views[n], (middle[None], radius), setup.offset))
+            if len(blocks_near(views[n], (middle[None], radius), setup.mesh.offset))
         )
         ring = [key for key in _around(number, 1, ratio) if key in fine.cells and key not in tiles]
         near = {key for cell in _around(number, 1) for key in _around(cell, 0, ratio)}
@@ -215,7 +204,7 @@ def region_tasks(
             tiles={**tiles, **{key: fine.cells[key] for key in ring}},
             count=len(tiles),
             box=(*(corner - margin).tolist(), *(corner + coarse.side + margin).tolist()),
-            occluders=tuple(_between(hiding, low, high, seeing, setup.offset)),
+            occluders=tuple(_between(hiding, low, high, seeing, setup.mesh.offset)),
             views=seeing,
             light=replace(light, gains={n: g for n, g in light.gains.items() if n in names}),
         )
@@ -250,42 +239,23 @@ def paint_region(setup: TileSetup, task: RegionTask) -> None:
     kept = (tile < task.count) | near
     tile = np.where(tile < task.count, tile, -1)[kept].astype(np.int32)
     used, flat = np.unique(whole.triangles[kept], return_inverse=True)
-    vertices, triangles = whole.vertices[used], flat.reshape(-1, 3).astype(np.int32)
     beyond = [
         replace(whole, triangles=whole.triangles[~kept]),
         *(cell.mesh() for cell in task.occluders),
     ]
     folder = setup.scratch / f"region_{task.number[0]}_{task.number[1]}"
     folder.mkdir()
-    np.savez(
-        folder / "mesh.npz",
-        vertices=vertices,
-        triangles=triangles,
-        offset=setup.offset,
+    textured = make_texture(
+        setup.mesh,
+        folder,
+        whole.vertices[used],
+        flat.reshape(-1, 3).astype(np.int32),
+        task.views,
+        task.light,
+        SERIAL,
+        tile,
         occluder_vertices=np.concatenate([part.vertices for part in beyond]),
         occluder_triangles=_stack(beyond),
-    )
-    candidates = find_candidates(
-        folder / "mesh.npz", len(triangles), setup.workspace, task.views, setup.lift, SERIAL
-    )
-    label = choose_views(vertices, triangles, candidates)
-    charts = make_charts(vertices, triangles, label, tile)
-    page = np.empty(len(charts.views), np.int32)
-    page[charts.chart] = tile
-    textured = paint(
-        folder,
-        vertices,
-        triangles,
-        setup.offset,
-        charts,
-        task.views,
-        setup.workspace,
-        task.light,
-        colours_of_cloud(setup.cloud, vertices, setup.step),
-        plain_pixel=setup.pixel,
-        page_px=setup.page_px,
-        executor=SERIAL,
-        page=page,
     )
     for number, key in enumerate(list(task.tiles)[: task.count]):
         _write_tile(setup, 0, key, _of_page(textured, number))
@@ -340,13 +310,13 @@ def bake_tile(setup: TileSetup, task: BakeTask) -> None:
         task: the tile.
     """
     mesh = task.cell.mesh()
-    texel = setup.pixel * 2.0**task.level
+    texel = setup.mesh.pixel * 2.0**task.level
     label = choose_axes(mesh.vertices, mesh.triangles)
     charts = make_charts(mesh.vertices, mesh.triangles, label)
     wedges = make_wedges(mesh.triangles, charts)
-    pixels = wedge_pixels(mesh.vertices, wedges, charts, (), setup.offset, texel)
+    pixels = wedge_pixels(mesh.vertices, wedges, charts, (), setup.mesh.offset, texel)
     page = np.zeros(len(charts.views), np.int32)
-    atlas = make_pages(pixels, wedges, page, setup.page_px)
+    atlas = make_pages(pixels, wedges, page, len(page))
     (width, height), on_page = atlas.sizes[0], atlas.place(pixels, wedges.chart)
     middle = mesh.vertices.mean(axis=0)
     local = (mesh.vertices - middle)[wedges.vertex].astype(np.float32)
@@ -393,9 +363,7 @@ def _colours_next_to(
                 )
             )
             uv.append(data["uv"])
-        page = cv2.imread(str(skin.with_suffix(".jpg")))
-        if page is None:
-            raise FileNotFoundError(skin.with_suffix(".jpg"))
+        page = read_page(skin.with_suffix(".jpg"))
         pages.append(cv2.resize(page, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
     owner = np.repeat(np.arange(len(parts)), [len(part.triangles) for part in parts])
     scene = ray_scene(np.concatenate([part.vertices for part in parts]), _stack(parts))
@@ -429,7 +397,7 @@ def _write_tree(setup: TileSetup, levels: Sequence[CellLevel], frame: WorldFrame
         error = max((n[0]["geometricError"] for n in nodes), default=0.0)
         if level:
             distance = 0.0 if cell is None else cell.distance
-            error = max(error, distance, _TEXELS * setup.pixel * 2.0**level)
+            error = max(error, distance, _TEXELS * setup.mesh.pixel * 2.0**level)
         tile: dict[str, Any] = {"boundingVolume": _box(low, high), "geometricError": error}
         if cell is not None:
             tile["content"] = {"uri": f"{level}/{key[0]}_{key[1]}.glb"}
@@ -446,7 +414,7 @@ def _write_tree(setup: TileSetup, levels: Sequence[CellLevel], frame: WorldFrame
     (top,) = present[-1]
     root, low, high = node(len(levels) - 1, top)
     if frame.datum is not None and frame.name == "ned" and frame.scaled:
-        corners = to_world(np.vstack([np.eye(3), np.zeros((1, 3))]), setup.offset)
+        corners = to_world(np.vstack([np.eye(3), np.zeros((1, 3))]), setup.mesh.offset)
         ecef = frame.datum.ecef_from_ned(corners)
         axes = np.vstack([ecef[:3] - ecef[3], ecef[3:]])
         root["transform"] = np.column_stack([axes, [0.0, 0.0, 0.0, 1.0]]).ravel().tolist()

@@ -88,7 +88,7 @@ def mesh(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_dense(folder, [view.image for view in views])
     settings = SurveyConfig(reconstruct=ReconstructConfig(mesh_error_px=0.1))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("reconstruct.mesh.run._PAGE_PX", 1024)
+        patch.setattr("reconstruct.mesh.atlas.PAGE_PX", 1024)
         assert spec("mesh").make(folder, settings, SERIAL)
     assert not spec("mesh").make(folder, settings, SERIAL)
     return folder / "mesh"
@@ -153,10 +153,12 @@ def test_kernels_do_what_their_twins_do():
 def test_boxes_of_an_atlas_do_not_overlap():
     rng = np.random.default_rng(1)
     boxes = rng.integers(3, 60, (60, 2))
-    page, corner = pack(boxes, 128)
-    assert ((corner >= 0) & (corner + boxes <= 128)).all()
-    for number in range(page.max() + 1):
-        assert not boxes_overlap(corner[page == number], boxes[page == number])
+    for side, fit in ((300, 60), (128, 15)):
+        corner = pack(boxes, side)
+        placed = corner[:, 0] >= 0
+        assert placed.sum() >= fit
+        assert ((corner[placed] >= 0) & ((corner + boxes)[placed] <= side)).all()
+        assert not boxes_overlap(corner[placed], boxes[placed])
 
 
 def test_decimation_keeps_planes_outlines_and_locked_vertices():

@@ -113,7 +113,7 @@ def survey(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(surface, "_TILE_STEPS", (12, 12))
         patch.setattr("reconstruct.mesh.tiles._LEVELS_OF_A_FILE", 2)
-        patch.setattr("reconstruct.mesh.run._PAGE_PX", PAGE_PX)
+        patch.setattr("reconstruct.mesh.atlas.PAGE_PX", PAGE_PX)
         patch.setattr(surface, "_MAX_TRIANGLES", 1)
         settings = SurveyConfig(reconstruct=ReconstructConfig(mesh_error_px=0.1))
         assert spec("mesh").make(folder, settings, SERIAL)
