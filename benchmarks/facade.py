@@ -36,7 +36,7 @@ from benchmarks.harbour_mosaic import PATCH_PX, plane_points_ned, shift_px, wind
 from benchmarks.harbour_survey import command
 from benchmarks.machine import heading, machine
 from benchmarks.measured import measured
-from reconstruct.evaluate.surface import read_mesh
+from reconstruct.evaluate.scores import read_mesh
 from reconstruct.placing.alignment import Similarity, align_similarity
 from reconstruct.placing.track import read_track_poses
 from reconstruct.ply import read_header, read_ply_points

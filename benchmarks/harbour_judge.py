@@ -26,7 +26,7 @@ from benchmarks.harbour_survey import DISTANCE_M, Station, body_poses, harbour_r
 from benchmarks.harbour_truth import clearance, distances, moving_distance, normals
 from camera_calib.camera import Camera
 from reconstruct.elevation import elevation_in
-from reconstruct.evaluate.surface import read_mesh
+from reconstruct.evaluate.scores import read_mesh
 from reconstruct.pictures.undistorted import MOVING
 from reconstruct.placing.track import read_track_poses
 from reconstruct.ply import read_header, read_ply_points

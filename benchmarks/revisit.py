@@ -28,7 +28,7 @@ from missions.values.area import multipolygon
 from missions.values.plan_file import read_plan
 from reconstruct.elevation import elevation_in
 from reconstruct.evaluate.run import score_cameras
-from reconstruct.evaluate.surface import score_surface
+from reconstruct.evaluate.scores import score_surface
 from reconstruct.evaluate.truth import read_true_poses
 from reconstruct.pictures.importing import join_dives
 from reconstruct.placing.track import read_track_poses

@@ -34,7 +34,7 @@ from alice_survey.core.frames import Array
 from alice_survey.core.records import MeshRecord, SurfaceRecord
 from alice_survey.core.run import progress
 from reconstruct.copc import PointSpool, write_copc
-from reconstruct.evaluate.surface import read_mesh
+from reconstruct.evaluate.scores import read_mesh
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.raster import BLOCK, local_crs, opened_raster, small_cache, tiles_of_shape
 from reconstruct.stages import DENSE, MESH, MOSAIC, PLACING

@@ -272,15 +272,10 @@ def slope_deg(height: Float32, cell: float) -> Float32:
 
     Horn's (1981) third-order differences over the eight neighbours.
     """
-    rise = height.astype(np.float64)
-    padded = np.pad(rise, 1, constant_values=np.nan)
-    above, level, below = padded[:-2], padded[1:-1], padded[2:]
-    right = above[:, 2:] + 2 * level[:, 2:] + below[:, 2:]
-    left = above[:, :-2] + 2 * level[:, :-2] + below[:, :-2]
-    down = below[:, :-2] + 2 * below[:, 1:-1] + below[:, 2:]
-    up = above[:, :-2] + 2 * above[:, 1:-1] + above[:, 2:]
-    steep = np.rad2deg(np.arctan(np.hypot(right - left, down - up) / (8 * cell)))
-    slope: Float32 = np.where(np.isfinite(rise), steep, np.nan).astype(np.float32)
+    padded = np.pad(height.astype(np.float64), 1, constant_values=np.nan)
+    right, down = (cv2.Sobel(padded, cv2.CV_64F, *way)[1:-1, 1:-1] for way in ((1, 0), (0, 1)))
+    steep = np.rad2deg(np.arctan(np.hypot(right, down) / (8 * cell)))
+    slope: Float32 = np.where(np.isfinite(height), steep, np.nan).astype(np.float32)
     return slope
 
 

@@ -34,9 +34,9 @@ from reconstruct.dense.refine_depth import ComparedView, prepare, refine
 from reconstruct.dense.stereo_pairs import in_frame
 from reconstruct.dense.surface_tiles import ViewSummary
 from reconstruct.dense.view_store import ViewStore
-from reconstruct.light.parts import Parts
 from reconstruct.light.solve import (
     LightSamples,
+    Parts,
     as_rows,
     at_nodes,
     compare_light,
@@ -123,49 +123,29 @@ def find_match_sigma(
 
     Args:
         scale: of matching, a factor on the size of the views.
-        probes: some views with their partners, and points (N, 3) that bound their depth; what
-            partners find stays for `view_depth`.
+        probes: some views with their partners, and points (N, 3) that bound their depth.
         executor: where tasks run.
     """
-    match = partial(match_apart, scale)
+    match = partial(_match_apart, scale)
     return match_sigma(list(executor.map(match, probes, label="compare partners")))
 
 
-def match_apart(scale: float, matched: tuple[ViewTask, Array]) -> float:
-    """Match a view with its partners and keep what each finds; return the `spread` of that.
-
-    Args:
-        scale: of matching.
-        matched: the view with its partners, and points (N, 3) that bound its depth.
-    """
-    task, points_world = matched
-    depths = _pair_depths(scale, task, points_world)
-    shape = (0, *scaled_view(task.view, scale).pinhole.size_px[::-1])
-    task.store.save(task.index, "apart", np.array([d.depth for d in depths] or np.empty(shape)))
-    scales = np.array([d.focal_baseline for d in depths])
-    task.store.save(task.index, "apart.scales", scales)
-    return spread(depths)
+def _match_apart(scale: float, matched: tuple[ViewTask, Array]) -> float:
+    """The `spread` of what a view's partners find."""
+    return spread(_pair_depths(scale, *matched))
 
 
 def _pair_depths(scale: float, task: ViewTask, points_world: Array) -> list[PartnerDepth]:
     """Depth of a view, shrunk by a factor, from each partner with which it can be rectified."""
-    store = task.store
-    if store.has(task.index, "apart.scales"):
-        scales = store.load(task.index, "apart.scales").tolist()
-        kept = zip(store.load(task.index, "apart"), scales, strict=True)
-        return [PartnerDepth(depth=depth, focal_baseline=scale) for depth, scale in kept]
-    every = [
-        (number, view, scaled_view(view, scale))
-        for number, view in ((task.index, task.view), *task.others)
+    smalls, looks = [], []
+    for number, view in ((task.index, task.view), *task.others):
+        smalls.append(scaled_view(view, scale))
+        size_px = smalls[-1].pinhole.size_px
+        looks.append(_even_picture(task.store, number, view.pinhole.size_px, size_px))
+    found = [
+        pair_depth((smalls[0], small), (looks[0], look), points_world)
+        for small, look in zip(smalls[1:], looks[1:], strict=True)
     ]
-    looks = (
-        _even_picture(store, number, view.pinhole.size_px, small.pinhole.size_px)
-        for number, view, small in every
-    )
-    look, reference = next(looks), every[0][2]
-    partners = zip((small for *_, small in every[1:]), looks, strict=True)
-    found = [pair_depth((reference, small), (look, other), points_world)
-             for small, other in partners]  # fmt: skip
     return [depth for depth in found if depth is not None]
 
 
@@ -194,8 +174,6 @@ def view_depth(scale: float, match_sigma_px: float, matched: tuple[ViewTask, Arr
         sigma, agreeing = depth, np.zeros(shape, np.uint8)
     store.save_depth(task.index, "depth", depth, sigma)
     store.save(task.index, "agreeing", agreeing)
-    store.drop(task.index, "apart")
-    store.drop(task.index, "apart.scales")
 
 
 def _compared_view(store: ViewStore, scale: float, number: int, view: View) -> ComparedView:

@@ -21,10 +21,9 @@ from alice_survey.core.frames import Array, Datum
 from alice_survey.core.records import ReferenceRecord, RegistrationRecord
 from alice_survey.core.run import progress
 from alice_survey.kit.figure import colour_bar, figure_style, map_axes, new_figure, save_figure
-from reconstruct.evaluate.figures import WITHIN_PX, fit_doming, json_number, mean_grid
+from reconstruct.evaluate.figures import fit_doming, json_number, mean_grid, shares_within
 from reconstruct.evaluate.registration import (
     CloudDistances,
-    CloudFit,
     ReferenceSurface,
     covers,
     distances,
@@ -281,8 +280,9 @@ def evaluate_reference(
     surface = ReferenceSurface.of(theirs)
     start = first_placement(own, surface)
     fit = register_cloud(own, surface, start, free_scale=free_scale, rng=rng)
-    moved = fit.reference_from_cloud.apply(own)
-    pixel_m = mean_pixel(model) * fit.reference_from_cloud.scale
+    pose, middle = fit.reference_from_cloud, own.mean(axis=0)
+    moved, shift = pose.apply(own), pose.apply(middle[None])[0] - middle
+    pixel_m = mean_pixel(model) * pose.scale
     ours = distances(moved, surface, rng)
     back = distances(theirs, ReferenceSurface.of(moved), rng)
     figures = {
@@ -291,11 +291,18 @@ def evaluate_reference(
         "reference": str(reference),
         "reference_has_coordinate_system": placed,
         "ground_pixel_m": json_number(pixel_m, 6),
-        "registration": _registration(fit, own, free_scale=free_scale, source=source),
+        "registration": {
+            "transform": "similarity" if free_scale else "rigid",
+            "scale_source": source,
+            "scale": round(pose.scale, 7),
+            "scale_sigma": round(fit.scale_sigma, 7),
+            "shift_east_north_up_m": [round(float(v), 4) for v in shift],
+            "turn_deg": [round(float(v), 4) for v in np.rad2deg(pose.rotation.as_rotvec())],
+            "spread_m": round(fit.spread, 5),
+        },
         "survey_to_reference": ours.to_json(pixel_m),
         "reference_to_survey": back.to_json(pixel_m),
-        "completeness_within_px": _completeness(back, pixel_m, all_of_it=False),
-        "completeness_of_whole_reference_within_px": _completeness(back, pixel_m, all_of_it=True),
+        "completeness_within_px": shares_within(np.abs(back.signed_m), pixel_m, len(back.signed_m)),
         "doming": fit_doming(ours.points[:, :2], ours.signed_m).to_json(),
     }
     folder = out or workspace / "reference"
@@ -321,61 +328,39 @@ def first_placement(own: Array, surface: ReferenceSurface) -> Similarity:
     return Similarity(scale=1.0, rotation=Rotation.identity(), translation=shift)
 
 
-def _completeness(back: CloudDistances, pixel_m: float, *, all_of_it: bool) -> dict[str, float]:
-    """Share of the reference's points within some ground pixels of the survey's surface."""
-    share = back.covered_share if all_of_it else 1.0
-    return {
-        str(px): round(share * float(np.mean(np.abs(back.signed_m) < px * pixel_m)), 4)
-        for px in WITHIN_PX
-    }
-
-
-def _registration(fit: CloudFit, own: Array, *, free_scale: bool, source: str) -> dict[str, Any]:
-    pose, middle = fit.reference_from_cloud, own.mean(axis=0)
-    shift = pose.apply(middle[None])[0] - middle
-    return {
-        "transform": "similarity" if free_scale else "rigid",
-        "scale_source": source,
-        "scale": round(pose.scale, 7),
-        "scale_sigma": round(fit.scale_sigma, 7),
-        "shift_east_north_up_m": [round(float(v), 4) for v in shift],
-        "turn_deg": [round(float(v), 4) for v in np.rad2deg(pose.rotation.as_rotvec())],
-        "spread_m": round(fit.spread, 5),
-        "rounds": fit.rounds,
-    }
-
-
 def _text(figures: dict[str, Any], folder: Path) -> str:
-    ours, back = figures["survey_to_reference"], figures["reference_to_survey"]
-    fit = figures["registration"]
-    dome = figures["doming"]
-    bend = (
-        "" if dome["dome_mm"] is None else f"; dome {dome['dome_mm']:.1f} +/- {dome['sigma_mm']} mm"
-    )
+    fit, dome = figures["registration"], figures["doming"]
+    lines = [
+        f"{name}: median {one['median_m']:.4f} m ({one['median_px']:.2f} ground pixels), rms "
+        f"{one['rms_m']:.4f} m, 95 % below {one['95_m']:.4f} m; {one['covered_share']:.1%} covered"
+        for name, one in (
+            ("survey to reference", figures["survey_to_reference"]),
+            ("reference to survey", figures["reference_to_survey"]),
+        )
+    ]
     scale = f", scale {fit['scale']:.5f}" if fit["transform"] == "similarity" else ""
-    return "\n".join([
-        f"survey to reference: median {ours['median_m']:.4f} m ({ours['median_px']:.2f} ground "
-        f"pixels), rms {ours['rms_m']:.4f} m, 95 % below {ours['95_m']:.4f} m",
-        f"reference to survey: median {back['median_m']:.4f} m ({back['median_px']:.2f}), rms "
-        f"{back['rms_m']:.4f} m; {figures['completeness_within_px']['3']:.1%} within 3 pixels "
-        f"where the survey covers it ({back['covered_share']:.1%}){bend}",
+    lines.append(
         f"registered ({fit['transform']}{scale}) by {fit['shift_east_north_up_m']} m east, north, "
-        "up",
-        f"map in {folder / 'reference.png'}",
-    ])  # fmt: skip
+        f"up; {figures['completeness_within_px']['3']:.1%} of the reference within 3 pixels"
+    )
+    if dome["dome_mm"] is not None:
+        lines.append(f"dome {dome['dome_mm']:.1f} +/- {dome['sigma_mm']} mm")
+    return "\n".join([*lines, f"map in {folder / 'reference.png'}"])
 
 
 @figure_style()
 def plot_reference(path: Path, ours: CloudDistances, back: CloudDistances, pixel_m: float) -> None:
     """Map of the survey's signed distance from the reference, and both cumulative shares."""
     limit = max(float(np.percentile(np.abs(ours.signed_m), 95)), 1e-9)
-    values, extent = mean_map(ours.points[:, :2], ours.signed_m, _CELLS)
+    places = ours.points[:, :2]
+    side = max(float(np.ptp(places, axis=0).max()) / _CELLS, 1e-12)
+    values, west, north = mean_grid(places, ours.signed_m, side)
+    extent = (west, west + values.shape[1] * side, north - values.shape[0] * side, north)
     figure = new_figure(5.6, 13)
     plane, curve = figure.subplots(1, 2, width_ratios=[1.3, 1])
     plane.set_facecolor("0.85")
-    image = plane.imshow(
-        values, extent=extent, vmin=-limit, vmax=limit, cmap="RdBu_r", interpolation="nearest"
-    )
+    colours: dict[str, Any] = {"vmin": -limit, "vmax": limit, "cmap": "RdBu_r"}
+    image = plane.imshow(values, extent=extent, interpolation="nearest", **colours)
     plane.grid(visible=False)
     plane.set_title("Survey minus reference")
     colour_bar(image, plane, "survey above reference (m)")
@@ -383,21 +368,7 @@ def plot_reference(path: Path, ours: CloudDistances, back: CloudDistances, pixel
     for one, name in ((ours, "survey to reference"), (back, "reference to survey")):
         away = np.sort(np.abs(one.signed_m))[:: max(1, len(one.signed_m) // 2000)]
         curve.plot(away / pixel_m, np.linspace(0, 1, len(away)), label=name)
-    curve.axvline(2, color="0.6", linestyle=":", label="2 ground pixels")
     curve.set(xlim=(0, max(6.0, 2 * limit / pixel_m)), ylim=(0, 1))
     curve.set(xlabel="distance (ground pixels)", ylabel="share of points below")
-    curve.set_title(
-        f"median {np.median(np.abs(ours.signed_m)):.3g} m, ground pixel {pixel_m:.3g} m"
-    )
     curve.legend(loc="lower right")
     save_figure(figure, path)
-
-
-def mean_map(
-    places_en: Array, values: Array, cells: int
-) -> tuple[Array, tuple[float, float, float, float]]:
-    """Means of values at (N, 2) places on a grid, rows from north; and its extent for a plot."""
-    side = max(float(np.ptp(places_en, axis=0).max()) / cells, 1e-12)
-    mean, west, north = mean_grid(places_en, values, side)
-    rows, columns = mean.shape
-    return mean, (west, west + columns * side, north - rows * side, north)

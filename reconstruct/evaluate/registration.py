@@ -335,7 +335,6 @@ class CloudFit:
     """0 where the scale was held."""
     spread: float
     """Robust standard deviation of the distances from the reference's planes."""
-    rounds: int
 
 
 def register_cloud(
@@ -369,7 +368,7 @@ def _adjust_cloud(
     pose, spacing = start, reference.spacing
     unknowns = 7 if free_scale else 6
     low, high = reference.points.min(axis=0), reference.points.max(axis=0)
-    for done in range(1, _CLOUD_ROUNDS + 1):  # noqa: B007 - used in the result
+    for _ in range(_CLOUD_ROUNDS):
         moved = pose.apply(cloud)
         middles, normals, nearest = reference.planes_at(moved)
         inside = np.all((moved[:, :2] >= low[:2]) & (moved[:, :2] <= high[:2]), axis=1)
@@ -394,23 +393,18 @@ def _adjust_cloud(
         system = slopes.T @ (weight[:, None] * slopes)
         system += 1e-9 * np.trace(system) * np.eye(unknowns)
         move = -np.linalg.solve(system, slopes.T @ (weight * miss))
-        pose = _moved_cloud(pose, centre, move, rim)
+        turn = Rotation.from_rotvec(move[:3] / rim)
+        stretch = 1.0 + (float(move[6]) / rim if free_scale else 0.0)
+        pose = Similarity(
+            scale=stretch * pose.scale,
+            rotation=turn * pose.rotation,
+            translation=centre + move[3:6] + stretch * turn.apply(pose.translation - centre),
+        )
         if np.abs(move).max() < _CLOUD_STILL * spacing:
             break
     variance = spread**2 * np.linalg.inv(system)
     scale_sigma = pose.scale * float(np.sqrt(variance[6, 6])) / rim if free_scale else 0.0
-    return CloudFit(reference_from_cloud=pose, scale_sigma=scale_sigma, spread=spread, rounds=done)
-
-
-def _moved_cloud(pose: Similarity, centre: Array, move: Array, rim: float) -> Similarity:
-    """A pose followed by a small turn, shift and stretch about a centre."""
-    turn = Rotation.from_rotvec(move[:3] / rim)
-    stretch = 1.0 + (float(move[6]) / rim if len(move) == 7 else 0.0)
-    return Similarity(
-        scale=stretch * pose.scale,
-        rotation=turn * pose.rotation,
-        translation=centre + move[3:6] + stretch * turn.apply(pose.translation - centre),
-    )
+    return CloudFit(reference_from_cloud=pose, scale_sigma=scale_sigma, spread=spread)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -37,8 +37,13 @@ from camera_calib.rig import read_rig
 from missions.values.plan_file import read_plan
 from reconstruct.elevation import elevation_in
 from reconstruct.evaluate.figures import compare_lengths, rms
-from reconstruct.evaluate.mosaic import score_mosaic
-from reconstruct.evaluate.surface import SurfaceScore, read_mesh, score_mesh, score_surface
+from reconstruct.evaluate.scores import (
+    SurfaceScore,
+    read_mesh,
+    score_mesh,
+    score_mosaic,
+    score_surface,
+)
 from reconstruct.evaluate.truth import (
     ground_pixel_m,
     overlaps_reached,

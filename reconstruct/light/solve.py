@@ -14,26 +14,29 @@ In the normal equations a sample touches the four nodes around each of its two p
 and the range, so that its share is a few numbers. Pictures, of which there may be thousands, are
 eliminated first (their block is sparse: a picture meets its neighbours alone), which leaves a small
 dense system for the patterns and the fall-off: the Schur complement, as in bundle adjustment.
+
+Samples that are too large for memory are worked on part by part.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import repeat
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_array
+from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
 
 from alice_survey.core.artefacts import read_json, write_json
 from alice_survey.core.compiled import compiled
 from alice_survey.core.contents import taken_from
+from alice_survey.core.executor import SERIAL, Executor
 from alice_survey.core.frames import Array
 from alice_survey.core.run import progress
-from reconstruct.light.parts import Parts
 
 GRID = (9, 11)
 """Rows and columns of nodes over a picture, first and last on its edges."""
@@ -63,8 +66,57 @@ _WHITE_LEVEL, _GREY_LEVEL = 215.0, 128.0
 _WHITE_SAMPLES = 1_000_000
 """Of a survey, that white is found from."""
 _NORM = 6.0
-_DENSE_PICTURES = 400
-"""More are solved for with sparse matrices."""
+
+
+Item = TypeVar("Item")
+Loaded = TypeVar("Loaded")
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Parts(Generic[Item, Loaded]):
+    """Parts that are loaded where they are worked on; a single one is loaded once, and here."""
+
+    items: Sequence[Item]
+    """From which parts are loaded, such as the paths of files; at least one."""
+    load: Callable[[Item], Loaded]
+    """A task."""
+    label: str
+    """What is done, for the progress bar."""
+    executor: Executor = SERIAL
+    _kept: list[Loaded] = field(default_factory=list, init=False)
+
+    @property
+    def is_one(self) -> bool:
+        """Whether they are one part."""
+        return len(self.items) == 1
+
+    def map(
+        self, function: Callable[[Loaded, Any], Result], values: Iterable[Any] | None = None
+    ) -> Iterator[Result]:
+        """Yield `function(part, value)` of every part, in order.
+
+        Args:
+            function: a task of a part and its value.
+            values: one for each part; None where tasks need none.
+        """
+        values = repeat(None, len(self.items)) if values is None else values
+        if self.is_one:
+            if not self._kept:
+                self._kept.append(self.load(self.items[0]))
+            return (function(self._kept[0], value) for value in values)
+        tasks = zip(self.items, values, strict=True)
+        run = partial(_run, self.load, function)
+        return self.executor.map(run, tasks, label=self.label, total=len(self.items))
+
+
+def _run(
+    load: Callable[[Item], Loaded],
+    function: Callable[[Loaded, Any], Result],
+    task: tuple[Item, Any],
+) -> Result:
+    item, value = task
+    return function(load(item), value)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -81,6 +133,15 @@ class LightSamples:
     """(N, 2) distances at which the views see the spots; None where they do not count."""
     unsure: Array | None = None
     """(N, 3) factors of their errors over the usual; None for 1."""
+
+    def part(self, chosen: Any) -> "LightSamples":
+        """The chosen rows."""
+        known = {name: values for name, values in vars(self).items() if values is not None}
+        return LightSamples(**{name: values[chosen] for name, values in known.items()})
+
+    def thin(self, maximum: int) -> "LightSamples":
+        """Every so many-th row, as many as a number or fewer."""
+        return self.part(slice(None, None, max(1, -(-len(self.views) // maximum))))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -494,7 +555,7 @@ def _white(
 ) -> Array:
     """Factors that make what is bright neutral, and the survey light without burning out."""
     kept = joined_samples(
-        list(parts.map(_thin, [_WHITE_SAMPLES // len(parts.items)] * len(parts.items)))
+        list(parts.map(LightSamples.thin, [_WHITE_SAMPLES // len(parts.items)] * len(parts.items)))
     )
     if not len(kept.views):
         return np.ones(3)
@@ -505,14 +566,6 @@ def _white(
     level = np.exp(kept.levels[:, 0]) * lift
     neutral = neutral_factors(level)
     return neutral * brightening(level * neutral, _WHITE_LEVEL, _GREY_LEVEL)
-
-
-def _thin(samples: LightSamples, maximum: int) -> LightSamples:
-    """Every so many-th of samples without ranges, as many as a number or fewer."""
-    chosen = slice(None, None, max(1, -(-len(samples.views) // maximum)))
-    return LightSamples(
-        views=samples.views[chosen], places=samples.places[chosen], levels=samples.levels[chosen]
-    )
 
 
 def neutral_factors(level: Array) -> Array:
@@ -627,7 +680,7 @@ class _LightSums:
 
     def solve(self, channel: int, prior: LightPrior) -> tuple[Array, Array, float]:
         """Nodes and fall-off (P + 1,), gains (V,), and the variance of the fall-off."""
-        mixed, pictures = self.mixed[channel], self.own.shape[1]
+        mixed = self.mixed[channel]
         dense = self.dense[channel] + np.triu(self.dense[channel], 1).T + prior.patterns
         right = self.right[channel] + prior.right
         block = _gains_block(
@@ -635,11 +688,8 @@ class _LightSums:
             np.concatenate([shared[channel] for shared in self.shared]),
         )  # fmt: skip
         sides = np.column_stack([mixed.T, self.right_gains[channel] + prior.gain_right])
-        if pictures <= _DENSE_PICTURES:
-            solved = solve_symmetric(block.toarray(), sides)
-        else:
-            solved = splu(block).solve(sides)
-        taken = _product(mixed, np.ascontiguousarray(solved))
+        solved = splu(block).solve(sides)
+        taken = csr_array(mixed) @ solved
         last = np.zeros(len(right))
         last[-1] = 1.0
         both = solve_symmetric(dense - taken[:, :-1], np.column_stack([right - taken[:, -1], last]))
@@ -667,21 +717,8 @@ def _sums_of_part(e: LightEquations, solution: tuple[Array, Array]) -> _LightSum
     )  # fmt: skip
 
 
-# numpy's products and solvers start threads that wait for each other: on a busy machine these small
-# systems then take a hundred times as long, and their last digits depend on the number of threads
-
-
-@compiled
-def _product(a: Array, b: Array) -> Array:
-    """The product of a matrix with many zeros (P, V) and another (V, Q)."""
-    found = np.zeros((a.shape[0], b.shape[1]))
-    for i in range(a.shape[0]):
-        for k in range(a.shape[1]):
-            value = a[i, k]
-            if value != 0.0:
-                for j in range(b.shape[1]):
-                    found[i, j] += value * b[k, j]
-    return found
+# numpy's solvers start threads that wait for each other: on a busy machine these small systems then
+# take a hundred times as long, and their last digits depend on the number of threads
 
 
 @compiled

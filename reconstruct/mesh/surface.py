@@ -279,7 +279,6 @@ def splat(
     return moment
 
 
-@compiled
 def zero_mesh(
     values: Array, first: tuple[int, int, int]
 ) -> tuple[Array, NDArray[np.int32], NDArray[np.int32]]:
@@ -297,118 +296,79 @@ def zero_mesh(
         their cells in the block, (V, 3); and
         quadrilaterals, (Q, 4), counter-clockwise seen from where the function is positive.
     """
-    nx, ny, nz = values.shape
-    number = np.full((max(nx - 1, 0), max(ny - 1, 0), max(nz - 1, 0)), -1, np.int32)
-    count = 0
-    for x in range(nx - 1):
-        for y in range(ny - 1):
-            for z in range(nz - 1):
-                below = 0
-                known = True
-                for corner in range(8):
-                    v = values[x + (corner & 1), y + ((corner >> 1) & 1), z + (corner >> 2)]
-                    if math.isnan(v):
-                        known = False
-                        break
-                    if v < 0.0:
-                        below += 1
-                if known and 0 < below < 8:
-                    number[x, y, z] = count
-                    count += 1
-    vertices = np.empty((count, 3))
-    cells = np.empty((count, 3), np.int32)
-    for x in range(nx - 1):
-        for y in range(ny - 1):
-            for z in range(nz - 1):
-                if number[x, y, z] >= 0:
-                    n = number[x, y, z]
-                    cells[n, 0], cells[n, 1], cells[n, 2] = x, y, z
-                    _place(values[x : x + 2, y : y + 2, z : z + 2], vertices[n])
-                    vertices[n, 0] += x + first[0]
-                    vertices[n, 1] += y + first[1]
-                    vertices[n, 2] += z + first[2]
-    quads = np.empty((3 * count, 4), np.int32)
-    made = 0
-    around = np.empty(4, np.int32)
-    step = np.zeros(3, np.int64)
-    for n in range(count):
-        x, y, z = cells[n, 0], cells[n, 1], cells[n, 2]
-        if x == 0 or y == 0 or z == 0:
-            continue
-        for axis in range(3):
-            # the lattice edge from this cell's first node along the axis
-            step[:] = 0
-            step[axis] = 1
-            b, c = (axis + 1) % 3, (axis + 2) % 3
-            start, end = values[x, y, z], values[x + step[0], y + step[1], z + step[2]]
-            if (start < 0.0) == (end < 0.0):
-                continue
-            for k in range(4):
-                i = cells[n].copy()
-                if k == 1 or k == 2:
-                    i[b] -= 1
-                if k >= 2:
-                    i[c] -= 1
-                around[k] = number[i[0], i[1], i[2]]
-            if around.min() < 0:
-                continue
-            for k in range(4):
-                quads[made, k] = around[k] if start < 0.0 else around[3 - k]
-            made += 1
-    return vertices, cells, quads[:made].copy()
+    shape = [size - 1 for size in values.shape]
+    below, crossed = np.zeros(shape, np.uint8), np.ones(shape, np.bool_)
+    for corner in np.ndindex(2, 2, 2):
+        part = values[tuple(slice(k, k + size) for k, size in zip(corner, shape, strict=True))]
+        below += part < 0.0
+        crossed &= ~np.isnan(part)
+    crossed &= (below > 0) & (below < 8)
+    cells = np.argwhere(crossed).astype(np.int32)
+    number = np.full(shape, -1, np.int32)
+    number[crossed] = np.arange(len(cells))
+    quads, sound = np.empty((len(cells), 3, 4), np.int32), np.empty((len(cells), 3), np.bool_)
+    for axis in range(3):  # the lattice edge from a cell's first node along the axis
+        ahead = cells + np.eye(3, dtype=np.int32)[axis]
+        starts, ends = values[tuple(cells.T)] < 0.0, values[tuple(ahead.T)] < 0.0
+        back = np.zeros((4, 3), np.int32)
+        back[[1, 2], (axis + 1) % 3] = back[[2, 3], (axis + 2) % 3] = 1
+        around = number[tuple(np.moveaxis(cells[:, None] - back, 2, 0))]
+        quads[:, axis] = np.where(starts[:, None], around, around[:, ::-1])
+        sound[:, axis] = cells.all(axis=1) & (starts != ends) & (around >= 0).all(axis=1)
+    return _place_vertices(values, cells) + (cells + np.array(first)), cells, quads[sound]
 
 
 @compiled
-def _place(corner: Array, out: Array) -> None:
-    """The vertex of one cell: the mean crossing of its edges, moved onto the zero within the cell.
+def _place_vertices(values: Array, cells: NDArray[np.int32]) -> Array:
+    """The vertex of each cell: the mean crossing of its edges, moved onto the zero within the cell.
 
     Args:
-        corner: (2, 2, 2) values.
-        out: (3,) filled, 0 to 1 in the cell.
+        values: (X, Y, Z) at the nodes.
+        cells: (V, 3) that the zero crosses.
+
+    Returns:
+        (V, 3) places in the cells, 0 to 1.
     """
-    out[:] = 0.0
-    crossings = 0
-    for axis in range(3):
-        for k in range(4):
-            i, j = k & 1, k >> 1
-            if axis == 0:
-                a, b = corner[0, i, j], corner[1, i, j]
-            elif axis == 1:
-                a, b = corner[j, 0, i], corner[j, 1, i]
-            else:
-                a, b = corner[i, j, 0], corner[i, j, 1]
-            if (a < 0.0) == (b < 0.0):
-                continue
-            t = a / (a - b)
-            crossings += 1
-            out[axis] += t
-            if axis == 0:
-                out[1] += i
-                out[2] += j
-            elif axis == 1:
-                out[2] += i
-                out[0] += j
-            else:
-                out[0] += i
-                out[1] += j
-    for axis in range(3):
-        out[axis] /= crossings
-    for _ in range(_NEWTON_STEPS):
-        u, v, w = out[0], out[1], out[2]
-        f, gx, gy, gz = 0.0, 0.0, 0.0, 0.0
-        for i in range(2):
-            p, dp = (u, 1.0) if i else (1.0 - u, -1.0)
-            for j in range(2):
-                q, dq = (v, 1.0) if j else (1.0 - v, -1.0)
-                for k in range(2):
-                    r, dr = (w, 1.0) if k else (1.0 - w, -1.0)
-                    f += corner[i, j, k] * p * q * r
-                    gx += corner[i, j, k] * dp * q * r
-                    gy += corner[i, j, k] * p * dq * r
-                    gz += corner[i, j, k] * p * q * dr
-        square = gx * gx + gy * gy + gz * gz
-        if square < 1e-6:
-            return
-        out[0] = min(max(u - f * gx / square, 0.0), 1.0)
-        out[1] = min(max(v - f * gy / square, 0.0), 1.0)
-        out[2] = min(max(w - f * gz / square, 0.0), 1.0)
+    vertices = np.zeros((len(cells), 3))
+    for n in range(len(cells)):
+        x, y, z = cells[n, 0], cells[n, 1], cells[n, 2]
+        corner, out = values[x : x + 2, y : y + 2, z : z + 2], vertices[n]
+        crossings = 0
+        for axis in range(3):
+            b, c = (axis + 1) % 3, (axis + 2) % 3
+            for k in range(4):
+                i, j = k & 1, k >> 1
+                if axis == 0:
+                    start, end = corner[0, i, j], corner[1, i, j]
+                elif axis == 1:
+                    start, end = corner[j, 0, i], corner[j, 1, i]
+                else:
+                    start, end = corner[i, j, 0], corner[i, j, 1]
+                if (start < 0.0) == (end < 0.0):
+                    continue
+                crossings += 1
+                out[axis] += start / (start - end)
+                out[b] += i
+                out[c] += j
+        for axis in range(3):
+            out[axis] /= crossings
+        for _ in range(_NEWTON_STEPS):
+            u, v, w = out[0], out[1], out[2]
+            f, gx, gy, gz = 0.0, 0.0, 0.0, 0.0
+            for i in range(2):
+                p, dp = (u, 1.0) if i else (1.0 - u, -1.0)
+                for j in range(2):
+                    q, dq = (v, 1.0) if j else (1.0 - v, -1.0)
+                    for k in range(2):
+                        r, dr = (w, 1.0) if k else (1.0 - w, -1.0)
+                        f += corner[i, j, k] * p * q * r
+                        gx += corner[i, j, k] * dp * q * r
+                        gy += corner[i, j, k] * p * dq * r
+                        gz += corner[i, j, k] * p * q * dr
+            square = gx * gx + gy * gy + gz * gz
+            if square < 1e-6:
+                break
+            out[0] = min(max(u - f * gx / square, 0.0), 1.0)
+            out[1] = min(max(v - f * gy / square, 0.0), 1.0)
+            out[2] = min(max(w - f * gz / square, 0.0), 1.0)
+    return vertices

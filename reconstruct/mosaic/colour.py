@@ -324,10 +324,7 @@ def solve_colour(
         return replace(model, light=light, notes=(*notes, note))
     white, note = _white(cleaned, model, facts)
     notes.append(note)
-    notes.append(
-        "brightness: one factor puts the survey's median at most at 22 % and 98 % of it below "
-        "68 % of white; sRGB"
-    )
+    notes.append("brightness: one factor for the whole survey; sRGB")
     model = replace(model, light=replace(model.light, white=white))
     cleared = model.water is not None and model.water.share.any()
     black = np.zeros(3) if cleared else _black(model, facts)
@@ -335,38 +332,24 @@ def solve_colour(
         grow = _brighter(cleaned, model, facts, black)
         light = replace(model.light, white=white * grow)
         model = replace(model, light=light, black=black * grow)
-        notes.append(
-            f"contrast: light below {100 * _BLACK_SHARE:.0f} % of what the survey's darkest pixels "
-            "show is black; one straight line from there to white"
-        )
+        notes.append("contrast: part of what the survey's darkest pixels show is black")
     return replace(model, notes=tuple(notes))
 
 
 def _water(samples: LightSamples, facts: Sequence[PictureMeasures]) -> tuple[WaterLight, str]:
     """What the water adds and takes, and a note."""
     dark = darkest(facts)
-    few = dark is None
+    unknown = dark is None
     if dark is None:
         dark = {fact.camera: np.zeros((*GRID, 3)) for fact in facts}
-    thin = _part(samples, slice(None, None, max(1, -(-len(samples.views) // _MAX_SAMPLES))))
-    water = solve_water(thin, dark, [fact.camera for fact in facts])
-    if few:
-        note = (
-            f"colours: fewer than {_MIN_PICTURES} pictures of a camera show each place of it; "
-            "no light of the water taken away"
-        )
-    elif not water.share.any():
-        words = ", ".join(f"{s:.2f}" for s in water.share_sigma)
-        note = (
-            f"colours: overlaps do not determine the water's light (sigma of its share {words} for "
-            "blue, green, red); none taken away"
-        )
-    else:
-        note = (
-            "colours: light that the water adds taken away, as overlaps determine it: a share of "
-            "what the darkest pixels at each place of the pictures show, which grows with range"
-        )
-    return water, note
+    cameras = [fact.camera for fact in facts]
+    water = solve_water(samples.thin(_MAX_SAMPLES), dark, cameras)
+    if water.share.any():
+        return water, "colours: light that the water adds taken away, as overlaps determine it"
+    sigmas = ", ".join(f"{s:.2f}" for s in water.share_sigma)
+    few = f"fewer than {_MIN_PICTURES} pictures of a camera show each place of it"
+    why = few if unknown else f"overlaps do not determine it (sigma of its share {sigmas}, BGR)"
+    return water, f"colours: no light of the water taken away: {why}"
 
 
 def _patterns(
@@ -474,17 +457,7 @@ def _without_water(
     loss = np.diff(model.weakening(np.asarray(samples.ranges)[kept]), axis=1)[:, 0]
     unsure = np.hypot((light[kept] / left[kept]).mean(axis=1), loss)
     levels = np.log(left[kept]).astype(np.float32)
-    return replace(_part(samples, kept), levels=levels), unsure
-
-
-def _part(samples: LightSamples, chosen: Any) -> LightSamples:
-    """The chosen rows of samples."""
-    return LightSamples(
-        views=samples.views[chosen],
-        places=samples.places[chosen],
-        levels=samples.levels[chosen],
-        ranges=None if samples.ranges is None else samples.ranges[chosen],
-    )
+    return replace(samples.part(kept), levels=levels), unsure
 
 
 def sample_maps(
@@ -574,8 +547,5 @@ def _white(
         grey = np.log(neutral / neutral[GREEN])
         neutral = np.exp((weight * taken + own * grey) / (weight + own))
         neutral = neutral / neutral.mean()
-        note = (
-            "colours: white is the weighted mean of two guesses: the water took from a white lamp "
-            "over the middle range what overlaps show, and what is bright in the survey is grey"
-        )
+        note = "colours: white is between a white lamp through this water and a grey sea floor"
     return neutral * brightening(level * neutral, _BRIGHT_LIGHT, _MIDDLE_LIGHT), note

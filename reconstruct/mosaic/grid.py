@@ -1,7 +1,8 @@
 """Pixels of the mosaic, its tiles, the views that reach each, and the surface below them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,7 +12,7 @@ from rasterio.windows import Window
 
 from alice_survey.core.errors import ReconstructionError
 from alice_survey.core.frames import Array
-from reconstruct.raster import DemGrid, tiles_of
+from reconstruct.raster import DemGrid, grid_of, read_cells, tiles_of
 from reconstruct.views.model import SparseModel, View, enu_from_cam, points_of_views
 
 Float32 = NDArray[np.float32]
@@ -50,17 +51,10 @@ class Block:
     """How far off, on the ground, the DEM may hide something in the window."""
 
 
-def mosaic_grid(raster: rasterio.DatasetReader, pixel: float) -> DemGrid:
-    """Pixels over the whole of the DEM."""
-    transform = raster.transform
-    width, height = raster.width * transform.a, -raster.height * transform.e
-    return DemGrid(
-        west=transform.c,
-        north=transform.f,
-        cell=pixel,
-        rows=int(np.ceil(height / pixel)),
-        columns=int(np.ceil(width / pixel)),
-    )
+def mosaic_grid(dem: DemGrid, pixel: float) -> DemGrid:
+    """Pixels over the whole of a DEM."""
+    rows, columns = (int(np.ceil(size * dem.cell / pixel)) for size in (dem.rows, dem.columns))
+    return replace(dem, cell=pixel, rows=rows, columns=columns)
 
 
 def footprints(views: tuple[View, ...], heights: tuple[float, float]) -> Footprints:
@@ -158,13 +152,8 @@ def in_passes(blocks: Sequence[Block]) -> list[list[tuple[Block, tuple[Window, .
 
 def coarse(grid: DemGrid, side_px: int = CELL_PX) -> DemGrid:
     """Cells of a number of pixels a side that cover a grid of pixels."""
-    return DemGrid(
-        west=grid.west,
-        north=grid.north,
-        cell=grid.cell * side_px,
-        rows=-(-grid.rows // side_px),
-        columns=-(-grid.columns // side_px),
-    )
+    rows, columns = -(-grid.rows // side_px), -(-grid.columns // side_px)
+    return replace(grid, cell=grid.cell * side_px, rows=rows, columns=columns)
 
 
 def _align(pixels: int) -> int:
@@ -197,27 +186,17 @@ def height_range(raster: rasterio.DatasetReader) -> tuple[float, float]:
     return low, high
 
 
-def dem_around(
-    raster: rasterio.DatasetReader, grid: DemGrid, reach: float
-) -> tuple[Float32, DemGrid]:
+def dem_around(dem: Path, grid: DemGrid, reach: float) -> tuple[Float32, DemGrid]:
     """The DEM of a grid and as far around it as something may hide it."""
-    transform = raster.transform
-    cell = transform.a
-    margin = int(np.ceil(reach / cell)) + 2
-    left = max(0, int((grid.west - transform.c) / cell) - margin)
-    top = max(0, int((transform.f - grid.north) / cell) - margin)
-    right = int(np.ceil((grid.west + grid.columns * grid.cell - transform.c) / cell)) + margin
-    bottom = int(np.ceil((transform.f - grid.north + grid.rows * grid.cell) / cell)) + margin
-    right, bottom = min(raster.width, right), min(raster.height, bottom)
-    heights = raster.read(1, window=Window(left, top, right - left, bottom - top))
-    around = DemGrid(
-        west=transform.c + left * cell,
-        north=transform.f - top * cell,
-        cell=cell,
-        rows=bottom - top,
-        columns=right - left,
-    )
-    return heights, around
+    whole = grid_of(dem)
+    margin = int(np.ceil(reach / whole.cell)) + 2
+    left = max(0, int((grid.west - whole.west) / whole.cell) - margin)
+    top = max(0, int((whole.north - grid.north) / whole.cell) - margin)
+    right = int(np.ceil((grid.east_of(grid.columns) - whole.west) / whole.cell)) + margin
+    bottom = int(np.ceil((whole.north - grid.north_of(grid.rows)) / whole.cell)) + margin
+    size = min(whole.rows, bottom) - top, min(whole.columns, right) - left
+    heights = read_cells(dem, top, left, *size).astype(np.float32)
+    return heights, whole.window(top, left, *size)
 
 
 def height_at_pixels(dem: Float32, around: DemGrid, grid: DemGrid) -> Float32:

@@ -21,9 +21,8 @@ from alice_survey.core.run.resources import release_memory
 from reconstruct.light.solve import LightSamples, at_places, joined_samples
 from reconstruct.mosaic.colour import ColourModel, curve_by_root, finish_colours
 from reconstruct.mosaic.grid import ALIGNED_PX, CELL_PX, Block, coarse, dem_around
-from reconstruct.mosaic.ortho import lanczos_weights, sample_lanczos
 from reconstruct.mosaic.picture_measures import DARKEST, linear_table, read_small, well_exposed
-from reconstruct.mosaic.seams import Blend, ViewPart, candidates, choose_views
+from reconstruct.mosaic.seams import Blend, candidates, choose_views
 from reconstruct.mosaic.visibility import (
     CameraOptics,
     GridHeights,
@@ -32,10 +31,12 @@ from reconstruct.mosaic.visibility import (
     Water,
     camera_optics,
     channel_optics,
+    lanczos_weights,
+    sample_lanczos,
     see,
 )
 from reconstruct.pictures.undistorted import Pictures
-from reconstruct.raster import opened_raster, small_cache
+from reconstruct.raster import small_cache
 from reconstruct.views.model import View
 
 _CACHED_BYTES = 100_000_000
@@ -68,10 +69,12 @@ class Tools:
     def __init__(self, survey: MosaicSetup) -> None:
         self._pictures = Pictures.still(survey.workspace)
         self.small = lru_cache(maxsize=_SMALL_COPIES)(partial(read_small, survey.scratch))
+        self.usable = self._pictures.usable
+        """Mask of a picture as taken."""
         self.table = linear_table()
         self.weights = lanczos_weights()
         self.curve = curve_by_root()
-        self._water, self._scaled = survey.water, survey.scaled
+        self._survey = survey
         self._optics: dict[str, CameraOptics] = {}
         self._channels: dict[str, tuple[CameraOptics, ...]] = {}
         self._kept: dict[str, NDArray[np.uint8]] = {}
@@ -79,21 +82,18 @@ class Tools:
     def optics(self, view: View) -> CameraOptics:
         """Optics of a view's camera (its green channel)."""
         if view.camera not in self._optics:
-            self._optics[view.camera] = camera_optics(self._pictures.warp(view.image), self._scaled)
+            warp = self._pictures.warp(view.image)
+            self._optics[view.camera] = camera_optics(warp, self._survey.scaled)
         return self._optics[view.camera]
 
     def channels(self, view: View) -> tuple[CameraOptics, ...] | None:
         """Optics of a view's channels, BGR; None where they share one."""
-        warp = self._pictures.warp(view.image)
-        if self._water is None or warp.camera.n_water == 1:
+        warp, water = self._pictures.warp(view.image), self._survey.water
+        if water is None or warp.camera.n_water == 1:
             return None
         if view.camera not in self._channels:
-            self._channels[view.camera] = channel_optics(warp, self._water, self._scaled)
+            self._channels[view.camera] = channel_optics(warp, water, self._survey.scaled)
         return self._channels[view.camera]
-
-    def usable(self, image: str) -> NDArray[np.bool_] | None:
-        """Mask of a picture as taken."""
-        return self._pictures.usable(image)
 
     def picture(self, image: str) -> NDArray[np.uint8]:
         """A picture as taken; the last few stay in memory."""
@@ -147,12 +147,18 @@ class _ViewOfCells:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PaintTask:
-    """A block to lay seams in, or to paint."""
+class BlockTask:
+    """A block on which to compare what views show."""
 
     survey: MosaicSetup
     block: Block
     views: tuple[SeenView, ...]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PaintTask(BlockTask):
+    """A block to lay seams in, or to paint."""
+
     colour: ColourModel
     even: bool
     """Broad tones are made to meet."""
@@ -186,48 +192,23 @@ class Painted:
     """(H, W) number of the view plus one; 0 where nothing is known."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class LightTask:
-    """A block on which to compare what views show."""
-
-    survey: MosaicSetup
-    block: Block
-    views: tuple[SeenView, ...]
-    step_px: int
-    """Distance of spots."""
-    maximum: int
-    """Samples to return at most."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Shown:
-    """Spots of a lattice that a view shows; arrays of N rows."""
-
-    number: int
-    lattice: NDArray[np.intp]
-    places: Float32
-    levels: Float32
-    ranges: Float32
-
-    def part(self, kept: NDArray[np.bool_]) -> "_Shown":
-        """Those of the spots that are kept."""
-        return _Shown(
-            number=self.number,
-            lattice=self.lattice[kept],
-            places=self.places[kept],
-            levels=self.levels[kept],
-            ranges=self.ranges[kept],
-        )
+_SHOWN = np.dtype([("lattice", "i8"), ("places", "f4", 2), ("levels", "f4", 3), ("ranges", "f4")])
+"""A spot of a lattice that a view shows."""
 
 
 @small_cache()
-def compare_block(task: LightTask) -> LightSamples:
+def compare_block(step_px: int, maximum: int, task: BlockTask) -> LightSamples:
     """What views show of the same spots of a lattice, in linear light.
 
     The survey's light is found from it.
+
+    Args:
+        step_px: distance of spots.
+        maximum: samples to return at most.
+        task: the block.
     """
     tools = tools_of(task.survey)
-    surface = ground_of(task.survey, task.block).surface(coarse(task.block.grid, task.step_px))
+    surface = ground_of(task.survey, task.block).surface(coarse(task.block.grid, step_px))
     if not np.isfinite(surface.height).any():
         return joined_samples([])
     seen = []
@@ -236,49 +217,45 @@ def compare_block(task: LightTask) -> LightSamples:
         sight = see(entry.view, optics, surface)
         copy = tools.small(entry.view.image)
         lattice = np.flatnonzero(sight.quality.ravel() > 0)
+        rows = np.empty(len(lattice), _SHOWN)
         places = sight.places(optics.size_px)[lattice]
         levels = at_places(copy.broad, places)
-        usable = well_exposed(levels) & (at_places(copy.valid[..., None], places, 1)[:, 0] > 0.9)
-        shown = _Shown(
-            number=entry.number,
-            lattice=lattice,
-            places=places,
-            levels=np.log(np.maximum(levels, DARKEST)),
-            ranges=sight.range.ravel()[lattice],
-        )
-        seen.append(shown.part(usable))
-    seen = _thin(seen, surface.height.size, task)
+        rows["lattice"], rows["places"] = lattice, places
+        rows["levels"] = np.log(np.maximum(levels, DARKEST))
+        rows["ranges"] = sight.range.ravel()[lattice]
+        valid = at_places(copy.valid[..., None], places, 1)[:, 0] > 0.9
+        seen.append((entry.number, rows[well_exposed(levels) & valid]))
+    kept = _thin([rows for _, rows in seen], surface.height.size, maximum, task.block)
+    seen = [(number, rows[kept[rows["lattice"]]]) for number, rows in seen]
     parts = []
-    for one, other in combinations(seen, 2):
-        _, a, b = np.intersect1d(
-            one.lattice, other.lattice, assume_unique=True, return_indices=True
-        )
-        if not len(a):
-            continue
-        parts.append(
-            LightSamples(
-                views=np.tile(np.array([[one.number, other.number]], np.int32), (len(a), 1)),
-                places=np.stack([one.places[a], other.places[b]], axis=1),
-                levels=np.stack([one.levels[a], other.levels[b]], axis=1),
-                ranges=np.stack([one.ranges[a], other.ranges[b]], axis=1),
-            )
-        )
+    for (n, one), (m, other) in combinations(seen, 2):
+        lattices = one["lattice"], other["lattice"]
+        _, a, b = np.intersect1d(*lattices, assume_unique=True, return_indices=True)
+        if len(a):
+            both = {
+                name: np.stack([one[name][a], other[name][b]], axis=1)
+                for name in ("places", "levels", "ranges")
+            }
+            views = np.tile(np.array([[n, m]], np.int32), (len(a), 1))
+            parts.append(LightSamples(views=views, **both))
     return joined_samples(parts)
 
 
-def _thin(seen: list[_Shown], lattice: int, task: LightTask) -> list[_Shown]:
-    """Views with as many of the spots, drawn at random, as give no more samples than allowed."""
+def _thin(
+    seen: Sequence[NDArray[np.void]], lattice: int, maximum: int, block: Block
+) -> NDArray[np.bool_]:
+    """Which spots of a lattice, drawn at random, give no more samples than allowed."""
     times = np.zeros(lattice, np.int64)
-    for shown in seen:
-        times[shown.lattice] += 1
+    for rows in seen:
+        times[rows["lattice"]] += 1
     pairs = times * (times - 1) // 2
-    if pairs.sum() <= task.maximum:
-        return seen
-    rng = np.random.default_rng([task.block.core.row_off, task.block.core.col_off])
-    order = rng.permutation(np.flatnonzero(pairs))
-    kept = np.zeros(lattice, np.bool_)
-    kept[order[np.cumsum(pairs[order]) <= task.maximum]] = True
-    return [shown.part(kept[shown.lattice]) for shown in seen]
+    kept = np.ones(lattice, np.bool_)
+    if pairs.sum() > maximum:
+        rng = np.random.default_rng([block.core.row_off, block.core.col_off])
+        order = rng.permutation(np.flatnonzero(pairs))
+        kept[:] = False
+        kept[order[np.cumsum(pairs[order]) <= maximum]] = True
+    return kept
 
 
 @small_cache()
@@ -363,48 +340,22 @@ def paint_tile(task: PaintTask) -> Painted:
     block, tools = task.block, tools_of(task.survey)
     grid = block.grid
     label, mean = _read_cells(task.survey, block)
-    if not label.any():
-        return _unknown(block)
-    ground = ground_of(task.survey, block)
-    cells = ground.surface(coarse(grid))
-    surface = ground.surface(grid)
-    used = [entry for entry in task.views if (label == entry.number + 1).any()]
-    changes = _changes(task, tools, _looks(task, cells, used), mean)
-    named = cv2.resize(label, (grid.columns, grid.rows), interpolation=cv2.INTER_NEAREST)
-    named[~np.isfinite(surface.height)] = 0
-    source = np.zeros((grid.rows, grid.columns), np.int32)
-    seen_by = {}
-    for entry in used:  # pixels of a cell that its view does not see go to the best that does
-        value = entry.number + 1
-        requested = cv2.dilate((label == value).astype(np.uint8), _AROUND) > 0
-        part, box = _box(requested)
-        sight = _sight_of(task, entry, surface.part(*part), requested[box])
-        seen_by[value] = (entry, part, sight, requested[box])
-        source[part][(named[part] == value) & (sight.quality > 0)] = value
-    left = (named > 0) & (source == 0)
-    if left.any():
-        best = np.zeros(left.shape, np.float32)
-        for value, (_, part, sight, _) in seen_by.items():
-            better = left[part] & (sight.quality > best[part])
-            best[part][better] = sight.quality[better]
-            source[part][better] = value
     blend = Blend(grid.rows, grid.columns)
-    for value, (entry, part, sight, requested) in seen_by.items():
-        taken = source[part] == value
-        if not taken.any():
-            continue
-        local = surface.part(*part)
-        change = changes.get(entry.number)
-        colour = _colours(task, tools, entry, sight, (local, part, requested), change)
-        blend.add(
-            ViewPart(
-                row=part[0].start,
-                column=part[1].start,
-                colour=colour,
-                valid=sight.quality > 0,
-                taken=taken,
-            )
-        )
+    source = np.zeros((grid.rows, grid.columns), np.int32)
+    if label.any():
+        ground = ground_of(task.survey, block)
+        surface = ground.surface(grid)
+        used = [entry for entry in task.views if (label == entry.number + 1).any()]
+        looks = _looks(task, ground.surface(coarse(grid)), used)
+        changes = _changes(task, tools, looks, mean)
+        seen_by = _take_sources(task, surface, label, used, source)
+        for value, (entry, part, sight, requested) in seen_by.items():
+            taken = source[part] == value
+            if taken.any():
+                local = surface.part(*part)
+                change = changes.get(entry.number)
+                colour = _colours(task, tools, entry, sight, (local, part, requested), change)
+                blend.add(part[0].start, part[1].start, colour, sight.quality > 0, taken)
     margin = block.core.row_off - block.window.row_off
     inner = (
         slice(margin, margin + block.core.height),
@@ -419,13 +370,31 @@ def paint_tile(task: PaintTask) -> Painted:
     return Painted(window=block.core, rgba=rgba, source=source)
 
 
-def _unknown(block: Block) -> Painted:
-    shape = (block.core.height, block.core.width)
-    return Painted(
-        window=block.core,
-        rgba=np.zeros((4, *shape), np.uint8),
-        source=np.zeros(shape, np.int32),
-    )
+def _take_sources(
+    task: PaintTask,
+    surface: GridHeights,
+    label: NDArray[np.int32],
+    used: Sequence[SeenView],
+    source: NDArray[np.int32],
+) -> dict[int, tuple[SeenView, tuple[slice, slice], SeenCells, NDArray[np.bool_]]]:
+    """Write the view of each pixel, plus one, into `source`; how views see parts of the tile."""
+    named = cv2.resize(label, source.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    named[~np.isfinite(surface.height)] = 0
+    seen_by = {}
+    for entry in used:  # pixels of a cell that its view does not see go to the best that does
+        value = entry.number + 1
+        requested = cv2.dilate((label == value).astype(np.uint8), _AROUND) > 0
+        part, box = _box(requested)
+        sight = _sight_of(task, entry, surface.part(*part), requested[box])
+        seen_by[value] = (entry, part, sight, requested[box])
+        source[part][(named[part] == value) & (sight.quality > 0)] = value
+    left = (named > 0) & (source == 0)
+    best = np.zeros(left.shape, np.float32)
+    for value, (_, part, sight, _) in seen_by.items() if left.any() else ():
+        better = left[part] & (sight.quality > best[part])
+        best[part][better] = sight.quality[better]
+        source[part][better] = value
+    return seen_by
 
 
 def _box(
@@ -445,8 +414,7 @@ def _box(
 
 def ground_of(survey: MosaicSetup, block: Block) -> Ground:
     """The surface of a block, and what around it may hide it."""
-    with opened_raster(survey.dem) as raster:
-        return Ground(*dem_around(raster, block.grid, block.reach), survey.sights)
+    return Ground(*dem_around(survey.dem, block.grid, block.reach), survey.sights)
 
 
 def _looks(
@@ -599,14 +567,8 @@ def _inner(block: Block) -> tuple[slice, slice]:
     return slice(margin, margin + rows), slice(margin, margin + columns)
 
 
-def label_path(sights: Path) -> Path:
-    """File of the survey's labels by cell."""
-    return sights / "labels.tif"
-
-
-def tones_path(sights: Path) -> Path:
-    """File of the survey's broad tones by cell."""
-    return sights / "tones.tif"
+LABELS, TONES = "labels.tif", "tones.tif"
+"""Files of the survey's labels, and of its broad tones, by cell."""
 
 
 def _read_cells(survey: MosaicSetup, block: Block) -> tuple[NDArray[np.int32], Float32]:
@@ -615,13 +577,13 @@ def _read_cells(survey: MosaicSetup, block: Block) -> tuple[NDArray[np.int32], F
     top, left = block.window.row_off // CELL_PX, block.window.col_off // CELL_PX
     label = np.zeros((rows, columns), np.int32)
     tones = np.zeros((rows, columns, 3), np.float32)
-    with rasterio.open(label_path(survey.sights)) as raster:
+    with rasterio.open(survey.sights / LABELS) as raster:
         r0, c0 = max(0, top), max(0, left)
         r1, c1 = min(raster.height, top + rows), min(raster.width, left + columns)
         window = Window(c0, r0, c1 - c0, r1 - r0)
         at = slice(r0 - top, r1 - top), slice(c0 - left, c1 - left)
         label[at] = raster.read(1, window=window)
     if label.any():
-        with rasterio.open(tones_path(survey.sights)) as raster:
+        with rasterio.open(survey.sights / TONES) as raster:
             tones[at] = raster.read(window=window).transpose(1, 2, 0)
     return label, tones

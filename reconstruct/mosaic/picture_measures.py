@@ -10,24 +10,23 @@ linear light, 0 to 1, `red`, `green`, `blue`. A patch may have rows in several p
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from rasterio.windows import Window
 
 from alice_survey.core.artefacts import atomic_path, read_csv
 from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.frames import Array
 from reconstruct.light.solve import GRID, at_places
-from reconstruct.mosaic.footprints import PictureFootprint, picture_footprint
+from reconstruct.mosaic.exports import PictureFootprint, picture_footprint
 from reconstruct.mosaic.grid import Float32, footprints
 from reconstruct.mosaic.visibility import store_visible
 from reconstruct.pictures.undistorted import Pictures
-from reconstruct.raster import DemGrid, opened_raster, small_cache
+from reconstruct.raster import DemGrid, grid_of, read_cells, small_cache
 from reconstruct.stages import COLOUR_FILE
 from reconstruct.views.model import View, enu_from_cam
 
@@ -262,25 +261,15 @@ def _part_seen(
 ) -> tuple[Float32, DemGrid, bool]:
     """The DEM below a view and all that it may see, coarser where that is a lot; whether it is."""
     west, east, south, north = footprints((view,), heights).boxes[0]
-    camera = enu_from_cam(view, np.zeros(3))[:, 3]
-    with opened_raster(dem_tif) as raster:
-        t = raster.transform
-        columns = [min(west, camera[0]), max(east, camera[0])]
-        rows = [max(north, camera[1]), min(south, camera[1])]
-        c0, c1 = np.clip((np.array(columns) - t.c) / t.a + [-3, 4], 0, raster.width).astype(int)
-        r0, r1 = np.clip((t.f - np.array(rows)) / t.a + [-3, 4], 0, raster.height).astype(int)
-        window = Window(int(c0), int(r0), int(c1 - c0), int(r1 - r0))
-        coarser = int(np.ceil(np.sqrt(window.width * window.height / _MAX_CELLS)))
-        shape = -(-window.height // max(coarser, 1)), -(-window.width // max(coarser, 1))
-        dem = raster.read(1, window=window, out_shape=shape) if min(shape) else np.empty(
-            shape, np.float32
-        )  # fmt: skip
-    cell = t.a * max(coarser, 1)
-    grid = DemGrid(
-        west=t.c + window.col_off * t.a, north=t.f - window.row_off * t.a, cell=cell,
-        rows=dem.shape[0], columns=dem.shape[1],
-    )  # fmt: skip
-    return dem, grid, coarser <= 1
+    place, whole = enu_from_cam(view, np.zeros(3))[:, 3], grid_of(dem_tif)
+    columns = np.array([min(west, place[0]), max(east, place[0])]) - whole.west
+    rows = whole.north - np.array([max(north, place[1]), min(south, place[1])])
+    left, right = np.clip(columns / whole.cell + [-3, 4], 0, whole.columns).astype(int).tolist()
+    top, bottom = np.clip(rows / whole.cell + [-3, 4], 0, whole.rows).astype(int).tolist()
+    every = max(1, int(np.ceil(np.sqrt((right - left) * (bottom - top) / _MAX_CELLS))))
+    dem = read_cells(dem_tif, top, left, bottom - top, right - left, every).astype(np.float32)
+    part = whole.window(top, left, *dem.shape)
+    return dem, replace(part, cell=every * whole.cell), every == 1
 
 
 _NUMBERS = ("x", "y", "radius_px", "red", "green", "blue")
@@ -319,44 +308,39 @@ def read_references(workspace: Path, images: Sequence[str]) -> tuple[ReferencePa
     known, pictures = set(images), Pictures.still(workspace)
     found = []
     for line, row in read_csv(path, ("image", *_NUMBERS), fault=WorkspaceError)[1]:
-        where = f"{path} line {line}"
-        if row["image"] not in known:
-            raise WorkspaceError(f"{where}: the model has no picture {row['image']!r}")
-        found.append(_measure_patch(where, row, pictures))
+        try:
+            if row["image"] not in known:
+                raise ValueError(f"the model has no picture {row['image']!r}")
+            found.append(_measure_patch(row, pictures))
+        except ValueError as error:
+            raise WorkspaceError(f"{path} line {line}: {error}") from None
     if not found:
         raise WorkspaceError(f"{path}: has no patch; fill it or take it away")
     return tuple(found)
 
 
-def _measure_patch(where: str, row: dict[str, str], pictures: Pictures) -> ReferencePatch:
+def _measure_patch(row: dict[str, str], pictures: Pictures) -> ReferencePatch:
+    """The patch of a row; a `ValueError` says why it cannot be used."""
     try:
         x, y, radius, *rgb = (float(row[name]) for name in _NUMBERS)
     except ValueError:
-        raise WorkspaceError(f"{where}: {', '.join(_NUMBERS)} must be numbers") from None
+        raise ValueError(f"{', '.join(_NUMBERS)} must be numbers") from None
     if not all(0.0 < value <= 1.0 for value in rgb):
-        raise WorkspaceError(f"{where}: red, green, blue must be reflectances above 0, at most 1")
+        raise ValueError("red, green, blue must be reflectances above 0, at most 1")
     taken, usable = pictures.as_taken(row["image"]), pictures.usable(row["image"])
     height, width = taken.shape[:2]
-    if not (radius > 0 and radius <= x + 0.5 <= width - radius and
-            radius <= y + 0.5 <= height - radius):  # fmt: skip
-        raise WorkspaceError(
-            f"{where}: a circle of {radius:g} px about {x:g}, {y:g} is not within the picture of "
-            f"{width} x {height} px"
-        )
+    if not 0 < radius <= min(x + 0.5, width - x - 0.5, y + 0.5, height - y - 0.5):
+        raise ValueError(f"the circle is not within the picture of {width} x {height} px")
     rows, columns = np.mgrid[:height, :width]
     inside = np.hypot(columns - x, rows - y) <= radius
     inside &= True if usable is None else usable
     if inside.sum() < _MIN_PIXELS:
-        raise WorkspaceError(
-            f"{where}: {inside.sum()} pixels in the circle, masked ones left out; "
-            f"{_MIN_PIXELS} are needed: raise radius_px"
-        )
+        raise ValueError(f"{inside.sum()} unmasked pixels in the circle: {_MIN_PIXELS} are needed")
     light = linear_table()[taken[inside]].astype(np.float64)
-    burnt = float((light > BRIGHTEST).any(axis=1).mean())
-    mean = light.mean(axis=0)
+    burnt, mean = float((light > BRIGHTEST).any(axis=1).mean()), light.mean(axis=0)
     if burnt > _MAX_BURNT or (mean < DARKEST).any():
         state = f"{burnt:.0%} of the patch is burnt out" if burnt > _MAX_BURNT else "it is black"
-        raise WorkspaceError(f"{where}: {state}: take another patch or picture")
+        raise ValueError(f"{state}: take another patch or picture")
     return ReferencePatch(
         image=row["image"],
         place=np.array([(x + 0.5) / width, (y + 0.5) / height], np.float32),

@@ -29,7 +29,7 @@ from alice_survey.core.records import MosaicRecord, PicturesRecord
 from alice_survey.core.run import progress
 from reconstruct.light.solve import joined_samples
 from reconstruct.mosaic.colour import ColourModel, solve_colour
-from reconstruct.mosaic.footprints import write_footprints
+from reconstruct.mosaic.exports import write_footprints
 from reconstruct.mosaic.grid import (
     CELL_PX,
     Block,
@@ -44,17 +44,17 @@ from reconstruct.mosaic.grid import (
     neighbours,
 )
 from reconstruct.mosaic.paint import (
+    LABELS,
+    TONES,
+    BlockTask,
     Labels,
-    LightTask,
     MosaicSetup,
     Painted,
     PaintTask,
     SeenView,
     compare_block,
     label_block,
-    label_path,
     paint_tiles,
-    tones_path,
 )
 from reconstruct.mosaic.picture_measures import (
     PictureMeasures,
@@ -71,6 +71,7 @@ from reconstruct.raster import (
     DemGrid,
     crs_of,
     frame_tags,
+    grid_of,
     opened_raster,
     round_cell,
     small_cache,
@@ -300,7 +301,7 @@ def paint_plane(painting: Painting, plane: Plane, dem: Path, folder: Path) -> bo
     with opened_raster(dem) as raster:
         heights = height_range(raster)
         pixel = reconstruct.mosaic_pixel_m or round_cell(mean_pixel(model))
-        grid = mosaic_grid(raster, pixel)
+    grid = mosaic_grid(grid_of(dem), pixel)
     names = [view.image for view in model.views]
     outline = partial(outline_view, dem, sights, heights)
     label = partial(_label, plane)
@@ -345,7 +346,7 @@ def paint_plane(painting: Painting, plane: Plane, dem: Path, folder: Path) -> bo
             yield from executor.map(label_block, tasks, label=label(name), task_mib=_TASK_MIB)
 
     write_labels(
-        (label_path(sights), tones_path(sights)),
+        (sights / LABELS, sights / TONES),
         folder / "coverage.tif",
         grid,
         model.frame,
@@ -437,17 +438,12 @@ def _solve(
         return solve_colour(requested, joined_samples([]), facts)
     width = float(np.median([view.pinhole.width_px for view in model.views]))
     step_px = max(CELL_PX, round(width * mean_pixel(model) / blocks[0].grid.cell / _LIGHT_LATTICE))
-    compare = [
-        LightTask(
-            survey=survey,
-            block=block,
-            views=tuple(views[n] for n in block.views),
-            step_px=step_px,
-            maximum=max(1000, _MAX_SAMPLES // len(blocks)),
-        )
+    tasks = [
+        BlockTask(survey=survey, block=block, views=tuple(views[n] for n in block.views))
         for block in blocks
     ]
-    found = painting.executor.map(compare_block, compare, label=label, task_mib=_TASK_MIB)
+    compare = partial(compare_block, step_px, max(1000, _MAX_SAMPLES // len(blocks)))
+    found = painting.executor.map(compare, tasks, label=label, task_mib=_TASK_MIB)
     parts = [part for part in found if len(part.views)]
     return solve_colour(requested, joined_samples(parts), facts, painting.references)
 
@@ -463,24 +459,18 @@ def _dispersion(
 ) -> tuple[Water | None, dict[str, Any]]:
     """The water through which colours are distinguished, or None, and what to say about it."""
     warps = read_warps(workspace / "sparse" / "cameras.json").values()
-    about = workspace / "images" / "survey.json"
-    reason = ""
-    if all(warp.camera.n_water == 1 for warp in warps):
-        reason = "no port"
-    elif grey:
-        reason = "grey pictures"
-    elif PicturesRecord.read(about).source == "simulated":
-        reason = "rendered pictures have none"
-    if reason:
-        return None, {"corrected": False, "reason": reason}
-    water = Water(
-        temperature_c=_TEMPERATURE_C if config.temperature_c is None else config.temperature_c,
-        salinity_psu=_SALINITY_PSU if config.salinity_psu is None else config.salinity_psu,
-        depth_m=depth_m,
-    )
-    return water, {
-        "corrected": True,
-        "temperature_c": water.temperature_c,
-        "salinity_psu": water.salinity_psu,
-        "water_stated": config.temperature_c is not None and config.salinity_psu is not None,
+    pictures = PicturesRecord.read(workspace / "images" / "survey.json")
+    for known, reason in (
+        (all(warp.camera.n_water == 1 for warp in warps), "no port"),
+        (grey, "grey pictures"),
+        (pictures.source == "simulated", "rendered pictures have none"),
+    ):
+        if known:
+            return None, {"corrected": False, "reason": reason}
+    stated = config.temperature_c is not None and config.salinity_psu is not None
+    values = {
+        "temperature_c": _TEMPERATURE_C if config.temperature_c is None else config.temperature_c,
+        "salinity_psu": _SALINITY_PSU if config.salinity_psu is None else config.salinity_psu,
     }
+    water = Water(depth_m=depth_m, **values)
+    return water, {"corrected": True, **values, "water_stated": stated}

@@ -12,7 +12,6 @@ blending (Burt & Adelson 1983, "A multiresolution spline with application to ima
 pyramids that know where a view shows nothing: levels are means over what is valid.
 """
 
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -197,21 +196,6 @@ SUPPORT_PX = 4 * ALIGNED_PX
 """How far a pixel's colour reaches."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ViewPart:
-    """What one view contributes."""
-
-    row: int
-    """Row of its first pixel in the tile; a multiple of `ALIGNED_PX`."""
-    column: int
-    colour: Float32
-    """(h, w, 3); any value where not valid. h and w are multiples of `ALIGNED_PX`."""
-    valid: NDArray[np.bool_]
-    """(h, w) where the view shows something."""
-    taken: NDArray[np.bool_]
-    """(h, w) where the tile takes this view; a subset of `valid`."""
-
-
 class Blend:
     """A tile as parts are added to it."""
 
@@ -221,15 +205,30 @@ class Blend:
         self._bands = [np.zeros((*size, 3), np.float32) for size in sizes]
         self._weights = [np.zeros(size, np.float32) for size in sizes]
 
-    def add(self, part: ViewPart) -> None:
-        """Add a view."""
-        weight = part.taken.astype(np.float32)
-        share = part.valid.astype(np.float32)
-        total = part.colour * share[..., None]
+    def add(
+        self,
+        row: int,
+        column: int,
+        colour: Float32,
+        valid: NDArray[np.bool_],
+        taken: NDArray[np.bool_],
+    ) -> None:
+        """Add a view.
+
+        Args:
+            row: of its first pixel in the tile; this and all sizes are multiples of `ALIGNED_PX`.
+            column: of it.
+            colour: (h, w, 3); any value where not valid.
+            valid: (h, w) where the view shows something.
+            taken: (h, w) where the tile takes this view; a subset of `valid`.
+        """
+        weight = taken.astype(np.float32)
+        share = valid.astype(np.float32)
+        total = colour * share[..., None]
         for level in range(LEVELS + 1):
             height, width = weight.shape
-            row, column = part.row >> level, part.column >> level
-            at = slice(row, row + height), slice(column, column + width)
+            top, left = row >> level, column >> level
+            at = slice(top, top + height), slice(left, left + width)
             mean = total / np.maximum(share, _NOTHING)[..., None]
             if level < LEVELS:
                 share_next, total_next = cv2.pyrDown(share), cv2.pyrDown(total)

@@ -42,9 +42,8 @@ from camera_calib.ports.flat import FlatPort
 from camera_calib.rig import Rig, write_rig
 from camera_calib.water import water_optics
 from reconstruct.elevation import elevation_in
-from reconstruct.evaluate.mosaic import MosaicScore, score_mosaic
 from reconstruct.evaluate.run import CameraScore, score_cameras
-from reconstruct.evaluate.surface import SurfaceScore, score_surface
+from reconstruct.evaluate.scores import MosaicScore, SurfaceScore, score_mosaic, score_surface
 from reconstruct.evaluate.truth import ground_pixel_m
 from reconstruct.placing.track import read_track_poses
 from tests.cameras import rig_of

@@ -444,7 +444,7 @@ class MosaicTilesCommand(WorkspaceCommand, ReportCommand):
 
     def run(self) -> Result:
         """Cut it."""
-        from reconstruct.mosaic.annotation import mosaic_tiles
+        from reconstruct.mosaic.exports import mosaic_tiles
 
         return mosaic_tiles(
             self.workspace, self.output, side_px=self.side, overlap_px=self.overlap,

@@ -13,7 +13,7 @@ from alice_survey.core.config import SeafloorConfig
 from alice_survey.sim.seafloor.terrain import Terrain, build_terrain
 from alice_survey.sim.seafloor.texture import Texture, survey_texture
 from reconstruct.evaluate.figures import compare_lengths
-from reconstruct.evaluate.mosaic import score_mosaic
+from reconstruct.evaluate.scores import score_mosaic
 from reconstruct.evaluate.truth import surface_material
 
 PIXEL, SIDE = 0.002, 700

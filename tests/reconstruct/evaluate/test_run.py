@@ -9,9 +9,8 @@ from shapely.geometry import MultiPolygon, Polygon
 from alice_survey.core.config import SeafloorConfig
 from alice_survey.sim.seafloor.terrain import Terrain, build_terrain
 from reconstruct.elevation import Elevation
-from reconstruct.evaluate.mosaic import area_in_world
 from reconstruct.evaluate.run import score_cameras
-from reconstruct.evaluate.surface import SurfaceScore, score_surface
+from reconstruct.evaluate.scores import SurfaceScore, area_in_world, score_surface
 from reconstruct.evaluate.truth import surface_depth
 
 HOLE = [(1.0, 0.8), (1.6, 0.8), (1.6, 1.4), (1.0, 1.4)]

@@ -9,7 +9,7 @@ from alice_survey.core.config import CameraConfig, SeafloorConfig, WaterConfig
 from alice_survey.sim.seafloor.terrain import Terrain, build_terrain
 from camera_calib.rig import Rig, design_rig
 from missions.values.footprint import level_pose
-from reconstruct.evaluate.surface import score_mesh
+from reconstruct.evaluate.scores import score_mesh
 from reconstruct.evaluate.truth import ground_pixel_m
 
 DEPTH_M = 10.0

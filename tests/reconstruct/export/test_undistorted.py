@@ -10,7 +10,7 @@ import pycolmap
 import pytest
 
 from alice_survey.core.executor import SERIAL
-from reconstruct.evaluate.surface import read_mesh
+from reconstruct.evaluate.scores import read_mesh
 from reconstruct.export import bilinear, export_undistorted
 from reconstruct.views.model import View, read_model, read_warps
 

@@ -1,6 +1,6 @@
 import numpy as np
 
-from reconstruct.mosaic.seams import Blend, ViewPart
+from reconstruct.mosaic.seams import Blend
 
 
 def test_one_view_comes_out_as_it_went_in() -> None:
@@ -9,7 +9,7 @@ def test_one_view_comes_out_as_it_went_in() -> None:
     valid = np.zeros((128, 144), bool)
     valid[40:80, 45:100] = True
     blend = Blend(160, 192)
-    blend.add(ViewPart(row=16, column=32, colour=colour, valid=valid, taken=valid))
+    blend.add(16, 32, colour, valid, valid)
     found = blend.result()[16:144, 32:176]
     np.testing.assert_allclose(found[valid], colour[valid], atol=2e-3)
 
@@ -21,8 +21,8 @@ def test_a_step_between_two_views_becomes_a_slope_and_detail_stays() -> None:
     left[:, :64] = True
     everywhere = np.ones_like(left)
     blend = Blend(128, 128)
-    blend.add(ViewPart(row=0, column=0, colour=fine + 100, valid=everywhere, taken=left))
-    blend.add(ViewPart(row=0, column=0, colour=fine + 140, valid=everywhere, taken=~left))
+    blend.add(0, 0, fine + 100, everywhere, left)
+    blend.add(0, 0, fine + 140, everywhere, ~left)
     rest = (blend.result() - fine)[..., 0].mean(axis=0)
     assert abs(rest[:8].mean() - 100) < 1
     assert abs(rest[-8:].mean() - 140) < 1

@@ -6,8 +6,7 @@ import pytest
 import rasterio
 
 from alice_survey.core.artefacts import read_json, write_json
-from reconstruct.mosaic.annotation import mosaic_tiles
-from reconstruct.mosaic.footprints import hits_of, picture_footprint, write_footprints
+from reconstruct.mosaic.exports import hits_of, mosaic_tiles, picture_footprint, write_footprints
 from reconstruct.raster import DemGrid, crs_of, transform_of
 from tests.oracles_dense import ALTITUDE_M, FOCAL, FRAME, HEIGHT, WIDTH, stereo_views
 

@@ -3,10 +3,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reconstruct.light.parts import Parts
 from reconstruct.light.solve import (
     GRID,
     LightSamples,
+    Parts,
     as_rows,
     at_places,
     from_rows,

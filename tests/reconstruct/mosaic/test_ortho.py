@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from reconstruct.mosaic.ortho import look_up, visible_cells
+from reconstruct.mosaic.visibility import look_up, visible_cells
 from reconstruct.views.model import View, enu_from_cam
 from reconstruct.views.range_shift import as_nodes
 from tests.oracles_dense import sees, stereo_views

@@ -10,13 +10,14 @@ from alice_survey.core.frames import BODY_FROM_NADIR_CAM
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.camera import Camera
 from camera_calib.water import channel_cameras
-from reconstruct.mosaic.ortho import lanczos_weights, sample_lanczos
 from reconstruct.mosaic.visibility import (
     Ground,
     SeenCells,
     Water,
     camera_optics,
     channel_optics,
+    lanczos_weights,
+    sample_lanczos,
     see,
 )
 from reconstruct.raster import DemGrid
