@@ -3,7 +3,6 @@
 import math
 import shutil
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from datetime import date
 from functools import partial
 from pathlib import Path
@@ -72,11 +71,6 @@ def vertices_of(surface: NDArray[Any], cell: float, edge: float) -> NDArray[Any]
     return vertices
 
 
-def voxel_edge(cell: float, cells: int, max_points: int) -> float:
-    """Edge of the cubes: a cell, or more where that many cells would give too many points."""
-    return cell * max(1.0, math.sqrt(cells / max_points))
-
-
 def write_cloud(
     path: Path, parts: Iterable[NDArray[Any]], offset_enu: Sequence[float], frame: WorldFrame
 ) -> int:
@@ -87,18 +81,6 @@ def write_cloud(
         f"vertical datum: {frame.vertical_datum}",
     ]
     return write_ply(path, parts, comments)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _CloudSetup:
-    """What all tiles share."""
-
-    store: ViewStore
-    header: "laspy.LasHeader"
-    spool: PointSpool
-    cell: float
-    edge: float
-    """Of the overview's cubes."""
 
 
 def write_clouds(
@@ -121,14 +103,13 @@ def write_clouds(
         cell: of the surface.
         executor: runs the tiles.
     """
-    edge = voxel_edge(cell, sum(tile.count for tile in tiles), _MAX_OVERVIEW_POINTS)
+    count = sum(tile.count for tile in tiles)
+    edge = cell * max(1.0, math.sqrt(count / _MAX_OVERVIEW_POINTS))  # of the overview's cubes
     header = las_header(offset_enu, frame)
     scratch = store.folder / "copc"
-    if scratch.exists():  # of a run that was interrupted
-        shutil.rmtree(scratch)
+    shutil.rmtree(scratch, ignore_errors=True)  # of a run that was interrupted
     spool = PointSpool.of(scratch, header, cell)
-    setup = _CloudSetup(store=store, header=header, spool=spool, cell=cell, edge=edge)
-    spool_tile = partial(_spool_tile, setup)
+    spool_tile = partial(_spool_tile, store, header, spool, (cell, edge))
     parts = list(executor.map(spool_tile, tiles, label="lay out the point cloud"))
     overview = (np.asarray(store.load(tile.number, _OVERVIEW)) for tile in tiles)
     points = write_cloud(folder / "cloud.ply", overview, offset_enu, frame)
@@ -136,13 +117,18 @@ def write_clouds(
     write_copc(folder / "cloud.copc.laz", header, spool, parts, executor)
 
 
-def _spool_tile(setup: _CloudSetup, tile: SurfaceTile) -> SpooledPart:
+def _spool_tile(
+    store: ViewStore,
+    header: "laspy.LasHeader",
+    spool: PointSpool,
+    sides: tuple[float, float],
+    tile: SurfaceTile,
+) -> SpooledPart:
     """Put the points of a tile in the spool, and those of the overview in the store."""
-    surface = tile.points(setup.store)
-    every = vertices_of(surface, setup.cell, setup.cell)
-    few = every if setup.edge == setup.cell else vertices_of(surface, setup.cell, setup.edge)
-    setup.store.save(tile.number, _OVERVIEW, few)
-    return setup.spool.add(f"{tile.number}", las_points(every, setup.header).array)
+    surface, (cell, edge) = tile.points(store), sides
+    every = vertices_of(surface, cell, cell)
+    store.save(tile.number, _OVERVIEW, vertices_of(surface, cell, edge) if edge > cell else every)
+    return spool.add(f"{tile.number}", las_points(every, header).array)
 
 
 def las_header(offset_enu: Sequence[float], frame: WorldFrame) -> "laspy.LasHeader":

@@ -16,7 +16,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -246,47 +246,36 @@ class _NeighbourSums:
     seen: NDArray[np.uint8]
 
 
-class Device(Protocol):
-    """What works on all pixels of a view, with arrays of its own (of type `Any` here)."""
+class Device:
+    """What works on all pixels of a view: the processor, with arrays of numpy.
+
+    Another device has arrays of its own (of type `Any` here).
+    """
 
     def put(self, values: Any) -> Any:
         """An array, or a tuple of arrays, numbers and tuples, as the device takes it."""
-
-    def get(self, array: Any) -> NDArray[Any]:
-        """An array of the device."""
-
-    def empty(self, *shape: int) -> Any:
-        """An array of 32-bit floats."""
-
-    def run(self, kernel: Callable[..., None], shape: tuple[int, ...], *arguments: Any) -> None:
-        """Run a kernel that takes its share of (H, W) pixels, then these arguments."""
-
-    def blur(self, planes: Any, sigma_px: float) -> Any:
-        """Planes (N, H, W), each as `_blur` gives it."""
-
-
-class _Processor:
-    """The device that this code runs on."""
-
-    def put(self, values: Any) -> Any:
         return values
 
     def get(self, array: Any) -> NDArray[Any]:
+        """An array of the device."""
         return np.asarray(array)
 
     def empty(self, *shape: int) -> Any:
+        """An array of 32-bit floats."""
         return np.empty(shape, np.float32)
 
     def run(self, kernel: Callable[..., None], _: tuple[int, ...], *arguments: Any) -> None:
+        """Run a kernel that takes its share of (H, W) pixels, then these arguments."""
         kernel(ALL, *arguments)
 
     def blur(self, planes: Any, sigma_px: float) -> Any:
+        """Planes (N, H, W), each as `_blur` gives it."""
         for plane in planes:
             plane[:] = _blur(plane, sigma_px)
         return planes
 
 
-PROCESSOR = _Processor()
+PROCESSOR = Device()
 
 
 _Look = tuple[View, Any]

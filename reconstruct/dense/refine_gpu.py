@@ -20,7 +20,14 @@ from numpy.typing import NDArray
 
 from alice_survey.core.errors import warn
 from alice_survey.core.run.resources import user_lock
-from reconstruct.dense.refine_depth import ComparedView, Float32, RefinedDepth, Share, refine
+from reconstruct.dense.refine_depth import (
+    ComparedView,
+    Device,
+    Float32,
+    RefinedDepth,
+    Share,
+    refine,
+)
 
 _BLOCK = (32, 8)
 """Threads along a row, and rows: a warp reads neighbouring pixels."""
@@ -62,7 +69,7 @@ def places() -> int:
     return int(max(1, min(total / _PROCESS_BYTES, _MAX_AT_ONCE)))
 
 
-class _Gpu:
+class _Gpu(Device):
     """The device of `refine` on the GPU that CUDA names first."""
 
     def put(self, values: Any) -> Any:

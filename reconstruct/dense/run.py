@@ -62,7 +62,6 @@ from reconstruct.dense.surface_tiles import (
 )
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.dense.views import (
-    LOOKS,
     ViewTask,
     check_view,
     find_match_sigma,
@@ -351,23 +350,17 @@ def run_dense(
             "depth_scale": scales.depth,
             "matching_scale": scales.matching,
             "match_sigma_px": match_sigma_px,
-            "refined_with": LOOKS,
             "sigma_factor": round(sigma_factor, 3),
             "pose_sigma": None if pose_sigma is None else float(f"{pose_sigma:.3g}"),
             "cell": grid.cell,
             "unit": model.frame.unit,
-            "rows": grid.rows,
-            "columns": grid.columns,
-            "frame": model.frame.name,
             "vertical_datum": model.frame.vertical_datum,
             "planes": [one.name for one, _ in made],
-            "pairs": sum(len(chosen) for chosen in partners),
             "moving": {
                 "pictures": len(moving),
                 "masked": sum(one.masked > 0 for one in moving),
                 "masked_share": float(np.mean([one.masked for one in moving] or [0.0])),
             },
-            "gaps_bridged_cells": FILL_CELLS,
             "notes": list(model.frame.notes),
         },
     )

@@ -132,12 +132,6 @@ class ViewStore:
         return bits[:, columns].astype(np.bool_)
 
 
-def encode_depth(depth: NDArray[np.float32], sigma: NDArray[np.float32]) -> StoredDepth:
-    """Depth (H, W) and its standard deviation as a store keeps them."""
-    level, share, (minimum, step) = _codes(depth, sigma)
-    return level, share, _depths(float(minimum), float(step)), _shares()
-
-
 def decode_depth(depth: StoredDepth) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Depth (H, W) and its standard deviation, NaN where unknown."""
     level, share, depths, shares = depth

@@ -130,18 +130,6 @@ class Change:
         }
 
 
-@dataclass(frozen=True, eq=False)
-class _Maps:
-    """Difference, its sigma, and the share of the registration in it."""
-
-    difference: Array
-    sigma: Array
-    registration: Array
-
-    def part(self, window: tuple[slice, slice]) -> "_Maps":
-        return _Maps(self.difference[window], self.sigma[window], self.registration[window])
-
-
 def find_change(now: Elevation, before: Elevation, fit: HeightFit) -> Change:
     """Differences of two registered surveys.
 
@@ -175,12 +163,13 @@ def find_change(now: Elevation, before: Elevation, fit: HeightFit) -> Change:
     labels = _label_changes(difference / sigma)
     noise_area = _noise_area(difference, sigma, labels == 0, now.cell)
     regions, changed = [], np.zeros(shape, dtype=np.bool_)
-    maps = _Maps(difference, sigma, registration)
+    maps = np.stack([difference, sigma, registration])
     for label, box in enumerate(find_objects(labels), 1):
         window = _pad(box, shape)
         free = (labels[window] == 0) & ~changed[window]
-        inside = _follow(labels[window] == label, free, maps.part(window), now.cell, noise_area)
-        region = _measure(inside, maps.part(window), window, now, noise_area)
+        part = maps[:, *window]
+        inside = _follow(labels[window] == label, free, part, now.cell, noise_area)
+        region = _measure(inside, part, window, now, noise_area)
         if abs(region.volume_m3) > _REGION_SIGMAS * region.sigma_m3:
             regions.append(region)
             changed[window] |= inside
@@ -242,12 +231,21 @@ def _pad(box: tuple[slice, ...], shape: tuple[int, ...]) -> tuple[slice, slice]:
 
 
 def _follow(
-    inside: NDArray[np.bool_], free: NDArray[np.bool_], maps: _Maps, cell: float, noise_area: float
+    inside: NDArray[np.bool_], free: NDArray[np.bool_], maps: Array, cell: float, noise_area: float
 ) -> NDArray[np.bool_]:
-    """A place and the rings around it, as far as they have changed on average."""
+    """A place and the rings around it, as far as they have changed on average.
+
+    Args:
+        inside: (h, w) the place.
+        free: (h, w) where no other place is.
+        maps: (3, h, w) difference, its sigma, and the share of the registration in it.
+        cell: side of a cell.
+        noise_area: see `Change`.
+    """
+    difference, sigma, registration = maps
     away = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, 5)
-    known = np.isfinite(maps.difference)
-    sign = np.sign(maps.difference[inside & known].sum())
+    known = np.isfinite(difference)
+    sign = np.sign(difference[inside & known].sum())
     reach, looked = 0.0, 0.0
     while looked < min(reach + 3 * _RING, _MAX_GROWTH):  # past rings that look still by chance
         ring = known & free & (away > looked) & (away <= looked + _RING)
@@ -255,9 +253,9 @@ def _follow(
         count = int(ring.sum())
         if not count:
             continue
-        mean = float(maps.difference[ring].mean())
-        alike = np.mean(maps.sigma[ring] ** 2) * noise_area / (count * cell**2)
-        if sign * mean > _RING_SIGMAS * np.sqrt(alike + np.mean(maps.registration[ring]) ** 2):
+        mean = float(difference[ring].mean())
+        alike = np.mean(sigma[ring] ** 2) * noise_area / (count * cell**2)
+        if sign * mean > _RING_SIGMAS * np.sqrt(alike + np.mean(registration[ring]) ** 2):
             reach = looked
     grown: NDArray[np.bool_] = (inside | (free & (away <= reach))) & known
     return grown
@@ -265,15 +263,15 @@ def _follow(
 
 def _measure(
     inside: NDArray[np.bool_],
-    maps: _Maps,
+    maps: Array,
     window: tuple[slice, slice],
     now: Elevation,
     noise_area: float,
 ) -> Region:
-    values = maps.difference[inside]
+    values, sigma, registration = maps[:, inside]
     area = len(values) * now.cell**2
-    random = np.sqrt(float(np.mean(maps.sigma[inside] ** 2)) * area * noise_area)
-    shared = area * float(np.mean(maps.registration[inside]))
+    random = np.sqrt(float(np.mean(sigma**2)) * area * noise_area)
+    shared = area * float(np.mean(registration))
     rows, columns = np.nonzero(inside)
     share = np.abs(values) / np.abs(values).sum()
     row, column = rows @ share + window[0].start, columns @ share + window[1].start

@@ -207,8 +207,7 @@ def _compare(
     pose: RigidTransform,
 ) -> _Compared:  # fmt: skip
     there = pose.inv().apply(points)
-    height = moving.at(moving.height, there[:, :2])
-    east, north = (moving.at(slope, there[:, :2]) for slope in slopes)
+    height, east, north = (moving.at(field, there[:, :2]) for field in (moving.height, *slopes))
     known = np.flatnonzero(np.isfinite(height + east + north))
     normals = np.column_stack([east[known], north[known], -np.ones(len(known))])
     total = variance[known] + moving.at(moving.sigma, there[known, :2]) ** 2

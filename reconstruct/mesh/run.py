@@ -14,7 +14,6 @@ from alice_survey.core.run import progress
 from reconstruct.light.solve import read_light
 from reconstruct.mesh.formats import GLB_AXES, render_oblique, write_mesh
 from reconstruct.mesh.surface import (
-    TRIM_STEPS,
     TriangleMesh,
     coarser_level,
     mesh_cloud,
@@ -92,14 +91,10 @@ def mesh_facts(
         "format": "alice-survey mesh",
         "version": 1,
         "triangles": len(mesh.triangles),
-        "vertices": len(mesh.vertices),
         "area": round(float(area.sum()), 6),
         "textured_share": round(float(area[textured.label >= 0].sum() / area.sum()), 6),
-        "patches": int(textured.wedges.chart.max()) + 1,
         "pages": [page.name for page in textured.pages],
         "texture_scale": round(textured.scale, 6),
-        "spacing": setup.step,
-        "gaps_bridged": 2 * TRIM_STEPS * setup.step,
         "decimation_error": mesh.error,
         "unit": frame.unit,
         "frame": frame.name,

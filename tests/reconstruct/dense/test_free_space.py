@@ -1,9 +1,12 @@
 """What views see through is judged against sight along exact rays."""
 
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
 import numpy as np
 
 from reconstruct.dense.surface_tiles import look_at_points
-from reconstruct.dense.view_store import encode_depth
+from reconstruct.dense.view_store import ViewStore
 from reconstruct.views.model import View, enu_from_cam
 from tests.oracles_dense import Scene, hits, sloped_with_step, speckle, stereo_views
 
@@ -20,10 +23,13 @@ def looks(view: View, world: np.ndarray, sigma_m: float = 1e-4) -> tuple[np.ndar
     depth[:20] = np.nan
     enu = (world[:, [1, 0, 2]] * [1, 1, -1] - OFFSET).astype(np.float32)
     to_cam = np.linalg.inv(np.vstack([enu_from_cam(view, OFFSET), [0, 0, 0, 1]]))[:3]
-    return look_at_points(
-        enu, np.full(len(enu), sigma_m, np.float32), np.ascontiguousarray(to_cam),
-        encode_depth(depth, np.full(shape, sigma_m, np.float32)), 1.0, view.kernel_lens, CELL_M,
-    )  # fmt: skip
+    with TemporaryDirectory() as folder:
+        store = ViewStore(Path(folder))
+        store.save_depth(0, "fine", depth, np.full(shape, sigma_m, np.float32))
+        return look_at_points(
+            enu, np.full(len(enu), sigma_m, np.float32), np.ascontiguousarray(to_cam),
+            store.stored_depth(0, "fine"), 1.0, view.kernel_lens, CELL_M,
+        )  # fmt: skip
 
 
 def rays(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

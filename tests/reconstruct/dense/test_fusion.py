@@ -4,7 +4,7 @@ import numpy as np
 
 from reconstruct.dense.depth import count_confirming, merge_depths
 from reconstruct.dense.stereo_pairs import in_frame
-from reconstruct.dense.view_store import decode_depth, encode_depth
+from reconstruct.dense.view_store import ViewStore, decode_depth
 from reconstruct.views.range_shift import KernelLens, no_shift, slopes_of
 from tests.oracles_dense import merged, plane_depth, port_view
 
@@ -27,7 +27,7 @@ def test_merge_depths_equals_its_slow_twin():
     assert 0 < (agreeing == 0).sum() < agreeing.size
 
 
-def test_witnesses_through_a_tilted_port_equal_their_slow_twin():
+def test_witnesses_through_a_tilted_port_equal_their_slow_twin(tmp_path):
     """Depth of the other is so noisy that the pixel chosen there decides the answer."""
     one, other = port_view([0, 0, 0], [1.0, -2.0, 30.0]), port_view([0.2, 0.1, 0], [-1, 1, 28])
     depth = plane_depth(one, 1.2)
@@ -35,7 +35,9 @@ def test_witnesses_through_a_tilted_port_equal_their_slow_twin():
     there = plane_depth(other, 1.2)
     there += rng.normal(0, 0.05, there.shape).astype(np.float32)
     sigma = np.full(depth.shape, 0.01, np.float32)
-    factor, other_depth = 2.0, encode_depth(there, 0.5 * sigma)
+    factor, store = 2.0, ViewStore(tmp_path)
+    store.save_depth(1, "fine", there, 0.5 * sigma)
+    other_depth = store.stored_depth(1, "fine")
     there, there_sigma = decode_depth(other_depth)
     move = other.world_from_cam.inv() * one.world_from_cam
     rows, columns = np.mgrid[: one.pinhole.height_px, : one.pinhole.width_px]
