@@ -70,22 +70,6 @@ class Scales:
     """For semi-global matching, by which this depth is found before it is refined."""
 
 
-def ground_pixel(views: Sequence[View], points_of: Callable[[int], Array]) -> float:
-    """Side of a pixel on the ground, the median of some views.
-
-    Args:
-        views: of the model.
-        points_of: from the number of a view to the points (N, 3) that bound its depth.
-    """
-    sides = []
-    for number in range(0, len(views), -(-len(views) // _LOOKED_AT)):
-        view, points = views[number], points_of(number)
-        if len(points):
-            depth = view.world_from_cam.inv().apply(points)[:, 2]
-            sides.append(float(np.median(depth)) / view.pinhole.focal_px)
-    return float(np.median(sides))
-
-
 def pixels_of(view: View) -> int:
     """How many a view has."""
     return view.pinhole.width_px * view.pinhole.height_px
@@ -141,13 +125,6 @@ def match_sigma(spreads: Sequence[float]) -> float:
     known = [one for one in spreads if np.isfinite(one)]
     sigma = MATCH_SIGMA_PX * (float(np.median(known)) if known else 1.0)
     return round(float(np.clip(sigma, *_SIGMA_LIMITS_PX)), 3)
-
-
-def shrink(
-    pictures: Pictures, image: str, size_px: tuple[int, int]
-) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Colour and validity of a picture at a size (width, height)."""
-    return resize(pictures.colour(image), pictures.valid(image), size_px)
 
 
 def resize(

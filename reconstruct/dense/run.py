@@ -36,7 +36,6 @@ from reconstruct.dense.matching_trial import (
     Scales,
     choose_probes,
     find_scales,
-    ground_pixel,
     matching_scale,
     pixels_of,
     scale_for_cell,
@@ -74,6 +73,7 @@ from reconstruct.dense.views import (
     view_depth,
 )
 from reconstruct.light.solve import solve_light, write_light
+from reconstruct.mosaic.grid import mean_pixel
 from reconstruct.planes import PLANES, Plane, chosen_planes, plane_frame, write_plane
 from reconstruct.raster import (
     DemGrid,
@@ -380,7 +380,7 @@ def _scales(
         requested = reconstruct.dense_scale
         smallest = min(matching_scale(pixels_of(view), requested) for view in model.views)
         return Scales(depth=requested, matching=smallest)
-    finest = scale_for_cell(reconstruct.dem_cell_m, ground_pixel(model.views, points.of))
+    finest = scale_for_cell(reconstruct.dem_cell_m, mean_pixel(model))
     return find_scales(workspace, model.views, partners, points.of, finest, executor)
 
 

@@ -28,7 +28,7 @@ from reconstruct.dense.depth import (
     merge_depths,
     pair_depth,
 )
-from reconstruct.dense.matching_trial import match_sigma, resize, shrink, spread
+from reconstruct.dense.matching_trial import match_sigma, resize, spread
 from reconstruct.dense.points import block_bounds, points_of_pixels
 from reconstruct.dense.refine_depth import ComparedView, prepare, refine
 from reconstruct.dense.stereo_pairs import in_frame
@@ -84,7 +84,8 @@ def prepare_view(workspace: Path, task: ViewTask) -> None:
     if store.has(task.index, "low"):
         return
     size_px = view.pinhole.size_px
-    colour, valid = shrink(Pictures.open(workspace), view.image, size_px)
+    pictures = Pictures.open(workspace)
+    colour, valid = resize(pictures.colour(view.image), pictures.valid(view.image), size_px)
     store.save_colour(task.index, colour)
     store.save_mask(task.index, "valid", valid)
     store.save(task.index, "low", low_pass(colour, valid))

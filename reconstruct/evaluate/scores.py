@@ -33,6 +33,7 @@ from reconstruct.evaluate.figures import (
     spread,
 )
 from reconstruct.evaluate.truth import surface_depth, surface_distance, surface_material
+from reconstruct.mesh.visibility import ray_scene
 from reconstruct.raster import opened_raster
 
 GOOD_M = 0.01
@@ -231,12 +232,8 @@ def distance_from_mesh(vertices: Array, triangles: Array, points: Array) -> Arra
     import open3d as o3d
 
     centre = vertices.mean(axis=0)
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        o3d.core.Tensor((vertices - centre).astype(np.float32)),
-        o3d.core.Tensor(np.ascontiguousarray(triangles, dtype=np.uint32)),
-    )
-    found = scene.compute_distance(o3d.core.Tensor((points - centre).astype(np.float32)))
+    scene = ray_scene(vertices - centre, triangles.astype(np.int32))
+    found = scene.compute_distance(o3d.core.Tensor((points - centre).astype(np.float32)), 1)
     distance: Array = found.numpy().astype(np.float64)
     return distance
 

@@ -218,15 +218,19 @@ def low_pass(colour: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.
         colour: (H, W, 3).
         valid: (H, W); what is not is left out of all averages (0 where nothing is near).
     """
-    height, width = valid.shape
-    small = (LOW_WIDTH_PX, max(8, round(LOW_WIDTH_PX * height / width)))
-    weight = valid.astype(np.float32)
-    picture = colour.astype(np.float32) * weight[..., None]
-    total, weight = (
-        cv2.GaussianBlur(cv2.resize(p, small, interpolation=cv2.INTER_AREA), (0, 0), 1.0)
-        for p in (picture, weight)
+    size = (LOW_WIDTH_PX, max(8, round(LOW_WIDTH_PX * valid.shape[0] / valid.shape[1])))
+    return blur_valid(colour.astype(np.float32), valid.astype(np.float32), size)
+
+
+def blur_valid(
+    picture: NDArray[np.float32], weight: NDArray[np.float32], size: tuple[int, int]
+) -> NDArray[np.float32]:
+    """Weighted means of a picture (H, W, 3) around the pixels of a smaller one (w, h)."""
+    total, share = (
+        cv2.GaussianBlur(cv2.resize(part, size, interpolation=cv2.INTER_AREA), (0, 0), 1.0)
+        for part in (picture * weight[..., None], weight)
     )
-    low: NDArray[np.float32] = total / np.maximum(weight, 1e-3)[..., None]
+    low: NDArray[np.float32] = total / np.maximum(share, np.float32(1e-3))[..., None]
     return low
 
 
@@ -538,16 +542,27 @@ def _brightness(nodes: Array, camera_of: NDArray[np.int64], cameras: int) -> tup
     return found, known_gain
 
 
-def at_nodes(low: NDArray[np.float32]) -> Array:
+def at_nodes(
+    low: NDArray[np.float32],
+    limits: tuple[float, float] = (_DARKEST, _BRIGHTEST),
+    valid: NDArray[np.float32] | None = None,
+) -> Array:
     """Logarithm of a low-passed picture at the nodes, (rows, columns, 3); NaN where dark or burnt.
 
     The outermost nodes take what is shown a little inside of the edge.
+
+    Args:
+        low: the picture.
+        limits: levels beyond which it is dark or burnt.
+        valid: (h, w) share of each pixel that may be used; None for 1.
     """
     x, y = np.meshgrid(np.linspace(0.01, 0.99, GRID[1]), np.linspace(0.01, 0.99, GRID[0]))
     places = np.column_stack([x.ravel(), y.ravel()]).astype(np.float32)
     level = at_places(low, places).reshape(*GRID, 3).astype(np.float64)
-    usable = ((level > _DARKEST) & (level < _BRIGHTEST)).all(axis=-1, keepdims=True)
-    return np.where(usable, np.log(np.maximum(level, _DARKEST)), np.nan)
+    usable = ((level > limits[0]) & (level < limits[1])).all(axis=-1, keepdims=True)
+    if valid is not None:
+        usable &= at_places(valid[..., None], places, 1).reshape(*GRID, 1) > 0.5
+    return np.where(usable, np.log(np.maximum(level, limits[0])), np.nan)
 
 
 def _white(

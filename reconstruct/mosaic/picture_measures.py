@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from alice_survey.core.artefacts import atomic_path, read_csv
 from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.frames import Array
-from reconstruct.light.solve import GRID, at_places
+from reconstruct.light.solve import GRID, at_nodes, blur_valid
 from reconstruct.mosaic.exports import PictureFootprint, picture_footprint
 from reconstruct.mosaic.grid import Float32, footprints
 from reconstruct.mosaic.visibility import store_visible
@@ -138,7 +138,7 @@ def measure_picture(workspace: Path, folder: Path, view: View) -> PictureMeasure
         camera=view.camera,
         sharpness=fine / mean if mean > 0 else float("nan"),
         grey=bool((taken[..., 0] == green).all() and (taken[..., 2] == green).all()),
-        nodes=_broad_nodes(copy),
+        nodes=at_nodes(copy.broad, (DARKEST, BRIGHTEST), copy.valid),
         dark=_dark(taken, usable, table),
     )
 
@@ -155,15 +155,6 @@ def sharp_and_mean(grey: NDArray[np.uint8], usable: NDArray[np.bool_]) -> tuple[
     fine = np.abs(cv2.Laplacian(grey, cv2.CV_16S)[inner][chosen])
     count = max(len(fine), 1)
     return int(fine.sum(dtype=np.int64)) / count, int(grey[inner][chosen].sum()) / count
-
-
-def _broad_nodes(copy: SmallCopy) -> Array:
-    x, y = np.meshgrid(np.linspace(0.01, 0.99, GRID[1]), np.linspace(0.01, 0.99, GRID[0]))
-    places = np.column_stack([x.ravel(), y.ravel()]).astype(np.float32)
-    level = at_places(copy.broad, places).reshape(*GRID, 3).astype(np.float64)
-    valid = at_places(copy.valid[..., None], places, 1).reshape(*GRID, 1)
-    usable = well_exposed(level)[..., None] & (valid > 0.5)
-    return np.where(usable, np.log(np.maximum(level, DARKEST)), np.nan)
 
 
 def well_exposed(light: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
@@ -228,14 +219,7 @@ def read_small(folder: Path, image: str) -> SmallCopy:
 def _small_copy(content: NDArray[np.uint8]) -> SmallCopy:
     copy = SmallCopy(levels=content, broad=np.empty((0, 0, 3), np.float32))
     size = (max(8, content.shape[1] // _BROAD_STEP), max(8, content.shape[0] // _BROAD_STEP))
-    valid = copy.valid
-    parts = (copy.detail * valid[..., None], valid)
-    total, weight = (
-        cv2.GaussianBlur(cv2.resize(part, size, interpolation=cv2.INTER_AREA), (0, 0), 1.0)
-        for part in parts
-    )
-    broad: Float32 = total / np.maximum(weight, np.float32(1e-3))[..., None]
-    return SmallCopy(levels=content, broad=broad)
+    return replace(copy, broad=blur_valid(copy.detail, copy.valid, size))
 
 
 @small_cache()

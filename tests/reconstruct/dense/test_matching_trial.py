@@ -10,7 +10,6 @@ from alice_survey.core.frames import Array
 from reconstruct.dense.depth import enlarge
 from reconstruct.dense.matching_trial import (
     find_scales,
-    ground_pixel,
     scale_for_cell,
 )
 from reconstruct.dense.stereo_pairs import choose_partners
@@ -22,6 +21,7 @@ from reconstruct.dense.views import (
     refine_view,
     view_depth,
 )
+from reconstruct.mosaic.grid import mean_pixel
 from reconstruct.views.model import points_of_views, scaled_view
 from tests.oracles_dense import (
     Scene,
@@ -111,7 +111,7 @@ def test_enlarged_depth_of_a_plane_is_that_plane_and_unknown_stays_unknown():
 @pytest.mark.parametrize(("cell", "scale"), [(None, 1.0), (0.01, 1.0), (0.1, None), (9.0, 0.05)])
 def test_scale_follows_from_the_cell_that_is_wanted(survey, cell, scale):
     model = survey[1]
-    pixel = ground_pixel(model.views, points_of_views(model).__getitem__)
+    pixel = mean_pixel(model)
     assert pixel == pytest.approx(2.0 / model.views[0].pinhole.focal_px, rel=0.1)
     expected = 2.5 * pixel / 0.1 if scale is None else scale
     assert scale_for_cell(cell, pixel) == pytest.approx(expected)

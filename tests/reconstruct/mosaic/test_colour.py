@@ -27,7 +27,6 @@ IMAGES = [f"left/{n:02d}.png" for n in range(24)]
 FALL_OFF = np.array([0.45, 0.5, 0.9])
 """Blue, green, red, 1/m, spreading included."""
 MIDDLE_M = 2.0
-NODE_X, NODE_Y = np.meshgrid(np.linspace(0, 1, GRID[1]), np.linspace(0, 1, GRID[0]))
 
 
 def lamp(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -145,20 +144,13 @@ def test_a_card_makes_light_its_reflectance(wanted: Colour) -> None:
 def test_few_pictures_leave_the_haze_and_no_overlaps_leave_all() -> None:
     samples, facts = survey(0.4)
     full = solve_colour("water", samples, facts)
-    few = solve_colour("water", part(samples, np.all(samples.views < 8, axis=1)), facts[:8])
+    few = solve_colour("water", samples.part(np.all(samples.views < 8, axis=1)), facts[:8])
     assert few.water is not None
     assert (few.water.share == 0).all()
     assert set(few.notes) - set(full.notes)
-    alone = solve_colour("water", part(samples, np.zeros(len(samples.views), bool)), facts)
+    alone = solve_colour("water", samples.part(np.zeros(len(samples.views), bool)), facts)
     assert alone.water is None
     np.testing.assert_array_equal(alone.light.white, 1.0)
-
-
-def part(samples: LightSamples, chosen: np.ndarray) -> LightSamples:
-    return LightSamples(
-        views=samples.views[chosen], places=samples.places[chosen], levels=samples.levels[chosen],
-        ranges=None if samples.ranges is None else samples.ranges[chosen],
-    )  # fmt: skip
 
 
 def test_raw_changes_nothing() -> None:

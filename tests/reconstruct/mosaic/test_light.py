@@ -183,9 +183,7 @@ def test_samples_in_files_give_the_light_of_all_at_once(tmp_path):
     order = np.argsort(found.views[:, 0], kind="stable")
     files = []
     for number, chosen in enumerate(np.array_split(order, 4)):
-        part = LightSamples(
-            views=found.views[chosen], places=found.places[chosen], levels=found.levels[chosen]
-        )
+        part = found.part(chosen)
         files.append(tmp_path / f"{number}.npy")
         np.save(files[-1], as_rows(part))
     by_parts = [
