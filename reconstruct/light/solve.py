@@ -28,7 +28,7 @@ from typing import Any, Generic, TypeVar
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_array, csr_array
+from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.sparse.linalg import splu
 
 from alice_survey.core.artefacts import read_json, write_json
@@ -170,23 +170,13 @@ class LightModel:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LightEquations:
-    """Samples as equations: nodes @ x + gain of view 0 - gain of view 1 = target, N rows.
+    """Samples as equations: matrix @ (nodes, fall-off, gains) = target, N rows.
 
-    Views count among those of their part.
+    Gains are those of a part's own views.
     """
 
-    nodes: NDArray[np.int64]
-    """(N, 8) numbers of the nodes of both sides among all cameras'."""
-    weights: Array
-    """(N, 8) weights of those nodes, negative for the second side."""
-    farther: Array
-    """(N,) how much farther off the first view is."""
-    views: NDArray[np.int64]
-    """(N, 2) numbers of the two views."""
-    pair: NDArray[np.int64]
-    """(N,) row of `pairs`."""
-    pairs: NDArray[np.int64]
-    """(M, 2) views that share spots."""
+    matrix: csr_array
+    """(N, P + 1 + v), eleven entries a row."""
     target: Array
     """(N, 3) differences of logarithms."""
     misfit: Array
@@ -427,27 +417,28 @@ def _linear(
     """The equations of a part, which count in its own views (v,) of cameras (v,)."""
     item, own, camera_of = part
     samples = load(item)
-    size = GRID[0] * GRID[1]
+    size, count = GRID[0] * GRID[1], len(samples.views)
     views = np.searchsorted(own, samples.views)
-    sides = [node_weights(samples.places[:, side]) for side in range(2)]
-    number = [nodes + size * camera_of[views[:, n]][:, None] for n, (nodes, _) in enumerate(sides)]
-    farther = np.zeros(len(views))
+    columns, values = np.empty((count, 11), np.int64), np.empty((count, 11))
+    for side, sign in enumerate((1.0, -1.0)):
+        nodes, weights = node_weights(samples.places[:, side])
+        at = slice(4 * side, 4 * side + 4)
+        columns[:, at] = nodes + size * camera_of[views[:, side]][:, None]
+        values[:, at] = sign * weights
+    unknowns = cameras * size + 1
+    columns[:, 8], columns[:, 9:] = unknowns - 1, unknowns + views
+    values[:, 8:] = 0.0, 1.0, -1.0
     if samples.ranges is not None:
-        farther = (samples.ranges[:, 0] - samples.ranges[:, 1]).astype(np.float64)
-    keys, pair = np.unique(
-        views.min(axis=1) * len(own) + views.max(axis=1), return_inverse=True
-    )  # several times as quick as by rows
+        values[:, 8] = samples.ranges[:, 1].astype(np.float64) - samples.ranges[:, 0]
+    rows = np.arange(0, 11 * count + 1, 11)
     levels = samples.levels.astype(np.float64)
     unsure = 1.0 if samples.unsure is None else samples.unsure
     return LightEquations(
-        nodes=np.ascontiguousarray(np.concatenate(number, axis=1)),
-        weights=np.ascontiguousarray(np.concatenate([sides[0][1], -sides[1][1]], axis=1)),
-        farther=farther,
-        views=views,
-        pair=pair.ravel().astype(np.int64),
-        pairs=np.column_stack(np.divmod(keys, len(own))),
+        matrix=csr_array(
+            (values.ravel(), columns.ravel(), rows), shape=(count, unknowns + len(own))
+        ),
         target=levels[:, 0] - levels[:, 1],
-        misfit=np.full((len(levels), 3), _MISFIT) * unsure,
+        misfit=np.full((count, 3), _MISFIT) * unsure,
     )
 
 
@@ -644,92 +635,51 @@ def solve_robustly(
         priors: of every channel: what holds without samples.
     """
     unknowns, pictures = len(priors[0].right), len(priors[0].gain)
-    x, gains = np.zeros((unknowns, 3)), np.zeros((pictures, 3))
-    variance = np.full(3, np.inf)
+    size = unknowns + pictures
+    solution, variance = np.zeros((size, 3)), np.full(3, np.inf)
+    places = [np.concatenate([np.arange(unknowns), unknowns + own]) for own in views]
     for _ in range(_ROUNDS):
-        sums = _LightSums.zero(unknowns, pictures)
-        steps = ((x, gains[own]) for own in views)
-        for own, part in zip(views, parts.map(_sums_of_part, steps), strict=True):
-            sums.add(own, part)
+        normal, right = [csr_array((size, size)) for _ in priors], np.zeros((size, 3))
+        steps = (solution[place] for place in places)
+        for place, part in zip(places, parts.map(_sums_of_part, steps), strict=True):
+            for channel, (matrix, side) in enumerate(part):
+                entries = matrix.tocoo()
+                at = place[entries.row], place[entries.col]
+                normal[channel] = normal[channel] + csr_array((entries.data, at), (size, size))
+                right[place, channel] += side
         for channel, prior in enumerate(priors):
-            x[:, channel], gains[:, channel], variance[channel] = sums.solve(channel, prior)
-    return x, gains, variance
+            solution[:, channel], variance[channel] = _solve_channel(
+                normal[channel], right[:, channel], prior
+            )
+    return solution[:unknowns], solution[unknowns:], variance
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _LightSums:
-    """Normal equations of the three channels; see `normal_equations`."""
-
-    dense: Array
-    """(3, P + 1, P + 1)."""
-    mixed: Array
-    """(3, P + 1, V)."""
-    own: Array
-    """(3, V)."""
-    right: Array
-    """(3, P + 1)."""
-    right_gains: Array
-    """(3, V)."""
-    pairs: list[NDArray[np.int64]]
-    """(M, 2) of views, part by part."""
-    shared: list[Array]
-    """(3, M) of them."""
-
-    @classmethod
-    def zero(cls, unknowns: int, pictures: int) -> "_LightSums":
-        return cls(
-            dense=np.zeros((3, unknowns, unknowns)), mixed=np.zeros((3, unknowns, pictures)),
-            own=np.zeros((3, pictures)), right=np.zeros((3, unknowns)),
-            right_gains=np.zeros((3, pictures)), pairs=[], shared=[],
-        )  # fmt: skip
-
-    def add(self, views: NDArray[np.int64], part: "_LightSums") -> None:
-        """Add, in place, those of a part with views (v,) of its own."""
-        self.dense[:] += part.dense
-        self.mixed[:, :, views] += part.mixed
-        self.own[:, views] += part.own
-        self.right[:] += part.right
-        self.right_gains[:, views] += part.right_gains
-        self.pairs.extend(views[pairs] for pairs in part.pairs)
-        self.shared.extend(part.shared)
-
-    def solve(self, channel: int, prior: LightPrior) -> tuple[Array, Array, float]:
-        """Nodes and fall-off (P + 1,), gains (V,), and the variance of the fall-off."""
-        mixed = self.mixed[channel]
-        dense = self.dense[channel] + np.triu(self.dense[channel], 1).T + prior.patterns
-        right = self.right[channel] + prior.right
-        block = _gains_block(
-            self.own[channel] + prior.gain, np.concatenate(self.pairs),
-            np.concatenate([shared[channel] for shared in self.shared]),
-        )  # fmt: skip
-        sides = np.column_stack([mixed.T, self.right_gains[channel] + prior.gain_right])
-        solved = splu(block).solve(sides)
-        taken = csr_array(mixed) @ solved
-        last = np.zeros(len(right))
-        last[-1] = 1.0
-        both = solve_symmetric(dense - taken[:, :-1], np.column_stack([right - taken[:, -1], last]))
-        x, variance = both[:, 0], float(both[-1, 1])
-        return x, solved[:, -1] - (solved[:, :-1] * x).sum(axis=1), variance
+def _solve_channel(normal: csr_array, right: Array, prior: LightPrior) -> tuple[Array, float]:
+    """Nodes, fall-off and gains of a channel, and the variance of the fall-off."""
+    unknowns = len(prior.right)
+    mixed = normal[:unknowns, unknowns:]
+    block = splu(csc_array(normal[unknowns:, unknowns:] + diags_array(prior.gain)))
+    solved = block.solve(np.column_stack([mixed.T.toarray(), right[unknowns:] + prior.gain_right]))
+    taken = mixed @ solved
+    dense = normal[:unknowns, :unknowns].toarray() + prior.patterns - taken[:, :-1]
+    last = np.zeros(unknowns)
+    last[-1] = 1.0
+    ends = right[:unknowns] + prior.right - taken[:, -1]
+    both = solve_symmetric(dense, np.column_stack([ends, last]))
+    gains = solved[:, -1] - (solved[:, :-1] * both[:, 0]).sum(axis=1)
+    return np.concatenate([both[:, 0], gains]), float(both[-1, 1])
 
 
-def _sums_of_part(e: LightEquations, solution: tuple[Array, Array]) -> _LightSums:
-    x, gains = solution
-    channels = [
-        normal_equations(
-            e.nodes, e.weights, e.farther, e.views, e.pair, len(e.pairs),
-            np.ascontiguousarray(e.target[:, channel]), np.ascontiguousarray(x[:, channel]),
-            np.ascontiguousarray(gains[:, channel]), np.ascontiguousarray(e.misfit[:, channel]),
-            SAMPLES_PER_FACT,
-        )
-        for channel in range(3)
-    ]  # fmt: skip
-    dense, mixed, own, shared, right, right_gains = (
-        np.stack(values) for values in zip(*channels, strict=True)
-    )
-    return _LightSums(
-        dense=dense, mixed=mixed, own=own, right=right, right_gains=right_gains, pairs=[e.pairs],
-        shared=[shared],
-    )  # fmt: skip
+def _sums_of_part(e: LightEquations, solution: Array) -> list[tuple[csr_array, Array]]:
+    """Normal matrix and right side of every channel, reweighted at a solution."""
+    found = []
+    for channel in range(3):
+        target, misfit = e.target[:, channel], e.misfit[:, channel]
+        rest = np.abs(target - e.matrix @ solution[:, channel])
+        weight = 1.0 / (np.maximum(rest, misfit) * misfit * SAMPLES_PER_FACT)
+        weighted = (diags_array(weight) @ e.matrix).T
+        found.append(((weighted @ e.matrix).tocsr(), weighted @ target))
+    return found
 
 
 # numpy's solvers start threads that wait for each other: on a busy machine these small systems then
@@ -760,66 +710,3 @@ def solve_symmetric(matrix: Array, right: Array) -> Array:
                 total -= lower[k, i] * found[k, m]
             found[i, m] = total / lower[i, i]
     return found
-
-
-def _gains_block(own: Array, pairs: NDArray[np.int64], shared: Array) -> csc_array:
-    a, b = pairs.T
-    every = np.arange(len(own))
-    values = np.concatenate([own, -shared, -shared])
-    rows, columns = np.concatenate([every, a, b]), np.concatenate([every, b, a])
-    return csc_array((values, (rows, columns)), shape=(len(own), len(own)))
-
-
-@compiled
-def normal_equations(
-    nodes: NDArray[np.int64], weights: Array, farther: Array, views: NDArray[np.int64],
-    pair: NDArray[np.int64], pairs: int, target: Array, x: Array, gains: Array, misfit: Array,
-    per_fact: float,
-) -> tuple[Array, Array, Array, Array, Array, Array]:  # fmt: skip
-    """Sums over samples, reweighted at a solution.
-
-    Args:
-        nodes: see `LightEquations`, as all up to `pair`.
-        weights: as above.
-        farther: as above.
-        views: as above.
-        pair: as above.
-        pairs: how many there are.
-        target: (N,).
-        x: (P + 1,) solution so far.
-        gains: (V,).
-        misfit: see `solve_robustly`.
-        per_fact: see above.
-
-    Returns:
-        Upper triangle of the patterns' normal matrix (P + 1, P + 1), the part they share with
-        gains (P + 1, V), the gains' diagonal (V,), minus their other entries by pair, and the
-        right sides (P + 1,) and (V,).
-    """
-    unknowns, pictures = len(x), len(gains)
-    dense, mixed = np.zeros((unknowns, unknowns)), np.zeros((unknowns, pictures))
-    own, shared = np.zeros(pictures), np.zeros(pairs)
-    right, right_gains = np.zeros(unknowns), np.zeros(pictures)
-    at, slope = np.empty(9, np.int64), np.empty(9)
-    for n in range(len(target)):
-        first, second = views[n, 0], views[n, 1]
-        at[:8], slope[:8] = nodes[n], weights[n]
-        at[8], slope[8] = unknowns - 1, -farther[n]
-        rest = target[n] - gains[first] + gains[second]
-        for i in range(9):
-            rest -= slope[i] * x[at[i]]
-        weight = 1.0 / (max(abs(rest), misfit[n]) * misfit[n] * per_fact)
-        for i in range(9):
-            value = weight * slope[i]
-            right[at[i]] += value * target[n]
-            mixed[at[i], first] += value
-            mixed[at[i], second] -= value
-            for j in range(9):
-                if at[j] >= at[i]:
-                    dense[at[i], at[j]] += value * slope[j]
-        own[first] += weight
-        own[second] += weight
-        shared[pair[n]] += weight
-        right_gains[first] += weight * target[n]
-        right_gains[second] -= weight * target[n]
-    return dense, mixed, own, shared, right, right_gains
