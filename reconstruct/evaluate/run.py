@@ -150,9 +150,10 @@ def run_evaluate(workspace: Path, folder: Path, executor: Executor, *, seed: int
     cameras = score_cameras(read_track_poses(sparse / "track.csv"), poses, total)
     moved = cameras.truth_from_world
     pixel_m = ground_pixel_m(rig, {r.image: r.camera for r in records}, poses, terrain)
-    surface = score_surface(elevation_in(dense), area, terrain, moved, pixel_m)
+    heights = elevation_in(dense)
+    surface = score_surface(heights, area, terrain, moved, pixel_m)
     mosaic, texture = workspace / "mosaic" / "mosaic.tif", survey_texture(seed)
-    painted = score_mosaic(mosaic, dense / "dem.tif", area, terrain, texture, moved)
+    painted = score_mosaic(mosaic, heights, area, terrain, texture, moved)
     rng = np.random.default_rng([seed, _SEED_STREAM])
     score: dict[str, Any] = {
         "cameras": cameras.to_json(),

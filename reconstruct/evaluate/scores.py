@@ -281,7 +281,7 @@ class MosaicScore:
 @progress.step("score the mosaic")
 def score_mosaic(
     mosaic: Path,
-    dem: Path,
+    surface: Elevation,
     area: MultiPolygon,
     terrain: Terrain,
     texture: Texture,
@@ -291,7 +291,7 @@ def score_mosaic(
 
     Args:
         mosaic: colour and a last band that is 0 where nothing is known, over local east and north.
-        dem: heights the mosaic lies on, positive up.
+        surface: that the mosaic lies on.
         area: the survey area, x north and y east.
         terrain: true shape.
         texture: true reflectance.
@@ -300,7 +300,7 @@ def score_mosaic(
     area = area_in_world(area, terrain, truth_from_world)
     half = _PATCH_PX // 2 - 1
     shapely.prepare(area)
-    with opened_raster(mosaic) as source, opened_raster(dem) as heights:
+    with opened_raster(mosaic) as source:
         transform = source.transform
         windows = _patches(source.height, source.width, transform, area)
         shifts, middles, true_places = [], [], []
@@ -308,7 +308,7 @@ def score_mosaic(
             picture = source.read(window=window)
             if picture[-1].min() == 0:
                 continue
-            points = _points(window, transform, heights)
+            points = _points(window, transform, surface)
             if points is None:
                 continue
             places = truth_from_world.apply(points)[:, :2]
@@ -360,24 +360,13 @@ def _patches(rows: int, columns: int, transform: Any, area: MultiPolygon) -> lis
     return windows
 
 
-def _points(window: Window, transform: Any, heights: Any) -> Array | None:
+def _points(window: Window, transform: Any, surface: Elevation) -> Array | None:
     """World points, (pixels, 3), of a window's pixels on the DEM; None where it has a hole."""
     rows, columns = np.mgrid[: window.height, : window.width] + 0.5
-    east = transform.c + (window.col_off + columns) * transform.a
-    north = transform.f + (window.row_off + rows) * transform.e
-    inverse = ~heights.transform
-    column, row = inverse * (east.mean(), north.mean())
-    half = int(np.ceil(_PATCH_PX * transform.a / heights.transform.a / 2)) + 2
-    part = Window(int(column) - half, int(row) - half, 2 * half, 2 * half)
-    tile = heights.read(1, window=part, boundless=True, fill_value=np.nan)
-    if not np.isfinite(tile).all():
-        return None
-    x, y = inverse * (east.ravel(), north.ravel())
-    maps = [
-        np.float32(v - o - 0.5).reshape(1, -1) for v, o in ((x, part.col_off), (y, part.row_off))
-    ]
-    height = cv2.remap(tile, *maps, cv2.INTER_LINEAR).ravel().astype(np.float64)
-    return np.column_stack([north.ravel(), east.ravel(), -height])
+    east = transform.c + (window.col_off + columns.ravel()) * transform.a
+    north = transform.f + (window.row_off + rows.ravel()) * transform.e
+    height = surface.at(surface.height, np.column_stack([east, north]))
+    return np.column_stack([north, east, -height]) if np.isfinite(height).all() else None
 
 
 def _true_reflectance(terrain: Terrain, texture: Texture, places: Array, pixel_m: float) -> Array:

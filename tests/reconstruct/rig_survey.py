@@ -224,9 +224,10 @@ def score(workspace: Path, lines: int = LINES) -> RigScore:
 
     moved = cameras.truth_from_world
     dense = workspace / "dense"
-    surface = score_surface(elevation_in(dense), area(lines), terrain, moved, pixel_m)
+    heights = elevation_in(dense)
+    surface = score_surface(heights, area(lines), terrain, moved, pixel_m)
     mosaic = score_mosaic(
-        workspace / "mosaic" / "mosaic.tif", dense / "dem.tif", area(lines), terrain,
+        workspace / "mosaic" / "mosaic.tif", heights, area(lines), terrain,
         scene().texture, moved,
     )  # fmt: skip
     return RigScore(cameras=cameras, surface=surface, mosaic=mosaic, pixel_m=pixel_m)

@@ -12,6 +12,7 @@ from shapely.geometry import MultiPolygon, box
 from alice_survey.core.config import SeafloorConfig
 from alice_survey.sim.seafloor.terrain import Terrain, build_terrain
 from alice_survey.sim.seafloor.texture import Texture, survey_texture
+from reconstruct.elevation import Elevation
 from reconstruct.evaluate.figures import compare_lengths
 from reconstruct.evaluate.scores import score_mosaic
 from reconstruct.evaluate.truth import surface_material
@@ -30,7 +31,7 @@ def floor() -> tuple[Terrain, Texture]:
 
 def write(
     folder: Path, floor: tuple[Terrain, Texture], off_m: tuple[float, float], scale: float = 1.0
-) -> tuple[Path, Path]:
+) -> tuple[Path, Elevation]:
     """Mosaic and elevation model whose content lies `off_m` (east, north) of where it should."""
     terrain, texture = floor
     folder.mkdir(parents=True, exist_ok=True)
@@ -48,9 +49,9 @@ def write(
     }  # fmt: skip
     with rasterio.open(folder / "mosaic.tif", "w", count=4, dtype="uint8", **profile) as target:
         target.write(np.concatenate([picture, np.full((1, SIDE, SIDE), 255, np.uint8)]))
-    with rasterio.open(folder / "dem.tif", "w", count=1, dtype="float32", **profile) as target:
-        target.write(-scale * points[:, 2].reshape(SIDE, SIDE).astype(np.float32), 1)
-    return folder / "mosaic.tif", folder / "dem.tif"
+    height = -scale * points[:, 2].reshape(SIDE, SIDE)
+    surface = Elevation(height=height, sigma=0 * height, west=0.0, north=1.4, cell=PIXEL)
+    return folder / "mosaic.tif", surface
 
 
 def test_a_shift_is_measured_in_length_and_pixels(
