@@ -158,7 +158,7 @@ def test_boxes_of_an_atlas_do_not_overlap():
         placed = corner[:, 0] >= 0
         assert placed.sum() >= fit
         assert ((corner[placed] >= 0) & ((corner + boxes)[placed] <= side)).all()
-        assert not boxes_overlap(corner[placed], boxes[placed])
+        assert not boxes_overlap(*(one[placed].astype(float) for one in (corner, boxes)))
 
 
 def test_decimation_keeps_planes_outlines_and_locked_vertices():
