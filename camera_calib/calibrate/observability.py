@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.block_solver import inverse_of
@@ -40,10 +39,6 @@ _ROWS, _COLUMNS = ("top", "middle", "bottom"), ("far left", "left", "right", "fa
 _MIN_TILT = math.radians(8.0)
 """Root mean square lean of the target about each axis, from its mean."""
 _MIN_RANGE_RATIO = 1.4
-_ALIKE = 0.99
-_LENS_ONLY = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
-_FOCAL = ("fx_px", "fy_px")
-_WATER = ("n_water",)
 _USEFUL = {
     "fx_px": (0.005, "of the focal length", "more views at 20 to 40 degrees of tilt"),
     "fy_px": (0.005, "of the focal length", "more views at 20 to 40 degrees of tilt"),
@@ -168,7 +163,6 @@ def advice(
         lines += _ranges(rig_from_target)
     if rig.covariance is not None:
         lines += _loose(rig, rig.covariance)
-        lines += _alike(rig.covariance)
     return tuple(lines)
 
 
@@ -231,28 +225,4 @@ def _loose(rig: Rig, covariance: Covariance) -> list[str]:
                 f"{camera}.port_distance_m ended at 0, its least: hold it, or hold the intrinsics "
                 "of a calibration in air"
             )
-    return lines
-
-
-def _alike(covariance: Covariance) -> list[str]:
-    """One line for each group of parameters of which only the sum is determined."""
-    strong = np.abs(covariance.correlation) > _ALIKE
-    names = covariance.parameters
-    fields = [name.split(".")[1] for name in names]
-    for kin in (_LENS_ONLY, _FOCAL, _WATER):  # always alike, and never used apart
-        at = [i for i, field in enumerate(fields) if field in kin]
-        strong[np.ix_(at, at)] = False
-    count, group_of = connected_components(strong, directed=False)
-    groups = [np.flatnonzero(group_of == group).tolist() for group in range(count)]
-    lines = []
-    for together in groups:
-        if len(together) < 2:
-            continue
-        both = np.abs(covariance.correlation[np.ix_(together, together)])
-        np.fill_diagonal(both, 0.0)
-        lines.append(
-            f"{', '.join(names[i] for i in together)} go together (correlation {both.max():.4f}) "
-            "and are not known one by one: tilt the target more, fill the frame's corners, or hold "
-            "some of them"
-        )
     return lines
