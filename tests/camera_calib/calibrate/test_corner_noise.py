@@ -1,5 +1,7 @@
 """Sigmas that cover what residuals show, whatever the board and its corners are like."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -17,6 +19,7 @@ from camera_calib.calibrate.normal_equations import CalibrationProblem
 from camera_calib.calibrate.solve import recalibrate
 from camera_calib.calibration import TargetView, stack_views
 from camera_calib.freedom import Freedom, of_ports, pose_names
+from camera_calib.judge.judgement import judge, verdicts
 from camera_calib.judge.validation import halves_agreement
 from camera_calib.target_shape import usual_shape
 from tests.camera_calib.calibration_scenes import board, board_poses, built_rig, views_of
@@ -75,6 +78,19 @@ def test_sigmas_cover_the_errors_of_a_few_calibrations() -> None:
     case = run_case("correlated, bow 0.25 mm", range(12), SERIAL)
     assert 0.7 < float(np.sqrt(np.mean(np.square(case.by_sigma)))) < 1.35
     assert case.fx_as_drawn_rms_px > 1.5 * case.fx_rms_px
+
+
+def test_an_uneven_print_is_found_with_its_size_and_stated() -> None:
+    sizes = []
+    for seed in range(3):
+        found = run_trial(seed, replace(TARGETS["correlated"], place_m=6e-5))
+        assert found.spread is not None
+        sizes.append(found.spread.noise.place_sigmas_m[0])
+        (said,) = [v for v in verdicts(judge(found, None)) if "off their places" in v.text]
+        assert said.level == "look"
+    assert np.sqrt(np.mean(np.square(sizes))) == pytest.approx(6e-5, rel=0.25)
+    even = verdicts(judge(run_trial(0, TARGETS["sound"]), None))
+    assert [v.level for v in even if "off their places" in v.text] == ["good"]
 
 
 @pytest.mark.slow

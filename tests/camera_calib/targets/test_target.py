@@ -215,3 +215,10 @@ def test_symmetries_are_those_that_keep_the_picture(text: str, count: int) -> No
             assert np.linalg.norm(after[i] - after[0]) == pytest.approx(
                 np.linalg.norm(before[i] - before[0])
             )
+
+
+def test_tags_count_from_the_bottom_left() -> None:
+    target = parse_target("apriltag 5x4 88mm 0.3")
+    step = 1.3 * 0.088
+    x, y = np.meshgrid(step * np.arange(5), step * np.arange(4)[::-1])
+    np.testing.assert_allclose(target.marker_places, np.column_stack([x.ravel(), y.ravel()]))
