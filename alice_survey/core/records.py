@@ -184,9 +184,6 @@ class ScaleOfPairs(JsonRecord):
     mean: float
     """1 when they agree."""
     mean_sigma: float
-    range: float = 0.0
-    """Largest minus smallest value of the fitted paraboloid over the stations."""
-    range_sigma: float = 0.0
 
 
 class DomingRecord(JsonRecord):

@@ -13,7 +13,7 @@ from itertools import combinations
 
 import numpy as np
 import pycolmap
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.block_solver import CAUCHY_TUNING, MAD_TO_SIGMA
 from alice_survey.core.errors import warn
@@ -33,7 +33,7 @@ from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.working_range import ray_passes
 from reconstruct.matching.pairs import positions_ned
 from reconstruct.pictures.files import list_names
-from reconstruct.placing.alignment import MIN_STATIONS, align_rigid, quadratic
+from reconstruct.placing.alignment import MIN_STATIONS, align_rigid
 from reconstruct.placing.navigation import body_from_pinhole
 from reconstruct.views.model_files import as_transform
 
@@ -50,14 +50,11 @@ _FIT_ROUNDS = 10
 _MIN_STEREO_POINTS = 20
 
 
-def measure_doming(
-    model: pycolmap.Reconstruction, rotations: Mapping[int, Rotation], bends: Sequence[BendRecord]
-) -> DomingRecord:
+def measure_doming(model: pycolmap.Reconstruction, bends: Sequence[BendRecord]) -> DomingRecord:
     """Bring together how bent a model is, and warn where that is significant.
 
     Args:
         model: in metres; picture i has the id i + 1.
-        rotations: `ned_from_pinhole` by picture's index, as navigation has it.
         bends: along and across, as navigation shows them.
     """
     seen = observations(model)
@@ -76,48 +73,28 @@ def measure_doming(
     return DomingRecord(
         along=along,
         across=across,
-        scale=scale_trend(model, seen, first_pictures(model), down_of(model, rotations)),
+        scale=scale_of_pairs(model, seen),
         notes=tuple(notes),
         pixel_m=pixel_m if np.isfinite(pixel_m) else None,
     )
 
 
-def scale_trend(
-    model: pycolmap.Reconstruction, seen: Observed, reference: Mapping[int, int], down: Array
-) -> ScaleOfPairs | None:
-    """The model's scale at every station against that station's stereo, as a trend over the block.
+def scale_of_pairs(model: pycolmap.Reconstruction, seen: Observed) -> ScaleOfPairs | None:
+    """The model's scale against the stereo of each station, as a mean over all.
 
     Args:
         model: on one rig.
         seen: its observations.
-        reference: picture by frame.
-        down: (3,) unit vector in the model's frame.
 
     Returns:
         None where too few stations have points that two of their cameras show.
     """
-    local = [
-        (model.images[reference[frame]].projection_center(), *given)
-        for frame in sorted(reference)
-        if (given := _station_scale(model, seen, frame)) is not None
-    ]
+    frames = sorted(first_pictures(model))
+    local = [given for f in frames if (given := _station_scale(model, seen, f)) is not None]
     if len(local) < MIN_STATIONS:
         return None
-    centres = np.array([row[0] for row in local])
-    scale, sigma = np.array([row[1:] for row in local]).T
-    design = _quadratic(centres, down)
-    if not np.linalg.matrix_rank(design) == design.shape[1] < len(design):
-        return None
-    fitted, covariance = _robust_fit(design, scale, sigma)
-    values = design @ fitted
-    between = design[np.argmax(values)] - design[np.argmin(values)]
-    mean, mean_cov = _robust_fit(np.ones((len(scale), 1)), scale, sigma)
-    return ScaleOfPairs(
-        mean=float(mean[0]),
-        mean_sigma=float(np.sqrt(mean_cov[0, 0])),
-        range=float(np.ptp(values)),
-        range_sigma=float(np.sqrt(between @ covariance @ between)),
-    )
+    mean, sigma = _robust_mean(*np.array(local).T)
+    return ScaleOfPairs(mean=mean, mean_sigma=sigma)
 
 
 def pinhole_positions(
@@ -149,20 +126,6 @@ def pinhole_positions(
     return positions, sigmas
 
 
-def down_of(model: pycolmap.Reconstruction, rotations: Mapping[int, Rotation]) -> Array:
-    """Down in the model's frame: by navigation's attitudes, else the mean way that cameras look."""
-    posed = [n for n in sorted(model.images) if model.images[n].has_pose]
-    given = [n for n in posed if n - 1 in rotations]
-    rows = [
-        model.images[n].cam_from_world().matrix()[:, :3].T
-        @ (rotations[n - 1].inv().apply([0.0, 0.0, 1.0]) if given else [0.0, 0.0, 1.0])
-        for n in given or posed
-    ]
-    mean = np.median(np.array(rows), axis=0)
-    unit: Array = mean / np.linalg.norm(mean)
-    return unit
-
-
 def ground_pixel(model: pycolmap.Reconstruction, seen: Observed) -> float:
     """Median size of a pixel on the ground, in units of the model; NaN without points."""
     rows = []
@@ -173,28 +136,17 @@ def ground_pixel(model: pycolmap.Reconstruction, seen: Observed) -> float:
     return float(np.median(rows)) if rows else float("nan")
 
 
-def _quadratic(centres: Array, down: Array) -> Array:
-    """Columns of a paraboloid over places (N, 3) in the plane across `down`."""
-    side = np.cross(down, np.eye(3)[np.argmin(np.abs(down))])
-    side /= np.linalg.norm(side)
-    return quadratic(centres @ np.column_stack([side, np.cross(down, side)]))[0]
-
-
-def _robust_fit(design: Array, values: Array, sigmas: Array) -> tuple[Array, Array]:
-    """Coefficients and their covariance."""
-    weight = np.ones(len(values))
+def _robust_mean(values: Array, sigmas: Array) -> tuple[float, float]:
+    """Mean of values (N,) of such sigmas by Cauchy's weights, and its sigma."""
+    weight, mean, left = np.ones(len(values)), 0.0, values
     for _ in range(_FIT_ROUNDS):
-        root = np.sqrt(weight) / sigmas
-        fitted = np.linalg.lstsq(root[:, None] * design, root * values, rcond=None)[0]
-        left = (values - design @ fitted) / sigmas
+        mean = float(np.average(values, weights=weight / sigmas**2))
+        left = (values - mean) / sigmas
         spread = max(MAD_TO_SIGMA * float(np.median(np.abs(left))), 1e-12)
         weight = np.asarray(1.0 / (1.0 + (left / (CAUCHY_TUNING * spread)) ** 2), np.float64)
-    free = len(values) - design.shape[1]
-    root = np.sqrt(weight) / sigmas
-    variance = float((weight * left**2).sum() / max(weight.sum() * free / len(values), 1e-12))
-    normal = (root[:, None] * design).T @ (root[:, None] * design)
-    covariance = np.asarray(np.linalg.inv(normal) * max(1.0, variance), np.float64)
-    return np.asarray(fitted, np.float64), covariance
+    free = weight.sum() * (len(values) - 1) / len(values)
+    variance = float((weight * left**2).sum() / max(free, 1e-12))
+    return mean, float(np.sqrt(max(1.0, variance) / (weight / sigmas**2).sum()))
 
 
 def _station_scale(
@@ -254,17 +206,10 @@ def judge_model(
         bends: along and across, as navigation shows them.
     """
     positions = sigmas = np.full((len(records), 3), np.nan)
-    rotations: dict[int, Rotation] = {}
-    if rig.body_from_rig is not None:
+    if rig.body_from_rig is not None and datum is not None:
         mounts = body_from_pinhole(rig, mapped.warps)
-        rotations = {
-            i: r.ned_from_body * mounts[r.camera].rotation
-            for i, r in enumerate(records)
-            if r.has_attitude
-        }
-        if datum is not None:
-            positions, sigmas = pinhole_positions(records, mounts, datum)
-    doming = measure_doming(mapped.model, rotations, bends)
+        positions, sigmas = pinhole_positions(records, mounts, datum)
+    doming = measure_doming(mapped.model, bends)
     # What adjustments made of the rig, before its size was put back.
     rig_error = model_baseline(mapped.model) / (mapped.baseline * mapped.rig_factor) - 1.0
     accepted = check_mapping(mapped.model, records, positions, sigmas, rig_error, doming.scale)

@@ -118,7 +118,7 @@ def test_any_number_of_unlike_cameras_map_to_the_same_truth(names: tuple[str, ..
     assert 0.02e-3 < camera_rms(mapped, scene) < 1e-3
     found, true = pupils(mapped, scene)
     assert abs(align_similarity(found, true).scale - 1.0) < 5e-4
-    trend = measure_doming(mapped.model, {}, ()).scale
+    trend = measure_doming(mapped.model, ()).scale
     assert trend is not None
     assert trend.mean == pytest.approx(1.0, abs=1e-3)
 

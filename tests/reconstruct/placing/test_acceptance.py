@@ -9,12 +9,11 @@ from alice_survey.core.records import ScaleOfPairs
 from reconstruct.mapping.arrays import observations
 from reconstruct.placing.acceptance import (
     check_mapping,
-    down_of,
     ground_pixel,
     measure_doming,
     navigation_residuals,
     pinhole_positions,
-    scale_trend,
+    scale_of_pairs,
 )
 from reconstruct.placing.alignment import bend_of
 from reconstruct.placing.navigation import body_from_pinhole
@@ -96,39 +95,30 @@ def test_a_significant_bend_is_reported_and_a_small_one_is_not(
     capsys.readouterr()  # of a slow machine's progress
     large = bend_of(curvature_per_m=0.05, sigma_per_m=1e-3, length_m=4.0)
     small = bend_of(curvature_per_m=1e-4, sigma_per_m=1e-4, length_m=2.0)
-    straight = measure_doming(mapped.model, {}, (small, small))
+    straight = measure_doming(mapped.model, (small, small))
     assert straight.notes == ()
     assert not capsys.readouterr().err
     focal = mapped.warps["left"].pinhole.focal_px
     assert straight.pixel_m == pytest.approx(ALTITUDE_M / focal, rel=0.1)
-    found = measure_doming(mapped.model, {}, (large, small))
+    found = measure_doming(mapped.model, (large, small))
     assert found.along == large and found.across == small
     assert "bent along the block: +100.0 +/- 2.0 mm over 4.0 m" in found.notes[0]
     assert len(capsys.readouterr().err.splitlines()) == len(found.notes) == 1
 
 
-def test_the_scale_shows_a_model_that_stretches_along_the_block() -> None:
-    """Every station scaled about its own place, by 1 % more at one end than at the other."""
+def test_the_scale_shows_a_model_whose_depths_are_stretched() -> None:
+    """Points 1 % farther from the cameras than each station's own stereo has them."""
     mapped = block_mapped()
     model = pycolmap.Reconstruction(mapped.model)
-    down = down_of(model, {})
-    reference = {}
-    for n in sorted(model.images):
-        reference.setdefault(model.images[n].frame_id, n)
-    before = scale_trend(model, observations(model), reference, down)
+    before = scale_of_pairs(model, observations(model))
     assert before is not None
-    assert before.range < 4 * before.range_sigma + 1e-3
-    centres = np.array([model.images[n].projection_center() for n in sorted(model.images)])
-    middle = centres.mean(axis=0)
-    axis = np.linalg.svd(centres - middle)[2][0]
-    span = np.ptp((centres - middle) @ axis)
-    height = float(np.mean(centres @ down)) + ALTITUDE_M
+    assert abs(before.mean - 1.0) < 4 * before.mean_sigma + 1e-4
+    down = np.median([i.cam_from_world().matrix()[2, :3] for i in model.images.values()], axis=0)
+    height = np.median([i.projection_center() @ down for i in model.images.values()])
     for point in model.points3D.values():
-        share = (point.xyz - middle) @ axis / span
-        above = float(point.xyz @ down) - (height - ALTITUDE_M)
-        point.xyz = point.xyz + 0.01 * share * above * down
-    after = scale_trend(model, observations(model), reference, down)
+        point.xyz = point.xyz + 0.01 * (point.xyz @ down - height) * down
+    after = scale_of_pairs(model, observations(model))
     assert after is not None
-    assert after.range == pytest.approx(0.01, rel=0.25)
-    assert after.range > 3 * after.range_sigma
+    assert after.mean == pytest.approx(1.01 * before.mean, abs=4e-4)
+    assert after.mean - 1.0 > 3 * after.mean_sigma
     assert ground_pixel(model, observations(model)) > 0
