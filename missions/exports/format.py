@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -123,11 +124,10 @@ class Export:
             for point in self.dives[dive]
         ]
         rate_rad_s = self.options.turn_rate_rad_s
-        return mission_items(self.plan, points, self.tolerance_m, rate_rad_s)
+        return list(mission_items(self.plan, points, self.tolerance_m, rate_rad_s))
 
 
-@dataclass(frozen=True, kw_only=True)
-class ExportFile:
+class ExportFile(NamedTuple):
     """A file of a format."""
 
     name: str

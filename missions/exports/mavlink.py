@@ -39,20 +39,6 @@ class Item:
     longitude, degrees, and altitude, metres."""
 
 
-def mission_items(
-    plan: Plan, points: Sequence[Waypoint], tolerance_m: float, turn_rate_rad_s: float
-) -> list[Item]:
-    """All items of a dive, without home.
-
-    Args:
-        plan: what the dive is of.
-        points: the dive's way-points.
-        tolerance_m: how near to pass; ArduSub takes its parameter WPNAV_RADIUS instead.
-        turn_rate_rad_s: of turns on the spot.
-    """
-    return list(_items(plan, points, tolerance_m, math.degrees(turn_rate_rad_s)))
-
-
 def trigger_m(plan: Plan, line: int) -> float:
     """Distance from picture to picture, at least 0.1 mm short so that a line's last is not lost."""
     requested = plan.lines[line]
@@ -61,9 +47,18 @@ def trigger_m(plan: Plan, line: int) -> float:
     return (math.ceil(requested.length_m / (requested.stations - 1) * 1e4 - 1e-6) - 1) / 1e4
 
 
-def _items(
-    plan: Plan, points: Sequence[Waypoint], tolerance_m: float, rate_deg_s: float
+def mission_items(
+    plan: Plan, points: Sequence[Waypoint], tolerance_m: float, turn_rate_rad_s: float
 ) -> Iterator[Item]:
+    """All items of a dive, without home.
+
+    Args:
+        plan: what the dive is of.
+        points: the dive's way-points.
+        tolerance_m: how near to pass; ArduSub takes its parameter WPNAV_RADIUS instead.
+        turn_rate_rad_s: of turns on the spot.
+    """
+    rate_deg_s = math.degrees(turn_rate_rad_s)
     speed = _command(DO_CHANGE_SPEED, 1, plan.speed_mps, -1)  # over ground; throttle as it is
     yield speed
     heading_deg = math.degrees(points[0].heading_rad)
@@ -138,7 +133,7 @@ def item_of(command: Any, frame: Any, params: Sequence[Any], where: str) -> Item
 def mission_of(items: Sequence[Item]) -> Mission:
     """Items as ArduSub flies them.
 
-    `CONDITION_YAW` counts only as the second command after a way-point (see `_items`).
+    `CONDITION_YAW` counts only as the second command after a way-point (see `mission_items`).
 
     Raises:
         ValueError: a command or a frame is not one that ArduSub flies, or a way-point comes before

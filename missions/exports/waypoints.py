@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import shapely
@@ -56,8 +56,7 @@ class Waypoint:
     """How long to stay: to turn and to settle; 0 where it flies on."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Point:
+class _Point(NamedTuple):
     kind: Kind
     place_ne_m: tuple[float, float]
     heading_rad: float
@@ -124,63 +123,38 @@ def _points(
 ) -> Iterator[_Point]:
     """Where each leg leads, in order."""
     legs = dive.route.legs
-    first = legs[0]
-    yield _Point(
-        kind="descend",
-        place_ne_m=first.start_ne_m,
-        heading_rad=first.heading_rad + first.side_rad,
-        line=-1,
-    )
+    first, last = legs[0], legs[-1]
+    yield _Point("descend", first.start_ne_m, first.heading_rad + first.side_rad)
     for index, leg in enumerate(legs):
         following = legs[index + 1] if index + 1 < len(legs) else None
         heading = leg.end_heading_rad + leg.side_rad
         if leg.length_m <= _TINY_M:
             if leg.turn_rad:
                 hold_s = abs(leg.turn_rad) / turn_rate_rad_s + SETTLE_S
-                yield _Point(
-                    kind="turn", place_ne_m=leg.start_ne_m, heading_rad=heading, hold_s=hold_s
-                )
+                yield _Point("turn", leg.start_ne_m, heading, hold_s=hold_s)
         elif leg.line >= 0:
             depths = None if line_depths is None else line_depths[leg.line]
             yield from _line_points(plan, leg, depths)
         elif leg.side_rad:
-            yield _Point(
-                kind="sway",
-                place_ne_m=leg.end_ne_m,
-                heading_rad=heading,
-                hold_s=SETTLE_S,
-            )
+            yield _Point("sway", leg.end_ne_m, heading, hold_s=SETTLE_S)
         elif leg.curvature_per_m:
             yield from _arc_points(leg)
         else:
             kind: Kind = "run-in" if _leads_to_line(leg, following) else "way"
-            yield _Point(kind=kind, place_ne_m=leg.end_ne_m, heading_rad=heading)
-    last = legs[-1]
-    yield _Point(
-        kind="surface",
-        place_ne_m=last.end_ne_m,
-        heading_rad=last.end_heading_rad + last.side_rad,
-    )
+            yield _Point(kind, leg.end_ne_m, heading)
+    yield _Point("surface", last.end_ne_m, last.end_heading_rad + last.side_rad)
 
 
 def _line_points(plan: Plan, leg: Leg, depths: Array | None) -> Iterator[_Point]:
     """The end of a line, and places before it where its depth bends."""
     line = plan.lines[leg.line]
     if depths is None:
-        yield _Point(
-            kind="line", place_ne_m=leg.end_ne_m, heading_rad=leg.heading_rad, line=leg.line
-        )
+        yield _Point("line", leg.end_ne_m, leg.heading_rad, leg.line)
         return
     along_m = np.linspace(0.0, line.length_m, line.stations)
     for i in bends(along_m, depths, DEPTH_STEP_M)[1:]:
-        place = line.stations_ne[i]
-        yield _Point(
-            kind="line",
-            place_ne_m=(float(place[0]), float(place[1])),
-            heading_rad=leg.heading_rad,
-            line=leg.line,
-            glass_depth_m=float(depths[i]),
-        )
+        north, east = line.stations_ne[i].tolist()
+        yield _Point("line", (north, east), leg.heading_rad, leg.line, float(depths[i]))
 
 
 def bends(along_m: Array, depths_m: Array, tolerance_m: float) -> list[int]:
@@ -216,11 +190,8 @@ def _arc_points(leg: Leg) -> Iterator[_Point]:
     """Ends of chords that stand for an arc."""
     along_m = np.linspace(0.0, leg.length_m, chords(leg) + 1)[1:]
     for distance_m, place in zip(along_m, leg.places(along_m), strict=True):
-        yield _Point(
-            kind="way",
-            place_ne_m=(float(place[0]), float(place[1])),
-            heading_rad=leg.heading_rad + leg.curvature_per_m * float(distance_m) + leg.side_rad,
-        )
+        heading = leg.heading_rad + leg.curvature_per_m * float(distance_m) + leg.side_rad
+        yield _Point("way", (float(place[0]), float(place[1])), heading)
 
 
 def _leads_to_line(leg: Leg, following: Leg | None) -> bool:
@@ -237,12 +208,12 @@ def _switch_camera(points: list[_Point]) -> list[_Point]:
             continue
         if points[i - 1].kind != "line" or points[i - 1].line != point.line:
             if points[i - 1].kind == "line":  # lines that touch: pictures go on
-                result[i - 1] = replace(result[i - 1], camera=None)
+                result[i - 1] = result[i - 1]._replace(camera=None)
             else:
-                result[i - 1] = replace(result[i - 1], camera="on", line=point.line)
+                result[i - 1] = result[i - 1]._replace(camera="on", line=point.line)
         after = points[i + 1] if i + 1 < len(points) else None
         if after is None or after.line != point.line:
-            result[i] = replace(result[i], camera="off")
+            result[i] = result[i]._replace(camera="off")
     return result
 
 
@@ -252,7 +223,7 @@ def _with_depths(
     """Way-points with a depth each: between lines the shallower of the lines next to it."""
     if line_depths is None:
         level_m = plan.seafloor_depth_m - plan.altitude_m
-        return [replace(point, glass_depth_m=level_m) for point in points]
+        return [point._replace(glass_depth_m=level_m) for point in points]
     depths = np.array(
         [
             float(line_depths[point.line][0])
@@ -268,7 +239,7 @@ def _with_depths(
     after = depths[known[np.clip(np.searchsorted(known, place), 0, len(known) - 1)]]
     before = depths[known[np.clip(np.searchsorted(known, place, "right") - 1, 0, len(known) - 1)]]
     levels = np.minimum(before, after)
-    return [replace(p, glass_depth_m=float(d)) for p, d in zip(points, levels, strict=True)]
+    return [p._replace(glass_depth_m=float(d)) for p, d in zip(points, levels, strict=True)]
 
 
 def line_depths(plan: Plan) -> list[Array] | None:

@@ -26,7 +26,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from missions.exports.format import MIN_TOLERANCE_M, Export, ExportFile, ExportFormat, Options
+from missions.exports.format import MIN_TOLERANCE_M, Export, ExportFile, ExportFormat
 from missions.exports.waypoints import Waypoint, gone_on, move, room_m
 from missions.exports.xml_text import (
     child,
@@ -37,11 +37,15 @@ from missions.exports.xml_text import (
     value_of,
     write_xml,
 )
-from missions.values.mission import Heave, Mission, MissionStep
+from missions.values.mission import Heave, Manoeuvre, Mission, MissionStep
 
 _DEPTH, _ALTITUDE, _BOTH = 0, 1, 2
 """Version 2.0's heave modes. Both: altitude where the altimeter sees the floor, else depth."""
 _HEAVES: tuple[Heave, ...] = ("depth", "altitude", "both")
+_MANOEUVRES: dict[str, Manoeuvre] = {
+    "goto": "goto", "section": "section", "park": "anchor", "turn": "keep",
+}  # fmt: skip
+"""How steps are flown, by their type; of a park that turns, `turn`."""
 _TOUCH_M = 1e-6
 
 
@@ -141,7 +145,10 @@ def write_cola2(path: Path, export: Export, dive: int) -> None:
             _section(step, planned)
         else:
             _goto(step, planned.end, planned.tolerance_m)
-        _add_actions(step, planned.end, export.options)
+        if planned.end.camera is not None:
+            on, off = export.options.camera_on, export.options.camera_off
+            action = child(child(step, "actions_list"), "action")
+            child(action, "action_id", on if planned.end.camera == "on" else off)
     write_xml(path, root, _comment(export))
 
 
@@ -188,15 +195,6 @@ def _final(manoeuvre: Element, point: Waypoint) -> None:
     child(manoeuvre, "final_altitude", metres(point.altitude_m))
 
 
-def _add_actions(step: Element, point: Waypoint, options: Options) -> None:
-    """Call the service that starts or stops pictures, where a way-point does so."""
-    if point.camera is None:
-        return
-    action = child(child(step, "actions_list"), "action")
-    name = options.camera_on if point.camera == "on" else options.camera_off
-    child(action, "action_id", name)
-
-
 def _comment(export: Export) -> str:
     """What the places of a mission are of, for people who read the file."""
     plan = export.plan
@@ -224,25 +222,15 @@ def read_cola2(text: str) -> Mission | None:
     return Mission(
         autopilot="cola2",
         steps=tuple(
-            _read_step(_manoeuvre_of(element), camera)
-            for element, camera in zip(elements, cameras, strict=True)
+            _read_step(element, camera) for element, camera in zip(elements, cameras, strict=True)
         ),
     )
 
 
-def _manoeuvre_of(step: Element) -> Element:
-    """The manoeuvre of a step.
-
-    Raises:
-        ValueError: there is none.
-    """
+def _read_step(step: Element, camera: Literal["on", "off"] | None) -> MissionStep:
     manoeuvre = step.find("maneuver")
     if manoeuvre is None:
         raise ValueError("a <mission_step> lacks <maneuver>")
-    return manoeuvre
-
-
-def _read_step(manoeuvre: Element, camera: Literal["on", "off"] | None) -> MissionStep:
     kind = manoeuvre.get("type", "")
     if kind not in ("goto", "section", "park"):
         raise ValueError(f"the maneuver {kind[:40]!r} is not known")
@@ -257,7 +245,7 @@ def _read_step(manoeuvre: Element, camera: Literal["on", "off"] | None) -> Missi
             number_of(manoeuvre, "initial_longitude"),
         )
     return MissionStep(
-        manoeuvre="goto" if kind == "goto" else ("section" if start_deg else _park_kind(turns)),
+        manoeuvre=_MANOEUVRES[kind if kind != "park" or not turns else "turn"],
         latitude_deg=number_of(manoeuvre, "final_latitude"),
         longitude_deg=number_of(manoeuvre, "final_longitude"),
         start_deg=start_deg,
@@ -270,10 +258,6 @@ def _read_step(manoeuvre: Element, camera: Literal["on", "off"] | None) -> Missi
         heading_rad=number_of(manoeuvre, "final_yaw") if turns else math.nan,
         camera=camera,
     )
-
-
-def _park_kind(turns: bool) -> Literal["keep", "anchor"]:
-    return "keep" if turns else "anchor"
 
 
 def _camera_switches(steps: Sequence[Element]) -> list[Literal["on", "off"] | None]:
@@ -303,11 +287,7 @@ def _camera_switches(steps: Sequence[Element]) -> list[Literal["on", "off"] | No
 FORMAT = ExportFormat(
     read_by="COLA2, version 2.0: SPARUS II and its kin",
     files=(
-        ExportFile(
-            name="mission_dive{}.xml",
-            about="COLA2 mission, version 2.0 (SPARUS II)",
-            write=write_cola2,
-        ),
+        ExportFile("mission_dive{}.xml", "COLA2 mission, version 2.0 (SPARUS II)", write_cola2),
     ),
     read=read_cola2,
     keeps_altitude=True,

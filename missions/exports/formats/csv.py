@@ -10,7 +10,6 @@ import numpy as np
 from alice_survey.core.artefacts import write_csv
 from missions.exports.format import Export, ExportFile, ExportFormat
 from missions.exports.geometry import dive_of_line, lat_lon, line_depths_m
-from missions.exports.waypoints import Waypoint
 from missions.values.plan_file import Plan
 
 
@@ -88,7 +87,8 @@ def _waypoints(export: Export) -> Iterator[list[Any]]:
                 number, dive, f"{point.glass_latitude_deg:.10f}",
                 f"{point.glass_longitude_deg:.10f}", f"{point.glass_depth_m:.3f}",
                 f"{export.plan.altitude_m:.3f}", point.speed_mps,
-                f"{math.degrees(point.heading_rad):.4f}", _action(point),
+                f"{math.degrees(point.heading_rad):.4f}",
+                point.kind + (f", camera {point.camera}" if point.camera else ""),
                 point.line if point.line >= 0 else None, f"{point.hold_s:.1f}",
                 f"{point.latitude_deg:.10f}", f"{point.longitude_deg:.10f}",
                 f"{point.depth_m:.3f}", f"{point.altitude_m:.3f}",
@@ -96,22 +96,13 @@ def _waypoints(export: Export) -> Iterator[list[Any]]:
             number += 1
 
 
-def _action(point: Waypoint) -> str:
-    switch = "" if point.camera is None else f", camera {point.camera}"
-    return f"{point.kind}{switch}"
-
-
 FORMAT = ExportFormat(
     read_by="tables; `waypoints.csv` is the lawnmower's way-point table",
     files=(
-        ExportFile(name="lines.csv", about="table of the lines", write=write_lines),
+        ExportFile("lines.csv", "table of the lines", write_lines),
+        ExportFile("stations.csv", "table of the places of pictures", write_stations),
         ExportFile(
-            name="stations.csv", about="table of the places of pictures", write=write_stations
-        ),
-        ExportFile(
-            name="waypoints.csv",
-            about="table of the way-points, of glass and vehicle",
-            write=write_waypoints,
+            "waypoints.csv", "table of the way-points, of glass and vehicle", write_waypoints
         ),
     ),
 )

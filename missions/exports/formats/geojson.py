@@ -62,10 +62,6 @@ def _text(role: str, about: dict[str, Any], geometry: str) -> str:
 FORMAT = ExportFormat(
     read_by="GIS: areas, lines, routes, stations, footprints",
     files=(
-        ExportFile(
-            name="plan.geojson",
-            about="GeoJSON for geographic information systems",
-            write=write_geojson,
-        ),
+        ExportFile("plan.geojson", "GeoJSON for geographic information systems", write_geojson),
     ),
 )

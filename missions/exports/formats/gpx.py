@@ -59,5 +59,5 @@ def _point(
 
 FORMAT = ExportFormat(
     read_by="chart plotters: home, ends of lines, a route a dive",
-    files=(ExportFile(name="plan.gpx", about="GPX for chart plotters", write=write_gpx),),
+    files=(ExportFile("plan.gpx", "GPX for chart plotters", write_gpx),),
 )

@@ -72,5 +72,5 @@ def _add_coordinates(element: Element, shape: BaseGeometry) -> None:
 
 FORMAT = ExportFormat(
     read_by="globes: areas with holes, lines, routes",
-    files=(ExportFile(name="plan.kml", about="KML for globes", write=write_kml),),
+    files=(ExportFile("plan.kml", "KML for globes", write_kml),),
 )

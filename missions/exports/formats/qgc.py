@@ -111,14 +111,9 @@ def _fence(plan: Plan, points: Sequence[Waypoint], mount: CameraMount) -> list[d
 
 
 def _polygon(plan: Plan, polygon: Polygon, *, inclusion: bool) -> dict[str, Any]:
-    return {"version": 1, "inclusion": inclusion, "polygon": _corners(plan, polygon)}
-
-
-def _corners(plan: Plan, polygon: Polygon) -> list[list[float]]:
-    """Latitudes and longitudes of a polygon's outer corners."""
     outer_ne = np.asarray(polygon.exterior.coords, dtype=np.float64)[:-1, :2]
-    rows = lat_lon(plan.datum, outer_ne, 0.0)
-    return [[round(float(lat), 10), round(float(lon), 10)] for lat, lon in rows]
+    corners = np.round(lat_lon(plan.datum, outer_ne, 0.0), 10).tolist()
+    return {"version": 1, "inclusion": inclusion, "polygon": corners}
 
 
 def read_qgc(text: str) -> Mission | None:
@@ -157,13 +152,7 @@ def _read_items(items: list[Any]) -> Iterator[Item]:
 
 FORMAT = ExportFormat(
     read_by="QGroundControl, MAVSDK: mission, fence",
-    files=(
-        ExportFile(
-            name="mission_dive{}.plan",
-            about="QGroundControl plan for ArduSub",
-            write=write_qgc,
-        ),
-    ),
+    files=(ExportFile("mission_dive{}.plan", "QGroundControl plan for ArduSub", write_qgc),),
     read=read_qgc,
     keeps_altitude=True,
 )

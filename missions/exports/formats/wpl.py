@@ -48,13 +48,7 @@ def read_wpl(text: str) -> Mission | None:
 
 FORMAT = ExportFormat(
     read_by="QGroundControl, Mission Planner, MAVProxy: QGC WPL 110",
-    files=(
-        ExportFile(
-            name="mission_dive{}.waypoints",
-            about="QGC WPL 110 mission for ArduSub",
-            write=write_wpl,
-        ),
-    ),
+    files=(ExportFile("mission_dive{}.waypoints", "QGC WPL 110 mission for ArduSub", write_wpl),),
     read=read_wpl,
     keeps_altitude=True,
 )
