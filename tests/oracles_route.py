@@ -102,7 +102,7 @@ def route_cost_by_steps(route: Route, costs: Costs, step_m: float) -> tuple[floa
     joules = seconds = 0.0
     for leg in route.legs:
         if leg.turn_rad:
-            joules += costs.stop_j(leg.turn_rad)
+            joules += costs.stop_w * (abs(leg.turn_rad) / costs.turn_rate_rad_s + costs.settle_s)
             seconds += abs(leg.turn_rad) / costs.turn_rate_rad_s + costs.settle_s
             continue
         if leg.side_rad:

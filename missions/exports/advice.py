@@ -6,7 +6,6 @@ from alice_survey.core.errors import warn
 from alice_survey.sim.vehicle.pilot.mission import MIN_RADIUS_M, MIN_SPEED_MPS, Cola2Settings
 from missions.exports.follower import line_offset_m
 from missions.exports.format import Export
-from missions.values.plan_file import Plan
 
 COLA2_TOLERANCE_Z_M = 0.3
 """A step down is done this near to its depth; COLA2's own 1 m begins a line a metre too high."""
@@ -23,11 +22,6 @@ def cola2_settings(delta_m: float, speed_mps: float) -> Cola2Settings:
         max_surge_mps=max(Cola2Settings().max_surge_mps, speed_mps),
         min_surge_mps=max(Cola2Settings().min_surge_mps, speed_mps),
     )
-
-
-def allowed_offset_m(plan: Plan) -> float:
-    """Half of what neighbouring pictures overlap: two lines so far off, apart, just meet."""
-    return 0.5 * (plan.footprint_m[0] - plan.line_spacing_m)
 
 
 def advice(export: Export, formats: list[str], *, chosen: bool) -> list[str]:
@@ -56,7 +50,7 @@ def _cola2(export: Export, *, chosen: bool) -> list[str]:
     if not math.isfinite(follower.delta_m):
         return [f"COLA2: no section/delta keeps {follower.name} from weaving: lower the speed."]
     own, default = cola2_settings(follower.delta_m, plan.speed_mps), Cola2Settings()
-    lever_m, allowed_m = export.mount.glass_body_m[0], allowed_offset_m(plan)
+    lever_m, allowed_m = export.mount.glass_body_m[0], plan.allowed_offset_m
     offsets = [
         abs(line_offset_m(follower, line.heading_rad, plan.speed_mps, lever_m))
         for line in plan.lines

@@ -129,7 +129,7 @@ def flight_summary(flight: Flight, vehicle: VehicleConfig, rig: Rig) -> dict[str
         "stations_planned": stations_of_dives(plan),
         "dives": len(plan.dives),
         "stations_off_line": flight.stations_off_line,
-        "allowed_cross_track_m": flight.allowed_cross_track_m,
+        "allowed_cross_track_m": flight.plan.allowed_offset_m,
         "on_lines": {
             "share_of_time": float(on_line.mean()),
             "cross_track_rms_m": _rms(cross[on_line]),

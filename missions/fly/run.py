@@ -148,7 +148,7 @@ def _check_pictures(flight: Flight, planned: int, sea: str) -> None:
     if flight.stations_off_line:
         warn(
             f"{flight.stations_off_line} of {len(flight.trigger_s)} pictures were taken more than "
-            f"{flight.allowed_cross_track_m:.2f} m off their lines, where neighbouring lines may "
+            f"{flight.plan.allowed_offset_m:.2f} m off their lines, where neighbouring lines may "
             "leave gaps: choose more side_overlap, less current or another controller"
         )
 

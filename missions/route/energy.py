@@ -82,17 +82,6 @@ class FlightConditions:
     needs_arcs: bool = False
     """Whether the plan turns in no other way."""
 
-    def with_vehicle(self, settings: VehicleConfig) -> "FlightConditions":
-        """The same conditions for another vehicle or controller.
-
-        Raises:
-            VehicleError: as `sound_vehicle`.
-        """
-        vehicle = planned_vehicle(settings)
-        return replace(
-            self, vehicle=vehicle, manner=_manner(vehicle, settings), hotel_w=hotel_w(settings)
-        )
-
 
 def flight_conditions(
     plan: PlanConfig,

@@ -27,8 +27,6 @@ from missions.values.line import Line
 
 Turns = Literal["auto", "arcs", "spot", "sway"]
 
-PAPER_SPEED_MPS = 0.2
-"""Gutnik et al. 2021, section VII.A."""
 MAX_SWAY_M = 5.0
 """Longest sway step. Chosen: some line spacings; farther the vehicle had better go ahead, since its
 lateral thrusters and its side's drag are made for correction, not for transit."""

@@ -61,10 +61,6 @@ class Costs(NamedTuple):
         }
         return self._replace(**bounded, refused=None)
 
-    def stop_j(self, turn_rad: float) -> float:
-        """Energy of a turn on the spot, with its stop."""
-        return self.stop_w * (abs(turn_rad) / self.turn_rate_rad_s + self.settle_s)
-
     def dive_j(self, depth_m: float) -> float:
         """Energy of going down to a depth and up again."""
         return self.dive_s(depth_m) * self.heave_w

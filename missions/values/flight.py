@@ -84,11 +84,6 @@ class Flight:
         across = off[:, 1] * np.cos(heading) - off[:, 0] * np.sin(heading)
         return self.believed_route_error + across
 
-    @property
-    def allowed_cross_track_m(self) -> float:
-        """How far off its line a picture may be: two neighbours so far apart just meet."""
-        return 0.5 * (self.plan.footprint_m[0] - self.plan.line_spacing_m)
-
     @cached_property
     def stations_off_line(self) -> int:
         """How many pictures were truly taken farther off their line than is allowed."""
@@ -99,7 +94,7 @@ class Flight:
         for place, index in zip(places, self.trigger_line, strict=True):
             line = self.plan.lines[index]
             starboard = np.array([-math.sin(line.heading_rad), math.cos(line.heading_rad)])
-            count += bool(abs((place - line.start_ne_m) @ starboard) > self.allowed_cross_track_m)
+            count += bool(abs((place - line.start_ne_m) @ starboard) > self.plan.allowed_offset_m)
         return count
 
     def _cross_track(self, glass_ned: Array) -> Array:

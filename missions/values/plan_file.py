@@ -121,6 +121,11 @@ class Plan:
     """Further facts for a reader; nothing is computed from it."""
 
     @property
+    def allowed_offset_m(self) -> float:
+        """How far off its line a picture may be: two neighbours so far apart just meet."""
+        return 0.5 * (self.footprint_m[0] - self.line_spacing_m)
+
+    @property
     def blur_px(self) -> float:
         """Motion blur over one exposure; NaN where it is not noted."""
         return float(self.details.get("imaging", {}).get("blur_px", math.nan))

@@ -110,7 +110,7 @@ def _set_back(export: Export, point: Waypoint, start: Waypoint) -> Waypoint:
     follower, plan = export.options.follower, export.plan
     if follower is None or not math.isfinite(follower.delta_m):
         return point
-    allowed_m = max(0.5 * (plan.footprint_m[0] - plan.line_spacing_m), MIN_TOLERANCE_M)
+    allowed_m = max(plan.allowed_offset_m, MIN_TOLERANCE_M)
     requested_m = follower.delta_m * math.log(max(export.cola2_tolerance_m / allowed_m, 1.0))
     line = plan.lines[start.line]
     back = -np.array([math.cos(line.heading_rad), math.sin(line.heading_rad)])

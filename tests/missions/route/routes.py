@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import Any
 
 from missions.route.turns import (
-    PAPER_SPEED_MPS,
     Manoeuvre,
     Turns,
     legs_through,
@@ -16,7 +15,7 @@ from missions.values.costs import Costs, time_costs
 from missions.values.legs import Route
 from missions.values.line import Line
 
-PAPER_COSTS = time_costs(PAPER_SPEED_MPS)
+PAPER_COSTS = time_costs(0.2)  # Gutnik et al. 2021, section VII.A
 
 
 def route_through(
