@@ -2,8 +2,8 @@
 
 - Held-out views: pictures that took no part, posed in the rig; their error against what noise and
   the rig's covariance predict.
-- Halves: two calibrations from disjoint views, and how far their projections lie apart (mrcal's
-  cross-validation), against what their covariances predict.
+- Halves: two calibrations from disjoint views, and how far their parameters lie apart, against what
+  their covariances predict.
 - Lengths: distances on the target, from triangulated points.
 """
 
