@@ -14,10 +14,16 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from alice_survey.app.api.arrays import (
+        Dem,
+        Mosaic,
+        Track,
+        read_dem,
+        read_mosaic,
+        read_track,
+    )
     from alice_survey.app.api.figures import plot_dem, plot_mosaic, plot_plan, plot_track
-    from alice_survey.app.api.rasters import Dem, Mosaic, read_dem, read_mosaic
     from alice_survey.app.api.survey import Survey
-    from alice_survey.app.api.track import Track, read_track
     from alice_survey.core.config import SurveyConfig, load_config
     from alice_survey.core.errors import AliceError
     from alice_survey.core.frames import Datum
@@ -34,9 +40,10 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "alice_survey.app.api.figures": ("plot_dem", "plot_mosaic", "plot_plan", "plot_track"),
-    "alice_survey.app.api.rasters": ("Dem", "Mosaic", "read_dem", "read_mosaic"),
+    "alice_survey.app.api.arrays": (
+        "Dem", "Mosaic", "Track", "read_dem", "read_mosaic", "read_track",
+    ),
     "alice_survey.app.api.survey": ("Survey",),
-    "alice_survey.app.api.track": ("Track", "read_track"),
     "alice_survey.core.config": ("SurveyConfig", "load_config"),
     "alice_survey.core.errors": ("AliceError",),
     "alice_survey.core.frames": ("Datum",),
@@ -50,7 +57,7 @@ _HOMES = {
     "camera_calib.triangulate": ("Triangulation", "triangulate"),
     "missions.values.plan_file": ("Plan", "read_plan"),
     "reconstruct.views.model": ("SparseModel", "View", "read_model"),
-}
+}  # fmt: skip
 
 __all__ = [
     "AliceError",

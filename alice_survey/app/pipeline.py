@@ -32,8 +32,6 @@ from alice_survey.core.stages import is_imported
 if TYPE_CHECKING:
     from alice_survey.core.settings_text import Values
 
-_VIDEOS = (".avi", ".mkv", ".mov", ".mp4")
-
 
 def run(
     stages: Sequence[str],
@@ -56,8 +54,7 @@ def run(
     """
     stages = [spec(stage).name for stage in stages]
     imported = is_imported(workspace)
-    simulated = all(spec(stage).simulated for stage in stages)
-    config = as_written = settings(workspace, survey, needed=not imported, simulated=simulated)
+    config = as_written = settings(workspace, survey, needed=not imported)
     for section, values in (changes or {}).items():
         config = change_section(config, section, **values)
         if getattr(config, section) != getattr(as_written, section):
@@ -150,43 +147,26 @@ def _predict_cost(
     return summary(size, groups, workers=workers, records=made)
 
 
-def settings(
-    workspace: Path, survey: Path | None, *, needed: bool, simulated: bool = True
-) -> SurveyConfig:
+def settings(workspace: Path, survey: Path | None, *, needed: bool) -> SurveyConfig:
     """The settings of a workspace.
 
     Args:
         workspace: folder of the survey.
         survey: the file; None looks for survey.toml in the workspace, then here.
         needed: whether there must be one.
-        simulated: whether they are for stages of simulated surveys alone.
 
     Raises:
         ConfigError: the file is wrong, or none is there though it is needed.
     """
-    if survey is not None:
-        return load_config(survey)
-    for path in (workspace / "survey.toml", Path("survey.toml")):
-        if path.is_file():
+    for path in (workspace / "survey.toml", Path("survey.toml")) if survey is None else (survey,):
+        if path.is_file() or survey is not None:
             return load_config(path)
     if not needed:
         return SurveyConfig()
-    if not simulated and _holds_pictures(workspace):
-        raise ConfigError(
-            f"{workspace} holds pictures, but not a survey: 'alice-survey import-images "
-            f"{workspace} -w WORKSPACE' makes one of them"
-        )
     raise ConfigError(
-        f"no survey.toml in {workspace} or here: 'alice-survey init {workspace}' writes one"
+        f"no survey.toml in {workspace} or here: 'alice-survey init {workspace}' writes one, and "
+        "'alice-survey import-images PICTURES -w WORKSPACE' makes a survey of pictures"
     )
-
-
-def _holds_pictures(folder: Path) -> bool:
-    """Whether a folder holds pictures or videos, itself or in folders below."""
-    from reconstruct.pictures.files import PLAIN, RAW, TIFF
-
-    suffixes = {*PLAIN, *TIFF, *RAW, *_VIDEOS}
-    return any(path.suffix.lower() in suffixes for path in folder.rglob("*"))
 
 
 def init_survey(

@@ -17,21 +17,10 @@ def map_data(survey_map: SurveyMap) -> tuple[str, list[tuple[str, str]]]:
     Returns:
         JSON without a `<`, since within a script only "</" and "<!--" could end or change it, and
         the tiles of each layer as (id, base64 text).
-
-    Raises:
-        ValueError: two layers share a name, two base layers are shown, or a tile is not a JPEG, PNG
-            or WebP.
     """
-    layers = survey_map.layers
-    names = [layer.name for layer in layers]
-    if len(set(names)) < len(names):
-        raise ValueError(f"layers share a name: {', '.join(sorted(names))}")
-    pictures = [layer for layer in layers if isinstance(layer, PictureLayer)]
-    if sum(layer.base and layer.shown for layer in pictures) > 1:
-        raise ValueError("more than one base layer is shown")
     described: list[dict[str, Any]] = []
     tiles: list[tuple[str, str]] = []
-    for index, layer in enumerate(layers):
+    for index, layer in enumerate(survey_map.layers):
         if isinstance(layer, ShapeLayer):
             described.append(_shapes(layer))
         elif layer.address is not None:
@@ -116,8 +105,6 @@ def picture_json(layer: PictureLayer) -> dict[str, Any]:
 
 
 def _shapes(layer: ShapeLayer) -> dict[str, Any]:
-    if layer.texts and len(layer.texts) != len(layer.shapes):
-        raise ValueError(f"{layer.name}: {len(layer.texts)} texts for {len(layer.shapes)} shapes")
     return {
         "kind": layer.kind,
         "name": layer.name,

@@ -44,10 +44,8 @@ def render_html(report: Report) -> str:
         The page, to be written as UTF-8.
 
     Raises:
-        ValueError: two sections or layers share a name, a section shows a map or a mesh that the
-            report lacks, a map or a mesh has no section, or a picture is of an unknown kind.
+        ValueError: a picture is of an unknown kind.
     """
-    _check(report)
     styles, scripts = _embedded_files(report)
     map_json, map_tiles = ("", []) if report.map is None else map_data(report.map)
     carried = report.mesh is not None and report.mesh.address is None
@@ -87,16 +85,6 @@ def _templates() -> Any:
         "short": lambda value: f"{value:.4g}".replace("-", "−"),
     }
     return found
-
-
-def _check(report: Report) -> None:
-    names = [_anchor(section) for section in report.sections]
-    if len(set(names)) < len(names):
-        raise ValueError(f"sections share a name: {', '.join(sorted(names))}")
-    for scene, held in (("map", report.map), ("mesh", report.mesh)):
-        shown = sum(section.scene == scene for section in report.sections)
-        if shown != (held is not None):
-            raise ValueError(f"{shown} sections show the {scene}, {int(held is not None)} expected")
 
 
 def _embedded_files(report: Report) -> tuple[list[str], list[str]]:

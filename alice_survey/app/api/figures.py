@@ -4,8 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.app.api.rasters import Dem, Mosaic
-from alice_survey.app.api.track import Track
+from alice_survey.app.api.arrays import Dem, Mosaic, Track
 from alice_survey.kit.document import EAST_NORTH, OWN_AXES
 from alice_survey.kit.figure import (
     INK,

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from alice_survey.app.api.rasters import Dem, Mosaic, read_dem, read_mosaic
-from alice_survey.app.api.track import Track, read_track
+from alice_survey.app.api.arrays import Dem, Mosaic, Track, read_dem, read_mosaic, read_track
 from alice_survey.core.config import SurveyConfig
 from camera_calib.rig import Rig, design_rig, read_rig
 from missions.values.plan_file import Plan, read_plan

@@ -21,6 +21,8 @@ CONTEXT = {"help_option_names": ["-h", "--help"]}
 _SHARED = ("workspace", "survey", "threads", "scheduler", "cluster", "device", "as_json", "quiet",
            "log_file")  # fmt: skip
 """Fields that come last in the help."""
+_VEHICLE = "The vehicle: coefficients from geometry and from logs, and how its two forms compare."
+"""Help of the group of commands that is no command itself."""
 RENAMED = {
     "simulate": "pilot --simulated",
     "scale": "control",
@@ -80,16 +82,12 @@ def make_app(commands: Sequence[type[CommandModel]] = (*COMMANDS, StudioCommand)
         context_settings=CONTEXT,
         rich_markup_mode=None,
     )
-    groups = {
-        "vehicle": "The vehicle: coefficients from geometry and from logs, and how its two forms "
-        "compare.",
-    }
     parents = {"": app}
     names = {command.name for command in commands}
     for name in dict.fromkeys(one.name.split()[0] for one in commands if " " in one.name):
         alone = name in names
         parents[name] = typer.Typer(
-            help=None if alone else groups.get(name), invoke_without_command=alone,
+            help=None if alone else _VEHICLE, invoke_without_command=alone,
             no_args_is_help=not alone, context_settings=CONTEXT, rich_markup_mode=None,
         )  # fmt: skip
     for command in commands:

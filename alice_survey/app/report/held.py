@@ -14,7 +14,6 @@ from alice_survey.app import stages
 from alice_survey.app.stages import finished_stages
 from alice_survey.core.artefacts import JsonRecord, StageRecord
 from alice_survey.core.config import LEVEL
-from alice_survey.core.frames import Array
 from alice_survey.core.records import (
     ChangeRecord,
     FrameRecord,
@@ -217,17 +216,6 @@ def planned_area(held: Held) -> Any | None:
     if held.plan is None:
         return None
     return shapely.transform(held.plan.area.survey, lambda rows: rows[:, ::-1])
-
-
-def known_column(rows: Sequence[Mapping[str, str]], start: str) -> Array:
-    """The numbers of a column whose name begins so, without empty cells.
-
-    Such as "area_" for `area_m2`, and for the `area_units2` of a model without scale.
-    """
-    name = next((name for name in (rows[0] if rows else {}) if name.startswith(start)), "")
-    values = np.array([number(row, name) for row in rows], dtype=np.float64)
-    known: Array = values[np.isfinite(values)]
-    return known
 
 
 def number(row: Mapping[str, str], name: str) -> float:

@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from alice_survey.app.report.held import Held, known_column, number, planned_area
+from alice_survey.app.report.held import Held, number, planned_area
 from alice_survey.core.artefacts import read_json
 from alice_survey.core.frames import Array, Datum
 from alice_survey.core.records import FrameRecord
@@ -133,7 +133,7 @@ def _footprints(held: Held) -> Iterator[tuple[Shape, str]]:
             if datum is not None and held.frame.name == "ned":
                 level = np.column_stack([corners[:, 1::-1], np.zeros(len(corners))])
                 corners = datum.ned_from_geodetic(level)[:, 1::-1]
-            area = float(known_column([facts], "area_")[0])
+            area = float(next(facts[name] for name in facts if name.startswith("area_")))
             yield _pairs(corners[:, :2]), f"{facts['image']}: {area:.2f} {held.unit}²"
 
 

@@ -13,7 +13,7 @@ import pytest
 from alice_survey.kit.document import Report, Table
 from alice_survey.kit.map import map_extent
 from alice_survey.kit.page import numeric_columns, render_html
-from tests.alice_survey.kit.sketch import RUDE, picture_layer, seafloor, sketch_report
+from tests.alice_survey.kit.sketch import RUDE, sketch_report
 
 ROOT = Path(__file__).parents[3]
 ROOM = ROOT / "alice_survey" / "kit"
@@ -98,19 +98,6 @@ def test_a_report_without_scenes_runs_nothing(report: Report) -> None:
     assert "script-src 'none'" in text
     assert "<script" not in text
     assert len(text) < 200_000
-
-
-def test_contradictions_are_refused(report: Report) -> None:
-    assert report.map is not None
-    layers, sections = report.map.layers, report.sections
-    shown_twice = [picture_layer(name, name, seafloor(20, 20), shown=True) for name in "ab"]
-    for changes in (
-        {"sections": [*sections, sections[-1]]}, {"map": None}, {"sections": sections[:1]},
-        {"map": replace(report.map, layers=[*layers, layers[0]])},
-        {"map": replace(report.map, layers=shown_twice)},
-    ):  # fmt: skip
-        with pytest.raises(ValueError):
-            render_html(replace(report, **changes))
 
 
 def test_every_tile_lies_in_its_text(report: Report, text: str) -> None:
