@@ -8,10 +8,7 @@ const browser = [
   "AbortController", "FileReader", "performance", "crypto", "structuredClone",
 ];
 const vendored = ["leaflet", "three"];
-const shared = [
-  "aroundStation", "drawStations", "extendMap", "parse", "Pyramid", "readPixels", "startMap",
-  "startMesh", "stationLine",
-];
+const shared = ["parse", "Pyramid", "startMap", "startMesh"];
 const readable = (names) => Object.fromEntries(names.map((name) => [name, "readonly"]));
 
 const rules = {
@@ -66,7 +63,7 @@ export default [
     files: ["alice_survey/kit/*.js"],
     languageOptions: {
       ecmaVersion: 2023, sourceType: "script",
-      globals: readable([...browser, ...vendored, ...shared, "module"]),
+      globals: readable([...browser, ...vendored, ...shared]),
     },
     rules: {...rules, "no-unused-vars": ["error", {argsIgnorePattern: "^_$", vars: "local"}]},
   },

@@ -1,11 +1,6 @@
 /* What vendor_map.js, vendor_mesh.js and the kit's classic scripts put into the global scope. */
 declare const leaflet: any;
 declare const three: any;
-declare const module: any;
-declare function aroundStation(line: any, station: any, outline: any): any;
-declare function drawStations(...parts: any[]): any;
-declare function stationLine(...parts: any[]): any;
-declare function readPixels(address: string): Promise<ImageData>;
 
 /* Elements are found by selectors that say what they are. */
 interface Element {

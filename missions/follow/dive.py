@@ -197,9 +197,8 @@ class FollowedDive:
     """A dive and its growing log; for any number of threads."""
 
     def __init__(
-        self, workspace: Path, config: SurveyConfig, log: str | Path, *,
-        dive: int | None = None, replay: float | None = None,
-    ) -> None:  # fmt: skip
+        self, workspace: Path, config: SurveyConfig, log: str | Path, *, dive: int | None = None
+    ) -> None:
         """Read the plan; of the log nothing is read yet.
 
         Args:
@@ -207,7 +206,6 @@ class FollowedDive:
             config: the survey.
             log: navigation CSV that is appended to; it need not be there yet.
             dive: which dive of the plan, from 1 on; None: found by its lines.
-            replay: show a finished log so many times as fast as it was flown.
 
         Raises:
             AliceError: there is no plan, or the log cannot be one.
@@ -219,7 +217,7 @@ class FollowedDive:
             )
         if self.log.is_dir():
             raise NavigationError(f"{log}: is a folder: give the navigation CSV that grows")
-        self.config, self.replay = config, replay
+        self.config = config
         self.plan = read_plan(need_stage(workspace, "plan", "plan") / "plan.json")
         if dive is not None and not 1 <= dive <= len(self.plan.dives):
             raise PlanError(f"dive {dive} was requested; the plan has {len(self.plan.dives)}")
@@ -240,7 +238,6 @@ class FollowedDive:
         self._file_key: tuple[int, int, int] | None = None
         self._grew_s: float | None = None
         self._due_s = -math.inf
-        self._replay_start_s: float | None = None
         self._patience_s = math.inf
 
     def update(self, wall_s: float | None = None) -> bool:
@@ -255,10 +252,9 @@ class FollowedDive:
         wall_s = time.monotonic() if wall_s is None else wall_s
         with self.lock:
             key = self._key()
-            if key != self._file_key:
-                self._grew_s = wall_s
-            elif self.replay is None:
+            if key == self._file_key:
                 return False
+            self._grew_s = wall_s
             if wall_s < self._due_s:
                 return False
             began = time.perf_counter()
@@ -283,8 +279,6 @@ class FollowedDive:
 
     def _look(self, wall_s: float, warnings: list[str]) -> DiveView:
         nav = read_growing_log(self.log)
-        if self.replay is not None:
-            nav = self._rows_to_replay(nav, wall_s, self.replay)
         self._patience_s = nav.max_gap_s + _MIN_UPDATE_S + _SILENT_S
         plan = self.plan
         record = record_of_log(self.log, nav, plan, self.rig)
@@ -310,20 +304,6 @@ class FollowedDive:
             elapsed_s=elapsed_s,
             is_up=progress.line >= 0 and bool(depth_m[-1] <= _SURFACE_M),
             warnings=tuple(warnings),
-        )
-
-    def _rows_to_replay(self, nav: NavigationLog, wall_s: float, pace: float) -> NavigationLog:
-        if self._replay_start_s is None:
-            self._replay_start_s = wall_s
-        until_s = nav.time_s[0] + pace * (wall_s - self._replay_start_s)
-        count = int(np.searchsorted(nav.time_s, until_s, side="right"))
-        if count < len(nav.time_s):
-            self._grew_s = wall_s
-        count = max(count, 2)
-        return NavigationLog(
-            time_s=nav.time_s[:count],
-            columns={name: values[:count] for name, values in nav.columns.items()},
-            start_utc=nav.start_utc,
         )
 
     def _fixes(self, nav: NavigationLog) -> Array:
@@ -376,12 +356,9 @@ class FollowedDive:
         """All figures as JSON values; numbers that are not finite are None."""
         wall_s = time.monotonic() if wall_s is None else wall_s
         with self.lock:
-            source = str(self.log)
-            if self.replay is not None:
-                source += f" again, {self.replay:g} times as fast"
             age_s = None if self._grew_s is None else wall_s - self._grew_s
             state: dict[str, Any] = {
-                "source": source, "fault": self.fault, "version": self.version, "fix": None,
+                "source": str(self.log), "fault": self.fault, "version": self.version, "fix": None,
                 "silent_s": age_s, "patience_s": self._patience_s,
                 "is_silent": age_s is not None and age_s > self._patience_s,
                 "planned_altitude_m": self.plan.altitude_m,

@@ -1,4 +1,4 @@
-"""A survey as somebody changes and draws it: the new settings, its plan at a glance, and played.
+"""A survey as somebody changes and draws it: the new settings, and its plan at a glance.
 
 The plan is JSON values for a page. All totals are those of the plan itself. Only the certificate of
 a large area is counted on a coarser grid (`MAX_CELLS`): the shares that it gives, and the holes,
@@ -39,8 +39,6 @@ from missions.coverage.raster import north_up
 from missions.exports.geometry import dive_of_line, footprint_outline, rings_ne, route_ne
 from missions.exposure.conflict import ConflictError
 from missions.plan.planner import Planned, plan_survey
-from missions.plan.run import station_times_s
-from missions.values.costs import Costs, leg_costs
 from missions.values.plan_file import Dive, Plan
 
 MAX_CELLS = 400_000
@@ -54,8 +52,6 @@ _PROFILE_POINTS = 600
 _DETAIL = 1 / 5000
 """Of the plan's width: what a way may lie off its drawing."""
 _FINEST_M = 0.005
-_TURN_RAD = 0.2
-"""Angle of an arc from place to place of a playback."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -323,54 +319,6 @@ def _counts_json(seen: Certificate) -> dict[str, Any]:
     return {"png": f"data:image/png;base64,{data}", "north": north, "west": west, "pixel": pixel_m}
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Playback:
-    """Moments of all dives, one after the other."""
-
-    time_s: Array
-    """(T,) seconds from the start of the first dive; a dive begins when the one before is up."""
-    glass_ne: Array
-    """(T, 2) the left port's glass."""
-    depth_m: Array
-    """(T,) of the glass."""
-    altitude_m: Array
-    """(T,) of the glass above the floor."""
-    heading_rad: Array
-    """(T,) of the vehicle, without jumps within a dive."""
-    pictures_s: Array
-    """(S,) when pictures are taken."""
-
-
-def play(plan: Plan, costs: Costs, bathymetry: Bathymetry | None) -> Playback:
-    """Play a plan back.
-
-    Args:
-        plan: it.
-        costs: of the vehicle, by which legs take their time.
-        bathymetry: of the sea floor; None: it is level.
-    """
-    times, places, headings, depths, floors, pictures = [], [], [], [], [], []
-    begin_s = 0.0
-    for dive in plan.dives:
-        time_s, along_m, heading_rad = _dive(dive, costs)
-        glass_m, floor_m = depths_along(plan, dive, along_m, bathymetry)
-        times.append(begin_s + time_s)
-        places.append(dive.route.places(along_m))
-        headings.append(heading_rad)
-        depths.append(glass_m)
-        floors.append(floor_m)
-        pictures.append(begin_s + np.array(station_times_s(plan, dive, costs)))
-        begin_s += dive.duration_s
-    return Playback(
-        time_s=np.concatenate(times),
-        glass_ne=np.vstack(places),
-        depth_m=np.concatenate(depths),
-        altitude_m=np.concatenate(floors) - np.concatenate(depths),
-        heading_rad=np.concatenate(headings),
-        pictures_s=np.concatenate(pictures),
-    )
-
-
 def depths_along(
     plan: Plan, dive: Dive, along_m: Array, bathymetry: Bathymetry | None
 ) -> tuple[Array, Array]:
@@ -390,17 +338,3 @@ def depths_along(
             at.append(start_m + np.linspace(0.0, leg.length_m, len(row)))
             depths.append(np.array(row))
     return np.interp(along_m, np.concatenate(at), np.concatenate(depths)), floor
-
-
-def _dive(dive: Dive, costs: Costs) -> tuple[Array, Array, Array]:
-    """Times from the dive's start, distances along its way, headings."""
-    _, took_s = leg_costs(dive.route, costs)
-    starts_s = costs.settle_s + np.concatenate([[0.0], np.cumsum(took_s)])
-    times, along, headings = [], [], []
-    for i, leg in enumerate(dive.route.legs):
-        turned = leg.curvature_per_m * leg.length_m
-        share = np.linspace(0.0, 1.0, max(1, math.ceil(abs(turned) / _TURN_RAD)) + 1)
-        times.append(starts_s[i] + share * took_s[i])
-        along.append(dive.route.starts_m[i] + share * leg.length_m)
-        headings.append(leg.heading_rad + leg.side_rad + share * (turned + leg.turn_rad))
-    return np.concatenate(times), np.concatenate(along), np.unwrap(np.concatenate(headings))

@@ -51,9 +51,7 @@ class StudioCommand(WorkspaceCommand):
         "studio -w reef --port 8000 --no-browser",
     )
     port: int = option(0, "To listen on; 0 for any that is free.", ge=0, le=65535)
-    background: str | None = option(
-        None, "Tiles of a web map under it, with {z}, {x} and {y}: network.", metavar="URL"
-    )
+    background: str | None = option(None, "No longer used.", metavar="URL")
     browser: bool = option(True, "Open the page in a browser.", "--browser/--no-browser")
     log: str | None = option(
         None, "Navigation CSV of a dive to follow, which grows.", metavar="LOG"
@@ -63,10 +61,9 @@ class StudioCommand(WorkspaceCommand):
         """Serve it."""
         from alice_survey.app.studio.server import run_studio
 
-        run_studio(
-            self.workspace, self.port, browser=self.browser, show=typer.echo, log=self.log,
-            background=self.background,
-        )  # fmt: skip
+        if self.background is not None:
+            note("--background: web maps are no longer shown under a survey")
+        run_studio(self.workspace, self.port, browser=self.browser, show=typer.echo, log=self.log)
 
 
 def make_app(commands: Sequence[type[CommandModel]] = (*COMMANDS, StudioCommand)) -> typer.Typer:

@@ -422,11 +422,11 @@ class Jobs:
         with self._lock:
             self._adopt()
             running = self.running()
-            last = next((one for one in self._records() if one.ended_utc is not None), None)
+            last = next(iter(self.history()), None)
         elsewhere = running is None and is_locked(self._workspace)
         return {
             "job": running,
-            "last": None if last is None else last.to_json(),
+            "last": last,
             "elsewhere": _other_command(self._workspace) if elsewhere else None,
         }
 

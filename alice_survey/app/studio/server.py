@@ -1,32 +1,64 @@
-"""The studio's server: on the loopback address, with a deadline for every request."""
+"""The studio's server: its page, endpoints, files and events, on the loopback address.
+
+Starlette's middleware refuses a request whose Host is not this machine, since a page of another
+site could otherwise reach it through a name of its own (DNS rebinding). Nothing allows another site
+to read an answer. Only endpoints below `/api/` take a body, from this server's own pages; what
+changes files needs the token of the studio's address on top. Every request has a deadline.
+"""
 
 import asyncio
 import contextlib
+import importlib
 import logging
+import pkgutil
 import secrets
 import socket
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from importlib import resources
 from pathlib import Path
 from typing import Any
-
-from alice_survey.app.studio.files import Workspace
-from alice_survey.app.studio.layers import Layers
-from alice_survey.core.errors import WorkspaceError, why
-from alice_survey.core.run.interrupts import for_other_programs
+from urllib.parse import quote
 
 try:
     import uvicorn
+    from starlette.applications import Starlette
+    from starlette.concurrency import run_in_threadpool
+    from starlette.datastructures import Headers, MutableHeaders
+    from starlette.middleware import Middleware
+    from starlette.middleware.trustedhost import TrustedHostMiddleware
+    from starlette.requests import Request
+    from starlette.responses import JSONResponse, Response, StreamingResponse
+    from starlette.routing import Mount, Route
+    from starlette.types import ASGIApp, Message, Receive, Scope, Send
     from uvicorn.protocols.http.h11_impl import H11Protocol
 
-    from alice_survey.app.studio.app import application
-    from alice_survey.app.studio.endpoints.base import Studio
-    from alice_survey.app.studio.endpoints.plan import prepare_planning
+    from alice_survey.app.studio.files import (
+        INERT,
+        PAGE,
+        POLICY,
+        REVALIDATE,
+        ScriptFiles,
+        Workspace,
+        WorkspaceFiles,
+    )
 except ImportError as missing:
+    from alice_survey.core.errors import WorkspaceError
+
     raise WorkspaceError(
         f"the studio needs {missing.name}, which is not installed: "
         "pip install 'alice-survey[studio]'"
     ) from None
+
+from alice_survey.app.studio import endpoints
+from alice_survey.app.studio.endpoints.base import Call, Content, Endpoint, Studio, json_text
+from alice_survey.app.studio.jobs import BusyError
+from alice_survey.app.studio.layers import Layers
+from alice_survey.core.artefacts import StaleError
+from alice_survey.core.config import SurveyConfig
+from alice_survey.core.errors import AliceError, WorkspaceError, known_fault, why
+from alice_survey.core.run.interrupts import for_other_programs
+from missions.plan.preview import preview
 
 ADDRESS = "127.0.0.1"
 _ASK_S = 10.0
@@ -36,6 +68,162 @@ _ANSWER_S = 900.0
 _ENDING_S = 3
 """Time to wait at the end for answers in work."""
 _MAX_CONNECTIONS = 400
+HOSTS = ("127.0.0.1", "localhost")
+"""Names of this machine."""
+_KEEP = "private, max-age=86400, immutable"
+"""Cache policy of requests that state a version."""
+_BODY_S = 30.0
+"""Time for the body of a request to arrive."""
+_STUDIO_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'"
+)
+"""Policy of the studio's page."""
+_LOCKED = {
+    "X-Content-Type-Options": "nosniff",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Frame-Options": "DENY",
+}
+_TOKEN = "X-Studio-Token"  # noqa: S105 (the name of a header)
+_JSON = "application/json"
+
+
+def application(studio: Studio, port: int) -> Starlette:
+    """The studio of a workspace.
+
+    Args:
+        studio: what its endpoints share.
+        port: that it is asked by.
+    """
+    package = resources.files("alice_survey")
+    index = (package / "app/studio/web/index.html").read_bytes()
+
+    async def page(_: Request) -> Response:
+        return Response(
+            index, headers={"Cache-Control": REVALIDATE, POLICY: _STUDIO_POLICY}, media_type=PAGE
+        )
+
+    async def events(_: Request) -> Response:
+        return StreamingResponse(
+            studio.events.stream(studio.ending.is_set), media_type="text/event-stream"
+        )
+
+    return Starlette(
+        routes=[
+            Route("/", page),
+            Route("/api/events", events),
+            *(_route(studio, endpoint) for endpoint in all_endpoints(studio)),
+            Mount("/app", ScriptFiles()),
+            Mount("/files", WorkspaceFiles(studio.workspace)),
+        ],
+        middleware=[
+            Middleware(_Guard, origins={f"http://{name}:{port}" for name in HOSTS}),
+            Middleware(TrustedHostMiddleware, allowed_hosts=HOSTS, www_redirect=False),
+        ],
+    )
+
+
+def all_endpoints(studio: Studio) -> Iterable[Endpoint]:
+    """The endpoints of every tab."""
+    for found in pkgutil.iter_modules(endpoints.__path__):
+        tab = importlib.import_module(f"{endpoints.__name__}.{found.name}")
+        if hasattr(tab, "endpoints"):
+            yield from tab.endpoints(studio)
+
+
+class _Guard:
+    """Refuses bodies that are not from this server's own pages, and locks every answer in."""
+
+    def __init__(self, app: ASGIApp, origins: set[str]) -> None:
+        self._app, self._origins = app, origins
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        async def send_locked(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                headers.update(_LOCKED)
+                headers[POLICY] = f"{headers.get(POLICY, INERT)}; frame-ancestors 'none'"
+                headers.setdefault("Cache-Control", "no-store")
+            await send(message)
+
+        refusal = self._refusal(scope["method"], Headers(scope=scope))
+        await (refusal or self._app)(scope, receive, send_locked)
+
+    def _refusal(self, method: str, headers: Headers) -> Response | None:
+        """A form of another site can be neither of this origin nor of these types."""
+        size = headers.get("Content-Length", "0")
+        if method != "POST":
+            has_body = "Transfer-Encoding" in headers or size != "0"
+            return _fault(400, "a request with a body", close=True) if has_body else None
+        origin = headers.get("Origin")
+        if origin is not None and origin.lower() not in self._origins:
+            return _fault(403, "a request of another page", close=True)
+        kind = headers.get("Content-Type", "").split(";")[0].strip().lower()
+        if kind not in (_JSON, "application/octet-stream"):
+            return _fault(415, "application/json or application/octet-stream", close=True)
+        if "Transfer-Encoding" in headers or not size.isdecimal() or int(size) == 0:
+            return _fault(411, "a body without its length", close=True)
+        return None
+
+
+def _route(studio: Studio, endpoint: Endpoint) -> Route:
+    """An endpoint behind its checks."""
+
+    async def answer(request: Request) -> Response:
+        token = request.headers.get(_TOKEN, "").encode()
+        if endpoint.writes and not secrets.compare_digest(token, studio.token.encode()):
+            return _fault(403, "this needs the address with its token, as the command printed it")
+        body = b""
+        if endpoint.method == "POST":
+            size = int(request.headers["Content-Length"])
+            if size > endpoint.max_bytes:
+                return _fault(
+                    413, f"{size:,} bytes: at most {endpoint.max_bytes:,} are taken", close=True
+                )
+            try:
+                body = await asyncio.wait_for(request.body(), _BODY_S)
+            except TimeoutError:
+                return _fault(408, "the request did not arrive in time", close=True)
+        call = Call(query=dict(request.query_params), path=dict(request.path_params), body=body)
+        return await run_in_threadpool(_answer, endpoint, call, request)
+
+    return Route(endpoint.path, answer, methods=[endpoint.method])
+
+
+def _answer(endpoint: Endpoint, call: Call, request: Request) -> Response:
+    try:
+        found = endpoint.answer(call)
+    except (StaleError, BusyError) as fault:
+        return _fault(409, str(fault))
+    except FileNotFoundError:
+        return _fault(404, "nothing is here")
+    except Exception as fault:  # libraries raise known faults as all kinds; bugs are raised again
+        known = known_fault(fault)
+        if known is None:
+            raise
+        asked_wrongly = isinstance(fault, AliceError) and not isinstance(fault, WorkspaceError)
+        return _fault(400 if asked_wrongly else 500, known)
+    if not isinstance(found, Content):
+        return Response(json_text(found), media_type=_JSON)
+    headers = {}
+    if found.name:
+        headers["Content-Disposition"] = (
+            f"attachment; filename*=UTF-8''{quote(found.name, safe='')}"
+        )
+    if found.tag:
+        headers |= {
+            "ETag": f'"{found.tag}"',
+            "Cache-Control": _KEEP if "v" in call.query else REVALIDATE,
+        }
+        if request.headers.get("If-None-Match") == headers["ETag"]:
+            return Response(status_code=304, headers=headers)
+    return Response(found.data, headers=headers, media_type=found.kind)
+
+
+def _fault(status: int, text: str, *, close: bool = False) -> Response:
+    return JSONResponse({"error": text}, status, {"Connection": "close"} if close else {})
 
 
 class _TimedConnection(H11Protocol):
@@ -72,21 +260,13 @@ class _TimedConnection(H11Protocol):
 class Server:
     """Serves one workspace until it is shut down."""
 
-    def __init__(
-        self,
-        folder: Path,
-        port: int = 0,
-        *,
-        log: str | None = None,
-        background: str | None = None,
-    ) -> None:
+    def __init__(self, folder: Path, port: int = 0, *, log: str | None = None) -> None:
         """Listen.
 
         Args:
             folder: folder of the workspace.
             port: 0 for any that is free.
             log: where the navigation of a dive comes from.
-            background: address of a web map's tiles to lie under it.
 
         Raises:
             WorkspaceError: the port is not available.
@@ -97,7 +277,6 @@ class Server:
             layers=Layers(workspace),
             token=secrets.token_urlsafe(24),
             log=log,
-            background=background,
         )
         try:
             self.socket = socket.create_server((ADDRESS, port), backlog=128)
@@ -167,13 +346,7 @@ class Server:
 
 
 def run_studio(
-    workspace: Path,
-    port: int,
-    *,
-    browser: bool,
-    show: Callable[[str], Any],
-    log: str | None = None,
-    background: str | None = None,
+    workspace: Path, port: int, *, browser: bool, show: Callable[[str], Any], log: str | None = None
 ) -> None:
     """Serve a workspace; Ctrl-C ends it as it ends every command.
 
@@ -183,13 +356,13 @@ def run_studio(
         browser: open one.
         show: prints a line.
         log: where the navigation of a dive comes from.
-        background: address of a web map's tiles to lie under it.
 
     Raises:
         WorkspaceError: the port is taken.
     """
-    server = Server(workspace, port, log=log, background=background)
-    threading.Thread(target=prepare_planning, daemon=True).start()
+    server = Server(workspace, port, log=log)
+    # Imported and compiled before a page asks for it: 20 s after an installation.
+    threading.Thread(target=preview, args=(SurveyConfig(),), daemon=True).start()
     try:
         show(f"{workspace} is shown at {server.address} to this machine alone; Ctrl-C ends it")
         if browser:

@@ -1,8 +1,7 @@
-"""Previews and playbacks: the plan's own totals, and a suggestion that works."""
+"""Previews: the plan's own totals, and a suggestion that works."""
 
 import json
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,8 +12,7 @@ from camera_calib.rig import design_rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import plan_pattern, stations_of_plan
 from missions.plan.planner import Planned, plan_survey
-from missions.plan.preview import counts_picture, play, preview
-from missions.route.ways import Ways
+from missions.plan.preview import counts_picture, preview
 from tests.missions.exports.plans import RIG, small_plan
 
 SMALL = parse_config({"area": {"length_m": 8.0, "width_m": 6.0}}, "test")
@@ -80,29 +78,6 @@ def test_a_quick_look_estimates_the_certificate(cells: int) -> None:
         error = 1.5 / math.sqrt(cells)
         assert getattr(quick, share) == pytest.approx(getattr(whole, share), abs=error)
     assert whole.share_at_overlap < 0.99
-
-
-@pytest.mark.parametrize("values", [{}, {"vehicle.battery_wh": 13.0, "plan.turns": "spot"}])
-def test_a_playback_takes_as_long_as_the_plan_and_stays_inside(values: dict[str, Any]) -> None:
-    made = planned(with_settings(SMALL, values))
-    played = play(made.plan, made.costs, None)
-    assert np.all(np.diff(played.time_s) >= -1e-9)
-    down_s = made.costs.dive_s(made.plan.seafloor_depth_m - made.plan.altitude_m)
-    settled = played.time_s[-1] - made.plan.duration_s + down_s
-    assert settled == pytest.approx(made.costs.settle_s, abs=1e-6)
-    steps = np.linalg.norm(np.diff(played.glass_ne, axis=0), axis=1)
-    ahead = np.diff(played.time_s) > 1e-9
-    assert (steps[ahead] / np.diff(played.time_s)[ahead]).max() <= 0.2 + 1e-6
-    assert (
-        Ways(made.plan.area.allowed).free_many(played.glass_ne[:-1], played.glass_ne[1:]).mean()
-        > 0.7
-    )
-    assert (
-        len(played.pictures_s)
-        <= made.plan.stations
-        <= len(played.pictures_s) + len(made.plan.lines)
-    )
-    assert np.all(played.altitude_m == pytest.approx(2.0))
 
 
 def test_counts_in_the_picture_are_those_of_their_cells() -> None:

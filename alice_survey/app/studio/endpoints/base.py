@@ -146,8 +146,6 @@ class Studio:
     """What a page has to show to change anything."""
     log: str | None = None
     """Where the navigation of a dive comes from, as `--log` names it."""
-    background: str | None = None
-    """Address of a web map's tiles, with {z}, {x} and {y}."""
     events: "Events" = field(default_factory=lambda: Events())
     ending: threading.Event = field(default_factory=threading.Event)
     """Set when the studio ends: threads of endpoints have to end then."""

@@ -11,7 +11,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from pydantic import Field
 
 from alice_survey.app.studio.endpoints.base import Call, Content, Endpoint, Studio, zip_files
 from alice_survey.core.config import Config
@@ -41,8 +40,6 @@ for _bits in range(1, 8):
 
 class _Open(Config):
     log: str
-    replay: float | None = Field(None, gt=0, le=1000)
-    dive: int | None = Field(None, ge=1)
 
 
 class FollowTab:
@@ -59,13 +56,13 @@ class FollowTab:
 
     # ---- One dive at a time ----------------------------------------------------------------
 
-    def _open(self, log: str, replay: float | None, dive: int | None) -> None:
+    def _open(self, log: str) -> None:
         from alice_survey.app.pipeline import settings
 
         folder = self._studio.workspace.folder
         self._close()
         config = settings(folder, None, needed=False)
-        followed = FollowedDive(folder, config, log, dive=dive, replay=replay)
+        followed = FollowedDive(folder, config, log)
         ended = threading.Event()
         self._dive, self._ended, self._fault = followed, ended, None
         threading.Thread(target=self._work, args=(followed, ended), daemon=True).start()
@@ -81,7 +78,7 @@ class FollowTab:
             if self._is_new and self._studio.log is not None:
                 self._is_new = False
                 try:
-                    self._open(self._studio.log, None, None)
+                    self._open(self._studio.log)
                 except AliceError as error:
                     self._fault = str(error)
             return self._dive
@@ -140,14 +137,14 @@ class FollowTab:
         return found
 
     def open(self, call: Call) -> dict[str, Any]:
-        """Follow a log of the workspace, or replay it."""
+        """Follow a log of the workspace."""
         ask = call.read(_Open)
         if ask.log not in self._logs():
             raise FileNotFoundError(ask.log)
         path = self._studio.workspace.file(ask.log.split("/"))
         with self._lock:
             self._is_new = False
-            self._open(str(path), ask.replay, ask.dive)
+            self._open(str(path))
         return self.state(call)
 
     def end(self, call: Call) -> dict[str, Any]:

@@ -15,9 +15,8 @@ from alice_survey.app.studio.endpoints.base import Call, Content, Endpoint, Kept
 from alice_survey.app.studio.files import stale_page
 from alice_survey.core.config import Config
 from alice_survey.core.errors import AliceError
-from alice_survey.core.products import DEM, MOSAIC, RASTERS, SIGMA
+from alice_survey.core.products import DEM, MOSAIC, RASTERS
 from alice_survey.core.records import MeshRecord
-from reconstruct.measure.errors import SharedErrors
 from reconstruct.measure.figures import Measured, Measurement, as_csv, as_geojson, geometry_of
 from reconstruct.measure.shapes import measure_line, measure_points, measure_polygon, profile
 from reconstruct.measure.surface import MeasuredSurface, values_at
@@ -132,26 +131,7 @@ class _ModelTab:
                     "file": one.file, "title": one.title, "value": value,
                     "unit": shown.replace("degrees", "°"),
                 })  # fmt: skip
-        height, sigma = (found.get(one.file) for one in (DEM, SIGMA))
-        return {
-            "values": rows,
-            "height": None if height is None else height[0],
-            "sigma": None if sigma is None else sigma[0],
-            "unit": unit,
-        }
-
-    def about(self, call: Call) -> dict[str, Any]:
-        """What is measured on, and what sigmas count."""
-        with self._surface() as surface:
-            errors: SharedErrors = surface.errors
-            return {
-                "unit": surface.unit,
-                "cell": surface.grid.cell,
-                "axes": surface.axes,
-                "plane": None if surface.plane.is_level else surface.plane.about,
-                "notes": errors.notes,
-                "vertical_datum": surface.frame.vertical_datum,
-            }
+        return {"values": rows, "unit": unit}
 
     def profile(self, call: Call) -> dict[str, Any]:
         """Heights along a line with their sigmas, thinned to what a page draws."""
@@ -252,7 +232,6 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
     """Of the model."""
     model = _ModelTab(studio)
     return (
-        Endpoint(path="/api/model/about", answer=model.about),
         Endpoint(path="/api/model/value", answer=model.value),
         Endpoint(path="/api/model/mesh", answer=model.mesh),
         Endpoint(path="/mesh.glb", answer=model.light_mesh),

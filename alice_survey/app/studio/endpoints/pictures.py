@@ -18,7 +18,7 @@ from alice_survey.core.config import Config
 from alice_survey.core.errors import AliceError, ReconstructionError, WorkspaceError
 from alice_survey.core.frames import Array
 from alice_survey.core.manifest import ImageRecord, read_manifest
-from alice_survey.core.records import ControlRecord, MappingRecord
+from alice_survey.core.records import MappingRecord
 from reconstruct.picking.lengths import Lengths, point_residuals, preview_control
 from reconstruct.picking.matching import refine
 from reconstruct.picking.registered import RegisteredPictures, Sight
@@ -191,14 +191,19 @@ class _Refine(Config):
     """The best of those that see the point where they are not named."""
 
 
-class _SavePicks(Config):
+class _SaveRequest(Config):
     token: str
+    """Of the file that the page has seen."""
+    page: str = ""
+    """Names the page: what it saves is no news to it."""
+
+
+class _SavePicks(_SaveRequest):
     points: Annotated[list[Name], Field(max_length=1000)]
     picks: Annotated[list[_AskedPick], Field(max_length=20_000)]
 
 
-class _SaveControl(Config):
-    token: str
+class _SaveControl(_SaveRequest):
     rows: Annotated[
         list[dict[Name, Annotated[str, Field(max_length=1000)]]], Field(max_length=5000)
     ]
@@ -390,14 +395,12 @@ class _Tab:
                     "residual": None if miss is None else miss.tolist(),
                 }
             )
-        record = ControlRecord.read_existing(folder / ControlRecord.path)
         mapped = MappingRecord.read_existing(folder / MappingRecord.path)
         return {
             "token": table_token(folder / PICKS_FILE),
             "points": list(points.values()),
             "control": None if model is None
             else preview_control(control, found_points, lost, model.pictures.frame),
-            "last": None if record is None else record.to_json(),
             "unit": "m" if model is None else model.pictures.frame.unit,
             "scaled_by_rig": mapped is not None and mapped.scaled,
         }  # fmt: skip
@@ -411,8 +414,9 @@ class _Tab:
             raise AliceError(f"{strange[0]!r} is no picture of this survey")
         picks = [one.pick for one in asked.picks]
         return self._write_file(
-            PICKS_FILE, lambda path: save_picks(path, asked.token, picks, set(asked.points))
-        )
+            PICKS_FILE, asked.page,
+            lambda path: save_picks(path, asked.token, picks, set(asked.points)),
+        )  # fmt: skip
 
     # ---- Control ----
 
@@ -433,8 +437,9 @@ class _Tab:
         """Replace rows of `control.csv` by kind and name."""
         asked = call.read(_SaveControl)
         return self._write_file(
-            CONTROL_FILE, lambda path: save_control(path, asked.token, asked.rows, asked.names)
-        )
+            CONTROL_FILE, asked.page,
+            lambda path: save_control(path, asked.token, asked.rows, asked.names),
+        )  # fmt: skip
 
     # ---- Spots and lengths ----
 
@@ -486,7 +491,7 @@ class _Tab:
 
     # ---- What all use ----
 
-    def _write_file(self, name: str, write: Callable[[Any], str]) -> dict[str, Any]:
+    def _write_file(self, name: str, page: str, write: Callable[[Any], str]) -> dict[str, Any]:
         path = self._studio.workspace.folder / name
         if path.is_symlink():
             raise AliceError(f"{name} is a link: the studio changes files of the survey alone")
@@ -495,7 +500,7 @@ class _Tab:
                 token = write(path)
             except WorkspaceError as error:  # a row of the page, or of the file by its line
                 raise AliceError(str(error)) from None
-        self._studio.publish("picks", {"file": name, "token": token})
+        self._studio.publish("picks", {"file": name, "token": token, "page": page})
         return {"token": token}
 
     def _read(self, name: str, read: Callable[[Any], T]) -> T | None:

@@ -1,7 +1,6 @@
 """The tab Plan: settings and shapes as they are, planned again while they change, and saved."""
 
 import base64
-import math
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -26,12 +25,11 @@ from alice_survey.app.studio.endpoints.base import (
     zip_files,
 )
 from alice_survey.core.artefacts import check_token, content_of, content_token, json_values
-from alice_survey.core.config import AreaConfig, Config, SurveyConfig, parse_settings, settings_in
+from alice_survey.core.config import Config, SurveyConfig, parse_settings, settings_in
 from alice_survey.core.errors import AliceError, ConfigError, PlanError, collected_by, keep_warnings
 from alice_survey.core.executor import local_executor
-from alice_survey.core.frames import Array, Datum, attitude_from_rotation
+from alice_survey.core.frames import Datum
 from alice_survey.core.settings_form import settings_form
-from alice_survey.core.trajectory import read_columns, read_track
 from alice_survey.kit.figure import palette_colours, palette_steps
 from alice_survey.sim.vehicle.files import known_vehicles
 from camera_calib.rig import design_rig
@@ -39,7 +37,7 @@ from missions.areas.drawn import AreaDrawing, DrawnShapes, area_drawing, drawing
 from missions.areas.files import SUFFIXES
 from missions.exports.registry import format_named, format_names
 from missions.plan.planner import plan_survey
-from missions.plan.preview import Draft, draft_settings, play, preview, refusal_json
+from missions.plan.preview import Draft, draft_settings, preview, refusal_json
 from missions.values.plan_file import read_plan
 from reconstruct.precision.predict import Precision
 from reconstruct.precision.run import Candidate, heights_raster, summary, worst_bend
@@ -50,8 +48,6 @@ _MAX_FILE = 32 << 20
 _MAX_PRECISION = 3000
 """Stations of which the precision is predicted while somebody waits."""
 _PALETTE, _COLOURS, _OPACITY = "viridis", 9, 215
-_MAX_MOMENTS = 4000
-"""Moments of a playback."""
 _LENSES_MM = (12.5, 25.0)
 """Of the paper."""
 _JSON = "application/json"
@@ -91,12 +87,6 @@ class LatestRequests:
                 self._condition.notify_all()
 
 
-def prepare_planning() -> None:
-    """Import and compile the planner before a page asks for it: 20 s after an installation."""
-    with _quiet():
-        preview(SurveyConfig())
-
-
 class PlanRequest(Config):
     """Settings that a page has changed, and what it has drawn."""
 
@@ -105,7 +95,7 @@ class PlanRequest(Config):
     token: str | None = None
     """Of the settings that the page has seen."""
     page: str = ""
-    """Names the page: the newest request of each is answered."""
+    """Names the page: of its requests the newest is answered."""
 
 
 @dataclass(frozen=True)
@@ -167,7 +157,6 @@ class _PlanTab:
             "error": None,
             "written": {},
             "limits": self.limits,
-            "vehicles": known_vehicles(),
             "formats": format_names(),
             "suffixes": list(SUFFIXES),
             "stage": "missing",
@@ -243,24 +232,6 @@ class _PlanTab:
             "text": summary(found),
         }
 
-    def play(self, call: Call) -> dict[str, Any]:
-        """The dive: as it was simulated where that is of this plan, else as it is planned."""
-        draft = self.draft(call.read(PlanRequest))
-        folder, states = self.studio.workspace.folder, dict[str, str]()
-        for name in ("plan", "fly"):
-            states[name] = "missing" if draft.files else spec(name).state(
-                folder, draft.config, states
-            )  # fmt: skip
-        track = folder / "flight" / "truth" / "track.csv"
-        if set(states.values()) == {"up to date"} and track.is_file():
-            return _true_dive(folder / "flight", draft.config.camera.position_body_m)
-        with _draft_settings(draft) as config, _quiet():
-            planned = plan_survey(config, design_rig(config.camera, config.water))
-            played = play(planned.plan, planned.costs, planned.bathymetry)
-        place = np.column_stack([played.glass_ne, played.depth_m])
-        return _moments("planned", played.time_s, place, played.altitude_m, played.heading_rad,
-                        played.pictures_s)  # fmt: skip
-
     def read_dropped(self, call: Call) -> dict[str, Any]:
         """The shapes of a file that was dropped on the page."""
         name = Path(call.query.get("name", "")).name
@@ -275,11 +246,9 @@ class _PlanTab:
             file = Path(scratch) / f"dropped{Path(name).suffix.lower()}"
             file.write_bytes(call.body)
             try:
-                drawing = drawing_of_file(
-                    file, config.area, role=role, layer=call.query.get("layer"),
-                    crs=call.query.get("crs"),
-                    datum=_datum_asked(call, found.token, config.area),
-                )  # fmt: skip
+                # The middle of the file is the datum of a new survey.
+                datum = area_drawing(config.area).datum if found.token else None
+                drawing = drawing_of_file(file, config.area, role=role, datum=datum)
             except PlanError as error:
                 text = str(error).replace(str(file), name).replace(file.name, name)
                 raise PlanError(text) from None
@@ -302,7 +271,7 @@ class _PlanTab:
                     init_survey(folder)
                 draft.write()
             token = self.settings().token
-            self.studio.publish("plan", {"token": token})
+            self.studio.publish("plan", {"token": token, "page": request.page})
             fault = None
             try:
                 run(["plan"], folder, None, executor=local_executor(1))
@@ -339,25 +308,6 @@ def _json(found: Mapping[str, Any]) -> Content:
     return Content(data=to_json(found, inf_nan_mode="null"), kind=_JSON)
 
 
-def _datum_asked(call: Call, token: str, area: AreaConfig) -> Datum | None:
-    """The datum that a dropped file is to count to; None for its own middle.
-
-    `datum` of the query is `middle`, or latitude and longitude with a comma between; where it is
-    left out that of the survey counts, and for a new survey the middle.
-    """
-    asked = call.query.get("datum", "" if token else "middle")
-    if asked == "middle":
-        return None
-    if not asked:
-        return area_drawing(area).datum
-    try:
-        latitude_deg, longitude_deg = map(float, asked.split(","))
-        place = AreaConfig(latitude_deg=latitude_deg, longitude_deg=longitude_deg)
-    except ValueError:
-        raise PlanError(f"datum {asked[:40]!r}: it is 'middle' or LATITUDE,LONGITUDE") from None
-    return Datum(place.latitude_deg, place.longitude_deg)
-
-
 @contextmanager
 def _draft_settings(draft: Draft) -> Iterator[SurveyConfig]:
     """The settings of a draft, with its files in a folder that lasts as long as this block."""
@@ -379,8 +329,8 @@ def _about(config: SurveyConfig, drawing: AreaDrawing | None) -> dict[str, Any]:
         "settings": json_values(config.model_dump(mode="json")),
         "shapes": _shapes(DrawnShapes() if drawing is None else drawing.shapes),
         "datum": _datum(datum if drawing is None else drawing.datum),
+        "vehicles": sorted({*known_vehicles(), config.vehicle.name}),
         "lenses_mm": sorted({*_LENSES_MM, config.camera.focal_mm}),
-        "bathymetry": config.area.bathymetry_file is not None,
     }
 
 
@@ -415,40 +365,6 @@ def _heights_layer(found: Precision) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _true_dive(folder: Path, glass_body_m: Sequence[float]) -> dict[str, Any]:
-    """The simulated dive as it truly was, of the left port's glass; altitudes are its log's."""
-    track = read_track(folder / "truth" / "track.csv")
-    log = read_columns(folder / "navigation.csv", ("time_s", "altitude_m"))
-    pictures_s = read_columns(folder / "triggers.csv", ("time_s",))["time_s"]
-    poses, known = track.ned_from_body, np.isfinite(log["altitude_m"])
-    altitude_m = np.full(len(track.time_s), np.nan)
-    if known.any():
-        altitude_m = np.interp(track.time_s, log["time_s"][known], log["altitude_m"][known])
-    return _moments(
-        "flown", track.time_s, poses.apply(np.array(glass_body_m)), altitude_m,
-        np.unwrap(attitude_from_rotation(poses.rotation)[:, 2]), pictures_s,
-    )  # fmt: skip
-
-
-def _moments(
-    what: str, time_s: Array, glass_ned: Array, altitude_m: Array, heading_rad: Array,
-    pictures_s: Array,
-) -> dict[str, Any]:  # fmt: skip
-    """A playback as JSON values, of so many moments as can be seen."""
-    step = max(1, math.ceil(len(time_s) / _MAX_MOMENTS))
-    shown = np.unique(np.append(np.arange(0, len(time_s), step), len(time_s) - 1))
-    return {
-        "what": what,
-        "t_s": np.round(time_s[shown], 2).tolist(),
-        "n": np.round(glass_ned[shown, 0], 3).tolist(),
-        "e": np.round(glass_ned[shown, 1], 3).tolist(),
-        "depth_m": np.round(glass_ned[shown, 2], 3).tolist(),
-        "altitude_m": np.round(altitude_m[shown], 3).tolist(),
-        "heading_deg": np.round(np.rad2deg(heading_rad[shown]) % 360.0, 2).tolist(),
-        "pictures_s": np.round(pictures_s, 2).tolist(),
-    }
-
-
 def endpoints(studio: Studio) -> Sequence[Endpoint]:
     """All of the tab Plan."""
     plan = _PlanTab(studio)
@@ -464,7 +380,6 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
         Endpoint(path="/api/plan/export", answer=plan.export),
         post("preview", plan.preview),
         post("precision", plan.precision),
-        post("play", plan.play),
         post("import", plan.read_dropped, max_bytes=_MAX_FILE),
         post("text", plan.text),
         post("save", plan.save, writes=True),

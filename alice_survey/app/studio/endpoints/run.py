@@ -196,13 +196,9 @@ class _RunTab:
         after = call.number("after") if "after" in call.query else 0
         return self.studio.jobs.log(int(call.number("job")), int(after))
 
-    def history(self, call: Call) -> dict[str, Any]:
-        """Jobs that have ended."""
-        return {"jobs": self.studio.jobs.history()}
-
 
 def endpoints(studio: Studio) -> Sequence[Endpoint]:
-    """State, start, stop, log and history."""
+    """State, start, stop and log."""
     run = _RunTab(studio)
     return (
         Endpoint(path="/api/run", answer=run.state),
@@ -210,5 +206,4 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
         Endpoint(path="/api/run/start", answer=run.start, method="POST", writes=True),
         Endpoint(path="/api/run/stop", answer=run.stop, method="POST", writes=True),
         Endpoint(path="/api/run/log", answer=run.log),
-        Endpoint(path="/api/run/history", answer=run.history),
     )

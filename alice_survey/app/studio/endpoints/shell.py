@@ -1,7 +1,7 @@
 """What every tab needs: the state of the workspace, and the map of what it holds."""
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,7 +56,6 @@ class _Shell:
                 if workspace.has(f"{stage.folder}/{path}")
             },
             "log": self.studio.log,
-            "background": self.studio.background,
             "tabs": TABS,
         }
 
@@ -108,16 +107,3 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
         Endpoint(path="/api/map", answer=shell.map),
         Endpoint(path="/tiles/{name}/{level}/{x}/{y}.webp", answer=shell.tile),
     )
-
-
-def all_endpoints(studio: Studio) -> Iterable[Endpoint]:
-    """The endpoints of every module here."""
-    import importlib
-    import pkgutil
-
-    from alice_survey.app.studio import endpoints as package
-
-    for module in sorted(found.name for found in pkgutil.iter_modules(package.__path__)):
-        of_module = importlib.import_module(f"{package.__name__}.{module}")
-        if hasattr(of_module, "endpoints"):
-            yield from of_module.endpoints(studio)

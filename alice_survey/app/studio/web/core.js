@@ -1,5 +1,8 @@
 /* What every tab uses: requests to the server, its events, elements, messages. */
 
+/* Names this page: what it saves is no news to it. */
+export const PAGE = crypto.randomUUID();
+
 const key = "alice-survey token";
 const given = new URLSearchParams(window.location.search).get("token");
 if (given) {
@@ -36,13 +39,11 @@ export async function get(path, params, options) {
 
 export const bytes = async (path) => (await asked(path)).arrayBuffer();
 
-/* A body that is a Blob or bytes goes as it is, anything else as JSON. */
+/* A body that is a Blob goes as it is, anything else as JSON. */
 function posted(body, signal) {
-  const raw = body instanceof Blob || body instanceof ArrayBuffer;
+  const raw = body instanceof Blob;
   return {
-    method: "POST",
-    body: raw ? body : JSON.stringify(body),
-    signal,
+    method: "POST", body: raw ? body : JSON.stringify(body), signal,
     headers: {
       "Content-Type": raw ? "application/octet-stream" : "application/json",
       "X-Studio-Token": sessionStorage.getItem(key) || "",
@@ -55,21 +56,19 @@ function posted(body, signal) {
 export const send = async (path, body = {}, {params, signal} = {}) => (
   await asked(addressOf(path, params), posted(body, signal))).json();
 
-/* Save a file that the server makes, under the name that it gives, else the given one. */
-export async function save(path, name, body = null) {
-  const response = await asked(path, body ? posted(body) : {});
-  const named = /filename\*=UTF-8''([^;]+)/.exec(response.headers.get("Content-Disposition") || "");
-  download(named ? decodeURIComponent(named[1]) : name, await response.blob(),
-    response.headers.get("Content-Type"));
+/* Save a file that the server makes. */
+export async function save(path, name, body) {
+  const response = await asked(path, posted(body));
+  const link = el("a", {href: URL.createObjectURL(await response.blob()), download: name});
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
 }
 
-/* Events of the server: `on("run", (data) => ...)`; returns a function that ends it. */
+/* Events of the server: `on("run", (data) => ...)`. */
 let source = null;
 export function on(name, listener) {
   source = source || new EventSource("/api/events");
-  const heard = (event) => listener(JSON.parse(event.data));
-  source.addEventListener(name, heard);
-  return () => source.removeEventListener(name, heard);
+  source.addEventListener(name, (event) => listener(JSON.parse(event.data)));
 }
 
 /* An element: el("button", {type: "button", class: "primary", onclick: fn, disabled: true},
@@ -117,6 +116,21 @@ export function table(caption, header, rows) {
   })));
 }
 
+/* What a tab shows while the workspace lacks what it needs: one sentence, and the way there.
+   `needed()` returns [text, tab, title of the button], or null where all is there; the content
+   is hidden meanwhile. Returns the element and `show()`, which says whether the tab can work. */
+export function missing(studio, content, needed) {
+  const element = el("div", {class: "missing", hidden: true});
+  function show() {
+    const [text, tab, title] = needed() || [];
+    [content.hidden, element.hidden] = [Boolean(text), !text];
+    if (text) element.replaceChildren(el("p", {}, text), el("div", {class: "buttons"},
+      button(title, () => studio.open(tab), {class: "primary"})));
+    return !text;
+  }
+  return {element, show};
+}
+
 /* A line for everybody, screen readers too; it stays until the next one. */
 export function say(text, level = "note") {
   const line = document.getElementById("status");
@@ -132,10 +146,4 @@ export async function attempt(work) {
     if (fault.name !== "AbortError") say(fault.message, "error");
     return undefined;
   }
-}
-
-export function download(name, content, type = "text/plain") {
-  const link = el("a", {href: URL.createObjectURL(new Blob([content], {type})), download: name});
-  link.click();
-  setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
 }

@@ -1,29 +1,17 @@
-/* Drawing on the map: a point, a line, a polygon or a rectangle by clicks, or by Enter, which takes
-   the map's middle; and what the panel says and offers meanwhile. */
+/* Drawing on the map: a line or a polygon by clicks, or by Enter, which takes the map's middle; and
+   what the panel says and offers meanwhile. */
 
 import {button, el, say} from "./core.js";
 import {WHITE} from "./palette.js";
 
 const REACH_PX = 9;
 /* Places that each kind of shape needs. */
-export const LEAST = {point: 1, line: 2, polyline: 2, polygon: 3, rectangle: 2};
-const FIRST = {
-  point: "Click on the map, or press Enter to take its middle.",
-  rectangle: "Click two opposite corners, or press Enter to take the map's middle.",
-};
-
-/* What is drawn is seen over all layers, and takes no clicks. */
-function paneOf(map) {
-  const pane = map.getPane("drawing") || map.createPane("drawing");
-  pane.style.pointerEvents = "none";
-}
-
-/* The corners of a rectangle between two opposite ones. */
-export const rectangle = ([[n0, e0], [n1, e1]]) => [[n0, e0], [n0, e1], [n1, e1], [n1, e0]];
+const LEAST = {line: 2, polygon: 3};
 
 export function drawingTool(studio, name) {
   const map = studio.map.leaflet;
-  paneOf(map);
+  /* What is drawn is seen over all layers, and takes no clicks. */
+  (map.getPane("drawing") || map.createPane("drawing")).style.pointerEvents = "none";
   const renderer = leaflet.canvas({pane: "drawing", padding: 0.3});
   const sketch = leaflet.featureGroup();
   const hint = el("p", {class: "note"});
@@ -35,13 +23,11 @@ export function drawingTool(studio, name) {
       {title: "Escape"})));
   let session = null;
 
-  /* `done(points)` takes points [north, east]; `most` of them end it; with `again` the tool
-     stays in hand for the next one; `ended()` is called when it is put down; while not `ready()`
-     it cannot be finished. */
-  function begin({kind, colour, most = {point: 1, rectangle: 2}[kind] || Infinity, again = false,
-    ready = () => true, done, ended = () => {}}) {
+  /* `done(points)` takes points [north, east]; `most` of them end it; `ended()` is called when the
+     tool is put down. */
+  function begin({kind, colour, most = Infinity, done, ended}) {
     studio.map.release();
-    session = {kind, colour, most, again, ready, done, points: []};
+    session = {kind, colour, most, done, points: []};
     const own = session;
     map.doubleClickZoom?.disable();
     sketch.addTo(map);
@@ -89,13 +75,12 @@ export function drawingTool(studio, name) {
     if (!session) return;
     const {kind, colour, points} = session;
     const all = pointer && points.length ? [...points, pointer] : points;
-    const corners = kind === "rectangle" && all.length === 2 ? rectangle(all) : all;
-    const many = corners.length > 2 && kind !== "line" ? leaflet.polygon : leaflet.polyline;
+    const many = all.length > 2 && kind === "polygon" ? leaflet.polygon : leaflet.polyline;
     const style = {renderer, pane: "drawing", interactive: false};
     sketch.clearLayers();
-    sketch.addLayer(many(corners, {...style, color: WHITE, weight: 5, opacity: 0.75, fill: false}));
+    sketch.addLayer(many(all, {...style, color: WHITE, weight: 5, opacity: 0.75, fill: false}));
     sketch.addLayer(many(
-      corners, {...style, color: colour, weight: 2.6, dashArray: "6 4", fillOpacity: 0.08}));
+      all, {...style, color: colour, weight: 2.6, dashArray: "6 4", fillOpacity: 0.08}));
     points.forEach((point) => sketch.addLayer(leaflet.circleMarker(point, {
       ...style, radius: 5, color: WHITE, weight: 1.5, fillColor: colour, fillOpacity: 1,
     })));
@@ -105,9 +90,8 @@ export function drawingTool(studio, name) {
   function describe() {
     const {kind, points} = session;
     const missing = LEAST[kind] - points.length;
-    const first = FIRST[kind] || "Click on the map, or press Enter to take its middle: " + missing
-      + " more at least.";
-    hint.textContent = missing > 0 || FIRST[kind] ? first
+    hint.textContent = missing > 0
+      ? `Click on the map, or press Enter to take its middle: ${missing} more at least.`
       : "Go on, or finish: click the " + (kind === "polygon" ? "first" : "last")
         + " place again, or press F.";
     finishing.disabled = missing > 0;
@@ -121,18 +105,13 @@ export function drawingTool(studio, name) {
 
   function finish() {
     if (!session) return;
-    const {kind, points, again, ready, done} = session;
+    const {kind, points, done} = session;
     if (points.length < LEAST[kind]) {
       say("Draw " + (LEAST[kind] - points.length) + " more at least");
       return;
     }
-    if (!ready()) return;
-    const whole = kind === "rectangle" ? rectangle(points) : points.slice();
-    if (again) {
-      session.points = [];
-      drawn();
-    } else studio.map.release();
-    done(whole);
+    studio.map.release();
+    done(points);
   }
 
   return {element, begin, isDrawing: () => Boolean(session)};

@@ -1,11 +1,10 @@
 /* Follow a dive: figures to read on deck, the map of what is seen, holes, and a plan that flies
    them again. */
 
-import {attempt, button, el, field, get, on, say, send, table} from "./core.js";
-import {missing} from "./missing.js";
-import {BLUE, GREEN, GREY, INK, ORANGE, PINK, RED, SKY, WHITE} from "./palette.js";
+import {attempt, button, el, field, get, missing, on, say, send, table} from "./core.js";
+import {BLUE, GREEN, GREY, INK, ORANGE, PINK, RED, SKY} from "./palette.js";
 import {profileChart} from "./profile_chart.js";
-import {clock, counted, number, paceText, share} from "./words.js";
+import {clock, counted, number, share} from "./words.js";
 
 const LEGEND = [[GREEN, "at the requested overlap"], [SKY, "in stereo"], [ORANGE, "in a picture"],
   ["#3c3c3c3c", "not yet"]];  /* as the coverage's own */
@@ -18,7 +17,6 @@ export function tab(studio) {
   let heardAt = 0;
   let fixes = [];
   let overlay = null;
-  let arrow = null;
   let drawn = {};
   let wasSilent = false;
   let isHere = false;
@@ -47,39 +45,28 @@ export function tab(studio) {
     box.classList.toggle("bad", bad);
   };
 
-  const profile = profileChart("Altitude over time", {high: 120});
+  const profile = el("div", {});
   const holeTable = el("div", {});
   const proposalText = el("p", {}, "");
   const format = el("select", {});
   const fetchIt = button("Download missions", download, {class: "primary", disabled: true});
   const more = el("div", {});
-  const keep = el("input", {type: "checkbox", checked: true});
   const logs = el("select", {});
-  const pace = el("select", {}, [1, 2, 5, 10, 20, 50, 200].map(
-    (n) => el("option", {value: n}, paceText(n))));
   const stop = button("Stop", () => change("/api/follow/end", {}), {hidden: true});
   const choose = el("details", {}, el("summary", {}, "Choose a log"),
     field("Navigation CSV of this workspace", logs),
-    field("Pace of a replay", pace, "For training: a finished log as if it were flown now"),
-    el("div", {class: "buttons"}, button("Follow it", () => opened({log: logs.value})),
-      button("Replay it", () => opened({log: logs.value, replay: Number(pace.value)})),
-      stop),
+    el("div", {class: "buttons"}, button("Follow it", open), stop),
     el("p", {class: "note"}, "For a file elsewhere: alice-survey studio --log nav.csv."));
 
-  // files may come while the page is open
-  for (const event of ["pointerenter", "focusin"]) {
-    choose.addEventListener(event, async () => {
-      const heard = await get("/api/follow/state").catch(() => null);
-      if (heard) fillChoices(heard);
-    });
-  }
+  /* Files may come while the page is open. */
+  ["pointerenter", "focusin"].forEach((event) => choose.addEventListener(event,
+    () => get("/api/follow/state").then(fillChoices, () => null)));
 
   const live = el("div", {hidden: true}, big,
     el("ul", {class: "legend-row", "aria-label": "Colours of the coverage"},
       LEGEND.map(([colour, text]) => el("li", {},
       el("span", {class: "swatch", style: {background: colour}}), text))),
-    el("div", {class: "field"}, el("label", {}, keep, " Keep the vehicle in view")),
-    el("h3", {}, "Altitude against the plan"), profile.element,
+    el("h3", {}, "Altitude against the plan"), profile,
     el("h3", {}, "A plan over the holes"), proposalText,
     field("Format", format),
     el("div", {class: "buttons"}, fetchIt),
@@ -101,12 +88,9 @@ export function tab(studio) {
     });
   }
 
-  async function opened(body) {
-    if (!body.log) {
-      say("No navigation CSV lies in this workspace", "warn");
-      return;
-    }
-    if (await change("/api/follow/open", body)) choose.open = false;
+  async function open() {
+    if (!logs.value) say("No navigation CSV lies in this workspace", "warn");
+    else if (await change("/api/follow/open", {log: logs.value})) choose.open = false;
   }
 
   function download() {
@@ -154,10 +138,8 @@ export function tab(studio) {
     centred = false;
     overlay?.remove();
     overlay = null;
-    arrow?.remove();
-    arrow = null;
-    ["follow-left", "follow-done", "follow-track", "follow-holes", "follow-proposal"].forEach(
-      (name) => map.remove(name));
+    ["left", "done", "track", "holes", "proposal", "vehicle"].forEach(
+      (name) => map.remove("follow-" + name));
   }
 
   /* Fixes, lines and holes are asked for where the log was read again. */
@@ -181,7 +163,6 @@ export function tab(studio) {
         showProposal(state.proposal);
         drawn.proposal = proposalKey;
       }
-      showArrow();
     } finally {
       fetching = false;
     }
@@ -288,36 +269,12 @@ export function tab(studio) {
     shapes("follow-track", "line", "Track", INK, [fixes.map((fix) => [fix[2], fix[1]])],
       {width: 1.6});
     showProfile();
-    const fix = fixes[fixes.length - 1];
-    const place = leaflet.latLng(fix[1], fix[2]);
-    if (!centred) {
-      centred = true;
-      map.fit();
-    } else if (keep.checked && !map.leaflet.getBounds().pad(-0.1).contains(place)) {
-      map.leaflet.panTo(place, {animate: false});
-    }
+    const [, n, e] = fixes.at(-1);
+    shapes("follow-vehicle", "point", "Vehicle", BLUE, [[[e, n]]]);
+    if (centred) return;
+    centred = true;
+    map.fit();
   }
-
-  function showArrow() {
-    const fix = fixes[fixes.length - 1];
-    if (!fix || !isHere) return;
-    const size = 15 / 2 ** map.leaflet.getZoom();
-    const heading = ((fix[4] ?? 0) * Math.PI) / 180;
-    const corner = (ahead, right) => [
-      fix[1] + size * (ahead * Math.cos(heading) - right * Math.sin(heading)),
-      fix[2] + size * (ahead * Math.sin(heading) + right * Math.cos(heading)),
-    ];
-    const corners = [corner(1.2, 0), corner(-0.8, 0.75), corner(-0.35, 0), corner(-0.8, -0.75)];
-    if (arrow) {
-      arrow.setLatLngs(corners);
-    } else {
-      arrow = leaflet.polygon(
-        corners, {color: WHITE, weight: 2, fillColor: BLUE, fillOpacity: 1, interactive: false})
-        .addTo(map.leaflet);
-    }
-    arrow.bringToFront();
-  }
-  map.leaflet.on("zoomend", showArrow);
 
   function showHoles(holes) {
     const outlines = holes.flatMap((hole) => hole.rings_ne.map((ring) => ring.map(flat)));
@@ -355,15 +312,14 @@ export function tab(studio) {
     const plan = state.planned_altitude_m;
     const minutes = (fix) => (fix[0] - last) / 60;
     const latest = shown.length ? shown[shown.length - 1][3] : null;
-    profile.show({
-      lines: [{kind: "planned", xs: [-PROFILE_S / 60, 0], ys: [plan, plan]},
-        {kind: "flown", xs: shown.map(minutes),
-        ys: shown.map((fix) => Math.min(fix[3], 2 * plan))}],
-      range: [0, 2 * plan], caption: "minutes from now; altitude, m",
-    });
-    profile.element.firstChild.setAttribute(
-      "aria-label", "Altitude over the last five minutes: now " + number(latest, "m") + ", planned "
-      + number(plan, "m"));
+    profile.replaceChildren(profileChart(
+      `Altitude over the last five minutes: now ${number(latest, "m")}, planned ${
+        number(plan, "m")}`, {
+        lines: [{kind: "planned", xs: [-PROFILE_S / 60, 0], ys: [plan, plan]},
+          {kind: "flown", xs: shown.map(minutes),
+            ys: shown.map((fix) => Math.min(fix[3], 2 * plan))}],
+        range: [0, 2 * plan], caption: "minutes from now; altitude, m", high: 120,
+      }));
   }
 
   return {
@@ -380,6 +336,5 @@ export function tab(studio) {
       isHere = false;
       forget();
     },
-    keys: {v: () => { keep.checked = !keep.checked; }},
   };
 }

@@ -1,12 +1,11 @@
 /* The tab Model: values under the pointer, measures with their sigmas, the mesh, the files. */
 
-import {attempt, button, el, field, get, save, say, send, table} from "./core.js";
-import {missing} from "./missing.js";
+import {attempt, button, el, field, get, missing, save, say, send, table} from "./core.js";
 import {RED} from "./palette.js";
 import {counted, number, withSigma} from "./words.js";
 import {drawingTool} from "./drawing.js";
 import {meshPart} from "./model_mesh.js";
-import {measuredProfile} from "./model_profile.js";
+import {profileChart} from "./profile_chart.js";
 
 const ASK_MS = 120;
 /* What each tool draws, how many places end it, and the figure that stands for the measure. */
@@ -22,29 +21,15 @@ const LAYERS = ["measured-line", "measured-polygon"];
 export function tab(studio) {
   const {map, state} = studio;
   const kept = "alice-survey measures " + state.workspace;
-  let measures = restored();
+  let measures = JSON.parse(sessionStorage.getItem(kept) || "[]");
   let chosen = null;
   let active = false;
-
-  function restored() {
-    try {
-      return JSON.parse(sessionStorage.getItem(kept)) || [];
-    } catch {
-      return [];
-    }
-  }
 
   /* ---- Values of the rasters under the pointer, or in the middle of the map ---- */
 
   const under = el("div", {class: "under"});
-  const readout = document.getElementById("map-readout");
   let asking = null;
   let wanted = null;
-
-  function heightText(found) {
-    return found.height === null ? "; no height here" : "; height " + withSigma(found.height,
-      found.sigma, found.unit);
-  }
 
   function valueOf({value, unit}) {
     if (!Array.isArray(value)) return Number.isInteger(value)
@@ -71,8 +56,7 @@ export function tab(studio) {
       el("dl", {}, found.values.map(
         (row) => el("div", {}, el("dt", {}, row.title.replace(" of height", "")),
         el("dd", {}, valueOf(row))))));
-    if (wanted === place) readout.textContent += heightText(found);
-    else later();
+    if (wanted !== place) later();
   }
 
   function later() {
@@ -96,13 +80,9 @@ export function tab(studio) {
       title: tool.title + " (" + tool.key.toUpperCase() + ")",
   }));
 
-  const base = el("select", {}, el("option", {value: "rim"}, "fitted to the polygon's rim"),
-    el("option", {value: "level"}, "level, at a height"));
   const level = el("input", {type: "number", step: "any"});
-  const levelField = field("Height of the plane, " + state.unit, level);
-  const forVolume = el("div", {hidden: true}, field("Plane of the volume", base), levelField);
-  base.addEventListener("change", () => { levelField.hidden = base.value !== "level"; });
-  levelField.hidden = true;
+  const forVolume = el("div", {hidden: true}, field("Height of the volume's plane, " + state.unit,
+    level, "Empty: a plane that is fitted to the polygon's rim."));
 
   let inHand = null;
   function begin(name) {
@@ -113,8 +93,10 @@ export function tab(studio) {
     const tool = TOOLS[name];
     drawing.begin({
       kind: tool.kind, colour: RED, most: tool.ends, ended: () => held(null),
-      ready: () => name !== "volume" || hasPlane(),
-      done: (points) => finish(name, points.map(([north, east]) => [east, north])),
+      done: (points) => measure(name, {
+        kind: tool.kind, places: points.map(([north, east]) => [east, north]),
+        ...(name === "volume" ? {base: level.value ? level.valueAsNumber : "rim"} : {}),
+      }),
     });
     held(name);
   }
@@ -125,19 +107,6 @@ export function tab(studio) {
       "aria-pressed", String(one.dataset.tool === name)));
     if (!name) return;
     forVolume.hidden = name !== "volume";
-  }
-
-  function hasPlane() {
-    if (base.value === "rim" || Number.isFinite(level.valueAsNumber)) return true;
-    say("Give the height of the plane", "warn");
-    level.focus();
-    return false;
-  }
-
-  async function finish(name, places) {
-    const asked = {kind: TOOLS[name].kind, places};
-    if (name === "volume") asked.base = base.value === "level" ? level.valueAsNumber : "rim";
-    await measure(name, asked);
   }
 
   async function measure(name, asked) {
@@ -155,7 +124,7 @@ export function tab(studio) {
     chosen = made.id;
     changed();
     const main = found.figures.find((one) => one.name === tool.main);
-    say(made.name + ": " + withSigma(main.value, main.sigma, main.unit));
+    say(made.name + ": " + valueText(main));
   }
 
   /* ---- Results ---- */
@@ -175,23 +144,17 @@ export function tab(studio) {
   }
 
   function drawMeasures() {
-    const described = (kind) => {
+    [["line", "Measured lines"], ["polygon", "Measured areas"]].forEach(([kind, title]) => {
       const some = measures.filter((one) => (one.kind === "polygon") === (kind === "polygon"));
-      return {
-        kind, name: "measured-" + kind, title: kind === "polygon"
-          ? "Measured areas" : "Measured lines", colour: RED,
-        dashed: false, fill: 0.12, width: 3, group: "Measures",
+      const name = "measured-" + kind;
+      if (!some.length) map.remove(name);
+      else map.put({kind, name, title, colour: RED, fill: 0.12, width: 3, group: "Measures",
         shapes: some.map((one) => one.places.map(([east, north]) => [east, north])),
-        texts: some.map((one) => one.name + ": " + withSigma(mainOf(one).value, mainOf(one).sigma,
-          mainOf(one).unit)),
-      };
-    };
-    ["line", "polygon"].forEach((kind) => {
-      const about = described(kind);
-      if (about.shapes.length) map.put(about);
-      else map.remove(about.name);
+        texts: some.map((one) => one.name + ": " + valueText(mainOf(one)))});
     });
   }
+
+  const valueText = ({value, sigma, unit}) => withSigma(value, sigma, unit);
 
   function showResults() {
     if (!measures.length) {
@@ -205,8 +168,7 @@ export function tab(studio) {
         one.name = name.value.trim() || one.name;
         changed();
       });
-      const main = mainOf(one);
-      const cells = [name, withSigma(main.value, main.sigma, main.unit),
+      const cells = [name, valueText(mainOf(one)),
         [button("Show", () => { chosen = one.id; changed(); lookAt(one); },
           {"aria-label": "Show " + one.name}), " ",
           button("×", () => drop(one), {"aria-label": "Delete " + one.name})]];
@@ -231,26 +193,26 @@ export function tab(studio) {
     map.leaflet.fitBounds(bounds.pad(0.4), {animate: false});
   }
 
-  const profile = measuredProfile(map, state.unit);
-
   async function showChosen() {
     const one = measures.find((other) => other.id === chosen);
-    profile.clear();
     if (!one) {
       details.replaceChildren();
       return;
     }
-    const rows = one.figures.map(
-      (figure) => [figure.title, withSigma(figure.value, figure.sigma, figure.unit)]);
+    const profile = el("div", {});
     details.replaceChildren(
-      table(one.name, ["Figure", "Value ± sigma"], rows),
+      table(one.name, ["Figure", "Value ± sigma"],
+        one.figures.map((figure) => [figure.title, valueText(figure)])),
       ...one.notes.map((note) => el("p", {class: "note"}, note)),
-      one.kind === "polygon" ? "" : profile.element,
-    );
+      profile);
     if (one.kind === "polygon") return;
     const places = one.places.map(([east, north]) => [east, north]);
     const found = await attempt(() => send("/api/model/profile", {places}));
-    if (found && chosen === one.id) profile.show(found);
+    if (found) profile.append(profileChart("Heights along the line with one sigma", {
+      lines: [{kind: "vehicle", xs: found.along, ys: found.height, sigmas: found.sigma}],
+      caption: "along the line, " + state.unit + "; height ± sigma, " + state.unit,
+      rules: found.corners.slice(1, -1), high: 170,
+    }));
   }
 
   async function exported(form) {
@@ -262,17 +224,7 @@ export function tab(studio) {
     say(counted(measures.length, "measure") + " written to measures." + form);
   }
 
-  /* ---- What sigmas count, and the files ---- */
-
-  const noted = el("ul", {});
-  const about = el("details", {hidden: true}, el("summary", {}, "What the sigmas count"), noted);
-  async function fillAbout() {
-    const found = await get("/api/model/about").catch(() => null);
-    about.hidden = !found;
-    if (!found) return;
-    noted.replaceChildren(...found.notes.map((note) => el("li", {}, note)),
-      el("li", {}, "areas and rugosity are of cells of " + number(found.cell, found.unit, 3)));
-  }
+  /* ---- The files ---- */
 
   const links = el("ul", {});
   function fillFiles() {
@@ -292,7 +244,7 @@ export function tab(studio) {
   const content = el("div", {},
     el("h2", {}, "Look and measure"),
     el("div", {class: "buttons", role: "group", "aria-label": "Measure on the map"}, toolButtons),
-    drawing.element, forVolume, under, results, details, mesh.element, about);
+    drawing.element, forVolume, under, results, details, mesh.element);
   const lack = missing(studio, content, () => (state.has.dem ? null
     : ["There is no model of the sea floor to look at yet: make it in Run, from a simulated dive "
       + "or from pictures.", "run", "Open Run"]));
@@ -304,7 +256,6 @@ export function tab(studio) {
       active = true;
       fillFiles();
       if (!lack.show()) return;
-      fillAbout();
       mesh.enter();
       changed();
       map.refresh();
@@ -312,7 +263,6 @@ export function tab(studio) {
     leave() {
       active = false;
       LAYERS.forEach((name) => map.remove(name));
-      profile.clear();
       mesh.leave();
     },
     keys: Object.fromEntries(Object.entries(TOOLS).map(

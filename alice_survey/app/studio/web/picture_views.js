@@ -1,8 +1,7 @@
 /* Views of pictures as taken, each about a pixel, with crosses for what is expected and picked.
    Pixels count from 0 at the middle of the first one, as in picks.csv. */
 
-import {attempt, el, get} from "./core.js";
-import {INK, WHITE} from "./palette.js";
+import {attempt, button, el, get} from "./core.js";
 import {number} from "./words.js";
 
 const CLOSE = 2;  /* zoom at which a pixel has four of the screen's */
@@ -23,36 +22,31 @@ function cross(kind) {
 }
 
 class PictureView {
-  /* `seen` is a picture that sees the spot: name, and where it is expected (x, y), or the
-     `rings` that are seen in it. `changed(view)` is called where a person picks, if one may,
-     `used(view)` where one takes or drops a pick that stays, and `opened(view)` once the picture
-     is there. */
-  constructor(seen, {changed, used, chosen, opened}) {
+  /* `seen` is a picture that sees the spot: name, and where it is expected (x, y), or that it is
+     shown `whole`. `changed(view)` is called where a person picks, `used()` where one takes or
+     drops a pick that stays, `chosen(view)` where the view has the focus. */
+  constructor(seen, {changed, used, chosen}) {
     this.name = seen.name;
     this.seen = seen;
     this.pick = null;
     this.use = true;
     this.onPick = changed;
-    this.onOpen = opened;
     this.box = el("div", {
       class: "picture-view", tabindex: "0", role: "application",
-      "aria-label": "Picture " + seen.name
-        + (changed ? ": click to pick; arrow keys move the pick by a pixel, with Shift by a "
-        + "tenth; Enter picks the middle; + and - zoom" : ": arrow keys move it, + and - zoom"),
+      "aria-label": "Picture " + seen.name + ": click to pick; arrow keys move the pick by a "
+        + "pixel, with Shift by a tenth; Enter picks the middle; + and - zoom",
       onkeydown: (event) => this.key(event), onfocus: () => chosen(this),
     });
-    this.about = el("p", {},
-      seen.about || (seen.off_nadir_deg === undefined
-      ? "" : number(seen.off_nadir_deg, "", 2) + "° off the normal"));
-    this.text = el("p", {class: "note"}, used ? "not picked" : "");
+    const about = seen.off_nadir_deg === undefined
+      ? "" : number(seen.off_nadir_deg, "", 2) + "° off the normal";
+    this.text = el("p", {class: "note"}, "not picked");
     this.check = el("input", {type: "checkbox", checked: true, onchange: () => {
       this.use = this.check.checked;
-      used(this);
+      used();
     }});
     this.choice = el("label", {class: "use", hidden: true}, this.check, "Use this pick");
     this.card = el("section", {class: "picture-card", "aria-label": seen.name},
-      this.box, el("h2", {}, seen.name), this.about, this.text,
-      this.choice);
+      this.box, el("h2", {}, seen.name), el("p", {}, about), this.text, this.choice);
   }
 
   /* Once it is on the page. */
@@ -77,8 +71,7 @@ class PictureView {
         levels: about.levels,
       address: addressOf(this.name) + "/tile/{}.webp?v=" + about.token,
     }, "pictures").addTo(map);
-    if (seen.rings) this.outline(seen);
-    this.crosses = seen.whole || seen.rings ? [] : [[cross("expected"), place(seen.x, seen.y)]];
+    this.crosses = seen.whole ? [] : [[cross("expected"), place(seen.x, seen.y)]];
     map.on("move zoom resize", () => this.settle());
     map.on("click", ({latlng}) => {
       this.box.focus({preventScroll: true});
@@ -86,27 +79,9 @@ class PictureView {
     });
     this.draw();
     this.box.dataset.ready = "";
-    this.onOpen?.(this);
-  }
-
-  /* Rings of pixels from the outer corner of the first, of which those that are not known are
-     null. */
-  outline({rings, closed, colour = WHITE, closest = CLOSE}, framed = true) {
-    const places = rings.map((ring) => ring.filter(([x]) => x !== null).map(([x, y]) => [-y, x]));
-    const many = closed ? leaflet.polygon : leaflet.polyline;
-    this.shape = (this.shape || leaflet.featureGroup().addTo(this.map)).clearLayers();
-    this.colour = this.colour || colour;
-    [[INK, 6], [this.colour, 2.5]].forEach(([color, weight]) => this.shape.addLayer(
-      places[0].length > 1
-      ? many(places, {color, weight, fill: false, interactive: false})
-      : leaflet.circleMarker(
-        places[0][0], {radius: 7, color, weight, fill: false, interactive: false})));
-    if (framed) this.map.fitBounds(leaflet.latLngBounds(places.flat()).pad(0.3), {
-      maxZoom: closest, animate: false});
   }
 
   byHand(x, y) {
-    if (!this.onPick) return;
     const [wide, high] = this.size || [0, 0];
     if (x < -0.5 || y < -0.5 || x > wide - 0.5 || y > high - 0.5) return;
     this.set({x, y, matched_to: "", sigma_px: null});
@@ -161,7 +136,6 @@ class PictureView {
     event.stopPropagation();
   }
 
-  closer(by) { this.map?.setZoom(this.map.getZoom() + by, {animate: false}); }
   say(text, level = "note") {
     this.text.className = level;
     this.text.textContent = text;
@@ -175,29 +149,22 @@ class PictureView {
 
 /* The wall of views over the map. */
 export class Wall {
-  /** @param {any} listeners */
-  constructor({changed, used, opened, refine} = {}) {
+  constructor({changed, used, refine}) {
     this.views = [];
     this.active = null;
-    this.acts = {changed, used, opened, chosen: (view) => this.choose(view)};
+    this.acts = {changed, used, chosen: (view) => this.choose(view)};
     this.title = el("strong", {}, "");
     this.refineButton =
-      el("button", {type: "button", disabled: true, hidden: !refine,
-      onclick: () => refine(this.active)}, "Find it in all others");
-    this.more = el("button", {type: "button", hidden: true, onclick: () => this.showMore()},
-      "More pictures");
+      button("Find it in all others", () => refine(this.active), {disabled: true});
+    this.more = button("More pictures", () => this.showMore(), {hidden: true});
     this.light = el("input", {type: "range", min: "0.4", max: "3", step: "0.05", value: "1",
       oninput: () => this.lit()});
     this.list = el("div", {class: "views", tabindex: "0", role: "region",
       "aria-label": "Pictures that show it"});
     this.root = el("div", {class: "wall", hidden: true, role: "region", "aria-label": "Pictures"},
       el("div", {class: "bar-top"}, this.title, this.refineButton,
-        el("button", {type: "button", onclick: () => this.views.forEach((view) => view.closer(1))},
-          "Closer"),
-        el("button", {type: "button", onclick: () => this.views.forEach((view) => view.closer(-1))},
-          "Farther"),
         el("label", {}, "Brightness", this.light), this.more,
-        el("button", {type: "button", onclick: () => this.hide()}, "Back to the map")),
+        button("Back to the map", () => this.hide())),
       this.list);
     document.querySelector(".map-side").append(this.root);
   }

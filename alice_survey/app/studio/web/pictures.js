@@ -1,10 +1,8 @@
 /* Pictures: a spot picked in the pictures as taken, lengths with sigma, control, scale. */
 
-import {attempt, button, download, el, field, get, on, say, send, table} from "./core.js";
-import {missing} from "./missing.js";
-import {startOwnSaves} from "./own_saves.js";
+import {PAGE, attempt, button, el, field, get, missing, on, say, send, table} from "./core.js";
 import {ORANGE} from "./palette.js";
-import {counted, csv, number, withSigma} from "./words.js";
+import {counted, number, withSigma} from "./words.js";
 import {controlForm, controlRows, mm} from "./picture_control.js";
 import {Wall, addressOf} from "./picture_views.js";
 
@@ -12,12 +10,11 @@ const BAD_PX = 2;
 const shownBy = (count) => counted(count, "picture shows the spot", "pictures show the spot");
 
 export function tab(studio) {
-  let held = {token: "", points: [], control: null, last: null, unit: studio.state.unit};
+  let held = {token: "", points: [], control: null, unit: studio.state.unit};
   let control = {token: "", rows: []};
   let chosen = [];
   let wall = null;
   let checking = 0;
-  const saves = startOwnSaves();
 
   const name = el("input", {type: "text", value: "", maxlength: "100", autocomplete: "off"});
   const sigma = el("input", {type: "number", min: "0.01", max: "20", step: "any", value: "0.3"});
@@ -32,7 +29,6 @@ export function tab(studio) {
   const scaleBox = el("div", {hidden: true}, field("Its true length, m", known),
     button("Set the scale", () => attempt(setScale)));
   const controlBox = el("div", {});
-  const lastBox = el("div", {});
 
   const content = el("div", {},
     el("h2", {}, "Pick a spot"),
@@ -46,7 +42,7 @@ export function tab(studio) {
     spotText, el("div", {class: "buttons"}, save, button("Start another", clearSpot)),
     points,
     el("h2", {}, "Length"), lengthText, scaleBox,
-    el("h2", {}, "Control"), controlBox, lastBox,
+    el("h2", {}, "Control"), controlBox,
   );
   const lack = missing(studio, content, () => (
     ["pictures", "sparse", "dem"].some((name) => studio.state.has[name]) ? null
@@ -201,21 +197,22 @@ export function tab(studio) {
     return "P" + number_;
   }
 
+  /* Replace rows of a file by others. */
+  async function change(path, table_, rows) {
+    table_.token = (await send(path, {token: table_.token, page: PAGE, ...rows})).token;
+    await load();
+  }
+
   async function savePoint() {
     const point = name.value.trim();
     if (!point) throw new Error("give the point a name");
-    held.token = (await saves.save(
-      send("/api/picks/save", {token: held.token, points: [point], picks: used().map(asPick)})))
-      .token;
-    await load();
+    await change("/api/picks/save", held, {points: [point], picks: used().map(asPick)});
     say("Saved " + point + " to picks.csv.");
   }
 
   async function removePoint(point) {
-    held.token = (await saves.save(
-      send("/api/picks/save", {token: held.token, points: [point], picks: []}))).token;
     chosen = chosen.filter((one) => one !== point);
-    await load();
+    await change("/api/picks/save", held, {points: [point], picks: []});
     say("Took " + point + " out of picks.csv.");
   }
 
@@ -269,22 +266,13 @@ export function tab(studio) {
           button("Delete", () => attempt(() => removePoint(point.name)),
             {"aria-label": "Delete " + point.name})],
       ];
-    })), el("div", {class: "buttons"}, button("Export CSV", exportPoints)));
+    })));
     studio.map.put({
       kind: "point", name: "picked", title: "Picked points", colour: ORANGE, group: "Pictures",
       shapes: held.points.filter((point) => point.position)
         .map((point) => [[point.position.e, point.position.n]]),
       texts: held.points.filter((point) => point.position).map((point) => point.name),
     });
-  }
-
-  function exportPoints() {
-    const rows = held.points.filter((point) => point.position).map(({name: of, position}) => [
-      of, position.n, position.e, position.down, ...position.sigma, position.views,
-      position.rms_px]);
-    const header = ["name", "north", "east", "down", "sigma_north", "sigma_east", "sigma_down",
-      "views", "rms_px"];
-    download("points.csv", csv(header, rows), "text/csv");
   }
 
   function choose(point, isOn) {
@@ -335,9 +323,7 @@ export function tab(studio) {
   /* ---- Control ---- */
 
   async function saveControl(rows, names) {
-    control.token = (
-      await saves.save(send("/api/control/save", {token: control.token, rows, names}))).token;
-    await load();
+    await change("/api/control/save", control, {rows, names});
     say("Saved to control.csv. Run the reconstruction for the model to use it.");
   }
 
@@ -347,17 +333,9 @@ export function tab(studio) {
         (row) => attempt(() => saveControl([], [[row.kind, row.name]]))),
       controlForm(held.points.map((point) => point.name),
         (row) => attempt(() => saveControl([row], []))));
-    const {last} = held;
-    const rms = last?.rms?.control;
-    lastBox.replaceChildren(
-      last ? el("p", {class: "note"}, "The last reconstruction used " + (rms.points || 0)
-        + " points and " + (rms.bars || 0) + " lengths"
-        + (rms.points ? ": rms north " + mm(rms.north_m) + ", east " + mm(rms.east_m) + ", down "
-          + mm(rms.down_m) + " mm" : "")
-        + (rms.bars ? "; lengths " + mm(rms.length_m) + " mm" : "") + ".") : "",
-      control.rows.length ? el("p", {class: "note"},
-        "Run the reconstruction again for the model to use what is saved here. ",
-        button("Open Run", () => studio.open("run"))) : "");
+    if (control.rows.length) controlBox.append(el("p", {class: "note"},
+      "Run the reconstruction again for the model to use what is saved here. ",
+      button("Open Run", () => studio.open("run"))));
   }
 
   async function load() {
@@ -366,9 +344,8 @@ export function tab(studio) {
     drawControl();
   }
 
-  on("picks", async ({file, token}) => {
-    if (await saves.isOwn(token) || panel.hidden || !file || token === held.token
-      || token === control.token) return;
+  on("picks", ({file, page}) => {
+    if (page === PAGE || panel.hidden || !file) return;
     say(file + " was changed by another page: loaded again.", "warn");
     attempt(load);
   });

@@ -1,29 +1,23 @@
 /* The Plan tab: draw a survey, see it re-planned, save it. */
 
-import {attempt, button, el, field, get, on, say, send} from "./core.js";
-import {fileDrop} from "./file_drop.js";
+import {PAGE, attempt, button, el, field, get, on, say, send, table} from "./core.js";
 import {AS_IN_FILE, withChange, withChanges} from "./plan_changes.js";
 import {drawing} from "./plan_draw.js";
 import {latest} from "./plan_latest.js";
-import {playback} from "./plan_play.js";
-import {planProfile} from "./plan_profile.js";
-import {resultsPanel} from "./plan_results.js";
 import {settingsPanel} from "./plan_settings.js";
 import {noShapes, paths, withImported} from "./plan_shapes.js";
 import {shown} from "./plan_show.js";
-import {summaryOf} from "./plan_words.js";
+import {keyFigures, summaryOf} from "./plan_words.js";
+import {profileChart} from "./profile_chart.js";
 import {canRedo, canUndo, current, record, redo, same, startHistory, undo} from "./undo.js";
 import {number} from "./words.js";
 
 const QUIET_MS = 900;  /* after which the figures are said */
-const PAGE = crypto.randomUUID();
-const TOO_LARGE = 20e6;
 const ROLES = {survey: "area to survey", no_go: "no-go zones", allowed: "allowed area"};
 const EMPTY = "Draw the area to survey on the map, or import a file with it.";
 
 export function tab(studio) {
-  let [file, history, active, preview, fitted, quiet, saving] =
-    [null, startHistory(AS_IN_FILE), false, null, false, null, false];
+  let [file, history, preview, fitted, quiet] = [null, startHistory(AS_IN_FILE), null, false, null];
   const body = () => current(history);
   const isDirty = () => !same(body(), AS_IN_FILE);
 
@@ -33,8 +27,6 @@ export function tab(studio) {
   const draw = drawing(studio, {changed: reshaped, moving: (shapes) => plan({...body(), shapes})});
   const results = resultsPanel(
     (changes) => edit({...body(), changes: withChanges(body().changes, file, changes)}));
-  const along = planProfile((place) => view.mark(place));
-  const play = playback({ask: () => send("/api/plan/play", body()), mark: view.mark});
   const controls = el("div");
   const precision = el("p", {class: "note plan-precision"},
     "How well the model of this survey is expected to be known.");
@@ -57,20 +49,15 @@ export function tab(studio) {
     el("h2", {}, "Area"), draw.panel,
     el("details", {}, el("summary", {}, "Import a file"), field("It is the", role),
       field("File", dropped,
-        "GeoJSON, KML, GeoPackage, zipped shapefile, WKT and others; or drop it on the map")),
+        "GeoJSON, KML, GeoPackage, zipped shapefile, WKT and others")),
     el("h2", {}, "How to fly"), controls,
     results.below,
-    el("details", {open: true}, el("summary", {}, "Depth along the way"), along.element),
-    el("details", {ontoggle: () => play.pause()}, el("summary", {}, "Play the dive"), play.element),
     el("details", {}, el("summary", {}, "Expected precision"), precision,
       el("div", {class: "buttons"}, button("Compute it", () => attempt(showPrecision)))),
     el("details", {}, el("summary", {}, "Export"), exports));
-  const missing = el("div", {hidden: true}, el(
-    "p", {}, "The settings cannot be read; the line below says why."),
-    el("div", {class: "buttons"}, button("Read them again", () => start())));
   const waiting = el("p", {class: "note"}, "Planning …");
   const wait = (on) => { waiting.hidden = !on; };
-  const panel = el("div", {}, waiting, missing, content);
+  const panel = el("div", {}, waiting, content);
 
   /* ---- Planning in the background ---- */
 
@@ -97,11 +84,9 @@ export function tab(studio) {
       preview = answer;
       view.sigma(null);
       view.show(answer);
-      along.show(answer.profile, answer.routes);
       if (!fitted) view.fit(shapesOf(body()));
       fitted = true;
     }
-    play.forget();
     results.show(answer);
     settings.set(body().changes, answer.ok ? answer : preview);
     panel.dataset.plans = Number(panel.dataset.plans || 0) + 1;
@@ -173,11 +158,12 @@ export function tab(studio) {
   }
 
   async function save() {
-    [keep.disabled, saving] = [true, true];
+    keep.disabled = true;
     say("Saving: the plan is made with all its files");
     try {
       const {changes, shapes} = body();
-      const {saved} = await send("/api/plan/save", {changes, shapes, token: file.token});
+      const {saved} = await send("/api/plan/save", {
+        changes, shapes, token: file.token, page: PAGE});
       await restart();
       await studio.refresh();
       view.alone();
@@ -188,13 +174,12 @@ export function tab(studio) {
       if (fault.status === 409) conflict(fault);
       else say(fault.message, "error");
     }
-    saving = false;
     buttons();
   }
 
   /* Another page saved. */
-  on("plan", ({token}) => {
-    if (!file || saving || token === file.token) return;
+  on("plan", ({page}) => {
+    if (!file || page === PAGE) return;
     if (isDirty()) say("survey.toml was changed by another page; what is changed here is kept",
       "warn");
     else attempt(() => restart());
@@ -246,11 +231,6 @@ export function tab(studio) {
 
   function importFile(taken) {
     if (!taken) return;
-    if (taken.size > TOO_LARGE) {
-      say(taken.name + " has " + Math.round(taken.size / 1e6) + " MB: at most 20 are taken",
-        "error");
-      return;
-    }
     attempt(async () => {
       const found = await send("/api/plan/import", taken, {
         params: {name: taken.name, role: role.value}});
@@ -267,15 +247,11 @@ export function tab(studio) {
   /* The middle of a file is the datum of a new survey. */
   const moved = (datum) => (same(datum, file.datum) ? {} : {area: datum});
 
-  fileDrop(studio.map.leaflet.getContainer(), ([first]) => importFile(first),
-    () => active && Boolean(file));
-
   /* ---- The page ---- */
 
   window.addEventListener("beforeunload", (event) => { if (isDirty()) event.preventDefault(); });
 
   async function enter() {
-    active = true;
     view.enter();
     draw.enter();
     if (!file) await start();
@@ -283,15 +259,12 @@ export function tab(studio) {
 
   async function start() {
     wait(true);
-    missing.hidden = true;
     await attempt(() => restart());
-    [content.hidden, missing.hidden] = [!file, Boolean(file)];
+    content.hidden = !file;
     if (!file || file.saved || !hasArea(body())) wait(false);
   }
 
   function leave() {
-    active = false;
-    play.pause();
     draw.leave();
     view.leave();
     view.dim(false);
@@ -299,4 +272,49 @@ export function tab(studio) {
 
   const keys = {"Ctrl+z": () => step(undo), "Ctrl+Z": () => step(redo), "Ctrl+y": () => step(redo)};
   return {name: "plan", title: "Plan", panel, enter, leave, keys};
+}
+
+/* What a plan comes to: figures, warnings, settings and why, depths; or why there is none, and the setting that would help. `apply(changes)` takes a suggestion. */
+function resultsPanel(apply) {
+  const key = el("dl", {class: "plan-key"});
+  const top = el("div", {});
+  const below = el("div", {});
+  const opened = new Set(["Depth along the way"]);
+  const folded = (name, title, content) => el("details", {open: opened.has(name),
+    ontoggle: (event) => (event.target.open ? opened.add(name) : opened.delete(name))},
+    el("summary", {}, title), content);
+
+  function show(preview) {
+    if (!preview.ok) {
+      refuse(preview);
+      return;
+    }
+    const {totals, warnings, rows, profile} = preview;
+    key.replaceChildren(...keyFigures(totals).map(
+      ([name, text]) => el("div", {}, el("dt", {}, name), el("dd", {}, text))));
+    top.replaceChildren(warnings.length ? el("ul", {class: "warn"},
+      warnings.map((text) => el("li", {}, text))) : "");
+    below.replaceChildren(
+      folded("rows", "Settings and why",
+        table("Settings and why", ["setting", "value", "why"], rows)),
+      folded("Depth along the way", "Depth along the way",
+        profileChart("Depth of the sea floor and of the camera along the way", {
+          lines: [{kind: "floor", xs: profile.s_m, ys: profile.floor_depth_m, ground: true},
+            {kind: "vehicle", xs: profile.s_m, ys: profile.vehicle_depth_m}],
+          downwards: true, caption: "along the way, m; depth, m",
+          rules: profile.s_m.filter((_, i) => i && profile.dive[i] !== profile.dive[i - 1]),
+        })));
+  }
+
+  function refuse({error, suggestion}) {
+    const words = suggestion && Object.entries(suggestion).flatMap(([section, values]) =>
+      Object.entries(values).map(([name, value]) => section + "." + name + " = " + value));
+    top.replaceChildren(
+      el("p", {class: "error"}, "No plan: " + error),
+      el("p", {class: "note"}, "The map shows the last plan."),
+      words ? el("div", {class: "plan-ways"},
+        button("Set " + words.join(", "), () => apply(suggestion))) : "");
+  }
+
+  return {key, top, below, show};
 }

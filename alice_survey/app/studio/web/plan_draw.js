@@ -5,23 +5,21 @@ import {button, el} from "./core.js";
 import {drawingTool} from "./drawing.js";
 import {WHITE} from "./palette.js";
 import {
-  KINDS, addRing, insertVertex, isClosed, moveRing, moveVertex, nameOf, noShapes, pathAt, paths,
-    pointsOf, removeRing,
-  removeVertex, samePath, sizeOf,
+  KINDS, addRing, areaOf, insertVertex, isClosed, moveRing, moveVertex, nameOf, noShapes, paths,
+  pointsOf, removeRing, removeVertex, samePath, sizeOf,
 } from "./plan_shapes.js";
 import {vertexHandles} from "./vertices.js";
 
-const REACH_PX = 9;
 const fixed = {interactive: false};
 
 /* A ring as what handles edit. */
 const targetOf = (shapes, path) => ({
   value: shapes, name: nameOf(shapes, path).toLowerCase(),
-    word: isClosed(path) ? "Corner" : "Point",
-  rings: [{points: pointsOf(shapes, path), closed: isClosed(path)}],
-  move: (_, i, place) => moveVertex(shapes, path, i, place),
-  insert: (_, after, place) => insertVertex(shapes, path, after, place),
-  remove: (_, i) => removeVertex(shapes, path, i),
+  word: isClosed(path) ? "Corner" : "Point",
+  points: pointsOf(shapes, path), closed: isClosed(path),
+  move: (i, place) => moveVertex(shapes, path, i, place),
+  insert: (after, place) => insertVertex(shapes, path, after, place),
+  remove: (i) => removeVertex(shapes, path, i),
   shift: (north, east) => moveRing(shapes, path, north, east),
   drop: () => removeRing(shapes, path),
 });
@@ -30,11 +28,10 @@ const targetOf = (shapes, path) => ({
 export function drawing(studio, {changed, moving}) {
   const map = studio.map.leaflet;
   const pane = map.createPane("plan-shapes");
-  pane.style.pointerEvents = "none";
-  const renderer = leaflet.canvas({pane: "plan-shapes", padding: 0.3});
+  const renderer = leaflet.canvas({pane: "plan-shapes", padding: 0.3, tolerance: 6});
   const drawn = leaflet.featureGroup();
   const tool = drawingTool(studio, "plan");
-  let [shapes, chosen, active] = [noShapes(), null, false];
+  let [shapes, chosen, active, hit] = [noShapes(), null, false, null];
   const edges = vertexHandles(map, "plan", {
     changed, moving,
     left: () => { choose(null); document.getElementById("map-canvas").focus(); },
@@ -46,21 +43,27 @@ export function drawing(studio, {changed, moving}) {
     const {colour} = KINDS[path.kind];
     const bold = samePath(path, chosen);
     const many = isClosed(path) ? leaflet.polygon : leaflet.polyline;
-    const style = {...fixed, renderer, fill: false};
-    drawn.addLayer(many(points, {...style, color: WHITE, weight: bold ? 6 : 5, opacity: 0.75}));
+    const style = {renderer, fill: false};
+    drawn.addLayer(many(points, {
+      ...style, ...fixed, color: WHITE, weight: bold ? 6 : 5, opacity: 0.75}));
     drawn.addLayer(many(points, {
       ...style, color: colour, weight: bold ? 3.4 : 2.2,
       dashArray: path.kind === "allowed" ? "7 5" : null,
-    }));
+    }).on("click", () => { hit = path; }));
   }
 
+  /* The smallest shape lies on top, and takes a click that several could. */
+  const areaIn = (path) => (isClosed(path) ? areaOf(pointsOf(shapes, path)) : 0);
+
   function render() {
+    pane.style.pointerEvents = active ? "" : "none";
     drawn.clearLayers();
     if (active) {
       shapes.no_go.forEach(({outer, holes}) => drawn.addLayer(leaflet.polygon([outer, ...holes], {
         ...fixed, renderer, stroke: false, fillColor: KINDS.no_go.colour, fillOpacity: 0.22,
       })));
-      paths(shapes).forEach((path) => outline(pointsOf(shapes, path), path));
+      paths(shapes).sort((a, b) => areaIn(b) - areaIn(a))
+        .forEach((path) => outline(pointsOf(shapes, path), path));
     }
     toolsShown();
   }
@@ -78,11 +81,13 @@ export function drawing(studio, {changed, moving}) {
     list();
   }
 
-  /* A click that no tool takes chooses what is there. */
-  function pick({latlng: {lat, lng}}) {
-    if (document.getElementById("map-canvas").dataset.tool !== undefined) return;
-    choose(pathAt(shapes, [lat, lng], REACH_PX / 2 ** map.getZoom()));
-  }
+  /* A click that no tool takes chooses what is there; the map hears it after the shape, and a tool
+     may be put down by it. */
+  let isFree = true;
+  const listeners = {
+    preclick() { [hit, isFree] = [null, map.getContainer().dataset.tool === undefined]; },
+    click() { if (isFree) choose(hit); },
+  };
 
   /* ---- Drawing ---- */
 
@@ -140,13 +145,13 @@ export function drawing(studio, {changed, moving}) {
   function enter() {
     active = true;
     drawn.addTo(map);
-    map.on("click", pick);
+    map.on(listeners);
     render();
   }
 
   function leave() {
     active = false;
-    map.off("click", pick);
+    map.off(listeners);
     render();
     drawn.remove();
   }

@@ -132,58 +132,6 @@ function lengthOf(points) {
   );
 }
 
-/* Whether a ring encloses a place: crossings of the ray to the north. */
-export function encloses(points, [n, e]) {
-  return points.reduce((inside, [n0, e0], i) => {
-    const [n1, e1] = points[(i + 1) % points.length];
-    const crosses = (e0 > e) !== (e1 > e) && n < n0 + (e - e0) / (e1 - e0) * (n1 - n0);
-    return crosses ? !inside : inside;
-  }, false);
-}
-
-/* Distance from a place to the edges of a ring, or to a corridor's line. */
-export function distanceTo(points, closed, [n, e]) {
-  const edges = points.length - (closed ? 0 : 1);
-  let least = Infinity;
-  for (let i = 0; i < edges; i += 1) {
-    const [[n0, e0], [n1, e1]] = [points[i], points[(i + 1) % points.length]];
-    const [dn, de] = [n1 - n0, e1 - e0];
-    const square = dn * dn + de * de;
-    const t = square > 0 ? Math.min(1, Math.max(0, ((n - n0) * dn + (e - e0) * de) / square)) : 0;
-    least = Math.min(least, Math.hypot(n0 + t * dn - n, e0 + t * de - e));
-  }
-  return least;
-}
-
-/* The ring at a place: an edge within reach, else the smallest ring that encloses it, else null. */
-export function pathAt(shapes, place, reach) {
-  let [best, least] = [null, reach];
-  paths(shapes).forEach((path) => {
-    const away = distanceTo(pointsOf(shapes, path), isClosed(path), place);
-    if (away < least) [best, least] = [path, away];
-  });
-  if (best) return best;
-  let smallest = Infinity;
-  paths(shapes).filter(isClosed).forEach((path) => {
-    const points = pointsOf(shapes, path);
-    if (encloses(points, place) && areaOf(points) < smallest) [best, smallest] =
-      [path, areaOf(points)];
-  });
-  return best;
-}
-
-/* [south, west, north, east] of all points, or null where there are none. */
-export function boundsOf(shapes) {
-  const all = paths(shapes).flatMap((path) => pointsOf(shapes, path));
-  if (!all.length) return null;
-  const [norths, easts] = [all.map(([n]) => n), all.map(([, e]) => e)];
-  const reduced = (pick, values) => values.reduce((a, b) => pick(a, b));
-  return [
-    reduced(Math.min, norths), reduced(Math.min, easts), reduced(Math.max, norths),
-      reduced(Math.max, easts),
-  ];
-}
-
 /* "No-go zone 2", "Hole 1 of survey area"; a number only where there are several. */
 export function nameOf(shapes, {kind, index, ring}) {
   const several = shapes[kind].length > 1 ? " " + (index + 1) : "";

@@ -1,12 +1,12 @@
 /* A plan on the map: its lines by kind, way, stations, footprints, counts, holes, homes. */
 
 import {COUNTS, PLAN, WHITE} from "./palette.js";
-import {boundsOf} from "./plan_shapes.js";
+import {paths, pointsOf} from "./plan_shapes.js";
+import {drawStations} from "./plan_stations.js";
 import {paintCounts} from "./plan_words.js";
 import {counted} from "./words.js";
 
 const LINES = ["survey", "cross", "closing", "fill", "tie"];
-const GROUP = "The plan";
 const MADE = ["area", "plan"];  /* layers of the shell */
 const eastNorth = ([n, e]) => [e, n];
 const MAX_POINTS = 500;
@@ -17,21 +17,31 @@ function pieces(way) {
   return Array.from({length: count}, (_, i) => way.slice(i * MAX_POINTS, (i + 1) * MAX_POINTS + 1));
 }
 
+/* The pixels of a picture: `data` of four bytes each, and a canvas that holds them. */
+async function readPixels(address) {
+  const image = new Image();
+  image.src = address;
+  await image.decode();
+  const canvas = document.createElement("canvas");
+  [canvas.width, canvas.height] = [image.width, image.height];
+  const context = canvas.getContext("2d", {willReadFrequently: true});
+  context.drawImage(image, 0, 0);
+  return {canvas, context, pixels: context.getImageData(0, 0, image.width, image.height)};
+}
+
 export function shown(studio) {
   const {map} = studio;
   const off = new Set(["plan-footprints"]);
   const away = new Set();
-  const marks = leaflet.featureGroup();
-  let [names, stations, number, active, last, sigmaLayer, whole, fitted] =
-    [new Set(), null, 0, false, null, null, null, ""];
-  map.moreAt((place) => (active && stations ? stations.textAt(place) : ""));
+  let [names, stations, number, active, last, sigmaLayer, whole] =
+    [new Set(), null, 0, false, null, null, null];
+  let textAt = (_) => "";
+  map.moreAt((place) => (active ? textAt(place) : ""));
 
   function put(about) {
     names.add(about.name);
-    const layer = map.put({
-      group: GROUP, texts: [], fill: 0, dashed: false, about: "", shown: !off.has(about.name),
-        ...about,
-    });
+    const layer = map.put({group: "The plan", texts: [], shapes: [], fill: 0,
+      shown: !off.has(about.name), ...about});
     /* A click chooses an area; what a line is appears under the pointer. */
     layer.eachLayer?.((shape) => shape.off("click"));
     return layer;
@@ -44,174 +54,129 @@ export function shown(studio) {
     names = new Set();
     stations?.remove();
     number += 1;
+    textAt = () => "";
     putCounts(preview.counts, number);
     putLayers(preview);
-    if (before.has("plan-counts") && preview.counts) names.add("plan-counts");
-    if (sigmaLayer) putSigma(sigmaLayer);
+    if (before.has("plan-counts")) names.add("plan-counts");
+    if (sigmaLayer) putPicture("plan-sigma", number, sigmaLayer);
     before.forEach((name) => { if (!names.has(name)) map.remove(name); });
   }
 
-  function putLayers(preview) {
-    const {totals, holes, homes, routes, outline, area} = preview;
+  function putLayers({holes, homes, routes, outline, area, lines}) {
     put({
       kind: "polygon", name: "plan-allowed", title: "The vehicle may be within",
-        colour: PLAN.allowed, dashed: true, width: 1.2,
+      colour: PLAN.allowed, dashed: true, width: 1.2,
       shapes: area.allowed.flat().map((ring) => [...ring, ring[0]].map(eastNorth)),
     });
-    if (holes.length) {
-      put({
-        kind: "polygon", name: "plan-holes", title: counted(holes.length, "hole"),
-          colour: PLAN.missed, fill: 0.25,
-        shapes: holes.map((hole) => hole.outer.map(eastNorth)),
-        texts: holes.map((hole) => "Not seen: " + hole.area_m2.toFixed(2) + " m²"),
-      });
-    }
-    const footprints =
-      put({kind: "polygon", name: "plan-footprints", title: "Footprints", colour: PLAN.footprint,
-      shapes: []});
-    putLines("plan-way", "Way between lines", PLAN.way, routes.flatMap(pieces), 1.1);
-    const drawn = lineLayers(preview.lines);
-    const points = put(
-      {kind: "point", name: "plan-stations", title: "Stations", colour: PLAN.survey, shapes: []});
-    put({
-      kind: "point", name: "plan-home", title: homes.length > 1 ? "Homes" : "Home",
-        colour: PLAN.home, shapes: homes.map((home) => [eastNorth(home)]),
+    if (holes.length) put({
+      kind: "polygon", name: "plan-holes", title: counted(holes.length, "hole"),
+      colour: PLAN.missed, fill: 0.25, shapes: holes.map((hole) => hole.outer.map(eastNorth)),
     });
-    const rights = outline.map(([, right]) => right);
+    const footprints = put({kind: "polygon", name: "plan-footprints", title: "Footprints",
+      colour: PLAN.footprint});
+    putLines("plan-way", "Way between lines", PLAN.way, routes.flatMap(pieces), 1.1);
+    const drawn = lineLayers(lines);
+    const points = put({kind: "point", name: "plan-stations", title: "Stations",
+      colour: PLAN.survey});
+    put({kind: "point", name: "plan-home", title: homes.length > 1 ? "Homes" : "Home",
+      colour: PLAN.home, shapes: homes.map((home) => [eastNorth(home)])});
     stations = drawStations(map.leaflet, {
-      lines: () => drawn.lines.filter((line) => map.leaflet.hasLayer(line.group)),
-      groups: drawn.groups, stations: points, footprints, outline, spacing: totals.line_spacing_m,
-      across: Math.max(...rights) - Math.min(...rights), counts: preview.counts,
+      lines: () => drawn.filter((line) => map.leaflet.hasLayer(line.group)),
+      stations: points, footprints, outline,
     });
     stations.refresh();
   }
 
   /* Lines of one colour with a light rim: two shapes, however many lines there are. */
   function putLines(name, title, colour, lines, weight) {
-    const group = put({kind: "line", name, title, colour, shapes: []});
-    const rim = leaflet.polyline(
-      lines, {color: WHITE, weight: 5, opacity: 0.75, interactive: false});
-    const drawn = leaflet.polyline(lines, {color: colour, weight, interactive: false});
-    drawn.survey = {title, text: ""};
-    group.addLayer(rim).addLayer(drawn);
+    const group = put({kind: "line", name, title, colour});
+    [[WHITE, 5], [colour, weight]].forEach(([color, wide]) => group.addLayer(leaflet.polyline(
+      lines, {color, weight: wide, opacity: color === WHITE ? 0.75 : 1, interactive: false})));
     return group;
   }
 
   function lineLayers(lines) {
     let first = 0;
     const numbered = lines.map((line, index) => {
-      const entry = {...line, index, first};
+      const length = Math.hypot(line.to[0] - line.from[0], line.to[1] - line.from[1]);
       first += line.stations;
-      return entry;
+      return {...line, colour: PLAN[line.kind], first: first - line.stations,
+        text: `Line ${index}, dive ${line.dive}: ${length.toFixed(2)} m, `
+          + counted(line.stations, "station")};
     });
-    const kinds = LINES.filter((kind) => lines.some((line) => line.kind === kind));
-    const groups = [];
-    const drawn = kinds.flatMap((kind) => {
+    return LINES.flatMap((kind) => {
       const own = numbered.filter((line) => line.kind === kind);
-      const ends = own.map(({from, to}) => [from, to]);
-      const group = putLines("plan-" + kind, counted(own.length, kind + " line"), PLAN[kind], ends,
-        1.7);
-      groups.push(group);
-      return own.map((line) => {
-        const made = stationLine(line.from, line.to, {
-          group, index: line.index, first: line.first, stations: line.stations, colour: PLAN[kind],
-        });
-        const heading = ((made.heading * 180 / Math.PI) + 360) % 360;
-        made.text = "Line " + line.index + ", dive " + line.dive + ": " + made.length.toFixed(2)
-          + " m, heading "
-          + heading.toFixed(1) + "°, " + counted(line.stations, "station");
-        return made;
-      });
+      if (!own.length) return [];
+      const group = putLines("plan-" + kind, counted(own.length, kind + " line"), PLAN[kind],
+        own.map(({from, to}) => [from, to]), 1.7);
+      return own.map((line) => ({...line, group}));
     });
-    return {lines: drawn, groups};
   }
 
   async function putCounts(counts, own) {
-    if (!counts) return;
-    const pixels = await readPixels(counts.png);
+    const {canvas, context, pixels} = await readPixels(counts.png);
     if (own !== number || !active) return;
+    const raw = pixels.data.slice();
     const most = paintCounts(pixels.data);
-    const canvas = document.createElement("canvas");
-    [canvas.width, canvas.height] = [pixels.width, pixels.height];
-    canvas.getContext("2d").putImageData(pixels, 0, 0);
-    putPicture("plan-counts", "Pictures that see a place", canvas.toDataURL(),
-      {...counts, ...size(pixels)}, {
-      about: "Orange: below the requested overlap.",
-      scale: {label: "pictures that see a place", low: 0, high: most, colours: COUNTS},
-    });
+    context.putImageData(pixels, 0, 0);
+    textAt = ({lat, lng}) => {
+      const row = Math.floor((counts.north - lat) / counts.pixel);
+      const column = Math.floor((lng - counts.west) / counts.pixel);
+      if (row < 0 || column < 0 || row >= pixels.height || column >= pixels.width) return "";
+      const [pictures, passes] = raw.slice(4 * (row * pixels.width + column));
+      if (pictures === 255) return "";
+      return `; ${pictures === 254 ? "254 or more" : pictures} pictures of `
+        + counted(passes, "line");
+    };
+    putPicture("plan-counts", own, {...counts, png: canvas.toDataURL(),
+      title: "Pictures that see a place", about: "Orange: below the requested overlap.",
+      scale: {label: "pictures that see a place", low: 0, high: most, colours: COUNTS}});
   }
 
-  const size = ({width, height}) => ({width, height});
-  function putPicture(name, title, address, {north, west, pixel, width, height}, more) {
-    put({
-      kind: "picture", name, title, address, north, west, pixel, width, height,
-        tile: Math.max(width, height), levels: 1, base: false, ...more,
-    });
-  }
-
-  async function putSigma(layer) {
-    names.add("plan-sigma");
-    const own = number;
-    const pixels = await readPixels(layer.png);
+  async function putPicture(name, own, {png, ...about}) {
+    names.add(name);
+    const {canvas: {width, height}} = await readPixels(png);
     if (own !== number || !active) return;
-    putPicture("plan-sigma", layer.title || "Expected sigma of the model", layer.png,
-      {...layer, ...size(pixels)}, {scale: layer.scale});
+    put({kind: "picture", name, address: png, width, height, tile: Math.max(width, height),
+      levels: 1, base: false, ...about});
   }
 
   /* The expected sigma as a layer, until the plan is another one. */
   function sigma(layer) {
     sigmaLayer = layer;
-    if (layer) putSigma(layer);
+    if (layer) putPicture("plan-sigma", number, layer);
     else {
       names.delete("plan-sigma");
       map.remove("plan-sigma");
     }
   }
 
-  /* One place on the way, or none; with a heading as an arrow, and the way up to there. */
-  function mark(place, heading = null, way = []) {
-    marks.clearLayers();
-    if (!place) return;
-    const style = {color: WHITE, weight: 2, fillColor: PLAN.mark, fillOpacity: 1,
-      interactive: false};
-    if (way.length > 1) marks.addLayer(
-      leaflet.polyline(way, {color: PLAN.mark, weight: 3, opacity: 0.8, interactive: false}));
-    if (heading === null) marks.addLayer(leaflet.circleMarker(place, {...style, radius: 6}));
-    else {
-      const px = 1 / 2 ** map.leaflet.getZoom();
-      const line = {heading: heading * Math.PI / 180};
-      const arrow = [[14, 0], [-9, 8], [-4, 0], [-9, -8]].map(([a, b]) => [a * px, b * px]);
-      marks.addLayer(leaflet.polygon(aroundStation(line, place, arrow), style));
-    }
-  }
-
   /* Show all of a plan, and let "Show all" mean it. */
   function fit(shapes) {
     const ways = last?.ok ? [...last.routes, ...last.area.allowed.flat()] : [];
-    const bounds = boundsOf({...shapes, corridors: [...shapes.corridors, ...ways]});
-    if (!bounds) return;
-    const [south, west, north, east] = bounds;
+    const places = [...paths(shapes).map((path) => pointsOf(shapes, path)), ...ways].flat();
+    if (!places.length) return;
+    const bounds = leaflet.latLngBounds(places);
+    const [south, west, north, east] = [bounds.getSouth(), bounds.getWest(), bounds.getNorth(),
+      bounds.getEast()];
     const margin = 0.04 * Math.max(north - south, east - west, 1);
     whole = [west - margin, south - margin, east + margin, north + margin];
     map.extend(whole);
     map.fit(false);
-    fitted = viewOf();
   }
-  const viewOf = () => [map.leaflet.getZoom(), ...Object.values(map.leaflet.getCenter())].join();
 
   /* The plan as it was made is put away while the one in work is shown. */
   function alone() {
     MADE.filter((name) => map.layers.has(name) && map.leaflet.hasLayer(map.layers.get(name)))
       .forEach((name) => {
-      away.add(name);
-      map.show(name, false);
-    });
+        away.add(name);
+        map.show(name, false);
+      });
   }
 
   function enter() {
     active = true;
     if (whole) map.extend(whole);
-    marks.addTo(map.leaflet);
     alone();
     show(last);
   }
@@ -227,15 +192,12 @@ export function shown(studio) {
     stations?.remove();
     stations = null;
     active = false;
-    const isMoved = viewOf() !== fitted;
     map.extend(map.data.extent);
-    if (!isMoved) map.fit(false);
-    marks.remove();
     away.forEach((name) => map.show(name, true));
     away.clear();
   }
 
   const dim = (on) => { map.leaflet.getContainer().closest("main").toggleAttribute(
     "data-planning", on); };
-  return {show, sigma, mark, fit, alone, enter, leave, dim};
+  return {show, sigma, fit, alone, enter, leave, dim};
 }

@@ -1,8 +1,7 @@
 /* The Run tab: what is made, what is left and what it takes; the job that runs, its log, its
    end. */
 
-import {attempt, button, el, field, get, mayWrite, on, say, send, table} from "./core.js";
-import {showSteps} from "./job_progress.js";
+import {attempt, button, el, get, mayWrite, on, say, send} from "./core.js";
 import {startPage} from "./start.js";
 import {ago, counted, duration, gigabytes, number} from "./words.js";
 
@@ -14,17 +13,25 @@ const STATES = {
   working: ["▶", "blue", "working now"],
 };
 const ENDS = {
-  done: ["✓", "good", "done"],
-  failed: ["✗", "bad", "failed"],
-  stopped: ["■", "look", "stopped"],
-  killed: ["✗", "bad", "ended without a word"],
+  done: ["✓", "good", "done", null],
+  failed: ["✗", "bad", "failed", "Try again"],
+  stopped: ["■", "look", "stopped", "Go on"],
+  killed: ["✗", "bad", "ended without a word", "Start again"],
 };
-const LONG_S = 20;
-const LOUD_EVERY_S = 60;
+const FURTHER = [
+  ["quality", "Judge the pictures: sharpness, exposure, overlap", "image"],
+  ["control", "Find coded markers in the pictures", "image"],
+  ["plan check", "Check what the flown dive has seen", "fly"],
+  ["plan revisit", "Plan a dive over what the model lacks", "dense"],
+  ["plan export", "Write the plan for vehicles again", "plan"],
+];
 const SILENT_MS = 6000;
+const SHOWN = /\.(html|json|csv|txt|pdf|png)$/;
 
-const secondsOf = ({started_utc: start, ended_utc: end}) =>
-  (new Date(end).getTime() - new Date(start).getTime()) / 1000;
+const iconOf = (icon, colour) => el("span", {class: "icon " + colour, "aria-hidden": "true"}, icon);
+const link = (path, text) => el("a", {href: "/files/" + path, target: "_blank", rel: "noopener"},
+  text);
+const report = () => link("report/report.html", "Open the report");
 
 export function tab(studio) {
   const job = el("section", {class: "job", "aria-label": "Running now", hidden: true});
@@ -32,21 +39,15 @@ export function tab(studio) {
   const begin = el("section", {"aria-label": "Start"});
   const stages = el("div", {class: "stages"});
   const log = logView();
-  const history = historyView();
-  const options = optionsView();
-  const more = moreView();
-  const work = el("div", {}, job, last, begin, el("h2", {}, "Stages"), stages, options.element,
-    more.element, log.element, history.element);
+  const further = el("div", {class: "buttons column"});
+  const more = el("details", {}, el("summary", {}, "Further commands"), further);
+  const work = el("div", {}, begin, el("h2", {}, "Stages"), stages, more, log.element);
   const first = el("div", {hidden: true});
-  const panel = el("div", {class: "run"}, first, work);
-  let known = null;
-  let running = null;
-  let heardAt = 0;
-  let finished = 0;
-  let spoken = {stage: "", at: 0};
-  let timer = null;
-  let opened = false;
-  let failed = null;
+  const panel = el("div", {class: "run"}, job, last, first, work);
+  let [known, running, heardAt, spoken, timer, opened] = [null, null, 0, "", null, false];
+
+  const command = (text, name, args = {}, attributes = {}) => button(text, () => start(name, args),
+    {disabled: Boolean(running) || Boolean(known.elsewhere) || !mayWrite(), ...attributes});
 
   async function load() {
     const found = await attempt(() => get("/api/run"));
@@ -58,19 +59,20 @@ export function tab(studio) {
 
   function show() {
     running = known.job;
-    failed = known.last && known.last.state === "failed" ? known.last : null;
-    first.hidden = !known.new || Boolean(running);
-    work.hidden = !first.hidden;
-    wide(!first.hidden && opened);
-    if (!first.hidden && !first.firstChild) first.append(
+    const isNew = known.new && !running;
+    if (isNew && !first.firstChild) first.append(
       startPage(studio, {started: load, disk: known.disk, others: known.others}));
-    if (!first.hidden) showLast(first.querySelector(".start-last"));
-    if (work.hidden) return;
+    [first.hidden, work.hidden] = [!isNew, isNew];
+    wide(isNew && opened);
     showJob();
-    showLast(last);
+    showLast();
+    if (isNew) return;
     showBegin();
     showStages();
-    more.show(known, running);
+    const made = (name) => known.stages.some((stage) => stage.name === name && stage.made_utc);
+    const offered = FURTHER.filter(([, , stage]) => made(stage));
+    further.replaceChildren(...offered.map(([name, title]) => command(title, name)));
+    more.hidden = !offered.length;
   }
 
   /* The start page takes the room of the map, which has nothing to show yet. */
@@ -83,10 +85,11 @@ export function tab(studio) {
   /* ---- The job that runs ---- */
 
   function showJob() {
-    job.hidden = !running && !known?.elsewhere;
+    job.hidden = !running && !known.elsewhere;
     if (job.hidden) return;
     if (!running) {
       const what = known.elsewhere.stage ? `: it makes ${known.elsewhere.stage}` : "";
+      job.dataset.number = "";
       job.replaceChildren(el("h2", {}, "Another command is working here"),
         el("p", {}, `A terminal or another program works in this survey${what}. Nothing else can `
           + `start until it ends; it can be stopped only there.`));
@@ -94,269 +97,160 @@ export function tab(studio) {
     }
     if (job.dataset.number !== String(running.number)) {
       job.dataset.number = running.number;
-      job.replaceChildren(el("h2", {}, running.title), el("p", {class: "what"}), el(
-        "div", {class: "bars"}),
-        el("p", {class: "warn", hidden: true}),
-        el("div", {class: "buttons"}, button("Stop", stop,
-          {class: "stop", disabled: !mayWrite()})));
+      job.replaceChildren(el("h2", {}, running.title), el("p", {class: "what"}),
+        el("div", {class: "bars"}), el("p", {class: "warn"}),
+        el("div", {class: "buttons"}, button("Stop", stop, {class: "stop"})));
     }
     const stopping = running.state === "stopping";
     const stage = running.stage_title ? `${running.stage_title}, ` : "";
     job.querySelector(".what").textContent = stopping
-      ? "stopping: what is made so far is kept" : `${stage}running for `
-        + `${duration(running.elapsed_s)}`;
-    showSteps(job.querySelector(".bars"), running);
-    const warned = job.querySelector(".warn");
-    warned.hidden = !running.warned;
-    warned.textContent = running.warned
+      ? "stopping: what is made so far is kept"
+      : `${stage}running for ${duration(running.elapsed_s)}`;
+    job.querySelector(".bars").replaceChildren(...running.steps.map(stepBar));
+    job.querySelector(".warn").textContent = running.warned
       ? `${counted(running.warned, "warning")}; the last: ${running.warnings.at(-1)}` : "";
     job.querySelector(".stop").disabled = stopping || !mayWrite();
-    speak();
+    if (running.stage_title && running.stage_title !== spoken) say(`${running.stage_title} begins`);
+    spoken = running.stage_title;
   }
 
-  /* Screen readers hear a stage begin, and once a minute how long it still takes. */
-  function speak() {
-    const step = running.steps.find((one) => one.remaining_s !== null);
-    const isNew = running.stage_title !== spoken.stage;
-    if (!isNew && (Date.now() - spoken.at < 1000 * LOUD_EVERY_S || !step)) return;
-    if (isNew && running.stage_title) say(`${running.stage_title} begins`);
-    else if (step) say(
-      `${running.stage_title}: ${step.step}, about ${duration(step.remaining_s)} left`);
-    spoken = {stage: running.stage_title, at: Date.now()};
+  function stepBar({step, done, total, elapsed_s, remaining_s}) {
+    const count = done === null ? "" : total ? ` ${done} of ${total}` : ` ${done}`;
+    const left = remaining_s === null
+      ? `, for ${duration(elapsed_s)}` : `, about ${duration(remaining_s)} left`;
+    return el("div", {class: "step"}, el("span", {}, step + count + left),
+      el("progress", {"aria-label": step, max: total || null, value: total ? done : null}));
   }
 
-  async function stop() {
-    await attempt(async () => {
-      await send("/api/run/stop");
-      say("Stopping: the same command goes on from there later.");
-    });
-  }
+  const stop = () => attempt(async () => {
+    await send("/api/run/stop");
+    say("Stopping: the same command goes on from there later.");
+  });
 
-  async function start(name, args = {}) {
+  async function start(name, args) {
     const begun = await attempt(() => send("/api/run/start", {name, arguments: args}));
     if (!begun) return;
-    running = begun.job;
-    finished = 0;
-    spoken = {stage: "", at: Date.now()};
-    say(`${running.title}: started`);
-    log.follow(running);
+    say(`${begun.job.title}: started`);
+    log.follow(begun.job.number);
     await load();
     job.querySelector(".stop")?.focus();
   }
 
   /* ---- How the last one ended ---- */
 
-  function showLast(place) {
+  function showLast() {
     const ended = known.last;
-    place.hidden = !ended || Boolean(running) || Boolean(known.elsewhere);
-    if (place.hidden) return;
-    const [icon, colour, words] = ENDS[ended.state] || ENDS.killed;
-    const again = {done: null, stopped: "Go on", failed: "Try again", killed: "Start again"}[
-      ended.state];
+    last.hidden = !ended || Boolean(running) || Boolean(known.elsewhere);
+    if (last.hidden) return;
+    const [icon, colour, words, again] = ENDS[ended.state] || ENDS.killed;
     const ways = (ended.ways || []).map((way) => el("li", {}, el("code", {}, way.command), " ",
-      way.name ? button(way.title, () => start(way.name), {disabled: !mayWrite()}) : null));
-    place.replaceChildren(...[
-      el("h2", {}, el("span", {class: "icon " + colour, "aria-hidden": "true"}, icon),
-        ` ${ended.title}: ${words}`),
-      el("p", {}, `${ago(ended.ended_utc)}, after `
-        + `${duration(secondsOf(ended))}`),
-      ended.line ? el("p",
-        {class: ["failed", "killed"].includes(ended.state) ? "line error" : "line"},
-        ended.line) : null,
-      ways.length ? el("div", {}, el("p", {}, "The way on:"), el("ul", {}, ways)) : null,
+      way.name ? command(way.title, way.name) : null));
+    const lasted = (Date.parse(ended.ended_utc) - Date.parse(ended.started_utc)) / 1000;
+    last.replaceChildren(
+      el("h2", {}, iconOf(icon, colour), ` ${ended.title}: ${words}`),
+      el("p", {}, `${ago(ended.ended_utc)}, after ${duration(lasted)}`),
+      el("p", {class: colour === "bad" ? "line error" : "line"}, ended.line),
+      ways.length ? el("div", {}, el("p", {}, "The way on:"), el("ul", {}, ways)) : "",
       el("div", {class: "buttons"},
         again && ended.name !== "import-images"
-          ? button(again, () => repeat(ended), {disabled: !mayWrite()}) : null,
-        button("Show its log", () => log.show(ended)),
-        ended.state === "done" && ended.finished.includes("report")
-          ? button("Open the report", report) : null),
-    ].filter(Boolean));
+          ? command(again, ended.name, ended.arguments || {}) : null,
+        button("Show its log", () => log.show(ended.number)),
+        ended.state === "done" && ended.finished.includes("report") ? report() : null));
   }
-
-  const repeat = (ended) => start(ended.name, ended.arguments || {});
 
   /* ---- What is left ---- */
 
-  function costText(cost) {
-    return cost ? `About ${duration(cost.time_s)} on ${counted(known.cores, "core")}, `
-      + `${gigabytes(cost.disk_mb)} of disk` : "";
-  }
+  const costText = (cost) => (cost ? `About ${duration(cost.time_s)} on ${
+    counted(known.cores, "core")}, ${gigabytes(cost.disk_mb)} of disk` : "");
 
   function showBegin() {
-    const free = el("small", {}, `${number(known.disk.free_gb, "GB", 3)} of the disk are free`);
     if (known.fault) {
       begin.replaceChildren(el("p", {class: "error line"}, known.fault),
-        known.ways.length
-          ? el("ul", {}, known.ways.map((way) => el("li", {}, el("code", {}, way.command)))) : null,
+        el("ul", {}, known.ways.map((way) => el("li", {}, el("code", {}, way.command)))),
         el("p", {}, "The stages are shown once that is settled."));
       return;
     }
-    const wanted = known.commands.filter(
-      (one) => (known.imported ? ["reconstruct", "report"] : ["run"]).includes(one.name));
-    const all = wanted.find((one) => one.left.length);
-    const left = all ? all.left : [];
+    const names = known.imported ? ["reconstruct", "report"] : ["run"];
+    const all = known.commands.find((one) => names.includes(one.name) && one.left.length);
     const tight = all?.cost && all.cost.disk_mb / 1000 > 0.9 * known.disk.free_gb;
-    const made = known.stages.find((one) => one.name === "report");
-    begin.replaceChildren(...[
-      left.length ? el("p", {}, costText(all.cost)
-        || "What it takes is known once there is a plan or pictures.", el("br"), free)
-        : el("p", {}, "All stages are up to date. ", free),
+    const made = known.stages.some((one) => one.name === "report" && one.made_utc);
+    const costs = all ? costText(all.cost)
+      || "What it takes is known once there is a plan or pictures." : "All stages are up to date.";
+    begin.replaceChildren(
+      el("p", {}, costs, el("br"),
+        el("small", {}, `${number(known.disk.free_gb, "GB", 3)} of the disk are free`)),
       tight ? el("p", {class: "error"},
-        "That is more than there is room for: free some of the disk first.") : null,
+        "That is more than there is room for: free some of the disk first.") : "",
       el("div", {class: "buttons"},
-        left.length ? button(all.title, () => start(all.name, options.of(all.name)), {
-          class: "primary", disabled: Boolean(running) || Boolean(known.elsewhere)
-          || !mayWrite()}) : null,
-        made && made.made_utc ? button("Open the report", report) : null),
-    ].filter(Boolean));
+        all ? command(all.title, all.name, {}, {class: "primary"}) : null, made ? report() : null));
   }
 
   function showStages() {
-    const groups = known.commands.filter((one) => one.name !== "run").map((command) => {
-      const own = known.stages.filter((stage) => stage.command === command.name);
-      if (!own.length) return null;
-      const busy = Boolean(running) || Boolean(known.elsewhere);
+    const commands = known.commands.filter((one) => one.name !== "run");
+    const groups = commands.map((one) => {
+      const own = known.stages.filter((stage) => stage.command === one.name);
+      if (!own.length) return "";
       const begun = own.some((stage) => stage.state === "interrupted");
-      const word = command.left.length && !command.after.length ? begun ? "Go on" : "Start" : null;
-      const after = known.commands.filter((one) => one.name !== "run" && one.left.some(
-        (name) => command.after.includes(name)));
-      return el("section", {class: "group", "aria-label": command.title},
-        el("div", {class: "head"}, el("h3", {}, command.title),
-          word ? button(word, () => start(command.name, options.of(command.name)),
-            {"aria-label": `${word}: ${command.title}`, disabled: busy || !mayWrite()}) : null),
-        after.length ? el("small", {}, "after: " + after.map((one) => one.title).join(", ")) : null,
-        command.cost ? el("small", {}, costText(command.cost)) : null,
-        el("ul", {}, own.map(row)));
-    }).filter(Boolean);
-    const rest = known.stages.filter((stage) => !known.commands.some(
-      (one) => one.name === stage.command));
-    if (rest.length) groups.unshift(
-      el("section", {class: "group", "aria-label": "Pictures"},
-      el("div", {class: "head"}, el("h3", {}, "Imported pictures")), el("ul", {}, rest.map(row))));
-    stages.replaceChildren(...groups);
+      const word = begun ? "Go on" : "Start";
+      const after = commands.filter((other) =>
+        other.left.some((name) => one.after.includes(name))).map((other) => other.title);
+      return group(one.title, own,
+        one.left.length && !one.after.length ? command(word, one.name, {},
+          {"aria-label": `${word}: ${one.title}`}) : null,
+        [after.length ? "after: " + after.join(", ") : "", costText(one.cost)]);
+    });
+    const rest = known.stages.filter((stage) =>
+      !known.commands.some((one) => one.name === stage.command));
+    stages.replaceChildren(rest.length ? group("Imported pictures", rest) : "", ...groups);
   }
+
+  const group = (title, own, act = null, notes = []) =>
+    el("section", {class: "group", "aria-label": title},
+      el("div", {class: "head"}, el("h3", {}, title), act),
+      notes.filter(Boolean).map((text) => el("small", {}, text)), el("ul", {}, own.map(row)));
 
   function row(stage) {
     const working = running && running.stage === stage.folder
       && !running.finished.includes(stage.folder);
-    const [icon, colour, words] = STATES[working ? "working" : stage.state] || STATES.missing;
+    const state = working ? "working" : stage.state;
+    const [icon, colour, words] = STATES[state] || STATES.missing;
     const why = stage.why && !working ? ` (${stage.why})` : "";
     const took = stage.took_s === null
       ? "" : `; took ${duration(stage.took_s)}${stage.made_utc ? ", " + ago(stage.made_utc) : ""}`;
-    const broken = failed && failed.name === stage.command && stage.state !== "up to date"
-      && !running && failed.stage === stage.folder;
-    const open = stage.products.filter((one) => /\.(html|json|csv|txt|pdf|png)$/.test(one.path)
-      || !one.path.includes("."));
-    return el("li", {"data-stage": stage.name, "data-state": working ? "working" : stage.state},
-      el("span", {class: "icon " + colour, "aria-hidden": "true"}, icon),
+    const ended = running ? null : known.last;
+    const broken = ended?.state === "failed" && ended.stage === stage.folder
+      && stage.state !== "up to date";
+    const open = stage.products.filter(({path}) => SHOWN.test(path) || !path.includes("."));
+    return el("li", {"data-stage": stage.name, "data-state": state}, iconOf(icon, colour),
       el("div", {}, el("strong", {}, stage.name), ` ${words}${why}${took}`,
-        broken ? el("p", {class: "error line"}, failed.line) : null,
+        broken ? el("p", {class: "error line"}, ended.line) : null,
         el("small", {}, stage.about),
-        open.length ? el("small", {}, open.map(
-          (one, i) => [i ? ", " : "", one.path === "report/report.html"
-          ? el("a", {href: "#run", onclick: (event) => { event.preventDefault(); report(); }},
-            one.about)
-          : el("a", {href: "/files/" + one.path + (one.path.includes(".") ? "" : "/"),
-            target: "_blank", rel: "noopener"}, one.about)])) : null));
-  }
-
-  /* ---- The report, inside ---- */
-
-  function report() {
-    const frame = el(
-      "iframe", {src: "/files/report/report.html", sandbox: "allow-scripts",
-      title: "Report of the survey"});
-    const close = button("Close the report", () => sheet.close(), {class: "primary"});
-    const sheet = el("dialog", {class: "report", "aria-label": "Report of the survey"},
-      el("div", {class: "buttons"}, close,
-        el("a", {href: "/files/report/report.html", target: "_blank", rel: "noopener"},
-          "in a page of its own"),
-        el("a", {href: "/files/report/report.pdf", target: "_blank", rel: "noopener"}, "PDF")),
-          frame);
-    sheet.addEventListener("close", () => sheet.remove());
-    document.body.append(sheet);
-    sheet.showModal();
-  }
-
-  /* ---- Options, and further commands ---- */
-
-  function optionsView() {
-    const threads = el("input", {type: "number", min: 1, max: 256, step: 1, placeholder: "all"});
-    const scale = el(
-      "input", {type: "number", min: 1, max: 16, step: 1, placeholder: "as in the settings"});
-    const given = (input) => (input.value && input.checkValidity() ? Number(input.value) : null);
-    const takes = {run: ["threads", "scale"], image: ["threads", "scale"], plan: [], fly: []};
-    return {
-      element: el("details", {}, el("summary", {}, "Options"),
-        field("Cores to use", threads, "fewer need less memory"),
-        field("Resolution of rendered pictures divided by", scale, "4 renders 16 times faster")),
-      of(name) {
-        const values = {threads: given(threads), scale: given(scale)};
-        return Object.fromEntries((takes[name] || ["threads"]).filter((key) => values[key] !== null)
-          .map((key) => [key, values[key]]));
-      },
-    };
-  }
-
-  function moreView() {
-    const rows = [
-      ["quality", "Judge the pictures: sharpness, exposure, overlap", "image"],
-      ["control", "Find coded markers in the pictures", "image"],
-      ["plan check", "Check what the flown dive has seen", "fly"],
-      ["plan revisit", "Plan a dive over what the model lacks", "dense"],
-      ["plan export", "Write the plan for vehicles again", "plan"],
-    ];
-    const list = el("div", {class: "buttons column"});
-    return {
-      element: el("details", {}, el("summary", {}, "Further commands"), list),
-      show(state, busy) {
-        const made = (name) => state.stages.some((stage) => stage.name === name && stage.made_utc);
-        list.replaceChildren(...rows.filter((one) => made(one[2])).map(([name, title]) =>
-          button(title, () => start(name),
-            {disabled: Boolean(busy) || Boolean(state.elsewhere) || !mayWrite()})));
-        this.element.hidden = !list.firstChild;
-      },
-    };
+        el("small", {}, open.map(({path, about}, i) => [i ? ", " : "",
+          link(path.includes(".") ? path : path + "/", about)]))));
   }
 
   /* ---- Events ---- */
 
   on("run", (data) => {
     heardAt = Date.now();
-    if (data.job) {
-      running = data.job;
-      if (!known) return;
-      const grown = running.finished.length !== finished || !known.job;
-      const moved = known.job?.stage !== running.stage;
-      finished = running.finished.length;
-      known.job = running;
-      if (opened) showJob();
-      if (opened && moved) showStages();
-      if (opened && grown) load();
-      log.follow(running);
-      return;
-    }
     if (data.ended) end(data.last);
+    if (!data.job || !known) return;
+    const before = known.job;
+    known.job = running = data.job;
+    log.follow(running.number);
+    if (!opened) return;
+    showJob();
+    if (before?.finished.length !== running.finished.length) load();
+    else if (before.stage !== running.stage) showStages();
   });
 
   async function end(ended) {
-    running = null;
-    finished = 0;
-    const [icon, , words] = ENDS[ended.state] || ENDS.killed;
-    const lasted = secondsOf(ended);
+    const [, , words] = ENDS[ended.state] || ENDS.killed;
     say(`${ended.title}: ${words}${ended.state === "done" ? "" : ". " + ended.line}`,
       {done: "note", stopped: "warn"}[ended.state] || "error");
-    if (lasted > LONG_S && !document.hasFocus()) notice(`${icon} ${words}: ${ended.title}`);
-    log.follow({number: ended.number});
+    log.follow(ended.number);
     await attempt(() => studio.refresh());
     await load();
-    await history.show();
-  }
-
-  function notice(text) {
-    const title = document.title;
-    document.title = text;
-    window.addEventListener("focus", () => { document.title = title; }, {once: true});
   }
 
   /* Commands of a terminal, and what was missed while this page slept. */
@@ -364,15 +258,12 @@ export function tab(studio) {
     if (document.hidden || Date.now() - heardAt < SILENT_MS) return;
     heardAt = Date.now();
     const now = await attempt(() => get("/api/run/job"));
-    if (!now || !known) return;
-    const same = (key) => JSON.stringify(now[key]) === JSON.stringify(known[key]);
-    if (now.job?.number !== known.job?.number || !same("elsewhere")) load();
+    if (now && known && (now.job?.number !== known.job?.number
+      || JSON.stringify(now.elsewhere) !== JSON.stringify(known.elsewhere))) load();
   }
 
   return {
-    name: "run",
-    title: "Run",
-    panel,
+    name: "run", title: "Run", panel,
     enter() {
       opened = true;
       timer = timer || setInterval(watch, 2000);
@@ -387,92 +278,51 @@ export function tab(studio) {
   };
 }
 
-/* ---- The log: fetched while it is open ---- */
-
-const KEPT_LINES = 2000;
-
+/* The log of the last job, fetched while it is open. */
 function logView() {
   const lines = el("ol", {class: "log", tabindex: "0", "aria-label": "Log"});
-  const title = el("p", {});
-  const element = el("details", {}, el("summary", {}, "Log"), title, lines);
-  let job = null;
-  let had = 0;
-  let busy = false;
+  const element = el("details", {}, el("summary", {}, "Log"), lines);
+  let [job, had, busy] = [null, 0, false];
 
   async function more() {
-    if (!element.open || job === null || busy) return;
+    if (!element.open || busy) return;
     busy = true;
-    const asked = job;
-    const found = await attempt(() => get("/api/run/log", {job: asked, after: had}));
+    const found = await attempt(async () => {
+      if (job === null) {
+        const {job: runs, last} = await get("/api/run/job");
+        job = (runs || last)?.number ?? null;
+      }
+      return job === null ? null : {job, ...await get("/api/run/log", {job, after: had})};
+    });
     busy = false;
-    if (!found || asked !== job) return;
+    if (!found || found.job !== job) return;
     const atEnd = lines.scrollTop + lines.clientHeight >= lines.scrollHeight - 8;
     const texts = found.lines.length || had || !found.output
       ? found.lines : [{kind: "note", text: found.output, time_utc: ""}];
-    lines.append(...texts.map(
-      (line) => el("li", {class: line.kind},
-      line.time_utc ? el("time", {datetime: line.time_utc}, new Date(line.time_utc)
-      .toLocaleTimeString("en-GB")) : null, " ", line.text)));
-    while (lines.children.length > KEPT_LINES) lines.firstChild.remove();
+    lines.append(...texts.map(({kind, text, time_utc}) => el("li", {class: kind},
+      time_utc ? el("time", {datetime: time_utc}, new Date(time_utc).toLocaleTimeString("en-GB"))
+        : null, " ", text)));
     had = found.total;
     if (atEnd) lines.scrollTop = lines.scrollHeight;
   }
 
-  function take(number) {
-    if (number === job) return;
-    job = number;
-    had = 0;
-    lines.replaceChildren();
-    title.textContent = `of run ${number}`;
-  }
-
-  element.addEventListener("toggle", async () => {
-    if (element.open && job === null) {
-      const found = await attempt(() => get("/api/run"));
-      const shown = found && (found.job || found.last);
-      if (!shown) {
-        title.textContent = "Nothing has run yet.";
-        return;
-      }
-      take(shown.number);
+  function follow(number) {
+    if (number !== job) {
+      [job, had] = [number, 0];
+      lines.replaceChildren();
     }
     more();
-  });
+  }
+
+  element.addEventListener("toggle", more);
   return {
     element,
-    follow(running) {
-      take(running.number);
-      more();
-    },
-    async show(ended) {
-      take(ended.number);
+    follow,
+    show(number) {
       element.open = true;
-      await more();
+      follow(number);
       lines.focus();
       element.scrollIntoView({block: "end"});
     },
   };
-}
-
-function historyView() {
-  const place = el("div", {});
-  const element = el("details", {}, el("summary", {}, "Earlier runs"), place);
-  async function show() {
-    if (!element.open) return;
-    const found = await attempt(() => get("/api/run/history"));
-    if (!found) return;
-    if (!found.jobs.length) {
-      place.replaceChildren(el("p", {}, "None yet: runs that the studio starts are listed here."));
-      return;
-    }
-    place.replaceChildren(
-      table("Runs that the studio has started, the last first", ["what", "how it ended", "when"],
-      found.jobs.map((one) => {
-      const [icon, colour, words] = ENDS[one.state] || ENDS.killed;
-      return [one.title, [el("span", {class: "icon " + colour, "aria-hidden": "true"}, icon),
-        " " + words], ago(one.ended_utc)];
-    })));
-  }
-  element.addEventListener("toggle", show);
-  return {element, show};
 }

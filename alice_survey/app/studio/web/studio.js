@@ -1,6 +1,5 @@
 /* The studio's shell: the one map, its list of layers, and the tabs. */
 
-import {background} from "./background.js";
 import {attempt, el, get, mayWrite, say} from "./core.js";
 
 const state = await get("/api/state");
@@ -10,7 +9,7 @@ document.getElementById("title").textContent = state.name;
 const held = await attempt(() => get("/api/map"));
 const mapData = {
   unit: state.unit, axes: state.axes, extent: [-50, -50, 50, 50], layers: [],
-    ...held,
+  ...held,
 };
 const described = mapData.layers;
 mapData.layers = [];
@@ -91,36 +90,14 @@ const map = {...core, put, remove, show};
 const isLine = (about) => ["flown", "plan", "footprints"].includes(about.name);
 described.forEach(
   (about) => put({...about, shown: about.shown && !(state.has.mosaic && isLine(about))}));
-if (state.background && state.datum) {
-  const tiles = background(state.datum, state.background).addTo(core.leaflet);
-  const input = el("input", {type: "checkbox", value: "background", checked: true});
-  input.addEventListener(
-    "change", () => (input.checked ? tiles.addTo(core.leaflet) : tiles.remove()));
-  const host = new URL(state.background).host;
-  groupOf("Background")
-    .append(el("div", {class: "choice"}, el("label", {}, input, "Map of " + host),
-    el("small", {}, "From the network, as --background says; its terms are those of " + host
-      + ".")));
-}
-
-/* The list is open where it leaves two thirds of the map free, until it is closed by hand. */
+/* The list is open where there is room for it, until it is closed by hand. */
 const layersKey = "alice-survey layers";
 const layers = document.getElementById("layers");
+const isWide = () => window.innerWidth > 900;
+layers.open = (sessionStorage.getItem(layersKey) || (isWide() ? "open" : "closed")) === "open";
 layers.firstElementChild.addEventListener("click", () => sessionStorage.setItem(
   layersKey, layers.open ? "closed" : "open"));
-const fits = () => layers.offsetWidth * layers.offsetHeight < core.leaflet.getSize()
-  .x * core.leaflet.getSize().y / 3;
-function fold() {
-  const wanted = sessionStorage.getItem(layersKey);
-  layers.open = wanted ? wanted === "open" : window.innerWidth > 900 && Boolean(list.firstChild);
-  if (layers.open && !wanted && !fits()) layers.open = false;
-}
-new ResizeObserver(
-  () => { if (layers.open && !sessionStorage.getItem(layersKey) && !fits()) layers.open = false; })
-  .observe(list);
-fold();
-mapData.room = () =>
-  (layers.open && fits() ? {paddingTopLeft: [56, 24],
+mapData.room = () => (layers.open && list.firstChild && isWide() ? {paddingTopLeft: [56, 24],
   paddingBottomRight: [layers.offsetWidth + 32, 40]} : {});
 core.fit(false);
 

@@ -49,9 +49,6 @@ export function clock(seconds) {
     + pair(whole % 60);
 }
 
-/* How fast a dive is shown. */
-export const paceText = (times) => (times === 1 ? "as fast as it was" : times + " times as fast");
-
 /* How long ago a time of the clock was. */
 export function ago(utc) {
   const seconds = (Date.now() - new Date(utc).getTime()) / 1000;
@@ -71,10 +68,3 @@ export function share(value, decimals = 2) {
 
 export const gigabytes = (megabytes) => (megabytes < 1000
   ? number(megabytes, "MB", 2) : number(megabytes / 1000, "GB", 2));
-
-/* The text of a CSV file: a header and rows of values, of which null is an empty cell. */
-export function csv(header, rows) {
-  const cell = (value) => (value === null || value === undefined ? ""
-    : /[",\n]/.test(value) ? '"' + String(value).replaceAll('"', '""') + '"' : String(value));
-  return [header, ...rows].map((row) => row.map(cell).join(",")).join("\n") + "\n";
-}

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from pydantic import BaseModel
 
-from alice_survey.app.studio import app as studio_app
+from alice_survey.app.studio import server as studio_server
 from alice_survey.app.studio.endpoints.base import Call, Content, Endpoint, Studio
 from alice_survey.app.studio.server import Server
 from alice_survey.core.artefacts import StaleError
@@ -53,7 +53,7 @@ def endpoints(studio: Studio) -> list[Endpoint]:
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(studio_app, "all_endpoints", endpoints)
+        patch.setattr(studio_server, "all_endpoints", endpoints)
         with serving(tiny_workspace(tmp_path_factory.mktemp("studio"))) as started:
             yield started
 
@@ -113,7 +113,7 @@ def test_bodies_are_bounded_and_checked(server: Server) -> None:
 
 
 def test_a_body_that_drips_in_is_given_up(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(studio_app, "_BODY_S", 0.5)
+    monkeypatch.setattr(studio_server, "_BODY_S", 0.5)
     before = written(server)
     head = (
         f"POST /api/test/write HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\nContent-Length: 900\r\n"

@@ -90,13 +90,11 @@ def test_only_the_page_itself_changes_what_is_followed(dive: tuple[Server, Path]
     (log.parent / "link.csv").symlink_to("/etc/passwd")
     for name in ("../nav.csv", "/etc/passwd", "none.csv", "link.csv"):
         assert call(server, "/api/follow/open", {"log": name}).status in (400, 404), name
-    assert call(server, "/api/follow/open", {"log": "nav.csv", "replay": -1}).status == 400
     assert not json.loads(call(server, "/api/follow/end", {}).text)["following"]
     assert ask(server, "/api/follow/dive").status == 400
-    opened = call(server, "/api/follow/open", {"log": "nav.csv", "replay": 200})
+    opened = call(server, "/api/follow/open", {"log": "nav.csv"})
     assert opened.status == 200, opened.text
-    half = wait_for(server, lambda found: found["coverage"]["seen"] > 0)
-    assert "200 times" in half["source"]
+    wait_for(server, lambda found: found["coverage"]["seen"] > 0)
 
 
 def test_a_log_that_cannot_be_used_is_said_in_a_line(tmp_path: Path) -> None:

@@ -140,11 +140,7 @@ def test_a_dive_is_followed_and_its_hole_closed(tmp_path: Path, size: dict[str, 
         )
         assert float(figure(page, "overlap").split()[0]) > 99.0
         is_accessible(page, tmp_path / "closed.png")
-        # A finished log is flown again, for training.
         page.get_by_text("Choose a log", exact=True).click()
         button(page, "Stop").click()
         phase(page, "No dive is followed")
-        page.get_by_label("Pace of a replay").select_option("20")
-        button(page, "Replay it").click()
-        phase(page, "On line")
         assert heard.complaints == []

@@ -38,14 +38,12 @@ def named(answer: Any) -> dict[str, Any]:
 
 def test_a_place_has_the_value_of_every_raster(server: Server) -> None:
     answer = ask(server, "/api/model/value?east=0.305&north=0.605").json
-    assert answer["height"] == pytest.approx(SLOPE * 0.305 - 10.0, abs=1e-5)
-    assert answer["sigma"] == pytest.approx(SIGMA_M, rel=1e-6)
     found = {row["title"]: row for row in answer["values"]}
+    assert found["Height"]["value"] == pytest.approx(SLOPE * 0.305 - 10.0, abs=1e-5)
     assert found["Sigma of height"]["value"] == pytest.approx(1e3 * SIGMA_M)
     assert found["Sigma of height"]["unit"] == "mm"
     assert len(found["Mosaic"]["value"]) == 3
     nothing = ask(server, "/api/model/value?east=5&north=0.6").json
-    assert nothing["height"] is None
     assert nothing["values"] == []
     assert ask(server, "/api/model/value?east=x&north=0.6").status == 400
 
@@ -134,9 +132,7 @@ def test_measures_are_exported_with_names_that_no_spreadsheet_runs(server: Serve
 
 def test_a_model_without_scale_is_in_its_own_units(tmp_path: Path) -> None:
     with serving(tiny_workspace(tmp_path, scaled=False, placed=False)) as server:
-        about = ask(server, "/api/model/about").json
-        assert about["unit"] == "model units"
-        assert any("no scale" in note for note in about["notes"])
+        assert ask(server, "/api/state").json["unit"] == "unit"
         line = named(measured(server, kind="line", places=[[0.2, 0.6], [0.6, 0.6]]))
         assert line["length"]["unit"] == "model units"
         assert line["length"]["value"] == pytest.approx(0.4 * RISE, rel=1e-5)
@@ -152,8 +148,7 @@ def test_a_plane_that_is_not_level_has_its_own_axes(tmp_path: Path) -> None:
     folder = tiny_workspace(tmp_path)
     write_json(folder / "dense" / "plane.json", plane_of("wall"))
     with serving(folder) as server:
-        about = ask(server, "/api/model/about").json
-        assert about["axes"] == ["right", "up", "out"]
+        assert ask(server, "/api/state").json["axes"] == ["right", "up", "out"]
         line = named(measured(server, kind="line", places=[[0.2, 0.6], [0.6, 0.6]]))
         assert line["length"]["value"] == pytest.approx(0.4 * RISE, rel=1e-5)
 
@@ -172,5 +167,6 @@ def test_no_link_leads_out_of_the_workspace(tmp_path: Path) -> None:
 
 def test_without_a_surface_nothing_is_here(tmp_path: Path) -> None:
     with serving(tmp_path) as server:
-        assert ask(server, "/api/model/about").status == 404
+        asked = {"places": [[0.2, 0.6], [0.6, 0.6]]}
+        assert call(server, "/api/model/profile", asked).status == 404
         assert ask(server, "/api/model/mesh").status == 404

@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from alice_survey.app.pipeline import run, template_text
@@ -20,9 +19,7 @@ from alice_survey.core.artefacts import read_json
 from alice_survey.core.errors import collected_by
 from alice_survey.core.executor import local_executor
 from alice_survey.core.settings_form import settings_form
-from missions.values.plan_file import read_plan
 from tests.alice_survey.app.studio.client import ask, call, serving
-from tests.small_survey import settings_in
 
 SQUARE = [[0, 0], [6, 0], [6, 5], [0, 5]]
 DRAWN = {
@@ -236,24 +233,13 @@ def test_dropped_files_become_shapes(server: Server) -> None:
     assert post(server, "preview", {"shapes": found})["ok"]
     zone = post(server, "import?name=reef.geojson&role=no_go", text)
     assert zone["no_go"] == found["survey"] and zone["survey"] == []
-    there = post(server, "import?name=reef.geojson&datum=32.8237,34.9553", text)
-    assert there["datum"]["latitude_deg"] == 32.8237
-    assert there["survey"][0]["outer"][0] == pytest.approx((-11.09, 0.0), abs=0.01)
-    own = post(server, "import?name=reef.geojson&datum=middle", text)
-    assert own["datum"] == {"latitude_deg": 32.82365, "longitude_deg": 34.95535}
-    assert call(server, "/api/plan/import?name=reef.geojson&datum=x,1", text).status == 400
     for name, body in (("reef.kml", b"no"), ("reef.exe", text), ("", text), ("a.wkt", b"POINT (")):
         reply = call(server, f"/api/plan/import?name={name}", body)
         assert reply.status == 400 and len(reply.json["error"].splitlines()) == 1
         assert "dropped" not in reply.json["error"]
 
 
-def test_playback_and_exports_of_the_plan(workspace: Path, server: Server) -> None:
-    played = post(server, "play", {})
-    assert played["what"] == "planned" and played["t_s"] == sorted(played["t_s"])
-    rows = ("t_s", "n", "e", "depth_m", "altitude_m", "heading_deg")
-    assert len({len(played[name]) for name in rows}) == 1 and len(played["pictures_s"]) > 50
-    assert set(played["depth_m"]) == {13.0} and set(played["altitude_m"]) == {2.0}
+def test_exports_of_the_plan(workspace: Path, server: Server) -> None:
     assert ask(server, "/api/plan/export?format=wpl").status == 404
     changes = {"plan": {"dive_s": 400.0}}
     saved = post(server, "save", {"changes": changes, "token": get(server)["token"]})
@@ -268,25 +254,6 @@ def test_playback_and_exports_of_the_plan(workspace: Path, server: Server) -> No
     assert one.body == (workspace / "plan" / "exports" / "plan.kml").read_bytes()
     assert "plan.kml" in one.headers["content-disposition"]
     assert ask(server, "/api/plan/export?format=../plan").status == 400
-
-
-def test_a_dive_that_was_simulated_is_played_back(tmp_path: Path) -> None:
-    workspace = settings_in(tmp_path / "small")
-    with collected_by(lambda *_: None):
-        run(["plan", "fly"], workspace, None, executor=local_executor(1))
-    plan = read_json(workspace / "plan" / "plan.json")
-    with serving(workspace) as server:
-        flown = post(server, "play", {})
-        assert flown["what"] == "flown" and len(flown["pictures_s"]) == plan["stations"]
-        places = np.array([flown["n"], flown["e"]]).T
-        at = [np.interp(flown["pictures_s"], flown["t_s"], axis) for axis in places.T]
-        lines = read_plan(workspace / "plan" / "plan.json").lines
-        stations = np.vstack([line.stations_ne for line in lines])
-        off_m = np.linalg.norm(np.array(at).T - stations, axis=1)
-        assert 0.001 < np.median(off_m) < 0.3
-        assert 1.5 < np.interp(flown["pictures_s"][3], flown["t_s"], flown["altitude_m"]) < 2.5
-        changed = post(server, "play", {"changes": {"plan": {"altitude_m": 1.8}}})
-        assert changed["what"] == "planned" and set(changed["altitude_m"]) == {1.8}
 
 
 def test_precision_comes_with_a_layer(server: Server) -> None:

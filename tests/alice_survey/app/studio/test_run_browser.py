@@ -81,20 +81,12 @@ def test_a_job_is_seen_again_and_stopped(page: Any, tmp_path: Path) -> None:
         is_accessible(page)
 
 
-def test_a_map_file_is_dropped(page: Any, tmp_path: Path) -> None:
+def test_a_map_file_is_the_area(page: Any, tmp_path: Path) -> None:
     with serving(tmp_path / "reef") as server:
         page.goto(server.address)
         named(page, "Plan a survey").click()
-        page.evaluate(
-            """(text) => {
-              const carried = new DataTransfer();
-              carried.items.add(new File([text], "bay.geojson"));
-              const place = document.querySelector("fieldset.drop");
-              const about = {dataTransfer: carried, bubbles: true, cancelable: true};
-              place.dispatchEvent(new DragEvent("drop", about));
-            }""",
-            json.dumps(AREA),
-        )
+        file = {"name": "bay.geojson", "mimeType": "", "buffer": json.dumps(AREA).encode()}
+        page.get_by_label("Or a map file").set_input_files(file)
         assert page.get_by_label("Latitude, degrees").is_disabled()
         with page.expect_navigation():
             named(page, "Make the survey").click()
@@ -134,7 +126,7 @@ def test_pictures_are_looked_at_and_imported(page: Any, tmp_path: Path) -> None:
     assert len(list((tmp_path / "w" / "images" / "camera").iterdir())) == 5
 
 
-def test_a_fault_and_the_report_inside(page: Any, tmp_path: Path) -> None:
+def test_a_fault_and_the_report(page: Any, tmp_path: Path) -> None:
     workspace = tiny_workspace(tmp_path)
     (workspace / "survey.toml").write_text('name = "tiny"\n')
     report = workspace / "report"
@@ -143,11 +135,9 @@ def test_a_fault_and_the_report_inside(page: Any, tmp_path: Path) -> None:
     (report / "stage.json").write_text(json.dumps({"stage": "report", "took_s": 1.0}))
     with serving(workspace) as server:
         page.goto(server.address + "#run")
-        named(page, "Open the report").click()
-        page.frame_locator("iframe").get_by_text("What was mapped").wait_for()
-        is_accessible(page)
-        page.keyboard.press("Escape")
-        page.wait_for_selector("dialog.report", state="detached")
+        with page.expect_popup() as report:
+            page.get_by_role("link", name="Open the report").click()
+        report.value.get_by_text("What was mapped").wait_for()
         page.evaluate(
             "(against) => import('/app/core.js').then(({send}) =>"
             " send('/api/run/start', {name: 'evaluate', arguments: {against}}))",

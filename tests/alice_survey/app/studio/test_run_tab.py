@@ -71,8 +71,7 @@ def test_a_job_from_its_start_to_its_end(server: Server) -> None:
     assert call(server, "/api/run/stop").json == {"stopping": True}
     assert ended(server)["state"] == "stopped"
     assert call(server, "/api/run/stop").json == {"stopping": False}
-    (one,) = ask(server, "/api/run/history").json["jobs"]
-    assert one["exit_code"] == 130
+    assert run_state(server)["last"]["exit_code"] == 130
 
 
 def test_a_fault_shows_its_line_and_the_way_on(server: Server) -> None:
@@ -116,7 +115,7 @@ def test_nothing_without_the_token(server: Server, tmp_path: Path, path: str) ->
 def test_what_is_not_of_the_list_is_refused(server: Server, body: Any) -> None:
     reply = call(server, "/api/run/start", body)
     assert reply.status == 400 and "\n" not in reply.json["error"]
-    assert not ask(server, "/api/run/history").json["jobs"]
+    assert run_state(server)["last"] is None
 
 
 def test_the_stages_of_a_survey_and_what_they_need(server: Server, tmp_path: Path) -> None:

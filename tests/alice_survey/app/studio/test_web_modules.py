@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.geometry import Polygon
@@ -86,33 +85,34 @@ def test_names_and_sizes(tmp_path: Path) -> None:
     assert several == ["Survey area 2", {"kind": "survey", "index": 1, "ring": 0}]
 
 
-def test_areas_and_what_is_under_the_pointer_agree_with_shapely(tmp_path: Path) -> None:
+def test_areas_agree_with_shapely(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     angles = np.sort(rng.uniform(0, 2 * np.pi, 11))
-    star = (
-        rng.uniform(2, 9, 11)[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
-    ).round(3)
-    places = rng.uniform(-10, 10, (200, 2))
-    area, inside, away, bounds = run(
-        tmp_path, "plan_shapes",
-        "[m.areaOf(p), q.map((x) => m.encloses(p, x)), q.map((x) => m.distanceTo(p, true, x)),"
-        " m.boundsOf({survey: [{outer: p, holes: []}]})]",
-        p=star.tolist(), q=places.tolist(),
-    )  # fmt: skip
-    polygon, points = Polygon(star), shapely.points(places)
-    assert area == pytest.approx(polygon.area, rel=1e-12)
-    assert inside == shapely.contains(polygon, points).tolist()
-    assert 20 < sum(inside) < 180
-    np.testing.assert_allclose(away, shapely.distance(polygon.exterior, points), atol=1e-9)
-    assert bounds == list(polygon.bounds)
+    star = rng.uniform(2, 9, 11)[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
+    area = run(tmp_path, "plan_shapes", "m.areaOf(p)", p=star.tolist())
+    assert area == pytest.approx(Polygon(star).area, rel=1e-12)
 
 
-def test_an_edge_within_reach_comes_before_what_encloses(tmp_path: Path) -> None:
+def test_the_station_at_a_place_is_the_nearest(tmp_path: Path) -> None:
+    """Of all stations of all lines; none where none is within reach."""
+    rng = np.random.default_rng(5)
+    ends = rng.uniform(-20, 20, (6, 2, 2))
+    lines = [{"from": a, "to": b, "stations": 401} for a, b in ends.tolist()]
+    places = rng.uniform(-20, 20, (60, 2))
     found = run(
-        tmp_path, "plan_shapes", "q.map((x) => m.pathAt(s, x, 0.5))", s=SHAPES,
-        q=[[3, 3], [6, 3], [10.3, 4], [12, 4], [3, 9.5], [1.7, 3]],
+        tmp_path, "plan_stations",
+        "q.map((x) => m.nearestStation(lines, x, 3))"
+        ".map((f) => f && [lines.indexOf(f.line), f.station])", lines=lines, q=places.tolist(),
     )  # fmt: skip
-    assert found == [HOLE, OUTER, OUTER, None, WAY, HOLE]
+    share = np.linspace(0, 1, 401)[:, None]
+    stations = np.array([a + share * (b - a) for a, b in ends])
+    away = np.linalg.norm(stations - places[:, None, None], axis=-1)
+    for one, place in zip(found, away, strict=True):
+        if one is None:
+            assert place.min() > 3 - 0.1
+        else:
+            assert place[tuple(one)] == pytest.approx(place.min(), abs=1e-2)
+    assert 10 < sum(one is None for one in found) < 50
 
 
 def test_what_a_file_has_replaces_what_is_of_its_kind(tmp_path: Path) -> None:
@@ -124,30 +124,6 @@ def test_what_a_file_has_replaces_what_is_of_its_kind(tmp_path: Path) -> None:
     )  # fmt: skip
     assert zones == {"survey": [], "no_go": [SQUARE], "allowed": [], "corridors": [LINE]}
     assert kept == {**SHAPES, "allowed": [SQUARE]}
-
-
-def test_reports_of_own_saves_are_known_whatever_comes_first(tmp_path: Path) -> None:
-    """The report before its answer; both answers before the first report; content saved twice."""
-    early, late, again, other, failed = run(
-        tmp_path, "own_saves",
-        """(async () => {
-          const wait = (ms, value) => new Promise((done) => setTimeout(() => done(value), ms));
-          const saves = m.startOwnSaves();
-          const slow = saves.save(wait(30, {token: "a"}));
-          const early = await saves.isOwn("a");
-          await slow;
-          await saves.save(wait(0, {token: "b"}));
-          await saves.save(wait(0, {token: "a"}));
-          await saves.save(wait(0, {token: "b"}));
-          const late = [await saves.isOwn("b"), await saves.isOwn("a")];
-          const again = await saves.isOwn("b");
-          const other = [await saves.isOwn("b"), await saves.isOwn("c")];
-          const refused = saves.save(Promise.reject(new Error("no"))).catch((no) => no.message);
-          return [early, late, again, other, [await saves.isOwn("d"), await refused]];
-        })()""",
-    )  # fmt: skip
-    assert (early, late, again) == (True, [True, True], True)
-    assert other == [False, False] and failed == [False, "no"]
 
 
 edits = st.lists(
@@ -290,18 +266,18 @@ def test_totals_as_words(tmp_path: Path) -> None:
         "line_spacing_m": 1.0, "forward_overlap": 0.63, "side_overlap": 0.281, "covered": 0.999996,
         "at_overlap": None, "speed_mps": 0.2,
     }  # fmt: skip
-    rows, summary, refused, times = run(
+    figures, summary, refused, times = run(
         tmp_path, "plan_words",
-        """[m.totalRows(t), m.summaryOf({ok: true, totals: t, warnings: [], holes: [1]}),
+        """[m.keyFigures(t), m.summaryOf({ok: true, totals: t, warnings: [], holes: [1]}),
             m.summaryOf({ok: false, error: "too steep"}),
             await import("./words.js").then(
               (w) => [...[98, 3600, 14400].map(w.duration), w.clock(3723), w.clock(48)])]""",
         t=totals,
     )  # fmt: skip
-    assert dict(rows)["Covered"] == "99.99 %"
-    assert dict(rows)["Exposure"] == "1.83 ms, f/4, gain 0 dB"
-    assert dict(rows)["Longest dive"] == "61 of 1120 Wh usable"
-    assert "At the requested overlap" not in dict(rows)
+    assert dict(figures) == {
+        "Time": "28 min", "Dives": "1", "Energy": "61 Wh", "Pictures": "1,224", "Data": "11.2 GB",
+        "Covered": "99.99 %",
+    }  # fmt: skip
     assert summary == "18 lines, 28 min, 1 dive, 1,224 pictures, 99.99 % covered, 1 hole"
     assert refused == "No plan: too steep"
     assert times == ["98 s", "60 min", "4.0 h", "1:02:03", "0:48"]
@@ -322,68 +298,14 @@ def test_counts_are_coloured_and_what_lacks_overlap_stands_out(tmp_path: Path) -
     assert rgba[1, :3].sum() > rgba[3, :3].sum() > rgba[2, :3].sum()
 
 
-def test_places_along_a_way_agree_with_shapely(tmp_path: Path) -> None:
-    rng = np.random.default_rng(8)
-    way = rng.uniform(-20, 20, (12, 2))
-    line = shapely.LineString(way)
-    lengths = rng.uniform(0, line.length, 60)
-    found, beyond = run(
-        tmp_path, "way", "[s.map((x) => m.placeAlong(p, x)), m.placeAlong(p, 1e6)]",
-        p=way.tolist(), s=lengths.tolist(),
-    )  # fmt: skip
-    expected = shapely.get_coordinates(shapely.line_interpolate_point(line, lengths))
-    np.testing.assert_allclose(found, expected, atol=1e-9)
-    assert beyond == way[-1].tolist()
-
-
-def test_a_profile_leads_to_its_place_whether_or_not_dives_begin_at_zero(tmp_path: Path) -> None:
-    """Halfway between two samples of each dive, at its ends, and beyond all."""
-    routes = [[[0, 0], [10, 0]], [[5, 5], [5, 25]]]
-    ends = {
-        "s_m": [0, 10, 0, 20], "dive": [1, 1, 2, 2],
-        "floor_depth_m": [14, 16, 15, None], "vehicle_depth_m": [12, 14, 13, 13],
-    }  # fmt: skip
-    goes_on = {**ends, "s_m": [0, 10, 10, 30]}
-    found, along = run(
-        tmp_path, "way",
-        "[both.map((p) => s.map((x) => m.profileAt(p, routes, m.growing(p.s_m), x))),"
-        " both.map((p) => m.growing(p.s_m))]",
-        both=[ends, goes_on], routes=routes, s=[0, 5, 20, 30, 99],
-    )  # fmt: skip
-    assert along == [goes_on["s_m"]] * 2
-    for places in found:
-        assert [one["place"] for one in places] == [[0, 0], [5, 0], [5, 15], [5, 25], [5, 25]]
-        assert [one["dive"] for one in places] == [1, 1, 2, 2, 2]
-        assert [one["floor"] for one in places] == [14, 15, None, None, None]
-        assert [one["vehicle"] for one in places] == [12, 13, 13, 13, 13]
-
-
-def test_playback_turns_the_shorter_way_and_counts_pictures(tmp_path: Path) -> None:
-    dive = {
-        "t_s": [0, 2, 4, 6], "n": [0, 1, 2, 3], "e": [0, 0, 0, 4], "depth_m": [0, 10, 10, 10],
-        "altitude_m": [12, 2, 2, 2], "heading_deg": [350, 10, 10, 190],
-    }  # fmt: skip
-    states, counts = run(
-        tmp_path, "way",
-        "[[0, 1, 2, 3.5, 9, -1].map((t) => m.stateAt(d, t)),"
-        " [-1, 0, 1.5, 9].map((t) => m.countUpTo([0, 1, 1.5, 4], t))]",
-        d=dive,
-    )  # fmt: skip
-    assert [state["heading"] for state in states] == [350, 0, 10, 10, 190, 350]
-    assert [state["index"] for state in states] == [0, 0, 1, 1, 3, 0]
-    assert states[3]["n"] == 1.75 and states[1]["depth"] == 5
-    assert states[4]["e"] == 4 and states[5]["n"] == 0
-    assert counts == [0, 1, 3, 4]
-
-
 def test_unknown_depths_interrupt_the_profile(tmp_path: Path) -> None:
-    path = run(tmp_path, "way", "m.pathData([0, 1, 2, 3, 4], [1, 2, null, 3, 4])")
+    path = run(tmp_path, "chart_lines", "m.pathData([0, 1, 2, 3, 4], [1, 2, null, 3, 4])")
     assert path == "M0.0 1.0L1.0 2.0M3.0 3.0L4.0 4.0"
 
 
 def test_ticks_are_round_and_within_their_limits(tmp_path: Path) -> None:
     limits = [(-12.31, -11.87, 5), (0.0, 1234.0, 5), (0.0, 4.0, 4), (-5.0, 0.0, 5)]
-    found = run(tmp_path, "way", "l.map(([a, b, n]) => m.ticks(a, b, n))", l=limits)
+    found = run(tmp_path, "chart_lines", "l.map(([a, b, n]) => m.ticks(a, b, n))", l=limits)
     for (low, high, maximum), (values, digits) in zip(limits, found, strict=True):
         assert 2 <= len(values) <= maximum + 1
         assert low - 1e-9 <= min(values) and max(values) <= high + 1e-9
@@ -395,10 +317,9 @@ def test_words_of_figures(tmp_path: Path) -> None:
         tmp_path, "words",
         """[m.number(-1234.56, "m", 4), m.number(null), m.withSigma(-1.23456, 0.0123, "m"),
             m.withSigma(2, 0), m.clock(-20.5), m.clock(null), m.share(0.9996, 1), m.share(null),
-            m.counted(1, "line"), m.counted(1200, "pass", "passes"), m.fixed(-0.256, 2, "m"),
-            m.csv(["a", "b"], [['x"y', null], ["1,2", 3]])]""",
+            m.counted(1, "line"), m.counted(1200, "pass", "passes"), m.fixed(-0.256, 2, "m")]""",
     )  # fmt: skip
     assert words == [
         "−1,235 m", "unknown", "−1.235 ± 0.012 m", "2.000", "−0:20", "–", "99.9 %", "–",
-        "1 line", "1,200 passes", "−0.26 m", 'a,b\n"x""y",\n"1,2",3\n',
+        "1 line", "1,200 passes", "−0.26 m",
     ]  # fmt: skip

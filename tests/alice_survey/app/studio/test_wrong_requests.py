@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alice_survey.app.studio.endpoints.base import Endpoint
-from alice_survey.app.studio.endpoints.shell import all_endpoints
-from alice_survey.app.studio.server import Server
+from alice_survey.app.studio.server import Server, all_endpoints
 from tests.alice_survey.app.report.tiny import tiny_workspace
 from tests.alice_survey.app.studio.client import Reply, ask, call, serving
 
