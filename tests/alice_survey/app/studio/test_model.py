@@ -148,7 +148,7 @@ def test_a_plane_that_is_not_level_has_its_own_axes(tmp_path: Path) -> None:
     folder = tiny_workspace(tmp_path)
     write_json(folder / "dense" / "plane.json", plane_of("wall"))
     with serving(folder) as server:
-        assert ask(server, "/api/state").json["axes"] == ["right", "up", "out"]
+        assert ask(server, "/api/state").json["axes"] == ["right", "up"]
         line = named(measured(server, kind="line", places=[[0.2, 0.6], [0.6, 0.6]]))
         assert line["length"]["value"] == pytest.approx(0.4 * RISE, rel=1e-5)
 

@@ -67,7 +67,7 @@ def test_a_job_from_its_start_to_its_end(server: Server) -> None:
     assert refused.status == 409 and "alice-survey plan" in refused.json["error"]
     until(lambda: ask(server, "/api/run/log?job=1").json["total"] > 2)
     log = ask(server, "/api/run/log?job=1&after=1").json
-    assert log["lines"][0]["text"] == "stage plan"
+    assert log["lines"][0]["text"].endswith("plan")
     assert call(server, "/api/run/stop").json == {"stopping": True}
     assert ended(server)["state"] == "stopped"
     assert call(server, "/api/run/stop").json == {"stopping": False}
