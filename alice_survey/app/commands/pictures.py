@@ -178,8 +178,6 @@ class ImportLogCommand(ReportCommand):
         "import-log dvl.bag --dead-reckon --start-at 43.05 5.92 10 -o navigation.csv",
         "import-log dvl.json --dead-reckon --start-at 43.05 5.92 10 -o navigation.csv",
     )
-    title = "Import a vehicle's log"
-    offered = ("log", "output", "declination", "dead_reckon")
     log: Path = argument(..., "ROS bag, log of ArduSub or PX4, or JSON of a Water Linked DVL.")
     output: Path = option(..., "CSV to write.", "-o", "--output", metavar="FILE")
     declination: float = option(0.0, "Add this declination to headings, degrees; east is positive.")

@@ -4,35 +4,28 @@ Nothing else can be reached: paths that climb, hidden or unfinished files, and l
 not found.
 """
 
+import contextlib
 import os
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path, PurePath
-from urllib.parse import quote
 
 from rasterio.errors import RasterioError
-from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers
-from starlette.exceptions import HTTPException
-from starlette.responses import FileResponse, RedirectResponse, Response
+from starlette.responses import FileResponse, Response
 from starlette.staticfiles import NotModifiedResponse, StaticFiles
 from starlette.types import Scope
 
 from alice_survey.app.stages import LOOSE_FOLDERS, STAGES
 from alice_survey.core.artefacts import STAGE_FILE, StaleError
 from alice_survey.core.errors import AliceError
-from alice_survey.kit.document import Link, Report, Section
-from alice_survey.kit.page import page_policy, render_html
-from alice_survey.kit.words import count
 
 PRODUCTS = (*(stage.folder for stage in STAGES), *LOOSE_FOLDERS, "check", "revisit")
 """Folders that are shown."""
 _LOOSE_FILES = ("survey.toml",)
 _MAX_NAME = 255
-_MAX_LISTED = 20_000
 _UNFINISHED = (".partial", ".replaced")
 POLICY = "Content-Security-Policy"
 REVALIDATE = "no-cache"
@@ -54,15 +47,6 @@ _TYPES = {
 }  # fmt: skip
 """What browsers show; all other files are bytes to save."""
 _SCRIPT = re.compile(r"[a-z_]+\.(js|css)")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Entry:
-    """One line of a listing."""
-
-    name: str
-    is_folder: bool
-    size: int
 
 
 def stale_page() -> StaleError:
@@ -104,36 +88,6 @@ class Workspace:
         """Token of a file as it is now; see `file`."""
         return token_of(self.file(path.split("/")).stat())
 
-    def is_folder(self, names: Sequence[str]) -> bool:
-        """Whether a folder, not a link to one, is there."""
-        try:
-            return self._real_path(names).is_dir()
-        except FileNotFoundError:
-            return False
-
-    def entries(self, names: Sequence[str]) -> tuple[Sequence[Entry], int]:
-        """Visible contents of a folder, folders first, and the number of further entries.
-
-        Raises:
-            FileNotFoundError: there is no such folder.
-        """
-        if not self.is_folder(names):
-            raise FileNotFoundError
-        with os.scandir(self._real_path(names)) as entries:
-            found = sorted(
-                (
-                    Entry(
-                        name=entry.name,
-                        is_folder=entry.is_dir(follow_symlinks=False),
-                        size=entry.stat(follow_symlinks=False).st_size,
-                    )
-                    for entry in entries
-                    if _is_shown(entry, top=not names)
-                ),
-                key=lambda entry: (not entry.is_folder, entry.name),
-            )
-        return found[:_MAX_LISTED], max(0, len(found) - _MAX_LISTED)
-
     def state(self, paths: Sequence[str]) -> tuple[str, ...]:
         """Tokens of all finished stages and of some files, empty where there is none."""
         files = (*(f"{name}/{STAGE_FILE}" for name in PRODUCTS), *paths)
@@ -161,15 +115,6 @@ class Workspace:
         if path.resolve() != path:
             raise FileNotFoundError(path)
         return path
-
-
-def _is_shown(entry: os.DirEntry[str], *, top: bool) -> bool:
-    is_folder = entry.is_dir(follow_symlinks=False)
-    is_file = entry.is_file(follow_symlinks=False)
-    if top:
-        is_folder = is_folder and entry.name in PRODUCTS
-        is_file = is_file and entry.name in _LOOSE_FILES
-    return _may_be_named(entry.name) and (is_folder or is_file)
 
 
 def _may_be_named(name: str) -> bool:
@@ -224,7 +169,7 @@ class ScriptFiles(_Files):
 
 
 class WorkspaceFiles(_Files):
-    """Files of a workspace's products; folders are listed."""
+    """Files of a workspace's products."""
 
     def __init__(self, workspace: Workspace) -> None:
         """Take a workspace."""
@@ -237,63 +182,10 @@ class WorkspaceFiles(_Files):
         return path.removeprefix(scope["root_path"]).removeprefix("/")
 
     def lookup_path(self, path: str) -> tuple[str, os.stat_result | None]:
-        """A file, or a folder.
-
-        Raises:
-            ValueError: no product can have such a path.
-        """
-        names = _names_of(path)
-        try:
-            found = self._workspace.folder.joinpath(*names)
-            if not self._workspace.is_folder(names):
+        """A file that a product may have, and that neither is a link nor lies behind one."""
+        names = path.split("/")
+        if (names[0] in PRODUCTS or path in _LOOSE_FILES) and all(map(_may_be_named, names)):
+            with contextlib.suppress(OSError):
                 found = self._workspace.file(names)
-            return str(found), found.stat()
-        except OSError:
-            return "", None
-
-    async def get_response(self, path: str, scope: Scope) -> Response:
-        """A file, or the list of a folder's contents."""
-        try:
-            names = _names_of(path)
-        except ValueError:
-            raise HTTPException(404) from None
-        if scope["method"] not in ("GET", "HEAD") or not self._workspace.is_folder(names):
-            if path.endswith("/"):
-                raise HTTPException(404)
-            return await super().get_response(path, scope)
-        if path and not path.endswith("/"):
-            return RedirectResponse("/files/" + "/".join(map(quote, names)) + "/", 301)
-        content, policy = await run_in_threadpool(self._listing, names)
-        headers = {"Cache-Control": REVALIDATE, POLICY: policy}
-        return Response(content, headers=headers, media_type=PAGE)
-
-    def _listing(self, names: Sequence[str]) -> tuple[bytes, str]:
-        """A page that lists a folder, and its policy."""
-        entries, more = self._workspace.entries(names)
-        links = [Link(text="The studio", address="/")]
-        if names:
-            links.append(Link(text="..", address="../"))
-        for entry in entries:
-            mark = "/" if entry.is_folder else ""
-            size = "" if entry.is_folder else count(entry.size, "byte")
-            address = f"./{quote(entry.name)}{mark}"
-            links.append(Link(text=entry.name + mark, address=address, about=size))
-        text = [f"and {more:,} more"] if more else []
-        report = Report(
-            title="/".join(("files", *names)), subtitle="",
-            sections=[Section(title="Files", text=text, links=links)],
-        )  # fmt: skip
-        return render_html(report).encode(), page_policy(report)
-
-
-def _names_of(path: str) -> tuple[str, ...]:
-    """The names along a requested path.
-
-    Raises:
-        ValueError: it climbs, is absolute, or has a name that no product has.
-    """
-    names = tuple(path.removesuffix("/").split("/")) if path else ()
-    is_product = not names or names[0] in PRODUCTS or names == _LOOSE_FILES
-    if not is_product or not all(map(_may_be_named, names)):
-        raise ValueError("no product of a survey has this path")
-    return names
+                return str(found), found.stat()
+        return "", None

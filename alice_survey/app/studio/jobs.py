@@ -41,7 +41,6 @@ RECORD, OUTPUT, ERRORS, EVENTS = "job.json", "output.txt", "errors.txt", "events
 FOLDER = Path(".studio", "jobs")
 _NUMBER = re.compile("[0-9]{4,9}")
 """Names of jobs' folders."""
-_NAVIGATION_FILE = re.compile(r"navigation[\w-]{0,40}\.csv")
 _KEPT_JOBS = 20
 _POLL_S = 0.1
 _PUBLISH_EVERY_S = 0.25
@@ -76,8 +75,7 @@ def command_of(name: str, arguments: Mapping[str, Any], workspace: Path) -> Comm
 
     Args:
         name: one of `OFFERED`.
-        arguments: JSON values by the names of its fields; of `import-log` the output is a file
-            name.
+        arguments: JSON values by the names of its fields.
         workspace: folder to work in.
 
     Raises:
@@ -89,15 +87,7 @@ def command_of(name: str, arguments: Mapping[str, Any], workspace: Path) -> Comm
     given = {field: value for field, value in arguments.items() if value is not None}
     if refused := sorted(given.keys() - set(kind.offered)):
         raise ConfigError(f"{name}: {refused[0]}: cannot be set by a page")
-    if "workspace" in kind.model_fields:
-        given["workspace"] = str(workspace.resolve())
-    elif "output" in kind.offered:  # a file of the workspace
-        file = str(given.get("output", "navigation.csv"))
-        if not _NAVIGATION_FILE.fullmatch(file):
-            raise ConfigError(
-                f"{name}: output: {as_line(file)} is not a name like navigation-2.csv"
-            )
-        given["output"] = str(workspace.resolve() / file)
+    given["workspace"] = str(workspace.resolve())
     try:
         command = kind.model_validate(given)
     except ValidationError as error:
@@ -107,7 +97,7 @@ def command_of(name: str, arguments: Mapping[str, Any], workspace: Path) -> Comm
         for one in value if isinstance(value, list) else [value]:
             if not str(one).isprintable():
                 raise ConfigError(f"{name}: {field}: {as_line(str(one))} is not one printable line")
-            if isinstance(one, Path) and field != "output":
+            if isinstance(one, Path):
                 if not one.is_absolute():
                     raise ConfigError(f"{name}: {field}: {one} is not a whole path")
                 if not one.exists():
@@ -423,11 +413,10 @@ class Jobs:
             self._adopt()
             running = self.running()
             last = next(iter(self.history()), None)
-        elsewhere = running is None and is_locked(self._workspace)
         return {
             "job": running,
             "last": last,
-            "elsewhere": _other_command(self._workspace) if elsewhere else None,
+            "elsewhere": running is None and is_locked(self._workspace),
         }
 
     def history(self) -> list[dict[str, Any]]:
@@ -547,7 +536,7 @@ class Jobs:
                 break
             since_s = time.monotonic() - published_s
             if (is_news and since_s >= _PUBLISH_EVERY_S) or since_s >= _ALIVE_EVERY_S:
-                self._publish("run", {"job": job.to_json(), "last": None, "elsewhere": None})
+                self._publish("run", {"job": job.to_json(), "last": None, "elsewhere": False})
                 published_s, is_news = time.monotonic(), False
             time.sleep(_POLL_S)
         record = job.end_record()
@@ -561,7 +550,7 @@ class Jobs:
             self._job = None
         job.ended.set()
         self._publish(
-            "run", {"job": None, "last": record.to_json(), "elsewhere": None, "ended": True}
+            "run", {"job": None, "last": record.to_json(), "elsewhere": False, "ended": True}
         )
 
 
@@ -583,13 +572,6 @@ def _environment() -> dict[str, str]:
     """This environment; modules are found where this program found its own."""
     places = [place or str(Path.cwd()) for place in sys.path]
     return os.environ | {"PYTHONPATH": os.pathsep.join(places)}
-
-
-def _other_command(workspace: Path) -> dict[str, Any]:
-    """What a command that another program has started seems to be doing."""
-    partial = [path for path in workspace.glob("*.partial") if path.is_dir()]
-    newest = max(partial, key=lambda path: path.stat().st_mtime, default=None)
-    return {"stage": "" if newest is None else newest.name.removesuffix(".partial")}
 
 
 def _output(path: Path) -> str:

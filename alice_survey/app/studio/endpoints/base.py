@@ -14,11 +14,12 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from alice_survey.app.studio.files import Workspace
 from alice_survey.app.studio.jobs import Jobs
 from alice_survey.app.studio.layers import Layers
+from alice_survey.core.config import Config
 from alice_survey.core.contents import first_fault
 from alice_survey.core.errors import AliceError
 from alice_survey.kit.document import PictureLayer
@@ -88,33 +89,29 @@ class Call:
         Raises:
             AliceError: it is not one; the line names the first value that is wrong.
         """
-        try:
-            return kind.model_validate_json(self.body)
-        except ValidationError as error:
-            raise AliceError(f"the request: {first_fault(error, 'its body')}") from None
+        return _validate(lambda: kind.model_validate_json(self.body))
 
-    def number(self, name: str) -> float:
-        """A finite number of the query.
+    def ask(self, kind: type[M]) -> M:
+        """The query and the parts of the path as a model; see `read`."""
+        return _validate(lambda: kind.model_validate({**self.query, **self.path}))
 
-        Raises:
-            AliceError: it is missing, or no number.
-        """
-        with contextlib.suppress(KeyError, ValueError):
-            value = float(self.query[name])
-            if math.isfinite(value):
-                return value
-        raise AliceError(f"the request needs a number as {name}")
 
-    def whole(self, name: str) -> int:
-        """A whole number of the path, not negative.
+def _validate(make: Callable[[], M]) -> M:
+    try:
+        return make()
+    except ValidationError as error:
+        raise AliceError(f"the request: {first_fault(error, 'its body')}") from None
 
-        Raises:
-            FileNotFoundError: it is none.
-        """
-        text = self.path[name]
-        if not (text.isascii() and text.isdigit() and len(text) < 7):
-            raise FileNotFoundError(text)
-        return int(text)
+
+class TileRequest(Config):
+    """A tile of a picture or of a layer, of some version."""
+
+    name: str
+    level: int = Field(ge=0, le=1_000_000)
+    """0 is the coarsest."""
+    x: int = Field(ge=0, le=1_000_000)
+    y: int = Field(ge=0, le=1_000_000)
+    v: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -42,6 +42,15 @@ class _Open(Config):
     log: str
 
 
+class _Since(Config):
+    after: float = -1e9
+    """Seconds of the last fix that the page has."""
+
+
+class _Export(Config):
+    format: str = ""
+
+
 class FollowTab:
     """The dive that a studio follows, if any, with the thread that reads its log."""
 
@@ -157,8 +166,11 @@ class FollowTab:
     def dive(self, call: Call) -> dict[str, Any]:
         """Fixes since one, lines with their states, and holes, worst first."""
         dive = self._require_dive()
-        after_s = call.number("after") if "after" in call.query else -math.inf
-        return {"fixes": dive.track(after_s), "lines": dive.lines(), "holes": dive.holes()}
+        return {
+            "fixes": dive.track(call.ask(_Since).after),
+            "lines": dive.lines(),
+            "holes": dive.holes(),
+        }
 
     def coverage(self, call: Call) -> Content:
         """What is seen so far as a picture, north up."""
@@ -169,7 +181,7 @@ class FollowTab:
     def export(self, call: Call) -> Content:
         """The plan over the holes as missions for vehicles: one format or all, zipped."""
         dive = self._require_dive()
-        requested = call.query.get("format", "")
+        requested = call.ask(_Export).format
         with dive.lock:
             plan = dive.proposal
         if plan is None:

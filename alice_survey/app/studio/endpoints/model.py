@@ -37,6 +37,13 @@ Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
 Place = tuple[Coordinate, Coordinate]
 
 
+class AskedPlace(Config):
+    """A place of the map."""
+
+    east: Coordinate
+    north: Coordinate
+
+
 class AskedProfile(Config):
     """A line on the surface."""
 
@@ -116,7 +123,8 @@ class _ModelTab:
 
     def value(self, call: Call) -> dict[str, Any]:
         """Value and sigma of every raster at a place."""
-        place = (call.number("east"), call.number("north"))
+        asked = call.ask(AskedPlace)
+        place = (asked.east, asked.north)
         workspace = self.studio.workspace
         with self._check_files():
             there = [one for one in RASTERS if workspace.has(one.file)]

@@ -11,7 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from alice_survey.app.studio.endpoints.base import Call, Content, Endpoint, KeptValue, Studio
+from alice_survey.app.studio.endpoints.base import (
+    Call,
+    Content,
+    Endpoint,
+    KeptValue,
+    Studio,
+    TileRequest,
+)
 from alice_survey.app.studio.files import Workspace
 from alice_survey.core.artefacts import read_csv, read_stage
 from alice_survey.core.config import Config
@@ -159,7 +166,6 @@ def levels_of(width: int, height: int) -> int:
 
 
 T = TypeVar("T")
-_MAX_LISTED = 500
 _MAX_SEEING = 60
 _MODEL = ("sparse/cameras.json", "sparse/model/images.bin", "sparse/frame.json")
 
@@ -183,6 +189,23 @@ class _AskedPick(Config):
             image=self.image, point=self.point, x_px=self.x + 0.5, y_px=self.y + 0.5,
             sigma_px=self.sigma_px, matched_to=self.matched_to,
         )  # fmt: skip
+
+
+class _List(Config):
+    find: str = ""
+    """Part of the names."""
+    count: int = Field(100, ge=0, le=500)
+
+
+class _Seeing(Config):
+    """A place of the surface, or a pixel of a picture that shows it."""
+
+    n: float | None = None
+    e: float | None = None
+    image: str | None = None
+    x: Pixel = 0.0
+    y: Pixel = 0.0
+    count: int = Field(24, ge=0, le=_MAX_SEEING)
 
 
 class _Refine(Config):
@@ -245,28 +268,17 @@ class _Tab:
     # ---- Pictures ----
 
     def list_pictures(self, call: Call) -> dict[str, Any]:
-        """Pictures in the order of the manifest, some at a time, and where they were taken."""
-        records = list(self._taken.records().values())
-        words = call.query.get("find", "").lower()
-        found = [record for record in records if words in record.image.lower()]
-        first = _count(call, "first", 0)
-        model = self._read_model() if self._has_model() else None
+        """Pictures in the order of the manifest, and whether the model has them."""
+        asked = call.ask(_List)
+        words = asked.find.lower()
+        found = [name for name in self._taken.records() if words in name.lower()]
+        known = self._read_model().pictures if self._has_model() else ()
         return {
             "total": len(found),
             "pictures": [
-                self._about(record, model)
-                for record in found[first : first + _count(call, "count", 100, _MAX_LISTED)]
+                {"name": name, "registered": name in known} for name in found[: asked.count]
             ],
         }
-
-    def _about(self, record: ImageRecord, model: _OpenModel | None) -> dict[str, Any]:
-        place = None
-        if model is not None and record.image in model.pictures:
-            place = model.pictures.centres[model.pictures.row(record.image)].tolist()
-        return {
-            "name": record.image, "camera": record.camera, "station": record.station,
-            "registered": place is not None, "place": place,
-        }  # fmt: skip
 
     def picture(self, call: Call) -> dict[str, Any]:
         """Size and tiles of a picture."""
@@ -279,48 +291,37 @@ class _Tab:
 
     def tile(self, call: Call) -> Content:
         """A tile of a picture as taken, WebP; level 0 is the coarsest."""
-        level, x, y = (call.whole(key) for key in ("level", "x", "y"))
-        name = call.path["name"]
-        token = self._taken.token(name)
-        wide, high = self._taken.size(name)
-        halvings = levels_of(wide, high) - 1 - level
+        asked = call.ask(TileRequest)
+        token = self._taken.token(asked.name)
+        halvings = levels_of(*self._taken.size(asked.name)) - 1 - asked.level
         if halvings < 0:
-            raise FileNotFoundError(name)
-        data = self._taken.tile(name, halvings, x, y)
-        return Content(data=data, kind="image/webp", tag=f"{token}-{level}-{x}-{y}")
+            raise FileNotFoundError(asked.name)
+        data = self._taken.tile(asked.name, halvings, asked.x, asked.y)
+        return Content(
+            data=data, kind="image/webp", tag=f"{token}-{asked.level}-{asked.x}-{asked.y}"
+        )
 
     def seeing(self, call: Call) -> dict[str, Any]:
-        """Pictures that see a place of the surface, the best first.
-
-        The place is north and east (`n`, `e`), or where the ray of a pixel (`image`, `x`, `y`)
-        meets the surface.
-        """
-        model = self._read_model()
-        place = self._place(model, call)
+        """Pictures that see a place of the surface, the best first."""
+        asked, model = call.ask(_Seeing), self._read_model()
+        if asked.image is not None:
+            place = self._surface_at(model, asked.image, asked.x + 0.5, asked.y + 0.5)
+        elif asked.n is None or asked.e is None:
+            raise AliceError("the request needs a place, n and e, or a pixel of an image")
+        else:
+            place = model.surface.below(asked.n, asked.e)
         seen, hidden = _unhidden(model, place)
-        maximum = _count(call, "count", 24, _MAX_SEEING)
         return {
-            "place": {
-                "n": place.point[0], "e": place.point[1], "down": place.point[2],
-                "sigma": place.sigma, "dense": model.surface.is_dense,
-            },
+            "place": {"n": place.point[0], "e": place.point[1], "down": place.point[2]},
             "total": len(seen), "hidden": hidden,
             "pictures": [
                 {
                     "name": one.image, "x": one.pixel[0] - 0.5, "y": one.pixel[1] - 0.5,
-                    "resolution": one.pixels_per_unit,
                     "off_nadir_deg": float(np.degrees(one.off_nadir_rad)),
                 }
-                for one in seen[:maximum]
+                for one in seen[: asked.count]
             ],
         }  # fmt: skip
-
-    def _place(self, model: _OpenModel, call: Call) -> SurfacePlace:
-        if "image" not in call.query:
-            return model.surface.below(call.number("n"), call.number("e"))
-        return self._surface_at(
-            model, call.query["image"], call.number("x") + 0.5, call.number("y") + 0.5
-        )
 
     @staticmethod
     def _surface_at(model: _OpenModel, image: str, x_px: float, y_px: float) -> SurfacePlace:
@@ -350,13 +351,7 @@ class _Tab:
         found = refine(pick, images, place, model.pictures.picture, self._taken.grey)
         return {
             "picks": [_pick_json(one) for one in found.picks],
-            "matches": [
-                {"name": m.image, "correlation": m.correlation, "moved_px": m.moved_px}
-                for m in found.matches
-            ],
             "refused": [{"name": one.image, "why": one.why} for one in found.refused],
-            "factor": found.factor,
-            "position": None if found.meeting is None else _position_json(found.meeting),
         }
 
     def picks(self, call: Call) -> dict[str, Any]:
@@ -470,7 +465,7 @@ class _Tab:
         return {
             "value": found.value, "sigma": found.sigma, "unit": model.pictures.frame.unit,
             "sigma_picks": found.sigma_picks, "sigma_poses": found.sigma_poses,
-            "sigma_scale": found.sigma_scale, "scaled": model.pictures.frame.scaled,
+            "sigma_scale": found.sigma_scale,
         }  # fmt: skip
 
     def scale(self, call: Call) -> dict[str, Any]:
@@ -540,13 +535,6 @@ def _position_json(position: TriangulatedPoint) -> dict[str, Any]:
         "sigma": np.sqrt(np.diag(position.covariance)).tolist(), "views": position.views,
         "rms_px": position.rms_px,
     }  # fmt: skip
-
-
-def _count(call: Call, name: str, usual: int, maximum: int = 1_000_000_000) -> int:
-    text = call.query.get(name, str(usual))
-    if not (text.isascii() and text.isdigit() and len(text) < 10):
-        raise AliceError(f"{name}={text!r} is no count")
-    return min(int(text), maximum)
 
 
 def endpoints(studio: Studio) -> Sequence[Endpoint]:

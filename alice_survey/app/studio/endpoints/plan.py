@@ -1,6 +1,5 @@
 """The tab Plan: settings and shapes as they are, planned again while they change, and saved."""
 
-import base64
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -8,10 +7,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-import cv2
-import numpy as np
 from pydantic import Field
 from pydantic_core import to_json
 
@@ -30,24 +27,16 @@ from alice_survey.core.errors import AliceError, ConfigError, PlanError, collect
 from alice_survey.core.executor import local_executor
 from alice_survey.core.frames import Datum
 from alice_survey.core.settings_form import settings_form
-from alice_survey.kit.figure import palette_colours, palette_steps
 from alice_survey.sim.vehicle.files import known_vehicles
-from camera_calib.rig import design_rig
 from missions.areas.drawn import AreaDrawing, DrawnShapes, area_drawing, drawing_of_file
 from missions.areas.files import SUFFIXES
 from missions.exports.registry import format_named, format_names
-from missions.plan.planner import plan_survey
 from missions.plan.preview import Draft, draft_settings, preview, refusal_json
 from missions.values.plan_file import read_plan
-from reconstruct.precision.predict import Precision
-from reconstruct.precision.run import Candidate, heights_raster, summary, worst_bend
 
 SETTINGS = "survey.toml"
 _MAX_REQUEST = 8 << 20
 _MAX_FILE = 32 << 20
-_MAX_PRECISION = 3000
-"""Stations of which the precision is predicted while somebody waits."""
-_PALETTE, _COLOURS, _OPACITY = "viridis", 9, 215
 _LENSES_MM = (12.5, 25.0)
 """Of the paper."""
 _JSON = "application/json"
@@ -96,6 +85,15 @@ class PlanRequest(Config):
     """Of the settings that the page has seen."""
     page: str = ""
     """Names the page: of its requests the newest is answered."""
+
+
+class _AreaFile(Config):
+    name: str
+    role: Literal["survey", "no_go", "allowed"] = "survey"
+
+
+class _ExportFile(Config):
+    format: str = ""
 
 
 @dataclass(frozen=True)
@@ -207,37 +205,10 @@ class _PlanTab:
         with _draft_settings(draft) as config:
             return preview(config)
 
-    def precision(self, call: Call) -> dict[str, Any]:
-        """What the model of a plan is expected to be worth."""
-        with _draft_settings(self.draft(call.read(PlanRequest))) as config, _quiet():
-            plan = plan_survey(config, design_rig(config.camera, config.water)).plan
-            if plan.stations > _MAX_PRECISION:
-                raise PlanError(
-                    f"{plan.stations:,} stations: the precision of up to {_MAX_PRECISION:,} is "
-                    "predicted here; save, and run 'alice-survey plan precision'"
-                )
-            # What calibrates and what flies is heavy, and needed here alone.
-            from reconstruct.precision.instruments import expected_rig
-
-            folder = self.studio.workspace.folder
-            rig = expected_rig(folder, config.camera, config.water, config.imaging)
-            found = Candidate(config=config, made=plan, rig=rig).precision
-        bend_m, station_m = worst_bend(found), np.linalg.norm(found.shape_m, axis=1)
-        return {
-            "bend_mm": 1e3 * bend_m,
-            "scale_ppm": 1e6 * found.scale,
-            "height_mm": 1e3 * found.heights_rms_m,
-            "station_mm": 1e3 * float(np.sqrt((station_m**2).mean())),
-            "layer": _heights_layer(found),
-            "text": summary(found),
-        }
-
     def read_dropped(self, call: Call) -> dict[str, Any]:
         """The shapes of a file that was dropped on the page."""
-        name = Path(call.query.get("name", "")).name
-        role: Any = call.query.get("role", "survey")
-        if role not in ("survey", "no_go", "allowed"):
-            raise PlanError(f"role {role[:20]!r}: it is survey, no_go or allowed")
+        asked = call.ask(_AreaFile)
+        name = Path(asked.name).name
         if Path(name).suffix.lower() not in SUFFIXES:
             raise PlanError(f"{name[:60]!r} is not read; those that are: {', '.join(SUFFIXES)}")
         found = self.settings()
@@ -248,7 +219,7 @@ class _PlanTab:
             try:
                 # The middle of the file is the datum of a new survey.
                 datum = area_drawing(config.area).datum if found.token else None
-                drawing = drawing_of_file(file, config.area, role=role, datum=datum)
+                drawing = drawing_of_file(file, config.area, role=asked.role, datum=datum)
             except PlanError as error:
                 text = str(error).replace(str(file), name).replace(file.name, name)
                 raise PlanError(text) from None
@@ -285,7 +256,7 @@ class _PlanTab:
 
     def export(self, call: Call) -> Content:
         """A file of the saved plan; of one a dive all of them, zipped."""
-        name = call.query.get("format", "")
+        name = call.ask(_ExportFile).format
         files = format_named(name).files
         folder = self.studio.workspace.folder / "plan"
         plan = read_plan(self.studio.workspace.file(["plan", "plan.json"]))
@@ -343,28 +314,6 @@ def _datum(datum: Datum) -> dict[str, float]:
     return {"latitude_deg": datum.latitude_deg, "longitude_deg": datum.longitude_deg}
 
 
-def _heights_layer(found: Precision) -> dict[str, Any]:
-    """Expected sigmas of heights as a picture for the map, and what its colours mean."""
-    heights, grid = heights_raster(found)
-    heights_mm, known = 1e3 * heights, np.isfinite(heights)
-    low, high = float(np.nanmin(heights_mm)), float(np.nanmax(heights_mm))
-    shares = np.where(known, heights_mm - low, 0.0) / max(high - low, 1e-9)
-    rgba = palette_colours(_PALETTE, np.clip(shares, 0.0, 1.0))
-    rgba[..., 3] = np.where(known, _OPACITY, 0)
-    png = cv2.imencode(".png", cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA))[1].tobytes()
-    return {
-        "png": f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}",
-        "north": grid.north,
-        "west": grid.west,
-        "pixel": grid.cell,
-        "title": "Expected sigma of heights",
-        "scale": {
-            "label": "expected sigma of heights, mm", "low": low, "high": high,
-            "colours": palette_steps(_PALETTE, _COLOURS),
-        },
-    }  # fmt: skip
-
-
 def endpoints(studio: Studio) -> Sequence[Endpoint]:
     """All of the tab Plan."""
     plan = _PlanTab(studio)
@@ -379,7 +328,6 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
         Endpoint(path="/api/plan", answer=plan.overview),
         Endpoint(path="/api/plan/export", answer=plan.export),
         post("preview", plan.preview),
-        post("precision", plan.precision),
         post("import", plan.read_dropped, max_bytes=_MAX_FILE),
         post("text", plan.text),
         post("save", plan.save, writes=True),

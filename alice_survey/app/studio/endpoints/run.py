@@ -1,7 +1,6 @@
 """The Run tab: the stages, and the job that makes them."""
 
 import re
-import shlex
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -62,10 +61,8 @@ def survey_state(workspace: Path) -> dict[str, Any]:
         costs = {} if size is None else _costs(workspace, stage_costs(size), states)
     except AliceError as error:
         return found | {"fault": str(error), "ways": ways_on(str(error))}
-    found["stages"] = [
-        _stage(workspace, spec(name), state, costs.get(name)) for name, state in states.items()
-    ]
-    found["commands"] = _commands(workspace, states, costs, imported=imported)
+    found["stages"] = [_stage(workspace, spec(name), state) for name, state in states.items()]
+    found["commands"] = _commands(states, costs, imported=imported)
     return found
 
 
@@ -83,7 +80,7 @@ def ways_on(line: str) -> list[dict[str, Any]]:
     return list(found.values())
 
 
-def _stage(workspace: Path, stage: StageSpec, state: str, cost: StageCost | None) -> dict[str, Any]:
+def _stage(workspace: Path, stage: StageSpec, state: str) -> dict[str, Any]:
     """One line of the list of stages."""
     folder = workspace / stage.folder
     record = read_stage(folder)
@@ -98,8 +95,6 @@ def _stage(workspace: Path, stage: StageSpec, state: str, cost: StageCost | None
         "state": "stale" if stale else state, "why": stale[1] if stale else "",
         "made_utc": made,
         "took_s": None if record is None else record.took_s,
-        "peak_mib": None if record is None else record.peak_mib,
-        "cost": None if cost is None or state == UP_TO_DATE else _cost_json({stage.name: cost}),
         "products": [
             {"path": f"{stage.folder}/{path}", "about": what}
             for path, what in stage.products.items()
@@ -129,7 +124,7 @@ def _cost_json(costs: Mapping[str, StageCost]) -> dict[str, float]:
 
 
 def _commands(
-    workspace: Path, states: Mapping[str, str], costs: Mapping[str, StageCost], *, imported: bool
+    states: Mapping[str, str], costs: Mapping[str, StageCost], *, imported: bool
 ) -> list[dict[str, Any]]:
     """Commands that make stages, in order, and what each has left to do."""
     found = []
@@ -144,7 +139,6 @@ def _commands(
             {
                 "name": name, "title": command.title, "left": left,
                 "after": [n for n in states if n in needs and states[n] in _NOT_THERE],
-                "command": shlex.join(["alice-survey", name, "-w", str(workspace)]),
                 "cost": _cost_json(known) if known else None,
             }
         )  # fmt: skip
@@ -155,12 +149,17 @@ def _disk(workspace: Path) -> dict[str, float]:
     """Room on the disk of a workspace, which need not exist yet."""
     place = next(folder for folder in (workspace, *workspace.parents) if folder.exists())
     usage = shutil.disk_usage(place)
-    return {"free_gb": usage.free / 1e9, "total_gb": usage.total / 1e9}
+    return {"free_gb": usage.free / 1e9}
 
 
 class _AskedCommand(Config):
     name: str
     arguments: dict[str, Any] = Field(default_factory=dict)
+
+
+class _AskedLog(Config):
+    job: int
+    after: int = 0
 
 
 @dataclass(frozen=True)
@@ -193,8 +192,8 @@ class _RunTab:
 
     def log(self, call: Call) -> dict[str, Any]:
         """Lines of a job's log after those that the page has."""
-        after = call.number("after") if "after" in call.query else 0
-        return self.studio.jobs.log(int(call.number("job")), int(after))
+        asked = call.ask(_AskedLog)
+        return self.studio.jobs.log(asked.job, asked.after)
 
 
 def endpoints(studio: Studio) -> Sequence[Endpoint]:

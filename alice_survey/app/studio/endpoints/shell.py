@@ -9,7 +9,14 @@ from alice_survey.app.report.held import Held
 from alice_survey.app.report.run import survey_map
 from alice_survey.app.report.shapes import shape_layers
 from alice_survey.app.stages import STAGES
-from alice_survey.app.studio.endpoints.base import Call, Content, Endpoint, Studio, scale_json
+from alice_survey.app.studio.endpoints.base import (
+    Call,
+    Content,
+    Endpoint,
+    Studio,
+    TileRequest,
+    scale_json,
+)
 from alice_survey.kit.document import EAST_NORTH, PictureLayer, ShapeLayer
 from alice_survey.kit.map import map_data, map_extent
 
@@ -33,21 +40,13 @@ class _Shell:
         workspace = self.studio.workspace
         held = Held.of(workspace.folder)
         found = survey_map(held, ())
-        datum = held.frame.datum
-        placed = found.axes == EAST_NORTH or not held.has(
-            "sparse"
-        )  # a plan is drawn on east and north
+        is_model = found.axes != EAST_NORTH and held.has("sparse")
         return {
             "workspace": str(workspace.folder),
             "name": held.name,
             "stages": sorted(held.stages),
             "unit": found.unit,
-            "axes": EAST_NORTH if placed else found.axes,
-            "placed": placed,
-            "origin": found.origin,
-            "simulated": held.simulated,
-            "plane": None if held.plane is None else held.plane.name,
-            "datum": None if datum is None else [datum.latitude_deg, datum.longitude_deg],
+            "axes": found.axes if is_model else EAST_NORTH,
             "has": {name: workspace.has(path) for name, path in _PRODUCTS.items()},
             "files": {
                 f"{stage.folder}/{path}": text
@@ -61,10 +60,11 @@ class _Shell:
 
     def tile(self, call: Call) -> Content:
         """A tile of a raster; of the version that the page has, where it states one."""
-        name, token = call.path["name"], call.query.get("v")
-        level, x, y = (call.whole(part) for part in ("level", "x", "y"))
-        data, found = self.studio.layers.tile(name, level, x, y, token)
-        return Content(data=data, kind="image/webp", tag=f"{found}-{level}-{x}-{y}")
+        asked = call.ask(TileRequest)
+        data, found = self.studio.layers.tile(asked.name, asked.level, asked.x, asked.y, asked.v)
+        return Content(
+            data=data, kind="image/webp", tag=f"{found}-{asked.level}-{asked.x}-{asked.y}"
+        )
 
     def map(self, call: Call) -> dict[str, Any]:
         """The layers of what the workspace holds, as the map's script takes them."""

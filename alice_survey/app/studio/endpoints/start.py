@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, cast
 
 from pydantic import Field, RootModel
 
@@ -132,8 +132,6 @@ def _count_folder(folder: Path) -> Folder:
 
 
 _MAX_BYTES = 12 << 20
-_COLOUR = '[reconstruct]\ncolour = "{}"\n'
-"""Settings of a survey of real pictures that has no others."""
 _TRIAL: Values = {
     "seafloor": {"grid_m": 0.02},
     "imaging": {"scale": 6, "pool_views": 12},
@@ -169,11 +167,6 @@ class _NewSurvey(Config):
 
 class _Arguments(RootModel[dict[str, Any]]):
     pass
-
-
-class _NewPictures(Config):
-    arguments: dict[str, Any]
-    colour: Literal["water", "even", "raw"] = "water"
 
 
 @dataclass(frozen=True)
@@ -252,44 +245,17 @@ class _StartPage:
             area.unlink(missing_ok=True)
             raise
 
-    def pictures(self, call: Call) -> Any:
-        """Import pictures, as a job; what differs from the usual goes into survey.toml."""
-        asked = call.read(_NewPictures)
-        command_of("import-images", asked.arguments, self.studio.workspace.folder)
-        self._keep_colour(asked.colour)
-        return {"job": self.studio.jobs.start("import-images", asked.arguments)}
-
-    def _keep_colour(self, colour: str) -> None:
-        """Write the colours that are not the usual ones; what an earlier try has written goes."""
-        toml = self.studio.workspace.folder / "survey.toml"
-        text = "" if colour == "water" else _COLOUR.format(colour)
-        refuse_links(toml.parent, toml)
-        before = toml.read_text(encoding="utf-8") if toml.is_file() else ""
-        if before == text:
-            return
-        if before and before not in map(_COLOUR.format, ("even", "raw")):
-            raise StaleError(
-                f'{toml} is there already: set colour = "{colour}" below [reconstruct] in it, and '
-                "leave the colours here as they are"
-            )
-        with self.studio.only_writer():
-            if text:
-                toml.write_text(text, encoding="utf-8")
-            else:
-                toml.unlink()
-
 
 def _known_values(asked: _NewSurvey, names: Sequence[str]) -> dict[str, float]:
     return {name: value for name in names if (value := getattr(asked, name)) is not None}
 
 
 def endpoints(studio: Studio) -> Sequence[Endpoint]:
-    """Folders, preview, and the two ways to begin."""
+    """Folders, preview, and a survey to begin."""
     start = _StartPage(studio)
     post: dict[str, Any] = {"method": "POST", "writes": True}
     return (
         Endpoint(path="/api/start/folders", answer=start.list_folder, **post),
         Endpoint(path="/api/start/preview", answer=start.preview, **post),
         Endpoint(path="/api/start/survey", answer=start.survey, max_bytes=_MAX_BYTES, **post),
-        Endpoint(path="/api/start/pictures", answer=start.pictures, **post),
     )

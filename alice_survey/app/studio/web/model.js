@@ -229,8 +229,7 @@ export function tab(studio) {
   const links = el("ul", {});
   function fillFiles() {
     links.replaceChildren(...Object.entries(state.files).map(
-      ([path, text]) => el("li", {}, el("a", {href: "/files/" + path}, text))),
-      el("li", {}, el("a", {href: "/files/"}, "All files of this workspace")));
+      ([path, text]) => el("li", {}, el("a", {href: "/files/" + path}, text))));
   }
   const files = el("details", {}, el("summary", {}, "Files"), links, el("p", {class: "note"},
     "A GIS reads rasters from here part by part, without a copy: in QGIS add a raster layer with "

@@ -10,7 +10,6 @@ import {shown} from "./plan_show.js";
 import {keyFigures, summaryOf} from "./plan_words.js";
 import {profileChart} from "./profile_chart.js";
 import {canRedo, canUndo, current, record, redo, same, startHistory, undo} from "./undo.js";
-import {number} from "./words.js";
 
 const QUIET_MS = 900;  /* after which the figures are said */
 const ROLES = {survey: "area to survey", no_go: "no-go zones", allowed: "allowed area"};
@@ -28,8 +27,6 @@ export function tab(studio) {
   const results = resultsPanel(
     (changes) => edit({...body(), changes: withChanges(body().changes, file, changes)}));
   const controls = el("div");
-  const precision = el("p", {class: "note plan-precision"},
-    "How well the model of this survey is expected to be known.");
   const exports = el("ul");
   const back = button("Undo", () => step(undo), {title: "Ctrl+Z"});
   const forth = button("Redo", () => step(redo), {title: "Ctrl+Shift+Z"});
@@ -52,8 +49,6 @@ export function tab(studio) {
         "GeoJSON, KML, GeoPackage, zipped shapefile, WKT and others")),
     el("h2", {}, "How to fly"), controls,
     results.below,
-    el("details", {}, el("summary", {}, "Expected precision"), precision,
-      el("div", {class: "buttons"}, button("Compute it", () => attempt(showPrecision)))),
     el("details", {}, el("summary", {}, "Export"), exports));
   const waiting = el("p", {class: "note"}, "Planning …");
   const wait = (on) => { waiting.hidden = !on; };
@@ -82,7 +77,6 @@ export function tab(studio) {
     if (answer.superseded) return;
     if (answer.ok) {
       preview = answer;
-      view.sigma(null);
       view.show(answer);
       if (!fitted) view.fit(shapesOf(body()));
       fitted = true;
@@ -214,20 +208,7 @@ export function tab(studio) {
     });
   }
 
-  /* ---- Precision and import ---- */
-
-  async function showPrecision() {
-    precision.textContent = "Computing ...";
-    const asked = body();
-    const found = await send("/api/plan/precision", asked)
-      .finally(() => { precision.textContent = ""; });
-    if (!same(asked, body())) return;
-    precision.textContent = found.text || "Bend " + number(found.bend_mm, "mm") + ", scale "
-      + number(found.scale_ppm, "ppm")
-      + ", heights " + number(found.height_mm, "mm") + ", stations "
-        + number(found.station_mm, "mm");
-    view.sigma(found.layer);
-  }
+  /* ---- Import ---- */
 
   function importFile(taken) {
     if (!taken) return;
@@ -274,7 +255,8 @@ export function tab(studio) {
   return {name: "plan", title: "Plan", panel, enter, leave, keys};
 }
 
-/* What a plan comes to: figures, warnings, settings and why, depths; or why there is none, and the setting that would help. `apply(changes)` takes a suggestion. */
+/* What a plan comes to: figures, warnings, settings and why, depths; or why there is none, and the
+   setting that would help. `apply(changes)` takes a suggestion. */
 function resultsPanel(apply) {
   const key = el("dl", {class: "plan-key"});
   const top = el("div", {});

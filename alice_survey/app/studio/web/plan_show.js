@@ -33,8 +33,8 @@ export function shown(studio) {
   const {map} = studio;
   const off = new Set(["plan-footprints"]);
   const away = new Set();
-  let [names, stations, number, active, last, sigmaLayer, whole] =
-    [new Set(), null, 0, false, null, null, null];
+  let [names, stations, number, active, last, whole] =
+    [new Set(), null, 0, false, null, null];
   let textAt = (_) => "";
   map.moreAt((place) => (active ? textAt(place) : ""));
 
@@ -58,7 +58,6 @@ export function shown(studio) {
     putCounts(preview.counts, number);
     putLayers(preview);
     if (before.has("plan-counts")) names.add("plan-counts");
-    if (sigmaLayer) putPicture("plan-sigma", number, sigmaLayer);
     before.forEach((name) => { if (!names.has(name)) map.remove(name); });
   }
 
@@ -128,27 +127,11 @@ export function shown(studio) {
       return `; ${pictures === 254 ? "254 or more" : pictures} pictures of `
         + counted(passes, "line");
     };
-    putPicture("plan-counts", own, {...counts, png: canvas.toDataURL(),
-      title: "Pictures that see a place", about: "Orange: below the requested overlap.",
+    put({...counts, kind: "picture", name: "plan-counts", address: canvas.toDataURL(),
+      width: pixels.width, height: pixels.height, tile: Math.max(pixels.width, pixels.height),
+      levels: 1, base: false, title: "Pictures that see a place",
+      about: "Orange: below the requested overlap.",
       scale: {label: "pictures that see a place", low: 0, high: most, colours: COUNTS}});
-  }
-
-  async function putPicture(name, own, {png, ...about}) {
-    names.add(name);
-    const {canvas: {width, height}} = await readPixels(png);
-    if (own !== number || !active) return;
-    put({kind: "picture", name, address: png, width, height, tile: Math.max(width, height),
-      levels: 1, base: false, ...about});
-  }
-
-  /* The expected sigma as a layer, until the plan is another one. */
-  function sigma(layer) {
-    sigmaLayer = layer;
-    if (layer) putPicture("plan-sigma", number, layer);
-    else {
-      names.delete("plan-sigma");
-      map.remove("plan-sigma");
-    }
   }
 
   /* Show all of a plan, and let "Show all" mean it. */
@@ -199,5 +182,5 @@ export function shown(studio) {
 
   const dim = (on) => { map.leaflet.getContainer().closest("main").toggleAttribute(
     "data-planning", on); };
-  return {show, sigma, fit, alone, enter, leave, dim};
+  return {show, fit, alone, enter, leave, dim};
 }

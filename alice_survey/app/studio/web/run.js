@@ -47,7 +47,7 @@ export function tab(studio) {
   let [known, running, heardAt, spoken, timer, opened] = [null, null, 0, "", null, false];
 
   const command = (text, name, args = {}, attributes = {}) => button(text, () => start(name, args),
-    {disabled: Boolean(running) || Boolean(known.elsewhere) || !mayWrite(), ...attributes});
+    {disabled: Boolean(running) || known.elsewhere || !mayWrite(), ...attributes});
 
   async function load() {
     const found = await attempt(() => get("/api/run"));
@@ -88,11 +88,10 @@ export function tab(studio) {
     job.hidden = !running && !known.elsewhere;
     if (job.hidden) return;
     if (!running) {
-      const what = known.elsewhere.stage ? `: it makes ${known.elsewhere.stage}` : "";
       job.dataset.number = "";
       job.replaceChildren(el("h2", {}, "Another command is working here"),
-        el("p", {}, `A terminal or another program works in this survey${what}. Nothing else can `
-          + `start until it ends; it can be stopped only there.`));
+        el("p", {}, "A terminal or another program works in this survey. Nothing else can start "
+          + "until it ends; it can be stopped only there."));
       return;
     }
     if (job.dataset.number !== String(running.number)) {
@@ -140,7 +139,7 @@ export function tab(studio) {
 
   function showLast() {
     const ended = known.last;
-    last.hidden = !ended || Boolean(running) || Boolean(known.elsewhere);
+    last.hidden = !ended || Boolean(running) || known.elsewhere;
     if (last.hidden) return;
     const [icon, colour, words, again] = ENDS[ended.state] || ENDS.killed;
     const ways = (ended.ways || []).map((way) => el("li", {}, el("code", {}, way.command), " ",
@@ -220,13 +219,12 @@ export function tab(studio) {
     const ended = running ? null : known.last;
     const broken = ended?.state === "failed" && ended.stage === stage.folder
       && stage.state !== "up to date";
-    const open = stage.products.filter(({path}) => SHOWN.test(path) || !path.includes("."));
+    const open = stage.products.filter(({path}) => SHOWN.test(path));
     return el("li", {"data-stage": stage.name, "data-state": state}, iconOf(icon, colour),
       el("div", {}, el("strong", {}, stage.name), ` ${words}${why}${took}`,
         broken ? el("p", {class: "error line"}, ended.line) : null,
         el("small", {}, stage.about),
-        el("small", {}, open.map(({path, about}, i) => [i ? ", " : "",
-          link(path.includes(".") ? path : path + "/", about)]))));
+        el("small", {}, open.map(({path, about}, i) => [i ? ", " : "", link(path, about)]))));
   }
 
   /* ---- Events ---- */
@@ -259,7 +257,7 @@ export function tab(studio) {
     heardAt = Date.now();
     const now = await attempt(() => get("/api/run/job"));
     if (now && known && (now.job?.number !== known.job?.number
-      || JSON.stringify(now.elsewhere) !== JSON.stringify(known.elsewhere))) load();
+      || now.elsewhere !== known.elsewhere)) load();
   }
 
   return {

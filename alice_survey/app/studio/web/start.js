@@ -4,12 +4,6 @@ import {attempt, button, el, field, mayWrite, say, send} from "./core.js";
 import {counted, duration, gigabytes, number} from "./words.js";
 
 const AREA_FILES = ".geojson,.json,.kml,.kmz,.gpkg,.zip,.wkt";
-const COLOURS = {
-  water: "As without the water: haze and colour cast are taken out",
-  even: "As taken, with even light",
-  raw: "As taken",
-};
-
 /* The page of an empty workspace; `started` is called where a job has begun. */
 export function startPage(studio, {started, disk, others}) {
   const forms = {plan: planForm(studio.state.workspace), pictures: picturesForm(started, disk)};
@@ -119,8 +113,6 @@ function picturesForm(started, disk) {
   const found = el("div", {class: "found", "aria-live": "polite"});
   const calibration = text({list: "start-files", placeholder: "none"});
   const navigation = text({list: "start-files", placeholder: "none"});
-  const colour = el("select", {}, Object.entries(COLOURS).map(
-    ([value, words]) => el("option", {value}, words)));
   const zone = text({value: "UTC"});
   const offset = numeric({value: "0"});
   const overlap = numeric({min: 0.3, max: 0.95, value: "0.7"});
@@ -137,8 +129,6 @@ function picturesForm(started, disk) {
       "a CSV with time and position, depth or heading, as import-log writes it. Without one, and "
         + "without GPS in the pictures, the model has no place and no scale: a known length "
         + "gives it one later"),
-    field("Colours of the mosaic", colour,
-      "can be changed later, below [reconstruct] in survey.toml"),
     el("details", {}, el("summary", {}, "Times, folders inside, videos"),
       field("Time zone of the camera's clock", zone, "such as Europe/Oslo"),
       field("Seconds to add to the pictures' times", offset),
@@ -248,7 +238,7 @@ function picturesForm(started, disk) {
     event.preventDefault();
     take.disabled = true;
     const begun = await attempt(
-      () => send("/api/start/pictures", {arguments: given(), colour: colour.value}));
+      () => send("/api/run/start", {name: "import-images", arguments: given()}));
     take.disabled = false;
     if (!begun) return;
     say("Pictures are being imported");

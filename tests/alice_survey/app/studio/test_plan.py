@@ -256,12 +256,6 @@ def test_exports_of_the_plan(workspace: Path, server: Server) -> None:
     assert ask(server, "/api/plan/export?format=../plan").status == 400
 
 
-def test_precision_comes_with_a_layer(server: Server) -> None:
-    found = post(server, "precision", {})
-    assert 0.01 < found["height_mm"] < 20 and 0 < found["scale_ppm"] < 5000
-    assert found["layer"]["png"].startswith("data:image/png;base64,") and found["text"]
-
-
 def test_of_requests_that_wait_only_the_newest_of_a_page_is_stale_page() -> None:
     newest, began, go_on = LatestRequests(), threading.Event(), threading.Event()
     done: list[str] = []

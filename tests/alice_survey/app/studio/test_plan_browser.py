@@ -273,7 +273,7 @@ REEF = {
 }
 
 
-def test_sea_import_profile_and_precision(browser: Any, tmp_path: Path) -> None:
+def test_sea_import_and_profile(browser: Any, tmp_path: Path) -> None:
     with serving(tmp_path) as server:
         plan = opened(browser, server.address)
         page = plan.page
@@ -303,18 +303,6 @@ def test_sea_import_profile_and_precision(browser: Any, tmp_path: Path) -> None:
         plan.press("Control+z")
         assert page.locator("#panel-plan .profile-chart path.of").count() == 2
 
-        page.get_by_text("Expected precision").click()
-        page.get_by_role("button", name="Compute it").click()
-        page.wait_for_function(
-            "() => /\\d mm/.test(document.querySelector('.plan-precision').textContent)",
-            timeout=120_000,
-        )
-        if not page.locator("#layers").evaluate("(layers) => layers.open"):
-            page.locator("#layers summary").click()
-        expected = page.locator("[data-layer=plan-sigma]")
-        expected.wait_for()
-        assert expected.get_by_role("checkbox").is_checked()
-        page.get_by_role("button", name="Compute it").scroll_into_view_if_needed()
         page.screenshot(path=tmp_path / "more.png")
         assert plan.violations() == []
         assert plan.heard.complaints == []

@@ -95,7 +95,7 @@ def test_the_ways_that_a_line_names() -> None:
 
 @pytest.mark.parametrize(
     "path",
-    ["run/start", "run/stop", "start/folders", "start/preview", "start/survey", "start/pictures"],
+    ["run/start", "run/stop", "start/folders", "start/preview", "start/survey"],
 )
 def test_nothing_without_the_token(server: Server, tmp_path: Path, path: str) -> None:
     for token in (None, "wrong"):
@@ -219,9 +219,7 @@ def test_a_preview_tells_a_rig_from_one_camera(home: Path, server: Server) -> No
 def test_pictures_are_imported_as_a_job(home: Path, tmp_path: Path) -> None:
     folder = str(home / "dive" / "left")
     with serving(tmp_path / "w") as server:
-        began = call(server, "/api/start/pictures", {
-            "arguments": {"folders": [folder]}, "colour": "raw",
-        })  # fmt: skip
+        began = started(server, "import-images", folders=[folder])
         assert began.status == 200, began.text
         last = ended(server)
         assert last["state"] == "done" and last["line"].startswith("4 pictures (4 JPEG)")
@@ -229,7 +227,6 @@ def test_pictures_are_imported_as_a_job(home: Path, tmp_path: Path) -> None:
         assert found["imported"] and not found["new"]
         names = [one["name"] for one in found["commands"]]
         assert names == ["reconstruct", "report"]
-    assert load_config(tmp_path / "w" / "survey.toml").reconstruct.colour == "raw"
 
 
 @pytest.mark.slow
@@ -237,13 +234,11 @@ def test_a_failed_import_may_be_begun_again(home: Path, tmp_path: Path) -> None:
     (home / "one").mkdir()
     shutil.copy(home / "dive" / "left" / "0.jpg", home / "one")
     with serving(tmp_path / "w") as server:
-        for colour, folder in (("raw", home / "one"), ("even", home / "one")):
-            body = {"arguments": {"folders": [str(folder)]}, "colour": colour}
-            assert call(server, "/api/start/pictures", body).status == 200
+        for _ in range(2):
+            assert started(server, "import-images", folders=[str(home / "one")]).status == 200
             last = ended(server)
             assert last["state"] == "failed" and "1 usable picture" in last["line"]
             assert run_state(server)["new"]
-        body = {"arguments": {"folders": [str(home / "dive" / "left")]}, "colour": "water"}
-        assert call(server, "/api/start/pictures", body).status == 200
-        assert ended(server)["state"] == "done"
+        again = started(server, "import-images", folders=[str(home / "dive" / "left")])
+        assert again.status == 200 and ended(server)["state"] == "done"
     assert not (tmp_path / "w" / "survey.toml").exists()

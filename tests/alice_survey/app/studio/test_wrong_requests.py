@@ -14,7 +14,7 @@ from alice_survey.app.studio.server import Server, all_endpoints
 from tests.alice_survey.app.report.tiny import tiny_workspace
 from tests.alice_survey.app.studio.client import Reply, ask, call, serving
 
-STARTS = {"/api/run/start", "/api/start/pictures"}
+STARTS = {"/api/run/start"}
 """Endpoints that start a program."""
 LONGEST = 200
 NAMES = (
