@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from alice_survey.core.config import SurveyConfig, change_section, parse_config, with_settings
+from alice_survey.core.config import SurveyConfig, change_section, parse_config
 from alice_survey.core.errors import collected_by
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import certificate
@@ -24,7 +24,9 @@ def planned(config: SurveyConfig) -> Planned:
 
 
 def test_totals_and_warnings_are_those_of_the_plan() -> None:
-    config = with_settings(SMALL, {"plan.line_spacing_m": 1.45, "vehicle.battery_wh": 13.0})
+    config = change_section(
+        change_section(SMALL, "plan", line_spacing_m=1.45), "vehicle", battery_wh=13.0
+    )
     found, made = preview(config), planned(config)
     plan, totals = made.plan, found["totals"]
     assert found["ok"] and len(plan.dives) == totals["dives"] == 2
@@ -45,7 +47,7 @@ def test_totals_and_warnings_are_those_of_the_plan() -> None:
 
 def test_holes_are_where_the_area_is_not_covered() -> None:
     room = [[-1, -1], [9, -1], [9, 4], [-1, 4]]
-    config = with_settings(SMALL, {"area.allowed_ne_m": room})
+    config = change_section(SMALL, "area", allowed_ne_m=room)
     found = preview(config)
     hole = max(found["holes"], key=lambda one: float(one["area_m2"]))
     assert found["totals"]["at_overlap"] < 0.9
