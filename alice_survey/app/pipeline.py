@@ -205,7 +205,8 @@ def init_survey(
     if area is not None:
         rectangle = ("latitude_deg", "longitude_deg", "length_m", "width_m", "heading_deg")
         named = Path(os.path.relpath(area.resolve(), folder.resolve())).as_posix()
-        values = {"area": dict.fromkeys(rectangle, None) | {"file": named}, **(values or {})}
+        values = dict(values or {})
+        values["area"] = dict.fromkeys(rectangle, None) | {"file": named, **values.get("area", {})}
     if values:
         text = with_settings_changed(text, values)
     parse_config(settings_in(text, "the new survey"), "the new survey")
