@@ -141,7 +141,6 @@ Pixels = Annotated[int, Field(ge=1, le=1_000_000)]
 Numbers = Annotated[Array, _validator(read_vector, ()), PlainSerializer(_as_list)]
 Vector3 = Annotated[Array, _validator(read_vector, (3,)), PlainSerializer(_as_list)]
 Vector4 = Annotated[Array, _validator(read_vector, (4,)), PlainSerializer(_as_list)]
-Vector6 = Annotated[Array, _validator(read_vector, (6,)), PlainSerializer(_as_list)]
 Matrix33 = Annotated[Array, _validator(_read_matrix, 3, 3), PlainSerializer(matrix_of)]
 Matrix34 = Annotated[Array, _validator(_read_matrix, 3, 4), PlainSerializer(matrix_of)]
 Turn = Annotated[

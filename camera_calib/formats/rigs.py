@@ -105,7 +105,7 @@ def assemble(
     return refer_to_first(rig)
 
 
-def file_each(path: Path, rig: Rig, suffix: str = ".yaml") -> list[Path]:
+def file_each(path: Path, rig: Rig) -> list[Path]:
     """Files of formats that have one for each camera: the path, or those in it when it is a folder.
 
     Raises:
@@ -117,7 +117,7 @@ def file_each(path: Path, rig: Rig, suffix: str = ".yaml") -> list[Path]:
         raise CalibrationError(
             f"{path}: {len(rig.cameras)} cameras have as many files: name a folder for them"
         )
-    return [path / f"{name}{suffix}" for name in rig.cameras]
+    return [path / f"{name}.yaml" for name in rig.cameras]
 
 
 def default_names(count: int) -> list[str]:
