@@ -125,7 +125,7 @@ def write_copc(
         for key in part.cubes:
             names.setdefault(key, []).append(part.name)
     grid = _OctreeGrid.over(names, spool.bits)
-    packing = _Packing.of(header)
+    packing = header.point_format.id, header.point_format.num_extra_bytes
     tasks = [(key, tuple(names[key])) for key in grid.in_order(names)]
     found = executor.map(
         partial(_make_cube, spool, grid, packing),
@@ -138,37 +138,28 @@ def write_copc(
     shutil.rmtree(spool.folder)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Packing:
-    """How the points of a file are compressed."""
+_Packing = tuple[int, int]
+"""Number of the points' format, and their extra bytes."""
 
-    format_id: int
-    extra_bytes: int
 
-    @classmethod
-    def of(cls, header: "laspy.LasHeader") -> "_Packing":
-        point_format = header.point_format
-        return cls(format_id=point_format.id, extra_bytes=point_format.num_extra_bytes)
+def _laz_of(packing: _Packing) -> Any:
+    """Description of how points are compressed, for readers."""
+    import lazrs
 
-    def laz(self) -> Any:
-        """Description for readers."""
-        import lazrs
+    return lazrs.LazVlr.new_for_compression(*packing, use_variable_size_chunks=True)
 
-        return lazrs.LazVlr.new_for_compression(
-            self.format_id, self.extra_bytes, use_variable_size_chunks=True
-        )
 
-    def chunk(self, points: Records) -> bytes:
-        """Points as a chunk, which no other chunk has a part in."""
-        if not len(points):
-            return b""
-        import lazrs
+def _pack(packing: _Packing, points: Records) -> bytes:
+    """Points as a chunk, which no other chunk has a part in."""
+    if not len(points):
+        return b""
+    import lazrs
 
-        packed = io.BytesIO()
-        packer = lazrs.LasZipCompressor(packed, self.laz())
-        packer.compress_many(points.tobytes())
-        packer.finish_current_chunk()
-        return packed.getvalue()[_TABLE_AT.size :]  # without the place of a table
+    packed = io.BytesIO()
+    packer = lazrs.LasZipCompressor(packed, _laz_of(packing))
+    packer.compress_many(points.tobytes())
+    packer.finish_current_chunk()
+    return packed.getvalue()[_TABLE_AT.size :]  # without the place of a table
 
 
 def _extremes(points: Records) -> Records:
@@ -217,7 +208,7 @@ def _make_cube(
     with cube.chunks.open("wb") as file:
 
         def put(level: int, key: Key, points: Records) -> None:
-            chunk = packing.chunk(points)
+            chunk = _pack(packing, points)
             file.write(chunk)
             cube.entries.append((level, key, len(chunk), len(points)))
 
@@ -237,7 +228,7 @@ def _write(file: BinaryIO, header: "laspy.LasHeader", nodes: "_Nodes") -> None:
     import lazrs
     from laspy.vlrs.known import LasZipVlr
 
-    laz = nodes.packing.laz()
+    laz = _laz_of(nodes.packing)
     info = laspy.VLR("copc", 1, "COPC info VLR", bytes(_INFO.size))
     header.vlrs.insert(0, info)
     header.vlrs.append(LasZipVlr(laz.record_data()))
@@ -408,7 +399,7 @@ class _Nodes:
 
     def _put(self, level: int, key: Key, points: Records) -> None:
         """Write a node, which may be empty."""
-        offset, chunk = self._file.tell(), self.packing.chunk(points)
+        offset, chunk = self._file.tell(), _pack(self.packing, points)
         self._file.write(chunk)
         self._enter(level, key, offset, len(chunk), len(points))
 

@@ -84,29 +84,20 @@ def chosen_planes(requested: Sequence[WantedPlane], model: SparseModel) -> tuple
             "the model has no place in the world: the directions that planes face count from its "
             "own first axis"
         )
-    planes = [_plane(one, model) for one in requested]
-    found: list[Plane] = []
-    for plane in planes:
-        if all(plane.name != other.name for other in found):  # auto may be level too
-            found.append(plane)
-    return tuple(found)
-
-
-def _plane(requested: WantedPlane, model: SparseModel) -> Plane:
-    if requested.name == AUTO:
-        return best_plane(model)
-    if requested.facing_deg is None:
-        return LEVEL_PLANE
-    rotation = facing(requested.facing_deg, requested.tilt_deg)
-    return Plane(
-        name=requested.name,
-        about=_words(requested.facing_deg, requested.tilt_deg),
-        plane_from_world=RigidTransform.from_rotation(rotation),
-    )
-
-
-def _words(facing_deg: float, tilt_deg: float) -> str:
-    return f"facing {facing_deg:g} deg, tilt {tilt_deg:g} deg"
+    found: dict[str, Plane] = {}
+    for one in requested:
+        plane = LEVEL_PLANE
+        if one.name == AUTO:
+            plane = best_plane(model)
+        elif one.facing_deg is not None:
+            rotation = facing(one.facing_deg, one.tilt_deg)
+            plane = Plane(
+                name=one.name,
+                about=f"facing {one.facing_deg:g} deg, tilt {one.tilt_deg:g} deg",
+                plane_from_world=RigidTransform.from_rotation(rotation),
+            )
+        found.setdefault(plane.name, plane)  # auto may be level too
+    return tuple(found.values())
 
 
 def best_plane(model: SparseModel) -> Plane:
@@ -127,7 +118,8 @@ def best_plane(model: SparseModel) -> Plane:
     azimuth = math.degrees(math.atan2(normal[1], normal[0])) % 360.0
     tilt = math.degrees(math.asin(max(-1.0, min(1.0, -normal[2]))))
     rotation = facing(azimuth, tilt)
-    about = f"best plane: {_words(round(azimuth, 1) + 0.0, round(tilt, 1) + 0.0)}"
+    turned, leaning = round(azimuth, 1) + 0.0, round(tilt, 1) + 0.0
+    about = f"best plane: facing {turned:g} deg, tilt {leaning:g} deg"
     if upright is not None:
         into = -normal
         rotation = Rotation.from_matrix(np.stack([upright, np.cross(into, upright), into]))

@@ -153,20 +153,20 @@ def _recording(chapters: dict[int, Path]) -> Recording:
                 f"{file.path} has {file.size[0]} x {file.size[1]} pixels, but {first.path.name} "
                 f"of the same recording {first.size[0]} x {first.size[1]}: import them apart"
             )
-    longest_s = max(file.duration_s for file in files.values())
+    max_duration_s = max(file.duration_s for file in files.values())
     old = first.path.name.upper().startswith(("GOPR", _OLD))
     lost = [str(chapter) for chapter in range(0 if old else 1, max(files)) if chapter not in files]
     if lost:
         warn(
             f"chapters {', '.join(lost)} of the recording are missing: its times count from the "
             f"start of {first.path.name}, and run on as if each missing one after it lasted "
-            f"{longest_s:.1f} s"
+            f"{max_duration_s:.1f} s"
         )
     placed, start_s = [], 0.0
     for chapter in range(min(files), max(files) + 1):
         if chapter in files:
             placed.append(replace(files[chapter], start_s=start_s))
-        start_s += files[chapter].duration_s if chapter in files else longest_s
+        start_s += files[chapter].duration_s if chapter in files else max_duration_s
     start, clock = _began(placed)
     return Recording(name=first.path.stem, files=tuple(placed), start=start, clock=clock)
 
