@@ -373,6 +373,12 @@ def test_every_fault_names_its_cause(tmp_path: Path, draw: Draw) -> None:
         tmp_path / "nav.csv", [[0, 60, 5, 3], [1, 60, 5, 3]],
         "time_s,latitude_deg,longitude_deg,depth_m",
     )  # fmt: skip
+    for number in range(2):
+        draw(tmp_path / "dated" / f"{number}.jpg", number, time=f"2024:07:01 12:00:0{number}")
+    later = navigation(
+        tmp_path / "later.csv", [["2024-07-02T12:00:01Z", 10], ["2024-07-02T12:00:09Z", 10]],
+        "time_utc,depth_m",
+    )  # fmt: skip
     w, three = tmp_path / "w", tmp_path / "three"
     faults: list[tuple[list[Path], dict[str, object], str]] = [
         ([tmp_path / "empty"], {}, "empty"),
@@ -385,6 +391,7 @@ def test_every_fault_names_its_cause(tmp_path: Path, draw: Draw) -> None:
         ([three], {"overlap": 0.7}, "--video too"),
         ([], {"videos": [tmp_path / "no.mp4"] * 2}, "given twice"),
         ([three], {"navigation": nav}, "DateTimeOriginal"),
+        ([tmp_path / "dated"], {"navigation": later}, "--clock-offset"),
         ([three], {"clock_offset_s": float("nan")}, "--clock-offset"),
         ([three], {"vertical_datum": "LAT"}, "--navigation"),
         ([three], {"navigation": nav, "vertical_datum": "a\nb"}, "--vertical-datum"),
@@ -393,25 +400,12 @@ def test_every_fault_names_its_cause(tmp_path: Path, draw: Draw) -> None:
         with pytest.raises(AliceError, match=named):
             import_images(w, folders, **given)  # type: ignore[arg-type]
     assert not (w / "images").exists()
-
-
-@pytest.mark.parametrize("stage", ["images", "pool"])
-def test_a_simulated_survey_is_not_mixed_with_real_pictures(
-    tmp_path: Path, several: Several, stage: str
-) -> None:
-    truth = tmp_path / "w" / stage / "truth"
-    truth.mkdir(parents=True)
-    with pytest.raises(WorkspaceError):
-        import_images(tmp_path / "w", [several(2)])
-    assert truth.is_dir()
-
-
-def test_a_navigation_log_of_another_day_is_refused(tmp_path: Path, several: Several) -> None:
-    source = several(2, dated=True)
-    rows = [[f"2024-07-02T12:00:{s:02d}Z", 60, 5.0, 10] for s in range(9)]
-    nav = navigation(tmp_path / "nav.csv", rows, "time_utc,latitude_deg,longitude_deg,depth_m")
-    with pytest.raises(ImageError, match="--clock-offset"):
-        import_images(tmp_path / "w", [source], navigation=nav)
+    for stage in ("images", "pool"):
+        truth = tmp_path / stage / stage / "truth"
+        truth.mkdir(parents=True)
+        with pytest.raises(WorkspaceError):
+            import_images(tmp_path / stage, [three])
+        assert truth.is_dir()
 
 
 def test_one_or_two_processes_write_the_same(tmp_path: Path, several: Several) -> None:
