@@ -33,7 +33,7 @@ from reconstruct.evaluate.figures import (
     spread,
 )
 from reconstruct.evaluate.truth import surface_depth, surface_distance, surface_material
-from reconstruct.mesh.visibility import ray_scene
+from reconstruct.mesh.visibility import distances_from
 from reconstruct.raster import opened_raster
 
 GOOD_M = 0.01
@@ -206,7 +206,7 @@ def score_mesh(
     places = rng.uniform(low, high, (_SAMPLES, 2))
     places = places[shapely.contains_xy(area, places[:, 0], places[:, 1])]
     truth = np.column_stack([places, surface_depth(terrain, places)])
-    away = distance_from_mesh(vertices, triangles, truth[np.isfinite(truth[:, 2])])
+    away = distances_from(vertices, triangles.astype(np.int32), truth[np.isfinite(truth[:, 2])])
     return {
         "triangles": len(triangles),
         **spread("distance", distance),
@@ -225,17 +225,6 @@ def spread_over(vertices: Array, triangles: Array, count: int, rng: np.random.Ge
     share[over] = 1 - share[over]
     points: Array = corners[chosen, 0] + np.einsum("nk,nkj->nj", share, sides[chosen])
     return points
-
-
-def distance_from_mesh(vertices: Array, triangles: Array, points: Array) -> Array:
-    """(N,) distances of (N, 3) points from a mesh; in float32 about its centre."""
-    import open3d as o3d
-
-    centre = vertices.mean(axis=0)
-    scene = ray_scene(vertices - centre, triangles.astype(np.int32))
-    found = scene.compute_distance(o3d.core.Tensor((points - centre).astype(np.float32)), 1)
-    distance: Array = found.numpy().astype(np.float64)
-    return distance
 
 
 _PATCH_PX = 96

@@ -28,7 +28,7 @@ from alice_survey.core.compiled import compiled
 from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Array
 from reconstruct.mesh.topology import Triangles, component_areas, edges_of, split_fans
-from reconstruct.mesh.visibility import ray_scene
+from reconstruct.mesh.visibility import distances_from
 
 _MAX_ROUNDS = 60
 _ENOUGH = 0.004
@@ -493,12 +493,7 @@ def without_pairs(triangles: Triangles) -> Triangles:
 
 def farthest(points: Array, vertices: Array, triangles: Triangles) -> float:
     """Largest distance of points (N, 3) from a mesh."""
-    import open3d as o3d
-
-    middle = points.mean(axis=0)
-    scene = ray_scene(vertices - middle, triangles)
-    away = scene.compute_distance(o3d.core.Tensor((points - middle).astype(np.float32)), 1)
-    return float(away.numpy().max())
+    return float(distances_from(vertices, triangles, points).max())
 
 
 def _keys(edges: NDArray[np.integer]) -> NDArray[np.int64]:

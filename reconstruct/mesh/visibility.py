@@ -229,6 +229,17 @@ def _geometry(path: Path, _written_ns: int) -> _Shape:
     )
 
 
+def distances_from(vertices: Array, triangles: Triangles, points: Array) -> Array:
+    """(N,) distances of (N, 3) points from a mesh; in float32 about their middle."""
+    import open3d as o3d
+
+    middle = points.mean(axis=0) if len(points) else vertices[0]
+    scene = ray_scene(vertices - middle, triangles)
+    found = scene.compute_distance(o3d.core.Tensor((points - middle).astype(np.float32)), 1)
+    distances: Array = found.numpy().astype(np.float64)
+    return distances
+
+
 def ray_scene(vertices: Array, triangles: Triangles) -> Any:
     """A mesh as an Open3D `RaycastingScene`."""
     import open3d as o3d

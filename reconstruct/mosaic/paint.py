@@ -356,11 +356,7 @@ def paint_tile(task: PaintTask) -> Painted:
                 change = changes.get(entry.number)
                 colour = _colours(task, tools, entry, sight, (local, part, requested), change)
                 blend.add(part[0].start, part[1].start, colour, sight.quality > 0, taken)
-    margin = block.core.row_off - block.window.row_off
-    inner = (
-        slice(margin, margin + block.core.height),
-        slice(margin, margin + block.core.width),
-    )
+    inner = _inner(block, 1)
     source = source[inner]
     known = source > 0
     levels = np.rint(np.clip(blend.result()[inner], 0, 255)).astype(np.uint8)
@@ -559,11 +555,10 @@ def _colours(
     return light
 
 
-def _inner(block: Block) -> tuple[slice, slice]:
-    """Cells of the core within the block's."""
-    margin = (block.core.row_off - block.window.row_off) // CELL_PX
-    rows = -(-block.core.height // CELL_PX)
-    columns = -(-block.core.width // CELL_PX)
+def _inner(block: Block, side_px: int = CELL_PX) -> tuple[slice, slice]:
+    """Cells of the core within the block's, or pixels of a side of 1."""
+    margin = (block.core.row_off - block.window.row_off) // side_px
+    rows, columns = (-(-size // side_px) for size in (block.core.height, block.core.width))
     return slice(margin, margin + rows), slice(margin, margin + columns)
 
 

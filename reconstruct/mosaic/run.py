@@ -459,14 +459,13 @@ def _dispersion(
 ) -> tuple[Water | None, dict[str, Any]]:
     """The water through which colours are distinguished, or None, and what to say about it."""
     warps = read_warps(workspace / "sparse" / "cameras.json").values()
-    pictures = PicturesRecord.read(workspace / "images" / "survey.json")
-    for known, reason in (
-        (all(warp.camera.n_water == 1 for warp in warps), "no port"),
-        (grey, "grey pictures"),
-        (pictures.source == "simulated", "rendered pictures have none"),
-    ):
-        if known:
-            return None, {"corrected": False, "reason": reason}
+    reason = "grey pictures" if grey else ""
+    if all(warp.camera.n_water == 1 for warp in warps):
+        reason = "no port"
+    elif not grey and PicturesRecord.read(workspace / "images/survey.json").source == "simulated":
+        reason = "rendered pictures have none"
+    if reason:
+        return None, {"corrected": False, "reason": reason}
     stated = config.temperature_c is not None and config.salinity_psu is not None
     values = {
         "temperature_c": _TEMPERATURE_C if config.temperature_c is None else config.temperature_c,

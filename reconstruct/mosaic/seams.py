@@ -103,20 +103,15 @@ def seam_cost(
         return 0.0
     total = 0.0
     for side in range(2):
+        numbers, colours, own = (number_p, colours_p, a) if side == 0 else (number_q, colours_q, b)
+        other = number_q[b] if side == 0 else number_p[a]
         # how much the two views differ in one of the cells; unknown counts as most
         difference = _MAX_DIFFERENCE
-        if side == 0:
-            for k in range(len(number_p)):
-                if number_p[k] == number_q[b]:
-                    difference = 0.0
-                    for c in range(3):
-                        difference += abs(colours_p[a, c] - colours_p[k, c]) / 3.0
-        else:
-            for k in range(len(number_q)):
-                if number_q[k] == number_p[a]:
-                    difference = 0.0
-                    for c in range(3):
-                        difference += abs(colours_q[b, c] - colours_q[k, c]) / 3.0
+        for k in range(len(numbers)):
+            if numbers[k] == other:
+                difference = 0.0
+                for c in range(3):
+                    difference += abs(colours[own, c] - colours[k, c]) / 3.0
         total += min(difference, _MAX_DIFFERENCE)
     return _SEAM_COST + _DIFFERENCE_COST * 0.5 * total
 

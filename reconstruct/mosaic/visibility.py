@@ -12,11 +12,9 @@ import math
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rasterio.windows import Window
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from alice_survey.core.artefacts import atomic_path
@@ -30,7 +28,7 @@ from reconstruct.mosaic.grid import Float32, footprints, height_at_pixels
 from reconstruct.pictures.undistorted import taken_nodes
 from reconstruct.planes import Plane
 from reconstruct.ply import read_header
-from reconstruct.raster import DemGrid, opened_raster, small_cache
+from reconstruct.raster import DemGrid, grid_of, read_cells, small_cache
 from reconstruct.views.model import View, enu_from_cam
 from reconstruct.views.range_shift import (
     FAST,
@@ -152,40 +150,23 @@ def _off_heights(
 
 def _are_off(points: Array, dem: Path) -> NDArray[np.bool_]:
     """(N,) whether points (N, 3), north, east, down, are off all heights around them."""
-    off = np.zeros(len(points), np.bool_)
-    with opened_raster(dem) as raster:
-        t = raster.transform
-        column = np.floor((points[:, 1] - t.c) / t.a).astype(np.int64)
-        row = np.floor((t.f - points[:, 0]) / t.a).astype(np.int64)
-        blocks = np.stack([row, column], axis=1) // _BLOCK_CELLS
-        _, block = np.unique(blocks, axis=0, return_inverse=True)
-        for n in range(block.max(initial=-1) + 1):
-            here = block.reshape(-1) == n
-            off[here] = _off_in_block(points[here, 2], row[here], column[here], raster)
-    return off
-
-
-def _off_in_block(
-    down: Array, row: NDArray[np.int64], column: NDArray[np.int64], raster: Any
-) -> NDArray[np.bool_]:
-    """(N,) whether points are off all heights around them, of those in a part of a DEM.
-
-    Args:
-        down: (N,) of the points.
-        row: (N,) of their cells.
-        column: (N,) of their cells.
-        raster: the DEM.
-    """
-    left, top = column.min() - _AROUND_CELLS, row.min() - _AROUND_CELLS
-    size = column.max() - left + _AROUND_CELLS + 1, row.max() - top + _AROUND_CELLS + 1
-    window = Window(int(left), int(top), int(size[0]), int(size[1]))
-    heights = raster.read(1, window=window, boundless=True, fill_value=np.nan)
-    known = np.isfinite(heights)
-    side = 2 * _AROUND_CELLS + 1
-    highest = maximum_filter(np.where(known, heights, -np.inf), side)[row - top, column - left]
-    lowest = minimum_filter(np.where(known, heights, np.inf), side)[row - top, column - left]
-    up, limit = -down, _OFF_CELLS * raster.transform.a
-    off: NDArray[np.bool_] = (up > highest + limit) | (up < lowest - limit)
+    off, grid = np.zeros(len(points), np.bool_), grid_of(dem)
+    column = np.floor((points[:, 1] - grid.west) / grid.cell).astype(np.int64)
+    row = np.floor((grid.north - points[:, 0]) / grid.cell).astype(np.int64)
+    blocks = np.stack([row, column], axis=1) // _BLOCK_CELLS
+    _, block = np.unique(blocks, axis=0, return_inverse=True)
+    side, limit = 2 * _AROUND_CELLS + 1, _OFF_CELLS * grid.cell
+    for n in range(block.max(initial=-1) + 1):
+        here = np.flatnonzero(block.reshape(-1) == n)
+        top, left = row[here].min() - _AROUND_CELLS, column[here].min() - _AROUND_CELLS
+        at = row[here] - top, column[here] - left
+        size = (int(part.max()) + _AROUND_CELLS + 1 for part in at)
+        heights = read_cells(dem, int(top), int(left), *size)
+        known = np.isfinite(heights)
+        highest = maximum_filter(np.where(known, heights, -np.inf), side)[at]
+        lowest = minimum_filter(np.where(known, heights, np.inf), side)[at]
+        up = -points[here, 2]
+        off[here] = (up > highest + limit) | (up < lowest - limit)
     return off
 
 
