@@ -2,7 +2,11 @@
 
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
+
+from alice_survey.core.config import SurveyConfig, change_section
 
 SMALL = """
 seed = 3
@@ -39,3 +43,11 @@ def start(workspace: Path, threads: int) -> subprocess.Popen[bytes]:
         stderr=subprocess.DEVNULL,
         start_new_session=True,
     )
+
+
+def with_settings(config: SurveyConfig, values: Mapping[str, Any]) -> SurveyConfig:
+    """A survey with settings such as `plan.speed_mps` changed."""
+    for name, value in values.items():
+        section, key = name.split(".")
+        config = change_section(config, section, **{key: value})
+    return config

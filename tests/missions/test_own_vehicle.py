@@ -8,7 +8,7 @@ import pytest
 
 from alice_survey.app.pipeline import plan_report
 from alice_survey.core.artefacts import read_json
-from alice_survey.core.config import SurveyConfig, load_config, parse_config, with_settings
+from alice_survey.core.config import SurveyConfig, load_config, parse_config
 from alice_survey.core.errors import AliceError, PlanError, VehicleError
 from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.pilot.gains import gains_for
@@ -16,6 +16,7 @@ from missions.plan.strength import survey_costs
 from missions.route.energy import battery_wh, hotel_w, planned_vehicle
 from missions.values.flight import Flight, rms
 from tests.missions.flown_plans import flown, planned
+from tests.small_survey import with_settings
 
 HEAVY = Path(__file__).parents[2] / "alice_survey/sim/vehicle/fleet_files/bluerov2_heavy.toml"
 PLACES = {"position_body_m": [0.2, -0.05, 0.1], "dvl_position_body_m": [-0.1, 0.0, 0.12]}

@@ -4,10 +4,11 @@ from typing import Any
 
 import pytest
 
-from alice_survey.core.config import SurveyConfig, parse_config, with_settings
+from alice_survey.core.config import SurveyConfig, parse_config
 from camera_calib.rig import design_rig
 from missions.exposure.conflict import ConflictError
 from missions.plan.planner import Planned, plan_survey
+from tests.small_survey import with_settings
 
 SMALL = {"length_m": 8.0, "width_m": 5.0}
 

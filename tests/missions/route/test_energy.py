@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from alice_survey.core.config import SurveyConfig, with_settings
+from alice_survey.core.config import SurveyConfig
 from alice_survey.core.errors import PlanError
 from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.steady import drag_power, steady_flight
@@ -26,6 +26,7 @@ from missions.route.energy import (
 from missions.route.turns import Manoeuvre
 from missions.values.costs import power_at
 from missions.values.line import Line
+from tests.small_survey import with_settings
 
 
 def _config(current: float = 0.1, towards: float = 90.0, **sections: Any) -> SurveyConfig:
