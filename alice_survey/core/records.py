@@ -313,17 +313,11 @@ class GeoreferenceRecord(JsonRecord):
     mount: MountRecord | None = None
     format: str = "alice-survey georeference"
     version: int = 1
-    method: str = ""
     stations: int = 0
     left_out: dict[str, int] = Field(default_factory=dict)
     """Readings that the rest contradicts, by group of channels."""
-    sigma_tilt_north_deg: float = 0.0
-    sigma_tilt_east_deg: float = 0.0
     largest_tilt_deg: float = 0.0
     largest_tilt_axis_deg: float = 0.0
-    mount_sigma_deg: float = 0.0
-    lever_sigma_m: float = 0.0
-    clock_sigma_s: float = 0.0
     nuisances: dict[str, NuisanceRecord] = Field(default_factory=dict)
     soft_modes: tuple[float, ...] = ()
     """Sizes of the model's soft modes, in their sigmas."""

@@ -4,7 +4,6 @@ The place, nuisances of navigation and sizes of the model's soft modes are found
 robust first placement on; then what contradicts itself is named and counts as that unsure.
 """
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -54,12 +53,6 @@ from reconstruct.placing.navigation import (
     read_epochs,
     without_navigation,
 )
-
-_METHOD = (
-    "generalised least squares; errors of navigation as first-order Gauss-Markov processes of the "
-    "stated sigmas, correlation times and white shares by restricted maximum likelihood"
-)
-
 
 _ORDER = (
     "rotation_north_rad", "rotation_east_rad", "rotation_down_rad", "north_m", "east_m", "down_m",
@@ -159,8 +152,6 @@ class PlacementFit:
             "sigma_tilt_deg": float(np.rad2deg(np.sqrt(tilts.mean()))) or None,
             "sigma_scale": self.sigma_scale,
             "mount": None if self.mount is None else self.mount.record,
-            "sigma_tilt_north_deg": float(self.sigma_tilt_deg[0]),
-            "sigma_tilt_east_deg": float(self.sigma_tilt_deg[1]),
             "largest_tilt_deg": float(np.rad2deg(np.sqrt(tilts[1]))),
             "largest_tilt_axis_deg": float(np.rad2deg(np.arctan2(axes[1, 1], axes[0, 1])) % 180.0),
             "covariance": tuple(map(tuple, self.covariance.tolist())),
@@ -340,7 +331,6 @@ class NavigationTask:
         north, east, depth = (None if np.isnan(v) else v for v in _rms(residuals).tolist())
         unit = "s" if epochs.timed else "stations"
         stated = GeoreferenceRecord(
-            method=_METHOD,
             # With a position (without any, with a depth) that took part.
             stations=int((got.used[:, 0] if got.used[:, 0].any() else got.used[:, 2]).sum()),
             left_out={group: int(lost[:, k].sum()) for group, k in first.items()},
@@ -350,9 +340,6 @@ class NavigationTask:
             # That a similarity would choose: 1 where navigation agrees with the known scale.
             scale_of_navigation=float(np.exp(scaled.change[SCALE])) if SCALE not in free else 1.0,
             scale_of_navigation_sigma=float(np.sqrt(scaled.covariance[SCALE, SCALE])),
-            mount_sigma_deg=math.degrees(self.installed.mount_rad),
-            lever_sigma_m=self.installed.lever_m,
-            clock_sigma_s=self.installed.clock_s,
             nuisances=named,
             soft_modes=tuple(at.sizes.tolist()),
             soft_modes_factor=at.factor,

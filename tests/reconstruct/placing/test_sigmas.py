@@ -167,11 +167,9 @@ def test_bad_fixes_are_left_out_and_gaps_do_no_harm() -> None:
 def test_the_mount_adds_its_sigma_and_a_turning_vehicle_shows_it() -> None:
     body = flight()
     records = flown(body, 2, 1.0)
-    plain, _, exact = place(body, records, 1)
+    *_, exact = place(body, records, 1)
     installed = replace(USUAL_INSTALLATION, mount_rad=np.deg2rad(2.0))
-    mounted, _, loose = place(body, records, 1, installed=installed)
-    assert plain.record.mount_sigma_deg == 0.0
-    assert mounted.record.mount_sigma_deg == pytest.approx(2.0)
+    *_, loose = place(body, records, 1, installed=installed)
     # Heading: its mount error is the same on all lines, only positions determine it.
     assert loose[5] > 1.5 * exact[5]
     # Tilt: lines flown to and fro show it, and depths do.
