@@ -232,9 +232,9 @@ def moving_parts(look: Look, others: Sequence[Look]) -> tuple[Mask, float]:
             continue
         there = other.light.reshape(-1, 3, 3)[cells]
         there[cells < 0] = np.nan
-        features = _smooth(places, log_ratio)
+        features = smooth_features(places, log_ratio)
         chosen = known[:: max(1, len(known) // _FITTED_CELLS)]
-        fit, sigma = _smooth_difference(features[chosen], own[chosen, 0] - there[chosen, 0])
+        fit, sigma = smooth_difference(features[chosen], own[chosen, 0] - there[chosen, 0])
         there += np.einsum("nk,kc->nc", features, fit)[:, None].astype(np.float32)
         shown.append(there)
         sigmas.append(sigma)
@@ -356,13 +356,13 @@ def with_bounds(light: Float32) -> Float32:
     return np.stack([light, cv2.erode(light, kernel), cv2.dilate(light, kernel)], axis=2)
 
 
-def _smooth(places: Array, log_ratio: Array) -> Array:
+def smooth_features(places: Array, log_ratio: Array) -> Array:
     """(N, 7) what light may differ by: of second degree over the view, and with the range."""
     x, y = places.T - 0.5
     return np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y, log_ratio])
 
 
-def _smooth_difference(features: Array, apart: Float32) -> tuple[Array, Array]:
+def smooth_difference(features: Array, apart: Float32) -> tuple[Array, Array]:
     """Fit differences of light (N, 3) robustly; coefficients (7, 3), and sigma (3,) of the rest."""
     a, b = features, apart.astype(np.float64)
     fit = np.zeros((a.shape[1], 3))

@@ -9,7 +9,16 @@ import pytest
 from alice_survey.app.stages import spec
 from alice_survey.core.config import ReconstructConfig, SurveyConfig
 from alice_survey.core.executor import SERIAL
-from reconstruct.dense.moving import Look, cells_at, draw, find_odd, shared_depth, with_bounds
+from reconstruct.dense.moving import (
+    Look,
+    cells_at,
+    draw,
+    find_odd,
+    shared_depth,
+    smooth_difference,
+    smooth_features,
+    with_bounds,
+)
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.views.model import View
 from tests.oracles_dense import (
@@ -200,6 +209,20 @@ def test_bounds_of_light_are_those_of_the_cells_around():
     light = with_bounds(np.random.default_rng(2).normal(size=(9, 11, 3)).astype(np.float32))
     np.testing.assert_array_equal(light[4, 5, 1], light[3:6, 4:7, 0].min(axis=(0, 1)))
     np.testing.assert_array_equal(light[4, 5, 2], light[3:6, 4:7, 0].max(axis=(0, 1)))
+
+
+def test_smooth_differences_of_light_are_found_under_what_moves():
+    rng = np.random.default_rng(2)
+    places, log_ratio = rng.random((3000, 2)), 0.1 * rng.normal(size=3000)
+    fit = rng.normal(size=(7, 3))
+    x, y = places.T - 0.5
+    true = np.stack([x**0, x, y, x * x, x * y, y * y, log_ratio], axis=1) @ fit
+    apart = true + rng.normal(0, 0.03, true.shape)
+    apart[:300] += 1.5
+    features = smooth_features(places, log_ratio)
+    found, sigma = smooth_difference(features, apart.astype(np.float32))
+    assert 1e-3 < np.sqrt(np.mean((features @ found - true) ** 2)) < 0.04  # without weights 0.15
+    assert ((sigma > 0.03) & (sigma < 0.06)).all()  # of noise, and what the ridge leaves
 
 
 def test_a_cell_is_odd_where_others_agree_on_something_else():
