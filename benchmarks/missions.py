@@ -29,8 +29,13 @@ from missions.coverage.certificate import certificate
 from missions.coverage.stations import plan_pattern, stations_of_flight
 from missions.exports.format import options_of
 from missions.exports.write import write_exports
-from missions.fly.mission_flight import PASSED_M, mission_of_settings, overshoot_m, simulate_mission
-from missions.fly.simulation import flight_settings
+from missions.fly.simulation import (
+    PASSED_M,
+    flight_settings,
+    mission_of_settings,
+    overshoot_m,
+    simulate_mission,
+)
 from missions.plan.planner import plan_survey
 from missions.values.flight import rms
 from missions.values.plan_file import Plan

@@ -118,7 +118,17 @@ FLY = StageSpec(
     about="the plan flown by a simulated vehicle",
     version=5,
     work="missions.fly.run:run_fly",
-    takes=(WHOLE,),
+    takes=(
+        "seed",
+        "vehicle",
+        "sea",
+        "navigation",
+        "camera",
+        "water",
+        "seafloor",
+        "area",
+        "plan",
+    ),
     needs=("plan",),
     settings={
         "seed": "seed",

@@ -26,13 +26,13 @@ from alice_survey.core.frames import Array
 from alice_survey.kit.words import text_table
 from alice_survey.sim.vehicle.files import vehicle_to_fly
 from alice_survey.sim.vehicle.pilot.gains import gains_for
-from alice_survey.sim.vehicle.pilot.memory import CROSS, FOLLOW, PHASE
+from alice_survey.sim.vehicle.pilot.memory import FOLLOW, PHASE
 from alice_survey.sim.vehicle.pilot.settings import pilot_guidance
 from alice_survey.sim.vehicle.sea import level_floor
 from alice_survey.sim.vehicle.simulator import Flown, Setup, simulate
 from alice_survey.sim.vehicle.vehicle import Vehicle
 from camera_calib.rig import design_rig
-from missions.fly.flight_records import true_velocity
+from missions.fly.run import true_velocity
 from missions.fly.simulation import (
     FlightSettings,
     flight_of,
@@ -147,16 +147,11 @@ class FlightFigures:
     lines_true_m: float
     lines_believed_m: float
     route_true_m: float
-    route_believed_m: float
-    lines_worst_m: float
     heading_rms_deg: float
     turn_roll_peak_deg: float
     """Mean over turns."""
-    turn_roll_worst_deg: float
     turn_surge_peak_mps: float
-    turn_surge_worst_mps: float
     turn_yaw_peak_deg_s: float
-    navigation_rms_m: float
     survey_energy_wh: float
     """Energy from the run-in to the end of the last line."""
     survey_s: float
@@ -306,22 +301,19 @@ def figures_of(flight: Flight) -> FlightFigures:
     believed = flight.believed_cross_track
     velocity = true_velocity(flown)
     roll = np.abs(np.rad2deg(flight.attitude_rad[:, 0]))
-    off = flight.log.position_ned - flight.truth.ned_from_body.translation
     turns = turn_rows(line, following)
-    roll_peaks, surge_peaks = _peaks(roll, turns), _peaks(velocity[:, 0], turns)
+
+    def peak(values: Array) -> float:
+        return float(np.mean([values[rows].max() for rows in turns])) if turns else math.nan
+
     return FlightFigures(
         lines_true_m=rms(true),
         lines_believed_m=rms(believed),
         route_true_m=rms(flight.route_error[route]),
-        route_believed_m=rms(flown.report[route, CROSS]),
-        lines_worst_m=_worst(np.abs(true[~np.isnan(true)])),
         heading_rms_deg=rms(np.rad2deg(heading)),
-        turn_roll_peak_deg=_mean(roll_peaks),
-        turn_roll_worst_deg=_worst(roll_peaks),
-        turn_surge_peak_mps=_mean(surge_peaks),
-        turn_surge_worst_mps=_worst(surge_peaks),
-        turn_yaw_peak_deg_s=_mean(_peaks(np.abs(np.rad2deg(velocity[:, 5])), turns)),
-        navigation_rms_m=rms(np.linalg.norm(off[route, :2], axis=1)),
+        turn_roll_peak_deg=peak(roll),
+        turn_surge_peak_mps=peak(velocity[:, 0]),
+        turn_yaw_peak_deg_s=peak(np.abs(np.rad2deg(velocity[:, 5]))),
         survey_energy_wh=float(flown.power_w[route].sum()) * tick_s / 3600.0,
         survey_s=float(route.sum()) * tick_s,
         complete=float(flight.ending == "complete"),
@@ -355,18 +347,6 @@ def summarise(outcomes: Sequence[Outcome]) -> Summary:
             key: float(value) if math.isfinite(value) else None for key, value in found.items()
         }
     return summary
-
-
-def _peaks(values: Array, turns: Sequence[slice]) -> Array:
-    return np.array([values[rows].max() for rows in turns])
-
-
-def _mean(values: Array) -> float:
-    return float(values.mean()) if len(values) else math.nan
-
-
-def _worst(values: Array) -> float:
-    return float(values.max()) if len(values) else math.nan
 
 
 def compare_report(
@@ -407,7 +387,12 @@ def compare_report(
     plan = plan_survey(config, design_rig(config.camera, config.water)).plan
     cases = [_case(text) for text in currents] or list(default_cases(plan))
     if swell is not None:
-        cases = [_with_swell(plan, case, swell) for case in cases]
+        height, period = _swell(swell)
+        across = math.degrees(plan.lines[0].heading_rad) + 90.0
+        cases = [
+            replace(case, swell_m=height, swell_s=period, swell_towards_deg=across)
+            for case in cases
+        ]
     first = config.seed if seed is None else seed
     seeds = list(range(first, first + flights))
     settings = flight_settings(config)
@@ -439,9 +424,11 @@ def compare_report(
     try:
         out.mkdir(parents=True, exist_ok=True)
         write_json(out / "compare.json", data)
-        rows = ([_round_figure(value) for value in outcome.values()] for outcome in outcomes)
+        rows = (
+            [round(value, 6) if isinstance(value, float) else value for value in outcome.values()]
+            for outcome in outcomes
+        )
         write_csv(out / "flights.csv", list(outcomes[0]), rows)
-        (out / "compare.txt").write_text(text + "\n", encoding="utf-8")
         draw_cross_track(out / "compare.png", data["cases"])
     except OSError as error:
         raise ConfigError(f"{error.filename}: cannot be written: {error.strerror}") from None
@@ -495,10 +482,6 @@ def _cell(values: Mapping[str, float | None], digits: int) -> str:
     return shown if sd is None else f"{shown} ±{sd:.{digits}f}"
 
 
-def _round_figure(value: Any) -> Any:
-    return round(value, 6) if isinstance(value, float) else value
-
-
 def _case(text: str) -> Case:
     speed, towards = parse_current(text)
     if speed is None or towards is None or speed < 0.0 or not math.isfinite(speed + towards):
@@ -506,18 +489,15 @@ def _case(text: str) -> Case:
     return Case(current_mps=speed, towards_deg=towards)
 
 
-def _with_swell(plan: Plan, case: Case, text: str) -> Case:
-    height, _, period = text.partition("@")
+def _swell(text: str) -> tuple[float, float]:
+    """Height, m, and period, s, of swell."""
     try:
-        found = replace(
-            case, swell_m=float(height), swell_s=float(period),
-            swell_towards_deg=math.degrees(plan.lines[0].heading_rad) + 90.0,
-        )  # fmt: skip
+        height, period = (float(part) for part in text.split("@"))
     except ValueError:
-        found = case
-    if found is case or not (0.0 <= found.swell_m < math.inf and 0.0 < found.swell_s < math.inf):
+        height = period = math.nan
+    if not (0.0 <= height < math.inf and 0.0 < period < math.inf):
         raise ConfigError(f"swell {text!r}: give HEIGHT@PERIOD, m and s, as 0.5@6")
-    return found
+    return height, period
 
 
 def draw_cross_track(path: Path, cases: Sequence[Mapping[str, Any]]) -> None:

@@ -23,8 +23,7 @@ from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array, Datum, rotation_from_attitude
 from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.simulator import TICK_S
-from missions.live.loop import FIRST_S, SILENCE_S, Command, LinkState, Odometry
-from missions.live.mission import LiveMission
+from missions.live.mission import FIRST_S, SILENCE_S, Command, LinkState, LiveMission, Odometry
 
 GUIDED, SURFACE = 4, 9
 """Modes of ArduSub."""

@@ -10,8 +10,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from alice_survey.core.config import parse_config
-from missions.fly.flight_records import rpm_of
-from missions.fly.run import draw_flight, draw_vehicle, line_spans
+from missions.fly.run import draw_flight, draw_vehicle, line_spans, rpm_of
 from missions.values.flight import Flight
 from tests.missions.flown_plans import flown, planned
 

@@ -23,15 +23,15 @@ from missions.coverage.stations import plan_pattern, stations_of_flight
 from missions.exports.follower import follower_of
 from missions.exports.format import options_of
 from missions.exports.write import write_exports
-from missions.fly.mission_flight import (
+from missions.fly.simulation import (
     PASSED_M,
+    flight_settings,
     mission_of_settings,
     mission_summary,
     overshoot_m,
     picture_times,
     simulate_mission,
 )
-from missions.fly.simulation import flight_settings
 from missions.route.energy import planned_vehicle
 from missions.values.flight import Flight
 from missions.values.plan_file import Plan

@@ -21,7 +21,7 @@ from alice_survey.sim.vehicle.navigation.tick import LOG_COLUMNS
 from alice_survey.sim.vehicle.pilot.failures import ThrustWatch
 from alice_survey.sim.vehicle.sea import FloorGrid, current_at
 from camera_calib.rig import design_rig
-from missions.fly.flight_records import flight_summary
+from missions.fly.run import flight_summary
 from missions.fly.simulation import current_of
 from missions.values.flight import Flight, rms
 from missions.values.plan_file import Plan

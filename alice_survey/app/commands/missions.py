@@ -447,25 +447,26 @@ class PilotCommand(SurveyCommand):
 
     def run(self) -> Result:
         """Be the one or the other side."""
-        config = self.settings(needed=True)
+        from missions.fly.simulation import flight_settings
+
+        settings = flight_settings(self.settings(needed=True))
         if self.simulated:
-            from missions.live.mission import simulate_report
+            from missions.live.ros import simulate_report
 
             return simulate_report(
-                self.workspace, config, takes=self.takes, rate=self.rate, track=self.track
+                self.workspace, settings, takes=self.takes, rate=self.rate, track=self.track
             )
-        from missions.live.loop import LinkLimits
-        from missions.live.mission import pilot_report
+        from missions.live.mission import LinkLimits, pilot_report
 
         limits = LinkLimits(on_loss=self.on_loss, grace_s=self.grace, odometry_s=self.odometry_age)
         return pilot_report(
-            self.workspace, config, limits, self._fly, altimeter_body_m=self.altimeter,
+            self.workspace, settings, limits, self._fly, altimeter_body_m=self.altimeter,
             record=self.record,
         )  # fmt: skip
 
     def _fly(self, mission: "LiveMission") -> None:
         from missions.live.mavlink_pilot import pilot_over_mavlink
-        from missions.live.ros_pilot import Topics, pilot_over_ros
+        from missions.live.ros import Topics, pilot_over_ros
 
         if self.mavlink is not None:
             pilot_over_mavlink(mission, self.mavlink, sim_time=self.sim_time)

@@ -37,7 +37,9 @@ from numpy.typing import NDArray
 
 from alice_survey.core.compiled import kernel
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.propulsion import DISTRUST, Propulsion
+from alice_survey.sim.vehicle.fins import MAX_RAD, Fins, write_fin_matrix
+from alice_survey.sim.vehicle.propulsion import DISTRUST, Propulsion, speeds_for, thrust_limits
+from alice_survey.sim.vehicle.vehicle import Vehicle
 
 
 class AllocationScratch(NamedTuple):
@@ -462,3 +464,82 @@ def allocate_rpi(
                 held[i] = 1
                 again = True
     return rounds
+
+
+class Allocation(NamedTuple):
+    """Settings of the allocation from wrench to n thrusts and m angles of fins."""
+
+    exact: bool
+    propulsion: Propulsion
+    """Propulsion as the allocation assumes it."""
+    fins: Fins
+    matrix: Array
+    """B, (6, n + m): of the thrusters; and of the fins, per angle, at the speed of the tick."""
+    axes: Array
+    """(6,) weight of each axis; 0 of one that is not requested."""
+    health: Array
+    """(n,) 1 of an intact thruster, 0 of a failed one, see `weakened`."""
+    lower: Array
+    upper: Array
+    """(n + m,) N, and rad."""
+    weights: Array
+    thrust: Array
+    """(n + m,) thrusts, and angles of fins."""
+    command: Array
+    """(n + m,) speeds, and angles of fins."""
+    known: Array
+    """(6,) velocity that thrusters are believed to meet."""
+    scratch: AllocationScratch
+
+
+def new_allocation(vehicle: Vehicle, health: Array, *, exact: bool, axes: Array) -> Allocation:
+    """An allocation to the thrusters and fins of a vehicle.
+
+    Args:
+        vehicle: as the allocation assumes it.
+        health: (n,) share of its greatest thrust that each thruster has left.
+        exact: by `allocate_exact`; else by `allocate_rpi`.
+        axes: (6,) weight of each axis.
+    """
+    n, thrusters, fins = vehicle.actuators, len(vehicle.thrusters), vehicle.plant.fins
+    matrix, upper = np.zeros((6, n)), np.zeros(n)
+    matrix[:, :thrusters] = vehicle.configuration_matrix
+    upper[thrusters:] = fins.drives[:, MAX_RAD]
+    return Allocation(
+        exact, vehicle.plant.propulsion, fins, matrix, axes.copy(), health,
+        lower=-upper, upper=upper, weights=np.ones(n), thrust=np.zeros(n),
+        command=np.zeros(n), known=np.zeros(6), scratch=allocation_scratch(n),
+    )  # fmt: skip
+
+
+@kernel
+def allocate(wrench: Array, nu: Array, allocation: Allocation) -> None:
+    """Write the thrusts and the thruster speeds, and angles of fins, that make a wrench.
+
+    Args:
+        wrench: (6,) requested, N and N m.
+        nu: (6 or more,) velocity, of which the first six count; rest where it is not a number.
+        allocation: is written.
+    """
+    # The flow past the hull is not measured: the velocity over ground stands for it.
+    known = allocation.known
+    for i in range(6):
+        known[i] = nu[i] if math.isfinite(nu[i]) else 0.0
+    lower, upper = allocation.lower, allocation.upper
+    thrust_limits(allocation.propulsion, allocation.health, known, lower, upper)
+    preference_weights(allocation.propulsion, known[0], allocation.weights)
+    thrusters = allocation.propulsion.table.shape[0]
+    write_fin_matrix(allocation.fins, known, allocation.matrix, thrusters)
+    if allocation.exact:
+        allocate_exact(
+            allocation.matrix, wrench, lower, upper,
+            allocation.axes, allocation.weights, allocation.thrust, allocation.scratch,
+        )  # fmt: skip
+    else:
+        allocate_rpi(
+            allocation.matrix, wrench, lower, upper,
+            allocation.axes, allocation.weights, allocation.thrust, allocation.scratch,
+        )  # fmt: skip
+    speeds_for(allocation.propulsion, allocation.thrust, known, allocation.command)
+    for i in range(thrusters, allocation.thrust.shape[0]):
+        allocation.command[i] = allocation.thrust[i]

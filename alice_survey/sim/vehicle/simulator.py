@@ -7,7 +7,7 @@ five Runge-Kutta steps of 10 ms.
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +15,7 @@ import numpy as np
 from alice_survey.core.compiled import kernel, note_compiling
 from alice_survey.core.frames import Array, attitude_from_rotation
 from alice_survey.sim.vehicle import estimate_vector as vector
+from alice_survey.sim.vehicle.allocation import Allocation, allocate
 from alice_survey.sim.vehicle.dynamics import (
     STATE,
     Plant,
@@ -24,22 +25,18 @@ from alice_survey.sim.vehicle.dynamics import (
     scratch_for,
 )
 from alice_survey.sim.vehicle.navigation.filter import NavigationState, new_navigation
-from alice_survey.sim.vehicle.navigation.sensors import DVL, FOLLOWED, Sensors
+from alice_survey.sim.vehicle.navigation.sensors import Sensors
 from alice_survey.sim.vehicle.navigation.tick import LOG_ROW, log_row, navigation_tick
 from alice_survey.sim.vehicle.pilot import memory as slot
-from alice_survey.sim.vehicle.pilot.command import Allocation, Pilot, Without, allocate
+from alice_survey.sim.vehicle.pilot.command import Pilot, Piloting
 from alice_survey.sim.vehicle.pilot.failures import WATCHED_S, FoundFailure, navigated_stretch
-from alice_survey.sim.vehicle.pilot.gains import Gains
 from alice_survey.sim.vehicle.pilot.guidance import steer
-from alice_survey.sim.vehicle.pilot.memory import PilotState
-from alice_survey.sim.vehicle.pilot.mission import NO_MISSION, PilotMission
-from alice_survey.sim.vehicle.pilot.path import Path
+from alice_survey.sim.vehicle.pilot.mission import PilotMission
 from alice_survey.sim.vehicle.pilot.safety import TOUCHED
-from alice_survey.sim.vehicle.pilot.settings import Guidance
+from alice_survey.sim.vehicle.pilot.settings import Tick
 from alice_survey.sim.vehicle.propulsion import electrical_power, with_health, without_thrust
 from alice_survey.sim.vehicle.rotations import matrix_rows
 from alice_survey.sim.vehicle.sea import Current, Disturbance, FloorGrid, current_at, floor_depth
-from alice_survey.sim.vehicle.vehicle import Vehicle
 
 TICK_S = 0.05
 STEPS = 5
@@ -87,70 +84,6 @@ def _write_truth(world: World, current: Current, time_s: float) -> None:
         now[10 + i] = state[10 + i]
 
 
-@kernel
-def touches(now: Array, sensors: Sensors, floor: FloorGrid) -> bool:
-    """Whether hull, DVL or port is on the sea floor, or in it."""
-    rows = matrix_rows(now[3], now[4], now[5], now[6])
-    points = sensors.hull.shape[0]
-    for i in range(points + 2):
-        if i < points:
-            a, b, c = sensors.hull[i, 0], sensors.hull[i, 1], sensors.hull[i, 2]
-        else:
-            k = DVL if i == points else FOLLOWED
-            a, b, c = sensors.place[k, 0], sensors.place[k, 1], sensors.place[k, 2]
-        north = rows[0][0] * a + rows[0][1] * b + rows[0][2] * c
-        east = rows[1][0] * a + rows[1][1] * b + rows[1][2] * c
-        down = rows[2][0] * a + rows[2][1] * b + rows[2][2] * c
-        if now[2] + down >= floor_depth(floor, now[0] + north, now[1] + east):
-            return True
-    return False
-
-
-@kernel
-def sense(
-    tick: int,
-    sea: Sea,
-    floor: FloorGrid,
-    sensors: Sensors,
-    navigation: NavigationState,
-    world: World,
-    rng: np.random.Generator,
-) -> None:
-    """Write the truth of a tick, and what the navigation makes of its sensors."""
-    time_s = tick * TICK_S
-    _write_truth(world, sea.current, time_s)
-    navigation_tick(
-        time_s, tick, TICK_S, world.before, world.now, world.water, floor, sensors,
-        navigation, rng, world.estimate,
-    )  # fmt: skip
-
-
-@kernel
-def move(
-    tick: int,
-    plant: Plant,
-    sea: Sea,
-    command: Array,
-    world: World,
-    scratch: Scratch,
-    sea_rng: np.random.Generator,
-) -> None:
-    """Advance the vehicle from a tick to the next under commanded speeds and angles, (n + m,)."""
-    time_s = tick * TICK_S
-    for i in range(STATE):
-        world.before[i] = world.now[i]
-    kept = math.sqrt(1.0 - sea.gust_decay * sea.gust_decay)
-    for i in range(6):
-        world.gust[i] = sea.gust_decay * world.gust[i] + kept * sea_rng.standard_normal()
-        world.load[i] = sea.gust_sigma[i] * world.gust[i]
-    step = TICK_S / STEPS
-    for i in range(STEPS):
-        rk4_step(
-            time_s + i * step, step, world.state, command, world.load, plant, sea.current,
-            scratch,
-        )  # fmt: skip
-
-
 class VehicleParts(NamedTuple):
     """A vehicle in its sea, as compiled code takes it."""
 
@@ -163,67 +96,113 @@ class VehicleParts(NamedTuple):
     scratch: Scratch
 
 
-class PilotParts(NamedTuple):
-    """A pilot, as compiled code takes it."""
+@kernel
+def touches(parts: VehicleParts) -> bool:
+    """Whether hull, DVL or port is on the sea floor, or in it."""
+    now, low = parts.world.now, parts.sensors.low
+    north, east, down = matrix_rows(now[3], now[4], now[5], now[6])
+    for i in range(low.shape[0]):
+        a, b, c = low[i, 0], low[i, 1], low[i, 2]
+        n = north[0] * a + north[1] * b + north[2] * c
+        e = east[0] * a + east[1] * b + east[2] * c
+        d = down[0] * a + down[1] * b + down[2] * c
+        if now[2] + d >= floor_depth(parts.floor, now[0] + n, now[1] + e):
+            return True
+    return False
 
-    path: Path
-    mission: PilotMission
-    guidance: Guidance
-    gains: Gains
-    state: PilotState
-    wrench: Array
-    allocation: Allocation
+
+@kernel
+def sense(tick: int, parts: VehicleParts, rng: np.random.Generator) -> None:
+    """Write the truth of a tick, and what the navigation makes of its sensors."""
+    time_s, world = tick * TICK_S, parts.world
+    _write_truth(world, parts.sea.current, time_s)
+    navigation_tick(
+        time_s, tick, TICK_S, world.before, world.now, world.water, parts.floor, parts.sensors,
+        parts.navigation, rng, world.estimate,
+    )  # fmt: skip
+
+
+@kernel
+def move(tick: int, parts: VehicleParts, command: Array, sea_rng: np.random.Generator) -> None:
+    """Advance the vehicle from a tick to the next under commanded speeds and angles, (n + m,)."""
+    time_s, world, sea = tick * TICK_S, parts.world, parts.sea
+    for i in range(STATE):
+        world.before[i] = world.now[i]
+    kept = math.sqrt(1.0 - sea.gust_decay * sea.gust_decay)
+    for i in range(6):
+        world.gust[i] = sea.gust_decay * world.gust[i] + kept * sea_rng.standard_normal()
+        world.load[i] = sea.gust_sigma[i] * world.gust[i]
+    step = TICK_S / STEPS
+    for i in range(STEPS):
+        rk4_step(
+            time_s + i * step, step, world.state, command, world.load, parts.plant, sea.current,
+            parts.scratch,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Failure:
+    """A thruster that fails on the way."""
+
+    time_s: float
+    thruster: str
+    left: float
+    """Share of its greatest speed squared that is left; of its thrust if it turns."""
+    turns: bool = False
+    """Whether it goes on turning as commanded, with the propeller gone or fouled."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Setup(Piloting):
+    """All inputs of a mission except random numbers."""
+
+    sensors: Sensors
+    floor: FloorGrid
+    current: Current
+    disturbance: Disturbance
+    health: Mapping[str, float] = field(default_factory=dict)
+    """Share of its greatest speed squared left in a thruster: 0 failed; intact if not named."""
+    start_ne_m: tuple[float, float] = (0.0, 0.0)
+    start_heading_rad: float = 0.0
+    failures: tuple[Failure, ...] = ()
+    """Thrusters that fail on the way."""
 
 
 class SimulatedVehicle:
     """A vehicle in its sea, with its sensors and the state of both."""
 
     def __init__(
-        self,
-        vehicle: Vehicle,
-        sensors: Sensors,
-        floor: FloorGrid,
-        current: Current,
-        disturbance: Disturbance,
-        rng: np.random.Generator,
-        *,
-        sea_rng: np.random.Generator | None = None,
-        start_ne_m: tuple[float, float] = (0.0, 0.0),
-        start_heading_rad: float = 0.0,
-        health: Mapping[str, float] | None = None,
+        self, setup: Setup, rng: np.random.Generator, sea_rng: np.random.Generator | None = None
     ) -> None:
-        """Put a vehicle at rest on the surface.
+        """Put a vehicle at rest on the surface, where a mission starts.
 
         Args:
-            vehicle: with all its thrusters.
-            sensors: its instruments.
-            floor: the sea floor.
-            current: the water.
-            disturbance: the gusts.
+            setup: of the mission.
             rng: source of all noise.
             sea_rng: source of the gusts; `rng` if not given.
-            start_ne_m: where the body's origin is.
-            start_heading_rad: where it heads.
-            health: as of `Vehicle.health_of`.
 
         Raises:
             VehicleError: a thruster that is named is not one of the vehicle's.
         """
-        self.vehicle, self.sensors, self.floor = vehicle, sensors, floor
-        self.rng, self.sea_rng = rng, sea_rng or rng
+        self.vehicle, self.rng, self.sea_rng = setup.vehicle, rng, sea_rng or rng
         self.tick = 0
-        self.weaken(health or {})
-        decay = math.exp(-TICK_S / max(disturbance.correlation_s, 1e-9))
-        self.sea = Sea(current, np.array(disturbance.sigma), decay)
-        attitude = np.array([0.0, 0.0, start_heading_rad])
-        self.world = World(
-            initial_state(np.array([*start_ne_m, 0.0]), attitude, vehicle.actuators),
+        gusts, actuators = setup.disturbance, self.vehicle.actuators
+        decay = math.exp(-TICK_S / max(gusts.correlation_s, 1e-9))
+        attitude = np.array([0.0, 0.0, setup.start_heading_rad])
+        world = World(
+            initial_state(np.array([*setup.start_ne_m, 0.0]), attitude, actuators),
             *(np.zeros(size) for size in (13, 13, 6, 6, 6, vector.ESTIMATE)),
         )
-        _write_truth(self.world, current, 0.0)
-        self.world.before[:] = self.world.now
-        self.navigation = new_navigation(sensors, self.world.now, rng)
-        self.scratch = scratch_for(vehicle.actuators)
+        _write_truth(world, setup.current, 0.0)
+        world.before[:] = world.now
+        self.parts = VehicleParts(
+            self.vehicle.plant, Sea(setup.current, np.array(gusts.sigma), decay), setup.floor,
+            setup.sensors, new_navigation(setup.sensors, world.now, rng), world,
+            scratch_for(actuators),
+        )  # fmt: skip
+        """For compiled code."""
+        self.world = world
+        self.weaken(setup.health)
 
     def weaken(self, left: Mapping[str, float], pushing: Mapping[str, float] | None = None) -> None:
         """Leave thrusters a share of their speed squared, or of their thrust at all speeds.
@@ -235,33 +214,21 @@ class SimulatedVehicle:
         sound = self.vehicle.plant
         slower = with_health(sound.propulsion, self.vehicle.health_of(left))
         propulsion = without_thrust(slower, self.vehicle.health_of(pushing or {}))
-        self.plant = sound._replace(propulsion=propulsion)
+        self.parts = self.parts._replace(plant=sound._replace(propulsion=propulsion))
 
     def sense(self) -> Array:
         """Measure at this tick; the navigation's estimate, as `estimate_vector` has it."""
-        sense(
-            self.tick, self.sea, self.floor, self.sensors, self.navigation, self.world, self.rng
-        )  # fmt: skip
+        sense(self.tick, self.parts, self.rng)
         return self.world.estimate
-
-    @property
-    def parts(self) -> VehicleParts:
-        """For compiled code."""
-        return VehicleParts(
-            self.plant, self.sea, self.floor, self.sensors, self.navigation, self.world,
-            self.scratch,
-        )  # fmt: skip
 
     @property
     def touches_floor(self) -> bool:
         """Whether hull, DVL or port is on the sea floor, or in it."""
-        return bool(touches(self.world.now, self.sensors, self.floor))
+        return bool(touches(self.parts))
 
     def move(self, command: Array) -> None:
         """Advance to the next tick under commands (n + m,): speeds in rev/s, angles in rad."""
-        move(
-            self.tick, self.plant, self.sea, command, self.world, self.scratch, self.sea_rng
-        )  # fmt: skip
+        move(self.tick, self.parts, command, self.sea_rng)
         self.tick += 1
 
 
@@ -290,28 +257,28 @@ def _record(values: Array, row: Array) -> None:
 @kernel
 def _fly_ticks(
     first: int,
-    vehicle: VehicleParts,
-    piloting: PilotParts,
+    parts: VehicleParts,
+    steered: Tick,
+    mission: PilotMission,
+    wrench: Array,
+    allocation: Allocation,
     rng: np.random.Generator,
     sea_rng: np.random.Generator,
     rows: TickRows,
 ) -> int:
     """Fly ticks until the rows are full or the mission is over; return their number."""
-    plant, sea, floor, sensors, navigation, world, scratch = vehicle
-    path, mission, guidance, gains, pilot, wrench, allocation = piloting
+    world, navigation, pilot = parts.world, parts.navigation, steered.pilot
     count, flown = rows.state.shape[0], 0
     for k in range(count):
         tick = first + k
-        sense(tick, sea, floor, sensors, navigation, world, rng)
+        sense(tick, parts, rng)
         spread = max(navigation.covariance[0, 0], navigation.covariance[1, 1])
         pilot.memory[slot.SIGMA_M] = math.sqrt(max(spread, 0.0))
-        steer(
-            tick * TICK_S, TICK_S, world.estimate, path, mission, guidance, gains, pilot, wrench
-        )  # fmt: skip
-        touched = touches(world.now, sensors, floor)
+        steer(tick * TICK_S, steered, mission, wrench)
+        touched = touches(parts)
         if touched:
             pilot.report[slot.PHASE], pilot.report[slot.REASON] = slot.ABORT, TOUCHED
-        allocate(wrench, world.estimate, allocation)
+        allocate(wrench, world.estimate[vector.U :], allocation)
 
         _record(world.state, rows.state[k])
         _record(world.now, rows.truth[k])
@@ -319,57 +286,15 @@ def _fly_ticks(
         _record(pilot.report, rows.report[k])
         _record(allocation.command, rows.command_rps[k])
         electrical_power(
-            plant.propulsion, world.state[STATE:], world.state[7:STATE], rows.power_w[k]
+            parts.plant.propulsion, world.state[STATE:], world.state[7:STATE], rows.power_w[k]
         )
         log_row(navigation, rows.navigation[k])
         flown += 1
         if touched or pilot.report[slot.PHASE] == slot.DONE or pilot.report[slot.AT_SURFACE] == 1.0:
             break
 
-        move(tick, plant, sea, allocation.command, world, scratch, sea_rng)
+        move(tick, parts, allocation.command, sea_rng)
     return flown
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Setup:
-    """All inputs of a mission except random numbers."""
-
-    vehicle: Vehicle
-    path: Path
-    guidance: Guidance
-    gains: Gains
-    sensors: Sensors
-    floor: FloorGrid
-    current: Current
-    disturbance: Disturbance
-    mission: PilotMission = NO_MISSION
-    """What is flown instead of the path, by the law of another vehicle's software."""
-    exact_allocation: bool = True
-    health: Mapping[str, float] = field(default_factory=dict)
-    """Share of its greatest speed squared left in a thruster: 0 failed; intact if not named."""
-    known_health: Mapping[str, float] | None = None
-    """The same as the allocation assumes it; the true one if not given."""
-    believed: Vehicle | None = None
-    """Vehicle that the allocation assumes, with as many thrusters; the vehicle itself if not
-    given."""
-    start_ne_m: tuple[float, float] = (0.0, 0.0)
-    start_heading_rad: float = 0.0
-    failures: tuple["Failure", ...] = ()
-    """Thrusters that fail on the way."""
-    without: Without | None = None
-    """How to go on once failures are found; not looked for if None."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Failure:
-    """A thruster that fails on the way."""
-
-    time_s: float
-    thruster: str
-    left: float
-    """Share of its greatest speed squared that is left; of its thrust if it turns."""
-    turns: bool = False
-    """Whether it goes on turning as commanded, with the propeller gone or fouled."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -469,36 +394,25 @@ def _chunks(
 ) -> Iterator[TickRows]:
     """Rows of a minute each at most, until the mission is over; adds failures that are found."""
     left, pushing = dict(setup.health), dict[str, float]()
+    simulated = SimulatedVehicle(setup, rng, sea_rng)
     known = setup.health if setup.known_health is None else setup.known_health
-    simulated = SimulatedVehicle(
-        setup.vehicle, setup.sensors, setup.floor, setup.current, setup.disturbance, rng,
-        sea_rng=sea_rng, start_ne_m=setup.start_ne_m, start_heading_rad=setup.start_heading_rad,
-        health=left,
-    )  # fmt: skip
-    pilot = Pilot(
-        setup.vehicle, setup.path, setup.gains, setup.guidance,
-        exact_allocation=setup.exact_allocation, believed=setup.believed, known_health=known,
-        without=setup.without, tick_s=TICK_S,
-    )  # fmt: skip
+    pilot = Pilot(replace(setup, known_health=known), TICK_S)
     thrusters, last, first = len(setup.vehicle.thrusters), math.ceil(max_s / TICK_S), 0
     maximum = _CHUNK_TICKS if setup.without is None else _WATCHED_TICKS
+    widths = (STATE + setup.vehicle.actuators, STATE, LOG_ROW, slot.REPORT, 6, thrusters, thrusters)
     waiting = sorted(setup.failures, key=lambda failure: failure.time_s)
     while first < last:
         while waiting and round(waiting[0].time_s / TICK_S) <= first:
-            (pushing if waiting[0].turns else left)[waiting[0].thruster] = waiting[0].left
+            failure = waiting.pop(0)
+            (pushing if failure.turns else left)[failure.thruster] = failure.left
             simulated.weaken(left, pushing)
-            del waiting[0]
         end = min(first + maximum, last)
         if waiting:
             end = min(end, round(waiting[0].time_s / TICK_S))
-        rows = _new_rows(end - first, thrusters, setup.vehicle.actuators)
+        rows = TickRows(*(np.zeros((end - first, width)) for width in widths))
         flown = _fly_ticks(
-            first, simulated.parts,
-            PilotParts(
-                pilot.path, setup.mission, pilot.guidance, pilot.gains, pilot.state, pilot.wrench,
-                pilot.allocation,
-            ),
-            rng, sea_rng, rows,
+            first, simulated.parts, pilot.tick(TICK_S, simulated.world.estimate), setup.mission,
+            pilot.wrench, pilot.allocation, rng, sea_rng, rows,
         )  # fmt: skip
         yield TickRows(*(part[:flown] for part in rows))
         if flown < len(rows.state) or pilot.state.report[slot.REASON] == TOUCHED:
@@ -508,10 +422,5 @@ def _chunks(
             first * TICK_S,
             rows.command_rps,
             rows.state[:, STATE : STATE + thrusters],
-            navigated_stretch(rows.navigation, simulated.navigation),
+            navigated_stretch(rows.navigation, simulated.parts.navigation),
         )
-
-
-def _new_rows(count: int, thrusters: int, actuators: int) -> TickRows:
-    widths = (STATE + actuators, STATE, LOG_ROW, slot.REPORT, 6, thrusters, thrusters)
-    return TickRows(*(np.zeros((count, width)) for width in widths))

@@ -15,7 +15,6 @@ the laws of `dynamics` and `fins`). Roll is left to the low centre of gravity.
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 
@@ -24,21 +23,13 @@ from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.allocation import (
     AXIS_WEIGHTS,
-    AllocationScratch,
-    allocate_exact,
-    allocation_scratch,
-    preference_weights,
+    Allocation,
+    allocate,
+    new_allocation,
 )
 from alice_survey.sim.vehicle.dynamics import Body, add_coriolis, add_damping, add_weight
 from alice_survey.sim.vehicle.fins import MAX_RAD, add_fins, write_fin_matrix
-from alice_survey.sim.vehicle.propulsion import (
-    MAX_RPS,
-    Propulsion,
-    add_thrust,
-    electrical_power,
-    speeds_for,
-    thrust_limits,
-)
+from alice_survey.sim.vehicle.propulsion import MAX_RPS, add_thrust, electrical_power
 from alice_survey.sim.vehicle.vehicle import Vehicle
 
 MAX_DRIFT_RAD = math.radians(10.0)
@@ -219,17 +210,6 @@ class SteadyFlight:
     limit."""
 
 
-class _Room(NamedTuple):
-    """Work arrays for one velocity."""
-
-    lower: Array
-    upper: Array
-    weights: Array
-    thrust: Array
-    target: Array
-    allocation: AllocationScratch
-
-
 def steady_flight(
     vehicle: Vehicle,
     nu: Array,
@@ -266,12 +246,9 @@ def steady_flight(
             requested += nu_rate @ body.mass
         axes = AXIS_WEIGHTS * np.any(np.abs(matrix) > 1e-12, axis=1)
     n = len(vehicle.thrusters)
-    room = _Room(
-        lower=np.zeros(n), upper=np.zeros(n), weights=np.zeros(n), thrust=np.zeros(n),
-        target=np.zeros(6), allocation=allocation_scratch(n),
-    )  # fmt: skip
+    allocation = new_allocation(vehicle, np.full(n, share), exact=True, axes=axes)
     rps, power_w, made = np.zeros((len(nu), n)), np.zeros((len(nu), n)), np.zeros((len(nu), 6))
-    _keep(propulsion, matrix, axes, np.full(n, share), requested, nu, room, made, rps, power_w)
+    _keep(allocation, requested, nu, np.zeros(6), made, rps, power_w)
     balanced = np.flatnonzero(axes) if slips or vehicle.fins else list(BALANCED)
     off = np.abs(requested - made)[:, balanced].max(axis=1)
     lost = ~(off <= 1e3 * _TOLERANCE_N)
@@ -313,13 +290,10 @@ def drag_power(body: Body, nu: Array) -> Array:
 
 @kernel
 def _keep(
-    propulsion: Propulsion,
-    matrix: Array,
-    axes: Array,
-    share: Array,
+    allocation: Allocation,
     requested: Array,
     nu: Array,
-    room: _Room,
+    target: Array,
     made: Array,
     rps: Array,
     power_w: Array,
@@ -330,44 +304,35 @@ def _keep(
     allocation cannot be met is left with what it makes.
 
     Args:
-        propulsion: n thrusters.
-        matrix: (6, n) wrench per thrust.
-        axes: (6,) weights of the axes, 0 of one that no thruster has.
-        share: (n,) of each thruster's greatest speed squared.
+        allocation: to n thrusters.
         requested: (N, 6)
         nu: (N, 6)
-        room: work arrays for one velocity.
+        target: (6,) room.
         made: (N, 6) wrench, is written.
         rps: (N, n) is written.
         power_w: (N, n) is written.
     """
-    n = matrix.shape[1]
+    propulsion, matrix, axes = allocation.propulsion, allocation.matrix, allocation.axes
     for k in range(nu.shape[0]):
-        thrust_limits(propulsion, share, nu[k], room.lower, room.upper)
-        preference_weights(propulsion, nu[k, 0], room.weights)
         for axis in range(6):
-            room.target[axis] = requested[k, axis]
+            target[axis] = requested[k, axis]
         for _ in range(_ROUNDS):
-            allocate_exact(
-                matrix, room.target, room.lower, room.upper, axes, room.weights, room.thrust,
-                room.allocation,
-            )  # fmt: skip
-            speeds_for(propulsion, room.thrust, nu[k], rps[k])
-            for axis in range(6):
-                made[k, axis] = 0.0
+            allocate(target, nu[k], allocation)
+            for i in range(rps.shape[1]):
+                rps[k, i] = allocation.command[i]
+            made[k, :] = 0.0
             add_thrust(propulsion, rps[k], nu[k], made[k])
-            worst = 0.0
-            beyond = False
+            worst, beyond = 0.0, False
             for axis in range(6):
                 if axes[axis] > 0.0:
                     allocated = 0.0
-                    for i in range(n):
-                        allocated += matrix[axis, i] * room.thrust[i]
-                    slack = _TOLERANCE_N * (1.0 + abs(room.target[axis]))
-                    beyond = beyond or abs(allocated - room.target[axis]) > slack
+                    for i in range(rps.shape[1]):
+                        allocated += matrix[axis, i] * allocation.thrust[i]
+                    slack = _TOLERANCE_N * (1.0 + abs(target[axis]))
+                    beyond = beyond or abs(allocated - target[axis]) > slack
                     residual = requested[k, axis] - made[k, axis]
                     worst = max(worst, abs(residual))
-                    room.target[axis] += residual
+                    target[axis] += residual
             if beyond or worst <= _TOLERANCE_N:
                 break
         electrical_power(propulsion, rps[k], nu[k], power_w[k])

@@ -16,9 +16,8 @@ from scipy.spatial.transform import Rotation
 from alice_survey.core.artefacts import write_csv
 from alice_survey.core.config import SurveyConfig, load_config
 from alice_survey.core.frames import Array, Datum, attitude_from_rotation
-from alice_survey.sim.vehicle.allocation import AXIS_WEIGHTS
+from alice_survey.sim.vehicle.allocation import AXIS_WEIGHTS, allocate, new_allocation
 from alice_survey.sim.vehicle.navigation.sensors import DVL
-from alice_survey.sim.vehicle.pilot.command import allocate, new_allocation
 from alice_survey.sim.vehicle.pilot.gains import (
     HEAVE,
     MASS,
@@ -66,7 +65,7 @@ class InnerLoops:
         wrench = np.array([asked[0], asked[1], asked[2], 0.0, 0.0, asked[3]])
         estimate = np.zeros(14)
         estimate[6:9], estimate[9:12] = body.apply(truth[7:10]), truth[10:13]
-        allocate(wrench, estimate, self.allocation)
+        allocate(wrench, estimate[6:], self.allocation)
         return self.allocation.command.copy()
 
 
@@ -130,10 +129,10 @@ def send(link: object, vehicle: SimulatedVehicle, stamp_ms: int, shift: Array) -
     roll, pitch, heading = attitude_from_rotation(turn)
     mav.heartbeat_send(SUBMARINE, ARDUPILOT, 1 | ARMED, GUIDED, 4)
     mav.attitude_send(stamp_ms, roll, pitch, heading, *truth[10:13])
-    place = vehicle.sensors.place[DVL]
+    place = vehicle.parts.sensors.place[DVL]
     north, east, depth = truth[:3] + turn.apply(place)
     x, y, z = turn.apply([0.0, 0.0, 1.0])
-    reach = floor_range(vehicle.floor, north, east, depth, x, y, z, 75.0)
+    reach = floor_range(vehicle.parts.floor, north, east, depth, x, y, z, 75.0)
     mav.rangefinder_send(reach if math.isfinite(reach) else 0.0, 0.0)
     mav.local_position_ned_send(stamp_ms, *(truth[:3] - shift), *truth[7:10])
 

@@ -10,8 +10,7 @@ from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.sea import level_floor
 from alice_survey.sim.vehicle.simulator import SimulatedVehicle
 from missions.fly.simulation import flight_settings, mission_setup
-from missions.live.loop import LinkLimits, Odometry
-from missions.live.mission import LiveMission, mission_of
+from missions.live.mission import LinkLimits, LiveMission, Odometry, mission_of
 from missions.values.plan_file import Plan
 from tests.missions.flown_plans import Move, plan_of, walk
 
@@ -36,10 +35,7 @@ def vehicle_afloat(plan: Plan, survey: SurveyConfig, seed: int = 1) -> Simulated
     """The vehicle at the start of a plan."""
     rng = np.random.default_rng(seed)
     setup = mission_setup(plan, flight_settings(survey), level_floor(FLOOR_M), 1000.0, rng)
-    return SimulatedVehicle(
-        setup.vehicle, setup.sensors, setup.floor, setup.current, setup.disturbance, rng,
-        start_ne_m=setup.start_ne_m, start_heading_rad=setup.start_heading_rad,
-    )  # fmt: skip
+    return SimulatedVehicle(setup, rng)
 
 
 class LoopFlight:

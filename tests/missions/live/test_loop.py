@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from alice_survey.core.config import SurveyConfig
-from missions.live.loop import LinkState
+from missions.live.mission import LinkState
 from missions.values.flight import trigger_times
 from tests.missions.flown_plans import flown
 from tests.missions.live.flights import FLOOR_M, LoopFlight, small_plan

@@ -15,9 +15,8 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from alice_survey.core.artefacts import read_csv
 from alice_survey.core.config import SurveyConfig
 from missions.fly.simulation import flight_settings
-from missions.live.loop import LinkLimits, LinkState
 from missions.live.mavlink_pilot import GUIDED, SURFACE, MavlinkPilot
-from missions.live.mission import mission_of
+from missions.live.mission import LinkLimits, LinkState, mission_of
 from missions.values.flight import trigger_times
 from tests.missions.live.flights import FLOOR_M, small_plan
 

@@ -24,11 +24,10 @@ from alice_survey.sim.vehicle.sea import floor_depth
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import Stations, plan_pattern, stations_of_flight
-from missions.fly.run import flight_noise, true_floor
-from missions.fly.simulation import flight_settings, simulate_plan
-from missions.live import ros_messages
-from missions.live.loop import Odometry
-from missions.live.ros_vehicle import START_S, VehicleNode
+from missions.fly.simulation import flight_noise, flight_settings, simulate_plan, true_floor
+from missions.live import ros as ros_messages
+from missions.live.mission import Odometry
+from missions.live.ros import START_S, VehicleNode
 from missions.logs.ros_builder import JOINTS, ODOMETRY, WRENCH
 from missions.values.flight import trigger_times
 from tests.missions.live.flights import FLOOR_M, small_plan, vehicle_afloat
@@ -222,8 +221,9 @@ def test_dive_of_two_processes_covers_what_the_closed_loop_does(workspace: Path)
     assert "its commander left" in said
 
     survey, plan = load_config(workspace / "survey.toml"), small_plan()
-    floor = true_floor(plan, survey)
-    closed = simulate_plan(plan, flight_settings(survey), floor, flight_noise(survey.seed))
+    settings = flight_settings(survey)
+    floor = true_floor(plan, settings)
+    closed = simulate_plan(plan, settings, floor, flight_noise(survey.seed))
     rig = design_rig(survey.camera, survey.water)
     glass_body = survey.camera.position_body_m
 

@@ -1,4 +1,4 @@
-"""The command `vehicle identify`: from logs to coefficients, a report and a picture.
+"""The command `vehicle identify`: from logs to coefficients, a table and a picture.
 
 Without logs to fit, `--validate` alone runs a log through the vehicle as it is known, open loop.
 
@@ -10,6 +10,7 @@ perfect, 0 no better than the mean. Simulations start from what is measured in t
 see only the inputs from there on; next to them the velocity of that row is kept.
 """
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -56,6 +57,7 @@ from alice_survey.sim.vehicle.identification.sensitivity import (
 )
 from alice_survey.sim.vehicle.identification.two_step import (
     ThrustCoefficient,
+    TwoStep,
     calibrate,
     fit_pulls,
     read_pulls,
@@ -194,8 +196,6 @@ _VALIDATION_WINDOW_S = 10.0
 _HIGH_CORRELATION = 0.9
 _POOR = 0.25
 """Relative sigma of a coefficient that the logs hardly determine."""
-_AS_GOOD = 1.0
-"""Points of fit by which two predictions may differ and be equally good."""
 _MAX_POINTS = 8000
 
 
@@ -224,41 +224,10 @@ class IdentifyOptions:
     """How far the vehicle may be from where the joint fit starts; anywhere if None."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Identified:
-    """Parameters by either method."""
-
-    parameters: Parameters
-    values: Array
-    sigma: Array
-    fit: OutputErrorFit | None
-    """None of the two-step calibration."""
-    steps: tuple[str, ...]
-    """Step in which each was calibrated; none of the joint fit."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Validation:
-    """A log predicted by the identified vehicle, and by the one that the fit began with."""
-
-    found: MotionValidation
-    started: MotionValidation | None = None
-    current_ne: Array | None = None
-    """(2,) current of that log, where it was fitted to it."""
-
-    @property
-    def worse(self) -> list[str]:
-        """Motions that the start predicts better."""
-        if self.started is None:
-            return []
-        gain = self.found.fit_percent - self.started.fit_percent
-        return [name for name, g in zip(CHANNEL_NAMES[:6], gain, strict=True) if g < -_AS_GOOD]
-
-
 def identify_report(
     logs: Sequence[Path], out: Path, options: IdentifyOptions
 ) -> tuple[str, dict[str, Any]]:
-    """Identify a vehicle from logs; write coefficients.json, report.txt and fit.png into a folder.
+    """Identify a vehicle from logs; write coefficients.json and fit.png into a folder.
 
     Without logs the vehicle is as it is known, and a log to validate is predicted by it.
 
@@ -286,19 +255,30 @@ def identify_report(
             f"the logs give speeds, but {options.vehicle} does not say what they mean of "
             f"{'; '.join(missing)}"
         )
-    how = Simulation()
-    result = _identify(windows, used, how, options)
-    validation = _validation(shorter, result, how) if shorter else None
-    own = validate(windows, result.parameters, result.values, simulation=how) if windows else None
-    data = _data(vehicle, logs, result, thrust, own, validation)
-    text = _text(data, result, validation)
+    found = _identify(windows, used, options)
+    parameters, values, shown = found.parameters, found.values, None
+    data: dict[str, Any] = {
+        "vehicle": vehicle.name,
+        "logs": [path.name for path in logs],
+        "method": options.method,
+        "identified": {name: _row(found, k) for k, name in enumerate(parameters.names)},
+        "others": parameters.others(values),
+        "thrust": [
+            {**asdict(one), "sigma": _or_none(one.sigma), "factor": one.factor} for one in thrust
+        ],
+        **({} if isinstance(found, TwoStep) else _fit_data(found)),
+    }
+    if windows:
+        shown = validate(windows, parameters, values)
+        data["same_logs"] = _fits_of(shown)
+    if shorter:
+        shown, data["validation"] = _validation(shorter, parameters, values)
+    text = _text(data)
     try:
         out.mkdir(parents=True, exist_ok=True)
         if logs:
-            identified = result.parameters.coefficients(result.values, "identified")
+            identified = parameters.coefficients(values, "identified")
             write_coefficients(out / "coefficients.json", identified, data)
-        (out / "report.txt").write_text(text + "\n", encoding="utf-8")
-        shown = validation.found if validation is not None else own
         if shown is not None:
             draw_motion(out / "fit.png", f"{vehicle.name}: {shown.source}", shown)
     except OSError as error:
@@ -332,22 +312,17 @@ def _windows(
 
 
 def _identify(
-    windows: Sequence[Window], vehicle: Vehicle, how: Simulation, options: IdentifyOptions
-) -> _Identified:
-    held, nothing = _held_values(options.held), np.zeros(0)
+    windows: Sequence[Window], vehicle: Vehicle, options: IdentifyOptions
+) -> OutputErrorFit | TwoStep:
+    held = _held_values(options.held)
     if not windows:
         known = free_parameters(vehicle, (), _others_of(options.coefficients) | held)
-        return _Identified(parameters=known, values=nothing, sigma=nothing, fit=None, steps=())
+        return TwoStep(parameters=known, values=np.zeros(0), sigma=np.zeros(0), step=())
     free = options.free or (JOINT_FREE if options.method == "joint" else TWO_STEP_FREE)
     parameters = free_parameters(vehicle, free, held)
     if options.method == "two-step":
-        found = calibrate(windows, parameters)
-        return _Identified(
-            parameters=parameters, values=found.values, sigma=found.sigma, fit=None,
-            steps=found.step,
-        )  # fmt: skip
-    fit = fit_output_error(windows, parameters, simulation=how, prior=options.prior)
-    return _Identified(parameters=parameters, values=fit.values, sigma=fit.sigma, fit=fit, steps=())
+        return calibrate(windows, parameters)
+    return fit_output_error(windows, parameters, prior=options.prior)
 
 
 def _held_values(pairs: Sequence[str]) -> dict[str, float]:
@@ -371,21 +346,27 @@ def _others_of(coefficients: str | None) -> dict[str, float]:
     return {name: value for name, value in found.items() if name not in CURRENTS}
 
 
-def _validation(windows: Sequence[Window], result: _Identified, how: Simulation) -> _Validation:
-    values, current_ne = _with_its_current(windows, result.parameters, result.values, how)
-    found = validate(windows, result.parameters, values, simulation=how)
-    if not len(values):
-        return _Validation(found=found)
-    try:
-        start, _ = _with_its_current(windows, result.parameters, result.parameters.start, how)
-        started = validate(windows, result.parameters, start, simulation=how)
-    except VehicleError:  # the motions of the start may not last
-        started = None
-    return _Validation(found=found, started=started, current_ne=current_ne)
+def _validation(
+    windows: Sequence[Window], parameters: Parameters, values: Array
+) -> tuple[MotionValidation, dict[str, Any]]:
+    """A log predicted by the identified vehicle, next to the one that the fit began with."""
+    found, current_ne = _with_its_current(windows, parameters, values)
+    shown, started = validate(windows, parameters, found), None
+    if len(values):
+        try:
+            start, _ = _with_its_current(windows, parameters, parameters.start)
+            started = _motions(validate(windows, parameters, start).fit_percent)
+        except VehicleError:  # the motions of the start may not last
+            started = None
+    return shown, {
+        **_fits_of(shown),
+        "start_fit_percent": started,
+        "current_ne_mps": None if current_ne is None else current_ne.tolist(),
+    }
 
 
 def _with_its_current(
-    windows: Sequence[Window], parameters: Parameters, found: Array, how: Simulation
+    windows: Sequence[Window], parameters: Parameters, found: Array
 ) -> tuple[Array, Array | None]:
     """Values for another log: coefficients are the vehicle's, a current is the day's.
 
@@ -400,73 +381,98 @@ def _with_its_current(
         name: value for name, value in parameters.others(found).items() if name not in CURRENTS
     }
     identified = parameters.vehicle.with_coefficients(parameters.coefficients(found, "identified"))
-    drift = fit_output_error(
-        windows, free_parameters(identified, CURRENTS, others), simulation=how
-    ).values
+    drift = fit_output_error(windows, free_parameters(identified, CURRENTS, others)).values
     values = found.copy()
-    for name, value in zip(CURRENTS, drift, strict=True):
-        values[parameters.names.index(name)] = value
+    values[[parameters.names.index(name) for name in CURRENTS]] = drift
     return values, drift
+
+
+def _row(found: OutputErrorFit | TwoStep, k: int) -> dict[str, Any]:
+    """A parameter as JSON values, with what limits it; unknown ones are null."""
+    name, start = found.parameters.names[k], float(found.parameters.start[k])
+    value, sigma = float(found.values[k]), float(found.sigma[k])
+    remarks = [] if isinstance(found, OutputErrorFit) else [found.step[k]]
+    if name not in OTHERS and math.isfinite(sigma) and sigma > _POOR * abs(value):
+        remarks.append(f"sigma over {_POOR:.0%}")
+    if isinstance(found, OutputErrorFit):
+        prior = found.prior_covariance[k, k]
+        remarks += ["at a bound"] if found.at_bound[k] else []
+        remarks += ["held by the prior"] if 2.0 * prior > found.covariance[k, k] else []
+    return {
+        "start": start,
+        "identified": value,
+        "sigma": _or_none(sigma),
+        "factor": None if name in OTHERS or start == 0.0 else value / start,
+        "unit": unit_of(name),
+        "remark": ", ".join(remarks),
+    }
+
+
+def _fit_data(fit: OutputErrorFit) -> dict[str, Any]:
+    """What the joint fit knows besides: pairs that the logs hardly separate, noise, prior."""
+    names, matrix = fit.parameters.names, fit.correlation
+    pairs = [
+        {"of": [names[i], names[j]], "correlation": float(matrix[i, j])}
+        for i, j in itertools.combinations(range(len(names)), 2)
+        if math.isfinite(matrix[i, j]) and abs(matrix[i, j]) > _HIGH_CORRELATION
+    ]
+    sigma = map(_or_none, fit.channel_sigma)
+    return {
+        "high_correlations": sorted(pairs, key=lambda pair: -abs(pair["correlation"])),
+        "residual_sigma": dict(zip(CHANNEL_NAMES, sigma, strict=True)),
+        "prior": None if fit.prior is None else asdict(fit.prior),
+        "covariance": fit.covariance.tolist(),
+    }
+
+
+def _or_none(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _motions(values: Array) -> dict[str, float | None]:
+    return dict(zip(CHANNEL_NAMES[:6], map(_or_none, values), strict=True))
+
+
+def _fits_of(found: MotionValidation) -> dict[str, Any]:
+    return {
+        "source": found.source,
+        "window_s": found.window_s,
+        "fit_percent": _motions(found.fit_percent),
+        "constant_fit_percent": _motions(found.constant_fit_percent),
+    }
 
 
 def _cell(value: float | None, style: str) -> str:
     return "-" if value is None or not math.isfinite(value) else f"{value:{style}}"
 
 
-def _text(data: Mapping[str, Any], result: _Identified, validation: _Validation | None) -> str:
-    """The report: one table, and a line for each fit."""
-    found = {
+def _text(data: Mapping[str, Any]) -> str:
+    """The report: one table, and a line for each log's fit."""
+    thrust = {
         f"k_t {'+'.join(one['thrusters'])} {one['way']}": {
             **one, "start": one["model"], "unit": "", "remark": f"{one['readings']} readings"
         }
         for one in data["thrust"]
     }  # fmt: skip
-    for k, (name, one) in enumerate(data["identified"].items()):
-        found[name] = {**one, "remark": _remark(result, k)}
     styles = {"start": ".5g", "identified": ".5g", "sigma": ".2g", "factor": ".3g"}
     rows = [
-        (
-            name,
-            *(_cell(one[key], style) for key, style in styles.items()),
-            one["unit"],
-            one["remark"],
-        )
-        for name, one in found.items()
+        (name, *(_cell(one[key], styles[key]) for key in styles), one["unit"], one["remark"])
+        for name, one in (thrust | data["identified"]).items()
     ]
-    lines = [
-        f"{data['vehicle']}, {data['method']}, fitted to {', '.join(data['logs']) or 'no log'}"
-    ]
+    logs = ", ".join(data["logs"]) or "no log"
+    lines = [f"{data['vehicle']}, {data['method']}, fitted to {logs}"]
     if rows:
         lines.append(text_table(("coefficient", *styles, "unit", ""), rows))
     lines += [
         f"correlated {one['correlation']:+.3f}: {' and '.join(one['of'])}"
         for one in data.get("high_correlations", ())
     ]
-    if result.fit is not None and result.fit.prior is not None:
-        lines.append(f"prior about the start, relative sigmas: {result.fit.prior}")
     lines += [_fit_line(data[key]) for key in ("same_logs", "validation") if key in data]
-    if validation is not None and validation.worse:
-        lines.append(
-            f"Worse than the values that the fit began with in {', '.join(validation.worse)}: "
-            "free fewer coefficients, or log manoeuvres that excite these motions"
-        )
-    if validation is not None and validation.current_ne is not None:
-        north, east = validation.current_ne
+    current_ne = data.get("validation", {}).get("current_ne_mps")
+    if current_ne is not None:
+        north, east = current_ne
         lines.append(f"current of that log: {north:.3f} m/s north, {east:.3f} m/s east")
     return "\n".join(lines)
-
-
-def _remark(result: _Identified, k: int) -> str:
-    """What limits a parameter; of the two-step calibration the step as well."""
-    name, fit = result.parameters.names[k], result.fit
-    remarks = [result.steps[k]] if result.steps else []
-    if name in poorly_determined(result.parameters.names, result.values, result.sigma):
-        remarks.append(f"sigma over {_POOR:.0%}")
-    if fit is not None and fit.at_bound[k]:
-        remarks.append("at a bound")
-    if fit is not None and name in held_by_prior(fit):
-        remarks.append("held by the prior")
-    return ", ".join(remarks)
 
 
 def _fit_line(found: Mapping[str, Any]) -> str:
@@ -478,105 +484,6 @@ def _fit_line(found: Mapping[str, Any]) -> str:
         if found.get(key) is not None
     )
     return f"fit of {found['source']} by {found['window_s']:.4g} s, % of u/v/w/p/q/r: {fits}"
-
-
-def held_by_prior(fit: OutputErrorFit) -> list[str]:
-    """Parameters whose variance comes of the start's error for more than a half."""
-    logs, prior = np.diag(fit.covariance - fit.prior_covariance), np.diag(fit.prior_covariance)
-    return [name for name, more in zip(fit.parameters.names, prior > logs, strict=True) if more]
-
-
-def poorly_determined(names: Sequence[str], values: Array, sigma: Array) -> list[str]:
-    """Coefficients whose sigma is a large part of their value."""
-    return [
-        name
-        for name, value, s in zip(names, values, sigma, strict=True)
-        if name not in OTHERS and math.isfinite(s) and s > _POOR * abs(value)
-    ]
-
-
-def high_correlations(fit: OutputErrorFit) -> list[tuple[str, str, float]]:
-    """Pairs of parameters that the logs hardly separate, the closest first."""
-    names, matrix = fit.parameters.names, fit.correlation
-    pairs = [
-        (names[i], names[j], float(matrix[i, j]))
-        for i in range(len(names))
-        for j in range(i)
-        if math.isfinite(matrix[i, j]) and abs(matrix[i, j]) > _HIGH_CORRELATION
-    ]
-    return sorted(pairs, key=lambda pair: -abs(pair[2]))
-
-
-def _data(
-    vehicle: Vehicle,
-    logs: Sequence[Path],
-    result: _Identified,
-    thrust: Sequence[ThrustCoefficient],
-    own: MotionValidation | None,
-    validation: _Validation | None,
-) -> dict[str, Any]:
-    """The same as JSON values; unknown ones are null."""
-    names, fit, start = result.parameters.names, result.fit, result.parameters.start
-    data: dict[str, Any] = {
-        "vehicle": vehicle.name,
-        "logs": [path.name for path in logs],
-        "method": "joint" if fit is not None or not names else "two-step",
-        "identified": {
-            name: {
-                "start": float(start[k]),
-                "identified": float(result.values[k]),
-                "sigma": _or_none(result.sigma[k]),
-                "factor": None
-                if name in OTHERS or start[k] == 0.0
-                else float(result.values[k] / start[k]),
-                "unit": unit_of(name),
-            }
-            for k, name in enumerate(names)
-        },
-        "others": result.parameters.others(result.values),
-        "poorly_determined": poorly_determined(names, result.values, result.sigma),
-        "thrust": [
-            {**asdict(one), "sigma": _or_none(one.sigma), "factor": one.factor} for one in thrust
-        ],
-    }
-    if own is not None:
-        data["same_logs"] = _fit_data(own)
-    if fit is not None:
-        data["high_correlations"] = [
-            {"of": [a, b], "correlation": value} for a, b, value in high_correlations(fit)
-        ]
-        data["residual_sigma"] = {
-            name: _or_none(value)
-            for name, value in zip(CHANNEL_NAMES, fit.channel_sigma, strict=True)
-        }
-        data["prior"] = None if fit.prior is None else asdict(fit.prior)
-        data["held_by_prior"] = held_by_prior(fit)
-        data["covariance"] = fit.covariance.tolist()
-    if validation is not None:
-        started = validation.started
-        data["validation"] = {
-            **_fit_data(validation.found),
-            "start_fit_percent": None if started is None else _motions(started.fit_percent),
-            "worse_than_start": validation.worse,
-        }
-    return data
-
-
-def _or_none(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
-
-
-def _motions(values: Array) -> dict[str, float | None]:
-    return {name: _or_none(value) for name, value in zip(CHANNEL_NAMES[:6], values, strict=True)}
-
-
-def _fit_data(found: MotionValidation) -> dict[str, Any]:
-    return {
-        "source": found.source,
-        "window_s": found.window_s,
-        "fit_percent": _motions(found.fit_percent),
-        "constant_fit_percent": _motions(found.constant_fit_percent),
-    }
 
 
 @figure_style()

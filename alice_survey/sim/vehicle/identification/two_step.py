@@ -199,6 +199,7 @@ _PASSES, _AGREED = 60, 1e-6
 class TwoStep:
     """Coefficients by the paper's calibration."""
 
+    parameters: Parameters
     values: Array
     """(P,)"""
     sigma: Array
@@ -267,7 +268,7 @@ def calibrate(windows: Sequence[Window], parameters: Parameters) -> TwoStep:
             f"added mass and damping do not agree after {_PASSES} passes: free fewer of them, or "
             "add manoeuvres"
         )
-    return TwoStep(values=values, sigma=sigma, step=tuple(steps))
+    return TwoStep(parameters=parameters, values=values, sigma=sigma, step=tuple(steps))
 
 
 def _regress(

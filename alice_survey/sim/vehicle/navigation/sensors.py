@@ -161,8 +161,8 @@ class Sensors(NamedTuple):
     tick_s: float
     place: Array
     """(6, 3) positions of the instruments and of the followed point on the body."""
-    hull: Array
-    """(P, 3) points of the vehicle's hull, whose clearance is computed."""
+    low: Array
+    """(P + 2, 3) points whose clearance is computed: of the hull, the DVL, the followed one."""
     beams: Array
     """(4, 3) unit vectors in the body frame."""
     dropouts_s: Array
@@ -226,7 +226,7 @@ class SensorSuite(NamedTuple):
             *self[:6],
             tick_s=tick_s,
             place=np.array([*places, self.followed_body_m], dtype=np.float64),
-            hull=hull.points_body_m,
+            low=np.vstack([hull.points_body_m, dvl.position_body_m, self.followed_body_m]),
             beams=janus_beams(dvl.beam_angle_rad),
             dropouts_s=np.array(self.dvl_dropouts_s, dtype=np.float64).reshape(-1, 2),
             bottom_dropouts_s=np.array(self.bottom_dropouts_s, dtype=np.float64).reshape(-1, 2),

@@ -250,17 +250,9 @@ def _hear_floor(time_s: float, used: int, nav: NavigationState, suite: Sensors) 
     memory[slot.FOLLOWED_DEPTH] = _followed_depth(nav, suite)
 
     clearance, lowest = altitude, 0.0
-    points = suite.hull.shape[0]
-    for i in range(points + 1):
-        if i < points:
-            a, b, c = suite.hull[i, 0], suite.hull[i, 1], suite.hull[i, 2]
-        else:
-            a, b, c = place[part.DVL, 0], place[part.DVL, 1], place[part.DVL, 2]
-        a, b, c = (
-            a - place[part.FOLLOWED, 0],
-            b - place[part.FOLLOWED, 1],
-            c - place[part.FOLLOWED, 2],
-        )
+    low, port = suite.low, place[part.FOLLOWED]
+    for i in range(low.shape[0]):
+        a, b, c = low[i, 0] - port[0], low[i, 1] - port[1], low[i, 2] - port[2]
         n, e, d = rotate(turned, a, b, c)
         clearance = min(clearance, altitude + north * n + east * e - d)
         lowest = max(lowest, d)
@@ -414,15 +406,6 @@ def measure_imu(
             + hidden[3 + i] * dt_s
             + sensors.imu.accelerometer_noise_mps_per_sqrt_s * root * rng.standard_normal()
         )
-
-
-@kernel
-def usbl_sigma(sensors: Sensors, north_m: float, east_m: float, depth_m: float) -> float:
-    """Standard deviation of north and of east of a transponder's fix, by its slant range."""
-    a, b = north_m - sensors.usbl.boat_ned_m[0], east_m - sensors.usbl.boat_ned_m[1]
-    c = depth_m - sensors.usbl.boat_ned_m[2]
-    noise, slope = sensors.usbl.noise_m, sensors.usbl.noise_fraction
-    return math.sqrt(noise * noise + slope * slope * (a * a + b * b + c * c))
 
 
 @kernel

@@ -48,10 +48,14 @@ from numpy.typing import NDArray
 from alice_survey.core.compiled import columns
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.allocation import AXIS_WEIGHTS, LEVEL_WEIGHTS
+from alice_survey.sim.vehicle.allocation import (
+    AXIS_WEIGHTS,
+    LEVEL_WEIGHTS,
+    allocate,
+    new_allocation,
+)
 from alice_survey.sim.vehicle.dynamics import Body, coriolis_matrix
-from alice_survey.sim.vehicle.fins import MAX_RAD, Fins, fin_slope, pack_fins, write_fin_matrix
-from alice_survey.sim.vehicle.propulsion import thrust_limits
+from alice_survey.sim.vehicle.fins import Fins, fin_slope, pack_fins
 from alice_survey.sim.vehicle.steady import balance_fins, min_radius_m
 from alice_survey.sim.vehicle.vehicle import Vehicle
 
@@ -230,12 +234,9 @@ def gains_for(vehicle: Vehicle, speed_mps: float, navigation_hz: float = 5.0) ->
         )
     cruise = np.array([speed_mps, 0.0, 0.0, 0.0, 0.0, 0.0])
     radius_m = min_radius_m(vehicle, speed_mps, STEADY_SHARE) if fins else 0.0
-    upper, matrix = np.zeros(vehicle.actuators), np.zeros((6, vehicle.actuators))
-    upper[count:] = plant.fins.drives[:, MAX_RAD]
-    lower = -upper
-    thrust_limits(plant.propulsion, np.ones(count), cruise, lower, upper)
-    matrix[:, :count] = vehicle.configuration_matrix
-    write_fin_matrix(plant.fins, cruise, matrix, count)
+    room = new_allocation(vehicle, np.ones(count), exact=True, axes=np.ones(6))
+    allocate(np.zeros(6), cruise, room)
+    matrix, lower, upper = room.matrix, room.lower, room.upper
     rows = matrix[list(_DEGREE)]
     if fins:
         rolls = np.linalg.matrix_rank(matrix[3:, count:]) == 3
@@ -506,7 +507,6 @@ def _steady_speed(body: Body, degree: int, force: float) -> float:
     return float((math.sqrt(linear**2 + 4.0 * quadratic * force) - linear) / (2.0 * quadratic))
 
 
-_VERTICAL = [2, 4]
 _MAX_MPS = 5.0
 _STEP_MPS = 0.02
 _GROWS_PER_S = 1e-6
@@ -526,13 +526,9 @@ def pitch_matrix(vehicle: Vehicle, speed_mps: float) -> Array:
     Returns:
         (3, 3)
     """
-    body = vehicle.plant.body
-    nu = np.array([speed_mps, 0.0, 0.0, 0.0, 0.0, 0.0])
-    pair = np.ix_(_VERTICAL, _VERTICAL)
-    inverse = np.linalg.inv(body.mass[pair])
-    matrix = np.zeros((3, 3))
-    matrix[:2, :2] = -inverse @ (linear_damping(body, nu) + linear_coriolis(body, nu))[pair]
-    matrix[:2, 2] = -inverse[:, 1] * body.weight_n * body.cg[2]
+    body, matrix = vehicle.plant.body, np.zeros((3, 3))
+    matrix[:2, :2], by_moment = coupled_pair(body, speed_mps, plane=VERTICAL)
+    matrix[:2, 2] = -by_moment * body.weight_n * body.cg[2]
     matrix[2, 1] = 1.0
     return matrix
 

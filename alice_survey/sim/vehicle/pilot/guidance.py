@@ -24,7 +24,6 @@ from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.pilot import gains as g
 from alice_survey.sim.vehicle.pilot import memory as slot
-from alice_survey.sim.vehicle.pilot.gains import Gains
 from alice_survey.sim.vehicle.pilot.memory import PilotState
 from alice_survey.sim.vehicle.pilot.mission import (
     COLA2,
@@ -207,31 +206,16 @@ _QUICKEST = 2.0
 
 
 @kernel
-def steer(
-    time_s: float,
-    dt_s: float,
-    estimate: Array,
-    path: Path,
-    mission: PilotMission,
-    guidance: Guidance,
-    gains: Gains,
-    pilot: PilotState,
-    wrench: Array,
-) -> None:
+def steer(time_s: float, tick: Tick, mission: PilotMission, wrench: Array) -> None:
     """Guide and control the vehicle for a tick.
 
     Args:
         time_s: since the start of the mission.
-        dt_s: the tick.
-        estimate: (14,) of the navigation, see estimate_vector.py.
-        path: to follow, unless there is a mission.
+        tick: what is read, and the pilot that is written.
         mission: steps to fly by the law of another vehicle's software; `NO_MISSION` for none.
-        guidance: settings.
-        gains: gains of the inner loops.
-        pilot: memory and report, written.
         wrench: (6,) N and N m, is written: forces and moments commanded of the thrusters.
     """
-    tick = Tick(dt_s, estimate, path, guidance, gains, pilot)
+    dt_s, estimate, path, guidance, gains, pilot = tick
     report, demand = pilot.report, pilot.demand
     for i in range(slot.FULL_SURGE):
         demand[i] = 0.0

@@ -25,7 +25,7 @@ from alice_survey.sim.vehicle.pilot.guidance import steer
 from alice_survey.sim.vehicle.pilot.memory import PilotState, new_pilot
 from alice_survey.sim.vehicle.pilot.mission import NO_MISSION
 from alice_survey.sim.vehicle.pilot.path import Path, path_from_legs
-from alice_survey.sim.vehicle.pilot.settings import Guidance, pilot_guidance
+from alice_survey.sim.vehicle.pilot.settings import Guidance, Tick, pilot_guidance
 from alice_survey.sim.vehicle.sea import Current, constant_current, current_at
 
 Controller = Literal["sway", "los"]
@@ -73,11 +73,12 @@ def _fly(
 ) -> None:
     estimate, wrench, water, command = room[:14], room[14:20], room[20:26], room[26:]
     step = 0.05 / 5
+    tick = Tick(0.05, estimate, path, guidance, gains, pilot)
     for k in range(rows.shape[0]):
         time_s = (first + k) * 0.05
         current_at(current, time_s, state[2], water)
         estimate_truth(state, water, guidance.point_body_m, floor, estimate)
-        steer(time_s, 0.05, estimate, path, NO_MISSION, guidance, gains, pilot, wrench)
+        steer(time_s, tick, NO_MISSION, wrench)
         rows[k, 0] = time_s
         for i in range(14):
             rows[k, 1 + i] = estimate[i]

@@ -25,6 +25,7 @@ from alice_survey.sim.vehicle.pilot.settings import (
     CONTROL_LENGTH_M,
     LOS_DAMPING_RATIO,
     Guidance,
+    Tick,
     los_loop,
     min_look_ahead_m,
     pilot_guidance,
@@ -85,7 +86,7 @@ def test_a_tick_asks_for_what_its_twin_asks(
     pilot = pilot_on(path, along_m=place[0])
     expected, cross = oracle.follow_demand(estimate, path, guidance, gains, place[0])
     assume(abs(abs(cross) - guidance.near_m) > 1e-9)
-    steer(0.0, TICK_S, estimate, path, NO_MISSION, guidance, gains, pilot, wrench)
+    steer(0.0, Tick(TICK_S, estimate, path, guidance, gains, pilot), NO_MISSION, wrench)
     accelerations = pilot.demand[[slot.ACC_SURGE, slot.ACC_SWAY, slot.ACC_YAW]]
     np.testing.assert_allclose(accelerations, expected, atol=1e-9)
     assert pilot.report[slot.CROSS] == pytest.approx(cross, abs=1e-9)

@@ -14,6 +14,7 @@ from alice_survey.sim.vehicle.pilot.guidance import steer
 from alice_survey.sim.vehicle.pilot.memory import PilotState, new_pilot
 from alice_survey.sim.vehicle.pilot.mission import NO_MISSION
 from alice_survey.sim.vehicle.pilot.safety import SafetyLimits
+from alice_survey.sim.vehicle.pilot.settings import Tick
 from tests.alice_survey.sim.vehicle.pilot.pilot_runs import Flight, launch, straight
 
 LIMITS = SafetyLimits(1.0, 20.0, math.radians(30.0), 20.0, 90.0, 3.0, 5000.0)
@@ -83,17 +84,8 @@ def test_without_bottom_lock_the_navigation_decides_if_it_may() -> None:
 
 def _steered(flight: Flight, estimate: Array) -> Array:
     wrench = np.full(6, math.nan)
-    steer(
-        10.0,
-        TICK_S,
-        estimate,
-        flight.path,
-        NO_MISSION,
-        flight.guidance,
-        flight.gains,
-        flight.pilot,
-        wrench,
-    )
+    tick = Tick(TICK_S, estimate, flight.path, flight.guidance, flight.gains, flight.pilot)
+    steer(10.0, tick, NO_MISSION, wrench)
     return wrench
 
 

@@ -18,6 +18,7 @@ from alice_survey.sim.vehicle.pilot.mission import NO_MISSION
 from alice_survey.sim.vehicle.pilot.path import Path
 from alice_survey.sim.vehicle.pilot.settings import (
     Guidance,
+    Tick,
     pilot_guidance,
 )
 from alice_survey.sim.vehicle.pilot.steering import STOP_M, STOP_RAD, ramp
@@ -111,7 +112,7 @@ def test_a_tick_of_a_stop_asks_for_what_its_twin_asks(
         estimate, guidance, gains, path.speed_mps, place, moves, quickens, turning
     )
     wrench = np.zeros(6)
-    steer(0.0, TICK_S, estimate, path, NO_MISSION, guidance, gains, pilot, wrench)
+    steer(0.0, Tick(TICK_S, estimate, path, guidance, gains, pilot), NO_MISSION, wrench)
     found = pilot.demand[[slot.ACC_SURGE, slot.ACC_SWAY, slot.ACC_YAW]]
     np.testing.assert_allclose(found, expected, atol=1e-9)
     np.testing.assert_allclose(wrench, oracle.wrench(gains, pilot.demand), atol=1e-9)
@@ -182,7 +183,9 @@ def test_a_stop_is_left_though_the_sea_does_not_let_the_vehicle_rest() -> None:
     estimate[[vector.ALTITUDE, vector.CLEARANCE]] = 2.0
     left = None
     for tick in range(600):
-        steer(tick * TICK_S, TICK_S, estimate, path, NO_MISSION, guidance, gains, pilot, wrench)
+        steer(
+            tick * TICK_S, Tick(TICK_S, estimate, path, guidance, gains, pilot), NO_MISSION, wrench
+        )
         if pilot.report[slot.LEG] == 2.0:
             left = tick * TICK_S
             break
