@@ -270,17 +270,13 @@ class CoefficientsCommand(ReportCommand):
     """
 
     name = "vehicle coefficients"
-    examples = (
-        "vehicle coefficients",
-        "vehicle coefficients --plot coefficients.png",
-    )
-    plot: Path | None = option(None, "Figure to draw.", metavar="FILE")
+    examples = ("vehicle coefficients",)
 
     def run(self) -> Result:
         """Compute and compare them."""
         from alice_survey.sim.vehicle.paper_tables import coefficients_report
 
-        return coefficients_report(self.plot)
+        return coefficients_report()
 
 
 class CompareCommand(SurveyCommand, ThreadsCommand):
@@ -365,8 +361,8 @@ class IdentifyCommand(ReportCommand):
         None, "Longest stretch to simulate in one go.", metavar="SECONDS", ge=0.1
     )
     prior: str | None = option(
-        None, "Relative sigmas of the start: damping=0.5,added_mass=0.3; a number; none.",
-        metavar="SIGMAS",
+        None, "Relative sigma of the values that the fit starts from, or none.",
+        metavar="SIGMA",
     )  # fmt: skip
     out: Path = option(Path("identified"), "Directory to write.", "-o", "--out", metavar="DIR")
 

@@ -166,6 +166,47 @@ def add_weight(body: Body, r20: float, r21: float, r22: float, force: Array) -> 
     force[5] += weight * (gx * r21 - gy * r20)
 
 
+def forces_over_time(
+    body: Body, propulsion: Propulsion, nu: Array, down: Array, rps: Array
+) -> tuple[Array, Array]:
+    """Forces and moments of the hull, (T, 6), and of each thruster, (T, n, 6), over time.
+
+    Args:
+        body: the vehicle's.
+        propulsion: n thrusters.
+        nu: (T, 6) velocity through the water.
+        down: (T, 3) the direction down in the body frame.
+        rps: (T, n) speeds.
+
+    Returns:
+        Damping, inertial terms, weight and buoyancy; and thrusts.
+    """
+    hull, thrust = np.zeros((len(nu), 6)), np.zeros((*rps.shape, 6))
+    _write_forces(body, propulsion, nu, down, rps, np.zeros(rps.shape[1]), hull, thrust)
+    return hull, thrust
+
+
+@kernel
+def _write_forces(
+    body: Body,
+    propulsion: Propulsion,
+    nu: Array,
+    down: Array,
+    rps: Array,
+    alone: Array,
+    hull: Array,
+    thrust: Array,
+) -> None:
+    for k in range(nu.shape[0]):
+        add_damping(body, nu[k], hull[k])
+        add_coriolis(body, nu[k], hull[k])
+        add_weight(body, down[k, 0], down[k, 1], down[k, 2], hull[k])
+        for i in range(rps.shape[1]):
+            alone[:] = 0.0
+            alone[i] = rps[k, i]
+            add_thrust(propulsion, alone, nu[k], thrust[k, i])
+
+
 @kernel
 def derivative(
     time_s: float,

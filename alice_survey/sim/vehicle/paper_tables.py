@@ -8,14 +8,10 @@ The command `vehicle coefficients` puts each row next to the value from shape (s
 """
 
 import tomllib
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from alice_survey.core.errors import ConfigError
 from alice_survey.kit.words import text_table
 from alice_survey.sim.vehicle.coefficients import LIFTS, Coefficients
 
@@ -147,23 +143,8 @@ went the other way, the sum stays below that of the other sets.
 """
 
 
-def coefficients_report(plot: Path | None = None) -> tuple[str, dict[str, Any]]:
-    """The paper's three tables next to ALICE's coefficients from shape.
-
-    Args:
-        plot: figure of the ratios to the paper's values to draw.
-
-    Returns:
-        Text, and the same as values for JSON.
-
-    Raises:
-        ConfigError: the figure cannot be written.
-    """
-    try:
-        if plot is not None:
-            draw_ratios(plot, ROWS)
-    except OSError as error:
-        raise ConfigError(f"{error.filename}: cannot be written: {error.strerror}") from None
+def coefficients_report() -> tuple[str, dict[str, Any]]:
+    """The paper's three tables next to ALICE's coefficients from shape: text, and JSON values."""
     table = text_table(
         ("table", "coefficient", "printed", "paper", "computed", "difference", "CFD, at sea", ""),
         [
@@ -181,30 +162,3 @@ def coefficients_report(plot: Path | None = None) -> tuple[str, dict[str, Any]]:
         "computed": dict(COMPUTED["alice"].values),
     }
     return f"{table}\nHow each differs: docs/vehicle-comparison.md", data
-
-
-def draw_ratios(path: Path, rows: Sequence[CoefficientRow]) -> None:
-    """Draw the computed values over the paper's, on a logarithmic axis.
-
-    Raises:
-        ConfigError: the suffix is not one of a figure.
-    """
-    from alice_survey.kit.figure import INKS, check_figure_path, figure_style, new_figure
-    from alice_survey.kit.figure import save_figure as save
-
-    check_figure_path(path)
-    with figure_style():
-        figure = new_figure(9.0)
-        axes = figure.subplots()
-        labels = [f"{row.table} {row.label}" for row in rows]
-        for mark, colour in zip((*_MARKS, "no"), (INKS[2], INKS[4], INKS[1]), strict=True):
-            chosen = [i for i, row in enumerate(rows) if row.mark == mark]
-            ratios = np.array([rows[i].computed / rows[i].paper for i in chosen])
-            axes.plot(ratios, chosen, "o", color=colour, label=mark)
-        axes.set_xscale("log")
-        axes.axvline(1.0, color="black", lw=1.0, zorder=1)
-        axes.set_yticks(range(len(labels)), labels, fontsize=6.5)
-        axes.invert_yaxis()
-        axes.set_xlabel("computed from the shape over the paper's value")
-        axes.legend(loc="lower right")
-        save(figure, path)

@@ -47,7 +47,6 @@ from alice_survey.sim.vehicle.identification import sensitivity as term
 from alice_survey.sim.vehicle.identification.parameters import QUADRATICS, Parameters, place_of
 from alice_survey.sim.vehicle.identification.sensitivity import (
     Physics,
-    scratch_for,
     simulate,
     with_given,
 )
@@ -171,10 +170,6 @@ class PriorSigmas:
             if not value > 0:
                 raise VehicleError(f"prior {one.name}={value:g}: a relative sigma is above 0")
 
-    def __str__(self) -> str:
-        named = ((one.name, getattr(self, one.name)) for one in fields(self))
-        return ", ".join(f"{name} {value:g}" for name, value in named if math.isfinite(value))
-
     def of_kind(self, kind: int) -> float:
         """The sigma of a kind of parameter; infinite of kinds without prior."""
         known = {
@@ -185,30 +180,18 @@ class PriorSigmas:
 
 
 def read_prior(text: str) -> PriorSigmas | None:
-    """A prior as the command line has it: `none`, one number for all, or `KIND=SIGMA,...`.
-
-    Kinds that are not named have their default.
+    """A prior as the command line has it: `none`, one relative sigma for all, or the default.
 
     Raises:
         VehicleError: it is neither.
     """
-    if text.strip() == "none":
-        return None
-    kinds = [one.name for one in fields(PriorSigmas)]
-    given: dict[str, float] = {}
-    for part in filter(None, text.split(",")):
-        name, mark, number = (one.strip() for one in part.partition("="))
-        try:
-            value = float(number if mark else name)
-        except ValueError:
-            value = math.nan
-        if math.isnan(value) or (mark and name not in kinds) or (not mark and "," in text):
-            raise VehicleError(
-                f"--prior {text!r}: give none, a relative sigma, or KIND=SIGMA,... with kinds of "
-                f"{', '.join(kinds)}"
-            )
-        given |= {name: value} if mark else dict.fromkeys(kinds, value)
-    return PriorSigmas(**given)
+    if text in ("", "none"):
+        return PriorSigmas() if not text else None
+    try:
+        sigma = float(text)
+    except ValueError:
+        raise VehicleError(f"--prior {text!r}: give a relative sigma, or none") from None
+    return PriorSigmas(**dict.fromkeys((one.name for one in fields(PriorSigmas)), sigma))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -444,9 +427,6 @@ class _FitProblem:
         self.gains = [np.zeros((term.START, self.count)) for _ in windows]
         self.at = parameters.start.copy()
         self.trial: tuple[Array, list[Array], list[Array], Array] | None = None
-        columns = self.count + term.START
-        self.scratch = scratch_for(columns, windows[0].record.rps.shape[1])
-        self.sensitivity = np.zeros((term.STATES, columns))
 
     def begin(self, values: Array) -> None:
         """Check that the simulation works where the fit starts."""
@@ -602,13 +582,9 @@ class _FitProblem:
     def _simulate(
         self, window: Window, i: int, physics: Physics, start: Array
     ) -> tuple[Array, Array] | None:
-        rows = len(window.record.time_s)
-        states, observed = np.empty((rows, term.STATES)), np.empty((rows, term.CHANNELS))
-        slopes = np.empty((rows, term.CHANNELS, self.count + term.START))
-        simulate(
-            physics, self.parameters.terms, window.record, start, self.how.max_step_s,
-            self.scratch, self.sensitivity, states, observed, slopes,
-        )  # fmt: skip
+        _, observed, slopes = simulate(
+            physics, self.parameters.terms, window.record, start, self.how.max_step_s
+        )
         mask = self.measured[i]
         residual = (residual_channels(window, observed) / self.sigma)[mask]
         if not np.all(np.isfinite(residual)):

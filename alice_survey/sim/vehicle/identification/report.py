@@ -47,11 +47,7 @@ from alice_survey.sim.vehicle.identification.parameters import (
     unit_of,
 )
 from alice_survey.sim.vehicle.identification.sensitivity import (
-    CHANNELS,
-    STATES,
     Physics,
-    Terms,
-    scratch_for,
     simulate,
     with_given,
 )
@@ -161,14 +157,7 @@ def _run(window: Window, motion: Array, physics: Physics, how: Simulation) -> Ar
     start = window.start.copy()
     start[4:] = motion - physics.bias
     start[4:7] -= Rotation.from_quat(start[:4]).inv().apply([*physics.current_ne, 0.0])
-    rows = len(window.record.time_s)
-    states, observed = np.empty((rows, STATES)), np.empty((rows, CHANNELS))
-    nothing = np.zeros(0, np.int64)
-    simulate(
-        physics, Terms(nothing, nothing, nothing), window.record, start, how.max_step_s,
-        scratch_for(0, window.record.rps.shape[1]), np.zeros((STATES, 0)), states,
-        observed, np.empty((rows, CHANNELS, 0)),
-    )  # fmt: skip
+    _, observed, _ = simulate(physics, None, window.record, start, how.max_step_s)
     if not np.all(np.isfinite(observed[:, :_MOTIONS])):
         raise VehicleError(
             f"{window.source}: the simulation does not stay finite: simulate shorter stretches"

@@ -332,131 +332,99 @@ def _step(
 
 
 @kernel
-def observe(
-    physics: Physics,
-    terms: Terms,
-    state: Array,
-    sensitivity: Array,
-    attitude: Array,
-    out: Array,
-    slopes: Array,
-) -> None:
-    """Write the predicted sensor readings, (9,), and their slopes, (9, C).
-
-    Velocity over ground and rates in the body frame with their biases, and twice the vector part of
-    the turn from the measured attitude to the state's: for small turns the angles about the axes.
-    """
-    x, y, z, s = state[0], state[1], state[2], state[3]
-    cn, ce = physics.current_ne[0], physics.current_ne[1]
-    columns, parameters = sensitivity.shape[1], terms.kind.shape[0]
-    (r00, r01, r02), (r10, r11, r12), _ = matrix_rows(x, y, z, s)
-    out[0] = state[4] + r00 * cn + r10 * ce
-    out[1] = state[5] + r01 * cn + r11 * ce
-    out[2] = state[6] + r02 * cn + r12 * ce
-    for i in range(3):
-        out[3 + i] = state[7 + i]
-    for i in range(6):
-        out[i] += physics.bias[i]
-    mx, my, mz, ms = attitude[0], attitude[1], attitude[2], attitude[3]
-    turn = 2.0 if mx * x + my * y + mz * z + ms * s >= 0.0 else -2.0
-    out[6] = turn * (ms * x - mx * s - my * z + mz * y)
-    out[7] = turn * (ms * y - my * s - mz * x + mx * z)
-    out[8] = turn * (ms * z - mz * s - mx * y + my * x)
-    for c in range(columns):
-        dx, dy, dz, ds = (
-            sensitivity[0, c], sensitivity[1, c], sensitivity[2, c], sensitivity[3, c],
-        )  # fmt: skip
-        slopes[0, c] = (
-            sensitivity[4, c]
-            - 4 * cn * (y * dy + z * dz)
-            + 2 * ce * (y * dx + x * dy + s * dz + z * ds)
-        )
-        slopes[1, c] = (
-            sensitivity[5, c]
-            + 2 * cn * (y * dx + x * dy - s * dz - z * ds)
-            - 4 * ce * (x * dx + z * dz)
-        )
-        slopes[2, c] = (
-            sensitivity[6, c]
-            + 2 * cn * (z * dx + s * dy + x * dz + y * ds)
-            + 2 * ce * (-s * dx + z * dy + y * dz - x * ds)
-        )
-        for i in range(3):
-            slopes[3 + i, c] = sensitivity[7 + i, c]
-        slopes[6, c] = turn * (ms * dx - mx * ds - my * dz + mz * dy)
-        slopes[7, c] = turn * (ms * dy - my * ds - mz * dx + mx * dz)
-        slopes[8, c] = turn * (ms * dz - mz * ds - mx * dy + my * dx)
-    for k in range(parameters):
-        if terms.kind[k] == CURRENT and terms.row[k] == 0:
-            slopes[0, k] += r00
-            slopes[1, k] += r01
-            slopes[2, k] += r02
-        elif terms.kind[k] == CURRENT:
-            slopes[0, k] += r10
-            slopes[1, k] += r11
-            slopes[2, k] += r12
-        elif terms.kind[k] == BIAS:
-            slopes[terms.row[k], k] += 1.0
-
-
-@kernel
-def simulate(
+def _simulate(
     physics: Physics,
     terms: Terms,
     record: Record,
-    start: Array,
     max_step_s: float,
     scratch: SlopeScratch,
-    sensitivity: Array,
     states: Array,
-    observed: Array,
-    slopes: Array,
+    sensitivities: Array,
 ) -> None:
-    """Simulate a window.
-
-    Args:
-        physics: the vehicle, with values of the parameters.
-        terms: P parameters.
-        record: T rows.
-        start: (10,) state at the first row.
-        max_step_s: rows farther apart are crossed in equal steps no longer than this.
-        scratch: for C = P + 9 columns; or for none, with no terms.
-        sensitivity: (10, C) room.
-        states: (T, 10) is written.
-        observed: (T, 9) is written, see `observe`.
-        slopes: (T, 9, C) is written.
-    """
-    columns, parameters = sensitivity.shape[1], terms.kind.shape[0]
-    sensitivity[:, :] = 0.0
-    scratch.by_column[:, :] = 0.0
-    for i in range(STATES):
-        states[0, i] = start[i]
-    if columns > parameters:
-        # A small turn d about the body's axes changes q by q * (d, 0) / 2.
-        x, y, z, s = start[0], start[1], start[2], start[3]
-        c = parameters
-        sensitivity[0, c], sensitivity[0, c + 1], sensitivity[0, c + 2] = 0.5 * s, -0.5 * z, 0.5 * y
-        sensitivity[1, c], sensitivity[1, c + 1], sensitivity[1, c + 2] = 0.5 * z, 0.5 * s, -0.5 * x
-        sensitivity[2, c], sensitivity[2, c + 1], sensitivity[2, c + 2] = -0.5 * y, 0.5 * x, 0.5 * s
-        sensitivity[3, c], sensitivity[3, c + 1], sensitivity[3, c + 2] = (
-            -0.5 * x, -0.5 * y, -0.5 * z,
-        )  # fmt: skip
-        for i in range(6):
-            sensitivity[4 + i, c + 3 + i] = 1.0 - physics.given[i]
-    for row in range(record.time_s.shape[0]):
-        observe(
-            physics, terms, states[row], sensitivity, record.attitude[row], observed[row],
-            slopes[row],
-        )  # fmt: skip
-        if row + 1 == record.time_s.shape[0]:
-            break
+    """Simulate a window from its first state (10,) and sensitivities (10, C) on."""
+    columns = sensitivities.shape[2]
+    for row in range(record.time_s.shape[0] - 1):
         for i in range(STATES):
             states[row + 1, i] = states[row, i]
+            for c in range(columns):
+                sensitivities[row + 1, i, c] = sensitivities[row, i, c]
         span = record.time_s[row + 1] - record.time_s[row]
         # Slightly over a step is still one step: times are written with rounding.
         count = max(int(np.ceil(span / max_step_s - 1e-6)), 1)
         for i in range(count):
             _step(
                 physics, terms, record, row, i * span / count, span / count, states[row + 1],
-                sensitivity, scratch,
+                sensitivities[row + 1], scratch,
             )  # fmt: skip
+
+
+def simulate(
+    physics: Physics, terms: Terms | None, record: Record, start: Array, max_step_s: float
+) -> tuple[Array, Array, Array]:
+    """Simulate a window.
+
+    Args:
+        physics: the vehicle, with values of the parameters.
+        terms: P parameters; None for no derivatives.
+        record: T rows.
+        start: (10,) state at the first row.
+        max_step_s: rows farther apart are crossed in equal steps no longer than this.
+
+    Returns:
+        States, (T, 10); predicted sensor readings, (T, 9), see `observe`; and their slopes,
+        (T, 9, C) by the C = P + 9 columns, or none.
+    """
+    free = terms is not None
+    known = terms or Terms(*[np.zeros(0, np.int64)] * 3)
+    rows, parameters = len(record.time_s), len(known.kind)
+    columns = parameters + START if free else 0
+    states, sensitivities = np.zeros((rows, STATES)), np.zeros((rows, STATES, columns))
+    states[0] = start
+    if free:
+        # A small turn d about the body's axes changes q by q * (d, 0) / 2.
+        x, y, z, s = start[:4]
+        turned = 0.5 * np.array([[s, -z, y], [z, s, -x], [-y, x, s], [-x, -y, -z]])
+        sensitivities[0, :4, parameters : parameters + 3] = turned
+        sensitivities[0, 4:, parameters + 3 :] = np.diag(1.0 - physics.given)
+    scratch = scratch_for(columns, record.rps.shape[1])
+    _simulate(physics, known, record, max_step_s, scratch, states, sensitivities)
+    return states, *observe(physics, known, states, sensitivities, record.attitude)
+
+
+def observe(
+    physics: Physics, terms: Terms, states: Array, sensitivities: Array, attitude: Array
+) -> tuple[Array, Array]:
+    """Predicted sensor readings, (T, 9), and their slopes, (T, 9, C).
+
+    Velocity over ground and rates in the body frame with their biases, and twice the vector part of
+    the turn from the measured attitude to the state's: for small turns the angles about the axes.
+    """
+    x, y, z, s = quaternion = states[:, :4].T
+    mx, my, mz, ms = attitude.T
+    cn, ce = physics.current_ne
+    # Rows of what turns the current into the body, and its slopes by the quaternion.
+    north = np.array([1 - 2 * (y * y + z * z), 2 * (x * y - z * s), 2 * (x * z + y * s)])
+    east = np.array([2 * (x * y + z * s), 1 - 2 * (x * x + z * z), 2 * (y * z - x * s)])
+    by_turn = 2.0 * np.array([
+        [ce * y, ce * x - 2 * cn * y, ce * s - 2 * cn * z, ce * z],
+        [cn * y - 2 * ce * x, cn * x, -cn * s - 2 * ce * z, -cn * z],
+        [cn * z - ce * s, cn * s + ce * z, cn * x + ce * y, cn * y - ce * x],
+    ])  # fmt: skip
+    sign = np.where(mx * x + my * y + mz * z + ms * s >= 0.0, 2.0, -2.0)
+    away = sign * np.array([
+        [ms, mz, -my, -mx], [-mz, ms, mx, -my], [my, -mx, ms, -mz],
+    ])  # fmt: skip
+    observed = np.empty((len(states), CHANNELS))
+    observed[:, :6] = states[:, 4:] + physics.bias
+    observed[:, :3] += (cn * north + ce * east).T
+    observed[:, 6:] = np.einsum("ijt,jt->ti", away, quaternion)
+    slopes = np.empty((len(states), CHANNELS, sensitivities.shape[2]))
+    slopes[:, :6] = sensitivities[:, 4:]
+    slopes[:, :3] += np.einsum("ijt,tjc->tic", by_turn, sensitivities[:, :4])
+    slopes[:, 6:] = np.einsum("ijt,tjc->tic", away, sensitivities[:, :4])
+    for k, (kind, row) in enumerate(zip(terms.kind, terms.row, strict=True)):
+        if kind == CURRENT:
+            slopes[:, :3, k] += (north if row == 0 else east).T
+        elif kind == BIAS:
+            slopes[:, row, k] += 1.0
+    return observed, slopes

@@ -30,10 +30,10 @@ from scipy.signal import fftconvolve, savgol_filter
 from scipy.spatial.transform import Rotation
 
 from alice_survey.core.artefacts import read_csv
-from alice_survey.core.compiled import kernel
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.core.run.progress import step as named_step
+from alice_survey.sim.vehicle.dynamics import forces_over_time
 from alice_survey.sim.vehicle.identification import sensitivity as term
 from alice_survey.sim.vehicle.identification.output_error import (
     in_stretches,
@@ -41,7 +41,6 @@ from alice_survey.sim.vehicle.identification.output_error import (
     stretch_numbers,
 )
 from alice_survey.sim.vehicle.identification.parameters import OTHERS, Parameters
-from alice_survey.sim.vehicle.identification.sensitivity import Physics, force_on
 from alice_survey.sim.vehicle.identification.windows import Mask, Window
 from alice_survey.sim.vehicle.propulsion import add_thrust
 from alice_survey.sim.vehicle.vehicle import Vehicle
@@ -281,8 +280,10 @@ def _regress(
     if not much:
         now[group] = 0.0
     physics = parameters.physics(now)
-    forces = np.empty((len(rows.states), 6))
-    _forces(physics, rows.states, rows.rps, rows.wrench, forces)
+    down = Rotation.from_quat(rows.states[:, :4]).inv().apply([0.0, 0.0, 1.0])
+    nu = np.ascontiguousarray(rows.states[:, 4:])
+    hull, thrust = forces_over_time(physics.body, physics.propulsion, nu, down, rows.rps)
+    forces = hull + thrust.sum(axis=1) + physics.gain * rows.wrench
     known = physics.body.mass[force] @ rows.accelerations.T
     known -= _average(rows, forces[:, force : force + 1])[:, 0]
     if much:
@@ -333,13 +334,6 @@ def _regressor(rows: _Rows, kind: int, force: int, motion: int) -> Array:
         return product
     square: Array = nu[:, motion] * np.abs(nu[:, motion])
     return square
-
-
-@kernel
-def _forces(physics: Physics, states: Array, rps: Array, wrench: Array, out: Array) -> None:
-    """Write the forces, (T, 6), on a vehicle in states (T, 10)."""
-    for row in range(states.shape[0]):
-        force_on(physics, states[row], rps[row], wrench[row], out[row])
 
 
 def _smooth(windows: Sequence[Window], parameters: Parameters) -> _Rows:

@@ -394,10 +394,16 @@ def _transform_rows(dt_s: float, nav: NavigationState) -> None:
 
 
 @kernel
-def project(nav: NavigationState) -> float:
-    """P h into row GAIN of `scratch`, for h in row ROW; the variance h P h."""
-    p, h, w = nav.covariance, nav.scratch[ROW], nav.scratch[GAIN]
+def project(nav: NavigationState, innovation: float) -> tuple[float, float]:
+    """P h into row GAIN of `scratch`, for h in row ROW.
+
+    Returns:
+        The innovation about the estimate, minus what this tick's corrections already account for;
+        and the variance h P h.
+    """
+    p, h, w, error = nav.covariance, nav.scratch[ROW], nav.scratch[GAIN], nav.scratch[CORRECTION]
     for j in range(ERROR):
+        innovation -= h[j] * error[j]
         w[j] = 0.0
     for i in range(ERROR):
         if h[i] != 0.0:
@@ -407,7 +413,7 @@ def project(nav: NavigationState) -> float:
     variance = 0.0
     for j in range(ERROR):
         variance += h[j] * w[j]
-    return variance
+    return innovation, variance
 
 
 @kernel
@@ -427,15 +433,6 @@ def absorb(nav: NavigationState, innovation: float, variance: float) -> None:
             p[i, j] -= factor * w[j]
     # Considered: no correction, and what all others know of it stays.
     error[DVL_SCALE], p[DVL_SCALE, DVL_SCALE] = 0.0, scale_variance
-
-
-@kernel
-def remaining(nav: NavigationState, innovation: float) -> float:
-    """An innovation about the estimate, minus what this tick's corrections already account for."""
-    h, error = nav.scratch[ROW], nav.scratch[CORRECTION]
-    for j in range(ERROR):
-        innovation -= h[j] * error[j]
-    return innovation
 
 
 @kernel
@@ -465,8 +462,8 @@ def weigh(
         Whether it was used.
     """
     h, w, counts = nav.scratch[ROW], nav.scratch[GAIN], nav.counts
-    innovation = remaining(nav, innovation)
-    variance = project(nav) + noise_variance
+    innovation, variance = project(nav, innovation)
+    variance += noise_variance
     if not (math.isfinite(innovation) and variance > 0.0):
         counts[instrument, REJECTED] += 1
         return False
@@ -651,8 +648,8 @@ def use_fix(
         if bias >= 0:
             nav.scratch[ROW, bias + axis] = 1.0
             innovation -= x[bias + 1 + axis]
-        innovation = remaining(nav, innovation)
-        variance = project(nav) + noise_variance
+        innovation, variance = project(nav, innovation)
+        variance += noise_variance
         if not (math.isfinite(innovation) and variance > 0.0):
             counts[instrument, REJECTED] += 1
             return False
@@ -674,8 +671,8 @@ def use_fix(
         if bias >= 0:
             nav.scratch[ROW, bias + axis] = 1.0
             innovation -= x[bias + 1 + axis]
-        innovation = remaining(nav, innovation)
-        absorb(nav, innovation, project(nav) + noise_variance)
+        innovation, variance = project(nav, innovation)
+        absorb(nav, innovation, variance + noise_variance)
     return True
 
 

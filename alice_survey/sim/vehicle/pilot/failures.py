@@ -27,12 +27,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from alice_survey.core.compiled import kernel
 from alice_survey.core.frames import Array, rotation_from_attitude
 from alice_survey.sim.vehicle import estimate_vector as vector
-from alice_survey.sim.vehicle.dynamics import Body, add_coriolis, add_damping, add_weight
+from alice_survey.sim.vehicle.dynamics import forces_over_time
 from alice_survey.sim.vehicle.navigation.filter import WATER, NavigationState
-from alice_survey.sim.vehicle.propulsion import Propulsion, Thruster, add_thrust, turned_speeds
+from alice_survey.sim.vehicle.propulsion import Thruster, turned_speeds
 from alice_survey.sim.vehicle.vehicle import Vehicle
 
 WATCHED_S = 5.0
@@ -120,41 +119,6 @@ _GREATEST_SHARE = 1.5
 """More than all of a thrust is missing: another force, and no failure."""
 _APART = math.log(100.0)
 """By how much, as a logarithm of odds, one thruster must explain it better than any other."""
-
-
-@kernel
-def forces_of(
-    body: Body,
-    propulsion: Propulsion,
-    nu: Array,
-    down: Array,
-    rps: Array,
-    alone: Array,
-    hull: Array,
-    thrust: Array,
-) -> None:
-    """Write the forces and moments of hull, (T, 6), and thrusters, (T, n, 6), over time.
-
-    Args:
-        body: the vehicle's.
-        propulsion: n thrusters.
-        nu: (T, 6) velocity through the water.
-        down: (T, 3) the direction down in the body frame.
-        rps: (T, n) speeds.
-        alone: (n,) room.
-        hull: written: damping, inertial terms, weight and buoyancy.
-        thrust: written.
-    """
-    for k in range(nu.shape[0]):
-        hull[k, :] = 0.0
-        add_damping(body, nu[k], hull[k])
-        add_coriolis(body, nu[k], hull[k])
-        add_weight(body, down[k, 0], down[k, 1], down[k, 2], hull[k])
-        for i in range(rps.shape[1]):
-            alone[:] = 0.0
-            alone[i] = rps[k, i]
-            thrust[k, i, :] = 0.0
-            add_thrust(propulsion, alone, nu[k], thrust[k, i])
 
 
 class NavigatedStretch(NamedTuple):
@@ -247,7 +211,7 @@ class ThrustWatch:
         nu = estimate[:, vector.U : vector.U + 6].copy()
         nu[:, :3] -= body_from_ned.apply([water_ne[0], water_ne[1], 0.0])
         down = body_from_ned.apply([0.0, 0.0, 1.0])
-        hull, thrust = self._forces(nu, down, rps)
+        hull, thrust = forces_over_time(*self._plant[:2], nu, down, rps)
         thrust[:, self._gone] = 0.0
         edges = np.arange(0, ticks, _SAMPLE_TICKS)
         span_s = _SAMPLE_TICKS * self._tick_s
@@ -263,15 +227,9 @@ class ThrustWatch:
         for axis in range(2):
             other = nu.copy()
             other[:, axis] += water_sigma_mps
-            doubts.append(sample(self._forces(other, down, rps)[0] - hull))
+            doubts.append(sample(forces_over_time(*self._plant[:2], other, down, rps)[0] - hull))
         doubt = np.sum([[d.mean(axis=0) ** 2, d.var(axis=0)] for d in doubts], axis=0)
         return inertial - by_hull - pushed, by_thrust, doubt
-
-    def _forces(self, nu: Array, down: Array, rps: Array) -> tuple[Array, Array]:
-        hull, thrust = np.zeros((len(nu), 6)), np.zeros((*rps.shape, 6))
-        body, alone = self._plant.body, np.zeros(rps.shape[1])
-        forces_of(body, self._plant.propulsion, nu, down, rps, alone, hull, thrust)
-        return hull, thrust
 
     def _add_up(self, rest: Array, thrust: Array, doubt: Array) -> None:
         """Add a stretch's logarithms of likelihood ratios to the sums."""

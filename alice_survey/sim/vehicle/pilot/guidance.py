@@ -51,7 +51,6 @@ from alice_survey.sim.vehicle.pilot.steering import (
     hear_floor,
     sink_to,
     stand,
-    stands,
     start_standing,
     surge_at,
     sway_by,
@@ -68,48 +67,6 @@ _MAX_LEAN_RAD = math.radians(30.0)
 """Greatest angle into a current that is learned (inferred: half of a vehicle's speed across)."""
 _HOVER_SHARE = 0.25
 """Bandwidth of keeping place by surge, over that of the surge loop."""
-
-
-@kernel
-def go_to(goal_n: float, goal_e: float, heading: float, tick: Tick) -> tuple[float, float]:
-    """Go to a place and stay there, with a heading if the vehicle can sway.
-
-    A vehicle without sway faces its goal and waits until the current has carried it off again. One
-    that cannot hover circles, and comes through the place with the heading.
-
-    Returns:
-        Distance from the goal, and the error of the requested heading.
-    """
-    _dt_s, estimate, path, guidance, gains, pilot = tick
-    now = estimate[vector.HEADING]
-    dn, de = goal_n - pilot.point[slot.POINT_NORTH], goal_e - pilot.point[slot.POINT_EAST]
-    distance = math.hypot(dn, de)
-    if guidance.under_way.circle_m > 0.0:
-        course, bend = circle_course(
-            goal_n, goal_e, heading, guidance.look_ahead_m, guidance.under_way, pilot.point
-        )
-        head_for(course, bend * path.speed_mps, 0.0, tick)
-        surge_at(path.speed_mps, tick)
-        pilot.report[slot.BY_SWAY] = 0.0
-        return distance, wrap_angle(heading - now)
-    ahead, abeam = math.cos(now) * dn + math.sin(now) * de, math.cos(now) * de - math.sin(now) * dn
-    speed = clamp(_HOVER_SHARE * gains.axes[g.SURGE, g.BANDWIDTH] * ahead, path.speed_mps)
-    hover = guidance.sway > 0.0 and distance < _HOVER_M
-    if hover:
-        error = head_for(heading, 0.0, 0.0, tick)
-    elif distance > guidance.capture_m:
-        error = head_for(math.atan2(de, dn), 0.0, 0.0, tick)
-        speed = path.speed_mps * max(math.cos(error), 0.0)
-    else:
-        facing = pilot.report[slot.TARGET_HEADING]
-        if not math.isfinite(facing):
-            facing = heading
-        error = head_for(facing, 0.0, 0.0, tick)
-    surge_at(speed, tick)
-    if hover:
-        sway_by(-abeam, 0.0, tick)
-    pilot.report[slot.BY_SWAY] = 1.0 if hover else 0.0
-    return distance, error
 
 
 @kernel
@@ -330,7 +287,7 @@ def _minded_m(tick: Tick) -> float:
 def _goal(path: Path, guidance: Guidance, pilot: PilotState) -> tuple[float, float, float]:
     """North, east and heading at the start of the approach to the path."""
     leg, along = int(pilot.report[slot.LEG]), pilot.report[slot.ALONG]
-    if stands(path, leg):
+    if path.stands[leg] > 0.0:
         # Here the vehicle goes to the place itself, with the heading it has there.
         turned = math.copysign(pilot.memory[slot.REF], path.turn_rad[leg])
         n, e, heading, _ = place_at(path, leg, along)
@@ -343,14 +300,41 @@ def _goal(path: Path, guidance: Guidance, pilot: PilotState) -> tuple[float, flo
 @kernel
 def _on_the_way(tick: Tick) -> None:
     """Dive or approach for a tick."""
-    dt_s, estimate, path, guidance, _gains, pilot = tick
+    dt_s, estimate, path, guidance, gains, pilot = tick
     memory, report, point = pilot.memory, pilot.report, pilot.point
     phase = report[slot.PHASE]
     target = _minded_m(tick)
     sink_to(target, memory[slot.FLOOR_SLOPE], tick)
     n, e, heading = _goal(path, guidance, pilot)
-    distance, error = go_to(n, e, heading, tick)
-    dn, de = point[slot.POINT_NORTH] - n, point[slot.POINT_EAST] - e
+    # Go to the goal and stay there, with its heading if the vehicle can sway. One without faces it
+    # and waits until the current has carried it off again. One that cannot hover circles, and comes
+    # through the place with the heading.
+    now, dn, de = estimate[vector.HEADING], n - point[slot.POINT_NORTH], e - point[slot.POINT_EAST]
+    distance, hover = math.hypot(dn, de), False
+    if guidance.under_way.circle_m > 0.0:
+        course, bend = circle_course(
+            n, e, heading, guidance.look_ahead_m, guidance.under_way, point
+        )
+        head_for(course, bend * path.speed_mps, 0.0, tick)
+        surge_at(path.speed_mps, tick)
+        error = wrap_angle(heading - now)
+    else:
+        ahead = math.cos(now) * dn + math.sin(now) * de
+        speed = clamp(_HOVER_SHARE * gains.axes[g.SURGE, g.BANDWIDTH] * ahead, path.speed_mps)
+        hover = guidance.sway > 0.0 and distance < _HOVER_M
+        facing = heading
+        if not hover and distance > guidance.capture_m:
+            facing = math.atan2(de, dn)
+        elif not hover and math.isfinite(report[slot.TARGET_HEADING]):
+            facing = report[slot.TARGET_HEADING]
+        error = head_for(facing, 0.0, 0.0, tick)
+        if not hover and distance > guidance.capture_m:
+            speed = path.speed_mps * max(math.cos(error), 0.0)
+        surge_at(speed, tick)
+    if hover:
+        sway_by(-(math.cos(now) * de - math.sin(now) * dn), 0.0, tick)
+    report[slot.BY_SWAY] = 1.0 if hover else 0.0
+    dn, de = -dn, -de
     report[slot.CROSS] = de * math.cos(heading) - dn * math.sin(heading)
     report[slot.PATH_HEADING], report[slot.LINE] = heading, -1.0
 
@@ -383,7 +367,7 @@ def _on_the_way(tick: Tick) -> None:
         swings or memory[slot.SETTLED_S] > (_SETTLE_S if guidance.sway > 0.0 else 0.0)
     ):
         memory[slot.STANDING] = 0.0
-        if not stands(path, int(report[slot.LEG])):
+        if path.stands[int(report[slot.LEG])] == 0.0:
             report[slot.ALONG] -= guidance.way_in_m
         _enter(pilot, slot.FOLLOW)
 
@@ -394,7 +378,7 @@ def _on_path(tick: Tick) -> None:
     dt_s, estimate, path, guidance, gains, pilot = tick
     memory, report, point = pilot.memory, pilot.report, pilot.point
     leg, along, over = int(report[slot.LEG]), report[slot.ALONG], False
-    if memory[slot.STANDING] == 0.0 and stands(path, leg):
+    if memory[slot.STANDING] == 0.0 and path.stands[leg] > 0.0:
         start_standing(memory[slot.REF], 0.0, pilot)
     elif memory[slot.STANDING] == 0.0:
         leg, along, over = advance(
@@ -425,7 +409,7 @@ def _on_path(tick: Tick) -> None:
         if not over:
             report[slot.LEG], report[slot.ALONG] = leg + 1, 0.0
             start_standing(0.0, 0.0, pilot)
-            if not stands(path, leg + 1):
+            if path.stands[leg + 1] == 0.0:
                 memory[slot.STANDING], heading = 0.0, estimate[vector.HEADING]
                 memory[slot.SURGE_SUM] = memory[slot.PLACE_SUM_N] * math.cos(heading) + memory[
                     slot.PLACE_SUM_E

@@ -325,18 +325,40 @@ def manoeuvre(step: Array, heave_m: float, settings: Array, tick: Tick) -> bool:
         tick: what is read, and the pilot that is written.
     """
     dt_s, estimate, _path, guidance, gains, pilot = tick
-    memory = pilot.memory
+    memory, point, heading = pilot.memory, pilot.point, estimate[vector.HEADING]
     parks = step[KIND] == KEEP or step[KIND] == ANCHOR
     if not parks or memory[slot.KEEPS] == 0.0:
         tolerance = PARK_APPROACH_M if parks else step[TOLERANCE]
-        done = _section(step, tolerance, heave_m, settings, tick)
+        now, north, east = heading, point[slot.POINT_NORTH], point[slot.POINT_EAST]
+        to_end = math.hypot(step[END_N] - north, step[END_E] - east)
+        to_start = math.hypot(memory[slot.FROM_N] - north, memory[slot.FROM_E] - east)
+        heading = aim(
+            north, east, memory[slot.FROM_N], memory[slot.FROM_E], step[END_N], step[END_E],
+            settings[_DELTA],
+        )  # fmt: skip
+        speed = min(step[SPEED], settings[_MAX_SURGE])
+        near = min(to_end, to_start) / max(settings[_RAMP], 1e-9)
+        if 0.0 < near < 1.0:
+            speed -= (speed - min(settings[_MIN_SURGE], speed)) * (1.0 - near)
+        if to_end < _STOPS * tolerance:
+            speed = 0.0
+        if to_end < _STRAIGHT * tolerance:
+            heading = now
+        off = abs(wrap_angle(heading - now))
+        speed *= min(max((_YAW_STOP_RAD - off) / (_YAW_STOP_RAD - _YAW_FREE_RAD), 0.0), 1.0)
+        head_for(heading, 0.0, 0.0, tick)
+        surge_at(speed, tick)
+        pilot.report[slot.BY_SWAY] = 0.0
+        done = to_end < tolerance and abs(heave_m) < settings[_TOLERANCE_Z]
         done = done or memory[slot.STEP_S] > memory[slot.TIMEOUT_S]
         if done and parks:
             memory[slot.KEEPS] = 1.0
-            heading, speed = estimate[vector.HEADING], pilot.point[slot.SURGE_SPEED]
-            held = memory[slot.SURGE_SUM] - (1.0 - gains.axes[g.SURGE, g.WEIGHT]) * speed
-            memory[slot.PLACE_SUM_N] = held * math.cos(heading)
-            memory[slot.PLACE_SUM_E] = held * math.sin(heading)
+            unseen = (1.0 - gains.axes[g.SURGE, g.WEIGHT]) * point[slot.SURGE_SPEED]
+            held = memory[slot.SURGE_SUM] - unseen
+            memory[slot.PLACE_SUM_N], memory[slot.PLACE_SUM_E] = (
+                held * math.cos(now),
+                held * math.sin(now),
+            )
         return bool(done and not parks)
     memory[slot.HELD_S] += dt_s
     if step[KIND] == KEEP:  # by surge and sway, or by surge alone without thrusters for it
@@ -386,34 +408,6 @@ def aim(
     if delta_m <= to_end:
         ahead = math.sqrt(max(delta_m * delta_m - cross * cross, 0.0))
     return beta - math.atan2(cross, ahead)
-
-
-@kernel
-def _section(step: Array, tolerance_m: float, heave_m: float, settings: Array, tick: Tick) -> bool:
-    """Follow a section for a tick; return whether its end is reached."""
-    estimate, pilot = tick.estimate, tick.pilot
-    memory, point, now = pilot.memory, pilot.point, estimate[vector.HEADING]
-    north, east = point[slot.POINT_NORTH], point[slot.POINT_EAST]
-    to_end = math.hypot(step[END_N] - north, step[END_E] - east)
-    to_start = math.hypot(memory[slot.FROM_N] - north, memory[slot.FROM_E] - east)
-    heading = aim(
-        north, east, memory[slot.FROM_N], memory[slot.FROM_E], step[END_N],
-        step[END_E], settings[_DELTA],
-    )  # fmt: skip
-    speed = min(step[SPEED], settings[_MAX_SURGE])
-    near = min(to_end, to_start) / max(settings[_RAMP], 1e-9)
-    if 0.0 < near < 1.0:
-        speed -= (speed - min(settings[_MIN_SURGE], speed)) * (1.0 - near)
-    if to_end < _STOPS * tolerance_m:
-        speed = 0.0
-    if to_end < _STRAIGHT * tolerance_m:
-        heading = now
-    off = abs(wrap_angle(heading - now))
-    speed *= min(max((_YAW_STOP_RAD - off) / (_YAW_STOP_RAD - _YAW_FREE_RAD), 0.0), 1.0)
-    head_for(heading, 0.0, 0.0, tick)
-    surge_at(speed, tick)
-    pilot.report[slot.BY_SWAY] = 0.0
-    return bool(to_end < tolerance_m and abs(heave_m) < settings[_TOLERANCE_Z])
 
 
 NO_LAW, COLA2, ARDUSUB = 0, 1, 2

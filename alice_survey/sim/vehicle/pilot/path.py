@@ -48,6 +48,8 @@ class Path(NamedTuple):
     """(L,) angle of a turn on the spot, positive to starboard; 0 of all other legs."""
     side_rad: Array
     """(L,) heading minus course: 0 where the vehicle goes ahead, +-pi/2 in a sway step."""
+    stands: Array
+    """(L,) 1 of turns on the spot and sway steps, else 0."""
     stop: Array
     """(L,) 1 where the vehicle comes to rest at the leg's end, else 0."""
     altitude_m: float
@@ -131,6 +133,7 @@ def path_from_legs(
         begins_m=np.concatenate([[0.0], np.cumsum(length)[:-1]]),
         turn_rad=turns,
         side_rad=side,
+        stands=standing.astype(np.float64),
         stop=(standing | np.append(standing[1:], False)).astype(np.float64),
         altitude_m=float(altitude_m),
         speed_mps=float(speed_mps),

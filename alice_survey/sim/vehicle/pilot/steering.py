@@ -35,7 +35,7 @@ from alice_survey.sim.vehicle.pilot import gains as g
 from alice_survey.sim.vehicle.pilot import memory as slot
 from alice_survey.sim.vehicle.pilot.gains import Gains
 from alice_survey.sim.vehicle.pilot.memory import PilotState
-from alice_survey.sim.vehicle.pilot.path import Path, place_at
+from alice_survey.sim.vehicle.pilot.path import place_at
 from alice_survey.sim.vehicle.pilot.safety import restart_watch
 from alice_survey.sim.vehicle.pilot.settings import MAX_PITCH_RAD, Guidance, Tick
 from alice_survey.sim.vehicle.rotations import wrap_angle
@@ -98,31 +98,6 @@ def sum_bound(gains: Gains, axis: int) -> float:
     if row[g.INNER] == 0.0:
         return 0.0
     return float(max(-row[g.MIN_FORCE], row[g.MAX_FORCE]) / (row[g.MASS] * row[g.INNER]))
-
-
-@kernel
-def speed_demand(
-    gains: Gains, axis: int, target: float, speed: float, full: float, total: float, dt_s: float
-) -> tuple[float, float]:
-    """A PI on speed whose proportional part sees a share of the target speed (gains.py).
-
-    Args:
-        gains: gains of all axes.
-        axis: row of gains.
-        target: speed.
-        speed: measured.
-        full: +1 or -1 where the force is cut at its greatest or least, else 0.
-        total: the integral part, as a speed.
-        dt_s: the tick.
-
-    Returns:
-        The acceleration, and the new integral.
-    """
-    row, error = gains.axes[axis], target - speed
-    if full * error <= 0.0:
-        step = row[g.PLACE] / row[g.RATE] * error * dt_s
-        total = clamp(total + step, sum_bound(gains, axis))
-    return row[g.RATE] * (row[g.WEIGHT] * target - speed + total), total
 
 
 @kernel
@@ -314,14 +289,18 @@ def head_for(heading: float, feed: float, quicken: float, tick: Tick) -> float:
 
 @kernel
 def surge_at(speed: float, tick: Tick) -> None:
-    """Command a surge of the followed point over ground, as far as the sea floor permits."""
+    """Command a surge of the followed point over ground, as far as the sea floor permits.
+
+    A PI on speed whose proportional part sees a share of the target speed (gains.py).
+    """
     dt_s, _estimate, _path, guidance, gains, pilot = tick
-    memory, demand = pilot.memory, pilot.demand
+    memory, demand, row = pilot.memory, pilot.demand, gains.axes[g.SURGE]
     speed *= memory[slot.PACE]
     now = pilot.point[slot.SURGE_SPEED]
-    demand[slot.ACC_SURGE], memory[slot.SURGE_SUM] = speed_demand(
-        gains, g.SURGE, speed, now, demand[slot.FULL_SURGE], memory[slot.SURGE_SUM], dt_s
-    )
+    if demand[slot.FULL_SURGE] * (speed - now) <= 0.0:
+        step = row[g.PLACE] / row[g.RATE] * (speed - now) * dt_s
+        memory[slot.SURGE_SUM] = clamp(memory[slot.SURGE_SUM] + step, sum_bound(gains, g.SURGE))
+    demand[slot.ACC_SURGE] = row[g.RATE] * (row[g.WEIGHT] * speed - now + memory[slot.SURGE_SUM])
     demand[slot.REF_SURGE] = speed + demand[slot.REF_YAW] * guidance.point_body_m[1]
     pilot.report[slot.TARGET_SURGE] = speed
 
@@ -371,12 +350,6 @@ _BEHIND_M = 0.3
 _BEHIND_RAD = math.radians(20.0)
 """Lag beyond which the reference slows down; it waits at twice of it."""
 _TINY = 1e-12
-
-
-@kernel
-def stands(path: Path, leg: int) -> bool:
-    """Whether a leg is a turn on the spot or a sway step."""
-    return bool(path.turn_rad[leg] != 0.0 or path.side_rad[leg] != 0.0)
 
 
 @kernel

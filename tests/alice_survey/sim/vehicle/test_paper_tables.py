@@ -2,7 +2,6 @@
 
 import json
 import math
-from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -16,7 +15,6 @@ from alice_survey.sim.vehicle.paper_tables import (
     ESTIMATED,
     ROWS,
     CoefficientRow,
-    coefficients_report,
 )
 
 
@@ -69,16 +67,11 @@ def test_the_surge_fit_is_about_the_water_inside() -> None:
     assert fit.paper_other - fit.paper == pytest.approx(-inside_kg, rel=0.05)
 
 
-def test_the_command_prints_and_writes_every_row(tmp_path: Path) -> None:
-    picture = tmp_path / "picture.svg"
-    done = CliRunner().invoke(app, ["vehicle", "coefficients", "--plot", str(picture), "--json"])
+def test_the_command_prints_every_row() -> None:
+    done = CliRunner().invoke(app, ["vehicle", "coefficients", "--json"])
     assert done.exit_code == 0, done.output
     data = json.loads(done.output)
     assert len(data["rows"]) == 58
     for each, shown in zip(ROWS, data["rows"], strict=True):
         assert (each.coefficient, each.computed) == (shown["coefficient"], shown["computed"])
-    first = picture.read_bytes()
-    assert b"N_rr" in first
-    _, values = coefficients_report(plot=picture)
-    assert values["counts"] == {"reproduced": 7, "near": 12, "no": 39}
-    assert picture.read_bytes() == first
+    assert data["counts"] == {"reproduced": 7, "near": 12, "no": 39}

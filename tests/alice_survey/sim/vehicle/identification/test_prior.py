@@ -86,7 +86,6 @@ def test_priors_are_read() -> None:
     assert read_prior("none") is None
     assert read_prior("") == PriorSigmas()
     assert read_prior("0.2") == PriorSigmas(damping=0.2, added_mass=0.2, lift=0.2, gain=0.2)
-    assert read_prior("gain=2, lift=inf") == PriorSigmas(gain=2.0, lift=math.inf)
-    for wrong in ("wide", "drag=0.5", "0.5,0.2", "gain=0", "gain=nan", "gain=-1"):
+    for wrong in ("wide", "0.5,0.2", "0", "nan", "-1"):
         with pytest.raises(VehicleError):
             read_prior(wrong)

@@ -8,12 +8,8 @@ from alice_survey.core.frames import Array, rotation_from_attitude
 from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.identification.parameters import Parameters, free_parameters
 from alice_survey.sim.vehicle.identification.sensitivity import (
-    CHANNELS,
     START,
-    STATES,
     Record,
-    Terms,
-    scratch_for,
     simulate,
     with_given,
 )
@@ -48,18 +44,8 @@ def run(
     slopes: bool = True,
     step_s: float = STEP_S,
 ) -> tuple[Array, Array, Array]:
-    columns = len(values) + START if slopes else 0
-    nothing = np.zeros(0, np.int64)
-    terms = parameters.terms if slopes else Terms(nothing, nothing, nothing)
-    rows = len(record.time_s)
-    states, observed = np.empty((rows, STATES)), np.empty((rows, CHANNELS))
-    derivatives = np.empty((rows, CHANNELS, columns))
     physics = with_given(parameters.physics(values), given)
-    simulate(
-        physics, terms, record, start, step_s, scratch_for(columns, record.rps.shape[1]),
-        np.zeros((STATES, columns)), states, observed, derivatives,
-    )  # fmt: skip
-    return states, observed, derivatives
+    return simulate(physics, parameters.terms if slopes else None, record, start, step_s)
 
 
 def a_start() -> Array:
