@@ -7,7 +7,6 @@ Logs in foreign columns and frames: a TOML file, `ColumnMap`, defines their mean
 """
 
 import csv
-import difflib
 import itertools
 import math
 from collections.abc import Mapping, Sequence
@@ -160,7 +159,7 @@ def read_vehicle_log(path: Path) -> VehicleLog:
 def log_of_columns(columns: Mapping[str, Array], source: str) -> VehicleLog:
     """A log of named columns, (T,) each, as in the CSV; see `read_vehicle_log`."""
     if TIME not in columns:
-        raise VehicleError(f"{source}: column {TIME} is missing{_near(TIME, columns)}")
+        raise VehicleError(f"{source}: column {TIME} is missing")
     merged = _in_time(dict(columns), source)
     count = len(merged[TIME])
 
@@ -175,10 +174,6 @@ def log_of_columns(columns: Mapping[str, Array], source: str) -> VehicleLog:
         for name, value in merged.items()
         if name not in _KNOWN and not _is_rpm(name) and not _is_thrust(name)
     }
-    for name in others:
-        near = difflib.get_close_matches(name, set(_KNOWN) - set(merged), n=1, cutoff=0.8)
-        if near:
-            warn(f"{source}: column {name} is not used; is it {near[0]}?")
     return VehicleLog(
         source=source, time_s=merged[TIME], position_ned=table(POSITION),
         quaternion_xyzw=_quaternions(merged, source), velocity_body=table(VELOCITY),
@@ -264,11 +259,6 @@ def _is_thrust(name: str) -> bool:
 
 def _is_used(name: str) -> bool:
     return name in _KNOWN or _is_rpm(name) or _is_thrust(name)
-
-
-def _near(name: str, columns: Mapping[str, Array]) -> str:
-    near = difflib.get_close_matches(name, columns, n=1, cutoff=0.5)
-    return f"; is {near[0]!r} meant?" if near else ""
 
 
 def _in_time(columns: dict[str, Array], source: str) -> dict[str, Array]:

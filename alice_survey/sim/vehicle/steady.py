@@ -13,6 +13,7 @@ the laws of `dynamics` and `fins`). Roll is left to the low centre of gravity.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -39,6 +40,18 @@ _SPEEDS_MPS = (0.05, 10.0)
 _WIDEST_M = 1000.0
 _BALANCED = 1e-6
 """Residual forces, N and N m, of a steady flight over those of the fins."""
+
+
+def bisect(holds: Callable[[float], bool], yes: float, no: float, tolerance: float) -> float:
+    """Where something ceases to hold, between a value for which it does and one for which not.
+
+    Returns:
+        The last value found for which it holds.
+    """
+    while abs(yes - no) > tolerance:
+        middle = 0.5 * (yes + no)
+        yes, no = (middle, no) if holds(middle) else (yes, middle)
+    return yes
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -138,16 +151,12 @@ def min_radius_m(vehicle: Vehicle, speed_mps: float, share: float) -> float:
         rates = (speed_mps / radius_m, -speed_mps / radius_m)
         return all(fin_flight(vehicle, speed_mps, rate, share) is not None for rate in rates)
 
-    wide, tight = _WIDEST_M, _WIDEST_M
-    if not turns(wide):
+    tight = _WIDEST_M
+    if not turns(tight):
         raise VehicleError(too_slow(vehicle, speed_mps, share))
     while tight > 0.1 and turns(tight / 1.2):
         tight /= 1.2
-    wide, tight = tight, tight / 1.2
-    while wide - tight > 1e-3:
-        middle = 0.5 * (wide + tight)
-        wide, tight = (middle, tight) if turns(middle) else (wide, middle)
-    return wide
+    return bisect(turns, tight, tight / 1.2, 1e-3)
 
 
 @lru_cache(maxsize=64)
@@ -161,22 +170,18 @@ def min_speed_mps(vehicle: Vehicle, share: float) -> float:
     Raises:
         VehicleError: there is none.
     """
+
+    def flies(speed: float) -> bool:
+        return fin_flight(vehicle, speed, 0.0, share) is not None
+
     speeds = np.geomspace(*_SPEEDS_MPS, 60).tolist()
-    flies = [fin_flight(vehicle, speed, 0.0, share) is not None for speed in speeds]
-    if not any(flies):
+    first = next((k for k, speed in enumerate(speeds) if flies(speed)), None)
+    if first is None:
         raise VehicleError(
             f"the fins of {vehicle.name} hold it level at no speed: check their places, areas and "
             "shafts, and weight and buoyancy"
         )
-    first = flies.index(True)
-    if first == 0:
-        return float(speeds[0])
-    low, high = speeds[first - 1], speeds[first]
-    while high - low > 1e-4:
-        middle = 0.5 * (low + high)
-        flies_there = fin_flight(vehicle, middle, 0.0, share) is not None
-        low, high = (low, middle) if flies_there else (middle, high)
-    return float(high)
+    return bisect(flies, speeds[first], speeds[max(first - 1, 0)], 1e-4)
 
 
 def too_slow(vehicle: Vehicle, speed_mps: float, share: float) -> str:

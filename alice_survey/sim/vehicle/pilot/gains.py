@@ -56,7 +56,7 @@ from alice_survey.sim.vehicle.allocation import (
 )
 from alice_survey.sim.vehicle.dynamics import Body, coriolis_matrix
 from alice_survey.sim.vehicle.fins import Fins, fin_slope, pack_fins
-from alice_survey.sim.vehicle.steady import balance_fins, min_radius_m
+from alice_survey.sim.vehicle.steady import balance_fins, bisect, min_radius_m
 from alice_survey.sim.vehicle.vehicle import Vehicle
 
 LATERAL, VERTICAL = (1, 5), (2, 4)
@@ -549,8 +549,4 @@ def pitch_divergence_speed_mps(vehicle: Vehicle) -> float:
         high += _STEP_MPS
         if high > _MAX_MPS:
             return math.inf
-    low = high - _STEP_MPS
-    while high - low > 1e-6:
-        middle = 0.5 * (low + high)
-        low, high = (low, middle) if grows(middle) else (middle, high)
-    return high
+    return bisect(grows, high, high - _STEP_MPS, 1e-6)

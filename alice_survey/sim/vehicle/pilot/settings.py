@@ -23,6 +23,7 @@ from alice_survey.sim.vehicle.pilot.gains import Gains, coupled_pair, damping_ra
 from alice_survey.sim.vehicle.pilot.memory import PilotState
 from alice_survey.sim.vehicle.pilot.path import Path
 from alice_survey.sim.vehicle.pilot.safety import SafetyLimits
+from alice_survey.sim.vehicle.steady import bisect
 
 TURN_IN_PLACE_RAD_S = math.radians(15.0)
 """Rate of a turn on the spot: half of the fastest that gains.py lets a vehicle ask for (inferred).
@@ -433,7 +434,4 @@ def _min_m(damping: Callable[[float], float]) -> float:
     if first == 0:
         return CONTROL_LENGTH_M
     low, high = float(_LOOK_AHEADS_M[first - 1]), float(_LOOK_AHEADS_M[first])
-    while high - low > 1e-3:
-        middle = 0.5 * (low + high)
-        low, high = (low, middle) if damping(middle) >= LOS_DAMPING_RATIO else (middle, high)
-    return high
+    return bisect(lambda ahead_m: damping(ahead_m) >= LOS_DAMPING_RATIO, high, low, 1e-3)

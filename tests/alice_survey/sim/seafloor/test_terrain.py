@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 
 from alice_survey.core.config import SeafloorConfig
 from alice_survey.core.errors import WorkspaceError
-from alice_survey.sim.seafloor.relief import LENGTH_M, amphora_mesh
 from alice_survey.sim.seafloor.terrain import (
     CERAMIC,
+    LENGTH_M,
     Terrain,
+    amphora_mesh,
     build_terrain,
     read_terrain,
     survey_terrain,
