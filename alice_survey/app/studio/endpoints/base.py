@@ -103,6 +103,12 @@ def _validate(make: Callable[[], M]) -> M:
         raise AliceError(f"the request: {first_fault(error, 'its body')}") from None
 
 
+class FormatRequest(Config):
+    """A format to export."""
+
+    format: str = ""
+
+
 class TileRequest(Config):
     """A tile of a picture or of a layer, of some version."""
 

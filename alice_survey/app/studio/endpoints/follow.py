@@ -12,7 +12,14 @@ from typing import Any
 import cv2
 import numpy as np
 
-from alice_survey.app.studio.endpoints.base import Call, Content, Endpoint, Studio, zip_files
+from alice_survey.app.studio.endpoints.base import (
+    Call,
+    Content,
+    Endpoint,
+    FormatRequest,
+    Studio,
+    zip_files,
+)
 from alice_survey.core.config import Config
 from alice_survey.core.contents import one_line
 from alice_survey.core.errors import AliceError, NavigationError, known_fault
@@ -45,10 +52,6 @@ class _Open(Config):
 class _Since(Config):
     after: float = -1e9
     """Seconds of the last fix that the page has."""
-
-
-class _Export(Config):
-    format: str = ""
 
 
 class FollowTab:
@@ -181,7 +184,7 @@ class FollowTab:
     def export(self, call: Call) -> Content:
         """The plan over the holes as missions for vehicles: one format or all, zipped."""
         dive = self._require_dive()
-        requested = call.ask(_Export).format
+        requested = call.ask(FormatRequest).format
         with dive.lock:
             plan = dive.proposal
         if plan is None:

@@ -18,6 +18,7 @@ from alice_survey.app.studio.endpoints.base import (
     Call,
     Content,
     Endpoint,
+    FormatRequest,
     Studio,
     zip_files,
 )
@@ -90,10 +91,6 @@ class PlanRequest(Config):
 class _AreaFile(Config):
     name: str
     role: Literal["survey", "no_go", "allowed"] = "survey"
-
-
-class _ExportFile(Config):
-    format: str = ""
 
 
 @dataclass(frozen=True)
@@ -256,7 +253,7 @@ class _PlanTab:
 
     def export(self, call: Call) -> Content:
         """A file of the saved plan; of one a dive all of them, zipped."""
-        name = call.ask(_ExportFile).format
+        name = call.ask(FormatRequest).format
         files = format_named(name).files
         folder = self.studio.workspace.folder / "plan"
         plan = read_plan(self.studio.workspace.file(["plan", "plan.json"]))
