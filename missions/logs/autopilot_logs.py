@@ -455,7 +455,7 @@ _ULG: Mapping[str, tuple[Source, ...]] = {
 }
 
 
-def _needed(sources: Mapping[str, tuple[Source, ...]], *others: str) -> set[str]:
+def _messages_of(sources: Mapping[str, tuple[Source, ...]], *others: str) -> set[str]:
     return {source.message for some in sources.values() for source in some} | {*others}
 
 
@@ -472,9 +472,9 @@ def read_ardusub_bin(
     Raises:
         NavigationError: it is not such a log, or lacks what navigation needs.
     """
-    log = read_dataflash(path, _needed(_BIN, "GPS", "ORGN", "PARM"))
+    log = read_dataflash(path, _messages_of(_BIN, "GPS", "ORGN", "PARM"))
     offset_s = _ardusub_offset(log.tables)
-    timed = _timed(log.tables, "TimeUS", offset_s)
+    timed = _add_times(log.tables, "TimeUS", offset_s)
     if datum is not None:
         values = {"Type": 0.0, "Lat": datum.latitude_deg, "Lng": datum.longitude_deg}
         columns = {name: np.array([value]) for name, value in values.items()}
@@ -490,7 +490,7 @@ def read_ardusub_bin(
 
 def read_ardusub_tlog(path: Path, requested: Mapping[str, str]) -> LoggedDive:
     """Read a ground station's log; arguments and errors as of `read_ardusub_bin`."""
-    log = read_tlog(path, _needed(_TLOG, "HEARTBEAT"))
+    log = read_tlog(path, _messages_of(_TLOG, "HEARTBEAT"))
     beats = log.tables.get("HEARTBEAT")
     tables = {name: table for name, table in log.tables.items() if name != "HEARTBEAT"}
     vehicle = _vehicle(replace(log, tables=tables))
@@ -511,17 +511,17 @@ def read_ardusub_tlog(path: Path, requested: Mapping[str, str]) -> LoggedDive:
 
 def read_px4_ulog(path: Path, requested: Mapping[str, str]) -> LoggedDive:
     """Read an on-board log of PX4; arguments and errors as of `read_ardusub_bin`."""
-    log = read_ulog(path, _needed(_ULG))
+    log = read_ulog(path, _messages_of(_ULG))
     offset_s = _px4_offset(log.tables)
     return dive_from(
-        replace(log, tables=_timed(log.tables, "timestamp", offset_s)), _ULG, requested,
+        replace(log, tables=_add_times(log.tables, "timestamp", offset_s)), _ULG, requested,
         kind="an on-board log of PX4",
         clock=_clock(offset_s),
         dated=offset_s is not None,
     )  # fmt: skip
 
 
-def _timed(tables: Tables, field: str, offset_s: float | None) -> dict[str, LogTable]:
+def _add_times(tables: Tables, field: str, offset_s: float | None) -> dict[str, LogTable]:
     """Those tables that have a field of microseconds, with `time_s`."""
     return {
         name: replace(

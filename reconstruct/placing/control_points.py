@@ -161,7 +161,7 @@ def read_control(path: Path) -> Control:
     points, lengths = [], []
     for row, fault in _rows(path, ("kind", "name", "use")):
         with fault:
-            known = _known(row)
+            known = _read_known(row)
         if isinstance(known, KnownPoint):
             points.append(known)
         else:
@@ -217,7 +217,7 @@ def _fault_of(place: str) -> Iterator[None]:
         raise WorkspaceError(f"{place}: {error}") from None
 
 
-def _known(row: dict[str, str]) -> KnownPoint | KnownLength:
+def _read_known(row: dict[str, str]) -> KnownPoint | KnownLength:
     """What a row of `control.csv` says.
 
     Raises:
