@@ -137,7 +137,7 @@ def area_settings(
         if not same:
             points = now.marks[1] if role == "no_go" else ()
             values |= {key: None for key in keys if key in settings.model_fields_set}
-            values |= _stored(role, polygons, lines[role], points, frame, files)
+            values |= _store(role, polygons, lines[role], points, frame, files)
     if not values:
         return {}, {}
     if len(settings.datum_given) < 2 and (not frame.datum_is_given or "file" in values):
@@ -247,7 +247,7 @@ def _same_lines(one: Sequence[Open], other: Sequence[Open]) -> bool:
     )
 
 
-def _stored(
+def _store(
     role: str,
     polygons: Sequence[DrawnPolygon],
     lines: Sequence[Any],
