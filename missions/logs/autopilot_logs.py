@@ -18,22 +18,22 @@ import math
 import os
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from alice_survey.core.contents import one_line
 from alice_survey.core.errors import NavigationError, warn, why
-from alice_survey.core.frames import Array, Datum, attitude_from_rotation
+from alice_survey.core.frames import Array, Datum
 from missions.logs.dive import (
     DATED_AFTER_S,
     ROLES,
     LoggedDive,
     Signal,
+    angles_of,
     clean_signal,
     usable_positions,
 )
@@ -74,31 +74,28 @@ _REBOOT_S = 1.0
 Mask = NDArray[np.bool_]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class LogTable:
-    """All messages of one name."""
+class LackError(Exception):
+    """A log lacks what a reader needs; the text says what."""
 
-    name: str
-    columns: dict[str, Array]
-    """(N,) numbers by field."""
-    texts: dict[str, list[str]] = field(default_factory=dict)
-    """Fields of text."""
 
-    def __len__(self) -> int:
-        return len(next(iter(self.columns.values()), ()))
+class LogTable(dict[str, Array]):
+    """All messages of one name: (N,) columns by field."""
 
-    def has(self, *names: str) -> bool:
-        """Whether all of these columns are there."""
-        return all(name in self.columns for name in names)
+    def __missing__(self, name: str) -> Array:
+        raise LackError(f"it lacks {name}")
 
-    def rows(self, keep: Mask) -> "LogTable":
-        """The rows of numbers where a mask, (N,), holds."""
-        columns = {name: column[keep] for name, column in self.columns.items()}
-        return LogTable(name=self.name, columns=columns)
+    def rows(self, keep: Mask | NDArray[np.intp]) -> "LogTable":
+        """The rows that a mask, (N,), marks, or those of some numbers."""
+        return LogTable({name: column[keep] for name, column in self.items()})
 
     def stack(self, *names: str) -> Array:
         """Columns side by side, (N, k)."""
-        return np.stack([self.columns[name] for name in names], axis=1)
+        return np.stack([self[name] for name in names], axis=1)
+
+
+Tables = Mapping[str, LogTable]
+Reader = Callable[[LogTable, Tables], tuple[Array, Array]]
+"""Takes the table of a message, and all tables, to times and values; raises `LackError`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -112,11 +109,6 @@ class MessageLog:
     """Names of all messages."""
     lost: Counter[str]
     """What could not be read or used; is added to."""
-
-
-Tables = Mapping[str, LogTable]
-Reader = Callable[[LogTable, Tables], tuple[Array, Array] | str]
-"""Takes the table of a message, and all tables, to times and values, or to what is missing."""
 
 
 @dataclass(frozen=True)
@@ -135,31 +127,13 @@ _SIGMA_COLUMNS = {"navigation": "sigma_horizontal_m", "depth": "sigma_depth_m"}
 
 
 def take(
-    *fields: str,
-    scale: float = 1.0,
-    where: Callable[[LogTable], Mask] | None = None,
-    needs: Collection[str] = (),
-    absent: float | None = None,
+    *fields: str, scale: float = 1.0, where: Callable[[LogTable], Mask] | None = None
 ) -> Reader:
-    """Read fields of a message.
+    """Read fields of a message, times a factor, in the rows that `where` marks."""
 
-    Args:
-        fields: names.
-        scale: factor on all.
-        where: marks rows to use.
-        needs: fields that `where` needs.
-        absent: value that stands for NaN.
-    """
-
-    def read(table: LogTable, _: Tables) -> tuple[Array, Array] | str:
-        if not table.has(*fields, *needs):
-            missing = [name for name in (*fields, *needs) if not table.has(name)]
-            return f"it lacks {', '.join(missing)}"
+    def read(table: LogTable, _: Tables) -> tuple[Array, Array]:
         table = table if where is None else table.rows(where(table))
-        values = table.stack(*fields)
-        if absent is not None:
-            values = np.where(values == absent, np.nan, values)
-        return table.columns["time_s"], values * scale
+        return table["time_s"], table.stack(*fields) * scale
 
     return read
 
@@ -183,24 +157,16 @@ def dive_from(
     """
     found: dict[str, Signal | None] = {}
     sigmas, notes = {}, []
-    counted: set[str] = set()
     for role, some in sources.items():
-        lost: Counter[str] = Counter()
-        found[role], note, sigma = _signal(log, role, some, requested.get(role), lost)
-        signal = found[role]
-        # What the times of a message cost is counted once, though it serves several roles.
-        if signal is not None and signal.source not in counted:
-            counted.add(signal.source)
-            log.lost.update(lost)
+        found[role], note, sigma = _signal(log, role, some, requested.get(role, ""))
         notes += [note] if note else []
         if sigma is not None:
             sigmas[_SIGMA_COLUMNS[role]] = sigma
     if not any(found[role] for role in ROLES):
         names = ", ".join(dict.fromkeys(s.message for role in ROLES for s in sources[role]))
         raise NavigationError(f"{log.path}: none of {names}; it has {', '.join(log.present)}")
-    position = usable_positions(found["navigation"], log.lost)
     return LoggedDive(
-        position=position,
+        position=usable_positions(found["navigation"], log.lost),
         depth=found["depth"],
         attitude=found["attitude"],
         altitude=found["altitude"],
@@ -209,171 +175,136 @@ def dive_from(
         velocity_ned=found["velocity"],
         rates=found["rates"],
         pwm=found["pwm"],
-        lost=dict(log.lost),
+        lost=log.lost,
         notes=tuple(dict.fromkeys(notes)),
         **about,
     )
 
 
 def _signal(
-    log: MessageLog,
-    role: str,
-    sources: Sequence[Source],
-    requested: str | None,
-    lost: Counter[str],
+    log: MessageLog, role: str, sources: Sequence[Source], requested: str
 ) -> tuple[Signal | None, str, Signal | None]:
     """The best source that the log holds, or the requested one, its note and its sigmas."""
-    name, _, instance = (requested or "").removesuffix("]").partition("[")
+    name, _, instance = requested.removesuffix("]").partition("[")
     known = [source.message for source in sources]
     if name and name not in known:
         raise NavigationError(f"{log.path}: {role} can come from {', '.join(known)}, not {name}")
     reason = f"the log has {', '.join(log.present)}"
     for source in sources:
-        table = log.tables.get(source.message)
-        if table is None or (name and source.message != name):
+        message = source.message
+        if message not in log.tables or (name and message != name):
             continue
-        one, others = _one_instance(log.path, role, table, instance, bool(name))
-        if one is None:
+        try:
+            table, others = _one_instance(message, log.tables[message], instance)
+            found = clean_signal(message, *source.read(table, log.tables), log.lost)
+        except LackError as error:
+            reason = str(error)
             continue
-        read = source.read(one, log.tables)
-        if isinstance(read, str):
-            reason = read
-            continue
-        found = clean_signal(source.message, *read, lost) if len(read[0]) else None
         if found is None:
             reason = "none of its rows can be used"
             continue
-        stated = "" if source.sigma is None else source.sigma(one, log.tables)
         sigma = None
-        if not isinstance(stated, str):
-            values = np.where(stated[1] > 0, stated[1], np.nan)
-            sigma = clean_signal(source.message, stated[0], values, Counter())
+        if source.sigma is not None:
+            with contextlib.suppress(LackError):
+                at_s, stated = source.sigma(table, log.tables)
+                positive = np.where(stated > 0, stated, np.nan)
+                sigma = clean_signal(message, at_s, positive, Counter())
         return found, f"{source.note}{others}".strip("; "), sigma
     if name:
         raise NavigationError(f"{log.path}: {requested} gives no {role}: {reason}")
     return None, "", None
 
 
-def _one_instance(
-    path: Path, role: str, table: LogTable, requested: str, named: bool
-) -> tuple[LogTable | None, str]:
+def _one_instance(message: str, table: LogTable, requested: str) -> tuple[LogTable, str]:
     """The rows of one core or sensor, and a note on the others.
 
     Cores and GPS receivers count from the one that is used. Which barometer is the depth sensor
     is not identified by its number, so that one of several must be requested.
     """
-    field = next((name for name in _INSTANCE if name in table.columns), None)
+    field = next((name for name in _INSTANCE if name in table), None)
     if field is None:
         return table, ""
-    known = table.columns[field][np.isfinite(table.columns[field])]
-    numbers = np.unique(known).astype(int).tolist()
+    numbers = np.unique(table[field][np.isfinite(table[field])]).astype(int).tolist()
     names = ", ".join(map(str, numbers))
     if requested:
         if not requested.isdigit() or int(requested) not in numbers:
-            raise NavigationError(f"{path}: {table.name} has {names}, not {requested}")
-        return table.rows(table.columns[field] == int(requested)), ""
-    if len(numbers) < 2 or table.name.upper() in ("RFND", "DISTANCE_SENSOR"):
+            raise LackError(f"{message} has {names}")
+        return table.rows(table[field] == int(requested)), ""
+    if len(numbers) < 2 or message.upper() in ("RFND", "DISTANCE_SENSOR"):
         return table, ""
-    if table.name == "BARO":
-        if not named:
-            return None, ""
-        raise NavigationError(
-            f"{path}: BARO has {names}: choose the depth sensor with "
-            f"--topic {role}=BARO[{numbers[-1]}]"
-        )
-    note = f"; {table.name} {numbers[0]} of {names} is used"
-    return table.rows(table.columns[field] == numbers[0]), note
+    if message == "BARO":
+        raise LackError(f"it has {names}: choose the depth sensor, as in depth=BARO[{numbers[-1]}]")
+    note = f"; {message} {numbers[0]} of {names} is used"
+    return table.rows(table[field] == numbers[0]), note
 
 
-def _from_ardusub_origin(table: LogTable, tables: Tables) -> tuple[Array, Array] | str:
+def _from_ardusub_origin(table: LogTable, tables: Tables) -> tuple[Array, Array]:
     """Latitude and longitude of north and east from the filter's origin (message ORGN, type 0)."""
-    if not table.has("PN", "PE", "PD"):
-        return "it lacks PN, PE or PD"
-    origin = tables.get("ORGN")
-    rows = np.empty(0, np.intp)
-    if origin is not None and origin.has("Type", "Lat", "Lng"):
-        rows = np.flatnonzero(origin.columns["Type"] == 0)
-    if origin is None or not len(rows):
-        return (
+    ned, origin = table.stack("PN", "PE", "PD"), tables.get("ORGN", LogTable(Type=np.empty(0)))
+    rows = np.flatnonzero(origin["Type"] == 0)
+    if not len(rows):
+        raise LackError(
             "it counts from the filter's origin, and the log holds none (ORGN): give it by --datum "
             "LATITUDE LONGITUDE"
         )
-    datum = Datum(*(float(origin.columns[name][rows[-1]]) for name in ("Lat", "Lng")))
-    ned = table.stack("PN", "PE", "PD")
-    return table.columns["time_s"], datum.geodetic_from_ned(ned)[:, :2]
+    datum = Datum(*(float(origin[name][rows[-1]]) for name in ("Lat", "Lng")))
+    return table["time_s"], datum.geodetic_from_ned(ned)[:, :2]
 
 
-def _from_px4_origin(table: LogTable, _: Tables) -> tuple[Array, Array] | str:
+def _from_px4_origin(table: LogTable, _: Tables) -> tuple[Array, Array]:
     """Latitude and longitude of north and east from the filter's origin, which may be set again."""
-    if not table.has("x", "y", "xy_valid", "xy_global", "ref_lat", "ref_lon"):
-        return "it lacks x, y or the filter's origin (xy_global, ref_lat, ref_lon)"
     table = table.rows(
-        (table.columns["xy_valid"] > 0)
-        & (table.columns["xy_global"] > 0)
+        (table["xy_valid"] > 0)
+        & (table["xy_global"] > 0)
         & np.isfinite(table.stack("x", "y", "ref_lat", "ref_lon")).all(axis=1)
     )
-    places = np.full((len(table), 2), np.nan)
-    ne0 = np.column_stack([table.stack("x", "y"), np.zeros(len(table))])
+    ne0 = np.column_stack([table.stack("x", "y"), np.zeros(len(table["x"]))])
+    places = np.full((len(ne0), 2), np.nan)
     origins, of = np.unique(table.stack("ref_lat", "ref_lon"), axis=0, return_inverse=True)
     for number, (latitude, longitude) in enumerate(origins.tolist()):
         if abs(latitude) < 90 and abs(longitude) <= 360:
             rows = of.ravel() == number
             places[rows] = Datum(latitude, longitude).geodetic_from_ned(ne0[rows])[:, :2]
-    return table.columns["time_s"], places
+    return table["time_s"], places
 
 
-def _px4_attitude(table: LogTable, _: Tables) -> tuple[Array, Array] | str:
-    if not table.has(*(f"q[{i}]" for i in range(4))):
-        return "it lacks q"
-    quaternion = table.stack(*(f"q[{i}]" for i in (1, 2, 3, 0)))
-    known = np.abs(np.linalg.norm(quaternion, axis=1) - 1.0) < 0.05
-    angles = np.full((len(table), 3), np.nan)
-    if known.any():
-        turns = Rotation.from_quat(quaternion[known])
-        angles[known] = np.rad2deg(attitude_from_rotation(turns))
-    return table.columns["time_s"], angles
+def _px4_attitude(table: LogTable, _: Tables) -> tuple[Array, Array]:
+    return table["time_s"], angles_of(table.stack(*(f"q[{i}]" for i in (1, 2, 3, 0))))
 
 
 def _place(latitude: str, longitude: str, fix: str, scale: float = 1.0) -> Reader:
     """Positions of a GPS receiver while it has a fix."""
-    return take(
-        latitude, longitude, scale=scale, where=lambda t: t.columns[fix] >= _FIX_3D, needs=(fix,)
-    )
+    return take(latitude, longitude, scale=scale, where=lambda t: t[fix] >= _FIX_3D)
 
 
 def _valid(*fields: str, by: Sequence[str]) -> Reader:
     """Fields of PX4 where its flags say that they hold."""
-    return take(
-        *fields, where=lambda t: np.all([t.columns[name] > 0 for name in by], axis=0), needs=by
-    )
+    return take(*fields, where=lambda t: np.min(t.stack(*by), axis=1) > 0)
 
 
 def _sees_down(table: LogTable) -> Mask:
     """Rows of a range finder that looks down and is in range."""
-    good: Mask = table.columns["Stat"] == _GOOD
-    if "Orient" in table.columns:
-        good &= table.columns["Orient"] == _DOWN
-    return good
+    good: Mask = table["Stat"] == _GOOD
+    return good & (table["Orient"] == _DOWN) if "Orient" in table else good
 
 
 def _hears_bottom(table: LogTable) -> Mask:
     """Rows of a distance sensor that looks down and is within what it measures."""
-    distance = table.columns["current_distance"]
+    distance = table["current_distance"]
     good: Mask = (
-        (table.columns["orientation"] == _DOWN)
-        & (distance >= table.columns["min_distance"])
-        & (distance < table.columns["max_distance"])
-        # Of PX4: a quality of 0 is invalid, one of -1 not known. ArduSub sends 0 for not known.
-        & (
-            (table.columns.get("signal_quality", np.ones(1)) != 0)
-            | (table.name != "distance_sensor")
-        )
+        (table["orientation"] == _DOWN)
+        & (distance >= table["min_distance"])
+        & (distance < table["max_distance"])
     )
     return good
 
 
-_HEARD_BY = ("orientation", "min_distance", "max_distance")
-"""Fields that `_hears_bottom` needs."""
+def _hears_well(table: LogTable) -> Mask:
+    """The same of PX4: a quality of 0 is invalid, one of -1 not known. ArduSub's 0 is not known."""
+    good = _hears_bottom(table)
+    return good & (table["signal_quality"] != 0) if "signal_quality" in table else good
+
+
 _AT_SURFACE = "positions are GPS: they hold at the surface only"
 _BACKUP = "positions are those of the backup attitude filter"
 _DEGREES = float(np.rad2deg(1.0))
@@ -395,7 +326,7 @@ _BIN: Mapping[str, tuple[Source, ...]] = {
     "attitude": tuple(
         Source(message, take("Roll", "Pitch", "Yaw")) for message in ("ATT", "XKF1", "NKF1", "AHR2")
     ),
-    "altitude": (Source("RFND", take("Dist", where=_sees_down, needs=("Stat",))),),
+    "altitude": (Source("RFND", take("Dist", where=_sees_down)),),
     "velocity": tuple(Source(message, take("VN", "VE", "VD")) for message in ("XKF1", "NKF1")),
     "rates": (Source("RATE", take("R", "P", "Y", scale=float(np.deg2rad(1.0)))),),
     "pwm": (Source("RCOU", take(*(f"C{i}" for i in range(1, 9)))),),
@@ -412,11 +343,8 @@ _TLOG: Mapping[str, tuple[Source, ...]] = {
     ),
     "attitude": (Source("ATTITUDE", take("roll", "pitch", "yaw", scale=_DEGREES)),),
     "altitude": (
-        Source(
-            "DISTANCE_SENSOR",
-            take("current_distance", scale=1e-2, where=_hears_bottom, needs=_HEARD_BY),
-        ),
-        Source("RANGEFINDER", take("distance", absent=0.0)),
+        Source("DISTANCE_SENSOR", take("current_distance", scale=1e-2, where=_hears_bottom)),
+        Source("RANGEFINDER", take("distance", where=lambda t: t["distance"] != 0.0)),
     ),
     "velocity": (Source("GLOBAL_POSITION_INT", take("vx", "vy", "vz", scale=1e-2)),),
     "rates": (Source("ATTITUDE", take("rollspeed", "pitchspeed", "yawspeed")),),
@@ -446,9 +374,7 @@ _ULG: Mapping[str, tuple[Source, ...]] = {
         ),
     ),
     "attitude": (Source("vehicle_attitude", _px4_attitude),),
-    "altitude": (
-        Source("distance_sensor", take("current_distance", where=_hears_bottom, needs=_HEARD_BY)),
-    ),
+    "altitude": (Source("distance_sensor", take("current_distance", where=_hears_well)),),
     "velocity": (Source(_LOCAL, _valid("vx", "vy", "vz", by=("v_xy_valid", "v_z_valid"))),),
     "rates": (Source("vehicle_angular_velocity", take(*(f"xyz[{i}]" for i in range(3)))),),
     "pwm": (Source("actuator_outputs", take(*(f"output[{i}]" for i in range(8)))),),
@@ -477,32 +403,33 @@ def read_ardusub_bin(
     timed = _add_times(log.tables, "TimeUS", offset_s)
     if datum is not None:
         values = {"Type": 0.0, "Lat": datum.latitude_deg, "Lng": datum.longitude_deg}
-        columns = {name: np.array([value]) for name, value in values.items()}
-        timed["ORGN"] = LogTable(name="ORGN", columns=columns)
+        timed["ORGN"] = LogTable({name: np.array([value]) for name, value in values.items()})
     return dive_from(
         replace(log, tables=timed), _BIN, requested,
         kind="an on-board log of ArduSub",
         clock=_clock(offset_s),
         dated=offset_s is not None,
-        declination_in_log_deg=_declination(log.tables.get("PARM")),
+        declination_in_log_deg=_declination(log.tables.get("PARM", LogTable())),
     )  # fmt: skip
 
 
 def read_ardusub_tlog(path: Path, requested: Mapping[str, str]) -> LoggedDive:
     """Read a ground station's log; arguments and errors as of `read_ardusub_bin`."""
     log = read_tlog(path, _messages_of(_TLOG, "HEARTBEAT"))
-    beats = log.tables.get("HEARTBEAT")
-    tables = {name: table for name, table in log.tables.items() if name != "HEARTBEAT"}
-    vehicle = _vehicle(replace(log, tables=tables))
-    _warn_of_other_kinds(path, beats, vehicle)
-    recorded = np.concatenate([table.columns[RECORDED] for table in tables.values()])
-    for name, table in tables.items():
-        own = table.rows(table.columns[SYSTEM] == vehicle)
-        if others := len(table) - len(own):
+    beats = log.tables.pop("HEARTBEAT", None)
+    vehicle = _vehicle(log)
+    if beats is not None:
+        _warn_of_other_kinds(path, beats, vehicle)
+    recorded = np.concatenate([table[RECORDED] for table in log.tables.values()])
+    for name, table in log.tables.items():
+        is_own = table[SYSTEM] == vehicle
+        if not is_own.all():
+            others = int((~is_own).sum())
             log.lost[f"{name}: messages of another system than {vehicle:.0f}"] += others
-        tables[name] = replace(own, columns={**own.columns, "time_s": _tlog_times(own)})
+        own = log.tables[name] = table.rows(is_own)
+        own["time_s"] = _tlog_times(own)
     return dive_from(
-        replace(log, tables=tables), _TLOG, requested,
+        log, _TLOG, requested,
         kind="a ground station's log of ArduSub",
         clock="the ground station's clock",
         dated=bool(np.median(recorded) > DATED_AFTER_S),
@@ -524,12 +451,9 @@ def read_px4_ulog(path: Path, requested: Mapping[str, str]) -> LoggedDive:
 def _add_times(tables: Tables, field: str, offset_s: float | None) -> dict[str, LogTable]:
     """Those tables that have a field of microseconds, with `time_s`."""
     return {
-        name: replace(
-            table,
-            columns={**table.columns, "time_s": table.columns[field] * 1e-6 + (offset_s or 0.0)},
-        )
+        name: LogTable(table, time_s=table[field] * 1e-6 + (offset_s or 0.0))
         for name, table in tables.items()
-        if field in table.columns
+        if field in table
     }
 
 
@@ -539,37 +463,37 @@ def _clock(offset_s: float | None) -> str:
 
 def _ardusub_offset(tables: Tables) -> float | None:
     """What makes UTC of seconds since boot: the median over all GPS fixes; None without one."""
-    gps = tables.get("GPS")
-    if gps is None or not gps.has("TimeUS", "GMS", "GWk", "Status"):
+    try:
+        gps = tables.get("GPS", LogTable())
+        fixed = gps.rows((gps["Status"] >= _FIX_3D) & (gps["GWk"] > 0))
+        seconds, boot_us = fixed["GWk"] * _WEEK_S + fixed["GMS"] * 1e-3, fixed["TimeUS"]
+    except LackError:
         return None
-    fixed = gps.rows((gps.columns["Status"] >= _FIX_3D) & (gps.columns["GWk"] > 0))
-    if not len(fixed):
+    if not len(seconds):
         return None
-    seconds = fixed.columns["GWk"] * _WEEK_S + fixed.columns["GMS"] * 1e-3
     starts, ahead = np.array(_LEAPS).T
     leap = ahead[np.argmax(seconds[:, None] >= starts, axis=1)]
     utc = _GPS_EPOCH_S + seconds - leap
-    return float(np.median(utc - fixed.columns["TimeUS"] * 1e-6))
+    return float(np.median(utc - boot_us * 1e-6))
 
 
 def _px4_offset(tables: Tables) -> float | None:
     """The same of PX4."""
     for name in _RECEIVERS:
-        table = tables.get(name)
-        if table is None or not table.has("timestamp", "time_utc_usec", "fix_type"):
-            continue
-        good = (table.columns["fix_type"] >= _FIX_3D) & (table.columns["time_utc_usec"] > 0)
-        if good.any():
-            apart = table.columns["time_utc_usec"][good] - table.columns["timestamp"][good]
-            return float(np.median(apart)) * 1e-6
+        table = tables.get(name, LogTable())
+        with contextlib.suppress(LackError):
+            good = (table["fix_type"] >= _FIX_3D) & (table["time_utc_usec"] > 0)
+            if good.any():
+                apart = table["time_utc_usec"][good] - table["timestamp"][good]
+                return float(np.median(apart)) * 1e-6
     return None
 
 
-def _declination(parameters: LogTable | None) -> float | None:
+def _declination(parameters: LogTable) -> float | None:
     """What the vehicle added to its compass, degrees; NaN where it took it from its own table."""
-    if parameters is None or "Name" not in parameters.texts or "Value" not in parameters.columns:
+    if not {"Name", "Value"} <= parameters.keys():
         return None
-    values = dict(zip(parameters.texts["Name"], parameters.columns["Value"], strict=True))
+    values = dict(zip(parameters["Name"].tolist(), parameters["Value"].tolist(), strict=True))
     if values.get("COMPASS_AUTODEC", 0.0) > 0:
         return math.nan
     declination = values.get("COMPASS_DEC")
@@ -584,15 +508,13 @@ def _vehicle(log: MessageLog) -> float:
         raise NavigationError(
             f"{log.path}: no message of a vehicle; it has {', '.join(log.present)}"
         )
-    systems, counts = np.unique(log.tables[name].columns[SYSTEM], return_counts=True)
+    systems, counts = np.unique(log.tables[name][SYSTEM], return_counts=True)
     return float(systems[np.argmax(counts)])
 
 
-def _warn_of_other_kinds(path: Path, beats: LogTable | None, vehicle: float) -> None:
+def _warn_of_other_kinds(path: Path, beats: LogTable, vehicle: float) -> None:
     """Warn where the vehicle calls itself something else than a submarine."""
-    if beats is None or not beats.has("type"):
-        return
-    kinds = set(beats.columns["type"][beats.columns[SYSTEM] == vehicle].astype(int).tolist())
+    kinds = set(beats["type"][beats[SYSTEM] == vehicle].astype(int).tolist())
     own = sorted(kinds - _NO_VEHICLES)
     if own and _SUBMARINE not in own:
         warn(
@@ -607,11 +529,11 @@ def _tlog_times(table: LogTable) -> Array:
     A message that carries the vehicle's time since boot has that, plus what the quickest message
     of one boot took; the others have the time of their recording.
     """
-    recorded: Array = table.columns[RECORDED]
+    recorded: Array = table[RECORDED]
     # Components of one system may count from separate boots.
-    if "time_boot_ms" not in table.columns or len(np.unique(table.columns[COMPONENT])) > 1:
+    if "time_boot_ms" not in table or len(np.unique(table[COMPONENT])) > 1:
         return recorded
-    boot = table.columns["time_boot_ms"] * 1e-3
+    boot = table["time_boot_ms"] * 1e-3
     session = np.cumsum(np.diff(boot, prepend=boot[:1]) < -_REBOOT_S)
     times = np.empty_like(recorded)
     for number in np.unique(session):
@@ -690,16 +612,15 @@ def _dataflash_table(name: str, messages: Sequence[Any], lost: Counter[str]) -> 
             return math.nan
 
     form = messages[0].fmt
-    columns: dict[str, Array] = {}
-    texts: dict[str, list[str]] = {}
+    table = LogTable()
     for key, kind in zip(form.columns, form.msg_fmts, strict=False):
         if any(key not in message.fmt.colhash for message in messages):
             continue
-        if kind in _TEXTS:
-            texts[key] = [str(getattr(message, key)) for message in messages]
-        elif kind != "M":
-            columns[key] = np.array([number(message, key) for message in messages])
-    return LogTable(name=name, columns=columns, texts=texts)
+        if kind not in (*_TEXTS, "M"):
+            table[key] = np.array([number(message, key) for message in messages])
+        elif key == "Name":  # of parameters
+            table[key] = np.array([str(getattr(message, key)) for message in messages])
+    return table
 
 
 def read_tlog(path: Path, needed: Collection[str]) -> MessageLog:
@@ -742,11 +663,11 @@ def read_tlog(path: Path, needed: Collection[str]) -> MessageLog:
                 )  # fmt: skip
     if not present:
         raise NavigationError(f"{path}: no telemetry log: it holds no MAVLink packet")
-    tables = {}
-    for name, table in rows.items():
-        names = (RECORDED, SYSTEM, COMPONENT, *fields[name])
-        cells = np.array(table, dtype=np.float64).T
-        tables[name] = LogTable(name=name, columns=dict(zip(names, cells, strict=True)))
+    tables = {
+        name: LogTable(zip((RECORDED, SYSTEM, COMPONENT, *fields[name]),
+                           np.array(table, dtype=np.float64).T, strict=True))
+        for name, table in rows.items()
+    }  # fmt: skip
     return MessageLog(path=path, tables=tables, present=sorted(present), lost=lost)
 
 
@@ -780,7 +701,7 @@ def read_ulog(path: Path, needed: Collection[str]) -> MessageLog:
             parts.setdefault(topic.name, []).append(columns)
     return MessageLog(
         path=path,
-        tables={name: _join(name, own) for name, own in parts.items()},
+        tables={name: _join(own) for name, own in parts.items()},
         present=sorted({topic.name for topic in log.data_list}),
         lost=lost,
     )
@@ -815,15 +736,14 @@ def _field_count(
     return total
 
 
-def _join(name: str, parts: list[dict[str, Array]]) -> LogTable:
+def _join(parts: list[dict[str, Array]]) -> LogTable:
     """One table of the messages of several sensors, by time."""
     columns = {
         field: np.concatenate([part[field] for part in parts])
         for field in parts[0]
         if all(field in part for part in parts)
     }
-    order = np.argsort(columns["timestamp"], kind="stable")
-    return LogTable(name=name, columns={f: column[order] for f, column in columns.items()})
+    return LogTable(columns).rows(np.argsort(columns["timestamp"], kind="stable"))
 
 
 def first_bytes(path: Path, count: int) -> bytes:

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from alice_survey.core.frames import Array
+from alice_survey.core.frames import Array, attitude_from_rotation
 from missions.logs.navigation_csv import interpolate
 
 ROLES = ("navigation", "depth", "attitude", "altitude", "velocity")
@@ -20,6 +21,8 @@ DATED_AFTER_S = 1e8
 
 _LATEST_S = 7258118400.0
 """1 January 2200."""
+_UNIT = 0.05
+"""How far from 1 the length of a quaternion may be."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -114,6 +117,15 @@ def finite_number(value: Any) -> float:
     return number if math.isfinite(number) and not isinstance(value, bool) else math.nan
 
 
+def angles_of(xyzw: Array) -> Array:
+    """Roll, pitch, heading, (N, 3) degrees, of quaternions, (N, 4); NaN where not of length 1."""
+    angles = np.full((len(xyzw), 3), np.nan)
+    known = np.abs(np.linalg.norm(xyzw, axis=1) - 1.0) < _UNIT
+    if known.any():
+        angles[known] = np.rad2deg(attitude_from_rotation(Rotation.from_quat(xyzw[known])))
+    return angles
+
+
 def clean_signal(source: str, time_s: Array, values: Array, lost: Counter[str]) -> Signal | None:
     """A signal of the rows whose times increase, the most that can be kept; None without rows.
 
@@ -121,19 +133,19 @@ def clean_signal(source: str, time_s: Array, values: Array, lost: Counter[str]) 
         source: topic or message.
         time_s: (N,) as logged.
         values: (N, k).
-        lost: counts what is left out; is added to.
+        lost: counts what is left out, once for a source that serves several roles; is added to.
     """
     time_s = np.asarray(time_s, dtype=np.float64)
     values = np.asarray(values, dtype=np.float64)
     values = values[:, None] if values.ndim == 1 else values
     good = np.abs(time_s) < _LATEST_S
     if not good.all():
-        lost[f"{source}: the time is not a number, or after 2200"] += int((~good).sum())
+        lost[f"{source}: the time is not a number, or after 2200"] = int((~good).sum())
     time_s, values = time_s[good], values[good]
     values = np.where(np.isfinite(values), values, np.nan)
     keep = _increasing(time_s)
     if len(keep) < len(time_s):
-        lost[f"{source}: the time repeats or goes back"] += len(time_s) - len(keep)
+        lost[f"{source}: the time repeats or goes back"] = len(time_s) - len(keep)
         time_s, values = time_s[keep], values[keep]
     known = np.isfinite(values).any(axis=1)
     if not known.any():

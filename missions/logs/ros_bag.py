@@ -14,18 +14,23 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from alice_survey.core.contents import one_line
 from alice_survey.core.errors import NavigationError
 from alice_survey.core.executor import progress
-from alice_survey.core.frames import Array, Datum, attitude_from_rotation
-from missions.logs.dive import DATED_AFTER_S, LoggedDive, Signal, clean_signal, usable_positions
+from alice_survey.core.frames import Array, Datum
+from missions.logs.dive import (
+    DATED_AFTER_S,
+    LoggedDive,
+    Signal,
+    angles_of,
+    clean_signal,
+    usable_positions,
+)
 from missions.logs.ros_builder import flipped_body, flipped_quaternion, flipped_world
 
 if TYPE_CHECKING:
@@ -59,10 +64,8 @@ _WORLDS = ("map", "odom", "world", "earth")
 """Frames that do not turn with the body."""
 _NOT_ALTITUDE = ("beam", "front", "forward", "fls", "obstacle")
 
-DENSITY_KG_M3, _SURFACE_PA, GRAVITY_MPS2 = 1025.0, 101325.0, 9.80665
+_DENSITY_KG_M3, _SURFACE_PA, _GRAVITY_MPS2 = 1025.0, 101325.0, 9.80665
 """What makes a depth of a pressure; the standard atmosphere (ISO 2533)."""
-_UNIT = 0.05
-"""How far from 1 the length of a quaternion may be."""
 _SIGMAS: Mapping[str, tuple[tuple[str, ...], float]] = {
     "sigma_horizontal_m": (VARIANCES[0:2], 1.0),
     "sigma_depth_m": (VARIANCES[2:3], 1.0),
@@ -72,11 +75,14 @@ _SIGMAS: Mapping[str, tuple[tuple[str, ...], float]] = {
 """For each column of the navigation CSV: which variances make it, and its unit."""
 
 
-@dataclass(frozen=True)
-class _Topic:
+class _Topic(NamedTuple):
     name: str
     kind: str
     """Type without its package."""
+
+    @property
+    def last_name(self) -> str:
+        return self.name.rsplit("/", 1)[-1]
 
 
 def read_ros_bag(path: Path, requested: Mapping[str, str], datum: Datum | None) -> LoggedDive:
@@ -90,27 +96,71 @@ def read_ros_bag(path: Path, requested: Mapping[str, str], datum: Datum | None) 
     Raises:
         NavigationError: it is not a bag, is damaged, or lacks what navigation needs.
     """
+    lost: Counter[str] = Counter()
+    notes: list[str] = []
     with opened_bag(path) as reader:
-        present = sorted({_Topic(c.topic, c.msgtype.split("/")[-1]) for c in reader.connections},
-                         key=lambda topic: topic.name)  # fmt: skip
+        present = sorted({_Topic(c.topic, c.msgtype.split("/")[-1]) for c in reader.connections})
         chosen = _choose(path, present, requested)
-        origin = [
-            topic for topic in present if topic.kind == FIX and _last_name(topic) in _ORIGIN
-        ]  # fmt: skip
+        origin = [t for t in present if t.kind == FIX and t.last_name in _ORIGIN]
         navigation = chosen.get("navigation")
-        if navigation is not None and navigation.kind == ODOMETRY and not (datum or origin):
+        local = navigation if navigation is not None and navigation.kind == ODOMETRY else None
+        if local is not None and not (datum or origin):
             raise NavigationError(
-                f"{path}: {navigation.name} counts from an origin that the bag does not "
+                f"{path}: {local.name} counts from an origin that the bag does not "
                 "hold: give --datum LATITUDE LONGITUDE (of a tank any)"
             )
         joints = [topic for topic in present if topic.kind == JOINTS]
-        lost: Counter[str] = Counter()
-        notes: list[str] = []
-        series = _collect(reader, {*chosen.values(), *origin, *joints}, lost, notes)
-    reading = _BagReading(
-        path=path, datum=datum, chosen=chosen, series=series, lost=lost, notes=notes
+        times, tables = _collect(reader, {*chosen.values(), *origin, *joints}, lost, notes)
+    if local is not None:
+        _add_geodetic(tables, datum or _datum(path, origin[0], tables[origin[0]]))
+
+    for role, convert in (
+        ("navigation", _add_sigmas), ("attitude", _add_angles), ("altitude", _drop_no_bottom)
+    ):  # fmt: skip
+        if (topic := chosen.get(role, navigation)) is not None:
+            convert(topic, tables[topic], lost)
+
+    def signal(topic: _Topic | None, names: Sequence[str], scale: float = 1.0) -> Signal | None:
+        """A signal of columns, None where there is no topic, or it lacks them or is empty."""
+        if topic is None or not set(names) <= tables[topic].keys():
+            return None
+        values = scale * np.stack([tables[topic][name] for name in names], axis=1)
+        return clean_signal(topic.name, times[topic], values, lost)
+
+    def of_role(role: str, names: Sequence[str]) -> Signal | None:
+        return signal(chosen.get(role, navigation), names)
+
+    if len(joints) > 1:
+        notes.append(f"thrusters are left out: {_list_topics(joints)} all have joints")
+    thrusters = tuple(tables[joints[0]]) if len(joints) == 1 else ()
+    if any(role == "depth" and topic.kind == PRESSURE for role, topic in chosen.items()):
+        notes.append(
+            f"depth is pressure minus {_SURFACE_PA:g} Pa, in water of {_DENSITY_KG_M3:g} kg/m^3"
+        )
+    all_s = np.concatenate([times[topic] for topic in chosen.values()])
+    ranged = chosen.get("altitude")
+    sigmas = {name: signal(navigation, (name,)) for name in _SIGMAS}
+    return LoggedDive(
+        kind="a bag of ROS",
+        clock="the times of the message headers",
+        dated=bool(len(all_s) and np.median(all_s) > DATED_AFTER_S),
+        position=usable_positions(signal(navigation, PLACE), lost),
+        depth=of_role("depth", ("depth",)),
+        attitude=of_role("attitude", ANGLES),
+        altitude=of_role("altitude", ("altitude",)),
+        altitude_slant=(
+            ranged is not None
+            and ranged.kind in (RANGE, DVL)
+            and not ranged.name.endswith("altitude")
+        ),
+        sigmas={name: sigma for name, sigma in sigmas.items() if sigma is not None},
+        velocity_body=of_role("velocity", VELOCITY),
+        rates=signal(navigation, RATES),
+        rpm=signal(joints[0], thrusters, 60.0 / (2.0 * np.pi)) if thrusters else None,
+        thrusters=thrusters,
+        lost=lost,
+        notes=tuple(notes),
     )
-    return reading.dive(origin, joints)
 
 
 def _choose(
@@ -129,7 +179,7 @@ def _choose(
             )
         chosen[role] = topic
     for kind in () if "navigation" in chosen else _TAKES["navigation"]:
-        found = [t for t in _of_kind(present, (kind,), _TRUTH) if _last_name(t) not in _ORIGIN]
+        found = [t for t in _of_kind(present, (kind,), _TRUTH) if t.last_name not in _ORIGIN]
         named = [t for t in found if "navig" in t.name.lower()]
         if found:
             chosen["navigation"] = _only(path, "navigation", named if len(named) == 1 else found)
@@ -165,10 +215,6 @@ def _of_kind(
     ]  # fmt: skip
 
 
-def _last_name(topic: _Topic) -> str:
-    return topic.name.rsplit("/", 1)[-1]
-
-
 def _only(path: Path, role: str, found: Sequence[_Topic]) -> _Topic:
     """The one topic that there is.
 
@@ -187,21 +233,13 @@ def _list_topics(topics: Sequence[_Topic]) -> str:
     return ", ".join(f"{topic.name} ({topic.kind})" for topic in topics) or "no topics"
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Series:
-    """The messages of one topic as numbers."""
-
-    topic: _Topic
-    time_s: Array
-    """(N,) times as logged."""
-    columns: dict[str, Array]
-    """(N,) columns by name (`ROWS`), or by joint."""
-
-
 def _collect(
     reader: "AnyReader", needed: set[_Topic], lost: Counter[str], notes: list[str]
-) -> dict[_Topic, _Series]:
-    """Messages with their times: of the header, else (unset, or no header) of the recording."""
+) -> tuple[dict[_Topic, Array], dict[_Topic, dict[str, Array]]]:
+    """Times of messages, and their columns by name (`ROWS`) or joint.
+
+    Times are of the header, else (unset, or no header) of the recording.
+    """
     kinds = {topic.name: topic for topic in needed}
     connections = [c for c in reader.connections if c.topic in kinds]
     times: dict[str, list[float]] = {name: [] for name in kinds}
@@ -238,165 +276,59 @@ def _collect(
         times[name].append(time_s)
     for name, count in sorted(unset.items()):
         notes.append(f"{name}: {count} headers without a time have that of their recording")
-    found = {}
+    tables = {}
     for name, topic in kinds.items():
         columns = names.get(name, ())
         table = np.array(rows[name], dtype=np.float64).reshape(-1, len(columns))
-        found[topic] = _Series(
-            topic=topic,
-            time_s=np.array(times[name]),
-            columns={column: table[:, i] for i, column in enumerate(columns)},
-        )
-    return found
+        tables[topic] = dict(zip(columns, table.T, strict=True))
+    return {topic: np.array(times[name]) for name, topic in kinds.items()}, tables
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _BagReading:
-    """The parts of a dive out of the topics of a bag."""
+def _add_sigmas(_: _Topic, table: dict[str, Array], __: Counter[str]) -> None:
+    """Standard deviations of variances; one that is not positive is not known."""
+    for column, (names, scale) in _SIGMAS.items():
+        if set(names) <= table.keys():
+            variance = np.mean([table[name] for name in names], axis=0)
+            table[column] = scale * np.sqrt(np.where(variance > 0, variance, np.nan))
 
-    path: Path
-    datum: Datum | None
-    chosen: Mapping[str, _Topic]
-    series: Mapping[_Topic, _Series]
-    lost: Counter[str]
-    notes: list[str]
-    counted: set[_Topic] = field(default_factory=set)
-    """Topics whose lost rows are in `lost`."""
 
-    def dive(self, origin: Sequence[_Topic], joints: Sequence[_Topic]) -> LoggedDive:
-        """Everything that the bag holds."""
-        navigation = self._of("navigation")
-        if navigation is not None and navigation.topic.kind == ODOMETRY:
-            self._add_geodetic(self._datum(origin))
-        position = usable_positions(self._signal(navigation, PLACE), self.lost)
-        times = np.concatenate([self.series[topic].time_s for topic in self.chosen.values()])
-        ranged = self.chosen.get("altitude")
-        rpm, thrusters = self._rpm(joints)
-        return LoggedDive(
-            kind="a bag of ROS",
-            clock="the times of the message headers",
-            dated=bool(np.median(times) > DATED_AFTER_S) if len(times) else False,
-            position=position,
-            depth=self._depth(),
-            attitude=self._attitude(),
-            altitude=self._altitude(),
-            altitude_slant=(
-                ranged is not None
-                and ranged.kind in (RANGE, DVL)
-                and not ranged.name.endswith("altitude")
-            ),
-            sigmas=self._sigmas(navigation),
-            velocity_body=self._signal(self._of("velocity"), VELOCITY),
-            rates=self._signal(navigation, RATES),
-            rpm=rpm,
-            thrusters=thrusters,
-            lost=dict(self.lost),
-            notes=tuple(self.notes),
-        )
+def _add_angles(topic: _Topic, table: dict[str, Array], lost: Counter[str]) -> None:
+    """Angles in degrees, of quaternions where there are such."""
+    if QUATERNION[0] in table:
+        xyzw = np.stack([table[name] for name in QUATERNION], axis=1)
+        angles = angles_of(xyzw)
+        if bad := int((np.isfinite(xyzw).all(axis=1) & np.isnan(angles[:, 0])).sum()):
+            lost[f"{topic.name}: quaternions that are not of length 1"] += bad
+        table.update(zip(ANGLES, angles.T, strict=True))
+    elif ANGLES[0] in table:
+        table.update({name: table[name] * float(np.rad2deg(1.0)) for name in ANGLES})
 
-    def _signal(
-        self, series: _Series | None, names: Sequence[str], scale: float = 1.0
-    ) -> Signal | None:
-        """A signal of columns, None where there is no topic, or it lacks them or is empty."""
-        if series is None or not len(series.time_s) or not set(names) <= set(series.columns):
-            return None
-        values = scale * np.stack([series.columns[name] for name in names], axis=1)
-        return self._clean_series(series, values)
 
-    def _clean_series(self, series: _Series, values: Array) -> Signal | None:
-        """A signal; what its times cost is counted once for a topic."""
-        lost = Counter() if series.topic in self.counted else self.lost
-        self.counted.add(series.topic)
-        return clean_signal(series.topic.name, series.time_s, values, lost)
-
-    def _of(self, role: str) -> _Series | None:
-        topic = self.chosen.get(role, self.chosen.get("navigation"))
-        return None if topic is None else self.series[topic]
-
-    def _datum(self, origin: Sequence[_Topic]) -> Datum:
-        if self.datum is not None:
-            return self.datum
-        fixes = self.series[origin[0]].columns if origin else {}
-        place = [fixes[name][0] for name in (*PLACE, "height") if len(fixes.get(name, ()))]
-        if len(place) < 3 or not np.all(np.isfinite(place)):
-            raise NavigationError(f"{self.path}: {origin[0].name} holds no place: give --datum")
-        return Datum(*(float(value) for value in place))
-
-    def _add_geodetic(self, datum: Datum) -> None:
-        """Latitude, longitude and depth to every odometry, which counts from the datum."""
-        for series in self.series.values():
-            if series.topic.kind == ODOMETRY:
-                ned = np.stack([series.columns[name] for name in NED], axis=1)
-                known = np.isfinite(ned).all(axis=1)
-                place = np.full(ned.shape, np.nan)
-                place[known] = datum.geodetic_from_ned(ned[known])
-                series.columns.update(zip((*PLACE, "depth"), place.T, strict=True))
-
-    def _depth(self) -> Signal | None:
-        series = self._of("depth")
-        if series is None or series.topic.kind != PRESSURE:
-            return self._signal(series, ("number",)) or self._signal(series, ("depth",))
-        self.notes.append(
-            f"depth is pressure minus {_SURFACE_PA:g} Pa, in water of {DENSITY_KG_M3:g} kg/m^3"
-        )
-        per_metre = DENSITY_KG_M3 * GRAVITY_MPS2
-        values = (series.columns["pressure"] - _SURFACE_PA) / per_metre
-        return self._clean_series(series, values)
-
-    def _attitude(self) -> Signal | None:
-        series = self._of("attitude")
-        if series is None or QUATERNION[0] not in series.columns:
-            return self._signal(series, ANGLES, scale=float(np.rad2deg(1.0)))
-        xyzw = np.stack([series.columns[name] for name in QUATERNION], axis=1)
-        good = np.abs(np.linalg.norm(xyzw, axis=1) - 1.0) < _UNIT
-        given = np.isfinite(xyzw).all(axis=1)
-        if (given & ~good).any():
-            self.lost[f"{series.topic.name}: quaternions that are not of length 1"] += int(
-                (given & ~good).sum()
-            )
-        angles = np.full((len(xyzw), 3), np.nan)
-        if good.any():
-            angles[good] = np.rad2deg(attitude_from_rotation(Rotation.from_quat(xyzw[good])))
-        return self._clean_series(series, angles)
-
-    def _altitude(self) -> Signal | None:
-        series = self._of("altitude")
-        if series is None:
-            return None
-        values = series.columns.get("number", series.columns.get("altitude"))
-        if values is None:
-            return None
-        with np.errstate(invalid="ignore"):
-            absent = values <= 0
+def _drop_no_bottom(topic: _Topic, table: dict[str, Array], lost: Counter[str]) -> None:
+    if "altitude" in table:
+        absent = table["altitude"] <= 0
         if absent.any():
-            self.lost[f"{series.topic.name}: altitudes not above 0: no bottom"] += int(absent.sum())
-        return self._clean_series(series, np.where(absent, np.nan, values))
+            lost[f"{topic.name}: altitudes not above 0: no bottom"] += int(absent.sum())
+        table["altitude"] = np.where(absent, np.nan, table["altitude"])
 
-    def _sigmas(self, series: _Series | None) -> dict[str, Signal]:
-        """Standard deviations; a variance that is not positive is not known."""
-        sigmas: dict[str, Signal] = {}
-        if series is None:
-            return sigmas
-        for column, (names, scale) in _SIGMAS.items():
-            if not set(names) <= set(series.columns):
-                continue
-            variance = np.mean([series.columns[name] for name in names], axis=0)
-            with np.errstate(invalid="ignore"):
-                sigma = scale * np.sqrt(np.where(variance > 0, variance, np.nan))
-            signal = self._clean_series(series, sigma)
-            if signal is not None:
-                sigmas[column] = signal
-        return sigmas
 
-    def _rpm(self, joints: Sequence[_Topic]) -> tuple[Signal | None, tuple[str, ...]]:
-        """Speeds of propellers, where exactly one topic has joints."""
-        if len(joints) > 1:
-            self.notes.append(f"thrusters are left out: {_list_topics(joints)} all have joints")
-        if len(joints) != 1:
-            return None, ()
-        series = self.series[joints[0]]
-        names = tuple(series.columns)
-        return self._signal(series, names, scale=60.0 / (2.0 * np.pi)) if names else None, names
+def _datum(path: Path, topic: _Topic, fixes: Mapping[str, Array]) -> Datum:
+    """The place that a topic states first."""
+    place = [float(fixes[name][0]) for name in (*PLACE, "height") if len(fixes[name])]
+    if len(place) < 3 or not np.isfinite(place).all():
+        raise NavigationError(f"{path}: {topic.name} holds no place: give --datum")
+    return Datum(*place)
+
+
+def _add_geodetic(tables: Mapping[_Topic, dict[str, Array]], datum: Datum) -> None:
+    """Latitude, longitude and depth to every odometry, which counts from the datum."""
+    for topic, table in tables.items():
+        if topic.kind == ODOMETRY:
+            ned = np.stack([table[name] for name in NED], axis=1)
+            known = np.isfinite(ned).all(axis=1)
+            place = np.full(ned.shape, np.nan)
+            place[known] = datum.geodetic_from_ned(ned[known])
+            table.update(zip((*PLACE, "depth"), place.T, strict=True))
 
 
 def _nav_sts(m: Any) -> list[float]:
@@ -475,6 +407,10 @@ def _range(m: Any) -> list[float]:
     return [m.range if known else _NOTHING]
 
 
+def _pressure(m: Any) -> list[float]:
+    return [(m.fluid_pressure - _SURFACE_PA) / (_DENSITY_KG_M3 * _GRAVITY_MPS2)]
+
+
 ROWS: Mapping[str, tuple[tuple[str, ...], Callable[[Any], list[float]]]] = {
     NAV_STS: (
         (*PLACE, "depth", "altitude", *ANGLES, *VARIANCES, *VELOCITY, *RATES), _nav_sts,
@@ -482,12 +418,12 @@ ROWS: Mapping[str, tuple[tuple[str, ...], Callable[[Any], list[float]]]] = {
     ODOMETRY: ((*NED, *QUATERNION, *VARIANCES, *VELOCITY, *RATES), _odometry),
     FIX: ((*PLACE, "height", "var_north", "var_east"), _fix),
     IMU: (QUATERNION, _imu),
-    PRESSURE: (("pressure",), lambda m: [m.fluid_pressure]),
+    PRESSURE: (("depth",), _pressure),
     RANGE: (("altitude",), _range),
     DVL: ((*VELOCITY, "altitude"), _dvl),
     TWIST: (VELOCITY, _twist),
     TWIST_COVARIANCE: (VELOCITY, _twist),
-} | {kind: (("number",), lambda m: [m.data]) for kind in NUMBERS}  # fmt: skip
+} | {kind: (("depth", "altitude"), lambda m: [m.data] * 2) for kind in NUMBERS}  # fmt: skip
 """For each type: the names of the columns, and what takes them from a message."""
 
 
