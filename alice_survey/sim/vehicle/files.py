@@ -119,11 +119,6 @@ def known_vehicles() -> list[str]:
     return list(_DESCRIBED)
 
 
-def vehicles_of_a_geometry() -> list[str]:
-    """Names of the known vehicles whose shape is known: they carry the same payload."""
-    return [name for name in _DESCRIBED if name in SHAPES]
-
-
 def vehicle_from_file(path: Path, coefficients: str = OWN_SET) -> Vehicle:
     """Read a vehicle file.
 
