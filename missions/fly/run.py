@@ -14,7 +14,16 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.artefacts import write_csv
-from alice_survey.core.config import VehicleConfig, WaterConfig
+from alice_survey.core.config import (
+    AreaConfig,
+    CameraConfig,
+    NavigationConfig,
+    PlanConfig,
+    SeaConfig,
+    SeafloorConfig,
+    VehicleConfig,
+    WaterConfig,
+)
 from alice_survey.core.errors import VehicleError, warn
 from alice_survey.core.executor import Executor, progress
 from alice_survey.core.frames import Array, rotation_from_attitude
@@ -62,21 +71,30 @@ TRIGGER_COLUMNS = ("station", "time_s", "line")
 
 
 def run_fly(
-    workspace: Path, folder: Path, executor: Executor, *, water: WaterConfig, **sections: Any
+    workspace: Path,
+    folder: Path,
+    executor: Executor,
+    *,
+    seed: int,
+    vehicle: VehicleConfig,
+    sea: SeaConfig,
+    navigation: NavigationConfig,
+    camera: CameraConfig,
+    water: WaterConfig,
+    seafloor: SeafloorConfig,
+    area: AreaConfig,
+    plan: PlanConfig,
 ) -> None:
     """Write triggers, navigation, vehicle logs, a bag, the truth and plots.
-
-    Args:
-        workspace: with the plan.
-        folder: to write.
-        executor: where tasks run.
-        water: of the survey.
-        sections: of `FlightSettings`.
 
     Raises:
         VehicleError: the vehicle took no picture at all; the message says why.
     """
-    steps = _steps(folder, workspace / "plan" / "plan.json", FlightSettings(**sections), water)
+    settings = FlightSettings(
+        seed=seed, vehicle=vehicle, sea=sea, navigation=navigation, camera=camera,
+        seafloor=seafloor, area=area, plan=plan,
+    )  # fmt: skip
+    steps = _steps(folder, workspace / "plan" / "plan.json", settings, water)
     for _ in progress(steps, "flight files", 5):
         pass
 
