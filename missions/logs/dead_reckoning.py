@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from alice_survey.core.compiled import compiled
 from alice_survey.core.errors import NavigationError
-from alice_survey.core.frames import Array, Datum, rotation_from_attitude
-from missions.logs.dive import LoggedDive, Signal
+from alice_survey.core.frames import Array, Datum
+from missions.logs.dive import LoggedDive, Signal, of_known, rotation_of
 from missions.logs.navigation_csv import max_gap_s
 
 _FAR_M = 1e4
@@ -183,11 +183,8 @@ def _velocity_ne(dive: LoggedDive, declination_rad: float) -> tuple[Signal, int]
             lacks = "velocity over ground" if dive.velocity_body is None else "attitude"
             raise NavigationError(f"dead reckoning needs a {lacks}, and the log has none")
         source, times = dive.velocity_body.source, dive.velocity_body.time_s
-        angles = dive.attitude.at(times, turning=True)
-        known = np.isfinite(angles).all(axis=1)
-        ne = np.full((len(times), 2), np.nan)
-        turn = rotation_from_attitude(*np.deg2rad(angles[known]).T)
-        ne[known] = turn.apply(dive.velocity_body.values[known])[:, :2]
+        turning = np.hstack([dive.attitude.at(times, turning=True), dive.velocity_body.values])
+        ne = of_known(turning, 2, lambda row: rotation_of(row[:, :3]).apply(row[:, 3:])[:, :2])
     good = np.isfinite(ne).all(axis=1)
     if good.sum() < 2:
         raise NavigationError(f"{source}: no two velocities have an attitude")

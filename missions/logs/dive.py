@@ -3,7 +3,7 @@
 import bisect
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from alice_survey.core.frames import Array, attitude_from_rotation
+from alice_survey.core.frames import Array, attitude_from_rotation, rotation_from_attitude
 from missions.logs.navigation_csv import interpolate
 
 ROLES = ("navigation", "depth", "attitude", "altitude", "velocity")
@@ -117,13 +117,28 @@ def finite_number(value: Any) -> float:
     return number if math.isfinite(number) and not isinstance(value, bool) else math.nan
 
 
+def of_known(values: Array, width: int, function: Callable[[Array], Array]) -> Array:
+    """What a function makes of rows, (N, k) to (N, width); NaN where a row is not all known."""
+    known = np.isfinite(values).all(axis=1)
+    found = np.full((len(values), width), np.nan)
+    if known.any():
+        found[known] = function(values[known])
+    return found
+
+
 def angles_of(xyzw: Array) -> Array:
     """Roll, pitch, heading, (N, 3) degrees, of quaternions, (N, 4); NaN where not of length 1."""
-    angles = np.full((len(xyzw), 3), np.nan)
-    known = np.abs(np.linalg.norm(xyzw, axis=1) - 1.0) < _UNIT
-    if known.any():
-        angles[known] = np.rad2deg(attitude_from_rotation(Rotation.from_quat(xyzw[known])))
-    return angles
+    unit = np.abs(np.linalg.norm(xyzw, axis=1, keepdims=True) - 1.0) < _UNIT
+    return of_known(
+        np.where(unit, xyzw, np.nan),
+        3,
+        lambda q: np.rad2deg(attitude_from_rotation(Rotation.from_quat(q))),
+    )
+
+
+def rotation_of(angles_deg: Array) -> Rotation:
+    """Rotations of roll, pitch and heading, (N, 3) degrees."""
+    return rotation_from_attitude(*np.deg2rad(angles_deg).T)
 
 
 def clean_signal(source: str, time_s: Array, values: Array, lost: Counter[str]) -> Signal | None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from alice_survey.core.artefacts import read_csv
 from alice_survey.core.errors import NavigationError, warn
-from alice_survey.core.frames import Array, Datum, rotation_from_attitude
+from alice_survey.core.frames import Array, Datum
 from missions.logs.autopilot_logs import (
     MAGIC,
     first_bytes,
@@ -22,7 +22,7 @@ from missions.logs.autopilot_logs import (
     read_px4_ulog,
 )
 from missions.logs.dead_reckoning import TrackErrors, with_dead_reckoning
-from missions.logs.dive import DATED_AFTER_S, ROLES, LoggedDive, Signal
+from missions.logs.dive import DATED_AFTER_S, ROLES, LoggedDive, Signal, of_known, rotation_of
 from missions.logs.navigation_csv import READINGS, max_gap_s, utc_date
 from missions.logs.ros_bag import is_bag, read_ros_bag
 from missions.logs.waterlinked import is_waterlinked, read_waterlinked
@@ -287,45 +287,34 @@ def _at_origin(
         return place
     if dive.attitude is None:
         raise NavigationError("a lever arm needs an attitude, and the log has none")
-    moved = np.full_like(place, np.nan)
-    upright = np.isfinite(angles_deg).all(axis=1)
-    arms = rotation_from_attitude(*np.deg2rad(angles_deg[upright]).T).apply(lever)
-    moved[upright, 2] = place[upright, 2] - arms[:, 2]
-    located = np.isfinite(place[upright, :2]).all(axis=1)
-    good = np.flatnonzero(upright)[located]
-    if len(good):
-        datum = Datum(*(float(value) for value in place[good[0], :2]))
-        ned = datum.ned_from_geodetic(np.nan_to_num(place[good])) - arms[located]
-        moved[good, :2] = datum.geodetic_from_ned(ned)[:, :2]
-    return moved
+    arms = of_known(angles_deg, 3, lambda angles: rotation_of(angles).apply(lever))
+
+    def move(row: Array) -> Array:
+        datum = Datum(float(row[0, 0]), float(row[0, 1]))
+        return datum.geodetic_from_ned(datum.ned_from_geodetic(row[:, :3]) - row[:, 3:])[:, :2]
+
+    # Positions hold where the depth is not known too.
+    at_depth = np.hstack([place[:, :2], np.nan_to_num(place[:, 2:]), arms])
+    return np.column_stack([of_known(at_depth, 2, move), place[:, 2] - arms[:, 2]])
 
 
 def _write_vehicle_log(path: Path, dive: LoggedDive, at_s: Array, options: ImportOptions) -> None:
     """The vehicle log (docs/vehicle-logs.md) at the rows' times, (N,) as logged, from the first."""
-    from scipy.spatial.transform import Rotation
-
     from alice_survey.sim.vehicle.log import vehicle_log, write_vehicle_log
 
     # Depths of the log, not of the chart: a vehicle's log knows of no tide.
     columns = navigation_table(dive, at_s, options, 0.0)
-    place = np.stack([columns[name] for name in COLUMNS[:3]], axis=1)
-    known = np.isfinite(place).all(axis=1)
-    position = np.full(place.shape, np.nan)
-    if known.any():
-        datum = Datum(*(float(value) for value in place[known][0, :2]))
-        position[known] = datum.ned_from_geodetic(place[known])
-    angles = np.stack([columns[name] for name in COLUMNS[3:6]], axis=1)
-    upright = np.isfinite(angles).all(axis=1)
-    quaternion = np.full((len(at_s), 4), np.nan)
-    if upright.any():
-        turn = rotation_from_attitude(*np.deg2rad(angles[upright]).T)
-        quaternion[upright] = turn.as_quat(canonical=True)
+    place, angles = (
+        np.stack([columns[name] for name in names], axis=1) for names in (COLUMNS[:3], COLUMNS[3:6])
+    )
+    position = of_known(place, 3, lambda row: Datum(*map(float, row[0, :2])).ned_from_geodetic(row))
+    quaternion = of_known(angles, 4, lambda row: rotation_of(row).as_quat(canonical=True))
     velocity = None if dive.velocity_body is None else dive.velocity_body.at(at_s)
     if velocity is None and dive.velocity_ned is not None:
-        velocity = np.full((len(at_s), 3), np.nan)
-        logged = dive.velocity_ned.at(at_s)
-        if upright.any():
-            velocity[upright] = Rotation.from_quat(quaternion[upright]).inv().apply(logged[upright])
+        velocity = of_known(
+            np.hstack([angles, dive.velocity_ned.at(at_s)]), 3,
+            lambda row: rotation_of(row[:, :3]).inv().apply(row[:, 3:]),
+        )  # fmt: skip
     rpm = {} if dive.rpm is None else dict(zip(dive.thrusters, dive.rpm.at(at_s).T, strict=True))
     others = {}
     if dive.pwm is not None:

@@ -29,6 +29,7 @@ from missions.logs.dive import (
     Signal,
     angles_of,
     clean_signal,
+    of_known,
     usable_positions,
 )
 from missions.logs.ros_builder import flipped_body, flipped_quaternion, flipped_world
@@ -325,9 +326,7 @@ def _add_geodetic(tables: Mapping[_Topic, dict[str, Array]], datum: Datum) -> No
     for topic, table in tables.items():
         if topic.kind == ODOMETRY:
             ned = np.stack([table[name] for name in NED], axis=1)
-            known = np.isfinite(ned).all(axis=1)
-            place = np.full(ned.shape, np.nan)
-            place[known] = datum.geodetic_from_ned(ned[known])
+            place = of_known(ned, 3, datum.geodetic_from_ned)
             table.update(zip((*PLACE, "depth"), place.T, strict=True))
 
 
