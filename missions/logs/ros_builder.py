@@ -106,6 +106,14 @@ class MessageBuilder:
         x, y, z, w = (float(v) for v in xyzw)
         return self.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
 
+    def _twist(self, linear: Array, angular: Array) -> Any:
+        twist = self.make(
+            "geometry_msgs/msg/Twist", linear=self._vector(linear), angular=self._vector(angular)
+        )
+        return self.make(
+            "geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)
+        )
+
     def odometry(
         self,
         stamp_ns: int,
@@ -130,11 +138,6 @@ class MessageBuilder:
             position=self._vector(position_enu, "Point"),
             orientation=self._quaternion(enu_from_flu),
         )
-        twist = self.make(
-            "geometry_msgs/msg/Twist",
-            linear=self._vector(velocity_flu[:3]),
-            angular=self._vector(velocity_flu[3:]),
-        )
         return self.make(
             ODOMETRY,
             header=self._header(stamp_ns, MAP),
@@ -144,9 +147,7 @@ class MessageBuilder:
                 pose=pose,
                 covariance=np.diag(pose_variances).ravel(),
             ),
-            twist=self.make(
-                "geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)
-            ),
+            twist=self._twist(velocity_flu[:3], velocity_flu[3:]),
         )
 
     def transforms(self, stamp_ns: int, children: dict[str, tuple[Array, Array]]) -> Any:
@@ -229,15 +230,8 @@ class MessageBuilder:
 
     def velocity(self, stamp_ns: int, frame: str, velocity_flu: Array) -> Any:
         """Velocity, (3,), of a DVL, whose covariance is not known; turns are not measured."""
-        twist = self.make(
-            "geometry_msgs/msg/Twist",
-            linear=self._vector(velocity_flu),
-            angular=self._vector(np.zeros(3)),
-        )
-        known = self.make(
-            "geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)
-        )
-        return self.make(TWIST, header=self._header(stamp_ns, frame), twist=known)
+        twist = self._twist(velocity_flu, np.zeros(3))
+        return self.make(TWIST, header=self._header(stamp_ns, frame), twist=twist)
 
     def imu(
         self, stamp_ns: int, frame: str, enu_from_flu: Array, rates_flu: Array, force_flu: Array
@@ -331,18 +325,18 @@ def write_bag(path: Path, record: BagRecord) -> None:
             store = get_typestore(Stores.ROS2_HUMBLE)
             topics = _topics(record, MessageBuilder(store.types.__getitem__))
             connections = [
-                writer.add_connection(topic.name, topic.kind, typestore=store) for topic in topics
+                writer.add_connection(name, kind, typestore=store) for name, kind, _, _ in topics
             ]
             ordered = heapq.merge(
                 *(
-                    zip(topic.stamps_ns, itertools.repeat(rank), itertools.count(), strict=False)
-                    for rank, topic in enumerate(topics)
+                    zip(stamps_ns, itertools.repeat(rank), itertools.count(), strict=False)
+                    for rank, (_, _, stamps_ns, _) in enumerate(topics)
                 )
             )
-            total = sum(len(topic.stamps_ns) for topic in topics)
+            total = sum(len(stamps_ns) for _, _, stamps_ns, _ in topics)
             for stamp, rank, row in progress(ordered, "bag", total):
-                topic = topics[rank]
-                data = store.serialize_cdr(topic.message(stamp, row), topic.kind)
+                _, kind, _, message = topics[rank]
+                data = store.serialize_cdr(message(stamp, row), kind)
                 writer.write(connections[rank], stamp, data)
         os.replace(outer / path.name, path)  # noqa: PTH105 (a folder onto a free name)
     except OSError as error:
@@ -351,15 +345,8 @@ def write_bag(path: Path, record: BagRecord) -> None:
         shutil.rmtree(outer, ignore_errors=True)
 
 
-@dataclass(frozen=True)
-class _BagTopic:
-    """One topic: when its messages are, and how to make one."""
-
-    name: str
-    kind: str
-    stamps_ns: list[int]
-    message: Callable[[int, int], Any]
-    """Makes the message of a stamp and a row of the record."""
+_BagTopic = tuple[str, str, list[int], Callable[[int, int], Any]]
+"""Name, type, times of the messages, and what makes one of its time and its row of the record."""
 
 
 def _topics(record: BagRecord, ros: MessageBuilder) -> list[_BagTopic]:
@@ -383,50 +370,47 @@ def _topics(record: BagRecord, ros: MessageBuilder) -> list[_BagTopic]:
     label = ",".join(record.thrusters)
     stamps, heard = _nanoseconds(record.time_s), _nanoseconds(record.beam_time_s)
 
-    def beam(number: int) -> _BagTopic:
-        frame, ranges = f"{name}/dvl_beam_{number + 1}", record.beam_m[:, number]
-        return _BagTopic(
-            f"/{name}/dvl/beam_{number + 1}", RANGE, heard,
-            lambda stamp, i: ros.range(stamp, frame, ranges[i]),
-        )  # fmt: skip
+    def ranges(topic: str, frame: str, at_ns: list[int], values: Array) -> _BagTopic:
+        topic, frame = f"/{name}/{topic}", f"{name}/{frame}"
+        return topic, RANGE, at_ns, lambda stamp, i: ros.range(stamp, frame, values[i])
 
     return [
-        _BagTopic(
+        (
             f"/{name}/datum", FIX, stamps[:1], lambda stamp, _: ros.fix(stamp, MAP, origin, None)
         ),
-        _BagTopic(
+        (
             f"/{name}/truth/odometry", ODOMETRY, stamps,
             lambda stamp, i: ros.odometry(
                 stamp, true_body, true_place[i], true_turn[i], exact, true_speed[i]
             ),
         ),
-        _BagTopic(
+        (
             f"/{name}/navigation/odometry", ODOMETRY, stamps,
             lambda stamp, i: ros.odometry(stamp, body, place[i], turn[i], variances[i], speed[i]),
         ),
-        _BagTopic(
+        (
             f"/{name}/navigation/fix", FIX, stamps,
             lambda stamp, i: ros.fix(stamp, body, geodetic[i], variances[i, :3]),
         ),
-        _BagTopic(
+        (
             "/tf", TRANSFORMS, stamps,
             lambda stamp, i: ros.transforms(
                 stamp, {body: (place[i], turn[i]), true_body: (true_place[i], true_turn[i])}
             ),
         ),
-        _BagTopic(
-            f"/{name}/navigation/altitude", RANGE, stamps,
-            lambda stamp, i: ros.range(stamp, f"{name}/port", record.altitude_m[i]),
-        ),
-        _BagTopic(
+        ranges("navigation/altitude", "port", stamps, record.altitude_m),
+        (
             f"/{name}/thrusters/state", JOINTS, stamps,
             lambda stamp, i: ros.joints(stamp, record.thrusters, rad_s[i]),
         ),
-        _BagTopic(
+        (
             f"/{name}/thrusters/power", NUMBERS, stamps,
             lambda _, i: ros.numbers(label, record.power_w[i]),
         ),
-        *(beam(number) for number in range(record.beam_m.shape[1])),
+        *(
+            ranges(f"dvl/beam_{number}", f"dvl_beam_{number}", heard, beam)
+            for number, beam in enumerate(record.beam_m.T, start=1)
+        ),
     ]  # fmt: skip
 
 
