@@ -157,8 +157,10 @@ def spread_part(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction | Non
         model: with registered pictures.
     """
     seen = observations(model)
-    order = np.argsort(seen.point, kind="stable")
-    chosen = _spread(_starts(seen), _cells(model, seen)[order], len(seen.pictures) * _CELLS**2)
+    cell = _cells(model, seen)[np.argsort(seen.point, kind="stable")]
+    starts, chosen = _starts(seen), np.zeros(len(seen.point_ids), np.bool_)
+    longest = np.argsort(-np.diff(starts), kind="stable")
+    _choose(starts, cell, longest, np.zeros(len(seen.pictures) * _CELLS**2, np.int64), chosen)
     kept = int(chosen[seen.point].sum())
     if kept > _WORTH * len(seen.point):
         return None
@@ -219,14 +221,6 @@ def _cells(model: pycolmap.Reconstruction, seen: Observed) -> Indices:
         column, row = np.clip(at, 0, _CELLS - 1).astype(np.int64).T
         found[rows] = (n * _CELLS + row) * _CELLS + column
     return found
-
-
-def _spread(starts: Indices, cell: Indices, cells: int) -> Flags:
-    """Which points (P,) are chosen, from the cells (O,) of their observations, sorted by point."""
-    longest = np.argsort(-np.diff(starts), kind="stable")
-    chosen = np.zeros(len(starts) - 1, np.bool_)
-    _choose(starts, cell, longest, np.zeros(cells, np.int64), chosen)
-    return chosen
 
 
 @compiled

@@ -1,7 +1,8 @@
 """The COLMAP database that the mapper reads: cameras, rig, stations, keypoints and matches."""
 
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -50,6 +51,17 @@ def new_folder(path: Path) -> Path:
     return path
 
 
+@contextmanager
+def scratch_database(
+    folder: Path, seen: Observations, cam_from_rig: Mapping[str, RigidTransform] | None
+) -> Iterator[Path]:
+    """A new folder with `database.db` (see `write_database`), removed at the end."""
+    new_folder(folder)
+    write_database(folder / "database.db", seen, cam_from_rig)
+    yield folder
+    shutil.rmtree(folder)
+
+
 @progress.step("hand pictures to the mapper")
 def write_database(
     path: Path, seen: Observations, cam_from_rig: Mapping[str, RigidTransform] | None
@@ -81,7 +93,14 @@ def write_database(
                 frame.add_data_id(pycolmap.data_t(sensor, member + 1))
             database.write_frame(frame, use_frame_id=True)
         for i, j, pair in seen.pairs:
-            _write_pair(database, i + 1, j + 1, pair)
+            matrices = {k: v for k, v in (pair.geometry or {}).items() if v is not None}
+            geometry = pycolmap.TwoViewGeometry(
+                config=pycolmap.TwoViewGeometryConfiguration(matrices.pop("config")),
+                inlier_matches=pair.matches,
+                **matrices,
+            )
+            database.write_matches(i + 1, j + 1, pair.matches)
+            database.write_two_view_geometry(i + 1, j + 1, geometry)
 
 
 def _write_rigs(
@@ -107,11 +126,6 @@ def _write_rigs(
     return dict.fromkeys(sensors, 1)
 
 
-def station_frames(images: Sequence[ImageRecord]) -> dict[int, int]:
-    """Stations by the id that their frames have in a database with one rig."""
-    return dict(enumerate(sorted({record.station for record in images}), 1))
-
-
 def _frames(images: Sequence[ImageRecord], one_rig: bool) -> Iterable[list[int]]:
     if not one_rig:
         return [[i] for i in range(len(images))]
@@ -119,16 +133,3 @@ def _frames(images: Sequence[ImageRecord], one_rig: bool) -> Iterable[list[int]]
     for i, record in enumerate(images):
         stations.setdefault(record.station, []).append(i)
     return [stations[s] for s in sorted(stations)]
-
-
-def _write_pair(database: pycolmap.Database, first: int, second: int, pair: PairMatches) -> None:
-    if pair.geometry is None:
-        return
-    matrices = {k: v for k, v in pair.geometry.items() if k != "config" and v is not None}
-    geometry = pycolmap.TwoViewGeometry(
-        config=pycolmap.TwoViewGeometryConfiguration(pair.geometry["config"]),
-        inlier_matches=pair.matches,
-        **matrices,
-    )
-    database.write_matches(first, second, pair.matches)
-    database.write_two_view_geometry(first, second, geometry)

@@ -49,7 +49,7 @@ from reconstruct.mapping.bundle import (
     spread_part,
     take_poses,
 )
-from reconstruct.mapping.database import Observations, station_frames
+from reconstruct.mapping.database import Observations
 from reconstruct.mapping.working_range import ray_passes
 from reconstruct.matching.matches import Matches
 from reconstruct.views.model_files import as_transform, rigid3d
@@ -70,6 +70,9 @@ _BLOCK = 32
 """Pairs of stations in one task, so that sending them costs little."""
 _LinkAnswer = tuple[Array, Array, int, float, float]
 """The second station's rig as the first sees it: quaternion, shift, inliers, variances of both."""
+_RigCamera = tuple[Mapping[str, object], Array, Array]
+"""COLMAP's pinhole as `todict` gives it, and `cam_from_rig`: quaternion and shift. Numbers, not
+poses, go to and from processes: unpickling a pose rounds it once more."""
 _LINK_ROUNDS = 10
 _SETTLED = 1e-7
 """Radians, or metres, below which a step ends the search."""
@@ -99,7 +102,7 @@ class _Resection:
     second: int
     points: Array
     pixels: Array
-    cameras: tuple[int, ...]
+    cameras: Indices
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -148,13 +151,11 @@ def stereo_points(
     gaps = tuple(np.full(len(pixels), np.inf) for pixels in seen.pixels)
     for i, j, pair in seen.pairs:
         a, b = seen.images[i], seen.images[j]
-        if a.station != b.station or pair.geometry is None:
+        if a.station != b.station:
             continue
         start, ray = zip(
-            *(
-                _rays(seen, picture, pair.matches[:, side], cam_from_rig[record.camera])
-                for side, (picture, record) in enumerate(((i, a), (j, b)))
-            ),
+            _rays(seen, i, pair.matches[:, 0], cam_from_rig),
+            _rays(seen, j, pair.matches[:, 1], cam_from_rig),
             strict=True,
         )
         along, gap = ray_passes(start[0], ray[0], start[1], ray[1])
@@ -185,19 +186,13 @@ def link_stations(
     Returns:
         Links by rising stations; those that no pose explains are left out.
     """
-    points = stereo_points(seen, cam_from_rig)
-    names = list(seen.cameras)
-    tasks = list(_resections(seen, points, names))
+    tasks = list(_resections(seen, stereo_points(seen, cam_from_rig)))
     blocks = [tasks[k : k + _BLOCK] for k in range(0, len(tasks), _BLOCK)]
-    resect = partial(
-        _resect_all,
-        cameras=[seen.cameras[name].todict() for name in names],
-        # Numbers, not poses, go to and from processes: unpickling a pose rounds it once more.
-        cam_from_rig=[
-            (cam_from_rig[n].rotation.as_quat(), cam_from_rig[n].translation) for n in names
-        ],
-        seed=seed,
-    )
+    rig = [
+        (camera.todict(), cam_from_rig[name].rotation.as_quat(), cam_from_rig[name].translation)
+        for name, camera in seen.cameras.items()
+    ]
+    resect = partial(_resect_all, rig=rig, seed=seed)
     found = executor.map(resect, blocks, label="linking stations")
     answers = zip(tasks, (answer for block in found for answer in block), strict=True)
     return [
@@ -216,44 +211,32 @@ def link_stations(
 
 
 def _rays(
-    seen: Observations, picture: int, rows: Matches, cam_from_rig: RigidTransform
+    seen: Observations, picture: int, rows: Matches, cam_from_rig: Mapping[str, RigidTransform]
 ) -> tuple[Array, Array]:
     """Starts and unit directions in the rig's frame, (N, 3) each."""
-    camera = seen.cameras[seen.images[picture].camera]
-    at_one = np.asarray(camera.cam_from_img(np.asarray(seen.pixels[picture][rows], float)))
+    name = seen.images[picture].camera
+    at_one = np.asarray(seen.cameras[name].cam_from_img(seen.pixels[picture][rows]))
     rays = np.column_stack([at_one.reshape(-1, 2), np.ones(len(rows))])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    rig_from_cam = cam_from_rig.inv()
-    start = np.broadcast_to(rig_from_cam.translation, rays.shape)
-    return start, rig_from_cam.rotation.apply(rays)
+    rig_from_cam = cam_from_rig[name].inv()
+    return np.broadcast_to(rig_from_cam.translation, rays.shape), rig_from_cam.rotation.apply(rays)
 
 
-def _resections(
-    seen: Observations, points: Sequence[Array], names: Sequence[str]
-) -> Iterable[_Resection]:
+def _resections(seen: Observations, points: Sequence[Array]) -> Iterable[_Resection]:
     """The better of the two ways to resect one station from another: more points."""
     shared: dict[tuple[int, int], list[tuple[int, int, Matches]]] = {}
     for i, j, pair in seen.pairs:
         a, b = seen.images[i].station, seen.images[j].station
-        if a == b or pair.geometry is None:
-            continue
-        if a > b:
-            shared.setdefault((b, a), []).append((j, i, pair.matches[:, ::-1]))
-        else:
+        if a < b:
             shared.setdefault((a, b), []).append((i, j, pair.matches))
+        elif b < a:
+            shared.setdefault((b, a), []).append((j, i, pair.matches[:, ::-1]))
     for a, b in _best_pairs({ends: sum(len(m) for _, _, m in r) for ends, r in shared.items()}):
-        rows = shared[a, b]
-        there = _collect(seen, points, names, rows)
-        back = _collect(seen, points, names, [(j, i, m[:, ::-1]) for i, j, m in rows])
-        first, second, best = (b, a, back) if len(back[0]) > len(there[0]) else (a, b, there)
-        if len(best[0]) >= _MIN_INLIERS:
-            yield _Resection(
-                first=first,
-                second=second,
-                points=best[0],
-                pixels=best[1],
-                cameras=tuple(int(c) for c in best[2]),
-            )
+        there = _collect(seen, points, shared[a, b])
+        back = _collect(seen, points, [(j, i, m[:, ::-1]) for i, j, m in shared[a, b]])
+        best = max(there, back, key=lambda task: len(task.points))
+        if len(best.points) >= _MIN_INLIERS:
+            yield best
 
 
 def _best_pairs(matches: Mapping[tuple[int, int], int]) -> list[tuple[int, int]]:
@@ -284,31 +267,29 @@ def _best_pairs(matches: Mapping[tuple[int, int], int]) -> list[tuple[int, int]]
 
 
 def _collect(
-    seen: Observations,
-    points: Sequence[Array],
-    names: Sequence[str],
-    rows: Sequence[tuple[int, int, Matches]],
-) -> tuple[Array, Array, Array]:
+    seen: Observations, points: Sequence[Array], rows: Sequence[tuple[int, int, Matches]]
+) -> _Resection:
     """Points of the first station, pixels of the second, and the cameras of those."""
-    known, pixels, cameras = [], [], []
+    names, known, pixels, cameras = list(seen.cameras), [], [], []
     for i, j, matches in rows:
         place = points[i][matches[:, 0]]
         good = np.isfinite(place[:, 0])
         known.append(place[good])
-        pixels.append(np.asarray(seen.pixels[j][matches[good, 1]], float))
+        pixels.append(seen.pixels[j][matches[good, 1]])
         cameras.append(np.full(int(good.sum()), names.index(seen.images[j].camera)))
-    stacked = np.concatenate(known), np.concatenate(pixels), np.concatenate(cameras)
-    if len(stacked[0]) <= _ENOUGH:
-        return stacked
-    some = np.linspace(0, len(stacked[0]) - 1, _ENOUGH).astype(int)
-    return stacked[0][some], stacked[1][some], stacked[2][some]
+    count = sum(map(len, known))
+    some = np.linspace(0, count - 1, min(count, _ENOUGH)).astype(int)
+    return _Resection(
+        first=seen.images[rows[0][0]].station,
+        second=seen.images[rows[0][1]].station,
+        points=np.concatenate(known)[some],
+        pixels=np.concatenate(pixels)[some],
+        cameras=np.concatenate(cameras)[some],
+    )
 
 
 def _resect_all(
-    tasks: Sequence[_Resection],
-    cameras: Sequence[Mapping[str, object]],
-    cam_from_rig: Sequence[tuple[Array, Array]],
-    seed: int,
+    tasks: Sequence[_Resection], rig: Sequence[_RigCamera], seed: int
 ) -> list[_LinkAnswer | None]:
     ransac = pycolmap.RANSACOptions()
     ransac.max_error = _MAX_ERROR_PX
@@ -318,24 +299,31 @@ def _resect_all(
     ransac.confidence = 0.999
     refine = pycolmap.AbsolutePoseRefinementOptions()
     refine.print_summary = False
-    pinholes = _pinholes(cameras, cam_from_rig)
-    made = [pycolmap.Camera(dict(camera)) for camera in cameras]
-    poses = [pycolmap.Rigid3d(pycolmap.Rotation3d(quat), shift) for quat, shift in cam_from_rig]
+    params = np.array([camera["params"] for camera, _, _ in rig], float)
+    pinholes = RigPinholes(
+        focal_px=params[:, :2],
+        centre_px=params[:, 2:],
+        turn=np.array([Rotation.from_quat(quat).as_matrix() for _, quat, _ in rig]),
+        shift=np.array([shift for _, _, shift in rig]),
+    )
     estimate = partial(
         pycolmap.estimate_and_refine_generalized_absolute_pose,
-        cams_from_rig=poses, cameras=made, estimation_options=ransac, refinement_options=refine,
-    )  # fmt: skip
+        cams_from_rig=[pycolmap.Rigid3d(pycolmap.Rotation3d(q), shift) for _, q, shift in rig],
+        cameras=[pycolmap.Camera(dict(camera)) for camera, _, _ in rig],
+        estimation_options=ransac,
+        refinement_options=refine,
+    )
     return [_resect(task, estimate, pinholes) for task in tasks]
 
 
 def _resect(
     task: _Resection, estimate: Callable[..., Any], pinholes: RigPinholes
 ) -> _LinkAnswer | None:
-    found = estimate(task.pixels, task.points, task.cameras)
+    found = estimate(task.pixels, task.points, task.cameras.tolist())
     if found is None or found["num_inliers"] < max(_MIN_INLIERS, _MIN_SHARE * len(task.points)):
         return None
     start = as_transform(found["rig_from_world"])
-    refined = refine_link(task.points, task.pixels, np.array(task.cameras), pinholes, start)
+    refined = refine_link(task.points, task.pixels, task.cameras, pinholes, start)
     if refined is None:
         return None
     pose, covariance = refined
@@ -344,18 +332,6 @@ def _resect(
         return None
     shift = np.asarray(pose.translation)
     return pose.rotation.as_quat(), shift, int(found["num_inliers"]), turns, shifts
-
-
-def _pinholes(
-    cameras: Sequence[Mapping[str, object]], cam_from_rig: Sequence[tuple[Array, Array]]
-) -> RigPinholes:
-    params = np.array([camera["params"] for camera in cameras], float)  # of pinholes
-    return RigPinholes(
-        focal_px=params[:, :2],
-        centre_px=params[:, 2:],
-        turn=np.array([Rotation.from_quat(quat).as_matrix() for quat, _ in cam_from_rig]),
-        shift=np.array([shift for _, shift in cam_from_rig]),
-    )
 
 
 def refine_link(
@@ -450,7 +426,10 @@ def map_globally(
     for group in station_groups(links) if links else []:
         members = set(group)
         poses = average_poses([link for link in links if link.first in members])
-        model = triangulate_and_adjust(database, _frame_poses(seen, cam_from_rig, poses), options)
+        # The database's rig has the frame of its first camera.
+        reference = cam_from_rig[next(iter(seen.cameras))]
+        poses = {station: reference * pose for station, pose in poses.items()}
+        model = triangulate_and_adjust(database, frame_poses(seen, poses), options)
         if model.num_reg_images() and model.num_points3D():
             models.append(model)
     return models
@@ -558,18 +537,12 @@ def _triangulate(
     return mapper
 
 
-def _frame_poses(
-    seen: Observations,
-    cam_from_rig: Mapping[str, RigidTransform],
-    rig_from_world: Mapping[int, RigidTransform],
+def frame_poses(
+    seen: Observations, rig_from_world: Mapping[int, RigidTransform]
 ) -> dict[int, RigidTransform]:
-    """Poses by frame of the database, whose rig's frame is that of its first camera."""
-    reference = cam_from_rig[next(iter(seen.cameras))]
-    return {
-        frame: reference * rig_from_world[station]
-        for frame, station in station_frames(seen.images).items()
-        if station in rig_from_world
-    }
+    """Poses of stations by the ids that their frames have in a database with one rig."""
+    stations = enumerate(sorted({record.station for record in seen.images}), 1)
+    return {frame: rig_from_world[s] for frame, s in stations if s in rig_from_world}
 
 
 def station_groups(links: Sequence[StationLink]) -> list[list[int]]:
@@ -602,10 +575,26 @@ def average_poses(links: Sequence[StationLink]) -> Mapping[int, RigidTransform]:
     shift = 1.0 / np.array([link.shift_variance for link in links])
     relative = RigidTransform.concatenate([link.second_from_first for link in links])
     root, start = _along_tree(len(names), first, second, relative, turn)
-    turned = _average_rotations(start.rotation, first, second, relative.rotation, turn, root)
+    turned, centres = start.rotation, start.inv().translation
+    differences = coo_array(
+        (np.repeat([-1.0, 1.0], len(links)), (np.tile(np.arange(len(links)), 2), ends.T.ravel()))
+    ).tocsr()
+    solve = partial(_solve, differences, root)
+    for _ in range(_ROUNDS):
+        # (relative * first).inv() * second is what is left over, about the world's axes.
+        left = ((relative.rotation * turned[first]).inv() * turned[second]).as_rotvec()
+        step = solve(left, turn, _MIN_ANGLE_RAD)
+        turned = turned * Rotation.from_rotvec(step)
+        if np.abs(step).max() < 1e-8:
+            break
     # Where the second station's origin lies as the first sees it, turned into the world's axes.
     steps = turned[first].inv().apply(relative.inv().translation)
-    centres = _average_centres(start.inv().translation, first, second, steps, shift, root)
+    floor = _MIN_LENGTH * float(np.median(np.linalg.norm(steps, axis=1)))
+    for _ in range(_ROUNDS):
+        step = solve(centres[second] - centres[first] - steps, shift, floor)
+        centres = centres + step
+        if np.abs(step).max() < 1e-6 * floor:
+            break
     poses = RigidTransform.from_components(-turned.apply(centres), turned)
     return {name: poses[k] for k, name in enumerate(names.tolist())}
 
@@ -626,66 +615,26 @@ def _along_tree(
     graph = csr_array(coo_array((1.0 / weight, (first, second)), shape=(count, count)))
     tree = minimum_spanning_tree(graph)
     order, parent = breadth_first_order(tree, root, directed=False)
-    of_pair = {(int(a), int(b)): k for k, (a, b) in enumerate(zip(first, second, strict=True))}
+    steps = {}
+    for a, b, pose in zip(first.tolist(), second.tolist(), relative, strict=True):
+        steps[a, b], steps[b, a] = pose, pose.inv()
     poses = [RigidTransform.identity() for _ in range(count)]
-    for node in order[1:]:
-        above = int(parent[node])
-        k = of_pair.get((above, int(node)))
-        step = relative[k] if k is not None else relative[of_pair[int(node), above]].inv()
-        poses[node] = step * poses[above]
+    for node in order[1:].tolist():
+        poses[node] = steps[int(parent[node]), node] * poses[parent[node]]
     return root, RigidTransform.concatenate(poses)
 
 
-def _average_rotations(
-    start: Rotation, first: Indices, second: Indices, relative: Rotation, weight: Array, root: int
-) -> Rotation:
-    turned = start
-    for _ in range(_ROUNDS):
-        # (relative * first).inv() * second is what is left over, about the world's axes.
-        left = ((relative * turned[first]).inv() * turned[second]).as_rotvec()
-        trust = weight * _trust(np.linalg.norm(left, axis=1), _MIN_ANGLE_RAD)
-        step = _solve(len(turned), first, second, -left, trust, root)
-        turned = turned * Rotation.from_rotvec(step)
-        if np.abs(step).max() < 1e-8:
-            break
-    return turned
+def _solve(differences: csr_array, root: int, left: Array, weight: Array, floor: float) -> Array:
+    """A step that reduces what links leave over, (N, 3), where the root does not move.
 
-
-def _average_centres(
-    centres: Array, first: Indices, second: Indices, steps: Array, weight: Array, root: int
-) -> Array:
-    floor = _MIN_LENGTH * float(np.median(np.linalg.norm(steps, axis=1)))
-    for _ in range(_ROUNDS):
-        left = centres[second] - centres[first] - steps
-        trust = weight * _trust(np.linalg.norm(left, axis=1), floor)
-        step = _solve(len(centres), first, second, -left, trust, root)
-        centres = centres + step
-        if np.abs(step).max() < 1e-6 * floor:
-            break
-    return centres
-
-
-def _trust(residuals: Array, floor: float) -> Array:
-    scale = max(_MEDIANS * float(np.median(residuals)), floor)
-    trust: Array = 1.0 / (1.0 + (residuals / scale) ** 2)
-    return trust
-
-
-def _solve(
-    count: int, first: Indices, second: Indices, target: Array, weight: Array, root: int
-) -> Array:
-    """Least squares of `x[second] - x[first] = target` with `x[root] = 0`; (count, 3)."""
-    rows = np.arange(len(first))
-    sign = np.concatenate([-np.ones(len(first)), np.ones(len(first))])
-    incidence = csr_array(
-        coo_array(
-            (sign, (np.concatenate([rows, rows]), np.concatenate([first, second]))),
-            shape=(len(first), count),
-        )
-    )
-    free = np.flatnonzero(np.arange(count) != root)
-    reduced = incidence[:, free]
-    normal = csr_array(reduced.T @ (diags_array(weight).tocsr() @ reduced)).tocsc()
-    solved = np.zeros((count, 3))
-    solved[free] = splu(normal).solve(reduced.T @ (weight[:, None] * target))
+    Links fade out that contradict the others: those that leave more than the usual, or `floor`.
+    """
+    size = np.linalg.norm(left, axis=1)
+    scale = max(_MEDIANS * float(np.median(size)), floor)
+    trust = weight * (1.0 / (1.0 + (size / scale) ** 2))
+    free = np.flatnonzero(np.arange(differences.shape[1]) != root)
+    reduced = differences[:, free]
+    normal = csr_array(reduced.T @ (diags_array(trust).tocsr() @ reduced)).tocsc()
+    solved = np.zeros((differences.shape[1], 3))
+    solved[free] = splu(normal).solve(reduced.T @ (trust[:, None] * -left))
     return solved

@@ -7,11 +7,10 @@ Of several models those that share stations become one. Others are kept apart in
 gives them the same scale, for navigation to join; else they are left out and reported by name.
 """
 
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import pycolmap
@@ -19,13 +18,17 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.errors import ReconstructionError, warn
 from alice_survey.core.executor import SERIAL, Executor
-from alice_survey.core.frames import Array
 from alice_survey.core.manifest import ImageRecord
 from alice_survey.core.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.mapping.arrays import observations
-from reconstruct.mapping.database import Observations, new_folder, station_frames, write_database
-from reconstruct.mapping.global_mapper import adjust, map_globally, triangulate_and_adjust
+from reconstruct.mapping.database import Observations, new_folder, scratch_database
+from reconstruct.mapping.global_mapper import (
+    adjust,
+    frame_poses,
+    map_globally,
+    triangulate_and_adjust,
+)
 from reconstruct.pictures.files import list_names
 from reconstruct.views.model_files import as_transform, rigid3d
 
@@ -96,10 +99,9 @@ def map_calibrated(
     }
     found, notes = _map_rig(seen, pinhole_from_rig, folder, seed, executor)
     model, kept = largest(found, seen.images), found
-    if len(seen.cameras) > 1:
+    scaled, known, factor = len(seen.cameras) > 1, float("nan"), 1.0
+    if scaled:
         model, *_ = kept = side_by_side(found)
-    known, factor = float("nan"), 1.0
-    if len(seen.cameras) > 1:
         first, second, *_ = pinhole_from_rig.values()
         known = float(np.linalg.norm((second * first.inv()).translation))
         factor = known / model_baseline(model)
@@ -109,7 +111,7 @@ def map_calibrated(
         model=model,
         warps=seen.warps,
         models=sizes(found),
-        scaled=len(seen.cameras) > 1,
+        scaled=scaled,
         baseline=known,
         rig_factor=factor,
         notes=(*notes, *report_left_out(kept)),
@@ -128,26 +130,21 @@ def _map_rig(
     one_station = len({record.station for record in seen.images}) == 1
     if len(seen.cameras) < 2 or one_station:
         why = "there is one station" if one_station else "one camera has no stereo pairs"
-        return run_mapper(seen, cam_from_rig, folder, seed, free="nothing"), [
-            f"incremental mapping: {why}"
-        ]
+        found = run_mapper(seen, cam_from_rig, folder, seed, free="nothing")
+        return found, [f"incremental mapping: {why}"]
     found = _globally(seen, cam_from_rig, folder, seed, executor)
     faults = faults_of(found, total)
     if not faults:
         return found, ["global mapping of stations"]
     again = run_mapper(seen, cam_from_rig, folder, seed, free="nothing")
-    ranks = [
-        (not (models and unsound(models[0])), models[0].num_reg_images() if models else 0)
-        for models in (found, again)
-    ]
-    better = ranks[1] > ranks[0]
-    note = f"global mapping {' and '.join(faults)}: incremental mapping " + (
-        f"instead, with {ranks[1][1]} of {total} pictures"
-        if better
-        else f"was no better, with {ranks[1][1]} of {total} pictures"
+    best = max(found, again, key=lambda ms: (not (ms and unsound(ms[0])), pictures_in_largest(ms)))
+    note = (
+        f"global mapping {' and '.join(faults)}: incremental mapping "
+        f"{'was no better' if best is found else 'instead'}, "
+        f"with {pictures_in_largest(again)} of {total} pictures"
     )
     warn(note)
-    return (again if better else found), [note]
+    return best, [note]
 
 
 def _globally(
@@ -159,15 +156,13 @@ def _globally(
 ) -> list[pycolmap.Reconstruction]:
     """Map all stations at once, then register what is left over one by one; largest first."""
     options = _options(cam_from_rig, seed, "nothing")
-    scratch = new_folder(folder / "mapper")
-    database = scratch / "database.db"
-    write_database(database, seen, cam_from_rig)
-    found = _sort_by_size(map_globally(database, seen, cam_from_rig, options, seed, executor))
-    if found and not unsound(found[0]):
-        grown = _grow(found[0], len(seen.images), scratch, options)
-        if grown is not found[0]:
-            found = merge_models(_sort_by_size([grown, *found[1:]]), database, options)
-    shutil.rmtree(scratch)
+    with scratch_database(folder / "mapper", seen, cam_from_rig) as scratch:
+        database = scratch / "database.db"
+        found = _sort_by_size(map_globally(database, seen, cam_from_rig, options, seed, executor))
+        if found and not unsound(found[0]):
+            grown = _grow(found[0], len(seen.images), scratch, options)
+            if grown is not found[0]:
+                found = merge_models(_sort_by_size([grown, *found[1:]]), database, options)
     return _sort_by_size(found)
 
 
@@ -193,16 +188,11 @@ def map_from_poses(
         free: what of the cameras is refined in addition to their poses.
     """
     options = _options(cam_from_rig, seed, free)
-    scratch = new_folder(folder / "mapper")
-    database = scratch / "database.db"
-    write_database(database, seen, cam_from_rig)
-    frames = station_frames(seen.images)
-    poses = {frame: rig_from_world[s] for frame, s in frames.items() if s in rig_from_world}
-    model = triangulate_and_adjust(database, poses, options)
-    model = _grow(model, len(seen.images), scratch, options)
-    model = _grow(model, len(seen.images), scratch, _undemanding(options))
-    shutil.rmtree(scratch)
-    return model
+    with scratch_database(folder / "mapper", seen, cam_from_rig) as scratch:
+        poses = frame_poses(seen, rig_from_world)
+        model = triangulate_and_adjust(scratch / "database.db", poses, options)
+        model = _grow(model, len(seen.images), scratch, options)
+        return _grow(model, len(seen.images), scratch, _lower_demands(options))
 
 
 def _grow(
@@ -215,14 +205,16 @@ def _grow(
     if model.num_reg_images() == total:
         return model
     options.multiple_models = False
-    grown = _sort_by_size(
-        [pycolmap.Reconstruction(more) for more in _continue_mapping(model, scratch, options)]
+    grown = max(
+        model,
+        *map(pycolmap.Reconstruction, _continue_mapping(model, scratch, options)),
+        key=_size,
     )
-    if not grown or grown[0].num_reg_images() <= model.num_reg_images():
+    if grown.num_reg_images() <= model.num_reg_images():
         return model
-    adjust(grown[0], options, tolerance=1e-7)
-    grown[0].update_point_3d_errors()
-    return grown[0]
+    adjust(grown, options, tolerance=1e-7)
+    grown.update_point_3d_errors()
+    return grown
 
 
 def faults_of(found: Sequence[pycolmap.Reconstruction], total: int) -> list[str]:
@@ -248,8 +240,17 @@ def unsound(model: pycolmap.Reconstruction) -> list[str]:
     return faults
 
 
+def _size(model: pycolmap.Reconstruction) -> tuple[int, int]:
+    return model.num_reg_images(), model.num_points3D()
+
+
 def _sort_by_size(models: Sequence[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
-    return sorted(models, key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
+    return sorted(models, key=_size, reverse=True)
+
+
+def pictures_in_largest(models: Sequence[pycolmap.Reconstruction]) -> int:
+    """Pictures in the first of models by falling size; 0 where there is none."""
+    return models[0].num_reg_images() if models else 0
 
 
 def model_baseline(model: pycolmap.Reconstruction) -> float:
@@ -264,17 +265,7 @@ def model_baseline(model: pycolmap.Reconstruction) -> float:
 
 def scale_model(model: pycolmap.Reconstruction, factor: float) -> None:
     """Multiply all lengths of a model, its rig's too, in place."""
-    rigs = {rig_id: _sensor_poses(rig) for rig_id, rig in model.rigs.items()}
     model.transform(pycolmap.Sim3d(factor, pycolmap.Rotation3d(), np.zeros(3)))
-    for rig_id, poses in rigs.items():
-        for sensor, pose in poses.items():
-            now = model.rigs[rig_id].sensor_from_rig(sensor).translation
-            if not np.allclose(now, factor * pose, rtol=1e-9, atol=0):
-                raise RuntimeError("COLMAP did not scale the rig with the model")
-
-
-def _sensor_poses(rig: Any) -> dict[Any, Array]:
-    return {s: np.array(p.translation) for s, p in rig.non_ref_sensors.items()}
 
 
 def run_mapper(
@@ -298,13 +289,12 @@ def run_mapper(
     Returns:
         All models, largest first.
     """
-    found = _map_once(seen, cam_from_rig, folder, _options(cam_from_rig, seed, free), free)
-    if not found or found[0].num_reg_images() < len(seen.images):
-        options = _undemanding(_options(cam_from_rig, seed, free))
-        again = _map_once(seen, cam_from_rig, folder, options, free)
-        if again and (not found or again[0].num_reg_images() > found[0].num_reg_images()):
-            return again
-    return found
+    options = _options(cam_from_rig, seed, free)
+    found = _map_once(seen, cam_from_rig, folder, options, free)
+    if pictures_in_largest(found) == len(seen.images):
+        return found
+    again = _map_once(seen, cam_from_rig, folder, _lower_demands(options), free)
+    return max(found, again, key=pictures_in_largest)
 
 
 def _options(
@@ -337,7 +327,7 @@ def _options(
     return options
 
 
-def _undemanding(
+def _lower_demands(
     options: pycolmap.IncrementalPipelineOptions,
 ) -> pycolmap.IncrementalPipelineOptions:
     """Lower the demands on matches, in place, and return the options."""
@@ -355,21 +345,22 @@ def _map_once(
     options: pycolmap.IncrementalPipelineOptions,
     free: Free,
 ) -> list[pycolmap.Reconstruction]:
-    scratch = new_folder(folder / "mapper")
-    write_database(scratch / "database.db", seen, cam_from_rig)
     total = len({r.station for r in seen.images}) if cam_from_rig else len(seen.images)
-    with progress.step("add pictures to the model", total) as counter:
+    with (
+        scratch_database(folder / "mapper", seen, cam_from_rig) as scratch,
+        progress.step("add pictures to the model", total) as counter,
+    ):
+        database = scratch / "database.db"
         found = pycolmap.incremental_mapping(
-            scratch / "database.db", scratch, scratch, options, next_image_callback=counter.advance
+            database, scratch, scratch, options, next_image_callback=counter.advance
         )
-    models = [pycolmap.Reconstruction(model) for model in found.values()]
-    models = [_repair(model, scratch, options) for model in models]
-    if cam_from_rig is not None and free == "nothing":
-        for model in models:
-            adjust(model, options, tolerance=1e-7)
-            model.update_point_3d_errors()
-        models = merge_models(_sort_by_size(models), scratch / "database.db", options)
-    shutil.rmtree(scratch)
+        models = [pycolmap.Reconstruction(model) for model in found.values()]
+        models = [_repair(model, scratch, options) for model in models]
+        if cam_from_rig is not None and free == "nothing":
+            for model in models:
+                adjust(model, options, tolerance=1e-7)
+                model.update_point_3d_errors()
+            models = merge_models(_sort_by_size(models), database, options)
     return _sort_by_size(models)
 
 
@@ -408,20 +399,11 @@ def _continue_mapping(
 
 def collapsed_frames(model: pycolmap.Reconstruction) -> list[int]:
     """Frames many of whose points lie in their cameras' own centres."""
-    depths: dict[int, list[Array]] = {}
     seen = observations(model)
-    for n, number in enumerate(seen.pictures.tolist()):
-        depth = seen.in_cameras[seen.of(n), 2]
-        if len(depth):
-            depths.setdefault(model.images[number].frame_id, []).append(depth)
-    if not depths:
-        return []
-    usual = float(np.median(np.concatenate([np.concatenate(rows) for rows in depths.values()])))
-    return [
-        frame
-        for frame, rows in depths.items()
-        if np.mean(np.concatenate(rows) < _COLLAPSED * usual) > _MAX_COLLAPSED
-    ]
+    frames = [model.images[number].frame_id for number in seen.pictures.tolist()]
+    frame, depth = np.repeat(frames, np.diff(seen.starts)), seen.in_cameras[:, 2]
+    near = depth < _COLLAPSED * np.median(depth) if len(depth) else np.zeros(0, np.bool_)
+    return [f for f in dict.fromkeys(frame.tolist()) if near[frame == f].mean() > _MAX_COLLAPSED]
 
 
 def largest(

@@ -7,7 +7,6 @@ and the model is adjusted, until neither moves. What it converges to is the mode
 pixels as taken through the port. Where rays meet in one centre nothing changes.
 """
 
-import shutil
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +31,7 @@ from reconstruct.mapping.bundle import (
     spread_part,
     take_poses,
 )
-from reconstruct.mapping.database import Observations, new_folder, write_database
+from reconstruct.mapping.database import Observations, scratch_database
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.views.model_files import stored_of
 
@@ -180,10 +179,9 @@ def refract(
             "refraction through the port removed for a median distance of the working range",
         )
 
-    def judge(model: pycolmap.Reconstruction, scale: float) -> tuple[int, int]:
-        keypoints.correct_unseen(model, scale)
-        return _judge_again(model, seen, folder, _pinholes(mapped, cam_from_rig))
-
+    pinholes = None
+    if cam_from_rig is not None:
+        pinholes = {n: mapped.warps[n].pinhole_from_cam * pose for n, pose in cam_from_rig.items()}
     model = pycolmap.Reconstruction(mapped.model)
     moves: list[float] = []
     removed = added = 0
@@ -197,10 +195,11 @@ def refract(
             settled = True
             break
         rough = replace(mapped, model=model, notes=notes)
-        mapped = adjust_freely(rough, FULLY) if settle else adjust_roughly(rough)
+        mapped = adjust_freely(rough, FULLY) if settle else adjust_freely(rough, spread=True)
         model = pycolmap.Reconstruction(mapped.model)
         if len(moves) == 1:
-            removed, added = judge(model, scale)
+            keypoints.correct_unseen(model, scale)
+            removed, added = _judge_again(model, seen, folder, pinholes)
             if not settle:
                 keypoints.correct(model, scale)
                 settled = True
@@ -224,7 +223,9 @@ def refract(
     return replace(mapped, model=model), found
 
 
-def adjust_freely(mapped: Mapped, tolerance: float | None = None) -> Mapped:
+def adjust_freely(
+    mapped: Mapped, tolerance: float | None = None, *, spread: bool = False
+) -> Mapped:
     """Adjust all poses and points.
 
     A rig fixes the scale, so that one station's pose is all that is held of each group that points
@@ -235,51 +236,30 @@ def adjust_freely(mapped: Mapped, tolerance: float | None = None) -> Mapped:
         tolerance: relative change of the cost at which the adjustment ends. If left out, that of a
             step of all unknowns of half a sigma: one of L sigmas lowers the cost of N observations,
             about N, by L^2 / 2.
+        spread: adjust poses roughly, by points that are spread over the pictures, which all others
+            follow: near enough for an adjustment on exact rays.
     """
-    if tolerance is None:
+    model = pycolmap.Reconstruction(mapped.model)
+    part, sigma_px = spread_part(model) if spread else None, pixel_sigma(model)
+    if spread:
+        tolerance = ROUGHLY
+    elif tolerance is None:
         count = sum(image.num_points3D for image in mapped.model.images.values())
         tolerance = _LAST_STEP_SIGMAS**2 / (2.0 * max(count, 1))
-    model = pycolmap.Reconstruction(mapped.model)
-    _solve(model, pixel_sigma(model), tolerance, on_rig=bool(np.isfinite(mapped.baseline)))
-    model.update_point_3d_errors()
-    return replace(mapped, model=model)
-
-
-def adjust_roughly(mapped: Mapped) -> Mapped:
-    """Adjust all poses on a rig by points that are spread over the pictures; all points follow.
-
-    Near enough for an adjustment on exact rays.
-    """
-    model = pycolmap.Reconstruction(mapped.model)
-    part, sigma_px = spread_part(model), pixel_sigma(model)
-    _solve(model if part is None else part, sigma_px, ROUGHLY, on_rig=True)
+    adjusted = model if part is None else part
+    config = all_pictures(adjusted)
+    if np.isfinite(mapped.baseline):
+        for frame in frames_of(adjusted)[first_of(model_groups(adjusted))].tolist():
+            config.set_constant_rig_from_world_pose(frame)
+    else:
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    options = held_options(sigma_px, tolerance)
+    pycolmap.create_default_bundle_adjuster(options, config, adjusted).solve()
     if part is not None:
         take_poses(model, part)
         move_points(model, loss_scale(sigma_px))
     model.update_point_3d_errors()
     return replace(mapped, model=model)
-
-
-def _solve(
-    model: pycolmap.Reconstruction, sigma_px: float, tolerance: float, *, on_rig: bool
-) -> None:
-    """Adjust poses and points in place."""
-    config = all_pictures(model)
-    if on_rig:
-        for frame in frames_of(model)[first_of(model_groups(model))].tolist():
-            config.set_constant_rig_from_world_pose(frame)
-    else:
-        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    options = held_options(sigma_px, tolerance)
-    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
-
-
-def _pinholes(
-    mapped: Mapped, cam_from_rig: Mapping[str, RigidTransform] | None
-) -> dict[str, RigidTransform] | None:
-    if cam_from_rig is None:
-        return None
-    return {name: mapped.warps[name].pinhole_from_cam * pose for name, pose in cam_from_rig.items()}
 
 
 def _judge_again(
@@ -290,16 +270,16 @@ def _judge_again(
 ) -> tuple[int, int]:
     """Take wrong observations out and complete tracks, in place; how many went and came."""
     before = model.compute_num_observations()
-    limit = _wrong_px(model)
+    limit = float(np.clip(_WRONG_SIGMAS * pixel_sigma(model), _MIN_WRONG_PX, _MAX_WRONG_PX))
     if seen.pairs:
-        scratch = new_folder(folder / "refraction")
-        write_database(scratch / "database.db", seen, cam_from_rig)
         cached = pycolmap.DatabaseCacheOptions()
         # a picture that no larger model could use is in none, but its few matches are there
         cached.image_names = {image.name for image in model.images.values()}
-        with pycolmap.Database.open(scratch / "database.db") as database:
-            cache = pycolmap.DatabaseCache.create(database, cached)
-        graph = cache.correspondence_graph
+        with (
+            scratch_database(folder / "refraction", seen, cam_from_rig) as scratch,
+            pycolmap.Database.open(scratch / "database.db") as database,
+        ):
+            graph = pycolmap.DatabaseCache.create(database, cached).correspondence_graph
         manager = pycolmap.ObservationManager(model, graph)
         options = pycolmap.IncrementalTriangulatorOptions()
         options.ignore_two_view_tracks = False
@@ -308,14 +288,8 @@ def _judge_again(
         triangulator = pycolmap.IncrementalTriangulator(graph, model, manager)
         triangulator.complete_all_tracks(options)
         triangulator.merge_all_tracks(options)
-        shutil.rmtree(scratch)
     else:
         manager = pycolmap.ObservationManager(model)
     added = model.compute_num_observations() - before
     removed = manager.filter_all_points3D(limit, _MIN_ANGLE_DEG)
     return int(removed), int(added)
-
-
-def _wrong_px(model: pycolmap.Reconstruction) -> float:
-    """Size of the miss from which an observation is wrong."""
-    return float(np.clip(_WRONG_SIGMAS * pixel_sigma(model), _MIN_WRONG_PX, _MAX_WRONG_PX))

@@ -44,7 +44,13 @@ from reconstruct.mapping.working_range import (
 from reconstruct.matching.features import find_features, load_features, save_features
 from reconstruct.matching.learned import Taken, all_pixels, quarter_turns, with_learned
 from reconstruct.matching.matches import PairTask, coarse_matches, match_pair
-from reconstruct.matching.pairs import SMALL_SET, alike_pairs, choose_pairs, placed_pictures
+from reconstruct.matching.pairs import (
+    SMALL_SET,
+    Pair,
+    alike_pairs,
+    choose_pairs,
+    placed_pictures,
+)
 from reconstruct.matching.refinement import refine_tracks
 from reconstruct.pictures.files import exif_focal_px, list_names
 from reconstruct.pictures.normalise import even_light, finely, normalise, read_deep
@@ -115,8 +121,6 @@ def write_reasons(path: Path, records: Sequence[ImageRecord], words: dict[str, s
         write_csv(path, ("image", "camera", "station", "reason"), rows)
 
 
-RATIO = 0.8
-"""Largest distance of a match over that of the second nearest descriptor."""
 _MIN_COARSE = 10
 """Coarse matches from which a pair is matched fully."""
 _ALIKE = 12
@@ -140,15 +144,6 @@ class Inputs:
         return None if place is None else datum_of(place)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _FeatureTask:
-    picture: Path
-    mask: Path | None
-    target: Path
-    maximum: int
-    thrifty: bool
-
-
 def run_mapping(
     workspace: Path, folder: Path, executor: Executor, *, reconstruct: ReconstructConfig, seed: int
 ) -> None:
@@ -160,11 +155,32 @@ def run_mapping(
     """
     inputs = read_inputs(workspace)
     pycolmap.logging.minloglevel = 2  # its own account of every step is for its developers
-    features, counts = _find_all(inputs, folder / "features", reconstruct, executor)
+    (folder / "features").mkdir(parents=True, exist_ok=True)
+    mounted = rig_with_mount(inputs.rig)
+    pictures = [
+        Taken(
+            picture=inputs.images / record.image,
+            mask=inputs.images / record.mask if record.mask else None,
+            features=folder / "features" / f"{i:06d}.npz",
+            maximum=reconstruct.max_features,
+            turns=quarter_turns(record, mounted),
+            thrifty=inputs.rig is not None,
+        )
+        for i, record in enumerate(inputs.records)
+    ]
+    features = [picture.features for picture in pictures]
+    counts = list(executor.map(extract, pictures, label="features"))
+    poor = [r.image for r, n in zip(inputs.records, counts, strict=True) if n < FEW_FEATURES]
+    if poor:
+        warn(f"{len(poor)} pictures have fewer than {FEW_FEATURES} features: {list_names(poor)}")
     warps, distances = _warps(inputs, features, executor)
     cameras, exif_focal = _cameras(inputs, warps)
-    known = None if distances is None or distances.source == ANY_DISTANCE else distances
-    pairs = _match_all(inputs, features, cameras, warps, known, reconstruct, seed, executor)
+    planned = _plan_pairs(inputs, features, distances, seed, executor)
+    tasks = _pair_tasks(inputs, features, cameras, warps, planned, seed)
+    found = list(executor.map(match_pair, tasks, label="matching"))
+    if reconstruct.learned_features:
+        found = with_learned(pictures, tasks, found, executor)
+    pairs = [(i, j, m) for (i, j), m in zip(planned, found, strict=True) if m.geometry is not None]
     refined = refine_tracks(
         all_pixels(features),
         [_grey_file(path) for path in features],
@@ -189,49 +205,26 @@ def run_mapping(
             f"{len(words)} of {len(images)} pictures are not in the model, "
             f"mapping/{UNREGISTERED} says why: {list_names(list(words))}"
         )
-    _write(folder, inputs, mapped, distances, refracted)
+    _write(folder, inputs, mapped, registered, distances, refracted)
     shutil.rmtree(folder / "features")
 
 
-def extract(task: _FeatureTask) -> int:
+def extract(task: Taken) -> int:
     """Find and save the features of one picture, unless they are there; how many there are."""
-    if not task.target.exists():
+    if not task.features.exists():
         picture = read_deep(task.picture)
         grey = normalise(picture)
         mask = None if task.mask is None else read_mask(task.mask, (grey.shape[1], grey.shape[0]))
         found = find_features(grey, mask, maximum=task.maximum, thrifty=task.thrifty)
-        with atomic_path(_grey_file(task.target)) as temporary, temporary.open("wb") as file:
+        with atomic_path(_grey_file(task.features)) as temporary, temporary.open("wb") as file:
             np.save(file, finely(even_light(picture)))
-        save_features(task.target, found)
-    return len(load_features(task.target).pixels)
+        save_features(task.features, found)
+    return len(load_features(task.features).pixels)
 
 
 def _grey_file(features: Path) -> Path:
     """Where the evened picture lies next to its features."""
     return features.with_suffix(".npy")
-
-
-def _find_all(
-    inputs: Inputs, folder: Path, settings: ReconstructConfig, executor: Executor
-) -> tuple[list[Path], list[int]]:
-    """Files of features, in the order of the pictures, and how many each has."""
-    targets = [folder / f"{i:06d}.npz" for i in range(len(inputs.records))]
-    tasks = [
-        _FeatureTask(
-            picture=inputs.images / record.image,
-            mask=inputs.images / record.mask if record.mask else None,
-            target=target,
-            maximum=settings.max_features,
-            thrifty=inputs.rig is not None,
-        )
-        for record, target in zip(inputs.records, targets, strict=True)
-    ]
-    folder.mkdir(parents=True, exist_ok=True)
-    counts = list(executor.map(extract, tasks, label="features"))
-    poor = [r.image for r, n in zip(inputs.records, counts, strict=True) if n < FEW_FEATURES]
-    if poor:
-        warn(f"{len(poor)} pictures have fewer than {FEW_FEATURES} features: {list_names(poor)}")
-    return targets, counts
 
 
 def _warps(
@@ -240,7 +233,7 @@ def _warps(
     """The pinholes that stand in for calibrated cameras; none without a rig."""
     if inputs.rig is None:
         return {}, None
-    distances = find_distances(inputs.records, features, inputs.rig, ratio=RATIO, executor=executor)
+    distances = find_distances(inputs.records, features, inputs.rig, executor=executor)
     warps = {
         name: best_warp(inputs.rig.cameras[name], distances.near_m, distances.far_m)
         for name in _camera_names(inputs)
@@ -261,7 +254,7 @@ def _cameras(
         if name in warps:
             cameras[name] = colmap_pinhole(warps[name].pinhole)
             continue
-        first = inputs.images / next(r.image for r in inputs.records if r.camera == name)
+        first = _first_of(inputs, name)
         height, width = read_colour(first).shape[:2]
         focal = exif_focal_px(first, width, height)
         if np.isfinite(focal):
@@ -293,66 +286,47 @@ def _camera_names(inputs: Inputs) -> list[str]:
     return [name for name in inputs.rig.cameras if name in taken]
 
 
-def _match_all(
+def _plan_pairs(
+    inputs: Inputs,
+    features: Sequence[Path],
+    distances: RangeRecord | None,
+    seed: int,
+    executor: Executor,
+) -> list[Pair]:
+    """Pairs to match fully: those that are sure, and those that a coarse look finds likely."""
+    records, rig, datum = inputs.records, rig_with_mount(inputs.rig), inputs.datum
+    known = distances is not None and distances.source != ANY_DISTANCE
+    range_m = (distances.near_m, distances.far_m) if distances is not None and known else None
+    alike: list[Pair] = []
+    if len(records) > SMALL_SET:
+        aside = sorted({*range(len(records))} - placed_pictures(records, rig, datum))
+        alike = alike_pairs(features, aside, _ALIKE, seed=seed, executor=executor)
+    sure, maybe = choose_pairs(records, rig, datum, alike, range_m)
+    looks = [PairTask(first=features[i], second=features[j]) for i, j in maybe]
+    counts = executor.map(coarse_matches, looks, label="choosing pairs")
+    likely = [pair for pair, n in zip(maybe, counts, strict=True) if n >= _MIN_COARSE]
+    return sorted([*sure, *likely])
+
+
+def _pair_tasks(
     inputs: Inputs,
     features: Sequence[Path],
     cameras: Mapping[str, pycolmap.Camera],
     warps: Mapping[str, PinholeWarp],
-    distances: RangeRecord | None,
-    settings: ReconstructConfig,
+    pairs: Sequence[Pair],
     seed: int,
-    executor: Executor,
-) -> list[VerifiedPair]:
-    rig = rig_with_mount(inputs.rig)
-    range_m = None if distances is None else (distances.near_m, distances.far_m)
-    everything = set(range(len(inputs.records)))
-    lost = everything - placed_pictures(inputs.records, rig, inputs.datum, range_m)
-    aside = sorted(everything - placed_pictures(inputs.records, rig, inputs.datum))
-    unseen = sum(inputs.records[i].has_attitude for i in lost)
-    if rig is not None and inputs.datum is not None and unseen:
-        warn(
-            f"{unseen} pictures with an attitude have no footprint (they see the horizon, or have "
-            "no altitude), and the working range is not known: their partners are sought in their "
-            "order and by their looks"
-        )
-    alike: list[tuple[int, int]] = []
-    if len(inputs.records) > SMALL_SET:
-        alike = alike_pairs(features, aside, _ALIKE, seed=seed, executor=executor)
-    sure, maybe = choose_pairs(inputs.records, rig, inputs.datum, alike, range_m)
-    looks = [PairTask(first=features[i], second=features[j], ratio=RATIO) for i, j in maybe]
-    counts = executor.map(coarse_matches, looks, label="choosing pairs")
-    likely = [pair for pair, n in zip(maybe, counts, strict=True) if n >= _MIN_COARSE]
-    pairs = sorted([*sure, *likely])
+) -> list[PairTask]:
     fields = {name: camera.todict() for name, camera in cameras.items()}
     names = [record.camera for record in inputs.records]
-    tasks = [
+    return [
         PairTask(
             first=features[i],
             second=features[j],
-            ratio=RATIO,
             cameras=(fields[names[i]], fields[names[j]]),
             warps=(warps.get(names[i]), warps.get(names[j])),
             seed=seed,
         )
         for i, j in pairs
-    ]
-    found = list(executor.map(match_pair, tasks, label="matching"))
-    if settings.learned_features:
-        taken = [
-            Taken(
-                picture=inputs.images / record.image,
-                mask=inputs.images / record.mask if record.mask else None,
-                features=file,
-                maximum=settings.max_features,
-                turns=quarter_turns(record, rig),
-            )
-            for record, file in zip(inputs.records, features, strict=True)
-        ]
-        found = with_learned(taken, tasks, found, executor)
-    return [
-        (i, j, matches)
-        for (i, j), matches in zip(pairs, found, strict=True)
-        if matches.geometry is not None
     ]
 
 
@@ -360,11 +334,11 @@ def _write(
     partial: Path,
     inputs: Inputs,
     mapped: Mapped,
+    registered: Collection[str],
     distances: RangeRecord | None,
     refracted: RefractionRecord | None,
 ) -> None:
     model = mapped.model
-    registered = {image.name for image in model.images.values() if image.has_pose}
     (partial / "model").mkdir(exist_ok=True)
     model.write_binary(partial / "model")
     CamerasRecord(
@@ -409,24 +383,20 @@ def read_inputs(workspace: Path) -> Inputs:
         rig=None if rig is None else read_rig(rig),
         survey=PicturesRecord.read(images / "survey.json"),
     )
-    check_sizes(inputs)
-    return inputs
-
-
-def check_sizes(inputs: Inputs) -> None:
-    """Check that the first picture of every camera is as large as the rig says.
-
-    Raises:
-        ImageError: it is not.
-    """
     if inputs.rig is None:
-        return
+        return inputs
     for name in _camera_names(inputs):
-        first = next(r.image for r in inputs.records if r.camera == name)
-        height, width = read_colour(inputs.images / first).shape[:2]
+        first = _first_of(inputs, name)
+        height, width = read_colour(first).shape[:2]
         camera = inputs.rig.cameras[name]
         if (width, height) != (camera.width_px, camera.height_px):
             raise ImageError(
-                f"{inputs.images / first}: {width} x {height} pixels, but the rig's camera {name} "
-                f"has {camera.width_px} x {camera.height_px}: give the rig file of these pictures"
+                f"{first}: {width} x {height} pixels, but the rig's camera {name} has "
+                f"{camera.width_px} x {camera.height_px}: give the rig file of these pictures"
             )
+    return inputs
+
+
+def _first_of(inputs: Inputs, camera: str) -> Path:
+    """The first picture of a camera."""
+    return inputs.images / next(r.image for r in inputs.records if r.camera == camera)

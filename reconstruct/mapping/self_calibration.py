@@ -27,6 +27,7 @@ from reconstruct.mapping.mapper import (
     largest,
     map_from_poses,
     model_baseline,
+    pictures_in_largest,
     report_left_out,
     run_mapper,
     scale_model,
@@ -69,29 +70,32 @@ def map_self_calibrated(
     """
     known = set(exif_focal) == set(seen.cameras)
     found = run_mapper(seen, None, folder, seed, free="distortion" if known else "all")
-    if known and (not found or found[0].num_reg_images() < len(seen.images)):
+    if known and pictures_in_largest(found) < len(seen.images):
         freed = run_mapper(seen, None, folder, seed, free="all")
-        if freed and (not found or freed[0].num_reg_images() > found[0].num_reg_images()):
+        if pictures_in_largest(freed) > pictures_in_largest(found):
             found, known = freed, False
     model = largest(found, seen.images)
     notes: list[str] = []
-    cam_from_rig = None
+    names, cam_from_rig = list(seen.cameras), None
     stations = Counter(record.station for record in seen.images)
-    if len(seen.cameras) > 1 and max(stations.values()) == 1:
+    if len(names) > 1 and max(stations.values()) == 1:
         notes.append("cameras that took no pictures together: each calibrates itself")
-    elif len(seen.cameras) > 1:
-        cam_from_rig = rig_from_model(model, seen.images, list(seen.cameras))
+    elif len(names) > 1:
+        cam_from_rig = rig_from_model(model, seen.images, names)
         if cam_from_rig is None:
-            first, *others = seen.cameras
             notes.append(
-                f"fewer than {_MIN_STATIONS} stations have both {first} and one of "
-                f"{', '.join(others)}: mapped without a rig"
+                f"fewer than {_MIN_STATIONS} stations have both {names[0]} and one of "
+                f"{', '.join(names[1:])}: mapped without a rig"
             )
             warn(notes[0])
     if cam_from_rig is not None:
         for _ in range(_ROUNDS):
+            calibrated = {
+                names[number - 1]: pycolmap.Camera(camera.todict())
+                for number, camera in model.cameras.items()
+            }
             model = map_from_poses(
-                replace(seen, cameras={**seen.cameras, **_cameras_of(model, list(seen.cameras))}),
+                replace(seen, cameras={**seen.cameras, **calibrated}),
                 cam_from_rig,
                 poses_on_rig(model, seen.images, cam_from_rig),
                 folder,
@@ -111,10 +115,10 @@ def map_self_calibrated(
         notes.append("the rig calibrated itself; unless scaled, its baseline is the unit of length")
     warps = {
         name: self_calibrated_warp(model.cameras[number])
-        for number, name in enumerate(seen.cameras, 1)
+        for number, name in enumerate(names, 1)
         if number in model.cameras
     }
-    _to_pinholes(model, list(seen.cameras), warps)
+    _to_pinholes(model, {names.index(name) + 1: warp for name, warp in warps.items()})
     return Mapped(
         model=model,
         warps=warps,
@@ -124,15 +128,6 @@ def map_self_calibrated(
         rig_factor=factor,
         notes=(*notes, *report_left_out(found)),
     )
-
-
-def _cameras_of(model: pycolmap.Reconstruction, names: Sequence[str]) -> dict[str, pycolmap.Camera]:
-    """The cameras of a model by name, as they are calibrated so far."""
-    return {
-        name: pycolmap.Camera(model.cameras[number].todict())
-        for number, name in enumerate(names, 1)
-        if number in model.cameras
-    }
 
 
 def self_calibrated_warp(camera: pycolmap.Camera) -> PinholeWarp:
@@ -262,11 +257,8 @@ def _adjust(model: pycolmap.Reconstruction, *, focal: bool) -> None:
     model.update_point_3d_errors()
 
 
-def _to_pinholes(
-    model: pycolmap.Reconstruction, names: Sequence[str], warps: Mapping[str, PinholeWarp]
-) -> None:
+def _to_pinholes(model: pycolmap.Reconstruction, of_camera: Mapping[int, PinholeWarp]) -> None:
     """Make the model one of ideal pinholes, in place."""
-    of_camera = {n: warps[name] for n, name in enumerate(names, 1) if name in warps}
     for image in model.images.values():
         warp, points = of_camera[image.camera_id], image.points2D
         ideal = warp.to_pinhole(np.array([p.xy for p in points]).reshape(-1, 2))

@@ -1,7 +1,6 @@
 """How far the sea floor is from the cameras: it decides where the warp to a pinhole is exact."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.camera import Camera
 from camera_calib.rig import Rig
 from reconstruct.matching.features import load_features
-from reconstruct.matching.matches import match_descriptors
+from reconstruct.matching.matches import SIFT_RATIO, match_descriptors
 from reconstruct.views.range_shift import range_shift
 
 _STATIONS = 24
@@ -36,22 +35,12 @@ _MAX_CUT = 0.05
 """Share of a frame whose loss is worth a warning."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _StereoTask:
-    first: Path
-    second: Path
-    cameras: tuple[Camera, Camera]
-    second_from_first: RigidTransform
-    ratio: float
+_StereoTask = tuple[tuple[Path, Path], tuple[Camera, Camera], RigidTransform]
+"""Features of two pictures of a station, their cameras, and `second_from_first`."""
 
 
 def find_distances(
-    records: Sequence[ImageRecord],
-    features: Sequence[Path],
-    rig: Rig,
-    *,
-    ratio: float,
-    executor: Executor,
+    records: Sequence[ImageRecord], features: Sequence[Path], rig: Rig, *, executor: Executor
 ) -> RangeRecord:
     """Distances of the sea floor from stereo matches, else from the altitudes measured.
 
@@ -59,7 +48,6 @@ def find_distances(
         records: pictures.
         features: file of features of every picture.
         rig: calibrated cameras.
-        ratio: for matching.
         executor: where tasks run.
 
     Raises:
@@ -67,7 +55,7 @@ def find_distances(
     """
     if not any(camera.refracts for camera in rig.cameras.values()):
         return RangeRecord(near_m=_NEAR, far_m=_FAR, source=ANY_DISTANCE)
-    tasks = _stereo_tasks(records, features, rig, ratio)
+    tasks = _stereo_tasks(records, features, rig)
     depths = np.concatenate([np.zeros(0), *executor.map(
         stereo_depths, tasks, label="working range"
     )])  # fmt: skip
@@ -76,8 +64,7 @@ def find_distances(
         return RangeRecord(near_m=float(near), far_m=float(far), source="stereo")
     altitudes = np.array([r.altitude_m for r in records])
     if np.isfinite(altitudes).any():
-        reference = rig.cameras[rig.reference]
-        glass = float(reference.front_cam[2])
+        glass = float(rig.cameras[rig.reference].front_cam[2])
         middle = float(np.nanmedian(altitudes)) + glass
         if tasks:
             warn(f"{len(depths)} points in stereo matches: the altitude sets the working range")
@@ -121,16 +108,17 @@ def warn_of_warps(warps: Mapping[str, PinholeWarp], distances: RangeRecord) -> N
 
 def stereo_depths(task: _StereoTask) -> Array:
     """Depths of the matches of two pictures along the axis of either camera, exactly refracted."""
-    a, b = load_features(task.first), load_features(task.second)
-    matches = match_descriptors(a.descriptors[:_FEATURES], b.descriptors[:_FEATURES], task.ratio)
-    first, second = task.cameras
+    files, (first, second), second_from_first = task
+    a, b = map(load_features, files)
+    some, other = a.descriptors[:_FEATURES], b.descriptors[:_FEATURES]
+    matches = match_descriptors(some, other, SIFT_RATIO)
     start_a, ray_a = first.unproject(a.pixels[matches[:, 0]])
     start_b, ray_b = second.unproject(b.pixels[matches[:, 1]])
-    first_from_second = task.second_from_first.inv()
+    first_from_second = second_from_first.inv()
     start_b, ray_b = first_from_second.apply(start_b), first_from_second.rotation.apply(ray_b)
     along_a, gap = ray_passes(start_a, ray_a, start_b, ray_b)
     points = start_a + along_a[:, None] * ray_a
-    depths = np.stack([points[:, 2], task.second_from_first.apply(points)[:, 2]])
+    depths = np.stack([points[:, 2], second_from_first.apply(points)[:, 2]])
     focal = first.focal_in_water_px
     with np.errstate(invalid="ignore"):
         good = (along_a > 0) & (gap * focal < _MAX_GAP_PX * depths[0]) & (depths[1] > 0)
@@ -162,7 +150,7 @@ def ray_passes(start_a: Array, ray_a: Array, start_b: Array, ray_b: Array) -> tu
 
 
 def _stereo_tasks(
-    records: Sequence[ImageRecord], features: Sequence[Path], rig: Rig, ratio: float
+    records: Sequence[ImageRecord], features: Sequence[Path], rig: Rig
 ) -> list[_StereoTask]:
     stations: dict[int, dict[str, int]] = {}
     for i, record in enumerate(records):
@@ -171,14 +159,12 @@ def _stereo_tasks(
     together = [pairs for pairs in together if pairs]
     cameras = max(map(len, stations.values()), default=0)
     step = max(1, sum(map(len, together)) // (_STATIONS * max(1, cameras - 1)))
-    poses: Mapping[str, RigidTransform] = rig.cam_from_rig
+    poses = rig.cam_from_rig
     return [
-        _StereoTask(
-            first=features[i],
-            second=features[j],
-            cameras=(rig.cameras[first], rig.cameras[second]),
-            second_from_first=poses[second] * poses[first].inv(),
-            ratio=ratio,
+        (
+            (features[i], features[j]),
+            (rig.cameras[first], rig.cameras[second]),
+            poses[second] * poses[first].inv(),
         )
         for pairs in together[::step]
         for (first, i), (second, j) in pairs

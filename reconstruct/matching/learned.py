@@ -220,7 +220,7 @@ _STEEP = np.sqrt(0.5)
 
 @dataclass(frozen=True, kw_only=True)
 class Taken:
-    """A picture and where its features are kept."""
+    """A picture whose features are sought, and where they are kept."""
 
     picture: Path
     mask: Path | None
@@ -229,6 +229,8 @@ class Taken:
     maximum: int
     turns: int
     """Quarter turns that bring its north up, see `quarter_turns`."""
+    thrifty: bool = False
+    """Look for SIFT where there are enough first, see `detection_scales`."""
 
     @property
     def learned(self) -> Path:

@@ -21,6 +21,8 @@ from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.matching.features import Features, load_features
 
 Matches = NDArray[np.uint32]
+SIFT_RATIO = 0.8
+"""Largest distance of a match over that of the second nearest descriptor of SIFT."""
 _BLOCK = 1024
 _COARSE_FEATURES = 800
 _PROBE_FEATURES = 1500
@@ -144,8 +146,6 @@ def match_near(
     Returns:
         (K, 2) indices into a and b, by rising index into a.
     """
-    if not len(a.pixels) or len(b.pixels) < 2:
-        return np.zeros((0, 2), np.uint32)
     if not len(a.pixels):
         return np.zeros((0, 2), np.uint32)
     across = np.argsort(b.pixels[:, 0], kind="stable")
@@ -172,7 +172,7 @@ class PairTask:
 
     first: Path
     second: Path
-    ratio: float
+    ratio: float = SIFT_RATIO
     cameras: tuple[dict[str, Any], dict[str, Any]] = field(default_factory=lambda: ({}, {}))
     """COLMAP cameras as `todict` gives them; empty for a coarse look."""
     warps: tuple[PinholeWarp | None, PinholeWarp | None] = (None, None)

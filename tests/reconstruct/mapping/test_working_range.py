@@ -37,7 +37,7 @@ def test_stereo_matches_give_the_distance(tmp_path: Path, rig: Rig | None) -> No
     """Also of cameras that look obliquely, and see farther along their axes."""
     scene = make_scene(lines=1, stations=4, points=2500, noise_px=0.2, rig=rig)
     paths = features_of(scene, tmp_path)
-    found = find_distances(scene.records, paths, scene.rig, ratio=0.8, executor=SERIAL)
+    found = find_distances(scene.records, paths, scene.rig, executor=SERIAL)
     depths = []
     for (i, one), (j, other) in permutations(enumerate(scene.records), 2):
         if one.station == other.station:
@@ -54,12 +54,12 @@ def test_the_altitude_stands_in(tmp_path: Path) -> None:
     scene = make_scene(lines=1, stations=2, points=10)
     paths = features_of(scene, tmp_path)
     arguments = (scene.records, paths, scene.rig)
-    measured = find_distances(*arguments, ratio=0.8, executor=SERIAL)
+    measured = find_distances(*arguments, executor=SERIAL)
     assert measured.source == "altitude"
     assert 2 / (1 / measured.near_m + 1 / measured.far_m) == pytest.approx(ALTITUDE_M + 0.03)
     blind = [replace(r, altitude_m=np.nan) for r in scene.records]
     with pytest.raises(ReconstructionError, match="altitude"):
-        find_distances(blind, paths, scene.rig, ratio=0.8, executor=SERIAL)
+        find_distances(blind, paths, scene.rig, executor=SERIAL)
 
 
 def test_cameras_without_refraction_need_no_distance(tmp_path: Path) -> None:
@@ -68,7 +68,7 @@ def test_cameras_without_refraction_need_no_distance(tmp_path: Path) -> None:
     blind = [replace(r, altitude_m=np.nan) for r in scene.records]
     cameras = {name: camera.in_air() for name, camera in scene.rig.cameras.items()}
     rig = replace(scene.rig, cameras=cameras)
-    found = find_distances(blind, paths, rig, ratio=0.8, executor=SERIAL)
+    found = find_distances(blind, paths, rig, executor=SERIAL)
     assert 0 < found.near_m < found.far_m and found.source == "no refraction"
 
 
