@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 from scipy.spatial.transform import RigidTransform
 from shapely import STRtree
@@ -124,17 +125,14 @@ def overlap_shares(
         By pair two shares, each the mean of both directions; of the second the frames are widened
         by the slack.
     """
-    found = {}
-    middle = _DISTANCES // 2
+    found, middle = {}, _DISTANCES // 2
     for i, j in pairs:
         wide = float(np.hypot(slack_m[i], slack_m[j]))
-        sure = 0.5 * (_seen_by(frusta, i, j, 0.0) + _seen_by(frusta, j, i, 0.0))
-        likely = (
-            sure
-            if wide == 0
-            else 0.5 * (_seen_by(frusta, i, j, wide) + _seen_by(frusta, j, i, wide))
-        )
-        found[i, j] = float(sure[middle]), float(likely.max())
+        shares = [
+            0.5 * (_seen_by(frusta, i, j, by) + _seen_by(frusta, j, i, by))
+            for by in sorted({0.0, wide})
+        ]
+        found[i, j] = float(shares[0][middle]), float(shares[-1].max())
     return found
 
 
@@ -152,11 +150,9 @@ def _seen_by(frusta: Frusta, i: int, j: int, wide_m: float) -> Array:
     if facing.any():
         pixels = camera.project(local[facing])
         margin = wide_m * camera.focal_in_water_px / local[facing][:, 2]
-        size = np.array([camera.width_px, camera.height_px])
+        beyond = np.array([camera.width_px, camera.height_px]) + margin[:, None]
         with np.errstate(invalid="ignore"):
-            inside[facing] = ((pixels > -margin[:, None]) & (pixels < size + margin[:, None])).all(
-                axis=1
-            )
+            inside[facing] = ((pixels > -margin[:, None]) & (pixels < beyond)).all(axis=1)
     share: Array = inside.mean(axis=1)
     return share
 
@@ -386,7 +382,9 @@ def _overlapping(
     records: Sequence[ImageRecord], rig: Rig, datum: Datum
 ) -> tuple[set[Pair], set[Pair]]:
     polygons = footprints(records, rig, datum)
-    wider = [p.buffer(_reach_m(r)) for p, r in zip(polygons, records, strict=True)]
+    # Two together make up the uncertainty of their distance, the root of two of that of one.
+    reach = [_SIGMAS / np.sqrt(2.0) * _sigma_m(r, r.altitude_m) for r in records]
+    wider = [p.buffer(float(by)) for p, by in zip(polygons, reach, strict=True)]
     centres = np.array([p.centroid.coords[0] for p in polygons]).reshape(-1, 2)
     group = joined_cameras(records, lambda i, j: _overlap(polygons[i], polygons[j]))
     sure: dict[Pair, float] = {}
@@ -419,8 +417,9 @@ def _sharing(
 ) -> tuple[set[Pair], set[Pair]]:
     """Pairs by frusta in which a chosen picture is, as `_overlapping` by footprints."""
     frusta = frusta_of(records, rig, datum, *range_m)
-    slack = np.array([_slack_m(r, float(np.mean(range_m))) for r in records])
-    group = joined_cameras(records, lambda i, j: _shared_middle(frusta, i, j))
+    slack = np.array([_SIGMAS * _sigma_m(r, float(np.mean(range_m))) for r in records])
+    sharp = np.zeros(len(records))
+    group = joined_cameras(records, lambda i, j: overlap_shares(frusta, [(i, j)], sharp)[i, j][0])
 
     def linked_within(i: int, j: int) -> bool:
         cameras = records[i].camera, records[j].camera
@@ -436,20 +435,11 @@ def _sharing(
             maybe[pair] = maximum
     middles = frusta.middles
     away = {(i, j): float(np.linalg.norm(middles[i] - middles[j])) for i, j in maybe}
-    chosen_pairs = all_round(frusta, sure, _SECTORS)
-    return chosen_pairs, nearest_each(maybe, away, _LOOKS)
-
-
-def _shared_middle(frusta: Frusta, i: int, j: int) -> float:
-    return overlap_shares(frusta, [(i, j)], np.zeros(len(frusta.cameras)))[i, j][0]
-
-
-def _slack_m(record: ImageRecord, distance_m: float) -> float:
-    """How far a picture's middle may be from where navigation has it; 0 where no sigma is known."""
-    return _SIGMAS * _sigma_m(record, distance_m)
+    return all_round(frusta, sure, _SECTORS), nearest_each(maybe, away, _LOOKS)
 
 
 def _sigma_m(record: ImageRecord, distance_m: float) -> float:
+    """Of the place of what a picture shows, by navigation; 0 where no sigma is known."""
     tilt = np.deg2rad(np.nan_to_num(record.sigma_attitude_deg)) * distance_m
     return float(np.hypot(np.nan_to_num(record.sigma_horizontal_m), tilt))
 
@@ -482,14 +472,6 @@ def _overlap(first: Polygon, second: Polygon) -> float:
     """Share of the smaller footprint that the other covers."""
     smaller = min(first.area, second.area)
     return float(first.intersection(second).area / smaller) if smaller > 0 else 0.0
-
-
-def _reach_m(record: ImageRecord) -> float:
-    """Distance by which a footprint is widened; 0 where no sigma is known.
-
-    Two together make up the uncertainty of their distance, the root of two of that of one.
-    """
-    return float(_SIGMAS / np.sqrt(2.0) * _sigma_m(record, record.altitude_m))
 
 
 def well_conditioned(
@@ -538,13 +520,15 @@ def _nearest(records: Sequence[ImageRecord], datum: Datum) -> set[Pair]:
     if len(known) < 2:
         return set()
     count = min(_NEAREST + 1, len(known))
-    nearest = np.atleast_2d(KDTree(positions[known]).query(positions[known], k=count)[1])
-    return {
-        (min(int(known[a]), int(known[b])), max(int(known[a]), int(known[b])))
-        for a, row in enumerate(nearest)
-        for b in row
-        if a != b
-    }
+    nearest = known[KDTree(positions[known]).query(positions[known], k=count)[1]]
+    return {pair for pair in _pairs_of(known, nearest) if pair[0] != pair[1]}
+
+
+def _pairs_of(pictures: NDArray[np.int64], partners: NDArray[np.int64]) -> set[Pair]:
+    """Pairs of pictures (N,) with each of their partners (N, K)."""
+    first = np.broadcast_to(pictures[:, None], partners.shape)
+    pairs = np.sort(np.stack([first, partners], axis=-1).reshape(-1, 2), axis=1)
+    return {(i, j) for i, j in pairs.tolist()}
 
 
 def alike_pairs(
@@ -579,17 +563,10 @@ def alike_pairs(
         looks[number] = row
     find = partial(nearest_looks, file, looks.mean(axis=0), min(partners, len(features) - 1))
     looks.flush()
-    blocks = [np.asarray(requested[n : n + _BLOCK]) for n in range(0, len(requested), _BLOCK)]
-    found = executor.map(find, blocks, label="pictures that look alike")
-    pairs: set[Pair] = set()
-    for some, best in zip(blocks, found, strict=True):
-        pairs |= {
-            (min(int(i), int(j)), max(int(i), int(j)))
-            for i, row in zip(some, best, strict=True)
-            for j in row
-        }
+    blocks = np.split(np.asarray(requested), range(_BLOCK, len(requested), _BLOCK))
+    found = list(executor.map(find, blocks, label="pictures that look alike"))
     file.unlink()
-    return sorted(pairs)
+    return sorted(_pairs_of(np.asarray(requested), np.concatenate(found)))
 
 
 def nearest_looks(
@@ -619,10 +596,8 @@ def nearest_looks(
 
 
 def _directions(looks: NDArray[np.float32], mean: NDArray[np.float32]) -> NDArray[np.float32]:
-    looks = looks - mean
-    found: NDArray[np.float32] = looks / np.maximum(
-        np.linalg.norm(looks, axis=1, keepdims=True), 1e-9
-    ).astype(np.float32)
+    away = looks - mean
+    found: NDArray[np.float32] = away / np.maximum(np.linalg.norm(away, axis=1)[:, None], 1e-9)
     return found
 
 
@@ -640,7 +615,6 @@ def make_codebook(features: Sequence[Path], seed: int) -> NDArray[np.float32]:
         count = np.bincount(word, minlength=len(words))
         sums = _sums(sample, word, len(words))
         filled = count > 0
-        words = words.copy()
         words[filled] = (sums[filled] / count[filled, None]).astype(np.float32)
     return words
 
@@ -653,8 +627,7 @@ def describe(features: Path, words: NDArray[np.float32]) -> NDArray[np.float32]:
     word = _nearest_words(descriptors, words)
     sums = _sums(descriptors - words[word], word, len(words))
     norms = np.linalg.norm(sums, axis=1, keepdims=True)
-    vector = (sums / np.maximum(norms, 1e-9)).ravel()
-    found: NDArray[np.float32] = vector.astype(np.float32)
+    found: NDArray[np.float32] = (sums / np.maximum(norms, 1e-9)).ravel().astype(np.float32)
     return found
 
 
@@ -668,9 +641,6 @@ def _nearest_words(
 
 def _sums(rows: NDArray[np.float32], word: NDArray[np.intp], words: int) -> Array:
     """Sums, (W, D), of rows (N, D) by word."""
-    order = np.argsort(word, kind="stable")
-    starts = np.searchsorted(word[order], np.arange(words))
-    present = np.bincount(word, minlength=words) > 0
-    found = np.zeros((words, rows.shape[1]))
-    found[present] = np.add.reduceat(rows[order].astype(np.float64), starts[present], axis=0)
+    member = csr_array((np.ones(len(word)), (word, np.arange(len(word)))), (words, len(word)))
+    found: Array = member @ rows.astype(np.float64)
     return found
