@@ -60,10 +60,8 @@ class _Partner:
     """(M, 2) pixels of verified matches, in the picture of the references and in this one."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _TrackTask:
-    grey: Path
-    partners: tuple[_Partner, ...]
+_TrackTask = tuple[Path, Sequence[_Partner]]
+"""A picture that has references, and their partners."""
 
 
 def refine_tracks(
@@ -129,14 +127,12 @@ def _tasks(
     greys: Sequence[Path],
 ) -> list[_TrackTask]:
     """One task for each picture that has references."""
-    nodes = np.flatnonzero(reference != np.arange(len(reference)))
+    nodes = np.arange(len(reference))
     picture = np.searchsorted(starts, nodes, side="right") - 1
-    of_reference = np.searchsorted(starts, reference[nodes], side="right") - 1
-    nodes, picture, of_reference = (
-        x[picture != of_reference] for x in (nodes, picture, of_reference)
-    )
-    order = np.lexsort((nodes, picture, of_reference))
-    nodes, picture, of_reference = nodes[order], picture[order], of_reference[order]
+    of_reference = picture[reference]
+    nodes = np.flatnonzero(picture != of_reference)
+    nodes = nodes[np.lexsort((picture[nodes], of_reference[nodes]))]
+    picture, of_reference = picture[nodes], of_reference[nodes]
     matched = {(i, j): m for i, j, m in pairs}
     changes = np.flatnonzero((np.diff(picture) != 0) | (np.diff(of_reference) != 0)) + 1
     partners: dict[int, list[_Partner]] = {}
@@ -149,24 +145,25 @@ def _tasks(
         support = at
         if (min(r, j), max(r, j)) in matched:
             pair = matched[min(r, j), max(r, j)]
-            columns = (0, 1) if r < j else (1, 0)
-            support = pixels[r][pair[:, columns[0]]], pixels[j][pair[:, columns[1]]]
+            own, other = pair.T if r < j else pair[:, ::-1].T
+            support = pixels[r][own], pixels[j][other]
         if len(support[0]) >= _MIN_SUPPORT:
             partners.setdefault(r, []).append(
                 _Partner(grey=greys[j], nodes=mine, reference=at[0], pixels=at[1], support=support)
             )
-    return [_TrackTask(grey=greys[r], partners=tuple(partners[r])) for r in sorted(partners)]
+    return [(greys[r], partners[r]) for r in sorted(partners)]
 
 
 def align(task: _TrackTask) -> tuple[NDArray[np.int64], Array]:
     """Numbers of features and their aligned positions (N, 2); NaN where they are to stay."""
-    first = np.asarray(np.load(task.grey, mmap_mode="c"))
+    grey, partners = task
+    first = np.asarray(np.load(grey, mmap_mode="c"))
     found = []
-    for partner in task.partners:
+    for partner in partners:
         second = np.asarray(np.load(partner.grey, mmap_mode="c"))
         affine = affine_from_neighbours(*partner.support, partner.reference)
         found.append(align_coarser(first, second, partner.reference, partner.pixels, affine))
-    return np.concatenate([p.nodes for p in task.partners]), np.concatenate(found)
+    return np.concatenate([p.nodes for p in partners]), np.concatenate(found)
 
 
 def align_coarser(
@@ -203,8 +200,7 @@ def affine_from_neighbours(first: Array, second: Array, at: Array) -> Array:
         second: (M, 2) in the second.
         at: (N, 2) places in the first picture.
     """
-    around = KDTree(first).query(at, k=min(_SUPPORT, len(first)))[1]
-    around = around.reshape(len(at), -1)
+    around = KDTree(first).query(at, k=min(_SUPPORT, len(first)))[1].reshape(len(at), -1)
     source, target = first[around], second[around]
     source = source - source.mean(axis=1, keepdims=True)
     target = target - target.mean(axis=1, keepdims=True)
