@@ -17,6 +17,7 @@ from shapely.geometry import MultiPolygon, Polygon
 from shapely.geometry.base import BaseGeometry
 from shapely.geometry.polygon import orient
 
+from alice_survey.core.errors import PlanError
 from alice_survey.core.frames import Array, Datum
 from camera_calib.rig import Rig
 from missions.values.footprint import footprint_ne, level_pose
@@ -49,8 +50,7 @@ def map_features(plan: Plan) -> Iterator[MapFeature]:
     home = lon_lat(plan, np.array([plan.home_ne_m]), 0.0)
     yield MapFeature("home", "home", {}, shapely.Point(np.append(home, 0.0)))
     dives = dive_of_line(plan)
-    for index, line in enumerate(plan.lines):
-        depths = line_depths_m(plan, index)
+    for index, (line, depths) in enumerate(zip(plan.lines, line_depths(plan), strict=True)):
         about = {
             "line": index, "kind": line.kind, "dive": dives.get(index), "stations": line.stations,
             "length_m": round(line.length_m, 4), "depth_m": glass_m,
@@ -58,8 +58,7 @@ def map_features(plan: Plan) -> Iterator[MapFeature]:
             "altitude_m": plan.altitude_m, "speed_mps": plan.speed_mps,
         }  # fmt: skip
         ends = lon_lat(plan, np.array([line.start_ne_m, line.end_ne_m]), depths[0])
-        heights = [-depths[0], -depths[-1]]
-        shape = shapely.LineString(np.column_stack([ends, heights]))
+        shape = shapely.LineString(np.column_stack([ends, -depths[[0, -1]]]))
         yield MapFeature("line", f"line {index}", about, shape)
     for number, dive in enumerate(plan.dives, start=1):
         about = {
@@ -102,11 +101,23 @@ def dive_of_line(plan: Plan) -> dict[int, int]:
     }
 
 
-def line_depths_m(plan: Plan, index: int) -> tuple[float, ...]:
-    """Depth of the glass at each station of a line."""
-    if plan.line_depths_m:
-        return plan.line_depths_m[index]
-    return (plan.seafloor_depth_m - plan.altitude_m,) * plan.lines[index].stations
+def line_depths(plan: Plan) -> list[Array]:
+    """Depths of the glass at each line's stations.
+
+    Raises:
+        PlanError: they do not fit the lines.
+    """
+    if not plan.line_depths_m:
+        level_m = plan.seafloor_depth_m - plan.altitude_m
+        return [np.full(line.stations, level_m) for line in plan.lines]
+    depths = [np.asarray(row, dtype=np.float64) for row in plan.line_depths_m]
+    stations, requested = [len(row) for row in depths], [line.stations for line in plan.lines]
+    if stations != requested:
+        raise PlanError(
+            f"depths of {len(stations)} lines with {sum(stations)} stations do not fit a plan of "
+            f"{len(requested)} lines with {sum(requested)} stations: plan again"
+        )
+    return depths
 
 
 def grow(geometry: MultiPolygon, by_m: float) -> list[Polygon]:

@@ -11,7 +11,7 @@ from shapely.geometry import LineString, Point
 
 from alice_survey.core.errors import PlanError
 from alice_survey.core.frames import Array
-from missions.exports.geometry import CameraMount, chords
+from missions.exports.geometry import CameraMount, chords, line_depths
 from missions.values.costs import SETTLE_S
 from missions.values.legs import Leg
 from missions.values.plan_file import Dive, Plan
@@ -119,7 +119,7 @@ def waypoints(
 
 
 def _points(
-    plan: Plan, dive: Dive, turn_rate_rad_s: float, line_depths: Sequence[Array] | None
+    plan: Plan, dive: Dive, turn_rate_rad_s: float, depths: Sequence[Array]
 ) -> Iterator[_Point]:
     """Where each leg leads, in order."""
     legs = dive.route.legs
@@ -133,8 +133,7 @@ def _points(
                 hold_s = abs(leg.turn_rad) / turn_rate_rad_s + SETTLE_S
                 yield _Point("turn", leg.start_ne_m, heading, hold_s=hold_s)
         elif leg.line >= 0:
-            depths = None if line_depths is None else line_depths[leg.line]
-            yield from _line_points(plan, leg, depths)
+            yield from _line_points(plan, leg, depths[leg.line])
         elif leg.side_rad:
             yield _Point("sway", leg.end_ne_m, heading, hold_s=SETTLE_S)
         elif leg.curvature_per_m:
@@ -145,12 +144,9 @@ def _points(
     yield _Point("surface", last.end_ne_m, last.end_heading_rad + last.side_rad)
 
 
-def _line_points(plan: Plan, leg: Leg, depths: Array | None) -> Iterator[_Point]:
+def _line_points(plan: Plan, leg: Leg, depths: Array) -> Iterator[_Point]:
     """The end of a line, and places before it where its depth bends."""
     line = plan.lines[leg.line]
-    if depths is None:
-        yield _Point("line", leg.end_ne_m, leg.heading_rad, leg.line)
-        return
     along_m = np.linspace(0.0, line.length_m, line.stations)
     for i in bends(along_m, depths, DEPTH_STEP_M)[1:]:
         north, east = line.stations_ne[i].tolist()
@@ -217,13 +213,8 @@ def _switch_camera(points: list[_Point]) -> list[_Point]:
     return result
 
 
-def _with_depths(
-    points: list[_Point], plan: Plan, line_depths: Sequence[Array] | None
-) -> list[_Point]:
+def _with_depths(points: list[_Point], plan: Plan, line_depths: Sequence[Array]) -> list[_Point]:
     """Way-points with a depth each: between lines the shallower of the lines next to it."""
-    if line_depths is None:
-        level_m = plan.seafloor_depth_m - plan.altitude_m
-        return [point._replace(glass_depth_m=level_m) for point in points]
     depths = np.array(
         [
             float(line_depths[point.line][0])
@@ -234,30 +225,13 @@ def _with_depths(
     )
     known = np.flatnonzero(np.isfinite(depths))
     if not len(known):
-        return _with_depths(points, plan, None)
+        level_m = plan.seafloor_depth_m - plan.altitude_m
+        return [point._replace(glass_depth_m=level_m) for point in points]
     place = np.arange(len(points))
     after = depths[known[np.clip(np.searchsorted(known, place), 0, len(known) - 1)]]
     before = depths[known[np.clip(np.searchsorted(known, place, "right") - 1, 0, len(known) - 1)]]
     levels = np.minimum(before, after)
     return [p._replace(glass_depth_m=float(d)) for p, d in zip(points, levels, strict=True)]
-
-
-def line_depths(plan: Plan) -> list[Array] | None:
-    """Depths of the glass at each line's stations; None over a level sea floor.
-
-    Raises:
-        PlanError: they do not fit the lines.
-    """
-    if not plan.line_depths_m:
-        return None
-    depths = [np.asarray(row, dtype=np.float64) for row in plan.line_depths_m]
-    stations, requested = [len(row) for row in depths], [line.stations for line in plan.lines]
-    if stations != requested:
-        raise PlanError(
-            f"depths of {len(stations)} lines with {sum(stations)} stations do not fit a plan of "
-            f"{len(requested)} lines with {sum(requested)} stations: plan again"
-        )
-    return depths
 
 
 def gone_on(plan: Plan, point: Waypoint, tolerance_m: float) -> Waypoint:

@@ -14,7 +14,6 @@ from camera_calib.rig import Rig, design_rig
 from missions.exports.advice import advice
 from missions.exports.format import Export, ExportFormat, Options, line_tolerance_m, options_of
 from missions.exports.registry import format_named, format_names
-from missions.exports.waypoints import line_depths
 from missions.values.plan_file import Plan, read_plan
 
 MAX_ALTITUDE_DIFFERENCE_M = 0.3
@@ -78,7 +77,7 @@ def altitude_refusal(plan: Plan) -> str:
     A mission states one altitude, which the altimeter measures straight down. Over a bathymetry the
     plan climbs ahead of what is higher, which such a vehicle does not.
     """
-    if line_depths(plan) is None:
+    if not plan.line_depths_m:
         return ""
     terrain = plan.details.get("terrain") or {}
     known = terrain.get("at_constant_altitude") or {}

@@ -9,7 +9,7 @@ import numpy as np
 
 from alice_survey.core.artefacts import write_csv
 from missions.exports.format import Export, ExportFile, ExportFormat
-from missions.exports.geometry import dive_of_line, lat_lon, line_depths_m
+from missions.exports.geometry import dive_of_line, lat_lon, line_depths
 from missions.values.plan_file import Plan
 
 
@@ -26,8 +26,7 @@ def write_lines(path: Path, export: Export, _dive: int) -> None:
     geodetic = lat_lon(plan.datum, ends_ne, depth_m).reshape(-1, 4)
     ends = ends_ne.reshape(-1, 4)
     rows = []
-    for index, line in enumerate(plan.lines):
-        depths = line_depths_m(plan, index)
+    for index, (line, depths) in enumerate(zip(plan.lines, line_depths(plan), strict=True)):
         rows.append(
             [
                 index, line.kind,
@@ -64,9 +63,8 @@ def _stations(plan: Plan) -> Iterator[list[Any]]:
     depth_m = plan.seafloor_depth_m - plan.altitude_m
     dive_of = dive_of_line(plan)
     station = 0
-    for index, line in enumerate(plan.lines):
+    for index, (line, depths) in enumerate(zip(plan.lines, line_depths(plan), strict=True)):
         places = line.stations_ne
-        depths = line_depths_m(plan, index)
         heading = f"{math.degrees(line.heading_rad):.6f}"
         for place, (lat, lon), depth in zip(
             places, lat_lon(plan.datum, places, depth_m), depths, strict=True

@@ -6,7 +6,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from missions.exports.format import Export, ExportFile, ExportFormat
-from missions.exports.geometry import lat_lon, line_depths_m
+from missions.exports.geometry import lat_lon, line_depths
 from missions.exports.xml_text import child, degrees, metres, write_xml
 
 _GPX = "http://www.topografix.com/GPX/1/1"
@@ -24,8 +24,7 @@ def write_gpx(path: Path, export: Export, _dive: int) -> None:
     glass_m = plan.seafloor_depth_m - plan.altitude_m
     ends_ne = np.array([end for line in plan.lines for end in (line.start_ne_m, line.end_ne_m)])
     ends = lat_lon(plan.datum, ends_ne, glass_m)
-    for index, line in enumerate(plan.lines):
-        depths = line_depths_m(plan, index)
+    for index, (line, depths) in enumerate(zip(plan.lines, line_depths(plan), strict=True)):
         for place, depth_m, name in (
             (ends[2 * index], depths[0], "start"),
             (ends[2 * index + 1], depths[-1], "end"),
