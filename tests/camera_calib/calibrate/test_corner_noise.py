@@ -9,7 +9,9 @@ from alice_survey.core.executor import SERIAL
 from benchmarks.target_calibration import (
     GOAL_OF_SIGMA,
     MAX_GROWTH,
+    SOUND,
     TARGETS,
+    Board,
     run_case,
     run_trial,
 )
@@ -21,7 +23,7 @@ from camera_calib.calibration import TargetView, stack_views
 from camera_calib.freedom import Freedom, of_ports, pose_names
 from camera_calib.judge.judgement import judge, verdicts
 from camera_calib.judge.validation import halves_agreement
-from camera_calib.target_shape import usual_shape
+from camera_calib.target_shape import AS_DRAWN, TargetShape, usual_shape
 from tests.camera_calib.calibration_scenes import board, board_poses, built_rig, views_of
 from tests.oracles_corner_noise import dense_spread
 
@@ -91,6 +93,22 @@ def test_an_uneven_print_is_found_with_its_size_and_stated() -> None:
     assert np.sqrt(np.mean(np.square(sizes))) == pytest.approx(6e-5, rel=0.25)
     even = verdicts(judge(run_trial(0, TARGETS["sound"]), None))
     assert [v.level for v in even if "off their places" in v.text] == ["good"]
+
+
+def test_noise_is_no_uneven_print_and_a_bend_that_was_not_adjusted_lies_across_the_target() -> None:
+    def places_m(seed: int, target: Board, *shape: TargetShape) -> tuple[float, float]:
+        found = run_trial(seed, target, *shape).spread
+        assert found is not None
+        return found.noise.place_sigmas_m
+
+    for seed in range(3):
+        for target in (SOUND, replace(SOUND, together_px=0.15)):
+            assert max(places_m(seed, target)) < 2e-5
+        for bow_m in (2.5e-4, 5e-4):
+            bent = replace(SOUND, bow_m=bow_m)
+            assert max(places_m(seed, bent)) < 1.3e-5
+            assert places_m(seed, bent, AS_DRAWN)[0] < 5e-6
+            assert places_m(seed, bent, AS_DRAWN)[1] == pytest.approx(0.15 * bow_m, rel=0.2)
 
 
 @pytest.mark.slow

@@ -59,7 +59,7 @@ def test_a_tilted_port_left_in_opencv_costs_most_of_a_pixel(port: float, glass: 
     """Held upright it would cost 0.9 px; bundle adjustment turns the camera and saves a part."""
     camera = behind_port(port, glass, tilt_deg=2.0)
     opencv, full = (fit_in_water(camera, 1.5, 2.5, m) for m in ("OPENCV", "FULL_OPENCV"))
-    assert 0.54 < opencv.rms_px < 0.81
+    assert 0.6 < opencv.rms_px < 0.85 * 0.9
     assert full.rms_px < opencv.rms_px
     # All of it many times what the warp to a pinhole costs.
     best = rms_px(residual_px(best_warp(camera, 1.5, 2.5, 2.0), DISTANCES_M))

@@ -18,6 +18,7 @@ from camera_calib.judge.uncertainty import (
     overlap_points,
     point_sigmas_m,
     projection_sigma,
+    rig_parameters,
     rig_slopes,
     shape_sigmas_m,
     stereo_sigma,
@@ -25,7 +26,10 @@ from camera_calib.judge.uncertainty import (
 )
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.ports.flat import FlatPort
+from camera_calib.rig import Covariance
 from camera_calib.triangulate import reproject, triangulate
+from tests.camera_calib.calibration_scenes import tilted
+from tests.cameras import changed
 from tests.oracles_report import (
     DESIGN,
     best_pose_by_search,
@@ -173,6 +177,24 @@ def test_the_baselines_sigma_is_that_of_its_length() -> None:
     at = [rig.covariance.parameters.index(f"right.{axis}") for axis in POSE[3:]]
     lengths = np.linalg.norm(rig.cam_from_rig["right"].translation + draws[:, at], axis=1)
     assert baselines_m(rig)["right"][1] == pytest.approx(lengths.std(), rel=0.05)
+
+
+def test_the_sigma_of_a_tilt_is_the_spread_of_drawn_tilts() -> None:
+    names = ("left.normal_x", "left.normal_y")
+    covariance = np.array([[4e-6, 1e-6], [1e-6, 1e-6]])
+    left = changed(DESIGN.cameras["left"], normal=tilted(2.0, -25.0))
+    rig = replace(
+        DESIGN, cameras={**DESIGN.cameras, "left": left},
+        covariance=Covariance(parameters=names, matrix=covariance),
+    )  # fmt: skip
+    rows = {row.name: row for row in rig_parameters(rig)}
+    drawn = np.random.default_rng(4).multivariate_normal(left.port.axis_cam[:2], covariance, 20_000)
+    for name, angles in zip(names, np.degrees(np.arcsin(drawn)).T, strict=True):
+        row = rows[name]
+        assert (row.unit, row.correlation) == ("deg", pytest.approx(0.5))
+        assert row.value == pytest.approx(angles.mean(), abs=0.01)
+        assert row.sigma == pytest.approx(angles.std(), rel=0.03)
+    assert rows["right.normal_x"].sigma is None
 
 
 @pytest.mark.parametrize("seed", range(1, 4))

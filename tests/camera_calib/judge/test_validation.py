@@ -122,15 +122,20 @@ def test_an_error_of_the_prior_is_the_same_in_both_halves() -> None:
     assert np.mean(independent) < 0.75 * np.mean(ratios)
 
 
-def test_the_same_calibration_twice_does_not_differ_and_one_sigma_counts_one() -> None:
+def test_the_same_calibration_twice_does_not_differ_and_drawn_ones_do_by_chance() -> None:
     found = usual()
     same = halves_agreement((found, found))
     assert same.chi2 == 0.0
     assert same.p_value == 1.0
-    sigma_px = found.rig.sigmas["left.cx_px"]
-    moved = replace(found, rig=moved_rig(found.rig, {"left.cx_px": sigma_px}))
-    # Other parameters do not move with it, so that it is less likely than by its sigma alone.
-    assert halves_agreement((found, moved)).chi2 > 0.5
+    covariance = found.rig.covariance
+    assert covariance is not None
+    names, rng = covariance.parameters, np.random.default_rng(6)
+    draws = rng.multivariate_normal(np.zeros(len(names)), 2.0 * covariance.matrix, 100, "ignore")
+    moved = (moved_rig(found.rig, dict(zip(names, draw, strict=True))) for draw in draws)
+    agree = [halves_agreement((found, replace(found, rig=rig))) for rig in moved]
+    assert np.mean([one.chi2 for one in agree]) == pytest.approx(len(names), rel=0.08)
+    assert np.std([one.chi2 for one in agree]) == pytest.approx((2 * len(names)) ** 0.5, rel=0.3)
+    assert 0.4 < np.mean([one.p_value for one in agree]) < 0.6
 
 
 @pytest.mark.parametrize("enough", [8, 14])

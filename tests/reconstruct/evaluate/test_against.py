@@ -62,6 +62,7 @@ def test_a_mound_is_measured_within_its_sigma_and_nothing_else_changes() -> None
         assert (region.east_m, region.north_m) == pytest.approx(AT, abs=0.03)
         assert region.volume_m3 == pytest.approx(MOUND_M3, rel=0.05)
         assert change.changed.sum() * CELL**2 == pytest.approx(region.area_m2, rel=1e-9)
+        assert change.changed[int((4.0 - AT[1]) / CELL), int(AT[0] / CELL)]
         ratios.append((region.volume_m3 - MOUND_M3) / region.sigma_m3)
         figures = change.to_json()
         # Heights between cells are means of noisy cells: fewer than 5 % exceed what cells would.
