@@ -134,25 +134,22 @@ def observations(model: pycolmap.Reconstruction) -> Observed:
     stored = stored_of(model)
     ids, points = stored.point_ids, stored.points
     # One of no length first, for a model without pictures.
-    keypoint, pixels, point = [np.zeros(0, np.int64)], [np.zeros((0, 2))], [np.zeros(0, np.int64)]
-    local, starts = [np.zeros((0, 3))], [0]
+    rows: list[tuple[Any, ...]] = [
+        (np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros((0, 3)))
+    ]
     for number in pictures.tolist():
-        rows = stored.keypoints[number]
-        at = np.flatnonzero(rows["point"] >= 0)
-        mine = np.searchsorted(ids, rows["point"][at]).astype(np.int64)
-        keypoint.append(at)
-        pixels.append(rows["xy"][at])
-        point.append(mine)
-        pose = poses[number]
-        local.append(points[mine] @ pose[:, :3].T + pose[:, 3])
-        starts.append(starts[-1] + len(at))
+        own, pose = stored.keypoints[number], poses[number]
+        at = np.flatnonzero(own["point"] >= 0)
+        mine = np.searchsorted(ids, own["point"][at]).astype(np.int64)
+        rows.append((at, own["xy"][at], mine, points[mine] @ pose[:, :3].T + pose[:, 3]))
+    keypoint, pixels, point, in_cameras = map(np.concatenate, zip(*rows, strict=True))
     return Observed(
         pictures=pictures,
-        starts=np.array(starts, dtype=np.int64),
-        keypoint=np.concatenate(keypoint),
-        pixels=np.concatenate(pixels),
-        point=np.concatenate(point),
+        starts=np.cumsum([len(row[0]) for row in rows]),
+        keypoint=keypoint,
+        pixels=pixels,
+        point=point,
         point_ids=ids,
         points=points,
-        in_cameras=np.concatenate(local),
+        in_cameras=in_cameras,
     )
