@@ -1,7 +1,7 @@
 """The COLMAP database that the mapper reads: cameras, rig, stations, keypoints and matches."""
 
 import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -86,7 +86,10 @@ def write_database(
             )
             database.write_image(image, use_image_id=True)
             database.write_keypoints(number, seen.pixels[number - 1].astype(np.float32))
-        for number, members in enumerate(_frames(seen.images, cam_from_rig is not None), 1):
+        stations: dict[int, list[int]] = {}
+        for i, record in enumerate(seen.images):
+            stations.setdefault(i if cam_from_rig is None else record.station, []).append(i)
+        for number, (_, members) in enumerate(sorted(stations.items()), 1):
             frame = pycolmap.Frame(frame_id=number, rig_id=rig_of[seen.images[members[0]].camera])
             for member in members:
                 sensor = sensors[seen.images[member].camera]
@@ -124,12 +127,3 @@ def _write_rigs(
             rig.add_sensor(sensor, rigid3d(cam_from_rig[name] * rig_from_reference))
     database.write_rig(rig, use_rig_id=True)
     return dict.fromkeys(sensors, 1)
-
-
-def _frames(images: Sequence[ImageRecord], one_rig: bool) -> Iterable[list[int]]:
-    if not one_rig:
-        return [[i] for i in range(len(images))]
-    stations: dict[int, list[int]] = {}
-    for i, record in enumerate(images):
-        stations.setdefault(record.station, []).append(i)
-    return [stations[s] for s in sorted(stations)]

@@ -257,11 +257,23 @@ def with_learned(
     """
     number = {picture.features: i for i, picture in enumerate(taken)}
     pairs = [(number[task.first], number[task.second]) for task in tasks]
-    open_ = [k for k, pair in enumerate(found) if pair.geometry is None]
-    gained = _match_pairs(taken, tasks, pairs, open_, executor)
+
+    def match(chosen: Sequence[int]) -> dict[int, PairMatches]:
+        """Learned matches of some pairs, of those that have a geometry."""
+        pictures = [taken[i] for i in sorted({i for k in chosen for i in pairs[k]})]
+        list(executor.map(extract_learned, pictures, label="learned features"))
+        learned = [
+            replace(tasks[k], first=taken[i].learned, second=taken[j].learned, ratio=RATIO)
+            for k in chosen
+            for i, j in (pairs[k],)
+        ]
+        matched = executor.map(match_learned, learned, label="learned matches")
+        return {k: m for k, m in zip(chosen, matched, strict=True) if m.geometry is not None}
+
+    gained = match([k for k, pair in enumerate(found) if pair.geometry is None])
     touched = {i for k in gained for i in pairs[k]}
-    around = [k for k, pair in enumerate(pairs) if k not in set(open_) and touched & {*pair}]
-    gained |= _match_pairs(taken, tasks, pairs, around, executor)
+    tied = [k for k, pair in enumerate(found) if pair.geometry is not None]
+    gained |= match([k for k in tied if touched & {*pairs[k]}])
     counts = {i: len(load_features(taken[i].features).pixels) for k in gained for i in pairs[k]}
     whole = list(found)
     for k, pair in gained.items():
@@ -269,25 +281,6 @@ def with_learned(
         matches = np.concatenate([found[k].matches, pair.matches + after])
         whole[k] = PairMatches(matches=matches, geometry=found[k].geometry or pair.geometry)
     return whole
-
-
-def _match_pairs(
-    taken: Sequence[Taken],
-    tasks: Sequence[PairTask],
-    pairs: Sequence[tuple[int, int]],
-    chosen: Sequence[int],
-    executor: Executor,
-) -> dict[int, PairMatches]:
-    """Learned matches of some pairs, of those that have a geometry."""
-    pictures = [taken[i] for i in sorted({i for k in chosen for i in pairs[k]})]
-    list(executor.map(extract_learned, pictures, label="learned features"))
-    learned = [
-        replace(tasks[k], first=taken[i].learned, second=taken[j].learned, ratio=RATIO)
-        for k in chosen
-        for i, j in (pairs[k],)
-    ]
-    matched = executor.map(match_learned, learned, label="learned matches")
-    return {k: m for k, m in zip(chosen, matched, strict=True) if m.geometry is not None}
 
 
 def extract_learned(taken: Taken) -> None:
