@@ -111,6 +111,23 @@ def test_noise_is_no_uneven_print_and_a_bend_that_was_not_adjusted_lies_across_t
             assert places_m(seed, bent, AS_DRAWN)[1] == pytest.approx(0.15 * bow_m, rel=0.2)
 
 
+def test_a_few_bad_corners_are_found_with_their_size() -> None:
+    """Three of 63 corners lie 0.3 mm to the right of where the drawing has them."""
+    sound, bad = run_trial(1, SOUND), [10, 31, 50]
+    camera, points = sound.rig.cameras["camera"], sound.target_points[bad]
+    views = []
+    for view, pose in zip(sound.views, sound.rig_from_target, strict=True):
+        pixels = view.pixels["camera"].copy()
+        pixels[bad] += camera.project(pose.apply(points + [3e-4, 0.0, 0.0]))
+        pixels[bad] -= camera.project(pose.apply(points))
+        views.append(replace(view, pixels={"camera": pixels}))
+    found = recalibrate(sound, views)
+    assert found.spread is not None
+    rms_m = 3e-4 * (len(bad) / len(sound.target_points) / 2.0) ** 0.5
+    # Their weights in the adjustment are low, and so is what they count here.
+    assert 0.5 * rms_m < found.spread.noise.place_sigmas_m[0] < rms_m
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TARGETS)
 def test_sigmas_cover_the_errors(name: str) -> None:

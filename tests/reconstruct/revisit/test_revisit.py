@@ -10,8 +10,10 @@ import pytest
 import scipy.sparse as sp
 import shapely
 from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.config import SurveyConfig
+from alice_survey.core.frames import Array
 from alice_survey.core.records import RegistrationRecord
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import certificate
@@ -20,6 +22,11 @@ from missions.fly.refly import dive_means
 from missions.plan.strength import survey_costs
 from missions.values.plan_file import Plan
 from reconstruct.elevation import Elevation
+from reconstruct.precision.instruments import NavigationErrors, usual_rig
+from reconstruct.precision.predict import Precision
+from reconstruct.precision.predict import predict as predict_precision
+from reconstruct.precision.run import BETWEEN_DIVES_S, stations_and_times
+from reconstruct.precision.tracks import TrackModel, expected_block, waves
 from reconstruct.revisit.links import cut_around, footprints, links, pieces
 from reconstruct.revisit.run import plan_revisit, predict
 from reconstruct.revisit.weak import Found, Pictured, measure_survey, pair_sigma_m, weak_places
@@ -74,6 +81,17 @@ def surveyed(
 
 def dive_over(found: Found) -> Plan:
     return plan_revisit(found, dive_means(CONFIG.plan, CONFIG.vehicle, survey_costs(CONFIG)))
+
+
+def precision_of(ned_from_body: RigidTransform, time_s: Array) -> Precision:
+    """Expected of stations over a rippled floor, with a usual calibration and navigation."""
+    ripple = waves(CONFIG.plan.relief_m, 2.0 * PLAN.altitude_m)
+    block = expected_block(
+        usual_rig(CONFIG.camera, CONFIG.water, CONFIG.imaging), ned_from_body, time_s,
+        lambda places: PLAN.seafloor_depth_m + ripple(places), TrackModel.of(CONFIG.reconstruct),
+    )  # fmt: skip
+    errors = NavigationErrors.of(CONFIG.navigation, CONFIG.reconstruct)
+    return predict_precision(block, errors)
 
 
 def test_one_station_is_cut_off_at_the_price_of_its_tracks() -> None:
@@ -141,6 +159,22 @@ def test_a_hole_a_strip_of_blur_and_a_loose_corner_are_cured_by_the_dive() -> No
     assert found.seen.share_at_overlap < 0.85
     assert after.share_at_overlap >= 0.999
     assert pieces(links(tracks(both, seed=1)), found.least_tracks).max() == 0
+    # The mended survey is as good as one that lacked nothing.
+    (flown, flown_s), (new, new_s) = (
+        stations_and_times(plan, RIG, survey_costs(CONFIG)) for plan in (PLAN, again)
+    )
+    now = np.flatnonzero(good)[found.piece == 0]
+    before, mended, whole = (
+        precision_of(RigidTransform.concatenate(poses), np.concatenate(times))
+        for poses, times in (
+            ([flown[now]], [flown_s[now]]),
+            ([flown[good], new], [flown_s[good], flown_s[-1] + BETWEEN_DIVES_S + new_s]),
+            ([flown], [flown_s]),
+        )
+    )
+    np.testing.assert_array_less(1.4 * mended.bend_m, before.bend_m)
+    ratios = [*mended.bend_m / whole.bend_m, mended.heights_rms_m / whole.heights_rms_m]
+    assert 0.9 < min(ratios) <= max(ratios) < 1.3
 
 
 def test_a_rough_patch_of_the_surface_is_flown_again() -> None:
