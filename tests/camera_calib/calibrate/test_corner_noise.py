@@ -118,7 +118,7 @@ def test_a_few_bad_corners_are_found_with_their_size() -> None:
     views = []
     for view, pose in zip(sound.views, sound.rig_from_target, strict=True):
         pixels = view.pixels["camera"].copy()
-        pixels[bad] += camera.project(pose.apply(points + [3e-4, 0.0, 0.0]))
+        pixels[bad] += camera.project(pose.apply(points + np.array([3e-4, 0.0, 0.0])))
         pixels[bad] -= camera.project(pose.apply(points))
         views.append(replace(view, pixels={"camera": pixels}))
     found = recalibrate(sound, views)
