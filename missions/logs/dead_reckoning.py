@@ -148,7 +148,7 @@ def dead_reckoned(
     fixes_s, places = fixes_s[order], places[order]
     sigmas = sigmas[order] * np.sqrt(_company(fixes_s))
     # A fix counts at the nearest velocity, moved by the velocity in between.
-    at = _nearest(time_s, fixes_s)
+    at = np.rint(np.interp(fixes_s, time_s, np.arange(len(time_s)))).astype(np.intp)
     late = (fixes_s - time_s[at])[:, None]
     near = np.abs(late[:, 0]) <= 0.5 * max_gap_s(time_s)
     at, places, sigmas = at[near], (places - late * velocity.values[at])[near], sigmas[near]
@@ -211,13 +211,6 @@ def _company(times_s: Array) -> Array:
     last = np.searchsorted(times_s, times_s + half, side="right")
     found: Array = (last - np.searchsorted(times_s, times_s - half)).astype(np.float64)
     return found
-
-
-def _nearest(times_s: Array, at_s: Array) -> NDArray[np.intp]:
-    """Index of the nearest of times (N,) for each of (F,)."""
-    after = np.clip(np.searchsorted(times_s, at_s), 1, len(times_s) - 1)
-    before = after - 1
-    return np.where(at_s - times_s[before] <= times_s[after] - at_s, before, after)
 
 
 @compiled

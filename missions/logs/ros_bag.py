@@ -179,24 +179,37 @@ def _choose(
                 f"{path}: {name} is {topic.kind}; {role} can come from {', '.join(_TAKES[role])}"
             )
         chosen[role] = topic
-    for kind in () if "navigation" in chosen else _TAKES["navigation"]:
-        found = [t for t in _of_kind(present, (kind,), _TRUTH) if t.last_name not in _ORIGIN]
+
+    def choose(role: str, groups: Sequence[Sequence[str]], but: Sequence[str] = ()) -> list[_Topic]:
+        """Choose the one topic of the first group of types that there is; else all of them."""
+        fitting = [
+            topic for topic in present
+            if topic.last_name not in _ORIGIN and not any(w in topic.name.lower() for w in but)
+        ]  # fmt: skip
+        of_groups = ([t for t in fitting if t.kind in kinds] for kinds in groups)
+        found = next((some for some in of_groups if some), [])
         named = [t for t in found if "navig" in t.name.lower()]
-        if found:
-            chosen["navigation"] = _only(path, "navigation", named if len(named) == 1 else found)
-            break
+        found = named if len(named) == 1 else found
+        if len(found) == 1:
+            chosen.setdefault(role, found[0])
+        return [] if role in chosen else found
+
+    unclear = {"navigation": choose("navigation", [(k,) for k in _TAKES["navigation"]], _TRUTH)}
     main = chosen["navigation"].kind if "navigation" in chosen else None
-    for role, kind in (("depth", PRESSURE), ("attitude", IMU)) if main in (FIX, None) else ():
-        if role not in chosen and (found := _of_kind(present, (kind,))):
-            chosen[role] = _only(path, role, found)
-    velocities = _of_kind(present, (DVL, TWIST_COVARIANCE, TWIST), (*_TRUTH, "cmd", "command"))
-    dvls = [t for t in velocities if t.kind == DVL]
-    if "velocity" not in chosen and len(dvls or velocities) == 1:
-        chosen["velocity"] = (dvls or velocities)[0]
-    if "altitude" not in chosen and main != NAV_STS:
-        ranges = _of_kind(present, (RANGE,), _NOT_ALTITUDE)
-        if len(ranges) == 1 or (not ranges and len(dvls) == 1):
-            chosen["altitude"] = (ranges or dvls)[0]
+    if main in (FIX, None):
+        unclear |= {
+            "depth": choose("depth", [(PRESSURE,)]),
+            "attitude": choose("attitude", [(IMU,)]),
+        }
+    for role, found in unclear.items():
+        if found:
+            raise NavigationError(
+                f"{path}: {_list_topics(found)} could all be {role}: choose one with --topic "
+                f"{role}=NAME"
+            )
+    choose("velocity", [(DVL,), (TWIST_COVARIANCE, TWIST)], (*_TRUTH, "cmd", "command"))
+    if main != NAV_STS:
+        choose("altitude", [(RANGE,), (DVL,)], (*_TRUTH, *_NOT_ALTITUDE))
     if not chosen:
         known = dict.fromkeys(kind for kinds in _TAKES.values() for kind in kinds)
         raise NavigationError(
@@ -204,30 +217,6 @@ def _choose(
             "choose with --topic ROLE=NAME"
         )
     return chosen
-
-
-def _of_kind(
-    present: Sequence[_Topic], kinds: Sequence[str], but: Sequence[str] = ()
-) -> list[_Topic]:
-    """Topics of some types whose names hold none of some words."""
-    return [
-        topic for topic in present
-        if topic.kind in kinds and not any(word in topic.name.lower() for word in but)
-    ]  # fmt: skip
-
-
-def _only(path: Path, role: str, found: Sequence[_Topic]) -> _Topic:
-    """The one topic that there is.
-
-    Raises:
-        NavigationError: there are several.
-    """
-    if len(found) > 1:
-        raise NavigationError(
-            f"{path}: {_list_topics(found)} could all be {role}: choose one with --topic "
-            f"{role}=NAME"
-        )
-    return found[0]
 
 
 def _list_topics(topics: Sequence[_Topic]) -> str:
