@@ -1,4 +1,3 @@
-import csv
 import math
 from collections.abc import Iterable
 from dataclasses import replace
@@ -17,6 +16,7 @@ from alice_survey.sim.vehicle.log import read_column_map, read_foreign_log, read
 from missions.logs.import_log import ImportOptions, import_log
 from missions.logs.navigation_csv import read_navigation
 from tests.missions.logs.log_files import dataflash_log, dataflash_message, tlog
+from tests.missions.logs.test_import_bag import numbers
 
 # Week 2312 of GPS began on Sunday 28 April 2024; 302418 s into it are 1 May 12:00:18 by GPS, whose
 # clock was 18 s ahead of UTC.
@@ -65,15 +65,8 @@ def imported(folder: Path, log: Path, **options: Any) -> dict[str, Any]:
     return import_log(log, folder / "n.csv", ImportOptions(**options))[1]
 
 
-def numbers(path: Path, *names: str) -> np.ndarray:
-    with path.open(newline="") as file:
-        return np.array(
-            [[float(row[name] or "nan") for name in names] for row in csv.DictReader(file)]
-        )
-
-
 def test_an_on_board_log_becomes_navigation(tmp_path: Path) -> None:
-    data = imported(tmp_path, bin_log(tmp_path))
+    data = imported(tmp_path, bin_log(tmp_path), vehicle_log=tmp_path / "v.csv")
 
     assert data["left_out"] == {}
     assert data["sources"] == {
@@ -94,6 +87,14 @@ def test_an_on_board_log_becomes_navigation(tmp_path: Path) -> None:
     np.testing.assert_allclose(read.columns["pitch_deg"], -2.25, atol=1e-6)
     upright = 2.5 * math.cos(math.radians(1.5)) * math.cos(math.radians(2.25))
     np.testing.assert_allclose(read.columns["altitude_m"][1:], upright, atol=1e-5)
+    vehicle = read_vehicle_log(tmp_path / "v.csv")
+    np.testing.assert_allclose(vehicle.time_s, 0.1 * np.arange(20), atol=1e-6)
+    np.testing.assert_allclose(vehicle.others["pwm_3_us"][1:], 1520 + np.arange(1, 20) - 0.05)
+    # North at 0.5 and down at 0.1 m/s, heading 358: nearly all of it ahead, a little to starboard.
+    u, v, w = vehicle.velocity_body[0]
+    assert v == pytest.approx(0.5 * math.sin(math.radians(2.0)), abs=0.005)
+    assert math.hypot(u, v, w) == pytest.approx(math.hypot(0.5, 0.1), abs=1e-6)
+    assert u > 0.49
 
 
 def test_declination_by_hand(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -156,20 +157,6 @@ def test_a_lever_arm_moves_positions_to_the_body(tmp_path: Path) -> None:
     assert (latitude - LAT) * 60 * 1856.9 == pytest.approx(-math.cos(math.radians(2)), abs=0.01)
     assert (longitude - LON) * 60 * 927.2 == pytest.approx(math.sin(math.radians(2)), abs=0.01)
     assert depth == pytest.approx(4.0 - 0.3, abs=1e-4)
-
-
-def test_vehicle_log_has_servo_outputs_and_body_velocity(tmp_path: Path) -> None:
-    log = bin_log(tmp_path)
-    options = ImportOptions(vehicle_log=tmp_path / "v.csv")
-    import_log(log, tmp_path / "n.csv", options)
-    vehicle = read_vehicle_log(tmp_path / "v.csv")
-    np.testing.assert_allclose(vehicle.time_s, 0.1 * np.arange(20), atol=1e-6)
-    np.testing.assert_allclose(vehicle.others["pwm_3_us"][1:], 1520 + np.arange(1, 20) - 0.05)
-    # North at 0.5 and down at 0.1 m/s, heading 358: nearly all of it ahead, a little to starboard.
-    u, v, w = vehicle.velocity_body[0]
-    assert v == pytest.approx(0.5 * math.sin(math.radians(2.0)), abs=0.005)
-    assert math.hypot(u, v, w) == pytest.approx(math.hypot(0.5, 0.1), abs=1e-6)
-    assert u > 0.49
 
 
 def test_filter_positions_count_from_its_origin(tmp_path: Path) -> None:

@@ -95,12 +95,14 @@ def test_a_flight_comes_back_from_its_bag(tmp_path: Path) -> None:
     record = flight()
     write_bag(tmp_path / "dive", record)
 
-    import_log(
-        tmp_path / "dive",
-        tmp_path / "navigation.csv",
-        ImportOptions(vehicle_log=tmp_path / "vehicle.csv"),
-    )
+    options = ImportOptions(vehicle_log=tmp_path / "vehicle.csv")
+    _, data = import_log(tmp_path / "dive", tmp_path / "navigation.csv", options)
 
+    assert not data["dated"]  # a simulation's clock
+    # Not the truth, which the bag also holds.
+    assert data["sources"]["position"] == "/alice/navigation/odometry"
+    times = numbers(tmp_path / "navigation.csv", "time_s")[:, 0]
+    np.testing.assert_allclose(times, record.time_s, atol=1e-6)
     read = read_navigation(tmp_path / "navigation.csv", UTC)
     np.testing.assert_allclose(read.time_s, record.time_s, atol=2e-6)
     place = np.stack([read.columns[n] for n in ("latitude_deg", "longitude_deg", "depth_m")], 1)
@@ -124,16 +126,6 @@ def test_a_flight_comes_back_from_its_bag(tmp_path: Path) -> None:
     np.testing.assert_allclose(vehicle.rpm["starboard"], record.rpm[:, 1], atol=1e-6)
     moved = record.believed.translation - record.believed.translation[0]
     np.testing.assert_allclose(vehicle.position_ned[:, :2], moved[:, :2], atol=1e-4)
-
-
-def test_a_simulations_clock_gives_seconds(tmp_path: Path) -> None:
-    write_bag(tmp_path / "dive", flight())
-    _, data = import_log(tmp_path / "dive", tmp_path / "n.csv")
-    assert not data["dated"]
-    # Not the truth, which the bag also holds.
-    assert data["sources"]["position"] == "/alice/navigation/odometry"
-    times = numbers(tmp_path / "n.csv", "time_s")[:, 0]
-    np.testing.assert_allclose(times, flight().time_s, atol=1e-6)
 
 
 @pytest.mark.parametrize("frame", ["world_ned", "odom"])
