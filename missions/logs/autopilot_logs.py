@@ -409,7 +409,7 @@ def read_ardusub_bin(
         kind="an on-board log of ArduSub",
         clock=_clock(offset_s),
         dated=offset_s is not None,
-        declination_in_log_deg=_declination(log.tables.get("PARM", LogTable())),
+        declination_in_log=_declination(log.tables.get("PARM", LogTable())),
     )  # fmt: skip
 
 
@@ -489,15 +489,15 @@ def _px4_offset(tables: Tables) -> float | None:
     return None
 
 
-def _declination(parameters: LogTable) -> float | None:
-    """What the vehicle added to its compass, degrees; NaN where it took it from its own table."""
+def _declination(parameters: LogTable) -> str:
+    """What the vehicle added to its compass, in words."""
     if not {"Name", "Value"} <= parameters.keys():
-        return None
+        return ""
     values = dict(zip(parameters["Name"].tolist(), parameters["Value"].tolist(), strict=True))
     if values.get("COMPASS_AUTODEC", 0.0) > 0:
-        return math.nan
-    declination = values.get("COMPASS_DEC")
-    return None if declination is None else math.degrees(declination)
+        return "itself (COMPASS_AUTODEC)"
+    declination = math.degrees(values.get("COMPASS_DEC", 0.0))
+    return f"of {declination:.2f} degrees (COMPASS_DEC)" if declination else ""
 
 
 def _vehicle(log: MessageLog) -> float:

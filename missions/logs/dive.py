@@ -82,9 +82,8 @@ class LoggedDive:
     thrusters: tuple[str, ...] = ()
     pwm: Signal | None = None
     """(N, n) microseconds of servo outputs 1 to n."""
-    declination_in_log_deg: float | None = None
-    """What the vehicle itself added to its compass, where the log says; NaN: it did, by its
-    built-in table."""
+    declination_in_log: str = ""
+    """What the vehicle itself added to its compass, in words, where the log says that it did."""
     lost: Mapping[str, int] = field(default_factory=dict)
     """How many rows or bytes were left out, by reason."""
     notes: tuple[str, ...] = ()

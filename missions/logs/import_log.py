@@ -4,6 +4,7 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -129,12 +130,17 @@ def import_log(
         except NavigationError as error:
             raise NavigationError(f"{path}: {error}") from None
     tide = read_tide(options.tide, dated=dive.dated)
-    _warn_of_declination(dive, options.declination_deg)
+    if dive.declination_in_log and options.declination_deg:
+        warn(f"the vehicle added a declination {dive.declination_in_log}: yours comes on top")
     columns = navigation_table(dive, dive.row_times, options, tide)
     useful = np.any([np.isfinite(columns[name]) for name in READINGS], axis=0)
     lost = Counter(dict(dive.lost))
     if not useful.any():
-        raise NavigationError(_nothing_of_use(path, dive, lost))
+        reasons = [f"{count} times {reason}" for reason, count in sorted(lost.items())]
+        if dive.altitude is not None and dive.altitude_slant:
+            reasons.append(f"ranges of {dive.altitude.source} are of use with an attitude only")
+        text = f"{path}: no row holds a position, depth, attitude or altitude"
+        raise NavigationError("; ".join([text, *reasons]))
     if not useful.all():
         lost["rows without any reading"] += int((~useful).sum())
     time_s = dive.row_times[useful]
@@ -155,14 +161,6 @@ def import_log(
         raise NavigationError(f"{error.filename}: cannot be written: {error.strerror}") from None
     tidal = isinstance(tide, Signal) or tide != 0.0
     return _report(path, out, dive, time_s, columns, lost, tidal=tidal)
-
-
-def _nothing_of_use(path: Path, dive: LoggedDive, lost: Mapping[str, int]) -> str:
-    reasons = [f"{count} times {reason}" for reason, count in sorted(lost.items())]
-    if dive.altitude is not None and dive.altitude_slant:
-        reasons.append(f"ranges of {dive.altitude.source} are of use with an attitude only")
-    text = f"{path}: no row holds a position, depth, attitude or altitude"
-    return f"{text} ({'; '.join(reasons)})" if reasons else text
 
 
 def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
@@ -218,15 +216,6 @@ def _roles(topics: Sequence[str]) -> dict[str, str]:
             raise NavigationError(f"--topic {role} is given twice")
         chosen[role] = name
     return chosen
-
-
-def _warn_of_declination(dive: LoggedDive, declination_deg: float) -> None:
-    known = dive.declination_in_log_deg
-    if known and declination_deg:
-        how = "itself (COMPASS_AUTODEC)"
-        if not math.isnan(known):
-            how = f"of {known:.2f} degrees (COMPASS_DEC)"
-        warn(f"the vehicle added a declination {how}: yours comes on top")
 
 
 def navigation_table(
@@ -346,7 +335,9 @@ def _report(
     """What was read, from where, and what is missing; warns of what was left out and of gaps."""
     filled = {name: int(np.isfinite(column).sum()) for name, column in columns.items()}
     leading = next(name for name in READINGS if filled[name])
-    gaps = _gaps(time_s[np.isfinite(columns[leading])])
+    known_s = time_s[np.isfinite(columns[leading])]
+    longest_s = max_gap_s(known_s)
+    gaps = [(a, b - a) for a, b in itertools.pairwise(known_s.tolist()) if b - a > longest_s]
     if lost:
         warn(f"{path}: left out: " + "; ".join(f"{n} {why}" for why, n in sorted(lost.items())))
     if gaps:
@@ -389,12 +380,6 @@ def _report(
     return "\n  ".join([head, *notes]), data
 
 
-def _gaps(time_s: Array) -> list[tuple[float, float]]:
-    """Start and length of steps that nothing is interpolated over."""
-    longest = max_gap_s(time_s)
-    return [(a, b - a) for a, b in itertools.pairwise(time_s.tolist()) if b - a > longest]
-
-
 def _tide_at(time_s: Array, tide: float | Signal) -> Array:
     """Heights, (N,) metres, of a tide at times.
 
@@ -423,14 +408,9 @@ def read_tide(text: str, *, dated: bool) -> float | Signal:
     Raises:
         NavigationError: it is neither, or the file cannot be used.
     """
-    try:
-        metres = float(text)
-    except ValueError:
-        pass
-    else:
-        if not math.isfinite(metres):
-            raise NavigationError(f"--tide {text}: give a finite number")
-        return metres
+    with suppress(ValueError):
+        if math.isfinite(metres := float(text)):
+            return metres
     column = "time_utc" if dated else "time_s"
     try:
         rows = read_csv(Path(text), (column, "height_m"))[1]
