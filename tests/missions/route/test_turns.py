@@ -11,10 +11,10 @@ from alice_survey.core.errors import PlanError
 from missions.route.turns import MAX_SWAY_M, Turns
 from missions.route.ways import TOUCH_M, Ways
 from missions.values.area import multipolygon
-from missions.values.costs import Costs, time_costs
+from missions.values.costs import SETTLE_S, Costs, time_costs
 from missions.values.legs import Route
 from missions.values.line import Line
-from tests.missions.route.routes import route_through
+from tests.missions.route.routes import PAPER_COSTS, route_through
 from tests.oracles_route import (
     farthest_outside_m,
     lawn,
@@ -150,6 +150,28 @@ def test_turns_are_flown_as_requested(turns: Turns, capsys: pytest.CaptureFixtur
     )
     assert capsys.readouterr().err == ""
     check_joints(route)
+
+
+def test_turns_take_the_time_of_their_closed_forms() -> None:
+    """At 0.2 m/s, with run-ins and run-outs of 0.5 m."""
+
+    def turn_s(turns: Turns, apart_m: float) -> float:
+        two, three = (
+            route_cost(route_through(lawn(n, 10.0, apart_m), 0.5, 0.5, turns=turns), PAPER_COSTS)[1]
+            for n in (2, 3)
+        )
+        return three - two - 10.0 / 0.2
+
+    for apart_m in (1.0, 2.0):
+        arcs, spot = (turn_s(turns, apart_m) for turns in ("arcs", "spot"))
+        assert arcs == pytest.approx((math.pi * 0.5 + apart_m) / 0.2)
+        # Half a turn in all at 15 deg/s, and the time of two stops.
+        way_m = 0.5 + math.hypot(apart_m, 0.5)
+        assert spot == pytest.approx(12.0 + 2.0 * SETTLE_S + way_m / 0.2)
+        assert turn_s("auto", apart_m) == min(arcs, spot)
+    # Dubins' three arcs join half circles where lines are two radii apart, and 7/3 pi R at none.
+    assert turn_s("arcs", 1.0 - 1e-9) == pytest.approx(turn_s("arcs", 1.0), abs=1e-3)
+    assert turn_s("arcs", 1e-9) == pytest.approx((7 / 3 * math.pi * 0.5 + 1.0) / 0.2)
 
 
 def test_a_sway_step_keeps_the_heading_and_then_turns() -> None:
