@@ -7,6 +7,7 @@ relative to the last reset and are not read. The maker's page "DVL protocol" des
 json_v2 to json_v3.1.
 """
 
+import itertools
 import json
 import math
 from collections import Counter
@@ -30,7 +31,8 @@ def is_waterlinked(path: Path) -> bool:
     """Whether a file holds such reports."""
     if path.suffix.lower() not in SUFFIXES:
         return False
-    return any(report is not None for report in _read_reports(path, _LOOKED_AT))
+    first = itertools.islice(_read_reports(path), _LOOKED_AT)
+    return any(report and report["type"] in (_VELOCITY, _ATTITUDE) for report in first)
 
 
 def read_waterlinked(path: Path) -> LoggedDive:
@@ -48,7 +50,7 @@ def read_waterlinked(path: Path) -> LoggedDive:
             lost["lines that are no report"] += 1
         elif report["type"] == _ATTITUDE:
             attitudes.append([finite_number(report.get(k)) for k in ("ts", "roll", "pitch", "yaw")])
-        else:
+        elif report["type"] == _VELOCITY:
             since_s += 1e-3 * np.nan_to_num(finite_number(report.get("time")))
             row = [finite_number(report.get(k)) for k in ("vx", "vy", "vz", "altitude")]
             if report.get("velocity_valid") is not True:
@@ -81,20 +83,15 @@ def read_waterlinked(path: Path) -> LoggedDive:
     )
 
 
-def _read_reports(path: Path, max_lines: int | None = None) -> Iterator[dict[str, Any] | None]:
-    """Reports that are read, None for a line that is not a report; other types are passed over."""
+def _read_reports(path: Path) -> Iterator[dict[str, Any] | None]:
+    """The report of each line, of any type; None for a line that is not a report."""
     try:
         with path.open("rb") as file:
-            while (line := file.readline(_MAX_LINE)) and max_lines != 0:
-                max_lines = None if max_lines is None else max_lines - 1
+            while line := file.readline(_MAX_LINE):
                 try:
-                    report = json.loads(line)
-                    kind = report["type"]
+                    report = json.loads(line) if line.strip() else {"type": "empty line"}
+                    yield report if report["type"] else None
                 except (ValueError, RecursionError, TypeError, KeyError):
-                    if line.strip() and max_lines is None:
-                        yield None
-                    continue
-                if kind in (_VELOCITY, _ATTITUDE):
-                    yield report
+                    yield None
     except OSError as error:
         raise NavigationError(f"{path}: cannot be read: {error.strerror}") from None

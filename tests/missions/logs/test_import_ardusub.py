@@ -389,7 +389,7 @@ def test_damaged_logs_end_in_a_table_or_in_one_line(tmp_path: Path, form: str) -
     }[form]
     rng = np.random.default_rng(11)
     outcomes = []
-    for _ in range(40):
+    for _ in range(20):
         data = bytearray(whole)
         for place in rng.integers(len(data), size=rng.integers(1, 15)):
             data[place] = rng.integers(256)
