@@ -1,7 +1,8 @@
 """What `fov` shows: tables as plain text, rows of a CSV file, and one figure of three panels."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from alice_survey.core.artefacts import json_values
 from alice_survey.kit.words import field_table
-from camera_calib.fov.paper import PAPER_RULE, RELIEF, PaperCheck, PaperClaim, PaperValidation
+from camera_calib.fov.paper import PAPER_RULE, RELIEF, PaperValidation
 from camera_calib.fov.table import FISHEYE_FOV_DEG, TRUSTED_FOV_DEG, BlurRow, FovRow
 
 _LENS = {"lens": "{lens_mm:.4g} mm", "altitude": "{altitude_m:g} m"}
@@ -63,11 +64,6 @@ def fov_text(rows: Sequence[FovRow], blur: Sequence[BlurRow] = ()) -> str:
     """Footprint and resolution, stereo, focus and depth of field, and motion blur."""
     first = rows[0]
     marked = [vars(r) | {"mark": "" if r.within_trusted_fov else " (!)"} for r in rows]
-    in_ms = [
-        vars(b)
-        | {"exposure_ms": 1e3 * b.exposure_s, "longest_exposure_ms": 1e3 * b.longest_exposure_s}
-        for b in blur
-    ]
     tables = [
         field_table("Footprint and resolution", _FOOTPRINT, marked, list(_footprint_notes(rows))),
         field_table(
@@ -80,6 +76,11 @@ def fov_text(rows: Sequence[FovRow], blur: Sequence[BlurRow] = ()) -> str:
         ),
     ]  # fmt: skip
     if blur:
+        in_ms = [
+            vars(b)
+            | {"exposure_ms": 1e3 * b.exposure_s, "longest_exposure_ms": 1e3 * b.longest_exposure_s}
+            for b in blur
+        ]
         note = "of the central pixel; exposure of the shutter, or of the strobe if that is short"
         tables.append(field_table("Motion blur", _BLUR, in_ms, [note]))
     return "\n\n".join(tables)
@@ -141,23 +142,24 @@ def fov_csv_rows(rows: Sequence[FovRow], blur: Sequence[BlurRow]) -> list[dict[s
 
 def validation_rows(validation: PaperValidation) -> list[dict[str, str]]:
     """Every check and claim in words, flat."""
-    checks: list[tuple[PaperCheck | PaperClaim, str, str, str]] = [
-        (c, f"{c.quantity} of the {c.lens_mm:g} mm lens: {c.paper} {c.unit}", "rule of the table",
-         f"within {c.tolerance:g} {c.unit}")
+    words = [
+        (f"{c.quantity} of the {c.lens_mm:g} mm lens: {c.paper} {c.unit}",
+         f"within {c.tolerance:g} {c.unit}", "rule of the table")
         for c in validation.table
     ]  # fmt: skip
-    checks += [
-        (c, c.claim, c.assumption,
-         (f"{c.minimum:g} to " if c.minimum else "at most ") + f"{c.maximum:g} {c.unit}")
+    words += [
+        (c.claim, (f"{c.minimum:g} to " if c.minimum else "at most ") + f"{c.maximum:g} {c.unit}",
+         c.assumption)
         for c in validation.claims
     ]  # fmt: skip
+    found = [
+        ("pass" if c.passed else "FAIL", f"{c.computed:.4f} {c.unit}")
+        for c in (*validation.table, *validation.claims)
+    ]
     return [
-        {
-            "claim": claim, "verdict": "pass" if c.passed else "FAIL",
-            "computed": f"{c.computed:.4f} {c.unit}", "allowed": allowed, "if": assumption,
-        }
-        for c, claim, assumption, allowed in checks
-    ]  # fmt: skip
+        dict(zip(_CLAIMS, (claim, *result, *rest), strict=True))
+        for (claim, *rest), result in zip(words, found, strict=True)
+    ]
 
 
 def draw_fov(
@@ -184,7 +186,10 @@ def draw_fov(
     check_figure_path(path)
     high = 1.5 * max(altitudes_m)
     heights = np.linspace(max(0.25 * min(altitudes_m), 0.01), high, _CURVE_POINTS).tolist()
-    curves, marked = (_by_lens(table(at)) for at in (heights, altitudes_m))
+    curves, marked = (
+        {lens_mm: list(rows) for lens_mm, rows in groupby(table(at), lambda r: round(r.lens_mm, 6))}
+        for at in (heights, altitudes_m)
+    )
     with figure_style():
         figure = new_figure(4.4, 13.0)
         for axes, (title, unit, fields) in zip(figure.subplots(1, 3), _PANELS, strict=True):
@@ -204,10 +209,3 @@ def draw_fov(
             f"n {first.n_water:.4g}, {first.port}; F/{first.f_number:g} focused on the sea floor"
         )
         save_figure(figure, path, dpi=120)
-
-
-def _by_lens(rows: Sequence[FovRow]) -> Mapping[float, list[FovRow]]:
-    lenses: dict[float, list[FovRow]] = {}
-    for row in rows:
-        lenses.setdefault(round(row.lens_mm, 6), []).append(row)
-    return lenses

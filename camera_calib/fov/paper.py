@@ -8,7 +8,7 @@ happens at 70 degrees. Other readings, and where the paper rounds, are in docs/p
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -37,6 +37,8 @@ PAPER_TABLE = (
 )
 """Lens (mm), quantity, unit, and the value as printed."""
 _FIELDS = {"horizontal": "horizontal_m", "vertical": "vertical_m", "pixel": "pixel_centre_mm"}
+_BOUNDS = {"minimum": "least", "maximum": "most"}
+"""Names of a claim's bounds in JSON."""
 ANGLES_DEG = (40.0, 50.0, 60.0, 70.0, 80.0, 90.0, 100.0, 110.0)
 RELIEF = 0.25
 """Working ranges from (1 - this) to (1 + this) times the altitude: 1.5 to 2.5 m at 2 m."""
@@ -84,7 +86,7 @@ class PaperCheck:
         return abs(self.difference) <= self.tolerance
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class PaperClaim:
     """A claim of the paper in words, and the number that decides it."""
 
@@ -93,7 +95,7 @@ class PaperClaim:
     """Assumption where the paper states nothing."""
     computed: float
     unit: str
-    minimum: float = 0.0
+    minimum: float
     maximum: float
 
     @property
@@ -147,28 +149,15 @@ class PaperValidation:
     def to_json(self) -> dict[str, Any]:
         """Everything as JSON values."""
         computed = ("difference", "tolerance", "passed")
+        table = [asdict(c) | {name: getattr(c, name) for name in computed} for c in self.table]
+        claims = [
+            {_BOUNDS.get(name, name): value for name, value in asdict(claim).items()}
+            | {"passed": claim.passed}
+            for claim in self.claims
+        ]
+        start = {"passed": self.passed, "rule": PAPER_RULE}
         data: dict[str, Any] = json_values(
-            {
-                "passed": self.passed,
-                "rule": PAPER_RULE,
-                "table": [
-                    asdict(check) | {name: getattr(check, name) for name in computed}
-                    for check in self.table
-                ],
-                "claims": [
-                    {
-                        "claim": one.claim,
-                        "assumption": one.assumption,
-                        "computed": one.computed,
-                        "unit": one.unit,
-                        "least": one.minimum,
-                        "most": one.maximum,
-                        "passed": one.passed,
-                    }
-                    for one in self.claims
-                ],
-                "angles": self.angles,
-            }
+            {**start, "table": table, "claims": claims, "angles": self.angles}
         )
         return data
 
@@ -187,26 +176,37 @@ def validate_paper() -> PaperValidation:
         for lens_mm, quantity, unit, printed in PAPER_TABLE
     )
     angles = tuple(angle_table(_PORT, _N_SEA, altitude_m=_ALTITUDE_M))
-    at_limit = next(row for row in angles if row.fov_air_deg == TRUSTED_FOV_DEG)
-    lenses = [
-        PaperClaim(
-            claim=f"lenses of up to {TRUSTED_FOV_DEG:g} deg: the {lens_mm:g} mm lens",
-            assumption="the angle is the diagonal's, in air (its widest)",
-            computed=row.diagonal_air_deg,
-            unit="deg",
-            maximum=TRUSTED_FOV_DEG,
-        )
-        for lens_mm, row in rows.items()
-    ]
-    distortion = PaperClaim(
-        claim=f"a flat port up to {TRUSTED_FOV_DEG:g} deg avoids distortion",
-        assumption="residual rms of the best virtual pinhole, relief of +/-25 %, against the noise "
-        f"of matching; {_IN_SEA}, {_ALTITUDE_M:g} m",
-        computed=at_limit.residual_rms_px,
-        unit="px",
-        maximum=MATCH_SIGMA_PX,
-    )
-    return PaperValidation(table=table, claims=(*lenses, distortion, *_focus()), angles=angles)
+    return PaperValidation(table=table, claims=tuple(_claims(rows, angles)), angles=angles)
+
+
+def _claims(rows: Mapping[float, FovRow], angles: Sequence[AngleRow]) -> Iterator[PaperClaim]:
+    limit = TRUSTED_FOV_DEG
+    for lens_mm, row in rows.items():
+        yield PaperClaim(
+            f"lenses of up to {limit:g} deg: the {lens_mm:g} mm lens",
+            "the angle is the diagonal's, in air (its widest)",
+            row.diagonal_air_deg, "deg", 0.0, limit,
+        )  # fmt: skip
+    at_limit = next(row for row in angles if row.fov_air_deg == limit)
+    yield PaperClaim(
+        f"a flat port up to {limit:g} deg avoids distortion",
+        "residual rms of the best virtual pinhole, relief of +/-25 %, against the noise of "
+        f"matching; {_IN_SEA}, {_ALTITUDE_M:g} m",
+        at_limit.residual_rms_px, "px", 0.0, MATCH_SIGMA_PX,
+    )  # fmt: skip
+    readings = ((rows[12.5], _IN_PAPER), (_row(12.5, in_sea=True), _IN_SEA))
+    for row, setup in readings:
+        yield PaperClaim(
+            "focused at 2 m in water, 1.5 m in air",
+            f"near the axis, distance in air from the entrance pupil; {setup}",
+            row.focus_air_m, "m", 1.4, 1.6,
+        )  # fmt: skip
+    for row, setup in readings:
+        yield PaperClaim(
+            "F/4 gives a depth of field of 2 m at 2 m",
+            f"circle of confusion of the diagonal/1500; 12.5 mm, {setup}",
+            row.depth_of_field_m, "m", 1.9, 2.1,
+        )  # fmt: skip
 
 
 def paper_settings() -> tuple[CameraConfig, float, float]:
@@ -219,28 +219,6 @@ def _row(lens_mm: float, *, in_sea: bool = False) -> FovRow:
     camera, n_water = (_PORT, _N_SEA) if in_sea else (_BARE, _N_PAPER)
     coc_px = math.hypot(camera.width_px, camera.height_px) / _DIAGONAL_SHARE
     return fov_table([lens_mm], [_ALTITUDE_M], n_water, camera, coc_px)[0]
-
-
-def _focus() -> list[PaperClaim]:
-    readings = ((_row(12.5), _IN_PAPER), (_row(12.5, in_sea=True), _IN_SEA))
-    claims = (
-        ("focused at 2 m in water, 1.5 m in air",
-         "near the axis, distance in air from the entrance pupil; ", "focus_air_m", 1.4, 1.6),
-        ("F/4 gives a depth of field of 2 m at 2 m",
-         "circle of confusion of the diagonal/1500; 12.5 mm, ", "depth_of_field_m", 1.9, 2.1),
-    )  # fmt: skip
-    return [
-        PaperClaim(
-            claim=claim,
-            assumption=assumption + setup,
-            computed=getattr(row, field),
-            unit="m",
-            minimum=minimum,
-            maximum=maximum,
-        )
-        for claim, assumption, field, minimum, maximum in claims
-        for row, setup in readings
-    ]
 
 
 def angle_table(

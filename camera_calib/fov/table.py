@@ -9,6 +9,7 @@ the closed forms that follow from it.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -101,7 +102,7 @@ class FovRow:
     """The diagonal is within what the port is trusted for: 70 degrees for a flat one."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class BlurRow:
     """Motion blur of the central pixel. Exposure is the shorter of shutter and strobe."""
 
@@ -198,18 +199,12 @@ def blur_table(
     check_range("blur", [allowed_px], 1e-6, 1e6, "px")
     return [
         BlurRow(
-            lens_mm=row.lens_mm,
-            altitude_m=row.altitude_m,
-            speed_mps=speed,
-            exposure_s=exposure,
-            blur_px=speed * exposure / (row.pixel_centre_mm * 1e-3),
-            allowed_px=allowed_px,
-            longest_exposure_s=allowed_px * row.pixel_centre_mm * 1e-3 / speed,
+            row.lens_mm, row.altitude_m, speed, exposure,
+            speed * exposure / (row.pixel_centre_mm * 1e-3), allowed_px,
+            allowed_px * row.pixel_centre_mm * 1e-3 / speed,
         )
-        for row in rows
-        for speed in speeds_mps
-        for exposure in exposures_s
-    ]
+        for row, speed, exposure in product(rows, speeds_mps, exposures_s)
+    ]  # fmt: skip
 
 
 def check_range(
@@ -222,9 +217,8 @@ def check_range(
     """
     for value in values:
         if not minimum <= value <= maximum:
-            raise ConfigError(
-                f"{what} {value} {unit}".rstrip() + f": allowed {minimum:g} to {maximum:g}"
-            )
+            given = f"{what} {value} {unit}".rstrip()
+            raise ConfigError(f"{given}: allowed {minimum:g} to {maximum:g}")
 
 
 def _row(
