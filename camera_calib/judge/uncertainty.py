@@ -41,8 +41,8 @@ _PROJECTIONS = {
     "fixed pose, median/worst": "{plain_median_px:.3f} / {plain_worst_px:.3f} px",
 }  # fmt: skip
 _STEREO = {
-    "at": "{range_m:g} m", "depth": "{depth_mm:.3g} mm", "shape": "{shape_mm:.3g} mm",
-    "noise": "{noise_mm:.3g} mm", "a length": "{length_mm:.3g} mm of {length_m:.2f} m",
+    "at": "{at.range_m:g} m", "depth": "{mm[0]:.3g} mm", "shape": "{mm[1]:.3g} mm",
+    "noise": "{mm[2]:.3g} mm", "a length": "{mm[3]:.3g} mm of {at.length_m:.2f} m",
 }  # fmt: skip
 
 
@@ -278,13 +278,13 @@ class StereoSigma:
     """Stereo uncertainty at one distance; NaN where no two cameras see the same."""
 
     range_m: float
-    point_m: tuple[float, float, float] = (math.nan, math.nan, math.nan)
+    point_m: tuple[float, ...] = (math.nan,) * 3
     """Sigmas right, down, forward of a point mid-overlap, by calibration alone."""
     worst_point_m: float = math.nan
     """Largest sigma forward in the overlap, by calibration alone."""
     worst_shape_m: float = math.nan
     """Largest sigma forward in the overlap, after the best rigid motion."""
-    noise_m: tuple[float, float, float] = (math.nan, math.nan, math.nan)
+    noise_m: tuple[float, ...] = (math.nan,) * 3
     """Sigmas of the same point as `point_m`, by the noise of its pixels alone."""
     length_m: float = math.nan
     """A length across the overlap: 1 m, or what fits."""
@@ -312,10 +312,10 @@ def stereo_sigma(rig: Rig, range_m: float, noise_px: float) -> StereoSigma:
     length = length_sigmas_m(rig, (centre - half)[None], (centre + half)[None])
     return StereoSigma(
         range_m=range_m,
-        point_m=(float(at_centre[0]), float(at_centre[1]), float(at_centre[2])),
+        point_m=tuple(at_centre.tolist()),
         worst_point_m=float(np.nanmax(at_all[:, 2])),
         worst_shape_m=float(np.nanmax(shape_sigmas_m(rig, points)[:, 2])),
-        noise_m=(float(noise[0]), float(noise[1]), float(noise[2])),
+        noise_m=tuple(noise.tolist()),
         length_m=2 * float(half[0]),
         length_sigma_m=float(length[0]),
     )
@@ -330,9 +330,9 @@ class Parameter:
     sigma: float | None
     """Standard deviation; None: it was fixed."""
     unit: str
-    most_alike: str
+    most_alike: str = ""
     """The parameter it correlates with most; empty when fixed or alone."""
-    correlation: float
+    correlation: float = 0.0
     prior: bool
     """Whether it had a prior."""
 
@@ -349,40 +349,23 @@ def rig_parameters(rig: Rig, with_prior: Collection[str] = ()) -> tuple[Paramete
     off_diagonal = covariance.correlation - np.eye(len(names))
     rows = []
     for name in all_names(rig):
-        other, correlation = "", 0.0
+        alike: dict[str, Any] = {}
         if name in sigmas:
             row = off_diagonal[names.index(name)]
             largest = int(np.abs(row).argmax())
             if names[largest] != name:
-                other, correlation = names[largest], float(row[largest])
-        shown, factor, unit = _reader_unit(name, value(rig, name))
-        rows.append(
-            Parameter(
-                name=name,
-                value=shown,
-                sigma=sigmas[name] * factor if name in sigmas else None,
-                unit=unit,
-                most_alike=other,
-                correlation=correlation,
-                prior=name in with_prior,
-            )
-        )
+                alike = {"most_alike": names[largest], "correlation": float(row[largest])}
+        number = _in_reader_unit(name, value(rig, name), sigmas.get(name))
+        rows.append(Parameter(name=name, prior=name in with_prior, **number, **alike))
     return tuple(rows)
 
 
 def shape_parameters(shape: TargetShape) -> tuple[Parameter, ...]:
     """Modes of a target's shape that were adjusted with the cameras."""
-    rows = []
-    for name in shape.parameters:
-        value, sigma = shape.value_and_sigma(name)
-        shown, factor, unit = _reader_unit(name, value)
-        rows.append(
-            Parameter(
-                name=name, value=shown, sigma=sigma * factor, unit=unit, most_alike="",
-                correlation=0.0, prior=True,
-            )
-        )  # fmt: skip
-    return tuple(rows)
+    return tuple(
+        Parameter(name=n, prior=True, **_in_reader_unit(n, *shape.value_and_sigma(n)))
+        for n in shape.parameters
+    )
 
 
 def parameter_cells(parameters: Collection[Parameter]) -> list[dict[str, str]]:
@@ -406,15 +389,14 @@ def parameter_table(parameters: Collection[Parameter]) -> str:
     return field_table("Parameters", _PARAMETERS, parameter_cells(parameters))
 
 
-def _reader_unit(name: str, number: float) -> tuple[float, float, str]:
-    """Value, factor of its sigma and unit: mm and degrees, not m, radians and sines of tilts."""
+def _in_reader_unit(name: str, number: float, sigma: float | None) -> dict[str, Any]:
+    """Value, sigma and unit: mm and degrees, not m, radians and sines of tilts."""
+    factor, unit = next((known for end, *known in _READER_UNITS if name.endswith(end)), (1.0, ""))
+    shown = number * factor
     if name.endswith(("normal_x", "normal_y")):
-        per_sine = math.degrees(1.0) / math.sqrt(1.0 - number * number)
-        return math.degrees(math.asin(number)), per_sine, "deg"
-    for ending, factor, unit in _READER_UNITS:
-        if name.endswith(ending):
-            return number * factor, factor, unit
-    return number, 1.0, ""
+        factor, unit = math.degrees(1.0) / math.sqrt(1.0 - number * number), "deg"
+        shown = math.degrees(math.asin(number))
+    return {"value": shown, "sigma": None if sigma is None else sigma * factor, "unit": unit}
 
 
 def baselines_m(rig: Rig) -> dict[str, tuple[float, float]]:
@@ -433,7 +415,7 @@ def baselines_m(rig: Rig) -> dict[str, tuple[float, float]]:
     return found
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class RangeSigma:
     """Projection uncertainty over the frame of one camera at one distance, px."""
 
@@ -451,20 +433,12 @@ def sigmas_by_range(
     found = []
     for range_m in ranges_m:
         sigma = projection_sigma(rig, camera, pixels, range_m, compensating)
-        (plain, plain_worst), (best, best_worst) = (
-            np.quantile(values[np.isfinite(values)], [0.5, 1.0])
-            if np.isfinite(values).any() else (np.nan, np.nan)
-            for values in (sigma.plain_px, sigma.compensated_px)
-        )  # fmt: skip
-        found.append(
-            RangeSigma(
-                range_m=range_m,
-                plain_median_px=float(plain),
-                plain_worst_px=float(plain_worst),
-                compensated_median_px=float(best),
-                compensated_worst_px=float(best_worst),
-            )
-        )
+        both = np.stack([sigma.plain_px.ravel(), sigma.compensated_px.ravel()])
+        known = both[:, np.isfinite(both).all(axis=0)]
+        levels = np.full((2, 2), np.nan)
+        if known.size:
+            levels = np.quantile(known, [0.5, 1.0], axis=1).T
+        found.append(RangeSigma(range_m, *levels.ravel().tolist()))
     return tuple(found)
 
 
@@ -502,25 +476,25 @@ def uncertainty_report(
             for name, camera in rig.cameras.items()
         },
     }  # fmt: skip
-    if len(rig.cameras) > 1:
-        data["stereo"] = [stereo_sigma(rig, r, noise_px) for r in ranges]
     projections = [
         vars(one) | {"camera": name}
         for name, sigmas in data["projection_sigma"].items()
         for one in sigmas
     ]
-    stereo = [
-        {
-            "range_m": s.range_m, "length_m": s.length_m, "depth_mm": 1e3 * s.point_m[2],
-            "shape_mm": 1e3 * s.worst_shape_m, "noise_mm": 1e3 * s.noise_m[2],
-            "length_mm": 1e3 * s.length_sigma_m,
-        }
-        for s in data.get("stereo", ())
-    ]  # fmt: skip
-    tables = (
-        ("One sigma of a projection over the frame", _PROJECTIONS, projections),
-        (f"One sigma of stereo by calibration alone, and by {noise_px:g} px of noise", _STEREO,
-         stereo),
-    )  # fmt: skip
-    texts = [parameter_table(parameters), *(field_table(*table) for table in tables if table[2])]
+    texts = [
+        parameter_table(parameters),
+        field_table("One sigma of a projection over the frame", _PROJECTIONS, projections),
+    ]
+    if len(rig.cameras) > 1:
+        data["stereo"] = [stereo_sigma(rig, r, noise_px) for r in ranges]
+        title = f"One sigma of stereo by calibration alone, and by {noise_px:g} px of noise"
+        rows = [
+            {
+                "at": s,
+                "mm": 1e3
+                * np.array([s.point_m[2], s.worst_shape_m, s.noise_m[2], s.length_sigma_m]),
+            }
+            for s in data["stereo"]
+        ]
+        texts.append(field_table(title, _STEREO, rows))
     return "\n\n".join(texts), json_values(data)
