@@ -12,12 +12,7 @@ from alice_survey.core.executor import Executor
 from camera_calib.calibrate.picture_sets import PictureSet
 from camera_calib.calibration import TargetView
 from camera_calib.picture_files import is_cut_short, read_pixels
-from camera_calib.targets.detect import (
-    Detection,
-    as_grey,
-    chessboard_size,
-    detect_with_reasons,
-)
+from camera_calib.targets.detect import Detection, as_grey, chessboard_size, detect_with_reasons
 from camera_calib.targets.target import Rejection, Target
 
 _CHECKED = 3

@@ -15,12 +15,7 @@ from alice_survey.kit.words import with_sigma
 from camera_calib.calibrate.detect_views import Detections
 from camera_calib.calibrate.solve import recalibrate
 from camera_calib.calibrate.start import locate
-from camera_calib.calibration import (
-    Calibration,
-    TargetView,
-    residuals_px,
-    stack_views,
-)
+from camera_calib.calibration import Calibration, TargetView, residuals_px, stack_views
 from camera_calib.judge.report import write_report
 from camera_calib.judge.uncertainty import (
     baselines_m,

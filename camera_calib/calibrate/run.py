@@ -11,11 +11,7 @@ from alice_survey.core.records import BoardRecord
 from camera_calib.calibrate.detect_views import Size, detect_views
 from camera_calib.calibrate.picture_sets import PictureSet
 from camera_calib.calibrate.results import warn_of_unseen, write_results
-from camera_calib.calibrate.solve import (
-    Intrinsics,
-    calibrate_in_air,
-    calibrate_through_ports,
-)
+from camera_calib.calibrate.solve import Intrinsics, calibrate_in_air, calibrate_through_ports
 from camera_calib.freedom import USUAL_LENS
 from camera_calib.rig import design_rig
 from camera_calib.targets.target import Target

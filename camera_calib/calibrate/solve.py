@@ -21,12 +21,7 @@ from camera_calib.calibrate.corner_noise import spread_of
 from camera_calib.calibrate.normal_equations import CalibrationProblem
 from camera_calib.calibrate.observability import advice, unobservable
 from camera_calib.calibrate.start import first_cam_from_rig, first_focal_px, locate_all, spans
-from camera_calib.calibration import (
-    Calibration,
-    TargetView,
-    residuals_px,
-    stack_views,
-)
+from camera_calib.calibration import Calibration, TargetView, residuals_px, stack_views
 from camera_calib.camera import Camera
 from camera_calib.freedom import (
     PINHOLE,

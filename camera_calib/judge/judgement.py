@@ -14,40 +14,7 @@ from alice_survey.core.run import progress
 from alice_survey.kit.document import Level, Verdict, worst_first
 from alice_survey.kit.words import with_sigma
 from camera_calib.calibration import Calibration
-from camera_calib.judge.residuals import (
-    CameraResiduals,
-    Coverage,
-    HomographyTest,
-    PictureFit,
-    Profile,
-    camera_residuals,
-    coverage,
-    homography_test,
-    incidence_profile,
-    picture_fits,
-)
-from camera_calib.judge.uncertainty import (
-    Parameter,
-    ProjectionSigma,
-    RangeSigma,
-    StereoSigma,
-    baselines_m,
-    compensation,
-    projection_sigma,
-    rig_parameters,
-    shape_parameters,
-    sigmas_by_range,
-    stereo_sigma,
-)
-from camera_calib.judge.validation import (
-    HalvesAgreement,
-    HeldOut,
-    HoldOutScore,
-    LengthErrors,
-    halves_agreement,
-    length_errors,
-    score_hold_out,
-)
+from camera_calib.judge import residuals, uncertainty, validation
 from camera_calib.optics import likely_port
 from camera_calib.target_shape import BOW_X, BOW_Y
 
@@ -90,14 +57,14 @@ _SIGMA_LIMITS = 3.0, 10.0
 class CameraJudgement:
     """Measures of one camera."""
 
-    seen: CameraResiduals
-    by_incidence: Profile
+    seen: residuals.CameraResiduals
+    by_incidence: residuals.Profile
     """Residuals against the angle to the port's normal in water, deg."""
-    coverage: Coverage
-    homography: HomographyTest | None
-    sigma: ProjectionSigma
+    coverage: residuals.Coverage
+    homography: residuals.HomographyTest | None
+    sigma: uncertainty.ProjectionSigma
     """(R, C) at the working range."""
-    by_range: tuple[RangeSigma, ...]
+    by_range: tuple[uncertainty.RangeSigma, ...]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -106,30 +73,30 @@ class Judgement:
 
     calibration: Calibration
     working_range_m: float
-    parameters: tuple[Parameter, ...]
+    parameters: tuple[uncertainty.Parameter, ...]
     baselines_m: dict[str, tuple[float, float]]
     """Distance from the reference camera and its sigma, by camera."""
-    pictures: tuple[PictureFit, ...]
+    pictures: tuple[residuals.PictureFit, ...]
     cameras: dict[str, CameraJudgement]
-    stereo: tuple[StereoSigma, ...]
+    stereo: tuple[uncertainty.StereoSigma, ...]
     """By distance; empty for one camera."""
-    lengths: LengthErrors | None
+    lengths: validation.LengthErrors | None
     """Errors on the views used; None for one camera."""
-    held_lengths: LengthErrors | None
+    held_lengths: validation.LengthErrors | None
     """Errors on held-out views, in the rig calibrated without them."""
-    hold_out: HoldOutScore | None
-    halves: HalvesAgreement | None
+    hold_out: validation.HoldOutScore | None
+    halves: validation.HalvesAgreement | None
     """All parameters of two calibrations, from either half of the views."""
 
     @property
-    def stereo_at_work(self) -> StereoSigma | None:
+    def stereo_at_work(self) -> uncertainty.StereoSigma | None:
         """Stereo at the working range."""
         return next((s for s in self.stereo if s.range_m == self.working_range_m), None)
 
 
 @progress.step("judge the calibration")
 def judge(
-    calibration: Calibration, held: HeldOut | None, working_range_m: float | None = None
+    calibration: Calibration, held: validation.HeldOut | None, working_range_m: float | None = None
 ) -> Judgement:
     """Compute everything that the report shows.
 
@@ -143,33 +110,37 @@ def judge(
         CalibrationError: the rig has no covariance.
     """
     rig, found = calibration.rig, calibration
-    of_rig = rig_parameters(rig, calibration.freedom.prior.parameters)
+    of_rig = uncertainty.rig_parameters(rig, calibration.freedom.prior.parameters)
     range_m = working_range_m or _working_range_m(calibration)
     ranges = tuple(float(r) for r in range_m * _RANGE_STEPS)
     stereo = len(rig.cameras) > 1
-    lengths = held_lengths = None
+    lengths = held_lengths = halves = None
+    if held is not None and held.halves is not None:
+        halves = validation.halves_agreement(held.halves)
     if stereo:
-        lengths = length_errors(
+        lengths = validation.length_errors(
             rig, found.views, found.rig_from_target, found.residuals_px, found.target_points,
             found.sigma_px,
         )  # fmt: skip
     if stereo and held is not None:
-        held_lengths = length_errors(
+        held_lengths = validation.length_errors(
             held.used.rig, held.views, held.rig_from_target, held.residuals_px,
             held.used.target_points, held.used.noise_px,
         )  # fmt: skip
     return Judgement(
         calibration=calibration,
         working_range_m=range_m,
-        parameters=(*of_rig, *shape_parameters(calibration.shape)),
-        baselines_m=baselines_m(rig),
-        pictures=tuple(picture_fits(calibration)),
+        parameters=(*of_rig, *uncertainty.shape_parameters(calibration.shape)),
+        baselines_m=uncertainty.baselines_m(rig),
+        pictures=tuple(residuals.picture_fits(calibration)),
         cameras={name: _camera(calibration, name, range_m, ranges) for name in rig.cameras},
-        stereo=tuple(stereo_sigma(rig, r, calibration.noise_px) for r in ranges) if stereo else (),
+        stereo=tuple(
+            uncertainty.stereo_sigma(rig, r, calibration.noise_px) for r in ranges if stereo
+        ),
         lengths=lengths,
         held_lengths=held_lengths,
-        hold_out=None if held is None else score_hold_out(held),
-        halves=None if held is None or held.halves is None else halves_agreement(held.halves),
+        hold_out=None if held is None else validation.score_hold_out(held),
+        halves=halves,
     )
 
 
@@ -197,15 +168,16 @@ def _camera(
     calibration: Calibration, name: str, range_m: float, ranges: tuple[float, ...]
 ) -> CameraJudgement:
     rig, model = calibration.rig, calibration.rig.cameras[name]
-    seen, pixels = camera_residuals(calibration, name), model.frame_grid(_MAP_COLUMNS, _MAP_ROWS)
-    compensating = compensation(rig, name, anchors_cam(calibration, name))
+    seen = residuals.camera_residuals(calibration, name)
+    pixels = model.frame_grid(_MAP_COLUMNS, _MAP_ROWS)
+    compensating = uncertainty.compensation(rig, name, anchors_cam(calibration, name))
     return CameraJudgement(
         seen=seen,
-        by_incidence=incidence_profile(model, seen),
-        coverage=coverage(model, seen.pixels),
-        homography=homography_test(calibration, name),
-        sigma=projection_sigma(rig, name, pixels, range_m, compensating),
-        by_range=sigmas_by_range(rig, name, pixels[::2, ::2], ranges, compensating),
+        by_incidence=residuals.incidence_profile(model, seen),
+        coverage=residuals.coverage(model, seen.pixels),
+        homography=residuals.homography_test(calibration, name),
+        sigma=uncertainty.projection_sigma(rig, name, pixels, range_m, compensating),
+        by_range=uncertainty.sigmas_by_range(rig, name, pixels[::2, ::2], ranges, compensating),
     )
 
 
@@ -243,18 +215,13 @@ def _fit_verdicts(judged: Judgement) -> Iterator[Verdict]:
     median = float(np.median([p.rms_px for p in judged.pictures]))
     odd = [p for p in judged.pictures if p.rms_px > _ODD_PICTURE * median]
     score = judged.hold_out
-    if odd:
-        harmless = score is not None and score.rms_px <= _HELD_OUT_LIMITS[0] * score.expected_px
-        listed = ", ".join(f"view {p.view} of {p.camera} ({p.rms_px:.3f} px)" for p in odd[:5])
-        yield Verdict(
-            level="good" if harmless else "look",
-            text=f"{len(odd)} pictures over {_ODD_PICTURE:g} times the median of {median:.3f} px "
-            f"rms, such as {listed}; "
-            + ("held-out views fit as expected nonetheless" if harmless
-               else "look at them for blur, motion or a bent target"),
-        )  # fmt: skip
+    harmless = score is not None and score.rms_px <= _HELD_OUT_LIMITS[0] * score.expected_px
+    listed = ", ".join(f"view {p.view} of {p.camera} ({p.rms_px:.3f} px)" for p in odd[:5])
+    text = f"{len(odd)} pictures over {_ODD_PICTURE:g} times the median of {median:.3f} px rms"
+    if odd and not harmless:
+        yield _look(f"{text}, such as {listed}; look at them for blur, motion or a bent target")
     else:
-        yield Verdict(level="good", text=f"all pictures fit alike (median {median:.3f} px rms)")
+        yield Verdict(level="good", text=f"{text}{', such as ' if odd else ''}{listed}")
     outliers, points = (sum(getattr(p, n) for p in judged.pictures) for n in ("outliers", "points"))
     yield from _outlier_verdicts(outliers, points, "points")
     for name, camera in judged.cameras.items():
@@ -379,12 +346,10 @@ def _target_verdicts(judged: Judgement) -> Iterator[Verdict]:
 
 def _length_verdicts(judged: Judgement) -> Iterator[Verdict]:
     for lengths, which in ((judged.held_lengths, "held-out"), (judged.lengths, "used")):
-        if lengths is None:
+        scale, sigma = (np.nan, np.nan) if lengths is None else lengths.scale_ppm()
+        if lengths is None or not np.isfinite(scale):
             continue
-        scale, sigma = lengths.scale_ppm()
         found, expected = lengths.rms_m(long=True)
-        if not (np.isfinite(scale) and np.isfinite(found)):
-            continue
         off = abs(scale) > _SIGMAS * sigma or found > _HELD_OUT_LIMITS[0] ** 2 * expected
         yield Verdict(
             level="look" if off else "good",

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.frames import Array
@@ -35,7 +36,7 @@ CORNERS = {
     for side, x in (("left", -1), ("right", 1))
 }
 """Directions from the centre to the corners of a frame."""
-_CELLS = np.array([10, 8])
+_CELLS = (10, 8)
 """Columns and rows of a frame in which points are counted."""
 _MIN_POINTS = 12
 """Fewest points of a view: 8 unknowns of a homography against 24 coordinates."""
@@ -179,15 +180,11 @@ def profile(
         sigma_px: (N,) expected standard deviation of one coordinate of each.
         largest: end of the last bin.
     """
-    edges = np.linspace(0.0, largest, PROFILE_BINS + 1)
-    bins = np.clip(np.searchsorted(edges, position, side="right") - 1, 0, PROFILE_BINS - 1)
-    count: NDArray[np.intp] = np.bincount(bins, minlength=PROFILE_BINS)
+    count, edges = np.histogram(position, PROFILE_BINS, (0.0, largest))
 
     def mean(values: Array) -> Array:
-        total = np.bincount(bins, weights=values, minlength=PROFILE_BINS)
-        few = np.full(PROFILE_BINS, np.nan)
-        means: Array = np.divide(total, count, out=few, where=count >= _MIN_IN_BIN)
-        return means
+        total = np.histogram(position, edges, weights=values)[0]
+        return np.where(count >= _MIN_IN_BIN, total / np.maximum(count, 1), np.nan)
 
     return Profile(
         edges=edges,
@@ -222,17 +219,14 @@ class Coverage:
 
 def coverage(camera: Camera, pixels: Array) -> Coverage:
     """Count pixels (N, 2) by cell of the frame, and measure how near they come to its corners."""
-    size = np.array([camera.width_px, camera.height_px])
-    cell = np.floor(pixels / size * _CELLS).astype(int)
-    inside = ((cell >= 0) & (cell < _CELLS)).all(axis=1)
-    columns, rows = _CELLS
-    counts = np.bincount(cell[inside] @ [1, columns], minlength=rows * columns)
-    off = pixels / (size / 2) - 1.0
+    size = (camera.width_px, camera.height_px)
+    counts = np.histogram2d(*pixels.T, bins=_CELLS, range=[(0, side) for side in size])[0].T
+    off = pixels / (np.array(size) / 2) - 1.0
     reach = {
         name: float(np.max((off * sign).min(axis=1), initial=0.0)) for name, sign in CORNERS.items()
     }
     return Coverage(
-        counts=counts.reshape(rows, columns),
+        counts=counts.astype(np.intp),
         empty_share=float((counts == 0).mean()),
         corner_reach=reach,
         uncovered=tuple(name for name, share in reach.items() if share < COVERED_REACH),
@@ -357,14 +351,12 @@ def homography_residuals(
         off = np.einsum("nab,nb->na", back, size * mapped + centre - seen)
         return off, (back @ (size * slopes)).reshape(-1, 8)
 
-    h = np.ravel(cv2.findHomography(plane, (seen - centre) / size)[0])[:8]
-    for _ in range(20):
-        residuals, rows = left(h)
-        step = np.linalg.lstsq(rows, -residuals.ravel(), rcond=None)[0]
-        h = h + step
-        if np.abs(step).max() < 1e-13:
-            break
-    residuals, rows = left(h)
+    start = np.ravel(cv2.findHomography(plane, (seen - centre) / size)[0])[:8]
+    found = least_squares(
+        lambda h: left(h)[0].ravel(), start, lambda h: left(h)[1],
+        method="lm", xtol=1e-14, ftol=1e-15, gtol=1e-15,
+    )  # fmt: skip
+    residuals, rows = left(found.x)
     leverage = (np.linalg.qr(rows)[0] ** 2).sum(axis=1).reshape(-1, 2).mean(axis=1)
     return residuals, 1.0 - leverage
 

@@ -24,11 +24,7 @@ from camera_calib.calibration import Calibration, TargetView, residuals_px, stac
 from camera_calib.camera import pose_jacobian
 from camera_calib.freedom import POSE, value
 from camera_calib.judge.residuals import rms_length_px, within_gate
-from camera_calib.judge.uncertainty import (
-    covariance_of,
-    rig_slopes,
-    taken_up,
-)
+from camera_calib.judge.uncertainty import covariance_of, rig_slopes, taken_up
 from camera_calib.rig import Rig
 from camera_calib.triangulate import triangulate
 

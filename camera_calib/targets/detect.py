@@ -17,20 +17,8 @@ from scipy.spatial import cKDTree
 
 from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import Array
-from camera_calib.targets.corners import (
-    ASTRAY,
-    FITTED,
-    REASONS,
-    Corners,
-    Grey,
-    fit_corners,
-)
-from camera_calib.targets.grow import (
-    board_map,
-    from_neighbours,
-    grown_chessboard,
-    spans_board,
-)
+from camera_calib.targets.corners import ASTRAY, FITTED, REASONS, Corners, Grey, fit_corners
+from camera_calib.targets.grow import board_map, from_neighbours, grown_chessboard, spans_board
 from camera_calib.targets.pattern import surroundings
 from camera_calib.targets.target import (
     TAG_BITS,

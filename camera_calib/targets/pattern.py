@@ -8,12 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.core.frames import Array
-from camera_calib.targets.target import (
-    TAG_BORDER_BITS,
-    TAG_FAMILY,
-    Target,
-    aruco_dictionary,
-)
+from camera_calib.targets.target import TAG_BORDER_BITS, TAG_FAMILY, Target, aruco_dictionary
 
 Bits = NDArray[np.bool_]
 

@@ -10,11 +10,7 @@ from numpy.typing import NDArray
 
 from alice_survey.core.errors import CalibrationError
 from camera_calib.camera import Camera, camera_from_json
-from camera_calib.fov.focus import (
-    altitude_of_apparent_m,
-    apparent_distance_m,
-    axial_pixel_m,
-)
+from camera_calib.fov.focus import altitude_of_apparent_m, apparent_distance_m, axial_pixel_m
 from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.lenses.values import LensValues

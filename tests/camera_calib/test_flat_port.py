@@ -8,11 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from alice_survey.core.errors import CalibrationError
-from camera_calib.camera import (
-    Camera,
-    camera_from_json,
-    pose_jacobian,
-)
+from camera_calib.camera import Camera, camera_from_json, pose_jacobian
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.ports.flat import FlatPort
 from tests.cameras import changed, flat_port_camera

@@ -1,15 +1,7 @@
 import numpy as np
 import pytest
 
-from camera_calib.target_shape import (
-    AS_DRAWN,
-    BOW_X,
-    BOW_Y,
-    SHEAR,
-    STRETCH,
-    TWIST,
-    usual_shape,
-)
+from camera_calib.target_shape import AS_DRAWN, BOW_X, BOW_Y, SHEAR, STRETCH, TWIST, usual_shape
 from tests.camera_calib.calibration_scenes import board
 
 

@@ -20,15 +20,7 @@ from camera_calib.calibrate.solve import (
 )
 from camera_calib.calibrate.start import locate
 from camera_calib.calibration import TargetView
-from camera_calib.freedom import (
-    Freedom,
-    Prior,
-    intrinsics,
-    of_cameras,
-    of_ports,
-    pose_names,
-    value,
-)
+from camera_calib.freedom import Freedom, Prior, intrinsics, of_cameras, of_ports, pose_names, value
 from camera_calib.ports.flat import FlatPort
 from camera_calib.rig import Rig
 from camera_calib.target_shape import usual_shape

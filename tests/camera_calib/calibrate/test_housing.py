@@ -20,13 +20,7 @@ from camera_calib.ports.flat import FlatPort
 from camera_calib.ports.values import PortValues
 from camera_calib.rig import Rig
 from camera_calib.targets.target import parse_target
-from tests.camera_calib.calibration_scenes import (
-    BOARD,
-    board_poses,
-    built_rig,
-    in_air,
-    views_of,
-)
+from tests.camera_calib.calibration_scenes import BOARD, board_poses, built_rig, in_air, views_of
 
 TRUTH = built_rig()
 TARGET = parse_target("chessboard 11x8 30mm")

@@ -6,12 +6,7 @@ import pytest
 from camera_calib.calibrate.results import calibration_text
 from camera_calib.calibrate.solve import calibrate_through_ports
 from camera_calib.targets.target import parse_target
-from tests.camera_calib.calibration_scenes import (
-    BOARD,
-    board_poses,
-    built_rig,
-    views_of,
-)
+from tests.camera_calib.calibration_scenes import BOARD, board_poses, built_rig, views_of
 
 TARGET = parse_target("chessboard 11x8 30mm")
 VERDICTS = [{"level": "look", "text": "blurred"}, {"level": "good", "text": "fine"}]

@@ -13,13 +13,7 @@ from alice_survey.core.errors import CalibrationError, ConfigError
 from camera_calib.camera import Camera
 from camera_calib.formats.rigs import led_by
 from camera_calib.fov.focus import apparent_distance_m
-from camera_calib.fov.table import (
-    MATCH_SIGMA_PX,
-    FovRow,
-    blur_table,
-    fov_table,
-    rig_fov_table,
-)
+from camera_calib.fov.table import MATCH_SIGMA_PX, FovRow, blur_table, fov_table, rig_fov_table
 from camera_calib.rig import Rig, design_rig
 from tests.cameras import changed
 from tests.oracles_camera import project_by_shortest_path
@@ -306,22 +300,3 @@ def test_any_camera_of_a_rig_has_its_row(name: str) -> None:
     )
     with pytest.raises(CalibrationError, match="no camera 'mast'"):
         led_by(rig, "mast")
-
-
-@pytest.mark.parametrize("kind", ["design", "crooked"])
-def test_overlap_is_the_share_of_random_spots_that_both_cameras_see(kind: str) -> None:
-    rig = crooked_rig() if kind == "crooked" else design_rig(PORT, WaterConfig())
-    first, second = rig.cameras["left"], rig.cameras["right"]
-    floor_z = 0.03 * first.port.axis_cam[2] + 1.0
-    rng = np.random.default_rng(7)
-    spots = np.column_stack([rng.uniform(-0.6, 0.6, (60_000, 2)), np.full(60_000, floor_z)])
-
-    def sees(camera: Camera, points: Any) -> Any:
-        pixels = camera.project(points)
-        return np.all((pixels >= 0) & (pixels <= [camera.width_px, camera.height_px]), axis=1)
-
-    ours = sees(first, spots)
-    both = ours & sees(second, rig.cam_from_rig["right"].apply(spots))
-    row = rig_fov_table(rig, [1.0], PORT)[0]
-    assert row.stereo_overlap == pytest.approx(both.sum() / ours.sum(), abs=0.006)
-    assert 0.7 < row.stereo_overlap < 0.95

@@ -7,15 +7,7 @@ import pytest
 from alice_survey.core.errors import CalibrationError
 from camera_calib.calibrate.start import locate
 from camera_calib.calibration import Calibration, TargetView
-from camera_calib.freedom import (
-    Freedom,
-    Prior,
-    intrinsics,
-    of_cameras,
-    of_ports,
-    pose_names,
-    value,
-)
+from camera_calib.freedom import Freedom, Prior, intrinsics, of_cameras, of_ports, pose_names, value
 from camera_calib.judge.validation import (
     LengthErrors,
     farthest,
