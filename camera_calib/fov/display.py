@@ -153,8 +153,7 @@ def validation_rows(validation: PaperValidation) -> list[dict[str, str]]:
         for c in validation.claims
     ]  # fmt: skip
     found = [
-        ("pass" if c.passed else "FAIL", f"{c.computed:.4f} {c.unit}")
-        for c in (*validation.table, *validation.claims)
+        ("pass" if c.passed else "FAIL", f"{c.computed:.4f} {c.unit}") for c in validation.checks
     ]
     return [
         dict(zip(_CLAIMS, (claim, *result, *rest), strict=True))

@@ -141,10 +141,14 @@ class PaperValidation:
     """Errors up to and beyond 70 degrees."""
 
     @property
+    def checks(self) -> tuple[PaperCheck | PaperClaim, ...]:
+        """The table's values, then the claims."""
+        return *self.table, *self.claims
+
+    @property
     def passed(self) -> bool:
         """Every check and every claim holds."""
-        checks: tuple[PaperCheck | PaperClaim, ...] = (*self.table, *self.claims)
-        return all(check.passed for check in checks)
+        return all(check.passed for check in self.checks)
 
     def to_json(self) -> dict[str, Any]:
         """Everything as JSON values."""

@@ -220,7 +220,7 @@ class Coverage:
 def coverage(camera: Camera, pixels: Array) -> Coverage:
     """Count pixels (N, 2) by cell of the frame, and measure how near they come to its corners."""
     size = (camera.width_px, camera.height_px)
-    counts = np.histogram2d(*pixels.T, bins=_CELLS, range=[(0, side) for side in size])[0].T
+    counts = np.histogramdd(pixels, _CELLS, [(0.0, float(side)) for side in size])[0].T
     off = pixels / (np.array(size) / 2) - 1.0
     reach = {
         name: float(np.max((off * sign).min(axis=1), initial=0.0)) for name, sign in CORNERS.items()
@@ -345,20 +345,20 @@ def homography_residuals(
     plane = _plane_coordinates(target_points)
     centre, size = seen.mean(axis=0), np.abs(seen - seen.mean(axis=0)).max()
 
-    def left(h: Array) -> tuple[Array, Array]:
-        """Residuals (N, 2) and their slopes by h, (2 N, 8)."""
-        mapped, slopes = _map(h, plane)
-        off = np.einsum("nab,nb->na", back, size * mapped + centre - seen)
-        return off, (back @ (size * slopes)).reshape(-1, 8)
+    def misfit(h: Array) -> Array:
+        """(2 N,) residuals."""
+        off: Array = np.einsum("nab,nb->na", back, size * _map(h, plane)[0] + centre - seen)
+        return off.ravel()
+
+    def slopes(h: Array) -> Array:
+        """(2 N, 8) of the residuals by h."""
+        by_h: Array = back @ (size * _map(h, plane)[1])
+        return by_h.reshape(-1, 8)
 
     start = np.ravel(cv2.findHomography(plane, (seen - centre) / size)[0])[:8]
-    found = least_squares(
-        lambda h: left(h)[0].ravel(), start, lambda h: left(h)[1],
-        method="lm", xtol=1e-14, ftol=1e-15, gtol=1e-15,
-    )  # fmt: skip
-    residuals, rows = left(found.x)
-    leverage = (np.linalg.qr(rows)[0] ** 2).sum(axis=1).reshape(-1, 2).mean(axis=1)
-    return residuals, 1.0 - leverage
+    found = least_squares(misfit, start, slopes, method="lm", xtol=1e-14, ftol=1e-15, gtol=1e-15)
+    leverage = (np.linalg.qr(slopes(found.x))[0] ** 2).sum(axis=1).reshape(-1, 2).mean(axis=1)
+    return found.fun.reshape(-1, 2), 1.0 - leverage
 
 
 def _plane_coordinates(points: Array) -> Array:

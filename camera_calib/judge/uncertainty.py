@@ -391,7 +391,8 @@ def parameter_table(parameters: Collection[Parameter]) -> str:
 
 def _in_reader_unit(name: str, number: float, sigma: float | None) -> dict[str, Any]:
     """Value, sigma and unit: mm and degrees, not m, radians and sines of tilts."""
-    factor, unit = next((known for end, *known in _READER_UNITS if name.endswith(end)), (1.0, ""))
+    units = ((factor, unit) for ending, factor, unit in _READER_UNITS if name.endswith(ending))
+    factor, unit = next(units, (1.0, ""))
     shown = number * factor
     if name.endswith(("normal_x", "normal_y")):
         factor, unit = math.degrees(1.0) / math.sqrt(1.0 - number * number), "deg"
