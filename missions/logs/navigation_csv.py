@@ -4,6 +4,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, tzinfo
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
@@ -203,18 +205,14 @@ def read_navigation(
 
 def _by_ranges(faults: Sequence[tuple[int, str]]) -> list[str]:
     """Faults by line, in order: one text for lines that follow one another with the same fault."""
-    ranges: list[tuple[int, int, str]] = []
-    latest: dict[str, int] = {}
-    for line, fault in faults:
-        index = latest.get(fault)
-        if index is not None and ranges[index][1] == line - 1:
-            ranges[index] = (ranges[index][0], line, fault)
-        else:
-            latest[fault] = len(ranges)
-            ranges.append((line, line, fault))
+    ranges = []
+    ordered = enumerate(sorted(faults, key=itemgetter(1, 0)))
+    for (fault, _), run in groupby(ordered, lambda item: (item[1][1], item[1][0] - item[0])):
+        lines = [line for _, (line, _) in run]
+        ranges.append((lines[0], lines[-1], fault))
     return [
         f"line {first}: {fault}" if first == last else f"lines {first} to {last}: {fault}"
-        for first, last, fault in ranges
+        for first, last, fault in sorted(ranges)
     ]
 
 
