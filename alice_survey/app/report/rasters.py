@@ -1,9 +1,14 @@
-"""Rasters of a survey on a map: their colours, the same wherever shown, and pyramids for a page.
+"""Rasters of a survey on a map: their colours and pyramids, the same in the report and the studio.
 
-In a page each is read once, shrunk to what the page can carry.
+Level 0 of a pyramid is the finest: each further one has half the columns and rows, rounded up, or
+those of the overview in the file, as of a cloud-optimised GeoTIFF. Where there is none, GDAL
+averages what is known below a pixel. A report holds all tiles, of a finest level that is shrunk to
+what a page can carry.
 """
 
+import math
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,6 +41,12 @@ _SAMPLED = 2_000_000
 _THINNED = 4
 """Step between the rows and columns of a block that a larger raster's limits are taken from."""
 _WINDOW_PX = 256
+MAP_RASTERS = (MOSAIC, *(one for one in RASTERS if one.palette))
+"""In the order in which a page shows them."""
+_GDAL = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_CACHEMAX": 32 << 20}
+"""GDAL options: no sidecar file of a raster is read, and the cache is small."""
+_OPAQUE = 128
+"""Mean opacity, of 255, from which a pixel is shown."""
 _COLOURS = 9
 """Colours of a scale in a legend."""
 _QUALITY = 82
@@ -57,14 +68,17 @@ class Numbers:
         return np.where(level > 0, level, np.nan) if self.raster.limits == "counts" else level
 
 
-def number_rasters(unit: str) -> tuple[Numbers, ...]:
-    """The rasters of numbers that are layers of a map.
+def numbers_of(raster: Raster, unit: str) -> Numbers | None:
+    """How a raster is coloured; None of the mosaic, which has its own colours.
 
     Args:
+        raster: of a map.
         unit: unit of a workspace's lengths.
     """
-    layers = [(one, *one.shown_unit(unit)) for one in RASTERS if one.palette]
-    return tuple(Numbers(raster=one, factor=factor, unit=unit) for one, factor, unit in layers)
+    if not raster.palette:
+        return None
+    factor, shown = raster.shown_unit(unit)
+    return Numbers(raster=raster, factor=factor, unit=shown)
 
 
 _LIMITS: Mapping[str, Callable[[Array], tuple[float, float]]] = {
@@ -182,66 +196,175 @@ def encode_webp(tile: Rgba) -> bytes:
     return data
 
 
+@dataclass(frozen=True, kw_only=True)
+class Level:
+    """Size of a level, which covers the whole raster."""
+
+    columns: int
+    rows: int
+    east: float
+    """Width of a pixel, in the raster's unit."""
+    north: float
+    """Height of a pixel."""
+
+    @property
+    def tiles(self) -> tuple[int, int]:
+        """Columns and rows of tiles."""
+        return math.ceil(self.columns / TILE_PX), math.ceil(self.rows / TILE_PX)
+
+
+class Pyramid:
+    """All levels of one raster in its colours."""
+
+    def __init__(self, path: Path, numbers: Numbers | None, max_px: float = math.inf) -> None:
+        """Open a raster.
+
+        Args:
+            path: path of the file.
+            numbers: its colouring; None for a mosaic, which has its own colours.
+            max_px: about the most pixels of the finest level.
+
+        Raises:
+            rasterio.errors.RasterioError: it cannot be read.
+        """
+        self._path, self.numbers = path, numbers
+        with self._open() as raster:
+            self.west, self.north = raster.transform.c, raster.transform.f
+            self._full = raster.width, raster.height
+            wide, high = (side * raster.transform.a for side in self._full)
+            self.limits = None if numbers is None else limits_of(raster, numbers)
+            shrink = max(1.0, math.sqrt(raster.width * raster.height / max_px))
+            sizes = [(_shrink(raster.width, shrink), _shrink(raster.height, shrink))]
+            factors = raster.overviews(1) if sizes == [self._full] else []
+        while max(sizes[-1]) > TILE_PX:
+            if 2 ** len(sizes) in factors:
+                with self._open(overview_level=factors.index(2 ** len(sizes))) as raster:
+                    sizes.append((raster.width, raster.height))
+            else:
+                sizes.append((-(-sizes[-1][0] // 2), -(-sizes[-1][1] // 2)))
+        self.levels = [
+            Level(columns=columns, rows=rows, east=wide / columns, north=high / rows)
+            for columns, rows in sizes
+        ]
+
+    @contextmanager
+    def _open(self, **options: int) -> Iterator[Any]:
+        with (
+            rasterio.Env(**_GDAL),
+            rasterio.open(self._path, driver="GTiff", sharing=False, **options) as raster,
+        ):
+            yield raster
+
+    def tile(self, level: int, x: int, y: int) -> Rgba:
+        """Pixels of a tile of a level.
+
+        Raises:
+            FileNotFoundError: there is no such tile.
+            rasterio.errors.RasterioError: the file is damaged.
+        """
+        if not 0 <= level < len(self.levels):
+            raise FileNotFoundError(f"level {level}")
+        size = self.levels[level]
+        columns, rows = size.tiles
+        if not (0 <= x < columns and 0 <= y < rows):
+            raise FileNotFoundError(f"tile {x}, {y}")
+        left, top = x * TILE_PX, y * TILE_PX
+        right, bottom = min(left + TILE_PX, size.columns), min(top + TILE_PX, size.rows)
+        if self.numbers is None or self.limits is None:
+            return self._paint(size, left, top, right, bottom)
+        # One pixel more on each side, so that the shade has no seams.
+        west, north = min(left, 1), min(top, 1)
+        east, south = min(size.columns - right, 1), min(size.rows - bottom, 1)
+        values = self.values(size, left - west, top - north, right + east, bottom + south)
+        whole = colour_tile(self.numbers.levels(values), self.numbers, self.limits, size.east)
+        return whole[north : whole.shape[0] - south, west : whole.shape[1] - east]
+
+    def values(self, size: Level, left: int, top: int, right: int, bottom: int) -> Array:
+        """Means of known numbers of a part of a level; NaN where none is known."""
+        window, shape = self._window(size, left, top, right, bottom)
+        with self._open() as raster:
+            read = raster.read(
+                1, window=window, out_shape=shape, out_dtype="float32", masked=True,
+                resampling=Resampling.average,
+            )  # fmt: skip
+        values: Array = read.filled(np.nan)
+        return values
+
+    def _paint(self, size: Level, left: int, top: int, right: int, bottom: int) -> Rgba:
+        window, shape = self._window(size, left, top, right, bottom)
+        options = {"window": window, "resampling": Resampling.average}
+        with self._open() as raster:
+            bands = raster.read([1, 2, 3], out_shape=(3, *shape), **options)
+            opacity = raster.dataset_mask(out_shape=shape, **options)
+        picture: Rgba = np.dstack([*bands, np.where(opacity < _OPAQUE, 0, 255)]).astype(np.uint8)
+        return picture
+
+    def _window(
+        self, size: Level, left: int, top: int, right: int, bottom: int
+    ) -> tuple[Window, tuple[int, int]]:
+        """Part of the full raster, and the shape it is read in."""
+        wide, high = self._full[0] / size.columns, self._full[1] / size.rows
+        window = Window(left * wide, top * high, (right - left) * wide, (bottom - top) * high)
+        return window, (bottom - top, right - left)
+
+    def layer(self, raster: Raster, *, shown: bool, **tiles: Any) -> PictureLayer:
+        """The layer of a map.
+
+        Args:
+            raster: what it shows.
+            shown: whether it is shown at first.
+            tiles: its `tiles`, or the `address` that they are requested from.
+        """
+        full = self.levels[0]
+        numbers, limits = self.numbers, self.limits
+        return PictureLayer(
+            name=raster.name, title=raster.title, about=raster.about,
+            west_m=self.west, north_m=self.north, pixel_m=full.east,
+            width_px=full.columns, height_px=full.rows, tile_px=TILE_PX,
+            levels=len(self.levels), shown=shown,
+            scale=None if numbers is None or limits is None else scale_of(numbers, limits),
+            sizes=[(s.columns, s.rows, s.east, s.north) for s in self.levels],
+            **{"tiles": {}, **tiles},
+        )  # fmt: skip
+
+    def all_tiles(self) -> dict[str, bytes]:
+        """Tiles that show anything, as WebP by "k/x/y"; k = 0 is the coarsest."""
+        found: dict[str, bytes] = {}
+        for level, size in enumerate(reversed(self.levels)):
+            for x, y in np.ndindex(size.tiles):
+                tile = self.tile(len(self.levels) - 1 - level, x, y)
+                if tile[..., 3].any():
+                    found[f"{level}/{x}/{y}"] = encode_webp(tile)
+        return found
+
+
+def _shrink(side: int, factor: float) -> int:
+    return max(1, round(side / factor))
+
+
 def picture_layers(held: Held) -> Iterator[PictureLayer]:
     """The mosaic and all rasters of numbers that a workspace holds."""
-    mosaic = held.file(MOSAIC.file)
-    if mosaic is not None:
-        yield mosaic_layer(mosaic)
-    first = mosaic is None
-    for numbers in number_rasters(held.unit):
-        file = held.file(numbers.raster.file)
-        if file is not None and is_of_surface(held.workspace, numbers.raster):
-            yield _number_layer(file, numbers, shown=first)
-            first = False
+    shown = True
+    for raster in MAP_RASTERS:
+        file = held.file(raster.file)
+        if file is not None and is_of_surface(held.workspace, raster):
+            yield page_layer(file, raster, held.unit, shown=shown)
+            shown = False
 
 
-def mosaic_layer(path: Path, max_px: int = _MAX_PAINTED_PX) -> PictureLayer:
-    """The mosaic; what no picture saw is transparent."""
-    bands, opacity, transform = read_shrunk(path, [1, 2, 3], max_px)
-    picture = np.dstack([*np.ma.getdata(bands), np.where(opacity > 0, 255, 0)]).astype(np.uint8)
-    return _layer(picture, transform, MOSAIC, shown=True)
-
-
-def _number_layer(path: Path, numbers: Numbers, *, shown: bool) -> PictureLayer:
-    with rasterio.open(path) as opened:
-        limits = limits_of(opened, numbers)
-    (values,), _, transform = read_shrunk(path, [1], _MAX_COLOURED_PX)
-    level = numbers.levels(values.astype(np.float64).filled(np.nan))
-    picture = colour_tile(level, numbers, limits, transform.a)
-    scale = scale_of(numbers, limits)
-    return _layer(picture, transform, numbers.raster, shown=shown, scale=scale)
-
-
-def _layer(
-    picture: Rgba, transform: Affine, raster: Raster, *, shown: bool, scale: Scale | None = None
+def page_layer(
+    path: Path, raster: Raster, unit: str, *, shown: bool, max_px: float | None = None
 ) -> PictureLayer:
-    """Cut an RGBA picture into tiles of all levels."""
-    height, width = picture.shape[:2]
-    levels = 1 + (-(-max(height, width) // TILE_PX) - 1).bit_length()
-    tiles: dict[str, bytes] = {}
-    for level in reversed(range(levels)):
-        for y in range(0, picture.shape[0], TILE_PX):
-            for x in range(0, picture.shape[1], TILE_PX):
-                tile = picture[y : y + TILE_PX, x : x + TILE_PX]
-                if tile[..., 3].any():
-                    tiles[f"{level}/{x // TILE_PX}/{y // TILE_PX}"] = encode_webp(tile)
-        picture = _halve(picture)
-    return PictureLayer(
-        name=raster.name, title=raster.title, about=raster.about,
-        west_m=transform.c, north_m=transform.f, pixel_m=transform.a,
-        width_px=width, height_px=height, tile_px=TILE_PX, levels=levels, tiles=tiles,
-        scale=scale, shown=shown,
-    )  # fmt: skip
+    """A raster with all its tiles.
 
-
-def _halve(picture: Rgba) -> Rgba:
-    """Half the size, rounded up; transparent pixels add no colour to their neighbours."""
-    height, width = picture.shape[:2]
-    padded = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0))).astype(np.uint32)
-    blocks = padded.reshape(padded.shape[0] // 2, 2, padded.shape[1] // 2, 2, 4)
-    cover = blocks[..., 3].sum(axis=(1, 3))
-    colour = (blocks[..., :3] * blocks[..., 3:]).sum(axis=(1, 3))
-    half = np.zeros((*cover.shape, 4), np.uint8)
-    half[..., :3] = colour // np.maximum(cover, 1)[..., None]
-    half[..., 3] = np.where(cover >= 510, 255, 0)
-    return half
+    Args:
+        path: its file.
+        raster: what it is.
+        unit: unit of a workspace's lengths.
+        shown: whether it is shown at first.
+        max_px: about the most pixels; what a page can carry if not given.
+    """
+    numbers = numbers_of(raster, unit)
+    carried_px = _MAX_PAINTED_PX if numbers is None else _MAX_COLOURED_PX
+    pyramid = Pyramid(path, numbers, max_px or carried_px)
+    return pyramid.layer(raster, shown=shown, tiles=pyramid.all_tiles())

@@ -8,9 +8,10 @@ import rasterio
 from affine import Affine
 
 from alice_survey.app.report.held import Held
-from alice_survey.app.report.rasters import mosaic_layer, picture_layers, read_shrunk
+from alice_survey.app.report.rasters import page_layer, picture_layers, read_shrunk
 from alice_survey.app.studio.files import Workspace
 from alice_survey.app.studio.layers import Layers
+from alice_survey.core.products import MOSAIC
 from alice_survey.kit.document import PictureLayer
 from reconstruct.measure.surface import values_at
 from tests.alice_survey.app.report.tiny import COLUMNS, ROWS, tiny_workspace
@@ -19,6 +20,11 @@ from tests.alice_survey.app.report.tiny import COLUMNS, ROWS, tiny_workspace
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tiny_workspace(tmp_path_factory.mktemp("tiny"))
+
+
+def mosaic_layer(workspace: Path, max_px: float | None = None) -> PictureLayer:
+    path = workspace / MOSAIC.path
+    return page_layer(path, MOSAIC, "m", shown=True, max_px=max_px)
 
 
 def put_together(layer: PictureLayer, level: int) -> np.ndarray:
@@ -39,7 +45,7 @@ def put_together(layer: PictureLayer, level: int) -> np.ndarray:
 
 
 def test_the_mosaics_tiles_make_the_mosaic(workspace: Path) -> None:
-    layer = mosaic_layer(workspace / "mosaic" / "mosaic.tif")
+    layer = mosaic_layer(workspace)
     assert (layer.width_px, layer.height_px, layer.levels) == (400, 600, 2)
     assert (layer.west_m, layer.north_m, layer.pixel_m) == (0.0, pytest.approx(1.2), 0.002)
     sheet = put_together(layer, 1)
@@ -53,7 +59,7 @@ def test_the_mosaics_tiles_make_the_mosaic(workspace: Path) -> None:
 
 
 def test_a_coarser_level_is_the_mean_of_the_finer(workspace: Path) -> None:
-    layer = mosaic_layer(workspace / "mosaic" / "mosaic.tif")
+    layer = mosaic_layer(workspace)
     fine, coarse = put_together(layer, 1).astype(float), put_together(layer, 0).astype(float)
     mean = fine.reshape(300, 2, 200, 2, 4).mean(axis=(1, 3))
     inner = mean[..., 3] == 255
@@ -62,7 +68,7 @@ def test_a_coarser_level_is_the_mean_of_the_finer(workspace: Path) -> None:
 
 
 def test_a_mosaic_too_large_is_shrunk(workspace: Path) -> None:
-    layer = mosaic_layer(workspace / "mosaic" / "mosaic.tif", max_px=60_000)
+    layer = mosaic_layer(workspace, max_px=60_000)
     assert layer.width_px * layer.height_px <= 61_000
     assert layer.pixel_m * layer.width_px == pytest.approx(0.8)
 

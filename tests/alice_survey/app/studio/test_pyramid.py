@@ -10,15 +10,22 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.transform import Affine
 
-from alice_survey.app.report.rasters import TILE_PX, colour_tile, limits_of, number_rasters
+from alice_survey.app.report.rasters import (
+    MAP_RASTERS,
+    TILE_PX,
+    Pyramid,
+    colour_tile,
+    limits_of,
+    numbers_of,
+)
 from alice_survey.app.studio.files import Workspace
-from alice_survey.app.studio.layers import Layers, Pyramid
+from alice_survey.app.studio.layers import Layers
 from alice_survey.core.artefacts import StaleError
 from tests.alice_survey.app.report.tiny import tiny_workspace
 
 ROWS, COLUMNS = 1302, 1110
 """No multiples of a tile or of a pixel of the third level."""
-NUMBERS = {numbers.raster.name: numbers for numbers in number_rasters("m")}
+NUMBERS = {one.name: numbers for one in MAP_RASTERS if (numbers := numbers_of(one, "m"))}
 Array = NDArray[Any]
 
 
