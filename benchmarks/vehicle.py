@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 
 from alice_survey.core.config import SurveyConfig, change_section
-from alice_survey.sim.vehicle.pilot.memory import DONE, PHASE, REASON
-from alice_survey.sim.vehicle.pilot.safety import NONE
+from alice_survey.sim.vehicle.pilot.memory import DONE, NONE, PHASE, REASON
 from alice_survey.sim.vehicle.sea import FloorGrid, level_floor
 from alice_survey.sim.vehicle.simulator import Setup, simulate
 from benchmarks import vehicle_seas

@@ -24,13 +24,12 @@ from alice_survey.core.errors import ConfigError, VehicleError
 from alice_survey.core.executor import Executor, local_executor
 from alice_survey.core.frames import Array
 from alice_survey.kit.words import text_table
-from alice_survey.sim.vehicle.files import vehicle_to_fly
 from alice_survey.sim.vehicle.pilot.gains import gains_for
 from alice_survey.sim.vehicle.pilot.memory import FOLLOW, PHASE
 from alice_survey.sim.vehicle.pilot.settings import pilot_guidance
 from alice_survey.sim.vehicle.sea import level_floor
 from alice_survey.sim.vehicle.simulator import Flown, Setup, simulate
-from alice_survey.sim.vehicle.vehicle import Vehicle
+from alice_survey.sim.vehicle.vehicle import Vehicle, vehicle_to_fly
 from camera_calib.rig import design_rig
 from missions.fly.run import true_velocity
 from missions.fly.simulation import (

@@ -50,15 +50,17 @@ from camera_calib.rig import Rig, design_rig
 from missions.coverage.certificate import certificate
 from missions.coverage.drawing import draw_polygons
 from missions.coverage.stations import plan_pattern, stations_of_flight
-from missions.fly.flight_route import one_dive, stations_of_dives, whole_route
 from missions.fly.simulation import (
     FlightSettings,
     flight_noise,
     mission_of_settings,
     mission_summary,
+    one_dive,
     simulate_mission,
     simulate_plan,
+    stations_of_dives,
     true_floor,
+    whole_route,
 )
 from missions.logs.ros_builder import BagRecord, write_bag
 from missions.values.flight import Flight, rms

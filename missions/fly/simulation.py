@@ -1,14 +1,19 @@
-"""A plan, or the mission file written from one, flown by the simulated vehicle over a sea floor."""
+"""A plan, or the mission file written from one, flown by the simulated vehicle over a sea floor.
+
+The part of a plan that is flown: all its dives in one go, or one of them.
+"""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
+import shapely
 from scipy.spatial.transform import RigidTransform, Rotation
+from shapely.geometry import LineString, Point
 
 from alice_survey.core.config import (
     AreaConfig,
@@ -37,7 +42,18 @@ from alice_survey.sim.vehicle.navigation.tick import LOG_COLUMNS
 from alice_survey.sim.vehicle.pilot import mission as pilot
 from alice_survey.sim.vehicle.pilot.command import Piloting
 from alice_survey.sim.vehicle.pilot.gains import Gains, gains_for, pitch_divergence_speed_mps
-from alice_survey.sim.vehicle.pilot.memory import ALONG, DONE, FOLLOW, LEG, LINE, PHASE, REASON
+from alice_survey.sim.vehicle.pilot.memory import (
+    ALONG,
+    DONE,
+    FOLLOW,
+    LEG,
+    LINE,
+    NONE,
+    PHASE,
+    REASON,
+    REASONS,
+    SafetyLimits,
+)
 from alice_survey.sim.vehicle.pilot.mission import (
     MIN_SPEED_MPS,
     NO_LAW,
@@ -45,7 +61,8 @@ from alice_survey.sim.vehicle.pilot.mission import (
     ArduSubSettings,
     PilotMission,
 )
-from alice_survey.sim.vehicle.pilot.safety import NONE, REASONS, SafetyLimits
+from alice_survey.sim.vehicle.pilot.path import Path as PilotPath
+from alice_survey.sim.vehicle.pilot.path import path_from_legs
 from alice_survey.sim.vehicle.pilot.settings import (
     Guidance,
     pilot_guidance,
@@ -70,9 +87,9 @@ from missions.exports.advice import cola2_settings
 from missions.exports.follower import cola2_delta_m, sways
 from missions.exports.geometry import CameraMount
 from missions.exports.registry import read_mission
-from missions.fly.flight_route import one_dive, path_of, room_behind_m, roomier_side, turns_in_place
 from missions.route.energy import sound_vehicle
 from missions.values.flight import Flight, trigger_times
+from missions.values.legs import Leg, Route
 from missions.values.mission import Mission
 from missions.values.navigation import BelievedNavigation
 from missions.values.plan_file import Plan
@@ -771,3 +788,140 @@ def mission_summary(known: MissionOfPlan, flight: Flight, rig: Rig) -> dict[str,
             "share_at_overlap": promised.share_at_overlap,
         },
     }
+
+
+_SAME_RAD = 1e-6
+_TOUCH_M = 1e-6
+_SAME_HOME_M = 0.01
+
+
+def one_dive(plan: Plan, dive: int | None) -> Plan:
+    """The plan with one of its dives alone; all lines keep their index.
+
+    Args:
+        plan: a survey.
+        dive: which, from 1 on; None leaves all of them.
+
+    Raises:
+        PlanError: the plan lacks that dive.
+    """
+    if dive is None:
+        return plan
+    count = len(plan.dives)
+    if not 1 <= dive <= count:
+        held = "1 dive" if count == 1 else f"dives 1 to {count}"
+        raise PlanError(f"dive {dive} was requested; the plan has {held}: choose one of these")
+    chosen = plan.dives[dive - 1]
+    return replace(
+        plan,
+        dives=(chosen,),
+        length_m=chosen.route.length_m,
+        duration_s=chosen.duration_s,
+        energy_wh=chosen.energy_wh,
+    )
+
+
+def stations_of_dives(plan: Plan) -> int:
+    """How many times all cameras take a picture on the plan's dives."""
+    return sum(
+        line.stations
+        for dive in plan.dives
+        for line in plan.lines[dive.first_line : dive.last_line + 1]
+    )
+
+
+def whole_route(plan: Plan) -> Route:
+    """The routes of all dives, one after the other: at home the vehicle turns for the next.
+
+    Raises:
+        PlanError: a dive begins elsewhere than the one before has ended.
+    """
+    return Route(legs=tuple(_join_dives(plan)))
+
+
+def _join_dives(plan: Plan) -> Iterator[Leg]:
+    last: Leg | None = None
+    for dive in plan.dives:
+        first = dive.route.legs[0]
+        if last is not None:
+            away_m = math.dist(last.end_ne_m, first.start_ne_m)
+            if away_m > _SAME_HOME_M:
+                raise PlanError(
+                    f"a dive begins {away_m:.1f} m from where the one before ends, in another part "
+                    f"of the area: fly them one by one: vehicle.dive = 1 to {len(plan.dives)}"
+                )
+            heading = last.end_heading_rad + last.side_rad
+            turn = math.remainder(first.heading_rad + first.side_rad - heading, 2 * math.pi)
+            if abs(turn) > _SAME_RAD:
+                yield Leg(
+                    start_ne_m=last.end_ne_m,
+                    heading_rad=heading,
+                    length_m=0.0,
+                    curvature_per_m=0.0,
+                    line=-1,
+                    turn_rad=turn,
+                )
+        yield from dive.route.legs
+        last = dive.route.legs[-1]
+
+
+def path_of(plan: Plan) -> PilotPath:
+    """The route of a plan for the pilot."""
+    legs = whole_route(plan).legs
+    return path_from_legs(
+        [leg.start_ne_m for leg in legs],
+        [leg.heading_rad for leg in legs],
+        [leg.length_m for leg in legs],
+        [leg.curvature_per_m for leg in legs],
+        [leg.line for leg in legs],
+        plan.altitude_m,
+        plan.speed_mps,
+        turn_rad=[leg.turn_rad for leg in legs],
+        side_rad=[leg.side_rad for leg in legs],
+    )
+
+
+def turns_in_place(path: PilotPath) -> int:
+    """How many there are."""
+    return int(np.count_nonzero(path.turn_rad))
+
+
+def room_behind_m(plan: Plan, path: PilotPath, max_m: float) -> float:
+    """How far the vehicle may go back from the path's start, to come in straight.
+
+    Args:
+        plan: whose allowed area counts.
+        path: its first leg's course.
+        max_m: the most that is of use.
+    """
+    start = np.array([path.start_n[0], path.start_e[0]])
+    course = float(path.heading_rad[0])
+    end = start - max_m * np.array([math.cos(course), math.sin(course)])
+    inside = LineString([start, end]).intersection(plan.area.allowed.buffer(_TOUCH_M))
+    parts = [part for part in shapely.get_parts(inside) if part.distance(Point(start)) <= _TOUCH_M]
+    return min(max_m, max((float(part.length) for part in parts), default=0.0))
+
+
+def roomier_side(
+    plan: Plan, path: PilotPath, way_in_m: float, radius_m: float
+) -> tuple[float, float]:
+    """On which side of the way in a circle lies more inside the allowed area, +1 to starboard.
+
+    Args:
+        plan: whose allowed area counts.
+        path: its first leg's course.
+        way_in_m: length of the way in, at whose start the circle touches it.
+        radius_m: of the circle.
+
+    Returns:
+        The side, and the share of the circle that lies outside.
+    """
+    course = float(path.heading_rad[0])
+    ahead = np.array([math.cos(course), math.sin(course)])
+    touches = np.array([path.start_n[0], path.start_e[0]]) - way_in_m * ahead
+    starboard = np.array([-ahead[1], ahead[0]])
+    outside = []
+    for side in (1.0, -1.0):
+        circle = Point(touches + side * radius_m * starboard).buffer(radius_m)
+        outside.append(float(circle.difference(plan.area.allowed).area / circle.area))
+    return (1.0 if outside[0] <= outside[1] else -1.0), min(outside)

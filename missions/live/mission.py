@@ -34,14 +34,12 @@ from alice_survey.core.frames import Array, attitude_from_rotation, rotation_fro
 from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.navigation.sensors import DvlSpec
 from alice_survey.sim.vehicle.pilot import memory as slot
-from alice_survey.sim.vehicle.pilot.command import Pilot
-from alice_survey.sim.vehicle.pilot.failures import WATCHED_S, FoundFailure
-from alice_survey.sim.vehicle.pilot.safety import NONE, REASONS
+from alice_survey.sim.vehicle.pilot.command import WATCHED_S, FoundFailure, Pilot
+from alice_survey.sim.vehicle.pilot.memory import NONE, REASONS
 from alice_survey.sim.vehicle.rotations import wrap_angle
 from alice_survey.sim.vehicle.simulator import TICK_S
 from alice_survey.sim.vehicle.vehicle import Vehicle
-from missions.fly.flight_route import one_dive
-from missions.fly.simulation import FlightSettings, max_mission_s, piloting_of
+from missions.fly.simulation import FlightSettings, max_mission_s, one_dive, piloting_of
 from missions.values.plan_file import Plan, read_plan
 
 FIRST_S, SILENCE_S = 600.0, 60.0

@@ -33,7 +33,6 @@ from numpy.typing import NDArray
 from alice_survey.core.config import PlanConfig, SeaConfig, VehicleConfig
 from alice_survey.core.errors import PlanError, VehicleError
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.files import coefficients_from_file, vehicle_to_fly
 from alice_survey.sim.vehicle.pilot.gains import STEADY_SHARE
 from alice_survey.sim.vehicle.pilot.settings import (
     MAX_PITCH_RAD,
@@ -41,7 +40,7 @@ from alice_survey.sim.vehicle.pilot.settings import (
     turn_in_place_rate_rad_s,
 )
 from alice_survey.sim.vehicle.steady import fin_flight, min_radius_m, steady_flight
-from alice_survey.sim.vehicle.vehicle import Vehicle
+from alice_survey.sim.vehicle.vehicle import Vehicle, coefficients_from_file, vehicle_to_fly
 from missions.values.costs import SETTLE_S, Costs
 
 Manner = Literal["held", "crab"]

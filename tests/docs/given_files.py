@@ -18,8 +18,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from alice_survey.core.config import CameraConfig, WaterConfig
 from alice_survey.core.frames import Array, Datum, rotation_from_attitude
-from alice_survey.sim.vehicle.files import vehicle_from_file
 from alice_survey.sim.vehicle.log import write_vehicle_log
+from alice_survey.sim.vehicle.vehicle import vehicle_from_file
 from camera_calib.camera import Camera
 from camera_calib.rig import Rig, design_rig, write_rig
 from camera_calib.targets.pattern import black_rectangles

@@ -248,7 +248,7 @@ def read_foreign(path: Path) -> object:
 
 
 def read_vehicle(path: Path) -> object:
-    from alice_survey.sim.vehicle.files import speeds_missing, vehicle_from_file
+    from alice_survey.sim.vehicle.vehicle import speeds_missing, vehicle_from_file
 
     return vehicle_from_file(path), speeds_missing(path)
 
@@ -272,7 +272,7 @@ def _coefficients() -> list[str]:
 
 
 def read_coefficients(path: Path) -> object:
-    from alice_survey.sim.vehicle.files import coefficients_from_file
+    from alice_survey.sim.vehicle.vehicle import coefficients_from_file
 
     return coefficients_from_file(path)
 

@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.core.config import SurveyConfig, parse_config
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.files import vehicle_from
-from alice_survey.sim.vehicle.pilot.safety import REASONS, TOO_LOW
+from alice_survey.sim.vehicle.pilot.memory import REASONS, TOO_LOW
 from alice_survey.sim.vehicle.sea import FloorGrid, floor_depth
+from alice_survey.sim.vehicle.vehicle import vehicle_from
 from missions.values.flight import Flight
 from missions.values.plan_file import Plan
 from tests.missions.flown_plans import flown, planned

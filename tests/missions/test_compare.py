@@ -14,7 +14,7 @@ from alice_survey.app.cli.main import app
 from alice_survey.core.config import SurveyConfig, change_section, parse_config
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.executor import SERIAL
-from alice_survey.sim.vehicle import files
+from alice_survey.sim.vehicle import vehicle as files
 from alice_survey.sim.vehicle.sea import level_floor
 from alice_survey.sim.vehicle.simulator import Flown, Setup, simulate
 from missions.fly.compare import (

@@ -16,15 +16,15 @@ from alice_survey.core.errors import PlanError, VehicleError
 from alice_survey.core.executor import SERIAL
 from alice_survey.sim.vehicle.pilot.memory import FOLLOW, LEG, PHASE
 from camera_calib.rig import design_rig
-from missions.fly.flight_route import (
+from missions.fly.run import flight_summary
+from missions.fly.simulation import (
+    max_mission_s,
     one_dive,
     path_of,
     room_behind_m,
     stations_of_dives,
     whole_route,
 )
-from missions.fly.run import flight_summary
-from missions.fly.simulation import max_mission_s
 from missions.values.flight import Flight
 from tests.missions.flown_plans import flown, plan_of, walk
 

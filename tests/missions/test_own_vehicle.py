@@ -10,8 +10,8 @@ from alice_survey.app.pipeline import plan_report
 from alice_survey.core.artefacts import read_json
 from alice_survey.core.config import SurveyConfig, load_config, parse_config
 from alice_survey.core.errors import AliceError, PlanError, VehicleError
-from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.pilot.gains import gains_for
+from alice_survey.sim.vehicle.vehicle import vehicle_from
 from missions.plan.strength import survey_costs
 from missions.route.energy import battery_wh, hotel_w, planned_vehicle
 from missions.values.flight import Flight, rms

@@ -18,7 +18,7 @@ from alice_survey.core.config import (
 )
 from alice_survey.core.errors import VehicleError
 from alice_survey.sim.vehicle.navigation.tick import LOG_COLUMNS
-from alice_survey.sim.vehicle.pilot.failures import ThrustWatch
+from alice_survey.sim.vehicle.pilot.command import ThrustWatch
 from alice_survey.sim.vehicle.sea import FloorGrid, current_at
 from camera_calib.rig import design_rig
 from missions.fly.run import flight_summary

@@ -12,8 +12,8 @@ from alice_survey.sim.vehicle.pilot.gains import STEADY_SHARE
 from alice_survey.sim.vehicle.pilot.memory import ABORT, PHASE
 from alice_survey.sim.vehicle.steady import min_radius_m, min_speed_mps
 from missions.exposure.conflict import ConflictError
-from missions.fly.flight_route import path_of, roomier_side
 from missions.fly.run import true_log
+from missions.fly.simulation import path_of, roomier_side
 from missions.route.energy import planned_vehicle
 from missions.values.flight import rms
 from tests.missions.flown_plans import flown, planned

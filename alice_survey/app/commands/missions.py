@@ -274,7 +274,7 @@ class CoefficientsCommand(ReportCommand):
 
     def run(self) -> Result:
         """Compute and compare them."""
-        from alice_survey.sim.vehicle.paper_tables import coefficients_report
+        from alice_survey.sim.vehicle.coefficients import coefficients_report
 
         return coefficients_report()
 

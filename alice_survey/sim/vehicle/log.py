@@ -24,7 +24,7 @@ from alice_survey.core.config import Config
 from alice_survey.core.contents import as_line
 from alice_survey.core.errors import VehicleError, warn
 from alice_survey.core.frames import Array, attitude_from_rotation, rotation_from_attitude
-from alice_survey.sim.vehicle.files import parse_table, read_table
+from alice_survey.sim.vehicle.vehicle import parse_table, read_table
 
 TIME = "time_s"
 POSITION = ("north_m", "east_m", "depth_m")

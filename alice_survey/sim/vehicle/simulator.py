@@ -28,11 +28,16 @@ from alice_survey.sim.vehicle.navigation.filter import NavigationState, new_navi
 from alice_survey.sim.vehicle.navigation.sensors import Sensors
 from alice_survey.sim.vehicle.navigation.tick import LOG_ROW, log_row, navigation_tick
 from alice_survey.sim.vehicle.pilot import memory as slot
-from alice_survey.sim.vehicle.pilot.command import Pilot, Piloting
-from alice_survey.sim.vehicle.pilot.failures import WATCHED_S, FoundFailure, navigated_stretch
+from alice_survey.sim.vehicle.pilot.command import (
+    WATCHED_S,
+    FoundFailure,
+    Pilot,
+    Piloting,
+    navigated_stretch,
+)
 from alice_survey.sim.vehicle.pilot.guidance import steer
+from alice_survey.sim.vehicle.pilot.memory import TOUCHED
 from alice_survey.sim.vehicle.pilot.mission import PilotMission
-from alice_survey.sim.vehicle.pilot.safety import TOUCHED
 from alice_survey.sim.vehicle.pilot.settings import Tick
 from alice_survey.sim.vehicle.propulsion import electrical_power, with_health, without_thrust
 from alice_survey.sim.vehicle.rotations import matrix_rows

@@ -10,9 +10,9 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from alice_survey.core.errors import NavigationError
-from alice_survey.sim.vehicle.files import vehicle_from
-from alice_survey.sim.vehicle.identification.windows import make_windows
+from alice_survey.sim.vehicle.identification.problem import make_windows
 from alice_survey.sim.vehicle.log import read_column_map, read_foreign_log, read_vehicle_log
+from alice_survey.sim.vehicle.vehicle import vehicle_from
 from missions.logs.import_log import ImportOptions, import_log
 from missions.logs.navigation_csv import read_navigation
 from tests.missions.logs.log_files import dataflash_log, dataflash_message, tlog

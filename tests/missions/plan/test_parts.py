@@ -15,7 +15,7 @@ from alice_survey.core.config import parse_config
 from alice_survey.core.errors import PlanError
 from camera_calib.rig import Rig, design_rig
 from missions.exports.geometry import footprint_outline, footprints_ne
-from missions.fly.flight_route import one_dive, path_of
+from missions.fly.simulation import one_dive, path_of
 from missions.plan.parts import parts_of
 from missions.values.line import Line
 from missions.values.plan_file import Dive, Plan

@@ -9,8 +9,8 @@ import pytest
 
 from alice_survey.core.config import SurveyConfig
 from alice_survey.core.errors import PlanError
-from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.steady import drag_power, steady_flight
+from alice_survey.sim.vehicle.vehicle import vehicle_from
 from missions.exposure.conflict import ConflictError
 from missions.plan.strength import current_error, held_current_mps, survey_costs
 from missions.route.dives import split_dives

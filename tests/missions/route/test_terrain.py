@@ -11,7 +11,7 @@ from pyproj import Transformer
 
 from alice_survey.core.errors import PlanError
 from alice_survey.core.frames import Array, Datum
-from alice_survey.sim.vehicle.files import vehicle_from
+from alice_survey.sim.vehicle.vehicle import vehicle_from
 from missions.areas.bathymetry import Bathymetry, read_bathymetry
 from missions.route.terrain import (
     TerrainLimits,

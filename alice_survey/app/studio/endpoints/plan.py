@@ -28,7 +28,7 @@ from alice_survey.core.errors import AliceError, ConfigError, PlanError, collect
 from alice_survey.core.executor import local_executor
 from alice_survey.core.frames import Datum
 from alice_survey.core.settings_form import settings_form
-from alice_survey.sim.vehicle.files import known_vehicles
+from alice_survey.sim.vehicle.vehicle import known_vehicles
 from missions.areas.drawn import AreaDrawing, DrawnShapes, area_drawing, drawing_of_file
 from missions.areas.files import SUFFIXES
 from missions.exports.registry import format_named, format_names

@@ -44,13 +44,20 @@ from alice_survey.core.frames import Array
 from alice_survey.core.run.progress import step as named_step
 from alice_survey.sim.vehicle.coefficients import MOTIONS
 from alice_survey.sim.vehicle.identification import sensitivity as term
-from alice_survey.sim.vehicle.identification.parameters import QUADRATICS, Parameters, place_of
+from alice_survey.sim.vehicle.identification.problem import (
+    QUADRATICS,
+    Mask,
+    Parameters,
+    Window,
+    cut,
+    place_of,
+    residual_channels,
+)
 from alice_survey.sim.vehicle.identification.sensitivity import (
     Physics,
     simulate,
     with_given,
 )
-from alice_survey.sim.vehicle.identification.windows import Mask, Window, cut, residual_channels
 from alice_survey.sim.vehicle.log import attitude_of
 
 _MIN_STRETCHES, _MAX_STRETCHES = 10, 20

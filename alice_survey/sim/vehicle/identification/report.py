@@ -25,25 +25,21 @@ from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.kit.figure import INKS, SOFT, figure_style, new_figure, save_figure
 from alice_survey.kit.words import text_table
-from alice_survey.sim.vehicle.files import (
-    coefficients_from_file,
-    parse_table,
-    read_table,
-    speeds_missing,
-    vehicle_from,
-    write_coefficients,
-)
 from alice_survey.sim.vehicle.identification.output_error import (
     OutputErrorFit,
     PriorSigmas,
     Simulation,
     fit_output_error,
 )
-from alice_survey.sim.vehicle.identification.parameters import (
+from alice_survey.sim.vehicle.identification.problem import (
+    CHANNEL_NAMES,
     CURRENTS,
     OTHERS,
     Parameters,
+    Window,
     free_parameters,
+    make_windows,
+    of_windows,
     unit_of,
 )
 from alice_survey.sim.vehicle.identification.sensitivity import (
@@ -59,14 +55,16 @@ from alice_survey.sim.vehicle.identification.two_step import (
     read_pulls,
     with_thrust,
 )
-from alice_survey.sim.vehicle.identification.windows import (
-    CHANNEL_NAMES,
-    Window,
-    make_windows,
-    of_windows,
-)
 from alice_survey.sim.vehicle.log import read_column_map, read_foreign_log, read_vehicle_log
-from alice_survey.sim.vehicle.vehicle import Vehicle
+from alice_survey.sim.vehicle.vehicle import (
+    Vehicle,
+    coefficients_from_file,
+    parse_table,
+    read_table,
+    speeds_missing,
+    vehicle_from,
+    write_coefficients,
+)
 
 _MOTIONS = 6
 

@@ -40,8 +40,7 @@ from alice_survey.sim.vehicle.identification.output_error import (
     jackknife_covariance,
     stretch_numbers,
 )
-from alice_survey.sim.vehicle.identification.parameters import OTHERS, Parameters
-from alice_survey.sim.vehicle.identification.windows import Mask, Window
+from alice_survey.sim.vehicle.identification.problem import OTHERS, Mask, Parameters, Window
 from alice_survey.sim.vehicle.propulsion import add_thrust
 from alice_survey.sim.vehicle.vehicle import Vehicle
 

@@ -12,7 +12,7 @@ A mission in the form of another vehicle's software is flown by its law instead 
 A mission's phases (memory.py): DIVE to the altitude, as near to the start as the thrusters can
 stay; APPROACH to the start of a straight way in, however far the current has carried the vehicle;
 FOLLOW the path; ASCEND; DONE. ABORT, from any phase but the last two, is an ascent with a reason
-(safety.py). Close to the sea floor the vehicle slows down and climbs. Without bottom lock it stops
+(memory.py). Close to the sea floor the vehicle slows down and climbs. Without bottom lock it stops
 and holds its depth, rising as the floor last did, until the lock is lost for too long. A vehicle
 that fins steer goes on at the survey's speed in all of these, on a circle where it would wait.
 """
@@ -24,7 +24,15 @@ from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.pilot import gains as g
 from alice_survey.sim.vehicle.pilot import memory as slot
-from alice_survey.sim.vehicle.pilot.memory import PilotState
+from alice_survey.sim.vehicle.pilot.memory import (
+    LOST_PATH,
+    NO_NAVIGATION,
+    NONE,
+    PilotState,
+    mind_floor,
+    restart_watch,
+    watch,
+)
 from alice_survey.sim.vehicle.pilot.mission import (
     COLA2,
     END_E,
@@ -34,14 +42,6 @@ from alice_survey.sim.vehicle.pilot.mission import (
     fly_mission,
 )
 from alice_survey.sim.vehicle.pilot.path import MIN_SLANT, Path, advance, heading_at, place_at
-from alice_survey.sim.vehicle.pilot.safety import (
-    LOST_PATH,
-    NO_NAVIGATION,
-    NONE,
-    mind_floor,
-    restart_watch,
-    watch,
-)
 from alice_survey.sim.vehicle.pilot.settings import Guidance, Tick, circle_course, turning_speed_mps
 from alice_survey.sim.vehicle.pilot.steering import (
     DEPTH_KEPT_M,

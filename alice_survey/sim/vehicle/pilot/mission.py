@@ -60,8 +60,7 @@ from alice_survey.sim.vehicle.dynamics import add_coriolis, add_damping
 from alice_survey.sim.vehicle.pilot import gains as g
 from alice_survey.sim.vehicle.pilot import memory as slot
 from alice_survey.sim.vehicle.pilot.gains import Gains
-from alice_survey.sim.vehicle.pilot.memory import DIVE, FOLLOW
-from alice_survey.sim.vehicle.pilot.safety import mind_floor, restart_watch
+from alice_survey.sim.vehicle.pilot.memory import DIVE, FOLLOW, mind_floor, restart_watch
 from alice_survey.sim.vehicle.pilot.settings import Tick
 from alice_survey.sim.vehicle.pilot.steering import (
     StopReference,

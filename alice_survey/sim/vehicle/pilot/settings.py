@@ -20,9 +20,8 @@ from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.pilot import gains as g
 from alice_survey.sim.vehicle.pilot import memory as slot
 from alice_survey.sim.vehicle.pilot.gains import Gains, coupled_pair, damping_ratio, heading_loop
-from alice_survey.sim.vehicle.pilot.memory import PilotState
+from alice_survey.sim.vehicle.pilot.memory import PilotState, SafetyLimits
 from alice_survey.sim.vehicle.pilot.path import Path
-from alice_survey.sim.vehicle.pilot.safety import SafetyLimits
 from alice_survey.sim.vehicle.steady import bisect
 
 TURN_IN_PLACE_RAD_S = math.radians(15.0)

@@ -34,9 +34,8 @@ from alice_survey.sim.vehicle.fins import add_fins
 from alice_survey.sim.vehicle.pilot import gains as g
 from alice_survey.sim.vehicle.pilot import memory as slot
 from alice_survey.sim.vehicle.pilot.gains import Gains
-from alice_survey.sim.vehicle.pilot.memory import PilotState
+from alice_survey.sim.vehicle.pilot.memory import PilotState, restart_watch
 from alice_survey.sim.vehicle.pilot.path import place_at
-from alice_survey.sim.vehicle.pilot.safety import restart_watch
 from alice_survey.sim.vehicle.pilot.settings import MAX_PITCH_RAD, Guidance, Tick
 from alice_survey.sim.vehicle.rotations import wrap_angle
 

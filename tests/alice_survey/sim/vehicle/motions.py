@@ -11,10 +11,9 @@ from scipy.spatial.transform import Rotation
 from alice_survey.core.frames import attitude_from_rotation, rotation_from_attitude
 from alice_survey.sim.vehicle.coefficients import Coefficients
 from alice_survey.sim.vehicle.dynamics import Body, derivative, initial_state, rk4_step, scratch_for
-from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.propulsion import Thruster
 from alice_survey.sim.vehicle.sea import Current, constant_current
-from alice_survey.sim.vehicle.vehicle import RigidBody, Vehicle
+from alice_survey.sim.vehicle.vehicle import RigidBody, Vehicle, vehicle_from
 
 Array = NDArray[np.float64]
 STILL = constant_current(0.0, 0.0)

@@ -10,9 +10,8 @@ from alice_survey.sim.vehicle.allocation import (
     allocation_scratch,
     preference_weights,
 )
-from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.propulsion import add_thrust, speeds_for, thrust_limits
-from alice_survey.sim.vehicle.vehicle import Vehicle
+from alice_survey.sim.vehicle.vehicle import Vehicle, vehicle_from
 from tests import oracles_propulsion as oracles
 from tests.oracles_propulsion import Array
 

@@ -15,9 +15,8 @@ from alice_survey.sim.vehicle.dynamics import (
     add_damping,
     coriolis_matrix,
 )
-from alice_survey.sim.vehicle.files import SETS
 from alice_survey.sim.vehicle.sea import GRAVITY
-from alice_survey.sim.vehicle.vehicle import Vehicle
+from alice_survey.sim.vehicle.vehicle import SETS, Vehicle
 from tests import oracles_dynamics as oracle
 from tests.alice_survey.sim.vehicle.motions import (
     SHEAR_AND_TIDE,

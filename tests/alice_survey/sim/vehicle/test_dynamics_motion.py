@@ -11,9 +11,8 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.files import SETS, vehicle_from
 from alice_survey.sim.vehicle.sea import Current, constant_current, sheared_current
-from alice_survey.sim.vehicle.vehicle import RigidBody, Vehicle
+from alice_survey.sim.vehicle.vehicle import SETS, RigidBody, Vehicle, vehicle_from
 from tests import oracles_dynamics as oracle
 from tests.alice_survey.sim.vehicle.motions import (
     SHEAR_AND_TIDE,

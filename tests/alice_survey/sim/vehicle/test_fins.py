@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.fins import Fin, add_fins, fin_slope, pack_fins, write_fin_matrix
+from alice_survey.sim.vehicle.vehicle import vehicle_from
 from tests import oracles_dynamics as oracle
 from tests.alice_survey.sim.vehicle.motions import (
     advance,

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from alice_survey.core.errors import VehicleError
-from alice_survey.sim.vehicle import files
-from alice_survey.sim.vehicle.files import SETS, vehicle_from
+from alice_survey.sim.vehicle import vehicle as files
+from alice_survey.sim.vehicle.vehicle import SETS, vehicle_from
 from tests.oracles_shape import ALICE, SPARUS2
 
 NAMES = ("alice", "sparus2")

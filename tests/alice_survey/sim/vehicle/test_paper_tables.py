@@ -7,8 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from alice_survey.app.cli.main import app
-from alice_survey.sim.vehicle.files import vehicle_from
-from alice_survey.sim.vehicle.paper_tables import (
+from alice_survey.sim.vehicle.coefficients import (
     CALIBRATED,
     CFD,
     COMPUTED,
@@ -16,6 +15,7 @@ from alice_survey.sim.vehicle.paper_tables import (
     ROWS,
     CoefficientRow,
 )
+from alice_survey.sim.vehicle.vehicle import vehicle_from
 
 
 def row(table: str, coefficient: str, part: str = "vehicle") -> CoefficientRow:

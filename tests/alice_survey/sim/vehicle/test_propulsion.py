@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from alice_survey.core.errors import VehicleError
 from alice_survey.sim.vehicle import propulsion as kernels
-from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.propulsion import Thruster, pack, with_health
+from alice_survey.sim.vehicle.vehicle import vehicle_from
 from tests import oracles_propulsion as oracles
 from tests.oracles_propulsion import Array
 

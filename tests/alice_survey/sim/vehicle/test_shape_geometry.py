@@ -3,8 +3,8 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from alice_survey.sim.vehicle.files import vehicle_from
-from alice_survey.sim.vehicle.paper_tables import SHAPES
+from alice_survey.sim.vehicle.coefficients import SHAPES
+from alice_survey.sim.vehicle.vehicle import vehicle_from
 from tests.oracles_shape import (
     ALICE,
     SHELL_M,

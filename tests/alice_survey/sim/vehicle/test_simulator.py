@@ -7,7 +7,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from alice_survey.sim.vehicle.dynamics import rk4_step, scratch_for
-from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.navigation.sensors import SensorSuite
 from alice_survey.sim.vehicle.pilot.gains import gains_for
 from alice_survey.sim.vehicle.pilot.memory import APPROACH, ASCEND, DIVE, DONE, FOLLOW, PHASE
@@ -15,6 +14,7 @@ from alice_survey.sim.vehicle.pilot.path import path_from_legs
 from alice_survey.sim.vehicle.pilot.settings import pilot_guidance
 from alice_survey.sim.vehicle.sea import Disturbance, constant_current, level_floor
 from alice_survey.sim.vehicle.simulator import STEPS, TICK_S, Flown, Setup, simulate
+from alice_survey.sim.vehicle.vehicle import vehicle_from
 
 CURRENT = constant_current(0.1, 60.0)
 STILL = Disturbance()

@@ -7,10 +7,9 @@ import pytest
 
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.dynamics import derivative, initial_state, scratch_for
-from alice_survey.sim.vehicle.files import SETS, vehicle_from
 from alice_survey.sim.vehicle.pilot.gains import pitch_divergence_speed_mps
 from alice_survey.sim.vehicle.sea import constant_current
-from alice_survey.sim.vehicle.vehicle import Vehicle
+from alice_survey.sim.vehicle.vehicle import SETS, Vehicle, vehicle_from
 
 
 def growth(craft: Vehicle, speed_mps: float) -> float:

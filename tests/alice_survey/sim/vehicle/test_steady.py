@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from alice_survey.sim.vehicle.dynamics import derivative, initial_state, scratch_for
-from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.propulsion import add_thrust
 from alice_survey.sim.vehicle.sea import constant_current
 from alice_survey.sim.vehicle.steady import BALANCED, drag_power, steady_flight
+from alice_survey.sim.vehicle.vehicle import vehicle_from
 
 ALICE, SPARUS = vehicle_from("alice"), vehicle_from("sparus2")
 

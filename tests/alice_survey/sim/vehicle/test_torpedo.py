@@ -14,7 +14,6 @@ import pytest
 from numpy.typing import NDArray
 
 from alice_survey.core.errors import VehicleError
-from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.identification.report import IdentifyOptions, identify_report
 from alice_survey.sim.vehicle.pilot import gains as g
 from alice_survey.sim.vehicle.pilot.gains import (
@@ -33,6 +32,7 @@ from alice_survey.sim.vehicle.steady import (
     min_speed_mps,
     steady_flight,
 )
+from alice_survey.sim.vehicle.vehicle import vehicle_from
 from tests import oracles_dynamics as oracle
 from tests.alice_survey.sim.vehicle.motions import STILL
 

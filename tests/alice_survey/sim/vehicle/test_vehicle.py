@@ -7,10 +7,9 @@ from hypothesis import strategies as st
 
 from alice_survey.core.errors import VehicleError
 from alice_survey.sim.vehicle.coefficients import Coefficients
-from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.propulsion import add_thrust
 from alice_survey.sim.vehicle.sea import GRAVITY
-from alice_survey.sim.vehicle.vehicle import RigidBody
+from alice_survey.sim.vehicle.vehicle import RigidBody, vehicle_from
 from tests.alice_survey.sim.vehicle.motions import block
 
 METRES = st.tuples(*[st.floats(-0.5, 0.5)] * 3)

@@ -8,10 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.dynamics import initial_state, rk4_step, scratch_for
-from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.log import VehicleLog, vehicle_log
 from alice_survey.sim.vehicle.sea import constant_current
-from alice_survey.sim.vehicle.vehicle import Vehicle
+from alice_survey.sim.vehicle.vehicle import Vehicle, vehicle_from
 
 ROW_S, STEP_S = 0.05, 0.01
 NAMES = ("starboard", "port", "vertical", "bow", "stern")

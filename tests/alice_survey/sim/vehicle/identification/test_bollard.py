@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.identification.two_step import fit_pulls, read_pulls, with_thrust
 from alice_survey.sim.vehicle.propulsion import add_thrust
+from alice_survey.sim.vehicle.vehicle import vehicle_from
 
 KNOWN = vehicle_from("alice")
 

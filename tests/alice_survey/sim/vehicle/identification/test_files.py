@@ -8,15 +8,15 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.core.errors import VehicleError
 from alice_survey.sim.vehicle.coefficients import Coefficients
-from alice_survey.sim.vehicle.files import (
+from alice_survey.sim.vehicle.identification.problem import inputs, make_windows
+from alice_survey.sim.vehicle.log import read_column_map, read_foreign_log, vehicle_log
+from alice_survey.sim.vehicle.vehicle import (
     coefficients_from_file,
     speeds_missing,
     vehicle_from,
     vehicle_from_file,
     write_coefficients,
 )
-from alice_survey.sim.vehicle.identification.windows import inputs, make_windows
-from alice_survey.sim.vehicle.log import read_column_map, read_foreign_log, vehicle_log
 
 HERE = Path(__file__).parent
 SMALL = """

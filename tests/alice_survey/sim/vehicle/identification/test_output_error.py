@@ -5,15 +5,14 @@ import pytest
 
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.identification.output_error import (
     OutputErrorFit,
     Simulation,
     fit_output_error,
 )
-from alice_survey.sim.vehicle.identification.parameters import free_parameters, unit_of
-from alice_survey.sim.vehicle.identification.windows import make_windows
+from alice_survey.sim.vehicle.identification.problem import free_parameters, make_windows, unit_of
 from alice_survey.sim.vehicle.log import VehicleLog
+from alice_survey.sim.vehicle.vehicle import vehicle_from
 from tests.alice_survey.sim.vehicle.identification.manoeuvres import fly, hidden, measured
 
 KNOWN = vehicle_from("alice")

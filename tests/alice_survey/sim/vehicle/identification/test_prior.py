@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from alice_survey.core.errors import VehicleError
-from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.identification.output_error import (
     PriorSigmas,
     Simulation,
@@ -14,8 +13,8 @@ from alice_survey.sim.vehicle.identification.output_error import (
     prior_of,
     read_prior,
 )
-from alice_survey.sim.vehicle.identification.parameters import free_parameters
-from alice_survey.sim.vehicle.identification.windows import make_windows
+from alice_survey.sim.vehicle.identification.problem import free_parameters, make_windows
+from alice_survey.sim.vehicle.vehicle import vehicle_from
 from tests.alice_survey.sim.vehicle.identification.manoeuvres import Noise, fly, hidden, measured
 
 KNOWN = vehicle_from("alice")

@@ -10,9 +10,9 @@ from typer.testing import CliRunner
 
 from alice_survey.app.cli.main import app
 from alice_survey.core.errors import VehicleError
-from alice_survey.sim.vehicle.files import coefficients_from_file, vehicle_from
 from alice_survey.sim.vehicle.identification.report import IdentifyOptions, identify_report
 from alice_survey.sim.vehicle.log import write_vehicle_log
+from alice_survey.sim.vehicle.vehicle import coefficients_from_file, vehicle_from
 from tests.alice_survey.sim.vehicle.identification.manoeuvres import (
     fly,
     hidden,

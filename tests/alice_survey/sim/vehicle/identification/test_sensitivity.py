@@ -5,14 +5,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from alice_survey.core.frames import Array, rotation_from_attitude
-from alice_survey.sim.vehicle.files import vehicle_from
-from alice_survey.sim.vehicle.identification.parameters import Parameters, free_parameters
+from alice_survey.sim.vehicle.identification.problem import Parameters, free_parameters
 from alice_survey.sim.vehicle.identification.sensitivity import (
     START,
     Record,
     simulate,
     with_given,
 )
+from alice_survey.sim.vehicle.vehicle import vehicle_from
 from tests.oracles_identification import integrated
 
 ALL = (

@@ -7,17 +7,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from alice_survey.sim.vehicle.files import vehicle_from_file
 from alice_survey.sim.vehicle.identification.output_error import (
     OutputErrorFit,
     PriorSigmas,
     Simulation,
     fit_output_error,
 )
-from alice_survey.sim.vehicle.identification.parameters import free_parameters
+from alice_survey.sim.vehicle.identification.problem import free_parameters, make_windows
 from alice_survey.sim.vehicle.identification.report import validate
-from alice_survey.sim.vehicle.identification.windows import make_windows
 from alice_survey.sim.vehicle.log import VehicleLog, read_column_map, read_foreign_log
+from alice_survey.sim.vehicle.vehicle import vehicle_from_file
 
 HERE = Path(__file__).parent
 QUICK = Simulation(max_step_s=0.05)

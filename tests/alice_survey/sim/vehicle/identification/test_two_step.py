@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from alice_survey.core.errors import VehicleError
-from alice_survey.sim.vehicle.files import vehicle_from
-from alice_survey.sim.vehicle.identification.parameters import free_parameters
+from alice_survey.sim.vehicle.identification.problem import free_parameters, make_windows
 from alice_survey.sim.vehicle.identification.two_step import calibrate
-from alice_survey.sim.vehicle.identification.windows import make_windows
+from alice_survey.sim.vehicle.vehicle import vehicle_from
 from tests.alice_survey.sim.vehicle.identification.manoeuvres import fly, hidden
 
 KNOWN = vehicle_from("alice")

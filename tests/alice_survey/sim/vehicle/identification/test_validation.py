@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from alice_survey.sim.vehicle.files import vehicle_from
-from alice_survey.sim.vehicle.identification.parameters import free_parameters
+from alice_survey.sim.vehicle.identification.problem import free_parameters, make_windows
 from alice_survey.sim.vehicle.identification.report import fit_percent, validate
-from alice_survey.sim.vehicle.identification.windows import make_windows
+from alice_survey.sim.vehicle.vehicle import vehicle_from
 from tests.alice_survey.sim.vehicle.identification.manoeuvres import fly, hidden
 
 

@@ -18,7 +18,6 @@ from alice_survey.sim.vehicle.dynamics import (
     rk4_step,
     scratch_for,
 )
-from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.pilot import memory as slot
 from alice_survey.sim.vehicle.pilot.gains import DEGREES, LAG, Gains, gains_for
 from alice_survey.sim.vehicle.pilot.guidance import steer
@@ -27,6 +26,7 @@ from alice_survey.sim.vehicle.pilot.mission import NO_MISSION
 from alice_survey.sim.vehicle.pilot.path import Path, path_from_legs
 from alice_survey.sim.vehicle.pilot.settings import Guidance, Tick, pilot_guidance
 from alice_survey.sim.vehicle.sea import Current, constant_current, current_at
+from alice_survey.sim.vehicle.vehicle import vehicle_from
 
 Controller = Literal["sway", "los"]
 TICK_S = 0.05

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.dynamics import Body, add_coriolis, add_damping
-from alice_survey.sim.vehicle.files import SETS, vehicle_from
 from alice_survey.sim.vehicle.pilot import gains as g
 from alice_survey.sim.vehicle.pilot.gains import (
     DEGREES,
@@ -21,6 +20,7 @@ from alice_survey.sim.vehicle.pilot.gains import (
     linear_coriolis,
     linear_damping,
 )
+from alice_survey.sim.vehicle.vehicle import SETS, vehicle_from
 from tests.alice_survey.sim.vehicle.pilot.pilot_runs import gains_of
 
 AXES = [("alice", axis) for axis in range(4)] + [("sparus2", axis) for axis in (0, 2, 3)]

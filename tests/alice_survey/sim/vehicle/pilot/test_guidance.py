@@ -10,7 +10,6 @@ from hypothesis.extra.numpy import arrays
 
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import estimate_vector as vector
-from alice_survey.sim.vehicle.files import vehicle_from
 from alice_survey.sim.vehicle.pilot import gains as g
 from alice_survey.sim.vehicle.pilot import memory as slot
 from alice_survey.sim.vehicle.pilot.gains import (
@@ -31,6 +30,7 @@ from alice_survey.sim.vehicle.pilot.settings import (
     pilot_guidance,
 )
 from alice_survey.sim.vehicle.pilot.steering import hear_floor, write_point
+from alice_survey.sim.vehicle.vehicle import vehicle_from
 from tests import oracles_guidance as oracle
 from tests.alice_survey.sim.vehicle.pilot.pilot_runs import gains_of, straight
 from tests.oracles_guidance import los_offset_m

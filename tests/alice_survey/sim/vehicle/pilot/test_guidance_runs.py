@@ -9,8 +9,8 @@ import pytest
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.pilot import gains as g
+from alice_survey.sim.vehicle.pilot import memory as safety
 from alice_survey.sim.vehicle.pilot import memory as slot
-from alice_survey.sim.vehicle.pilot import safety
 from alice_survey.sim.vehicle.pilot.memory import ABORT, APPROACH, ASCEND, DIVE, DONE, FOLLOW
 from tests.alice_survey.sim.vehicle.pilot.pilot_runs import (
     Controller,

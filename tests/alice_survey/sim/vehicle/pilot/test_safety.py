@@ -8,12 +8,11 @@ import pytest
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.pilot import gains as g
+from alice_survey.sim.vehicle.pilot import memory as safety
 from alice_survey.sim.vehicle.pilot import memory as slot
-from alice_survey.sim.vehicle.pilot import safety
 from alice_survey.sim.vehicle.pilot.guidance import steer
-from alice_survey.sim.vehicle.pilot.memory import PilotState, new_pilot
+from alice_survey.sim.vehicle.pilot.memory import PilotState, SafetyLimits, new_pilot
 from alice_survey.sim.vehicle.pilot.mission import NO_MISSION
-from alice_survey.sim.vehicle.pilot.safety import SafetyLimits
 from alice_survey.sim.vehicle.pilot.settings import Tick
 from tests.alice_survey.sim.vehicle.pilot.pilot_runs import Flight, launch, straight
 

@@ -9,15 +9,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.files import vehicle_from
-from alice_survey.sim.vehicle.pilot.failures import (
+from alice_survey.sim.vehicle.pilot.command import (
     FALSE_ALARM_H,
     WATCHED_S,
     FoundFailure,
     NavigatedStretch,
     ThrustWatch,
 )
-from alice_survey.sim.vehicle.vehicle import Vehicle
+from alice_survey.sim.vehicle.vehicle import Vehicle, vehicle_from
 from tests.alice_survey.sim.vehicle.identification.manoeuvres import fly, survey_like
 
 TICK_S, STRETCH = 0.05, 100

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.files import vehicle_from
-from alice_survey.sim.vehicle.pilot.failures import FoundFailure, ThrusterWatch
+from alice_survey.sim.vehicle.pilot.command import FoundFailure, ThrusterWatch
+from alice_survey.sim.vehicle.vehicle import vehicle_from
 
 TICK_S = 0.05
 STRETCH = 100
