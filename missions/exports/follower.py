@@ -11,9 +11,18 @@ from dataclasses import dataclass
 
 from alice_survey.core.config import SeaConfig, VehicleConfig
 from alice_survey.sim.vehicle.pilot.gains import FASTEST, SWAY, Gains, gains_for
-from alice_survey.sim.vehicle.pilot.mission import circling_m, steady_drift, turn_in_m, yaw_rad_s
+from alice_survey.sim.vehicle.pilot.mission import (
+    Cola2Settings,
+    circling_m,
+    steady_drift,
+    turn_in_m,
+    yaw_rad_s,
+)
 from alice_survey.sim.vehicle.pilot.settings import min_look_ahead_m
 from missions.route.energy import planned_vehicle
+
+COLA2_TOLERANCE_Z_M = 0.3
+"""A step down is done this near to its depth; COLA2's own 1 m begins a line a metre too high."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,3 +120,16 @@ def end_tolerance_m(follower: Follower) -> float:
     vehicle follows at a heading error of a radian at most.
     """
     return follower.circle_m + follower.current_mps / follower.turn_rad_s
+
+
+def cola2_settings(delta_m: float, speed_mps: float) -> Cola2Settings:
+    """The pilot's parameters that exported missions count on.
+
+    Speed is the same all along a line: pictures are taken at a constant interval.
+    """
+    return Cola2Settings(
+        delta_m=delta_m,
+        tolerance_z_m=COLA2_TOLERANCE_Z_M,
+        max_surge_mps=max(Cola2Settings().max_surge_mps, speed_mps),
+        min_surge_mps=max(Cola2Settings().min_surge_mps, speed_mps),
+    )

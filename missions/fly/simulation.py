@@ -83,8 +83,7 @@ from alice_survey.sim.vehicle.vehicle import Vehicle
 from camera_calib.rig import Rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import plan_pattern, stations_of_lines
-from missions.exports.advice import cola2_settings
-from missions.exports.follower import cola2_delta_m, sways
+from missions.exports.follower import cola2_delta_m, cola2_settings, sways
 from missions.exports.geometry import CameraMount
 from missions.exports.registry import read_mission
 from missions.route.energy import sound_vehicle

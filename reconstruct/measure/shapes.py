@@ -18,7 +18,7 @@ from alice_survey.core.errors import ConfigError, ReconstructionError, Workspace
 from alice_survey.core.frames import Array
 from alice_survey.core.products import MOSAIC
 from alice_survey.core.run import progress
-from missions.areas.safe import DRIVERS, gis_files
+from missions.areas.files import DRIVERS, gis_files
 from reconstruct.measure.areas import (
     NOTHING_KNOWN,
     AreaSums,

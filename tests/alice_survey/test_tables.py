@@ -8,9 +8,9 @@ import pytest
 from typer.testing import CliRunner
 
 from alice_survey.app.cli.main import app
-from alice_survey.app.commands.fov_tables import FovOptions, fov_report, validation_report
 from alice_survey.core.config import CameraConfig, WaterConfig
 from alice_survey.core.errors import AliceError, ConfigError
+from camera_calib.fov.display import FovOptions, fov_report, validation_report
 from camera_calib.rig import design_rig, write_rig
 
 

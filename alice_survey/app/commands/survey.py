@@ -85,7 +85,7 @@ class FovCommand(ReportCommand):
 
     def run(self) -> Result:
         """Compute and write the tables."""
-        from alice_survey.app.commands.fov_tables import FovOptions, fov_report, validation_report
+        from camera_calib.fov.display import FovOptions, fov_report, validation_report
 
         options = FovOptions(
             lens_mm=self.lens or (), altitude_m=self.altitude or (), speed_mps=self.speed or (),

@@ -15,7 +15,7 @@ from shapely.geometry.base import BaseGeometry
 
 from alice_survey.core.config import AreaConfig
 from alice_survey.core.errors import PlanError
-from missions.areas import safe
+from missions.areas import files
 from missions.areas.survey import survey_area
 from missions.values.area import Area
 
@@ -281,11 +281,11 @@ def test_archives_that_swell_are_refused(tmp_path: Path, monkeypatch: pytest.Mon
     kml = make("kml", tmp_path)
     bomb = zipped(tmp_path / "bomb.kmz", {"doc.kml": kml, "padding.bin": bytes(3_000_000)})
     assert bomb.stat().st_size < 20_000
-    monkeypatch.setattr(safe, "MAX_BYTES", 1_000_000)
+    monkeypatch.setattr(files, "MAX_BYTES", 1_000_000)
     assert "2 files of 3 MB" in refusal(file=bomb)
     many = zipped(tmp_path / "many.kmz", {f"{i}.txt": b"" for i in range(1001)})
     assert "1001 files" in refusal(file=many)
-    monkeypatch.setattr(safe, "MAX_BYTES", 10)
+    monkeypatch.setattr(files, "MAX_BYTES", 10)
     assert " 0 MB" in refusal(file=kml)
 
 
