@@ -10,13 +10,13 @@ int_radius int_thick na ng nw`, its centre and the radius of its inner surface.
 
 import math
 import struct
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from itertools import takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, Self
 
 import pycolmap
+from pydantic import Field, model_validator
 
 from alice_survey.core.artefacts import atomic_path
 from alice_survey.core.contents import as_line
@@ -45,52 +45,35 @@ MODELS = {
 """Number and parameters of COLMAP's models that a lens here contains."""
 PORTS = ("FLATPORT", "DOMEPORT")
 """Refraction models by their numbers; both have eight parameters, the last three indices."""
+_WORDS = ("CAMERA_ID", "MODEL", "WIDTH", "HEIGHT")
 _NO_REFRACTION = -1
 _PORT_PARAMETERS = 8
-_MAX_PX = 10**6
 _OURS = {"fx": "fx_px", "fy": "fy_px", "cx": "cx_px", "cy": "cy_px"}
 
 
-@dataclass(frozen=True, kw_only=True)
-class CameraRecord:
-    """A camera as these files have it.
+class CameraRecord(fields.FileModel):
+    """A camera as these files have it, by the words of their comments."""
 
-    Raises:
-        CalibrationError: a value is not what its model or port has.
-    """
-
-    camera_id: int
-    model: str
+    camera_id: int = Field(alias="CAMERA_ID")
+    model: str = Field(alias="MODEL")
     """One of `MODELS`."""
-    width_px: int
-    height_px: int
-    params: tuple[float, ...]
-    refraction: str | None = None
-    """One of `PORTS`."""
-    port: tuple[float, ...] = ()
+    width_px: fields.Pixels = Field(alias="WIDTH")
+    height_px: fields.Pixels = Field(alias="HEIGHT")
+    params: tuple[float, ...] = Field(alias="PARAMS")
+    refraction: Literal["FLATPORT", "DOMEPORT"] | None = Field(None, alias="REFRAC_MODEL")
+    port: tuple[float, ...] = Field((), alias="REFRAC_PARAMS")
     """Its parameters."""
 
-    def __post_init__(self) -> None:
-        names = MODELS[self.model][1]
-        if len(self.params) != len(names):
-            raise CalibrationError(
-                f"{self.model} has {len(names)} PARAMS: {len(self.params)} found"
-            )
-        if self.refraction is not None and self.refraction not in PORTS:
-            raise CalibrationError(
-                f"port {as_line(self.refraction)}: {' and '.join(PORTS)} can be read"
-            )
-        if self.refraction is not None and len(self.port) != _PORT_PARAMETERS:
-            raise CalibrationError(
-                f"{self.refraction} has {_PORT_PARAMETERS} REFRAC_PARAMS: {len(self.port)} found"
-            )
-        for name, value in zip(names, self.params, strict=True):
-            if not math.isfinite(value):
-                raise CalibrationError(f"{name} is not a finite number")
-        if not all(map(math.isfinite, self.port)):
-            raise CalibrationError("REFRAC_PARAMS are not finite numbers")
-        if not all(1 <= side <= _MAX_PX for side in (self.width_px, self.height_px)):
-            raise CalibrationError(f"WIDTH or HEIGHT is not from 1 to {_MAX_PX} px")
+    @model_validator(mode="after")
+    def _check_counts(self) -> Self:
+        ports = 0 if self.refraction is None else _PORT_PARAMETERS
+        for model, kind, values, count in (
+            (self.model, "PARAMS", self.params, len(MODELS[self.model][1])),
+            (self.refraction, "REFRAC_PARAMS", self.port, ports),
+        ):
+            if len(values) != count:
+                raise ValueError(f"{model} has {count} {kind}: {len(values)} found")
+        return self
 
 
 def record_of(camera_id: int, camera: Camera, *, port: bool) -> CameraRecord:
@@ -230,26 +213,16 @@ def _read_text(path: Path) -> list[CameraRecord]:
         items = line.split()
         if not items or items[0].startswith("#"):
             continue
-        where = f"{path}: line {row}"
+        where = f"line {row}: "
         if len(items) < 5:
-            raise CalibrationError(f"{where}: CAMERA_ID MODEL WIDTH HEIGHT PARAMS[] expected")
-        params = list(takewhile(_is_number, items[4:]))
-        port = items[4 + len(params) :]
-        values: Mapping[str, Any] = {
-            "model": _check_model(where, items[1]),
-            "params": tuple(map(float, params)),
-            "refraction": port[0] if port else None,
-        }
-        try:
-            camera_id, width, height = (int(items[i]) for i in (0, 2, 3))
-            numbers = tuple(map(float, port[1:]))
-            records.append(
-                CameraRecord(
-                    camera_id=camera_id, width_px=width, height_px=height, port=numbers, **values
-                )
-            )
-        except (ValueError, CalibrationError) as error:
-            raise CalibrationError(f"{where}: {as_line(str(error))}") from None
+            raise CalibrationError(f"{path}: {where}CAMERA_ID MODEL WIDTH HEIGHT PARAMS[] expected")
+        _check_model(f"{path}: {where}", items[1])
+        values: dict[str, Any] = dict(zip(_WORDS, items, strict=False))
+        values["PARAMS"] = list(takewhile(_is_number, items[4:]))
+        port = items[4 + len(values["PARAMS"]) :]
+        if port:
+            values |= {"REFRAC_MODEL": port[0], "REFRAC_PARAMS": port[1:]}
+        records.append(CameraRecord.check(path, values, where))
     return records
 
 
@@ -258,12 +231,12 @@ def _read_binary(path: Path) -> list[CameraRecord]:
     others = {int(value): name for name, value in pycolmap.CameraModelId.__members__.items()}
     first = int.from_bytes(content[12:16], "little") if len(content) >= 16 else -1
     if first in others:
-        _check_model(f"{path}: first camera", others[first])
+        _check_model(f"{path}: first camera: ", others[first])
     # Only one of the two kinds ends where the file ends: the other is 4 bytes or more off.
     for refractive in (False, True):
         try:
             records = _unpack(content, refractive)
-        except (struct.error, KeyError, IndexError, CalibrationError):
+        except (struct.error, KeyError, IndexError, ValueError):
             continue
         if records is not None:
             return records
@@ -305,9 +278,8 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _check_model(where: str, model: str) -> str:
+def _check_model(where: str, model: str) -> None:
     if model not in MODELS:
         raise CalibrationError(
-            f"{where}: model {as_line(model)} is not held here: {', '.join(MODELS)} can be read"
+            f"{where}model {as_line(model)} is not held here: {', '.join(MODELS)} can be read"
         )
-    return model

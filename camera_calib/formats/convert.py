@@ -35,10 +35,6 @@ _CANCELLING_PX = 0.01
 the smallest are taken; the residual grows by less than 1 % for it."""
 
 
-def _read_own(path: Path, _: rigs.ReadOptions) -> Rig:
-    return read_rig(path)
-
-
 def _write_own(path: Path, rig: Rig) -> list[Path]:
     write_rig(path, rig)
     return [path]
@@ -49,7 +45,7 @@ _OWN = rigs.CalibrationFormat(
     title="rig.json of this project",
     holds=rigs.ALL,
     owns=lambda path: path.suffix.lower() == ".json" and read_text(path).lstrip()[:1] != "[",
-    read=_read_own,
+    read=lambda path, _: read_rig(path),
     write=_write_own,
     suffix=".json",
 )

@@ -50,10 +50,6 @@ class ReadOptions:
         return self.image_size
 
 
-def _itself(path: Path, _: Rig) -> list[Path]:
-    return [path]
-
-
 @dataclass(frozen=True, kw_only=True)
 class CalibrationFormat:
     """One tool's format: what it holds, how it is recognised, read and written."""
@@ -66,7 +62,7 @@ class CalibrationFormat:
     """Whether a file or folder is of this format."""
     read: Callable[[Path, ReadOptions], Rig]
     write: Callable[[Path, Rig], list[Path]]
-    files: Callable[[Path, Rig], list[Path]] = _itself
+    files: Callable[[Path, Rig], list[Path]] = lambda path, _: [path]
     """The files that writing a rig to a path would replace."""
     suffix: str = ""
     """Ending of new files that are of this format if none is named."""

@@ -8,7 +8,7 @@ shape of its squares, and to a cross along the edges where markers or bits stand
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import cv2
@@ -79,16 +79,16 @@ class Corners:
         """These corners in another order."""
         return self._change(lambda values: values[order])
 
-    def join(self, more: Self) -> Self:
-        """These corners and then more."""
-        return self._change(lambda *both: np.concatenate(both), more)
+    def with_fitted(self, again: Self) -> Self:
+        """These corners, and of other fits of them those that succeeded."""
+        found = again.states == FITTED
+        order = np.where(found, np.arange(len(found)) + len(found), np.arange(len(found)))
+        return self._change(lambda one, other: np.concatenate([one, other])[order], again)
 
     def _change(self, change: Callable[..., Any], *others: Self) -> Self:
         """All fields changed in the same way."""
-        names = [field.name for field in fields(self)]
-        return replace(
-            self, **{n: change(*(getattr(one, n) for one in (self, *others))) for n in names}
-        )
+        values = zip(*(vars(one).values() for one in (self, *others)), strict=True)
+        return type(self)(**dict(zip(vars(self), (change(*v) for v in values), strict=True)))
 
     def without(self, which: NDArray[np.bool_], state: int) -> Self:
         """These corners, but some of them unfitted for a reason."""

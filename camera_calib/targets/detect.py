@@ -121,14 +121,9 @@ def as_grey(picture: Picture) -> Grey:
     Raises:
         CalibrationError: the picture is of another kind than 8 or 16 bits, grey or colour.
     """
+    known = picture.dtype in (np.uint8, np.uint16) and picture.ndim in (2, 3) and picture.size
     channels = picture.shape[2] if picture.ndim == 3 else 1
-    depth_known = picture.dtype in (np.uint8, np.uint16)
-    if (
-        not depth_known
-        or picture.ndim not in (2, 3)
-        or channels not in (1, 3, 4)
-        or not picture.size
-    ):
+    if not known or channels not in (1, 3, 4):
         raise CalibrationError(
             f"a picture of shape {picture.shape} and type {picture.dtype} cannot hold a target: "
             "give grey or colour pictures of 8 or 16 bits"
@@ -252,9 +247,7 @@ def _second_look(target: Target, grey: Grey, corners: Corners) -> Corners:
         adjacent = cKDTree(board[used]).query(board)[0] < 1.1 * pitch
         near[used | ~adjacent] = np.nan
         again = _fit_with(target, grey, near, steps, shrink)
-        found = again.states == FITTED
-        order = np.where(found, np.arange(len(used)) + len(used), np.arange(len(used)))
-        corners = _without_astray(target, corners.join(again).take(order))
+        corners = _without_astray(target, corners.with_fitted(again))
     return corners
 
 
@@ -267,10 +260,7 @@ def _last_look(target: Target, grey: Grey, corners: Corners) -> Corners:
     board = target.points[:, :2] / target.size_m
     steps[used], bends[used] = board_map(board[used], corners.pixels[used])
     near = np.where(used[:, None], corners.pixels, np.nan)
-    again = _fit_with(target, grey, near, steps, bends=bends)
-    found = again.states == FITTED
-    order = np.where(found, np.arange(len(used)) + len(used), np.arange(len(used)))
-    return corners.join(again).take(order)
+    return corners.with_fitted(_fit_with(target, grey, near, steps, bends=bends))
 
 
 def _without_astray(target: Target, corners: Corners) -> Corners:

@@ -285,7 +285,7 @@ def test_faults_name_file_and_line(tmp_path: Path) -> None:
         (lens + " FLATPORT 0 0 1 0.05 0.007 1 1.52 0.9", "0.9"),
         (lens + " FLATPORT 0 0 1 -0.05 0.007 1 1.52 1.33", "port_distance_m"),
         ("1 PINHOLE 9 8 5 6 x 3", "line 1"),
-        ("1 PINHOLE 9 8 5 6 nan 3", "cx"),
+        ("1 PINHOLE 9 8 5 6 nan 3", "PARAMS.2"),
         ("1 PINHOLE 9 8 0 6 4 3", "fx"),
         ("1 PINHOLE 0 8 5 6 4 3", "WIDTH"),
         ("# nothing", "camera"),
