@@ -251,30 +251,24 @@ def _pose_values(pose: RigidTransform) -> dict[str, Any]:
     return {"turn": turn.tolist(), "shift": pose.translation.tolist()}
 
 
-def _owns(path: Path) -> bool:
+def _has_ports(path: Path) -> bool | None:
+    """Whether a camera of a file or folder of these formats has a port; None for any other."""
     if path.is_dir():
         names = (*CAMERA_FILES, RIG_CONFIG)
         found = [path / name for name in names if (path / name).is_file()]
-        return bool(found) and _owns(found[0])
+        return _has_ports(found[0]) if found else None
     suffix = path.suffix.lower()
-    if suffix == ".json":
-        return fields.read_text(path).lstrip().startswith("[")
-    return suffix in (".txt", ".bin") and not any(r.refraction for r in read_records(path))
-
-
-def _owns_refractive(path: Path) -> bool:
-    if path.is_dir():
-        found = [path / name for name in CAMERA_FILES if (path / name).is_file()]
-        return bool(found) and _owns_refractive(found[0])
-    suffixes = (".txt", ".bin")
-    return path.suffix.lower() in suffixes and any(r.refraction for r in read_records(path))
+    if suffix in (".txt", ".bin"):
+        return any(record.refraction for record in read_records(path))
+    listed = suffix == ".json" and fields.read_text(path).lstrip().startswith("[")
+    return False if listed else None
 
 
 FORMAT = rigs.CalibrationFormat(
     name="colmap",
     title="COLMAP model and rig_config.json",
     holds=frozenset({rigs.K3, rigs.RATIONAL}),
-    owns=_owns,
+    owns=lambda path: _has_ports(path) is False,
     read=read_colmap,
     write=write_colmap,
     files=model_files,
@@ -283,7 +277,7 @@ REFRACTIVE = rigs.CalibrationFormat(
     name="refractive",
     title="Refractive COLMAP cameras with FLATPORT or DOMEPORT",
     holds=FORMAT.holds | {FlatPort.shape, DomePort.shape},
-    owns=_owns_refractive,
+    owns=lambda path: _has_ports(path) is True,
     read=read_colmap,
     write=write_refractive,
     files=model_files,

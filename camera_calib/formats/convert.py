@@ -151,9 +151,8 @@ def convert(task: Conversion) -> tuple[str, dict[str, Any]]:
         CalibrationError: a file is wrong, or the target's format cannot hold what the source has.
     """
     source = detect(task.source) if task.source_format is None else format_named(task.source_format)
-    target = (
-        of_target(task.target) if task.target_format is None else format_named(task.target_format)
-    )
+    named = task.target_format
+    target = of_target(task.target) if named is None else format_named(named)
     rig = _change(_read(source, task.source, task.reading), task)
     prices: Mapping[str, StandIn] = {}
     if task.water is not None:
@@ -171,7 +170,7 @@ def convert(task: Conversion) -> tuple[str, dict[str, Any]]:
     written = target.write(task.target, rig)
     for note in notes:
         warn(note)
-    lines = [f"{source.title} -> {target.title}: {', '.join(str(path) for path in written)}"]
+    lines = [f"{source.title} -> {target.title}: {', '.join(map(str, written))}"]
     for name, c in rig.cameras.items():
         place = _port_words(c) if c.port.parameters else "in water" if prices else "in air"
         lines.append(
@@ -191,10 +190,10 @@ def convert(task: Conversion) -> tuple[str, dict[str, Any]]:
     data = {
         "from": source.name,
         "to": target.name,
-        "written": [str(path) for path in written],
+        "written": list(map(str, written)),
         "cameras": {name: camera.to_json() for name, camera in rig.cameras.items()},
         "price": {
-            name: {"model": one.model, "rms_px": one.rms_px, "max_px": one.max_px}
+            name: {key: getattr(one, key) for key in ("model", "rms_px", "max_px")}
             for name, one in prices.items()
         },
         "baseline_m": rig.baseline_m if len(rig.cameras) > 1 else None,
@@ -243,18 +242,12 @@ def fit_to_format(
     """
     where, instead = f"{task.target}: {target.title} cannot hold", "add --water NEAR FAR (m) for"
     notes = []
-    lost = {
-        f"the distortion {' '.join(names)}": [
-            name for name, camera in rig.cameras.items() if distorts(camera, *names)
-        ]
-        for terms, names in _TERMS.items()
-        if terms not in target.holds
-    }
-    for what, cameras in lost.items():
-        if cameras:
+    for terms, names in _TERMS.items():
+        lost = [name for name, one in rig.cameras.items() if distorts(one, *names)]
+        if lost and terms not in target.holds:
             raise CalibrationError(
-                f"{where} {what} of {', '.join(cameras)}: choose another format, or {instead} the "
-                "best fit"
+                f"{where} the distortion {' '.join(names)} of {', '.join(lost)}: choose "
+                f"another format, or {instead} the best fit"
             )
     if target.max_cameras is not None and len(rig.cameras) > target.max_cameras:
         raise CalibrationError(f"{where} {len(rig.cameras)} cameras: choose one with --camera")

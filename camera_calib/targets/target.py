@@ -42,6 +42,7 @@ TAG_BITS, TAG_BORDER_BITS = 10, 2
 _DEFAULT_DICTIONARY = "DICT_5X5_1000"
 _MIN_COUNT, _MAX_COUNT = 3, 100
 _MIN_M, _MAX_M = 1e-4, 10.0
+_MIN_MARKER, _MAX_MARKER = 0.3, 0.95
 _MIN_SPACING, _MAX_SPACING = 0.1, 1.0
 _LENGTH = r"(?:\d+\.?\d*|\.\d+)(?:mm|cm|m)"
 _UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
@@ -99,26 +100,18 @@ class Target:
                 f"target: a {self.kind} has {', '.join(own) or 'no more than counts and a size'}; "
                 f"{_GRAMMAR}"
             )
-        if not (minimum <= self.columns <= _MAX_COUNT and minimum <= self.rows <= _MAX_COUNT):
-            raise CalibrationError(
-                f"target: {self.columns}x{self.rows} {counted}: each count must be {minimum} to "
-                f"{_MAX_COUNT}"
-            )
-        if not _MIN_M <= self.size_m <= _MAX_M:
-            raise CalibrationError(
-                f"target: {self.size_m * 1e3:g} mm for a {sized}: it must be {_MIN_M * 1e3:g} to "
-                f"{_MAX_M * 1e3:g} mm; check the unit"
-            )
-        if self.marker_m is not None and not 0.3 <= self.marker_m / self.size_m <= 0.95:
-            raise CalibrationError(
-                f"target: markers of {self.marker_m * 1e3:g} mm in squares of "
-                f"{self.size_m * 1e3:g} mm: a marker must be 30 to 95 % of its square"
-            )
-        if self.spacing is not None and not _MIN_SPACING <= self.spacing <= _MAX_SPACING:
-            raise CalibrationError(
-                f"target: spacing {self.spacing:g}: it is the gap over the tag, "
-                f"{_MIN_SPACING} to {_MAX_SPACING} (Kalibr's tagSpacing, such as 0.3)"
-            )
+        share = None if self.marker_m is None else self.marker_m / self.size_m
+        for what, number, low, high in (
+            (f"a count of {counted}", self.columns, minimum, _MAX_COUNT),
+            (f"a count of {counted}", self.rows, minimum, _MAX_COUNT),
+            (f"mm for a {sized}", 1e3 * self.size_m, 1e3 * _MIN_M, 1e3 * _MAX_M),
+            ("of a square's side for its marker", share, _MIN_MARKER, _MAX_MARKER),
+            ("of a tag's side for its gap (spacing)", self.spacing, _MIN_SPACING, _MAX_SPACING),
+        ):
+            if number is not None and not low <= number <= high:
+                raise CalibrationError(
+                    f"target: {number:g} {what}: it must be {low:g} to {high:g}; check the unit"
+                )
         if self.kind == "chessboard":
             return
         family = TAG_FAMILY if self.dictionary is None else self.dictionary
