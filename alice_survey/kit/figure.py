@@ -34,7 +34,7 @@ from matplotlib.colors import (
     to_hex,
 )
 from matplotlib.figure import Figure as Sheet
-from matplotlib.patches import PathPatch, Rectangle
+from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
@@ -48,7 +48,7 @@ from alice_survey.kit.map import round_length
 __all__ = [
     "BAND", "GRID", "INK", "INKS", "MARKS", "SOFT", "WIDTH_IN", "Axes", "BoundaryNorm",
     "LineCollection", "LinearSegmentedColormap", "ListedColormap",
-    "Outline", "PathPatch", "PolyCollection", "Rectangle",
+    "Outline", "PathPatch", "PolyCollection",
     "Sheet", "check_figure_path", "colour_bar", "draw_figure", "even_limit", "figure_style",
     "map_axes", "new_figure", "north_arrow", "palette_colours", "palette_steps", "plain_name",
     "png_of", "save_figure",

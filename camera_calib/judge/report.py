@@ -17,7 +17,6 @@ from alice_survey.kit.figure import (
     INKS,
     Axes,
     LinearSegmentedColormap,
-    Rectangle,
     Sheet,
     colour_bar,
     figure_style,
@@ -29,7 +28,7 @@ from alice_survey.kit.page import render_html
 from alice_survey.kit.words import with_sigma
 from camera_calib.calibration import Calibration
 from camera_calib.judge.judgement import Judgement, judge, verdicts
-from camera_calib.judge.residuals import COVERED_REACH, GATE_SIGMAS
+from camera_calib.judge.residuals import GATE_SIGMAS
 from camera_calib.judge.uncertainty import parameter_cells
 from camera_calib.judge.validation import HeldOut, LengthErrors
 
@@ -156,9 +155,8 @@ def _sections(judged: Judgement) -> Iterator[Section]:
             Figure(
                 png=_plot_coverage(judged),
                 title="Where points fell",
-                alt="Counts of points by cell of each frame; corners without points hatched",
-                shows="Points seen by cell. Hatched corners have none: distortion is extrapolated "
-                "there.",
+                alt="Counts of points by cell of each frame; corners without points are named",
+                shows="Points seen by cell. In corners without any, distortion is extrapolated.",
                 good="All cells filled, corners too.",
                 otherwise="Hold the target in the empty parts, partly out of the frame if it can "
                 "be read so (ChArUco, AprilTags).",
@@ -305,15 +303,14 @@ def _plot_profiles(judged: Judgement) -> bytes:
 
 @figure_style()
 def _plot_coverage(judged: Judgement) -> bytes:
-    """Number of points over each frame; red marks corners that none came near."""
+    """Number of points over each frame, and corners that none came near."""
     figure, grid = _frames(judged)
     largest = max(int(c.coverage.counts.max()) for c in judged.cameras.values())
     for axes, (name, camera) in zip(grid, judged.cameras.items(), strict=True):
         model = judged.calibration.rig.cameras[name]
-        size = (model.width_px, model.height_px)
         image = axes.imshow(
             np.ma.masked_equal(camera.coverage.counts, 0),
-            extent=(0, size[0], size[1], 0),
+            extent=(0, model.width_px, model.height_px, 0),
             cmap=_SEQUENTIAL,
             vmin=0,
             vmax=largest,
@@ -321,15 +318,8 @@ def _plot_coverage(judged: Judgement) -> bytes:
         )
         axes.set_facecolor("#f1ece6")
         axes.plot(*camera.seen.pixels.T, ".", ms=1.3, color=INK, alpha=0.45)
-        wide, high = ((1 - COVERED_REACH) * side / 2 for side in size)
-        for corner in camera.coverage.uncovered:
-            place = (
-                0.0 if "left" in corner else size[0] - wide,
-                0.0 if "top" in corner else size[1] - high,
-            )
-            axes.add_patch(
-                Rectangle(place, wide, high, fill=False, hatch="////", edgecolor="#b3261e", lw=1.5)
-            )
+        if camera.coverage.uncovered:
+            axes.set_xlabel(f"x (px);  no point near {', '.join(camera.coverage.uncovered)}")
     colour_bar(image, grid, "points in a cell")
     return png_of(figure)
 
