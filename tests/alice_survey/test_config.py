@@ -7,7 +7,6 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pydantic import ValidationError
 
 from alice_survey.core.config import (
     REMOVED,
@@ -83,14 +82,6 @@ def test_no_value_slips_through_its_bounds(value: float) -> None:
         assert "plan.side_overlap" in fault({"plan": {"side_overlap": value}})
 
 
-def test_sections_cannot_be_changed() -> None:
-    config = SurveyConfig()
-    with pytest.raises(ValidationError):
-        config.seed = 3  # type: ignore[misc]
-    with pytest.raises(ValidationError):
-        config.plan.altitude_m = 3.0  # type: ignore[misc]
-
-
 def test_settings_come_back_from_their_json() -> None:
     config = parse_config(
         {
@@ -125,16 +116,6 @@ def test_the_index_of_water_follows_from_temperature_salinity_and_depth() -> Non
 )  # fmt: skip
 def test_water_is_given_once_and_whole(water: dict[str, float], named: str) -> None:
     assert named in fault({"water": water})
-
-
-def test_a_corner_out_of_range_is_named() -> None:
-    text = fault({"area": {"polygon_latlon_deg": [[0, 0], [95, 0], [0, 1]]}})
-    assert "area.polygon_latlon_deg.1.0 = 95" in text
-
-
-def test_a_missing_file_says_how_to_make_one(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"none\.toml"):
-        load_config(tmp_path / "none.toml")
 
 
 @pytest.mark.parametrize(
@@ -178,7 +159,7 @@ def test_files_named_in_settings_are_relative_to_them(tmp_path: Path) -> None:
 def test_thrusters_have_their_health_by_name() -> None:
     config = parse_config({"vehicle": {"failures": ["stern", "bow=0.5", "port@60"]}}, "test")
     assert config.vehicle.impaired == {"stern": 0.0, "bow": 0.5}
-    for wrong in ("bow=1.5", "bow=-0.1", "bow=half", "bow@-1", True):
+    for wrong in ("bow=1.5", "bow=-0.1", "bow=half", "bow@soon", "bow@-1", True):
         with pytest.raises(ConfigError, match=r"vehicle\.failures"):
             parse_config({"vehicle": {"failures": [wrong]}}, "test")
 
@@ -233,9 +214,6 @@ def test_weak_thrusters_are_read_from_their_texts() -> None:
     propellers = parse_failures(["bow:propeller=0.2", "stern:propeller@600"])
     assert propellers == ({}, [], [("bow", 0.0, 0.2), ("stern", 600.0, 0.0)])
     assert parse_failures([]) == ({}, [], [])
-    for wrong in ("bow@soon", "bow=half"):
-        with pytest.raises(ConfigError, match="stern@600"):
-            parse_failures([wrong])
 
 
 def test_a_key_that_is_gone_says_what_to_do() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from alice_survey.core.errors import WorkspaceError
-from alice_survey.core.run.events import EventFile, duration
+from alice_survey.core.run.events import EventFile
 
 TIME = "2023-11-14T22:13:20.250Z"
 
@@ -76,12 +76,3 @@ def test_a_pipe_is_written_to_as_well(tmp_path: Path) -> None:
         file.close()
     finally:
         os.close(reader)
-
-
-@pytest.mark.parametrize(
-    ("seconds", "words"),
-    [(0.42, "0.4 s"), (9.97, "10 s"), (59.4, "59 s"), (59.6, "1 min 00 s"), (3599.0, "59 min 59 s"),
-     (3600.0, "1 h 00 min"), (90_000.0, "25 h 00 min")],
-)  # fmt: skip
-def test_lengths_of_time_in_words(seconds: float, words: str) -> None:
-    assert duration(seconds) == words

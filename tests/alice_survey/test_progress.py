@@ -161,36 +161,6 @@ def test_a_stage_ends_what_was_left_in_it(run: Run, kept: Kept) -> None:
     assert len(kept.events) == 4
 
 
-def test_lines_say_what_took_long_and_stay_alive(
-    run: Run, clock: Clock, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with progress.part("sparse", 2, 5), progress.stage("mapping") as finish:
-        with progress.step("short", 3) as counter:
-            counter.advance(3)
-            clock.turn(1.9)
-        with progress.step("matching", 100) as counter:
-            for _ in range(50):
-                clock.turn(1.0)
-                counter.advance()
-                run.tick()
-        with progress.step("adjustment"):
-            clock.turn(3.0)
-        for _ in range(35):  # a part that has no name
-            clock.turn(1.0)
-            run.tick()
-        finish(took_s=125.3, cpu_s=1.0, peak_mib=1.0)
-    shown = capsys.readouterr()
-    assert shown.out == ""
-    assert shown.err.splitlines() == [
-        "sparse (2 of 5): mapping",
-        "mapping: matching 29 of 100 after 29 s, about 1 min 12 s left",
-        "mapping: matching: 50 done in 50 s",
-        "mapping: adjustment: done in 3.0 s",
-        "mapping: working for 1 min 25 s",
-        "mapping: done in 2 min 05 s, 1 MiB at most",
-    ]
-
-
 def test_what_hangs_is_reported_every_five_seconds(run: Run, kept: Kept, clock: Clock) -> None:
     with progress.step("solve"):
         for _ in range(20):

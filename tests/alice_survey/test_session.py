@@ -4,7 +4,6 @@ import contextlib
 import json
 import os
 import pty
-import re
 import signal
 import subprocess
 import sys
@@ -23,6 +22,7 @@ from alice_survey.app.commands.base import ReportCommand, option
 from alice_survey.core.errors import PlanError, note, warn
 from alice_survey.core.executor import local_executor
 from alice_survey.core.run import interrupts, progress
+from tests.alice_survey.app.studio.client import until
 
 
 class Works(ReportCommand):
@@ -69,15 +69,6 @@ def test_events_follow_a_run_from_its_beginning_to_its_end(tmp_path: Path) -> No
     assert found[0]["process"] == os.getpid()
     assert found[-1]["exit_code"] == 0
     assert [event["time_utc"] for event in found] == sorted(event["time_utc"] for event in found)
-
-
-def test_quiet_leaves_the_result_and_the_warnings() -> None:
-    def work() -> None:
-        note("compiling")
-        warn("odd")
-
-    done = CliRunner().invoke(made(work), ["work-hard", "--quiet"])
-    assert (done.exit_code, done.stdout, done.stderr) == (0, "done 1\n", "warning: odd\n")
 
 
 @pytest.mark.parametrize(
@@ -237,7 +228,7 @@ def test_a_signal_ends_all_processes_and_says_how_to_go_on(
         stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
         preexec_fn=_default_signals,
     )  # fmt: skip
-    _wait_until(lambda: len(list(folder.glob("begun*"))) == workers)
+    until(lambda: len(list(folder.glob("begun*"))) == workers)
     os.killpg(run.pid, number)  # a terminal sends it to all processes
     if times == 2:
         time.sleep(0.02)  # two that come while one is pending are one
@@ -246,7 +237,7 @@ def test_a_signal_ends_all_processes_and_says_how_to_go_on(
     by = "" if number == signal.SIGINT else f" by {number.name}"
     assert (run.returncode, out) == (128 + number, "")
     assert shown.splitlines() == ["made", f"interrupted{by}; the same command goes on from here"]
-    _wait_until(lambda: not _of_session(run.pid))
+    until(lambda: not _of_session(run.pid))
     assert [p.name for p in folder.iterdir() if p.is_dir()] == ["made.partial"]
     *_, before, last = events_of(file)
     assert (before["event"], before["message"]) == ("error", f"interrupted{by}")
@@ -283,12 +274,12 @@ def test_a_terminal_that_closes_ends_what_was_not_meant_to_outlive_it(
         signal.signal(signal.SIGHUP, signal.SIG_IGN if outlives else signal.SIG_DFL)
         command = [str(tmp_path / "script.py"), "parallel", str(folder), "--log-file", str(file)]
         os.execv(sys.executable, [sys.executable, *command])  # noqa: S606 (a fork's own end)
-    _wait_until(lambda: len(list(folder.glob("begun*"))) == 2)
+    until(lambda: len(list(folder.glob("begun*"))) == 2)
     os.close(terminal)
     _, status = os.waitpid(run, 0)
     code = 0 if outlives else 129
     assert os.waitstatus_to_exitcode(status) == code
-    _wait_until(lambda: not _of_session(run))
+    until(lambda: not _of_session(run))
     *_, before, last = events_of(file)
     assert (last["event"], last["exit_code"]) == ("run_finished", code)
     assert before.get("message") == (None if outlives else "interrupted by SIGHUP")
@@ -336,14 +327,6 @@ def _default_signals() -> None:
         signal.signal(number, signal.SIG_DFL)
 
 
-def _wait_until(true: Callable[[], bool]) -> None:
-    for _ in range(600):
-        if true():
-            return
-        time.sleep(0.05)
-    pytest.fail("it does not happen")
-
-
 def _of_session(leader: int) -> list[int]:
     """Processes that still run in the session of one that has ended."""
     found = []
@@ -374,48 +357,3 @@ def test_a_killed_worker_is_reported_in_one_line(tmp_path: Path) -> None:
 def _dies(item: int) -> int:
     os.kill(os.getpid(), signal.SIGKILL)
     return item
-
-
-BARS = """
-import time
-import typer
-from alice_survey.core.run import progress
-from alice_survey.app.cli.main import make_app
-from alice_survey.app.commands.base import CommandModel
-from alice_survey.core.errors import warn
-
-def run(self):
-    with progress.part("sparse", 2, 5), progress.stage("mapping") as finish:
-        with progress.step("[features]", 10) as counter:
-            for _ in range(10):
-                time.sleep(0.2)
-                counter.advance()
-            warn("few [b]features[/b] in " + "a very long name " * 10)
-        with progress.step("solve"):
-            time.sleep(0.3)
-        finish(took_s=125.0, cpu_s=1.0, peak_mib=1.0)
-    return "the result", {}
-
-make_app([type("Run", (CommandModel,), {"name": "run", "run": run})])()
-"""
-
-
-def test_a_terminal_shows_bars_and_is_left_as_it_was(tmp_path: Path) -> None:
-    (tmp_path / "bars.py").write_text(BARS)
-    leader, follower = os.openpty()
-    run = subprocess.Popen(
-        [sys.executable, str(tmp_path / "bars.py")], stdout=subprocess.PIPE, stderr=follower,
-        env={**os.environ, "TERM": "xterm-256color", "COLUMNS": "100", "LINES": "30"},
-    )  # fmt: skip
-    os.close(follower)
-    shown = b""
-    with contextlib.suppress(OSError):  # what reading a terminal gives whose writer has ended
-        while part := os.read(leader, 65536):
-            shown += part
-    os.close(leader)
-    out, _ = run.communicate(timeout=20)
-    assert (run.returncode, out) == (0, b"the result\n")
-    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown.decode())
-    for shown_part in ("2 of 5", "[features]", "solve", "[b]features[/b]", "2 min 05 s"):
-        assert shown_part in text
-    assert shown.count(b"\x1b[?25l") == shown.count(b"\x1b[?25h") == 1  # the cursor is back

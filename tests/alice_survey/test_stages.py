@@ -203,12 +203,6 @@ def test_settings_that_are_not_named_leave_a_stage_as_it_is(old: Path) -> None:
     assert same == ["calibrate", "placing", "dense", "mosaic", "mesh", "report"]
 
 
-def test_a_stage_is_found_by_its_name_and_by_its_folder() -> None:
-    assert spec("flight") is spec("fly")
-    with pytest.raises(WorkspaceError, match=r"'flights'.*fly, pool"):
-        spec("flights")
-
-
 # A stage, added here alone.
 
 

@@ -2,9 +2,6 @@
 
 import csv
 import math
-import subprocess
-import sys
-import tempfile
 from collections.abc import Iterable
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -21,7 +18,8 @@ from alice_survey.core.frames import Array, Datum, rotation_from_attitude
 from alice_survey.sim.vehicle.log import write_vehicle_log
 from alice_survey.sim.vehicle.vehicle import vehicle_from_file
 from camera_calib.camera import Camera
-from camera_calib.rig import Rig, design_rig, write_rig
+from camera_calib.formats.convert import FORMATS
+from camera_calib.rig import Rig, design_rig
 from camera_calib.targets.pattern import black_rectangles
 from camera_calib.targets.target import Target, parse_target
 from missions.logs.ros_builder import flipped_quaternion
@@ -51,6 +49,14 @@ FAST_S = 1.5
 def rows_of(path: Path) -> list[dict[str, str]]:
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
+
+
+def flown_rows(reef: Path, every: int) -> list[dict[str, float]]:
+    """Rows of the navigation of the flight."""
+    return [
+        {name: float(value or "nan") for name, value in row.items()}
+        for row in rows_of(reef / "flight/navigation.csv")[::every]
+    ]
 
 
 def boards(folder: Path, *, air: bool) -> None:
@@ -118,17 +124,7 @@ def smaller(reef: Path, folders: dict[str, Path], stations: Iterable[int], width
 
 def calibrated_in_air(path: Path, kind: str) -> None:
     """Write the designed cameras as another tool would that calibrated them in air."""
-    rig = in_air(design_rig(CameraConfig(), WaterConfig(), 4))
-    with tempfile.TemporaryDirectory() as scratch:
-        write_rig(Path(scratch) / "rig.json", rig)
-        subprocess.run(
-            [
-                *(sys.executable, "-m", "alice_survey", "camera", "convert", "-q"),
-                *(f"{scratch}/rig.json", str(path), "--to", kind),
-            ],
-            check=True,
-            capture_output=True,
-        )
+    FORMATS[kind].write(path, in_air(design_rig(CameraConfig(), WaterConfig(), 4)))
 
 
 def smaller_rig(rig: Rig, width_px: int) -> Rig:
@@ -233,10 +229,7 @@ def navigation(reef: Path, path: Path, *, dated: bool) -> None:
 
 def vehicle_logs(reef: Path, folder: Path) -> None:
     """Write the flight as COLA2, ArduSub and a ground station would have logged it."""
-    rows = [
-        {name: float(value or "nan") for name, value in row.items()}
-        for row in rows_of(reef / "flight/navigation.csv")[::10]
-    ]
+    rows = flown_rows(reef, 10)
     bag, dvl = Bag(1), Bag(1)
     boot_us = 20_000_000
     messages: list[tuple[object, ...]] = []
@@ -298,10 +291,7 @@ def vehicle_logs(reef: Path, folder: Path) -> None:
 
 def robot_bag(reef: Path, path: Path, stations: Iterable[int], width_px: int) -> None:
     """Write small pictures of some stations, and what a DVL, an IMU and a depth sensor said."""
-    rows = [
-        {name: float(value or "nan") for name, value in row.items()}
-        for row in rows_of(reef / "flight/navigation.csv")[::5]
-    ]
+    rows = flown_rows(reef, 5)
     time_s = np.array([row["time_s"] for row in rows])
     place = np.array(
         [[row[n] for n in ("latitude_deg", "longitude_deg", "depth_m")] for row in rows]
@@ -364,31 +354,23 @@ Z_ww = -130.0
 K_pp = -2.0
 M_qq = -9.0
 N_rr = -7.0
+""" + "".join(
+    f"""
 [[thrusters]]
-name = "port"
-position_body_m = [-0.4, -0.2, 0.0]
-direction_body = [1.0, 0.0, 0.0]
-diameter_m = 0.076
-kt_forward = 0.47
-kt_reverse = 0.40
-time_constant_s = 0.15
-[[thrusters]]
-name = "starboard"
-position_body_m = [-0.4, 0.2, 0.0]
-direction_body = [1.0, 0.0, 0.0]
-diameter_m = 0.076
-kt_forward = 0.47
-kt_reverse = 0.40
-time_constant_s = 0.15
-[[thrusters]]
-name = "vertical"
-position_body_m = [0.0, 0.0, 0.0]
-direction_body = [0.0, 0.0, 1.0]
+name = "{name}"
+position_body_m = {place}
+direction_body = {way}
 diameter_m = 0.076
 kt_forward = 0.47
 kt_reverse = 0.40
 time_constant_s = 0.15
 """
+    for name, place, way in (
+        ("port", [-0.4, -0.2, 0.0], [1.0, 0.0, 0.0]),
+        ("starboard", [-0.4, 0.2, 0.0], [1.0, 0.0, 0.0]),
+        ("vertical", [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]),
+    )
+)
 """A vehicle with three thrusters; what its owner knows of it stands in the page on it."""
 
 

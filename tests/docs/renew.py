@@ -7,15 +7,12 @@ import argparse
 import tempfile
 from pathlib import Path
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
+from PIL import Image, ImageOps
 
 from tests.alice_survey.kit.browser import chromium
 from tests.docs.given import TUTORIAL, Made
 from tests.docs.pages import DOCS
 
-Picture = NDArray[np.uint8]
 MAX_BYTES = 1_500_000
 STATION = 14
 """One that shows the amphora."""
@@ -44,66 +41,47 @@ def renew(made: Path, out: Path) -> None:
     """
     out.mkdir(exist_ok=True)
     reef = made / "reef"
-    png(out / "plan.png", to_width(read(reef / "plan/map.png"), 800))
-    png(out / "flight.png", to_width(read(reef / "flight/track.png"), 1400))
+    to_width(read(reef / "plan/map.png"), 800).save(out / "plan.png", optimize=True)
+    to_width(read(reef / "flight/track.png"), 1400).save(out / "flight.png", optimize=True)
     pair = [read(reef / f"images/{side}/{STATION:06d}.png") for side in ("left", "right")]
-    jpeg(out / "pictures.jpg", side_by_side([*pair, read(reef / "pool/left/03.png")], 338))
+    pictures = side_by_side([*pair, read(reef / "pool/left/03.png")], 338)
+    pictures.save(out / "pictures.jpg", quality=82)
     surface = [cut(read(reef / "dense/dem.png")), read(reef / "mosaic/mosaic.png")]
-    jpeg(out / "surface.jpg", side_by_side(surface, 620))
-    jpeg(out / "mesh.jpg", to_width(cut(read(reef / "mesh/mesh.png")), 1000))
-    png(out / "errors.png", read(reef / "evaluation/errors.png"))
+    side_by_side(surface, 620).save(out / "surface.jpg", quality=82)
+    to_width(cut(read(reef / "mesh/mesh.png")), 1000).save(out / "mesh.jpg", quality=82)
+    read(reef / "evaluation/errors.png").save(out / "errors.png", optimize=True)
     photograph(reef / "report/report.html", out / "report.jpg")
     size = sum(path.stat().st_size for path in out.iterdir())
     if size > MAX_BYTES:
         raise ValueError(f"{size / 1e6:.2f} MB of pictures in {out}")
 
 
-def read(path: Path) -> Picture:
+def read(path: Path) -> Image.Image:
     """A picture, in colour; what is clear becomes white."""
-    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if picture is None:
-        raise FileNotFoundError(path)
-    if picture.ndim == 3 and picture.shape[2] == 4:
-        clear = 1 - picture[..., 3:] / 255.0
-        picture = np.rint(picture[..., :3] * (1 - clear) + 255 * clear).astype(np.uint8)
-    return np.asarray(picture, np.uint8)
+    picture = Image.open(path).convert("RGBA")
+    return Image.alpha_composite(Image.new("RGBA", picture.size, "white"), picture).convert("RGB")
 
 
-def cut(picture: Picture) -> Picture:
+def cut(picture: Image.Image) -> Image.Image:
     """What is left without a white border."""
-    there = np.argwhere(np.any(picture < 255 - NOTICED_PX, axis=-1))
-    (top, left), (bottom, right) = there.min(axis=0), there.max(axis=0) + 1
-    return picture[top:bottom, left:right]
+    dark = ImageOps.invert(picture.convert("L")).point(lambda value: 255 * (value > NOTICED_PX))
+    return picture.crop(dark.getbbox())
 
 
-def to_width(picture: Picture, width: int) -> Picture:
+def to_width(picture: Image.Image, width: int) -> Image.Image:
     """The picture at another size."""
-    return scaled(picture, width / picture.shape[1])
+    return picture.resize((width, round(picture.height * width / picture.width)))
 
 
-def scaled(picture: Picture, by: float) -> Picture:
-    """The picture, larger or smaller."""
-    how = cv2.INTER_AREA if by < 1 else cv2.INTER_CUBIC
-    return np.asarray(cv2.resize(picture, None, fx=by, fy=by, interpolation=how), np.uint8)
-
-
-def side_by_side(pictures: list[Picture], height: int) -> Picture:
+def side_by_side(pictures: list[Image.Image], height: int) -> Image.Image:
     """Pictures of one height with gaps between them."""
-    row = []
-    for picture in pictures:
-        small = scaled(picture, height / picture.shape[0])[:height]
-        row += [small, np.full((len(small), GAP_PX, 3), 255, np.uint8)]
-    return np.hstack(row[:-1])
-
-
-def jpeg(path: Path, picture: Picture) -> None:
-    """Write what was photographed."""
-    cv2.imwrite(str(path), picture, [cv2.IMWRITE_JPEG_QUALITY, 82])
-
-
-def png(path: Path, picture: Picture) -> None:
-    """Write what was drawn."""
-    cv2.imwrite(str(path), picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    row = [to_width(one, round(one.width * height / one.height)) for one in pictures]
+    width = sum(one.width + GAP_PX for one in row) - GAP_PX
+    sheet, left = Image.new("RGB", (width, height), "white"), 0
+    for one in row:
+        sheet.paste(one, (left, 0))
+        left += one.width + GAP_PX
+    return sheet
 
 
 def photograph(page: Path, path: Path) -> None:

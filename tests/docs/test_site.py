@@ -1,6 +1,5 @@
 """The site of `docs/` builds without a warning, is whole, and needs no network."""
 
-import importlib.util
 import itertools
 import os
 import re
@@ -9,13 +8,10 @@ import sys
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
 from typing import Any
 
-import markdown
 import pytest
 import yaml
-from mkdocs.exceptions import PluginError
 
 import alice_survey as alice
 from tests.alice_survey.kit.browser import Heard, chromium
@@ -141,41 +137,6 @@ def test_lists_and_tables_stand_apart(page: Path) -> None:
     for before, line in itertools.pairwise(plain.split("\n")):
         if _LIST.match(line) and before.strip():
             assert _WITHIN.match(before), line
-
-
-@pytest.fixture(scope="module")
-def hooks() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("hooks_of_docs", DOCS / "hooks.py")
-    assert spec is not None
-    assert spec.loader is not None
-    loaded = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(loaded)
-    return loaded
-
-
-def html_of(text: str, hooks: ModuleType) -> str:
-    """A page as mkdocs makes it of Markdown."""
-    given = [
-        part if isinstance(part, dict) else {part: {}} for part in SETTINGS["markdown_extensions"]
-    ]
-    settings = {name: values for part in given for name, values in part.items()}
-    made = markdown.markdown(text, extensions=list(settings), extension_configs=settings)
-    page = SimpleNamespace(file=SimpleNamespace(src_uri="page.md"))
-    return str(hooks.on_page_content(made, page=page, config=None, files=None))
-
-
-def test_formulas_within_and_between_lines(hooks: ModuleType) -> None:
-    made = html_of("Of $a < b$ follows\n\n$$\n\\frac{a}{b} < 1\n$$\n\nfor $b > 0$.", hooks)
-    assert made.count("<math") == 3
-    assert made.count('display="block"') == 1
-    assert "<mfrac><mrow><mi>a</mi></mrow><mrow><mi>b</mi></mrow></mfrac>" in made
-    assert "$" not in made
-
-
-@pytest.mark.parametrize("wrong", [r"$\frok{a}{b}$", r"$\left(a$", "$a_{b$"])
-def test_a_wrong_formula_stops_the_build(wrong: str, hooks: ModuleType) -> None:
-    with pytest.raises(PluginError, match=r"page\.md"):
-        html_of(wrong, hooks)
 
 
 @pytest.fixture(scope="module")

@@ -309,53 +309,31 @@ def _csv(
 
 
 TARGETS = (
+    Target("ROS 1 bag", "binary", "a.bag", partial(_bag, version=1), read_any_log),
+    Target("ROS 2 bag, MCAP", "binary", "bag/bag.mcap", partial(_bag, version=2), read_any_log),
     Target(
-        name="ROS 1 bag", syntax="binary", file="a.bag", build=partial(_bag, version=1),
-        read=read_any_log,
+        "ROS 2 bag, SQLite", "binary", "bag/bag.db3", partial(_bag, version=2, storage="SQLITE3"),
+        read_any_log,
     ),
     Target(
-        name="ROS 2 bag, MCAP", syntax="binary", file="bag/bag.mcap",
-        build=partial(_bag, version=2), read=read_any_log,
+        "ROS 2 bag, metadata", "text", "bag/metadata.yaml", partial(_bag, version=2), read_any_log,
     ),
-    Target(
-        name="ROS 2 bag, SQLite", syntax="binary", file="bag/bag.db3",
-        build=partial(_bag, version=2, storage="SQLITE3"), read=read_any_log,
-    ),
-    Target(
-        name="ROS 2 bag, metadata", syntax="text", file="bag/metadata.yaml",
-        build=partial(_bag, version=2), read=read_any_log,
-    ),
-    Target(
-        name="reports of a DVL", syntax="json", file="a.json", build=_dvl, read=read_dead_reckoned
-    ),
-    Target(name="ULog", syntax="binary", file="a.ulg", build=_ulog, read=read_any_log),
-    Target(
-        name="trigger log of pictures", syntax="csv", file="p.csv", build=_pairing,
-        read=read_pairing,
-    ),
-    Target(
-        name="DataFlash .BIN", syntax="binary", file="a.bin",
-        build=partial(_dataflash, name="a.bin"), read=read_any_log,
-    ),
-    Target(name="tlog", syntax="binary", file="a.tlog", build=_telemetry, read=read_any_log),
+    Target("reports of a DVL", "json", "a.json", _dvl, read_dead_reckoned),
+    Target("ULog", "binary", "a.ulg", _ulog, read_any_log),
+    Target("trigger log of pictures", "csv", "p.csv", _pairing, read_pairing),
+    Target("DataFlash .BIN", "binary", "a.bin", partial(_dataflash, name="a.bin"), read_any_log),
+    Target("tlog", "binary", "a.tlog", _telemetry, read_any_log),
     _csv("navigation CSV", "n.csv", partial(navigation_rows, dated=False), read_nav),
     _csv("navigation CSV, dated", "n.csv", partial(navigation_rows, dated=True), read_nav),
-    Target(name="triggers", syntax="csv", file="t.csv", build=_triggers, read=read_triggers),
-    Target(name="log to check", syntax="csv", file="d.csv", build=_check_log, read=check_dive),
+    Target("triggers", "csv", "t.csv", _triggers, read_triggers),
+    Target("log to check", "csv", "d.csv", _check_log, check_dive),
     _csv("tide", "tide.csv", _tide, read_tide),
     _csv("vehicle log", "v.csv", _vehicle_rows, read_vehicle_log),
-    Target(
-        name="column map", syntax="toml", file="map.toml", build=_column_map, read=read_foreign
-    ),
-    Target(name="foreign log", syntax="csv", file="log.csv", build=_column_map, read=read_foreign),
-    Target(name="vehicle TOML", syntax="toml", file="v.toml", build=_vehicle, read=read_vehicle),
-    Target(
-        name="vehicle JSON", syntax="json", file="v.json", build=_vehicle_json, read=read_vehicle
-    ),
-    Target(
-        name="coefficients", syntax="toml", file="c.toml", build=_written("c.toml", _coefficients),
-        read=read_coefficients,
-    ),
+    Target("column map", "toml", "map.toml", _column_map, read_foreign),
+    Target("foreign log", "csv", "log.csv", _column_map, read_foreign),
+    Target("vehicle TOML", "toml", "v.toml", _vehicle, read_vehicle),
+    Target("vehicle JSON", "json", "v.json", _vehicle_json, read_vehicle),
+    Target("coefficients", "toml", "c.toml", _written("c.toml", _coefficients), read_coefficients),
     _csv("bollard pull", "pull.csv", _pulls, read_pulls),
     _csv("current", "current.csv", _current, read_current),
 )  # fmt: skip

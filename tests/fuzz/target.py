@@ -7,7 +7,7 @@ from pathlib import Path
 from tests.fuzz.mutations import Syntax
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Target:
     """One kind of file, in good order, and its reader."""
 

@@ -42,21 +42,19 @@ def take_orientation_off(path: Path) -> object:
 
 TARGETS = (
     Target(
-        name="MP4 with GPS5", syntax="binary", file="GX010042.MP4",
-        build=lambda folder: _film(folder, gopro.gps5(_PLACES, _WHEN)), read=read_video,
-        examples=60,
+        "MP4 with GPS5", "binary", "GX010042.MP4",
+        lambda folder: _film(folder, gopro.gps5(_PLACES, _WHEN)), read_video, examples=60,
     ),
     Target(
-        name="MP4 with GPS9", syntax="binary", file="GX010042.MP4",
-        build=lambda folder: _film(folder, gopro.gps9(_PLACES, _WHEN)), read=read_video,
-        examples=60,
+        "MP4 with GPS9", "binary", "GX010042.MP4",
+        lambda folder: _film(folder, gopro.gps9(_PLACES, _WHEN)), read_video, examples=60,
     ),
     Target(
-        name="JPEG with an orientation", syntax="binary", file="a.jpg",
-        build=lambda folder: _turned(folder, "a.jpg"), read=take_orientation_off,
+        "JPEG with an orientation", "binary", "a.jpg", lambda folder: _turned(folder, "a.jpg"),
+        take_orientation_off,
     ),
     Target(
-        name="TIFF with an orientation", syntax="binary", file="a.tif",
-        build=lambda folder: _turned(folder, "a.tif"), read=take_orientation_off,
+        "TIFF with an orientation", "binary", "a.tif", lambda folder: _turned(folder, "a.tif"),
+        take_orientation_off,
     ),
 )  # fmt: skip

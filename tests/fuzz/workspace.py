@@ -1,7 +1,6 @@
 """Files of a workspace that a user writes, and references of other programs."""
 
 import re
-from collections.abc import Callable
 from functools import partial
 from importlib import resources
 from pathlib import Path
@@ -163,40 +162,26 @@ def read_reference(path: Path) -> object:
     return read_reference(path, _DATUM)
 
 
-def _target(
-    name: str, syntax: str, file: str, build: Callable[[Path], None],
-    read: Callable[[Path], object], **more: Any,
-) -> Target:  # fmt: skip
-    return Target(name=name, syntax=syntax, file=file, build=build, read=read, **more)  # type: ignore[arg-type]
-
-
 TARGETS = (
-    _target(
-        "survey.toml",
-        "toml",
-        "survey.toml",
-        partial(_survey, text=settings_template()),
+    Target(
+        "survey.toml", "toml", "survey.toml", partial(_survey, text=settings_template()),
         read_survey,
     ),
-    _target(
-        "survey.toml, demo", "toml", "survey.toml", partial(_survey, text=_DEMO), read_survey
-    ),
-    _target(
+    Target("survey.toml, demo", "toml", "survey.toml", partial(_survey, text=_DEMO), read_survey),
+    Target(
         "survey.toml, used", "toml", "survey.toml", partial(_survey, text=settings_template()),
         read_and_check_survey, examples=60,
     ),
-    _target("control.csv", "csv", "control.csv", _control, read_control),
-    _target("picks.csv", "csv", "picks.csv", _picks, read_picks),
-    _target("gcp_list.txt", "text", "gcp_list.txt", _gcp_list, read_foreign_control),
-    _target("markers of Metashape", "text", "markers.xml", _markers, read_foreign_control),
-    _target("reference PLY", "text", "a.ply", _reference_ply, read_reference),
-    _target("reference PLY, binary", "binary", "a.ply", _binary_ply, read_reference),
-    _target(
-        "reference LAS", "binary", "a.las", partial(build_las, name="a.las"), read_reference,
-    ),
-    _target(
+    Target("control.csv", "csv", "control.csv", _control, read_control),
+    Target("picks.csv", "csv", "picks.csv", _picks, read_picks),
+    Target("gcp_list.txt", "text", "gcp_list.txt", _gcp_list, read_foreign_control),
+    Target("markers of Metashape", "text", "markers.xml", _markers, read_foreign_control),
+    Target("reference PLY", "text", "a.ply", _reference_ply, read_reference),
+    Target("reference PLY, binary", "binary", "a.ply", _binary_ply, read_reference),
+    Target("reference LAS", "binary", "a.las", partial(build_las, name="a.las"), read_reference),
+    Target(
         "reference LAZ", "binary", "a.laz", partial(build_las, name="a.laz"), read_reference,
         examples=4,
     ),
-    _target("reference DEM", "binary", "a.tif", _reference_dem, read_reference),
+    Target("reference DEM", "binary", "a.tif", _reference_dem, read_reference),
 )  # fmt: skip

@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -45,3 +46,24 @@ class Heard:
     def _console(self, kind: str, text: str) -> None:
         if kind in ("error", "warning"):
             self.complaints.append(f"{kind}: {text}")
+
+
+def is_accessible(page: Any, shot: Path | None = None, sizes: tuple[Any, ...] = ()) -> None:
+    """No violations that axe knows, and nothing wider than the screen; a picture of the page.
+
+    Args:
+        page: as it is, or at `sizes`, the last of which stays.
+        shot: PNG to write, with the width in its name.
+        sizes: of the viewport.
+    """
+    from axe_playwright_python.sync_playwright import Axe
+
+    for size in sizes or (page.viewport_size,):
+        if size != page.viewport_size:
+            page.set_viewport_size(size)
+        found = Axe().run(page, options={"resultTypes": ["violations"]}).response["violations"]
+        assert [(one["id"], one["nodes"][0]["html"][:160]) for one in found] == []
+        assert page.evaluate("document.documentElement.scrollWidth") <= size["width"]
+        if shot is not None:
+            path = shot.with_name(f"{shot.stem}-{size['width']}.png")
+            page.screenshot(path=str(path), full_page=size["width"] < 700)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from PIL import Image
+from PIL import Image, ImageOps
 
 from alice_survey.kit.document import (
     Figure,
@@ -81,22 +81,12 @@ def picture_layer(name: str, title: str, picture: Image.Image, **more: object) -
 def sketch_map(side: int = 1100) -> SurveyMap:
     floor = seafloor(side, side - 90)
     depths = floor.convert("L").resize((side // 2, (side - 90) // 2))
-    ramp = np.array([[int(c[i : i + 2], 16) for i in (1, 3, 5)] for c in VIRIDIS])
-    level = np.linspace(0, 255, len(VIRIDIS))
-    coloured = np.stack(
-        [np.interp(np.asarray(depths), level, ramp[:, band]) for band in range(3)], axis=-1
-    )
-    dem = Image.fromarray(coloured.astype(np.uint8))
+    dem = ImageOps.colorize(depths, VIRIDIS[0], VIRIDIS[-1], mid=VIRIDIS[2])
     seen = Image.new("RGBA", dem.size, (230, 159, 0, 0))
     seen.paste((230, 159, 0, 120), (0, 0, dem.width // 3, dem.height))
     coarse = {"pixel_m": 2 * PIXEL_M}
     rows = np.linspace(-1.6, 1.6, 7)
     stations = [(e, n) for n in rows for e in np.linspace(-1.7, 1.7, 9)]
-    track = [
-        (east, float(n) + 0.03 * np.sin(6 * east))
-        for i, n in enumerate(rows)
-        for east in np.linspace(-1.9, 1.9, 20)[:: 1 if i % 2 == 0 else -1]
-    ]
     wide, high = 0.42, 0.34
     return SurveyMap(
         unit="m",
@@ -135,10 +125,6 @@ def sketch_map(side: int = 1100) -> SurveyMap:
                 name="plan", title="Planned lines", about="", kind="line", colour="#e69f00",
                 dashed=True, shapes=[[(-1.9, float(n)), (1.9, float(n))] for n in rows],
                 texts=[f"Line {i}" for i in range(len(rows))],
-            ),
-            ShapeLayer(
-                name="track", title="Flown track", about="From the adjusted cameras.",
-                kind="line", shapes=[track], texts=["0.2 m/s, 58 stations"],
             ),
             ShapeLayer(
                 name="points", title="Check points", about="Left out of the adjustment.",

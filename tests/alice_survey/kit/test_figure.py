@@ -1,10 +1,8 @@
-import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from alice_survey.kit.document import ShapeLayer, SurveyMap
 from alice_survey.kit.figure import (
     even_limit,
     figure_style,
@@ -13,9 +11,8 @@ from alice_survey.kit.figure import (
     save_figure,
     scale_bar,
 )
-from alice_survey.kit.page import png_size
-from alice_survey.kit.paper import flat_picture, map_figures, with_stills
-from tests.alice_survey.kit.sketch import picture_layer, seafloor, sketch_map
+from alice_survey.kit.paper import flat_picture
+from tests.alice_survey.kit.sketch import picture_layer, seafloor
 
 
 @figure_style()
@@ -67,23 +64,3 @@ def test_a_flat_picture_shows_every_tile_on_white() -> None:
     clear = floor.convert("RGBA")
     clear.putalpha(0)
     assert (flat_picture(picture_layer("c", "C", clear)) == 255).all()
-
-
-def test_every_base_picture_has_its_map_in_print() -> None:
-    survey_map = with_stills(sketch_map(600))
-    assert [figure.title for figure in survey_map.stills] == ["Mosaic", "Height", "Its sigma"]
-    height = survey_map.stills[1].svg.decode()
-    texts = set(re.findall(r">([^<>]+)</text>", height))
-    assert {"east, m", "north, m", "height above the datum, m"} <= texts
-    numbers = [float(t.replace("−", "-")) for t in texts if re.fullmatch(r"−?1[45]\.\d", t)]
-    assert len(numbers) >= 3 and min(numbers) >= -15.4 and max(numbers) <= -14.8
-    assert "data:image/jpeg" in survey_map.stills[0].svg.decode()
-
-
-def test_a_map_of_shapes_alone_is_drawn() -> None:
-    square = ShapeLayer(
-        name="area", title="Area", about="", kind="polygon", shapes=[[(0, 0), (1, 0), (1, 1)]]
-    )
-    (figure,) = map_figures(SurveyMap(layers=[square], unit="m", origin=""))
-    assert figure.title == "Area"
-    assert png_size(figure.png)[0] > 300

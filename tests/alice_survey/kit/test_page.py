@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from alice_survey.kit.document import Report, Table
+from alice_survey.kit.document import Report
 from alice_survey.kit.map import map_extent
-from alice_survey.kit.page import numeric_columns, render_html
+from alice_survey.kit.page import render_html
 from tests.alice_survey.kit.sketch import RUDE, sketch_report
 
 ROOT = Path(__file__).parents[3]
@@ -116,22 +116,6 @@ def test_extent_of_the_map(report: Report) -> None:
     assert report.map is not None
     # The mosaic goes from -2.2 m to 0.2 m east; the footprints reach farther east and south.
     assert map_extent(report.map) == pytest.approx((-2.2, -1.6 - 0.34, 1.7 + 0.42, 2.1))
-
-
-@pytest.mark.parametrize(
-    ("cell", "number"),
-    [
-        ("12", True), ("-0.3 mm", True), ("−0.3 mm", True), ("1.2e-05", True), ("99.4 %", True),
-        ("0.4 ± 0.1 mm", True), ("3 of 58", True), ("1 234.5", True), ("4.10.0", True),
-        ("640 x 480", True), ("< 0.01", True), ("12.3 m²", True),
-        ("left/000001.png", False), ("good", False), ("2 lines are too far apart", False),
-        ("2026-05-04T10:00:00Z", False),
-    ],
-)  # fmt: skip
-def test_columns_of_numbers_are_recognised(cell: str, number: bool) -> None:
-    rows = [["a", cell, "0.12"], ["b", "–", "0.3"], ["c", "", "held"]]
-    table = Table(title="T", header=["what", "value", "sigma"], rows=rows)
-    assert numeric_columns(table) == [False, number, True]
 
 
 def test_committed_libraries_are_those_of_the_lock() -> None:

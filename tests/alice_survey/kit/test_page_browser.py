@@ -12,7 +12,7 @@ from PIL import Image
 
 from alice_survey.kit.document import Report
 from alice_survey.kit.page import render_html
-from tests.alice_survey.kit.browser import Heard, chromium
+from tests.alice_survey.kit.browser import Heard, chromium, is_accessible
 from tests.alice_survey.kit.sketch import RUDE, sketch_report
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
@@ -123,11 +123,6 @@ def place_on_page(page: Any, east_m: float, north_m: float) -> tuple[float, floa
     return x, y
 
 
-def test_fits_its_window(page: Any) -> None:
-    wide = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
-    assert wide[0] <= wide[1]
-
-
 def test_map_pans(page: Any) -> None:
     east, north = data(page, MAP, "east"), data(page, MAP, "north")
     px_per_m = 2 ** data(page, MAP, "zoom")
@@ -167,22 +162,6 @@ def test_mosaic_zooms(page: Any) -> None:
     page.get_by_role("button", name="Zoom out").click()
     assert settled(page, MAP, "zoom", before) == before - 1
     page.keyboard.press("Tab")
-
-
-def test_layers_switch(page: Any) -> None:
-    mosaic = picture_of(page, MAP)
-    assert not page.get_by_text("height above the datum, m").first.is_visible()
-    page.get_by_label("Height", exact=True).check()
-    assert page.locator(MAP).get_attribute("data-base") == "dem"
-    assert page.get_by_text("height above the datum, m").first.is_visible()
-    dem = picture_of(page, MAP)
-    assert np.abs(dem - mosaic).mean() > 10
-    page.get_by_label("Footprints").check()
-    assert np.abs(picture_of(page, MAP) - dem).mean() > 0.5
-    page.get_by_label("Footprints").uncheck()
-    page.get_by_label("Mosaic", exact=True).check()
-    assert page.locator(MAP).get_attribute("data-base") == "mosaic"
-    np.testing.assert_allclose(picture_of(page, MAP), mosaic, atol=40)
 
 
 def test_place_under_the_pointer(page: Any) -> None:
@@ -231,19 +210,9 @@ def test_mesh_is_drawn_and_turns(page: Any) -> None:
 
 
 def test_no_fault_that_axe_finds(page: Any) -> None:
-    from axe_playwright_python.sync_playwright import Axe
-
-    rules = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]
     page.mouse.click(*place_on_page(page, 0.6, -0.533))  # with a popup open
-    found = Axe().run(page, options={"runOnly": rules, "resultTypes": ["violations"]})
+    is_accessible(page)
     page.keyboard.press("Escape")
-    faults = [
-        f"{fault['id']}: {node['html'][:160]}"
-        for fault in found.response["violations"]
-        for node in fault["nodes"]
-    ]
-    assert faults == []
-    assert len(found.response["passes"]) > 20
 
 
 def test_paper_shows_all(page: Any) -> None:
@@ -296,13 +265,3 @@ def test_without_webgl_a_still(browser: Any, file: Path) -> None:
     assert not page.locator("#mesh").is_visible()
     assert heard.complaints == []
     page.close()
-
-
-def test_without_scripts_stills(browser: Any, file: Path) -> None:
-    context = browser.new_context(java_script_enabled=False)
-    page = context.new_page()
-    page.goto(file.as_uri())
-    assert page.locator(".mesh .still img").is_visible()
-    assert page.locator(".map .still img").is_visible()
-    assert not page.locator("#map").is_visible()
-    context.close()

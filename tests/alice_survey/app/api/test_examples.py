@@ -2,7 +2,6 @@
 
 import ast
 import doctest
-import inspect
 import subprocess
 import sys
 from pathlib import Path
@@ -95,14 +94,6 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["dem", "mosaic", "track"])
-def test_results_show_themselves_in_a_notebook(name: str, small_survey: Path) -> None:
-    shown = getattr(alice.Survey(small_survey), name)._repr_html_()
-    assert shown.startswith("<b>")
-    assert " m" in shown
-
-
-@pytest.mark.slow
 def test_heights_are_looked_up_in_their_cells(small_survey: Path) -> None:
     dem = alice.read_dem(small_survey)
     rows, columns = dem.height.shape
@@ -112,12 +103,6 @@ def test_heights_are_looked_up_in_their_cells(small_survey: Path) -> None:
     assert np.isnan(dem.height_at(np.array(dem.west - dem.cell), np.array(dem.north)))
     west, right, south, top = dem.extent
     assert (right - west, top - south) == pytest.approx((columns * dem.cell, rows * dem.cell))
-
-
-def test_signatures_take_strings_as_paths() -> None:
-    for name in ("read_plan", "read_rig", "read_model", "load_config", "read_dem", "read_track"):
-        first = next(iter(inspect.signature(getattr(alice, name)).parameters.values()))
-        assert str(first.annotation) == "str | pathlib.Path", name
 
 
 def test_an_averaged_surface_stays_in_its_place(tmp_path: Path) -> None:

@@ -1,22 +1,15 @@
 import json
 import re
-from dataclasses import replace
 from html import unescape
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 from pypdf import PdfReader
 
 from alice_survey.app.stages import spec
 from alice_survey.core.artefacts import write_json
 from alice_survey.core.config import SurveyConfig
-from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.executor import SERIAL
-from camera_calib.approximation.pinhole_warp import best_warp
-from camera_calib.mount import with_mount
-from camera_calib.rig import design_rig, write_rig
 from tests.alice_survey.app.report.tiny import plane_of, tiny_workspace
 
 
@@ -85,27 +78,6 @@ def test_a_model_without_a_place_is_reported(tmp_path: Path, scaled: bool, unit:
     assert shown["axes"] == ["y", "x"]
 
 
-def test_every_plane_is_shown_by_its_name(tmp_path: Path) -> None:
-    workspace = tiny_workspace(tmp_path)
-    assert spec("report").make(workspace, SurveyConfig(), SERIAL)
-    for name, painted in (("wall", True), ("hull", False)):
-        for stage, picture in (("dense", "dem"), ("mosaic", "mosaic")):
-            folder = workspace / stage / "planes" / name
-            if stage == "dense" or painted:
-                write_json(folder / "plane.json", plane_of(name, "12"))
-                see_through = np.zeros((30, 40, 4), np.uint8)
-                see_through[10:, :, 1::2] = 255
-                cv2.imwrite(str(folder / f"{picture}.png"), see_through)
-    about = {"pixel": 0.01, "width_px": 400, "height_px": 250}
-    write_json(workspace / "mosaic" / "planes" / "wall" / "mosaic.json", about)
-    assert spec("report").make(workspace, SurveyConfig(), SERIAL)  # for there are planes now
-    page = (workspace / "report" / "report.html").read_text(encoding="utf-8")
-    assert "Plane wall" in page
-    assert "4.00 m wide and 2.50 m high" in page
-    assert "Surface over the plane: facing 180 deg, tilt 12 deg. No picture" in page
-    assert page.count("Plane hull") == 1
-
-
 def test_a_survey_of_a_wall_alone_is_reported_on_its_own_axes(tmp_path: Path) -> None:
     workspace = tiny_workspace(tmp_path)
     write_json(workspace / "dense" / "plane.json", plane_of("wall", "0"))
@@ -121,26 +93,6 @@ def test_a_survey_of_a_wall_alone_is_reported_on_its_own_axes(tmp_path: Path) ->
     )
 
 
-@pytest.mark.parametrize("mount", ["nadir-bow-up", "forward+30", None])
-def test_a_known_mount_is_described_and_an_unknown_one_is_not(
-    tmp_path: Path, mount: str | None
-) -> None:
-    workspace = tiny_workspace(tmp_path)
-    config = SurveyConfig()
-    rig = replace(design_rig(config.camera, config.water), body_from_rig=None)
-    if mount is not None:
-        rig = with_mount(rig, mount, (0.5, 0.0, 0.1))
-    warp = best_warp(rig.cameras["left"], 1.8, 2.4).to_json()
-    write_json(workspace / "sparse" / "cameras.json", {"cameras": {"left": warp}, "images": {}})
-    write_rig(workspace / "sparse" / "rig.json", rig)
-    assert spec("report").make(workspace, config, SERIAL)
-    page = (workspace / "report" / "report.html").read_text(encoding="utf-8")
-    assert f"The rig is as imported with the pictures: {rig.source}." in page
-    assert ("The mount on the vehicle: " in page) == (mount is not None)
-    if mount is not None:
-        assert f"0.0 deg from {mount}" in page
-
-
 def test_a_plan_alone_is_reported(tmp_path: Path) -> None:
     workspace = tiny_workspace(tmp_path)
     for stage in ("images", "mapping", "sparse", "dense", "mosaic"):
@@ -148,8 +100,3 @@ def test_a_plan_alone_is_reported(tmp_path: Path) -> None:
     assert spec("report").make(workspace, SurveyConfig(), SERIAL)
     said = json.loads((workspace / "report" / "report.json").read_text())["summary"]
     assert "1 line" in said["What was mapped"]
-
-
-def test_an_empty_folder_says_what_to_run(tmp_path: Path) -> None:
-    with pytest.raises(WorkspaceError, match="alice-survey plan"):
-        spec("report").make(tmp_path, SurveyConfig(), SERIAL)

@@ -2,14 +2,11 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
-
-from axe_playwright_python.sync_playwright import Axe
 
 from tests.alice_survey.app.studio.client import FOLDED
 from tests.alice_survey.app.studio.picture_page import WAIT_MS, said
-from tests.alice_survey.kit.browser import Heard, chromium
+from tests.alice_survey.kit.browser import Heard, chromium, is_accessible
 
 WIDE, NARROW = {"width": 1280, "height": 900}, {"width": 400, "height": 850}
 LONG_MS = 800_000
@@ -39,25 +36,6 @@ def opened(page: Any, tab: str) -> None:
 def made(page: Any, stage: str) -> None:
     """Wait until a stage is made."""
     page.wait_for_selector(f"[data-stage={stage}][data-state='up to date']", timeout=LONG_MS)
-
-
-def is_accessible(page: Any, shot: Path | None = None, sizes: tuple[Any, ...] = ()) -> None:
-    """No violations that axe knows, and nothing wider than the screen; a picture of the page.
-
-    Args:
-        page: as it is, or at `sizes`, the last of which stays.
-        shot: PNG to write, with the width in its name.
-        sizes: of the viewport.
-    """
-    for size in sizes or (page.viewport_size,):
-        if size != page.viewport_size:
-            page.set_viewport_size(size)
-        found = Axe().run(page, options={"resultTypes": ["violations"]}).response["violations"]
-        assert [(one["id"], one["nodes"][0]["html"][:160]) for one in found] == []
-        assert page.evaluate("document.documentElement.scrollWidth") <= size["width"]
-        if shot is not None:
-            path = shot.with_name(f"{shot.stem}-{size['width']}.png")
-            page.screenshot(path=str(path), full_page=size["width"] < 700)
 
 
 def survey_begun(page: Any, address: str, *, length_m: float, width_m: float) -> None:

@@ -159,9 +159,7 @@ def test_every_page_hears_an_event(server: Server) -> None:
         socket.create_connection(("127.0.0.1", server.port), timeout=20) as second,
     ):
         for page in (first, second):
-            page.sendall(
-                f"GET /api/events HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\n\r\n".encode()
-            )
+            page.sendall(events_asked(server))
             assert b"text/event-stream" in read_to(page, b"retry: 1000")
         call(server, "/api/test/write", b"abcd")
         for page in (first, second):

@@ -15,11 +15,11 @@ from tests.alice_survey.app.studio.journey_page import (
     WIDE,
     begun_page,
     button,
-    is_accessible,
     opened,
     survey_begun,
     survey_flown,
 )
+from tests.alice_survey.kit.browser import is_accessible
 from tests.missions.follow.dives import rows_along, text_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]

@@ -27,7 +27,6 @@ from tests.alice_survey.app.studio.journey_page import (
     WIDE,
     begun_page,
     button,
-    is_accessible,
     made,
     opened,
     survey_begun,
@@ -37,55 +36,18 @@ from tests.alice_survey.app.studio.picture_page import PicturePage, said
 from tests.alice_survey.app.studio.test_model_browser import click, kept
 from tests.alice_survey.app.studio.test_model_browser import named as figures
 from tests.alice_survey.app.studio.test_pictures import Truth
-from tests.alice_survey.app.studio.test_plan_browser import PlanPage
-from tests.alice_survey.kit.browser import Heard
+from tests.alice_survey.kit.browser import Heard, is_accessible
 from tests.docs import given_divers as dive
 
 Point = NDArray[np.float64]
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
-AT_1280 = pytest.mark.parametrize("journey", [WIDE], indirect=True, ids=["1280"])
-AT_400 = pytest.mark.parametrize("journey", [NARROW], indirect=True, ids=["400"])
 
 
 @pytest.fixture
-def journey(request: pytest.FixtureRequest) -> Iterator[tuple[Any, Heard]]:
-    """A page, 1280 px wide unless a test says otherwise, and what it complains about."""
-    with begun_page(getattr(request, "param", WIDE)) as page_and_heard:
+def journey() -> Iterator[tuple[Any, Heard]]:
+    """A page, 1280 px wide, and what it complains about."""
+    with begun_page(WIDE) as page_and_heard:
         yield page_and_heard
-
-
-@AT_1280
-def test_a_survey_is_drawn_saved_and_flown(journey: tuple[Any, Heard], tmp_path: Path) -> None:
-    page, heard = journey
-    reef = tmp_path / "reef"
-    with serving(reef) as server:
-        page.goto(server.address)
-        page.wait_for_selector(".start")
-        is_accessible(page, tmp_path / "start.png")
-        button(page, "Plan a survey").click()
-        assert page.get_by_label("Its name").input_value() == "reef"
-        page.get_by_label("Latitude, degrees").fill("43.05")
-        page.get_by_label("Longitude, degrees").fill("5.92")
-        page.get_by_label("Depth of the sea floor, m").fill("12")
-        assert not (reef / "survey.toml").exists()
-        with page.expect_navigation():
-            button(page, "Make the survey").click()
-        page.wait_for_selector("#panel-plan[data-read]")
-        plan = PlanPage(page=page, heard=heard)
-        before = plan.settled()
-        page.get_by_role("button", name=re.compile("^Delete")).first.click()
-        plan.settled(before)
-        plan.draw("Survey area", ((2.0, 2.0), (2.0, 5.0), (4.5, 5.0), (4.5, 2.0)))
-        is_accessible(page, tmp_path / "drawn.png")
-        survey_flown(page)
-        page.get_by_role("heading", name="Fly the plan: done").wait_for()
-        page.get_by_text("Log", exact=True).click()
-        page.get_by_text("run finished: exit code 0").wait_for()
-        assert "of disk" in page.locator("section[aria-label=Start]").inner_text()
-        is_accessible(page, tmp_path / "flown.png")
-        assert heard.complaints == []
-    with (reef / "flight" / "triggers.csv").open(newline="") as rows:
-        assert len(list(csv.DictReader(rows))) > 10
 
 
 @pytest.fixture(scope="module")
@@ -143,28 +105,14 @@ def pictures_shown(page: Any, modelled: Path, folder: Path) -> Iterator[tuple[Se
         yield server, workspace
 
 
-@AT_400
-def test_a_stereo_dive_gives_a_length_beside_its_truth(
-    journey: tuple[Any, Heard], modelled: Path, tmp_path: Path
-) -> None:
-    page, heard = journey
-    with pictures_shown(page, modelled, tmp_path) as (_, workspace):
-        truth, ends = truth_of(workspace, 2)
-        pictures = pictures_with(page, truth, ends)
-        value, sigma = pictures.length("P0", "P1")
-        assert abs(value - float(np.linalg.norm(ends[0] - ends[1]))) < 4.0 * sigma < 0.004
-        is_accessible(page, tmp_path / "length.png")
-        assert heard.complaints == []
-
-
-@AT_1280
 def test_control_points_are_picked_and_their_residuals_shown(
     journey: tuple[Any, Heard], modelled: Path, tmp_path: Path
 ) -> None:
     page, heard = journey
     with pictures_shown(page, modelled, tmp_path) as (server, workspace):
         truth, places = truth_of(workspace, 3)
-        pictures_with(page, truth, places)
+        value, sigma = pictures_with(page, truth, places).length("P0", "P1")
+        assert abs(value - float(np.linalg.norm(places[0] - places[1]))) < 4.0 * sigma < 0.004
         stored = read_picks(workspace / "picks.csv")
         for number in range(3):
             mine = [pick for pick in stored if pick.point == f"P{number}"]

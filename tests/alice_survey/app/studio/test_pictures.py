@@ -296,20 +296,3 @@ def test_pictures_have_any_names_and_nothing_else_is_reached(
         manifest.write_bytes(before)
         new.unlink()
         link.unlink()
-
-
-def test_what_cannot_be_asked_is_said_in_a_line(server: Server) -> None:
-    image = asked(server, "/api/pictures", count=1)["pictures"][0]["name"]
-    good = {"image": image, "x": 100.0, "y": 100.0}
-    for path, body in (
-        ("/api/picks/refine", {"pick": {**good, "x": 9e5}}),
-        ("/api/picks/refine", {"pick": {**good, "image": "no.png"}}),
-        ("/api/picks/refine", {"pick": {**good, "sigma_px": -1}}),
-        ("/api/picks/length", {"first": [good], "second": [good]}),
-        ("/api/picks/position", {"picks": [good]}),
-    ):
-        refused(call(server, path, body))
-    refused(ask(server, "/api/pictures/seeing?n=500&e=500"))
-    refused(ask(server, "/api/pictures/seeing?n=0.4"))
-    scale = {"first": [good], "second": [good], "length_m": 1.0}
-    refused(call(server, "/api/scale", scale))

@@ -18,7 +18,6 @@ from alice_survey.app.studio.server import Server
 from alice_survey.core.artefacts import read_json
 from alice_survey.core.errors import collected_by
 from alice_survey.core.executor import local_executor
-from alice_survey.core.settings_form import settings_form
 from tests.alice_survey.app.studio.client import ask, call, serving
 
 SQUARE = [[0, 0], [6, 0], [6, 5], [0, 5]]
@@ -205,21 +204,6 @@ def test_settings_that_cannot_be_read_are_said(workspace: Path, server: Server) 
     assert "gone.kml" in found["error"] and not found["saved"]["ok"]
     drawn = post(server, "preview", {"shapes": {"survey": [{"outer": SQUARE}]}})
     assert drawn["ok"]
-
-
-def test_what_the_page_starts_from(server: Server) -> None:
-    found = get(server)
-    assert found["shapes"]["survey"] == [{"outer": SQUARE, "holes": []}]
-    assert found["datum"] == {"latitude_deg": 32.8236, "longitude_deg": 34.9553}
-    assert "altitude_m" in found["written"]["plan"] and "dive_s" not in found["written"]["plan"]
-    limit = found["limits"]["plan.altitude_m"]
-    assert (limit["low"], limit["high"], limit["unit"]) == (0.3, 10.0, "m")
-    assert limit["about"] == "of the left port's outer glass"
-    assert {"alice", "sparus2"} <= set(found["vehicles"]) and 12.5 in found["lenses_mm"]
-    assert found["saved"]["ok"] and found["error"] is None
-    about = settings_form(("plan", "sea", "camera", "vehicle"))
-    for name in ("plan.side_overlap", "sea.current_mps", "camera.focal_mm", "vehicle.battery_wh"):
-        assert about[name]["step"] > 0 and about[name]["low"] is not None
 
 
 def test_dropped_files_become_shapes(server: Server) -> None:

@@ -111,22 +111,6 @@ def test_a_port_that_is_taken(tmp_path: Path) -> None:
     assert str(port) in str(done.exception) and "--port" in str(done.exception)
 
 
-@pytest.mark.parametrize("browser", [True, False])
-def test_the_browser_is_opened_unless_it_is_not_wanted(
-    browser: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    import webbrowser
-
-    opened: list[str] = []
-    monkeypatch.setattr(webbrowser, "open", opened.append)
-    monkeypatch.setattr(Server, "serve_forever", lambda self: None)
-    option = "--browser" if browser else "--no-browser"
-    done = CliRunner().invoke(app, ["studio", "-w", str(tiny_workspace(tmp_path)), option])
-    assert done.exit_code == 0
-    (address,) = re.findall(r"http://127\.0\.0\.1:\d+/\?token=[\w-]{32}", done.output)
-    assert opened == ([address] if browser else [])
-
-
 def test_it_cannot_be_reached_from_another_machine(tmp_path: Path) -> None:
     server = Server(tiny_workspace(tmp_path))
     assert server.socket.getsockname()[0] == "127.0.0.1"

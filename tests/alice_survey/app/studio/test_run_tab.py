@@ -12,7 +12,6 @@ import pytest
 
 from alice_survey.app.stages import STAGES
 from alice_survey.app.studio.endpoints import start as start_page
-from alice_survey.app.studio.endpoints.run import ways_on
 from alice_survey.app.studio.endpoints.start import Folders
 from alice_survey.app.studio.jobs import Jobs
 from alice_survey.app.studio.server import Server
@@ -83,14 +82,6 @@ def test_a_fault_shows_its_line_and_the_way_on(server: Server) -> None:
     assert last["ways"] == [
         {"command": "alice-survey plan -w reef", "name": "plan", "title": "Plan the survey"}
     ]
-
-
-def test_the_ways_that_a_line_names() -> None:
-    found = ways_on(
-        "no images: run 'alice-survey import-images /a -w b', or 'alice-survey plan check -w b', "
-        "or 'alice-survey plan' or 'alice-survey nothing' or 'alice-survey reconstruct'"
-    )
-    assert [way["name"] for way in found] == [None, "plan check", "plan", None, "reconstruct"]
 
 
 @pytest.mark.parametrize(

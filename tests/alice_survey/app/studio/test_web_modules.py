@@ -1,7 +1,6 @@
 """Pure functions of the studio's tabs, run with node: shapes, undo, requests, words."""
 
 import json
-import math
 from pathlib import Path
 from typing import Any
 
@@ -67,22 +66,6 @@ def test_vertices_come_and_go_and_the_last_take_their_ring(tmp_path: Path) -> No
     assert no_hole["survey"] == [{"outer": SQUARE["outer"], "holes": []}]
     assert nothing == {**SHAPES, "survey": []}
     assert no_way["corridors"] == []
-
-
-def test_names_and_sizes(tmp_path: Path) -> None:
-    names, sizes, several = run(
-        tmp_path, "plan_shapes",
-        """(() => {
-          const all = m.paths(s);
-          const two = m.addRing(s, "survey", [[20, 0], [30, 0], [30, 1]]);
-          return [all.map((p) => m.nameOf(s, p)), all.map((p) => m.sizeOf(s, p)),
-                  [m.nameOf(two.shapes, two.path), two.path]];
-        })()""",
-        s=SHAPES,
-    )  # fmt: skip
-    assert names == ["Survey area", "Hole of survey area", "Corridor"]
-    assert sizes == ["4 corners, 80.0 m²", "4 corners, 4.0 m²", "3 points, 11.0 m"]
-    assert several == ["Survey area 2", {"kind": "survey", "index": 1, "ring": 0}]
 
 
 def test_areas_agree_with_shapely(tmp_path: Path) -> None:
@@ -180,27 +163,6 @@ def test_undoing_all_of_random_edits_returns_to_the_start(
         assert np.allclose(1000 * np.array(points), np.round(1000 * np.array(points)), atol=1e-6)
 
 
-def test_edits_of_one_tag_within_a_second_are_one_step(tmp_path: Path) -> None:
-    sizes = run(
-        tmp_path, "undo",
-        """(() => {
-          const state = (v) => ({changes: {plan: {altitude_m: v}}, shapes: null});
-          let h = m.startHistory(state(0));
-          h = m.record(h, state(1), "altitude", 0);
-          h = m.record(h, state(2), "altitude", 900);
-          h = m.record(h, state(3), "altitude", 1800);
-          const one = h.states.length;
-          h = m.record(h, state(4), "altitude", 2900);
-          h = m.record(h, state(5), "speed", 2950);
-          const three = h.states.length;
-          h = m.record(h, state(5), "heading", 9000);
-          h = m.record(m.undo(h), state(6), "speed", 2960);
-          return [one, three, h.states.length, m.canRedo(h), m.current(m.undo(h))];
-        })()""",
-    )  # fmt: skip
-    assert sizes == [2, 4, 4, False, {"changes": {"plan": {"altitude_m": 4}}, "shapes": None}]
-
-
 def test_a_value_that_the_file_has_is_no_change(tmp_path: Path) -> None:
     file = {
         "settings": {"plan": {"altitude_m": 2.0, "line_spacing_m": 1.0, "side_overlap": 0.28}},
@@ -257,47 +219,6 @@ def test_no_answer_is_shown_after_that_of_a_newer_request(tmp_path: Path) -> Non
     assert seen == [["quick", False], "bad"]
 
 
-def test_totals_as_words(tmp_path: Path) -> None:
-    totals = {
-        "area_m2": 255.0, "lines": 18, "stations": 612, "pictures": 1224, "length_m": 330.2,
-        "duration_s": 1690.0, "energy_wh": 61.3, "usable_wh": 1120.0, "longest_dive_wh": 61.3,
-        "dives": 1, "data_gb": 11.2,
-        "interval_s": 1.21, "exposure_s": 0.00183, "gain_db": 0.0, "aperture": 4.0, "gsd_mm": 0.44,
-        "line_spacing_m": 1.0, "forward_overlap": 0.63, "side_overlap": 0.281, "covered": 0.999996,
-        "at_overlap": None, "speed_mps": 0.2,
-    }  # fmt: skip
-    figures, summary, refused, times = run(
-        tmp_path, "plan_words",
-        """[m.keyFigures(t), m.summaryOf({ok: true, totals: t, warnings: [], holes: [1]}),
-            m.summaryOf({ok: false, error: "too steep"}),
-            await import("./words.js").then(
-              (w) => [...[98, 3600, 14400].map(w.duration), w.clock(3723), w.clock(48)])]""",
-        t=totals,
-    )  # fmt: skip
-    assert dict(figures) == {
-        "Time": "28 min", "Dives": "1", "Energy": "61 Wh", "Pictures": "1,224", "Data": "11.2 GB",
-        "Covered": "99.99 %",
-    }  # fmt: skip
-    assert summary == "18 lines, 28 min, 1 dive, 1,224 pictures, 99.99 % covered, 1 hole"
-    assert refused == "No plan: too steep"
-    assert times == ["98 s", "60 min", "4.0 h", "1:02:03", "0:48"]
-
-
-def test_counts_are_coloured_and_what_lacks_overlap_stands_out(tmp_path: Path) -> None:
-    """Five pixels: outside, few, most, half, and one without its overlap."""
-    pixels = [(255, 0, 0), (1, 1, 1), (8, 2, 1), (4, 2, 1), (3, 1, 0)]
-    maximum, painted = run(
-        tmp_path, "plan_words",
-        "(() => { const d = new Uint8ClampedArray(p); return [m.paintCounts(d), [...d]]; })()",
-        p=[value for pixel in pixels for value in (*pixel, 255)],
-    )  # fmt: skip
-    rgba = np.array(painted).reshape(-1, 4)
-    assert maximum == math.floor(maximum) and 4 <= maximum <= 8
-    assert rgba[:, 3].tolist() == [0, 215, 215, 215, 190]
-    assert rgba[4, :3].tolist() == [0xD3, 0x54, 0x00]
-    assert rgba[1, :3].sum() > rgba[3, :3].sum() > rgba[2, :3].sum()
-
-
 def test_unknown_depths_interrupt_the_profile(tmp_path: Path) -> None:
     path = run(tmp_path, "chart_lines", "m.pathData([0, 1, 2, 3, 4], [1, 2, null, 3, 4])")
     assert path == "M0.0 1.0L1.0 2.0M3.0 3.0L4.0 4.0"
@@ -310,16 +231,3 @@ def test_ticks_are_round_and_within_their_limits(tmp_path: Path) -> None:
         assert 2 <= len(values) <= maximum + 1
         assert low - 1e-9 <= min(values) and max(values) <= high + 1e-9
         assert np.allclose(values, np.round(values, digits), atol=1e-9)
-
-
-def test_words_of_figures(tmp_path: Path) -> None:
-    words = run(
-        tmp_path, "words",
-        """[m.number(-1234.56, "m", 4), m.number(null), m.withSigma(-1.23456, 0.0123, "m"),
-            m.withSigma(2, 0), m.clock(-20.5), m.clock(null), m.share(0.9996, 1), m.share(null),
-            m.counted(1, "line"), m.counted(1200, "pass", "passes"), m.fixed(-0.256, 2, "m")]""",
-    )  # fmt: skip
-    assert words == [
-        "−1,235 m", "unknown", "−1.235 ± 0.012 m", "2.000", "−0:20", "–", "99.9 %", "–",
-        "1 line", "1,200 passes", "−0.26 m",
-    ]  # fmt: skip
