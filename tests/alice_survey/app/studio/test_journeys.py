@@ -8,7 +8,6 @@ import json
 import re
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from alice_survey.app.studio.server import Server
 from reconstruct.placing.control_points import read_control, read_picks
 from tests.alice_survey.app.studio.client import ask, looks_at, serving, still
 from tests.alice_survey.app.studio.journey_page import (
@@ -70,14 +68,6 @@ def modelled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "reef"
 
 
-def truth_of(workspace: Path, count: int) -> tuple[Truth, list[Point]]:
-    """The rendered truth, and places of it that many pictures show."""
-    truth, rng = Truth(workspace), np.random.default_rng(21)
-    places = [place for place in truth.places(rng, 12) if truth.nearest(place) is not None]
-    places.sort(key=lambda place: float(np.abs(place[:2] - [0.6, 0.45]).max()))
-    return truth, places[:count]
-
-
 def pictures_with(page: Any, truth: Truth, places: list[Point]) -> PicturePage:
     """Pick places in the picture that shows each nearest its middle, and save them as P0, P1..."""
     camera = next(iter(truth.rig.cameras.values()))
@@ -96,21 +86,17 @@ def pictures_with(page: Any, truth: Truth, places: list[Point]) -> PicturePage:
     return pictures
 
 
-@contextmanager
-def pictures_shown(page: Any, modelled: Path, folder: Path) -> Iterator[tuple[Server, Path]]:
-    """Show the pictures of a copy of a model; what serves it, and its workspace."""
-    workspace = Path(shutil.copytree(modelled, folder / "reef"))
-    with serving(workspace) as server:
-        page.goto(server.address + "#pictures")
-        yield server, workspace
-
-
 def test_control_points_are_picked_and_their_residuals_shown(
     journey: tuple[Any, Heard], modelled: Path, tmp_path: Path
 ) -> None:
     page, heard = journey
-    with pictures_shown(page, modelled, tmp_path) as (server, workspace):
-        truth, places = truth_of(workspace, 3)
+    workspace = Path(shutil.copytree(modelled, tmp_path / "reef"))
+    truth, rng = Truth(workspace), np.random.default_rng(21)
+    places = [place for place in truth.places(rng, 12) if truth.nearest(place) is not None]
+    places.sort(key=lambda place: float(np.abs(place[:2] - [0.6, 0.45]).max()))
+    places = places[:3]  # many pictures show them
+    with serving(workspace) as server:
+        page.goto(server.address + "#pictures")
         value, sigma = pictures_with(page, truth, places).length("P0", "P1")
         assert abs(value - float(np.linalg.norm(places[0] - places[1]))) < 4.0 * sigma < 0.004
         stored = read_picks(workspace / "picks.csv")

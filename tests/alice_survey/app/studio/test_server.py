@@ -62,16 +62,6 @@ def server(folder: Path) -> Iterator[Server]:
     assert contents(folder.parent) == before  # it never writes
 
 
-@pytest.mark.parametrize("scaled", [True, False])
-def test_a_model_without_a_place_is_shown(tmp_path: Path, scaled: bool) -> None:
-    workspace = tiny_workspace(tmp_path, scaled=scaled, placed=False)
-    (workspace / "plan" / "stage.json").unlink()
-    with serving(workspace) as server:
-        reply = ask(server, "/api/map")
-    assert reply.status == 200
-    assert '"name":"cameras"' in reply.text
-
-
 def contents(folder: Path) -> dict[str, int]:
     return {str(path): path.lstat().st_mtime_ns for path in sorted(folder.rglob("*"))}
 
