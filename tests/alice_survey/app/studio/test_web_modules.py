@@ -68,12 +68,16 @@ def test_vertices_come_and_go_and_the_last_take_their_ring(tmp_path: Path) -> No
     assert no_way["corridors"] == []
 
 
-def test_areas_agree_with_shapely(tmp_path: Path) -> None:
+def test_areas_agree_with_shapely_and_lengths_add_up(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     angles = np.sort(rng.uniform(0, 2 * np.pi, 11))
     star = rng.uniform(2, 9, 11)[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
-    area = run(tmp_path, "plan_shapes", "m.areaOf(p)", p=star.tolist())
+    area, size = run(
+        tmp_path, "plan_shapes", "[m.areaOf(p), m.sizeOf(s, way)]", p=star.tolist(), s=SHAPES,
+        way=WAY,
+    )  # fmt: skip
     assert area == pytest.approx(Polygon(star).area, rel=1e-12)
+    assert "11.0 m" in size
 
 
 def test_the_station_at_a_place_is_the_nearest(tmp_path: Path) -> None:
