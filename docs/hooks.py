@@ -44,14 +44,24 @@ def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: 
 
         markdown = markdown.replace(_STAGES, stages.table())
     if _FORMATS in markdown:
-        from missions.exports.registry import formats_table
-
         markdown = markdown.replace(_FORMATS, formats_table())
     if _RASTERS in markdown:
         from alice_survey.core.products import rasters_table
 
         markdown = markdown.replace(_RASTERS, rasters_table())
     return markdown
+
+
+def formats_table() -> str:
+    """The formats of export as a table in Markdown."""
+    from missions.exports.registry import format_named, format_names
+
+    rows = ["| format (`--format`) | files | read by |", "|---|---|---|"]
+    for name in format_names():
+        known = format_named(name)
+        files = ", ".join(f"`{file.name.format(1)}`" for file in known.files)
+        rows.append(f"| `{name}` | {files} | {known.read_by} |")
+    return "\n".join(rows)
 
 
 def _block(latex: str, where: str) -> str:

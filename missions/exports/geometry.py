@@ -92,6 +92,12 @@ def rings_ne(polygon: Polygon) -> Iterator[Array]:
         yield corners
 
 
+def line_ends_deg(plan: Plan) -> Array:
+    """(lines, 4) latitude and longitude of the start, then of the end, at the lines' depth."""
+    ends_ne = np.array([end for line in plan.lines for end in (line.start_ne_m, line.end_ne_m)])
+    return lat_lon(plan.datum, ends_ne, plan.seafloor_depth_m - plan.altitude_m).reshape(-1, 4)
+
+
 def dive_of_line(plan: Plan) -> dict[int, int]:
     """Number of the dive, from 1 on, that flies each line."""
     return {

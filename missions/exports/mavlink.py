@@ -34,7 +34,7 @@ class Item:
 
     command: int
     frame: int
-    params: tuple[float, float, float, float, float, float, float]
+    params: tuple[float, ...]
     """Parameters as the command defines them; the last three of a way-point are latitude and
     longitude, degrees, and altitude, metres."""
 
@@ -107,9 +107,11 @@ def _waypoint(plan: Plan, point: Waypoint, stays_s: int, tolerance_m: float) -> 
 
 
 def _command(command: int, *params: float) -> Item:
-    p = [round(float(value), 6) for value in params] + [0.0] * (7 - len(params))
+    rounded = (round(float(value), 6) for value in params)
     return Item(
-        command=command, frame=FRAME_MISSION, params=(p[0], p[1], p[2], p[3], p[4], p[5], p[6])
+        command=command,
+        frame=FRAME_MISSION,
+        params=(*rounded, *[0.0] * (_PARAMS - len(params))),
     )
 
 
@@ -126,8 +128,7 @@ def item_of(command: Any, frame: Any, params: Sequence[Any], where: str) -> Item
         raise ValueError(f"{where} holds a value that is not a number") from None
     if len(numbers) != _PARAMS or not all(map(math.isfinite, numbers)):
         raise ValueError(f"{where} does not have {_PARAMS} finite parameters")
-    a, b, c, d, e, f, g = numbers
-    return Item(command=code, frame=in_frame, params=(a, b, c, d, e, f, g))
+    return Item(command=code, frame=in_frame, params=tuple(numbers))
 
 
 def mission_of(items: Sequence[Item]) -> Mission:

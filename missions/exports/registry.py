@@ -42,16 +42,6 @@ def format_named(name: str) -> "ExportFormat":
     return found
 
 
-def formats_table() -> str:
-    """The formats as a table in Markdown, for the documentation."""
-    rows = ["| format (`--format`) | files | read by |", "|---|---|---|"]
-    for name in format_names():
-        known = format_named(name)
-        files = ", ".join(f"`{file.name.format(1)}`" for file in known.files)
-        rows.append(f"| `{name}` | {files} | {known.read_by} |")
-    return "\n".join(rows)
-
-
 def read_mission(path: Path) -> "Mission":
     """Read a mission as the vehicle that the file is for does.
 

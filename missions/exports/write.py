@@ -10,6 +10,7 @@ from alice_survey.core.artefacts import atomic_path, read_stage
 from alice_survey.core.config import SurveyConfig, parse_config
 from alice_survey.core.errors import PlanError, warn
 from alice_survey.core.run import progress
+from alice_survey.kit.words import count
 from alice_survey.sim.vehicle.pilot.mission import MIN_RADIUS_M, MIN_SPEED_MPS, Cola2Settings
 from camera_calib.rig import Rig, design_rig
 from missions.exports.follower import cola2_settings, line_offset_m
@@ -145,8 +146,8 @@ def export_report(
     tolerance_m = line_tolerance_m(plan, rig)
     text = "\n".join(
         [
-            f"{folder}: {count_text(len(files), 'file')} of {count_text(plan.stations, 'station')} "
-            f"in {count_text(len(plan.dives), 'dive')}, tolerance {tolerance_m:.3f} m",
+            f"{folder}: {count(len(files), 'file')} of {count(plan.stations, 'station')} "
+            f"in {count(len(plan.dives), 'dive')}, tolerance {tolerance_m:.3f} m",
             *(f"  {file.name:<24}{file.stat().st_size / 1000:>9.1f} kB" for file in files),
         ]
     )
@@ -158,19 +159,14 @@ def export_report(
     return text, about
 
 
-def count_text(number: int, what: str) -> str:
-    """A number of things, in the singular where it is one."""
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
-
-
 def _write_about(
     path: Path, export: Export, files: Mapping[Path, str], advice: Sequence[str]
 ) -> None:
     """What the files are, of which point of the vehicle, and what to set on it."""
     plan, options = export.plan, export.options
     text = [
-        f"{plan.name}: plan of {count_text(len(plan.lines), 'line')}, "
-        f"{count_text(plan.stations, 'station')}, {count_text(len(plan.dives), 'dive')}",
+        f"{plan.name}: plan of {count(len(plan.lines), 'line')}, "
+        f"{count(plan.stations, 'station')}, {count(len(plan.dives), 'dive')}",
         "",
         f"Missions (.xml, .plan, .waypoints): {export.mount.about}",
         "Maps and tables (.kml, .gpx, .geojson, .csv): places are of the left port's glass; "

@@ -11,13 +11,12 @@ from alice_survey.core.artefacts import need_stage, refuse_links, write_json
 from alice_survey.core.config import CameraConfig, SurveyConfig, WaterConfig
 from alice_survey.core.errors import PlanError, warn
 from alice_survey.core.executor import SERIAL, Executor, local_executor
-from alice_survey.kit.words import share, text_table
+from alice_survey.kit.words import count, share, text_table
 from camera_calib.rig import Rig, design_rig, read_rig, rig_with_mount
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.dive_record import DiveRecord, read_dive_record
 from missions.coverage.holes import Hole, find_holes
 from missions.coverage.stations import plan_pattern, stations_of_plan
-from missions.exports.write import count_text
 from missions.fly.refly import dive_means, holes_plan, write_refly
 from missions.plan.strength import survey_costs
 from missions.values.plan_file import Plan, read_plan
@@ -83,7 +82,7 @@ def check_log(
     )
     if flown.blind:
         warn(
-            f"{count_text(flown.blind, 'station')} without the sea floor in view: counted as "
+            f"{count(flown.blind, 'station')} without the sea floor in view: counted as "
             "seeing nothing"
         )
     return Check(
@@ -201,7 +200,7 @@ def _write(folder: Path, check: Check, data: dict[str, Any]) -> None:
 def _check_text(check: Check) -> str:
     record, planned, flown = check.record, check.planned, check.flown
     pattern, triggered = flown.pattern, record.triggered
-    overlap = f"{count_text(pattern.passes, 'line')}, {pattern.passes * pattern.pictures} pictures"
+    overlap = f"{count(pattern.passes, 'line')}, {pattern.passes * pattern.pictures} pictures"
     altitude = record.stations.altitude_m
     above = f", {altitude.min():.2f} to {altitude.max():.2f} m above it" if len(altitude) else ""
     lines = [
@@ -244,7 +243,7 @@ def _hole_rows(holes: Sequence[Hole]) -> list[str]:
     whole = sum(hole.area_m2 for hole in holes)
     unseen = sum(hole.unseen_m2 for hole in holes)
     rows = [
-        f"{count_text(len(holes), 'hole')}, {whole:.2f} m2 short of that overlap, of which "
+        f"{count(len(holes), 'hole')}, {whole:.2f} m2 short of that overlap, of which "
         f"{unseen:.2f} m2 in no picture; worst first:",
         text_table(
             ("", "area m2", "unseen m2", "size m", "latitude", "longitude", "north m", "east m"),

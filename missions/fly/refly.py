@@ -15,12 +15,13 @@ from shapely.geometry import MultiPolygon
 from alice_survey.core.artefacts import Stage, run_stage, write_json
 from alice_survey.core.config import CameraConfig, PlanConfig, VehicleConfig, WaterConfig
 from alice_survey.core.errors import PlanError
+from alice_survey.kit.words import count
 from camera_calib.rig import Rig
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.holes import Hole
 from missions.coverage.stations import stations_of_plan
 from missions.exports.format import options_of
-from missions.exports.write import count_text, write_exports
+from missions.exports.write import write_exports
 from missions.lines.fill import lines_over
 from missions.lines.lay import order_lines
 from missions.route.dives import split_dives
@@ -185,9 +186,9 @@ def write_refly(
 
     run_stage(folder, stage, work)
     words = (
-        f"{count_text(len(plan.lines), 'line')}, {count_text(plan.stations, 'station')}, "
+        f"{count(len(plan.lines), 'line')}, {count(plan.stations, 'station')}, "
         f"{plan.length_m:.0f} m, {plan.duration_s / 60:.0f} min in "
-        f"{count_text(len(plan.dives), 'dive')}"
+        f"{count(len(plan.dives), 'dive')}"
     )
     return words, {
         "folder": str(folder),

@@ -21,7 +21,7 @@ from alice_survey.core.artefacts import need_stage
 from alice_survey.core.config import SurveyConfig
 from alice_survey.core.errors import NavigationError, PlanError, collected_by
 from alice_survey.core.frames import Array
-from alice_survey.kit.words import share
+from alice_survey.kit.words import count, share
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.dive_record import (
     MIN_RUN,
@@ -39,7 +39,6 @@ from missions.coverage.stations import (
     stations_of_lines,
     stations_of_plan,
 )
-from missions.exports.write import count_text
 from missions.fly.check import rig_of
 from missions.fly.refly import dive_means, holes_plan, write_refly
 from missions.logs.navigation_csv import READINGS, NavigationLog
@@ -555,7 +554,7 @@ def state_text(state: dict[str, Any]) -> str:
         rows.append(f"  {state['fault']}")
     if proposal is not None:
         rows.append(
-            f"  to fly the holes again: {count_text(len(proposal['lines']), 'line')}, "
+            f"  to fly the holes again: {count(len(proposal['lines']), 'line')}, "
             f"{_minutes(proposal['time_s'])} and {proposal['energy_wh']:.1f} Wh from home to home; "
             f"then {share(proposal['holes_share'], 1)} of them are at that overlap"
         )

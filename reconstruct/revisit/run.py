@@ -17,7 +17,7 @@ from alice_survey.core.errors import PlanError, warn
 from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Array
 from alice_survey.kit.figure import figure_style, save_figure
-from alice_survey.kit.words import share
+from alice_survey.kit.words import count, share
 from missions.coverage.certificate import certificate
 from missions.coverage.drawing import (
     draw_counts,
@@ -28,7 +28,6 @@ from missions.coverage.drawing import (
     write_outlines,
 )
 from missions.coverage.stations import Stations, join, stations_of_lines, stations_of_plan
-from missions.exports.write import count_text
 from missions.fly.check import rig_of
 from missions.fly.refly import DiveMeans, dive_means, refly_plan, write_refly
 from missions.plan.strength import survey_costs
@@ -266,7 +265,7 @@ def _text(found: Found, cures: Sequence[Prediction]) -> str:
     good, spoilt = len(found.pictured.good), len(found.pictured.spoilt)
     lines = [
         f"{found.plan.name}: {found.record.registered} of {found.record.total} pictures in the "
-        f"model; {good} of {count_text(good + spoilt, 'station')} of use, they see "
+        f"model; {good} of {count(good + spoilt, 'station')} of use, they see "
         f"{share(found.seen.covered_share, 2)} and {share(found.seen.share_at_overlap, 2)} at the "
         "overlap asked for"
     ]
@@ -276,7 +275,7 @@ def _text(found: Found, cures: Sequence[Prediction]) -> str:
     if not found.places:
         return "\n".join([*lines, "nothing is weak"])
     lines += [
-        f"{count_text(len(found.places), 'weak place')}, worst first:",
+        f"{count(len(found.places), 'weak place')}, worst first:",
         f"  {'':>3}  {'cause':<8} {'area m2':>8}  {'north m':>8}  {'east m':>8}  reason",
     ]
     for number, place in enumerate(found.places[:_LISTED], 1):
@@ -329,6 +328,6 @@ def _draw(path: Path, found: Found, again: Plan | None) -> None:
         places = line.stations_ne
         label = "_nolegend_" if index else "dive over them"
         axes.plot(places[:, 1], places[:, 0], "-o", ms=3, lw=1.2, color="#117864", label=label)
-    text = f"{count_text(len(found.places), 'weak place')} of {found.plan.name}"
+    text = f"{count(len(found.places), 'weak place')} of {found.plan.name}"
     finish_map(figure, axes, area.datum, "Weak places", text)
     save_figure(figure, path)

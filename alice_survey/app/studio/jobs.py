@@ -319,10 +319,9 @@ class _Job:
         """As a page takes it."""
         record, run = self.record, self.run
         began = datetime.fromisoformat(record.started_utc)
+        kept = {"number", "name", "title", "command", "state", "started_utc"}
         return {
-            "number": record.number, "name": record.name, "title": record.title,
-            "command": record.command, "state": "stopping" if self.stopping else record.state,
-            "started_utc": record.started_utc,
+            **record.model_dump(include=kept), **({"state": "stopping"} if self.stopping else {}),
             "elapsed_s": round((datetime.now(UTC) - began).total_seconds(), 1),
             "stage": run.stage, "stage_title": run.title, "finished": list(run.finished),
             "steps": run.steps, "warned": run.warned, "warnings": list(run.warnings)[-5:],

@@ -139,12 +139,7 @@ def write_cola2(path: Path, export: Export, dive: int) -> None:
     child(root, "version", "2.0")
     for planned in _steps(export, export.dives[dive]):
         step = child(root, "mission_step")
-        if planned.end.kind == "sway":
-            _park(step, planned.end)
-        elif planned.is_section:
-            _section(step, planned)
-        else:
-            _goto(step, planned.end, planned.tolerance_m)
+        _manoeuvre(step, planned)
         if planned.end.camera is not None:
             on, off = export.options.camera_on, export.options.camera_off
             action = child(child(step, "actions_list"), "action")
@@ -152,47 +147,34 @@ def write_cola2(path: Path, export: Export, dive: int) -> None:
     write_xml(path, root, _comment(export))
 
 
-def _goto(step: Element, point: Waypoint, tolerance_m: float) -> None:
-    mode = {"descend": _BOTH, "surface": _DEPTH}.get(point.kind, _ALTITUDE)
-    manoeuvre = child(step, "maneuver", type="goto")
-    _final(manoeuvre, point)
-    child(manoeuvre, "heave_mode", mode)
-    child(manoeuvre, "surge_velocity", metres(point.speed_mps))
-    child(manoeuvre, "tolerance_xy", metres(tolerance_m))
-    # On the way down no floor is seen at first; on the way up none need be.
-    child(manoeuvre, "no_altitude_goes_up", _bool(mode == _ALTITUDE))
-
-
-def _section(step: Element, planned: Cola2Step) -> None:
+def _manoeuvre(step: Element, planned: Cola2Step) -> None:
+    """How a step is flown; a park holds place and heading, and is used to step sideways."""
     start, end = planned.start, planned.end
-    manoeuvre = child(step, "maneuver", type="section")
-    child(manoeuvre, "initial_latitude", degrees(start.latitude_deg))
-    child(manoeuvre, "initial_longitude", degrees(start.longitude_deg))
-    child(manoeuvre, "initial_depth", metres(start.depth_m))
-    _final(manoeuvre, end)
-    child(manoeuvre, "heave_mode", _ALTITUDE)
-    child(manoeuvre, "surge_velocity", metres(end.speed_mps))
-    child(manoeuvre, "tolerance_xy", metres(planned.tolerance_m))
-    child(manoeuvre, "no_altitude_goes_up", _bool(True))
-
-
-def _park(step: Element, point: Waypoint) -> None:
-    """Hold place and heading; used to step sideways."""
-    manoeuvre = child(step, "maneuver", type="park")
-    _final(manoeuvre, point)
-    child(manoeuvre, "final_yaw", f"{math.remainder(point.heading_rad, 2 * math.pi):.6f}")
-    child(manoeuvre, "use_yaw", _bool(True))
-    child(manoeuvre, "heave_mode", _ALTITUDE)
-    child(manoeuvre, "surge_velocity", metres(point.speed_mps))
-    child(manoeuvre, "time", f"{point.hold_s:.1f}")
-    child(manoeuvre, "no_altitude_goes_up", _bool(True))
-
-
-def _final(manoeuvre: Element, point: Waypoint) -> None:
-    child(manoeuvre, "final_latitude", degrees(point.latitude_deg))
-    child(manoeuvre, "final_longitude", degrees(point.longitude_deg))
-    child(manoeuvre, "final_depth", metres(point.depth_m))
-    child(manoeuvre, "final_altitude", metres(point.altitude_m))
+    parks = end.kind == "sway"
+    mode = {"descend": _BOTH, "surface": _DEPTH}.get(end.kind, _ALTITUDE)
+    values: dict[str, str | float] = {}
+    if planned.is_section:
+        values["initial_latitude"] = degrees(start.latitude_deg)
+        values["initial_longitude"] = degrees(start.longitude_deg)
+        values["initial_depth"] = metres(start.depth_m)
+    values["final_latitude"] = degrees(end.latitude_deg)
+    values["final_longitude"] = degrees(end.longitude_deg)
+    values["final_depth"] = metres(end.depth_m)
+    values["final_altitude"] = metres(end.altitude_m)
+    if parks:
+        values["final_yaw"] = f"{math.remainder(end.heading_rad, 2 * math.pi):.6f}"
+        values["use_yaw"] = "true"
+    values |= {"heave_mode": mode, "surge_velocity": metres(end.speed_mps)}
+    if parks:
+        values["time"] = f"{end.hold_s:.1f}"
+    else:
+        values["tolerance_xy"] = metres(planned.tolerance_m)
+    # On the way down no floor is seen at first; on the way up none need be.
+    values["no_altitude_goes_up"] = "true" if mode == _ALTITUDE else "false"
+    kind = "park" if parks else "section" if planned.is_section else "goto"
+    manoeuvre = child(step, "maneuver", type=kind)
+    for tag, value in values.items():
+        child(manoeuvre, tag, value)
 
 
 def _comment(export: Export) -> str:
@@ -204,10 +186,6 @@ def _comment(export: Export) -> str:
         "see twice, or half a step, or what this software needs so as not to circle an end. Lines "
         "go on past their last picture by as much, where they may."
     )
-
-
-def _bool(value: bool) -> str:
-    return "true" if value else "false"
 
 
 def read_cola2(text: str) -> Mission | None:

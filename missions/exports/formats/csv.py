@@ -5,11 +5,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from alice_survey.core.artefacts import write_csv
 from missions.exports.format import Export, ExportFile, ExportFormat
-from missions.exports.geometry import dive_of_line, lat_lon, line_depths
+from missions.exports.geometry import dive_of_line, lat_lon, line_depths, line_ends_deg
 from missions.values.plan_file import Plan
 
 
@@ -21,17 +19,14 @@ def write_lines(path: Path, export: Export, _dive: int) -> None:
         "end_longitude_deg", "start_north_m", "start_east_m", "end_north_m", "end_east_m",
         "heading_deg", "length_m", "stations", "depth_m", "altitude_m", "speed_mps", "interval_s",
     )  # fmt: skip
-    depth_m = plan.seafloor_depth_m - plan.altitude_m
-    ends_ne = np.array([end for line in plan.lines for end in (line.start_ne_m, line.end_ne_m)])
-    geodetic = lat_lon(plan.datum, ends_ne, depth_m).reshape(-1, 4)
-    ends = ends_ne.reshape(-1, 4)
+    ends_deg = line_ends_deg(plan)
     rows = []
     for index, (line, depths) in enumerate(zip(plan.lines, line_depths(plan), strict=True)):
         rows.append(
             [
                 index, line.kind,
-                *(f"{value:.10f}" for value in geodetic[index]),
-                *(f"{value:.4f}" for value in ends[index]),
+                *(f"{value:.10f}" for value in ends_deg[index]),
+                *(f"{value:.4f}" for value in (*line.start_ne_m, *line.end_ne_m)),
                 f"{math.degrees(line.heading_rad):.6f}", f"{line.length_m:.4f}", line.stations,
                 f"{sum(depths) / len(depths):.3f}", f"{plan.altitude_m:.3f}", plan.speed_mps,
                 plan.interval_s,

@@ -6,7 +6,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from missions.exports.format import Export, ExportFile, ExportFormat
-from missions.exports.geometry import lat_lon, line_depths
+from missions.exports.geometry import lat_lon, line_depths, line_ends_deg
 from missions.exports.xml_text import child, degrees, metres, write_xml
 
 _GPX = "http://www.topografix.com/GPX/1/1"
@@ -21,18 +21,10 @@ def write_gpx(path: Path, export: Export, _dive: int) -> None:
     child(metadata, "desc", "Places of the left port's glass; elevation is the negative depth.")
     ((lat, lon),) = lat_lon(plan.datum, np.array([plan.home_ne_m]), 0.0)
     _point(root, "wpt", float(lat), float(lon), 0.0, "home")
-    glass_m = plan.seafloor_depth_m - plan.altitude_m
-    ends_ne = np.array([end for line in plan.lines for end in (line.start_ne_m, line.end_ne_m)])
-    ends = lat_lon(plan.datum, ends_ne, glass_m)
-    for index, (line, depths) in enumerate(zip(plan.lines, line_depths(plan), strict=True)):
-        for place, depth_m, name in (
-            (ends[2 * index], depths[0], "start"),
-            (ends[2 * index + 1], depths[-1], "end"),
-        ):
-            _point(
-                root, "wpt", float(place[0]), float(place[1]), -depth_m,
-                f"line {index} {name}", line.kind,
-            )  # fmt: skip
+    ends = zip(plan.lines, line_ends_deg(plan).tolist(), line_depths(plan), strict=True)
+    for index, (line, ends_deg, depths) in enumerate(ends):
+        _point(root, "wpt", ends_deg[0], ends_deg[1], -depths[0], f"line {index} start", line.kind)
+        _point(root, "wpt", ends_deg[2], ends_deg[3], -depths[-1], f"line {index} end", line.kind)
     for index, points in enumerate(export.dives, start=1):
         route = child(root, "rte")
         child(route, "name", f"{plan.name} dive {index}")

@@ -11,7 +11,7 @@ from alice_survey.core.artefacts import write_json
 from alice_survey.core.config import parse_config
 from alice_survey.core.errors import PlanError
 from missions.exports import formats
-from missions.exports.registry import format_names, formats_table
+from missions.exports.registry import format_names
 from missions.exports.waypoints import DEPTH_STEP_M, bends
 from missions.exports.write import export_report, write_exports
 from tests.missions.exports.plans import RIG, small_plan
@@ -117,7 +117,6 @@ def test_a_format_is_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     (tmp_path / "toy_lengths.py").write_text(_TOY)
     monkeypatch.setattr(formats, "__path__", [*formats.__path__, str(tmp_path)])
     assert "toy-lengths" in format_names()
-    assert "| `toy-lengths` | `lengths.txt` |" in formats_table()
     files = write_exports(tmp_path / "out", small_plan(), RIG)
     assert files[tmp_path / "out" / "lengths.txt"] == "lengths of lines"
     assert len((tmp_path / "out" / "lengths.txt").read_text().splitlines()) == 6

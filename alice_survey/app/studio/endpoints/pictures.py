@@ -1,8 +1,8 @@
 """The studio's pictures: which show a place, picks and control in them, lengths between points."""
 
 import threading
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -48,10 +48,9 @@ from reconstruct.placing.control_points import (
 )
 
 TILE_PX = 512
-_MAX_BYTES = 500_000_000
-"""Of decoded pictures that are kept; the last one is, whatever its size."""
+_KEPT_PICTURES = 8
+"""Decoded pictures that are kept: some 500 MB of 20 megapixels each."""
 _QUALITY = 95
-_GREY = np.array([0.114, 0.587, 0.299])
 
 
 class TakenPictures:
@@ -60,21 +59,20 @@ class TakenPictures:
     def __init__(self, workspace: Workspace) -> None:
         """Take a workspace; it need not have any."""
         self._workspace = workspace
-        self._lock = threading.Lock()
-        self._kept: OrderedDict[tuple[str, str], Colour] = OrderedDict()
-        self._decoding: dict[tuple[str, str], threading.Lock] = {}
-        self._records: tuple[str, dict[str, ImageRecord]] = ("", {})
+        # By the token of the file, so that a changed one is read again.
+        self._decoded = lru_cache(_KEPT_PICTURES)(lambda name, _: read_colour(self.path(name)))
+        self._records = lru_cache(1)(self._read_records)
 
     def records(self) -> dict[str, ImageRecord]:
         """What the manifest says, by name; nothing where there are no pictures yet."""
         folder = self._workspace.folder / "images"
         if read_stage(folder) is None or not self._workspace.has("images/manifest.csv"):
             return {}
-        token = self._workspace.token("images/manifest.csv")
-        if self._records[0] != token:
-            read = read_manifest(folder / "manifest.csv")
-            self._records = token, {record.image: record for record in read}
-        return self._records[1]
+        return self._records(self._workspace.token("images/manifest.csv"))
+
+    def _read_records(self, _: str) -> dict[str, ImageRecord]:
+        rows = read_manifest(self._workspace.folder / "images" / "manifest.csv")
+        return {record.image: record for record in rows}
 
     def path(self, name: str) -> Path:
         """The file of a picture.
@@ -99,30 +97,11 @@ class TakenPictures:
             ImageError: it cannot be decoded.
             FileNotFoundError: see `path`.
         """
-        key = name, self.token(name)
-        with self._lock:
-            if key in self._kept:
-                self._kept.move_to_end(key)
-                return self._kept[key]
-            mine = self._decoding.setdefault(key, threading.Lock())
-        with mine:  # of two that want it, one decodes
-            with self._lock:
-                if key in self._kept:
-                    return self._kept[key]
-            pixels = read_colour(self.path(name))
-            with self._lock:
-                self._kept[key] = pixels
-                while len(self._kept) > 1 and self._bytes() > _MAX_BYTES:
-                    self._kept.popitem(last=False)
-                self._decoding.pop(key, None)
-        return pixels
+        return self._decoded(name, self.token(name))
 
     def grey(self, name: str) -> NDArray[np.uint8]:
         """(H, W) as taken; see `colour`."""
         return np.asarray(cv2.cvtColor(self.colour(name), cv2.COLOR_BGR2GRAY), np.uint8)
-
-    def _bytes(self) -> int:
-        return sum(picture.nbytes for picture in self._kept.values())
 
     def size(self, name: str) -> tuple[int, int]:
         """Width and height, without decoding the picture where its header says so."""
@@ -152,12 +131,9 @@ class TakenPictures:
         if halvings:
             size = tuple(-(-length >> halvings) if length else 0 for length in part.shape[1::-1])
             part = cv2.resize(part, size, interpolation=cv2.INTER_AREA)
-        return _webp(part)
-
-
-def _webp(pixels: Colour) -> bytes:
-    data: bytes = cv2.imencode(".webp", pixels, [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])[1].tobytes()
-    return data
+        options = [cv2.IMWRITE_WEBP_QUALITY, _QUALITY]
+        data: bytes = cv2.imencode(".webp", part, options)[1].tobytes()
+        return data
 
 
 def levels_of(width: int, height: int) -> int:

@@ -1,7 +1,6 @@
 """The first start: a survey to plan, or pictures that are there, become a workspace."""
 
-import base64
-import binascii
+import contextlib
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -9,7 +8,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any, cast
 
-from pydantic import Field, RootModel
+from pydantic import Base64Bytes, Field, RootModel
 
 from alice_survey.app.commands.pictures import ImportImagesCommand
 from alice_survey.app.pipeline import init_survey
@@ -108,26 +107,16 @@ def _is_shown(entry: os.DirEntry[str]) -> bool:
 
 def _count_folder(folder: Path) -> Folder:
     """A folder with the numbers of its pictures, videos and folders; one that cannot be read, 0."""
-    pictures = videos = folders = entries_n = 0
-    try:
-        with os.scandir(folder) as entries:
-            for entry in entries:
-                entries_n += 1
-                if entries_n > _MAX_ENTRIES:
-                    break
-                if not _is_shown(entry):
-                    continue
-                if entry.is_dir(follow_symlinks=False):
-                    folders += 1
-                elif kind_of(Path(entry.name)):
-                    pictures += 1
-                elif Path(entry.name).suffix.lower() in VIDEO:
-                    videos += 1
-    except OSError:
-        pass
+    entries: list[os.DirEntry[str]] = []
+    with contextlib.suppress(OSError), os.scandir(folder) as found:
+        entries = list(islice(found, _MAX_ENTRIES + 1))
+    shown = [entry for entry in entries[:_MAX_ENTRIES] if _is_shown(entry)]
+    files = [Path(entry.name) for entry in shown if not entry.is_dir(follow_symlinks=False)]
+    pictures = sum(bool(kind_of(file)) for file in files)
+    videos = sum(not kind_of(file) and file.suffix.lower() in VIDEO for file in files)
     return Folder(
         path=str(folder), name=folder.name or str(folder), pictures=pictures, videos=videos,
-        folders=folders, more=entries_n > _MAX_ENTRIES,
+        folders=len(shown) - len(files), more=len(entries) > _MAX_ENTRIES,
     )  # fmt: skip
 
 
@@ -150,7 +139,7 @@ class _AskedFolder(Config):
 
 class _DroppedArea(Config):
     name: str = Field(max_length=300)
-    base64: str
+    base64: Base64Bytes
 
 
 class _NewSurvey(Config):
@@ -202,9 +191,10 @@ class _StartPage:
         """Write the settings of a survey to plan."""
         asked = call.read(_NewSurvey)
         workspace = self.studio.workspace.folder
-        area = ("latitude_deg", "longitude_deg", "length_m", "width_m", "seafloor_depth_m")
+        area = {"latitude_deg", "longitude_deg", "length_m", "width_m", "seafloor_depth_m"}
         values: dict[str, Mapping[str, Any]] = {
-            "area": _known_values(asked, area), "camera": _known_values(asked, ("focal_mm",)),
+            "area": asked.model_dump(include=area, exclude_none=True),
+            "camera": asked.model_dump(include={"focal_mm"}, exclude_none=True),
             **(_TRIAL if asked.trial else {}),
         }  # fmt: skip
         if (asked.latitude_deg is None) != (asked.longitude_deg is None):
@@ -226,17 +216,13 @@ class _StartPage:
                 f"{given.name}: {suffix or 'no ending'!r} files are not read; those that are: "
                 f"{', '.join(_SINGLE)} (a shapefile as .zip)"
             )
-        try:
-            content = base64.b64decode(given.base64, validate=True)
-        except binascii.Error:
-            raise AliceError(f"{given.name} did not arrive whole: drop it again") from None
         folder = self.studio.workspace.folder
         area, toml = folder / f"area{suffix}", folder / "survey.toml"
         refuse_links(folder, area, toml)
         if area.exists():
             raise StaleError(f"{area} exists already: remove it first")
         try:
-            area.write_bytes(content)
+            area.write_bytes(given.base64)
             init_survey(folder, area=area, name=name, values=values)
             config = load_config(toml)
             survey_area(config.area, turn_margin_m=3.0)
@@ -244,10 +230,6 @@ class _StartPage:
             toml.unlink(missing_ok=True)
             area.unlink(missing_ok=True)
             raise
-
-
-def _known_values(asked: _NewSurvey, names: Sequence[str]) -> dict[str, float]:
-    return {name: value for name in names if (value := getattr(asked, name)) is not None}
 
 
 def endpoints(studio: Studio) -> Sequence[Endpoint]:
