@@ -118,7 +118,7 @@ def adjusted(
         scale_sigma=float(np.sqrt(scaling @ left @ scaling)),
         points_ned={int(i): point.xyz for i, point in model.points3D.items()},
         correlation=(
-            f"{depth.factor:.2g} of stated, {depth.tau:.3g} {fit.time_unit}, white "
+            f"{depth.factor:.2g} of stated, {depth.tau:.3g} s, white "
             f"{depth.white:.2g}, constant {depth.constant:.2g}"
         ),
     )

@@ -12,9 +12,9 @@ does not change lies in files, of which a task has the paths.
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from itertools import pairwise, repeat
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -186,7 +186,7 @@ def start_state(
     )
 
 
-def exact_residuals(state: RigState, pixels: Pixels) -> Array:
+def exact_residuals(pixels: Pixels, state: RigState, _: None = None) -> Array:
     """(O, 2) computed pixels minus observed ones; NaN where no ray explains one."""
     arm = state.points[pixels.point] - state.centres[pixels.station]
     residuals = np.empty((len(arm), 2))
@@ -275,29 +275,15 @@ ALONE = Workers()
 """This process."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _PixelPart(Generic[Value]):
-    """A part for a worker."""
-
-    pixels: Pixels | Path
-    """Of its own stations and points."""
-    state: RigState
-    """Of the same."""
-    value: Value
-
-    def run(self, function: Callable[[Pixels, RigState, Value], Result]) -> Result:
-        """What a function makes of it."""
-        pixels = _load(self.pixels) if isinstance(self.pixels, Path) else self.pixels
-        return function(pixels, self.state, self.value)
-
-
-def _run(function: Callable[[Pixels, RigState, Any], Result], part: _PixelPart[Any]) -> Result:
-    return part.run(function)
-
-
-def _load(path: Path) -> Pixels:
-    with np.load(path) as arrays:
-        return Pixels(**arrays)
+def _run(
+    function: Callable[[Pixels, Any, Any], Result], part: tuple[Pixels | Path, Any, Any]
+) -> Result:
+    """What a function makes of a part, whose pixels may lie in a file."""
+    pixels, state, value = part
+    if isinstance(pixels, Path):
+        with np.load(pixels) as arrays:
+            pixels = Pixels(**arrays)
+    return function(pixels, state, value)
 
 
 class PixelParts:
@@ -344,10 +330,8 @@ class PixelParts:
     def _map(
         self, function: Callable[..., Result], states: Iterable[Any], values: Iterable[Any]
     ) -> Iterator[Result]:
-        tasks = (
-            _PixelPart(pixels=self._of(k), state=state, value=value)
-            for k, state, value in zip(range(len(self.runs)), states, values, strict=True)
-        )
+        parts = map(self._of, range(len(self.runs)))
+        tasks = zip(parts, states, values, strict=True)
         run, executor = partial(_run, function), self.workers.executor
         if self.is_one or self.workers.folder is None:
             return map(run, tasks)
@@ -383,17 +367,11 @@ class PixelParts:
 
     def residuals(self, state: RigState) -> Array:
         """(O, 2) computed pixels minus observed ones; NaN where no ray explains one."""
-        return np.concatenate(
-            list(self.map(_residuals_of_part, state, repeat(None, len(self.runs))))
-        )
+        return np.concatenate(list(self.map(exact_residuals, state, [None] * len(self.runs))))
 
 
 def _pattern_of_part(pixels: Pixels, _: None, own: Indices) -> BlockPattern:
     return pattern_of(pixels.starts, pixels.station, len(own))
-
-
-def _residuals_of_part(pixels: Pixels, state: RigState, _: None) -> Array:
-    return exact_residuals(state, pixels)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -427,32 +405,27 @@ class Linearised:
         self, function: Callable[[LinearObservations, Any], Result], values: Iterable[Any]
     ) -> Iterator[Result]:
         """Yield `function(part, value)` of every part with its value, in order."""
-        how = _How(fields=tuple(self.fields), noise=self.noise)
+        weigh = partial(_weighted, tuple(self.fields), self.noise)
         if self.pixels.is_one:
             if not self.kept:
-                self.kept.append(how.linear(self.pixels.pixels, self.state))
+                self.kept.append(weigh(self.pixels.pixels, self.state))
             return (function(self.kept[0], value) for value in values)
-        return self.pixels.map(partial(_on_linear, function, how), self.state, values)
+        return self.pixels.map(partial(_on_weighted, function, weigh), self.state, values)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _How:
-    """How observations are linearised."""
-
-    fields: tuple[str, ...]
-    noise: tuple[float, float]
-
-    def linear(self, pixels: Pixels, state: RigState) -> LinearObservations:
-        sigma, variance = self.noise
-        found = exact_observations(state, pixels, self.fields)
-        return found.weigh(cauchy_weights(found.miss, sigma) / variance)
+def _weighted(
+    fields: tuple[str, ...], noise: tuple[float, float], pixels: Pixels, state: RigState
+) -> LinearObservations:
+    sigma, variance = noise
+    found = exact_observations(state, pixels, fields)
+    return found.weigh(cauchy_weights(found.miss, sigma) / variance)
 
 
-def _on_linear(
+def _on_weighted(
     function: Callable[[LinearObservations, Any], Result],
-    how: _How,
+    weigh: Callable[[Pixels, RigState], LinearObservations],
     pixels: Pixels,
     state: RigState,
     value: Any,
 ) -> Result:
-    return function(how.linear(pixels, state), value)
+    return function(weigh(pixels, state), value)

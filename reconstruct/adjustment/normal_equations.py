@@ -52,15 +52,9 @@ class LinearObservations:
         return self.rest[..., -1]
 
     @property
-    def seen_by(self) -> Indices:
-        """(O,) how many observations each one's point has."""
-        counts: Indices = np.diff(self.starts)
-        return np.repeat(counts, counts)
-
-    @property
-    def point(self) -> Indices:
-        """(O,) index of the point."""
-        return np.repeat(np.arange(len(self.starts) - 1), np.diff(self.starts))
+    def point_inverse(self) -> Array:
+        """(P, 3, 3) covariances of points where all else is known."""
+        return _point_inverse(self.starts, self.by_point)
 
     def weigh(self, weights: Array) -> "LinearObservations":
         """The same observations with the squares of each weighted, (O,)."""
@@ -169,17 +163,6 @@ def _pattern(meets: csr_matrix) -> BlockPattern:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PartSums:
-    """What a part of the points says of its own stations and of what is shared."""
-
-    pattern: BlockPattern
-    blocks: Array
-    border: Array
-    shared: Array
-    """Below its diagonal; all three as in `Equations`."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class PointEquations(Equations):
     """Normal equations of stations and of what is shared, the points eliminated."""
 
@@ -255,12 +238,12 @@ def _between(whole: BlockPattern, own: Indices) -> tuple[BlockPattern, Indices]:
 
 
 def _inverse_of_part(linear: LinearObservations, _: None) -> Array:
-    return _point_inverse(linear.starts, linear.by_point)
+    return linear.point_inverse
 
 
 def _follow_part(linear: LinearObservations, steps: tuple[Array, Array]) -> Array:
     """Motions (p, 3) of a part's points by steps of its stations and of the rest."""
-    return _follow(*linear.arrays, _point_inverse(linear.starts, linear.by_point), *steps)
+    return _follow(*linear.arrays, linear.point_inverse, *steps)
 
 
 def _follow_steps_in_part(
@@ -268,7 +251,7 @@ def _follow_steps_in_part(
 ) -> Array:
     """Motions (p, 3, K) of chosen points by steps (f, 6, K) of stations, (K, G + 1) of the rest."""
     (poses, rest), chosen = by
-    inverse = _point_inverse(linear.starts, linear.by_point)
+    inverse = linear.point_inverse
     steps = zip(np.ascontiguousarray(poses.transpose(2, 0, 1)), rest, strict=True)
     moved = [_follow(*linear.arrays, inverse, *step)[chosen] for step in steps]
     return np.stack(moved, axis=-1)
@@ -276,8 +259,9 @@ def _follow_steps_in_part(
 
 def _covariances_of_part(linear: LinearObservations, known: tuple[BlockPattern, Array]) -> Array:
     pattern, blocks = known
-    inverse = _point_inverse(linear.starts, linear.by_point)
-    return _point_covariances(*linear.arrays, inverse, pattern.pointers, pattern.columns, blocks)
+    return _point_covariances(
+        *linear.arrays, linear.point_inverse, pattern.pointers, pattern.columns, blocks
+    )
 
 
 def reduce_points(linear: LinearObservations, stations: int) -> PointEquations:
@@ -295,38 +279,41 @@ def reduce_parts(parts: LinearParts) -> PointEquations:
     pattern = parts.pattern
     stations = len(pattern.pointers) - 1
     found: PointEquations | None = None
-    for own, sums in zip(
-        parts.stations, parts.map(_reduce_part, map(len, parts.stations)), strict=True
-    ):
+    every = parts.map(_reduce_part, map(len, parts.stations))
+    for own, (part, blocks, border, shared) in zip(parts.stations, every, strict=True):
         if found is None:
-            count = len(sums.shared)
+            count = len(shared)
             found = PointEquations(
                 pointers=pattern.pointers, columns=pattern.columns, parts=parts,
                 blocks=np.zeros((len(pattern.columns), POSE, POSE)),
                 border=np.zeros((stations, POSE, count)), shared=np.zeros((count, count)),
                 free=np.ones((stations, POSE), dtype=np.bool_),
             )  # fmt: skip
-        found.blocks[pattern.at(own, sums.pattern)] += sums.blocks
-        found.border[own] += sums.border
-        found.shared[:] += sums.shared
+        found.blocks[pattern.at(own, part)] += blocks
+        found.border[own] += border
+        found.shared[:] += shared
     if found is None:
         raise ValueError("no observations")
     found.shared[:] += np.tril(found.shared, -1).T
     return found
 
 
-def _reduce_part(linear: LinearObservations, stations: int) -> PartSums:
+def _reduce_part(
+    linear: LinearObservations, stations: int
+) -> tuple[BlockPattern, Array, Array, Array]:
+    """What a part of the points says of its own stations and of what is shared.
+
+    Blocks, border and, below its diagonal, what is shared are as in `Equations`.
+    """
     pattern = pattern_of(linear.starts, linear.station, stations)
     count = linear.rest.shape[2]
-    sums = PartSums(
-        pattern=pattern, blocks=np.zeros((len(pattern.columns), POSE, POSE)),
-        border=np.zeros((stations, POSE, count)), shared=np.zeros((count, count)),
-    )  # fmt: skip
+    blocks = np.zeros((len(pattern.columns), POSE, POSE))
+    border, shared = np.zeros((stations, POSE, count)), np.zeros((count, count))
     _reduce(
-        *linear.arrays, _point_inverse(linear.starts, linear.by_point), pattern.pointers,
-        pattern.columns, sums.blocks, sums.border, sums.shared,
+        *linear.arrays, linear.point_inverse, pattern.pointers, pattern.columns, blocks, border,
+        shared,
     )  # fmt: skip
-    return sums
+    return pattern, blocks, border, shared
 
 
 @compiled

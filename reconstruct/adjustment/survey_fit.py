@@ -52,8 +52,7 @@ from reconstruct.adjustment.exact_observations import (
     start_state,
 )
 from reconstruct.adjustment.normal_equations import POSE, PointEquations, reduce_parts
-from reconstruct.adjustment.soft_modes import Motions, SoftModes
-from reconstruct.adjustment.uncertainty import Uncertainty, estimate
+from reconstruct.adjustment.uncertainty import Motions, SoftModes, Uncertainty, estimate
 from reconstruct.mapping.arrays import (
     MIN_POINTS,
     Indices,
@@ -128,18 +127,13 @@ class Contradiction:
     chi_square: float
     directions: int
     """Combinations of parameters that the pictures measure: the mean of a right calibration's."""
-    named: tuple[str, ...]
-    """Parameters that moved by the most prior sigmas, the most moved first."""
-    pulls: tuple[float, ...]
-    """By how many."""
+    pulls: Mapping[str, float]
+    """Parameters that moved by the most prior sigmas, by how many, the most moved first."""
 
     @property
     def words(self) -> str:
         """What to tell, in one line."""
-        moved = ", ".join(
-            f"{name} by {pull:+.1f} sigmas"
-            for name, pull in zip(self.named, self.pulls, strict=True)
-        )
+        moved = ", ".join(f"{name} by {pull:+.1f} sigmas" for name, pull in self.pulls.items())
         return (
             f"the pictures contradict the calibration (chi-square {self.chi_square:.0f} of "
             f"{self.directions}): they move {moved} of what it states: calibrate again in the "
@@ -175,12 +169,8 @@ def contradiction(
     pulls = change / sigmas
     order = np.argsort(-np.abs(pulls))
     far = [int(k) for k in order if abs(pulls[k]) > _FAR][:_MAX_NAMED] or [int(order[0])]
-    return Contradiction(
-        chi_square=total,
-        directions=count,
-        named=tuple(parameters[k] for k in far),
-        pulls=tuple(float(pulls[k]) for k in far),
-    )
+    named = {parameters[k]: float(pulls[k]) for k in far}
+    return Contradiction(chi_square=total, directions=count, pulls=named)
 
 
 _RIG_SIGMAS = dict(zip(TURN_AND_SHIFT, [0.02] * 3 + [0.005] * 3, strict=True))
@@ -390,23 +380,20 @@ class SurveyProblem:
         self.parts = PixelParts(pixels, len(state.centres), workers)
         self.information = prior.information.copy()
         _hold_baseline(self.information, self.fields, state.rig)
-        self.left = self._spare(state) / (2 * len(pixels.station))
+        observed, stations = len(pixels.station), len(state.centres)
+        spare, shared = 2 * observed - 3 * pixels.points - POSE * stations, len(self.information)
+        if spare < 10 * shared:
+            raise ReconstructionError(
+                f"{observed} observations of {pixels.points} points from {stations} stations do "
+                f"not determine {shared} parameters of the rig: leave refine_port and refine_rig "
+                "off"
+            )
+        self.left = spare / (2 * observed)
         seen = np.bincount(pixels.station, minlength=len(state.centres))
         self.held = seen < MIN_POINTS
         group = linked_groups(pixels.station, pixels.point, len(seen))
         self.held[first_of(group)] = True
         self.start = self._observations(state)
-
-    def _spare(self, state: RigState) -> int:
-        observations, points = len(self.pixels.station), self.pixels.points
-        stations, shared = len(state.centres), len(self.information)
-        spare = 2 * observations - 3 * points - POSE * stations
-        if spare < 10 * shared:
-            raise ReconstructionError(
-                f"{observations} observations of {points} points from {stations} stations do not "
-                f"determine {shared} parameters of the rig: leave refine_port and refine_rig off"
-            )
-        return spare
 
     def _observations(self, state: RigState) -> _Guess:
         miss = self.parts.residuals(state)
@@ -467,11 +454,10 @@ def _prior(rig: Rig, names: Sequence[str], *, port: bool, pose: bool) -> Prior:
     """What is known before the pictures of what may move."""
     known = calibrated_parameters(rig, names)
     wide: dict[str, float] = {}
-    if port:
-        for name in names:
-            camera = rig.cameras[name]
-            if camera.refracts:
-                wide |= {f"{name}.{field}": sigma for field, sigma in camera.port.spreads.items()}
+    for name in names if port else ():
+        camera = rig.cameras[name]
+        if camera.refracts:
+            wide |= {f"{name}.{field}": sigma for field, sigma in camera.port.spreads.items()}
     if pose:
         wide |= {
             name: _RIG_SIGMAS[name.split(".")[1]]
@@ -629,7 +615,19 @@ def adjust_survey(
         rig = part_of_rig(rig, list(mapped.warps))
     try:
         if rig is not None and distances is not None and mapped.scaled:
-            exact = _exact(mapped, records, rig, distances, settings, workers)
+            names = list(mapped.warps)
+            seen = Observations(
+                images=records,
+                cameras={name: colmap_pinhole(w.pinhole) for name, w in mapped.warps.items()},
+                taken=taken_pixels(mapped.model, records, mapped.warps),
+                pairs=(),
+                warps=mapped.warps,
+            )
+            fit = fit_survey(
+                mapped, seen, rig, port=settings.refine_port,
+                pose=frees_poses(settings, rig, names), workers=workers,
+            )  # fmt: skip
+            exact = ExactSurvey(mapped=mapped, seen=seen, distances=distances, fit=fit)
         elif settings.refine_port or settings.refine_rig == "on":
             raise ReconstructionError(
                 "refine_port and refine_rig need two cameras, whose known baseline gives the "
@@ -640,9 +638,14 @@ def adjust_survey(
             raise
         notes = (*notes, f"rig as calibrated: {error}")
     found = replace(mapped, notes=notes) if exact is None else exact.on_pinholes()
-    shape = None
+    shape, fit_of = None, None if exact is None else exact.fit
     try:
-        shape = _shape(found, records, exact, workers)
+        with progress.step("covariance of the model"):
+            shape = estimate(
+                found, records, None if fit_of is None else fit_of.calibration,
+                held=fit_of is not None and not fit_of.parameters,
+                workers=workers.apart("covariance"),
+            )  # fmt: skip
     except ReconstructionError as error:
         warn(f"no covariance: {error}")
     if exact is not None:
@@ -650,43 +653,8 @@ def adjust_survey(
     return AdjustedSurvey(mapped=found, rig=rig, exact=exact, shape=shape)
 
 
-def _exact(
-    mapped: Mapped,
-    records: Sequence[ImageRecord],
-    rig: Rig,
-    distances: RangeRecord,
-    settings: ReconstructConfig,
-    workers: Workers,
-) -> ExactSurvey:
-    names = list(mapped.warps)
-    seen = Observations(
-        images=records,
-        cameras={name: colmap_pinhole(warp.pinhole) for name, warp in mapped.warps.items()},
-        taken=taken_pixels(mapped.model, records, mapped.warps),
-        pairs=(),
-        warps=mapped.warps,
-    )
-    pose = frees_poses(settings, rig, names)
-    fit = fit_survey(mapped, seen, rig, port=settings.refine_port, pose=pose, workers=workers)
-    return ExactSurvey(mapped=mapped, seen=seen, distances=distances, fit=fit)
-
-
-@progress.step("covariance of the model")
-def _shape(
-    mapped: Mapped, records: Sequence[ImageRecord], exact: ExactSurvey | None, workers: Workers
-) -> Uncertainty:
-    workers = workers.apart("covariance")
-    if exact is None:
-        return estimate(mapped, records, workers=workers)
-    return estimate(
-        mapped, records, exact.fit.calibration, held=not exact.fit.parameters, workers=workers
-    )
-
-
 def taken_pixels(
-    model: pycolmap.Reconstruction,
-    records: Sequence[ImageRecord],
-    warps: Mapping[str, PinholeWarp],
+    model: pycolmap.Reconstruction, records: Sequence[ImageRecord], warps: Mapping[str, PinholeWarp]
 ) -> list[Array]:
     """The keypoints of all pictures as taken, (N, 2) each.
 

@@ -13,6 +13,12 @@ Rig and ports are not exact: a lens that is off by its sigma bends the whole blo
 every picture more does the same again. To first order stations and points move with the rig's
 parameters as the adjustment's normal equations say (implicit function theorem), and the covariance
 of the calibration moves with them.
+
+Pictures leave few deformations of a block soft: its bends, its twist, its scale. These soft modes,
+the leading eigenvectors of the covariance, are what measurements from outside can improve; all
+others are known better from the pictures. Updating them alone is the best approximation of its rank
+to the joint estimate (Spantini et al. 2015, "Optimal low-rank approximations of Bayesian linear
+inverse problems").
 """
 
 from collections.abc import Sequence
@@ -24,6 +30,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
+from scipy.sparse.linalg import LinearOperator, eigsh
 from scipy.spatial import KDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -50,7 +57,6 @@ from reconstruct.adjustment.normal_equations import (
     PointEquations,
     reduce_parts,
 )
-from reconstruct.adjustment.soft_modes import Motions, SoftModes, no_modes, soft_modes, spread
 from reconstruct.mapping.arrays import (
     MIN_POINTS,
     Indices,
@@ -62,6 +68,249 @@ from reconstruct.mapping.arrays import (
 from reconstruct.mapping.bundle import cauchy_weights, sigma_of, variance_of
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.views.model_files import as_transform
+
+_MODES = 32
+"""Soft modes at most: of a block of lines the tenth is known a hundred times as well as the first.
+"""
+_MODES_TOLERANCE = 1e-4
+_ROWS = 10_000
+"""Points whose motions are worked on at a time: in double precision they take much memory."""
+_MIN_MODE = 1e-13
+"""Variance of a mode over that of the softest, above rounding: where two parts of a model hardly
+hang together, one mode is kilometres large and others are millimetres."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Groups:
+    """Groups of stations that no point links; the first is the largest."""
+
+    station: Indices
+    """(F,) the group of each station."""
+    point: Indices
+    """(P,) that of each point."""
+    middles: Array
+    """(N, 3) about which groups turn and grow."""
+
+    def carry(self, motions: Array, places: Array, group: Indices) -> Array:
+        """Places (M, 3) of groups (M,) that are moved relative to the first.
+
+        Args:
+            motions: (N - 1, 6 or 7) of the other groups: turn, shift, logarithm of the scale.
+            places: to carry, in the model.
+            group: of each.
+        """
+        every = np.concatenate([np.zeros((1, motions.shape[1])), motions])[group]
+        arms = Rotation.from_rotvec(every[:, :3]).apply(places - self.middles[group])
+        grown = arms * np.exp(every[:, 6:].sum(axis=1, keepdims=True))
+        carried: Array = self.middles[group] + every[:, 3:6] + grown
+        return carried
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SoftModes:
+    """Deformations of a block that pictures determine least, the softest first, each by a sigma.
+
+    They are independent of each other and of what else the covariance holds. After them come
+    motions of the groups of stations that nothing links to the first: turns about the axes of the
+    model (radians), shifts and, where it is free, the logarithm of the scale. Pictures know nothing
+    of these.
+    """
+
+    stations: Array
+    """(F, 6, K) turns and motions of the stations, in the model's axes."""
+    points: Array | NDArray[np.float32]
+    """(P, 3, K) motions of the points; in single precision, as there are many."""
+    calibration: Array
+    """(G, K) changes of the parameters of the rig; G is 0 where it is held."""
+    joints: int = 0
+    """How many of the K are motions of groups."""
+    groups: Groups | None = None
+    """The groups, where there are several."""
+
+    @property
+    def known(self) -> Array:
+        """(K,) 1 of modes with a variance by pictures, 0 of motions of groups, which have none."""
+        count = self.stations.shape[2]
+        return np.repeat([1.0, 0.0], [count - self.joints, self.joints])
+
+    def of_points(self, rows: Indices) -> Self:
+        """The same of some of the points, (P',), in that order."""
+        groups = self.groups and replace(self.groups, point=self.groups.point[rows])
+        return replace(self, points=self.points[rows], groups=groups)
+
+    def move(
+        self, sizes: Array, centres: Array, points: Array, rows: Indices | slice
+    ) -> tuple[Rotation, Array, Array]:
+        """Turns (F,) of the stations, and where these and the points are, with modes of a size.
+
+        Groups stay as they are in themselves, however far they turn.
+
+        Args:
+            sizes: (K,).
+            centres: (F, 3) of the stations before.
+            points: (N, 3) of some points before.
+            rows: which these are.
+        """
+        soft = sizes * self.known
+        step = self.stations @ soft
+        turns, centres = Rotation.from_rotvec(step[:, :3]), centres + step[:, 3:]
+        points = points + np.einsum("nik,k->ni", self.points[rows], soft)
+        if self.groups is None:
+            return turns, centres, points
+        motions = sizes[-self.joints :].reshape(len(self.groups.middles) - 1, -1)
+        every = np.concatenate([np.zeros((1, 3)), motions[:, :3]])[self.groups.station]
+        return (
+            Rotation.from_rotvec(every) * turns,
+            self.groups.carry(motions, centres, self.groups.station),
+            self.groups.carry(motions, points, self.groups.point[rows]),
+        )
+
+
+def no_modes(stations: int, points: int) -> SoftModes:
+    """Those of a stiff model."""
+    return SoftModes(
+        stations=np.zeros((stations, POSE, 0)),
+        points=np.zeros((points, 3, 0), np.float32),
+        calibration=np.zeros((0, 0)),
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Motions:
+    """How a block moves with the parameters of its rig, and how uncertain those are."""
+
+    stations: Array
+    """(F, 6, G) turns and motions of the stations by the parameters, in the model's axes."""
+    places: Array
+    """(P, 3) points at which the motion is known: enough of them, not all."""
+    points: Array
+    """(P, 3, G) motions of those points by the parameters."""
+    covariance: Array
+    """(G, G) covariance of the parameters."""
+    group: Indices | None = None
+    """(P,) of the `places`; None where all are of one."""
+
+    def of_stations(self) -> Array:
+        """Covariances (F, 6, 6) of the stations."""
+        return spread(self.stations, self.covariance)
+
+    def of_points(self, points: Array, group: Indices | None = None) -> Array:
+        """Covariances (N, 3, 3) of (N, 3) points: those of the nearest where it is known."""
+        given, which = np.unique(self.nearest(points, group), return_inverse=True)
+        found: Array = spread(self.points[given], self.covariance)[which]
+        return found
+
+    def nearest(self, points: Array, group: Indices | None = None) -> Indices:
+        """(N,) which of `places` are nearest to (N, 3) points, of groups (N,) where there are some.
+
+        A group without a place takes those of the others.
+        """
+        if group is None or self.group is None:
+            found: Indices = np.asarray(KDTree(self.places).query(points)[1])
+            return found
+        found = np.empty(len(points), np.int64)
+        for number in np.unique(group):
+            own = np.flatnonzero(self.group == number)
+            own = own if len(own) else np.arange(len(self.places))
+            mine = group == number
+            found[mine] = own[KDTree(self.places[own]).query(points[mine])[1]]
+        return found
+
+    def without(self, gauge: Gauge) -> "Motions":
+        """The same minus what motions of whole groups do, which do not change their shape."""
+        whole = gauge.motion_in(self.stations)
+        return replace(
+            self,
+            stations=self.stations - gauge.motions @ whole,
+            points=self.points - gauge.of_points(self.places, self.group) @ whole,
+        )
+
+
+def soft_modes(
+    equations: PointEquations,
+    gauge: Gauge,
+    calibration: Motions | None,
+    points: Array,
+    group: Indices,
+) -> SoftModes:
+    """The leading eigenvectors of the covariance of the shape, then motions of groups.
+
+    Turns count as what they move at the usual distance, like the gauge's. A mode of the stations
+    takes with it what it makes likely of the points and of the rig.
+
+    Args:
+        equations: of the stations, with nothing shared.
+        gauge: motions of whole groups, which are no change of their shape.
+        calibration: what errors of the rig do; None without.
+        points: (P, 3) in the model.
+        group: (P,) of them.
+    """
+    weigh = np.sqrt(gauge.weights)
+    stations, width = equations.free.shape
+
+    def respond(weighed: Array) -> tuple[Array, Array, Array]:
+        """Covariance times (F, 6): of stations in a fixed rig, in all, and of the rig."""
+        kick = gauge.shape_weights(weigh * weighed)
+        own = equations.covariance_times(kick[..., None])[..., 0]
+        if calibration is None:
+            return own, own, np.zeros(0)
+        rig = calibration.covariance @ np.tensordot(
+            calibration.stations, kick, axes=([0, 1], [0, 1])
+        )
+        return own, own + calibration.stations @ rig, rig
+
+    def product(flat: Array) -> Array:
+        step = respond(flat.reshape(stations, width))[1]
+        shape: Array = weigh * (step - gauge.motions @ gauge.motion_in(step))
+        return shape.ravel()
+
+    size = stations * width
+    count = min(_MODES, size - gauge.motions.shape[2] - 1)
+    operator: Any = LinearOperator((size, size), matvec=product, dtype=np.float64)
+    start = np.random.default_rng(0).normal(size=size)  # any will do; the same modes each time
+    values, vectors = eigsh(operator, k=count, which="LA", v0=start, tol=_MODES_TOLERANCE)
+    kept = np.flatnonzero(values > _MIN_MODE * values.max())[::-1]
+    owns, shape, rigs, wholes = [], [], [], []
+    for k in kept.tolist():
+        sigma = np.sqrt(values[k])
+        own, step, rig = (part / sigma for part in respond(vectors[:, k].reshape(stations, width)))
+        owns.append(own)
+        wholes.append(gauge.motion_in(step))
+        shape.append(step - gauge.motions @ wholes[-1])
+        rigs.append(rig)
+    by_rig, whole = np.stack(rigs, axis=-1), np.stack(wholes, axis=-1)
+    moved = np.empty((*points.shape, len(kept)), np.float32)
+    nearest = None if calibration is None else calibration.nearest(points, group)
+    end = 0
+    for place in equations.follow_poses(np.stack(owns, axis=-1)):
+        rows = slice(end, end + len(place))
+        end = rows.stop
+        if calibration is not None and nearest is not None:
+            place = place + calibration.points[nearest[rows]] @ by_rig
+        moved[rows] = place - gauge.of_points(points[rows], group[rows]) @ whole
+    soft = SoftModes(stations=np.stack(shape, axis=-1), points=moved, calibration=by_rig)
+    joints = gauge.motions.shape[2] - gauge.each
+    if not joints:
+        return soft
+    return SoftModes(
+        stations=np.concatenate([soft.stations, gauge.motions[..., -joints:]], axis=2),
+        points=np.concatenate(
+            [soft.points, gauge.of_points(points, group)[..., -joints:].astype(np.float32)], axis=2
+        ),
+        calibration=np.pad(soft.calibration, ((0, 0), (0, joints))),
+        joints=joints,
+        groups=Groups(station=gauge.group, point=group, middles=gauge.middles),
+    )
+
+
+def spread(motions: Array | NDArray[np.float32], covariance: Array) -> Array:
+    """Covariances (N, k, k) of what moves by (N, k, G)."""
+    found = np.empty((len(motions), motions.shape[1], motions.shape[1]))
+    for first in range(0, len(motions), _ROWS):
+        some = motions[first : first + _ROWS]
+        found[first : first + _ROWS] = some @ covariance @ some.swapaxes(1, 2)
+    return found
+
 
 _MAX_PLACES = 2000
 """Places at most at which the motions that points share are kept: they are smooth."""
@@ -109,7 +358,7 @@ class Uncertainty:
     """(P, 3, 3): of it, what the noise of the point's own keypoints does; the rest are poses."""
     sigma_px: float
     """Sigma of one coordinate of a keypoint, from the residuals."""
-    modes: "SoftModes"
+    modes: SoftModes
     """What of these errors is soft."""
     shared: SharedMotions | None = None
     """What points share; None where a file of an earlier version does not say."""
@@ -265,7 +514,11 @@ def shape_of_block(
     count = len(centres)
     group = linked_groups(pixels.station, pixels.point, count)
     group_of_point = np.maximum.reduceat(group[pixels.station], pixels.starts[:-1])
-    gauge = Gauge(centres, _usual_reach(pixels, centres, points), scale_free, group)
+    reach = [
+        np.linalg.norm(points[part.point] - centres[part.station], axis=1)
+        for part in (pixels.run(*run) for run in pixels.parts())
+    ]
+    gauge = Gauge(centres, float(np.median(np.concatenate(reach))), scale_free, group)
     loose = np.bincount(pixels.station, minlength=count) < MIN_POINTS
     equations = replace(reduce_parts(linear), free=~(gauge.held | loose[:, None]))
     blocks = gauge.shape_blocks(equations)
@@ -349,23 +602,13 @@ def _spread_rows(points: Array) -> Indices:
         side *= 1.25
 
 
-def _usual_reach(pixels: Pixels, centres: Array, points: Array) -> float:
-    """Median distance from the stations to the points that they see."""
-    reach = np.empty(len(pixels.station))
-    for first, end in pixels.parts():
-        rows = slice(pixels.starts[first], pixels.starts[end])
-        arm = points[pixels.point[rows]] - centres[pixels.station[rows]]
-        reach[rows] = np.linalg.norm(arm, axis=1)
-    return float(np.median(reach))
-
-
 def write_uncertainty(path: Path, found: Uncertainty) -> None:
     """Write `covariance.npz`: fields of `Uncertainty` but the modes; points as float32."""
-    parts: tuple[Array, ...] = ()
+    more: dict[str, Any] = {}
     if found.shared is not None:
         one = found.shared
-        parts = (one.places, one.motions.astype(np.float32), one.covariance, one.rest)
-    more: dict[str, Any] = dict(zip(_SHARED, parts, strict=False))
+        parts = one.places, one.motions.astype(np.float32), one.covariance, one.rest
+        more = dict(zip(_SHARED, parts, strict=True))
     np.savez(
         path,
         frames=found.frames,
@@ -401,9 +644,9 @@ def read_uncertainty(path: Path) -> Uncertainty:
             point_noise=data["point_noise"].astype(np.float64),
             sigma_px=float(data["sigma_px"]),
             modes=no_modes(len(data["frames"]), len(data["point_ids"])),
-            shared=None
-            if not all(name in data for name in _SHARED)
-            else SharedMotions(*(data[name].astype(np.float64) for name in _SHARED)),
+            shared=SharedMotions(*(data[name].astype(np.float64) for name in _SHARED))
+            if _SHARED[-1] in data
+            else None,
         )
 
 
@@ -430,41 +673,33 @@ def pinhole_survey(
         taken=seen.pixels[order],
         point=seen.point[order],
     )
-    poses = rig_poses(model, frames).inv()
-    state = RigState(
-        rig=_pinhole_rig(model, numbers),
-        turns=poses.rotation.as_matrix(),
-        centres=poses.translation,
-        points=seen.points,
-    )
-    return pixels, state, seen.point_ids, _first_pictures(images, frames)
-
-
-def _pinhole_rig(model: pycolmap.Reconstruction, numbers: Sequence[int]) -> Rig:
-    """Cameras by their numbers, each where it is on its own rig."""
     where = {
         sensor.id: as_transform(pose)
-        for rig in model.rigs.values()
-        for sensor, pose in rig.non_ref_sensors.items()
+        for one in model.rigs.values()
+        for sensor, pose in one.non_ref_sensors.items()
     }
     cameras = {}
     for number in numbers:
-        camera = model.cameras[number]
-        fx, fy, cx, cy = camera.params
-        lens = OpenCVLens(fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy)
-        cameras[str(number)] = Camera(width_px=camera.width, height_px=camera.height, lens=lens)
-    return Rig(
+        given = model.cameras[number]
+        lens = OpenCVLens(
+            **dict(zip(("fx_px", "fy_px", "cx_px", "cy_px"), given.params, strict=True))
+        )
+        cameras[str(number)] = Camera(width_px=given.width, height_px=given.height, lens=lens)
+    rig = Rig(
         cameras=cameras,
         cam_from_rig={str(n): where.get(n, RigidTransform.identity()) for n in numbers},
         body_from_rig=None,
         source="pinholes of a model",
     )
-
-
-def _first_pictures(images: Sequence[pycolmap.Image], frames: Indices) -> list[int]:
-    """The picture of the reference camera of every frame, else its first."""
-    chosen: dict[int, tuple[bool, int]] = {}
+    poses = rig_poses(model, frames).inv()
+    state = RigState(
+        rig=rig,
+        turns=poses.rotation.as_matrix(),
+        centres=poses.translation,
+        points=seen.points,
+    )
+    first: dict[int, tuple[bool, int]] = {}
     for image in images:
         rank = (not image.is_ref_in_frame(), int(image.image_id))
-        chosen[image.frame_id] = min(rank, chosen.get(image.frame_id, rank))
-    return [chosen[int(f)][1] for f in frames]
+        first[image.frame_id] = min(rank, first.get(image.frame_id, rank))
+    return pixels, state, seen.point_ids, [first[int(f)][1] for f in frames]

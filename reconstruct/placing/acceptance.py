@@ -235,14 +235,30 @@ def check_mapping(
         rig_error: relative error of the rig's baseline in the model; NaN without one.
         scale: of the model against its stations' own stereo.
     """
-    checked, usual, far = _far_stations(model, records, positions, sigmas)
+    numbers = sorted(first_pictures(model, positions + sigmas).values())
+    usual, far = float("nan"), []
+    if len(numbers) >= _MIN_STATIONS:
+        rows = np.array(numbers) - 1
+        poses = [as_transform(model.images[n].cam_from_world()).inv() for n in numbers]
+        centres = np.array([pose.translation for pose in poses])
+        off, sigma = navigation_residuals(centres, positions[rows], sigmas[rows])
+        usual = float(np.median(off) / _MEDIAN_SIGMAS)
+        for row, off_m, over in zip(
+            rows.tolist(), off.tolist(), (off / sigma).tolist(), strict=True
+        ):
+            if off_m > FAR_M and over > FAR_SIGMAS:
+                one = records[row]
+                far.append(
+                    FarStation(station=one.station, image=one.image, off_m=off_m, sigmas=over)
+                )
+        far.sort(key=lambda f: (-f.off_m, f.station))
     notes = []
     if far:
         names = list_names([f"{f.image} ({f.off_m:.2f} m)" for f in far])
         notes.append(
-            f"{len(far)} of {checked} stations lie more than {FAR_SIGMAS:.0f} sigmas and {FAR_M} m "
-            f"from where navigation has them, which others miss by {usual:.2f} m: {names}; look at "
-            "these pictures and at navigation's log"
+            f"{len(far)} of {len(numbers)} stations lie more than {FAR_SIGMAS:.0f} sigmas and "
+            f"{FAR_M} m from where navigation has them, which others miss by {usual:.2f} m: "
+            f"{names}; look at these pictures and at navigation's log"
         )
     if abs(rig_error) > SCALE_BOUND:
         notes.append(
@@ -258,37 +274,11 @@ def check_mapping(
         warn(note)
     return AcceptanceRecord(
         notes=tuple(notes),
-        checked=checked,
+        checked=len(numbers),
         usual_m=usual if np.isfinite(usual) else None,
-        far=far,
+        far=tuple(far),
         rig_error=rig_error if np.isfinite(rig_error) else None,
     )
-
-
-def _far_stations(
-    model: pycolmap.Reconstruction, records: Sequence[ImageRecord], positions: Array, sigmas: Array
-) -> tuple[int, float, tuple[FarStation, ...]]:
-    numbers = sorted(first_pictures(model, positions + sigmas).values())
-    if len(numbers) < _MIN_STATIONS:
-        return len(numbers), float("nan"), ()
-    rows = np.array(numbers) - 1
-    centres = np.array(
-        [as_transform(model.images[n].cam_from_world()).inv().translation for n in numbers]
-    )
-    off, sigma = navigation_residuals(centres, positions[rows], sigmas[rows])
-    over = off / sigma
-    found = [
-        FarStation(
-            station=records[row].station,
-            image=records[row].image,
-            off_m=float(off[k]),
-            sigmas=float(over[k]),
-        )
-        for k, row in enumerate(rows.tolist())
-        if off[k] > FAR_M and over[k] > FAR_SIGMAS
-    ]
-    ordered = tuple(sorted(found, key=lambda f: (-f.off_m, f.station)))
-    return len(numbers), float(np.median(off) / _MEDIAN_SIGMAS), ordered
 
 
 def navigation_residuals(centres: Array, given: Array, sigmas: Array) -> tuple[Array, Array]:

@@ -54,8 +54,6 @@ class _Tie:
 class _Bar:
     """A known length and the model's points that span it."""
 
-    name: str
-    use: str
     pairs: tuple[tuple[TriangulatedPoint, TriangulatedPoint], ...]
     """One for a bar; the four sides of a marker."""
     known: KnownLength
@@ -96,7 +94,7 @@ class ControlFit:
     @property
     def used_bars(self) -> tuple[_Bar, ...]:
         """Bars that scale the model."""
-        return tuple(b for b in self.bars if b.use == "control")
+        return tuple(b for b in self.bars if b.known.use == "control")
 
     @property
     def informs(self) -> bool:
@@ -116,9 +114,7 @@ class ControlFit:
         for tie in self.used_points:
             motion = self._motion(tie.picked_point, len(sizes))
             at = place.apply((tie.picked_point.model + motion @ sizes)[None])[0]
-            spread = place.scale**2 * turn @ tie.picked_point.covariance @ turn.T + np.diag(
-                tie.sigma**2
-            )
+            spread = tie.residual(place)[1] + np.diag(tie.sigma**2)
             white = np.linalg.inv(np.linalg.cholesky(spread))
             jacobian = np.zeros((3, columns))
             jacobian[:, :3] = -cross_matrices((at - middle)[None])[0]
@@ -144,23 +140,15 @@ class ControlFit:
     def deform(self, sizes: Array) -> "ControlFit":
         """The same on the model after its soft modes (K,) have been found."""
 
-        def shift_point(picked_point: TriangulatedPoint) -> TriangulatedPoint:
-            return replace(
-                picked_point,
-                model=picked_point.model + self._motion(picked_point, len(sizes)) @ sizes,
-            )
+        def shift(point: TriangulatedPoint) -> TriangulatedPoint:
+            return replace(point, model=point.model + self._motion(point, len(sizes)) @ sizes)
 
-        return replace(
-            self,
-            ties=tuple(
-                replace(tie, picked_point=shift_point(tie.picked_point)) for tie in self.ties
-            ),
-            bars=tuple(
-                replace(bar, pairs=tuple((shift_point(a), shift_point(b)) for a, b in bar.pairs))
-                for bar in self.bars
-            ),
-            motion_at=None,
-        )
+        ties = [replace(tie, picked_point=shift(tie.picked_point)) for tie in self.ties]
+        bars = [
+            replace(bar, pairs=tuple((shift(a), shift(b)) for a, b in bar.pairs))
+            for bar in self.bars
+        ]
+        return replace(self, ties=tuple(ties), bars=tuple(bars), motion_at=None)
 
     def _motion(self, picked_point: TriangulatedPoint, modes: int) -> Array:
         """(3, K) of a point by the soft modes."""
@@ -244,29 +232,21 @@ def tie_control(
             missing.setdefault(point.name, "not picked in any picture")
             continue
         sigma = np.array([point.sigma_m, point.sigma_m, point.sigma_vertical_m])
-        ties.append(
-            _Tie(
-                name=point.name,
-                use=point.use,
-                picked_point=picked[point.name],
-                ned=point.place_ned(datum),
-                sigma=sigma,
-            )
-        )
+        tie = _Tie(
+            name=point.name, use=point.use, picked_point=picked[point.name],
+            ned=point.place_ned(datum), sigma=sigma,
+        )  # fmt: skip
+        ties.append(tie)
     for length in control.lengths:
-        names = [length.ends] if length.ends else _sides(length.name)
+        sides = [(f"{length.name}.{k}", f"{length.name}.{(k + 1) % 4}") for k in range(4)]
+        names = [length.ends] if length.ends else sides  # of a marker
         absent = sorted({n for pair in names for n in pair} - set(picked))
         if absent:
             missing.setdefault(length.name, f"{', '.join(absent)} not found in the pictures")
             continue
         pairs = tuple((picked[a], picked[b]) for a, b in names)
-        bars.append(_Bar(name=length.name, use=length.use, pairs=pairs, known=length))
+        bars.append(_Bar(pairs=pairs, known=length))
     return ControlFit(ties=tuple(ties), bars=tuple(bars), lost=missing)
-
-
-def _sides(marker: str) -> list[tuple[str, str]]:
-    """The corners at the ends of a marker's four sides."""
-    return [(f"{marker}.{k}", f"{marker}.{(k + 1) % 4}") for k in range(4)]
 
 
 def warn_of_contradictions(score: ControlRecord) -> None:
@@ -308,8 +288,8 @@ def _score_bar(bar: _Bar, scale: float) -> BarRow:
     error = length - bar.known.length_m
     sigma = float(np.hypot(bar.known.sigma_m, scale * bar.sigma_in_model))
     return BarRow(
-        name=bar.name,
-        use=bar.use,
+        name=bar.known.name,
+        use=bar.known.use,
         misfit_sigmas=abs(error) / sigma,
         known_m=bar.known.length_m,
         error_m=error,
@@ -359,10 +339,7 @@ def without_wrong_points(control: ControlFit, known_scale: float | None) -> Cont
         if place is None:
             continue
         off = control.misfits(place)
-        if (
-            np.partition(off, agreeing - 1)[agreeing - 1]
-            < np.partition(best, agreeing - 1)[agreeing - 1]
-        ):
+        if np.sort(off)[agreeing - 1] < np.sort(best)[agreeing - 1]:
             best = off
     if not np.isfinite(best).all():
         return control

@@ -19,7 +19,7 @@ Control of other programs becomes `control.csv` and `picks.csv`:
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -28,8 +28,6 @@ from xml.etree import ElementTree as ET
 
 import cv2
 import numpy as np
-from pyproj import CRS, Transformer
-from pyproj.exceptions import CRSError, ProjError
 
 from alice_survey.core.artefacts import need_stage, write_csv
 from alice_survey.core.contents import as_line, one_line, xml_root
@@ -48,7 +46,9 @@ from reconstruct.placing.control_points import (
     KnownLength,
     KnownPoint,
     Pick,
+    PlaceOf,
     Use,
+    coordinates,
     write_control,
     write_picks,
 )
@@ -66,30 +66,24 @@ _HEADER = ("image", "point", "x", "y", "sigma_px")
 _MIN_VIEWS = 2
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Marker:
-    """One marker in one picture."""
+def find_markers(picture: Any, dictionary: str) -> dict[int, Array]:
+    """Find the markers of a dictionary of OpenCV's in a picture, (H, W) or (H, W, 3) bytes.
 
-    number: int
-    corners: Array
-    """(4, 2) clockwise from its own upper left; pixels from 0 at the first one's middle."""
-
-
-def find_markers(picture: Any, dictionary: str) -> list[Marker]:
-    """Find the markers of a dictionary of OpenCV's in a picture, (H, W) or (H, W, 3) bytes."""
+    Returns:
+        Their corners by number: (4, 2), clockwise from their own upper left; pixels from 0 at the
+        first one's middle.
+    """
     options = cv2.aruco.DetectorParameters()
     options.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
     corners, numbers, _ = cv2.aruco.ArucoDetector(known, options).detectMarkers(picture)
     if numbers is None:
-        return []
-    found = [
-        Marker(number=int(n), corners=np.asarray(c, dtype=np.float64).reshape(4, 2))
-        for n, c in zip(np.ravel(numbers), corners, strict=True)
-    ]
+        return {}
+    found = dict(zip(np.ravel(numbers).tolist(), corners, strict=True))
     # A number seen twice in one picture is a misreading or a copy: neither is a known place.
-    counts = Counter(marker.number for marker in found)
-    return sorted((m for m in found if counts[m.number] == 1), key=lambda m: m.number)
+    counts = Counter(np.ravel(numbers).tolist())
+    once = sorted(number for number, count in counts.items() if count == 1)
+    return {number: np.asarray(found[number], np.float64).reshape(4, 2) for number in once}
 
 
 def survey_control(
@@ -120,11 +114,11 @@ def survey_control(
     found = list(executor.map(look, [images / name for name in names], label="markers"))
     best, views = _best_dictionary(tried, found)
     rows = [
-        (name, f"{marker.number}.{k}", f"{x:.4f}", f"{y:.4f}", MARKER_SIGMA_PX)
-        for name, markers in zip(names, (seen[best] for seen in found), strict=True)
-        for marker in markers
-        if views[marker.number] >= _MIN_VIEWS
-        for k, (x, y) in enumerate(marker.corners)
+        (name, f"{number}.{k}", f"{x:.4f}", f"{y:.4f}", MARKER_SIGMA_PX)
+        for name, seen in zip(names, found, strict=True)
+        for number, corners in seen[best].items()
+        if views[number] >= _MIN_VIEWS
+        for k, (x, y) in enumerate(corners)
     ]
     write_csv(workspace / MARKERS_FILE, _HEADER, rows)
     seen_often = {n: count for n, count in sorted(views.items()) if count >= _MIN_VIEWS}
@@ -149,20 +143,20 @@ def _known_dictionaries() -> tuple[str, ...]:
     return tuple(sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_")))
 
 
-def _look(path: Path, dictionaries: Sequence[str]) -> dict[str, list[Marker]]:
+def _look(path: Path, dictionaries: Sequence[str]) -> dict[str, dict[int, Array]]:
     picture = cv2.cvtColor(read_colour(path), cv2.COLOR_BGR2GRAY)
     return {name: find_markers(picture, name) for name in dictionaries}
 
 
 def _best_dictionary(
-    tried: Sequence[str], found: Sequence[dict[str, list[Marker]]]
+    tried: Sequence[str], found: Sequence[dict[str, dict[int, Array]]]
 ) -> tuple[str, Counter[int]]:
     """The dictionary with most detections of markers that two pictures or more show."""
-    views = {name: Counter(m.number for seen in found for m in seen[name]) for name in tried}
+    views = {name: Counter(n for seen in found for n in seen[name]) for name in tried}
     detections = {
         name: sum(n for n in counts.values() if n >= _MIN_VIEWS) for name, counts in views.items()
     }
-    best = max(tried, key=lambda name: (detections[name], -tried.index(name)))
+    best = max(tried, key=detections.__getitem__)  # of equals the first
     return best, views[best]
 
 
@@ -224,36 +218,6 @@ class ForeignControl:
     points: list[KnownPoint] = field(default_factory=list)
     lengths: list[KnownLength] = field(default_factory=list)
     picks: list[Pick] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-    """What else it holds that is not used."""
-
-
-PlaceOf = Callable[[float, float], KnownPoint]
-"""A nameless point from x (easting or longitude) and y in the coordinates of a file."""
-
-
-def _coordinates(system: str) -> PlaceOf:
-    """Coordinates of a file from the name of their system: what pyproj takes.
-
-    Raises:
-        ValueError: it is no coordinate system; of a place, that it is beyond it.
-    """
-    try:
-        crs = CRS.from_user_input(system)
-    except CRSError:
-        raise ValueError(f"{as_line(system)!r} is no coordinate system that is known") from None
-    if crs.is_engineering:  # a local grid, metres
-        return lambda x, y: KnownPoint(name="", north_m=y, east_m=x)
-    to_wgs84 = Transformer.from_crs(crs.to_2d(), 4326, always_xy=True)
-
-    def place(x: float, y: float) -> KnownPoint:
-        try:
-            longitude, latitude = to_wgs84.transform(x, y, errcheck=True)
-        except ProjError:
-            raise ValueError(f"{x}, {y} is not a place in {as_line(crs.name)}") from None
-        return KnownPoint(name="", latitude_deg=float(latitude), longitude_deg=float(longitude))
-
-    return place
 
 
 _ACCURACIES = ("accuracy_markers", "accuracy_projections", "accuracy_scalebars")
@@ -292,7 +256,7 @@ def read_markers(text: str) -> ForeignControl:
         reference = marker.find("reference")
         if reference is not None:
             name = labels[marker.get("id")]
-            found.points.append(_marker_point(name, reference, _coordinates(system), sigma_m))
+            found.points.append(_marker_point(name, reference, coordinates(system), sigma_m))
     for marker in chunk.findall("frames/frame/markers/marker"):
         for location in marker.findall("location"):
             if not _is_true(location, "pinned"):
@@ -315,9 +279,7 @@ def read_markers(text: str) -> ForeignControl:
         else:
             found.lengths.append(bar)
     if lost:
-        found.notes.append(
-            f"scale bars without a distance or two markers are left out: {', '.join(lost)}"
-        )
+        warn(f"scale bars without a distance or two markers are left out: {', '.join(lost)}")
     return found
 
 
@@ -412,7 +374,7 @@ def read_gcp_list(text: str) -> ForeignControl:
     utm = _UTM.match(system)
     if utm is not None:
         system = f"EPSG:{(32700 if utm[2].upper() == 'S' else 32600) + int(utm[1])}"
-    place_of = _coordinates(system)
+    place_of = coordinates(system)
     points: dict[str, KnownPoint] = {}
     names: dict[tuple[float, ...], str] = {}
     found = ForeignControl()
@@ -457,7 +419,7 @@ def import_control(
     heights: Heights = "level",
     overwrite: bool = False,
 ) -> str:
-    """Write `control.csv` and `picks.csv` from a file of another program (`_FORMATS`).
+    """Write `control.csv` and `picks.csv` from a file of another program (see the module).
 
     Args:
         workspace: folder with finished `images/`.
@@ -490,14 +452,11 @@ def import_control(
         warn(f"{path}: points without a whole place are left out: {_name_some(left)}")
     if not placed and not found.lengths:
         raise WorkspaceError(f"{path}: no point has a place")
-    stated = [(point.sigma_m, point.sigma_vertical_m) for point in placed]
     points = []
-    for point, (level, vertical) in zip(placed, stated, strict=True):
-        level = _first_above_0(level, sigma_m)
-        point = replace(
-            point, sigma_m=level,
-            sigma_vertical_m=_first_above_0(vertical, sigma_vertical_m, level),
-        )  # fmt: skip
+    for point in placed:
+        level = _first_above_0(point.sigma_m, sigma_m)
+        vertical = _first_above_0(point.sigma_vertical_m, sigma_vertical_m, level)
+        point = replace(point, sigma_m=level, sigma_vertical_m=vertical)
         if heights == "level":
             point = replace(point, depth_m=-point.height_m, height_m=math.nan)
         points.append(point)
@@ -520,8 +479,6 @@ def import_control(
         warn(f"{path}: {lost_names}; picks in them are left out")
     write_control(targets[0], points, lengths)
     write_picks(targets[1], picks)
-    for note in found.notes:
-        warn(f"{path}: {note}")
     checks = [one.use for one in every].count("check")
     held = f" ({checks} of them to check by)" if checks else ""
     bars = f", {len(lengths)} scale bar{'s' * (len(lengths) > 1)}" if lengths else ""
@@ -531,13 +488,6 @@ def import_control(
 
 def _first_above_0(*values: float | None) -> float:
     return next((value for value in values if value is not None and value > 0), math.nan)
-
-
-_FORMATS: tuple[tuple[Callable[[str], object], Callable[[str], ForeignControl]], ...] = (
-    (lambda text: text.lstrip().startswith("<") and "<markers" in text, read_markers),
-    (_SYSTEM.match, read_gcp_list),
-)
-"""What a text of each known format looks like, and what reads it."""
 
 
 def read_foreign(path: Path) -> ForeignControl:
@@ -552,8 +502,11 @@ def read_foreign(path: Path) -> ForeignControl:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise WorkspaceError(f"{path}: cannot be read: {why(error)}") from None
-    read = next((read for looks_right, read in _FORMATS if looks_right(text)), None)
-    if read is None:
+    if text.lstrip().startswith("<") and "<markers" in text:
+        read = read_markers
+    elif _SYSTEM.match(text):
+        read = read_gcp_list
+    else:
         raise WorkspaceError(
             f"{path}: neither a gcp_list.txt of ODM (its first line names the coordinate system) "
             "nor markers that Metashape exported as XML"

@@ -53,6 +53,7 @@ from alice_survey.core.artefacts import (
     replace_file,
     write_csv,
 )
+from alice_survey.core.contents import as_line
 from alice_survey.core.errors import WorkspaceError, warn, why
 from alice_survey.core.frames import Array, Datum
 from camera_calib.approximation.pinhole_warp import PinholeWarp
@@ -283,7 +284,8 @@ def _point(row: dict[str, str], name: str, use: Use, sigma: float) -> KnownPoint
     if math.isnan(at["depth_m"]) == math.isnan(at["height_m"]):
         raise ValueError(f"point {name} needs either depth_m or height_m")
     if known[2]:
-        at["longitude_deg"], at["latitude_deg"] = _unproject(epsg, easting, northing)
+        place = coordinates(f"EPSG:{epsg:g}")(easting, northing)
+        at["latitude_deg"], at["longitude_deg"] = place.latitude_deg, place.longitude_deg
     if known[0] and not (abs(at["latitude_deg"]) <= 90 and abs(at["longitude_deg"]) <= 360):
         raise ValueError(f"{places[0][0]}, {places[0][1]} is not a place on Earth")
     if at["sigma_vertical_m"] <= 0:
@@ -293,16 +295,35 @@ def _point(row: dict[str, str], name: str, use: Use, sigma: float) -> KnownPoint
     return KnownPoint(name=name, use=use, **at)
 
 
-def _unproject(epsg: float, x: float, y: float) -> tuple[float, float]:
-    from pyproj import Transformer
+PlaceOf = Callable[[float, float], KnownPoint]
+"""A nameless point from x (easting or longitude) and y in the coordinates of a file."""
+
+
+def coordinates(system: str) -> PlaceOf:
+    """Coordinates of a file from the name of their system: what pyproj takes.
+
+    Raises:
+        ValueError: it is no coordinate system; of a place, that it is beyond it.
+    """
+    from pyproj import CRS, Transformer
     from pyproj.exceptions import CRSError, ProjError
 
     try:
-        to_wgs84 = Transformer.from_crs(int(epsg), 4326, always_xy=True)
-        longitude, latitude = to_wgs84.transform(x, y, errcheck=True)
-    except (ValueError, CRSError, ProjError) as error:
-        raise ValueError(f"epsg {epsg}: {error}") from None
-    return float(longitude), float(latitude)
+        crs = CRS.from_user_input(system)
+    except CRSError:
+        raise ValueError(f"{as_line(system)!r} is no coordinate system that is known") from None
+    if crs.is_engineering:  # a local grid, metres
+        return lambda x, y: KnownPoint(name="", north_m=y, east_m=x)
+    to_wgs84 = Transformer.from_crs(crs.to_2d(), 4326, always_xy=True)
+
+    def place(x: float, y: float) -> KnownPoint:
+        try:
+            longitude, latitude = to_wgs84.transform(x, y, errcheck=True)
+        except ProjError:
+            raise ValueError(f"{x}, {y} is not a place in {as_line(crs.name)}") from None
+        return KnownPoint(name="", latitude_deg=float(latitude), longitude_deg=float(longitude))
+
+    return place
 
 
 def _number(row: dict[str, str], key: str) -> float:
@@ -399,13 +420,6 @@ def save_control(
     )  # fmt: skip
 
 
-@dataclass(frozen=True, kw_only=True)
-class _TableRow:
-    text: str
-    """As it stands in the file, with the end of its line."""
-    cells: list[str]
-
-
 def _save(
     path: Path,
     token: str,
@@ -421,25 +435,21 @@ def _save(
     if before:
         read(path)  # a file that is wrong is the user's to mend, with the line named
     mark, records, end = _records(path, before)
-    names = [cell.strip() for cell in records[0].cells] if records else []
+    names = [cell.strip() for cell in records[0][1]] if records else []
     requested = {name for row in rows.values() for name, cell in row.items() if cell}
     more = [name for name in header if name not in names and (not names or name in requested)]
     more += sorted(requested - {*names, *more})
-    first = records[0].text.rstrip("\r\n") if records else ""
-    lines = [
-        mark + (",".join(([first] if first else []) + more) + end if more else records[0].text)
-    ]
+    first = [text.rstrip("\r\n") for text, _ in records[:1]]
+    lines = [mark + (",".join([*filter(None, first), *more]) + end if more else records[0][0])]
     left = dict(rows)
     names = [*names, *more]
-    for record in records[1:]:
-        if not record.text.endswith(("\n", "\r")):
-            record = _TableRow(text=record.text + end, cells=record.cells)
-        cells = dict(zip(names, (cell.strip() for cell in record.cells), strict=False))
+    for text, values in records[1:]:
+        cells = dict(zip(names, map(str.strip, values), strict=False))
         new = left.pop((cells.get(key[0], ""), cells.get(key[1], "")), None)
         if new is not None:
             lines.append(_line({**cells, **new}, names, end))
         elif not meant(cells):
-            lines.append(record.text)
+            lines.append(text if text.endswith(("\n", "\r")) else text + end)
     lines += [_line(row, names, end) for row in left.values()]
     return replace_file(path, "".join(lines).encode("utf-8"), read)
 
@@ -453,19 +463,22 @@ def _line(cells: Mapping[str, str], names: Sequence[str], end: str) -> str:
     return text.getvalue() + end
 
 
-def _records(path: Path, content: bytes) -> tuple[str, list[_TableRow], str]:
-    """The byte order mark, the records with the header first, and how lines end."""
+def _records(path: Path, content: bytes) -> tuple[str, list[tuple[str, list[str]]], str]:
+    """The byte order mark, the records with the header first, and how lines end.
+
+    A record is its text as it stands in the file, with the end of its line, and its cells.
+    """
     try:
         text = content.decode("utf-8")
         mark = "\ufeff" if text.startswith("\ufeff") else ""
         lines = io.StringIO(text.removeprefix(mark), newline="").readlines()
         reader, records, at = csv.reader(lines, skipinitialspace=True), [], 0
         for cells in reader:
-            records.append(_TableRow(text="".join(lines[at : reader.line_num]), cells=cells))
+            records.append(("".join(lines[at : reader.line_num]), cells))
             at = reader.line_num
     except (UnicodeDecodeError, csv.Error) as error:
         raise WorkspaceError(f"{path}: cannot be read: {why(error)}") from None
-    return mark, records, "\r\n" if records and records[0].text.endswith("\r\n") else "\n"
+    return mark, records, "\r\n" if records and records[0][0].endswith("\r\n") else "\n"
 
 
 _ROBUST_PX = 1.0
@@ -724,25 +737,19 @@ def _fit(
     start: Array, picks: Sequence[Pick], cameras: Mapping[str, RegisteredPicture]
 ) -> tuple[Array, Array, Array]:
     """Misses (N, 2) px of the best point, the point (3,), and their derivatives (2 N, 3)."""
-    picked = np.array([[p.x_px, p.y_px] for p in picks])
     own = own_sigmas(picks)
     usual = float(np.median(own))
     near_px = max(_ROBUST_PX, 2.0 * usual)
     weight = np.repeat(usual / own, 2)
     unit = float(np.linalg.norm(start - cameras[picks[0].image].model_from_pinhole.translation))
 
-    def offsets(x: Array) -> Array:
-        point = start + unit * x
-        seen = np.stack([cameras[p.image].project(point) for p in picks])
-        return np.asarray(np.nan_to_num((seen - picked).ravel(), nan=1e6))
-
-    def weigh_offsets(x: Array) -> Array:
-        found: Array = weight * offsets(x)
-        return found
+    def offsets(x: Array, weight: Array | float = 1.0) -> Array:
+        off = residuals(start + unit * x, picks, cameras)
+        return np.asarray(weight * np.nan_to_num(off.ravel(), nan=1e6))
 
     found = least_squares(
-        weigh_offsets, np.zeros(3), loss="soft_l1", f_scale=near_px, xtol=1e-12,
-        ftol=1e-12, gtol=1e-12, jac="3-point",
+        offsets, np.zeros(3), loss="soft_l1", f_scale=near_px, xtol=1e-12, ftol=1e-12,
+        gtol=1e-12, jac="3-point", args=(weight,),
     )  # fmt: skip
     jacobian = np.empty((2 * len(picks), 3))
     for axis in range(3):

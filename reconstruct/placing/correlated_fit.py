@@ -19,34 +19,25 @@ multiplication by the inverse of K's Cholesky factor, in one pass (Kailath 1968)
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from alice_survey.core.block_solver import MAD_TO_SIGMA
+from alice_survey.core.block_solver import MAD_TO_SIGMA, Flags, Indices
 from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
-from reconstruct.placing.navigation import GROUP_OF, GROUPS, PARAMETERS, NavigationEquations
+from reconstruct.placing.navigation import GROUP_OF, GROUPS, NavigationEquations
 
 MIN_WHITE = 1e-4
 """Share of white error that two readings at the same time need to have any innovation."""
 
 
 @compiled
-def _kept_share(time: Array, sigma: Array, i: int, j: int, tau: float) -> float:
-    """Correlation of the Markov parts of two neighbours."""
-    lesser, greater = min(sigma[i], sigma[j]), max(sigma[i], sigma[j])
-    kept: float = math.exp(-abs(time[j] - time[i]) / tau) * lesser / greater
-    return kept
-
-
-@compiled
 def whiten(
-    time: Array, sigma: Array, used: NDArray[np.bool_], values: Array, tau: float, white: float
-) -> tuple[Array, float]:
+    time: Array, sigma: Array, used: Flags, values: Array, tau: float, white: float
+) -> tuple[Array, float, Array, Array]:
     """Make columns of correlated values of unit variance white.
 
     Args:
@@ -58,18 +49,10 @@ def whiten(
         white: share w of the variance that is white, `MIN_WHITE` to 1.
 
     Returns:
-        (N, P) innovations over their standard deviation, zero where not used, and the logarithm of
-        the determinant of the covariance matrix of what is used.
+        (N, P) innovations over their standard deviation, zero where not used; the logarithm of the
+        determinant of the covariance matrix of what is used; and the mean (N, P) and variance (N,)
+        of the Markov part before each value.
     """
-    found, log_det, _, _ = _filter(time, sigma, used, values, tau, white)
-    return found, log_det
-
-
-@compiled
-def _filter(
-    time: Array, sigma: Array, used: NDArray[np.bool_], values: Array, tau: float, white: float
-) -> tuple[Array, float, Array, Array]:
-    """As `whiten`; also the mean (N, P) and variance (N,) of the Markov part before each value."""
     count, columns = values.shape
     found = np.zeros((count, columns))
     means, variances = np.zeros((count, columns)), np.ones(count)
@@ -79,7 +62,10 @@ def _filter(
     for i in range(count):
         if not used[i]:
             continue
-        kept = _kept_share(time, sigma, last, i, tau) if last >= 0 else 1.0
+        kept = 1.0
+        if last >= 0:
+            lesser, greater = min(sigma[i], sigma[last]), max(sigma[i], sigma[last])
+            kept = math.exp(-abs(time[i] - time[last]) / tau) * lesser / greater
         last = i
         variance = kept * kept * variance + 1.0 - kept * kept
         variances[i] = variance
@@ -98,7 +84,7 @@ def _filter(
 
 
 def standard_residuals(
-    time: Array, sigma: Array, used: NDArray[np.bool_], values: Array, tau: float, white: float
+    time: Array, sigma: Array, used: Flags, values: Array, tau: float, white: float
 ) -> Array:
     """How far each value is from what all the others predict, in standard deviations.
 
@@ -116,9 +102,9 @@ def standard_residuals(
     Returns:
         (N,), meaningless where not used.
     """
-    past, past_variance = _filter(time, sigma, used, values[:, None], tau, white)[2:]
+    past, past_variance = whiten(time, sigma, used, values[:, None], tau, white)[2:]
     reversed_ = (np.ascontiguousarray(row[::-1]) for row in (time, sigma, used, values[:, None]))
-    future, future_variance = (row[::-1] for row in _filter(*reversed_, tau, white)[2:])
+    future, future_variance = (row[::-1] for row in whiten(*reversed_, tau, white)[2:])
     past, future = past[:, 0], future[:, 0]
     precision = 1.0 / past_variance + 1.0 / future_variance - 1.0
     mean = (past / past_variance + future / future_variance) / precision
@@ -155,6 +141,10 @@ class Correlation:
     """Constant error of each dive over what the constant share allows; 0: errors outlast gaps."""
 
 
+Correlations = Mapping[str, Correlation]
+"""By group."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Extra:
     """Independent further equations, made white: misfit + jacobian x change = N(0, 1)."""
@@ -163,11 +153,6 @@ class Extra:
     """(E,) misfits."""
     jacobian: Array
     """(E, P) their slopes."""
-
-
-def no_extra(columns: int = PARAMETERS) -> Extra:
-    """No further equations, in so many parameters."""
-    return Extra(misfit=np.zeros(0), jacobian=np.zeros((0, columns)))
 
 
 def frame_sigma(bound: float, time: Array, how: Correlation) -> float:
@@ -183,17 +168,12 @@ class _Normal(NamedTuple):
     matrix: Array
     vector: Array
     square: float
-    log_det: float
-    rows: int
+    log_det: float = 0.0
+    rows: int = 0
 
     def plus(self, other: "_Normal") -> "_Normal":
-        return _Normal(
-            self.matrix + other.matrix,
-            self.vector + other.vector,
-            self.square + other.square,
-            self.log_det + other.log_det,
-            self.rows + other.rows,
-        )
+        pairs: Iterable[tuple[Any, Any]] = zip(self, other, strict=True)
+        return _Normal(*(mine + theirs for mine, theirs in pairs))
 
     def solve(self) -> tuple[Array, Array]:
         """Parameters and their covariance."""
@@ -211,18 +191,18 @@ class PlacementProblem:
     time: Array
     """(M,) times, not decreasing."""
     found: NavigationEquations
-    free: NDArray[np.int64]
+    free: Indices
     """Parameters to solve for."""
     extra: Extra
     frame_bounds: Mapping[int, float]
     """Sigmas of nuisances of navigation's own frame if its position errors lasted throughout."""
     widened: Mapping[str, float]
     """Groups whose stated sigmas are too small by this factor or more."""
-    dives: NDArray[np.int64]
+    dives: Indices
     """(M,) number of the dive of each time."""
     cache: dict[Any, _Normal] = field(default_factory=dict)
 
-    def group(self, group: str, used: NDArray[np.bool_], correlation: Correlation) -> _Normal:
+    def group(self, group: str, used: Flags, correlation: Correlation) -> _Normal:
         """Normal equations of one group.
 
         Constant errors of variance 1 with columns C add `C C'` to the covariance matrix: its
@@ -240,18 +220,24 @@ class PlacementProblem:
             rows=found.rows,
         )
 
-    def _unscaled_group(
-        self, group: str, used: NDArray[np.bool_], correlation: Correlation
-    ) -> _Normal:
+    def _unscaled_group(self, group: str, used: Flags, correlation: Correlation) -> _Normal:
         size = len(self.free)
-        total = _Normal(
-            matrix=np.zeros((size, size)), vector=np.zeros(size), square=0.0, log_det=0.0, rows=0
-        )
+        total = _Normal(np.zeros((size, size)), np.zeros(size), 0.0)
         for channel in channels_of(group):
             rows = used[:, channel]
             if not rows.any():
                 continue
-            product, log_det, count = self._products(channel, rows, correlation)
+            varying, constants = self.shares(channel, rows, correlation)
+            columns = np.column_stack(
+                [
+                    self.found.jacobian[:, channel][:, self.free],
+                    self.found.misfit[:, channel],
+                    constants,
+                ]
+            )
+            even, log_det = self.whiten_columns(channel, rows, correlation, varying, columns)
+            product = even.T @ even
+            log_det += 2.0 * float(np.log(varying[rows]).sum())
             matrix, steady = product[: size + 1, : size + 1], product[: size + 1, size + 1 :]
             inner = np.eye(steady.shape[1]) + product[size + 1 :, size + 1 :]
             kept = matrix - steady @ np.linalg.solve(inner, steady.T)
@@ -261,35 +247,18 @@ class PlacementProblem:
                     vector=kept[:-1, -1],
                     square=float(kept[-1, -1]),
                     log_det=log_det + float(np.linalg.slogdet(inner)[1]),
-                    rows=count,
+                    rows=int(rows.sum()),
                 )
             )
         return total
 
-    def _products(
-        self, channel: int, rows: NDArray[np.bool_], correlation: Correlation
-    ) -> tuple[Array, float, int]:
-        """Products of all white columns, the last those of constant errors; log det; readings."""
-        varying, constants = self.shares(channel, rows, correlation)
-        misfit = self.found.misfit[:, channel]
-        columns = np.column_stack([self.found.jacobian[:, channel][:, self.free], misfit])
-        even, log_det = self.whiten_columns(
-            channel, rows, correlation, varying, np.column_stack([columns, constants])
-        )
-        return even.T @ even, log_det + 2.0 * float(np.log(varying[rows]).sum()), int(rows.sum())
-
     def whiten_columns(
-        self,
-        channel: int,
-        rows: NDArray[np.bool_],
-        how: Correlation,
-        varying: Array,
-        columns: Array,
+        self, channel: int, rows: Flags, how: Correlation, varying: Array, columns: Array
     ) -> tuple[Array, float]:
         """Columns (M, C) over the stated sigma, made white; log det of what is used."""
         columns = np.where(rows[:, None], columns / varying[:, None], 0.0)
         sigma = varying * self.found.sigma[:, channel]
-        return whiten(self.times(how), sigma, rows, columns, how.tau, how.white)
+        return whiten(self.times(how), sigma, rows, columns, how.tau, how.white)[:2]
 
     def times(self, how: Correlation) -> Array:
         """(M,) times; dives where errors restart are too far apart for any correlation."""
@@ -298,9 +267,7 @@ class PlacementProblem:
         apart = 100.0 * how.tau + float(np.ptp(self.time))
         return self.time + apart * self.dives
 
-    def shares(
-        self, channel: int, rows: NDArray[np.bool_], correlation: Correlation
-    ) -> tuple[Array, Array]:
+    def shares(self, channel: int, rows: Flags, correlation: Correlation) -> tuple[Array, Array]:
         """Sigmas of the varying (M,) and the constant parts (M, D) over the stated one.
 
         The constant part is as large as the least of the stated sigmas allows.
@@ -313,7 +280,7 @@ class PlacementProblem:
             own = correlation.restart * np.eye(self.dives[-1] + 1)[self.dives]
         return np.sqrt(1.0 - constant**2), constant[:, None] * own
 
-    def rest(self, correlation: Mapping[str, Correlation]) -> _Normal:
+    def rest(self, correlation: Correlations) -> _Normal:
         """Normal equations of what is not navigation, and of the turn of navigation's frame."""
         jacobian, misfit = self.extra.jacobian[:, self.free], self.extra.misfit
         matrix, vector = jacobian.T @ jacobian, jacobian.T @ misfit
@@ -322,11 +289,9 @@ class PlacementProblem:
             for parameter, bound in self.frame_bounds.items():
                 at = np.flatnonzero(self.free == parameter)
                 matrix[at, at] += frame_sigma(bound, self.time, how) ** -2
-        return _Normal(
-            matrix=matrix, vector=vector, square=float(misfit @ misfit), log_det=0.0, rows=0
-        )
+        return _Normal(matrix, vector, float(misfit @ misfit))
 
-    def total(self, used: NDArray[np.bool_], correlation: Mapping[str, Correlation]) -> _Normal:
+    def total(self, used: Flags, correlation: Correlations) -> _Normal:
         """Normal equations of all."""
         total = self.rest(correlation)
         for group, how in correlation.items():
@@ -367,22 +332,22 @@ class Estimate:
     """(P,) change, zero for what is held."""
     covariance: Array
     """(P, P) covariance, zero for what is held."""
-    correlation: Mapping[str, Correlation]
+    correlation: Correlations
     """Correlation by group, of those with readings."""
-    used: NDArray[np.bool_]
+    used: Flags
     """(M, 6) readings that took part."""
 
 
 def estimate(
     time: Array,
     found: NavigationEquations,
-    used: NDArray[np.bool_],
+    used: Flags,
     free: Sequence[int],
     extra: Extra,
     *,
     frame_bounds: Mapping[int, float],
     widened: Mapping[str, float] | None = None,
-    correlation: Mapping[str, Correlation] | None = None,
+    correlation: Correlations | None = None,
 ) -> Estimate:
     """Solve for the parameters, the correlation of errors and the readings to leave out.
 
@@ -405,25 +370,27 @@ def estimate(
     )  # fmt: skip
     used = used & np.isfinite(found.misfit)
     if correlation is not None:
-        parameters, spread = problem.total(used, correlation).solve()
-        change, covariance = _fill(problem, parameters, spread)
-        return Estimate(change=change, covariance=covariance, correlation=correlation, used=used)
-    correlation = {
-        group: Correlation(tau=float(np.ptp(time)) or 1.0, white=0.1)
-        for group in GROUPS
-        if used[:, channels_of(group)].any()
-    }
-    for _ in range(_ROUNDS):
-        correlation = _likeliest(problem, used, correlation)
-        kept = _without_contradicted(problem, used, correlation)
-        if np.array_equal(kept, used):
-            break
-        used = kept
-    change, covariance = _average(problem, used, correlation)
+        solution = problem.total(used, correlation).solve()
+    else:
+        correlation = {
+            group: Correlation(tau=float(np.ptp(time)) or 1.0, white=0.1)
+            for group in GROUPS
+            if used[:, channels_of(group)].any()
+        }
+        for _ in range(_ROUNDS):
+            correlation = _likeliest(problem, used, correlation)
+            kept = _without_contradicted(problem, used, correlation)
+            if np.array_equal(kept, used):
+                break
+            used = kept
+        solution = _average(problem, used, correlation)
+    columns = found.jacobian.shape[2]
+    change, covariance = np.zeros(columns), np.zeros((columns, columns))
+    change[problem.free], covariance[np.ix_(problem.free, problem.free)] = solution
     return Estimate(change=change, covariance=covariance, correlation=correlation, used=used)
 
 
-def dives_of(time: Array) -> NDArray[np.int64]:
+def dives_of(time: Array) -> Indices:
     """(M,) number of the dive of each of the times (M,), from 0: long gaps lie between dives."""
     steps = np.diff(time)
     usual = np.median(steps[steps > 0]) if np.any(steps > 0) else 0.0
@@ -431,7 +398,7 @@ def dives_of(time: Array) -> NDArray[np.int64]:
     return np.concatenate([[0], np.cumsum(surfaced)]).astype(np.int64)
 
 
-def without_gross_errors(time: Array, misfit: Array, known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def without_gross_errors(time: Array, misfit: Array, known: Flags) -> Flags:
     """Leave out readings far from their channel's median misfit in a dive, all of a group together.
 
     A frame that is off as a whole in a dive (a constant error) leaves nothing out.
@@ -480,7 +447,7 @@ def _choices(grid: Sequence[Correlation], now: Correlation) -> list[Correlation]
 
 
 def _likeliest(
-    problem: PlacementProblem, used: NDArray[np.bool_], correlation: Mapping[str, Correlation]
+    problem: PlacementProblem, used: Flags, correlation: Correlations
 ) -> dict[str, Correlation]:
     """The likeliest correlation of every group, one after the other, in several rounds."""
     now = {group: how for group, how in correlation.items() if used[:, channels_of(group)].any()}
@@ -500,10 +467,7 @@ def _likeliest(
 
 
 def _with_jumps(
-    problem: PlacementProblem,
-    used: NDArray[np.bool_],
-    now: Mapping[str, Correlation],
-    group: str,
+    problem: PlacementProblem, used: Flags, now: Correlations, group: str
 ) -> Correlation:
     """A group's correlation with dives apart as far as they contradict each other, if they do."""
     present = replace(now[group], restart=min(now[group].restart, 1.0))
@@ -520,8 +484,8 @@ def _with_jumps(
 
 def _scores(
     problem: PlacementProblem,
-    used: NDArray[np.bool_],
-    now: Mapping[str, Correlation],
+    used: Flags,
+    now: Correlations,
     group: str,
     choices: Sequence[Correlation],
 ) -> Array:
@@ -548,9 +512,7 @@ def _scores(
     return scores
 
 
-def _factor(
-    problem: PlacementProblem, used: NDArray[np.bool_], now: Mapping[str, Correlation], group: str
-) -> float:
+def _factor(problem: PlacementProblem, used: Flags, now: Correlations, group: str) -> float:
     """Factor by which a group's misfits are larger than its sigmas allow, 1 or more."""
     minimum = problem.widened.get(group, 1.0)
     change, covariance = problem.total(used, now).solve()
@@ -565,8 +527,8 @@ def _factor(
 
 
 def _without_contradicted(
-    problem: PlacementProblem, used: NDArray[np.bool_], correlation: Mapping[str, Correlation]
-) -> NDArray[np.bool_]:
+    problem: PlacementProblem, used: Flags, correlation: Correlations
+) -> Flags:
     """Leave out, of each group, readings that all others contradict, the worst of neighbours first.
 
     An outlier makes its neighbours look wrong too: of two in a row only the worse goes at a time.
@@ -601,9 +563,9 @@ def _without_contradicted(
 
 
 def _average(
-    problem: PlacementProblem, used: NDArray[np.bool_], correlation: Mapping[str, Correlation]
+    problem: PlacementProblem, used: Flags, correlation: Correlations
 ) -> tuple[Array, Array]:
-    """Parameters and covariance over all likely correlations of errors, (P,) and (P, P).
+    """Free parameters and their covariance over all likely correlations of errors.
 
     The covariance is the mean of those of the single ways and the scatter of their solutions.
     """
@@ -624,13 +586,4 @@ def _average(
     mean = changes.mean(axis=0)
     spread = (changes - mean).T @ (changes - mean) / len(changes)
     covariance = np.mean([c for _, c in solutions], axis=0) + spread
-    return _fill(problem, mean, covariance)
-
-
-def _fill(problem: PlacementProblem, mean: Array, covariance: Array) -> tuple[Array, Array]:
-    """Parameters and covariance with zeros for what is held."""
-    columns = problem.found.jacobian.shape[2]
-    full, matrix = np.zeros(columns), np.zeros((columns, columns))
-    full[problem.free] = mean
-    matrix[np.ix_(problem.free, problem.free)] = covariance
-    return full, matrix
+    return mean, covariance

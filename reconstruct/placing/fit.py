@@ -30,7 +30,6 @@ from reconstruct.placing.correlated_fit import (
     Extra,
     estimate,
     frame_sigma,
-    no_extra,
     without_gross_errors,
 )
 from reconstruct.placing.navigation import (
@@ -369,20 +368,15 @@ class NavigationTask:
 
     def _warn_of_installation(self, found: Mapping[str, NuisanceRecord]) -> None:
         """Name what is off by more than is likely, and what may be off in its place."""
-        settings = [
-            *((name, "lever_sigma_m", self.installed.lever_m) for name in _LEVERS),
-            ("clock_s", "clock_sigma_s", self.installed.clock_s),
-        ]
-        off = [
-            (
-                abs(found[name].value) / sigma,
-                f"{name} = {found[name].value:+.3g} ({setting} = {sigma:g})",
+        levers = dict.fromkeys(_LEVERS, ("lever_sigma_m", self.installed.lever_m))
+        stated = {**levers, "clock_s": ("clock_sigma_s", self.installed.clock_s)}
+        off = {n: abs(found[n].value) / sigma for n, (_, sigma) in stated.items() if n in found}
+        if max(off.values(), default=0.0) > _CONTRADICTION_SIGMAS:
+            likely = ", ".join(
+                f"{n} = {found[n].value:+.3g} ({stated[n][0]} = {stated[n][1]:g})"
+                for n in sorted(off, key=off.__getitem__, reverse=True)
+                if off[n] > 1.0
             )
-            for name, setting, sigma in settings
-            if name in found
-        ]
-        if off and max(off)[0] > _CONTRADICTION_SIGMAS:
-            likely = ", ".join(text for sigmas, text in sorted(off, reverse=True) if sigmas > 1.0)
             warn(
                 f"navigation fits the pictures with {likely}: correct the log or the rig's mount, "
                 "or state a larger sigma, for the place is as unsure as that"
@@ -506,7 +500,7 @@ class NavigationTask:
     def _extra(self, at: _FitGuess) -> Extra:
         place, sizes = at.place, at.sizes
         columns = PARAMETERS + len(sizes)
-        misfits, rows = [no_extra(columns).misfit], [no_extra(columns).jacobian]
+        misfits, rows = [np.zeros(0)], [np.zeros((0, columns))]
         if self.levelled is not None and not self.epochs.has_tilt:
             down = place.rotation.apply(self.levelled.rotation.inv().apply([0.0, 0.0, 1.0]))
             sigma = np.deg2rad(_LEVEL_SIGMA_DEG)

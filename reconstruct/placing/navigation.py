@@ -30,11 +30,8 @@ GROUP_OF = ("horizontal", "horizontal", "depth", "tilt", "tilt", "heading")
 """Groups of the six channels: north, east, depth, roll, pitch, heading."""
 _NEAR_STEPS = 3.0
 """Usual time steps between stations within which a vehicle's motion is taken as even."""
-_SIGMA_HORIZONTAL_M = 3.0
-_SIGMA_DEPTH_M = 3.0
-_SIGMA_ATTITUDE_DEG = 2.0
-_SIGMA_HEADING_DEG = 5.0
-"""Used where navigation states no sigma."""
+_USUAL_SIGMAS = (3.0, 3.0, 2.0, 5.0)
+"""Horizontal and depth (m), attitude and heading (deg): used where navigation states no sigma."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,13 +108,6 @@ class Epochs:
         return moved
 
     @property
-    def elapsed(self) -> Array:
-        """(M,) time over that of all, from -1/2 to 1/2."""
-        from_first = self.time - self.time[0]
-        share: Array = from_first / max(float(from_first[-1]), 1e-300) - 0.5
-        return share
-
-    @property
     def has_attitude(self) -> bool:
         """Whether any roll, pitch or heading is known."""
         return bool(self.known[:, 3:].any())
@@ -170,12 +160,11 @@ def read_epochs(
         key=lambda i: (records[i].time_s if timed else 0.0, records[i].station, records[i].image)
     )
     rows = [records[i] for i in chosen]
-    stations = list(dict.fromkeys(r.station for r in rows))
-    number = {station: k for k, station in enumerate(stations)}
     firsts: dict[int, ImageRecord] = {}
     for row in rows:
         firsts.setdefault(row.station, row)
-    first = list(firsts.values())
+    stations, first = list(firsts), list(firsts.values())
+    number = {station: k for k, station in enumerate(stations)}
     moment = np.array([number[r.station] for r in rows])
     readings = readings[chosen]
     shared = np.full((len(stations), 6), np.nan)  # pictures of a station share what one has
@@ -185,9 +174,8 @@ def read_epochs(
     known = np.isfinite(shared)
     unknown = RigidTransform.identity()
     levers = [unknown if body_from_cam is None else body_from_cam[r.camera] for r in rows]
-    time = [r.time_s for r in first] if timed else [float(s) for s in stations]
     return Epochs(
-        time=np.array(time),
+        time=np.array([r.time_s for r in first] if timed else stations, np.float64),
         timed=timed,
         moment=moment,
         centres=np.stack([model_from_cam[i].translation for i in chosen]),
@@ -253,14 +241,14 @@ def without_navigation(
 
 
 def _sigmas(rows: Sequence[ImageRecord]) -> Array:
-    def or_default(values: Sequence[float], default: float) -> Array:
-        array = np.array(values)
-        return np.where(array > 0, array, default)
-
-    level = or_default([r.sigma_horizontal_m for r in rows], _SIGMA_HORIZONTAL_M)
-    depth = or_default([r.sigma_depth_m for r in rows], _SIGMA_DEPTH_M)
-    tilt = np.deg2rad(or_default([r.sigma_attitude_deg for r in rows], _SIGMA_ATTITUDE_DEG))
-    heading = np.deg2rad(or_default([r.sigma_heading_deg for r in rows], _SIGMA_HEADING_DEG))
+    stated = np.array(
+        [
+            (r.sigma_horizontal_m, r.sigma_depth_m, r.sigma_attitude_deg, r.sigma_heading_deg)
+            for r in rows
+        ]
+    )
+    level, depth, *angles = np.where(stated > 0, stated, _USUAL_SIGMAS).T
+    tilt, heading = np.deg2rad(angles)
     return np.stack([level, level, depth, tilt, tilt, heading], axis=1)
 
 
@@ -307,7 +295,8 @@ def equations(epochs: Epochs, place: Similarity, middle_ned: Array) -> Navigatio
     jacobian[:, 3:, MOUNT] = angles_from_ned @ ned_from_body
     jacobian[:, :3, LEVER] = ned_from_body
     jacobian[:, :3, CLOCK] = _velocities(epochs, positions)
-    jacobian[:, 2, DRIFT] = epochs.elapsed[epochs.moment]
+    elapsed = epochs.time - epochs.time[0]  # over that of all, from -1/2 to 1/2
+    jacobian[:, 2, DRIFT] = (elapsed / max(float(elapsed[-1]), 1e-300) - 0.5)[epochs.moment]
     turn = place.rotation.as_matrix()
     turned = turn @ epochs.modes[:, 3:]
     moved = place.scale * turn @ epochs.modes[:, :3]

@@ -34,8 +34,7 @@ from alice_survey.core.records import MappingRecord, PicturesRecord, ScaleRecord
 from alice_survey.core.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.rig import Rig, rig_with_mount
-from reconstruct.adjustment.soft_modes import SoftModes
-from reconstruct.adjustment.uncertainty import Uncertainty
+from reconstruct.adjustment.uncertainty import SoftModes, Uncertainty
 from reconstruct.pictures.files import list_names
 from reconstruct.placing.alignment import Similarity, level
 from reconstruct.placing.control import (
@@ -160,8 +159,9 @@ def fit_with_mount(
             found, said = _collect_messages(navigate, mounts, known)
             if found is None:
                 break
-            turn_deg, turn_sigma_deg = _nuisances(found, _AXES)
-            arm_m, arm_sigma_m = _nuisances(found, _ARMS)
+            own = [found.nuisances[name] for name in (*_AXES, *_ARMS)]
+            turn_deg, arm_m = np.array([one.value for one in own]).reshape(2, 3)
+            turn_sigma_deg, arm_sigma_m = np.array([one.sigma for one in own]).reshape(2, 3)
             mount = RigidTransform.from_components(
                 mount.translation - arm_m,
                 Rotation.from_rotvec(-turn_deg, degrees=True) * mount.rotation,
@@ -177,19 +177,13 @@ def fit_with_mount(
     return fit
 
 
-def _nuisances(fit: PlacementFit, names: Sequence[str]) -> tuple[Array, Array]:
-    """Values and sigmas (3,) of what was found."""
-    found = [fit.nuisances[name] for name in names]
-    return np.array([one.value for one in found]), np.array([one.sigma for one in found])
-
-
 def _first_mount(
     records: Sequence[ImageRecord],
     model_from_cam: Sequence[RigidTransform],
     cam_from_rig: Mapping[str, RigidTransform],
     fit: PlacementFit,
 ) -> Rotation | None:
-    """Rotation from rig to body by attitudes at a place; None where there are too few."""
+    """Mean rotation from rig to body by most attitudes at a place; None where they are few."""
     turns = [
         r.ned_from_body.inv()
         * fit.ned_from_model.rotation
@@ -198,7 +192,13 @@ def _first_mount(
         for r, pose in zip(records, model_from_cam, strict=True)
         if r.has_attitude
     ]
-    return _trimmed_mean(Rotation.concatenate(turns)) if len(turns) >= _MIN_PICTURES else None
+    if len(turns) < _MIN_PICTURES:
+        return None
+    every = kept = Rotation.concatenate(turns)
+    for _ in range(_TRIMS):
+        off = (kept.mean().inv() * every).magnitude()
+        kept = every[np.flatnonzero(off <= _TRIMMED * np.median(off) + 1e-12)]
+    return kept.mean()
 
 
 def _collect_messages(
@@ -208,16 +208,6 @@ def _collect_messages(
     messages: list[tuple[Level, str]] = []
     with collected_by(lambda *message: messages.append(message)):
         return navigate(mounts, installed), messages
-
-
-def _trimmed_mean(turns: Rotation) -> Rotation:
-    """The mean of most of the rotations (N,)."""
-    kept = turns
-    for _ in range(_TRIMS):
-        mean = kept.mean()
-        off = (mean.inv() * turns).magnitude()
-        kept = turns[np.flatnonzero(off <= _TRIMMED * np.median(off) + 1e-12)]
-    return kept.mean()
 
 
 RIG_SCALE_SIGMA = 1e-3
@@ -286,8 +276,10 @@ def find_place(task: Placing) -> Placed:
     points = np.array([p.xyz for _, p in sorted(task.model.points3D.items())]).reshape(-1, 3)
     if len(points) < 3:
         raise ReconstructionError(f"the model has {len(points)} points only")
-    centres = np.stack([p.translation for p in _by_station(task.records, task.pinholes)])
-    levelled = level(points, centres)
+    order = sorted(
+        range(len(task.records)), key=lambda i: (task.records[i].station, task.records[i].image)
+    )
+    levelled = level(points, np.stack([task.pinholes[i].translation for i in order]))
     known = _known_scale(task.workspace, task.mapping)
     if known is None and task.datum is None:
         stations = levelled.apply(np.stack([pose.translation for pose in task.pinholes]))
@@ -557,10 +549,3 @@ def _known_scale(workspace: Path, mapping: MappingRecord) -> _KnownScale | None:
         source="scaled by one known length",
         sigma=LENGTH_SCALE_SIGMA,
     )
-
-
-def _by_station(
-    records: Sequence[ImageRecord], poses: Sequence[RigidTransform]
-) -> list[RigidTransform]:
-    order = sorted(range(len(records)), key=lambda i: (records[i].station, records[i].image))
-    return [poses[i] for i in order]

@@ -6,7 +6,7 @@ so that a new scale or georeference does not repeat the mapping.
 Groups of stations that no point links are put where navigation has them. Pictures do not show where
 such groups are relative to each other. Each is placed by its own navigation first, which brings it
 near enough for the adjustment's linear motions of groups (see
-`reconstruct.adjustment.soft_modes.SoftModes`); the model's place then finds these motions, with
+`reconstruct.adjustment.uncertainty.SoftModes`); the model's place then finds these motions, with
 navigation's errors correlated between groups as along the track.
 """
 
@@ -27,9 +27,7 @@ from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Datum
 from alice_survey.core.manifest import ImageRecord
 from alice_survey.core.records import (
-    AcceptanceRecord,
     CamerasRecord,
-    DomingRecord,
     JointRecord,
     MappingRecord,
     RegistrationRecord,
@@ -39,9 +37,8 @@ from camera_calib.freedom import knowing_water
 from camera_calib.rig import Rig, rig_with_mount, write_rig
 from reconstruct.adjustment.exact_observations import Workers
 from reconstruct.adjustment.normal_equations import POSE
-from reconstruct.adjustment.soft_modes import SoftModes
 from reconstruct.adjustment.survey_fit import adjust_survey
-from reconstruct.adjustment.uncertainty import write_uncertainty
+from reconstruct.adjustment.uncertainty import SoftModes, write_uncertainty
 from reconstruct.mapping.arrays import cross_matrices, frames_of, model_groups
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.run import UNREGISTERED, read_inputs, write_reasons
@@ -57,28 +54,17 @@ from reconstruct.placing.navigation import (
     Installation,
     body_from_pinhole,
 )
-from reconstruct.placing.place import Placed, Placing, find_place
+from reconstruct.placing.place import Placing, find_place
 from reconstruct.placing.track import (
-    TrackRow,
+    POSE_ORDER,
     pose_covariances,
     track_rows,
     track_sigmas,
-    write_covariances,
     write_track_csv,
     write_track_geojson,
 )
 from reconstruct.views.model import read_warps, write_frame
 from reconstruct.views.model_files import as_transform, read_reconstruction, rigid3d
-
-
-def read_reasons(mapping: Path) -> dict[str, str]:
-    """Why pictures are not in the model, by name, as the mapping wrote it; empty if all are."""
-    path = mapping / UNREGISTERED
-    if not path.exists():
-        return {}
-    rows = read_csv(path, ("image", "reason"), exact=True, fault=WorkspaceError)[1]
-    return {row["image"]: row["reason"] for _, row in rows}
-
 
 _MAX_TURN_RAD = 0.1
 """Sigma of a group's turn about any axis up to which turns are linear."""
@@ -120,7 +106,13 @@ def join_groups(
         if fit is None or fits[0] is None:
             notes.append(_leave_out(model, of_frames))
         else:
-            _move(model, of_frames, _rigid(fits[0]).inv() * _rigid(fit))
+            first, own = (
+                RigidTransform.from_components(
+                    f.ned_from_model.translation, f.ned_from_model.rotation
+                )
+                for f in (fits[0], fit)
+            )
+            _move(model, of_frames, first.inv() * own)
             notes.append(f"{len(of_frames)} stations joined to the others by navigation alone")
     model.tear_down()  # what is left out is no longer in it at all
     model.update_point_3d_errors()
@@ -225,11 +217,6 @@ def _move(model: pycolmap.Reconstruction, frames: Sequence[int], motion: RigidTr
         model.points3D[number].xyz = motion.apply(model.points3D[number].xyz)
 
 
-def _rigid(fit: PlacementFit) -> RigidTransform:
-    place = fit.ned_from_model
-    return RigidTransform.from_components(place.translation, place.rotation)
-
-
 _LEFT_OUT = "in a part of the model that neither pictures nor navigation tie to the rest"
 _UNKNOWN = "not known: the mapping was made by an earlier version"
 
@@ -257,10 +244,17 @@ def run_sparse(
     """
     inputs = read_inputs(workspace)
     mapping = MappingRecord.read(workspace / "mapping" / "mapping.json")
-    known = join_groups(
-        _read_mapping(workspace, mapping), inputs.records, inputs.rig, inputs.datum,
-        Installation.of(reconstruct),
-    )  # fmt: skip
+    mapped = Mapped(
+        model=read_reconstruction(workspace / "mapping" / "model"),
+        warps=read_warps(workspace / "mapping" / "cameras.json"),
+        models=mapping.models,
+        scaled=mapping.scaled,
+        baseline=math.nan if mapping.baseline is None else mapping.baseline,
+        rig_factor=1.0 if mapping.rig_factor is None else mapping.rig_factor,
+        notes=mapping.notes,
+    )
+    installed = Installation.of(reconstruct)
+    known = join_groups(mapped, inputs.records, inputs.rig, inputs.datum, installed)
     left = sum(image.has_pose for image in known.model.images.values())
     mapping = mapping.model_copy(update={"registered": left, "notes": known.notes})
     rig = inputs.rig
@@ -298,15 +292,16 @@ def run_sparse(
     if placed.fit is not None and len(placed.fit.modes):
         adjusted = adjusted.deform(placed.fit.modes, placed.fit.joint[PLACE:, PLACE:])
     model, warps = pycolmap.Reconstruction(adjusted.mapped.model), adjusted.mapped.warps
-    move = placed.world_from_model
+    move, fit = placed.world_from_model, placed.fit
     rotation = pycolmap.Rotation3d(move.rotation.as_quat())
     model.transform(pycolmap.Sim3d(move.scale, rotation, move.translation))
     (folder / "model").mkdir()
     model.write_binary(folder / "model")
     model.export_PLY(folder / "sparse.ply")
     cameras = CamerasRecord.read(workspace / "mapping" / "cameras.json").to_json()
+    in_mapping = cameras["images"]
     cameras["cameras"] = {name: warp.to_json() for name, warp in warps.items()}
-    cameras["images"] = {name: of for name, of in cameras["images"].items() if name in poses}
+    cameras["images"] = {name: of for name, of in in_mapping.items() if name in poses}
     CamerasRecord.save(folder / "cameras.json", cameras)
     if adjusted.exact is not None and adjusted.exact.fit.parameters:
         adjusted.exact.fit.record.write(folder / "port.json")
@@ -315,8 +310,8 @@ def run_sparse(
         write_rig(folder / "rig.json", adjusted.exact.fit.rig)
     write_frame(folder / "frame.json", placed.frame)
     rig = adjusted.rig
-    if rig is not None and placed.fit is not None and placed.fit.mount is not None:
-        rig = replace(rig, body_from_rig=placed.fit.mount.body_from_rig)
+    if rig is not None and fit is not None and fit.mount is not None:
+        rig = replace(rig, body_from_rig=fit.mount.body_from_rig)
         write_rig(folder / "rig.json", rig)
     known_mount = rig_with_mount(rig)
     mounts = (
@@ -326,83 +321,50 @@ def run_sparse(
     )
     rows = track_rows(model, of_name, warps, placed.frame, mounts)
     covariances = None
-    if placed.fit is not None or shape is not None:
-        covariances = pose_covariances(rows, placed.fit, shape, move)
-        parts = ["place"] * (placed.fit is not None)
+    if fit is not None or shape is not None:
+        covariances = pose_covariances(rows, fit, shape, move)
+        parts = ["place"] * (fit is not None)
         parts.append("no model covariance" if shape is None else "shape of the model")
-        names = [row.image for row in rows]
-        write_covariances(folder / "track_covariance.npz", names, covariances, "; ".join(parts))
+        np.savez(
+            folder / "track_covariance.npz", image=np.array([row.image for row in rows]),
+            covariance=covariances, order=np.array(POSE_ORDER), parts=np.array("; ".join(parts)),
+        )  # fmt: skip
     if adjusted.shape is not None:
         write_uncertainty(
             folder / "covariance.npz",
             adjusted.shape.move(move.scale, move.rotation, move.translation),
         )
-    sigmas = track_sigmas(rows, None if placed.fit is None else covariances)
+    sigmas = track_sigmas(rows, None if fit is None else covariances)
     write_track_csv(folder / "track.csv", rows, placed.frame, sigmas)
     if placed.frame.datum is not None:
         write_track_geojson(folder / "track.geojson", rows, placed.frame, sigmas)
-    if placed.fit is not None:
-        placed.fit.record.write(folder / "georeference.json")
+    if fit is not None:
+        fit.record.write(folder / "georeference.json")
     if placed.control is not None:
         score = placed.control.score(move, located=placed.located)
         warn_of_contradictions(score)
         score.write(folder / "control.json")
     doming = accepted = None
     if rig is not None and adjusted.mapped.scaled:
-        bends = () if placed.fit is None else placed.fit.bends
+        bends = () if fit is None else fit.bends
         doming, accepted = judge_model(adjusted.mapped, inputs.records, rig, inputs.datum, bends)
-    joints = () if shape is None or placed.fit is None else joints_of(placed.fit, shape.modes)
-    _report_unregistered(workspace, folder, inputs.records, rows)
-    _registration(model, mapping, placed, rows, doming, accepted, joints).write(
-        folder / "registration.json"
-    )
-
-
-def _report_unregistered(
-    workspace: Path, folder: Path, records: Sequence[ImageRecord], rows: Sequence[TrackRow]
-) -> None:
-    """Write which pictures are not in the model, and why."""
-    registered = {row.image for row in rows}
-    mapped = CamerasRecord.read(workspace / "mapping" / "cameras.json").images
-    words = read_reasons(workspace / "mapping")
+    words, path = {}, workspace / "mapping" / UNREGISTERED
+    if path.exists():
+        found = read_csv(path, ("image", "reason"), exact=True, fault=WorkspaceError)[1]
+        words = {row["image"]: row["reason"] for _, row in found}
     lost = {
-        record.image: _LEFT_OUT if record.image in mapped else words.get(record.image, _UNKNOWN)
-        for record in records
-        if record.image not in registered
+        record.image: _LEFT_OUT if record.image in in_mapping else words.get(record.image, _UNKNOWN)
+        for record in inputs.records
+        if record.image not in poses
     }
-    write_reasons(folder / UNREGISTERED, records, lost)
-
-
-def _read_mapping(workspace: Path, mapping: MappingRecord) -> Mapped:
-    """The model of the mapping."""
-    return Mapped(
-        model=read_reconstruction(workspace / "mapping" / "model"),
-        warps=read_warps(workspace / "mapping" / "cameras.json"),
-        models=mapping.models,
-        scaled=mapping.scaled,
-        baseline=math.nan if mapping.baseline is None else mapping.baseline,
-        rig_factor=1.0 if mapping.rig_factor is None else mapping.rig_factor,
-        notes=mapping.notes,
-    )
-
-
-def _registration(
-    model: pycolmap.Reconstruction,
-    mapping: MappingRecord,
-    placed: Placed,
-    rows: Sequence[TrackRow],
-    doming: DomingRecord | None,
-    accepted: AcceptanceRecord | None,
-    joints: tuple[JointRecord, ...],
-) -> RegistrationRecord:
+    write_reasons(folder / UNREGISTERED, inputs.records, lost)
     baseline = model_baseline(model)
-    fit = placed.fit
-    return RegistrationRecord(
+    RegistrationRecord(
         registered=mapping.registered,
         total=mapping.total,
         stations=len({row.station for row in rows}),
         models=mapping.models,
-        joints=joints,
+        joints=() if shape is None or fit is None else joints_of(fit, shape.modes),
         points=int(model.num_points3D()),
         mean_reprojection_px=float(model.compute_mean_reprojection_error()),
         mean_track_length=float(model.compute_mean_track_length()),
@@ -411,12 +373,12 @@ def _registration(
         scale_source=placed.scale_source,
         gauge=mapping.gauge,
         world_from_mapping=SimilarityRecord(
-            scale=placed.world_from_model.scale,
-            quaternion_xyzw=tuple(placed.world_from_model.rotation.as_quat().tolist()),
-            translation=tuple(placed.world_from_model.translation.tolist()),
+            scale=move.scale,
+            quaternion_xyzw=tuple(move.rotation.as_quat().tolist()),
+            translation=tuple(move.translation.tolist()),
         ),
         working_range=mapping.distances,
         doming=doming,
         acceptance=accepted,
         georeference=None if fit is None else fit.record,
-    )
+    ).write(folder / "registration.json")

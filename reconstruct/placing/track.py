@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.core.artefacts import atomic_path, read_csv, write_csv, write_json
+from alice_survey.core.artefacts import read_csv, write_csv, write_json
 from alice_survey.core.contents import one_line
 from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.frames import BODY_FROM_NADIR_CAM, Array, attitude_from_rotation
@@ -201,18 +201,6 @@ def attitude_sigmas_deg(ned_from_body: Rotation, covariances: Array) -> Array:
     moved = angles @ covariances[:, 3:, 3:] @ np.swapaxes(angles, 1, 2)
     found: Array = np.rad2deg(np.sqrt(np.diagonal(moved, axis1=1, axis2=2)))
     return found
-
-
-def write_covariances(path: Path, images: list[str], covariances: Array, parts: str) -> None:
-    """Write `track_covariance.npz`: `image` (N,), `covariance` (N, 6, 6), `order`, `parts`."""
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        np.savez(
-            file,
-            image=np.array(images),
-            covariance=covariances,
-            order=np.array(POSE_ORDER),
-            parts=np.array(parts),
-        )
 
 
 def track_sigmas(rows: Sequence[TrackRow], covariances: Array | None) -> Array:

@@ -19,9 +19,8 @@ from reconstruct.adjustment.normal_equations import (
     OnePart,
     reduce_points,
 )
-from reconstruct.adjustment.soft_modes import Motions
 from reconstruct.adjustment.survey_fit import calibrated_covariance, motions_of
-from reconstruct.adjustment.uncertainty import BlockShape, shape_of_block
+from reconstruct.adjustment.uncertainty import BlockShape, Motions, shape_of_block
 from reconstruct.mapping.arrays import cross_matrices, first_of, linked_groups
 from reconstruct.placing.alignment import Similarity, sag_weights
 from reconstruct.placing.correlated_fit import Extra, estimate

@@ -42,7 +42,7 @@ def test_a_wrong_parameter_is_found_and_named():
     found = [contradiction(NAMES, *linear_fit(rng, wrong)) for _ in range(200)]
     known = [one for one in found if one is not None]
     assert len(known) > 180
-    named = sum("left.p3" in one.named for one in known)
+    named = sum("left.p3" in one.pulls for one in known)
     assert named > 0.6 * len(known)
     assert all(3 <= one.directions <= 4 for one in known)
 

@@ -19,13 +19,14 @@ from reconstruct.adjustment.normal_equations import (
     LinearObservations,
     reduce_points,
 )
-from reconstruct.adjustment.soft_modes import Motions, spread
 from reconstruct.adjustment.survey_fit import fit_survey
 from reconstruct.adjustment.uncertainty import (
+    Motions,
     Uncertainty,
     estimate,
     pinhole_survey,
     read_uncertainty,
+    spread,
     write_uncertainty,
 )
 from reconstruct.mapping.arrays import frames_of, observations

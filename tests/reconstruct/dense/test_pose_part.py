@@ -3,8 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reconstruct.adjustment.soft_modes import no_modes
-from reconstruct.adjustment.uncertainty import Uncertainty, write_uncertainty
+from reconstruct.adjustment.uncertainty import Uncertainty, no_modes, write_uncertainty
 from reconstruct.dense.surface_tiles import (
     ErrorsOfPoses,
     find_errors_of_poses,

@@ -7,8 +7,12 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.artefacts import write_json
-from reconstruct.adjustment.soft_modes import no_modes
-from reconstruct.adjustment.uncertainty import SharedMotions, Uncertainty, write_uncertainty
+from reconstruct.adjustment.uncertainty import (
+    SharedMotions,
+    Uncertainty,
+    no_modes,
+    write_uncertainty,
+)
 from reconstruct.measure.errors import in_plane, own_correlation
 from reconstruct.measure.shapes import measure_line
 from reconstruct.measure.surface import MeasuredSurface

@@ -10,8 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.frames import Array, Datum, attitude_from_rotation, rotation_from_attitude
 from alice_survey.core.records import GeoreferenceRecord
-from reconstruct.adjustment.soft_modes import SoftModes, no_modes
-from reconstruct.adjustment.uncertainty import Uncertainty
+from reconstruct.adjustment.uncertainty import SoftModes, Uncertainty, no_modes
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.fit import PlacementFit
 from reconstruct.placing.navigation import attitude_axes
