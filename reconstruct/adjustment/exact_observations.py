@@ -325,7 +325,16 @@ class PixelParts:
             state: of the survey.
             values: one for each part.
         """
-        return self._map(function, self._states(state), values)
+        states = iter([state])
+        if not self.is_one:
+            states = (
+                replace(
+                    state, turns=state.turns[own], centres=state.centres[own],
+                    points=state.points[slice(*run)],
+                )
+                for run, own in zip(self.runs, self.stations, strict=True)
+            )  # fmt: skip
+        return self._map(function, states, values)
 
     def _map(
         self, function: Callable[..., Result], states: Iterable[Any], values: Iterable[Any]
@@ -336,16 +345,6 @@ class PixelParts:
         if self.is_one or self.workers.folder is None:
             return map(run, tasks)
         return executor.map(run, tasks, label="parts of the survey", total=len(self.runs))
-
-    def _states(self, state: RigState) -> Iterator[RigState]:
-        if self.is_one:
-            yield state
-            return
-        for run, own in zip(self.runs, self.stations, strict=True):
-            yield replace(
-                state, turns=state.turns[own], centres=state.centres[own],
-                points=state.points[slice(*run)],
-            )  # fmt: skip
 
     def _of(self, number: int) -> Pixels | Path:
         """Pixels of a part, counting in its stations and points, or the file of these."""

@@ -153,3 +153,13 @@ def observations(model: pycolmap.Reconstruction) -> Observed:
         points=points,
         in_cameras=in_cameras,
     )
+
+
+def ground_pixel(model: pycolmap.Reconstruction, seen: Observed) -> float:
+    """Median size of a pixel on the ground, in units of the model; NaN without points."""
+    rows = []
+    for n, number in enumerate(seen.pictures.tolist()):
+        depth = seen.in_cameras[seen.of(n), 2]
+        if len(depth):
+            rows.append(np.median(depth) / model.images[number].camera.mean_focal_length())
+    return float(np.median(rows)) if rows else float("nan")

@@ -223,9 +223,9 @@ class NavigationTask:
     """The levelled model; None where control holds the model level."""
     known_scale: float | None
     scale_sigma: float
-    installed: Installation
     control: ExtraOf | None
     joints: int
+    installed: Installation = USUAL_INSTALLATION
 
     def fit(self, place: Similarity, free: list[int]) -> PlacementFit:
         """Iterate from a robust placement to the final one.
@@ -725,7 +725,6 @@ def fit_control(
         levelled=None,
         known_scale=known_scale,
         scale_sigma=scale_sigma,
-        installed=USUAL_INSTALLATION,
         control=control,
         joints=joints,
     )

@@ -256,10 +256,10 @@ class Placing:
 
 @dataclass(frozen=True, kw_only=True)
 class _KnownScale:
-    scale: float
-    """Metres in a unit of the mapped model."""
-    source: str
-    sigma: float
+    scale: float | None = None
+    """Metres in a unit of the mapped model; None where nothing but navigation or control says."""
+    source: str = "scale from navigation"
+    sigma: float = 0.0
     """Relative sigma of the scale."""
     held: bool = True
     """Whether the scale changes by control alone."""
@@ -281,18 +281,17 @@ def find_place(task: Placing) -> Placed:
     )
     levelled = level(points, np.stack([task.pinholes[i].translation for i in order]))
     known = _known_scale(task.workspace, task.mapping)
-    if known is None and task.datum is None:
+    if known.scale is None and task.datum is None:
         stations = levelled.apply(np.stack([pose.translation for pose in task.pinholes]))
         found = scale_by_altitudes(task.records, stations, levelled.apply(points))
         if found is not None:
             source = f"scale from altitudes, sigma {found[1]:.1%}"
             known = _KnownScale(scale=found[0], source=source, sigma=found[1], held=False)
-    scale = None if known is None else known.scale
     path = task.workspace / CONTROL_FILE
     control = read_control(path) if path.is_file() else Control()
     datum = task.datum or control.datum()
-    ties = without_wrong_points(_tie(task, control, datum), scale)
-    fit, local = _fit(task, levelled, scale, known, ties, datum)
+    ties = without_wrong_points(_tie(task, control, datum), known.scale)
+    fit, local = _fit(task, levelled, known, ties)
     # Points that count for more than they are worth bend the model, and so hide what they miss by.
     for _ in range(_WIDENED_TIMES):
         if fit is None or local is not None:
@@ -302,13 +301,13 @@ def find_place(task: Placing) -> Placed:
         if factor == 1.0:
             break
         ties = widen(ties, factor)
-        fit, local = _fit(task, levelled, scale, known, ties, datum)
+        fit, local = _fit(task, levelled, known, ties)
     warn_of_coarse(ties)
     notes = [*task.survey.notes, *task.mapping.notes]
     if fit is not None:
         place = fit.ned_from_model
         source = _scale_source(known, ties)
-        if known is None and not ties.informs_scale:
+        if known.scale is None and not ties.informs_scale:
             source += f", sigma {fit.sigma_scale:.2g}"
         scaled, vertical = True, _VERTICAL_OF_CONTROL
         if local is not None:
@@ -320,13 +319,14 @@ def find_place(task: Placing) -> Placed:
                 vertical = MEAN_PLANE
         notes += [source] if datum is not None else [source, local or _LOCAL]
     else:
-        found = ties.bar_scale(scale, 0.0 if known is None else known.sigma)
-        factor = 1.0 if scale is None else scale
-        source = "unscaled" if known is None else known.source
+        found = ties.bar_scale(known.scale, known.sigma)
+        factor, source = 1.0, "unscaled"
+        if known.scale is not None:
+            factor, source = known.scale, known.source
         if found is not None:
             factor, source = found[0], _scale_source(known, ties)
         place = replace(levelled, scale=factor, translation=factor * levelled.translation)
-        scaled, vertical = known is not None or found is not None, MEAN_PLANE
+        scaled, vertical = source != "unscaled", MEAN_PLANE
         turned = None if scaled else _turn_by_attitudes(task, levelled)
         if turned is not None:
             place, note = turned
@@ -354,21 +354,14 @@ def find_place(task: Placing) -> Placed:
 
 
 def _fit(
-    task: Placing,
-    levelled: Similarity,
-    scale: float | None,
-    known: _KnownScale | None,
-    ties: ControlFit,
-    datum: Datum | None,
+    task: Placing, levelled: Similarity, known: _KnownScale, ties: ControlFit
 ) -> tuple[PlacementFit | None, str | None]:
     """The fit to navigation and control, to one of them, or None where nothing places it.
 
     Also, of a fit to navigation without positions, what of the place is the model's own.
     """
     # Control corrects a known scale within its sigma; without control it is held.
-    sigma = 0.0
-    if known is not None and (ties.informs_scale or not known.held):
-        sigma = known.sigma
+    sigma = known.sigma if ties.informs_scale or not known.held else 0.0
     fit, modes, joints = None, None, 0
     if task.shape is not None:
         joints = task.shape.modes.joints
@@ -381,7 +374,7 @@ def _fit(
         task.records,
         task.pinholes,
         levelled=levelled,
-        known_scale=scale,
+        known_scale=known.scale,
         scale_sigma=sigma,
         modes=modes,
         joints=joints,
@@ -409,23 +402,20 @@ def _fit(
         )
     if fit is not None:
         return fit, None
-    start = ties.start(scale)
+    start = ties.start(known.scale)
     if start is None:
         if ties.used_points:
             warn(
                 f"{len(ties.used_points)} control points do not place the model without "
                 "navigation: three that are not on one line do"
             )
-        bars = ties.bar_scale(scale, 0.0 if known is None else known.sigma)
-        if bars is not None:
-            fit = navigate(None, known_scale=bars[0], scale_sigma=bars[1])
-        else:
-            fit = navigate(None)
+        bars = ties.bar_scale(known.scale, known.sigma) or (known.scale, sigma)
+        fit = navigate(None, known_scale=bars[0], scale_sigma=bars[1])
         note = None if fit is None else _local_note(task.records, headed=rig is not None)
         return fit, note
     fit = fit_control(
-        task.records, task.pinholes, start, ties.equations, known_scale=scale, scale_sigma=sigma,
-        modes=modes, joints=joints,
+        task.records, task.pinholes, start, ties.equations, known_scale=known.scale,
+        scale_sigma=sigma, modes=modes, joints=joints,
     )  # fmt: skip
     return fit, None
 
@@ -524,21 +514,19 @@ def _motions_near(tree: KDTree, modes: SoftModes, places: Array) -> Array:
     return modes.points[np.asarray(tree.query(places)[1])].astype(np.float64)
 
 
-def _scale_source(known: _KnownScale | None, ties: ControlFit) -> str:
-    source = "scale from navigation" if known is None else known.source
+def _scale_source(known: _KnownScale, ties: ControlFit) -> str:
     if not ties.informs_scale:
-        return source
-    return "scale from control" if known is None else f"{source}, corrected by control"
+        return known.source
+    return f"{known.source}, corrected by control" if known.scale else "scale from control"
 
 
-def _known_scale(workspace: Path, mapping: MappingRecord) -> _KnownScale | None:
-    """The known scale; None where nothing but navigation or control gives it."""
+def _known_scale(workspace: Path, mapping: MappingRecord) -> _KnownScale:
     if mapping.scaled:
         return _KnownScale(scale=1.0, source="scale from the calibrated rig", sigma=RIG_SCALE_SIGMA)
     path = workspace / SCALE_FILE
     measured = ScaleRecord.read_existing(path)
     if measured is None:
-        return None
+        return _KnownScale()
     if measured.gauge != mapping.gauge:
         raise ReconstructionError(
             f"{path} measures an earlier model: remove it, run 'alice-survey reconstruct', and "

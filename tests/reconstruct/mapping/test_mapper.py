@@ -22,8 +22,8 @@ from reconstruct.mapping.mapper import (
     second_from_first,
 )
 from reconstruct.mapping.self_calibration import map_self_calibrated
-from reconstruct.placing.acceptance import measure_doming
 from reconstruct.placing.alignment import align_rigid, align_similarity
+from reconstruct.placing.run import measure_doming
 from reconstruct.views.model_files import as_transform, colmap_pinhole, rigid3d
 from tests.reconstruct.rig_survey import four_cameras
 from tests.reconstruct.scenes import Scene, make_scene

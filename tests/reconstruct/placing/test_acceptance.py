@@ -6,17 +6,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from alice_survey.core.records import ScaleOfPairs
-from reconstruct.mapping.arrays import observations
-from reconstruct.placing.acceptance import (
+from reconstruct.mapping.arrays import ground_pixel, observations
+from reconstruct.placing.alignment import bend_of
+from reconstruct.placing.navigation import body_from_pinhole
+from reconstruct.placing.run import (
     check_mapping,
-    ground_pixel,
     measure_doming,
     navigation_residuals,
     pinhole_positions,
     scale_of_pairs,
 )
-from reconstruct.placing.alignment import bend_of
-from reconstruct.placing.navigation import body_from_pinhole
 from tests.reconstruct.mapping.test_mapper import block, block_mapped
 from tests.reconstruct.scenes import ALTITUDE_M, DATUM
 
