@@ -120,8 +120,7 @@ class BlockPattern:
         """(B,) row and column of each block as one number, ascending."""
         stations = len(self.pointers) - 1
         rows = np.repeat(np.arange(stations), np.diff(self.pointers))
-        found: Indices = rows * stations + self.columns
-        return found
+        return np.asarray(rows * stations + self.columns)
 
     def at(self, stations: Indices, part: "BlockPattern") -> Indices:
         """Where the blocks of a part of the stations, (f,), are among these."""
@@ -542,14 +541,12 @@ class Gauge:
 
     def motion_in(self, steps: Array) -> Array:
         """How much of each motion (6 or 7 a group, G) steps (F, 6, G) of the stations are."""
-        found: Array = self.spread @ product_of(self.weighed, steps)
-        return found
+        return np.asarray(self.spread @ product_of(self.weighed, steps))
 
     def shape_weights(self, weights: Array) -> Array:
         """Weights (F, 6) of stations' steps in a sum, those minus the motions being summed."""
         along = np.tensordot(self.motions, weights, axes=([0, 1], [0, 1]))
-        found: Array = weights - self.weighed @ (self.spread @ along)
-        return found
+        return np.asarray(weights - self.weighed @ (self.spread @ along))
 
     def shape_blocks(self, equations: Equations) -> Array:
         """Covariances (B, 6, 6) of stations without these motions, where the equations have blocks.

@@ -102,8 +102,7 @@ class Groups:
         every = np.concatenate([np.zeros((1, motions.shape[1])), motions])[group]
         arms = Rotation.from_rotvec(every[:, :3]).apply(places - self.middles[group])
         grown = arms * np.exp(every[:, 6:].sum(axis=1, keepdims=True))
-        carried: Array = self.middles[group] + every[:, 3:6] + grown
-        return carried
+        return np.asarray(self.middles[group] + every[:, 3:6] + grown)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -197,8 +196,7 @@ class Motions:
     def of_points(self, points: Array, group: Indices | None = None) -> Array:
         """Covariances (N, 3, 3) of (N, 3) points: those of the nearest where it is known."""
         given, which = np.unique(self.nearest(points, group), return_inverse=True)
-        found: Array = spread(self.points[given], self.covariance)[which]
-        return found
+        return np.asarray(spread(self.points[given], self.covariance)[which])
 
     def nearest(self, points: Array, group: Indices | None = None) -> Indices:
         """(N,) which of `places` are nearest to (N, 3) points, of groups (N,) where there are some.
@@ -206,8 +204,7 @@ class Motions:
         A group without a place takes those of the others.
         """
         if group is None or self.group is None:
-            found: Indices = np.asarray(KDTree(self.places).query(points)[1])
-            return found
+            return np.asarray(np.asarray(KDTree(self.places).query(points)[1]))
         found = np.empty(len(points), np.int64)
         for number in np.unique(group):
             own = np.flatnonzero(self.group == number)

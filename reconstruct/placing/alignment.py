@@ -27,8 +27,7 @@ class Similarity:
 
     def apply(self, points: Array) -> Array:
         """Take (N, 3) source points to the target's frame."""
-        moved: Array = self.scale * self.rotation.apply(points) + self.translation
-        return moved
+        return np.asarray(self.scale * self.rotation.apply(points) + self.translation)
 
 
 def align_rigid(source: Array, target: Array, weight: Array | None = None) -> RigidTransform:

@@ -154,8 +154,7 @@ class ControlFit:
         """(3, K) of a point by the soft modes."""
         if self.motion_at is None:
             return np.zeros((3, modes))
-        motion: Array = self.motion_at(picked_point.model[None])[0]
-        return motion
+        return np.asarray(self.motion_at(picked_point.model[None])[0])
 
     def start(self, known_scale: float | None) -> Similarity | None:
         """A first placement from the points alone; None where fewer than three, or on a line."""

@@ -109,8 +109,7 @@ def standard_residuals(
     precision = 1.0 / past_variance + 1.0 / future_variance - 1.0
     mean = (past / past_variance + future / future_variance) / precision
     spread = (1.0 - white) / precision + white
-    found: Array = (values - math.sqrt(1.0 - white) * mean) / np.sqrt(spread)
-    return found
+    return np.asarray((values - math.sqrt(1.0 - white) * mean) / np.sqrt(spread))
 
 
 def correlated_share(time: Array, tau: float, white: float) -> float:

@@ -182,17 +182,15 @@ _VAGUE_PER_M = 10.0
 _STRETCH = 0.005
 """Stretch of positions integrated from a Doppler log: makers and users say 0.1 to 1 % (as in
 `vehicle.navigation.sensors`)."""
-_LEVERS = ("lever_forward_m", "lever_right_m", "lever_down_m")
+LEVERS = ("lever_forward_m", "lever_right_m", "lever_down_m")
+MOUNTS = ("mount_forward_deg", "mount_right_deg", "mount_down_deg")
 _NUISANCES = {
     "turn_deg": (TURN, float(np.rad2deg(1.0))),
     "stretch": (STRETCH, 1.0),
-    **{name: (LEVER.start + k, 1.0) for k, name in enumerate(_LEVERS)},
+    **{name: (LEVER.start + k, 1.0) for k, name in enumerate(LEVERS)},
     "clock_s": (CLOCK, 1.0),
     "depth_drift_m": (DRIFT, 1.0),
-    **{
-        f"mount_{axis}_deg": (MOUNT.start + k, float(np.rad2deg(1.0)))
-        for k, axis in enumerate(("forward", "right", "down"))
-    },
+    **{name: (MOUNT.start + k, float(np.rad2deg(1.0))) for k, name in enumerate(MOUNTS)},
 }
 
 
@@ -368,7 +366,7 @@ class NavigationTask:
 
     def _warn_of_installation(self, found: Mapping[str, NuisanceRecord]) -> None:
         """Name what is off by more than is likely, and what may be off in its place."""
-        levers = dict.fromkeys(_LEVERS, ("lever_sigma_m", self.installed.lever_m))
+        levers = dict.fromkeys(LEVERS, ("lever_sigma_m", self.installed.lever_m))
         stated = {**levers, "clock_s": ("clock_sigma_s", self.installed.clock_s)}
         off = {n: abs(found[n].value) / sigma for n, (_, sigma) in stated.items() if n in found}
         if max(off.values(), default=0.0) > _CONTRADICTION_SIGMAS:
@@ -395,15 +393,9 @@ class NavigationTask:
         modes = np.concatenate([modes, epochs.modes[..., len(at.sizes) - self.joints :]], axis=2)
         bending = replace(self, control=None, epochs=replace(epochs, modes=modes))
         stiff = _FitGuess(place=place, sizes=np.zeros(modes.shape[2]))
-        bent = estimate(
-            epochs.time,
-            equations(bending.epochs, place, self._middle(place)),
-            got.used,
-            [*(p for p in free if p < PARAMETERS), *range(PARAMETERS, PARAMETERS + modes.shape[2])],
-            bending._extra(stiff),
-            frame_bounds=bounds,
-            correlation=got.correlation,
-        )
+        solved_for = [p for p in free if p < PARAMETERS]
+        solved_for += range(PARAMETERS, PARAMETERS + modes.shape[2])
+        bent = bending._estimate(stiff, got.used, solved_for, bounds, correlation=got.correlation)
         values = _VAGUE_PER_M * bent.change[PARAMETERS:]
         sigmas = _VAGUE_PER_M * np.sqrt(np.diag(bent.covariance)[PARAMETERS:])
         design, lengths, _ = quadratic(places[:, :2])
@@ -479,8 +471,7 @@ class NavigationTask:
         return widened
 
     def _middle(self, place: Similarity) -> Array:
-        middle: Array = place.apply(self.epochs.centres).mean(axis=0)
-        return middle
+        return np.asarray(place.apply(self.epochs.centres).mean(axis=0))
 
     def _frame_bounds(self) -> dict[int, float]:
         """How navigation's own frame may be turned and stretched within its positions' sigmas.

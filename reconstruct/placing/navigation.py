@@ -104,8 +104,7 @@ class Epochs:
     def positions(self, ned_from_model: Similarity) -> Array:
         """Body origins in NED, (N, 3)."""
         arms = (ned_from_model.rotation * self.model_from_body).apply(self.levers)
-        moved: Array = ned_from_model.apply(self.centres) + arms
-        return moved
+        return np.asarray(ned_from_model.apply(self.centres) + arms)
 
     @property
     def has_attitude(self) -> bool:

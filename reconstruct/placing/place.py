@@ -56,7 +56,14 @@ from reconstruct.placing.control_points import (
     read_picks,
     triangulate_picks,
 )
-from reconstruct.placing.fit import FoundMount, PlacementFit, fit_control, fit_navigation
+from reconstruct.placing.fit import (
+    LEVERS,
+    MOUNTS,
+    FoundMount,
+    PlacementFit,
+    fit_control,
+    fit_navigation,
+)
 from reconstruct.placing.navigation import PLACE, SCALE, Installation, body_from_pinhole
 from reconstruct.placing.track import picture_modes
 from reconstruct.stages import SCALE_FILE
@@ -116,8 +123,6 @@ def scale_by_altitudes(
     return float(np.exp(found)), float(sigma)
 
 
-_AXES = ("mount_forward_deg", "mount_right_deg", "mount_down_deg")
-_ARMS = ("lever_forward_m", "lever_right_m", "lever_down_m")
 _UNKNOWN_RAD, _UNKNOWN_LEVER_M = 1.0, 1.0
 """Sigmas of a mount of which nothing is known, about a first value, and of its lever arm."""
 _MIN_PICTURES = 3
@@ -159,7 +164,7 @@ def fit_with_mount(
             found, said = _collect_messages(navigate, mounts, known)
             if found is None:
                 break
-            own = [found.nuisances[name] for name in (*_AXES, *_ARMS)]
+            own = [found.nuisances[name] for name in (*MOUNTS, *LEVERS)]
             turn_deg, arm_m = np.array([one.value for one in own]).reshape(2, 3)
             turn_sigma_deg, arm_sigma_m = np.array([one.sigma for one in own]).reshape(2, 3)
             mount = RigidTransform.from_components(

@@ -199,8 +199,7 @@ def attitude_sigmas_deg(ned_from_body: Rotation, covariances: Array) -> Array:
     """Sigmas of roll, pitch and heading, (N, 3) degrees, of poses with such covariances."""
     angles = np.linalg.inv(attitude_axes(ned_from_body))
     moved = angles @ covariances[:, 3:, 3:] @ np.swapaxes(angles, 1, 2)
-    found: Array = np.rad2deg(np.sqrt(np.diagonal(moved, axis1=1, axis2=2)))
-    return found
+    return np.asarray(np.rad2deg(np.sqrt(np.diagonal(moved, axis1=1, axis2=2))))
 
 
 def track_sigmas(rows: Sequence[TrackRow], covariances: Array | None) -> Array:
@@ -214,8 +213,7 @@ def track_sigmas(rows: Sequence[TrackRow], covariances: Array | None) -> Array:
         return np.full((len(rows), 6), np.nan)
     attitudes = Rotation.concatenate([row.world_from_body for row in rows])
     places = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)[:, :3])
-    found: Array = np.hstack([places, attitude_sigmas_deg(attitudes, covariances)])
-    return found
+    return np.asarray(np.hstack([places, attitude_sigmas_deg(attitudes, covariances)]))
 
 
 def write_track_csv(path: Path, rows: Sequence[TrackRow], frame: WorldFrame, sigmas: Array) -> None:
