@@ -388,8 +388,8 @@ def fit_in_water(camera: Camera, near_m: float, far_m: float, model: str) -> Sta
         project = cv2.fisheye.projectPoints if kind is FisheyeLens else cv2.projectPoints
         seen = pose(unknowns).apply(points.reshape(-1, 3))[:, None]
         found = project(seen, np.zeros(3), np.zeros(3), matrix, np.array(terms))[0]
-        misses: Array = found.reshape(_DISTANCES, _GRID, _GRID, 2) - pixels
-        return misses
+        residuals_px: Array = found.reshape(_DISTANCES, _GRID, _GRID, 2) - pixels
+        return residuals_px
 
     def cost(unknowns: Array) -> Array:
         return np.append(errors(unknowns) * weights, _CANCELLING_PX * unknowns[8:])

@@ -336,8 +336,8 @@ def _report(
     filled = {name: int(np.isfinite(column).sum()) for name, column in columns.items()}
     leading = next(name for name in READINGS if filled[name])
     known_s = time_s[np.isfinite(columns[leading])]
-    longest_s = max_gap_s(known_s)
-    gaps = [(a, b - a) for a, b in itertools.pairwise(known_s.tolist()) if b - a > longest_s]
+    max_s = max_gap_s(known_s)
+    gaps = [(a, b - a) for a, b in itertools.pairwise(known_s.tolist()) if b - a > max_s]
     if lost:
         warn(f"{path}: left out: " + "; ".join(f"{n} {why}" for why, n in sorted(lost.items())))
     if gaps:

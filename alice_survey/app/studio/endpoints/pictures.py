@@ -1,6 +1,7 @@
 """The studio's pictures: which show a place, picks and control in them, lengths between points."""
 
 import threading
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -48,8 +49,8 @@ from reconstruct.placing.control_points import (
 )
 
 TILE_PX = 512
-_KEPT_PICTURES = 8
-"""Decoded pictures that are kept: some 500 MB of 20 megapixels each."""
+_MAX_BYTES = 500 << 20
+"""Of decoded pictures that are kept; the last one is, however large."""
 _QUALITY = 95
 
 
@@ -59,8 +60,8 @@ class TakenPictures:
     def __init__(self, workspace: Workspace) -> None:
         """Take a workspace; it need not have any."""
         self._workspace = workspace
-        # By the token of the file, so that a changed one is read again.
-        self._decoded = lru_cache(_KEPT_PICTURES)(lambda name, _: read_colour(self.path(name)))
+        self._lock = threading.Lock()
+        self._kept: OrderedDict[tuple[str, str], Colour] = OrderedDict()
         self._records = lru_cache(1)(self._read_records)
 
     def records(self) -> dict[str, ImageRecord]:
@@ -97,7 +98,17 @@ class TakenPictures:
             ImageError: it cannot be decoded.
             FileNotFoundError: see `path`.
         """
-        return self._decoded(name, self.token(name))
+        key = name, self.token(name)  # a changed file is read again
+        with self._lock:  # of several that request it, one decodes
+            if key not in self._kept:
+                self._kept[key] = read_colour(self.path(name))
+                while len(self._kept) > 1 and self._bytes() > _MAX_BYTES:
+                    self._kept.popitem(last=False)
+            self._kept.move_to_end(key)
+            return self._kept[key]
+
+    def _bytes(self) -> int:
+        return sum(picture.nbytes for picture in self._kept.values())
 
     def grey(self, name: str) -> NDArray[np.uint8]:
         """(H, W) as taken; see `colour`."""
