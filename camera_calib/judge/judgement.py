@@ -333,15 +333,19 @@ def _target_verdicts(judged: Judgement) -> Iterator[Verdict]:
             )
     if calibration.spread is None:
         return
-    off_m = calibration.spread.noise.place_sigmas_m[0]
     focal_px = np.mean([one.focal_in_water_px for one in calibration.rig.cameras.values()])
     range_m = np.median([picture.range_m for picture in judged.pictures])
-    yield _grade(
-        float(off_m * focal_px / range_m) / calibration.noise_px, (_UNEVEN, np.inf),
-        f"corners lie {1e3 * off_m:.3f} mm off their places in the target's plane, which the "
-        "sigmas include",
-        ": use a target of even print",
-    )  # fmt: skip
+    for off_m, where, remedy in zip(
+        calibration.spread.noise.place_sigmas_m,
+        ("in the target's plane", "across the target's plane"),
+        ("use a target of even print", "find its bends with --target-shape sheet, or flatten it"),
+        strict=True,
+    ):
+        yield _grade(
+            float(off_m * focal_px / range_m) / calibration.noise_px, (_UNEVEN, np.inf),
+            f"corners lie {1e3 * off_m:.3f} mm off their places {where}, which the sigmas include",
+            f": {remedy}",
+        )  # fmt: skip
 
 
 def _length_verdicts(judged: Judgement) -> Iterator[Verdict]:

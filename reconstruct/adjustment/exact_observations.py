@@ -404,15 +404,15 @@ class Linearised:
         self, function: Callable[[LinearObservations, Any], Result], values: Iterable[Any]
     ) -> Iterator[Result]:
         """Yield `function(part, value)` of every part with its value, in order."""
-        weigh = partial(_weighted, tuple(self.fields), self.noise)
+        weigh = partial(_weigh, tuple(self.fields), self.noise)
         if self.pixels.is_one:
             if not self.kept:
                 self.kept.append(weigh(self.pixels.pixels, self.state))
             return (function(self.kept[0], value) for value in values)
-        return self.pixels.map(partial(_on_weighted, function, weigh), self.state, values)
+        return self.pixels.map(partial(_with_weights, function, weigh), self.state, values)
 
 
-def _weighted(
+def _weigh(
     fields: tuple[str, ...], noise: tuple[float, float], pixels: Pixels, state: RigState
 ) -> LinearObservations:
     sigma, variance = noise
@@ -420,7 +420,7 @@ def _weighted(
     return found.weigh(cauchy_weights(found.miss, sigma) / variance)
 
 
-def _on_weighted(
+def _with_weights(
     function: Callable[[LinearObservations, Any], Result],
     weigh: Callable[[Pixels, RigState], LinearObservations],
     pixels: Pixels,

@@ -19,7 +19,7 @@ from camera_calib.calibrate.adjust import adjust
 from camera_calib.calibrate.corner_noise import spread_of
 from camera_calib.calibrate.normal_equations import CalibrationProblem
 from camera_calib.calibrate.solve import recalibrate
-from camera_calib.calibration import TargetView, stack_views
+from camera_calib.calibration import Calibration, TargetView, stack_views
 from camera_calib.freedom import Freedom, of_ports, pose_names
 from camera_calib.judge.judgement import judge, verdicts
 from camera_calib.judge.validation import halves_agreement
@@ -82,17 +82,24 @@ def test_sigmas_cover_the_errors_of_a_few_calibrations() -> None:
     assert case.fx_as_drawn_rms_px > 1.5 * case.fx_rms_px
 
 
-def test_an_uneven_print_is_found_with_its_size_and_stated() -> None:
+def levels(found: Calibration) -> dict[str, str]:
+    """Levels of the verdicts on places of corners, in the target's plane and across it."""
+    said = [v for v in verdicts(judge(found, None)) if "off their places" in v.text]
+    return {"across" if "across" in v.text else "in": v.level for v in said}
+
+
+def test_places_of_corners_are_found_with_their_size_and_stated() -> None:
     sizes = []
     for seed in range(3):
         found = run_trial(seed, replace(TARGETS["correlated"], place_m=6e-5))
         assert found.spread is not None
         sizes.append(found.spread.noise.place_sigmas_m[0])
-        (said,) = [v for v in verdicts(judge(found, None)) if "off their places" in v.text]
-        assert said.level == "look"
+        assert levels(found) == {"in": "look", "across": "good"}
     assert np.sqrt(np.mean(np.square(sizes))) == pytest.approx(6e-5, rel=0.25)
-    even = verdicts(judge(run_trial(0, TARGETS["sound"]), None))
-    assert [v.level for v in even if "off their places" in v.text] == ["good"]
+    assert levels(run_trial(0, TARGETS["sound"])) == {"in": "good", "across": "good"}
+    bent = replace(SOUND, bow_m=5e-4)
+    assert levels(run_trial(0, bent)) == {"in": "good", "across": "good"}
+    assert levels(run_trial(0, bent, AS_DRAWN)) == {"in": "good", "across": "look"}
 
 
 def test_noise_is_no_uneven_print_and_a_bend_that_was_not_adjusted_lies_across_the_target() -> None:
