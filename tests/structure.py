@@ -29,24 +29,24 @@ PACKAGES = ("alice_survey", "camera_calib", "missions", "reconstruct")
 WORDS = Path(__file__).with_name("structure_words.toml")
 """Words that are not used, and where each of them counts."""
 BOUNDS = {
-    "code lines of the packages": 79_050,  # goal: 68_000
-    "code lines of the tests": 55_900,  # goal: 48_000
-    "code lines of the benchmarks": 8_850,  # goal: 8_000
-    "lines of our own JavaScript": 6_420,  # goal: 5_000
-    "modules": 449,  # goal: 400
-    "modules with a single importer": 97,  # goal: 90
-    "kernels": 281,  # goal: 260
+    "code lines of the packages": 72_100,  # goal: 68_000
+    "code lines of the tests": 53_600,  # goal: 48_000
+    "code lines of the benchmarks": 8_000,
+    "lines of our own JavaScript": 4_910,
+    "modules": 395,
+    "modules with a single importer": 73,
+    "kernels": 252,
     "commands": 36,
-    "options of commands": 348,
+    "options of commands": 342,
     "settings": 125,
-    "functions that take the whole SurveyConfig": 28,  # goal: 20
+    "functions that take the whole SurveyConfig": 14,
     "layers of the import contract": 8,
     "modules without a layer": 0,
     "circles of imports": 0,
     "class names with two meanings": 0,
     "modules that import matplotlib": 2,
     "pages begun by hand (<!DOCTYPE)": 2,
-    "modules that name the flat port": 11,
+    "modules that name the flat port": 10,
     "identifiers with an avoided word": 0,
     "functions named by a participle": 0,
     "help texts with an avoided phrase": 0,
