@@ -114,11 +114,10 @@ def _truth(score: ScoreRecord, held: Held) -> Section:
     cameras, surface, mosaic = score.cameras, score.surface, score.mosaic
     mesh = score.mesh
     rows = [
-        ("cameras", None, cameras.max_mm, "position"),
-        ("surface", None, surface.distance_max_mm, "distance from the true surface"),
+        ("cameras", cameras.rms_mm, cameras.max_mm, "position"),
+        ("surface", surface.distance_rms_mm, surface.distance_max_mm, "distance from the truth"),
         ("mosaic", mosaic.position_rms_mm, mosaic.position_95_mm, "position; the larger: 95 %"),
         ("lengths", score.lengths.rms_mm, None, f"over {length(score.lengths.mean_length_m)}"),
-
         ("mesh", None if mesh is None else mesh.distance_rms_mm, None, "distance from the truth"),
     ]  # fmt: skip
     shown = [
