@@ -188,7 +188,7 @@ def _choose(
         ]  # fmt: skip
         of_groups = ([t for t in fitting if t.kind in kinds] for kinds in groups)
         found = next((some for some in of_groups if some), [])
-        named = [t for t in found if "navig" in t.name.lower()]
+        named = [t for t in found if role == "navigation" and "navig" in t.name.lower()]
         found = named if len(named) == 1 else found
         if len(found) == 1:
             chosen.setdefault(role, found[0])

@@ -159,12 +159,12 @@ def test_a_hole_a_strip_of_blur_and_a_loose_corner_are_cured_by_the_dive() -> No
     assert found.seen.share_at_overlap < 0.85
     assert after.share_at_overlap >= 0.999
     assert pieces(links(tracks(both, seed=1)), found.least_tracks).max() == 0
-    # The mended survey is as good as one that lacked nothing.
+    # The improved survey is as good as one that lacked nothing.
     (flown, flown_s), (new, new_s) = (
         stations_and_times(plan, RIG, survey_costs(CONFIG)) for plan in (PLAN, again)
     )
     now = np.flatnonzero(good)[found.piece == 0]
-    before, mended, whole = (
+    before, improved, whole = (
         precision_of(RigidTransform.concatenate(poses), np.concatenate(times))
         for poses, times in (
             ([flown[now]], [flown_s[now]]),
@@ -172,8 +172,8 @@ def test_a_hole_a_strip_of_blur_and_a_loose_corner_are_cured_by_the_dive() -> No
             ([flown], [flown_s]),
         )
     )
-    np.testing.assert_array_less(1.4 * mended.bend_m, before.bend_m)
-    ratios = [*mended.bend_m / whole.bend_m, mended.heights_rms_m / whole.heights_rms_m]
+    np.testing.assert_array_less(1.4 * improved.bend_m, before.bend_m)
+    ratios = [*improved.bend_m / whole.bend_m, improved.heights_rms_m / whole.heights_rms_m]
     assert 0.9 < min(ratios) <= max(ratios) < 1.3
 
 

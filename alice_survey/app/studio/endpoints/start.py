@@ -1,5 +1,6 @@
 """The first start: a survey to plan, or pictures that are there, become a workspace."""
 
+import base64
 import contextlib
 import os
 from collections.abc import Mapping, Sequence
@@ -8,7 +9,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any, cast
 
-from pydantic import Base64Bytes, Field, RootModel
+from pydantic import Field, RootModel
 
 from alice_survey.app.commands.pictures import ImportImagesCommand
 from alice_survey.app.pipeline import init_survey
@@ -137,9 +138,9 @@ class _AskedFolder(Config):
     typed: bool = False
 
 
-class _DroppedArea(Config):
+class _ChosenArea(Config):
     name: str = Field(max_length=300)
-    base64: Base64Bytes
+    base64: str
 
 
 class _NewSurvey(Config):
@@ -150,7 +151,7 @@ class _NewSurvey(Config):
     width_m: float | None = None
     seafloor_depth_m: float | None = None
     focal_mm: float | None = None
-    area: _DroppedArea | None = None
+    area: _ChosenArea | None = None
     trial: bool = False
 
 
@@ -208,21 +209,25 @@ class _StartPage:
                 self._with_area(asked.area, asked.name, values)
         return {"workspace": str(workspace)}
 
-    def _with_area(self, given: _DroppedArea, name: str, values: Values) -> None:
-        """Write an area file that was dropped, and the settings that name it; both or neither."""
+    def _with_area(self, given: _ChosenArea, name: str, values: Values) -> None:
+        """Write an area file that was chosen, and the settings that name it; both or neither."""
         suffix = Path(given.name).suffix.lower()
         if suffix not in _SINGLE:
             raise AliceError(
                 f"{given.name}: {suffix or 'no ending'!r} files are not read; those that are: "
                 f"{', '.join(_SINGLE)} (a shapefile as .zip)"
             )
+        try:
+            content = base64.b64decode(given.base64, validate=True)
+        except ValueError:
+            raise AliceError(f"{given.name} did not arrive whole: choose it again") from None
         folder = self.studio.workspace.folder
         area, toml = folder / f"area{suffix}", folder / "survey.toml"
         refuse_links(folder, area, toml)
         if area.exists():
             raise StaleError(f"{area} exists already: remove it first")
         try:
-            area.write_bytes(given.base64)
+            area.write_bytes(content)
             init_survey(folder, area=area, name=name, values=values)
             config = load_config(toml)
             survey_area(config.area, turn_margin_m=3.0)

@@ -150,9 +150,9 @@ def test_a_survey_is_begun_from_its_place_and_depth(server: Server, tmp_path: Pa
     assert load_config(tmp_path / "reef" / "survey.toml") == made
 
 
-def test_a_survey_is_begun_from_a_file_that_was_dropped(server: Server, tmp_path: Path) -> None:
-    def dropped(name: str, content: bytes) -> Reply:
-        area = {"name": name, "base64": base64.b64encode(content).decode()}
+def test_a_survey_is_begun_from_a_file_that_was_chosen(server: Server, tmp_path: Path) -> None:
+    def chosen(name: str, content: bytes, damage: str = "") -> Reply:
+        area = {"name": name, "base64": damage + base64.b64encode(content).decode()}
         return call(
             server, "/api/start/survey", {"name": "Reef", "seafloor_depth_m": 9, "area": area}
         )
@@ -162,9 +162,10 @@ def test_a_survey_is_begun_from_a_file_that_was_dropped(server: Server, tmp_path
         ("reef.geojson", b"{}"), ("reef.geojson", b""), ("reef.exe", good), ("reef", good),
         ("reef.shp", good), ("reef.kml", good),
     ):  # fmt: skip
-        assert dropped(name, content).status == 400
+        assert chosen(name, content).status == 400
         assert {path.name for path in (tmp_path / "reef").glob("*")} <= {".lock", ".studio"}
-    assert dropped("../../My reef.GeoJSON", good).status == 200
+    assert "choose it again" in chosen("reef.geojson", good, damage="?*").json["error"]
+    assert chosen("../../My reef.GeoJSON", good).status == 200
     made = load_config(tmp_path / "reef" / "survey.toml")
     assert made.area.file == tmp_path / "reef" / "area.geojson"
     assert made.area.file.read_bytes() == good and made.area.datum_given == []
