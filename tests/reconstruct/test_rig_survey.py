@@ -85,5 +85,5 @@ def test_four_cameras_are_calibrated_and_map_as_well_as_with_the_true_rig(tmp_pa
     workspace = tmp_path / "of_4"
     command("report", "-w", workspace)
     report = (workspace / "report" / "report.html").read_text()
-    assert "Rig refined by the survey" in report
+    assert "pictures refined the rig from" in report
     assert all(word in report for word in (*NAMES, "fisheye", "dome of 80 mm radius"))
