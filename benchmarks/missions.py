@@ -69,9 +69,7 @@ class Row:
 
     def figure(self) -> Figure:
         """What is seen, and as its goal what is promised, unless less was said beforehand."""
-        # Turns and gusts come on top of what an export says of COLA2.
-        said_less = self.warned or self.format == "cola2"
-        goal = None if said_less else Goal(minimum=100.0 * (self.promised - _SPARE))
+        goal = None if self.warned else Goal(minimum=100.0 * (self.promised - _SPARE))
         return Figure(
             name=f"{self.vehicle}, {self.format}, {_sea(self)}: at the requested overlap",
             value=100.0 * self.flown,

@@ -15,7 +15,7 @@ from PIL import Image
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("alice_survey", "camera_calib", "missions", "reconstruct")
-_ROS = "missions/live/ros_"
+_ROS = "missions/live/ros.py"
 EXTRAS: dict[str, str | tuple[str, ...]] = {
     "starlette": "alice_survey/app/studio/",
     "uvicorn": "alice_survey/app/studio/",

@@ -331,7 +331,8 @@ def _window(
                 f"{path}: does not reach the survey area, which is at columns "
                 f"{columns.min():.0f} to {columns.max():.0f} and rows {rows.min():.0f} to "
                 f"{rows.max():.0f} of its {file.width} x {file.height}: check the "
-                "area's datum and area.bathymetry_file"
+                "area's datum, whether its latitude and longitude are swapped, and "
+                "area.bathymetry_file"
             )
         window = (first_c, first_r, last_c - first_c, last_r - first_r)
     cells = window[2] * window[3]

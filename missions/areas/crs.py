@@ -84,6 +84,8 @@ class LocalFrame:
             return
         worst = int(far.argmax())
         advice = "move the datum (latitude_deg, longitude_deg), or check the corner and its crs"
+        if not self.datum_is_given:
+            advice = "the area is too large, or a corner or its crs is wrong"
         if raw.geographic and _distance_m(corners[:, ::-1], self.datum).max() <= MAX_M:
             advice = "latitude and longitude are swapped"
         raise PlanError(

@@ -148,7 +148,7 @@ def _line_points(plan: Plan, leg: Leg, depths: Array) -> Iterator[_Point]:
     """The end of a line, and places before it where its depth bends."""
     line = plan.lines[leg.line]
     along_m = np.linspace(0.0, line.length_m, line.stations)
-    for i in bends(along_m, depths, DEPTH_STEP_M)[1:]:
+    for i in bends(along_m, depths, DEPTH_STEP_M)[1:] or [0]:
         north, east = line.stations_ne[i].tolist()
         yield _Point("line", (north, east), leg.heading_rad, leg.line, float(depths[i]))
 

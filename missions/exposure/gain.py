@@ -36,6 +36,7 @@ _ACCEPTABLE_SNR = 10.0
 _WHITE, _BLACK = 0.99, 0.002
 """Linear shares of full scale that count as clipped and as black."""
 _MAX_CLIPPED = 0.5
+_CLIPPED = 0.01
 _LAPLACE = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])
 _LAPLACE_GAIN = 6.0
 """Root of the sum of its squares: white noise grows so much (Immerkaer 1996)."""
@@ -160,6 +161,14 @@ def gain_advice(
         advice.append(
             f"the gain would be {gain_db:.1f} dB: set 0 dB, and the exposure to "
             f"{10 ** (gain_db / 20):.2f} of what it is, or close the aperture"
+        )
+    if clipped > _CLIPPED:
+        advice.append(f"{clipped:.1%} of the pixels are clipped: check this gain with new pictures")
+    darkest, brightest = float(rows[:, 0].min()), float(rows[:, 0].max())
+    if brightest > 2 * max(darkest, 1e-9):
+        advice.append(
+            f"medians go from {darkest:.1%} to {brightest:.1%}: the altitude or the ground varied; "
+            "take pictures at the survey's altitude"
         )
     return GainAdvice(
         pictures=len(levels),

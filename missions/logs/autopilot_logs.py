@@ -196,13 +196,15 @@ def _signal(
             continue
         try:
             table, others = _one_instance(message, log.tables[message], instance)
-            found = clean_signal(message, *source.read(table, log.tables), log.lost)
+            lost: Counter[str] = Counter()
+            found = clean_signal(message, *source.read(table, log.tables), lost)
         except LackError as error:
             reason = str(error)
             continue
         if found is None:
             reason = "none of its rows can be used"
             continue
+        log.lost.update(lost - log.lost)  # once for a message that serves several roles
         sigma = None
         if source.sigma is not None:
             with contextlib.suppress(LackError):
@@ -517,9 +519,12 @@ def _warn_of_other_kinds(path: Path, beats: LogTable, vehicle: float) -> None:
     kinds = set(beats["type"][beats[SYSTEM] == vehicle].astype(int).tolist())
     own = sorted(kinds - _NO_VEHICLES)
     if own and _SUBMARINE not in own:
+        from pymavlink.dialects.v20.ardupilotmega import enums
+
+        names = [getattr(enums["MAV_TYPE"].get(kind), "name", f"MAV_TYPE {kind}") for kind in own]
         warn(
-            f"{path}: the log is of a vehicle of MAV_TYPE {' and '.join(map(str, own))}, not of a "
-            "submarine: depths are minus its heights"
+            f"{path}: the log is of a vehicle of {' and '.join(names)}, not of a submarine: depths "
+            "are minus its heights"
         )
 
 

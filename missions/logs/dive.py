@@ -154,12 +154,12 @@ def clean_signal(source: str, time_s: Array, values: Array, lost: Counter[str]) 
     values = values[:, None] if values.ndim == 1 else values
     good = np.abs(time_s) < _LATEST_S
     if not good.all():
-        lost[f"{source}: the time is not a number, or after 2200"] = int((~good).sum())
+        lost |= Counter({f"{source}: the time is not a number, or after 2200": int((~good).sum())})
     time_s, values = time_s[good], values[good]
     values = np.where(np.isfinite(values), values, np.nan)
     keep = _increasing(time_s)
     if len(keep) < len(time_s):
-        lost[f"{source}: the time repeats or goes back"] = len(time_s) - len(keep)
+        lost |= Counter({f"{source}: the time repeats or goes back": len(time_s) - len(keep)})
         time_s, values = time_s[keep], values[keep]
     known = np.isfinite(values).any(axis=1)
     if not known.any():

@@ -183,6 +183,10 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
     if path.is_dir() or is_bag(path):
         return read_ros_bag(path, chosen, datum)
     if is_waterlinked(path):
+        if chosen:
+            raise NavigationError(
+                f"--topic {next(iter(chosen))}: reports of a DVL have nothing to choose from"
+            )
         return read_waterlinked(path)
     if suffix in (".ulg", ".ulog") or first_bytes(path, len(MAGIC)) == MAGIC:
         return read_px4_ulog(path, chosen)
@@ -415,20 +419,28 @@ def read_tide(text: str, *, dated: bool) -> float | Signal:
     try:
         rows = read_csv(Path(text), (column, "height_m"))[1]
     except NavigationError as error:
-        raise NavigationError(f"--tide is neither metres nor a CSV of tides: {error}") from None
-    try:
-        table = np.array(
-            [
-                [utc_date(row[column]).timestamp() if dated else float(row[column]),
-                 float(row["height_m"])]
-                for _, row in rows
-            ]
-        )  # fmt: skip
-    except ValueError as error:
-        raise NavigationError(f"{text}: {error}") from None
-    if not len(table) or not np.isfinite(table).all() or not np.all(np.diff(table[:, 0]) > 0):
-        raise NavigationError(f"{text}: needs finite heights at times that increase")
-    return Signal(source=text, time_s=table[:, 0], values=table[:, 1:])
+        undated = "" if dated else " (the log's times have no date)"
+        raise NavigationError(
+            f"--tide is neither metres nor a CSV of tides: {error}{undated}"
+        ) from None
+    table: list[tuple[float, float]] = []
+    for line, row in rows:
+        cell, height = row[column], row["height_m"]
+        try:
+            time_s = utc_date(cell).timestamp() if dated else float(cell)
+            table.append((time_s, float(height)))
+        except ValueError:
+            raise NavigationError(
+                f"{text} line {line}: {cell!r}, {height!r}: not a time and a height"
+            ) from None
+        if not np.isfinite(table[-1]).all() or (table[:-1] and time_s <= table[-2][0]):
+            raise NavigationError(
+                f"{text} line {line}: needs finite heights at times that increase"
+            )
+    if not table:
+        raise NavigationError(f"{text}: holds no tides")
+    times, heights = np.array(table).T
+    return Signal(source=text, time_s=times, values=heights[:, None])
 
 
 def _moment(time_s: float) -> str:

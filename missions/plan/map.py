@@ -219,7 +219,11 @@ def _draw_lines(axes: Axes, plan: Plan) -> None:
 def _arrows(plan: Plan) -> tuple[Array, Array]:
     """Places (N, 2) at a third of lines and their ways, so that the direction of travel is seen."""
     # Of many lines every n-th, an odd number: neighbours fly opposite ways.
-    shown = plan.lines[:: 2 * int(len(plan.lines) / _ARROWS / 2) + 1]
+    apart = 2 * int(len(plan.lines) / _ARROWS / 2) + 1
+    shown = [
+        line for n, line in enumerate(plan.lines)
+        if line.length_m > 0 and (line.kind != "survey" or n % apart == 0)
+    ]  # fmt: skip
     ends = np.array([(line.start_ne_m, line.end_ne_m) for line in shown])
     ways = ends[:, 1] - ends[:, 0]
     return ends[:, 0] + ways / 3, ways / np.linalg.norm(ways, axis=1)[:, None]

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
+from scipy.ndimage import minimum_filter
 
 from alice_survey.core.artefacts import atomic_path
 from alice_survey.core.config import (
@@ -297,18 +298,23 @@ def _round_points(points: Array) -> list[list[float]]:
 def counts_picture(seen: Certificate) -> tuple[NDArray[np.uint8], tuple[float, float], float]:
     """Counts with north up: red pictures, green lines, blue 1 at the requested overlap.
 
+    Pixels that are larger than cells show the worst of these.
+
     Returns:
         The (H, W, 3) picture, red 255 outside of the area; north and east of its upper left
         corner; and the side of a pixel, metres.
     """
     grid = seen.grid
     places, (south, west, north, _) = north_up(seen.area, grid.cell_m / 2, _MAX_PICTURE_PX)
+    pixel_m = (north - south) / len(places)
     within = grid.sample(seen.inside, places, False)
     rgb = np.zeros((*within.shape, 3), dtype=np.uint8)
     for channel, counts in enumerate((seen.pictures, seen.least_lines, seen.at_overlap)):
-        rgb[..., channel] = np.minimum(grid.sample(counts, places, 0), _MAX_COUNT) * within
+        known = np.where(seen.inside, counts, _MAX_COUNT)
+        worst = minimum_filter(known, math.ceil(pixel_m / grid.cell_m - 1e-6))
+        rgb[..., channel] = np.minimum(grid.sample(worst, places, 0), _MAX_COUNT) * within
     rgb[..., 0][~within] = 255
-    return rgb, (north, west), (north - south) / len(rgb)
+    return rgb, (north, west), pixel_m
 
 
 def _counts_json(seen: Certificate) -> dict[str, Any]:

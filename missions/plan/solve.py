@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from alice_survey.core.artefacts import json_values
+from alice_survey.core.config import SurveyConfig, change_section
 from alice_survey.core.errors import AliceError, PlanError
 from alice_survey.kit.words import text_table
 from missions.exposure.conflict import MAX_ALTITUDE_M
@@ -22,8 +23,6 @@ _COLUMNS = {
     "gain_db": ":.1f", "snr": ":.1f", "hours_per_1000_m2": ":.2f",
 }  # fmt: skip
 """Figures of the table: signal to noise is of the median pixel, hours those on lines alone."""
-_LENS_MM = (0.5, 500.0)
-"""Focal lengths that `camera.focal_mm` takes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,9 +103,8 @@ def solve_lenses(
     Raises:
         PlanError: none fits; with the nearest resolution that does.
     """
-    for lens in lenses:
-        if not _LENS_MM[0] <= lens <= _LENS_MM[1]:
-            raise PlanError(f"--lens {lens:g}: give {_LENS_MM[0]:g} to {_LENS_MM[1]:g} mm")
+    for lens in lenses:  # as the setting is checked
+        change_section(SurveyConfig(), "camera", focal_mm=lens)
     max_m = min(MAX_ALTITUDE_M, max_m)
     options = [_option(setup.with_camera(focal_mm=lens), max_m, resolution_mm) for lens in lenses]
     if any(not option.against for option in options):

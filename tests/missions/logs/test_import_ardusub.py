@@ -427,5 +427,5 @@ def test_what_is_no_submarine_is_said(tmp_path: Path, capsys: pytest.CaptureFixt
     log.write_bytes(tlog(high))
     data = imported(tmp_path, log)
     said = capsys.readouterr().err
-    assert "the log is of a vehicle of MAV_TYPE 21, not of a submarine" in said
+    assert "the log is of a vehicle of MAV_TYPE_VTOL_TILTROTOR, not of a submarine" in said
     assert f"{data['rows']} of {data['rows']} rows lie above the water, by 63.4 m" in said

@@ -77,7 +77,6 @@ class ThrusterWatch:
     def __init__(self, thrusters: Sequence[Thruster], tick_s: float) -> None:
         self._thrusters, self._tick_s = thrusters, tick_s
         self._slow = np.zeros(len(thrusters), dtype=np.int64)
-        self._maximum = np.array([thruster.most_rps for thruster in thrusters])
         self._gone = np.zeros(len(thrusters), dtype=np.bool_)
 
     def judge(self, end_s: float, command_rps: Array, rps: Array) -> list[FoundFailure]:
