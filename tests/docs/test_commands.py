@@ -1,5 +1,6 @@
 """The commands that the pages of `docs/` give work as written."""
 
+import re
 import shlex
 import tomllib
 from pathlib import Path
@@ -77,3 +78,15 @@ def test_blocks_are_of_a_kind_that_is_looked_at(page: Path) -> None:
         assert fence.language in LANGUAGES, f"{name_of(page)} line {fence.line}"
         if fence.language == "toml":
             tomllib.loads(fence.text)
+
+
+def test_modules_that_are_named_exist() -> None:
+    """But for placeholders; `*` stands for several, and folders that lead there may be left out."""
+    root = DOCS.parent
+    texts = [page.read_text(encoding="utf-8") for page in [*pages(), *root.glob("[!C]*.md")]]
+    texts.append((root / "CONTRIBUTING.md").read_text(encoding="utf-8"))
+    names = set(re.findall(r"`([\w/*]+\.py)`", "".join(texts)))
+    folders = ("alice_survey", "camera_calib", "missions", "reconstruct", "tests", "benchmarks")
+    files = [path for folder in folders for path in (root / folder).rglob("*.py")]
+    unknown = {name for name in names if not any(path.match(name) for path in files)}
+    assert all(name.endswith("NAME.py") for name in unknown), unknown

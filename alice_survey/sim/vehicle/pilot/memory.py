@@ -42,7 +42,7 @@ or place and heading, are kept; the watchdog's best value and its age; returns t
 bottom lock is lost, the altitude too low, the pitch too large, s; how long the clearance is less
 than half of what is allowed, s; the share of the target surge that the sea floor leaves; 1 while
 the vehicle follows a place that moves along the leg or a heading that turns on the spot
-(standing.py), how far these have got, m or rad, and how fast; how long it waits at the leg's end,
+(steering.py), how far these have got, m or rad, and how fast; how long it waits at the leg's end,
 s; the integral, as a speed, of keeping that place by surge, a vector in NED; the place or heading,
 and its speed, that thrusters without lag would be at; the integrals of roll and pitch, as
 accelerations; how far the followed point is from its goal on the mean of some time, m, and how long
