@@ -29,9 +29,7 @@ from benchmarks.planner_peers import (
     measured,
     own_plan,
 )
-from missions.lines.hops import comparable
-from missions.lines.lay import lay_pattern
-from missions.lines.rows import Site
+from missions.lines.lay import LineTask, lay_pattern
 from missions.lines.sweep import best_heading
 from missions.route.ways import Ways
 from missions.values.costs import time_costs
@@ -132,23 +130,24 @@ def _growth(table: dict[tuple[str, int], list[Measured]]) -> dict[str, float]:
 def _angle_figures(name: str, *, quick: bool) -> Iterator[Figure]:
     """Cost and width of the heading found next to the best sampled ones, and the search's time."""
     rows, sampled = (_QUICK_ANGLE_ROWS, _QUICK_ANGLES) if quick else (_ANGLE_ROWS, _ANGLES)
-    costs, peer = time_costs(0.2), f"best of {sampled:,}"
+    peer = f"best of {sampled:,}"
     area = planned_area(shapes()[name], rows, PATTERN.spacing_m, MARGIN_M)
-    ways = Ways(area.allowed)
     north, east = area.rings_ne[0][0]
-    home = (float(north), float(east))
+    task = LineTask(
+        area=area,
+        pattern=PATTERN,
+        ways=Ways(area.allowed),
+        costs=time_costs(0.2),
+        home_ne=(float(north), float(east)),
+        cross_lines=1,
+        closing_line=True,
+    )
     for _ in range(2):
         began = time.perf_counter()
-        sweep = best_heading(area, PATTERN, ways, costs, home, cross_lines=1, closing_line=True)
+        sweep = best_heading(task)
         seconds = time.perf_counter() - began
     headings = np.arange(sampled) * math.pi / sampled
-    site, bounded = Site.of(area), comparable(costs)
-    costs_j = [
-        lay_pattern(
-            site, h, PATTERN, ways, bounded, home, cross_lines=1, closing_line=True
-        ).energy_j
-        for h in headings
-    ]
+    costs_j = [lay_pattern(task, h).energy_j for h in headings]
     north_m, east_m = np.concatenate([np.diff(ring, axis=0) for ring in area.rings_ne]).T
     across = np.abs(east_m * np.cos(headings)[:, None] - north_m * np.sin(headings)[:, None])
     width_m = float(across.sum(axis=1).min() / 2)

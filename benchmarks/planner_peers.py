@@ -16,7 +16,7 @@ import shapely
 from shapely.geometry import LineString, Polygon
 
 from alice_survey.core.frames import Array
-from missions.lines.lay import lay_lines
+from missions.lines.lay import LineTask, lay_lines
 from missions.route.turns import Manoeuvre, legs_through, line_table, route_of
 from missions.route.ways import Ways
 from missions.values.area import Area
@@ -98,17 +98,17 @@ def own_plan(area: Area, repeats: int) -> Way:
 def own_lines(area: Area, ways: Ways) -> list[Line]:
     """Survey lines alone, from the area's first corner, as the peers lay them."""
     home = area.survey.geoms[0].exterior.coords[0]
-    return lay_lines(
-        area,
-        HEADING_RAD,
-        PATTERN,
-        ways,
-        time_costs(_SPEED_MPS),
-        (home[0], home[1]),
+    task = LineTask(
+        area=area,
+        pattern=PATTERN,
+        ways=ways,
+        costs=time_costs(_SPEED_MPS),
+        home_ne=(home[0], home[1]),
         cross_lines=0,
         closing_line=False,
         max_stations=_ALL,
     )
+    return lay_lines(task, HEADING_RAD)
 
 
 def coverage_path_plan(area: Area, repeats: int, spacing_m: float = PATTERN.spacing_m) -> Way:

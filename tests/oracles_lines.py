@@ -3,7 +3,6 @@
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 import shapely
@@ -14,9 +13,7 @@ from shapely.geometry import LineString, MultiPolygon, Point, Polygon, box
 from shapely.geometry.base import BaseGeometry
 
 from alice_survey.core.frames import Array, Datum
-from missions.lines.hops import comparable
-from missions.lines.lay import lay_lines, lay_pattern
-from missions.lines.rows import Site
+from missions.lines.lay import LineTask, lay_lines
 from missions.route.ways import Ways
 from missions.values.area import Area, multipolygon
 from missions.values.costs import Costs, power_at, time_costs
@@ -54,13 +51,28 @@ def lay(
     """The lines of an area with a margin, from somewhere inside it and home again."""
     area = area_of(survey, margin_m)
     home = area.allowed.representative_point()
-    return lay_lines(
-        area,
-        heading,
-        pattern,
-        Ways(area.allowed),
-        time_costs(0.2) if costs is None else costs,
-        (home.x, home.y),
+    task = line_task(
+        area, pattern, costs, (home.x, home.y), cross_lines=cross_lines, closing_line=closing_line
+    )
+    return lay_lines(task, heading)
+
+
+def line_task(
+    area: Area,
+    pattern: Pattern = STEREO,
+    costs: Costs | None = None,
+    home_ne: tuple[float, float] = (0.0, 0.0),
+    *,
+    cross_lines: int = 1,
+    closing_line: bool = True,
+) -> LineTask:
+    """What lines are laid for; 1 W at 0.2 m/s where no costs are given."""
+    return LineTask(
+        area=area,
+        pattern=pattern,
+        ways=Ways(area.allowed),
+        costs=costs or time_costs(0.2),
+        home_ne=home_ne,
         cross_lines=cross_lines,
         closing_line=closing_line,
     )
@@ -214,13 +226,3 @@ def flight_by_hand(
     for line in lines:
         total += line.length_m / costs.speed_mps * float(power_at(costs.line_w, line.heading_rad))
     return total
-
-
-def full_cost_j(
-    area: Area, heading_rad: float, pattern: Pattern, ways: Ways, costs: Costs,
-    home: tuple[float, float], **kinds: Any,
-) -> float:  # fmt: skip
-    """Energy of the flight through all lines of a heading, as the planner counts it."""
-    return lay_pattern(
-        Site.of(area), heading_rad, pattern, ways, comparable(costs), home, **kinds
-    ).energy_j

@@ -4,7 +4,7 @@ import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,10 +71,6 @@ class Certificate:
     """(rows, columns) how many lines see it, of the camera for which they are fewest."""
     pairs: Counts
     """(rows, columns) stations that see it with all cameras at once."""
-    histograms: dict[str, Array]
-    """By camera: share of the area, (N,), that 0, 1, 2, ... of its pictures see."""
-    line_histograms: dict[str, Array]
-    """By camera: share of the area, (N,), that is seen on 0, 1, 2, ... lines."""
     estimated: bool = False
     """Whether it is a quick look: cells are larger than usual, and borders have fewer points."""
 
@@ -157,8 +153,6 @@ class Certificate:
             "fewest_pictures_of_a_camera": self.fewest_pictures,
             "fewest_lines": self.fewest_lines,
             "mean_pictures": self.mean_pictures,
-            "share_by_pictures": {name: _round_shares(h) for name, h in self.histograms.items()},
-            "share_by_lines": {name: _round_shares(h) for name, h in self.line_histograms.items()},
         }
 
 
@@ -170,17 +164,6 @@ class _Tile:
     rays: tuple[Array, Array]
     stations: Stations
     """Line by line, and none that is blind."""
-    inside: NDArray[np.bool_]
-
-
-class _TileViews(NamedTuple):
-    """What was counted in a part of the area."""
-
-    maps: dict[str, Counts]
-    pictures: list[NDArray[np.intp]]
-    """For each camera: how many cells of the area are in 0, 1, ... pictures."""
-    lines: list[NDArray[np.intp]]
-    """For each camera: how many cells of the area are on 0, 1, ... lines."""
 
 
 def certificate(
@@ -231,31 +214,26 @@ def certificate(
             off = glass - np.clip(glass, (row, column), (row + part.rows, column + part.columns))
             near = np.hypot(*off.T) <= reach
             places.append(here)
-            tasks.append(
-                _Tile(grid=part, rays=rays, stations=stations.some(near), inside=mask[here])
-            )
+            tasks.append(_Tile(grid=part, rays=rays, stations=stations.some(near)))
     maps = {
         name: np.zeros(grid.shape, np.uint16)
         for name in ("pictures", "least_pictures", "least_lines", "pairs")
     }
-    found = list(
-        executor.map(_count_views, tasks, label="count the views of each place", task_mib=_TILE_MIB)
+    found = executor.map(
+        _count_views, tasks, label="count the views of each place", task_mib=_TILE_MIB
     )
     for here, tile in zip(places, found, strict=True):
-        for name, counts in tile.maps.items():
+        for name, counts in tile.items():
             maps[name][here] = counts
-    cameras = tuple(rig.cameras)
     return Certificate(
         area=area,
         pattern=pattern,
-        cameras=cameras,
+        cameras=tuple(rig.cameras),
         stations=len(stations),
         blind=blind,
         estimated=coarse,
         grid=grid,
         inside=mask,
-        histograms={n: _histogram([t.pictures[i] for t in found]) for i, n in enumerate(cameras)},
-        line_histograms={n: _histogram([t.lines[i] for t in found]) for i, n in enumerate(cameras)},
         **maps,
     )
 
@@ -334,8 +312,8 @@ def _reaches_m(rays: tuple[Array, Array], stations: Stations) -> Array:
     return np.concatenate(reaches)
 
 
-def _count_views(tile: _Tile) -> _TileViews:
-    """Count the views of each cell of a part of the area."""
+def _count_views(tile: _Tile) -> dict[str, Counts]:
+    """Count the views of each cell of a part of the area, by the certificate's maps."""
     grid, stations = tile.grid, tile.stations
     shape = (len(tile.rays[0]), *grid.shape)
     pictures, lines = np.zeros(shape, np.uint16), np.zeros(shape, np.uint16)
@@ -351,26 +329,9 @@ def _count_views(tile: _Tile) -> _TileViews:
             rows.start, pictures, lines, last, stamp, pairs,
         )  # fmt: skip
     total = np.minimum(pictures.sum(axis=0, dtype=np.uint32), 65535).astype(np.uint16)
-    return _TileViews(
-        maps={
-            "pictures": total,
-            "least_pictures": pictures.min(axis=0),
-            "least_lines": lines.min(axis=0),
-            "pairs": pairs,
-        },
-        pictures=[np.bincount(counts[tile.inside]) for counts in pictures],
-        lines=[np.bincount(counts[tile.inside]) for counts in lines],
-    )
-
-
-def _histogram(counts: list[NDArray[np.intp]]) -> Array:
-    """Shares of all cells, from counts of parts of them."""
-    total = np.zeros(max(len(count) for count in counts))
-    for count in counts:
-        total[: len(count)] += count
-    shares: Array = total / total.sum()
-    return shares
-
-
-def _round_shares(shares: Array) -> list[float]:
-    return [round(share, 6) for share in shares.tolist()]
+    return {
+        "pictures": total,
+        "least_pictures": pictures.min(axis=0),
+        "least_lines": lines.min(axis=0),
+        "pairs": pairs,
+    }

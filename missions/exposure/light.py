@@ -151,10 +151,6 @@ class LightBudget:
     gain_db: float
     """Gain that brings the median to middle grey of the full scale; 0 dB puts the full well there.
     """
-    half_full_f_number: float
-    """F-number at which the brightest reaches half the full well, in this exposure."""
-    half_full_exposure_s: float
-    """Exposure at which it does, with this f-number."""
 
 
 def cone_intensity(cos_angle: Array, half_beam_rad: float) -> Array:
@@ -277,7 +273,6 @@ def light_budget(
     median, brightest = float(np.median(means)), float(electrons.max())
     median_share = float(np.median(sharp.mean(axis=-1))) / max(median, 1e-30)
     noise_e = limits.read_noise_e
-    half = 0.5 * limits.full_well_e
     return LightBudget(
         centre_e=_triple(electrons[centre]),
         corner_e=_triple(electrons[darkest]),
@@ -290,8 +285,6 @@ def light_budget(
         needed_light=_needed_light(median, median_share, noise_e),
         full_share=brightest / limits.full_well_e,
         gain_db=20.0 * math.log10(MIDDLE_GREY * limits.full_well_e / max(median, 1e-9)),
-        half_full_f_number=limits.f_number * math.sqrt(brightest / half),
-        half_full_exposure_s=exposure_s * half / max(brightest, 1e-9),
     )
 
 

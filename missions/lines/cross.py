@@ -18,6 +18,7 @@ from scipy.sparse.csgraph import connected_components
 
 from alice_survey.core.frames import Array
 from missions.lines.rows import rooms
+from missions.values.pattern import Pattern
 
 MIN_STEPS = 2
 """Survey lines of fewer steps from picture to picture may stay uncrossed. Chosen: a line of one or
@@ -38,12 +39,11 @@ class _CrossedBlock(NamedTuple):
     v: Array
     edges: Array
     """(A, 4) v, -u of the edges of the allowed area."""
-    step: float
-    min_steps: int
+    pattern: Pattern
 
 
 def cross_table(
-    pieces: Array, offsets: Array, allowed: Array, step: float, min_steps: int, count: int
+    pieces: Array, offsets: Array, allowed: Array, pattern: Pattern, count: int
 ) -> Array:
     """Lay the cross lines over the pieces of all rows.
 
@@ -51,8 +51,7 @@ def cross_table(
         pieces: (P, 4) row, begin, end, steps; by row and begin.
         offsets: (R,) v of the rows.
         allowed: (A, 4) u, v of the edges of the area where lines may be.
-        step: most from picture to picture.
-        min_steps: of a line.
+        pattern: how far it is from picture to picture.
         count: of cross lines over each block.
 
     Returns:
@@ -67,7 +66,7 @@ def cross_table(
         if row[0] == row[-1]:
             continue  # one row has nothing to be tied to
         rows = row.astype(np.int64)
-        here = _CrossedBlock(begin, end, rows, offsets[rows], edges, step, min_steps)
+        here = _CrossedBlock(begin, end, rows, offsets[rows], edges, pattern)
         target, spans = steps >= MIN_STEPS, tied[members]
         places = begin.min() + (end.max() - begin.min()) * np.arange(1, count + 1) / (count + 1)
         groups = stabs(spans[target])
@@ -171,8 +170,8 @@ def _lines_at(
             useful = last > first
         if useful and high - low > _MIN_M:
             span = v[last] - v[first]
-            steps = max(block.min_steps, math.ceil(span / block.step - _EVEN))
-            length = steps * block.step
+            steps = max(block.pattern.min_steps, math.ceil(span / block.pattern.step_m - _EVEN))
+            length = steps * block.pattern.step_m
             v_0 = max(low, v[first] - (length - span) / 2)
             v_1 = min(high, v_0 + length)
             v_0 = max(low, v_1 - length)

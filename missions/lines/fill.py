@@ -173,7 +173,7 @@ def _offer(
             pattern.half_along_m,
             pattern.overhang_m,
             pattern.step_m,
-            max(1, pattern.pictures - 1),
+            pattern.min_steps,
         )
         if score > best_score:
             ends = _turn(np.array([[begin, offset], [end, offset]]), -course).ravel()

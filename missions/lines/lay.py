@@ -9,6 +9,7 @@ lines and cross lines are one tour, from home and home again.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,32 +57,46 @@ class Laid:
         ]
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LineTask:
+    """What lines are laid for, and what keeps their order cheap."""
+
+    area: Area
+    """What must be seen, and where lines may be."""
+    pattern: Pattern
+    """How far apart lines and pictures are, and what they see."""
+    ways: Ways
+    """Ways inside the allowed area."""
+    costs: Costs
+    """What the order of the lines keeps low."""
+    home_ne: tuple[float, float]
+    """Place where the flight begins and ends."""
+    cross_lines: int
+    """How many across the survey lines, over every block of them; more where some would stay
+    uncrossed (`missions.lines.cross`); 0: none."""
+    closing_line: bool
+    """Whether the start of the first line is flown again at the end."""
+    max_stations: int = MAX_STATIONS
+    """Most stations that a plan may have."""
+
+    @cached_property
+    def site(self) -> Site:
+        """The area as compiled code takes it."""
+        return Site.of(self.area)
+
+    @cached_property
+    def bounded(self) -> Costs:
+        """The costs without infinite ones."""
+        return hops.comparable(self.costs)
+
+
 @progress.step("lay the lines")
-def lay_lines(
-    area: Area,
-    heading_rad: float,
-    pattern: Pattern,
-    ways: Ways,
-    costs: Costs,
-    home_ne: tuple[float, float],
-    *,
-    cross_lines: int,
-    closing_line: bool,
-    max_stations: int = MAX_STATIONS,
-) -> list[Line]:
+def lay_lines(task: LineTask, heading_rad: float) -> list[Line]:
     """Lay all lines of a survey.
 
     Args:
-        area: what must be seen, and where lines may be.
+        task: what for.
         heading_rad: of the survey lines; they are flown to and fro, from the better end.
-        pattern: how far apart lines and pictures are, and what they see.
-        ways: inside the allowed area.
-        costs: what the order of the lines keeps low.
-        home_ne: where the flight begins and ends.
-        cross_lines: how many across the survey lines, over every block of them; more where some
-            would stay uncrossed (`missions.lines.cross`); 0: none.
-        closing_line: whether the start of the first line is flown again at the end.
-        max_stations: that a plan may have.
 
     Returns:
         Lines in the order of flight. No line leaves the allowed area.
@@ -91,20 +106,11 @@ def lay_lines(
             allowed area between two lines.
     """
     note_planner()
-    check_size(area, pattern, max_stations)
-    result = lay_pattern(
-        Site.of(area),
-        heading_rad,
-        pattern,
-        ways.coarse,
-        hops.comparable(costs),
-        home_ne,
-        cross_lines=cross_lines,
-        closing_line=closing_line,
-    )
+    check_size(task.area, task.pattern, task.max_stations)
+    result = lay_pattern(task, heading_rad)
     stations = int(result.steps.sum()) + len(result.steps)
-    if stations > max_stations:
-        raise _too_many(area, pattern, stations, max_stations)
+    if stations > task.max_stations:
+        raise _too_many(task.area, task.pattern, stations, task.max_stations)
     return result.lines()
 
 
@@ -148,22 +154,13 @@ def check_size(area: Area, pattern: Pattern, max_stations: int = MAX_STATIONS) -
         raise _too_many(area, pattern, stations, max_stations)
 
 
-def lay_pattern(
-    site: Site,
-    heading_rad: float,
-    pattern: Pattern,
-    ways: Ways,
-    costs: Costs,
-    home_ne: tuple[float, float],
-    *,
-    cross_lines: int,
-    closing_line: bool,
-    quick: bool = False,
-) -> Laid:
+def lay_pattern(task: LineTask, heading_rad: float, *, quick: bool = False) -> Laid:
     """As `lay_lines`, as arrays and with the cost.
 
     Quick is without fill lines, and with an order of many cells that is improved, but not shaken.
     """
+    site, pattern, costs = task.site, task.pattern, task.bounded
+    ways = task.ways.sketch if quick else task.ways.coarse
     pieces, offsets, cuts = survey_pieces(site, heading_rad, pattern)
     if len(pieces) == 0:
         raise PlanError(
@@ -178,8 +175,8 @@ def lay_pattern(
     inner = cells.cell_costs(costs, begins, listed, ends, heading_rad, links_m)
     steps = pieces[:, 3].astype(np.int64)
     survey_count, survey_cells = len(pieces), len(inner)
-    if cross_lines:
-        across, cross_steps = _cross(site, heading_rad, pattern, pieces, offsets, cross_lines)
+    if task.cross_lines:
+        across, cross_steps = _cross(task, heading_rad, pieces, offsets)
         alone = np.arange(len(across) + 1)
         course = heading_rad + math.pi / 2
         more, leaving = cells.cell_corners(alone, alone[:-1], across, course)
@@ -190,10 +187,10 @@ def lay_pattern(
         begins = np.concatenate([begins, begins[-1] + alone[1:]])
         listed = np.concatenate([listed, survey_count + alone[:-1]])
         ends, steps = np.concatenate([ends, across]), np.concatenate([steps, cross_steps])
-    home = np.array(home_ne, dtype=np.float64)
+    home = np.array(task.home_ne, dtype=np.float64)
     piece = _piece_at(begins, listed).ravel()
     closing, closing_steps = _closings(corners, steps[piece], ends, piece)
-    closes = closing_line and survey_count > 1
+    closes = task.closing_line and survey_count > 1
     order = _tour(
         corners, exits, inner, ways, costs, home, closing if closes else None, survey_cells, quick
     )
@@ -219,15 +216,10 @@ def survey_pieces(site: Site, heading_rad: float, pattern: Pattern) -> tuple[Arr
     allowed = rows.to_uv(site.allowed, heading_rad)
     low, high = float(survey[:, 1].min()), float(survey[:, 1].max())
     offsets = rows.row_offsets(low, high, pattern.spacing_m, pattern.edge_m, pattern.passes)
+    # A point needs its `passes` nearest lines, and the last of them is this far at most.
+    half_m = pattern.passes * pattern.spacing_m / 2
     pieces, cuts = rows.lay_rows(
-        survey,
-        allowed,
-        offsets,
-        # A point needs its `passes` nearest lines, and the last of them is this far at most.
-        pattern.passes * pattern.spacing_m / 2,
-        pattern.overhang_m,
-        pattern.step_m,
-        max(1, pattern.pictures - 1),
+        survey, allowed, offsets, half_m, pattern.overhang_m, pattern.step_m, pattern.min_steps
     )
     return pieces, offsets, cuts
 
@@ -289,21 +281,15 @@ def _link(
 
 
 def _cross(
-    site: Site, heading_rad: float, pattern: Pattern, pieces: Array, offsets: Array, count: int
+    task: LineTask, heading_rad: float, pieces: Array, offsets: Array
 ) -> tuple[Array, NDArray[np.int64]]:
     """Lines across the survey lines, so that each of these is crossed.
 
     Returns:
         (N, 4) north and east of begin and end, (N,) steps.
     """
-    found = cross.cross_table(
-        pieces,
-        offsets,
-        rows.to_uv(site.allowed, heading_rad),
-        pattern.step_m,
-        max(1, pattern.pictures - 1),
-        count,
-    )
+    allowed = rows.to_uv(task.site.allowed, heading_rad)
+    found = cross.cross_table(pieces, offsets, allowed, task.pattern, task.cross_lines)
     ends = rows.to_uv(np.ascontiguousarray(found[:, [0, 1, 0, 2]]), -heading_rad)
     return ends, found[:, 3].astype(np.int64)
 

@@ -15,22 +15,17 @@ cost at the best of those.
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
 
-from alice_survey.core.compiled import compiled
 from alice_survey.core.errors import PlanError
 from alice_survey.core.executor import progress
 from alice_survey.core.frames import Array
 from alice_survey.core.run.progress import step
 from missions.lines import cells, hops, rows
-from missions.lines.lay import check_size, lay_pattern, note_planner, survey_pieces
-from missions.lines.rows import Site
-from missions.route.ways import Ways
-from missions.values.area import Area
-from missions.values.costs import Costs
+from missions.lines.lay import LineTask, check_size, lay_pattern, note_planner, survey_pieces
 from missions.values.pattern import Pattern
 
 _ESTIMATES = 1800
@@ -76,25 +71,15 @@ class Sweep:
 
 
 @step("look for the best heading")
-def best_heading(
-    area: Area,
-    pattern: Pattern,
-    ways: Ways,
-    costs: Costs,
-    home_ne: tuple[float, float],
-    *,
-    cross_lines: int,
-    closing_line: bool,
-) -> Sweep:
-    """Search the heading at which all lines cost least; arguments as of `lay.lay_lines`.
+def best_heading(task: LineTask) -> Sweep:
+    """Search the heading at which all lines cost least.
 
     Raises:
         PlanError: the area is too large, or cannot be flown at any heading.
     """
     note_planner()
-    check_size(area, pattern)
-    site, costs = Site.of(area), hops.comparable(costs)
-    width_heading, width = min_width(site.survey)
+    check_size(task.area, task.pattern)
+    width_heading, width = min_width(task.site.survey)
     close: dict[float, float] = {}
     found: dict[float, float] = {}
     faults: list[PlanError] = []
@@ -104,30 +89,20 @@ def best_heading(
             if heading in costs_j:
                 continue
             try:
-                costs_j[heading] = lay_pattern(
-                    site,
-                    heading,
-                    pattern,
-                    ways.sketch if costs_j is close else ways.coarse,
-                    costs,
-                    home_ne,
-                    cross_lines=cross_lines,
-                    closing_line=closing_line,
-                    quick=costs_j is close,
-                ).energy_j
+                costs_j[heading] = lay_pattern(task, heading, quick=costs_j is close).energy_j
             except PlanError as fault:
                 faults.append(fault)
             yield heading
 
     def search() -> Iterator[float]:
-        headings = _worthwhile(_headings(area, site, pattern), width_heading, site, pattern, costs)
-        estimates = estimate_j(site, headings, pattern, costs, cross_lines)
+        headings = _worthwhile(_headings(task), width_heading, task)
+        estimates = estimate_j(task, headings)
         spread = np.append(np.arange(_SPREAD) * math.pi / _SPREAD, width_heading)
-        spread = _worthwhile(spread, width_heading, site, pattern, costs)
-        promising = estimate_j(site, spread, pattern, costs, cross_lines)
+        spread = _worthwhile(spread, width_heading, task)
+        promising = estimate_j(task, spread)
         spread = spread[promising <= _PROMISING * estimates.min()]
         best = headings[np.argmin(estimates)]
-        share = min(1.0, _FEW_CELLS / _count_cells(site, float(best), pattern))
+        share = min(1.0, _FEW_CELLS / _count_cells(task, float(best)))
         yield from take(close, spread[:: math.ceil(1 / share)])
         yield from take(close, _best(headings, estimates, _some(_BEST, share), math.radians(0.3)))
         for heading in _minimum(close, _some(_REFINED, share)):
@@ -152,24 +127,24 @@ def best_heading(
     )
 
 
-def _worthwhile(
-    headings: Array, narrow: float, site: Site, pattern: Pattern, costs: Costs
-) -> Array:
+def _worthwhile(headings: Array, narrow: float, task: LineTask) -> Array:
     """Headings at which lines and a turn to each may cost little more than at a narrow heading.
 
     That spares thousands of short lines across a long strip.
     """
-    known_j = float(estimate_j(site, np.array([narrow]), pattern, costs, 0)[0])
-    min_j = float(costs.line_w.min()) / costs.speed_mps * site.area_m2 / pattern.spacing_m
-    turns = widths_m(site.survey, headings) / pattern.spacing_m
-    kept = headings[min_j + turns * _turn_j(pattern, costs) <= _PROMISING * known_j]
+    costs, spacing_m = task.bounded, task.pattern.spacing_m
+    known_j = float(estimate_j(replace(task, cross_lines=0), np.array([narrow]))[0])
+    min_j = float(costs.line_w.min()) / costs.speed_mps * task.site.area_m2 / spacing_m
+    turns = widths_m(task.site.survey, headings) / spacing_m
+    kept = headings[min_j + turns * _turn_j(task) <= _PROMISING * known_j]
     return kept if len(kept) else np.array([narrow])
 
 
-def _turn_j(pattern: Pattern, costs: Costs) -> float:
+def _turn_j(task: LineTask) -> float:
     """Energy from the end of a line to the start of the next."""
-    start, goal = np.zeros((1, 3)), np.array([[0.0, pattern.spacing_m, math.pi]])
-    return float(hops.hop_j(costs, start, goal, np.array([pattern.spacing_m]))[0])
+    spacing_m = task.pattern.spacing_m
+    start, goal = np.zeros((1, 3)), np.array([[0.0, spacing_m, math.pi]])
+    return float(hops.hop_j(task.bounded, start, goal, np.array([spacing_m]))[0])
 
 
 def _some(count: int, share: float) -> int:
@@ -177,9 +152,9 @@ def _some(count: int, share: float) -> int:
     return max(2, round(share * count))
 
 
-def _count_cells(site: Site, heading_rad: float, pattern: Pattern) -> int:
+def _count_cells(task: LineTask, heading_rad: float) -> int:
     """How many cells the survey lines of a heading have, at least 1."""
-    pieces, _, _ = survey_pieces(site, heading_rad, pattern)
+    pieces, _, _ = survey_pieces(task.site, heading_rad, task.pattern)
     return max(1, len(cells.chains(cells.followers(pieces))[0]) - 1)
 
 
@@ -208,61 +183,28 @@ def widths_m(edges: Array, headings: Array) -> Array:
     return np.array(widths)
 
 
-def estimate_j(
-    site: Site, headings: Array, pattern: Pattern, costs: Costs, cross_lines: int
-) -> Array:
+def estimate_j(task: LineTask, headings: Array) -> Array:
     """Energy, (H,), of all pieces of lines and of a turn to each, at headings (H,)."""
-    length_m, across_m, turns = _totals(
-        site.survey,
-        site.allowed,
-        headings,
-        pattern.spacing_m,
-        pattern.edge_m,
-        pattern.passes,
-        pattern.overhang_m,
-        pattern.step_m,
-        max(1, pattern.pictures - 1),
-    )
+    costs, totals = task.bounded, []
+    for heading in headings.tolist():
+        pieces, _, _ = survey_pieces(task.site, heading, task.pattern)
+        width_m = np.ptp(rows.to_uv(task.site.survey, heading)[:, 1])
+        linked = np.count_nonzero(cells.followers(pieces) >= 0)
+        # From cell to cell the way is some turns long.
+        count = 3 * len(pieces) - 2 * linked
+        totals.append((np.sum(pieces[:, 2] - pieces[:, 1]), width_m, count))
+    length_m, across_m, turns = np.array(totals).reshape(-1, 3).T
     both = hops.line_j(costs, 1.0, headings) + hops.line_j(costs, 1.0, headings + math.pi)
-    across = hops.line_j(costs, across_m * cross_lines, headings + math.pi / 2)
-    estimates: Array = length_m * both / 2 + across + turns * _turn_j(pattern, costs)
+    across = hops.line_j(costs, across_m * task.cross_lines, headings + math.pi / 2)
+    estimates: Array = length_m * both / 2 + across + turns * _turn_j(task)
     return estimates
 
 
-@compiled
-def _totals(
-    survey: Array,
-    allowed: Array,
-    headings: Array,
-    spacing: float,
-    edge: float,
-    passes: int,
-    overhang: float,
-    step: float,
-    min_steps: int,
-) -> Array:
-    """(3, H) length of all pieces, width of the area, and turns between pieces, at headings."""
-    totals = np.zeros((3, headings.size))
-    for i in range(headings.size):
-        turned, room = rows.to_uv(survey, headings[i]), rows.to_uv(allowed, headings[i])
-        low, high = turned[:, 1].min(), turned[:, 1].max()
-        offsets = rows.row_offsets(low, high, spacing, edge, passes)
-        pieces, _ = rows.lay_rows(
-            turned, room, offsets, passes * spacing / 2, overhang, step, min_steps
-        )
-        follower = cells.followers(pieces)
-        # From cell to cell the way is some turns long.
-        totals[1, i], totals[2, i] = high - low, 3 * pieces.shape[0]
-        for p in range(pieces.shape[0]):
-            totals[0, i] += pieces[p, 2] - pieces[p, 1]
-            totals[2, i] -= 2 if follower[p] >= 0 else 0
-    return totals
-
-
-def _headings(area: Area, site: Site, pattern: Pattern) -> Array:
+def _headings(task: LineTask) -> Array:
     """Headings worth an estimate: evenly spread, along edges, and where the row count jumps."""
-    hull = shapely.get_coordinates(area.survey.convex_hull)
-    north_0, east_0, north_1, east_1 = area.survey.bounds
+    site, pattern = task.site, task.pattern
+    hull = shapely.get_coordinates(task.area.survey.convex_hull)
+    north_0, east_0, north_1, east_1 = task.area.survey.bounds
     rows_most = math.hypot(north_1 - north_0, east_1 - east_0) / pattern.spacing_m
     effort = max(rows_most / _FEW_ROWS, len(site.survey) / _FEW_EDGES)
     count = int(np.clip(_ESTIMATES / effort, _MIN_ESTIMATES, _ESTIMATES))

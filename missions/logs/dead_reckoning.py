@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.core.compiled import compiled
 from alice_survey.core.errors import NavigationError
 from alice_survey.core.frames import Array, Datum
 from missions.logs.dive import LoggedDive, Signal, of_known, rotation_of
@@ -153,23 +152,11 @@ def dead_reckoned(
     near = np.abs(late[:, 0]) <= 0.5 * max_gap_s(time_s)
     at, places, sigmas = at[near], (places - late * velocity.values[at])[near], sigmas[near]
     starts = np.searchsorted(at, np.arange(len(time_s) + 1))
-    prior = np.array([errors.scale, np.deg2rad(errors.heading_deg)])
-    state, spread, refused = _smooth(
-        steps,
-        moves,
-        breaks,
-        starts,
-        places,
-        sigmas,
-        prior,
-        errors.noise_mps**2,
-        _FAR_M**2,
-        _GATE,
-    )
+    state, spread, refused = _smooth((steps, moves, breaks), (starts, places, sigmas), errors)
     tied = np.isin(stretch, stretch[at])
     state[~tied], spread[~tied] = np.nan, np.nan
     return ReckonedTrack(
-        time_s=time_s, ne=state, sigma_m=np.sqrt(0.5 * spread.sum(axis=1)), refused=int(refused)
+        time_s=time_s, ne=state, sigma_m=np.sqrt(0.5 * spread.sum(axis=1)), refused=refused
     )
 
 
@@ -213,90 +200,55 @@ def _company(times_s: Array) -> Array:
     return found
 
 
-@compiled
 def _smooth(
-    steps: Array,
-    moves: Array,
-    breaks: NDArray[np.bool_],
-    starts: NDArray[np.int64],
-    places: Array,
-    sigmas: Array,
-    prior: Array,
-    noise: float,
-    far: float,
-    gate: float,
+    velocities: tuple[Array, Array, NDArray[np.bool_]],
+    fixes: tuple[NDArray[np.int64], Array, Array],
+    errors: TrackErrors,
 ) -> tuple[Array, Array, int]:
     """Filter forwards and smooth backwards.
 
     Args:
-        steps: (N,) seconds since the velocity before.
-        moves: (N, 2) metres since then.
-        breaks: (N,) whether the track begins again there: the place is unknown, the errors stay.
-        starts: (N + 1,) where the fixes of each velocity start.
-        places: (F, 2) of the fixes.
-        sigmas: (F,).
-        prior: (2,) standard deviations of scale and heading (rad).
-        noise: variance of the velocity's noise, m^2/s.
-        far: variance of a place that is not known, m^2.
-        gate: in standard deviations, of fixes; the first after a break is always taken.
+        velocities: (N,) seconds since the velocity before; (N, 2) metres since then; (N,) whether
+            the track begins again there: the place is unknown, the errors stay.
+        fixes: (N + 1,) where the fixes of each velocity start, (F, 2) their places, (F,) sigmas;
+            the first after a break is always taken.
+        errors: of the velocities.
 
     Returns:
         (N, 2) places, (N, 2) variances, and how many fixes were refused.
     """
+    (steps, moves, breaks), (starts, places, sigmas) = velocities, fixes
     count = len(steps)
     x, p = np.zeros((count, 4)), np.zeros((count, 4, 4))
-    ahead_x, ahead_p = np.zeros((count, 4)), np.zeros((count, 4, 4))
-    step_f = np.zeros((count, 4, 4))
-    now, spread = np.zeros(4), np.zeros((4, 4))
-    spread[0, 0], spread[1, 1] = far, far
-    spread[2, 2], spread[3, 3] = prior[0] ** 2, prior[1] ** 2
+    ahead_x, ahead_p, step_f = np.zeros_like(x), np.zeros_like(p), np.zeros_like(p)
+    prior = np.array([_FAR_M, _FAR_M, errors.scale, np.deg2rad(errors.heading_deg)])
+    now, spread, unit = np.zeros(4), np.diag(prior**2), np.eye(4)
+    place = np.diag([1.0, 1.0, 0.0, 0.0])
     refused, tied = 0, False
-    unit = np.eye(4)
     for k in range(count):
-        f = unit.copy()
-        if k > 0 and breaks[k]:
-            f[0, 0], f[1, 1] = 0.0, 0.0
-            now = f @ now
-            spread = f @ spread @ f.T
-            spread[0, 0], spread[1, 1] = far, far
-            tied = False
-        elif k > 0:
-            f[0, 2], f[0, 3] = moves[k, 0], -moves[k, 1]
-            f[1, 2], f[1, 3] = moves[k, 1], moves[k, 0]
-            now = f @ now
-            now[0] += moves[k, 0]
-            now[1] += moves[k, 1]
-            spread = f @ spread @ f.T
-            spread[0, 0] += noise * steps[k]
-            spread[1, 1] += noise * steps[k]
+        north, east = moves[k]
+        if breaks[k]:
+            f, grown, tied = unit - place, _FAR_M**2, False
+        else:
+            f, grown = unit.copy(), errors.noise_mps**2 * steps[k]
+            f[:2, 2:] = [[north, -east], [east, north]]
+        now, spread = f @ now, f @ spread @ f.T + grown * place
+        if not breaks[k]:
+            now[:2] += moves[k]
         step_f[k], ahead_x[k], ahead_p[k] = f, now, spread
         for i in range(starts[k], starts[k + 1]):
-            # (2, 2) of the innovation
-            s00 = spread[0, 0] + sigmas[i] ** 2
-            s11 = spread[1, 1] + sigmas[i] ** 2
-            s01 = spread[0, 1]
-            det = s00 * s11 - s01 * s01
-            dn, de = places[i, 0] - now[0], places[i, 1] - now[1]
-            if tied and (s11 * dn * dn - 2 * s01 * dn * de + s00 * de * de) / det > gate * gate:
+            off = places[i] - now[:2]
+            inverse = np.linalg.inv(spread[:2, :2] + sigmas[i] ** 2 * unit[:2, :2])
+            if tied and off @ inverse @ off > _GATE**2:
                 refused += 1
                 continue
-            tied = True
-            gain = np.empty((4, 2))
-            for r in range(4):
-                gain[r, 0] = (spread[r, 0] * s11 - spread[r, 1] * s01) / det
-                gain[r, 1] = (spread[r, 1] * s00 - spread[r, 0] * s01) / det
-            keep = unit.copy()
-            for r in range(4):
-                keep[r, 0] -= gain[r, 0]
-                keep[r, 1] -= gain[r, 1]
-            now = now + gain[:, 0] * dn + gain[:, 1] * de
+            tied, gain = True, spread[:, :2] @ inverse
+            keep = unit - gain @ unit[:2]
+            now = now + gain @ off
             spread = keep @ spread @ keep.T + sigmas[i] ** 2 * (gain @ gain.T)
         x[k], p[k] = now, spread
     for k in range(count - 2, -1, -1):
         back = np.linalg.solve(ahead_p[k + 1], step_f[k + 1] @ p[k]).T
-        x[k] = x[k] + back @ (x[k + 1] - ahead_x[k + 1])
-        p[k] = p[k] + back @ (p[k + 1] - ahead_p[k + 1]) @ back.T
-    variances = np.empty((count, 2))
-    for k in range(count):
-        variances[k, 0], variances[k, 1] = p[k, 0, 0], p[k, 1, 1]
-    return x[:, :2].copy(), variances, refused
+        x[k] += back @ (x[k + 1] - ahead_x[k + 1])
+        p[k] += back @ (p[k + 1] - ahead_p[k + 1]) @ back.T
+    return x[:, :2], np.diagonal(p, axis1=1, axis2=2)[:, :2].copy(), refused

@@ -15,7 +15,7 @@ from shapely.geometry import MultiPolygon, Point
 
 from alice_survey.core.config import PlanConfig
 from alice_survey.core.errors import warn
-from missions.lines.lay import check_size, lay_lines
+from missions.lines.lay import LineTask, check_size, lay_lines
 from missions.lines.sweep import Sweep, best_heading
 from missions.route.dives import split_dives
 from missions.route.turns import Manoeuvre
@@ -139,24 +139,19 @@ def _plan_part(
 ) -> PlannedDives:
     """Lines and dives of one part; arguments as of `plan_parts`."""
     ways, sweep = Ways(area.allowed), None
-    cross_lines, closing_line = settings.cross_lines, settings.closing_line
-    if settings.line_heading_deg is None:
-        sweep = best_heading(
-            area, pattern, ways, costs, home_ne, cross_lines=cross_lines, closing_line=closing_line
-        )
-        heading = sweep.heading_rad
-    else:
-        heading = math.radians(settings.line_heading_deg)
-    lines = lay_lines(
-        area,
-        heading,
-        pattern,
-        ways,
-        costs,
-        home_ne,
-        cross_lines=cross_lines,
-        closing_line=closing_line,
+    task = LineTask(
+        area=area,
+        pattern=pattern,
+        ways=ways,
+        costs=costs,
+        home_ne=home_ne,
+        cross_lines=settings.cross_lines,
+        closing_line=settings.closing_line,
     )
+    if settings.line_heading_deg is None:
+        sweep = best_heading(task)
+    heading = math.radians(settings.line_heading_deg or 0.0) if sweep is None else sweep.heading_rad
+    lines = lay_lines(task, heading)
     dives = split_dives(
         lines,
         Manoeuvre(costs, settings.arc_radius_m, settings.run_in_m, settings.turns, ways),

@@ -1,11 +1,13 @@
 """The table of a plan's settings: each number with its equation and what bounds it."""
 
+import itertools
 import math
 import textwrap
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from alice_survey.core.artefacts import json_values
 from alice_survey.core.config import VehicleConfig
 from alice_survey.kit.words import share, text_table
 from missions.coverage.certificate import Certificate
@@ -19,8 +21,6 @@ from missions.values.line import LINE_KINDS
 from missions.values.plan_file import Plan
 
 WIDTH = 100
-_COLUMNS = (23, 24, 31, 16)
-_GAP = "  "
 _MAIN = (
     "footprint across", "footprint along", "pixel on the floor", "stereo swath", "line spacing",
     "side overlap", "interval", "forward overlap", "exposure", "blur", "focus, set in air",
@@ -51,17 +51,8 @@ class Setting:
     note: str = ""
 
     def to_json(self) -> dict[str, Any]:
-        """All fields as JSON values; what is not finite is null."""
-        values = self.value if isinstance(self.value, tuple) else (self.value,)
-        finite = [v if math.isfinite(v) else None for v in values]
-        return {**asdict(self), "value": finite if isinstance(self.value, tuple) else finite[0]}
-
-    @classmethod
-    def from_json(cls, row: dict[str, Any]) -> "Setting":
-        """The inverse of `to_json`; what was not finite is NaN."""
-        values = row["value"] if isinstance(row["value"], list) else [row["value"]]
-        known = tuple(math.nan if value is None else float(value) for value in values)
-        return cls(**{**row, "value": known})
+        """All fields, and the text of the value, as JSON values; what is not finite is null."""
+        return {**json_values(asdict(self)), "text": self.text}
 
     @property
     def text(self) -> str:
@@ -72,29 +63,18 @@ class Setting:
 
 
 def settings_table(rows: Sequence[Setting]) -> str:
-    """Rows under the headings of their groups, with notes below each; no line exceeds `WIDTH`."""
-    lines = _line("setting", "value", "equation", "bound by")
-    lines += _line(*("-" * width for width in _COLUMNS))
-    group = ""
-    for row in rows:
-        if row.group != group:
-            group = row.group
-            lines += ["", group.upper()]
-        lines += _line(row.name, row.text, row.equation, row.bound_by or "-")
-        lines += textwrap.wrap(row.note, WIDTH, initial_indent="    ", subsequent_indent="    ")
-    return "\n".join(lines)
+    """Rows under the headings of their groups, with notes below each; no line exceeds `WIDTH`.
 
-
-def _line(*cells: str) -> list[str]:
-    """A row of the table, on as many lines as its longest cell needs."""
-    parts = [textwrap.wrap(cell, width) for cell, width in zip(cells, _COLUMNS, strict=True)]
-    return [
-        _GAP.join(
-            (part[i] if i < len(part) else "").ljust(width)
-            for part, width in zip(parts, _COLUMNS, strict=True)
-        ).rstrip()
-        for i in range(max(map(len, parts)))
-    ]
+    A row has name, value, equation, and in brackets what a better value would break.
+    """
+    lines = []
+    for group, some in itertools.groupby(rows, lambda row: row.group):
+        lines += ["", group.upper()]
+        for row in some:
+            head = f"  {row.name:<24}{row.text:<24}{row.equation} ({row.bound_by or '-'})"
+            lines += textwrap.wrap(head, WIDTH, subsequent_indent=" " * 50)
+            lines += textwrap.wrap(" " * 6 + row.note, WIDTH, subsequent_indent=" " * 6)
+    return "\n".join(lines[1:])
 
 
 def _percent(part: float) -> str:
@@ -123,8 +103,8 @@ def main_settings(plan_json: dict[str, Any]) -> str:
     Args:
         plan_json: the contents of `plan.json`.
     """
-    rows = map(Setting.from_json, plan_json["details"]["imaging"]["rows"])
-    shown = {row.name: (row.name, row.text, row.bound_by) for row in rows}
+    rows = plan_json["details"]["imaging"]["rows"]
+    shown = {row["name"]: [row[key] for key in ("name", "text", "bound_by")] for row in rows}
     table = text_table(("setting", "value", "bound by"), [shown[n] for n in _MAIN if n in shown])
     return f"{table}\nEvery setting with its equation: plan/settings.txt, or --all\n"
 
@@ -250,9 +230,6 @@ def _light_rows(found: ImagingSettings, setup: ImagingSetup) -> list[Row]:
          "light" if light.gain_db > 0 else "full well",
          f"brings the median to {MIDDLE_GREY:.0%} of full scale (linear). Check it in the water: "
          "alice-survey plan gain PICTURES"),
-        ("f-number for half well", light.half_full_f_number, "", "N sqrt(S / half well)",
-         "depth of field", f"for the brightest pixel; or {light.half_full_exposure_s * 1e3:.3g} ms "
-         f"at F/{limits.f_number:g}"),
         ("veil, centre", found.scatter.veil_share, "%", "B / (B + L)", "strobe places",
          "share of the light that the water throws back before it reached the floor. Strobes "
          f"light the axis from {found.scatter.lit_from_m:.2f} m below the glass on, "

@@ -39,6 +39,11 @@ class Pattern:
         return max(1, math.floor(2 * self.half_along_m / self.step_m + _WHOLE))
 
     @property
+    def min_steps(self) -> int:
+        """Least number of steps of a line, from picture to picture."""
+        return max(1, self.pictures - 1)
+
+    @property
     def edge_m(self) -> float:
         """How far outside of the area the outermost lines lie at least."""
         return _outside(self.spacing_m, self.half_across_m, self.passes)

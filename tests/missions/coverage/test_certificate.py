@@ -12,6 +12,7 @@ from shapely.ops import unary_union
 
 from alice_survey.core.config import CameraConfig, SurveyConfig, WaterConfig
 from alice_survey.core.errors import PlanError
+from alice_survey.core.frames import Array
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.holes import find_holes, geodetic
@@ -39,6 +40,11 @@ RIG = design_rig(CameraConfig(), WaterConfig())
 ONCE = Pattern(spacing_m=1.0, step_m=1.0, half_across_m=0.5, half_along_m=0.5)
 
 
+def shares_of(certificate: Certificate, counts: Array) -> Array:
+    """Share of the area, (N,), that is seen 0, 1, 2, ... times."""
+    return np.bincount(counts[certificate.inside]) / certificate.inside.sum()
+
+
 def misjudged_m2(certificate: Certificate, shape: BaseGeometry) -> float:
     """The most that counting middles of cells can be wrong by for a shape.
 
@@ -59,7 +65,7 @@ def test_one_rectangle_covers_its_own_area() -> None:
     assert seen.grid.shape == (100, 100)
     assert seen.covered_share == pytest.approx(2.0 / 25.0, abs=1e-12)
     assert (seen.stations, seen.taken, seen.fewest_pictures) == (1, 1, 0)
-    np.testing.assert_allclose(seen.histograms["left"], [0.92, 0.08], atol=1e-12)
+    np.testing.assert_allclose(shares_of(seen, seen.pictures), [0.92, 0.08], atol=1e-12)
     higher = certificate(area, rig, stations_at([(2.5, 2.5)], 1.5), ONCE, cell_m=0.05)
     assert higher.covered_share == pytest.approx(1.5**2 * 2.0 / 25.0, abs=0.003)
 
@@ -255,9 +261,8 @@ def test_shares_do_not_alias_with_steps_and_lines() -> None:
     shares = np.zeros(7)
     for (n, p), (m, q) in itertools.product(on_a_line.items(), lines.items()):
         shares[n * m] += p * q
-    (found,) = seen.histograms.values()
-    assert found == pytest.approx(shares, abs=6e-3)
-    (by_lines,) = seen.line_histograms.values()
+    assert shares_of(seen, seen.pictures) == pytest.approx(shares, abs=6e-3)
+    by_lines = shares_of(seen, seen.least_lines)
     assert by_lines == pytest.approx([0.0, *lines.values()], abs=6e-3)
 
 
@@ -286,8 +291,7 @@ def test_shares_of_the_papers_mission_are_those_of_a_finer_grid() -> None:
     )
 
     assert seen.inside.sum() < 1.05 * 80_000
-    for kind in ("histograms", "line_histograms"):
-        for name, shares in getattr(fine, kind).items():
-            ours = getattr(seen, kind)[name]
-            assert ours == pytest.approx(shares[: len(ours)], abs=3e-3)
+    for kind in ("pictures", "least_pictures", "least_lines", "pairs"):
+        ours, shares = (shares_of(one, getattr(one, kind)) for one in (seen, fine))
+        assert ours == pytest.approx(shares[: len(ours)], abs=3e-3)
     assert seen.mean_pictures == pytest.approx(fine.mean_pictures, abs=0.01)

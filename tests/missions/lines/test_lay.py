@@ -10,7 +10,7 @@ from shapely.geometry import MultiPolygon, box
 
 from alice_survey.core.errors import PlanError
 from missions.lines.hops import comparable, hop_j
-from missions.lines.lay import lay_lines, order_lines, stops
+from missions.lines.lay import lay_lines, lay_pattern, order_lines, stops
 from missions.route.ways import Ways
 from missions.values.costs import Costs, time_costs
 from missions.values.line import Line
@@ -18,13 +18,12 @@ from missions.values.pattern import Pattern
 from tests.oracles_lines import (
     ELL_WITH_HOLES,
     PATTERNS,
-    STEREO,
     area_of,
     areas,
     as_string,
     flight_by_hand,
-    full_cost_j,
     lay,
+    line_task,
     points_in,
     random_area,
     seen_enough,
@@ -105,15 +104,10 @@ def test_five_hundred_areas_never_crash_and_never_leave_the_allowed_area() -> No
         area = area_of(survey, float(rng.choice([0.0, 0.5, 3.0])))
         home = area.allowed.representative_point()
         try:
+            heading = float(rng.uniform(0, 7))
+            kinds: Any = {"cross_lines": int(rng.integers(3)), "closing_line": rng.integers(2) > 0}
             lines = lay_lines(
-                area,
-                float(rng.uniform(0, 7)),
-                PATTERNS[seed % 3],
-                Ways(area.allowed),
-                time_costs(0.2),
-                (home.x, home.y),
-                cross_lines=int(rng.integers(3)),
-                closing_line=bool(rng.integers(2)),
+                line_task(area, PATTERNS[seed % 3], home_ne=(home.x, home.y), **kinds), heading
             )
         except PlanError as error:
             assert "not connected" in str(error) or "can be flown" in str(error)
@@ -140,11 +134,10 @@ def test_every_part_is_tied_by_cross_lines() -> None:
 @pytest.mark.parametrize("costs", [time_costs(0.2), CURRENT])
 def test_the_cost_is_that_of_the_lines_flown_by_hand(costs: Costs) -> None:
     area = area_of(ELL_WITH_HOLES)
-    ways, home = Ways(area.allowed), (-2.0, -2.0)
-    kinds: dict[str, Any] = {"cross_lines": 1, "closing_line": True}
-    lines = lay_lines(area, 0.4, STEREO, ways, costs, home, **kinds)
-    cost = full_cost_j(area, 0.4, STEREO, ways, costs, home, **kinds)
-    assert flight_by_hand(lines, partial(way_m, ways), costs, home) == pytest.approx(cost, rel=1e-6)
+    task = line_task(area, costs=costs, home_ne=(-2.0, -2.0))
+    lines, cost = lay_lines(task, 0.4), lay_pattern(task, 0.4).energy_j
+    by_hand = flight_by_hand(lines, partial(way_m, task.ways), costs, task.home_ne)
+    assert by_hand == pytest.approx(cost, rel=1e-6)
 
 
 def test_the_order_is_better_than_rows_one_after_the_other() -> None:
@@ -192,8 +185,5 @@ def test_too_many_stations_are_refused() -> None:
 def test_ten_thousand_rows_are_laid() -> None:
     wide = Pattern(spacing_m=1.0, step_m=8.0, half_across_m=0.6, half_along_m=4.5)
     area = area_of(box(0, 0, 40, 9_999))
-    lines = lay_lines(
-        area, 0.0, wide, Ways(area.allowed), time_costs(0.2), (0.0, 0.0),
-        cross_lines=0, closing_line=False,
-    )  # fmt: skip
+    lines = lay_lines(line_task(area, wide, cross_lines=0, closing_line=False), 0.0)
     assert len(lines) == 9_999

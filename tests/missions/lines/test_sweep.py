@@ -1,5 +1,4 @@
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -8,10 +7,11 @@ from hypothesis import strategies as st
 from shapely.geometry import MultiPolygon, Polygon, box
 
 from alice_survey.core.errors import PlanError
+from missions.lines.lay import lay_pattern
 from missions.lines.sweep import best_heading, min_width, widths_m
-from missions.route.ways import Ways, edges_of
+from missions.route.ways import edges_of
 from missions.values.costs import Costs, time_costs
-from tests.oracles_lines import ELL, ELL_WITH_HOLES, STEREO, area_of, areas, full_cost_j
+from tests.oracles_lines import ELL, ELL_WITH_HOLES, area_of, areas, line_task
 
 ALONG = np.arange(16) * 2 * np.pi / 16
 NORTHWARD = time_costs(0.2)._replace(
@@ -36,27 +36,21 @@ def test_no_direction_is_narrower_than_the_least_width(
 @pytest.mark.parametrize("costs", [time_costs(0.2), NORTHWARD])
 @pytest.mark.parametrize("shape", [QUAD, ELL, box(0, 0, 15, 17)])
 def test_no_sampled_heading_is_much_better(shape: Polygon, costs: Costs) -> None:
-    area = area_of(shape)
-    ways, home = Ways(area.allowed), (0.0, 0.0)
-    sweep = best_heading(area, STEREO, ways, costs, home, cross_lines=1, closing_line=True)
-    sampled = [
-        full_cost_j(area, h, STEREO, ways, costs, home, cross_lines=1, closing_line=True)
-        for h in (np.arange(400) + 0.123) * math.pi / 400
-    ]
+    task = line_task(area_of(shape), costs=costs)
+    sweep = best_heading(task)
+    sampled = [lay_pattern(task, h).energy_j for h in (np.arange(400) + 0.123) * math.pi / 400]
     assert sweep.cost_j <= 1.005 * min(sampled)
-    again = full_cost_j(
-        area, sweep.heading_rad, STEREO, ways, costs, home, cross_lines=1, closing_line=True
-    )
+    again = lay_pattern(task, sweep.heading_rad).energy_j
     assert again == pytest.approx(sweep.cost_j, rel=1e-12)
     assert max(sampled) > 1.02 * sweep.cost_j
 
 
 def test_lines_turn_into_the_current() -> None:
     area = area_of(box(0, 0, 15, 17))
-    ways = Ways(area.allowed)
-    kinds: dict[str, Any] = {"cross_lines": 0, "closing_line": False}
-    calm = best_heading(area, STEREO, ways, time_costs(0.2), (0.0, 0.0), **kinds)
-    current = best_heading(area, STEREO, ways, NORTHWARD, (0.0, 0.0), **kinds)
+    calm, current = (
+        best_heading(line_task(area, costs=costs, cross_lines=0, closing_line=False))
+        for costs in (time_costs(0.2), NORTHWARD)
+    )
     assert abs(math.sin(calm.heading_rad)) > 0.99
     assert abs(math.sin(current.heading_rad)) < 0.1
     assert calm.width_m == pytest.approx(15)
@@ -65,22 +59,14 @@ def test_lines_turn_into_the_current() -> None:
 def test_headings_that_cannot_be_flown_are_refused() -> None:
     parts = area_of(MultiPolygon([box(0, 0, 5, 5), box(20, 0, 25, 5)]), 1.0)
     with pytest.raises(PlanError, match=r"area\.turn_margin_m"):
-        best_heading(
-            parts, STEREO, Ways(parts.allowed), time_costs(0.2), (0.0, 0.0),
-            cross_lines=0, closing_line=False,
-        )  # fmt: skip
+        best_heading(line_task(parts, cross_lines=0, closing_line=False))
 
 
 def test_the_search_over_areas_with_fill_lines_finds_as_good_a_heading() -> None:
     """The search leaves fill lines out until it compares the best headings."""
-    area = area_of(ELL_WITH_HOLES)
-    ways, home = Ways(area.allowed), (-2.0, -2.0)
-    kinds: dict[str, Any] = {"cross_lines": 1, "closing_line": True}
-    sweep = best_heading(area, STEREO, ways, time_costs(0.2), home, **kinds)
-    sampled = [
-        full_cost_j(area, h, STEREO, ways, time_costs(0.2), home, **kinds)
-        for h in (np.arange(120) + 0.3) * math.pi / 120
-    ]
+    task = line_task(area_of(ELL_WITH_HOLES), home_ne=(-2.0, -2.0))
+    sweep = best_heading(task)
+    sampled = [lay_pattern(task, h).energy_j for h in (np.arange(120) + 0.3) * math.pi / 120]
     assert sweep.cost_j <= 1.005 * min(sampled)
     assert max(sampled) > 1.02 * sweep.cost_j
 
