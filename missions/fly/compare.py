@@ -31,7 +31,7 @@ from alice_survey.sim.vehicle.sea import level_floor
 from alice_survey.sim.vehicle.simulator import Flown, Setup, simulate
 from alice_survey.sim.vehicle.vehicle import Vehicle, vehicle_to_fly
 from camera_calib.rig import design_rig
-from missions.fly.run import true_velocity
+from missions.fly.run import line_runs, true_velocity
 from missions.fly.simulation import (
     FlightSettings,
     flight_of,
@@ -111,13 +111,11 @@ def variants_of(vehicles: Sequence[str]) -> tuple[Variant, ...]:
     names = [one.name for one in found]
     if len(set(names)) < len(names):
         raise VehicleError(f"vehicles {', '.join(names)}: two have one name")
-    return (
-        tuple(
-            Variant(name=one.name, vehicle=vehicle, controller="sway" if has_sway(one) else "los")
-            for vehicle, one in zip(vehicles, found, strict=True)
-        )
-        or VARIANTS
-    )
+    variants = [
+        Variant(name=one.name, vehicle=vehicle, controller="sway" if has_sway(one) else "los")
+        for vehicle, one in zip(vehicles, found, strict=True)
+    ]
+    return tuple(variants) or VARIANTS
 
 
 PAPER = {
@@ -219,8 +217,8 @@ def fly_all(
         executor: where tasks run.
         variants: what flies.
     """
-    fly = partial(_fly_one, settings, plan)
-    yield from executor.map(fly, list(itertools.product(cases, variants, seeds)), label="flights")
+    flights = list(itertools.product(cases, variants, seeds))
+    yield from executor.map(partial(_fly_one, settings, plan), flights, label="flights")
 
 
 def _fly_one(settings: FlightSettings, plan: Plan, which: tuple[Case, Variant, int]) -> Outcome:
@@ -297,7 +295,6 @@ def figures_of(flight: Flight) -> FlightFigures:
     ends = (reached[0], reached[-1]) if len(reached) else (0, -1)
     route = following & (ticks >= ends[0]) & (ticks <= ends[1])
     true, heading = flight.line_errors
-    believed = flight.believed_cross_track
     velocity = true_velocity(flown)
     roll = np.abs(np.rad2deg(flight.attitude_rad[:, 0]))
     turns = turn_rows(line, following)
@@ -307,7 +304,7 @@ def figures_of(flight: Flight) -> FlightFigures:
 
     return FlightFigures(
         lines_true_m=rms(true),
-        lines_believed_m=rms(believed),
+        lines_believed_m=rms(flight.believed_cross_track),
         route_true_m=rms(flight.route_error[route]),
         heading_rms_deg=rms(np.rad2deg(heading)),
         turn_roll_peak_deg=peak(roll),
@@ -322,16 +319,11 @@ def figures_of(flight: Flight) -> FlightFigures:
 def turn_rows(line: Array, following: NDArray[np.bool_]) -> list[slice]:
     """Ticks of each turn: from the end of a line to the middle of the next."""
     known = np.where(following & (line >= 0), line, -1.0)
-    on = np.concatenate([[-1.0], known, [-1.0]])
-    edges = np.flatnonzero(np.diff(on) != 0)
-    runs = [
-        (int(first), int(last)) for first, last in itertools.pairwise(edges) if known[first] >= 0
+    return [
+        slice(left, (begun + ended) // 2)
+        for (_, left), (begun, ended) in itertools.pairwise(line_runs(known))
+        if begun > left and known[left - 1] != known[begun]
     ]
-    turns = []
-    for (_, left), (begun, ended) in itertools.pairwise(runs):
-        if begun > left and known[left - 1] != known[begun]:
-            turns.append(slice(left, (begun + ended) // 2))
-    return turns
 
 
 def summarise(outcomes: Sequence[Outcome]) -> Summary:
@@ -376,7 +368,7 @@ def compare_report(
         Text, and the same as values for JSON.
 
     Raises:
-        ConfigError: a current or swell is not of that form, or the folder cannot be written.
+        ConfigError: a current or swell is not of that form.
     """
     variants = variants_of(vehicles)
     # Turns that all can fly.
@@ -420,17 +412,13 @@ def compare_report(
         "cross-track rms, mean peak of the turns, mean ± standard deviation over flights\n"
         f"{_table(data['cases'])}"
     )
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        write_json(out / "compare.json", data)
-        rows = (
-            [round(value, 6) if isinstance(value, float) else value for value in outcome.values()]
-            for outcome in outcomes
-        )
-        write_csv(out / "flights.csv", list(outcomes[0]), rows)
-        draw_cross_track(out / "compare.png", data["cases"])
-    except OSError as error:
-        raise ConfigError(f"{error.filename}: cannot be written: {error.strerror}") from None
+    write_json(out / "compare.json", data)
+    rows = (
+        [round(value, 6) if isinstance(value, float) else value for value in outcome.values()]
+        for outcome in outcomes
+    )
+    write_csv(out / "flights.csv", list(outcomes[0]), rows)
+    draw_cross_track(out / "compare.png", data["cases"])
     return f"{text}\n\nwrote {out}", data
 
 

@@ -5,7 +5,7 @@ Pictures show how near the plan a flight came, and what the vehicle did for it.
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -14,18 +14,9 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.artefacts import write_csv
-from alice_survey.core.config import (
-    AreaConfig,
-    CameraConfig,
-    NavigationConfig,
-    PlanConfig,
-    SeaConfig,
-    SeafloorConfig,
-    VehicleConfig,
-    WaterConfig,
-)
+from alice_survey.core.config import VehicleConfig, WaterConfig
 from alice_survey.core.errors import VehicleError, warn
-from alice_survey.core.executor import Executor, progress
+from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Array, rotation_from_attitude
 from alice_survey.core.records import FlightRecord
 from alice_survey.core.trajectory import write_track
@@ -47,11 +38,11 @@ from alice_survey.sim.vehicle.navigation.tick import LOG_COLUMNS
 from alice_survey.sim.vehicle.pilot.memory import FOLLOW, PHASE
 from alice_survey.sim.vehicle.simulator import Flown
 from camera_calib.rig import Rig, design_rig
-from missions.coverage.certificate import certificate
 from missions.coverage.drawing import draw_polygons
-from missions.coverage.stations import plan_pattern, stations_of_flight
+from missions.coverage.stations import stations_of_flight
 from missions.fly.simulation import (
     FlightSettings,
+    covered_shares,
     flight_noise,
     mission_of_settings,
     mission_summary,
@@ -73,50 +64,28 @@ TRIGGER_COLUMNS = ("station", "time_s", "line")
 
 
 def run_fly(
-    workspace: Path,
-    folder: Path,
-    executor: Executor,
-    *,
-    seed: int,
-    vehicle: VehicleConfig,
-    sea: SeaConfig,
-    navigation: NavigationConfig,
-    camera: CameraConfig,
-    water: WaterConfig,
-    seafloor: SeafloorConfig,
-    area: AreaConfig,
-    plan: PlanConfig,
+    workspace: Path, folder: Path, executor: Executor, *, water: WaterConfig, **values: Any
 ) -> None:
     """Write triggers, navigation, vehicle logs, a bag, the truth and plots.
+
+    Args:
+        workspace: that holds the plan.
+        folder: to write.
+        executor: not used: a flight is one task.
+        water: of the survey.
+        values: of `FlightSettings`.
 
     Raises:
         VehicleError: the vehicle took no picture at all; the message says why.
     """
-    settings = FlightSettings(
-        seed=seed, vehicle=vehicle, sea=sea, navigation=navigation, camera=camera,
-        seafloor=seafloor, area=area, plan=plan,
-    )  # fmt: skip
-    steps = _steps(folder, workspace / "plan" / "plan.json", settings, water)
-    for _ in progress(steps, "flight files", 5):
-        pass
-
-
-def _steps(
-    folder: Path, plan_path: Path, settings: FlightSettings, water: WaterConfig
-) -> Iterator[str]:
-    """Write the files of a flight, and say after each step what is done."""
-    plan, vehicle = one_dive(read_plan(plan_path), settings.vehicle.dive), settings.vehicle
-    floor = true_floor(plan, settings)
-    yield "sea floor"
+    settings = FlightSettings(**values)
+    vehicle = settings.vehicle
+    plan = one_dive(read_plan(workspace / "plan" / "plan.json"), vehicle.dive)
     fly = simulate_plan if vehicle.mission_file is None else simulate_mission
-    flight = fly(plan, settings, floor, flight_noise(settings.seed))
-    _check_pictures(
-        flight, stations_of_dives(flight.plan), "swell" if settings.sea.swell_m > 0.0 else "current"
-    )
-    yield "flight"
+    flight = fly(plan, settings, true_floor(plan, settings), flight_noise(settings.seed))
+    _check_pictures(flight, "swell" if settings.sea.swell_m > 0.0 else "current")
     write_track(folder / "truth" / "track.csv", flight.truth)
     write_vehicle_log(folder / "truth" / "vehicle.csv", true_log(flight))
-    yield "truth"
     rows = zip(flight.trigger_s.tolist(), flight.trigger_line, strict=True)
     write_csv(
         folder / "triggers.csv",
@@ -126,7 +95,6 @@ def _steps(
     write_navigation(folder / "navigation.csv", flight.log, plan.datum)
     write_vehicle_log(folder / "vehicle.csv", believed_log(flight))
     write_bag(folder / "bag", bag_record(flight))
-    yield "logs"
     rig = design_rig(settings.camera, water)
     summary = flight_summary(flight, vehicle, rig)
     if vehicle.mission_file is not None:
@@ -134,20 +102,19 @@ def _steps(
     FlightRecord.save(folder / "flight.json", summary)
     draw_flight(folder / "track.png", flight)
     draw_vehicle(folder / "vehicle.png", flight)
-    yield "plots"
 
 
-def _check_pictures(flight: Flight, planned: int, sea: str) -> None:
+def _check_pictures(flight: Flight, sea: str) -> None:
     """Warn of stations that were missed or lie off their lines.
 
     Args:
         flight: to judge.
-        planned: stations.
         sea: what may have carried the vehicle off.
 
     Raises:
         VehicleError: no picture was taken.
     """
+    planned = stations_of_dives(flight.plan)
     if not len(flight.trigger_s):
         raise VehicleError(
             f"{flight.vehicle.name} reached no line of the plan ({flight.ending} after "
@@ -159,7 +126,12 @@ def _check_pictures(flight: Flight, planned: int, sea: str) -> None:
             f"{one.thruster} {what}, found after {one.time_s:.0f} s: from there "
             f"on {flight.vehicle.name} counted on {one.left:.0%} of its thrust"
         )
-    _warn_of_heading(flight)
+    heading = np.rad2deg(flight.line_errors[1])
+    if np.isfinite(heading).any() and rms(heading) > MAX_HEADING_DEG:
+        warn(
+            f"on lines the heading was off by {rms(heading):.0f} deg rms, "
+            f"{np.nanmax(np.abs(heading)):.0f} at most: pictures do not lie square to their lines"
+        )
     if len(flight.trigger_s) < planned:
         warn(
             f"{len(flight.trigger_s)} of {planned} stations were reached: the mission "
@@ -170,16 +142,6 @@ def _check_pictures(flight: Flight, planned: int, sea: str) -> None:
             f"{flight.stations_off_line} of {len(flight.trigger_s)} pictures were taken more than "
             f"{flight.plan.allowed_offset_m:.2f} m off their lines, where neighbouring lines may "
             "leave gaps: choose more side_overlap, less current or another controller"
-        )
-
-
-def _warn_of_heading(flight: Flight) -> None:
-    """Warn where pictures are turned so far that they leave the strip of their line."""
-    heading = np.rad2deg(flight.line_errors[1])
-    if np.isfinite(heading).any() and rms(heading) > MAX_HEADING_DEG:
-        warn(
-            f"on lines the heading was off by {rms(heading):.0f} deg rms, "
-            f"{np.nanmax(np.abs(heading)):.0f} at most: pictures do not lie square to their lines"
         )
 
 
@@ -250,14 +212,14 @@ def draw_vehicle(path: Path, flight: Flight) -> None:
 
 def line_spans(flight: Flight) -> list[tuple[float, float]]:
     """When each line was begun and left, seconds."""
-    on = np.concatenate([[-1.0], flight.line, [-1.0]])
-    edges = np.flatnonzero(np.diff(on) != 0)
     time_s = flight.truth.time_s
-    return [
-        (float(time_s[first]), float(time_s[last - 1]))
-        for first, last in itertools.pairwise(edges)
-        if flight.line[first] >= 0
-    ]
+    return [(float(time_s[i]), float(time_s[j - 1])) for i, j in line_runs(flight.line)]
+
+
+def line_runs(line: Array) -> list[tuple[int, int]]:
+    """First tick on each line, and the one after the last, of (T,) lines, -1 between them."""
+    edges = np.flatnonzero(np.diff(line, prepend=-1.0, append=-1.0) != 0).tolist()
+    return [(i, j) for i, j in itertools.pairwise(edges) if line[i] >= 0]
 
 
 def true_current(flown: Flown) -> Array:
@@ -346,41 +308,34 @@ _BAG_EVERY = 2
 
 def true_log(flight: Flight) -> VehicleLog:
     """How the vehicle truly moved, and what its thrusters and fins did."""
-    flown = flight.flown
-    return vehicle_log(
-        flown.time_s,
-        source="truth",
-        position_ned=flown.truth[:, :3],
-        quaternion_xyzw=flown.truth[:, 3:7],
-        velocity_body=true_velocity(flown)[:, :3],
-        rates_body=flown.truth[:, 10:13],
-        rpm=rpm_of(flown),
-        others=_fin_columns(flight),
-    )
+    position, turn = flight.flown.truth[:, :3], flight.flown.truth[:, 3:7]
+    return _log(flight, "truth", position, turn, true_velocity(flight.flown))
 
 
 def believed_log(flight: Flight) -> VehicleLog:
     """What the vehicle's own computer knows of its motion, thrusters and fins."""
-    flown, log = flight.flown, flight.log
-    believed = believed_velocity(flown)
-    return vehicle_log(
-        flown.time_s,
-        source="navigation",
-        position_ned=log.position_ned,
-        quaternion_xyzw=rotation_from_attitude(*log.attitude_rad.T).as_quat(),
-        velocity_body=believed[:, :3],
-        rates_body=believed[:, 3:],
-        altitude_m=log.altitude_m,
-        rpm=rpm_of(flown),
-        others=_fin_columns(flight),
-    )
+    log, velocity = flight.log, believed_velocity(flight.flown)
+    turn = rotation_from_attitude(*log.attitude_rad.T).as_quat()
+    altitude_m = log.altitude_m
+    return _log(flight, "navigation", log.position_ned, turn, velocity, altitude_m=altitude_m)
 
 
-def _fin_columns(flight: Flight) -> dict[str, Array]:
-    """Angles of the fins, (T,) degrees each."""
+def _log(
+    flight: Flight, source: str, position: Array, turn: Array, velocity: Array, **more: Array
+) -> VehicleLog:
     angles = np.rad2deg(flight.flown.fin_rad).T
-    fins = flight.vehicle.fins
-    return {f"fin_{fin.name}_deg": angle for fin, angle in zip(fins, angles, strict=True)}
+    fins = zip(flight.vehicle.fins, angles, strict=True)
+    return vehicle_log(
+        flight.flown.time_s,
+        source=source,
+        position_ned=position,
+        quaternion_xyzw=turn,
+        velocity_body=velocity[:, :3],
+        rates_body=velocity[:, 3:],
+        rpm=rpm_of(flight.flown),
+        others={f"fin_{fin.name}_deg": angle for fin, angle in fins},
+        **more,
+    )
 
 
 def bag_record(flight: Flight) -> BagRecord:
@@ -471,20 +426,7 @@ def flight_summary(flight: Flight, vehicle: VehicleConfig, rig: Rig) -> dict[str
         "navigation_error_rms_m": _rms(np.linalg.norm(off[following, :2], axis=1)),
         "power_mean_w": float(flown.power_w.sum(axis=1).mean()),
         "energy_wh": dict(zip(flown.thrusters, energy_wh.tolist(), strict=True)),
-        "coverage": _coverage(flight, rig),
-    }
-
-
-def _coverage(flight: Flight, rig: Rig) -> dict[str, float]:
-    """What the pictures of the true track see of the whole area; `plan check` shows more."""
-    if not len(flight.trigger_s):
-        return {"covered_share": 0.0, "every_camera_share": 0.0, "share_at_overlap": 0.0}
-    pattern = plan_pattern(flight.plan, rig)
-    seen = certificate(flight.plan.area, rig, stations_of_flight(flight), pattern)
-    return {
-        "covered_share": seen.covered_share,
-        "every_camera_share": seen.every_camera_share,
-        "share_at_overlap": seen.share_at_overlap,
+        "coverage": covered_shares(plan, rig, stations_of_flight(flight)),
     }
 
 

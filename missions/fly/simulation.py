@@ -4,11 +4,11 @@ The part of a plan that is flown: all its dives in one go, or one of them.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import shapely
@@ -30,7 +30,7 @@ from alice_survey.core.config import (
 from alice_survey.core.errors import PlanError, VehicleError, warn
 from alice_survey.core.frames import Array, rotation_from_attitude
 from alice_survey.core.trajectory import Trajectory
-from alice_survey.sim.seafloor.terrain import survey_terrain
+from alice_survey.sim.seafloor.terrain import Terrain, survey_terrain
 from alice_survey.sim.vehicle.navigation.sensors import (
     CompassSpec,
     DvlSpec,
@@ -82,13 +82,14 @@ from alice_survey.sim.vehicle.simulator import Failure, Flown, Setup, simulate
 from alice_survey.sim.vehicle.vehicle import Vehicle
 from camera_calib.rig import Rig
 from missions.coverage.certificate import certificate
-from missions.coverage.stations import plan_pattern, stations_of_lines
+from missions.coverage.stations import Stations, plan_pattern, stations_of_lines
 from missions.exports.follower import cola2_delta_m, cola2_settings, sways
 from missions.exports.geometry import CameraMount
 from missions.exports.registry import read_mission
 from missions.route.energy import sound_vehicle
 from missions.values.flight import Flight, trigger_times
 from missions.values.legs import Leg, Route
+from missions.values.line import Line
 from missions.values.mission import Mission
 from missions.values.navigation import BelievedNavigation
 from missions.values.plan_file import Plan
@@ -161,17 +162,6 @@ def with_values(section: _Section, **values: Any) -> _Section:
     return type(section).model_validate({**section.model_dump(exclude_unset=True), **values})
 
 
-class SeaFloor(Protocol):
-    """What a flight needs to know of a sea floor."""
-
-    @property
-    def bounds_ne_m(self) -> tuple[float, float, float, float]:
-        """Least and greatest north, least and greatest east."""
-
-    def depth_at(self, points_ne: Array) -> Array:
-        """Depth, (...), at places (..., 2) within the bounds."""
-
-
 def simulate_plan(
     plan: Plan,
     settings: FlightSettings,
@@ -192,22 +182,28 @@ def simulate_plan(
         VehicleError: a setting does not fit the vehicle, or it cannot fly the plan's sway steps.
         NavigationError: the file of the current cannot be read.
     """
+    return _simulate(plan, settings, floor, rng, label)
+
+
+def _simulate(
+    plan: Plan,
+    settings: FlightSettings,
+    floor: FloorGrid,
+    rng: np.random.Generator,
+    label: str,
+    mission: PilotMission = NO_MISSION,
+    pictures: "PictureTimes" = trigger_times,
+) -> Flight:
     max_s = max_mission_s(plan)
-    setup = mission_setup(plan, settings, floor, max_s, rng)
-    flown = simulate(
-        setup, rng, max_s=max_s + ascent_s(plan), label=label, expected_s=plan.duration_s
-    )
-    return flight_of(plan, settings.camera.position_body_m, setup, flown)
+    setup = mission_setup(plan, settings, floor, max_s, rng, mission)
+    ascent_s = plan.seafloor_depth_m / _CLIMB_MPS
+    flown = simulate(setup, rng, max_s=max_s + ascent_s, label=label, expected_s=plan.duration_s)
+    return flight_of(plan, settings.camera.position_body_m, setup, flown, pictures)
 
 
 def max_mission_s(plan: Plan) -> float:
     """After how long a mission is aborted."""
     return _PATIENCE * (plan.duration_s + 2.0 * plan.seafloor_depth_m / _CLIMB_MPS)
-
-
-def ascent_s(plan: Plan) -> float:
-    """How long a vehicle may take to the surface."""
-    return plan.seafloor_depth_m / _CLIMB_MPS
 
 
 def piloting_of(
@@ -233,7 +229,7 @@ def piloting_of(
             "m/s: lower the speed"
         )
     path = path_of(plan)
-    turns = turns_in_place(path)
+    turns = int(np.count_nonzero(path.turn_rad))
     if turns and mission.law == NO_LAW and settings.vehicle.controller == "los":
         warn(
             f"{vehicle.name} cannot push itself sideways under the controller los: in each of the "
@@ -351,32 +347,21 @@ def current_of(
     sea: SeaConfig, seafloor_depth_m: float, duration_s: float, rng: np.random.Generator
 ) -> Current:
     """The current of a survey: measured, or as its settings have it; with its swell."""
-    current = _current_without_swell(sea, seafloor_depth_m, duration_s, rng)
-    if sea.swell_m == 0.0:
-        return current
-    return with_swell(
-        current,
-        sea.swell_m,
-        sea.swell_period_s,
-        sea.swell_towards_deg,
-        seafloor_depth_m,
-        duration_s,
-    )
-
-
-def _current_without_swell(
-    sea: SeaConfig, seafloor_depth_m: float, duration_s: float, rng: np.random.Generator
-) -> Current:
     if sea.current_file is not None:
-        return read_current(sea.current_file)
-    surface = sea.current_mps if sea.surface_current_mps is None else sea.surface_current_mps
-    mean = sheared_current(
-        np.array([0.0, seafloor_depth_m]),
-        np.array([[speed, sea.current_towards_deg] for speed in (surface, sea.current_mps)]),
-    )
-    if sea.current_sigma_mps == 0.0:
-        return mean
-    return varying_current(mean, sea.current_sigma_mps, sea.current_correlation_s, duration_s, rng)
+        current = read_current(sea.current_file)
+    else:
+        surface = sea.current_mps if sea.surface_current_mps is None else sea.surface_current_mps
+        current = sheared_current(
+            np.array([0.0, seafloor_depth_m]),
+            np.array([[speed, sea.current_towards_deg] for speed in (surface, sea.current_mps)]),
+        )
+        sigma, lasting_s = sea.current_sigma_mps, sea.current_correlation_s
+        if sigma > 0.0:
+            current = varying_current(current, sigma, lasting_s, duration_s, rng)
+    waves = sea.swell_m, sea.swell_period_s, sea.swell_towards_deg
+    if sea.swell_m > 0.0:
+        current = with_swell(current, *waves, seafloor_depth_m, duration_s)
+    return current
 
 
 def sensors_of(navigation: NavigationConfig, camera: CameraConfig) -> SensorSuite:
@@ -401,7 +386,7 @@ def sensors_of(navigation: NavigationConfig, camera: CameraConfig) -> SensorSuit
     )
 
 
-def floor_grid(floor: SeaFloor) -> FloorGrid:
+def floor_grid(floor: Terrain) -> FloorGrid:
     """A sea floor on a grid for compiled code."""
     south, north, west, east = floor.bounds_ne_m
     inset = 1e-6
@@ -584,25 +569,13 @@ def simulate_mission(
         PlanError: the file holds no mission of this plan.
         VehicleError: the autopilot cannot fly this vehicle, or is not the one of the file.
     """
-    known, camera = mission_of_settings(plan, settings), settings.camera
-    flown_by = pilot_mission(known, settings.vehicle, _mount(camera))
+    known, vehicle = mission_of_settings(plan, settings), settings.vehicle
+    flown_by = pilot_mission(known, vehicle, _mount(settings.camera))
     # Our own pilot holds places by sway where a vehicle has it, which the laws may ask for.
-    own = settings.vehicle.model_copy(
-        update={"controller": "sway" if _sways(settings.vehicle, plan.speed_mps) else "los"}
-    )
-    max_s = max_mission_s(known.plan)
-    setup = mission_setup(
-        known.plan, replace(settings, vehicle=own), floor, max_s, rng, mission=flown_by
-    )
-    flown = simulate(
-        setup,
-        rng,
-        max_s=max_s + ascent_s(plan),
-        label=label,
-        expected_s=known.plan.duration_s,
-    )
-    pictures = partial(picture_times, known)
-    return flight_of(known.plan, camera.position_body_m, setup, flown, pictures)
+    has_sway = sways(gains_for(sound_vehicle(vehicle), plan.speed_mps))
+    own = vehicle.model_copy(update={"controller": "sway" if has_sway else "los"})
+    own_settings, pictures = replace(settings, vehicle=own), partial(picture_times, known)
+    return _simulate(known.plan, own_settings, floor, rng, label, flown_by, pictures)
 
 
 def mission_of_settings(plan: Plan, settings: FlightSettings) -> MissionOfPlan:
@@ -621,10 +594,6 @@ def _mount(camera: CameraConfig) -> CameraMount:
     return CameraMount(
         glass_body_m=camera.position_body_m, altimeter_body_m=camera.dvl_position_body_m
     )
-
-
-def _sways(vehicle: VehicleConfig, speed_mps: float) -> bool:
-    return sways(gains_for(sound_vehicle(vehicle), speed_mps))
 
 
 def pilot_mission(
@@ -738,20 +707,15 @@ def overshoot_m(known: MissionOfPlan, flight: Flight) -> list[float]:
     Zero where the step was done before its end was passed. ArduSub comes to rest at an end, about
     which it may swing within its radius: only what is beyond counts.
     """
-    report = flight.flown.report
-    ends, starts = (
-        known.mission.ends_ne(known.plan.datum),
-        known.mission.starts_ne(known.plan.datum),
-    )
+    report, mission, datum = flight.flown.report, known.mission, known.plan.datum
+    ends, starts = mission.ends_ne(datum), mission.starts_ne(datum)
     beyond = []
     for i, index in enumerate(known.line):
         if index < 0 or (i + 1 < len(known.line) and known.line[i + 1] == index):
             continue
         rows = report[:, LEG] == i
         start = starts[i] if np.isfinite(starts[i]).all() else ends[i - 1]
-        swing_m = (
-            known.mission.steps[i].tolerance_m if known.mission.autopilot == "ardusub" else 0.0
-        )
+        swing_m = mission.steps[i].tolerance_m if mission.autopilot == "ardusub" else 0.0
         along = report[rows, ALONG] - math.dist(start, ends[i]) - swing_m
         beyond.append(max(0.0, float(along.max(initial=-math.inf))))
     return beyond
@@ -766,12 +730,7 @@ def mission_summary(known: MissionOfPlan, flight: Flight, rig: Rig) -> dict[str,
         rig: the cameras in the survey's water.
     """
     plan = known.plan
-    lines = [
-        line for dive in plan.dives for line in plan.lines[dive.first_line : dive.last_line + 1]
-    ]
-    promised = certificate(
-        plan.area, rig, stations_of_lines(lines, plan.altitude_m), plan_pattern(plan, rig)
-    )
+    promised = stations_of_lines(_flown_lines(plan), plan.altitude_m)
     beyond_m = overshoot_m(known, flight)
     return {
         "file": known.path.name,
@@ -781,12 +740,15 @@ def mission_summary(known: MissionOfPlan, flight: Flight, rig: Rig) -> dict[str,
         "line_ends": len(beyond_m),
         "line_ends_overshot": sum(beyond > PASSED_M for beyond in beyond_m),
         "overshot_worst_m": max(beyond_m, default=0.0),
-        "planned": {
-            "covered_share": promised.covered_share,
-            "every_camera_share": promised.every_camera_share,
-            "share_at_overlap": promised.share_at_overlap,
-        },
+        "planned": covered_shares(plan, rig, promised),
     }
+
+
+def covered_shares(plan: Plan, rig: Rig, stations: Stations) -> dict[str, float]:
+    """What the pictures of some stations see of the whole area; `plan check` shows more."""
+    seen = certificate(plan.area, rig, stations, plan_pattern(plan, rig))
+    names = ("covered_share", "every_camera_share", "share_at_overlap")
+    return {name: getattr(seen, name) for name in names}
 
 
 _SAME_RAD = 1e-6
@@ -822,11 +784,13 @@ def one_dive(plan: Plan, dive: int | None) -> Plan:
 
 def stations_of_dives(plan: Plan) -> int:
     """How many times all cameras take a picture on the plan's dives."""
-    return sum(
-        line.stations
-        for dive in plan.dives
-        for line in plan.lines[dive.first_line : dive.last_line + 1]
-    )
+    return sum(line.stations for line in _flown_lines(plan))
+
+
+def _flown_lines(plan: Plan) -> list[Line]:
+    return [
+        line for dive in plan.dives for line in plan.lines[dive.first_line : dive.last_line + 1]
+    ]
 
 
 def whole_route(plan: Plan) -> Route:
@@ -835,14 +799,11 @@ def whole_route(plan: Plan) -> Route:
     Raises:
         PlanError: a dive begins elsewhere than the one before has ended.
     """
-    return Route(legs=tuple(_join_dives(plan)))
-
-
-def _join_dives(plan: Plan) -> Iterator[Leg]:
-    last: Leg | None = None
+    legs: list[Leg] = []
     for dive in plan.dives:
         first = dive.route.legs[0]
-        if last is not None:
+        if legs:
+            last = legs[-1]
             away_m = math.dist(last.end_ne_m, first.start_ne_m)
             if away_m > _SAME_HOME_M:
                 raise PlanError(
@@ -852,16 +813,12 @@ def _join_dives(plan: Plan) -> Iterator[Leg]:
             heading = last.end_heading_rad + last.side_rad
             turn = math.remainder(first.heading_rad + first.side_rad - heading, 2 * math.pi)
             if abs(turn) > _SAME_RAD:
-                yield Leg(
-                    start_ne_m=last.end_ne_m,
-                    heading_rad=heading,
-                    length_m=0.0,
-                    curvature_per_m=0.0,
-                    line=-1,
-                    turn_rad=turn,
-                )
-        yield from dive.route.legs
-        last = dive.route.legs[-1]
+                legs.append(
+                    Leg(start_ne_m=last.end_ne_m, heading_rad=heading, length_m=0.0,
+                        curvature_per_m=0.0, line=-1, turn_rad=turn)
+                )  # fmt: skip
+        legs += dive.route.legs
+    return Route(legs=tuple(legs))
 
 
 def path_of(plan: Plan) -> PilotPath:
@@ -878,11 +835,6 @@ def path_of(plan: Plan) -> PilotPath:
         turn_rad=[leg.turn_rad for leg in legs],
         side_rad=[leg.side_rad for leg in legs],
     )
-
-
-def turns_in_place(path: PilotPath) -> int:
-    """How many there are."""
-    return int(np.count_nonzero(path.turn_rad))
 
 
 def room_behind_m(plan: Plan, path: PilotPath, max_m: float) -> float:
