@@ -7,7 +7,6 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import chain
 from typing import Any
 
@@ -18,7 +17,6 @@ from shapely.geometry import Point
 from alice_survey.core.config import AreaConfig, PlanConfig, SurveyConfig
 from alice_survey.core.errors import PlanError, keep_warnings, warn
 from alice_survey.sim.vehicle.vehicle import POINT, Hull
-from camera_calib.camera import Camera
 from camera_calib.rig import Rig
 from missions.areas.bathymetry import Bathymetry, mean_depth_m, read_bathymetry
 from missions.areas.survey import survey_area
@@ -56,7 +54,7 @@ from missions.route.terrain import (
 )
 from missions.values.area import Area
 from missions.values.costs import Costs
-from missions.values.footprint import Swath, common_swath, footprint_size_m
+from missions.values.footprint import Swath, common_swath
 from missions.values.line import Line
 from missions.values.pattern import Pattern
 from missions.values.plan_file import Plan
@@ -142,8 +140,7 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
             max(stereo.port_m, stereo.starboard_m),
             max(stereo.ahead_m, stereo.astern_m),
         )
-        camera = rig.cameras[rig.reference]
-        depths_m, figures = _terrain(lines, plan, reach, pattern, camera, bathymetry)
+        depths_m, figures = _terrain(lines, plan, reach, bathymetry)
         deepest_m, rating_m = max([below_m, *chain.from_iterable(depths_m)]), vehicle.depth_rating_m
         if rating_m is not None and deepest_m > rating_m:
             raise PlanError(
@@ -332,12 +329,7 @@ def area_bathymetry(settings: AreaConfig, area: Area, altitude_m: float) -> Bath
 
 
 def _terrain(
-    lines: Sequence[Line],
-    plan: PlanConfig,
-    reach: Reach,
-    pattern: Pattern,
-    camera: Camera,
-    bathymetry: Bathymetry | None,
+    lines: Sequence[Line], plan: PlanConfig, reach: Reach, bathymetry: Bathymetry | None
 ) -> tuple[tuple[tuple[float, ...], ...], dict[str, Any] | None]:
     """How lines follow a bathymetry: depths of the glass at each station, and figures."""
     if bathymetry is None:
@@ -348,17 +340,8 @@ def _terrain(
         steepest_rad=math.radians(plan.steepest_deg),
     )
     profiles = line_profiles(lines, bathymetry, reach, limits)
-    figures = terrain_figures(
-        lines,
-        profiles,
-        limits,
-        relief_m=plan.relief_m,
-        spacing_m=pattern.spacing_m,
-        step_m=pattern.step_m,
-        extent_m=partial(footprint_size_m, camera),
-    )
     depths = tuple(tuple(round(float(d), 4) for d in p.depth_m) for p in profiles)
-    return depths, figures
+    return depths, terrain_figures(profiles, limits, plan.relief_m)
 
 
 def _stations(plan: Plan, bathymetry: Bathymetry | None) -> Stations:

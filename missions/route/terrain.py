@@ -13,7 +13,7 @@ follow, the altitude rises.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -235,81 +235,39 @@ def line_profiles(
 
 
 def terrain_figures(
-    lines: Sequence[Line],
-    profiles: Sequence[DepthProfile],
-    limits: TerrainLimits,
-    *,
-    relief_m: float,
-    spacing_m: float,
-    step_m: float,
-    extent_m: Callable[[float], tuple[float, float]],
+    profiles: Sequence[DepthProfile], limits: TerrainLimits, relief_m: float
 ) -> dict[str, Any]:
     """The figures of following the terrain, and a warning where pictures suffer.
 
     Args:
-        lines: of the plan.
-        profiles: of each.
+        profiles: of each line.
         limits: that they keep.
         relief_m: what the imaging settings allow for beyond the planned altitude.
-        spacing_m: of the lines.
-        step_m: of the pictures.
-        extent_m: footprint across and along at an altitude.
+
+    Returns:
+        Among others what happens if a vehicle keeps one altitude above the floor below instead:
+        `max_difference_m` from the profiles, and `min_clearance_m` above the highest floor within
+        reach, negative where the vehicle runs into it.
     """
-    altitude = np.concatenate([profile.altitude_m for profile in profiles])
-    low, high = float(altitude.min()), float(altitude.max())
-    floor_slopes = [_steepest(np.arctan2(np.diff(p.floor_m), np.diff(p.along_m))) for p in profiles]
-    slopes = [_steepest(profile.slopes_rad) for profile in profiles]
-    climbing = [int(np.sum(p.clearance_m > limits.altitude_m + 1e-6)) for p in profiles]
-    highest_on = int(np.argmax([profile.altitude_m.max() for profile in profiles]))
-    worst = profiles[highest_on]
-    at_m = float(worst.along_m[int(np.argmax(worst.altitude_m))])
-    across, along = extent_m(low)
-    rows = [
-        {
-            "line": index,
-            "altitude_m": [float(p.altitude_m.min()), float(p.altitude_m.max())],
-            "depth_m": [float(p.depth_m.min()), float(p.depth_m.max())],
-            "steepest_deg": math.degrees(slopes[index]),
-            "steepest_floor_deg": math.degrees(floor_slopes[index]),
-            "raised_stations": climbing[index],
-        }
-        for index, p in enumerate(profiles)
-    ]
-    data: dict[str, Any] = {
-        "altitude_m": [low, high],
-        "least_clearance_m": float(min(p.clearance_m.min() for p in profiles)),
-        "at_constant_altitude": _at_constant_altitude(profiles, limits.altitude_m),
-        "steepest_deg": math.degrees(max(slopes)),
-        "steepest_floor_deg": math.degrees(max(floor_slopes)),
-        "raised_stations": sum(climbing),
-        "highest": {"line": highest_on, "along_m": at_m, "altitude_m": high},
-        "least_side_overlap": 1.0 - spacing_m / across,
-        "least_forward_overlap": 1.0 - step_m / along,
-        "coarsest_pixel": high / limits.altitude_m,
-        "lines": rows,
-    }
+    line = int(np.argmax([profile.altitude_m.max() for profile in profiles]))
+    highest = profiles[line].altitude_m
+    at_m, high = float(profiles[line].along_m[highest.argmax()]), float(highest.max())
     if high > limits.altitude_m + relief_m:
         warn(
-            f"line {highest_on}, {at_m:.1f} m along: the sea floor falls away faster than "
+            f"line {line}, {at_m:.1f} m along: the sea floor falls away faster than "
             f"{math.degrees(limits.steepest_rad):g} deg, so that pictures are taken from "
             f"{high:.2f} m, beyond altitude_m + relief_m = {limits.altitude_m + relief_m:g} m: "
             "raise plan.steepest_deg or plan.relief_m, or turn the lines along the slope"
         )
-    return data
-
-
-def _at_constant_altitude(profiles: Sequence[DepthProfile], altitude_m: float) -> dict[str, float]:
-    """What happens if a vehicle keeps one altitude above the floor below instead of the profiles.
-
-    Returns:
-        `max_difference_m` from the profiles, and `min_clearance_m` above the highest floor within
-        reach: negative where the vehicle runs into it.
-    """
+    altitude = np.concatenate([p.altitude_m for p in profiles])
+    below = np.concatenate([p.highest_floor_m - p.floor_m for p in profiles])
     return {
-        "max_difference_m": max(float(np.abs(p.altitude_m - altitude_m).max()) for p in profiles),
-        "min_clearance_m": min(
-            float((altitude_m + p.highest_floor_m - p.floor_m).min()) for p in profiles
-        ),
+        "altitude_m": [float(altitude.min()), high],
+        "least_clearance_m": float(min(p.clearance_m.min() for p in profiles)),
+        "at_constant_altitude": {
+            "max_difference_m": float(np.abs(altitude - limits.altitude_m).max()),
+            "min_clearance_m": float((limits.altitude_m + below).min()),
+        },
     }
 
 
@@ -318,7 +276,3 @@ def _spread(low: float, high: float, finest: float) -> Array:
     below = np.linspace(low, 0.0, max(math.ceil(-low / finest), 1) + 1)
     above = np.linspace(0.0, high, max(math.ceil(high / finest), 1) + 1)
     return np.concatenate([below, above[1:]])
-
-
-def _steepest(slopes_rad: Array) -> float:
-    return float(np.abs(slopes_rad).max(initial=0.0))

@@ -46,19 +46,8 @@ _WAIT_S = 30.0
 """For the first worker of a scheduler, and before a missing worker is reported."""
 _LOOK_EVERY_S = 2.0
 _GOES_ON = "the same command goes on from here"
-_MEMORY = "MEMORY"
-"""Resource of workers that Dask's documentation gives that name, in bytes."""
 _LOOPBACK = {"dashboard_address": "127.0.0.1:0", "worker_dashboard_address": "127.0.0.1:0"}
 """Options of a local cluster without which its pages can be opened from other machines."""
-
-
-class TlsConfig(Config):
-    """Files of a connection that is encrypted and authenticated."""
-
-    ca: Path
-    """Certificate of the authority that signed those of scheduler and workers."""
-    certificate: Path
-    key: Path
 
 
 class ClusterConfig(Config):
@@ -74,7 +63,6 @@ class ClusterConfig(Config):
     """With `start`: how many workers to ask for."""
     options: dict[str, Any] = Field(default_factory=dict)
     """With `start`: arguments of the class."""
-    tls: TlsConfig | None = None
 
     @model_validator(mode="after")
     def _one_cluster(self) -> Self:
@@ -84,20 +72,6 @@ class ClusterConfig(Config):
         if self.start is None and (self.workers or self.options):
             raise ValueError("workers and options are of a cluster to start: give start too")
         return self
-
-    @property
-    def security(self) -> dict[str, Any]:
-        """How to connect, as an argument of clients and clusters; none for Dask's own settings."""
-        from distributed.security import Security
-
-        if self.tls is None:
-            return {}
-        files = {
-            "tls_ca_file": str(self.tls.ca),
-            "tls_client_cert": str(self.tls.certificate),
-            "tls_client_key": str(self.tls.key),
-        }
-        return {"security": Security(require_encryption=True, **files)}
 
 
 def read_cluster_file(path: Path) -> ClusterConfig:
@@ -139,9 +113,8 @@ def _connect(config: ClusterConfig) -> Iterator["Client"]:
             given = {"scheduler_file": str(config.scheduler_file)}
             if not config.scheduler_file.is_file():
                 raise ConfigError(f"{where}: no such file; 'dask scheduler' writes one")
-        given |= {"timeout": _CONNECT_S, "set_as_default": False} | config.security
         try:
-            client = stack.enter_context(Client(**given))
+            client = stack.enter_context(Client(**given, timeout=_CONNECT_S, set_as_default=False))
         except (OSError, ValueError, TypeError, KeyError) as error:
             raise WorkspaceError(
                 f"the scheduler at {where} does not answer ({why(error)}): start it with 'dask "
@@ -156,7 +129,7 @@ def _start_cluster(config: ClusterConfig) -> Iterator[Any]:
     local = _LOOPBACK if name == "LocalCluster" else {}
     try:
         kind = getattr(import_module(module), name)
-        cluster = kind(**local | config.options | config.security)
+        cluster = kind(**local | config.options)
     except (ImportError, AttributeError, TypeError, ValueError, OSError, RuntimeError) as error:
         raise ConfigError(
             f"start = {config.start!r}: {why(error)}; give a class that can be imported here, such "
@@ -386,8 +359,6 @@ class _Tasks:
         options: dict[str, Any] = {}
         if cluster.unfit or len(large) < len(fit):
             options = {"workers": sorted(large), "allow_other_workers": True}  # once these ended
-        if self._memory and large and all(_MEMORY in w["resources"] for w in large.values()):
-            options["resources"] = {_MEMORY: self._memory}
         key = f"{self.label}-{cluster.site.store.name}-{next(cluster.numbers)}"
         with cluster.report_loss():
             return cluster.client.submit(

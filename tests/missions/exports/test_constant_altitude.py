@@ -38,10 +38,7 @@ def plan_over(folder: Path, wall_m: float, slope: float = 0.0) -> Plan:
     lines = small_plan().lines
     limits = TerrainLimits(altitude_m=2.0, least_clearance_m=1.0, steepest_rad=np.deg2rad(30.0))
     profiles = line_profiles(lines, bathymetry, REACH, limits)
-    figures = terrain_figures(
-        lines, profiles, limits,
-        relief_m=10.0, spacing_m=1.0, step_m=0.46, extent_m=lambda m: (0.7 * m, 0.6 * m),
-    )  # fmt: skip
+    figures = terrain_figures(profiles, limits, relief_m=10.0)
     depths = tuple(tuple(map(float, profile.depth_m)) for profile in profiles)
     return small_plan(line_depths_m=depths, seafloor_depth_m=16.0, details={"terrain": figures})
 
