@@ -32,7 +32,7 @@ from alice_survey.kit.figure import (
     save_figure,
 )
 from alice_survey.sim.vehicle import estimate_vector as vector
-from alice_survey.sim.vehicle.log import VehicleLog, vehicle_log, write_vehicle_log
+from alice_survey.sim.vehicle.log import VehicleLog, write_vehicle_log
 from alice_survey.sim.vehicle.navigation import tick as navigation
 from alice_survey.sim.vehicle.navigation.tick import LOG_COLUMNS
 from alice_survey.sim.vehicle.pilot.memory import FOLLOW, PHASE
@@ -325,8 +325,8 @@ def _log(
 ) -> VehicleLog:
     angles = np.rad2deg(flight.flown.fin_rad).T
     fins = zip(flight.vehicle.fins, angles, strict=True)
-    return vehicle_log(
-        flight.flown.time_s,
+    return VehicleLog(
+        time_s=flight.flown.time_s,
         source=source,
         position_ned=position,
         quaternion_xyzw=turn,

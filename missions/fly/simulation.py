@@ -40,7 +40,7 @@ from alice_survey.sim.vehicle.navigation.sensors import (
 )
 from alice_survey.sim.vehicle.navigation.tick import LOG_COLUMNS
 from alice_survey.sim.vehicle.pilot import mission as pilot
-from alice_survey.sim.vehicle.pilot.command import Piloting
+from alice_survey.sim.vehicle.pilot.command import Failure, Piloting
 from alice_survey.sim.vehicle.pilot.gains import Gains, gains_for, pitch_divergence_speed_mps
 from alice_survey.sim.vehicle.pilot.memory import (
     ALONG,
@@ -78,7 +78,7 @@ from alice_survey.sim.vehicle.sea import (
     varying_current,
     with_swell,
 )
-from alice_survey.sim.vehicle.simulator import Failure, Flown, Setup, simulate
+from alice_survey.sim.vehicle.simulator import Flown, Setup, simulate
 from alice_survey.sim.vehicle.vehicle import Vehicle
 from camera_calib.rig import Rig
 from missions.coverage.certificate import certificate

@@ -34,7 +34,7 @@ from alice_survey.core.frames import Array, attitude_from_rotation, rotation_fro
 from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.navigation.sensors import DvlSpec
 from alice_survey.sim.vehicle.pilot import memory as slot
-from alice_survey.sim.vehicle.pilot.command import WATCHED_S, FoundFailure, Pilot
+from alice_survey.sim.vehicle.pilot.command import WATCHED_S, Failure, Pilot
 from alice_survey.sim.vehicle.pilot.memory import NONE, REASONS
 from alice_survey.sim.vehicle.rotations import wrap_angle
 from alice_survey.sim.vehicle.simulator import TICK_S
@@ -164,7 +164,7 @@ class PilotLoop:
         """
         self.pilot, self.limits = pilot, limits
         pilot.state.memory[slot.SIGMA_M] = math.inf  # odometry is not asked for its sigma
-        self.state, self.failures = LinkState.WAITING, list[FoundFailure]()
+        self.state, self.failures = LinkState.WAITING, list[Failure]()
         self.refused: Counter[str] = Counter()
         """How many messages were refused, by reason."""
         self.late_ticks, self.ticks, self.jumps = 0, 0, 0

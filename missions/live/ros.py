@@ -37,8 +37,8 @@ from alice_survey.sim.vehicle.allocation import (
     new_allocation,
 )
 from alice_survey.sim.vehicle.dynamics import STATE
-from alice_survey.sim.vehicle.navigation.filter import DVL_TIME, DVL_VELOCITY, PUSH, RATES
-from alice_survey.sim.vehicle.navigation.sensors import DVL
+from alice_survey.sim.vehicle.navigation.filter import BEAM, PUSH, RATES
+from alice_survey.sim.vehicle.navigation.sensors import DVL, beam_velocity
 from alice_survey.sim.vehicle.navigation.tick import LOG_ROW, LOG_SIGMA, log_row
 from alice_survey.sim.vehicle.sea import floor_range
 from alice_survey.sim.vehicle.simulator import TICK_S, SimulatedVehicle
@@ -608,8 +608,9 @@ class VehicleNode:
         if self.vehicle.tick % self.vehicle.parts.sensors.dvl_every == 0:
             reach = self._altimeter_range(turn)
             sent.append((self.altimeter, build.range(stamp_ns, frames["dvl"], reach)))
-            velocity = readings[DVL_VELOCITY : DVL_VELOCITY + 3]
-            if np.all(np.isfinite(velocity)) and readings[DVL_TIME] == self.vehicle.tick * TICK_S:
+            beams = self.vehicle.parts.sensors.beams
+            velocity = beam_velocity(beams, readings[BEAM : BEAM + 4])
+            if np.all(np.isfinite(velocity)):
                 velocity = flipped_body(velocity)
                 sent.append((self.dvl, build.velocity(stamp_ns, frames["dvl"], velocity)))
         return [*sent, (self.clock, build.make(CLOCK, clock=build.stamp(stamp_ns)))]

@@ -293,7 +293,7 @@ def _at_origin(
 
 def _write_vehicle_log(path: Path, dive: LoggedDive, at_s: Array, options: ImportOptions) -> None:
     """The vehicle log (docs/vehicle-logs.md) at the rows' times, (N,) as logged, from the first."""
-    from alice_survey.sim.vehicle.log import vehicle_log, write_vehicle_log
+    from alice_survey.sim.vehicle.log import VehicleLog, write_vehicle_log
 
     # Depths of the log, not of the chart: a vehicle's log knows of no tide.
     columns = navigation_table(dive, at_s, options, 0.0)
@@ -302,8 +302,8 @@ def _write_vehicle_log(path: Path, dive: LoggedDive, at_s: Array, options: Impor
     )
     position = of_known(place, 3, lambda row: Datum(*map(float, row[0, :2])).ned_from_geodetic(row))
     quaternion = of_known(angles, 4, lambda row: rotation_of(row).as_quat(canonical=True))
-    velocity = None if dive.velocity_body is None else dive.velocity_body.at(at_s)
-    if velocity is None and dive.velocity_ned is not None:
+    velocity = np.empty(0) if dive.velocity_body is None else dive.velocity_body.at(at_s)
+    if dive.velocity_body is None and dive.velocity_ned is not None:
         velocity = of_known(
             np.hstack([angles, dive.velocity_ned.at(at_s)]), 3,
             lambda row: rotation_of(row[:, :3]).inv().apply(row[:, 3:]),
@@ -312,13 +312,13 @@ def _write_vehicle_log(path: Path, dive: LoggedDive, at_s: Array, options: Impor
     others = {}
     if dive.pwm is not None:
         others = {f"pwm_{i}_us": column for i, column in enumerate(dive.pwm.at(at_s).T, 1)}
-    log = vehicle_log(
-        np.round(at_s - at_s[0], 6),
+    log = VehicleLog(
+        time_s=np.round(at_s - at_s[0], 6),
         source=str(path),
         position_ned=position,
         quaternion_xyzw=quaternion,
         velocity_body=velocity,
-        rates_body=None if dive.rates is None else dive.rates.at(at_s),
+        rates_body=np.empty(0) if dive.rates is None else dive.rates.at(at_s),
         altitude_m=columns["altitude_m"],
         rpm=rpm,
         others=others,

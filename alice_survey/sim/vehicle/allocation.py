@@ -25,8 +25,8 @@ x = W_f f.
 
 The redistributed pseudo-inverse:
 f = -c + W^-1 B^T (B W^-1 B^T + eps I)^-1 (tau + B_0 c): the columns of B of thrusters that are
-saturated are zero, and c holds minus their thrust. The identity has as many rows as there are axes
-requested (the paper prints I_3 next to a 6 x 5 matrix).
+saturated are zero, and c holds minus their thrust. Here eps goes to 0: the least-norm solution that
+the exact solver takes its steps by (the paper prints I_3 next to a 6 x 5 matrix).
 """
 
 import math
@@ -128,11 +128,30 @@ def allocate_exact(
         Number of least-squares problems solved; negative if that many were not enough, with
         `thrust` within the bounds but perhaps not the best.
     """
+    n = matrix.shape[1]
+    m = _pose(matrix, wrench, lower, upper, axes, weights, scratch)
+    limit = 10 * n + 10
+    solved = _min_residual(m, n, scratch, limit)
+    if solved > 1:
+        solved = _min_norm(m, n, scratch, solved, limit)
+    _write_thrust(lower, upper, thrust, scratch)
+    return solved
+
+
+@kernel
+def _pose(
+    matrix: Array,
+    wrench: Array,
+    lower: Array,
+    upper: Array,
+    axes: Array,
+    weights: Array,
+    scratch: AllocationScratch,
+) -> int:
+    """Write the problem for x = W_f f, with x as near to 0 as the bounds allow; return its rows."""
     n, m = matrix.shape[1], 0
-    a, state, scale = scratch.matrices[0], scratch.states, scratch.vectors[_SCALE]
-    x, b, low, high = (
-        scratch.vectors[_X], scratch.vectors[_B], scratch.vectors[_LOW], scratch.vectors[_HIGH],
-    )  # fmt: skip
+    a, state, v = scratch.matrices[0], scratch.states, scratch.vectors
+    x, b, low, high, scale = v[_X], v[_B], v[_LOW], v[_HIGH], v[_SCALE]
     for i in range(n):
         scale[i] = 1.0 / math.sqrt(weights[i])
         low[i], high[i] = lower[i] / scale[i], upper[i] / scale[i]
@@ -144,13 +163,15 @@ def allocate_exact(
             for i in range(n):
                 a[m, i] = axes[axis] * matrix[axis, i] * scale[i]
             m += 1
-    limit = 10 * n + 10
-    solved = _min_residual(m, n, scratch, limit)
-    if solved > 1:
-        solved = _min_norm(m, n, scratch, solved, limit)
-    for i in range(n):
+    return m
+
+
+@kernel
+def _write_thrust(lower: Array, upper: Array, thrust: Array, scratch: AllocationScratch) -> None:
+    """Write the thrusts, (n,), that x stands for."""
+    x, scale = scratch.vectors[_X], scratch.vectors[_SCALE]
+    for i in range(thrust.shape[0]):
         thrust[i] = min(max(x[i] * scale[i], lower[i]), upper[i])
-    return solved
 
 
 @kernel
@@ -373,10 +394,6 @@ def _pseudo_solve(m: int, n: int, right: Array, out: Array, scratch: AllocationS
     return rank
 
 
-_EPSILON = 1e-9
-"""Regularisation, as a share of the mean diagonal of B W^-1 B^T."""
-
-
 @kernel
 def allocate_rpi(
     matrix: Array,
@@ -401,68 +418,24 @@ def allocate_rpi(
     Returns:
         Number of solutions computed.
     """
-    n = matrix.shape[1]
-    gram, solution, held = scratch.matrices[0], scratch.vectors[0], scratch.states
-    for i in range(n):
-        held[i] = 1 if upper[i] <= lower[i] else 0
-        thrust[i] = min(max(0.0, lower[i]), upper[i])
-    rounds, again = 0, True
+    n, rounds, again = matrix.shape[1], 0, True
+    m = _pose(matrix, wrench, lower, upper, axes, weights, scratch)
+    a, state, v = scratch.matrices[0], scratch.states, scratch.vectors
+    x, b, low, high, step, rest = v[_X], v[_B], v[_LOW], v[_HIGH], v[_STEP], v[_REST]
     while again:
-        rounds, again, m = rounds + 1, False, 0
-        for a in range(6):
-            if axes[a] <= 0.0:
-                continue
-            rest = wrench[a]
+        rounds, again = rounds + 1, False
+        for k in range(m):
+            rest[k] = b[k]
             for i in range(n):
-                if held[i]:
-                    rest -= matrix[a, i] * thrust[i]
-            solution[m] = axes[a] * rest
-            k = 0
-            for b in range(a + 1):
-                if axes[b] <= 0.0:
-                    continue
-                total = 0.0
-                for i in range(n):
-                    if not held[i]:
-                        total += matrix[a, i] * matrix[b, i] / weights[i]
-                gram[m, k] = axes[a] * axes[b] * total
-                k += 1
-            m += 1
-        trace = 0.0
-        for a in range(m):
-            trace += gram[a, a]
-        if trace == 0.0:
-            break
-        for a in range(m):
-            gram[a, a] += _EPSILON * trace / m
-        # By Cholesky, in place: gram is symmetric, of which the lower half is given.
-        for a in range(m):
-            for b in range(a + 1):
-                total = gram[a, b]
-                for k in range(b):
-                    total -= gram[a, k] * gram[b, k]
-                gram[a, b] = math.sqrt(total) if a == b else total / gram[b, b]
-            for k in range(a):
-                solution[a] -= gram[a, k] * solution[k]
-            solution[a] /= gram[a, a]
-        for a in range(m - 1, -1, -1):
-            for k in range(a + 1, m):
-                solution[a] -= gram[k, a] * solution[k]
-            solution[a] /= gram[a, a]
+                if state[i] == _FIXED:
+                    rest[k] -= a[k, i] * x[i]
+        _pseudo_solve(m, n, rest, step, scratch)
         for i in range(n):
-            if held[i]:
-                continue
-            total, k = 0.0, 0
-            for a in range(6):
-                if axes[a] > 0.0:
-                    total += axes[a] * matrix[a, i] * solution[k]
-                    k += 1
-            thrust[i] = total / weights[i]
-        for i in range(n):
-            if not held[i] and not lower[i] <= thrust[i] <= upper[i]:
-                thrust[i] = min(max(thrust[i], lower[i]), upper[i])
-                held[i] = 1
-                again = True
+            if state[i] == _FREE:
+                x[i] = min(max(step[i], low[i]), high[i])
+                if x[i] != step[i]:
+                    state[i], again = _FIXED, True
+    _write_thrust(lower, upper, thrust, scratch)
     return rounds
 
 

@@ -19,15 +19,16 @@ stalled flow smoothly over `_STALLS_OVER_RAD`. Fins on one shaft, or linked, tur
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
-from pydantic import ConfigDict
+from pydantic import Field, NonNegativeFloat, PositiveFloat
+from pydantic.dataclasses import dataclass
 
 from alice_survey.core.compiled import kernel
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
+from alice_survey.sim.vehicle.propulsion import FILE_PART
 
 _SECTION_SHARE = 0.9
 """Lift slope of a section over the 2 pi of theory (Hoerner; Prestero 2001, equation 4.46)."""
@@ -37,48 +38,37 @@ _STALLS_OVER_RAD = math.radians(10.0)
 """Attached flow goes over into stalled flow between the stall and this much more (inferred)."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, config=FILE_PART)
 class Fin:
     """One fin, or several that turn together, each of the same shape.
 
     Raises:
-        VehicleError: a number is not physical.
+        ValidationError: a number is not physical.
+        VehicleError: the shaft is not square to x.
     """
 
-    __pydantic_config__ = ConfigDict(extra="forbid", allow_inf_nan=False)
-
     name: str
-    positions_body_m: tuple[tuple[float, float, float], ...]
+    positions_body_m: Annotated[tuple[tuple[float, float, float], ...], Field(min_length=1)]
     """Where the lift of each acts: its quarter chord, half way along its span."""
     shaft_body: tuple[float, float, float]
     """Unit vector about which a positive angle turns them, by the right hand; square to x."""
-    area_m2: float
+    area_m2: PositiveFloat
     """Of one of them, seen along its normal."""
-    aspect_ratio: float
+    aspect_ratio: PositiveFloat
     """Span squared by area; of a fin on a hull that mirrors it, twice that of what is seen."""
-    most_angle_deg: float
-    most_rate_deg_s: float
-    time_constant_s: float = 0.1
+    most_angle_deg: Annotated[float, Field(gt=0, le=90)]
+    most_rate_deg_s: PositiveFloat
+    time_constant_s: PositiveFloat = 0.1
     """Lag of the drive."""
-    lift_slope_per_rad: float | None = None
+    lift_slope_per_rad: PositiveFloat | None = None
     """dC_L / d alpha; of the aspect ratio if not given."""
-    stall_deg: float = 20.0
-    profile_drag: float = 0.0
+    stall_deg: Annotated[float, Field(gt=0, lt=60)] = 20.0
+    profile_drag: NonNegativeFloat = 0.0
     """C_D0; 0 where the hull's X_uu has it."""
-    plate_drag: float = 0.56
+    plate_drag: NonNegativeFloat = 0.56
     """C_N, the drag coefficient square to the flow: 0.1 + 0.7 t of a taper ratio t (Prestero)."""
 
     def __post_init__(self) -> None:
-        for field in (
-            "area_m2", "aspect_ratio", "most_angle_deg", "most_rate_deg_s", "time_constant_s",
-            "stall_deg", "slope",
-        ):  # fmt: skip
-            self._require(field, getattr(self, field) > 0)
-        self._require("profile_drag", self.profile_drag >= 0)
-        self._require("plate_drag", self.plate_drag >= 0)
-        self._require("stall_deg", self.stall_deg < 60)
-        self._require("most_angle_deg", self.most_angle_deg <= 90)
-        self._require("positions_body_m", len(self.positions_body_m) > 0)
         shaft = self.shaft_body
         if not (abs(math.hypot(*shaft) - 1.0) < 1e-6 and abs(shaft[0]) < 1e-6):
             raise VehicleError(
@@ -91,15 +81,7 @@ class Fin:
         """dC_L / d alpha, per radian."""
         if self.lift_slope_per_rad is not None:
             return self.lift_slope_per_rad
-        if not self.aspect_ratio > 0:
-            return 0.0
         return 1.0 / (1.0 / (2.0 * math.pi * _SECTION_SHARE) + 1.0 / (math.pi * self.aspect_ratio))
-
-    def _require(self, field: str, holds: bool) -> None:
-        if not holds:
-            raise VehicleError(
-                f"{field} {getattr(self, field)} of fin {self.name!r} makes no sense"
-            )
 
 
 # Columns of `Fins.surfaces`.

@@ -9,13 +9,13 @@ Logs in foreign columns and frames: a TOML file, `ColumnMap`, defines their mean
 import csv
 import itertools
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
@@ -35,49 +35,56 @@ RATES = ("p_rad_s", "q_rad_s", "r_rad_s")
 ALTITUDE = "altitude_m"
 WRENCH = ("X_n", "Y_n", "Z_n", "K_nm", "M_nm", "N_nm")
 _KNOWN = (TIME, *POSITION, *ANGLES, *QUATERNION, *VELOCITY, *RATES, ALTITUDE, *WRENCH)
+_RPM, _THRUST = re.compile(r"rpm_(.+)", re.DOTALL), re.compile(r"thrust_(.+)_n", re.DOTALL)
+_WIDTHS = {
+    "position_ned": (3,), "quaternion_xyzw": (4,), "velocity_body": (3,), "rates_body": (3,),
+    "altitude_m": (), "wrench": (6,),
+}  # fmt: skip
 _UNIT = 0.05
 """Tolerance of a quaternion's length: more is not rounding of a written attitude."""
 _GAP_STEPS = 10
 """A gap is longer than this many median steps."""
 
 
+def _nothing() -> Array:
+    return np.empty(0)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VehicleLog:
-    """Motion and input of a vehicle at times."""
+    """Motion and input of a vehicle at times; NaN in what is not given."""
 
-    source: str
+    source: str = "log"
     """Source, for messages."""
     time_s: Array
     """(T,) strictly increasing."""
-    position_ned: Array
+    position_ned: Array = field(default_factory=_nothing)
     """(T, 3) position of the body's origin, metres."""
-    quaternion_xyzw: Array
+    quaternion_xyzw: Array = field(default_factory=_nothing)
     """(T, 4) quaternions of ned_from_body, of unit length."""
-    velocity_body: Array
+    velocity_body: Array = field(default_factory=_nothing)
     """(T, 3) velocity over ground, m/s."""
-    rates_body: Array
+    rates_body: Array = field(default_factory=_nothing)
     """(T, 3) body rates, rad/s."""
-    altitude_m: Array
+    altitude_m: Array = field(default_factory=_nothing)
     """(T,) height above the sea floor."""
-    rpm: Mapping[str, Array]
+    rpm: Mapping[str, Array] = field(default_factory=dict)
     """By thruster: (T,) speed in revolutions per minute, positive pushes along its direction."""
-    thrust_n: Mapping[str, Array]
+    thrust_n: Mapping[str, Array] = field(default_factory=dict)
     """By thruster: (T,) net force on the vehicle along its direction."""
-    wrench: Array
+    wrench: Array = field(default_factory=_nothing)
     """(T, 6) force, N, and moment about the body's origin, N m, of all thrusters."""
     others: Mapping[str, Array] = field(default_factory=dict)
     """Columns that have no meaning here, carried along: (T,) each."""
 
     def __post_init__(self) -> None:
         count = len(self.time_s)
-        for name, value, width in (
-            ("position_ned", self.position_ned, 3), ("quaternion_xyzw", self.quaternion_xyzw, 4),
-            ("velocity_body", self.velocity_body, 3), ("rates_body", self.rates_body, 3),
-            ("wrench", self.wrench, 6),
-        ):  # fmt: skip
-            if value.shape != (count, width):
-                raise ValueError(f"{name} has the shape {value.shape} at {count} times")
-        for series in (self.altitude_m, *self.rpm.values(), *self.thrust_n.values()):
+        for name, width in _WIDTHS.items():
+            if not len(getattr(self, name)):
+                object.__setattr__(self, name, np.full((count, *width), np.nan))
+            if (shape := getattr(self, name).shape) != (count, *width):
+                raise ValueError(f"{name} has the shape {shape} at {count} times")
+        for series in (*self.rpm.values(), *self.thrust_n.values()):
             if series.shape != (count,):
                 raise ValueError(f"a series of shape {series.shape} at {count} times")
         if not np.all(np.diff(self.time_s) > 0):
@@ -87,33 +94,6 @@ class VehicleLog:
     def attitude_rad(self) -> Array:
         """(T, 3) roll, pitch, heading in (-pi, pi]; NaN rows where it was not measured."""
         return attitude_of(self.quaternion_xyzw)
-
-
-def vehicle_log(
-    time_s: Array,
-    *,
-    source: str = "log",
-    position_ned: Array | None = None,
-    quaternion_xyzw: Array | None = None,
-    velocity_body: Array | None = None,
-    rates_body: Array | None = None,
-    altitude_m: Array | None = None,
-    rpm: Mapping[str, Array] | None = None,
-    thrust_n: Mapping[str, Array] | None = None,
-    wrench: Array | None = None,
-    others: Mapping[str, Array] | None = None,
-) -> VehicleLog:
-    """A log of what is known; the rest is NaN. Fields as in `VehicleLog`."""
-
-    def fill(value: Array | None, *shape: int) -> Array:
-        return np.full((len(time_s), *shape), np.nan) if value is None else np.asarray(value, float)
-
-    return VehicleLog(
-        source=source, time_s=np.asarray(time_s, float), position_ned=fill(position_ned, 3),
-        quaternion_xyzw=fill(quaternion_xyzw, 4), velocity_body=fill(velocity_body, 3),
-        rates_body=fill(rates_body, 3), altitude_m=fill(altitude_m), rpm=dict(rpm or {}),
-        thrust_n=dict(thrust_n or {}), wrench=fill(wrench, 6), others=dict(others or {}),
-    )  # fmt: skip
 
 
 def attitude_of(quaternion_xyzw: Array) -> Array:
@@ -167,19 +147,21 @@ def log_of_columns(columns: Mapping[str, Array], source: str) -> VehicleLog:
         nothing = np.full(count, np.nan)
         return np.stack([merged.get(name, nothing) for name in names], axis=1)
 
-    rpm = {name[4:]: value for name, value in merged.items() if _is_rpm(name)}
-    thrust = {name[7:-2]: value for name, value in merged.items() if _is_thrust(name)}
-    others = {
-        name: value
-        for name, value in merged.items()
-        if name not in _KNOWN and not _is_rpm(name) and not _is_thrust(name)
-    }
+    used = {*_KNOWN, *(name for name in merged if _RPM.fullmatch(name) or _THRUST.fullmatch(name))}
     return VehicleLog(
         source=source, time_s=merged[TIME], position_ned=table(POSITION),
         quaternion_xyzw=_quaternions(merged, source), velocity_body=table(VELOCITY),
-        rates_body=table(RATES), altitude_m=table((ALTITUDE,))[:, 0], rpm=rpm, thrust_n=thrust,
-        wrench=table(WRENCH), others=others,
+        rates_body=table(RATES), altitude_m=table((ALTITUDE,))[:, 0],
+        rpm=_by_thruster(merged, _RPM), thrust_n=_by_thruster(merged, _THRUST),
+        wrench=table(WRENCH),
+        others={name: value for name, value in merged.items() if name not in used},
     )  # fmt: skip
+
+
+def _by_thruster(columns: Mapping[str, Array], pattern: re.Pattern[str]) -> dict[str, Array]:
+    return {
+        found[1]: value for name, value in columns.items() if (found := pattern.fullmatch(name))
+    }
 
 
 def max_step_s(time_s: Array) -> float:
@@ -223,7 +205,12 @@ def read_number_columns(path: Path) -> dict[str, Array]:
         bad = next((j for j, value in enumerate(values) if value is None), None)
         if bad is None:
             columns[name] = np.array(values, dtype=np.float64)
-        elif _is_used(name) or any(v is not None and math.isfinite(v) for v in values):
+        elif (
+            name in _KNOWN
+            or _RPM.fullmatch(name)
+            or _THRUST.fullmatch(name)
+            or any(v is not None and math.isfinite(v) for v in values)
+        ):
             line, row = rows[bad]
             raise VehicleError(
                 f"{path} line {line}: {as_line(name)} is {row[i]!r:.60}, not a finite number"
@@ -249,18 +236,6 @@ def _value(text: str) -> float | None:
     return None if math.isinf(value) else value
 
 
-def _is_rpm(name: str) -> bool:
-    return name.startswith("rpm_") and len(name) > 4
-
-
-def _is_thrust(name: str) -> bool:
-    return name.startswith("thrust_") and name.endswith("_n") and len(name) > 9
-
-
-def _is_used(name: str) -> bool:
-    return name in _KNOWN or _is_rpm(name) or _is_thrust(name)
-
-
 def _in_time(columns: dict[str, Array], source: str) -> dict[str, Array]:
     """The columns with one row a time."""
     time_s = columns[TIME]
@@ -282,17 +257,11 @@ def _in_time(columns: dict[str, Array], source: str) -> dict[str, Array]:
         f"{source}: {len(again)} rows repeat a time, the first is row {again[0] + 2}: merged, a "
         "later value stands where both hold one"
     )
-    first = np.concatenate([[0], np.flatnonzero(steps > 0) + 1])
-    last = np.concatenate([first[1:], [len(time_s)]])
-    merged = {}
+    times, place = np.unique(time_s, return_inverse=True)
+    merged = {name: np.full(len(times), np.nan) for name in columns}
     for name, values in columns.items():
-        column = values[last - 1].copy()
-        for i in np.flatnonzero(np.isnan(column)):
-            known = values[first[i] : last[i]]
-            known = known[np.isfinite(known)]
-            if len(known):
-                column[i] = known[-1]
-        merged[name] = column
+        known = np.isfinite(values)
+        merged[name][place[known]] = values[known]
     return merged
 
 
@@ -314,33 +283,22 @@ def _quaternions(columns: Mapping[str, Array], source: str) -> Array:
     if given[0] is ANGLES:
         quaternions[known] = rotation_from_attitude(*np.deg2rad(values[known].T)).as_quat()
         return quaternions
-    quaternions[known] = (values / unit_lengths(values, source)[:, None])[known]
-    return quaternions
-
-
-def unit_lengths(quaternions: Array, source: str) -> Array:
-    """Lengths, (T,), of quaternions (T, 4), 1 but for rounding; NaN where one is not known.
-
-    Raises:
-        VehicleError: a length is farther from 1 than rounding.
-    """
-    length: Array = np.linalg.norm(quaternions, axis=1)
+    length = np.linalg.norm(values, axis=1)
     wrong = np.flatnonzero(np.abs(length - 1) > _UNIT)
     if len(wrong):
         raise VehicleError(
             f"{source} row {wrong[0] + 1}: the quaternion has the length {length[wrong[0]]:.4g}, "
             "not 1"
         )
-    return length
+    quaternions[known] = (values / length[:, None])[known]
+    return quaternions
 
 
 Three = tuple[str, str, str]
 _FLU = np.array([1.0, -1.0, -1.0])
 """Forward-left-up to forward-right-down, and back."""
-_NED_FROM_ENU = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _NEUTRAL_US = 1500.0
 """Pulse at which a thruster that turns both ways stands still."""
-_FLU_FROM_FRD = Rotation.from_matrix(np.diag(_FLU))
 
 
 class ColumnMap(Config):
@@ -412,43 +370,37 @@ def read_foreign_log(path: Path, columns: ColumnMap) -> VehicleLog:
             raise VehicleError(f"{path}: column {as_line(name)} is missing")
         return table[name]
 
-    rows = len(next(iter(table.values())))
-    time_s: NDArray[np.floating]
     if columns.time is not None:
         time_s = one(columns.time) * columns.time_unit_s
         time_s = time_s - time_s[0]
     else:
-        time_s = np.arange(rows) * (columns.time_step_s or 1.0)
+        rows = len(next(iter(table.values())))
+        time_s = np.arange(rows, dtype=np.float64) * (columns.time_step_s or 1.0)
     flip = _FLU if columns.body == "flu" else np.ones(3)
-    named: dict[str, Array] = {TIME: np.asarray(time_s, np.float64)}
+    named: dict[str, Array] = {TIME: time_s}
 
-    def add(names: str, values: Array) -> None:
-        named.update(zip(names.split(), values.T, strict=True))
-
-    def many(names: tuple[str, ...]) -> Array:
-        return np.stack([one(name) for name in names], axis=1)
+    def add(ours: Sequence[str], names: Sequence[str], scale: Array | float = 1.0) -> None:
+        values = scale * np.stack([one(name) for name in names], axis=1)
+        named.update(zip(ours, values.T, strict=True))
 
     if columns.position is not None:
-        position = many(columns.position)
+        add(POSITION, columns.position)
         if columns.world == "enu":
-            position = np.stack([position[:, 1], position[:, 0], -position[:, 2]], axis=1)
-        add("north_m east_m depth_m", position)
+            north, east = named["east_m"], named["north_m"]
+            named |= {"north_m": north, "east_m": east, "depth_m": -named["depth_m"]}
     if columns.quaternion_xyzw is not None:
-        add("quat_x quat_y quat_z quat_w", _turn_axes(many(columns.quaternion_xyzw), columns, path))
+        add(QUATERNION, columns.quaternion_xyzw)
+        named |= _turn_axes(named, columns)
     elif columns.angles_deg is not None:
-        angles = np.deg2rad(many(columns.angles_deg))
-        known = np.all(np.isfinite(angles), axis=1)
-        quaternions = np.full((rows, 4), np.nan)
-        quaternions[known] = rotation_from_attitude(*angles[known].T).as_quat()
-        add("quat_x quat_y quat_z quat_w", quaternions)
+        add(ANGLES, columns.angles_deg)
     if columns.velocity is not None:
-        add("u_mps v_mps w_mps", many(columns.velocity) * flip)
+        add(VELOCITY, columns.velocity, flip)
     if columns.rates is not None:
-        add("p_rad_s q_rad_s r_rad_s", many(columns.rates) * flip)
+        add(RATES, columns.rates, flip)
     if columns.altitude is not None:
-        named["altitude_m"] = one(columns.altitude)
+        named[ALTITUDE] = one(columns.altitude)
     if columns.wrench is not None:
-        add("X_n Y_n Z_n K_nm M_nm N_nm", many(columns.wrench) * np.tile(flip, 2))
+        add(WRENCH, columns.wrench, np.tile(flip, 2))
     named |= {f"rpm_{name}": one(column) for name, column in columns.rpm.items()}
     named |= {f"thrust_{name}_n": one(column) for name, column in columns.thrust.items()}
     for name, column in columns.pulses.items():
@@ -472,15 +424,12 @@ def _thrust(pulses: Array, columns: ColumnMap, source: str) -> Array:
     return np.where(pulses == 0.0, 0.0, thrust)
 
 
-def _turn_axes(quaternions: Array, columns: ColumnMap, path: Path) -> Array:
-    """Quaternions of ned_from_frd, (T, 4); NaN stays."""
-    known = np.isfinite(unit_lengths(quaternions, str(path)))
-    turned = np.full(quaternions.shape, np.nan)
-    if known.any():
-        rotation = Rotation.from_quat(quaternions[known])
-        if columns.world == "enu":
-            rotation = _NED_FROM_ENU * rotation
-        if columns.body == "flu":
-            rotation = rotation * _FLU_FROM_FRD
-        turned[known] = rotation.as_quat()
-    return turned
+def _turn_axes(named: Mapping[str, Array], columns: ColumnMap) -> dict[str, Array]:
+    """Quaternion columns, (T,) each, of ned_from_frd; of the same length, and NaN stays."""
+    x, y, z, w = (named[name] for name in QUATERNION)
+    half = math.sqrt(0.5)
+    if columns.world == "enu":  # half a turn about (1, 1, 0)
+        x, y, z, w = half * (z + w), half * (w - z), half * (y - x), -half * (x + y)
+    if columns.body == "flu":  # half a turn about x, first
+        x, y, z, w = w, z, -y, -x
+    return dict(zip(QUATERNION, (x, y, z, w), strict=True))

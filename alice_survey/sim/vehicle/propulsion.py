@@ -27,77 +27,72 @@ with all its slopes, as the thruster stops (u_j -> 0): "while the thruster runs"
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
-from pydantic import ConfigDict
+from pydantic import ConfigDict, Field, NonNegativeFloat, PositiveFloat
+from pydantic.dataclasses import dataclass
 
 from alice_survey.core.compiled import kernel
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 
+FILE_PART = ConfigDict(extra="forbid", allow_inf_nan=False)
+"""Of the parts of a vehicle file."""
+_Drag = NonNegativeFloat
 
-@dataclass(frozen=True, kw_only=True)
+
+@dataclass(frozen=True, kw_only=True, config=FILE_PART)
 class Thruster:
     """One thruster and its mounting on the hull.
 
     Raises:
-        VehicleError: a number is not physical.
+        ValidationError: a number is not physical.
+        VehicleError: numbers do not go together.
     """
-
-    __pydantic_config__ = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     name: str
     kind: Literal["open", "tunnel"]
     position_body_m: tuple[float, float, float]
     direction_body: tuple[float, float, float]
     """Unit vector along which positive thrust pushes the vehicle."""
-    diameter_m: float
-    kt_forward: float
+    diameter_m: PositiveFloat
+    kt_forward: PositiveFloat
     """k_t at rest in the water, at positive speed; the three below in the same way."""
-    kt_reverse: float
-    kq_forward: float
-    kq_reverse: float
+    kt_reverse: PositiveFloat
+    kq_forward: NonNegativeFloat
+    kq_reverse: NonNegativeFloat
     handedness: Literal[-1, 1]
     """+1: at positive speed the propeller turns by the right hand about `direction_body`; its
     reaction on the body is then about minus that axis."""
-    most_rps: float
-    dead_band_rps: float
+    most_rps: PositiveFloat
+    dead_band_rps: NonNegativeFloat
     """Below this commanded speed the propeller stands still."""
-    time_constant_s: float
-    advance_slope: float = 0.0
+    time_constant_s: PositiveFloat
+    advance_slope: NonNegativeFloat = 0.0
     """Loss of k_t per advance ratio J = u_a / (n D)."""
-    torque_slope: float = 0.0
+    torque_slope: NonNegativeFloat = 0.0
     """Loss of k_q per advance ratio."""
-    wake_fraction: float = 0.0
+    wake_fraction: Annotated[float, Field(gt=-1, lt=1)] = 0.0
     """u_a = (1 - w) u; propellers behind the hull (paper, w_T)."""
-    thrust_deduction: float = 0.0
+    thrust_deduction: Annotated[float, Field(gt=-1, lt=1)] = 0.0
     """Share of the thrust that suction on the hull takes away (paper, t)."""
-    jet_loss: float = 0.0
+    jet_loss: NonNegativeFloat = 0.0
     """C of the tunnel's jet deflection, T = T_0 exp(-C (u / u_j)^2)."""
-    jet_drag: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    jet_drag: tuple[_Drag, _Drag, _Drag, _Drag] = (0.0, 0.0, 0.0, 0.0)
     """(a, b, c, d) of the jet's drag by displaced volume to the power 2/3,
     C_d = a exp(-b |u| / u_j) + c exp(-d |u| / u_j)."""
-    efficiency: float = 0.7
+    efficiency: Annotated[float, Field(gt=0, le=1)] = 0.7
     """Shaft power over electrical power, of motor and driver."""
-    idle_w: float = 0.0
+    idle_w: NonNegativeFloat = 0.0
     """Electrical power of its driver at rest."""
 
     def __post_init__(self) -> None:
-        self._require("diameter_m", self.diameter_m > 0)
-        for field in ("kt_forward", "kt_reverse", "most_rps", "time_constant_s"):
-            self._require(field, getattr(self, field) > 0)
-        for field in ("kq_forward", "kq_reverse", "advance_slope", "torque_slope", "jet_loss"):
-            self._require(field, getattr(self, field) >= 0)
-        self._require("idle_w", self.idle_w >= 0)
-        self._require("dead_band_rps", 0 <= self.dead_band_rps < self.most_rps)
-        self._require("wake_fraction", -1 < self.wake_fraction < 1)
-        self._require("thrust_deduction", -1 < self.thrust_deduction < 1)
-        self._require("efficiency", 0 < self.efficiency <= 1)
-        self._require("jet_drag", min(self.jet_drag) >= 0)
-        self._require("handedness", self.handedness in (-1, 1))
-        self._require("position_body_m", bool(np.all(np.isfinite(self.position_body_m))))
+        if not self.dead_band_rps < self.most_rps:
+            raise VehicleError(
+                f"dead_band_rps {self.dead_band_rps} of thruster {self.name!r} is not below its "
+                f"most_rps {self.most_rps}"
+            )
         length = math.hypot(*self.direction_body)
         if not abs(length - 1.0) < 1e-6:
             raise VehicleError(
@@ -118,12 +113,6 @@ class Thruster:
                     f"k_q {kq:g} of thruster {self.name!r} {way} is less than {minimum:.4g}: with "
                     f"k_t {kt:g} it would take less power than the jet carries away"
                 )
-
-    def _require(self, field: str, holds: bool) -> None:
-        if not holds:
-            raise VehicleError(
-                f"{field} {getattr(self, field)} of thruster {self.name!r} makes no sense"
-            )
 
 
 def _min_torque(kt: float) -> float:

@@ -30,7 +30,7 @@ from alice_survey.sim.vehicle.navigation.tick import LOG_ROW, log_row, navigatio
 from alice_survey.sim.vehicle.pilot import memory as slot
 from alice_survey.sim.vehicle.pilot.command import (
     WATCHED_S,
-    FoundFailure,
+    Failure,
     Pilot,
     Piloting,
     navigated_stretch,
@@ -143,18 +143,6 @@ def move(tick: int, parts: VehicleParts, command: Array, sea_rng: np.random.Gene
             time_s + i * step, step, world.state, command, world.load, parts.plant, sea.current,
             parts.scratch,
         )  # fmt: skip
-
-
-@dataclass(frozen=True, kw_only=True)
-class Failure:
-    """A thruster that fails on the way."""
-
-    time_s: float
-    thruster: str
-    left: float
-    """Share of its greatest speed squared that is left; of its thrust if it turns."""
-    turns: bool = False
-    """Whether it goes on turning as commanded, with the propeller gone or fouled."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -322,7 +310,7 @@ class Flown:
     power_w: Array
     """(T, n) electrical power."""
     thrusters: tuple[str, ...]
-    found: tuple[FoundFailure, ...] = ()
+    found: tuple[Failure, ...] = ()
     """Failures that the vehicle found."""
 
     @property
@@ -377,7 +365,7 @@ def simulate(
     note_compiling(_fly_ticks, "the vehicle's model, once: this takes about a minute")
     chunks: list[TickRows] = []
     total = math.ceil((expected_s or max_s) / TICK_S / _CHUNK_TICKS)
-    found: list[FoundFailure] = []
+    found: list[Failure] = []
     flying = _chunks(setup, rng, sea_rng or rng, max_s, found)
     for chunk in progress(flying, label, total) if label else flying:
         chunks.append(chunk)  # noqa: PERF402  the bar takes an iterator
@@ -395,7 +383,7 @@ def _chunks(
     rng: np.random.Generator,
     sea_rng: np.random.Generator,
     max_s: float,
-    found: list[FoundFailure],
+    found: list[Failure],
 ) -> Iterator[TickRows]:
     """Rows of a minute each at most, until the mission is over; adds failures that are found."""
     left, pushing = dict(setup.health), dict[str, float]()

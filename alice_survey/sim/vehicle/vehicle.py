@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
 
 from alice_survey.core.artefacts import write_json
 from alice_survey.core.config import VEHICLE_FILES, Config
@@ -39,7 +39,7 @@ from alice_survey.sim.vehicle.coefficients import (
 )
 from alice_survey.sim.vehicle.dynamics import Body, Plant
 from alice_survey.sim.vehicle.fins import Fin, pack_fins
-from alice_survey.sim.vehicle.propulsion import Thruster, pack
+from alice_survey.sim.vehicle.propulsion import FILE_PART, Thruster, pack
 from alice_survey.sim.vehicle.sea import GRAVITY
 
 
@@ -50,7 +50,7 @@ class Hull:
     What hangs below it, DVL and ports, is placed by a survey's settings.
     """
 
-    __pydantic_config__ = ConfigDict(extra="forbid", allow_inf_nan=False)
+    __pydantic_config__ = FILE_PART
 
     profile_body_m: tuple[tuple[float, float, float], ...]
     """Points in the plane of symmetry, from the nose along the keel to the tail, between which the
@@ -82,7 +82,7 @@ POINT = Hull(profile_body_m=((0.0, 0.0, 0.0),), half_breadth_m=0.0)
 class RigidBody:
     """Mass and its distribution; lengths from the centre of buoyancy, the body's origin."""
 
-    __pydantic_config__ = ConfigDict(extra="forbid", allow_inf_nan=False)
+    __pydantic_config__ = FILE_PART
 
     dry_kg: float
     """Mass in air, drained."""

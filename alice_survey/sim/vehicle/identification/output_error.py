@@ -272,8 +272,8 @@ def _speeds(windows: Sequence[Window]) -> Array:
 _SHORT_S = 5.0
 """First approximation uses windows no longer than this: over a short time a simulation stays
 near the measured motion whatever the parameters, so that the fit is led to the right minimum."""
-_ROUGH_STEP_S = 0.1
-"""Integration steps of the first approximation."""
+MAX_STEP_S, _ROUGH_STEP_S = 0.025, 0.1
+"""Rows farther apart are crossed in several steps: of the fit, and of its first approximation."""
 _START_SIGMA = np.array([0.5] * 3 + [2.0] * 6)
 """Distance, rad, m/s and rad/s, of a start from the first measured values that costs one
 sigma: wide, so that it matters only where nothing was measured."""
@@ -301,14 +301,6 @@ _MIN_SIGMA = np.array([1e-6] * term.CHANNELS)
 """Noise cannot be estimated smaller: m/s, rad/s, rad."""
 _SINGULAR = 1e-12
 """Ratio of the information's least to greatest eigenvalue, in units of its diagonal."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Simulation:
-    """Settings of the simulation of windows."""
-
-    max_step_s: float = 0.025
-    """Rows farther apart are crossed in several steps."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -353,7 +345,7 @@ def fit_output_error(
     windows: Sequence[Window],
     parameters: Parameters,
     *,
-    simulation: Simulation | None = None,
+    max_step_s: float = MAX_STEP_S,
     prior: PriorSigmas | None = None,
 ) -> OutputErrorFit:
     """Fit parameters to windows.
@@ -361,19 +353,18 @@ def fit_output_error(
     Args:
         windows: all with the thrusters of the parameters' vehicle, or all without.
         parameters: what is free, and where it starts.
-        simulation: steps and inputs.
+        max_step_s: longest step of the simulation.
         prior: how near the values are to those they start from; nothing is known if not given.
 
     Raises:
         VehicleError: the simulation does not stay finite at the start, the fit does not settle, or
             the logs do not determine the parameters.
     """
-    how = simulation or Simulation()
     lower, upper = parameters.bounds
     short = [part for window in windows for part in cut(window, _SHORT_S)]
-    rough = replace(how, max_step_s=max(how.max_step_s, _ROUGH_STEP_S))
+    rough_s = max(max_step_s, _ROUGH_STEP_S)
     known = prior_of(parameters, windows, prior)
-    approach = _FitProblem(short, parameters, rough, _first_sigma(windows), known, settled=1.0)
+    approach = _FitProblem(short, parameters, rough_s, _first_sigma(windows), known, settled=1.0)
     approach.begin(parameters.start)
     result = least_squares(
         approach.residuals, np.clip(parameters.start, lower, upper), approach.jacobian,
@@ -381,7 +372,7 @@ def fit_output_error(
     )  # fmt: skip
     values = result.x
     approach.estimate_sigma(values)
-    problem = _FitProblem(windows, parameters, how, approach.sigma, known)
+    problem = _FitProblem(windows, parameters, max_step_s, approach.sigma, known)
     rounds = (1e2,) * _ROUNDS + (1.0,)
     settled = False
     for looseness in progress(rounds, "fit", len(rounds)):
@@ -414,12 +405,13 @@ class _FitProblem:
         self,
         windows: Sequence[Window],
         parameters: Parameters,
-        how: Simulation,
+        max_step_s: float,
         sigma: Array,
         prior: StartPrior | None,
         settled: float = _SETTLED,
     ) -> None:
-        self.windows, self.parameters, self.how, self.settled = windows, parameters, how, settled
+        self.windows, self.parameters, self.settled = windows, parameters, settled
+        self.max_step_s = max_step_s
         self.prior, self.prior_weight = prior, 1.0
         self.sigma = np.maximum(np.where(np.isfinite(sigma), sigma, 1.0), _MIN_SIGMA)
         self.count = len(parameters.names)
@@ -430,6 +422,10 @@ class _FitProblem:
         # Starts of the parameters whose slopes were last requested: a trial nearby begins there, so
         # that it comes back to the same residuals as its step goes to nothing.
         self.samples = sum(int(mask.sum()) for mask in self.measured)
+        # Of each residual but those of the prior: its channel, none for those of the starts.
+        blank = np.full(term.START, term.CHANNELS)
+        places = [np.concatenate([np.nonzero(mask)[1], blank]) for mask in self.measured]
+        self.channel = np.concatenate(places)
         self.starts = [window.start.copy() for window in windows]
         self.gains = [np.zeros((term.START, self.count)) for _ in windows]
         self.at = parameters.start.copy()
@@ -485,7 +481,7 @@ class _FitProblem:
 
     def estimate_sigma(self, values: Array) -> float:
         """Estimate the noise from the residuals; return its relative change."""
-        sigma = self._channel_sigma(self._by_channel(self.residuals(values)))
+        sigma = self._channel_sigma(self.residuals(values))
         known = np.isfinite(sigma)
         new = np.maximum(np.where(known, sigma * self.sigma, 1.0), _MIN_SIGMA)
         changed = float(np.max(np.abs(new / self.sigma - 1.0)[known]))
@@ -498,7 +494,6 @@ class _FitProblem:
         free = np.flatnonzero(~at_bound)
         information = table[:, free].T @ table[:, free]
         inverse = _inverse(information, [self.parameters.names[k] for k in free])
-        runs = self._by_channel(residuals)
         held = self._prior_information(values)[np.ix_(free, free)]
         scattered = jackknife_covariance(self._stretches(residuals, table[:, free]), held)
         # By chance it may come out below that of white noise: this is not used.
@@ -514,7 +509,7 @@ class _FitProblem:
         return OutputErrorFit(
             parameters=self.parameters, values=values, covariance=tables[0] + tables[1],
             prior_covariance=tables[1], at_bound=at_bound,
-            channel_sigma=self._channel_sigma(runs) * self.sigma,
+            channel_sigma=self._channel_sigma(residuals) * self.sigma,
             windows=self.windows, starts=list(self.starts), samples=self.samples,
         )  # fmt: skip
 
@@ -590,7 +585,7 @@ class _FitProblem:
         self, window: Window, i: int, physics: Physics, start: Array
     ) -> tuple[Array, Array] | None:
         _, observed, slopes = simulate(
-            physics, self.parameters.terms, window.record, start, self.how.max_step_s
+            physics, self.parameters.terms, window.record, start, self.max_step_s
         )
         mask = self.measured[i]
         residual = (residual_channels(window, observed) / self.sigma)[mask]
@@ -602,37 +597,20 @@ class _FitProblem:
         away = _between(window.start, start) / _START_SIGMA
         return np.concatenate([residual, away]), np.concatenate([slope, prior])
 
-    def _by_channel(self, table: Array) -> list[list[Array]]:
-        """Rows of residuals or slopes, by channel and window, without those of the priors."""
-        channels: list[list[Array]] = [[] for _ in range(term.CHANNELS)]
-        begin = 0
-        for mask in self.measured:
-            size = int(mask.sum())
-            part, place = table[begin : begin + size], np.nonzero(mask)[1]
-            for channel in range(term.CHANNELS):
-                channels[channel].append(part[place == channel])
-            begin += size + term.START
-        return channels
-
-    def _freedom(self, runs: list[list[Array]]) -> float:
-        """Samples over degrees of freedom: parameters and starts fit some of the noise."""
-        samples = sum(len(run) for channel in runs for run in channel)
-        left = samples - self.count - term.START * len(self.windows)
-        if left < 0.1 * samples:
+    def _channel_sigma(self, residuals: Array) -> Array:
+        """Sigma of each channel, (9,), in those it was weighed by; NaN without samples."""
+        left = self.samples - self.count - term.START * len(self.windows)
+        if left < 0.1 * self.samples:
             raise VehicleError(
-                f"{samples} samples for {self.count} parameters and {len(self.windows)} windows "
-                "are too few: use longer windows or free fewer parameters"
+                f"{self.samples} samples for {self.count} parameters and {len(self.windows)} "
+                "windows are too few: use longer windows or free fewer parameters"
             )
-        return samples / left
-
-    def _channel_sigma(self, runs: list[list[Array]]) -> Array:
-        spread = self._freedom(runs)
-        sigma = np.full(term.CHANNELS, np.nan)
-        for channel, series in enumerate(runs):
-            values = np.concatenate(series)
-            if len(values):
-                sigma[channel] = np.sqrt(spread * float(values @ values) / len(values))
-        return sigma
+        counts = np.bincount(self.channel, minlength=term.CHANNELS + 1)
+        squares = np.bincount(self.channel, residuals[: len(self.channel)] ** 2, len(counts))
+        # Parameters and starts fit some of the noise.
+        with np.errstate(invalid="ignore"):
+            sigma: Array = np.sqrt(self.samples / left * squares / counts)
+        return sigma[: term.CHANNELS]
 
 
 def _first_sigma(windows: Sequence[Window]) -> Array:

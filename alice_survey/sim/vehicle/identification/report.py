@@ -26,9 +26,9 @@ from alice_survey.core.frames import Array
 from alice_survey.kit.figure import INKS, SOFT, figure_style, new_figure, save_figure
 from alice_survey.kit.words import text_table
 from alice_survey.sim.vehicle.identification.output_error import (
+    MAX_STEP_S,
     OutputErrorFit,
     PriorSigmas,
-    Simulation,
     fit_output_error,
 )
 from alice_survey.sim.vehicle.identification.problem import (
@@ -113,7 +113,7 @@ def validate(
     parameters: Parameters,
     values: Array,
     *,
-    simulation: Simulation | None = None,
+    max_step_s: float = MAX_STEP_S,
 ) -> MotionValidation:
     """Compare simulations with windows of a log.
 
@@ -121,12 +121,11 @@ def validate(
         windows: windows of the log.
         parameters: parameters of the model.
         values: (P,) theirs.
-        simulation: steps and inputs.
+        max_step_s: longest step of the simulation.
 
     Raises:
         VehicleError: a simulation does not stay finite.
     """
-    how = simulation or Simulation()
     physics = with_given(parameters.physics(values), windows[0].given)
     measured = np.concatenate([window.measured for window in windows])
     # A motion that follows the log is not predicted.
@@ -134,7 +133,7 @@ def validate(
     simulated, constant, longest = [], [], 0.0
     for window in windows:
         filled = _hold_last(window.measured)
-        simulated.append(_run(window, filled[0], physics, how))
+        simulated.append(_run(window, filled[0], physics, max_step_s))
         constant.append(np.tile(filled[0], (len(filled), 1)))
         time_s = window.record.time_s
         longest = max(longest, float(time_s[-1] - time_s[0]))
@@ -146,7 +145,7 @@ def validate(
     )  # fmt: skip
 
 
-def _run(window: Window, motion: Array, physics: Physics, how: Simulation) -> Array:
+def _run(window: Window, motion: Array, physics: Physics, max_step_s: float) -> Array:
     """Velocity over ground and rates, (T, 6), of a window simulated from those of its first row.
 
     Raises:
@@ -155,7 +154,7 @@ def _run(window: Window, motion: Array, physics: Physics, how: Simulation) -> Ar
     start = window.start.copy()
     start[4:] = motion - physics.bias
     start[4:7] -= Rotation.from_quat(start[:4]).inv().apply([*physics.current_ne, 0.0])
-    _, observed, _ = simulate(physics, None, window.record, start, how.max_step_s)
+    _, observed, _ = simulate(physics, None, window.record, start, max_step_s)
     if not np.all(np.isfinite(observed[:, :_MOTIONS])):
         raise VehicleError(
             f"{window.source}: the simulation does not stay finite: simulate shorter stretches"

@@ -41,7 +41,6 @@ from alice_survey.sim.vehicle.identification.output_error import (
     stretch_numbers,
 )
 from alice_survey.sim.vehicle.identification.problem import OTHERS, Mask, Parameters, Window
-from alice_survey.sim.vehicle.propulsion import add_thrust
 from alice_survey.sim.vehicle.vehicle import Vehicle
 
 
@@ -146,23 +145,11 @@ def with_thrust(vehicle: Vehicle, found: Sequence[ThrustCoefficient]) -> Vehicle
 
 def _unit_force(vehicle: Vehicle, group: tuple[str, ...], rps: float) -> float:
     """Force along their directions, N, of thrusters with k_t = 1 at rest in the water."""
-    probe = replace(
-        vehicle,
-        thrusters=tuple(
-            replace(t, kt_forward=1.0, kt_reverse=1.0, kq_forward=0.0, kq_reverse=0.0)
-            for t in vehicle.thrusters
-        ),
+    return sum(
+        (1.0 - t.thrust_deduction) * vehicle.density_kg_m3 * t.diameter_m**4 * rps * abs(rps)
+        for t in vehicle.thrusters
+        if t.name in group
     )
-    total = 0.0
-    for i, thruster in enumerate(probe.thrusters):
-        if thruster.name not in group:
-            continue
-        speeds, force = np.zeros(len(probe.thrusters)), np.zeros(6)
-        speeds[i] = rps
-        add_thrust(probe.plant.propulsion, speeds, np.zeros(6), force)
-        direction: Array = np.array(thruster.direction_body)
-        total += float(force[:3] @ direction)
-    return total
 
 
 def _pull(path: Path, line: int, row: dict[str, str]) -> Pull:

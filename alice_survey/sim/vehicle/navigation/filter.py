@@ -51,14 +51,12 @@ HIDDEN = WATER - GYRO_BIAS
 """Number of true errors of the instruments; error `GYRO_BIAS + i` estimates `hidden[i]`."""
 
 TURN, PUSH, RATES, HEADING, DEPTH, RANGE, BEAM, WATER_BEAM = 0, 3, 6, 9, 10, 11, 15, 19
-DVL_VELOCITY, WATER_VELOCITY, GPS_FIX, USBL_FIX = 23, 26, 29, 31
-HEADING_TIME, DEPTH_TIME, DVL_TIME, WATER_TIME, GPS_TIME, USBL_TIME = 33, 34, 35, 36, 37, 38
-"""Offsets of each instrument's latest reading in `readings`, and its time:
-increments of angle (3) and velocity (3) over the tick, rates (3), heading, depth, ranges (4) and
-velocities (4) along the beams, velocities through the water (4), bottom and water velocity in the
-body frame at the DVL (3 each), north and east of the GPS antenna and of the transponder (2 each).
+GPS_FIX, USBL_FIX = 23, 25
+"""Offsets of each instrument's latest reading in `readings`: increments of angle (3) and velocity
+(3) over the tick, rates (3), heading, depth, ranges (4) and velocities (4) along the beams,
+velocities through the water (4), north and east of the GPS antenna and of the transponder (2 each).
 NaN where nothing was measured."""
-READINGS = 39
+READINGS = 27
 
 COMPASS_USE, DEPTH_USE, DVL_USE, WATER_USE, GPS_USE, USBL_USE = 0, 1, 2, 3, 4, 5
 """Rows of `counts`."""

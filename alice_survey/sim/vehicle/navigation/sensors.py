@@ -284,6 +284,14 @@ def janus_beams(angle_rad: float) -> Array:
     )
 
 
+def beam_velocity(beams: Array, along: Array) -> Array:
+    """Velocity, (3,), of the speeds along four beams, or of three where one is NaN; else NaN."""
+    heard = np.isfinite(along)
+    if heard.sum() < 3:
+        return np.full(3, np.nan)
+    return np.asarray(np.linalg.lstsq(beams[heard], along[heard])[0], np.float64)
+
+
 def _ticks(name: str, rate_hz: float, tick_s: float) -> int:
     """Ticks between measurements; 0 at no rate."""
     if rate_hz == 0:

@@ -118,7 +118,6 @@ def navigation_tick(
     pinged, used = False, False
     bottom = 0
     if suite.compass_every > 0 and tick % suite.compass_every == 0:
-        nav.readings[slot.HEADING_TIME] = time_s
         nav.readings[slot.HEADING] = (
             math.atan2(truth[1, 0], truth[0, 0])
             + nav.hidden[slot.HEADING_BIAS - slot.GYRO_BIAS]
@@ -127,7 +126,6 @@ def navigation_tick(
         used |= use_heading(nav, suite)
     if suite.pressure_every > 0 and tick % suite.pressure_every == 0:
         place = suite.place[part.PRESSURE]
-        nav.readings[slot.DEPTH_TIME] = time_s
         nav.readings[slot.DEPTH] = (
             now[2]
             + rotate(truth, place[0], place[1], place[2])[2]
@@ -143,7 +141,6 @@ def navigation_tick(
             drawn = suite.gps.noise_m * rng.standard_normal()
             bias = nav.hidden[slot.GPS_BIAS - slot.GYRO_BIAS + i]
             nav.readings[slot.GPS_FIX + i] = now[i] + arm[i] + bias + drawn
-        nav.readings[slot.GPS_TIME] = time_s
         used |= use_fix(
             nav,
             suite,
@@ -155,7 +152,7 @@ def navigation_tick(
         )
     due = suite.usbl_every > 0 and tick % suite.usbl_every == 0
     if due:
-        used |= _use_usbl(time_s, now, suite, nav, rng)
+        used |= _use_usbl(now, suite, nav, rng)
     if suite.dvl_every > 0 and tick % suite.dvl_every == 0:
         pinged = True
         ping = tick // suite.dvl_every
@@ -409,9 +406,7 @@ def measure_imu(
 
 
 @kernel
-def _use_usbl(
-    time_s: float, now: Array, sensors: Sensors, nav: NavigationState, rng: np.random.Generator
-) -> bool:
+def _use_usbl(now: Array, sensors: Sensors, nav: NavigationState, rng: np.random.Generator) -> bool:
     """Measure and weigh north and east of the transponder; whether there was an answer of use."""
     place, turn, usbl = sensors.place[part.USBL], nav.turns[slot.TRUTH_NOW], sensors.usbl
     north, east, depth = rotate(turn, place[0], place[1], place[2])
@@ -429,7 +424,6 @@ def _use_usbl(
         if wrong:
             value += usbl.outlier_m * (2.0 * rng.random() - 1.0)
         nav.readings[slot.USBL_FIX + i] = value
-    nav.readings[slot.USBL_TIME] = time_s
     # The filter takes the sigma of the distance that is estimated.
     north = lever_row(nav, sensors, part.USBL, slot.NORTH_AXIS)
     east = lever_row(nav, sensors, part.USBL, slot.EAST_AXIS)
@@ -456,9 +450,8 @@ def measure_dvl(
     in the body frame, its scale error s and its misalignment a about the vertical.
     """
     readings, turn, dvl = nav.readings, nav.turns[slot.TRUTH_NOW], sensors.dvl
-    for i in range(slot.RANGE, slot.WATER_VELOCITY + 3):
+    for i in range(slot.RANGE, slot.WATER_BEAM + 4):
         readings[i] = math.nan
-    readings[slot.DVL_TIME] = time_s
     for i in range(sensors.dropouts_s.shape[0]):
         if sensors.dropouts_s[i, 0] <= time_s < sensors.dropouts_s[i, 1]:
             return
@@ -496,11 +489,6 @@ def measure_dvl(
         if rng.random() < dvl.outlier_probability:
             readings[slot.BEAM + i] = dvl.outlier_mps * (2.0 * rng.random() - 1.0)
             readings[slot.RANGE + i] *= rng.random()
-    solve_beams(
-        sensors.beams,
-        readings[slot.BEAM : slot.BEAM + 4],
-        readings[slot.DVL_VELOCITY : slot.DVL_VELOCITY + 3],
-    )
     if dvl.water_every == 0 or (heard > 0 and ping % dvl.water_every != 0):
         return
     if clearance < dvl.water_least_altitude_m:
@@ -514,12 +502,6 @@ def measure_dvl(
             _along_beam(sensors, nav.hidden, i, u, v, w)
             + dvl.water_noise_mps * rng.standard_normal()
         )
-    solve_beams(
-        sensors.beams,
-        readings[slot.WATER_BEAM : slot.WATER_BEAM + 4],
-        readings[slot.WATER_VELOCITY : slot.WATER_VELOCITY + 3],
-    )
-    readings[slot.WATER_TIME] = time_s
 
 
 @kernel
@@ -534,28 +516,3 @@ def _along_beam(sensors: Sensors, hidden: Array, i: int, u: float, v: float, w: 
         + b[i, 1] * (scale * (c * v - s * u) + hidden[slot.DVL_BIAS - slot.GYRO_BIAS + 1])
         + b[i, 2] * scale * w
     )
-
-
-@kernel
-def solve_beams(beams: Array, along: Array, out: Array) -> None:
-    """Velocity, (3,), that four beams give by least squares, or three; NaN from fewer.
-
-    Opposite beams of a Janus arrangement add up to the same as the other two, which gives back a
-    beam that is missing.
-    """
-    missing, which = 0, 0
-    for i in range(part.BEAMS):
-        if not math.isfinite(along[i]):
-            missing, which = missing + 1, i
-    if missing > 1:
-        out[0] = out[1] = out[2] = math.nan
-        return
-    given = along[which]
-    if missing == 1:
-        given = along[(which + 1) % 4] + along[(which + 3) % 4] - along[(which + 2) % 4]
-    for axis in range(3):
-        total = square = 0.0
-        for i in range(part.BEAMS):
-            total += beams[i, axis] * (given if i == which else along[i])
-            square += beams[i, axis] * beams[i, axis]
-        out[axis] = total / square

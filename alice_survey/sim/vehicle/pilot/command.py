@@ -60,15 +60,16 @@ _MIN_S = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class FoundFailure:
-    """A thruster that was found not to do as commanded."""
+class Failure:
+    """A thruster that does not do as commanded: as it happens in a simulation, or as found."""
 
     time_s: float
     thruster: str
     left: float
-    """Share of its greatest thrust that it has left."""
+    """Share that it has left of its greatest thrust: of its speed squared, or if it turns as
+    before, at all speeds."""
     turns: bool = False
-    """Whether it turns as commanded, and gives no thrust."""
+    """Whether it turns as commanded, with the propeller gone or fouled."""
 
 
 class ThrusterWatch:
@@ -79,7 +80,7 @@ class ThrusterWatch:
         self._slow = np.zeros(len(thrusters), dtype=np.int64)
         self._gone = np.zeros(len(thrusters), dtype=np.bool_)
 
-    def judge(self, end_s: float, command_rps: Array, rps: Array) -> list[FoundFailure]:
+    def judge(self, end_s: float, command_rps: Array, rps: Array) -> list[Failure]:
         """Failures that a stretch shows, each once.
 
         Args:
@@ -104,7 +105,7 @@ class ThrusterWatch:
                 maximum = float(np.abs(rps[:, i]).max())
                 turns = maximum > thruster.dead_band_rps + _MARGIN_RPS
                 left = (maximum / thruster.most_rps) ** 2 if turns else 0.0
-                found.append(FoundFailure(time_s=end_s, thruster=thruster.name, left=left))
+                found.append(Failure(time_s=end_s, thruster=thruster.name, left=left))
         return found
 
 
@@ -178,7 +179,7 @@ class ThrustWatch:
         """Take a thruster for lost from now on, by whatever showed it."""
         self._gone[self._names.index(thruster)] = True
 
-    def judge(self, end_s: float, navigated: NavigatedStretch, rps: Array) -> list[FoundFailure]:
+    def judge(self, end_s: float, navigated: NavigatedStretch, rps: Array) -> list[Failure]:
         """Failures that a stretch shows, each once.
 
         Args:
@@ -205,7 +206,7 @@ class ThrustWatch:
             self._learn(residual)
             return []
         self._gone[best] = True
-        return [FoundFailure(time_s=end_s, thruster=self._names[best], left=0.0, turns=True)]
+        return [Failure(time_s=end_s, thruster=self._names[best], left=0.0, turns=True)]
 
     def _residuals(self, navigated: NavigatedStretch, rps: Array) -> tuple[Array, Array, Array]:
         """Residual force, (S, 6), thrust by thruster, (S, n, 6), and the model's doubt, (2, 6).
@@ -358,7 +359,7 @@ class Pilot:
         command_rps: Array,
         rps: Array,
         navigated: NavigatedStretch | None = None,
-    ) -> list[FoundFailure]:
+    ) -> list[Failure]:
         """Look for failures in a stretch of `WATCHED_S`, and go on without what has failed.
 
         Args:

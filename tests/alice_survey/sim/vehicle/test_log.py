@@ -10,7 +10,6 @@ from alice_survey.core.frames import rotation_from_attitude
 from alice_survey.sim.vehicle.log import (
     VehicleLog,
     read_vehicle_log,
-    vehicle_log,
     write_vehicle_log,
 )
 
@@ -21,8 +20,8 @@ def a_log(count: int = 40) -> VehicleLog:
     angles = rng.uniform(-0.5, 0.5, (3, count)) * np.array([[1.0], [1.0], [6.0]])
     velocity = rng.normal(size=(count, 3))
     velocity[::3] = np.nan
-    return vehicle_log(
-        time_s,
+    return VehicleLog(
+        time_s=time_s,
         position_ned=rng.normal(size=(count, 3)),
         quaternion_xyzw=rotation_from_attitude(*angles).as_quat(),
         velocity_body=velocity,

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from alice_survey.core.errors import VehicleError
 from alice_survey.sim.vehicle import propulsion as kernels
@@ -145,7 +146,7 @@ def test_a_t200_takes_what_its_maker_says() -> None:
     ],
 )  # fmt: skip
 def test_thrusters_that_make_no_sense_are_refused(change: dict[str, object]) -> None:
-    with pytest.raises(VehicleError, match="'starboard'") as caught:
+    with pytest.raises((VehicleError, ValidationError)) as caught:
         replace(STARBOARD, **change)  # type: ignore[arg-type]
     (field,) = change
     words = {"direction_body": "direction", "kq_forward": "k_q", "kq_reverse": "k_q|kq_reverse"}

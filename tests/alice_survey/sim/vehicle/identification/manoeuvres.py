@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.dynamics import initial_state, rk4_step, scratch_for
-from alice_survey.sim.vehicle.log import VehicleLog, vehicle_log
+from alice_survey.sim.vehicle.log import VehicleLog
 from alice_survey.sim.vehicle.sea import constant_current
 from alice_survey.sim.vehicle.vehicle import Vehicle, vehicle_from
 
@@ -81,8 +81,8 @@ def fly(
             rk4_step(now, STEP_S, state, asked(now), load, truth.plant, water, scratch)
     ned_from_body = Rotation.from_quat(states[:, 3:7])
     drift = ned_from_body.inv().apply(np.array([*current, 0.0]))
-    return vehicle_log(
-        np.arange(rows, dtype=float) * ROW_S,
+    return VehicleLog(
+        time_s=np.arange(rows, dtype=float) * ROW_S,
         source="simulated",
         position_ned=states[:, :3],
         quaternion_xyzw=states[:, 3:7],
@@ -98,8 +98,8 @@ def measured(log: VehicleLog, rng: np.random.Generator, noise: Noise | None = No
     turns = Rotation.from_rotvec(rng.normal(0, sigma.attitude_rad, (rows, 3)))
     velocity = log.velocity_body + rng.normal(0, sigma.velocity_mps, (rows, 3))
     velocity[np.arange(rows) % 4 != 0] = np.nan
-    return vehicle_log(
-        log.time_s,
+    return VehicleLog(
+        time_s=log.time_s,
         source=log.source,
         quaternion_xyzw=(Rotation.from_quat(log.quaternion_xyzw) * turns).as_quat(),
         velocity_body=velocity,

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from alice_survey.core.errors import VehicleError
 from alice_survey.sim.vehicle.coefficients import Coefficients
 from alice_survey.sim.vehicle.identification.problem import inputs, make_windows
-from alice_survey.sim.vehicle.log import read_column_map, read_foreign_log, vehicle_log
+from alice_survey.sim.vehicle.log import VehicleLog, read_column_map, read_foreign_log
 from alice_survey.sim.vehicle.vehicle import (
     coefficients_from_file,
     speeds_missing,
@@ -49,8 +49,9 @@ def test_any_thruster_matrix_comes_from_a_file(tmp_path: Path) -> None:
     made = vehicle_from(str(small(tmp_path)))
     assert made.name == "small"
     assert made.coefficients.values == {"X_uu": -20.0}
-    log = vehicle_log(
-        np.arange(3.0), thrust_n={"left": np.array([1.0, 2, 3]), "right": np.array([1.0, 0, -3])}
+    log = VehicleLog(
+        time_s=np.arange(3.0),
+        thrust_n={"left": np.array([1.0, 2, 3]), "right": np.array([1.0, 0, -3])},
     )
     rps, wrench = inputs(log, made)
     assert rps.shape == (3, 0)
@@ -132,8 +133,9 @@ def test_missing_inputs_are_held_but_not_for_long(capsys: pytest.CaptureFixture[
     rpm = {t.name: np.full(60, 600.0) for t in known.thrusters}
     rpm["port"][10:14] = np.nan
     rpm["port"][30:50] = np.nan
-    log = vehicle_log(
-        time_s, quaternion_xyzw=np.tile([0.0, 0, 0, 1], (60, 1)), velocity_body=np.zeros((60, 3)),
+    log = VehicleLog(
+        time_s=time_s, quaternion_xyzw=np.tile([0.0, 0, 0, 1], (60, 1)),
+        velocity_body=np.zeros((60, 3)),
         rpm=rpm,
     )  # fmt: skip
     first, second = make_windows(log, known)

@@ -7,7 +7,6 @@ from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.identification.output_error import (
     OutputErrorFit,
-    Simulation,
     fit_output_error,
 )
 from alice_survey.sim.vehicle.identification.problem import free_parameters, make_windows, unit_of
@@ -17,12 +16,12 @@ from tests.alice_survey.sim.vehicle.identification.manoeuvres import fly, hidden
 
 KNOWN = vehicle_from("alice")
 DAMPING = ("X_uu", "Y_vv", "Z_ww", "N_rr")
-QUICK = Simulation(max_step_s=0.05)
+QUICK_S = 0.05
 
 
 def fitted(log: VehicleLog, free: tuple[str, ...], window_s: float | None = None) -> OutputErrorFit:
     windows = make_windows(log, KNOWN, window_s=window_s)
-    return fit_output_error(windows, free_parameters(KNOWN, free), simulation=QUICK)
+    return fit_output_error(windows, free_parameters(KNOWN, free), max_step_s=QUICK_S)
 
 
 def test_hidden_coefficients_and_current_are_recovered() -> None:

@@ -8,7 +8,6 @@ import pytest
 from alice_survey.core.errors import VehicleError
 from alice_survey.sim.vehicle.identification.output_error import (
     PriorSigmas,
-    Simulation,
     fit_output_error,
     prior_of,
     read_prior,
@@ -18,7 +17,7 @@ from alice_survey.sim.vehicle.vehicle import vehicle_from
 from tests.alice_survey.sim.vehicle.identification.manoeuvres import Noise, fly, hidden, measured
 
 KNOWN = vehicle_from("alice")
-QUICK = Simulation(max_step_s=0.05)
+QUICK_S = 0.05
 
 
 def test_where_a_log_says_little_the_start_is_kept_and_where_much_the_log() -> None:
@@ -35,7 +34,7 @@ def test_where_a_log_says_little_the_start_is_kept_and_where_much_the_log() -> N
         noisy = measured(flown, np.random.default_rng(seed), Noise(velocity_mps=0.15))
         windows = make_windows(noisy, KNOWN)
         for fits, prior in ((free, None), (held, PriorSigmas())):
-            fits.append(fit_output_error(windows, parameters, simulation=QUICK, prior=prior))
+            fits.append(fit_output_error(windows, parameters, max_step_s=QUICK_S, prior=prior))
     off, off_held = (
         np.sqrt(np.mean([np.log(fit.values[1] / -3.0) ** 2 for fit in fits]))
         for fits in (free, held)

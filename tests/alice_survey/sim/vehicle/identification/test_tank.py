@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from alice_survey.sim.vehicle.identification.output_error import (
     OutputErrorFit,
     PriorSigmas,
-    Simulation,
     fit_output_error,
 )
 from alice_survey.sim.vehicle.identification.problem import free_parameters, make_windows
@@ -19,7 +18,7 @@ from alice_survey.sim.vehicle.log import VehicleLog, read_column_map, read_forei
 from alice_survey.sim.vehicle.vehicle import vehicle_from_file
 
 HERE = Path(__file__).parent
-QUICK = Simulation(max_step_s=0.05)
+QUICK_S = 0.05
 FREE = (
     "X_u", "X_uu", "Y_v", "Y_vv", "Z_w", "Z_ww", "N_r", "N_rr", "gain_X", "gain_Y", "gain_Z",
     "gain_N", "buoyancy",
@@ -64,16 +63,16 @@ def test_each_run_is_predicted_from_the_others(runs: list[VehicleLog], left_out:
         if k != left_out
         for window in make_windows(run, rov, window_s=5.0, given=("p", "q"))
     ]
-    fit = fit_output_error(windows, parameters, simulation=QUICK)
+    fit = fit_output_error(windows, parameters, max_step_s=QUICK_S)
     shorter = make_windows(runs[left_out], rov, window_s=10.0, given=("p", "q"))
-    found = validate(shorter, parameters, fit.values, simulation=QUICK)
+    found = validate(shorter, parameters, fit.values, max_step_s=QUICK_S)
     moving = [0, 1, 2, 5]
     model, constant = found.fit_percent[moving], found.constant_fit_percent[moving]
     assert np.all(model > 20.0)
     assert np.all(model < 90.0)
     assert np.all(model > constant + 30.0)
     # All in all better than the published coefficients, too.
-    published = validate(shorter, parameters, parameters.start, simulation=QUICK)
+    published = validate(shorter, parameters, parameters.start, max_step_s=QUICK_S)
     assert model.mean() > published.fit_percent[moving].mean() + 10.0
 
 
@@ -90,7 +89,7 @@ def single(
     fits = [
         fit_output_error(
             make_windows(run, rov, window_s=5.0, given=("p", "q")), parameters,
-            simulation=QUICK, prior=request.param,
+            max_step_s=QUICK_S, prior=request.param,
         )
         for run in runs
     ]  # fmt: skip
@@ -108,7 +107,7 @@ def test_unseen_runs_are_not_predicted_worse_than_by_the_start(
     for k, run in enumerate(runs):
         windows = make_windows(run, rov, window_s=10.0, given=("p", "q"))
         start, *others = (
-            validate(windows, fits[0].parameters, values, simulation=QUICK).fit_percent[MOVING]
+            validate(windows, fits[0].parameters, values, max_step_s=QUICK_S).fit_percent[MOVING]
             for values in (
                 fits[0].parameters.start,
                 *(fit.values for j, fit in enumerate(fits) if j != k),

@@ -12,7 +12,7 @@ from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.pilot.command import (
     FALSE_ALARM_H,
     WATCHED_S,
-    FoundFailure,
+    Failure,
     NavigatedStretch,
     ThrustWatch,
 )
@@ -71,7 +71,7 @@ def flown(name: str, share: float, seed: int, duration_s: float = 60.0) -> tuple
 
 def judged(
     watch: ThrustWatch, begin_s: float, flight: tuple[Array, Array], water_mps: float = 0.0
-) -> tuple[list[FoundFailure], list[Array]]:
+) -> tuple[list[Failure], list[Array]]:
     found, sums = [], []
     for first in range(0, len(flight[0]), STRETCH):
         part = slice(first, first + STRETCH)
@@ -108,7 +108,7 @@ def test_a_thruster_that_pushes_nothing_is_found_in_two_minutes(name: str) -> No
         watch = ThrustWatch(ALICE, TICK_S)
         assert judged(watch, 0.0, flown("", 1.0, seed))[0] == []
         found, _ = judged(watch, SOUND_S, flown(name, 0.0, 10 + seed, 120.0))
-        assert found == [FoundFailure(time_s=found[0].time_s, thruster=name, left=0.0, turns=True)]
+        assert found == [Failure(time_s=found[0].time_s, thruster=name, left=0.0, turns=True)]
         delays.append(found[0].time_s - SOUND_S)
     assert 5.0 <= min(delays) <= max(delays) <= 120.0
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.pilot.command import FoundFailure, ThrusterWatch
+from alice_survey.sim.vehicle.pilot.command import Failure, ThrusterWatch
 from alice_survey.sim.vehicle.vehicle import vehicle_from
 
 TICK_S = 0.05
@@ -31,7 +31,7 @@ def commands(seconds: float, size_rps: float, seed: int = 0) -> Array:
     return np.array(found)
 
 
-def judged(command_rps: Array, rps: Array) -> list[FoundFailure]:
+def judged(command_rps: Array, rps: Array) -> list[Failure]:
     watch = ThrusterWatch([STERN], TICK_S)
     found = []
     for first in range(0, len(command_rps), STRETCH):
