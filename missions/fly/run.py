@@ -6,7 +6,7 @@ Pictures show how near the plan a flight came, and what the vehicle did for it.
 import itertools
 import math
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -316,13 +316,11 @@ def believed_log(flight: Flight) -> VehicleLog:
     """What the vehicle's own computer knows of its motion, thrusters and fins."""
     log, velocity = flight.log, believed_velocity(flight.flown)
     turn = rotation_from_attitude(*log.attitude_rad.T).as_quat()
-    altitude_m = log.altitude_m
-    return _log(flight, "navigation", log.position_ned, turn, velocity, altitude_m=altitude_m)
+    known = _log(flight, "navigation", log.position_ned, turn, velocity)
+    return replace(known, altitude_m=log.altitude_m)
 
 
-def _log(
-    flight: Flight, source: str, position: Array, turn: Array, velocity: Array, **more: Array
-) -> VehicleLog:
+def _log(flight: Flight, source: str, position: Array, turn: Array, velocity: Array) -> VehicleLog:
     angles = np.rad2deg(flight.flown.fin_rad).T
     fins = zip(flight.vehicle.fins, angles, strict=True)
     return VehicleLog(
@@ -334,7 +332,6 @@ def _log(
         rates_body=velocity[:, 3:],
         rpm=rpm_of(flight.flown),
         others={f"fin_{fin.name}_deg": angle for fin, angle in fins},
-        **more,
     )
 
 
