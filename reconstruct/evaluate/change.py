@@ -20,15 +20,9 @@ from alice_survey.core.errors import ReconstructionError, WorkspaceError, warn
 from alice_survey.core.frames import Array, Datum
 from alice_survey.core.records import ChangeRecord
 from alice_survey.core.run import progress
-from alice_survey.kit.figure import (
-    colour_bar,
-    figure_style,
-    map_axes,
-    new_figure,
-    save_figure,
-)
+from alice_survey.kit.figure import figure_style, new_figure, save_figure
 from reconstruct.elevation import Elevation, elevation_in
-from reconstruct.evaluate.figures import json_number, rms
+from reconstruct.evaluate.figures import json_number, map_errors, rms
 from reconstruct.evaluate.registration import HeightFit, refine_heights, register_heights
 from reconstruct.placing.alignment import align_rigid
 from reconstruct.raster import DemGrid, hillshade, tiled_raster
@@ -307,12 +301,7 @@ def plot_change(path: Path, now: Elevation, change: Change) -> None:
     ):
         axis.imshow(shade, extent=extent, cmap="gray", vmin=0, vmax=1.2)
         opacity = np.where(np.isfinite(values), 0.75, 0.0)
-        colours = {"cmap": "RdBu_r", "vmin": -span, "vmax": span, "interpolation": "nearest"}
-        image = axis.imshow(values, extent=extent, alpha=opacity, **colours)
-        axis.grid(visible=False)
-        axis.set_title(title)
-        colour_bar(image, axis, label)
-        map_axes(axis)
+        map_errors(axis, values, span, title, label, extent=extent, alpha=opacity)
         if change.changed.any():
             outline = change.changed[::step, ::step]
             axis.contour(outline, levels=[0.5], colors="k", extent=extent, origin="upper")

@@ -8,6 +8,7 @@ import numpy as np
 
 from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.frames import Array
+from alice_survey.kit.figure import Axes, colour_bar, map_axes
 
 _BLOCKS = 10
 """Blocks along the longer side over which errors are averaged before a bend is fitted."""
@@ -70,6 +71,18 @@ def mean_grid(places_en: Array, values: Array, side: float) -> tuple[Array, floa
     total = np.bincount(place, values, minlength=shape[0] * shape[1])
     mean = np.where(count > 0, total / np.maximum(count, 1), np.nan)
     return mean.reshape(shape), float(west), float(north)
+
+
+def map_errors(
+    axis: Axes, values: Array, limit: float, title: str, label: str, **drawn: Any
+) -> None:
+    """Draw a map of errors (rows, columns), blue and red up to a limit; more as `imshow` takes."""
+    axis.set_facecolor("0.85")
+    colours = {"vmin": -limit, "vmax": limit, "cmap": "RdBu_r", "interpolation": "nearest"}
+    colour_bar(axis.imshow(values, **(colours | drawn)), axis, label)
+    axis.grid(visible=False)
+    axis.set_title(title)
+    map_axes(axis)
 
 
 def json_number(value: float, digits: int) -> float | None:

@@ -20,8 +20,14 @@ from alice_survey.core.executor import run_apart
 from alice_survey.core.frames import Array, Datum
 from alice_survey.core.records import ReferenceRecord, RegistrationRecord
 from alice_survey.core.run import progress
-from alice_survey.kit.figure import colour_bar, figure_style, map_axes, new_figure, save_figure
-from reconstruct.evaluate.figures import fit_doming, json_number, mean_grid, shares_within
+from alice_survey.kit.figure import figure_style, new_figure, save_figure
+from reconstruct.evaluate.figures import (
+    fit_doming,
+    json_number,
+    map_errors,
+    mean_grid,
+    shares_within,
+)
 from reconstruct.evaluate.registration import (
     CloudDistances,
     ReferenceSurface,
@@ -358,13 +364,8 @@ def plot_reference(path: Path, ours: CloudDistances, back: CloudDistances, pixel
     extent = (west, west + values.shape[1] * side, north - values.shape[0] * side, north)
     figure = new_figure(5.6, 13)
     plane, curve = figure.subplots(1, 2, width_ratios=[1.3, 1])
-    plane.set_facecolor("0.85")
-    colours: dict[str, Any] = {"vmin": -limit, "vmax": limit, "cmap": "RdBu_r"}
-    image = plane.imshow(values, extent=extent, interpolation="nearest", **colours)
-    plane.grid(visible=False)
-    plane.set_title("Survey minus reference")
-    colour_bar(image, plane, "survey above reference (m)")
-    map_axes(plane)
+    title, label = "Survey minus reference", "survey above reference (m)"
+    map_errors(plane, values, limit, title, label, extent=extent)
     for one, name in ((ours, "survey to reference"), (back, "reference to survey")):
         away = np.sort(np.abs(one.signed_m))[:: max(1, len(one.signed_m) // 2000)]
         curve.plot(away / pixel_m, np.linspace(0, 1, len(away)), label=name)

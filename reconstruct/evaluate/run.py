@@ -23,20 +23,13 @@ from alice_survey.core.manifest import read_manifest
 from alice_survey.core.products import ERROR
 from alice_survey.core.records import RegistrationRecord, ScoreRecord
 from alice_survey.core.run import progress
-from alice_survey.kit.figure import (
-    colour_bar,
-    even_limit,
-    figure_style,
-    map_axes,
-    new_figure,
-    save_figure,
-)
+from alice_survey.kit.figure import even_limit, figure_style, new_figure, save_figure
 from alice_survey.sim.seafloor.terrain import read_terrain
 from alice_survey.sim.seafloor.texture import survey_texture
 from camera_calib.rig import read_rig
 from missions.values.plan_file import read_plan
 from reconstruct.elevation import elevation_in
-from reconstruct.evaluate.figures import compare_lengths, rms
+from reconstruct.evaluate.figures import compare_lengths, map_errors, rms
 from reconstruct.evaluate.scores import (
     SurfaceScore,
     read_mesh,
@@ -44,11 +37,7 @@ from reconstruct.evaluate.scores import (
     score_mosaic,
     score_surface,
 )
-from reconstruct.evaluate.truth import (
-    ground_pixel_m,
-    overlaps_reached,
-    read_true_poses,
-)
+from reconstruct.evaluate.truth import ground_pixel_m, overlaps_reached, read_true_poses
 from reconstruct.placing.alignment import align_rigid, align_similarity
 from reconstruct.placing.track import read_track_poses
 
@@ -62,8 +51,6 @@ class CameraScore:
     truth_from_world: RigidTransform
     """The rigid alignment; the surface and the mosaic are moved by it too."""
     names: tuple[str, ...]
-    positions_ned: Array
-    """(N, 3) aligned entrance pupils."""
     errors_m: Array
     """(N, 3) aligned minus true position, north, east, down."""
     turns_deg: Array
@@ -124,7 +111,6 @@ def score_cameras(
         total=total,
         truth_from_world=alignment,
         names=names,
-        positions_ned=alignment.apply(found),
         errors_m=alignment.apply(found) - true,
         turns_deg=np.rad2deg(turns),
         scale_error=1.0 / similarity.scale - 1.0,
@@ -205,19 +191,14 @@ def plot_errors(path: Path, surface: SurfaceScore, area: MultiPolygon) -> None:
     west, east, south, north = surface.extent_m
     figure = new_figure(5.5 * min(max(0.9 * (north - south) / (east - west), 1.0), 1.7), 11.0)
     plane, bars = figure.subplots(1, 2, width_ratios=[1.3, 1])
-    colours: dict[str, Any] = {"vmin": -shown, "vmax": shown, "cmap": "PuOr"}
-    image = plane.imshow(
-        1e3 * surface.map_m, extent=surface.extent_m, interpolation="nearest", **colours
-    )
+    map_errors(
+        plane, 1e3 * surface.map_m, shown, "Surface minus truth", "height error (mm)",
+        extent=surface.extent_m, cmap="PuOr",
+    )  # fmt: skip
     for part in area.geoms:
         for ring in (part.exterior, *part.interiors):
             ring_ne = np.asarray(ring.coords)
             plane.plot(ring_ne[:, 1], ring_ne[:, 0], "k--", linewidth=1)
-    colour_bar(image, plane, "height error (mm)")
-    plane.set_title("Surface minus truth")
-    plane.grid(visible=False)
-    map_axes(plane)
-    plane.set_facecolor("0.85")
     bars.hist(1e3 * surface.height_m, bins=np.linspace(-4 * limit, 4 * limit, 161), log=True)
     bars.set(xlabel="height error (mm)", ylabel="cells")
     bars.set_title(f"rms {figures['height_rms_mm']:.2f} mm; {surface.completeness:.1%} complete")

@@ -36,9 +36,6 @@ from reconstruct.evaluate.truth import surface_depth, surface_distance, surface_
 from reconstruct.mesh.visibility import distances_from
 from reconstruct.raster import opened_raster
 
-GOOD_M = 0.01
-"""A cell counts as accurate when its distance from the true surface is below this."""
-
 _STRIP_CELLS = 400_000
 
 
@@ -79,7 +76,6 @@ class SurfaceScore:
         return {
             "cells": self.cells,
             "completeness": round(self.completeness, 4),
-            "accurate_share": round(float((self.distance_m < GOOD_M).sum() / self.cells), 4),
             **spread("distance", distance),
             "distance_max_mm": json_number(percentile(distance, 100), 3),
             "height_rms_mm": json_number(rms(height), 3),
@@ -259,11 +255,8 @@ class MosaicScore:
             "clear_share": round(len(self.shifts_m) / max(self.patches, 1), 4),
         }
         if len(self.shifts_m):
-            length_mm = 1e3 * np.linalg.norm(self.shifts_m, axis=1)
-            figures["position_rms_mm"] = round(float(np.sqrt(np.mean(length_mm**2))), 3)
+            figures |= spread("position", 1e3 * np.linalg.norm(self.shifts_m, axis=1))
             figures["position_rms_px"] = round(1e-3 * figures["position_rms_mm"] / self.pixel_m, 4)
-            figures["position_median_mm"] = round(float(np.median(length_mm)), 3)
-            figures["position_95_mm"] = round(float(np.percentile(length_mm, 95)), 3)
         return figures
 
 

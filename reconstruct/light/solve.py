@@ -312,11 +312,7 @@ SampleParts = Parts[Any, LightSamples]
 
 def in_one_part(samples: LightSamples) -> SampleParts:
     """Samples that are in memory."""
-    return Parts(items=[samples], load=_as_they_are, label="light of all pictures")
-
-
-def _as_they_are(samples: LightSamples) -> LightSamples:
-    return samples
+    return Parts(items=[()], load=lambda _: samples, label="light of all pictures")
 
 
 @progress.step("solve the light of all pictures")
@@ -332,44 +328,27 @@ def solve_light(
         images: names of the views, by number.
         cameras: their cameras.
     """
-    even = _solve_parts(parts, nodes, images, cameras, _GAIN_SIGMA, 0.0)
+    even = solve_patterns(parts, nodes, images, cameras)
     return replace(even, white=_white(parts, even, images, cameras))
 
 
 def solve_patterns(
-    samples: LightSamples,
-    nodes: Array,
-    images: Sequence[str],
-    cameras: Sequence[str],
-    gain_sigma: float = _GAIN_SIGMA,
-    unsure: Array | None = None,
-) -> LightModel:
-    """As `solve_light`, with a white of 1; the fall-off with range too where samples have it.
-
-    Args:
-        samples: see `solve_light`.
-        nodes: see `solve_light`.
-        images: see `solve_light`.
-        cameras: see `solve_light`.
-        gain_sigma: expected size of the logarithm of a picture's own light.
-        unsure: (N, 3) factors of the samples' errors over the usual; None for 1.
-    """
-    middle = 0.0
-    if samples.ranges is not None and len(samples.views):
-        middle = float(np.median(samples.ranges))
-    parts = in_one_part(replace(samples, unsure=unsure))
-    return _solve_parts(parts, nodes, images, cameras, gain_sigma, middle)
-
-
-def _solve_parts(
     parts: SampleParts,
     nodes: Array,
     images: Sequence[str],
     cameras: Sequence[str],
-    gain_sigma: float,
-    middle: float,
+    gain_sigma: float = _GAIN_SIGMA,
 ) -> LightModel:
-    """As `solve_patterns`, of samples in parts with a middle range."""
+    """As `solve_light`, with a white of 1; of one part with ranges the fall-off with them too.
+
+    Args:
+        parts: see `solve_light`.
+        nodes: see `solve_light`.
+        images: see `solve_light`.
+        cameras: see `solve_light`.
+        gain_sigma: expected size of the logarithm of a picture's own light.
+    """
+    middle = next(parts.map(_middle_range)) if parts.is_one else 0.0
     names = sorted(set(cameras))
     number = {name: n for n, name in enumerate(names)}
     camera_of = np.array([number[camera] for camera in cameras])
@@ -402,6 +381,12 @@ def _solve_parts(
         fall_off_sigma=np.sqrt(variance),
         middle_range=middle,
     )
+
+
+def _middle_range(samples: LightSamples, _: None) -> float:
+    if samples.ranges is None or not len(samples.views):
+        return 0.0
+    return float(np.median(samples.ranges))
 
 
 def _views_of(samples: LightSamples, _: None) -> NDArray[np.int64]:

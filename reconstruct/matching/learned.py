@@ -21,6 +21,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from alice_survey.core.executor import Executor
 from alice_survey.core.frames import BODY_FROM_NADIR_CAM, Array
@@ -197,14 +198,8 @@ def dense_features(grey: NDArray[np.uint8]) -> tuple[Floats, Floats, Floats]:
 
 def sample(field: Floats, at: Array) -> Array:
     """Values (N, C) of a field (H, W, C) at places (N, 2), x and y, bilinear; held at its rim."""
-    last = np.array([field.shape[1] - 1, field.shape[0] - 1])
-    inside = np.clip(at, 0, last)
-    low = np.minimum(inside.astype(int), np.maximum(last - 1, 0))
-    high = np.minimum(low + 1, last)
-    x, y = (inside - low).T[..., None]
-    upper = (1 - x) * field[low[:, 1], low[:, 0]] + x * field[low[:, 1], high[:, 0]]
-    lower = (1 - x) * field[high[:, 1], low[:, 0]] + x * field[high[:, 1], high[:, 0]]
-    values: Array = (1 - y) * upper + y * lower
+    where = np.broadcast_arrays(at[:, 1:], at[:, :1], np.arange(field.shape[2]))
+    values: Array = map_coordinates(field, where, np.float64, order=1, mode="nearest")
     return values
 
 

@@ -373,10 +373,6 @@ class SurfaceAreas:
     by_plan: PackedSlopes
     """What moves that of its plan."""
 
-    def figures(self, surface: MeasuredSurface) -> tuple[Measured, Measured]:
-        """Area of the surface, and that over the area in plan."""
-        return figures_of_all(surface, [self])
-
 
 def figures_of_all(
     surface: MeasuredSurface, parts: Sequence[SurfaceAreas]

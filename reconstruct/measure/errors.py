@@ -80,12 +80,6 @@ class SharedErrors:
         weights = np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=1)
         return nodes, weights
 
-    def motions_at(self, places: Array) -> Array:
-        """Motions (N, 3, K) of (N, 2) places."""
-        nodes, weights = self.around(places)
-        flat = self.motions.reshape(self.nodes, 3, -1)
-        return np.asarray(np.einsum("na,naik->nik", weights, flat[nodes]))
-
     def variance_of_heights(self, places: Array) -> Array:
         """Variances (N,) of the heights of (N, 2) places by what they share."""
         nodes, weights = self.around(places)
@@ -94,20 +88,6 @@ class SharedErrors:
     def own_sigma(self, places: Array, sigma: Array) -> Array:
         """What a sigma (N,) of heights leaves to each of (N, 2) places alone."""
         return np.sqrt(np.maximum(sigma**2 - self.variance_of_heights(places), 0.0))
-
-    def together(self, places: Array) -> Array:
-        """How (N, 2) close places move with K independent errors of sigma 1, (N, 3, K).
-
-        What places around a node share with no others they share all, as one node's.
-        """
-        values, axes = np.linalg.eigh(self.covariance)
-        root = axes * np.sqrt(np.maximum(values, 0.0))
-        known = places[np.isfinite(places).all(axis=1)]
-        nodes, weights = self.around(known.sum(axis=0, keepdims=True) / max(1, len(known)))
-        values, axes = np.linalg.eigh(self.rest.reshape(-1, 3, 3)[nodes[0, weights[0].argmax()]])
-        rest = axes * np.sqrt(np.maximum(values, 0.0))
-        alike = np.broadcast_to(rest, (len(places), 3, 3))
-        return np.concatenate([self.motions_at(places) @ root, alike], axis=2)
 
     @cached_property
     def _of_heights(self) -> Array:

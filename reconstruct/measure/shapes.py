@@ -5,6 +5,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -207,13 +208,11 @@ Base = float | Literal["rim"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _PolygonMoments:
-    """Sums over the known squares of a polygon, about its middle."""
+    """Sums over the known part of a polygon, about its middle."""
 
     share: float
     """Known, of the polygon's area."""
     area: float
-    first: Array
-    """(3,) sum of area times 1, x and y."""
     second: Array
     """(3, 3) sum over cells of weights times the products of 1, x and y."""
     heights: Array
@@ -232,19 +231,17 @@ def _upright(block: GridPart) -> Array:
 
 def _moments(region: PolygonOnGrid) -> _PolygonMoments:
     cell = region.surface.grid.cell
-    first, second, heights = np.zeros(3), np.zeros((3, 3)), np.zeros(3)
+    area, second, heights = 0.0, np.zeros((3, 3)), np.zeros(3)
     for block in region.blocks():
         upright = _upright(block)
-        middles = np.stack([mean_of_corners(upright[..., k]) for k in range(3)], axis=-1)
-        first += cell**2 * (block.weight[..., None] * middles).sum(axis=(0, 1))
+        area += cell**2 * float(block.weight.sum())
         weight = spread_to_cells(block.weight)
         used = weight > 0
         second += (weight[used, None] * upright[used]).T @ upright[used]
         heights += (weight[used] * block.height[used]) @ upright[used]
     return _PolygonMoments(
-        share=first[0] / region.polygon.area, area=first[0], first=first, second=second,
-        heights=heights,
-    )  # fmt: skip
+        share=area / region.polygon.area, area=area, second=second, heights=heights
+    )
 
 
 def measure_polygon(
@@ -286,7 +283,7 @@ def measure_polygon(
     sums = _PolygonSums(region, moments, rim)
     figures = [
         of_points(surface, ring, "plan_area", "Area in plan", plan_area, 2),
-        *sums.areas.figures(surface),
+        *figures_of_all(surface, [sums.areas]),
         *sums.slope,
         figure(surface, "mean_height", "Mean height", sums.mean, sums.by_mean.packed, 1),
         of_points(surface, ring, "perimeter", "Perimeter in plan", _plan_length, 1),
@@ -516,7 +513,8 @@ def measure_polygon_file(
         lines.append(_line(f"{one.polygon.name} ({one.polygon.label})", figures))
         each.append([figure.to_json() for figure in figures])
     known = _known_area(surface)
-    for name, group in groupby(sorted(measured, key=_label), _label):
+    by_label = attrgetter("polygon.label")
+    for name, group in groupby(sorted(measured, key=by_label), by_label):
         same = list(group)
         figures = _figures(surface, same, sigma)
         covered = float(shapely.union_all([one.polygon.geometry for one in same]).area) / known
@@ -636,18 +634,14 @@ def plan_slopes_of(surface: MeasuredSurface, polygon: BaseGeometry, sigma: float
         sigma: of a corner in each axis.
     """
     gathered = FigureSlopes(surface.errors)
-    for part in shapely.get_parts(shapely.orient_polygons(polygon)):
-        for ring in shapely.get_rings(part):
-            places = shapely.get_coordinates(ring)[:-1]
-            chord = np.roll(places, -1, axis=0) - np.roll(places, 1, axis=0)
-            slopes = 0.5 * np.column_stack([chord[:, 1], -chord[:, 0], np.zeros(len(chord))])
-            found = surface.at_picks(places)
-            known = np.isfinite(found.height)[:, None]
-            samples = replace(
-                found, own=np.where(known, found.own, 0.0), sight=np.where(known, found.sight, 0.0)
-            )
-            own = samples.own_variance(slopes) + sigma**2 * float((slopes**2).sum())
-            gathered.add(places, slopes, own)
+    for places, slopes in _corners(polygon):
+        found = surface.at_picks(places)
+        known = np.isfinite(found.height)[:, None]
+        samples = replace(
+            found, own=np.where(known, found.own, 0.0), sight=np.where(known, found.sight, 0.0)
+        )
+        own = samples.own_variance(slopes) + sigma**2 * float((slopes**2).sum())
+        gathered.add(places, slopes, own)
     return gathered.packed
 
 
@@ -670,14 +664,18 @@ def _figures(
     return plan, replace(slanted, own=own), rugosity
 
 
-def _corner_gain(polygon: BaseGeometry) -> float:
-    """Variance of a polygon's area where each corner has a variance of 1 in each axis."""
-    total = 0.0
-    for part in shapely.get_parts(polygon):
+def _corners(polygon: BaseGeometry) -> Iterator[tuple[Array, Array]]:
+    """Corners (N, 2) of each ring, and (N, 3) how motions of these change the area in plan."""
+    for part in shapely.get_parts(shapely.orient_polygons(polygon)):
         for ring in shapely.get_rings(part):
             places = shapely.get_coordinates(ring)[:-1]
-            total += float(((np.roll(places, -1, axis=0) - np.roll(places, 1, axis=0)) ** 2).sum())
-    return total / 4.0
+            chord = np.roll(places, -1, axis=0) - np.roll(places, 1, axis=0)
+            yield places, 0.5 * np.column_stack([chord[:, 1], -chord[:, 0], np.zeros(len(chord))])
+
+
+def _corner_gain(polygon: BaseGeometry) -> float:
+    """Variance of a polygon's area where each corner has a variance of 1 in each axis."""
+    return math.fsum(float((slopes**2).sum()) for _, slopes in _corners(polygon))
 
 
 def _pixel(surface: MeasuredSurface) -> float:
@@ -696,10 +694,6 @@ def _known_area(surface: MeasuredSurface) -> float:
         for _, window in raster.block_windows(1):
             known += int(np.isfinite(raster.read(1, window=window)).sum())
     return max(known, 1) * surface.grid.cell**2
-
-
-def _label(one: _PolygonAreas) -> str:
-    return one.polygon.label
 
 
 def _line(what: str, figures: Sequence[Measured]) -> str:

@@ -47,13 +47,9 @@ def sight_lines(workspace: Path, plane: Plane, points: Array) -> Array | None:
     source, track = workspace / SOURCE, workspace / _TRACK
     if not source.is_file() or not track.is_file():
         return None
-    numbers = np.zeros(len(points), np.int64)
     with small_cache(), opened_raster(source) as raster:
         names = json.loads(raster.tags().get("PICTURES", "[]"))
-        for n, (x, y, _) in enumerate(points):
-            row, column = raster.index(x, y)
-            if 0 <= row < raster.height and 0 <= column < raster.width:
-                numbers[n] = raster.read(1, window=Window(int(column), int(row), 1, 1))[0, 0]
+        numbers = np.array([int(value) for (value,) in raster.sample(points[:, :2], indexes=[1])])
     used_names = {names[n - 1] for n in numbers.tolist() if 0 < n <= len(names)}
     centres = camera_centres(track, plane, used_names)
     lines = np.zeros((len(points), 2))
@@ -70,15 +66,11 @@ def camera_centres(track: Path, plane: Plane, used_names: set[str]) -> dict[str,
     axes = next((axes for axes in _AXES if axes[0] in header), _AXES[0])
     with taken_from(track):
         places = {
-            row["image"]: np.array([float(row[axis]) for axis in axes])
+            row["image"]: plane.plane_from_world.apply([float(row[axis]) for axis in axes])
             for _, row in rows
             if row["image"] in used_names
         }
-    centres = {}
-    for name, place in places.items():
-        up, right, into = plane.plane_from_world.apply(place)
-        centres[name] = np.array([right, up, -into])
-    return centres
+    return {name: np.array([right, up, -into]) for name, (up, right, into) in places.items()}
 
 
 _PICKING = "not counted: how well a place was picked on the map"

@@ -33,6 +33,7 @@ from reconstruct.light.solve import (
     LightSamples,
     bilinear,
     brightening,
+    in_one_part,
     neutral_factors,
     node_weights,
     solve_patterns,
@@ -316,8 +317,8 @@ def solve_colour(
             ),
         )
         notes.append(note)
-    cleaned, unsure = _without_water(samples, model, facts)
-    model = replace(model, light=_patterns(cleaned, unsure, model, facts))
+    cleaned = _without_water(samples, model, facts)
+    model = replace(model, light=_patterns(cleaned, model, facts))
     if found := _reference_white(samples, model, facts, references):
         white, note = found
         light = replace(model.light, white=white)
@@ -353,7 +354,7 @@ def _water(samples: LightSamples, facts: Sequence[PictureMeasures]) -> tuple[Wat
 
 
 def _patterns(
-    cleaned: LightSamples, unsure: Array, model: ColourModel, facts: Sequence[PictureMeasures]
+    cleaned: LightSamples, model: ColourModel, facts: Sequence[PictureMeasures]
 ) -> LightModel:
     """The light of lamps and pictures, once that which the water adds is taken away.
 
@@ -374,12 +375,11 @@ def _patterns(
     with np.errstate(invalid="ignore"):
         usable = left > MIN_LEFT * nodes
     found = solve_patterns(
-        cleaned,
+        in_one_part(cleaned),
         np.where(usable, np.log(np.where(usable, left, 1.0)), np.nan),
         [fact.image for fact in facts],
         [fact.camera for fact in facts],
         _GAIN_SIGMA,
-        unsure,
     )
     if water is None:
         return found
@@ -442,14 +442,14 @@ def _levels(samples: LightSamples, model: ColourModel, facts: Sequence[PictureMe
 
 def _without_water(
     samples: LightSamples, model: ColourModel, facts: Sequence[PictureMeasures]
-) -> tuple[LightSamples, Array]:
-    """Samples minus the light that the water adds, and (N, 3) how much less sure they are for it.
+) -> LightSamples:
+    """Samples minus the light that the water adds, and how much less sure they are for it.
 
     The usual error counts over the share of light that is left, and the loss between two ranges is
     off by as much of itself. Where too little is left they are dropped.
     """
     if model.water is None:
-        return samples, np.ones((len(samples.views), 3))
+        return samples
     light = np.exp(samples.levels.astype(np.float64))
     beyond = growth_at(model.growth, np.asarray(samples.ranges), model.light.middle_range)
     left = light - sample_maps(samples, model.water.added, facts) * beyond
@@ -457,7 +457,7 @@ def _without_water(
     loss = np.diff(model.weakening(np.asarray(samples.ranges)[kept]), axis=1)[:, 0]
     unsure = np.hypot((light[kept] / left[kept]).mean(axis=1), loss)
     levels = np.log(left[kept]).astype(np.float32)
-    return replace(samples.part(kept), levels=levels), unsure
+    return replace(samples.part(kept), levels=levels, unsure=unsure)
 
 
 def sample_maps(

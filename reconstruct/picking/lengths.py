@@ -16,7 +16,7 @@ out knows less, never more.
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,7 @@ from reconstruct.adjustment.exact_observations import (
     RigState,
     calibrated_parameters,
     exact_observations,
+    exact_residuals,
 )
 from reconstruct.adjustment.normal_equations import Gauge, PointEquations, by_pose, reduce_parts
 from reconstruct.mapping.arrays import MIN_POINTS, Indices, first_of, linked_groups
@@ -117,14 +118,14 @@ class StationBlock:
 
     @classmethod
     def around(
-        cls, workspace: Path, pictures: RegisteredPictures, stations: Indices
+        cls, workspace: Path, pictures: RegisteredPictures, stations: Sequence[int]
     ) -> "StationBlock":
         """The block of some stations.
 
         Args:
             workspace: folder with a finished `sparse/`.
             pictures: its pictures.
-            stations: numbers of those wanted.
+            stations: their numbers.
 
         Raises:
             ReconstructionError: these do not hang together, or have too few points.
@@ -209,13 +210,8 @@ class StationBlock:
             return np.zeros((len(by_poses),) * 2), by_rig @ self.covariance @ by_rig.T
         shape = np.stack([self.gauge.shape_weights(one) for one in by_poses], axis=-1)
         poses = np.einsum("fik,fil->kl", shape, self.equations.undamped.solve(shape))
-        along = np.einsum("fik,fig->kg", shape, self._response) + by_rig
+        along = np.einsum("fik,fig->kg", shape, self.equations.response) + by_rig
         return poses, along @ self.covariance @ along.T
-
-    @cached_property
-    def _response(self) -> Array:
-        """(F, 6, G)."""
-        return self.equations.response
 
 
 class Lengths:
@@ -224,7 +220,7 @@ class Lengths:
     def __init__(self, workspace: Path, pictures: RegisteredPictures) -> None:
         """Take a workspace with a finished `sparse/`."""
         self._workspace, self._pictures = workspace, pictures
-        self._kept: tuple[bytes, StationBlock] | None = None
+        self._around = lru_cache(1)(lambda chosen: StationBlock.around(workspace, pictures, chosen))
         numbers, first = np.unique(pictures.station, return_index=True)
         self._numbers, self._places = numbers, pictures.centres[first]
 
@@ -296,12 +292,7 @@ class Lengths:
         away = np.asarray(KDTree(along).query(self._places)[0])
         away[np.isin(self._numbers, needed)] = -1.0
         chosen = np.sort(self._numbers[np.argsort(away, kind="stable")[:MAX_STATIONS]])
-        if self._kept is None or self._kept[0] != chosen.tobytes():
-            self._kept = (
-                chosen.tobytes(),
-                StationBlock.around(self._workspace, self._pictures, chosen),
-            )
-        return self._kept[1]
+        return self._around(tuple(chosen.tolist()))
 
 
 def point_residuals(
@@ -403,13 +394,8 @@ def _observations(
         camera=np.concatenate(camera)[kept].astype(np.int64),
         taken=np.zeros((len(kept), 2)), point=index.astype(np.int64),
     )  # fmt: skip
-    arm = state.points[pixels.point] - state.centres[pixels.station]
-    in_rig = np.einsum("nij,ni->nj", state.turns[pixels.station], arm)
-    for number, (name, pose) in enumerate(state.rig.cam_from_rig.items()):
-        mine = np.flatnonzero(pixels.camera == number)
-        # where they are seen, not where they were found: these are slopes, not an adjustment
-        pixels.taken[mine] = state.rig.cameras[name].project(pose.apply(in_rig[mine]))
-    return pixels, state
+    # where they are seen, not where they were found: these are slopes, not an adjustment
+    return replace(pixels, taken=exact_residuals(pixels, state)), state
 
 
 def _scale_sigma(workspace: Path) -> float:

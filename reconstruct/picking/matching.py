@@ -12,7 +12,7 @@ must meet in one point; how far they are off, over what they state, is the facto
 worse.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -59,20 +59,6 @@ _LAG_PX = 1
 """Residuals farther apart are independent."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Match:
-    """A spot found in another picture."""
-
-    image: str
-    pixel: Array
-    """(2,) of the picture as taken, from the outer corner of the first."""
-    sigma_px: float
-    """Of either coordinate, relative to the pick that was matched."""
-    correlation: float
-    moved_px: float
-    """From where the surface and the poses say it is."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class NoMatch:
     """Why a spot is not found in a picture."""
@@ -85,17 +71,18 @@ class Matcher:
     """Finds one pick again."""
 
     def __init__(
-        self, grey: Grey, picture: RegisteredPicture, pixel: Array, place: SurfacePlace
+        self, grey: Grey, picture: RegisteredPicture, pick: Pick, place: SurfacePlace
     ) -> None:
         """Take a pick.
 
         Args:
             grey: (H, W) the picture as taken.
             picture: its camera and pose.
-            pixel: (2,) picked in it, from the outer corner of the first.
+            pick: in it.
             place: of the surface, where the pick's ray meets it.
         """
-        self._place = place
+        self._pick, self._place = pick, place
+        pixel = np.array([pick.x_px, pick.y_px])
         reach = np.arange(-HALF_PX, HALF_PX + 1.0)
         grid = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 2)
         self._weight = np.exp(-0.5 * (grid**2).sum(axis=1) / _WEIGHT_PX**2)
@@ -106,8 +93,8 @@ class Matcher:
         self._own = _PicturePart.around(grey, pixel, HALF_PX + 1)
         self._shown = self._own.at(pixel + grid)[0]
 
-    def find(self, image: str, grey: Grey, picture: RegisteredPicture) -> Match | NoMatch:
-        """Find the pick in another picture.
+    def find(self, image: str, grey: Grey, picture: RegisteredPicture) -> Pick | NoMatch:
+        """Find the pick in another picture, with a sigma relative to the pick.
 
         Args:
             image: its name.
@@ -144,11 +131,10 @@ class Matcher:
             return NoMatch(
                 image=image, why=f"too little texture: it would be known to {sigma:.1f} px only"
             )
-        found = middle + shift + move
-        return Match(
-            image=image, pixel=found, sigma_px=sigma, correlation=correlation,
-            moved_px=float(np.linalg.norm(found - middle)),
-        )  # fmt: skip
+        x, y = (middle + shift + move).tolist()
+        return replace(
+            self._pick, image=image, x_px=x, y_px=y, sigma_px=sigma, matched_to=self._pick.image
+        )
 
     def _search(
         self, part: "_PicturePart", expected: Array, reach: int
@@ -289,13 +275,9 @@ class Refined:
 
     picks: tuple[Pick, ...]
     """The pick itself first."""
-    matches: tuple[Match, ...]
-    """One for each of the other picks, with the sigma that these state."""
     refused: tuple[NoMatch, ...]
     meeting: TriangulatedPoint | None
     """The point that they have in common."""
-    factor: float
-    """By which sigmas were enlarged."""
 
 
 def refine(
@@ -314,76 +296,45 @@ def refine(
         picture: camera and pose by name.
         grey: pixels as taken by name.
     """
-    mark = np.array([pick.x_px, pick.y_px])
-    matcher = Matcher(grey(pick.image), picture(pick.image), mark, place)
-    found: dict[str, Match] = {}
+    matcher = Matcher(grey(pick.image), picture(pick.image), pick, place)
+    found: dict[str, Pick] = {}
     refused: list[NoMatch] = []
     for image in images:
         if image == pick.image:
             continue
         got = matcher.find(image, grey(image), picture(image))
-        if isinstance(got, Match):
-            found[image] = got
-        else:
+        if isinstance(got, NoMatch):
             refused.append(got)
+        else:
+            found[image] = got
     cameras = {image: picture(image) for image in (pick.image, *found)}
     while True:
-        picks = [pick, *(_pick_of(match, pick) for match in found.values())]
+        picks = [pick, *found.values()]
         meeting = triangulate_picks(picks, cameras)[0].get(pick.point) if found else None
         if meeting is None:
             break
-        factor = _factor(meeting, picks, cameras)
-        worst, off = _worst(meeting, picks, cameras, factor)
-        if len(found) < 3 or off <= _WRONG_SIGMAS:
+        away = residuals(meeting.model, picks, cameras) / own_sigmas(picks)[:, None]
+        factor = _factor(away)
+        off = np.linalg.norm(away[1:], axis=1) / factor
+        if len(found) < 3 or off.max() <= _WRONG_SIGMAS:
             break
+        worst = picks[1 + int(np.argmax(off))].image
         del found[worst]
         refused.append(
-            NoMatch(image=worst, why=f"{off:.0f} sigmas off the point that the others show")
+            NoMatch(image=worst, why=f"{off.max():.0f} sigmas off the point that the others show")
         )
     if meeting is None:
         refused += [
             NoMatch(image=image, why="it does not meet the pick in one point") for image in found
         ]
-        return Refined(
-            picks=(pick,), matches=(), refused=tuple(refused), meeting=None, factor=_USUAL_FACTOR
-        )
-    matches = [replace(m, sigma_px=factor * m.sigma_px) for m in found.values()]
-    picks = [pick, *(_pick_of(match, pick) for match in matches)]
-    return Refined(
-        picks=tuple(picks), matches=tuple(matches), refused=tuple(refused), factor=factor,
-        meeting=triangulate_picks(picks, cameras)[0].get(pick.point),
-    )  # fmt: skip
+        return Refined(picks=(pick,), refused=tuple(refused), meeting=None)
+    picks = [pick, *(replace(one, sigma_px=factor * one.sigma_px) for one in picks[1:])]
+    meeting = triangulate_picks(picks, cameras)[0].get(pick.point)
+    return Refined(picks=tuple(picks), refused=tuple(refused), meeting=meeting)
 
 
-def _pick_of(match: Match, pick: Pick) -> Pick:
-    x, y = match.pixel.tolist()
-    return replace(
-        pick, image=match.image, x_px=x, y_px=y, sigma_px=match.sigma_px, matched_to=pick.image
-    )
-
-
-def _factor(
-    meeting: TriangulatedPoint, picks: Sequence[Pick], cameras: Mapping[str, RegisteredPicture]
-) -> float:
-    """By which matches are worse than they state, at least 1."""
-    off = residuals(meeting.model, picks, cameras) / own_sigmas(picks)[:, None]
-    spare = 2 * len(picks) - 3
+def _factor(off: Array) -> float:
+    """By which matches are worse than they state, at least 1, by residuals (N, 2) over sigmas."""
     total = float((np.minimum(np.abs(off), 2 * _WRONG_SIGMAS) ** 2).sum())
-    mean = (total + _USUAL_WEIGHT * _USUAL_FACTOR**2) / (spare + _USUAL_WEIGHT)
+    mean = (total + _USUAL_WEIGHT * _USUAL_FACTOR**2) / (off.size - 3 + _USUAL_WEIGHT)
     return float(np.sqrt(max(1.0, mean)))
-
-
-def _worst(
-    meeting: TriangulatedPoint,
-    picks: Sequence[Pick],
-    cameras: Mapping[str, RegisteredPicture],
-    factor: float,
-) -> tuple[str, float]:
-    """The match that is farthest off the common point, and by how many of its sigmas."""
-    off = (
-        np.linalg.norm(residuals(meeting.model, picks, cameras), axis=1)
-        / own_sigmas(picks)
-        / factor
-    )
-    worst = 1 + int(np.argmax(off[1:]))
-    return picks[worst].image, float(off[worst])

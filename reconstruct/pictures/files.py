@@ -341,16 +341,16 @@ def bits_used(highest: int) -> int:
     return next(bits for bits in (8, 10, 12, 14, 16) if highest < 2**bits)
 
 
-def copy_picture(source: Path, target: Path, bits: int) -> None:
+def copy_picture(task: tuple[Path, Path, int]) -> None:
     """Import a picture: JPEG and PNG of 8 bits as they are, all else as PNG of 8 bits.
 
     An EXIF orientation is taken off the copy, so that every program shows pixels as stored.
 
     Args:
-        source: a file that `inspect` found whole.
-        target: where it goes, with the suffix `target_suffix` gives.
-        bits: `bits_used` by all pictures of the camera; lower bits are cut off.
+        task: a file that `inspect` found whole; where it goes, with the suffix `target_suffix`
+            gives; and `bits_used` by all pictures of the camera: lower bits are cut off.
     """
+    source, target, bits = task
     target.parent.mkdir(parents=True, exist_ok=True)
     if source.suffix.lower() in PLAIN and target.suffix == source.suffix.lower() and bits == 8:
         if _with_exif(PictureFacts(path=source)).orientation == 1:

@@ -486,7 +486,12 @@ def import_images(
     """
     videos = [*videos, *(f for f in folders if f.is_file() and f.suffix.lower() in VIDEO)]
     folders = [folder for folder in folders if folder not in videos]
-    _check_options(folders, cameras, videos, bag, overlap, every_s, triggers)
+    if triggers is not None and not (folders or cameras):
+        raise ImageError("--triggers is for folders of pictures: videos and bags have times")
+    if not videos and (overlap is not None or (every_s is not None and bag is None)):
+        raise ImageError("--overlap and --every choose frames of a video: give --video too")
+    if overlap is not None and every_s is not None:
+        raise ImageError("--overlap and --every exclude each other: give one of them")
     if not np.isfinite(clock_offset_s):
         raise ImageError(f"--clock-offset {clock_offset_s} is not a number of seconds")
     level_name = level_of_log(vertical_datum, navigation)
@@ -600,24 +605,6 @@ def _cameras_by_size(recordings: Sequence[Recording], mono: str) -> list[str]:
     order = [size for size, _ in seconds.most_common()]
     numbers = [order.index(recording.size) for recording in recordings]
     return [f"{mono}-{number + 1}" if number else mono for number in numbers]
-
-
-def _check_options(
-    folders: Sequence[Path],
-    cameras: Mapping[str, Path],
-    videos: Sequence[Path],
-    bag: Path | None,
-    overlap: float | None,
-    every_s: float | None,
-    triggers: Path | None,
-) -> None:
-    """Check that options are of the source that is given."""
-    if triggers is not None and not (folders or cameras):
-        raise ImageError("--triggers is for folders of pictures: videos and bags have times")
-    if not videos and (overlap is not None or (every_s is not None and bag is None)):
-        raise ImageError("--overlap and --every choose frames of a video: give --video too")
-    if overlap is not None and every_s is not None:
-        raise ImageError("--overlap and --every exclude each other: give one of them")
 
 
 def _check_paths(workspace: Path, given: Sequence[Path]) -> None:

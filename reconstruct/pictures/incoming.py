@@ -573,13 +573,13 @@ def check_rig(sizes: Mapping[str, tuple[int, int]], rig: Rig) -> None:
 def unique_names(entries: Sequence[Incoming]) -> list[Incoming]:
     """Names below `images/`: the camera's folder and a safe, unique form of the file's own name."""
     taken: set[str] = set()
-    named = []
+    named, bits = [], _bits(entries)
     for entry in entries:
         if entry.image:
             named.append(entry)
             continue
         stem = safe_name(entry.source.stem)
-        suffix = target_suffix(entry.source, _bits(entries, entry.camera))
+        suffix = target_suffix(entry.source, bits[entry.camera])
         image, copy = f"{safe_name(entry.camera)}/{stem}{suffix}", 1
         while image.lower() in taken:
             copy += 1
@@ -589,8 +589,12 @@ def unique_names(entries: Sequence[Incoming]) -> list[Incoming]:
     return named
 
 
-def _bits(entries: Sequence[Incoming], camera: str) -> int:
-    return bits_used(max(e.facts.highest for e in entries if e.camera == camera))
+def _bits(entries: Sequence[Incoming]) -> dict[str, int]:
+    """Bits that the pictures of each camera use."""
+    highest: dict[str, int] = {}
+    for entry in entries:
+        highest[entry.camera] = max(entry.facts.highest, highest.get(entry.camera, 0))
+    return {camera: bits_used(value) for camera, value in sorted(highest.items())}
 
 
 def mask_of(entry: Incoming, masks: Path | None, stereo: bool) -> Path | None:
@@ -611,19 +615,15 @@ def mask_of(entry: Incoming, masks: Path | None, stereo: bool) -> Path | None:
 
 def copy_all(entries: Sequence[Incoming], partial: Path, executor: Executor) -> list[str]:
     """Copy pictures to where their names say; what was lost in it, as notes."""
-    bits = {camera: _bits(entries, camera) for camera in {e.camera for e in entries}}
+    bits = _bits(entries)
     tasks = [(entry.source, partial / entry.image, bits[entry.camera]) for entry in entries]
-    for _ in executor.map(_copy, tasks, label="copying pictures"):
+    for _ in executor.map(copy_picture, tasks, label="copying pictures"):
         pass
     return [
         f"pictures of camera {camera} held {count} bits; the upper 8 were kept"
-        for camera, count in sorted(bits.items())
+        for camera, count in bits.items()
         if count > 8
     ]
-
-
-def _copy(task: tuple[Path, Path, int]) -> None:
-    copy_picture(*task)
 
 
 def record_of(entry: Incoming, partial: Path) -> ImageRecord:

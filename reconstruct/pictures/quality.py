@@ -8,6 +8,7 @@ import math
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -71,30 +72,21 @@ class PictureQuality:
         return bool(self.reasons)
 
 
-@dataclass(frozen=True, kw_only=True)
-class MeasureTask:
-    """One picture to read and measure."""
-
-    images: Path
-    record: ImageRecord
-
-
-def measure_file(task: MeasureTask) -> PictureQuality:
+def measure_file(images: Path, record: ImageRecord) -> PictureQuality:
     """Read and measure one picture; a file that cannot be used gives the reason, never an error."""
-    record = task.record
+    path = images / record.image
     bare = PictureQuality(image=record.image, camera=record.camera, station=record.station)
     try:
-        path = task.images / record.image
         pixels = decode(path) if path.is_file() else None
         if pixels is None:
             raise ImageError("no such file")
         mask = None
         if record.mask:
-            mask = read_mask(task.images / record.mask, (pixels.shape[1], pixels.shape[0]))
+            mask = read_mask(images / record.mask, (pixels.shape[1], pixels.shape[0]))
         figures: dict[str, Any] = dict(measure(pixels, mask))
         return replace(bare, **figures)
     except (ImageError, OSError) as error:
-        text = why(error).removeprefix(f"{task.images / record.image}: ")
+        text = why(error).removeprefix(f"{path}: ")
         return replace(bare, reasons=(f"unreadable: {text}",))
 
 
@@ -288,9 +280,9 @@ def quality_report(workspace: Path, executor: Executor) -> tuple[str, dict[str, 
     records = read_manifest(images / "manifest.csv")
     if not records:
         raise ImageError(f"{images / 'manifest.csv'} names no picture")
-    tasks = [MeasureTask(images=images, record=record) for record in records]
-    found = list(executor.map(measure_file, tasks, label="picture quality"))
-    found = judge(found)
+    found = judge(
+        list(executor.map(partial(measure_file, images), records, label="picture quality"))
+    )
     folder = workspace / "quality"
     write_csv(folder / "quality.csv", _HEADER, (_row(quality) for quality in found))
     plot_quality(folder / "quality.png", found)

@@ -126,16 +126,14 @@ class Pictures:
     The warps of all cameras are kept (8 bytes a pixel each); pictures are not.
     """
 
-    def __init__(
-        self, images: Path, warps: dict[str, PinholeWarp], cameras: dict[str, str]
-    ) -> None:
-        """Use `open`; `cameras` names the camera of every picture below the folder `images`."""
-        self._images = images
-        self._warps = warps
-        self._cameras = cameras
-        self._masks: dict[str, str] = {}
+    def __init__(self, images: Path, cameras_json: Path) -> None:
+        """Use `open`; take a folder of pictures and the file of their cameras."""
+        stored = CamerasRecord.read(cameras_json)
+        with taken_from(cameras_json):
+            self._warps = {name: warp_from_json(warp) for name, warp in stored.cameras.items()}
+        self._images, self._stored = images, stored.images
         self._moving: Path | None = None
-        self._maps = lru_cache(maxsize=None)(lambda camera: undistortion_maps(warps[camera]))
+        self._maps = lru_cache(maxsize=None)(lambda camera: undistortion_maps(self._warps[camera]))
         self._inside = lru_cache(maxsize=None)(self._camera_inside)
 
     @classmethod
@@ -156,16 +154,6 @@ class Pictures:
         pictures._moving = workspace / "dense" / MOVING
         return pictures
 
-    @classmethod
-    def from_json(cls, images: Path, cameras_json: Path) -> "Pictures":
-        """As `open`, from the folder of the pictures and a file of cameras."""
-        stored = CamerasRecord.read(cameras_json)
-        with taken_from(cameras_json):
-            warps = {name: warp_from_json(warp) for name, warp in stored.cameras.items()}
-        pictures = cls(images, warps, {name: i.camera for name, i in stored.images.items()})
-        pictures._masks = {name: i.mask for name, i in stored.images.items() if i.mask}
-        return pictures
-
     def warp(self, image: str) -> PinholeWarp:
         """The camera that took a picture, and its pinhole.
 
@@ -173,7 +161,7 @@ class Pictures:
             WorkspaceError: no picture of that name is in the model.
         """
         try:
-            return self._warps[self._cameras[image]]
+            return self._warps[self._stored[image].camera]
         except KeyError:
             raise WorkspaceError(f"no picture {image!r} in sparse/cameras.json") from None
 
@@ -198,7 +186,8 @@ class Pictures:
         Raises:
             ImageError: the mask is missing, cannot be decoded or is of another size.
         """
-        paths = [self._images / self._masks[image]] if image in self._masks else []
+        mask = self._stored[image].mask
+        paths = [self._images / mask] if mask else []
         moving = None if self._moving is None else moving_path(self._moving, image)
         if moving is not None and moving.is_file():
             paths.append(moving)
@@ -207,7 +196,7 @@ class Pictures:
 
     def maps(self, image: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Where each pixel of a picture's pinhole lies in it as taken; see `undistortion_maps`."""
-        return self._maps(self._cameras[image])
+        return self._maps(self._stored[image].camera)
 
     def colour(self, image: str, part: Part = WHOLE) -> Colour:
         """A picture as its pinhole sees it, (H, W, 3) BGR; black where there is nothing.
@@ -220,10 +209,11 @@ class Pictures:
             ImageError: the file is missing, cannot be decoded or is of another size.
         """
         taken = self.as_taken(image)
-        x, y = (axis[part] for axis in self._maps(self._cameras[image]))
+        x, y = (axis[part] for axis in self.maps(image))
         # OpenCV's cubic kernel misplaces fine texture by up to 0.045 px, Lanczos' by 0.009
         warped: Colour = cv2.remap(taken, x, y, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
-        return np.where(self._inside(self._cameras[image])[part][..., None], warped, np.uint8(0))
+        inside = self._inside(self._stored[image].camera)[part]
+        return np.where(inside[..., None], warped, np.uint8(0))
 
     def grey(self, image: str) -> Grey:
         """A picture as its pinhole sees it, (H, W), of even light and contrast."""
@@ -231,11 +221,11 @@ class Pictures:
 
     def valid(self, image: str, part: Part = WHOLE) -> Mask:
         """Where `colour` shows something that may be used, (H, W)."""
-        inside: Mask = self._inside(self._cameras[image])[part]
+        inside: Mask = self._inside(self._stored[image].camera)[part]
         taken = self.usable(image)
         if taken is None:
             return inside.copy()
-        x, y = (axis[part] for axis in self._maps(self._cameras[image]))
+        x, y = (axis[part] for axis in self.maps(image))
         warped = cv2.remap(taken.astype(np.uint8), x, y, cv2.INTER_NEAREST)
         mask: Mask = inside & (warped > 0)
         return mask
@@ -248,4 +238,4 @@ class Pictures:
 
 @lru_cache(maxsize=1)
 def _open_once(images: Path, cameras_json: Path, written_ns: int) -> Pictures:
-    return Pictures.from_json(images, cameras_json)
+    return Pictures(images, cameras_json)

@@ -8,12 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import shapely
 from rasterio.windows import Window
 from scipy.special import ellipe
 
 from alice_survey.core.frames import Array
-from reconstruct.measure.areas import surface_within
 from reconstruct.measure.errors import own_correlation
 from reconstruct.measure.figures import Measured
 from reconstruct.measure.shapes import measure_line, measure_polygon, profile
@@ -34,10 +32,6 @@ SLANTED = [(-0.41, -0.32), (0.33, -0.4), (0.4, 0.21), (0.02, 0.43), (-0.35, 0.3)
 
 def named(figures: Sequence[Measured]) -> dict[str, Measured]:
     return {figure.name: figure for figure in figures}
-
-
-def roughness(surface: MeasuredSurface, polygon: shapely.Polygon) -> tuple[Measured, Measured]:
-    return surface_within(surface, polygon).figures(surface)
 
 
 def ramp(x: Array, y: Array) -> Array:

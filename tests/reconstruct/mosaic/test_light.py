@@ -117,7 +117,9 @@ def drift_of_a_long_line(seed: int, *, pictures: int = 30) -> float:
                 levels=np.stack(levels, axis=1).astype(np.float32),
             )
         )
-    light = solve_patterns(joined_samples(parts), nodes, images, ["left"] * pictures, 1.0)
+    light = solve_patterns(
+        in_one_part(joined_samples(parts)), nodes, images, ["left"] * pictures, 1.0
+    )
     gains = [light.gains[n][1] for n in images]
     return float(np.polyfit(np.linspace(0, 1, pictures), gains, 1)[0])
 
