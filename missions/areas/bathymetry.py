@@ -121,9 +121,8 @@ class Bathymetry:
         return _pixels(self.from_pixel, np.asarray(x), np.asarray(y))
 
     def _ne_from_pixel(self, pixel: Array) -> Array:
-        a, b, c, d, e, f = self.from_pixel
-        x = a * pixel[:, 0] + b * pixel[:, 1] + c
-        y = d * pixel[:, 0] + e * pixel[:, 1] + f
+        places = np.column_stack([pixel, np.ones(len(pixel))])
+        x, y = np.reshape(self.from_pixel, (2, 3)) @ places.T
         lon, lat = self._transformer.transform(x, y, direction="INVERSE")
         depth = np.full(len(pixel), self._middle_depth_m)
         return self.datum.ned_from_geodetic(np.column_stack([lat, lon, depth]))[:, :2]
@@ -271,14 +270,8 @@ def _snap(share: Array) -> Array:
 def _pixels(from_pixel: tuple[float, ...], x: Array, y: Array) -> Array:
     """(N, 2) column and row of places in the raster's own coordinates."""
     a, b, c, d, e, f = from_pixel
-    right, up, size = x - c, y - f, a * e - b * d
-    return np.column_stack([(e * right - b * up) / size, (a * up - d * right) / size])
-
-
-def _pixels_at(file: Any, crs: str, lat_lon: Array) -> Array:
-    """(N, 2) column and row of (N, 2) degrees."""
-    x, y = _transformer(crs).transform(lat_lon[:, 1], lat_lon[:, 0])
-    return _pixels(tuple(file.transform)[:6], np.asarray(x), np.asarray(y))
+    pixels: Array = np.linalg.solve(np.array([[a, b], [d, e]]), np.stack([x - c, y - f])).T
+    return pixels
 
 
 def _transformer(crs: str) -> Any:
@@ -319,22 +312,21 @@ def _window(
             shapely.segmentize(box.exterior, max(box.length / _EDGE_POINTS, 1e-9))
         )
         geodetic = datum.geodetic_from_ned(np.hstack([edge, np.zeros((len(edge), 1))]))
-        columns, rows = _pixels_at(file, crs, geodetic[:, :2]).T
-        if not (np.all(np.isfinite(columns)) and np.all(np.isfinite(rows))):
+        x, y = _transformer(crs).transform(geodetic[:, 1], geodetic[:, 0])
+        pixels = _pixels(tuple(file.transform)[:6], np.asarray(x), np.asarray(y))
+        if not np.isfinite(pixels).all():
             raise PlanError(f"{path}: its coordinate system does not reach the survey area")
-        first_c = max(math.floor(columns.min()) - _PAD_CELLS, 0)
-        first_r = max(math.floor(rows.min()) - _PAD_CELLS, 0)
-        last_c = min(math.ceil(columns.max()) + _PAD_CELLS, file.width)
-        last_r = min(math.ceil(rows.max()) + _PAD_CELLS, file.height)
-        if last_c <= first_c or last_r <= first_r:
+        low, high, size = pixels.min(axis=0), pixels.max(axis=0), (file.width, file.height)
+        first = np.maximum(np.floor(low) - _PAD_CELLS, 0).astype(int)
+        count = np.minimum(np.ceil(high) + _PAD_CELLS, size).astype(int) - first
+        if (count <= 0).any():
             raise PlanError(
-                f"{path}: does not reach the survey area, which is at columns "
-                f"{columns.min():.0f} to {columns.max():.0f} and rows {rows.min():.0f} to "
-                f"{rows.max():.0f} of its {file.width} x {file.height}: check the "
-                "area's datum, whether its latitude and longitude are swapped, and "
-                "area.bathymetry_file"
+                f"{path}: does not reach the survey area, which is at columns {low[0]:.0f} to "
+                f"{high[0]:.0f} and rows {low[1]:.0f} to {high[1]:.0f} of its {size[0]} x "
+                f"{size[1]}: check the area's datum, whether its latitude and longitude are "
+                "swapped, and area.bathymetry_file"
             )
-        window = (first_c, first_r, last_c - first_c, last_r - first_r)
+        window = (int(first[0]), int(first[1]), int(count[0]), int(count[1]))
     cells = window[2] * window[3]
     if cells > _MAX_CELLS:
         raise PlanError(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from alice_survey.core.errors import PlanError, warn
 from alice_survey.core.frames import Array, Datum
@@ -74,31 +75,45 @@ class LocalFrame:
         return raw.change(change, geographic=False)
 
     def _check_near(self, corners: Array, points_ne: Array, raw: RawShapes, name: str) -> None:
-        if not len(points_ne):
-            return
         if raw.geographic:
-            far = _distance_m(corners, self.datum)
+            far_m = _distance_m(corners, self.datum)
         else:
-            far = np.linalg.norm(points_ne, axis=1)
-        if far.max() <= MAX_M:
-            return
-        worst = int(far.argmax())
+            far_m = np.linalg.norm(points_ne, axis=1)
         advice = "move the datum (latitude_deg, longitude_deg), or check the corner and its crs"
         if not self.datum_is_given:
             advice = "the area is too large, or a corner or its crs is wrong"
-        if raw.geographic and _distance_m(corners[:, ::-1], self.datum).max() <= MAX_M:
+        if raw.geographic and _distance_m(corners[:, ::-1], self.datum).max(initial=0.0) <= MAX_M:
             advice = "latitude and longitude are swapped"
+        max_m, datum = far_m.max(initial=0.0), self.datum
+        refuse_corners(
+            (far_m > MAX_M) & (far_m == max_m), corners, raw.origin, name,
+            f"is {max_m / 1e3:.0f} km from the datum ({datum.latitude_deg:g}, "
+            f"{datum.longitude_deg:g}), at most {MAX_M / 1e3:.0f} km: {advice}",
+        )  # fmt: skip
+
+
+def refuse_corners(
+    bad: NDArray[np.bool_], corners: Array, origin: str, name: str, fault: str
+) -> None:
+    """Refuse corners, (N, 2), that a mask, (N,), marks.
+
+    Args:
+        bad: the mask.
+        corners: as they were given, y (north, latitude) before x.
+        origin: of the shapes.
+        name: of the ring or line.
+        fault: what is wrong with one, as the end of a sentence.
+
+    Raises:
+        PlanError: with the first one's number and coordinates, as `area: reef.kml: polygon 2,
+            corner 3 at (1, 2): fault`.
+    """
+    if bad.any():
+        first = int(bad.argmax())
+        place = ", ".join(f"{value:.10g}" for value in corners[first])
         raise PlanError(
-            f"{corner_name(raw.origin, name, worst)} at ({corners[worst][0]:.6g}, "
-            f"{corners[worst][1]:.6g}) is {far.max() / 1e3:.0f} km from the datum "
-            f"({self.datum.latitude_deg:g}, {self.datum.longitude_deg:g}); at most "
-            f"{MAX_M / 1e3:.0f} km: {advice}"
+            f"area: {origin}: {name + ', ' if name else ''}corner {first + 1} at ({place}) {fault}"
         )
-
-
-def corner_name(origin: str, name: str, index: int) -> str:
-    """Such as `area: reef.kml: polygon 2, corner 3`."""
-    return f"area: {origin}: {name + ', ' if name else ''}corner {index + 1}"
 
 
 def check_finite(corners: Array, origin: str, name: str) -> None:
@@ -107,13 +122,8 @@ def check_finite(corners: Array, origin: str, name: str) -> None:
     Raises:
         PlanError: with the corner's number.
     """
-    bad = ~np.isfinite(corners).all(axis=1)
-    if bad.any():
-        first = int(bad.argmax())
-        values = ", ".join(f"{value:g}" for value in corners[first])
-        raise PlanError(
-            f"{corner_name(origin, name, first)} is ({values}): coordinates must be numbers"
-        )
+    bad: NDArray[np.bool_] = np.logical_not(np.isfinite(corners).all(axis=1))
+    refuse_corners(bad, corners, origin, name, "is not a place: coordinates must be numbers")
 
 
 def geographic_shapes(raw: RawShapes, crs: Any) -> RawShapes:
@@ -147,20 +157,24 @@ def geographic_shapes(raw: RawShapes, crs: Any) -> RawShapes:
             return yx
         check_finite(yx, raw.origin, name)
         if flat.is_geographic:
-            _check_degrees(yx, raw.origin, name, crs)
+            # Longitudes to 360 are common where an area lies across the date line.
+            refuse_corners(
+                (np.abs(yx[:, 1]) > 360.0) | (np.abs(yx[:, 0]) > 90.0), yx, raw.origin, name,
+                f"has no latitude and longitude in {crs.name}: set crs to the system that it is "
+                "in, or swap the two",
+            )  # fmt: skip
         lon, lat = transformer.transform(yx[:, 1], yx[:, 0])
         lat_lon = np.column_stack([lat, lon])
-        bad = ~np.isfinite(lat_lon).all(axis=1)
-        if bad.any():
-            first = int(bad.argmax())
-            raise PlanError(
-                f"{corner_name(raw.origin, name, first)} at x "
-                f"{yx[first, 1]:.10g}, y {yx[first, 0]:.10g} has no place in {crs.name}: check crs"
-            )
+        lost = ~np.isfinite(lat_lon).all(axis=1)
+        refuse_corners(lost, yx, raw.origin, name, f"has no place in {crs.name}: check crs")
         # PROJ reports no operation where there is nothing to change.
         with contextlib.suppress(ProjError):
             accuracy_m.append(float(transformer.get_last_used_operation().accuracy))
-        check_latitudes(lat_lon, raw.origin, name)
+        refuse_corners(
+            np.abs(lat_lon[:, 0]) > _HIGHEST_LATITUDE_DEG, lat_lon, raw.origin, name,
+            f"is too near a pole: areas are planned up to {_HIGHEST_LATITUDE_DEG:g} degrees north "
+            "and south; are latitude and longitude swapped?",
+        )  # fmt: skip
         return lat_lon
 
     moved = raw.change(change, geographic=True)
@@ -170,39 +184,6 @@ def geographic_shapes(raw: RawShapes, crs: Any) -> RawShapes:
             f"area: {raw.origin}: positions in {crs.name} are known in WGS 84 to {worst_m:g} m only"
         )
     return moved
-
-
-def check_latitudes(lat_lon: Array, origin: str, name: str) -> None:
-    """Refuse what is too near to a pole.
-
-    Raises:
-        PlanError: with the corner.
-    """
-    if not len(lat_lon):
-        return
-    worst = int(np.abs(lat_lon[:, 0]).argmax())
-    if abs(lat_lon[worst, 0]) > _HIGHEST_LATITUDE_DEG:
-        raise PlanError(
-            f"{corner_name(origin, name, worst)} is at latitude "
-            f"{lat_lon[worst, 0]:.6g}, longitude {lat_lon[worst, 1]:.6g}; areas are planned up to "
-            f"{_HIGHEST_LATITUDE_DEG:g} degrees north and south: are the two swapped?"
-        )
-
-
-def _check_degrees(lat_lon: Array, origin: str, name: str, crs: Any) -> None:
-    """Refuse longitudes beyond a turn and latitudes beyond a pole.
-
-    Longitudes to 360 are common where an area lies across the date line.
-    """
-    bad = (np.abs(lat_lon[:, 1]) > 360.0) | (np.abs(lat_lon[:, 0]) > 90.0)
-    if not bad.any():
-        return
-    first = int(bad.argmax())
-    lat, lon = lat_lon[first]
-    raise PlanError(
-        f"{corner_name(origin, name, first)} has longitude {lon:.10g} and latitude {lat:.10g} in "
-        f"{crs.name}: set crs to the system they are in, or swap the two"
-    )
 
 
 def parse_crs(text: str) -> Any:

@@ -13,7 +13,7 @@ from alice_survey.core.config import AreaConfig
 from alice_survey.core.errors import PlanError, warn
 from alice_survey.core.frames import Array, Datum
 from missions.areas.crs import LocalFrame, middle
-from missions.areas.files import read_area_file, read_wkt
+from missions.areas.files import Role, read_area_file, read_wkt
 from missions.areas.raw import RawShapes, from_rings, is_closed, no_points
 from missions.values.area import Area, multipolygon
 
@@ -87,8 +87,8 @@ def given_shapes(settings: AreaConfig) -> GivenShapes:
     survey = _with_closed_lines(_survey_shapes(settings), settings)
     return GivenShapes(
         survey=survey,
-        no_go=_no_go_shapes(settings),
-        allowed=_allowed_shapes(settings),
+        no_go=_zone_shapes(settings, "no_go"),
+        allowed=next(iter(_zone_shapes(settings, "allowed")), None),
         frame=_local_frame(settings, survey),
     )
 
@@ -310,31 +310,20 @@ def _with_closed_lines(raw: RawShapes, settings: AreaConfig) -> RawShapes:
     return raw
 
 
-def _no_go_shapes(settings: AreaConfig) -> tuple[RawShapes, ...]:
-    """The zones to keep out of, by source.
+def _zone_shapes(settings: AreaConfig, role: Role) -> tuple[RawShapes, ...]:
+    """The zones to keep out of, or where the vehicle may be, by source; none where none is set.
 
     Raises:
         PlanError: a file cannot be read.
     """
+    key = f"{role}_ne_m"
+    rings, file = getattr(settings, key), getattr(settings, f"{role}_file")
     zones = []
-    if settings.no_go_ne_m:
-        zones.append(from_rings("no_go_ne_m", settings.no_go_ne_m, geographic=False))
-    if settings.no_go_file is not None:
-        zones.append(read_area_file(settings.no_go_file, None, settings.crs, role="no_go"))
+    if rings:
+        zones.append(from_rings(key, rings if role == "no_go" else [rings], geographic=False))
+    if file is not None:
+        zones.append(read_area_file(file, None, settings.crs, role=role))
     return tuple(zones)
-
-
-def _allowed_shapes(settings: AreaConfig) -> RawShapes | None:
-    """Where the vehicle may be, or None where the settings do not say it.
-
-    Raises:
-        PlanError: a file cannot be read.
-    """
-    if settings.allowed_ne_m is not None:
-        return from_rings("allowed_ne_m", [settings.allowed_ne_m], geographic=False)
-    if settings.allowed_file is None:
-        return None
-    return read_area_file(settings.allowed_file, None, settings.crs, role="allowed")
 
 
 def _rectangle(settings: AreaConfig) -> Array:

@@ -7,9 +7,6 @@ from `altitude_m - relief_m` (the top of the relief) to `altitude_m + relief_m`.
 import math
 from dataclasses import dataclass
 
-import numpy as np
-from shapely.affinity import translate
-
 from alice_survey.core.config import PlanConfig
 from camera_calib.camera import Camera
 from camera_calib.fov.focus import axial_pixel_m
@@ -21,11 +18,8 @@ from missions.exposure.conflict import (
     last_that_fits,
 )
 from missions.values.footprint import (
-    camera_swath,
     common_swath,
-    footprint_polygon,
     footprint_size_m,
-    level_pose,
     overlap,
     step_for_overlap,
 )
@@ -68,11 +62,6 @@ class Spacing:
     off_track_overlap: float
     """Side overlap at the top of the relief where two neighbours are each off by the track error,
     away from each other."""
-    area_overlap: float
-    """Share of the area of one camera's picture that the picture abeam on the next line sees too,
-    at the mean altitude."""
-    swath_overlap: float
-    """Side overlap of what one camera surely sees on a line, between its pictures."""
     stereo_overlap: float
     """Least overlap of neighbouring stereo swaths at the mean altitude."""
 
@@ -167,19 +156,12 @@ def line_spacing(rig: Rig, plan: PlanConfig, step_m: float) -> Spacing:
     spacing_m, bound_by = plan.line_spacing_m, "line_spacing_m"
     if spacing_m is None:
         spacing_m, bound_by = _widest_spacing(rig, prints, plan, step_m)
-    camera = rig.cameras[rig.reference]
-    one = camera_swath(rig, rig.reference, plan.altitude_m, step_m)
-    pose = level_pose(camera, np.zeros(2), plan.altitude_m, plan.altitude_m, 0.0)
-    picture = footprint_polygon(camera, pose, plan.altitude_m)
-    abeam = translate(picture, yoff=spacing_m)
     return Spacing(
         spacing_m=spacing_m,
         bound_by=bound_by,
         mean_overlap=overlap(prints.mean.across_m, spacing_m),
         top_overlap=overlap(prints.top.across_m, spacing_m),
         off_track_overlap=overlap(prints.top.across_m, spacing_m + 2 * plan.track_error_m),
-        area_overlap=picture.intersection(abeam).area / picture.area,
-        swath_overlap=overlap(one.across_m, spacing_m),
         stereo_overlap=max(0.0, (2 * swath.half_across_m - spacing_m) / swath.across_m),
     )
 

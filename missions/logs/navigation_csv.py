@@ -4,8 +4,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, tzinfo
-from itertools import groupby
-from operator import itemgetter
 from pathlib import Path
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
@@ -167,7 +165,7 @@ def read_navigation(
     start_utc: datetime | None = None
     times: list[float] = []
     table: list[list[float]] = []
-    faults: list[tuple[int, str]] = []
+    faults: dict[str, list[int]] = {}
     for line, row in rows:
         try:
             if clocks[0] == "time_utc":
@@ -178,21 +176,25 @@ def read_navigation(
                 time = _number(row, "time_s")
             values = [_number(row, name) for name in needed]
         except ValueError as error:
-            faults.append((line, str(error)))
+            faults.setdefault(str(error), []).append(line)
             continue
         if times and time <= times[-1]:
-            faults.append((line, "time does not follow that of the row before"))
+            faults.setdefault("time does not follow that of the row before", []).append(line)
             continue
         for name in others:
             try:
                 values.append(_number(row, name) if row[name] else math.nan)
             except ValueError as error:
                 values.append(math.nan)
-                faults.append((line, f"{error} (that value only)"))
+                faults.setdefault(f"{error} (that value only)", []).append(line)
         times.append(time)
         table.append(values)
     if faults:
-        texts = _by_ranges(faults)
+        texts = [
+            f"line {lines[0]}: {fault}" if len(lines) == 1
+            else f"{len(lines)} lines from {lines[0]} on: {fault}"
+            for fault, lines in faults.items()
+        ]  # fmt: skip
         more = f" and {len(texts) - _NAMED} more" if len(texts) > _NAMED else ""
         warn(f"{path}: left out {'; '.join(texts[:_NAMED])}{more}")
     cells = np.array(table).reshape(len(times), len(names))
@@ -201,19 +203,6 @@ def read_navigation(
         what = "a position" if needed else "a reading"
         raise NavigationError(f"{path}: no row with a time and {what}")
     return NavigationLog(time_s=np.array(times), columns=columns, start_utc=start_utc)
-
-
-def _by_ranges(faults: Sequence[tuple[int, str]]) -> list[str]:
-    """Faults by line, in order: one text for lines that follow one another with the same fault."""
-    ranges = []
-    ordered = enumerate(sorted(faults, key=itemgetter(1, 0)))
-    for (fault, _), run in groupby(ordered, lambda item: (item[1][1], item[1][0] - item[0])):
-        lines = [line for _, (line, _) in run]
-        ranges.append((lines[0], lines[-1], fault))
-    return [
-        f"line {first}: {fault}" if first == last else f"lines {first} to {last}: {fault}"
-        for first, last, fault in sorted(ranges)
-    ]
 
 
 def _number(row: Mapping[str, str], name: str) -> float:

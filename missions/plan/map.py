@@ -36,6 +36,8 @@ COLOURS = {
 }  # fmt: skip
 """Colours of all maps of a plan."""
 _ARROWS = 60
+_ROOM_PT = 200.0
+"""Sum of the widths of all lines, points: about a third of a map's side."""
 _MAX_FOOTPRINTS = 3000
 """Most footprints drawn one by one; beyond, the count of pictures shows what they cover."""
 _ALLOWED_BEYOND = 0.3
@@ -136,18 +138,14 @@ def _bounds(points_ne: Array, plan: Plan) -> tuple[float, float, float, float]:
 
     Below them is room for the scale.
     """
-    low, high = points_ne.min(axis=0), points_ne.max(axis=0)
-    south, west, north, east = plan.area.allowed.bounds
-    beyond = max(low[0] - south, low[1] - west, north - high[0], east - high[1])
-    if beyond < _ALLOWED_BEYOND * float(max(high - low)):
-        low, high = np.minimum(low, [south, west]), np.maximum(high, [north, east])
-    margin = 0.06 * float(max(high - low))
-    return (
-        float(low[0]) - 2.0 * margin,
-        float(low[1]) - margin,
-        float(high[0]) + margin,
-        float(high[1]) + margin,
-    )
+    shown, allowed = np.array([points_ne.min(axis=0), points_ne.max(axis=0)]), plan.area.allowed
+    both = np.vstack([shown, np.reshape(allowed.bounds, (2, 2))])
+    both = np.array([both.min(axis=0), both.max(axis=0)])
+    if np.abs(both - shown).max() < _ALLOWED_BEYOND * np.ptp(shown, axis=0).max():
+        shown = both
+    margin = 0.06 * float(np.ptp(shown, axis=0).max())
+    (south, west), (north, east) = shown.tolist()
+    return south - 2.0 * margin, west - margin, north + margin, east + margin
 
 
 def _draw_footprints(axes: Axes, shapes: list[Array], rig: Rig) -> None:
@@ -194,10 +192,8 @@ def _draw_route(axes: Axes, plan: Plan, ways: list[Array]) -> None:
 
 
 def _draw_lines(axes: Axes, plan: Plan) -> None:
-    size = 9.0 if plan.stations < 300 else 3.0 if plan.stations < 20_000 else 0.3
-    # Lines and dots leave two thirds of the space between lines to what they cover.
-    widest = max(plan.line_spacing_m * _points_per_metre(axes) / 3.0, 0.25)
-    size = min(size, widest**2)
+    # Lines and dots leave room between them to what they cover.
+    width = min(1.6, _ROOM_PT / len(plan.lines))
     for kind in LINE_KINDS:
         lines = [line for line in plan.lines if line.kind == kind]
         if not lines:
@@ -205,10 +201,10 @@ def _draw_lines(axes: Axes, plan: Plan) -> None:
         colour, ends = COLOURS[kind], [(a.start_ne_m[::-1], a.end_ne_m[::-1]) for a in lines]
         label = f"{len(ends)} {kind} line{'s' if len(ends) > 1 else ''}"
         axes.add_collection(
-            LineCollection(ends, colors=colour, linewidths=min(1.6, widest), zorder=4, label=label)
+            LineCollection(ends, colors=colour, linewidths=width, zorder=4, label=label)
         )
         places = np.vstack([line.stations_ne for line in lines])
-        axes.scatter(places[:, 1], places[:, 0], s=size, color=colour, zorder=5, lw=0)
+        axes.scatter(places[:, 1], places[:, 0], s=4.0 * width**2, color=colour, zorder=5, lw=0)
     (north, east), (ahead_n, ahead_e) = (pair.T for pair in _arrows(plan))
     axes.quiver(
         east, north, ahead_e, ahead_n, color=INK, pivot="mid", scale=60, width=0.003,
@@ -240,13 +236,6 @@ def _draw_bathymetry(axes: Axes, bathymetry: Bathymetry) -> None:
         colour = COLOURS["contour"]
         lines = axes.contour(easts, norths, depth, 10, colors=colour, linewidths=0.6, zorder=1.5)
         axes.clabel(lines, fontsize=7, fmt="%g m")
-
-
-def _points_per_metre(axes: Axes) -> float:
-    """Scale of the printed map, before it is laid out; a point is 1/72 inch."""
-    (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
-    width_in, height_in = axes.figure.get_size_inches()
-    return float(72.0 * 0.8 * min(width_in / (east - west), height_in / (north - south)))
 
 
 def _points(length_m: float) -> int:

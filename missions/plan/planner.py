@@ -30,7 +30,7 @@ from missions.coverage.stations import (
 from missions.exposure.settings import ImagingSettings, ImagingSetup, imaging_settings
 from missions.exposure.strobe import raw_bytes
 from missions.plan.parts import plan_parts
-from missions.plan.rows import Setting, imaging_rows, plan_rows
+from missions.plan.rows import Setting, imaging_rows
 from missions.plan.strength import (
     check_no_stops,
     check_turns,
@@ -77,7 +77,7 @@ class Planned:
     totals: dict[str, float]
     """Main figures by name, as tables and pages show them."""
     rows: tuple[Setting, ...]
-    """Every setting with its equation and limit."""
+    """Every setting of cameras, strobes and the pattern of lines, with its equation and limit."""
 
 
 def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None) -> Planned:
@@ -207,7 +207,7 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
             bathymetry=bathymetry,
             warnings=(),
             totals=totals,
-            rows=(*rows, *plan_rows(finished, totals, seen, sweep, config.vehicle)),
+            rows=rows,
         )
     return replace(planned, warnings=tuple(warnings))
 

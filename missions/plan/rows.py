@@ -8,17 +8,11 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from alice_survey.core.artefacts import json_values
-from alice_survey.core.config import VehicleConfig
 from alice_survey.kit.words import share, text_table
-from missions.coverage.certificate import Certificate
 from missions.exposure.light import MIDDLE_GREY, SEEN_SHARE
 from missions.exposure.settings import ImagingSettings, ImagingSetup
 from missions.exposure.strobe import BUS_SAG, BUS_V, WARM_SEA_C
-from missions.lines.sweep import Sweep
-from missions.route.energy import battery_wh, hotel_w
 from missions.values.footprint import step_for_overlap
-from missions.values.line import LINE_KINDS
-from missions.values.plan_file import Plan
 
 WIDTH = 100
 _MAIN = (
@@ -150,8 +144,7 @@ def _footprint_rows(found: ImagingSettings, setup: ImagingSetup) -> list[Row]:
         ("side overlap", (spacing.mean_overlap, spacing.top_overlap, spacing.off_track_overlap),
          "%", "1 - (s + 2 e) / W", "line spacing",
          "at the mean / over the top of the relief / there with lines each "
-         f"{plan.track_error_m:g} m off; by area whole pictures share {spacing.area_overlap:.1%}, "
-         f"swaths of lines {spacing.swath_overlap:.1%}, at the mean"),
+         f"{plan.track_error_m:g} m off"),
         ("stereo side overlap", spacing.stereo_overlap, "%", "(2 half swath - s) / swath",
          "line spacing", "of neighbouring stereo swaths, the smaller side"),
     ]  # fmt: skip
@@ -276,57 +269,3 @@ def _data_rows(found: ImagingSettings, setup: ImagingSetup) -> list[Row]:
          f"{rate_hz:.3g} triggers a second of at most {limits[tightest]:.3g} ({tightest}); all "
          f"cameras on one cable take {storage.shared_link_hz:.3g}"),
     ]  # fmt: skip
-
-
-def plan_rows(
-    plan: Plan,
-    totals: dict[str, float],
-    seen: Certificate,
-    sweep: Sweep | None,
-    vehicle: VehicleConfig,
-) -> tuple[Setting, ...]:
-    """The main figures of lines, dives and coverage.
-
-    Args:
-        plan: the plan.
-        totals: its totals.
-        seen: its certificate.
-        sweep: how the direction of the lines was found; None where it was given.
-        vehicle: its battery.
-    """
-    counts = {kind: sum(line.kind == kind for line in plan.lines) for kind in LINE_KINDS}
-    kinds = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
-    why = "as set"
-    if sweep is not None:
-        why = f"least total width along {math.degrees(sweep.width_heading_rad) % 180.0:.1f} deg"
-    stops = sum(1 for dive in plan.dives for leg in dive.route.legs if leg.turn_rad)
-    load_w, energy_wh = hotel_w(vehicle), totals["energy_wh"]
-    load = f"hotel load {load_w:g} W is {load_w * plan.duration_s / 3600 / energy_wh:.0%} of it"
-    if "hotel_w" not in vehicle.model_fields_set and vehicle.file is None:
-        load += ", and is inferred: measure it with the thrusters at rest, and set vehicle.hotel_w"
-    passes, pictures = seen.pattern.passes, seen.pattern.pictures
-    rows: list[Row] = [
-        ("area", totals["area_m2"], "m2", "as given, with margin_m", "[area]", ""),
-        ("line heading", totals["heading_deg"], "deg", "least energy of all headings",
-         "line_heading_deg" if sweep is None else "energy", why),
-        ("lines", totals["lines"], "", "width / spacing", "line spacing", kinds),
-        ("way", totals["length_m"], "m", "lines, turns, ways from home and back",
-         "lines", f"{totals['lines_m']:.0f} m on lines; {stops} turns on the spot"),
-        ("duration", totals["duration_s"] / 60, "min", "way / speed + stops + dive",
-         "speed_mps", ""),
-        ("dives", totals["dives"], "", "least number that the battery holds",
-         "battery_wh", f"the longest takes {totals['longest_dive_wh']:.0f} of "
-         f"{totals['usable_wh']:.0f} Wh ({vehicle.battery_reserve:.0%} of "
-         f"{battery_wh(vehicle):.0f} Wh are kept)"),
-        ("energy", energy_wh, "Wh", "sum of power x time", "hotel_w, drag, current",
-         load),
-        ("data", totals["data_gb"], "GB", "stations x cameras x pixels", "stations",
-         f"{totals['stations']} stations, {totals['pictures']} pictures"),
-        ("covered as requested", totals["at_overlap"], "%", "union of real footprints",
-         "lines", f"by every camera on {passes} line{'s'[: passes > 1]} and in {passes * pictures} "
-         f"pictures or more; {share(totals['covered'], 2)} is in some picture, "
-         f"{share(totals['stereo'], 2)} in stereo; the place seen least is in "
-         f"{seen.fewest_pictures} pictures of a camera, the mean place in {seen.mean_pictures:.1f} "
-         "of all"),
-    ]  # fmt: skip
-    return tuple(Setting("LINES AND DIVES", *row) for row in rows)

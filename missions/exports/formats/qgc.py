@@ -117,7 +117,7 @@ def _polygon(plan: Plan, polygon: Polygon, *, inclusion: bool) -> dict[str, Any]
 
 
 def read_qgc(text: str) -> Mission | None:
-    """Read the mission of a plan: single items, and those that survey items hold."""
+    """Read the mission of a plan: single items."""
     try:
         data = json.loads(text.lstrip("\ufeff"))
     except (ValueError, RecursionError):
@@ -136,13 +136,7 @@ def _read_items(items: list[Any]) -> Iterator[Item]:
         where = f"mission item {number}"
         if not isinstance(item, dict):
             raise ValueError(f"{where} is no object")  # noqa: TRY004  a file's
-        style = item.get("TransectStyleComplexItem")
-        if item.get("type") == "ComplexItem" and isinstance(style, dict):
-            held = style.get("Items")
-            if not isinstance(held, list):
-                raise ValueError(f"{where} holds no items: save it with QGroundControl 4 or later")
-            yield from _read_items(held)
-        elif item.get("type") == "SimpleItem" and isinstance(item.get("params"), list):
+        if item.get("type") == "SimpleItem" and isinstance(item.get("params"), list):
             # null stands for a parameter that is not given.
             params = [0.0 if value is None else value for value in item["params"]]
             yield item_of(item.get("command"), item.get("frame"), params, where)

@@ -57,15 +57,13 @@ def test_bad_rows_are_left_out_and_named(
         assert f"line {line}: " in warned
 
 
-def test_rows_of_one_fault_are_given_as_ranges(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_rows_of_one_fault_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = [f"{t},{'nan' if 10 <= t < 50 else 60},5,1,{'x' if t in (5, 6, 8) else 0},2"
             for t in range(60)]  # fmt: skip
     read_navigation(log_file(tmp_path, *rows, "3,60,5,1,0,2"), UTC)
     parts = capsys.readouterr().err.split("left out ")[1].split("; ")
     assert [part.split(":")[0] for part in parts] == [
-        "lines 7 to 8", "line 10", "lines 12 to 51", "line 62",
+        "3 lines from 7 on", "40 lines from 12 on", "line 62",
     ]  # fmt: skip
 
 
