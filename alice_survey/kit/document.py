@@ -58,15 +58,6 @@ class Table:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Link:
-    """A link to a file next to the page, or to a page on the same server."""
-
-    text: str
-    address: str
-    about: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Section:
     """A part of the report."""
 
@@ -76,8 +67,6 @@ class Section:
     text: Sequence[str] = ()
     figures: Sequence[Figure] = ()
     tables: Sequence[Table] = ()
-    links: Sequence[Link] = ()
-    """Shown on the page alone, not in print."""
     scene: Literal["map", "mesh"] | None = None
     """The interactive part of the page that belongs here; print shows its stills."""
 
@@ -177,8 +166,6 @@ class Mesh:
     """Triangles and size of what the page shows, in words."""
     still: Figure
     """Image for print and for browsers without WebGL."""
-    address: str | None = None
-    """URL on the server of the page, which then does not embed the mesh."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -110,16 +110,10 @@ def figure_style() -> Iterator[None]:
         yield
 
 
-def new_figure(height_in: float, width_in: float = WIDTH_IN, layout: str | None = None) -> Any:
-    """An empty figure that lays itself out.
-
-    Args:
-        height_in: inches.
-        width_in: inches.
-        layout: of matplotlib; None is "constrained".
-    """
+def new_figure(height_in: float, width_in: float = WIDTH_IN) -> Any:
+    """An empty figure that lays itself out."""
     with figure_style():
-        sheet = _ShownSheet(figsize=(width_in, height_in), dpi=_DPI, layout=layout or "constrained")
+        sheet = _ShownSheet(figsize=(width_in, height_in), dpi=_DPI, layout="constrained")
         FigureCanvasAgg(sheet)
     return sheet
 

@@ -216,15 +216,9 @@ async function startMesh(root, canvas, bytes, {told, lost}) {
   return {pick, mark, show, dress, forget, draw, camera, canvas};
 }
 
-/* What the page holds, or its server gives. */
-async function bytesOf(id) {
-  const held = document.getElementById(id);
-  if (held.dataset.from) {
-    const answer = await fetch(held.dataset.from);
-    if (!answer.ok) throw new Error((await answer.text()).trim());
-    return answer.arrayBuffer();
-  }
-  const text = atob(held.textContent);
+/* What the page holds. */
+function bytesOf(id) {
+  const text = atob(document.getElementById(id).textContent);
   return Uint8Array.from(text, (letter) => letter.charCodeAt(0)).buffer;
 }
 
@@ -266,7 +260,7 @@ function awaitMesh() {
     const told = (text) => { document.getElementById("mesh-readout").textContent = text; };
     const lost = () =>
       showStill(root, "The browser took its graphics memory back: this is a still picture.");
-    bytesOf("mesh-glb").then((bytes) => startMesh(root, canvas, bytes, {told, lost}))
+    startMesh(root, canvas, bytesOf("mesh-glb"), {told, lost})
       .then(() => { root.dataset.ready = ""; }, (fault) => {
       showStill(root, "The mesh cannot be shown here (" + fault.message
         + "): this is a still picture.");

@@ -48,20 +48,11 @@ def render_html(report: Report) -> str:
     """
     styles, scripts = _embedded_files(report)
     map_json, map_tiles = ("", []) if report.map is None else map_data(report.map)
-    carried = report.mesh is not None and report.mesh.address is None
-    page: str = (
-        _templates()
-        .get_template("page.html")
-        .render(
-            report=report,
-            policy=page_policy(report),
-            styles=styles,
-            scripts=scripts,
-            map_json=map_json,
-            map_tiles=map_tiles,
-            mesh_glb=_base64(report.mesh.glb.read_bytes()) if carried and report.mesh else "",
-        )
-    )
+    page: str = _templates().get_template("page.html").render(
+        report=report, policy=_policy(styles, scripts), styles=styles, scripts=scripts,
+        map_json=map_json, map_tiles=map_tiles,
+        mesh_glb="" if report.mesh is None else _base64(report.mesh.glb.read_bytes()),
+    )  # fmt: skip
     return page
 
 
@@ -102,23 +93,13 @@ def _read(name: str) -> str:
     return (_HERE / name).read_text(encoding="utf-8")
 
 
-def page_policy(report: Report) -> str:
-    """The page's content security policy: what it may load.
-
-    A texture of the mesh is a `blob:` of the page itself. A page that a server gives may load
-    from that server too.
-    """
-    styles, scripts = _embedded_files(report)
-    layers = report.map.layers if report.map is not None else ()
-    tiled = any(isinstance(layer, PictureLayer) and layer.address for layer in layers)
-    fetched = report.mesh is not None and report.mesh.address is not None
+def _policy(styles: list[str], scripts: list[str]) -> str:
+    """The page's content security policy; a texture of the mesh is a `blob:` of the page itself."""
     allowed_styles = " ".join(_hash(text) for text in styles)
     allowed_scripts = " ".join(_hash(text) for text in scripts) or "'none'"
-    pictures = "'self' data: blob:" if tiled else "data: blob:"
-    fetches = "connect-src 'self'; " if fetched else ""
     return (
-        f"default-src 'none'; img-src {pictures}; style-src {allowed_styles}; "
-        f"script-src {allowed_scripts}; {fetches}base-uri 'none'; form-action 'none'"
+        f"default-src 'none'; img-src data: blob:; style-src {allowed_styles}; "
+        f"script-src {allowed_scripts}; base-uri 'none'; form-action 'none'"
     )
 
 

@@ -5,6 +5,7 @@ screen readers (PDF/UA-1). Text reaches it as data and is never read as markup.
 """
 
 import base64
+import itertools
 import json
 import re
 import tempfile
@@ -104,7 +105,7 @@ def _fonts() -> Path:
 
 
 def _data(report: Report, folder: Path) -> dict[str, Any]:
-    files = _FigureFiles(folder)
+    numbers = itertools.count(1)
     return {
         "title": report.title,
         "subtitle": report.subtitle,
@@ -118,7 +119,10 @@ def _data(report: Report, folder: Path) -> dict[str, Any]:
             {
                 "title": section.title,
                 "text": list(section.text),
-                "figures": [files.figure(figure) for figure in _figures(report, section)],
+                "figures": [
+                    _write_figure(figure, folder / f"figure-{next(numbers)}")
+                    for figure in _figures(report, section)
+                ],
                 "tables": [
                     {
                         "title": table.title,
@@ -142,19 +146,13 @@ def _figures(report: Report, section: Section) -> Iterator[Figure]:
     yield from section.figures
 
 
-class _FigureFiles:
-    """Figures as files next to the template."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder, self._count = folder, 0
-
-    def figure(self, figure: Figure) -> dict[str, Any]:
-        self._count += 1
-        name = f"figure-{self._count}.{'svg' if figure.svg else 'png'}"
-        (self._folder / name).write_bytes(figure.svg or figure.png)
-        words = ("title", "alt", "shows", "good", "otherwise")
-        texts = {word: getattr(figure, word) for word in words}
-        return {"file": name, "share": _width_share(figure)} | texts
+def _write_figure(figure: Figure, path: Path) -> dict[str, Any]:
+    """Write a figure next to the template, and describe it."""
+    file = path.with_suffix(".svg" if figure.svg else ".png")
+    file.write_bytes(figure.svg or figure.png)
+    words = ("title", "alt", "shows", "good", "otherwise")
+    texts = {word: getattr(figure, word) for word in words}
+    return {"file": file.name, "share": _width_share(figure)} | texts
 
 
 def _width_share(figure: Figure) -> float:
@@ -171,8 +169,8 @@ def _breakable(cell: str) -> str:
     return _LONG_WORD.sub(lambda word: _BREAKS.sub("\\1\u200b", word[0]), cell)
 
 
-def map_figures(survey_map: SurveyMap) -> list[Figure]:
-    """The map as it first shows, then each further picture without the shapes over it."""
+def with_stills(survey_map: SurveyMap) -> SurveyMap:
+    """The same map with figures for print: as it first shows, then further pictures alone."""
     shown = [layer for layer in survey_map.layers if layer.shown]
     outline = [a for a in survey_map.layers if isinstance(a, ShapeLayer) and a.name == "area"]
     further = [
@@ -180,10 +178,9 @@ def map_figures(survey_map: SurveyMap) -> list[Figure]:
         for layer in survey_map.layers
         if isinstance(layer, PictureLayer) and layer.base and not layer.shown
     ]
-    return [
-        map_figure(survey_map, shown),
-        *(map_figure(survey_map, [layer, *outline], on_page=False) for layer in further),
-    ]
+    stills = [map_figure(survey_map, shown)]
+    stills += [map_figure(survey_map, [layer, *outline], on_page=False) for layer in further]
+    return replace(survey_map, stills=stills)
 
 
 @figure_style()
@@ -301,8 +298,3 @@ def _with_jpegs(svg: bytes) -> bytes:
         return b"data:image/jpeg;base64," + base64.b64encode(coded)
 
     return re.sub(rb"data:image/png;base64,([A-Za-z0-9+/=\s]+)", shrunk, svg)
-
-
-def with_stills(survey_map: SurveyMap) -> SurveyMap:
-    """The same map with its figures for print."""
-    return replace(survey_map, stills=map_figures(survey_map))

@@ -37,13 +37,6 @@ class PlanCommand(SurveyCommand):
         "plan -w reef --all",
         "plan -w reef -s other.toml --json",
         "plan -w reef --vehicle bluerov2_heavy",
-        "plan solve -w reef --resolution 0.5",
-        "plan precision -w reef",
-        "plan gain 'control/*.jpg'",
-        "plan check navigation.csv -w reef",
-        "plan follow nav.csv -w reef --every 5",
-        "plan revisit -w reef",
-        "plan export -w reef --format cola2 --format wpl",
     )
     title = "Plan the survey"
     offered = ("vehicle",)
@@ -171,7 +164,6 @@ class FollowCommand(SurveyCommand):
 
     name = "plan follow"
     examples = (
-        "plan follow nav.csv -w reef",
         "plan follow nav.csv -w reef --every 5",
         "plan follow nav.csv -w reef --every 5 --json -o holes",
     )
@@ -231,7 +223,6 @@ class ExportCommand(WorkspaceCommand, ReportCommand):
 
     name = "plan export"
     examples = (
-        "plan export -w reef",
         "plan export -w reef --format cola2 --format wpl -o to_vehicle",
         "plan export -w reef --map -o map.pdf",
     )
@@ -289,7 +280,6 @@ class CompareCommand(SurveyCommand, ThreadsCommand):
 
     name = "vehicle compare"
     examples = (
-        "vehicle compare",
         "vehicle compare -w reef --current 0.1@90 --current 0.05@0 -o compared",
         "vehicle compare --current 0@0 --swell 0.5@6 --flights 3",
         "vehicle compare -w reef --vehicle bluerov2_heavy --vehicle own.toml",

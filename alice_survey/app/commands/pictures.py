@@ -28,7 +28,6 @@ class ImportImagesCommand(WorkspaceCommand, ThreadsCommand):
     name = "import-images"
     examples = (
         "import-images photos -w reef",
-        "import-images --left cam1 --right cam2 -w reef",
         "import-images --left cam1 --right cam2 --triggers triggers.csv -w reef",
         "import-images --camera bow=B --camera port=P --camera down=D --rig rig.json -w reef",
         "import-images --bag dive.mcap --every 0.5 --rig rig.json --navigation dive.csv -w reef",
@@ -175,7 +174,6 @@ class ImportLogCommand(ReportCommand):
         "import-log sparus2.bag -o navigation.csv",
         "import-log 00000042.BIN --declination 3.4 --tide tides.csv -o navigation.csv",
         "import-log dive.tlog --topic depth=VFR_HUD --vehicle-log vehicle.csv -o navigation.csv",
-        "import-log dvl.bag --dead-reckon --start-at 43.05 5.92 10 -o navigation.csv",
         "import-log dvl.json --dead-reckon --start-at 43.05 5.92 10 -o navigation.csv",
     )
     log: Path = argument(..., "ROS bag, log of ArduSub or PX4, or JSON of a Water Linked DVL.")

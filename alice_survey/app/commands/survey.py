@@ -28,7 +28,6 @@ class InitCommand(WorkspaceCommand):
 
     name = "init"
     examples = (
-        "init reef",
         "init reef --area reef.geojson",
         "init harbour --example caesarea",
     )
@@ -112,7 +111,6 @@ class FlyCommand(SurveyCommand):
         "fly -w reef --vehicle alice --controller sway --current 0.1@90",
         "fly -w before --vehicle sparus2 --controller los",
         "fly -w reef --fail stern --fail bow=0.5 --json",
-        "fly -w reef --fail stern@600",
         "fly -w reef --fail stern:propeller@600",
         "fly -w reef --dive 2",
         "fly -w reef --mission reef/plan/exports/mission_dive1.xml --current 0.1@90",
@@ -183,7 +181,6 @@ class TargetCommand(ReportCommand):
     name = "target"
     examples = (
         'target "charuco 12x9 40mm 30mm" -o board.pdf',
-        'target "chessboard 9x6 25mm" -o chess.pdf --paper A4',
         'target "apriltag 6x6 70mm 0.3" -o grid.pdf --paper A1',
         'target "charuco 12x9 40mm 30mm DICT_5X5_250 legacy" -o old.pdf',
     )

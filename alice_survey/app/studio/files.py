@@ -24,6 +24,8 @@ from alice_survey.core.errors import AliceError
 
 PRODUCTS = (*(stage.folder for stage in STAGES), *LOOSE_FOLDERS, "check", "revisit")
 """Folders that are shown."""
+STAGES_MADE = tuple(f"{name}/{STAGE_FILE}" for name in PRODUCTS)
+"""Files that say that a stage is finished."""
 _LOOSE_FILES = ("survey.toml",)
 _MAX_NAME = 255
 _UNFINISHED = (".partial", ".replaced")
@@ -72,8 +74,8 @@ class Workspace:
         Raises:
             FileNotFoundError: there is no such file, or it is a link or below one.
         """
-        path = self._real_path(names)
-        if not path.is_file():
+        path = self.folder.joinpath(*names)
+        if path.resolve() != path or not path.is_file():
             raise FileNotFoundError(path)
         return path
 
@@ -89,13 +91,12 @@ class Workspace:
         return token_of(self.file(path.split("/")).stat())
 
     def state(self, paths: Sequence[str]) -> tuple[str, ...]:
-        """Tokens of all finished stages and of some files, empty where there is none."""
-        files = (*(f"{name}/{STAGE_FILE}" for name in PRODUCTS), *paths)
-        return tuple(self.token(path) if self.has(path) else "" for path in files)
+        """Tokens of some files, empty where there is none."""
+        return tuple(self.token(path) if self.has(path) else "" for path in paths)
 
     @contextmanager
-    def check_unchanged(self, paths: Sequence[str] = ()) -> Iterator[tuple[str, ...]]:
-        """The state of finished stages and of some files, which are read within this block.
+    def check_unchanged(self, *paths: str) -> Iterator[tuple[str, ...]]:
+        """The state of some files, which are read within this block.
 
         Raises:
             StaleError: they are others by now; what reading them raised gives way to that.
@@ -109,12 +110,6 @@ class Workspace:
             raise
         if self.state(paths) != before:
             raise stale_page()
-
-    def _real_path(self, names: Sequence[str]) -> Path:
-        path = self.folder.joinpath(*names)
-        if path.resolve() != path:
-            raise FileNotFoundError(path)
-        return path
 
 
 def _may_be_named(name: str) -> bool:

@@ -5,13 +5,12 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
-from pathlib import Path
 
 from rasterio.errors import RasterioError
 
 from alice_survey.app.report.held import Held
 from alice_survey.app.report.rasters import MAP_RASTERS, Pyramid, encode_webp, numbers_of
-from alice_survey.app.studio.files import Workspace, stale_page, token_of
+from alice_survey.app.studio.files import Workspace, stale_page
 from alice_survey.core.contents import one_line
 from alice_survey.core.errors import WorkspaceError
 from alice_survey.kit.document import PictureLayer
@@ -20,8 +19,6 @@ from reconstruct.measure.surface import is_of_surface
 _KEPT_TILES = 1000
 _KEPT_PYRAMIDS = 12
 _MAX_RENDERERS = 4
-_ENDING_S = 3.0
-"""Time to wait at the end for tiles in work."""
 _DAMAGES = (RasterioError, IndexError, MemoryError)
 """Errors on reading a damaged raster, or one with too few bands."""
 _LAYERS = {one.name: one for one in MAP_RASTERS}
@@ -33,8 +30,7 @@ class Layers:
     def __init__(self, workspace: Workspace) -> None:
         """Take a workspace, whose rasters are shown."""
         self._workspace = workspace
-        self._max_renderers = min(_MAX_RENDERERS, os.cpu_count() or 1)
-        self._renderers = threading.BoundedSemaphore(self._max_renderers)
+        self._renderers = threading.BoundedSemaphore(min(_MAX_RENDERERS, os.cpu_count() or 1))
         # By the token of the file, so that a changed raster is read again.
         self._pyramid = lru_cache(_KEPT_PYRAMIDS)(self._read_pyramid)
         self._tile = lru_cache(_KEPT_TILES)(self._read_tile)
@@ -50,16 +46,6 @@ class Layers:
             except FileNotFoundError:
                 continue
         return found
-
-    def _path(self, name: str) -> Path:
-        """File of a layer.
-
-        Raises:
-            FileNotFoundError: there is none.
-        """
-        if name not in _LAYERS:
-            raise FileNotFoundError(name)
-        return self._workspace.file(_LAYERS[name].path.parts)
 
     def _picture_layer(self, name: str, *, shown: bool) -> PictureLayer:
         with self._check_unchanged(name, None) as token:
@@ -85,32 +71,26 @@ class Layers:
         with self._check_unchanged(name, token) as now:
             return self._tile(name, now, level, x, y), now
 
-    def close(self) -> None:
-        """Wait briefly for the tiles in work."""
-        for _ in range(self._max_renderers):
-            self._renderers.acquire(timeout=_ENDING_S / self._max_renderers)
-
     @contextmanager
     def _check_unchanged(self, name: str, token: str | None) -> Iterator[str]:
         """The token of a layer's file, which is read within this block."""
-        now = token_of(self._path(name).stat())
-        if token not in (None, now):
-            raise stale_page()
-        try:
-            yield now
-        except _DAMAGES as error:
-            path = self._path(name)
-            if token_of(path.stat()) != now:
-                raise stale_page() from None
-            raise WorkspaceError(
-                f"{path}: is damaged ({one_line(error)}): delete it and run again"
-            ) from error
-        if token_of(self._path(name).stat()) != now:
-            raise stale_page()
+        if name not in _LAYERS:
+            raise FileNotFoundError(name)
+        path = _LAYERS[name].file
+        with self._workspace.check_unchanged(path) as (now,):
+            if not now:
+                raise FileNotFoundError(path)
+            if token not in (None, now):
+                raise stale_page()
+            try:
+                yield now
+            except _DAMAGES as error:
+                text = f"{path}: is damaged ({one_line(error)}): delete it and run again"
+                raise WorkspaceError(text) from error
 
     def _read_pyramid(self, name: str, token: str) -> Pyramid:
-        unit = Held.of(self._workspace.folder).unit
-        return Pyramid(self._path(name), numbers_of(_LAYERS[name], unit))
+        unit, raster = Held.of(self._workspace.folder).unit, _LAYERS[name]
+        return Pyramid(self._workspace.file(raster.path.parts), numbers_of(raster, unit))
 
     def _read_tile(self, name: str, token: str, level: int, x: int, y: int) -> bytes:
         with self._renderers:

@@ -338,11 +338,10 @@ class Server:
         self._uvicorn.should_exit = True
 
     def close(self) -> None:
-        """Stop listening, end the job, and wait briefly for what is being read."""
+        """Stop listening, and end the job."""
         with contextlib.suppress(OSError):
             self.socket.close()
         self.studio.jobs.close()
-        self.studio.layers.close()
 
 
 def run_studio(

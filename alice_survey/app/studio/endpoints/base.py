@@ -8,7 +8,8 @@ import json
 import math
 import threading
 import zipfile
-from collections.abc import AsyncIterator, Callable, Hashable, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Hashable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -16,13 +17,13 @@ from typing import Any, Generic, Literal, TypeVar
 
 from pydantic import BaseModel, Field, ValidationError
 
+from alice_survey.app.pipeline import only_one
 from alice_survey.app.studio.files import Workspace
 from alice_survey.app.studio.jobs import Jobs
 from alice_survey.app.studio.layers import Layers
 from alice_survey.core.config import Config
 from alice_survey.core.contents import first_fault
 from alice_survey.core.errors import AliceError
-from alice_survey.kit.document import PictureLayer
 
 M = TypeVar("M", bound=BaseModel)
 T = TypeVar("T")
@@ -53,11 +54,6 @@ def zip_files(name: str, files: Mapping[str, bytes | Path]) -> Content:
             data = content if isinstance(content, bytes) else content.read_bytes()
             archive.writestr(zipfile.ZipInfo(file), data, zipfile.ZIP_DEFLATED)
     return Content(data=packed.getvalue(), kind="application/zip", name=name)
-
-
-def scale_json(layer: PictureLayer) -> dict[str, Any] | None:
-    """What the colours of a raster mean; None where they are what was seen."""
-    return None if layer.scale is None else {**vars(layer.scale)}
 
 
 class KeptValue(Generic[T]):
@@ -162,17 +158,9 @@ class Studio:
         """The commands that run in the workspace."""
         return Jobs(self.workspace.folder, self.publish)
 
-    @contextlib.contextmanager
-    def only_writer(self) -> Iterator[None]:
-        """Keep commands and other pages from working in the workspace.
-
-        Raises:
-            WorkspaceError: one does already.
-        """
-        from alice_survey.app.pipeline import only_one
-
-        with only_one(self.workspace.folder):
-            yield
+    def only_writer(self) -> AbstractContextManager[None]:
+        """Keep commands and other pages from working in the workspace."""
+        return only_one(self.workspace.folder)
 
 
 class Events:

@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from alice_survey.app.pipeline import settings
 from alice_survey.app.studio.endpoints.base import (
     Call,
     Content,
@@ -64,17 +65,18 @@ class FollowTab:
         self._dive: FollowedDive | None = None
         self._ended: threading.Event | None = None
         self._fault: str | None = None
-        self._is_new = studio.log is not None
+        if studio.log is not None:
+            try:
+                self._open(studio.log)
+            except AliceError as error:
+                self._fault = str(error)
 
     # ---- One dive at a time ----------------------------------------------------------------
 
     def _open(self, log: str) -> None:
-        from alice_survey.app.pipeline import settings
-
         folder = self._studio.workspace.folder
         self._close()
-        config = settings(folder, None, needed=False)
-        followed = FollowedDive(folder, config, log)
+        followed = FollowedDive(folder, settings(folder, None, needed=False), log)
         ended = threading.Event()
         self._dive, self._ended, self._fault = followed, ended, None
         threading.Thread(target=self._work, args=(followed, ended), daemon=True).start()
@@ -84,19 +86,8 @@ class FollowTab:
             self._ended.set()
         self._dive = None
 
-    def _current(self) -> FollowedDive | None:
-        """The dive; that of the command line is opened the first time."""
-        with self._lock:
-            if self._is_new and self._studio.log is not None:
-                self._is_new = False
-                try:
-                    self._open(self._studio.log)
-                except AliceError as error:
-                    self._fault = str(error)
-            return self._dive
-
     def _require_dive(self) -> FollowedDive:
-        dive = self._current()
+        dive = self._dive
         if dive is None:
             raise NavigationError(self._fault or "no dive is followed: choose its log first")
         return dive
@@ -125,7 +116,7 @@ class FollowTab:
 
     def state(self, call: Call) -> dict[str, Any]:
         """Figures of the dive, and the logs to choose from."""
-        dive = self._current()
+        dive = self._dive
         return {
             **({"following": False, "fault": self._fault} if dive is None
                else self._state_of(dive)),
@@ -155,14 +146,12 @@ class FollowTab:
             raise FileNotFoundError(ask.log)
         path = self._studio.workspace.file(ask.log.split("/"))
         with self._lock:
-            self._is_new = False
             self._open(str(path))
         return self.state(call)
 
     def end(self, call: Call) -> dict[str, Any]:
         """Follow nothing any more."""
         with self._lock:
-            self._is_new = False
             self._close()
         return self.state(call)
 

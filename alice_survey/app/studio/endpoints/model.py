@@ -12,7 +12,7 @@ from pydantic import Field
 from alice_survey.app.report.held import Held
 from alice_survey.app.report.mesh_copy import mesh_about, mesh_copy
 from alice_survey.app.studio.endpoints.base import Call, Content, Endpoint, KeptValue, Studio
-from alice_survey.app.studio.files import stale_page
+from alice_survey.app.studio.files import STAGES_MADE, stale_page
 from alice_survey.core.config import Config
 from alice_survey.core.errors import AliceError
 from alice_survey.core.products import DEM, MOSAIC, RASTERS
@@ -118,7 +118,7 @@ class _ModelTab:
         for path in _READ:
             if (workspace.folder / path).exists() and not workspace.has(path):
                 raise AliceError(f"{path} is, or lies behind, a link: files of a survey are none")
-        with workspace.check_unchanged(_READ) as state:
+        with workspace.check_unchanged(*STAGES_MADE, *_READ) as state:
             yield state
 
     def value(self, call: Call) -> dict[str, Any]:

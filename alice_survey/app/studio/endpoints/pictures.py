@@ -20,7 +20,7 @@ from alice_survey.app.studio.endpoints.base import (
     Studio,
     TileRequest,
 )
-from alice_survey.app.studio.files import Workspace
+from alice_survey.app.studio.files import STAGES_MADE, Workspace
 from alice_survey.core.artefacts import read_csv, read_stage
 from alice_survey.core.config import Config
 from alice_survey.core.errors import AliceError, ReconstructionError, WorkspaceError
@@ -498,7 +498,7 @@ class _Tab:
         workspace = self._studio.workspace
         if not self._has_model():
             raise AliceError("no model yet: run 'alice-survey reconstruct' first")
-        return self._model.of(workspace.state((*_MODEL, "dense/dem.tif")))
+        return self._model.of(workspace.state((*STAGES_MADE, *_MODEL, "dense/dem.tif")))
 
 
 def _unhidden(model: _OpenModel, place: SurfacePlace) -> tuple[list[Sight], int]:

@@ -47,8 +47,8 @@ def survey_state(workspace: Path) -> dict[str, Any]:
     """
     is_new = not any((workspace / name).exists() for name in ("survey.toml", "images", "plan"))
     found: dict[str, Any] = {
-        "new": is_new, "fault": None, "stages": [], "commands": [], "disk": _disk(workspace),
-        "cores": default_threads(), "imported": False,
+        "new": is_new, "fault": None, "stages": [], "commands": [],
+        "disk": {"free_gb": _free_gb(workspace)}, "cores": default_threads(), "imported": False,
     }  # fmt: skip
     if is_new:
         inside = workspace.iterdir() if workspace.is_dir() else ()
@@ -145,11 +145,10 @@ def _commands(
     return found
 
 
-def _disk(workspace: Path) -> dict[str, float]:
+def _free_gb(workspace: Path) -> float:
     """Room on the disk of a workspace, which need not exist yet."""
     place = next(folder for folder in (workspace, *workspace.parents) if folder.exists())
-    usage = shutil.disk_usage(place)
-    return {"free_gb": usage.free / 1e9}
+    return shutil.disk_usage(place).free / 1e9
 
 
 class _AskedCommand(Config):

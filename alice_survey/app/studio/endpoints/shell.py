@@ -15,8 +15,8 @@ from alice_survey.app.studio.endpoints.base import (
     Endpoint,
     Studio,
     TileRequest,
-    scale_json,
 )
+from alice_survey.app.studio.files import STAGES_MADE
 from alice_survey.kit.document import EAST_NORTH, PictureLayer, ShapeLayer
 from alice_survey.kit.map import map_data, map_extent
 
@@ -68,7 +68,7 @@ class _Shell:
 
     def map(self, call: Call) -> dict[str, Any]:
         """The layers of what the workspace holds, as the map's script takes them."""
-        with self.studio.workspace.check_unchanged():
+        with self.studio.workspace.check_unchanged(*STAGES_MADE):
             return self._map()
 
     def _map(self) -> dict[str, Any]:
@@ -89,14 +89,12 @@ class _Shell:
 
 def _layer_json(layer: PictureLayer | ShapeLayer) -> dict[str, Any]:
     """What the list of layers says of one."""
-    is_base = isinstance(layer, PictureLayer) and layer.base
+    picture = layer if isinstance(layer, PictureLayer) else None
     return {
-        "title": layer.title,
-        "about": layer.about,
-        "shown": layer.shown,
-        "group": "Base layer" if is_base else "Overlays",
-        "scale": scale_json(layer) if isinstance(layer, PictureLayer) else None,
-    }
+        "title": layer.title, "about": layer.about, "shown": layer.shown,
+        "group": "Base layer" if picture is not None and picture.base else "Overlays",
+        "scale": None if picture is None or picture.scale is None else vars(picture.scale),
+    }  # fmt: skip
 
 
 def endpoints(studio: Studio) -> Sequence[Endpoint]:

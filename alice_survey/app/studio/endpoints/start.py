@@ -155,8 +155,7 @@ class _NewSurvey(Config):
     trial: bool = False
 
 
-class _Arguments(RootModel[dict[str, Any]]):
-    pass
+_Arguments = RootModel[dict[str, Any]]
 
 
 @dataclass(frozen=True)
