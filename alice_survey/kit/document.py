@@ -104,9 +104,9 @@ class PictureLayer:
     """WebP by "k/x/y"; a tile at the border may be smaller; empty where a server gives them."""
     address: str | None = None
     """URL of a tile on the server of the page, with "{}" in place of "k/x/y"."""
-    sizes: Sequence[tuple[int, int, float, float]] | None = None
-    """Columns, rows and a pixel's width and height, metres, of each level, full resolution first;
-    halves, rounded up, where not given."""
+    sizes: Sequence[tuple[int, int, float, float]]
+    """Columns, rows and a pixel's width and height, metres, of each level, full resolution
+    first."""
     scale: Scale | None = None
     shown: bool = False
     """Whether it is shown at first; only one base layer can be."""
@@ -115,12 +115,7 @@ class PictureLayer:
 
     def size(self, level: int) -> tuple[int, int, float, float]:
         """Columns, rows and a pixel's width and height, metres, of a level."""
-        halvings = self.levels - 1 - level
-        if self.sizes is not None:
-            return self.sizes[halvings]
-        side = 2**halvings
-        pixel = self.pixel_m * side
-        return -(-self.width_px // side), -(-self.height_px // side), pixel, pixel
+        return self.sizes[self.levels - 1 - level]
 
 
 @dataclass(frozen=True, kw_only=True)

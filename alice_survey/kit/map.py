@@ -59,32 +59,17 @@ def map_extent(survey_map: SurveyMap) -> tuple[float, float, float, float]:
     return min(east), min(north), max(east), max(north)
 
 
-def _pack_tiles(tiles: Mapping[str, bytes]) -> tuple[dict[str, list[Any]], str]:
+def _pack_tiles(tiles: Mapping[str, bytes]) -> tuple[dict[str, list[int]], str]:
     """Where each tile lies in the text of all, and that text."""
-    found: dict[str, list[Any]] = {}
+    found: dict[str, list[int]] = {}
     texts: list[str] = []
     at = 0
     for name in sorted(tiles):
         text = base64.b64encode(tiles[name]).decode("ascii")
-        found[name] = [at, len(text), picture_kind(tiles[name])]
+        found[name] = [at, len(text)]
         texts.append(text)
         at += len(text)
     return found, "".join(texts)
-
-
-def picture_kind(content: bytes) -> str:
-    """The subtype of a picture, by its first bytes.
-
-    Raises:
-        ValueError: it is not a JPEG, PNG or WebP.
-    """
-    if content.startswith(b"\xff\xd8\xff"):
-        return "jpeg"
-    if content.startswith(b"\x89PNG\r\n\x1a\n"):
-        return "png"
-    if content[:4] == b"RIFF" and content[8:12] == b"WEBP":
-        return "webp"
-    raise ValueError("a tile of the map is not a JPEG, PNG or WebP")
 
 
 def picture_json(layer: PictureLayer) -> dict[str, Any]:
@@ -100,7 +85,7 @@ def picture_json(layer: PictureLayer) -> dict[str, Any]:
         "tile": layer.tile_px,
         "levels": layer.levels,
         "base": layer.base,
-        **({} if layer.sizes is None else {"sizes": [list(size) for size in layer.sizes]}),
+        "sizes": layer.sizes,
     }
 
 

@@ -109,7 +109,7 @@ const Pyramid = leaflet.Layer.extend({
   _uri(name) {
     if (this.about.address) return this.about.address.replace("{}", name);
     if (this._text === null) this._text = document.getElementById(this.about.block).textContent;
-    const [at, length, kind] = this.about.tiles[name];
-    return "data:image/" + kind + ";base64," + this._text.slice(at, at + length);
+    const [at, length] = this.about.tiles[name];
+    return "data:image/webp;base64," + this._text.slice(at, at + length);
   },
 });

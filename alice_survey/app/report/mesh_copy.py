@@ -81,14 +81,14 @@ def _relief(held: Held, offset: Array) -> Any:
     import trimesh
     from PIL import Image
 
-    (heights,), _, cell = read_shrunk(held.workspace / "dense" / "dem.tif", [1], _MAX_CELLS)
+    (heights,), cell = read_shrunk(held.workspace / "dense" / "dem.tif", [1], _MAX_CELLS)
     rows, columns = heights.shape
     east = cell.c + cell.a * (np.arange(columns) + 0.5)
     north = cell.f + cell.e * (np.arange(rows) + 0.5)
     points, faces, used = grid_mesh(east, north, heights.astype(np.float64).filled(np.nan))
     points -= offset[[0, 2, 1]] * [1.0, 1.0, -1.0]
     path = held.workspace / "mosaic" / "mosaic.tif"
-    bands, _, at = read_shrunk(path, [1, 2, 3], _MAX_TEXTURE_PX**2)
+    bands, at = read_shrunk(path, [1, 2, 3], _MAX_TEXTURE_PX**2)
     high, wide = bands.shape[1:]
     uv = (used - [at.c, at.f + at.e * high]) / [at.a * wide, -at.e * high]
     picture = _as_jpeg(Image.fromarray(np.moveaxis(np.ma.getdata(bands), 0, -1)))

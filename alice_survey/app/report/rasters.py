@@ -52,35 +52,6 @@ _COLOURS = 9
 _QUALITY = 82
 
 
-@dataclass(frozen=True, kw_only=True)
-class Numbers:
-    """A raster of numbers in the unit that people read."""
-
-    raster: Raster
-    factor: float
-    """Factor from the raster's unit to the legend's."""
-    unit: str
-    """Of the legend; none of counts."""
-
-    def levels(self, values: Array) -> Array:
-        """Values of the raster in the legend's unit; NaN where nothing is known."""
-        level = self.factor * values.astype(np.float64)
-        return np.where(level > 0, level, np.nan) if self.raster.limits == "counts" else level
-
-
-def numbers_of(raster: Raster, unit: str) -> Numbers | None:
-    """How a raster is coloured; None of the mosaic, which has its own colours.
-
-    Args:
-        raster: of a map.
-        unit: unit of a workspace's lengths.
-    """
-    if not raster.palette:
-        return None
-    factor, shown = raster.shown_unit(unit)
-    return Numbers(raster=raster, factor=factor, unit=shown)
-
-
 _LIMITS: Mapping[str, Callable[[Array], tuple[float, float]]] = {
     "middle": lambda v: (
         np.percentile(v, 1),
@@ -91,23 +62,6 @@ _LIMITS: Mapping[str, Callable[[Array], tuple[float, float]]] = {
     "counts": lambda v: (0.0, max(np.ceil(np.percentile(v, 99)), 1.0)),
 }
 """Limits of colours from the known values, as `Raster.limits` names them."""
-
-
-def limits_of(raster: Any, numbers: Numbers) -> tuple[float, float]:
-    """Limits of a raster's colours, in the legend's unit; 0 to 1 where no value is known.
-
-    A large raster is sampled in blocks all over it, in an order without a pattern, until there
-    are enough values: memory does not grow with the raster.
-    """
-    kept, count = list[Array](), 0
-    for values in _sample(raster):
-        level = numbers.levels(values)
-        kept.append(level[np.isfinite(level)])
-        count += len(kept[-1])
-        if count >= _SAMPLED:
-            break
-    low, high = _LIMITS[numbers.raster.limits](np.concatenate(kept)) if count else (0.0, 1.0)
-    return float(low), float(high)
 
 
 def _sample(raster: Any) -> Iterator[Array]:
@@ -131,7 +85,7 @@ def known_values(raster: Any, window: Window) -> Array:
 
 def read_shrunk(
     path: Path, bands: list[int], max_px: float, resampling: Resampling = Resampling.average
-) -> tuple[Array, Array, Affine]:
+) -> tuple[Array, Affine]:
     """A raster, shrunk to about so many pixels at most.
 
     Args:
@@ -141,52 +95,18 @@ def read_shrunk(
         resampling: how pixels are merged.
 
     Returns:
-        (B, H, W) masked values, (H, W) opacity from 0 to 255, and the transform of a pixel.
+        (B, H, W) masked values, and the transform of a pixel.
     """
     with rasterio.open(path) as raster:
         shrink = max(1.0, float(np.sqrt(raster.height * raster.width / max_px)))
-        shape = max(1, round(raster.height / shrink)), max(1, round(raster.width / shrink))
+        shape = _shrink(raster.height, shrink), _shrink(raster.width, shrink)
         values: Array = raster.read(
             bands, out_shape=(len(bands), *shape), resampling=resampling, masked=True
         )
-        opacity: Array = raster.dataset_mask(out_shape=shape)
         full = raster.transform
         # Exactly its own transform where nothing is shrunk.
         wide, high = raster.width / shape[1], raster.height / shape[0]
-        return values, opacity, Affine(full.a * wide, 0.0, full.c, 0.0, full.e * high, full.f)
-
-
-def colour_tile(level: Array, numbers: Numbers, limits: tuple[float, float], pixel: float) -> Rgba:
-    """Numbers as colours; unknown values are transparent.
-
-    Args:
-        level: (H, W) in the legend's unit, NaN where unknown.
-        numbers: how to colour them.
-        limits: as `limits_of` gives them.
-        pixel: side of a pixel in the unit of lengths, for the shade.
-    """
-    low, high = limits
-    known = np.isfinite(level)
-    shares = np.clip((level - low) / (high - low), 0, 1)
-    picture: Rgba = palette_colours(numbers.raster.palette, shares)
-    if numbers.raster.shaded:
-        flat = np.sqrt(0.5)
-        shade = hillshade(level, pixel) if min(level.shape) > 1 else np.full(level.shape, flat)
-        tinted = picture[..., :3] * (0.25 + 1.05 * np.nan_to_num(shade, nan=flat)[..., None])
-        picture[..., :3] = np.clip(tinted, 0, 255)
-    picture[..., 3] = np.where(known, 255, 0)
-    return picture
-
-
-def scale_of(numbers: Numbers, limits: tuple[float, float]) -> Scale:
-    """The legend."""
-    title = numbers.raster.title.lower()
-    return Scale(
-        label=f"{title}, {numbers.unit}" if numbers.unit else title,
-        low=limits[0],
-        high=limits[1],
-        colours=palette_steps(numbers.raster.palette, _COLOURS),
-    )
+        return values, Affine(full.a * wide, 0.0, full.c, 0.0, full.e * high, full.f)
 
 
 def encode_webp(tile: Rgba) -> bytes:
@@ -216,30 +136,32 @@ class Level:
 class Pyramid:
     """All levels of one raster in its colours."""
 
-    def __init__(self, path: Path, numbers: Numbers | None, max_px: float = math.inf) -> None:
+    def __init__(self, path: Path, raster: Raster, unit: str, max_px: float = math.inf) -> None:
         """Open a raster.
 
         Args:
             path: path of the file.
-            numbers: its colouring; None for a mosaic, which has its own colours.
+            raster: what it is.
+            unit: unit of a workspace's lengths.
             max_px: about the most pixels of the finest level.
 
         Raises:
             rasterio.errors.RasterioError: it cannot be read.
         """
-        self._path, self.numbers = path, numbers
-        with self._open() as raster:
-            self.west, self.north = raster.transform.c, raster.transform.f
-            self._full = raster.width, raster.height
-            wide, high = (side * raster.transform.a for side in self._full)
-            self.limits = None if numbers is None else limits_of(raster, numbers)
-            shrink = max(1.0, math.sqrt(raster.width * raster.height / max_px))
-            sizes = [(_shrink(raster.width, shrink), _shrink(raster.height, shrink))]
-            factors = raster.overviews(1) if sizes == [self._full] else []
+        self._path, self.raster = path, raster
+        self._factor, self._unit = raster.shown_unit(unit)
+        with self._open() as file:
+            self.west, self.north = file.transform.c, file.transform.f
+            self._full = file.width, file.height
+            wide, high = (side * file.transform.a for side in self._full)
+            self.limits = self._limits_of(file) if raster.palette else None
+            shrink = max(1.0, math.sqrt(file.width * file.height / max_px))
+            sizes = [(_shrink(file.width, shrink), _shrink(file.height, shrink))]
+            factors = file.overviews(1) if sizes == [self._full] else []
         while max(sizes[-1]) > TILE_PX:
             if 2 ** len(sizes) in factors:
-                with self._open(overview_level=factors.index(2 ** len(sizes))) as raster:
-                    sizes.append((raster.width, raster.height))
+                with self._open(overview_level=factors.index(2 ** len(sizes))) as file:
+                    sizes.append((file.width, file.height))
             else:
                 sizes.append((-(-sizes[-1][0] // 2), -(-sizes[-1][1] // 2)))
         self.levels = [
@@ -251,9 +173,30 @@ class Pyramid:
     def _open(self, **options: int) -> Iterator[Any]:
         with (
             rasterio.Env(**_GDAL),
-            rasterio.open(self._path, driver="GTiff", sharing=False, **options) as raster,
+            rasterio.open(self._path, driver="GTiff", sharing=False, **options) as file,
         ):
-            yield raster
+            yield file
+
+    def _levels(self, values: Array) -> Array:
+        """Values in the legend's unit; NaN where nothing is known."""
+        level = self._factor * values.astype(np.float64)
+        return np.where(level > 0, level, np.nan) if self.raster.limits == "counts" else level
+
+    def _limits_of(self, file: Any) -> tuple[float, float]:
+        """Limits of the colours, in the legend's unit; 0 to 1 where no value is known.
+
+        A large raster is sampled in blocks all over it, in an order without a pattern, until there
+        are enough values: memory does not grow with the raster.
+        """
+        kept, count = list[Array](), 0
+        for values in _sample(file):
+            level = self._levels(values)
+            kept.append(level[np.isfinite(level)])
+            count += len(kept[-1])
+            if count >= _SAMPLED:
+                break
+        low, high = _LIMITS[self.raster.limits](np.concatenate(kept)) if count else (0.0, 1.0)
+        return float(low), float(high)
 
     def tile(self, level: int, x: int, y: int) -> Rgba:
         """Pixels of a tile of a level.
@@ -270,20 +213,48 @@ class Pyramid:
             raise FileNotFoundError(f"tile {x}, {y}")
         left, top = x * TILE_PX, y * TILE_PX
         right, bottom = min(left + TILE_PX, size.columns), min(top + TILE_PX, size.rows)
-        if self.numbers is None or self.limits is None:
+        if self.limits is None:
             return self._paint(size, left, top, right, bottom)
         # One pixel more on each side, so that the shade has no seams.
         west, north = min(left, 1), min(top, 1)
         east, south = min(size.columns - right, 1), min(size.rows - bottom, 1)
         values = self.values(size, left - west, top - north, right + east, bottom + south)
-        whole = colour_tile(self.numbers.levels(values), self.numbers, self.limits, size.east)
+        whole = self.colour(values, size.east)
         return whole[north : whole.shape[0] - south, west : whole.shape[1] - east]
+
+    def colour(self, values: Array, pixel: float) -> Rgba:
+        """Values of a raster of numbers as colours; unknown ones are transparent.
+
+        Args:
+            values: (H, W), NaN where unknown.
+            pixel: side of a pixel in the unit of lengths, for the shade.
+        """
+        level, (low, high) = self._levels(values), self.limits or (0.0, 1.0)
+        shares = np.clip((level - low) / (high - low), 0, 1)
+        picture: Rgba = palette_colours(self.raster.palette, shares)
+        if self.raster.shaded:
+            flat = np.sqrt(0.5)
+            shade = hillshade(level, pixel) if min(level.shape) > 1 else np.full(level.shape, flat)
+            tinted = picture[..., :3] * (0.25 + 1.05 * np.nan_to_num(shade, nan=flat)[..., None])
+            picture[..., :3] = np.clip(tinted, 0, 255)
+        picture[..., 3] = np.where(np.isfinite(level), 255, 0)
+        return picture
+
+    @property
+    def scale(self) -> Scale | None:
+        """The legend; None of the mosaic, which has its own colours."""
+        if self.limits is None:
+            return None
+        title, (low, high) = self.raster.title.lower(), self.limits
+        label = f"{title}, {self._unit}" if self._unit else title
+        colours = palette_steps(self.raster.palette, _COLOURS)
+        return Scale(label=label, low=low, high=high, colours=colours)
 
     def values(self, size: Level, left: int, top: int, right: int, bottom: int) -> Array:
         """Means of known numbers of a part of a level; NaN where none is known."""
         window, shape = self._window(size, left, top, right, bottom)
-        with self._open() as raster:
-            read = raster.read(
+        with self._open() as file:
+            read = file.read(
                 1, window=window, out_shape=shape, out_dtype="float32", masked=True,
                 resampling=Resampling.average,
             )  # fmt: skip
@@ -293,9 +264,9 @@ class Pyramid:
     def _paint(self, size: Level, left: int, top: int, right: int, bottom: int) -> Rgba:
         window, shape = self._window(size, left, top, right, bottom)
         options = {"window": window, "resampling": Resampling.average}
-        with self._open() as raster:
-            bands = raster.read([1, 2, 3], out_shape=(3, *shape), **options)
-            opacity = raster.dataset_mask(out_shape=shape, **options)
+        with self._open() as file:
+            bands = file.read([1, 2, 3], out_shape=(3, *shape), **options)
+            opacity = file.dataset_mask(out_shape=shape, **options)
         picture: Rgba = np.dstack([*bands, np.where(opacity < _OPAQUE, 0, 255)]).astype(np.uint8)
         return picture
 
@@ -307,22 +278,19 @@ class Pyramid:
         window = Window(left * wide, top * high, (right - left) * wide, (bottom - top) * high)
         return window, (bottom - top, right - left)
 
-    def layer(self, raster: Raster, *, shown: bool, **tiles: Any) -> PictureLayer:
+    def layer(self, *, shown: bool, **tiles: Any) -> PictureLayer:
         """The layer of a map.
 
         Args:
-            raster: what it shows.
             shown: whether it is shown at first.
             tiles: its `tiles`, or the `address` that they are requested from.
         """
-        full = self.levels[0]
-        numbers, limits = self.numbers, self.limits
+        full, raster = self.levels[0], self.raster
         return PictureLayer(
             name=raster.name, title=raster.title, about=raster.about,
             west_m=self.west, north_m=self.north, pixel_m=full.east,
             width_px=full.columns, height_px=full.rows, tile_px=TILE_PX,
-            levels=len(self.levels), shown=shown,
-            scale=None if numbers is None or limits is None else scale_of(numbers, limits),
+            levels=len(self.levels), shown=shown, scale=self.scale,
             sizes=[(s.columns, s.rows, s.east, s.north) for s in self.levels],
             **{"tiles": {}, **tiles},
         )  # fmt: skip
@@ -364,7 +332,6 @@ def page_layer(
         shown: whether it is shown at first.
         max_px: about the most pixels; what a page can carry if not given.
     """
-    numbers = numbers_of(raster, unit)
-    carried_px = _MAX_PAINTED_PX if numbers is None else _MAX_COLOURED_PX
-    pyramid = Pyramid(path, numbers, max_px or carried_px)
-    return pyramid.layer(raster, shown=shown, tiles=pyramid.all_tiles())
+    carried_px = _MAX_COLOURED_PX if raster.palette else _MAX_PAINTED_PX
+    pyramid = Pyramid(path, raster, unit, max_px or carried_px)
+    return pyramid.layer(shown=shown, tiles=pyramid.all_tiles())

@@ -9,7 +9,7 @@ from functools import lru_cache
 from rasterio.errors import RasterioError
 
 from alice_survey.app.report.held import Held
-from alice_survey.app.report.rasters import MAP_RASTERS, Pyramid, encode_webp, numbers_of
+from alice_survey.app.report.rasters import MAP_RASTERS, Pyramid, encode_webp
 from alice_survey.app.studio.files import Workspace, stale_page
 from alice_survey.core.contents import one_line
 from alice_survey.core.errors import WorkspaceError
@@ -51,7 +51,7 @@ class Layers:
         with self._check_unchanged(name, None) as token:
             pyramid = self._pyramid(name, token)
         address = f"/tiles/{name}/{{}}.webp?v={token}"
-        return pyramid.layer(_LAYERS[name], shown=shown, address=address)
+        return pyramid.layer(shown=shown, address=address)
 
     def tile(self, name: str, level: int, x: int, y: int, token: str | None) -> tuple[bytes, str]:
         """A tile as WebP, and the token of the raster that it is of.
@@ -90,7 +90,7 @@ class Layers:
 
     def _read_pyramid(self, name: str, token: str) -> Pyramid:
         unit, raster = Held.of(self._workspace.folder).unit, _LAYERS[name]
-        return Pyramid(self._workspace.file(raster.path.parts), numbers_of(raster, unit))
+        return Pyramid(self._workspace.file(raster.path.parts), raster, unit)
 
     def _read_tile(self, name: str, token: str, level: int, x: int, y: int) -> bytes:
         with self._renderers:

@@ -59,7 +59,7 @@ def test_a_flat_picture_shows_every_tile_on_white() -> None:
     assert found.shape == (500, 700, 3)
     difference = found.astype(int) - np.asarray(floor).astype(int)
     assert abs(difference.mean()) < 0.5
-    assert np.abs(difference).mean() < 6  # of JPEG
+    assert np.abs(difference).mean() < 6  # of WebP
     assert flat_picture(layer, max_px=400).shape == (250, 350, 3)
     clear = floor.convert("RGBA")
     clear.putalpha(0)

@@ -14,9 +14,6 @@ from alice_survey.app.report.rasters import (
     MAP_RASTERS,
     TILE_PX,
     Pyramid,
-    colour_tile,
-    limits_of,
-    numbers_of,
 )
 from alice_survey.app.studio.files import Workspace
 from alice_survey.app.studio.layers import Layers
@@ -25,7 +22,7 @@ from tests.alice_survey.app.report.tiny import tiny_workspace
 
 ROWS, COLUMNS = 1302, 1110
 """No multiples of a tile or of a pixel of the third level."""
-NUMBERS = {one.name: numbers for one in MAP_RASTERS if (numbers := numbers_of(one, "m"))}
+RASTERS = {one.name: one for one in MAP_RASTERS}
 Array = NDArray[Any]
 
 
@@ -39,6 +36,10 @@ def written(path: Path, bands: Array, **more: Any) -> Path:
     with rasterio.open(path, "w", **profile) as raster:
         raster.write(bands)
     return path
+
+
+def pyramid_of(path: Path, name: str) -> Pyramid:
+    return Pyramid(path, RASTERS[name], "m")
 
 
 def heights() -> Array:
@@ -71,7 +72,7 @@ def mean_of_known(values: Array, weight: Array, side: int) -> tuple[Array, Array
 def test_levels_are_means_of_what_is_known(tmp_path: Path) -> None:
     values = heights()
     path = written(tmp_path / "a.tif", values[None], nodata=np.nan)
-    pyramid = Pyramid(path, NUMBERS["dem"])
+    pyramid = pyramid_of(path, "dem")
     assert [(s.columns, s.rows) for s in pyramid.levels] == [(1110, 1302), (555, 651), (278, 326)]
     for size in pyramid.levels:  # each covers the whole raster
         assert (size.columns * size.east, size.rows * size.north) == pytest.approx((11.10, 13.02))
@@ -92,7 +93,7 @@ def test_levels_are_means_of_what_is_known(tmp_path: Path) -> None:
 def test_counts_of_zero_are_unknown(tmp_path: Path) -> None:
     counts = np.zeros((1, 600, 600), np.uint8)
     counts[0, :, 300:] = 4
-    tile = Pyramid(written(tmp_path / "a.tif", counts), NUMBERS["stations"]).tile(1, 0, 0)
+    tile = pyramid_of(written(tmp_path / "a.tif", counts), "stations").tile(1, 0, 0)
     assert (tile[:, 150:, 3] == 255).all()
     assert not tile[:, :150, 3].any()
 
@@ -104,7 +105,7 @@ def test_a_mosaics_own_levels_are_shown_as_they_are(tmp_path: Path) -> None:
         from rasterio.shutil import copy
 
         copy(raster, cog, driver="COG", blocksize=512, overview_resampling="average")
-    pyramid = Pyramid(cog, None)
+    pyramid = pyramid_of(cog, "mosaic")
     for number in (1, 2):
         with rasterio.open(cog, overview_level=number - 1) as raster:
             own = raster.read()
@@ -117,7 +118,7 @@ def test_a_mosaics_own_levels_are_shown_as_they_are(tmp_path: Path) -> None:
 def test_a_mosaic_without_levels_is_averaged_without_what_is_clear(tmp_path: Path) -> None:
     bands = painting()
     path = written(tmp_path / "a.tif", bands, photometric="RGB", alpha="YES")
-    tile = Pyramid(path, None).tile(1, 0, 0)
+    tile = pyramid_of(path, "mosaic").tile(1, 0, 0)
     for band in range(3):
         mean, cover = mean_of_known(bands[band].astype(float), bands[3] / 255.0, 2)
         seen = cover[:512, :512] > 0.5
@@ -146,9 +147,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_tiles_make_the_whole_level(folder: Path, name: str) -> None:
     """Pixel by pixel before compression, shade included: no seams, no shift, one colour scale."""
     shown = {layer.name: layer for layer in Layers(Workspace(folder)).picture_layers()}[name]
-    numbers = NUMBERS.get(name)
-    path = folder / ("mosaic/mosaic.tif" if numbers is None else numbers.raster.file)
-    pyramid = Pyramid(path, numbers)
+    pyramid = pyramid_of(folder / RASTERS[name].file, name)
     for level, size in enumerate(pyramid.levels):
         assert shown.size(shown.levels - 1 - level) == (
             size.columns, size.rows, size.east, size.north,
@@ -160,13 +159,13 @@ def test_tiles_make_the_whole_level(folder: Path, name: str) -> None:
                 tile = pyramid.tile(level, x, y)
                 top, left = y * TILE_PX, x * TILE_PX
                 sheet[top : top + tile.shape[0], left : left + tile.shape[1]] = tile
-        if numbers is None:
+        if name == "mosaic":
             whole = pyramid._paint(size, 0, 0, size.columns, size.rows)
         else:
             assert shown.scale is not None and pyramid.limits is not None
             assert pyramid.limits == (shown.scale.low, shown.scale.high)
-            values = numbers.levels(pyramid.values(size, 0, 0, size.columns, size.rows))
-            whole = colour_tile(values, numbers, pyramid.limits, size.east)
+            values = pyramid.values(size, 0, 0, size.columns, size.rows)
+            whole = pyramid.colour(values, size.east)
         # Means may differ in the last bits, and then a colour by one or two.
         assert np.abs(sheet.astype(int) - whole).max() <= 2
         assert (sheet == whole).mean() > 0.999
@@ -194,8 +193,7 @@ def test_limits_of_a_large_raster_are_close_to_those_of_all_its_values(tmp_path:
     values = np.kron(rng.normal(0, 1, (40, 40)), np.ones((60, 60))).astype(np.float32)
     values += rng.normal(0, 0.1, values.shape).astype(np.float32)
     values[:1200, :900] = np.nan
-    with rasterio.open(written(tmp_path / "a.tif", values[None], nodata=np.nan)) as raster:
-        limits = limits_of(raster, NUMBERS["dem"])
+    limits = pyramid_of(written(tmp_path / "a.tif", values[None], nodata=np.nan), "dem").limits
     expected = np.nanpercentile(values, [1, 99])
     assert limits == pytest.approx(tuple(expected), abs=0.15)
 
@@ -205,8 +203,8 @@ def test_a_raster_of_one_row_and_one_without_a_value(tmp_path: Path) -> None:
     written(workspace / "dense" / "dem.tif", np.full((1, 1, 700), -3, np.float32), nodata=np.nan)
     written(workspace / "dense" / "sigma.tif", np.full((1, 9, 7), np.nan, np.float32))
     dense = workspace / "dense"
-    assert Pyramid(dense / "dem.tif", NUMBERS["dem"]).tile(1, 0, 0).shape == (1, 350, 4)
-    assert not Pyramid(dense / "sigma.tif", NUMBERS["sigma"]).tile(0, 0, 0)[..., 3].any()
+    assert pyramid_of(dense / "dem.tif", "dem").tile(1, 0, 0).shape == (1, 350, 4)
+    assert not pyramid_of(dense / "sigma.tif", "sigma").tile(0, 0, 0)[..., 3].any()
     layers = Layers(Workspace(workspace)).picture_layers()
     scale = {layer.name: layer.scale for layer in layers}["sigma"]
     assert scale is not None and (scale.low, scale.high) == (0.0, 1.0)
