@@ -2,12 +2,12 @@
 
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from pydantic import Field
 from pydantic_core import to_json
@@ -93,8 +93,7 @@ class _AreaFile(Config):
     role: Literal["survey", "no_go", "allowed"] = "survey"
 
 
-@dataclass(frozen=True)
-class _Settings:
+class _Settings(NamedTuple):
     """survey.toml as it is, or the template where there is none."""
 
     text: str
@@ -199,8 +198,8 @@ class _PlanTab:
             draft = self.draft(request)
         except AliceError as error:
             return {**refusal_json(error), "cpu_s": 0.0}
-        with _draft_settings(draft) as config:
-            return preview(config)
+        with tempfile.TemporaryDirectory() as scratch:  # for its files
+            return preview(draft.config_with(Path(scratch)))
 
     def read_dropped(self, call: Call) -> dict[str, Any]:
         """The shapes of a file that was dropped on the page."""
@@ -221,7 +220,8 @@ class _PlanTab:
                 text = str(error).replace(str(file), name).replace(file.name, name)
                 raise PlanError(text) from None
         texts = [text.replace(file.name, name) for text in warnings]
-        return {**_shapes(drawing.shapes), "datum": _datum(drawing.datum), "warnings": texts}
+        shapes = drawing.shapes.model_dump(mode="json")
+        return {**shapes, "datum": _datum(drawing.datum), "warnings": texts}
 
     def text(self, call: Call) -> dict[str, Any]:
         """The settings file as it would be saved."""
@@ -255,20 +255,17 @@ class _PlanTab:
         """A file of the saved plan; of one a dive all of them, zipped."""
         name = call.ask(FormatRequest).format
         files = format_named(name).files
-        folder = self.studio.workspace.folder / "plan"
         plan = read_plan(self.studio.workspace.file(["plan", "plan.json"]))
         names = [
             file.name.format(dive + 1)
             for file in files
             for dive in range(len(plan.dives) if "{}" in file.name else 1)
         ]
-        paths = [self.studio.workspace.file(["plan", "exports", one]) for one in names]
-        if len(paths) == 1:
-            return Content(
-                data=paths[0].read_bytes(), kind="application/octet-stream", name=names[0]
-            )
-        exports = folder / "exports"
-        return zip_files(f"{name}.zip", {str(one.relative_to(exports)): one for one in paths})
+        paths = {one: self.studio.workspace.file(["plan", "exports", one]) for one in names}
+        if len(names) == 1:
+            data = paths[names[0]].read_bytes()
+            return Content(data=data, kind="application/octet-stream", name=names[0])
+        return zip_files(f"{name}.zip", paths)
 
 
 def _json(found: Mapping[str, Any]) -> Content:
@@ -276,18 +273,9 @@ def _json(found: Mapping[str, Any]) -> Content:
     return Content(data=to_json(found, inf_nan_mode="null"), kind=_JSON)
 
 
-@contextmanager
-def _draft_settings(draft: Draft) -> Iterator[SurveyConfig]:
-    """The settings of a draft, with its files in a folder that lasts as long as this block."""
-    with tempfile.TemporaryDirectory() as scratch:
-        yield draft.config_with(Path(scratch))
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
+def _quiet() -> AbstractContextManager[None]:
     """Without notes and warnings on the terminal."""
-    with collected_by(lambda _, __: None):
-        yield
+    return collected_by(lambda _, __: None)
 
 
 def _about(config: SurveyConfig, drawing: AreaDrawing | None) -> dict[str, Any]:
@@ -295,16 +283,11 @@ def _about(config: SurveyConfig, drawing: AreaDrawing | None) -> dict[str, Any]:
     datum = Datum(config.area.latitude_deg, config.area.longitude_deg)
     return {
         "settings": json_values(config.model_dump(mode="json")),
-        "shapes": _shapes(DrawnShapes() if drawing is None else drawing.shapes),
+        "shapes": (DrawnShapes() if drawing is None else drawing.shapes).model_dump(mode="json"),
         "datum": _datum(datum if drawing is None else drawing.datum),
         "vehicles": sorted({*known_vehicles(), config.vehicle.name}),
         "lenses_mm": sorted({*_LENSES_MM, config.camera.focal_mm}),
     }
-
-
-def _shapes(shapes: DrawnShapes) -> dict[str, Any]:
-    found: dict[str, Any] = shapes.model_dump(mode="json")
-    return found
 
 
 def _datum(datum: Datum) -> dict[str, float]:
