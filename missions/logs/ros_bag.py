@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from alice_survey.core.contents import one_line
-from alice_survey.core.errors import NavigationError
+from alice_survey.core.errors import AliceError, NavigationError
 from alice_survey.core.executor import progress
 from alice_survey.core.frames import Array, Datum
 from missions.logs.dive import (
@@ -455,7 +455,7 @@ def opened_bag(path: Path) -> Iterator["AnyReader"]:
     try:
         with _bounded_chunks(), AnyReader([path], default_typestore=store) as reader:
             yield reader
-    except NavigationError:
+    except AliceError:
         raise
     except Exception as error:  # damaged bags raise all kinds, MemoryError too
         if path.is_file() and path.open("rb").read(4) == b"\x89HDF":

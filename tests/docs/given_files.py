@@ -313,11 +313,8 @@ def robot_bag(reef: Path, path: Path, stations: Iterable[int], width_px: int) ->
         if int(taken["station"]) in wanted:
             seen = shrunk(cv2.imread(str(reef / "images" / taken["image"])), width_px)
             stamp = round((SAID + timedelta(seconds=float(taken["time_s"]))).timestamp() * 1e9)
-            data = cv2.imencode(".png", seen)[1].ravel()
-            picture = bag.make(
-                kind, header=bag.header(stamp, taken["camera"]), format="png", data=data
-            )
-            bag.add(f"/camera/{taken['camera']}/compressed", kind, stamp, picture)
+            topic, data = f"/camera/{taken['camera']}/compressed", cv2.imencode(".png", seen)[1]
+            bag.add(topic, kind, stamp, taken["camera"], format="png", data=data.ravel())
     bag.write(path)
 
 

@@ -1,12 +1,13 @@
 """Logs of other makers' formats, written here from numbers that tests know."""
 
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rosbags.interfaces import Nodetype
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
@@ -42,198 +43,126 @@ int64 status
 Numbers = Sequence[float] | NDArray[np.float64]
 
 
+def fields_of(names: str, values: Iterable[float]) -> dict[str, float]:
+    """Numbers by the names of their fields, such as `x y z`."""
+    return dict(zip(names.split(), map(float, values), strict=True))
+
+
 class Bag:
     """Messages by topic, to be written as a bag of ROS 1 or ROS 2."""
 
     def __init__(self, version: int) -> None:
         self.version = version
         self.store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
-        for name, text in _COLA2.items():
+        for name, text in {**_COLA2, _DVL: _DVL_TEXT}.items():
             self.store.register(get_types_from_msg(text, name))
         self.rows: list[tuple[int, str, str, Any]] = []
 
-    def make(self, kind: str, **fields: Any) -> Any:
-        return self.store.types[kind](**fields)
+    def make(self, kind: str, fields: Mapping[str, Any]) -> Any:
+        """A message; nested ones are mappings, and what is left out is 0 or empty."""
+        values = {}
+        for name, (node, of) in self.store.fielddefs[kind][1]:
+            if node == Nodetype.NAME:
+                values[name] = self.make(of, fields.get(name, {}))
+            elif node == Nodetype.BASE:
+                values[name] = fields.get(name, "" if of[0] == "string" else 0)
+            else:
+                values[name] = fields.get(name, np.zeros(of[1]))
+        return self.store.types[kind](**values)
 
-    def header(self, stamp_ns: int, frame: str = "world_ned") -> Any:
+    def add(
+        self, topic: str, kind: str, stamp_ns: int, frame: str, recorded_ns: int | None = None,
+        **fields: Any,
+    ) -> None:  # fmt: skip
+        """A message with a header."""
         sec, nanosec = divmod(stamp_ns, 10**9)
-        stamp = self.make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
-        more = {"seq": 0} if self.version == 1 else {}
-        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame, **more)
-
-    def point(self, xyz: Iterable[float], kind: str = "Point") -> Any:
-        x, y, z = map(float, xyz)
-        return self.make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
-
-    def quaternion(self, xyzw: Numbers) -> Any:
-        x, y, z, w = (float(v) for v in xyzw)
-        return self.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
-
-    def add(self, topic: str, kind: str, recorded_ns: int, message: Any) -> None:
-        self.rows.append((recorded_ns, topic, kind, message))
+        header = {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame}
+        message = self.make(kind, {"header": header, **fields})
+        self.rows.append((stamp_ns if recorded_ns is None else recorded_ns, topic, kind, message))
 
     def add_nav_sts(
-        self,
-        stamp_ns: int,
-        place: Sequence[float],
-        attitude_rad: Sequence[float],
-        altitude_m: float,
-        *,
-        topic: str = "/sparus2/navigator/navigation",
-        variances: Sequence[float] = (0.04, 0.09, 0.0025, 1e-4, 4e-4, 9e-4),
-    ) -> None:
+        self, stamp_ns: int, place: Sequence[float], attitude_rad: Sequence[float],
+        altitude_m: float, *, topic: str = "/sparus2/navigator/navigation",
+    ) -> None:  # fmt: skip
         """Place: latitude, longitude, depth."""
-
-        def rpy(values: Sequence[float]) -> Any:
-            roll, pitch, yaw = values
-            return self.make("cola2_msgs/msg/RPY", roll=roll, pitch=pitch, yaw=yaw)
-
-        def ned(values: Sequence[float]) -> Any:
-            north, east, depth = values
-            return self.make("cola2_msgs/msg/NED", north=north, east=east, depth=depth)
-
-        message = self.make(
-            NAV_STS,
-            header=self.header(stamp_ns),
-            global_position=self.make(
-                "cola2_msgs/msg/DecimalLatLon", latitude=place[0], longitude=place[1]
-            ),
-            origin=self.make("cola2_msgs/msg/DecimalLatLon", latitude=41.0, longitude=3.0),
-            position=ned((0.0, 0.0, place[2])),
+        self.add(
+            topic, NAV_STS, stamp_ns, "world_ned",
+            global_position=fields_of("latitude longitude", place[:2]),
+            origin={"latitude": 41.0, "longitude": 3.0},
+            position={"depth": float(place[2])},
             altitude=altitude_m,
-            body_velocity=self.point((0.5, -0.1, 0.02)),
-            orientation=rpy(attitude_rad),
-            orientation_rate=rpy((0.01, 0.02, 0.03)),
-            position_variance=ned(variances[:3]),
-            orientation_variance=rpy(variances[3:]),
-        )
-        self.add(topic, NAV_STS, stamp_ns, message)
+            body_velocity=fields_of("x y z", (0.5, -0.1, 0.02)),
+            orientation=fields_of("roll pitch yaw", attitude_rad),
+            orientation_rate=fields_of("roll pitch yaw", (0.01, 0.02, 0.03)),
+            position_variance=fields_of("north east depth", (0.04, 0.09, 0.0025)),
+            orientation_variance=fields_of("roll pitch yaw", (1e-4, 4e-4, 9e-4)),
+        )  # fmt: skip
 
     def add_odometry(
-        self,
-        stamp_ns: int,
-        topic: str,
-        frame: str,
-        position: Numbers,
-        xyzw: Numbers,
-        velocity: Numbers = (0.0,) * 6,
-    ) -> None:
-        pose = self.make(
-            "geometry_msgs/msg/Pose",
-            position=self.point(position),
-            orientation=self.quaternion(xyzw),
-        )
-        twist = self.make(
-            "geometry_msgs/msg/Twist",
-            linear=self.point(velocity[:3], kind="Vector3"),
-            angular=self.point(velocity[3:], kind="Vector3"),
-        )
-        message = self.make(
-            "nav_msgs/msg/Odometry",
-            header=self.header(stamp_ns, frame),
-            child_frame_id="base",
-            pose=self.make(
-                "geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36)
-            ),
-            twist=self.make(
-                "geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)
-            ),
-        )
-        self.add(topic, "nav_msgs/msg/Odometry", stamp_ns, message)
+        self, stamp_ns: int, topic: str, frame: str, position: Numbers, xyzw: Numbers,
+        velocity: Numbers,
+    ) -> None:  # fmt: skip
+        place = {
+            "position": fields_of("x y z", position), "orientation": fields_of("x y z w", xyzw),
+        }  # fmt: skip
+        twist = {
+            "linear": fields_of("x y z", velocity[:3]),
+            "angular": fields_of("x y z", velocity[3:]),
+        }
+        self.add(
+            topic, "nav_msgs/msg/Odometry", stamp_ns, frame,
+            pose={"pose": place}, twist={"twist": twist},
+        )  # fmt: skip
 
     def add_fix(self, stamp_ns: int, topic: str, place: Sequence[float], status: int = 0) -> None:
         """Place: latitude, longitude, height."""
-        message = self.make(
-            "sensor_msgs/msg/NavSatFix",
-            header=self.header(stamp_ns, "gps"),
-            status=self.make("sensor_msgs/msg/NavSatStatus", status=status, service=1),
-            latitude=place[0],
-            longitude=place[1],
-            altitude=place[2],
-            position_covariance=np.diag([4.0, 16.0, 25.0]).ravel(),
-            position_covariance_type=2,
-        )
-        self.add(topic, "sensor_msgs/msg/NavSatFix", stamp_ns, message)
+        self.add(
+            topic, "sensor_msgs/msg/NavSatFix", stamp_ns, "gps",
+            status={"status": status, "service": 1},
+            position_covariance=np.diag([4.0, 16.0, 25.0]).ravel(), position_covariance_type=2,
+            **fields_of("latitude longitude altitude", place),
+        )  # fmt: skip
 
     def add_imu(self, stamp_ns: int, topic: str, frame: str, xyzw: Numbers) -> None:
-        zero = self.point((0.0, 0.0, 0.0), kind="Vector3")
-        message = self.make(
-            "sensor_msgs/msg/Imu",
-            header=self.header(stamp_ns, frame),
-            orientation=self.quaternion(xyzw),
-            orientation_covariance=np.zeros(9),
-            angular_velocity=zero,
-            angular_velocity_covariance=np.zeros(9),
-            linear_acceleration=zero,
-            linear_acceleration_covariance=np.zeros(9),
-        )
-        self.add(topic, "sensor_msgs/msg/Imu", stamp_ns, message)
+        turn = fields_of("x y z w", xyzw)
+        self.add(topic, "sensor_msgs/msg/Imu", stamp_ns, frame, orientation=turn)
 
-    def add_range(self, stamp_ns: int, topic: str, range_m: float, max_m: float = 50.0) -> None:
-        message = self.make(
-            "sensor_msgs/msg/Range",
-            header=self.header(stamp_ns, "sonar"),
-            radiation_type=0,
-            field_of_view=0.1,
-            min_range=0.1,
-            max_range=max_m,
-            range=range_m,
-        )
-        self.add(topic, "sensor_msgs/msg/Range", stamp_ns, message)
+    def add_range(self, stamp_ns: int, topic: str, range_m: float) -> None:
+        self.add(
+            topic, "sensor_msgs/msg/Range", stamp_ns, "sonar",
+            field_of_view=0.1, min_range=0.1, max_range=50.0, range=range_m,
+        )  # fmt: skip
 
     def add_dvl(
         self, stamp_ns: int, topic: str, velocity_frd: Numbers, altitude_m: float,
         *, valid: bool = True,
     ) -> None:  # fmt: skip
         """What a Water Linked DVL's driver publishes (the fields of dvl_msgs that matter)."""
-        if _DVL not in self.store.types:
-            self.store.register(get_types_from_msg(_DVL_TEXT, _DVL))
-        message = self.make(
-            _DVL,
-            header=self.header(stamp_ns, "dvl"),
-            time=0.1,
-            velocity=self.point(velocity_frd, kind="Vector3"),
-            fom=0.01,
-            altitude=altitude_m,
-            velocity_valid=valid,
-            status=0,
-        )
-        self.add(topic, _DVL, stamp_ns, message)
+        self.add(
+            topic, _DVL, stamp_ns, "dvl", time=0.1, fom=0.01, altitude=altitude_m,
+            velocity=fields_of("x y z", velocity_frd), velocity_valid=valid,
+        )  # fmt: skip
 
     def add_twist(self, stamp_ns: int, topic: str, frame: str, velocity: Numbers) -> None:
-        zero = self.point((0.0, 0.0, 0.0), kind="Vector3")
-        linear = self.point(velocity, kind="Vector3")
-        twist = self.make("geometry_msgs/msg/Twist", linear=linear, angular=zero)
-        message = self.make(
-            "geometry_msgs/msg/TwistStamped", header=self.header(stamp_ns, frame), twist=twist
-        )
-        self.add(topic, "geometry_msgs/msg/TwistStamped", stamp_ns, message)
+        twist = {"linear": fields_of("x y z", velocity)}
+        self.add(topic, "geometry_msgs/msg/TwistStamped", stamp_ns, frame, twist=twist)
 
     def add_pressure(self, stamp_ns: int, topic: str, pressure_pa: float) -> None:
-        message = self.make(
-            "sensor_msgs/msg/FluidPressure",
-            header=self.header(stamp_ns, "p"),
-            fluid_pressure=pressure_pa,
-            variance=0.0,
-        )
-        self.add(topic, "sensor_msgs/msg/FluidPressure", stamp_ns, message)
+        kind = "sensor_msgs/msg/FluidPressure"
+        self.add(topic, kind, stamp_ns, "p", fluid_pressure=pressure_pa)
 
     def write(self, path: Path, storage: StoragePlugin = StoragePlugin.MCAP) -> Path:
-        if self.version == 1:
-            with Writer1(path) as bag:
-                self._write(bag, self.store.serialize_ros1)
-        else:
-            with Writer2(path, version=9, storage_plugin=storage) as bag:
-                self._write(bag, self.store.serialize_cdr)
+        bag: Any
+        with (
+            Writer1(path) if self.version == 1
+            else Writer2(path, version=9, storage_plugin=storage)
+        ) as bag:  # fmt: skip
+            self.fill(bag)
         return path
 
     def fill(self, bag: Any) -> None:
         """Write the messages to an open writer."""
-        self._write(
-            bag, self.store.serialize_ros1 if self.version == 1 else self.store.serialize_cdr
-        )
-
-    def _write(self, bag: Any, serialize: Any) -> None:
+        serialize = self.store.serialize_ros1 if self.version == 1 else self.store.serialize_cdr
         connections: dict[str, Any] = {}
         for recorded_ns, topic, kind, message in sorted(self.rows, key=lambda row: row[0]):
             if topic not in connections:

@@ -76,14 +76,6 @@ def test_what_cannot_be_a_picture_is_refused(changes: dict[str, Any]) -> None:
         pixels_of(message(**{"encoding": "bgr8", "pixels": scene(3), **changes}))
 
 
-def image(bag: Bag, stamp_ns: int, pixels: np.ndarray) -> Any:
-    return bag.make(
-        "sensor_msgs/msg/Image", header=bag.header(stamp_ns, "camera"), height=pixels.shape[0],
-        width=pixels.shape[1], encoding="bgr8", is_bigendian=0, step=pixels.shape[1] * 3,
-        data=np.frombuffer(pixels.tobytes(), np.uint8),
-    )  # fmt: skip
-
-
 def stereo(
     folder: Path, version: int = 2, *, dropped: tuple[int, ...] = (), late_ns: int = 1_000_000
 ) -> Path:
@@ -91,14 +83,18 @@ def stereo(
     bag = Bag(version)
     for i in range(COUNT):
         stamp = START_NS + i * STEP_NS
-        left = image(bag, stamp, scene(i))
-        bag.add("/stereo/left/image_raw", "sensor_msgs/msg/Image", stamp, left)
+        left = scene(i)
+        bag.add(
+            "/stereo/left/image_raw", "sensor_msgs/msg/Image", stamp, "camera",
+            height=left.shape[0], width=left.shape[1], encoding="bgr8", step=left.shape[1] * 3,
+            data=left.ravel(),
+        )  # fmt: skip
         if i not in dropped:
-            kind = "sensor_msgs/msg/CompressedImage"
-            data = cv2.imencode(".jpg", scene(100 + i))[1].ravel()
-            header = bag.header(stamp + late_ns, "camera")
-            right = bag.make(kind, header=header, format="jpeg", data=data)
-            bag.add("/stereo/right/image_raw/compressed", kind, stamp + 90_000_000, right)
+            bag.add(
+                "/stereo/right/image_raw/compressed", "sensor_msgs/msg/CompressedImage",
+                stamp + late_ns, "camera", stamp + 90_000_000, format="jpeg",
+                data=cv2.imencode(".jpg", scene(100 + i))[1].ravel(),
+            )  # fmt: skip
     return bag.write(folder / ("d.bag" if version == 1 else "d"))
 
 
