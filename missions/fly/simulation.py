@@ -58,7 +58,6 @@ from alice_survey.sim.vehicle.pilot.mission import (
     MIN_SPEED_MPS,
     NO_LAW,
     NO_MISSION,
-    ArduSubSettings,
     PilotMission,
 )
 from alice_survey.sim.vehicle.pilot.path import Path as PilotPath
@@ -619,13 +618,13 @@ def pilot_mission(
                 f"ArduSub holds on to its track sideways; {vehicle.name} has no thrusters for it: "
                 "fly a mission for COLA2, or another vehicle"
             )
-        return pilot.mission_of(pilot.ARDUSUB, steps, ArduSubSettings())
+        return PilotMission(pilot.ARDUSUB, steps)
     delta_m = cola2_delta_m(gains, plan.speed_mps)
     if not math.isfinite(delta_m):
         raise VehicleError(
             f"no look-ahead keeps {vehicle.name} from weaving under COLA2: lower the speed"
         )
-    return pilot.mission_of(pilot.COLA2, steps, cola2_settings(delta_m, plan.speed_mps))
+    return PilotMission(pilot.COLA2, steps, cola2_settings(delta_m, plan.speed_mps))
 
 
 def _rows(known: MissionOfPlan, mount: CameraMount) -> Array:

@@ -46,7 +46,7 @@ class Coefficients:
 
     def __post_init__(self) -> None:
         for name, value in self.values.items():
-            if _kind(name) is None:
+            if kind_of(name) is None:
                 raise VehicleError(
                     f"coefficient {name!r} is not known; names are like Y_vdot, Y_vv"
                 )
@@ -120,7 +120,7 @@ class Coefficients:
     def _matrix(self, kind: str) -> Array:
         matrix = np.full((6, 6), np.nan)
         for name, value in self.values.items():
-            if _kind(name) == kind:
+            if kind_of(name) == kind:
                 matrix[FORCES.index(name[0]), MOTIONS.index(name[2])] = value
         return matrix
 
@@ -130,7 +130,7 @@ def both_ways(name: str) -> str:
     return name[:-4] if name.endswith(("_pos", "_neg")) else name
 
 
-def _kind(name: str) -> str | None:
+def kind_of(name: str) -> str | None:
     """`dot`, `linear`, `quadratic` (`_pos`, `_neg`), `lift`, or None if it is not a name."""
     if name in LIFTS:
         return "lift"
@@ -143,7 +143,7 @@ def _kind(name: str) -> str | None:
 
 def _mirror(name: str) -> str:
     """Name of an added mass with force and motion exchanged; other names unchanged."""
-    if _kind(name) != "dot":
+    if kind_of(name) != "dot":
         return name
     force, motion = FORCES.index(name[0]), MOTIONS.index(name[2])
     return f"{FORCES[motion]}_{MOTIONS[force]}dot"

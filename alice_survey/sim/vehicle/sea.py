@@ -68,14 +68,14 @@ def varying_current(
         duration_s: duration.
         rng: source of the process.
     """
+    from scipy.signal import lfilter
+
     step_s = correlation_s / 10.0
     time_s: Array = step_s * np.arange(math.ceil(duration_s / step_s) + 2, dtype=np.float64)
     decay = math.exp(-step_s / correlation_s)
     draws = rng.standard_normal((len(time_s), 2))
-    process = np.empty_like(draws)
-    process[0] = draws[0]
-    for i in range(1, len(time_s)):
-        process[i] = decay * process[i - 1] + math.sqrt(1 - decay**2) * draws[i]
+    draws[1:] *= math.sqrt(1 - decay**2)
+    process = lfilter([1.0], [1.0, -decay], draws, axis=0)
     velocity = mean.velocity_ne_mps + sigma_mps * process[:, None, :]
     return check_current(Current(time_s, mean.depth_m, np.array(velocity, dtype=np.float64)))
 

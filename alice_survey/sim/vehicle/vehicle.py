@@ -15,7 +15,7 @@ Instead of a hull, `geometry` names a shape of shapes.toml with its hull and the
 import json
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -308,6 +308,9 @@ class _VehicleFile(Config):
     hotel_w: float | None = Field(None, ge=0)
 
 
+_OF_VEHICLE = [one.name for one in fields(Vehicle)]
+
+
 def vehicle_from(name_or_file: str, coefficients: str = OWN_SET) -> Vehicle:
     """A vehicle known by name, or described by a TOML or JSON file.
 
@@ -355,18 +358,9 @@ def _vehicle_of(path: Path, text: str, coefficients: str) -> Vehicle:
         names = [part.name for part in parts]
         if len(set(names)) < len(names):
             raise VehicleError(f"{path}: two {what} have one name")
-    return Vehicle(
-        name=found.name or path.stem,
-        rigid_body=found.rigid_body,
-        coefficients=_choose_set(path, found, coefficients),
-        thrusters=found.thrusters,
-        fins=found.fins,
-        hull=found.hull,
-        density_kg_m3=found.density_kg_m3,
-        depth_rating_m=found.depth_rating_m,
-        battery_wh=found.battery_wh,
-        hotel_w=found.hotel_w,
-    )
+    own = {name: getattr(found, name) for name in _VehicleFile.model_fields if name in _OF_VEHICLE}
+    own |= {"name": found.name or path.stem}
+    return Vehicle(**own | {"coefficients": _choose_set(path, found, coefficients)})
 
 
 def _with_shape(table: dict[str, Any]) -> dict[str, Any]:
@@ -485,10 +479,8 @@ def read_table(path: Path) -> dict[str, Any]:
 def _text_of(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise VehicleError(f"{path}: cannot be read: {why(error)}") from None
-    except ValueError as error:
-        raise VehicleError(f"{path}: cannot be read: {one_line(error)}") from None
+    except (OSError, ValueError) as error:
+        raise VehicleError(f"{path}: cannot be read: {as_line(why(error))}") from None
 
 
 def _table_of(path: Path, text: str) -> dict[str, Any]:

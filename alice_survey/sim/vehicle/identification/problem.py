@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 
 from alice_survey.core.errors import VehicleError, warn
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.coefficients import FORCES, LIFTS, MOTIONS, Coefficients, both_ways
+from alice_survey.sim.vehicle.coefficients import (
+    FORCES,
+    MOTIONS,
+    Coefficients,
+    both_ways,
+    kind_of,
+)
 from alice_survey.sim.vehicle.identification import sensitivity as term
 from alice_survey.sim.vehicle.identification.sensitivity import (
     CHANNELS,
@@ -40,6 +46,14 @@ GROUPS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {"current": CURRENTS, "trim": TRIMS, "bias": BIASES, "buoyancy": (NET_BUOYANCY,), "gain": GAINS}
 )
 """Short names of several parameters."""
+_GROUP_KINDS: Mapping[int, tuple[str, ...]] = {
+    term.CURRENT: CURRENTS, term.TRIM: TRIMS, term.BIAS: BIASES, term.GAIN: GAINS,
+    term.BUOYANCY: (NET_BUOYANCY,),
+}  # fmt: skip
+_KINDS = {
+    "dot": term.ADDED_MASS, "linear": term.LINEAR, "lift": term.LIFT, "quadratic": term.QUADRATIC,
+    "quadratic_pos": term.QUADRATIC_POS, "quadratic_neg": term.QUADRATIC_NEG,
+}  # fmt: skip
 QUADRATICS = (term.QUADRATIC, term.QUADRATIC_POS, term.QUADRATIC_NEG)
 _GREATEST: Mapping[int, float] = MappingProxyType({term.CURRENT: 5.0, term.TRIM: 1.0})
 
@@ -191,23 +205,12 @@ def place_of(name: str) -> tuple[int, int, int]:
     Raises:
         VehicleError: the name is not known.
     """
-    for kind, group in (
-        (term.CURRENT, CURRENTS),
-        (term.TRIM, TRIMS),
-        (term.BIAS, BIASES),
-        (term.GAIN, GAINS),
-    ):
+    for kind, group in _GROUP_KINDS.items():
         if name in group:
             return kind, group.index(name), 0
-    if name == NET_BUOYANCY:
-        return term.BUOYANCY, 0, 0
-    if name in LIFTS:
-        return term.LIFT, FORCES.index(name[0]), MOTIONS.index(name[3])
-    if len(name) > 2 and name[0] in FORCES and name[1] == "_" and name[2] in MOTIONS:
-        kinds = {"dot": term.ADDED_MASS, "": term.LINEAR, name[2]: term.QUADRATIC}
-        kinds |= {f"{name[2]}_pos": term.QUADRATIC_POS, f"{name[2]}_neg": term.QUADRATIC_NEG}
-        if name[3:] in kinds:
-            return kinds[name[3:]], FORCES.index(name[0]), MOTIONS.index(name[2])
+    if (found := kind_of(name)) is not None:
+        motion = name[3] if found == "lift" else name[2]
+        return _KINDS[found], FORCES.index(name[0]), MOTIONS.index(motion)
     known = ", ".join((*GROUPS, *OTHERS))
     raise VehicleError(
         f"parameter {name!r} is not known; known: X_udot, X_u, X_uu, Z_ww_neg, ..., {known}"

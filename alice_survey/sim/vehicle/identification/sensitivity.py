@@ -69,7 +69,9 @@ class SlopeScratch(NamedTuple):
     """Work arrays for intermediate results."""
 
     force: Array
-    """(3, 6): force, and forces at both ends of a difference."""
+    """(3, 6): of the rate, and of a parameter."""
+    ends: Array
+    """(2, 10) rates at both ends of a difference."""
     tilted: Array
     """(10,) a state a step away."""
     by_state: Array
@@ -91,7 +93,7 @@ class SlopeScratch(NamedTuple):
 def scratch_for(columns: int, thrusters: int) -> SlopeScratch:
     """Work arrays for a number of columns and thrusters."""
     return SlopeScratch(
-        np.zeros((3, 6)), np.zeros(STATES), np.zeros((STATES, STATES)),
+        np.zeros((3, 6)), np.zeros((2, STATES)), np.zeros(STATES), np.zeros((STATES, STATES)),
         np.zeros((STATES, columns)),
         np.zeros((3, STATES)), np.zeros((3, STATES, columns)), np.zeros(thrusters), np.zeros(6),
         np.zeros(6),
@@ -109,49 +111,50 @@ def with_given(physics: Physics, given: Sequence[int]) -> Physics:
 
 
 @kernel
-def force_on(physics: Physics, state: Array, rps: Array, load: Array, force: Array) -> None:
-    """Write the force and moment, (6,), on the body: all but M nu'."""
-    body, nu = physics.body, state[4:10]
+def _write_rate(physics: Physics, state: Array, scratch: SlopeScratch, rate: Array) -> None:
+    """Write the rate, (10,), of a state under the speeds and the load of the scratch.
+
+    Given motions have the acceleration (6,) that they are given; the others feel it through the
+    inertia that couples them, and answer with the rest of the mass matrix alone.
+    """
+    body, nu, force = physics.body, state[4:10], scratch.force[0]
     x, y, z, s = state[0], state[1], state[2], state[3]
+    p, q, r = state[7], state[8], state[9]
+    rate[0] = 0.5 * (s * p + y * r - z * q)
+    rate[1] = 0.5 * (s * q + z * p - x * r)
+    rate[2] = 0.5 * (s * r + x * q - y * p)
+    rate[3] = -0.5 * (x * p + y * q + z * r)
     r20, r21, r22 = matrix_rows(x, y, z, s)[2]
     for i in range(6):
-        force[i] = physics.gain[i] * load[i]
-    add_thrust(physics.propulsion, rps, nu, force)
+        force[i] = physics.gain[i] * scratch.load[i]
+    add_thrust(physics.propulsion, scratch.rps, nu, force)
     add_damping(body, nu, force)
     add_coriolis(body, nu, force)
     add_weight(body, r20, r21, r22, force)
+    for j in range(6):
+        if physics.given[j] != 0.0:
+            for i in range(6):
+                force[i] -= body.mass[i, j] * scratch.acceleration[j]
+    for i in range(6):
+        total = physics.given[i] * scratch.acceleration[i]
+        for j in range(6):
+            total += body.mass_inverse[i, j] * force[j]
+        rate[4 + i] = total
 
 
 @kernel
-def slope_by_state(
-    physics: Physics, state: Array, rps: Array, load: Array, scratch: SlopeScratch
-) -> None:
+def slope_by_state(physics: Physics, state: Array, scratch: SlopeScratch) -> None:
     """Write df/dx into `by_state`."""
-    tilted, out, inverse = scratch.tilted, scratch.by_state, physics.body.mass_inverse
-    x, y, z, s = state[0], state[1], state[2], state[3]
-    p, q, r = state[7], state[8], state[9]
-    out[:, :] = 0.0
-    # Attitude: q' = q * (omega, 0) / 2, linear in both.
-    out[0, 1], out[0, 2], out[0, 3] = 0.5 * r, -0.5 * q, 0.5 * p
-    out[1, 0], out[1, 2], out[1, 3] = -0.5 * r, 0.5 * p, 0.5 * q
-    out[2, 0], out[2, 1], out[2, 3] = 0.5 * q, -0.5 * p, 0.5 * r
-    out[3, 0], out[3, 1], out[3, 2] = -0.5 * p, -0.5 * q, -0.5 * r
-    out[0, 7], out[0, 8], out[0, 9] = 0.5 * s, -0.5 * z, 0.5 * y
-    out[1, 7], out[1, 8], out[1, 9] = 0.5 * z, 0.5 * s, -0.5 * x
-    out[2, 7], out[2, 8], out[2, 9] = -0.5 * y, 0.5 * x, 0.5 * s
-    out[3, 7], out[3, 8], out[3, 9] = -0.5 * x, -0.5 * y, -0.5 * z
+    tilted, ends = scratch.tilted, scratch.ends
     for j in range(STATES):
         tilted[j] = state[j]
     for j in range(STATES):
         for end in range(2):
             tilted[j] = state[j] + (_TILT if end else -_TILT)
-            force_on(physics, tilted, rps, load, scratch.force[1 + end])
+            _write_rate(physics, tilted, scratch, ends[end])
         tilted[j] = state[j]
-        for i in range(6):
-            total = 0.0
-            for k in range(6):
-                total += inverse[i, k] * (scratch.force[2, k] - scratch.force[1, k])
-            out[4 + i, j] = total / (2.0 * _TILT)
+        for i in range(STATES):
+            scratch.by_state[i, j] = (ends[1, i] - ends[0, i]) / (2.0 * _TILT)
 
 
 @kernel
@@ -240,29 +243,10 @@ class Record(NamedTuple):
 def _stage(
     physics: Physics, terms: Terms, state: Array, sensitivity: Array, scratch: SlopeScratch
 ) -> None:
-    """Write the rates of a state and of its sensitivities into the first of the stages.
-
-    Given motions have the acceleration (6,) that they are given; the others feel it through the
-    inertia that couples them, and answer with the rest of the mass matrix alone.
-    """
-    rate, slopes, force = scratch.stage[0], scratch.stages[0], scratch.force[0]
-    x, y, z, s = state[0], state[1], state[2], state[3]
-    p, q, r = state[7], state[8], state[9]
-    rate[0] = 0.5 * (s * p + y * r - z * q)
-    rate[1] = 0.5 * (s * q + z * p - x * r)
-    rate[2] = 0.5 * (s * r + x * q - y * p)
-    rate[3] = -0.5 * (x * p + y * q + z * r)
-    force_on(physics, state, scratch.rps, scratch.load, force)
-    for j in range(6):
-        if physics.given[j] != 0.0:
-            for i in range(6):
-                force[i] -= physics.body.mass[i, j] * scratch.acceleration[j]
-    for i in range(6):
-        total = physics.given[i] * scratch.acceleration[i]
-        for j in range(6):
-            total += physics.body.mass_inverse[i, j] * force[j]
-        rate[4 + i] = total
-    slope_by_state(physics, state, scratch.rps, scratch.load, scratch)
+    """Write the rates of a state and of its sensitivities into the first of the stages."""
+    rate, slopes = scratch.stage[0], scratch.stages[0]
+    _write_rate(physics, state, scratch, rate)
+    slope_by_state(physics, state, scratch)
     slope_by_parameters(physics, terms, state, rate[4:10], scratch)
     a, b = scratch.by_state, scratch.by_column
     columns = sensitivity.shape[1]

@@ -180,7 +180,6 @@ class Sensors(NamedTuple):
     gate: float
     """Square of the sigmas beyond which a measurement is not used."""
     altitude_age_s: float
-    relief_memory_s: float
 
 
 class SensorSuite(NamedTuple):
@@ -205,8 +204,6 @@ class SensorSuite(NamedTuple):
     """The point whose altitude is reported: the left port's outer glass."""
     altitude_age_s: float = 2.0
     """An altitude whose last ping is older is not reported."""
-    relief_memory_s: float = 10.0
-    """Time over which the beams' spread is averaged; their own footprint at survey speed."""
 
     def pack(self, hull: Hull = POINT, tick_s: float = 0.05) -> Sensors:
         """For compiled code.
@@ -240,7 +237,6 @@ class SensorSuite(NamedTuple):
             current_correlation_s=self.current_correlation_s,
             gate=self.gate_sigmas**2,
             altitude_age_s=self.altitude_age_s,
-            relief_memory_s=self.relief_memory_s,
         )
 
     def _check(self) -> None:
@@ -264,7 +260,7 @@ _POSITIVE = {
     "dvl": ("beam_noise_mps", "water_noise_mps", "range_noise_m"),
     "gps": ("noise_m", "bias_correlation_s"),
     "usbl": ("noise_m",),
-    "": ("current_correlation_s", "gate_sigmas", "relief_memory_s"),
+    "": ("current_correlation_s", "gate_sigmas"),
 }
 """Numbers of each instrument, and of the suite, that must be greater than 0."""
 

@@ -56,6 +56,8 @@ LOG_SIGMA, LOG_RANGE, LOG_USED, LOG_REJECTED, LOG_CLEARANCE = 13, 20, 24, 30, 36
 _MIN_SPREAD = 0.01
 """Least determinant of the scatter of the ends over its squared trace: 1/4 for a square, 0.19 for
 three corners."""
+_RELIEF_MEMORY_S = 10.0
+"""Time over which the beams' spread is averaged; their own footprint at survey speed."""
 
 
 @kernel
@@ -223,7 +225,7 @@ def _hear_floor(time_s: float, used: int, nav: NavigationState, suite: Sensors) 
     # Of the plane's depth below the point, by that of a beam's end.
     leverage = 1.0 / count + (cee * n * n - 2.0 * cne * n * e + cnn * e * e) / determinant
 
-    share = suite.dvl_every * suite.tick_s / suite.relief_memory_s
+    share = suite.dvl_every * suite.tick_s / _RELIEF_MEMORY_S
     share = max(1.0 / (memory[slot.RELIEF_PINGS] + 1.0), share)
     freedom = count - 3.0 + 2.0 * (1.0 - share) * (1.0 - share)
     if freedom > 0.0:

@@ -161,19 +161,10 @@ class ThrustWatch:
         self._white, self._constant = self._minimum.copy(), self._minimum / _MEMORY
         self._slow, self._before, self._lagged, self._next = (np.zeros(6) for _ in range(4))
         self._learned = 0
-        self._sums, self._scores, self._information = (np.zeros(count) for _ in range(3))
+        self.sums, self._scores, self._information = (np.zeros(count) for _ in range(3))
         self._gone = np.zeros(count, dtype=np.bool_)
-        self._alarm = math.log(FALSE_ALARM_H * 3600.0 / WATCHED_S * count)
-
-    @property
-    def sums(self) -> Array:
-        """(n,) cumulative sums, which are an alarm above `alarm`."""
-        return self._sums.copy()
-
-    @property
-    def alarm(self) -> float:
-        """The sum that is an alarm."""
-        return self._alarm
+        # Cumulative sums by thruster; one above this is an alarm.
+        self.alarm = math.log(FALSE_ALARM_H * 3600.0 / WATCHED_S * count)
 
     def known_gone(self, thruster: str) -> None:
         """Take a thruster for lost from now on, by whatever showed it."""
@@ -192,16 +183,16 @@ class ThrustWatch:
         residual, missing, doubt = self._residuals(navigated, rps)
         if self._learned >= _FIRST:
             self._add_up(residual - self._slow, missing, doubt)
-        order = np.argsort(self._sums)
+        order = np.argsort(self.sums)
         best = int(order[-1])
-        other = float(self._sums[order[-2]]) if len(order) > 1 else 0.0
+        other = float(self.sums[order[-2]]) if len(order) > 1 else 0.0
         # What looks like a failure is not learned as noise.
-        if self._sums[best] < 0.5 * self._alarm:
+        if self.sums[best] < 0.5 * self.alarm:
             self._learn(residual)
-        if self._sums[best] < max(self._alarm, other + _APART):
+        if self.sums[best] < max(self.alarm, other + _APART):
             return []
         share = self._scores[best] / self._information[best]
-        self._sums[:], self._scores[:], self._information[:] = 0.0, 0.0, 0.0
+        self.sums[:], self._scores[:], self._information[:] = 0.0, 0.0, 0.0
         if share > _GREATEST_SHARE:
             self._learn(residual)
             return []
@@ -261,11 +252,11 @@ class ThrustWatch:
                 continue
             score = product(thrust[:, i], -rest)
             information = product(thrust[:, i], thrust[:, i])
-            self._sums[i] += score - 0.5 * information
+            self.sums[i] += score - 0.5 * information
             self._scores[i] += score
             self._information[i] += information
-            if self._sums[i] <= 0.0:
-                self._sums[i] = self._scores[i] = self._information[i] = 0.0
+            if self.sums[i] <= 0.0:
+                self.sums[i] = self._scores[i] = self._information[i] = 0.0
 
     def _learn(self, residual: Array) -> None:
         """Follow the slow force, and the size of the noise about it."""

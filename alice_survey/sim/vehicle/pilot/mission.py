@@ -48,7 +48,6 @@ After the public sources of ArduPilot (`ArduSub/mode_auto.cpp`, `commands_logic.
 """
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -72,6 +71,7 @@ from alice_survey.sim.vehicle.pilot.steering import (
     surge_at,
 )
 from alice_survey.sim.vehicle.rotations import wrap_angle
+from alice_survey.sim.vehicle.steady import bisect
 
 (
     KIND, START_N, START_E, END_N, END_E, HEADING, BY_DEPTH, BY_ALTITUDE, DEPTH, ALTITUDE, SPEED,
@@ -98,27 +98,19 @@ _SLOW = 0.1
 """Share of the greatest speed below which the heading is not corrected."""
 _TINY_S = 1e-9
 
-ARDUSUB_SETTINGS = 4
-
-
-class ArduSubSettings(NamedTuple):
-    """Parameters of ArduSub, with its defaults."""
-
-    accel_mps2: float = 2.5
-    """`WPNAV_ACCEL`, there in cm/s^2."""
-    jerk_mps3: float = 1.0
-    """`WPNAV_JERK`"""
-    position_p: float = 1.0
-    """`PSC_POSXY_P`"""
-    xtrack_limit_rad: float = math.radians(45.0)
-    """`XTRACK_ANG_LIM`, there in degrees."""
-
-
-_ACCEL, _JERK, _POSITION_P, _XTRACK = range(ARDUSUB_SETTINGS)
+# Parameters of ArduSub, at its defaults.
+_ACCEL_MPS2 = 2.5
+"""`WPNAV_ACCEL`, there in cm/s^2."""
+_JERK_MPS3 = 1.0
+"""`WPNAV_JERK`"""
+_POSITION_P = 1.0
+"""`PSC_POSXY_P`"""
+_XTRACK_RAD = math.radians(45.0)
+"""`XTRACK_ANG_LIM`, there in degrees."""
 
 
 @kernel
-def to_waypoint(step: Array, heave_m: float, settings: Array, tick: Tick) -> bool:
+def to_waypoint(step: Array, heave_m: float, tick: Tick) -> bool:
     """Fly to a way-point for a tick; return whether it is done. Arguments as of `manoeuvre`."""
     dt_s, estimate, pilot = tick.dt_s, tick.estimate, tick.pilot
     memory, point, now = pilot.memory, pilot.point, estimate[vector.HEADING]
@@ -127,7 +119,7 @@ def to_waypoint(step: Array, heave_m: float, settings: Array, tick: Tick) -> boo
     course = math.atan2(de, dn) if length > 1e-6 else now
     s, c = math.sin(course), math.cos(course)
     speed = max(step[SPEED], MIN_SPEED_MPS)
-    acceleration = min(settings[_ACCEL], 0.5 * math.sqrt(speed * settings[_JERK]))
+    acceleration = min(_ACCEL_MPS2, 0.5 * math.sqrt(speed * _JERK_MPS3))
     # How fast the target's time runs.
     moves, pace = memory[slot.RAMP_SPEED], 1.0
     if moves > 0.0:
@@ -136,9 +128,9 @@ def to_waypoint(step: Array, heave_m: float, settings: Array, tick: Tick) -> boo
         cosine = c * math.cos(now) + s * math.sin(now)
         sine = s * math.cos(now) - c * math.sin(now)
         track_speed = point[slot.SURGE_SPEED] * cosine + point[slot.SWAY_SPEED] * sine
-        behind = settings[_POSITION_P] * (memory[slot.RAMP] - done)
+        behind = _POSITION_P * (memory[slot.RAMP] - done)
         pace = min(max(_SPARE + (track_speed - behind) / moves, 0.0), 1.0)
-    time_s = settings[_ACCEL] / settings[_JERK]
+    time_s = _ACCEL_MPS2 / _JERK_MPS3
     memory[slot.TRACK_PACE] += (pace - memory[slot.TRACK_PACE]) * min(dt_s / time_s, 1.0)
     quicken, dt = 0.0, memory[slot.TRACK_PACE] * dt_s
     if dt > _TINY_S:
@@ -154,11 +146,11 @@ def to_waypoint(step: Array, heave_m: float, settings: Array, tick: Tick) -> boo
     heading = step[HEADING]
     if not math.isfinite(heading):
         heading = course
-        target_n = moves * c + settings[_POSITION_P] * off_n
-        target_e = moves * s + settings[_POSITION_P] * off_e
+        target_n = moves * c + _POSITION_P * off_n
+        target_e = moves * s + _POSITION_P * off_e
         if length > 1e-6 and math.hypot(target_n, target_e) >= _SLOW * speed:
             error = wrap_angle(math.atan2(target_e, target_n) - course)
-            heading += clamp(error, settings[_XTRACK])
+            heading += clamp(error, _XTRACK_RAD)
     head_for(heading, 0.0, 0.0, tick)
     reference = StopReference(north, east, course, moves, quicken, heading, 0.0, 0.0, at, False)
     keep_place(reference, tick)
@@ -186,8 +178,6 @@ _FASTEST_SLIP = 3.0
 _ANCHOR_RAD = 0.5
 """Heading error beyond which an anchored vehicle does not surge."""
 
-COLA2_SETTINGS = 9
-
 
 class Cola2Settings(NamedTuple):
     """Parameters of COLA2's pilot, with its defaults."""
@@ -210,12 +200,6 @@ class Cola2Settings(NamedTuple):
     """`~anchor/min_surge_velocity`"""
     anchor_max_mps: float = 0.3
     """`~anchor/max_surge_velocity`"""
-
-
-(
-    _DELTA, _TOLERANCE_Z, _RAMP, _MAX_SURGE, _MIN_SURGE,
-    _ANCHOR_KP, _ANCHOR_RADIUS, _ANCHOR_MIN, _ANCHOR_MAX,
-) = range(COLA2_SETTINGS)  # fmt: skip
 
 
 def steady_drift(current_mps: float, speed_mps: float) -> float:
@@ -246,15 +230,12 @@ def circling_m(gains: Gains, speed_mps: float) -> float:
         gains: of the vehicle.
         speed_mps: that the mission states.
     """
-    low, high = 0.0, _YAW_STOP_RAD
-    while high - low > 1e-6:
-        middle = 0.5 * (low + high)
-        surge, sway, _ = _circling(gains, speed_mps, middle)
-        if middle + math.atan2(abs(sway), surge) > 0.5 * math.pi:
-            high = middle
-        else:
-            low = middle
-    surge, sway, turn = _circling(gains, speed_mps, low)
+
+    def within(error_rad: float) -> bool:
+        surge, sway, _ = _circling(gains, speed_mps, error_rad)
+        return error_rad + math.atan2(abs(sway), surge) <= 0.5 * math.pi
+
+    surge, sway, turn = _circling(gains, speed_mps, bisect(within, 0.0, _YAW_STOP_RAD, 1e-6))
     return math.hypot(surge, sway) / turn
 
 
@@ -284,21 +265,18 @@ def _circling(gains: Gains, speed_mps: float, error_rad: float) -> tuple[float, 
     """Surge, steady sway and yaw rate of a section's law at a heading error."""
     share = (_YAW_STOP_RAD - error_rad) / (_YAW_STOP_RAD - _YAW_FREE_RAD)
     surge, turn = speed_mps * min(max(share, 0.0), 1.0), yaw_rad_s(gains, error_rad)
-    low, high = -_FASTEST_SLIP * speed_mps, 0.0
-    while high - low > 1e-6 * speed_mps:
-        middle = 0.5 * (low + high)
-        motion, force = np.array([surge, middle, 0.0, 0.0, 0.0, turn]), np.zeros(6)
+
+    def outwards(sway: float) -> bool:
+        motion, force = np.array([surge, sway, 0.0, 0.0, 0.0, turn]), np.zeros(6)
         add_damping(gains.body, motion, force)
         add_coriolis(gains.body, motion, force)
-        if force[1] > 0.0:
-            low = middle
-        else:
-            high = middle
-    return surge, 0.5 * (low + high), turn
+        return bool(force[1] > 0.0)
+
+    return surge, bisect(outwards, -_FASTEST_SLIP * speed_mps, 0.0, 1e-6 * speed_mps), turn
 
 
 @kernel
-def timeout_s(step: Array, distance_m: float, heave_m: float, settings: Array) -> float:
+def timeout_s(step: Array, distance_m: float, heave_m: float, settings: Cola2Settings) -> float:
     """How long the captain lets a manoeuvre take.
 
     Args:
@@ -307,14 +285,14 @@ def timeout_s(step: Array, distance_m: float, heave_m: float, settings: Array) -
         heave_m: to its depth.
         settings: of the law.
     """
-    speed = max(min(step[SPEED], settings[_MAX_SURGE]), 1e-3)
+    speed = max(min(step[SPEED], settings.max_surge_mps), 1e-3)
     heave = abs(heave_m) if step[BY_DEPTH] > 0.0 else 0.0
     heave += _DVL_RANGE_M if step[BY_ALTITUDE] > 0.0 else 0.0
     return float(2.0 * max(math.sqrt(2.0) * distance_m / speed, heave / _HEAVE_MPS) + _SPARE_S)
 
 
 @kernel
-def manoeuvre(step: Array, heave_m: float, settings: Array, tick: Tick) -> bool:
+def manoeuvre(step: Array, heave_m: float, settings: Cola2Settings, tick: Tick) -> bool:
     """Fly a goto, section or park for a tick; return whether it is done.
 
     Args:
@@ -333,12 +311,12 @@ def manoeuvre(step: Array, heave_m: float, settings: Array, tick: Tick) -> bool:
         to_start = math.hypot(memory[slot.FROM_N] - north, memory[slot.FROM_E] - east)
         heading = aim(
             north, east, memory[slot.FROM_N], memory[slot.FROM_E], step[END_N], step[END_E],
-            settings[_DELTA],
+            settings.delta_m,
         )  # fmt: skip
-        speed = min(step[SPEED], settings[_MAX_SURGE])
-        near = min(to_end, to_start) / max(settings[_RAMP], 1e-9)
+        speed = min(step[SPEED], settings.max_surge_mps)
+        near = min(to_end, to_start) / max(settings.distance_to_max_velocity_m, 1e-9)
         if 0.0 < near < 1.0:
-            speed -= (speed - min(settings[_MIN_SURGE], speed)) * (1.0 - near)
+            speed -= (speed - min(settings.min_surge_mps, speed)) * (1.0 - near)
         if to_end < _STOPS * tolerance:
             speed = 0.0
         if to_end < _STRAIGHT * tolerance:
@@ -348,7 +326,7 @@ def manoeuvre(step: Array, heave_m: float, settings: Array, tick: Tick) -> bool:
         head_for(heading, 0.0, 0.0, tick)
         surge_at(speed, tick)
         pilot.report[slot.BY_SWAY] = 0.0
-        done = to_end < tolerance and abs(heave_m) < settings[_TOLERANCE_Z]
+        done = to_end < tolerance and abs(heave_m) < settings.tolerance_z_m
         done = done or memory[slot.STEP_S] > memory[slot.TIMEOUT_S]
         if done and parks:
             memory[slot.KEEPS] = 1.0
@@ -372,8 +350,8 @@ def manoeuvre(step: Array, heave_m: float, settings: Array, tick: Tick) -> bool:
         dn = step[END_N] - pilot.point[slot.POINT_NORTH]
         de = step[END_E] - pilot.point[slot.POINT_EAST]
         heading = math.atan2(de, dn)
-        speed = settings[_ANCHOR_KP] * (math.hypot(dn, de) - settings[_ANCHOR_RADIUS])
-        speed = min(max(speed, settings[_ANCHOR_MIN]), settings[_ANCHOR_MAX])
+        speed = settings.anchor_kp * (math.hypot(dn, de) - settings.anchor_radius_m)
+        speed = min(max(speed, settings.anchor_min_mps), settings.anchor_max_mps)
         if abs(wrap_angle(heading - estimate[vector.HEADING])) > _ANCHOR_RAD:
             speed = 0.0
         head_for(heading, 0.0, 0.0, tick)
@@ -418,26 +396,12 @@ class PilotMission(NamedTuple):
     law: int
     steps: Array
     """(M, COLUMNS), see above."""
-    settings: Array
-    """Of the law: `COLA2_SETTINGS` or `ARDUSUB_SETTINGS` values."""
+    cola2: Cola2Settings = Cola2Settings()
+    """Of that law."""
 
 
-_SETTINGS = max(COLA2_SETTINGS, ARDUSUB_SETTINGS)
-NO_MISSION = PilotMission(NO_LAW, np.zeros((0, COLUMNS)), np.zeros(_SETTINGS))
+NO_MISSION = PilotMission(NO_LAW, np.zeros((0, COLUMNS)))
 """The path is followed by our own guidance."""
-
-
-def mission_of(law: int, steps: Array, settings: Sequence[float]) -> PilotMission:
-    """A mission.
-
-    Args:
-        law: COLA2 or ARDUSUB.
-        steps: (M, COLUMNS)
-        settings: of the law.
-    """
-    padded = np.zeros(_SETTINGS)
-    padded[: len(settings)] = settings
-    return PilotMission(law, np.ascontiguousarray(steps, np.float64), padded)
 
 
 @kernel
@@ -483,7 +447,7 @@ def fly_mission(mission: PilotMission, tick: Tick) -> bool:
                 step,
                 math.hypot(step[END_N] - north, step[END_E] - east),
                 target - estimate[vector.DEPTH],
-                mission.settings,
+                mission.cola2,
             )
     memory[slot.STEP_S] += dt_s
     sink_to(target, slope, tick)
@@ -502,9 +466,9 @@ def fly_mission(mission: PilotMission, tick: Tick) -> bool:
 
     away = target - estimate[vector.DEPTH]
     if mission.law == COLA2:
-        done = manoeuvre(step, away, mission.settings, tick)
+        done = manoeuvre(step, away, mission.cola2, tick)
     else:
-        done = to_waypoint(step, away, mission.settings, tick)
+        done = to_waypoint(step, away, tick)
     last = leg + 1 == mission.steps.shape[0]
     if heave and last and estimate[vector.DEPTH] < guidance.surface_m and step[DEPTH] == 0.0:
         done = True

@@ -12,13 +12,11 @@ from alice_survey.sim.vehicle.pilot.gains import gains_for
 from alice_survey.sim.vehicle.pilot.mission import (
     BY_ALTITUDE,
     BY_DEPTH,
-    COLA2,
     COLUMNS,
     SPEED,
     Cola2Settings,
     aim,
     circling_m,
-    mission_of,
     steady_drift,
     timeout_s,
 )
@@ -90,7 +88,7 @@ def test_the_circle_is_that_of_a_simulated_vehicle(
 def test_the_captain_waits_twice_the_way_and_half_a_minute() -> None:
     row = np.zeros(COLUMNS)
     row[[SPEED, BY_DEPTH]] = 0.2, 1.0
-    settings = mission_of(COLA2, row[None], Cola2Settings()).settings
+    settings = Cola2Settings()
     assert timeout_s(row, 10.0, 1.0, settings) == pytest.approx(30 + 2 * math.sqrt(2) * 10 / 0.2)
     assert timeout_s(row, 1.0, -12.0, settings) == pytest.approx(30 + 2 * 12 / 0.3)
     row[[BY_DEPTH, BY_ALTITUDE]] = 0.0, 1.0  # by altitude: as if through the range of a DVL

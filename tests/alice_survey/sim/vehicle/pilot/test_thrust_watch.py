@@ -80,7 +80,7 @@ def judged(
         found += watch.judge(
             end_s, NavigatedStretch(flight[0][part], current, 0.05), flight[1][part]
         )
-        sums.append(watch.sums)
+        sums.append(watch.sums.copy())
     return found, sums
 
 
