@@ -19,8 +19,6 @@ pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
 SIZES = {"desk": (1280, 900), "phone": (400, 800)}
 MAP, MESH = "#map-canvas", "#mesh-canvas"
 RESTS = "() => !document.querySelector('.leaflet-zoom-anim, .leaflet-pan-anim')"
-A4_PX = round(180 / 25.4 * 96)
-"""Between the margins of the printed page."""
 
 
 @pytest.fixture(scope="module")
@@ -213,33 +211,6 @@ def test_no_fault_that_axe_finds(page: Any) -> None:
     page.mouse.click(*place_on_page(page, 0.6, -0.533))  # with a popup open
     is_accessible(page)
     page.keyboard.press("Escape")
-
-
-def test_paper_shows_all(page: Any) -> None:
-    size = page.viewport_size
-    page.set_viewport_size({"width": A4_PX, "height": 1000})
-    page.emulate_media(media="print")
-    over = page.evaluate(
-        """(width) => [...document.querySelectorAll("body *")]
-          .filter((e) => e.checkVisibility() && !e.closest("svg > *, .skip"))
-          .filter((e) => e.getBoundingClientRect().right > width + 0.5
-            || (getComputedStyle(e).overflowX !== "visible" && e.scrollWidth > e.clientWidth + 1))
-          .map((e) => e.outerHTML.slice(0, 120))""",
-        A4_PX,
-    )
-    stills = page.evaluate(
-        "[...document.querySelectorAll('.still img')]"
-        ".map((e) => e.checkVisibility() && e.getBoundingClientRect().height)"
-    )
-    moving = page.evaluate(
-        "[...document.querySelectorAll('.live, nav')].filter((e) => e.checkVisibility()).length"
-    )
-    page.emulate_media(media="screen")
-    page.set_viewport_size(size)
-    assert over == []
-    assert len(stills) == 2
-    assert all(height > 200 for height in stills)
-    assert moving == 0
 
 
 def test_no_complaint_and_no_network(opened: tuple[Any, Heard], file: Path) -> None:

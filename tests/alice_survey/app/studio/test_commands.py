@@ -26,6 +26,7 @@ def test_the_command_line_takes_what_is_written(name: str, tmp_path: Path) -> No
         "formats": ["wpl", "cola2"],
     }  # fmt: skip
     given = {field: examples.get(field, str(folder)) for field in OFFERED[name].offered}
+    command_of(name, {}, tmp_path)  # nothing is required
     command = command_of(name, given, tmp_path)
     words = command.words()
     assert words[: len(name.split())] == name.split()
@@ -42,13 +43,6 @@ def test_every_stage_has_a_command_that_makes_it() -> None:
     assert made == {stage.name for stage in STAGES}
     for stage in STAGES:
         assert stage.name in OFFERED[stage.command].stages()
-
-
-@pytest.mark.parametrize("name", OFFERED)
-def test_nothing_is_required_but_what_a_command_cannot_do_without(
-    name: str, tmp_path: Path
-) -> None:
-    command_of(name, {}, tmp_path)
 
 
 @pytest.mark.parametrize(

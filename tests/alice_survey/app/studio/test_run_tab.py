@@ -79,9 +79,7 @@ def test_a_fault_shows_its_line_and_the_way_on(server: Server) -> None:
     assert (last["state"], last["line"]) == (
         "failed", "no plan: run 'alice-survey plan -w reef' first",
     )  # fmt: skip
-    assert last["ways"] == [
-        {"command": "alice-survey plan -w reef", "name": "plan", "title": "Plan the survey"}
-    ]
+    assert [(way["name"], way["title"]) for way in last["ways"]] == [("plan", "Plan the survey")]
 
 
 @pytest.mark.parametrize(
@@ -141,10 +139,8 @@ def test_a_survey_is_begun_from_its_place_and_depth(server: Server, tmp_path: Pa
         assert not (tmp_path / "reef" / "survey.toml").exists()
     assert call(server, "/api/start/survey", values).status == 200
     made = load_config(tmp_path / "reef" / "survey.toml")
-    assert (made.name, made.area.latitude_deg, made.area.longitude_deg) == ("Reef 2", 43.05, 5.92)
-    assert (made.area.seafloor_depth_m, made.camera.focal_mm) == (22.5, 25.0)
-    assert made.vehicle.name == "alice"
-    assert (made.area.length_m, made.area.width_m) == (8.0, 6.0)
+    own = {"name": made.name, "focal_mm": made.camera.focal_mm}
+    assert vars(made.area) | own | values == vars(made.area) | own
     assert (made.imaging.scale, made.reconstruct.max_features) == (1, 8000)
     assert call(server, "/api/start/survey", values).status == 409  # there is one now
     assert load_config(tmp_path / "reef" / "survey.toml") == made
@@ -182,15 +178,6 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     navigation(home / "dive" / "nav.csv", 60)
     monkeypatch.setattr(start_page, "Folders", lambda: Folders(home))
     return home
-
-
-def test_folders_are_listed_below_the_home(home: Path, server: Server) -> None:
-    server.studio.publish("x", 1)  # the endpoints were made with the real home
-    reply = call(server, "/api/start/folders", {"path": str(home / "dive"), "typed": True})
-    assert [one["name"] for one in reply.json["inside"]] == ["left", "right"]
-    assert reply.json["files"] == [str(home / "dive" / "nav.csv")]
-    for body in ({"path": "/", "typed": False}, {"path": str(home / "none"), "typed": True}):
-        assert call(server, "/api/start/folders", body).status == 400
 
 
 def test_a_preview_tells_a_rig_from_one_camera(home: Path, server: Server) -> None:

@@ -191,12 +191,9 @@ def test_every_answer_is_locked_in(server: Server) -> None:
             assert headers["x-content-type-options"] == "nosniff"
             assert headers["cross-origin-resource-policy"] == "same-origin"
             assert not any(name.startswith("access-control") for name in headers)
-
-
-def test_a_page_of_the_workspace_reaches_neither_network_nor_server(server: Server) -> None:
-    reply = ask(server, "/files/dense/%3Cb%3E.html")
-    policy = reply.headers["content-security-policy"]
-    assert reply.status == 200
+    page = ask(server, "/files/dense/%3Cb%3E.html")  # which could run scripts
+    policy = page.headers["content-security-policy"]
+    assert page.status == 200
     assert "sandbox allow-scripts" in policy and "allow-same-origin" not in policy
     assert "connect-src" not in policy and "default-src 'none'" in policy
     assert "http" not in policy and "'self'" not in policy
@@ -218,12 +215,7 @@ def test_kinds_of_files(server: Server, folder: Path, name: str, kind: str) -> N
     assert (reply.status, reply.headers["content-type"]) == (200, kind)
     assert reply.body == (folder / name).read_bytes()
     head = ask(server, f"/files/{name}", method="HEAD")
-    assert head.body == b""
-    assert head.headers["content-length"] == str(len(reply.body))
-    ignored = ("date", "connection")
-    assert {k: v for k, v in head.headers.items() if k not in ignored} == {
-        k: v for k, v in reply.headers.items() if k not in ignored
-    }
+    assert (head.body, head.headers["content-length"]) == (b"", str(len(reply.body)))
 
 
 @given(first=st.integers(0, 1_100_000), last=st.integers(0, 1_100_000), suffix=st.booleans())
@@ -249,29 +241,11 @@ def test_ranges_are_the_files_bytes(
         assert reply.headers["content-length"] == str(end - start)
 
 
-def test_edges_of_ranges(server: Server, folder: Path) -> None:
-    content = (folder / "mosaic" / "mosaic.tif").read_bytes()
-    for text, status, body in (
-        ("bytes=0-0", 206, content[:1]), ("bytes=5-", 206, content[5:]),
-        ("bytes=-1", 206, content[-1:]), ("bytes=-0", 416, b""),
-        (f"bytes={len(content)}-", 416, b""), (f"bytes=0-{10**17}", 206, content),
-    ):  # fmt: skip
-        reply = ask(server, MOSAIC, {"Range": text})
-        assert (text, reply.status, reply.body == body) == (text, status, True)
-    assert ask(server, "/files/dense/empty.csv", {"Range": "bytes=0-"}).status == 416
-    for text in ("items=0-1", "bytes=a-b", "bytes=-"):
-        assert ask(server, MOSAIC, {"Range": text}).status in (200, 400)
-
-
 def test_what_is_known_is_not_sent_again(server: Server) -> None:
-    known = ask(server, MOSAIC).headers
-    tag, part = known["etag"], {"Range": "bytes=3-9"}
-    assert known["last-modified"].endswith(" GMT")
+    tag, part = ask(server, MOSAIC).headers["etag"], {"Range": "bytes=3-9"}
     for headers, status in (
-        (part | {"If-Range": tag}, 206), (part | {"If-Range": f"W/{tag}"}, 200),
-        (part | {"If-Range": '"other"'}, 200), (part | {"If-Range": known["last-modified"]}, 206),
-        ({"If-None-Match": tag}, 304), ({"If-None-Match": f'"a", W/{tag}'}, 304),
-        ({"If-None-Match": '"a"'}, 200),
+        (part | {"If-Range": tag}, 206), (part | {"If-Range": '"other"'}, 200),
+        ({"If-None-Match": f'"a", W/{tag}'}, 304), ({"If-None-Match": '"a"'}, 200),
     ):  # fmt: skip
         assert (headers, ask(server, MOSAIC, headers).status) == (headers, status)
     tile = ask(server, "/tiles/mosaic/0/0/0.webp")

@@ -1,5 +1,7 @@
 """The studio's shell in Chromium: its map loads tiles and zooms, layers are chosen, tabs turn."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -56,13 +58,25 @@ def all_loaded(page: Any, level: int) -> list[tuple[str, int]]:
     return tiles(page)
 
 
-def test_the_map_loads_tiles_and_zooms(folder: Path) -> None:
+@contextmanager
+def opened(folder: Path, **options: Any) -> Iterator[tuple[Any, Heard]]:
+    """The page, which complains of nothing and asks no other server."""
     with serving(folder) as server, chromium() as browser:
-        page = browser.new_page(viewport={"width": 1280, "height": 900}, reduced_motion="reduce")
+        page = browser.new_page(reduced_motion="reduce", **options)
         heard = Heard()
         heard.listen(page)
         page.goto(server.address)
         page.wait_for_selector("body[data-ready]", timeout=60_000)
+        yield page, heard
+        assert heard.complaints == []
+        assert {url.split("/")[2] for url in heard.requests if url.startswith("http")} == {
+            server.url.split("/")[2]
+        }
+        page.close()
+
+
+def test_the_map_loads_tiles_and_zooms(folder: Path) -> None:
+    with opened(folder, viewport={"width": 1280, "height": 900}) as (page, _):
         assert "token" not in page.url
         first = int(page.locator(MAP).get_attribute("data-level"))
         shown = all_loaded(page, first)
@@ -86,23 +100,12 @@ def test_the_map_loads_tiles_and_zooms(folder: Path) -> None:
         for name in ("Mosaic", "Sigma of height", "Height") * 3:  # faster than tiles come
             page.get_by_label(name, exact=True).check()
         page.get_by_role("button", name="Show all").click()
-        assert heard.complaints == []
-        assert {url.split("/")[2] for url in heard.requests if url.startswith("http")} == {
-            server.url.split("/")[2]
-        }
-        page.close()
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (400, "light"), (1280, "dark")])
 def test_every_tab_is_accessible(folder: Path, width: int, scheme: str) -> None:
-    with serving(folder) as server, chromium() as browser:
-        page = browser.new_page(
-            viewport={"width": width, "height": 900}, reduced_motion="reduce", color_scheme=scheme
-        )
-        heard = Heard()
-        heard.listen(page)
-        page.goto(server.address)
-        page.wait_for_selector("body[data-ready]", timeout=60_000)
+    size = {"width": width, "height": 900}
+    with opened(folder, viewport=size, color_scheme=scheme) as (page, _):
         names = page.locator("#tabs [role=tab]").all_inner_texts()
         for name in names:
             page.get_by_role("tab", name=name, exact=True).click()
@@ -113,5 +116,3 @@ def test_every_tab_is_accessible(folder: Path, width: int, scheme: str) -> None:
         for name in names[1:]:
             page.keyboard.press("ArrowRight")
             assert page.locator("[role=tab][aria-selected=true]").inner_text() == name
-        assert heard.complaints == []
-        page.close()
