@@ -29,11 +29,6 @@ pytestmark = pytest.mark.slow
 FOLDERS = tuple(stage.folder for stage in STAGES)
 
 
-@pytest.fixture
-def undisturbed(small_survey: Path) -> Path:
-    return small_survey
-
-
 def results(workspace: Path) -> dict[str, bytes]:
     """Every file of the finished stages but SQLite files, and those that state how long it took."""
     return {
@@ -46,12 +41,12 @@ def results(workspace: Path) -> dict[str, bytes]:
 
 
 def test_a_sound_survey_has_no_weak_place_unless_more_is_asked_for(
-    undisturbed: Path, tmp_path: Path
+    small_survey: Path, tmp_path: Path
 ) -> None:
-    config = load_config(undisturbed / "survey.toml")
+    config = load_config(small_survey / "survey.toml")
 
-    text, sound = revisit_report(undisturbed, config, SERIAL, out=tmp_path / "sound")
-    _, asked = revisit_report(undisturbed, config, SERIAL, sigma_mm=0.1, out=tmp_path / "asked")
+    text, sound = revisit_report(small_survey, config, SERIAL, out=tmp_path / "sound")
+    _, asked = revisit_report(small_survey, config, SERIAL, sigma_mm=0.1, out=tmp_path / "asked")
 
     assert sound["places"] == []
     assert "nothing is weak" in text
@@ -65,8 +60,8 @@ def test_a_sound_survey_has_no_weak_place_unless_more_is_asked_for(
         revisit_report(tmp_path, config, SERIAL)
 
 
-def test_every_stage_is_reported(undisturbed: Path) -> None:
-    lines = undisturbed.with_suffix(".jsonl").read_text().splitlines()
+def test_every_stage_is_reported(small_survey: Path) -> None:
+    lines = small_survey.with_suffix(".jsonl").read_text().splitlines()
     events = [json.loads(line) for line in lines]
     run = events[
         : 1 + next(i for i, event in enumerate(events) if event["event"] == "run_finished")
@@ -75,25 +70,21 @@ def test_every_stage_is_reported(undisturbed: Path) -> None:
     assert run[-1]["exit_code"] == 0
     for name in ("stage_started", "stage_finished"):
         assert [e["stage"] for e in run if e["event"] == name] == list(FOLDERS)
-    titles = [e["message"] for e in run if e["event"] == "stage_started"]
-    assert titles == [f"{name} ({n} of {len(FOLDERS)})" for n, name in enumerate(FOLDERS, 1)]
     for event in run:
         if event["event"] == "stage_finished":
-            record = json.loads((undisturbed / event["stage"] / "stage.json").read_text())
-            assert {key: record[key] for key in ("took_s", "cpu_s", "peak_mib")} == {
-                key: event[key] for key in ("took_s", "cpu_s", "peak_mib")
-            }
+            record = json.loads((small_survey / event["stage"] / "stage.json").read_text())
+            for key in ("took_s", "cpu_s", "peak_mib"):
+                assert record[key] == event[key]
             assert 50 < record["peak_mib"] < 8000
             assert 0.02 * record["took_s"] < record["cpu_s"] < 50 * record["took_s"]
             assert record["versions"]["pycolmap"]
-    begun = {e["step_number"]: e for e in run if e["event"] == "step_started"}
-    ended = {e["step_number"]: e for e in run if e["event"] == "step_finished"}
-    assert begun.keys() == ended.keys()
-    assert len(begun) > 20
-    for number, event in ended.items():
-        assert event["complete"]
-        assert event["step"] == begun[number]["step"]
-        assert event.get("done", 0) <= event.get("total", event.get("done", 0))
+    begun = {e["step_number"]: e["step"] for e in run if e["event"] == "step_started"}
+    ended = {e["step_number"]: e["step"] for e in run if e["event"] == "step_finished"}
+    assert begun == ended and len(begun) > 20
+    for event in run:
+        if event["event"] == "step_finished":
+            assert event["complete"]
+            assert event.get("done", 0) <= event.get("total", event.get("done", 0))
 
 
 KILLED = tuple(
@@ -119,12 +110,12 @@ def wait_for(
     return None
 
 
-def test_killed_again_and_again_it_ends_the_same(undisturbed: Path, tmp_path: Path) -> None:
+def test_killed_again_and_again_it_ends_the_same(small_survey: Path, tmp_path: Path) -> None:
     """At random times in every stage, once in most."""
     workspace = settings_in(tmp_path / "killed")
     events = workspace.with_suffix(".jsonl")
     took_s = {
-        stage: json.loads((undisturbed / stage / "stage.json").read_text())["took_s"]
+        stage: json.loads((small_survey / stage / "stage.json").read_text())["took_s"]
         for stage in FOLDERS
     }
     rng = np.random.default_rng(5)
@@ -148,7 +139,7 @@ def test_killed_again_and_again_it_ends_the_same(undisturbed: Path, tmp_path: Pa
     assert whole_before_kill < len(KILLED) - 4  # at least five fell into the work of their stage
     assert start(workspace, threads=1).wait() == 0
     assert not list(workspace.glob("*.partial"))
-    again, whole = results(workspace), results(undisturbed)
+    again, whole = results(workspace), results(small_survey)
     assert set(again) == set(whole)
     different = [name for name in whole if again[name] != whole[name]]
     assert not different
@@ -174,14 +165,14 @@ def reconstruct(
 
 
 def test_what_goes_wrong_half_way_is_reported_in_a_line_and_nothing_is_lost(
-    undisturbed: Path, tmp_path: Path
+    small_survey: Path, tmp_path: Path
 ) -> None:
     """A picture that goes, one that changes, and memory that runs out.
 
     The truth is not next to the pictures: in the end the reconstruction is the same without it.
     """
     workspace, events = tmp_path / "half", tmp_path / "half.jsonl"
-    shutil.copytree(undisturbed, workspace)
+    shutil.copytree(small_survey, workspace)
     made = ("mapping", "sparse", "dense", "mosaic", "mesh")
     for stage in (*made, "evaluation", "report", "calibration"):
         shutil.rmtree(workspace / stage)
@@ -211,22 +202,22 @@ def test_what_goes_wrong_half_way_is_reported_in_a_line_and_nothing_is_lost(
     assert line.startswith("error: memory ran out") and "\n" not in line, line
     run = reconstruct(workspace)
     assert (run.communicate()[1].strip(), run.returncode) == ("", 0)
-    again, whole = results(workspace), results(undisturbed)
+    again, whole = results(workspace), results(small_survey)
     different = [name for name in again if again[name] != whole[name]]
     assert {name.split("/")[0] for name in again} >= {*made, "calibration"}
     assert not different
 
 
-def test_more_threads_give_the_same_numbers(undisturbed: Path, tmp_path: Path) -> None:
+def test_more_threads_give_the_same_numbers(small_survey: Path, tmp_path: Path) -> None:
     workspace = tmp_path / "two"
-    shutil.copytree(undisturbed, workspace)
+    shutil.copytree(small_survey, workspace)
     for stage in FOLDERS[FOLDERS.index("mapping") :]:
         shutil.rmtree(workspace / stage)
     assert start(workspace, threads=2).wait() == 0
     for name in ("sparse/track.csv", "evaluation/cameras.csv"):
         one, two = (
             [row.split(",") for row in (w / name).read_text().splitlines()]
-            for w in (undisturbed, workspace)
+            for w in (small_survey, workspace)
         )
         assert len(one) == len(two)
         for a, b in zip(one, two, strict=True):
@@ -235,21 +226,14 @@ def test_more_threads_give_the_same_numbers(undisturbed: Path, tmp_path: Path) -
                     assert float(x) == pytest.approx(float(y), abs=1e-6)
                 except ValueError:
                     assert x == y
-    with (
-        rasterio.open(undisturbed / "dense" / "dem.tif") as a,
-        rasterio.open(workspace / "dense" / "dem.tif") as b,
-    ):
-        np.testing.assert_allclose(a.read(1), b.read(1), rtol=0, atol=1e-6)
-        assert a.transform == b.transform
-    with (
-        rasterio.open(undisturbed / "mosaic" / "mosaic.tif") as a,
-        rasterio.open(workspace / "mosaic" / "mosaic.tif") as b,
-    ):
-        np.testing.assert_array_equal(a.read(), b.read())
+    for name, atol in (("dense/dem.tif", 1e-6), ("mosaic/mosaic.tif", 0.0)):
+        with rasterio.open(small_survey / name) as a, rasterio.open(workspace / name) as b:
+            np.testing.assert_allclose(a.read(), b.read(), rtol=0, atol=atol)
+            assert a.transform == b.transform
 
 
-def test_a_second_run_does_nothing(undisturbed: Path) -> None:
-    before = {p: p.stat().st_mtime_ns for p in undisturbed.rglob("*") if p.name != ".lock"}
-    assert start(undisturbed, threads=1).wait() == 0
-    after = {p: p.stat().st_mtime_ns for p in undisturbed.rglob("*") if p.name != ".lock"}
+def test_a_second_run_does_nothing(small_survey: Path) -> None:
+    before = {p: p.stat().st_mtime_ns for p in small_survey.rglob("*") if p.name != ".lock"}
+    assert start(small_survey, threads=1).wait() == 0
+    after = {p: p.stat().st_mtime_ns for p in small_survey.rglob("*") if p.name != ".lock"}
     assert before == after

@@ -5,7 +5,6 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
 
@@ -22,16 +21,6 @@ FEW = (0, 1, 2, 3, 10, 11, 12)
 """Stations of a line of the tutorial's survey and of the one across it."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Run:
-    """What came of a page's commands."""
-
-    folder: Path
-    returncode: int
-    stdout: str
-    stderr: str
-
-
 class Made:
     """What takes long to make, made once and only on request."""
 
@@ -40,33 +29,25 @@ class Made:
         self._folder = folder
         self.run = cache(self._run)
 
-    def _run(self, page: str) -> Run:
-        """Type the commands of a page; others may look at what they made, not change it."""
+    def _run(self, page: str) -> tuple[Path, subprocess.CompletedProcess[str]]:
+        """Type the commands of a page; others may look at what they made, not change it.
+
+        Returns:
+            Where, and what came of it.
+        """
         folder = self._folder / page.removesuffix(".md").replace("/", "-")
         folder.mkdir()
         prepare = GIVEN.get(page)
         if prepare is not None:
             prepare(folder, self)
+        # A browser that does nothing.
+        path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
         ended = subprocess.run(
-            ["bash", "-euo", "pipefail", "-c", script_of(DOCS / page)],
-            cwd=folder,
-            env={
-                **os.environ,
-                "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
-                "COLUMNS": "120",
-                "BROWSER": "true",  # the command that does nothing
-            },
-            capture_output=True,
-            text=True,
-            timeout=MAX_S,
-            preexec_fn=_on_one_core,
-        )
-        return Run(
-            folder=folder,
-            returncode=ended.returncode,
-            stdout=ended.stdout,
-            stderr=ended.stderr,
-        )
+            ["bash", "-euo", "pipefail", "-c", script_of(DOCS / page)], cwd=folder,
+            env={**os.environ, "PATH": path, "COLUMNS": "120", "BROWSER": "true"},
+            capture_output=True, text=True, timeout=MAX_S, preexec_fn=_on_one_core,
+        )  # fmt: skip
+        return folder, ended
 
     def after(self, page: str) -> Path:
         """The folder that the commands of a page leave behind.
@@ -74,10 +55,10 @@ class Made:
         Raises:
             RuntimeError: they fail; the page's own test shows how.
         """
-        ran = self.run(page)
+        folder, ran = self.run(page)
         if ran.returncode != 0:
             raise RuntimeError(f"the commands of {page} fail")
-        return ran.folder
+        return folder
 
     @property
     def reef(self) -> Path:

@@ -11,14 +11,7 @@ import typer
 
 from alice_survey.app.cli.main import app
 from tests.docs.given import GIVEN, Made
-from tests.docs.pages import (
-    DOCS,
-    fences,
-    mentioned,
-    name_of,
-    pages,
-    script_of,
-)
+from tests.docs.pages import DOCS, fences, mentioned, name_of, pages, script_of
 
 LANGUAGES = {"bash", "text", "toml", "json", "python", "csv", "math"}
 """`bash` is run; `text` is what a program prints, or a form that stands for many commands."""
@@ -29,18 +22,11 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     return Made(tmp_path_factory.mktemp("made"))
 
 
-def with_commands() -> list[object]:
-    return [
-        pytest.param(page, id=name_of(page), marks=pytest.mark.xdist_group("docs"))
-        for page in pages()
-        if script_of(page)
-    ]
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("page", with_commands())
+@pytest.mark.xdist_group("docs")
+@pytest.mark.parametrize("page", [page for page in pages() if script_of(page)], ids=name_of)
 def test_the_commands_of_a_page_run(page: Path, made: Made) -> None:
-    ran = made.run(name_of(page))
+    _, ran = made.run(name_of(page))
     assert ran.returncode == 0, f"{ran.stdout[-3000:]}\n{ran.stderr[-3000:]}"
     assert "Traceback" not in ran.stderr
 

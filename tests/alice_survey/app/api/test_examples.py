@@ -8,10 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rasterio
-from rasterio.transform import Affine
 
 import alice_survey as alice
+from tests.alice_survey.app.report.tiny import write_raster
 
 NEEDS_A_MODEL = '"small'
 
@@ -28,34 +27,21 @@ def run(test: doctest.DocTest) -> str:
     return "".join(shown)
 
 
-@pytest.mark.parametrize("name", alice.__all__)
-def test_each_public_name_has_an_example(name: str) -> None:
-    assert any(test.name == name for test in examples_of(name))
+def needs_a_model(name: str) -> bool:
+    return any(NEEDS_A_MODEL in str(test.docstring) for test in examples_of(name))
 
 
-def quick_or_slow() -> list[object]:
-    return [
-        pytest.param(
-            name,
-            marks=pytest.mark.slow
-            if any(NEEDS_A_MODEL in str(test.docstring) for test in examples_of(name))
-            else (),
-        )
-        for name in alice.__all__
-    ]
-
-
-@pytest.mark.parametrize("name", quick_or_slow())
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=pytest.mark.slow if needs_a_model(n) else ()) for n in alice.__all__],
+)
 def test_examples_run(
-    name: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    request: pytest.FixtureRequest,
-    capfd: pytest.CaptureFixture[str],
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:
     monkeypatch.chdir(tmp_path)
     tests = examples_of(name)
-    if any(NEEDS_A_MODEL in str(test.docstring) for test in tests):
+    assert any(test.name == name for test in tests)
+    if needs_a_model(name):
         Path("small").symlink_to(request.getfixturevalue("small_survey"))
     assert [run(test) for test in tests] == [""] * len(tests)
 
@@ -107,15 +93,10 @@ def test_heights_are_looked_up_in_their_cells(small_survey: Path) -> None:
 
 def test_an_averaged_surface_stays_in_its_place(tmp_path: Path) -> None:
     """A plane of known slope, 301 x 203 cells, has the same heights when it is averaged."""
-    (tmp_path / "dense").mkdir()
     rows, columns = np.mgrid[:301, :203]
-    plane = (0.5 * rows - 0.25 * columns).astype(np.float32)
+    plane = (0.5 * rows - 0.25 * columns).astype(np.float32)[None]
     for name in ("dem", "sigma"):
-        with rasterio.open(
-            tmp_path / "dense" / f"{name}.tif", "w", driver="GTiff", dtype="float32", count=1,
-            width=203, height=301, nodata=np.nan, transform=Affine(0.1, 0, 7.0, 0, -0.1, 40.0),
-        ) as raster:  # fmt: skip
-            raster.write(plane, 1)
+        write_raster(tmp_path / "dense" / f"{name}.tif", plane, 0.1, (7.0, 40.0), nodata=np.nan)
     dem = alice.read_dem(tmp_path, max_cells=100)
     assert dem.height.shape == (75, 50)
     row, column = np.mgrid[:75, :50]

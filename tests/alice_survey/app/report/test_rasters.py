@@ -4,7 +4,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import rasterio
 from affine import Affine
 
 from alice_survey.app.report.held import Held
@@ -14,7 +13,7 @@ from alice_survey.app.studio.layers import Layers
 from alice_survey.core.products import MOSAIC
 from alice_survey.kit.document import PictureLayer
 from reconstruct.measure.surface import values_at
-from tests.alice_survey.app.report.tiny import COLUMNS, ROWS, tiny_workspace
+from tests.alice_survey.app.report.tiny import CELL_M, COLUMNS, ROWS, tiny_workspace, write_raster
 
 
 @pytest.fixture(scope="module")
@@ -75,13 +74,8 @@ def test_a_mosaic_too_large_is_shrunk(workspace: Path) -> None:
 
 @pytest.mark.parametrize("width", [3, 1000, 2719])
 def test_a_raster_that_fits_keeps_its_own_grid(width: int, tmp_path: Path) -> None:
-    grid = Affine(0.0018, 0.0, -2.3, 0.0, -0.0018, 4.1)
-    with rasterio.open(
-        tmp_path / "a.tif", "w", driver="GTiff", width=width, height=2, count=1, dtype="uint8",
-        transform=grid,
-    ) as raster:  # fmt: skip
-        raster.write(np.ones((1, 2, width), np.uint8))
-    assert read_shrunk(tmp_path / "a.tif", [1], 1e6)[1] == grid
+    path = write_raster(tmp_path / "a.tif", np.ones((1, 2, width), np.uint8), 0.0018, (-2.3, 4.1))
+    assert read_shrunk(path, [1], 1e6)[1] == Affine(0.0018, 0, -2.3, 0, -0.0018, 4.1)
 
 
 @pytest.mark.parametrize("columns", [COLUMNS, COLUMNS + 3])
@@ -89,11 +83,9 @@ def test_errors_of_an_earlier_surface_are_no_layer(columns: int, tmp_path: Path)
     """Nor a value under the cursor: they may have been evaluated over another plane."""
     workspace = tiny_workspace(tmp_path)
     shutil.copytree(workspace / "dense", workspace / "evaluation")
-    with rasterio.open(workspace / "dense" / "dem.tif") as dem:
-        profile = dem.profile | {"width": columns}
     errors = np.full((1, ROWS, columns), 0.001, np.float32)
-    with rasterio.open(workspace / "evaluation" / "error.tif", "w", **profile) as raster:
-        raster.write(errors)
+    path = workspace / "evaluation" / "error.tif"
+    write_raster(path, errors, CELL_M, (0.0, ROWS * CELL_M), nodata=np.nan, crs="EPSG:32636")
     is_current = columns == COLUMNS
     for layers in (
         picture_layers(Held.of(workspace)),

@@ -17,6 +17,7 @@ HOLE = (slice(100, 120), slice(0, 20))
 """Of the elevation model: 400 of 9600 cells."""
 SLOPE = 0.25
 """Rise to the east."""
+_SLOPE_DEG = np.degrees(np.arctan(SLOPE))
 SIGMA_M = 0.0005
 
 
@@ -70,12 +71,10 @@ def tiny_workspace(
         "match_sigma_px": 0.2, "pose_sigma": 0.0002, "vertical_datum": "sea surface",
         "cell": CELL_M,
     })  # fmt: skip
-    crs = "EPSG:32636" if placed else None
-    _write_rasters(folder / "dense", crs)
+    _write_rasters(folder, "EPSG:32636" if placed else None)
     write_json(
         folder / "mosaic" / "mosaic.json", {"pixel": 0.002, "width_px": 400, "height_px": 600}
     )
-    _write_mosaic(folder / "mosaic" / "mosaic.tif", crs)
     _write_footprints(folder / "mosaic", "m" if scaled else "units", placed=placed)
     return folder
 
@@ -128,38 +127,38 @@ def _write_footprints(folder: Path, unit: str, *, placed: bool) -> None:
         ]})  # fmt: skip
 
 
-def _profile(dtype: str, nodata: float | None, crs: str | None) -> dict[str, Any]:
-    return {
-        "driver": "GTiff", "width": COLUMNS, "height": ROWS, "count": 1, "dtype": dtype,
-        "nodata": nodata, "transform": Affine(CELL_M, 0, 0.0, 0, -CELL_M, ROWS * CELL_M),
-        "crs": crs,
+def write_raster(
+    path: Path, bands: Any, pixel_m: float, corner: tuple[float, float], **more: Any
+) -> Path:
+    """Write bands (B, H, W) as a GeoTIFF.
+
+    Args:
+        path: of the file.
+        bands: its values.
+        pixel_m: side of a pixel.
+        corner: east and north of the upper left one's outer corner.
+        more: of the profile.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    profile = {
+        "driver": "GTiff", "count": len(bands), "height": bands.shape[1], "width": bands.shape[2],
+        "dtype": bands.dtype, "transform": Affine(pixel_m, 0, corner[0], 0, -pixel_m, corner[1]),
     }  # fmt: skip
+    with rasterio.open(path, "w", **profile | more) as raster:
+        raster.write(bands)
+    return path
 
 
-def _write_rasters(dense: Path, crs: str | None) -> None:
-    known = np.isfinite(heights())
-    stations = np.where(known, 4, 0).astype(np.uint8)
-    parts = {
-        "dem": heights(),
-        "sigma": np.where(known, SIGMA_M, np.nan).astype(np.float32),
-        "slope": np.where(known, np.degrees(np.arctan(SLOPE)), np.nan).astype(np.float32),
-    }
-    for name, values in parts.items():
-        with rasterio.open(
-            dense / f"{name}.tif", "w", **_profile("float32", np.nan, crs)
-        ) as raster:
-            raster.write(values, 1)
-    with rasterio.open(dense / "stations.tif", "w", **_profile("uint8", None, crs)) as raster:
-        raster.write(stations, 1)
-
-
-def _write_mosaic(path: Path, crs: str | None) -> None:
-    profile = _profile("uint8", None, crs) | {
-        "width": 400, "height": 600, "count": 4,
-        "transform": Affine(0.002, 0, 0.0, 0, -0.002, ROWS * CELL_M),
-    }  # fmt: skip
+def _write_rasters(folder: Path, crs: str | None) -> None:
+    corner, known = (0.0, ROWS * CELL_M), np.isfinite(heights())
+    for name, value in (("dem", heights()), ("sigma", SIGMA_M), ("slope", _SLOPE_DEG)):
+        values = np.where(known, value, np.nan).astype(np.float32)[None]
+        path = folder / "dense" / f"{name}.tif"
+        write_raster(path, values, CELL_M, corner, nodata=np.nan, crs=crs)
+    stations = np.where(known, 4, 0).astype(np.uint8)[None]
+    write_raster(folder / "dense" / "stations.tif", stations, CELL_M, corner, crs=crs)
     rows, columns = np.mgrid[:600, :400]
     bands = np.stack([rows % 256, columns % 256, 0 * rows + 90, 0 * rows + 255]).astype(np.uint8)
     bands[3, 500:, :100] = 0
-    with rasterio.open(path, "w", photometric="RGB", alpha="YES", **profile) as raster:
-        raster.write(bands)
+    path = folder / "mosaic" / "mosaic.tif"
+    write_raster(path, bands, 0.002, corner, crs=crs, photometric="RGB", alpha="YES")

@@ -154,32 +154,6 @@ def test_all_of_it_by_keyboard(tmp_path: Path) -> None:
         is_accessible(page)
 
 
-def test_two_picks_on_the_mesh_are_a_length(tmp_path: Path) -> None:
-    import open3d as o3d
-
-    with opened(with_mesh(tmp_path / "reef")) as (page, _):
-        page.get_by_text("In 3D", exact=True).click()
-        page.wait_for_selector(".mesh[data-ready]", timeout=60_000)
-        canvas = page.locator("#mesh-canvas")
-        box = canvas.bounding_box()
-        canvas.click(position={"x": box["width"] * 0.45, "y": box["height"] * 0.5})
-        page.get_by_text("click another place").wait_for()
-        canvas.focus()
-        page.keyboard.press("Enter")
-        (length,) = measured(page, 1)
-        first, second = length["places"]
-        assert named(length)["length"]["value"] == pytest.approx(math.dist(first, second), rel=1e-6)
-        # picked points lie on the triangles of the file
-        mesh = trimesh.load_scene(tmp_path / "reef" / "mesh" / "mesh.glb").to_mesh()
-        points = np.array([[e - 0.4, u + 10.0, 0.6 - n] for e, n, u in length["places"]])
-        scene = o3d.t.geometry.RaycastingScene()
-        scene.add_triangles(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32))
-        assert scene.compute_distance(points.astype(np.float32)).numpy().max() < 1e-4
-        assert math.dist(first, second) > 1e-3
-        page.get_by_role("button", name="Larger, over the map").click()
-        assert canvas.bounding_box()["width"] > 800
-
-
 LIFT = 0.05
 """Height of the finest tiles over the coarse one, so that a pick tells which it hit."""
 
@@ -216,10 +190,30 @@ def with_tiles(folder: Path) -> Path:
     return workspace
 
 
-def test_tiles_are_drawn_as_the_view_needs_them_and_picked(tmp_path: Path) -> None:
+def picked_off(page: Any, folder: Path, number: int, lift: float) -> float:
+    """Pick two places on the mesh by mouse and keys: how far off the triangles of the file."""
     import open3d as o3d
 
-    with opened(with_tiles(tmp_path / "reef")) as (page, heard):
+    canvas = page.locator("#mesh-canvas")
+    box = canvas.bounding_box()
+    canvas.click(position={"x": box["width"] * 0.42, "y": box["height"] * 0.5})
+    page.get_by_text("click another place").wait_for()
+    canvas.focus()
+    page.keyboard.press("Enter")
+    length = measured(page, number)[-1]
+    apart = math.dist(*length["places"])
+    assert named(length)["length"]["value"] == pytest.approx(apart, rel=1e-6) and apart > 1e-3
+    mesh = trimesh.load_scene(folder / "mesh" / "mesh.glb").to_mesh()
+    scene = o3d.t.geometry.RaycastingScene()
+    lifted = (mesh.vertices + np.array([0.0, lift, 0.0])).astype(np.float32)
+    scene.add_triangles(lifted, mesh.faces.astype(np.uint32))
+    points = np.array([[e - 0.4, u + 10.0, 0.6 - n] for e, n, u in length["places"]])
+    return float(scene.compute_distance(points.astype(np.float32)).numpy().max())
+
+
+def test_tiles_are_drawn_as_the_view_needs_them_and_picked(tmp_path: Path) -> None:
+    folder = with_tiles(tmp_path / "reef")
+    with opened(folder) as (page, heard):
         page.get_by_text("In 3D", exact=True).click()
         page.wait_for_selector(".mesh[data-ready]", timeout=60_000)
         canvas = page.locator("#mesh-canvas")
@@ -227,6 +221,7 @@ def test_tiles_are_drawn_as_the_view_needs_them_and_picked(tmp_path: Path) -> No
         def loaded() -> set[str]:
             return {url.split("/")[-1] for url in heard.requests if "/mesh/tiles/" in url}
 
+        assert picked_off(page, folder, 1, 0.0) < 1e-4
         assert loaded() == set()
         canvas.focus()
         for _ in range(16):
@@ -240,26 +235,11 @@ def test_tiles_are_drawn_as_the_view_needs_them_and_picked(tmp_path: Path) -> No
         assert loaded() == {"tileset.json", "top.glb", "west.json", "west.glb", "east.glb"}
         shot = np.asarray(Image.open(io.BytesIO(canvas.screenshot())).convert("RGB"), float)
         assert 0.1 < (np.abs(shot - [243, 246, 248]).max(axis=2) > 30).mean() < 0.95
-
-        box = canvas.bounding_box()
-        canvas.click(position={"x": box["width"] * 0.42, "y": box["height"] * 0.5})
-        page.get_by_text("click another place").wait_for()
-        canvas.focus()
-        page.keyboard.press("Enter")
-        (length,) = measured(page, 1)
-        mesh = trimesh.load_scene(tmp_path / "reef" / "mesh" / "mesh.glb").to_mesh()
-        scene = o3d.t.geometry.RaycastingScene()
-        lifted = (mesh.vertices + np.array([0.0, LIFT, 0.0])).astype(np.float32)
-        scene.add_triangles(lifted, mesh.faces.astype(np.uint32))
-        points = np.array([[e - 0.4, u + 10.0, 0.6 - n] for e, n, u in length["places"]])
-        assert scene.compute_distance(points.astype(np.float32)).numpy().max() < 1e-4
-        assert math.dist(*length["places"]) > 1e-3
-
+        assert picked_off(page, folder, 2, LIFT) < 1e-4
         page.get_by_label("Drawn as").select_option("light")
-        canvas.focus()
-        page.keyboard.press("Enter")
-        page.get_by_text("click another place").wait_for()
-
+        assert picked_off(page, folder, 3, 0.0) < 1e-4
+        page.get_by_role("button", name="Larger, over the map").click()
+        assert canvas.bounding_box()["width"] > 800
         is_accessible(page)
 
 

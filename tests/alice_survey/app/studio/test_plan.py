@@ -166,7 +166,7 @@ def test_a_conflict_comes_with_a_change_that_solves_it(server: Server) -> None:
     ("body", "status"),
     [
         (b"\xff\xfe", 400), (b"[1]", 400), (b"[" * 100_000, 400),
-        ({"changes": 3}, 400), ({"changes": {"plan": [1]}}, 400), ({"shape": {}}, 400),
+        ({"changes": {"plan": [1]}}, 400), ({"shape": {}}, 400),
         ({"shapes": {"survey": [{"outer": [[0, 0]]}]}}, 400),
         ({"shapes": {"survey": [{"outer": [[0, "a"], [1, 1], [2, 2]]}]}}, 400),
         ({"changes": {"plan": {"altitude_m": "high"}}}, 200),
@@ -240,7 +240,7 @@ def test_exports_of_the_plan(workspace: Path, server: Server) -> None:
     assert ask(server, "/api/plan/export?format=../plan").status == 400
 
 
-def test_of_requests_that_wait_only_the_newest_of_a_page_is_stale_page() -> None:
+def test_of_requests_that_wait_only_the_newest_of_a_page_is_answered() -> None:
     newest, began, go_on = LatestRequests(), threading.Event(), threading.Event()
     done: list[str] = []
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import rasterio
 from numpy.typing import NDArray
-from rasterio.transform import Affine
 
 from alice_survey.app.report.rasters import (
     MAP_RASTERS,
@@ -18,7 +17,7 @@ from alice_survey.app.report.rasters import (
 from alice_survey.app.studio.files import Workspace
 from alice_survey.app.studio.layers import Layers
 from alice_survey.core.artefacts import StaleError
-from tests.alice_survey.app.report.tiny import tiny_workspace
+from tests.alice_survey.app.report.tiny import tiny_workspace, write_raster
 
 ROWS, COLUMNS = 1302, 1110
 """No multiples of a tile or of a pixel of the third level."""
@@ -27,15 +26,8 @@ Array = NDArray[Any]
 
 
 def written(path: Path, bands: Array, **more: Any) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    profile = {
-        "driver": "GTiff", "count": len(bands), "height": bands.shape[1], "width": bands.shape[2],
-        "dtype": bands.dtype, "tiled": True, "blockxsize": 256, "blockysize": 256,
-        "compress": "deflate", "transform": Affine(0.01, 0, -3.0, 0, -0.01, 7.0), **more,
-    }  # fmt: skip
-    with rasterio.open(path, "w", **profile) as raster:
-        raster.write(bands)
-    return path
+    tiles = {"tiled": True, "blockxsize": 256, "blockysize": 256, "compress": "deflate"}
+    return write_raster(path, bands, 0.01, (-3.0, 7.0), **tiles, **more)
 
 
 def pyramid_of(path: Path, name: str) -> Pyramid:

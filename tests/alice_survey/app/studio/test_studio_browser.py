@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rasterio.transform import Affine
 
-from tests.alice_survey.app.report.tiny import tiny_workspace
+from tests.alice_survey.app.report.tiny import tiny_workspace, write_raster
 from tests.alice_survey.app.studio.client import serving
 from tests.alice_survey.kit.browser import Heard, chromium, is_accessible
 from tests.alice_survey.kit.sketch import seafloor
@@ -22,17 +21,11 @@ PICTURES = f"{MAP} img.leaflet-image-layer"
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """A workspace with a mosaic of four levels."""
-    import rasterio
-
     workspace = tiny_workspace(tmp_path / "reef")
-    floor = np.asarray(seafloor(2500, 2400))
-    bands = np.concatenate([np.moveaxis(floor, 2, 0), np.full((1, 2400, 2500), 255, np.uint8)])
-    with rasterio.open(
-        workspace / "mosaic" / "mosaic.tif", "w", driver="GTiff", count=4, dtype="uint8",
-        width=2500, height=2400, photometric="RGB", alpha="YES", tiled=True,
-        transform=Affine(0.0005, 0, 0, 0, -0.0005, 1.2),
-    ) as raster:  # fmt: skip
-        raster.write(bands)
+    floor = np.moveaxis(np.asarray(seafloor(2500, 2400)), 2, 0)
+    bands = np.concatenate([floor, np.full((1, 2400, 2500), 255, np.uint8)])
+    options = {"photometric": "RGB", "alpha": "YES", "tiled": True}
+    write_raster(workspace / "mosaic" / "mosaic.tif", bands, 0.0005, (0.0, 1.2), **options)
     return workspace
 
 
