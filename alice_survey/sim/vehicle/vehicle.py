@@ -493,7 +493,7 @@ def _table_of(path: Path, text: str) -> dict[str, Any]:
     return table
 
 
-def parse_table(path: Path, kind: type[_Kind], table: object) -> _Kind:
+def parse_table(path: Path | str, kind: type[_Kind], table: object) -> _Kind:
     """The value of a kind that a table read from a file holds.
 
     Raises:

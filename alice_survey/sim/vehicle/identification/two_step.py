@@ -22,14 +22,16 @@ The force is net of what the vehicle's model takes off at rest, such as thrust d
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, model_validator
 from scipy.signal import fftconvolve, savgol_filter
 from scipy.spatial.transform import Rotation
 
 from alice_survey.core.artefacts import read_csv
+from alice_survey.core.config import Config
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.core.run.progress import step as named_step
@@ -41,16 +43,21 @@ from alice_survey.sim.vehicle.identification.output_error import (
     stretch_numbers,
 )
 from alice_survey.sim.vehicle.identification.problem import OTHERS, Mask, Parameters, Window
-from alice_survey.sim.vehicle.vehicle import Vehicle
+from alice_survey.sim.vehicle.vehicle import Vehicle, parse_table
 
 
-@dataclass(frozen=True, kw_only=True)
-class Pull:
+class Pull(Config):
     """One reading."""
 
-    thrusters: tuple[str, ...]
+    thrusters: tuple[Annotated[str, Field(min_length=1)], ...]
     rpm: float
     force_n: float
+
+    @model_validator(mode="after")
+    def _check_signs(self) -> Self:
+        if self.rpm == 0 or self.rpm * self.force_n < 0:
+            raise ValueError("force and speed must have one sign")
+        return self
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +88,18 @@ def read_pulls(path: Path) -> list[Pull]:
             not a number, or a force against its speed.
     """
     _, rows = read_csv(path, ("thruster", "rpm", "force_n"), fault=VehicleError)
-    pulls = [_pull(path, line, row) for line, row in rows]
+    pulls = [
+        parse_table(
+            f"{path} line {line}",
+            Pull,
+            {
+                "thrusters": [name.strip() for name in row["thruster"].split("+")],
+                "rpm": row["rpm"],
+                "force_n": row["force_n"],
+            },
+        )
+        for line, row in rows
+    ]
     if not pulls:
         raise VehicleError(f"{path}: has no rows")
     return pulls
@@ -150,27 +168,6 @@ def _unit_force(vehicle: Vehicle, group: tuple[str, ...], rps: float) -> float:
         for t in vehicle.thrusters
         if t.name in group
     )
-
-
-def _pull(path: Path, line: int, row: dict[str, str]) -> Pull:
-    values = []
-    for name in ("rpm", "force_n"):
-        try:
-            value = float(row[name])
-        except ValueError:
-            value = float("nan")
-        if not np.isfinite(value):
-            raise VehicleError(f"{path} line {line}: {name} is {row[name]!r}, not a finite number")
-        values.append(value)
-    names = tuple(part.strip() for part in row["thruster"].split("+"))
-    if not all(names):
-        raise VehicleError(f"{path} line {line}: thruster is missing")
-    rpm, force = values
-    if rpm == 0 or rpm * force < 0:
-        raise VehicleError(
-            f"{path} line {line}: {force:g} N at {rpm:g} rpm: force and speed must have one sign"
-        )
-    return Pull(thrusters=names, rpm=rpm, force_n=force)
 
 
 STEPS = (("surge", "X"), ("heave", "ZM"), ("turns", "NYK"))
