@@ -29,8 +29,7 @@ nu_j |nu_j| are those of one motion at a time, as in the paper.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, NamedTuple
 
@@ -107,11 +106,6 @@ class Outline:
         x, r, w = self.strips()
         return float(np.pi * np.sum(w * r**2 * x) / self.volume_m3)
 
-    @property
-    def frontal_area_m2(self) -> float:
-        """Area of the largest section."""
-        return math.pi * self.diameter_m**2 / 4.0
-
     def shift(self, by_m: float) -> "Outline":
         """The same shape, further forward."""
         return Outline(x_m=tuple(x + by_m for x in self.x_m), radius_m=self.radius_m)
@@ -125,8 +119,7 @@ class Outline:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Mast:
+class Mast(NamedTuple):
     """The mast: an upright strut of elliptic section on top of the hull."""
 
     x_m: float
@@ -151,8 +144,7 @@ class Mast:
         return math.pi / 4.0 * self.chord_m * self.width_m * self.height_m
 
 
-@dataclass(frozen=True, kw_only=True)
-class Pod:
+class Pod(NamedTuple):
     """A horizontal thruster: a motor body that carries the nozzle; two, mirrored."""
 
     outline: Outline
@@ -168,8 +160,7 @@ class Pod:
         return math.pi / 4.0 * self.body_diameter_m**2 * self.outline.length_m
 
 
-@dataclass(frozen=True, kw_only=True)
-class PodArm:
+class PodArm(NamedTuple):
     """The arm between hull and pod, on either side, at z = 0."""
 
     aft_x_m: float
@@ -184,8 +175,7 @@ class PodArm:
         return self.fore_x_m - self.aft_x_m
 
 
-@dataclass(frozen=True, kw_only=True)
-class Tunnel:
+class Tunnel(NamedTuple):
     """A thruster's tunnel through the hull."""
 
     name: str
@@ -318,31 +308,21 @@ tail section, the pods, are taken to have moved with it."""
 ALICE = Geometry(
     name="alice",
     outline=_ALICE_HULL,
-    mast=replace(SPARUS2.mast, x_m=-0.472),
-    pod=replace(SPARUS2.pod, outline=_POD.shift(_MOVED_M)),
-    mount=replace(
-        SPARUS2.mount,
+    mast=SPARUS2.mast._replace(x_m=-0.472),
+    pod=SPARUS2.pod._replace(outline=_POD.shift(_MOVED_M)),
+    mount=SPARUS2.mount._replace(
         aft_x_m=SPARUS2.mount.aft_x_m + _MOVED_M,
         fore_x_m=SPARUS2.mount.fore_x_m + _MOVED_M,
     ),
     # "At the farthest possible distance" (paper, section III.A); T200 propellers of 0.076 m.
     tunnels=(
         *SPARUS2.tunnels,
-        *(
-            Tunnel(
-                name=end,
-                x_m=round(farthest_tunnel_x(_ALICE_HULL, end), 3),
-                axis="y",
-                diameter_m=0.076,
-            )
-            for end in _ENDS
-        ),
+        *(Tunnel(end, round(farthest_tunnel_x(_ALICE_HULL, end), 3), "y", 0.076) for end in _ENDS),
     ),
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Entrained:
+class Entrained(NamedTuple):
     """Water inside the hull."""
 
     mass_kg: float
@@ -414,27 +394,18 @@ def alpha_0(length_m: float, diameter_m: float) -> float:
     if squared < 1e-6:
         # The closed form loses its digits near a sphere: its series in e^2.
         return 2.0 * (1.0 - squared) * (1.0 / 3.0 + squared / 5.0)
-    return _alpha(math.sqrt(squared))
-
-
-def _alpha(e: float) -> float:
+    e = math.sqrt(squared)
     return 2.0 * (1.0 - e**2) / e**3 * (0.5 * math.log((1.0 + e) / (1.0 - e)) - e)
 
 
-def ellipsoid_mass(length_m: float, diameter_m: float, density: float) -> float:
-    """m_e = 4/3 pi rho (l/2) (d/2)^2, kg: mass of the water that the spheroid displaces."""
-    return 4.0 / 3.0 * math.pi * density * length_m / 2.0 * (diameter_m / 2.0) ** 2
-
-
 def ellipsoid_axial(length_m: float, diameter_m: float, density: float) -> float:
-    """Added mass of a prolate spheroid along its axis, kg: alpha_0 / (2 - alpha_0) m_e."""
+    """Added mass of a prolate spheroid along its axis, kg: alpha_0 / (2 - alpha_0) m_e.
+
+    m_e = 4/3 pi rho (l/2) (d/2)^2, the mass of the water that the spheroid displaces.
+    """
     alpha = alpha_0(length_m, diameter_m)
-    return alpha / (2.0 - alpha) * ellipsoid_mass(length_m, diameter_m, density)
-
-
-def circle_section(radius_m: Array, density: float) -> Array:
-    """Added mass of circular sections moving across, kg/m: rho pi r^2 (Fossen 2011; Newman)."""
-    return density * np.pi * np.asarray(radius_m, dtype=np.float64) ** 2
+    displaced_kg = 4.0 / 3.0 * math.pi * density * length_m / 2.0 * (diameter_m / 2.0) ** 2
+    return alpha / (2.0 - alpha) * displaced_kg
 
 
 def finned_circle_section(radius_m: Array, span_m: float, density: float) -> Array:
@@ -532,18 +503,12 @@ def strut_along(chord_m: float, width_m: float, reynolds: float) -> float:
     return 2.0 * friction * (1.0 + 1.0 / slim) + 1.1 * slim
 
 
-def tunnel_area(diameter_m: float) -> float:
-    """C_d A of a tunnel's two mouths, m^2: R = rho u^2 pi d^2 C_BTO (Holtrop and Mennen 1982)."""
-    return 2.0 * math.pi * diameter_m**2 * TUNNEL_CBTO
-
-
 _FORWARD, _STARBOARD, _DOWN = np.eye(3)
 _NOTHING = 1e-9
 """Below this an entry is a zero by symmetry that rounding hides."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Flow:
+class Flow(NamedTuple):
     """The water, and the speed at which friction is evaluated."""
 
     density_kg_m3: float = 1025.0
@@ -557,8 +522,7 @@ class Flow:
         return self.speed_mps * length_m / self.viscosity_m2_s
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class HullPart:
+class HullPart(NamedTuple):
     """One part's contribution."""
 
     name: str
@@ -594,59 +558,65 @@ def drag_of(points_body: Array, direction_body: Array, drag_kg_m: Array) -> Arra
 
 def parts(geometry: Geometry, flow: Flow) -> tuple[HullPart, ...]:
     """Hull, mast, pods, mounts and tunnels."""
-    pods = [_pod(geometry.pod, side, flow) for side in (1.0, -1.0)]
-    tunnels = [_tunnel(tunnel, flow) for tunnel in geometry.tunnels]
+    pod = geometry.pod
     return (
         _hull(geometry, flow),
         _mast(geometry.mast, flow),
-        _sum("pods", pods),
+        *(
+            _revolved("pod", pod.outline, pod.body_diameter_m, pod.outline.volume_x_m, y, flow)
+            for y in (pod.y_m, -pod.y_m)
+        ),
         _mounts(geometry.mount, geometry.outline, flow),
-        _sum("tunnels", tunnels),
+        *(_tunnel(tunnel, flow) for tunnel in geometry.tunnels),
     )
 
 
-def _sum(name: str, each: Sequence[HullPart]) -> HullPart:
-    nothing = np.zeros((6, 6))
-    return HullPart(
-        name=name,
-        added_mass=sum((part.added_mass for part in each), nothing),
-        quadratic=sum((part.quadratic for part in each), nothing),
-    )
-
-
-def _on_axis(x_m: Array, y_m: float = 0.0) -> Array:
+def _on_axis(x_m: Array, y_m: Array | float = 0.0) -> Array:
     points = np.zeros((len(x_m), 3))
     points[:, 0], points[:, 1] = x_m, y_m
     return points
 
 
-def _hull(geometry: Geometry, flow: Flow) -> HullPart:
-    """Ellipsoid along; circular strips across, finned where the mounts are, in heave."""
-    outline, mount, density = geometry.outline, geometry.mount, flow.density_kg_m3
-    x, r, w = outline.strips(breaks_m=(mount.aft_x_m, mount.fore_x_m))
-    points, origin = _on_axis(x), np.zeros((1, 3))
-    axial = ellipsoid_axial(outline.length_m, outline.diameter_m, density)
-    across = w * circle_section(r, density)
-    finned = (x > mount.aft_x_m) & (x < mount.fore_x_m)
-    heaving = across.copy()
-    heaving[finned] = w[finned] * finned_circle_section(r[finned], mount.tip_y_m, density)
-    rolling = w[finned] * finned_circle_roll(r[finned], mount.tip_y_m, density)
-    inertia = (
-        inertia_of(origin, _FORWARD, np.array([axial]))
-        + inertia_of(points, _STARBOARD, across)
-        + inertia_of(points, _DOWN, heaving)
-    )
-    inertia[3, 3] += rolling.sum()
-
+def _revolved(
+    name: str,
+    outline: Outline,
+    diameter_m: float,
+    centre_x_m: float,
+    y_m: float,
+    flow: Flow,
+    breaks_m: tuple[float, ...] = (),
+) -> HullPart:
+    """Ellipsoid along, as thick as `diameter_m`; circular strips across."""
+    density = flow.density_kg_m3
+    x, r, w = outline.strips(breaks_m)
+    points, centre = _on_axis(x, y_m), _on_axis(np.array([centre_x_m]), y_m)
+    across = w * density * np.pi * r**2
+    axial = ellipsoid_axial(outline.length_m, diameter_m, density)
     friction = ittc57(flow.reynolds(outline.length_m))
-    along = ellipsoid_drag(outline.length_m, outline.diameter_m, friction)
-    side = 0.5 * density * cylinder_across(outline.length_m / outline.diameter_m) * 2.0 * r * w
-    quadratic = (
-        drag_of(origin, _FORWARD, np.array([0.5 * density * along * outline.frontal_area_m2]))
+    along = ellipsoid_drag(outline.length_m, diameter_m, friction) * np.pi / 4.0 * diameter_m**2
+    side = 0.5 * density * cylinder_across(outline.length_m / diameter_m) * 2.0 * r * w
+    return HullPart(
+        name,
+        inertia_of(centre, _FORWARD, np.array([axial]))
+        + inertia_of(points, _STARBOARD, across)
+        + inertia_of(points, _DOWN, across),
+        drag_of(centre, _FORWARD, np.array([0.5 * density * along]))
         + drag_of(points, _STARBOARD, side)
-        + drag_of(points, _DOWN, side)
+        + drag_of(points, _DOWN, side),
     )
-    return HullPart(name="hull", added_mass=inertia, quadratic=quadratic)
+
+
+def _hull(geometry: Geometry, flow: Flow) -> HullPart:
+    """A body of revolution, with fins where the mounts are, in heave and roll."""
+    outline, mount, density = geometry.outline, geometry.mount, flow.density_kg_m3
+    breaks = (mount.aft_x_m, mount.fore_x_m)
+    hull = _revolved("hull", outline, outline.diameter_m, 0.0, 0.0, flow, breaks)
+    strips = np.array(outline.strips(breaks))
+    x, r, w = strips[:, (strips[0] > mount.aft_x_m) & (strips[0] < mount.fore_x_m)]
+    more = finned_circle_section(r, mount.tip_y_m, density) - density * np.pi * r**2
+    added = hull.added_mass + inertia_of(_on_axis(x), _DOWN, w * more)
+    added[3, 3] += np.sum(w * finned_circle_roll(r, mount.tip_y_m, density))
+    return hull._replace(added_mass=added)
 
 
 def _mast(mast: Mast, flow: Flow) -> HullPart:
@@ -655,75 +625,44 @@ def _mast(mast: Mast, flow: Flow) -> HullPart:
     z = mast.middle_z_m + mast.height_m / 2.0 * _NODES
     w = mast.height_m / 2.0 * _WEIGHTS
     points = np.column_stack([np.full(4, mast.x_m), np.zeros(4), z])
-    inertia = inertia_of(
-        points, _FORWARD, w * elliptic_section(mast.width_m, density)
-    ) + inertia_of(points, _STARBOARD, w * elliptic_section(mast.chord_m, density))
     along = strut_along(mast.chord_m, mast.width_m, flow.reynolds(mast.chord_m))
     across = plate_across(2.0 * mast.height_m / mast.chord_m)
-    quadratic = drag_of(points, _FORWARD, 0.5 * density * along * mast.width_m * w) + drag_of(
-        points, _STARBOARD, 0.5 * density * across * mast.chord_m * w
+    return HullPart(
+        "mast",
+        inertia_of(points, _FORWARD, w * elliptic_section(mast.width_m, density))
+        + inertia_of(points, _STARBOARD, w * elliptic_section(mast.chord_m, density)),
+        drag_of(points, _FORWARD, 0.5 * density * along * mast.width_m * w)
+        + drag_of(points, _STARBOARD, 0.5 * density * across * mast.chord_m * w),
     )
-    return HullPart(name="mast", added_mass=inertia, quadratic=quadratic)
-
-
-def _pod(pod: Pod, side: float, flow: Flow) -> HullPart:
-    """Ellipsoid along, of the motor body: water passes through the nozzle; strips across."""
-    density, outline, y = flow.density_kg_m3, pod.outline, side * pod.y_m
-    x, r, w = outline.strips()
-    points = _on_axis(x, y)
-    middle = _on_axis(np.array([outline.volume_x_m]), y)
-    across = w * circle_section(r, density)
-    axial = ellipsoid_axial(outline.length_m, pod.body_diameter_m, density)
-    inertia = (
-        inertia_of(middle, _FORWARD, np.array([axial]))
-        + inertia_of(points, _STARBOARD, across)
-        + inertia_of(points, _DOWN, across)
-    )
-    friction = ittc57(flow.reynolds(outline.length_m))
-    along = ellipsoid_drag(outline.length_m, pod.body_diameter_m, friction)
-    area = np.pi / 4.0 * pod.body_diameter_m**2
-    crossing = cylinder_across(outline.length_m / pod.body_diameter_m)
-    sideways = 0.5 * density * crossing * 2.0 * r * w
-    quadratic = (
-        drag_of(middle, _FORWARD, np.array([0.5 * density * along * area]))
-        + drag_of(points, _STARBOARD, sideways)
-        + drag_of(points, _DOWN, sideways)
-    )
-    return HullPart(name="pod", added_mass=inertia, quadratic=quadratic)
 
 
 def _mounts(mount: PodArm, hull: Outline, flow: Flow) -> HullPart:
     """Plates in heave, struts in surge; their added mass is in the hull's finned strips."""
-    density = flow.density_kg_m3
     middle_x = (mount.aft_x_m + mount.fore_x_m) / 2.0
     root = float(hull.radius_at(np.array([middle_x]))[0])
-    span = mount.tip_y_m - root
+    span, middle_y = mount.tip_y_m - root, (root + mount.tip_y_m) / 2.0
     along = strut_along(mount.chord_m, mount.thickness_m, flow.reynolds(mount.chord_m))
     across = plate_across(2.0 * span / mount.chord_m)
-    middle_y = (root + mount.tip_y_m) / 2.0
-    points = _on_axis(np.full(2, middle_x))
-    points[:, 1] = middle_y, -middle_y
-    frontal, plan = span * mount.thickness_m, span * mount.chord_m
-    quadratic = drag_of(points, _FORWARD, np.full(2, 0.5 * density * along * frontal)) + drag_of(
-        points, _DOWN, np.full(2, 0.5 * density * across * plan)
+    points = _on_axis(np.full(2, middle_x), np.array([middle_y, -middle_y]))
+    pressed = np.full(2, 0.5 * flow.density_kg_m3 * span)
+    return HullPart(
+        "mounts",
+        np.zeros((6, 6)),
+        drag_of(points, _FORWARD, pressed * along * mount.thickness_m)
+        + drag_of(points, _DOWN, pressed * across * mount.chord_m),
     )
-    return HullPart(name="mounts", added_mass=np.zeros((6, 6)), quadratic=quadratic)
 
 
 def _tunnel(tunnel: Tunnel, flow: Flow) -> HullPart:
-    """Drag of the mouths in surge; the water inside belongs to the hull's."""
+    """Drag of the mouths in surge; the water inside belongs to the hull's.
+
+    R = rho u^2 pi d^2 C_BTO of both (Holtrop and Mennen 1982).
+    """
+    amount = flow.density_kg_m3 * math.pi * tunnel.diameter_m**2 * TUNNEL_CBTO
     points = _on_axis(np.array([tunnel.x_m]))
-    amount = 0.5 * flow.density_kg_m3 * tunnel_area(tunnel.diameter_m)
     return HullPart(
-        name=tunnel.name,
-        added_mass=np.zeros((6, 6)),
-        quadratic=drag_of(points, _FORWARD, np.array([amount])),
-    )
-
-
-def centre_of_pressure(nose_x_m: float, length_m: float) -> float:
-    """x_cp = x_n - 0.65 l, metres."""
-    return nose_x_m - 0.65 * length_m
+        tunnel.name, np.zeros((6, 6)), drag_of(points, _FORWARD, np.array([amount]))
+    )  # fmt: skip
 
 
 def body_lift(
@@ -737,7 +676,7 @@ def body_lift(
     """
     slope = 0.003 * (180.0 / math.pi) * length_m / diameter_m
     force = -0.5 * density * diameter_m**2 * slope
-    x = centre_of_pressure(nose_x_m, length_m)
+    x = nose_x_m - 0.65 * length_m  # the centre of pressure
     return {"Y_uv": force, "Z_uw": force, "M_uw": -x * force, "N_uv": x * force}
 
 
@@ -751,26 +690,20 @@ def estimate(geometry: Geometry, flow: Flow | None = None) -> Coefficients:
         geometry: the vehicle.
         flow: the water; sea water at the paper's speed if not given.
     """
-    flow = flow or Flow()
-    outline = geometry.outline
+    flow, outline = flow or Flow(), geometry.outline
     lift = body_lift(outline.length_m, outline.diameter_m, outline.nose_x_m, flow.density_kg_m3)
-    whole = part_coefficients(_sum(geometry.name, parts(geometry, flow)))
+    _, added, quadratic = zip(*parts(geometry, flow), strict=True)
+    whole = part_coefficients(
+        HullPart(geometry.name, np.sum(added, axis=0), np.sum(quadratic, axis=0))
+    )
     return Coefficients(name="computed", values={**whole, **lift})
 
 
 def part_coefficients(part: HullPart) -> dict[str, float]:
-    """One part's share by name."""
+    """One part's share by SNAME name: M_A with its sign turned, and its drag."""
     return {
-        **by_name(part.added_mass, kind="dot"),
-        **by_name(part.quadratic, kind="quadratic"),
-    }
-
-
-def by_name(matrix: Array, *, kind: Literal["dot", "quadratic"]) -> dict[str, float]:
-    """A (6, 6) matrix by SNAME names: of `dot`, M_A with its sign turned; of `quadratic`, as is."""
-    sign = -1.0 if kind == "dot" else 1.0
-    return {
-        f"{FORCES[i]}_{motion}{'dot' if kind == 'dot' else motion}": float(sign * matrix[i, j])
+        f"{FORCES[i]}_{motion}{ending or motion}": float(matrix[i, j])
+        for matrix, ending in ((-part.added_mass, "dot"), (part.quadratic, ""))
         for i in range(6)
         for j, motion in enumerate(MOTIONS)
         if abs(matrix[i, j]) > _NOTHING

@@ -3,13 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alice_survey.sim.vehicle.allocation import (
-    AXIS_WEIGHTS,
-    allocate_exact,
-    allocate_rpi,
-    allocation_scratch,
-    preference_weights,
-)
+from alice_survey.sim.vehicle import allocation
 from alice_survey.sim.vehicle.propulsion import add_thrust, speeds_for, thrust_limits
 from alice_survey.sim.vehicle.vehicle import Vehicle, vehicle_from
 from tests import oracles_propulsion as oracles
@@ -40,14 +34,16 @@ def solve(
     lower: Array,
     upper: Array,
     weights: Array | None = None,
-    axes: Array = AXIS_WEIGHTS,
-    solver: object = allocate_exact,
+    axes: Array = allocation.AXIS_WEIGHTS,
+    solver: object = allocation.allocate_exact,
 ) -> Array:
     count = matrix.shape[1]
     thrust = np.full(count, np.nan)
     chosen = np.ones(count) if weights is None else weights
     assert callable(solver)
-    solved = solver(matrix, wanted, lower, upper, axes, chosen, thrust, allocation_scratch(count))
+    solved = solver(
+        matrix, wanted, lower, upper, axes, chosen, thrust, allocation.allocation_scratch(count)
+    )
     assert solved > 0
     assert np.all((thrust >= lower) & (thrust <= upper))
     return thrust
@@ -55,16 +51,16 @@ def solve(
 
 def miss_n(matrix: Array, thrust: Array, wanted: Array) -> float:
     """Weighted, over the axes that are requested."""
-    return float(np.linalg.norm(AXIS_WEIGHTS * (matrix @ thrust - wanted)))
+    return float(np.linalg.norm(allocation.AXIS_WEIGHTS * (matrix @ thrust - wanted)))
 
 
 @pytest.mark.parametrize("craft", [ALICE, SPARUS], ids=lambda craft: craft.name)
-@pytest.mark.parametrize("solver", [allocate_exact, allocate_rpi])
+@pytest.mark.parametrize("solver", [allocation.allocate_exact, allocation.allocate_rpi])
 def test_a_wrench_turns_the_vehicle_the_way_it_says(craft: Vehicle, solver: object) -> None:
     """A positive yaw turns the bow to starboard; the other axes are alike."""
     lower, upper = limits_of(craft)
     axes = [SURGE, HEAVE, YAW] if craft is SPARUS else [SURGE, SWAY, HEAVE, YAW]
-    asked = np.where(np.isin(range(6), axes), AXIS_WEIGHTS, 0.0)
+    asked = np.where(np.isin(range(6), axes), allocation.AXIS_WEIGHTS, 0.0)
     for axis in axes:
         for sign in (1.0, -1.0):
             wanted = np.zeros(6)
@@ -83,16 +79,16 @@ def test_a_wrench_turns_the_vehicle_the_way_it_says(craft: Vehicle, solver: obje
 def test_what_cannot_be_had_is_missed_as_little_as_by_bvls(craft: Vehicle) -> None:
     rng = np.random.default_rng(12)
     matrix, count = craft.configuration_matrix, len(craft.thrusters)
-    asked, beyond = AXIS_WEIGHTS > 0, 0
+    asked, beyond = allocation.AXIS_WEIGHTS > 0, 0
     for trial in range(2000 if craft is ALICE else 300):
         failed = int(rng.integers(count)) if trial % 3 == 0 else None
         lower, upper = limits_of(craft, failed)
         wanted = rng.normal(size=6) * REACH
         weights = np.exp(rng.uniform(0, 4, count))
         thrust = solve(matrix, wanted, lower, upper, weights)
-        best = oracles.min_miss(matrix, wanted, lower, upper, AXIS_WEIGHTS)
+        best = oracles.min_miss(matrix, wanted, lower, upper, allocation.AXIS_WEIGHTS)
         np.testing.assert_allclose(
-            (AXIS_WEIGHTS * (matrix @ thrust))[asked], best, atol=1e-6, rtol=0
+            (allocation.AXIS_WEIGHTS * (matrix @ thrust))[asked], best, atol=1e-6, rtol=0
         )
         beyond += miss_n(matrix, thrust, wanted) > 1e-3
     assert beyond > 200
@@ -178,8 +174,8 @@ def test_the_pseudo_inverse_is_its_numpy_twin() -> None:
         lower, upper = limits_of(craft, int(rng.integers(count)) if trial % 3 == 0 else None)
         wanted = rng.normal(size=6) * REACH * rng.choice([0.05, 1.0])
         weights = np.exp(rng.uniform(0, 3, count))
-        got = solve(matrix, wanted, lower, upper, weights, solver=allocate_rpi)
-        slow = oracles.redistributed(matrix, wanted, lower, upper, AXIS_WEIGHTS, weights)
+        got = solve(matrix, wanted, lower, upper, weights, solver=allocation.allocate_rpi)
+        slow = oracles.redistributed(matrix, wanted, lower, upper, allocation.AXIS_WEIGHTS, weights)
         np.testing.assert_allclose(got, slow, rtol=1e-5, atol=1e-5)
 
 
@@ -203,7 +199,7 @@ def test_of_all_thrusts_that_do_it_is_the_least() -> None:
         inside = matrix @ rng.uniform(lower, upper)
         wanted = inside if trial % 2 else rng.normal(size=6) * REACH
         thrust = solve(matrix, wanted, lower, upper, weights)
-        best = oracles.best_thrust(matrix, wanted, lower, upper, AXIS_WEIGHTS, weights)
+        best = oracles.best_thrust(matrix, wanted, lower, upper, allocation.AXIS_WEIGHTS, weights)
         np.testing.assert_allclose(thrust, best, atol=1e-6)
 
 
@@ -217,7 +213,7 @@ def test_heave_comes_before_yaw_before_sway_before_surge() -> None:
         wanted[[more, less]] = 1.0
         thrust = solve(matrix, wanted, np.array([-9.0]), np.array([9.0]))[0]
         # They pull opposite ways with weights a and b: (a^2 - b^2) / (a^2 + b^2).
-        a, b = AXIS_WEIGHTS[more] ** 2, AXIS_WEIGHTS[less] ** 2
+        a, b = allocation.AXIS_WEIGHTS[more] ** 2, allocation.AXIS_WEIGHTS[less] ** 2
         assert thrust == pytest.approx((a - b) / (a + b))
         assert 0.75 < thrust < 0.9
 
@@ -230,7 +226,7 @@ def test_the_pseudo_inverses_shortfall() -> None:
     misses = np.zeros((2000, 2))
     for row in misses:
         wanted = rng.normal(size=6) * REACH
-        for i, solver in enumerate((allocate_exact, allocate_rpi)):
+        for i, solver in enumerate((allocation.allocate_exact, allocation.allocate_rpi)):
             thrust = solve(matrix, wanted, lower, upper, solver=solver)
             row[i] = miss_n(matrix, thrust, wanted)
     exact, rpi = misses[misses[:, 0] > 1e-3].T
@@ -246,7 +242,7 @@ def test_laterals_turn_the_vehicle_on_a_line_and_the_pair_at_speed() -> None:
     matrix, weights = ALICE.configuration_matrix, np.zeros(5)
     shares = []
     for u in np.linspace(0.0, 2.0, 41):
-        preference_weights(ALICE.plant.propulsion, float(u), weights)
+        allocation.preference_weights(ALICE.plant.propulsion, float(u), weights)
         assert np.all(weights[:2] == 1.0) and np.all(weights[2:] >= 1.0)
         thrust = solve(matrix, np.array([0, 0, 0, 0, 0, 2.0]), lower, upper, weights)
         shares.append(matrix[YAW, :2] @ thrust[:2] / 2.0)
@@ -259,11 +255,11 @@ def test_preference_is_the_square_of_what_the_jet_loses() -> None:
     """At the jet of 3 % of full thrust, the law of deflection by hand; alike astern; bounded."""
     bow = ALICE.thrusters[3]
     ahead, astern = np.zeros(5), np.zeros(5)
-    preference_weights(ALICE.plant.propulsion, 0.6, ahead)
-    preference_weights(ALICE.plant.propulsion, -0.6, astern)
+    allocation.preference_weights(ALICE.plant.propulsion, 0.6, ahead)
+    allocation.preference_weights(ALICE.plant.propulsion, -0.6, astern)
     np.testing.assert_array_equal(ahead, astern)
     thrust = 0.03 * 1025.0 * bow.diameter_m**4 * bow.kt_forward * bow.most_rps**2
     ratio = 0.6 / oracles.jet_speed_mps(bow, 1025.0, thrust)
     assert ahead[3] == pytest.approx(np.exp(bow.jet_loss * ratio**2) ** 2)
-    preference_weights(ALICE.plant.propulsion, 30.0, ahead)
+    allocation.preference_weights(ALICE.plant.propulsion, 30.0, ahead)
     assert ahead[3] == pytest.approx(np.exp(9.0))

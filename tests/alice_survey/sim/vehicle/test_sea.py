@@ -10,24 +10,17 @@ from hypothesis import strategies as st
 
 from alice_survey.core.errors import AliceError
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.sea import (
-    Current,
-    constant_current,
-    current_at,
-    read_current,
-    sheared_current,
-    varying_current,
-)
+from alice_survey.sim.vehicle import sea
 
 TIMES, DEPTHS = np.array([0.0, 7.0, 10.0, 31.0]), np.array([-1.0, 2.0, 2.5, 20.0, 21.0])
 
 TIMES, DEPTHS = np.array([0.0, 7.0, 10.0, 31.0]), np.array([-1.0, 2.0, 2.5, 20.0, 21.0])
-GRID = Current(TIMES, DEPTHS, np.random.default_rng(2).normal(0.0, 0.3, (4, 5, 2)))
+GRID = sea.Current(TIMES, DEPTHS, np.random.default_rng(2).normal(0.0, 0.3, (4, 5, 2)))
 
 
-def at(current: Current, time_s: float, depth_m: float) -> Array:
+def at(current: sea.Current, time_s: float, depth_m: float) -> Array:
     out = np.full(6, np.nan)
-    current_at(current, time_s, depth_m, out)
+    sea.current_at(current, time_s, depth_m, out)
     return out
 
 
@@ -39,7 +32,7 @@ def test_the_direction_is_the_one_it_flows_towards(
     towards_deg: float, north: float, east: float
 ) -> None:
     for time_s, depth_m in ((0.0, 0.0), (1e5, -3.0), (-5.0, 1e4)):
-        value = at(constant_current(0.2, towards_deg), time_s, depth_m)
+        value = at(sea.constant_current(0.2, towards_deg), time_s, depth_m)
         np.testing.assert_allclose(value, [north, east, 0, 0, 0, 0], atol=1e-16)
 
 
@@ -68,8 +61,8 @@ def test_slopes_are_those_of_the_values(cell: tuple[int, int], within: tuple[flo
 
 def test_a_random_series_has_the_spread_and_memory_asked_for() -> None:
     """20 hours with a memory of 60 s: some 600 independent draws a component."""
-    mean = sheared_current(np.array([0.0, 10.0]), np.array([[0.1, 0.0], [0.3, 0.0]]))
-    series = varying_current(mean, 0.05, 60.0, 72_000.0, np.random.default_rng(4))
+    mean = sea.sheared_current(np.array([0.0, 10.0]), np.array([[0.1, 0.0], [0.3, 0.0]]))
+    series = sea.varying_current(mean, 0.05, 60.0, 72_000.0, np.random.default_rng(4))
     assert series.time_s[0] == 0.0 and series.time_s[-1] >= 72_000.0
     steps = np.diff(series.time_s)
     np.testing.assert_allclose(steps, steps[0])
@@ -100,14 +93,14 @@ def test_a_file_gives_its_values_in_whatever_order(
     path = tmp_path_factory.mktemp("current") / "current.csv"
     header = "time_s,depth_m,north_mps,east_mps"
     path.write_text("\n".join([header, *rng.permutation(rows)]) + "\n")
-    current = read_current(path)
+    current = sea.read_current(path)
     np.testing.assert_array_equal(current.velocity_ne_mps, values)
     np.testing.assert_array_equal(current.time_s, 10.0 * np.arange(times))
     np.testing.assert_array_equal(current.depth_m, 2.5 * np.arange(depths) + 1)
 
 
 def test_shear_is_linear_between_and_constant_beyond() -> None:
-    shear = sheared_current(np.array([2.0, 12.0]), np.array([[0.1, 0.0], [0.4, 90.0]]))
+    shear = sea.sheared_current(np.array([2.0, 12.0]), np.array([[0.1, 0.0], [0.4, 90.0]]))
     np.testing.assert_allclose(at(shear, 3.0, 0.0), [0.1, 0.0, 0, 0, 0, 0], atol=1e-16)
     np.testing.assert_allclose(at(shear, 3.0, 99.0), [0.0, 0.4, 0, 0, 0, 0], atol=1e-16)
     middle = at(shear, 3.0, 7.0)
@@ -130,4 +123,4 @@ def test_a_file_with_gaps_is_refused(tmp_path: Path, rows: str) -> None:
     path = tmp_path / "current.csv"
     path.write_text(f"time_s,depth_m,north_mps,east_mps\n{rows}\n")
     with pytest.raises(AliceError, match=r"current\.csv"):
-        read_current(path)
+        sea.read_current(path)

@@ -7,21 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests import oracles_shape as shape
 from tests.oracles_hydrodynamics import Array, reaction
-from tests.oracles_shape import (
-    ALICE,
-    SPARUS2,
-    Flow,
-    Outline,
-    drag_of,
-    estimate,
-    inertia_of,
-    part_coefficients,
-    parts,
-)
 
 RHO = 1025.0
-SHARES = {part.name: part_coefficients(part) for part in parts(ALICE, Flow())}
+SHARES = {
+    part.name: shape.part_coefficients(part) for part in shape.parts(shape.ALICE, shape.Flow())
+}
 TRIPLES = st.tuples(*3 * [st.floats(-1.0, 1.0)]).map(np.array)
 
 
@@ -35,12 +27,12 @@ def test_elements_react_as_brute_force_says(
     points, amounts = np.array([point, other]), np.array([3.0, 5.0])
     motion = np.eye(6)[nu]
     np.testing.assert_allclose(
-        -inertia_of(points, direction, amounts) @ motion,
+        -shape.inertia_of(points, direction, amounts) @ motion,
         reaction(points, direction, amounts, motion, 1), atol=1e-12,
     )  # fmt: skip
     for sign in (1.0, -1.0):
         np.testing.assert_allclose(
-            sign * drag_of(points, direction, amounts)[:, nu],
+            sign * shape.drag_of(points, direction, amounts)[:, nu],
             reaction(points, direction, amounts, sign * motion, 2), atol=1e-12,
         )  # fmt: skip
 
@@ -72,12 +64,12 @@ def test_elements_react_as_brute_force_says(
     ],
 )
 def test_signs_by_hand(name: str, sign: int) -> None:
-    assert np.sign(estimate(ALICE).values[name]) == sign
+    assert np.sign(shape.estimate(shape.ALICE).values[name]) == sign
 
 
 def test_the_mast_by_hand() -> None:
     """Its strips integrate over its height, from z_0 to z_1: z, z^2 and |z|^3."""
-    mast, share = ALICE.mast, SHARES["mast"]
+    mast, share = shape.ALICE.mast, SHARES["mast"]
     z_0, z_1 = -mast.root_z_m, -mast.root_z_m + mast.height_m
     section = RHO * np.pi / 4.0 * mast.chord_m**2
     mass = section * mast.height_m
@@ -96,10 +88,10 @@ def test_strips_of_a_cylinder_in_closed_form() -> None:
     """Mass rho pi r^2 l, its moments, and the drag's; mounts too short to count."""
     low, high, r = -0.7, 0.9, 0.1
     cylinder = replace(
-        SPARUS2, outline=Outline(x_m=(low, high), radius_m=(r, r)),
-        mount=replace(SPARUS2.mount, aft_x_m=0.2, fore_x_m=0.2 + 1e-12, tip_y_m=0.11),
+        shape.SPARUS2, outline=shape.Outline(x_m=(low, high), radius_m=(r, r)),
+        mount=shape.SPARUS2.mount._replace(aft_x_m=0.2, fore_x_m=0.2 + 1e-12, tip_y_m=0.11),
     )  # fmt: skip
-    hull = part_coefficients(parts(cylinder, Flow())[0])
+    hull = shape.part_coefficients(shape.parts(cylinder, shape.Flow())[0])
     section = RHO * np.pi * r**2
     assert hull["Y_vdot"] == pytest.approx(-section * 1.6)
     assert hull["Z_wdot"] == pytest.approx(-section * 1.6)

@@ -14,24 +14,10 @@ import pytest
 from numpy.typing import NDArray
 
 from alice_survey.core.errors import VehicleError
+from alice_survey.sim.vehicle import steady
 from alice_survey.sim.vehicle.identification.report import IdentifyOptions, identify_report
 from alice_survey.sim.vehicle.pilot import gains as g
-from alice_survey.sim.vehicle.pilot.gains import (
-    LATERAL,
-    VERTICAL,
-    damping_ratio,
-    gains_for,
-    heading_loop,
-)
 from alice_survey.sim.vehicle.pilot.settings import UnderWay, circle_course, dive_loop
-from alice_survey.sim.vehicle.steady import (
-    MAX_DRIFT_RAD,
-    balance_fins,
-    fin_flight,
-    min_radius_m,
-    min_speed_mps,
-    steady_flight,
-)
 from alice_survey.sim.vehicle.vehicle import vehicle_from
 from tests import oracles_dynamics as oracle
 from tests.alice_survey.sim.vehicle.motions import STILL
@@ -57,7 +43,7 @@ def test_fins_lift_as_their_shape_has_it() -> None:
 @pytest.mark.parametrize("turn", [0.0, 0.1, -0.1])
 def test_steady_flight_is_one_by_the_equations_of_the_textbook(speed: float, turn: float) -> None:
     """Nothing changes but roll, which is left to the low weight: heave, pitch, sway and yaw."""
-    flight = balance_fins(REMUS, speed, turn)
+    flight = steady.balance_fins(REMUS, speed, turn)
     assert flight is not None
     attitude = np.array([0.0, flight.pitch_rad, 0.4])
     load = np.array([flight.force_x_n, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -75,16 +61,16 @@ def test_steady_flight_is_one_by_the_equations_of_the_textbook(speed: float, tur
 
 
 def test_the_lowest_speed_is_that_at_which_lift_carries_the_buoyancy() -> None:
-    minimum = min_speed_mps(REMUS, SHARE)
+    minimum = steady.min_speed_mps(REMUS, SHARE)
     assert 0.3 < minimum < 0.6
-    assert fin_flight(REMUS, 1.01 * minimum, 0.0, SHARE) is not None
-    assert fin_flight(REMUS, 0.97 * minimum, 0.0, SHARE) is None
+    assert steady.fin_flight(REMUS, 1.01 * minimum, 0.0, SHARE) is not None
+    assert steady.fin_flight(REMUS, 0.97 * minimum, 0.0, SHARE) is None
     # Lift grows with the square of the speed: four times as light, twice as fast, where nothing
     # rights the hull.
     body = replace(REMUS.rigid_body, cg_body_m=(0.0, 0.0, 0.0))
     light = body.buoyancy_kg - body.dry_kg
     speeds = [
-        min_speed_mps(
+        steady.min_speed_mps(
             replace(REMUS, rigid_body=replace(body, buoyancy_kg=body.dry_kg + share * light)), SHARE
         )
         for share in (1.0, 4.0, -1.0)
@@ -92,16 +78,16 @@ def test_the_lowest_speed_is_that_at_which_lift_carries_the_buoyancy() -> None:
     assert speeds[1] == pytest.approx(2.0 * speeds[0], rel=1e-3)
     assert speeds[2] == pytest.approx(speeds[0], rel=0.3)  # heavy, it flies nose up
     with pytest.raises(VehicleError, match=r"from 0\.\d\d m/s through the water on, not at 0\.20"):
-        gains_for(REMUS, 0.2)
+        g.gains_for(REMUS, 0.2)
 
 
 def test_the_tightest_turn_is_one_that_fins_hold() -> None:
-    radius = min_radius_m(REMUS, 1.0, SHARE)
+    radius = steady.min_radius_m(REMUS, 1.0, SHARE)
     assert 5.0 < radius < 8.0
-    flight = fin_flight(REMUS, 1.0, 1.0 / (1.01 * radius), SHARE)
+    flight = steady.fin_flight(REMUS, 1.0, 1.0 / (1.01 * radius), SHARE)
     assert flight is not None
-    assert flight.load <= SHARE and flight.drift_rad <= MAX_DRIFT_RAD
-    assert fin_flight(REMUS, 1.0, 1.0 / (0.98 * radius), SHARE) is None
+    assert flight.load <= SHARE and flight.drift_rad <= steady.MAX_DRIFT_RAD
+    assert steady.fin_flight(REMUS, 1.0, 1.0 / (0.98 * radius), SHARE) is None
 
 
 def test_what_cannot_be_flown_by_fins_is_said() -> None:
@@ -110,11 +96,11 @@ def test_what_cannot_be_flown_by_fins_is_said() -> None:
         position_body_m=(0.0, 0.0, 0.0),
     )  # fmt: skip
     with pytest.raises(VehicleError, match="not controlled together"):
-        gains_for(replace(REMUS, thrusters=(*REMUS.thrusters, up)), 1.0)
+        g.gains_for(replace(REMUS, thrusters=(*REMUS.thrusters, up)), 1.0)
     with pytest.raises(VehicleError, match="cannot control surge"):
-        gains_for(replace(REMUS, thrusters=()), 1.0)
+        g.gains_for(replace(REMUS, thrusters=()), 1.0)
     with pytest.raises(VehicleError, match="at no speed"):
-        min_speed_mps(replace(REMUS, fins=REMUS.fins[1:]), SHARE)
+        steady.min_speed_mps(replace(REMUS, fins=REMUS.fins[1:]), SHARE)
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
@@ -209,13 +195,13 @@ def test_the_tables_have_ten_times_the_drag_across_that_their_equations_give() -
 
 @pytest.mark.parametrize("speed", SPEEDS)
 def test_loops_are_damped_and_within_the_strength_of_the_fins(speed: float) -> None:
-    gains = gains_for(REMUS, speed)
+    gains = g.gains_for(REMUS, speed)
     assert gains.dives_by_pitch and not gains.holds_level
     assert not gains.axes[[g.SWAY, g.HEAVE, g.ROLL]].any()
-    for axis, plane in ((g.YAW, LATERAL), (g.PITCH, VERTICAL)):
+    for axis, plane in ((g.YAW, g.LATERAL), (g.PITCH, g.VERTICAL)):
         row = gains.axes[axis]
-        loop = heading_loop(gains.body, speed, row, gains.fins, plane)
-        assert g.MIN_HEADING_DAMPING < damping_ratio(loop) < 1.0
+        loop = g.heading_loop(gains.body, speed, row, gains.fins, plane)
+        assert g.MIN_HEADING_DAMPING < g.damping_ratio(loop) < 1.0
         poles = np.linalg.eigvals(loop)
         assert poles.real.max() < -0.02
         # An error of 10 deg takes about the moment that there is.
@@ -231,7 +217,7 @@ def test_four_fins_that_turn_apart_hold_roll_too() -> None:
         for fin in (planes, rudders)
         for i, place in enumerate(fin.positions_body_m)
     )
-    gains = gains_for(replace(REMUS, fins=apart), 1.0)
+    gains = g.gains_for(replace(REMUS, fins=apart), 1.0)
     assert gains.holds_level and gains.dives_by_pitch
     assert gains.axes[g.ROLL, g.MAX_FORCE] > 0.5
 
@@ -240,9 +226,9 @@ def test_power_is_that_of_drag_and_turns() -> None:
     """At 1.5 m/s, nearly level: the propeller gives X_uu u^2 / (1 - t), by its open-water curve."""
     nu = np.zeros((4, 6))
     nu[:, 0], nu[1, 5], nu[2, 0], nu[3, 1] = 1.5, 0.2, 0.2, 0.1
-    flight = steady_flight(REMUS, nu, share=SHARE)
+    flight = steady.steady_flight(REMUS, nu, share=SHARE)
     assert np.isnan(flight.power_w).tolist() == [False, False, True, True]
-    level = balance_fins(REMUS, 1.5)
+    level = steady.balance_fins(REMUS, 1.5)
     assert level is not None
     assert level.force_x_n == pytest.approx(2.94 * 1.5**2, rel=0.05)
     n = flight.rps[0, 0]

@@ -4,13 +4,7 @@ import numpy as np
 import pytest
 
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.identification.output_error import (
-    Stretches,
-    design_effect,
-    in_stretches,
-    jackknife_covariance,
-    stretch_numbers,
-)
+from alice_survey.sim.vehicle.identification import output_error as fits
 
 ROWS, WINDOW = 2000, 50
 NOTHING = np.zeros((2, 2))
@@ -24,16 +18,16 @@ def noise(rng: np.random.Generator, decay: float) -> Array:
     return values
 
 
-def fitted(rng: np.random.Generator, decay: float) -> tuple[Array, Stretches]:
+def fitted(rng: np.random.Generator, decay: float) -> tuple[Array, fits.Stretches]:
     """Error of a level and of a factor on a slow motion, and what stretches of the log say."""
     slopes = np.column_stack([np.ones(ROWS), np.sin(np.arange(ROWS) / 40.0)])
     residuals = noise(rng, decay)
     error = -np.linalg.lstsq(slopes, residuals, rcond=None)[0]
     residuals = residuals + slopes @ error
     windows = [np.arange(WINDOW, dtype=float) for _ in range(ROWS // WINDOW)]
-    number = np.concatenate(stretch_numbers(windows))
+    number = np.concatenate(fits.stretch_numbers(windows))
     assert number.max() == 9
-    return error, in_stretches(residuals, slopes, number)
+    return error, fits.in_stretches(residuals, slopes, number)
 
 
 @pytest.mark.parametrize("decay", [0.0, 0.8, 0.95])
@@ -42,12 +36,12 @@ def test_errors_are_as_large_as_they_are_said_to_be(decay: float) -> None:
     scores, white, effects = [], [], []
     for _ in range(200):
         error, stretches = fitted(rng, decay)
-        covariance = jackknife_covariance(stretches, NOTHING)
+        covariance = fits.jackknife_covariance(stretches, NOTHING)
         assert covariance is not None
         scores.append(error / np.sqrt(np.diag(covariance)))
         inverse = np.linalg.inv(stretches.information.sum(axis=0))
         white.append(error / np.sqrt(np.diag(inverse)))
-        effects.append(design_effect(stretches, NOTHING))
+        effects.append(fits.design_effect(stretches, NOTHING))
     rms, rms_white = (np.sqrt(np.mean(np.square(z))) for z in (scores, white))
     assert 0.85 < rms < 1.25
     # A process with this memory counts (1 + a) / (1 - a) times in its mean.
@@ -59,26 +53,26 @@ def test_errors_are_as_large_as_they_are_said_to_be(decay: float) -> None:
 
 def test_stretches_keep_windows_whole_and_cut_a_single_one() -> None:
     windows = [np.linspace(0.0, 5.0, 51) for _ in range(41)]
-    numbers = stretch_numbers(windows)
+    numbers = fits.stretch_numbers(windows)
     assert all(len(set(number.tolist())) == 1 for number in numbers)
     counts = np.bincount([number[0] for number in numbers])
     assert len(counts) == 10
     assert set(counts.tolist()) <= {4, 5}
-    (whole,) = stretch_numbers([np.linspace(0.0, 60.0, 601)])
+    (whole,) = fits.stretch_numbers([np.linspace(0.0, 60.0, 601)])
     assert np.bincount(whole).tolist() == [60] * 9 + [61]
-    many = np.array([n[0] for n in stretch_numbers([np.linspace(0.0, 5.0, 51)] * 1000)])
+    many = np.array([n[0] for n in fits.stretch_numbers([np.linspace(0.0, 5.0, 51)] * 1000)])
     assert many.max() == 19
-    few = [number[0] for number in stretch_numbers([np.linspace(0.0, 5.0, 51)] * 6)]
+    few = [number[0] for number in fits.stretch_numbers([np.linspace(0.0, 5.0, 51)] * 6)]
     assert few == list(range(6))
 
 
 def test_few_stretches_give_no_spread_and_a_prior_stays() -> None:
     _, stretches = fitted(np.random.default_rng(2), 0.8)
-    few = Stretches(scores=stretches.scores[:4], information=stretches.information[:4])
-    assert jackknife_covariance(few, NOTHING) is None
-    assert design_effect(few, NOTHING) == 1.0
-    free = jackknife_covariance(stretches, NOTHING)
-    held = jackknife_covariance(stretches, np.diag([1e6, 1e-6]))
+    few = fits.Stretches(scores=stretches.scores[:4], information=stretches.information[:4])
+    assert fits.jackknife_covariance(few, NOTHING) is None
+    assert fits.design_effect(few, NOTHING) == 1.0
+    free = fits.jackknife_covariance(stretches, NOTHING)
+    held = fits.jackknife_covariance(stretches, np.diag([1e6, 1e-6]))
     assert free is not None and held is not None
     # A parameter that the prior holds is not moved by noise; another is, as before.
     assert held[0, 0] < 1e-2 * free[0, 0]

@@ -7,16 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from alice_survey.core.errors import VehicleError
+from alice_survey.sim.vehicle import vehicle as vehicles
 from alice_survey.sim.vehicle.coefficients import Coefficients
 from alice_survey.sim.vehicle.identification.problem import inputs, make_windows
 from alice_survey.sim.vehicle.log import VehicleLog, read_column_map, read_foreign_log
-from alice_survey.sim.vehicle.vehicle import (
-    coefficients_from_file,
-    speeds_missing,
-    vehicle_from,
-    vehicle_from_file,
-    write_coefficients,
-)
 
 HERE = Path(__file__).parent
 SMALL = """
@@ -46,7 +40,7 @@ def small(tmp_path: Path, text: str = SMALL) -> Path:
 
 
 def test_any_thruster_matrix_comes_from_a_file(tmp_path: Path) -> None:
-    made = vehicle_from(str(small(tmp_path)))
+    made = vehicles.vehicle_from(str(small(tmp_path)))
     assert made.name == "small"
     assert made.coefficients.values == {"X_uu": -20.0}
     log = VehicleLog(
@@ -58,7 +52,7 @@ def test_any_thruster_matrix_comes_from_a_file(tmp_path: Path) -> None:
     # More thrust to port turns the bow to starboard: 0.3 m times the difference.
     np.testing.assert_allclose(wrench[:, 0], [2, 2, 0])
     np.testing.assert_allclose(wrench[:, 5], [0, 0.6, 1.8])
-    assert speeds_missing(small(tmp_path)) == [
+    assert vehicles.speeds_missing(small(tmp_path)) == [
         "left (diameter_m, kt_forward, kt_reverse, time_constant_s)",
         "right (diameter_m, kt_forward, kt_reverse, time_constant_s)",
     ]
@@ -83,24 +77,26 @@ def test_faults_of_vehicle_files_are_named(
 ) -> None:
     assert old in SMALL
     with pytest.raises(VehicleError) as raised:
-        vehicle_from_file(small(tmp_path, SMALL.replace(old, new, 1)))
+        vehicles.vehicle_from_file(small(tmp_path, SMALL.replace(old, new, 1)))
     assert message in str(raised.value)
 
 
 def test_coefficients_go_through_a_file(tmp_path: Path) -> None:
     known = Coefficients(name="found", values={"X_uu": -12.3456789012, "Y_rdot": 1.5})
-    write_coefficients(tmp_path / "c.json", known, {"vehicle": "alice", "values_of": "nothing"})
-    read = coefficients_from_file(tmp_path / "c.json")
+    vehicles.write_coefficients(
+        tmp_path / "c.json", known, {"vehicle": "alice", "values_of": "nothing"}
+    )
+    read = vehicles.coefficients_from_file(tmp_path / "c.json")
     assert (read.name, read.values) == ("found", known.values)
     plain = tmp_path / "plain.toml"
     plain.write_text("X_uu = -3\n")
-    assert coefficients_from_file(plain).values == {"X_uu": -3.0}
+    assert vehicles.coefficients_from_file(plain).values == {"X_uu": -3.0}
     (tmp_path / "other.json").write_text('{"format": "else 2", "values": {"X_uu": 1}}')
     with pytest.raises(VehicleError, match="'else 2'"):
-        coefficients_from_file(tmp_path / "other.json")
+        vehicles.coefficients_from_file(tmp_path / "other.json")
     (tmp_path / "none.json").write_text("{}")
     with pytest.raises(VehicleError, match=r"none\.json"):
-        coefficients_from_file(tmp_path / "none.json")
+        vehicles.coefficients_from_file(tmp_path / "none.json")
 
 
 def test_foreign_axes_become_ours(tmp_path: Path) -> None:
@@ -129,7 +125,7 @@ def test_foreign_axes_become_ours(tmp_path: Path) -> None:
 
 
 def test_missing_inputs_are_held_but_not_for_long(capsys: pytest.CaptureFixture[str]) -> None:
-    known, time_s = vehicle_from("alice"), np.arange(60.0) * 0.1
+    known, time_s = vehicles.vehicle_from("alice"), np.arange(60.0) * 0.1
     rpm = {t.name: np.full(60, 600.0) for t in known.thrusters}
     rpm["port"][10:14] = np.nan
     rpm["port"][30:50] = np.nan
@@ -148,7 +144,7 @@ def test_damping_must_damp(tmp_path: Path) -> None:
     path = tmp_path / "found.json"
     path.write_text('{"X_uu": -14.0, "Y_vv": 300.0}')
     with pytest.raises(VehicleError, match=r"found\.json: .* Y "):
-        coefficients_from_file(path)
+        vehicles.coefficients_from_file(path)
     path.write_text('{"a": -14.0}')
     with pytest.raises(VehicleError, match=r"found\.json: .*\'a\'"):
-        coefficients_from_file(path)
+        vehicles.coefficients_from_file(path)

@@ -5,10 +5,7 @@ import pytest
 
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.identification.output_error import (
-    OutputErrorFit,
-    fit_output_error,
-)
+from alice_survey.sim.vehicle.identification import output_error as fits
 from alice_survey.sim.vehicle.identification.problem import free_parameters, make_windows, unit_of
 from alice_survey.sim.vehicle.log import VehicleLog
 from alice_survey.sim.vehicle.vehicle import vehicle_from
@@ -19,9 +16,11 @@ DAMPING = ("X_uu", "Y_vv", "Z_ww", "N_rr")
 QUICK_S = 0.05
 
 
-def fitted(log: VehicleLog, free: tuple[str, ...], window_s: float | None = None) -> OutputErrorFit:
+def fitted(
+    log: VehicleLog, free: tuple[str, ...], window_s: float | None = None
+) -> fits.OutputErrorFit:
     windows = make_windows(log, KNOWN, window_s=window_s)
-    return fit_output_error(windows, free_parameters(KNOWN, free), max_step_s=QUICK_S)
+    return fits.fit_output_error(windows, free_parameters(KNOWN, free), max_step_s=QUICK_S)
 
 
 def test_hidden_coefficients_and_current_are_recovered() -> None:

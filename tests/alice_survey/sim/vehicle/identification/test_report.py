@@ -13,12 +13,7 @@ from alice_survey.core.errors import VehicleError
 from alice_survey.sim.vehicle.identification.report import IdentifyOptions, identify_report
 from alice_survey.sim.vehicle.log import write_vehicle_log
 from alice_survey.sim.vehicle.vehicle import coefficients_from_file, vehicle_from
-from tests.alice_survey.sim.vehicle.identification.manoeuvres import (
-    fly,
-    hidden,
-    measured,
-    survey_like,
-)
+from tests.alice_survey.sim.vehicle.identification import manoeuvres as flown
 from tests.alice_survey.sim.vehicle.identification.test_bollard import pull_csv
 
 KNOWN = vehicle_from("alice")
@@ -29,13 +24,16 @@ TRUTH = {"X_uu": -12.0, "N_rr": -70.0}
 def logs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A log, and one of another day: another current, other manoeuvres."""
     folder = tmp_path_factory.mktemp("logs")
-    truth = hidden(TRUTH)
-    first = fly(truth, duration_s=40.0, current=(0.1, -0.05))
-    second = fly(
-        truth, duration_s=30.0, current=(-0.05, 0.1), asked=lambda time_s: survey_like(time_s + 53)
+    truth = flown.hidden(TRUTH)
+    first = flown.fly(truth, duration_s=40.0, current=(0.1, -0.05))
+    second = flown.fly(
+        truth,
+        duration_s=30.0,
+        current=(-0.05, 0.1),
+        asked=lambda time_s: flown.survey_like(time_s + 53),
     )
     for seed, (name, log) in enumerate((("first", first), ("second", second))):
-        write_vehicle_log(folder / f"{name}.csv", measured(log, np.random.default_rng(seed)))
+        write_vehicle_log(folder / f"{name}.csv", flown.measured(log, np.random.default_rng(seed)))
     return folder / "first.csv", folder / "second.csv"
 
 

@@ -5,13 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from alice_survey.core.frames import Array, rotation_from_attitude
+from alice_survey.sim.vehicle.identification import sensitivity
 from alice_survey.sim.vehicle.identification.problem import Parameters, free_parameters
-from alice_survey.sim.vehicle.identification.sensitivity import (
-    START,
-    Record,
-    simulate,
-    with_given,
-)
 from alice_survey.sim.vehicle.vehicle import vehicle_from
 from tests.oracles_identification import integrated
 
@@ -23,7 +18,7 @@ ALL = (
 ROWS, STEP_S = 41, 0.05
 
 
-def a_record(rng: np.random.Generator) -> Record:
+def a_record(rng: np.random.Generator) -> sensitivity.Record:
     time_s = np.arange(ROWS, dtype=float) * STEP_S
     attitude = rotation_from_attitude(
         0.1 * np.sin(time_s), 0.1 * np.cos(time_s), 0.5 + 0.2 * time_s
@@ -31,21 +26,23 @@ def a_record(rng: np.random.Generator) -> Record:
     acceleration = np.zeros((ROWS, 6))
     acceleration[:, 3] = np.cos(2 * time_s)
     rps = rng.uniform(-30, 30, (ROWS, 5))
-    return Record(time_s, rps, rng.normal(size=(ROWS, 6)), attitude, acceleration)
+    return sensitivity.Record(time_s, rps, rng.normal(size=(ROWS, 6)), attitude, acceleration)
 
 
 def run(
     parameters: Parameters,
     values: Array,
-    record: Record,
+    record: sensitivity.Record,
     start: Array,
     *,
     given: tuple[int, ...] = (),
     slopes: bool = True,
     step_s: float = STEP_S,
 ) -> tuple[Array, Array, Array]:
-    physics = with_given(parameters.physics(values), given)
-    return simulate(physics, parameters.terms if slopes else None, record, start, step_s)
+    physics = sensitivity.with_given(parameters.physics(values), given)
+    return sensitivity.simulate(
+        physics, parameters.terms if slopes else None, record, start, step_s
+    )
 
 
 def a_start() -> Array:
@@ -53,7 +50,7 @@ def a_start() -> Array:
     return np.concatenate([quaternion, [0.6, -0.2, 0.1, 0.1, -0.05, 0.2]])
 
 
-def a_case() -> tuple[Parameters, Array, Record, Array]:
+def a_case() -> tuple[Parameters, Array, sensitivity.Record, Array]:
     parameters = free_parameters(vehicle_from("alice"), ALL)
     rng = np.random.default_rng(4)
     values = parameters.start * rng.uniform(0.8, 1.2, len(parameters.names))
@@ -70,7 +67,7 @@ def test_a_window_is_what_the_simulators_equations_give() -> None:
     parameters = free_parameters(truth, ("X_uu",))
     rps, load = np.array([25.0, -10.0, 12.0, 30.0, -20.0]), np.array([3.0, -2, 4, 0.1, 0.5, -1])
     time_s = np.arange(201.0) * STEP_S
-    record = Record(
+    record = sensitivity.Record(
         time_s, np.tile(rps, (201, 1)), np.tile(load, (201, 1)), np.tile(a_start()[:4], (201, 1)),
         np.zeros((201, 6)),
     )  # fmt: skip
@@ -106,7 +103,7 @@ def test_sensitivities_to_the_start_are_slopes_too() -> None:
     parameters, values, record, start = a_case()
     derivatives = run(parameters, values, record, start)[2][:, :, len(values) :]
     step = 1e-6
-    for k in range(START):
+    for k in range(sensitivity.START):
         moved = []
         for sign in (1.0, -1.0):
             other = start.copy()
@@ -127,11 +124,11 @@ def test_a_lagging_thruster_is_followed_exactly_between_rows() -> None:
     coarse_s, fine_s = np.arange(11.0) * 0.2, np.arange(201.0) * 0.01
     asked = np.array([30.0, 10.0, -20.0, 40.0, -40.0])
 
-    def record(time_s: Array) -> Record:
+    def record(time_s: Array) -> sensitivity.Record:
         rps = asked * (1 - np.exp(-time_s[:, None] / lag))
         rows = len(time_s)
         attitude = np.tile(a_start()[:4], (rows, 1))
-        return Record(time_s, rps, np.zeros((rows, 6)), attitude, np.zeros((rows, 6)))
+        return sensitivity.Record(time_s, rps, np.zeros((rows, 6)), attitude, np.zeros((rows, 6)))
 
     values = parameters.start
     few = run(parameters, values, record(coarse_s), a_start(), slopes=False, step_s=0.01)[0]

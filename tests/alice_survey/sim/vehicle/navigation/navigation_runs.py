@@ -8,12 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.core.compiled import kernel
 from alice_survey.sim.vehicle.estimate_vector import ESTIMATE
-from alice_survey.sim.vehicle.navigation.filter import (
-    GYRO_BIAS,
-    WATER,
-    NavigationState,
-    new_navigation,
-)
+from alice_survey.sim.vehicle.navigation import filter as nf
 from alice_survey.sim.vehicle.navigation.sensors import IMU, Sensors
 from alice_survey.sim.vehicle.navigation.tick import LOG_ROW, log_row, navigation_tick
 from alice_survey.sim.vehicle.sea import FloorGrid
@@ -29,7 +24,7 @@ def _run(
     water: Array,
     floor: FloorGrid,
     sensors: Sensors,
-    nav: NavigationState,
+    nav: nf.NavigationState,
     rng: np.random.Generator,
     estimate: Array,
     log: Array,
@@ -70,7 +65,7 @@ class Run:
     hidden: Array
     covariance: Array
     water: Array
-    nav: NavigationState
+    nav: nf.NavigationState
     sensors: Sensors
     every: int
 
@@ -85,8 +80,10 @@ class Run:
         error[:, 3:6] = (1 + self.hidden[:, 8:9]) * velocity - self.nominal[:, 3:6]
         believed = Rotation.from_quat(self.nominal[:, 6:10])
         error[:, 6:9] = (attitude * believed.inv()).as_rotvec()
-        error[:, GYRO_BIAS:WATER] = self.hidden - self.nominal[:, GYRO_BIAS + 1 : WATER + 1]
-        error[:, WATER:] = self.water[:2] - self.nominal[:, WATER + 1 :]
+        error[:, nf.GYRO_BIAS : nf.WATER] = (
+            self.hidden - self.nominal[:, nf.GYRO_BIAS + 1 : nf.WATER + 1]
+        )
+        error[:, nf.WATER :] = self.water[:2] - self.nominal[:, nf.WATER + 1 :]
         return error
 
     def nees(self, states: slice) -> Array:
@@ -108,13 +105,13 @@ def fly(
     *,
     water: Array | None = None,
     every: int = 100,
-    start: NavigationState | None = None,
+    start: nf.NavigationState | None = None,
 ) -> Run:
     """Navigate a known track; the current is drawn from the filter's own belief if not given."""
     rng = np.random.default_rng(seed)
     drawn = np.array([*(sensors.current_sigma_mps * rng.standard_normal(2)), 0.0])
     water = drawn if water is None else water
-    nav = start or new_navigation(sensors, truth[0], rng)
+    nav = start or nf.new_navigation(sensors, truth[0], rng)
     count = len(truth)
     epochs = (count - 1) // every + 1
     run = Run(

@@ -6,102 +6,51 @@ import numpy as np
 import pytest
 from numpy.random import default_rng
 
+from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import rotations
-from alice_survey.sim.vehicle.navigation.filter import (
-    BEAM,
-    BELIEVED,
-    COMPASS_USE,
-    DEPTH,
-    DVL_SCALE,
-    DVL_USE,
-    GPS_FIX,
-    HEADING,
-    HEADING_BIAS,
-    PUSH,
-    QUATERNION,
-    RATES,
-    REJECTED,
-    ROW,
-    RUN,
-    TRUTH_NOW,
-    TURN,
-    USBL_FIX,
-    USBL_USE,
-    USED,
-    WATER_BEAM,
-    WIDENED,
-    NavigationState,
-    correct,
-    lever_row,
-    new_navigation,
-    predict,
-    use_beams,
-    use_depth,
-    use_heading,
-)
-from alice_survey.sim.vehicle.navigation.sensors import (
-    GPS,
-    USBL,
-    CompassSpec,
-    DvlSpec,
-    GpsSpec,
-    ImuSpec,
-    PressureSpec,
-    Sensors,
-    SensorSuite,
-    UsblSpec,
-)
-from alice_survey.sim.vehicle.navigation.tick import (
-    LOG_COLUMNS,
-    measure_imu,
-    navigation_tick,
-)
+from alice_survey.sim.vehicle.navigation import filter as nf
+from alice_survey.sim.vehicle.navigation import sensors as part
+from alice_survey.sim.vehicle.navigation import tick
 from alice_survey.sim.vehicle.sea import FloorGrid, level_floor
 from tests import oracles_navigation as oracle
-from tests.alice_survey.sim.vehicle.navigation.navigation_runs import (
-    TICK_S,
-    Array,
-    fly,
-    straight,
-    track,
-)
+from tests.alice_survey.sim.vehicle.navigation.navigation_runs import TICK_S, fly, straight, track
 
 TINY = 1e-9
-PERFECT_IMU = ImuSpec(
+PERFECT_IMU = part.ImuSpec(
     gyro_bias_sigma_radps=TINY, gyro_bias_walk_radps_per_sqrt_s=0.0,
     accelerometer_bias_sigma_mps2=TINY, accelerometer_bias_walk_mps2_per_sqrt_s=0.0,
     tilt_sigma_rad=TINY,
 )  # fmt: skip
-PERFECT_COMPASS = CompassSpec(noise_rad=1e-6, bias_sigma_rad=TINY)
-PERFECT_DVL = DvlSpec(
+PERFECT_COMPASS = part.CompassSpec(noise_rad=1e-6, bias_sigma_rad=TINY)
+PERFECT_DVL = part.DvlSpec(
     scale_sigma=TINY, bias_sigma_mps=TINY, misalignment_sigma_rad=TINY, ping_loss=0.0,
     beam_loss=0.0, outlier_probability=0.0, beam_noise_per_speed=0.0,
 )  # fmt: skip
-PERFECT_GPS = GpsSpec(noise_m=1e-6, bias_sigma_m=TINY)
+PERFECT_GPS = part.GpsSpec(noise_m=1e-6, bias_sigma_m=TINY)
 
 FLOOR = level_floor(15.0)
 
 
 def column(name: str) -> int:
-    return LOG_COLUMNS.index(name)
+    return tick.LOG_COLUMNS.index(name)
 
 
-def shaken(sensors: Sensors, truth: Array) -> NavigationState:
+def shaken(sensors: part.Sensors, truth: Array) -> nf.NavigationState:
     """A filter that has seen a few seconds, with biases believed and a full covariance."""
     run = fly(sensors, truth[:101], FLOOR, 7)
     nav, rng = run.nav, default_rng(11)
-    nav.nominal[QUATERNION + 4 :] += 1e-3 * rng.standard_normal(16)
-    nav.nominal[DVL_SCALE + 1] = 0.0
-    rotations.matrix_of(nav.nominal[QUATERNION : QUATERNION + 4], nav.turns[BELIEVED])
+    nav.nominal[nf.QUATERNION + 4 :] += 1e-3 * rng.standard_normal(16)
+    nav.nominal[nf.DVL_SCALE + 1] = 0.0
+    rotations.matrix_of(nav.nominal[nf.QUATERNION : nf.QUATERNION + 4], nav.turns[nf.BELIEVED])
     mixed = rng.standard_normal((25, 40))
     sigma = np.sqrt(np.diag(nav.covariance))
     nav.covariance[:] = sigma[:, None] * (mixed @ mixed.T / 40.0) * sigma
     return nav
 
 
-ALL_AT_ONCE = SensorSuite(
-    usbl=UsblSpec(rate_hz=1.0, outlier_probability=0.0),
-    dvl=DvlSpec(outlier_probability=0.0, ping_loss=0.0, beam_loss=0.0, water_every=1),
+ALL_AT_ONCE = part.SensorSuite(
+    usbl=part.UsblSpec(rate_hz=1.0, outlier_probability=0.0),
+    dvl=part.DvlSpec(outlier_probability=0.0, ping_loss=0.0, beam_loss=0.0, water_every=1),
     gate_sigmas=1e3,
 )
 
@@ -112,19 +61,19 @@ def test_a_run_equals_the_dense_twin() -> None:
     truth = track(8.0, speed_mps=0.4, line_m=1.0, turn_s=4.0, depth_m=0.28)
     truth[:, 2], truth[:, 9] = 0.28, 0.0
     rng = default_rng(5)
-    nav = new_navigation(sensors, truth[0], rng)
+    nav = nf.new_navigation(sensors, truth[0], rng)
     water, estimate = np.array([0.1, -0.05, 0.0]), np.zeros(14)
     belief, covariance = oracle.from_nominal(nav.nominal), nav.covariance.copy()
     for k in range(len(truth)):
-        navigation_tick(
+        tick.navigation_tick(
             k * TICK_S, k, TICK_S, truth[max(k - 1, 0)], truth[k], water, FLOOR, sensors, nav, rng,
             estimate,
         )  # fmt: skip
         readings = nav.readings
         if k > 0:
             belief, covariance, _ = oracle.predict(
-                belief, covariance, readings[TURN : TURN + 3], readings[PUSH : PUSH + 3], sensors,
-                TICK_S,
+                belief, covariance, readings[nf.TURN : nf.TURN + 3],
+                readings[nf.PUSH : nf.PUSH + 3], sensors, TICK_S,
             )  # fmt: skip
         belief, covariance = twin_update(k, belief, covariance, readings, sensors)
         sigma = np.sqrt(np.diag(covariance))
@@ -134,12 +83,16 @@ def test_a_run_equals_the_dense_twin() -> None:
         np.testing.assert_allclose(error / sigma, 0.0, atol=1e-3)
         scaled = (nav.covariance - covariance) / np.outer(sigma, sigma)
         np.testing.assert_allclose(scaled, 0.0, atol=1e-3)
-    assert nav.counts[:, USED].tolist() == [81, 81, 164, 164, 9, 9]
+    assert nav.counts[:, nf.USED].tolist() == [81, 81, 164, 164, 9, 9]
     np.testing.assert_array_equal(nav.covariance, nav.covariance.T)
 
 
 def twin_update(
-    tick: int, belief: oracle.Belief, covariance: Array, readings: Array, sensors: Sensors
+    tick: int,
+    belief: oracle.Belief,
+    covariance: Array,
+    readings: Array,
+    sensors: part.Sensors,
 ) -> tuple[oracle.Belief, Array]:
     """All that is due in a tick, at once."""
     asked: list[Callable[[oracle.Belief], Array]] = []
@@ -153,7 +106,7 @@ def twin_update(
 
     if tick % 2 == 0:
         heading = oracle.heading(belief)
-        wrapped = heading + rotations.wrap_angle(readings[HEADING] - heading)
+        wrapped = heading + rotations.wrap_angle(readings[nf.HEADING] - heading)
         add(
             lambda b: np.array([heading + rotations.wrap_angle(oracle.heading(b) - heading)]),
             np.array([wrapped]),
@@ -161,19 +114,19 @@ def twin_update(
         )
         add(
             lambda b: np.array([oracle.depth(b, sensors)]),
-            readings[DEPTH : DEPTH + 1],
+            readings[nf.DEPTH : nf.DEPTH + 1],
             np.array([sensors.pressure.noise_m**2]),
         )
     if tick % 20 == 0:
-        fix, heard = readings[GPS_FIX : GPS_FIX + 2], readings[USBL_FIX : USBL_FIX + 2]
+        fix, heard = readings[nf.GPS_FIX : nf.GPS_FIX + 2], readings[nf.USBL_FIX : nf.USBL_FIX + 2]
         add(lambda b: oracle.gps(b, sensors), fix, np.full(2, sensors.gps.noise_m**2))
         boat = np.array(sensors.usbl.boat_ned_m)
-        slant2 = np.sum((oracle.place(belief, sensors, USBL) - boat) ** 2)
+        slant2 = np.sum((oracle.place(belief, sensors, part.USBL) - boat) ** 2)
         spread = sensors.usbl.noise_m**2 + sensors.usbl.noise_fraction**2 * slant2
         add(lambda b: oracle.usbl(b, sensors), heard, np.full(2, spread))
     if tick % 4 == 0:
-        rates = readings[RATES : RATES + 3].copy()
-        for first, water in ((BEAM, False), (WATER_BEAM, True)):
+        rates = readings[nf.RATES : nf.RATES + 3].copy()
+        for first, water in ((nf.BEAM, False), (nf.WATER_BEAM, True)):
             noise = np.full(4, sensors.dvl.water_noise_mps**2)
             if not water:
                 along = oracle.beams(belief, sensors, rates, False)
@@ -208,12 +161,12 @@ def twin_update(
 def test_the_transition_equals_finite_differences() -> None:
     sensors, truth = ALL_AT_ONCE.pack(), track(10.0, line_m=1.0, speed_mps=0.3)
     nav = shaken(sensors, truth)
-    rotations.matrix_of(truth[102, 3:7], nav.turns[TRUTH_NOW])
-    measure_imu(TICK_S, truth[101], truth[102], sensors, nav, default_rng(0))
+    rotations.matrix_of(truth[102, 3:7], nav.turns[nf.TRUTH_NOW])
+    tick.measure_imu(TICK_S, truth[101], truth[102], sensors, nav, default_rng(0))
     belief, covariance = oracle.from_nominal(nav.nominal), nav.covariance.copy()
-    turn, push = nav.readings[TURN : TURN + 3], nav.readings[PUSH : PUSH + 3]
+    turn, push = nav.readings[nf.TURN : nf.TURN + 3], nav.readings[nf.PUSH : nf.PUSH + 3]
     after, expected, _ = oracle.predict(belief, covariance, turn, push, sensors, TICK_S)
-    predict(TICK_S, sensors, nav)
+    nf.predict(TICK_S, sensors, nav)
     assert np.abs(after.error_of(oracle.from_nominal(nav.nominal))).max() < 1e-12
     sigma = np.sqrt(np.diag(expected))
     scaled = (nav.covariance - expected) / np.outer(sigma, sigma)
@@ -224,44 +177,44 @@ def test_the_transition_equals_finite_differences() -> None:
 def test_rows_equal_finite_differences(name: str) -> None:
     sensors, truth = ALL_AT_ONCE.pack(), track(10.0, line_m=1.0, speed_mps=0.3)
     nav = shaken(sensors, truth)
-    nav.readings[BEAM : BEAM + 4] = nav.readings[WATER_BEAM : WATER_BEAM + 4] = 0.1
+    nav.readings[nf.BEAM : nf.BEAM + 4] = nav.readings[nf.WATER_BEAM : nf.WATER_BEAM + 4] = 0.1
     nav.nominal[24:26] = [0.2, -0.3]
-    belief, rates = oracle.from_nominal(nav.nominal), nav.readings[RATES : RATES + 3].copy()
+    belief, rates = oracle.from_nominal(nav.nominal), nav.readings[nf.RATES : nf.RATES + 3].copy()
     # The last row that was weighed stays in scratch: of the beams the fourth.
     reading: dict[str, Callable[[oracle.Belief], float]] = {
         "heading": oracle.heading,
         "depth": lambda b: oracle.depth(b, sensors),
-        "gps": lambda b: float(oracle.place(b, sensors, GPS)[1]),
+        "gps": lambda b: float(oracle.place(b, sensors, part.GPS)[1]),
         "beams": lambda b: float(oracle.beams(b, sensors, rates, False)[3]),
         "water": lambda b: float(oracle.beams(b, sensors, rates, True)[3]),
     }
     weigh: dict[str, Callable[[], object]] = {
-        "heading": lambda: use_heading(nav, sensors),
-        "depth": lambda: use_depth(nav, sensors),
-        "gps": lambda: lever_row(nav, sensors, GPS, 1),
-        "beams": lambda: use_beams(nav, sensors, False),
-        "water": lambda: use_beams(nav, sensors, True),
+        "heading": lambda: nf.use_heading(nav, sensors),
+        "depth": lambda: nf.use_depth(nav, sensors),
+        "gps": lambda: nf.lever_row(nav, sensors, part.GPS, 1),
+        "beams": lambda: nf.use_beams(nav, sensors, False),
+        "water": lambda: nf.use_beams(nav, sensors, True),
     }
     weigh[name]()
     expected = oracle.jacobian(lambda e: np.array([reading[name](belief.moved(e))]), 25)[0]
-    np.testing.assert_allclose(nav.scratch[ROW], expected, atol=1e-8)
+    np.testing.assert_allclose(nav.scratch[nf.ROW], expected, atol=1e-8)
 
 
 def test_a_usbl_bounds_the_drift() -> None:
     truth = straight(600.0)
-    compass = CompassSpec(bias_sigma_rad=np.deg2rad(2.0))
-    gps = GpsSpec(bias_sigma_m=0.05, noise_m=0.05)
-    boat = UsblSpec(rate_hz=0.2, boat_ned_m=(150.0, 20.0, 1.0), outlier_probability=0.1)
+    compass = part.CompassSpec(bias_sigma_rad=np.deg2rad(2.0))
+    gps = part.GpsSpec(bias_sigma_m=0.05, noise_m=0.05)
+    boat = part.UsblSpec(rate_hz=0.2, boat_ned_m=(150.0, 20.0, 1.0), outlier_probability=0.1)
     drift, held, sigma = [], [], []
     for seed in range(8):
         drift.append(
-            fly(SensorSuite(compass=compass, gps=gps).pack(), truth, FLOOR, seed)
+            fly(part.SensorSuite(compass=compass, gps=gps).pack(), truth, FLOOR, seed)
             .horizontal_error()[-1]
         )  # fmt: skip
-        run = fly(SensorSuite(compass=compass, gps=gps, usbl=boat).pack(), truth, FLOOR, seed)
+        run = fly(part.SensorSuite(compass=compass, gps=gps, usbl=boat).pack(), truth, FLOOR, seed)
         held.append(run.horizontal_error()[-1])
         sigma.append(np.hypot(*run.log[-1, 13:15]))
-        assert run.nav.counts[USBL_USE, REJECTED] > 0
+        assert run.nav.counts[nf.USBL_USE, nf.REJECTED] > 0
     rms = [np.sqrt(np.mean(np.square(values))) for values in (drift, held)]
     assert rms[0] > 4.0
     assert rms[1] < 1.0
@@ -270,15 +223,15 @@ def test_a_usbl_bounds_the_drift() -> None:
 
 def test_outliers_are_refused_and_leave_no_trace() -> None:
     truth = track(120.0)
-    clean = DvlSpec(outlier_probability=0.0)
+    clean = part.DvlSpec(outlier_probability=0.0)
     dirty = clean._replace(outlier_probability=0.1)
     ends = []
     for dvl in (clean, dirty):
-        run = fly(SensorSuite(dvl=dvl).pack(), truth, FLOOR, 3)
+        run = fly(part.SensorSuite(dvl=dvl).pack(), truth, FLOOR, 3)
         speed = run.estimate[:, 6:9] - true_velocity(truth)
         ends.append(np.abs(speed[200:]).max())
-        counts = run.nav.counts[DVL_USE]
-        share = counts[REJECTED] / counts[USED]
+        counts = run.nav.counts[nf.DVL_USE]
+        share = counts[nf.REJECTED] / counts[nf.USED]
         assert (share > 0.05) if dvl is dirty else (share < 1e-3)
     assert ends[1] < 2.0 * ends[0] < 0.05
 
@@ -292,33 +245,33 @@ def true_velocity(truth: Array) -> Array:
 
 
 def test_a_filter_that_is_sure_and_wrong_comes_back() -> None:
-    usbl = UsblSpec(rate_hz=1.0, outlier_probability=0.0)
-    sensors, truth = SensorSuite(usbl=usbl).pack(), straight(60.0, 0.2)
-    nav = new_navigation(sensors, truth[0], default_rng(2))
+    usbl = part.UsblSpec(rate_hz=1.0, outlier_probability=0.0)
+    sensors, truth = part.SensorSuite(usbl=usbl).pack(), straight(60.0, 0.2)
+    nav = nf.new_navigation(sensors, truth[0], default_rng(2))
     nav.nominal[:2] += 40.0
     run = fly(sensors, truth, FLOOR, 2, start=nav)
     assert run.horizontal_error()[20] > 30.0
-    assert run.nav.counts[USBL_USE, WIDENED] == 1
-    assert run.nav.counts[USBL_USE, REJECTED] == 6
+    assert run.nav.counts[nf.USBL_USE, nf.WIDENED] == 1
+    assert run.nav.counts[nf.USBL_USE, nf.REJECTED] == 6
     assert run.horizontal_error()[-1] < 3.0 * np.hypot(*run.log[-1, 13:15])
 
 
 def test_nothing_that_is_no_number_enters() -> None:
     nothing = FloorGrid(0.0, 0.0, 1.0, np.full((2, 2), np.nan))
-    run = fly(SensorSuite().pack(), track(60.0), nothing, 0)
+    run = fly(part.SensorSuite().pack(), track(60.0), nothing, 0)
     assert np.all(np.isnan(run.estimate[:, 12]))
     assert np.all(np.isfinite(run.estimate[:, :12]))
     assert np.all(np.isfinite(run.covariance))
-    assert run.nav.counts[DVL_USE, USED] == 0
-    sensors = SensorSuite().pack()
+    assert run.nav.counts[nf.DVL_USE, nf.USED] == 0
+    sensors = part.SensorSuite().pack()
     nav = shaken(sensors, track(10.0))
     before, nominal = nav.covariance.copy(), nav.nominal.copy()
-    nav.readings[DEPTH] = nav.readings[HEADING] = np.nan
-    nav.readings[BEAM : BEAM + 4] = np.inf
-    assert not use_depth(nav, sensors)
-    assert not use_heading(nav, sensors)
-    assert use_beams(nav, sensors, False) == 0
-    correct(nav)
+    nav.readings[nf.DEPTH] = nav.readings[nf.HEADING] = np.nan
+    nav.readings[nf.BEAM : nf.BEAM + 4] = np.inf
+    assert not nf.use_depth(nav, sensors)
+    assert not nf.use_heading(nav, sensors)
+    assert nf.use_beams(nav, sensors, False) == 0
+    nf.correct(nav)
     np.testing.assert_array_equal(nav.covariance, before)
     np.testing.assert_allclose(nav.nominal, nominal, rtol=1e-15)
 
@@ -326,9 +279,9 @@ def test_nothing_that_is_no_number_enters() -> None:
 def test_noise_of_the_dvl_walks_with_the_root_of_time() -> None:
     # Whatever the IMU does, a filter that follows white noise of velocity gathers all of it:
     # sigma^2 = (noise of a ping)^2 (time between pings) (time).
-    suite = SensorSuite(
+    suite = part.SensorSuite(
         imu=PERFECT_IMU, compass=PERFECT_COMPASS, dvl=PERFECT_DVL, gps=PERFECT_GPS,
-        pressure=PressureSpec(bias_sigma_m=TINY),
+        pressure=part.PressureSpec(bias_sigma_m=TINY),
     )  # fmt: skip
     sensors = suite.pack()
     of_a_ping = PERFECT_DVL.beam_noise_mps / np.sqrt(np.sum(sensors.beams[:, 0] ** 2))
@@ -345,13 +298,13 @@ def test_noise_of_the_dvl_walks_with_the_root_of_time() -> None:
 
 
 def test_a_heading_bias_leads_astray_by_distance_times_bias() -> None:
-    suite = SensorSuite(
+    suite = part.SensorSuite(
         imu=PERFECT_IMU, dvl=PERFECT_DVL, gps=PERFECT_GPS,
-        compass=CompassSpec(bias_sigma_rad=np.deg2rad(1.0), bias_correlation_s=1e9),
+        compass=part.CompassSpec(bias_sigma_rad=np.deg2rad(1.0), bias_correlation_s=1e9),
     )  # fmt: skip
     sensors, truth = suite.pack(), straight(300.0)
     run = fly(sensors, truth, FLOOR, 4)
-    bias = run.hidden[-1, HEADING_BIAS - 9]
+    bias = run.hidden[-1, nf.HEADING_BIAS - 9]
     distance_m = truth[-1, 0]
     assert abs(bias) > np.deg2rad(0.3)
     # Walked noise of the DVL, 0.04 m, and the compass's, which averages out.
@@ -363,11 +316,11 @@ def test_a_heading_bias_leads_astray_by_distance_times_bias() -> None:
 def test_without_the_dvl_a_level_imu_falls_off_as_integrated_noise() -> None:
     # Angle noise tilts gravity: variance g^2 n^2 t^5 / 20; velocity noise adds m^2 t^3 / 3.
     imu = PERFECT_IMU._replace(gyro_noise_rad_per_sqrt_s=2e-4)
-    suite = SensorSuite(
+    suite = part.SensorSuite(
         imu=imu, compass=PERFECT_COMPASS, gps=PERFECT_GPS, dvl=PERFECT_DVL._replace(rate_hz=0.0)
     )
     sensors, time_s = suite.pack(), 40.0
-    nav = new_navigation(sensors, straight(time_s)[0], default_rng(0))
+    nav = nf.new_navigation(sensors, straight(time_s)[0], default_rng(0))
     nav.covariance[3:6] = nav.covariance[:, 3:6] = 0.0
     nav.covariance[3:6, 3:6] = 1e-12 * np.eye(3)
     run = fly(sensors, straight(time_s), FLOOR, 0, start=nav)
@@ -379,25 +332,25 @@ def test_without_the_dvl_a_level_imu_falls_off_as_integrated_noise() -> None:
 
 
 def test_a_disturbed_compass_is_rejected_first_and_then_widens_its_bias() -> None:
-    sensors, truth = SensorSuite().pack(), straight(60.0, 0.2)
+    sensors, truth = part.SensorSuite().pack(), straight(60.0, 0.2)
     rng = default_rng(2)
-    nav = new_navigation(sensors, truth[0], rng)
+    nav = nf.new_navigation(sensors, truth[0], rng)
     heading, sigma = [], []
     for k in range(len(truth)):
         if k == 400:
-            nav.hidden[HEADING_BIAS - 9] += np.deg2rad(30.0)
+            nav.hidden[nf.HEADING_BIAS - 9] += np.deg2rad(30.0)
         estimate = np.zeros(14)
-        navigation_tick(
+        tick.navigation_tick(
             k * TICK_S, k, TICK_S, truth[max(k - 1, 0)], truth[k], np.zeros(3), FLOOR, sensors,
             nav, rng, estimate,
         )  # fmt: skip
         heading.append(estimate[5])
         sigma.append(np.sqrt(nav.covariance[8, 8]))
-    counts = nav.counts[COMPASS_USE]
-    assert counts[WIDENED] == 1
-    assert counts[REJECTED] == 50
-    assert counts[RUN] == 0
+    counts = nav.counts[nf.COMPASS_USE]
+    assert counts[nf.WIDENED] == 1
+    assert counts[nf.REJECTED] == 50
+    assert counts[nf.RUN] == 0
     # The gyroscopes hold the heading; the bias takes up the disturbance.
     assert np.ptp(heading[390:]) < np.deg2rad(0.5)
-    assert np.rad2deg(nav.nominal[HEADING_BIAS + 1]) == pytest.approx(30.0, abs=3.0)
+    assert np.rad2deg(nav.nominal[nf.HEADING_BIAS + 1]) == pytest.approx(30.0, abs=3.0)
     assert sigma[-1] >= 0.99 * sigma[399]

@@ -8,44 +8,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import rotations
-from alice_survey.sim.vehicle.navigation.filter import (
-    BEAM,
-    PUSH,
-    RANGE,
-    RATES,
-    TRUTH_NOW,
-    TURN,
-    WATER_BEAM,
-    NavigationState,
-    new_navigation,
-)
-from alice_survey.sim.vehicle.navigation.sensors import (
-    DVL,
-    IMU,
-    Sensors,
-    SensorSuite,
-    beam_velocity,
-    janus_beams,
-)
-from alice_survey.sim.vehicle.navigation.tick import measure_dvl, measure_imu
+from alice_survey.sim.vehicle.navigation import filter as nf
+from alice_survey.sim.vehicle.navigation import sensors as part
+from alice_survey.sim.vehicle.navigation import tick
 from alice_survey.sim.vehicle.sea import FloorGrid, level_floor
-from tests.alice_survey.sim.vehicle.navigation.navigation_runs import (
-    TICK_S,
-    Array,
-    fly,
-    straight,
-    track,
-)
+from tests.alice_survey.sim.vehicle.navigation.navigation_runs import TICK_S, fly, straight, track
 
 angles = st.floats(-3.0, 3.0)
 vectors = st.tuples(angles, angles, angles).map(np.array)
 SILENT = 1e-15
 
 
-def silent(suite: SensorSuite | None = None) -> Sensors:
+def silent(suite: part.SensorSuite | None = None) -> part.Sensors:
     """Instruments without error or loss."""
-    packed = (suite or SensorSuite()).pack()
+    packed = (suite or part.SensorSuite()).pack()
     words = ("noise", "walk", "sigma", "loss", "probability")
     kinds = {}
     for kind in ("imu", "compass", "dvl", "pressure", "gps", "usbl"):
@@ -55,12 +33,14 @@ def silent(suite: SensorSuite | None = None) -> Sensors:
     return packed._replace(**kinds, current_sigma_mps=SILENT)
 
 
-def ping(sensors: Sensors, truth: Array, floor: FloorGrid, count: int = 1) -> NavigationState:
+def ping(
+    sensors: part.Sensors, truth: Array, floor: FloorGrid, count: int = 1
+) -> nf.NavigationState:
     """What the DVL hears at a place; number `count` of its pings."""
     rng = np.random.default_rng(0)
-    nav = new_navigation(sensors, truth, rng)
-    rotations.matrix_of(truth[3:7], nav.turns[TRUTH_NOW])
-    measure_dvl(0.0, count, truth, np.array([0.1, -0.2, 0.0]), floor, sensors, nav, rng)
+    nav = nf.new_navigation(sensors, truth, rng)
+    rotations.matrix_of(truth[3:7], nav.turns[nf.TRUTH_NOW])
+    tick.measure_dvl(0.0, count, truth, np.array([0.1, -0.2, 0.0]), floor, sensors, nav, rng)
     return nav
 
 
@@ -88,16 +68,16 @@ def test_turns_are_those_of_scipy(rotation: Array, angle: Array) -> None:
 
 def test_increments_of_the_imu_rebuild_the_motion() -> None:
     sensors, truth = silent(), track(60.0)
-    nav = new_navigation(sensors, truth[0], np.random.default_rng(0))
+    nav = nf.new_navigation(sensors, truth[0], np.random.default_rng(0))
     nav.hidden[:] = 0.0
-    lever = sensors.place[IMU]
+    lever = sensors.place[part.IMU]
     attitude = Rotation.from_quat(truth[0, 3:7])
     velocity = truth[0, 7:10] + attitude.apply(np.cross(truth[0, 10:13], lever))
     rng = np.random.default_rng(0)
     for before, now in pairwise(truth):
-        rotations.matrix_of(now[3:7], nav.turns[TRUTH_NOW])
-        measure_imu(TICK_S, before, now, sensors, nav, rng)
-        push, turn = nav.readings[PUSH : PUSH + 3], nav.readings[TURN : TURN + 3]
+        rotations.matrix_of(now[3:7], nav.turns[nf.TRUTH_NOW])
+        tick.measure_imu(TICK_S, before, now, sensors, nav, rng)
+        push, turn = nav.readings[nf.PUSH : nf.PUSH + 3], nav.readings[nf.TURN : nf.TURN + 3]
         velocity = velocity + attitude.apply(push) + np.array([0.0, 0.0, 9.80665 * TICK_S])
         attitude = attitude * Rotation.from_rotvec(turn)
     last = Rotation.from_quat(truth[-1, 3:7])
@@ -107,15 +87,15 @@ def test_increments_of_the_imu_rebuild_the_motion() -> None:
 
 
 def test_the_imu_errs_by_its_random_walks() -> None:
-    sensors, truth = SensorSuite().pack(), at_depth(3.0)
+    sensors, truth = part.SensorSuite().pack(), at_depth(3.0)
     rng = np.random.default_rng(3)
-    nav = new_navigation(sensors, truth, rng)
+    nav = nf.new_navigation(sensors, truth, rng)
     nav.hidden[:] = 0.0
-    rotations.matrix_of(truth[3:7], nav.turns[TRUTH_NOW])
+    rotations.matrix_of(truth[3:7], nav.turns[nf.TRUTH_NOW])
     rows = np.empty((4000, 9))
     for row in rows:
-        measure_imu(TICK_S, truth, truth, sensors, nav, rng)
-        row[:] = nav.readings[: RATES + 3]
+        tick.measure_imu(TICK_S, truth, truth, sensors, nav, rng)
+        row[:] = nav.readings[: nf.RATES + 3]
     sigma = rows.std(axis=0)
     # The mean of three axes of 4000 draws is good to 0.65 %: four of those.
     assert sigma[:3].mean() == pytest.approx(np.deg2rad(0.01) * TICK_S**0.5, rel=0.026)
@@ -129,16 +109,16 @@ def test_beams_hear_the_floor_and_the_velocity_at_the_dvl() -> None:
     truth = at_depth(8.0, attitude)
     truth[7:10], truth[10:13] = [0.3, -0.1, 0.05], [0.1, -0.2, 0.3]
     nav = ping(sensors, truth, level_floor(15.0))
-    dvl = truth[:3] + attitude.apply(sensors.place[DVL])
+    dvl = truth[:3] + attitude.apply(sensors.place[part.DVL])
     reach = (15.0 - dvl[2]) / attitude.apply(sensors.beams)[:, 2]
-    np.testing.assert_allclose(nav.readings[RANGE : RANGE + 4], reach, atol=1e-4)
-    velocity = attitude.inv().apply(truth[7:10]) + np.cross(truth[10:13], sensors.place[DVL])
-    heard = beam_velocity(sensors.beams, nav.readings[BEAM : BEAM + 4])
+    np.testing.assert_allclose(nav.readings[nf.RANGE : nf.RANGE + 4], reach, atol=1e-4)
+    velocity = attitude.inv().apply(truth[7:10]) + np.cross(truth[10:13], sensors.place[part.DVL])
+    heard = part.beam_velocity(sensors.beams, nav.readings[nf.BEAM : nf.BEAM + 4])
     np.testing.assert_allclose(heard, velocity, atol=1e-9)
-    assert np.all(np.isnan(nav.readings[WATER_BEAM : WATER_BEAM + 4]))
+    assert np.all(np.isnan(nav.readings[nf.WATER_BEAM : nf.WATER_BEAM + 4]))
     through = ping(sensors, truth, level_floor(15.0), count=0).readings
     np.testing.assert_allclose(
-        beam_velocity(sensors.beams, through[WATER_BEAM : WATER_BEAM + 4]),
+        part.beam_velocity(sensors.beams, through[nf.WATER_BEAM : nf.WATER_BEAM + 4]),
         velocity - attitude.inv().apply([0.1, -0.2, 0.0]),
         atol=1e-9,
     )
@@ -158,42 +138,42 @@ def test_the_dvl_hears_what_is_in_its_reach(
 ) -> None:
     truth = at_depth(depth_m, Rotation.from_rotvec([0.0, tilt_rad, 0.0]))
     heard = ping(silent(), truth, level_floor(15.0), count=0).readings
-    assert np.isfinite(heard[BEAM : BEAM + 4]).sum() == beams
-    assert np.isfinite(heard[WATER_BEAM]) == water
+    assert np.isfinite(heard[nf.BEAM : nf.BEAM + 4]).sum() == beams
+    assert np.isfinite(heard[nf.WATER_BEAM]) == water
 
 
 def test_an_imu_at_rest_feels_its_weight_upwards() -> None:
     sensors, truth = silent(), at_depth(3.0, Rotation.from_euler("ZYX", [1.0, 0.0, np.pi / 2]))
-    nav = new_navigation(sensors, truth, np.random.default_rng(0))
-    rotations.matrix_of(truth[3:7], nav.turns[TRUTH_NOW])
-    measure_imu(TICK_S, truth, truth, sensors, nav, np.random.default_rng(0))
+    nav = nf.new_navigation(sensors, truth, np.random.default_rng(0))
+    rotations.matrix_of(truth[3:7], nav.turns[nf.TRUTH_NOW])
+    tick.measure_imu(TICK_S, truth, truth, sensors, nav, np.random.default_rng(0))
     # Rolled to starboard, port is up: -y.
-    push = nav.readings[PUSH : PUSH + 3] / TICK_S
+    push = nav.readings[nf.PUSH : nf.PUSH + 3] / TICK_S
     np.testing.assert_allclose(push, [0.0, -9.80665, 0.0], atol=1e-9)
 
 
 def test_over_a_deep_floor_the_dvl_hears_the_water_alone() -> None:
     sensors = silent()
     heard = ping(sensors, at_depth(8.0), level_floor(200.0)).readings
-    assert np.all(np.isnan(heard[RANGE : RANGE + 4]))
-    through = beam_velocity(sensors.beams, heard[WATER_BEAM : WATER_BEAM + 4])
+    assert np.all(np.isnan(heard[nf.RANGE : nf.RANGE + 4]))
+    through = part.beam_velocity(sensors.beams, heard[nf.WATER_BEAM : nf.WATER_BEAM + 4])
     np.testing.assert_allclose(through, [-0.1, 0.2, 0.0], atol=1e-9)
 
 
 @given(velocity=vectors, missing=st.integers(0, 4))
 def test_three_beams_give_the_velocity_as_four_do(velocity: Array, missing: int) -> None:
-    beams = janus_beams(np.deg2rad(30.0))
+    beams = part.janus_beams(np.deg2rad(30.0))
     along = beams @ velocity
     if missing < 4:
         along[missing] = np.nan
-    np.testing.assert_allclose(beam_velocity(beams, along), velocity, atol=1e-9)
+    np.testing.assert_allclose(part.beam_velocity(beams, along), velocity, atol=1e-9)
     along[(missing + 1) % 4] = np.nan
     along[(missing + 2) % 4] = np.nan
-    assert np.all(np.isnan(beam_velocity(beams, along)))
+    assert np.all(np.isnan(part.beam_velocity(beams, along)))
 
 
 def test_no_echo_comes_in_a_drop_out() -> None:
-    suite = SensorSuite(dvl_dropouts_s=((2.0, 3.0), (5.0, 5.5)))
+    suite = part.SensorSuite(dvl_dropouts_s=((2.0, 3.0), (5.0, 5.5)))
     run = fly(suite.pack(), straight(8.0), level_floor(15.0), 0)
     heard = np.any(np.isfinite(run.innovations[::4, 2:6]), axis=1)
     time_s = np.arange(len(heard)) * 0.2

@@ -10,14 +10,8 @@ import numpy as np
 
 from alice_survey.core.compiled import kernel
 from alice_survey.core.frames import Array
+from alice_survey.sim.vehicle import dynamics
 from alice_survey.sim.vehicle import estimate_vector as vector
-from alice_survey.sim.vehicle.dynamics import (
-    Plant,
-    Scratch,
-    initial_state,
-    rk4_step,
-    scratch_for,
-)
 from alice_survey.sim.vehicle.pilot import memory as slot
 from alice_survey.sim.vehicle.pilot.gains import DEGREES, LAG, Gains, gains_for
 from alice_survey.sim.vehicle.pilot.guidance import steer
@@ -61,13 +55,13 @@ def _fly(
     load: Array,
     floor: Array,
     keep: Array,
-    plant: Plant,
+    plant: dynamics.Plant,
     current: Current,
     path: Path,
     guidance: Guidance,
     gains: Gains,
     pilot: PilotState,
-    scratch: Scratch,
+    scratch: dynamics.Scratch,
     room: Array,
     rows: Array,
 ) -> None:
@@ -89,7 +83,9 @@ def _fly(
         for i in range(5):
             for j in range(6):
                 load[j] = wrench[j] + keep[j] * (load[j] - wrench[j])
-            rk4_step(time_s + i * step, step, state, command, load, plant, current, scratch)
+            dynamics.rk4_step(
+                time_s + i * step, step, state, command, load, plant, current, scratch
+            )
 
 
 @dataclass(eq=False)
@@ -99,7 +95,7 @@ class Flight:
     path: Path
     guidance: Guidance
     gains: Gains
-    plant: Plant
+    plant: dynamics.Plant
     current: Current
     state: Array
     floor: Array
@@ -116,7 +112,7 @@ class Flight:
         keep = np.exp(-TICK_S / STEPS / np.maximum(lag_s, 1e-6))
         _fly(
             self.ticks, self.state, self.load, self.floor, keep, self.plant, self.current,
-            self.path, self.guidance, self.gains, self.pilot, scratch_for(thrusters),
+            self.path, self.guidance, self.gains, self.pilot, dynamics.scratch_for(thrusters),
             np.zeros(26 + thrusters), rows,
         )  # fmt: skip
         self.ticks += len(rows)
@@ -236,6 +232,6 @@ def launch(
     n = len(craft.thrusters)
     return Flight(
         path, guidance, gains, craft.plant, constant_current(*current),
-        initial_state(np.array(at_ned), np.array([0.0, 0.0, heading_rad]), n),
+        dynamics.initial_state(np.array(at_ned), np.array([0.0, 0.0, heading_rad]), n),
         np.array([floor_m, slope, 1.0]), pilot, np.zeros(6),
     )  # fmt: skip

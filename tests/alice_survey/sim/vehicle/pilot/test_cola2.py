@@ -8,18 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from alice_survey.core.config import VehicleConfig
+from alice_survey.sim.vehicle.pilot import mission as pilot
 from alice_survey.sim.vehicle.pilot.gains import gains_for
-from alice_survey.sim.vehicle.pilot.mission import (
-    BY_ALTITUDE,
-    BY_DEPTH,
-    COLUMNS,
-    SPEED,
-    Cola2Settings,
-    aim,
-    circling_m,
-    steady_drift,
-    timeout_s,
-)
 from missions.route.energy import planned_vehicle
 
 FAR = 1000.0
@@ -36,7 +26,7 @@ def test_the_point_aimed_at_is_on_the_section_at_the_look_ahead(
 ) -> None:
     c, s = math.cos(course), math.sin(course)
     north, east = along * c - cross * s, along * s + cross * c
-    heading = aim(north, east, 0.0, 0.0, FAR * c, FAR * s, delta)
+    heading = pilot.aim(north, east, 0.0, 0.0, FAR * c, FAR * s, delta)
     # Fossen 2011, equation 10.72: the point is delta away from the vehicle, and on the straight.
     point = np.array([north + delta * math.cos(heading), east + delta * math.sin(heading)])
     assert abs(point @ [-s, c]) < 1e-6
@@ -53,7 +43,7 @@ def test_the_point_aimed_at_is_on_the_section_at_the_look_ahead(
     ],
 )
 def test_the_ends_of_a_section(place: tuple[float, float], bearing: float) -> None:
-    assert aim(*place, 0.0, 0.0, 10.0, 0.0, 2.0) == pytest.approx(bearing, abs=1e-9)
+    assert pilot.aim(*place, 0.0, 0.0, 10.0, 0.0, 2.0) == pytest.approx(bearing, abs=1e-9)
 
 
 @pytest.mark.parametrize("current", [0.02, 0.05, 0.1, -0.1, 0.2, 0.3])
@@ -63,11 +53,11 @@ def test_a_current_across_holds_it_off_by_the_look_ahead_times_the_sine_of_the_d
     """A vehicle that heads where it is wanted to and is carried along by the water."""
     delta, speed, north, east = 3.0, 0.2, 0.0, 0.0
     for _ in range(12000):
-        heading = aim(north, east, 0.0, 0.0, FAR, 0.0, delta)
+        heading = pilot.aim(north, east, 0.0, 0.0, FAR, 0.0, delta)
         sway = current * math.cos(heading)
         north += 0.05 * (speed * math.cos(heading) - sway * math.sin(heading))
         east += 0.05 * (speed * math.sin(heading) + sway * math.cos(heading))
-    wanted = math.copysign(delta * steady_drift(current, speed), current)
+    wanted = math.copysign(delta * pilot.steady_drift(current, speed), current)
     assert east == pytest.approx(wanted, rel=1e-3)
     assert 0.0 < abs(wanted) < delta
 
@@ -80,18 +70,25 @@ def test_the_circle_is_that_of_a_simulated_vehicle(
 ) -> None:
     """Bounds: 10 % about what `test_mission_flight` measures."""
     vehicle = planned_vehicle(VehicleConfig(name=name))
-    circle = circling_m(gains_for(vehicle, 0.2), 0.2)
+    circle = pilot.circling_m(gains_for(vehicle, 0.2), 0.2)
     assert minimum < circle < maximum
-    assert circling_m(gains_for(vehicle, 0.4), 0.4) > circle
+    assert pilot.circling_m(gains_for(vehicle, 0.4), 0.4) > circle
 
 
 def test_the_captain_waits_twice_the_way_and_half_a_minute() -> None:
-    row = np.zeros(COLUMNS)
-    row[[SPEED, BY_DEPTH]] = 0.2, 1.0
-    settings = Cola2Settings()
-    assert timeout_s(row, 10.0, 1.0, settings) == pytest.approx(30 + 2 * math.sqrt(2) * 10 / 0.2)
-    assert timeout_s(row, 1.0, -12.0, settings) == pytest.approx(30 + 2 * 12 / 0.3)
-    row[[BY_DEPTH, BY_ALTITUDE]] = 0.0, 1.0  # by altitude: as if through the range of a DVL
-    assert timeout_s(row, 10.0, 1.0, settings) == pytest.approx(30 + 2 * 200 / 0.3)
-    row[SPEED] = 3.0  # no faster than the pilot's parameter
-    assert timeout_s(row, 900.0, 1.0, settings) == pytest.approx(30 + 2 * math.sqrt(2) * 900 / 0.5)
+    row = np.zeros(pilot.COLUMNS)
+    row[[pilot.SPEED, pilot.BY_DEPTH]] = 0.2, 1.0
+    settings = pilot.Cola2Settings()
+    assert pilot.timeout_s(row, 10.0, 1.0, settings) == pytest.approx(
+        30 + 2 * math.sqrt(2) * 10 / 0.2
+    )
+    assert pilot.timeout_s(row, 1.0, -12.0, settings) == pytest.approx(30 + 2 * 12 / 0.3)
+    row[[pilot.BY_DEPTH, pilot.BY_ALTITUDE]] = (
+        0.0,
+        1.0,
+    )  # by altitude: as if through the range of a DVL
+    assert pilot.timeout_s(row, 10.0, 1.0, settings) == pytest.approx(30 + 2 * 200 / 0.3)
+    row[pilot.SPEED] = 3.0  # no faster than the pilot's parameter
+    assert pilot.timeout_s(row, 900.0, 1.0, settings) == pytest.approx(
+        30 + 2 * math.sqrt(2) * 900 / 0.5
+    )

@@ -12,14 +12,6 @@ from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.dynamics import Body, add_coriolis, add_damping
 from alice_survey.sim.vehicle.pilot import gains as g
-from alice_survey.sim.vehicle.pilot.gains import (
-    DEGREES,
-    Gains,
-    damping_ratio,
-    gains_for,
-    linear_coriolis,
-    linear_damping,
-)
 from alice_survey.sim.vehicle.vehicle import SETS, vehicle_from
 from tests.alice_survey.sim.vehicle.pilot.pilot_runs import gains_of
 
@@ -47,8 +39,10 @@ def test_each_loop_is_damped_with_lag_integral_and_any_drag(name: str, axis: int
     row = gains_of(name).axes[axis]
     # From no drag at all to what the axis meets at its greatest speed.
     nu = np.zeros(6)
-    nu[DEGREES[axis]] = row[g.FASTEST] if axis else 0.3
-    maximum = linear_damping(gains_of(name).body, nu)[DEGREES[axis], DEGREES[axis]] / row[g.MASS]
+    nu[g.DEGREES[axis]] = row[g.FASTEST] if axis else 0.3
+    maximum = (
+        g.linear_damping(gains_of(name).body, nu)[g.DEGREES[axis], g.DEGREES[axis]] / row[g.MASS]
+    )
     for decay in np.linspace(0.0, maximum, 5):
         damped = [row[g.LAG], 1 + row[g.LAG] * decay, decay + row[g.RATE]]
         poles = np.roots([*damped, row[g.PLACE], row[g.INTEGRAL]])
@@ -78,7 +72,7 @@ def _lateral_slopes(body: Body, nu: Array) -> Array:
     return np.array(np.linalg.inv(body.mass[two]) @ slope[two])
 
 
-def _whole_loop(gains: Gains, drift_mps: float, lag_scale: float) -> Array:
+def _whole_loop(gains: g.Gains, drift_mps: float, lag_scale: float) -> Array:
     """Closed loop of sway and yaw, coupled by the full model, slopes by differences.
 
     States: sway place, heading, sway, yaw rate, and the two lagging accelerations.
@@ -122,14 +116,14 @@ def test_slopes_are_those_of_the_forces(u: float, v: float, w: float, r: float) 
     nu = np.array([u, v, w, 0.0, 0.0, r])
     damping, coriolis = (_slope(add, body, nu, 1e-4) for add in (add_damping, add_coriolis))
     # The drag is piecewise quadratic: at a kink its slope is off by the step times the coefficient.
-    np.testing.assert_allclose(linear_damping(body, nu), -damping, atol=0.1)
-    np.testing.assert_allclose(linear_coriolis(body, nu), -coriolis, atol=1e-6)
+    np.testing.assert_allclose(g.linear_damping(body, nu), -damping, atol=0.1)
+    np.testing.assert_allclose(g.linear_coriolis(body, nu), -coriolis, atol=1e-6)
 
 
 @pytest.mark.parametrize("axis", range(4))
 def test_authority_is_reached_and_not_exceeded_by_any_thrusts(axis: int) -> None:
     craft, rng = vehicle_from("alice"), np.random.default_rng(axis)
-    matrix = craft.configuration_matrix[list(DEGREES)]
+    matrix = craft.configuration_matrix[list(g.DEGREES)]
     upper = rng.uniform(10.0, 80.0, (matrix.shape[1],))
     lower = -rng.uniform(10.0, 40.0, (matrix.shape[1],))
     minimum, maximum = g.authority(matrix, lower, upper, axis)
@@ -166,9 +160,9 @@ def test_heading_is_damped_with_the_sway_that_it_brings(
     craft = vehicle_from(name, coefficients)
     if name == "sparus2" and speed_mps == 1.0:
         with pytest.raises(VehicleError, match="1 m/s"):
-            gains_for(craft, speed_mps)
+            g.gains_for(craft, speed_mps)
         return
-    gains = gains_for(craft, speed_mps)
+    gains = g.gains_for(craft, speed_mps)
     poles = np.linalg.eigvals(_coupled_loop(gains.body, speed_mps, gains.axes[g.YAW]))
     ratio = np.min(-poles.real / np.abs(poles))
     # Only the slow thrusters of SPARUS II at speed give less than is wanted.
@@ -180,22 +174,22 @@ def test_heading_is_damped_with_the_sway_that_it_brings(
     assert np.min(np.abs(poles)) > 0.01
     assert np.max(np.abs(poles)) < 1.2 / gains.axes[g.YAW, g.LAG]
     slower = _coupled_loop(gains.body, 0.5 * speed_mps, gains.axes[g.YAW])
-    assert damping_ratio(slower) > g.MIN_HEADING_DAMPING - g.PASSING_DAMPING
+    assert g.damping_ratio(slower) > g.MIN_HEADING_DAMPING - g.PASSING_DAMPING
 
 
 @pytest.mark.parametrize(("name", "lost"), [("alice", "vertical"), ("sparus2", "port")])
 def test_a_vehicle_that_cannot_be_controlled_is_refused(name: str, lost: str) -> None:
     with pytest.raises(VehicleError):
-        gains_for(vehicle_from(name).weaken({lost: 0.0}), 0.2)
+        g.gains_for(vehicle_from(name).weaken({lost: 0.0}), 0.2)
 
 
 @pytest.mark.parametrize(("name", "axis"), AXES)
 def test_greatest_speed_takes_three_quarters_of_the_force(name: str, axis: int) -> None:
     gains = gains_of(name)
     row, nu, force = gains.axes[axis], np.zeros(6), np.zeros(6)
-    nu[DEGREES[axis]] = row[g.FASTEST]
+    nu[g.DEGREES[axis]] = row[g.FASTEST]
     add_damping(gains.body, nu, force)
-    share = -force[DEGREES[axis]] / min(-row[g.MIN_FORCE], row[g.MAX_FORCE])
+    share = -force[g.DEGREES[axis]] / min(-row[g.MIN_FORCE], row[g.MAX_FORCE])
     if axis == g.YAW and row[g.FASTEST] == pytest.approx(math.radians(30.0)):
         assert share < g.STEADY_SHARE  # bounded by the rate, not by the thrusters
     else:
@@ -216,7 +210,7 @@ def test_a_wanted_speed_is_not_overshot(name: str, decay_share: float) -> None:
 
     row = gains_of(name).axes[g.SURGE]
     body = gains_of(name).body
-    decay = linear_damping(body, np.array([0.2, 0, 0, 0, 0, 0]))[0, 0] / row[g.MASS]
+    decay = g.linear_damping(body, np.array([0.2, 0, 0, 0, 0, 0]))[0, 0] / row[g.MASS]
     plant = [row[g.LAG], 1 + row[g.LAG] * decay * decay_share, decay * decay_share + row[g.RATE]]
 
     def overshoot(weight: float) -> float:
@@ -231,6 +225,6 @@ def test_a_wanted_speed_is_not_overshot(name: str, decay_share: float) -> None:
 
 def test_a_lost_lateral_thruster_makes_sway_as_slow_as_the_pair_that_helps_it() -> None:
     whole, lame = vehicle_from("alice"), vehicle_from("alice").weaken({"bow": 0.0})
-    slow = gains_for(lame, 0.2).axes[g.SWAY]
-    assert slow[g.LAG] > 2.0 * gains_for(whole, 0.2).axes[g.SWAY, g.LAG]
+    slow = g.gains_for(lame, 0.2).axes[g.SWAY]
+    assert slow[g.LAG] > 2.0 * g.gains_for(whole, 0.2).axes[g.SWAY, g.LAG]
     assert slow[g.LAG] < 0.85

@@ -12,23 +12,14 @@ from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.pilot import gains as g
 from alice_survey.sim.vehicle.pilot import memory as slot
+from alice_survey.sim.vehicle.pilot import settings as settings_of
 from alice_survey.sim.vehicle.pilot.gains import (
     damping_ratio,
     gains_for,
 )
 from alice_survey.sim.vehicle.pilot.guidance import steer
-from alice_survey.sim.vehicle.pilot.memory import PilotState, new_pilot
 from alice_survey.sim.vehicle.pilot.mission import NO_MISSION
 from alice_survey.sim.vehicle.pilot.path import Path
-from alice_survey.sim.vehicle.pilot.settings import (
-    CONTROL_LENGTH_M,
-    LOS_DAMPING_RATIO,
-    Guidance,
-    Tick,
-    los_loop,
-    min_look_ahead_m,
-    pilot_guidance,
-)
 from alice_survey.sim.vehicle.pilot.steering import hear_floor, write_point
 from alice_survey.sim.vehicle.vehicle import vehicle_from
 from tests import oracles_guidance as oracle
@@ -48,15 +39,15 @@ def estimate_of(motion: Array, cross_m: float = 0.0) -> Array:
     return estimate
 
 
-def pilot_on(path: Path, leg: int = 0, along_m: float = 0.0) -> PilotState:
-    pilot = new_pilot()
+def pilot_on(path: Path, leg: int = 0, along_m: float = 0.0) -> slot.PilotState:
+    pilot = slot.new_pilot()
     pilot.report[[slot.PHASE, slot.LEG, slot.ALONG]] = slot.FOLLOW, leg, along_m
     return pilot
 
 
-def guide(path: Path, name: str, controller: str) -> tuple[g.Gains, Guidance]:
+def guide(path: Path, name: str, controller: str) -> tuple[g.Gains, settings_of.Guidance]:
     gains = gains_of(name, path.speed_mps)
-    guidance = pilot_guidance(gains, path, controller, max_depth_m=40.0)  # type: ignore[arg-type]
+    guidance = settings_of.pilot_guidance(gains, path, controller, max_depth_m=40.0)  # type: ignore[arg-type]
     return gains, guidance
 
 
@@ -64,7 +55,7 @@ def guide(path: Path, name: str, controller: str) -> tuple[g.Gains, Guidance]:
 @settings(deadline=None)
 def test_followed_point_moves_as_rotations_say(motion: Array) -> None:
     _, guidance = guide(straight(20.0), "alice", "sway")
-    estimate, pilot = estimate_of(motion), new_pilot()
+    estimate, pilot = estimate_of(motion), slot.new_pilot()
     write_point(estimate, guidance, pilot)
     place, velocity = oracle.point_motion(estimate, guidance)
     np.testing.assert_allclose(pilot.point[:2], place[:2], atol=1e-12)
@@ -86,7 +77,7 @@ def test_a_tick_asks_for_what_its_twin_asks(
     pilot = pilot_on(path, along_m=place[0])
     expected, cross = oracle.follow_demand(estimate, path, guidance, gains, place[0])
     assume(abs(abs(cross) - guidance.near_m) > 1e-9)
-    steer(0.0, Tick(TICK_S, estimate, path, guidance, gains, pilot), NO_MISSION, wrench)
+    steer(0.0, settings_of.Tick(TICK_S, estimate, path, guidance, gains, pilot), NO_MISSION, wrench)
     accelerations = pilot.demand[[slot.ACC_SURGE, slot.ACC_SWAY, slot.ACC_YAW]]
     np.testing.assert_allclose(accelerations, expected, atol=1e-9)
     assert pilot.report[slot.CROSS] == pytest.approx(cross, abs=1e-9)
@@ -100,7 +91,7 @@ def test_the_floor_is_smoothed_as_its_transfer_function_says() -> None:
     _, guidance = guide(straight(20.0), "alice", "sway")
     rng = np.random.default_rng(2)
     heard = 15.0 + 0.02 * np.arange(800) * TICK_S + 0.05 * rng.standard_normal(800)
-    pilot, smoothed = new_pilot(), []
+    pilot, smoothed = slot.new_pilot(), []
     estimate = np.zeros(vector.ESTIMATE)
     for depth in heard:
         estimate[vector.DEPTH], estimate[vector.ALTITUDE] = 13.0, depth - 13.0
@@ -129,12 +120,15 @@ def test_the_offset_has_its_closed_form_without_a_current_along() -> None:
 @pytest.mark.parametrize("name", ["alice", "sparus2"])
 def test_look_ahead_is_the_shortest_that_damps(name: str) -> None:
     gains = gains_of(name)
-    shortest = min_look_ahead_m(gains, 0.2, 0.55)
-    ratios = [damping_ratio(los_loop(gains, 0.2, 0.55, shortest * f)) for f in (0.8, 1.0, 1.25)]
+    shortest = settings_of.min_look_ahead_m(gains, 0.2, 0.55)
+    ratios = [
+        damping_ratio(settings_of.los_loop(gains, 0.2, 0.55, shortest * f))
+        for f in (0.8, 1.0, 1.25)
+    ]
     assert ratios[0] < ratios[1] < ratios[2]
-    assert ratios[1] == pytest.approx(LOS_DAMPING_RATIO, abs=1e-3)
+    assert ratios[1] == pytest.approx(settings_of.LOS_DAMPING_RATIO, abs=1e-3)
     # About the least that the literature takes: 1.5 to 2.5 lengths of the vessel.
-    assert 1.0 < shortest / CONTROL_LENGTH_M < 2.0
+    assert 1.0 < shortest / settings_of.CONTROL_LENGTH_M < 2.0
 
 
 @pytest.mark.parametrize(
@@ -145,6 +139,6 @@ def test_look_ahead_hangs_on_the_coefficients_as_documented(
     coefficients: str, expected_m: float
 ) -> None:
     gains = gains_for(vehicle_from("sparus2", coefficients), 0.2)
-    assert min_look_ahead_m(gains, 0.2, 0.0) == pytest.approx(expected_m, abs=0.006)
-    with_port = min_look_ahead_m(gains, 0.2, 0.55)
+    assert settings_of.min_look_ahead_m(gains, 0.2, 0.0) == pytest.approx(expected_m, abs=0.006)
+    with_port = settings_of.min_look_ahead_m(gains, 0.2, 0.55)
     assert with_port == pytest.approx(2.23 if coefficients == "calibrated" else 1.6, abs=0.006)

@@ -11,14 +11,7 @@ from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.pilot import gains as g
 from alice_survey.sim.vehicle.pilot import memory as safety
 from alice_survey.sim.vehicle.pilot import memory as slot
-from alice_survey.sim.vehicle.pilot.memory import ABORT, APPROACH, ASCEND, DIVE, DONE, FOLLOW
-from tests.alice_survey.sim.vehicle.pilot.pilot_runs import (
-    Controller,
-    Rows,
-    launch,
-    lawnmower,
-    straight,
-)
+from tests.alice_survey.sim.vehicle.pilot import pilot_runs as runs
 from tests.oracles_guidance import los_offset_m
 
 
@@ -36,7 +29,9 @@ def rms(values: Array) -> float:
 def test_los_settles_at_the_offset_that_the_current_gives(
     name: str, speed_mps: float, towards_deg: float
 ) -> None:
-    flight = launch(straight(100.0), name, "los", current=(speed_mps, towards_deg), following=True)
+    flight = runs.launch(
+        runs.straight(100.0), name, "los", current=(speed_mps, towards_deg), following=True
+    )
     rows = flight.fly(300.0)
     settled = rows.cross_m[-600:]
     across = speed_mps * math.sin(math.radians(towards_deg))
@@ -51,16 +46,16 @@ def test_los_settles_at_the_offset_that_the_current_gives(
 
 @pytest.mark.parametrize("towards_deg", [90.0, 0.0, 225.0])
 def test_sway_holds_lines_and_heading_in_a_current(towards_deg: float) -> None:
-    flight = launch(lawnmower(4, 8.0), current=(0.1, towards_deg))
+    flight = runs.launch(runs.lawnmower(4, 8.0), current=(0.1, towards_deg))
     rows = flight.fly(420.0)
-    assert rows.phases() == [DIVE, APPROACH, FOLLOW, ASCEND, DONE]
+    assert rows.phases() == [slot.DIVE, slot.APPROACH, slot.FOLLOW, slot.ASCEND, slot.DONE]
     lines = rows.on_lines()
     assert sorted(set(lines.report[:, slot.LINE])) == [0, 1, 2, 3]
     assert 1e-5 < rms(lines.cross_m) < 0.03
     assert 1e-4 < rms(lines.heading_error_rad) < math.radians(1.0)
     assert np.all(lines.report[:, slot.BY_SWAY] == 1.0)
     assert rms(lines.estimate[:, vector.ALTITUDE] - 2.0) < 0.05
-    turns = Rows(rows.table[(rows.report[:, slot.PHASE] == FOLLOW)])
+    turns = runs.Rows(rows.table[(rows.report[:, slot.PHASE] == slot.FOLLOW)])
     assert 0.0 < np.abs(turns.cross_m).max() < 0.12
     # Lines last as long as their length at the wanted speed over ground.
     assert len(lines.table) * 0.05 == pytest.approx(4 * 8.0 / 0.2, rel=0.02)
@@ -68,10 +63,10 @@ def test_sway_holds_lines_and_heading_in_a_current(towards_deg: float) -> None:
 
 @pytest.mark.parametrize("towards_deg", [90.0, 0.0])
 def test_a_vehicle_without_sway_flies_every_line_in_order(towards_deg: float) -> None:
-    flight = launch(lawnmower(4, 8.0), "sparus2", "los", current=(0.1, towards_deg))
+    flight = runs.launch(runs.lawnmower(4, 8.0), "sparus2", "los", current=(0.1, towards_deg))
     rows = flight.fly(420.0)
-    assert rows.phases() == [DIVE, APPROACH, FOLLOW, ASCEND, DONE]
-    following = rows.report[rows.report[:, slot.PHASE] == FOLLOW]
+    assert rows.phases() == [slot.DIVE, slot.APPROACH, slot.FOLLOW, slot.ASCEND, slot.DONE]
+    following = rows.report[rows.report[:, slot.PHASE] == slot.FOLLOW]
     legs = following[:, slot.LEG].astype(int)
     assert set(np.diff(legs)) <= {0, 1}
     assert legs[0] == 0
@@ -93,9 +88,9 @@ def test_a_vehicle_without_sway_flies_every_line_in_order(towards_deg: float) ->
 def test_speed_is_reached_without_overshoot(
     name: str, speed_mps: float, current: tuple[float, float]
 ) -> None:
-    path = straight(100.0, speed_mps=speed_mps)
+    path = runs.straight(100.0, speed_mps=speed_mps)
     controller: Literal["sway", "los"] = "sway" if name == "alice" else "los"
-    flight = launch(path, name, controller, current=current, following=True)
+    flight = runs.launch(path, name, controller, current=current, following=True)
     surge = flight.fly(60.0).estimate[:, vector.U]
     assert surge.max() < 1.05 * speed_mps
     assert surge[-200:].mean() == pytest.approx(speed_mps, rel=0.01 if name == "alice" else 0.02)
@@ -103,11 +98,11 @@ def test_speed_is_reached_without_overshoot(
 
 
 def test_carried_off_it_goes_back_to_where_it_left_the_path() -> None:
-    flight = launch(straight(40.0), following=True)
+    flight = runs.launch(runs.straight(40.0), following=True)
     left = flight.fly(60.0).report[-1, slot.ALONG]
     flight.state[1] += 12.0
     rows = flight.fly(150.0)
-    assert rows.phases() == [APPROACH, FOLLOW]
+    assert rows.phases() == [slot.APPROACH, slot.FOLLOW]
     back = np.argmax(np.diff(rows.report[:, slot.PHASE]) > 0) + 1
     resumed = rows.report[back:]
     # From before the place, on the path when there.
@@ -117,18 +112,18 @@ def test_carried_off_it_goes_back_to_where_it_left_the_path() -> None:
 
 
 def test_a_current_too_strong_for_the_vehicle_ends_in_an_explained_abort() -> None:
-    flight = launch(straight(40.0), "sparus2", "los", current=(2.5, 90.0))
+    flight = runs.launch(runs.straight(40.0), "sparus2", "los", current=(2.5, 90.0))
     rows = flight.fly(400.0)
-    assert rows.phases()[-1] == ABORT
+    assert rows.phases()[-1] == slot.ABORT
     assert rows.report[-1, slot.REASON] in (safety.NO_DIVE, safety.NO_APPROACH)
     assert rows.report[-1, slot.AT_SURFACE] == 1.0
 
 
 @pytest.mark.parametrize("name", ["alice", "sparus2"])
 def test_fast_paths_slow_down_for_turns_that_are_too_tight(name: str) -> None:
-    controller: Controller = "sway" if name == "alice" else "los"
-    flight = launch(
-        lawnmower(3, 8.0, speed_mps=0.5),
+    controller: runs.Controller = "sway" if name == "alice" else "los"
+    flight = runs.launch(
+        runs.lawnmower(3, 8.0, speed_mps=0.5),
         name,
         controller,
         following=True,

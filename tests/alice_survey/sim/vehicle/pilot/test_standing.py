@@ -10,34 +10,22 @@ from hypothesis.extra.numpy import arrays
 
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import estimate_vector as vector
+from alice_survey.sim.vehicle.pilot import gains as g
 from alice_survey.sim.vehicle.pilot import memory as slot
-from alice_survey.sim.vehicle.pilot.gains import LAG, SURGE, SWAY, YAW
+from alice_survey.sim.vehicle.pilot import settings as settings_of
 from alice_survey.sim.vehicle.pilot.guidance import steer
-from alice_survey.sim.vehicle.pilot.memory import new_pilot
 from alice_survey.sim.vehicle.pilot.mission import NO_MISSION
 from alice_survey.sim.vehicle.pilot.path import Path
-from alice_survey.sim.vehicle.pilot.settings import (
-    Guidance,
-    Tick,
-    pilot_guidance,
-)
 from alice_survey.sim.vehicle.pilot.steering import STOP_M, STOP_RAD, ramp
 from tests import oracles_guidance as oracle
-from tests.alice_survey.sim.vehicle.pilot.pilot_runs import (
-    DEEPEST_M,
-    Flight,
-    Rows,
-    gains_of,
-    launch,
-    with_stops,
-)
+from tests.alice_survey.sim.vehicle.pilot import pilot_runs as runs
 
 TICK_S = 0.05
 QUARTER = math.pi / 2
-SPOTS = with_stops(
+SPOTS = runs.with_stops(
     [("go", 3.0, 0), ("spot", QUARTER), ("go", 1.0), ("spot", QUARTER), ("go", 3.0, 1)]
 )
-STEPS = with_stops([("go", 3.0, 0), ("step", 1.0), ("spot", math.pi), ("go", 3.0, 1)])
+STEPS = runs.with_stops([("go", 3.0, 0), ("step", 1.0), ("spot", math.pi), ("go", 3.0, 1)])
 MOTIONS = arrays(np.float64, 12, elements=st.floats(-1.0, 1.0))
 SCALES = np.array([0.2, 0.2, 1.0, 0.1, 0.1, 0.15, 0.2, 0.2, 0.1, 0.05, 0.05, 0.2])
 
@@ -66,9 +54,11 @@ def test_a_reference_goes_as_far_as_the_closed_form_says(
     assert time_s > total_s - 3 * TICK_S - 2.0 * math.sqrt(2.0 * TICK_S**2)
 
 
-def guidance_of(path: Path, name: str = "alice") -> Guidance:
-    gains = gains_of(name, path.speed_mps)
-    return pilot_guidance(gains, path, "sway" if name == "alice" else "los", max_depth_m=DEEPEST_M)
+def guidance_of(path: Path, name: str = "alice") -> settings_of.Guidance:
+    gains = runs.gains_of(name, path.speed_mps)
+    return settings_of.pilot_guidance(
+        gains, path, "sway" if name == "alice" else "los", max_depth_m=runs.DEEPEST_M
+    )
 
 
 @pytest.mark.parametrize(("leg", "progress"), [(1, 0.4), (2, 0.8), (0, 2.7)])
@@ -77,8 +67,8 @@ def guidance_of(path: Path, name: str = "alice") -> Guidance:
 def test_a_tick_of_a_stop_asks_for_what_its_twin_asks(
     leg: int, progress: float, motion: Array, share: float
 ) -> None:
-    path, gains = STEPS, gains_of("alice")
-    guidance, pilot = guidance_of(path), new_pilot()
+    path, gains = STEPS, runs.gains_of("alice")
+    guidance, pilot = guidance_of(path), slot.new_pilot()
     fastest = (0.2, guidance.step_mps, guidance.turn_in_place_rad_s)[leg]
     slowing = (guidance.stop_mps2, guidance.step_mps2, guidance.turn_in_place_rad_s2)[leg]
     goal = (path.length_m[0], path.length_m[1], abs(path.turn_rad[2]))[leg]
@@ -88,7 +78,7 @@ def test_a_tick_of_a_stop_asks_for_what_its_twin_asks(
     pilot.memory[[slot.RAMP, slot.RAMP_SPEED]] = progress, speed
     _, rate, quicken = ramp(progress, speed, goal, fastest, slowing, TICK_S)
     # What thrusters that lag make of it.
-    rate = speed + (rate - speed) * TICK_S / gains.axes[(SURGE, SWAY, YAW)[leg], LAG]
+    rate = speed + (rate - speed) * TICK_S / gains.axes[(g.SURGE, g.SWAY, g.YAW)[leg], g.LAG]
     after = min(progress + rate * TICK_S, goal)
     start, course = np.array([path.start_n[leg], path.start_e[leg]]), path.heading_rad[leg]
     ahead = np.array([math.cos(course), math.sin(course)])
@@ -112,13 +102,13 @@ def test_a_tick_of_a_stop_asks_for_what_its_twin_asks(
         estimate, guidance, gains, path.speed_mps, place, moves, quickens, turning
     )
     wrench = np.zeros(6)
-    steer(0.0, Tick(TICK_S, estimate, path, guidance, gains, pilot), NO_MISSION, wrench)
+    steer(0.0, settings_of.Tick(TICK_S, estimate, path, guidance, gains, pilot), NO_MISSION, wrench)
     found = pilot.demand[[slot.ACC_SURGE, slot.ACC_SWAY, slot.ACC_YAW]]
     np.testing.assert_allclose(found, expected, atol=1e-9)
     np.testing.assert_allclose(wrench, oracle.wrench(gains, pilot.demand), atol=1e-9)
 
 
-def glass_of(flight: Flight, rows: Rows) -> Array:
+def glass_of(flight: runs.Flight, rows: runs.Rows) -> Array:
     """(T, 2) where the followed point is."""
     heading, lever = rows.estimate[:, vector.HEADING], flight.guidance.point_body_m
     ahead = np.stack([np.cos(heading), np.sin(heading)], axis=1)
@@ -126,14 +116,14 @@ def glass_of(flight: Flight, rows: Rows) -> Array:
     return np.asarray(rows.estimate[:, :2] + lever[0] * ahead + lever[1] * across)
 
 
-def on_leg(rows: Rows, leg: int) -> Array:
+def on_leg(rows: runs.Rows, leg: int) -> Array:
     following = rows.report[:, slot.PHASE] == slot.FOLLOW
     return np.asarray(following & (rows.report[:, slot.LEG] == leg))
 
 
 @pytest.mark.parametrize("current", [(0.0, 0.0), (0.1, 30.0), (0.2, 90.0)])
 def test_alice_turns_on_the_spot_about_her_port(current: tuple[float, float]) -> None:
-    flight = launch(SPOTS, current=current, at_ned=(-1.2, 0.05, 0.0), following=True)
+    flight = runs.launch(SPOTS, current=current, at_ned=(-1.2, 0.05, 0.0), following=True)
     rows = flight.fly(90.0)
     assert rows.phases()[-1] == slot.ASCEND
     glass = glass_of(flight, rows)
@@ -158,7 +148,7 @@ def test_alice_turns_on_the_spot_about_her_port(current: tuple[float, float]) ->
 
 @pytest.mark.parametrize("current", [(0.0, 0.0), (0.1, 30.0), (0.2, 90.0)])
 def test_alice_steps_aside_with_her_heading_held(current: tuple[float, float]) -> None:
-    flight = launch(STEPS, current=current, at_ned=(-1.2, 0.05, 0.0), following=True)
+    flight = runs.launch(STEPS, current=current, at_ned=(-1.2, 0.05, 0.0), following=True)
     rows = flight.fly(90.0)
     assert rows.phases()[-1] == slot.ASCEND
     on, glass = on_leg(rows, 1), glass_of(flight, rows)
@@ -172,8 +162,8 @@ def test_alice_steps_aside_with_her_heading_held(current: tuple[float, float]) -
 
 
 def test_a_stop_is_left_though_the_sea_does_not_let_the_vehicle_rest() -> None:
-    path, guidance, gains = SPOTS, guidance_of(SPOTS), gains_of("alice")
-    pilot, wrench = new_pilot(), np.zeros(6)
+    path, guidance, gains = SPOTS, guidance_of(SPOTS), runs.gains_of("alice")
+    pilot, wrench = slot.new_pilot(), np.zeros(6)
     pilot.report[[slot.PHASE, slot.LEG]] = slot.FOLLOW, 1
     pilot.memory[[slot.STANDING, slot.REF, slot.RAMP]] = 1.0, QUARTER, QUARTER
     estimate = np.zeros(vector.ESTIMATE)
@@ -184,7 +174,10 @@ def test_a_stop_is_left_though_the_sea_does_not_let_the_vehicle_rest() -> None:
     left = None
     for tick in range(600):
         steer(
-            tick * TICK_S, Tick(TICK_S, estimate, path, guidance, gains, pilot), NO_MISSION, wrench
+            tick * TICK_S,
+            settings_of.Tick(TICK_S, estimate, path, guidance, gains, pilot),
+            NO_MISSION,
+            wrench,
         )
         if pilot.report[slot.LEG] == 2.0:
             left = tick * TICK_S

@@ -9,13 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.pilot.command import (
-    FALSE_ALARM_H,
-    WATCHED_S,
-    Failure,
-    NavigatedStretch,
-    ThrustWatch,
-)
+from alice_survey.sim.vehicle.pilot import command
 from alice_survey.sim.vehicle.vehicle import Vehicle, vehicle_from
 from tests.alice_survey.sim.vehicle.identification.manoeuvres import fly, survey_like
 
@@ -70,15 +64,15 @@ def flown(name: str, share: float, seed: int, duration_s: float = 60.0) -> tuple
 
 
 def judged(
-    watch: ThrustWatch, begin_s: float, flight: tuple[Array, Array], water_mps: float = 0.0
-) -> tuple[list[Failure], list[Array]]:
+    watch: command.ThrustWatch, begin_s: float, flight: tuple[Array, Array], water_mps: float = 0.0
+) -> tuple[list[command.Failure], list[Array]]:
     found, sums = [], []
     for first in range(0, len(flight[0]), STRETCH):
         part = slice(first, first + STRETCH)
         end_s = begin_s + (first + STRETCH) * TICK_S
         current = np.array([water_mps, 0.0])
         found += watch.judge(
-            end_s, NavigatedStretch(flight[0][part], current, 0.05), flight[1][part]
+            end_s, command.NavigatedStretch(flight[0][part], current, 0.05), flight[1][part]
         )
         sums.append(watch.sums.copy())
     return found, sums
@@ -88,7 +82,7 @@ def test_sound_thrusters_add_up_to_less_than_chance_allows() -> None:
     """The stated rate of false alarms rests on it: a sum is above x no more often than exp(-x)."""
     sums = []
     for seed in range(6):
-        found, own = judged(ThrustWatch(ALICE, TICK_S), 0.0, flown("", 1.0, seed, 120.0))
+        found, own = judged(command.ThrustWatch(ALICE, TICK_S), 0.0, flown("", 1.0, seed, 120.0))
         assert found == []
         sums += own
     table = np.array(sums)
@@ -96,19 +90,23 @@ def test_sound_thrusters_add_up_to_less_than_chance_allows() -> None:
     assert 0.0 < table.max() < 6.0
     for above in (1.0, 2.0, 4.0):
         assert np.mean(table > above) < math.exp(-above)
-    alarm = ThrustWatch(ALICE, TICK_S).alarm
+    alarm = command.ThrustWatch(ALICE, TICK_S).alarm
     # Lorden's bound for each of the thrusters, by the stated hours of all.
-    assert math.exp(alarm) * WATCHED_S / 3600.0 / len(NAMES) == pytest.approx(FALSE_ALARM_H)
+    assert math.exp(alarm) * command.WATCHED_S / 3600.0 / len(NAMES) == pytest.approx(
+        command.FALSE_ALARM_H
+    )
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_thruster_that_pushes_nothing_is_found_in_two_minutes(name: str) -> None:
     delays = []
     for seed in range(3):
-        watch = ThrustWatch(ALICE, TICK_S)
+        watch = command.ThrustWatch(ALICE, TICK_S)
         assert judged(watch, 0.0, flown("", 1.0, seed))[0] == []
         found, _ = judged(watch, SOUND_S, flown(name, 0.0, 10 + seed, 120.0))
-        assert found == [Failure(time_s=found[0].time_s, thruster=name, left=0.0, turns=True)]
+        assert found == [
+            command.Failure(time_s=found[0].time_s, thruster=name, left=0.0, turns=True)
+        ]
         delays.append(found[0].time_s - SOUND_S)
     assert 5.0 <= min(delays) <= max(delays) <= 120.0
 
@@ -131,6 +129,6 @@ def test_a_model_that_is_off_and_a_wrong_current_are_no_failure() -> None:
     for believed, water_mps in ((draggy, 0.0), (strong, 0.0), (ALICE, 0.1)):
         for seed in range(2):
             flight = flown("", 1.0, seed, 120.0)
-            found, sums = judged(ThrustWatch(believed, TICK_S), 0.0, flight, water_mps)
+            found, sums = judged(command.ThrustWatch(believed, TICK_S), 0.0, flight, water_mps)
             assert found == []
             assert np.max(sums) < 8.0
