@@ -17,9 +17,11 @@ from missions.coverage.certificate import Certificate
 from missions.coverage.stations import Stations
 from missions.values.area import Area, multipolygon
 from missions.values.footprint import footprint_ne
-from missions.values.legs import Leg, Route
+from missions.values.legs import Route
 from missions.values.line import Line
-from missions.values.plan_file import Dive, Plan
+from missions.values.plan_file import Plan
+from tests.missions.exports.plans import plan_of as plan_by_hand
+from tests.missions.exports.plans import straight
 
 DATUM = Datum(32.8236, 34.9553)
 _FLOOR_M = 50.0
@@ -95,17 +97,13 @@ def counts_at(points_ne: Array, rig: Rig, stations: Stations) -> dict[str, Any]:
         name: np.array([shapely.contains_xy(shape, points_ne) for shape in shapes])
         for name, shapes in polygons.items()
     }
-    lines = {}
-    for name, by_station in seen.items():
-        of_lines = [
-            by_station[stations.line == line].any(axis=0)
-            for line in np.unique(stations.line)
-            if line >= 0
-        ]
-        lines[name] = np.sum(of_lines, axis=0) if of_lines else np.zeros(len(points_ne), dtype=int)
+    numbers = np.unique(stations.line[stations.line >= 0])
     return {
         "pictures": {name: by_station.sum(axis=0) for name, by_station in seen.items()},
-        "lines": lines,
+        "lines": {
+            name: sum(by_station[stations.line == n].any(axis=0).astype(int) for n in numbers)
+            for name, by_station in seen.items()
+        },
         "pairs": np.all(list(seen.values()), axis=0).sum(axis=0),
     }
 
@@ -115,12 +113,8 @@ def middles_ne(certificate: Certificate) -> Array:
     grid = certificate.grid
     ahead = np.array([np.cos(grid.heading_rad), np.sin(grid.heading_rad)])
     right = np.array([-ahead[1], ahead[0]])
-    row, column = np.meshgrid(np.arange(grid.rows), np.arange(grid.columns), indexing="ij")
-    middles: Array = (
-        np.array(grid.origin_ne)
-        + (row[..., None] + 0.5) * grid.cell_m * ahead
-        + (column[..., None] + 0.5) * grid.cell_m * right
-    )
+    row, column = (np.indices(grid.shape)[..., None] + 0.5) * grid.cell_m
+    middles: Array = np.array(grid.origin_ne) + row * ahead + column * right
     return middles
 
 
@@ -149,30 +143,9 @@ def plan_of(area: Area, lines: list[Line], **others: Any) -> Plan:
     """A plan of lines, straight from each to the next."""
     legs = []
     for index, line in enumerate(lines):
-        legs.append(_straight(line.start_ne_m, line.end_ne_m, index))
+        legs.append(straight(line.start_ne_m, line.end_ne_m, index))
         if index + 1 < len(lines):
-            legs.append(_straight(line.end_ne_m, lines[index + 1].start_ne_m, -1))
-    route = Route(legs=tuple(legs))
-    values: dict[str, Any] = {
-        "name": "known", "area": area, "home_ne_m": lines[0].start_ne_m,
-        "seafloor_depth_m": 15.0, "altitude_m": 2.0, "speed_mps": 0.2, "interval_s": 2.3,
-        "exposure_s": 0.001, "strobe_pulse_s": 0.002, "strobe_lead_s": 0.0002,
-        "footprint_m": (1.44, 1.15), "line_spacing_m": 1.0, "station_spacing_m": 0.46,
-        "reached_forward_overlap": 0.6, "reached_side_overlap": 0.3, "lines": tuple(lines),
-        "turn_radius_m": 0.5, "run_in_m": 0.5, "length_m": route.length_m,
-        "duration_s": route.length_m / 0.2, "energy_wh": 10.0, "coverage": 1.0, "details": {},
-    }  # fmt: skip
-    values |= others
-    dive = Dive(
-        first_line=0, last_line=len(lines) - 1, route=route, duration_s=values["duration_s"],
-        energy_wh=values["energy_wh"],
-    )  # fmt: skip
-    return Plan(dives=(dive,), **values)
-
-
-def _straight(start: tuple[float, float], end: tuple[float, float], line: int) -> Leg:
-    north, east = end[0] - start[0], end[1] - start[1]
-    return Leg(
-        start_ne_m=start, heading_rad=float(np.arctan2(east, north)),
-        length_m=float(np.hypot(north, east)), curvature_per_m=0.0, line=line,
-    )  # fmt: skip
+            legs.append(straight(line.end_ne_m, lines[index + 1].start_ne_m))
+    given = {"name": "known", "area": area, "exposure_s": 0.001, "strobe_pulse_s": 0.002} | others
+    route, home = Route(legs=tuple(legs)), lines[0].start_ne_m
+    return plan_by_hand(lines, [(0, len(lines) - 1)], home=home, routes=[route], **given)

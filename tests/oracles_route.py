@@ -1,11 +1,11 @@
 """Slow, obvious twins of ways, turns and costs of routes: shapely, all pairs, dense sampling."""
 
-import heapq
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import shapely
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
 from shapely.geometry import LineString, MultiPolygon
 
 from alice_survey.core.frames import Array
@@ -24,23 +24,10 @@ def min_way_m(allowed: MultiPolygon, a: tuple[float, float], b: tuple[float, flo
     shapely.prepare(wider)
     free = shapely.covers(wider, straights)
     lengths = np.linalg.norm(places[one] - places[two], axis=1)
-    ways: list[list[tuple[int, float]]] = [[] for _ in places]
-    for i, j, length in zip(one[free].tolist(), two[free].tolist(), lengths[free], strict=True):
-        ways[i].append((j, float(length)))
-        ways[j].append((i, float(length)))
-    reached = {0: 0.0}
-    queue = [(0.0, 0)]
-    while queue:
-        so_far, place = heapq.heappop(queue)
-        if place == 1:
-            return so_far
-        if so_far > reached[place]:
-            continue
-        for other, length in ways[place]:
-            if so_far + length < reached.get(other, math.inf):
-                reached[other] = so_far + length
-                heapq.heappush(queue, (so_far + length, other))
-    return math.inf
+    # Places that coincide are joined too: a length of 0 would be no edge.
+    edges = (np.maximum(lengths[free], 1e-12), (one[free], two[free]))
+    graph = csr_array(edges, shape=(len(places), len(places)))
+    return float(dijkstra(graph, directed=False, indices=0)[1])
 
 
 def sampled_leg(leg: Leg, samples: int) -> tuple[Array, float]:
@@ -125,21 +112,11 @@ def route_cost_by_steps(route: Route, costs: Costs, step_m: float) -> tuple[floa
 
 def lawn(count: int, length_m: float, spacing_m: float) -> list[Line]:
     """Lines north and south, side by side."""
-    lines = [
-        Line(
-            kind="survey",
-            start_ne_m=(0.0, i * spacing_m),
-            end_ne_m=(length_m, i * spacing_m),
-            stations=20,
-        )
-        for i in range(count)
-    ]
-    return [line if i % 2 == 0 else line.reverse() for i, line in enumerate(lines)]
-
-
-def total_m(legs: Sequence[Leg]) -> float:
-    """Length of legs."""
-    return sum(leg.length_m for leg in legs)
+    lines = []
+    for east in (np.arange(count) * spacing_m).tolist():
+        line = Line(kind="survey", start_ne_m=(0.0, east), end_ne_m=(length_m, east), stations=20)
+        lines.append(line.reverse() if len(lines) % 2 else line)
+    return lines
 
 
 def way_m(ways: Ways, a: tuple[float, float], b: tuple[float, float]) -> float:

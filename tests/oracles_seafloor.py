@@ -115,14 +115,11 @@ def direct_light(
     attenuation: np.ndarray,
 ) -> np.ndarray:
     """What strobes send that shine on the point with the share `profile` of their peak, (3,)."""
-    total = np.zeros(3)
-    for strobe, share in zip(strobes, profile, strict=True):
-        ray = strobe - point
-        distance = np.linalg.norm(ray)
-        cosine = max(float(normal @ ray) / distance, 0.0)
-        lost = np.exp(-attenuation * (distance + path_m))
-        total += share * peak * cosine / distance**2 * lost
-    return total
+    rays = strobes - point
+    distance = np.linalg.norm(rays, axis=1)
+    cosine = np.maximum(rays @ normal / distance, 0.0)
+    lost = np.exp(-attenuation * (distance + path_m)[:, None])
+    return (profile * peak * cosine / distance**2) @ lost
 
 
 def fit_saddle(picture: np.ndarray, near: np.ndarray, half: int) -> np.ndarray:

@@ -1,5 +1,6 @@
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -140,11 +141,10 @@ def test_turning_and_moving_everything_changes_nothing(
     lines = lawnmower(9, 5, 1.7, 0.6)
     home = stations_of_lines(lines, 2.0)
     c, s = math.cos(turn), math.sin(turn)
-    turned = Stations(
+    turned = replace(
+        home,
         glass_ne=home.glass_ne @ np.array([[c, s], [-s, c]]) + [north, east],
-        altitude_m=home.altitude_m,
         attitude_rad=home.attitude_rad + np.array([0.0, 0.0, turn]),
-        line=home.line,
     )
     moved = shapely.affinity.affine_transform(shape, [c, -s, s, c, north, east])
 

@@ -1,11 +1,12 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from alice_survey.core.config import CameraConfig, WaterConfig
 from camera_calib.rig import Rig, design_rig
-from missions.coverage.stations import Stations, stations_of_lines
+from missions.coverage.stations import stations_of_lines
 from tests.oracles_coverage import lawnmower, pinhole_rig
 from tests.oracles_overlap import measured_side_overlap
 
@@ -51,10 +52,7 @@ def test_a_vehicle_off_its_line_overlaps_less_on_one_side() -> None:
     exact = stations_of_lines(lines, 2.0)
     places = exact.glass_ne.copy()
     places[exact.line == 1, 1] += 0.1
-    off = Stations(
-        glass_ne=places, altitude_m=exact.altitude_m, attitude_rad=exact.attitude_rad,
-        line=exact.line,
-    )  # fmt: skip
+    off = replace(exact, glass_ne=places)
     width_m = middle_row_m(REAL, 2.0)
 
     measured = measured_side_overlap(REAL, off)
@@ -74,12 +72,8 @@ def test_a_rolled_vehicle_loses_overlap_on_the_side_it_looks_away_from() -> None
     exact = stations_of_lines(lawnmower(4, 2, 1.0, 0.46), 2.0)
     attitude = exact.attitude_rad.copy()
     attitude[:, 0] = np.where(exact.line == 0, math.radians(5.0), 0.0)
-    rolled = Stations(
-        glass_ne=exact.glass_ne, altitude_m=exact.altitude_m, attitude_rad=attitude,
-        line=exact.line,
-    )  # fmt: skip
     before = measured_side_overlap(REAL, exact)
-    after = measured_side_overlap(REAL, rolled)
+    after = measured_side_overlap(REAL, replace(exact, attitude_rad=attitude))
 
     # A camera rolled by 5 degrees to starboard looks 2 tan(5 deg) = 0.17 m to port.
     first = exact.line[before.stations] == 0

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -120,9 +121,7 @@ def test_a_picture_past_the_sea_floor_sees_nothing() -> None:
     level = wandering(3, 4)
     rolled = level.attitude_rad.copy()
     rolled[1] = [math.radians(75.0), 0.0, 0.0]
-    stations = Stations(
-        glass_ne=level.glass_ne, altitude_m=level.altitude_m, attitude_rad=rolled, line=level.line
-    )
+    stations = replace(level, attitude_rad=rolled)
 
     seen = certificate(area, RIG, stations, ASKED)
     others = certificate(area, RIG, stations.some(np.array([0, 2])), ASKED, cell_m=seen.grid.cell_m)

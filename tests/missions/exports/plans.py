@@ -1,6 +1,7 @@
 """Plans for tests of exports, made by hand so that they need no planner."""
 
 import math
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -21,53 +22,39 @@ RIG: Rig = design_rig(CameraConfig(), WaterConfig())
 def straight(
     start: tuple[float, float], end: tuple[float, float], line: int = -1, side_rad: float = 0.0
 ) -> Leg:
-    course = math.atan2(end[1] - start[1], end[0] - start[0])
+    course, length_m = math.atan2(end[1] - start[1], end[0] - start[0]), math.dist(start, end)
     return Leg(
-        start_ne_m=start, heading_rad=course, length_m=math.dist(start, end), curvature_per_m=0.0,
-        line=line, side_rad=side_rad,
-    )  # fmt: skip
+        start_ne_m=start, heading_rad=course, length_m=length_m, line=line, side_rad=side_rad
+    )
 
 
 def spot(place: tuple[float, float], heading_rad: float, turn_rad: float) -> Leg:
-    return Leg(
-        start_ne_m=place, heading_rad=heading_rad, length_m=0.0, curvature_per_m=0.0, line=-1,
-        turn_rad=turn_rad,
-    )  # fmt: skip
+    return Leg(start_ne_m=place, heading_rad=heading_rad, length_m=0.0, turn_rad=turn_rad)
 
 
 def arc(place: tuple[float, float], heading_rad: float, radius_m: float, turn_rad: float) -> Leg:
+    curvature, length_m = math.copysign(1 / radius_m, turn_rad), radius_m * abs(turn_rad)
     return Leg(
-        start_ne_m=place, heading_rad=heading_rad, length_m=radius_m * abs(turn_rad),
-        curvature_per_m=math.copysign(1 / radius_m, turn_rad), line=-1,
-    )  # fmt: skip
+        start_ne_m=place, heading_rad=heading_rad, length_m=length_m, curvature_per_m=curvature
+    )
 
 
 def lawnmower_route(lines: list[Line], first: int, home: tuple[float, float]) -> Route:
-    """From home along lines and home again: a turn on the spot at each kink."""
-    legs: list[Leg] = []
-    place, heading = home, None
-
-    def go(end: tuple[float, float], line: int) -> None:
-        nonlocal place, heading
-        if math.dist(place, end) < 1e-9:
-            return
-        leg = straight(place, end, line)
-        if heading is not None:
-            turn = math.remainder(leg.heading_rad - heading, 2 * math.pi)
-            if abs(turn) > 1e-12:
-                legs.append(spot(place, heading, turn))
-        legs.append(leg)
-        place, heading = end, leg.heading_rad
-
+    """From home along lines, with run-ins, and home again: a turn on the spot at each kink."""
+    stops = [(home, -1)]
     for index, line in enumerate(lines, start=first):
-        run_in = (
-            line.start_ne_m[0] - 0.5 * math.cos(line.heading_rad),
-            line.start_ne_m[1] - 0.5 * math.sin(line.heading_rad),
-        )
-        go(run_in, -1)
-        go(line.start_ne_m, -1)
-        go(line.end_ne_m, index)
-    go(home, -1)
+        ahead = math.cos(line.heading_rad), math.sin(line.heading_rad)
+        run_in = line.start_ne_m[0] - 0.5 * ahead[0], line.start_ne_m[1] - 0.5 * ahead[1]
+        stops += [(run_in, -1), (line.start_ne_m, -1), (line.end_ne_m, index)]
+    legs: list[Leg] = []
+    for (start, _), (end, line_number) in pairwise([*stops, (home, -1)]):
+        if math.dist(start, end) < 1e-9:
+            continue
+        leg = straight(start, end, line_number)
+        heading = legs[-1].end_heading_rad if legs else leg.heading_rad
+        turn = math.remainder(leg.heading_rad - heading, 2 * math.pi)
+        legs += [spot(start, heading, turn)] if abs(turn) > 1e-12 else []
+        legs.append(leg)
     return Route(legs=tuple(legs))
 
 
@@ -113,14 +100,8 @@ def plan_of(
         "reached_side_overlap": 0.3,
         "lines": tuple(lines),
         "dives": tuple(
-            Dive(
-                first_line=first,
-                last_line=last,
-                route=route,
-                duration_s=route.length_m / 0.2,
-                energy_wh=12.5,
-            )
-            for (first, last), route in zip(dives, flown, strict=True)
+            Dive(first_line=a, last_line=b, route=r, duration_s=r.length_m / 0.2, energy_wh=12.5)
+            for (a, b), r in zip(dives, flown, strict=True)
         ),
         "turn_radius_m": 0.5,
         "run_in_m": 0.5,

@@ -27,12 +27,7 @@ def test_the_depth_of_field_agrees_with_the_table_of_views() -> None:
 
 
 @settings(max_examples=60, deadline=None)
-@given(
-    altitude_m=st.floats(1.0, 8.0),
-    relief=st.floats(0.01, 0.4),
-    f_number=st.floats(1.4, 8.0),
-    lens_mm=st.floats(8.0, 35.0),
-)
+@given(st.floats(1.0, 8.0), st.floats(0.01, 0.4), st.floats(1.4, 8.0), st.floats(8.0, 35.0))
 def test_blur_at_both_ends_of_the_relief_is_that_of_traced_images(
     altitude_m: float, relief: float, f_number: float, lens_mm: float
 ) -> None:

@@ -1,4 +1,5 @@
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -67,24 +68,14 @@ def test_the_spacing_yields_the_overlap_on_traced_footprints(ideal: bool, wanted
 
 
 @settings(max_examples=25, deadline=None)
-@given(
-    altitude_m=st.floats(1.2, 6.0),
-    wanted=st.floats(0.3, 0.7),
-    track_error_m=st.floats(0.0, 0.08),
-    over_relief=st.booleans(),
-)
-def test_neighbours_off_their_lines_still_overlap_as_requested(
-    altitude_m: float, wanted: float, track_error_m: float, over_relief: bool
-) -> None:
-    rig, config = survey(
-        plan={
-            "altitude_m": altitude_m,
-            "relief_m": 0.2,
-            "side_overlap": wanted,
-            "track_error_m": track_error_m,
-            "overlap_over_relief": over_relief,
-        }
-    )
+@given(plan=st.fixed_dictionaries({
+    "altitude_m": st.floats(1.2, 6.0), "side_overlap": st.floats(0.3, 0.7),
+    "track_error_m": st.floats(0.0, 0.08), "overlap_over_relief": st.booleans(),
+}))  # fmt: skip
+def test_neighbours_off_their_lines_still_overlap_as_requested(plan: dict[str, Any]) -> None:
+    rig, config = survey(plan={"relief_m": 0.2, **plan})
+    altitude_m, wanted = plan["altitude_m"], plan["side_overlap"]
+    track_error_m, over_relief = plan["track_error_m"], plan["overlap_over_relief"]
     spacing = line_spacing(rig, config.plan, STEP_M)
     ground_m = altitude_m - 0.2 if over_relief else altitude_m
     here = traced_footprint(rig.cameras["left"], ground_m, -track_error_m)

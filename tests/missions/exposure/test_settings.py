@@ -32,30 +32,18 @@ def test_settings_of_the_papers_mission() -> None:
 
 
 @settings(max_examples=60, deadline=None)
-@given(
-    altitude_m=st.floats(1.0, 8),
-    speed_mps=st.floats(0.05, 1.0),
-    forward=st.floats(0, 0.9),
-    blur_px=st.floats(0.2, 5),
-)
-def test_what_was_requested_is_reached(
-    altitude_m: float, speed_mps: float, forward: float, blur_px: float
-) -> None:
-    rig, config = survey(
-        camera={"shortest_interval_s": 0.01},
-        plan={
-            "altitude_m": altitude_m,
-            "relief_m": 0.1,
-            "speed_mps": speed_mps,
-            "forward_overlap": forward,
-            "allowed_blur_px": blur_px,
-        },
-    )
+@given(plan=st.fixed_dictionaries({
+    "altitude_m": st.floats(1.0, 8), "speed_mps": st.floats(0.05, 1.0),
+    "forward_overlap": st.floats(0, 0.9), "allowed_blur_px": st.floats(0.2, 5),
+}))  # fmt: skip
+def test_what_was_requested_is_reached(plan: dict[str, float]) -> None:
+    rig, config = survey(camera={"shortest_interval_s": 0.01}, plan={"relief_m": 0.1, **plan})
     planned = imaging_settings(rig, config)
+    speed_mps, blur_px = plan["speed_mps"], plan["allowed_blur_px"]
 
     # Rounding down to a millisecond of interval costs at most that much overlap.
     finest = speed_mps * 1e-3 / planned.footprint_along_m
-    assert -1e-8 <= planned.forward_overlap - forward <= finest + 1e-8
+    assert -1e-8 <= planned.forward_overlap - plan["forward_overlap"] <= finest + 1e-8
     assert planned.station_spacing_m == pytest.approx(planned.interval_s * speed_mps, abs=1e-8)
     assert planned.blur_px <= blur_px + 1e-6
     assert planned.blur_px >= blur_px - planned.blur.combined * 1e-5 - 1e-6

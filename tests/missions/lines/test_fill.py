@@ -27,14 +27,9 @@ from tests.oracles_lines import (
 
 def pieces_as_lines(pieces: np.ndarray, offsets: np.ndarray) -> list[Line]:
     """Pieces of heading north."""
+    rows = [(offsets[int(i)], a, b, int(n) + 1) for i, a, b, n in pieces.tolist()]
     return [
-        Line(
-            kind="survey",
-            start_ne_m=(a, offsets[int(i)]),
-            end_ne_m=(b, offsets[int(i)]),
-            stations=int(n) + 1,
-        )
-        for i, a, b, n in pieces.tolist()
+        Line(kind="survey", start_ne_m=(a, v), end_ne_m=(b, v), stations=n) for v, a, b, n in rows
     ]
 
 

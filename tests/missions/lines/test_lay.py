@@ -49,30 +49,19 @@ def across(line: Line, heading: float) -> float:
     survey=areas,
     heading=st.floats(0, 6.28),
     pattern=st.sampled_from(PATTERNS),
-    margin_m=st.sampled_from([0.5, 3.0]),
-    cross_lines=st.integers(0, 2),
-    closing_line=st.booleans(),
-)
+    kinds=st.fixed_dictionaries({
+        "margin_m": st.sampled_from([0.5, 3.0]), "cross_lines": st.integers(0, 2),
+        "closing_line": st.booleans(),
+    }),
+)  # fmt: skip
 def test_lines_of_any_area_cover_it_and_stay_inside(
-    survey: MultiPolygon,
-    heading: float,
-    pattern: Pattern,
-    margin_m: float,
-    cross_lines: int,
-    closing_line: bool,
+    survey: MultiPolygon, heading: float, pattern: Pattern, kinds: dict[str, Any]
 ) -> None:
-    area = area_of(survey, margin_m)
+    area = area_of(survey, kinds["margin_m"])
     # The planner refuses an area that is less than a picture across.
     picture_m2 = 4.0 * pattern.half_across_m * pattern.half_along_m
     assume(survey.area > picture_m2 and len(area.allowed.geoms) == 1)
-    lines = lay(
-        survey,
-        heading,
-        pattern,
-        margin_m=margin_m,
-        cross_lines=cross_lines,
-        closing_line=closing_line,
-    )
+    lines = lay(survey, heading, pattern, **kinds)
 
     fence = area.allowed.buffer(1e-6)
     assert all(fence.contains(as_string(line)) for line in lines)
@@ -89,7 +78,7 @@ def test_lines_of_any_area_cover_it_and_stay_inside(
     once = [line for line in lines if line.kind != "closing"]
     assert len({frozenset([line.start_ne_m, line.end_ne_m]) for line in once}) == len(once)
     closing = [line for line in lines if line.kind == "closing"]
-    assert len(closing) == int(closing_line and len(grid) > 1)
+    assert len(closing) == int(kinds["closing_line"] and len(grid) > 1)
     if closing:
         assert closing[0].end_ne_m == pytest.approx(grid[0].start_ne_m, abs=1e-9)
         middle = (grid[0].length_m + grid[0].length_m / (grid[0].stations - 1)) / 2
