@@ -345,7 +345,6 @@ def compare_report(
     out: Path,
     *,
     currents: Sequence[str] = (),
-    swell: str | None = None,
     seed: int | None = None,
     flights: int = 5,
     executor: Executor | None = None,
@@ -357,7 +356,6 @@ def compare_report(
         config: the survey; lines are 1 m apart, as the paper's, where it does not say.
         out: folder to write.
         currents: `SPEED@DIRECTION`; `default_cases` when left out.
-        swell: `HEIGHT@PERIOD`, m and s, of waves that travel across the lines in all currents.
         seed: of the first flight; the survey's when left out.
         flights: of each variant in each current.
         executor: where tasks run; all cores of this machine when left out.
@@ -368,7 +366,7 @@ def compare_report(
         Text, and the same as values for JSON.
 
     Raises:
-        ConfigError: a current or swell is not of that form.
+        ConfigError: a current is not of that form.
     """
     variants = variants_of(vehicles)
     # Turns that all can fly.
@@ -377,13 +375,6 @@ def compare_report(
         config = change_section(config, "plan", line_spacing_m=_PAPER_SPACING_M)
     plan = plan_survey(config, design_rig(config.camera, config.water)).plan
     cases = [_case(text) for text in currents] or list(default_cases(plan))
-    if swell is not None:
-        height, period = _swell(swell)
-        across = math.degrees(plan.lines[0].heading_rad) + 90.0
-        cases = [
-            replace(case, swell_m=height, swell_s=period, swell_towards_deg=across)
-            for case in cases
-        ]
     first = config.seed if seed is None else seed
     seeds = list(range(first, first + flights))
     settings = flight_settings(config)
@@ -474,17 +465,6 @@ def _case(text: str) -> Case:
     if speed is None or towards is None or speed < 0.0 or not math.isfinite(speed + towards):
         raise ConfigError(f"current {text!r}: give SPEED@DIRECTION with a speed of 0 or more")
     return Case(current_mps=speed, towards_deg=towards)
-
-
-def _swell(text: str) -> tuple[float, float]:
-    """Height, m, and period, s, of swell."""
-    try:
-        height, period = (float(part) for part in text.split("@"))
-    except ValueError:
-        height = period = math.nan
-    if not (0.0 <= height < math.inf and 0.0 < period < math.inf):
-        raise ConfigError(f"swell {text!r}: give HEIGHT@PERIOD, m and s, as 0.5@6")
-    return height, period
 
 
 def draw_cross_track(path: Path, cases: Sequence[Mapping[str, Any]]) -> None:

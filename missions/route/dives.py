@@ -96,18 +96,26 @@ def split_dives(
         PlanError: a line does not fit a dive by itself, or a course cannot be flown in the current.
     """
     table, costs = line_table(lines), how.costs
+    down_and_up = costs.dive_j(depth_m), costs.dive_s(depth_m)
 
-    def route(first: int, last: int) -> Array:
-        return legs_through(table[first : last + 1], how, home_ne=home_ne, first_line=first)
+    def dive(first: int, last: int, legs: Array | None = None) -> Dive:
+        if legs is None:
+            legs = legs_through(table[first : last + 1], how, home_ne=home_ne, first_line=first)
+        energy_j, time_s = np.stack(leg_row_costs(legs[:, 2:], costs)).sum(axis=1) + down_and_up
+        return Dive(
+            first_line=first,
+            last_line=last,
+            route=route_of(legs),
+            duration_s=float(time_s),
+            energy_wh=float(energy_j) / _J_PER_WH,
+        )
 
     limits = DiveLimits(energy_j=usable_wh * _J_PER_WH, time_s=math.inf if max_s is None else max_s)
-    down_and_up = costs.dive_j(depth_m), costs.dive_s(depth_m)
-    whole = route(0, len(lines) - 1)
+    whole = legs_through(table, how, home_ne=home_ne)
     spent = np.stack(leg_row_costs(whole[:, 2:], costs))
     _check_flyable(whole, spent[0], lines, costs)
-    energy_j, time_s = spent.sum(axis=1) + down_and_up
-    if limits.hold(energy_j, time_s):
-        return (_dive(0, len(lines) - 1, whole, float(energy_j), float(time_s)),)
+    if limits.hold(*(spent.sum(axis=1) + down_and_up)):
+        return (dive(0, len(lines) - 1, whole),)
 
     sums = _sums(whole, spent, *legs_alone(table, how, home_ne), costs, depth_m)
     parted = _min_dives(sums, limits)
@@ -115,12 +123,7 @@ def split_dives(
         raise PlanError(_line_too_long(lines, sums, limits, depth_m))
     if tied:
         parted = _tie(lines, sums, limits, parted)
-    dives = []
-    for first, last in parted:
-        legs = route(first, last)
-        energy_j, time_s = np.stack(leg_row_costs(legs[:, 2:], costs)).sum(axis=1) + down_and_up
-        dives.append(_dive(first, last, legs, float(energy_j), float(time_s)))
-    return tuple(dives)
+    return tuple(dive(*ends) for ends in parted)
 
 
 def _tie(
@@ -131,18 +134,8 @@ def _tie(
     joined = _min_dives(sums, limits, (np.flatnonzero(fill) + 1).tolist(), overlap=1)
     if joined is None or len(joined) > len(parted):
         return parted
-    energy_j, apart_j = (sum(sums.of(*dive)[0] for dive in dives) for dives in (joined, parted))
+    energy_j, apart_j = (sum(sums.of(*ends)[0] for ends in dives) for dives in (joined, parted))
     return joined if energy_j <= DEAREST_TIE * apart_j else parted
-
-
-def _dive(first: int, last: int, legs: Array, energy_j: float, time_s: float) -> Dive:
-    return Dive(
-        first_line=first,
-        last_line=last,
-        route=route_of(legs),
-        duration_s=time_s,
-        energy_wh=energy_j / _J_PER_WH,
-    )
 
 
 def _check_flyable(legs: Array, energy_j: Array, lines: Sequence[Line], costs: Costs) -> None:
@@ -197,7 +190,7 @@ def _min_dives(
 ) -> list[tuple[int, int]] | None:
     """First and last line of each dive; None where some line fits no dive by itself.
 
-    Of the best division of lines up to each: how many dives, what energy, where the last begins.
+    For the best division of lines up to each: how many dives, what energy, where the last begins.
 
     Args:
         sums: along the lines.
@@ -208,32 +201,6 @@ def _min_dives(
     count = sums.until.shape[1]
     may_begin = np.ones(count + 1, dtype=np.bool_)
     may_begin[list(not_at)] = False
-    begins, dives = _part(sums, may_begin[:count], overlap, limits)
-    if not math.isfinite(dives[count]):
-        return None
-    parted, end = [], count
-    while end > 0:
-        begin = int(begins[end])
-        parted.append((max(begin - overlap, 0), end - 1))
-        end = begin
-    return parted[::-1]
-
-
-def _part(
-    sums: _Sums, may_begin: NDArray[np.bool_], overlap: int, limits: DiveLimits
-) -> tuple[NDArray[np.int64], Array]:
-    """Where the last dive begins of the best division of lines up to each, and how many dives.
-
-    Args:
-        sums: along the lines.
-        may_begin: (N,) lines that a dive may begin with.
-        overlap: how many lines of the dive before each dive flies first.
-        limits: of each dive.
-
-    Returns:
-        (N + 1,) both; infinitely many where no division holds all lines.
-    """
-    count = sums.until.shape[1]
     dives, spent = np.full(count + 1, np.inf), np.full(count + 1, np.inf)
     dives[0] = spent[0] = 0.0
     begins = np.zeros(count + 1, dtype=np.int64)
@@ -255,7 +222,14 @@ def _part(
             best = np.lexsort((total, dives[first]))[0]
             begins[last + 1] = first[best]
             dives[last + 1], spent[last + 1] = dives[first[best]] + 1.0, total[best]
-    return begins, dives
+    if not math.isfinite(dives[count]):
+        return None
+    parted, end = [], count
+    while end > 0:
+        begin = int(begins[end])
+        parted.append((max(begin - overlap, 0), end - 1))
+        end = begin
+    return parted[::-1]
 
 
 def _line_too_long(lines: Sequence[Line], sums: _Sums, limits: DiveLimits, depth_m: float) -> str:

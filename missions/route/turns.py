@@ -145,12 +145,9 @@ def legs_alone(
     out, _ = _hops(home, table[:, [0, 1, 4]], how)
     back, _ = _hops(table[:, 2:], home, how)
     lines = _line_legs(table, 0)
-    pieces = list(
-        chain.from_iterable(
-            (np.concatenate([there, line]), home_again)
-            for there, line, home_again in zip(out, lines, back, strict=True)
-        )
-    )
+    pieces = []
+    for there, line, home_again in zip(out, lines, back, strict=True):
+        pieces += [np.concatenate([there, line]), home_again]
     return np.concatenate(pieces), np.cumsum([0, *map(len, pieces)])
 
 

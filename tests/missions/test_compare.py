@@ -180,7 +180,6 @@ def test_the_report_holds_every_flight_next_to_the_paper(tmp_path: Path) -> None
         CONFIG,
         tmp_path / "one",
         currents=currents,
-        swell="0.3@5",
         seed=4,
         flights=1,
         executor=SERIAL,

@@ -275,20 +275,16 @@ class CompareCommand(SurveyCommand, ThreadsCommand):
 
     SPARUS II steering by line of sight, and ALICE holding its lines by sway: cross-track error,
     roll, speed and energy next to the paper's section VIII. Other vehicles are steered by sway if
-    they can sway. Without a current: across the lines, along them, and none.
+    they can sway. Without a current: across the lines, along them, none, and none with swell.
     """
 
     name = "vehicle compare"
     examples = (
         "vehicle compare -w reef --current 0.1@90 --current 0.05@0 -o compared",
-        "vehicle compare --current 0@0 --swell 0.5@6 --flights 3",
         "vehicle compare -w reef --vehicle bluerov2_heavy --vehicle own.toml",
     )
     current: list[str] | None = option(
         None, "Current to fly in, m/s and degrees.", metavar="SPEED@DIRECTION"
-    )
-    swell: str | None = option(
-        None, "Swell across the lines, metres and seconds.", metavar="HEIGHT@PERIOD"
     )
     vehicle: list[str] | None = option(
         None, "Vehicle to compare; default: the paper's two.", metavar="NAME|FILE"
@@ -303,7 +299,7 @@ class CompareCommand(SurveyCommand, ThreadsCommand):
 
         return compare_report(
             self.settings(needed=self.workspace != WORK), self.out or self.workspace / "compare",
-            currents=self.current or (), swell=self.swell, seed=self.seed, flights=self.flights,
+            currents=self.current or (), seed=self.seed, flights=self.flights,
             executor=self.executor(), vehicles=self.vehicle or (),
         )  # fmt: skip
 
