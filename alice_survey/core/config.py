@@ -515,10 +515,15 @@ class ImagingConfig(Config):
 
 
 LEVEL, AUTO = "level", "auto"
-_PLANE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,29}")
-_NUMBER = r"[+-]?\d+(?:\.\d+)?"
-_FACING = re.compile(rf"facing\s+({_NUMBER})(?:\s+tilt\s+({_NUMBER}))?")
-_FORMS = "give level, auto, or NAME=facing DEGREES [tilt DEGREES], as wall=facing 180"
+_NUMBER = r"([+-]?\d+(?:\.\d+)?)"
+_PLANE = re.compile(
+    rf"([A-Za-z][A-Za-z0-9_-]{{0,29}})\s*=\s*facing\s+{_NUMBER}(?:\s+tilt\s+{_NUMBER})?"
+)
+_FORMS = (
+    "give level, auto, or NAME=facing DEGREES [tilt DEGREES], as wall=facing 180: a letter and up "
+    "to 29 letters, digits, _ and -, since it names a folder too; 0 to 360 degrees by the compass; "
+    "-90 (overhanging) to 90 (lying)"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -539,27 +544,15 @@ def parse_plane(text: str) -> WantedPlane:
     Raises:
         ValueError: it is not of that form, in words for the person who wrote it.
     """
-    name, equals, how = (part.strip() for part in text.partition("="))
-    if not equals:
-        if name not in (LEVEL, AUTO):
-            raise ValueError(f"plane {text!r}: {_FORMS}")
-        return WantedPlane(name=name)
-    if not _PLANE_NAME.fullmatch(name):
-        raise ValueError(
-            f"plane {text!r}: a name is a letter and up to 29 letters, digits, _ and -, since it "
-            "is a folder's too"
-        )
-    if name.lower() in (LEVEL, AUTO):
-        raise ValueError(f"plane {text!r}: {name.lower()!r} has its own meaning: name it otherwise")
-    found = _FACING.fullmatch(how)
-    if found is None:
+    if text.strip() in (LEVEL, AUTO):
+        return WantedPlane(name=text.strip())
+    found = _PLANE.fullmatch(text.strip())
+    if found is None or found[1].lower() in (LEVEL, AUTO):
         raise ValueError(f"plane {text!r}: {_FORMS}")
-    facing, tilt = float(found[1]), float(found[2] or 0.0)
-    if not 0.0 <= facing <= 360.0:
-        raise ValueError(f"plane {text!r}: facing is a compass direction, 0 to 360 degrees")
-    if not -90.0 <= tilt <= 90.0:
-        raise ValueError(f"plane {text!r}: tilt is -90 (overhanging) to 90 degrees (lying)")
-    return WantedPlane(name=name, facing_deg=facing, tilt_deg=tilt)
+    facing, tilt = float(found[2]), float(found[3] or 0.0)
+    if not (0.0 <= facing <= 360.0 and -90.0 <= tilt <= 90.0):
+        raise ValueError(f"plane {text!r}: {_FORMS}")
+    return WantedPlane(name=found[1], facing_deg=facing, tilt_deg=tilt)
 
 
 def parse_planes(texts: Sequence[str]) -> tuple[WantedPlane, ...]:
@@ -572,9 +565,8 @@ def parse_planes(texts: Sequence[str]) -> tuple[WantedPlane, ...]:
     if not planes:
         raise ValueError(f"no plane: {_FORMS}")
     names = [plane.name.lower() for plane in planes]  # some file systems ignore the case
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise ValueError(f"two planes are named {twice!r}: give each its own name")
+    if len(set(names)) < len(names):
+        raise ValueError(f"two of the planes {', '.join(names)} have one name")
     return planes
 
 

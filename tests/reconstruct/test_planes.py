@@ -156,11 +156,11 @@ def test_without_gravity_the_pictures_say_what_is_up():
     [
         (["wall"], "give level, auto, or NAME=facing DEGREES"),
         (["wall=north"], "give level, auto, or NAME=facing DEGREES"),
-        (["../wall=facing 3"], "a name is a letter"),
-        (["auto=facing 3"], "has its own meaning"),
+        (["../wall=facing 3"], "a letter and up"),
+        (["auto=facing 3"], "give level, auto"),
         (["wall=facing 400"], "0 to 360"),
         (["wall=facing 40 tilt 100"], "-90"),
-        (["wall=facing 3", "Wall=facing 4"], "two planes are named 'wall'"),
+        (["wall=facing 3", "Wall=facing 4"], "wall, wall have one name"),
         ([], "no plane"),
     ],
 )
