@@ -154,6 +154,10 @@ def test_files_named_in_settings_are_relative_to_them(tmp_path: Path) -> None:
     config = load_config(path)
     assert config.sea.current_file == tmp_path / "adcp.csv"
     assert config.vehicle.coefficients_file == Path("/far/found.json")
+    for name, file in (("rov.toml", tmp_path / "rov.toml"), ("/f/rov.JSON", Path("/f/rov.JSON"))):
+        path.write_text(f'[vehicle]\nname = "{name}"\n')
+        assert load_config(path).vehicle.file == file
+    assert SurveyConfig().vehicle.file is None
 
 
 def test_thrusters_have_their_health_by_name() -> None:
@@ -162,6 +166,11 @@ def test_thrusters_have_their_health_by_name() -> None:
     for wrong in ("bow=1.5", "bow=-0.1", "bow=half", "bow@soon", "bow@-1", True):
         with pytest.raises(ConfigError, match=r"vehicle\.failures"):
             parse_config({"vehicle": {"failures": [wrong]}}, "test")
+    assert parse_failures(["stern", "bow=0.5"]) == ({"stern": 0.0, "bow": 0.5}, [], [])
+    assert parse_failures(["stern@600", "bow=0.5@30"])[1] == [("stern", 600, 0), ("bow", 30, 0.5)]
+    propellers = parse_failures(["bow:propeller=0.2", "stern:propeller@600"])
+    assert propellers == ({}, [], [("bow", 0.0, 0.2), ("stern", 600.0, 0.0)])
+    assert parse_failures([]) == ({}, [], [])
 
 
 def test_surveys_are_keys() -> None:
@@ -171,49 +180,22 @@ def test_surveys_are_keys() -> None:
     assert len({same: 1, again: 2, other: 3}) == 2
 
 
-def test_a_vehicle_is_a_name_or_a_file_relative_to_the_settings(tmp_path: Path) -> None:
-    path = tmp_path / "survey.toml"
-    for name, file in (
-        ("rov.toml", tmp_path / "rov.toml"),
-        ("/far/rov.JSON", Path("/far/rov.JSON")),
-    ):
-        path.write_text(f'[vehicle]\nname = "{name}"\n')
-        assert load_config(path).vehicle.file == file
-    assert SurveyConfig().vehicle.file is None
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"), [("0.1@90", (0.1, 90.0)), ("1@-10", (1.0, 350.0)), (None, (None, None))]
-)
-def test_a_current_is_read_from_its_text(
-    text: str | None, expected: tuple[float | None, float | None]
-) -> None:
-    assert parse_current(text) == expected
-
-
-@pytest.mark.parametrize("text", ["abc", "0.1", "0.1@", "@90", "0.1@north", ""])
-def test_a_current_that_is_none_is_refused(text: str) -> None:
-    with pytest.raises(ConfigError):
-        parse_current(text)
+def test_a_current_is_read_from_its_text() -> None:
+    assert parse_current("0.1@90") == (0.1, 90.0)
+    assert parse_current("1@-10") == (1.0, 350.0)
+    assert parse_current(None) == (None, None)
+    for text in ("abc", "0.1", "0.1@", "@90", "0.1@north", ""):
+        with pytest.raises(ConfigError):
+            parse_current(text)
 
 
 def test_a_changed_setting_is_checked_like_one_in_the_file() -> None:
     config = parse_config({}, "test")
-    assert (
-        change_section(config, "sea", current_mps=0.3, current_towards_deg=None).sea.current_mps
-        == 0.3
-    )
+    changed = change_section(config, "sea", current_mps=0.3, current_towards_deg=None)
+    assert changed.sea.current_mps == 0.3
     assert change_section(config, "sea", current_mps=None) is config
     with pytest.raises(ConfigError, match=r"sea\.current_mps = 9"):
         change_section(config, "sea", current_mps=9)
-
-
-def test_weak_thrusters_are_read_from_their_texts() -> None:
-    assert parse_failures(["stern", "bow=0.5"]) == ({"stern": 0.0, "bow": 0.5}, [], [])
-    assert parse_failures(["stern@600", "bow=0.5@30"])[1] == [("stern", 600, 0), ("bow", 30, 0.5)]
-    propellers = parse_failures(["bow:propeller=0.2", "stern:propeller@600"])
-    assert propellers == ({}, [], [("bow", 0.0, 0.2), ("stern", 600.0, 0.0)])
-    assert parse_failures([]) == ({}, [], [])
 
 
 def test_a_key_that_is_gone_says_what_to_do() -> None:

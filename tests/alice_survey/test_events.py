@@ -16,34 +16,17 @@ TIME = "2023-11-14T22:13:20.250Z"
 def write(file: logging.Handler, event: str, **known: object) -> dict[str, object]:
     """Have a file take an event down."""
     made = {"time_utc": TIME, "event": event, **known}
-    level = {"warning": logging.WARNING, "error": logging.ERROR}.get(event, logging.INFO)
-    file.handle(
-        logging.makeLogRecord(
-            {"levelno": level, "event": made, "levelname": logging.getLevelName(level)}
-        )
-    )
+    file.handle(logging.makeLogRecord({"levelno": logging.INFO, "event": made}))
     return made
 
 
-def write_step(file: logging.Handler, event: str, **known: object) -> dict[str, object]:
-    return write(file, event, stage="dense", step="match", **known)
-
-
-def test_a_line_holds_an_event(tmp_path: Path) -> None:
-    file = EventFile(tmp_path / "new" / "events.jsonl")
-    written = [
-        write_step(file, "step_progress", done=3, total=9, elapsed_s=1.235, remaining_s=2.5),
-        write(file, "warning", message="böse\nzwei"),
-    ]
-    lines = (tmp_path / "new" / "events.jsonl").read_text().splitlines()
-    assert [json.loads(line) for line in lines] == written
-
-
-def test_each_event_is_there_at_once(tmp_path: Path) -> None:
-    file = EventFile(tmp_path / "e")
+def test_a_line_holds_an_event_at_once(tmp_path: Path) -> None:
+    file, written = EventFile(tmp_path / "new" / "events.jsonl"), []
     for count in range(1, 4):
-        write_step(file, "step_progress", done=count)
-        assert len((tmp_path / "e").read_bytes().splitlines()) == count
+        written.append(write(file, "step_progress", done=count, total=9, remaining_s=2.5))
+        written.append(write(file, "warning", message="böse\nzwei"))
+        lines = (tmp_path / "new" / "events.jsonl").read_text().splitlines()
+        assert [json.loads(line) for line in lines] == written
 
 
 def test_files_are_added_to(tmp_path: Path) -> None:
@@ -71,7 +54,7 @@ def test_a_pipe_is_written_to_as_well(tmp_path: Path) -> None:
     reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
     try:
         file = EventFile(pipe)
-        write_step(file, "step_started")
+        write(file, "step_started", step="match")
         assert json.loads(os.read(reader, 1000))["step"] == "match"
         file.close()
     finally:

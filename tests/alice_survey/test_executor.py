@@ -120,23 +120,18 @@ def test_an_engine_elsewhere_gives_the_same_results_and_reports(
         assert reported(threads.executor, capsys) == here
 
 
-def test_as_many_tasks_run_as_there_is_memory_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    memory = psutil.virtual_memory()._replace(available=1000 * 2**20)
-    monkeypatch.setattr(psutil, "virtual_memory", lambda: memory)
-
-    def processes(task_mib: float) -> set[int]:
-        return set(local_executor(3).map(_process, range(9), label="ids", task_mib=task_mib))
-
-    assert processes(2000.0) == {os.getpid()}  # one runs, whatever it takes
-    assert len(processes(450.0)) == 2
-    assert os.getpid() not in processes(450.0)
-
-
-def test_no_more_processes_start_than_there_is_memory_for(
+def test_as_many_tasks_run_and_processes_start_as_there_is_memory_for(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     memory = psutil.virtual_memory()._replace(available=1000 * 2**20)
     monkeypatch.setattr(psutil, "virtual_memory", lambda: memory)
+
+    def tasks(task_mib: float) -> set[int]:
+        return set(local_executor(3).map(_process, range(9), label="ids", task_mib=task_mib))
+
+    assert tasks(2000.0) == {os.getpid()}  # one runs, whatever it takes
+    assert len(tasks(450.0)) == 2
+    assert os.getpid() not in tasks(450.0)
 
     def processes(task_mib: float) -> set[int]:
         with replace(local_executor(3), task_mib=task_mib).start() as started:

@@ -100,7 +100,7 @@ def test_steps_are_reported_in_order_with_their_counts(run: Run, kept: Kept, clo
     assert moved[-1]["remaining_s"] == pytest.approx(0.2 * (40 - moved[-1]["done"]), abs=1.0)
 
 
-def test_more_items_than_expected_leave_their_number_open(run: Run, kept: Kept) -> None:
+def test_more_items_than_expected_and_none_leave_their_number_open(run: Run, kept: Kept) -> None:
     with progress.step("fly", 2) as counter:
         counter.advance(2)
         assert counter.remaining_s == 0.0
@@ -108,9 +108,6 @@ def test_more_items_than_expected_leave_their_number_open(run: Run, kept: Kept) 
         assert counter.remaining_s is None
     assert kept.events[-1]["done"] == 3
     assert "total" not in kept.events[-1]
-
-
-def test_items_are_passed_on_and_counted(run: Run, kept: Kept) -> None:
     assert list(counted(iter("abc"), "letters")) == ["a", "b", "c"]
     assert kept.events[-1]["done"] == 3
     assert "total" not in kept.events[-1]

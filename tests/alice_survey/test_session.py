@@ -49,6 +49,13 @@ def events_of(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
+def worked(work: Callable[[], None], folder: Path) -> tuple[Any, list[dict[str, Any]]]:
+    """How a run of the command ends, and its events."""
+    file = folder / "events.jsonl"
+    done = CliRunner().invoke(made(work), ["work-hard", "--length", "7", "--log-file", str(file)])
+    return done, events_of(file)
+
+
 def test_events_follow_a_run_from_its_beginning_to_its_end(tmp_path: Path) -> None:
     def work() -> None:
         with progress.step("count", 2) as counter:
@@ -57,11 +64,9 @@ def test_events_follow_a_run_from_its_beginning_to_its_end(tmp_path: Path) -> No
             note("compiling")
             counter.advance()
 
-    file = tmp_path / "events.jsonl"
-    done = CliRunner().invoke(made(work), ["work-hard", "--length", "7", "--log-file", str(file)])
+    done, found = worked(work, tmp_path)
     assert (done.exit_code, done.stdout) == (0, "done 7\n")
     assert done.stderr == "warning: odd\ncompiling\n"
-    found = events_of(file)
     assert [event["event"] for event in found] == [
         "run_started", "step_started", "warning", "note", "step_finished", "result", "run_finished",
     ]  # fmt: skip
@@ -69,6 +74,13 @@ def test_events_follow_a_run_from_its_beginning_to_its_end(tmp_path: Path) -> No
     assert found[0]["process"] == os.getpid()
     assert found[-1]["exit_code"] == 0
     assert [event["time_utc"] for event in found] == sorted(event["time_utc"] for event in found)
+
+
+def _by_ctrl_c() -> SystemError:
+    """A fault that a library makes of Ctrl-C, as numba does while it loads a kernel."""
+    error = SystemError("returned a result with an exception set")
+    error.__cause__ = KeyboardInterrupt()
+    return error
 
 
 @pytest.mark.parametrize(
@@ -79,6 +91,7 @@ def test_events_follow_a_run_from_its_beginning_to_its_end(tmp_path: Path) -> No
         (ZeroDivisionError("by zero"), 1, "ZeroDivisionError: by zero", True),
         (typer.Exit(3), 3, None, False),
         (SystemExit(4), 4, None, False),
+        (_by_ctrl_c(), 130, "interrupted", False),
     ],
 )
 def test_the_end_of_a_run_is_reported(
@@ -87,10 +100,8 @@ def test_the_end_of_a_run_is_reported(
     def work() -> None:
         raise error
 
-    file = tmp_path / "events.jsonl"
-    done = CliRunner().invoke(made(work), ["work-hard", "--log-file", str(file)])
+    done, (*_, before, last) = worked(work, tmp_path)
     assert done.exit_code == code
-    *_, before, last = events_of(file)
     assert (last["event"], last["exit_code"]) == ("run_finished", code)
     if message is None:
         assert before["event"] == "run_started"
@@ -154,9 +165,9 @@ def test_warnings_of_other_processes_are_reported_in_order(
         for _ in local_executor(threads).map(_warns, range(3), label="look"):
             pass
 
-    done = CliRunner().invoke(made(work), ["work-hard", "--log-file", str(tmp_path / "e.jsonl")])
+    done, events = worked(work, tmp_path)
     assert isinstance(done.exception, PlanError)
-    warnings = [e["message"] for e in events_of(tmp_path / "e.jsonl") if e["event"] == "warning"]
+    warnings = [event["message"] for event in events if event["event"] == "warning"]
     assert warnings == ["item 0 is odd", "item 1 is odd", "item 2 is odd"]
     assert done.stderr.splitlines() == [f"warning: {line}" for line in warnings]
     assert capfd.readouterr().err == ""  # the other processes say nothing themselves
@@ -205,6 +216,16 @@ def stay(folder):
 """
 
 
+def sleeper(tmp_path: Path, kind: str, sleep_s: int = 60) -> tuple[Path, Path, list[str]]:
+    """A workspace, a file of events, and the command of a run that sleeps in it."""
+    (tmp_path / "sleeping.py").write_text(SLEEPING.replace("60", str(sleep_s)))
+    (tmp_path / "script.py").write_text(SCRIPT)
+    folder, file = tmp_path / "workspace", tmp_path / "events.jsonl"
+    folder.mkdir()
+    words = (tmp_path / "script.py", kind, folder, "--log-file", file)
+    return folder, file, [sys.executable, *map(str, words)]
+
+
 @pytest.mark.parametrize(
     ("kind", "workers", "number", "times"),
     [
@@ -218,14 +239,9 @@ def test_a_signal_ends_all_processes_and_says_how_to_go_on(
     kind: str, workers: int, number: signal.Signals, times: int, tmp_path: Path
 ) -> None:
     """Of Ctrl-C, a scheduler, and a terminal that closes; twice at once, as `timeout` sends it."""
-    (tmp_path / "sleeping.py").write_text(SLEEPING)
-    (tmp_path / "script.py").write_text(SCRIPT)
-    folder, file = tmp_path / "workspace", tmp_path / "events.jsonl"
-    folder.mkdir()
-    command = [sys.executable, str(tmp_path / "script.py"), kind, str(folder)]
+    folder, file, command = sleeper(tmp_path, kind)
     run = subprocess.Popen(
-        [*command, "--log-file", str(file)],
-        stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
+        command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
         preexec_fn=_default_signals,
     )  # fmt: skip
     until(lambda: len(list(folder.glob("begun*"))) == workers)
@@ -244,36 +260,16 @@ def test_a_signal_ends_all_processes_and_says_how_to_go_on(
     assert (last["event"], last["exit_code"]) == ("run_finished", 128 + number)
 
 
-def test_ctrl_c_that_a_library_makes_a_fault_of_is_none(tmp_path: Path) -> None:
-    """As numba does while it loads a kernel."""
-
-    def work() -> None:
-        try:
-            raise KeyboardInterrupt
-        except KeyboardInterrupt as error:
-            raise SystemError("returned a result with an exception set") from error
-
-    done = CliRunner().invoke(made(work), ["work-hard", "--log-file", str(tmp_path / "e.jsonl")])
-    assert (done.exit_code, done.stderr) == (130, "interrupted\n")
-    *_, before, last = events_of(tmp_path / "e.jsonl")
-    assert (before["event"], before["message"]) == ("error", "interrupted")
-    assert (last["event"], last["exit_code"]) == ("run_finished", 130)
-
-
 @pytest.mark.parametrize("outlives", [False, True])
 def test_a_terminal_that_closes_ends_what_was_not_meant_to_outlive_it(
     outlives: bool, tmp_path: Path
 ) -> None:
     """As `nohup` has it. Nothing reads what either writes any more."""
-    (tmp_path / "sleeping.py").write_text(SLEEPING.replace("60", "2" if outlives else "60"))
-    (tmp_path / "script.py").write_text(SCRIPT)
-    folder, file = tmp_path / "workspace", tmp_path / "events.jsonl"
-    folder.mkdir()
+    folder, file, command = sleeper(tmp_path, "parallel", 2 if outlives else 60)
     run, terminal = pty.fork()
     if run == 0:
         signal.signal(signal.SIGHUP, signal.SIG_IGN if outlives else signal.SIG_DFL)
-        command = [str(tmp_path / "script.py"), "parallel", str(folder), "--log-file", str(file)]
-        os.execv(sys.executable, [sys.executable, *command])  # noqa: S606 (a fork's own end)
+        os.execv(sys.executable, command)  # noqa: S606 (a fork's own end)
     until(lambda: len(list(folder.glob("begun*"))) == 2)
     os.close(terminal)
     _, status = os.waitpid(run, 0)
@@ -348,9 +344,9 @@ def test_a_killed_worker_is_reported_in_one_line(tmp_path: Path) -> None:
     def work() -> None:
         list(local_executor(2).map(_dies, range(4), label="die"))
 
-    done = CliRunner().invoke(made(work), ["work-hard", "--log-file", str(tmp_path / "e.jsonl")])
+    done, events = worked(work, tmp_path)
     assert done.exit_code == 1
-    (line,) = [e["message"] for e in events_of(tmp_path / "e.jsonl") if e["event"] == "error"]
+    (line,) = [event["message"] for event in events if event["event"] == "error"]
     assert "--threads" in line
 
 

@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alice_survey.app.pipeline import template_text
-from alice_survey.core.config import SurveyConfig, change_section, parse_config
 from alice_survey.core.errors import ConfigError
 from alice_survey.core.settings_text import with_settings_changed, with_values
 
@@ -21,15 +20,6 @@ KEYS = {
     name: sorted(set(re.findall(r"^(?:# )?(\w+) = ", text, re.M))) for name, text in _TEXTS.items()
 }
 """All keys that the template names, in use or as an example."""
-
-
-def test_the_template_states_every_default() -> None:
-    """It is the default survey, but for the paper's stated line spacing."""
-    written, default = parse_config(tomllib.loads(TEMPLATE), "survey.toml"), SurveyConfig()
-    assert written == change_section(default, "plan", line_spacing_m=1.0)
-    for section, field in SurveyConfig.model_fields.items():
-        for key in getattr(field.annotation, "model_fields", {section: None}):
-            assert re.search(rf"^(# )?{key} = ", TEMPLATE, re.MULTILINE), f"{section}.{key}"
 
 
 def _lines(before: str, after: str) -> tuple[list[str], list[str]]:

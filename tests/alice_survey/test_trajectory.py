@@ -71,11 +71,8 @@ def test_columns_may_come_in_any_order_and_company(tmp_path: Path) -> None:
 
     assert columns["a"].tolist() == [1.0, 3.0]
     assert columns["b"].tolist() == [2.0, 4.0]
-
-
-def test_a_file_without_rows_gives_empty_columns(tmp_path: Path) -> None:
-    (tmp_path / "log.csv").write_text("a,b\n")
-    assert read_columns(tmp_path / "log.csv", ("a", "b"))["b"].shape == (0,)
+    path.write_text("a,b\n")
+    assert read_columns(path, ("a", "b"))["b"].shape == (0,)
 
 
 @pytest.mark.parametrize(

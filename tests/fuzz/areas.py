@@ -2,16 +2,20 @@
 
 import json
 import zipfile
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pyogrio.raw
+import rasterio
 import shapely
+from rasterio.transform import from_origin
 from shapely.geometry import Polygon
 
 from alice_survey.core.config import AreaConfig
 from alice_survey.core.frames import Datum
+from missions.areas.bathymetry import read_bathymetry
+from missions.areas.survey import survey_area
 from tests.fuzz.target import Target
 
 _DEGREES = Polygon(
@@ -19,31 +23,25 @@ _DEGREES = Polygon(
     [[(35.00004, 32.80003), (35.00009, 32.80003), (35.00006, 32.80008)]],
 )
 _METRES = shapely.transform(_DEGREES, lambda xy: (xy - [35.0, 32.8]) * 1e5 + [7e5, 36.4e5])
-_DATUM = Datum(32.8, 35.0)
 
 
 def read_area(path: Path, ending: str = "") -> object:
     """An area for planning, of a file, or of the file whose side file is damaged."""
-    from missions.areas.survey import survey_area
-
     file = path.with_suffix(ending) if ending else path
     return survey_area(AreaConfig(file=file), turn_margin_m=3.0)
 
 
 def read_zones(path: Path) -> object:
     """Zones to keep out of, where points and lines count."""
-    from missions.areas.survey import survey_area
-
     settings = AreaConfig(
         latitude_deg=32.8, longitude_deg=35.0, no_go_file=path, no_go_clearance_m=1.0
     )
     return survey_area(settings, turn_margin_m=3.0)
 
 
-def read_depths(path: Path) -> object:
-    from missions.areas.bathymetry import read_bathymetry
-
-    return read_bathymetry(path, _DATUM, bounds_ne=(0.0, 0.0, 15.0, 15.0), sense="depths")
+def read_depths(path: Path, crs: str | None = None) -> object:
+    bounds_ne = (0.0, 0.0, 15.0, 15.0)
+    return read_bathymetry(path, Datum(32.8, 35.0), bounds_ne=bounds_ne, sense="depths", crs=crs)
 
 
 def geojson() -> str:
@@ -69,119 +67,72 @@ def kml(extra: str = "", head: str = "") -> str:
     )
 
 
-def _by_gdal(folder: Path, name: str, driver: str, geometry_type: str = "Polygon") -> Path:
-    import pyogrio.raw
-
+def _by_gdal(path: Path, driver: str) -> None:
     pyogrio.raw.write(
-        folder / name, shapely.to_wkb(np.array([_METRES], dtype=object)), [np.arange(1)],
-        ["number"], geometry_type=geometry_type, crs="EPSG:32636", driver=driver,
+        path, shapely.to_wkb(np.array([_METRES], dtype=object)), [np.arange(1)], ["number"],
+        geometry_type="Polygon", crs="EPSG:32636", driver=driver,
     )  # fmt: skip
-    return folder / name
 
 
-def _text(folder: Path, name: str, text: str) -> None:
-    (folder / name).write_text(text, encoding="utf-8")
-
-
-def _kmz(folder: Path) -> None:
-    with zipfile.ZipFile(folder / "a.kmz", "w", zipfile.ZIP_DEFLATED) as archive:
+def _kmz(path: Path) -> None:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("doc.kml", kml())
         archive.writestr("files/readme.txt", "x" * 50)
 
 
-def build_shapefile(folder: Path) -> None:
-    _by_gdal(folder, "a.shp", "ESRI Shapefile")
+def build_shapefile(path: Path) -> None:
+    """All its side files, one of which is that path."""
+    _by_gdal(path.with_suffix(".shp"), "ESRI Shapefile")
 
 
-def _zip(folder: Path) -> None:
-    build_shapefile(folder)
-    with zipfile.ZipFile(folder / "a.zip", "w") as archive:
+def _zip(path: Path) -> None:
+    build_shapefile(path)
+    with zipfile.ZipFile(path, "w") as archive:
         for side in (".shp", ".shx", ".dbf", ".prj"):
-            archive.write(folder / f"a{side}", f"site/a{side}")
-            (folder / f"a{side}").unlink()
-    (folder / "a.cpg").unlink(missing_ok=True)
+            archive.write(path.with_suffix(side), f"site/a{side}")
+            path.with_suffix(side).unlink()
+    path.with_suffix(".cpg").unlink(missing_ok=True)
 
 
-def _geopackage(folder: Path) -> None:
-    _by_gdal(folder, "a.gpkg", "GPKG")
-
-
-def _geotiff(folder: Path) -> None:
-    import rasterio
-    from rasterio.transform import from_origin
-
+def _geotiff(path: Path) -> None:
     north, east = np.mgrid[0:24, 0:24]
     depths = (15.0 + 0.1 * north + 0.05 * east).astype(np.float32)
     with rasterio.open(
-        folder / "a.tif", "w", driver="GTiff", width=24, height=24, count=1, dtype="float32",
+        path, "w", driver="GTiff", width=24, height=24, count=1, dtype="float32",
         crs="EPSG:4326", transform=from_origin(34.9999, 32.8004, 2.5e-5, 2.5e-5), nodata=-9999.0,
         compress="deflate",
     ) as file:  # fmt: skip
         file.write(depths, 1)
 
 
-def _cells() -> tuple[list[float], list[float]]:
-    return [35.0 + 2e-5 * i for i in range(-5, 15)], [32.8003 - 2e-5 * i for i in range(20)]
-
-
-def _xyz(folder: Path, name: str, mark: str) -> None:
-    xs, ys = _cells()
-    rows = [f"{x:.6f}{mark}{y:.6f}{mark}{15 + i % 7}" for y in ys for i, x in enumerate(xs)]
-    head = [mark.join("xyz")] if mark == "," else []
-    _text(folder, name, "\n".join([*head, *rows]) + "\n")
-
-
-def _ascii_grid(folder: Path) -> None:
-    rows = "\n".join(" ".join(f"{15 + (i + j) % 5}.5" for i in range(20)) for j in range(20))
-    head = "ncols 20\nnrows 20\nxllcorner 34.9999\nyllcorner 32.7999\ncellsize 0.00002\n"
-    _text(folder, "a.asc", f"{head}NODATA_value -9999\n{rows}\n")
-
-
-def _of_text(name: str, text: Callable[[], str]) -> Callable[[Path], None]:
-    return lambda folder: _text(folder, name, text())
-
-
-def _target(name: str, file: str, build: Callable[[Path], None], **more: object) -> Target:
-    settings = {"syntax": "binary", "read": read_area} | more
-    return Target(name=name, file=file, build=build, **settings)  # type: ignore[arg-type]
-
-
-def _wkt() -> str:
-    return f"SRID=4326;{_DEGREES.wkt}"
-
-
-def _prefixed(path: Path) -> object:
-    from missions.areas.bathymetry import read_bathymetry
-
-    return read_bathymetry(
-        path, _DATUM, bounds_ne=(0.0, 0.0, 15.0, 15.0), sense="depths", crs="EPSG:4326"
+def _xyz(mark: str) -> str:
+    return "".join(
+        f"{35.0 + 2e-5 * i:.6f}{mark}{32.8003 - 2e-5 * j:.6f}{mark}{15 + (i + 5) % 7}\n"
+        for j in range(20)
+        for i in range(-5, 15)
     )
 
 
+def _ascii_grid() -> str:
+    rows = "\n".join(" ".join(f"{15 + (i + j) % 5}.5" for i in range(20)) for j in range(20))
+    head = "ncols 20\nnrows 20\nxllcorner 34.9999\nyllcorner 32.7999\ncellsize 0.00002\n"
+    return f"{head}NODATA_value -9999\n{rows}\n"
+
+
+_GPKG, _SIDES = partial(_by_gdal, driver="GPKG"), (".shx", ".dbf", ".prj")
+_BY_SHP, _PREFIXED = partial(read_area, ending=".shp"), partial(read_depths, crs="EPSG:4326")
 TARGETS = (
-    _target("GeoJSON", "a.geojson", _of_text("a.geojson", geojson), syntax="json"),
-    _target("GeoJSON zones", "z.json", _of_text("z.json", geojson), syntax="json", read=read_zones),
-    _target("KML", "a.kml", _of_text("a.kml", kml), syntax="text"),
-    _target("KMZ", "a.kmz", _kmz),
-    _target("WKT", "a.wkt", _of_text("a.wkt", _wkt), syntax="text"),
-    _target("GeoPackage", "a.gpkg", _geopackage),
-    _target("shapefile", "a.shp", build_shapefile),
-    *(
-        _target(
-            f"shapefile's {side}", f"a{side}", build_shapefile,
-            read=partial(read_area, ending=".shp"),
-        )
-        for side in (".shx", ".dbf", ".prj")
-    ),
-    _target("zipped shapefile", "a.zip", _zip),
-    _target("bathymetry GeoTIFF", "a.tif", _geotiff, read=read_depths),
-    _target(
-        "bathymetry XYZ", "a.xyz", partial(_xyz, name="a.xyz", mark=" "), read=_prefixed,
-        syntax="text",
-    ),
-    _target(
-        "bathymetry CSV", "a.csv", partial(_xyz, name="a.csv", mark=","), read=_prefixed,
-        syntax="csv",
-    ),
-    _target("bathymetry ASCII grid", "a.asc", _ascii_grid, read=_prefixed, syntax="text"),
-)  # fmt: skip
+    Target("GeoJSON", "json", "a.geojson", geojson(), read_area),
+    Target("GeoJSON zones", "json", "z.json", geojson(), read_zones),
+    Target("KML", "text", "a.kml", kml(), read_area),
+    Target("KMZ", "binary", "a.kmz", _kmz, read_area),
+    Target("WKT", "text", "a.wkt", f"SRID=4326;{_DEGREES.wkt}", read_area),
+    Target("GeoPackage", "binary", "a.gpkg", _GPKG, read_area),
+    Target("shapefile", "binary", "a.shp", build_shapefile, read_area),
+    *(Target(f"shapefile's {s}", "binary", f"a{s}", build_shapefile, _BY_SHP) for s in _SIDES),
+    Target("zipped shapefile", "binary", "a.zip", _zip, read_area),
+    Target("bathymetry GeoTIFF", "binary", "a.tif", _geotiff, read_depths),
+    Target("bathymetry XYZ", "text", "a.xyz", _xyz(" "), _PREFIXED),
+    Target("bathymetry CSV", "csv", "a.csv", f"x,y,z\n{_xyz(',')}", _PREFIXED),
+    Target("bathymetry ASCII grid", "text", "a.asc", _ascii_grid(), _PREFIXED),
+)

@@ -1,18 +1,38 @@
-"""Calibrations of every format that is read, pictures of every kind, and targets."""
+"""Calibrations of every format that is read, pictures and videos of every kind, and targets."""
 
 import struct
 from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+from PIL import Image
 
 from alice_survey.core.config import CameraConfig, WaterConfig
 from alice_survey.core.executor import SERIAL
-from camera_calib.rig import Rig, design_rig
+from camera_calib.calibrate.detect_views import detect_views
+from camera_calib.calibrate.picture_sets import PictureSet
+from camera_calib.camera import Camera
+from camera_calib.formats.convert import FORMATS, detect
+from camera_calib.formats.rigs import ReadOptions, in_air, only
+from camera_calib.lenses.fisheye import FisheyeLens
+from camera_calib.picture_files import without_orientation
+from camera_calib.ports.dome import DomePort
+from camera_calib.rig import Rig, design_rig, read_rig, write_rig
+from camera_calib.targets.target import parse_target, read_target, write_target
+from missions.exposure.gain import read_linear
+from reconstruct.pictures.files import bits_used, exif_focal_px, inspect
+from reconstruct.pictures.normalise import even_light, finely, read_deep
+from reconstruct.pictures.telemetry import read_fixes
+from reconstruct.pictures.undistorted import read_colour, read_mask
+from reconstruct.pictures.videos import video_start
 from tests.cameras import flat_port_camera
 from tests.fuzz.target import Target
+from tests.reconstruct.pictures import gopro
 
 _SIZE = (48, 32)
 
@@ -24,8 +44,6 @@ def small_rig() -> Rig:
 
 def _in_air() -> Rig:
     """Two cameras that formats without ports can hold."""
-    from dataclasses import replace
-
     lens = flat_port_camera(
         width_px=640, height_px=480, fx_px=500.0, fy_px=501.0, cx_px=320.0, cy_px=240.0,
         k1=-0.1, k2=0.01, p1=1e-3, p2=-1e-3, n_water=1.0,
@@ -36,12 +54,6 @@ def _in_air() -> Rig:
 
 def _domes() -> Rig:
     """Two fisheyes behind domes."""
-    from dataclasses import replace
-
-    from camera_calib.camera import Camera
-    from camera_calib.lenses.fisheye import FisheyeLens
-    from camera_calib.ports.dome import DomePort
-
     lens = FisheyeLens(fx_px=300.0, fy_px=301.0, cx_px=320.0, cy_px=240.0, k1=0.02, k4=0.001)
     port = DomePort(dome_z_m=0.005, outer_radius_m=0.06, glass_thickness_m=0.006)
     camera = Camera(width_px=640, height_px=480, lens=lens, port=port)
@@ -51,25 +63,20 @@ def _domes() -> Rig:
 
 def _one() -> Rig:
     """One fisheye in air."""
-    from camera_calib.formats.rigs import in_air, only
-
     return only(in_air(_domes()), "left")
 
 
-def _write(name: str, file: str, rig: Callable[[], Rig]) -> Callable[[Path], None]:
-    def build(folder: Path) -> None:
-        from camera_calib.formats.convert import FORMATS
+def _write(name: str, rig: Callable[[], Rig], file: str = "") -> Callable[[Path], None]:
+    """Writer of a calibration to the path of a file, or where it is in the folder above that."""
 
-        FORMATS[name].write(folder / file, rig())
+    def build(path: Path) -> None:
+        FORMATS[name].write(path.parent.parent / file if file else path, rig())
 
     return build
 
 
 def read_calibration(path: Path) -> object:
     """As `camera convert` and `calibrate --from`: of whatever format it looks like."""
-    from camera_calib.formats.convert import detect
-    from camera_calib.formats.rigs import ReadOptions
-
     return detect(path).read(path, ReadOptions(image_size=(640, 480), camera="1"))
 
 
@@ -77,27 +84,15 @@ def _read_folder(path: Path) -> object:
     return read_calibration(path.parent)
 
 
-def _rig_json(folder: Path) -> None:
-    from camera_calib.rig import write_rig
-
-    write_rig(folder / "rig.json", small_rig())
+def _rig_json(path: Path) -> None:
+    write_rig(path, small_rig())
 
 
-def read_rig(path: Path) -> object:
-    from camera_calib.rig import read_rig
-
-    return read_rig(path)
-
-
-def _board(folder: Path) -> None:
-    from camera_calib.targets.target import parse_target, write_target
-
-    write_target(folder / "board.json", parse_target("charuco 12x9 40mm 30mm"))
+def _board(path: Path) -> None:
+    write_target(path, parse_target("charuco 12x9 40mm 30mm"))
 
 
 def read_board(path: Path) -> object:
-    from camera_calib.targets.target import read_target
-
     return read_target(path).points
 
 
@@ -109,8 +104,6 @@ def _pixels(channels: int, kind: type) -> Any:
 
 def picture(path: Path, mode: str = "RGB", **more: Any) -> Path:
     """A small picture with the EXIF of a camera that had GPS."""
-    from PIL import Image
-
     bands = len(Image.new(mode, (1, 1)).getbands())
     image = Image.frombytes(mode, _SIZE, _pixels(bands, np.uint8).tobytes())
     exif = Image.Exif()
@@ -122,26 +115,18 @@ def picture(path: Path, mode: str = "RGB", **more: Any) -> Path:
     return path
 
 
-def _picture(folder: Path, name: str, mode: str, **more: Any) -> None:
-    picture(folder / name, mode, **more)
+def _deep(path: Path) -> None:
+    cv2.imwrite(str(path), _pixels(3, np.uint16) >> 4)
 
 
-def _deep(folder: Path, name: str) -> None:
-    import cv2
-
-    cv2.imwrite(str(folder / name), _pixels(3, np.uint16) >> 4)
-
-
-def _chessboard(folder: Path) -> None:
+def _chessboard(path: Path) -> None:
     """9 x 6 inner corners, 16 px apart, with a white edge."""
-    import cv2
-
     y, x = np.mgrid[0:144, 0:192] // 16
     dark = (x % 2 == y % 2) & (x > 0) & (x < 11) & (y > 0) & (y < 8)
-    cv2.imwrite(str(folder / "a.png"), np.where(dark, 20, 230).astype(np.uint8))
+    cv2.imwrite(str(path), np.where(dark, 20, 230).astype(np.uint8))
 
 
-def dng(folder: Path) -> None:
+def dng(path: Path) -> None:
     """A negative of one strip, as small as LibRaw takes them."""
     width, height = 64, 48
     values = np.random.default_rng(3).integers(0, 4096, width * height).astype("<u2").tobytes()
@@ -170,96 +155,87 @@ def dng(folder: Path) -> None:
         else:
             entries += struct.pack("<HHI", number, kind, count) + content.ljust(4, b"\0")
     head = b"II*\0" + struct.pack("<I", 8) + struct.pack("<H", len(tags))
-    (folder / "a.dng").write_bytes(head + entries + b"\0" * 4 + extra + values)
+    path.write_bytes(head + entries + b"\0" * 4 + extra + values)
 
 
 def read_picture(path: Path) -> object:
     """As `import-images` does: looked at, decoded, and copied in memory."""
-    from reconstruct.pictures.files import bits_used, exif_focal_px, inspect
-
     facts = inspect(path)
     return facts, bits_used(facts.highest), exif_focal_px(path, 48, 32)
 
 
 def read_for_matching(path: Path) -> object:
-    from missions.exposure.gain import read_linear
-    from reconstruct.pictures.normalise import even_light, finely, read_deep
-    from reconstruct.pictures.undistorted import read_colour
-
     return finely(even_light(read_deep(path))), read_colour(path), read_linear(path, linear=False)
-
-
-def read_mask(path: Path) -> object:
-    from reconstruct.pictures.undistorted import read_mask
-
-    return read_mask(path, _SIZE)
 
 
 def look_for_board(path: Path) -> object:
     """As `calibrate` does with each picture."""
-    from camera_calib.calibrate.detect_views import detect_views
-    from camera_calib.calibrate.picture_sets import PictureSet
-    from camera_calib.targets.target import parse_target
-
     sets = [PictureSet(name="v", paths={path.name: path})]
     return detect_views(sets, parse_target("chessboard 9x6 25mm"), SERIAL)
 
 
-def _calibration(
-    name: str, syntax: str, file: str, build: Callable[[Path], None], **more: Any
-) -> Target:
-    read = more.get("read", read_calibration)
-    return Target(name=name, syntax=syntax, file=file, build=build, read=read)  # type: ignore[arg-type]
+def read_video(path: Path) -> object:
+    """As `import-images` does next to the decoder of its frames."""
+    fixes = read_fixes(path, 3.0)
+    return video_start(path), fixes.start_utc(), fixes.at(0.5)
 
 
-def _image(name: str, file: str, build: Callable[[Path], None], **more: Any) -> Target:
-    settings = {"read": read_picture} | more
-    return Target(name=name, syntax="binary", file=file, build=build, **settings)
+_WHEN = datetime(2024, 7, 1, 12, tzinfo=UTC)
 
 
+def _film(path: Path, telemetry: Callable[..., bytes]) -> None:
+    """A short film of a GoPro."""
+    frames = [np.full((16, 16, 3), level, np.uint8) for level in range(3)]
+    payloads = [telemetry([(60.0, 5.0, 1.0)] * 3, _WHEN)] * 3
+    gopro.film(path, frames, 1.0, created=_WHEN, payloads=payloads)
+
+
+def _turned(path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x112] = 6
+    Image.new("RGB", (16, 16)).save(path, exif=exif)
+
+
+def take_orientation_off(path: Path) -> object:
+    return without_orientation(path.read_bytes())
+
+
+read_small_mask = partial(read_mask, size=_SIZE)
+_FILES = (
+    ("rig.json", "json", "rig.json", _rig_json, read_rig),
+    ("target JSON", "json", "board.json", _board, read_board),
+    ("OpenCV YAML", "text", "a.yaml", _write("opencv", _in_air), read_calibration),
+    ("OpenCV XML", "text", "a.xml", _write("opencv", _in_air), read_calibration),
+    ("Kalibr camchain", "text", "a.yaml", _write("kalibr", _in_air), read_calibration),
+    ("Metashape XML", "text", "a.xml", _write("metashape", _one), read_calibration),
+)
+_IN_FOLDERS = (
+    ("ROS camera_info", "text", "ros/left.yaml", "ros", _in_air, "ros"),
+    ("COLMAP cameras.txt", "text", "m/cameras.txt", "colmap", _in_air, "m"),
+    ("COLMAP cameras.bin", "binary", "m/cameras.bin", "colmap", _in_air, "m/cameras.bin"),
+    ("COLMAP rig_config.json", "json", "m/rig_config.json", "colmap", _in_air, "m"),
+    ("FLATPORT cameras.txt", "text", "m/cameras.txt", "refractive", small_rig, "m"),
+    ("DOMEPORT cameras.bin", "binary", "m/cameras.bin", "refractive", _domes, "m/cameras.bin"),
+)
+_IMAGES = (
+    ("JPEG", "a.jpg", picture, read_picture),
+    ("PNG, 8 bits", "a.png", partial(picture, mode="RGBA"), read_picture),
+    ("PNG, 16 bits", "a.png", _deep, read_picture),
+    ("TIFF, LZW", "a.tif", partial(picture, compression="tiff_lzw"), read_picture),
+    ("DNG", "a.dng", dng, read_picture),
+    ("picture to match, JPEG", "a.jpg", picture, read_for_matching),
+    ("mask", "a.png", partial(picture, mode="L"), read_small_mask),
+    ("JPEG with an orientation", "a.jpg", _turned, take_orientation_off),
+    ("TIFF with an orientation", "a.tif", _turned, take_orientation_off),
+    ("picture of a board", "a.png", _chessboard, look_for_board, 2),
+    ("MP4 with GPS5", "GX010042.MP4", partial(_film, telemetry=gopro.gps5), read_video, 60),
+    ("MP4 with GPS9", "GX010042.MP4", partial(_film, telemetry=gopro.gps9), read_video, 60),
+)
 TARGETS = (
-    _calibration("rig.json", "json", "rig.json", _rig_json, read=read_rig),
-    _calibration("OpenCV YAML", "text", "a.yaml", _write("opencv", "a.yaml", _in_air)),
-    _calibration("OpenCV XML", "text", "a.xml", _write("opencv", "a.xml", _in_air)),
-    _calibration("Kalibr camchain", "text", "a.yaml", _write("kalibr", "a.yaml", _in_air)),
-    _calibration(
-        "ROS camera_info", "text", "ros/left.yaml", _write("ros", "ros", _in_air),
-        read=_read_folder,
+    *(Target(*row) for row in _FILES),  # type: ignore[arg-type]
+    *(
+        Target(name, syntax, file, _write(kind, rig, to), _read_folder)  # type: ignore[arg-type]
+        for name, syntax, file, kind, rig, to in _IN_FOLDERS
     ),
-    _calibration(
-        "COLMAP cameras.txt", "text", "m/cameras.txt", _write("colmap", "m", _in_air),
-        read=_read_folder,
-    ),
-    _calibration(
-        "COLMAP cameras.bin", "binary", "m/cameras.bin",
-        _write("colmap", "m/cameras.bin", _in_air), read=_read_folder,
-    ),
-    _calibration(
-        "COLMAP rig_config.json", "json", "m/rig_config.json", _write("colmap", "m", _in_air),
-        read=_read_folder,
-    ),
-    _calibration(
-        "FLATPORT cameras.txt", "text", "m/cameras.txt", _write("refractive", "m", small_rig),
-        read=_read_folder,
-    ),
-    _calibration(
-        "DOMEPORT cameras.bin", "binary", "m/cameras.bin",
-        _write("refractive", "m/cameras.bin", _domes), read=_read_folder,
-    ),
-    _calibration("Metashape XML", "text", "a.xml", _write("metashape", "a.xml", _one)),
-    _calibration("target JSON", "json", "board.json", _board, read=read_board),
-    _image("JPEG", "a.jpg", partial(_picture, name="a.jpg", mode="RGB")),
-    _image("PNG, 8 bits", "a.png", partial(_picture, name="a.png", mode="RGBA")),
-    _image("PNG, 16 bits", "a.png", partial(_deep, name="a.png")),
-    _image(
-        "TIFF, LZW", "a.tif",
-        partial(_picture, name="a.tif", mode="RGB", compression="tiff_lzw"),
-    ),
-    _image("DNG", "a.dng", dng),
-    _image(
-        "picture to match, JPEG", "a.jpg", partial(_picture, name="a.jpg", mode="RGB"),
-        read=read_for_matching,
-    ),
-    _image("mask", "a.png", partial(_picture, name="a.png", mode="L"), read=read_mask),
-    _image("picture of a board", "a.png", _chessboard, read=look_for_board, examples=2),
-)  # fmt: skip
+    *(Target(name, "binary", *row) for name, *row in _IMAGES),  # type: ignore[arg-type]
+)

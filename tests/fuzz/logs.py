@@ -1,14 +1,33 @@
 """Logs of vehicles: what `import-log`, `import-images`, `fly`, `plan check` and `identify` read."""
 
-from collections.abc import Callable
+import json
+import tomllib
 from datetime import UTC
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
 
-from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.sim.vehicle import log as vehicle_log
+from alice_survey.sim.vehicle.identification.two_step import read_pulls
+from alice_survey.sim.vehicle.sea import read_current
+from alice_survey.sim.vehicle.vehicle import (
+    coefficients_from_file,
+    speeds_missing,
+    vehicle_from_file,
+)
+from missions.coverage import dive_record
+from missions.logs.dead_reckoning import TrackErrors, with_dead_reckoning
+from missions.logs.import_log import ImportOptions, navigation_table, read_dive, read_tide
+from missions.logs.navigation_csv import read_navigation
+from reconstruct.pictures.incoming import pair_by_time
 from tests.fuzz.target import Target
+from tests.missions.exports.plans import RIG, line, plan_of
+from tests.missions.logs.log_files import Bag, dataflash_log, tlog
+from tests.missions.logs.test_import_ulog import dive, ulog
 
 _HERE = Path(__file__).parent
 _START_NS = 1_714_564_800_000_000_000
@@ -16,30 +35,24 @@ _START_NS = 1_714_564_800_000_000_000
 
 def read_any_log(path: Path) -> object:
     """As `import-log` until it writes; of a side file, the log in whose folder it is."""
-    from missions.logs.import_log import ImportOptions, navigation_table, read_dive
-
     log = path.parent if path.parent.name == "bag" else path
     options = ImportOptions(lever_body_m=(0.1, 0.0, 0.2))
-    dive = read_dive(log, options)
-    lever = options.lever_body_m if dive.attitude is not None else (0.0, 0.0, 0.0)
-    return navigation_table(dive, dive.row_times, ImportOptions(lever_body_m=lever), 0.0)
+    found = read_dive(log, options)
+    lever = options.lever_body_m if found.attitude is not None else (0.0, 0.0, 0.0)
+    return navigation_table(found, found.row_times, ImportOptions(lever_body_m=lever), 0.0)
 
 
-def _bag(folder: Path, version: int, storage: str = "MCAP") -> None:
-    from rosbags.rosbag2 import StoragePlugin
-
-    from tests.missions.logs.log_files import Bag
-
+def _bag(path: Path, version: int = 2, storage: StoragePlugin = StoragePlugin.MCAP) -> None:
     bag = Bag(version)
     for i in range(12):
         bag.add_nav_sts(
             _START_NS + i * 10**8, (41.7 + 1e-6 * i, 3.03, 5.0), (0.01, -0.02, 3.1), 2.5
         )
         bag.add_range(_START_NS + i * 10**8, "/sonar/ping", 4.0)
-    bag.write(folder / ("a.bag" if version == 1 else "bag"), getattr(StoragePlugin, storage))
+    bag.write(path if version == 1 else path.parent, storage)
 
 
-def _dvl(folder: Path) -> None:
+def _dvl() -> str:
     lines = []
     for i in range(12):
         micro = 1_714_564_800_000_000 + 100_000 * i
@@ -50,16 +63,13 @@ def _dvl(folder: Path) -> None:
             f'{{"ts": {micro / 1e6}, "x": 1, "y": 2, "z": 3, "std": 0.01, "roll": 1.5, '
             f'"pitch": -2, "yaw": {i}, "type": "position_local", "status": 0}}',
         ]
-    (folder / "a.json").write_text("\n".join(lines) + "\n")
+    return _text(lines)
 
 
 def read_dead_reckoned(path: Path) -> object:
     """As `import-log --dead-reckon`."""
-    from missions.logs.dead_reckoning import TrackErrors, with_dead_reckoning
-    from missions.logs.import_log import ImportOptions, read_dive
-
-    dive = read_dive(path, ImportOptions())
-    return with_dead_reckoning(dive, TrackErrors(), (43.0, 5.0, 2.0), 0.0)
+    found = read_dive(path, ImportOptions())
+    return with_dead_reckoning(found, TrackErrors(), (43.0, 5.0, 2.0), 0.0)
 
 
 def _dive() -> list[tuple[object, ...]]:
@@ -78,35 +88,22 @@ def _dive() -> list[tuple[object, ...]]:
     return rows
 
 
-def _ulog(folder: Path) -> None:
-    from tests.missions.logs.test_import_ulog import dive, ulog
-
-    (folder / "a.ulg").write_bytes(ulog(dive(6)))
+def _ulog(path: Path) -> None:
+    path.write_bytes(ulog(dive(6)))
 
 
 def read_pairing(path: Path) -> object:
     """As `import-images --triggers`."""
-    from reconstruct.pictures.incoming import pair_by_time
-
     sides = {side: [Path(f"{side}/{k}.jpg") for k in range(5)] for side in ("left", "right")}
     return pair_by_time(sides, path, UTC)
 
 
-def _pairing(folder: Path) -> None:
-    rows = [f"{side},{k},{10.5 + k}" for k in range(5) for side in ("left", "right")]
-    (folder / "p.csv").write_text("camera,number,time_s\n" + "\n".join(rows) + "\n")
+def _dataflash(path: Path) -> None:
+    path.write_bytes(dataflash_log(_dive()))
 
 
-def _dataflash(folder: Path, name: str) -> None:
-    from tests.missions.logs.log_files import dataflash_log
-
-    (folder / name).write_bytes(dataflash_log(_dive()))
-
-
-def _telemetry(folder: Path) -> None:
+def _telemetry(path: Path) -> None:
     from pymavlink.dialects.v20 import ardupilotmega as mavlink
-
-    from tests.missions.logs.log_files import tlog
 
     records = []
     for i in range(12):
@@ -118,7 +115,7 @@ def _telemetry(folder: Path) -> None:
             (t, mavlink.MAVLink_global_position_int_message(ms, *place)),
             (t, mavlink.MAVLink_distance_sensor_message(ms, 20, 3000, 180 + i, 0, 0, 25, 255)),
         ]
-    (folder / "a.tlog").write_bytes(tlog(records))
+    path.write_bytes(tlog(records))
 
 
 def navigation_rows(*, dated: bool) -> list[str]:
@@ -130,99 +127,47 @@ def navigation_rows(*, dated: bool) -> list[str]:
     return rows
 
 
-def _written(name: str, rows: Callable[[], list[str]]) -> Callable[[Path], None]:
-    return lambda folder: _write(folder / name, rows())
-
-
-def _write(path: Path, rows: list[str]) -> None:
-    path.write_text("\n".join(rows) + "\n", encoding="utf-8")
+def _text(rows: list[str]) -> str:
+    return "\n".join(rows) + "\n"
 
 
 def read_nav(path: Path) -> object:
     """As `import-images --navigation`: read, and interpolated at other times."""
-    from missions.logs.navigation_csv import read_navigation
-
-    log = read_navigation(path, UTC)
-    return log.at(np.linspace(-5.0, 60.0, 40))
+    return read_navigation(path, UTC).at(np.linspace(-5.0, 60.0, 40))
 
 
 def read_triggers(path: Path) -> object:
-    from missions.coverage.dive_record import read_triggers
-    from missions.logs.navigation_csv import read_navigation
-
-    return read_triggers(path, read_navigation(path.with_name("n.csv"), UTC))
+    return dive_record.read_triggers(path, read_navigation(path.with_name("n.csv"), UTC))
 
 
-def _triggers(folder: Path) -> None:
-    _write(folder / "n.csv", navigation_rows(dated=True))
-    _write(folder / "t.csv", ["time_utc,line", *(f"2024-05-01T12:00:{i:02d}Z,0" for i in range(9))])
+def _triggers(path: Path) -> None:
+    path.with_name("n.csv").write_text(_text(navigation_rows(dated=True)))
+    rows = ["time_utc,line", *(f"2024-05-01T12:00:{i:02d}Z,0" for i in range(9))]
+    path.write_text(_text(rows))
 
 
 def check_dive(path: Path) -> object:
-    """As `plan check LOG`: the stations of a dive, for a plan."""
-    from camera_calib.rig import design_rig
-    from missions.coverage.dive_record import read_dive_record
-    from tests.fuzz.workspace import small_plan
-
-    return read_dive_record(path, small_plan(), design_rig(CameraConfig(), WaterConfig()))
-
-
-def _check_log(folder: Path) -> None:
-    rows = ["time_s,latitude_deg,longitude_deg,depth_m,roll_deg,pitch_deg,heading_deg,altitude_m"]
-    rows += [f"{i},{32.8236 + 2e-6 * i:.7f},34.9553,13.0,0,0,{i % 3},2.0" for i in range(40)]
-    _write(folder / "d.csv", rows)
-
-
-def read_tide(path: Path) -> object:
-    from missions.logs.import_log import read_tide
-
-    return read_tide(str(path), dated=True)
-
-
-def _vehicle_rows() -> list[str]:
-    names = (
-        "time_s,north_m,east_m,depth_m,quat_x,quat_y,quat_z,quat_w,u_mps,v_mps,w_mps,"
-        "p_rad_s,q_rad_s,r_rad_s,rpm_stern"
-    )
-    row = "0.0,0.0,10.0,0,0,0,1,0.2,0,0,0,0,0.01,300"
-    return [names, *(f"{0.1 * i:.1f},{row}" for i in range(20))]
+    """As `plan check LOG`: the stations of a dive, for a plan of two lines."""
+    plan = plan_of([line((0.0, 0.0), (5.0, 0.0)), line((5.0, 1.0), (0.0, 1.0))], [(0, 1)])
+    return dive_record.read_dive_record(path, plan, RIG)
 
 
 def read_vehicle_log(path: Path) -> object:
-    from alice_survey.sim.vehicle.log import read_vehicle_log, segments
-
-    return segments(read_vehicle_log(path))
+    return vehicle_log.segments(vehicle_log.read_vehicle_log(path))
 
 
-def _column_map(folder: Path) -> None:
-    _write(
-        folder / "map.toml",
-        [
-            'time = "t"', "time_unit_s = 0.001", 'body = "flu"', 'world = "enu"',
-            'velocity = ["vx", "vy", "vz"]', 'quaternion_xyzw = ["a", "b", "c", "d"]',
-            "[rpm]", 'stern = "m1"',
-        ],
-    )  # fmt: skip
-    _write(
-        folder / "log.csv",
-        ["t,vx,vy,vz,a,b,c,d,m1", *(f"{100 * i},0.2,0,0,0,0,0,1,300" for i in range(9))],
+def _column_map(path: Path) -> None:
+    path.with_name("map.toml").write_text(
+        'time = "t"\ntime_unit_s = 0.001\nbody = "flu"\nworld = "enu"\n'
+        'velocity = ["vx", "vy", "vz"]\nquaternion_xyzw = ["a", "b", "c", "d"]\n'
+        '[rpm]\nstern = "m1"\n'
     )
-
-
-def read_column_map(path: Path) -> object:
-    from alice_survey.sim.vehicle.log import read_column_map as read
-
-    return read(path)
+    rows = ["t,vx,vy,vz,a,b,c,d,m1", *(f"{100 * i},0.2,0,0,0,0,0,1,300" for i in range(9))]
+    path.with_name("log.csv").write_text(_text(rows))
 
 
 def swelling_bag(folder: Path, packed: str, size: int) -> Path:
     """A navigation log with one message more, of a number of zeros, in packed chunks."""
-    from rosbags.rosbag1 import Writer as Writer1
-    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
-    from rosbags.rosbag2 import Writer as Writer2
-
-    from tests.missions.logs.log_files import Bag
-
     bag = Bag(1 if packed == "bz2" else 2)
     bag.add_nav_sts(_START_NS, (41.7, 3.03, 5.0), (0.01, -0.02, 3.1), 2.5)
     writer: Writer1 | Writer2
@@ -242,98 +187,60 @@ def swelling_bag(folder: Path, packed: str, size: int) -> Path:
 
 
 def read_foreign(path: Path) -> object:
-    from alice_survey.sim.vehicle.log import read_column_map, read_foreign_log
-
-    return read_foreign_log(path.with_name("log.csv"), read_column_map(path.with_name("map.toml")))
+    columns = vehicle_log.read_column_map(path.with_name("map.toml"))
+    return vehicle_log.read_foreign_log(path.with_name("log.csv"), columns)
 
 
 def read_vehicle(path: Path) -> object:
-    from alice_survey.sim.vehicle.vehicle import speeds_missing, vehicle_from_file
-
     return vehicle_from_file(path), speeds_missing(path)
 
 
-def _vehicle(folder: Path) -> None:
-    source = _HERE.parent / "alice_survey" / "sim" / "vehicle" / "identification" / "bluerov2.toml"
-    (folder / "v.toml").write_bytes(source.read_bytes())
-
-
-def _vehicle_json(folder: Path) -> None:
-    import json
-    import tomllib
-
-    _vehicle(folder)
-    (folder / "v.json").write_text(json.dumps(tomllib.loads((folder / "v.toml").read_text())))
-    (folder / "v.toml").unlink()
-
-
-def _coefficients() -> list[str]:
-    return ["X_u = -4.0", "X_uu = -18.0", "Y_v = -6.0", "X_udot = -5.5", "N_r = -0.1"]
-
-
-def read_coefficients(path: Path) -> object:
-    from alice_survey.sim.vehicle.vehicle import coefficients_from_file
-
-    return coefficients_from_file(path)
-
-
-def _pulls() -> list[str]:
-    return ["thruster,rpm,force_n", "stern,300,12.5", "stern,-300,-9", "stern,600,50"]
-
-
-def read_pulls(path: Path) -> object:
-    from alice_survey.sim.vehicle.identification.two_step import read_pulls as read
-
-    return read(path)
-
-
-def _current() -> list[str]:
-    rows = [f"{t},{d},0.1,0.02" for t in (0, 60, 120) for d in (5, 10, 15)]
-    return ["time_s,depth_m,north_mps,east_mps", *rows]
-
-
-def read_current(path: Path) -> object:
-    from alice_survey.sim.vehicle.sea import read_current
-
-    return read_current(path)
-
-
-def _tide() -> list[str]:
-    return ["time_utc,height_m", *(f"2024-05-01T{h:02d}:00:00Z,0.{h}" for h in range(9))]
-
-
-def _csv(
-    name: str, file: str, rows: Callable[[], list[str]], read: Callable[[Path], object]
-) -> Target:
-    return Target(name=name, syntax="csv", file=file, build=_written(file, rows), read=read)
-
-
+_VEHICLE = (
+    Path(__file__).parents[1] / "alice_survey/sim/vehicle/identification/bluerov2.toml"
+).read_text()
+_PAIRING = [f"{side},{k},{10.5 + k}" for k in range(5) for side in ("left", "right")]
+_DIVE = [
+    "time_s,latitude_deg,longitude_deg,depth_m,roll_deg,pitch_deg,heading_deg,altitude_m",
+    *(f"{i},{32.8236 + 2e-6 * i:.7f},34.9553,13.0,0,0,{i % 3},2.0" for i in range(40)),
+]
+_TIDE = ["time_utc,height_m", *(f"2024-05-01T{h:02d}:00:00Z,0.{h}" for h in range(9))]
+_VEHICLE_LOG = [
+    "time_s,north_m,east_m,depth_m,quat_x,quat_y,quat_z,quat_w,u_mps,v_mps,w_mps,"
+    "p_rad_s,q_rad_s,r_rad_s,rpm_stern",
+    *(f"{0.1 * i:.1f},0.0,0.0,10.0,0,0,0,1,0.2,0,0,0,0,0.01,300" for i in range(20)),
+]
+_COEFFICIENTS = ["X_u = -4.0", "X_uu = -18.0", "Y_v = -6.0", "X_udot = -5.5", "N_r = -0.1"]
+_PULLS = ["thruster,rpm,force_n", "stern,300,12.5", "stern,-300,-9", "stern,600,50"]
+_CURRENT = [
+    "time_s,depth_m,north_mps,east_mps",
+    *(f"{t},{d},0.1,0.02" for t in (0, 60, 120) for d in (5, 10, 15)),
+]
+_OF_TEXT = (
+    ("trigger log of pictures", "p.csv", ["camera,number,time_s", *_PAIRING], read_pairing),
+    ("navigation CSV", "n.csv", navigation_rows(dated=False), read_nav),
+    ("navigation CSV, dated", "n.csv", navigation_rows(dated=True), read_nav),
+    ("log to check", "d.csv", _DIVE, check_dive),
+    ("tide", "tide.csv", _TIDE, lambda path: read_tide(str(path), dated=True)),
+    ("vehicle log", "v.csv", _VEHICLE_LOG, read_vehicle_log),
+    ("bollard pull", "pull.csv", _PULLS, read_pulls),
+    ("current", "current.csv", _CURRENT, read_current),
+)
+_SQLITE = partial(_bag, storage=StoragePlugin.SQLITE3)
+_VEHICLE_JSON = json.dumps(tomllib.loads(_VEHICLE))
 TARGETS = (
+    *(Target(name, "csv", file, _text(rows), read) for name, file, rows, read in _OF_TEXT),
     Target("ROS 1 bag", "binary", "a.bag", partial(_bag, version=1), read_any_log),
-    Target("ROS 2 bag, MCAP", "binary", "bag/bag.mcap", partial(_bag, version=2), read_any_log),
-    Target(
-        "ROS 2 bag, SQLite", "binary", "bag/bag.db3", partial(_bag, version=2, storage="SQLITE3"),
-        read_any_log,
-    ),
-    Target(
-        "ROS 2 bag, metadata", "text", "bag/metadata.yaml", partial(_bag, version=2), read_any_log,
-    ),
-    Target("reports of a DVL", "json", "a.json", _dvl, read_dead_reckoned),
+    Target("ROS 2 bag, MCAP", "binary", "bag/bag.mcap", _bag, read_any_log),
+    Target("ROS 2 bag, SQLite", "binary", "bag/bag.db3", _SQLITE, read_any_log),
+    Target("ROS 2 bag, metadata", "text", "bag/metadata.yaml", _bag, read_any_log),
+    Target("reports of a DVL", "json", "a.json", _dvl(), read_dead_reckoned),
     Target("ULog", "binary", "a.ulg", _ulog, read_any_log),
-    Target("trigger log of pictures", "csv", "p.csv", _pairing, read_pairing),
-    Target("DataFlash .BIN", "binary", "a.bin", partial(_dataflash, name="a.bin"), read_any_log),
+    Target("DataFlash .BIN", "binary", "a.bin", _dataflash, read_any_log),
     Target("tlog", "binary", "a.tlog", _telemetry, read_any_log),
-    _csv("navigation CSV", "n.csv", partial(navigation_rows, dated=False), read_nav),
-    _csv("navigation CSV, dated", "n.csv", partial(navigation_rows, dated=True), read_nav),
     Target("triggers", "csv", "t.csv", _triggers, read_triggers),
-    Target("log to check", "csv", "d.csv", _check_log, check_dive),
-    _csv("tide", "tide.csv", _tide, read_tide),
-    _csv("vehicle log", "v.csv", _vehicle_rows, read_vehicle_log),
     Target("column map", "toml", "map.toml", _column_map, read_foreign),
     Target("foreign log", "csv", "log.csv", _column_map, read_foreign),
-    Target("vehicle TOML", "toml", "v.toml", _vehicle, read_vehicle),
-    Target("vehicle JSON", "json", "v.json", _vehicle_json, read_vehicle),
-    Target("coefficients", "toml", "c.toml", _written("c.toml", _coefficients), read_coefficients),
-    _csv("bollard pull", "pull.csv", _pulls, read_pulls),
-    _csv("current", "current.csv", _current, read_current),
-)  # fmt: skip
+    Target("vehicle TOML", "toml", "v.toml", _VEHICLE, read_vehicle),
+    Target("vehicle JSON", "json", "v.json", _VEHICLE_JSON, read_vehicle),
+    Target("coefficients", "toml", "c.toml", _text(_COEFFICIENTS), coefficients_from_file),
+)

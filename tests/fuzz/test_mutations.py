@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from alice_survey.core.errors import PlanError, WorkspaceError
 from tests.fuzz.judge import Sandbox, judge
 from tests.fuzz.mutations import mutate
-from tests.fuzz.targets import TARGETS, Trial
+from tests.fuzz.target import Trial
+from tests.fuzz.targets import TARGETS
 
 pytestmark = pytest.mark.slow
 

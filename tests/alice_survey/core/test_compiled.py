@@ -80,17 +80,12 @@ def test_a_kernel_is_kept_when_files_change_that_it_does_not_use(folder: Path) -
     assert ask(folder) == (8.0, 1)
 
 
-def test_a_constant_of_a_called_kernel_counts(folder: Path) -> None:
+def test_constants_and_code_of_a_called_kernel_count(folder: Path) -> None:
     write(folder, offset=10.0)
     assert ask(folder) == (26.0, 0)
-
-
-def test_a_constant_named_through_a_module_counts(folder: Path) -> None:
-    write(folder, factor=3.0)
+    write(folder, factor=3.0)  # named through a module
     assert ask(folder) == (12.0, 0)
-
-
-def test_the_code_of_a_called_kernel_counts(folder: Path) -> None:
+    write(folder)
     inner = (folder / "inner.py").read_text()
     (folder / "inner.py").write_text(inner.replace("x + OFFSET", "x - OFFSET"))
     assert ask(folder) == (4.0, 0)
