@@ -42,12 +42,6 @@ _SRID = re.compile(r"\s*SRID\s*=\s*(\d+)\s*;", re.IGNORECASE)
 MAX_BYTES = 100_000_000
 """Size limit of a file, and of all that is unpacked from an archive."""
 MAX_CORNERS = 200_000
-_GEOJSON = frozenset(
-    {
-        "FeatureCollection", "Feature", "GeometryCollection", "Polygon", "MultiPolygon",
-        "LineString", "MultiLineString", "Point", "MultiPoint",
-    }
-)  # fmt: skip
 _STARTS = {".gpkg": b"SQLite format 3\x00", ".shp": b"\x00\x00\x27\x0a"}
 DRIVERS = {
     ".geojson": "GeoJSON", ".json": "GeoJSON", ".kml": "KML", ".kmz": "KML", ".gpkg": "GPKG",
@@ -345,11 +339,10 @@ def check_file(path: Path, *, may_be_empty: bool = False) -> None:
 
 
 def read_geojson(path: Path) -> dict[str, Any]:
-    """The GeoJSON object in a file; its geometries are not looked at.
+    """The JSON object in a file, whose kind and geometries GDAL looks at.
 
     Raises:
-        PlanError: it is not JSON, the message names the line; is not GeoJSON; or holds too many
-            corners.
+        PlanError: it is not a JSON object, the message names the line; or holds too many corners.
     """
 
     def no_number(text: str) -> float:
@@ -365,9 +358,8 @@ def read_geojson(path: Path) -> dict[str, Any]:
         raise PlanError(f"area: {path}: not JSON, line {error.lineno}: {error.msg}") from None
     except (ValueError, RecursionError):  # not text, or a number of thousands of digits
         raise PlanError(f"area: {path}: not JSON that can be read") from None
-    kind = data.get("type") if isinstance(data, dict) else None
-    if not (isinstance(data, dict) and isinstance(kind, str) and kind in _GEOJSON):
-        raise PlanError(f"area: {path}: not GeoJSON: its type is {kind!r}")
+    if not isinstance(data, dict):
+        raise PlanError(f"area: {path}: not GeoJSON: it holds no object")
     return data
 
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
-from shapely.geometry import MultiPolygon, Polygon
+from shapely.geometry import Polygon
 from shapely.geometry.base import BaseGeometry
 from shapely.geometry.polygon import orient
 
@@ -124,16 +124,6 @@ def line_depths(plan: Plan) -> list[Array]:
             f"{len(requested)} lines with {sum(requested)} stations: plan again"
         )
     return depths
-
-
-def grow(geometry: MultiPolygon, by_m: float) -> list[Polygon]:
-    """The parts of a geometry grown by a distance, sharp corners kept; shrunk where negative."""
-    parts: list[Polygon] = [
-        part
-        for part in shapely.get_parts(geometry.buffer(by_m, join_style="mitre")).tolist()
-        if part.geom_type == "Polygon" and part.area > 0
-    ]
-    return parts
 
 
 def route_ne(route: Route, chord_m: float = CHORD_M) -> Array:

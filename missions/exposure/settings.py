@@ -233,8 +233,6 @@ class ImagingSettings:
     imaging_w: float
     """Mean power of the strobes from the battery while a line is flown; cameras and recorder are
     in `vehicle.hotel_w`."""
-    frame_j: float
-    """Battery energy of the strobes for one trigger."""
     paper_rule: PaperRule
     footprints: FootprintRange
     spacing: Spacing
@@ -298,7 +296,6 @@ def imaging_settings(rig: Rig, setup: ImagingSetup, *, quiet: bool = False) -> I
         strobe_lead_s=plan.strobe_lead_s,
         strobe_duty=load.duty,
         imaging_w=load.mean_w,
-        frame_j=load.frame_j,
         paper_rule=paper_rule(plan, along_m),
         footprints=prints,
         spacing=spacing,

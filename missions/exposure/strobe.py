@@ -111,8 +111,6 @@ def duty_limit(imaging: ImagingConfig) -> float:
 class Storage:
     """Data of one trigger and what limits their flow."""
 
-    frame_bytes: int
-    """Size of one picture, raw, one byte a pixel."""
     station_bytes: int
     """Size of all cameras' pictures of one trigger."""
     bytes_per_s: float
@@ -140,7 +138,6 @@ def storage_load(camera: Camera, cameras: int, interval_s: float) -> Storage:
     """
     frame, station = raw_bytes(camera, 1, 1), raw_bytes(camera, cameras, 1)
     return Storage(
-        frame_bytes=frame,
         station_bytes=station,
         bytes_per_s=station / interval_s,
         own_link_hz=LINK_BYTES_PER_S / frame,

@@ -68,14 +68,6 @@ class ImportOptions:
     """Latitude, longitude and its sigma in metres of the first velocity, for dead reckoning."""
 
     def __post_init__(self) -> None:
-        if not (
-            abs(self.declination_deg) <= 180
-            and np.isfinite([*self.lever_body_m, self.altitude_offset_m]).all()
-        ):
-            raise NavigationError(
-                f"declination {self.declination_deg:g}, lever arm {self.lever_body_m}: give -180 "
-                "to 180 degrees, and finite metres"
-            )
         if self.start_at is not None:
             latitude, longitude, sigma = self.start_at
             if self.dead_reckon is None:

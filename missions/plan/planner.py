@@ -215,28 +215,21 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
 def _totals(plan: Plan, imaging: ImagingSettings, seen: Certificate, rig: Rig) -> dict[str, float]:
     """Main figures of a plan, but for those of its settings."""
     cameras = len(rig.cameras)
-    return {
+    own = ("stations", "length_m", "duration_s", "energy_wh", "altitude_m", "speed_mps",
+           "interval_s", "exposure_s", "line_spacing_m")  # fmt: skip
+    return {name: getattr(plan, name) for name in own} | {
         "area_m2": plan.area.survey.area,
         "lines": len(plan.lines),
         "heading_deg": math.degrees(plan.lines[0].heading_rad),
         "lines_m": sum(line.length_m for line in plan.lines),
-        "stations": plan.stations,
         "pictures": plan.stations * cameras,
-        "length_m": plan.length_m,
-        "duration_s": plan.duration_s,
-        "energy_wh": plan.energy_wh,
         "longest_dive_wh": max(dive.energy_wh for dive in plan.dives),
         "dives": len(plan.dives),
         "data_gb": raw_bytes(rig.cameras[rig.reference], cameras, plan.stations) / 1e9,
-        "altitude_m": plan.altitude_m,
-        "speed_mps": plan.speed_mps,
-        "interval_s": plan.interval_s,
-        "exposure_s": plan.exposure_s,
         "gain_db": imaging.light.gain_db,
         "sharp_from_m": imaging.focus.near_altitude_m,
         "sharp_to_m": imaging.focus.far_altitude_m,
         "gsd_mm": 1e3 * imaging.pixel_m,
-        "line_spacing_m": plan.line_spacing_m,
         "forward_overlap": plan.reached_forward_overlap,
         "side_overlap": plan.reached_side_overlap,
         "covered": seen.covered_share,

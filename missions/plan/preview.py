@@ -16,12 +16,10 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 from scipy.ndimage import minimum_filter
 
 from alice_survey.core.artefacts import atomic_path
 from alice_survey.core.config import (
-    AreaConfig,
     SurveyConfig,
     checked_settings,
     parse_settings,
@@ -111,7 +109,11 @@ def draft_settings(
     files: dict[str, str] = {}
     if shapes is not None:
         base = parse_settings(text, path).area
-        drawn, files = area_settings(shapes, base, _moved_datum(base, area))
+        datum = None
+        if any(area.get(name) is not None for name in ("latitude_deg", "longitude_deg")):
+            moved = checked_settings(with_values(before, {"area": area}), path).area
+            datum = Datum(moved.latitude_deg, moved.longitude_deg)
+        drawn, files = area_settings(shapes, base, datum)
         area = {**drawn, **area}
     values = {**changes, **({"area": area} if area else {})}
     config = checked_settings(with_values(before, values), path)
@@ -130,19 +132,6 @@ def draft_settings(
     except UnicodeEncodeError:
         raise ConfigError(f"{origin}: a setting holds what is no text: write it again") from None
     return Draft(path=path, text=new, config=config, files=files)
-
-
-def _moved_datum(area: AreaConfig, changes: Mapping[str, Any]) -> Datum | None:
-    """The datum that changes set; None where they set none that can be."""
-    names = ("latitude_deg", "longitude_deg")
-    if all(changes.get(name) is None for name in names):
-        return None
-    moved = {name: changes[name] for name in names if changes.get(name) is not None}
-    try:
-        found = AreaConfig.model_validate({name: getattr(area, name) for name in names} | moved)
-    except ValidationError:
-        return None  # the settings as a whole are checked, too
-    return Datum(found.latitude_deg, found.longitude_deg)
 
 
 def _as_typed(value: Any, checked: Any) -> Any:

@@ -178,7 +178,9 @@ class ImportLogCommand(ReportCommand):
     )
     log: Path = argument(..., "ROS bag, log of ArduSub or PX4, or JSON of a Water Linked DVL.")
     output: Path = option(..., "CSV to write.", "-o", "--output", metavar="FILE")
-    declination: float = option(0.0, "Add this declination to headings, degrees; east is positive.")
+    declination: float = option(
+        0.0, "Add this declination to headings, degrees; east is positive.", ge=-180, le=180
+    )
     tide: str = option("0", "Height of the water above the level of depths: metres, or a CSV.")
     topic: list[str] | None = option(
         None, "Use this topic or message for navigation, depth, attitude, altitude or velocity.",

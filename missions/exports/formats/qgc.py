@@ -15,7 +15,7 @@ from shapely.geometry import Polygon
 from alice_survey.core.artefacts import write_json
 from alice_survey.core.errors import warn
 from missions.exports.format import Export, ExportFile, ExportFormat
-from missions.exports.geometry import CameraMount, grow, lat_lon
+from missions.exports.geometry import CameraMount, lat_lon
 from missions.exports.mavlink import (
     FRAME_ABOVE_HOME,
     FRAME_ABOVE_TERRAIN,
@@ -25,6 +25,7 @@ from missions.exports.mavlink import (
     mission_of,
 )
 from missions.exports.waypoints import Waypoint
+from missions.values.area import multipolygon
 from missions.values.mission import Mission
 from missions.values.plan_file import Plan
 
@@ -88,7 +89,8 @@ def _fence(plan: Plan, points: Sequence[Waypoint], mount: CameraMount) -> list[d
     reference point has to cut its corner to bring the glass along its edge: then it shrinks by the
     lever arm, which the reference point surely keeps out of.
     """
-    outer = [Polygon(part.exterior) for part in grow(plan.area.allowed, mount.reach_m)]
+    grown = plan.area.allowed.buffer(mount.reach_m, join_style="mitre")
+    outer = [Polygon(part.exterior) for part in multipolygon(grown).geoms]
     zones: list[Polygon] = []
     holes = [Polygon(hole) for part in plan.area.allowed.geoms for hole in part.interiors]
     for zone in (*holes, *plan.area.no_go.geoms):
@@ -100,7 +102,7 @@ def _fence(plan: Plan, points: Sequence[Waypoint], mount: CameraMount) -> list[d
     for zone in zones:
         parts = [zone]
         if zone.intersects(track):
-            parts = grow(shapely.MultiPolygon([zone]), -mount.reach_m)
+            parts = list(multipolygon(zone.buffer(-mount.reach_m, join_style="mitre")).geoms)
             if not parts:
                 warn(
                     f"a no-go zone of {zone.area:.2f} m2 is left out of the fence: the vehicle's "

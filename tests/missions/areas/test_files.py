@@ -216,7 +216,7 @@ BOMB = (
         ("a.kml", b'<kml xmlns="http://www.opengis.net/kml/2.2"><Document/></kml>', "a.kml"),
         ("a.kml", b'<?xml version="1.0" encoding="cp99"?><kml/>', "a.kml"),
         ("a.geojson", b"<OGRVRTDataSource/>", "line 1"),
-        ("a.geojson", b'{"type": "Topology"}', "'Topology'"),
+        ("a.geojson", b'{"type": "Topology"}', "a.geojson"),
         ("a.geojson", b'{"type": ["Polygon"]}', "a.geojson"),
         ("a.geojson", b'{"type": "Polygon", "coordinates": [[[NaN, 0]]]}', "NaN"),
         ("a.geojson", b"[" * 100_000, "a.geojson"),

@@ -48,7 +48,7 @@ def test_what_was_requested_is_reached(plan: dict[str, float]) -> None:
     assert planned.blur_px <= blur_px + 1e-6
     assert planned.blur_px >= blur_px - planned.blur.combined * 1e-5 - 1e-6
     assert 0 < planned.strobe_duty < 1
-    assert planned.imaging_w == pytest.approx(planned.frame_j / planned.interval_s)
+    assert planned.imaging_w == pytest.approx(planned.strobe.frame_j / planned.interval_s)
 
 
 def test_rows_name_equation_source_and_limit_and_fit_a_hundred_columns() -> None:
