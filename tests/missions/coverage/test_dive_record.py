@@ -1,6 +1,6 @@
 import csv
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -33,16 +33,6 @@ def plan() -> Plan:
     return plan_of(area_of(shapely.box(0, 0, 6, 3)), lawnmower(6.0, 3.0, 1.0, 0.46, over_m=0.5))
 
 
-def record_of(log: Path, **sources: Path) -> DiveRecord:
-    return read_dive_record(log, plan(), rig(), **sources)
-
-
-def refusal(log: Path, **sources: Path) -> str:
-    with pytest.raises(NavigationError) as fault:
-        record_of(log, **sources)
-    return str(fault.value)
-
-
 def leaning_flight() -> tuple[Array, Stations]:
     """Times 2.3 s apart, and the plan's stations flown with some roll, pitch and altitude."""
     exact = stations_of_plan(plan())
@@ -50,32 +40,45 @@ def leaning_flight() -> tuple[Array, Stations]:
     tilt = np.deg2rad(rng.normal(0, 3, (len(exact), 2)))
     attitude = np.column_stack([tilt, exact.attitude_rad[:, 2]])
     time_s = 100.0 + plan().interval_s * np.arange(len(exact), dtype=float)
-    flown = replace(
-        exact,
-        attitude_rad=attitude,
-        altitude_m=rng.uniform(1.8, 2.2, len(exact)),
-        time_s=time_s,
-    )
-    return time_s, flown
+    altitude_m = rng.uniform(1.8, 2.2, len(exact))
+    return time_s, replace(exact, attitude_rad=attitude, altitude_m=altitude_m, time_s=time_s)
+
+
+@dataclass(frozen=True)
+class LoggedFlight:
+    """A navigation CSV, its triggers, and the stations they were made of."""
+
+    folder: Path
+    flown: Stations
+
+    def edited(
+        self, change: dict[str, str], rows: slice = slice(None), of: Path | None = None
+    ) -> Path:
+        """The log, or another, with columns set to a text in some rows."""
+        with (of or self.folder / "nav.csv").open(newline="") as file:
+            table = list(csv.DictReader(file))
+        for row in table[rows]:
+            row.update(change)
+        out = self.folder / f"edited{len(list(self.folder.iterdir()))}.csv"
+        write_csv(out, list(table[0]), [list(row.values()) for row in table])
+        return out
+
+    def record(self, log: Path | None = None, triggers: str | None = "triggers.csv") -> DiveRecord:
+        at = {} if triggers is None else {"triggers": self.folder / triggers}
+        return read_dive_record(log or self.folder / "nav.csv", plan(), rig(), **at)
+
+    def refusal(self, log: Path | None = None, triggers: str = "triggers.csv") -> str:
+        with pytest.raises(NavigationError) as fault:
+            self.record(log, triggers)
+        return str(fault.value)
 
 
 @pytest.fixture
-def dive(tmp_path: Path) -> tuple[Path, Path, Stations]:
-    """A navigation CSV, its triggers, and the stations they were made of."""
+def dive(tmp_path: Path) -> LoggedFlight:
     time_s, flown = leaning_flight()
     write_navigation(tmp_path / "nav.csv", log_of(flown, plan(), rig()), DATUM)
     write_triggers(tmp_path / "triggers.csv", time_s, flown.line)
-    return tmp_path / "nav.csv", tmp_path / "triggers.csv", flown
-
-
-def edited(path: Path, out: Path, change: dict[str, str], rows: slice = slice(None)) -> Path:
-    """The log with columns set to a text in some rows."""
-    with path.open(newline="") as file:
-        table = list(csv.DictReader(file))
-    for row in table[rows]:
-        row.update(change)
-    write_csv(out, list(table[0]), [list(row.values()) for row in table])
-    return out
+    return LoggedFlight(tmp_path, flown)
 
 
 def assert_alike(found: Stations, expected: Stations, place_m: float = 2e-5) -> None:
@@ -88,45 +91,38 @@ def assert_alike(found: Stations, expected: Stations, place_m: float = 2e-5) -> 
 
 
 def test_a_log_gives_back_where_its_pictures_were_taken(
-    dive: tuple[Path, Path, Stations], capsys: pytest.CaptureFixture[str]
+    dive: LoggedFlight, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    log, triggers, flown = dive
+    record = dive.record()
 
-    record = record_of(log, triggers=triggers)
-
-    assert_alike(record.stations, flown)
-    assert (record.triggered, record.left_out, record.notes) == (len(flown), {}, ())
+    assert_alike(record.stations, dive.flown)
+    assert (record.triggered, record.left_out, record.notes) == (len(dive.flown), {}, ())
     assert capsys.readouterr().err == ""
 
 
-def test_lines_are_found_where_triggers_name_none(
-    dive: tuple[Path, Path, Stations], tmp_path: Path
-) -> None:
-    log, _, flown = dive
+def test_lines_are_found_where_triggers_name_none(dive: LoggedFlight) -> None:
+    flown = dive.flown
     assert flown.time_s is not None
-    write_triggers(tmp_path / "bare.csv", flown.time_s)
-    assert_alike(record_of(log, triggers=tmp_path / "bare.csv").stations, flown)
+    write_triggers(dive.folder / "bare.csv", flown.time_s)
+    assert_alike(dive.record(triggers="bare.csv").stations, flown)
 
     # Without triggers the plan's interval counts from the start of the log.
-    record = record_of(log)
+    record = dive.record(triggers=None)
     assert "interval" in record.triggers
     assert_alike(record.stations, flown.some(np.arange(len(flown) - 1)))
 
 
 def test_triggers_in_a_gap_and_beyond_the_log_are_counted(
-    dive: tuple[Path, Path, Stations], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    dive: LoggedFlight, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    log, triggers, flown = dive
-    with log.open(newline="") as file:
-        rows = list(csv.reader(file))
-    gappy = tmp_path / "gappy.csv"
+    rows = list(csv.reader((dive.folder / "nav.csv").read_text().splitlines()))
+    gappy = dive.folder / "gappy.csv"
     # Rows every 2.3 s: nothing is interpolated over more than 5 of these.
     write_csv(gappy, rows[0], [*rows[1:11], *rows[31:-3]])
 
-    record = record_of(gappy, triggers=triggers)
+    record = dive.record(gappy)
 
-    count = len(flown)
-    assert_alike(record.stations, flown.some(np.r_[0:10, 30 : count - 3]))
+    assert_alike(record.stations, dive.flown.some(np.r_[0:10, 30 : len(dive.flown) - 3]))
     assert list(record.left_out.values()) == [3, 20]
     assert record.gaps[0] == pytest.approx((100.0 + 9 * 2.3, 21 * 2.3))
     warnings = capsys.readouterr().err
@@ -135,100 +131,71 @@ def test_triggers_in_a_gap_and_beyond_the_log_are_counted(
 
 
 def test_a_log_without_altitude_uses_depth_and_sea_floor(
-    dive: tuple[Path, Path, Stations], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    dive: LoggedFlight, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    log, triggers, flown = dive
-    blind = edited(log, tmp_path / "blind.csv", {"altitude_m": ""})
+    record = dive.record(dive.edited({"altitude_m": ""}))
 
-    record = record_of(blind, triggers=triggers)
-
-    assert_alike(record.stations, flown)  # the test's sea floor is level at the plan's depth
-    assert f"{len(flown)} of {len(flown)}" in record.notes[0]
+    assert_alike(record.stations, dive.flown)  # the test's sea floor is level at the plan's depth
+    assert f"{len(dive.flown)} of {len(dive.flown)}" in record.notes[0]
     assert "15 m" in record.notes[0]
     assert capsys.readouterr().err == ""
 
 
-def test_a_log_without_depth_uses_altitude(
-    dive: tuple[Path, Path, Stations], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log, triggers, flown = dive
-    assert_alike(
-        record_of(edited(log, tmp_path / "a.csv", {"depth_m": ""}), triggers=triggers).stations,
-        flown,
-        place_m=1e-3,  # a degree is shorter at depth
-    )
-    assert capsys.readouterr().err == ""
-    blind = edited(log, tmp_path / "b.csv", {"depth_m": "", "altitude_m": ""})
-    assert "neither depth_m nor altitude_m" in refusal(blind, triggers=triggers)
-    half = edited(log, tmp_path / "c.csv", {"depth_m": "", "altitude_m": ""}, slice(0, 9))
-    record = record_of(half, triggers=triggers)
+def test_a_log_without_depth_uses_altitude(dive: LoggedFlight) -> None:
+    record = dive.record(dive.edited({"depth_m": ""}))
+    assert_alike(record.stations, dive.flown, place_m=1e-3)  # a degree is shorter at depth
+    blind = {"depth_m": "", "altitude_m": ""}
+    assert "neither depth_m nor altitude_m" in dive.refusal(dive.edited(blind))
+    record = dive.record(dive.edited(blind, slice(0, 9)))
     assert record.left_out == {"without a depth or an altitude": 9}
 
 
-def test_a_log_without_attitude_is_level_along_its_track(
-    dive: tuple[Path, Path, Stations], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log, triggers, flown = dive
-    bare = edited(log, tmp_path / "bare.csv", {"roll_deg": "", "pitch_deg": "", "heading_deg": ""})
-
-    record = record_of(bare, triggers=triggers)
+def test_a_log_without_attitude_is_level_along_its_track(dive: LoggedFlight) -> None:
+    record = dive.record(dive.edited({"roll_deg": "", "pitch_deg": "", "heading_deg": ""}))
 
     assert np.all(record.stations.attitude_rad[:, :2] == 0.0)
-    away = record.stations.attitude_rad[:, 2] - flown.attitude_rad[:, 2]
-    inner = np.ones(len(flown), dtype=bool)
-    ends = np.flatnonzero(np.diff(flown.line))
+    away = record.stations.attitude_rad[:, 2] - dive.flown.attitude_rad[:, 2]
+    inner = np.ones(len(dive.flown), dtype=bool)
+    ends = np.flatnonzero(np.diff(dive.flown.line))
     inner[[0, *ends, *(ends + 1), -1]] = False  # there the course is that of the way to the next
     assert np.abs(np.angle(np.exp(1j * away[inner]))).max() < math.radians(6.0)
     assert len(record.notes) == 2
-    assert capsys.readouterr().err == ""
 
 
-def test_pictures_from_high_above_and_from_below_do_not_count(
-    dive: tuple[Path, Path, Stations], tmp_path: Path
-) -> None:
-    log, triggers, flown = dive
-    high = edited(log, tmp_path / "a.csv", {"altitude_m": "3.01"}, slice(8, 13))
-    strange = edited(high, tmp_path / "b.csv", {"altitude_m": "-0.2"}, slice(5, 7))
+def test_pictures_from_high_above_and_from_below_do_not_count(dive: LoggedFlight) -> None:
+    high = dive.edited({"altitude_m": "3.01"}, slice(8, 13))
 
-    record = record_of(strange, triggers=triggers)
+    record = dive.record(dive.edited({"altitude_m": "-0.2"}, slice(5, 7), high))
 
-    assert_alike(record.stations, flown.some(np.r_[0:5, 7:8, 13 : len(flown)]))
+    assert_alike(record.stations, dive.flown.some(np.r_[0:5, 7:8, 13 : len(dive.flown)]))
     assert sorted(record.left_out.values()) == [2, 5]
     assert record.on_way == 0
 
 
-def test_triggers_on_the_way_down_and_up_are_not_amiss(
-    dive: tuple[Path, Path, Stations], tmp_path: Path
-) -> None:
-    log, triggers, flown = dive
-    down = edited(log, tmp_path / "a.csv", {"altitude_m": "9"}, slice(0, 6))
-    gap = edited(down, tmp_path / "b.csv", {"altitude_m": "4"}, slice(20, 22))
-    up = edited(gap, tmp_path / "c.csv", {"altitude_m": "3.5"}, slice(-3, None))
+def test_triggers_on_the_way_down_and_up_are_not_amiss(dive: LoggedFlight) -> None:
+    down = dive.edited({"altitude_m": "9"}, slice(0, 6))
+    gap = dive.edited({"altitude_m": "4"}, slice(20, 22), down)
 
-    record = record_of(up, triggers=triggers)
+    record = dive.record(dive.edited({"altitude_m": "3.5"}, slice(-3, None), gap))
 
-    assert record.on_way == 6 + 3
+    assert record.on_way == record.to_json()["on_way"] == 6 + 3
     assert list(record.left_out.values()) == [2]
-    assert len(record.stations) == len(flown) - 11
-    assert record.to_json()["on_way"] == 9
+    assert len(record.stations) == len(dive.flown) - 11
 
 
-def test_logs_of_elsewhere_or_another_time_are_refused(
-    dive: tuple[Path, Path, Stations], tmp_path: Path
-) -> None:
-    log, triggers, flown = dive
-    away = edited(log, tmp_path / "away.csv", {"latitude_deg": "32.9236"})
-    assert "11.1 km" in refusal(away, triggers=triggers)
+def test_logs_of_elsewhere_or_another_time_are_refused(dive: LoggedFlight) -> None:
+    assert "11.1 km" in dive.refusal(dive.edited({"latitude_deg": "32.9236"}))
 
-    assert flown.time_s is not None
-    write_triggers(tmp_path / "late.csv", flown.time_s + 1e6)
-    assert f"{len(flown)} triggers" in refusal(log, triggers=tmp_path / "late.csv")
-    write_triggers(tmp_path / "back.csv", flown.time_s[::-1])
-    assert "line 3" in refusal(log, triggers=tmp_path / "back.csv")
-    (tmp_path / "none.csv").write_text("station,when\n0,1\n")
-    assert "time_utc" in refusal(log, triggers=tmp_path / "none.csv")
-    (tmp_path / "dates.csv").write_text("time_utc\n2024-05-01T12:00:00Z\n")
-    assert "dates.csv" in refusal(log, triggers=tmp_path / "dates.csv")
+    times = dive.flown.time_s
+    assert times is not None
+    write_triggers(dive.folder / "late.csv", times + 1e6)
+    assert f"{len(times)} triggers" in dive.refusal(triggers="late.csv")
+    write_triggers(dive.folder / "back.csv", times[::-1])
+    assert "line 3" in dive.refusal(triggers="back.csv")
+    (dive.folder / "none.csv").write_text("station,when\n0,1\n")
+    assert "time_utc" in dive.refusal(triggers="none.csv")
+    (dive.folder / "dates.csv").write_text("time_utc\n2024-05-01T12:00:00Z\n")
+    assert "dates.csv" in dive.refusal(triggers="dates.csv")
 
 
 def test_a_simulated_flight_counts_by_its_true_track(tmp_path: Path) -> None:
@@ -245,8 +212,11 @@ def test_a_simulated_flight_counts_by_its_true_track(tmp_path: Path) -> None:
     )
     write_track(tmp_path / "truth" / "track.csv", track)
 
-    assert_alike(record_of(tmp_path).stations, flown)
-    drifted = record_of(tmp_path / "navigation.csv").stations
+    by_track, drifted = (
+        read_dive_record(log, plan(), rig()).stations
+        for log in (tmp_path, tmp_path / "navigation.csv")
+    )
+    assert_alike(by_track, flown)
     assert np.all(drifted.glass_ne[:, 0] - flown.glass_ne[: len(drifted), 0] > 2.9)
 
 

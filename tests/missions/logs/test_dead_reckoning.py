@@ -9,6 +9,7 @@ import pytest
 from alice_survey.core.errors import NavigationError
 from alice_survey.core.frames import Array, Datum
 from missions.logs.dead_reckoning import (
+    ReckonedTrack,
     TrackErrors,
     dead_reckoned,
     with_dead_reckoning,
@@ -26,6 +27,15 @@ def lawnmower(count: int = 400, step_s: float = 0.5, seed: int = 0) -> tuple[Arr
     line = np.where((time_s // 40).astype(int) % 2 == 0, 0.4, -0.4)
     drift = 0.05 + 0.02 * np.sin(time_s / 17)
     return time_s, np.column_stack([line, drift]) + rng.normal(0, 0.01, (count, 2))
+
+
+def reckoned(
+    time_s: Array, velocity: Array, at: Any, places: Array, sigmas: Any = 1.0
+) -> ReckonedTrack:
+    """The track of velocities with fixes at some of their times."""
+    signal = Signal(source="dvl", time_s=time_s, values=velocity)
+    fixes = time_s[at], places, np.broadcast_to(sigmas, len(places))
+    return dead_reckoned(signal, fixes, ERRORS)
 
 
 def moves_of(time_s: Array, velocity: Array) -> Array:
@@ -69,9 +79,7 @@ def test_the_smoother_is_least_squares_over_all_places(at: list[int]) -> None:
     time_s, velocity = lawnmower()
     places = np.vstack([[0, 0], moves_of(time_s, velocity).cumsum(axis=0)])[at] * 1.02
     sigmas = np.linspace(0.5, 2.0, len(at))
-    track = dead_reckoned(
-        Signal(source="dvl", time_s=time_s, values=velocity), (time_s[at], places, sigmas), ERRORS
-    )
+    track = reckoned(time_s, velocity, at, places, sigmas)
     expected, sigma = dense(time_s, velocity, (np.array(at), places, sigmas), ERRORS)
     np.testing.assert_allclose(track.ne, expected, atol=2e-5)
     np.testing.assert_allclose(track.sigma_m, sigma, rtol=1e-4)
@@ -92,11 +100,7 @@ def test_sigmas_are_those_of_the_errors(at: list[int]) -> None:
         # White noise of velocity over a step dt has a variance of noise^2 / dt.
         measured = measured + rng.normal(0, ERRORS.noise_mps / np.sqrt(0.5), measured.shape)
         fixes = true[at] + rng.normal(0, 0.3, (len(at), 2))
-        track = dead_reckoned(
-            Signal(source="dvl", time_s=time_s, values=measured),
-            (time_s[at], fixes, np.full(len(at), 0.3)),
-            ERRORS,
-        )
+        track = reckoned(time_s, measured, at, fixes, 0.3)
         ratios.append((track.ne - true) / track.sigma_m[:, None])
     rms = np.sqrt(np.mean(np.square(ratios), axis=(0, 2)))
     assert rms.min() > 0.85
@@ -105,28 +109,24 @@ def test_sigmas_are_those_of_the_errors(at: list[int]) -> None:
 
 def test_a_wild_fix_is_refused_and_many_at_once_count_as_one() -> None:
     time_s, velocity = lawnmower()
-    signal = Signal(source="dvl", time_s=time_s, values=velocity)
     true = np.vstack([[0, 0], moves_of(time_s, velocity).cumsum(axis=0)])
     places = true[[0, 200, 399]] + [[0, 0], [80, 0], [0, 0]]
-    track = dead_reckoned(signal, (time_s[[0, 200, 399]], places, np.full(3, 1.0)), ERRORS)
+    track = reckoned(time_s, velocity, [0, 200, 399], places)
     assert track.refused == 1
     assert np.abs(track.ne - true).max() < 0.5
     often = np.arange(0, 40)  # 20 s
-    many = dead_reckoned(signal, (time_s[often], true[often], np.full(40, 1.0)), ERRORS)
+    many = reckoned(time_s, velocity, often, true[often])
     assert 0.9 < many.sigma_m[20] < 1.1
 
 
 def test_a_gap_breaks_the_track() -> None:
     time_s, velocity = lawnmower()
     time_s = np.where(time_s > 100, time_s + 60, time_s)
-    signal = Signal(source="dvl", time_s=time_s, values=velocity)
-    track = dead_reckoned(signal, (time_s[:1], np.zeros((1, 2)), np.ones(1)), ERRORS)
+    track = reckoned(time_s, velocity, [0], np.zeros((1, 2)))
     after = time_s > 150
     assert np.isnan(track.sigma_m[after]).all()
     assert np.isfinite(track.sigma_m[~after]).all()
-    both = dead_reckoned(
-        signal, (time_s[[0, -1]], np.array([[0, 0], [30.0, 9.0]]), np.ones(2)), ERRORS
-    )
+    both = reckoned(time_s, velocity, [0, -1], np.array([[0, 0], [30.0, 9.0]]))
     assert np.isfinite(both.sigma_m).all()
     np.testing.assert_allclose(both.ne[-1], [30, 9], atol=0.01)
 
@@ -171,10 +171,8 @@ def test_what_is_missing_is_named(lacks: str) -> None:
 
 def test_sigma_grows_away_from_a_fix_and_shrinks_towards_the_next() -> None:
     time_s, velocity = lawnmower()
-    signal = Signal(source="dvl", time_s=time_s, values=velocity)
     true = np.vstack([[0, 0], moves_of(time_s, velocity).cumsum(axis=0)])
-    one = dead_reckoned(signal, (time_s[:1], true[:1], np.array([0.1])), ERRORS)
-    two = dead_reckoned(signal, (time_s[[0, -1]], true[[0, -1]], np.array([0.1, 0.1])), ERRORS)
+    one, two = (reckoned(time_s, velocity, at, true[at], 0.1) for at in ([0], [0, -1]))
     assert one.sigma_m[0] == pytest.approx(0.1, rel=1e-3)
     assert one.sigma_m[-1] > 0.6
     assert two.sigma_m[-1] < 0.11
