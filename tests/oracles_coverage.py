@@ -146,6 +146,11 @@ def plan_of(area: Area, lines: list[Line], **others: Any) -> Plan:
         legs.append(straight(line.start_ne_m, line.end_ne_m, index))
         if index + 1 < len(lines):
             legs.append(straight(line.end_ne_m, lines[index + 1].start_ne_m))
-    given = {"name": "known", "area": area, "exposure_s": 0.001, "strobe_pulse_s": 0.002} | others
+    given: dict[str, Any] = {
+        "name": "known",
+        "area": area,
+        "exposure_s": 0.001,
+        "strobe_pulse_s": 0.002,
+    } | others
     route, home = Route(legs=tuple(legs)), lines[0].start_ne_m
     return plan_by_hand(lines, [(0, len(lines) - 1)], home=home, routes=[route], **given)

@@ -1,6 +1,7 @@
 """Slow, obvious twins of ways, turns and costs of routes: shapely, all pairs, dense sampling."""
 
 import math
+from typing import Any
 
 import numpy as np
 import shapely
@@ -26,7 +27,7 @@ def min_way_m(allowed: MultiPolygon, a: tuple[float, float], b: tuple[float, flo
     lengths = np.linalg.norm(places[one] - places[two], axis=1)
     # Places that coincide are joined too: a length of 0 would be no edge.
     edges = (np.maximum(lengths[free], 1e-12), (one[free], two[free]))
-    graph = csr_array(edges, shape=(len(places), len(places)))
+    graph: Any = csr_array(edges, shape=(len(places), len(places)))
     return float(dijkstra(graph, directed=False, indices=0)[1])
 
 

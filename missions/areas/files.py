@@ -28,12 +28,7 @@ from alice_survey.core.contents import (
     xml_root_name,
 )
 from alice_survey.core.errors import PlanError, warn
-from missions.areas.crs import (
-    LOCAL,
-    geographic_shapes,
-    parse_crs,
-    usable_crs,
-)
+from missions.areas.crs import LOCAL, geographic_shapes, parse_crs, usable_crs
 from missions.areas.raw import RawShapes, from_geometries
 
 Role = Literal["survey", "no_go", "allowed"]

@@ -11,18 +11,8 @@ from alice_survey.core.config import PlanConfig
 from camera_calib.camera import Camera
 from camera_calib.fov.focus import axial_pixel_m
 from camera_calib.rig import Rig
-from missions.exposure.conflict import (
-    MAX_ALTITUDE_M,
-    MIN_ALTITUDE_M,
-    conflict,
-    last_that_fits,
-)
-from missions.values.footprint import (
-    common_swath,
-    footprint_size_m,
-    overlap,
-    step_for_overlap,
-)
+from missions.exposure.conflict import MAX_ALTITUDE_M, MIN_ALTITUDE_M, conflict, last_that_fits
+from missions.values.footprint import common_swath, footprint_size_m, overlap, step_for_overlap
 
 
 @dataclass(frozen=True, kw_only=True)

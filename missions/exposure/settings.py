@@ -18,24 +18,14 @@ from typing import Any, Self
 import numpy as np
 
 from alice_survey.core.artefacts import json_values
-from alice_survey.core.config import (
-    CameraConfig,
-    ImagingConfig,
-    PlanConfig,
-    WaterConfig,
-)
+from alice_survey.core.config import CameraConfig, ImagingConfig, PlanConfig, WaterConfig
 from alice_survey.core.errors import PlanError, warn
 from alice_survey.core.frames import Array
 from camera_calib.rig import Rig, design_rig
 from camera_calib.water import water_optics
 from missions.exposure.conflict import conflict
 from missions.exposure.focus import Focus, aperture_warning, plan_focus
-from missions.exposure.footprints import (
-    FootprintRange,
-    Spacing,
-    footprint_range,
-    line_spacing,
-)
+from missions.exposure.footprints import FootprintRange, Spacing, footprint_range, line_spacing
 from missions.exposure.light import (
     LightBudget,
     Scatter,

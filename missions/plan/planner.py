@@ -21,37 +21,13 @@ from camera_calib.rig import Rig
 from missions.areas.bathymetry import Bathymetry, mean_depth_m, read_bathymetry
 from missions.areas.survey import survey_area
 from missions.coverage.certificate import Certificate, certificate
-from missions.coverage.stations import (
-    MAX_ALTITUDES,
-    Stations,
-    stations_of_plan,
-    sure_pattern,
-)
+from missions.coverage.stations import MAX_ALTITUDES, Stations, stations_of_plan, sure_pattern
 from missions.exposure.settings import ImagingSettings, ImagingSetup, imaging_settings
 from missions.exposure.strobe import raw_bytes
 from missions.plan.parts import plan_parts
 from missions.plan.rows import Setting, imaging_rows
-from missions.plan.strength import (
-    check_no_stops,
-    check_turns,
-    survey_costs,
-    warn_of_swell,
-)
-from missions.route.energy import (
-    flight_conditions,
-    plan_as_flown,
-    planned_vehicle,
-    sound_vehicle,
-    usable_wh,
-    without_stops,
-)
-from missions.route.terrain import (
-    Reach,
-    TerrainLimits,
-    line_profiles,
-    reach_of,
-    terrain_figures,
-)
+from missions.plan.strength import check_no_stops, check_turns, survey_costs, warn_of_swell
+from missions.route import energy, terrain
 from missions.values.area import Area
 from missions.values.costs import Costs
 from missions.values.footprint import Swath, common_swath
@@ -93,7 +69,7 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
             makes a plan possible, its value.
     """
     with keep_warnings() as warnings:
-        plan = plan_as_flown(config.plan, planned_vehicle(config.vehicle))
+        plan = energy.plan_as_flown(config.plan, energy.planned_vehicle(config.vehicle))
         if plan.turn_radius_m > config.plan.arc_radius_m:
             warn(
                 f"{config.vehicle.name} is steered by fins: turns are planned with a radius of "
@@ -111,30 +87,30 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
         area, bathymetry, depth_m = _site(config.area, plan, pattern, imaging)
         below_m = depth_m - plan.altitude_m
         _warn_of_spacing(plan, imaging, stereo)
-        vehicle, glass_body_m = sound_vehicle(config.vehicle), config.camera.position_body_m
+        vehicle, glass_body_m = energy.sound_vehicle(config.vehicle), config.camera.position_body_m
         hull, clearance_m = vehicle.hull, config.area.no_go_clearance_m
         _warn_of_hull(vehicle.name, area, clearance_m, hull, glass_body_m)
         home = _home(plan.home_ne_m, area)
         costs = survey_costs(config, imaging_w=imaging.imaging_w)
         set_depth_m = config.area.seafloor_depth_m - plan.altitude_m
         warn_of_swell(
-            flight_conditions(plan, config.vehicle, config.sea, set_depth_m, glass_body_m),
+            energy.flight_conditions(plan, config.vehicle, config.sea, set_depth_m, glass_body_m),
             config.sea,
             depth_m,
             below_m,
         )
         flown = plan_parts(
             area,
-            without_stops(plan, vehicle),
+            energy.without_stops(plan, vehicle),
             pattern,
             costs,
             home,
-            usable_wh=usable_wh(config.vehicle),
+            usable_wh=energy.usable_wh(config.vehicle),
             depth_m=below_m,
         )
         lines, dives, sweep = flown.lines, flown.dives, flown.sweep
         check_no_stops(vehicle, plan, dives)
-        reach = reach_of(
+        reach = terrain.reach_of(
             hull,
             glass_body_m,
             max(stereo.port_m, stereo.starboard_m),
@@ -198,7 +174,10 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
         details = json.loads(json.dumps(about))  # as they are read back
         finished = replace(laid, coverage=seen.share_at_overlap, details=details)
         totals = _totals(finished, imaging, seen, rig)
-        totals |= {"usable_wh": usable_wh(config.vehicle), "aperture": config.camera.f_number}
+        totals |= {
+            "usable_wh": energy.usable_wh(config.vehicle),
+            "aperture": config.camera.f_number,
+        }
         planned = Planned(
             plan=finished,
             imaging=imaging,
@@ -322,19 +301,19 @@ def area_bathymetry(settings: AreaConfig, area: Area, altitude_m: float) -> Bath
 
 
 def _terrain(
-    lines: Sequence[Line], plan: PlanConfig, reach: Reach, bathymetry: Bathymetry | None
+    lines: Sequence[Line], plan: PlanConfig, reach: terrain.Reach, bathymetry: Bathymetry | None
 ) -> tuple[tuple[tuple[float, ...], ...], dict[str, Any] | None]:
     """How lines follow a bathymetry: depths of the glass at each station, and figures."""
     if bathymetry is None:
         return (), None
-    limits = TerrainLimits(
+    limits = terrain.TerrainLimits(
         altitude_m=plan.altitude_m,
         least_clearance_m=plan.least_clearance_m,
         steepest_rad=math.radians(plan.steepest_deg),
     )
-    profiles = line_profiles(lines, bathymetry, reach, limits)
+    profiles = terrain.line_profiles(lines, bathymetry, reach, limits)
     depths = tuple(tuple(round(float(d), 4) for d in p.depth_m) for p in profiles)
-    return depths, terrain_figures(profiles, limits, plan.relief_m)
+    return depths, terrain.terrain_figures(profiles, limits, plan.relief_m)
 
 
 def _stations(plan: Plan, bathymetry: Bathymetry | None) -> Stations:

@@ -14,35 +14,27 @@ from alice_survey.sim.vehicle.sea import orbital_speed_mps
 from alice_survey.sim.vehicle.steady import fin_flight, min_speed_mps, too_slow
 from alice_survey.sim.vehicle.vehicle import Vehicle
 from missions.exposure.conflict import conflict, last_that_fits
-from missions.route.energy import (
-    FlightConditions,
-    course_powers,
-    flies_everywhere,
-    flight_conditions,
-    plan_as_flown,
-    planned_vehicle,
-    vehicle_costs,
-)
+from missions.route import energy
 from missions.values.costs import Costs
 from missions.values.plan_file import Dive
 
 
 def survey_costs(config: SurveyConfig, *, imaging_w: float = 0.0) -> Costs:
-    """What flying a survey takes; as `vehicle_costs`, whose errors name the current here.
+    """What flying a survey takes; as `energy.vehicle_costs`, whose errors name the current here.
 
     Args:
         config: of the survey.
         imaging_w: mean power of strobes while on lines.
     """
-    plan = plan_as_flown(config.plan, planned_vehicle(config.vehicle))
+    plan = energy.plan_as_flown(config.plan, energy.planned_vehicle(config.vehicle))
     depth_m = config.area.seafloor_depth_m - plan.altitude_m
     glass_body_m = config.camera.position_body_m
-    flown = flight_conditions(plan, config.vehicle, config.sea, depth_m, glass_body_m)
+    flown = energy.flight_conditions(plan, config.vehicle, config.sea, depth_m, glass_body_m)
     refused = partial(current_error, flown, is_set=config.sea.current_file is None)
-    return vehicle_costs(flown, refused=refused, imaging_w=imaging_w)
+    return energy.vehicle_costs(flown, refused=refused, imaging_w=imaging_w)
 
 
-def current_error(flown: FlightConditions, what: str, *, is_set: bool = True) -> PlanError:
+def current_error(flown: energy.FlightConditions, what: str, *, is_set: bool = True) -> PlanError:
     """The error that names the current, and what the vehicle holds.
 
     Args:
@@ -79,7 +71,7 @@ def current_error(flown: FlightConditions, what: str, *, is_set: bool = True) ->
 
     def flies(speed_mps: float) -> bool:
         at = replace(flown, speed_mps=speed_mps)
-        return flies_everywhere(at) and bool(np.isfinite(course_powers(at)[0]).all())
+        return energy.flies_everywhere(at) and bool(np.isfinite(energy.course_powers(at)[0]).all())
 
     slow_mps = PlanConfig().speed_mps
     if speed > slow_mps and flies(slow_mps):
@@ -89,13 +81,13 @@ def current_error(flown: FlightConditions, what: str, *, is_set: bool = True) ->
     return PlanError(f"{said} with the thrust it has left: check vehicle.failures")
 
 
-def _min_fin_speed_mps(flown: FlightConditions, current_mps: float) -> float | None:
+def _min_fin_speed_mps(flown: energy.FlightConditions, current_mps: float) -> float | None:
     """The lowest speed over ground at which fins hold a vehicle everywhere; None if unknown."""
 
     def flies(speed_mps: float) -> bool:
         settings = PlanConfig(speed_mps=speed_mps, turn_radius_m=flown.turn_radius_m)
-        radius_m = plan_as_flown(settings, flown.vehicle).arc_radius_m
-        return flies_everywhere(replace(flown, speed_mps=speed_mps, turn_radius_m=radius_m))
+        radius_m = energy.plan_as_flown(settings, flown.vehicle).arc_radius_m
+        return energy.flies_everywhere(replace(flown, speed_mps=speed_mps, turn_radius_m=radius_m))
 
     slow_mps = min_speed_mps(flown.vehicle, STEADY_SHARE)
     fast_mps = min(2.0 * (slow_mps + current_mps), 3.0)
@@ -107,7 +99,7 @@ def _min_fin_speed_mps(flown: FlightConditions, current_mps: float) -> float | N
     return next(filter(flies, tried), fast_mps)
 
 
-def held_current_mps(conditions: FlightConditions) -> float:
+def held_current_mps(conditions: energy.FlightConditions) -> float:
     """The strongest current, in the expected one's direction and no stronger, to fly any survey in.
 
     In whole centimetres a second; 0 where there is none.
@@ -117,14 +109,16 @@ def held_current_mps(conditions: FlightConditions) -> float:
 
     def flies(held_mps: float) -> bool:
         held_ne = current * (held_mps / max(size, 1e-9))
-        return flies_everywhere(replace(conditions, current_ne_mps=held_ne))
+        return energy.flies_everywhere(replace(conditions, current_ne_mps=held_ne))
 
     if flies(size):
         return size
     return math.floor(100.0 * last_that_fits(flies, 0.0, size, 1e-3)) / 100.0
 
 
-def warn_of_swell(flown: FlightConditions, sea: SeaConfig, depth_m: float, below_m: float) -> None:
+def warn_of_swell(
+    flown: energy.FlightConditions, sea: SeaConfig, depth_m: float, below_m: float
+) -> None:
     """Warn where swell moves the water faster, with the current, than the vehicle holds.
 
     Args:
@@ -139,7 +133,7 @@ def warn_of_swell(flown: FlightConditions, sea: SeaConfig, depth_m: float, below
     towards = math.radians(sea.swell_towards_deg)
     way = np.array([math.cos(towards), math.sin(towards)])
     crests = [flown.current_ne_mps + sign * swell_mps * way for sign in (1.0, -1.0)]
-    if all(flies_everywhere(replace(flown, current_ne_mps=crest)) for crest in crests):
+    if all(energy.flies_everywhere(replace(flown, current_ne_mps=crest)) for crest in crests):
         return
     warn(
         f"swell of {sea.swell_m:g} m every {sea.swell_period_s:g} s moves the water by up to "

@@ -14,16 +14,9 @@ from shapely.geometry import Polygon
 
 from alice_survey.core.artefacts import write_json
 from alice_survey.core.errors import warn
+from missions.exports import mavlink
 from missions.exports.format import Export, ExportFile, ExportFormat
 from missions.exports.geometry import CameraMount, lat_lon
-from missions.exports.mavlink import (
-    FRAME_ABOVE_HOME,
-    FRAME_ABOVE_TERRAIN,
-    NAV_WAYPOINT,
-    Item,
-    item_of,
-    mission_of,
-)
 from missions.exports.waypoints import Waypoint
 from missions.values.area import multipolygon
 from missions.values.mission import Mission
@@ -31,7 +24,7 @@ from missions.values.plan_file import Plan
 
 _ARDUPILOT, _SUBMARINE = 3, 12
 """MAV_AUTOPILOT_ARDUPILOTMEGA and MAV_TYPE_SUBMARINE."""
-_ALTITUDE_MODES = {FRAME_ABOVE_HOME: 1, FRAME_ABOVE_TERRAIN: 4}
+_ALTITUDE_MODES = {mavlink.FRAME_ABOVE_HOME: 1, mavlink.FRAME_ABOVE_TERRAIN: 4}
 """QGroundControl's own numbers for MAVLink frames."""
 _MIXED = 0
 
@@ -64,7 +57,7 @@ def write_qgc(path: Path, export: Export, dive: int) -> None:
     write_json(path, document)
 
 
-def _simple(item: Item, number: int) -> dict[str, Any]:
+def _simple(item: mavlink.Item, number: int) -> dict[str, Any]:
     data: dict[str, Any] = {
         "type": "SimpleItem",
         "autoContinue": True,
@@ -73,7 +66,7 @@ def _simple(item: Item, number: int) -> dict[str, Any]:
         "frame": item.frame,
         "params": list(item.params),
     }
-    if item.command == NAV_WAYPOINT:
+    if item.command == mavlink.NAV_WAYPOINT:
         data |= {
             "AMSLAltAboveTerrain": None,
             "Altitude": item.params[6],
@@ -130,10 +123,10 @@ def read_qgc(text: str) -> Mission | None:
     items = mission.get("items") if isinstance(mission, dict) else None
     if not isinstance(items, list):
         raise ValueError("the plan has no list of mission items")  # noqa: TRY004  a file's
-    return mission_of(list(_read_items(items)))
+    return mavlink.mission_of(list(_read_items(items)))
 
 
-def _read_items(items: list[Any]) -> Iterator[Item]:
+def _read_items(items: list[Any]) -> Iterator[mavlink.Item]:
     for number, item in enumerate(items, start=1):
         where = f"mission item {number}"
         if not isinstance(item, dict):
@@ -141,7 +134,7 @@ def _read_items(items: list[Any]) -> Iterator[Item]:
         if item.get("type") == "SimpleItem" and isinstance(item.get("params"), list):
             # null stands for a parameter that is not given.
             params = [0.0 if value is None else value for value in item["params"]]
-            yield item_of(item.get("command"), item.get("frame"), params, where)
+            yield mavlink.item_of(item.get("command"), item.get("frame"), params, where)
         else:
             raise ValueError(f"{where} is of the type {str(item.get('type'))[:40]!r}")
 

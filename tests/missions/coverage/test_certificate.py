@@ -7,6 +7,7 @@ import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from shapely.geometry import Polygon
 from shapely.geometry.base import BaseGeometry
 from shapely.ops import unary_union
@@ -17,12 +18,7 @@ from alice_survey.core.frames import Array
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.holes import find_holes, geodetic
-from missions.coverage.stations import (
-    Stations,
-    stations_of_lines,
-    stations_of_plan,
-    sure_pattern,
-)
+from missions.coverage.stations import Stations, stations_of_lines, stations_of_plan, sure_pattern
 from missions.plan.planner import plan_survey
 from missions.values.footprint import footprint_size_m
 from missions.values.pattern import Pattern
@@ -41,7 +37,7 @@ RIG = design_rig(CameraConfig(), WaterConfig())
 ONCE = Pattern(spacing_m=1.0, step_m=1.0, half_across_m=0.5, half_along_m=0.5)
 
 
-def shares_of(certificate: Certificate, counts: Array) -> Array:
+def shares_of(certificate: Certificate, counts: NDArray[np.uint16]) -> Array:
     """Share of the area, (N,), that is seen 0, 1, 2, ... times."""
     return np.bincount(counts[certificate.inside]) / certificate.inside.sum()
 
@@ -66,7 +62,7 @@ def test_one_rectangle_covers_its_own_area() -> None:
     assert seen.grid.shape == (100, 100)
     assert seen.covered_share == pytest.approx(2.0 / 25.0, abs=1e-12)
     assert (seen.stations, seen.taken, seen.fewest_pictures) == (1, 1, 0)
-    np.testing.assert_allclose(shares_of(seen, seen.pictures), [0.92, 0.08], atol=1e-12)
+    assert shares_of(seen, seen.pictures) == pytest.approx([0.92, 0.08], abs=1e-12)
     higher = certificate(area, rig, stations_at([(2.5, 2.5)], 1.5), ONCE, cell_m=0.05)
     assert higher.covered_share == pytest.approx(1.5**2 * 2.0 / 25.0, abs=0.003)
 

@@ -13,12 +13,7 @@ from alice_survey.core.executor import local_executor
 from camera_calib.rig import design_rig
 from missions.coverage import certificate as module
 from missions.coverage.certificate import certificate
-from missions.coverage.raster import (
-    border_rays_body,
-    footprints_ne,
-    grid_over,
-    inside,
-)
+from missions.coverage.raster import border_rays_body, footprints_ne, grid_over, inside
 from missions.coverage.stations import Stations
 from missions.values.pattern import Pattern
 from tests.oracles_coverage import area_of, counts_at, footprint_polygons, middles_ne

@@ -16,14 +16,7 @@ from missions.exports.write import write_exports
 from missions.values.footprint import common_swath
 from missions.values.plan_file import Plan
 from tests.missions.exports.plans import RIG, golden_plan, small_plan
-from tests.missions.exports.readers import (
-    Step,
-    local_ne,
-    plans,
-    read_cola2,
-    rigs,
-    turned,
-)
+from tests.missions.exports.readers import Step, local_ne, plans, read_cola2, rigs, turned
 
 GOLDEN = Path(__file__).parent / "golden"
 MM = 1e-3

@@ -14,15 +14,7 @@ from missions.lines.rows import Site, to_uv
 from missions.values.area import multipolygon
 from missions.values.line import Line
 from missions.values.pattern import Pattern
-from tests.oracles_lines import (
-    PATTERNS,
-    STEREO,
-    area_of,
-    areas,
-    as_string,
-    points_in,
-    seen_enough,
-)
+from tests.oracles_lines import PATTERNS, STEREO, area_of, areas, as_string, points_in, seen_enough
 
 
 def pieces_as_lines(pieces: np.ndarray, offsets: np.ndarray) -> list[Line]:

@@ -61,7 +61,8 @@ class Bag:
     def make(self, kind: str, fields: Mapping[str, Any]) -> Any:
         """A message; nested ones are mappings, and what is left out is 0 or empty."""
         values = {}
-        for name, (node, of) in self.store.fielddefs[kind][1]:
+        described: Any = self.store.fielddefs[kind][1]
+        for name, (node, of) in described:
             if node == Nodetype.NAME:
                 values[name] = self.make(of, fields.get(name, {}))
             elif node == Nodetype.BASE:
@@ -118,7 +119,7 @@ class Bag:
         """Place: latitude, longitude, height."""
         self.add(
             topic, "sensor_msgs/msg/NavSatFix", stamp_ns, "gps",
-            status={"status": status, "service": 1},
+            status={"status": status, "service": 1}, recorded_ns=None,
             position_covariance=np.diag([4.0, 16.0, 25.0]).ravel(), position_covariance_type=2,
             **fields_of("latitude longitude altitude", place),
         )  # fmt: skip
