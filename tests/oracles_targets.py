@@ -5,10 +5,11 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import erf
 
 from alice_survey.core.compiled import compiled_ieee
+from camera_calib.camera import Camera
 from camera_calib.targets.pattern import black_rectangles
 from camera_calib.targets.target import Target
 
@@ -120,6 +121,20 @@ def picture_light(
             nodes = warp(nodes.reshape(-1, 2)).reshape(nodes.shape)
         light[part[:, 1], part[:, 0]] = _mean_light(nodes, samples, back, grid_x, grid_y, shade)
     return cv2.GaussianBlur(light, (0, 0), blur_px) if blur_px > 0 else light
+
+
+def light_through(
+    target: Target, camera: Camera, board_from_cam: RigidTransform, fine: int = 4
+) -> np.ndarray:
+    """(H, W) light of a target as the rays of pixels meet it, through a port too."""
+
+    def hits(pixels: np.ndarray) -> np.ndarray:
+        """(M, 2) x and y where the rays of pixels meet the board's plane."""
+        points, directions = camera.unproject(pixels)
+        start, ways = board_from_cam.apply(points), board_from_cam.rotation.apply(directions)
+        return start[:, :2] - start[:, 2:] / ways[:, 2:] * ways[:, :2]
+
+    return picture_light(target, np.eye(3), (camera.width_px, camera.height_px), fine, warp=hits)
 
 
 @compiled_ieee

@@ -17,18 +17,13 @@ from typing import Any
 
 from PIL import Image
 
-from alice_survey.kit.document import PictureLayer, Report, Section, SurveyMap, Table
+from alice_survey.kit.document import Report, Section, Table
 from alice_survey.kit.map import map_data
 
 _HERE = Path(__file__).parent
 _MAP_SCRIPTS = ("web/vendor_map.js", "map_tiles.js", "map.js")
 _MESH_SCRIPTS = ("web/vendor_mesh.js", "mesh.js")
-_NUMBER = re.compile(
-    r"[~<>≤≥±+\-−]?\s*\d[\d.,'\u2009\u202f ]*(e[+\-−]?\d+)?"  # with groups of thousands
-    r"(\s*(±|to|of|/|x|×)\s*[+\-−]?\d[\d.,]*(e[+\-−]?\d+)?)*"
-    r"\s*([%‰°]|[a-zA-Zµ²³/·%]{1,8}( [a-z]{1,4})?)?",
-    re.IGNORECASE,
-)
+_NUMBER = re.compile(r"[~<>≤≥±+\-−]?\s*\d.{0,23}")
 """A number with its unit, its sigma or a share: "12.3 mm", "0.4 ± 0.1 %", "3 of 58"."""
 _SHORT_WORD = 8
 _NO_VALUE = {"", "-", "–", "—", "n/a"}
@@ -69,7 +64,6 @@ def _templates() -> Any:
     )
     found.filters |= {
         "anchor": _anchor,
-        "layer_groups": _layer_groups,
         "numeric_columns": numeric_columns,
         "png_address": lambda png: f"data:image/png;base64,{_base64(png)}",
         "png_size": png_size,
@@ -115,15 +109,6 @@ def _base64(content: bytes) -> str:
 def _anchor(section: Section) -> str:
     name = (section.name or section.title).lower()
     return "part-" + re.sub(r"[^a-z0-9]+", "-", name).strip("-")
-
-
-def _layer_groups(survey_map: SurveyMap) -> list[tuple[str, str, list[Any]]]:
-    """Heading, kind of control and layers of each group in the map's list."""
-    groups: dict[bool, list[Any]] = {True: [], False: []}
-    for layer in survey_map.layers:
-        groups[isinstance(layer, PictureLayer) and layer.base].append(layer)
-    named = [("Base layer", "radio", groups[True]), ("Overlays", "checkbox", groups[False])]
-    return [group for group in named if group[2]]
 
 
 def png_size(png: bytes) -> tuple[int, int]:

@@ -76,6 +76,7 @@ def render_pdf(report: Report, date: datetime) -> bytes:
         The PDF, tagged for screen readers.
     """
     import typst
+    from matplotlib import get_data_path
 
     with tempfile.TemporaryDirectory(prefix="alice-survey-") as name:
         folder = Path(name)
@@ -87,21 +88,12 @@ def render_pdf(report: Report, date: datetime) -> bytes:
         (folder / "report.json").write_text(json.dumps(data, allow_nan=False), encoding="utf-8")
         main = folder / "main.typ"
         main.write_bytes(_TEMPLATE.read_bytes())
+        # matplotlib brings the fonts of the figures, with the letters of most scripts.
         content: bytes = typst.compile(
-            main,
-            root=folder,
-            font_paths=[_fonts()],
-            ignore_system_fonts=True,
-            pdf_standards=[_STANDARD],
-        )
+            main, root=folder, font_paths=[Path(get_data_path()) / "fonts" / "ttf"],
+            ignore_system_fonts=True, pdf_standards=[_STANDARD],
+        )  # fmt: skip
     return content
-
-
-def _fonts() -> Path:
-    """Fonts that come with matplotlib: those of the figures, with the letters of most scripts."""
-    from matplotlib import get_data_path
-
-    return Path(get_data_path()) / "fonts" / "ttf"
 
 
 def _data(report: Report, folder: Path) -> dict[str, Any]:

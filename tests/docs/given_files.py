@@ -20,8 +20,7 @@ from alice_survey.sim.vehicle.vehicle import vehicle_from_file
 from camera_calib.camera import Camera
 from camera_calib.formats.convert import FORMATS
 from camera_calib.rig import Rig, design_rig
-from camera_calib.targets.pattern import black_rectangles
-from camera_calib.targets.target import Target, parse_target
+from camera_calib.targets.target import parse_target
 from missions.logs.ros_builder import flipped_quaternion
 from tests.alice_survey.sim.vehicle.identification.manoeuvres import fly, hidden, measured
 from tests.camera_calib.calibration_scenes import board_poses, in_air
@@ -29,7 +28,7 @@ from tests.cameras import changed
 from tests.missions.logs.log_files import Bag, dataflash_log, tlog
 from tests.missions.logs.test_import_ulog import dive as px4_dive
 from tests.missions.logs.test_import_ulog import ulog
-from tests.oracles_targets import BLACK, WALL, WHITE, to_srgb
+from tests.oracles_targets import light_through, to_srgb
 
 SAID = datetime(2024, 5, 1, 9, 0, 0, tzinfo=UTC)
 """When the simulated flight is said to have begun."""
@@ -38,10 +37,6 @@ LEAP_S = 18
 """GPS time is ahead of UTC by this since 2017."""
 BOARD = "charuco 12x9 40mm 30mm"
 VIEWS = 8
-SHEET_PX_M = 4000
-"""How finely the board is painted."""
-FINE = 2
-"""Samples along a side of a pixel."""
 FAST_S = 1.5
 """By which the clocks of cameras are ahead."""
 
@@ -65,45 +60,14 @@ def boards(folder: Path, *, air: bool) -> None:
     target = parse_target(BOARD)
     looking = in_air(rig) if air else rig
     near_m, far_m = (0.6, 1.0) if air else (0.75, 1.1)
-    poses = board_poses(
-        looking,
-        VIEWS,
-        np.random.default_rng(7 if air else 8),
-        near_m=near_m,
-        far_m=far_m,
-        points=target.points,
-    )
-    sheet, corner_m = _sheet(target)
+    rng = np.random.default_rng(7 if air else 8)
+    poses = board_poses(looking, VIEWS, rng, near_m=near_m, far_m=far_m, points=target.points)
     for name, camera in looking.cameras.items():
         place = folder / ("air" if air else "pool") / name
         place.mkdir(parents=True)
-        y, x = np.mgrid[: camera.height_px * FINE, : camera.width_px * FINE]
-        origins, rays = camera.unproject((np.stack([x, y], axis=-1).reshape(-1, 2) + 0.5) / FINE)
         for view in range(VIEWS):
-            target_from_cam = (looking.cam_from_rig[name] * poses[view]).inv()
-            start, ways = target_from_cam.apply(origins), target_from_cam.rotation.apply(rays)
-            places_m = (start - ways * (start[:, 2:] / ways[:, 2:]))[:, :2]
-            places = ((places_m - corner_m) * SHEET_PX_M - 0.5).astype(np.float32)
-            light = cv2.remap(
-                sheet, places.reshape(*x.shape, 2), None, cv2.INTER_LINEAR,
-                borderMode=cv2.BORDER_CONSTANT, borderValue=WALL,
-            )  # fmt: skip
-            shrunken = cv2.resize(
-                light, None, fx=1 / FINE, fy=1 / FINE, interpolation=cv2.INTER_AREA
-            )
-            cv2.imwrite(str(place / f"{view:02d}.png"), to_srgb(shrunken))
-
-
-def _sheet(target: Target) -> tuple[NDArray[np.float32], Array]:
-    """The light that a target with its white margin sends, and where its upper left corner is."""
-    margin_m = 0.5 * target.size_m
-    left, top, right, bottom = np.array(target.outline) + margin_m * np.array([-1, -1, 1, 1])
-    size = np.rint(np.array([bottom - top, right - left]) * SHEET_PX_M).astype(int)
-    sheet = np.full(size, WHITE, np.float32)
-    corners = (black_rectangles(target) - np.array([left, top, left, top])) * SHEET_PX_M
-    for x0, y0, x1, y1 in np.rint(corners).astype(int):
-        sheet[y0:y1, x0:x1] = BLACK
-    return sheet, np.array([left, top])
+            light = light_through(target, camera, (looking.cam_from_rig[name] * poses[view]).inv())
+            cv2.imwrite(str(place / f"{view:02d}.png"), to_srgb(light))
 
 
 def shrunk(picture: NDArray[np.uint8], width_px: int) -> NDArray[np.uint8]:

@@ -1,96 +1,121 @@
-"""Make the tutorial's pictures again, from a run of the tutorial's own commands.
+"""Make the pictures of the tutorial and of `docs/studio.md` again.
 
-`python -m tests.docs.renew` runs them first; `--folder F` takes a folder where they were run.
+    python -m tests.docs.renew [FOLDER]
+
+The tutorial's own commands are run first, but for a folder where they were; nothing in it changes.
 """
 
-import argparse
+import shutil
+import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 from PIL import Image, ImageOps
 
-from tests.alice_survey.kit.browser import chromium
+from tests.alice_survey.app.studio.client import serving
+from tests.alice_survey.app.studio.journey_page import begun_page, button
+from tests.alice_survey.app.studio.test_follow_browser import SimulatedDive
+from tests.alice_survey.app.studio.test_model_browser import click
 from tests.docs.given import TUTORIAL, Made
 from tests.docs.pages import DOCS
+from tests.missions.follow.dives import text_of
 
-MAX_BYTES = 1_500_000
-STATION = 14
-"""One that shows the amphora."""
-GAP_PX = 12
-NOTICED_PX = 4
+WIDE, NARROW = {"width": 1280, "height": 800}, {"width": 400, "height": 800}
+WAIT_MS = 60_000
+SHEETS: dict[str, tuple[int, list[str]]] = {
+    "plan.png": (800, ["plan/map.png"]),
+    "flight.png": (1400, ["flight/track.png"]),
+    "pictures.jpg": (
+        1260,
+        ["images/left/000014.png", "images/right/000014.png", "pool/left/03.png"],
+    ),
+    "surface.jpg": (1000, ["dense/dem.png", "mosaic/mosaic.png"]),
+    "mesh.jpg": (1000, ["mesh/mesh.png"]),
+    "errors.png": (1400, ["evaluation/errors.png"]),
+}
+"""Widths, and what is shown side by side; station 14 shows the amphora."""
 
 
 def main() -> None:
-    """Run the tutorial unless it was, and draw its pictures."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--folder", type=Path)
-    folder = parser.parse_args().folder
-    with tempfile.TemporaryDirectory() as scratch:
-        renew(folder or Made(Path(scratch)).after(TUTORIAL), DOCS / "tutorial")
+    """Run the tutorial unless it was, and draw its pictures and those of the studio."""
+    with tempfile.TemporaryDirectory() as name:
+        scratch = Path(name)
+        made = Path(sys.argv[1]) if sys.argv[1:] else Made(scratch).after(TUTORIAL)
+        copy = Path(shutil.copytree(made / "reef", scratch / "copy" / "reef"))
+        for file, (width, paths) in SHEETS.items():
+            side_by_side([copy / path for path in paths], width).save(DOCS / "tutorial" / file)
+        with begun_page({"width": 1100, "height": 900}) as (page, _):
+            page.goto((copy / "report" / "report.html").as_uri())
+            photograph(page, DOCS / "tutorial" / "report.jpg", 1500)
+        photograph_studio(copy, DOCS / "studio")
 
 
-def renew(made: Path, out: Path) -> None:
-    """Draw the pictures of `docs/tutorial.md`.
-
-    Args:
-        made: where its commands were run.
-        out: folder to write.
-
-    Raises:
-        ValueError: together they are too large for a page.
-    """
-    out.mkdir(exist_ok=True)
-    reef = made / "reef"
-    to_width(read(reef / "plan/map.png"), 800).save(out / "plan.png", optimize=True)
-    to_width(read(reef / "flight/track.png"), 1400).save(out / "flight.png", optimize=True)
-    pair = [read(reef / f"images/{side}/{STATION:06d}.png") for side in ("left", "right")]
-    pictures = side_by_side([*pair, read(reef / "pool/left/03.png")], 338)
-    pictures.save(out / "pictures.jpg", quality=82)
-    surface = [cut(read(reef / "dense/dem.png")), read(reef / "mosaic/mosaic.png")]
-    side_by_side(surface, 620).save(out / "surface.jpg", quality=82)
-    to_width(cut(read(reef / "mesh/mesh.png")), 1000).save(out / "mesh.jpg", quality=82)
-    read(reef / "evaluation/errors.png").save(out / "errors.png", optimize=True)
-    photograph(reef / "report/report.html", out / "report.jpg")
-    size = sum(path.stat().st_size for path in out.iterdir())
-    if size > MAX_BYTES:
-        raise ValueError(f"{size / 1e6:.2f} MB of pictures in {out}")
+def side_by_side(paths: list[Path], width: int) -> Image.Image:
+    """Pictures of one height without their white borders, in a row; what is clear becomes white."""
+    row = []
+    for path in paths:
+        clear = Image.open(path).convert("RGBA")
+        one = Image.alpha_composite(Image.new("RGBA", clear.size, "white"), clear).convert("RGB")
+        one = one.crop(ImageOps.invert(one.convert("L")).getbbox())
+        row.append(np.asarray(ImageOps.expand(ImageOps.contain(one, (9999, 620)), 6, "white")))
+    return ImageOps.contain(Image.fromarray(np.hstack(row)), (width, 9999))
 
 
-def read(path: Path) -> Image.Image:
-    """A picture, in colour; what is clear becomes white."""
-    picture = Image.open(path).convert("RGBA")
-    return Image.alpha_composite(Image.new("RGBA", picture.size, "white"), picture).convert("RGB")
+def photograph_studio(reef: Path, out: Path) -> None:
+    """Serve a workspace, and photograph its tabs."""
+    dive = SimulatedDive.read(reef)
+    (reef / "nav.csv").write_bytes(text_of(dive.between(0.0, float(np.mean(dive.on_lines[2])))))
+    before = {"model": measure, "pictures": open_pictures, "follow": follow}
+    with serving(reef) as server, begun_page(WIDE) as (page, _):
+        page.goto(server.address)
+        page.wait_for_selector("body[data-ready]")
+        for name in ("follow", "model", "pictures", "run", "plan"):
+            page.locator(f"#tab-{name}").click()
+            page.wait_for_timeout(4000)
+            before.get(name, lambda _: None)(page)
+            photograph(page, out / f"{name}.jpg", 1500)
+        page.set_viewport_size(NARROW)
+        photograph(page, out / "narrow.jpg", 3000)
+    with serving(reef.parent / "bay") as server, begun_page(WIDE) as (page, _):
+        page.goto(server.address)
+        button(page, "Plan a survey").click()
+        photograph(page, out / "begin.jpg", 0)
 
 
-def cut(picture: Image.Image) -> Image.Image:
-    """What is left without a white border."""
-    dark = ImageOps.invert(picture.convert("L")).point(lambda value: 255 * (value > NOTICED_PX))
-    return picture.crop(dark.getbbox())
+def measure(page: Any) -> None:
+    """An area in the middle of the map."""
+    box = page.locator("#map-canvas")
+    east, north = (float(box.get_attribute(f"data-{axis}")) for axis in ("east", "north"))
+    size = 130 / 2 ** float(box.get_attribute("data-zoom"))
+    east -= 0.85 * size  # the list of layers takes the right of the map
+    button(page, "Area").click()
+    corners = ((-1, -1), (0.2, -1.3), (0.6, 0.1), (-0.5, 0.5))
+    click(page, *((east + size * e, north + size * n) for e, n in corners))
+    button(page, "Finish").click()
+    page.wait_for_selector("tr[data-measure]")
 
 
-def to_width(picture: Image.Image, width: int) -> Image.Image:
-    """The picture at another size."""
-    return picture.resize((width, round(picture.height * width / picture.width)))
+def open_pictures(page: Any) -> None:
+    """The pictures that see the middle of the map."""
+    button(page, "Choose on the map").click()
+    page.locator("#map-canvas").focus()
+    page.keyboard.press("Enter")
+    page.locator(".picture-view[data-ready]").nth(3).wait_for(timeout=WAIT_MS)
 
 
-def side_by_side(pictures: list[Image.Image], height: int) -> Image.Image:
-    """Pictures of one height with gaps between them."""
-    row = [to_width(one, round(one.width * height / one.height)) for one in pictures]
-    width = sum(one.width + GAP_PX for one in row) - GAP_PX
-    sheet, left = Image.new("RGB", (width, height), "white"), 0
-    for one in row:
-        sheet.paste(one, (left, 0))
-        left += one.width + GAP_PX
-    return sheet
+def follow(page: Any) -> None:
+    """A dive that has lost a stretch of its second line, with lines that close the hole."""
+    page.get_by_label("Navigation CSV of this workspace").select_option("nav.csv")
+    button(page, "Follow it").click()
+    page.wait_for_selector("#panel-follow button.primary:enabled", timeout=WAIT_MS)
 
 
-def photograph(page: Path, path: Path) -> None:
-    """What a browser shows of a page at its top."""
-    with chromium() as browser:
-        tab = browser.new_page(viewport={"width": 1100, "height": 900})
-        tab.goto(page.resolve().as_uri())
-        tab.wait_for_timeout(1500)
-        tab.screenshot(path=str(path), type="jpeg", quality=80)
+def photograph(page: Any, path: Path, after_ms: int) -> None:
+    """What the page shows at its top after a while."""
+    page.wait_for_timeout(after_ms)
+    page.screenshot(path=str(path), type="jpeg", quality=76)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from alice_survey.core.executor import Executor, local_executor
 from camera_calib.rig import Rig, read_rig
 from camera_calib.targets.target import parse_target
 from tests.camera_calib.calibration_scenes import differences, in_air, views_of_some
-from tests.oracles_targets import picture_light, to_srgb
+from tests.oracles_targets import light_through, to_srgb
 from tests.reconstruct.rig_survey import (
     command,
     four_cameras,
@@ -50,16 +50,8 @@ def _take(task: tuple[Path, bool, str, int, RigidTransform]) -> None:
     if path.exists():
         return
     rig = _housed(wet)
-    camera, board_from_cam = rig.cameras[name], (rig.cam_from_rig[name] * rig_from_board).inv()
-
-    def hits(pixels: np.ndarray) -> np.ndarray:
-        """(M, 2) x and y where the rays of pixels meet the board's plane."""
-        points, directions = camera.unproject(pixels)
-        start, ways = board_from_cam.apply(points), board_from_cam.rotation.apply(directions)
-        return start[:, :2] - start[:, 2:] / ways[:, 2:] * ways[:, :2]
-
-    size = camera.width_px, camera.height_px
-    light = picture_light(BOARD, np.eye(3), size, fine=4, warp=hits)
+    board_from_cam = (rig.cam_from_rig[name] * rig_from_board).inv()
+    light = light_through(BOARD, rig.cameras[name], board_from_cam)
     rng = np.random.default_rng([view, wet, list(rig.cameras).index(name)])
     path.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(path), to_srgb(light + rng.normal(0.0, _NOISE, light.shape)))

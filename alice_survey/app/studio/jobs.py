@@ -586,10 +586,8 @@ def _output(path: Path) -> str:
 def _main_line(result: str, finished: Sequence[str]) -> str:
     """The line of the last stage of a result, else the first line."""
     lines = result.splitlines() or [""]
-    name = next(
-        (one.name for one in STAGES if finished and finished[-1] in (one.name, one.folder)), ""
-    )
-    return next((line for line in lines if line.startswith(f"{name}: ")), lines[0])
+    names = [one.name for one in STAGES if {one.name, one.folder} & set(finished[-1:])]
+    return next((x for x in lines if names and x.startswith(f"{names[0]}: ")), lines[0])
 
 
 def _last_line(path: Path) -> str:

@@ -120,7 +120,6 @@ class FollowTab:
         return {
             **({"following": False, "fault": self._fault} if dive is None
                else self._state_of(dive)),
-            "has_plan": self._studio.workspace.has("plan/plan.json"),
             "logs": self._logs(),
             "formats": format_names(),
         }  # fmt: skip

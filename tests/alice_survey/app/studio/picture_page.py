@@ -61,12 +61,6 @@ class PicturePage:
                     self.page.keyboard.press(key + (more if count > 0 else less))
         return float(view.get_attribute("data-x")), float(view.get_attribute("data-y"))
 
-    def picked_in(self, view: Any, x: float, y: float) -> tuple[float, float]:
-        """Pick a pixel in a view that is zoomed to where the spot is expected."""
-        view.scroll_into_view_if_needed()
-        view.click()
-        return self.moved_to(view, x, y)
-
     def found_in_others(self) -> int:
         """Have the page find the spot in the other pictures, and count those."""
         self.page.get_by_role("button", name="Find it in all others").click()
