@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import typer
@@ -24,6 +24,7 @@ from scipy.sparse.csgraph import connected_components
 from alice_survey.app.cli.main import app
 from alice_survey.core.config import SurveyConfig
 
+T = TypeVar("T", bound=ast.AST)
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("alice_survey", "camera_calib", "missions", "reconstruct")
 WORDS = Path(__file__).with_name("structure_words.toml")
@@ -69,12 +70,9 @@ class Count:
     """Where it was counted, for those that have to be looked up."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Module:
+class Module(NamedTuple):
     """One source file of the four packages."""
 
-    name: str
-    path: Path
     text: str
     tree: ast.Module
 
@@ -84,12 +82,18 @@ def modules() -> dict[str, Module]:
     """All modules of the four packages, by name."""
     found = {}
     for package in PACKAGES:
-        for path in sorted((ROOT / package).rglob("*.py")):
-            name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
-            name = name.removesuffix(".__init__")
-            text = path.read_text(encoding="utf-8")
-            found[name] = Module(name=name, path=path, text=text, tree=ast.parse(text))
+        for path, text in _texts(package).items():
+            name = path.removesuffix(".py").replace("/", ".").removesuffix(".__init__")
+            found[name] = Module(text, ast.parse(text))
     return found
+
+
+def nodes(kind: type[T]) -> Iterator[tuple[str, T]]:
+    """Parts of the code of a kind, with the module that each is in."""
+    for name, module in modules().items():
+        for node in ast.walk(module.tree):
+            if isinstance(node, kind):
+                yield name, node
 
 
 def code_lines(text: str) -> int:
@@ -164,27 +168,21 @@ def without_a_layer() -> list[str]:
     ]
 
 
-def ambiguous_classes() -> dict[str, list[str]]:
+def ambiguous_classes() -> list[str]:
     """Class names that are defined in more than one module."""
     places = defaultdict(list)
-    for name, module in modules().items():
-        for node in ast.walk(module.tree):
-            if isinstance(node, ast.ClassDef):
-                places[node.name.lstrip("_")].append(f"{name}.{node.name}")
-    return {name: where for name, where in places.items() if len(where) > 1}
+    for name, node in nodes(ast.ClassDef):
+        places[node.name.lstrip("_")].append(f"{name}.{node.name}")
+    return [f"{name}: {where}" for name, where in places.items() if len(where) > 1]
 
 
 def whole_config() -> list[str]:
     """Functions that take the whole `SurveyConfig`."""
-    found = []
-    for name, module in modules().items():
-        for node in ast.walk(module.tree):
-            if isinstance(node, ast.FunctionDef):
-                every = (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)
-                notes = [ast.unparse(arg.annotation) for arg in every if arg.annotation]
-                if any("SurveyConfig" in note for note in notes):
-                    found.append(f"{name}.{node.name}")
-    return found
+    return [
+        f"{name}.{node.name}"
+        for name, node in nodes(ast.FunctionDef)
+        if "SurveyConfig" in ast.unparse(node.args)
+    ]
 
 
 def naming(*words: str) -> list[str]:
@@ -202,14 +200,12 @@ def avoided_identifiers() -> list[str]:
     """Names in the code that hold one of the avoided words, once for each module."""
     rule = words()["identifiers"]
     avoided = re.compile(rule["pattern"])
-    found = []
-    for name, module in modules().items():
-        found += [
-            f"{name}.{identifier}"
-            for identifier in sorted(set(_identifiers(module.tree)) - set(rule["allowed"]))
-            if avoided.search(identifier.strip("_"))
-        ]
-    return found
+    return [
+        f"{name}.{identifier}"
+        for name, module in modules().items()
+        for identifier in sorted(set(_identifiers(module.tree)) - set(rule["allowed"]))
+        if avoided.search(identifier.strip("_"))
+    ]
 
 
 def _identifiers(tree: ast.Module) -> Iterator[str]:
@@ -230,14 +226,13 @@ def participles() -> list[str]:
     rule = words()["functions"]
     bare = re.compile(rule["pattern"])
     found = []
-    for name, module in modules().items():
-        for node in ast.walk(module.tree):
-            if isinstance(node, ast.FunctionDef) and bare.fullmatch(node.name.strip("_")):
-                decorators = {ast.unparse(one).split(".")[-1] for one in node.decorator_list}
-                says = node.returns is not None and ast.unparse(node.returns) == "bool"
-                if not says and not decorators & {"property", "cached_property"}:
-                    found.append(f"{name}.{node.name}")
-    return [where for where in found if where.rpartition(".")[2] not in rule["allowed"]]
+    for name, node in nodes(ast.FunctionDef):
+        if bare.fullmatch(node.name.strip("_")) and node.name not in rule["allowed"]:
+            decorators = {ast.unparse(one).split(".")[-1] for one in node.decorator_list}
+            says = node.returns is not None and ast.unparse(node.returns) == "bool"
+            if not says and not decorators & {"property", "cached_property"}:
+                found.append(f"{name}.{node.name}")
+    return found
 
 
 def avoided_in_docs() -> list[str]:
@@ -309,21 +304,19 @@ def kernels() -> list[str]:
     """Functions that numba compiles."""
     return [
         f"{name}.{node.name}"
-        for name, module in modules().items()
-        for node in ast.walk(module.tree)
-        if isinstance(node, ast.FunctionDef)
-        and any(_KERNEL.fullmatch(ast.unparse(one)) for one in node.decorator_list)
+        for name, node in nodes(ast.FunctionDef)
+        if any(_KERNEL.fullmatch(ast.unparse(one)) for one in node.decorator_list)
     ]
 
 
-def own_javascript() -> list[Path]:
-    """JavaScript files of the packages that are not built from libraries."""
-    return [
-        path
+def own_javascript() -> dict[str, int]:
+    """Lines of the packages' JavaScript files that are not built from libraries."""
+    return {
+        where: len(text.splitlines())
         for package in PACKAGES
-        for path in sorted((ROOT / package).rglob("*.js"))
-        if _VENDORED not in path.name and "node_modules" not in path.parts
-    ]
+        for where, text in _texts(package, ".js").items()
+        if _VENDORED not in where.rpartition("/")[2] and "node_modules" not in where
+    }
 
 
 def single_importer() -> list[str]:
@@ -335,50 +328,40 @@ def single_importer() -> list[str]:
 @cache
 def counts() -> list[Count]:
     """All counts, with their bounds."""
-    sources = {name: module.text for name, module in modules().items()}
-    tests, benchmarks = _texts("tests"), _texts("benchmarks")
-    javascript = {
-        str(path.relative_to(ROOT)): len(path.read_text(encoding="utf-8").splitlines())
-        for path in own_javascript()
+    matplotlib = re.compile(r"^\s*(import|from) matplotlib", re.MULTILINE)
+    places = {
+        "modules": list(modules()),
+        "modules with a single importer": single_importer(),
+        "kernels": kernels(),
+        "commands": list(commands()),
+        "options of commands": options(),
+        "settings": settings(),
+        "functions that take the whole SurveyConfig": whole_config(),
+        "layers of the import contract": [str(layer) for layer in layers()],
+        "modules without a layer": without_a_layer(),
+        "circles of imports": [" <-> ".join(ring) for ring in circles(imports())],
+        "class names with two meanings": ambiguous_classes(),
+        "modules that import matplotlib": [
+            name for name, module in modules().items() if matplotlib.search(module.text)
+        ],
+        "pages begun by hand (<!DOCTYPE)": [
+            where
+            for package in PACKAGES
+            for where, text in _texts(package, ".py", ".html", ".jinja", ".js").items()
+            if "<!doctype" in text.lower()
+        ],
+        "modules that name the flat port": naming("FlatPort", "flat_port"),
+        "identifiers with an avoided word": avoided_identifiers(),
+        "functions named by a participle": participles(),
+        "help texts with an avoided phrase": avoided_in_help(),
+        "lines of docs with an avoided phrase": avoided_in_docs(),
     }
-    matplotlib = [
-        name
-        for name, module in modules().items()
-        if any(line.lstrip().startswith(("import matplotlib", "from matplotlib"))
-               for line in module.text.splitlines())
-    ]  # fmt: skip
-    pages = [
-        str(path.relative_to(ROOT))
-        for package in PACKAGES
-        for path in (ROOT / package).rglob("*")
-        if path.suffix in {".py", ".html", ".jinja", ".js"}
-        and "<!doctype" in path.read_text(encoding="utf-8", errors="replace").lower()
-    ]
-    rings = circles(imports())
-    names = ambiguous_classes()
     return [
-        _lines("code lines of the packages", sources),
-        _lines("code lines of the tests", tests),
-        _lines("code lines of the benchmarks", benchmarks),
-        _sum("lines of our own JavaScript", javascript),
-        _count("modules", list(modules())),
-        _count("modules with a single importer", single_importer()),
-        _count("kernels", kernels()),
-        _count("commands", list(commands())),
-        _count("options of commands", options()),
-        _count("settings", settings()),
-        _count("functions that take the whole SurveyConfig", whole_config()),
-        _count("layers of the import contract", [str(layer) for layer in layers()]),
-        _count("modules without a layer", without_a_layer()),
-        _count("circles of imports", [" <-> ".join(ring) for ring in rings]),
-        _count("class names with two meanings", [f"{n}: {w}" for n, w in names.items()]),
-        _count("modules that import matplotlib", matplotlib),
-        _count("pages begun by hand (<!DOCTYPE)", pages),
-        _count("modules that name the flat port", naming("FlatPort", "flat_port")),
-        _count("identifiers with an avoided word", avoided_identifiers()),
-        _count("functions named by a participle", participles()),
-        _count("help texts with an avoided phrase", avoided_in_help()),
-        _count("lines of docs with an avoided phrase", avoided_in_docs()),
+        _lines("code lines of the packages", {name: m.text for name, m in modules().items()}),
+        _lines("code lines of the tests", _texts("tests")),
+        _lines("code lines of the benchmarks", _texts("benchmarks")),
+        _sum("lines of our own JavaScript", own_javascript()),
+        *(_count(name, found) for name, found in places.items()),
     ]
 
 
@@ -396,9 +379,13 @@ def _lines(name: str, texts: dict[str, str]) -> Count:
     return _sum(name, {where: code_lines(text) for where, text in texts.items()})
 
 
-def _texts(folder: str) -> dict[str, str]:
-    paths = sorted((ROOT / folder).rglob("*.py"))
-    return {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in paths}
+def _texts(folder: str, *suffixes: str) -> dict[str, str]:
+    """Texts of the files of a folder with some suffixes, by their paths."""
+    paths = [p for p in sorted((ROOT / folder).rglob("*")) if p.suffix in (suffixes or (".py",))]
+    return {
+        path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8", errors="replace")
+        for path in paths
+    }
 
 
 def main(arguments: list[str]) -> int:

@@ -28,22 +28,13 @@ def test_place_on_earth_is_the_rms_of_the_cameras_level_sigmas(held: Held) -> No
     assert held.pictures == "4 pictures taken at 2 stations"
 
 
-def test_a_model_without_positions_is_nowhere_on_earth(tmp_path: Path) -> None:
-    local = tiny_workspace(tmp_path, frame={"name": "model", "datum": None})
-    assert np.isnan(Held.of(local).place_sigma_m)
-
-
-def test_an_empty_workspace_holds_nothing(tmp_path: Path) -> None:
-    held = Held.of(tmp_path)
-    assert held.surface is None
-    assert np.isnan(held.place_sigma_m)
-    assert not held.stages
-
-
-def test_a_half_written_stage_is_not_held(tmp_path: Path) -> None:
-    workspace = tiny_workspace(tmp_path)
-    (workspace / "dense" / "stage.json").unlink()
-    held = Held.of(workspace)
+def test_what_is_not_there_is_not_held(tmp_path: Path) -> None:
+    """A place on the Earth without positions, all of an empty folder, a half-written stage."""
+    local = Held.of(tiny_workspace(tmp_path / "a", frame={"name": "model", "datum": None}))
+    empty = Held.of(tmp_path / "none")
+    assert np.isnan([local.place_sigma_m, empty.place_sigma_m]).all()
+    assert empty.surface is None and not empty.stages
+    (tmp_path / "a" / "dense" / "stage.json").unlink()
+    held = Held.of(tmp_path / "a")
     assert not held.has("dense")
-    assert held.file("dense/dem.tif") is None
-    assert held.surface is None
+    assert held.file("dense/dem.tif") is held.surface is None

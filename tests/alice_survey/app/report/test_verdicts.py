@@ -21,47 +21,45 @@ def level_of(found: list[Verdict], word: str) -> str:
     return levels[0]
 
 
-def test_a_hole_in_the_planned_area_is_seen_and_named(tmp_path: Path) -> None:
-    held, found = judged(tiny_workspace(tmp_path))
-    assert level_of(found, "95.8 % of the planned area") == "look"
-    assert "plan check" in summary(held, found)["What to do next"]
+def navigation(scale: float) -> dict[str, Any]:
+    place = {f"{kind}_{axis}_m": 0.1 for kind in ("rms", "sigma") for axis in
+             ("north", "east", "depth")}  # fmt: skip
+    place |= {"sigma_heading_deg": 0.1, "sigma_tilt_deg": 0.1}
+    return place | {"scale_of_navigation": scale, "scale_of_navigation_sigma": 0.001}
 
 
-@pytest.mark.parametrize(("registered", "level"), [(4, "good"), (3, "bad")])
-def test_lost_pictures_are_judged(tmp_path: Path, registered: int, level: str) -> None:
-    _, found = judged(tiny_workspace(tmp_path, sparse={"registered": registered}))
-    assert level_of(found, f"{registered} of 4") == level
+JOINT = {"stations": 7, "sigma_north_m": 0.03, "sigma_east_m": 0.04, "sigma_depth_m": 0.0,
+         "sigma_tilt_deg": 0.1, "sigma_heading_deg": 0.2}  # fmt: skip
 
 
-def test_parts_that_navigation_alone_joins_are_named_with_their_sigma(tmp_path: Path) -> None:
-    joint = {"stations": 7, "sigma_north_m": 0.03, "sigma_east_m": 0.04, "sigma_depth_m": 0.0,
-             "sigma_tilt_deg": 0.1, "sigma_heading_deg": 0.2}  # fmt: skip
-    held, found = judged(tiny_workspace(tmp_path, sparse={"joints": [joint]}))
-    assert level_of(found, "7 stations show nothing that the others show") == "look"
-    assert any("sigma of 5" in verdict.text for verdict in found)
-    assert "across the gap" in summary(held, found)["What to do next"]
-
-
-@pytest.mark.parametrize(("scale", "level"), [(0.99, "look"), (0.999, "good"), (1.01, "look")])
-def test_navigation_that_contradicts_the_rig_is_judged(
-    tmp_path: Path, scale: float, level: str
+@pytest.mark.parametrize(
+    ("sparse", "words", "level", "next_step"),
+    [
+        ({}, "95.8 % of the planned area", "look", "plan check"),
+        ({"registered": 4}, "4 of 4", "good", ""), ({"registered": 3}, "3 of 4", "bad", ""),
+        ({"joints": [JOINT]}, "7 stations show nothing that the others show", "look",
+         "across the gap"),
+        ({"joints": [JOINT]}, "sigma of 5", "look", ""),
+        ({"georeference": navigation(0.99)}, "navigation's differs", "look", ""),
+        ({"georeference": navigation(0.999)}, "navigation's differs", "good", ""),
+        ({"georeference": navigation(1.01)}, "navigation's differs", "look", ""),
+    ],
+)  # fmt: skip
+def test_a_model_is_judged_and_the_next_step_named(
+    tmp_path: Path, sparse: dict[str, Any], words: str, level: str, next_step: str
 ) -> None:
-    place: dict[str, Any] = {"scale_of_navigation": scale, "scale_of_navigation_sigma": 0.001}
-    axes = {f"{kind}_{axis}_m": 0.1 for kind in ("rms", "sigma") for axis in
-            ("north", "east", "depth")}  # fmt: skip
-    place |= axes | {"sigma_heading_deg": 0.1, "sigma_tilt_deg": 0.1}
-    _, found = judged(tiny_workspace(tmp_path, sparse={"georeference": place}))
-    assert level_of(found, "navigation's differs") == level
+    held, found = judged(tiny_workspace(tmp_path, sparse=sparse))
+    assert level_of(found, words) == level
+    assert next_step in summary(held, found)["What to do next"]
 
 
 def test_a_model_without_scale_is_bad_and_says_what_to_do(tmp_path: Path) -> None:
-    held, found = judged(
-        tiny_workspace(
-            tmp_path, frame={"scaled": False}, sparse={"scale_source": "the model has no scale"}
-        )
-    )
-    assert found[0].level == "bad"
-    assert "no scale" in found[0].text
+    changes: dict[str, Any] = {
+        "frame": {"scaled": False},
+        "sparse": {"scale_source": "the model has no scale"},
+    }
+    held, found = judged(tiny_workspace(tmp_path, **changes))
+    assert found[0].level == "bad" and "no scale" in found[0].text
     assert "scale bar" in summary(held, found)["What to do next"]
     assert any("unit" in value for _, value in facts(held))
 

@@ -2,9 +2,10 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
-from tests.alice_survey.app.studio.client import FOLDED
+from tests.alice_survey.app.studio.client import FOLDED, serving
 from tests.alice_survey.app.studio.picture_page import WAIT_MS, said
 from tests.alice_survey.kit.browser import Heard, chromium, is_accessible
 
@@ -22,6 +23,23 @@ def begun_page(size: dict[str, int]) -> Iterator[tuple[Any, Heard]]:
         heard.listen(page)
         page.add_init_script(FOLDED)
         yield page, heard
+        page.close()
+
+
+@contextmanager
+def opened_page(folder: Path, tab: str = "", **options: Any) -> Iterator[tuple[Any, Heard]]:
+    """The studio's page of a workspace, which complains of nothing and asks no other server."""
+    with serving(folder) as server, chromium() as browser:
+        page = browser.new_page(**{"viewport": WIDE, "reduced_motion": "reduce"} | options)
+        heard = Heard()
+        heard.listen(page)
+        page.add_init_script(FOLDED)
+        page.goto(server.address + tab)
+        page.wait_for_selector("body[data-ready]", timeout=60_000)
+        yield page, heard
+        assert heard.complaints == []
+        asked = {url.split("/")[2] for url in heard.requests if url.startswith("http")}
+        assert asked == {server.url.split("/")[2]}
         page.close()
 
 

@@ -16,8 +16,9 @@ from PIL import Image
 
 from alice_survey.core.artefacts import write_json
 from tests.alice_survey.app.report.tiny import SLOPE, plane_of, tiny_workspace
-from tests.alice_survey.app.studio.client import FOLDED, move_map, serving
-from tests.alice_survey.kit.browser import Heard, chromium, is_accessible
+from tests.alice_survey.app.studio.client import move_map
+from tests.alice_survey.app.studio.journey_page import opened_page
+from tests.alice_survey.kit.browser import Heard, is_accessible
 from tests.alice_survey.kit.sketch import sketch_mesh
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
@@ -41,21 +42,10 @@ def with_mesh(folder: Path) -> Path:
 
 @contextmanager
 def opened(folder: Path, width: int = 1280) -> Iterator[tuple[Any, Heard]]:
-    """The tab in a browser, which complains of nothing and asks no other server."""
-    with serving(folder) as server, chromium() as browser:
-        page = browser.new_page(viewport={"width": width, "height": 900}, reduced_motion="reduce")
-        heard = Heard()
-        heard.listen(page)
-        page.add_init_script(FOLDED)
-        page.goto(server.address + "#model")
-        page.wait_for_selector("body[data-ready]", timeout=60_000)
-        page.wait_for_selector("#panel-model:visible")
-        yield page, heard
-        assert heard.complaints == []
-        assert {url.split("/")[2] for url in heard.requests if url.startswith("http")} == {
-            server.url.split("/")[2]
-        }
-        page.close()
+    """The tab in a browser."""
+    with opened_page(folder, "#model", viewport={"width": width, "height": 900}) as found:
+        found[0].wait_for_selector("#panel-model:visible")
+        yield found
 
 
 def at(page: Any, east: float, north: float) -> dict[str, float]:

@@ -1,7 +1,5 @@
 """The studio's shell in Chromium: its map loads tiles and zooms, layers are chosen, tabs turn."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +7,8 @@ import numpy as np
 import pytest
 
 from tests.alice_survey.app.report.tiny import tiny_workspace, write_raster
-from tests.alice_survey.app.studio.client import serving
-from tests.alice_survey.kit.browser import Heard, chromium, is_accessible
+from tests.alice_survey.app.studio.journey_page import opened_page
+from tests.alice_survey.kit.browser import is_accessible
 from tests.alice_survey.kit.sketch import seafloor
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
@@ -51,25 +49,8 @@ def all_loaded(page: Any, level: int) -> list[tuple[str, int]]:
     return tiles(page)
 
 
-@contextmanager
-def opened(folder: Path, **options: Any) -> Iterator[tuple[Any, Heard]]:
-    """The page, which complains of nothing and asks no other server."""
-    with serving(folder) as server, chromium() as browser:
-        page = browser.new_page(reduced_motion="reduce", **options)
-        heard = Heard()
-        heard.listen(page)
-        page.goto(server.address)
-        page.wait_for_selector("body[data-ready]", timeout=60_000)
-        yield page, heard
-        assert heard.complaints == []
-        assert {url.split("/")[2] for url in heard.requests if url.startswith("http")} == {
-            server.url.split("/")[2]
-        }
-        page.close()
-
-
 def test_the_map_loads_tiles_and_zooms(folder: Path) -> None:
-    with opened(folder, viewport={"width": 1280, "height": 900}) as (page, _):
+    with opened_page(folder) as (page, _):
         assert "token" not in page.url
         first = int(page.locator(MAP).get_attribute("data-level"))
         shown = all_loaded(page, first)
@@ -98,7 +79,7 @@ def test_the_map_loads_tiles_and_zooms(folder: Path) -> None:
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (400, "light"), (1280, "dark")])
 def test_every_tab_is_accessible(folder: Path, width: int, scheme: str) -> None:
     size = {"width": width, "height": 900}
-    with opened(folder, viewport=size, color_scheme=scheme) as (page, _):
+    with opened_page(folder, viewport=size, color_scheme=scheme) as (page, _):
         names = page.locator("#tabs [role=tab]").all_inner_texts()
         for name in names:
             page.get_by_role("tab", name=name, exact=True).click()
