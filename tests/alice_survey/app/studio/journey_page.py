@@ -33,7 +33,8 @@ def opened_page(folder: Path, tab: str = "", **options: Any) -> Iterator[tuple[A
         page = browser.new_page(**{"viewport": WIDE, "reduced_motion": "reduce"} | options)
         heard = Heard()
         heard.listen(page)
-        page.add_init_script(FOLDED)
+        if tab:  # else the list of layers is looked at
+            page.add_init_script(FOLDED)
         page.goto(server.address + tab)
         page.wait_for_selector("body[data-ready]", timeout=60_000)
         yield page, heard
