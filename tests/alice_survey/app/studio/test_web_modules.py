@@ -33,51 +33,46 @@ def run(folder: Path, module: str, expression: str, **values: Any) -> Any:
     return run_modules(WEB, folder, "\n".join(lines))
 
 
-def test_rings_move_alone_or_with_their_holes(tmp_path: Path) -> None:
-    moved, hole, way = run(
-        tmp_path, "plan_shapes",
-        "[m.moveRing(s, outer, 1, 2), m.moveRing(s, hole, 1, 2), m.moveRing(s, way, -1, 0.5)]",
-        s=SHAPES, outer=OUTER, hole=HOLE, way=WAY,
-    )  # fmt: skip
-    assert moved["survey"][0]["outer"][2] == [11, 10]
-    assert moved["survey"][0]["holes"][0][0] == [3, 4]
-    assert hole["survey"][0] == {
-        "outer": SQUARE["outer"],
-        "holes": [[[3, 4], [5, 4], [5, 6], [3, 6]]],
-    }
-    assert way["corridors"] == [[[-1, 0.5], [2, 4.5], [2, 10.5]]]
-    assert moved["corridors"] == [LINE]
-
-
-def test_vertices_come_and_go_and_the_last_take_their_ring(tmp_path: Path) -> None:
-    more, fewer, no_hole, nothing, no_way = run(
+def test_rings_move_and_vertices_come_and_go(tmp_path: Path) -> None:
+    """Rings move alone or with their holes; the last vertices take their ring with them."""
+    moved, hole, way, more, fewer, no_hole, nothing, no_way = run(
         tmp_path, "plan_shapes",
         """(() => {
           const more = m.insertVertex(s, outer, 3);
           const hole3 = m.removeVertex(s, hole, 0);
           const way2 = m.removeVertex(s, way, 1);
-          return [more, m.removeVertex(more, outer, 4), m.removeVertex(hole3, hole, 0),
-                  m.removeRing(s, outer), m.removeVertex(way2, way, 0)];
+          return [m.moveRing(s, outer, 1, 2), m.moveRing(s, hole, 1, 2),
+                  m.moveRing(s, way, -1, 0.5), more, m.removeVertex(more, outer, 4),
+                  m.removeVertex(hole3, hole, 0), m.removeRing(s, outer),
+                  m.removeVertex(way2, way, 0)];
         })()""",
         s=SHAPES, outer=OUTER, hole=HOLE, way=WAY,
     )  # fmt: skip
+    further = [[3, 4], [5, 4], [5, 6], [3, 6]]
+    assert moved["survey"][0]["outer"][2] == [11, 10]
+    assert moved["survey"][0]["holes"] == [further] and moved["corridors"] == [LINE]
+    assert hole["survey"][0] == {"outer": SQUARE["outer"], "holes": [further]}
+    assert way["corridors"] == [[[-1, 0.5], [2, 4.5], [2, 10.5]]]
     assert more["survey"][0]["outer"] == [*SQUARE["outer"], [0, 4]]
-    assert fewer == SHAPES
+    assert fewer == SHAPES and nothing == {**SHAPES, "survey": []}
     assert no_hole["survey"] == [{"outer": SQUARE["outer"], "holes": []}]
-    assert nothing == {**SHAPES, "survey": []}
     assert no_way["corridors"] == []
 
 
-def test_areas_agree_with_shapely_and_lengths_add_up(tmp_path: Path) -> None:
+def test_areas_agree_with_shapely_and_files_replace_what_is_of_their_kind(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     angles = np.sort(rng.uniform(0, 2 * np.pi, 11))
     star = rng.uniform(2, 9, 11)[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
-    area, size = run(
-        tmp_path, "plan_shapes", "[m.areaOf(p), m.sizeOf(s, way)]", p=star.tolist(), s=SHAPES,
-        way=WAY,
+    imported = {"survey": [], "no_go": [SQUARE], "corridors": [LINE]}
+    area, size, zones, kept = run(
+        tmp_path, "plan_shapes",
+        "[m.areaOf(p), m.sizeOf(s, way), m.withImported(s, i), m.withImported(s, {allowed: [a]})]",
+        p=star.tolist(), s=SHAPES, way=WAY, i=imported, a=SQUARE,
     )  # fmt: skip
     assert area == pytest.approx(Polygon(star).area, rel=1e-12)
     assert "11.0 m" in size
+    assert zones == {"survey": [], "no_go": [SQUARE], "allowed": [], "corridors": [LINE]}
+    assert kept == {**SHAPES, "allowed": [SQUARE]}
 
 
 def test_the_station_at_a_place_is_the_nearest(tmp_path: Path) -> None:
@@ -100,17 +95,6 @@ def test_the_station_at_a_place_is_the_nearest(tmp_path: Path) -> None:
         else:
             assert place[tuple(one)] == pytest.approx(place.min(), abs=1e-2)
     assert 10 < sum(one is None for one in found) < 50
-
-
-def test_what_a_file_has_replaces_what_is_of_its_kind(tmp_path: Path) -> None:
-    imported = {"survey": [], "no_go": [SQUARE], "corridors": [LINE]}
-    zones, kept = run(
-        tmp_path, "plan_shapes",
-        "[m.withImported(s, imported), m.withImported(s, {allowed: [a]})]",
-        s=SHAPES, imported=imported, a=SQUARE,
-    )  # fmt: skip
-    assert zones == {"survey": [], "no_go": [SQUARE], "allowed": [], "corridors": [LINE]}
-    assert kept == {**SHAPES, "allowed": [SQUARE]}
 
 
 edits = st.lists(
