@@ -37,12 +37,6 @@ class CornerNoise:
     place_sigmas_m: tuple[float, float]
     """Sigmas of the places of corners on the target, along each axis of its plane and across."""
 
-    @property
-    def together_share(self) -> float:
-        """Share of the variance in a picture that goes together."""
-        total = self.alone + float(self.together.sum())
-        return float(self.together.sum()) / total
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ErrorBudget:

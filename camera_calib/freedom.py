@@ -288,14 +288,10 @@ class Prior:
         twice = set(self.parameters) & set(other.parameters)
         if twice:
             raise CalibrationError(f"prior: two are given for {', '.join(sorted(twice))}")
-        first, second = len(self.parameters), len(other.parameters)
-        covariance = np.zeros((first + second, first + second))
-        covariance[:first, :first] = self.covariance
-        covariance[first:, first:] = other.covariance
         return Prior(
             parameters=(*self.parameters, *other.parameters),
             mean=np.concatenate([self.mean, other.mean]),
-            covariance=covariance,
+            covariance=block_diag(self.covariance, other.covariance),
         )
 
 

@@ -83,20 +83,15 @@ def mount_line(rig: Rig) -> str:
     )
 
 
-def check_mount(mount: str) -> None:
-    """Check words or a file before work starts.
+def mount_pose(mount: str) -> tuple[RigidTransform, bool]:
+    """The pose of the reference camera that words or a file state, and whether it has a place.
 
     Raises:
         CalibrationError: they state no mount.
     """
-    if _is_file(mount):
-        _mount_of_file(Path(mount))
-    else:
-        mount_rotation(mount)
-
-
-def _is_file(mount: str) -> bool:
-    return Path(mount).suffix == ".json" or Path(mount).is_file()
+    if Path(mount).suffix == ".json" or Path(mount).is_file():
+        return _mount_of_file(Path(mount)), True
+    return RigidTransform.from_rotation(mount_rotation(mount)), False
 
 
 def with_mount(rig: Rig, mount: str, lever_m: tuple[float, float, float] | None) -> Rig:
@@ -113,14 +108,11 @@ def with_mount(rig: Rig, mount: str, lever_m: tuple[float, float, float] | None)
     Raises:
         CalibrationError: the words or the file state no mount.
     """
-    if _is_file(mount):
-        pose = _mount_of_file(Path(mount))
-    else:
-        pose = RigidTransform.from_rotation(mount_rotation(mount))
-        lever_m = lever_m or (0.0, 0.0, 0.0)
-    if lever_m is not None:
+    pose, is_placed = mount_pose(mount)
+    if lever_m is not None or not is_placed:
         glass = pose.rotation.apply(rig.cameras[rig.reference].front_cam)
-        pose = RigidTransform.from_components(np.array(lever_m) - glass, pose.rotation)
+        place = np.array(lever_m or (0.0, 0.0, 0.0))
+        pose = RigidTransform.from_components(place - glass, pose.rotation)
     return replace(rig, body_from_rig=pose)
 
 

@@ -1,11 +1,12 @@
 """Picture files: checked before they are decoded, and decoded within bounds."""
 
+import contextlib
 import re
 import struct
 import warnings
 import zlib
 from collections.abc import Sequence
-from datetime import datetime, timedelta, timezone
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -162,11 +163,9 @@ def exif_time(exif: Any) -> datetime | None:
     digits = re.match(r"\d+", str(details.get(_SUBSECOND, "")))
     if digits:
         time += timedelta(seconds=float(f"0.{digits[0]}"))
-    zone = re.fullmatch(r"([+-])(\d\d):(\d\d)", str(details.get(_OFFSET, "")).strip("\0 "))
-    if zone:
-        shift = timedelta(hours=int(zone[2]), minutes=int(zone[3]))
-        if shift < timedelta(hours=24):
-            time = time.replace(tzinfo=timezone(-shift if zone[1] == "-" else shift))
+    with contextlib.suppress(ValueError):
+        zone = datetime.strptime(str(details.get(_OFFSET, "")).strip("\0 "), "%z")
+        time = time.replace(tzinfo=zone.tzinfo)
     return time
 
 

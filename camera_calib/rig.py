@@ -52,9 +52,10 @@ class Covariance:
         """Standard deviations by name."""
         return dict(zip(self.parameters, np.sqrt(np.diag(self.matrix)).tolist(), strict=True))
 
-    def without(self, field: str) -> "Covariance":
-        """Covariance without one parameter of every camera: it is marginalised."""
-        return self.marginal(n for n in self.parameters if not n.endswith(f".{field}"))
+    def without(self, *fields: str) -> "Covariance | None":
+        """Covariance without some parameters of every camera, marginalised; None of no others."""
+        kept = [n for n in self.parameters if n.rpartition(".")[2] not in fields]
+        return self.marginal(kept) if kept else None
 
     def marginal(self, names: Iterable[str]) -> "Covariance":
         """Covariance of some of the parameters alone."""
@@ -179,11 +180,6 @@ def design_rig(camera: CameraConfig, water: WaterConfig, scale: int = 1) -> Rig:
         body_from_rig=RigidTransform.from_components(pupil, BODY_FROM_NADIR_CAM),
         source="design values",
     )
-
-
-def port_settings(camera: Camera) -> dict[str, Any]:
-    """The settings of `CameraConfig` that design the port of a camera."""
-    return {"lens": camera.lens.model, "port": camera.port.shape, **camera.port.settings}
 
 
 def write_rig(path: str | Path, rig: Rig) -> None:

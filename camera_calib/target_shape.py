@@ -16,7 +16,7 @@ import numpy as np
 from numpy.polynomial import legendre
 
 from alice_survey.core.frames import Array
-from camera_calib.freedom import NO_PRIOR, Prior
+from camera_calib.freedom import Prior
 
 OWNER = "target"
 """Stands in the place of a camera in the names of a target's parameters."""
@@ -50,13 +50,8 @@ class TargetShape:
     @cached_property
     def prior(self) -> Prior:
         """The modes' distribution before any view is seen."""
-        if not self.parameters:
-            return NO_PRIOR
-        return Prior(
-            parameters=self.parameters,
-            mean=np.zeros(len(self.parameters)),
-            covariance=np.diag(self.prior_sigmas**2),
-        )
+        mean, covariance = np.zeros(len(self.parameters)), np.diag(self.prior_sigmas**2)
+        return Prior(parameters=self.parameters, mean=mean, covariance=covariance)
 
     @property
     def offsets_m(self) -> Array:

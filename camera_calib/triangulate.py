@@ -48,10 +48,6 @@ class Triangulation:
     """(N, 3, 3) covariances from the noise of the pixels alone, m^2."""
     residuals_px: Array
     """(C, N, 2) projected minus measured; NaN where a camera does not see the point."""
-    nearest_world: Array
-    """(N, 3) the points nearest to all rays in water: where the search began."""
-    nearest_residuals_px: Array
-    """(C, N, 2) residuals of these points; NaN also where one is not in the water."""
 
     @property
     def sigmas_m(self) -> Array:
@@ -105,7 +101,7 @@ def triangulate(
         )
     if not np.all(np.isfinite(sigmas) & (sigmas > 0)):
         raise CalibrationError(f"triangulation: sigma_px {sigmas.tolist()} must be positive")
-    origins, directions = _rays_world(cameras, cam_from_world, measured)
+    origins, directions = rays_world(cameras, cam_from_world, measured)
     nearest = nearest_to_rays(origins, directions)
     # Weights relative to the best camera keep the search's own threshold in pixels.
     best = float(sigmas.min())
@@ -114,8 +110,6 @@ def triangulate(
         points_world=points,
         covariance=covariance * best**2,
         residuals_px=reproject(cameras, cam_from_world, points) - measured,
-        nearest_world=nearest,
-        nearest_residuals_px=reproject(cameras, cam_from_world, nearest) - measured,
     )
 
 
@@ -152,9 +146,10 @@ def nearest_to_rays(origins: Array, directions: Array) -> Array:
     return points
 
 
-def _rays_world(
+def rays_world(
     cameras: Sequence[Camera], cam_from_world: Sequence[RigidTransform], pixels: Array
 ) -> tuple[Array, Array]:
+    """Where rays in water leave the ports, and their unit directions, (C, N, 3) in the world."""
     origins, directions = np.empty((2, *pixels.shape[:2], 3))
     for i, (camera, pose) in enumerate(zip(cameras, cam_from_world, strict=True)):
         points_cam, directions_cam = camera.unproject(pixels[i])

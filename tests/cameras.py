@@ -20,6 +20,13 @@ def flat_port_camera(*, width_px: int, height_px: int, **values: Any) -> Camera:
     )
 
 
+MANTA = flat_port_camera(
+    width_px=3384, height_px=2710, fx_px=3388.0, fy_px=3388.0, cx_px=1692.0, cy_px=1355.0,
+    port_distance_m=0.02, glass_thickness_m=0.01,
+)  # fmt: skip
+"""The camera of the project's design, behind its port."""
+
+
 def changed(camera: Camera, **values: Any) -> Camera:
     """The camera with fields of its size, its lens or its port set to other values."""
     size, lens, port = (
@@ -51,4 +58,14 @@ def rig_of(
         cam_from_rig={name: pose.inv() for name, pose in poses.items()},
         body_from_rig=body_from_rig,
         source="truth",
+    )
+
+
+def pair_of(left: Camera, right: Camera, right_from_left: RigidTransform) -> Rig:
+    """A stereo rig."""
+    return Rig(
+        cameras={"left": left, "right": right},
+        cam_from_rig={"left": RigidTransform.identity(), "right": right_from_left},
+        body_from_rig=RigidTransform.identity(),
+        source="a test",
     )

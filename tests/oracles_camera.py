@@ -1,7 +1,7 @@
 """Slow, obvious twins of the flat-port camera, written apart from it."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import cv2
 import numpy as np
@@ -20,13 +20,8 @@ def lens_pixel(camera: Camera, ray_air: Array) -> Array:
     """Pixel of a ray in air, by OpenCV."""
     matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]])
     distortion = np.array([camera.parameter(name) for name in COEFFICIENTS])
-    pixels, _ = cv2.projectPoints(
-        np.asarray(ray_air, dtype=np.float64).reshape(1, 1, 3),
-        np.zeros(3),
-        np.zeros(3),
-        matrix,
-        distortion,
-    )
+    ray = np.asarray(ray_air, dtype=np.float64).reshape(1, 1, 3)
+    pixels, _ = cv2.projectPoints(ray, np.zeros(3), np.zeros(3), matrix, distortion)
     return np.asarray(pixels, dtype=np.float64).reshape(2)
 
 
@@ -41,15 +36,14 @@ def project_by_bisection(camera: Camera, point_cam: Array) -> Array:
     radius = math.hypot(x, y)
     water_m = z - camera.parameter("port_distance_m") - camera.parameter("glass_thickness_m")
 
+    layers = (
+        (camera.parameter("port_distance_m"), 1.0),
+        (camera.parameter("glass_thickness_m"), camera.parameter("n_glass")),
+        (water_m, camera.n_water),
+    )
+
     def reaches(angle: float) -> float:
-        in_glass = math.asin(math.sin(angle) / camera.parameter("n_glass"))
-        in_water = math.asin(math.sin(angle) / camera.n_water)
-        return (
-            camera.parameter("port_distance_m") * math.tan(angle)
-            + camera.parameter("glass_thickness_m") * math.tan(in_glass)
-            + water_m * math.tan(in_water)
-            - radius
-        )
+        return sum(m * math.tan(math.asin(math.sin(angle) / n)) for m, n in layers) - radius
 
     angle = bisect(reaches, 0.0, math.pi / 2 - 1e-12, xtol=1e-15, rtol=1e-15, maxiter=200)
     ray = np.array([0.0, 0.0, 1.0])
@@ -98,18 +92,9 @@ def project_by_shortest_path(camera: Camera, point_cam: Array) -> Array:
             total += n * m.T @ ((np.eye(3) - np.outer(unit, unit)) / length) @ m
         return total
 
-    along = float(np.asarray(point_cam) @ normal)
-    sideways = np.asarray(point_cam) @ axes
-    start = np.concatenate(
-        [
-            sideways * (camera.parameter("port_distance_m") / along),
-            sideways
-            * (
-                (camera.parameter("port_distance_m") + camera.parameter("glass_thickness_m"))
-                / along
-            ),
-        ]
-    )
+    near, far = (float(surface @ normal) for surface in (inner, outer))
+    sideways = (np.asarray(point_cam) @ axes) / float(np.asarray(point_cam) @ normal)
+    start = np.concatenate([near * sideways, far * sideways])
     found = minimize(
         path, start, jac=gradient, hess=hessian, method="trust-exact", options={"gtol": 1e-9}
     ).x
@@ -123,3 +108,19 @@ def numeric_slope(at: Callable[..., Array], step: float) -> Array:
     weights = {1: 45.0, 2: -9.0, 3: 1.0}
     total = sum(w * (at(i * step) - at(-i * step)) for i, w in weights.items())
     return np.asarray(total / (60.0 * step))
+
+
+def assert_slopes(camera: Camera, points: Array, steps: Mapping[str, float]) -> None:
+    """Analytic slopes are those of `project`, by the point and by each parameter."""
+    pixels, by_point, by_parameter = camera.project_jacobian(points)
+    np.testing.assert_allclose(pixels, camera.project(points), atol=1e-9)
+    for axis in range(3):
+        moved = numeric_slope(lambda h, a=axis: camera.project(points + h * np.eye(3)[a]), 1e-3)
+        np.testing.assert_allclose(by_point[..., axis], moved, rtol=1e-6, atol=2e-4)
+    for i, name in enumerate(camera.parameters):
+        value, step = camera.parameter(name), steps.get(name, 1e-4)
+        moved = numeric_slope(
+            lambda h, n=name, v=value: camera.with_parameters({n: v + h}).project(points), step
+        )
+        scale = 1e-8 * max(1.0, float(np.abs(moved).max())) + 1e-9 / step
+        np.testing.assert_allclose(by_parameter[..., i], moved, rtol=1e-6, atol=scale, err_msg=name)

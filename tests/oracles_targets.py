@@ -8,7 +8,6 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import erf
 
-from alice_survey.core.compiled import compiled_ieee
 from camera_calib.camera import Camera
 from camera_calib.targets.pattern import black_rectangles
 from camera_calib.targets.target import Target
@@ -112,14 +111,12 @@ def picture_light(
     # Samples are strewn, or an edge along the pixels would be rounded to a sample's width.
     rng = np.random.default_rng(0)
     first = np.argwhere(mixed)[:, ::-1]
-    nine = 0.5 * np.stack(np.meshgrid(np.arange(3), np.arange(3)), axis=-1).reshape(-1, 2)
+    strata = np.stack(np.meshgrid(np.arange(fine), np.arange(fine)), axis=-1).reshape(-1, 2)
     for start in range(0, len(first), 20_000):
         part = first[start : start + 20_000]
-        samples = rng.uniform(0, 1, (len(part), fine * fine, 2))
-        nodes = part[:, None] + nine
-        if warp is not None:
-            nodes = warp(nodes.reshape(-1, 2)).reshape(nodes.shape)
-        light[part[:, 1], part[:, 0]] = _mean_light(nodes, samples, back, grid_x, grid_y, shade)
+        strewn = rng.uniform(0, 1, (len(part), fine * fine, 2))
+        column, row = cells(part[:, None] + (strata + strewn) / fine)
+        light[part[:, 1], part[:, 0]] = shade[row, column].mean(axis=1)
     return cv2.GaussianBlur(light, (0, 0), blur_px) if blur_px > 0 else light
 
 
@@ -135,51 +132,6 @@ def light_through(
         return start[:, :2] - start[:, 2:] / ways[:, 2:] * ways[:, :2]
 
     return picture_light(target, np.eye(3), (camera.width_px, camera.height_px), fine, warp=hits)
-
-
-@compiled_ieee
-def _mean_light(
-    nodes: np.ndarray,
-    samples: np.ndarray,
-    back: np.ndarray,
-    grid_x: np.ndarray,
-    grid_y: np.ndarray,
-    shade: np.ndarray,
-) -> np.ndarray:
-    """Mean light of the samples of each pixel.
-
-    Args:
-        nodes: (P, 9, 2) where three by three places of each pixel, its corners among them, are by
-            the homography; a parabola through them is a lens to 1e-6 of a pixel up to 85 degrees.
-        samples: (P, S * S, 2) places in the S by S parts of each pixel, row by row, 0 to 1.
-        back: (3, 3) homography to the board.
-        grid_x: (A,) columns, sorted.
-        grid_y: (B,) rows, sorted.
-        shade: (B + 1, A + 1) light between them.
-    """
-    fine = round(samples.shape[1] ** 0.5)
-    mean = np.zeros(len(nodes))
-    weights = np.empty((2, 3))
-    for p in range(len(nodes)):
-        for k in range(samples.shape[1]):
-            for axis in range(2):
-                t = ((k % fine if axis == 0 else k // fine) + samples[p, k, axis]) / fine
-                weights[axis, 0] = 2 * (t - 0.5) * (t - 1)
-                weights[axis, 1] = 4 * t * (1 - t)
-                weights[axis, 2] = 2 * t * (t - 0.5)
-            x = y = 0.0
-            for n in range(9):
-                weight = weights[1, n // 3] * weights[0, n % 3]
-                x += weight * nodes[p, n, 0]
-                y += weight * nodes[p, n, 1]
-            away = back[2, 0] * x + back[2, 1] * y + back[2, 2]
-            column, row = len(grid_x), len(grid_y)
-            if away * back[2, 2] > 0:
-                u = (back[0, 0] * x + back[0, 1] * y + back[0, 2]) / away
-                v = (back[1, 0] * x + back[1, 1] * y + back[1, 2]) / away
-                column, row = np.searchsorted(grid_x, u), np.searchsorted(grid_y, v)
-            mean[p] += shade[row, column] / samples.shape[1]
-    return mean
 
 
 def _merged(edges: np.ndarray) -> np.ndarray:

@@ -20,6 +20,8 @@ from camera_calib.ports.none import NO_PORT
 from camera_calib.ports.values import PortValues
 from camera_calib.rig import Covariance, Rig
 
+DATA = Path(__file__).parent / "data" / "calibrations"
+"""Calibrations as other tools write them."""
 RNG = np.random.default_rng(11)
 POINTS_RIG = RNG.uniform([-0.5, -0.4, 1.5], [0.5, 0.4, 3.0], (40, 3))
 """Points that every camera of `rigs` sees, metres."""
@@ -145,6 +147,13 @@ def opencv_pixels(points: Array, rvec: Array, tvec: Array, k: Array, d: Array) -
     project = cv2.fisheye.projectPoints if d.size == 4 else cv2.projectPoints
     seen, _ = project(np.ascontiguousarray(points)[:, None], rvec, tvec, k, d)
     return np.asarray(seen).reshape(-1, 2)
+
+
+def assert_same_pixels(ours: Array, theirs: Array, least: int = 1) -> None:
+    """Another tool sees points where we do, as far as we see them."""
+    known = np.isfinite(ours[:, 0])
+    assert known.sum() >= least
+    np.testing.assert_allclose(theirs[known], ours[known], atol=1e-8, rtol=0)
 
 
 def assert_same_geometry(after: Rig, before: Rig, *, pixels: float = 1e-9) -> None:

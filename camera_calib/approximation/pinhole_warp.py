@@ -8,7 +8,7 @@ leaves at other depths is `f s (1/z - 1/z0)`, exactly. The best centre makes the
 are zero where a camera has one centre: without a port, or behind a dome centred on the pupil.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -18,6 +18,7 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import Array
 from camera_calib.camera import Camera, camera_from_json
+from camera_calib.lenses.values import FOCAL_AND_CENTRE
 
 _GRID = 15
 """Rays along each side of the frame."""
@@ -77,15 +78,9 @@ class Pinhole:
 
     def resize(self, width_px: int, height_px: int) -> "Pinhole":
         """The same view in a picture of another size."""
-        sx, sy = width_px / self.width_px, height_px / self.height_px
-        return Pinhole(
-            width_px=width_px,
-            height_px=height_px,
-            fx_px=self.fx_px * sx,
-            fy_px=self.fy_px * sy,
-            cx_px=self.cx_px * sx,
-            cy_px=self.cy_px * sy,
-        )
+        growth = np.tile([width_px / self.width_px, height_px / self.height_px], 2)
+        numbers = zip(FOCAL_AND_CENTRE, (self.numbers * growth).tolist(), strict=True)
+        return Pinhole(width_px=width_px, height_px=height_px, **dict(numbers))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,18 +217,13 @@ def best_warp(
     centre = np.linalg.lstsq(rows.reshape(-1, 3), offset.ravel(), rcond=None)[0]
     x_m, y_m, z_m = (float(one) for one in centre)
     focal = camera.focal_in_water_px
-    one = PinholeWarp(
+    warp = PinholeWarp(
         camera=camera,
         pinhole=Pinhole(width_px=1, height_px=1, fx_px=focal, fy_px=focal, cx_px=0.0, cy_px=0.0),
         centre_m=(x_m, y_m, z_m),
         working_range_m=working,
     )
-    return PinholeWarp(
-        camera=camera,
-        pinhole=_fitted_to_frame(one),
-        centre_m=one.centre_m,
-        working_range_m=working,
-    )
+    return replace(warp, pinhole=_fitted_to_frame(warp))
 
 
 def residual_px(warp: PinholeWarp, depths_m: Array) -> Array:
@@ -273,11 +263,5 @@ def _fitted_to_frame(warp: PinholeWarp) -> Pinhole:
     low = np.maximum(edge.min(axis=0), at - _MAX_GROWTH * middle)
     high = np.minimum(edge.max(axis=0), at + _MAX_GROWTH * middle)
     width, height = np.ceil(high - low - 1e-6).astype(int).tolist()
-    return Pinhole(
-        width_px=width,
-        height_px=height,
-        fx_px=warp.pinhole.fx_px,
-        fy_px=warp.pinhole.fy_px,
-        cx_px=float(-low[0]),
-        cy_px=float(-low[1]),
-    )
+    centre = {"cx_px": float(-low[0]), "cy_px": float(-low[1])}
+    return replace(warp.pinhole, width_px=width, height_px=height, **centre)

@@ -12,7 +12,7 @@ from alice_survey.core.executor import Executor
 from camera_calib.calibrate.picture_sets import PictureSet
 from camera_calib.calibration import TargetView
 from camera_calib.picture_files import is_cut_short, read_pixels
-from camera_calib.targets.detect import Detection, as_grey, chessboard_size, detect_with_reasons
+from camera_calib.targets.detect import Detection, as_grey, chessboard_size, detect
 from camera_calib.targets.target import Rejection, Target
 
 _CHECKED = 3
@@ -34,7 +34,8 @@ class Detections:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Seen:
-    size: Size | None
+    path: Path
+    size: Size | None = None
     """None where the picture cannot be decoded."""
     detection: Detection
     board: Size | None = None
@@ -58,25 +59,22 @@ def detect_views(sets: Sequence[PictureSet], target: Target, executor: Executor)
         for path in one.paths.values()
     ]
     found = iter(list(executor.map(_look, jobs, label="target points")))
-    seen = {(one.name, camera): next(found) for one in sets for camera in one.paths}
-    paths = {(one.name, camera): path for one in sets for camera, path in one.paths.items()}
-    cameras = list(dict.fromkeys(camera for one in sets for camera in one.paths))
+    seen = [(one.name, {camera: next(found) for camera in one.paths}) for one in sets]
+    by_camera: dict[str, list[_Seen]] = {}
     rejections: list[Rejection] = []
-    for (view, camera), what in seen.items():
-        rejections += what.detection.rejections(view, camera)
-    _check_board(target, list(seen.values()))
-    sizes = {camera: _one_size(camera, seen, paths) for camera in cameras}
-    for camera in cameras:
-        _check_found(camera, target, [s for (_, c), s in seen.items() if c == camera])
     views = []
-    for one in sets:
-        pixels = {}
-        for camera in one.paths:
-            points = seen[one.name, camera].detection.pixels
-            if points is not None:
-                pixels[camera] = points
+    for view, pictures in seen:
+        for camera, what in pictures.items():
+            by_camera.setdefault(camera, []).append(what)
+            rejections += what.detection.rejections(view, camera)
+        points = {camera: what.detection.pixels for camera, what in pictures.items()}
+        pixels = {camera: known for camera, known in points.items() if known is not None}
         if pixels:
-            views.append(TargetView(name=one.name, pixels=pixels))
+            views.append(TargetView(name=view, pixels=pixels))
+    _check_board(target, [what for mine in by_camera.values() for what in mine])
+    sizes = {camera: _one_size(camera, mine) for camera, mine in by_camera.items()}
+    for camera, mine in by_camera.items():
+        _check_found(camera, target, mine)
     return Detections(views=tuple(views), sizes=sizes, rejections=tuple(rejections))
 
 
@@ -87,34 +85,30 @@ def _measured_numbers(count: int) -> set[int]:
 
 def _look(job: tuple[Path, Target, bool]) -> _Seen:
     path, target, check = job
-    if is_cut_short(path):
-        return _Seen(size=None, detection=Detection(pixels=None, refused="the file is cut short"))
-    picture = read_pixels(path, _READ)
+    picture = None if is_cut_short(path) else read_pixels(path, _READ)
     if picture is None:
-        reason = f"{path.name} cannot be decoded as a picture"
-        return _Seen(size=None, detection=Detection(pixels=None, refused=reason))
+        why = "is cut short" if is_cut_short(path) else "cannot be decoded as a picture"
+        return _Seen(path=path, detection=Detection(pixels=None, refused=f"{path.name} {why}"))
     height, width = map(int, picture.shape[:2])
     try:
-        detection = detect_with_reasons(target, picture)
+        detection = detect(target, picture)
     except CalibrationError as error:
         detection = Detection(pixels=None, refused=str(error))
     board = None
     if check and target.kind == "chessboard" and detection.pixels is not None:
         board = chessboard_size(as_grey(picture))
-    return _Seen(size=(width, height), detection=detection, board=board)
+    return _Seen(path=path, size=(width, height), detection=detection, board=board)
 
 
-def _one_size(
-    camera: str, seen: Mapping[tuple[str, str], _Seen], paths: Mapping[tuple[str, str], Path]
-) -> Size:
-    sizes = {key: what.size for key, what in seen.items() if key[1] == camera and what.size}
-    if not sizes:
-        first = next(what.detection.refused for key, what in seen.items() if key[1] == camera)
-        raise CalibrationError(f"none of the pictures of {camera} can be read: {first}")
-    counts = Counter(sizes.values()).most_common()
+def _one_size(camera: str, seen: Sequence[_Seen]) -> Size:
+    counts = Counter(what.size for what in seen if what.size is not None).most_common()
+    if not counts:
+        raise CalibrationError(
+            f"none of the pictures of {camera} can be read: {seen[0].detection.refused}"
+        )
     if len(counts) > 1:
         (common, many), (other, few) = counts[:2]
-        odd = next(paths[key].name for key, size in sizes.items() if size == other)
+        odd = next(what.path.name for what in seen if what.size == other)
         raise CalibrationError(
             f"pictures of {camera} differ in size: {many} of {common[0]} x {common[1]} px, {few} "
             f"of {other[0]} x {other[1]} px (such as {odd}): give those of one size"

@@ -1,4 +1,4 @@
-"""Calibrate from pictures of a target: `alice-survey calibrate --left ... --right ...`.
+"""Calibrate from pictures of a target: `alice-survey calibrate --left ... --right ...`, or pool.
 
 A flat port makes focal lengths the water's index times longer than in air, a dome about its pupil
 leaves them as they are. Where both calibrations exist, their ratio shows a wrong housing at once.
@@ -10,6 +10,7 @@ import contextlib
 import math
 import shlex
 import shutil
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,14 +19,23 @@ from typing import Any
 import numpy as np
 
 from alice_survey.core.artefacts import read_json
+from alice_survey.core.config import CameraConfig, WaterConfig
 from alice_survey.core.errors import AliceError, CalibrationError
 from alice_survey.core.executor import Executor, local_executor
 from alice_survey.core.frames import Array
-from camera_calib.calibrate.detect_views import Detections, detect_views
+from alice_survey.core.manifest import read_manifest
+from alice_survey.core.records import BoardRecord
+from camera_calib.calibrate.detect_views import Detections, Size, detect_views
 from camera_calib.calibrate.options import AUTO, CalibrateOptions, CalibrationTask, read_task
-from camera_calib.calibrate.picture_sets import check_own, find_pictures, pair_pictures
+from camera_calib.calibrate.picture_sets import (
+    PictureSet,
+    check_own,
+    find_pictures,
+    pair_pictures,
+)
 from camera_calib.calibrate.results import calibration_text, warn_of_unseen, write_results
 from camera_calib.calibrate.solve import (
+    Intrinsics,
     blank_camera,
     calibrate_in_air,
     calibrate_in_water_alone,
@@ -33,11 +43,12 @@ from camera_calib.calibrate.solve import (
     first_cameras,
 )
 from camera_calib.calibration import Calibration, HousingTrial, TargetView
-from camera_calib.freedom import LensNames, lens_of
+from camera_calib.freedom import USUAL_LENS, LensNames, lens_of
 from camera_calib.mount import mount_line, with_mount
 from camera_calib.optics import PORTS, likely_port
 from camera_calib.ports.flat import FlatPort
-from camera_calib.rig import Rig
+from camera_calib.rig import Rig, design_rig
+from camera_calib.targets.target import Target
 
 _MIN_FITTING = 0.5
 """Share of a camera's pictures that must fit those of the others."""
@@ -54,44 +65,38 @@ def calibrate_pictures(
     Raises:
         CalibrationError: the pictures, the target or the options do not give a calibration.
     """
-    task = read_task(options)
+    task, output = read_task(options)
     lists = {camera: find_pictures(place) for camera, place in task.places.items()}
     check_own(lists)
-    with _replacing(task.output) as partial:
+    with _replacing(output) as partial:
         found = detect_views(pair_pictures(lists), task.target, executor or local_executor())
         warn_of_unseen(found)
         # In the order of the options: the first camera is the reference.
         found = replace(found, sizes={name: found.sizes[name] for name in lists})
         calibration = calibrate_task(task, found)
-        if task.mount is not None:
-            rig = with_mount(calibration.rig, task.mount, task.lever_m)
+        if options.mount is not None:
+            rig = with_mount(calibration.rig, options.mount, options.lever_m)
             calibration = replace(calibration, rig=rig)
         write_results(partial, calibration, found)
-    _check_useful(calibration, found, task.output)
-    verdicts = read_json(task.output / "report.json")["verdicts"]
+    _check_useful(calibration, found, output)
+    verdicts = read_json(output / "report.json")["verdicts"]
     text = calibration_text(calibration, task.target, verdicts)
-    text = "\n".join([text, *_next(calibration, task)])
-    return text, read_json(task.output / "calibration.json")
+    text = "\n".join([text, *_next(calibration, task, output)])
+    return text, read_json(output / "calibration.json")
 
 
-def _next(calibration: Calibration, task: CalibrationTask) -> Iterator[str]:
+def _next(calibration: Calibration, task: CalibrationTask, output: Path) -> Iterator[str]:
     """Location of the results, and what to do with them."""
-    rig = shlex.quote(str(task.output / "rig.json"))
-    yield f"rig in {task.output / 'rig.json'}; read {task.output / 'report.html'}"
+    rig = shlex.quote(str(output / "rig.json"))
+    yield f"rig in {output / 'rig.json'}; read {output / 'report.html'}"
     yield mount_line(calibration.rig)
     if calibration.rig.body_from_rig is None:
         yield (
             f"  state it with alice-survey camera convert {rig} {rig} --mount nadir-bow-up --lever "
             "0.55 -0.05 0.08 --overwrite, or let a survey with navigation find it"
         )
-    if task.water:
-        yield f"next: alice-survey camera uncertainty {rig}"
-    else:
-        cameras = " ".join(f"--camera {name}=FOLDER" for name in task.places)
-        yield (
-            f"next, behind ports, with pictures under water: alice-survey calibrate {cameras} "
-            f"--target T --water --glass MM --start {rig} -o DIR"
-        )
+    if not task.options.water:
+        yield f"next, under water through the ports: add --water --glass MM --start {rig}"
 
 
 def _check_useful(calibration: Calibration, found: Detections, output: Path) -> None:
@@ -115,18 +120,14 @@ def _check_useful(calibration: Calibration, found: Detections, output: Path) -> 
 @contextlib.contextmanager
 def _replacing(output: Path) -> Iterator[Path]:
     """A folder to write to that replaces `output` on success."""
-    partial = output.with_name(f"{output.name}.partial")
-    if partial.exists():
-        shutil.rmtree(partial)
-    partial.mkdir(parents=True)
-    try:
+    output.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=output.parent, prefix=f".{output.name}") as folder:
+        partial = Path(folder) / output.name
+        partial.mkdir()
         yield partial
         if output.exists():
             shutil.rmtree(output)
         partial.rename(output)
-    finally:
-        if partial.exists():
-            shutil.rmtree(partial)
 
 
 def calibrate_task(task: CalibrationTask, found: Detections) -> Calibration:
@@ -140,7 +141,7 @@ def calibrate_task(task: CalibrationTask, found: Detections) -> Calibration:
         CalibrationError: the views do not determine it, or are not of the start's cameras.
     """
     _check_sizes(task, found)
-    if not task.water:
+    if not task.options.water:
         cameras = task.cameras(found.sizes)
         start = None if task.start is None else replace(task.start, cameras=cameras)
         points = task.target.points
@@ -237,3 +238,54 @@ def _other_housing(ratios: Mapping[str, float], kinds: Mapping[str, str]) -> str
                 f"says --port {likely}"
             )
     return ""
+
+
+def run_calibrate(
+    workspace: Path, folder: Path, executor: Executor, *, camera: CameraConfig, water: WaterConfig
+) -> None:
+    """Calibrate the rig from `pool/`.
+
+    Intrinsics, ports (with their normals) and the pose of the right camera are found together,
+    from the design, or from the pictures in air where there are some.
+
+    Raises:
+        CalibrationError: too few usable views.
+    """
+    pool = workspace / "pool"
+    board = BoardRecord.read(pool / "board.json")
+    target = Target(
+        kind="chessboard", columns=board.columns, rows=board.rows, size_m=board.square_m
+    )
+    found = detect_views(_pool_pictures(pool), target, executor)
+    warn_of_unseen(found)
+    start = design_rig(camera, water, _scale(found.sizes["left"], camera))
+    lens = USUAL_LENS[camera.lens]
+    known: Intrinsics = "free"
+    if (pool / "air").is_dir():
+        seen = detect_views(_pool_pictures(pool / "air"), target, executor)
+        dry = calibrate_in_air(seen.views, target.points, seen.sizes, lens).rig
+        cameras = {
+            name: replace(one, port=start.cameras[name].port) for name, one in dry.cameras.items()
+        }
+        start, known = replace(dry, cameras=cameras, body_from_rig=start.body_from_rig), "prior"
+    calibration = calibrate_through_ports(found.views, target.points, start, known, lens)
+    write_results(folder, calibration, found)
+
+
+def _pool_pictures(pool: Path) -> list[PictureSet]:
+    stations: dict[int, dict[str, Path]] = {}
+    for record in read_manifest(pool / "manifest.csv"):
+        stations.setdefault(record.station, {})[record.camera] = pool / record.image
+    return [PictureSet(name=str(n), paths=stations[n]) for n in sorted(stations)]
+
+
+def _scale(size: Size, camera: CameraConfig) -> int:
+    """How many times larger than designed the pixels of a pool's pictures are."""
+    width, height = size
+    scale = max(round(camera.width_px / width), 1)
+    if (camera.width_px // scale, camera.height_px // scale) != (width, height):
+        raise CalibrationError(
+            f"the pool's pictures have {width} x {height} px, which is not a whole fraction of the "
+            f"camera's {camera.width_px} x {camera.height_px}: set [camera] width_px and height_px"
+        )
+    return scale

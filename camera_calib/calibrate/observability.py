@@ -8,7 +8,7 @@ an error of it moves a by -S_aa^-1 S_ab.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,9 +18,8 @@ from alice_survey.core.block_solver import inverse_of
 from alice_survey.core.frames import Array
 from camera_calib.calibrate.normal_equations import CalibrationProblem
 from camera_calib.calibration import Calibration, stack_views
-from camera_calib.camera import Camera
 from camera_calib.freedom import Freedom, of_cameras, value
-from camera_calib.rig import Covariance, Rig
+from camera_calib.rig import Rig
 
 _TAKEN_FOR_GRANTED: Mapping[str, float] = {
     "n_water": 0.001,
@@ -59,19 +58,32 @@ class HeldEffect:
     """By adjusted parameter: how far it moves for each unit of an error of the held one."""
 
 
-def unobservable(calibration: Calibration) -> tuple[str, ...]:
+def unobservable(calibration: Calibration) -> Iterator[str]:
     """A line for each held parameter whose likely error matters and that the views leave open.
 
     Args:
         calibration: through ports.
     """
-    known = {name for camera in calibration.rig.cameras.values() for name in camera.parameters}
-    lines = (
-        _line(calibration, name, error)
-        for name, error in _TAKEN_FOR_GRANTED.items()
-        if name in known
-    )
-    return tuple(line for line in lines if line)
+    rig = calibration.rig
+    known = {name for camera in rig.cameras.values() for name in camera.parameters}
+    for name, error in _TAKEN_FOR_GRANTED.items():
+        held = of_cameras(rig, [name])
+        if name not in known or set(held) & set(calibration.freedom.names(rig)):
+            continue
+        effect = held_effect(calibration, name)
+        moved = [
+            (abs(slope) * error / rig.sigmas[parameter], parameter, slope * error)
+            for parameter, slope in effect.slopes.items()
+            if parameter.split(".")[1] in _MOVED
+        ]
+        notable = sorted((m for m in moved if m[0] > _NOTABLE), reverse=True)[:_MAX_NAMED]
+        if notable and effect.sigma >= error:
+            yield (
+                f"{name} is taken as {value(rig, held[0]):g}; these views would determine it to "
+                f"{effect.sigma:.2g} only (sigma), and {error:g} more would move "
+                + ", ".join(f"{parameter} by {move:+.2g}" for _, parameter, move in notable)
+                + ": measure it apart"
+            )
 
 
 def held_effect(calibration: Calibration, name: str) -> HeldEffect:
@@ -103,46 +115,7 @@ def held_effect(calibration: Calibration, name: str) -> HeldEffect:
     )
 
 
-def _line(calibration: Calibration, name: str, error: float) -> str | None:
-    rig = calibration.rig
-    held = of_cameras(rig, [name])
-    if set(held) & set(calibration.freedom.names(rig)):
-        return None
-    if not any(_matters(camera, name) for camera in rig.cameras.values()):
-        return None
-    effect = held_effect(calibration, name)
-    if effect.sigma < error:
-        return None
-    moved = [
-        (abs(slope) * error / rig.sigmas[parameter], parameter, slope * error)
-        for parameter, slope in effect.slopes.items()
-        if parameter.split(".")[1] in _MOVED
-    ]
-    notable = sorted((m for m in moved if m[0] > _NOTABLE), reverse=True)[:_MAX_NAMED]
-    if not notable:
-        return None
-    return (
-        f"{name} is taken as {value(rig, held[0]):g}; these views would determine it to "
-        f"{effect.sigma:.2g} only (sigma), and {error:g} more would move "
-        + ", ".join(f"{parameter} by {move:+.2g}" for _, parameter, move in notable)
-        + ": measure it apart"
-    )
-
-
-def _matters(camera: Camera, name: str) -> bool:
-    """Whether light meets what the parameter describes."""
-    if name == "n_glass":
-        return camera.parameter("glass_thickness_m") > 0.0
-    if name == "glass_thickness_m":
-        return camera.parameter("n_glass") != camera.n_water
-    return True
-
-
-def advice(
-    rig: Rig,
-    measured: Array,
-    rig_from_target: RigidTransform,
-) -> tuple[str, ...]:
+def advice(rig: Rig, measured: Array, rig_from_target: RigidTransform) -> Iterator[str]:
     """Lines on what the views do not constrain, each stating which views to add.
 
     Args:
@@ -150,23 +123,19 @@ def advice(
         measured: (V, cameras, N, 2) pixels used; NaN where unseen.
         rig_from_target: (V,).
     """
-    lines = []
     views = len(measured)
     if views < FEW_VIEWS:
-        lines.append(f"only {views} views: take {FEW_VIEWS} or more, 25 is good")
+        yield f"only {views} views: take {FEW_VIEWS} or more, 25 is good"
     for c, camera in enumerate(rig.cameras):
-        lines += _coverage(camera, rig, measured[:, c].reshape(-1, 2))
-    adjusted = set() if rig.covariance is None else set(rig.covariance.parameters)
-    if any(name.split(".")[1] in _USEFUL for name in adjusted):
-        lines += _tilts(rig_from_target)
-    if any(name.endswith("port_distance_m") for name in adjusted):
-        lines += _ranges(rig_from_target)
-    if rig.covariance is not None:
-        lines += _loose(rig, rig.covariance)
-    return tuple(lines)
+        yield from _coverage(camera, rig, measured[:, c].reshape(-1, 2))
+    if any(name.split(".")[1] in _USEFUL for name in rig.sigmas):
+        yield from _tilts(rig_from_target)
+    if any(name.endswith("port_distance_m") for name in rig.sigmas):
+        yield from _ranges(rig_from_target)
+    yield from _loose(rig)
 
 
-def _coverage(camera: str, rig: Rig, pixels: Array) -> list[str]:
+def _coverage(camera: str, rig: Rig, pixels: Array) -> Iterator[str]:
     model = rig.cameras[camera]
     seen = pixels[np.isfinite(pixels).all(axis=1)]
     counts, _, _ = np.histogram2d(
@@ -174,55 +143,44 @@ def _coverage(camera: str, rig: Rig, pixels: Array) -> list[str]:
     )
     empty = [f"{_ROWS[y]} {_COLUMNS[x]}" for y in range(_CELLS[1]) for x in range(_CELLS[0])
              if counts[x, y] == 0]  # fmt: skip
-    if not empty:
-        return []
-    where = ", ".join(empty[:4]) + (", ..." if len(empty) > 4 else "")
-    return [
-        f"{camera}: no points in {len(empty)} of {counts.size} parts of the frame ({where}): "
-        "take views with the target there"
-    ]
+    if empty:
+        where = ", ".join(empty[:4]) + (", ..." if len(empty) > 4 else "")
+        yield (
+            f"{camera}: no points in {len(empty)} of {counts.size} parts of the frame ({where}): "
+            "take views with the target there"
+        )
 
 
-def _tilts(rig_from_target: RigidTransform) -> list[str]:
+def _tilts(rig_from_target: RigidTransform) -> Iterator[str]:
     normals = rig_from_target.rotation.apply([0.0, 0.0, 1.0]).reshape(-1, 3)
     lean = np.arcsin(np.clip(normals[:, :2] - normals[:, :2].mean(axis=0), -1.0, 1.0))
     spread = np.sqrt((lean**2).mean(axis=0))
-    lines = []
     for axis, tilt in (("left and right", spread[0]), ("up and down", spread[1])):
         if tilt < _MIN_TILT:
-            lines.append(
+            yield (
                 f"the target leans {axis} by only {math.degrees(tilt):.1f} deg rms: take views "
                 f"in which it faces 20 to 40 deg {axis}"
             )
-    return lines
 
 
-def _ranges(rig_from_target: RigidTransform) -> list[str]:
+def _ranges(rig_from_target: RigidTransform) -> Iterator[str]:
     depths = np.asarray(rig_from_target.translation).reshape(-1, 3)[:, 2]
     near, far = np.quantile(depths, [0.1, 0.9])
-    if far > _MIN_RANGE_RATIO * near:
-        return []
-    return [
-        f"nearly all views lie between {near:.2f} and {far:.2f} m: take some at half and some at "
-        "twice the distance, for the port"
-    ]
+    if far <= _MIN_RANGE_RATIO * near:
+        yield (
+            f"nearly all views lie between {near:.2f} and {far:.2f} m: take some at half and some "
+            "at twice the distance, for the port"
+        )
 
 
-def _loose(rig: Rig, covariance: Covariance) -> list[str]:
-    lines = []
-    for name, sigma in covariance.sigmas.items():
-        camera, field = name.split(".")
+def _loose(rig: Rig) -> Iterator[str]:
+    for name, sigma in rig.sigmas.items():
+        field = name.split(".")[1]
         if field not in _USEFUL:
             continue
         limit, unit, more = _USEFUL[field]
-        size = sigma / rig.cameras[camera].parameter(field) if unit.startswith("of") else sigma
+        size = sigma / value(rig, name) if unit.startswith("of") else sigma
         if size > limit:
-            lines.append(f"{name} is known to {size:.2g} {unit} only (sigma): take {more}")
-    for camera, model in rig.cameras.items():
-        name = f"{camera}.port_distance_m"
-        if name in covariance.parameters and model.parameter("port_distance_m") == 0.0:
-            lines.append(
-                f"{camera}.port_distance_m ended at 0, its least: hold it, or hold the intrinsics "
-                "of a calibration in air"
-            )
-    return lines
+            yield f"{name} is known to {size:.2g} {unit} only (sigma): take {more}"
+        if field == "port_distance_m" and value(rig, name) == 0.0:
+            yield f"{name} ended at 0, its least: hold it, or the intrinsics as found in air"

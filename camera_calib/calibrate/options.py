@@ -10,7 +10,7 @@ from camera_calib.calibrate.solve import Intrinsics, blank_camera
 from camera_calib.camera import Camera
 from camera_calib.freedom import LENSES, USUAL_LENS, part_of_rig
 from camera_calib.lenses.opencv import OpenCVLens
-from camera_calib.mount import MOUNTS, check_mount
+from camera_calib.mount import MOUNTS, mount_pose
 from camera_calib.optics import PORTS
 from camera_calib.picture_files import places_of_cameras
 from camera_calib.ports.flat import FlatPort
@@ -67,10 +67,10 @@ class CalibrateOptions:
 class CalibrationTask:
     """Pictures to calibrate from, and prior knowledge."""
 
+    options: CalibrateOptions
     places: Mapping[str, str]
     """Folder or pattern of pictures by camera; the first is the reference."""
     target: Target
-    output: Path
     lenses: Mapping[str, str]
     """Lens model by camera, of `freedom.LENSES`."""
     ports: Mapping[str, str]
@@ -79,21 +79,16 @@ class CalibrationTask:
     """Known parameters of the ports by camera; of those that are found, first values."""
     port_sigmas: Mapping[str, Mapping[str, float]]
     """Prior sigmas of parameters that are known and found again, by camera."""
-    water: bool = False
-    """Whether the pictures were taken under water, through the ports."""
     start: Rig | None = None
     """These cameras as calibrated in air, or earlier."""
     known: Intrinsics = "free"
     """Treatment of the start's intrinsics."""
-    target_shape: Literal["sheet", "flat"] = "sheet"
-    mount: str | None = None
-    """How the rig sits on the vehicle, as `with_mount` reads it; None: as of the start."""
-    lever_m: tuple[float, float, float] | None = None
 
     @property
     def shape(self) -> TargetShape:
         """How the target may differ from its drawing."""
-        return AS_DRAWN if self.target_shape == "flat" else usual_shape(self.target.points)
+        is_flat = self.options.target_shape == "flat"
+        return AS_DRAWN if is_flat else usual_shape(self.target.points)
 
     def cameras(self, sizes: Mapping[str, tuple[int, int]]) -> dict[str, Camera]:
         """Cameras of the start, or blank ones of pictures of some sizes, behind their ports."""
@@ -124,8 +119,8 @@ class CalibrationTask:
         }
 
 
-def read_task(options: CalibrateOptions) -> CalibrationTask:
-    """The values that options state, checked before the work starts.
+def read_task(options: CalibrateOptions) -> tuple[CalibrationTask, Path]:
+    """The values that options state, checked before the work starts, and the folder to write.
 
     Raises:
         CalibrationError: options are missing, wrong, or do not go together.
@@ -143,15 +138,11 @@ def read_task(options: CalibrateOptions) -> CalibrationTask:
         raise CalibrationError("-o is missing: the folder to write the calibration into")
     _check_output(options.output, options.start)
     start = None if options.start is None else read_rig(options.start)
-    return task_of(options, places, options.output, parse_target(options.target), start)
+    return task_of(options, places, parse_target(options.target), start), options.output
 
 
 def task_of(
-    options: CalibrateOptions,
-    places: Mapping[str, str],
-    output: Path,
-    target: Target,
-    start: Rig | None,
+    options: CalibrateOptions, places: Mapping[str, str], target: Target, start: Rig | None
 ) -> CalibrationTask:
     """As `read_task`, of what options name.
 
@@ -172,14 +163,13 @@ def task_of(
     ports = _ports(options, places, start)
     _check_ports(ports, values, start)
     if options.mount is not None:
-        check_mount(options.mount)
+        mount_pose(options.mount)
     elif options.lever_m is not None:
         raise CalibrationError(f"--lever goes with --mount: {MOUNTS}, or a file")
     return CalibrationTask(
-        places=places, target=target, output=output, lenses=_lenses(options, places, start),
-        ports=ports, port_values=values, port_sigmas=sigmas, water=options.water, start=start,
-        known=options.known or usual, target_shape=options.target_shape, mount=options.mount,
-        lever_m=options.lever_m,
+        options=options, places=places, target=target, lenses=_lenses(options, places, start),
+        ports=ports, port_values=values, port_sigmas=sigmas, start=start,
+        known=options.known or usual,
     )  # fmt: skip
 
 

@@ -110,16 +110,7 @@ def calibrate(
     _check_focal(adjusted.rig, adjusted.rig_from_target)
     used = np.where(kept[..., None], pixels, np.nan)[alive_views]
     left_out = np.where(kept[..., None], np.nan, pixels)[alive_views]
-    names = list(start.cameras)
-    final = tuple(
-        TargetView(
-            name=usable[v].name,
-            pixels={
-                name: used[i, c] for c, name in enumerate(names) if np.isfinite(used[i, c]).any()
-            },
-        )
-        for i, v in enumerate(np.flatnonzero(alive_views))
-    )
+    final = tuple(_views_of(usable, np.where(kept[..., None], pixels, np.nan), alive_views, start))
     problem = CalibrationProblem(used, points, start, freedom, shape)
     spread = spread_of(problem, adjusted)
     rig = replace(
@@ -138,7 +129,7 @@ def calibrate(
         weights=adjusted.weights,
         noise_px=adjusted.noise_px,
         rejections=tuple(rejections),
-        warnings=advice(rig, used, adjusted.rig_from_target),
+        warnings=tuple(advice(rig, used, adjusted.rig_from_target)),
         freedom=freedom,
         rejected=left_out,
         blur=adjusted.blur,
@@ -292,11 +283,7 @@ def first_cameras(
     usable, _ = _usable(views, points)
     for name in blank:
         count = sum(name in view.pixels for view in usable)
-        if count < _MIN_VIEWS:
-            raise CalibrationError(
-                f"{count} views of the target from {name}; at least {_MIN_VIEWS} are "
-                "needed: take more, nearer and at more angles"
-            )
+        _check_enough(count, len(views), f" from {name}")
     return {
         name: _alone(name, camera, usable, points, lens_of(lens, name))
         for name, camera in blank.items()
@@ -386,13 +373,19 @@ def _adjust_without_outliers(
     measured = np.asarray(np.isfinite(pixels).all(axis=-1))
     kept, alive = measured, np.ones(len(views), dtype=bool)
     blur = np.ones(measured.shape[:2])
+
+    def trim(kept: Flags, alive: Flags) -> list[TargetView]:
+        return _views_of(views, np.where(kept[..., None], pixels, np.nan), alive, rig)
+
     for _ in range(_ROUNDS):
-        trimmed = [_trim(view, kept[v], rig) for v, view in enumerate(views) if alive[v]]
         adjusted = adjust(
-            trimmed, points, rig, poses, freedom, at_most=_STEPS, blur=blur[alive], shape=shape
-        )
+            trim(kept, alive), points, rig, poses, freedom, at_most=_STEPS, blur=blur[alive],
+            shape=shape,
+        )  # fmt: skip
+        shaped = points + adjusted.shape.offsets_m
+        off = residuals_px(adjusted.rig, adjusted.rig_from_target, shaped, pixels[alive])
         lengths = np.full(measured.shape, np.inf)
-        lengths[alive] = _lengths(adjusted, pixels[alive], points + adjusted.shape.offsets_m)
+        lengths[alive] = np.nan_to_num(np.linalg.norm(off, axis=-1), nan=np.inf)
         found = np.ones_like(blur)
         found[alive] = _blur(adjusted)
         limits = np.maximum(_OUTLIER * adjusted.noise_px * found, _MIN_LIMIT_PX)
@@ -404,8 +397,7 @@ def _adjust_without_outliers(
         _check_enough(int(still.sum()), len(views))
         poses = adjusted.rig_from_target[np.flatnonzero(still[alive])]
         rig, kept, alive, blur, shape = adjusted.rig, fitting, still, found, adjusted.shape
-    trimmed = [_trim(view, kept[v], rig) for v, view in enumerate(views) if alive[v]]
-    last = adjust(trimmed, points, rig, poses, freedom, blur=blur[alive], shape=shape)
+    last = adjust(trim(kept, alive), points, rig, poses, freedom, blur=blur[alive], shape=shape)
     return last, kept, alive
 
 
@@ -448,20 +440,18 @@ def _blur(adjusted: Adjustment) -> Array:
     return blur
 
 
-def _trim(view: TargetView, kept: Flags, rig: Rig) -> TargetView:
-    pixels = {
-        name: np.where(kept[c, :, None], view.pixels[name], np.nan)
-        for c, name in enumerate(rig.cameras)
-        if name in view.pixels and kept[c].any()
-    }
-    return replace(view, pixels=pixels)
-
-
-def _lengths(adjusted: Adjustment, pixels: Array, points: Array) -> Array:
-    """(V, cameras, N) residual lengths of all measured points, also of those left out; px."""
-    missed = residuals_px(adjusted.rig, adjusted.rig_from_target, points, pixels)
-    lengths = np.linalg.norm(missed, axis=-1)
-    return np.where(np.isfinite(lengths), lengths, np.inf)
+def _views_of(
+    views: Sequence[TargetView], pixels: Array, alive: Flags, rig: Rig
+) -> list[TargetView]:
+    """Some of the views, with pixels (V, cameras, N, 2); cameras that see nothing are absent."""
+    seen = np.asarray(np.isfinite(pixels).any(axis=(2, 3)))
+    return [
+        replace(
+            views[v],
+            pixels={name: pixels[v, c] for c, name in enumerate(rig.cameras) if seen[v, c]},
+        )
+        for v in np.flatnonzero(alive).tolist()
+    ]
 
 
 def _rejections(
@@ -469,19 +459,16 @@ def _rejections(
 ) -> list[Rejection]:
     """Pictures and points that the adjustment left out."""
     limit = f"{_OUTLIER:.0f} sigmas (of {adjusted.noise_px:.2g} px, or of the picture's own noise)"
-    rejections = []
-    for v, view in enumerate(views):
-        for c, name in enumerate(rig.cameras):
-            measured = int(np.isfinite(pixels[v, c, :, 0]).sum())
-            lost = measured - int(kept[v, c].sum())
-            if lost and lost == measured:
-                reason = f"fits badly: most of its points miss by more than {limit}"
-                rejections.append(_whole_picture(view.name, name, reason))
-            elif lost:
-                reason = f"missed by more than {limit}"
-                rejections.append(
-                    Rejection(view=view.name, camera=name, points=lost, reason=reason)
-                )
+    rejections, names = [], list(rig.cameras)
+    measured = np.isfinite(pixels[..., 0]).sum(axis=2)
+    lost = measured - kept.sum(axis=2)
+    for v, c in np.argwhere(lost > 0).tolist():
+        points, reason = int(lost[v, c]), f"missed by more than {limit}"
+        if points == measured[v, c]:
+            points, reason = 0, f"fits badly: most of its points miss by more than {limit}"
+        rejections.append(
+            Rejection(view=views[v].name, camera=names[c], points=points, reason=reason)
+        )
     return rejections
 
 
@@ -490,7 +477,7 @@ def _whole_picture(view: str, camera: str, reason: str) -> Rejection:
     return Rejection(view=view, camera=camera, points=0, reason=reason)
 
 
-def _check_enough(usable: int, given: int) -> None:
+def _check_enough(usable: int, given: int, camera: str = "") -> None:
     """Refuse too few views.
 
     Raises:
@@ -499,6 +486,6 @@ def _check_enough(usable: int, given: int) -> None:
     if usable < _MIN_VIEWS:
         of = f" of {given}" if given > usable else ""
         raise CalibrationError(
-            f"{usable}{of} views of the target can be used; at least {_MIN_VIEWS} are needed: "
-            "take more, nearer and at more angles"
+            f"{usable}{of} views of the target{camera} can be used; at least {_MIN_VIEWS} are "
+            "needed: take more, nearer and at more angles"
         )

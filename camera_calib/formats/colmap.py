@@ -236,12 +236,11 @@ def _lens_of(path: Path, entry: _ConfigCamera) -> tuple[str, tuple[float, ...]]:
 def _pose_of(path: Path, entry: _ConfigCamera) -> RigidTransform:
     if entry.ref_sensor:
         return RigidTransform.identity()
-    if entry.turn is None or abs(np.linalg.norm(entry.turn) - 1.0) > 1e-3:
+    if entry.turn is None or entry.shift is None or abs(np.linalg.norm(entry.turn) - 1.0) > 1e-3:
         raise CalibrationError(
-            f"{path}: cam_from_rig_rotation of {entry.name} is not a unit quaternion w x y z"
+            f"{path}: {entry.name} needs cam_from_rig_rotation, a unit quaternion w x y z, and "
+            "cam_from_rig_translation"
         )
-    if entry.shift is None:
-        raise CalibrationError(f"{path}: lacks cam_from_rig_translation of {entry.name}")
     turn = Rotation.from_quat(entry.turn, scalar_first=True)
     return RigidTransform.from_components(entry.shift, turn)
 

@@ -21,7 +21,6 @@ from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.lenses.values import FOCAL_AND_CENTRE
 from camera_calib.mount import mount_line, with_mount
-from camera_calib.ports.dome import DomePort
 from camera_calib.ports.none import NO_PORT
 from camera_calib.rig import Rig, read_rig, write_rig
 
@@ -31,8 +30,8 @@ _TERMS = {rigs.K3: ("k3",), rigs.RATIONAL: ("k4", "k5", "k6"), rigs.PRISM: ("s1"
 _GRID, _DISTANCES = 15, 9
 """Places along each side of the frame, and distances, at which a camera without port is fitted."""
 _CANCELLING_PX = 0.01
-"""Penalty of a distortion coefficient of 1: of coefficients that cancel in FULL_OPENCV's fraction,
-the smallest are taken; the residual grows by less than 1 % for it."""
+"""Penalty of a distortion coefficient of 1: of those that hardly differ the smallest are taken; the
+residual grows by less than 1 % for it."""
 
 
 def _write_own(path: Path, rig: Rig) -> list[Path]:
@@ -110,14 +109,8 @@ class Conversion:
     reading: rigs.ReadOptions = field(default_factory=rigs.ReadOptions)
     names: tuple[str, ...] = ()
     """New names of the cameras, in order."""
-    port_distance_mm: float | None = None
-    """To set, as the five below."""
-    dome_radius_mm: float | None = None
-    """Outer; makes the port a dome."""
-    dome_centre_mm: tuple[float, float, float] | None = None
-    glass_mm: float | None = None
-    n_glass: float | None = None
-    n_water: float | None = None
+    port: Mapping[str, float] = field(default_factory=dict)
+    """Fields of `FlatPort` or `DomePort` to set."""
     mount: str | None = None
     """How the rig sits on its vehicle, as of `with_mount`."""
     lever_m: tuple[float, float, float] | None = None
@@ -126,19 +119,6 @@ class Conversion:
     drop_port: bool = False
     drop_covariance: bool = False
     overwrite: bool = False
-
-    @property
-    def port(self) -> dict[str, float]:
-        """Fields of a port to set."""
-        lengths = {
-            "port_distance_m": self.port_distance_mm,
-            "glass_thickness_m": self.glass_mm,
-            "outer_radius_m": self.dome_radius_mm,
-            **dict(zip(DomePort.parameters, self.dome_centre_mm or (), strict=False)),
-        }
-        given = {"n_glass": self.n_glass, "n_water": self.n_water}
-        given |= {name: None if mm is None else mm / 1e3 for name, mm in lengths.items()}
-        return {name: value for name, value in given.items() if value is not None}
 
 
 def convert(task: Conversion) -> tuple[str, dict[str, Any]]:
@@ -321,10 +301,7 @@ def in_water(rig: Rig, near_m: float, far_m: float) -> tuple[Rig, Mapping[str, S
         CalibrationError: a part of a frame sees nothing, or the fit is no lens over all of it.
         ConfigError: the interval is empty or reaches into a port.
     """
-    fits = {
-        name: fit_in_water(one, near_m, far_m, "OPENCV_FISHEYE" if is_fisheye(one) else "OPENCV")
-        for name, one in rig.cameras.items()
-    }
+    fits = {name: fit_in_water(one, near_m, far_m) for name, one in rig.cameras.items()}
     for name, fit in fits.items():
         if not np.isfinite(fit.camera.unproject(fit.camera.border())[1]).all():
             raise CalibrationError(
@@ -342,21 +319,11 @@ def in_water(rig: Rig, near_m: float, far_m: float) -> tuple[Rig, Mapping[str, S
     return fitted, fits
 
 
-def fit_in_water(camera: Camera, near_m: float, far_m: float, model: str) -> StandIn:
-    """Fit a camera without port to the exact rays of one behind a port, by least squares.
+def fit_in_water(camera: Camera, near_m: float, far_m: float) -> StandIn:
+    """Fit a camera without port to the exact rays of one behind a port, as of `in_water`.
 
     Unknown are a shift along the port's axis, a turn (as bundle adjustment finds with a tilted
-    port) and the model's parameters; nine distances count alike.
-
-    Args:
-        camera: exact.
-        near_m: nearest distance from the entrance pupil along the axis.
-        far_m: farthest.
-        model: OPENCV, FULL_OPENCV or OPENCV_FISHEYE.
-
-    Raises:
-        ConfigError: the interval is empty or reaches into the port.
-        CalibrationError: a part of the frame sees nothing.
+    port) and the parameters of COLMAP's model; nine distances count alike.
     """
     glass = float(np.nanmax(camera.unproject(camera.border(8))[0][:, 2], initial=0.0))
     glass = max(float(camera.front_cam[2]), glass)
@@ -375,7 +342,7 @@ def fit_in_water(camera: Camera, near_m: float, far_m: float, model: str) -> Sta
     side = np.r_[0.5, np.ones(_GRID - 2), 0.5] / (_GRID - 1)
     weights = np.sqrt(np.outer(side, side) / _DISTANCES)[..., None]
     axis = np.array(camera.port.axis_cam)
-    kind = FisheyeLens if model == "OPENCV_FISHEYE" else OpenCVLens
+    kind, model = (FisheyeLens, "OPENCV_FISHEYE") if is_fisheye(camera) else (OpenCVLens, "OPENCV")
     names = MODELS[model][1]
 
     def pose(unknowns: Array) -> RigidTransform:

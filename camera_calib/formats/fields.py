@@ -28,8 +28,6 @@ _MAX_SKIPPED_BYTES = 1 << 26
 _MAX_PARTS = 5000
 """Lists, mappings and tags. Parsers recurse: this bounds how deep (OpenCV's exhausts memory at some
 hundred thousand levels, and handles 20,000)."""
-_DEEPEST = 20
-"""Lists in lists that hold numbers."""
 _ROTATION_TOLERANCE = 1e-3
 """Tolerance of a rotation matrix written with few digits (four decimals and better pass)."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
@@ -68,13 +66,18 @@ class FileModel(BaseModel):
 
 def read_vector(counts: tuple[int, ...], value: Any) -> Array:
     """Finite numbers in a list, however nested, or in a matrix with its `data`."""
-    flat = _flat(value.get("data") if isinstance(value, Mapping) else value)
-    if flat is None:
+    values = value.get("data") if isinstance(value, Mapping) else value
+    try:  # YAML 1.1 takes 1e-05, without a dot, for text; other tools write it so
+        items = np.array(values, dtype=object).ravel()
+        flat = np.array([None if isinstance(item, bool) else item for item in items], dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        flat = np.array([math.nan])
+    if not np.isfinite(flat).all():
         raise ValueError("holds something that is not a finite number")
     if counts and len(flat) not in counts:
         expected = " or ".join(map(str, counts))
         raise ValueError(f"holds {len(flat)} numbers; {expected} expected")
-    return np.array(flat)
+    return flat
 
 
 def _read_matrix(rows: int, columns: int, value: Any) -> Array:
@@ -97,22 +100,6 @@ def _read_pose(value: Any) -> RigidTransform:
     if not np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]):
         raise ValueError("does not end in the row 0 0 0 1")
     return RigidTransform.from_components(matrix[:3, 3], _read_rotation(matrix[:3, :3].tolist()))
-
-
-def _flat(value: Any, depth: int = 0) -> list[float] | None:
-    if isinstance(value, list | tuple):
-        parts = [_flat(part, depth + 1) for part in value] if depth <= _DEEPEST else [None]
-        if any(part is None for part in parts):
-            return None
-        return [number for part in parts if part is not None for number in part]
-    # YAML 1.1 takes 1e-05, without a dot, for text; other tools write it so.
-    if isinstance(value, bool) or not isinstance(value, int | float | str):
-        return None
-    try:
-        number = float(value)
-    except (ValueError, OverflowError):
-        return None
-    return [number] if math.isfinite(number) else None
 
 
 def _as_list(array: Array) -> Any:

@@ -78,10 +78,9 @@ def read_opencv(path: Path, reading: rigs.ReadOptions) -> Rig:
         pose = _PairPose.check(reading.extrinsics or path, other)
         poses.append(RigidTransform.from_components(pose.shift, pose.rotation))
     found = _Names.check(path, values)
-    names = [found.camera_names] if isinstance(found.camera_names, str) else found.camera_names
-    if names is None:
-        names = rigs.default_names(len(cameras))
-        names = [found.camera_name] if single and found.camera_name is not None else names
+    usual = ["cam0"] if single else ["left", "right"]
+    stated = found.camera_names or (found.camera_name if single else None) or usual
+    names = [stated] if isinstance(stated, str) else stated
     if len(names) != len(cameras):
         raise CalibrationError(
             f"{path}: camera_names has {len(names)} names for {len(cameras)} cameras"
@@ -127,23 +126,18 @@ def _camera(
         )
     prefix = f"camera {number}: " if number else ""
     found = _OpenCVCamera.check(path, own, prefix)
-    k, model, width, height = (
-        found.distortion_coefficients, found.distortion_model, found.image_width,
-        found.image_height,
-    )  # fmt: skip
+    k, model = found.distortion_coefficients, found.distortion_model
     name, where = model or reading.lens or "opencv", f"{path}: {prefix}"
     if name not in opencv_model.LENS_NAMES:
         key = "--lens" if model is None else "distortion_model"
-        raise CalibrationError(
-            f"{where}{key} is {name}; {', '.join(opencv_model.LENS_NAMES)} can be read"
-        )
+        lenses = ", ".join(opencv_model.LENS_NAMES)
+        raise CalibrationError(f"{where}{key} is {name}; {lenses} can be read")
     if k is not None and len(k) == 4 and model is None and reading.lens is None:
         warn(f"{where}4 coefficients taken for k1 k2 p1 p2: a fisheye needs --lens fisheye")
-    size = reading.size(path) if width is None or height is None else (width, height)
-    lens = opencv_model.LENS_NAMES[name]
-    return opencv_model.camera_of_matrix(
-        f"{where}camera_matrix", found.camera_matrix, k, size, lens
-    )
+    size = (found.image_width or 0, found.image_height or 0)
+    size = size if all(size) else reading.size(path)
+    lens, key = opencv_model.LENS_NAMES[name], f"{where}camera_matrix"
+    return opencv_model.camera_of_matrix(key, found.camera_matrix, k, size, lens)
 
 
 def _owns(path: Path) -> bool:

@@ -15,7 +15,7 @@ from camera_calib.freedom import part_of_rig
 from camera_calib.optics import PORTS
 from camera_calib.ports.dome import DomePort
 from camera_calib.ports.flat import FlatPort
-from camera_calib.rig import Covariance, Rig
+from camera_calib.rig import Rig
 
 K3, RATIONAL, PRISM, COVARIANCE, MOUNT = "k3", "rational", "prism", "covariance", "mount"
 PINHOLE = frozenset({K3, RATIONAL, PRISM})
@@ -101,26 +101,6 @@ def assemble(
     return refer_to_first(rig)
 
 
-def file_each(path: Path, rig: Rig) -> list[Path]:
-    """Files of formats that have one for each camera: the path, or those in it when it is a folder.
-
-    Raises:
-        CalibrationError: several cameras should go into one file.
-    """
-    if len(rig.cameras) == 1:
-        return [path]
-    if path.suffix:
-        raise CalibrationError(
-            f"{path}: {len(rig.cameras)} cameras have as many files: name a folder for them"
-        )
-    return [path / f"{name}.yaml" for name in rig.cameras]
-
-
-def default_names(count: int) -> list[str]:
-    """Names for cameras whose file states none."""
-    return ["left", "right"] if count == 2 else [f"cam{i}" for i in range(count)]
-
-
 def only(rig: Rig, camera: str) -> Rig:
     """One camera of a rig, with its own pose on the vehicle and its share of the covariance.
 
@@ -189,14 +169,14 @@ def with_port(rig: Rig, port: Mapping[str, Any]) -> Rig:
 
     Args:
         rig: cameras in air, or behind ports some of whose numbers change.
-        port: by field of `FlatPort` or `DomePort`: lengths in metres, indices, `normal`.
+        port: by field of `FlatPort` or `DomePort`: lengths in metres, indices.
 
     Raises:
         CalibrationError: a camera has a port of another shape, or a value is out of range.
     """
-    changed = {"normal_x", "normal_y"} if "normal" in port else set()
     cameras = {name: _with_port(camera, port) for name, camera in rig.cameras.items()}
-    return replace(rig, cameras=cameras, covariance=_without(rig, {*port, *changed}))
+    covariance = rig.covariance and rig.covariance.without(*port)
+    return replace(rig, cameras=cameras, covariance=covariance)
 
 
 def _with_port(camera: Camera, port: Mapping[str, Any]) -> Camera:
@@ -216,12 +196,5 @@ def in_air(rig: Rig) -> Rig:
     """The cameras of a rig without their ports; the covariance of these is dropped."""
     ports = {name for camera in rig.cameras.values() for name in camera.port.parameters}
     cameras = {name: camera.in_air() for name, camera in rig.cameras.items()}
-    return replace(rig, cameras=cameras, covariance=_without(rig, ports))
-
-
-def _without(rig: Rig, fields: set[str]) -> Covariance | None:
-    """The covariance of a rig without some parameters of every camera."""
-    if rig.covariance is None:
-        return None
-    kept = [name for name in rig.covariance.parameters if name.rsplit(".", 1)[1] not in fields]
-    return rig.covariance.marginal(kept) if kept else None
+    covariance = rig.covariance and rig.covariance.without(*ports)
+    return replace(rig, cameras=cameras, covariance=covariance)

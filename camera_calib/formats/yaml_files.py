@@ -18,10 +18,9 @@ import re
 from pathlib import Path
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 from pydantic import Field
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.errors import CalibrationError, warn
 from alice_survey.core.frames import Array
@@ -162,42 +161,22 @@ def read_ros(path: Path, reading: rigs.ReadOptions) -> Rig:
 
 
 def write_ros(path: Path, rig: Rig) -> list[Path]:
-    """Write a file of one camera, or into a folder those of a stereo pair, rectified as by OpenCV.
-
-    Raises:
-        CalibrationError: two cameras cannot be rectified.
-    """
-    names = list(rig.cameras)
-    if len(names) == 1:
-        camera = rig.cameras[names[0]]
-        projection = np.hstack([opencv_model.camera_matrix(camera), np.zeros((3, 1))])
-        fields.write_yaml(path, _ros_values(names[0], camera, np.eye(3), projection))
-        return [path]
-    files = rigs.file_each(path, rig)
-    first, second = rig.cameras.values()
-    size = (first.width_px, first.height_px)
-    second_from_first = rig.cam_from_rig[names[1]]
-    if size != (second.width_px, second.height_px):
-        raise CalibrationError(f"{path}: ROS rectifies pairs of one picture size only")
-    if float(np.linalg.norm(second_from_first.translation)) == 0.0:
-        raise CalibrationError(f"{path}: the cameras have no baseline to rectify along")
-    # A fisheye is rectified to the pinhole of its focal length: no such picture holds all of it.
-    k1, k2 = (
-        np.zeros(5) if opencv_model.is_fisheye(one) else opencv_model.distortion(one)
-        for one in (first, second)
-    )
-    _, _, p1, p2, *_ = cv2.stereoRectify(
-        opencv_model.camera_matrix(first), k1, opencv_model.camera_matrix(second), k2, size,
-        second_from_first.rotation.as_matrix(), second_from_first.translation[:, None],
-        flags=cv2.CALIB_ZERO_DISPARITY, alpha=0.0,
-    )  # fmt: skip
-    axis = int(np.argmax(np.abs(p2[:2, 3])))
-    r1, r2, line = _rectify(second_from_first, axis)
-    p2[:, 3] = p2[axis, axis] * line
-    pieces = zip(files, names, (first, second), (r1, r2), (p1, p2), strict=True)
-    for file, name, camera, rotation, projection in pieces:
-        fields.write_yaml(file, _ros_values(name, camera, rotation, projection))
-    return files
+    """Write a file of one camera."""
+    ((name, camera),) = rig.cameras.items()
+    k, matrix = opencv_model.distortion(camera), opencv_model.camera_matrix(camera)
+    models: dict[int, _RosModel] = {4: "equidistant", 5: "plumb_bob"}
+    values = _RosCamera(
+        image_width=camera.width_px,
+        image_height=camera.height_px,
+        camera_name=name,
+        camera_matrix=matrix.tolist(),
+        distortion_model=models.get(k.size, "rational_polynomial"),
+        distortion_coefficients=k.tolist(),
+        rectification_matrix=np.eye(3).tolist(),
+        projection_matrix=np.hstack([matrix, np.zeros((3, 1))]).tolist(),
+    ).values()
+    fields.write_yaml(path, values | {"distortion_coefficients": fields.matrix_of(k)})
+    return [path]
 
 
 def _ros_camera(file: Path, one: _RosCamera) -> Camera:
@@ -228,45 +207,6 @@ def _second_from_first(
     return RigidTransform.from_components(back.apply(baseline), back * turns[0])
 
 
-def _rectify(second_from_first: RigidTransform, axis: int) -> tuple[Array, Array, Array]:
-    """Rotations of both cameras to a pair with its baseline along x (0) or y (1), and that line.
-
-    Each takes half of the turn between the cameras, then both what is left to the axis, as
-    `cv2.stereoRectify` does; that one takes turns below 1e-5 rad for none, so that the pose could
-    not be recovered from its rotations.
-    """
-    half = Rotation.from_rotvec(-0.5 * second_from_first.rotation.as_rotvec())
-    shift = half.apply(second_from_first.translation)
-    length = float(np.linalg.norm(shift))
-    line = np.zeros(3)
-    line[axis] = np.sign(shift[axis])
-    across = np.cross(shift / length, line)
-    sine = float(np.linalg.norm(across))
-    angle = np.arctan2(sine, shift @ line / length)
-    level = Rotation.from_rotvec(across * (angle / sine if sine > 0 else 0.0))
-    second = level * half
-    first = second * second_from_first.rotation
-    return first.as_matrix(), second.as_matrix(), line * length
-
-
-def _ros_values(name: str, camera: Camera, rotation: Array, projection: Array) -> object:
-    k = opencv_model.distortion(camera)
-    models: dict[int, _RosModel] = {4: "equidistant", 5: "plumb_bob"}
-    values = _RosCamera(
-        image_width=camera.width_px,
-        image_height=camera.height_px,
-        camera_name=name,
-        camera_matrix=opencv_model.camera_matrix(camera).tolist(),
-        distortion_model=models.get(k.size, "rational_polynomial"),
-        distortion_coefficients=k.tolist(),
-        rectification_matrix=rotation.tolist(),
-        projection_matrix=projection.tolist(),
-    ).values()
-    # To the last bit, which the pose of a small turn needs: a rotation is made orthogonal.
-    values["rectification_matrix"] = fields.matrix_of(rotation)
-    return values | {"distortion_coefficients": fields.matrix_of(k)}
-
-
 def _is_ros(path: Path) -> bool:
     if path.is_dir():
         files = [file for file in sorted(path.iterdir()) if file.suffix.lower() in _YAML]
@@ -283,6 +223,5 @@ ROS = rigs.CalibrationFormat(
     owns=_is_ros,
     read=read_ros,
     write=write_ros,
-    files=rigs.file_each,
-    max_cameras=2,
+    max_cameras=1,
 )

@@ -30,7 +30,7 @@ from camera_calib.fov.table import (
     fov_table,
     rig_fov_table,
 )
-from camera_calib.rig import Rig, port_settings, read_rig
+from camera_calib.rig import Rig, read_rig
 
 PAPER_LENSES_MM = (12.5, 25.0)
 PAPER_EXPOSURE_MS = 3.0
@@ -252,15 +252,13 @@ def fov_report(options: FovOptions) -> tuple[str, Any]:
     """FOV, resolution, focus, stereo and blur as text and JSON values."""
     settings = _settings(options)
     rig = _rig(options, settings.water.n_water)
-    camera, n_water = settings.camera, settings.water.n_water
-    if rig is not None:
-        camera, n_water = _sensor_of(rig, settings.camera)
+    camera = settings.camera if rig is None else _with_pixels_of(rig, settings.camera)
     lenses = options.lens_mm or ((camera.focal_mm,) if options.survey else PAPER_LENSES_MM)
 
     def table(altitudes_m: Sequence[float]) -> list[FovRow]:
         if rig is not None:
             return rig_fov_table(rig, altitudes_m, camera)
-        return fov_table(lenses, altitudes_m, n_water, camera)
+        return fov_table(lenses, altitudes_m, settings.water.n_water, camera)
 
     altitudes = options.altitude_m or (settings.plan.altitude_m,)
     speeds = options.speed_mps or (settings.plan.speed_mps,)
@@ -329,24 +327,18 @@ def _rig(options: FovOptions, n_water: float) -> Rig | None:
     return rig if options.n_water is None else rig.in_water(n_water)
 
 
-def _sensor_of(rig: Rig, camera: CameraConfig) -> tuple[CameraConfig, float]:
-    """Sensor and port of a rig's reference camera, and its water; a rig has no pixel pitch."""
-    own = rig.cameras[rig.reference]
-    pixel_um = camera.pixel_um
-    if own.width_px != camera.width_px:
-        pixel_um *= camera.width_px / own.width_px
-        warn(
-            f"the rig's pictures are {own.width_px} px wide and the settings' "
-            f"{camera.width_px}: pixels of {pixel_um:.4g} um (the same sensor) are taken for the "
-            "depth of field; pixel_um under [camera] of --survey sets it"
-        )
-    update = {
-        "width_px": own.width_px,
-        "height_px": own.height_px,
-        "pixel_um": pixel_um,
-        **port_settings(own),
-    }
-    return camera.model_copy(update=update), own.n_water
+def _with_pixels_of(rig: Rig, camera: CameraConfig) -> CameraConfig:
+    """The settings' sensor with the pixels of a rig's pictures: a rig has no pixel pitch."""
+    width_px = rig.cameras[rig.reference].width_px
+    if width_px == camera.width_px:
+        return camera
+    pixel_um = camera.pixel_um * camera.width_px / width_px
+    warn(
+        f"the rig's pictures are {width_px} px wide and the settings' {camera.width_px}: pixels of "
+        f"{pixel_um:.4g} um (the same sensor) are taken for the depth of field; pixel_um under "
+        "[camera] of --survey sets it"
+    )
+    return camera.model_copy(update={"pixel_um": pixel_um})
 
 
 def _write(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from alice_survey.core.frames import Array
 from alice_survey.core.run import progress
@@ -20,8 +21,6 @@ from camera_calib.target_shape import BOW_X, BOW_Y
 
 DESIGN_RANGE_M = 2.0
 """Usual working range; used if the views are close to it."""
-_RANGE_STEPS = np.array([0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.0])
-"""Distances evaluated, in working ranges: 0.5 to 10 m for 2 m."""
 _MAP_COLUMNS, _MAP_ROWS = 25, 21
 
 _ODD_PICTURE = 2.0
@@ -60,11 +59,11 @@ class CameraJudgement:
     seen: residuals.CameraResiduals
     by_incidence: residuals.Profile
     """Residuals against the angle to the port's normal in water, deg."""
-    coverage: residuals.Coverage
+    coverage: NDArray[np.intp]
+    """(rows, columns) points by cell of the frame."""
     homography: residuals.HomographyTest | None
     sigma: uncertainty.ProjectionSigma
     """(R, C) at the working range."""
-    by_range: tuple[uncertainty.RangeSigma, ...]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -78,8 +77,8 @@ class Judgement:
     """Distance from the reference camera and its sigma, by camera."""
     pictures: tuple[residuals.PictureFit, ...]
     cameras: dict[str, CameraJudgement]
-    stereo: tuple[uncertainty.StereoSigma, ...]
-    """By distance; empty for one camera."""
+    stereo: uncertainty.StereoSigma | None
+    """At the working range; None for one camera."""
     lengths: validation.LengthErrors | None
     """Errors on the views used; None for one camera."""
     held_lengths: validation.LengthErrors | None
@@ -88,31 +87,21 @@ class Judgement:
     halves: validation.HalvesAgreement | None
     """All parameters of two calibrations, from either half of the views."""
 
-    @property
-    def stereo_at_work(self) -> uncertainty.StereoSigma | None:
-        """Stereo at the working range."""
-        return next((s for s in self.stereo if s.range_m == self.working_range_m), None)
-
 
 @progress.step("judge the calibration")
-def judge(
-    calibration: Calibration, held: validation.HeldOut | None, working_range_m: float | None = None
-) -> Judgement:
+def judge(calibration: Calibration, held: validation.HeldOut | None) -> Judgement:
     """Compute everything that the report shows.
 
     Args:
         calibration: with its rig's covariance.
         held: held-out views, if there were any.
-        working_range_m: distance at which the rig will work; 2 m if not given, or, where the views
-            were taken at very different distances, the views' median.
 
     Raises:
         CalibrationError: the rig has no covariance.
     """
     rig, found = calibration.rig, calibration
     of_rig = uncertainty.rig_parameters(rig, calibration.freedom.prior.parameters)
-    range_m = working_range_m or _working_range_m(calibration)
-    ranges = tuple(float(r) for r in range_m * _RANGE_STEPS)
+    range_m = _working_range_m(calibration)
     stereo = len(rig.cameras) > 1
     lengths = held_lengths = halves = None
     if held is not None and held.halves is not None:
@@ -133,10 +122,8 @@ def judge(
         parameters=(*of_rig, *uncertainty.shape_parameters(calibration.shape)),
         baselines_m=uncertainty.baselines_m(rig),
         pictures=tuple(residuals.picture_fits(calibration)),
-        cameras={name: _camera(calibration, name, range_m, ranges) for name in rig.cameras},
-        stereo=tuple(
-            uncertainty.stereo_sigma(rig, r, calibration.noise_px) for r in ranges if stereo
-        ),
+        cameras={name: _camera(calibration, name, range_m) for name in rig.cameras},
+        stereo=(uncertainty.stereo_sigma(rig, range_m, calibration.noise_px) if stereo else None),
         lengths=lengths,
         held_lengths=held_lengths,
         hold_out=None if held is None else validation.score_hold_out(held),
@@ -145,6 +132,7 @@ def judge(
 
 
 def _working_range_m(calibration: Calibration) -> float:
+    """The usual one or, where the views were taken at very different distances, their median."""
     centre = calibration.target_points.mean(axis=0)
     ranges = calibration.rig_from_target.apply(centre)[:, 2]
     if ranges.min() / 2 <= DESIGN_RANGE_M <= ranges.max() * 2:
@@ -164,9 +152,7 @@ def anchors_cam(calibration: Calibration, camera: str) -> Array:
     return np.concatenate(points)
 
 
-def _camera(
-    calibration: Calibration, name: str, range_m: float, ranges: tuple[float, ...]
-) -> CameraJudgement:
+def _camera(calibration: Calibration, name: str, range_m: float) -> CameraJudgement:
     rig, model = calibration.rig, calibration.rig.cameras[name]
     seen = residuals.camera_residuals(calibration, name)
     pixels = model.frame_grid(_MAP_COLUMNS, _MAP_ROWS)
@@ -174,10 +160,9 @@ def _camera(
     return CameraJudgement(
         seen=seen,
         by_incidence=residuals.incidence_profile(model, seen),
-        coverage=residuals.coverage(model, seen.pixels),
+        coverage=residuals.points_by_cell(model, seen.pixels),
         homography=residuals.homography_test(calibration, name),
         sigma=uncertainty.projection_sigma(rig, name, pixels, range_m, compensating),
-        by_range=uncertainty.sigmas_by_range(rig, name, pixels[::2, ::2], ranges, compensating),
     )
 
 
@@ -353,7 +338,7 @@ def _length_verdicts(judged: Judgement) -> Iterator[Verdict]:
         scale, sigma = (np.nan, np.nan) if lengths is None else lengths.scale_ppm()
         if lengths is None or not np.isfinite(scale):
             continue
-        found, expected = lengths.rms_m(long=True)
+        found, expected = lengths.rms_m()
         off = abs(scale) > _SIGMAS * sigma or found > _HELD_OUT_LIMITS[0] ** 2 * expected
         yield Verdict(
             level="look" if off else "good",
@@ -373,7 +358,7 @@ def _uncertainty_verdicts(judged: Judgement) -> Iterator[Verdict]:
             f"{worst:.3f} px (worst), best pose taken",
             "; more views towards the edges bring it down",
         )  # fmt: skip
-    at_work = judged.stereo_at_work
+    at_work = judged.stereo
     if at_work is not None and np.isfinite(at_work.length_sigma_m):
         yield Verdict(
             level="good" if at_work.length_sigma_m < 1e-3 * at_work.length_m else "look",

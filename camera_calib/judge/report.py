@@ -1,6 +1,5 @@
 """The calibration report: one self-contained page with four figures, and its numbers as JSON."""
 
-import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -76,7 +75,6 @@ def write_report(folder: Path, calibration: Calibration, held_out: HeldOut | Non
             name: {
                 "coverage": camera.coverage,
                 "residuals_by_incidence_deg": camera.by_incidence,
-                "projection_sigma": camera.by_range,
                 "homography": camera.homography,
             }
             for name, camera in judged.cameras.items()
@@ -104,13 +102,9 @@ def write_report(folder: Path, calibration: Calibration, held_out: HeldOut | Non
 def _length_numbers(lengths: LengthErrors | None) -> dict[str, Any] | None:
     if lengths is None:
         return None
-    scale, sigma = lengths.scale_ppm()
-    found: dict[str, Any] = {"scale_ppm": scale, "scale_sigma_ppm": sigma}
-    for key, long in (("long", True), ("neighbours", False)):
-        rms, expected = lengths.rms_m(long)
-        count = int((lengths.long == long).sum())
-        found[key] = {"count": count, "rms_m": rms, "expected_m": expected}
-    return found
+    (scale, sigma), (rms, expected) = lengths.scale_ppm(), lengths.rms_m()
+    long = {"count": len(lengths.view), "rms_m": rms, "expected_m": expected}
+    return {"scale_ppm": scale, "scale_sigma_ppm": sigma, "long": long}
 
 
 def _facts(judged: Judgement) -> Iterator[tuple[str, str]]:
@@ -122,12 +116,6 @@ def _facts(judged: Judgement) -> Iterator[tuple[str, str]]:
     for name, (length_m, sigma_m) in judged.baselines_m.items():
         label = "baseline" if len(judged.baselines_m) == 1 else f"baseline to {name}"
         yield label, f"{with_sigma(1e3 * length_m, 1e3 * sigma_m)} mm"
-    if judged.hold_out is not None:
-        yield "held-out views", f"{judged.hold_out.rms_px:.3f} px rms"
-    at_work = judged.stereo_at_work
-    if at_work is not None and math.isfinite(at_work.length_sigma_m):
-        per_mille = 1e3 * at_work.length_sigma_m / at_work.length_m
-        yield f"a length at {judged.working_range_m:.3g} m", f"+/- {per_mille:.2f} mm per metre"
 
 
 def _sections(judged: Judgement) -> Iterator[Section]:
@@ -155,7 +143,7 @@ def _sections(judged: Judgement) -> Iterator[Section]:
             Figure(
                 png=_plot_coverage(judged),
                 title="Where points fell",
-                alt="Counts of points by cell of each frame; corners without points are named",
+                alt="Counts of points by cell of each frame",
                 shows="Points seen by cell. In corners without any, distortion is extrapolated.",
                 good="All cells filled, corners too.",
                 otherwise="Hold the target in the empty parts, partly out of the frame if it can "
@@ -303,13 +291,13 @@ def _plot_profiles(judged: Judgement) -> bytes:
 
 @figure_style()
 def _plot_coverage(judged: Judgement) -> bytes:
-    """Number of points over each frame, and corners that none came near."""
+    """Number of points over each frame."""
     figure, grid = _frames(judged)
-    largest = max(int(c.coverage.counts.max()) for c in judged.cameras.values())
+    largest = max(int(c.coverage.max()) for c in judged.cameras.values())
     for axes, (name, camera) in zip(grid, judged.cameras.items(), strict=True):
         model = judged.calibration.rig.cameras[name]
         image = axes.imshow(
-            np.ma.masked_equal(camera.coverage.counts, 0),
+            np.ma.masked_equal(camera.coverage, 0),
             extent=(0, model.width_px, model.height_px, 0),
             cmap=_SEQUENTIAL,
             vmin=0,
@@ -318,8 +306,6 @@ def _plot_coverage(judged: Judgement) -> bytes:
         )
         axes.set_facecolor("#f1ece6")
         axes.plot(*camera.seen.pixels.T, ".", ms=1.3, color=INK, alpha=0.45)
-        if camera.coverage.uncovered:
-            axes.set_xlabel(f"x (px);  no point near {', '.join(camera.coverage.uncovered)}")
     colour_bar(image, grid, "points in a cell")
     return png_of(figure)
 

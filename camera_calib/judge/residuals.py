@@ -28,14 +28,6 @@ GATE_SIGMAS = 5.0
 statistics. Of 2D normal errors, 4 in a million are longer."""
 PROFILE_BINS = 12
 _MIN_IN_BIN = 8
-COVERED_REACH = 0.75
-"""A corner of the frame is covered when a point lies beyond this share of both half sides."""
-CORNERS = {
-    f"{high} {side}": (x, y)
-    for high, y in (("top", -1), ("bottom", 1))
-    for side, x in (("left", -1), ("right", 1))
-}
-"""Directions from the centre to the corners of a frame."""
 _CELLS = (10, 8)
 """Columns and rows of a frame in which points are counted."""
 _MIN_POINTS = 12
@@ -75,8 +67,6 @@ class PictureFit:
     outliers: int
     range_m: float
     """Mean distance of its points from the entrance pupil along the axis."""
-    tilt_deg: float
-    """Angle between the target's normal and the camera's axis."""
 
 
 def picture_fits(calibration: Calibration) -> list[PictureFit]:
@@ -89,7 +79,6 @@ def picture_fits(calibration: Calibration) -> list[PictureFit]:
             if not seen.any():
                 continue
             pose = calibration.rig.cam_from_rig[camera] * calibration.rig_from_target[v]
-            along_axis = abs(float(pose.rotation.as_matrix()[2, 2]))
             rows.append(
                 PictureFit(
                     view=view.name,
@@ -99,7 +88,6 @@ def picture_fits(calibration: Calibration) -> list[PictureFit]:
                     worst_px=float(lengths[seen].max()),
                     outliers=int((lengths[seen] > GATE_SIGMAS * noise_px[v, c]).sum()),
                     range_m=float(pose.apply(calibration.target_points[seen])[:, 2].mean()),
-                    tilt_deg=float(np.degrees(np.arccos(min(along_axis, 1.0)))),
                 )
             )
     return rows
@@ -203,34 +191,10 @@ def incidence_profile(camera: Camera, seen: CameraResiduals) -> Profile:
     return profile(angles, seen.residuals_px, away, seen.sigma_px, steepest)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Coverage:
-    """Distribution of the points over one frame."""
-
-    counts: NDArray[np.intp]
-    """(rows, columns) points by cell of the frame."""
-    empty_share: float
-    """Share of the cells without a point."""
-    corner_reach: dict[str, float]
-    """By corner: how far out, as a share of both half sides, the outermost point lies."""
-    uncovered: tuple[str, ...]
-    """Corners that no point comes near."""
-
-
-def coverage(camera: Camera, pixels: Array) -> Coverage:
-    """Count pixels (N, 2) by cell of the frame, and measure how near they come to its corners."""
-    size = (camera.width_px, camera.height_px)
-    counts = np.histogramdd(pixels, _CELLS, [(0.0, float(side)) for side in size])[0].T
-    off = pixels / (np.array(size) / 2) - 1.0
-    reach = {
-        name: float(np.max((off * sign).min(axis=1), initial=0.0)) for name, sign in CORNERS.items()
-    }
-    return Coverage(
-        counts=counts.astype(np.intp),
-        empty_share=float((counts == 0).mean()),
-        corner_reach=reach,
-        uncovered=tuple(name for name, share in reach.items() if share < COVERED_REACH),
-    )
+def points_by_cell(camera: Camera, pixels: Array) -> NDArray[np.intp]:
+    """Counts of pixels (N, 2) by cell of the frame, (rows, columns)."""
+    size = [(0.0, float(camera.width_px)), (0.0, float(camera.height_px))]
+    return np.histogramdd(pixels, _CELLS, size)[0].T.astype(np.intp)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

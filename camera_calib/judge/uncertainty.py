@@ -19,7 +19,7 @@ from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import Array
 from alice_survey.kit.words import field_table, with_sigma
 from camera_calib.camera import Camera, pose_jacobian
-from camera_calib.freedom import POSE, all_names, value
+from camera_calib.freedom import POSE, all_names, slope_columns, value
 from camera_calib.rig import Covariance, Rig, read_rig
 from camera_calib.target_shape import TargetShape
 
@@ -75,12 +75,11 @@ def camera_slopes(rig: Rig, camera: str, points_cam: Array) -> tuple[Array, Arra
         (N, 2, P), those of poses and of other cameras being 0. NaN where nothing is projected.
     """
     pixels, by_point, by_own = rig.cameras[camera].project_jacobian(points_cam)
-    names, own = covariance_of(rig).parameters, rig.cameras[camera].parameters
+    names = covariance_of(rig).parameters
+    columns, at = slope_columns(rig, names, camera)
+    own = columns < by_own.shape[-1]
     by_parameter = np.zeros((*pixels.shape, len(names)))
-    for column, name in enumerate(names):
-        owner, _, field = name.rpartition(".")
-        if owner == camera and field in own:
-            by_parameter[..., column] = by_own[..., own.index(field)]
+    by_parameter[..., at[own]] = by_own[..., columns[own]]
     return pixels, by_point, by_parameter
 
 
@@ -92,10 +91,9 @@ def rig_slopes(rig: Rig, camera: str, points_rig: Array) -> tuple[Array, Array, 
     pose = rig.cam_from_rig[camera]
     pixels, by_point, by_parameter = camera_slopes(rig, camera, pose.apply(points_rig))
     by_pose = pose_jacobian(by_point, pose.rotation.apply(points_rig))
-    for column, name in enumerate(covariance_of(rig).parameters):
-        owner, _, field = name.rpartition(".")
-        if owner == camera and field in POSE:
-            by_parameter[..., column] = by_pose[..., POSE.index(field)]
+    columns, at = slope_columns(rig, covariance_of(rig).parameters, camera)
+    columns = columns - len(rig.cameras[camera].parameters)
+    by_parameter[..., at[columns >= 0]] = by_pose[..., columns[columns >= 0]]
     return pixels, by_point @ pose.rotation.as_matrix(), by_parameter
 
 
@@ -280,8 +278,6 @@ class StereoSigma:
     range_m: float
     point_m: tuple[float, ...] = (math.nan,) * 3
     """Sigmas right, down, forward of a point mid-overlap, by calibration alone."""
-    worst_point_m: float = math.nan
-    """Largest sigma forward in the overlap, by calibration alone."""
     worst_shape_m: float = math.nan
     """Largest sigma forward in the overlap, after the best rigid motion."""
     noise_m: tuple[float, ...] = (math.nan,) * 3
@@ -307,13 +303,12 @@ def stereo_sigma(rig: Rig, range_m: float, noise_px: float) -> StereoSigma:
     centre = points[np.argmin(np.linalg.norm(points - middle, axis=1))]
     reach = min(centre[0] - points[:, 0].min(), points[:, 0].max() - centre[0])
     half = min(0.5, 0.95 * float(reach)) * np.array([1.0, 0.0, 0.0])
-    at_centre, at_all = point_sigmas_m(rig, centre[None])[0], point_sigmas_m(rig, points)
+    at_centre = point_sigmas_m(rig, centre[None])[0]
     noise = noise_sigmas_m(rig, centre[None], noise_px)[0]
     length = length_sigmas_m(rig, (centre - half)[None], (centre + half)[None])
     return StereoSigma(
         range_m=range_m,
         point_m=tuple(at_centre.tolist()),
-        worst_point_m=float(np.nanmax(at_all[:, 2])),
         worst_shape_m=float(np.nanmax(shape_sigmas_m(rig, points)[:, 2])),
         noise_m=tuple(noise.tolist()),
         length_m=2 * float(half[0]),

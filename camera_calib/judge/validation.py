@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import RigidTransform
 from scipy.stats import chi2
@@ -197,22 +196,20 @@ class LengthErrors:
     """(L,) expected from the noise of the pixels alone."""
     view: NDArray[np.intp]
     """(L,) number of the view."""
-    long: NDArray[np.bool_]
-    """(L,) from a point to the farthest seen one; else between neighbours."""
 
     def scale_ppm(self) -> tuple[float, float]:
-        """Relative error of the long lengths, and its sigma from the scatter between views.
+        """Relative error of the lengths, and its sigma from the scatter between views.
 
-        The error of a view is that of its long lengths beyond their bias; its weight the inverse of
-        their mean variance. NaN where fewer than two views have long lengths.
+        The error of a view is that of its lengths beyond their bias; its weight the inverse of
+        their mean variance. NaN where fewer than two views have lengths.
         """
-        views = np.unique(self.view[self.long])
+        views = np.unique(self.view)
         count = len(views)
         if count < 2:
             return float("nan"), float("nan")
         errors, weights = np.zeros((2, count))
         for i, v in enumerate(views):
-            at = self.long & (self.view == v)
+            at = self.view == v
             beyond, true = self.error_m[at] - self.bias_m[at], self.true_m[at]
             errors[i] = beyond @ true / (true @ true)
             weights[i] = 1.0 / (self.sigma_m[at] ** 2).mean()
@@ -221,13 +218,13 @@ class LengthErrors:
         variance = float(share**2 @ (errors - mean) ** 2) * count / (count - 1)
         return 1e6 * mean, 1e6 * variance**0.5
 
-    def rms_m(self, long: bool) -> tuple[float, float]:
-        """Rms error of long or of neighbours' lengths, and the expected one; NaN for none."""
-        at = self.long == long
-        if not at.any():
+    def rms_m(self) -> tuple[float, float]:
+        """Rms error of the lengths, and the expected one; NaN for none."""
+        if not len(self.view):
             return float("nan"), float("nan")
-        square, expected = self.error_m**2, self.sigma_m**2 + self.bias_m**2
-        return float(np.sqrt(square[at].mean())), float(np.sqrt(expected[at].mean()))
+        squares = self.error_m**2, self.sigma_m**2 + self.bias_m**2
+        found, expected = (float(np.sqrt(square.mean())) for square in squares)
+        return found, expected
 
 
 def length_errors(
@@ -238,7 +235,7 @@ def length_errors(
     target_points: Array,
     noise_px: Array | float,
 ) -> LengthErrors:
-    """Triangulate the points of two or more cameras and compare lengths with the target's.
+    """Triangulate the points of two or more cameras and compare long lengths with the target's.
 
     With C the covariance of the difference of both points, u the length's direction, L the length
     and Q = 1 - u u^T, noise gives a length the bias tr(Q C) / 2L and the variance
@@ -252,7 +249,6 @@ def length_errors(
         target_points: (N, 3).
         noise_px: standard deviation of one coordinate, of all or of each picture (V, cameras).
     """
-    near = neighbours(target_points)
     sigma_px = np.broadcast_to(noise_px, (len(views), len(rig.cameras)))
     pixels = stack_views(views, rig, len(target_points))
     pixels[~within_gate(residuals, sigma_px[..., None])] = np.nan
@@ -263,10 +259,7 @@ def length_errors(
         seen = np.nonzero(np.isfinite(found.points_world).all(axis=1))[0]
         if len(seen) < 2:
             continue
-        far = farthest(target_points, seen)
-        both = near[np.isin(near, seen).all(axis=1)]
-        pairs, long = np.concatenate([both, far]), np.repeat([False, True], [len(both), len(far)])
-        a, b = pairs.T
+        a, b = farthest(target_points, seen).T
         along = target_points[a] - target_points[b]
         true = np.linalg.norm(along, axis=1)
         unit = rig_from_target[v].rotation.apply(along / true[:, None])
@@ -276,23 +269,15 @@ def length_errors(
         across = (np.eye(3) - unit[:, :, None] * unit[:, None, :]) @ spread
         bias = np.trace(across, axis1=1, axis2=2) / (2 * true)
         variance = lengthwise + np.einsum("nab,nba->n", across, across) / (2 * true**2)
-        parts.append((true, length - true, bias, np.sqrt(variance), np.full(len(pairs), v), long))
-    empty = (np.zeros(0),) * 6
-    true, error, bias, sigma, number, long = (
+        parts.append((true, length - true, bias, np.sqrt(variance), np.full(len(a), v)))
+    empty = (np.zeros(0),) * 5
+    true, error, bias, sigma, number = (
         np.concatenate(columns) for columns in zip(*(parts or [empty]), strict=True)
     )
     return LengthErrors(
         true_m=true, error_m=error, bias_m=bias, sigma_m=sigma,
-        view=number.astype(np.intp), long=long.astype(bool),
+        view=number.astype(np.intp),
     )  # fmt: skip
-
-
-def neighbours(target_points: Array) -> NDArray[np.intp]:
-    """Pairs (K, 2) of points that are nearest to one another, by 1 %."""
-    tree = KDTree(target_points)
-    spacing = float(np.asarray(tree.query(target_points, k=2)[0])[:, 1].min())
-    pairs = tree.query_pairs(1.01 * spacing, output_type="ndarray")
-    return np.asarray(pairs[np.lexsort(pairs.T)], dtype=np.intp).reshape(-1, 2)
 
 
 def farthest(target_points: Array, seen: NDArray[np.intp]) -> NDArray[np.intp]:

@@ -17,17 +17,37 @@ MAX_PX = 1e7
 
 
 @dataclass(frozen=True, kw_only=True)
-class LensValues(ABC):
-    """A lens in air: rays of any length to pixels and back, by the kernels of its file."""
+class OpticalPart:
+    """What a lens and a port have: finite values, some of which can be calibrated."""
 
     __pydantic_config__ = ConfigDict(extra="forbid", strict=True)
 
-    model: ClassVar[str]
-    """Its name in files."""
     kind: ClassVar[int]
     """Its number in kernels."""
     parameters: ClassVar[tuple[str, ...]]
     """Names of its parameters, ordered as its slopes."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not all(map(math.isfinite, value if isinstance(value, tuple) else (value,))):
+                raise CalibrationError(f"camera: {field.name} = {value} is not finite")
+
+    def parameter(self, name: str) -> float:
+        """The value of one of `parameters`."""
+        return float(getattr(self, name))
+
+    def with_parameters(self, values: Mapping[str, float]) -> Self:
+        """The same part with some parameters set to other values."""
+        return replace(self, **{name: float(value) for name, value in values.items()})
+
+
+@dataclass(frozen=True, kw_only=True)
+class LensValues(OpticalPart, ABC):
+    """A lens in air: rays of any length to pixels and back, by the kernels of its file."""
+
+    model: ClassVar[str]
+    """Its name in files."""
 
     falloff: ClassVar[float] = 4.0
     """Power of the cosine off the axis with which its pictures darken."""
@@ -38,11 +58,7 @@ class LensValues(ABC):
     cy_px: float
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            if not math.isfinite(getattr(self, field.name)):
-                raise CalibrationError(
-                    f"camera: {field.name} = {getattr(self, field.name)} is not finite"
-                )
+        super().__post_init__()
         if min(self.fx_px, self.fy_px) <= 0:
             raise CalibrationError("camera: width_px, height_px, fx_px and fy_px must be positive")
         if max(self.fx_px, self.fy_px) > MAX_PX:
@@ -52,14 +68,6 @@ class LensValues(ABC):
     @abstractmethod
     def values(self) -> Array:
         """Its parameters, and what else its kernels need."""
-
-    def parameter(self, name: str) -> float:
-        """The value of one of `parameters`."""
-        return float(getattr(self, name))
-
-    def with_parameters(self, values: Mapping[str, float]) -> Self:
-        """The same lens with some parameters set to other values."""
-        return replace(self, **{name: float(value) for name, value in values.items()})
 
     def downscale(self, scale: float) -> Self:
         """The same lens with pixels `scale` times as large."""

@@ -9,8 +9,7 @@ method finds it. With the pupil at the centre the dome does nothing to any ray.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -51,16 +50,6 @@ class DomePort(PortValues):
     spreads: ClassVar[Mapping[str, float]] = {
         "dome_x_m": 0.005, "dome_y_m": 0.005, "dome_z_m": 0.02, "n_water": N_WATER_SPREAD
     }  # fmt: skip
-    labels: ClassVar[Mapping[str, str]] = {
-        "dome_x_m": "its centre {} right of the pupil",
-        "dome_y_m": "{} down",
-        "dome_z_m": "{} before it",
-        "outer_radius_m": "radius {}",
-        "glass_thickness_m": "glass {}",
-        "n_glass": "index {}",
-        "n_water": "water {}",
-    }
-
     needs_air: ClassVar[bool] = True
 
     dome_x_m: float = 0.0
@@ -88,16 +77,6 @@ class DomePort(PortValues):
             n_water=n_water,
         )
 
-    @property
-    def settings(self) -> dict[str, Any]:
-        """The settings of `CameraConfig` that design it."""
-        return {
-            "dome_radius_m": self.outer_radius_m,
-            "dome_centre_m": (self.dome_x_m, self.dome_y_m, self.dome_z_m),
-            "glass_thickness_m": self.glass_thickness_m,
-            "n_glass": self.n_glass,
-        }
-
     def __post_init__(self) -> None:
         super().__post_init__()
         inner = self.outer_radius_m - self.glass_thickness_m
@@ -107,11 +86,6 @@ class DomePort(PortValues):
                 f"camera: the pupil is {off * 1e3:g} mm from the dome's centre, outside its inner "
                 f"radius of {inner * 1e3:g} mm"
             )
-
-    @cached_property
-    def values(self) -> Array:
-        """(7,) as `parameters`."""
-        return np.array([getattr(self, name) for name in self.parameters])
 
     @property
     def refracts(self) -> bool:

@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -56,12 +56,6 @@ class FlatPort(PortValues):
     spreads: ClassVar[Mapping[str, float]] = {
         "port_distance_m": 0.02, **dict.fromkeys(_NORMAL, 0.05), "n_water": N_WATER_SPREAD
     }  # fmt: skip
-    labels: ClassVar[Mapping[str, str]] = {
-        "port_distance_m": "{} from the pupil",
-        "glass_thickness_m": "glass {}",
-        "n_glass": "index {}",
-        "n_water": "water {}",
-    }
 
     port_distance_m: float = 0.0
     """Distance from the entrance pupil to the inner glass, along the port's normal."""
@@ -90,15 +84,6 @@ class FlatPort(PortValues):
             n_water=n_water,
             normal=(x, y, float(np.sqrt(1.0 - x * x - y * y))),
         )
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """The settings of `CameraConfig` that design it, but for its tilt."""
-        return {
-            "port_distance_m": self.port_distance_m,
-            "glass_thickness_m": self.glass_thickness_m,
-            "n_glass": self.n_glass,
-        }
 
     def __post_init__(self) -> None:
         super().__post_init__()

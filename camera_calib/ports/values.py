@@ -1,17 +1,17 @@
 """What all ports have: the water behind them, and where they end."""
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar, Self
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar, Self
 
 import numpy as np
-from pydantic import ConfigDict
 
 from alice_survey.core.config import CameraConfig
 from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import Array
+from camera_calib.lenses.values import OpticalPart
 
 Vector = tuple[float, float, float]
 GLASS_AND_WATER: Mapping[str, tuple[float, float]] = {
@@ -25,20 +25,14 @@ N_WATER_SPREAD = 0.005
 
 
 @dataclass(frozen=True, kw_only=True)
-class PortValues(ABC):
-    """What stands between a lens and the water; rays are straight in the water.
+class PortValues(OpticalPart):
+    """What stands between a lens and the water, by itself nothing; rays are straight in the water.
 
     Axes are the camera's (right, down, forward) with the origin at the entrance pupil.
     """
 
-    __pydantic_config__ = ConfigDict(extra="forbid", strict=True)
-
     shape: ClassVar[str]
     """Its name in files."""
-    kind: ClassVar[int]
-    """Its number in kernels."""
-    parameters: ClassVar[tuple[str, ...]]
-    """Names of its parameters, ordered as its slopes."""
     ranges: ClassVar[Mapping[str, tuple[float, float]]] = {}
     """Least and largest values; the wall of a tank may be some metres away."""
     places: ClassVar[tuple[str, ...]] = ()
@@ -47,8 +41,6 @@ class PortValues(ABC):
     """Parameters that tilt it: sines of angles."""
     spreads: ClassVar[Mapping[str, float]] = {}
     """Standard deviations of parameters of a port of which only the kind is known."""
-    labels: ClassVar[Mapping[str, str]] = {}
-    """What each parameter is, with its value as `{}`; lengths are stated in millimetres."""
     needs_air: ClassVar[bool] = False
     """Whether views under water alone leave its place and the lens's focal length undetermined."""
 
@@ -56,58 +48,49 @@ class PortValues(ABC):
     """Full angle of a lens in air up to which it is trusted to be sharp."""
 
     @classmethod
-    @abstractmethod
     def guess(cls) -> Self:
         """A usual one, from which a calibration can start."""
+        return cls()
 
     @classmethod
-    @abstractmethod
     def from_design(cls, camera: CameraConfig, n_water: float) -> Self:
         """The port of a design, in water of an index."""
-
-    @property
-    @abstractmethod
-    def settings(self) -> dict[str, Any]:
-        """The settings of `CameraConfig` that design it; those of other kinds have no meaning."""
+        return cls()
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not all(map(math.isfinite, value if isinstance(value, tuple) else (value,))):
-                raise CalibrationError(f"camera: {field.name} = {value} is not finite")
-            if field.name not in self.ranges:
-                continue
-            minimum, maximum = self.ranges[field.name]
+        super().__post_init__()
+        for name, (minimum, maximum) in self.ranges.items():
+            value = getattr(self, name)
             if not minimum <= value <= maximum:
-                unit = " m" if field.name.endswith("_m") else ""
+                unit = " m" if name.endswith("_m") else ""
                 raise CalibrationError(
-                    f"camera: {field.name} = {value:g}: {minimum:g} to {maximum:g}{unit} allowed"
+                    f"camera: {name} = {value:g}: {minimum:g} to {maximum:g}{unit} allowed"
                 )
 
-    @property
-    @abstractmethod
+    @cached_property
     def values(self) -> Array:
         """Its parameters as kernels take them."""
+        return np.array([self.parameter(name) for name in self.parameters])
 
     @property
-    @abstractmethod
     def n_water(self) -> float:
-        """Index of refraction of the water."""
+        """Index of refraction of the water; 1 where nothing is known of what is looked through."""
+        return 1.0
 
     @property
-    @abstractmethod
     def refracts(self) -> bool:
         """Whether light bends at the port."""
+        return False
 
     @property
-    @abstractmethod
     def front_cam(self) -> Vector:
         """The foremost point of its outer surface; altitudes are measured from there."""
+        return 0.0, 0.0, 0.0
 
     @property
-    @abstractmethod
     def magnification(self) -> float:
         """How many times smaller small angles about the axis are in water than in air."""
+        return 1.0
 
     @property
     def axis_cam(self) -> Vector:
@@ -119,14 +102,14 @@ class PortValues(ABC):
         """(P, 3) changes of the parameters as the port moves by a metre along each axis."""
         return np.zeros((len(self.parameters), 3))
 
-    @abstractmethod
     def clearance(self, points_cam: Array) -> tuple[Array, Array]:
         """Distance (N,) of points (N, 3) beyond the outer surface, and its normals there (N, 3)."""
+        return points_cam[:, 2], np.tile(self.axis_cam, (len(points_cam), 1))
 
     @property
-    @abstractmethod
     def words(self) -> str:
         """What the port is, in a few words."""
+        return "no port"
 
     @property
     def estimated(self) -> tuple[str, ...]:
@@ -136,11 +119,3 @@ class PortValues(ABC):
     def minimum(self, name: str) -> float:
         """Least value of a parameter; minus infinity where it has none."""
         return self.ranges.get(name, (-math.inf, math.inf))[0]
-
-    def parameter(self, name: str) -> float:
-        """The value of one of `parameters`."""
-        return float(getattr(self, name))
-
-    def with_parameters(self, values: Mapping[str, float]) -> Self:
-        """The same port with some parameters set to other values."""
-        return replace(self, **{name: float(value) for name, value in values.items()})

@@ -7,9 +7,8 @@ shape of its squares, and to a cross along the edges where markers or bits stand
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Self
 
 import cv2
 import numpy as np
@@ -65,40 +64,45 @@ _TWO_OVER_ROOT_PI = 2.0 / math.sqrt(math.pi)
 class Corners:
     """Fitted corners."""
 
-    pixels: Array
-    """(N, 2) from the outer corner of the first pixel; NaN rows were not fitted."""
-    sigma_px: Array
-    """(N,) standard deviation of a coordinate, from the residuals of the fit; NaN as above."""
-    contrast: Array
-    """(N,) half the difference of black and white in linear light; above 0 where the square between
-    the ways back along both steps is black, below 0 where it is white; NaN as above."""
+    fits: Array
+    """(N, 4) pixel from the outer corner of the first one, standard deviation of a coordinate from
+    the residuals of the fit, contrast; NaN rows were not fitted."""
     states: NDArray[np.intp]
     """(N,) FITTED, a key of REASONS, or UNSEEN where there was nothing to start from."""
 
+    @property
+    def pixels(self) -> Array:
+        """(N, 2)."""
+        return self.fits[:, :2]
+
+    @property
+    def sigma_px(self) -> Array:
+        """(N,) standard deviations of a coordinate."""
+        return self.fits[:, 2]
+
+    @property
+    def contrast(self) -> Array:
+        """(N,) half the difference of black and white in linear light.
+
+        Above 0 where the square between the ways back along both steps is black, below 0 where it
+        is white.
+        """
+        return self.fits[:, 3]
+
     def take(self, order: NDArray[np.intp]) -> Self:
         """These corners in another order."""
-        return self._change(lambda values: values[order])
+        return replace(self, fits=self.fits[order], states=self.states[order])
 
     def with_fitted(self, again: Self) -> Self:
         """These corners, and of other fits of them those that succeeded."""
         found = again.states == FITTED
-        order = np.where(found, np.arange(len(found)) + len(found), np.arange(len(found)))
-        return self._change(lambda one, other: np.concatenate([one, other])[order], again)
-
-    def _change(self, change: Callable[..., Any], *others: Self) -> Self:
-        """All fields changed in the same way."""
-        values = zip(*(vars(one).values() for one in (self, *others)), strict=True)
-        return type(self)(**dict(zip(vars(self), (change(*v) for v in values), strict=True)))
+        fits = np.where(found[:, None], again.fits, self.fits)
+        return replace(self, fits=fits, states=np.where(found, again.states, self.states))
 
     def without(self, which: NDArray[np.bool_], state: int) -> Self:
         """These corners, but some of them unfitted for a reason."""
-        return replace(
-            self,
-            pixels=np.where(which[:, None], np.nan, self.pixels),
-            sigma_px=np.where(which, np.nan, self.sigma_px),
-            contrast=np.where(which, np.nan, self.contrast),
-            states=np.where(which, state, self.states),
-        )
+        fits = np.where(which[:, None], np.nan, self.fits)
+        return replace(self, fits=fits, states=np.where(which, state, self.states))
 
 
 def linear_light(picture: NDArray[np.uint8]) -> Array:
@@ -162,7 +166,7 @@ def fit_corners(
             around.lines, around.shades, which, _lines_in_window(steps, around.lines[which]), noise,
         )  # fmt: skip
         fits[inside, :2] += low
-    return Corners(pixels=fits[:, :2], sigma_px=fits[:, 2], contrast=fits[:, 3], states=states)
+    return Corners(fits=fits, states=states)
 
 
 def _windows(steps: Array, bends: Array, reach: float, arm: float) -> Array:

@@ -64,7 +64,8 @@ class Detection:
     """Points of a target found in one picture."""
 
     pixels: Array | None
-    """(N, 2) from the outer corner of the first pixel, NaN rows not found; None: not the target."""
+    """(N, 2) from the outer corner of the first pixel, in the order of the target's points, NaN
+    where not found; None: not the target."""
     sigma_px: Array | None = None
     """(N,) standard deviation of a coordinate, from the misfit of each corner."""
     refused: str | None = None
@@ -82,7 +83,7 @@ class Detection:
         )
 
 
-def detect(target: Target, picture: Picture) -> Array | None:
+def detect(target: Target, picture: Picture) -> Detection:
     """Find the points of a target.
 
     Args:
@@ -90,18 +91,9 @@ def detect(target: Target, picture: Picture) -> Array | None:
         picture: (H, W) or (H, W, 3) blue, green, red, as OpenCV reads it; 8 bits (encoded by the
             sRGB curve; a linear encoding shifts no corner) or 16 bits (linear).
 
-    Returns:
-        (N, 2) pixels from the outer corner of the first pixel, in the order of `target.points`; NaN
-        rows were not found. None when the target was not found.
-
     Raises:
         CalibrationError: the picture is of another kind than 8 or 16 bits, grey or colour.
     """
-    return detect_with_reasons(target, picture).pixels
-
-
-def detect_with_reasons(target: Target, picture: Picture) -> Detection:
-    """As `detect`, with rejected points and the reasons."""
     grey = as_grey(picture)
     poor = unusable(grey)
     if poor is not None:

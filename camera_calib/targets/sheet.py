@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from reportlab.lib import pagesizes
 from reportlab.lib.units import mm
 
 from alice_survey.core.artefacts import atomic_path
@@ -14,12 +15,9 @@ from camera_calib.targets.pattern import black_rectangles
 from camera_calib.targets.target import Target, parse_target, read_target, write_target
 
 PAPERS_MM = {
-    "A4": (210.0, 297.0),
-    "A3": (297.0, 420.0),
-    "A2": (420.0, 594.0),
-    "A1": (594.0, 841.0),
-    "A0": (841.0, 1189.0),
-    "letter": (215.9, 279.4),
+    name: (round(width / mm, 1), round(height / mm, 1))
+    for name in ("A4", "A3", "A2", "A1", "A0", "letter")
+    for width, height in [getattr(pagesizes, name)]
 }
 BAR_MM = 100.0
 _MARGIN_MM = 8.0

@@ -5,7 +5,7 @@ down along the columns, z into the board, away from the camera. Points are numbe
 the top left, as the board is read when it hangs upright.
 
 - A chessboard's points are its inner corners. The square at its top left is black wherever that can
-  be distinguished (see `Target.symmetries`).
+  be distinguished (see `Target.is_ambiguous`).
 - A ChArUco board is OpenCV's: its points are the inner corners too, and the markers, in the white
   squares, count row by row from the top left. `legacy` is the layout before OpenCV 4.6: boards with
   an even number of rows then begin with a white square.
@@ -33,7 +33,6 @@ from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import Array
 
 Kind = Literal["chessboard", "charuco", "apriltag"]
-Indices = NDArray[np.intp]
 
 FORMAT, VERSION = "alice-survey target", 1
 TAG_FAMILY = "DICT_APRILTAG_36h11"
@@ -161,21 +160,6 @@ class Target:
         around = self.size_m * (1.0 if self.spacing is None else self.spacing)
         return -around, -around, float(x) + around, float(y) + around
 
-    @cached_property
-    def symmetries(self) -> tuple[Indices, ...]:
-        """Other numberings of the points under which the target looks the same.
-
-        Each entry is an array of N indices: what was taken for point i may be point `entry[i]`.
-        Empty for targets with markers, and for chessboards of which one corner square is black and
-        its opposite white (an odd and an even count). A chessboard with two odd or two even counts
-        looks the same when turned by half a turn; with equal even counts by quarter turns too.
-        """
-        if self.kind != "chessboard" or (self.columns + self.rows) % 2:
-            return ()
-        grid = np.arange(self.columns * self.rows).reshape(self.rows, self.columns)
-        turns = (1, 2, 3) if self.columns == self.rows and self.columns % 2 == 0 else (2,)
-        return tuple(np.rot90(grid, turn).ravel() for turn in turns)
-
     @property
     def top_left_black(self) -> NDArray[np.bool_]:
         """(N,) whether the area above and left of a point is black; it is opposite below it."""
@@ -191,8 +175,13 @@ class Target:
 
     @property
     def is_ambiguous(self) -> bool:
-        """Whether the numbering is not unique: two cameras may number points differently."""
-        return bool(self.symmetries)
+        """Whether the numbering is not unique: two cameras may number points differently.
+
+        A chessboard with two odd or two even counts looks the same when turned by half a turn; one
+        with an odd and an even count, which has one black corner square and its opposite white,
+        does not, nor does any target with markers.
+        """
+        return self.kind == "chessboard" and (self.columns + self.rows) % 2 == 0
 
     @property
     def description(self) -> str:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.config import CameraConfig, WaterConfig
 from camera_calib.calibration import TargetView
+from camera_calib.freedom import POSE, value
 from camera_calib.rig import Rig, design_rig
 from tests.cameras import changed
 
@@ -147,27 +149,30 @@ def with_pixels(view: TargetView, camera: str, pixels: Array | None) -> TargetVi
     return replace(view, pixels=dict(rest) if pixels is None else {**rest, camera: pixels})
 
 
-def scene(
-    rig: Rig, count: int, seed: int = 1, noise_px: float = 0.1, **poses: float
-) -> list[TargetView]:
-    """Noisy views of the board in random poses (see `board_poses`)."""
+def posed_scene(
+    rig: Rig,
+    count: int,
+    seed: int | list[int] = 1,
+    noise_px: float = 0.1,
+    points: Array = BOARD,
+    **poses: float,
+) -> tuple[list[TargetView], RigidTransform]:
+    """Noisy views of a board in random poses (see `board_poses`), and these."""
     rng = np.random.default_rng(seed)
-    return views_of(rig, board_poses(rig, count, rng, **poses), noise_px, rng)  # type: ignore[arg-type]
+    found = board_poses(rig, count, rng, points=points, **poses)
+    return views_of(rig, found, noise_px, rng, points), found
+
+
+def scene(*arguments: Any, **options: Any) -> list[TargetView]:
+    """The views of `posed_scene`."""
+    return posed_scene(*arguments, **options)[0]
 
 
 def differences(found: Rig, truth: Rig) -> dict[str, float]:
-    """Found minus true values of all parameters that have a sigma."""
-    errors = {}
-    for key in found.sigmas:
-        name, field = key.split(".")
-        if field in ("rx_rad", "ry_rad", "rz_rad", "x_m", "y_m", "z_m"):
-            off = found.cam_from_rig[name] * truth.cam_from_rig[name].inv()
-            turn = off.rotation.as_rotvec()
-            shift = found.cam_from_rig[name].translation - truth.cam_from_rig[name].translation
-            values = dict(zip(("rx_rad", "ry_rad", "rz_rad"), turn, strict=True))
-            values |= dict(zip(("x_m", "y_m", "z_m"), shift, strict=True))
-            errors[key] = float(values[field])
-        else:
-            true = truth.cameras[name].parameter(field)
-            errors[key] = found.cameras[name].parameter(field) - true
+    """Found minus true values of all parameters that have a sigma; of turns, the turn between."""
+    errors = {name: value(found, name) - value(truth, name) for name in found.sigmas}
+    for name, pose in found.cam_from_rig.items():
+        turn = (pose.rotation * truth.cam_from_rig[name].rotation.inv()).as_rotvec()
+        between = {f"{name}.{axis}": float(one) for axis, one in zip(POSE, turn, strict=False)}
+        errors |= {key: one for key, one in between.items() if key in errors}
     return errors

@@ -19,7 +19,7 @@ from camera_calib.ports.flat import FlatPort
 from camera_calib.ports.none import NO_PORT
 from camera_calib.ports.values import PortValues
 from tests.cameras import changed
-from tests.oracles_camera import numeric_slope
+from tests.oracles_camera import assert_slopes
 from tests.oracles_dome import optical_path_slopes, ray_to, traced
 
 Array = NDArray[np.float64]
@@ -116,20 +116,7 @@ def test_slopes_are_those_of_project(lens: LensValues, port: PortValues) -> None
     axis = 1.3 * np.array(port.axis_cam)
     points = np.random.default_rng(2).uniform([-0.5, -0.5, 0.6], [0.5, 0.5, 3.0], (60, 3))
     points = np.vstack([points, axis, [0.0, 0.0, 2.0]])
-    pixels, by_point, by_parameter = camera.project_jacobian(points)
-
-    np.testing.assert_allclose(pixels, camera.project(points), atol=1e-9)
-    for k in range(3):
-        moved = numeric_slope(lambda h, a=k: camera.project(points + h * np.eye(3)[a]), 1e-3)
-        np.testing.assert_allclose(by_point[..., k], moved, rtol=1e-6, atol=1e-4)
-    for i, name in enumerate(camera.parameters):
-        step = 0.1 if name.endswith("_px") else 1e-4
-        value = camera.parameter(name)
-        moved = numeric_slope(
-            lambda h, n=name, v=value: camera.with_parameters({n: v + h}).project(points), step
-        )
-        scale = 1e-8 * max(1.0, float(np.abs(moved).max())) + 1e-9 / step
-        np.testing.assert_allclose(by_parameter[..., i], moved, rtol=1e-6, atol=scale, err_msg=name)
+    assert_slopes(camera, points, dict.fromkeys(("fx_px", "fy_px", "cx_px", "cy_px"), 0.1))
 
 
 @settings(deadline=None, max_examples=60)
@@ -137,17 +124,7 @@ def test_slopes_are_those_of_project(lens: LensValues, port: PortValues) -> None
 def test_slopes_through_a_dome_are_those_of_project(port: DomePort) -> None:
     camera = camera_of(FISHEYE, changed_radius(port))
     points = np.random.default_rng(3).uniform([-0.5, -0.5, 0.4], [0.5, 0.5, 3.0], (20, 3))
-    _, by_point, by_parameter = camera.project_jacobian(points)
-    for k in range(3):
-        moved = numeric_slope(lambda h, a=k: camera.project(points + h * np.eye(3)[a]), 1e-3)
-        np.testing.assert_allclose(by_point[..., k], moved, rtol=1e-6, atol=1e-3)
-    for name in port.parameters:
-        i, value = camera.parameters.index(name), camera.parameter(name)
-        moved = numeric_slope(
-            lambda h, n=name, v=value: camera.with_parameters({n: v + h}).project(points), 1e-4
-        )
-        scale = 1e-7 * max(1.0, float(np.abs(moved).max()))
-        np.testing.assert_allclose(by_parameter[..., i], moved, rtol=1e-5, atol=scale, err_msg=name)
+    assert_slopes(camera, points, dict.fromkeys(("fx_px", "fy_px", "cx_px", "cy_px"), 0.1))
 
 
 def changed_radius(port: DomePort) -> DomePort:

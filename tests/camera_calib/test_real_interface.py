@@ -50,7 +50,9 @@ def lens_in_air(folder: Path) -> Camera:
     """OpenCV's rational model from the product's corners of a chessboard in air."""
     target = parse_target("chessboard 9x6 9.35mm")
     pictures = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in sorted(folder.iterdir())]
-    pixels = [found for picture in pictures if (found := detect(target, picture)) is not None]
+    pixels = [
+        found for picture in pictures if (found := detect(target, picture).pixels) is not None
+    ]
     height, width = pictures[0].shape
     views = [np.isfinite(found).all(axis=1) for found in pixels]
     points = [(target.points[seen] / 0.1).astype(np.float32) for seen in views]

@@ -6,8 +6,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.errors import CalibrationError
-from camera_calib.triangulate import nearest_to_rays, reproject, triangulate
-from tests.cameras import changed, flat_port_camera
+from camera_calib.triangulate import nearest_to_rays, rays_world, reproject, triangulate
+from tests.cameras import MANTA, changed
 from tests.oracles_interface import (
     LENS,
     nearest_slowly,
@@ -18,20 +18,9 @@ from tests.oracles_interface import (
 
 Array = NDArray[np.float64]
 
-UNDERWATER = flat_port_camera(
-    width_px=3384,
-    height_px=2710,
-    fx_px=3388.0,
-    fy_px=3390.0,
-    cx_px=1692.0,
-    cy_px=1355.0,
-    k1=-0.1,
-    k2=0.05,
-    k4=0.02,
-    s1=1e-3,
-    port_distance_m=0.02,
-    glass_thickness_m=0.01,
-).with_parameters({"normal_x": 0.03, "normal_y": -0.05})
+UNDERWATER = changed(MANTA, fy_px=3390.0, k1=-0.1, k2=0.05, k4=0.02, s1=1e-3).with_parameters(
+    {"normal_x": 0.03, "normal_y": -0.05}
+)
 
 
 def stereo(cameras: int = 2) -> list[RigidTransform]:
@@ -44,6 +33,11 @@ def stereo(cameras: int = 2) -> list[RigidTransform]:
     ]
 
 
+def seen(points: Array, cameras: int, noise_px: Array | float = 0.0) -> Array:
+    """Pixels of points in cameras in a row."""
+    return reproject([UNDERWATER] * cameras, stereo(cameras), points) + noise_px
+
+
 def seafloor(rng: np.random.Generator, count: int) -> Array:
     return np.column_stack([rng.uniform(-0.2, 0.5, (count, 2)), rng.uniform(1.2, 2.6, count)])
 
@@ -51,14 +45,10 @@ def seafloor(rng: np.random.Generator, count: int) -> Array:
 @pytest.mark.parametrize("cameras", [2, 3, 5])
 def test_exact_pixels_give_back_the_points(cameras: int) -> None:
     points = seafloor(np.random.default_rng(1), 500)
-    poses = stereo(cameras)
 
-    found = triangulate(
-        [UNDERWATER] * cameras, poses, reproject([UNDERWATER] * cameras, poses, points)
-    )
+    found = triangulate([UNDERWATER] * cameras, stereo(cameras), seen(points, cameras))
 
     np.testing.assert_allclose(found.points_world, points, atol=1e-11)
-    np.testing.assert_allclose(found.nearest_world, points, atol=1e-9)
     assert np.abs(found.residuals_px).max() < 1e-8
 
 
@@ -103,21 +93,20 @@ def test_converges_even_where_rays_miss_by_hundreds_of_pixels() -> None:
     found = tank.triangulate(pixels)
 
     assert np.isfinite(found.points_world).all()
+    nearest = nearest_to_rays(*rays_world(tank.cameras, tank.poses, pixels))
     for i in range(len(points)):
-        slow = triangulate_slowly(tank.cameras, tank.poses, pixels[:, i], found.nearest_world[i])
+        slow = triangulate_slowly(tank.cameras, tank.poses, pixels[:, i], nearest[i])
         np.testing.assert_allclose(found.points_world[i], slow, atol=1e-6)
 
 
 @pytest.mark.parametrize("sigma_px", [0.3, [0.2, 0.8, 0.4]])
 def test_sigmas_are_true(sigma_px: float | list[float]) -> None:
     rng = np.random.default_rng(5)
-    points, poses = seafloor(rng, 4000), stereo(3)
+    points = seafloor(rng, 4000)
     sigmas = np.broadcast_to(sigma_px, 3)
     noise = rng.normal(0.0, 1.0, (3, 4000, 2)) * sigmas[:, None, None]
 
-    found = triangulate(
-        [UNDERWATER] * 3, poses, reproject([UNDERWATER] * 3, poses, points) + noise, sigma_px
-    )
+    found = triangulate([UNDERWATER] * 3, stereo(3), seen(points, 3, noise), sigma_px)
 
     error = found.points_world - points
     normalised = np.sqrt(np.mean((error / found.sigmas_m) ** 2, axis=0))
@@ -131,7 +120,7 @@ def test_sigmas_are_true(sigma_px: float | list[float]) -> None:
 def test_a_camera_that_does_not_see_a_point_does_not_count() -> None:
     rng = np.random.default_rng(6)
     points, poses = seafloor(rng, 30), stereo(3)
-    pixels = reproject([UNDERWATER] * 3, poses, points) + rng.normal(0.0, 1.0, (3, 30, 2))
+    pixels = seen(points, 3, rng.normal(0.0, 1.0, (3, 30, 2)))
     pixels[1, :10] = np.nan
     pixels[1:, 10:20] = np.nan
 
@@ -190,12 +179,13 @@ def test_bad_input_is_one_clear_line(pixels: Array, poses: int, sigma: float, na
 def test_least_squares_is_never_worse_than_the_midpoint() -> None:
     rng = np.random.default_rng(4)
     points, poses = seafloor(rng, 2000), stereo()
-    pixels = reproject([UNDERWATER] * 2, poses, points) + rng.normal(0.0, 5.0, (2, 2000, 2))
+    pixels = seen(points, 2, rng.normal(0.0, 5.0, (2, 2000, 2)))
 
     found = triangulate([UNDERWATER] * 2, poses, pixels)
 
     best = (found.residuals_px**2).sum(axis=(0, 2))
-    middle = (found.nearest_residuals_px**2).sum(axis=(0, 2))
+    nearest = nearest_to_rays(*rays_world([UNDERWATER] * 2, poses, pixels))
+    middle = ((reproject([UNDERWATER] * 2, poses, nearest) - pixels) ** 2).sum(axis=(0, 2))
     assert np.all(best <= middle + 1e-9)
     assert np.any(best < 0.99 * middle)
 

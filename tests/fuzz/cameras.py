@@ -210,7 +210,7 @@ _FILES = (
     ("Metashape XML", "text", "a.xml", _write("metashape", _one), read_calibration),
 )
 _IN_FOLDERS = (
-    ("ROS camera_info", "text", "ros/left.yaml", "ros", _in_air, "ros"),
+    ("ROS camera_info", "text", "ros/left.yaml", "ros", _one, "ros/left.yaml"),
     ("COLMAP cameras.txt", "text", "m/cameras.txt", "colmap", _in_air, "m"),
     ("COLMAP cameras.bin", "binary", "m/cameras.bin", "colmap", _in_air, "m/cameras.bin"),
     ("COLMAP rig_config.json", "json", "m/rig_config.json", "colmap", _in_air, "m"),

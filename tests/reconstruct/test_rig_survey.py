@@ -58,7 +58,7 @@ def check_calibration(folder: Path, rig: Rig) -> None:
         for name in NAMES[1:]:
             assert f"baseline from wide to {name}" in said
             assert f"baseline to {name}" in page
-    assert "--camera wide=FOLDER --camera tele=FOLDER" in (folder / "air.txt").read_text()
+    assert "--water --glass MM --start" in (folder / "air.txt").read_text()
 
 
 @pytest.mark.slow

@@ -87,7 +87,15 @@ class ConvertCommand(ReportCommand):
         """Read, change and write."""
         from camera_calib.formats.convert import Conversion, convert
         from camera_calib.formats.rigs import ReadOptions
+        from camera_calib.ports.dome import DomePort
 
+        centre_mm = self.dome_centre or (None, None, None)
+        lengths = zip(
+            (*DomePort.places, "outer_radius_m", "port_distance_m", "glass_thickness_m"),
+            (*centre_mm, self.dome_radius, self.port_distance, self.glass), strict=True,
+        )  # fmt: skip
+        port = {name: None if mm is None else mm / 1e3 for name, mm in lengths}
+        port |= {"n_glass": self.n_glass, "n_water": self.n_water}
         task = Conversion(
             source=self.source, target=self.target, source_format=self.source_format,
             target_format=self.target_format,
@@ -96,9 +104,8 @@ class ConvertCommand(ReportCommand):
                 metres_per_unit=self.unit_m, camera=self.camera, lens=self.lens,
             ),
             names=tuple(self.names.split(",")) if self.names else (),
-            port_distance_mm=self.port_distance, dome_radius_mm=self.dome_radius,
-            dome_centre_mm=self.dome_centre, glass_mm=self.glass, n_glass=self.n_glass,
-            n_water=self.n_water, mount=self.mount, lever_m=self.lever, water=self.water,
+            port={name: value for name, value in port.items() if value is not None},
+            mount=self.mount, lever_m=self.lever, water=self.water,
             drop_port=self.drop_port, drop_covariance=self.drop_covariance,
             overwrite=self.overwrite,
         )  # fmt: skip

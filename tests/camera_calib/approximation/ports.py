@@ -3,11 +3,9 @@
 import math
 
 from camera_calib.camera import Camera
-from tests.cameras import changed, flat_port_camera
+from tests.cameras import MANTA, changed
 
-CAMERA = flat_port_camera(
-    width_px=3384, height_px=2710, fx_px=3388.0, fy_px=3388.0, cx_px=1692.0, cy_px=1355.0,
-)  # fmt: skip
+CAMERA = changed(MANTA, port_distance_m=0.0, glass_thickness_m=0.0)
 STUDY = [
     # port mm, glass mm: at the pupil px, at the best point px, shift mm, tilted by 2 degrees px
     (5, 6, 0.18, 0.014, 1.3, 0.015),

@@ -41,6 +41,7 @@ from tests.camera_calib.calibration_scenes import (
     board_poses,
     built_rig,
     in_air,
+    posed_scene,
     scene,
     tilted,
     views_of,
@@ -94,10 +95,9 @@ def test_the_linear_part_of_errors_is_nearly_all_and_has_the_bound_as_covariance
 def small_problem(
     noise_px: float, seed: int
 ) -> tuple[list[TargetView], np.ndarray, Rig, RigidTransform]:
-    rng = np.random.default_rng(seed)
     points = board(5, 4, 0.08)
-    poses = board_poses(TRUTH, 8, rng, points=points)
-    return views_of(TRUTH, poses, noise_px, rng, points), points, TRUTH, poses
+    views, poses = posed_scene(TRUTH, 8, seed, noise_px, points)
+    return views, points, TRUTH, poses
 
 
 def vector_misses(
@@ -176,8 +176,7 @@ def test_it_finds_the_minimum_and_the_covariance_that_a_plain_solver_finds() -> 
 
 
 def test_without_noise_everything_is_recovered_from_the_design() -> None:
-    poses = board_poses(TRUTH, 15, np.random.default_rng(1))
-    views = views_of(TRUTH, poses, 0.0, np.random.default_rng(1))
+    views = scene(TRUTH, 15, noise_px=0.0)
     found = [pose for pose in locate_all(DESIGN, views, BOARD) if pose is not None]
 
     solved = adjust(
@@ -282,9 +281,7 @@ def test_a_port_at_the_pupil_stays_there() -> None:
     flat = with_values(TRUTH, dict.fromkeys(of_cameras(TRUTH, ("port_distance_m",)), 0.0))
     ends = []
     for seed in range(6):
-        rng = np.random.default_rng([2, seed])
-        poses = board_poses(flat, 8, rng)
-        views = views_of(flat, poses, 0.5, rng)
+        views, poses = posed_scene(flat, 8, [2, seed], 0.5)
         found = adjust(views, BOARD, TRUTH, poses, Freedom(free=PORTS)).rig
         ends += [camera.parameter("port_distance_m") for camera in found.cameras.values()]
     assert min(ends) == 0.0
@@ -345,10 +342,8 @@ def test_a_start_from_which_points_leave_the_model_does_not_pass_as_settled() ->
         body_from_rig=RigidTransform.identity(),
         source="tank",
     )
-    rng = np.random.default_rng(1)
-    poses = board_poses(truth, 3, rng, near_m=0.6, far_m=0.65, points=board(5, 4, 0.03))
     points = board(5, 4, 0.03)
-    views = views_of(truth, poses, 0.3, rng, points)
+    views, poses = posed_scene(truth, 3, 1, 0.3, points, near_m=0.6, far_m=0.65)
     free = Freedom(free=("tank.glass_thickness_m", "tank.normal_x", "tank.normal_y"))
 
     good = adjust(views, points, with_values(truth, {"tank.glass_thickness_m": 0.2}), poses, free)

@@ -30,6 +30,7 @@ from tests.camera_calib.calibration_scenes import (
     board_poses,
     built_rig,
     in_air,
+    posed_scene,
     scene,
     views_of,
     with_pixels,
@@ -61,10 +62,8 @@ def behind_ports(air: Rig) -> Rig:
 
 
 def test_in_air_from_nothing() -> None:
-    rng = np.random.default_rng(2)
     air = in_air(TRUTH)
-    poses = board_poses(air, 20, rng)
-    found = calibrate_in_air(views_of(air, poses, NOISE_PX, rng), BOARD, SIZES)
+    found = calibrate_in_air(scene(air, 20, seed=2), BOARD, SIZES)
 
     assert found.rms_px == pytest.approx(NOISE_PX * np.sqrt(2), rel=0.05)
     assert found.noise_px == pytest.approx(NOISE_PX, rel=0.05)
@@ -183,9 +182,7 @@ def test_a_pool_calibration_holds_in_the_sea() -> None:
 
 
 def test_outliers_are_left_out_and_named() -> None:
-    rng = np.random.default_rng(3)
-    poses = board_poses(TRUTH, 12, rng)
-    views = views_of(TRUTH, poses, NOISE_PX, rng)
+    views = scene(TRUTH, 12, seed=3)
     spoiled = views[0].pixels["left"].copy()
     spoiled[::9] += 25.0
     wrong = views[3].pixels["right"][::-1].copy()
@@ -240,7 +237,6 @@ def test_views_of_one_camera_and_partial_boards_take_part() -> None:
 
 def test_three_cameras_joined_in_a_chain() -> None:
     """The third camera shares views with the second only."""
-    rng = np.random.default_rng(9)
     air = in_air(TRUTH)
     third = RigidTransform.from_translation([-0.2, 0.0, 0.0])
     rig = replace(
@@ -248,10 +244,9 @@ def test_three_cameras_joined_in_a_chain() -> None:
         cameras={**air.cameras, "far": air.cameras["left"]},
         cam_from_rig={**air.cam_from_rig, "far": third},
     )
-    poses = board_poses(rig, 24, rng, near_m=1.2)
     views = [
         with_pixels(view, "far" if v % 2 else "left", None)
-        for v, view in enumerate(views_of(rig, poses, NOISE_PX, rng))
+        for v, view in enumerate(scene(rig, 24, seed=9, near_m=1.2))
     ]
     sizes = {**SIZES, "far": SIZES["left"]}
     found = calibrate_in_air(views, BOARD, sizes, "opencv4").rig
@@ -261,9 +256,7 @@ def test_three_cameras_joined_in_a_chain() -> None:
 
 
 def test_parts_of_the_views_calibrate_alike_and_a_view_is_located() -> None:
-    rng = np.random.default_rng(10)
-    poses = board_poses(TRUTH, 16, rng)
-    views = views_of(TRUTH, poses, NOISE_PX, rng)
+    views, poses = posed_scene(TRUTH, 16, seed=10)
     whole = calibrate_through_ports(views, BOARD, DESIGN, "free")
     half = recalibrate(whole, whole.views[::2])
     assert half.rig.covariance is not None
@@ -277,23 +270,19 @@ def test_parts_of_the_views_calibrate_alike_and_a_view_is_located() -> None:
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 0.3])
 def test_views_that_face_one_way_are_refused(tilt_deg: float) -> None:
-    rng = np.random.default_rng(1)
-    air = in_air(TRUTH)
-    poses = board_poses(air, 8, rng, near_m=1.0, far_m=1.2, tilt_deg=tilt_deg)
+    views = scene(in_air(TRUTH), 8, near_m=1.0, far_m=1.2, tilt_deg=tilt_deg)
     with pytest.raises(CalibrationError):
-        calibrate_in_air(views_of(air, poses, NOISE_PX, rng), BOARD, SIZES)
+        calibrate_in_air(views, BOARD, SIZES)
 
 
 def test_weak_views_give_warnings_that_name_what_is_missing() -> None:
-    rng = np.random.default_rng(1)
-    poses = board_poses(TRUTH, 8, rng, near_m=1.5, far_m=1.6, tilt_deg=8.0)
-    weak = calibrate_through_ports(views_of(TRUTH, poses, NOISE_PX, rng), BOARD, TRUTH, "free")
+    views = scene(TRUTH, 8, near_m=1.5, far_m=1.6, tilt_deg=8.0)
+    weak = calibrate_through_ports(views, BOARD, TRUTH, "free")
     assert len(weak.warnings) >= 6
     lines = "\n".join(weak.warnings)
     assert "8 views" in lines and "left.port_distance_m" in lines
 
-    strong_views = views_of(TRUTH, board_poses(TRUTH, 30, rng), NOISE_PX, rng)
-    strong = calibrate_through_ports(strong_views, BOARD, TRUTH, "held")
+    strong = calibrate_through_ports(scene(TRUTH, 30), BOARD, TRUTH, "held")
     assert strong.warnings == ()
 
 
@@ -387,9 +376,8 @@ def test_sharp_pictures_weigh_more_than_dull_ones() -> None:
 
 @pytest.mark.parametrize("blind", ["left", "right"])
 def test_a_view_of_one_camera_of_two_is_located(blind: str) -> None:
-    rng = np.random.default_rng(8)
-    poses = board_poses(TRUTH, 1, rng)
-    view = with_pixels(views_of(TRUTH, poses, 0.0, rng)[0], blind, None)
+    views, poses = posed_scene(TRUTH, 1, seed=8, noise_px=0.0)
+    view = with_pixels(views[0], blind, None)
     apart = locate(TRUTH, view, BOARD).inv() * poses[0]
     assert np.linalg.norm(apart.translation) < 1e-6
     assert apart.rotation.magnitude() < 1e-6

@@ -154,7 +154,9 @@ def test_halves_of_the_views_agree_by_their_covariances() -> None:
         agreement = halves_agreement((first, second))
         found.append(agreement.chi2 / agreement.parameters)
         assert 0.0 < agreement.p_value < 1.0
-        alone.append(first.spread.noise.together_share if first.spread else 0.0)
+        assert first.spread is not None
+        noise = first.spread.noise
+        alone.append(noise.together.sum() / (noise.alone + noise.together.sum()))
     # Chi-squared with 90 degrees of freedom: a sigma of 15 %.
     assert 0.6 < np.mean(found) < 1.5
     assert 0.2 < np.mean(alone) < 0.8

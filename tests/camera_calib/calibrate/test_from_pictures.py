@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from camera_calib.calibrate.detect_views import detect_views
 from camera_calib.calibrate.from_pictures import calibrate_pictures, calibrate_task
 from camera_calib.calibrate.options import CalibrateOptions
 from camera_calib.calibrate.picture_sets import find_pictures, pair_pictures
+from camera_calib.formats.rigs import only, rename_cameras
 from camera_calib.rig import Rig, read_rig, write_rig
 from camera_calib.targets.target import parse_target
 from tests.camera_calib.calibration_scenes import built_rig, in_air
@@ -28,12 +30,7 @@ BOARD = "chessboard 9x6 1m"
 
 def small(rig: Rig) -> Rig:
     """The same rig at a sixth of the resolution."""
-    return Rig(
-        cameras={name: camera.downscale(6) for name, camera in rig.cameras.items()},
-        cam_from_rig=rig.cam_from_rig,
-        body_from_rig=rig.body_from_rig,
-        source="truth",
-    )
+    return replace(rig, cameras={name: c.downscale(6) for name, c in rig.cameras.items()})
 
 
 def shoot(folder: Path, rig: Rig, views: int, seed: int) -> None:
@@ -239,46 +236,13 @@ def refuses(settings: CalibrateOptions, tmp_path: Path) -> str:
     return str(caught.value)
 
 
-def write_noise(folder: Path, names: list[str], size: tuple[int, int] = (120, 90)) -> None:
-    folder.mkdir(parents=True)
-    rng = np.random.default_rng(1)
-    for name in names:
-        cv2.imwrite(str(folder / name), rng.integers(0, 255, size[::-1], dtype=np.uint8))
-
-
-@pytest.mark.parametrize("wrong", ["chessboard 12x8 40mm", "chessboard 6x5 40mm"])
-def test_a_board_of_another_size(wrong: str, dry: Path, tmp_path: Path) -> None:
-    for view in range(3):
-        (tmp_path / "few").mkdir(exist_ok=True)
-        shutil.copy(dry / "left" / f"{view:02d}.png", tmp_path / "few")
-    settings = CalibrateOptions(**one(tmp_path / "few"), target=wrong)
-    message = refuses(settings, tmp_path)
-    assert "11x8" in message
-    assert wrong.split()[1] in message
-
-
-def test_mixed_sizes(dry: Path, tmp_path: Path) -> None:
-    shutil.copytree(dry / "left", tmp_path / "mixed")
-    odd = cv2.imread(str(tmp_path / "mixed" / "04.png"))
-    cv2.imwrite(str(tmp_path / "mixed" / "04.png"), odd[:-20, :-30])
-    settings = CalibrateOptions(**one(tmp_path / "mixed"), target=POOL_BOARD)
-    message = refuses(settings, tmp_path)
-    for named in ("564 x 451", "534 x 431", "04.png"):
-        assert named in message
-
-
-def test_a_start_of_another_size(dry: Path, tmp_path: Path) -> None:
-    write_rig(tmp_path / "rig.json", built_rig())
-    settings = CalibrateOptions(
-        **both(dry), target=POOL_BOARD, water=True, start=tmp_path / "rig.json"
-    )
-    message = refuses(settings, tmp_path)
-    assert "564 x 451" in message and "3384 x 2710" in message
-
-
 @pytest.mark.parametrize(
     ("options", "named"),
     [
+        ({"target": "chessboard 12x8 40mm"}, "11x8"),
+        ({"target": "chessboard 6x5 40mm"}, "11x8"),
+        ({"cameras": ("camera=MIXED",)}, "534 x 431 px (such as 04.png)"),
+        ({"water": True, "start": Path("built.json")}, "start's camera 3384 x 2710"),
         ({"glass_mm": "10"}, "--glass"),
         ({"water": True}, "--glass"),
         ({"water": True, "known": "prior", "glass_mm": "10"}, "--start"),
@@ -286,56 +250,56 @@ def test_a_start_of_another_size(dry: Path, tmp_path: Path) -> None:
         ({"target": "chessboard"}, "chessboard"),
         ({"start": Path("nowhere.json")}, "nowhere.json"),
         ({"cameras": ("left=none*.png",)}, "none"),
+        ({"cameras": ("left=DRY/left", "right=DRY/left")}, "left and right have the same picture"),
+        ({"cameras": ("bow",)}, "NAME=FOLDER"),
+        ({"cameras": ("b.c=x",)}, "b.c=x"),
+        ({"cameras": ("a=x", "a=y")}, "two cameras are called a"),
+        ({"cameras": tuple(f"c{i}=x" for i in range(9))}, "9 cameras"),
+        ({"cameras": ()}, "--pictures"),
+        ({"target": None}, "--target"),
     ],
 )
-def test_options_that_do_not_go_together(
-    options: dict[str, object], named: str, dry: Path, tmp_path: Path
+def test_what_gives_no_calibration_is_one_clear_line(
+    options: dict[str, Any], named: str, dry: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    fields: dict[str, object] = {**both(dry), "target": POOL_BOARD, **options}
-    assert named in refuses(CalibrateOptions(**fields), tmp_path)  # type: ignore[arg-type]
+    """Boards, sizes, starts, lists and options; a folder of three pictures unless they say."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "DRY").symlink_to(dry)
+    (tmp_path / "few").mkdir()
+    for view in range(3):
+        shutil.copy(dry / "left" / f"{view:02d}.png", tmp_path / "few")
+    shutil.copytree(dry / "left", tmp_path / "MIXED")
+    odd = cv2.imread("MIXED/04.png")
+    cv2.imwrite("MIXED/04.png", odd[:-20, :-30])
+    write_rig(tmp_path / "built.json", renamed(built_rig()))
+    usual = {"cameras": ("camera=few",), "target": POOL_BOARD}
+    assert named in refuses(CalibrateOptions(**usual | options), tmp_path)
 
 
-@pytest.mark.parametrize(
-    "given",
-    [{"cameras": ()}, {"target": None}, {"output": None}, {"cameras": ("left=a", "left=b")}],
-)
-def test_commands_that_lack_something(given: dict[str, object]) -> None:
-    usual: dict[str, object] = {**one(Path("c")), "target": BOARD, "output": Path("out")}
-    options = usual | given
-    with pytest.raises(AliceError):
-        calibrate_pictures(CalibrateOptions(**options))  # type: ignore[arg-type]
+def renamed(rig: Rig) -> Rig:
+    """Its left camera alone, as `camera`."""
+    return rename_cameras(only(rig, "left"), ["camera"])
 
 
-def test_a_folder_with_other_files_is_not_overwritten(dry: Path, tmp_path: Path) -> None:
+def test_what_others_need_is_not_replaced(tmp_path: Path) -> None:
+    """Other files, a file in the folder's place, and the start itself."""
+    settings = CalibrateOptions(**one(Path("nowhere")), target=BOARD)
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "thesis.tex").write_text("years of work")
-    settings = CalibrateOptions(**both(dry), target=POOL_BOARD)
-    with pytest.raises(AliceError):
-        calibrate_pictures(replace(settings, output=tmp_path / "out"), executor=SERIAL)
     (tmp_path / "out" / "calibration.json").write_text("{}")
-    with pytest.raises(AliceError, match=r"thesis\.tex"):
-        calibrate_pictures(replace(settings, output=tmp_path / "out"), executor=SERIAL)
-    assert (tmp_path / "out" / "thesis.tex").read_text() == "years of work"
-
-
-def test_a_place_that_cannot_be_a_folder_is_refused_at_once(tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("mine")
-    settings = CalibrateOptions(**one(tmp_path), target=BOARD)
-    for output in (tmp_path / "taken", Path()):
-        with pytest.raises(AliceError):
-            calibrate_pictures(replace(settings, output=output), executor=SERIAL)
-    assert (tmp_path / "taken").read_text() == "mine"
-
-
-def test_a_start_is_not_replaced_by_what_it_gives(tmp_path: Path) -> None:
     (tmp_path / "air").mkdir()
     write_rig(tmp_path / "air" / "rig.json", built_rig())
-    settings = CalibrateOptions(
-        **one(Path("nowhere")), target=BOARD, start=tmp_path / "air" / "rig.json"
-    )
-    with pytest.raises(AliceError, match="--start"):
-        calibrate_pictures(replace(settings, output=tmp_path / "air"), executor=SERIAL)
-    assert (tmp_path / "air" / "rig.json").is_file()
+    start = tmp_path / "air" / "rig.json"
+    for name, named in (
+        (None, "-o"), ("out", "thesis.tex"), ("taken", "taken"), ("..", "-o"), ("air", "--start"),
+    ):  # fmt: skip
+        output = None if name is None else tmp_path / name
+        with pytest.raises(AliceError, match=re.escape(named)):
+            calibrate_pictures(replace(settings, output=output, start=start), executor=SERIAL)
+    assert (tmp_path / "out" / "thesis.tex").read_text() == "years of work"
+    assert (tmp_path / "taken").read_text() == "mine"
+    assert start.is_file()
 
 
 def test_swapped_lists_are_reported_first(dry: Path, tmp_path: Path) -> None:
@@ -346,12 +310,6 @@ def test_swapped_lists_are_reported_first(dry: Path, tmp_path: Path) -> None:
         first = json.loads((tmp_path / "out" / "report.json").read_text())["verdicts"][0]
         assert (first["level"] == "bad" and " 100 mm " in first["text"]) == is_bad
         assert (text.splitlines()[0] == f"bad: {first['text']}") == is_bad
-
-
-def test_the_same_folder_twice_is_one_clear_line(dry: Path, tmp_path: Path) -> None:
-    twice = (f"left={dry / 'left'}", f"right={dry / 'left'}")
-    message = refuses(CalibrateOptions(cameras=twice, target=POOL_BOARD), tmp_path)
-    assert "left and right have the same picture" in message
 
 
 @pytest.mark.usefixtures("quick")
@@ -386,16 +344,3 @@ def test_a_camera_of_which_most_pictures_do_not_fit_is_no_calibration(
         calibrate_pictures(replace(settings, output=tmp_path / "out"), executor=SERIAL)
     assert len(str(caught.value).splitlines()) == 1
     assert (tmp_path / "out" / "report.json").is_file()
-
-
-@pytest.mark.parametrize(
-    ("cameras", "named"),
-    [
-        (("bow",), "NAME=FOLDER"),
-        (("b.c=x",), "b.c=x"),
-        (("a=x", "a=y"), "two cameras are called a"),
-        (tuple(f"c{i}=x" for i in range(9)), "9 cameras"),
-    ],
-)
-def test_cameras_that_cannot_be(cameras: tuple[str, ...], named: str, tmp_path: Path) -> None:
-    assert named in refuses(CalibrateOptions(cameras=cameras, target=POOL_BOARD), tmp_path)

@@ -2,9 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
-import numpy as np
 import pytest
 
 from alice_survey.core.errors import CalibrationError
@@ -20,7 +18,7 @@ from camera_calib.ports.flat import FlatPort
 from camera_calib.ports.values import PortValues
 from camera_calib.rig import Rig
 from camera_calib.targets.target import parse_target
-from tests.camera_calib.calibration_scenes import BOARD, board_poses, built_rig, in_air, views_of
+from tests.camera_calib.calibration_scenes import BOARD, built_rig, in_air, scene
 
 TRUTH = built_rig()
 TARGET = parse_target("chessboard 11x8 30mm")
@@ -34,23 +32,17 @@ OFF = replace(CENTRED, dome_x_m=0.002, dome_z_m=0.006)
 
 @cache
 def dry() -> Rig:
-    rng = np.random.default_rng(4)
-    air = in_air(TRUTH)
-    return calibrate_in_air(
-        views_of(air, board_poses(air, 12, rng), NOISE_PX, rng), BOARD, SIZES
-    ).rig
+    return calibrate_in_air(scene(in_air(TRUTH), 12, seed=4), BOARD, SIZES).rig
 
 
 def through(port: PortValues) -> Detections:
-    rng = np.random.default_rng(5)
     wet = replace(TRUTH, cameras={n: replace(c, port=port) for n, c in TRUTH.cameras.items()})
-    views = views_of(wet, board_poses(wet, 10, rng), NOISE_PX, rng)
-    return Detections(views=tuple(views), sizes=SIZES, rejections=())
+    return Detections(views=tuple(scene(wet, 10, seed=5)), sizes=SIZES, rejections=())
 
 
 def calibrated(options: CalibrateOptions, found: Detections) -> Calibration:
     places = dict.fromkeys(SIZES, "pictures")
-    return calibrate_task(task_of(options, places, Path("out"), TARGET, dry()), found)
+    return calibrate_task(task_of(options, places, TARGET, dry()), found)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """Rigs of many cameras, of other sizes, lenses and directions: from corners, and from pictures."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -69,7 +68,7 @@ def seen_by(truth: Rig, count: int, rng: np.random.Generator) -> Detections:
 
 
 def calibrated(options: CalibrateOptions, found: Detections, start: Rig | None) -> Calibration:
-    task = task_of(options, dict.fromkeys(found.sizes, "pictures"), Path("out"), TARGET, start)
+    task = task_of(options, dict.fromkeys(found.sizes, "pictures"), TARGET, start)
     return calibrate_task(task, found)
 
 
@@ -178,7 +177,7 @@ def test_four_lenses_behind_four_ports_are_found_in_air_and_then_in_water() -> N
 def test_a_wrong_port_or_number_of_one_is_named(given: dict[str, Any], fault: str) -> None:
     places = dict.fromkeys(four_cameras().cameras, "pictures")
     with pytest.raises(CalibrationError, match=fault):
-        task_of(CalibrateOptions(water=True, **given), places, Path("out"), TARGET, None)
+        task_of(CalibrateOptions(water=True, **given), places, TARGET, None)
 
 
 def test_numbers_of_ports_have_sigmas_where_they_are_found_again() -> None:
@@ -186,7 +185,7 @@ def test_numbers_of_ports_have_sigmas_where_they_are_found_again() -> None:
         water=True, port="flat,bow=none", glass_mm="5+-0.1,side=6", n_glass="+-0.01", n_water="1.34"
     )
     rig = four_cameras()
-    task = task_of(options, dict.fromkeys(rig.cameras, "p"), Path("out"), TARGET, rig)
+    task = task_of(options, dict.fromkeys(rig.cameras, "p"), TARGET, rig)
     assert task.ports["bow"] == "none" and task.ports["side"] == "flat"
     assert task.port_values["left"] == pytest.approx({"glass_thickness_m": 0.005, "n_water": 1.34})
     sizes = {name: (one.width_px, one.height_px) for name, one in rig.cameras.items()}

@@ -6,7 +6,6 @@ cameras, and the grid that both were calibrated with.
 """
 
 import csv
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,14 +21,12 @@ from camera_calib.calibrate.from_pictures import calibrate_pictures
 from camera_calib.calibrate.options import CalibrateOptions
 from camera_calib.camera import Camera
 from camera_calib.freedom import Freedom, intrinsics, of_cameras, pose_names
-from camera_calib.lenses.fisheye import FisheyeLens
-from camera_calib.lenses.opencv import OpenCVLens
-from camera_calib.lenses.values import LensValues
 from camera_calib.rig import Rig, read_rig
 from camera_calib.target_shape import usual_shape
 from camera_calib.targets.target import parse_target
 from tests.camera_calib.calibration_scenes import differences
 from tests.oracles_targets import picture_light, to_srgb
+from tests.strategies_formats import DATA
 
 Array = NDArray[np.float64]
 
@@ -41,64 +38,21 @@ VIEWS, TRIALS = 16, 3
 BORDER_PX = 5.0
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Stereo:
     """Two cameras, and how far from them and from their axes the grid is held."""
 
-    size: tuple[int, int]
-    lenses: Mapping[str, LensValues]
-    turn: tuple[float, float, float]
-    shift_m: tuple[float, float, float]
+    rig: Rig
     model: str
     ranges_m: tuple[float, float]
     off_axis_deg: float
 
-    @property
-    def rig(self) -> Rig:
-        right = RigidTransform.from_components(self.shift_m, Rotation.from_rotvec(self.turn))
-        width, height = self.size
-        return Rig(
-            cameras={
-                name: Camera(width_px=width, height_px=height, lens=lens)
-                for name, lens in self.lenses.items()
-            },
-            cam_from_rig={"left": RigidTransform.identity(), "right": right},
-            body_from_rig=RigidTransform.identity(),
-            source="truth",
-        )
-
 
 RIGS = {
-    "EuRoC": Stereo(
-        size=(752, 480),
-        lenses={
-            "left": OpenCVLens(
-                fx_px=458.65, fy_px=457.30, cx_px=367.7, cy_px=248.9,
-                k1=-0.2834, k2=0.0740, p1=1.94e-4, p2=1.8e-5,
-            ),
-            "right": OpenCVLens(
-                fx_px=457.59, fy_px=456.13, cx_px=380.5, cy_px=255.7,
-                k1=-0.2837, k2=0.0745, p1=-1.05e-4, p2=-3.6e-5,
-            ),
-        },
-        turn=(0.002, 0.014, -0.002), shift_m=(-0.1100, 0.0004, -0.0008), model="opencv4",
-        ranges_m=(0.5, 1.3), off_axis_deg=25.0,
-    ),
-    "TUM-VI": Stereo(
-        size=(512, 512),
-        lenses={
-            "left": FisheyeLens(
-                fx_px=190.98, fy_px=190.97, cx_px=255.4, cy_px=257.4,
-                k1=0.00348, k2=0.000715, k3=-0.00205, k4=0.000203,
-            ),
-            "right": FisheyeLens(
-                fx_px=190.44, fy_px=190.43, cx_px=253.1, cy_px=255.4,
-                k1=0.00340, k2=0.00177, k3=-0.00266, k4=0.000330,
-            ),
-        },
-        turn=(-0.020, 0.010, 0.001), shift_m=(-0.1010, 0.0020, 0.0010), model="fisheye",
-        ranges_m=(0.28, 0.55), off_axis_deg=40.0,
-    ),
+    name: Stereo(read_rig(DATA / f"{name}.json"), *how)
+    for name, how in {
+        "euroc": ("opencv4", (0.5, 1.3), 25.0), "tum-vi": ("fisheye", (0.28, 0.55), 40.0),
+    }.items()
 }  # fmt: skip
 
 
@@ -122,7 +76,7 @@ def poses_before(stereo: Stereo, rng: np.random.Generator) -> list[RigidTransfor
         aim = Rotation.from_rotvec(angle * np.array([-np.sin(way), np.cos(way), 0.0]))
         turn, place = aim * tilt, aim.apply([0.0, 0.0, rng.uniform(*stereo.ranges_m)])
         pose = RigidTransform.from_components(place - turn.apply(middle), turn)
-        shares = [np.isfinite(seen(stereo.rig, n, pose)[:, 0]).mean() for n in stereo.lenses]
+        shares = [np.isfinite(seen(stereo.rig, n, pose)[:, 0]).mean() for n in stereo.rig.cameras]
         if min(shares) >= 0.5:
             poses.append(pose)
     return poses

@@ -1,21 +1,19 @@
 """What a calibration says of itself in a few lines."""
 
-import numpy as np
 import pytest
 
 from camera_calib.calibrate.results import calibration_text
 from camera_calib.calibrate.solve import calibrate_through_ports
 from camera_calib.targets.target import parse_target
-from tests.camera_calib.calibration_scenes import BOARD, board_poses, built_rig, views_of
+from tests.camera_calib.calibration_scenes import BOARD, built_rig, scene
 
 TARGET = parse_target("chessboard 11x8 30mm")
 VERDICTS = [{"level": "look", "text": "blurred"}, {"level": "good", "text": "fine"}]
 
 
 def test_ports_and_baseline_are_reported_in_millimetres_with_their_sigmas() -> None:
-    rng, truth = np.random.default_rng(5), built_rig()
-    views = views_of(truth, board_poses(truth, 8, rng), 0.1, rng)
-    found = calibrate_through_ports(views, BOARD, truth, "held")
+    truth = built_rig()
+    found = calibrate_through_ports(scene(truth, 8, seed=5), BOARD, truth, "held")
 
     lines = calibration_text(found, TARGET, VERDICTS).splitlines()
 

@@ -18,9 +18,11 @@ from camera_calib.formats.camera_files import MODELS
 from camera_calib.formats.colmap import read_colmap, write_colmap, write_refractive
 from camera_calib.formats.convert import detect
 from camera_calib.formats.rigs import ReadOptions
+from camera_calib.ports.dome import DomePort
 from camera_calib.ports.none import NO_PORT
 from camera_calib.rig import Rig
-from tests.cameras import changed, flat_port_camera
+from tests.cameras import changed, flat_port_camera, pair_of
+from tests.oracles_dome import traced
 from tests.strategies_formats import (
     BOTH_LENSES,
     RATIONAL,
@@ -46,15 +48,8 @@ fault = partial(fault_of, read_colmap)
 
 def pair(camera: Camera) -> Rig:
     turn = Rotation.from_rotvec([0.01, -0.02, 0.03])
-    return Rig(
-        cameras={"left": camera, "right": changed(camera, fx_px=710.5, k1=-0.125)},
-        cam_from_rig={
-            "left": RigidTransform.identity(),
-            "right": RigidTransform.from_components([-0.1, 0.001, 0.002], turn),
-        },
-        body_from_rig=RigidTransform.identity(),
-        source="a test",
-    )
+    pose = RigidTransform.from_components([-0.1, 0.001, 0.002], turn)
+    return pair_of(camera, changed(camera, fx_px=710.5, k1=-0.125), pose)
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -230,38 +225,23 @@ def test_an_index_of_air_divides_the_others(tmp_path: Path) -> None:
     assert (camera.parameter("n_glass"), camera.n_water) == (1.2, 1.2)
 
 
-def test_a_domeport_bends_light_as_the_forks_code_does(tmp_path: Path) -> None:
-    """Its way: the far hit of each sphere, refraction there; the inner radius comes first."""
-    centre, inner, thickness, indices = (
-        np.array([0.002, -0.001, 0.006]),
-        0.05,
-        0.007,
-        (1, 1.52, 1.334),
-    )
+def test_a_domeport_bends_light_as_traced_rays_go(tmp_path: Path) -> None:
+    """Its centre and the radius of its inner surface come first."""
     path = tmp_path / "cameras.txt"
-    numbers = [*centre, inner, thickness, *indices]
     path.write_text(
         "1 OPENCV_FISHEYE 1920 1200 700 701 963 604 0.02 -0.01 0.002 0.001 DOMEPORT "
-        f"{' '.join(map(str, numbers))}\n"
+        "0.002 -0.001 0.006 0.05 0.007 1 1.52 1.334\n"
     )
     assert detect(path).name == "refractive"
     (camera,) = read_colmap(path, ReadOptions()).cameras.values()
+    port = DomePort(
+        dome_x_m=0.002, dome_y_m=-0.001, dome_z_m=0.006, outer_radius_m=0.057,
+        glass_thickness_m=0.007, n_glass=1.52, n_water=1.334,
+    )  # fmt: skip
     pixels = camera.frame_grid(7, 5).reshape(-1, 2)
-    _, rays = camera.in_air().unproject(pixels)
-    points = np.zeros_like(rays)
-    for radius, before, after in zip(
-        (inner, inner + thickness), indices, indices[1:], strict=False
-    ):
-        along = ((points - centre) * rays).sum(axis=1)
-        gap = ((points - centre) ** 2).sum(axis=1) - radius**2
-        points = points + (np.sqrt(along**2 - gap) - along)[:, None] * rays
-        normals = (points - centre) / radius
-        cos, ratio = (normals * rays).sum(axis=1), before / after
-        bend = np.sqrt(1 - ratio**2 * (1 - cos**2)) - ratio * cos
-        rays = ratio * rays + bend[:, None] * normals
     starts, directions = camera.unproject(pixels)
-    np.testing.assert_allclose(starts, points, atol=1e-14)
-    np.testing.assert_allclose(directions, rays, atol=1e-13)
+    for ray, *found in zip(camera.in_air().unproject(pixels)[1], starts, directions, strict=True):
+        np.testing.assert_allclose(found, traced(port, ray)[1:], atol=1e-13)
     for target in ("text", "binary/cameras.bin"):
         write_refractive(tmp_path / target, read_colmap(path, ReadOptions()))
         (written,) = read_colmap(tmp_path / target, ReadOptions()).cameras.values()

@@ -18,6 +18,7 @@ from camera_calib.camera import Camera
 from camera_calib.formats.convert import (
     FORMATS,
     Conversion,
+    StandIn,
     convert,
     detect,
     fit_in_water,
@@ -38,24 +39,13 @@ BENT = replace(
         "right": changed(DESIGN.cameras["right"], k1=-0.12),
     },
 )
-FISHEYE = Camera(
+DOMED = Camera(
     width_px=846,
     height_px=677,
     lens=FisheyeLens(fx_px=500, fy_px=501, cx_px=423, cy_px=340, k1=0.02),
+    port=DomePort(dome_z_m=0.004, outer_radius_m=0.06, glass_thickness_m=0.006),
 )
-DOMES = replace(
-    DESIGN,
-    cameras={
-        name: changed(
-            replace(
-                FISHEYE,
-                port=DomePort(dome_z_m=0.004, outer_radius_m=0.06, glass_thickness_m=0.006),
-            ),
-            k1=k1,
-        )
-        for name, k1 in (("left", 0.02), ("right", 0.03))
-    },
-)
+DOMES = replace(DESIGN, cameras={"left": DOMED, "right": changed(DOMED, k1=0.03)})
 FULL = replace(BENT, covariance=covariance_of(BENT, np.random.default_rng(4)))
 IN_AIR = in_air(BENT)
 CHANNELS = {
@@ -63,7 +53,6 @@ CHANNELS = {
     "colmap": "model",
     "refractive": "flat",
     "kalibr": "c.yaml",
-    "ros": "r",
 }
 
 
@@ -91,62 +80,67 @@ def refused(source: Path, target: Path, **options: Any) -> str:
     return shown
 
 
-@pytest.mark.parametrize("name", ["opencv", "colmap", "kalibr", "ros"])
-def test_a_port_is_not_lost_unasked(own: Path, tmp_path: Path, name: str) -> None:
-    shown = refused(own, tmp_path / CHANNELS[name], target_format=name, drop_covariance=True)
-    assert "--drop-port" in shown and "--water" in shown
+def bent_by(term: str) -> Rig:
+    """Cameras in air, the right one with one more distortion term."""
+    right = changed(IN_AIR.cameras["right"], **{term: 1e-3})
+    return replace(IN_AIR, cameras={**IN_AIR.cameras, "right": right})
 
 
-@pytest.mark.parametrize("name", ["opencv", "colmap", "refractive", "kalibr", "ros"])
-def test_a_covariance_is_not_lost_unasked(own: Path, tmp_path: Path, name: str) -> None:
-    water = None if name == "refractive" else (1.5, 3.0)
-    shown = refused(own, tmp_path / CHANNELS[name], target_format=name, water=water)
-    assert "--drop-covariance" in shown
+WATER = {"water": (1.5, 3.0)}
+LOSSES: list[tuple[str, Rig, dict[str, Any], tuple[str, ...]]] = [
+    *((n, FULL, {"drop_covariance": True}, ("--drop-port", "--water"))
+      for n in ("opencv", "colmap", "kalibr")),
+    *((n, DOMES, {}, ("dome of 60 mm", "--drop-port", "--water")) for n in ("colmap", "kalibr")),
+    *((n, FULL, WATER, ("--drop-covariance",)) for n in ("opencv", "colmap", "kalibr")),
+    ("refractive", FULL, {}, ("--drop-covariance",)),
+    *((n, bent_by(term), {}, (term, "right"))
+      for n, term in (("kalibr", "k3"), ("kalibr", "k5"), ("metashape", "k4"), ("ros", "s1"),
+                      ("colmap", "s4"), ("refractive", "s2"))),
+    ("metashape", in_air(DOMES), {}, ("2 cameras", "--camera")),
+    ("ros", in_air(DOMES), {}, ("2 cameras", "--camera")),
+    ("colmap", FULL, {**WATER, "drop_port": True, "drop_covariance": True}, ("--drop-port",)),
+    ("colmap", FULL, {"water": (3.0, 1.5), "drop_covariance": True}, ("3 to 1.5",)),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("name", "term"),
-    [("kalibr", "k3"), ("kalibr", "k5"), ("metashape", "k4"), ("ros", "s1"), ("colmap", "s4"),
-     ("refractive", "s2")],
-)  # fmt: skip
-def test_distortion_is_never_lost(tmp_path: Path, name: str, term: str) -> None:
-    rig = replace(IN_AIR, cameras={**IN_AIR.cameras})
-    cameras = {**rig.cameras, "right": changed(rig.cameras["right"], **{term: 1e-3})}
-    write_rig(tmp_path / "rig.json", replace(rig, cameras=cameras))
-    target = tmp_path / CHANNELS.get(name, "a.xml")
-    shown = refused(tmp_path / "rig.json", target, target_format=name)
-    assert term in shown and "right" in shown
+@pytest.mark.parametrize(("name", "rig", "options", "words"), LOSSES)
+def test_nothing_is_lost_unasked(
+    name: str, rig: Rig, options: dict[str, Any], words: tuple[str, ...], tmp_path: Path
+) -> None:
+    """Ports, covariances, distortion, cameras; nor are contradictions taken."""
+    write_rig(tmp_path / "rig.json", rig)
+    shown = refused(
+        tmp_path / "rig.json", tmp_path / CHANNELS.get(name, "a"), target_format=name, **options
+    )
+    assert all(word in shown for word in words)
 
 
-@pytest.mark.parametrize("name", ["colmap", "kalibr", "ros"])
-def test_a_dome_is_not_lost_unasked(own: Path, tmp_path: Path, name: str) -> None:
-    write_rig(own, DOMES)
-    shown = refused(own, tmp_path / CHANNELS[name], target_format=name)
-    assert "dome of 60 mm" in shown and "--drop-port" in shown and "--water" in shown
+def test_every_format_takes_a_rig_and_replaces_no_file_unasked(tmp_path: Path) -> None:
+    """Fisheyes and pinholes in air; Refractive COLMAP's has a port, or it would be COLMAP's."""
+    source = tmp_path / "rig.json"
+    for kind, rig in (("a", in_air(DOMES)), ("b", IN_AIR)):
+        write_rig(source, rig)
+        (tmp_path / kind).mkdir()
+        for name, file in CHANNELS.items():
+            target, options = tmp_path / kind / file, {"target_format": name}
+            convert_files(source, target, **options)
+            assert_same_geometry(FORMATS[name].read(target, ReadOptions()), rig)
+            refused(source, target, **options)
+            convert_files(source, target, overwrite=True, **options)
+    cameras = tmp_path / "b" / "model" / "cameras.bin"
+    refused(source, cameras, target_format="colmap", overwrite=True)
+    for name, file in CHANNELS.items():
+        FORMATS[name].write(tmp_path / "b" / file, _wet(name))
+        assert detect(tmp_path / "b" / file).name == name
+    assert detect(tmp_path / "b" / "model" / "rig_config.json").name == "colmap"
 
 
-def test_a_fisheye_goes_everywhere(tmp_path: Path) -> None:
-    write_rig(tmp_path / "rig.json", in_air(DOMES))
-    for name, target in CHANNELS.items():
-        convert_files(tmp_path / "rig.json", tmp_path / target, target_format=name)
-        assert_same_geometry(FORMATS[name].read(tmp_path / target, ReadOptions()), in_air(DOMES))
-
-
-def test_formats_take_as_many_cameras_as_they_hold(tmp_path: Path) -> None:
+def test_one_camera_of_several_is_converted(tmp_path: Path) -> None:
     write_rig(tmp_path / "rig.json", in_air(DOMES))
     target = tmp_path / "a.xml"
-    assert "--camera" in refused(tmp_path / "rig.json", target, target_format="metashape")
     convert_files(tmp_path / "rig.json", target, target_format="metashape", camera="right")
     (camera,) = FORMATS["metashape"].read(target, ReadOptions()).cameras.values()
     assert camera.parameter("k1") == 0.03
-    three = {"left": 0, "right": 1, "third": 2}
-    one = IN_AIR.cameras["left"]
-    poses = {n: RigidTransform.from_translation([0.1 * i, 0.0, 0.0]) for n, i in three.items()}
-    many = replace(IN_AIR, cameras=dict.fromkeys(three, one), cam_from_rig=poses)
-    write_rig(tmp_path / "rig.json", many)
-    for name in ("opencv", "ros"):
-        shown = refused(tmp_path / "rig.json", tmp_path / CHANNELS[name], target_format=name)
-        assert "3 cameras" in shown and "--camera" in shown
 
 
 @pytest.mark.parametrize("name", ["colmap", "kalibr"])
@@ -169,29 +163,36 @@ def test_a_fisheye_behind_a_dome_has_a_stand_in_at_a_stated_price(
 def test_a_stand_in_that_folds_back_inside_the_frame_is_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """No fraction of polynomials stands in for 120 degrees across the corners of a fisheye."""
-    monkeypatch.setattr(
-        "camera_calib.formats.convert.fit_in_water",
-        lambda camera, near_m, far_m, _: fit_in_water(camera, near_m, far_m, "FULL_OPENCV"),
-    )
-    with pytest.raises(AliceError, match="FULL_OPENCV of left folds"):
+    def folding(*arguments: Any) -> StandIn:
+        fit = fit_in_water(*arguments)
+        return replace(fit, camera=changed(fit.camera, k1=-0.2))
+
+    monkeypatch.setattr("camera_calib.formats.convert.fit_in_water", folding)
+    with pytest.raises(AliceError, match="OPENCV_FISHEYE of left folds"):
         in_water(only(DOMES, "left"), 1.0, 3.0)
 
 
-def test_a_dome_given_with_cameras_in_air_makes_the_rig(tmp_path: Path) -> None:
-    FORMATS["kalibr"].write(tmp_path / "c.yaml", in_air(DOMES))
-    convert_files(
-        tmp_path / "c.yaml", tmp_path / "rig.json", dome_radius_mm=60.0,
-        dome_centre_mm=(0.0, 0.0, 4.0), glass_mm=6.0, n_glass=1.49, n_water=1.34,
-    )  # fmt: skip
-    assert_same_geometry(read_rig(tmp_path / "rig.json"), DOMES)
-    shown = refused(tmp_path / "rig.json", tmp_path / "b.json", port_distance_mm=5.0)
-    assert "port_distance_m" in shown and "--drop-port" in shown
-    convert_files(tmp_path / "rig.json", tmp_path / "sea.json", n_water=1.342)
+PORT = {"port_distance_m": 0.02, "glass_thickness_m": 0.01}
+DOME = {"outer_radius_m": 0.06, "dome_x_m": 0.0, "dome_y_m": 0.0, "dome_z_m": 0.004,
+        "glass_thickness_m": 0.006, "n_glass": 1.49}  # fmt: skip
+
+
+@pytest.mark.parametrize(("rig", "port"), [(BENT, PORT), (DOMES, DOME)])
+def test_a_port_given_with_cameras_in_air_makes_the_rig(
+    rig: Rig, port: dict[str, float], tmp_path: Path
+) -> None:
+    FORMATS["kalibr"].write(tmp_path / "c.yaml", in_air(rig))
+    assert "--n-water" in refused(tmp_path / "c.yaml", tmp_path / "rig.json", port=port)
+    convert_files(tmp_path / "c.yaml", tmp_path / "rig.json", port={**port, "n_water": 1.34})
+    assert_same_geometry(read_rig(tmp_path / "rig.json"), rig)
+    other = {"outer_radius_m": 0.05} if rig is BENT else {"port_distance_m": 0.005}
+    shown = refused(tmp_path / "rig.json", tmp_path / "b.json", port=other)
+    assert next(iter(other)) in shown and "--drop-port" in shown
+    convert_files(tmp_path / "rig.json", tmp_path / "sea.json", port={"n_water": 1.342})
     assert read_rig(tmp_path / "sea.json").cameras["left"].n_water == 1.342
 
 
-@pytest.mark.parametrize("name", ["colmap", "kalibr", "ros"])
+@pytest.mark.parametrize("name", ["colmap", "kalibr"])
 def test_a_dropped_port_leaves_the_cameras_in_air_and_a_warning(
     own: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -200,16 +201,6 @@ def test_a_dropped_port_leaves_the_cameras_in_air_and_a_warning(
     assert len(capsys.readouterr().err.splitlines()) == 3  # port, covariance, pose on the vehicle
     after = FORMATS[name].read(target, ReadOptions())
     assert_same_geometry(after, IN_AIR)
-
-
-def test_flatport_carries_the_port(own: Path, tmp_path: Path) -> None:
-    _, data = convert_files(
-        own, tmp_path / "flat", target_format="refractive", drop_covariance=True
-    )
-    assert data["to"] == "refractive"
-    assert detect(tmp_path / "flat").name == "refractive"
-    convert_files(tmp_path / "flat", tmp_path / "back.json")
-    assert_same_geometry(read_rig(tmp_path / "back.json"), BENT)
 
 
 def test_the_price_in_water_is_what_colmap_misses_the_exact_camera_by(
@@ -254,26 +245,6 @@ def test_centres_follow_the_fit_onto_the_vehicle() -> None:
         assert -0.009 < moved[2] < -0.005
         assert np.linalg.norm(moved[:2]) < 1e-3
     assert fitted.covariance is None
-
-
-def test_a_camera_in_air_fits_itself(tmp_path: Path) -> None:
-    """The way of a rational lens into Kalibr: the best radtan, at a stated price."""
-    rational = changed(IN_AIR.cameras["left"], k4=0.02)
-    rig = only(replace(IN_AIR, cameras={**IN_AIR.cameras, "left": rational}), "left")
-    write_rig(tmp_path / "rig.json", rig)
-    _, data = convert_files(
-        tmp_path / "rig.json", tmp_path / "c.yaml", target_format="kalibr", water=(1.0, 4.0)
-    )
-    assert data["price"]["left"]["max_px"] < 0.05
-
-
-def test_a_port_given_with_cameras_in_air_makes_the_rig(tmp_path: Path) -> None:
-    FORMATS["kalibr"].write(tmp_path / "c.yaml", IN_AIR)
-    options: dict[str, Any] = {"port_distance_mm": 20.0, "glass_mm": 10.0}
-    shown = refused(tmp_path / "c.yaml", tmp_path / "rig.json", **options)
-    assert "--n-water" in shown
-    convert_files(tmp_path / "c.yaml", tmp_path / "rig.json", n_water=1.34, **options)
-    assert_same_geometry(read_rig(tmp_path / "rig.json"), BENT)
 
 
 def test_changed_numbers_take_their_covariance_with_them() -> None:
@@ -327,33 +298,17 @@ def test_a_name_of_a_camera_cannot_lead_out_of_the_folder(own: Path, tmp_path: P
 def test_the_mount_of_foreign_cameras_is_said_to_be_unknown(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    FORMATS["ros"].write(tmp_path / "pair", IN_AIR)
-    convert_files(tmp_path / "pair", tmp_path / "rig.json")
+    FORMATS["kalibr"].write(tmp_path / "pair.yaml", IN_AIR)
+    convert_files(tmp_path / "pair.yaml", tmp_path / "rig.json")
     assert "vehicle" in capsys.readouterr().err
     rig = read_rig(tmp_path / "rig.json")
     assert rig.body_from_rig is None
-    convert_files(tmp_path / "pair", tmp_path / "c.yaml", target_format="kalibr")
+    convert_files(tmp_path / "pair.yaml", tmp_path / "c.yaml", target_format="kalibr")
     assert "vehicle" not in capsys.readouterr().err
-
-
-def test_files_that_are_there_are_not_replaced_unasked(tmp_path: Path) -> None:
-    write_rig(tmp_path / "rig.json", IN_AIR)
-    for name, target in CHANNELS.items():
-        convert_files(tmp_path / "rig.json", tmp_path / target, target_format=name)
-        refused(tmp_path / "rig.json", tmp_path / target, target_format=name)
-        convert_files(tmp_path / "rig.json", tmp_path / target, target_format=name, overwrite=True)
-    refused(
-        tmp_path / "rig.json", tmp_path / "model" / "cameras.bin", target_format="colmap",
-        overwrite=True,
-    )  # fmt: skip
 
 
 def test_formats_are_found_from_files_and_names(tmp_path: Path) -> None:
     write_rig(tmp_path / "rig.json", IN_AIR)
-    for name, target in CHANNELS.items():
-        FORMATS[name].write(tmp_path / target, _wet(name))
-        assert detect(tmp_path / target).name == name
-    assert detect(tmp_path / "model" / "rig_config.json").name == "colmap"
     _, data = convert_files(tmp_path / "rig.json", tmp_path / "again.xml")
     assert data["to"] == "opencv"
     (tmp_path / "note.txt").write_text("hello\n")
@@ -364,13 +319,6 @@ def test_formats_are_found_from_files_and_names(tmp_path: Path) -> None:
         assert source in refused(tmp_path / source, tmp_path / "x.json")
     refused(tmp_path / "rig.json", tmp_path / "x.yaml")
     refused(tmp_path / "rig.json", tmp_path / "x", target_format="photoscan")
-
-
-def test_contradictions_are_refused(own: Path, tmp_path: Path) -> None:
-    to = {"target_format": "colmap", "drop_covariance": True}
-    target = tmp_path / "m"
-    assert "--drop-port" in refused(own, target, water=(1.5, 3.0), drop_port=True, **to)
-    assert "3 to 1.5" in refused(own, target, water=(3.0, 1.5), **to)
 
 
 def test_a_reference_of_its_own_pose_is_counted_out(tmp_path: Path) -> None:

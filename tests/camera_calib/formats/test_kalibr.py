@@ -15,55 +15,26 @@ from camera_calib.formats.convert import detect
 from camera_calib.formats.rigs import ReadOptions
 from camera_calib.formats.yaml_files import read_kalibr, write_kalibr
 from camera_calib.rig import Rig
-from tests.strategies_formats import POINTS_RIG, RADTAN, WIDE_RIG, fault_of, rigs
+from tests.strategies_formats import (
+    BOTH_LENSES,
+    DATA,
+    POINTS_RIG,
+    RADTAN,
+    assert_same_pixels,
+    fault_of,
+    rigs,
+)
 
-EXAMPLE = """\
-cam0:
-  camera_model: pinhole
-  intrinsics: [461.629, 460.152, 362.680, 246.049]
-  distortion_model: radtan
-  distortion_coeffs: [-0.27695497, 0.06712482, 8.7538e-4, 1e-05]
-  T_cam_imu:
-  - [0.01779318, 0.99967549,-0.01822936, 0.07008565]
-  - [-0.9998017, 0.01795239, 0.00860714,-0.01771023]
-  - [0.00893160, 0.01807260, 0.99979678, 0.00399246]
-  - [0.0, 0.0, 0.0, 1.0]
-  timeshift_cam_imu: -8.121e-05
-  rostopic: /cam0/image_raw
-  resolution: [752, 480]
-cam1:
-  camera_model: pinhole
-  intrinsics: [463.0, 460.0, 373.850, 253.749]
-  distortion_model: none
-  distortion_coeffs: []
-  T_cn_cnm1:
-  - [0.0, -1.0, 0.0, -0.1]
-  - [1.0, 0.0, 0.0, 0.0]
-  - [0.0, 0.0, 1.0, 0.0]
-  - [0.0, 0.0, 0.0, 1.0]
-  rostopic: /stereo/cam1/image_raw
-  resolution: [752, 480]
-cam2:
-  camera_model: pinhole
-  intrinsics: [463.0, 460.0, 373.850, 253.749]
-  distortion_model: none
-  distortion_coeffs: []
-  T_cn_cnm1:
-  - [1.0, 0.0, 0.0, 0.0]
-  - [0.0, 1.0, 0.0, -0.5]
-  - [0.0, 0.0, 1.0, 0.0]
-  - [0.0, 0.0, 0.0, 1.0]
-  rostopic: something else
-  resolution: [752, 480]
-"""
+EXAMPLE = (DATA / "camchain.yaml").read_text()
 
 
 fault = partial(fault_of, read_kalibr)
 
 
-@settings(max_examples=25, deadline=None)
-@given(rig=rigs(RADTAN, maximum=3))
+@settings(max_examples=50, deadline=None)
+@given(rig=rigs(RADTAN, lenses=BOTH_LENSES, maximum=3))
 def test_opencv_projects_as_we_do_from_the_chain(rig: Rig) -> None:
+    """Kalibr's radtan and equidistant are OpenCV's first four terms and its fisheye."""
     with tempfile.TemporaryDirectory() as folder:
         write_kalibr(Path(folder) / "camchain.yaml", rig)
         chain = yaml.safe_load((Path(folder) / "camchain.yaml").read_text())
@@ -73,47 +44,23 @@ def test_opencv_projects_as_we_do_from_the_chain(rig: Rig) -> None:
     for i, ((name, camera), entry) in enumerate(
         zip(rig.cameras.items(), chain.values(), strict=True)
     ):
-        assert (entry["camera_model"], entry["distortion_model"]) == ("pinhole", "radtan")
+        is_fisheye = camera.lens.model == "fisheye"
+        model = "equidistant" if is_fisheye else "radtan"
+        assert (entry["camera_model"], entry["distortion_model"]) == ("pinhole", model)
         assert entry["resolution"] == [camera.width_px, camera.height_px]
         assert entry["cam_overlaps"] == [other for other in range(len(chain)) if other != i]
         assert ("T_cn_cnm1" in entry) == (i > 0)
         cam_from_rig = np.array(entry.get("T_cn_cnm1", np.eye(4))) @ cam_from_rig
         fx, fy, cx, cy = entry["intrinsics"]
-        seen, _ = cv2.projectPoints(
-            POINTS_RIG,
+        seen = (cv2.fisheye.projectPoints if is_fisheye else cv2.projectPoints)(
+            POINTS_RIG[:, None],
             Rotation.from_matrix(cam_from_rig[:3, :3]).as_rotvec(),
             cam_from_rig[:3, 3],
             np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
             np.array(entry["distortion_coeffs"]),
-        )
+        )[0].reshape(-1, 2)
         ours = camera.project(rig.cam_from_rig[name].apply(POINTS_RIG))
-        known = np.isfinite(ours[:, 0])
-        assert known.any()
-        np.testing.assert_allclose(seen[known, 0] + 0.5, ours[known], atol=1e-8, rtol=0)
-
-
-@settings(max_examples=25, deadline=None)
-@given(rig=rigs(lenses=("fisheye",), maximum=3))
-def test_kalibrs_equidistant_equations_give_our_pixels(rig: Rig) -> None:
-    """Those of `EquidistantDistortion::distort`, on tangents, of points before the camera."""
-    with tempfile.TemporaryDirectory() as folder:
-        write_kalibr(Path(folder) / "camchain.yaml", rig)
-        chain = yaml.safe_load((Path(folder) / "camchain.yaml").read_text())
-    for (name, camera), entry in zip(rig.cameras.items(), chain.values(), strict=True):
-        assert (entry["camera_model"], entry["distortion_model"]) == ("pinhole", "equidistant")
-        points = rig.cam_from_rig[name].apply(WIDE_RIG)
-        points = points[points[:, 2] > 0.1]
-        ours = camera.project(points)
-        tangents = points[:, :2] / points[:, 2:]
-        r = np.linalg.norm(tangents, axis=1)
-        theta = np.arctan(r)
-        k1, k2, k3, k4 = entry["distortion_coeffs"]
-        bent = theta * (1 + k1 * theta**2 + k2 * theta**4 + k3 * theta**6 + k4 * theta**8)
-        fx, fy, cx, cy = entry["intrinsics"]
-        seen = tangents * (bent / r)[:, None] * [fx, fy] + [cx, cy]
-        known = np.isfinite(ours[:, 0])
-        assert known.sum() > 20
-        np.testing.assert_allclose(seen[known] + 0.5, ours[known], atol=1e-8, rtol=0)
+        assert_same_pixels(ours, seen + 0.5)
 
 
 def test_an_example_like_that_of_the_wiki_is_read(

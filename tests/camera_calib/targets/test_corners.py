@@ -3,7 +3,6 @@
 import cv2
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from camera_calib.targets.corners import (
     AT_BORDER,
@@ -14,36 +13,22 @@ from camera_calib.targets.corners import (
     fit_corners,
     linear_light,
 )
-from tests.oracles_targets import slow_corner
+from camera_calib.targets.target import parse_target
+from tests.oracles_targets import picture_light, seen_from, slow_corner, to_srgb, true_pixels
 
+TARGET = parse_target("chessboard 9x6 25mm")
 COLUMNS, ROWS = 9, 6
-FINE = 8
+SIZE, FINE = (320, 240), 8
 
 
 def drawn_board(noise: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """A tilted board seen by a pinhole, area-sampled in linear light, and its true corners."""
     rng = np.random.default_rng(seed)
-    turn = Rotation.from_euler("xyz", rng.uniform(-25, 25, 3), degrees=True).as_matrix()
-    centre = np.array([(COLUMNS - 1) / 2, (ROWS - 1) / 2, 0.0])
-    shift = np.array([rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5), 16.0])
-    matrix = np.array([[400.0, 0, 160.0], [0, 400.0, 120.0], [0, 0, 1]])
-    to_pixels = matrix @ np.column_stack([turn[:, :2], shift - turn @ centre])
-    y, x = np.mgrid[: 240 * FINE, : 320 * FINE]
-    pixels = np.stack([(x + 0.5) / FINE, (y + 0.5) / FINE, np.ones(x.shape)], axis=-1)
-    board = pixels @ np.linalg.inv(to_pixels).T
-    u, v = board[..., 0] / board[..., 2], board[..., 1] / board[..., 2]
-    inside = (u > -1) & (u < COLUMNS) & (v > -1) & (v < ROWS)
-    dark = (np.floor(u) + np.floor(v)) % 2 == 0
-    light = np.where(inside & dark, 0.05, 0.7)
-    light = light.reshape(240, FINE, 320, FINE).mean(axis=(1, 3))
-    light = light + rng.normal(0, noise, light.shape)
-    encoded = np.where(
-        light <= 0.0031308, 12.92 * light, 1.055 * np.abs(light) ** (1 / 2.4) - 0.055
-    )
-    picture = np.clip(np.rint(255 * encoded), 0, 255).astype(np.uint8)
-    cx, cy = np.meshgrid(np.arange(COLUMNS), np.arange(ROWS))
-    corners = np.stack([cx, cy, np.ones(cx.shape)], axis=-1).reshape(-1, 3) @ to_pixels.T
-    return picture, corners[:, :2] / corners[:, 2:]
+    x_deg, y_deg, z_deg = rng.uniform(-25, 25, 3).tolist()
+    off_x, off_y = rng.uniform(-12, 12, 2).tolist()
+    seen = seen_from(TARGET, SIZE, (x_deg, y_deg, z_deg), 0.75, (off_x, off_y))
+    light = picture_light(TARGET, seen, SIZE, FINE, blur_px=0.0)
+    return to_srgb(light + rng.normal(0, noise, light.shape)), true_pixels(TARGET, seen)
 
 
 def steps_of(corners: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from camera_calib.camera import Camera
 from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.targets.corners import FITTED, fit_corners
-from camera_calib.targets.detect import detect_with_reasons
+from camera_calib.targets.detect import detect
 from camera_calib.targets.grow import board_map
 from camera_calib.targets.pattern import CROSSING, black_rectangles, surroundings
 from camera_calib.targets.target import parse_target
@@ -75,7 +75,7 @@ def test_a_grid_of_small_tags_is_found_through_a_fisheye() -> None:
     light, true = fisheye_view()
     rng = np.random.default_rng(5)
 
-    found = detect_with_reasons(GRID, to_srgb(light + rng.normal(0.0, 0.01, light.shape)))
+    found = detect(GRID, to_srgb(light + rng.normal(0.0, 0.01, light.shape)))
 
     assert found.pixels is not None
     off = found.pixels - true

@@ -55,7 +55,7 @@ def read_pdf(path: Path) -> tuple[np.ndarray, tuple[float, float], str]:
 
 def check_scale(target: Target, picture: np.ndarray, dpi: float, within_m: float) -> None:
     """The points measured in a picture of the page are where the target has them."""
-    found = detect(target, picture)
+    found = detect(target, picture).pixels
     assert found is not None
     assert np.isfinite(found).all()
     metres = found * 25.4e-3 / dpi
