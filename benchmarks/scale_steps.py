@@ -40,12 +40,12 @@ from benchmarks.scale_model import (
 from camera_calib.freedom import Prior
 from camera_calib.rig import Rig, read_rig
 from reconstruct.adjustment.exact_observations import (
-    Linearised,
     PixelParts,
     Pixels,
     RigState,
     Workers,
     calibrated_parameters,
+    linearise_parts,
 )
 from reconstruct.adjustment.survey_fit import SurveyProblem
 from reconstruct.adjustment.uncertainty import shape_of_block
@@ -202,7 +202,7 @@ def _shape(work: StepWork) -> Prepared:
         near, order = pixels.by_place(state.centres)
         placed = replace(state, points=state.points[order])
         parts = PixelParts(near, len(state.centres))
-        linear = Linearised(pixels=parts, state=placed, fields=(), noise=(NOISE_PX, NOISE_PX**2))
+        linear = linearise_parts(parts, placed, (), (NOISE_PX, NOISE_PX**2))
         shape = shape_of_block(linear, near, placed.centres, placed.points, None, scale_free=False)
         np.savez(work.own / "shape.npz", modes=shape.modes.stations)
         return len(pixels.station)

@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 from rasterio.enums import Resampling
 from rasterio.vrt import WarpedVRT
 from rasterio.warp import calculate_default_transform
-from scipy.ndimage import distance_transform_edt
 
 from alice_survey.core import products
 from alice_survey.core.artefacts import Stage, atomic_path, run_stage, write_json
@@ -46,6 +45,7 @@ from reconstruct.views.model import (
     read_model,
 )
 from reconstruct.views.model_files import read_reconstruction
+from reconstruct.views.range_shift import fill_holes
 
 _CHUNK = 1_000_000
 _TILE = 4 * BLOCK
@@ -354,7 +354,8 @@ def export_view(workspace: Path, folder: Path, task: tuple[View, float]) -> floa
     on_surface = float(np.isfinite(surface).mean())
     if mask.exists():  # of a run that was interrupted; it is written last
         return on_surface
-    x, y = taken_at(pictures, view, _fill(surface, depth))
+    filled = fill_holes(surface) if on_surface else np.full(surface.shape, depth)
+    x, y = taken_at(pictures, view, filled)
     taken = pictures.as_taken(view.image)
     inside = (x >= 0) & (x <= taken.shape[1] - 1) & (y >= 0) & (y <= taken.shape[0] - 1)
     x, y = np.where(inside, x, np.float32(-10.0)), np.where(inside, y, np.float32(-10.0))
@@ -446,16 +447,6 @@ def bilinear(values: NDArray[Any], x: Array, y: Array) -> Array:
     below = values[row + 1, column] * (1 - p) + values[row + 1, column + 1] * p
     found: Array = np.where(inside, above * (1 - q) + below * q, np.nan)
     return found
-
-
-def _fill(depth: Array, otherwise: float) -> Array:
-    """Depths whose holes have that of the nearest known node."""
-    known = np.isfinite(depth)
-    if not known.any():
-        return np.full(depth.shape, otherwise)
-    nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
-    filled: Array = depth[tuple(nearest)]
-    return filled
 
 
 def scene_of(mesh: Path) -> tuple[Any, Array]:

@@ -10,7 +10,7 @@ does not change lies in files, of which a task has the paths.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import pairwise
 from pathlib import Path
@@ -27,7 +27,9 @@ from camera_calib.rig import Rig
 from reconstruct.adjustment.normal_equations import (
     BlockPattern,
     LinearObservations,
+    LinearParts,
     joined_pattern,
+    one_part,
     pattern_of,
 )
 from reconstruct.mapping.arrays import Indices, observations, rig_poses
@@ -373,43 +375,26 @@ def _pattern_of_part(pixels: Pixels, _: None, own: Indices) -> BlockPattern:
     return pattern_of(pixels.starts, pixels.station, len(own))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Linearised:
-    """Weighted observations from one guess, part by part; a single part is computed once only."""
+def linearise_parts(
+    pixels: PixelParts, state: RigState, fields: Sequence[str], noise: tuple[float, float]
+) -> LinearParts:
+    """Weighted observations from one guess, part by part; a single part is computed once only.
 
-    pixels: PixelParts
-    state: RigState
-    fields: Sequence[str]
-    """Parameters of the rig that are not held."""
-    noise: tuple[float, float]
-    """Sigma of a keypoint's coordinate for the weights, and variance that scales them."""
-    kept: list[LinearObservations] = field(default_factory=list)
-
-    @property
-    def stations(self) -> Sequence[Indices]:
-        """Of each part, its stations."""
-        return self.pixels.stations
-
-    @property
-    def points(self) -> Sequence[int]:
-        """How many points each part has."""
-        return self.pixels.points
-
-    @property
-    def pattern(self) -> BlockPattern:
-        """Which of all stations see points in common."""
-        return self.pixels.pattern
-
-    def map(
-        self, function: Callable[[LinearObservations, Any], Result], values: Iterable[Any]
-    ) -> Iterator[Result]:
-        """Yield `function(part, value)` of every part with its value, in order."""
-        weigh = partial(_weigh, tuple(self.fields), self.noise)
-        if self.pixels.is_one:
-            if not self.kept:
-                self.kept.append(weigh(self.pixels.pixels, self.state))
-            return (function(self.kept[0], value) for value in values)
-        return self.pixels.map(partial(_with_weights, function, weigh), self.state, values)
+    Args:
+        pixels: what is seen.
+        state: the guess.
+        fields: parameters of the rig that are not held.
+        noise: sigma of a keypoint's coordinate for the weights, and variance that scales them.
+    """
+    weigh = partial(_weigh, tuple(fields), noise)
+    if pixels.is_one:
+        return replace(one_part(weigh(pixels.pixels, state), pixels.count), pattern=pixels.pattern)
+    return LinearParts(
+        stations=pixels.stations, points=pixels.points, pattern=pixels.pattern,
+        map=lambda function, values: pixels.map(
+            partial(_with_weights, function, weigh), state, values
+        ),
+    )  # fmt: skip
 
 
 def _weigh(

@@ -11,7 +11,7 @@ one, which leaves a block-sparse system of the stations with a border of what is
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_matrix, identity
@@ -21,7 +21,6 @@ from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
 from reconstruct.mapping.arrays import first_of
 
-Result = TypeVar("Result")
 POSE = 6
 """Parameters of a station: turn about the axes of the world, then motion of its origin."""
 
@@ -62,49 +61,28 @@ class LinearObservations:
         return replace(self, by_point=root * self.by_point, rest=root * self.rest)
 
 
-class LinearParts(Protocol):
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LinearParts:
     """Observations by whole points, in parts that are linearised where they are needed."""
 
-    @property
-    def stations(self) -> Sequence[Indices]:
-        """Of each part, the stations (f,) that it sees, ascending; observations count in these."""
-
-    @property
-    def points(self) -> Sequence[int]:
-        """How many points each part has."""
-
-    @property
-    def pattern(self) -> "BlockPattern":
-        """Which of all stations see points in common."""
-
-    def map(
-        self, function: Callable[[LinearObservations, Any], Result], values: Iterable[Any]
-    ) -> Iterator[Result]:
-        """Yield `function(part, value)` of every part with its value, in order."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class OnePart:
-    """All observations as one part, in this process."""
-
-    linear: LinearObservations
     stations: Sequence[Indices]
+    """Of each part, the stations (f,) that it sees, ascending; observations count in these."""
+    points: Sequence[int]
+    """How many points each part has."""
+    pattern: "BlockPattern"
+    """Which of all stations see points in common."""
+    map: Callable[[Callable[[LinearObservations, Any], Any], Iterable[Any]], Iterator[Any]]
+    """Yields `function(part, value)` of every part with its value, in order."""
 
-    @property
-    def points(self) -> Sequence[int]:
-        """How many points it has."""
-        return [len(self.linear.starts) - 1]
 
-    @property
-    def pattern(self) -> "BlockPattern":
-        """Which stations see points in common."""
-        return pattern_of(self.linear.starts, self.linear.station, len(self.stations[0]))
-
-    def map(
-        self, function: Callable[[LinearObservations, Any], Result], values: Iterable[Any]
-    ) -> Iterator[Result]:
-        """Yield what a function makes of all."""
-        return (function(self.linear, value) for value in values)
+def one_part(linear: LinearObservations, stations: int) -> LinearParts:
+    """All observations of so many stations as one part, in this process."""
+    return LinearParts(
+        stations=[np.arange(stations)],
+        points=[len(linear.starts) - 1],
+        pattern=pattern_of(linear.starts, linear.station, stations),
+        map=lambda function, values: (function(linear, value) for value in values),
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -270,7 +248,7 @@ def reduce_points(linear: LinearObservations, stations: int) -> PointEquations:
         linear: observations; every point needs two that see it from apart.
         stations: F, how many there are.
     """
-    return reduce_parts(OnePart(linear=linear, stations=[np.arange(stations)]))
+    return reduce_parts(one_part(linear, stations))
 
 
 def reduce_parts(parts: LinearParts) -> PointEquations:

@@ -42,13 +42,13 @@ from camera_calib.freedom import Prior, at_bound, move_rig, part_of_rig, pose_na
 from camera_calib.rig import Covariance, Rig
 from reconstruct.adjustment.exact_observations import (
     ALONE,
-    Linearised,
     PixelParts,
     Pixels,
     RigState,
     Workers,
     calibrated_parameters,
     choose_pixels,
+    linearise_parts,
     start_state,
 )
 from reconstruct.adjustment.normal_equations import POSE, PointEquations, reduce_parts
@@ -426,10 +426,7 @@ class SurveyProblem:
     def reduce(self, guess: _Guess, noise: Array, fields: Sequence[str]) -> PointEquations:
         """The same without what is known before the pictures, for any fields of the rig."""
         sigma, variance = noise.tolist()
-        parts = Linearised(
-            pixels=self.parts, state=guess.state, fields=fields, noise=(sigma, variance)
-        )
-        found = reduce_parts(parts)
+        found = reduce_parts(linearise_parts(self.parts, guess.state, fields, (sigma, variance)))
         found.free[self.held] = False
         return found
 

@@ -44,11 +44,11 @@ from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.rig import Rig
 from reconstruct.adjustment.exact_observations import (
     ALONE,
-    Linearised,
     PixelParts,
     Pixels,
     RigState,
     Workers,
+    linearise_parts,
 )
 from reconstruct.adjustment.normal_equations import (
     POSE,
@@ -314,6 +314,12 @@ _MAX_PLACES = 2000
 
 
 _SHARED = ("shared_places", "shared_motions", "shared_cov", "shared_rest")
+_STORED = {
+    "frames": "frames", "stations": "stations", "images": "images", "cov": "frame_cov",
+    "point_ids": "point_ids", "point_cov": "point_cov", "point_noise": "point_noise",
+    "sigma_px": "sigma_px",
+}  # fmt: skip
+"""Arrays of the file, and the fields that they hold."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -439,7 +445,7 @@ def estimate(
     sigma = sigma_of(miss, pixels.seen_by, len(frames))
     weights = cauchy_weights(miss, sigma)
     variance = variance_of(miss, weights, spare / (2 * count))
-    linear = Linearised(pixels=parts, state=state, fields=(), noise=(sigma, variance))
+    linear = linearise_parts(parts, state, (), (sigma, variance))
     shape = shape_of_block(
         linear, pixels, state.centres, state.points, calibration,
         scale_free=scale_free, held=held,
@@ -600,24 +606,13 @@ def _spread_rows(points: Array) -> Indices:
 
 
 def write_uncertainty(path: Path, found: Uncertainty) -> None:
-    """Write `covariance.npz`: fields of `Uncertainty` but the modes; points as float32."""
-    more: dict[str, Any] = {}
+    """Write `covariance.npz`: fields of `Uncertainty` but the modes; much of it as float32."""
+    arrays = {key: np.asarray(getattr(found, name)) for key, name in _STORED.items()}
     if found.shared is not None:
-        one = found.shared
-        parts = one.places, one.motions.astype(np.float32), one.covariance, one.rest
-        more = dict(zip(_SHARED, parts, strict=True))
-    np.savez(
-        path,
-        frames=found.frames,
-        stations=found.stations,
-        images=np.array(found.images),
-        cov=found.frame_cov,
-        point_ids=found.point_ids,
-        point_cov=found.point_cov.astype(np.float32),
-        point_noise=found.point_noise.astype(np.float32),
-        sigma_px=np.array(found.sigma_px),
-        **more,
-    )
+        arrays |= dict(zip(_SHARED, vars(found.shared).values(), strict=True))
+    for key in arrays.keys() & {"point_cov", "point_noise", "shared_motions"}:
+        arrays[key] = arrays[key].astype(np.float32)
+    np.savez(path, **arrays)
 
 
 def read_uncertainty(path: Path) -> Uncertainty:
@@ -626,25 +621,17 @@ def read_uncertainty(path: Path) -> Uncertainty:
     Raises:
         WorkspaceError: it is missing, or not as it was written.
     """
-    data = read_arrays(
-        path, "frames", "stations", "images", "cov", "point_ids", "point_cov", "point_noise",
-        "sigma_px", optional=_SHARED,
-    )  # fmt: skip
+    data = read_arrays(path, *_STORED, optional=_SHARED)
     with taken_from(path):
+        for name in data.keys() - {"frames", "stations", "images", "point_ids"}:
+            data[name] = data[name].astype(np.float64)
+        found: dict[str, Any] = {name: data[key] for key, name in _STORED.items()}
+        found |= {"images": tuple(map(str, data["images"])), "sigma_px": float(data["sigma_px"])}
+        shared = [data[name] for name in _SHARED if name in data]
         return Uncertainty(
-            frames=data["frames"].astype(np.int64),
-            stations=data["stations"].astype(np.int64),
-            images=tuple(str(name) for name in data["images"]),
-            frame_cov=data["cov"].astype(np.float64),
-            point_ids=data["point_ids"].astype(np.int64),
-            point_cov=data["point_cov"].astype(np.float64),
-            point_noise=data["point_noise"].astype(np.float64),
-            sigma_px=float(data["sigma_px"]),
-            modes=no_modes(len(data["frames"]), len(data["point_ids"])),
-            shared=SharedMotions(*(data[name].astype(np.float64) for name in _SHARED))
-            if _SHARED[-1] in data
-            else None,
-        )
+            **found, modes=no_modes(len(data["frames"]), len(data["point_ids"])),
+            shared=SharedMotions(*shared) if shared else None,  # type: ignore[arg-type]
+        )  # fmt: skip
 
 
 def pinhole_survey(

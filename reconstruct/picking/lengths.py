@@ -31,13 +31,13 @@ from alice_survey.core.frames import Array
 from alice_survey.core.records import MappingRecord, RegistrationRecord, ScaleRecord
 from camera_calib.rig import Rig, read_rig
 from reconstruct.adjustment.exact_observations import (
-    Linearised,
     PixelParts,
     Pixels,
     RigState,
     calibrated_parameters,
     exact_observations,
     exact_residuals,
+    linearise_parts,
 )
 from reconstruct.adjustment.normal_equations import Gauge, PointEquations, by_pose, reduce_parts
 from reconstruct.mapping.arrays import MIN_POINTS, Indices, first_of, linked_groups
@@ -145,10 +145,8 @@ class StationBlock:
         if len(numbers) > 1:
             path = workspace / "sparse" / "covariance.npz"
             sigma = float(read_arrays(path, "sigma_px")["sigma_px"])
-        linear = Linearised(
-            pixels=PixelParts(pixels, len(numbers)), state=state, fields=fields,
-            noise=(sigma, sigma**2),
-        )  # fmt: skip
+        parts = PixelParts(pixels, len(numbers))
+        linear = linearise_parts(parts, state, fields, (sigma, sigma**2))
         group = linked_groups(pixels.station, pixels.point, len(numbers))
         if group.any():
             raise ReconstructionError(

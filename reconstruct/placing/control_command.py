@@ -49,6 +49,8 @@ from reconstruct.placing.control_points import (
     PlaceOf,
     Use,
     coordinates,
+    read_number,
+    read_positive,
     write_control,
     write_picks,
 )
@@ -238,7 +240,9 @@ def read_markers(text: str) -> ForeignControl:
         raise ValueError(f"{len(chunks)} chunks have markers: export the markers of one")
     (chunk,) = chunks
     settings = {item.get("name"): item.get("value") for item in chunk.iter("property")}
-    sigma_m, sigma_px, sigma_bar_m = (_sigma(settings.get(name), name) for name in _ACCURACIES)
+    sigma_m, sigma_px, sigma_bar_m = (
+        read_positive(settings.get(name) or "", name) for name in _ACCURACIES
+    )
     cameras = {camera.get("id"): str(camera.get("label")) for camera in chunk.iter("camera")}
     labels = {
         marker.get("id"): (marker.get("label") or f"marker {marker.get('id')}").strip()
@@ -268,7 +272,7 @@ def read_markers(text: str) -> ForeignControl:
                     f"a location names camera {location.get('camera_id')} and marker "
                     f"{marker.get('marker_id')}, which it does not list"
                 )
-            x, y = (_finite(location.get(axis, ""), f"{axis} of {point}") for axis in "xy")
+            x, y = (_finite(location, axis, point) for axis in "xy")
             sigma = PICK_SIGMA_PX if math.isnan(sigma_px) else sigma_px
             found.picks.append(Pick(image=picture, point=point, x_px=x, y_px=y, sigma_px=sigma))
     lost = []
@@ -302,10 +306,8 @@ def _bar(item: ET.Element, labels: Mapping[str | None, str], sigma_m: float) -> 
         ends = next(([*pair] for pair in pairs if known.issuperset(pair)), [])
     if len(ends) != 2 or ends[0] == ends[1]:
         return None
-    length_m = _finite(reference.get("distance", ""), f"distance of {name}")
-    if length_m <= 0:
-        raise ValueError(f"distance of {as_line(name)} is {length_m}: it must be more than 0")
-    own = _sigma(reference.get("accuracy"), f"accuracy of {name}")
+    length_m = read_positive(reference.get("distance", ""), f"distance of {name}")
+    own = read_positive(reference.get("accuracy", ""), f"accuracy of {name}")
     return KnownLength(
         name=name,
         ends=(ends[0], ends[1]),
@@ -321,8 +323,10 @@ def _marker_point(
     use: Use = "control" if _is_true(reference, "enabled") else "check"
     if any(reference.get(axis) is None for axis in "xyz"):
         return KnownPoint(name=name, use=use, sigma_m=sigma_m, sigma_vertical_m=sigma_m)
-    x, y, z = (_finite(reference.get(axis, ""), f"{axis} of {name}") for axis in "xyz")
-    sx, sy, sz = (_sigma(reference.get(axis), f"{axis} of {name}") for axis in ("sx", "sy", "sz"))
+    x, y, z = (_finite(reference, axis, name) for axis in "xyz")
+    sx, sy, sz = (
+        read_positive(reference.get(axis, ""), f"{axis} of {name}") for axis in ("sx", "sy", "sz")
+    )
     level = max((s for s in (sx, sy) if s > 0), default=sigma_m)
     return replace(
         place_of(x, y), name=name, use=use, height_m=z, sigma_m=level,
@@ -334,23 +338,10 @@ def _is_true(element: ET.Element, key: str) -> bool:
     return element.get(key, "true").lower() in ("true", "1")
 
 
-def _sigma(text: str | None, name: str) -> float:
-    """A positive number, or NaN where nothing is stated."""
-    if text is None or not text.strip():
-        return math.nan
-    value = _finite(text, name)
-    if value <= 0:
-        raise ValueError(f"{as_line(name)} is {value}: it must be more than 0")
-    return value
-
-
-def _finite(text: str, name: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise ValueError(f"{as_line(name)} is {as_line(text)!r}, not a number")
+def _finite(element: ET.Element, key: str, name: str) -> float:
+    value = read_number(element.get(key, ""), f"{key} of {name}")
+    if math.isnan(value):
+        raise ValueError(f"{key} of {as_line(name)} is missing")
     return value
 
 

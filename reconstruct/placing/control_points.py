@@ -185,7 +185,7 @@ def read_picks(path: Path) -> list[Pick]:
         if not row["x"] and not row["y"]:
             continue
         with fault:
-            x, y, sigma = (_number(row, name) for name in ("x", "y", "sigma_px"))
+            x, y, sigma = (read_number(row.get(n, ""), n) for n in ("x", "y", "sigma_px"))
             if math.isnan(x + y) or sigma <= 0:
                 raise ValueError("x, y and sigma_px must be numbers")
         picks.append(
@@ -269,8 +269,9 @@ def write_picks(path: Path, picks: Sequence[Pick]) -> None:
 
 
 def _point(row: dict[str, str], name: str, use: Use, sigma: float) -> KnownPoint:
-    at = {key: _number(row, key) for key in _POINT_COLUMNS}
-    easting, northing, epsg = (_number(row, key) for key in ("easting_m", "northing_m", "epsg"))
+    at = {key: read_number(row.get(key, ""), key) for key in _POINT_COLUMNS}
+    grid = ("easting_m", "northing_m", "epsg")
+    easting, northing, epsg = (read_number(row.get(key, ""), key) for key in grid)
     places = (
         (at["latitude_deg"], at["longitude_deg"]), (at["north_m"], at["east_m"]),
         (easting, northing),
@@ -326,20 +327,36 @@ def coordinates(system: str) -> PlaceOf:
     return place
 
 
-def _number(row: dict[str, str], key: str) -> float:
-    cell = row.get(key, "")
+def read_number(text: str, name: str) -> float:
+    """A finite number; NaN of an empty text.
+
+    Raises:
+        ValueError: it is none.
+    """
     try:
-        value = float(cell) if cell else math.nan
+        value = float(text) if text.strip() else math.nan
     except ValueError:
         value = math.inf
-    if math.isinf(value) or (cell and math.isnan(value)):
-        raise ValueError(f"{key} is {cell!r}, not a number")
+    if math.isinf(value) or (text.strip() and math.isnan(value)):
+        raise ValueError(f"{as_line(name)} is {as_line(text)!r}, not a number")
+    return value
+
+
+def read_positive(text: str, name: str) -> float:
+    """A number above 0; NaN of an empty text.
+
+    Raises:
+        ValueError: it is none.
+    """
+    value = read_number(text, name)
+    if value <= 0:
+        raise ValueError(f"{as_line(name)} is {value}: it must be more than 0")
     return value
 
 
 def _positive(row: dict[str, str], key: str) -> float:
-    value = _number(row, key)
-    if not value > 0:
+    value = read_positive(row.get(key, ""), key)
+    if math.isnan(value):
         raise ValueError(f"{key} must be more than 0")
     return value
 

@@ -155,8 +155,33 @@ def read_epochs(
     if not chosen:
         return None
     timed = all(np.isfinite(records[i].time_s) for i in chosen)
-    chosen.sort(
-        key=lambda i: (records[i].time_s if timed else 0.0, records[i].station, records[i].image)
+    return _collect(records, model_from_cam, body_from_cam, datum, modes, readings, chosen, timed)
+
+
+def without_navigation(
+    records: Sequence[ImageRecord],
+    model_from_cam: Sequence[RigidTransform],
+    modes: Array | None = None,
+) -> Epochs:
+    """Epochs of a model without navigation."""
+    unknown, every = np.full((len(records), 6), np.nan), list(range(len(records)))
+    return _collect(records, model_from_cam, None, None, modes, unknown, every, timed=False)
+
+
+def _collect(
+    records: Sequence[ImageRecord],
+    model_from_cam: Sequence[RigidTransform],
+    body_from_cam: Mapping[str, RigidTransform] | None,
+    datum: Datum | None,
+    modes: Array | None,
+    readings: Array,
+    chosen: list[int],
+    timed: bool,
+) -> Epochs:
+    """Epochs of chosen pictures, whose readings of navigation are (N, 6)."""
+    chosen = sorted(
+        chosen,
+        key=lambda i: (records[i].time_s if timed else 0.0, records[i].station, records[i].image),
     )
     rows = [records[i] for i in chosen]
     firsts: dict[int, ImageRecord] = {}
@@ -170,25 +195,21 @@ def read_epochs(
     for at, row_of in zip(moment[::-1], readings[::-1], strict=True):
         shared[at] = np.where(np.isnan(row_of), shared[at], row_of)
     readings = np.where(np.isnan(readings), shared[moment], readings)
-    known = np.isfinite(shared)
     unknown = RigidTransform.identity()
     levers = [unknown if body_from_cam is None else body_from_cam[r.camera] for r in rows]
+    poses = RigidTransform.concatenate([model_from_cam[i] for i in chosen])
+    mounts = RigidTransform.concatenate(levers)
     return Epochs(
         time=np.array([r.time_s for r in first] if timed else stations, np.float64),
         timed=timed,
         moment=moment,
-        centres=np.stack([model_from_cam[i].translation for i in chosen]),
-        model_from_body=Rotation.concatenate(
-            [
-                model_from_cam[i].rotation * lever.rotation.inv()
-                for i, lever in zip(chosen, levers, strict=True)
-            ]
-        ),
-        levers=np.stack([-lever.translation for lever in levers]),
+        centres=poses.translation,
+        model_from_body=poses.rotation * mounts.rotation.inv(),
+        levers=-mounts.translation,
         measured_ned=_positions(readings, datum),
         ned_from_body=rotation_from_attitude(*np.deg2rad(np.nan_to_num(readings[:, 3:])).T),
         sigma=_sigmas(first),
-        known=known,
+        known=np.isfinite(shared),
         modes=np.zeros((len(chosen), 6, 0)) if modes is None else modes[chosen],
     )
 
@@ -213,30 +234,6 @@ def _positions(readings: Array, datum: Datum | None) -> Array:
         places[:, 2] = 0.0
     middle = np.nanmean(places, axis=0)
     return datum.ned_from_geodetic(np.where(np.isfinite(places), places, middle))
-
-
-def without_navigation(
-    records: Sequence[ImageRecord],
-    model_from_cam: Sequence[RigidTransform],
-    modes: Array | None = None,
-) -> Epochs:
-    """Epochs of a model without navigation."""
-    stations = sorted({r.station for r in records})
-    number = {station: k for k, station in enumerate(stations)}
-    count, identity = len(records), Rotation.identity(len(records))
-    return Epochs(
-        time=np.arange(float(len(stations))),
-        timed=False,
-        moment=np.array([number[r.station] for r in records]),
-        centres=np.stack([pose.translation for pose in model_from_cam]),
-        model_from_body=identity,
-        levers=np.zeros((count, 3)),
-        measured_ned=np.zeros((count, 3)),
-        ned_from_body=identity,
-        sigma=np.ones((len(stations), 6)),
-        known=np.zeros((len(stations), 6), dtype=bool),
-        modes=np.zeros((count, 6, 0)) if modes is None else modes,
-    )
 
 
 def _sigmas(rows: Sequence[ImageRecord]) -> Array:

@@ -14,7 +14,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from scipy.spatial import KDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -32,9 +31,9 @@ from alice_survey.core.frames import Array, Datum
 from alice_survey.core.manifest import ImageRecord
 from alice_survey.core.records import MappingRecord, PicturesRecord, ScaleRecord
 from alice_survey.core.run import progress
-from camera_calib.approximation.pinhole_warp import PinholeWarp
-from camera_calib.rig import Rig, rig_with_mount
-from reconstruct.adjustment.uncertainty import SoftModes, Uncertainty
+from camera_calib.rig import rig_with_mount
+from reconstruct.adjustment.survey_fit import AdjustedSurvey
+from reconstruct.adjustment.uncertainty import SoftModes
 from reconstruct.pictures.files import list_names
 from reconstruct.placing.alignment import Similarity, level
 from reconstruct.placing.control import (
@@ -244,19 +243,21 @@ class Placing:
     """What a place is found from."""
 
     workspace: Path
-    model: pycolmap.Reconstruction
+    adjusted: AdjustedSurvey
     records: Sequence[ImageRecord]
     """Registered pictures."""
     pinholes: Sequence[RigidTransform]
     """`model_from_pinhole` of these."""
-    warps: Mapping[str, PinholeWarp]
-    rig: Rig | None
     datum: Datum | None
     survey: PicturesRecord
     mapping: MappingRecord
     settings: ReconstructConfig
-    shape: Uncertainty | None
-    """How well the model's shape is known; None where it is not."""
+
+    @property
+    def points(self) -> Array:
+        """(P, 3) of the model, by their ids."""
+        points = self.adjusted.mapped.model.points3D
+        return np.array([p.xyz for _, p in sorted(points.items())]).reshape(-1, 3)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -278,7 +279,7 @@ def find_place(task: Placing) -> Placed:
         ReconstructionError: the model is too small, or `scale.json` is of another model.
         WorkspaceError: a file of control is wrong.
     """
-    points = np.array([p.xyz for _, p in sorted(task.model.points3D.items())]).reshape(-1, 3)
+    points = task.points
     if len(points) < 3:
         raise ReconstructionError(f"the model has {len(points)} points only")
     order = sorted(
@@ -368,12 +369,13 @@ def _fit(
     # Control corrects a known scale within its sigma; without control it is held.
     sigma = known.sigma if ties.informs_scale or not known.held else 0.0
     fit, modes, joints = None, None, 0
-    if task.shape is not None:
-        joints = task.shape.modes.joints
-        modes = picture_modes(task.shape, task.records, task.pinholes)
-        if task.shape.modes.calibration.size:  # the rig's scale is one of them
+    shape, warps = task.adjusted.shape, task.adjusted.mapped.warps
+    if shape is not None:
+        joints = shape.modes.joints
+        modes = picture_modes(shape, task.records, task.pinholes)
+        if shape.modes.calibration.size:  # the rig's scale is one of them
             sigma = 0.0
-    rig, installed = rig_with_mount(task.rig), Installation.of(task.settings)
+    rig, installed = rig_with_mount(task.adjusted.rig), Installation.of(task.settings)
     fit_to = partial(
         fit_navigation,
         task.records,
@@ -384,7 +386,7 @@ def _fit(
         modes=modes,
         joints=joints,
     )
-    mounts = None if rig is None else body_from_pinhole(rig, task.warps)
+    mounts = None if rig is None else body_from_pinhole(rig, warps)
     navigate = partial(fit_to, mounts, installed=installed)
     if task.datum is not None:
         control = ties.equations if ties.informs else None
@@ -431,12 +433,13 @@ def _turn_by_attitudes(task: Placing, levelled: Similarity) -> tuple[Similarity,
     records = [
         replace(record, latitude_deg=nan, longitude_deg=nan, depth_m=nan) for record in task.records
     ]
-    rig = rig_with_mount(task.rig)
+    rig = rig_with_mount(task.adjusted.rig)
     if rig is None or not any(_is_turned(record) for record in records):
         return None
+    mounts = body_from_pinhole(rig, task.adjusted.mapped.warps)
     fit = fit_navigation(
-        records, task.pinholes, body_from_pinhole(rig, task.warps), None, levelled=levelled,
-        known_scale=1.0, installed=Installation.of(task.settings),
+        records, task.pinholes, mounts, None, levelled=levelled, known_scale=1.0,
+        installed=Installation.of(task.settings),
     )  # fmt: skip
     return None if fit is None else (fit.ned_from_model, _local_note(records, headed=True))
 
@@ -447,8 +450,9 @@ def _is_turned(record: ImageRecord) -> bool:
 
 def _pinhole_from_rig(task: Placing) -> dict[str, RigidTransform] | None:
     """Poses of the pinholes on the rig; None where several cameras are no rig."""
-    if task.rig is not None:
-        return {n: w.pinhole_from_cam * task.rig.cam_from_rig[n] for n, w in task.warps.items()}
+    rig, warps = task.adjusted.rig, task.adjusted.mapped.warps
+    if rig is not None:
+        return {n: w.pinhole_from_cam * rig.cam_from_rig[n] for n, w in warps.items()}
     names = {record.camera for record in task.records}
     return {name: RigidTransform.identity() for name in names} if len(names) == 1 else None
 
@@ -498,8 +502,9 @@ def _tie(task: Placing, control: Control, datum: Datum | None) -> ControlFit:
     if not (control.points or control.lengths):
         return ControlFit(ties=(), bars=(), lost={})
     picks = picks_of_model(task.workspace, {record.image for record in task.records})
+    warps = task.adjusted.mapped.warps
     cameras = {
-        record.image: RegisteredPicture(warp=task.warps[record.camera], model_from_pinhole=pose)
+        record.image: RegisteredPicture(warp=warps[record.camera], model_from_pinhole=pose)
         for record, pose in zip(task.records, task.pinholes, strict=True)
     }
     picked, lost = triangulate_picks(picks, cameras)
@@ -508,10 +513,10 @@ def _tie(task: Placing, control: Control, datum: Datum | None) -> ControlFit:
     }
     lost = {name: why for name, why in lost.items() if name in requested}
     found = tie_control(control, picked, lost, datum)
-    if task.shape is None:
+    shape = task.adjusted.shape
+    if shape is None:
         return found
-    xyz = np.array([p.xyz for _, p in sorted(task.model.points3D.items())])
-    return replace(found, motion_at=partial(_motions_near, KDTree(xyz), task.shape.modes))
+    return replace(found, motion_at=partial(_motions_near, KDTree(task.points), shape.modes))
 
 
 def _motions_near(tree: KDTree, modes: SoftModes, places: Array) -> Array:

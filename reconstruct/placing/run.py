@@ -307,17 +307,14 @@ def pinhole_positions(
         (N, 3) positions in NED and their sigmas, both metres; NaN where position, attitude or a
         sigma is unknown.
     """
-    positions = positions_ned(records, datum)
-    sigmas = np.full((len(records), 3), np.nan)
-    for i, record in enumerate(records):
+    positions, sigmas = np.full((2, len(records), 3), np.nan)
+    for i, (record, place) in enumerate(zip(records, positions_ned(records, datum), strict=True)):
         lever = mounts[record.camera].translation
         turn = np.deg2rad(max(record.sigma_attitude_deg, record.sigma_heading_deg))
         level, depth = record.sigma_horizontal_m, record.sigma_depth_m
         if record.has_attitude and min(level, depth, turn) > 0:
-            positions[i] += record.ned_from_body.apply(lever)
+            positions[i] = place + record.ned_from_body.apply(lever)
             sigmas[i] = np.hypot([level, level, depth], turn * np.linalg.norm(lever))
-        else:
-            positions[i] = np.nan
     sigmas[np.isnan(positions)] = np.nan
     return positions, sigmas
 
@@ -429,15 +426,13 @@ def check_mapping(
         centres = np.array([pose.translation for pose in poses])
         off, sigma = navigation_residuals(centres, positions[rows], sigmas[rows])
         usual = float(np.median(off) / _MEDIAN_SIGMAS)
-        for row, off_m, over in zip(
-            rows.tolist(), off.tolist(), (off / sigma).tolist(), strict=True
-        ):
-            if off_m > FAR_M and over > FAR_SIGMAS:
-                one = records[row]
-                far.append(
-                    FarStation(station=one.station, image=one.image, off_m=off_m, sigmas=over)
-                )
-        far.sort(key=lambda f: (-f.off_m, f.station))
+        over = off / sigma
+        jumped = np.flatnonzero((off > FAR_M) & (over > FAR_SIGMAS))
+        for k in jumped[np.argsort(-off[jumped], kind="stable")]:
+            one = records[rows[k]]
+            far.append(
+                FarStation(station=one.station, image=one.image, off_m=off[k], sigmas=over[k])
+            )
     notes = []
     if far:
         names = list_names([f"{f.image} ({f.off_m:.2f} m)" for f in far])
@@ -550,16 +545,13 @@ def run_sparse(
     placed = find_place(
         Placing(
             workspace=workspace,
-            model=adjusted.mapped.model,
+            adjusted=adjusted,
             records=[of_name[name] for name in names],
             pinholes=[poses[name] for name in names],
-            warps=adjusted.mapped.warps,
-            rig=adjusted.rig,
             datum=inputs.datum,
             survey=inputs.survey,
             mapping=mapping,
             settings=reconstruct,
-            shape=adjusted.shape,
         )
     )
     shape = adjusted.shape

@@ -16,7 +16,7 @@ from alice_survey.core.frames import Array
 from reconstruct.adjustment.exact_observations import calibrated_parameters, exact_observations
 from reconstruct.adjustment.normal_equations import (
     LinearObservations,
-    OnePart,
+    one_part,
     reduce_points,
 )
 from reconstruct.adjustment.survey_fit import calibrated_covariance, motions_of
@@ -97,8 +97,8 @@ def predict(
         rest=np.ascontiguousarray(linear.rest[..., -1:]),
     )  # fmt: skip
     shape = shape_of_block(
-        OnePart(linear=bare, stations=[np.arange(len(state.centres))]), block.pixels,
-        state.centres, state.points, motions, scale_free=len(rig.cameras) < 2,
+        one_part(bare, len(state.centres)), block.pixels, state.centres,
+        state.points, motions, scale_free=len(rig.cameras) < 2,
     )  # fmt: skip
     joint, middle = _place(block, shape, navigation, control, control_sigma_m)
     return _precision(block, shape, joint, middle)

@@ -106,11 +106,12 @@ def stored_of(model: pycolmap.Reconstruction) -> StoredModel:
     with tempfile.TemporaryDirectory() as folder:
         model.write_binary(folder)
         point_ids, points = all_points(Path(folder))
-        return StoredModel(
-            keypoints=dict(_all_keypoints(Path(folder) / "images.bin")),
-            point_ids=point_ids,
-            points=points,
-        )
+        try:
+            file = ImagesFile(Path(folder))
+        except ReconstructionError:
+            raise OSError(errno.ENOSPC, _NO_ROOM, folder) from None
+        keypoints = {picture.number: file.keypoints(picture) for picture in file.pictures}
+        return StoredModel(keypoints=keypoints, point_ids=point_ids, points=points)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -220,20 +221,6 @@ def _point_starts(content: NDArray[np.uint8]) -> tuple[NDArray[np.int64], int]:
             track |= np.int64(content[at + _TRACK_LENGTH + k]) << (8 * k)
         at += minimum + 8 * track
     return starts, int(at)
-
-
-def _all_keypoints(path: Path) -> Iterator[tuple[int, NDArray[np.void]]]:
-    content = path.read_bytes()
-    try:
-        (pictures,) = struct.unpack_from("<Q", content)
-        at = 8
-        for _ in range(pictures):
-            (number,) = struct.unpack_from("<I", content, at)
-            first, count = _keypoints(content, at)
-            yield number, np.frombuffer(content, KEYPOINT, count, first)
-            at = first + KEYPOINT.itemsize * count
-    except (struct.error, ValueError):
-        raise OSError(errno.ENOSPC, _NO_ROOM, path) from None
 
 
 def _map_file(path: Path) -> Content:

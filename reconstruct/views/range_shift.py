@@ -120,7 +120,7 @@ def range_shift(warp: PinholeWarp) -> RangeShift:
     x, y = np.linspace(0.0, width, _COLUMNS), np.linspace(0.0, height, rows)
     _, offset = warp.lines(warp.from_pinhole(np.stack(np.meshgrid(x, y), axis=-1)))
     return RangeShift(
-        nodes=_without_holes(offset * warp.pinhole.numbers[:2]),
+        nodes=fill_holes(offset * warp.pinhole.numbers[:2]),
         width_px=float(width),
         height_px=float(height),
         inverse_working=1.0 / warp.working_depth_m,
@@ -137,16 +137,13 @@ def no_shift(width_px: int, height_px: int) -> RangeShift:
     )
 
 
-def _without_holes(field: Array) -> Array:
-    """A field whose nodes beyond the lens's reach have the value of the nearest known one."""
-    known = np.isfinite(field).all(axis=2)
-    if known.all():
-        return field
+def fill_holes(field: Array) -> Array:
+    """A field (H, W) or (H, W, 2) whose unknown nodes have the value of the nearest known one."""
     from scipy.ndimage import distance_transform_edt
 
+    unknown = ~np.isfinite(field).reshape(*field.shape[:2], -1).all(axis=2)
     find: Any = distance_transform_edt
-    nearest = find(~known, return_distances=False, return_indices=True)
-    filled: Array = field[tuple(nearest)]
+    filled: Array = field[tuple(find(unknown, return_distances=False, return_indices=True))]
     return filled
 
 
