@@ -13,24 +13,28 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.config import ReconstructConfig
 from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.frames import Array
 from alice_survey.core.records import RangeRecord
-from camera_calib.freedom import POSE, value
+from camera_calib.freedom import POSE, knowing_water, value
 from camera_calib.rig import Covariance, Rig
 from reconstruct.adjustment import exact_observations, survey_fit
 from reconstruct.adjustment.exact_observations import (
-    Linearised,
     PixelParts,
     Pixels,
     RigState,
     Workers,
     choose_pixels,
+    linearise_parts,
     start_state,
 )
 from reconstruct.adjustment.normal_equations import PointEquations, reduce_parts
 from reconstruct.adjustment.survey_fit import (
+    BIAS_PX,
     AdjustedSurvey,
     SurveyFit,
     adjust_survey,
+    bias_covariance,
+    contradiction,
     fit_survey,
     frees_poses,
 )
@@ -38,9 +42,10 @@ from reconstruct.mapping.arrays import frames_of
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.refraction import refract
-from reconstruct.placing.alignment import align_rigid
+from reconstruct.placing.alignment import align_rigid, align_similarity
 from tests.cameras import changed
 from tests.engines import PicklingThreads
+from tests.reconstruct.rig_survey import four_cameras
 from tests.reconstruct.scenes import Scene, make_scene
 from tests.reconstruct.true_models import near_truth, pupils_and_points, warped_scene
 
@@ -197,8 +202,7 @@ def test_parts_say_of_stations_and_points_what_all_observations_say(
 
     def equations(pixels: Pixels, state: RigState) -> PointEquations:
         parts = PixelParts(pixels, len(state.centres))
-        linear = Linearised(pixels=parts, state=state, fields=fields, noise=(0.3, 0.09))
-        return reduce_parts(linear)
+        return reduce_parts(linearise_parts(parts, state, fields, (0.3, 0.09)))
 
     parts = equations(near, moved)
     assert len(parts.parts.stations) == 5
@@ -292,3 +296,195 @@ def test_a_large_survey_is_adjusted_in_parts_as_a_whole(
     every = round(len(whole.point_ids) / len(some.places))
     np.testing.assert_array_equal(some.points, parts.calibration.points[::every])
     np.testing.assert_array_equal(some.places, parts.calibration.places[::every])
+
+
+INDEX_DISTANCES = RangeRecord(near_m=1.75, far_m=2.35, source="test")
+POSES = {"right.rx_rad": 2e-5, "right.ry_rad": 2e-5, "right.rz_rad": 2e-5,
+         "right.x_m": 2e-6, "right.y_m": 2e-6, "right.z_m": 2e-6}  # fmt: skip
+SIGMA = 1e-3
+
+
+def believing(scene: Scene, believed: Rig, folder: Path) -> AdjustedSurvey:
+    """The survey as believing by who believes in a rig."""
+    seen, warps = warped_scene(replace(scene, rig=believed))
+    start = near_truth(replace(scene, rig=believed), seen, warps, np.random.default_rng(1))
+    mapped, _ = refract(start, seen, folder)
+    return adjust_survey(mapped, scene.records, believed, INDEX_DISTANCES, ReconstructConfig())
+
+
+def with_poses(rig: Rig) -> Rig:
+    matrix = np.diag(np.array(list(POSES.values())) ** 2)
+    return replace(rig, covariance=Covariance(parameters=tuple(POSES), matrix=matrix))
+
+
+def test_ranges_of_one_pair_follow_the_index_as_snells_law_says(tmp_path: Path) -> None:
+    """With h the sideways way in water, `z - d - g = h / tan(c)` and `sin(a) = n sin(c)`.
+
+    Pixels hold a, so that `dz/dn = (z - d - g) / (n cos^2 c)`: what lies amid two parallel cameras
+    moves along their axes alone.
+    """
+    scene = make_scene(lines=1, stations=1, points=60_000, relief_m=0.3)
+    scene = replace(
+        scene, pixels=[p + np.random.default_rng(i).normal(0, 0.05, p.shape)
+                       for i, p in enumerate(scene.pixels)]
+    )  # fmt: skip
+    rig = knowing_water(scene.rig, SIGMA)
+    seen, warps = warped_scene(scene)
+    start = near_truth(scene, seen, warps, np.random.default_rng(1))
+    mapped, _ = refract(start, seen, tmp_path)
+    moved = fit_survey(mapped, seen, rig, port=False, pose=False).calibration
+    assert moved is not None
+    ned_from_cam = scene.ned_from_cam[0]
+    places = ned_from_cam.inv().apply(moved.places)
+    ways = ned_from_cam.rotation.inv().apply(moved.points.sum(axis=2))
+    half_m = 0.5 * scene.rig.baseline_m
+    amid = np.abs(places[:, 0] - half_m) < 0.005
+    assert amid.sum() > 50
+    port = scene.rig.cameras["left"].port
+    d, g, n = map(port.parameter, ("port_distance_m", "glass_thickness_m", "n_water"))
+    _, y, z = places[amid].T
+    in_water = z - d - g
+    # The ways in air and glass are 3 % of all: c as if all were water is right to a thousandth.
+    cos_sq = z**2 / (half_m**2 + y**2 + z**2)
+    np.testing.assert_allclose(ways[amid, 2], in_water / (n * cos_sq), rtol=0.005)
+    spread = np.sqrt(np.diag(moved.of_points(moved.places[amid][:1])[0]))
+    along = np.abs(ned_from_cam.rotation.inv().apply(spread))[2]
+    assert along == pytest.approx(SIGMA * in_water[0] / (n * cos_sq[0]), rel=0.02)
+
+
+def scale_error_and_sigma(found: AdjustedSurvey, scene: Scene) -> tuple[float, float]:
+    """Of the stations' scale, relative."""
+    assert found.shape is not None
+    pupils, true, _, _ = pupils_and_points(found.mapped, scene)
+    error = 1.0 / align_similarity(pupils, true).scale - 1.0
+    stations = centres_of(found)
+    arms = stations - stations.mean(axis=0)
+    weights = arms / (arms**2).sum()
+    by_mode = np.einsum("fi,fik->k", weights, found.shape.modes.stations[:, 3:])
+    return error, float(np.linalg.norm(by_mode))
+
+
+def centres_of(found: AdjustedSurvey) -> Array:
+    assert found.exact is not None
+    return found.exact.fit.state.centres
+
+
+def test_scales_lie_within_their_sigmas_where_the_index_is_drawn(tmp_path: Path) -> None:
+    drawn, counted, ignored = np.random.default_rng(4).normal(0, SIGMA, 12), [], []
+    for seed, off in enumerate(drawn):
+        truth = make_scene(lines=2, stations=5, points=600, noise_px=0.05, scale=2, seed=seed)
+        believed = with_poses(truth.rig)
+        scene = make_scene(
+            lines=2, stations=5, points=600, noise_px=0.05, scale=2, seed=seed,
+            rig=truth.rig.in_water(truth.rig.cameras["left"].n_water + off),
+        )  # fmt: skip
+        for rig, ratios in ((knowing_water(believed, SIGMA), counted), (believed, ignored)):
+            error, sigma = scale_error_and_sigma(believing(scene, rig, tmp_path), scene)
+            ratios.append(error / sigma)
+    assert 0.7 < np.sqrt(np.mean(np.square(counted))) < 1.4
+    assert np.sqrt(np.mean(np.square(ignored))) > 1.5
+
+
+def test_changes_of_a_lens_move_pixels_radially_by_the_sigma() -> None:
+    """Drawn from the covariance and seen through the whole camera, port and all."""
+    rig, rng = four_cameras(), np.random.default_rng(4)
+    for owner, camera in rig.cameras.items():
+        fields = [f for f in ("fx_px", "fy_px", "cx_px", "k1", "k2", "p1")
+                  if f in camera.lens.parameters]  # fmt: skip
+        names = [*(f"{owner}.{field}" for field in fields), f"{owner}.n_water"]
+        covariance = bias_covariance(rig, names)
+        assert not covariance[-1].any()
+        assert not covariance[2].any(), "a shift of the whole picture"
+        grid = np.stack(np.meshgrid(*(np.linspace(5, n - 6, 15) for n in (
+            camera.width_px, camera.height_px))), axis=-1).reshape(-1, 2)  # fmt: skip
+        starts, rays = camera.unproject(grid)
+        squares, along = [], []
+        for _ in range(200):
+            step = rng.multivariate_normal(np.zeros(len(names)), covariance)
+            values: dict[str, float] = {
+                f: camera.parameter(f) + s for f, s in zip(fields, step, strict=False)
+            }
+            shift = camera.with_parameters(values).project(starts + 2.0 * rays) - grid
+            out = grid - [camera.parameter("cx_px"), camera.parameter("cy_px")]
+            squares.append((shift**2).sum(axis=1).mean())
+            along.append(np.abs(shift.mean(axis=0)).max() / np.sqrt(squares[-1]))
+            assert np.abs(np.corrcoef(shift[:, 0], out[:, 1])[0, 1]) < 0.5
+        assert np.sqrt(np.mean(squares)) == pytest.approx(BIAS_PX, rel=0.2)
+        assert np.median(along) < 0.35
+
+
+NAMES = tuple(f"left.p{n}" for n in range(6))
+
+
+def linear_fit(
+    rng: np.random.Generator, wrong: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Change, prior and what is left of 6 parameters, of which readings measure 4 combinations.
+
+    The truth is drawn from the prior, plus `wrong` of its sigmas.
+    """
+    root = rng.normal(size=(6, 6)) * np.logspace(-4, 2, 6)[:, None]
+    prior = root @ root.T
+    truth = root @ rng.normal(size=6) + wrong * np.sqrt(np.diag(prior))
+    seen = rng.normal(size=(4, 6)) / np.sqrt(np.diag(prior))
+    readings = seen @ truth + 0.3 * rng.normal(size=4)
+    gain = prior @ seen.T @ np.linalg.inv(seen @ prior @ seen.T + 0.09 * np.eye(4))
+    return gain @ readings, prior, prior - gain @ seen @ prior
+
+
+def test_a_right_calibration_is_contradicted_as_seldom_as_stated():
+    rng = np.random.default_rng(1)
+    found = [contradiction(NAMES, *linear_fit(rng, np.zeros(6))) for _ in range(4000)]
+    assert sum(one is not None for one in found) <= 4  # of 4000 at 1e-4
+
+
+def test_a_wrong_parameter_is_found_and_named():
+    rng = np.random.default_rng(2)
+    wrong = np.zeros(6)
+    wrong[3] = 12.0
+    found = [contradiction(NAMES, *linear_fit(rng, wrong)) for _ in range(200)]
+    known = [one for one in found if one is not None]
+    assert len(known) > 180
+    named = sum("left.p3" in one.pulls for one in known)
+    assert named > 0.6 * len(known)
+    assert all(3 <= one.directions <= 4 for one in known)
+
+
+def test_nothing_free_contradicts_nothing():
+    assert contradiction((), np.empty(0), np.empty((0, 0)), np.empty((0, 0))) is None
+    still = contradiction(NAMES, np.zeros(6), np.eye(6), np.eye(6))
+    assert still is None
+
+
+STATED = {"port_distance_m": 5e-5, "normal_x": 2e-4, "normal_y": 2e-4, "n_water": 2e-4}
+
+
+def believed(rig: Rig, wrong: dict[str, float]) -> Rig:
+    """The rig with parameters of its left camera off, and all of its ports stated as `STATED`."""
+    left = rig.cameras["left"]
+    off = {name: left.parameter(name) + by for name, by in wrong.items()}
+    names = tuple(f"{camera}.{field}" for camera in rig.cameras for field in STATED)
+    sigmas = np.array([STATED[name.split(".")[1]] for name in names])
+    return replace(
+        rig,
+        cameras={**rig.cameras, "left": left.with_parameters(off)},
+        covariance=Covariance(parameters=names, matrix=np.diag(sigmas**2)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("wrong", "about"),
+    [({}, None), ({"normal_x": 0.004}, "normal_x"), ({"port_distance_m": 0.008}, "")],
+)
+def test_a_port_stated_too_well_is_named_and_a_right_one_is_not(
+    tmp_path: Path, wrong: dict[str, float], about: str | None
+):
+    scene = noisy(5)
+    rig = believed(scene.rig, wrong)
+    mapped, seen = modelled(scene, rig, tmp_path)
+    found = fit_survey(mapped, seen, rig, port=True, pose=False).contradiction
+    assert (found is None) == (about is None)
+    if found is not None and about is not None:
+        assert about in found.words
+        assert found.words.count("sigmas") >= 2
+        assert "\n" not in found.words

@@ -10,16 +10,28 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.errors import keep_warnings
+from alice_survey.core.frames import Array
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
+from camera_calib.rig import design_rig
 from reconstruct.placing.alignment import Similarity, level
-from reconstruct.placing.control import ControlFit, tie_control
+from reconstruct.placing.control import (
+    ControlFit,
+    real_sigma_factor,
+    tie_control,
+    widen,
+    without_wrong_points,
+)
 from reconstruct.placing.control_points import (
+    Control,
+    KnownPoint,
     Pick,
     RegisteredPicture,
     read_control,
     triangulate_picks,
 )
-from reconstruct.placing.fit import fit_control, fit_navigation
+from reconstruct.placing.fit import PlacementFit, fit_control, fit_navigation
 from reconstruct.placing.navigation import body_from_pinhole
 from tests.reconstruct.scenes import ALTITUDE_M, DATUM, Scene, make_scene
 
@@ -287,3 +299,143 @@ def test_control_points_straighten_a_bent_model(tmp_path: Path) -> None:
         off.append(abs(next(p for p in score["points"] if p["use"] == "check")["down_m"]))
     assert fit.modes[0] == pytest.approx(-4.0, abs=1.5)  # the prior of unit size pulls
     assert off[1] < 0.4 * off[0] and off[0] > 0.004, off
+
+
+_MORE = [[1.2, 0.55, 14.92], [2.3, 0.7, 15.02], [2.0, 1.5, 14.97], [1.0, 1.2, 15.08]]
+POINTS = np.vstack([KNOWN, _MORE])
+"""Nine points of the sea floor in NED."""
+STATED_M, REAL_M = 0.002, 0.1
+WRONG_M = (1.5, -1.0, 0.5)
+
+
+def known_at(places: np.ndarray, sigma_m: float = STATED_M) -> Control:
+    nan = float("nan")
+    return Control(
+        points=tuple(
+            KnownPoint(
+                name=f"p{k}", use="control", latitude_deg=nan, longitude_deg=nan, north_m=north,
+                east_m=east, depth_m=down, height_m=nan, sigma_m=sigma_m, sigma_vertical_m=sigma_m,
+            )
+            for k, (north, east, down) in enumerate(places.tolist())
+        )
+    )  # fmt: skip
+
+
+def tied_to(gauge: Gauge, places: np.ndarray, noise_px: float = 0.3) -> ControlFit:
+    spots, lost = triangulate_picks(picks_of(POINTS[: len(places)], noise_px), gauge.cameras)
+    return tie_control(known_at(places), spots, lost, DATUM)
+
+
+def placed_by(gauge: Gauge, ties: ControlFit, known_scale: float | None) -> PlacementFit:
+    start = ties.start(known_scale)
+    assert start is not None
+    poses: list[RigidTransform] = [c.model_from_pinhole for c in gauge.cameras.values()]
+    return fit_control(
+        site().records, poses, start, ties.equations, known_scale=known_scale, scale_sigma=0.0
+    )
+
+
+@pytest.mark.parametrize("known_scale", [None, 1.0])
+def test_a_wrong_point_is_left_out_and_the_rest_has_its_real_sigma(
+    known_scale: float | None,
+) -> None:
+    misses, factors = [], []
+    for seed in range(10):
+        rng, gauge = np.random.default_rng(seed), in_gauge(seed)
+        places = POINTS + rng.normal(0, REAL_M, POINTS.shape)
+        wrong = int(rng.integers(len(places)))
+        places[wrong] += WRONG_M
+        with keep_warnings() as said:
+            ties = without_wrong_points(tied_to(gauge, places), known_scale)
+        assert [t.name for t in ties.ties if t.use == "left out"] == [f"p{wrong}"]
+        assert len(said) == 1 and f"p{wrong} is " in said[0]
+        fit = placed_by(gauge, ties, known_scale)
+        parameters = 6 if known_scale else 7
+        factor = real_sigma_factor(ties, fit.ned_from_model, parameters)
+        ties = widen(ties, factor)
+        fit = placed_by(gauge, ties, known_scale)
+        middle = fit.ned_from_model.apply(gauge.points(fit.middle_ned[None]))[0]
+        misses.append((middle - fit.middle_ned) / fit.sigma_position_m)
+        factors.append(factor)
+        score = ties.score(fit.ned_from_model, located=True)
+        assert score.sigma_factor == factor
+        assert score.rms["control"].points == len(places) - 1
+        assert [row.use for row in score.points].count("left out") == 1
+    assert REAL_M / STATED_M * 0.85 < np.sqrt(np.mean(np.square(factors))) < REAL_M / STATED_M * 1.1
+    assert 0.7 < np.sqrt(np.mean(np.square(misses))) < 1.4
+
+
+def test_hasty_picks_count_with_what_they_are_worth() -> None:
+    noise_px, misses = 6.0, []
+    for seed in range(6):
+        gauge = in_gauge(seed)
+        picks = picks_of(POINTS, noise_px, seed)
+        picks[seed] = replace(picks[seed], x_px=picks[seed].x_px + 150.0)
+        with keep_warnings() as said:
+            spots, lost = triangulate_picks(picks, gauge.cameras)
+        assert not lost and len(said) == 1 and "count with a sigma of" in said[0]
+        stated = float(said[0].rsplit("sigma of ", 1)[1].split()[0])
+        assert 0.7 * noise_px < stated < 1.4 * noise_px
+        assert [p for s in spots.values() for p in s.left_out] == [picks[seed].image]
+        true = gauge.points(POINTS)
+        for k, point in enumerate(true):
+            off = spots[f"p{k}"].model - point
+            misses.append(off @ np.linalg.solve(spots[f"p{k}"].covariance, off) / 3.0)
+    assert 0.6 < np.mean(misses) < 1.5
+
+
+NADIR = Rotation.from_euler("z", 90, degrees=True)
+
+
+def cameras(count: int) -> dict[str, RegisteredPicture]:
+    """Pictures in a line, 2 m above the origin, 0.25 m apart."""
+    camera = design_rig(CameraConfig(), WaterConfig(), scale=6).cameras["left"]
+    warp = best_warp(camera, 1.5, 2.5)
+    return {
+        f"{n}.png": RegisteredPicture(
+            warp=warp,
+            model_from_pinhole=RigidTransform.from_components(
+                [0.25 * (n - (count - 1) / 2), 0.1 * (n % 2), -2.0], NADIR
+            ),
+        )
+        for n in range(count)
+    }
+
+
+def drawn(
+    views: dict[str, RegisteredPicture], mark: float, match: float, rng: np.random.Generator
+) -> list[Pick]:
+    """A mark by eye in the first picture, and matches to it in the others.
+
+    The match of a patch errs by the noise of the patch, which all share, and by that of the other
+    picture; what is matched lies on a level floor.
+    """
+    first, *others = views
+    place = np.zeros(3)
+    marked = views[first].project(place) + rng.normal(0, mark, 2)
+    patch = marked + rng.normal(0, match / np.sqrt(2), 2)
+    start, way = views[first].ray(patch)
+    meant = start - way * start[2] / way[2]
+
+    def at(image: str, pixel: Array, sigma: float, to: str) -> Pick:
+        return Pick(image=image, point="p", x_px=float(pixel[0]), y_px=float(pixel[1]),
+                    sigma_px=sigma, matched_to=to)  # fmt: skip
+
+    return [
+        at(first, marked, mark, ""),
+        *(
+            at(o, views[o].project(meant) + rng.normal(0, match / np.sqrt(2), 2), match, first)
+            for o in others
+        ),
+    ]
+
+
+@pytest.mark.parametrize(("mark", "match"), [(0.5, 0.05), (0.05, 0.05), (0.02, 0.1)])
+def test_errors_of_matched_spots_are_as_stated(mark: float, match: float) -> None:
+    rng, views = np.random.default_rng(3), cameras(6)
+    chi = []
+    for _ in range(60):
+        spot = triangulate_picks(drawn(views, mark, match, rng), views)[0]["p"]
+        chi.append(spot.model @ np.linalg.solve(spot.covariance, spot.model))
+    # three degrees of freedom; chi above 1 only widens
+    assert 0.7**2 < np.mean(chi) / 3 < 1.3**2

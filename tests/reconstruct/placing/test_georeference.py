@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.manifest import ImageRecord
-from reconstruct.placing.alignment import Similarity, level
+from reconstruct.placing.alignment import Similarity, align_rigid, align_similarity, level
 from reconstruct.placing.fit import PlacementFit, fit_navigation
 from tests.reconstruct.scenes import DATUM, Scene, make_scene
 
@@ -190,3 +190,26 @@ def test_level_puts_the_mean_plane_flat_below_the_cameras(seed: int) -> None:
     ahead = cameras[-1] - cameras[0]
     np.testing.assert_allclose(ahead, [6.0, 0.0, 0.0], atol=0.1)
     assert np.linalg.det(placed.rotation.as_matrix()) == pytest.approx(1.0)
+
+
+@given(seed=st.integers(0, 2**32 - 1), scale=st.floats(0.1, 10.0))
+def test_a_similarity_is_recovered(seed: int, scale: float) -> None:
+    rng = np.random.default_rng(seed)
+    source = rng.normal(size=(12, 3))
+    turn, shift = Rotation.random(rng=rng), rng.normal(size=3)
+
+    found = align_similarity(source, scale * turn.apply(source) + shift)
+
+    assert found.scale == pytest.approx(scale, rel=1e-9)
+    assert (found.rotation * turn.inv()).magnitude() < 1e-7
+    np.testing.assert_allclose(found.apply(source), scale * turn.apply(source) + shift, atol=1e-8)
+
+
+def test_a_mirrored_flat_set_is_turned_not_mirrored() -> None:
+    rng = np.random.default_rng(1)
+    flat = np.column_stack([rng.normal(size=(20, 2)), 1e-3 * rng.normal(size=20)])
+
+    found = align_rigid(flat, flat * [1, 1, -1])
+
+    assert np.linalg.det(found.rotation.as_matrix()) == pytest.approx(1.0)
+    assert found.rotation.magnitude() < 1e-2

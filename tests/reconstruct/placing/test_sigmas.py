@@ -1,18 +1,29 @@
 """The sigmas that a placement states are those of its errors, however correlated errors are."""
 
+from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.core.errors import warn
 from alice_survey.core.frames import Array, Datum, rotation_from_attitude
 from alice_survey.core.manifest import ImageRecord
+from alice_survey.core.records import BendRecord
+from camera_calib.mount import mount_rotation
 from reconstruct.placing.alignment import level
-from reconstruct.placing.correlated_fit import correlated_share, standard_residuals, whiten
+from reconstruct.placing.correlated_fit import (
+    correlated_share,
+    dives_of,
+    standard_residuals,
+    whiten,
+)
 from reconstruct.placing.fit import PlacementFit, fit_navigation
 from reconstruct.placing.navigation import USUAL_INSTALLATION, Installation
+from reconstruct.placing.place import fit_with_mount
 from tests.oracles_place import covariance_matrix, standard_residuals_densely
 
 DATUM = Datum(32.8236, 34.9553)
@@ -317,3 +328,283 @@ def test_a_free_scale_has_a_sigma_that_holds_its_error() -> None:
         _, error, sigma = place(body, flown(body, [6, seed], 20.0), seed, known_scale=None)
         ratios.append(error[6] / sigma[6])
     assert 0.4 < np.sqrt(np.mean(np.square(ratios))) < 1.5
+
+
+TWO_DIVES = flight(8, 15)
+SECOND = len(TWO_DIVES) // 2
+GAP_S = 1800.0
+
+
+def two_dives(seed: int, jump_m: float, *, restart: bool = True) -> list[ImageRecord]:
+    """Constant errors, a fifth of their variance white; positions of the second dive jump."""
+    rng = np.random.default_rng([seed, int(10 * jump_m), restart])
+    constants = rng.normal(size=(2, 6))
+    if not restart:
+        constants[1] = constants[0]
+    dive = (np.arange(len(TWO_DIVES)) >= SECOND).astype(int)
+    errors: Array = np.sqrt(0.8) * constants[dive] + np.sqrt(0.2) * rng.normal(
+        size=(len(TWO_DIVES), 6)
+    )
+    errors *= SIGMA
+    errors[:, :2] += dive[:, None] * jump_m * np.array([np.cos(seed), np.sin(seed)])
+    return [
+        replace(record, time_s=record.time_s + GAP_S * d)
+        for record, d in zip(records_of(TWO_DIVES, errors, SIGMA), dive, strict=True)
+    ]
+
+
+def test_long_gaps_lie_between_dives() -> None:
+    time = np.array([0.0, 2.5, 5.0, 65.0, 67.5, 1000.0, 1002.0])
+    assert dives_of(time).tolist() == [0, 0, 0, 0, 0, 1, 1]
+    assert dives_of(100.0 * np.arange(5.0)).tolist() == [0] * 5
+    assert dives_of(400.0 * np.arange(5.0)).tolist() == [0] * 5
+
+
+@pytest.mark.parametrize("restart", [True, False])
+def test_two_dives_are_as_sure_as_their_errors_are_independent(restart: bool) -> None:
+    found, stated, restarts = [], [], []
+    for seed in range(8):
+        fit, errors, sigma = place(TWO_DIVES, two_dives(seed, 0.0, restart=restart), seed)
+        found.append(errors[:3] / SIGMA[:3])
+        stated.append(sigma[:3] / SIGMA[:3])
+        restarts.append(fit.correlation["horizontal"].restart)
+    ratio = np.sqrt(np.mean((np.array(found) / np.array(stated)) ** 2))
+    assert 0.7 < ratio < 1.4
+    share = np.mean(stated)
+    if restart:  # the mean of two constants
+        assert 0.6 < share < 0.85
+        assert np.mean(restarts) > 0.5
+    else:
+        assert 0.75 < share < 1.05
+
+
+@pytest.mark.parametrize("jump_m", [0.5, 5.0])
+def test_dives_that_contradict_each_other_leave_the_place_that_unsure(jump_m: float) -> None:
+    ratios = []
+    for seed in range(8):
+        fit, errors, sigma = place(TWO_DIVES, two_dives(seed, jump_m), seed)
+        assert not any(fit.record.left_out.values())
+        assert fit.correlation["horizontal"].restart * SIGMA[0] > 0.1 * jump_m
+        assert fit.correlation["horizontal"].factor < 1.5
+        assert sigma[2] < SIGMA[2]  # depths do not suffer
+        assert np.rad2deg(sigma[5]) < 0.35
+        assert abs(errors[5]) < 4.0 * sigma[5]  # nor the heading
+        ratios.append(errors[:2] / sigma[:2])
+    assert 0.4 < np.sqrt(np.mean(np.square(ratios))) < 1.6
+
+
+_MODES, _SIGMA_M = 16, 0.03
+_PLACE = 7
+"""Parameters of the placement before the modes."""
+
+
+def waves(centres: Array) -> Array:
+    """(N, 6, K) smooth heave of a block, waves of different lengths north and east."""
+    span = np.ptp(centres[:, :2], axis=0)
+    n, e = ((centres[:, :2] - centres[:, :2].min(axis=0)) / span).T
+    modes = np.zeros((len(centres), 6, _MODES))
+    for k in range(_MODES):
+        modes[:, 2, k] = np.cos(np.pi * (k % 4 + 1) * n) * np.cos(np.pi * (k // 4 + 1) * e)
+    return _SIGMA_M * modes
+
+
+def fitted(
+    seed: int, factor: float, *, apart_m: float | None = None, unit_m: float = 1e-3
+) -> tuple[PlacementFit, Array]:
+    """A model deformed by this many times its sigmas, placed; its errors, in the fit's order.
+
+    With `apart_m` its second half is so far east of where it ought to be, and nothing links it: its
+    motions are counted in this unit.
+    """
+    rng = np.random.default_rng([7, seed])
+    body = flight(8, 40)
+    cameras = body * BODY_FROM_CAM["cam"]
+    modes = waves(cameras.translation)
+    sizes = factor * rng.normal(size=_MODES)
+    if apart_m is not None:
+        joint = np.zeros((len(modes), 6, 3))
+        joint[len(modes) // 2 :, :3] = unit_m * np.eye(3)
+        modes = np.concatenate([modes, joint], axis=2)
+        sizes = np.append(sizes, [0.0, apart_m / unit_m, 0.0])
+    bent = RigidTransform.from_components(
+        cameras.translation - (modes @ sizes)[:, :3], cameras.rotation
+    )
+    own = RigidTransform.from_components(rng.normal(0, 30, 3), Rotation.random(rng=rng))
+    turn = own.inv().rotation.as_matrix()
+    modes[:, :3], modes[:, 3:] = turn @ modes[:, :3], turn @ modes[:, 3:]
+    poses = [own.inv() * pose for pose in bent]
+    floor = np.column_stack([rng.uniform(0, 5, (300, 2)), rng.normal(15, 0.1, 300)])
+    levelled = level(own.inv().apply(floor), np.stack([pose.translation for pose in poses]))
+    fit = fit_navigation(
+        flown(body, [4, seed], 1.0), poses, BODY_FROM_CAM, DATUM, levelled,
+        known_scale=1.0, modes=modes, joints=0 if apart_m is None else 3,
+    )  # fmt: skip
+    assert fit is not None
+    return fit, fit.modes - sizes
+
+
+def whitened(factor: float) -> tuple[Array, Array]:
+    """Factors found of 12 models, and errors of their modes over what is stated."""
+    found, off = [], []
+    for seed in range(12):
+        fit, error = fitted(seed, factor)
+        found.append(fit.record.soft_modes_factor)
+        off.append(error / np.sqrt(np.diag(fit.joint)[_PLACE:]))
+    return np.array(found), np.array(off)
+
+
+def test_modes_of_the_stated_size_stay_as_they_are() -> None:
+    found, off = whitened(1.0)
+    assert np.count_nonzero(found > 1.0) <= 1
+    assert 0.8 < np.sqrt((off**2).mean()) < 1.2
+
+
+@pytest.mark.parametrize("factor", [2.5, 6.0])
+def test_modes_larger_than_stated_are_found_and_their_sigmas_are_true(factor: float) -> None:
+    found, off = whitened(factor)
+    assert 0.85 * factor < np.median(found) < 1.2 * factor
+    assert 0.75 < np.sqrt((off**2).mean()) < 1.3
+
+
+def bends_of(
+    body: RigidTransform, records: list[ImageRecord], along: float, across: float, seed: int = 0
+) -> tuple[BendRecord, ...]:
+    """Of a model in a frame of its own whose heights err by these curvatures north and east."""
+    rng = np.random.default_rng(seed)
+    cameras = body * BODY_FROM_CAM["cam"]
+    n, e = (cameras.translation - cameras.translation.mean(axis=0))[:, :2].T
+    down = -0.5 * (along * n**2 + across * e**2)
+    zero = np.zeros_like(down)
+    turns = Rotation.from_rotvec(np.column_stack([-across * e, along * n, zero]))
+    bent = RigidTransform.from_components(
+        cameras.translation + np.column_stack([zero, zero, down]), turns * cameras.rotation
+    )
+    own = RigidTransform.from_components(rng.normal(0, 30, 3), Rotation.random(rng=rng))
+    poses = [own.inv() * pose for pose in bent]
+    floor = np.column_stack([rng.uniform(0, 5, (300, 2)), rng.normal(15, 0.1, 300)])
+    centres = np.stack([pose.translation for pose in poses])
+    levelled = level(own.inv().apply(floor), centres)
+    fit = fit_navigation(records, poses, BODY_FROM_CAM, DATUM, levelled, known_scale=1.0)
+    assert fit is not None
+    return fit.bends
+
+
+@pytest.mark.parametrize("tau_s", [1.0, 4000.0])
+def test_a_bent_block_shows_its_curvature(tau_s: float) -> None:
+    body = flight(8, 40)
+    for seed in range(3):
+        found = bends_of(body, flown(body, [3, seed], tau_s), 4e-3, -6e-3, seed)
+        along, across = found
+        assert along.curvature_per_m == pytest.approx(4e-3, abs=3.5 * along.sigma_per_m)
+        assert across.curvature_per_m == pytest.approx(-6e-3, abs=3.5 * across.sigma_per_m)
+        assert along.sigma_per_m < 1e-3
+        assert along.length_m == pytest.approx(19.5, rel=0.06)
+        assert along.sag_m == pytest.approx(along.curvature_per_m * along.length_m**2 / 8)
+        assert along.is_significant(1e-3)
+
+
+def test_straight_blocks_are_not_called_bent_and_sigmas_are_true() -> None:
+    body, pulls, called = flight(6, 20), [], 0
+    for seed in range(30):
+        tau_s = [1.0, 60.0, 4000.0][seed % 3]
+        for bend in bends_of(body, flown(body, [8, seed], tau_s), 0.0, 0.0, seed):
+            pulls.append(bend.curvature_per_m / bend.sigma_per_m)
+            called += bend.is_significant(1e-4)
+    assert len(pulls) == 60
+    assert 0.6 < np.sqrt(np.mean(np.square(pulls))) < 1.4
+    assert called <= 2
+
+
+def test_sigmas_that_are_stated_too_small_do_not_make_a_bend() -> None:
+    body = flight(6, 20)
+    honest = bends_of(body, flown(body, 3, 1.0), 0.0, 0.0)
+    boasted = bends_of(body, flown(body, 3, 1.0, factor=20.0), 0.0, 0.0)
+    for sure, unsure in zip(honest, boasted, strict=True):
+        assert unsure.sigma_per_m > 8.0 * sure.sigma_per_m
+        assert not unsure.is_significant(1e-4)
+
+
+def test_jumps_of_the_depth_sensor_do_not_make_a_bend() -> None:
+    body = flight(6, 20)
+    records = flown(body, 4, 1.0)
+    for k in (0, 19, 20, 39):
+        records[k] = replace(records[k], depth_m=records[k].depth_m + 1.5)
+    for bend in bends_of(body, records, 0.0, 0.0):
+        assert abs(bend.curvature_per_m) < 4.0 * bend.sigma_per_m
+        assert not bend.is_significant(1e-3)
+
+
+def test_a_line_has_no_bend_across_and_a_few_stations_have_none() -> None:
+    body = flight(1, 20)
+    (along,) = bends_of(body, flown(body, 5, 1.0), 3e-3, 0.0)
+    assert along.curvature_per_m == pytest.approx(3e-3, abs=4 * along.sigma_per_m)
+    short = flight(1, 6)
+    assert bends_of(short, flown(short, 5, 1.0), 0.0, 0.0) == ()
+
+
+MOUNTED = flight(8, 15)
+
+
+def with_mount(
+    words: str, seed: int, *, tau_s: float = 1.0, calls: list[str] | None = None
+) -> tuple[PlacementFit, RigidTransform, Array]:
+    """Fit with an unknown mount: the fit, the true mount, errors of turn (rad) and place (m).
+
+    With `calls` each fit on the way adds its number to them, and warns of it.
+    """
+    rng = np.random.default_rng([seed, 7])
+    mount = RigidTransform.from_components(
+        rng.uniform([0.2, -0.3, 0.0], [0.6, 0.3, 0.3]),
+        Rotation.from_rotvec(rng.normal(0, 0.1, 3)) * mount_rotation(words),
+    )
+    truth = RigidTransform.from_components(rng.normal(0, 30, 3), Rotation.random(rng=rng))
+    noise = Rotation.from_rotvec(rng.normal(0, 1e-4, (len(MOUNTED), 3)))
+    poses = [
+        truth.inv() * body * mount * RigidTransform.from_rotation(n)
+        for body, n in zip(MOUNTED, noise, strict=True)
+    ]
+    floor = np.column_stack([rng.uniform(0, 7, (300, 2)), rng.normal(15, 0.1, 300)])
+    centres = np.stack([pose.translation for pose in poses])
+    fit_to = partial(
+        fit_navigation,
+        flown(MOUNTED, [seed, 3], tau_s),
+        poses,
+        levelled=level(truth.inv().apply(floor), centres),
+        known_scale=1.0,
+    )
+
+    def navigate(
+        mounts: Mapping[str, RigidTransform] | None, installed: Installation
+    ) -> PlacementFit | None:
+        if calls is not None:
+            calls.append(f"fit {len(calls)}")
+            warn(calls[-1])
+        return fit_to(mounts, DATUM, installed=installed)
+
+    fit = fit_with_mount(
+        flown(MOUNTED, [seed, 3], tau_s), poses, {"cam": RigidTransform.identity()}, navigate,
+        USUAL_INSTALLATION,
+    )  # fmt: skip
+    assert fit is not None
+    found = fit.ned_from_model
+    shift = found.apply(centres).mean(axis=0) - truth.apply(centres).mean(axis=0)
+    turn = (found.rotation * truth.rotation.inv()).as_rotvec()
+    return fit, mount, np.r_[turn, shift]
+
+
+@pytest.mark.parametrize("words", ["nadir-bow-left", "forward+45"])
+def test_the_mount_is_found_within_its_sigmas(words: str) -> None:
+    turns, arms, places = [], [], []
+    for seed in range(6):
+        fit, true, error = with_mount(words, seed)
+        assert fit.mount is not None
+        off = (true.rotation * fit.mount.body_from_rig.rotation.inv()).as_rotvec(degrees=True)
+        assert np.abs(off).max() < 2.0
+        turns.append(off / fit.mount.turn_sigma_deg)
+        arm = true.translation - fit.mount.body_from_rig.translation
+        arms.append(arm / fit.mount.lever_sigma_m)
+        assert np.all(fit.mount.lever_sigma_m[:2] < 0.1)  # lines to and fro show it
+        assert 0.1 < fit.mount.lever_sigma_m[2] < 0.3  # and 1.5 deg of roll and pitch this one
+        places.append(error / np.sqrt(np.diag(fit.covariance))[:6])
+    for ratios, low in ((turns, 0.4), (np.array(arms)[:, :2], 0.4), (places, 0.3)):
+        assert low < np.sqrt(np.mean(np.square(ratios))) < 1.6
