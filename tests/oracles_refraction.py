@@ -55,19 +55,12 @@ def adjust_through_ports(
             out.append((camera.project(local) - scene.pixels[picture][known]).ravel())
         return np.concatenate(out)
 
-    columns, lines, line = [], [], 0
-    for picture, (at, known) in enumerate(rows):
-        for point in at[known]:
-            touched = [6 * (stations - 1) + 3 * point + k for k in range(3)]
-            if station_of[picture] > 0:
-                touched += [6 * (station_of[picture] - 1) + k for k in range(6)]
-            for _ in range(2):
-                columns += touched
-                lines += [line] * len(touched)
-                line += 1
-    size = 6 * (stations - 1) + 3 * len(points)
-    pattern = csr_matrix((np.ones(len(lines)), (lines, columns)), shape=(line, size))
-    x = np.zeros(size)
+    point = np.concatenate([at[known] for at, known in rows])
+    station = np.repeat(station_of, [int(known.sum()) for _, known in rows])
+    by_pose = np.kron(np.eye(stations)[station, 1:], np.ones((2, 6)))
+    by_point = np.kron(np.eye(len(points))[point], np.ones((2, 3)))
+    pattern = csr_matrix(np.hstack([by_pose, by_point]))
+    x = np.zeros(pattern.shape[1])
     for _ in range(6):  # lsmr stops early along weak directions; a new start goes on
         found = least_squares(
             misses, x, jac="3-point", jac_sparsity=pattern, x_scale="jac", tr_solver="lsmr",
@@ -83,20 +76,15 @@ def adjust_through_ports(
 
 def dense_normal_equations(linear: LinearObservations, stations: int) -> tuple[Array, Array]:
     """J^T J and J^T r of stations, points and shared parameters, in that order, from a full J."""
-    points, count = len(linear.starts) - 1, linear.rest.shape[2] - 1
-    size = 6 * stations + 3 * points + count
-    jacobian = np.zeros((2 * len(linear.station), size))
-    for point in range(points):
-        for o in range(linear.starts[point], linear.starts[point + 1]):
-            x, y, z = linear.arm[o]
-            cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-            rows, first = slice(2 * o, 2 * o + 2), 6 * int(linear.station[o])
-            # R^T (X - c) with R' = exp(turn) R moves by R^T (X - c) x turn.
-            jacobian[rows, first : first + 3] = linear.by_point[o] @ cross
-            jacobian[rows, first + 3 : first + 6] = -linear.by_point[o]
-            at = 6 * stations + 3 * point
-            jacobian[rows, at : at + 3] = linear.by_point[o]
-            jacobian[rows, size - count :] = linear.rest[o, :, :-1]
+    observed, points = len(linear.station), len(linear.starts) - 1
+    point = np.repeat(np.arange(points), np.diff(linear.starts))
+    # R^T (X - c) with R' = exp(turn) R moves by R^T (X - c) x turn.
+    turns = np.cross(linear.by_point, linear.arm[:, None])
+    slopes = np.concatenate([turns, -linear.by_point], axis=2)
+    by_pose = np.einsum("os,ork->orsk", np.eye(stations)[linear.station], slopes)
+    by_point = np.einsum("op,ork->orpk", np.eye(points)[point], linear.by_point)
+    parts = (by_pose, by_point, linear.rest[..., :-1])
+    jacobian = np.hstack([part.reshape(2 * observed, -1) for part in parts])
     return jacobian.T @ jacobian, jacobian.T @ linear.miss.ravel()
 
 
@@ -124,24 +112,17 @@ def laid_onto(
     position errors and of `depth` times their turns is least. Point i + 1 of the model is point i.
     """
     poses = [as_transform(model.frames[int(f)].rig_from_world).inv() for f in found.frames]
-    turns = np.array(
-        [
-            (a.rotation * b.rotation.inv()).as_rotvec()
-            for a, b in zip(poses, true_stations, strict=True)
-        ]
-    )
-    true = np.array([b.translation for b in true_stations])
-    misses = np.array([a.translation for a in poses]) - true
+    at, truth = RigidTransform.concatenate(poses), RigidTransform.concatenate(true_stations)
+    turns, true = (at.rotation * truth.rotation.inv()).as_rotvec(), truth.translation
+    misses = at.translation - true
     points = np.array([model.points3D[int(i)].xyz for i in found.point_ids])
     expected = true_points[found.point_ids - 1]
     middle = true.mean(axis=0)
-    rows, right = [], []
-    for arm, turn, miss in zip(true - middle, turns, misses, strict=True):
-        x, y, z = arm
-        by_turn = np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])
-        rows += [depth * np.eye(3, 6), np.hstack([by_turn, np.eye(3)])]
-        right += [depth * turn, miss]
-    motion = np.linalg.lstsq(np.vstack(rows), np.concatenate(right), rcond=None)[0]
+    rows = np.zeros((len(true), 2, 3, 6))
+    rows[:, 0, :, :3], rows[:, 1, :, 3:] = depth * np.eye(3), np.eye(3)
+    rows[:, 1, :, :3] = np.cross((true - middle)[:, None], np.eye(3))
+    right = np.stack([depth * turns, misses], axis=1)
+    motion = np.linalg.lstsq(rows.reshape(-1, 6), right.ravel(), rcond=None)[0]
     moved = misses - motion[3:] - np.cross(motion[:3], true - middle)
     away = points - expected - motion[3:] - np.cross(motion[:3], expected - middle)
     return np.hstack([turns - motion[:3], moved]), away

@@ -1,6 +1,8 @@
 """A synthetic survey whose every ray is known: stereo stations over relief, through flat ports."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +12,7 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.core.config import CameraConfig, WaterConfig
 from alice_survey.core.frames import Array, Datum, rotation_from_attitude
 from alice_survey.core.manifest import ImageRecord
+from camera_calib.freedom import part_of_rig
 from camera_calib.ports.values import PortValues
 from camera_calib.rig import Rig, design_rig
 from reconstruct.matching.matches import PairMatches
@@ -36,6 +39,32 @@ class Scene:
     ids: list[NDArray[np.int64]]
     """Which point every pixel shows."""
     pairs: list[tuple[int, int, PairMatches]]
+
+    @property
+    def bodies(self) -> list[RigidTransform]:
+        """`ned_from_body` of every picture."""
+        return [
+            pose * self.rig.body_from_cam(record.camera).inv()
+            for pose, record in zip(self.ned_from_cam, self.records, strict=True)
+        ]
+
+    @property
+    def left(self) -> "Scene":
+        """The pictures of the left camera, alone."""
+        mono = [k for k, record in enumerate(self.records) if record.camera == "left"]
+        return replace(
+            self, rig=part_of_rig(self.rig, ["left"]), records=[self.records[k] for k in mono],
+            ned_from_cam=[self.ned_from_cam[k] for k in mono],
+            pixels=[self.pixels[k] for k in mono], ids=[self.ids[k] for k in mono], pairs=[],
+        )  # fmt: skip
+
+
+def stating(records: Sequence[ImageRecord], places_ned: Array, **more: Any) -> list[ImageRecord]:
+    """Pictures whose navigation says these places, (N, 3), and more."""
+    return [
+        replace(record, latitude_deg=a, longitude_deg=b, depth_m=d, **more)
+        for record, (a, b, d) in zip(records, DATUM.geodetic_from_ned(places_ned), strict=True)
+    ]
 
 
 def make_scene(

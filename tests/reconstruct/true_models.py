@@ -1,6 +1,7 @@
 """COLMAP models of synthetic scenes that start near the truth, without a mapper."""
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -10,6 +11,7 @@ from alice_survey.core.frames import Array
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
+from reconstruct.mapping.refraction import refract
 from reconstruct.views.model_files import as_transform, colmap_pinhole, rigid3d
 from tests.reconstruct.scenes import Scene
 
@@ -82,6 +84,15 @@ def near_truth(
         baseline=model_baseline_of(pinhole_from_rig),
         rig_factor=1.0,
     )
+
+
+def refracted(
+    scene: Scene, folder: Path, rng: int | np.random.Generator = 1
+) -> tuple[Mapped, Observations]:
+    """A model that starts near the truth, adjusted to exact rays, and what its pinholes see."""
+    seen, warps = warped_scene(scene)
+    start = near_truth(scene, seen, warps, np.random.default_rng(rng))
+    return refract(start, seen, folder)[0], seen
 
 
 def _without_poses(

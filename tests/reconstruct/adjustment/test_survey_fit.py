@@ -41,13 +41,12 @@ from reconstruct.adjustment.survey_fit import (
 from reconstruct.mapping.arrays import frames_of
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped, model_baseline
-from reconstruct.mapping.refraction import refract
 from reconstruct.placing.alignment import align_rigid, align_similarity
 from tests.cameras import changed
 from tests.engines import PicklingThreads
 from tests.reconstruct.rig_survey import four_cameras
 from tests.reconstruct.scenes import Scene, make_scene
-from tests.reconstruct.true_models import near_truth, pupils_and_points, warped_scene
+from tests.reconstruct.true_models import pupils_and_points, refracted
 
 NOISE_PX = 0.3
 TURN_SIGMA = 3e-4
@@ -67,10 +66,7 @@ def noisy(seed: int) -> Scene:
 
 def modelled(scene: Scene, rig: Rig, folder: Path) -> tuple[Mapped, Observations]:
     """The model that pictures of a scene give to who believes in another rig."""
-    believed = replace(scene, rig=rig)
-    seen, warps = warped_scene(believed)
-    start = near_truth(believed, seen, warps, np.random.default_rng(1))
-    return refract(start, seen, folder)[0], seen
+    return refracted(replace(scene, rig=rig), folder)
 
 
 def nearer(rig: Rig, by_m: float) -> Rig:
@@ -306,9 +302,7 @@ SIGMA = 1e-3
 
 def believing(scene: Scene, believed: Rig, folder: Path) -> AdjustedSurvey:
     """The survey as believing by who believes in a rig."""
-    seen, warps = warped_scene(replace(scene, rig=believed))
-    start = near_truth(replace(scene, rig=believed), seen, warps, np.random.default_rng(1))
-    mapped, _ = refract(start, seen, folder)
+    mapped, _ = modelled(scene, believed, folder)
     return adjust_survey(mapped, scene.records, believed, INDEX_DISTANCES, ReconstructConfig())
 
 
@@ -329,9 +323,7 @@ def test_ranges_of_one_pair_follow_the_index_as_snells_law_says(tmp_path: Path) 
                        for i, p in enumerate(scene.pixels)]
     )  # fmt: skip
     rig = knowing_water(scene.rig, SIGMA)
-    seen, warps = warped_scene(scene)
-    start = near_truth(scene, seen, warps, np.random.default_rng(1))
-    mapped, _ = refract(start, seen, tmp_path)
+    mapped, seen = refracted(scene, tmp_path)
     moved = fit_survey(mapped, seen, rig, port=False, pose=False).calibration
     assert moved is not None
     ned_from_cam = scene.ned_from_cam[0]

@@ -39,7 +39,7 @@ from reconstruct.mapping.arrays import cross_matrices, frames_of, observations
 from reconstruct.mapping.bundle import cauchy_weights
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
-from reconstruct.mapping.refraction import adjust_freely, refract
+from reconstruct.mapping.refraction import adjust_freely
 from reconstruct.placing.alignment import align_rigid, align_similarity, level
 from reconstruct.placing.fit import fit_navigation
 from reconstruct.placing.navigation import PLACE, body_from_pinhole
@@ -47,8 +47,8 @@ from reconstruct.placing.track import picture_modes
 from reconstruct.views.model_files import as_transform
 from tests.engines import PicklingThreads
 from tests.oracles_refraction import dense_normal_equations, dense_of, laid_onto
-from tests.reconstruct.scenes import DATUM, Scene, make_scene
-from tests.reconstruct.true_models import near_truth, true_stations, warped_scene
+from tests.reconstruct.scenes import DATUM, Scene, make_scene, stating
+from tests.reconstruct.true_models import near_truth, refracted, true_stations, warped_scene
 
 NOISE_PX = 0.3
 
@@ -63,9 +63,7 @@ def drawn(seed: int, folder: Path) -> tuple[Scene, Mapped]:
     rng = np.random.default_rng(seed)
     pixels = [p + rng.normal(0, NOISE_PX, p.shape) for p in clean().pixels]
     scene = replace(clean(), pixels=pixels)
-    seen, lenses = warped_scene(scene)
-    mapped, _ = refract(near_truth(scene, seen, lenses, rng), seen, folder)
-    return scene, mapped
+    return scene, refracted(scene, folder, rng)[0]
 
 
 def test_errors_are_as_large_as_stated(tmp_path: Path) -> None:
@@ -204,9 +202,7 @@ def off(rig: Rig, steps: dict[str, float]) -> Rig:
 
 def points_with(rig: Rig, folder: Path, seed: int = 0) -> tuple[Mapped, Array]:
     """The model of the same pictures by who believes in a rig, and its points."""
-    believed = replace(noisy(seed), rig=rig)
-    seen, lenses = warped_scene(believed)
-    mapped, _ = refract(near_truth(believed, seen, lenses, np.random.default_rng(1)), seen, folder)
+    mapped, _ = refracted(replace(noisy(seed), rig=rig), folder)
     return mapped, observations(mapped.model).points
 
 
@@ -378,9 +374,7 @@ def on_known_rig() -> Scene:
 @pytest.fixture(scope="module")
 def survey(tmp_path_factory: pytest.TempPathFactory) -> AdjustedSurvey:
     scene = on_known_rig()
-    seen, warps = warped_scene(scene)
-    start = near_truth(scene, seen, warps, np.random.default_rng(1))
-    mapped, _ = refract(start, seen, tmp_path_factory.mktemp("refract"))
+    mapped, _ = refracted(scene, tmp_path_factory.mktemp("refract"))
     return adjust_survey(mapped, scene.records, scene.rig, DISTANCES, ReconstructConfig())
 
 
@@ -444,23 +438,14 @@ def test_modes_and_navigation_end_where_all_unknowns_at_once_do(survey: Adjusted
     assert np.all(np.abs(off) < 0.1 * np.sqrt(np.diag(fit.covariance)))
 
 
-def strip(jump_m: float, seed: int, noise_m: float = 0.004) -> Scene:
+def strip(jump_m: float, seed: int) -> Scene:
     """A line of 16 m; a log with a lasting bias, 2 % too long, perhaps with one wrong station."""
     scene = make_scene(lines=1, stations=30, points=2500, noise_px=0.3, seed=seed)
-    rng, records = np.random.default_rng(seed), []
-    bodies = [p * scene.rig.body_from_cam(r.camera).inv()
-              for p, r in zip(scene.ned_from_cam, scene.records, strict=True)]  # fmt: skip
-    noise = rng.normal(0, noise_m, (30, 3))
-    for body, record in zip(bodies, scene.records, strict=True):
-        stated = 1.02 * body.translation * [1, 1, 0] + body.translation * [0, 0, 1]
-        stated = stated + noise[record.station] + [0.4, -0.3, 0.05]
-        if record.station == 6:
-            stated = stated + np.array([jump_m, 0.0, 0.0])
-        place = DATUM.geodetic_from_ned(stated[None])[0]
-        records.append(
-            replace(record, latitude_deg=place[0], longitude_deg=place[1], depth_m=place[2])
-        )
-    return replace(scene, records=records)
+    station = np.array([record.station for record in scene.records])
+    places = np.array([body.translation for body in scene.bodies]) * [1.02, 1.02, 1.0]
+    places += np.random.default_rng(seed).normal(0, 0.004, (30, 3))[station] + [0.4, -0.3, 0.05]
+    places[station == 6, 0] += jump_m
+    return replace(scene, records=stating(scene.records, places))
 
 
 def mute(scene: Scene) -> Scene:
@@ -502,31 +487,16 @@ def test_navigation_straightens_a_long_line_but_leaves_its_scale(
     assert scale.max() < 1e-3, "2 % of the log must not reach the model"
 
 
-def test_one_camera_takes_scale_and_shape_from_navigation(tmp_path: Path) -> None:
+def test_one_camera_takes_scale_and_shape_from_navigation() -> None:
     """Pictures of the left camera alone, in a unit of 0.37 m: errors are as large as stated."""
     ratios, bends = [], []
     for seed in range(6):
-        scene = make_scene(lines=3, stations=9, points=9000, noise_px=0.3, seed=seed)
+        scene = make_scene(lines=3, stations=9, points=9000, noise_px=0.3, seed=seed).left
         rng = np.random.default_rng([9, seed])
-        rows = [k for k, r in enumerate(scene.records) if r.camera == "left"]
-        records = []
-        for k in rows:
-            body = scene.ned_from_cam[k] * scene.rig.body_from_cam("left").inv()
-            stated = DATUM.geodetic_from_ned(
-                (body.translation + rng.normal(0, [0.03, 0.03, 0.005]))[None]
-            )[0]
-            records.append(
-                replace(scene.records[k], latitude_deg=stated[0], longitude_deg=stated[1],
-                        depth_m=stated[2], sigma_horizontal_m=0.03, sigma_depth_m=0.005)
-            )  # fmt: skip
-        alone = replace(
-            scene, records=records,
-            rig=replace(scene.rig, cameras={"left": scene.rig.cameras["left"]},
-                        cam_from_rig={"left": scene.rig.cam_from_rig["left"]}),
-            ned_from_cam=[scene.ned_from_cam[k] for k in rows],
-            pixels=[scene.pixels[k] for k in rows], ids=[scene.ids[k] for k in rows], pairs=[],
-        )  # fmt: skip
-        scale, sigma, before, after = placed_alone(alone, rng, tmp_path)
+        places = np.array([body.translation for body in scene.bodies])
+        places += rng.normal(0, [0.03, 0.03, 0.005], places.shape)
+        records = stating(scene.records, places, sigma_horizontal_m=0.03, sigma_depth_m=0.005)
+        scale, sigma, before, after = placed_alone(replace(scene, records=records), rng)
         ratios.append(scale / sigma)
         bends.append((before, after))
         assert 1e-4 < sigma < 0.02
@@ -535,9 +505,7 @@ def test_one_camera_takes_scale_and_shape_from_navigation(tmp_path: Path) -> Non
     assert after < 0.9 * before
 
 
-def placed_alone(
-    scene: Scene, rng: np.random.Generator, folder: Path
-) -> tuple[float, float, float, float]:
+def placed_alone(scene: Scene, rng: np.random.Generator) -> tuple[float, float, float, float]:
     """Error and sigma of the scale; median of cameras after a similarity, before and with modes."""
     seen, warps = warped_scene(scene)
     start = near_truth(scene, seen, warps, rng)

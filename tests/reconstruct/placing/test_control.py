@@ -309,16 +309,14 @@ WRONG_M = (1.5, -1.0, 0.5)
 
 
 def known_at(places: np.ndarray, sigma_m: float = STATED_M) -> Control:
-    nan = float("nan")
-    return Control(
-        points=tuple(
-            KnownPoint(
-                name=f"p{k}", use="control", latitude_deg=nan, longitude_deg=nan, north_m=north,
-                east_m=east, depth_m=down, height_m=nan, sigma_m=sigma_m, sigma_vertical_m=sigma_m,
-            )
-            for k, (north, east, down) in enumerate(places.tolist())
+    points = (
+        KnownPoint(
+            name=f"p{k}", north_m=north, east_m=east, depth_m=down, sigma_m=sigma_m,
+            sigma_vertical_m=sigma_m,
         )
+        for k, (north, east, down) in enumerate(places.tolist())
     )  # fmt: skip
+    return Control(points=tuple(points))
 
 
 def tied_to(gauge: Gauge, places: np.ndarray, noise_px: float = 0.3) -> ControlFit:

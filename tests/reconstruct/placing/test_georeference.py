@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.core.manifest import ImageRecord
 from reconstruct.placing.alignment import Similarity, align_rigid, align_similarity, level
 from reconstruct.placing.fit import PlacementFit, fit_navigation
-from tests.reconstruct.scenes import DATUM, Scene, make_scene
+from tests.reconstruct.scenes import DATUM, Scene, make_scene, stating
 
 
 def gauge(seed: int, scale: float) -> Similarity:
@@ -34,22 +34,23 @@ def points_in_model(points: np.ndarray, ned_from_model: Similarity) -> np.ndarra
 
 def fit(
     scene: Scene, records: list[ImageRecord], truth: Similarity, *, known: bool, levers: bool = True
-) -> PlacementFit | None:
+) -> PlacementFit:
     poses = [in_model(pose, truth) for pose in scene.ned_from_cam]
     points = points_in_model(scene.points_ned, truth)
     centres = np.stack([p.translation for p in poses])
     arms = {name: scene.rig.body_from_cam(name) for name in scene.rig.cameras}
-    return fit_navigation(
+    found = fit_navigation(
         records, poses, arms if levers else None, DATUM, level(points, centres),
         known_scale=truth.scale if known else None,
     )  # fmt: skip
+    assert found is not None
+    return found
 
 
 def exact(scene: Scene) -> list[ImageRecord]:
     """Navigation that shows the true attitude too."""
     records = []
-    for record, pose in zip(scene.records, scene.ned_from_cam, strict=True):
-        ned_from_body = pose * scene.rig.body_from_cam(record.camera).inv()
+    for record, ned_from_body in zip(scene.records, scene.bodies, strict=True):
         heading, pitch, roll = np.rad2deg(ned_from_body.rotation.as_euler("ZYX"))
         records.append(replace(record, roll_deg=roll, pitch_deg=pitch, heading_deg=heading % 360))
     return records
@@ -57,12 +58,10 @@ def exact(scene: Scene) -> list[ImageRecord]:
 
 def without_attitude(scene: Scene) -> list[ImageRecord]:
     """Positions of the cameras themselves, nothing more, as GPS in EXIF gives them."""
-    places = DATUM.geodetic_from_ned(np.stack([p.translation for p in scene.ned_from_cam]))
-    return [
-        replace(r, latitude_deg=a, longitude_deg=b, depth_m=d, roll_deg=np.nan,
-                sigma_horizontal_m=0.02, sigma_depth_m=0.02)
-        for r, (a, b, d) in zip(scene.records, places, strict=True)
-    ]  # fmt: skip
+    places = np.stack([pose.translation for pose in scene.ned_from_cam])
+    return stating(
+        scene.records, places, roll_deg=np.nan, sigma_horizontal_m=0.02, sigma_depth_m=0.02
+    )
 
 
 def assert_same(found: Similarity, truth: Similarity, atol: float, scale_rtol: float) -> None:
@@ -82,7 +81,6 @@ def site() -> Scene:
 def test_any_gauge_is_undone_when_navigation_is_exact(seed: int, scale: float) -> None:
     truth = gauge(seed, scale)
     found = fit(site(), exact(site()), truth, known=False)
-    assert found is not None
     assert_same(found.ned_from_model, truth, atol=1e-6, scale_rtol=1e-7)
     said = found.record
     errors_m = (said.rms_north_m, said.rms_east_m, said.rms_depth_m)
@@ -96,7 +94,6 @@ def test_positions_alone_place_a_block(seed: int, roll_deg: float) -> None:
     truth = gauge(seed, 3.0)
     records = [replace(r, roll_deg=roll_deg) for r in without_attitude(site())]
     found = fit(site(), records, truth, known=False, levers=False)
-    assert found is not None
     assert_same(found.ned_from_model, truth, atol=0.02, scale_rtol=2e-3)
 
 
@@ -104,13 +101,8 @@ def test_a_known_scale_is_kept_and_that_of_navigation_reported() -> None:
     truth = gauge(3, 1.0)
     origin = np.array([1.0, 1.0, 13.0])
     places = np.stack([pose.translation for pose in site().ned_from_cam])
-    stated = DATUM.geodetic_from_ned(origin + 1.05 * (places - origin))
-    stretched = [
-        replace(r, latitude_deg=a, longitude_deg=b, depth_m=d)
-        for r, (a, b, d) in zip(without_attitude(site()), stated, strict=True)
-    ]
+    stretched = stating(without_attitude(site()), origin + 1.05 * (places - origin))
     found = fit(site(), stretched, truth, known=True, levers=False)
-    assert found is not None
     assert found.ned_from_model.scale == 1.0
     assert found.record.scale_of_navigation == pytest.approx(1.05, abs=0.003)
 
@@ -121,7 +113,6 @@ def test_one_wrong_position_hardly_moves_the_model(known: bool) -> None:
     records = exact(site())
     records[5] = replace(records[5], latitude_deg=records[5].latitude_deg + 1e-3)  # 111 m
     found = fit(site(), records, truth, known=known)
-    assert found is not None
     assert_same(found.ned_from_model, truth, atol=0.1, scale_rtol=1e-12 if known else 0.01)
 
 
@@ -130,7 +121,6 @@ def test_a_straight_line_is_kept_from_turning_about_itself() -> None:
     scene = make_scene(lines=1, stations=12, points=600)
     truth = gauge(5, 2.0)
     found = fit(scene, without_attitude(scene), truth, known=False, levers=False)
-    assert found is not None
     down = (found.ned_from_model.rotation * truth.rotation.inv()).apply([0.0, 0.0, 1.0])
     assert np.rad2deg(np.arccos(down[2])) < 6.0
 
@@ -147,12 +137,8 @@ def exif(scene: Scene, seed: int, drift_m: float, correlated_s: float) -> list[I
     errors += rng.normal(0, 3.0, 3) + rng.normal(0, 0.1, errors.shape)
     at = np.array([record.station for record in scene.records])
     places = np.stack([pose.translation for pose in scene.ned_from_cam]) + errors[at]
-    nan = float("nan")
-    return [
-        replace(r, latitude_deg=a, longitude_deg=b, depth_m=d, roll_deg=nan, pitch_deg=nan,
-                heading_deg=nan, altitude_m=nan, sigma_horizontal_m=3.0, sigma_depth_m=6.0)
-        for r, (a, b, d) in zip(scene.records, DATUM.geodetic_from_ned(places), strict=True)
-    ]  # fmt: skip
+    unknown = dict.fromkeys(("roll_deg", "pitch_deg", "heading_deg", "altitude_m"), np.nan)
+    return stating(scene.records, places, sigma_horizontal_m=3.0, sigma_depth_m=6.0, **unknown)
 
 
 def test_positions_closer_than_their_sigma_give_a_rough_scale_with_an_honest_sigma(
@@ -162,7 +148,6 @@ def test_positions_closer_than_their_sigma_give_a_rough_scale_with_an_honest_sig
     for seed in range(16):
         found = fit(site(), exif(site(), seed, 0.3, 20.0), gauge(seed, 2.0), known=False,
                     levers=False)  # fmt: skip
-        assert found is not None
         (line,) = capsys.readouterr().err.splitlines()
         assert "rough" in line and "alice-survey control" in line
         misses.append(np.log(found.ned_from_model.scale / 2.0) / found.sigma_scale)

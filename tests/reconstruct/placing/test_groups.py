@@ -42,11 +42,7 @@ def patches(
     scene = make_scene(
         lines=lines, stations=stations, points=150 * stations, noise_px=0.3, scale=1, seed=seed
     )
-    bodies = [
-        pose * scene.rig.body_from_cam(record.camera).inv()
-        for pose, record in zip(scene.ned_from_cam, scene.records, strict=True)
-        if record.camera == "left"
-    ]
+    bodies = scene.left.bodies
     errors = SIGMA * gauss_markov(np.random.default_rng([8, seed]), len(bodies), TAU_S)
     log = records_of(RigidTransform.concatenate(bodies), errors, SIGMA)
     kept = [k for k, record in enumerate(scene.records) if _patch(record.station, stations, steps)]
@@ -147,11 +143,8 @@ def placed(scene: Scene, mapped: Mapped) -> Found:
     rows = track_rows(after.mapped.model, of_name, after.mapped.warps, frame, {})
     rows = [replace(r, world_from_cam=_as_rigid(fit) * r.world_from_cam) for r in rows]
     rows = [row for row in rows if row.camera == "left"]
-    true = {
-        r.station: pose
-        for r, pose in zip(scene.records, scene.ned_from_cam, strict=True)
-        if r.camera == "left"
-    }
+    left = scene.left
+    true = {r.station: pose for r, pose in zip(left.records, left.ned_from_cam, strict=True)}
     groups = dict(zip(found.shape.stations.tolist(), model_groups(model).tolist(), strict=True))
     assert after.shape is not None
     return Found(

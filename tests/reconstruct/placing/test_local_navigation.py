@@ -13,7 +13,6 @@ from alice_survey.core.config import ReconstructConfig
 from alice_survey.core.frames import Datum
 from alice_survey.core.manifest import ImageRecord
 from alice_survey.core.records import MappingRecord, PicturesRecord
-from camera_calib.freedom import part_of_rig
 from reconstruct.adjustment.survey_fit import AdjustedSurvey
 from reconstruct.placing.alignment import Similarity, level
 from reconstruct.placing.fit import PlacementFit, fit_navigation
@@ -25,7 +24,7 @@ from tests.reconstruct.placing.test_georeference import (
     in_model,
     points_in_model,
 )
-from tests.reconstruct.scenes import DATUM, Scene, make_scene
+from tests.reconstruct.scenes import DATUM, Scene, make_scene, stating
 from tests.reconstruct.true_models import near_truth, warped_scene
 
 NAN = float("nan")
@@ -80,16 +79,7 @@ def placed_by_one_camera(
     workspace: Path, truth: Similarity, readings: tuple[str, ...], datum: Datum | None
 ) -> Placed:
     """A model of the left camera's pictures, in a gauge, with some of the readings."""
-    whole = make_scene(points=400)
-    mono = [i for i, r in enumerate(whole.records) if r.camera == "left"]
-    scene = replace(
-        whole,
-        rig=part_of_rig(whole.rig, ["left"]),
-        records=[whole.records[i] for i in mono],
-        ned_from_cam=[whole.ned_from_cam[i] for i in mono],
-        pixels=[whole.pixels[i] for i in mono],
-        ids=[whole.ids[i] for i in mono],
-    )
+    scene = make_scene(points=400).left
     seen, warps = warped_scene(scene)
     mapped = near_truth(scene, seen, warps, np.random.default_rng(1), (0.0, 0.0))
     model = mapped.model
@@ -141,40 +131,25 @@ def test_depths_of_a_track_without_relief_give_no_scale(
 @pytest.mark.parametrize("reading", ["depths", "positions"])
 def test_scale_and_level_of_one_camera_lie_within_their_sigmas(reading: str) -> None:
     """Of a track whose depth varies by 0.4 m, over 24 seeds of white errors."""
-    scene, sigma_m = make_scene(points=400), 0.01
-    rng = np.random.default_rng(11)
-    stations = {r.station for r in scene.records}
-    rise = {s: 0.4 * rng.standard_normal() for s in stations}
-    lifted = replace(
-        scene,
-        ned_from_cam=[
-            RigidTransform.from_components(p.translation + rise[r.station] * DOWN, p.rotation)
-            for r, p in zip(scene.records, scene.ned_from_cam, strict=True)
-        ],
-    )
+    scene, sigma_m = make_scene(points=400).left, 0.01
+    rise = 0.4 * np.random.default_rng(11).standard_normal(len(scene.records))
+    lifted = [
+        RigidTransform.from_translation(up * DOWN) * pose
+        for up, pose in zip(rise, scene.ned_from_cam, strict=True)
+    ]
+    true = np.stack([pose.translation for pose in lifted])
+    kept = ("depth_m",) if reading == "depths" else ("latitude_deg", "longitude_deg", "depth_m")
     errors, leans = [], []
     for seed in range(24):
         rng, truth = np.random.default_rng(seed), gauge(seed, 0.3)
-        off = {s: sigma_m * rng.standard_normal(3) for s in stations}
-        kept = ("depth_m",) if reading == "depths" else ("latitude_deg", "longitude_deg", "depth_m")
-        places = np.stack(
-            [p.translation + off[r.station] for r, p in
-             zip(lifted.records, lifted.ned_from_cam, strict=True)]
-        )  # fmt: skip
-        records = [
-            replace(r, latitude_deg=a, longitude_deg=b, depth_m=d, sigma_depth_m=sigma_m,
-                    sigma_horizontal_m=sigma_m)
-            for r, (a, b, d) in zip(
-                lifted.records, DATUM.geodetic_from_ned(places), strict=True
-            )
-        ]  # fmt: skip
-        poses = [in_model(pose, truth) for pose in lifted.ned_from_cam]
+        places = true + sigma_m * rng.standard_normal(true.shape)
+        records = stating(scene.records, places, sigma_depth_m=sigma_m, sigma_horizontal_m=sigma_m)
+        poses = [in_model(pose, truth) for pose in lifted]
         points = points_in_model(scene.points_ned, truth)
-        mono = [i for i, r in enumerate(records) if r.camera == "left"]
-        start = level(points, np.stack([poses[i].translation for i in mono]))
+        start = level(points, np.stack([pose.translation for pose in poses]))
         found = fit_navigation(
-            with_only([records[i] for i in mono], *kept), [poses[i] for i in mono], None,
-            None if reading == "depths" else DATUM, start, known_scale=None,
+            with_only(records, *kept), poses, None, None if reading == "depths" else DATUM, start,
+            known_scale=None,
         )  # fmt: skip
         assert found is not None
         errors.append(np.log(found.ned_from_model.scale / truth.scale) / found.sigma_scale)
@@ -208,39 +183,33 @@ def test_roll_and_pitch_alone_level_a_model() -> None:
 
 def test_altitudes_scale_a_model_within_their_sigma() -> None:
     """Over 24 seeds of one error that all altitudes share, of 2 % as stated, and white ones."""
-    scene, metres = make_scene(points=3000, relief_m=0.02), 2.5
-    mono = [i for i, r in enumerate(scene.records) if r.camera == "left"]
-    centres = np.stack([scene.ned_from_cam[i].translation for i in mono])
+    scene, metres = make_scene(points=3000, relief_m=0.02).left, 2.5
+    centres = np.stack([pose.translation for pose in scene.ned_from_cam])
     floor = np.median(scene.points_ned[:, 2])
     errors = []
     for seed in range(24):
         rng = np.random.default_rng(seed)
         shared = 1.0 + 0.02 * rng.standard_normal()
-        heights = (floor - centres[:, 2]) * shared * (1.0 + 0.01 * rng.standard_normal(len(mono)))
+        heights = (floor - centres[:, 2]) * shared
+        heights *= 1.0 + 0.01 * rng.standard_normal(len(heights))
         records = [
-            replace(scene.records[i], altitude_m=h, sigma_altitude_m=0.02 * h)
-            for i, h in zip(mono, heights, strict=True)
+            replace(record, altitude_m=h, sigma_altitude_m=0.02 * h)
+            for record, h in zip(scene.records, heights, strict=True)
         ]
         found = scale_by_altitudes(records, centres / metres, scene.points_ned / metres)
         assert found is not None
         errors.append(np.log(found[0] / metres) / found[1])
     assert 0.7 < np.sqrt(np.mean(np.square(errors))) < 1.4
-
-
-def test_a_model_without_altitudes_gets_no_scale_of_them() -> None:
-    scene = make_scene(points=100)
-    records = [replace(r, altitude_m=float("nan")) for r in scene.records]
-    centres = np.stack([p.translation for p in scene.ned_from_cam])
-    assert scale_by_altitudes(records, centres, scene.points_ned) is None
+    unknown = with_only(scene.records)
+    assert scale_by_altitudes(unknown, centres / metres, scene.points_ned / metres) is None
 
 
 def test_relief_below_makes_the_scale_less_certain() -> None:
     sigmas = []
     for relief in (0.02, 0.3):
-        scene = make_scene(points=3000, relief_m=relief)
-        mono = [i for i, r in enumerate(scene.records) if r.camera == "left"]
-        centres = np.stack([scene.ned_from_cam[i].translation for i in mono])
-        records = [replace(scene.records[i], altitude_m=2.0, sigma_altitude_m=0.02) for i in mono]
+        scene = make_scene(points=3000, relief_m=relief).left
+        centres = np.stack([pose.translation for pose in scene.ned_from_cam])
+        records = [replace(r, altitude_m=2.0, sigma_altitude_m=0.02) for r in scene.records]
         found = scale_by_altitudes(records, centres, scene.points_ned)
         assert found is not None
         sigmas.append(found[1])

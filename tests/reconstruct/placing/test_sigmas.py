@@ -2,19 +2,17 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.core.errors import warn
 from alice_survey.core.frames import Array, Datum, rotation_from_attitude
 from alice_survey.core.manifest import ImageRecord
 from alice_survey.core.records import BendRecord
 from camera_calib.mount import mount_rotation
-from reconstruct.placing.alignment import level
+from reconstruct.placing.alignment import Similarity, level
 from reconstruct.placing.correlated_fit import (
     correlated_share,
     dives_of,
@@ -83,6 +81,24 @@ def flown(
     return records_of(body, factor * SIGMA * gauss_markov(rng, len(body), tau_s), SIGMA)
 
 
+def own_frame(
+    rng: np.random.Generator, cameras: RigidTransform
+) -> tuple[RigidTransform, list[RigidTransform], Similarity]:
+    """Truth of a frame of a model's own, poses of cameras in it, and the model levelled."""
+    truth = RigidTransform.from_components(rng.normal(0, 30, 3), Rotation.random(rng=rng))
+    poses = [truth.inv() * pose for pose in cameras]
+    floor = np.column_stack([rng.uniform(0, 5, (300, 2)), rng.normal(15, 0.1, 300)])
+    centres = np.stack([pose.translation for pose in poses])
+    return truth, poses, level(truth.inv().apply(floor), centres)
+
+
+def errors_of(fit: PlacementFit, truth: RigidTransform, poses: list[RigidTransform]) -> Array:
+    """(6,) shift of the cameras' middle and turn, in NED."""
+    found, centres = fit.ned_from_model, np.stack([pose.translation for pose in poses])
+    shift = found.apply(centres).mean(axis=0) - truth.apply(centres).mean(axis=0)
+    return np.r_[shift, (found.rotation * truth.rotation.inv()).as_rotvec()]
+
+
 def place(
     body: RigidTransform,
     records: list[ImageRecord],
@@ -94,25 +110,17 @@ def place(
     The model's own errors are 1 mm and 0.005 degrees.
     """
     rng = np.random.default_rng(seed)
-    truth = RigidTransform.from_components(rng.normal(0, 30, 3), Rotation.random(rng=rng))
     noise = RigidTransform.from_components(
         rng.normal(0, 1e-3, (len(body), 3)),
         Rotation.from_rotvec(rng.normal(0, 1e-4, (len(body), 3))),
     )
-    cameras = body * BODY_FROM_CAM["cam"]
-    poses = [truth.inv() * pose * n for pose, n in zip(cameras, noise, strict=True)]
-    floor = np.column_stack([rng.uniform(0, 5, (300, 2)), rng.normal(15, 0.1, 300)])
-    centres = np.stack([pose.translation for pose in poses])
+    truth, poses, levelled = own_frame(rng, body * BODY_FROM_CAM["cam"] * noise)
     options.setdefault("known_scale", 1.0)
     fit = fit_navigation(
-        records, poses, BODY_FROM_CAM, DATUM, level(truth.inv().apply(floor), centres),
-        **options,  # type: ignore[arg-type]
+        records, poses, BODY_FROM_CAM, DATUM, levelled, **options,  # type: ignore[arg-type]
     )  # fmt: skip
     assert fit is not None
-    found = fit.ned_from_model
-    shift = found.apply(centres).mean(axis=0) - truth.apply(centres).mean(axis=0)
-    turn = (found.rotation * truth.rotation.inv()).as_rotvec()
-    errors = np.r_[shift, turn, np.log(found.scale)]
+    errors = np.r_[errors_of(fit, truth, poses), np.log(fit.ned_from_model.scale)]
     sigma = np.sqrt(np.diag(fit.covariance))
     return fit, errors, np.r_[sigma[3:6], sigma[:3], sigma[6]]
 
@@ -408,36 +416,22 @@ def waves(centres: Array) -> Array:
     return _SIGMA_M * modes
 
 
-def fitted(
-    seed: int, factor: float, *, apart_m: float | None = None, unit_m: float = 1e-3
-) -> tuple[PlacementFit, Array]:
-    """A model deformed by this many times its sigmas, placed; its errors, in the fit's order.
-
-    With `apart_m` its second half is so far east of where it ought to be, and nothing links it: its
-    motions are counted in this unit.
-    """
+def fitted(seed: int, factor: float) -> tuple[PlacementFit, Array]:
+    """A model deformed by this many times its sigmas, placed; its errors, in the fit's order."""
     rng = np.random.default_rng([7, seed])
     body = flight(8, 40)
     cameras = body * BODY_FROM_CAM["cam"]
     modes = waves(cameras.translation)
     sizes = factor * rng.normal(size=_MODES)
-    if apart_m is not None:
-        joint = np.zeros((len(modes), 6, 3))
-        joint[len(modes) // 2 :, :3] = unit_m * np.eye(3)
-        modes = np.concatenate([modes, joint], axis=2)
-        sizes = np.append(sizes, [0.0, apart_m / unit_m, 0.0])
     bent = RigidTransform.from_components(
         cameras.translation - (modes @ sizes)[:, :3], cameras.rotation
     )
-    own = RigidTransform.from_components(rng.normal(0, 30, 3), Rotation.random(rng=rng))
+    own, poses, levelled = own_frame(rng, bent)
     turn = own.inv().rotation.as_matrix()
     modes[:, :3], modes[:, 3:] = turn @ modes[:, :3], turn @ modes[:, 3:]
-    poses = [own.inv() * pose for pose in bent]
-    floor = np.column_stack([rng.uniform(0, 5, (300, 2)), rng.normal(15, 0.1, 300)])
-    levelled = level(own.inv().apply(floor), np.stack([pose.translation for pose in poses]))
     fit = fit_navigation(
         flown(body, [4, seed], 1.0), poses, BODY_FROM_CAM, DATUM, levelled,
-        known_scale=1.0, modes=modes, joints=0 if apart_m is None else 3,
+        known_scale=1.0, modes=modes,
     )  # fmt: skip
     assert fit is not None
     return fit, fit.modes - sizes
@@ -479,11 +473,7 @@ def bends_of(
     bent = RigidTransform.from_components(
         cameras.translation + np.column_stack([zero, zero, down]), turns * cameras.rotation
     )
-    own = RigidTransform.from_components(rng.normal(0, 30, 3), Rotation.random(rng=rng))
-    poses = [own.inv() * pose for pose in bent]
-    floor = np.column_stack([rng.uniform(0, 5, (300, 2)), rng.normal(15, 0.1, 300)])
-    centres = np.stack([pose.translation for pose in poses])
-    levelled = level(own.inv().apply(floor), centres)
+    _, poses, levelled = own_frame(rng, bent)
     fit = fit_navigation(records, poses, BODY_FROM_CAM, DATUM, levelled, known_scale=1.0)
     assert fit is not None
     return fit.bends
@@ -545,51 +535,28 @@ def test_a_line_has_no_bend_across_and_a_few_stations_have_none() -> None:
 MOUNTED = flight(8, 15)
 
 
-def with_mount(
-    words: str, seed: int, *, tau_s: float = 1.0, calls: list[str] | None = None
-) -> tuple[PlacementFit, RigidTransform, Array]:
-    """Fit with an unknown mount: the fit, the true mount, errors of turn (rad) and place (m).
-
-    With `calls` each fit on the way adds its number to them, and warns of it.
-    """
+def with_mount(words: str, seed: int) -> tuple[PlacementFit, RigidTransform, Array]:
+    """Fit with an unknown mount: the fit, the true mount, errors of turn (rad) and place (m)."""
     rng = np.random.default_rng([seed, 7])
     mount = RigidTransform.from_components(
         rng.uniform([0.2, -0.3, 0.0], [0.6, 0.3, 0.3]),
         Rotation.from_rotvec(rng.normal(0, 0.1, 3)) * mount_rotation(words),
     )
-    truth = RigidTransform.from_components(rng.normal(0, 30, 3), Rotation.random(rng=rng))
     noise = Rotation.from_rotvec(rng.normal(0, 1e-4, (len(MOUNTED), 3)))
-    poses = [
-        truth.inv() * body * mount * RigidTransform.from_rotation(n)
-        for body, n in zip(MOUNTED, noise, strict=True)
-    ]
-    floor = np.column_stack([rng.uniform(0, 7, (300, 2)), rng.normal(15, 0.1, 300)])
-    centres = np.stack([pose.translation for pose in poses])
-    fit_to = partial(
-        fit_navigation,
-        flown(MOUNTED, [seed, 3], tau_s),
-        poses,
-        levelled=level(truth.inv().apply(floor), centres),
-        known_scale=1.0,
-    )
+    truth, poses, levelled = own_frame(rng, MOUNTED * mount * RigidTransform.from_rotation(noise))
+    records = flown(MOUNTED, [seed, 3], 1.0)
 
     def navigate(
         mounts: Mapping[str, RigidTransform] | None, installed: Installation
     ) -> PlacementFit | None:
-        if calls is not None:
-            calls.append(f"fit {len(calls)}")
-            warn(calls[-1])
-        return fit_to(mounts, DATUM, installed=installed)
+        return fit_navigation(
+            records, poses, mounts, DATUM, levelled, known_scale=1.0, installed=installed
+        )
 
-    fit = fit_with_mount(
-        flown(MOUNTED, [seed, 3], tau_s), poses, {"cam": RigidTransform.identity()}, navigate,
-        USUAL_INSTALLATION,
-    )  # fmt: skip
+    alone = {"cam": RigidTransform.identity()}
+    fit = fit_with_mount(records, poses, alone, navigate, USUAL_INSTALLATION)
     assert fit is not None
-    found = fit.ned_from_model
-    shift = found.apply(centres).mean(axis=0) - truth.apply(centres).mean(axis=0)
-    turn = (found.rotation * truth.rotation.inv()).as_rotvec()
-    return fit, mount, np.r_[turn, shift]
+    return fit, mount, np.roll(errors_of(fit, truth, poses), 3)
 
 
 @pytest.mark.parametrize("words", ["nadir-bow-left", "forward+45"])

@@ -80,6 +80,16 @@ def placed(middle: Array, covariance: Array) -> PlacementFit:
     )  # fmt: skip
 
 
+def shape_of(pictures: dict[int, str], frame_cov: Array, modes: SoftModes) -> Uncertainty:
+    """Of stations with these reference pictures, without points."""
+    none = np.zeros((0, 3, 3))
+    return Uncertainty(
+        frames=np.arange(len(pictures)), stations=np.array([*pictures]),
+        images=tuple(pictures.values()), frame_cov=frame_cov, point_ids=np.zeros(0, np.int64),
+        point_cov=none, point_noise=none, sigma_px=0.3, modes=modes,
+    )  # fmt: skip
+
+
 def test_errors_of_the_place_move_every_picture_as_the_covariance_says() -> None:
     poses, middle = random_poses(4), np.array([1.0, -2.0, 0.5])
     covariance = random_covariance(7, 1, 1e-3)
@@ -116,12 +126,7 @@ def test_errors_of_a_station_move_its_other_camera_on_its_arm() -> None:
         )
         moved.append(RigidTransform.concatenate([world(turned), world(turned * arm)]))
     true = RigidTransform.concatenate([world(pose) for pose in both])
-    known = Uncertainty(
-        frames=np.array([1]), stations=np.array([7]), images=("a",),
-        frame_cov=covariance[None], point_ids=np.zeros(0, np.int64),
-        point_cov=np.zeros((0, 3, 3)), point_noise=np.zeros((0, 3, 3)), sigma_px=0.3,
-        modes=no_modes(1, 0),
-    )  # fmt: skip
+    known = shape_of({7: "a"}, covariance[None], no_modes(1, 0))
     assert_close(pose_covariances(rows_of(true, 7), None, known, place), scatter(true, moved))
     assert np.isnan(pose_covariances(rows_of(true, 8), None, known, place)).all()
 
@@ -136,11 +141,7 @@ def test_place_and_soft_modes_err_together() -> None:
     )  # fmt: skip
     rest = random_covariance(6, 4, 5e-4)
     spread = modes.stations @ modes.stations.swapaxes(1, 2)
-    known = Uncertainty(
-        frames=np.arange(2), stations=np.arange(2), images=("0", "1"),
-        frame_cov=spread + rest, point_ids=np.zeros(0, np.int64), point_cov=np.zeros((0, 3, 3)),
-        point_noise=np.zeros((0, 3, 3)), sigma_px=0.3, modes=modes,
-    )  # fmt: skip
+    known = shape_of({0: "0", 1: "1"}, spread + rest, modes)
     size = np.diag([1e-3] * 7 + [0.6] * 2)
     joint = size @ random_covariance(9, 8, 1.0) @ size
     place = Similarity(scale=1.5, rotation=Rotation.random(rng=rng), translation=np.zeros(3))
@@ -184,15 +185,10 @@ def test_sigmas_of_the_attitude_are_those_of_the_vehicle_not_of_north() -> None:
 
 
 def rows() -> list[TrackRow]:
-    poses = random_poses(3)
     return [
-        TrackRow(
-            image=f"{k}.png", station=k // 2, camera="left" if k % 2 == 0 else "right",
-            time_s=np.nan if k == 2 else float(k // 2), world_from_cam=pose, points=5,
-            reprojection_px=0.2, world_from_body=pose.rotation,
-        )
-        for k, pose in enumerate(poses)
-    ]  # fmt: skip
+        replace(row, station=k // 2, time_s=np.nan if k == 2 else float(k // 2))
+        for k, row in enumerate(rows_of(random_poses(3)))
+    ]
 
 
 def test_a_track_keeps_its_poses_and_says_its_sigmas(tmp_path: Path) -> None:
