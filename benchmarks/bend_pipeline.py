@@ -92,7 +92,7 @@ def adjusted(
     of_name = {record.image: record for record in seen.images}
     rows = [
         row
-        for row in track_rows(model, of_name, after.mapped.warps, frame, {})
+        for row in track_rows(model, of_name, after.mapped.warps, frame)
         if row.camera == rig.reference
     ]
     if len(rows) < len({record.station for record in seen.images}):

@@ -244,17 +244,11 @@ def _axes(plane: Plane) -> dict[str, Direction]:
     """Origin, and directions right, up and out of a plane: east, north, up."""
     up, right, into = plane.plane_from_world.rotation.as_matrix()
     origin = plane.plane_from_world.inv().translation
+    axes = {"origin_enu": origin, "right_enu": right, "up_enu": up, "out_enu": -into}
     return {
-        "origin_enu": _enu(origin),
-        "right_enu": _enu(right),
-        "up_enu": _enu(up),
-        "out_enu": _enu(-into),
+        name: (round(y, 15) + 0.0, round(x, 15) + 0.0, round(-z, 15) + 0.0)
+        for name, (x, y, z) in ((name, axis.tolist()) for name, axis in axes.items())
     }
-
-
-def _enu(ned: Array) -> Direction:
-    east, north, up = (round(float(v), 15) + 0.0 for v in (ned[1], ned[0], -ned[2]))
-    return east, north, up
 
 
 def write_plane(folder: Path, plane: Plane, world: WorldFrame) -> None:
@@ -285,21 +279,11 @@ def read_plane(folder: Path) -> Plane:
     found = PlaneRecord.read_existing(folder / "plane.json")
     if found is None or found.name == LEVEL:
         return LEVEL_PLANE
-    up, right, out = (
-        _ned_from_enu(axis) for axis in (found.up_enu, found.right_enu, found.out_enu)
-    )
+    enu = np.array([found.up_enu, found.right_enu, found.out_enu, found.origin_enu])
+    up, right, out, origin = enu[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
     rotation = Rotation.from_matrix(np.stack([up, right, -out]))
-    return Plane(
-        name=found.name,
-        about=found.about,
-        plane_from_world=RigidTransform.from_components(
-            -rotation.apply(_ned_from_enu(found.origin_enu)), rotation
-        ),
-    )
-
-
-def _ned_from_enu(enu: Direction) -> Array:
-    return np.array([enu[1], enu[0], -enu[2]])
+    move = RigidTransform.from_components(-rotation.apply(origin), rotation)
+    return Plane(name=found.name, about=found.about, plane_from_world=move)
 
 
 def plane_folders(stage: Path) -> list[Path]:

@@ -534,11 +534,8 @@ class ExactSurvey:
         stations = RigidTransform.from_components(
             fit.state.centres, Rotation.from_matrix(fit.state.turns)
         )
-        pinhole_from_cam = warps[names[0]].pinhole_from_cam
-        for frame, station in zip(frames_of(model).tolist(), stations, strict=True):
-            model.frames[frame].rig_from_world = rigid3d(pinhole_from_cam * station.inv())
-        for point, xyz in zip(fit.point_ids.tolist(), fit.state.points, strict=True):
-            model.points3D[point].xyz = xyz
+        rig_from_world = warps[names[0]].pinhole_from_cam * stations.inv()
+        _put(model, rig_from_world, fit.point_ids, fit.state.points)
         for number, image in model.images.items():
             for point, xy in zip(image.points2D, seen.pixels[number - 1], strict=True):
                 point.xy = xy
@@ -684,9 +681,16 @@ def _move_model(mapped: Mapped, modes: SoftModes, sizes: Array) -> Mapped:
     poses = rig_poses(model, frames).inv()
     turns, centres, points = modes.move(sizes, poses.translation, seen.points, slice(None))
     stations = RigidTransform.from_components(centres, turns * poses.rotation)
-    for frame, station in zip(frames.tolist(), stations, strict=True):
-        model.frames[frame].rig_from_world = rigid3d(station.inv())
-    for point, xyz in zip(seen.point_ids.tolist(), points, strict=True):
-        model.points3D[point].xyz = xyz
+    _put(model, stations.inv(), seen.point_ids, points)
     model.update_point_3d_errors()
     return replace(mapped, model=model)
+
+
+def _put(
+    model: pycolmap.Reconstruction, rig_from_world: RigidTransform, ids: Indices, points: Array
+) -> None:
+    """Put all stations and the points of these ids where they are, in place."""
+    for frame, pose in zip(frames_of(model).tolist(), rig_from_world, strict=True):
+        model.frames[frame].rig_from_world = rigid3d(pose)
+    for point, xyz in zip(ids.tolist(), points, strict=True):
+        model.points3D[point].xyz = xyz

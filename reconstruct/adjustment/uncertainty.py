@@ -607,7 +607,9 @@ def _spread_rows(points: Array) -> Indices:
 
 def write_uncertainty(path: Path, found: Uncertainty) -> None:
     """Write `covariance.npz`: fields of `Uncertainty` but the modes; much of it as float32."""
-    arrays = {key: np.asarray(getattr(found, name)) for key, name in _STORED.items()}
+    arrays: dict[str, Any] = {
+        key: np.asarray(getattr(found, name)) for key, name in _STORED.items()
+    }
     if found.shared is not None:
         arrays |= dict(zip(_SHARED, vars(found.shared).values(), strict=True))
     for key in arrays.keys() & {"point_cov", "point_noise", "shared_motions"}:

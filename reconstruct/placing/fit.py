@@ -6,7 +6,7 @@ robust first placement on; then what contradicts itself is named and counts as t
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -206,6 +206,12 @@ class _FitGuess:
     place: Similarity
     sizes: Array
     """(K,) of the soft modes, in their sigmas."""
+    free: Sequence[int] = ()
+    """Parameters to solve for."""
+    bounds: Mapping[int, float] = field(default_factory=dict)
+    """Of navigation's frame (see `estimate`)."""
+    widened: Mapping[str, float] = field(default_factory=dict)
+    """Groups whose stated sigmas are too small, and by what factor."""
     factor: float = 1.0
     """How many times larger modes are than pictures say."""
     drift_m: float = 0.0
@@ -232,12 +238,10 @@ class NavigationTask:
             ReconstructionError: the model shrinks to a point on the way, or grows without bound.
         """
         start, epochs = place, self.epochs
-        at = _FitGuess(place=place, sizes=np.zeros(epochs.modes.shape[2]))
         found = equations(epochs, place, self._middle(place))
         used = without_gross_errors(epochs.time, found.misfit, epochs.known)
-        bounds = self._frame_bounds()
-        modes = range(PARAMETERS, PARAMETERS + len(at.sizes))
-        soft = len(at.sizes) - self.joints
+        count, bounds = epochs.modes.shape[2], self._frame_bounds()
+        modes, soft = range(PARAMETERS, PARAMETERS + count), count - self.joints
         solved_for = [*free, *(p for p, bound in bounds.items() if bound > _MIN_BOUND), *modes]
         if epochs.has_attitude:
             solved_for += range(LEVER.start, LEVER.stop)
@@ -246,9 +250,9 @@ class NavigationTask:
         if epochs.timed and len(epochs.time) > 1:
             solved_for.append(CLOCK)
         settling = [*free, *modes]
-        widened: dict[str, float] = {}
+        at = _FitGuess(place=place, sizes=np.zeros(count), free=solved_for, bounds=bounds)
         for _ in range(_STEPS):
-            got = self._estimate(at, used, solved_for, bounds, widened=widened)
+            got = self._estimate(at, used)
             place = _move(at.place, _without_overshoot(got.change), self._middle(at.place))
             if not SHRUNK < place.scale / start.scale < 1.0 / SHRUNK:
                 raise ReconstructionError("positions of navigation show no scale of the model")
@@ -259,48 +263,31 @@ class NavigationTask:
             settled = still.all() and abs(factor - at.factor) <= _SETTLED_SIGMAS * factor
             at = replace(at, place=place, sizes=sizes, factor=factor)
             if settled:
-                if widened:
+                if at.widened:
                     break
-                drift_m = self._drift(at, got, solved_for, bounds)
-                widened = self._contradictions(got.change[TURN], drift_m, bounds, got.correlation)
-                if not widened:
+                at = self._widen(at, got)
+                if not at.widened:
                     break
-                at = replace(at, drift_m=drift_m)
-                if drift_m:
-                    solved_for.append(DRIFT)
         scaled = got
         if SCALE not in free:
-            stiff = [p for p in solved_for if p not in modes[:soft]]
-            scaled = self._estimate(
-                at, got.used, [*stiff, SCALE], bounds, correlation=got.correlation
-            )
-        return self._report(at, got, scaled, solved_for, bounds)
+            stiff = [*(p for p in at.free if p not in modes[:soft]), SCALE]
+            scaled = self._estimate(replace(at, free=stiff), got.used, got.correlation)
+        return self._report(at, got, scaled)
 
     def _estimate(
         self,
         at: _FitGuess,
         used: NDArray[np.bool_],
-        free: Sequence[int],
-        bounds: Mapping[int, float],
-        *,
-        widened: Mapping[str, float] | None = None,
         correlation: Mapping[str, Correlation] | None = None,
     ) -> Estimate:
         """Solve the equations of navigation, and of all else, about a guess."""
         found = equations(self.epochs.deform(at.sizes), at.place, self._middle(at.place))
         return estimate(
-            self.epochs.time, found, used, free, self._extra(at), frame_bounds=bounds,
-            widened=widened, correlation=correlation,
+            self.epochs.time, found, used, at.free, self._extra(at), frame_bounds=at.bounds,
+            widened=at.widened, correlation=correlation,
         )  # fmt: skip
 
-    def _report(
-        self,
-        at: _FitGuess,
-        got: Estimate,
-        scaled: Estimate,
-        free: Sequence[int],
-        bounds: Mapping[int, float],
-    ) -> PlacementFit:
+    def _report(self, at: _FitGuess, got: Estimate, scaled: Estimate) -> PlacementFit:
         epochs = self.epochs.deform(at.sizes)
         kept = got.used[epochs.moment, :3].any(axis=1)
         residuals = (epochs.positions(at.place) - epochs.measured_ned)[kept]
@@ -314,7 +301,7 @@ class NavigationTask:
                 value=float(unit * got.change[column]), sigma=float(unit * sigmas[column])
             )
             for name, (column, unit) in _NUISANCES.items()
-            if column in free
+            if column in at.free
         }
         self._warn_of_installation(named)
         for group, how in got.correlation.items():
@@ -335,7 +322,7 @@ class NavigationTask:
             rms_east_m=east,
             rms_depth_m=depth,
             # That a similarity would choose: 1 where navigation agrees with the known scale.
-            scale_of_navigation=float(np.exp(scaled.change[SCALE])) if SCALE not in free else 1.0,
+            scale_of_navigation=1.0 if scaled is got else float(np.exp(scaled.change[SCALE])),
             scale_of_navigation_sigma=float(np.sqrt(scaled.covariance[SCALE, SCALE])),
             nuisances=named,
             soft_modes=tuple(at.sizes.tolist()),
@@ -359,7 +346,7 @@ class NavigationTask:
             correlation=got.correlation,
             modes=at.sizes,
             joint=got.covariance[np.ix_(joint, joint)],
-            bends=self._bends(at, got, free, bounds),
+            bends=self._bends(at, got),
             nuisances=named,
             stated=stated,
         )
@@ -380,9 +367,7 @@ class NavigationTask:
                 "or state a larger sigma, for the place is as unsure as that"
             )
 
-    def _bends(
-        self, at: _FitGuess, got: Estimate, free: Sequence[int], bounds: Mapping[int, float]
-    ) -> tuple[BendRecord, ...]:
+    def _bends(self, at: _FitGuess, got: Estimate) -> tuple[BendRecord, ...]:
         """How bent the placed model is by navigation alone, whatever its modes allow."""
         epochs, place = self.epochs.deform(at.sizes), at.place
         if got.used[:, 2].sum() < MIN_STATIONS:
@@ -392,10 +377,12 @@ class NavigationTask:
         count = modes.shape[2]
         modes = np.concatenate([modes, epochs.modes[..., len(at.sizes) - self.joints :]], axis=2)
         bending = replace(self, control=None, epochs=replace(epochs, modes=modes))
-        stiff = _FitGuess(place=place, sizes=np.zeros(modes.shape[2]))
-        solved_for = [p for p in free if p < PARAMETERS]
-        solved_for += range(PARAMETERS, PARAMETERS + modes.shape[2])
-        bent = bending._estimate(stiff, got.used, solved_for, bounds, correlation=got.correlation)
+        own = range(PARAMETERS, PARAMETERS + modes.shape[2])
+        stiff = _FitGuess(
+            place=place, sizes=np.zeros(len(own)), bounds=at.bounds,
+            free=[*(p for p in at.free if p < PARAMETERS), *own],
+        )  # fmt: skip
+        bent = bending._estimate(stiff, got.used, got.correlation)
         values = _VAGUE_PER_M * bent.change[PARAMETERS:]
         sigmas = _VAGUE_PER_M * np.sqrt(np.diag(bent.covariance)[PARAMETERS:])
         design, lengths, _ = quadratic(places[:, :2])
@@ -406,9 +393,7 @@ class NavigationTask:
             for k in range(min(count, 2))
         )
 
-    def _drift(
-        self, at: _FitGuess, got: Estimate, free: Sequence[int], bounds: Mapping[int, float]
-    ) -> float:
+    def _drift(self, at: _FitGuess, got: Estimate) -> float:
         """Drift of depths over the survey, metres, if it is more than is likely, else 0.
 
         Only a known tilt tells it from one of the model.
@@ -417,8 +402,8 @@ class NavigationTask:
         if not (epochs.timed and epochs.has_tilt and got.used[:, 2].sum() >= MIN_STATIONS):
             return 0.0
         usual = self._usual_sigma(2)
-        vague = replace(at, drift_m=_VAGUE_DRIFT_SIGMAS * usual)
-        found = self._estimate(vague, got.used, [*free, DRIFT], bounds)
+        vague = replace(at, drift_m=_VAGUE_DRIFT_SIGMAS * usual, free=[*at.free, DRIFT])
+        found = self._estimate(vague, got.used)
         drift_m = float(found.change[DRIFT])
         likely = np.hypot(_DRIFT_SIGMAS * usual, np.sqrt(found.covariance[DRIFT, DRIFT]))
         return drift_m if abs(drift_m) > _CONTRADICTION_SIGMAS * likely else 0.0
@@ -426,26 +411,15 @@ class NavigationTask:
     def _usual_sigma(self, channel: int) -> float:
         return float(np.median(self.epochs.sigma[self.epochs.known[:, channel], channel]))
 
-    def _contradictions(
-        self,
-        turn: float,
-        drift_m: float,
-        bounds: dict[int, float],
-        correlation: Mapping[str, Correlation],
-    ) -> dict[str, float]:
+    def _widen(self, at: _FitGuess, got: Estimate) -> _FitGuess:
         """Name what navigation says of itself in two ways, and make both as unsure as they differ.
 
-        Args:
-            turn: of navigation's frame against its headings, radians.
-            drift_m: of depths against attitudes and pictures; 0 where there is none.
-            bounds: of navigation's frame; widened in place.
-            correlation: of errors.
-
-        Returns:
-            Groups whose stated sigmas are too small, and by what factor.
+        That is its turn of positions against headings, and a drift of depths against attitudes.
         """
-        widened = {}
+        widened, free, bounds = {}, at.free, dict(at.bounds)
+        turn, correlation, drift_m = got.change[TURN], got.correlation, self._drift(at, got)
         if drift_m:
+            free = [*free, DRIFT]
             usual = self._usual_sigma(2)
             warn(
                 f"depths of the navigation drift by {drift_m:+.2g} m against its attitudes and the "
@@ -468,7 +442,7 @@ class NavigationTask:
                 )
                 widened["heading"] = max(differ / stated, 1.0)
                 bounds[TURN] *= differ / expected
-        return widened
+        return replace(at, widened=widened, free=free, bounds=bounds, drift_m=drift_m)
 
     def _middle(self, place: Similarity) -> Array:
         return np.asarray(place.apply(self.epochs.centres).mean(axis=0))

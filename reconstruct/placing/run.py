@@ -579,13 +579,7 @@ def run_sparse(
     if rig is not None and fit is not None and fit.mount is not None:
         rig = replace(rig, body_from_rig=fit.mount.body_from_rig)
         write_rig(folder / "rig.json", rig)
-    known_mount = rig_with_mount(rig)
-    mounts = (
-        {}
-        if known_mount is None
-        else {n: known_mount.body_from_cam(n).rotation for n in known_mount.cameras}
-    )
-    rows = track_rows(model, of_name, warps, placed.frame, mounts)
+    rows = track_rows(model, of_name, warps, placed.frame, rig_with_mount(rig))
     covariances = None
     if fit is not None or shape is not None:
         covariances = pose_covariances(rows, fit, shape, move)

@@ -20,6 +20,7 @@ from alice_survey.core.frames import BODY_FROM_NADIR_CAM, Array, attitude_from_r
 from alice_survey.core.manifest import ImageRecord
 from alice_survey.core.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp
+from camera_calib.rig import Rig
 from reconstruct.adjustment.uncertainty import Uncertainty
 from reconstruct.mapping.arrays import cross_matrices, observations
 from reconstruct.placing.alignment import Similarity
@@ -66,7 +67,7 @@ def track_rows(
     records: Mapping[str, ImageRecord],
     warps: Mapping[str, PinholeWarp],
     frame: WorldFrame,
-    body_from_cam: Mapping[str, Rotation],
+    rig: Rig | None = None,
 ) -> list[TrackRow]:
     """Rows of all registered pictures of a COLMAP model of ideal pinholes, by station and name.
 
@@ -78,7 +79,7 @@ def track_rows(
         records: by picture.
         warps: by camera.
         frame: the world.
-        body_from_cam: mount of every camera that has one.
+        rig: on a vehicle; None where the mount is unknown.
     """
     seen = observations(model)
     missed = np.linalg.norm(seen.residuals(model), axis=1)
@@ -92,7 +93,7 @@ def track_rows(
         record = records[image.name]
         cam_from_world = as_transform(image.cam_from_world())
         pose = cam_from_world.inv() * pupils[record.camera]
-        mount = body_from_cam.get(record.camera, BODY_FROM_NADIR_CAM)
+        mount = rig.body_from_cam(record.camera).rotation if rig else BODY_FROM_NADIR_CAM
         rows.append(
             TrackRow(
                 image=image.name,

@@ -17,7 +17,7 @@ from alice_survey.core.errors import PlanError, warn
 from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Array
 from alice_survey.kit.figure import figure_style, save_figure
-from alice_survey.kit.words import count, share
+from alice_survey.kit.words import count, share, text_table
 from missions.coverage.certificate import certificate
 from missions.coverage.drawing import (
     draw_counts,
@@ -274,32 +274,23 @@ def _text(found: Found, cures: Sequence[Prediction]) -> str:
         lines.append(f"no picture links models of {sizes} pictures to each other")
     if not found.places:
         return "\n".join([*lines, "nothing is weak"])
-    lines += [
-        f"{count(len(found.places), 'weak place')}, worst first:",
-        f"  {'':>3}  {'cause':<8} {'area m2':>8}  {'north m':>8}  {'east m':>8}  reason",
-    ]
+    rows = []
     for number, place in enumerate(found.places[:_LISTED], 1):
-        north, east = place.place_ne
-        lines.append(
-            f"  {number:>3}  {place.cause:<8} {place.area_m2:>8.2f}  {north:>8.2f}  {east:>8.2f}  "
-            f"{place.reason}" + (f" -> {cures[number - 1].text}" if cures else "")
-        )
+        reason = place.reason + (f" -> {cures[number - 1].text}" if cures else "")
+        figures = (f"{value:.2f}" for value in (place.area_m2, *place.place_ne))
+        rows.append([str(number), place.cause, *figures, reason])
+    lines.append(f"{count(len(found.places), 'weak place')}, worst first:")
+    lines.append(text_table(("", "cause", "area m2", "north m", "east m", "reason"), rows))
     if len(found.places) > _LISTED:
         lines.append(f"  and {len(found.places) - _LISTED} more (revisit.json)")
     return "\n".join(lines)
 
 
 def _dive_text(
-    workspace: Path,
-    found: Found,
-    dive: dict[str, Any],
-    words: str,
-    cures: Sequence[Prediction],
+    workspace: Path, found: Found, dive: dict[str, Any], words: str, cures: Sequence[Prediction]
 ) -> str:
-    cured = sum(
-        place.severity_m2 * (1 - cure.left) for place, cure in zip(found.places, cures, strict=True)
-    )
-    whole = sum(place.severity_m2 for place in found.places)
+    severity = np.array([place.severity_m2 for place in found.places])
+    cured, whole = severity @ [1 - cure.left for cure in cures], severity.sum()
     return (
         f"\nthe dive over them: {words}; {dive['joining_stations']} of its stations are predicted "
         f"to join the model, {cured / whole:.0%} of the weakness to be cured: {dive['folder']}\n"

@@ -140,7 +140,7 @@ def placed(scene: Scene, mapped: Mapped) -> Found:
     after = found.deform(fit.modes, fit.joint[PLACE:, PLACE:])
     frame = WorldFrame(name="ned", datum=DATUM, scaled=True, vertical_datum="", notes=())
     of_name = {record.image: record for record in scene.records}
-    rows = track_rows(after.mapped.model, of_name, after.mapped.warps, frame, {})
+    rows = track_rows(after.mapped.model, of_name, after.mapped.warps, frame)
     rows = [replace(r, world_from_cam=_as_rigid(fit) * r.world_from_cam) for r in rows]
     rows = [row for row in rows if row.camera == "left"]
     left = scene.left
