@@ -278,8 +278,7 @@ class _OctreeGrid:
     @property
     def corner(self) -> NDArray[np.int64]:
         """(3,) corner of the root, in steps."""
-        corner: NDArray[np.int64] = self.first << self.cube_bits
-        return corner
+        return np.asarray(self.first << self.cube_bits)
 
     def bits(self, level: int) -> int:
         """Nodes of a level have edges of 2**bits steps."""
@@ -333,8 +332,7 @@ class _OctreeGrid:
 
     def _steps(self, points: Records) -> NDArray[np.int64]:
         """(N, 3) steps from the root's corner."""
-        steps: NDArray[np.int64] = np.stack([points[axis] for axis in "XYZ"], axis=1) - self.corner
-        return steps
+        return np.asarray(np.stack([points[axis] for axis in "XYZ"], axis=1) - self.corner)
 
 
 class _Nodes:

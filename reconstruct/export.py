@@ -37,13 +37,7 @@ from reconstruct.evaluate.scores import read_mesh
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.raster import BLOCK, local_crs, opened_raster, small_cache, tiles_of_shape
 from reconstruct.stages import DENSE, MESH, MOSAIC, PLACING
-from reconstruct.views.model import (
-    View,
-    WorldFrame,
-    points_of_views,
-    read_frame,
-    read_model,
-)
+from reconstruct.views.model import View, WorldFrame, points_of_views, read_frame, read_model
 from reconstruct.views.model_files import read_reconstruction
 from reconstruct.views.range_shift import fill_holes
 
@@ -65,16 +59,14 @@ class Destination:
     def places(self, east_north: Array) -> Array:
         """Easting and northing (N, 2), metres, of local east and north (N, 2)."""
         east, north = east_north.T
-        found: Array = np.column_stack(self.transformer.transform(east, north, errcheck=True))
-        return found
+        return np.asarray(np.column_stack(self.transformer.transform(east, north, errcheck=True)))
 
     def turn_normals(self, normals: Array, east_north: Array) -> Array:
         """Directions (N, 3) at a place (2,): by the convergence of its meridians."""
         at = self.places(np.array([east_north, east_north + np.array([0.0, 1.0])]))
         x, y = (at[1] - at[0]) / np.linalg.norm(at[1] - at[0])
         turn = np.array([[y, x, 0.0], [-x, y, 0.0], [0.0, 0.0, 1.0]])
-        found: Array = normals @ turn.T
-        return found
+        return np.asarray(normals @ turn.T)
 
 
 def export_projected(workspace: Path, crs: str) -> tuple[str, dict[str, Any]]:
@@ -175,22 +167,18 @@ def _resample(source: Path, path: Path, target: Destination) -> None:
             resolution=raster.transform.a,
         )  # fmt: skip
         smooth = raster.dtypes[0].startswith("float") or raster.count > 1
-        options = {
-            "crs": target.crs.to_wkt(),
-            "transform": transform,
-            "width": width,
-            "height": height,
-            "resampling": Resampling.bilinear if smooth else Resampling.nearest,
-        }
-        profile = raster.profile | {
-            "driver": "GTiff", "crs": target.crs.to_wkt(), "transform": transform, "width": width,
-            "height": height, "tiled": True, "blockxsize": BLOCK, "blockysize": BLOCK,
+        resampling = Resampling.bilinear if smooth else Resampling.nearest
+        grid = {
+            "crs": target.crs.to_wkt(), "transform": transform, "width": width, "height": height,
+        }  # fmt: skip
+        profile = raster.profile | grid | {
+            "driver": "GTiff", "tiled": True, "blockxsize": BLOCK, "blockysize": BLOCK,
             "compress": "deflate", "bigtiff": "if_safer",
         }  # fmt: skip
         for name in ("photometric", "interleave"):
             profile.pop(name, None)
         with (
-            WarpedVRT(raster, **options) as warped,
+            WarpedVRT(raster, resampling=resampling, **grid) as warped,
             atomic_path(path) as temporary,
             rasterio.open(temporary, "w", **profile) as made,
         ):
@@ -391,8 +379,7 @@ def surface_depth(view: View, scene: Any, origin: Array) -> Array:
     starts = np.broadcast_to(view.world_from_cam.translation - origin, ways.shape)
     cast = o3d.core.Tensor.from_numpy(np.hstack([starts, ways]).astype(np.float32))
     depth = scene.cast_rays(cast)["t_hit"].numpy().astype(np.float64)
-    found: Array = np.where(np.isfinite(depth), depth, np.nan).reshape(pixels.shape[:2])
-    return found
+    return np.asarray(np.where(np.isfinite(depth), depth, np.nan).reshape(pixels.shape[:2]))
 
 
 def taken_at(
@@ -445,8 +432,7 @@ def bilinear(values: NDArray[Any], x: Array, y: Array) -> Array:
     p, q = x - column, y - row
     above = values[row, column] * (1 - p) + values[row, column + 1] * p
     below = values[row + 1, column] * (1 - p) + values[row + 1, column + 1] * p
-    found: Array = np.where(inside, above * (1 - q) + below * q, np.nan)
-    return found
+    return np.asarray(np.where(inside, above * (1 - q) + below * q, np.nan))
 
 
 def scene_of(mesh: Path) -> tuple[Any, Array]:

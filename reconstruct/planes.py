@@ -51,8 +51,7 @@ class Plane:
     @property
     def normal_world(self) -> Array:
         """(3,) unit vector out of the plane, towards its viewer."""
-        normal: Array = -self.plane_from_world.rotation.as_matrix()[2]
-        return normal
+        return np.asarray(-self.plane_from_world.rotation.as_matrix()[2])
 
 
 LEVEL_PLANE = Plane(name=LEVEL, about="level", plane_from_world=RigidTransform.identity())

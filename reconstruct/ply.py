@@ -214,14 +214,12 @@ class CloudFile:
     @property
     def low(self) -> Array:
         """(3,) least coordinates."""
-        low: Array = self.chunk_low.min(axis=0)
-        return low
+        return np.asarray(self.chunk_low.min(axis=0))
 
     @property
     def high(self) -> Array:
         """(3,) greatest coordinates."""
-        high: Array = self.chunk_high.max(axis=0)
-        return high
+        return np.asarray(self.chunk_high.max(axis=0))
 
     def inside(self, west: float, east: float, south: float, north: float) -> NDArray[Any]:
         """Records of the points in a closed rectangle of x and y, in the order of the file."""

@@ -291,8 +291,7 @@ def hillshade(height: Array, cell: float) -> Array:
     normal = np.stack([-right, down, np.ones_like(height)], axis=-1)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     light = np.array([-0.5, 0.5, np.sqrt(0.5)])
-    shade: Array = np.clip(normal @ light, 0.0, 1.0)
-    return shade
+    return np.asarray(np.clip(normal @ light, 0.0, 1.0))
 
 
 @progress.step("draw the surface")

@@ -32,7 +32,7 @@ from reconstruct.adjustment.normal_equations import (
     one_part,
     pattern_of,
 )
-from reconstruct.mapping.arrays import Indices, observations, rig_poses
+from reconstruct.mapping.arrays import Indices, frames_of, observations, rig_poses
 from reconstruct.mapping.bundle import cauchy_weights
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
@@ -127,18 +127,20 @@ def calibrated_parameters(rig: Rig, names: Sequence[str]) -> tuple[str, ...]:
     return tuple(name for name in known if name.split(".")[0] in names)
 
 
-def choose_pixels(
-    mapped: Mapped, seen: Observations, names: Sequence[str], frames: Indices
-) -> tuple[Pixels, Indices]:
-    """The observations that take part, and the ids of their points.
+def exact_survey(mapped: Mapped, seen: Observations, rig: Rig) -> tuple[Pixels, RigState, Indices]:
+    """A model as flat-port cameras on one rig have it.
 
     Args:
-        mapped: exact model; picture i of `seen` has the id i + 1.
+        mapped: exact model on the rig; picture i of `seen` has the id i + 1.
         seen: keypoints.
-        names: of the cameras.
-        frames: ids of the stations, ascending.
+        rig: cameras.
+
+    Returns:
+        The observations that take part; where stations, by ascending frame, and the points of these
+        are; and the ids of the points.
     """
-    model, found = mapped.model, observations(mapped.model)
+    model, found, names = mapped.model, observations(mapped.model), list(seen.cameras)
+    frames = frames_of(model)
     camera, station = np.empty(len(found.point), np.int64), np.empty(len(found.point), np.int64)
     taken = np.empty((len(found.point), 2))
     for n, number in enumerate(found.pictures.tolist()):
@@ -158,25 +160,9 @@ def choose_pixels(
         taken=taken[order],
         point=inverse.astype(np.int64),
     )
-    return pixels, found.point_ids[points]
-
-
-def start_state(
-    mapped: Mapped, rig: Rig, names: Sequence[str], frames: Indices, ids: Indices
-) -> RigState:
-    """A model's poses and points as flat-port cameras on one rig have them.
-
-    Args:
-        mapped: exact model on the rig.
-        rig: cameras.
-        names: of the cameras that took pictures, the reference first.
-        frames: ids of the stations, ascending.
-        ids: of the points.
-    """
-    model, pinhole_from_cam = mapped.model, mapped.warps[names[0]].pinhole_from_cam
     reference = rig.cam_from_rig[names[0]]
-    poses = rig_poses(model, frames).inv() * pinhole_from_cam
-    return RigState(
+    poses = rig_poses(model, frames).inv() * mapped.warps[names[0]].pinhole_from_cam
+    state = RigState(
         rig=replace(
             rig,
             cameras={name: rig.cameras[name] for name in names},
@@ -184,8 +170,9 @@ def start_state(
         ),
         turns=poses.rotation.as_matrix(),
         centres=poses.translation,
-        points=np.array([model.points3D[i].xyz for i in ids.tolist()]).reshape(-1, 3),
+        points=found.points[points],
     )
+    return pixels, state, found.point_ids[points]
 
 
 def exact_residuals(pixels: Pixels, state: RigState, _: None = None) -> Array:

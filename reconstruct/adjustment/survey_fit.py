@@ -47,9 +47,8 @@ from reconstruct.adjustment.exact_observations import (
     RigState,
     Workers,
     calibrated_parameters,
-    choose_pixels,
+    exact_survey,
     linearise_parts,
-    start_state,
 )
 from reconstruct.adjustment.normal_equations import POSE, PointEquations, reduce_parts
 from reconstruct.adjustment.uncertainty import Motions, SoftModes, Uncertainty, estimate
@@ -308,10 +307,8 @@ def fit_survey(
         ReconstructionError: the survey does not determine what is requested.
     """
     names = list(seen.cameras)
-    frames = frames_of(mapped.model)
-    pixels, ids = choose_pixels(mapped, seen, names, frames)
+    pixels, start, ids = exact_survey(mapped, seen, rig)
     free = _prior(rig, names, port=port, pose=pose) if port or pose else Prior.around(rig, {})
-    start = start_state(mapped, rig, names, frames, ids)
     pixels, order = pixels.by_place(start.centres)
     start = replace(start, points=start.points[order])
     problem = SurveyProblem(pixels, start, free, workers)

@@ -183,6 +183,26 @@ class _Normal(NamedTuple):
         return -covariance @ self.vector, covariance
 
 
+_WHITE = (MIN_WHITE, 3e-3, 0.05, 0.3, 0.8, 0.97)
+_CONSTANT = (0.0, 0.5, 0.75, 0.9)
+"""The varying part's variance goes down by halves: what is not known of a variance is its size."""
+_JUMPS = (4.0, 16.0, 64.0, 256.0)
+"""Constant errors of dives over what stated sigmas allow, tried where dives contradict."""
+_SURFACED_S, _SURFACED_STEPS = 300.0, 20.0
+"""A gap between stations is one between dives from these times on, in seconds and usual steps."""
+_TAUS = 10
+_MIN_STEPS, _MAX_SPANS = 0.2, 30.0
+"""Correlation times tried: from this many median time steps to this many lengths of the survey."""
+_GROSS_SIGMAS = 5.0
+_CONTRADICTED_SIGMAS = 4.5
+"""A reading this far from what all others say is left out."""
+_SWEEPS = 3
+_ROUNDS = 6
+_DRAWS = 64
+_CHI_SIGMAS = 3.0
+"""A misfit larger than stated sigmas allow, at this significance, makes them larger."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlacementProblem:
     """What a place is solved from, whatever the correlation of navigation's errors."""
@@ -297,30 +317,153 @@ class PlacementProblem:
             total = total.plus(self.group(group, used, how))
         return total
 
+    def _grid(self) -> list[Correlation]:
+        time = self.time
+        steps = np.diff(np.unique(time))
+        if not len(steps):
+            return [Correlation(tau=1.0, white=0.1)]
+        taus = np.geomspace(
+            _MIN_STEPS * float(np.median(steps)), _MAX_SPANS * float(np.ptp(time)), _TAUS
+        )
+        return [
+            Correlation(tau=float(tau), white=white, constant=constant, restart=restart)
+            for tau in taus
+            for white in _WHITE
+            for constant in _CONSTANT
+            for restart in ((0.0, 1.0) if self.dives[-1] else (0.0,))
+        ]
+
+    def likeliest(self, used: Flags, correlation: Correlations) -> dict[str, Correlation]:
+        """The likeliest correlation of every group, one after the other, in several rounds."""
+        now = {
+            group: how for group, how in correlation.items() if used[:, channels_of(group)].any()
+        }
+        grid = self._grid()
+        for _ in range(_SWEEPS):
+            before = dict(now)
+            for group in now:
+                choices = _choices(grid, now[group])
+                scores = self._scores(used, now, group, choices)
+                now[group] = choices[int(np.argmax(scores))]
+                if self.dives[-1]:
+                    now[group] = self._with_jumps(used, now, group)
+                now[group] = replace(now[group], factor=self._factor(used, now, group))
+            if now == before:
+                break
+        return now
+
+    def _with_jumps(self, used: Flags, now: Correlations, group: str) -> Correlation:
+        """A group's correlation, with dives as far apart as they contradict each other."""
+        present = replace(now[group], restart=min(now[group].restart, 1.0))
+        jumps = [
+            replace(present, restart=jump, constant=constant)
+            for jump in _JUMPS
+            for constant in _CONSTANT[1:]
+        ]
+        scores = self._scores(used, now, group, [present, *jumps])
+        best = int(np.argmax(scores[1:]))
+        contradicted = scores[1 + best] > scores[0] + 0.5 * _CHI_SIGMAS**2
+        return jumps[best] if contradicted else present
+
+    def _scores(
+        self, used: Flags, now: Correlations, group: str, choices: Sequence[Correlation]
+    ) -> Array:
+        """Logarithm of the restricted likelihood of each choice for a group, but for a constant."""
+        others = self.rest(now)
+        for name, how in now.items():
+            if name != group:
+                others = others.plus(self.group(name, used, how))
+        parts = [self.group(group, used, choice) for choice in choices]
+        matrix = others.matrix + np.stack([part.matrix for part in parts])
+        vector = others.vector + np.stack([part.vector for part in parts])
+        square, own = (
+            np.array(row) for row in zip(*((p.square, p.log_det) for p in parts), strict=True)
+        )
+        size = np.sqrt(np.diagonal(matrix[0]))
+        size = np.where(size > 0, size, 1.0)
+        scaled = matrix / np.outer(size, size)
+        sign, log_det = np.linalg.slogdet(scaled)
+        usable = sign > 0
+        scores = np.full(len(choices), -np.inf)
+        change = np.linalg.solve(scaled[usable], (vector[usable] / size)[..., None])[..., 0]
+        gained = np.einsum("ki,ki->k", change, vector[usable] / size)
+        scores[usable] = -0.5 * (own[usable] + log_det[usable] + square[usable] - gained)
+        return scores
+
+    def _factor(self, used: Flags, now: Correlations, group: str) -> float:
+        """Factor by which a group's misfits are larger than its sigmas allow, 1 or more."""
+        minimum = self.widened.get(group, 1.0)
+        change, covariance = self.total(used, now).solve()
+        own = self.group(group, used, now[group])
+        square = own.square + 2.0 * float(own.vector @ change) + float(change @ own.matrix @ change)
+        freedom = own.rows - float(np.trace(covariance @ own.matrix))
+        if freedom < 1.0:
+            return now[group].factor
+        ratio = square / freedom * now[group].factor ** 2
+        significant = ratio > 1.0 + _CHI_SIGMAS * np.sqrt(2.0 / freedom)
+        return max(float(np.sqrt(ratio)) if significant else 1.0, minimum)
+
+    def without_contradicted(self, used: Flags, correlation: Correlations) -> Flags:
+        """Leave out, of each group, readings that all others contradict, the worst of neighbours.
+
+        An outlier makes its neighbours look wrong too: of two in a row only the worse goes at once.
+        """
+        change, _ = self.total(used, correlation).solve()
+        kept = used.copy()
+        for group, how in correlation.items():
+            channels = channels_of(group)
+            worst = np.zeros(len(self.time))
+            for channel in channels:
+                rows = used[:, channel]
+                jacobian = self.found.jacobian[:, channel][:, self.free]
+                misfit = self.found.misfit[:, channel] + jacobian @ change
+                varying, constants = self.shares(channel, rows, how)
+                sigma = varying * self.found.sigma[:, channel]
+                both = np.column_stack([misfit / how.factor, constants])
+                even = self.whiten_columns(channel, rows, how, varying, both)[0]
+                inner = np.eye(constants.shape[1]) + even[:, 1:].T @ even[:, 1:]
+                steady = np.linalg.solve(inner, even[:, 1:].T @ even[:, 0])
+                off = np.where(rows, (both[:, 0] - constants @ steady) / varying, 0.0)
+                off = standard_residuals(self.times(how), sigma, rows, off, how.tau, how.white)
+                off = np.abs(off)
+                worst = np.maximum(worst, np.where(rows, off, 0.0))
+            if np.count_nonzero(worst) < 3:
+                continue
+            peak = np.ones(len(worst), dtype=bool)
+            peak[1:] &= worst[1:] >= worst[:-1]
+            peak[:-1] &= worst[:-1] > worst[1:]
+            contradicted = np.flatnonzero(peak & (worst > _CONTRADICTED_SIGMAS))
+            kept[contradicted[:, None], channels] = False
+        return kept
+
+    def average(self, used: Flags, correlation: Correlations) -> tuple[Array, Array]:
+        """Free parameters and their covariance over all likely correlations of errors.
+
+        The covariance is the mean of those of the single ways and the scatter of their solutions.
+        """
+        rng = np.random.default_rng(0)  # any draws will do; the same bytes each time
+        grid = self._grid()
+        draws: dict[str, list[Correlation]] = {}
+        for group, how in correlation.items():
+            choices = _choices(grid, how)
+            scores = self._scores(used, correlation, group, choices)
+            weights = np.exp(scores - scores.max())
+            picked = rng.choice(len(choices), size=_DRAWS, p=weights / weights.sum())
+            draws[group] = [choices[k] for k in picked]
+        solutions = [
+            self.total(used, {group: draws[group][k] for group in correlation}).solve()
+            for k in range(_DRAWS if correlation else 1)
+        ]
+        changes = np.stack([change for change, _ in solutions])
+        mean = changes.mean(axis=0)
+        spread = (changes - mean).T @ (changes - mean) / len(changes)
+        covariance = np.mean([c for _, c in solutions], axis=0) + spread
+        return mean, covariance
+
 
 def channels_of(group: str) -> list[int]:
     """Numbers of a group's channels among the six."""
     return [k for k, name in enumerate(GROUP_OF) if name == group]
-
-
-_WHITE = (MIN_WHITE, 3e-3, 0.05, 0.3, 0.8, 0.97)
-_CONSTANT = (0.0, 0.5, 0.75, 0.9)
-"""The varying part's variance goes down by halves: what is not known of a variance is its size."""
-_JUMPS = (4.0, 16.0, 64.0, 256.0)
-"""Constant errors of dives over what stated sigmas allow, tried where dives contradict."""
-_SURFACED_S, _SURFACED_STEPS = 300.0, 20.0
-"""A gap between stations is one between dives from these times on, in seconds and usual steps."""
-_TAUS = 10
-_MIN_STEPS, _MAX_SPANS = 0.2, 30.0
-"""Correlation times tried: from this many median time steps to this many lengths of the survey."""
-_GROSS_SIGMAS = 5.0
-_CONTRADICTED_SIGMAS = 4.5
-"""A reading this far from what all others say is left out."""
-_SWEEPS = 3
-_ROUNDS = 6
-_DRAWS = 64
-_CHI_SIGMAS = 3.0
-"""A misfit larger than stated sigmas allow, at this significance, makes them larger."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -377,12 +520,12 @@ def estimate(
             if used[:, channels_of(group)].any()
         }
         for _ in range(_ROUNDS):
-            correlation = _likeliest(problem, used, correlation)
-            kept = _without_contradicted(problem, used, correlation)
+            correlation = problem.likeliest(used, correlation)
+            kept = problem.without_contradicted(used, correlation)
             if np.array_equal(kept, used):
                 break
             used = kept
-        solution = _average(problem, used, correlation)
+        solution = problem.average(used, correlation)
     columns = found.jacobian.shape[2]
     change, covariance = np.zeros(columns), np.zeros((columns, columns))
     change[problem.free], covariance[np.ix_(problem.free, problem.free)] = solution
@@ -417,23 +560,6 @@ def without_gross_errors(time: Array, misfit: Array, known: Flags) -> Flags:
     return used
 
 
-def _grid(problem: PlacementProblem) -> list[Correlation]:
-    time = problem.time
-    steps = np.diff(np.unique(time))
-    if not len(steps):
-        return [Correlation(tau=1.0, white=0.1)]
-    taus = np.geomspace(
-        _MIN_STEPS * float(np.median(steps)), _MAX_SPANS * float(np.ptp(time)), _TAUS
-    )
-    return [
-        Correlation(tau=float(tau), white=white, constant=constant, restart=restart)
-        for tau in taus
-        for white in _WHITE
-        for constant in _CONSTANT
-        for restart in ((0.0, 1.0) if problem.dives[-1] else (0.0,))
-    ]
-
-
 def _choices(grid: Sequence[Correlation], now: Correlation) -> list[Correlation]:
     """What is tried with the present factor, and with the present jumps where dives contradict."""
     if now.restart <= 1.0:
@@ -443,146 +569,3 @@ def _choices(grid: Sequence[Correlation], now: Correlation) -> list[Correlation]
         for how in grid
         if how.restart and how.constant
     ]
-
-
-def _likeliest(
-    problem: PlacementProblem, used: Flags, correlation: Correlations
-) -> dict[str, Correlation]:
-    """The likeliest correlation of every group, one after the other, in several rounds."""
-    now = {group: how for group, how in correlation.items() if used[:, channels_of(group)].any()}
-    grid = _grid(problem)
-    for _ in range(_SWEEPS):
-        before = dict(now)
-        for group in now:
-            choices = _choices(grid, now[group])
-            scores = _scores(problem, used, now, group, choices)
-            now[group] = choices[int(np.argmax(scores))]
-            if problem.dives[-1]:
-                now[group] = _with_jumps(problem, used, now, group)
-            now[group] = replace(now[group], factor=_factor(problem, used, now, group))
-        if now == before:
-            break
-    return now
-
-
-def _with_jumps(
-    problem: PlacementProblem, used: Flags, now: Correlations, group: str
-) -> Correlation:
-    """A group's correlation with dives apart as far as they contradict each other, if they do."""
-    present = replace(now[group], restart=min(now[group].restart, 1.0))
-    jumps = [
-        replace(present, restart=jump, constant=constant)
-        for jump in _JUMPS
-        for constant in _CONSTANT[1:]
-    ]
-    scores = _scores(problem, used, now, group, [present, *jumps])
-    best = int(np.argmax(scores[1:]))
-    contradicted = scores[1 + best] > scores[0] + 0.5 * _CHI_SIGMAS**2
-    return jumps[best] if contradicted else present
-
-
-def _scores(
-    problem: PlacementProblem,
-    used: Flags,
-    now: Correlations,
-    group: str,
-    choices: Sequence[Correlation],
-) -> Array:
-    """Logarithm of the restricted likelihood of each choice for a group, but for a constant."""
-    others = problem.rest(now)
-    for name, how in now.items():
-        if name != group:
-            others = others.plus(problem.group(name, used, how))
-    parts = [problem.group(group, used, choice) for choice in choices]
-    matrix = others.matrix + np.stack([part.matrix for part in parts])
-    vector = others.vector + np.stack([part.vector for part in parts])
-    square, own = (
-        np.array(row) for row in zip(*((p.square, p.log_det) for p in parts), strict=True)
-    )
-    size = np.sqrt(np.diagonal(matrix[0]))
-    size = np.where(size > 0, size, 1.0)
-    scaled = matrix / np.outer(size, size)
-    sign, log_det = np.linalg.slogdet(scaled)
-    usable = sign > 0
-    scores = np.full(len(choices), -np.inf)
-    change = np.linalg.solve(scaled[usable], (vector[usable] / size)[..., None])[..., 0]
-    gained = np.einsum("ki,ki->k", change, vector[usable] / size)
-    scores[usable] = -0.5 * (own[usable] + log_det[usable] + square[usable] - gained)
-    return scores
-
-
-def _factor(problem: PlacementProblem, used: Flags, now: Correlations, group: str) -> float:
-    """Factor by which a group's misfits are larger than its sigmas allow, 1 or more."""
-    minimum = problem.widened.get(group, 1.0)
-    change, covariance = problem.total(used, now).solve()
-    own = problem.group(group, used, now[group])
-    square = own.square + 2.0 * float(own.vector @ change) + float(change @ own.matrix @ change)
-    freedom = own.rows - float(np.trace(covariance @ own.matrix))
-    if freedom < 1.0:
-        return now[group].factor
-    ratio = square / freedom * now[group].factor ** 2
-    significant = ratio > 1.0 + _CHI_SIGMAS * np.sqrt(2.0 / freedom)
-    return max(float(np.sqrt(ratio)) if significant else 1.0, minimum)
-
-
-def _without_contradicted(
-    problem: PlacementProblem, used: Flags, correlation: Correlations
-) -> Flags:
-    """Leave out, of each group, readings that all others contradict, the worst of neighbours first.
-
-    An outlier makes its neighbours look wrong too: of two in a row only the worse goes at a time.
-    """
-    change, _ = problem.total(used, correlation).solve()
-    kept = used.copy()
-    for group, how in correlation.items():
-        channels = channels_of(group)
-        worst = np.zeros(len(problem.time))
-        for channel in channels:
-            rows = used[:, channel]
-            jacobian = problem.found.jacobian[:, channel][:, problem.free]
-            misfit = problem.found.misfit[:, channel] + jacobian @ change
-            varying, constants = problem.shares(channel, rows, how)
-            sigma = varying * problem.found.sigma[:, channel]
-            both = np.column_stack([misfit / how.factor, constants])
-            even = problem.whiten_columns(channel, rows, how, varying, both)[0]
-            inner = np.eye(constants.shape[1]) + even[:, 1:].T @ even[:, 1:]
-            steady = np.linalg.solve(inner, even[:, 1:].T @ even[:, 0])
-            off = np.where(rows, (both[:, 0] - constants @ steady) / varying, 0.0)
-            off = standard_residuals(problem.times(how), sigma, rows, off, how.tau, how.white)
-            off = np.abs(off)
-            worst = np.maximum(worst, np.where(rows, off, 0.0))
-        if np.count_nonzero(worst) < 3:
-            continue
-        peak = np.ones(len(worst), dtype=bool)
-        peak[1:] &= worst[1:] >= worst[:-1]
-        peak[:-1] &= worst[:-1] > worst[1:]
-        contradicted = np.flatnonzero(peak & (worst > _CONTRADICTED_SIGMAS))
-        kept[contradicted[:, None], channels] = False
-    return kept
-
-
-def _average(
-    problem: PlacementProblem, used: Flags, correlation: Correlations
-) -> tuple[Array, Array]:
-    """Free parameters and their covariance over all likely correlations of errors.
-
-    The covariance is the mean of those of the single ways and the scatter of their solutions.
-    """
-    rng = np.random.default_rng(0)  # any draws will do; the same bytes each time
-    grid = _grid(problem)
-    draws: dict[str, list[Correlation]] = {}
-    for group, how in correlation.items():
-        choices = _choices(grid, how)
-        scores = _scores(problem, used, correlation, group, choices)
-        weights = np.exp(scores - scores.max())
-        picked = rng.choice(len(choices), size=_DRAWS, p=weights / weights.sum())
-        draws[group] = [choices[k] for k in picked]
-    solutions = [
-        problem.total(used, {group: draws[group][k] for group in correlation}).solve()
-        for k in range(_DRAWS if correlation else 1)
-    ]
-    changes = np.stack([change for change, _ in solutions])
-    mean = changes.mean(axis=0)
-    spread = (changes - mean).T @ (changes - mean) / len(changes)
-    covariance = np.mean([c for _, c in solutions], axis=0) + spread
-    return mean, covariance

@@ -16,12 +16,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.core.errors import ReconstructionError, warn
 from alice_survey.core.frames import Array, Datum, pose_to_json
 from alice_survey.core.manifest import ImageRecord
-from alice_survey.core.records import (
-    BendRecord,
-    GeoreferenceRecord,
-    MountRecord,
-    NuisanceRecord,
-)
+from alice_survey.core.records import BendRecord, GeoreferenceRecord, MountRecord, NuisanceRecord
 from camera_calib.mount import nearest_mount
 from reconstruct.placing.alignment import MIN_STATIONS, Similarity, bend_modes, bend_of, quadratic
 from reconstruct.placing.correlated_fit import (

@@ -14,11 +14,7 @@ from scipy.spatial.transform import Rotation
 from alice_survey.core.block_solver import inverse_of, product_of
 from alice_survey.core.frames import Array
 from reconstruct.adjustment.exact_observations import calibrated_parameters, exact_observations
-from reconstruct.adjustment.normal_equations import (
-    LinearObservations,
-    one_part,
-    reduce_points,
-)
+from reconstruct.adjustment.normal_equations import LinearObservations, one_part, reduce_points
 from reconstruct.adjustment.survey_fit import calibrated_covariance, motions_of
 from reconstruct.adjustment.uncertainty import BlockShape, Motions, shape_of_block
 from reconstruct.mapping.arrays import cross_matrices, first_of, linked_groups

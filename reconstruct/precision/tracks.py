@@ -159,8 +159,7 @@ def _is_wide(point: Indices, rays: Array) -> Flags:
     count = np.bincount(point)
     sums = np.column_stack([np.bincount(point, weights=axis) for axis in rays.T])
     mean = np.linalg.norm(sums, axis=1) / np.maximum(count, 1)
-    wide: Flags = (mean < math.cos(_MIN_ANGLE_RAD / 2.0))[point]
-    return wide
+    return np.asarray((mean < math.cos(_MIN_ANGLE_RAD / 2.0))[point])
 
 
 def _points(

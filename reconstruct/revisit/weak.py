@@ -369,8 +369,7 @@ def max_of_patches(found: Found, lacking: NDArray[np.bool_]) -> NDArray[np.bool_
     _, labels, figures, _ = cv2.connectedComponentsWithStats(
         maximum.astype(np.uint8), connectivity=8
     )
-    large: NDArray[np.bool_] = maximum & (figures[labels, cv2.CC_STAT_AREA] >= size**2)
-    return large
+    return np.asarray(maximum & (figures[labels, cv2.CC_STAT_AREA] >= size**2))
 
 
 def _surface_places(found: Found, elevation: Elevation, shift_ne: Array) -> list[WeakPlace]:

@@ -82,8 +82,7 @@ class View:
         """World points (N, 3) that the warped picture shows at pixels (N, 2) and depths (N,)."""
         slopes = self.pinhole.slopes(self.shift.ideal(pixels, depth))
         points = np.column_stack([slopes * depth[:, None], depth])
-        found: Array = self.world_from_cam.apply(points)
-        return found
+        return np.asarray(self.world_from_cam.apply(points))
 
     @property
     def kernel_lens(self) -> KernelLens:

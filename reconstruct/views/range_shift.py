@@ -74,8 +74,7 @@ class RangeShift:
             self.nodes, self.height_px / (rows - 1), self.width_px / (columns - 1), axis=(0, 1)
         )
         steepest = np.linalg.norm(np.stack([by_x, by_y], axis=-1), ord=2, axis=(2, 3)).max()
-        found: Array = steepest * np.abs(1.0 / depth - self.inverse_working)
-        return found
+        return np.asarray(steepest * np.abs(1.0 / depth - self.inverse_working))
 
     def scale(self, sx: float, sy: float) -> "RangeShift":
         """The same field for a picture that is made smaller by a factor along x and y.
@@ -143,8 +142,7 @@ def fill_holes(field: Array) -> Array:
 
     unknown = ~np.isfinite(field).reshape(*field.shape[:2], -1).all(axis=2)
     find: Any = distance_transform_edt
-    filled: Array = field[tuple(find(unknown, return_distances=False, return_indices=True))]
-    return filled
+    return np.asarray(field[tuple(find(unknown, return_distances=False, return_indices=True))])
 
 
 @compiled(error_model="numpy", fastmath=FAST)

@@ -152,20 +152,10 @@ def _take(task: tuple[Path, str, int]) -> None:
     Image.fromarray(picture[..., ::-1]).save(path, exif=exif)
 
 
-def render_survey(
-    folder: Path,
-    executor: Executor,
-    lines: int = LINES,
-    moments: Sequence[int] | None = None,
-    names: Sequence[str] | None = None,
-) -> None:
-    """Write `NAME/0000.png` and so on, `navigation.csv` and `rig.json` of the truth.
-
-    Only those `moments` are taken, by the cameras of those `names`; all if left out.
-    """
-    poses = bodies(lines)
-    taken = range(len(poses)) if moments is None else moments
-    tasks = [(folder, name, moment) for name in names or four_cameras().cameras for moment in taken]
+def render_survey(folder: Path, executor: Executor, lines: int = LINES) -> None:
+    """Write `NAME/0000.png` and so on, `navigation.csv` and `rig.json` of the truth."""
+    poses, names = bodies(lines), four_cameras().cameras
+    tasks = [(folder, name, moment) for name in names for moment in range(len(poses))]
     list(executor.map(_take, tasks, label="pictures"))
     write_rig(folder / "rig.json", four_cameras())
     rng = np.random.default_rng(_SEED + 1)

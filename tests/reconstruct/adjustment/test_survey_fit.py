@@ -23,9 +23,8 @@ from reconstruct.adjustment.exact_observations import (
     Pixels,
     RigState,
     Workers,
-    choose_pixels,
+    exact_survey,
     linearise_parts,
-    start_state,
 )
 from reconstruct.adjustment.normal_equations import PointEquations, reduce_parts
 from reconstruct.adjustment.survey_fit import (
@@ -38,7 +37,6 @@ from reconstruct.adjustment.survey_fit import (
     fit_survey,
     frees_poses,
 )
-from reconstruct.mapping.arrays import frames_of
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.placing.alignment import align_rigid, align_similarity
@@ -188,9 +186,7 @@ def test_parts_say_of_stations_and_points_what_all_observations_say(
 ) -> None:
     scene = noisy(4)
     mapped, seen = modelled(scene, scene.rig, tmp_path)
-    names, frames = list(seen.cameras), frames_of(mapped.model)
-    pixels, ids = choose_pixels(mapped, seen, names, frames)
-    state = start_state(mapped, scene.rig, names, frames, ids)
+    pixels, state, _ = exact_survey(mapped, seen, scene.rig)
     fields = ("right.rx_rad", "right.x_m", "left.fx_px")
     monkeypatch.setattr(exact_observations, "PART", -(-len(pixels.station) // 5))
     near, order = pixels.by_place(state.centres)

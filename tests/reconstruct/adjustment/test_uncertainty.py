@@ -18,13 +18,9 @@ from alice_survey.core.records import RangeRecord
 from benchmarks.bend_pipeline import Adjusted, adjusted
 from camera_calib.rig import Covariance, Rig
 from reconstruct.adjustment import exact_observations
-from reconstruct.adjustment.exact_observations import Workers, choose_pixels
+from reconstruct.adjustment.exact_observations import Workers, exact_survey
 from reconstruct.adjustment.exact_observations import exact_observations as linearised
-from reconstruct.adjustment.normal_equations import (
-    Gauge,
-    LinearObservations,
-    reduce_points,
-)
+from reconstruct.adjustment.normal_equations import Gauge, LinearObservations, reduce_points
 from reconstruct.adjustment.survey_fit import AdjustedSurvey, adjust_survey, fit_survey
 from reconstruct.adjustment.uncertainty import (
     Motions,
@@ -381,9 +377,8 @@ def survey(tmp_path_factory: pytest.TempPathFactory) -> AdjustedSurvey:
 def hessian_of(survey: AdjustedSurvey) -> Array:
     """Of stations, points and rig, in that order, priors included: no elimination, no modes."""
     assert survey.exact is not None
-    fit, seen = survey.exact.fit, survey.exact.seen
-    names = list(seen.cameras)
-    pixels, _ = choose_pixels(survey.exact.mapped, seen, names, frames_of(survey.mapped.model))
+    fit = survey.exact.fit
+    pixels = exact_survey(survey.exact.mapped, survey.exact.seen, fit.calibrated)[0]
     linear = linearised(fit.state, pixels, fit.parameters)
     weights = cauchy_weights(linear.miss, fit.sigma_px)
     count = len(fit.state.centres)

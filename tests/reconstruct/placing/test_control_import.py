@@ -75,40 +75,15 @@ def gcp_list(path: Path, system: str = "WGS84 UTM 15N", *, named: bool = True) -
 
 
 def markers_xml(path: Path, **changes: str) -> Path:
-    """What Metashape writes, with B unticked and one marker place that is only expected."""
-    stated = {"C": 'sx="0.03" sy="0.02" sz="0.05"'}
-    numbers = {"DJI_1": 7, "DJI_2": 9}
-    rows = "".join(
-        f'<marker id="{i}" label="{name}"><reference x="{lon}" y="{lat}" z="{h}" '
-        f'enabled="{str(name != "B").lower()}" {stated.get(name, "")}/></marker>'
-        for i, (name, (lat, lon, h)) in enumerate(PLACES.items())
-    )
-    seen = "".join(
-        f'<marker marker_id="{i}">'
-        + "".join(
-            f'<location camera_id="{numbers[picture]}" pinned="true" x="{x}" y="{y}"/>'
-            for picture, point, x, y in PICKS
-            if point == name
-        )
-        + ('<location camera_id="7" pinned="false" x="1" y="1"/>' if name == "B" else "")
-        + "</marker>"
-        for i, name in enumerate(PLACES)
-    )
-    parts = {
-        "system": '<reference>GEOGCS["WGS 84",DATUM["World Geodetic System 1984",SPHEROID["WGS 84",'
-        '6378137,298.257223563]],PRIMEM["Greenwich",0],UNIT["degree",0.0174532925199433],'
-        'AUTHORITY["EPSG","4326"]]</reference>',
-        "settings": '<settings><property name="accuracy_markers" value="0.01"/>'
-        '<property name="accuracy_projections" value="0.8"/></settings>',
-        "head": '<?xml version="1.0" encoding="UTF-8"?>',
-        **changes,
-    }
-    path.write_text(
-        f'{parts["head"]}<document version="1.5.0"><chunk label="reef"><cameras>'
-        '<camera id="7" label="DJI_1"/><camera id="9" label="DJI_2.JPG"/></cameras>'
-        f'<markers>{rows}</markers><frames><frame id="0"><markers>{seen}</markers></frame></frames>'
-        f"{parts['system']}{parts['settings']}</chunk></document>"
-    )
+    """What Metashape writes, with B unticked and one marker place that is only expected.
+
+    `system` and `settings` stand in for the chunk's own.
+    """
+    text = (Path(__file__).parents[2] / "data" / "metashape_markers.xml").read_text()
+    for name, tag in (("system", "reference"), ("settings", "settings")):
+        pattern = re.compile(f"<{tag}>.*</{tag}>", re.DOTALL)
+        text = pattern.sub(changes.get(name, r"\g<0>"), text)
+    path.write_text(text)
     return path
 
 

@@ -18,12 +18,7 @@ from reconstruct.placing.alignment import Similarity, level
 from reconstruct.placing.fit import PlacementFit, fit_navigation
 from reconstruct.placing.place import Placed, Placing, find_place, scale_by_altitudes
 from reconstruct.views.model_files import as_transform
-from tests.reconstruct.placing.test_georeference import (
-    exact,
-    gauge,
-    in_model,
-    points_in_model,
-)
+from tests.reconstruct.placing.test_georeference import exact, gauge, in_model, points_in_model
 from tests.reconstruct.scenes import DATUM, Scene, make_scene, stating
 from tests.reconstruct.true_models import near_truth, warped_scene
 

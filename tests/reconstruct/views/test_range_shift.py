@@ -17,10 +17,7 @@ from camera_calib.lenses.values import LensValues
 from camera_calib.ports.dome import DomePort
 from camera_calib.rig import design_rig
 from reconstruct.views.model import View
-from reconstruct.views.range_shift import (
-    RangeShift,
-    range_shift,
-)
+from reconstruct.views.range_shift import RangeShift, range_shift
 from tests.cameras import changed
 
 
