@@ -157,8 +157,10 @@ class PointEquations(Equations):
 
     def follow(self, poses: Array, rest: Array) -> Array:
         """Motions (P, 3) of points by steps (F, 6) of stations and (G + 1,) of the `rest`."""
-        steps = ((poses[own], rest) for own in self.parts.stations)
-        return self._by_point(_follow_part, steps)
+        steps = ((poses[own, :, None], rest[None]) for own in self.parts.stations)
+        return self._by_point(_follow_steps_in_part, ((step, slice(None)) for step in steps))[
+            ..., 0
+        ]
 
     def follow_poses(self, poses: Array) -> Iterator[Array]:
         """Yield the motions (p, 3, K) of the points of each part by K steps (F, 6, K) of stations.
@@ -216,11 +218,6 @@ def _between(whole: BlockPattern, own: Indices) -> tuple[BlockPattern, Indices]:
 
 def _inverse_of_part(linear: LinearObservations, _: None) -> Array:
     return linear.point_inverse
-
-
-def _follow_part(linear: LinearObservations, steps: tuple[Array, Array]) -> Array:
-    """Motions (p, 3) of a part's points by steps of its stations and of the rest."""
-    return _follow(*linear.arrays, linear.point_inverse, *steps)
 
 
 def _follow_steps_in_part(

@@ -261,15 +261,6 @@ def _measure_json(base: Candidate, one: Candidate) -> dict[str, Any]:
     }
 
 
-def summary(found: Precision) -> str:
-    """The figures of a prediction in words."""
-    along, across, scale, heights, stations = _cells(found)
-    return (
-        f"bend {along} mm along, {across} mm across, scale {scale} ppm, heights {heights} mm, "
-        f"stations {stations} mm"
-    )
-
-
 def _cells(found: Precision) -> list[str]:
     """Its figures under `_HEADER`."""
     along, across = (f"{_MM * b:.2g}" if np.isfinite(b) else "-" for b in found.bend_m)

@@ -4,6 +4,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from alice_survey.core.records import RegistrationRecord
 from camera_calib.rig import Rig
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.dive_record import assign_lines
-from missions.coverage.holes import find_holes
+from missions.coverage.holes import Hole, find_holes
 from missions.coverage.stations import Stations, plan_pattern, stations_of_plan
 from missions.values.area import multipolygon
 from missions.values.footprint import footprint_size_m
@@ -33,7 +34,7 @@ from missions.values.pattern import Pattern
 from missions.values.plan_file import Plan, read_plan
 from reconstruct.adjustment.uncertainty import read_uncertainty
 from reconstruct.elevation import Elevation, elevation_in
-from reconstruct.pictures.quality import MeasureTask, judge, measure_file
+from reconstruct.pictures.quality import judge, measure_file
 from reconstruct.placing.track import read_track_poses
 from reconstruct.revisit.links import cut_around, footprints, links, pieces, views_of_floor
 from reconstruct.views.model import read_model
@@ -147,8 +148,8 @@ def find_weak(
     taken = [name for name in rig.cameras if any(r.camera == name for r in records)]
     elevation = elevation_in(dense)
     poses = read_track_poses(sparse / "track.csv")
-    tasks = [MeasureTask(images=images, record=record) for record in records]
-    judged = judge(list(executor.map(measure_file, tasks, label="picture quality")))
+    measure = partial(measure_file, images)
+    judged = judge(list(executor.map(measure, records, label="picture quality")))
     # Pale is bare sand as well as haze; another dive may change nothing.
     faults = {q.image: [reason.split(":")[0] for reason in q.reasons] for q in judged}
     flaws = {name: words[0] for name, words in faults.items() if words and words[0] != "pale"}
@@ -337,16 +338,18 @@ def _short_places(found: Found) -> list[WeakPlace]:
         why = ", ".join(f"{count} stations {fault}" for fault, count in spoilt.most_common())
         some = f"{hole.fewest_pictures} of {requested} pictures of each camera at its thinnest"
         minimum = "in no good picture" if hole.unseen_m2 == hole.area_m2 else some
-        places.append(
-            WeakPlace(
-                cause="overlap",
-                reason=f"{minimum}; {why or 'no picture was taken'}",
-                outline=hole.outline,
-                area_m2=hole.area_m2,
-                severity_m2=float(lacking_m2[cells_in(seen, hole.outline)].sum()),
-            )
-        )
+        reason = f"{minimum}; {why or 'no picture was taken'}"
+        places.append(_place_of(found, hole, "overlap", reason, lacking_m2))
     return places
+
+
+def _place_of(found: Found, hole: Hole, cause: str, reason: str, lacking_m2: Array) -> WeakPlace:
+    """A weak place of which each cell (rows, columns) lacks so much."""
+    inside = cells_in(found.seen, hole.outline)
+    return WeakPlace(
+        cause=cause, reason=reason, outline=hole.outline, area_m2=hole.area_m2,
+        severity_m2=float(lacking_m2[inside].sum()),
+    )  # fmt: skip
 
 
 def cells_in(seen: Certificate, outline: MultiPolygon) -> NDArray[np.bool_]:
@@ -380,6 +383,7 @@ def _surface_places(found: Found, elevation: Elevation, shift_ne: Array) -> list
     unsure = ~(sigma <= found.sigma_goal_m)
     weak = max_of_patches(found, unsure & seen.at_overlap)
     lacking = np.where(np.isfinite(sigma), np.maximum(0.0, 1 - found.sigma_goal_m / sigma), 1.0)
+    lacking_m2 = lacking * seen.grid.cell_m**2
     places = []
     for hole in find_holes(seen, weak):
         here = cells_in(seen, hole.outline)
@@ -390,15 +394,7 @@ def _surface_places(found: Found, elevation: Elevation, shift_ne: Array) -> list
                 f"sigma of heights {1e3 * np.median(sigma[known]):.1f} mm where "
                 f"{1e3 * found.sigma_goal_m:.1f} mm are asked for"
             )
-        places.append(
-            WeakPlace(
-                cause="surface",
-                reason=reason,
-                outline=hole.outline,
-                area_m2=hole.area_m2,
-                severity_m2=float(lacking[here].sum()) * seen.grid.cell_m**2,
-            )
-        )
+        places.append(_place_of(found, hole, "surface", reason, lacking_m2))
     return places
 
 
