@@ -132,7 +132,7 @@ STYLED = DemGrid(west=0.0, north=3.0, cell=0.1, rows=30, columns=40)
 
 def write_styled(path: Path, values: np.ndarray) -> Path:
     with tiled_raster(path, STYLED, FRAME, "float32", np.nan, "height", "m") as raster:
-        raster.write_styled(values.astype(np.float32), 1)
+        raster.write(values.astype(np.float32), 1)
     return path
 
 
