@@ -32,10 +32,7 @@ def cross_matrix(a: Array) -> Array:
 
 def blocks(upper_left: Array, upper_right: Array, lower_left: Array, lower_right: Array) -> Array:
     """Four (3, 3) as one (6, 6)."""
-    matrix = np.empty((6, 6))
-    matrix[:3, :3], matrix[:3, 3:] = upper_left, upper_right
-    matrix[3:, :3], matrix[3:, 3:] = lower_left, lower_right
-    return matrix
+    return np.block([[upper_left, upper_right], [lower_left, lower_right]])
 
 
 def ned_from_body(attitude: Array) -> Array:
@@ -166,14 +163,11 @@ def plain_thrust(vehicle: Vehicle, rps: Array, nu: Array) -> Array:
     """
     wrench = np.zeros(6)
     for thruster, n in zip(vehicle.thrusters, rps, strict=True):
-        kt, kq = (
-            (thruster.kt_forward, thruster.kq_forward)
-            if n > 0
-            else (thruster.kt_reverse, thruster.kq_reverse)
-        )
+        way = "forward" if n > 0 else "reverse"
+        kt, kq = getattr(thruster, f"kt_{way}"), getattr(thruster, f"kq_{way}")
+        square = vehicle.density_kg_m3 * thruster.diameter_m**4 * n * abs(n)
         direction = np.array(thruster.direction_body)
-        push = vehicle.density_kg_m3 * thruster.diameter_m**4 * kt * n * abs(n) * direction
-        torque = vehicle.density_kg_m3 * thruster.diameter_m**5 * kq * n * abs(n) * direction
+        push, torque = kt * square * direction, kq * thruster.diameter_m * square * direction
         wrench[:3] += push
         wrench[3:] += cross_matrix(np.array(thruster.position_body_m)) @ push
         wrench[3:] -= thruster.handedness * torque

@@ -22,13 +22,8 @@ import numpy as np
 from alice_survey.core.compiled import kernel
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.allocation import (
-    AXIS_WEIGHTS,
-    Allocation,
-    allocate,
-    new_allocation,
-)
-from alice_survey.sim.vehicle.dynamics import Body, add_coriolis, add_damping, add_weight
+from alice_survey.sim.vehicle.allocation import AXIS_WEIGHTS, Allocation, allocate, new_allocation
+from alice_survey.sim.vehicle.dynamics import add_coriolis, add_damping, add_weight
 from alice_survey.sim.vehicle.fins import MAX_RAD, add_fins, write_fin_matrix
 from alice_survey.sim.vehicle.propulsion import MAX_RPS, add_thrust, electrical_power
 from alice_survey.sim.vehicle.vehicle import Vehicle
@@ -281,16 +276,6 @@ def _fin_force_ahead(vehicle: Vehicle, nu: Array, share: float) -> Array:
             known[u, abs(r)] = np.nan if flight is None else flight.force_x_n
         row[0] = known[u, abs(r)]
     return requested
-
-
-def drag_power(body: Body, nu: Array) -> Array:
-    """Power, (N,) W, that the water takes from a body at velocities (N, 6) relative to it."""
-    nu = np.ascontiguousarray(nu, dtype=np.float64)
-    force = np.zeros_like(nu)
-    for motion, row in zip(nu, force, strict=True):
-        add_damping(body, motion, row)
-    power: Array = -np.sum(nu * force, axis=1)
-    return power
 
 
 @kernel

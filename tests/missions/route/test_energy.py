@@ -9,7 +9,7 @@ import pytest
 
 from alice_survey.core.config import SurveyConfig
 from alice_survey.core.errors import PlanError
-from alice_survey.sim.vehicle.steady import drag_power, steady_flight
+from alice_survey.sim.vehicle.steady import steady_flight
 from alice_survey.sim.vehicle.vehicle import vehicle_from
 from missions.exposure.conflict import ConflictError
 from missions.plan.strength import current_error, held_current_mps, survey_costs
@@ -26,6 +26,7 @@ from missions.route.energy import (
 from missions.route.turns import Manoeuvre
 from missions.values.costs import power_at
 from missions.values.line import Line
+from tests.alice_survey.sim.vehicle.motions import drag_power
 from tests.small_survey import with_settings
 
 

@@ -53,11 +53,7 @@ from alice_survey.sim.vehicle.identification.problem import (
     place_of,
     residual_channels,
 )
-from alice_survey.sim.vehicle.identification.sensitivity import (
-    Physics,
-    simulate,
-    with_given,
-)
+from alice_survey.sim.vehicle.identification.sensitivity import Physics, simulate, with_given
 from alice_survey.sim.vehicle.log import attitude_of
 
 _MIN_STRETCHES, _MAX_STRETCHES = 10, 20
@@ -214,20 +210,15 @@ class StartPrior:
 
     def residuals(self, values: Array) -> Array:
         """Distances, (P,), from the start in sigmas; zero where nothing is known."""
-        away = values - self.start
+        away, logs = values - self.start, self.logarithmic
         with np.errstate(divide="ignore"):
-            away[self.logarithmic] = np.log((values / self.start_or_one)[self.logarithmic])
+            away[logs] = np.log(values[logs] / self.start[logs])
         return away / self.sigma
 
     def slopes(self, values: Array) -> Array:
         """Derivatives of the residuals, (P,)."""
         slope: Array = 1.0 / (self.sigma * np.where(self.logarithmic, values, 1.0))
         return slope
-
-    @property
-    def start_or_one(self) -> Array:
-        """(P,) the start where logarithms are taken, else one."""
-        return np.where(self.logarithmic, self.start, 1.0)
 
 
 def prior_of(

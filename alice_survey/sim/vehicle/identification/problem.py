@@ -14,13 +14,7 @@ from numpy.typing import NDArray
 
 from alice_survey.core.errors import VehicleError, warn
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.coefficients import (
-    FORCES,
-    MOTIONS,
-    Coefficients,
-    both_ways,
-    kind_of,
-)
+from alice_survey.sim.vehicle.coefficients import FORCES, MOTIONS, Coefficients, both_ways, kind_of
 from alice_survey.sim.vehicle.identification import sensitivity as term
 from alice_survey.sim.vehicle.identification.sensitivity import (
     CHANNELS,

@@ -42,11 +42,7 @@ from alice_survey.sim.vehicle.identification.problem import (
     of_windows,
     unit_of,
 )
-from alice_survey.sim.vehicle.identification.sensitivity import (
-    Physics,
-    simulate,
-    with_given,
-)
+from alice_survey.sim.vehicle.identification.sensitivity import Physics, simulate, with_given
 from alice_survey.sim.vehicle.identification.two_step import (
     ThrustCoefficient,
     TwoStep,
@@ -132,9 +128,8 @@ def validate(
     measured[:, list(windows[0].given)] = np.nan
     simulated, constant, longest = [], [], 0.0
     for window in windows:
-        filled = _hold_last(window.measured)
-        simulated.append(_run(window, filled[0], physics, max_step_s))
-        constant.append(np.tile(filled[0], (len(filled), 1)))
+        simulated.append(_run(window, physics, max_step_s))
+        constant.append(np.tile(window.start[4:], (len(window.measured), 1)))
         time_s = window.record.time_s
         longest = max(longest, float(time_s[-1] - time_s[0]))
     return MotionValidation(
@@ -145,14 +140,14 @@ def validate(
     )  # fmt: skip
 
 
-def _run(window: Window, motion: Array, physics: Physics, max_step_s: float) -> Array:
-    """Velocity over ground and rates, (T, 6), of a window simulated from those of its first row.
+def _run(window: Window, physics: Physics, max_step_s: float) -> Array:
+    """Velocity over ground and rates, (T, 6), of a window simulated from its start.
 
     Raises:
         VehicleError: the simulation does not stay finite.
     """
     start = window.start.copy()
-    start[4:] = motion - physics.bias
+    start[4:] -= physics.bias
     start[4:7] -= Rotation.from_quat(start[:4]).inv().apply([*physics.current_ne, 0.0])
     _, observed, _ = simulate(physics, None, window.record, start, max_step_s)
     if not np.all(np.isfinite(observed[:, :_MOTIONS])):
@@ -160,19 +155,6 @@ def _run(window: Window, motion: Array, physics: Physics, max_step_s: float) -> 
             f"{window.source}: the simulation does not stay finite: simulate shorter stretches"
         )
     return observed[:, :_MOTIONS]
-
-
-def _hold_last(measured: Array) -> Array:
-    """Measurements with the last known one in rows without; the first known one before it."""
-    filled = measured.copy()
-    for column in filled.T:
-        known = np.flatnonzero(np.isfinite(column))
-        if not len(known):
-            column[:] = 0.0
-            continue
-        last = np.maximum.accumulate(np.where(np.isfinite(column), np.arange(len(column)), -1))
-        column[:] = column[np.where(last < 0, known[0], last)]
-    return filled
 
 
 JOINT_FREE = ("X_uu", "Y_vv", "Z_ww", "N_rr", "current")

@@ -330,7 +330,7 @@ def _smooth(windows: Sequence[Window], parameters: Parameters) -> _Rows:
         if len(time_s) < length:
             continue
         even = np.arange(time_s[0], time_s[-1] + 0.5 * step, step)
-        motion, rates = np.empty((len(even), 6)), np.empty((len(even), 6))
+        motion = np.empty((len(even), 6))
         attitude = _attitude(window, even)
         for k in range(6):
             known = np.isfinite(window.measured[:, k])
@@ -339,12 +339,10 @@ def _smooth(windows: Sequence[Window], parameters: Parameters) -> _Rows:
                     f"{window.source}: the two-step calibration needs u, v, w, p, q and r; "
                     f"{'uvwpqr'[k]} was not measured"
                 )
-            series = np.interp(even, time_s[known], window.measured[known, k]) - physics.bias[k]
-            motion[:, k] = series
-        drift = np.array([*physics.current_ne, 0.0])
-        motion[:, :3] -= attitude.inv().apply(drift)
-        for k in range(6):
-            rates[:, k] = savgol_filter(motion[:, k], length, 1, deriv=1, delta=step)
+            motion[:, k] = np.interp(even, time_s[known], window.measured[known, k])
+        motion -= physics.bias
+        motion[:, :3] -= attitude.inv().apply([*physics.current_ne, 0.0])
+        rates = savgol_filter(motion, length, 1, deriv=1, delta=step, axis=0)
         state = np.empty((len(even), term.STATES))
         state[:, :4], state[:, 4:] = attitude.as_quat(), motion
         inputs = [

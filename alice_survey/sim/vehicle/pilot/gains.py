@@ -290,7 +290,12 @@ def gains_for(vehicle: Vehicle, speed_mps: float, navigation_hz: float = 5.0) ->
                 plane=LATERAL if axis == YAW else VERTICAL,
                 slower=_SLOWER_BY_FINS if fins else _SLOWER,
             )  # fmt: skip
-            _check_damped(vehicle, _AXES[axis], damped, speed_mps)
+            if damped < MIN_HEADING_DAMPING:
+                raise VehicleError(
+                    f"the {_AXES[axis]} loop of {vehicle.name} with {vehicle.coefficients.name!r} "
+                    f"coefficients cannot be damped at {speed_mps:g} m/s (damping ratio "
+                    f"{damped:.2f} at best, {MIN_HEADING_DAMPING:g} is needed): lower the speed"
+                )
         axes[axis, [RATE, PLACE, LAG, BANDWIDTH]] = rate, place, lag_s, omega
         axes[axis, INTEGRAL] = _integral(rate, place, omega, max_decay)
         if fins or not levels:
@@ -304,15 +309,6 @@ def gains_for(vehicle: Vehicle, speed_mps: float, navigation_hz: float = 5.0) ->
     level = balance_fins(vehicle, speed_mps) if fins else None
     level_rad = 0.0 if level is None else level.pitch_rad
     return Gains(plant.body, plant.fins, np.zeros(len(vehicle.fins)), level_rad, axes)
-
-
-def _check_damped(vehicle: Vehicle, axis: str, damped: float, speed_mps: float) -> None:
-    if damped < MIN_HEADING_DAMPING:
-        raise VehicleError(
-            f"the {axis} loop of {vehicle.name} with {vehicle.coefficients.name!r} "
-            f"coefficients cannot be damped at {speed_mps:g} m/s (damping ratio "
-            f"{damped:.2f} at best, {MIN_HEADING_DAMPING:g} is needed): lower the speed"
-        )
 
 
 def _holds(configuration: Array, lower: Array, upper: Array) -> bool:

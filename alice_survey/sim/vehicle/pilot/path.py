@@ -101,12 +101,19 @@ def path_from_legs(
     values = np.concatenate([start.ravel(), *columns, [altitude_m, speed_mps]])
     if not np.all(np.isfinite(values)):
         raise VehicleError("the path holds a value that is not a finite number")
-    if np.any(length[turns == 0] <= 0) or altitude_m <= 0 or speed_mps <= 0:
+    if altitude_m <= 0 or speed_mps <= 0:
         raise VehicleError(
-            f"the path's lengths (least {length.min():g} m), altitude ({altitude_m:g} m) and speed "
-            f"({speed_mps:g} m/s) must be positive"
+            f"the path's altitude ({altitude_m:g} m) and speed ({speed_mps:g} m/s) must be positive"
         )
-    _check_stops(length, curvature, turns, side)
+    spot, aside, bent = turns != 0, side != 0, curvature != 0
+    square = np.abs(np.abs(side) - math.pi / 2) <= _KINK_RAD
+    bad = np.where(spot, (length != 0) | bent | aside, (length <= 0) | (aside & (bent | ~square)))
+    for i in np.flatnonzero(bad).tolist():
+        raise VehicleError(
+            f"leg {i} of the path is {length[i]:g} m long, curvature {curvature[i]:g}, turns "
+            f"{math.degrees(turns[i]):.1f} deg on the spot and heads {math.degrees(side[i]):.1f} "
+            "deg off its course: it must go ahead, turn without length, or step straight aside"
+        )
     for i in range(1, len(start)):
         before = i - 1
         turned = curvature[before] * length[before]
@@ -122,7 +129,7 @@ def path_from_legs(
                 f"off the end of leg {before}: legs must join"
             )
         heading[i] = heading[before] + turned + kink_rad
-    standing = (turns != 0) | (side != 0)
+    standing = spot | aside
     return Path(
         start_n=np.ascontiguousarray(start[:, 0]),
         start_e=np.ascontiguousarray(start[:, 1]),
@@ -138,21 +145,6 @@ def path_from_legs(
         altitude_m=float(altitude_m),
         speed_mps=float(speed_mps),
     )
-
-
-def _check_stops(length: Array, curvature: Array, turns: Array, side: Array) -> None:
-    """Reject legs that are neither ahead, nor on the spot, nor sideways."""
-    for i in np.flatnonzero((turns != 0) & ((length != 0) | (curvature != 0) | (side != 0))):
-        raise VehicleError(
-            f"leg {i} of the path turns {math.degrees(turns[i]):.1f} deg on the spot and goes "
-            f"{length[i]:g} m: a turn on the spot has no length, curvature or side"
-        )
-    square = np.abs(np.abs(side) - math.pi / 2) <= _KINK_RAD
-    for i in np.flatnonzero((side != 0) & (~square | (curvature != 0))):
-        raise VehicleError(
-            f"leg {i} of the path heads {math.degrees(side[i]):.1f} deg off its course, curvature "
-            f"{curvature[i]:g}: a sway step is straight and 90 deg off"
-        )
 
 
 @kernel

@@ -16,6 +16,7 @@ from alice_survey.sim.vehicle.sea import Current, constant_current
 from alice_survey.sim.vehicle.vehicle import RigidBody, Vehicle, vehicle_from
 
 Array = NDArray[np.float64]
+NOTHING = np.zeros(6)
 STILL = constant_current(0.0, 0.0)
 SHEAR_AND_TIDE = Current(
     np.array([-10.0, 100.0]),
@@ -78,6 +79,11 @@ def damping_matrix(body: Body, nu: Array) -> Array:
     return matrix
 
 
+def drag_power(body: Body, nu: Array) -> Array:
+    """Power, (N,) W, that the water takes from a body at velocities (N, 6) relative to it."""
+    return np.array([motion @ damping_matrix(body, motion) @ motion for motion in nu])
+
+
 def state_of(
     vehicle: Vehicle,
     nu: Array | None = None,
@@ -94,24 +100,16 @@ def state_of(
 def rates(
     vehicle: Vehicle,
     state: Array,
-    load: Array | None = None,
+    load: Array = NOTHING,
     current: Current = STILL,
     time_s: float = 0.0,
     command_rps: Array | None = None,
 ) -> Array:
     """Rate of change of a state."""
-    count = vehicle.actuators
-    out = np.full_like(state, np.nan)
-    derivative(
-        time_s,
-        state,
-        np.zeros(count) if command_rps is None else command_rps,
-        np.zeros(6) if load is None else load,
-        vehicle.plant,
-        current,
-        scratch_for(count),
-        out,
-    )
+    count, out = vehicle.actuators, np.full_like(state, np.nan)
+    command = np.zeros(count) if command_rps is None else command_rps
+    scratch = scratch_for(count)
+    derivative(time_s, state, command, load, vehicle.plant, current, scratch, out)
     return out
 
 
@@ -120,7 +118,7 @@ def advance(
     state: Array,
     duration_s: float,
     step_s: float = 0.01,
-    load: Array | None = None,
+    load: Array = NOTHING,
     current: Current = STILL,
     time_s: float = 0.0,
     command_rps: Array | None = None,
@@ -129,7 +127,6 @@ def advance(
     count = vehicle.actuators
     plant, scratch = vehicle.plant, scratch_for(count)
     command = np.zeros(count) if command_rps is None else command_rps
-    load = np.zeros(6) if load is None else load
     steps = round(duration_s / step_s)
     states = np.tile(state, (steps + 1, 1))
     for i in range(steps):

@@ -12,11 +12,9 @@ from tests.oracles_propulsion import Array
 ALICE, SPARUS = vehicle_from("alice"), vehicle_from("sparus2")
 SURGE, SWAY, HEAVE, YAW = 0, 1, 2, 5
 
-ALICE, SPARUS = vehicle_from("alice"), vehicle_from("sparus2")
 REST = np.zeros(6)
 REACH = np.array([120.0, 80.0, 60.0, 0.0, 0.0, 60.0])
 """Wrenches some way beyond what the thrusters can give together."""
-SURGE, SWAY, HEAVE, YAW = 0, 1, 2, 5
 
 
 def limits_of(craft: Vehicle, failed: int | None = None) -> tuple[Array, Array]:

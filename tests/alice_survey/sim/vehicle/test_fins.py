@@ -13,11 +13,8 @@ from scipy.spatial.transform import Rotation
 from alice_survey.sim.vehicle.fins import Fin, add_fins, fin_slope, pack_fins, write_fin_matrix
 from alice_survey.sim.vehicle.vehicle import vehicle_from
 from tests import oracles_dynamics as oracle
-from tests.alice_survey.sim.vehicle.motions import (
-    advance,
-    rates,
-    state_of,
-)
+from tests.alice_survey.sim.vehicle.motions import advance, rates, state_of
+from tests.oracles_navigation import jacobian
 
 Array = NDArray[np.float64]
 REMUS = vehicle_from("remus100")
@@ -44,6 +41,12 @@ def test_lift_of_a_plane_at_a_small_angle() -> None:
     assert force[0] == pytest.approx(-drag, rel=1e-4)
     assert force[1] == 0.0
     np.testing.assert_allclose(force[3:], np.cross([-0.6, 0.1, 0.02], force[:3]), atol=1e-12)
+
+
+def force_of_fins(angles: Array, nu: Array) -> Array:
+    force = np.zeros(6)
+    add_fins(REMUS.plant.fins, angles, nu, force)
+    return force
 
 
 def _triple(place: Array) -> tuple[float, float, float]:
@@ -78,18 +81,10 @@ def test_the_wrench_is_that_of_vectors_in_space(
 
 
 def test_the_matrix_of_fins_is_the_slope_of_their_wrench() -> None:
-    nu, step = np.array([1.2, 0, 0, 0, 0, 0]), 1e-6
-    matrix = np.zeros((6, 3))
+    nu, matrix = np.array([1.2, 0, 0, 0, 0, 0]), np.zeros((6, 3))
     write_fin_matrix(REMUS.plant.fins, nu, matrix, 1)
-    for drive in range(2):
-        ends = []
-        for sign in (1.0, -1.0):
-            force, angles = np.zeros(6), np.zeros(2)
-            angles[drive] = sign * step
-            add_fins(REMUS.plant.fins, angles, nu, force)
-            ends.append(force)
-        slope = (ends[0] - ends[1]) / (2 * step)
-        np.testing.assert_allclose(matrix[:, 1 + drive], slope, atol=1e-6 * np.abs(slope).max())
+    slope = jacobian(lambda angles: force_of_fins(angles, nu), 2, 1e-6)
+    np.testing.assert_allclose(matrix[:, 1:], slope, atol=1e-6 * np.abs(slope).max(axis=0).min())
     assert not matrix[:, 0].any()
     assert matrix[4, 1] < -10.0 and matrix[5, 2] < -10.0
     write_fin_matrix(REMUS.plant.fins, -nu, matrix, 1)
@@ -140,6 +135,4 @@ def test_lift_rises_to_the_stall_and_falls_smoothly_beyond() -> None:
 @settings(max_examples=40, deadline=None)
 @given(nu=st.tuples(*[SPEEDS] * 6))
 def test_fins_that_are_not_turned_take_energy_out(nu: tuple[float, ...]) -> None:
-    force, motion = np.zeros(6), np.array(nu)
-    add_fins(REMUS.plant.fins, np.zeros(2), motion, force)
-    assert force @ motion <= 1e-12
+    assert force_of_fins(np.zeros(2), np.array(nu)) @ nu <= 1e-12

@@ -7,11 +7,7 @@ import pytest
 
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import rotation_from_attitude
-from alice_survey.sim.vehicle.log import (
-    VehicleLog,
-    read_vehicle_log,
-    write_vehicle_log,
-)
+from alice_survey.sim.vehicle.log import VehicleLog, read_vehicle_log, write_vehicle_log
 
 
 def a_log(count: int = 40) -> VehicleLog:

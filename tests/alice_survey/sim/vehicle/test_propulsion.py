@@ -16,8 +16,6 @@ from tests import oracles_propulsion as oracles
 from tests.oracles_propulsion import Array
 
 DENSITY, DISPLACED = 1025.0, 75.0
-
-DENSITY, DISPLACED = 1025.0, 75.0
 ALICE = vehicle_from("alice")
 STARBOARD, PORT, VERTICAL, BOW, STERN = ALICE.thrusters
 EVERY = ALICE.thrusters

@@ -14,7 +14,6 @@ from alice_survey.sim.vehicle import sea
 
 TIMES, DEPTHS = np.array([0.0, 7.0, 10.0, 31.0]), np.array([-1.0, 2.0, 2.5, 20.0, 21.0])
 
-TIMES, DEPTHS = np.array([0.0, 7.0, 10.0, 31.0]), np.array([-1.0, 2.0, 2.5, 20.0, 21.0])
 GRID = sea.Current(TIMES, DEPTHS, np.random.default_rng(2).normal(0.0, 0.3, (4, 5, 2)))
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.dynamics import derivative, initial_state, scratch_for
 from alice_survey.sim.vehicle.pilot.gains import pitch_divergence_speed_mps
-from alice_survey.sim.vehicle.sea import constant_current
 from alice_survey.sim.vehicle.vehicle import SETS, Vehicle, vehicle_from
+from tests.alice_survey.sim.vehicle import motions as m
+from tests.oracles_navigation import jacobian
 
 
 def growth(craft: Vehicle, speed_mps: float) -> float:
@@ -17,30 +17,16 @@ def growth(craft: Vehicle, speed_mps: float) -> float:
 
     Surge is held: its acceleration is cancelled by a force.
     """
-    count = len(craft.thrusters)
-    loop = np.zeros((3, 3))
-    step = 1e-6
 
-    def rates(heave: float, turn: float, pitch: float) -> Array:
+    def slopes(motion: Array) -> Array:
+        heave, turn, pitch = motion
         nu = np.array([speed_mps, 0.0, heave, 0.0, turn, 0.0])
-        state = initial_state(np.zeros(3), np.array([0.0, pitch, 0.0]), count, nu)
-        out, scratch = np.zeros(13 + count), scratch_for(count)
-        water = constant_current(0.0, 0.0)
+        state = m.state_of(craft, nu, (0.0, pitch, 0.0))
+        free, pushed = (m.rates(craft, state, push * m.U)[7:13] for push in (0.0, 1.0))
+        slope = pushed - free
+        return np.append((free - slope * free[0] / slope[0])[[2, 4]], turn)
 
-        def accelerations(ahead_n: float) -> Array:
-            load = np.array([ahead_n, 0.0, 0.0, 0.0, 0.0, 0.0])
-            derivative(0.0, state, np.zeros(count), load, craft.plant, water, scratch, out)
-            return out[7:13].copy()
-
-        free = accelerations(0.0)
-        slope = accelerations(1.0) - free
-        return (free - slope * free[0] / slope[0])[[2, 4]]
-
-    for column in range(3):
-        ahead, behind = np.eye(3)[column] * step, -np.eye(3)[column] * step
-        loop[:2, column] = (rates(*ahead) - rates(*behind)) / (2 * step)
-    loop[2, 1] = 1.0
-    return float(np.linalg.eigvals(loop).real.max())
+    return float(np.linalg.eigvals(jacobian(slopes, 3, 1e-6)).real.max())
 
 
 @pytest.mark.parametrize("name", ["alice", "sparus2"])

@@ -5,15 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from alice_survey.sim.vehicle.dynamics import derivative, initial_state, scratch_for
 from alice_survey.sim.vehicle.propulsion import add_thrust
-from alice_survey.sim.vehicle.sea import constant_current
-from alice_survey.sim.vehicle.steady import BALANCED, drag_power, steady_flight
+from alice_survey.sim.vehicle.steady import BALANCED, steady_flight
 from alice_survey.sim.vehicle.vehicle import vehicle_from
+from tests.alice_survey.sim.vehicle import motions as m
 
 ALICE, SPARUS = vehicle_from("alice"), vehicle_from("sparus2")
 
-ALICE, SPARUS = vehicle_from("alice"), vehicle_from("sparus2")
 RNG = np.random.default_rng(1)
 
 
@@ -32,15 +30,9 @@ def test_the_compiled_dynamics_stay_as_they_are_at_the_steady_thrust() -> None:
     nu = _planar()
     flight = steady_flight(ALICE, nu)
     assert np.all(np.isfinite(flight.power_w))
-    plant, still = ALICE.plant, constant_current(0.0, 0.0)
-    scratch = scratch_for(5)
-    for i in range(len(nu)):
-        state = initial_state(np.array([0.0, 0.0, 10.0]), np.zeros(3), 5, nu[i])
-        state[13:] = flight.rps[i]
-        rate = np.zeros(18)
-        derivative(0.0, state, flight.rps[i], np.zeros(6), plant, still, scratch, rate)
-        force = plant.body.mass @ rate[7:13]
-        assert np.abs(force[list(BALANCED)]).max() < 1e-6
+    for motion, rps in zip(nu, flight.rps, strict=True):
+        rate = m.rates(ALICE, m.state_of(ALICE, motion, rps=rps), command_rps=rps)
+        assert np.abs((ALICE.mass @ rate[7:13])[list(BALANCED)]).max() < 1e-6
 
 
 def test_power_of_a_sound_figure_is_known() -> None:
@@ -48,7 +40,7 @@ def test_power_of_a_sound_figure_is_known() -> None:
     nu = np.zeros((1, 6))
     nu[0, 0] = 0.2
     flight = steady_flight(ALICE, nu)
-    assert drag_power(ALICE.plant.body, nu)[0] == pytest.approx(15.23 * 0.2**3, rel=1e-12)
+    assert m.drag_power(ALICE.plant.body, nu)[0] == pytest.approx(15.23 * 0.2**3, rel=1e-12)
     made = np.zeros(6)
     add_thrust(ALICE.plant.propulsion, flight.rps[0], nu[0], made)
     assert made[0] == pytest.approx(15.23 * 0.2**2, abs=1e-9)
@@ -72,13 +64,9 @@ def test_turning_while_the_water_stands_still_over_ground_takes_its_acceleration
     nu = np.array([[0.1, 0.05, 0, 0, 0, 0.2]])
     rate = np.array([[0.2 * 0.05, -0.2 * 0.1, 0, 0, 0, 0]])
     flight = steady_flight(ALICE, nu, rate)
-    plant = ALICE.plant
-    state = initial_state(np.array([0.0, 0.0, 10.0]), np.zeros(3), 5, nu[0])
-    state[13:] = flight.rps[0]
-    out = np.zeros(18)
-    still = constant_current(0.0, 0.0)
-    derivative(0.0, state, flight.rps[0], np.zeros(6), plant, still, scratch_for(5), out)
-    left = plant.body.mass @ (out[7:13] - rate[0])
+    state = m.state_of(ALICE, nu[0], rps=flight.rps[0])
+    out = m.rates(ALICE, state, command_rps=flight.rps[0])
+    left = ALICE.mass @ (out[7:13] - rate[0])
     assert np.abs(left[list(BALANCED)]).max() < 1e-6
 
 

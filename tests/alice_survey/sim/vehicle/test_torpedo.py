@@ -22,8 +22,6 @@ from alice_survey.sim.vehicle.vehicle import vehicle_from
 from tests import oracles_dynamics as oracle
 from tests.alice_survey.sim.vehicle.motions import STILL
 
-RHO, FIN_M2, FIN_X = 1030.0, 0.00665, -0.638
-
 Array = NDArray[np.float64]
 REMUS = vehicle_from("remus100")
 SHARE = g.STEADY_SHARE

@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alice_survey.core.errors import VehicleError
-from alice_survey.sim.vehicle.coefficients import Coefficients
 from alice_survey.sim.vehicle.propulsion import add_thrust
 from alice_survey.sim.vehicle.sea import GRAVITY
 from alice_survey.sim.vehicle.vehicle import RigidBody, vehicle_from
@@ -91,14 +90,3 @@ def test_rigid_inertia_of_two_weights_by_hand() -> None:
     expected[1, 5] = expected[5, 1] = 2.0  # turning to starboard moves the weight to starboard
     expected[2, 4] = expected[4, 2] = -2.0  # nose up moves it up
     np.testing.assert_array_equal(point.mass_matrix, expected)
-
-
-def test_thrusters_and_coefficients_can_be_exchanged() -> None:
-    full = vehicle_from("alice")
-    failed = full.without(["bow"])
-    assert [t.name for t in failed.thrusters] == [t.name for t in full.thrusters if t.name != "bow"]
-    assert failed.configuration_matrix.shape == (6, 4)
-    assert len(full.thrusters) == 5
-    other = full.with_coefficients(Coefficients(name="light", values={"X_udot": -1.0}))
-    assert other.mass[0, 0] == pytest.approx(full.rigid_body.mass_matrix[0, 0] + 1.0)
-    assert other.thrusters == full.thrusters

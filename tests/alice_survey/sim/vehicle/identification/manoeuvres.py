@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.dynamics import initial_state, rk4_step, scratch_for
 from alice_survey.sim.vehicle.log import VehicleLog
-from alice_survey.sim.vehicle.sea import constant_current
+from alice_survey.sim.vehicle.sea import Current
 from alice_survey.sim.vehicle.vehicle import Vehicle, vehicle_from
 
 ROW_S, STEP_S = 0.05, 0.01
@@ -63,11 +63,7 @@ def fly(
         attitude_rad: to begin with.
     """
     count = len(truth.thrusters)
-    speed, towards = (
-        float(np.hypot(*current)),
-        float(np.rad2deg(np.arctan2(current[1], current[0]))),
-    )
-    water, scratch = constant_current(speed, towards), scratch_for(count)
+    water, scratch = Current(np.zeros(1), np.zeros(1), np.array([[current]])), scratch_for(count)
     state = initial_state(np.array([0.0, 0.0, 5.0]), np.array(attitude_rad), count)
     rows = round(duration_s / ROW_S)
     states = np.empty((rows, len(state)))

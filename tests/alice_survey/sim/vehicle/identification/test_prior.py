@@ -15,6 +15,7 @@ from alice_survey.sim.vehicle.identification.output_error import (
 from alice_survey.sim.vehicle.identification.problem import free_parameters, make_windows
 from alice_survey.sim.vehicle.vehicle import vehicle_from
 from tests.alice_survey.sim.vehicle.identification.manoeuvres import Noise, fly, hidden, measured
+from tests.oracles_navigation import jacobian
 
 KNOWN = vehicle_from("alice")
 QUICK_S = 0.05
@@ -68,12 +69,7 @@ def test_what_has_a_prior_and_how_wide() -> None:
     assert prior.logarithmic.tolist() == [True, False, False, False, True, True, False, False]
     at = parameters.start * 1.3
     at[1] = -0.5
-    slope = np.array(
-        [
-            (prior.residuals(at + step)[k] - prior.residuals(at - step)[k]) / 2e-6
-            for k, step in enumerate(1e-6 * np.eye(len(at)))
-        ]
-    )
+    slope = np.diag(jacobian(lambda change: prior.residuals(at + change), len(at), 1e-6))
     np.testing.assert_allclose(prior.slopes(at), slope, rtol=1e-5, atol=1e-9)
     assert prior.residuals(at)[0] == pytest.approx(math.log(1.3) / 0.5)
     assert prior_of(parameters, windows, None) is None

@@ -1,6 +1,7 @@
 """The filter against its dense twin and against closed forms."""
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import pytest
@@ -48,6 +49,23 @@ def shaken(sensors: part.Sensors, truth: Array) -> nf.NavigationState:
     return nav
 
 
+def navigate(
+    k: int,
+    truth: Array,
+    water: Array,
+    sensors: part.Sensors,
+    nav: nf.NavigationState,
+    rng: np.random.Generator,
+) -> Array:
+    """The estimate, (14,), of one tick."""
+    estimate = np.zeros(14)
+    before = truth[max(k - 1, 0)]
+    tick.navigation_tick(
+        k * TICK_S, k, TICK_S, before, truth[k], water, FLOOR, sensors, nav, rng, estimate
+    )
+    return estimate
+
+
 ALL_AT_ONCE = part.SensorSuite(
     usbl=part.UsblSpec(rate_hz=1.0, outlier_probability=0.0),
     dvl=part.DvlSpec(outlier_probability=0.0, ping_loss=0.0, beam_loss=0.0, water_every=1),
@@ -62,13 +80,10 @@ def test_a_run_equals_the_dense_twin() -> None:
     truth[:, 2], truth[:, 9] = 0.28, 0.0
     rng = default_rng(5)
     nav = nf.new_navigation(sensors, truth[0], rng)
-    water, estimate = np.array([0.1, -0.05, 0.0]), np.zeros(14)
+    water = np.array([0.1, -0.05, 0.0])
     belief, covariance = oracle.from_nominal(nav.nominal), nav.covariance.copy()
     for k in range(len(truth)):
-        tick.navigation_tick(
-            k * TICK_S, k, TICK_S, truth[max(k - 1, 0)], truth[k], water, FLOOR, sensors, nav, rng,
-            estimate,
-        )  # fmt: skip
+        navigate(k, truth, water, sensors, nav, rng)
         readings = nav.readings
         if k > 0:
             belief, covariance, _ = oracle.predict(
@@ -88,73 +103,57 @@ def test_a_run_equals_the_dense_twin() -> None:
 
 
 def twin_update(
-    tick: int,
-    belief: oracle.Belief,
-    covariance: Array,
-    readings: Array,
-    sensors: part.Sensors,
+    k: int, belief: oracle.Belief, covariance: Array, readings: Array, sensors: part.Sensors
 ) -> tuple[oracle.Belief, Array]:
     """All that is due in a tick, at once."""
-    asked: list[Callable[[oracle.Belief], Array]] = []
-    measured: list[Array] = []
-    variance: list[float] = []
+    dvl, usbl = sensors.dvl, sensors.usbl
+    due: list[tuple[Callable[[oracle.Belief], Array], Array, Array | float]] = []
 
-    def add(reading: Callable[..., Array], values: Array, each: Array) -> None:
-        asked.append(reading)
-        measured.append(values)
-        variance.extend(each.tolist())
+    def heading_of(state: oracle.Belief) -> Array:
+        before = oracle.heading(belief)
+        return np.array([before + rotations.wrap_angle(oracle.heading(state) - before)])
 
-    if tick % 2 == 0:
-        heading = oracle.heading(belief)
-        wrapped = heading + rotations.wrap_angle(readings[nf.HEADING] - heading)
-        add(
-            lambda b: np.array([heading + rotations.wrap_angle(oracle.heading(b) - heading)]),
-            np.array([wrapped]),
-            np.array([sensors.compass.noise_rad**2]),
-        )
-        add(
-            lambda b: np.array([oracle.depth(b, sensors)]),
-            readings[nf.DEPTH : nf.DEPTH + 1],
-            np.array([sensors.pressure.noise_m**2]),
-        )
-    if tick % 20 == 0:
-        fix, heard = readings[nf.GPS_FIX : nf.GPS_FIX + 2], readings[nf.USBL_FIX : nf.USBL_FIX + 2]
-        add(lambda b: oracle.gps(b, sensors), fix, np.full(2, sensors.gps.noise_m**2))
-        boat = np.array(sensors.usbl.boat_ned_m)
-        slant2 = np.sum((oracle.place(belief, sensors, part.USBL) - boat) ** 2)
-        spread = sensors.usbl.noise_m**2 + sensors.usbl.noise_fraction**2 * slant2
-        add(lambda b: oracle.usbl(b, sensors), heard, np.full(2, spread))
-    if tick % 4 == 0:
+    if k % 2 == 0:
+        off = rotations.wrap_angle(readings[nf.HEADING] - oracle.heading(belief))
+        due += [
+            (heading_of, oracle.heading(belief) + np.array([off]), sensors.compass.noise_rad**2),
+            (
+                lambda b: np.array([oracle.depth(b, sensors)]),
+                readings[nf.DEPTH : nf.DEPTH + 1],
+                sensors.pressure.noise_m**2,
+            ),
+        ]
+    if k % 20 == 0:
+        fix, answer = readings[nf.GPS_FIX : nf.GPS_FIX + 2], readings[nf.USBL_FIX : nf.USBL_FIX + 2]
+        away = oracle.place(belief, sensors, part.USBL) - np.array(usbl.boat_ned_m)
+        spread = usbl.noise_m**2 + usbl.noise_fraction**2 * away @ away
+        due += [
+            (lambda b: oracle.gps(b, sensors), fix, sensors.gps.noise_m**2),
+            (lambda b: oracle.usbl(b, sensors), answer, spread),
+        ]
+    if k % 4 == 0:
         rates = readings[nf.RATES : nf.RATES + 3].copy()
-        for first, water in ((nf.BEAM, False), (nf.WATER_BEAM, True)):
-            noise = np.full(4, sensors.dvl.water_noise_mps**2)
-            if not water:
-                along = oracle.beams(belief, sensors, rates, False)
-                velocity = np.linalg.lstsq(sensors.beams, along, rcond=None)[0]
-                bias = np.array([*belief.rest[10:12], 0.0])
-                speed = np.linalg.norm(velocity - bias)
-                noise = np.full(
-                    4, (sensors.dvl.beam_noise_mps + sensors.dvl.beam_noise_per_speed * speed) ** 2
-                )
-            lever = oracle.jacobian(
-                lambda e, w=water: oracle.beams(belief, sensors, rates + e, w), 3
-            )
-            noise = noise + sensors.imu.gyro_noise_rad_per_sqrt_s**2 / TICK_S * np.sum(
-                lever**2, axis=1
-            )
-            add(
-                lambda b, w=water: oracle.beams(b, sensors, rates, w),
-                readings[first : first + 4],
-                noise,
-            )
-    if not asked:
+        along = oracle.beams(belief, sensors, rates, False)
+        bias = np.array([*belief.rest[10:12], 0.0])
+        speed = np.linalg.norm(np.linalg.lstsq(sensors.beams, along, rcond=None)[0] - bias)
+        bottom = dvl.beam_noise_mps + dvl.beam_noise_per_speed * speed
+        for first, w, sigma in (
+            (nf.BEAM, False, bottom),
+            (nf.WATER_BEAM, True, dvl.water_noise_mps),
+        ):
+            lever = oracle.jacobian(lambda e, w=w: oracle.beams(belief, sensors, rates + e, w), 3)
+            turning = sensors.imu.gyro_noise_rad_per_sqrt_s**2 / TICK_S * np.sum(lever**2, axis=1)
+            heard = partial(oracle.beams, sensors=sensors, rates=rates, water=w)
+            due.append((heard, readings[first : first + 4], sigma**2 + turning))
+    if not due:
         return belief, covariance
+    asked, measured, variance = zip(*due, strict=True)
     return oracle.update(
         belief,
         covariance,
         np.concatenate(measured),
         lambda b: np.concatenate([reading(b) for reading in asked]),
-        np.array(variance),
+        np.concatenate([np.full(len(m), v) for m, v in zip(measured, variance, strict=True)]),
     )
 
 
@@ -339,12 +338,7 @@ def test_a_disturbed_compass_is_rejected_first_and_then_widens_its_bias() -> Non
     for k in range(len(truth)):
         if k == 400:
             nav.hidden[nf.HEADING_BIAS - 9] += np.deg2rad(30.0)
-        estimate = np.zeros(14)
-        tick.navigation_tick(
-            k * TICK_S, k, TICK_S, truth[max(k - 1, 0)], truth[k], np.zeros(3), FLOOR, sensors,
-            nav, rng, estimate,
-        )  # fmt: skip
-        heading.append(estimate[5])
+        heading.append(navigate(k, truth, np.zeros(3), sensors, nav, rng)[5])
         sigma.append(np.sqrt(nav.covariance[8, 8]))
     counts = nav.counts[nf.COMPASS_USE]
     assert counts[nf.WIDENED] == 1

@@ -19,6 +19,7 @@ from alice_survey.sim.vehicle.pilot.memory import PilotState, new_pilot
 from alice_survey.sim.vehicle.pilot.mission import NO_MISSION
 from alice_survey.sim.vehicle.pilot.path import Path, path_from_legs
 from alice_survey.sim.vehicle.pilot.settings import Guidance, Tick, pilot_guidance
+from alice_survey.sim.vehicle.rotations import matrix_rows
 from alice_survey.sim.vehicle.sea import Current, constant_current, current_at
 from alice_survey.sim.vehicle.vehicle import vehicle_from
 
@@ -31,10 +32,9 @@ DEEPEST_M = 40.0
 @kernel
 def estimate_truth(state: Array, water: Array, point: Array, floor: Array, out: Array) -> None:
     """Write the true state as a navigation would: floor is depth, slope to north, lock or not."""
-    x, y, z, s = state[3], state[4], state[5], state[6]
-    r00, r10, r20 = 1 - 2 * (y * y + z * z), 2 * (x * y + z * s), 2 * (x * z - y * s)
-    r01, r11, r21 = 2 * (x * y - z * s), 1 - 2 * (x * x + z * z), 2 * (y * z + x * s)
-    r02, r12, r22 = 2 * (x * z + y * s), 2 * (y * z - x * s), 1 - 2 * (x * x + y * y)
+    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = matrix_rows(
+        state[3], state[4], state[5], state[6]
+    )
     for i in range(3):
         out[i] = state[i]
         out[9 + i] = state[10 + i]
@@ -57,27 +57,23 @@ def _fly(
     keep: Array,
     plant: dynamics.Plant,
     current: Current,
-    path: Path,
-    guidance: Guidance,
-    gains: Gains,
-    pilot: PilotState,
+    tick: Tick,
     scratch: dynamics.Scratch,
     room: Array,
     rows: Array,
 ) -> None:
-    estimate, wrench, water, command = room[:14], room[14:20], room[20:26], room[26:]
-    step = 0.05 / 5
-    tick = Tick(0.05, estimate, path, guidance, gains, pilot)
+    wrench, water, command = room[:6], room[6:12], room[12:]
+    estimate, report, step = tick.estimate, tick.pilot.report, 0.05 / 5
     for k in range(rows.shape[0]):
         time_s = (first + k) * 0.05
         current_at(current, time_s, state[2], water)
-        estimate_truth(state, water, guidance.point_body_m, floor, estimate)
+        estimate_truth(state, water, tick.guidance.point_body_m, floor, estimate)
         steer(time_s, tick, NO_MISSION, wrench)
         rows[k, 0] = time_s
         for i in range(14):
             rows[k, 1 + i] = estimate[i]
         for i in range(13):
-            rows[k, 15 + i] = pilot.report[i]
+            rows[k, 15 + i] = report[i]
         for i in range(6):
             rows[k, 28 + i] = wrench[i]
         for i in range(5):
@@ -112,8 +108,8 @@ class Flight:
         keep = np.exp(-TICK_S / STEPS / np.maximum(lag_s, 1e-6))
         _fly(
             self.ticks, self.state, self.load, self.floor, keep, self.plant, self.current,
-            self.path, self.guidance, self.gains, self.pilot, dynamics.scratch_for(thrusters),
-            np.zeros(26 + thrusters), rows,
+            Tick(TICK_S, np.zeros(14), self.path, self.guidance, self.gains, self.pilot),
+            dynamics.scratch_for(thrusters), np.zeros(12 + thrusters), rows,
         )  # fmt: skip
         self.ticks += len(rows)
         return Rows(rows)
@@ -159,6 +155,20 @@ class Rows:
         """Phases in the order in which they came."""
         phase = self.report[:, slot.PHASE].astype(int)
         return [int(phase[0]), *(int(p) for p in phase[1:][np.diff(phase) != 0])]
+
+
+def steered(
+    path: Path,
+    guidance: Guidance,
+    gains: Gains,
+    pilot: PilotState,
+    estimate: Array,
+    time_s: float = 0.0,
+) -> Array:
+    """The wrench, (6,), of one tick."""
+    wrench = np.full(6, math.nan)
+    steer(time_s, Tick(TICK_S, estimate, path, guidance, gains, pilot), NO_MISSION, wrench)
+    return wrench
 
 
 @cache

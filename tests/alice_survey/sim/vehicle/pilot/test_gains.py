@@ -14,6 +14,7 @@ from alice_survey.sim.vehicle.dynamics import Body, add_coriolis, add_damping
 from alice_survey.sim.vehicle.pilot import gains as g
 from alice_survey.sim.vehicle.vehicle import SETS, vehicle_from
 from tests.alice_survey.sim.vehicle.pilot.pilot_runs import gains_of
+from tests.oracles_navigation import jacobian
 
 AXES = [("alice", axis) for axis in range(4)] + [("sparus2", axis) for axis in (0, 2, 3)]
 
@@ -56,13 +57,13 @@ def test_each_loop_is_damped_with_lag_integral_and_any_drag(name: str, axis: int
 
 def _slope(add: Callable[[Body, Array, Array], None], body: Body, nu: Array, step: float) -> Array:
     """(6, 6) slope of a force by velocity, by differences."""
-    columns = []
-    for unit in np.eye(6):
-        ahead, behind = np.zeros(6), np.zeros(6)
-        add(body, nu + step * unit, ahead)
-        add(body, nu - step * unit, behind)
-        columns.append((ahead - behind) / (2 * step))
-    return np.stack(columns, axis=1)
+
+    def force(change: Array) -> Array:
+        made = np.zeros(6)
+        add(body, nu + change, made)
+        return made
+
+    return jacobian(force, 6, step)
 
 
 def _lateral_slopes(body: Body, nu: Array) -> Array:

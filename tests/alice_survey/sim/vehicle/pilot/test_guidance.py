@@ -13,17 +13,12 @@ from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.pilot import gains as g
 from alice_survey.sim.vehicle.pilot import memory as slot
 from alice_survey.sim.vehicle.pilot import settings as settings_of
-from alice_survey.sim.vehicle.pilot.gains import (
-    damping_ratio,
-    gains_for,
-)
-from alice_survey.sim.vehicle.pilot.guidance import steer
-from alice_survey.sim.vehicle.pilot.mission import NO_MISSION
+from alice_survey.sim.vehicle.pilot.gains import damping_ratio, gains_for
 from alice_survey.sim.vehicle.pilot.path import Path
 from alice_survey.sim.vehicle.pilot.steering import hear_floor, write_point
 from alice_survey.sim.vehicle.vehicle import vehicle_from
 from tests import oracles_guidance as oracle
-from tests.alice_survey.sim.vehicle.pilot.pilot_runs import gains_of, straight
+from tests.alice_survey.sim.vehicle.pilot.pilot_runs import gains_of, steered, straight
 from tests.oracles_guidance import los_offset_m
 
 TICK_S = 0.05
@@ -72,12 +67,12 @@ def test_a_tick_asks_for_what_its_twin_asks(
 ) -> None:
     path = straight(20.0)
     gains, guidance = guide(path, name, controller)
-    estimate, wrench = estimate_of(motion, cross_m), np.zeros(6)
+    estimate = estimate_of(motion, cross_m)
     place, _ = oracle.point_motion(estimate, guidance)
     pilot = pilot_on(path, along_m=place[0])
     expected, cross = oracle.follow_demand(estimate, path, guidance, gains, place[0])
     assume(abs(abs(cross) - guidance.near_m) > 1e-9)
-    steer(0.0, settings_of.Tick(TICK_S, estimate, path, guidance, gains, pilot), NO_MISSION, wrench)
+    wrench = steered(path, guidance, gains, pilot, estimate)
     accelerations = pilot.demand[[slot.ACC_SURGE, slot.ACC_SWAY, slot.ACC_YAW]]
     np.testing.assert_allclose(accelerations, expected, atol=1e-9)
     assert pilot.report[slot.CROSS] == pytest.approx(cross, abs=1e-9)

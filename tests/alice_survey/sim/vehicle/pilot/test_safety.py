@@ -10,11 +10,8 @@ from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.pilot import gains as g
 from alice_survey.sim.vehicle.pilot import memory as safety
 from alice_survey.sim.vehicle.pilot import memory as slot
-from alice_survey.sim.vehicle.pilot.guidance import steer
 from alice_survey.sim.vehicle.pilot.memory import PilotState, SafetyLimits, new_pilot
-from alice_survey.sim.vehicle.pilot.mission import NO_MISSION
-from alice_survey.sim.vehicle.pilot.settings import Tick
-from tests.alice_survey.sim.vehicle.pilot.pilot_runs import Flight, launch, straight
+from tests.alice_survey.sim.vehicle.pilot.pilot_runs import launch, steered, straight
 
 LIMITS = SafetyLimits(1.0, 20.0, math.radians(30.0), 20.0, 90.0, 3.0, 5000.0)
 TICK_S = 0.05
@@ -81,21 +78,14 @@ def test_without_bottom_lock_the_navigation_decides_if_it_may() -> None:
         assert reason == (safety.NONE if goes_on else safety.NO_BOTTOM)
 
 
-def _steered(flight: Flight, estimate: Array) -> Array:
-    wrench = np.full(6, math.nan)
-    tick = Tick(TICK_S, estimate, flight.path, flight.guidance, flight.gains, flight.pilot)
-    steer(10.0, tick, NO_MISSION, wrench)
-    return wrench
-
-
 @pytest.mark.parametrize("lost", range(12))
 def test_without_navigation_the_vehicle_pushes_itself_up(lost: int) -> None:
     flight = launch(straight(10.0), following=True)
-    estimate = calm()
-    assert _steered(flight, estimate)[2] > -1.0
+    estimate, flown = calm(), (flight.path, flight.guidance, flight.gains, flight.pilot)
+    assert steered(*flown, estimate)[2] > -1.0
     estimate[lost] = math.nan
     for _ in range(3):
-        wrench = _steered(flight, estimate)
+        wrench = steered(*flown, estimate)
         expected = g.STEADY_SHARE * flight.gains.axes[g.HEAVE, g.MIN_FORCE]
         np.testing.assert_array_equal(wrench, [0, 0, expected, 0, 0, 0])
     assert flight.pilot.report[slot.PHASE] == slot.ABORT

@@ -13,8 +13,6 @@ from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.pilot import gains as g
 from alice_survey.sim.vehicle.pilot import memory as slot
 from alice_survey.sim.vehicle.pilot import settings as settings_of
-from alice_survey.sim.vehicle.pilot.guidance import steer
-from alice_survey.sim.vehicle.pilot.mission import NO_MISSION
 from alice_survey.sim.vehicle.pilot.path import Path
 from alice_survey.sim.vehicle.pilot.steering import STOP_M, STOP_RAD, ramp
 from tests import oracles_guidance as oracle
@@ -101,8 +99,7 @@ def test_a_tick_of_a_stop_asks_for_what_its_twin_asks(
     expected = oracle.standing_demand(
         estimate, guidance, gains, path.speed_mps, place, moves, quickens, turning
     )
-    wrench = np.zeros(6)
-    steer(0.0, settings_of.Tick(TICK_S, estimate, path, guidance, gains, pilot), NO_MISSION, wrench)
+    wrench = runs.steered(path, guidance, gains, pilot, estimate)
     found = pilot.demand[[slot.ACC_SURGE, slot.ACC_SWAY, slot.ACC_YAW]]
     np.testing.assert_allclose(found, expected, atol=1e-9)
     np.testing.assert_allclose(wrench, oracle.wrench(gains, pilot.demand), atol=1e-9)
@@ -163,7 +160,7 @@ def test_alice_steps_aside_with_her_heading_held(current: tuple[float, float]) -
 
 def test_a_stop_is_left_though_the_sea_does_not_let_the_vehicle_rest() -> None:
     path, guidance, gains = SPOTS, guidance_of(SPOTS), runs.gains_of("alice")
-    pilot, wrench = slot.new_pilot(), np.zeros(6)
+    pilot = slot.new_pilot()
     pilot.report[[slot.PHASE, slot.LEG]] = slot.FOLLOW, 1
     pilot.memory[[slot.STANDING, slot.REF, slot.RAMP]] = 1.0, QUARTER, QUARTER
     estimate = np.zeros(vector.ESTIMATE)
@@ -173,12 +170,7 @@ def test_a_stop_is_left_though_the_sea_does_not_let_the_vehicle_rest() -> None:
     estimate[[vector.ALTITUDE, vector.CLEARANCE]] = 2.0
     left = None
     for tick in range(600):
-        steer(
-            tick * TICK_S,
-            settings_of.Tick(TICK_S, estimate, path, guidance, gains, pilot),
-            NO_MISSION,
-            wrench,
-        )
+        runs.steered(path, guidance, gains, pilot, estimate, tick * TICK_S)
         if pilot.report[slot.LEG] == 2.0:
             left = tick * TICK_S
             break

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,32 +21,20 @@ GUST_N = np.array([0.5, 0.5, 0.5, 0.0, 0.0, 0.1])
 SOUND_S = 60.0
 
 
-def without(name: str, share: float = 0.0) -> Vehicle:
-    """ALICE with a share of a thruster's thrust and torque left."""
-    return replace(
-        ALICE,
-        thrusters=tuple(
-            thruster
-            if thruster.name != name
-            else replace(
-                thruster,
-                kt_forward=thruster.kt_forward * max(share, 1e-9),
-                kt_reverse=thruster.kt_reverse * max(share, 1e-9),
-                kq_forward=thruster.kq_forward * share,
-                kq_reverse=thruster.kq_reverse * share,
-                advance_slope=thruster.advance_slope * share,
-                torque_slope=thruster.torque_slope * share,
-            )
-            for thruster in ALICE.thrusters
-        ),
-    )
+def without(name: str) -> Vehicle:
+    """ALICE with a thruster that turns and makes neither thrust nor torque."""
+    fields = [f"{k}_{w}" for k in ("kt", "kq") for w in ("forward", "reverse")]
+    fields += ["advance_slope", "torque_slope"]
+    nothing: dict[str, Any] = dict.fromkeys(fields, 0.0) | dict.fromkeys(fields[:2], 1e-9)
+    kept = (replace(t, **nothing) if t.name == name else t for t in ALICE.thrusters)
+    return replace(ALICE, thrusters=tuple(kept))
 
 
 @cache
-def flown(name: str, share: float, seed: int, duration_s: float = 60.0) -> tuple[Array, Array]:
+def flown(name: str, seed: int, duration_s: float = 60.0) -> tuple[Array, Array]:
     """What navigation and thrusters say, (T, 12) and (T, n), of a vehicle in gusts of 2 s."""
     rng, gust = np.random.default_rng(seed), np.zeros(6)
-    truth = ALICE if not name else without(name, share)
+    truth = without(name)
     kept = math.exp(-TICK_S / 2.0)
 
     def push() -> Array:
@@ -82,7 +71,7 @@ def test_sound_thrusters_add_up_to_less_than_chance_allows() -> None:
     """The stated rate of false alarms rests on it: a sum is above x no more often than exp(-x)."""
     sums = []
     for seed in range(6):
-        found, own = judged(command.ThrustWatch(ALICE, TICK_S), 0.0, flown("", 1.0, seed, 120.0))
+        found, own = judged(command.ThrustWatch(ALICE, TICK_S), 0.0, flown("", seed, 120.0))
         assert found == []
         sums += own
     table = np.array(sums)
@@ -102,8 +91,8 @@ def test_a_thruster_that_pushes_nothing_is_found_in_two_minutes(name: str) -> No
     delays = []
     for seed in range(3):
         watch = command.ThrustWatch(ALICE, TICK_S)
-        assert judged(watch, 0.0, flown("", 1.0, seed))[0] == []
-        found, _ = judged(watch, SOUND_S, flown(name, 0.0, 10 + seed, 120.0))
+        assert judged(watch, 0.0, flown("", seed))[0] == []
+        found, _ = judged(watch, SOUND_S, flown(name, 10 + seed, 120.0))
         assert found == [
             command.Failure(time_s=found[0].time_s, thruster=name, left=0.0, turns=True)
         ]
@@ -128,7 +117,7 @@ def test_a_model_that_is_off_and_a_wrong_current_are_no_failure() -> None:
     )
     for believed, water_mps in ((draggy, 0.0), (strong, 0.0), (ALICE, 0.1)):
         for seed in range(2):
-            flight = flown("", 1.0, seed, 120.0)
+            flight = flown("", seed, 120.0)
             found, sums = judged(command.ThrustWatch(believed, TICK_S), 0.0, flight, water_mps)
             assert found == []
             assert np.max(sums) < 8.0
