@@ -25,7 +25,6 @@ from typing import NamedTuple
 import numpy as np
 
 from alice_survey.core.compiled import columns, kernel
-from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.estimate_vector import ESTIMATE
 from alice_survey.sim.vehicle.navigation import sensors as part
@@ -129,16 +128,11 @@ def new_navigation(sensors: Sensors, truth: Array, rng: np.random.Generator) -> 
         sensors: the instruments.
         truth: (13,) position NED, quaternion, velocity over ground NED, body rates.
         rng: source of all errors.
-
-    Raises:
-        VehicleError: truth is not a finite state.
     """
     from scipy.spatial.transform import Rotation
 
     from alice_survey.core.frames import rotation_from_attitude
 
-    if truth.shape != (13,) or not np.all(np.isfinite(truth)):
-        raise VehicleError("navigation begins at a state that is not a finite (13,) vector")
     covariance = initial_covariance(sensors)
     hidden_sigma = np.sqrt(np.diag(covariance)[GYRO_BIAS:WATER])
     hidden = hidden_sigma * rng.standard_normal(HIDDEN)

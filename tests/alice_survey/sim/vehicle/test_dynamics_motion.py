@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.sea import Current, constant_current, sheared_current
-from alice_survey.sim.vehicle.vehicle import SETS, RigidBody, Vehicle, vehicle_from
+from alice_survey.sim.vehicle.vehicle import SETS, Vehicle, vehicle_from
 from tests import oracles_dynamics as oracle
 from tests.alice_survey.sim.vehicle import motions as m
 from tests.oracles_propulsion import wrench
@@ -85,17 +85,9 @@ def test_water_inside_the_nose_is_carried_where_it_is() -> None:
     """Water inside the hull is pushed along at its own centre as any other: nothing turns, and the
     drained part alone lags, by its low centre of gravity."""
     tide = Current(np.array([0.0, 10.0]), np.zeros(1), np.array([[[0.0, 0.0]], [[0.3, 1.0]]]))
-    flooded = replace(
-        m.block({"Y_vdot": -70.0}),
-        rigid_body=RigidBody(
-            dry_kg=50.0,
-            buoyancy_kg=50.0,
-            entrained_kg=25.0,
-            cg_body_m=(0.0, 0.0, 0.0),
-            inertia_kg_m2=(1.0, 6.0, 7.0),
-            entrained_cg_body_m=(0.33, -0.02, 0.01),
-        ),
-    )
+    plain = m.block({"Y_vdot": -70.0}, entrained_kg=25.0)
+    inside = replace(plain.rigid_body, entrained_cg_body_m=(0.33, -0.02, 0.01))
+    flooded = replace(plain, rigid_body=inside)
     for attitude in ((0.0, 0.0, 0.0), (0.2, -0.3, 1.0)):
         rate = m.rates(flooded, m.state_of(flooded, attitude_rad=attitude), current=tide)
         np.testing.assert_allclose(rate[7:13], 0.0, atol=1e-15)

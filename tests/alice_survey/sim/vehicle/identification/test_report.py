@@ -14,7 +14,7 @@ from alice_survey.sim.vehicle.identification.report import IdentifyOptions, iden
 from alice_survey.sim.vehicle.log import write_vehicle_log
 from alice_survey.sim.vehicle.vehicle import coefficients_from_file, vehicle_from
 from tests.alice_survey.sim.vehicle.identification import manoeuvres as flown
-from tests.alice_survey.sim.vehicle.identification.test_bollard import pull_csv
+from tests.alice_survey.sim.vehicle.identification.test_two_step import pull_csv
 
 KNOWN = vehicle_from("alice")
 TRUTH = {"X_uu": -12.0, "N_rr": -70.0}
