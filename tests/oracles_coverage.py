@@ -146,11 +146,6 @@ def plan_of(area: Area, lines: list[Line], **others: Any) -> Plan:
         legs.append(straight(line.start_ne_m, line.end_ne_m, index))
         if index + 1 < len(lines):
             legs.append(straight(line.end_ne_m, lines[index + 1].start_ne_m))
-    given: dict[str, Any] = {
-        "name": "known",
-        "area": area,
-        "exposure_s": 0.001,
-        "strobe_pulse_s": 0.002,
-    } | others
-    route, home = Route(legs=tuple(legs)), lines[0].start_ne_m
-    return plan_by_hand(lines, [(0, len(lines) - 1)], home=home, routes=[route], **given)
+    given: dict[str, Any] = {"name": "known", "exposure_s": 0.001, "strobe_pulse_s": 0.002}
+    route, home, dives = Route(legs=tuple(legs)), lines[0].start_ne_m, [(0, len(lines) - 1)]
+    return plan_by_hand(lines, dives, home=home, routes=[route], area=area, **(given | others))

@@ -1,7 +1,6 @@
 """Slow, obvious twins of ways, turns and costs of routes: shapely, all pairs, dense sampling."""
 
 import math
-from typing import Any
 
 import numpy as np
 import shapely
@@ -27,8 +26,8 @@ def min_way_m(allowed: MultiPolygon, a: tuple[float, float], b: tuple[float, flo
     lengths = np.linalg.norm(places[one] - places[two], axis=1)
     # Places that coincide are joined too: a length of 0 would be no edge.
     edges = (np.maximum(lengths[free], 1e-12), (one[free], two[free]))
-    graph: Any = csr_array(edges, shape=(len(places), len(places)))
-    return float(dijkstra(graph, directed=False, indices=0)[1])
+    graph = csr_array(edges, shape=(len(places), len(places)))
+    return float(dijkstra(graph, directed=False, indices=0)[1])  # type: ignore[call-overload]
 
 
 def sampled_leg(leg: Leg, samples: int) -> tuple[Array, float]:

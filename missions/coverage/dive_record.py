@@ -416,8 +416,8 @@ def _planned_lines(stations: Stations, plan: Plan) -> NDArray[np.intp]:
     moved = np.diff(stations.glass_ne, axis=0, prepend=stations.glass_ne[:1])
     for index, planned in enumerate(plan.lines):
         ahead = np.array([math.cos(planned.heading_rad), math.sin(planned.heading_rad)])
-        off = stations.glass_ne - planned.start_ne_m
-        along, across = off @ ahead, np.abs(off @ np.array([-ahead[1], ahead[0]]))
+        along, across = planned.offsets_m(stations.glass_ne).T
+        across = np.abs(across)
         here = (along >= -step_m) & (along <= planned.length_m + step_m)
         here &= np.abs(np.cos(heading - planned.heading_rad)) >= math.cos(_ALIKE_RAD)
         before = number[line == index - 1]

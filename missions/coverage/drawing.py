@@ -78,17 +78,14 @@ def write_coverage_tif(path: Path, certificate: Certificate) -> None:
         "tiled": True, "blockxsize": _BLOCK, "blockysize": _BLOCK,
     }  # fmt: skip
     with atomic_path(path) as temporary, rasterio.open(temporary, "w", **profile) as raster:
-        for row in range(0, rows, _BLOCK):
-            for column in range(0, columns, _BLOCK):
-                height, width = min(_BLOCK, rows - row), min(_BLOCK, columns - column)
-                # Between the corners of a block the projection is even to a few micrometres.
-                ends = np.meshgrid([row, row + height], [column, column + width], indexing="ij")
-                corners = places_ne(ends[0].astype(np.float64), ends[1].astype(np.float64))
-                places = _between(corners, height, width)
-                for band, (name, _) in enumerate(_BANDS, 1):
-                    values = sample_counts(certificate, getattr(certificate, name), places)
-                    window = rasterio.windows.Window(column, row, width, height)
-                    raster.write(values, band, window=window)
+        for _, window in raster.block_windows(1):
+            # Between the corners of a block the projection is even to a few micrometres.
+            edges = [np.array(span, dtype=np.float64) for span in window.toranges()]
+            corners = places_ne(*np.meshgrid(*edges, indexing="ij"))
+            places = _between(corners, window.height, window.width)
+            for band, (name, _) in enumerate(_BANDS, 1):
+                values = sample_counts(certificate, getattr(certificate, name), places)
+                raster.write(values, band, window=window)
         for band, (_, text) in enumerate(_BANDS, 1):
             raster.set_band_description(band, text)
 

@@ -15,7 +15,7 @@ from missions.exports import formats
 
 if TYPE_CHECKING:
     from missions.exports.format import ExportFormat
-    from missions.values.mission import Mission, MissionStep
+    from missions.values.mission import Mission
 
 _MAX_BYTES = 64_000_000
 _REMOVED = {"cola2-v1": "cola2", "qgc-survey": "qgc"}
@@ -77,25 +77,22 @@ def _check(mission: "Mission") -> None:
     if not mission.steps:
         raise ValueError("the mission has no step")
     for number, step in enumerate(mission.steps, start=1):
-        faults = [text for text, is_possible in _conditions(step).items() if not is_possible]
-        if faults:
-            raise ValueError(f"step {number} has {faults[0]}")
-
-
-def _conditions(step: "MissionStep") -> dict[str, bool]:
-    """What must hold of a step, by what it has where it does not."""
-    latitudes, longitudes = zip((step.latitude_deg, step.longitude_deg),
-                                step.start_deg or (0.0, 0.0), strict=True)  # fmt: skip
-    return {
-        f"the place {step.latitude_deg:g}, {step.longitude_deg:g}, or start, beyond a pole": (
-            max(map(abs, latitudes)) <= 90.0 and max(map(abs, longitudes)) <= 180.0
-        ),
-        f"the speed {step.speed_mps:g} m/s": step.speed_mps > 0.0,
-        "a negative time or tolerance": not (step.hold_s < 0.0 or step.tolerance_m < 0.0),
-        f"the depth {step.depth_m:g} m": (
-            step.heave == "altitude" or (math.isfinite(step.depth_m) and step.depth_m >= 0.0)
-        ),
-        f"the altitude {step.altitude_m:g} m": (
-            step.heave == "depth" or (math.isfinite(step.altitude_m) and step.altitude_m > 0.0)
-        ),
-    }
+        latitudes, longitudes = zip((step.latitude_deg, step.longitude_deg),
+                                    step.start_deg or (0.0, 0.0), strict=True)  # fmt: skip
+        below = math.isfinite(step.depth_m) and step.depth_m >= 0.0
+        above = math.isfinite(step.altitude_m) and step.altitude_m > 0.0
+        fault = ""
+        if not (max(map(abs, latitudes)) <= 90.0 and max(map(abs, longitudes)) <= 180.0):
+            fault = (
+                f"the place {step.latitude_deg:g}, {step.longitude_deg:g}, or start, beyond a pole"
+            )
+        elif not step.speed_mps > 0.0:
+            fault = f"the speed {step.speed_mps:g} m/s"
+        elif step.hold_s < 0.0 or step.tolerance_m < 0.0:
+            fault = "a negative time or tolerance"
+        elif step.heave != "altitude" and not below:
+            fault = f"the depth {step.depth_m:g} m"
+        elif step.heave != "depth" and not above:
+            fault = f"the altitude {step.altitude_m:g} m"
+        if fault:
+            raise ValueError(f"step {number} has {fault}")

@@ -154,7 +154,7 @@ def _line_points(plan: Plan, leg: Leg, depths: Array) -> Iterator[_Point]:
 
 
 def bends(along_m: Array, depths_m: Array, tolerance_m: float) -> list[int]:
-    """Fewest splits by halving at the worst place, so that straights miss no depth by more.
+    """Few places, so that straights between them miss no depth by more.
 
     The method is D. H. Douglas and T. K. Peucker's (1973), with the vertical distance.
 
@@ -166,20 +166,14 @@ def bends(along_m: Array, depths_m: Array, tolerance_m: float) -> list[int]:
     Returns:
         Indices that are kept, ascending; the first and the last always.
     """
-    keep = {0, len(along_m) - 1}
-    open_spans = [(0, len(along_m) - 1)]
-    while open_spans:
-        low, high = open_spans.pop()
-        if high - low < 2:
-            continue
-        span = slice(low, high + 1)
-        straight = np.interp(along_m[span], along_m[[low, high]], depths_m[[low, high]])
-        missed = np.abs(depths_m[span] - straight)
-        worst = int(np.argmax(missed))
-        if missed[worst] > tolerance_m:
-            keep.add(low + worst)
-            open_spans += [(low, low + worst), (low + worst, high)]
-    return sorted(keep)
+    # So far apart along it, the distance from a straight is the vertical one.
+    scale = 1e6 * (1.0 + float(np.ptp(depths_m)))
+    corners = np.column_stack([scale * along_m, depths_m])
+    kept = shapely.get_coordinates(
+        LineString(corners).simplify(tolerance_m, preserve_topology=False)
+    )
+    rows: list[int] = np.flatnonzero(np.isin(corners[:, 0], kept[:, 0])).tolist()
+    return rows
 
 
 def _arc_points(leg: Leg) -> Iterator[_Point]:

@@ -70,14 +70,7 @@ class Costs(NamedTuple):
         return 2.0 * depth_m / self.heave_mps
 
 
-def time_costs(
-    speed_mps: float,
-    *,
-    turn_rate_rad_s: float = TURN_IN_PLACE_RAD_S,
-    settle_s: float = SETTLE_S,
-    sway_mps: float = STEP_MPS,
-    heave_mps: float = 0.15,
-) -> Costs:
+def time_costs(speed_mps: float) -> Costs:
     """Costs of 1 W whatever the vehicle does: joules are seconds."""
     return Costs(
         speed_mps=speed_mps,
@@ -85,11 +78,11 @@ def time_costs(
         way_w=np.ones(4),
         stop_w=1.0,
         arc_extra_w=0.0,
-        turn_rate_rad_s=turn_rate_rad_s,
-        settle_s=settle_s,
-        sway_mps=sway_mps,
+        turn_rate_rad_s=TURN_IN_PLACE_RAD_S,
+        settle_s=SETTLE_S,
+        sway_mps=STEP_MPS,
         sway_w=np.ones(4),
-        heave_mps=heave_mps,
+        heave_mps=0.15,
         heave_w=1.0,
     )
 
@@ -118,17 +111,8 @@ def leg_costs(route: Route, costs: Costs) -> tuple[Array, Array]:
 
     The power on an arc is that of each course it passes through.
     """
-    rows = [
-        (
-            leg.heading_rad,
-            leg.length_m,
-            leg.curvature_per_m,
-            leg.line,
-            leg.turn_rad,
-            leg.side_rad,
-        )
-        for leg in route.legs
-    ]
+    names = ("heading_rad", "length_m", "curvature_per_m", "line", "turn_rad", "side_rad")
+    rows = [[getattr(leg, name) for name in names] for leg in route.legs]
     return leg_row_costs(np.array(rows, dtype=np.float64).reshape(-1, 6), costs)
 
 

@@ -90,20 +90,17 @@ class Flight:
         places = np.column_stack(
             [np.interp(self.trigger_s, self.truth.time_s, axis) for axis in self.glass_ned.T[:2]]
         )
-        count = 0
-        for place, index in zip(places, self.trigger_line, strict=True):
-            line = self.plan.lines[index]
-            starboard = np.array([-math.sin(line.heading_rad), math.cos(line.heading_rad)])
-            count += bool(abs((place - line.start_ne_m) @ starboard) > self.plan.allowed_offset_m)
-        return count
+        off = [
+            self.plan.lines[index].offsets_m(place)[1]
+            for place, index in zip(places, self.trigger_line, strict=True)
+        ]
+        return int(np.sum(np.abs(off) > self.plan.allowed_offset_m))
 
     def _cross_track(self, glass_ned: Array) -> Array:
         cross = np.full(len(self.line), np.nan)
         for index, line in enumerate(self.plan.lines):
             rows = self.line == index
-            off = glass_ned[rows, :2] - np.array(line.start_ne_m)
-            starboard = [-math.sin(line.heading_rad), math.cos(line.heading_rad)]
-            cross[rows] = off @ np.array(starboard)
+            cross[rows] = line.offsets_m(glass_ned[rows, :2])[:, 1]
         return cross
 
 
@@ -132,8 +129,7 @@ def trigger_times(
             continue
         # The tick before the line is entered brackets its first station, the one after its last.
         rows = np.arange(max(rows[0] - 1, 0), min(rows[-1] + 2, len(line)))
-        ahead = np.array([math.cos(planned.heading_rad), math.sin(planned.heading_rad)])
-        along = np.maximum.accumulate((glass_ne[rows] - planned.start_ne_m) @ ahead)
+        along = np.maximum.accumulate(planned.offsets_m(glass_ne[rows])[:, 0])
         stations = np.linspace(0.0, planned.length_m, planned.stations)
         stations = stations[stations <= along[-1] + (STOP_M if index in stopping else 0.0)]
         # Of equal distances, while the vehicle falls back, the first counts.

@@ -44,6 +44,12 @@ class Line:
         places: Array = np.array(self.start_ne_m) * (1 - t) + np.array(self.end_ne_m) * t
         return places
 
+    def offsets_m(self, points_ne: Array) -> Array:
+        """How far places (..., 2) are along the line from its start, and to starboard of it."""
+        cos, sin = math.cos(self.heading_rad), math.sin(self.heading_rad)
+        found: Array = (points_ne - np.array(self.start_ne_m)) @ np.array([[cos, -sin], [sin, cos]])
+        return found
+
     def reverse(self) -> "Line":
         """The same line flown the other way."""
         return replace(self, start_ne_m=self.end_ne_m, end_ne_m=self.start_ne_m)
