@@ -49,17 +49,26 @@ def build_report(held: Held, folder: Path) -> tuple[Report, dict[str, Any]]:
     mesh = mesh_copy(held, folder / "mesh.glb")
     parts = list(sections(held, has_map=chart is not None, has_mesh=mesh is not None))
     kind = "simulated survey" if held.simulated else "survey"
-    when = f"{last_worked_on(held):%Y-%m-%d %H:%M UTC}"
+    worked, datum = last_worked_on(held), held.frame.datum
+    place = "" if datum is None else (
+        f"{datum.latitude_deg:.5f}, {datum.longitude_deg:.5f} (WGS 84)"
+    )  # fmt: skip
+    program = f"alice-survey {version('alice-survey')}"
     report = Report(
         title=held.name,
-        subtitle="; ".join(filter(None, (kind, _place(held), f"last worked on {when}"))),
+        subtitle="; ".join(
+            filter(None, (kind, place, f"last worked on {worked:%Y-%m-%d %H:%M UTC}"))
+        ),
         summary=said,
         facts=known,
         verdicts=found,
         sections=parts,
         map=chart,
         mesh=mesh,
-        citation=_title_block(held),
+        citation=[
+            ("Software", f"{program}; versions of its libraries are in the last section"),
+            ("Cite as", f"{held.name}, survey report, {program}, {worked:%Y-%m-%d}"),
+        ],
     )
     return report, _data(held, found, said, known)
 
@@ -68,23 +77,6 @@ def last_worked_on(held: Held) -> datetime:
     """When the newest of its stages was finished."""
     newest = max((held.workspace / n / STAGE_FILE).stat().st_mtime for n in held.stages)
     return datetime.fromtimestamp(newest, UTC)
-
-
-def _place(held: Held) -> str:
-    """Latitude and longitude of the survey; empty where unknown."""
-    datum = held.frame.datum
-    if datum is None:
-        return ""
-    return f"{datum.latitude_deg:.5f}, {datum.longitude_deg:.5f} (WGS 84)"
-
-
-def _title_block(held: Held) -> list[tuple[str, str]]:
-    """Citation details of the report."""
-    program = f"alice-survey {version('alice-survey')}"
-    return [
-        ("Software", f"{program}; versions of its libraries are in the last section"),
-        ("Cite as", f"{held.name}, survey report, {program}, {last_worked_on(held):%Y-%m-%d}"),
-    ]
 
 
 def survey_map(held: Held, layers: Sequence[PictureLayer | ShapeLayer]) -> SurveyMap:

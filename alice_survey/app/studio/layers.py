@@ -1,5 +1,6 @@
 """The rasters of a workspace as layers of a map, whose tiles pages request."""
 
+import contextlib
 import os
 import threading
 from collections.abc import Iterator, Sequence
@@ -39,19 +40,13 @@ class Layers:
         """The layers that are there, for a page that requests their tiles."""
         found: list[PictureLayer] = []
         for name, raster in _LAYERS.items():
-            try:
-                layer = self._picture_layer(name, shown=not found)
+            with contextlib.suppress(FileNotFoundError):
+                with self._check_unchanged(name, None) as token:
+                    pyramid = self._pyramid(name, token)
+                address = f"/tiles/{name}/{{}}.webp?v={token}"
                 if is_of_surface(self._workspace.folder, raster):
-                    found.append(layer)
-            except FileNotFoundError:
-                continue
+                    found.append(pyramid.layer(shown=not found, address=address))
         return found
-
-    def _picture_layer(self, name: str, *, shown: bool) -> PictureLayer:
-        with self._check_unchanged(name, None) as token:
-            pyramid = self._pyramid(name, token)
-        address = f"/tiles/{name}/{{}}.webp?v={token}"
-        return pyramid.layer(shown=shown, address=address)
 
     def tile(self, name: str, level: int, x: int, y: int, token: str | None) -> tuple[bytes, str]:
         """A tile as WebP, and the token of the raster that it is of.

@@ -118,11 +118,6 @@ def _costs(
     return {name: cost.scale(factor) for name, cost in costs.items()}
 
 
-def _cost_json(costs: Mapping[str, StageCost]) -> dict[str, float]:
-    total = total_cost(costs.values(), default_threads())
-    return {name: round(value, 1) for name, value in total.items()}
-
-
 def _commands(
     states: Mapping[str, str], costs: Mapping[str, StageCost], *, imported: bool
 ) -> list[dict[str, Any]]:
@@ -133,13 +128,14 @@ def _commands(
         if not made or (imported and name in _SIMULATED):
             continue
         left = [s for s in made if states.get(s, UP_TO_DATE) != UP_TO_DATE]
-        known = {stage: costs[stage] for stage in left if stage in costs}
+        known = [costs[stage] for stage in left if stage in costs]
+        total = total_cost(known, default_threads()) if known else {}
         needs = {n for s in left for n in spec(s).needs if n not in made}
         found.append(
             {
                 "name": name, "title": command.title, "left": left,
                 "after": [n for n in states if n in needs and states[n] in _NOT_THERE],
-                "cost": _cost_json(known) if known else None,
+                "cost": {name: round(value, 1) for name, value in total.items()} or None,
             }
         )  # fmt: skip
     return found

@@ -69,16 +69,13 @@ class _Shell:
     def map(self, call: Call) -> dict[str, Any]:
         """The layers of what the workspace holds, as the map's script takes them."""
         with self.studio.workspace.check_unchanged(*STAGES_MADE):
-            return self._map()
-
-    def _map(self) -> dict[str, Any]:
-        held = Held.of(self.studio.workspace.folder)
-        pictures = self.studio.layers.picture_layers()
-        layers: list[PictureLayer | ShapeLayer] = [*pictures, *shape_layers(held)]
+            held = Held.of(self.studio.workspace.folder)
+            pictures = self.studio.layers.picture_layers()
+            layers: list[PictureLayer | ShapeLayer] = [*pictures, *shape_layers(held)]
+            page_map = survey_map(held, layers)
         found: dict[str, Any] = {"layers": []}
         extent = (-_EMPTY_M, -_EMPTY_M, _EMPTY_M, _EMPTY_M)
         if layers:
-            page_map = survey_map(held, layers)
             found = json.loads(map_data(page_map)[0])
             extent = map_extent(page_map)
         found["extent"] = extent

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 import rasterio
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from alice_survey.app.studio.server import Server
@@ -219,6 +219,9 @@ def test_kinds_of_files(server: Server, folder: Path, name: str, kind: str) -> N
 
 
 @given(first=st.integers(0, 1_100_000), last=st.integers(0, 1_100_000), suffix=st.booleans())
+@example(first=0, last=0, suffix=False)
+@example(first=0, last=10**17, suffix=False)
+@example(first=0, last=0, suffix=True)
 @settings(max_examples=40, deadline=None)
 def test_ranges_are_the_files_bytes(
     server: Server, folder: Path, first: int, last: int, suffix: bool
