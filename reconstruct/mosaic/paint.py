@@ -19,7 +19,7 @@ from rasterio.windows import Window
 from alice_survey.core.artefacts import atomic_path
 from alice_survey.core.run.resources import release_memory
 from reconstruct.light.solve import LightSamples, at_places, joined_samples
-from reconstruct.mosaic.colour import ColourModel, curve_by_root, finish_colours
+from reconstruct.mosaic.colour import ColourModel
 from reconstruct.mosaic.grid import ALIGNED_PX, CELL_PX, Block, coarse, dem_around
 from reconstruct.mosaic.picture_measures import DARKEST, linear_table, read_small, well_exposed
 from reconstruct.mosaic.seams import Blend, candidates, choose_views
@@ -73,7 +73,6 @@ class Tools:
         """Mask of a picture as taken."""
         self.table = linear_table()
         self.weights = lanczos_weights()
-        self.curve = curve_by_root()
         self._survey = survey
         self._optics: dict[str, CameraOptics] = {}
         self._channels: dict[str, tuple[CameraOptics, ...]] = {}
@@ -540,19 +539,17 @@ def _colours(
             sample_lanczos(
                 picture, tools.table, tools.weights, own_x, own_y, channel, channel + 1, light
             )
-    factor, first = np.ones((1, 1, 3), np.float32), (0.0, 0.0)
+    places = sight.places(tools.optics(view).size_px)
+    light = task.colour.correct(light, view.camera, view.image, places, sight.range)
     if change is not None:  # bilinear between the centres of cells
         factor, box = change
-        half = 0.5 / CELL_PX - 0.5
-        first = (
-            part[0].start / CELL_PX + half - box[0].start,
-            part[1].start / CELL_PX + half - box[1].start,
+        rows, columns = (
+            (np.arange(size) + 0.5) / CELL_PX - 0.5 + pixels.start / CELL_PX - cells.start
+            for size, pixels, cells in zip(x.shape, part, box, strict=True)
         )
-    finish_colours(
-        light, (x, sight.y), sight.range, task.colour.nodes(view.camera, view.image),
-        task.colour.law, tools.optics(view).size_px, factor, first, 1.0 / CELL_PX, tools.curve,
-    )  # fmt: skip
-    return light
+        at = np.meshgrid(columns.astype(np.float32), rows.astype(np.float32))
+        light *= cv2.remap(factor, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return task.colour.levels(light)
 
 
 def _inner(block: Block, side_px: int = CELL_PX) -> tuple[slice, slice]:

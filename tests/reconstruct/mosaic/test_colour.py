@@ -10,8 +10,6 @@ from reconstruct.light.solve import GRID, LightSamples
 from reconstruct.mosaic.colour import (
     Colour,
     ColourModel,
-    curve_by_root,
-    finish_colours,
     solve_colour,
 )
 from reconstruct.mosaic.picture_measures import (
@@ -166,35 +164,16 @@ def test_the_srgb_curve_and_its_inverse_agree() -> None:
     np.testing.assert_allclose(encode_srgb(linear_table()), np.arange(256), atol=0.02)
 
 
-@pytest.mark.parametrize("wanted", ["even", "water"])
-def test_one_pass_over_pixels_equals_the_steps_over_pictures(wanted: Colour) -> None:
-    samples, facts = survey(0.4)
-    model = solve_colour(wanted, samples, facts)
-    rng = np.random.default_rng(3)
-    light = rng.uniform(0.01, 0.6, (7, 9, 3)).astype(np.float32)
-    x, y = (rng.uniform(0, n - 1, (7, 9)).astype(np.float32) for n in (640, 480))
-    x[0, 0] = -1
-    ranges = rng.uniform(1.6, 2.4, (7, 9)).astype(np.float32)
-    ranges[2, 3] = np.nan
-    factor = np.full((3, 3, 3), 1.3, np.float32)
-    places = np.column_stack([(x.ravel() + 0.5) / 640, (y.ravel() + 0.5) / 480]).astype(np.float32)
-    lifted = model.correct(light, "left", IMAGES[3], places, ranges) * 1.3
-    expected = np.minimum(encode_srgb(((lifted - model.black) / (1 - model.black)).clip(0, 4)), 600)
-    found = light.copy()
-    finish_colours(
-        found, (x, y), ranges, model.nodes("left", IMAGES[3]), model.law, (640, 480), factor,
-        (0.2, 0.1), 0.125, curve_by_root(),
-    )  # fmt: skip
-    np.testing.assert_allclose(found.reshape(-1, 3)[1:], expected.reshape(-1, 3)[1:], atol=0.1)
-    np.testing.assert_array_equal(found[0, 0], light[0, 0])
-
-
 def test_black_leaves_the_order_of_light_and_takes_less_than_the_dark() -> None:
     samples, facts = survey(0.4)
     model = solve_colour("even", samples, facts)
     assert (model.black > 0).all()
     assert (model.black < 0.08).all()
-    assert (model.law[7:10] > 1).all()
+    light = np.repeat(np.linspace(0, 1, 50, dtype=np.float32)[:, None], 3, axis=1)
+    levels = model.levels(light)
+    assert (levels[light < model.black] == 0).all()
+    assert (np.diff(levels[light[:, 0] > model.black.max()], axis=0) > 0).all()
+    np.testing.assert_allclose(levels[-1], 255, atol=0.01)
 
 
 def oblique_chain() -> tuple[LightSamples, list[PictureMeasures]]:
