@@ -36,7 +36,7 @@ VERTEX = np.dtype(
 )  # fmt: skip
 """One point of a mesh: place, normal and colour."""
 _FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
-_COLOURED = {"nx", "ny", "nz", "red", "green", "blue"}
+_COLOURED = {"nx", "ny", "nz", "red", "green", "blue", "sigma"}
 _CHUNK = 65_536
 """Points of which the bounds are kept, so that a tile reads only what may fall into it."""
 

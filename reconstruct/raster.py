@@ -127,6 +127,24 @@ def frame_tags(frame: WorldFrame) -> dict[str, str]:
     return tags | dict(frame.tags)
 
 
+def geotiff_profile(grid: DemGrid, frame: WorldFrame, threads: int) -> dict[str, Any]:
+    """What all tiled GeoTIFFs of a grid share; parts that nobody writes take no room."""
+    return {
+        "driver": "GTiff",
+        "width": grid.columns,
+        "height": grid.rows,
+        "crs": crs_of(frame),
+        "transform": transform_of(grid),
+        "tiled": True,
+        "blockxsize": BLOCK,
+        "blockysize": BLOCK,
+        "compress": "deflate",
+        "bigtiff": "if_safer",
+        "sparse_ok": True,
+        "num_threads": threads,
+    }
+
+
 @contextmanager
 def tiled_raster(
     path: Path,
@@ -150,24 +168,9 @@ def tiled_raster(
         unit: of its values; none of numbers.
         threads: that compress; the file is the same for any number.
     """
-    profile = {
-        "driver": "GTiff",
-        "width": grid.columns,
-        "height": grid.rows,
-        "count": 1,
-        "dtype": dtype,
-        "nodata": nodata,
-        "crs": crs_of(frame),
-        "transform": transform_of(grid),
-        "tiled": True,
-        "blockxsize": BLOCK,
-        "blockysize": BLOCK,
-        "compress": "deflate",
-        "predictor": 3 if dtype.startswith("float") else 2,
-        "bigtiff": "if_safer",
-        "sparse_ok": True,
-        "num_threads": threads,
-    }
+    profile = geotiff_profile(grid, frame, threads)
+    profile |= {"count": 1, "dtype": dtype, "nodata": nodata}
+    profile |= {"predictor": 3 if dtype.startswith("float") else 2}
     with rasterio.open(path, "w", **profile) as raster:
         raster.update_tags(**frame_tags(frame))
         raster.set_band_description(1, text)

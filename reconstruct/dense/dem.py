@@ -1,8 +1,8 @@
 """The digital elevation model: a surface projected on a grid, heights up, with their sigmas."""
 
 import math
-from dataclasses import dataclass, fields
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -34,8 +34,7 @@ _DIAGONAL = math.sqrt(2.0)
 _MIN_STATIONS = 2
 
 
-@dataclass(frozen=True, eq=False)
-class FusedCells:
+class FusedCells(NamedTuple):
     """What a surface shows in the cells of a grid, (rows, columns) each."""
 
     height: Float32
@@ -52,10 +51,9 @@ class FusedCells:
 
     def without(self, cells: NDArray[np.bool_]) -> "FusedCells":
         """The same with some cells emptied."""
-        bands: list[Any] = [getattr(self, field.name) for field in fields(self)]
+        bands: list[Any] = [*self]
         nothing = [band.dtype.type(np.nan if band.dtype.kind == "f" else 0) for band in bands]
-        pairs = zip(nothing, bands, strict=True)
-        return FusedCells(*(np.where(cells, empty, band) for empty, band in pairs))
+        return FusedCells(*map(partial(np.where, cells), nothing, bands))
 
 
 def cells_over(grid: DemGrid, surface: NDArray[Any]) -> FusedCells:
@@ -242,18 +240,14 @@ def fill_gaps(height: Float32, sigma: Float32, reach: int, cell: float) -> tuple
             for down, right in steps:
                 spread = 0.0
                 first, second, a, b = 0.0, 0.0, 0, 0
-                for n in range(1, reach + 1):
-                    r, c = row + n * down, column + n * right
-                    if 0 <= r < rows and 0 <= c < columns and not math.isnan(height[r, c]):
-                        first, a = height[r, c], n
-                        spread = sigma[r, c]
-                        break
-                for n in range(1, reach + 1):
-                    r, c = row - n * down, column - n * right
-                    if 0 <= r < rows and 0 <= c < columns and not math.isnan(height[r, c]):
-                        second, b = height[r, c], n
-                        spread = max(spread, sigma[r, c])
-                        break
+                for way in (1, -1):
+                    first, a, second, b = second, b, 0.0, 0
+                    for n in range(1, reach + 1):
+                        r, c = row + way * n * down, column + way * n * right
+                        if 0 <= r < rows and 0 <= c < columns and not math.isnan(height[r, c]):
+                            second, b = height[r, c], n
+                            spread = max(spread, sigma[r, c])
+                            break
                 if a == 0 or b == 0 or abs(first - second) > _STEP * (a + b) * cell:
                     continue
                 w = 1.0 / (a + b)

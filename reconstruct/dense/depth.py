@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
+from reconstruct.dense.refine_depth import known_span
 from reconstruct.dense.view_store import StoredDepth
 from reconstruct.views.model import View
 from reconstruct.views.range_shift import FAST, KernelLens, between_nodes, warped_at
@@ -337,11 +338,8 @@ def undo_rounding(fixed: NDArray[np.int16]) -> Float32:
 
 def without_mixed(disparity_px: Float32) -> Float32:
     """Remove the pixels on either side of a step, which mix what is near and what is far."""
-    kernel = np.ones((3, 3), np.uint8)
-    known = np.isfinite(disparity_px)
-    high = cv2.dilate(np.where(known, disparity_px, np.float32(-1e6)), kernel)
-    low = cv2.erode(np.where(known, disparity_px, np.float32(1e6)), kernel)
-    return np.where(known & (high - low <= _JUMP_PX * 2), disparity_px, np.float32(np.nan))
+    known, span = known_span(disparity_px, 3)
+    return np.where(known & (span <= _JUMP_PX * 2), disparity_px, np.float32(np.nan))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

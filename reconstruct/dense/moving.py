@@ -179,7 +179,7 @@ def keep_look(task: ViewTask) -> None:
     step = _step(view)
     h, w = height // step, width // step
     colour = store.load_colour(index)
-    factors = cv2.resize(store.load_factors(index), (width, height))
+    factors = cv2.resize(store.load(index, "factors"), (width, height))
     valid = store.load_mask(index, "valid", width) & (colour.max(axis=2) > _DARKEST)
     depth, _ = store.load_depth(index, "fine")
     depth[~store.load_mask(index, "kept", width)] = np.nan

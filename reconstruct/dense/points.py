@@ -1,7 +1,7 @@
 """Depth maps as points with normals and colours, in local east, north, up."""
 
 import math
-from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +27,7 @@ _REACH = 2
 """Normals are spanned by the points this many pixels to either side."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Points:
+class Points(NamedTuple):
     """Points of one or more views; arrays of N rows."""
 
     enu: Float32
@@ -44,7 +43,7 @@ class Points:
 
     def part(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> "Points":
         """Those of the points that a mask or their numbers choose."""
-        return Points(**{field.name: getattr(self, field.name)[chosen] for field in fields(Points)})
+        return Points(*(values[chosen] for values in self))
 
 
 def part_in_box(
@@ -102,17 +101,11 @@ def points_in_box(
     """
     transform = enu_from_cam(view, offset_enu)
     frame = (part[0].start or 0, part[1].start or 0, *view.pinhole.size_px[::-1])
-    enu, normals, colours, sigmas = gather(
+    found = gather(
         depth, sigma, kept, colour, factors, view.kernel_lens, transform, np.array(box),
         _meeting(blocks, offset_enu, box), frame,
     )  # fmt: skip
-    return Points(
-        enu=enu,
-        normals=normals,
-        colours=colours,
-        sigmas=sigmas,
-        views=np.full(len(enu), number, np.int32),
-    )
+    return Points(*found, views=np.full(len(found[0]), number, np.int32))
 
 
 def points_of_pixels(view: View, depth: Float32, chosen: NDArray[np.bool_]) -> Array:
@@ -178,20 +171,9 @@ def _meeting(
 
 def join_points(parts: list[Points]) -> Points:
     """Points of several views as one."""
-    empty = np.empty((0, 3), np.float32)
-    none = Points(
-        enu=empty,
-        normals=empty,
-        colours=empty.astype(np.uint8),
-        sigmas=empty[:, 0],
-        views=empty[:, 0].astype(np.int32),
-    )
-    return Points(
-        **{
-            field.name: np.concatenate([getattr(part, field.name) for part in (none, *parts)])
-            for field in fields(Points)
-        }
-    )
+    row, rows = np.empty(0, np.float32), np.empty((0, 3), np.float32)
+    none = Points(rows, rows, rows.astype(np.uint8), row, row.astype(np.int32))
+    return Points(*map(np.concatenate, zip(none, *parts, strict=True)))
 
 
 @compiled(error_model="numpy", fastmath=FAST)

@@ -14,9 +14,9 @@ the noise that remains between pictures.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -221,8 +221,7 @@ def compare(
             speed[row, column] = math.sqrt(du * du + dv * dv)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class RefinedDepth:
+class RefinedDepth(NamedTuple):
     """Depth of a view where pictures agree, arrays of (H, W)."""
 
     depth: Float32
@@ -233,8 +232,7 @@ class RefinedDepth:
     """How many neighbours look alike there."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _NeighbourSums:
+class _NeighbourSums(NamedTuple):
     """What all neighbours say of a correction of the inverse depth, (H, W) each."""
 
     pull: Float32
@@ -286,8 +284,7 @@ def _look(other: ComparedView, device: Device) -> _Look:
     return other.view, device.put((other.spline, other.valid, other.view.kernel_lens))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Reference:
+class _Reference(NamedTuple):
     """Rows of a reference, with what all comparisons share as arrays of the device."""
 
     view: View
@@ -304,15 +301,8 @@ def _reference(reference: ComparedView, rows: slice, device: Device) -> _Referen
     lines = pixel_lines(reference.view.kernel_lens, *contrast.shape, rows.start)
     mean = _blur(contrast, WINDOW_SIGMA_PX)
     spread = _blur(contrast * contrast, WINDOW_SIGMA_PX) - mean * mean
-    contrast, lines, spread = device.put((contrast, lines, spread))
-    return _Reference(
-        view=reference.view,
-        valid=reference.valid[rows],
-        device=device,
-        contrast=contrast,
-        lines=lines,
-        spread=spread,
-    )
+    on_device = device.put((contrast, lines, spread))
+    return _Reference(reference.view, reference.valid[rows], device, *on_device)
 
 
 def refine(
@@ -347,9 +337,8 @@ def refine(
         inner = slice(first - part.start, last - part.start)
         rows = _reference(reference, part, device)
         band = _refine_band(rows, depth[part], sigma[part], looks, more)
-        bands.append([one[inner] for one in (band.depth, band.sigma, band.seen)])
-    joined = [np.concatenate(parts) for parts in zip(*bands, strict=True)]
-    return RefinedDepth(depth=joined[0], sigma=joined[1], seen=joined[2])
+        bands.append([values[inner] for values in band])
+    return RefinedDepth(*map(np.concatenate, zip(*bands, strict=True)))
 
 
 def _refine_band(
@@ -385,16 +374,19 @@ def _refine_band(
 
 def _has_step(inverse: Float32, speed: Float32) -> NDArray[np.bool_]:
     """Where known inverse depths in a window differ by much, in pixels of the farthest move."""
-    known = np.isfinite(inverse)
-    window = np.ones((_STEP_WINDOW_PX, _STEP_WINDOW_PX), np.uint8)
-    high = cv2.dilate(np.where(known, inverse, -_NONE), window)
-    low = cv2.erode(np.where(known, inverse, _NONE), window)
-    return np.asarray(known & ((high - low) * speed > _STEP_PX))
+    known, span = known_span(inverse, _STEP_WINDOW_PX)
+    return np.asarray(known & (span * speed > _STEP_PX))
+
+
+def known_span(values: Float32, side: int) -> tuple[NDArray[np.bool_], Float32]:
+    """Which values (H, W) are known, and the span of those known in a square of a side around."""
+    known, window = np.isfinite(values), np.ones((side, side), np.uint8)
+    high = cv2.dilate(np.where(known, values, -_NONE), window)
+    return known, high - cv2.erode(np.where(known, values, _NONE), window)
 
 
 def _choose(mask: NDArray[np.bool_], yes: _NeighbourSums, no: _NeighbourSums) -> _NeighbourSums:
-    names = [field.name for field in fields(yes)]
-    return _NeighbourSums(**{n: np.where(mask, getattr(yes, n), getattr(no, n)) for n in names})
+    return _NeighbourSums(*(np.where(mask, *both) for both in zip(yes, no, strict=True)))
 
 
 def _step(inverse: Float32, sums: _NeighbourSums) -> tuple[Float32, Float32]:
@@ -449,7 +441,7 @@ def _sums(one: _Reference, inverse: Float32, others: Sequence[_Look]) -> _Neighb
     pull, curvature, speed, likeness, seen = map(device.get, totals)
     with np.errstate(invalid="ignore"):
         likeness = likeness / curvature
-    return _NeighbourSums(pull=pull, curvature=curvature, speed=speed, likeness=likeness, seen=seen)
+    return _NeighbourSums(pull, curvature, speed, likeness, seen)
 
 
 @compiled(error_model="numpy", fastmath=FAST)

@@ -318,8 +318,8 @@ def run_dense(
     images, cameras = [view.image for view in views], [view.camera for view in views]
     light = solve_light(light_parts(store, samples, executor), np.stack(nodes), images, cameras)
     write_light(folder / "light.json", light)
-    factors = [light.factors(camera, image) for camera, image in zip(cameras, images, strict=True)]
-    store.save_factors(np.stack(factors))
+    for n, view in enumerate(views):
+        store.save(n, "factors", light.factors(view.camera, view.image))
     moving = []
     clear_moving(folder)
     if reconstruct.mask_moving:

@@ -251,6 +251,7 @@ SURFACE_POINT = np.dtype(
 )
 """One point: east, north, up; unit normal into the water; RGB; standard deviations along it, the
 point's own and what all points around share; views and stations that it rests on (255: or more)."""
+_FUSED = ("enu", "normal", "colour", "sigma", "views", "stations")
 _MIN_ALONG = 0.4
 """Least part of a point's normal along a direction for it to be fused there."""
 _GATE = 3.0
@@ -315,15 +316,12 @@ def _fuse_along(
         order, at = order[sort], [one[sort] for one in at]
     starts = np.flatnonzero(np.concatenate([[True], np.any(np.diff(at), axis=0), [True]]))
     cells = np.stack(at, axis=1)[starts[:-1]]
-    ranked = points.part(order)
     found = fuse_cells(
-        starts, origin[across] + (cells + 0.5) * cell, ranked.enu,
-        ranked.normals, ranked.colours, ranked.sigmas, ranked.views, stations, cell,
+        starts, origin[across] + (cells + 0.5) * cell, points.part(order), stations, cell,
         (across[0], across[1], axis), sign, _GATE, shared,
     )  # fmt: skip
     records = np.zeros(len(found[0]), SURFACE_POINT)
-    names = ("enu", "normal", "colour", "sigma", "views", "stations")
-    for name, values in zip(names, found, strict=True):
+    for name, values in zip(_FUSED, found, strict=True):
         records[name] = values
     return records
 
@@ -332,11 +330,7 @@ def _fuse_along(
 def fuse_cells(
     starts: NDArray[np.int64],
     middles: Array,
-    enu: Float32,
-    normals: Float32,
-    colours: NDArray[np.uint8],
-    sigmas: Float32,
-    views: NDArray[np.int32],
+    points: Points,
     stations: NDArray[np.int64],
     cell: float,
     axes: tuple[int, int, int],
@@ -351,11 +345,7 @@ def fuse_cells(
     Args:
         starts: (C + 1,) where the points of each cell start.
         middles: (C, 2) of the cells.
-        enu: (N, 3) sorted by cell, then by view.
-        normals: (N, 3) unit vectors.
-        colours: (N, 3) RGB.
-        sigmas: (N,) standard deviations along the normals.
-        views: (N,) of the points.
+        points: sorted by cell, then by view.
         stations: (V,) of every view, by its number.
         cell: side of a cell.
         axes: the two axes of the cells, and that of the direction.
@@ -366,6 +356,7 @@ def fuse_cells(
     Returns:
         Columns of `SURFACE_POINT` without what points share.
     """
+    enu, normals, colours, sigmas, views = points
     maximum, count = enu.shape[0], 0
     place, normal = np.empty((maximum, 3), np.float32), np.empty((maximum, 3), np.float32)
     colour = np.empty((maximum, 3), np.uint8)
@@ -494,9 +485,7 @@ def _aside(tree: cKDTree, place: Array, normal: Array) -> Array:
     apart = place[j] - place[i]
     count = len(place)
     near = np.bincount(i, minlength=count) + np.bincount(j, minlength=count) + 1
-    middle = np.stack(
-        [np.bincount(i, a, count) - np.bincount(j, a, count) for a in apart.T], axis=1
-    )
+    middle = np.array([np.bincount(i, a, count) - np.bincount(j, a, count) for a in apart.T]).T
     away = np.linalg.norm(middle, axis=1) / near
     found: Array = np.maximum(away - _MIN_ASIDE, 0.0)
     return found

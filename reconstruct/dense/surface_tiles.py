@@ -394,7 +394,7 @@ def _points_over(
                 sigma,
                 store.load_mask(index, "inside", view.pinhole.width_px, part) & sure,
                 store.load_colour(index, part),
-                store.load_factors(index),
+                np.asarray(store.load(index, "factors")),
                 offset,
                 sides,
                 blocks,

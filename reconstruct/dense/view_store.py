@@ -63,16 +63,6 @@ class ViewStore:
         """Forget an array."""
         self.path(view, name).unlink(missing_ok=True)
 
-    def save_factors(self, factors: NDArray[np.float32]) -> None:
-        """Keep what evens the light of all views (V, rows, columns, 3), in one file."""
-        with atomic_path(self.folder / "factors.npy") as path:
-            np.save(path, factors)
-
-    def load_factors(self, view: int) -> NDArray[np.float32]:
-        """What evens the light of a view, (rows, columns, 3)."""
-        every = np.load(self.folder / "factors.npy", mmap_mode="r")
-        return np.array(every[view])
-
     def save_depth(
         self, view: int, name: str, depth: NDArray[np.float32], sigma: NDArray[np.float32]
     ) -> None:

@@ -68,8 +68,6 @@ _PARTNERS = 6
 """Stations that each is linked with: those that share most with it. Others add time, not shape."""
 _BLOCK = 32
 """Pairs of stations in one task, so that sending them costs little."""
-_LinkAnswer = tuple[Array, Array, int, float, float]
-"""The second station's rig as the first sees it: quaternion, shift, inliers, variances of both."""
 _RigCamera = tuple[Mapping[str, object], Array, Array]
 """COLMAP's pinhole as `todict` gives it, and `cam_from_rig`: quaternion and shift. Numbers, not
 poses, go to and from processes: unpickling a pose rounds it once more."""
@@ -87,13 +85,18 @@ class StationLink:
     first: int
     second: int
     """The two stations."""
-    second_from_first: RigidTransform
-    """Transform between the rigs' frames, metres."""
-    inliers: int
+    quaternion: Array
+    shift: Array
+    """The second station's rig as the first sees it, metres."""
     turn_variance: float
     shift_variance: float
     """Variances of the turn and the shift, but for a factor common to all links (rad^2 and m^2,
     were points exact)."""
+
+    @property
+    def second_from_first(self) -> RigidTransform:
+        """Transform between the rigs' frames, metres."""
+        return RigidTransform.from_components(self.shift, Rotation.from_quat(self.quaternion))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -153,14 +156,13 @@ def stereo_points(
         a, b = seen.images[i], seen.images[j]
         if a.station != b.station:
             continue
-        start, ray = zip(
-            _rays(seen, i, pair.matches[:, 0], cam_from_rig),
-            _rays(seen, j, pair.matches[:, 1], cam_from_rig),
-            strict=True,
+        here, there = (
+            _rays(seen, picture, pair.matches[:, side], cam_from_rig)
+            for side, picture in enumerate((i, j))
         )
-        along, gap = ray_passes(start[0], ray[0], start[1], ray[1])
-        other, _ = ray_passes(start[1], ray[1], start[0], ray[0])
-        points = 0.5 * (start[0] + along[:, None] * ray[0] + start[1] + other[:, None] * ray[1])
+        along, gap = ray_passes(*here, *there)
+        other, _ = ray_passes(*there, *here)
+        points = 0.5 * (here[0] + along[:, None] * here[1] + there[0] + other[:, None] * there[1])
         focal = seen.cameras[a.camera].mean_focal_length()
         with np.errstate(invalid="ignore"):
             good = (along > 0) & (other > 0) & (gap * focal < _MAX_GAP_PX * along)
@@ -194,20 +196,7 @@ def link_stations(
     ]
     resect = partial(_resect_all, rig=rig, seed=seed)
     found = executor.map(resect, blocks, label="linking stations")
-    answers = zip(tasks, (answer for block in found for answer in block), strict=True)
-    return [
-        StationLink(
-            first=task.first,
-            second=task.second,
-            second_from_first=RigidTransform.from_components(shift, Rotation.from_quat(turn)),
-            inliers=inliers,
-            turn_variance=turn_variance,
-            shift_variance=shift_variance,
-        )
-        for task, answer in answers
-        if answer is not None
-        for turn, shift, inliers, turn_variance, shift_variance in (answer,)
-    ]
+    return [link for block in found for link in block if link is not None]
 
 
 def _rays(
@@ -290,7 +279,7 @@ def _collect(
 
 def _resect_all(
     tasks: Sequence[_Resection], rig: Sequence[_RigCamera], seed: int
-) -> list[_LinkAnswer | None]:
+) -> list[StationLink | None]:
     ransac = pycolmap.RANSACOptions()
     ransac.max_error = _MAX_ERROR_PX
     ransac.min_inlier_ratio = _MIN_SHARE
@@ -318,7 +307,7 @@ def _resect_all(
 
 def _resect(
     task: _Resection, estimate: Callable[..., Any], pinholes: RigPinholes
-) -> _LinkAnswer | None:
+) -> StationLink | None:
     found = estimate(task.pixels, task.points, task.cameras.tolist())
     if found is None or found["num_inliers"] < max(_MIN_INLIERS, _MIN_SHARE * len(task.points)):
         return None
@@ -330,8 +319,11 @@ def _resect(
     turns, shifts = float(np.trace(covariance[:3, :3])), float(np.trace(covariance[3:, 3:]))
     if not (turns > 0 and shifts > 0 and np.isfinite(turns + shifts)):
         return None
-    shift = np.asarray(pose.translation)
-    return pose.rotation.as_quat(), shift, int(found["num_inliers"]), turns, shifts
+    return StationLink(
+        first=task.first, second=task.second,
+        quaternion=pose.rotation.as_quat(), shift=np.asarray(pose.translation),
+        turn_variance=turns, shift_variance=shifts,
+    )  # fmt: skip
 
 
 def refine_link(

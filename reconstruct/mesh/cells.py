@@ -347,13 +347,7 @@ class CellMesh:
 
     def save(self, path: Path) -> "Cell":
         """Write it."""
-        np.savez(
-            path,
-            vertices=self.vertices,
-            triangles=self.triangles,
-            cut=self.cut,
-            distance=self.distance,
-        )
+        np.savez(path, **vars(self))
         low, high = self.vertices.min(axis=0).tolist(), self.vertices.max(axis=0).tolist()
         return Cell(
             path=path,
@@ -378,12 +372,7 @@ class Cell:
     def mesh(self) -> CellMesh:
         """Read it."""
         with np.load(self.path) as data:
-            return CellMesh(
-                vertices=data["vertices"],
-                triangles=data["triangles"],
-                cut=data["cut"],
-                distance=float(data["distance"]),
-            )
+            return CellMesh(**{**data, "distance": float(data["distance"])})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -409,10 +398,9 @@ class CellLevel:
 
 def join(parts: Sequence[CellMesh]) -> CellMesh:
     """Join meshes where they were cut; the triangles are those of the parts, in order."""
-    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     vertices = np.concatenate([np.empty((0, 3)), *(part.vertices for part in parts)])
-    triangles = _number_vertices([part.triangles for part in parts], starts)
-    cut = _number_vertices([part.cut for part in parts], starts).reshape(-1, 2)
+    triangles = number_vertices(parts, [part.triangles for part in parts])
+    cut = number_vertices(parts, [part.cut for part in parts]).reshape(-1, 2)
     target = np.arange(len(vertices))
     ends = np.unique(cut)
     _, first, group = np.unique(vertices[ends], axis=0, return_index=True, return_inverse=True)
@@ -429,11 +417,13 @@ def join(parts: Sequence[CellMesh]) -> CellMesh:
     )
 
 
-def _number_vertices(
-    parts: Sequence[NDArray[np.int32]], starts: NDArray[np.int64]
+def number_vertices(
+    parts: Sequence[CellMesh], corners: Sequence[NDArray[np.int32]]
 ) -> NDArray[np.int64]:
-    moved = [part.astype(np.int64) + start for part, start in zip(parts, starts, strict=False)]
-    return np.concatenate([np.empty((0, parts[0].shape[1]), np.int64), *moved])
+    """Corners of parts as numbers of vertices that follow one another, part after part."""
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    moved = [own.astype(np.int64) + start for own, start in zip(corners, starts, strict=False)]
+    return np.concatenate(moved)
 
 
 def decimate_cell(

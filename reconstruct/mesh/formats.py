@@ -152,7 +152,7 @@ def render_oblique(mesh: Textured) -> NDArray[np.uint8]:
     x = low[0] + (np.arange(columns) + 0.5) * side
     y = low[1] + (np.arange(rows) + 0.5) * side
     corners = mesh.wedges.vertex[mesh.wedges.triangles].astype(np.int32)
-    scene, normals = ray_scene(mesh.vertices, corners), face_normals(mesh.vertices, corners)
+    scene, normals = ray_scene((mesh.vertices, corners)), face_normals(mesh.vertices, corners)
     pages = [read_page(page) for page in mesh.pages]
     picture = np.empty((rows, columns, 3), np.uint8)
     for top in range(0, rows, _ROWS):

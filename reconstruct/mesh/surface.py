@@ -39,7 +39,6 @@ from reconstruct.mesh.topology import (
     find_unfolded,
     split_fans,
     triangulate,
-    without_folds,
 )
 from reconstruct.ply import CloudFile
 
@@ -105,7 +104,8 @@ def mesh_cloud(
         levels.append(coarser_level(levels, step, folder, executor))
     whole, error = levels[-1].whole(), levels[-1].error
     vertices = whole.vertices
-    triangles = without_folds(vertices, without_pairs(whole.triangles))
+    triangles = without_pairs(whole.triangles)
+    triangles = triangles[find_unfolded(vertices, triangles)]
     part, area = component_areas(vertices, triangles)
     large = area[part] >= min(_MIN_PART_STEPS2 * step * step, area.max(initial=0.0))
     if not large.any():
@@ -121,8 +121,7 @@ def finest_level(
     cloud: CloudFile, step: float, error: float, folder: Path, executor: Executor
 ) -> CellLevel:
     """The mesh of a cloud in cells of 2 x 2 tiles; arguments as `mesh_cloud` takes them."""
-    sample = cloud.sample(200_000)
-    sigma = float(np.median(sample["sigma"])) if "sigma" in (sample.dtype.names or ()) else 1.0
+    sigma = float(np.median(cloud.sample(200_000)["sigma"]))
     tiles = surface_tiles(cloud, step)
     (x, y), (side, _) = tiles[0]
     (folder / "lattice").mkdir(parents=True)
@@ -194,10 +193,8 @@ def mesh_tile(
         return None
     points = np.column_stack([records[axis].astype(np.float64) for axis in "xyz"]) / step
     normals = np.column_stack([records[f"n{axis}"].astype(np.float64) for axis in "xyz"])
-    weights = np.ones(len(points))
-    if "sigma" in (records.dtype.names or ()):
-        ratio = sigma / np.maximum(records["sigma"].astype(np.float64), 1e-3 * sigma)
-        weights = np.minimum(ratio * ratio, _MAX_WEIGHT)
+    ratio = sigma / np.maximum(records["sigma"].astype(np.float64), 1e-3 * sigma)
+    weights = np.minimum(ratio * ratio, _MAX_WEIGHT)
     sound = np.isfinite(normals).all(axis=1) & np.isfinite(weights) & (weights > 0)
     points, normals, weights = points[sound], normals[sound], weights[sound]
     if len(points) < _NEIGHBOURS:

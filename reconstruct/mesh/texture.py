@@ -137,21 +137,6 @@ def make_texture(
     if tile is not None:
         page = np.empty(len(charts.views), np.int32)
         page[charts.chart] = tile
-    return paint(setup, folder, vertices, triangles, charts, page, views, light, executor)
-
-
-def paint(
-    setup: MeshSetup,
-    folder: Path,
-    vertices: Array,
-    triangles: Triangles,
-    charts: Charts,
-    page: NDArray[np.int32] | None,
-    views: Sequence[View],
-    light: LightModel,
-    executor: Executor,
-) -> Textured:
-    """Paint the patches of a mesh; arguments as `make_texture` takes them."""
     wedges = make_wedges(triangles, charts)
     pixels = wedge_pixels(vertices, wedges, charts, views, setup.offset, setup.pixel)
     atlas = make_pages(pixels, wedges, page, len(charts.views))

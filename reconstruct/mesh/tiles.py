@@ -33,7 +33,7 @@ from alice_survey.core.executor import SERIAL, Executor
 from alice_survey.core.frames import Array
 from reconstruct.light.solve import LightModel
 from reconstruct.mesh.atlas import Wedges, make_pages, make_wedges
-from reconstruct.mesh.cells import Cell, CellLevel, CellMesh, Key, join
+from reconstruct.mesh.cells import Cell, CellLevel, Key, join, number_vertices
 from reconstruct.mesh.formats import write_glb
 from reconstruct.mesh.texture import (
     MeshSetup,
@@ -46,7 +46,6 @@ from reconstruct.mesh.texture import (
     wedge_pixels,
     write_jpeg,
 )
-from reconstruct.mesh.topology import Triangles
 from reconstruct.mesh.visibility import (
     CANDIDATES,
     blocks_near,
@@ -255,18 +254,11 @@ def paint_region(setup: TileSetup, task: RegionTask) -> None:
         SERIAL,
         tile,
         occluder_vertices=np.concatenate([part.vertices for part in beyond]),
-        occluder_triangles=_stack(beyond),
+        occluder_triangles=number_vertices(beyond, [part.triangles for part in beyond]),
     )
     for number, key in enumerate(list(task.tiles)[: task.count]):
         _write_tile(setup, 0, key, _of_page(textured, number))
     shutil.rmtree(folder)
-
-
-def _stack(parts: Sequence[CellMesh]) -> Triangles:
-    """(T, 3) triangles of meshes whose vertices follow one another."""
-    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    moved = [part.triangles + start for part, start in zip(parts, starts, strict=False)]
-    return np.concatenate(moved).astype(np.int32)
 
 
 def _of_page(mesh: Textured, number: int) -> Textured:
@@ -355,28 +347,21 @@ def _colours_next_to(
     parts, uv, pages = [], [], []
     for skin in skins:
         with np.load(skin) as data:
-            parts.append(
-                CellMesh(
-                    vertices=data["vertices"] - middle,
-                    triangles=data["triangles"],
-                    cut=np.empty((0, 2), np.int32),
-                )
-            )
+            parts.append((data["vertices"] - middle, data["triangles"]))
             uv.append(data["uv"])
         page = read_page(skin.with_suffix(".jpg"))
         pages.append(cv2.resize(page, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
-    owner = np.repeat(np.arange(len(parts)), [len(part.triangles) for part in parts])
-    scene = ray_scene(np.concatenate([part.vertices for part in parts]), _stack(parts))
-    found = scene.compute_closest_points(o3d.core.Tensor(points), 1)
+    found = ray_scene(*parts).compute_closest_points(o3d.core.Tensor(points), 1)
+    owner = found["geometry_ids"].numpy()
     face = found["primitive_ids"].numpy().astype(np.int64)
     share = found["primitive_uvs"].numpy().astype(np.float64)
     weights = np.column_stack([1.0 - share.sum(axis=1), share])
-    at = (np.concatenate(uv)[face] * weights[..., None]).sum(axis=1)
     colours = np.empty((len(points), 3), np.uint8)
     for number, page in enumerate(pages):
-        mine = owner[face] == number
+        mine = owner == number
+        at = (uv[number][face[mine]] * weights[mine][..., None]).sum(axis=1)
         size = page.shape[1::-1]
-        pixels = np.column_stack([at[mine, 0], 1.0 - at[mine, 1]]) * size
+        pixels = np.column_stack([at[:, 0], 1.0 - at[:, 1]]) * size
         colours[mine] = remap(page, pixels, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
     return colours
 

@@ -41,11 +41,6 @@ def triangulate(vertices: Array, quads: NDArray[np.int32]) -> Triangles:
     return np.ascontiguousarray(turned[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3))
 
 
-def without_folds(vertices: Array, triangles: Triangles) -> Triangles:
-    """Triangles without those that `find_unfolded` leaves out."""
-    return triangles[find_unfolded(vertices, triangles)]
-
-
 def find_unfolded(vertices: Array, triangles: Triangles) -> NDArray[np.bool_]:
     """Triangles (T,) that have an area and are at no edge that more than two share."""
     a, b, c = (vertices[triangles[:, k]] for k in range(3))

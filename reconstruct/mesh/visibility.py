@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,8 +50,7 @@ class Candidates:
     """(T, CANDIDATES); 0 where there are no more."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Shape:
+class _Shape(NamedTuple):
     """A mesh to look at."""
 
     vertices: Array
@@ -212,21 +211,15 @@ def _quality(
 def _geometry(path: Path, _written_ns: int) -> _Shape:
     with np.load(path) as data:
         vertices, triangles, offset = data["vertices"], data["triangles"], data["offset"]
-        scene = ray_scene(vertices, triangles)
+        meshes = [(vertices, triangles)]
         if "occluder_triangles" in data and len(data["occluder_triangles"]):
-            _add(scene, data["occluder_vertices"], data["occluder_triangles"])
+            meshes.append((data["occluder_vertices"], data["occluder_triangles"]))
     spheres = block_spheres(vertices)
     block = triangles[:, 0] // _BLOCK
     counts = np.bincount(block, minlength=len(spheres[0]))
-    return _Shape(
-        vertices=vertices,
-        triangles=triangles,
-        offset=offset,
-        scene=scene,
-        spheres=spheres,
-        by_block=np.argsort(block, kind="stable").astype(np.int32),
-        starts=np.concatenate([[0], np.cumsum(counts)]),
-    )
+    by_block = np.argsort(block, kind="stable").astype(np.int32)
+    starts = np.concatenate([[0], np.cumsum(counts)])
+    return _Shape(vertices, triangles, offset, ray_scene(*meshes), spheres, by_block, starts)
 
 
 def distances_from(vertices: Array, triangles: Triangles, points: Array) -> Array:
@@ -234,28 +227,23 @@ def distances_from(vertices: Array, triangles: Triangles, points: Array) -> Arra
     import open3d as o3d
 
     middle = points.mean(axis=0) if len(points) else vertices[0]
-    scene = ray_scene(vertices - middle, triangles)
+    scene = ray_scene((vertices - middle, triangles))
     found = scene.compute_distance(o3d.core.Tensor((points - middle).astype(np.float32)), 1)
     distances: Array = found.numpy().astype(np.float64)
     return distances
 
 
-def ray_scene(vertices: Array, triangles: Triangles) -> Any:
-    """A mesh as an Open3D `RaycastingScene`."""
+def ray_scene(*meshes: tuple[Array, Triangles]) -> Any:
+    """Vertices and triangles of meshes as an Open3D `RaycastingScene`."""
     import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    _add(scene, vertices, triangles)
+    for vertices, triangles in meshes:
+        scene.add_triangles(
+            o3d.core.Tensor(np.ascontiguousarray(vertices, dtype=np.float32)),
+            o3d.core.Tensor(np.ascontiguousarray(triangles, dtype=np.uint32)),
+        )
     return scene
-
-
-def _add(scene: Any, vertices: Array, triangles: Triangles) -> None:
-    import open3d as o3d
-
-    scene.add_triangles(
-        o3d.core.Tensor(np.ascontiguousarray(vertices, dtype=np.float32)),
-        o3d.core.Tensor(np.ascontiguousarray(triangles, dtype=np.uint32)),
-    )
 
 
 _SEAM_COST = 0.35

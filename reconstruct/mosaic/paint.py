@@ -5,10 +5,11 @@ A process keeps lenses, small copies and a few pictures between tasks.
 
 import uuid
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from itertools import combinations
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -136,8 +137,7 @@ class SeenView:
     """Sharpness over the survey's median."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _ViewOfCells:
+class _ViewOfCells(NamedTuple):
     """How a view sees the cells of a box of a block."""
 
     entry: SeenView
@@ -424,9 +424,7 @@ def _looks(
         if not sight.quality.any():
             continue
         box = _bounding(sight.quality > 0)
-        sight = SeenCells(
-            x=sight.x[box], y=sight.y[box], quality=sight.quality[box], range=sight.range[box]
-        )
+        sight = SeenCells(*(values[box] for values in sight))
         places = sight.places(optics.size_px)
         copy = tools.small(entry.view.image)
         quality = sight.quality * np.float32(np.clip(entry.sharpness, *_SHARP))
@@ -438,7 +436,7 @@ def _looks(
             valid = at_places(copy.valid[..., None], places, 1).reshape(quality.shape)
             quality[valid < 0.999] = 0
         if quality.any():
-            looks.append(_ViewOfCells(entry=entry, sight=replace(sight, quality=quality), box=box))
+            looks.append(_ViewOfCells(entry, sight._replace(quality=quality), box))
     return looks
 
 
@@ -507,10 +505,9 @@ def _sight_of(
         # as far as the kernel reaches, what is masked would colour its surroundings
         clear = cv2.erode(usable.astype(np.uint8) * np.uint8(255), _REACHED)
         inside = cv2.remap(
-            clear, sight.x, sight.y, cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_CONSTANT,
-        )  # fmt: skip
-        sight = replace(sight, quality=np.where(inside < 255, np.float32(0), sight.quality))
+            clear, sight.x, sight.y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
+        )
+        sight = sight._replace(quality=np.where(inside < 255, np.float32(0), sight.quality))
     return sight
 
 

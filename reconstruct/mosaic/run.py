@@ -67,15 +67,13 @@ from reconstruct.mosaic.seams import SUPPORT_PX
 from reconstruct.mosaic.visibility import Water, find_occluders, occluders_folder
 from reconstruct.planes import PLANES, Plane, plane_folders, read_plane, turn_model, write_plane
 from reconstruct.raster import (
-    BLOCK,
     DemGrid,
-    crs_of,
     frame_tags,
+    geotiff_profile,
     grid_of,
     opened_raster,
     round_cell,
     small_cache,
-    transform_of,
     write_png,
 )
 from reconstruct.views.model import SparseModel, WorldFrame, read_model, read_warps
@@ -94,7 +92,7 @@ def write_tiles(
     threads: int,
 ) -> float:
     """Write colours and sources as they come; return the share of pixels that have colour."""
-    shared = _profile(grid, frame, threads)
+    shared = geotiff_profile(grid, frame, threads) | {"zlevel": 1}
     numbers = "uint16" if len(names) <= _MAX_UINT16 else "uint32"
     painted = 0
     with (
@@ -125,7 +123,7 @@ def write_labels(
     threads: int,
 ) -> None:
     """Write view and tones of each cell, and a raster of how many pictures and stations see it."""
-    shared = _profile(coarse(grid), frame, threads)
+    shared = geotiff_profile(coarse(grid), frame, threads) | {"zlevel": 1}
     with (
         rasterio.open(cells_of[0], "w", count=1, dtype="int32", **shared) as labels,
         rasterio.open(
@@ -143,24 +141,6 @@ def write_labels(
             labels.write(block.label, 1, window=window)
             tones.write(block.tones, window=window)
             raster.write(np.stack([block.pictures, block.stations]), window=window)
-
-
-def _profile(grid: DemGrid, frame: WorldFrame, threads: int) -> dict[str, object]:
-    return {
-        "driver": "GTiff",
-        "width": grid.columns,
-        "height": grid.rows,
-        "crs": crs_of(frame),
-        "transform": transform_of(grid),
-        "tiled": True,
-        "blockxsize": BLOCK,
-        "blockysize": BLOCK,
-        "compress": "deflate",
-        "zlevel": 1,
-        "bigtiff": "if_safer",
-        "sparse_ok": True,
-        "num_threads": threads,
-    }
 
 
 @progress.step("write the mosaic with overviews")

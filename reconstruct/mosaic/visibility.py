@@ -12,6 +12,7 @@ import math
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,13 +123,7 @@ def find_occluders(
 def read_occluders(folder: Path) -> Occluders:
     """What `find_occluders` wrote."""
     with np.load(folder / "index.npz") as index:
-        return Occluders(
-            folder=folder,
-            numbers=index["numbers"],
-            centres=index["centres"],
-            radii=index["radii"],
-            spacing=float(index["spacing"]),
-        )
+        return Occluders(folder=folder, **index)
 
 
 @small_cache()
@@ -252,8 +247,7 @@ class CameraOptics:
     """Width and height of the picture as taken."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SeenCells:
+class SeenCells(NamedTuple):
     """Where and how well a view shows the cells of a grid, (H, W) each."""
 
     x: Float32
@@ -295,7 +289,8 @@ class Ground:
         if view.image not in self._visible:
             path = None if self._stored is None else visible_path(self._stored, view.image)
             if path is not None and path.is_file():
-                self._visible[view.image] = _load_visible(path)
+                with np.load(path) as stored:
+                    self._visible[view.image] = Visible(**stored)
             else:
                 self._visible[view.image] = visible_over(view, self.dem, self.around, self._stored)
         return self._visible[view.image]
@@ -332,19 +327,12 @@ def visible_over(view: View, dem: Float32, around: DemGrid, stored: Path | None 
         around: their cells.
         stored: folder of what is known of the plane; None where nothing stands off the DEM.
     """
-    known = np.isfinite(dem)
+    known = dem[np.isfinite(dem)]
     part = (0, 0, 0, 0)
-    if known.any():
-        part = _reach(view, (float(dem[known].min()), float(dem[known].max())), around)
-    cells = visible_cells(
-        dem,
-        enu_from_cam(view, np.zeros(3))[:, 3],
-        around.west,
-        around.north,
-        around.cell,
-        _HIDES_CELLS * around.cell,
-        part,
-    )
+    if len(known):
+        part = _reach(view, (float(known.min()), float(known.max())), around)
+    centre, cell = enu_from_cam(view, np.zeros(3))[:, 3], around.cell
+    cells = visible_cells(dem, centre, around.west, around.north, cell, _HIDES_CELLS * cell, part)
     if stored is not None:
         rows, columns = np.nonzero(cells)
         points = np.column_stack([
@@ -357,12 +345,11 @@ def visible_over(view: View, dem: Float32, around: DemGrid, stored: Path | None 
 def _reach(view: View, heights: tuple[float, float], around: DemGrid) -> tuple[int, int, int, int]:
     """Rows and columns of a DEM that a view may see."""
     west, east, south, north = footprints((view,), heights).boxes[0]
-    edge = 2.0 * around.cell
-    rows = (np.array([around.north - north - edge, around.north - south + edge])) / around.cell
-    columns = (np.array([west - edge - around.west, east + edge - around.west])) / around.cell
-    r = np.clip(rows, 0, around.rows).astype(int)
-    c = np.clip(columns, 0, around.columns).astype(int)
-    return int(r[0]), int(r[1]), int(c[0]), int(c[1])
+    rows = np.array([around.north - north, around.north - south]) / around.cell + [-2, 2]
+    columns = np.array([west - around.west, east - around.west]) / around.cell + [-2, 2]
+    top, bottom = np.clip(rows, 0, around.rows).astype(int).tolist()
+    left, right = np.clip(columns, 0, around.columns).astype(int).tolist()
+    return top, bottom, left, right
 
 
 def occluders_folder(stored: Path) -> Path:
@@ -388,17 +375,11 @@ def store_visible(folder: Path, view: View, dem: Float32, around: DemGrid) -> No
     rows, columns = np.flatnonzero(visible.cells.any(1)), np.flatnonzero(visible.cells.any(0))
     top, left = (int(seen[0]) if len(seen) else 0 for seen in (rows, columns))
     cells = visible.cells[top : rows.max(initial=-1) + 1, left : columns.max(initial=-1) + 1]
-    corner = np.array([around.west + left * around.cell, around.north - top * around.cell])
+    corner = around.window(top, left, *cells.shape)
     path = visible_path(folder, view.image)
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, cells=cells, corner=corner)
-
-
-def _load_visible(path: Path) -> Visible:
-    with np.load(path) as stored:
-        west, north = stored["corner"].tolist()
-        return Visible(cells=stored["cells"], west=west, north=north)
+        np.savez_compressed(file, cells=cells, west=corner.west, north=corner.north)
 
 
 def camera_optics(warp: PinholeWarp, scaled: bool) -> CameraOptics:
@@ -417,12 +398,7 @@ def channel_optics(warp: PinholeWarp, water: Water, scaled: bool) -> tuple[Camer
     All see through the pinhole of green; the rays that they take through port and water differ by
     their indices, at the working range and beyond it.
     """
-    cameras = channel_cameras(
-        warp.camera,
-        temperature_c=water.temperature_c,
-        salinity_psu=water.salinity_psu,
-        depth_m=water.depth_m,
-    )
+    cameras = channel_cameras(warp.camera, **vars(water))
     found = {n: camera_optics(replace(warp, camera=cameras[n]), scaled) for n in CHANNELS}
     return found["blue"], found["green"], found["red"]
 
@@ -451,7 +427,7 @@ def see(
     rotation = camera[:, :3].T
     cam_from_enu = np.column_stack([rotation, -rotation @ camera[:, 3]])
     lens = replace(view, shift=optics.shift).kernel_lens
-    x, y, quality, ranges = look_up(
+    found = look_up(
         surface.height,
         requested,
         visible.cells,
@@ -466,7 +442,7 @@ def see(
         grid.cell,
         _RIM_PX,
     )
-    return SeenCells(x=x, y=y, quality=quality, range=ranges)
+    return SeenCells(*found)
 
 
 _TAPS = 8
