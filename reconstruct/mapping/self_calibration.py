@@ -47,6 +47,7 @@ _ROUNDS = 2
 observations fit."""
 _CONTRADICTION = 1.05
 """EXIF's focal length goes when freeing it lowers the mean reprojection error by this factor."""
+_NOT_EXIF = "focal length from the pictures, not EXIF"
 _MAX_ASPECT, _MAX_TANGENTIAL = 0.03, 0.03
 """Bounds of a sane lens: difference of the two focal lengths, tangential distortion."""
 _MIN_FULL = 8
@@ -102,12 +103,13 @@ def map_self_calibrated(
                 seed,
                 free="distortion" if known else "all",
             )
+            if known and not model.num_points3D():  # so wrong that no rig suits the cameras
+                freed_rig = map_self_calibrated(seen, (), folder, seed)
+                return replace(freed_rig, notes=(*freed_rig.notes, _NOT_EXIF))
         found = [model, *found[1:]]
     model, kept = calibrate_fully(model, keep_focal=known)
     if known:
-        notes.append(
-            "focal length as EXIF states it" if kept else "focal length from the pictures, not EXIF"
-        )
+        notes.append("focal length as EXIF states it" if kept else _NOT_EXIF)
     baseline, factor = float("nan"), 1.0
     if cam_from_rig is not None:
         factor, baseline = 1.0 / model_baseline(model), 1.0
