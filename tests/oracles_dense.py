@@ -10,10 +10,11 @@ from typing import Any
 import cv2
 import numpy as np
 import pycolmap
+import rasterio
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.core.artefacts import write_csv, write_json
+from alice_survey.core.artefacts import write_json
 from alice_survey.core.config import CameraConfig, WaterConfig
 from alice_survey.core.frames import BODY_FROM_NADIR_CAM, Array, Datum
 from camera_calib.approximation.pinhole_warp import Pinhole, PinholeWarp, best_warp
@@ -22,6 +23,7 @@ from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.rig import design_rig
 from reconstruct.raster import DemGrid
 from reconstruct.views.model import SparseModel, View, WorldFrame, write_frame
+from reconstruct.views.model_files import colmap_pinhole, rigid3d
 from reconstruct.views.range_shift import no_shift, range_shift
 from tests.cameras import changed
 
@@ -249,15 +251,17 @@ def stereo_views(norths: Array, easts: Array, heading_deg: float = 20.0) -> list
             pose = RigidTransform.from_components(centre, ned_from_body * BODY_FROM_NADIR_CAM)
             views.append(
                 View(
-                    image=f"{camera}/{station:03d}.png",
-                    camera=camera,
-                    station=station,
-                    pinhole=PINHOLE,
-                    world_from_cam=pose,
-                    shift=no_shift(WIDTH, HEIGHT),
+                    image=f"{camera}/{station:03d}.png", camera=camera, station=station,
+                    pinhole=PINHOLE, world_from_cam=pose, shift=no_shift(WIDTH, HEIGHT),
                 )
-            )
+            )  # fmt: skip
     return sorted(views, key=lambda view: view.image)
+
+
+def two_lines(*along_m: float) -> list[View]:
+    """Two lines, half a metre apart, of stereo stations at these places along each."""
+    along, aside = np.meshgrid(along_m, [0.1, 0.6])
+    return stereo_views(along.ravel(), aside.ravel(), heading_deg=0.0)
 
 
 def port_view(centre: list[float], rpy_deg: list[float]) -> View:
@@ -377,24 +381,17 @@ def write_workspace(
             },
         },
     )
-    _write_track(sparse / "track.csv", model.views)
     for stage in ("images", "sparse"):
         write_json(folder / stage / "stage.json", {})
     return folder
 
 
-def _write_track(path: Path, views: tuple[View, ...]) -> None:
-    """What the mosaic's figure of the track reads of `sparse/track.csv`."""
-    header = ("image", "station", "time_s", "north_m", "east_m", "depth_m", "qx", "qy", "qz", "qw")
-    write_csv(
-        path,
-        header,
-        [
-            (view.image, view.station, float(view.station), *view.world_from_cam.translation,
-             *view.world_from_cam.rotation.as_quat())
-            for view in views
-        ],
-    )  # fmt: skip
+def read_raster(path: Path, band: int | None = 1) -> tuple[Array, Array, Array]:
+    """Values of a band (of all of them for None), and north and east of the cells' centres."""
+    with rasterio.open(path) as raster:
+        values, t = raster.read(band).astype(np.float64), raster.transform
+    rows, columns = np.mgrid[: values.shape[-2], : values.shape[-1]] + 0.5
+    return values, t.f + rows * t.e, t.c + columns * t.a
 
 
 def _warp(view: View) -> dict[str, object]:
@@ -413,16 +410,9 @@ def _colmap(model: SparseModel) -> pycolmap.Reconstruction:
     colmap = pycolmap.Reconstruction()
     names = sorted({view.camera for view in model.views})
     for number, name in enumerate(names, 1):
-        view = next(v for v in model.views if v.camera == name)
-        colmap.add_camera_with_trivial_rig(
-            pycolmap.Camera(
-                camera_id=number,
-                model="PINHOLE",
-                width=view.pinhole.width_px,
-                height=view.pinhole.height_px,
-                params=view.pinhole.numbers,
-            )
-        )
+        camera = colmap_pinhole(next(v for v in model.views if v.camera == name).pinhole)
+        camera.camera_id = number
+        colmap.add_camera_with_trivial_rig(camera)
     tracks: dict[int, list[pycolmap.TrackElement]] = {}
     for number, view in enumerate(model.views, 1):
         seen = model.observations[model.observations[:, 1] == number - 1, 0]
@@ -434,13 +424,7 @@ def _colmap(model: SparseModel) -> pycolmap.Reconstruction:
         for place, point in enumerate(seen):
             element = pycolmap.TrackElement(number, place)
             tracks.setdefault(int(point), []).append(element)
-        cam_from_world = view.world_from_cam.inv()
-        colmap.add_image_with_trivial_frame(
-            image,
-            pycolmap.Rigid3d(
-                pycolmap.Rotation3d(cam_from_world.rotation.as_quat()), cam_from_world.translation
-            ),
-        )
+        colmap.add_image_with_trivial_frame(image, rigid3d(view.world_from_cam.inv()))
     for point in sorted(tracks):
         colmap.add_point3D(model.points_world[point], pycolmap.Track(tracks[point]))
     return colmap

@@ -3,16 +3,22 @@
 import numpy as np
 
 
-def match_slowly(a: np.ndarray, b: np.ndarray, ratio: float) -> np.ndarray:
-    """Mutual nearest neighbours with a ratio test, one pair of descriptors at a time."""
-    distance = np.array([[int(((x.astype(int) - y.astype(int)) ** 2).sum()) for y in b] for x in a])
+def match_slowly(
+    a: np.ndarray, b: np.ndarray, ratio: float, searched: np.ndarray | None = None
+) -> np.ndarray:
+    """Mutual nearest neighbours with a ratio test, one pair of descriptors at a time.
+
+    Among the pairs that a (N, M) table allows, where there is one.
+    """
+    searched = np.ones((len(a), len(b)), bool) if searched is None else searched
+    distance = np.full(searched.shape, np.iinfo(np.int64).max)
+    for i, j in np.argwhere(searched):
+        distance[i, j] = int(((a[i].astype(int) - b[j].astype(int)) ** 2).sum())
     matches = []
-    for i in range(len(a)):
+    for i in np.flatnonzero(searched.sum(axis=1) >= 2):
         j = int(np.argmin(distance[i]))
-        others = [distance[i, k] for k in range(len(b)) if k != j]
-        if int(np.argmin(distance[:, j])) != i:
-            continue
-        if distance[i, j] < ratio**2 * min(others):
+        others = [distance[i, k] for k in np.flatnonzero(searched[i]) if k != j]
+        if int(np.argmin(distance[:, j])) == i and distance[i, j] < ratio**2 * min(others):
             matches.append((i, j))
     return np.array(matches, dtype=np.uint32).reshape(-1, 2)
 
@@ -69,28 +75,6 @@ def align_slowly(
 
     start = np.concatenate([pixel, affine.ravel(), [1.0, 0.0]])
     return least_squares(misses, start, x_scale=[1, 1, 0.1, 0.1, 0.1, 0.1, 0.1, 10]).x[:2]
-
-
-def match_near_slowly(
-    a: np.ndarray,
-    b: np.ndarray,
-    ratio: float,
-    searched: np.ndarray,
-) -> np.ndarray:
-    """As `match_slowly`, among the pairs of features that a (N, M) table allows."""
-    far = np.iinfo(np.int64).max
-    distance = np.full(searched.shape, far)
-    for i, j in np.argwhere(searched):
-        distance[i, j] = int(((a[i].astype(int) - b[j].astype(int)) ** 2).sum())
-    matches = []
-    for i in range(len(a)):
-        if searched[i].sum() < 2:
-            continue
-        j = int(np.argmin(distance[i]))
-        others = [distance[i, k] for k in np.flatnonzero(searched[i]) if k != j]
-        if int(np.argmin(distance[:, j])) == i and distance[i, j] < ratio**2 * min(others):
-            matches.append((i, j))
-    return np.array(matches, dtype=np.uint32).reshape(-1, 2)
 
 
 def vlad_slowly(descriptors: np.ndarray, words: np.ndarray) -> np.ndarray:

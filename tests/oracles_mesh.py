@@ -1,6 +1,5 @@
 """Slow, obvious twins of the mesh kernels, and scenes for meshes and single stereo pairs."""
 
-import itertools
 import math
 
 import cv2
@@ -35,11 +34,8 @@ def spread_value(corners: Array, values: Array, x: float, y: float) -> Array | N
 
 def boxes_overlap(corner: Array, box: Array) -> bool:
     """Whether any two boxes share a pixel."""
-    for a, b in itertools.combinations(range(len(box)), 2):
-        apart = (corner[a] + box[a] <= corner[b]).any() or (corner[b] + box[b] <= corner[a]).any()
-        if not apart:
-            return True
-    return False
+    before = ((corner + box)[:, None] <= corner).any(axis=2)
+    return bool((~(before | before.T))[np.triu_indices(len(box), 1)].any())
 
 
 SIZE = (320, 256)

@@ -71,16 +71,20 @@ def vertices_of(surface: NDArray[Any], cell: float, edge: float) -> NDArray[Any]
     return vertices
 
 
-def write_cloud(
-    path: Path, parts: Iterable[NDArray[Any]], offset_enu: Sequence[float], frame: WorldFrame
-) -> int:
-    """Write parts of `VERTEX` records as a PLY; return how many points there are."""
-    comments = [
+def frame_comments(frame: WorldFrame, offset_enu: Sequence[float]) -> list[str]:
+    """Lines for the header of a PLY or OBJ: where its coordinates lie."""
+    return [
         f"offset_east_north_up {' '.join(repr(float(o)) for o in offset_enu)}",
         f"frame {frame.name}, unit {frame.unit}, x east, y north, z up",
         f"vertical datum: {frame.vertical_datum}",
     ]
-    return write_ply(path, parts, comments)
+
+
+def write_cloud(
+    path: Path, parts: Iterable[NDArray[Any]], offset_enu: Sequence[float], frame: WorldFrame
+) -> int:
+    """Write parts of `VERTEX` records as a PLY; return how many points there are."""
+    return write_ply(path, parts, frame_comments(frame, offset_enu))
 
 
 def write_clouds(
@@ -151,8 +155,7 @@ def las_header(offset_enu: Sequence[float], frame: WorldFrame) -> "laspy.LasHead
             for name, text in _LAS_EXTRA.items()
         ]
     )
-    crs = crs_of(frame)
-    if crs is not None:
+    if (crs := crs_of(frame)) is not None:
         header.add_crs(pyproj.CRS.from_wkt(crs.to_wkt()))
     return header
 

@@ -211,7 +211,6 @@ def project_cells(
     return height, sigma, count, met, surfaces, lowest
 
 
-@compiled
 def fill_gaps(height: Float32, sigma: Float32, reach: int, cell: float) -> tuple[Float32, Float32]:
     """Bridge small gaps in straight lines between what lies on either side.
 
@@ -229,36 +228,30 @@ def fill_gaps(height: Float32, sigma: Float32, reach: int, cell: float) -> tuple
     Returns:
         Copies of both with small gaps filled.
     """
-    rows, columns = height.shape
-    filled, filled_sigma = height.copy(), sigma.copy()
-    steps = ((0, 1), (1, 0), (1, 1), (1, -1))
-    for row in range(rows):
-        for column in range(columns):
-            if not math.isnan(height[row, column]):
-                continue
-            lines, total, weights, widest = 0, 0.0, 0.0, 0.0
-            for down, right in steps:
-                spread = 0.0
-                first, second, a, b = 0.0, 0.0, 0, 0
-                for way in (1, -1):
-                    first, a, second, b = second, b, 0.0, 0
-                    for n in range(1, reach + 1):
-                        r, c = row + way * n * down, column + way * n * right
-                        if 0 <= r < rows and 0 <= c < columns and not math.isnan(height[r, c]):
-                            second, b = height[r, c], n
-                            spread = max(spread, sigma[r, c])
-                            break
-                if a == 0 or b == 0 or abs(first - second) > _STEP * (a + b) * cell:
-                    continue
-                w = 1.0 / (a + b)
-                lines += 1
-                total += w * (first * b + second * a) / (a + b)
-                weights += w
-                widest = max(widest, spread + 0.5 * abs(first - second))
-            if lines >= 2:
-                filled[row, column] = total / weights
-                filled_sigma[row, column] = widest
-    return filled, filled_sigma
+    padded = [np.pad(band.astype(float), reach, constant_values=np.nan) for band in (height, sigma)]
+    lines, total, weights, widest = np.zeros((4, *height.shape))
+    for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        ends = np.full((2, 3, *height.shape), np.nan)
+        for end, way in zip(ends, (1, -1), strict=True):
+            for n in range(reach, 0, -1):  # the nearest last
+                top, left = reach + way * n * down, reach + way * n * right
+                part = np.s_[top : top + height.shape[0], left : left + height.shape[1]]
+                known = np.isfinite(padded[0][part])
+                for values, found in zip(end, (padded[0][part], padded[1][part], n), strict=True):
+                    np.copyto(values, found, where=known)
+        (first, spread, a), (second, other_spread, b) = ends
+        with np.errstate(invalid="ignore"):
+            fine = np.abs(first - second) <= _STEP * (a + b) * cell
+        w = np.where(fine, 1.0 / (a + b), 0.0)
+        lines += fine
+        total += np.where(fine, w * (first * b + second * a) / (a + b), 0.0)
+        weights += w
+        wide = np.maximum(spread, other_spread) + 0.5 * np.abs(first - second)
+        widest = np.where(fine, np.maximum(widest, wide), widest)
+    gap = np.isnan(height) & (lines >= 2)
+    with np.errstate(invalid="ignore"):
+        filled = np.where(gap, total / weights, height).astype(np.float32)
+    return filled, np.where(gap, widest, sigma).astype(np.float32)
 
 
 def slope_deg(height: Float32, cell: float) -> Float32:

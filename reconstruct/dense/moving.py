@@ -6,12 +6,11 @@ are fitted away pair by pair; what is left is noise, fine detail that does not q
 what is not part of the surface. The latter is where a view differs from what the others agree on.
 """
 
-import math
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -19,7 +18,6 @@ from numpy.typing import NDArray
 
 from alice_survey.core.artefacts import atomic_path, write_csv
 from alice_survey.core.block_solver import MAD_TO_SIGMA
-from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.dense.view_store import ViewStore
@@ -27,7 +25,6 @@ from reconstruct.dense.views import ViewTask
 from reconstruct.pictures.undistorted import MOVING, Pictures, moving_path, read_mask
 from reconstruct.raster import write_png
 from reconstruct.views.model import View
-from reconstruct.views.range_shift import FAST, KernelLens, line_of, warped_at
 
 Float32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -61,10 +58,10 @@ _ABOUT = ("moving.csv", "moving.png")
 _LOGARITHMS = np.log(np.maximum(np.arange(256, dtype=np.float32), np.float32(_DARKEST)))
 """Of grey levels."""
 _OUTLINE_BGR = (60, 60, 255)
+_LOOK = ("look.light", "look.usable", "look.depth")
 
 
-@dataclass(frozen=True, kw_only=True)
-class MovingShare:
+class MovingShare(NamedTuple):
     """How much of a picture moves."""
 
     image: str
@@ -74,8 +71,7 @@ class MovingShare:
     """Share of it that two or more other stations show."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Look:
+class Look(NamedTuple):
     """A view on a lattice of cells."""
 
     view: View
@@ -187,20 +183,14 @@ def keep_look(task: ViewTask) -> None:
     middle = slice(step // 2, h * step, step), slice(step // 2, w * step, step)
     shown = cv2.resize(_LOGARITHMS[colour[part]], (w, h), interpolation=cv2.INTER_AREA)
     usable = cv2.resize(valid[part].astype(np.uint8), (w, h), interpolation=cv2.INTER_AREA) > 0
-    store.save(index, "look.light", with_bounds(shown + np.log(factors[middle])))
-    store.save(index, "look.usable", usable)
-    store.save(index, "look.depth", np.ascontiguousarray(depth[middle]))
+    looks = with_bounds(shown + np.log(factors[middle])), usable, depth[middle]
+    for name, values in zip(_LOOK, looks, strict=True):
+        store.save(index, name, np.ascontiguousarray(values))
 
 
 def load_look(store: ViewStore, index: int, view: View) -> Look:
     """What `keep_look` kept."""
-    return Look(
-        view=view,
-        step=_step(view),
-        light=np.asarray(store.load(index, "look.light")),
-        usable=np.asarray(store.load(index, "look.usable")),
-        depth=np.asarray(store.load(index, "look.depth")),
-    )
+    return Look(view, _step(view), *(np.asarray(store.load(index, name)) for name in _LOOK))
 
 
 def _step(view: View) -> int:
@@ -254,66 +244,29 @@ def moving_parts(look: Look, others: Sequence[Look]) -> tuple[Mask, float]:
 
 def still_depth(look: Look, others: Sequence[Look]) -> Float32:
     """Depth (h, w) of the surface on which two or more other stations agree; NaN where none."""
-    stack = np.full((len(others), *look.shape), np.nan, np.float32)
-    for k, other in enumerate(others):
-        move = look.view.world_from_cam.inv() * other.view.world_from_cam
-        draw(
-            other.depth,
-            (other.view.kernel_lens, float(other.step)),
-            np.ascontiguousarray(move.as_matrix()[:3]),
-            (look.view.kernel_lens, float(look.step)),
-            stack[k],
-        )
+    stack = np.array([draw(other, look) for other in others]).reshape(-1, *look.shape)
     stations = np.array([other.view.station for other in others], np.int64)
-    return shared_depth(stack, stations, _SAME_DEPTH)
+    return shared_depth(stack.astype(np.float32), stations, _SAME_DEPTH)
 
 
-@compiled(error_model="numpy", fastmath=FAST)
-def draw(
-    depth: Float32,
-    lattice: tuple[KernelLens, float],
-    onto_from_cam: Array,
-    onto_lattice: tuple[KernelLens, float],
-    onto: Float32,
-) -> None:
+def draw(look: Look, onto: Look) -> Array:
     """Draw the surface of a view into another, each cell into the four around it, the nearest last.
 
-    Args:
-        depth: (h, w) of the view's cells, NaN where unknown.
-        lattice: lens of the view, and pixels to a cell.
-        onto_from_cam: (3, 4) transform of points to the other's camera.
-        onto_lattice: as `lattice`, of the other.
-        onto: (h, w) depth of the other's cells, changed in place; NaN where nothing is drawn yet.
+    Returns:
+        (h, w) depth of the other's cells; NaN where nothing is drawn.
     """
-    (pinhole, field, inverse_working), step = lattice
-    (onto_pinhole, onto_field, onto_working), onto_step = onto_lattice
-    height, width = onto.shape
-    t = onto_from_cam
-    for i in range(depth.shape[0]):
-        for j in range(depth.shape[1]):
-            z = depth[i, j]
-            if math.isnan(z):
-                continue
-            x, y, by_x, by_y = line_of(
-                pinhole, field, inverse_working, (j + 0.5) * step, (i + 0.5) * step
-            )
-            a, b = x * z + by_x, y * z + by_y
-            deep = t[2, 0] * a + t[2, 1] * b + t[2, 2] * z + t[2, 3]
-            if deep <= 0.0:
-                continue
-            a, b = (
-                t[0, 0] * a + t[0, 1] * b + t[0, 2] * z + t[0, 3],
-                t[1, 0] * a + t[1, 1] * b + t[1, 2] * z + t[1, 3],
-            )
-            inverse = 1.0 / deep
-            u = onto_pinhole[0] * a * inverse + onto_pinhole[2]
-            v = onto_pinhole[1] * b * inverse + onto_pinhole[3]
-            u, v = warped_at(onto_field, onto_working, u, v, inverse)
-            left, top = math.floor(u / onto_step - 0.5), math.floor(v / onto_step - 0.5)
-            for row in range(max(top, 0), min(top + 2, height)):
-                for column in range(max(left, 0), min(left + 2, width)):
-                    if not onto[row, column] <= deep:
-                        onto[row, column] = deep
+    rows, columns = np.nonzero(np.isfinite(look.depth))
+    pixels = (np.column_stack([columns, rows]) + 0.5) * look.step
+    points = look.view.at_depth(pixels, look.depth[rows, columns].astype(np.float64))
+    depth = onto.view.world_from_cam.inv().apply(points)[:, 2]
+    at = np.floor(onto.view.project(points) / onto.step - 0.5)
+    found = np.full(onto.shape, np.inf)
+    for corner in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        place = at + corner
+        inside = ((place >= 0) & (place < onto.shape[::-1])).all(axis=1)  # NaN compares as False
+        column, row = place[inside].astype(np.int64).T
+        np.minimum.at(found, (row, column), depth[inside])
+    return np.where(np.isfinite(found), found, np.nan)
 
 
 def shared_depth(stack: Float32, stations: NDArray[np.int64], tolerance: float) -> Float32:

@@ -238,7 +238,6 @@ def gather(
     normals = np.full((count, 3), np.nan, np.float32)
     colours = np.empty((count, 3), np.uint8)
     sigmas = np.empty(count, np.float32)
-    a, b, other = np.empty(3), np.empty(3), np.empty(3)
     for i in range(count):
         row, column = pixels[i, 0], pixels[i, 1]
         sigmas[i] = sigma[row, column]
@@ -255,9 +254,8 @@ def gather(
             )
             level = colour[row, column, k] * (above * (1 - p) + below * p)
             colours[i, 2 - k] = min(255, int(level + 0.5))
-        length = _normal(depth, slopes, row, column, a, b, other)
+        n0, n1, n2, length = _normal(depth, slopes, row, column)
         if length > 0.0:
-            n0, n1, n2 = other[0], other[1], other[2]
             x, y = slopes[row, column, 0], slopes[row, column, 1]
             along = abs(x * n0 + y * n1 + n2) / length
             if along < _GRAZING * math.sqrt(x * x + y * y + 1.0):
@@ -270,34 +268,27 @@ def gather(
 
 @compiled(error_model="numpy", fastmath=FAST)
 def _normal(
-    depth: Float32, slopes: Float32, row: int, column: int, a: Array, b: Array, normal: Array
-) -> float:
-    """Write the normal (3,) of a pixel, in the camera, into `normal`; return its length.
-
-    The length is 0 or NaN where the normal is not known. `a` and `b` (3,) are for what lies
-    between.
-    """
+    depth: Float32, slopes: Float32, row: int, column: int
+) -> tuple[float, float, float, float]:
+    """The normal of a pixel, in the camera, and its length: 0 or NaN where it is not known."""
     up, down = row - _REACH, row + _REACH
     left, right = column - _REACH, column + _REACH
     if up < 0 or left < 0 or down >= depth.shape[0] or right >= depth.shape[1]:
-        return 0.0
-    _write_point(depth, slopes, row, right, a)
-    _write_point(depth, slopes, row, left, normal)
-    for k in range(3):
-        a[k] -= normal[k]
-    _write_point(depth, slopes, down, column, b)
-    _write_point(depth, slopes, up, column, normal)
-    for k in range(3):
-        b[k] -= normal[k]
-    n0 = b[1] * a[2] - b[2] * a[1]
-    n1 = b[2] * a[0] - b[0] * a[2]
-    n2 = b[0] * a[1] - b[1] * a[0]
-    normal[0], normal[1], normal[2] = n0, n1, n2
-    return math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
+        return 0.0, 0.0, 0.0, 0.0
+    a0, a1, a2 = _way(depth, slopes, row, left, row, right)
+    b0, b1, b2 = _way(depth, slopes, up, column, down, column)
+    n0, n1, n2 = b1 * a2 - b2 * a1, b2 * a0 - b0 * a2, b0 * a1 - b1 * a0
+    return n0, n1, n2, math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
 
 
 @compiled(error_model="numpy", fastmath=FAST)
-def _write_point(depth: Float32, slopes: Float32, row: int, column: int, point: Array) -> None:
-    """Write the point (3,) of a pixel, in the camera, into `point`; NaN where unknown."""
-    z = depth[row, column]
-    point[0], point[1], point[2] = slopes[row, column, 0] * z, slopes[row, column, 1] * z, z
+def _way(
+    depth: Float32, slopes: Float32, row: int, column: int, to_row: int, to_column: int
+) -> tuple[float, float, float]:
+    """From the point of a pixel to that of another, in the camera; NaN where one is unknown."""
+    z, y = depth[to_row, to_column], depth[row, column]
+    return (
+        np.float64(slopes[to_row, to_column, 0] * z) - np.float64(slopes[row, column, 0] * y),
+        np.float64(slopes[to_row, to_column, 1] * z) - np.float64(slopes[row, column, 1] * y),
+        np.float64(z) - np.float64(y),
+    )

@@ -11,7 +11,6 @@ together, minus what its own observations leave with poses held. The rest is wha
 it do to a surface there.
 """
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,7 +22,6 @@ from numpy.typing import NDArray
 from rasterio.windows import Window
 from scipy.spatial import cKDTree
 
-from alice_survey.core.compiled import compiled
 from alice_survey.core.errors import warn
 from alice_survey.core.frames import Array
 from alice_survey.core.run import progress
@@ -32,8 +30,7 @@ from reconstruct.dense.surface_points import PART_REACH_CELLS, SURFACE_POINT, fu
 from reconstruct.dense.view_store import StoredDepth, ViewStore
 from reconstruct.planes import Plane
 from reconstruct.raster import DemGrid, tiles_reached
-from reconstruct.views.model import SparseModel, View, enu_from_cam
-from reconstruct.views.range_shift import FAST, KernelLens, warped_at
+from reconstruct.views.model import SparseModel, View
 
 _COMPANY = 16
 """Sparse points around a spot of which the median counts: a single one may be a wrong match."""
@@ -131,74 +128,45 @@ _GATE = 3.0
 """Depths that differ by no more than this many standard deviations of their difference agree."""
 _MIN_KNOWN = 5
 """Of the nine pixels around a spot, for a view to see through it."""
-_FRAME = 1.2
-"""Times half a picture up to which a port may shift what is in the frame."""
+_AROUND = np.mgrid[-1:2, -1:2].reshape(2, 9)
 
 
-@compiled(error_model="numpy", fastmath=FAST)
 def look_at_points(
-    points: Float32,
+    points_world: Array,
     sigmas: Float32,
-    cam_from_enu: Array,
+    view: View,
     depth: StoredDepth,
     factor: float,
-    lens: KernelLens,
     cell: float,
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which points a view finds at their place, and which it sees through.
 
     A view finds a point where any of the nine pixels around shows the point's depth, and sees
     through it where all that are known show something beyond.
 
     Args:
-        points: (N, 3) east, north, up from an offset.
+        points_world: (N, 3).
         sigmas: (N,) of the points.
-        cam_from_enu: (3, 4) transform of such points into the view's camera.
+        view: that looks.
         depth: (H, W) of the view.
         factor: on its standard deviations.
-        lens: of the view.
         cell: distance between neighbouring points of the surface.
 
     Returns:
-        (N,) 1 where the view finds the point, and (N,) 1 where it sees through it.
+        (N,) whether the view finds the point, and (N,) whether it sees through it.
     """
     levels, shares, depth_of, share_of = depth
-    height, width = levels.shape
-    found = np.zeros(points.shape[0], np.uint8)
-    through = np.zeros(points.shape[0], np.uint8)
-    pinhole, field, inverse_working = lens
-    t = cam_from_enu
-    for n in range(points.shape[0]):
-        e, m, u = points[n, 0], points[n, 1], points[n, 2]
-        z = t[2, 0] * e + t[2, 1] * m + t[2, 2] * u + t[2, 3]
-        if z <= 0.0:
-            continue
-        x = pinhole[0] * (t[0, 0] * e + t[0, 1] * m + t[0, 2] * u + t[0, 3]) / z + pinhole[2]
-        y = pinhole[1] * (t[1, 0] * e + t[1, 1] * m + t[1, 2] * u + t[1, 3]) / z + pinhole[3]
-        if abs(2.0 * x - width) > _FRAME * width or abs(2.0 * y - height) > _FRAME * height:
-            continue
-        x, y = warped_at(field, inverse_working, x, y, 1.0 / z)
-        column, row = math.floor(x), math.floor(y)
-        if column < 1 or row < 1 or column >= width - 1 or row >= height - 1:
-            continue
-        known, beyond, here = 0, 0, False
-        for i in range(row - 1, row + 2):
-            for j in range(column - 1, column + 2):
-                if levels[i, j] == 0:
-                    continue
-                known += 1
-                there = depth_of[levels[i, j]]
-                sigma = factor * there * share_of[shares[i, j]]
-                tolerance = cell + _GATE * math.sqrt(sigmas[n] ** 2 + sigma**2)
-                if abs(there - z) <= tolerance:
-                    here = True
-                elif there > z:
-                    beyond += 1
-        if here:
-            found[n] = 1
-        elif known >= _MIN_KNOWN and beyond == known:
-            through[n] = 1
-    return found, through
+    z = view.world_from_cam.inv().apply(points_world)[:, 2:]
+    at = np.floor(np.nan_to_num(view.project(points_world), nan=-1.0)).astype(np.int64)
+    inside = ((at >= 1) & (at < np.array(levels.shape[::-1]) - 1)).all(axis=1)
+    place = np.where(inside[:, None], at, 1)[:, ::-1, None] + _AROUND
+    level, share = (codes[place[:, 0], place[:, 1]] for codes in (levels, shares))
+    there = depth_of[level]  # NaN where unknown
+    tolerance = cell + _GATE * np.hypot(sigmas[:, None], factor * there * share_of[share])
+    here = inside & (np.abs(there - z) <= tolerance).any(axis=1)
+    known, beyond = np.isfinite(there), there > z
+    through = (known.sum(axis=1) >= _MIN_KNOWN) & (beyond == known).all(axis=1)
+    return here, inside & through & ~here
 
 
 _TILE_CELLS = 256
@@ -357,14 +325,10 @@ def _seen_through(
 ) -> NDArray[np.bool_]:
     """Which points of a tile more views see through than find."""
     found, through = (np.zeros(len(surface), np.int64) for _ in range(2))
-    points, sigmas = (np.ascontiguousarray(surface[name]) for name in ("enu", "sigma"))
+    points = _swap_axes(surface["enu"] + offset)
     for index, view in task.views:
-        depth = setup.store.stored_depth(index, "fine")
-        to_enu = np.vstack([enu_from_cam(view, offset), [0.0, 0.0, 0.0, 1.0]])
-        to_cam = np.ascontiguousarray(np.linalg.inv(to_enu)[:3])
-        at, beyond = look_at_points(
-            points, sigmas, to_cam, depth, setup.sigma_factor, view.kernel_lens, task.grid.cell
-        )
+        depth, cell = setup.store.stored_depth(index, "fine"), task.grid.cell
+        at, beyond = look_at_points(points, surface["sigma"], view, depth, setup.sigma_factor, cell)
         found += at
         through += beyond
     return through > found
@@ -394,7 +358,7 @@ def _points_over(
                 sigma,
                 store.load_mask(index, "inside", view.pinhole.width_px, part) & sure,
                 store.load_colour(index, part),
-                np.asarray(store.load(index, "factors")),
+                np.array(store.load(index, "factors")),
                 offset,
                 sides,
                 blocks,

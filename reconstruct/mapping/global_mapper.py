@@ -28,7 +28,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pycolmap
@@ -99,8 +99,7 @@ class StationLink:
         return RigidTransform.from_components(self.shift, Rotation.from_quat(self.quaternion))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Resection:
+class _Resection(NamedTuple):
     first: int
     second: int
     points: Array
@@ -268,12 +267,9 @@ def _collect(
         cameras.append(np.full(int(good.sum()), names.index(seen.images[j].camera)))
     count = sum(map(len, known))
     some = np.linspace(0, count - 1, min(count, _ENOUGH)).astype(int)
+    first, second = (seen.images[picture].station for picture in rows[0][:2])
     return _Resection(
-        first=seen.images[rows[0][0]].station,
-        second=seen.images[rows[0][1]].station,
-        points=np.concatenate(known)[some],
-        pixels=np.concatenate(pixels)[some],
-        cameras=np.concatenate(cameras)[some],
+        first, second, *(np.concatenate(parts)[some] for parts in (known, pixels, cameras))
     )
 
 

@@ -513,13 +513,14 @@ def _add(whole: pycolmap.Reconstruction, model: pycolmap.Reconstruction) -> None
     ends = [np.array([p.xyz[0] for p in m.points3D.values()]) for m in (whole, model)]
     gap = float(np.ptp(ends[0]) + np.ptp(ends[1]))
     apart = RigidTransform.from_translation([ends[0].max() - ends[1].min() + gap, 0.0, 0.0])
-    for number in sorted(model.reg_frame_ids()):
+    poses = _poses(model)
+    for number in poses:
         theirs = model.frames[number]
         frame = pycolmap.Frame(frame_id=number, rig_id=theirs.rig_id)
         for data in theirs.image_ids:
             frame.add_data_id(data)
         whole.add_frame(frame)
-        whole.frames[number].rig_from_world = rigid3d(_pose(model, number) * apart.inv())
+        whole.frames[number].rig_from_world = rigid3d(poses[number] * apart.inv())
         for data in theirs.image_ids:
             image = model.images[data.id]
             rows = pycolmap.Point2DList([pycolmap.Point2D(p.xy) for p in image.points2D])
@@ -552,11 +553,8 @@ def report_left_out(models: Sequence[pycolmap.Reconstruction]) -> list[str]:
 
 def _poses(model: pycolmap.Reconstruction) -> dict[int, RigidTransform]:
     """`rig_from_world` by frame."""
-    return {frame: _pose(model, frame) for frame in sorted(model.reg_frame_ids())}
-
-
-def _pose(model: pycolmap.Reconstruction, frame: int) -> RigidTransform:
-    return as_transform(model.frames[frame].rig_from_world)
+    frames = sorted(model.reg_frame_ids())
+    return {frame: as_transform(model.frames[frame].rig_from_world) for frame in frames}
 
 
 def _reach(model: pycolmap.Reconstruction) -> float:

@@ -83,10 +83,8 @@ def reasons(
         By name, of those that are not in the model.
     """
     inside = np.array([image in registered for image in images])
-    tied: list[dict[int, int]] = [{} for _ in images]
-    for i, j, found in pairs:
-        tied[i][j] = tied[j][i] = len(found.matches)
     joined = np.array([(i, j) for i, j, _ in pairs], dtype=np.int64).reshape(-1, 2)
+    tied = np.bincount(joined.ravel(), minlength=len(images))
     links = coo_matrix((np.ones(len(joined)), joined.T), shape=(len(images),) * 2)
     part = connected_components(links, directed=False)[1]
     size, kept = np.bincount(part), np.bincount(part, weights=inside)
@@ -105,10 +103,9 @@ def reasons(
                 "model: pictures between them and the model are missing"
             )
         else:
-            best = max(tied[n], key=lambda other: tied[n][other])
             why = (
-                f"matches {len(tied[n])} pictures, best {images[best]} ({tied[n][best]} matches), "
-                "but what they share is too little or contradicts the model"
+                f"matches {tied[n]} pictures, but what they share is too little or contradicts "
+                "the model"
             )
         words[images[n]] = why
     return words

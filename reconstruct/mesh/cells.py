@@ -147,35 +147,28 @@ def _plane(normal: Array, offset: Array) -> Array:
     return np.stack([x * x, x * y, x * z, x * d, y * y, y * z, y * d, z * z, z * d, d * d], axis=1)
 
 
-@compiled
-def quadric_error(q: Array, p: Array) -> float:
-    """Sum of weighted squared distances of a point from the planes of a quadric (11,)."""
-    x, y, z = p[0], p[1], p[2]
-    total: float = (
+def quadric_errors(q: Array, p: Array) -> Array:
+    """(N,) sums of weighted squared distances of points (N, 3) from the planes of quadrics."""
+    (x, y, z), q = p.T, q.T
+    total: Array = (
         q[0] * x * x + q[4] * y * y + q[7] * z * z + q[9]
         + 2.0 * (q[1] * x * y + q[2] * x * z + q[3] * x + q[5] * y * z + q[6] * y + q[8] * z)
     )  # fmt: skip
-    return max(total, 0.0)
+    return np.maximum(total, 0.0)
 
 
-@compiled
-def best_point(q: Array, out: Array) -> bool:
-    """The point of least error; False where the planes leave it open."""
-    a, b, c, d, e, f = q[0], q[1], q[2], q[4], q[5], q[7]
+def best_points(q: Array) -> Array:
+    """(N, 3) points of least error of quadrics (N, 11); NaN where the planes leave it open."""
+    a, b, c, g, d, e, h, f, i = q.T[:9]
     m0, m1, m2 = d * f - e * e, c * e - b * f, b * e - c * d
-    determinant = a * m0 + b * m1 + c * m2
-    trace = a + d + f
-    if not determinant > 1e-3 * (trace / 3.0) ** 3:
-        return False
-    g, h, i = -q[3], -q[6], -q[8]
     m4, m5, m8 = a * f - c * c, b * c - a * e, a * d - b * b
-    out[0] = (m0 * g + m1 * h + m2 * i) / determinant
-    out[1] = (m1 * g + m4 * h + m5 * i) / determinant
-    out[2] = (m2 * g + m5 * h + m8 * i) / determinant
-    return True
+    determinant = a * m0 + b * m1 + c * m2
+    known = determinant > 1e-3 * ((a + d + f) / 3.0) ** 3
+    sums = m0 * -g + m1 * -h + m2 * -i, m1 * -g + m4 * -h + m5 * -i, m2 * -g + m5 * -h + m8 * -i
+    points: Array = np.array(sums) / np.where(known, determinant, np.nan)
+    return points.T
 
 
-@compiled
 def _costs(
     place: Array,
     quadrics: Array,
@@ -188,42 +181,20 @@ def _costs(
 
     An edge of which one end must stay is turned so that this end comes first.
     """
-    cost = np.full(edges.shape[0], np.inf)
-    target_place = np.empty((edges.shape[0], 3))
-    q = np.empty(11)
-    for n in range(edges.shape[0]):
-        a, b = edges[n, 0], edges[n, 1]
-        if fixed[a] and fixed[b]:
-            continue
-        if rim[a] and rim[b] and not rim_edge[n]:
-            continue
-        length2 = 0.0
-        for k in range(11):
-            q[k] = quadrics[a, k] + quadrics[b, k]
-        for k in range(3):
-            length2 += (place[a, k] - place[b, k]) ** 2
-        keep_a = fixed[a] or (rim[a] and not rim[b])
-        keep_b = fixed[b] or (rim[b] and not rim[a])
-        if keep_a and keep_b:
-            continue
-        if keep_b:  # the first of an edge is the one that survives
-            a, b = b, a
-            edges[n, 0], edges[n, 1] = a, b
-        if keep_a or keep_b:
-            target_place[n] = place[a]
-        else:
-            found = best_point(q, target_place[n])
-            if found:
-                away = 0.0
-                for k in range(3):
-                    away += (target_place[n, k] - 0.5 * (place[a, k] + place[b, k])) ** 2
-                found = away <= length2
-            if not found:
-                for k in range(3):
-                    target_place[n, k] = 0.5 * (place[a, k] + place[b, k])
-        weight = max(q[10], 1e-30)
-        cost[n] = quadric_error(q, target_place[n]) / weight + _SHORTNESS * length2
-    return cost, target_place
+    a, b = edges.T
+    keep_a, keep_b = fixed[a] | (rim[a] & ~rim[b]), fixed[b] | (rim[b] & ~rim[a])
+    able = ~(keep_a & keep_b) & (rim_edge | ~(rim[a] & rim[b]))
+    q, apart = quadrics[a] + quadrics[b], place[a] - place[b]
+    length2 = apart[:, 0] ** 2 + apart[:, 1] ** 2 + apart[:, 2] ** 2
+    turned = able & keep_b
+    edges[turned] = edges[turned][:, ::-1]
+    middle, target = 0.5 * (place[a] + place[b]), best_points(q)
+    off = target - middle
+    near = off[:, 0] ** 2 + off[:, 1] ** 2 + off[:, 2] ** 2 <= length2
+    target = np.where(near[:, None], target, middle)
+    target = np.where((keep_a | keep_b)[:, None], place[edges[:, 0]], target)
+    cost = quadric_errors(q, target) / np.maximum(q[:, 10], 1e-30) + _SHORTNESS * length2
+    return np.where(able, cost, np.inf), target
 
 
 @compiled

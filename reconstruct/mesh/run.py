@@ -11,13 +11,10 @@ from alice_survey.core.errors import warn
 from alice_survey.core.executor import Executor
 from alice_survey.core.records import CloudRecord, MeshRecord
 from alice_survey.core.run import progress
+from reconstruct.dense.cloud import frame_comments
 from reconstruct.light.solve import read_light
 from reconstruct.mesh.formats import GLB_AXES, render_oblique, write_mesh
-from reconstruct.mesh.surface import (
-    TriangleMesh,
-    coarser_level,
-    mesh_cloud,
-)
+from reconstruct.mesh.surface import TriangleMesh, coarser_level, mesh_cloud
 from reconstruct.mesh.texture import MeshSetup, Textured, make_texture
 from reconstruct.mesh.tiles import TileSetup, write_tiles
 from reconstruct.mesh.topology import face_areas
@@ -65,18 +62,14 @@ def run_mesh(
             f"only {facts['textured_share']:.0%} of the mesh is seen whole by a picture; the rest "
             "has the colours of the cloud"
         )
-    _write_results(folder, textured, facts)
+    _write_results(folder, textured, facts, frame_comments(model.frame, setup.offset))
 
 
 @progress.step("write the mesh")
-def _write_results(folder: Path, mesh: Textured, facts: dict[str, Any]) -> None:
+def _write_results(
+    folder: Path, mesh: Textured, facts: dict[str, Any], comments: list[str]
+) -> None:
     """Write `mesh.glb`, `.obj`, `.mtl`, `.ply`, `.json` and `.png` next to the pages."""
-    offset = " ".join(repr(value) for value in facts["offset_east_north_up"])
-    comments = [
-        f"offset_east_north_up {offset}",
-        f"frame {facts['frame']}, unit {facts['unit']}, x east, y north, z up",
-        f"vertical datum: {facts['vertical_datum']}",
-    ]
     write_mesh(folder, mesh, {**facts, "axes": GLB_AXES}, comments)
     MeshRecord.save(folder / "mesh.json", facts)
     write_png(folder / "mesh.png", render_oblique(mesh))

@@ -315,7 +315,6 @@ def zero_mesh(
     return _place_vertices(values, cells) + (cells + np.array(first)), cells, quads[sound]
 
 
-@compiled
 def _place_vertices(values: Array, cells: NDArray[np.int32]) -> Array:
     """The vertex of each cell: the mean crossing of its edges, moved onto the zero within the cell.
 
@@ -326,46 +325,32 @@ def _place_vertices(values: Array, cells: NDArray[np.int32]) -> Array:
     Returns:
         (V, 3) places in the cells, 0 to 1.
     """
-    vertices = np.zeros((len(cells), 3))
-    for n in range(len(cells)):
-        x, y, z = cells[n, 0], cells[n, 1], cells[n, 2]
-        corner, out = values[x : x + 2, y : y + 2, z : z + 2], vertices[n]
-        crossings = 0
-        for axis in range(3):
-            b, c = (axis + 1) % 3, (axis + 2) % 3
-            for k in range(4):
-                i, j = k & 1, k >> 1
-                if axis == 0:
-                    start, end = corner[0, i, j], corner[1, i, j]
-                elif axis == 1:
-                    start, end = corner[j, 0, i], corner[j, 1, i]
-                else:
-                    start, end = corner[i, j, 0], corner[i, j, 1]
-                if (start < 0.0) == (end < 0.0):
-                    continue
-                crossings += 1
-                out[axis] += start / (start - end)
-                out[b] += i
-                out[c] += j
-        for axis in range(3):
-            out[axis] /= crossings
-        for _ in range(_NEWTON_STEPS):
-            u, v, w = out[0], out[1], out[2]
-            f, gx, gy, gz = 0.0, 0.0, 0.0, 0.0
-            for i in range(2):
-                p, dp = (u, 1.0) if i else (1.0 - u, -1.0)
-                for j in range(2):
-                    q, dq = (v, 1.0) if j else (1.0 - v, -1.0)
-                    for k in range(2):
-                        r, dr = (w, 1.0) if k else (1.0 - w, -1.0)
-                        f += corner[i, j, k] * p * q * r
-                        gx += corner[i, j, k] * dp * q * r
-                        gy += corner[i, j, k] * p * dq * r
-                        gz += corner[i, j, k] * p * q * dr
-            square = gx * gx + gy * gy + gz * gz
-            if square < 1e-6:
-                break
-            out[0] = min(max(u - f * gx / square, 0.0), 1.0)
-            out[1] = min(max(v - f * gy / square, 0.0), 1.0)
-            out[2] = min(max(w - f * gz / square, 0.0), 1.0)
-    return vertices
+    corner = np.empty((2, 2, 2, len(cells)))
+    for at in np.ndindex(2, 2, 2):
+        corner[at] = values[tuple((cells + np.array(at)).T)]
+    out, crossings = np.zeros((3, len(cells))), np.zeros(len(cells))
+    for axis in range(3):
+        b, c = (axis + 1) % 3, (axis + 2) % 3
+        for j, i in np.ndindex(2, 2):
+            start, end = np.moveaxis(corner, (axis, b, c), (0, 1, 2))[:, i, j]
+            crossed = (start < 0.0) != (end < 0.0)
+            crossings += crossed
+            out[axis] += np.divide(start, start - end, np.zeros(len(cells)), where=crossed)
+            out[b] += i * crossed
+            out[c] += j * crossed
+    out /= crossings
+    moving = np.ones(len(cells), np.bool_)
+    for _ in range(_NEWTON_STEPS):
+        share, f, slope = (1.0 - out, out), np.zeros(len(cells)), np.zeros_like(out)
+        for at in np.ndindex(2, 2, 2):
+            (p, q, r), (dp, dq, dr) = (
+                (share[k][n] for n, k in enumerate(at)),
+                (2 * k - 1 for k in at),
+            )
+            f += corner[at] * p * q * r
+            slope += corner[at] * dp * q * r, corner[at] * p * dq * r, corner[at] * p * q * dr
+        square = slope[0] * slope[0] + slope[1] * slope[1] + slope[2] * slope[2]
+        moving &= square >= 1e-6
+        step = np.divide(f * slope, square, np.zeros_like(out), where=moving)
+        out = np.where(moving, np.minimum(np.maximum(out - step, 0.0), 1.0), out)
+    return np.ascontiguousarray(out.T)

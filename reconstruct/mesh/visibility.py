@@ -282,8 +282,7 @@ def choose_views(
     smooth(label, candidates.views, cost, neighbours, seam, _SWEEPS)
     for _ in range(_MERGES):
         chart = connected_charts(neighbours, label)
-        size = np.bincount(chart)
-        if not give_away(label, chart, size, candidates.views, neighbours, lengths, _SMALL_FACES):
+        if not give_away(label, chart, candidates.views, neighbours, lengths):
             break
     unseen = label < 0
     normal = face_normals(vertices, triangles[unseen])
@@ -391,66 +390,43 @@ def smooth(
             return
 
 
-@compiled
 def give_away(
     label: NDArray[np.int32],
     chart: NDArray[np.int32],
-    size: NDArray[np.int64],
     views: NDArray[np.int32],
     neighbours: NDArray[np.int32],
     lengths: Array,
-    small: int,
 ) -> int:
     """Give small patches the view with which they share most of their outline, in place.
 
-    A view is taken only if it is a candidate of every face of the patch. Patches next to one that
-    changed wait for the next call. Returns how many faces changed.
+    A view is taken only if it is a candidate of every face of the patch, and one of a neighbour
+    that is no smaller. Patches next to one that changed wait for the next call. Returns how many
+    faces changed.
     """
-    count = size.size
-    start = np.zeros(count + 1, np.int64)
-    for c in range(count):
-        start[c + 1] = start[c] + size[c]
-    fill = start[:count].copy()
-    members = np.empty(label.size, np.int64)
-    for face in range(label.size):
-        members[fill[chart[face]]] = face
-        fill[chart[face]] += 1
-    frozen = np.zeros(count, np.bool_)
-    changed = 0
-    for c in range(count):
-        if size[c] >= small or frozen[c] or label[members[start[c]]] < 0:
-            continue
-        mine = members[start[c] : start[c + 1]]
-        best, longest = -1, 0.0
-        tried = np.empty(0, np.int32)
-        for i in range(mine.size):
-            for side in range(3):
-                other = neighbours[mine[i], side]
-                if other < 0 or chart[other] == c or label[other] < 0:
-                    continue
-                if size[chart[other]] < size[c] or (tried == label[other]).any():
-                    continue
-                candidate = label[other]
-                tried = np.append(tried, candidate)
-                length = 0.0
-                able = True
-                for j in range(mine.size):
-                    if not (views[mine[j]] == candidate).any():
-                        able = False
-                        break
-                    for s in range(3):
-                        near = neighbours[mine[j], s]
-                        if near >= 0 and chart[near] != c and label[near] == candidate:
-                            length += lengths[mine[j], s]
-                if able and length > longest:
-                    best, longest = candidate, length
-        if best < 0:
-            continue
-        for i in range(mine.size):
-            label[mine[i]] = best
-            for side in range(3):
-                other = neighbours[mine[i], side]
-                if other >= 0:
-                    frozen[chart[other]] = True
-        changed += mine.size
+    size = np.bincount(chart)
+    given = (size[chart] < _SMALL_FACES) & (label >= 0)
+    at = (neighbours >= 0) & (label[neighbours] >= 0) & (chart[neighbours] != chart[:, None])
+    face, side = np.nonzero(at & given[:, None])
+    other, count = neighbours[face, side], int(label.max(initial=0)) + 1
+    key, row = np.unique(chart[face].astype(np.int64) * count + label[other], return_inverse=True)
+    mine, view = key // count, key % count
+    shared = np.bincount(row, lengths[face, side], len(key))
+    larger = np.bincount(row, size[chart[other]] >= size[chart[face]], len(key)) > 0
+    able = (views >= 0) & (views < count) & given[:, None]
+    seen = (chart[:, None].astype(np.int64) * count + views)[able]
+    seen, faces = np.unique(seen, return_counts=True)
+    place = np.minimum(np.searchsorted(seen, key), len(seen) - 1)
+    whole = (seen[place] == key) & (faces[place] == size[mine]) & larger
+    best = np.flatnonzero(whole)[np.lexsort((-shared[whole], mine[whole]))]
+    best = best[np.unique(mine[best], return_index=True)[1]]
+    order = np.argsort(chart, kind="stable")
+    starts = np.concatenate([[0], np.cumsum(size)])
+    frozen, changed = np.zeros(len(size), np.bool_), 0
+    for number, chosen in zip(mine[best].tolist(), view[best].tolist(), strict=True):
+        if not frozen[number]:
+            patch = order[starts[number] : starts[number + 1]]
+            label[patch] = chosen
+            around = neighbours[patch]
+            frozen[chart[around[around >= 0]]] = True
+            changed += len(patch)
     return changed

@@ -166,7 +166,6 @@ def mosaic_tiles(
         overlap_px: by which neighbours overlap.
         kind: of picture; `tif` keeps the coordinate system.
 
-
     Returns:
         What was written, as text and as JSON values.
 
@@ -232,7 +231,6 @@ def _write_tile(raster: rasterio.DatasetReader, window: Window, path: Path, kind
                     window=Window(window.col_off, window.row_off + top, window.width, high)
                 )
                 known += int((part[3] > 0).sum())
-
                 out.write(part[:bands], window=Window(0, top, window.width, high))
         if known and kind == "tif":
             rough.replace(path)

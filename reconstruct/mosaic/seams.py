@@ -80,65 +80,48 @@ def choose_views(
     if settled is not None:
         had = (number == settled[..., None]) & (number >= 0)
         own += np.where(had.any(axis=2, keepdims=True) & ~had, np.float32(_UNSETTLING_COST), 0)
-    chosen: NDArray[np.int32] = _trws(number, own, colours, _SWEEPS)
+    edges = np.zeros((*number.shape[:2], 2, *2 * number.shape[2:]), np.float32)
+    for way, here, there in ((0, np.s_[:, :-1], np.s_[:, 1:]), (1, np.s_[:-1], np.s_[1:])):
+        pair = (number[here], number[there]), (colours[here], colours[there])
+        edges[here][..., way, :, :] = seam_costs(*pair)
+    chosen: NDArray[np.int32] = _trws(number, own, edges, _SWEEPS)
     return chosen
 
 
-@compiled
-def seam_cost(
-    number_p: NDArray[np.int32], number_q: NDArray[np.int32], colours_p: Float32,
-    colours_q: Float32, a: int, b: int,
-) -> float:  # fmt: skip
-    """Cost between neighbouring cells of which one takes its candidate a, the other its b.
+def seam_costs(
+    numbers: tuple[NDArray[np.int32], NDArray[np.int32]], colours: tuple[Float32, Float32]
+) -> Float32:
+    """Costs (H, W, K, K) between neighbouring cells, by the candidates that one and other take.
 
     Args:
-        number_p: (K,) candidates of the one.
-        number_q: (K,) of the other.
-        colours_p: (K, 3) what they show.
-        colours_q: (K, 3).
-        a: index.
-        b: index.
+        numbers: (H, W, K) candidates of the ones, and of the others.
+        colours: (H, W, K, 3) what they show.
     """
-    if number_p[a] == number_q[b]:
-        return 0.0
-    total = 0.0
-    for side in range(2):
-        numbers, colours, own = (number_p, colours_p, a) if side == 0 else (number_q, colours_q, b)
-        other = number_q[b] if side == 0 else number_p[a]
-        # how much the two views differ in one of the cells; unknown counts as most
-        difference = _MAX_DIFFERENCE
-        for k in range(len(numbers)):
-            if numbers[k] == other:
-                difference = 0.0
-                for c in range(3):
-                    difference += abs(colours[own, c] - colours[k, c]) / 3.0
-        total += min(difference, _MAX_DIFFERENCE)
-    return _SEAM_COST + _DIFFERENCE_COST * 0.5 * total
+    same = numbers[0][..., :, None] == numbers[1][..., None, :]
+    total = np.zeros(same.shape)
+    for side, shown in enumerate(colours):  # how much the two views differ in one of the cells
+        match = same if side == 0 else same.swapaxes(-1, -2)
+        apart = np.abs(shown[..., :, None, :] - shown[..., None, :, :]).astype(np.float64) / 3.0
+        known = (apart[..., 0] + apart[..., 1] + apart[..., 2]) @ match
+        cost = np.where(match.any(axis=-2)[..., None, :], known, _MAX_DIFFERENCE)
+        cost = np.minimum(cost, _MAX_DIFFERENCE)  # unknown counts as most
+        total += cost if side == 0 else cost.swapaxes(-1, -2)
+    seam: Float32 = (_SEAM_COST + _DIFFERENCE_COST * 0.5 * total).astype(np.float32)
+    return np.where(same, np.float32(0), seam)
 
 
 @compiled
 def _trws(
-    number: NDArray[np.int32], own: Float32, colours: Float32, sweeps: int
+    number: NDArray[np.int32], own: Float32, edges: NDArray[np.float32], sweeps: int
 ) -> NDArray[np.int32]:
+    """Choose candidates by costs `edges` (H, W, 2, K, K) to the cell to the right, and below."""
     rows, columns, maximum = number.shape
-    # edges[r, c, 0] to the right, [1] downwards; messages into a cell from left, up, right, down
-    edges = np.zeros((rows, columns, 2, maximum, maximum), np.float32)
+    # messages into a cell come from left, up, right, down
     count = np.zeros((rows, columns), np.int32)
     for r in range(rows):
         for c in range(columns):
             while count[r, c] < maximum and number[r, c, count[r, c]] >= 0:
                 count[r, c] += 1
-    for r in range(rows):
-        for c in range(columns):
-            for way in range(2):
-                s, d = r + way, c + 1 - way
-                if s >= rows or d >= columns:
-                    continue
-                for a in range(count[r, c]):
-                    for b in range(count[s, d]):
-                        edges[r, c, way, a, b] = seam_cost(
-                            number[r, c], number[s, d], colours[r, c], colours[s, d], a, b
-                        )
     messages = np.zeros((rows, columns, 4, maximum), np.float32)
     chosen = np.full((rows, columns), -1, np.int32)
     total = np.zeros(maximum)

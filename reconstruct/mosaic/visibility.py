@@ -642,6 +642,7 @@ def sample_lanczos(
     rows, columns = x.shape
     high, wide = picture.shape[0] - 1, picture.shape[1] - 1
     steps = weights.shape[0] - 1
+    lines, places = np.empty(_TAPS, np.int64), np.empty(_TAPS, np.int64)
     for row in range(rows):
         for column in range(columns):
             px, py = x[row, column], y[row, column]
@@ -650,32 +651,14 @@ def sample_lanczos(
             left, top = int(px), int(py)
             across = weights[int((px - left) * steps + np.float32(0.5))]
             down = weights[int((py - top) * steps + np.float32(0.5))]
-            left -= _TAPS // 2 - 1
-            top -= _TAPS // 2 - 1
-            inside = left >= 0 and top >= 0 and left + _TAPS <= wide + 1 and top + _TAPS <= high + 1
-            if inside and last - first == 3:
-                blue, green, red = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-                for j in range(_TAPS):
-                    line = picture[top + j]
-                    b, g, r = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-                    for i in range(_TAPS):
-                        b += across[i] * table[line[left + i, 0]]
-                        g += across[i] * table[line[left + i, 1]]
-                        r += across[i] * table[line[left + i, 2]]
-                    blue += down[j] * b
-                    green += down[j] * g
-                    red += down[j] * r
-                out[row, column, 0] = max(blue, np.float32(0.0))
-                out[row, column, 1] = max(green, np.float32(0.0))
-                out[row, column, 2] = max(red, np.float32(0.0))
-                continue
+            for n in range(_TAPS):
+                lines[n] = min(max(top + n - (_TAPS // 2 - 1), 0), high)
+                places[n] = min(max(left + n - (_TAPS // 2 - 1), 0), wide)
             for channel in range(first, last):
                 total = np.float32(0.0)
                 for j in range(_TAPS):
                     one = np.float32(0.0)
-                    n = min(max(top + j, 0), high)
                     for i in range(_TAPS):
-                        at = min(max(left + i, 0), wide)
-                        one += across[i] * table[picture[n, at, channel]]
+                        one += across[i] * table[picture[lines[j], places[i], channel]]
                     total += down[j] * one
                 out[row, column, channel] = max(total, np.float32(0.0))

@@ -1,6 +1,6 @@
 """A synthetic survey whose every ray is known: stereo stations over relief, through flat ports."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -139,13 +139,7 @@ def make_scene(
                     sigma_heading_deg=1.0,
                 )
             )
-    pairs = []
-    for i, j in sorted(cKDTree([pose.translation for pose in poses]).query_pairs(_FAR_M)):
-        _, a, b = np.intersect1d(ids[i], ids[j], return_indices=True)
-        if len(a) >= 15:
-            matches = np.stack([a, b], axis=1).astype(np.uint32)
-            geometry = {"config": CALIBRATED, "E": None, "F": None, "H": None}
-            pairs.append((i, j, PairMatches(matches=matches, geometry=geometry)))
+    near = sorted(cKDTree([pose.translation for pose in poses]).query_pairs(_FAR_M))
     return Scene(
         rig=rig,
         records=records,
@@ -153,5 +147,22 @@ def make_scene(
         points_ned=points_ned,
         pixels=pixels,
         ids=ids,
-        pairs=pairs,
+        pairs=match_pictures(ids, near),
     )
+
+
+def match_pictures(
+    ids: Sequence[NDArray[np.int64]],
+    near: Iterable[tuple[int, int]],
+    minimum: int = 15,
+    config: int = CALIBRATED,
+) -> list[tuple[int, int, PairMatches]]:
+    """True matches of pairs of pictures that share enough points."""
+    pairs = []
+    for i, j in near:
+        _, a, b = np.intersect1d(ids[i], ids[j], return_indices=True)
+        if len(a) >= minimum:
+            matches = np.stack([a, b], axis=1).astype(np.uint32)
+            geometry = {"config": config, "E": None, "F": None, "H": None}
+            pairs.append((i, j, PairMatches(matches=matches, geometry=geometry)))
+    return pairs

@@ -7,13 +7,12 @@ import numpy as np
 
 from reconstruct.dense.surface_tiles import look_at_points
 from reconstruct.dense.view_store import ViewStore
-from reconstruct.views.model import View, enu_from_cam
+from reconstruct.views.model import View
 from tests.oracles_dense import Scene, hits, sloped_with_step, speckle, stereo_views
 
 SCENE = Scene(depth_of=sloped_with_step, paint=speckle())
 VIEW = stereo_views(np.array([0.1]), np.array([0.2]))[0]
 CELL_M = 0.01
-OFFSET = np.array([0.0, 0.0, -12.0])
 
 
 def looks(view: View, world: np.ndarray, sigma_m: float = 1e-4) -> tuple[np.ndarray, np.ndarray]:
@@ -21,15 +20,11 @@ def looks(view: View, world: np.ndarray, sigma_m: float = 1e-4) -> tuple[np.ndar
     depth = view.world_from_cam.inv().apply(hits(view, SCENE).reshape(-1, 3))[:, 2].reshape(shape)
     depth = depth.astype(np.float32)
     depth[:20] = np.nan
-    enu = (world[:, [1, 0, 2]] * [1, 1, -1] - OFFSET).astype(np.float32)
-    to_cam = np.linalg.inv(np.vstack([enu_from_cam(view, OFFSET), [0, 0, 0, 1]]))[:3]
     with TemporaryDirectory() as folder:
         store = ViewStore(Path(folder))
         store.save_depth(0, "fine", depth, np.full(shape, sigma_m, np.float32))
-        return look_at_points(
-            enu, np.full(len(enu), sigma_m, np.float32), np.ascontiguousarray(to_cam),
-            store.stored_depth(0, "fine"), 1.0, view.kernel_lens, CELL_M,
-        )  # fmt: skip
+        sigmas = np.full(len(world), sigma_m, np.float32)
+        return look_at_points(world, sigmas, view, store.stored_depth(0, "fine"), 1.0, CELL_M)
 
 
 def rays(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

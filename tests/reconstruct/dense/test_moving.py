@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from alice_survey.app.stages import spec
-from alice_survey.core.config import ReconstructConfig, SurveyConfig
+from alice_survey.core.config import SurveyConfig
 from alice_survey.core.executor import SERIAL
 from reconstruct.dense.moving import (
     Look,
@@ -32,19 +32,15 @@ from tests.oracles_dense import (
     sloped_with_step,
     sparse_model,
     speckle,
-    stereo_views,
+    two_lines,
     write_workspace,
 )
 
 SCENE = Scene(depth_of=sloped_with_step, paint=speckle())
-CONFIG = SurveyConfig(reconstruct=ReconstructConfig())
 SEMI_AXES_M = (0.14, 0.06)
 
 
-def survey_views() -> list[View]:
-    """Two lines, half a metre apart, of four stereo stations each."""
-    along, aside = np.meshgrid([-0.05, 0.2, 0.45, 0.7], [0.1, 0.6])
-    return stereo_views(along.ravel(), aside.ravel(), heading_deg=0.0)
+VIEWS = two_lines(-0.05, 0.2, 0.45, 0.7)
 
 
 def body_mask(view: View, middle: np.ndarray) -> np.ndarray:
@@ -81,18 +77,17 @@ def with_light(folder: Path, views: list[View], bodies: bool) -> dict[str, np.nd
     return found
 
 
-def made(folder: Path, bodies: bool, config: SurveyConfig = CONFIG) -> dict[str, np.ndarray]:
-    views = survey_views()
-    write_workspace(folder, sparse_model(views, SCENE), SCENE)
-    truth = with_light(folder, views, bodies)
-    assert spec("dense").make(folder, config, SERIAL)
+def made(folder: Path, bodies: bool) -> dict[str, np.ndarray]:
+    write_workspace(folder, sparse_model(VIEWS, SCENE), SCENE)
+    truth = with_light(folder, VIEWS, bodies)
+    assert spec("dense").make(folder, SurveyConfig(), SERIAL)
     return truth
 
 
 def masks(folder: Path) -> dict[str, np.ndarray]:
     """What is left out of each picture."""
     still = Pictures.still(folder)
-    usable = {view.image: still.usable(view.image) for view in survey_views()}
+    usable = {view.image: still.usable(view.image) for view in VIEWS}
     nothing = np.ones((HEIGHT, WIDTH), bool)
     return {name: ~(nothing if mask is None else mask) for name, mask in usable.items()}
 
@@ -168,12 +163,14 @@ def port_views() -> tuple[View, View, np.ndarray, int]:
     return one, other, depth, step
 
 
+def look_of(view: View, depth: np.ndarray, step: int) -> Look:
+    light, usable = np.zeros((*depth.shape, 3, 3), np.float32), np.ones(depth.shape, bool)
+    return Look(view=view, step=step, light=light, usable=usable, depth=depth)
+
+
 def test_a_surface_is_drawn_into_another_view_as_its_slow_twin_does():
     one, other, depth, step = port_views()
-    found = np.full_like(depth, np.nan)
-    move = (other.world_from_cam.inv() * one.world_from_cam).as_matrix()[:3]
-    lattices = [(view.kernel_lens, float(step)) for view in (one, other)]
-    draw(depth, lattices[0], np.ascontiguousarray(move), lattices[1], found)
+    found = draw(look_of(one, depth, step), look_of(other, depth, step))
     expected = drawn(depth, one, other, step)
     assert 0.3 < np.isfinite(expected).mean() < 1.0
     alike = np.isclose(found, expected, rtol=1e-5, equal_nan=True)
@@ -190,9 +187,7 @@ def test_cells_show_points_that_lie_at_their_depth():
     z = rng.uniform(1.1, 1.3, len(pixels))
     points = one.at_depth(pixels, z)
     here = (1.5 + 0.001 * np.arange(len(points))).astype(np.float32)
-    light = np.zeros((*depth.shape, 3, 3), np.float32)
-    look = Look(view=one, step=step, light=light, usable=usable, depth=depth)
-    cells, log_ratio = cells_at(points, here, look)
+    cells, log_ratio = cells_at(points, here, look_of(one, depth, step)._replace(usable=usable))
 
     columns, rows = np.floor(pixels / step).astype(int).T
     inside = (columns >= 0) & (rows >= 0) & (columns < depth.shape[1]) & (rows < depth.shape[0])

@@ -9,17 +9,18 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.app.stages import spec
-from alice_survey.core.artefacts import read_json, write_csv
+from alice_survey.core.artefacts import read_json
 from alice_survey.core.config import ReconstructConfig, SurveyConfig
 from alice_survey.core.errors import keep_warnings
 from alice_survey.core.executor import SERIAL
 from reconstruct.views.model import SparseModel
 from tests.oracles_dense import (
     Scene,
+    read_raster,
     sloped_with_step,
     sparse_model,
     speckle,
-    stereo_views,
+    two_lines,
     write_workspace,
 )
 
@@ -35,32 +36,15 @@ def config(*planes: str) -> SurveyConfig:
     return SurveyConfig(reconstruct=ReconstructConfig(dem_cell_m=0.01, planes=planes))
 
 
-def survey() -> tuple[list, SparseModel]:
-    along, aside = np.meshgrid([-0.05, 0.3, 0.65], [0.1, 0.6])
-    views = stereo_views(along.ravel(), aside.ravel(), heading_deg=0.0)
-    return views, sparse_model(views, SCENE)
-
-
-def write_track(folder: Path, views: list) -> None:
-    header = ("image", "station", "time_s", "north_m", "east_m", "depth_m", "qx", "qy", "qz", "qw")
-    write_csv(
-        folder / "sparse" / "track.csv",
-        header,
-        [
-            (view.image, view.station, float(view.station), *view.world_from_cam.translation,
-             *view.world_from_cam.rotation.as_quat())
-            for view in views
-        ],
-    )  # fmt: skip
+def survey() -> SparseModel:
+    return sparse_model(two_lines(-0.05, 0.3, 0.65), SCENE)
 
 
 @pytest.fixture(scope="module")
 def level(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The scene on the level plane, and on that turned by 90 degrees about the vertical."""
     folder = tmp_path_factory.mktemp("level")
-    views, model = survey()
-    write_workspace(folder, model, SCENE)
-    write_track(folder, views)
+    write_workspace(folder, survey(), SCENE)
     planes = config("level", "turned=facing 90 tilt 90")
     assert spec("dense").make(folder, planes, SERIAL)
     assert spec("mosaic").make(folder, planes, SERIAL)
@@ -71,9 +55,7 @@ def level(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def wall(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
     """The scene as a wall that faces south, and what was warned of."""
     folder = tmp_path_factory.mktemp("wall")
-    views, model = survey()
-    write_workspace(folder, model, SCENE, WORLD_FROM_SCENE)
-    write_track(folder, views)
+    write_workspace(folder, survey(), SCENE, WORLD_FROM_SCENE)
     planes = config("back=facing 0", "wall=facing 180")
     with keep_warnings() as warnings:
         assert spec("dense").make(folder, planes, SERIAL)
@@ -81,17 +63,9 @@ def wall(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
     return folder, [str(warning) for warning in warnings]
 
 
-def read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Values, and up and right of the cells' centres in the plane."""
-    with rasterio.open(path) as raster:
-        values, t = raster.read(1).astype(np.float64), raster.transform
-    rows, columns = np.mgrid[: values.shape[0], : values.shape[1]] + 0.5
-    return values, t.f + rows * t.e, t.c + columns * t.a
-
-
 def points_enu(folder: Path) -> np.ndarray:
     """The cells of a DEM as points (N, 3) by its `plane.json`: east, north, up."""
-    height, up, right = read(folder / "dem.tif")
+    height, up, right = read_raster(folder / "dem.tif")
     about = read_json(folder / "plane.json")
     known = np.isfinite(height)
     axes = np.array([about["right_enu"], about["up_enu"], about["out_enu"]])
@@ -100,8 +74,8 @@ def points_enu(folder: Path) -> np.ndarray:
 
 
 def test_a_turned_plane_has_the_heights_of_the_level_one(level: Path):
-    height, north, east = read(level / "dense" / "dem.tif")
-    turned, west, up_north = read(level / "dense" / "planes" / "turned" / "dem.tif")
+    height, north, east = read_raster(level / "dense" / "dem.tif")
+    turned, west, up_north = read_raster(level / "dense" / "planes" / "turned" / "dem.tif")
     # its up is west and its right is north
     column, row = (-west - east[0, 0]) / 0.01, (north[0, 0] - up_north) / 0.01
     there = map_coordinates(height, [row, column], order=1, cval=np.nan)
@@ -111,8 +85,8 @@ def test_a_turned_plane_has_the_heights_of_the_level_one(level: Path):
     assert np.median(difference) < 2e-6  # the same cells, of the same points
     assert np.mean(difference > 1e-3) < 0.005  # ends of views and bridged gaps
     for name in ("surfaces", "count"):
-        one = read(level / "dense" / f"{name}.tif")[0]
-        other = read(level / "dense" / "planes" / "turned" / f"{name}.tif")[0]
+        one = read_raster(level / "dense" / f"{name}.tif")[0]
+        other = read_raster(level / "dense" / "planes" / "turned" / f"{name}.tif")[0]
         assert other.sum() == pytest.approx(one.sum(), rel=1e-3)
 
 

@@ -28,11 +28,12 @@ SCENE = Scene(
     paint=position_code,
 )
 OFFSET = np.array([3.0, -2.0, -12.0])
+VIEW = stereo_views(np.array([0.2]), np.array([0.1]))[0]
 
 
-def depth_of(view, scene=SCENE) -> np.ndarray:
-    cam = view.world_from_cam.inv().apply(hits(view, scene).reshape(-1, 3))
-    return cam[:, 2].reshape(view.pinhole.height_px, view.pinhole.width_px).astype(np.float32)
+def depth_of(view) -> np.ndarray:
+    cam = view.world_from_cam.inv().apply(hits(view, SCENE).reshape(-1, 3))
+    return cam[:, 2].reshape(view.pinhole.size_px[::-1]).astype(np.float32)
 
 
 def gathered(view, box=EVERYWHERE, factors=None, depth=None):
@@ -40,24 +41,15 @@ def gathered(view, box=EVERYWHERE, factors=None, depth=None):
     colour = np.zeros((*depth.shape, 3), np.uint8)
     colour[...] = (100, 50, 20)
     known = np.isfinite(depth)
-    return points_in_box(
-        view,
-        7,
-        depth,
-        np.full_like(depth, 0.01),
-        known,
-        colour,
-        np.ones((2, 2, 3), np.float32) if factors is None else factors,
-        OFFSET,
-        box,
-        block_bounds(known, points_of_pixels(view, depth, known)),
-    )
+    factors = np.ones((2, 2, 3), np.float32) if factors is None else factors
+    blocks = block_bounds(known, points_of_pixels(view, depth, known))
+    sigma = np.full_like(depth, 0.01)
+    return points_in_box(view, 7, depth, sigma, known, colour, factors, OFFSET, box, blocks)
 
 
 def test_points_lie_where_the_rays_hit():
-    view = stereo_views(np.array([0.2]), np.array([0.1]))[0]
-    points = gathered(view)
-    world = hits(view, SCENE).reshape(-1, 3)
+    points = gathered(VIEW)
+    world = hits(VIEW, SCENE).reshape(-1, 3)
     enu = np.column_stack([world[:, 1], world[:, 0], -world[:, 2]]) - OFFSET
     np.testing.assert_allclose(points.enu, enu, atol=2e-6)
     assert (points.views == 7).all()
@@ -65,8 +57,7 @@ def test_points_lie_where_the_rays_hit():
 
 
 def test_normals_are_those_of_the_plane_and_point_to_the_camera():
-    view = stereo_views(np.array([0.2]), np.array([0.1]))[0]
-    normals = gathered(view).normals
+    normals = gathered(VIEW).normals
     known = np.isfinite(normals).all(axis=1)
     assert known.mean() > 0.95
     # depth = 12 + 0.2 n - 0.1 e, so up = -12 - 0.2 n + 0.1 e with normal (-0.1, 0.2, 1)
@@ -75,44 +66,35 @@ def test_normals_are_those_of_the_plane_and_point_to_the_camera():
 
 
 def test_boxes_share_no_point_and_miss_none():
-    view = stereo_views(np.array([0.2]), np.array([0.1]))[0]
-    everything = gathered(view)
+    everything = gathered(VIEW)
     middle = float(np.median(everything.enu[:, 0]))
-    west = gathered(view, (-100.0, middle, -100.0, 100.0))
-    east = gathered(view, (middle, 100.0, -100.0, 100.0))
+    west = gathered(VIEW, (-100.0, middle, -100.0, 100.0))
+    east = gathered(VIEW, (middle, 100.0, -100.0, 100.0))
     assert len(west.enu) + len(east.enu) == len(everything.enu)
     assert min(len(west.enu), len(east.enu)) > 1000
     assert west.enu[:, 0].max() <= middle <= east.enu[:, 0].max()
 
 
-def tilted():
-    return port_view([0.2, -0.1, 0.0], [2.0, -1.0, 40.0])
-
-
 def test_unknown_depth_gives_no_point_and_no_normal_next_to_it():
-    view = stereo_views(np.array([0.2]), np.array([0.1]))[0]
-    depth = depth_of(view)
+    depth = depth_of(VIEW)
     depth[100:110, 50:60] = np.nan
-    points = gathered(view, depth=depth)
+    points = gathered(VIEW, depth=depth)
     assert len(points.enu) == depth.size - 100
-    rim = 4 * (view.pinhole.width_px + view.pinhole.height_px) - 16
+    rim = 4 * sum(VIEW.pinhole.size_px) - 16
     assert (~np.isfinite(points.normals[:, 0])).sum() == pytest.approx(rim + 80, abs=2)
 
 
 def test_colours_take_the_factors_of_their_place():
-    view = stereo_views(np.array([0.2]), np.array([0.1]))[0]
     factors = np.ones((2, 2, 3), np.float32)
     factors[:, 1] = 2.0
-    colours = gathered(view, factors=factors).colours.reshape(
-        view.pinhole.height_px, view.pinhole.width_px, 3
-    )
+    colours = gathered(VIEW, factors=factors).colours.reshape(*VIEW.pinhole.size_px[::-1], 3)
     np.testing.assert_allclose(colours[:, 0, 2], 100, atol=1)
     np.testing.assert_allclose(colours[:, -1, 2], 200, atol=1)
-    np.testing.assert_allclose(colours[:, view.pinhole.width_px // 2, 0], 30, atol=1)
+    np.testing.assert_allclose(colours[:, VIEW.pinhole.width_px // 2, 0], 30, atol=1)
 
 
 def test_points_through_a_tilted_port_lie_where_the_exact_rays_hit():
-    view = tilted()
+    view = port_view([0.2, -0.1, 0.0], [2.0, -1.0, 40.0])
     depth = plane_depth(view, 1.6)  # far from the range at which the picture is exact
     points = gathered(view, depth=depth).enu + OFFSET
     np.testing.assert_allclose(points[:, 2], -1.6, atol=1e-6)

@@ -2,7 +2,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rasterio
 from scipy import ndimage
 
 from alice_survey.app.stages import spec
@@ -16,10 +15,12 @@ from reconstruct.dense.stereo_pairs import in_frame
 from tests.oracles_dense import (
     Scene,
     flat,
+    read_raster,
     sloped_with_step,
     sparse_model,
     speckle,
     stereo_views,
+    two_lines,
     write_workspace,
 )
 
@@ -27,26 +28,15 @@ SCENE = Scene(depth_of=sloped_with_step, paint=speckle())
 CONFIG = SurveyConfig(reconstruct=ReconstructConfig())
 
 
-def survey_views() -> list:
-    """Two lines, half a metre apart, of three stereo stations each."""
-    along, aside = np.meshgrid([-0.05, 0.3, 0.65], [0.1, 0.6])
-    return stereo_views(along.ravel(), aside.ravel(), heading_deg=0.0)
+VIEWS = two_lines(-0.05, 0.3, 0.65)
 
 
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("survey")
-    write_workspace(folder, sparse_model(survey_views(), SCENE), SCENE)
+    write_workspace(folder, sparse_model(VIEWS, SCENE), SCENE)
     assert spec("dense").make(folder, CONFIG, SERIAL)
     return folder
-
-
-def read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Values, and north and east of the cells' centres."""
-    with rasterio.open(path) as raster:
-        values, t = raster.read(1).astype(np.float64), raster.transform
-    rows, columns = np.mgrid[: values.shape[0], : values.shape[1]] + 0.5
-    return values, t.f + rows * t.e, t.c + columns * t.a
 
 
 def middle(north: np.ndarray, east: np.ndarray) -> np.ndarray:
@@ -55,7 +45,7 @@ def middle(north: np.ndarray, east: np.ndarray) -> np.ndarray:
 
 
 def test_surface_agrees_with_the_truth_edges_included(workspace: Path):
-    height, north, east = read(workspace / "dense" / "dem.tif")
+    height, north, east = read_raster(workspace / "dense" / "dem.tif")
     here = middle(north, east)
     assert np.isfinite(height[here]).mean() > 0.97
     error = (height + sloped_with_step(north, east))[here]
@@ -68,9 +58,9 @@ def test_surface_agrees_with_the_truth_edges_included(workspace: Path):
 
 
 def test_sigma_is_an_honest_bound(workspace: Path):
-    height, north, east = read(workspace / "dense" / "dem.tif")
-    sigma, _, _ = read(workspace / "dense" / "sigma.tif")
-    count, _, _ = read(workspace / "dense" / "count.tif")
+    height, north, east = read_raster(workspace / "dense" / "dem.tif")
+    sigma, _, _ = read_raster(workspace / "dense" / "sigma.tif")
+    count, _, _ = read_raster(workspace / "dense" / "count.tif")
     flat_part = middle(north, east) & (np.abs(north - 0.3) > 0.25) & (count > 0)
     error = (height + sloped_with_step(north, east))[flat_part]
     ratio = np.sqrt(np.mean(np.clip(error / sigma[flat_part], -5, 5) ** 2))
@@ -97,10 +87,10 @@ def test_cloud_lies_on_the_surface_with_normals_up(workspace: Path):
 
 
 def test_stations_and_slope(workspace: Path):
-    _, north, east = read(workspace / "dense" / "dem.tif")
-    count, _, _ = read(workspace / "dense" / "count.tif")
-    stations, _, _ = read(workspace / "dense" / "stations.tif")
-    slope, _, _ = read(workspace / "dense" / "slope.tif")
+    _, north, east = read_raster(workspace / "dense" / "dem.tif")
+    count, _, _ = read_raster(workspace / "dense" / "count.tif")
+    stations, _, _ = read_raster(workspace / "dense" / "stations.tif")
+    slope, _, _ = read_raster(workspace / "dense" / "slope.tif")
     assert (stations <= count).all()
     assert (2 * stations >= count).all()  # a station has two cameras
     assert np.median(stations[middle(north, east)]) >= 3
@@ -123,7 +113,7 @@ def test_scratch_is_gone_and_files_are_there(workspace: Path):
 def test_an_interruption_while_a_plane_is_written_costs_nothing(
     workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    write_workspace(tmp_path, sparse_model(survey_views(), SCENE), SCENE)
+    write_workspace(tmp_path, sparse_model(VIEWS, SCENE), SCENE)
     with monkeypatch.context() as interrupted:
 
         def stop(dem: Path, picture: Path) -> None:
@@ -150,11 +140,11 @@ def test_pictures_without_texture_are_refused(tmp_path: Path):
 
 
 def test_what_one_stereo_pair_alone_sees_is_kept_with_an_honest_sigma(workspace: Path):
-    height, north, east = read(workspace / "dense" / "dem.tif")
-    sigma, _, _ = read(workspace / "dense" / "sigma.tif")
+    height, north, east = read_raster(workspace / "dense" / "dem.tif")
+    sigma, _, _ = read_raster(workspace / "dense" / "sigma.tif")
     true = sloped_with_step(north, east)
     ground = np.stack([north.ravel(), east.ravel(), true.ravel()], axis=1)
-    left, right = np.split(np.array([in_frame(view, ground) for view in survey_views()]), 2)
+    left, right = np.split(np.array([in_frame(view, ground) for view in VIEWS]), 2)
     alone = ((left & right).sum(axis=0) == 1) & (left.sum(axis=0) + right.sum(axis=0) == 2)
     alone = alone.reshape(height.shape) & (np.hypot(north - 0.3, east - 0.35) > 0.4)
     alone = ndimage.binary_erosion(alone, iterations=2)  # of windows at a picture's border

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from reconstruct.dense.points import Points
 from reconstruct.dense.surface_points import SURFACE_POINT, fuse_surface, settle
 from tests.oracles_dense import fused
+from tests.reconstruct.dense.test_surfaces import together
 
 CELL_M, SIGMA_M = 0.01, 0.001
 STATIONS = np.arange(40) // 2
@@ -124,13 +125,8 @@ def test_both_sides_of_a_thin_wall_stay_apart():
     rng = np.random.default_rng(5)
     north = np.array([0.0, 1.0, 0.0])
     one, other = patch(north, rng), patch(-north, rng)
-    front = Points(**{**vars(one), "enu": one.enu + np.array([0, 0.02, 0], np.float32)})
-    found = fuse_surface(
-        Points(**{name: np.concatenate([getattr(front, name), getattr(other, name)])[
-            np.argsort(np.concatenate([front.views, other.views]), kind="stable")]
-            for name in vars(front)}),
-        STATIONS, CELL_M, np.zeros(3), 1.4,
-    )  # fmt: skip
+    front = one._replace(enu=one.enu + np.array([0, 0.02, 0], np.float32))
+    found = fuse_surface(together(front, other), STATIONS, CELL_M, np.zeros(3), 1.4)
     ahead = found["normal"][:, 1] > 0
     np.testing.assert_allclose(found["enu"][ahead, 1], 0.02, atol=5 * SIGMA_M)
     np.testing.assert_allclose(found["enu"][~ahead, 1], 0.0, atol=5 * SIGMA_M)

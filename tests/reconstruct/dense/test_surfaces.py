@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from reconstruct.dense.dem import FusedCells, cells_over
-from reconstruct.dense.points import Points
-from reconstruct.dense.surface_points import fuse_surface
+from reconstruct.dense.points import Points, join_points
+from reconstruct.dense.surface_points import fuse_surface, surfaces_of
 from reconstruct.raster import DemGrid
+from tests.oracles_dense import surfaces
 
 CELL_M, SIGMA_M = 0.01, 0.002
 STATIONS = np.arange(40) // 2
@@ -53,13 +54,8 @@ def sheet(
 
 def together(*sheets: Points) -> Points:
     """Points of several sheets, in the order of their views."""
-    order = np.argsort(np.concatenate([one.views for one in sheets]), kind="stable")
-    return Points(
-        **{
-            name: np.concatenate([getattr(one, name) for one in sheets])[order]
-            for name in ("enu", "normals", "colours", "sigmas", "views")
-        }
-    )
+    joined = join_points(list(sheets))
+    return joined.part(np.argsort(joined.views, kind="stable"))
 
 
 def fused(points: Points, cells: int = 30) -> FusedCells:
@@ -100,8 +96,7 @@ def test_a_cell_in_which_a_wall_stands_has_no_height(slope_deg: float):
 def test_undersides_do_not_count():
     rng = np.random.default_rng(5)
     floor, roof = sheet(rng, up_m=-5.0), sheet(rng, up_m=-4.0, views=range(4))
-    below = Points(**{**vars(roof), "normals": -roof.normals})
-    found = fused(together(floor, below))
+    found = fused(together(floor, roof._replace(normals=-roof.normals)))
     assert (found.surfaces == 1).all()
     np.testing.assert_allclose(found.height, -5.0, atol=1e-3)
 
@@ -122,3 +117,19 @@ def test_a_gap_that_noise_and_cell_explain_divides_nothing(gap_m: float, surface
     rng = np.random.default_rng(8)
     found = fused(together(sheet(rng, up_m=-5.0), sheet(rng, up_m=-5.0 + gap_m)))
     assert (found.surfaces == surfaces).all()
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_surfaces_of_a_cell_are_those_of_its_slow_twin(seed: int):
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(1, 40))
+    heights = rng.normal(0, 2e-3, count) + rng.choice([0.0, 0.018, 0.05, 0.12], count)
+    sigmas = rng.uniform(2e-4, 2e-3, count)
+    steepness = np.where(rng.random(count) < 0.3, np.nan, rng.uniform(0, 2, count))
+    rows = [values.astype(np.float32) for values in (heights, sigmas, steepness)]
+    places = rng.integers(0, 4, count)
+    found, surface = surfaces_of(rows[0], rows[1], places, rows[2], CELL_M)
+    expected = surfaces(rows[0], rows[1], places, rows[2], CELL_M)
+    assert [sorted(np.flatnonzero(surface == n)) for n in range(found)] == [
+        sorted(members) for members in expected
+    ]

@@ -44,18 +44,23 @@ def station_pair(
     return points, pixels, camera, true
 
 
-def start() -> RigidTransform:
-    return RigidTransform.from_components([0.0, 0.03, 0.0], Rotation.from_rotvec([0.02, 0, 0])) * (
-        TRUE
-    )
+OFF = RigidTransform.from_components([0.0, 0.03, 0.0], Rotation.from_rotvec([0.02, 0, 0]))
+START = OFF * TRUE
+
+
+def refined(
+    points: np.ndarray, pixels: np.ndarray, camera: np.ndarray
+) -> tuple[RigidTransform, np.ndarray]:
+    found = refine_link(points, pixels, camera, PINHOLES, START)
+    assert found is not None
+    return found
 
 
 def test_exact_pixels_give_the_exact_pose() -> None:
     points, pixels, camera, _ = station_pair(1, noise_px=0.0)
-    found = refine_link(points, pixels, camera, PINHOLES, start())
-    assert found is not None
-    np.testing.assert_allclose(found[0].translation, TRUE.translation, atol=1e-8)
-    assert (found[0].rotation * TRUE.rotation.inv()).magnitude() < 1e-8
+    pose, _ = refined(points, pixels, camera)
+    np.testing.assert_allclose(pose.translation, TRUE.translation, atol=1e-8)
+    assert (pose.rotation * TRUE.rotation.inv()).magnitude() < 1e-8
 
 
 def test_it_is_the_adjustment_of_pose_and_points_together() -> None:
@@ -71,12 +76,9 @@ def test_it_is_the_adjustment_of_pose_and_points_together() -> None:
             [(PINHOLES.see(pose.apply(at), camera)[0] - pixels).ravel(), held.ravel()]
         )
 
-    guess = start()
-    first = np.concatenate([guess.rotation.as_rotvec(), guess.translation, points.ravel()])
+    first = np.concatenate([START.rotation.as_rotvec(), START.translation, points.ravel()])
     oracle = least_squares(miss, first).x
-    found = refine_link(points, pixels, camera, PINHOLES, guess)
-    assert found is not None
-    pose, covariance = found
+    pose, covariance = refined(points, pixels, camera)
     sigma = np.sqrt(np.diag(covariance))
     assert (np.abs(pose.translation - oracle[3:6]) < 0.7 * sigma[3:]).all()
     turn = (pose.rotation * Rotation.from_rotvec(oracle[:3]).inv()).as_rotvec()
@@ -88,9 +90,7 @@ def test_noise_of_stereo_does_not_shorten_the_way_between_stations() -> None:
     lengths, pulls = [], []
     for seed in range(12):
         points, pixels, camera, _ = station_pair(seed)
-        found = refine_link(points, pixels, camera, PINHOLES, start())
-        assert found is not None
-        pose, covariance = found
+        pose, covariance = refined(points, pixels, camera)
         lengths.append(np.linalg.norm(pose.translation) / np.linalg.norm(TRUE.translation))
         turn = (pose.rotation * TRUE.rotation.inv()).as_rotvec()
         error = np.concatenate([turn, pose.translation - TRUE.translation])
@@ -101,10 +101,8 @@ def test_noise_of_stereo_does_not_shorten_the_way_between_stations() -> None:
 
 def test_wrong_matches_are_left_aside() -> None:
     points, pixels, camera, _ = station_pair(3)
-    clean = refine_link(points, pixels, camera, PINHOLES, start())
+    clean = refined(points, pixels, camera)
     pixels[::5] += np.random.default_rng(1).uniform(20, 200, pixels[::5].shape)
-    spoiled = refine_link(points, pixels, camera, PINHOLES, start())
-    assert clean is not None
-    assert spoiled is not None
+    spoiled = refined(points, pixels, camera)
     sigma = np.sqrt(np.diag(clean[1])[3:])
     assert (np.abs(spoiled[0].translation - clean[0].translation) < 2 * sigma).all()

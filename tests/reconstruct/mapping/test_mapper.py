@@ -1,6 +1,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
+from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -9,6 +10,7 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.core.manifest import ImageRecord
 from camera_calib.approximation.pinhole_warp import best_warp
 from reconstruct.mapping.database import Observations, write_database
 from reconstruct.mapping.mapper import (
@@ -26,7 +28,7 @@ from reconstruct.placing.alignment import align_rigid, align_similarity
 from reconstruct.placing.run import measure_doming
 from reconstruct.views.model_files import as_transform, colmap_pinhole, rigid3d
 from tests.reconstruct.rig_survey import four_cameras
-from tests.reconstruct.scenes import Scene, make_scene
+from tests.reconstruct.scenes import Scene, make_scene, match_pictures
 
 
 def seen_by_pinholes(scene: Scene) -> Observations:
@@ -190,9 +192,6 @@ def test_self_calibration_finds_focal_length_distortion_and_rig(
 
 def oblique_scene(camera: pycolmap.Camera, rng: np.random.Generator, names: Sequence[str]) -> Scene:
     """Eight stations around a bumpy floor, looking at its middle; 0.2 m from left to right."""
-    from alice_survey.core.manifest import ImageRecord
-    from reconstruct.matching.matches import PairMatches
-
     points = np.column_stack([rng.uniform(-1.6, 1.6, (700, 2)), rng.uniform(-0.25, 0.25, 700)])
     records, poses, pixels, ids = [], [], [], []
     cam_from_left = {
@@ -204,8 +203,7 @@ def oblique_scene(camera: pycolmap.Camera, rng: np.random.Generator, names: Sequ
             [-0.1, 0.25, 0.02], Rotation.from_rotvec([-0.1, 0.05, 0.2])
         ),
     }
-    for station in range(8):
-        angle = 0.35 * station
+    for station, angle in enumerate(0.35 * np.arange(8)):
         place = np.array([1.6 * np.cos(angle), 1.6 * np.sin(angle), -2.0])
         forward = -place / np.linalg.norm(place)
         side = np.cross(forward, [0.0, 0.0, -1.0])
@@ -221,14 +219,8 @@ def oblique_scene(camera: pycolmap.Camera, rng: np.random.Generator, names: Sequ
             pixels.append(seen[inside] + rng.normal(0, 0.2, (int(inside.sum()), 2)))
             poses.append(pose)
             records.append(ImageRecord(image=f"{name}/{station}.png", camera=name, station=station))
-    pairs = []
-    for i in range(len(ids)):
-        for j in range(i + 1, len(ids)):
-            _, a, b = np.intersect1d(ids[i], ids[j], return_indices=True)
-            if len(a) >= 30 and abs(records[i].station - records[j].station) <= 3:
-                matches = np.stack([a, b], axis=1).astype(np.uint32)
-                geometry = {"config": 3, "E": None, "F": None, "H": None}
-                pairs.append((i, j, PairMatches(matches=matches, geometry=geometry)))
+    near = [(i, j) for i, j in combinations(range(len(ids)), 2)
+            if abs(records[i].station - records[j].station) <= 3]  # fmt: skip
     return Scene(
         rig=make_scene(lines=1, stations=1, points=1).rig,
         records=records,
@@ -236,7 +228,7 @@ def oblique_scene(camera: pycolmap.Camera, rng: np.random.Generator, names: Sequ
         points_ned=points,
         pixels=pixels,
         ids=ids,
-        pairs=pairs,
+        pairs=match_pictures(ids, near, 30, 3),
     )
 
 

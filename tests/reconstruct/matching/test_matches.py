@@ -18,7 +18,7 @@ from reconstruct.matching.matches import (
     match_near,
     match_pair,
 )
-from tests.oracles_matching import match_near_slowly, match_slowly
+from tests.oracles_matching import match_slowly
 
 
 @settings(deadline=None, max_examples=40)
@@ -113,7 +113,7 @@ def test_narrowed_matches_equal_those_of_the_slow_twin(
         low, high = predicted[mates].min(axis=0) - radius, predicted[mates].max(axis=0) + radius
         searched[i] = ((b.pixels >= low) & (b.pixels <= high)).all(axis=1)
     found = match_near(a, b, 0.9, predicted, radius, cell)
-    slow = match_near_slowly(a.descriptors, b.descriptors, 0.9, searched)
+    slow = match_slowly(a.descriptors, b.descriptors, 0.9, searched)
     np.testing.assert_array_equal(found, slow)
 
 

@@ -1,3 +1,4 @@
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -68,11 +69,15 @@ def write_dense(folder: Path, images: list[str]) -> None:
     write_json(dense / "stage.json", {})
 
 
+def make_workspace(folder: Path, others: Sequence[str] = ()) -> None:
+    """Three stations over the bump; `others` are pictures that only the light knows."""
+    views = stereo_views(np.array([-0.2, 0.2, 0.5]), np.array([0.0, 0.05, 0.0]))
+    write_workspace(folder, sparse_model(views, SCENE), SCENE)
+    write_dense(folder, [*(view.image for view in views), *others])
+
+
 def test_tasks_do_not_grow_with_the_survey(tmp_path: Path):
-    views = stereo_views(np.array([-0.2, 0.2]), np.array([0.0, 0.05]))
-    write_workspace(tmp_path, sparse_model(views, SCENE), SCENE)
-    others = [f"left/other_{n:05d}.png" for n in range(5000)]
-    write_dense(tmp_path, [*(view.image for view in views), *others])
+    make_workspace(tmp_path, [f"left/other_{n:05d}.png" for n in range(5000)])
     settings = SurveyConfig(reconstruct=ReconstructConfig(mesh_error_px=1.0))
     with PicklingThreads(2) as engine:
         assert spec("mesh").make(tmp_path, settings, engine.executor)
@@ -83,9 +88,7 @@ def test_tasks_do_not_grow_with_the_survey(tmp_path: Path):
 @pytest.fixture(scope="module")
 def mesh(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("mesh")
-    views = stereo_views(np.array([-0.2, 0.2, 0.5]), np.array([0.0, 0.05, 0.0]))
-    write_workspace(folder, sparse_model(views, SCENE), SCENE)
-    write_dense(folder, [view.image for view in views])
+    make_workspace(folder)
     settings = SurveyConfig(reconstruct=ReconstructConfig(mesh_error_px=0.1))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("reconstruct.mesh.atlas.PAGE_PX", 1024)

@@ -22,15 +22,8 @@ from reconstruct.mesh.cells import CellLevel
 from reconstruct.mesh.surface import coarser_level, finest_level
 from reconstruct.mesh.topology import edges_of
 from reconstruct.ply import open_cloud
-from tests.oracles_dense import (
-    DATUM,
-    FRAME,
-    position_code,
-    sparse_model,
-    stereo_views,
-    write_workspace,
-)
-from tests.reconstruct.mesh.test_run import OFFSET, SCENE, STEP_M, bump, write_dense
+from tests.oracles_dense import DATUM, FRAME, position_code
+from tests.reconstruct.mesh.test_run import OFFSET, STEP_M, bump, make_workspace
 
 PAGE_PX = 512
 ERROR_M = 3e-4
@@ -107,9 +100,7 @@ def read_tiles(path: Path) -> list[Tile]:
 @pytest.fixture(scope="module")
 def survey(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     folder = tmp_path_factory.mktemp("tiles")
-    views = stereo_views(np.array([-0.2, 0.2, 0.5]), np.array([0.0, 0.05, 0.0]))
-    write_workspace(folder, sparse_model(views, SCENE), SCENE)
-    write_dense(folder, [view.image for view in views])
+    make_workspace(folder)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(surface, "_TILE_STEPS", (12, 12))
         patch.setattr("reconstruct.mesh.tiles._LEVELS_OF_A_FILE", 2)

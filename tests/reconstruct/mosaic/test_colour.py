@@ -42,21 +42,24 @@ def shown(albedo: np.ndarray, place: np.ndarray, ranges: np.ndarray) -> np.ndarr
     return albedo * lamp(x, y) * water + haze(x, y)
 
 
+def shown_twice(
+    rng: np.random.Generator, views: np.ndarray, places: np.ndarray, ranges: np.ndarray
+) -> LightSamples:
+    """Random spots as two views show them each, with 2 % of noise."""
+    albedo = rng.uniform(0.08, 0.5, (len(views), 1)) * rng.uniform(0.8, 1.2, (len(views), 3))
+    light = np.stack([shown(albedo, places[:, s], ranges[:, s]) for s in range(2)], axis=1)
+    light *= np.exp(rng.normal(0, 0.02, light.shape))
+    places, levels, ranges = (a.astype(np.float32) for a in (places, np.log(light), ranges))
+    return LightSamples(views=views.astype(np.int32), places=places, levels=levels, ranges=ranges)
+
+
 def survey(relief_m: float, count: int = 4000) -> tuple[LightSamples, list[PictureMeasures]]:
     rng = np.random.default_rng(4)
     views = rng.integers(0, len(IMAGES), (count, 2))
     views = views[views[:, 0] != views[:, 1]].astype(np.int32)
     places = rng.uniform(0, 1, (len(views), 2, 2))
     ranges = MIDDLE_M + rng.uniform(-relief_m, relief_m, (len(views), 2))
-    albedo = rng.uniform(0.08, 0.5, (len(views), 1)) * rng.uniform(0.8, 1.2, (len(views), 3))
-    light = np.stack([shown(albedo, places[:, s], ranges[:, s]) for s in range(2)], axis=1)
-    light *= np.exp(rng.normal(0, 0.02, light.shape))
-    samples = LightSamples(
-        views=views,
-        places=places.astype(np.float32),
-        levels=np.log(light).astype(np.float32),
-        ranges=ranges.astype(np.float32),
-    )
+    samples = shown_twice(rng, views, places, ranges)
     facts = []
     for image in IMAGES:
         dark = haze(NODE_X, NODE_Y) + 0.004 * rng.uniform(0, 1, (*GRID, 1))
@@ -212,15 +215,7 @@ def oblique_chain() -> tuple[LightSamples, list[PictureMeasures]]:
     x = rng.uniform(0, 1, (len(views), 2))
     y = np.stack([np.concatenate([row[k] for row in rows]) for k in (2, 4)], axis=1)
     ranges = np.stack([np.concatenate([row[k] for row in rows]) for k in (3, 5)], axis=1)
-    places = np.stack([x, y], axis=2)
-    albedo = rng.uniform(0.08, 0.5, (len(views), 1)) * rng.uniform(0.8, 1.2, (len(views), 3))
-    light = np.stack([shown(albedo, places[:, k], ranges[:, k]) for k in range(2)], axis=1)
-    light *= np.exp(rng.normal(0, 0.02, light.shape))
-    samples = LightSamples(
-        views=views.astype(np.int32), places=places.astype(np.float32),
-        levels=np.log(light).astype(np.float32), ranges=ranges.astype(np.float32),
-    )  # fmt: skip
-    return samples, facts
+    return shown_twice(rng, views, np.stack([x, y], axis=2), ranges), facts
 
 
 def test_light_does_not_drift_along_a_chain_of_oblique_pictures() -> None:

@@ -1,3 +1,4 @@
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -5,6 +6,7 @@ import pytest
 
 from reconstruct.light.solve import (
     GRID,
+    LightModel,
     LightSamples,
     Parts,
     as_rows,
@@ -29,6 +31,17 @@ def pattern(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return -1.2 * ((x - 0.45) ** 2 + (y - 0.6) ** 2)
 
 
+def seen_by(
+    views: tuple[int, int], places: Sequence[np.ndarray], levels: Sequence[np.ndarray]
+) -> LightSamples:
+    """Spots of two views, where each sees them and what it shows there."""
+    return LightSamples(
+        views=np.tile(np.array(views, np.int32), (len(places[0]), 1)),
+        places=np.stack(places, axis=1).astype(np.float32),
+        levels=np.stack(levels, axis=1).astype(np.float32),
+    )
+
+
 def samples(noise: float = 0.02, outliers: float = 0.0, lines: int = 3, count: int = 400):
     """Nine pictures in lines that overlap on all sides, over a sea floor of random colour."""
     rng = np.random.default_rng(3)
@@ -49,13 +62,7 @@ def samples(noise: float = 0.02, outliers: float = 0.0, lines: int = 3, count: i
             two = ground + (pattern(*there.T) + gains[b])[:, None]
             two = two + rng.normal(0, noise, two.shape)
             two[rng.random(len(two)) < outliers] += 0.8
-            parts.append(
-                LightSamples(
-                    views=np.tile(np.array([a, b], np.int32), (len(here), 1)),
-                    places=np.stack([here, there], axis=1).astype(np.float32),
-                    levels=np.stack([one, two], axis=1).astype(np.float32),
-                )
-            )
+            parts.append(seen_by((a, b), (here, there), (one, two)))
     return gains, joined_samples(parts)
 
 
@@ -68,10 +75,15 @@ def misfit(found: np.ndarray) -> float:
     return float(np.sqrt((error**2).mean()))
 
 
+def light_of(found: LightSamples, nodes: np.ndarray = UNKNOWN) -> LightModel:
+    """The light of pictures of one camera."""
+    return solve_light(in_one_part(found), nodes, IMAGES, ["left"] * len(IMAGES))
+
+
 @pytest.mark.parametrize("outliers", [0.0, 0.1])
 def test_overlaps_alone_separate_the_lamp_from_the_sea_floor(outliers: float):
     gains, found = samples(outliers=outliers)
-    light = solve_light(in_one_part(found), UNKNOWN, IMAGES, ["left"] * len(IMAGES))
+    light = light_of(found)
     for channel in range(3):
         assert 1e-4 < misfit(light.patterns["left"][..., channel]) < 0.03
     assert misfit(np.zeros(GRID)) > 0.1
@@ -82,12 +94,7 @@ def test_the_median_picture_gives_what_a_single_line_cannot():
     _, found = samples(lines=1)
     rng = np.random.default_rng(9)
     shown = pattern(NODES_X, NODES_Y)[None, ..., None] + rng.normal(4.2, 0.1, (9, *GRID, 3))
-    alone = solve_light(in_one_part(found), UNKNOWN, IMAGES, ["left"] * len(IMAGES)).patterns[
-        "left"
-    ][..., 1]
-    helped = solve_light(in_one_part(found), shown, IMAGES, ["left"] * len(IMAGES)).patterns[
-        "left"
-    ][..., 1]
+    alone, helped = (light_of(found, nodes).patterns["left"][..., 1] for nodes in (UNKNOWN, shown))
     assert misfit(alone) > 0.06
     assert misfit(helped) < 0.04
 
@@ -110,16 +117,9 @@ def drift_of_a_long_line(seed: int, *, pictures: int = 30) -> float:
         levels = [
             rng.normal(4.2, 0.02, (280, 3)) + (pattern(*p.T) + 0.4 * p[:, 1])[:, None] for p in both
         ]
-        parts.append(
-            LightSamples(
-                views=np.tile(np.array([a, a + 1], np.int32), (280, 1)),
-                places=np.stack(both, axis=1).astype(np.float32),
-                levels=np.stack(levels, axis=1).astype(np.float32),
-            )
-        )
-    light = solve_patterns(
-        in_one_part(joined_samples(parts)), nodes, images, ["left"] * pictures, 1.0
-    )
+        parts.append(seen_by((a, a + 1), both, levels))
+    found = in_one_part(joined_samples(parts))
+    light = solve_patterns(found, nodes, images, ["left"] * pictures, 1.0)
     gains = [light.gains[n][1] for n in images]
     return float(np.polyfit(np.linspace(0, 1, pictures), gains, 1)[0])
 
@@ -131,7 +131,7 @@ def test_a_long_line_does_not_drift_from_bright_to_dark():
 
 def test_corrected_views_of_a_spot_agree_better_than_raw_ones():
     _, found = samples()
-    light = solve_light(in_one_part(found), UNKNOWN, IMAGES, ["left"] * len(IMAGES))
+    light = light_of(found)
     raw, even = [], []
     for (a, b), places, levels in zip(found.views, found.places, found.levels, strict=True):
         lift = [
@@ -158,13 +158,13 @@ def test_even_light_is_left_as_it_is_but_for_the_common_white():
 
 
 def test_without_overlap_nothing_is_changed():
-    light = solve_light(in_one_part(joined_samples([])), UNKNOWN, IMAGES, ["left"] * len(IMAGES))
+    light = light_of(joined_samples([]))
     np.testing.assert_allclose(light.factors("left", IMAGES[0]), 1.0)
 
 
 def test_light_file_round_trip(tmp_path):
     _, found = samples()
-    light = solve_light(in_one_part(found), UNKNOWN, IMAGES, ["left"] * len(IMAGES))
+    light = light_of(found)
     write_light(tmp_path / "light.json", light)
     again = read_light(tmp_path / "light.json")
     np.testing.assert_allclose(again.patterns["left"], light.patterns["left"], atol=1e-5)

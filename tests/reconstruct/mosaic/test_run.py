@@ -26,6 +26,7 @@ from tests.oracles_dense import (
     PERIOD_M,
     Scene,
     position_code,
+    read_raster,
     sparse_model,
     stereo_views,
     write_workspace,
@@ -86,10 +87,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def read(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """RGBA (4, H, W), and north and east of the pixels' centres."""
-    with rasterio.open(folder / "mosaic" / "mosaic.tif") as raster:
-        values, t = raster.read().astype(np.float64), raster.transform
-    rows, columns = np.mgrid[: values.shape[1], : values.shape[2]] + 0.5
-    return values, t.f + rows * t.e, t.c + columns * t.a
+    return read_raster(folder / "mosaic" / "mosaic.tif", None)
 
 
 def test_every_pixel_shows_its_own_coordinates(workspace: Path):

@@ -52,46 +52,42 @@ def view_of(warp: PinholeWarp) -> View:
     )  # fmt: skip
 
 
-def relief() -> tuple[DemGrid, np.ndarray]:
-    """A surface whose height spans a metre."""
-    grid = DemGrid(west=-0.9, north=0.9, cell=0.012, rows=150, columns=150)
-    columns, rows = np.meshgrid(np.arange(150) + 0.5, np.arange(150) + 0.5)
-    height = -10.0 + 0.3 * grid.north_of(rows) - 0.25 * grid.east_of(columns)
-    return grid, height.astype(np.float32)
+GRID = DemGrid(west=-0.9, north=0.9, cell=0.012, rows=150, columns=150)
+NORTH, EAST = np.meshgrid(GRID.north_of(np.arange(150) + 0.5), GRID.east_of(np.arange(150) + 0.5),
+                          indexing="ij")  # fmt: skip
+HEIGHT = (-10.0 + 0.3 * NORTH - 0.25 * EAST).astype(np.float32)
+"""A surface whose height spans a metre."""
+RELIEF = Ground(HEIGHT, GRID).surface(GRID)
 
 
-def misses_px(sight: SeenCells, camera: Camera, view: View) -> np.ndarray:
+def misses_px(sight: SeenCells, camera: Camera) -> np.ndarray:
     """How far from the exact pixel of a camera each cell of the relief is looked up."""
-    grid, height = relief()
-    columns, rows = np.meshgrid(np.arange(150) + 0.5, np.arange(150) + 0.5)
-    world = np.stack([grid.north_of(rows), grid.east_of(columns), -height.astype(float)], axis=-1)
-    points = view.world_from_cam.inv().apply(world.reshape(-1, 3))
+    world = np.stack([NORTH, EAST, -HEIGHT.astype(float)], axis=-1)
+    points = view_of(warp()).world_from_cam.inv().apply(world.reshape(-1, 3))
     taken = camera.project(warp().pinhole_from_cam.inv().apply(points)).reshape(150, 150, 2)
     return np.hypot(sight.x + 0.5 - taken[..., 0], sight.y + 0.5 - taken[..., 1])
 
 
 def test_points_are_looked_up_where_the_camera_behind_a_tilted_port_shows_them() -> None:
-    view, (grid, height) = view_of(warp()), relief()
-    sight = see(view, camera_optics(warp(), True), Ground(height, grid).surface(grid))
+    sight = see(view_of(warp()), camera_optics(warp(), True), RELIEF)
     inside = sight.quality > 0
     assert inside.mean() > 0.3
-    error = misses_px(sight, CAMERA, view)
+    error = misses_px(sight, CAMERA)
     assert 1e-5 < error[inside].max() < 0.02
     assert np.sqrt((error[inside] ** 2).mean()) < 0.008
 
 
 def test_each_channel_is_looked_up_where_its_own_light_falls() -> None:
-    view, (grid, height) = view_of(warp()), relief()
-    surface = Ground(height, grid).surface(grid)
+    view = view_of(warp())
     cameras = channel_cameras(CAMERA, temperature_c=24.0, salinity_psu=39.0, depth_m=10.0)
-    green = see(view, camera_optics(warp(), True), surface)
+    green = see(view, camera_optics(warp(), True), RELIEF)
     moved = []
     for name, optics in zip(
         ("blue", "green", "red"), channel_optics(warp(), SEA, True), strict=True
     ):
-        sight = see(view, optics, surface)
+        sight = see(view, optics, RELIEF)
         inside = (sight.quality > 0) & (green.quality > 0)
-        assert misses_px(sight, cameras[name], view)[inside].max() < 0.05
+        assert misses_px(sight, cameras[name])[inside].max() < 0.05
         moved.append(np.hypot(sight.x - green.x, sight.y - green.y)[inside].max())
     assert moved[0] > 0.5
     assert moved[1] == 0
@@ -115,7 +111,5 @@ def test_lanczos_equals_its_definition_inside_and_at_edges(seed: int) -> None:
 
 
 def test_forgetting_the_range_would_show() -> None:
-    view, (grid, height) = view_of(warp()), relief()
-    sight = see(view, camera_optics(warp(), False), Ground(height, grid).surface(grid))
-    inside = sight.quality > 0
-    assert misses_px(sight, CAMERA, view)[inside].max() > 0.1
+    sight = see(view_of(warp()), camera_optics(warp(), False), RELIEF)
+    assert misses_px(sight, CAMERA)[sight.quality > 0].max() > 0.1
