@@ -5,13 +5,11 @@ into the pictures of the next line through the flat port, and those counted that
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from alice_survey.core.errors import PlanError
 from alice_survey.core.frames import Array, rotation_from_attitude
-from camera_calib.camera import Camera
 from camera_calib.rig import Rig
 from missions.coverage.stations import Stations
 
@@ -21,27 +19,7 @@ _BESIDE_M = 0.05
 """Pictures less far aside are of the same line flown twice."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SideOverlap:
-    """Of pictures' width on their middle row, the share that the next line to starboard sees."""
-
-    shares: Array
-    """(N,) of each picture that has a line to starboard of it."""
-    stations: Array
-    """(N,) its index."""
-
-    @property
-    def mean(self) -> float:
-        """Over pictures."""
-        return float(self.shares.mean())
-
-    @property
-    def minimum(self) -> float:
-        """Of any picture."""
-        return float(self.shares.min())
-
-
-def measured_side_overlap(rig: Rig, stations: Stations, camera: str | None = None) -> SideOverlap:
+def measured_side_overlap(rig: Rig, stations: Stations) -> tuple[Array, NDArray[np.intp]]:
     """Measure the side overlap of neighbouring lines.
 
     Of each picture, 1001 points of the sea floor on its middle row, evenly from its left edge to
@@ -49,43 +27,25 @@ def measured_side_overlap(rig: Rig, stations: Stations, camera: str | None = Non
     that is seen there is its overlap. Pictures beyond the ends of that line are left out.
 
     Args:
-        rig: the cameras, in water.
-        stations: of the pictures, with their lines.
-        camera: whose pictures; left out, the rig's first camera.
+        rig: the cameras, in water, of which the first takes the pictures.
+        stations: of the pictures, with their lines of two and more.
 
-    Raises:
-        PlanError: no two lines lie side by side.
+    Returns:
+        (N,) shares of those that have a line to starboard of them, and (N,) which these are.
     """
-    name = rig.reference if camera is None else camera
-    lines = [index for index in np.unique(stations.line).tolist() if index >= 0]
-    ways = {index: _direction(stations, index) for index in lines}
+    ways = {}
+    for index in np.unique(stations.line[stations.line >= 0]).tolist():
+        places = stations.glass_ne[stations.line == index]
+        ways[index] = (places[-1] - places[0]) / np.linalg.norm(places[-1] - places[0])
     shares, measured = [], []
-    for index in lines:
-        for s in np.flatnonzero(stations.line == index).tolist():
-            neighbour = _neighbour(stations, s, index, ways)
-            if neighbour is None:
-                continue
-            points = _middle_row(rig, name, stations, s)
-            seen = np.zeros(len(points), dtype=bool)
-            for other in _nearest(stations, s, neighbour):
-                seen |= _sees(rig, name, stations, other, points)
-            shares.append(float(seen.mean()))
+    for s, index in enumerate(stations.line.tolist()):
+        neighbour = _neighbour(stations, s, index, ways) if index >= 0 else None
+        if neighbour is not None:
+            points = _middle_row(rig, stations, s)
+            seen = [_sees(rig, stations, n, points) for n in _nearest(stations, s, neighbour)]
+            shares.append(float(np.any(seen, axis=0).mean()))
             measured.append(s)
-    if not shares:
-        raise PlanError("no two lines lie side by side: there is no side overlap to measure")
-    return SideOverlap(shares=np.array(shares), stations=np.array(measured))
-
-
-def _direction(stations: Stations, line: int) -> Array:
-    """Unit vector along a line, north and east, from its first to its last picture."""
-    places = stations.glass_ne[stations.line == line]
-    way = places[-1] - places[0]
-    length = float(np.linalg.norm(way))
-    if length > 0.0:
-        along: Array = way / length
-        return along
-    heading = float(stations.attitude_rad[stations.line == line][0, 2])
-    return np.array([math.cos(heading), math.sin(heading)])
+    return np.array(shares), np.array(measured)
 
 
 def _neighbour(stations: Stations, s: int, line: int, ways: dict[int, Array]) -> int | None:
@@ -112,21 +72,21 @@ def _nearest(stations: Stations, s: int, line: int) -> list[int]:
     return chosen
 
 
-def _pose(rig: Rig, name: str, stations: Stations, s: int) -> tuple[Array, Array, float]:
+def _pose(rig: Rig, stations: Stations, s: int) -> tuple[Array, Array, float]:
     """Rotation `ned_from_cam` (3, 3), the pupil about the glass (3,), and the altitude."""
     reference = rig.cameras[rig.reference]
     glass_body = rig.body_from_cam(rig.reference).apply(reference.front_cam)
-    body_from_cam = rig.body_from_cam(name)
+    body_from_cam = rig.body_from_cam(rig.reference)
     ned_from_body = rotation_from_attitude(*stations.attitude_rad[s])
     rotation: Array = (ned_from_body * body_from_cam.rotation).as_matrix()
     pupil: Array = ned_from_body.apply(body_from_cam.translation - glass_body)
     return rotation, pupil, float(stations.altitude_m[s])
 
 
-def _middle_row(rig: Rig, name: str, stations: Stations, s: int) -> Array:
+def _middle_row(rig: Rig, stations: Stations, s: int) -> Array:
     """Points on the sea floor, (P, 3) about the datum's vertical with the glass at depth 0."""
-    camera = rig.cameras[name]
-    rotation, pupil, altitude_m = _pose(rig, name, stations, s)
+    camera = rig.cameras[rig.reference]
+    rotation, pupil, altitude_m = _pose(rig, stations, s)
     ends = np.array([[0.0, camera.height_px / 2], [camera.width_px, camera.height_px / 2]])
     glass_cam, rays_cam = camera.unproject(ends)
     starts, rays = glass_cam @ rotation.T + pupil, rays_cam @ rotation.T
@@ -138,10 +98,10 @@ def _middle_row(rig: Rig, name: str, stations: Stations, s: int) -> Array:
     return placed
 
 
-def _sees(rig: Rig, name: str, stations: Stations, s: int, points: Array) -> Array:
+def _sees(rig: Rig, stations: Stations, s: int, points: Array) -> Array:
     """Which points fall into a picture, (P,); they lie on the sea floor below it."""
-    camera: Camera = rig.cameras[name]
-    rotation, pupil, altitude_m = _pose(rig, name, stations, s)
+    camera = rig.cameras[rig.reference]
+    rotation, pupil, altitude_m = _pose(rig, stations, s)
     below = np.column_stack(
         [points[:, :2] - stations.glass_ne[s], np.full(len(points), altitude_m)]
     )

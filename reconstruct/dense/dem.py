@@ -1,8 +1,8 @@
 """The digital elevation model: a surface projected on a grid, heights up, with their sigmas."""
 
 import math
-from functools import partial
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -34,7 +34,8 @@ _DIAGONAL = math.sqrt(2.0)
 _MIN_STATIONS = 2
 
 
-class FusedCells(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class FusedCells:
     """What a surface shows in the cells of a grid, (rows, columns) each."""
 
     height: Float32
@@ -51,9 +52,10 @@ class FusedCells(NamedTuple):
 
     def without(self, cells: NDArray[np.bool_]) -> "FusedCells":
         """The same with some cells emptied."""
-        bands: list[Any] = [*self]
+        bands = vars(self).values()
         nothing = [band.dtype.type(np.nan if band.dtype.kind == "f" else 0) for band in bands]
-        return FusedCells(*map(partial(np.where, cells), nothing, bands))
+        pairs = zip(nothing, bands, strict=True)
+        return FusedCells(*(np.where(cells, empty, band) for empty, band in pairs))
 
 
 def cells_over(grid: DemGrid, surface: NDArray[Any]) -> FusedCells:
@@ -237,7 +239,8 @@ def fill_gaps(height: Float32, sigma: Float32, reach: int, cell: float) -> tuple
                 top, left = reach + way * n * down, reach + way * n * right
                 part = np.s_[top : top + height.shape[0], left : left + height.shape[1]]
                 known = np.isfinite(padded[0][part])
-                for values, found in zip(end, (padded[0][part], padded[1][part], n), strict=True):
+                sources: tuple[Any, ...] = padded[0][part], padded[1][part], n
+                for values, found in zip(end, sources, strict=True):
                     np.copyto(values, found, where=known)
         (first, spread, a), (second, other_spread, b) = ends
         with np.errstate(invalid="ignore"):

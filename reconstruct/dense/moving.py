@@ -256,7 +256,7 @@ def draw(look: Look, onto: Look) -> Array:
         (h, w) depth of the other's cells; NaN where nothing is drawn.
     """
     rows, columns = np.nonzero(np.isfinite(look.depth))
-    pixels = (np.column_stack([columns, rows]) + 0.5) * look.step
+    pixels: Array = (np.column_stack([columns, rows]).astype(np.float64) + 0.5) * look.step
     points = look.view.at_depth(pixels, look.depth[rows, columns].astype(np.float64))
     depth = onto.view.world_from_cam.inv().apply(points)[:, 2]
     at = np.floor(onto.view.project(points) / onto.step - 0.5)

@@ -1,7 +1,7 @@
 """Depth maps as points with normals and colours, in local east, north, up."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +43,8 @@ class Points(NamedTuple):
 
     def part(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> "Points":
         """Those of the points that a mask or their numbers choose."""
-        return Points(*(values[chosen] for values in self))
+        every: list[Any] = [*self]
+        return Points(*(values[chosen] for values in every))
 
 
 def part_in_box(

@@ -386,7 +386,8 @@ def known_span(values: Float32, side: int) -> tuple[NDArray[np.bool_], Float32]:
 
 
 def _choose(mask: NDArray[np.bool_], yes: _NeighbourSums, no: _NeighbourSums) -> _NeighbourSums:
-    return _NeighbourSums(*(np.where(mask, *both) for both in zip(yes, no, strict=True)))
+    pairs: list[Any] = list(zip(yes, no, strict=True))
+    return _NeighbourSums(*(np.where(mask, *both) for both in pairs))
 
 
 def _step(inverse: Float32, sums: _NeighbourSums) -> tuple[Float32, Float32]:

@@ -158,7 +158,7 @@ def look_at_points(
     levels, shares, depth_of, share_of = depth
     z = view.world_from_cam.inv().apply(points_world)[:, 2:]
     at = np.floor(np.nan_to_num(view.project(points_world), nan=-1.0)).astype(np.int64)
-    inside = ((at >= 1) & (at < np.array(levels.shape[::-1]) - 1)).all(axis=1)
+    inside = np.asarray(((at >= 1) & (at < np.array(levels.shape[::-1]) - 1)).all(axis=1))
     place = np.where(inside[:, None], at, 1)[:, ::-1, None] + _AROUND
     level, share = (codes[place[:, 0], place[:, 1]] for codes in (levels, shares))
     there = depth_of[level]  # NaN where unknown

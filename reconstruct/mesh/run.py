@@ -62,7 +62,7 @@ def run_mesh(
             f"only {facts['textured_share']:.0%} of the mesh is seen whole by a picture; the rest "
             "has the colours of the cloud"
         )
-    _write_results(folder, textured, facts, frame_comments(model.frame, setup.offset))
+    _write_results(folder, textured, facts, frame_comments(model.frame, setup.offset.tolist()))
 
 
 @progress.step("write the mesh")
