@@ -281,15 +281,20 @@ def port_view(centre: list[float], rpy_deg: list[float]) -> View:
     )
 
 
+def pixels_of(view: View) -> Array:
+    """(N, 2) middles of all pixels, row by row."""
+    rows, columns = np.mgrid[: view.pinhole.height_px, : view.pinhole.width_px] + 0.5
+    return np.column_stack([columns.ravel(), rows.ravel()])
+
+
 def plane_depth(view: View, down: float) -> np.ndarray:
     """Depth (H, W) at which a view's pixels meet the level plane so far down."""
-    rows, columns = np.mgrid[: view.pinhole.height_px, : view.pinhole.width_px]
-    pixels = np.column_stack([columns.ravel(), rows.ravel()]) + 0.5
+    pixels = pixels_of(view)
     depth = np.full(len(pixels), down)
     for _ in range(30):
         points = view.at_depth(pixels, depth)
         depth = depth + (down - points[:, 2])
-    return depth.reshape(rows.shape).astype(np.float32)
+    return depth.reshape(view.pinhole.size_px[::-1]).astype(np.float32)
 
 
 def hits(view: View, scene: Scene, oversample: int = 1) -> Array:

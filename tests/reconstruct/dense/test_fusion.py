@@ -6,7 +6,7 @@ from reconstruct.dense.depth import count_confirming, merge_depths
 from reconstruct.dense.stereo_pairs import in_frame
 from reconstruct.dense.view_store import ViewStore, decode_depth
 from reconstruct.views.range_shift import KernelLens, no_shift, slopes_of
-from tests.oracles_dense import merged, plane_depth, port_view
+from tests.oracles_dense import merged, pixels_of, plane_depth, port_view
 
 
 def test_merge_depths_equals_its_slow_twin():
@@ -40,9 +40,7 @@ def test_witnesses_through_a_tilted_port_equal_their_slow_twin(tmp_path):
     other_depth = store.stored_depth(1, "fine")
     there, there_sigma = decode_depth(other_depth)
     move = other.world_from_cam.inv() * one.world_from_cam
-    rows, columns = np.mgrid[: one.pinhole.height_px, : one.pinhole.width_px]
-    pixels = np.column_stack([columns.ravel(), rows.ravel()]) + 0.5
-    points = one.at_depth(pixels, depth.ravel().astype(float))
+    points = one.at_depth(pixels_of(one), depth.ravel().astype(float))
     seen = in_frame(other, points).reshape(depth.shape)
     at = np.floor(other.project(points)).astype(int).reshape(*depth.shape, 2)
     z = other.world_from_cam.inv().apply(points)[:, 2].reshape(depth.shape)

@@ -10,7 +10,7 @@ from camera_calib.approximation.pinhole_warp import Pinhole
 from reconstruct.dense.depth import depth_in_reference, rectify
 from reconstruct.views.model import View
 from reconstruct.views.range_shift import no_shift
-from tests.oracles_dense import port_view
+from tests.oracles_dense import pixels_of, port_view
 
 
 def view(centre: list[float], rotvec: list[float], focal: float = 400.0) -> View:
@@ -86,11 +86,11 @@ def test_depth_map_of_a_plane_comes_back():
 
     inside = np.isfinite(depth)
     assert inside.mean() > 0.3
-    x, y = np.moveaxis(transfer(pair.rect_from_reference, _pixels(one)), 1, 0)
+    x, y = np.moveaxis(transfer(pair.rect_from_reference, pixels_of(one)), 1, 0)
     size = [pair.width_px, pair.height_px]
     reached = ((x > 1) & (y > 1) & (x < size[0] - 1) & (y < size[1] - 1)).reshape(240, 320)
     assert inside[reached].all()
-    found = one.at_depth(_pixels(one)[inside.ravel()], depth[inside].astype(float))
+    found = one.at_depth(pixels_of(one)[inside.ravel()], depth[inside].astype(float))
     np.testing.assert_allclose(found[:, 2], 2.0, atol=1e-3)
 
 
@@ -98,14 +98,6 @@ def test_no_pair_along_the_line_of_sight_or_face_to_face():
     points = np.array([[0.0, 0.0, 2.0], [0.1, 0.1, 2.1]])
     assert rectify(view([0, 0, 0], [0, 0, 0]), view([0, 0, 0.4], [0, 0, 0]), points) is None
     assert rectify(view([0, 0, 0], [0, 0, 0]), view([0.4, 0, 0], [0, np.pi, 0]), points) is None
-
-
-def _pixels(one: View) -> np.ndarray:
-    """(N, 2) middles of all pixels, row by row."""
-    x, y = np.meshgrid(
-        np.arange(one.pinhole.width_px) + 0.5, np.arange(one.pinhole.height_px) + 0.5
-    )
-    return np.column_stack([x.ravel(), y.ravel()])
 
 
 def sea_floor(points: np.ndarray) -> np.ndarray:
@@ -124,11 +116,9 @@ def spots(view: View, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("base_m", [0.1, 0.5])
 def test_depth_through_a_tilted_port_is_exact(base_m: float):
-    one, other = (
-        port_view([0, 0, 0], [1.0, -2.0, 30.0]),
-        port_view([base_m, 0.1, 0.02], [-1, 1, 28]),
-    )
-    points, true = spots(one, _pixels(one))
+    one = port_view([0, 0, 0], [1.0, -2.0, 30.0])
+    other = port_view([base_m, 0.1, 0.02], [-1, 1, 28])
+    points, true = spots(one, pixels_of(one))
     pair = rectify(one, other, points)
     assert pair is not None
     grid = np.stack(np.meshgrid(np.arange(pair.width_px), np.arange(pair.height_px)), -1) + 0.5

@@ -8,13 +8,14 @@ from reconstruct.dense import refine_depth
 from reconstruct.dense.refine_depth import (
     ALL,
     ComparedView,
+    RefinedDepth,
     compare,
     pixel_lines,
     prepare,
     refine,
 )
 from reconstruct.dense.stereo_pairs import in_frame
-from tests.oracles_dense import Scene, hits, render, speckle, stereo_views
+from tests.oracles_dense import Scene, hits, pixels_of, render, speckle, stereo_views
 
 SCENE = Scene(
     depth_of=lambda n, e: 12.0 + 0.06 * np.sin(6 * n) * np.cos(5 * e) + 0.1 * n,
@@ -32,6 +33,12 @@ def looks(*, far: bool = False) -> list[ComparedView]:
         contrast, spline, valid = prepare(grey, np.ones(grey.shape, bool))
         found.append(ComparedView(view=view, contrast=contrast, spline=spline, valid=valid))
     return found
+
+
+def refined(start: np.ndarray, others: list[ComparedView] | None = None) -> RefinedDepth:
+    """Depth from a start of 4 mm, by the others that see it."""
+    others = looks()[1:] if others is None else others
+    return refine(looks()[0], start, np.full_like(start, 0.004), others)
 
 
 def true_depth() -> np.ndarray:
@@ -86,7 +93,7 @@ def test_refinement_finds_the_surface_from_a_blurred_start_and_says_how_well():
     rng = np.random.default_rng(0)
     wrong = 0.006 * ndimage.gaussian_filter(rng.normal(size=true.shape), 4) * 12
     start = (true + wrong).astype(np.float32)
-    found = refine(looks()[0], start, np.full_like(start, 0.004), looks()[1:])
+    found = refined(start)
     known = np.isfinite(found.depth)
     assert known.mean() > 0.85
     error = (found.depth - true)[known]
@@ -101,10 +108,9 @@ def test_bands_of_rows_are_refined_as_the_whole_picture_is(monkeypatch):
     """But for the noise, which is measured in each band: the seams must not show."""
     true = true_depth()
     start = (true + 0.006 * np.sin(np.arange(true.shape[1]) / 9)).astype(np.float32)
-    sigma = np.full_like(start, 0.004)
-    whole = refine(looks()[0], start, sigma, looks()[1:])
+    whole = refined(start)
     monkeypatch.setattr(refine_depth, "_BAND_PIXELS", start.size // 5)
-    bands = refine(looks()[0], start, sigma, looks()[1:])
+    bands = refined(start)
     assert (np.isfinite(whole.depth) != np.isfinite(bands.depth)).mean() < 1e-3
     apart = np.abs(bands.depth - whole.depth) / whole.sigma
     assert 0.0 < np.nanpercentile(apart, 99.9) < 0.3
@@ -117,7 +123,7 @@ def test_windows_across_a_step_keep_what_they_had():
     true = true_depth().astype(np.float32)
     start, sigma = true.copy(), np.full_like(true, 0.004)
     start[100:120, 100:120] -= np.float32(0.3)  # 36 px of disparity at a baseline of 0.36 m
-    found = refine(looks()[0], start, sigma, looks()[1:])
+    found = refined(start)
     rim = np.zeros(true.shape, bool)
     rim[98:122, 98:122] = True
     rim[102:118, 102:118] = False
@@ -132,14 +138,14 @@ def test_windows_across_a_step_keep_what_they_had():
 def test_unknown_depth_stays_unknown():
     start = true_depth().astype(np.float32)
     start[100:108, 100:108] = np.nan
-    found = refine(looks()[0], start, np.full_like(start, 0.004), looks()[1:])
+    found = refined(start)
     assert np.isnan(found.depth[100:108, 100:108]).all()
     assert np.isfinite(found.depth[110:, 110:300]).mean() > 0.85
 
 
 def test_a_view_without_neighbours_keeps_no_depth():
     depth = true_depth().astype(np.float32)
-    found = refine(looks()[0], depth, np.full_like(depth, 0.004), [])
+    found = refined(depth, [])
     assert not np.isfinite(found.depth).any()
     assert (found.seen == 0).all()
 
@@ -150,8 +156,7 @@ def test_what_no_other_station_sees_rests_on_the_pair_with_a_larger_sigma():
     sigma = np.full_like(start, 0.01)
     one, ahead, pair, ahead_right = looks(far=True)
     apart = [ahead, ahead_right]
-    pixels = np.indices(true.shape, dtype=float)[::-1].reshape(2, -1).T + 0.5
-    points = one.view.at_depth(pixels, true.ravel().astype(np.float64))
+    points = one.view.at_depth(pixels_of(one.view), true.ravel().astype(np.float64))
     there = [in_frame(other.view, points).reshape(true.shape) for other in (pair, *apart)]
     alone = ndimage.binary_erosion(there[0] & ~there[1] & ~there[2], iterations=6)
     assert alone.mean() > 0.1

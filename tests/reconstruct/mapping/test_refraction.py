@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 
 from alice_survey.core.frames import Array
-from alice_survey.core.records import RangeRecord, RefractionRecord
+from alice_survey.core.records import RangeRecord
 from camera_calib.ports.dome import DomePort
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
@@ -45,12 +45,6 @@ def started(port_m: float, tilt_deg: float, noise_px: float = 0.3) -> tuple[Mapp
     return near_truth(scene, seen, warps, np.random.default_rng(1)), seen
 
 
-def exact(
-    scene: Scene, start: tuple[Mapped, Observations], folder: Path
-) -> tuple[Mapped, RefractionRecord]:
-    return refract(start[0], start[1], folder)
-
-
 def rigid_rms(found: Array, true: Array) -> float:
     return float(np.sqrt(((align_rigid(found, true).apply(found) - true) ** 2).sum(axis=1).mean()))
 
@@ -60,7 +54,7 @@ def test_without_noise_nothing_is_left_of_the_port(
     port_m: float, tilt_deg: float, tmp_path: Path
 ) -> None:
     scene, start = scene_at(port_m, tilt_deg, 0.0), started(port_m, tilt_deg, 0.0)
-    mapped, found = exact(scene, start, tmp_path)
+    mapped, found = refract(*start, tmp_path)
     pupils, true_pupils, points, true_points = pupils_and_points(mapped, scene)
     assert rigid_rms(points, true_points) < 0.01e-3
     assert rigid_rms(pupils, true_pupils) < 0.01e-3
@@ -107,7 +101,7 @@ def test_with_noise_points_are_those_of_an_exact_refractive_adjustment(
     port_m: float, tilt_deg: float, tmp_path: Path
 ) -> None:
     scene, start = scene_at(port_m, tilt_deg), started(port_m, tilt_deg)
-    mapped, _ = exact(scene, start, tmp_path)
+    mapped, _ = refract(*start, tmp_path)
     _, _, points, true_points = pupils_and_points(mapped, scene)
     ids = np.array(sorted(mapped.model.points3D)) - 1
     stations = [
@@ -125,7 +119,7 @@ def test_with_noise_points_are_those_of_an_exact_refractive_adjustment(
 def test_keypoints_end_where_the_field_of_the_lens_says(tmp_path: Path) -> None:
     """The later stages read the model through `RangeShift`: both must agree."""
     scene, start = scene_at(0.05, 2.0), started(0.05, 2.0)
-    mapped, _ = exact(scene, start, tmp_path)
+    mapped, _ = refract(*start, tmp_path)
     for number, image in mapped.model.images.items():
         shift = range_shift(mapped.warps[scene.records[number - 1].camera])
         at = image.get_observation_point2D_idxs()
