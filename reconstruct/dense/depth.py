@@ -29,7 +29,7 @@ _MIN_COSINE = 0.75
 """Least cosine of the angle by which a view may be turned."""
 _ROUNDS = 2
 """Rounds of depth and the port's shift, which depends on it."""
-_HALF = 0.5
+_FROM_CORNER = np.array([[1.0, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
 """OpenCV counts pixels from the first pixel's centre, the model from its outer corner."""
 
 
@@ -133,8 +133,7 @@ def warp(
     interpolation: int = cv2.INTER_CUBIC,
 ) -> NDArray[np.uint8]:
     """Resample a picture into its virtual one; 0 beyond its rim."""
-    corner = np.array([[1.0, 0, _HALF], [0, 1, _HALF], [0, 0, 1]])
-    homography = np.linalg.inv(corner) @ rect_from_picture @ corner
+    homography = _FROM_CORNER @ rect_from_picture @ np.linalg.inv(_FROM_CORNER)
     size = (rectification.width_px, rectification.height_px)
     warped: NDArray[np.uint8] = cv2.warpPerspective(picture, homography, size, flags=interpolation)
     return warped
@@ -157,14 +156,13 @@ def depth_in_reference(
     Returns:
         (H, W) depth, NaN where any of the four virtual pixels around is unknown.
     """
-    corner = np.array([[1.0, 0, _HALF], [0, 1, _HALF], [0, 0, 1]])
     depth: NDArray[np.float32] = triangulate(
         disparity_px,
         reference.pinhole.size_px[::-1],
         reference.kernel_lens,
         partner.kernel_lens,
-        np.linalg.inv(corner) @ rectification.rect_from_reference,
-        np.linalg.inv(corner) @ rectification.rect_from_partner,
+        _FROM_CORNER @ rectification.rect_from_reference,
+        _FROM_CORNER @ rectification.rect_from_partner,
         rectification.cosines,
         rectification.focal_px * rectification.baseline,
         rectification.disparity_offset_px,

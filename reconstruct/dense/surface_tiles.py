@@ -350,19 +350,8 @@ def _points_over(
         sigma *= np.float32(setup.sigma_factor)
         with np.errstate(invalid="ignore"):
             sure = sigma <= _WORST_CELLS * task.grid.cell
-        found.append(
-            points_in_box(
-                view,
-                index,
-                depth,
-                sigma,
-                store.load_mask(index, "inside", view.pinhole.width_px, part) & sure,
-                store.load_colour(index, part),
-                np.array(store.load(index, "factors")),
-                offset,
-                sides,
-                blocks,
-                part,
-            )
-        )
+        kept = store.load_mask(index, "inside", view.pinhole.width_px, part) & sure
+        colour, factors = store.load_colour(index, part), np.array(store.load(index, "factors"))
+        maps = depth, sigma, kept, colour, factors
+        found.append(points_in_box(view, index, *maps, offset, sides, blocks, part))
     return join_points(found)

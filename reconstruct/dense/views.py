@@ -164,11 +164,9 @@ def view_depth(scale: float, match_sigma_px: float, matched: tuple[ViewTask, Arr
         return
     depths = _pair_depths(scale, task, points_world)
     if depths:
-        depth, sigma, agreeing = merge_depths(
-            np.stack([one.depth for one in depths]),
-            np.stack([one.sigma(match_sigma_px) for one in depths]),
-            GATE_SIGMAS,
-        )
+        found = np.stack([one.depth for one in depths])
+        sigmas = np.stack([one.sigma(match_sigma_px) for one in depths])
+        depth, sigma, agreeing = merge_depths(found, sigmas, GATE_SIGMAS)
     else:
         shape = scaled_view(task.view, scale).pinhole.size_px[::-1]
         depth = np.full(shape, np.nan, np.float32)
@@ -219,13 +217,10 @@ def refine_view(scale: float, task: ViewTask, *, on_gpu: bool = False) -> None:
         reference = _compared_view(store, factor, task.index, task.view)
         depth, sigma = (enlarge(of, reference.view.pinhole.size_px) for of in (depth, sigma))
         start = depth
-        refined = refined_by(
-            reference,
-            depth,
-            sigma,
-            [_compared_view(store, factor, *other) for other in first],
-            [_compared_view(store, factor, *other) for other in spare],
-        )
+        compared = [
+            [_compared_view(store, factor, *other) for other in views] for views in (first, spare)
+        ]
+        refined = refined_by(reference, depth, sigma, *compared)
         depth, sigma = refined.depth, refined.sigma
     agreeing = np.asarray(store.load(task.index, "agreeing"))
     agreeing = cv2.resize(agreeing, full_px, interpolation=cv2.INTER_NEAREST)
@@ -301,16 +296,10 @@ def check_view(sigma_factor: float, task: ViewTask) -> tuple[Array, int]:
     supported = np.zeros_like(alike)
     slopes = slopes_of(depth, view.kernel_lens)
     for number, other in task.others:
-        other_from_ref = other.world_from_cam.inv() * view.world_from_cam
+        move = (other.world_from_cam.inv() * view.world_from_cam).as_matrix()[:3]
+        there = np.ascontiguousarray(move), store.stored_depth(number, "fine")
         seen, through = count_confirming(
-            depth,
-            sigma,
-            slopes,
-            np.ascontiguousarray(other_from_ref.as_matrix()[:3]),
-            store.stored_depth(number, "fine"),
-            sigma_factor,
-            other.kernel_lens,
-            GATE_SIGMAS,
+            depth, sigma, slopes, *there, sigma_factor, other.kernel_lens, GATE_SIGMAS
         )
         supported += seen
         refuted += through
@@ -386,11 +375,7 @@ def _shared_light(
     for number, other in task.others:
         seen = in_frame(other, ground)
         there = other.project(ground[seen]) / other.pinhole.size_px
-        parts.append(
-            compare_light(
-                (task.index, number),
-                (own, np.asarray(task.store.load(number, "low"))),
-                (here[seen].astype(np.float32), there.astype(np.float32)),
-            )
-        )
+        pictures = own, np.asarray(task.store.load(number, "low"))
+        places = here[seen].astype(np.float32), there.astype(np.float32)
+        parts.append(compare_light((task.index, number), pictures, places))
     return joined_samples(parts)

@@ -325,32 +325,19 @@ def paint_plane(painting: Painting, plane: Plane, dem: Path, folder: Path) -> bo
             tasks = [task(*one) for one in some]
             yield from executor.map(label_block, tasks, label=label(name), task_mib=_TASK_MIB)
 
-    write_labels(
-        (sights / LABELS, sights / TONES),
-        folder / "coverage.tif",
-        grid,
-        model.frame,
-        labels(),
-        executor.local_cores,
-    )
+    files, threads = (sights / LABELS, sights / TONES), executor.local_cores
+    write_labels(files, folder / "coverage.tif", grid, model.frame, labels(), threads)
     tiles = blocks_of(grid, ground, _TILE_PX, SUPPORT_PX)
     rough = sights / "rough.tif"
     groups = [[task(tile) for tile in group] for group in neighbours(tiles, _GROUP * _TILE_PX)]
     painted = executor.map(paint_tiles, groups, label=label("mosaic"), task_mib=_TASK_MIB)
-    covered = write_tiles(
-        rough,
-        folder / "mosaic_source.tif",
-        grid,
-        model.frame,
-        painted,
-        names,
-        executor.local_cores,
-    )
+    source = folder / "mosaic_source.tif"
+    covered = write_tiles(rough, source, grid, model.frame, painted, names, threads)
     if covered == 0.0:
-        for name in ("coverage.tif", "mosaic_source.tif"):
-            (folder / name).unlink()
+        (folder / "coverage.tif").unlink()
+        source.unlink()
         return False
-    cloud_optimised(rough, folder / "mosaic.tif", executor.local_cores)
+    cloud_optimised(rough, folder / "mosaic.tif", threads)
     thumbnail(folder / "mosaic.tif", folder / "mosaic.png")
     shutil.rmtree(sights)
     write_footprints(folder, model.views, outlines, model.frame)
