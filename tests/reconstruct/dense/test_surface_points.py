@@ -36,6 +36,10 @@ def seen(
     )
 
 
+def fused_from(points: Points, origin: np.ndarray | None = None) -> np.ndarray:
+    return fuse_surface(points, STATIONS, CELL_M, np.zeros(3) if origin is None else origin, 1.4)
+
+
 def patch(normal: np.ndarray, rng: np.random.Generator, count: int = 20_000) -> Points:
     """A square of 0.3 m across a normal."""
     across = np.linalg.svd(normal[None])[2][1:]
@@ -49,9 +53,7 @@ def test_a_plane_is_found_whichever_way_it_faces(up: float, azimuth: float):
     rng = np.random.default_rng(1)
     level = math.sqrt(1.0 - up * up)
     normal = np.array([level * math.sin(azimuth), level * math.cos(azimuth), up])
-    found = fuse_surface(
-        patch(normal, rng), STATIONS, CELL_M, np.array([0.003, -0.002, 0.001]), 1.4
-    )
+    found = fused_from(patch(normal, rng), np.array([0.003, -0.002, 0.001]))
     off = found["enu"] @ normal
     np.testing.assert_allclose(found["normal"] @ normal, 1.0, atol=1e-4)
     assert np.abs(off).max() < 5 * SIGMA_M
@@ -69,7 +71,7 @@ def test_a_ball_is_covered_from_all_sides_without_gaps():
     normals = rng.normal(size=(400_000, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     radius = 0.25
-    found = fuse_surface(seen(radius * normals, normals, rng), STATIONS, CELL_M, np.zeros(3), 1.4)
+    found = fused_from(seen(radius * normals, normals, rng))
     found = settle(found, CELL_M, *NO_BOUND)
     off = np.linalg.norm(found["enu"], axis=1) - radius
     assert np.sqrt(np.mean(off**2)) < 0.6 * SIGMA_M  # many points a cell
@@ -115,9 +117,8 @@ def test_a_slope_within_a_cell_is_no_scatter(slope_deg: float):
     rng = np.random.default_rng(4)
     slope = math.radians(slope_deg)
     normal = np.array([math.sin(slope), 0.0, math.cos(slope)])
-    found = fuse_surface(patch(normal, rng, 40_000), STATIONS, CELL_M, np.zeros(3), 1.4)
-    level = fuse_surface(patch(np.array([0.0, 0.0, 1.0]), rng, 40_000), STATIONS, CELL_M,
-                         np.zeros(3), 1.4)  # fmt: skip
+    found = fused_from(patch(normal, rng, 40_000))
+    level = fused_from(patch(np.array([0.0, 0.0, 1.0]), rng, 40_000))
     assert np.median(found["sigma"]) == pytest.approx(np.median(level["sigma"]), rel=0.1)
 
 
@@ -126,7 +127,7 @@ def test_both_sides_of_a_thin_wall_stay_apart():
     north = np.array([0.0, 1.0, 0.0])
     one, other = patch(north, rng), patch(-north, rng)
     front = one._replace(enu=one.enu + np.array([0, 0.02, 0], np.float32))
-    found = fuse_surface(together(front, other), STATIONS, CELL_M, np.zeros(3), 1.4)
+    found = fused_from(together(front, other))
     ahead = found["normal"][:, 1] > 0
     np.testing.assert_allclose(found["enu"][ahead, 1], 0.02, atol=5 * SIGMA_M)
     np.testing.assert_allclose(found["enu"][~ahead, 1], 0.0, atol=5 * SIGMA_M)
@@ -137,7 +138,7 @@ def fused_floor(rng: np.random.Generator, side_m: float = 0.3) -> np.ndarray:
     spots = rng.uniform(-side_m / 2, side_m / 2, (int(2e5 * side_m**2), 2))
     places = np.column_stack([spots, np.zeros(len(spots))])
     up = np.tile([0.0, 0.0, 1.0], (len(spots), 1))
-    return fuse_surface(seen(places, up, rng), STATIONS, CELL_M, np.zeros(3), 1.4)
+    return fused_from(seen(places, up, rng))
 
 
 def test_small_patches_off_the_surface_go_unless_they_may_go_on_elsewhere():
@@ -172,10 +173,8 @@ def test_tiles_agree_where_they_meet():
     normals = rng.normal([0.0, 0.0, 1.0], 0.6, (60_000, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     points = seen(0.2 * normals, normals, rng)
-    origin = np.array([0.0, 0.0, 0.0])
-    whole = fuse_surface(points, STATIONS, CELL_M, origin, 1.4)
-    west = points.part(points.enu[:, 0] < 5 * CELL_M)
-    part = fuse_surface(west, STATIONS, CELL_M, origin, 1.4)
+    whole = fused_from(points)
+    part = fused_from(points.part(points.enu[:, 0] < 5 * CELL_M))
 
     def own(found: np.ndarray) -> np.ndarray:
         return np.sort(found[found["enu"][:, 0] < 4 * CELL_M], order=("enu", "normal"))

@@ -4,8 +4,6 @@ import json
 
 import numpy as np
 import pytest
-import rasterio
-from rasterio.transform import from_origin
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.executor import local_executor
@@ -13,8 +11,10 @@ from camera_calib.approximation.pinhole_warp import Pinhole
 from reconstruct.mosaic.visibility import Occluders, find_occluders, hidden_by, read_occluders
 from reconstruct.planes import LEVEL_PLANE
 from reconstruct.ply import VERTEX, write_ply
+from reconstruct.raster import DemGrid, tiled_raster
 from reconstruct.views.model import View
 from reconstruct.views.range_shift import no_shift
+from tests.oracles_dense import FRAME
 
 CELL_M = 0.01
 POLE_M = 0.1
@@ -52,10 +52,8 @@ def occluders(tmp_path_factory: pytest.TempPathFactory) -> Occluders:
     heights = np.full((400, 400), np.nan, np.float32)
     row, column = (200 - floor[:, 1] / CELL_M).astype(int), (floor[:, 0] / CELL_M + 200).astype(int)
     heights[row, column] = FLOOR_M
-    with rasterio.open(
-        folder / "dem.tif", "w", driver="GTiff", width=400, height=400, count=1, dtype="float32",
-        nodata=np.nan, transform=from_origin(-2.0, 2.0, CELL_M, CELL_M),
-    ) as raster:  # fmt: skip
+    grid = DemGrid(west=-2.0, north=2.0, cell=CELL_M, rows=400, columns=400)
+    with tiled_raster(folder / "dem.tif", grid, FRAME, "float32", np.nan, "height") as raster:
         raster.write(heights, 1)
     with local_executor().start() as executor:
         find_occluders(

@@ -1,9 +1,10 @@
 import numpy as np
 import pytest
 
-from reconstruct.mosaic.visibility import look_up, visible_cells
-from reconstruct.views.model import View, enu_from_cam
-from reconstruct.views.range_shift import as_nodes
+from reconstruct.mosaic.visibility import CameraOptics, Ground, see, visible_cells
+from reconstruct.raster import DemGrid
+from reconstruct.views.model import View
+from reconstruct.views.range_shift import as_nodes, no_shift
 from tests.oracles_dense import sees, stereo_views
 
 
@@ -39,31 +40,17 @@ def straight_nodes(view: View) -> np.ndarray:
 
 def test_look_up_projects_as_the_view_does_and_prefers_its_middle():
     view = stereo_views(np.array([0.0]), np.array([0.0]))[0]
-    camera = enu_from_cam(view, np.zeros(3))
-    rotation = camera[:, :3].T
-    cam_from_enu = np.ascontiguousarray(np.column_stack([rotation, -rotation @ camera[:, 3]]))
-    height = np.full((90, 100), -12.0, np.float32)
-    height[40, 50] = np.nan
-    seen = np.ones((200, 200), bool)
-    pixel, first = 0.02, (-1.0, 0.9)
-    x, y, quality, ranges = look_up(
-        height,
-        (np.ones((1, 1), bool), 1),
-        seen,
-        (0.0, 0.0),
-        1.0,
-        cam_from_enu,
-        view.kernel_lens,
-        view.pinhole.size_px,
-        as_nodes(straight_nodes(view), *view.pinhole.size_px),
-        view.pinhole.size_px,
-        first,
-        pixel,
-        2.0,
-    )
-    rows, columns = np.mgrid[:90, :100]
+    size_px = view.pinhole.size_px
+    grid = DemGrid(west=-1.01, north=0.91, cell=0.02, rows=90, columns=100)
+    dem = np.full((90, 100), -12.0, np.float32)
+    dem[40, 50] = np.nan
+    surface = Ground(dem, grid).surface(grid)
+    taken, shift = as_nodes(straight_nodes(view), *size_px), no_shift(*size_px)
+    optics = CameraOptics(taken=taken, shift=shift, size_px=size_px)
+    x, y, quality, ranges = see(view, optics, surface)
+    rows, columns = np.mgrid[:90, :100] + 0.5
     world = np.stack(
-        [first[1] - rows * pixel, first[0] + columns * pixel, np.full(rows.shape, 12.0)], axis=-1
+        [grid.north_of(rows), grid.east_of(columns), np.full(rows.shape, 12.0)], axis=-1
     )
     pixels = view.project(world.reshape(-1, 3)).reshape(90, 100, 2)
     inside = quality > 0
@@ -72,8 +59,8 @@ def test_look_up_projects_as_the_view_does_and_prefers_its_middle():
     away = np.linalg.norm(world - view.world_from_cam.translation, axis=-1)
     np.testing.assert_allclose(ranges[inside], away[inside], rtol=1e-6)
     assert np.isnan(ranges[~inside]).all()
-    border = np.minimum(pixels, view.pinhole.size_px - pixels).min(axis=-1)
-    expected = (border > 2.0) & np.isfinite(height)
+    border = np.minimum(pixels, size_px - pixels).min(axis=-1)
+    expected = (border > 2.0) & np.isfinite(surface.height)
     np.testing.assert_array_equal(inside, expected)
     assert 0.2 < inside.mean() < 1.0
     best = np.unravel_index(np.argmax(quality), quality.shape)
