@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -183,12 +184,5 @@ def best_pose_by_search(true: Camera, wrong: Camera, anchors_cam: Array) -> Rigi
     def misses(vector: Array) -> Array:
         return (wrong.project(pose(vector).apply(anchors_cam)) - wanted).ravel()
 
-    found = least_squares(
-        misses,
-        np.zeros(6),
-        x_scale=[1e-3] * 6,
-        xtol=1e-15,
-        ftol=1e-15,
-        gtol=1e-15,
-    )
-    return pose(found.x)
+    exactly: Any = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15}
+    return pose(least_squares(misses, np.zeros(6), x_scale=[1e-3] * 6, **exactly).x)

@@ -107,17 +107,14 @@ def test_damaged_pictures_are_named_and_left_out(
     assert "cut.jpg" in errors
 
 
-@pytest.mark.parametrize(("level", "named"), [(0, "12 dB"), (255, "12 dB")])
-def test_pictures_that_say_nothing_are_refused(tmp_path: Path, level: int, named: str) -> None:
-    cv2.imwrite(str(tmp_path / "a.png"), np.full((*SIZE, 3), level, np.uint8))
-    with pytest.raises(ImageError, match=named):
-        gain_report(tmp_path)
-
-
-def test_no_picture_and_no_readable_one_are_refused(tmp_path: Path) -> None:
+def test_pictures_that_say_nothing_or_are_none_are_refused(tmp_path: Path) -> None:
     for pictures in (tmp_path, str(tmp_path / "*.png")):
         with pytest.raises(ImageError):
             gain_report(pictures)
+    for level in (0, 255):
+        cv2.imwrite(str(tmp_path / "a.png"), np.full((*SIZE, 3), level, np.uint8))
+        with pytest.raises(ImageError, match="12 dB"):
+            gain_report(tmp_path)
     (tmp_path / "a.png").write_bytes(b"junk")
     with pytest.raises(ImageError, match="none of 1"):
         gain_report(tmp_path)

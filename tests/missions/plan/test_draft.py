@@ -140,11 +140,8 @@ def test_files_elsewhere_are_refused_unless_they_are_named_already(
         assert draft_settings(text, PATH, {section: {key: name}}).text == text
 
 
-def test_a_section_that_is_none_is_refused() -> None:
+def test_what_is_no_section_or_no_text_is_refused() -> None:
     with pytest.raises(ConfigError, match="section"):
         draft_settings("area = 3\n", PATH, {"area": {"file": "reef.kml"}})
-
-
-def test_what_is_no_text_is_refused() -> None:
     with pytest.raises(ConfigError):
         draft_settings(TEMPLATE, PATH, {"area": {"layer": "\ud800"}})

@@ -17,10 +17,9 @@ from camera_calib.rig import Rig, design_rig
 from missions.exports.geometry import footprint_outline, footprints_ne
 from missions.fly.simulation import one_dive, path_of
 from missions.plan.parts import parts_of
-from missions.values.line import Line
 from missions.values.plan_file import Dive, Plan
 from tests.missions.flown_plans import planned
-from tests.oracles_lines import area_of
+from tests.oracles_lines import area_of, as_string
 
 APART = MultiPolygon([box(0, 0, 6, 5), box(42, 0, 48, 5), box(84, 0, 90, 5)]).wkt
 
@@ -71,10 +70,6 @@ def test_parts_that_touch_are_one() -> None:
     assert first.survey.bounds == (0, 0, 5, 5)
     assert second.survey.bounds == (20, 0, 25, 5)
     assert (home, entry) == ((0.0, 0.0), (19.0, 0.0))
-
-
-def _as_string(line: Line) -> LineString:
-    return LineString([line.start_ne_m, line.end_ne_m])
 
 
 def _seen_by(plan: Plan, rig: Rig, dive: Dive) -> BaseGeometry:
@@ -129,7 +124,7 @@ def test_cross_lines_tie_all_dives(cross_lines: int, capsys: pytest.CaptureFixtu
     ties = np.zeros((len(plan.dives), len(plan.dives)))
     for i, line in enumerate(plan.lines):
         for j, other in enumerate(plan.lines):
-            if line.kind == "cross" and _as_string(line).intersects(_as_string(other)):
+            if line.kind == "cross" and as_string(line).intersects(as_string(other)):
                 ties[owner[i], owner[j]] = 1
     together, _ = connected_components(ties, directed=False)
     assert together == (1 if cross_lines else len(plan.dives))
