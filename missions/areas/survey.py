@@ -259,7 +259,9 @@ def _check_inside(area: Area, raw: RawShapes, frame: LocalFrame, given: str) -> 
 
 
 def corridor_strip(points: Array, width_m: float, origin: str, name: str) -> BaseGeometry:
-    """The strip along a line.
+    """The strip along a line: flat ends, corners drawn out to no more than a width.
+
+    A line whose last point is its first goes round without ends.
 
     Raises:
         PlanError: the line has no length.
@@ -267,7 +269,9 @@ def corridor_strip(points: Array, width_m: float, origin: str, name: str) -> Bas
     apart = distinct(points, closed=False)
     if len(apart) < 2:
         raise PlanError(f"area: {origin}: {name}: {len(apart)} distinct points; it needs 2 or more")
-    return buffered_line(apart, width_m)
+    return LineString(apart).buffer(
+        width_m / 2, cap_style="flat", join_style="mitre", mitre_limit=MITRE_LIMIT
+    )
 
 
 def _survey_shapes(settings: AreaConfig) -> RawShapes:
@@ -463,17 +467,6 @@ def _join(solids: list[BaseGeometry], report: _Reporter | None) -> MultiPolygon:
     wider = union.buffer(SLIVER_M / 2, join_style="mitre", mitre_limit=_SHARP)
     closed = wider.buffer(-SLIVER_M / 2, join_style="mitre", mitre_limit=_SHARP)
     return multipolygon(closed)
-
-
-def buffered_line(points: Array, width_m: float) -> Polygon | MultiPolygon:
-    """The strip along a line: flat ends, corners drawn out to no more than a width.
-
-    A line whose last point is its first goes round without ends.
-    """
-    strip: Polygon | MultiPolygon = LineString(points).buffer(
-        width_m / 2, cap_style="flat", join_style="mitre", mitre_limit=MITRE_LIMIT
-    )
-    return strip
 
 
 def widen(geometry: MultiPolygon, by_m: float) -> MultiPolygon:

@@ -91,16 +91,15 @@ def find_holes(
         )
         cut = multipolygon(outline.intersection(certificate.area.survey))
         place = cut.representative_point()
-        geodetic_place = certificate.area.datum.geodetic_from_ned(
-            np.array([[place.x, place.y, 0.0]])
-        )[0]
+        place_ned = np.array([[place.x, place.y, 0.0]])
+        ((latitude, longitude, _),) = certificate.area.datum.geodetic_from_ned(place_ned)
         width_m, length_m = sorted(_sides_m(cut))
         holes.append(
             Hole(
                 outline=cut,
                 place_ne=(float(place.x), float(place.y)),
-                latitude_deg=float(geodetic_place[0]),
-                longitude_deg=float(geodetic_place[1]),
+                latitude_deg=float(latitude),
+                longitude_deg=float(longitude),
                 area_m2=float(cells[label] * cell_m2),
                 unseen_m2=float(unseen[label] * cell_m2),
                 length_m=length_m,

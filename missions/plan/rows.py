@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from alice_survey.core.artefacts import json_values
-from alice_survey.kit.words import share, text_table
+from alice_survey.kit.words import text_table
 from missions.exposure.light import MIDDLE_GREY, SEEN_SHARE
 from missions.exposure.settings import ImagingSettings, ImagingSetup
 from missions.exposure.strobe import BUS_SAG, BUS_V, WARM_SEA_C
@@ -52,8 +52,8 @@ class Setting:
     def text(self) -> str:
         """The value with its unit, to about three digits."""
         values = self.value if isinstance(self.value, tuple) else (self.value,)
-        shown = _percent if self.unit == "%" else _number
-        return f"{' / '.join(map(shown, values))} {self.unit}".rstrip()
+        scale = 100.0 if self.unit == "%" else 1.0
+        return f"{' / '.join(_number(scale * value) for value in values)} {self.unit}".rstrip()
 
 
 def settings_table(rows: Sequence[Setting]) -> str:
@@ -69,12 +69,6 @@ def settings_table(rows: Sequence[Setting]) -> str:
             lines += textwrap.wrap(head, WIDTH, subsequent_indent=" " * 50)
             lines += textwrap.wrap(" " * 6 + row.note, WIDTH, subsequent_indent=" " * 6)
     return "\n".join(lines[1:])
-
-
-def _percent(part: float) -> str:
-    """As other numbers; but 100 is all of it."""
-    text = _number(100.0 * part)
-    return share(part, 2).removesuffix(" %") if text == "100" and part < 1.0 else text
 
 
 def _number(value: float) -> str:
