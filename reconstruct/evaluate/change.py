@@ -23,7 +23,7 @@ from alice_survey.core.run import progress
 from alice_survey.kit.figure import figure_style, new_figure, save_figure
 from reconstruct.elevation import Elevation, elevation_in
 from reconstruct.evaluate.figures import json_number, map_errors, rms
-from reconstruct.evaluate.registration import HeightFit, refine_heights, register_heights
+from reconstruct.evaluate.registration import HeightFit, adjust_heights, register_heights
 from reconstruct.placing.alignment import align_rigid
 from reconstruct.raster import DemGrid, hillshade, tiled_raster
 from reconstruct.views.model import WorldFrame, read_frame
@@ -291,14 +291,11 @@ def plot_change(path: Path, now: Elevation, change: Change) -> None:
     known = difference[np.isfinite(difference)]
     limit = max(float(np.percentile(np.abs(known), 99.5)), 1e-6) if known.size else 1.0
     figure = new_figure(5.2, 11)
-    for axis, values, span, label, title in zip(
-        figure.subplots(1, 2),
-        (difference, change.significance[::step, ::step]),
-        (limit, 4.0),
-        ("mm", "standard deviations"),
-        ("Height now minus before", "Significance"),
-        strict=True,
-    ):
+    maps = (
+        (difference, limit, "Height now minus before", "mm"),
+        (change.significance[::step, ::step], 4.0, "Significance", "standard deviations"),
+    )
+    for axis, (values, span, title, label) in zip(figure.subplots(1, 2), maps, strict=True):
         axis.imshow(shade, extent=extent, cmap="gray", vmin=0, vmax=1.2)
         opacity = np.where(np.isfinite(values), 0.75, 0.0)
         map_errors(axis, values, span, title, label, extent=extent, alpha=opacity)
@@ -327,12 +324,11 @@ def compare_elevations(
     change = find_change(now, before, fit)
     if change.changed.any():
         stable = replace(now, height=np.where(change.changed, np.nan, now.height))
-        try:
-            fit = refine_heights(stable, before, fit.fixed_from_moving)
-        except ReconstructionError:
+        again = adjust_heights(stable, before, fit.fixed_from_moving)
+        if again is None:
             warn("too little is unchanged to register on it alone: change may be underestimated")
             return change, fit
-        change = find_change(now, before, fit)
+        change, fit = find_change(now, before, again), again
     return change, fit
 
 

@@ -37,10 +37,6 @@ _MIN_OVERLAP = 0.3
 _CLUSTERS = 12
 """Blocks along a side whose errors are taken as independent of one another."""
 _MIN_POINTS = 500
-_APART = (
-    f"the two surfaces overlap by less than {_MIN_OVERLAP:.0%} of the smaller one (or by under "
-    f"{_MIN_POINTS} cells): they show different places, or their georeferences are far apart"
-)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -65,16 +61,6 @@ class HeightFit:
         return np.sqrt(np.maximum(variance, 0.0))
 
 
-def refine_heights(
-    fixed: Elevation, moving: Elevation, fixed_from_moving: RigidTransform
-) -> HeightFit:
-    """Adjust a registration that is nearly right; raises as `register_heights` does."""
-    fit = _adjust(fixed, moving, fixed_from_moving, _step(fixed))
-    if fit is None:
-        raise ReconstructionError(_APART)
-    return fit
-
-
 def register_heights(
     fixed: Elevation, moving: Elevation, fixed_from_moving: RigidTransform
 ) -> HeightFit:
@@ -88,25 +74,20 @@ def register_heights(
     Raises:
         ReconstructionError: the two hardly overlap.
     """
-    step = _step(fixed)
-    starts = rough_shifts(fixed, moving, fixed_from_moving)
-    coarse = 4 * step
     fits = []
-    for shift in starts:
+    for shift in rough_shifts(fixed, moving, fixed_from_moving):
         start = RigidTransform.from_translation([*shift, 0.0]) * fixed_from_moving
-        fit = _adjust(fixed, moving, start, coarse)
+        fit = adjust_heights(fixed, moving, start, coarser=4)
         if fit is not None:
             fits.append(fit)
     if not fits:
-        raise ReconstructionError(_APART)
+        raise ReconstructionError(
+            f"the two surfaces overlap by less than {_MIN_OVERLAP:.0%} of the smaller one (or by "
+            f"under {_MIN_POINTS} cells): they show different places, or their georeferences are "
+            "far apart"
+        )
     best = min(fits, key=lambda fit: fit.spread)
-    final = _adjust(fixed, moving, best.fixed_from_moving, step)
-    return best if final is None else final
-
-
-def _step(elevation: Elevation) -> int:
-    """Step between cells that suffices."""
-    return max(1, int(np.sqrt(elevation.known.sum() / _MAX_POINTS)))
+    return adjust_heights(fixed, moving, best.fixed_from_moving) or best
 
 
 def rough_shifts(
@@ -171,10 +152,19 @@ class _Compared:
     """(N,) variances of the heights, both surveys; ones where it is not stated."""
 
 
-def _adjust(
-    fixed: Elevation, moving: Elevation, start: RigidTransform, step: int
+def adjust_heights(
+    fixed: Elevation, moving: Elevation, start: RigidTransform, *, coarser: int = 1
 ) -> HeightFit | None:
-    """Gauss-Newton with Tukey's weights; None when too little overlaps."""
+    """Adjust a registration that is nearly right; None when too little overlaps.
+
+    Args:
+        fixed: heights that stay.
+        moving: of the other survey.
+        start: `fixed_from_moving`.
+        coarser: times the step between cells that suffices.
+    """
+    # Gauss-Newton with Tukey's weights
+    step = coarser * max(1, int(np.sqrt(fixed.known.sum() / _MAX_POINTS)))
     points = fixed.points(step)
     variance = fixed.at(fixed.sigma, points[:, :2]) ** 2
     centre = points.mean(axis=0)

@@ -80,18 +80,12 @@ def find_features(
     chosen = usable[
         spread(pixels[usable], sizes[usable], response[usable], (width, height), maximum)
     ]
-    if not len(chosen):
-        return Features(
-            pixels=np.zeros((0, 2)),
-            scale_px=np.zeros(0, np.float32),
-            descriptors=np.zeros((0, 128), np.uint8),
-        )
     picked = [keypoints[i] for i in chosen]
-    _, sift_descriptors = sift.compute(small, picked)
+    found = sift.compute(small, picked)[1] if picked else np.zeros((0, 128), np.float32)
     return Features(
         pixels=pixels[chosen],
         scale_px=np.array([k.size for k in picked], dtype=np.float32) * np.float32(steps.mean()),
-        descriptors=root_sift(sift_descriptors),
+        descriptors=root_sift(found),
     )
 
 
@@ -151,17 +145,10 @@ def spread(
 def save_features(path: Path, features: Features) -> None:
     """Write features so that an interrupted run can go on."""
     with atomic_path(path) as temporary:
-        np.savez(
-            temporary,
-            pixels=features.pixels,
-            scale_px=features.scale_px,
-            descriptors=features.descriptors,
-        )
+        np.savez(temporary, **vars(features))
 
 
 def load_features(path: Path) -> Features:
     """Read what `save_features` wrote."""
     with np.load(path) as data:
-        return Features(
-            pixels=data["pixels"], scale_px=data["scale_px"], descriptors=data["descriptors"]
-        )
+        return Features(**data)

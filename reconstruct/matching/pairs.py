@@ -173,7 +173,7 @@ def near_pairs(frusta: Frusta, chosen: NDArray[np.bool_], slack_m: Array) -> lis
     return sorted((int(min(p)), int(max(p))) for p in pairs)
 
 
-def all_round(frusta: Frusta, overlaps: Mapping[Pair, float], sectors: int) -> set[Pair]:
+def all_round(frusta: Frusta, overlaps: Mapping[Pair, float]) -> set[Pair]:
     """Two partners of every picture in all directions across its view, as it is turned.
 
     In each direction, and among those turned by over 45 degrees about the axis, one that is best by
@@ -183,7 +183,6 @@ def all_round(frusta: Frusta, overlaps: Mapping[Pair, float], sectors: int) -> s
     Args:
         frusta: of the pictures.
         overlaps: by pair.
-        sectors: directions.
     """
     middles = frusta.middles
     chosen = set()
@@ -193,7 +192,7 @@ def all_round(frusta: Frusta, overlaps: Mapping[Pair, float], sectors: int) -> s
         here = frusta.ned_from_cam[i].rotation.inv()
         for j, overlap in found:
             right, down, _ = here.apply(middles[j] - middles[i])
-            sector = round(np.arctan2(down, right) / (2 * np.pi / sectors)) % sectors
+            sector = round(np.arctan2(down, right) / (2 * np.pi / _SECTORS)) % _SECTORS
             turn = (here * frusta.ned_from_cam[j].rotation).as_matrix()
             across = bool(abs(turn[1, 0]) > abs(turn[0, 0]))
             goodness = overlap * float(np.hypot(right, down))
@@ -435,7 +434,7 @@ def _sharing(
             maybe[pair] = maximum
     middles = frusta.middles
     away = {(i, j): float(np.linalg.norm(middles[i] - middles[j])) for i, j in maybe}
-    return all_round(frusta, sure, _SECTORS), nearest_each(maybe, away, _LOOKS)
+    return all_round(frusta, sure), nearest_each(maybe, away, _LOOKS)
 
 
 def _sigma_m(record: ImageRecord, distance_m: float) -> float:

@@ -224,7 +224,6 @@ _RIM = REACH_CELLS + 1
 _MAX_CELLS = 10_000_000
 _SHARE_DIGITS = 12
 """Decimals of shares of squares: less is rounding."""
-NOTHING_KNOWN = "no surface is known within the polygon: draw it on the surface"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -392,51 +391,27 @@ def figures_of_all(
     )
 
 
-class AreaSums:
-    """The areas within a polygon, gathered block by block."""
-
-    def __init__(self, region: PolygonOnGrid) -> None:
-        """Begin."""
-        self._region = region
-        self._surface = self._plan = self._added = self._scatter = 0.0
-        self._by_surface, self._by_plan = (FigureSlopes(region.surface.errors) for _ in range(2))
-
-    def add(self, block: GridPart) -> None:
-        """Add the squares that begin in the core of a block."""
-        region, cell = self._region, self._region.surface.grid.cell
-        found = surface_area(block.height, block.own, block.all_weight, cell)
-        area = np.nan_to_num(found.area)
-        self._surface += float((block.weight * area).sum())
-        self._plan += cell**2 * float(block.weight.sum())
-        self._added += float((block.weight * np.nan_to_num(found.added)).sum())
-        self._scatter += found.scatter(block.weight)
-        region.add(self._by_surface, block, found.slopes)
-        region.add(self._by_plan, block, plan_slopes(block.all_weight, cell))
-
-    def total(self) -> SurfaceAreas:
-        """What was gathered, once all blocks are in.
-
-        Raises:
-            ReconstructionError: no surface is known in it.
-        """
-        if not self._plan > 0:
-            raise ReconstructionError(NOTHING_KNOWN)
-        self._by_surface.count_once(self._scatter)
-        return SurfaceAreas(
-            surface=self._surface, plan=self._plan, share=self._plan / self._region.polygon.area,
-            noise=self._added / self._plan, by_surface=self._by_surface.packed,
-            by_plan=self._by_plan.packed,
-        )  # fmt: skip
-
-
 def surface_within(surface: MeasuredSurface, polygon: BaseGeometry) -> SurfaceAreas:
     """Areas of the surface within a polygon that may have holes, and of its plan.
 
     Raises:
         ReconstructionError: it is too large, or no surface is known in it.
     """
-    region = PolygonOnGrid(surface, polygon)
-    sums = AreaSums(region)
+    region, cell = PolygonOnGrid(surface, polygon), surface.grid.cell
+    area = plan = added = scatter = 0.0
+    by_surface, by_plan = (FigureSlopes(surface.errors) for _ in range(2))
     for block in region.blocks():
-        sums.add(block)
-    return sums.total()
+        found = surface_area(block.height, block.own, block.all_weight, cell)
+        area += float((block.weight * np.nan_to_num(found.area)).sum())
+        plan += cell**2 * float(block.weight.sum())
+        added += float((block.weight * np.nan_to_num(found.added)).sum())
+        scatter += found.scatter(block.weight)
+        region.add(by_surface, block, found.slopes)
+        region.add(by_plan, block, plan_slopes(block.all_weight, cell))
+    if not plan > 0:
+        raise ReconstructionError("no surface is known within the polygon: draw it on the surface")
+    by_surface.count_once(scatter)
+    return SurfaceAreas(
+        surface=area, plan=plan, share=plan / region.polygon.area, noise=added / plan,
+        by_surface=by_surface.packed, by_plan=by_plan.packed,
+    )  # fmt: skip

@@ -21,8 +21,6 @@ from alice_survey.core.products import MOSAIC
 from alice_survey.core.run import progress
 from missions.areas.files import DRIVERS, gis_files
 from reconstruct.measure.areas import (
-    NOTHING_KNOWN,
-    AreaSums,
     GridPart,
     PolygonOnGrid,
     SurfaceAreas,
@@ -206,42 +204,20 @@ Base = float | Literal["rim"]
 """Plane of a volume: level at a height, or fitted to the heights along the polygon's rim."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _PolygonMoments:
-    """Sums over the known part of a polygon, about its middle."""
-
-    share: float
-    """Known, of the polygon's area."""
-    area: float
-    second: Array
-    """(3, 3) sum over cells of weights times the products of 1, x and y."""
-    heights: Array
-    """(3,) the same of heights."""
-
-    @property
-    def fit(self) -> Array:
-        """(3,) height in the middle, and slopes to the right and up, of the plane that fits."""
-        return np.asarray(np.linalg.solve(self.second, self.heights), dtype=np.float64)
-
-
 def _upright(block: GridPart) -> Array:
     """(rows, columns, 3) 1, x and y of cells."""
     return np.stack([np.ones_like(block.x), block.x, block.y], axis=-1)
 
 
-def _moments(region: PolygonOnGrid) -> _PolygonMoments:
-    cell = region.surface.grid.cell
-    area, second, heights = 0.0, np.zeros((3, 3)), np.zeros(3)
+def _fit_sums(region: PolygonOnGrid) -> tuple[Array, Array]:
+    """Normal equations (3, 3) and (3,) of the plane that fits, about the polygon's middle."""
+    second, heights = np.zeros((3, 3)), np.zeros(3)
     for block in region.blocks():
-        upright = _upright(block)
-        area += cell**2 * float(block.weight.sum())
-        weight = spread_to_cells(block.weight)
+        upright, weight = _upright(block), spread_to_cells(block.weight)
         used = weight > 0
         second += (weight[used, None] * upright[used]).T @ upright[used]
         heights += (weight[used] * block.height[used]) @ upright[used]
-    return _PolygonMoments(
-        share=area / region.polygon.area, area=area, second=second, heights=heights
-    )
+    return second, heights
 
 
 def measure_polygon(
@@ -268,30 +244,28 @@ def measure_polygon(
         raise ReconstructionError(
             "the polygon crosses itself or has no area: draw its corners in order"
         )
-    region = PolygonOnGrid(surface, polygon)
-    moments = _moments(region)
-    if not moments.area > 0:
-        raise ReconstructionError(NOTHING_KNOWN)
+    areas, region = surface_within(surface, polygon), PolygonOnGrid(surface, polygon)
     notes = []
-    if moments.share < 0.999:
+    if areas.share < 0.999:
         notes.append(
-            f"{moments.share:.1%} of the polygon is known: area of the surface, volume, slope and "
+            f"{areas.share:.1%} of the polygon is known: area of the surface, volume, slope and "
             "rugosity are of that part"
         )
     ring = _ring(surface, places)
     rim = None if base is None else _VolumePlane.of(surface, region, base)
-    sums = _PolygonSums(region, moments, rim)
+    slope, aspect, mean, *volumes = _plane_figures(region, rim)
     figures = [
         of_points(surface, ring, "plan_area", "Area in plan", plan_area, 2),
-        *figures_of_all(surface, [sums.areas]),
-        *sums.slope,
-        figure(surface, "mean_height", "Mean height", sums.mean, sums.by_mean.packed, 1),
+        *figures_of_all(surface, [areas]),
+        slope,
+        aspect,
+        mean,
         of_points(surface, ring, "perimeter", "Perimeter in plan", _plan_length, 1),
-        *sums.volumes,
+        *volumes,
     ]
-    if sums.areas.noise > 0.1:
+    if areas.noise > 0.1:
         notes.append(
-            f"noise adds {sums.areas.noise:.0%} to the area of the surface, which is taken away "
+            f"noise adds {areas.noise:.0%} to the area of the surface, which is taken away "
             "but for about as large a share of that: it is large for such small cells"
         )
     return tuple(figures), tuple(notes)
@@ -344,88 +318,58 @@ class _VolumePlane:
         slopes.add(self._samples.places, motion, self._samples.own_variance(motion))
 
 
-class _PolygonSums:
-    """All sums over a polygon, in one pass."""
-
-    def __init__(
-        self, region: PolygonOnGrid, moments: _PolygonMoments, rim: _VolumePlane | None
-    ) -> None:
-        surface = self._surface = region.surface
-        errors, cell = surface.errors, surface.grid.cell
-        self._rim = rim
-        gathered, self.by_mean = AreaSums(region), FigureSlopes(errors)
-        self._by_slopes = [FigureSlopes(errors) for _ in range(2)]
-        self._by_volume = {name: FigureSlopes(errors) for name in ("volume", "above", "below")}
-        self._volume = dict.fromkeys(self._by_volume, 0.0)
-        by_plane = {name: np.zeros(3) for name in self._by_volume}
-        lift = 0.0
-        fit = moments.fit
-        inverse = np.linalg.inv(moments.second)
-        steep = float(np.hypot(fit[1], fit[2]))
-        # steepness in degrees and the way down, by the slopes to the right and up
-        turn = np.array([[fit[1], fit[2]], [-fit[2], fit[1]]]) / max(steep, 1e-300)
-        turn[0] /= 1.0 + steep**2
-        turn[1] /= -max(steep, 1e-300)
-        turn = np.rad2deg(turn)
-        for block in region.blocks():
-            gathered.add(block)
-            upright = _upright(block)
-            weight = spread_to_cells(block.all_weight)
-            by_fit = weight[..., None] * upright @ inverse
-            region.add(self.by_mean, block, _by_height(by_fit[..., 0]))
-            for slopes, way in zip(self._by_slopes, turn, strict=True):
-                region.add(slopes, block, _by_height(by_fit[..., 1:] @ way))
-            if rim is not None:
-                over = np.nan_to_num(mean_of_corners(block.height - upright @ rim.plane))
-                lift += float(
-                    (
-                        block.weight * noise_lift(over, np.nan_to_num(sigma_of_means(block.own)))
-                    ).sum()
-                )
-                parts = (np.ones_like(over), 1.0 * (over > 0), -1.0 * (over < 0))
-                for name, part in zip(self._by_volume, parts, strict=True):
-                    self._volume[name] += cell**2 * float((block.weight * part * over).sum())
-                    moved = _by_height(cell**2 * spread_to_cells(block.all_weight * part))
-                    wider = plan_slopes(block.all_weight * part * over, cell)
-                    region.add(self._by_volume[name], block, moved + wider)
-                    middles = np.stack([mean_of_corners(upright[..., k]) for k in range(3)], -1)
-                    share = (block.weight * part)[..., None] * middles
-                    by_plane[name] -= cell**2 * share.sum(axis=(0, 1))
-        self.areas = gathered.total()
-        if rim is not None:
-            for name, slopes in self._by_volume.items():
-                rim.moves(slopes, by_plane[name])
-        self._lift, self._fit, self._steep = cell**2 * lift, fit, steep
-        self.mean = float(moments.heights[0] / moments.second[0, 0])
-
-    @property
-    def slope(self) -> tuple[Measured, Measured]:
-        """Steepness of the plane that fits best, and the direction down it."""
-        down = math.degrees(math.atan2(-self._fit[1], -self._fit[2])) % 360.0
-        steep = math.degrees(math.atan(self._steep))
-        names = (("slope", "Slope of the plane that fits", steep),
-                 ("aspect", "Aspect, the way down from north or up", down))  # fmt: skip
-        first, second = (
-            figure(self._surface, name, title, value, slopes.packed, 0, "°")
-            for (name, title, value), slopes in zip(names, self._by_slopes, strict=True)
-        )
-        return first, second
-
-    @property
-    def volumes(self) -> tuple[Measured, ...]:
-        """Volume over the plane, and its parts above and below, which noise near it lifts."""
-        if self._rim is None:
-            return ()
-        titles = {"volume": "Volume above minus below the plane",
-                  "above": "Volume above the plane", "below": "Volume below the plane"}  # fmt: skip
-        found = []
+def _plane_figures(region: PolygonOnGrid, rim: _VolumePlane | None) -> list[Measured]:
+    """Slope and aspect of the plane that fits, mean height, and volumes over the rim's plane."""
+    surface, cell = region.surface, region.surface.grid.cell
+    by_mean, *by_slopes = (FigureSlopes(surface.errors) for _ in range(3))
+    titles = {"volume": "Volume above minus below the plane",
+              "above": "Volume above the plane", "below": "Volume below the plane"}  # fmt: skip
+    by_volume = {name: FigureSlopes(surface.errors) for name in titles}
+    volume, by_plane, lift = dict.fromkeys(titles, 0.0), dict.fromkeys(titles, np.zeros(3)), 0.0
+    second, heights = _fit_sums(region)
+    inverse, (_, right, up) = np.linalg.inv(second), np.linalg.solve(second, heights)
+    steep = float(np.hypot(right, up))
+    # steepness in degrees and the way down, by the slopes to the right and up
+    turn = np.array([[right, up], [-up, right]]) / max(steep, 1e-300)
+    turn[0] /= 1.0 + steep**2
+    turn[1] /= -max(steep, 1e-300)
+    turn = np.rad2deg(turn)
+    for block in region.blocks():
+        upright, weight = _upright(block), spread_to_cells(block.all_weight)
+        by_fit = weight[..., None] * upright @ inverse
+        region.add(by_mean, block, _by_height(by_fit[..., 0]))
+        for slopes, way in zip(by_slopes, turn, strict=True):
+            region.add(slopes, block, _by_height(by_fit[..., 1:] @ way))
+        if rim is None:
+            continue
+        over = np.nan_to_num(mean_of_corners(block.height - upright @ rim.plane))
+        noise = noise_lift(over, np.nan_to_num(sigma_of_means(block.own)))
+        lift += cell**2 * float((block.weight * noise).sum())
+        middles = np.stack([mean_of_corners(upright[..., k]) for k in range(3)], axis=-1)
+        parts = (np.ones_like(over), 1.0 * (over > 0), -1.0 * (over < 0))
+        for name, part in zip(titles, parts, strict=True):
+            volume[name] += cell**2 * float((block.weight * part * over).sum())
+            moved = _by_height(cell**2 * spread_to_cells(block.all_weight * part))
+            wider = plan_slopes(block.all_weight * part * over, cell)
+            region.add(by_volume[name], block, moved + wider)
+            share = (block.weight * part)[..., None] * middles
+            by_plane[name] = by_plane[name] - cell**2 * share.sum(axis=(0, 1))
+    down = math.degrees(math.atan2(-right, -up)) % 360.0
+    found = [
+        ("slope", "Slope of the plane that fits", math.degrees(math.atan(steep)), by_slopes[0], 0),
+        ("aspect", "Aspect, the way down from north or up", down, by_slopes[1], 0),
+        ("mean_height", "Mean height", float(heights[0] / second[0, 0]), by_mean, 1),
+    ]
+    if rim is not None:
         for name, title in titles.items():
-            by_volume = self._by_volume[name].packed
-            one = figure(self._surface, name, title, self._volume[name], by_volume, 3)
-            if name != "volume":
-                one = Measured(**{**vars(one), "own": math.hypot(one.own, self._lift)})
-            found.append(one)
-        return tuple(found)
+            rim.moves(by_volume[name], by_plane[name])
+            found.append((name, title, volume[name], by_volume[name], 3))
+    figures = [
+        figure(surface, name, title, value, slopes.packed, power, None if power else "°")
+        for name, title, value, slopes, power in found
+    ]
+    # noise near the plane lifts the parts above and below
+    return figures[:4] + [replace(one, own=math.hypot(one.own, lift)) for one in figures[4:]]
 
 
 def _by_height(slopes: Array) -> Array:

@@ -83,18 +83,15 @@ def gps9(places: Sequence[tuple[float, float, float]], when: datetime, fix: int 
     )
 
 
-def telemetry_track(offsets: Sequence[int], sizes: Sequence[int], *, per_chunk: int = 1) -> bytes:
-    """The track of payloads of a second each; with several to a chunk, they follow one another."""
-    chunks = list(offsets[::per_chunk])
+def telemetry_track(offsets: Sequence[int], sizes: Sequence[int]) -> bytes:
+    """The track of payloads of a second each."""
     table = box(
         b"stbl",
         full_box(b"stsd", struct.pack(">I", 1), box(b"gpmd", b"\0" * 6 + b"\0\1")),
         full_box(b"stts", struct.pack(">III", 1, len(sizes), 1000)),
-        full_box(b"stsc", struct.pack(">IIII", 1, 1, per_chunk, 1)),
-        full_box(
-            b"stsz", struct.pack(">II", 0, len(sizes)), *(struct.pack(">I", s) for s in sizes)
-        ),
-        full_box(b"stco", struct.pack(">I", len(chunks)), *(struct.pack(">I", o) for o in chunks)),
+        full_box(b"stsc", struct.pack(">IIII", 1, 1, 1, 1)),
+        full_box(b"stsz", struct.pack(f">II{len(sizes)}I", 0, len(sizes), *sizes)),
+        full_box(b"stco", struct.pack(f">I{len(offsets)}I", len(offsets), *offsets)),
     )
     header = full_box(b"mdhd", struct.pack(">IIIIHH", 0, 0, 1000, 1000 * len(sizes), 0, 0))
     kind = full_box(b"hdlr", b"mhlrmeta", b"\0" * 12, b"\x0bGoPro MET  ")
@@ -108,7 +105,7 @@ def telemetry_track(offsets: Sequence[int], sizes: Sequence[int], *, per_chunk: 
 
 
 def film(
-    path: Path, frames: Sequence[NDArray[np.uint8]], rate_hz: float, *,
+    path: Path, frames: Sequence[NDArray[np.uint8]], rate_hz: float = 10.0, *,
     created: datetime | None = None, payloads: Sequence[bytes] = (), gopro: bool = True,
 ) -> Path:  # fmt: skip
     """Write an MP4, with its time of creation and with telemetry where they are given."""

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from alice_survey.core.errors import AliceError, ImageError, collected_by
-from alice_survey.core.manifest import read_manifest
 from reconstruct.pictures.importing import import_images
 from reconstruct.pictures.incoming import pixels_of
 from tests.missions.logs.log_files import Bag
-from tests.reconstruct.pictures.dated import counts
+from tests.reconstruct.pictures.dated import counts, rows_of, table
 
 START_NS, STEP_NS, COUNT = 1_700_000_000_000_000_000, 200_000_000, 12
 SHAPE = (24, 32)
@@ -34,14 +33,11 @@ def message(encoding: str, pixels: np.ndarray, **changes: Any) -> SimpleNamespac
     return SimpleNamespace(**fields)
 
 
-@pytest.mark.parametrize(
-    ("encoding", "order"),
-    [("bgr8", [0, 1, 2]), ("rgb8", [2, 1, 0]), ("8UC3", [0, 1, 2]), ("bgra8", [0, 1, 2]),
-     ("rgba8", [2, 1, 0])],
-)  # fmt: skip
-def test_channels_are_in_opencvs_order(encoding: str, order: list[int]) -> None:
+@pytest.mark.parametrize("encoding", ["bgr8", "rgb8", "8UC3", "bgra8", "rgba8"])
+def test_channels_are_in_opencvs_order(encoding: str) -> None:
     pixels = scene(1, 4 if "a8" in encoding else 3)
-    np.testing.assert_array_equal(pixels_of(message(encoding, pixels)), pixels[..., order])
+    expected = pixels[..., [2, 1, 0]] if encoding.startswith("rgb") else pixels[..., :3]
+    np.testing.assert_array_equal(pixels_of(message(encoding, pixels)), expected)
 
 
 def test_lines_may_be_padded_and_bytes_swapped() -> None:
@@ -58,9 +54,7 @@ def test_lines_may_be_padded_and_bytes_swapped() -> None:
 def test_a_mosaic_of_colours_shows_them(pattern: str) -> None:
     """An even colour through each filter: its own value wherever the filter lets it through."""
     value = {"r": 200, "g": 120, "b": 40}
-    tile = np.array(
-        [[value[pattern[0]], value[pattern[1]]], [value[pattern[2]], value[pattern[3]]]]
-    )
+    tile = np.array([value[filtered] for filtered in pattern]).reshape(2, 2)
     mosaic = np.tile(tile, (SHAPE[0] // 2, SHAPE[1] // 2)).astype(np.uint8)
     found = pixels_of(message(f"bayer_{pattern}8", mosaic))
     np.testing.assert_array_equal(found[4:-4, 4:-4].reshape(-1, 3).max(axis=0), [40, 120, 200])
@@ -106,7 +100,7 @@ def test_a_stereo_bag_becomes_stations_by_time(tmp_path: Path, version: int) -> 
     with collected_by(lambda _, text: said.append(text)):
         found = import_images(workspace, [], bag=bag)
     assert counts(found) == {"left": COUNT, "right": COUNT - 1}
-    records = read_manifest(workspace / "images" / "manifest.csv")
+    records = rows_of(workspace)
     by_station: dict[int, dict[str, float]] = {}
     for record in records:
         by_station.setdefault(record.station, {})[record.camera] = record.time_s
@@ -127,36 +121,31 @@ def test_a_stereo_bag_becomes_stations_by_time(tmp_path: Path, version: int) -> 
 
 def test_moments_are_thinned_whole(tmp_path: Path) -> None:
     import_images(tmp_path / "w", [], bag=stereo(tmp_path), every_s=0.5)
-    records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
+    records = rows_of(tmp_path / "w")
     lefts = [r.time_s for r in records if r.camera == "left"]
     np.testing.assert_allclose(lefts, [0.0, 0.6, 1.2, 1.8], atol=1e-5)
     assert len(records) == 8
 
 
 def test_navigation_on_the_same_clock_places_them(tmp_path: Path) -> None:
-    path = tmp_path / "n.csv"
-    rows = [f"{START_NS / 1e9 - 2 + i:.3f},{43 + 1e-6 * i},5.0,{3 + 0.1 * i}" for i in range(9)]
-    path.write_text("\n".join(["time_utc,latitude_deg,longitude_deg,depth_m", *(
-        f"{np.datetime64(START_NS - 2 * 10**9 + i * 10**9, 'ns')}Z,{row.split(',', 1)[1]}"
-        for i, row in enumerate(rows)
-    )]))  # fmt: skip
+    rows = [
+        (f"{np.datetime64(START_NS + (i - 2) * 10**9, 'ns')}Z", 43 + 1e-6 * i, 5.0, 3 + 0.1 * i)
+        for i in range(9)
+    ]
+    path = table(tmp_path / "n.csv", "time_utc,latitude_deg,longitude_deg,depth_m", rows)
     import_images(tmp_path / "w", [], bag=stereo(tmp_path), navigation=path)
-    records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
+    records = rows_of(tmp_path / "w")
     lefts = [r for r in records if r.camera == "left"]
     expected = 3 + 0.1 * (2 + 0.2 * np.arange(COUNT))
     np.testing.assert_allclose([r.depth_m for r in lefts], expected, atol=1e-6)
 
 
-def test_cameras_of_different_clocks_are_refused(tmp_path: Path) -> None:
+def test_cameras_of_different_clocks_are_refused_and_one_of_them_taken(tmp_path: Path) -> None:
     bag = stereo(tmp_path, late_ns=100_000_000)
     with pytest.raises(ImageError, match="one clock"):
         import_images(tmp_path / "w", [], bag=bag)
-
-
-def test_one_topic_of_two_can_be_taken(tmp_path: Path) -> None:
     topics = {"camera": "/stereo/left/image_raw"}
-    found = import_images(tmp_path / "w", [], bag=stereo(tmp_path), topics=topics)
-    assert counts(found) == {"camera": COUNT}
+    assert counts(import_images(tmp_path / "w", [], bag=bag, topics=topics)) == {"camera": COUNT}
 
 
 def test_a_bag_without_pictures_or_of_no_bag_is_named(tmp_path: Path) -> None:

@@ -8,11 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from reconstruct.pictures.videos import (
-    Frame,
-    FrameCounts,
-    OverlapChooser,
-)
+from reconstruct.pictures.videos import Frame, FrameCounts, OverlapChooser
 
 WIDTH, HEIGHT = 320, 240
 RATE_HZ = 20.0

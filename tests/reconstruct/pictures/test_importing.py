@@ -1,13 +1,12 @@
-import csv
 import struct
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, TiffImagePlugin, TiffTags
 
 from alice_survey.core.artefacts import read_json
 from alice_survey.core.config import CameraConfig, WaterConfig
@@ -17,69 +16,27 @@ from alice_survey.core.manifest import read_manifest
 from camera_calib.rig import design_rig, read_rig, write_rig
 from reconstruct.pictures.files import inspect
 from reconstruct.pictures.importing import import_images
-from tests.reconstruct.pictures.dated import counts, reasons
-
-Draw = Callable[..., Path]
+from tests.reconstruct.pictures.dated import counts, date, noise, reasons, rows_of, save, table
 
 
-@pytest.fixture
-def draw() -> Draw:
-    """Write a picture of bytes by its number and folder, with EXIF where a time is given."""
-
-    def one(
-        path: Path,
-        number: int = 0,
-        size: tuple[int, int] = (64, 48),
-        time: str | None = None,
-        gps: tuple[float, float, float] | None = None,
-    ) -> Path:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        seed = [number, *path.parent.name.encode()]
-        pixels = np.random.default_rng(seed).integers(0, 256, (size[1], size[0], 3))
-        image, exif = Image.fromarray(pixels.astype(np.uint8)), Image.Exif()
-        if time is not None:
-            exif.get_ifd(0x8769)[0x9003] = time
-        if gps is not None:
-            latitude, longitude, altitude = gps
-
-            def angle(value: float) -> tuple[float, float, float]:
-                value = abs(value)
-                minutes = value % 1 * 60
-                return (int(value), int(minutes), minutes % 1 * 60)
-
-            exif.get_ifd(0x8825).update(
-                {
-                    1: "N" if latitude >= 0 else "S",
-                    2: angle(latitude),
-                    3: "E" if longitude >= 0 else "W",
-                    4: angle(longitude),
-                    5: b"\x00" if altitude >= 0 else b"\x01",
-                    6: abs(altitude),
-                }
-            )
-        image.save(path, exif=exif)
-        return path
-
-    return one
+def draw(path: Path, number: int = 0, size: tuple[int, int] = (64, 48), **tags: Any) -> Path:
+    """Write a picture of noise by its number and folder."""
+    return save(path, noise(number, *path.parent.name.encode(), size=size), **tags)
 
 
-@pytest.fixture
-def several(tmp_path: Path, draw: Draw) -> Callable[..., Path]:
+def several(folder: Path, count: int, *, dated: bool = False, suffix: str = ".jpg") -> Path:
     """Write pictures `in/0.jpg` and on; with dates, they are of 12:00:00 and the seconds after."""
-
-    def write(count: int, *, dated: bool = False, suffix: str = ".jpg") -> Path:
-        for number in range(count):
-            time = f"2024:07:01 12:00:0{number}" if dated else None
-            draw(tmp_path / "in" / f"{number}{suffix}", number, time=time)
-        return tmp_path / "in"
-
-    return write
+    for number in range(count):
+        tags = {"taken": date(number)} if dated else {}
+        draw(folder / "in" / f"{number}{suffix}", number, **tags)
+    return folder / "in"
 
 
-Several = Callable[..., Path]
+def pair_in(folder: Path) -> dict[str, Path]:
+    return {name: folder / name for name in ("left", "right")}
 
 
-def test_pictures_of_one_camera_keep_their_bytes_and_order(tmp_path: Path, draw: Draw) -> None:
+def test_pictures_of_one_camera_keep_their_bytes_and_order(tmp_path: Path) -> None:
     source = tmp_path / "in"
     for number, name in enumerate(["b10.jpg", "b9.jpg", "a.PNG"]):
         draw(source / name, number)
@@ -102,12 +59,12 @@ def test_pictures_of_one_camera_keep_their_bytes_and_order(tmp_path: Path, draw:
 
 
 def test_a_divers_folder_is_counted_by_kind_and_reason(
-    tmp_path: Path, draw: Draw, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source = tmp_path / "in"
     for number in range(4):
-        time = f"2024:07:01 12:00:0{number}"
-        draw(source / f"IMG_{number}.JPG", number, time=time, gps=(60.0 + number * 1e-5, 5.0, 0.0))
+        place = (60.0 + number * 1e-5, 5.0, 0.0)
+        draw(source / f"IMG_{number}.JPG", number, taken=date(number), gps=place)
     draw(source / "scan.png", 9)
     (source / "IMG_7.jpg").write_bytes(b"cut")
     for name in ("IMG_5.HEIC", "IMG_6.heic", "GX010001.MOV", "notes.txt", ".DS_Store"):
@@ -129,14 +86,12 @@ def test_a_divers_folder_is_counted_by_kind_and_reason(
     assert not again.changed and again.model_copy(update={"changed": True}) == found
 
 
-def test_stereo_pictures_pair_in_order(tmp_path: Path, draw: Draw) -> None:
+def test_stereo_pictures_pair_in_order(tmp_path: Path) -> None:
     for number in range(3):
-        draw(tmp_path / "port" / f"p{number}.png", number)
-        draw(tmp_path / "star" / f"s{number + 5}.png", number + 10)
-    import_images(
-        tmp_path / "w", [], cameras={"left": tmp_path / "port", "right": tmp_path / "star"}
-    )
-    records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
+        draw(tmp_path / "left" / f"p{number}.png", number)
+        draw(tmp_path / "right" / f"s{number + 5}.png", number + 10)
+    import_images(tmp_path / "w", [], cameras=pair_in(tmp_path))
+    records = rows_of(tmp_path / "w")
     assert [(r.image, r.station) for r in records] == [
         (f"{side}/{letter}{n + first}.png", n)
         for n in range(3)
@@ -144,7 +99,7 @@ def test_stereo_pictures_pair_in_order(tmp_path: Path, draw: Draw) -> None:
     ]
 
 
-def test_a_camera_that_missed_a_moment_is_paired_by_number(tmp_path: Path, draw: Draw) -> None:
+def test_a_camera_that_missed_a_moment_is_paired_by_number(tmp_path: Path) -> None:
     cameras = {name: tmp_path / name for name in ("down", "bow", "port")}
     for side in cameras:
         for number in range(7, 12):
@@ -154,7 +109,7 @@ def test_a_camera_that_missed_a_moment_is_paired_by_number(tmp_path: Path, draw:
         found = import_images(tmp_path / "w", [], cameras=cameras)
     assert str(found) == "14 pictures (14 PNG) of down, bow and port, 0 with a position"
     assert not warnings
-    records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
+    records = rows_of(tmp_path / "w")
     assert {(r.image, r.station) for r in records} == {
         (f"{side}/{side}_{number}.png", number - 7)
         for side in cameras
@@ -163,7 +118,7 @@ def test_a_camera_that_missed_a_moment_is_paired_by_number(tmp_path: Path, draw:
     }
 
 
-def test_one_camera_of_a_rig_goes_by_its_name(tmp_path: Path, draw: Draw) -> None:
+def test_one_camera_of_a_rig_goes_by_its_name(tmp_path: Path) -> None:
     rig = design_rig(CameraConfig(), WaterConfig())
     cameras = {
         name: replace(rig.cameras[name], width_px=width, height_px=48)
@@ -182,7 +137,7 @@ def test_one_camera_of_a_rig_goes_by_its_name(tmp_path: Path, draw: Draw) -> Non
 
 
 def test_a_corrupt_picture_is_left_out_and_its_partner_stays(
-    tmp_path: Path, draw: Draw, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for side in ("left", "right"):
         for number in range(4):
@@ -191,13 +146,11 @@ def test_a_corrupt_picture_is_left_out_and_its_partner_stays(
     (tmp_path / "left" / "1.jpg").write_bytes(whole[: len(whole) * 2 // 3])  # truncated
     (tmp_path / "right" / "2.jpg").write_bytes(b"no picture at all")
     (tmp_path / "right" / "3.jpg").write_bytes(b"")
-    import_images(
-        tmp_path / "w", [], cameras={"left": tmp_path / "left", "right": tmp_path / "right"}
-    )
+    import_images(tmp_path / "w", [], cameras=pair_in(tmp_path))
     shown = capsys.readouterr().err
     for name in ("left/1.jpg", "right/2.jpg", "right/3.jpg"):
         assert name in shown
-    records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
+    records = rows_of(tmp_path / "w")
     kept = [(r.camera, r.station) for r in records]
     assert kept == [("left", 0), ("right", 0), ("right", 1), ("left", 2), ("left", 3)]
 
@@ -217,12 +170,10 @@ def test_sixteen_bits_become_eight_by_one_gain_per_camera(tmp_path: Path) -> Non
     assert any("12 bits" in note for note in read_json(images / "survey.json")["notes"])
 
 
-def test_gps_of_exif_gives_positions_and_a_datum(tmp_path: Path, draw: Draw) -> None:
+def test_gps_of_exif_gives_positions_and_a_datum(tmp_path: Path) -> None:
     places = [(-33.5, 151.25, 12.5), (-33.5001, 151.2501, 13.0), (-33.5002, 151.25, -2.0)]
     for number, place in enumerate(places):
-        draw(
-            tmp_path / "in" / f"{number}.jpg", number, time=f"2024:03:01 10:00:0{number}", gps=place
-        )
+        draw(tmp_path / "in" / f"{number}.jpg", number, taken=date(number), gps=place)
     import_images(tmp_path / "w", [tmp_path / "in"])
     images = tmp_path / "w" / "images"
     for record, (latitude, longitude, altitude) in zip(
@@ -237,28 +188,19 @@ def test_gps_of_exif_gives_positions_and_a_datum(tmp_path: Path, draw: Draw) -> 
     assert survey["datum"]["latitude_deg"] == pytest.approx(-33.5, abs=1e-6)
 
 
-def navigation(path: Path, rows: list[list[object]], header: str) -> Path:
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(header.split(","))
-        writer.writerows(rows)
-    return path
-
-
 def test_navigation_is_tied_by_time_zone_and_clock_offset(
-    tmp_path: Path, draw: Draw, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for number, second in enumerate([0, 4, 8, 50]):
-        draw(tmp_path / "in" / f"{number}.jpg", number, time=f"2024:07:01 12:00:{second:02d}")
+        draw(tmp_path / "in" / f"{number}.jpg", number, taken=date(second))
     rows = [[f"2024-07-01T10:00:{s:02d}Z", 60 + s * 1e-5, 5.0, 10 + s, 90.0] for s in range(15)]
-    nav = navigation(
-        tmp_path / "nav.csv", rows, "time_utc,latitude_deg,longitude_deg,depth_m,heading_deg"
-    )
+    header = "time_utc,latitude_deg,longitude_deg,depth_m,heading_deg"
+    nav = table(tmp_path / "nav.csv", header, rows)
     import_images(
         tmp_path / "w", [tmp_path / "in"],
         navigation=nav, clock_offset_s=2.5, time_zone="Europe/Oslo",
     )  # fmt: skip
-    records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
+    records = rows_of(tmp_path / "w")
     assert [r.time_s for r in records] == [2.5, 6.5, 10.5, 52.5]
     assert [r.depth_m for r in records[:3]] == pytest.approx([12.5, 16.5, 20.5])
     assert records[1].heading_deg == pytest.approx(90)
@@ -271,47 +213,39 @@ def test_navigation_is_tied_by_time_zone_and_clock_offset(
     [(None, "sea surface, as in the navigation log"), (" NN2000 (tide) ", "NN2000 (tide)")],
 )
 def test_the_level_of_logged_depths_is_stated(
-    tmp_path: Path, several: Several, given: str | None, stated: str
+    tmp_path: Path, given: str | None, stated: str
 ) -> None:
-    several(2, dated=True)
+    several(tmp_path, 2, dated=True)
     rows = [[f"2024-07-01T12:00:{s:02d}Z", 60, 5.0, 10 + s] for s in range(5)]
-    nav = navigation(tmp_path / "nav.csv", rows, "time_utc,latitude_deg,longitude_deg,depth_m")
+    nav = table(tmp_path / "nav.csv", "time_utc,latitude_deg,longitude_deg,depth_m", rows)
     import_images(tmp_path / "w", [tmp_path / "in"], navigation=nav, vertical_datum=given)
     survey = read_json(tmp_path / "w" / "images" / "survey.json")
     assert survey["vertical_datum"] == stated
     # The name alone differs: depths stay as logged.
-    records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
+    records = rows_of(tmp_path / "w")
     assert [r.depth_m for r in records] == pytest.approx([10.0, 11.0])
 
 
-PART_LOGS = {
-    "depth": ("depth_m", "depth"),
-    "depth and heading": ("depth_m,heading_deg", "depth", "heading"),
-    "altitude": ("altitude_m", "altitude"),
-    "heading": ("heading_deg", "heading"),
-}
-
-
-@pytest.mark.parametrize("log", PART_LOGS)
+@pytest.mark.parametrize("columns", ["depth_m", "depth_m,heading_deg", "altitude_m", "heading_deg"])
 def test_a_log_of_any_one_reading_is_taken(
-    tmp_path: Path, several: Several, log: str, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, columns: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    columns, *readings = PART_LOGS[log]
-    source = several(3, dated=True)
+    readings = [name.rsplit("_", 1)[0] for name in columns.split(",")]
+    source = several(tmp_path, 3, dated=True)
     rows = [[f"2024-07-01T12:00:{s:02d}Z", *[10 + s] * len(readings)] for s in range(9)]
-    nav = navigation(tmp_path / "nav.csv", rows, f"time_utc,{columns}")
+    nav = table(tmp_path / "nav.csv", f"time_utc,{columns}", rows)
     done = import_images(tmp_path / "w", [source], navigation=nav)
     assert dict(done.readings) == dict.fromkeys(readings, 3)
     assert all(f"3 with {name}" in str(done) for name in readings)
-    records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
+    records = rows_of(tmp_path / "w")
     for name in columns.split(","):
         assert [getattr(r, name) for r in records] == pytest.approx([10.0, 11.0, 12.0])
     assert read_json(tmp_path / "w" / "images" / "survey.json")["datum"] is None
     assert "warning" not in capsys.readouterr().err
 
 
-def test_masks_come_along(tmp_path: Path, several: Several) -> None:
-    several(3, suffix=".png")
+def test_masks_come_along(tmp_path: Path) -> None:
+    several(tmp_path, 3, suffix=".png")
     near, apart = np.full((48, 64), 255, np.uint8), np.zeros((48, 64), np.uint8)
     near[:10] = 0
     apart[:, 32:] = 7
@@ -329,7 +263,7 @@ def test_masks_come_along(tmp_path: Path, several: Several) -> None:
     np.testing.assert_array_equal(cv2.imread(str(images / records[2].mask), 0), (apart > 0) * 255)
 
 
-def test_names_stay_inside_and_apart(tmp_path: Path, draw: Draw) -> None:
+def test_names_stay_inside_and_apart(tmp_path: Path) -> None:
     draw(tmp_path / "one" / "-x..jpg", 0)
     draw(tmp_path / "one" / "a b;c.jpg", 1)
     draw(tmp_path / "two" / "A b;c.JPG", 2)
@@ -347,14 +281,14 @@ def test_names_stay_inside_and_apart(tmp_path: Path, draw: Draw) -> None:
     assert linked == (tmp_path / "far" / "away.jpg").read_bytes()
 
 
-def test_a_rig_must_be_that_of_the_pictures(tmp_path: Path, draw: Draw) -> None:
+def test_a_rig_must_be_that_of_the_pictures(tmp_path: Path) -> None:
     for side in ("left", "right"):
         for number in range(2):
             draw(tmp_path / side / f"{number}.png", number, size=(846, 677))
     small = CameraConfig(width_px=846, height_px=677, pixel_um=14.76)
     write_rig(tmp_path / "good.json", design_rig(small, WaterConfig()))
     write_rig(tmp_path / "bad.json", design_rig(CameraConfig(), WaterConfig()))
-    pair = {"left": tmp_path / "left", "right": tmp_path / "right"}
+    pair = pair_in(tmp_path)
     import_images(tmp_path / "w", [], cameras=pair, rig=tmp_path / "good.json")
     assert read_rig(tmp_path / "w" / "images" / "rig.json").cameras["left"].width_px == 846
     with pytest.raises(ImageError, match=r"846 x 677.*3384 x 2710"):
@@ -362,36 +296,31 @@ def test_a_rig_must_be_that_of_the_pictures(tmp_path: Path, draw: Draw) -> None:
     assert (tmp_path / "w" / "images" / "rig.json").exists()  # what was there stays
 
 
-def test_every_fault_names_its_cause(tmp_path: Path, draw: Draw) -> None:
+def test_every_fault_names_its_cause(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     draw(tmp_path / "one" / "0.jpg")
     for number in range(3):
         draw(tmp_path / "three" / f"{number}.jpg", number)
         draw(tmp_path / "sizes" / f"{number}.jpg", number, size=(64, 48 + (number == 2)))
     (tmp_path / "no.mp4").write_bytes(b"no video")
-    nav = navigation(
-        tmp_path / "nav.csv", [[0, 60, 5, 3], [1, 60, 5, 3]],
-        "time_s,latitude_deg,longitude_deg,depth_m",
-    )  # fmt: skip
-    for number in range(2):
-        draw(tmp_path / "dated" / f"{number}.jpg", number, time=f"2024:07:01 12:00:0{number}")
-    later = navigation(
-        tmp_path / "later.csv", [["2024-07-02T12:00:01Z", 10], ["2024-07-02T12:00:09Z", 10]],
-        "time_utc,depth_m",
-    )  # fmt: skip
-    w, three = tmp_path / "w", tmp_path / "three"
+    several(tmp_path, 2, dated=True)
+    header = "time_s,latitude_deg,longitude_deg,depth_m"
+    nav = table(tmp_path / "nav.csv", header, [[0, 60, 5, 3], [1, 60, 5, 3]])
+    rows = [["2024-07-02T12:00:01Z", 10], ["2024-07-02T12:00:09Z", 10]]
+    later = table(tmp_path / "later.csv", "time_utc,depth_m", rows)
+    w, three, film = tmp_path / "w", tmp_path / "three", [tmp_path / "no.mp4"]
     faults: list[tuple[list[Path], dict[str, object], str]] = [
         ([tmp_path / "empty"], {}, "empty"),
         ([tmp_path / "one"], {}, "1"),
         ([], {"cameras": {"down": tmp_path / "sizes"}}, "64 x 49 .* 64 x 48"),
         ([three], {"cameras": {"left": three, "right": three}}, "--left and --right"),
         ([], {"cameras": {"left": three, "right": tmp_path / "one"}}, "3 of left .* 1 of right"),
-        ([], {"videos": [tmp_path / "no.mp4"]}, "no.mp4"),
-        ([], {"videos": [tmp_path / "no.mp4"], "every_s": 1.0, "overlap": 0.7}, "exclude"),
+        ([], {"videos": film}, "no.mp4"),
+        ([], {"videos": film, "every_s": 1.0, "overlap": 0.7}, "exclude"),
         ([three], {"overlap": 0.7}, "--video too"),
-        ([], {"videos": [tmp_path / "no.mp4"] * 2}, "given twice"),
+        ([], {"videos": film * 2}, "given twice"),
         ([three], {"navigation": nav}, "DateTimeOriginal"),
-        ([tmp_path / "dated"], {"navigation": later}, "--clock-offset"),
+        ([tmp_path / "in"], {"navigation": later}, "--clock-offset"),
         ([three], {"clock_offset_s": float("nan")}, "--clock-offset"),
         ([three], {"vertical_datum": "LAT"}, "--navigation"),
         ([three], {"navigation": nav, "vertical_datum": "a\nb"}, "--vertical-datum"),
@@ -408,8 +337,8 @@ def test_every_fault_names_its_cause(tmp_path: Path, draw: Draw) -> None:
         assert truth.is_dir()
 
 
-def test_one_or_two_processes_write_the_same(tmp_path: Path, several: Several) -> None:
-    source = several(4)
+def test_one_or_two_processes_write_the_same(tmp_path: Path) -> None:
+    source = several(tmp_path, 4)
     for threads in (1, 2):
         import_images(tmp_path / f"w{threads}", [source], executor=local_executor(threads))
     one, two = tmp_path / "w1" / "images", tmp_path / "w2" / "images"
@@ -419,37 +348,20 @@ def test_one_or_two_processes_write_the_same(tmp_path: Path, several: Several) -
 
 def write_dng(path: Path, mosaic: np.ndarray) -> None:
     """A minimal RAW file: a 16-bit RGGB mosaic with the tags that LibRaw needs."""
-    height, width = mosaic.shape
-    texts = {271: b"Alice\0", 272: b"Test\0", 50708: b"Alice Test\0"}
-    rationals = {50721: [1, 0, 0, 0, 1, 0, 0, 0, 1], 50728: [1, 1, 1]}
-    plain = {
-        254: (4, [0]), 256: (4, [width]), 257: (4, [height]), 258: (3, [16]), 259: (3, [1]),
-        262: (3, [32803]), 274: (3, [1]), 277: (3, [1]), 278: (4, [height]),
-        279: (4, [2 * width * height]), 33421: (3, [2, 2]), 33422: (1, [0, 1, 1, 2]),
-        50706: (1, [1, 4, 0, 0]), 50714: (3, [0]), 50717: (3, [65535]), 50778: (3, [21]),
-    }  # fmt: skip
-    tags = sorted([273, *texts, *rationals, *plain])
-    start = 8 + 2 + 12 * len(tags) + 4
-    extra, entries = b"", b""
-    for tag in tags:
-        if tag in texts:
-            kind, count, data = 2, len(texts[tag]), texts[tag]
-        elif tag in rationals:
-            kind = 10 if tag == 50721 else 5
-            count = len(rationals[tag])
-            data = b"".join(struct.pack("<iI", v, 1) for v in rationals[tag])
-        else:
-            kind, values = plain.get(tag, (4, [0]))
-            count, data = len(values), struct.pack(f"<{len(values)}{' BsHI'[kind]}", *values)
-            if tag == 273:
-                data = b"PIXL"
-        if len(data) > 4:
-            offset, extra = start + len(extra), extra + data + b"\0" * (len(data) % 2)
-            data = struct.pack("<I", offset)
-        entries += struct.pack("<HHI", tag, kind, count) + data.ljust(4, b"\0")
-    entries = entries.replace(b"PIXL", struct.pack("<I", start + len(extra)))
-    header = b"II*\0" + struct.pack("<IH", 8, len(tags))
-    path.write_bytes(header + entries + b"\0" * 4 + extra + mosaic.astype("<u2").tobytes())
+    tags = TiffImagePlugin.ImageFileDirectory_v2()
+    for kind, known in {
+        TiffTags.ASCII: {271: "Alice", 272: "Test", 50708: "Alice Test"},
+        TiffTags.BYTE: {33422: bytes([0, 1, 1, 2]), 50706: bytes([1, 4, 0, 0])},
+        TiffTags.SHORT: {33421: (2, 2), 50714: 0, 50717: 65535, 50778: 21},
+        TiffTags.LONG: {254: 0},
+        TiffTags.RATIONAL: {50728: (1, 1, 1)},
+        TiffTags.SIGNED_RATIONAL: {50721: (1, 0, 0, 0, 1, 0, 0, 0, 1)},
+    }.items():
+        for tag, value in known.items():
+            tags.tagtype[tag], tags[tag] = kind, value
+    Image.fromarray(mosaic.astype(np.uint16)).save(path, format="TIFF", tiffinfo=tags)
+    grey, filters = (struct.pack("<HHII", 262, 3, 1, kind) for kind in (1, 32803))
+    path.write_bytes(path.read_bytes().replace(grey, filters))
 
 
 def test_raw_pictures_are_developed_alike(

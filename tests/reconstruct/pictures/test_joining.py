@@ -26,23 +26,11 @@ RIG = design_rig(CameraConfig(), WaterConfig())
 PLAN = plan_of(area_of(shapely.box(0, 0, 4, 3)), lawnmower(4.0, 3.0, 1.0, 0.46))
 
 
-def dive(
-    folder: Path,
-    stations: int,
-    *,
-    level: str = "sea surface",
-    plan: Plan = PLAN,
-    depth_m: float = 5.0,
-    placed: bool = True,
-) -> Path:
+def dive(folder: Path, stations: int, *, level: str = "sea surface", plan: Plan = PLAN) -> Path:
     """A workspace with pictures, each of bytes of its own, a rig and a plan."""
     records = [
         ImageRecord(
-            image=f"{camera}/{s}.png",
-            camera=camera,
-            station=s,
-            time_s=10.0 + 2 * s,
-            depth_m=depth_m,
+            image=f"{camera}/{s}.png", camera=camera, station=s, time_s=10.0 + 2 * s, depth_m=5.0
         )
         for s in range(stations)
         for camera in ("left", "right")
@@ -54,17 +42,15 @@ def dive(
             (part / record.image).write_text(f"{folder.name} {record.image}")
         write_manifest(part / "manifest.csv", records)
         write_rig(part / "rig.json", RIG)
-        place = PlaceRecord(latitude_deg=32.8, longitude_deg=34.9) if placed else None
-        PicturesRecord(source="imported", datum=place, vertical_datum=level).write(
-            part / "survey.json"
-        )
+        place = PlaceRecord(latitude_deg=32.8, longitude_deg=34.9)
+        about = PicturesRecord(source="imported", datum=place, vertical_datum=level)
+        about.write(part / "survey.json")
 
-    run_stage(folder, Stage(name="images", version=1, settings={}), work)
-    run_stage(
-        folder,
-        Stage(name="plan", version=1, settings={}),
-        lambda part: write_json(part / "plan.json", plan.to_json()),
-    )
+    def plan_it(part: Path) -> None:
+        write_json(part / "plan.json", plan.to_json())
+
+    for name, function in (("images", work), ("plan", plan_it)):
+        run_stage(folder, Stage(name=name, version=1, settings={}), function)
     return folder
 
 
@@ -79,9 +65,8 @@ def test_every_picture_keeps_its_bytes_camera_and_order(tmp_path: Path) -> None:
     for record in records:
         number, _, name = record.image.partition("/")
         source = dives[int(number.removeprefix("dive")) - 1]
-        assert (both / "images" / record.image).read_bytes() == (
-            source / "images" / name
-        ).read_bytes()
+        copy = (both / "images" / record.image).read_bytes()
+        assert copy == (source / "images" / name).read_bytes()
         assert record.camera == Path(name).parent.name
     times = np.array([r.time_s for r in records[::2]])
     np.testing.assert_allclose(np.diff(times)[[0, 1, 3]], 2.0)
@@ -114,18 +99,15 @@ def test_the_plan_of_both_dives_holds_all_lines(tmp_path: Path) -> None:
 
 def test_dives_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     one, two = dive(tmp_path / "one", 2), dive(tmp_path / "two", 2, level="NN2000")
-    with pytest.raises(ImageError, match="--vertical-datum"):
-        join_dives(tmp_path / "both", [one, two])
-    three = dive(tmp_path / "three", 2)
+    three, both = dive(tmp_path / "three", 2), tmp_path / "both"
     write_rig(three / "images" / "rig.json", RIG.in_water(1.36))
-    with pytest.raises(CalibrationError, match="--rig"):
-        join_dives(tmp_path / "both", [one, three])
-    with pytest.raises(WorkspaceError, match="each once"):
-        join_dives(tmp_path / "both", [one, one])
-    with pytest.raises(WorkspaceError, match="choose another with -w"):
-        join_dives(one, [one, two])
-    with pytest.raises(WorkspaceError, match="import-images"):
-        join_dives(tmp_path / "both", [one, tmp_path / "none"])
     elsewhere = replace(PLAN, area=replace(PLAN.area, datum=Datum(32.0, 34.0)))
-    with pytest.raises(PlanError, match="different datums"):
-        join_dives(tmp_path / "both", [one, dive(tmp_path / "four", 2, plan=elsewhere)])
+    four = dive(tmp_path / "four", 2, plan=elsewhere)
+    for workspace, other, fault, named in (
+        (both, two, ImageError, "--vertical-datum"), (both, three, CalibrationError, "--rig"),
+        (both, one, WorkspaceError, "each once"), (one, two, WorkspaceError, "another with -w"),
+        (both, tmp_path / "none", WorkspaceError, "import-images"),
+        (both, four, PlanError, "different datums"),
+    ):  # fmt: skip
+        with pytest.raises(fault, match=named):
+            join_dives(workspace, [one, other])

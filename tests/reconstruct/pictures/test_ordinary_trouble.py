@@ -2,12 +2,10 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
 
 from alice_survey.core.artefacts import read_json
 from alice_survey.core.errors import ImageError
@@ -15,7 +13,7 @@ from alice_survey.core.manifest import read_manifest
 from reconstruct.pictures.files import decode, exif_focal_px, inspect
 from reconstruct.pictures.importing import import_images
 from reconstruct.pictures.undistorted import read_colour
-from tests.reconstruct.pictures.dated import counts, reasons
+from tests.reconstruct.pictures.dated import counts, reasons, rows_of, save
 
 DISPLAYED: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     1: lambda a: a, 2: np.fliplr, 3: lambda a: np.rot90(a, 2), 4: np.flipud,
@@ -33,29 +31,13 @@ def smooth(seed: int, size: tuple[int, int] = (64, 48)) -> np.ndarray:
     return np.clip(large, 0, 255).astype(np.uint8)
 
 
-def save(path: Path, pixels: np.ndarray, **tags: Any) -> Path:
-    """Write a picture with `orientation`, `make`, `model`, `serial` in EXIF."""
-    exif = Image.Exif()
-    numbers = {"orientation": 0x112, "make": 0x10F, "model": 0x110}
-    for name, number in numbers.items():
-        if name in tags:
-            exif[number] = tags[name]
-    if "serial" in tags:
-        exif.get_ifd(0x8769)[0xA431] = tags["serial"]
-    exif.get_ifd(0x8769)[0xA405] = 28
-    path.parent.mkdir(parents=True, exist_ok=True)
-    more = {"quality": 98, "subsampling": 0} if path.suffix == ".jpg" else {}
-    Image.fromarray(pixels).save(path, exif=exif, **more)  # type: ignore[arg-type]
-    return path
-
-
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_pixels_are_used_as_stored(tmp_path: Path, suffix: str, orientation: int) -> None:
     """The same in features, calibration and mosaic, and in every viewer of the copies."""
     stored = [smooth(seed) for seed in range(2)]
     for number, pixels in enumerate(stored):
-        save(tmp_path / "in" / f"{number}{suffix}", pixels, orientation=orientation)
+        save(tmp_path / "in" / f"{number}{suffix}", pixels, orientation=orientation, focal=28)
     first = tmp_path / "in" / f"0{suffix}"
     seen = cv2.imread(str(first), cv2.IMREAD_COLOR)
     if suffix != ".tif":  # of which OpenCV cannot read all
@@ -79,16 +61,16 @@ def test_pixels_are_used_as_stored(tmp_path: Path, suffix: str, orientation: int
 
 
 def test_cameras_of_a_mixed_folder_are_told_apart_by_exif_and_size(tmp_path: Path) -> None:
+    hero = {"make": "GoPro", "model": "GoPro HERO9"}
     phone = {"make": "Apple", "model": "iPhone 15"}
-    for number in range(6):
-        save(tmp_path / "in" / f"a{number}.jpg", smooth(number), make="GoPro", model="GoPro HERO9",
-             serial="C3", orientation=(1, 3)[number % 2])  # fmt: skip
-    for number in range(3):
-        save(tmp_path / "in" / f"b{number}.jpg", smooth(10 + number), make="GoPro",
-             model="GoPro HERO9", serial="C4")  # fmt: skip
-    for number in range(2):
-        save(tmp_path / "in" / f"c{number}.jpg", smooth(20 + number, (80, 60)), **phone)
-    save(tmp_path / "in" / "d.jpg", smooth(30))
+    for name, count, size, tags in (
+        ("a", 6, (64, 48), hero | {"serial": "C3"}), ("b", 3, (64, 48), hero | {"serial": "C4"}),
+        ("c", 2, (80, 60), phone), ("d", 1, (64, 48), {}),
+    ):  # fmt: skip
+        for number in range(count):
+            turned = {"orientation": (1, 3)[number % 2]} if name == "a" else {}
+            pixels = smooth(10 * ord(name) + number, size)
+            save(tmp_path / "in" / f"{name}{number}.jpg", pixels, **tags, **turned)
     found = import_images(tmp_path / "w", [tmp_path / "in"])
     assert counts(found) == {"camera": 6, "camera-2": 3, "camera-3": 2, "camera-4": 1}
     assert found.lines == [
@@ -138,12 +120,12 @@ def test_folders_inside_are_taken_on_request(tmp_path: Path) -> None:
     work = source / "work"
     for _ in range(2):  # what it wrote itself is not taken
         found = import_images(work, [source], recursive=True, masks=source / "masks")
-        records = read_manifest(work / "images" / "manifest.csv")
+        records = rows_of(work)
         assert [r.image for r in records] == [
             "camera/G2.jpg", "camera/G10.jpg", "camera/G2_2.jpg", "camera/a.jpg",
         ]  # fmt: skip
         assert reasons(found) == {"other files": 1}
     assert [bool(r.mask) for r in records] == [False, True, False, False]
     import_images(tmp_path / "v", [source], recursive=True)
-    records = read_manifest(tmp_path / "v" / "images" / "manifest.csv")
+    records = rows_of(tmp_path / "v")
     assert [r.image for r in records if r.mask] == ["camera/G2.jpg"]

@@ -4,14 +4,12 @@ from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
 
 from alice_survey.core.errors import keep_warnings
-from alice_survey.core.manifest import read_manifest
 from reconstruct.pictures.importing import import_images
 from reconstruct.pictures.incoming import pair_by_time
+from tests.reconstruct.pictures.dated import date, noise, rows_of, save, table
 
 START = datetime(2024, 7, 1, 12, 0, 0, 250_000, tzinfo=UTC)
 COUNT = 12
@@ -39,13 +37,8 @@ def write(
         for own, k in enumerate(kept):
             time = moment(k) + timedelta(seconds=(late_s or {}).get(side, 0.0))
             path = folder / side / f"{name(k, own, time)}.jpg"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            tags = Image.Exif()
-            if exif:
-                tags.get_ifd(0x8769)[0x9003] = time.strftime("%Y:%m:%d %H:%M:%S")
-                tags.get_ifd(0x8769)[0x9291] = f"{time.microsecond:06d}"
-            pixels = np.random.default_rng(seed + k).integers(0, 256, (24, 32), dtype=np.uint8)
-            Image.fromarray(pixels).save(path, exif=tags)
+            stated = {"taken": date(0, time), "fraction": f"{time.microsecond:06d}"}
+            save(path, noise(seed + k, size=(32, 24)), **(stated if exif else {}))
             found.setdefault(side, []).append(path)
     return found
 
@@ -82,19 +75,17 @@ def test_dropped_frames_shift_nothing(tmp_path: Path, how: str) -> None:
 
 def test_a_trigger_log_pairs_and_times(tmp_path: Path) -> None:
     sides = write(tmp_path, lambda k, own, time: f"shot{own:03d}")
-    rows = ["camera,image,time_utc"]
-    for side, paths in sides.items():
-        kept = [k for k in range(COUNT) if k not in DROPPED[side]]
-        rows += [
-            f"{side},{p.name},{moment(k).isoformat()}" for k, p in zip(kept, paths, strict=True)
-        ]
-    log = tmp_path / "triggers.csv"
-    log.write_text("\n".join(rows[:-1]))  # and none of the last picture
+    expected = true_moments(sides)
+    rows = [
+        (side, one[side].name, moment(k).isoformat())
+        for side in sides for k, one in enumerate(expected) if side in one
+    ]  # fmt: skip
+    # and none of the last picture
+    log = table(tmp_path / "triggers.csv", "camera,image,time_utc", rows[:-1])
     with keep_warnings() as said:
         import_images(tmp_path / "w", [], cameras={s: tmp_path / s for s in sides}, triggers=log)
     assert any("are not in" in text and sides["right"][-1].name in text for text in said)
-    records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
-    expected = true_moments(sides)
+    records = rows_of(tmp_path / "w")
     del expected[-1]["right"]
     assert {(r.image, r.station) for r in records} == {
         (f"{side}/{path.name}", k) for k, one in enumerate(expected) for side, path in one.items()
@@ -103,8 +94,8 @@ def test_a_trigger_log_pairs_and_times(tmp_path: Path) -> None:
 
 def test_a_trigger_log_by_number_times_one_camera(tmp_path: Path) -> None:
     sides = write(tmp_path, lambda k, own, time: f"DSC_{k:05d}")
-    log = tmp_path / "triggers.csv"
-    log.write_text("number,time_s\n" + "\n".join(f"{k},{10 + 0.5 * k}" for k in range(COUNT)))
+    rows = [(k, 10 + 0.5 * k) for k in range(COUNT)]
+    log = table(tmp_path / "triggers.csv", "number,time_s", rows)
     found = pair_by_time({"left": sides["left"]}, log, UTC)
     expected = [10 + 0.5 * k for k in range(COUNT) if k not in DROPPED["left"]]
     assert [found.time_s[one["left"]] for one in found.stations] == expected

@@ -24,9 +24,8 @@ def test_it_finds_what_the_import_finds(tmp_path: Path) -> None:
     found = preview_import([folder], navigation=log)
     made = import_images(tmp_path / "w", [folder], navigation=log)
     assert counts(found) == counts(made) == {"camera": 7, "camera-2": 3}
-    assert [(c.device, c.width_px, c.height_px) for c in found.cameras.values()] == [
-        ("GoPro", 64, 48), ("Sony", 96, 48),
-    ]  # fmt: skip
+    shown = [(c.device, c.width_px, c.height_px) for c in found.cameras.values()]
+    assert shown == [("GoPro", 64, 48), ("Sony", 96, 48)]
     assert found.kinds == made.kinds and found.pictures == 10
     assert found.positions == 7
     assert found.first_utc == "2024-07-01T12:00:00+00:00"
@@ -71,9 +70,7 @@ def test_folders_of_a_rig_are_recognised(tmp_path: Path) -> None:
     (tmp_path / ".cache").mkdir()
     rig = cameras_in(tmp_path)
     assert rig == {"left": tmp_path / "left", "right": tmp_path / "right"}
-    assert counts(preview_import(cameras=rig)) == {
-        "left": 5, "right": 5,
-    }  # fmt: skip
+    assert counts(preview_import(cameras=rig)) == {"left": 5, "right": 5}
     (tmp_path / "right" / "4.jpg").unlink()
     assert cameras_in(tmp_path) == {}
     take(tmp_path / "right" / "4.jpg", 9)

@@ -10,16 +10,14 @@ import pytest
 
 from alice_survey.core.artefacts import read_json
 from alice_survey.core.errors import ImageError, keep_warnings
-from alice_survey.core.manifest import read_manifest
 from reconstruct.pictures.importing import import_images
 from reconstruct.pictures.telemetry import read_fixes
 from reconstruct.pictures.videos import find_videos, read_recordings, video_start
 from tests.reconstruct.pictures import gopro
-from tests.reconstruct.pictures.dated import counts
+from tests.reconstruct.pictures.dated import counts, rows_of, table
 
 NOON = datetime(2024, 7, 1, 12, tzinfo=UTC)
 OSLO = ZoneInfo("Europe/Oslo")
-RATE_HZ = 10.0
 
 
 def levels(first: int, count: int, size: tuple[int, int] = (64, 48)) -> list[np.ndarray]:
@@ -28,21 +26,18 @@ def levels(first: int, count: int, size: tuple[int, int] = (64, 48)) -> list[np.
 
 
 @pytest.mark.parametrize(
-    "names",
-    [
-        ("GX010042.MP4", "GX020042.MP4", "GX030042.MP4"),
-        ("GOPR0042.MP4", "GP010042.MP4", "gp020042.mp4"),
-    ],
-)  # fmt: skip
-def test_chapters_of_a_recording_run_on(tmp_path: Path, names: tuple[str, ...]) -> None:
+    "chapters", ["GX010042.MP4 GX020042.MP4 GX030042.MP4", "GOPR0042.MP4 GP010042.MP4 gp020042.mp4"]
+)
+def test_chapters_of_a_recording_run_on(tmp_path: Path, chapters: str) -> None:
+    names = chapters.split()
     paths = [
-        gopro.film(tmp_path / name, levels(20 * i, 20), RATE_HZ, created=NOON)
+        gopro.film(tmp_path / name, levels(20 * i, 20), created=NOON)
         for i, name in enumerate(names)
     ]
     with keep_warnings() as warnings:
         found = import_images(tmp_path / "w", [], videos=paths[::-1], every_s=0.5)
     assert warnings == []
-    records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
+    records = rows_of(tmp_path / "w")
     assert [r.time_s for r in records] == pytest.approx(np.arange(12) * 0.5)
     assert [r.image for r in records][:2] == [
         f"camera/{Path(names[0]).stem}_00000{i}.png" for i in range(2)
@@ -58,7 +53,7 @@ def test_chapters_of_a_recording_run_on(tmp_path: Path, names: tuple[str, ...]) 
 def test_a_missing_chapter_is_named_and_its_time_is_kept(tmp_path: Path) -> None:
     lengths = {1: 30, 3: 30, 4: 10}
     paths = [
-        gopro.film(tmp_path / f"GX0{chapter}0042.MP4", levels(0, count), RATE_HZ)
+        gopro.film(tmp_path / f"GX0{chapter}0042.MP4", levels(0, count))
         for chapter, count in lengths.items()
     ]
     with keep_warnings() as warnings:
@@ -73,43 +68,34 @@ def test_a_missing_chapter_is_named_and_its_time_is_kept(tmp_path: Path) -> None
 
 
 def test_recordings_are_ordered_by_their_dates(tmp_path: Path) -> None:
-    late = gopro.film(
-        tmp_path / "a.mp4", levels(0, 20), RATE_HZ, created=NOON + timedelta(seconds=100),
-        gopro=False,
-    )  # fmt: skip
-    early = gopro.film(tmp_path / "b.mp4", levels(0, 20), RATE_HZ, created=NOON, gopro=False)
+    then = NOON + timedelta(seconds=100)
+    late = gopro.film(tmp_path / "a.mp4", levels(0, 20), created=then, gopro=False)
+    early = gopro.film(tmp_path / "b.mp4", levels(0, 20), created=NOON, gopro=False)
     found = read_recordings([late, early], UTC)
-    assert [(r.name, r.start_s, r.start) for r in found] == [
-        ("b", 0.0, NOON), ("a", 100.0, NOON + timedelta(seconds=100)),
-    ]  # fmt: skip
-    undated = gopro.film(tmp_path / "c.mp4", levels(0, 20), RATE_HZ)
+    shown = [(r.name, r.start_s, r.start) for r in found]
+    assert shown == [("b", 0.0, NOON), ("a", 100.0, then)]
+    undated = gopro.film(tmp_path / "c.mp4", levels(0, 20))
     assert [np.isnan(r.start_s) for r in read_recordings([early, undated], UTC)] == [True, True]
-
-
-def write_log(path: Path, start: datetime, seconds: int) -> Path:
-    rows = [f"{(start + timedelta(seconds=s)).isoformat()},{5 + s}" for s in range(seconds)]
-    path.write_text("\n".join(["time_utc,depth_m", *rows]) + "\n")
-    return path
 
 
 def test_a_gopros_local_time_ties_it_to_navigation(tmp_path: Path) -> None:
     """It writes 12:00 in Oslo as 12:00 UTC; that is 10:00 UTC."""
-    video = gopro.film(tmp_path / "GX010001.MP4", levels(0, 40), RATE_HZ, created=NOON)
-    log = write_log(tmp_path / "log.csv", NOON - timedelta(hours=2, seconds=10), 60)
+    video = gopro.film(tmp_path / "GX010001.MP4", levels(0, 40), created=NOON)
+    start = NOON - timedelta(hours=2, seconds=10)
+    rows = [((start + timedelta(seconds=s)).isoformat(), 5 + s) for s in range(60)]
+    log = table(tmp_path / "log.csv", "time_utc,depth_m", rows)
     import_images(
         tmp_path / "w", [video], every_s=1.0, navigation=log, time_zone="Europe/Oslo",
         clock_offset_s=3.0,
     )  # fmt: skip
-    records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
+    records = rows_of(tmp_path / "w")
     assert [r.depth_m for r in records] == pytest.approx([18.0, 19.0, 20.0, 21.0])
-    other = gopro.film(
-        tmp_path / "phone.mp4", levels(0, 40), RATE_HZ, created=NOON - timedelta(hours=2),
-        gopro=False,
-    )  # fmt: skip
+    began = NOON - timedelta(hours=2)
+    other = gopro.film(tmp_path / "phone.mp4", levels(0, 40), created=began, gopro=False)
     import_images(
         tmp_path / "v", [], videos=[other], every_s=1.0, navigation=log, time_zone="Europe/Oslo"
     )
-    records = read_manifest(tmp_path / "v" / "images" / "manifest.csv")
+    records = rows_of(tmp_path / "v")
     assert [r.depth_m for r in records] == pytest.approx([15.0, 16.0, 17.0, 18.0])
 
 
@@ -131,20 +117,20 @@ def test_videos_of_a_folder_are_found_without_previews(tmp_path: Path) -> None:
 
 def test_recordings_of_two_sizes_are_of_two_cameras(tmp_path: Path) -> None:
     videos = [
-        gopro.film(tmp_path / f"{name}.mp4", levels(0, count, size), RATE_HZ, created=NOON)
+        gopro.film(tmp_path / f"{name}.mp4", levels(0, count, size), created=NOON)
         for name, count, size in (("a", 20, (64, 48)), ("b", 40, (80, 48)), ("c", 30, (64, 48)))
     ]
     found = import_images(tmp_path / "w", [], videos=videos, every_s=1.0)
     assert counts(found) == {"camera": 5, "camera-2": 4}
-    wrong = gopro.film(tmp_path / "GX010001.mp4", levels(0, 9), RATE_HZ)
-    second = gopro.film(tmp_path / "GX020001.mp4", levels(0, 9, (80, 48)), RATE_HZ)
+    wrong = gopro.film(tmp_path / "GX010001.mp4", levels(0, 9))
+    second = gopro.film(tmp_path / "GX020001.mp4", levels(0, 9, (80, 48)))
     with pytest.raises(ImageError, match=r"80 x 48 .* 64 x 48"):
         read_recordings([wrong, second], UTC)
 
 
 def test_frames_come_as_they_are_stored(tmp_path: Path) -> None:
     """A matrix in the track's header turns a video by 90 deg in players."""
-    path = gopro.film(tmp_path / "a.mp4", levels(0, 20), RATE_HZ)
+    path = gopro.film(tmp_path / "a.mp4", levels(0, 20))
     data = path.read_bytes()
     upright = struct.pack(">9i", 65536, 0, 0, 0, 65536, 0, 0, 0, 1 << 30)
     turned = struct.pack(">9i", 0, 65536, 0, -65536, 0, 0, 0, 0, 1 << 30)
@@ -158,7 +144,7 @@ def test_frames_come_as_they_are_stored(tmp_path: Path) -> None:
 
 def test_a_clock_that_was_never_set_states_no_time(tmp_path: Path) -> None:
     reset = datetime(2016, 1, 1, 0, 42, tzinfo=UTC)
-    path = gopro.film(tmp_path / "GX010001.MP4", levels(0, 20), RATE_HZ, created=reset)
+    path = gopro.film(tmp_path / "GX010001.MP4", levels(0, 20), created=reset)
     with keep_warnings() as warnings:
         (recording,) = read_recordings([path], UTC)
     assert recording.start is None and "never set" in warnings[0]
@@ -173,15 +159,13 @@ def test_gps_of_a_gopro_gives_time_and_place(tmp_path: Path, telemetry: object) 
         places = [(60.0 + (18 * second + i) * 5e-6, -5.25, 0.5) for i in range(18)]
         when = began + timedelta(seconds=second)
         data.append(telemetry(places, when, fix=3 if second < 2 else 0))  # type: ignore[operator]
-    path = gopro.film(
-        tmp_path / "GX010042.MP4", levels(0, 40), RATE_HZ, payloads=data,
-        created=NOON - timedelta(days=300),
-    )  # fmt: skip
+    made = NOON - timedelta(days=300)
+    path = gopro.film(tmp_path / "GX010042.MP4", levels(0, 40), payloads=data, created=made)
     found = import_images(tmp_path / "w", [], videos=[path], every_s=0.5)
     (recording,) = read_recordings([path], OSLO)
     assert recording.start is not None
     assert abs((recording.start - began).total_seconds()) < 2e-3
-    records = read_manifest(tmp_path / "w" / "images" / "manifest.csv")
+    records = rows_of(tmp_path / "w")
     known = [r for r in records if r.has_position]
     assert [r.time_s for r in known] == pytest.approx(np.arange(6) * 0.5)
     for r in known[:4]:
@@ -200,7 +184,7 @@ def test_telemetry_that_states_too_much_counts_as_none(tmp_path: Path) -> None:
         good.replace(b"GPS5l\x14\0\x03", b"GPS5l\x14\xff\xff"),
         good[:30],
     ):
-        path = gopro.film(tmp_path / "a.mp4", levels(0, 5), RATE_HZ, payloads=[broken])
+        path = gopro.film(tmp_path / "a.mp4", levels(0, 5), payloads=[broken])
         assert len(read_fixes(path, 1.0).time_s) == 0
-    path = gopro.film(tmp_path / "a.mp4", levels(0, 5), RATE_HZ, payloads=[good])
+    path = gopro.film(tmp_path / "a.mp4", levels(0, 5), payloads=[good])
     assert len(read_fixes(path, 1.0).time_s) == 3
