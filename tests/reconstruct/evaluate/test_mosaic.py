@@ -37,17 +37,14 @@ def write(
     folder.mkdir(parents=True, exist_ok=True)
     rows, columns = np.mgrid[:SIDE, :SIDE] + 0.5
     east, north = columns * PIXEL, 1.4 - rows * PIXEL
-    shown = np.column_stack(
-        [((north - off_m[1]) / scale).ravel(), ((east - off_m[0]) / scale).ravel()]
-    )
+    shown = np.stack([north - off_m[1], east - off_m[0]], axis=-1).reshape(-1, 2) / scale
     points, material = surface_material(terrain, shown)
     colour = texture.albedo(points, material, np.full(len(points), PIXEL, np.float32))
     picture = np.clip(255 * colour.T.reshape(3, SIDE, SIDE), 0, 255).astype(np.uint8)
-    profile = {
-        "driver": "GTiff", "width": SIDE, "height": SIDE,
-        "transform": from_origin(0, 1.4, PIXEL, PIXEL),
-    }  # fmt: skip
-    with rasterio.open(folder / "mosaic.tif", "w", count=4, dtype="uint8", **profile) as target:
+    with rasterio.open(
+        folder / "mosaic.tif", "w", driver="GTiff", width=SIDE, height=SIDE, count=4,
+        dtype="uint8", transform=from_origin(0, 1.4, PIXEL, PIXEL),
+    ) as target:  # fmt: skip
         target.write(np.concatenate([picture, np.full((1, SIDE, SIDE), 255, np.uint8)]))
     height = -scale * points[:, 2].reshape(SIDE, SIDE)
     surface = Elevation(height=height, sigma=0 * height, west=0.0, north=1.4, cell=PIXEL)
@@ -66,13 +63,8 @@ def test_a_shift_is_measured_in_length_and_pixels(
     assert figures["position_rms_px"] == pytest.approx(np.hypot(3, 2), rel=0.05)
     assert figures["position_rms_mm"] == pytest.approx(1e3 * np.hypot(0.006, 0.004), rel=0.05)
 
-
-def test_lengths_between_patches_give_the_scale(
-    floor: tuple[Terrain, Texture], tmp_path: Path
-) -> None:
-    grown = score_mosaic(
-        *write(tmp_path, floor, (0.0, 0.0), scale=1.004), AREA, *floor, STILL
-    )  # fmt: skip
+    # lengths between patches give the scale
+    grown = score_mosaic(*write(tmp_path / "c", floor, (0.0, 0.0), 1.004), AREA, *floor, STILL)
     found = compare_lengths(grown.points_world, grown.points_true, np.random.default_rng(2))
     assert found["scale_error_ppm"] == pytest.approx(4000, rel=0.05)
 

@@ -1,7 +1,9 @@
 """A survey is laid on a reference of any kind, and its distance from it is what was put in."""
 
 import struct
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import laspy
 import numpy as np
@@ -16,6 +18,7 @@ from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.frames import Datum
 from reconstruct.evaluate.reference import first_placement, read_reference
 from reconstruct.evaluate.registration import (
+    CloudFit,
     ReferenceSurface,
     covers,
     distances,
@@ -48,15 +51,20 @@ def undone(pose: Similarity, points: np.ndarray) -> np.ndarray:
     return pose.rotation.inv().apply(points - pose.translation) / pose.scale
 
 
+def fitted(
+    own: np.ndarray, reference: ReferenceSurface, rng: np.random.Generator, free_scale: bool
+) -> CloudFit:
+    start = first_placement(own, reference)
+    return register_cloud(own, reference, start, free_scale=free_scale, rng=rng)
+
+
 @pytest.mark.parametrize("scale", [1.0, 1.013])
 def test_a_known_motion_and_scale_are_found(scale: float) -> None:
     rng = np.random.default_rng(1)
     reference = ReferenceSurface.of(ground(rng, 40_000))
     true = moved(scale)
     own = undone(true, ground(rng, 30_000))
-    fit = register_cloud(
-        own, reference, first_placement(own, reference), free_scale=scale != 1.0, rng=rng
-    )
+    fit = fitted(own, reference, rng, scale != 1.0)
     left = np.linalg.norm(fit.reference_from_cloud.apply(own) - true.apply(own), axis=1)
     assert left.max() < 0.01
     assert fit.reference_from_cloud.scale == pytest.approx(scale, abs=4e-4)
@@ -68,7 +76,7 @@ def test_the_rigid_fit_is_that_of_open3d() -> None:
     points, own = ground(rng, 20_000), undone(moved(1.0), ground(rng, 8_000))
     points[:, 2] += 0.01 * rng.normal(size=len(points))
     reference = ReferenceSurface.of(points)
-    fit = register_cloud(own, reference, first_placement(own, reference), free_scale=False, rng=rng)
+    fit = fitted(own, reference, rng, False)
     target, source = (o3d.geometry.PointCloud(o3d.utility.Vector3dVector(p)) for p in (points, own))
     target.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(12))
     start = np.eye(4)
@@ -88,7 +96,7 @@ def test_what_differs_does_not_pull_the_fit() -> None:
     own = ground(rng, 30_000)
     changed = (own[:, 0] > 4) & (own[:, 1] > 4)  # 9 %
     own[changed, 2] += 0.7
-    fit = register_cloud(own, reference, first_placement(own, reference), free_scale=True, rng=rng)
+    fit = fitted(own, reference, rng, True)
     still = own[~changed]
     assert np.abs(fit.reference_from_cloud.apply(still) - still).max() < 0.02
 
@@ -126,31 +134,43 @@ def utm(points: np.ndarray) -> np.ndarray:
     return np.column_stack([east, north, -lat_lon[:, 2]])
 
 
+def write_cloud(path: Path, points: np.ndarray) -> Path:
+    """A LAS or LAZ file in UTM."""
+    header = laspy.LasHeader(point_format=3, version="1.4")
+    header.offsets, header.scales = np.floor(points.min(axis=0)), [1e-4] * 3
+    header.add_crs(CRS.from_epsg(UTM))
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = points.T
+    cloud.write(str(path))
+    return path
+
+
 @pytest.mark.parametrize("kind", ["laz", "las"])
 def test_a_cloud_in_utm_comes_back_to_local_metres(tmp_path: Path, kind: str) -> None:
     points = ground(np.random.default_rng(7), 3_000)
-    there = utm(points)
-    header = laspy.LasHeader(point_format=3, version="1.4")
-    header.offsets, header.scales = np.floor(there.min(axis=0)), [1e-4] * 3
-    header.add_crs(CRS.from_epsg(UTM))
-    cloud = laspy.LasData(header)
-    cloud.x, cloud.y, cloud.z = there.T
-    cloud.write(str(tmp_path / f"c.{kind}"))
-    found, placed = read_reference(tmp_path / f"c.{kind}", DATUM)
+    found, placed = read_reference(write_cloud(tmp_path / f"c.{kind}", utm(points)), DATUM)
     assert placed
     np.testing.assert_allclose(found, points, atol=3e-4)
+
+
+def write_dem(
+    path: Path, height: np.ndarray, crs: Any, corner: Sequence[float], cell: float
+) -> Path:
+    with rasterio.open(
+        path, "w", driver="GTiff", width=20, height=20, count=1, dtype="float32", crs=crs,
+        transform=from_origin(*corner, cell, cell), nodata=-9999,
+    ) as target:  # fmt: skip
+        target.write(height, 1)
+    return path
 
 
 def test_cells_of_an_elevation_model_are_points_at_their_middles(tmp_path: Path) -> None:
     corner = utm(np.array([[-5.0, 5.0, 0.0]]))[0]
     height = np.arange(400, dtype=np.float32).reshape(20, 20) / 100
     height[3, 4] = -9999
-    with rasterio.open(
-        tmp_path / "dem.tif", "w", driver="GTiff", width=20, height=20, count=1, dtype="float32",
-        crs=UTM, transform=from_origin(corner[0], corner[1], 0.5, 0.5), nodata=-9999,
-    ) as target:  # fmt: skip
-        target.write(height, 1)
-    found, placed = read_reference(tmp_path / "dem.tif", DATUM)
+    found, placed = read_reference(
+        write_dem(tmp_path / "dem.tif", height, UTM, corner[:2], 0.5), DATUM
+    )
     assert placed
     assert len(found) == 399
     # The first cell's middle lies a quarter of a metre in; UTM is turned and stretched a little.
@@ -169,12 +189,7 @@ def test_a_real_cloud_is_read_in_local_metres(shared_data: Path) -> None:
 
 def test_packed_points_that_are_damaged_are_refused(tmp_path: Path) -> None:
     """Unpacking them here would end the program."""
-    header = laspy.LasHeader(point_format=3, version="1.4")
-    header.offsets, header.scales = [0.0, 0.0, 0.0], [1e-3] * 3
-    cloud = laspy.LasData(header)
-    cloud.x, cloud.y, cloud.z = ground(np.random.default_rng(7), 3_000).T
-    path = tmp_path / "c.laz"
-    cloud.write(str(path))
+    path = write_cloud(tmp_path / "c.laz", utm(ground(np.random.default_rng(7), 3_000)))
     whole = path.read_bytes()
     at = struct.unpack_from("<I", whole, 96)[0] + 8
     spoilt = [
@@ -203,10 +218,6 @@ def test_a_model_in_no_place_on_earth_is_refused(tmp_path: Path) -> None:
     height = np.arange(400, dtype=np.float32).reshape(20, 20)
     local = 'LOCAL_CS["mine",UNIT["metre",1],AXIS["x",EAST],AXIS["y",NORTH]]'
     for crs, corner in ((f"EPSG:{UTM}", (1e30, 1e30)), (local, (0.0, 0.0))):
-        with rasterio.open(
-            tmp_path / "m.tif", "w", driver="GTiff", width=20, height=20, count=1, dtype="float32",
-            crs=crs, transform=from_origin(*corner, 1.0, 1.0),
-        ) as file:  # fmt: skip
-            file.write(height, 1)
+        write_dem(tmp_path / "m.tif", height, crs, corner, 1.0)
         with pytest.raises(WorkspaceError):
             read_reference(tmp_path / "m.tif", DATUM)

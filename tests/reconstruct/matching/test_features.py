@@ -1,11 +1,7 @@
 import numpy as np
 import pytest
 
-from reconstruct.matching.features import (
-    detection_scales,
-    find_features,
-    spread,
-)
+from reconstruct.matching.features import detection_scales, find_features, spread
 
 
 def blobs(

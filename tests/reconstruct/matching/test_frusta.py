@@ -97,34 +97,21 @@ def test_pictures_of_a_wall_are_paired_with_all_around_and_no_others() -> None:
     assert not placed_pictures(records, rig, DATUM)
     assert placed_pictures(records, rig, DATUM, RANGE_M) == set(range(len(records)))
     sure, maybe = choose_pairs(records, rig, DATUM, (), RANGE_M)
-    places = np.array([[r.depth_m, r.longitude_deg] for r in records])
-    places[:, 1] = (
-        (places[:, 1] - DATUM.longitude_deg)
-        * np.deg2rad(1.0)
-        * 6.378e6
-        * np.cos(np.deg2rad(DATUM.latitude_deg))
+    places = DATUM.ned_from_geodetic(
+        np.array([[r.latitude_deg, r.longitude_deg, r.depth_m] for r in records])
     )
-    partners: dict[int, set[int]] = {i: set() for i in range(len(records))}
-    same_station = neighbours(records, 0)
-    for i, j in set(sure) - same_station:
-        assert records[i].camera == records[j].camera
-        across, down = abs(places[i] - places[j])[::-1]
-        overlap = (1 - across / wide) * (1 - down / high)
-        assert overlap > 0.1, (i, j)
-        partners[i].add(j)
-        partners[j].add(i)
-    for i, record in enumerate(records):
-        near = {
-            j for j, other in enumerate(records)
-            if other.camera == record.camera
-            and 0 < np.abs(places[i] - places[j]).max() < 1.05 * step
-            and np.abs(places[i] - places[j]).min() < 0.05 * step
-        }  # fmt: skip
-        joined = {j for j in near if tuple(sorted((i, j))) in set(sure) | set(maybe)}
-        assert joined == near, record.image
-    counts = [len(found) for found in partners.values()]
-    assert max(counts) <= 40
-    assert not {(0, len(records) - 1)} & (set(sure) | set(maybe))
+    apart = np.abs(places[:, None, 1:] - places[None, :, 1:])
+    overlap = (1 - apart[..., 0] / wide) * (1 - apart[..., 1] / high)
+    linked = np.array(sorted(set(sure) - neighbours(records, 0)))
+    assert all(records[i].camera == records[j].camera for i, j in linked.tolist())
+    assert overlap[tuple(linked.T)].min() > 0.1
+    cameras = np.array([r.camera for r in records])
+    next_to = (apart.max(axis=2) > 0.5 * step) & (apart.max(axis=2) < 1.05 * step)
+    next_to &= (apart.min(axis=2) < 0.05 * step) & (cameras[:, None] == cameras)
+    near = {(i, j) for i, j in np.argwhere(np.triu(next_to)).tolist()}
+    assert near <= set(sure) | set(maybe) and len(near) == 2 * (11 * 4 + 12 * 3)
+    assert np.bincount(linked.ravel()).max() <= 40
+    assert (0, len(records) - 1) not in set(sure) | set(maybe)
 
 
 def test_opposite_sides_of_a_pile_are_no_partners() -> None:

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,34 +41,32 @@ def test_matches_equal_those_of_the_slow_twin(
     np.testing.assert_array_equal(found, match_slowly(a, b, ratio))
 
 
+def plain_features(pixels: Array, descriptors: Array) -> Features:
+    sizes, rounded = np.ones(len(pixels), np.float32), np.clip(descriptors, 0, 255).astype(np.uint8)
+    return Features(pixels=pixels, scale_px=sizes, descriptors=rounded)
+
+
 def pair_task(
     folder: Path, camera: pycolmap.Camera, *sides: tuple[Array, NDArray[np.int64]]
 ) -> PairTask:
     """Two pictures of one camera with features (pixels and descriptors) saved in a folder."""
     paths = [folder / "a.npz", folder / "b.npz"]
     for path, (pixels, descriptors) in zip(paths, sides, strict=True):
-        features = Features(
-            pixels=pixels,
-            scale_px=np.ones(len(pixels), np.float32),
-            descriptors=np.clip(descriptors, 0, 255).astype(np.uint8),
-        )
-        save_features(path, features)
+        save_features(path, plain_features(pixels, descriptors))
     fields = camera.todict()
     return PairTask(first=paths[0], second=paths[1], ratio=0.8, cameras=(fields, fields), seed=3)
 
 
 def pinhole(width: int, height: int, focal_px: float) -> pycolmap.Camera:
     return pycolmap.Camera(
-        model="PINHOLE",
-        width=width,
-        height=height,
+        model="PINHOLE", width=width, height=height, has_prior_focal_length=True,
         params=[focal_px, focal_px, width / 2, height / 2],
-        has_prior_focal_length=True,
-    )
+    )  # fmt: skip
 
 
-def two_views(tmp_path: Path, outliers: int) -> tuple[PairTask, int]:
-    """Features of 120 points seen by two cameras, and wrong ones with equal descriptors."""
+def test_geometry_keeps_true_matches_and_drops_false_ones(tmp_path: Path) -> None:
+    """Features of 120 points seen by two cameras, and 60 wrong ones with equal descriptors."""
+    true, outliers = 120, 60
     rng = np.random.default_rng(2)
     camera = pinhole(800, 600, 900)
     points = np.column_stack([rng.uniform(-0.7, 0.7, (120, 2)), rng.uniform(2.2, 2.8, 120)])
@@ -75,11 +74,7 @@ def two_views(tmp_path: Path, outliers: int) -> tuple[PairTask, int]:
     wrong = rng.uniform(0, 600, (2, outliers, 2))
     descriptors = rng.integers(0, 90, (120 + outliers, 128))
     sides = [np.concatenate([p, w]) for p, w in zip((first, second), wrong, strict=True)]
-    return pair_task(tmp_path, camera, *((side, descriptors) for side in sides)), 120
-
-
-def test_geometry_keeps_true_matches_and_drops_false_ones(tmp_path: Path) -> None:
-    task, true = two_views(tmp_path, outliers=60)
+    task = pair_task(tmp_path, camera, *((side, descriptors) for side in sides))
     found = match_pair(task)
     assert found.geometry is not None
     right = int((found.matches[:, 0] < true).sum())
@@ -89,21 +84,16 @@ def test_geometry_keeps_true_matches_and_drops_false_ones(tmp_path: Path) -> Non
     np.testing.assert_array_equal(found.matches, again.matches)
 
 
-def random_features(rng: np.random.Generator, count: int, size: int = 8) -> Features:
-    return Features(
-        pixels=rng.uniform(0, 100, (count, 2)),
-        scale_px=np.ones(count, np.float32),
-        descriptors=rng.integers(0, 256, (count, size)).astype(np.uint8),
-    )
-
-
 @settings(deadline=None, max_examples=40)
 @given(n=st.integers(1, 25), m=st.integers(2, 25), radius=st.floats(5, 60), seed=st.integers(0, 99))
 def test_narrowed_matches_equal_those_of_the_slow_twin(
     n: int, m: int, radius: float, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    a, b = random_features(rng, n), random_features(rng, m)
+    a, b = (
+        plain_features(rng.uniform(0, 100, (count, 2)), rng.integers(0, 256, (count, 8)))
+        for count in (n, m)
+    )
     b.descriptors[: min(n, m) // 2] = a.descriptors[: min(n, m) // 2]
     predicted = a.pixels + np.array([3.0, -2.0])
     cell = 30.0
@@ -131,7 +121,7 @@ def test_homographies_come_back_from_exact_matches() -> None:
     np.testing.assert_array_equal(np.isnan(moved[:, 0]), [False, False, False, True])
 
 
-def repeated_texture(tmp_path: Path, alike: int) -> tuple[PairTask, int]:
+def repeated_texture(tmp_path: Path, alike: int) -> PairTask:
     """3000 true points, of which `alike` have a double elsewhere that looks the same to a few."""
     rng = np.random.default_rng(11)
     camera = pinhole(3000, 2400, 3000)
@@ -142,13 +132,13 @@ def repeated_texture(tmp_path: Path, alike: int) -> tuple[PairTask, int]:
     descriptors[doubles[: alike // 2]] = descriptors[doubles[alike // 2 :]]
     noise = rng.integers(-4, 5, (2, *descriptors.shape))
     sides = [(p, descriptors + n) for p, n in zip((first, second), noise, strict=True)]
-    return pair_task(tmp_path, camera, *sides), 3000
+    return pair_task(tmp_path, camera, *sides)
 
 
 def test_prediction_finds_what_looks_alike_and_loses_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    task, _ = repeated_texture(tmp_path, alike=800)
+    task = repeated_texture(tmp_path, alike=800)
     guided = match_pair(task)
     monkeypatch.setattr(matching, "_WORTH_PROBING", np.inf)
     full = match_pair(task)
@@ -159,11 +149,11 @@ def test_prediction_finds_what_looks_alike_and_loses_nothing(
 
 def test_where_the_largest_features_agree_on_nothing_all_are_compared(tmp_path: Path) -> None:
     """Only the smaller half of the features is common to both pictures."""
-    task, _ = repeated_texture(tmp_path, alike=0)
+    task = repeated_texture(tmp_path, alike=0)
     b = load_features(task.second)
     strange = b.descriptors.copy()
     strange[:1500] = np.random.default_rng(12).integers(0, 90, (1500, 128))
-    save_features(task.second, Features(pixels=b.pixels, scale_px=b.scale_px, descriptors=strange))
+    save_features(task.second, replace(b, descriptors=strange))
     found = match_pair(task)
     assert len(found.matches) >= 1300
     assert found.matches.min() >= 1500

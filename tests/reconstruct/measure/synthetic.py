@@ -1,7 +1,7 @@
 """Surfaces of known shape as the rasters of a workspace, and draws of their errors."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -113,8 +113,3 @@ class Drawn:
 
 def without_errors(folder: Path, cells: DemGrid, truth: Heights) -> MeasuredSurface:
     return Drawn(folder, cells, truth, Sigmas()).true
-
-
-def scaled(surface: MeasuredSurface, sigma: float) -> MeasuredSurface:
-    """The same with a scale that is known apart."""
-    return replace(surface, errors=replace(surface.errors, scale_sigma=sigma))

@@ -1,5 +1,6 @@
 """Figures of surfaces of known shape: closed forms, sigmas against draws of noise."""
 
+import math
 import tracemalloc
 from collections import defaultdict
 from collections.abc import Sequence
@@ -8,23 +9,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from rasterio.windows import Window
 from scipy.special import ellipe
 
 from alice_survey.core.frames import Array
+from reconstruct.measure.areas import covered_shares, figures_of_all, surface_within
 from reconstruct.measure.errors import own_correlation
 from reconstruct.measure.figures import Measured
 from reconstruct.measure.shapes import measure_line, measure_polygon, profile
 from reconstruct.measure.surface import MeasuredSurface
 from reconstruct.raster import DemGrid, tiled_raster
-from tests.reconstruct.measure.synthetic import (
-    FRAME,
-    Drawn,
-    Sigmas,
-    grid,
-    scaled,
-    without_errors,
-)
+from tests.reconstruct.measure.synthetic import FRAME, Drawn, Sigmas, grid, without_errors
 
 SQUARE = [(-0.4, -0.4), (0.4, -0.4), (0.4, 0.4), (-0.4, 0.4)]
 SLANTED = [(-0.41, -0.32), (0.33, -0.4), (0.4, 0.21), (0.02, 0.43), (-0.35, 0.3)]
@@ -125,40 +123,31 @@ def test_noise_makes_no_floor_rougher(tmp_path: Path) -> None:
         assert abs(np.mean(line)) < 0.25 * noise, (sigma, np.mean(line) / noise)
 
 
-ALL = Sigmas(own=0.0012, shift=0.004, tilt=0.002, scale=0.002, bend=0.004)
+SHARED = Sigmas(shift=0.004, tilt=0.002, scale=0.002, bend=0.004)
 
 
 @pytest.mark.parametrize(
-    "sigmas",
-    [
-        Sigmas(own=0.0012),
-        Sigmas(shift=0.004, tilt=0.002, scale=0.002, bend=0.004),
-        ALL,
-    ],
+    "sigmas", [Sigmas(own=0.0012), SHARED, replace(SHARED, own=0.0012)],
     ids=["own", "shared", "all"],
-)
+)  # fmt: skip
 def test_errors_are_as_large_as_their_sigmas(sigmas: Sigmas, tmp_path: Path) -> None:
     drawn, rng = Drawn(tmp_path, grid(1.0, 0.0125), hills, sigmas), np.random.default_rng(7)
     places = np.array([(-0.31, -0.22), (0.05, 0.13), (0.36, 0.17)])
     exact = without_errors(tmp_path, drawn.cells, hills)
-    line, region = measure_line(exact, places.tolist()), measure_polygon(exact, SLANTED, -10.05)[0]
-    over_rim = named(measure_polygon(exact, SLANTED, "rim")[0])
-    true = {f"line {one.name}": one.value for one in line} | {one.name: one.value for one in region}
-    true["rim"] = over_rim["volume"].value
-    misses = defaultdict(list)
-    stated = defaultdict(list)
+
+    def all_of(surface: MeasuredSurface, line: Array, corners: Array) -> dict[str, Measured]:
+        lengths = named(measure_line(surface, line.tolist()))
+        over_rim = named(measure_polygon(surface, corners.tolist(), "rim")[0])
+        areas = named(measure_polygon(surface, corners.tolist(), -10.05)[0])
+        by_line = {f"line {name}": one for name, one in lengths.items()}
+        return by_line | areas | {"rim": over_rim["volume"]}
+
+    true = all_of(exact, places, np.array(SLANTED))
+    misses, stated = defaultdict(list), defaultdict(list)
     for _ in range(40):
         surface, moved = drawn.draw(rng)
-        lengths = named(measure_line(surface, moved(places).tolist()))
-        corners = moved(np.array(SLANTED)).tolist()
-        areas = named(measure_polygon(surface, corners, -10.05)[0])
-        found = {
-            **{f"line {name}": one for name, one in lengths.items()},
-            **areas,
-            "rim": named(measure_polygon(surface, corners, "rim")[0])["volume"],
-        }
-        for name, one in found.items():
-            misses[name].append(one.value - true[name])
+        for name, one in all_of(surface, moved(places), moved(np.array(SLANTED))).items():
+            misses[name].append(one.value - true[name].value)
             stated[name].append(one.sigma)
     ratios = {
         name: float(np.sqrt(np.mean(np.square(errors))) / np.mean(stated[name]))
@@ -176,7 +165,8 @@ def test_errors_are_as_large_as_their_sigmas(sigmas: Sigmas, tmp_path: Path) -> 
 
 
 def test_a_scale_known_apart_counts_by_the_dimension(tmp_path: Path) -> None:
-    surface = scaled(without_errors(tmp_path, grid(1.0, 0.02), hills), 0.01)
+    surface = without_errors(tmp_path, grid(1.0, 0.02), hills)
+    surface = replace(surface, errors=replace(surface.errors, scale_sigma=0.01))
     found = named(measure_polygon(surface, SQUARE, -10.2)[0])
     line = named(measure_line(surface, [(-0.3, 0.0), (0.3, 0.2)]))
     powers = {"plan_area": 2, "surface_area": 2, "volume": 3, "rugosity": 0}
@@ -236,3 +226,54 @@ def test_memory_does_not_grow_with_the_raster(tmp_path: Path) -> None:
     assert found["volume"].value == pytest.approx(0.5 * 16.0, rel=1e-6)
     assert line["length"].value == pytest.approx(4.0 * np.sqrt(2), rel=1e-6)
     assert maximum < 400e6 < 4 * cells.rows * cells.columns / 10
+
+
+ROWS, COLUMNS = 12, 16
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), corners=st.integers(3, 40), whole=st.booleans())
+def test_squares_are_covered_as_shapely_cuts_them(seed: int, corners: int, whole: bool) -> None:
+    """Of polygons with holes that reach beyond the squares, some with corners on their sides."""
+    rng = np.random.default_rng(seed)
+    middle, reach = rng.uniform([0, 0], [COLUMNS, ROWS]), rng.uniform(0.1, 12.0)
+    turns = np.sort(rng.uniform(0, 2 * np.pi, corners))
+    out = reach * rng.uniform(0.5, 1.0, corners)
+    outer = middle + out[:, None] * np.column_stack([np.cos(turns), np.sin(turns)])
+    hole = middle + 0.3 * (outer - middle)
+    if whole:
+        outer = np.round(outer)
+    polygon = shapely.make_valid(shapely.Polygon(outer, [hole] if rng.random() < 0.5 else []))
+    parts = [p for p in shapely.get_parts(polygon) if p.geom_type == "Polygon"]
+    turned = [shapely.orient_polygons(part, exterior_cw=True) for part in parts]
+    rings = [shapely.get_coordinates(ring) for part in turned for ring in shapely.get_rings(part)]
+    if not rings:
+        return
+    y, x = np.mgrid[:ROWS, :COLUMNS]
+    cut = sum(shapely.area(shapely.intersection(shapely.box(x, y, x + 1, y + 1), p)) for p in parts)
+    np.testing.assert_allclose(covered_shares(rings, (ROWS, COLUMNS)), cut, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "sigmas", [Sigmas(own=0.0012), Sigmas(tilt=0.002, scale=0.002, bend=0.004)],
+    ids=["own", "shared"],
+)  # fmt: skip
+def test_the_sigma_of_a_sum_is_that_of_draws(sigmas: Sigmas, tmp_path: Path) -> None:
+    """What a scale does to one polygon it does to the other: sigmas add, and not their squares."""
+    drawn, rng = Drawn(tmp_path, grid(1.0, 0.0125), hills, sigmas), np.random.default_rng(3)
+    shapes = [shapely.box(-0.4, -0.35, -0.1, 0.3), shapely.box(0.1, -0.3, 0.4, 0.4)]
+    exact = without_errors(tmp_path, drawn.cells, hills)
+    true = sum(surface_within(exact, one).surface for one in shapes)
+    missed, stated, apart = [], [], []
+    for _ in range(40):
+        surface, moved = drawn.draw(rng)
+        there = [shapely.Polygon(moved(shapely.get_coordinates(one))) for one in shapes]
+        parts = [surface_within(surface, one) for one in there]
+        area = figures_of_all(surface, parts)[0]
+        missed.append(area.value - true)
+        stated.append(area.sigma)
+        apart.append(math.hypot(*(figures_of_all(surface, [one])[0].sigma for one in parts)))
+    ratio = float(np.sqrt(np.mean(np.square(missed))) / np.mean(stated))
+    assert 0.7 < ratio < 1.4  # 40 draws know a sigma to 11 %
+    together = np.mean(stated) / np.mean(apart)
+    assert together == pytest.approx(1.0 if sigmas.own else np.sqrt(2), abs=0.12)

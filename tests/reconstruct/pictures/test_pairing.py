@@ -4,11 +4,12 @@ from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from alice_survey.core.errors import keep_warnings
+from alice_survey.core.errors import ImageError, keep_warnings
 from reconstruct.pictures.importing import import_images
-from reconstruct.pictures.incoming import pair_by_time
+from reconstruct.pictures.incoming import moments_of, pair_by_time
 from tests.reconstruct.pictures.dated import date, noise, rows_of, save, table
 
 START = datetime(2024, 7, 1, 12, 0, 0, 250_000, tzinfo=UTC)
@@ -109,3 +110,32 @@ def test_cameras_whose_clocks_differ_are_paired_by_number_and_said(tmp_path: Pat
         found = pair_by_time(sides, None, UTC)
     assert list(found.stations) == true_moments(sides)
     assert any("not of one clock" in text and "--triggers" in text for text in said)
+
+
+RNG = np.random.default_rng(4)
+
+
+def test_a_dropped_picture_does_not_shift_the_others() -> None:
+    true = 100.0 + 0.1 * np.arange(50) + RNG.normal(0, 0.002, 50)
+    lost = {"left": [3, 20, 21], "right": [0, 20, 40]}
+    late = {"left": 0.0, "right": 0.004}
+    found = moments_of({side: np.delete(true + late[side], lost[side]) for side in lost})
+    left = {side: iter(range(47)) for side in lost}
+    moments = [{side: next(left[side]) for side in lost if k not in lost[side]} for k in range(50)]
+    assert found == [one for one in moments if one]
+
+
+def test_three_cameras_of_unlike_rates_meet_where_they_do() -> None:
+    fast, slow, odd = np.arange(0, 10, 0.1), np.arange(0, 10, 0.5), np.array([2.5, 4.03])
+    found = moments_of({"fast": fast, "slow": slow, "odd": odd})
+    assert len(found) == 101  # 4.03 is a moment of its own, 0.03 s from any other
+    together = [m for m in found if len(m) > 1]
+    assert len(together) == 20
+    assert [m for m in found if "odd" in m] == [{"fast": 25, "slow": 5, "odd": 0}, {"odd": 1}]
+
+
+def test_times_that_do_not_pair_are_refused() -> None:
+    left = np.arange(0, 5, 0.1)
+    for right, named in ((left + 0.05, "no pictures of left and right"), (left[::-1], "right")):
+        with pytest.raises(ImageError, match=named):
+            moments_of({"left": left, "right": right})

@@ -1,4 +1,4 @@
-"""Products in UTM, against Krueger's series and against each other."""
+"""Products in UTM against Krueger's series and each other; exported pictures against exact rays."""
 
 import csv
 import json
@@ -6,15 +6,22 @@ import math
 import shutil
 from pathlib import Path
 
+import cv2
 import laspy
 import numpy as np
+import pycolmap
 import pyproj
 import pytest
 import rasterio
+from scipy.ndimage import map_coordinates
 
+from alice_survey.core.executor import SERIAL
+from reconstruct import export
 from reconstruct.elevation import elevation_in
-from reconstruct.export import destination, export_projected
-from reconstruct.views.model import read_frame
+from reconstruct.evaluate.scores import read_mesh
+from reconstruct.export import bilinear, destination, export_projected, export_undistorted
+from reconstruct.pictures.undistorted import Pictures
+from reconstruct.views.model import View, read_frame, read_model, read_warps
 
 CRS = "EPSG:32636"
 CENTRAL_DEG, EAST_M, SCALE = 33.0, 500_000.0, 0.9996
@@ -39,11 +46,13 @@ def utm(latitude_deg: np.ndarray, longitude_deg: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def workspace(small_survey: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("utm") / "survey"
+    """A finished survey that is exported both ways."""
+    folder = tmp_path_factory.mktemp("export") / "survey"
     shutil.copytree(small_survey, folder)
     text, values = export_projected(folder, CRS)
     assert "UTM zone 36N" in text
     assert values["vertical_datum"] == read_frame(folder / "sparse" / "frame.json").vertical_datum
+    export_undistorted(folder, SERIAL)
     return folder
 
 
@@ -82,14 +91,9 @@ def test_heights_of_the_raster_are_those_of_the_old_one_at_the_same_places(works
         )
         east, north = back.transform(x, y)
     true = elevation_in(workspace / "dense")
-    column, row = (east - true.west) / cell - 0.5, (true.north - north) / cell - 0.5
-    r, c = np.floor(row).astype(int), np.floor(column).astype(int)
-    inside = (r >= 0) & (c >= 0) & (r < true.height.shape[0] - 1) & (c < true.height.shape[1] - 1)
-    r, c, p, q = r[inside], c[inside], (column % 1)[inside], (row % 1)[inside]
-    h = true.height
-    expected = (h[r, c] * (1 - p) + h[r, c + 1] * p) * (1 - q)
-    expected += (h[r + 1, c] * (1 - p) + h[r + 1, c + 1] * p) * q
-    error = heights[rows, columns][inside] - expected
+    at = (true.north - north) / cell - 0.5, (east - true.west) / cell - 0.5
+    expected = map_coordinates(true.height, at, order=1, cval=np.nan)
+    error = heights[rows, columns] - expected
     error = error[np.isfinite(error)]
     assert len(error) > 1000
     assert np.percentile(np.abs(error), 95) < 2e-4
@@ -120,3 +124,64 @@ def test_cloud_and_mesh_lie_on_the_raster(workspace: Path):
         assert np.nanmedian(np.abs(gap)) < 0.005
     length = np.sqrt(np.square([cloud[name] for name in ("nx", "ny", "nz")]).sum(axis=0))
     np.testing.assert_allclose(length, 1.0, atol=1e-4)
+
+
+def seen_points(view: View, workspace: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Points of the mesh that a view's pinhole sees first, world and camera, by a z-buffer."""
+    vertices, triangles = read_mesh(workspace / "mesh")
+    points = vertices[triangles].mean(axis=1)
+    local = view.world_from_cam.inv().apply(points)
+    pixels = view.pinhole.project(local)
+    inside = (local[:, 2] > 0) & (pixels > 12).all(axis=1)
+    inside &= (pixels < np.array(view.pinhole.size_px) - 12).all(axis=1)
+    points, local, pixels = points[inside], local[inside], pixels[inside]
+    block = (pixels // 12).astype(int)
+    key = block[:, 1] * 10_000 + block[:, 0]
+    nearest = np.full(key.max() + 1, np.inf)
+    np.minimum.at(nearest, key, local[:, 2])
+    first = local[:, 2] < nearest[key] + 0.01
+    return points[first], local[first]
+
+
+def test_the_colmap_model_projects_to_where_the_exact_rays_land(workspace: Path):
+    """The path of a pixel is found again by tracing positions through the exported resampling."""
+    model = read_model(workspace / "sparse")
+    warps = read_warps(workspace / "sparse" / "cameras.json")
+    exported = pycolmap.Reconstruction(workspace / "undistorted" / "sparse" / "0")
+    images = {image.name: image for image in exported.images.values()}
+    for view in (model.views[0], model.views[-1]):
+        points, local = seen_points(view, workspace)
+        at = np.array([images[view.image].project_point(p) for p in points])
+        warp = warps[view.camera]
+        exact = warp.camera.project(warp.pinhole_from_cam.inv().apply(local))
+        scene = export.scene_of(workspace / "mesh")
+        depth = export.surface_depth(view, *scene)
+        maps = export.taken_at(Pictures.open(workspace), view, depth)
+        found = 0.5 + np.stack(
+            [bilinear(one, at[:, 0] - 0.5, at[:, 1] - 0.5) for one in maps], axis=1
+        )
+        known = np.isfinite(found).all(axis=1) & np.isfinite(exact).all(axis=1)
+        assert known.sum() > 300
+        miss = np.linalg.norm(found - exact, axis=1)[known]
+        assert np.percentile(miss, 99) < 1e-3
+        one_distance = np.linalg.norm(warp.from_pinhole(at) - exact, axis=1)[known]
+        assert np.percentile(one_distance, 99) > 3 * np.percentile(miss, 99)
+
+
+def test_other_programs_read_what_was_written(workspace: Path):
+    folder = workspace / "undistorted"
+    text, binary = (pycolmap.Reconstruction(folder / name) for name in ("sparse", "sparse/0"))
+    assert (
+        text.num_reg_images()
+        == binary.num_reg_images()
+        == len(read_model(workspace / "sparse").views)
+    )
+    for image in text.images.values():
+        picture = cv2.imread(str(folder / "images" / image.name))
+        mask = cv2.imread(str(folder / "masks" / f"{image.name}.png"), cv2.IMREAD_GRAYSCALE)
+        assert picture.shape[:2] == mask.shape == (image.camera.height, image.camera.width)
+        assert (picture[mask == 0] == 0).all()
+        assert 0.5 < (mask == 255).mean() <= 1.0
+        assert picture[mask > 0].std() > 5
+    shown = json.loads((folder / "export.json").read_text())["on_surface"]
+    assert min(shown.values()) > 0.5
