@@ -28,6 +28,7 @@ from typing import Any, Generic, TypeVar
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.sparse.linalg import splu
 
@@ -443,17 +444,9 @@ def node_weights(places: NDArray[np.float32]) -> tuple[NDArray[np.int64], Array]
 
 def bending() -> Array:
     """Normal matrix (nodes, nodes) of the second differences over a picture."""
-    rows, columns = GRID
-    number = np.arange(rows * columns).reshape(rows, columns)
-    triples = np.concatenate(
-        [
-            np.stack([number[:, :-2], number[:, 1:-1], number[:, 2:]], axis=-1).reshape(-1, 3),
-            np.stack([number[:-2], number[1:-1], number[2:]], axis=-1).reshape(-1, 3),
-        ]
-    )
-    bend = np.zeros((len(triples), rows * columns))
-    np.put_along_axis(bend, triples, np.array([[1.0, -2.0, 1.0]]) / _BEND_SIGMA, axis=1)
-    found: Array = bend.T @ bend
+    along, across = (np.diff(np.eye(count), 2, axis=0) for count in GRID[::-1])
+    bend = np.vstack([np.kron(np.eye(GRID[0]), along), np.kron(across, np.eye(GRID[1]))])
+    found: Array = bend.T @ bend / _BEND_SIGMA**2
     return found
 
 
@@ -465,13 +458,8 @@ def around_zero() -> Array:
 
 def _prior(cameras: int, fall_off_sigma: float) -> Array:
     """Normal matrix of smooth patterns around 0, and of a fall-off, last."""
-    one = around_zero()
-    matrix = np.zeros((cameras * len(one) + 1,) * 2)
-    for camera in range(cameras):
-        at = slice(camera * len(one), (camera + 1) * len(one))
-        matrix[at, at] = one
-    matrix[-1, -1] = fall_off_sigma**-2
-    return matrix
+    found: Array = block_diag(*[around_zero()] * cameras, np.array([[fall_off_sigma**-2]]))
+    return found
 
 
 def _typical(nodes: Array, camera_of: NDArray[np.int64], cameras: int) -> tuple[Array, Array]:
@@ -484,15 +472,11 @@ def _typical(nodes: Array, camera_of: NDArray[np.int64], cameras: int) -> tuple[
         count = known.sum(axis=0)
         total = np.where(known, pictures, 0.0).sum(axis=1, keepdims=True)
         relative = pictures - total / np.maximum(known.sum(axis=1, keepdims=True), 1)
-        for node in range(size):
-            for channel in range(3):
-                if count[node, channel] < _MIN_PICTURES:
-                    continue
-                values = relative[known[:, node, channel], node, channel]
-                weight = count[node, channel] / _SCENE_SIGMA**2
-                at = camera * size + node
-                pull[at, channel] = weight
-                pulled[at, channel] = weight * np.median(values)
+        usual = count >= _MIN_PICTURES
+        middle = np.nanmedian(np.where(usual & ~known, np.nan, np.nan_to_num(relative)), axis=0)
+        at = slice(camera * size, (camera + 1) * size)
+        pull[at] = np.where(usual, count, 0.0) / _SCENE_SIGMA**2
+        pulled[at] = pull[at] * middle
     return pull, pulled
 
 

@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.sparse import block_array, csr_array, diags_array
 from scipy.sparse.linalg import splu
 
@@ -319,24 +320,13 @@ def _solve_normal(
 
 def _prior(cameras: int, middle: float, spread: tuple[float, float]) -> tuple[Array, Array]:
     """Normal matrix and right side of (m, u, b, log B, s) of a channel."""
-    nodes = cameras * _NODES
-    matrix, right = np.zeros((2 * nodes + 3,) * 2), np.zeros(2 * nodes + 3)
-    pattern = around_zero()
     # u of a whole picture counts once
     share = bending() + np.eye(_NODES) / (_SHARE_SIGMA**2 * _NODES)
-    for camera in range(cameras):
-        m = slice(camera * _NODES, (camera + 1) * _NODES)
-        matrix[m, m] = pattern
-        u = slice(nodes + camera * _NODES, nodes + (camera + 1) * _NODES)
-        matrix[u, u], right[u] = share, share.sum(axis=1) * _SHARE
-    ends = (
-        (_B, 0.0, FALL_OFF_SIGMA / middle),
-        (_LOG_GROWTH, np.log(_SATURATION / middle), _SATURATION_SIGMA),
-        (_SPREAD, spread[0], np.sqrt(3.0) * spread[1]),
-    )
-    for at, mean, sigma in ends:
-        matrix[at, at], right[at] = sigma**-2, mean * sigma**-2
-    return matrix, right
+    sigmas = np.array([FALL_OFF_SIGMA / middle, _SATURATION_SIGMA, np.sqrt(3.0) * spread[1]])
+    ends = np.array([0.0, np.log(_SATURATION / middle), spread[0]])
+    matrix = block_diag(*[around_zero()] * cameras, *[share] * cameras, np.diag(sigmas**-2))
+    expected = np.concatenate([np.zeros(cameras * _NODES), np.full(cameras * _NODES, _SHARE), ends])
+    return matrix, matrix @ expected
 
 
 def _place_matrix(

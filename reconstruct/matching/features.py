@@ -70,13 +70,7 @@ def find_features(
     pixels = (pixels + 0.5) * steps
     sizes = np.array([k.size for k in keypoints], dtype=np.float64)
     response = np.array([k.response for k in keypoints], dtype=np.float64)
-    if mask is not None:
-        free_px = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 3)
-        columns = np.clip(pixels[:, 0].astype(int), 0, width - 1)
-        rows = np.clip(pixels[:, 1].astype(int), 0, height - 1)
-        usable = np.flatnonzero(free_px[rows, columns] > _SUPPORT * steps.mean() * sizes)
-    else:
-        usable = np.arange(len(pixels))
+    usable = clear_of_mask(pixels, mask, _SUPPORT * steps.mean() * sizes)
     chosen = usable[
         spread(pixels[usable], sizes[usable], response[usable], (width, height), maximum)
     ]
@@ -87,6 +81,17 @@ def find_features(
         scale_px=np.array([k.size for k in picked], dtype=np.float32) * np.float32(steps.mean()),
         descriptors=root_sift(found),
     )
+
+
+def clear_of_mask(
+    pixels: Array, mask: NDArray[np.bool_] | None, apart_px: Array | float
+) -> NDArray[np.intp]:
+    """Which of (N, 2) pixels are so far inside of where a mask (H, W) lets features be."""
+    if mask is None:
+        return np.arange(len(pixels))
+    free_px = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 3)
+    columns, rows = np.clip(pixels.astype(int), 0, np.array(mask.shape[::-1]) - 1).T
+    return np.flatnonzero(free_px[rows, columns] > apart_px)
 
 
 def detection_scales(size: tuple[int, int], maximum: int) -> tuple[float, ...]:

@@ -27,7 +27,13 @@ from alice_survey.core.executor import Executor
 from alice_survey.core.frames import BODY_FROM_NADIR_CAM, Array
 from alice_survey.core.manifest import ImageRecord
 from camera_calib.rig import Rig
-from reconstruct.matching.features import Features, load_features, save_features, spread
+from reconstruct.matching.features import (
+    Features,
+    clear_of_mask,
+    load_features,
+    save_features,
+    spread,
+)
 from reconstruct.matching.matches import (
     PairMatches,
     PairTask,
@@ -106,12 +112,7 @@ def find_learned(
     steps = np.array([width / size[0], height / size[1]])
     pixels = (np.column_stack([columns, rows]) + 0.5) * steps
     strength = score[rows, columns].astype(np.float64)
-    if mask is not None:
-        free_px = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 3)
-        at = np.minimum(pixels.astype(int), [width - 1, height - 1])
-        usable = np.flatnonzero(free_px[at[:, 1], at[:, 0]] > _SUPPORT_PX * steps.mean())
-    else:
-        usable = np.arange(len(pixels))
+    usable = clear_of_mask(pixels, mask, _SUPPORT_PX * steps.mean())
     sizes = np.full(len(usable), _CELL * steps.mean())
     chosen = usable[spread(pixels[usable], sizes, strength[usable], (width, height), maximum)]
     there = (np.column_stack([columns, rows])[chosen] + 0.5) / _CELL - 0.5

@@ -123,47 +123,37 @@ def surface_area(height: Array, own: Array, weight: Array, cell: float) -> Surfa
         weight: (rows - 1, columns - 1) of the squares.
         cell: side of a square.
     """
-    nw, ne, sw, se = corners_of(height)
     own = np.nan_to_num(own)
-    variances = corners_of(own**2)
-    right = {1: (ne - nw) / cell, -1: (se - sw) / cell}
-    up = {-1: (nw - sw) / cell, 1: (ne - se) / cell}
-    sigma = {(-1, 1): 0, (1, 1): 1, (-1, -1): 2, (1, -1): 3}
-    roots = corners_of(own)
-    area, added, share_of_noise = np.zeros_like(nw), np.zeros_like(nw), np.ones_like(nw)
-    slopes = np.zeros((*height.shape, 3))
-    known = np.isfinite(nw + ne + sw + se)
-    weight = np.where(known, weight, 0.0)
-    for corner, to_right, to_up in _CORNERS:
-        p, q = right[to_up], up[to_right]
-        root = np.sqrt(1.0 + p**2 + q**2)
-        # this corner, and the ends of the square's sides that meet in it
-        here = sigma[to_right, to_up]
-        aside, below = sigma[-to_right, to_up], sigma[to_right, -to_up]
-        var_p = variances[here] + variances[aside] - 2 * _NEXT * roots[here] * roots[aside]
-        var_q = variances[here] + variances[below] - 2 * _NEXT * roots[here] * roots[below]
-        cov = (
-            variances[here]
-            - _NEXT * roots[here] * (roots[aside] + roots[below])
-            + _ACROSS * roots[aside] * roots[below]
+    area, added, slopes = (
+        np.zeros(weight.shape),
+        np.zeros(weight.shape),
+        np.zeros((*height.shape, 3)),
+    )
+    weight = np.where(known_squares(height), weight, 0.0)
+    here, aside, below = np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1]
+    # the half of each square at one of its corners, from which sides go to the right and up
+    for right, up in ((-1, -1), (-1, 1), (1, 1), (1, -1)):
+        flip = np.s_[::-up, ::right]
+        h, s = height[flip], own[flip]
+        a, b = ((h[end] - h[here]) / cell for end in (aside, below))
+        root = np.sqrt(1.0 + a**2 + b**2)
+        var_a, var_b = (
+            s[here] ** 2 + s[end] ** 2 - 2 * _NEXT * s[here] * s[end] for end in (aside, below)
         )
-        # p and q have the sign of the corner that is to the right, or up
-        cov = cov * (to_right * to_up)
-        bend = ((1 + q**2) * var_p + (1 + p**2) * var_q - 2 * p * q * cov) / root**3
-        if (to_right, to_up) == (-1, 1):  # one corner of each square stands for all
-            share_of_noise = not_more((p, q), (var_p + var_q) / cell**2)
-        area += cell**2 * root / 4.0
-        added += bend / 8.0
-        # A triangle's area ½ |E₁ × E₂| moves with its sides E₁ = c (1, 0, p), E₂ = c (0, 1, q).
-        share = weight * cell / 4.0 / root
-        by_first = np.stack([share * (1 + q**2), share * -p * q, share * p], axis=-1)
-        by_second = np.stack([share * -p * q, share * (1 + p**2), share * q], axis=-1)
-        by_first, by_second = (np.nan_to_num(side) for side in (by_first, by_second))
-        others = {(x, y): place for place, x, y in _CORNERS}
-        slopes[corner] += to_right * by_first + to_up * by_second
-        slopes[others[-to_right, to_up]] -= to_right * by_first
-        slopes[others[to_right, -to_up]] -= to_up * by_second
-    added *= share_of_noise
+        cov = s[here] ** 2 - _NEXT * s[here] * (s[aside] + s[below])
+        cov += _ACROSS * s[aside] * s[below]
+        area[flip] += cell**2 * root / 4.0
+        added[flip] += ((1 + b**2) * var_a + (1 + a**2) * var_b - 2 * a * b * cov) / root**3 / 8.0
+        # A triangle's area ½ |A × B| moves with its sides A = c (right, 0, a), B = c (0, up, b).
+        share = weight[flip] * cell / 4.0 / root
+        by_a = np.stack([right * (1 + b**2), -up * a * b, a], axis=-1) * share[..., None]
+        by_b = np.stack([-right * a * b, up * (1 + a**2), b], axis=-1) * share[..., None]
+        by_a, by_b = np.nan_to_num(by_a), np.nan_to_num(by_b)
+        moved = slopes[flip]
+        moved[aside] += by_a
+        moved[below] += by_b
+        moved[here] -= by_a + by_b
+    added *= not_more((a, b), (var_a + var_b) / cell**2)  # one corner of each stands for all
     return SurfaceArea(area=area - added, added=added, slopes=slopes)
 
 

@@ -5,7 +5,6 @@ import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
-from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -252,8 +251,7 @@ def measure_polygon(
             "rugosity are of that part"
         )
     ring = _ring(surface, places)
-    rim = None if base is None else _VolumePlane.of(surface, region, base)
-    slope, aspect, mean, *volumes = _plane_figures(region, rim)
+    slope, aspect, mean, *volumes = _plane_figures(region, base)
     figures = [
         of_points(surface, ring, "plan_area", "Area in plan", plan_area, 2),
         *figures_of_all(surface, [areas]),
@@ -279,53 +277,43 @@ def _ring(surface: MeasuredSurface, places: Array) -> Samples:
     return replace(found, height=height, own=own)
 
 
-class _VolumePlane:
-    """The plane of a volume."""
+def _volume_plane(region: PolygonOnGrid, base: Base) -> tuple[Array, Samples | None, Array]:
+    """The plane of a volume: at a height, or fitted to the rim.
 
-    def __init__(self, plane: Array, samples: Samples | None, by_height: Array) -> None:
-        self.plane = plane
-        """(3,) height in the middle, and slopes."""
-        self._samples, self._by_height = samples, by_height
-
-    @classmethod
-    def of(cls, surface: MeasuredSurface, region: PolygonOnGrid, base: Base) -> "_VolumePlane":
-        """At a height, or fitted to the rim."""
-        if base != "rim":
-            return cls(np.array([float(base), 0.0, 0.0]), None, np.zeros((3, 0)))
-        ring = region.polygon.exterior
-        step = max(surface.grid.cell, ring.length / _MAX_RIM_SAMPLES)
-        count = max(3, math.ceil(ring.length / step))
-        places = shapely.get_coordinates(
-            shapely.line_interpolate_point(ring, np.arange(count) / count, normalized=True)
+    Returns:
+        (3,) its height in the middle, and slopes; the rim that it is fitted to; and (3, N) how
+        heights of that move it.
+    """
+    if base != "rim":
+        return np.array([float(base), 0.0, 0.0]), None, np.zeros((3, 0))
+    surface, ring = region.surface, region.polygon.exterior
+    step = max(surface.grid.cell, ring.length / _MAX_RIM_SAMPLES)
+    count = max(3, math.ceil(ring.length / step))
+    places = shapely.get_coordinates(
+        shapely.line_interpolate_point(ring, np.arange(count) / count, normalized=True)
+    )
+    known = np.isfinite(surface.at(places).height)
+    if known.mean() < _MIN_SHARE or known.sum() < 3:
+        raise ReconstructionError(
+            f"only {known.mean():.0%} of the polygon's rim has a height, too little to fit the "
+            "plane of the volume to it: give the plane's height, or draw the rim on the surface"
         )
-        known = np.isfinite(surface.at(places).height)
-        if known.mean() < _MIN_SHARE or known.sum() < 3:
-            raise ReconstructionError(
-                f"only {known.mean():.0%} of the polygon's rim has a height, too little to fit the "
-                "plane of the volume to it: give the plane's height, or draw the rim on the surface"
-            )
-        samples = surface.at(places[known])
-        x, y = (samples.places - region.middle).T
-        by_height = np.linalg.pinv(np.column_stack([np.ones(len(x)), x, y]))
-        return cls(by_height @ samples.height, samples, by_height)
-
-    def moves(self, slopes: FigureSlopes, by_plane: Array) -> None:
-        """Add to a figure what moves the plane, from derivatives (3,) by its parameters."""
-        if self._samples is None:
-            return
-        up = by_plane @ self._by_height
-        motion = np.column_stack([np.zeros((len(up), 2)), up])
-        slopes.add(self._samples.places, motion, self._samples.own_variance(motion))
+    samples = surface.at(places[known])
+    x, y = (samples.places - region.middle).T
+    by_height = np.linalg.pinv(np.column_stack([np.ones(len(x)), x, y]))
+    return by_height @ samples.height, samples, by_height
 
 
-def _plane_figures(region: PolygonOnGrid, rim: _VolumePlane | None) -> list[Measured]:
-    """Slope and aspect of the plane that fits, mean height, and volumes over the rim's plane."""
+def _plane_figures(region: PolygonOnGrid, base: Base | None) -> list[Measured]:
+    """Slope and aspect of the plane that fits, mean height, and volumes over a base."""
     surface, cell = region.surface, region.surface.grid.cell
     by_mean, *by_slopes = (FigureSlopes(surface.errors) for _ in range(3))
     titles = {"volume": "Volume above minus below the plane",
               "above": "Volume above the plane", "below": "Volume below the plane"}  # fmt: skip
     by_volume = {name: FigureSlopes(surface.errors) for name in titles}
     volume, by_plane, lift = dict.fromkeys(titles, 0.0), dict.fromkeys(titles, np.zeros(3)), 0.0
+    if base is not None:
+        plane, rim, by_rim = _volume_plane(region, base)
     second, heights = _fit_sums(region)
     inverse, (_, right, up) = np.linalg.inv(second), np.linalg.solve(second, heights)
     steep = float(np.hypot(right, up))
@@ -340,9 +328,9 @@ def _plane_figures(region: PolygonOnGrid, rim: _VolumePlane | None) -> list[Meas
         region.add(by_mean, block, _by_height(by_fit[..., 0]))
         for slopes, way in zip(by_slopes, turn, strict=True):
             region.add(slopes, block, _by_height(by_fit[..., 1:] @ way))
-        if rim is None:
+        if base is None:
             continue
-        over = np.nan_to_num(mean_of_corners(block.height - upright @ rim.plane))
+        over = np.nan_to_num(mean_of_corners(block.height - upright @ plane))
         noise = noise_lift(over, np.nan_to_num(sigma_of_means(block.own)))
         lift += cell**2 * float((block.weight * noise).sum())
         middles = np.stack([mean_of_corners(upright[..., k]) for k in range(3)], axis=-1)
@@ -360,10 +348,12 @@ def _plane_figures(region: PolygonOnGrid, rim: _VolumePlane | None) -> list[Meas
         ("aspect", "Aspect, the way down from north or up", down, by_slopes[1], 0),
         ("mean_height", "Mean height", float(heights[0] / second[0, 0]), by_mean, 1),
     ]
-    if rim is not None:
-        for name, title in titles.items():
-            rim.moves(by_volume[name], by_plane[name])
-            found.append((name, title, volume[name], by_volume[name], 3))
+    for name, title in titles.items() if base is not None else ():
+        if rim is not None:
+            up = by_plane[name] @ by_rim
+            motion = np.column_stack([np.zeros((len(up), 2)), up])
+            by_volume[name].add(rim.places, motion, rim.own_variance(motion))
+        found.append((name, title, volume[name], by_volume[name], 3))
     figures = [
         figure(surface, name, title, value, slopes.packed, power, None if power else "°")
         for name, title, value, slopes, power in found
@@ -393,13 +383,12 @@ class LabelledPolygon:
     geometry: Any
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _PolygonAreas:
-    polygon: LabelledPolygon
-    by_plan: PackedSlopes
-    """What moves its area in plan."""
-    surface: SurfaceAreas | None
-    """None where no surface is known in it."""
+_PolygonAreas = tuple[LabelledPolygon, PackedSlopes, SurfaceAreas | None]
+"""A polygon, what moves its area in plan, and None where no surface is known in it."""
+
+
+def _label(one: _PolygonAreas) -> str:
+    return one[0].label
 
 
 def measure_polygon_file(
@@ -448,20 +437,19 @@ def measure_polygon_file(
             except ReconstructionError as error:
                 faults.append(f"{polygon.name}: {error}")
             by_plan = plan_slopes_of(surface, polygon.geometry, sigma)
-            measured.append(_PolygonAreas(polygon=polygon, by_plan=by_plan, surface=areas))
+            measured.append((polygon, by_plan, areas))
             step.advance()
     notes = [*faults, *notes]
     lines, each, labels = [], [], []
     for one in measured:
         figures = _figures(surface, [one], sigma)
-        lines.append(_line(f"{one.polygon.name} ({one.polygon.label})", figures))
+        lines.append(_line(f"{one[0].name} ({one[0].label})", figures))
         each.append([figure.to_json() for figure in figures])
     known = _known_area(surface)
-    by_label = attrgetter("polygon.label")
-    for name, group in groupby(sorted(measured, key=by_label), by_label):
+    for name, group in groupby(sorted(measured, key=_label), _label):
         same = list(group)
         figures = _figures(surface, same, sigma)
-        covered = float(shapely.union_all([one.polygon.geometry for one in same]).area) / known
+        covered = float(shapely.union_all([one.geometry for one, _, _ in same]).area) / known
         figures += (
             Measured(
                 name="cover", title="Share of the known surface, in plan", value=covered,
@@ -596,14 +584,14 @@ def _figures(
 
     Where corners were drawn wrongly the surface gains as the plan does, times its mean rugosity.
     """
-    area = math.fsum(float(one.polygon.geometry.area) for one in parts)
-    by_plan = sum_slopes([(1.0, one.by_plan) for one in parts])
+    area = math.fsum(float(one.geometry.area) for one, _, _ in parts)
+    by_plan = sum_slopes([(1.0, slopes) for _, slopes, _ in parts])
     plan = figure(surface, "plan_area", "Area in plan", area, by_plan, 2)
-    known = [one.surface for one in parts if one.surface is not None]
+    known = [areas for _, _, areas in parts if areas is not None]
     if not known:
         return (plan,)
     slanted, rugosity = figures_of_all(surface, known)
-    drawn = sigma * math.sqrt(sum(_corner_gain(one.polygon.geometry) for one in parts))
+    drawn = sigma * math.sqrt(sum(_corner_gain(one.geometry) for one, _, _ in parts))
     own = math.hypot(slanted.own, rugosity.value * drawn)
     return plan, replace(slanted, own=own), rugosity
 

@@ -73,19 +73,6 @@ _MAX_OBSERVATIONS = 400_000
 """Observations that are adjusted; of more, evenly chosen points."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SpotErrors:
-    """How a spot errs."""
-
-    target: TriangulatedPoint
-    picks: Array
-    """(3, 3) covariance by its own picks."""
-    by_poses: Array
-    """(3, F, 6) how it moves with the stations of a block."""
-    by_rig: Array
-    """(3, G) how it moves with the rig, the stations held."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class PickedFigure:
     """A figure of picked points, in the unit of the model, and parts of its sigma."""
@@ -167,8 +154,13 @@ class StationBlock:
 
     def errors(
         self, target: TriangulatedPoint, picks: Sequence[Pick], pictures: RegisteredPictures
-    ) -> SpotErrors:
-        """How a spot errs that was found from picks in pictures of the block."""
+    ) -> tuple[Array, Array, Array]:
+        """How a spot errs that was found from picks in pictures of the block.
+
+        Returns:
+            (3, 3) covariance by its own picks; (3, F, 6) how it moves with the stations of the
+            block; and (3, G) with the rig, the stations held.
+        """
         kept = [p for p in picks if p.image in pictures and p.image not in target.left_out]
         rows = [pictures.row(p.image) for p in kept]
         station = np.searchsorted(self.numbers, pictures.station[rows])
@@ -189,12 +181,8 @@ class StationBlock:
         for n in range(len(kept)):
             by_pose(linear.by_point[n], linear.arm[n], slopes)
             by_poses[:, station[n]] -= gain[:, 2 * n : 2 * n + 2] @ slopes
-        return SpotErrors(
-            target=target,
-            picks=gain @ covariance_of_picks(kept, jacobian, max(1.0, chi)) @ gain.T,
-            by_poses=by_poses,
-            by_rig=-gain @ linear.rest[..., :-1].reshape(2 * len(kept), -1),
-        )
+        by_picks = gain @ covariance_of_picks(kept, jacobian, max(1.0, chi)) @ gain.T
+        return by_picks, by_poses, -gain @ linear.rest[..., :-1].reshape(2 * len(kept), -1)
 
     def variances(self, by_poses: Array, by_rig: Array) -> tuple[Array, Array]:
         """Covariances (K, K) of K figures by the poses and by the rig.
@@ -245,10 +233,7 @@ class Lengths:
             raise ReconstructionError("the two spots are one and the same")
         block = self._block([pick for some in picks for pick in some])
         errors = [block.errors(s, p, self._pictures) for s, p in zip(targets, picks, strict=True)]
-        by_picks, by_poses, by_rig = (
-            np.stack([getattr(one, name) for one in errors])
-            for name in ("picks", "by_poses", "by_rig")
-        )
+        by_picks, by_poses, by_rig = (np.stack(one) for one in zip(*errors, strict=True))
         centred = points - points.mean(axis=0)
         slopes = np.stack([slopes_of(value, centred) for value, _ in figures])
         own = np.einsum("kni,nij,knj->k", slopes, by_picks, slopes)

@@ -8,7 +8,7 @@ flat floor, and near enough elsewhere to say how much two frames share.
 import os
 import re
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
@@ -334,82 +334,76 @@ class _SharpFrame:
     """(3, 3) from its pixels to those of the frame now, in the small picture."""
 
 
-class OverlapChooser:
+def choose_frames(frames: Iterable[Frame], overlap: float, counts: FrameCounts) -> Iterator[Frame]:
     """Take frames so that neighbours overlap by about a share; holds three frames at most.
 
     The next frame is the sharpest of those that moved on from the last by 0.75 to 1.25 of the
     requested advance, `1 - overlap`. While nothing moves, none is taken. Where the picture changes
     at once, the choice begins again.
+
+    Args:
+        frames: in order.
+        overlap: of neighbours, between 0 and 1.
+        counts: to which what the choice meets with is added.
     """
-
-    def __init__(self, overlap: float, counts: FrameCounts) -> None:
-        """Choose for an overlap of neighbours, between 0 and 1; count what it meets with."""
-        self.counts = counts
-        self._advance = 1.0 - overlap
-        self._small: Grey | None = None
-        self._size = (0, 0)
-        self._moved = np.eye(3)
-        self._best: _SharpFrame | None = None
-        self._before: _SharpFrame | None = None
-        self._starting = True
-        self._followed = 0
-        self._start_s = self._last_s = 0.0
-
-    def take(self, frame: Frame) -> Iterator[Frame]:
-        """Frames that are certain to be taken once this one is known, in order."""
-        self.counts.seen += 1
+    shot: _Shot | None = None
+    for frame in frames:
+        counts.seen += 1
         small = small_grey(frame.pixels)
         if small.mean() < _DARK:
-            self.counts.dark += 1
-            return
-        if self._small is None:
-            self._begin(frame, small)
-            return
-        step = motion(self._small, small)
-        if step is None:
-            if frame.time_s - self._last_s < _PATIENCE_S:
-                self.counts.unfollowed += 1
-                return
-            yield from self.rest()
-            if self._followed > 1:
-                self.counts.breaks_s.append(frame.time_s)
-            self._begin(frame, small)
-            return
-        self._followed += 1
-        self._small, self._last_s = small, frame.time_s
+            counts.dark += 1
+            continue
+        step = None if shot is None else motion(shot.small, small)
+        if shot is not None and step is not None:
+            yield from shot.follow(frame, small, step)
+            continue
+        if shot is not None and frame.time_s - shot.last_s < _PATIENCE_S:
+            counts.unfollowed += 1
+            continue
+        if shot is not None:
+            yield from shot.rest(counts)
+            if shot.followed > 1:
+                counts.breaks_s.append(frame.time_s)
+        shot = _Shot(frame, small, 1.0 - overlap)
+    if shot is not None:
+        yield from shot.rest(counts)
+
+
+class _Shot:
+    """Frames that follow one another without a break."""
+
+    def __init__(self, frame: Frame, small: Grey, advance: float) -> None:
+        self.small, self.last_s, self.followed = small, frame.time_s, 1
+        self._start_s, self._advance = frame.time_s, advance
+        self._moved, self._starting = np.eye(3), True
+        self._best: _SharpFrame | None
+        self._best = _SharpFrame(frame=frame, sharpness=_sharpness(frame.pixels))
+        self._before: _SharpFrame | None = None
+
+    def follow(self, frame: Frame, small: Grey, step: Array) -> Iterator[Frame]:
+        """Frames that are certain to be taken once this one is known, in order."""
+        self.followed += 1
+        self.small, self.last_s = small, frame.time_s
         self._moved = step @ self._moved
         for one in (self._best, self._before):
             if one is not None:
                 one.moved = step @ one.moved
         yield from self._weigh(frame)
 
-    def rest(self) -> Iterator[Frame]:
+    def rest(self, counts: FrameCounts) -> Iterator[Frame]:
         """The frame that would come next, if there is one, when nothing follows."""
-        if self._followed < 2:  # alone: it shows what no other frame shows
-            self.counts.unfollowed += self._followed
+        if self.followed < 2:  # alone: it shows what no other frame shows
+            counts.unfollowed += self.followed
             return
-        last = self._best
-        if (
-            last is None
-            and self._before is not None
-            and self._motion_since() > _AT_START * self._advance
-        ):
-            last = self._before
-        self._best = self._before = None
+        gone = self._motion_since() > _AT_START * self._advance
+        last = self._best or (self._before if gone else None)
         if last is not None:
             yield last.frame
 
-    def _begin(self, frame: Frame, small: Grey) -> None:
-        self._small, self._moved = small, np.eye(3)
-        self._size = (small.shape[1], small.shape[0])
-        self._starting, self._followed = True, 1
-        self._start_s = self._last_s = frame.time_s
-        self._before = None
-        self._best = _SharpFrame(frame=frame, sharpness=_sharpness(frame.pixels))
-
     def _motion_since(self) -> float:
         """Share of the picture that the last taken frame does not show."""
-        return 1.0 - overlap_share(self._moved, self._size)
+        height, width = self.small.shape
+        return 1.0 - overlap_share(self._moved, (width, height))
 
     def _weigh(self, frame: Frame) -> Iterator[Frame]:
         gone = self._motion_since()
@@ -581,7 +575,8 @@ def take_frames(
             name = f"{name}_{number + 1}"
         counts = FrameCounts()
         if every_s is None:
-            frames = _by_overlap(recording, overlap, counts)
+            every = _frames(recording, (1.0 - 0.1) / _MAX_HZ, even=False)
+            frames = choose_frames(every, overlap, counts)
         else:
             frames = _frames(recording, every_s, even=True)
         for taken, frame in enumerate(frames):
@@ -634,13 +629,6 @@ def _frames(recording: Recording, step_s: float, *, even: bool) -> Iterator[Fram
                 yield Frame(time_s=time_s, pixels=pixels)
         finally:
             capture.release()
-
-
-def _by_overlap(recording: Recording, overlap: float, counts: FrameCounts) -> Iterator[Frame]:
-    chooser = OverlapChooser(overlap, counts)
-    for frame in _frames(recording, (1.0 - 0.1) / _MAX_HZ, even=False):
-        yield from chooser.take(frame)
-    yield from chooser.rest()
 
 
 def _report_counts(recording: Recording, counts: FrameCounts) -> None:

@@ -41,12 +41,8 @@ def survey(
     light *= np.exp(rng.normal(0, shade, (count, 2, 1)))
     light += veil(x, y) * growth_at(GROWTH, ranges, MIDDLE_M)
     light *= np.exp(rng.normal(0, 0.004, light.shape))
-    samples = LightSamples(
-        views=views,
-        places=places.astype(np.float32),
-        levels=np.log(light).astype(np.float32),
-        ranges=ranges.astype(np.float32),
-    )
+    known = {"places": places, "levels": np.log(light), "ranges": ranges}
+    samples = LightSamples(views=views, **{k: v.astype(np.float32) for k, v in known.items()})
     # the darkest spots send light of their own
     dark = veil(NODE_X, NODE_Y) + 0.05 * direct(NODE_X, NODE_Y)
     return samples, {"left": dark, "right": dark}
@@ -81,20 +77,16 @@ def test_growth_with_range_matters_where_ranges_differ_much() -> None:
     found = solve_water(samples, dark, CAMERAS)
     ranges = np.array([0.7, 3.5])
     true = growth_at(GROWTH, ranges, MIDDLE_M)
-    here = growth_at(found.growth, ranges, found.middle_range) / growth_at(
-        found.growth, np.array(MIDDLE_M), found.middle_range
+    here, middle = (
+        growth_at(found.growth, at, found.middle_range) for at in (ranges, np.array(MIDDLE_M))
     )
-    np.testing.assert_allclose(here, true, rtol=0.12)
+    np.testing.assert_allclose(here / middle, true, rtol=0.12)
     assert (np.abs(true - 1) > 0.14).all()
 
 
 def test_what_overlaps_do_not_say_is_not_taken_away() -> None:
     samples, dark = survey(1.5, 2.6)
-    few = LightSamples(
-        views=samples.views[:40], places=samples.places[:40], levels=samples.levels[:40],
-        ranges=None if samples.ranges is None else samples.ranges[:40],
-    )  # fmt: skip
-    found = solve_water(few, dark, CAMERAS)
+    found = solve_water(samples.part(slice(40)), dark, CAMERAS)
     assert not found.share.any()
     assert all(not level.any() for level in found.added.values())
     assert np.isinf(found.share_sigma).all()

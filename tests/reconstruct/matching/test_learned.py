@@ -164,27 +164,21 @@ def test_a_turned_picture_is_tied_once_it_is_turned_back(tmp_path: Path, turns: 
     clear = np.clip(110 + 30 * floor(1, 2.0), 0, 255).astype(np.uint8)[: SIZE[1], : SIZE[0]]
     turned = np.ascontiguousarray(np.rot90(clear, -turns))
     counts = []
-    for back in (turns, 0):
+    for back in (0, turns):
         for k, (picture, by) in enumerate(((clear, 0), (turned, back))):
             save_features(tmp_path / f"{k}.npz", find_learned(picture, None, maximum=800, turns=by))
         found = match_learned(task(tmp_path / "0.npz", tmp_path / "1.npz", RATIO)).matches
         counts.append(len(found))
-        if back == turns:
-            first, second = (
-                load_features(tmp_path / f"{k}.npz").pixels[found[:, k]] for k in range(2)
-            )
-            for turn in range(turns):  # a quarter turn clockwise: what was the row is counted back
-                height = SIZE[1] if turn % 2 == 0 else SIZE[0]
-                first = np.column_stack([height - first[:, 1], first[:, 0]])
-            assert np.median(np.linalg.norm(first - second, axis=1)) < 0.51
-    assert counts[0] >= 300
-    assert counts[1] < counts[0] / 4
+    assert counts[1] >= 300 and counts[0] < counts[1] / 4
+    first, second = (load_features(tmp_path / f"{k}.npz").pixels[found[:, k]] for k in range(2))
+    for turn in range(turns):  # a quarter turn clockwise: what was the row is counted back
+        first = np.column_stack([SIZE[1 - turn % 2] - first[:, 1], first[:, 0]])
+    assert np.median(np.linalg.norm(first - second, axis=1)) < 0.51
 
 
 @pytest.mark.parametrize(("heading", "turns"), [(2, 0), (93, 3), (181, 2), (-92, 1), (268, 1)])
 def test_turns_bring_north_up(heading: float, turns: int) -> None:
     record = ImageRecord(image="a.png", camera="left", station=0)
     known = replace(record, roll_deg=1.0, pitch_deg=-2.0, heading_deg=float(heading))
-    assert quarter_turns(known, None) == turns
-    assert quarter_turns(record, None) == 0
-    assert quarter_turns(replace(known, pitch_deg=80.0), None) == 0
+    found = [quarter_turns(one, None) for one in (known, record, replace(known, pitch_deg=80.0))]
+    assert found == [turns, 0, 0]

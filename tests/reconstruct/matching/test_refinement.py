@@ -1,3 +1,4 @@
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -47,11 +48,19 @@ def spots(count: int, seed: int = 2) -> np.ndarray:
     return np.random.default_rng(seed).uniform([30, 35], [115, 85], (count, 2))
 
 
+Views = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+def two_views(seed: int, count: int, gain: float, noise: float) -> Views:
+    """Two pictures of a texture, spots in the first, and where the second shows them."""
+    texture, reference = Texture(seed), spots(count)
+    first = texture.picture(np.eye(2), np.zeros(2), noise=noise)
+    second = texture.picture(AFFINE, SHIFT, gain=gain, noise=noise)
+    return first, second, reference, reference @ AFFINE.T + SHIFT
+
+
 def test_patches_are_aligned_to_hundredths_of_a_pixel() -> None:
-    texture, reference = Texture(0), spots(60)
-    first = texture.picture(np.eye(2), np.zeros(2), noise=2.0)
-    second = texture.picture(AFFINE, SHIFT, gain=0.7, noise=2.0)
-    truth = reference @ AFFINE.T + SHIFT
+    first, second, reference, truth = two_views(0, 60, 0.7, 2.0)
     guess = truth + np.random.default_rng(3).normal(0, 0.5, truth.shape)
     start = AFFINE @ [[1.04, -0.05], [0.04, 0.97]]
     found = align_patches(first, second, reference, guess, np.broadcast_to(start, (60, 2, 2)))
@@ -62,10 +71,8 @@ def test_patches_are_aligned_to_hundredths_of_a_pixel() -> None:
 
 
 def test_alignment_equals_a_general_solver() -> None:
-    texture, reference = Texture(4), spots(6)
-    first = texture.picture(np.eye(2), np.zeros(2), noise=1.0)
-    second = texture.picture(AFFINE, SHIFT, gain=0.8, noise=1.0)
-    guess = reference @ AFFINE.T + SHIFT + [0.4, -0.3]
+    first, second, reference, truth = two_views(4, 6, 0.8, 1.0)
+    guess = truth + np.array([0.4, -0.3])
     found = align_patches(first, second, reference, guess, np.broadcast_to(AFFINE, (6, 2, 2)))
     slow = [
         align_slowly(first, second, r, g, AFFINE, radius=7, sigma=5.0)
@@ -77,8 +84,7 @@ def test_alignment_equals_a_general_solver() -> None:
 
 def test_what_does_not_resemble_stays() -> None:
     reference = spots(20)
-    first = Texture(0).picture(np.eye(2), np.zeros(2))
-    other = Texture(9).picture(np.eye(2), np.zeros(2))
+    first, other = (Texture(seed).picture(np.eye(2), np.zeros(2)) for seed in (0, 9))
     blank = np.full_like(first, 90)
     same = np.broadcast_to(np.eye(2), (20, 2, 2))
     assert np.isnan(align_patches(first, other, reference, reference, same)).all(axis=1).sum() >= 19
@@ -100,11 +106,10 @@ def test_references_equal_those_of_the_slow_twin(seed: int, matches: int) -> Non
     sizes = rng.integers(0, 8, 4)
     starts = np.concatenate([[0], np.cumsum(sizes)])
     pairs = []
-    for i in range(4):
-        for j in range(i + 1, 4):
-            count = min(matches, sizes[i], sizes[j])
-            chosen = [rng.permutation(sizes[k])[:count] for k in (i, j)]
-            pairs.append((i, j, np.stack(chosen, axis=1).astype(np.uint32)))
+    for i, j in itertools.combinations(range(4), 2):
+        count = min(matches, sizes[i], sizes[j])
+        chosen = [rng.permutation(sizes[k])[:count] for k in (i, j)]
+        pairs.append((i, j, np.stack(chosen, axis=1).astype(np.uint32)))
     np.testing.assert_array_equal(
         track_references(pairs, starts), track_references_slowly(pairs, starts)
     )
@@ -142,11 +147,9 @@ def test_tracks_mean_one_spot_in_all_pictures(tmp_path: Path, threads: int) -> N
 
 
 def test_what_noise_hides_is_aligned_on_smaller_pictures() -> None:
-    texture, reference = Texture(0), spots(40)
-    first = texture.picture(np.eye(2), np.zeros(2), noise=30.0)
-    second = texture.picture(AFFINE, SHIFT)
-    second = np.random.default_rng(7).normal(second, 30.0).clip(0, 255).astype(np.uint8)
-    truth = reference @ AFFINE.T + SHIFT
+    first, second, reference, truth = two_views(0, 40, 1.0, 0.0)
+    rng = np.random.default_rng(7)
+    first, second = (rng.normal(p, 30.0).clip(0, 255).astype(np.uint8) for p in (first, second))
     guess = truth + np.random.default_rng(3).normal(0, 0.6, truth.shape)
     affine = np.broadcast_to(AFFINE, (40, 2, 2))
     whole = align_patches(first, second, reference, guess, affine)

@@ -71,11 +71,12 @@ def test_what_all_heights_share_is_no_cells_own(tmp_path: Path) -> None:
 
 
 def test_a_scale_of_navigation_is_counted(tmp_path: Path) -> None:
-    folder = tiny_workspace(tmp_path, sparse={"georeference": {
-        "rms_north_m": None, "rms_east_m": None, "rms_depth_m": None, "sigma_north_m": None,
-        "sigma_east_m": None, "sigma_depth_m": None, "sigma_heading_deg": None,
-        "sigma_tilt_deg": None, "sigma_scale": 0.02,
-    }})  # fmt: skip
+    names = (
+        "rms_north_m rms_east_m rms_depth_m sigma_north_m sigma_east_m sigma_depth_m "
+        "sigma_heading_deg sigma_tilt_deg"
+    )
+    place = dict.fromkeys(names.split()) | {"sigma_scale": 0.02}
+    folder = tiny_workspace(tmp_path, sparse={"georeference": place})
     surface = MeasuredSurface.of(folder)
     length = measure_line(surface, [(0.2, 0.6), (0.6, 1.0)])[0]
     assert length.shared == pytest.approx(0.02 * length.value, rel=0.01)

@@ -179,16 +179,15 @@ def test_parts_of_a_large_polygon_add_up(tmp_path: Path) -> None:
     """More blocks than one, against the same polygon cut in two."""
     drawn = Drawn(tmp_path, grid(12.0, 0.02), hills, Sigmas(own=0.001))
     surface: MeasuredSurface = drawn.draw(np.random.default_rng(1))[0]
-    left = [(-5.5, -3.0), (0.105, -3.0), (0.105, -1.0), (-5.5, -1.0)]
-    right = [(0.105, -3.0), (5.5, -3.0), (5.5, -1.0), (0.105, -1.0)]
-    whole = [left[0], right[1], right[2], left[3]]
-    parts = [named(measure_polygon(surface, part, -10.2)[0]) for part in (left, right, whole)]
+    left, right, whole = (
+        named(measure_polygon(surface, [(a, -3.0), (b, -3.0), (b, -1.0), (a, -1.0)], -10.2)[0])
+        for a, b in ((-5.5, 0.105), (0.105, 5.5), (-5.5, 5.5))
+    )
     for name in ("surface_area", "volume", "above", "below", "plan_area"):
-        assert parts[0][name].value + parts[1][name].value == pytest.approx(
-            parts[2][name].value, rel=1e-6
-        )
-    own = [part["volume"].own for part in parts]
-    assert np.hypot(own[0], own[1]) == pytest.approx(own[2], rel=0.01)
+        both = left[name].value + right[name].value
+        assert both == pytest.approx(whole[name].value, rel=1e-6)
+    own = np.hypot(left["volume"].own, right["volume"].own)
+    assert own == pytest.approx(whole["volume"].own, rel=0.01)
 
 
 def test_a_profile_passes_its_corners(tmp_path: Path) -> None:

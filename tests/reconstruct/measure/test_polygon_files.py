@@ -14,11 +14,7 @@ from pyproj import Transformer
 from alice_survey.core.errors import AliceError, ConfigError, WorkspaceError
 from alice_survey.core.frames import Datum
 from reconstruct.measure.figures import figure
-from reconstruct.measure.shapes import (
-    measure_polygon_file,
-    plan_slopes_of,
-    read_polygons,
-)
+from reconstruct.measure.shapes import measure_polygon_file, plan_slopes_of, read_polygons
 from reconstruct.measure.surface import MeasuredSurface
 from reconstruct.raster import local_crs
 from reconstruct.views.model import WorldFrame
@@ -81,13 +77,12 @@ def test_areas_cover_and_rugosity_are_those_of_a_slope(
         assert found["surface_area"]["value"] == pytest.approx(SLANT * plan, rel=1e-3)
         assert found["rugosity"]["value"] == pytest.approx(SLANT, rel=1e-4)
         assert found["plan_area"]["sigma"] > 0 and found["surface_area"]["sigma"] > 0
-    by_label = {one["label"]: one for one in data["labels"]}
-    assert {name: one["count"] for name, one in by_label.items()} == {"coral": 2, "sponge": 1}
-    covers = {
-        n: {f["name"]: f["value"] for f in o["figures"]}["cover"] for n, o in by_label.items()
-    }
-    assert covers["coral"] == pytest.approx(0.27, rel=1e-3)
-    assert covers["sponge"] == pytest.approx(0.02, rel=1e-3)
+    for one, label, count, cover in zip(
+        data["labels"], ("coral", "sponge"), (2, 1), (0.27, 0.02), strict=True
+    ):
+        found = {f["name"]: f["value"] for f in one["figures"]}
+        assert (one["label"], one["count"]) == (label, count)
+        assert found["cover"] == pytest.approx(cover, rel=1e-3)
     assert "all of 'coral', 2" in text
 
 

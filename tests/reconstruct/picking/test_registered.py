@@ -45,8 +45,7 @@ def test_pictures_of_a_place_are_those_whose_rays_say_so() -> None:
     for name, pixel in expected.items():
         np.testing.assert_allclose(seen[name].pixel, pixel, atol=1e-6)
         start, way = pictures.picture(name).ray(pixel)
-        off = np.linalg.norm(np.cross(place - start, way))
-        assert off < 1e-8
+        assert np.linalg.norm(np.cross(place - start, way)) < 1e-8
 
 
 def test_resolution_is_pixels_over_length_and_the_best_come_first() -> None:
@@ -68,9 +67,8 @@ def test_a_wall_is_seen_from_its_front_alone() -> None:
     north = pictures.seeing(place, np.array([1.0, 0.0, 0.0]))
     south = pictures.seeing(place, np.array([-1.0, 0.0, 0.0]))
     for seen, sign in ((north, 1.0), (south, -1.0)):
-        assert seen
-        for one in seen:
-            assert sign * pictures.centres[pictures.row(one.image), 0] > 0
+        rows = [pictures.row(one.image) for one in seen]
+        assert rows and (sign * pictures.centres[rows, 0] > 0).all()
     assert len(north) + len(south) == len(pictures.seeing(place, UP))
 
 

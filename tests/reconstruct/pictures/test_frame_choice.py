@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from reconstruct.pictures.videos import Frame, FrameCounts, OverlapChooser
+from reconstruct.pictures.videos import Frame, FrameCounts, choose_frames
 
 WIDTH, HEIGHT = 320, 240
 RATE_HZ = 20.0
@@ -41,10 +41,8 @@ def film(frames: Sequence[Picture]) -> list[Frame]:
 def chosen(frames: Sequence[Frame], overlap: float) -> tuple[list[int], FrameCounts]:
     """Numbers of the frames that are taken."""
     counts = FrameCounts()
-    chooser = OverlapChooser(overlap, counts)
-    taken = [one for frame in frames for one in chooser.take(frame)]
-    taken += chooser.rest()
-    return [round(one.time_s * RATE_HZ) for one in taken], counts
+    taken = [round(one.time_s * RATE_HZ) for one in choose_frames(frames, overlap, counts)]
+    return taken, counts
 
 
 def overlaps(x_px: NDArray[Any], taken: Sequence[int]) -> NDArray[Any]:

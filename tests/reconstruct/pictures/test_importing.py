@@ -50,9 +50,7 @@ def test_pictures_of_one_camera_keep_their_bytes_and_order(tmp_path: Path) -> No
     for record, name in zip(records, ["a.PNG", "b9.jpg", "b10.jpg"], strict=True):
         assert (images / record.image).read_bytes() == (source / name).read_bytes()
     survey = read_json(images / "survey.json")
-    assert survey["source"] == "imported"
-    assert survey["datum"] is None
-    assert survey["notes"]
+    assert (survey["source"], survey["datum"]) == ("imported", None) and survey["notes"]
     assert not import_images(tmp_path / "w", [source]).changed
     draw(source / "c.jpg", 9)
     assert import_images(tmp_path / "w", [source]).changed
@@ -109,12 +107,10 @@ def test_a_camera_that_missed_a_moment_is_paired_by_number(tmp_path: Path) -> No
         found = import_images(tmp_path / "w", [], cameras=cameras)
     assert str(found) == "14 pictures (14 PNG) of down, bow and port, 0 with a position"
     assert not warnings
-    records = rows_of(tmp_path / "w")
-    assert {(r.image, r.station) for r in records} == {
-        (f"{side}/{side}_{number}.png", number - 7)
-        for side in cameras
-        for number in range(7, 12)
-        if (side, number) != ("bow", 8)
+    assert {(r.image, r.station) for r in rows_of(tmp_path / "w")} == {
+        (f"{side}/{path.name}", int(path.stem.removeprefix(f"{side}_")) - 7)
+        for side, folder in cameras.items()
+        for path in folder.iterdir()
     }
 
 
@@ -165,8 +161,8 @@ def test_sixteen_bits_become_eight_by_one_gain_per_camera(tmp_path: Path) -> Non
     cv2.imwrite(str(tmp_path / "in" / "b.png"), bright)
     import_images(tmp_path / "w", [tmp_path / "in"])
     images = tmp_path / "w" / "images"
-    np.testing.assert_array_equal(cv2.imread(str(images / "camera" / "a.png")), dim >> 4)
-    np.testing.assert_array_equal(cv2.imread(str(images / "camera" / "b.png")), bright >> 4)
+    for name, taken in (("a", dim), ("b", bright)):
+        np.testing.assert_array_equal(cv2.imread(str(images / f"camera/{name}.png")), taken >> 4)
     assert any("12 bits" in note for note in read_json(images / "survey.json")["notes"])
 
 
@@ -176,12 +172,9 @@ def test_gps_of_exif_gives_positions_and_a_datum(tmp_path: Path) -> None:
         draw(tmp_path / "in" / f"{number}.jpg", number, taken=date(number), gps=place)
     import_images(tmp_path / "w", [tmp_path / "in"])
     images = tmp_path / "w" / "images"
-    for record, (latitude, longitude, altitude) in zip(
-        read_manifest(images / "manifest.csv"), places, strict=True
-    ):
-        assert record.latitude_deg == pytest.approx(latitude, abs=1e-6)
-        assert record.longitude_deg == pytest.approx(longitude, abs=1e-6)
-        assert record.depth_m == pytest.approx(-altitude)
+    for record, place in zip(rows_of(tmp_path / "w"), places, strict=True):
+        found = (record.latitude_deg, record.longitude_deg, -record.depth_m)
+        assert found == pytest.approx(place, abs=1e-6)
         assert record.time_s == pytest.approx(record.station)
     survey = read_json(images / "survey.json")
     assert survey["vertical_datum"] == "EXIF GPS altitude"

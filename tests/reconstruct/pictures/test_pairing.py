@@ -24,19 +24,14 @@ def moment(k: int) -> datetime:
 
 
 def write(
-    folder: Path,
-    name: Name,
-    *,
-    exif: bool = False,
-    late_s: Mapping[str, float] | None = None,
-    dropped: Mapping[str, Sequence[int]] = DROPPED,
+    folder: Path, name: Name, *, exif: bool = False, late_s: float = 0.0
 ) -> dict[str, list[Path]]:
     """Pictures by side; `name` takes the moment, the camera's own count and the time."""
     found: dict[str, list[Path]] = {}
     for side, seed in (("left", 0), ("right", 100)):
-        kept = [k for k in range(COUNT) if k not in dropped[side]]
+        kept = [k for k in range(COUNT) if k not in DROPPED[side]]
         for own, k in enumerate(kept):
-            time = moment(k) + timedelta(seconds=(late_s or {}).get(side, 0.0))
+            time = moment(k) + timedelta(seconds=late_s if side == "right" else 0.0)
             path = folder / side / f"{name(k, own, time)}.jpg"
             stated = {"taken": date(0, time), "fraction": f"{time.microsecond:06d}"}
             save(path, noise(seed + k, size=(32, 24)), **(stated if exif else {}))
@@ -103,9 +98,7 @@ def test_a_trigger_log_by_number_times_one_camera(tmp_path: Path) -> None:
 
 
 def test_cameras_whose_clocks_differ_are_paired_by_number_and_said(tmp_path: Path) -> None:
-    sides = write(
-        tmp_path, lambda k, own, time: f"IMG_{k:04d}", exif=True, late_s={"right": 3600.0}
-    )
+    sides = write(tmp_path, lambda k, own, time: f"IMG_{k:04d}", exif=True, late_s=3600.0)
     with keep_warnings() as said:
         found = pair_by_time(sides, None, UTC)
     assert list(found.stations) == true_moments(sides)

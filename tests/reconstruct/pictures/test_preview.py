@@ -2,6 +2,7 @@
 
 from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -40,13 +41,11 @@ def test_time_zone_and_offset_tie_a_log_as_the_import_does(tmp_path: Path) -> No
     for n in range(3):
         take(tmp_path / "dive" / f"{n}.jpg", n)
     log = navigation(tmp_path / "dive.csv", 61, BEGAN - timedelta(hours=2))
-    other = preview_import([tmp_path / "dive"], navigation=log)
-    assert "0 of 3 picture times" in other.navigation
-    zoned = preview_import([tmp_path / "dive"], navigation=log, time_zone="Europe/Oslo")
-    moved = preview_import([tmp_path / "dive"], navigation=log, clock_offset_s=-7200.0)
-    for found in (zoned, moved):
-        assert "3 of 3 picture times" in found.navigation
-    assert zoned.first_utc == "2024-07-01T10:00:00+00:00"
+    ties: list[dict[str, Any]] = [{}, {"clock_offset_s": -7200.0}, {"time_zone": "Europe/Oslo"}]
+    for tie, inside in zip(ties, (0, 3, 3), strict=True):
+        found = preview_import([tmp_path / "dive"], navigation=log, **tie)
+        assert f"{inside} of 3 picture times" in found.navigation
+    assert found.first_utc == "2024-07-01T10:00:00+00:00"
     with pytest.raises(NavigationError):
         preview_import([tmp_path / "dive"], time_zone="Nowhere")
 

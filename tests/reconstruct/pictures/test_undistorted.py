@@ -81,10 +81,8 @@ def test_pixels_beyond_the_fold_of_a_polynomial_are_not_valid() -> None:
     x, y = undistortion_maps(lens)
     seen = (x >= 0) & (x < WIDTH) & (y >= 0) & (y < HEIGHT)
     rows, columns = np.nonzero(seen)
-    radius = (
-        np.hypot(columns + 0.5 - lens.pinhole.cx_px, rows + 0.5 - lens.pinhole.cy_px)
-        / lens.pinhole.focal_px
-    )
+    x, y = columns + 0.5 - lens.pinhole.cx_px, rows + 0.5 - lens.pinhole.cy_px
+    radius = np.hypot(x, y) / lens.pinhole.focal_px
     # r (1 + k1 r^2 + k2 r^4) turns back where 1 + 3 k1 r^2 + 5 k2 r^4 = 0
     fold = np.sqrt(min(r.real for r in np.roots([5 * 0.02, 3 * -0.35, 1]) if r.real > 0))
     pixel = 1.0 / lens.pinhole.focal_px
@@ -97,13 +95,9 @@ def workspace_of(
     (tmp_path / "images" / "camera").mkdir(parents=True)
     (tmp_path / "sparse").mkdir()
     cv2.imwrite(str(tmp_path / "images" / "camera" / "a.png"), picture)
-    write_json(
-        tmp_path / "sparse" / "cameras.json",
-        {
-            "cameras": {"camera": lens.to_json()},
-            "images": {"camera/a.png": {"camera": "camera", "station": 0, "mask": mask}},
-        },
-    )
+    image = {"camera": "camera", "station": 0, "mask": mask}
+    known = {"cameras": {"camera": lens.to_json()}, "images": {"camera/a.png": image}}
+    write_json(tmp_path / "sparse" / "cameras.json", known)
     return Pictures.open(tmp_path)
 
 
@@ -115,6 +109,5 @@ def test_masks_follow_the_warp(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "images" / "m.png"), mask)
     valid = pictures.valid("camera/a.png")
     edge = lens.to_pinhole(np.array([[100.0, y] for y in (40.0, 120.0, 200.0)]))
-    for x, y in edge:
-        assert not valid[int(y), int(x) - 3]
-        assert valid[int(y), int(x) + 3]
+    x, y = edge.astype(int).T
+    assert not valid[y, x - 3].any() and valid[y, x + 3].all()
