@@ -292,18 +292,12 @@ class ReferenceSurface:
         Returns:
             Middles, (N, 3); unit normals, (N, 3); and distances, (N,), of the nearest point.
         """
-        middles, normals = np.empty_like(points), np.empty_like(points)
-        nearest = np.empty(len(points))
-        for start in range(0, len(points), 50_000):
-            part = slice(start, start + 50_000)
-            found, index = self.tree.query(points[part], k=_NEIGHBOURS)
-            around = self.points[index]
-            middles[part] = around.mean(axis=1)
-            offset = around - middles[part, None]
-            covariance = np.einsum("nki,nkj->nij", offset, offset)
-            normals[part] = np.linalg.eigh(covariance)[1][:, :, 0]
-            nearest[part] = np.asarray(found)[:, 0]
-        return middles, normals, nearest
+        found, index = self.tree.query(points, k=_NEIGHBOURS)
+        around = self.points[index]
+        middles = around.mean(axis=1)
+        offset = around - middles[:, None]
+        covariance = np.einsum("nki,nkj->nij", offset, offset)
+        return middles, np.linalg.eigh(covariance)[1][:, :, 0], np.asarray(found)[:, 0]
 
     def distance(self, points: Array) -> tuple[Array, Array]:
         """Signed distance of (N, 3) points from the local plane, and distance of the nearest point.

@@ -389,18 +389,16 @@ def _overlapping(
     sure: dict[Pair, float] = {}
     across: dict[Pair, float] = {}
     maybe: dict[Pair, float] = {}
-    tree = STRtree(wider)
-    for i, polygon in enumerate(wider):
-        for j in sorted(int(k) for k in tree.query(polygon) if k > i):
-            cameras = records[i].camera, records[j].camera
-            apart = group[cameras[0]] != group[cameras[1]]
-            if cameras[0] != cameras[1] and not apart:
-                continue
-            overlap = _overlap(polygons[i], polygons[j])
-            if overlap >= _SURE_OVERLAP:
-                (across if apart else sure)[i, j] = overlap
-            elif _overlap(polygon, wider[j]) >= _MIN_OVERLAP:
-                maybe[i, j] = overlap
+    for i, j in sorted(STRtree(wider).query(wider).T.tolist()):
+        cameras = records[i].camera, records[j].camera
+        apart = group[cameras[0]] != group[cameras[1]]
+        if j <= i or (cameras[0] != cameras[1] and not apart):
+            continue
+        overlap = _overlap(polygons[i], polygons[j])
+        if overlap >= _SURE_OVERLAP:
+            (across if apart else sure)[i, j] = overlap
+        elif _overlap(wider[i], wider[j]) >= _MIN_OVERLAP:
+            maybe[i, j] = overlap
     headings = np.array([r.heading_deg for r in records])
     away = {(i, j): float(np.linalg.norm(centres[i] - centres[j])) for i, j in (*across, *maybe)}
     chosen = well_conditioned(sure, centres, headings)

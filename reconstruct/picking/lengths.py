@@ -17,6 +17,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -598,16 +599,14 @@ def _describe(
             f"sigma_of_calibration_{unit}": figure.sigma_scale,
         }
 
-    count = len(words) - 1
-    segments = [
-        {"from": words[n], "to": words[n + 1], **entry(figures[n], "m")} for n in range(count)
-    ]
-    lines = [
-        f"{words[n]} to {words[n + 1]}: {_millimetres(figures[n])} "
-        f"({1e3 * figures[n].sigma_picks:.2f} of pixels, {1e3 * figures[n].sigma_poses:.2f} of "
-        f"poses, {1e3 * figures[n].sigma_scale:.2f} of calibration)"
-        for n in range(count)
-    ]
+    segments, lines = [], []
+    for (one, other), figure in zip(pairwise(words), figures, strict=False):
+        segments.append({"from": one, "to": other, **entry(figure, "m")})
+        lines.append(
+            f"{one} to {other}: {_millimetres(figure)} ({1e3 * figure.sigma_picks:.2f} of pixels, "
+            f"{1e3 * figure.sigma_poses:.2f} of poses, {1e3 * figure.sigma_scale:.2f} of "
+            "calibration)"
+        )
     data: dict[str, Any] = {
         "format": "alice-survey measure",
         "version": 2,
@@ -617,7 +616,7 @@ def _describe(
         ],
         "distances": segments,
     }
-    if count > 1:
+    if len(words) > 2:
         length, area = figures[-2:]
         data["length"], data["area"] = entry(length, "m"), entry(area, "m2")
         lines.append(f"length of the line: {_millimetres(length)}")

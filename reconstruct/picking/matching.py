@@ -93,8 +93,8 @@ class Matcher:
         self._own = _PicturePart.around(grey, pixel, HALF_PX + 1)
         self._shown = self._own.at(pixel + grid)[0]
 
-    def find(self, image: str, grey: Grey, picture: RegisteredPicture) -> Pick | NoMatch:
-        """Find the pick in another picture, with a sigma relative to the pick.
+    def find(self, image: str, grey: Grey, picture: RegisteredPicture) -> Pick | str:
+        """Find the pick in another picture, with a sigma relative to the pick; else say why not.
 
         Args:
             image: its name.
@@ -102,11 +102,11 @@ class Matcher:
             picture: its camera and pose.
         """
         if not np.isfinite(self._shown).all():
-            return NoMatch(image=image, why="the pick is too close to the edge of its picture")
+            return "the pick is too close to the edge of its picture"
         expected = picture.project(self._points)
         middle = picture.project(self._place.point)
         if not np.isfinite(expected).all():
-            return NoMatch(image=image, why="the picture does not see the spot")
+            return "the picture does not see the spot"
         raised = picture.project(self._place.point - [0.0, 0.0, self._place.sigma])
         spread = float(np.hypot(np.linalg.norm(raised - middle), _POSE_SIGMA_PX))
         reach = int(np.clip(np.ceil(_REACH_SIGMAS * spread), _MIN_REACH_PX, _MAX_REACH_PX))
@@ -114,23 +114,18 @@ class Matcher:
         part = _PicturePart.around(grey, middle, extent)
         shift, likeness, rival = self._search(part, expected, reach)
         if likeness < _MIN_CORRELATION:
-            return NoMatch(
-                image=image,
-                why=f"nothing there looks like the pick (correlation {max(likeness, 0.0):.2f}): "
-                "hidden, in other light, outside, or without texture",
+            return (
+                f"nothing there looks like the pick (correlation {max(likeness, 0.0):.2f}): "
+                "hidden, in other light, outside, or without texture"
             )
         if rival > _RIVAL * likeness:
-            return NoMatch(image=image, why="several places there look like the pick")
+            return "several places there look like the pick"
         fit = _fit(part, expected + shift, self._grid, self._shown, self._weight)
-        if fit is None:
-            return NoMatch(image=image, why="the match does not settle")
-        move, sigma, correlation = fit
-        if np.linalg.norm(move) > _MAX_DRIFT_PX or correlation < _MIN_CORRELATION:
-            return NoMatch(image=image, why="the match does not settle")
+        if fit is None or np.linalg.norm(fit[0]) > _MAX_DRIFT_PX or fit[2] < _MIN_CORRELATION:
+            return "the match does not settle"
+        move, sigma, _ = fit
         if sigma > _MAX_SIGMA_PX:
-            return NoMatch(
-                image=image, why=f"too little texture: it would be known to {sigma:.1f} px only"
-            )
+            return f"too little texture: it would be known to {sigma:.1f} px only"
         x, y = (middle + shift + move).tolist()
         return replace(
             self._pick, image=image, x_px=x, y_px=y, sigma_px=sigma, matched_to=self._pick.image
@@ -303,8 +298,8 @@ def refine(
         if image == pick.image:
             continue
         got = matcher.find(image, grey(image), picture(image))
-        if isinstance(got, NoMatch):
-            refused.append(got)
+        if isinstance(got, str):
+            refused.append(NoMatch(image=image, why=got))
         else:
             found[image] = got
     cameras = {image: picture(image) for image in (pick.image, *found)}

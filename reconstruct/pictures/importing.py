@@ -42,6 +42,7 @@ from camera_calib.rig import Rig, read_rig, write_rig
 from missions.logs.navigation_csv import NavigationLog, find_zone, read_navigation
 from missions.values.legs import Route
 from missions.values.plan_file import Plan, read_plan
+from reconstruct.pictures import incoming
 from reconstruct.pictures.files import (
     ADVICE,
     VIDEO,
@@ -52,25 +53,6 @@ from reconstruct.pictures.files import (
     look_into,
     read_header,
     to_utc,
-)
-from reconstruct.pictures.incoming import (
-    COPIES,
-    MIRRORED,
-    UNDECODABLE,
-    camera_names,
-    check_entries,
-    check_rig,
-    copy_all,
-    find_entries,
-    level_of_log,
-    mask_of,
-    pair_by_time,
-    place_records,
-    readings_of,
-    record_of,
-    take_bag,
-    unique_names,
-    with_time,
 )
 from reconstruct.pictures.videos import (
     DEFAULT_OVERLAP,
@@ -84,9 +66,9 @@ from reconstruct.stages import rig_file
 _NO_HEADER = "headers that cannot be read"
 _ADVICE = {
     _NO_HEADER: "copy them from the camera again",
-    UNDECODABLE: "copy them from the camera again",
-    MIRRORED: "save them as they are seen, without an EXIF orientation",
-    COPIES: "each file counts once",
+    incoming.UNDECODABLE: "copy them from the camera again",
+    incoming.MIRRORED: "save them as they are seen, without an EXIF orientation",
+    incoming.COPIES: "each file counts once",
     **ADVICE,
 }
 _NAMED = 3
@@ -343,7 +325,7 @@ def preview_import(
         chosen = np.unique(np.linspace(0, len(paths) - 1, min(len(paths), _MAX_HEADERS)).round())
         seen = [read_header(paths[int(i)]) for i in chosen]
         facts += seen
-        names = camera_names([one for one in seen if not one.fault], name)
+        names = incoming.camera_names([one for one in seen if not one.fault], name)
         names = names if scan.unnamed else names[:1]
         total = sum(count for _, _, count in names)
         for camera, (device, width, height), count in names:
@@ -352,7 +334,9 @@ def preview_import(
                 device=device,
             )  # fmt: skip
     if scan.rig is not None:
-        check_rig({name: (row.width_px, row.height_px) for name, row in rows.items()}, scan.rig)
+        incoming.check_rig(
+            {name: (row.width_px, row.height_px) for name, row in rows.items()}, scan.rig
+        )
     times = [to_utc(one.time_local, scan.zone) for one in facts if one.time_local is not None]
     began = [(to_utc(r.start, scan.zone), r.duration_s) for r in recordings if r.start is not None]
     spans = [*times, *(t for t, _ in began), *(t + timedelta(seconds=s) for t, s in began)]
@@ -494,7 +478,7 @@ def import_images(
         raise ImageError("--overlap and --every exclude each other: give one of them")
     if not np.isfinite(clock_offset_s):
         raise ImageError(f"--clock-offset {clock_offset_s} is not a number of seconds")
-    level_name = level_of_log(vertical_datum, navigation)
+    level_name = incoming.level_of_log(vertical_datum, navigation)
     more = [path for path in (bag, navigation, rig, masks, triggers) if path is not None]
     given = [*folders, *cameras.values(), *videos, *more]
     _check_paths(workspace, given)
@@ -534,34 +518,36 @@ def import_images(
             entries = take_frames(scan.recordings, names, partial, frame_overlap, every_s)
         else:
             if bag is None:
-                found = pair_by_time(scan.pictures, triggers, scan.zone)
+                stations, taken = incoming.pair_by_time(scan.pictures, triggers, scan.zone)
             else:
-                found = take_bag(bag, topics, scan.mono, partial / _SCRATCH, every_s)
-            entries, left_out = find_entries(found.stations, executor)
-            if found.time_s:
-                entries = [with_time(entry, found.time_s[entry.source]) for entry in entries]
+                stations, taken = incoming.take_bag(
+                    bag, topics, scan.mono, partial / _SCRATCH, every_s
+                )
+            entries, left_out = incoming.find_entries(stations, executor)
+            if taken:
+                entries = [incoming.with_time(entry, taken[entry.source]) for entry in entries]
             if scan.unnamed:
                 by_key = {
                     key: name
-                    for name, key, _ in camera_names([e.facts for e in entries], scan.mono)
+                    for name, key, _ in incoming.camera_names([e.facts for e in entries], scan.mono)
                 }
                 entries = [replace(entry, camera=by_key[entry.facts.key]) for entry in entries]
-        check_entries(entries, scan.rig)
-        entries = unique_names(entries)
-        entries = [replace(e, mask=mask_of(e, masks, bool(cameras))) for e in entries]
+        incoming.check_entries(entries, scan.rig)
+        entries = incoming.unique_names(entries)
+        entries = [replace(e, mask=incoming.mask_of(e, masks, bool(cameras))) for e in entries]
         if not scan.videos:
-            notes += copy_all(entries, partial, executor)
+            notes += incoming.copy_all(entries, partial, executor)
             shutil.rmtree(partial / _SCRATCH, ignore_errors=True)
-        records = [record_of(entry, partial) for entry in entries]
-        records, datum, level = place_records(
+        records = [incoming.record_of(entry, partial) for entry in entries]
+        records, datum, level = incoming.place_records(
             entries, records, scan.log, level_name, clock_offset_s, scan.zone, notes
         )
         write_manifest(
             partial / "manifest.csv", sorted(records, key=lambda r: (r.station, r.camera))
         )
         if scan.rig is not None:
-            taken = {entry.camera for entry in entries}
-            names = [name for name in scan.rig.cameras if name in taken]
+            present = {entry.camera for entry in entries}
+            names = [name for name in scan.rig.cameras if name in present]
             write_rig(partial / "rig.json", part_of_rig(scan.rig, names))
         counted = Counter(entry.camera for entry in entries)
         some = {entry.camera: entry.facts for entry in entries}
@@ -592,7 +578,7 @@ def import_images(
         update={
             "changed": changed,
             "positions": sum(one.has_position for one in records),
-            "readings": dict(readings_of(records)),
+            "readings": dict(incoming.readings_of(records)),
         }
     )
 

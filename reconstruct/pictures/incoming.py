@@ -10,7 +10,7 @@ import hashlib
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -116,14 +116,9 @@ _WHOLE_SECONDS_S = 4.0
 """Times in whole seconds tell pictures apart that are this far from each other."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class PairedPictures:
-    """Pictures by moment."""
-
-    stations: tuple[Mapping[str, Path], ...]
-    """Picture of each camera, by moment."""
-    time_s: Mapping[Path, float] = field(default_factory=dict)
-    """When pictures were taken by the trigger log or the bag, on its clock."""
+PairedPictures = tuple[Sequence[Mapping[str, Path]], Mapping[Path, float]]
+"""Picture of each camera, by moment; and when pictures were taken by the trigger log or the bag, on
+its clock."""
 
 
 def pair_by_time(
@@ -149,11 +144,10 @@ def pair_by_time(
         moments = moments_of(
             {side: np.array([logged[p] for p in paths]) for side, paths in known.items() if paths}
         )
-        found = [{side: known[side][i] for side, i in moment.items()} for moment in moments]
-        return PairedPictures(stations=tuple(found), time_s=logged)
+        return [{side: known[side][i] for side, i in moment.items()} for moment in moments], logged
     if len(sides) <= 1:
-        return PairedPictures(stations=tuple({s: p} for s, paths in sides.items() for p in paths))
-    return PairedPictures(stations=tuple(_pair_by_times(sides) or _pair_by_numbers(sides)))
+        return [{side: path} for side, paths in sides.items() for path in paths], {}
+    return _pair_by_times(sides) or _pair_by_numbers(sides), {}
 
 
 def _pair_by_times(sides: Mapping[str, Sequence[Path]]) -> list[dict[str, Path]] | None:
@@ -352,10 +346,8 @@ def take_bag(
     if not files:
         raise ImageError(f"{bag}: no picture could be taken")
     stations = [{c: files[key] for c, key in m.items() if key in files} for m in moments]
-    return PairedPictures(
-        stations=tuple(station for station in stations if station),
-        time_s={path: 1e-9 * time_ns for (_, time_ns), path in files.items()},
-    )
+    times_s = {path: 1e-9 * time_ns for (_, time_ns), path in files.items()}
+    return [station for station in stations if station], times_s
 
 
 def _cameras(

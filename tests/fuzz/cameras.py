@@ -27,9 +27,8 @@ from camera_calib.targets.target import parse_target, read_target, write_target
 from missions.exposure.gain import read_linear
 from reconstruct.pictures.files import bits_used, exif_focal_px, inspect
 from reconstruct.pictures.normalise import even_light, finely, read_deep
-from reconstruct.pictures.telemetry import read_fixes
 from reconstruct.pictures.undistorted import read_colour, read_mask
-from reconstruct.pictures.videos import video_start
+from reconstruct.pictures.videos import read_fixes, video_start
 from tests.cameras import flat_port_camera
 from tests.fuzz.target import Target
 from tests.reconstruct.pictures import gopro

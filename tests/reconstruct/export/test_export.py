@@ -56,13 +56,9 @@ def workspace(small_survey: Path, tmp_path_factory: pytest.TempPathFactory) -> P
     return folder
 
 
-def rows_of(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def test_places_are_where_the_series_says(workspace: Path):
-    old = rows_of(workspace / "sparse" / "track.csv")
+    with (workspace / "sparse" / "track.csv").open(newline="") as file:
+        old = list(csv.DictReader(file))
     degrees = [np.array([float(r[f"{k}_deg"]) for r in old]) for k in ("latitude", "longitude")]
     local = np.array([[float(r["east_m"]), float(r["north_m"])] for r in old])
     frame = read_frame(workspace / "sparse" / "frame.json")
@@ -86,9 +82,7 @@ def test_heights_of_the_raster_are_those_of_the_old_one_at_the_same_places(works
         pick = np.random.default_rng(1).choice(len(rows), 2000, replace=False)
         rows, columns = rows[pick], columns[pick]
         x, y = new.transform * (columns + 0.5, rows + 0.5)
-        back = pyproj.Transformer.from_crs(
-            pyproj.CRS.from_epsg(32636), pyproj.CRS.from_wkt(old.crs.to_wkt()), always_xy=True
-        )
+        back = pyproj.Transformer.from_crs(CRS, old.crs.to_wkt(), always_xy=True)
         east, north = back.transform(x, y)
     true = elevation_in(workspace / "dense")
     at = (true.north - north) / cell - 0.5, (east - true.west) / cell - 0.5
@@ -154,12 +148,10 @@ def test_the_colmap_model_projects_to_where_the_exact_rays_land(workspace: Path)
         at = np.array([images[view.image].project_point(p) for p in points])
         warp = warps[view.camera]
         exact = warp.camera.project(warp.pinhole_from_cam.inv().apply(local))
-        scene = export.scene_of(workspace / "mesh")
-        depth = export.surface_depth(view, *scene)
+        depth = export.surface_depth(view, *export.scene_of(workspace / "mesh"))
         maps = export.taken_at(Pictures.open(workspace), view, depth)
-        found = 0.5 + np.stack(
-            [bilinear(one, at[:, 0] - 0.5, at[:, 1] - 0.5) for one in maps], axis=1
-        )
+        places = at.T - 0.5
+        found = 0.5 + np.stack([bilinear(one, *places) for one in maps], axis=1)
         known = np.isfinite(found).all(axis=1) & np.isfinite(exact).all(axis=1)
         assert known.sum() > 300
         miss = np.linalg.norm(found - exact, axis=1)[known]
@@ -171,11 +163,8 @@ def test_the_colmap_model_projects_to_where_the_exact_rays_land(workspace: Path)
 def test_other_programs_read_what_was_written(workspace: Path):
     folder = workspace / "undistorted"
     text, binary = (pycolmap.Reconstruction(folder / name) for name in ("sparse", "sparse/0"))
-    assert (
-        text.num_reg_images()
-        == binary.num_reg_images()
-        == len(read_model(workspace / "sparse").views)
-    )
+    views = read_model(workspace / "sparse").views
+    assert text.num_reg_images() == binary.num_reg_images() == len(views)
     for image in text.images.values():
         picture = cv2.imread(str(folder / "images" / image.name))
         mask = cv2.imread(str(folder / "masks" / f"{image.name}.png"), cv2.IMREAD_GRAYSCALE)

@@ -34,9 +34,7 @@ def forward_rig() -> Rig:
 
 
 def records_at(
-    places_ned: Array,
-    headings_deg: Sequence[float] | Array,
-    cameras: Sequence[str] = ("left", "right"),
+    places_ned: Array, headings_deg: Array, cameras: Sequence[str] = ("left", "right")
 ) -> list[ImageRecord]:
     geodetic = DATUM.geodetic_from_ned(np.asarray(places_ned, dtype=np.float64))
     return [
@@ -52,14 +50,10 @@ def records_at(
 
 def wall(columns: int, rows: int, step_m: float) -> list[ImageRecord]:
     """Rows of stations that look north at a wall, there and back."""
-    order = [
-        (row, column if row % 2 == 0 else columns - 1 - column)
-        for row in range(rows)
-        for column in range(columns)
-    ]
-    return records_at(
-        np.array([[0.0, step_m * c, 10.0 + step_m * r] for r, c in order]), [0.0] * len(order)
-    )
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    column = np.where(row % 2 == 0, column, columns - 1 - column)
+    places = np.column_stack([0.0 * row, step_m * column, 10.0 + step_m * row])
+    return records_at(places, np.zeros(len(row)))
 
 
 def width_m(rig: Rig) -> tuple[float, float]:
@@ -76,11 +70,8 @@ def test_shares_are_those_of_the_wall() -> None:
     rig = forward_rig()
     wide, high = width_m(rig)
     right, down = 0.3 * wide, 0.4 * high
-    records = records_at(
-        np.array([[0, 0, 10], [0, right, 10], [0, 0, 10 + down], [0, right, 10 + down]]),
-        [0.0] * 4,
-        ["left"],
-    )
+    places = [[0, 0, 10], [0, right, 10], [0, 0, 10 + down], [0, right, 10 + down]]
+    records = records_at(np.array(places), np.zeros(4), ["left"])
     frusta = frusta_of(records, rig, DATUM, DISTANCE_M, DISTANCE_M * (1 + 1e-9))
     found = overlap_shares(frusta, [(0, 1), (0, 2), (0, 3)], np.zeros(4))
     # A lattice of six rays a side counts in sixths.

@@ -116,19 +116,15 @@ def test_a_camera_that_missed_a_moment_is_paired_by_number(tmp_path: Path) -> No
 
 def test_one_camera_of_a_rig_goes_by_its_name(tmp_path: Path) -> None:
     rig = design_rig(CameraConfig(), WaterConfig())
-    cameras = {
-        name: replace(rig.cameras[name], width_px=width, height_px=48)
-        for name, width in (("left", 80), ("right", 64))
-    }
-    rig = replace(rig, cameras=cameras)
-    write_rig(tmp_path / "rig.json", rig)
+    widths = {"left": 80, "right": 64}
+    cameras = {n: replace(rig.cameras[n], width_px=w, height_px=48) for n, w in widths.items()}
+    write_rig(tmp_path / "rig.json", replace(rig, cameras=cameras))
     for number in range(2):
         draw(tmp_path / "in" / f"{number}.png", number)
     with pytest.raises(ImageError, match="--camera NAME=FOLDER says if right took them"):
         import_images(tmp_path / "w", [tmp_path / "in"], rig=tmp_path / "rig.json")
-    found = import_images(
-        tmp_path / "w", [], cameras={"right": tmp_path / "in"}, rig=tmp_path / "rig.json"
-    )
+    given = {"right": tmp_path / "in"}
+    found = import_images(tmp_path / "w", [], cameras=given, rig=tmp_path / "rig.json")
     assert counts(found) == {"right": 2}
 
 
@@ -189,34 +185,17 @@ def test_navigation_is_tied_by_time_zone_and_clock_offset(
     rows = [[f"2024-07-01T10:00:{s:02d}Z", 60 + s * 1e-5, 5.0, 10 + s, 90.0] for s in range(15)]
     header = "time_utc,latitude_deg,longitude_deg,depth_m,heading_deg"
     nav = table(tmp_path / "nav.csv", header, rows)
-    import_images(
-        tmp_path / "w", [tmp_path / "in"],
-        navigation=nav, clock_offset_s=2.5, time_zone="Europe/Oslo",
-    )  # fmt: skip
-    records = rows_of(tmp_path / "w")
-    assert [r.time_s for r in records] == [2.5, 6.5, 10.5, 52.5]
-    assert [r.depth_m for r in records[:3]] == pytest.approx([12.5, 16.5, 20.5])
-    assert records[1].heading_deg == pytest.approx(90)
-    assert not records[3].has_position
+    given: dict[str, Any] = {"clock_offset_s": 2.5, "time_zone": "Europe/Oslo", "navigation": nav}
+    # the name of the level alone differs: depths stay as logged
+    for name, level in (("sea surface, as in the navigation log", None), ("NN2000", " NN2000 ")):
+        import_images(tmp_path / "w", [tmp_path / "in"], vertical_datum=level, **given)
+        records = rows_of(tmp_path / "w")
+        assert [r.time_s for r in records] == [2.5, 6.5, 10.5, 52.5]
+        assert [r.depth_m for r in records[:3]] == pytest.approx([12.5, 16.5, 20.5])
+        assert records[1].heading_deg == pytest.approx(90)
+        assert not records[3].has_position
+        assert read_json(tmp_path / "w" / "images" / "survey.json")["vertical_datum"] == name
     assert "camera/3.jpg" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("given", "stated"),
-    [(None, "sea surface, as in the navigation log"), (" NN2000 (tide) ", "NN2000 (tide)")],
-)
-def test_the_level_of_logged_depths_is_stated(
-    tmp_path: Path, given: str | None, stated: str
-) -> None:
-    several(tmp_path, 2, dated=True)
-    rows = [[f"2024-07-01T12:00:{s:02d}Z", 60, 5.0, 10 + s] for s in range(5)]
-    nav = table(tmp_path / "nav.csv", "time_utc,latitude_deg,longitude_deg,depth_m", rows)
-    import_images(tmp_path / "w", [tmp_path / "in"], navigation=nav, vertical_datum=given)
-    survey = read_json(tmp_path / "w" / "images" / "survey.json")
-    assert survey["vertical_datum"] == stated
-    # The name alone differs: depths stay as logged.
-    records = rows_of(tmp_path / "w")
-    assert [r.depth_m for r in records] == pytest.approx([10.0, 11.0])
 
 
 @pytest.mark.parametrize("columns", ["depth_m", "depth_m,heading_deg", "altitude_m", "heading_deg"])

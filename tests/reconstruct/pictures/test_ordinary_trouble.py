@@ -80,9 +80,7 @@ def test_cameras_of_a_mixed_folder_are_told_apart_by_exif_and_size(tmp_path: Pat
         "camera-4: 1 of 64 x 48 pixels",
     ]
     images = tmp_path / "w" / "images"
-    assert {(r.camera, r.image.split("/")[0]) for r in read_manifest(images / "manifest.csv")} == {
-        (name, name) for name in found.cameras
-    }
+    assert all(r.camera == r.image.split("/")[0] for r in rows_of(tmp_path / "w"))
     assert read_json(images / "survey.json")["notes"][-4:] == found.lines
 
 
@@ -107,9 +105,8 @@ def test_copies_are_left_out_and_named(tmp_path: Path) -> None:
 
 def test_folders_inside_are_taken_on_request(tmp_path: Path) -> None:
     source = tmp_path / "card"
-    for number, name in enumerate(
-        ["100GOPRO/G2.jpg", "100GOPRO/G10.jpg", "101GOPRO/G2.jpg", "a.jpg"]
-    ):
+    names = ["100GOPRO/G2.jpg", "100GOPRO/G10.jpg", "101GOPRO/G2.jpg", "a.jpg"]
+    for number, name in enumerate(names):
         save(source / name, smooth(number))
     save(source / ".trash" / "x.jpg", smooth(8))
     save(source / "masks" / "G10.png", np.full((48, 64), 255, np.uint8))
@@ -121,9 +118,8 @@ def test_folders_inside_are_taken_on_request(tmp_path: Path) -> None:
     for _ in range(2):  # what it wrote itself is not taken
         found = import_images(work, [source], recursive=True, masks=source / "masks")
         records = rows_of(work)
-        assert [r.image for r in records] == [
-            "camera/G2.jpg", "camera/G10.jpg", "camera/G2_2.jpg", "camera/a.jpg",
-        ]  # fmt: skip
+        copies = ["G2.jpg", "G10.jpg", "G2_2.jpg", "a.jpg"]
+        assert [r.image for r in records] == [f"camera/{name}" for name in copies]
         assert reasons(found) == {"other files": 1}
     assert [bool(r.mask) for r in records] == [False, True, False, False]
     import_images(tmp_path / "v", [source], recursive=True)

@@ -11,8 +11,7 @@ import pytest
 from alice_survey.core.artefacts import read_json
 from alice_survey.core.errors import ImageError, keep_warnings
 from reconstruct.pictures.importing import import_images
-from reconstruct.pictures.telemetry import read_fixes
-from reconstruct.pictures.videos import find_videos, read_recordings, video_start
+from reconstruct.pictures.videos import find_videos, read_fixes, read_recordings, video_start
 from tests.reconstruct.pictures import gopro
 from tests.reconstruct.pictures.dated import counts, rows_of, table
 
