@@ -389,7 +389,7 @@ def _overlapping(
     sure: dict[Pair, float] = {}
     across: dict[Pair, float] = {}
     maybe: dict[Pair, float] = {}
-    for i, j in sorted(STRtree(wider).query(wider).T.tolist()):
+    for i, j in sorted(STRtree(wider).query(np.array(wider, object)).T.tolist()):
         cameras = records[i].camera, records[j].camera
         apart = group[cameras[0]] != group[cameras[1]]
         if j <= i or (cameras[0] != cameras[1] and not apart):
