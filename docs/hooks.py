@@ -46,8 +46,6 @@ def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: 
     if _FORMATS in markdown:
         markdown = markdown.replace(_FORMATS, formats_table())
     if _RASTERS in markdown:
-        from alice_survey.core.products import rasters_table
-
         markdown = markdown.replace(_RASTERS, rasters_table())
     return markdown
 
@@ -61,6 +59,17 @@ def formats_table() -> str:
         known = format_named(name)
         files = ", ".join(f"`{file.name.format(1)}`" for file in known.files)
         rows.append(f"| `{name}` | {files} | {known.read_by} |")
+    return "\n".join(rows)
+
+
+def rasters_table() -> str:
+    """All rasters as a table in Markdown."""
+    from alice_survey.core.products import LENGTH, RASTERS
+
+    rows = ["| file | values | unit |", "|---|---|---|"]
+    for one in RASTERS:
+        unit = "m, or model units" if one.unit == LENGTH else one.unit
+        rows.append(f"| `{one.file}` | {one.about} | {unit} |")
     return "\n".join(rows)
 
 

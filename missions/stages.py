@@ -46,7 +46,7 @@ def _fly_summary(folder: Path) -> Summary:
         f"{sum(flight.energy_wh.values()):.1f} Wh; "
         f"{share(flight.coverage.share_at_overlap)} of the area covered as requested{promised}, "
         f"{share(flight.coverage.every_camera_share)} seen by every camera; "
-        f"plots in {folder / 'track.png'} and {folder / 'vehicle.png'}"
+        f"plots in {folder / 'track.png'}"
     )
     return text, flight.to_json()
 
@@ -116,7 +116,7 @@ FLY = StageSpec(
     folder="flight",
     command="fly",
     about="the plan flown by a simulated vehicle",
-    version=5,
+    version=6,
     work="missions.fly.run:run_fly",
     takes=(
         "seed",

@@ -133,12 +133,3 @@ def rasters_in(folder: str) -> tuple[Raster, ...]:
 def listed_in(folder: str) -> Mapping[str, str]:
     """The rasters that lists of a stage's products name, by the names of their files."""
     return {one.path.name: one.listed for one in rasters_in(folder) if one.listed}
-
-
-def rasters_table() -> str:
-    """All rasters as a table in Markdown."""
-    rows = ["| file | values | unit |", "|---|---|---|"]
-    for one in RASTERS:
-        unit = "m, or model units" if one.unit == LENGTH else one.unit
-        rows.append(f"| `{one.file}` | {one.about} | {unit} |")
-    return "\n".join(rows)

@@ -327,11 +327,11 @@ def turn_rows(line: Array, following: NDArray[np.bool_]) -> list[slice]:
 
 
 def summarise(outcomes: Sequence[Outcome]) -> Summary:
-    """Mean and extremes of each figure over flights, and the standard deviation of two or more."""
+    """Mean of each figure over flights, and the standard deviation of two or more."""
     summary: Summary = {}
     for name in FlightFigures.__dataclass_fields__:
         values = np.array([outcome[name] for outcome in outcomes])
-        found = {"mean": values.mean(), "least": values.min(), "most": values.max()}
+        found = {"mean": values.mean()}
         if len(values) > 1:
             found["sd"] = values.std(ddof=1)
         summary[name] = {

@@ -5,7 +5,6 @@ Pictures show how near the plan a flight came, and what the vehicle did for it.
 
 import itertools
 import math
-from collections.abc import Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,6 @@ from alice_survey.kit.figure import (
     SOFT,
     Axes,
     LineCollection,
-    Sheet,
     figure_style,
     new_figure,
     save_figure,
@@ -34,7 +32,6 @@ from alice_survey.kit.figure import (
 from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.log import VehicleLog, write_vehicle_log
 from alice_survey.sim.vehicle.navigation import tick as navigation
-from alice_survey.sim.vehicle.navigation.tick import LOG_COLUMNS
 from alice_survey.sim.vehicle.pilot.memory import FOLLOW, PHASE
 from alice_survey.sim.vehicle.simulator import Flown
 from camera_calib.rig import Rig, design_rig
@@ -56,7 +53,7 @@ from missions.fly.simulation import (
 from missions.logs.ros_builder import BagRecord, write_bag
 from missions.values.flight import Flight, rms
 from missions.values.navigation import write_navigation
-from missions.values.plan_file import Plan, read_plan
+from missions.values.plan_file import read_plan
 
 MAX_HEADING_DEG = 10.0
 """A picture of 4 by 3 turned by so much covers a strip narrower by a tenth."""
@@ -101,7 +98,6 @@ def run_fly(
         summary["mission"] = mission_summary(mission_of_settings(plan, settings), flight, rig)
     FlightRecord.save(folder / "flight.json", summary)
     draw_flight(folder / "track.png", flight)
-    draw_vehicle(folder / "vehicle.png", flight)
 
 
 def _check_pictures(flight: Flight, sea: str) -> None:
@@ -153,61 +149,81 @@ _SIGMAS = 2.0
 
 @figure_style()
 def draw_flight(path: Path, flight: Flight) -> None:
-    """Draw a map of plan, true track and navigation next to strips of the errors."""
-    cross, heading = (values[_every_nth(flight)] for values in flight.line_errors)
+    """Draw a map of plan, true track and navigation next to strips of errors, rpm and power.
+
+    The strips share their time, with the lines shaded.
+    """
+    cross, heading = flight.line_errors
     attitude = np.rad2deg(flight.attitude_rad)
-    figure, strips = _sheet(flight, 6)
-    for axes, label, curves in zip(
-        strips,
-        ("cross-track, m", "heading error, °", "attitude, °", "altitude, m", "north error, m",
-         "east error, m"),
-        (
-            [("true", flight.line_errors[0]), ("believed", flight.believed_cross_track)],
-            [("on lines", np.rad2deg(flight.line_errors[1]))],
-            [("roll", attitude[:, 0]), ("pitch", attitude[:, 1])],
-            [("measured", flight.log.altitude_m)],
-            _navigation_error(flight, 0),
-            _navigation_error(flight, 1),
-        ),
-        strict=True,
-    ):  # fmt: skip
-        _draw_curves(axes, flight, label, curves)
+    error = (flight.log.position_ned - flight.truth.ned_from_body.translation).T
+    curves: dict[str, dict[str, Array]] = {
+        "cross-track, m": {"true": cross, "believed": flight.believed_cross_track},
+        "heading error, °": {"on lines": np.rad2deg(heading)},
+        "attitude, °": {"roll": attitude[:, 0], "pitch": attitude[:, 1]},
+        "altitude, m": {"measured": flight.log.altitude_m},
+        "north error, m": {"believed minus true": error[0]},
+        "east error, m": {"believed minus true": error[1]},
+        "rpm": rpm_of(flight.flown),
+        "power, W": {"all thrusters": flight.flown.power_w.sum(axis=1)},
+    }
+    figure = new_figure(11.0, 15)
+    grid = figure.add_gridspec(len(curves), 2, width_ratios=(1, 1.15))
+    chart, first = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
+    rows = range(1, len(curves))
+    strips = [first, *(figure.add_subplot(grid[i, 1], sharex=first) for i in rows)]
+    some = slice(None, None, math.ceil(len(flight.line) / _MAX_POINTS))
+    _draw_map(chart, flight, some)
+    figure.suptitle(f"{flight.plan.name}: {flight.vehicle.name}, {flight.ending}")
+    time_s = flight.truth.time_s
+    following = flight.flown.report[:, PHASE] == FOLLOW
+    for axes, (label, by_name) in zip(strips, curves.items(), strict=True):
+        for (name, values), colour in zip(by_name.items(), itertools.cycle(INKS), strict=False):
+            axes.plot(time_s[some], values[some], color=colour, label=name, lw=0.9)
+        axes.set_ylabel(label)
+        for begin, end in line_spans(flight):
+            axes.axvspan(begin, end, color=BAND, lw=0, zorder=0)
+        for edge in time_s[np.flatnonzero(np.diff(following))]:
+            axes.axvline(edge, color=SOFT, lw=0.7, ls="--", zorder=1)
     altitude_m = flight.plan.altitude_m
     strips[3].set_ylim(altitude_m - 0.5, altitude_m + 0.5)
-    for axes, name in zip(strips[4:], ("north", "east"), strict=True):
-        column = flight.flown.navigation[_every_nth(flight), LOG_COLUMNS.index(f"sigma_{name}_m")]
+    for axes, name in zip(strips[4:6], ("north", "east"), strict=True):
+        band = _SIGMAS * _column(flight.flown, f"sigma_{name}_m")[some]
         axes.fill_between(
-            flight.truth.time_s[_every_nth(flight)], -_SIGMAS * column, _SIGMAS * column, color=NAV,
-            alpha=0.18, lw=0, label=f"±{_SIGMAS:g} logged sigmas",
+            time_s[some], -band, band, color=NAV, alpha=0.18, lw=0,
+            label=f"±{_SIGMAS:g} logged sigmas",
         )  # fmt: skip
     strips[0].set_title(f"{rms(cross):.3f} m rms on lines, heading {np.rad2deg(rms(heading)):.1f}°")
-    _save(figure, strips, path)
+    for axes in strips:
+        axes.legend(loc="upper right", ncol=4, fontsize=7.5)
+        axes.tick_params(labelbottom=axes is strips[-1])
+    strips[-1].set_xlabel("time, s (lines shaded, survey between dashes)")
+    save_figure(figure, path, dpi=110)
 
 
-@figure_style()
-def draw_vehicle(path: Path, flight: Flight) -> None:
-    """Draw the track next to strips of speed, roll, thrusters, fins, power and current."""
-    flown, current = flight.flown, true_current(flight.flown)
-    velocity, energy_wh = true_velocity(flown), np.cumsum(flown.power_w.sum(axis=1))
-    energy_wh *= float(np.diff(flown.time_s, prepend=0.0).max()) / 3600.0
-    strips_of = {
-        "speed, m/s": [("over ground", np.hypot(velocity[:, 0], velocity[:, 1])),
-                       ("surge", velocity[:, 0])],
-        "roll, °": [("roll", np.rad2deg(flight.attitude_rad[:, 0]))],
-        "rpm": list(rpm_of(flown).items()),
-        "fins, °": [
-            (fin.name, angle)
-            for fin, angle in zip(flight.vehicle.fins, np.rad2deg(flown.fin_rad).T, strict=True)
-        ],
-        "power, W": [("all thrusters", flown.power_w.sum(axis=1))],
-        "energy, Wh": [("electrical", energy_wh)],
-        "current, m/s": [("north", current[:, 0]), ("east", current[:, 1])],
-    }  # fmt: skip
-    strips_of = {label: curves for label, curves in strips_of.items() if curves}
-    figure, strips = _sheet(flight, len(strips_of))
-    for axes, (label, curves) in zip(strips, strips_of.items(), strict=True):
-        _draw_curves(axes, flight, label, curves)
-    _save(figure, strips, path)
+def _draw_map(axes: Axes, flight: Flight, some: slice) -> None:
+    """Draw plan, area and both tracks."""
+    plan = flight.plan
+    axes.set_aspect("equal")
+    ends = [(line.start_ne_m[::-1], line.end_ne_m[::-1]) for line in plan.lines]
+    axes.add_collection(LineCollection(ends, colors=SOFT, linewidths=3, alpha=0.5, label="lines"))
+    route = whole_route(plan)
+    planned = route.places(np.linspace(0.0, route.length_m, 4000))
+    draw_polygons(axes, plan.area.survey, "area", edgecolor=INKS[3], lw=1.6, ls="--")
+    draw_polygons(axes, plan.area.allowed, "allowed", edgecolor=SOFT, lw=0.9, ls=":")
+    draw_polygons(axes, plan.area.no_go, "no-go zone", edgecolor=INKS[3], hatch="xxx", alpha=0.5)
+    for track, colour, width, label in (
+        (planned, SOFT, 0.8, "planned route"),
+        (flight.glass_ned[some], TRUE, 1.0, "true track of the left port"),
+        (flight.believed_glass_ned[some], NAV, 1.0, "believed track"),
+    ):
+        axes.plot(track[:, 1], track[:, 0], color=colour, lw=width, label=label)
+    north, east = (
+        np.interp(flight.trigger_s, flight.truth.time_s, axis) for axis in flight.glass_ned.T[:2]
+    )
+    axes.scatter(east, north, s=6, color="black", lw=0, zorder=5, label="pictures")
+    axes.set_xlabel("east, m")
+    axes.set_ylabel("north, m")
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, 0.0), borderaxespad=4.5, ncol=3)
 
 
 def line_spans(flight: Flight) -> list[tuple[float, float]]:
@@ -220,84 +236,6 @@ def line_runs(line: Array) -> list[tuple[int, int]]:
     """First tick on each line, and the one after the last, of (T,) lines, -1 between them."""
     edges = np.flatnonzero(np.diff(line, prepend=-1.0, append=-1.0) != 0).tolist()
     return [(i, j) for i, j in itertools.pairwise(edges) if line[i] >= 0]
-
-
-def true_current(flown: Flown) -> Array:
-    """(T, 2) current at the vehicle towards north and east: over ground minus through the water."""
-    through = Rotation.from_quat(flown.truth[:, 3:7]).apply(flown.state[:, 7:10])
-    return np.asarray((flown.truth[:, 7:10] - through)[:, :2])
-
-
-def draw_plan(axes: Axes, plan: Plan) -> None:
-    """Draw the lines and the route of a plan on a map, its area, and where it may be flown."""
-    axes.set_aspect("equal")
-    ends = [(line.start_ne_m[::-1], line.end_ne_m[::-1]) for line in plan.lines]
-    axes.add_collection(LineCollection(ends, colors=SOFT, linewidths=3, alpha=0.5, label="lines"))
-    route = whole_route(plan)
-    places = route.places(np.linspace(0.0, route.length_m, 4000))
-    axes.plot(places[:, 1], places[:, 0], color=SOFT, lw=0.8, zorder=1, label="planned route")
-    draw_polygons(axes, plan.area.survey, "area", edgecolor=INKS[3], lw=1.6, ls="--")
-    draw_polygons(axes, plan.area.allowed, "allowed", edgecolor=SOFT, lw=0.9, ls=":")
-    draw_polygons(axes, plan.area.no_go, "no-go zone", edgecolor=INKS[3], hatch="xxx", alpha=0.5)
-    axes.set_xlabel("east, m")
-    axes.set_ylabel("north, m")
-
-
-def _sheet(flight: Flight, count: int) -> tuple[Sheet, list[Axes]]:
-    """A map of the flight over its plan, and strips that share their time, lines shaded."""
-    figure = new_figure(9.5, 15)
-    grid = figure.add_gridspec(count, 2, width_ratios=(1, 1.15))
-    chart, first = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
-    strips = [first, *(figure.add_subplot(grid[i, 1], sharex=first) for i in range(1, count))]
-    draw_plan(chart, flight.plan)
-    some = _every_nth(flight)
-    for track, colour, label in (
-        (flight.glass_ned, TRUE, "true track of the left port"),
-        (flight.believed_glass_ned, NAV, "believed track"),
-    ):
-        chart.plot(track[some, 1], track[some, 0], color=colour, lw=1.0, label=label)
-    north, east = (
-        np.interp(flight.trigger_s, flight.truth.time_s, axis) for axis in flight.glass_ned.T[:2]
-    )
-    chart.scatter(east, north, s=6, color="black", lw=0, zorder=5, label="pictures")
-    chart.legend(loc="upper center", bbox_to_anchor=(0.5, 0.0), borderaxespad=4.5, ncol=3)
-    figure.suptitle(f"{flight.plan.name}: {flight.vehicle.name}, {flight.ending}")
-    following = flight.flown.report[:, PHASE] == FOLLOW
-    edges = flight.truth.time_s[np.flatnonzero(np.diff(following))]
-    for axes in strips:
-        for begin, end in line_spans(flight):
-            axes.axvspan(begin, end, color=BAND, lw=0, zorder=0)
-        for edge in edges:
-            axes.axvline(edge, color=SOFT, lw=0.7, ls="--", zorder=1)
-    return figure, strips
-
-
-def _navigation_error(flight: Flight, axis: int) -> list[tuple[str, Array]]:
-    error = flight.log.position_ned - flight.truth.ned_from_body.translation
-    return [("believed minus true", error[:, axis])]
-
-
-def _every_nth(flight: Flight) -> slice:
-    """Every n-th tick, so that a curve stays light."""
-    return slice(None, None, max(1, math.ceil(len(flight.line) / _MAX_POINTS)))
-
-
-def _draw_curves(
-    axes: Axes, flight: Flight, label: str, curves: Iterable[tuple[str, Array]]
-) -> None:
-    some = _every_nth(flight)
-    colours = itertools.cycle(INKS)
-    for (name, values), colour in zip(curves, colours, strict=False):
-        axes.plot(flight.truth.time_s[some], values[some], color=colour, label=name, lw=0.9)
-    axes.set_ylabel(label)
-
-
-def _save(figure: Sheet, strips: list[Axes], path: Path) -> None:
-    for axes in strips:
-        axes.legend(loc="upper right", ncol=4, fontsize=7.5)
-        axes.tick_params(labelbottom=axes is strips[-1])
-    strips[-1].set_xlabel("time, s (lines shaded, survey between dashes)")
-    save_figure(figure, path, dpi=110)
 
 
 _RANGES = ("range_1_m", "range_2_m", "range_3_m", "range_4_m")

@@ -3,11 +3,12 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from shapely.geometry import MultiPolygon, box
 
-from alice_survey.core.config import SurveyConfig
+from alice_survey.core.config import SurveyConfig, parse_config
 from alice_survey.core.frames import Datum
 from alice_survey.sim.seafloor.terrain import Terrain, survey_terrain
 from alice_survey.sim.vehicle.sea import FloorGrid, level_floor
@@ -80,6 +81,14 @@ def plan_of(routes: Sequence[Route], stations: int = 6, turn_radius_m: float = 0
         dives=dives,
         duration_s=sum(dive.duration_s for dive in dives),
     )
+
+
+def survey(**sections: Any) -> SurveyConfig:
+    """A survey of a small area in water of 6 m, in a current."""
+    area = {"length_m": 3.0, "width_m": 2.5, "seafloor_depth_m": 6.0}
+    sea = {"current_mps": 0.1, "current_towards_deg": 110.0}
+    area |= sections.pop("area", {})
+    return parse_config({"area": area, "sea": sea} | sections, "test")
 
 
 def planned(config: SurveyConfig) -> Plan:

@@ -1,7 +1,5 @@
 """The pictures of a flight show what the flight holds."""
 
-import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from alice_survey.core.config import parse_config
-from missions.fly.run import draw_flight, draw_vehicle, line_spans, rpm_of
+from missions.fly.run import draw_flight, line_spans, rpm_of
 from missions.values.flight import Flight
 from tests.missions.flown_plans import flown, planned
 
@@ -27,17 +25,6 @@ CONFIG = parse_config(
 @pytest.fixture(scope="module")
 def flight() -> Flight:
     return flown(planned(CONFIG), CONFIG)
-
-
-def figure_of(
-    draw: Callable[[Path, Flight], None], flight: Flight, monkeypatch: pytest.MonkeyPatch
-) -> Any:
-    """The figure that would be saved."""
-    kept: list[Figure] = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: kept.append(figure))
-    with tempfile.TemporaryDirectory() as folder:
-        draw(Path(folder) / "drawn.png", flight)
-    return kept[0]
 
 
 def curve(figure: Any, strip: str, label: str) -> np.ndarray:
@@ -59,15 +46,17 @@ def test_spans_are_the_times_on_lines(flight: Flight) -> None:
     np.testing.assert_array_equal(inside, flight.line >= 0)
 
 
-def test_strips_show_errors_thrusters_and_energy(
-    flight: Flight, monkeypatch: pytest.MonkeyPatch
+def test_strips_show_errors_thrusters_and_power(
+    flight: Flight, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    figure = figure_of(draw_flight, flight, monkeypatch)
+    kept: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: kept.append(figure))
+    draw_flight(tmp_path / "drawn.png", flight)
+    (figure,) = kept
     np.testing.assert_array_equal(curve(figure, "cross-track, m", "true"), flight.line_errors[0])
     off = flight.log.position_ned - flight.truth.ned_from_body.translation
     np.testing.assert_array_equal(curve(figure, "east error, m", "believed minus true"), off[:, 1])
-    figure = figure_of(draw_vehicle, flight, monkeypatch)
     for name, rpm in rpm_of(flight.flown).items():
         np.testing.assert_array_equal(curve(figure, "rpm", name), rpm)
-    energy_wh = curve(figure, "energy, Wh", "electrical")
-    assert energy_wh[-1] == pytest.approx(flight.flown.energy_j.sum() / 3600.0, rel=1e-3)
+    power_w = curve(figure, "power, W", "all thrusters")
+    assert 0.05 * power_w.sum() == pytest.approx(flight.flown.energy_j.sum(), rel=1e-3)

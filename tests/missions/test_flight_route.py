@@ -11,7 +11,7 @@ import pytest
 from shapely.geometry import MultiPolygon, Polygon, box
 
 from alice_survey.app.stages import spec
-from alice_survey.core.config import CameraConfig, SurveyConfig, WaterConfig, parse_config
+from alice_survey.core.config import CameraConfig, WaterConfig
 from alice_survey.core.errors import PlanError, VehicleError
 from alice_survey.core.executor import SERIAL
 from alice_survey.sim.vehicle.pilot.memory import FOLLOW, LEG, PHASE
@@ -26,7 +26,7 @@ from missions.fly.simulation import (
     whole_route,
 )
 from missions.values.flight import Flight
-from tests.missions.flown_plans import flown, plan_of, walk
+from tests.missions.flown_plans import flown, plan_of, survey, walk
 
 FIRST = walk(
     (0.0, 0.0), 0.0,
@@ -41,17 +41,6 @@ SECOND = walk(
 )  # fmt: skip
 """The third line ends in a turn on the spot."""
 PLAN = plan_of([FIRST, SECOND])
-
-
-def survey(**changes: object) -> SurveyConfig:
-    return parse_config(
-        {
-            "area": {"seafloor_depth_m": 6.0},
-            "sea": {"current_mps": 0.1, "current_towards_deg": 110.0},
-            **changes,
-        },
-        "test",
-    )
 
 
 def summary(flight: Flight) -> dict[str, Any]:
@@ -97,9 +86,7 @@ def test_all_dives_are_flown_in_one_mission_from_home_to_home(flight: Flight) ->
     assert np.linalg.norm(flight.glass_ned[following][-1, :2] - PLAN.home_ne_m) < 0.3
     found = summary(flight)
     assert (found["dives"], found["stations_planned"]) == (2, 18)
-
-
-def test_pictures_are_taken_in_their_places_at_a_line_that_ends_in_a_stop(flight: Flight) -> None:
+    # Pictures are in their places, at a line that ends in a stop too.
     planned = np.vstack([line.stations_ne for line in PLAN.lines])
     taken = np.column_stack(
         [

@@ -2,19 +2,21 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from alice_survey.app.pipeline import plan_report
 from alice_survey.core.artefacts import read_json
-from alice_survey.core.config import SurveyConfig, load_config, parse_config
+from alice_survey.core.config import SurveyConfig, load_config
 from alice_survey.core.errors import AliceError, PlanError, VehicleError
 from alice_survey.sim.vehicle.pilot.gains import gains_for
 from alice_survey.sim.vehicle.vehicle import vehicle_from
 from missions.plan.strength import survey_costs
 from missions.route.energy import battery_wh, hotel_w, planned_vehicle
 from missions.values.flight import Flight, rms
+from tests.missions import flown_plans
 from tests.missions.flown_plans import flown, planned
 from tests.small_survey import with_settings
 
@@ -22,17 +24,9 @@ HEAVY = Path(__file__).parents[2] / "alice_survey/sim/vehicle/fleet_files/bluero
 PLACES = {"position_body_m": [0.2, -0.05, 0.1], "dvl_position_body_m": [-0.1, 0.0, 0.12]}
 
 
-def survey(vehicle: dict[str, object], **changes: object) -> SurveyConfig:
-    return parse_config(
-        {
-            "area": {"length_m": 5.0, "width_m": 2.5, "seafloor_depth_m": 6.0},
-            "sea": {"current_mps": 0.1, "current_towards_deg": 110.0},
-            "camera": PLACES,
-            "vehicle": vehicle,
-            **changes,
-        },
-        "test",
-    )
+def survey(vehicle: dict[str, object], **changes: Any) -> SurveyConfig:
+    area = {"length_m": 5.0} | changes.pop("area", {})
+    return flown_plans.survey(area=area, camera=PLACES, vehicle=vehicle, **changes)
 
 
 def changed_heavy(folder: Path, **lines: str) -> str:
@@ -100,9 +94,9 @@ def test_battery_and_hotel_load_are_the_vehicles_own_or_as_set(tmp_path: Path) -
 
 def test_no_vehicle_dives_deeper_than_it_is_built_for() -> None:
     for name, rated_m in (("alice", 200), ("bluerov2_heavy", 100)):
-        deep = {"length_m": 5.0, "width_m": 2.5, "seafloor_depth_m": rated_m + 2.5}
+        deep = survey({"name": name}, area={"seafloor_depth_m": rated_m + 2.5})
         with pytest.raises(PlanError, match=f"{name} is built for {rated_m} m"):
-            planned(survey({"name": name}, area=deep))
+            planned(deep)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import math
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from alice_survey.core.config import SurveyConfig
 from alice_survey.core.frames import Array
@@ -21,13 +22,8 @@ START_S = 100.0
 
 def small_plan() -> Plan:
     """Two lines of 4 m, 1 m apart, in water of 6 m."""
-    moves: list[Move] = [
-        ("line", 4.0, 0),
-        ("spot", 90.0),
-        ("go", 1.0),
-        ("spot", 90.0),
-        ("line", 4.0, 1),
-    ]
+    turn: list[Move] = [("spot", 90.0), ("go", 1.0), ("spot", 90.0)]
+    moves: list[Move] = [("line", 4.0, 0), *turn, ("line", 4.0, 1)]
     return plan_of([walk((0.0, 0.0), 0.0, moves)])
 
 
@@ -41,13 +37,11 @@ def vehicle_afloat(plan: Plan, survey: SurveyConfig, seed: int = 1) -> Simulated
 class LoopFlight:
     """A loop that flies a simulated vehicle by its true motion; tests spoil what it hears."""
 
-    def __init__(self, survey: SurveyConfig | None = None, **limits: Any) -> None:
-        survey = survey or SurveyConfig()
-        self.plan = small_plan()
+    def __init__(self, **limits: Any) -> None:
+        survey, self.plan = SurveyConfig(), small_plan()
         self.vehicle = vehicle_afloat(self.plan, survey)
-        self.mission: LiveMission = mission_of(
-            self.plan, flight_settings(survey), LinkLimits(**limits)
-        )
+        link = LinkLimits(**limits)
+        self.mission: LiveMission = mission_of(self.plan, flight_settings(survey), link)
         self.loop = self.mission.loop
         self.glass: list[Array] = []
         self.clock_offset_s = 0.0
@@ -62,8 +56,6 @@ class LoopFlight:
         return self.vehicle.world.now
 
     def true_odometry(self, stamp_s: float | None = None) -> Odometry:
-        from scipy.spatial.transform import Rotation
-
         truth = self.truth.copy()
         velocity = Rotation.from_quat(truth[3:7]).inv().apply(truth[7:10])
         stamp = self.now_s if stamp_s is None else stamp_s
@@ -74,8 +66,6 @@ class LoopFlight:
 
     def true_range(self) -> float:
         """Of the altimeter at the DVL's place to the level floor."""
-        from scipy.spatial.transform import Rotation
-
         turn = Rotation.from_quat(self.truth[3:7])
         place = SurveyConfig().camera.dvl_position_body_m
         down = float(turn.apply([0.0, 0.0, 1.0])[2])
@@ -83,8 +73,6 @@ class LoopFlight:
 
     def tick(self, *, odometry: Odometry | str = "true", altitude: bool = True) -> None:
         """A tick: `odometry` may be another, or "none"."""
-        from scipy.spatial.transform import Rotation
-
         self.vehicle.sense()
         if isinstance(odometry, Odometry):
             self.loop.hear_odometry(odometry, self.now_s)

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from alice_survey.core.config import SurveyConfig
 from missions.live.mission import LinkState
@@ -29,9 +30,7 @@ def test_loop_flies_as_the_closed_loop_does() -> None:
     trigger_s, trigger_line = trigger_times(flight.plan, times, line, glass[:, :2])
     assert trigger_line == closed.trigger_line == (0,) * 6 + (1,) * 6
     # Lines are at east 0 and 1, with stations 0.8 m apart: pictures are taken there, straight.
-    north = np.interp(trigger_s, times, glass[:, 0])
-    east = np.interp(trigger_s, times, glass[:, 1])
-    depth = np.interp(trigger_s, times, glass[:, 2])
+    north, east, depth = (np.interp(trigger_s, times, axis) for axis in glass.T)
     there = np.array([*np.linspace(0, 4, 6), *np.linspace(4, 0, 6)])
     np.testing.assert_allclose(north, there, atol=0.08)  # where it stops, a little before
     np.testing.assert_allclose(east, [0.0] * 6 + [1.0] * 6, atol=0.06)
@@ -155,8 +154,6 @@ def test_pilot_without_altitude_stops_and_surfaces(following: LoopFlight) -> Non
 
 def test_altitude_is_that_of_a_level_floor_below_a_tilted_vehicle() -> None:
     """Roll and pitch move altimeter and glass; the depth of the floor comes back."""
-    from scipy.spatial.transform import Rotation
-
     flight = LoopFlight()
     flight.vehicle.sense()
     for roll, pitch in ((0.0, 0.0), (0.2, -0.1), (-0.15, 0.2)):

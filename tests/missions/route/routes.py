@@ -3,13 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from missions.route.turns import (
-    Manoeuvre,
-    Turns,
-    legs_through,
-    line_table,
-    route_of,
-)
+from missions.route.turns import Manoeuvre, Turns, legs_through, line_table, route_of
 from missions.route.ways import OPEN_WATER, Ways
 from missions.values.costs import Costs, time_costs
 from missions.values.legs import Route

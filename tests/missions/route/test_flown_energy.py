@@ -5,37 +5,25 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from alice_survey.core.config import SurveyConfig
 from alice_survey.sim.vehicle.pilot.memory import FOLLOW, LEG, PHASE
-from alice_survey.sim.vehicle.sea import level_floor
-from camera_calib.rig import design_rig
-from missions.fly.simulation import flight_settings, simulate_plan
-from missions.plan.planner import plan_survey
 from missions.plan.strength import survey_costs
 from missions.values.costs import leg_costs, power_at
 from missions.values.flight import Flight
 from missions.values.plan_file import Plan
+from tests.missions.flown_plans import flown, planned, survey
 
-CONFIG = SurveyConfig.model_validate(
-    {
-        "area": {"length_m": 9.0, "width_m": 3.0, "seafloor_depth_m": 6.0},
-        "plan": {"line_heading_deg": 0.0, "cross_lines": 1, "closing_line": False},
-        "sea": {
-            "current_mps": 0.1,
-            "current_towards_deg": 90.0,
-            "current_sigma_mps": 0.0,
-            "gust_n": (0.0, 0.0, 0.0),
-        },
-    }
+STEADY = {"current_towards_deg": 90.0, "current_sigma_mps": 0.0, "gust_n": (0.0, 0.0, 0.0)}
+CONFIG = survey(
+    area={"length_m": 9.0, "width_m": 3.0},
+    plan={"line_heading_deg": 0.0, "cross_lines": 1, "closing_line": False},
+    sea={"current_mps": 0.1, **STEADY},
 )
 
 
 @lru_cache
 def _flown() -> tuple[Plan, Flight]:
-    plan = plan_survey(CONFIG, design_rig(CONFIG.camera, CONFIG.water)).plan
-    return plan, simulate_plan(
-        plan, flight_settings(CONFIG), level_floor(6.0), np.random.default_rng(1)
-    )
+    plan = planned(CONFIG)
+    return plan, flown(plan, CONFIG)
 
 
 def test_lines_take_the_power_that_the_plan_counts_on() -> None:

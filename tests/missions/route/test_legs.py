@@ -1,4 +1,6 @@
 import math
+from dataclasses import astuple
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,37 +22,18 @@ places = st.tuples(st.floats(-1e4, 1e4), st.floats(-1e4, 1e4))
 def legs(draw: st.DrawFn) -> Leg:
     kind = draw(st.sampled_from(["straight", "arc", "spot", "sway"]))
     start, heading, length = draw(places), draw(angles), draw(lengths)
+    sign = draw(st.sampled_from([-1, 1]))
+    more: dict[str, Any] = {}
     if kind == "spot":
-        turn = draw(st.floats(0.01, math.pi)) * draw(st.sampled_from([-1, 1]))
-        return leg(start, heading, 0.0, turn=turn)
-    if kind == "sway":
-        side = draw(st.sampled_from([-1, 1])) * math.pi / 2
-        return leg(start, heading, min(length, 3.0), side=side)
-    if kind == "arc":
-        curvature = draw(st.floats(0.1, 4.0)) * draw(st.sampled_from([-1, 1]))
-        return leg(start, heading, min(length, 6.2 / abs(curvature)), curvature=curvature)
-    return leg(start, heading, length, line=draw(st.integers(-1, 9)))
-
-
-def leg(
-    start: tuple[float, float],
-    heading: float,
-    length: float,
-    *,
-    curvature: float = 0.0,
-    line: int = -1,
-    turn: float = 0.0,
-    side: float = 0.0,
-) -> Leg:
-    return Leg(
-        start_ne_m=start,
-        heading_rad=heading,
-        length_m=length,
-        curvature_per_m=curvature,
-        line=line,
-        turn_rad=turn,
-        side_rad=side,
-    )
+        length, more = 0.0, {"turn_rad": sign * draw(st.floats(0.01, math.pi))}
+    elif kind == "sway":
+        length, more = min(length, 3.0), {"side_rad": sign * math.pi / 2}
+    elif kind == "arc":
+        curvature = draw(st.floats(0.1, 4.0))
+        length, more = min(length, 6.2 / curvature), {"curvature_per_m": sign * curvature}
+    else:
+        more = {"line": draw(st.integers(-1, 9))}
+    return Leg(start_ne_m=start, heading_rad=heading, length_m=length, **more)
 
 
 @given(one=legs())
@@ -100,15 +83,8 @@ def test_a_route_costs_what_its_legs_do(many: list[Leg], seed: int) -> None:
     assert legs_j.sum() == pytest.approx(joules) and legs_s.sum() == pytest.approx(seconds)
     # What compiled code compares ways between lines by.
     ways = [one for one in many if one.line < 0]
-    table = np.array(
-        [
-            (
-                *one.start_ne_m, one.heading_rad, one.length_m, one.curvature_per_m, one.line,
-                one.turn_rad, one.side_rad,
-            )
-            for one in ways
-        ]
-    ).reshape(-1, COLUMNS)  # fmt: skip
+    rows = [(*one.start_ne_m, *astuple(one)[1:]) for one in ways]
+    table = np.array(rows, np.float64).reshape(-1, COLUMNS)
     expected = route_cost(Route(legs=tuple(ways)), costs)[0]
     assert prices_j(costs, table[None])[0] == pytest.approx(expected, rel=1e-9)
 

@@ -11,7 +11,7 @@ from alice_survey.core.errors import PlanError
 from missions.route.turns import MAX_SWAY_M, Turns
 from missions.route.ways import TOUCH_M, Ways
 from missions.values.area import multipolygon
-from missions.values.costs import SETTLE_S, Costs, time_costs
+from missions.values.costs import SETTLE_S, time_costs
 from missions.values.legs import Route
 from missions.values.line import Line
 from tests.missions.route.routes import PAPER_COSTS, route_through
@@ -77,26 +77,14 @@ def random_lines(area: MultiPolygon, ways: Ways, seed: int, count: int) -> list[
     from_home=st.booleans(),
 )
 def test_a_route_stays_inside_and_never_jumps(
-    area: MultiPolygon,
-    seed: int,
-    turns: Turns,
-    radius_m: float,
-    run_in_m: float,
-    from_home: bool,
+    area: MultiPolygon, seed: int, turns: Turns, radius_m: float, run_in_m: float, from_home: bool
 ) -> None:
     ways = Ways(area)
     lines = random_lines(area, ways, seed, 6)
     assume(len(lines) > 1)
-    home = lines[-1].stations_ne[2].tolist() if from_home else None
+    home = tuple(lines[-1].stations_ne[2].tolist()) if from_home else None
 
-    route = route_through(
-        lines,
-        radius_m,
-        run_in_m,
-        ways=ways,
-        turns=turns,
-        home_ne=None if home is None else (home[0], home[1]),
-    )
+    route = route_through(lines, radius_m, run_in_m, ways=ways, turns=turns, home_ne=home)
 
     check_joints(route)
     assert farthest_outside_m(area, route) <= 1.01 * TOUCH_M
@@ -119,24 +107,16 @@ def test_auto_is_as_cheap_as_any_way_of_turning(
     lines = random_lines(area, ways, seed, 5)
     assume(len(lines) > 1)
     rng = np.random.default_rng(seed)
-    costs = uneven_costs(rng, sway_w)
-
-    prices = {
-        turns: route_cost(
-            route_through(lines, 0.5, 0.3, ways=ways, costs=costs, turns=turns), costs
-        )[0]
-        for turns in MODES
-    }
-    assert prices["auto"] <= min(prices.values()) * (1 + 1e-9)
-
-
-def uneven_costs(rng: np.random.Generator, sway_w: float) -> Costs:
-    return time_costs(0.2)._replace(
-        line_w=rng.uniform(50, 150, 36),
-        way_w=rng.uniform(50, 150, 36),
-        stop_w=float(rng.uniform(30, 100)),
-        sway_w=sway_w * rng.uniform(50, 150, 36),
+    line_w, way_w, step_w = rng.uniform(50, 150, (3, 36))
+    costs = time_costs(0.2)._replace(
+        line_w=line_w, way_w=way_w, stop_w=float(rng.uniform(30, 100)), sway_w=sway_w * step_w
     )
+
+    def price(turns: Turns) -> float:
+        route = route_through(lines, 0.5, 0.3, ways=ways, costs=costs, turns=turns)
+        return route_cost(route, costs)[0]
+
+    assert price("auto") <= min(map(price, MODES)) * (1 + 1e-9)
 
 
 @pytest.mark.parametrize("turns", MODES)
@@ -144,10 +124,8 @@ def test_turns_are_flown_as_requested(turns: Turns, capsys: pytest.CaptureFixtur
     lines = lawn(6, 10.0, 1.0)
     route = route_through(lines, 0.5, 0.5, turns=turns)
 
-    assert (
-        turn_counts(route)
-        == {"auto": (5, 0, 0), "arcs": (5, 0, 0), "spot": (0, 10, 0), "sway": (0, 5, 5)}[turns]
-    )
+    counts = {"auto": (5, 0, 0), "arcs": (5, 0, 0), "spot": (0, 10, 0), "sway": (0, 5, 5)}
+    assert turn_counts(route) == counts[turns]
     assert capsys.readouterr().err == ""
     check_joints(route)
 
@@ -281,11 +259,8 @@ def test_parts_of_one_line_are_joined_straight() -> None:
 
 
 def test_a_route_is_continuous_and_keeps_its_lines() -> None:
-    lines = [
-        line((0.0, 0.0), (0.0, 5.0)),
-        line((1.0, 5.0), (1.0, 0.0)),
-        line((1.6, 0.0), (1.6, 5.0)),
-    ]
+    ends = (((0.0, 0.0), (0.0, 5.0)), ((1.0, 5.0), (1.0, 0.0)), ((1.6, 0.0), (1.6, 5.0)))
+    lines = [line(*both) for both in ends]
     route = route_through(lines, 0.5, 0.5)
 
     along = np.linspace(0.0, route.length_m, 20_001)

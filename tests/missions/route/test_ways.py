@@ -98,13 +98,8 @@ def test_arcs_are_inside_as_their_samples_are(
 ) -> None:
     ways = Ways(area)
     for place in places_in(area, np.random.default_rng(seed), 8).tolist():
-        leg = Leg(
-            start_ne_m=(place[0], place[1]),
-            heading_rad=heading,
-            length_m=radius * turned,
-            curvature_per_m=side / radius,
-            line=-1,
-        )
+        arc = {"length_m": radius * turned, "curvature_per_m": side / radius}
+        leg = Leg(start_ne_m=(place[0], place[1]), heading_rad=heading, **arc)
         holds = arc_free(ways, *leg.start_ne_m, heading, leg.curvature_per_m, leg.length_m)
 
         places, bend = sampled_leg(leg, 300)

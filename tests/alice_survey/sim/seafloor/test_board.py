@@ -21,11 +21,6 @@ def built_rig(seed: int = CONFIG.seed) -> Rig:
 EIGHTH = true_rig(CONFIG.camera, CONFIG.water, scale=8, seed=CONFIG.seed)
 
 
-@pytest.fixture(scope="module")
-def rig() -> Rig:
-    return built_rig()
-
-
 def find(picture: np.ndarray, board: PoolBoard) -> tuple[np.ndarray, np.ndarray]:
     """Corners in our pixels, by OpenCV and by a better fit.
 
@@ -96,14 +91,10 @@ def test_the_rig_as_built_is_near_its_drawing_but_not_on_it() -> None:
         design = drawn.cameras[name]
         assert 0.0 < abs(camera.fx_px / design.fx_px - 1.0) < 0.0031
         assert 0.0 < abs(camera.cx_px - design.cx_px) <= 2.6  # 10 px at full resolution
-        assert (
-            0.0
-            < abs(camera.parameter("port_distance_m") - design.parameter("port_distance_m"))
-            < 0.00101
-        )
-        assert (
-            0.0 < np.rad2deg(np.arccos(camera.port.axis_cam[2])) < 0.43
-        )  # 0.3 degrees about each axis
+        distances = (one.parameter("port_distance_m") for one in (camera, design))
+        assert 0.0 < abs(np.subtract(*distances)) < 0.00101
+        tilt = np.arccos(camera.port.axis_cam[2])
+        assert 0.0 < np.rad2deg(tilt) < 0.43  # 0.3 degrees about each axis
         assert -0.06 < camera.parameter("k1") < -0.04
     turn = built.cam_from_rig["right"].rotation.magnitude()
     assert 0.0 < np.rad2deg(turn) < 0.53  # 0.3 degrees about each axis

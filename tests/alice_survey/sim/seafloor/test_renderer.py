@@ -9,7 +9,7 @@ from alice_survey.core.config import SeafloorConfig, SurveyConfig
 from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.frames import rotation_from_attitude
 from alice_survey.sim.seafloor.as_built import true_rig
-from alice_survey.sim.seafloor.light import CameraLight, backscatter_at, camera_light
+from alice_survey.sim.seafloor.light import backscatter_at, camera_light
 from alice_survey.sim.seafloor.renderer import (
     Scene,
     camera_rays,
@@ -19,7 +19,7 @@ from alice_survey.sim.seafloor.renderer import (
 )
 from alice_survey.sim.seafloor.terrain import Terrain, TerrainObject, build_terrain
 from alice_survey.sim.seafloor.texture import Texture
-from camera_calib.rig import Rig, design_rig
+from camera_calib.rig import design_rig
 from camera_calib.water import water_optics
 from tests.oracles_seafloor import fermat_pixels, world_to_cam
 
@@ -27,7 +27,6 @@ CONFIG = SurveyConfig.model_validate({"imaging": {"scale": 16}})
 RIG = true_rig(CONFIG.camera, CONFIG.water, scale=16, seed=CONFIG.seed)
 CAMERA = RIG.cameras["left"]
 FLOOR_M = 15.0
-BOUNDS = (-3.0, 3.0, -3.0, 3.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,9 +36,7 @@ class Stripes(Texture):
     at_m: float
     axis: int
 
-    def albedo(
-        self, points_ned: np.ndarray, material: np.ndarray, footprint_m: np.ndarray
-    ) -> np.ndarray:
+    def albedo(self, points_ned: np.ndarray, *_: np.ndarray) -> np.ndarray:
         bright = points_ned[:, self.axis] > self.at_m
         return np.repeat(np.where(bright, 0.8, 0.1)[:, None], 3, axis=1).astype(np.float32)
 
@@ -48,35 +45,30 @@ class Stripes(Texture):
 class Even(Texture):
     """The same colour everywhere."""
 
-    def albedo(
-        self, points_ned: np.ndarray, material: np.ndarray, footprint_m: np.ndarray
-    ) -> np.ndarray:
+    def albedo(self, points_ned: np.ndarray, *_: np.ndarray) -> np.ndarray:
         return np.tile(np.array([0.4, 0.3, 0.2], dtype=np.float32), (len(points_ned), 1))
 
 
-def flat(grid_m: float = 0.25) -> Terrain:
-    config = SeafloorConfig(relief_m=0.0, rocks_per_m2=0.0, amphora=False, grid_m=grid_m)
-    return build_terrain(config, BOUNDS, FLOOR_M, np.random.default_rng(0))
+def flat(shift_m: float = 0.0, depth_m: float = FLOOR_M) -> Terrain:
+    config = SeafloorConfig(relief_m=0.0, rocks_per_m2=0.0, amphora=False, grid_m=0.25)
+    bounds = (shift_m - 3.0, shift_m + 3.0, shift_m - 3.0, shift_m + 3.0)
+    return build_terrain(config, bounds, depth_m, np.random.default_rng(0))
 
 
-def light_of(rig: Rig, name: str = "left") -> CameraLight:
-    water = water_optics("II")
-    return camera_light(rig.cameras[name], rig.body_from_cam(name), CONFIG.imaging, water, 5.0)
-
-
-LIGHT = light_of(RIG)
+LIGHT = camera_light(
+    CAMERA, RIG.body_from_cam("left"), CONFIG.imaging, water_optics("II"), reach_m=5.0
+)
+FLAT = Scene(terrain=flat(), texture=Even(seed=0))
 
 
 def pose(
     north_m: float = 0.0,
     east_m: float = 0.0,
     altitude_m: float = 2.0,
-    roll_deg: float = 0.0,
-    pitch_deg: float = 0.0,
-    heading_deg: float = 0.0,
+    attitude_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> RigidTransform:
     """Of the left camera's pupil."""
-    turn = rotation_from_attitude(*np.deg2rad([roll_deg, pitch_deg, heading_deg]))
+    turn = rotation_from_attitude(*np.deg2rad(attitude_deg))
     place = np.array([north_m, east_m, FLOOR_M - altitude_m])
     return RigidTransform.from_components(place, turn * RIG.body_from_cam("left").rotation)
 
@@ -106,7 +98,7 @@ def test_an_edge_on_the_floor_is_where_fermat_puts_it(
 ) -> None:
     """The whole way from picture over ray casting to the world, half a pixel included."""
     at_m = 0.137 if axis == 0 else -0.218
-    view = pose(0.03, -0.02, 2.0, *attitude)
+    view = pose(0.03, -0.02, 2.0, attitude)
     dark, bright, half = (
         render(
             Scene(terrain=flat(), texture=Stripes(seed=0, at_m=at, axis=axis)), CAMERA, LIGHT,
@@ -137,7 +129,7 @@ def test_an_edge_on_the_floor_is_where_fermat_puts_it(
 def test_a_flat_floor_has_the_light_of_the_closed_form() -> None:
     """Rendering with rays, against the same physics without them."""
     step = 13
-    picture = render(Scene(terrain=flat(), texture=Even(seed=0)), CAMERA, LIGHT, still(pose()), 1)
+    picture = render(FLAT, CAMERA, LIGHT, still(pose()), 1)
     expected = flat_floor_radiance(CAMERA, LIGHT, 2.0, np.array([0.4, 0.3, 0.2]), step)
     np.testing.assert_allclose(picture[::step, ::step], expected, rtol=2e-4)
     middle = picture[CAMERA.height_px // 2, CAMERA.width_px // 2]
@@ -171,8 +163,8 @@ def test_motion_blurs_by_speed_times_exposure_times_focal_length_over_range(blur
 
 
 def test_ranges_to_a_flat_floor_are_exact() -> None:
-    view = pose(0.1, -0.2, 1.8, 5.0, -3.0, 40.0)
-    ranges = range_map(Scene(terrain=flat(), texture=Even(seed=0)), CAMERA, view)
+    view = pose(0.1, -0.2, 1.8, (5.0, -3.0, 40.0))
+    ranges = range_map(FLAT, CAMERA, view)
     assert ranges.shape == (CAMERA.height_px, CAMERA.width_px)
     pixels = CAMERA.pixel_centres()
     # The point at that range on the pixel's ray is on the floor, and Fermat agrees on the pixel.
@@ -186,9 +178,8 @@ def test_ranges_to_a_flat_floor_are_exact() -> None:
 
 def test_rays_that_meet_nothing_see_only_water() -> None:
     far = pose(2.9, 2.9)
-    scene = Scene(terrain=flat(), texture=Even(seed=0))
-    ranges = range_map(scene, CAMERA, far)
-    picture = render(scene, CAMERA, LIGHT, still(far), 1)
+    ranges = range_map(FLAT, CAMERA, far)
+    picture = render(FLAT, CAMERA, LIGHT, still(far), 1)
     assert 0.1 < np.isnan(ranges).mean() < 0.9
     water, floor = picture[np.isnan(ranges)], picture[np.isfinite(ranges)]
     assert np.all(np.isfinite(picture))
@@ -198,10 +189,7 @@ def test_rays_that_meet_nothing_see_only_water() -> None:
 def test_an_amphora_hides_strobes_from_the_sand_next_to_it() -> None:
     config = SeafloorConfig(relief_m=0.0, rocks_per_m2=0.0, grid_m=0.02)
     laid = build_terrain(config, (-1.5, 1.5, -1.5, 1.5), FLOOR_M, np.random.default_rng(4))
-    bare = Terrain(
-        offset_ned=laid.offset_ned, grid_m=laid.grid_m, corner_ne=laid.corner_ne,
-        depths=laid.depths, material=laid.material,
-    )  # fmt: skip
+    bare = replace(laid, objects=())
     middle = laid.objects[0].vertices.mean(axis=0)
     view = pose(float(middle[0]), float(middle[1]), 1.5)
     with_it, without = (
@@ -237,20 +225,16 @@ def test_every_ray_of_a_pixel_has_its_share_of_the_exposure() -> None:
 
 def test_pictures_do_not_depend_on_where_the_survey_is() -> None:
     """Far from the datum, in deep water, nothing is lost to single precision."""
-    near = range_map(Scene(terrain=flat(), texture=Even(seed=0)), CAMERA, pose())
-    far_bounds = tuple(b + 40_000.0 for b in BOUNDS)
-    config = SeafloorConfig(relief_m=0.0, rocks_per_m2=0.0, amphora=False, grid_m=0.25)
-    deep = build_terrain(config, far_bounds, 5000.0, np.random.default_rng(0))  # type: ignore[arg-type]
     view = RigidTransform.from_translation([40_000.0, 40_000.0, 4985.0]) * pose()
-    far = range_map(Scene(terrain=deep, texture=Even(seed=0)), CAMERA, view)
+    deep = replace(FLAT, terrain=flat(40_000.0, 5000.0))
+    far, near = range_map(deep, CAMERA, view), range_map(FLAT, CAMERA, pose())
     np.testing.assert_allclose(far, near, atol=2e-6)
 
 
 def test_a_level_camera_sees_the_floor_below_the_horizon_and_backscatter_above() -> None:
-    scene = Scene(terrain=flat(), texture=Even(seed=0))
-    level = pose(pitch_deg=90.0, altitude_m=0.5)
+    level = pose(altitude_m=0.5, attitude_deg=(0.0, 90.0, 0.0))
     rotation = level.rotation.as_matrix()
-    found = range_map(scene, CAMERA, level, reach_m=2.5)
+    found = range_map(FLAT, CAMERA, level, reach_m=2.5)
     origins, directions = CAMERA.unproject(CAMERA.pixel_centres())
     down = directions @ rotation[2]
     start = level.translation[2] + origins @ rotation[2]
@@ -261,7 +245,7 @@ def test_a_level_camera_sees_the_floor_below_the_horizon_and_backscatter_above()
     np.testing.assert_allclose(found[near], expected[near], rtol=3e-6)
     assert np.isnan(found[down <= 0]).all()
 
-    lit = render(scene, CAMERA, LIGHT, still(level), 1)
+    lit = render(FLAT, CAMERA, LIGHT, still(level), 1)
     row, column = 3, CAMERA.width_px // 2
     place = np.array([column + 0.5, row + 0.5]) / (CAMERA.width_px, CAMERA.height_px)
     veil = np.empty(3)

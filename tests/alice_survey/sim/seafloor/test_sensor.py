@@ -28,10 +28,8 @@ def even(radiance: float, side: int = 300) -> np.ndarray:
 @pytest.mark.parametrize("radiance", [0.02, 0.5, 8.0])
 def test_shot_noise_has_the_variance_of_its_mean(radiance: float) -> None:
     electrons = expose(even(radiance), plain(), np.random.default_rng(1))
-    count = electrons.size
-    assert electrons.mean() == pytest.approx(
-        1000 * radiance, abs=5 * np.sqrt(1000 * radiance / count)
-    )
+    mean, count = 1000 * radiance, electrons.size
+    assert electrons.mean() == pytest.approx(mean, abs=5 * np.sqrt(mean / count))
     assert electrons.var() == pytest.approx(electrons.mean(), rel=5 * np.sqrt(2 / count) + 0.005)
 
 
@@ -50,16 +48,15 @@ def test_electrons_of_a_known_exposure() -> None:
 
 
 def test_large_pixels_add_small_ones() -> None:
-    one, four = (make_sensor(CameraConfig(), 1.34, 0.002, scale) for scale in (1, 4))
-    np.testing.assert_allclose(
-        four.electrons_per_radiance, 16 * np.array(one.electrons_per_radiance)
+    one, four, longer = (
+        make_sensor(CameraConfig(), 1.34, exposure_s, scale)
+        for exposure_s, scale in ((0.002, 1), (0.002, 4), (0.004, 1))
     )
+    electrons = np.array(one.electrons_per_radiance)
+    np.testing.assert_allclose(four.electrons_per_radiance, 16 * electrons)
+    np.testing.assert_allclose(longer.electrons_per_radiance, 2 * electrons)
     assert four.full_well_e == 16 * one.full_well_e
     assert four.read_noise_e == 4 * one.read_noise_e
-    longer = make_sensor(CameraConfig(), 1.34, 0.004, 1)
-    np.testing.assert_allclose(
-        longer.electrons_per_radiance, 2 * np.array(one.electrons_per_radiance)
-    )
 
 
 def test_grey_values_follow_the_srgb_curve_and_back() -> None:

@@ -62,9 +62,7 @@ def test_specks_cover_between_nothing_and_all(
     place: tuple[float, float, float], share: float
 ) -> None:
     cover, back, gloom, own = speck(*place, 0.03, share, 0.001, 0.0, 99)
-    assert 0.0 <= cover <= 1.0
-    assert 0.0 <= back <= 1.0
-    assert 0.0 <= gloom <= 1.0
+    assert all(0.0 <= share <= 1.0 for share in (cover, back, gloom))
     assert 0 <= own < 2**16
     if share == 0.0:
         assert cover == gloom == 0.0
@@ -104,18 +102,16 @@ def test_octaves_fade_before_samples_are_too_far_apart(footprint_m: float, left:
 
 
 def test_specks_end_smoothly_within_their_cell() -> None:
-    cell_m, n = 0.03, 60
-    faces = []
+    cell_m = 0.03
+
+    def covers(places: np.ndarray) -> list[float]:
+        return [speck(*place, cell_m, 1.0, 1e-4, 0.0, 5)[0] for place in places]
+
     for axis in range(3):
-        at = np.random.default_rng(axis).uniform(-1.0, 1.0, (n * n, 3))
+        at = np.random.default_rng(axis).uniform(-1.0, 1.0, (3600, 3))
         at[:, axis] = cell_m * np.round(at[:, axis] / cell_m) + 1e-9
-        faces.append([speck(*p, cell_m, 1.0, 1e-4, 0.0, 5)[0] for p in at])
-    inside = [
-        speck(*p, cell_m, 1.0, 1e-4, 0.0, 5)[0]
-        for p in np.random.default_rng(9).uniform(-1, 1, (3000, 3))
-    ]
-    assert np.max(faces) == 0.0
-    assert 0.005 < np.mean(inside) < 0.2
+        assert max(covers(at)) == 0.0
+    assert 0.005 < np.mean(covers(np.random.default_rng(9).uniform(-1, 1, (3000, 3)))) < 0.2
 
 
 def test_a_place_has_one_colour_in_any_order_of_evaluation() -> None:

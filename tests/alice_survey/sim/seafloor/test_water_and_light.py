@@ -33,16 +33,12 @@ NO_LOSS = np.zeros(3)
 
 
 def irradiance(
-    distance_m: float,
-    attenuation: np.ndarray = NO_LOSS,
-    path_m: float = 0.0,
-    off_axis_m: float = 0.0,
-) -> np.ndarray:
-    out = np.zeros(3)
-    strobe = np.array([[0.0, 0.0, -distance_m]])
-    add_direct(
-        0.0, 0.0, 0.0, UP, path_m, np.ones(1), strobe, DOWN, 1.0, 5.0, attenuation, out
-    )  # fmt: skip
+    distance_m: float, attenuation: np.ndarray = NO_LOSS, path_m: float = 0.0,
+    normal: np.ndarray = UP, lit: float = 1.0,
+) -> np.ndarray:  # fmt: skip
+    out, strobe = np.zeros(3), np.array([[0.0, 0.0, -distance_m]])
+    lit_by = np.full(1, lit)
+    add_direct(0.0, 0.0, 0.0, normal, path_m, lit_by, strobe, DOWN, 1.0, 5.0, attenuation, out)
     return out
 
 
@@ -165,10 +161,5 @@ def test_light_falls_with_the_square_of_the_distance(near: float, factor: float)
 
 
 def test_a_surface_that_faces_away_or_is_in_shadow_is_dark() -> None:
-    for normal, lit in ((DOWN, 1.0), (UP, 0.0)):
-        out = np.zeros(3)
-        strobe = np.array([[0.0, 0.0, -2.0]])
-        add_direct(
-            0.0, 0.0, 0.0, normal, 0.0, np.array([lit]), strobe, DOWN, 1.0, 1.0, NO_LOSS, out
-        )
-        assert np.all(out == 0.0)
+    assert np.all(irradiance(2.0, normal=DOWN) == 0.0)
+    assert np.all(irradiance(2.0, lit=0.0) == 0.0)
