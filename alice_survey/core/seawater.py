@@ -66,12 +66,9 @@ def n_water(
         >>> float(alice.n_water(22.0, 35.0, 15.0).round(4))
         1.3414
     """
-    values = {
-        "temperature_c": np.asarray(temperature_c, dtype=np.float64),
-        "salinity_psu": np.asarray(salinity_psu, dtype=np.float64),
-        "depth_m": np.asarray(depth_m, dtype=np.float64),
-        "wavelength_nm": np.asarray(wavelength_nm, dtype=np.float64),
-    }
+    given = (temperature_c, salinity_psu, depth_m, wavelength_nm)
+    t, s, depth, nm = (np.asarray(value, dtype=np.float64) for value in given)
+    values = {"temperature_c": t, "salinity_psu": s, "depth_m": depth, "wavelength_nm": nm}
     for name, (minimum, maximum, unit) in _REACH.items():
         wrong = values[name][~((values[name] >= minimum) & (values[name] <= maximum))]
         if wrong.size:
@@ -86,10 +83,9 @@ def n_water(
                 f"{name} = {beyond.flat[0]:g} is beyond the {minimum:g} to {maximum:g} {unit} of "
                 "Quan and Fry's index of sea water: it is extrapolated, to about 1e-4"
             )
-    t, s = values["temperature_c"], values["salinity_psu"]
-    nm = values["wavelength_nm"]
-    index: NDArray[np.float64] = _at_surface(t, s, nm)
-    return index + _by_pressure(t, s, pressure_dbar(depth_m), nm)
+    deeper = _by_pressure(t, s, pressure_dbar(depth), nm)
+    index: NDArray[np.float64] = _at_surface(t, s, nm) + deeper
+    return index
 
 
 def n_water_sigma(
@@ -131,15 +127,9 @@ def _at_surface(t: Any, s: Any, nm: Any) -> Any:
     )
 
 
-def _by_pressure(
-    t: NDArray[np.float64],
-    s: NDArray[np.float64],
-    p: NDArray[np.float64],
-    nm: NDArray[np.float64],
-) -> NDArray[np.float64]:
+def _by_pressure(t: Any, s: Any, p: Any, nm: Any) -> Any:
     """Pressure term of the index: regions III and IV of Millard and Seaver (1990), table 1."""
     pure = 1.5868383e-6 + 1.0712063e-8 / (nm * 1e-3) ** 2 - 9.4834486e-9 * t + 1.0100326e-10 * t**2
     salt = -1.1177517e-9 + 5.7311268e-11 * t - 1.5460458e-12 * t**2
     curved = -1.574074e-11 + 5.8085198e-15 * t**2
-    added: NDArray[np.float64] = p * (pure + salt * s) + p**2 * curved
-    return added
+    return p * (pure + salt * s) + p**2 * curved

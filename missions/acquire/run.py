@@ -4,10 +4,10 @@ A picture that is there already, from a run that was interrupted, is kept: each 
 not at all, and none depends on another.
 """
 
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC
 from functools import lru_cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -193,16 +193,18 @@ def run_images(
         altitude_m=planned.altitude_m,
         stamp=(terrain.stat().st_size, terrain.stat().st_mtime_ns),
     )
-    jobs = _jobs(shoot, stations, truth)
+    jobs = (
+        (shoot, station, camera, body.as_matrix())
+        for station, time_s in stations
+        for body in [_poses_over_exposure(truth, time_s, planned.exposure_s)]
+        for camera in CAMERAS
+    )
     images = list(executor.map(_take, jobs, label="pictures", total=2 * len(stations)))
+    both = [(known, station) for known, (station, _) in zip(believed, stations, strict=True)]
+    taken = zip(images, product(both, CAMERAS), strict=True)
     records = [
-        replace(
-            believed[i // 2],
-            image=image,
-            camera=CAMERAS[i % 2],
-            station=stations[i // 2][0],
-        )
-        for i, image in enumerate(images)
+        replace(known, image=image, camera=camera, station=station)
+        for image, ((known, station), camera) in taken
     ]
     write_manifest(folder / "manifest.csv", records)
     _write_poses(folder / "truth" / "poses.csv", records, stations, truth, rig)
@@ -234,15 +236,6 @@ def _believed_records(path: Path, at_s: Array) -> list[ImageRecord]:
         replace(nameless, **{name: float(values[i]) for name, values in columns.items()})  # type: ignore[arg-type]  # all are numbers
         for i in range(len(at_s))
     ]
-
-
-def _jobs(
-    shoot: _Shoot, stations: list[tuple[int, float]], truth: Trajectory
-) -> Iterator[tuple[_Shoot, int, str, Array]]:
-    for station, time_s in stations:
-        body = _poses_over_exposure(truth, time_s, shoot.exposure_s)
-        for camera in CAMERAS:
-            yield shoot, station, camera, body.as_matrix()
 
 
 def _poses_over_exposure(truth: Trajectory, time_s: float, exposure_s: float) -> RigidTransform:

@@ -9,7 +9,7 @@ differently still meet the same water. The followed point is the body's origin, 
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.core.artefacts import write_csv, write_json
+from alice_survey.core.artefacts import json_values, write_csv, write_json
 from alice_survey.core.config import SurveyConfig, change_section, parse_current
 from alice_survey.core.errors import ConfigError, VehicleError
 from alice_survey.core.executor import Executor, local_executor
@@ -178,7 +178,7 @@ class Case:
 
 Outcome = dict[str, Any]
 """A row of `flights.csv`: configuration, sea, seed, ending, look-ahead, and `FlightFigures`."""
-Summary = dict[str, dict[str, float | None]]
+_FIGURES = tuple(FlightFigures.__dataclass_fields__)
 
 
 def default_cases(plan: Plan) -> tuple[Case, ...]:
@@ -196,29 +196,6 @@ def default_cases(plan: Plan) -> tuple[Case, ...]:
         still,
         replace(still, swell_m=0.5, swell_s=6.0, swell_towards_deg=across),
     )
-
-
-def fly_all(
-    settings: FlightSettings,
-    plan: Plan,
-    cases: Sequence[Case],
-    seeds: Sequence[int],
-    executor: Executor,
-    variants: Sequence[Variant] = VARIANTS,
-) -> Iterator[Outcome]:
-    """Fly each variant in each sea, once a seed.
-
-    Args:
-        settings: sea and instruments; vehicle and the current's mean are those of the variants and
-            cases.
-        plan: what to fly.
-        cases: mean currents.
-        seeds: of the water and of the instruments.
-        executor: where tasks run.
-        variants: what flies.
-    """
-    flights = list(itertools.product(cases, variants, seeds))
-    yield from executor.map(partial(_fly_one, settings, plan), flights, label="flights")
 
 
 def _fly_one(settings: FlightSettings, plan: Plan, which: tuple[Case, Variant, int]) -> Outcome:
@@ -326,20 +303,6 @@ def turn_rows(line: Array, following: NDArray[np.bool_]) -> list[slice]:
     ]
 
 
-def summarise(outcomes: Sequence[Outcome]) -> Summary:
-    """Mean of each figure over flights, and the standard deviation of two or more."""
-    summary: Summary = {}
-    for name in FlightFigures.__dataclass_fields__:
-        values = np.array([outcome[name] for outcome in outcomes])
-        found = {"mean": values.mean()}
-        if len(values) > 1:
-            found["sd"] = values.std(ddof=1)
-        summary[name] = {
-            key: float(value) if math.isfinite(value) else None for key, value in found.items()
-        }
-    return summary
-
-
 def compare_report(
     config: SurveyConfig,
     out: Path,
@@ -378,11 +341,12 @@ def compare_report(
     first = config.seed if seed is None else seed
     seeds = list(range(first, first + flights))
     settings = flight_settings(config)
-    outcomes = list(fly_all(settings, plan, cases, seeds, executor or local_executor(), variants))
+    fly = partial(_fly_one, settings, plan)
+    jobs = list(itertools.product(cases, variants, seeds))
+    outcomes = list((executor or local_executor()).map(fly, jobs, label="flights"))
     each = len(variants) * flights
     data: dict[str, Any] = {
         "paper": PAPER,
-        "followed_point": "body origin",
         "plan": {
             "lines": len(plan.lines), "line_spacing_m": plan.line_spacing_m,
             "speed_mps": plan.speed_mps, "altitude_m": plan.altitude_m,
@@ -424,8 +388,20 @@ def _case_data(
         "across_mps": case.current_mps * math.sin(turned),
         "along_mps": case.current_mps * math.cos(turned),
         "look_ahead_m": {name: rows[-1]["look_ahead_m"] for name, rows in of.items()},
-        "variants": {name: summarise(rows) for name, rows in of.items()},
+        "variants": {
+            name: {figure: _spread([row[figure] for row in rows]) for figure in _FIGURES}
+            for name, rows in of.items()
+        },
     }
+
+
+def _spread(values: Sequence[float]) -> dict[str, float | None]:
+    """The mean over flights, and the standard deviation of two or more; None is not known."""
+    found = {"mean": np.mean(values)}
+    if len(values) > 1:
+        found["sd"] = np.std(values, ddof=1)
+    spread: dict[str, float | None] = json_values(found)
+    return spread
 
 
 def _title(case: Mapping[str, Any]) -> str:

@@ -84,7 +84,7 @@ def test_the_datum_is_the_origin() -> None:
     datum = Datum(32.8236, 34.9553, 17.0)
     places = np.array([[32.8236, 34.9553, 0.0], [32.8236, 34.9553, 12.5]])
     found = datum.ned_from_geodetic(places)
-    np.testing.assert_allclose(found, [[0, 0, 0], [0, 0, 12.5]], atol=1e-8)
+    np.testing.assert_allclose(found, [[0.0, 0.0, 0.0], [0.0, 0.0, 12.5]], atol=1e-8)
     assert datum.geodetic_from_ned(np.empty((0, 3))).shape == (0, 3)
 
 
