@@ -5,8 +5,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from scipy.spatial.transform import RigidTransform
-
 from alice_survey.core.artefacts import need_stage, refuse_links, write_json
 from alice_survey.core.config import CameraConfig, SurveyConfig, WaterConfig
 from alice_survey.core.errors import PlanError, warn
@@ -110,20 +108,12 @@ def rig_of(workspace: Path, camera: CameraConfig, water: WaterConfig) -> Rig:
             if rig_with_mount(rig) is not None:
                 return rig
             mount, how = designed.body_from_rig, "as designed"
-            found = _found_mount(workspace, rig)
-            if found is not None:
-                mount, how = found, "as the reconstruction found"
+            refined = workspace / "sparse" / "rig.json"
+            found = read_rig(refined) if refined.is_file() else rig
+            if found.body_from_rig is not None and list(found.cameras) == list(rig.cameras):
+                mount, how = found.body_from_rig, "as the reconstruction found"
             return replace(rig, body_from_rig=mount, source=f"{rig.source}; mounted {how}")
     return designed
-
-
-def _found_mount(workspace: Path, rig: Rig) -> RigidTransform | None:
-    """The mount that a reconstruction found; None where none did of these cameras."""
-    path = workspace / "sparse" / "rig.json"
-    if not path.is_file():
-        return None
-    found = read_rig(path)
-    return found.body_from_rig if list(found.cameras) == list(rig.cameras) else None
 
 
 def check_report(

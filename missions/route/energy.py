@@ -103,9 +103,10 @@ def flight_conditions(
         NavigationError: the file of the current cannot be read.
     """
     vehicle = planned_vehicle(settings)
+    by_sway = has_sway(vehicle) and settings.controller == "sway"
     return FlightConditions(
         vehicle=vehicle,
-        manner=_manner(vehicle, settings),
+        manner="held" if by_sway else "crab",
         speed_mps=plan.speed_mps,
         line_heading_deg=plan.line_heading_deg,
         current_ne_mps=expected_current(sea, depth_m),
@@ -214,7 +215,7 @@ def vehicle_costs(
         line_w=lines + hotel + imaging_w,
         way_w=between + hotel,
         stop_w=stop_w + hotel,
-        arc_extra_w=(arc_w + hotel) / pace - _known_mean(between) - hotel,
+        arc_extra_w=(arc_w + hotel) / pace - float(between[np.isfinite(between)].mean()) - hotel,
         turn_rate_rad_s=turn_rad_s,
         settle_s=SETTLE_S,
         sway_mps=step_mps,
@@ -317,11 +318,6 @@ def planned_vehicle(settings: VehicleConfig) -> Vehicle:
 def has_sway(vehicle: Vehicle) -> bool:
     """Whether any of its thrusters pushes a vehicle sideways."""
     return bool(np.any(np.abs(vehicle.configuration_matrix[1]) > 0))
-
-
-def _manner(vehicle: Vehicle, settings: VehicleConfig) -> Manner:
-    """Manner of flying lines: by sway if the vehicle has it and its controller uses it."""
-    return "held" if has_sway(vehicle) and settings.controller == "sway" else "crab"
 
 
 def expected_current(sea: SeaConfig, depth_m: float) -> Array:
@@ -481,10 +477,6 @@ def _arc(conditions: FlightConditions) -> tuple[float, float]:
     if not len(can):
         return math.inf, 1.0
     return float(power[can[0]]), float(_RATES[can[0]])
-
-
-def _known_mean(power_w: Array) -> float:
-    return float(power_w[np.isfinite(power_w)].mean())
 
 
 def _sway_step(

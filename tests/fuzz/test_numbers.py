@@ -75,13 +75,6 @@ def test_odd_numbers_of_settings_are_used_or_refused(
             assert verdict.outcome == "refused", number
 
 
-def test_a_vehicle_without_any_thrust_is_refused(tmp_path: Path) -> None:
-    sandbox = Sandbox(tmp_path)
-    path = sandbox.inside / "survey.toml"
-    path.write_text('[vehicle]\nfailures = ["starboard", "port", "vertical", "bow", "stern"]\n')
-    assert judge(read_and_check_survey, path, sandbox).outcome == "refused"
-
-
 @pytest.mark.parametrize("kind", ["pipe", "device"])
 @pytest.mark.parametrize(
     ("name", "read"),
