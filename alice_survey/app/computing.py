@@ -16,7 +16,7 @@ from alice_survey.core.executor import default_threads
 from alice_survey.core.manifest import read_manifest
 from alice_survey.core.run.resources import processor
 from alice_survey.kit.words import count, digits, duration
-from reconstruct.dense.matching_trial import CELL_PIXELS, scale_for_cell
+from reconstruct.dense.matching_trial import scale_for_cell
 
 OTHER_CORES = 16
 _CAMERAS = 2
@@ -72,9 +72,6 @@ class SurveySize:
     refined_mpx: float
     """Those at which its depth is found."""
     board_pictures: int = 0
-    pixel_m: float | None = None
-    cell_m: float | None = None
-    """Sides of a pixel on the ground and of a cell, where they are known."""
 
 
 def size_of(
@@ -94,15 +91,12 @@ def size_of(
         board_pictures: those of a board, to calibrate from.
         pixel_m: side of a pixel on the ground, if known.
     """
-    cell_m, scale = settings.dem_cell_m, settings.dense_scale
+    scale = settings.dense_scale
     if scale is None:
-        scale = 1.0 if pixel_m is None else scale_for_cell(cell_m, pixel_m)
-    if pixel_m is not None:
-        cell_m = cell_m or CELL_PIXELS * pixel_m / scale
+        scale = 1.0 if pixel_m is None else scale_for_cell(settings.dem_cell_m, pixel_m)
     return SurveySize(
-        pictures=pictures, mpx=mpx, refined_mpx=mpx * scale**2, board_pictures=board_pictures,
-        pixel_m=pixel_m, cell_m=cell_m,
-    )  # fmt: skip
+        pictures=pictures, mpx=mpx, refined_mpx=mpx * scale**2, board_pictures=board_pictures
+    )
 
 
 def workspace_size(
@@ -280,8 +274,6 @@ def summary(
             f"({others} on {OTHER_CORES}), {digits(here['memory_mib'] / 1024, 2)} GiB of memory, "
             f"{digits(here['disk_mb'] / 1e3, 2)} GB of disk"
         )
-    if lines and size.pixel_m is not None and size.cell_m is not None:
-        lines[-1] += f"; {1e3 * size.pixel_m:.2g} mm pixels, {1e3 * size.cell_m:.2g} mm surface"
     if lines and ran:
         found |= {"measured_over_predicted": round(ratio, 3), "corrected_by": round(factor, 3)}
         lines[-1] += f"; corrected by {factor:.2f}, since {', '.join(ran)} took {ratio:.2f} of it"

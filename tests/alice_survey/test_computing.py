@@ -64,7 +64,7 @@ def test_a_survey_that_was_not_learned_from_costs_what_it_did() -> None:
 def test_a_coarser_surface_takes_less() -> None:
     coarse = ReconstructConfig(dem_cell_m=0.01)
     size = size_of(10, 2.0, coarse, pixel_m=0.002)
-    assert (size.refined_mpx, size.cell_m) == (pytest.approx(2.0 * 0.5**2), 0.01)
+    assert size.refined_mpx == pytest.approx(2.0 * 0.5**2)
     fine = stage_costs(size_of(10, 2.0, SETTINGS, pixel_m=0.002))
     for stage, cost in stage_costs(size).items():
         assert (cost.cpu_s < fine[stage].cpu_s) == (stage in ("dense", "mesh"))
@@ -123,5 +123,4 @@ def test_plan_and_status_say_what_is_left_to_pay(
         assert line.startswith(name)
         for part in (" on 16), ", " of memory, ", " of disk"):
             assert part in line
-    assert "0.45 mm pixels" in lines[-1]
     assert "on 64 workers" in shown

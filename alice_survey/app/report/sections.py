@@ -6,7 +6,6 @@ A number that the summary, the facts or a verdict says is not said again in a ta
 import platform
 import tomllib
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,6 @@ from alice_survey.core.records import (
     ControlRecord,
     FlightRecord,
     MeshRecord,
-    MosaicRecord,
     PlaneRecord,
     PortRecord,
     ReferenceRecord,
@@ -255,28 +253,15 @@ def _sigma_test(held: Held) -> Iterator[Figure]:
 
 def _planes(held: Held) -> Iterator[Figure]:
     """Mosaic, else surface, of every further plane."""
-    for stage, what in (("mosaic", "mosaic"), ("dense", "dem")):
-        for folder in sorted((held.workspace / stage / "planes").glob("*")):
-            painted = held.workspace / "mosaic" / "planes" / folder.name / "mosaic.png"
-            there = held.has(stage) and all(
-                (folder / name).is_file() for name in (f"{what}.png", "plane.json")
-            )
-            if there and (what == "mosaic" or not painted.is_file()):
-                yield _plane(held, folder, what)
-
-
-def _plane(held: Held, folder: Path, what: str) -> Figure:
-    plane = PlaneRecord.read(folder / "plane.json")
-    shows = f"Surface over the plane: {plane.about}. No picture looks at it."
-    if what == "mosaic":
-        found = MosaicRecord.read(folder / "mosaic.json")
-        wide, high = (side * found.pixel for side in (found.width_px, found.height_px))
-        shows = (
-            f"Mosaic of the plane: {plane.about}, {length(wide, held.unit)} wide and "
-            f"{length(high, held.unit)} high."
-        )
-    png = shrunk_png(folder / f"{what}.png")
-    return Figure(png=png, title=f"Plane {plane.name}", alt=shows, shows=shows)
+    folders = [file.parent for file in held.workspace.glob("dense/planes/*/plane.json")]
+    for folder in sorted(folders) if held.has("dense") else ():
+        plane = PlaneRecord.read(folder / "plane.json")
+        painted = held.file(f"mosaic/planes/{folder.name}/mosaic.png")
+        shows = f"Mosaic of the plane: {plane.about}."
+        if painted is None:
+            shows = f"Surface over the plane: {plane.about}. No picture looks at it."
+        png = shrunk_png(painted or folder / "dem.png")
+        yield Figure(png=png, title=f"Plane {plane.name}", alt=shows, shows=shows)
 
 
 def _model(held: Held, found: RegistrationRecord) -> Section:
