@@ -225,19 +225,15 @@ def usable_crs(crs: Any, origin: str) -> Any:
 def middle(raw: RawShapes) -> Datum:
     """The middle of the bounds of geographic shapes, rounded so that it can be read and typed."""
     lat_lon = raw.coordinates
-    lat, lon = lat_lon[:, 0], unwrap_longitudes(lat_lon[:, 1], float(lat_lon[0, 1]))
+    # Within half a turn of the first, so that none jumps at the date line.
+    lat, east = lat_lon.T
+    lon = east[0] + (east - east[0] + 180.0) % 360.0 - 180.0
     centre_lat = (lat.min() + lat.max()) / 2
     centre_lon = (lon.min() + lon.max()) / 2
     return Datum(
         round(float(centre_lat), _DATUM_DECIMALS),
         round((float(centre_lon) + 180.0) % 360.0 - 180.0, _DATUM_DECIMALS),
     )
-
-
-def unwrap_longitudes(lon_deg: Array, near_deg: float) -> Array:
-    """Longitudes within half a turn of one, so that none jumps at the date line."""
-    turned: Array = near_deg + (np.asarray(lon_deg) - near_deg + 180.0) % 360.0 - 180.0
-    return turned
 
 
 def _distance_m(lat_lon: Array, datum: Datum) -> Array:

@@ -77,12 +77,11 @@ def _check(mission: "Mission") -> None:
     if not mission.steps:
         raise ValueError("the mission has no step")
     for number, step in enumerate(mission.steps, start=1):
-        latitudes, longitudes = zip((step.latitude_deg, step.longitude_deg),
-                                    step.start_deg or (0.0, 0.0), strict=True)  # fmt: skip
+        places = (step.latitude_deg, step.longitude_deg), step.start_deg or (0.0, 0.0)
         below = math.isfinite(step.depth_m) and step.depth_m >= 0.0
         above = math.isfinite(step.altitude_m) and step.altitude_m > 0.0
         fault = ""
-        if not (max(map(abs, latitudes)) <= 90.0 and max(map(abs, longitudes)) <= 180.0):
+        if not all(abs(lat) <= 90.0 and abs(lon) <= 180.0 for lat, lon in places):
             fault = (
                 f"the place {step.latitude_deg:g}, {step.longitude_deg:g}, or start, beyond a pole"
             )

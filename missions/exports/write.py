@@ -65,7 +65,8 @@ def write_exports(
             files |= each.write(folder, export)
     about = folder / "about.txt"
     files[about] = "what the files hold, and how"
-    notes = _advice(export, names, chosen=formats is not None)
+    notes = _cola2(export, chosen=formats is not None) if "cola2" in names else []
+    notes += _ardusub(export) if {"wpl", "qgc"} & set(names) else []
     if refusal:
         warn(f"missions are left out: {refusal}")
         notes = [f"Missions are left out: {refusal}."]
@@ -135,11 +136,10 @@ def export_report(
     plan = read_plan(path)
     survey = _config_of_plan(path)
     rig = design_rig(survey.camera, survey.water)
-    options = options_of(survey.camera, survey.plan, survey.vehicle, survey.sea)
+    given: dict[str, Any] = {"camera_on": camera_on, "camera_off": camera_off}
     options = replace(
-        options,
-        camera_on=options.camera_on if camera_on is None else camera_on,
-        camera_off=options.camera_off if camera_off is None else camera_off,
+        options_of(survey.camera, survey.plan, survey.vehicle, survey.sea),
+        **{name: service for name, service in given.items() if service is not None},
     )
     folder = path.parent / "exports" if out is None else out
     files = write_exports(folder, plan, rig, formats=formats, options=options)
@@ -199,26 +199,12 @@ def _config_of_plan(path: Path) -> SurveyConfig:
     return parse_config(known, str(path.parent))
 
 
-def _advice(export: Export, formats: list[str], *, chosen: bool) -> list[str]:
-    """Lines for people who load missions: parameters to set, and what is to be expected.
-
-    Warns where COLA2 cannot hold the plan's lines in the expected current, if its formats were
-    chosen or the vehicle has no sway: others are flown by what holds them better.
-
-    Args:
-        export: the plan.
-        formats: names of those that are written.
-        chosen: whether somebody chose them.
-    """
-    lines = []
-    if "cola2" in formats:
-        lines += _cola2(export, chosen=chosen)
-    if any(name in ("wpl", "qgc") for name in formats):
-        lines += _ardusub(export)
-    return lines
-
-
 def _cola2(export: Export, *, chosen: bool) -> list[str]:
+    """Parameters to set, and what is to be expected in the current.
+
+    Warns where COLA2 cannot hold the plan's lines in it, if formats were chosen or the vehicle has
+    no sway: others are flown by what holds them better.
+    """
     plan, follower = export.plan, export.options.follower
     if follower is None:
         return []

@@ -279,9 +279,10 @@ def _place(latitude: str, longitude: str, fix: str, scale: float = 1.0) -> Reade
     return take(latitude, longitude, scale=scale, where=lambda t: t[fix] >= _FIX_3D)
 
 
-def _valid(*fields: str, by: Sequence[str]) -> Reader:
-    """Fields of PX4 where its flags say that they hold."""
-    return take(*fields, where=lambda t: np.min(t.stack(*by), axis=1) > 0)
+def _velocity_holds(table: LogTable) -> Mask:
+    """Rows of PX4 whose flags say that velocities hold."""
+    holds: Mask = np.min(table.stack("v_xy_valid", "v_z_valid"), axis=1) > 0
+    return holds
 
 
 def _sees_down(table: LogTable) -> Mask:
@@ -369,7 +370,7 @@ _ULG: Mapping[str, tuple[Source, ...]] = {
     "depth": (
         Source(
             _LOCAL,
-            _valid("z", by=("z_valid",)),
+            take("z", where=lambda t: t["z_valid"] > 0),
             "depths count from where the vehicle's filter was started: --tide takes off its height "
             "above the water, if that was not the surface",
             take("epv"),
@@ -377,7 +378,7 @@ _ULG: Mapping[str, tuple[Source, ...]] = {
     ),
     "attitude": (Source("vehicle_attitude", _px4_attitude),),
     "altitude": (Source("distance_sensor", take("current_distance", where=_hears_well)),),
-    "velocity": (Source(_LOCAL, _valid("vx", "vy", "vz", by=("v_xy_valid", "v_z_valid"))),),
+    "velocity": (Source(_LOCAL, take("vx", "vy", "vz", where=_velocity_holds)),),
     "rates": (Source("vehicle_angular_velocity", take(*(f"xyz[{i}]" for i in range(3)))),),
     "pwm": (Source("actuator_outputs", take(*(f"output[{i}]" for i in range(8)))),),
 }

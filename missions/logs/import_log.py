@@ -342,7 +342,6 @@ def _report(
         warn(f"{path}: {len(gaps)} gaps in {leading}: {spans}{more}")
     signals = {role: getattr(dive, role) for role in ("position", "depth", "attitude", "altitude")}
     named = {role: signal.source for role, signal in signals.items() if signal is not None}
-    steps = np.diff(time_s)
     data: dict[str, Any] = {
         "log": str(path),
         "kind": dive.kind,
@@ -352,7 +351,6 @@ def _report(
         "rows": len(time_s),
         "start": _date(float(time_s[0])) if dive.dated else float(time_s[0]),
         "duration_s": round(float(time_s[-1] - time_s[0]), 6),
-        "median_interval_s": round(float(np.median(steps)), 6) if len(steps) else None,
         "sources": named,
         "depths_from": "level of the tide" if tidal else "sea surface",
         "filled": filled,

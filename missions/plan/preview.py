@@ -244,38 +244,32 @@ def _plan_json(planned: Planned, rig: Rig) -> dict[str, Any]:
 
 
 def _holes(seen: Certificate) -> list[dict[str, Any]]:
-    found = []
-    for hole in find_holes(seen)[:_MAX_HOLES]:
-        outer = max(hole.outline.geoms, key=lambda part: float(part.area)).exterior
-        found.append(
-            {
-                "outer": _round_points(np.asarray(outer.coords)[:-1]),
-                "area_m2": hole.area_m2,
-                "unseen_m2": hole.unseen_m2,
-            }
-        )
-    return found
+    holes = find_holes(seen)[:_MAX_HOLES]
+    outers = [max(hole.outline.geoms, key=lambda part: float(part.area)) for hole in holes]
+    return [
+        {"outer": _round_points(next(rings_ne(outer))), "area_m2": hole.area_m2,
+         "unseen_m2": hole.unseen_m2}
+        for hole, outer in zip(holes, outers, strict=True)
+    ]  # fmt: skip
 
 
 def _profile(plan: Plan, bathymetry: Bathymetry | None) -> dict[str, Any]:
     """Depth of the floor and of the glass along the ways of all dives."""
-    along, floor, depth, number = [], [], [], []
+    parts = []
     length_m = max(plan.length_m, 1e-9)
     before_m = 0.0
     for index, dive in enumerate(plan.dives, start=1):
         share = math.ceil(_PROFILE_POINTS * dive.route.length_m / length_m)
         s = np.linspace(0.0, dive.route.length_m, max(2, share if bathymetry else 2))
         glass_m, floor_m = depths_along(plan, dive, s, bathymetry)
-        along.append(before_m + s)
-        floor.append(floor_m)
-        depth.append(glass_m)
-        number.append(np.full(len(s), index))
+        parts.append(np.stack([before_m + s, floor_m, glass_m, np.full(len(s), index)]))
         before_m += dive.route.length_m
+    along, floor, glass, number = np.concatenate(parts, axis=1)
     return {
-        "s_m": np.round(np.concatenate(along), 2).tolist(),
-        "floor_depth_m": np.round(np.concatenate(floor), 3).tolist(),
-        "vehicle_depth_m": np.round(np.concatenate(depth), 3).tolist(),
-        "dive": np.concatenate(number).tolist(),
+        "s_m": np.round(along, 2).tolist(),
+        "floor_depth_m": np.round(floor, 3).tolist(),
+        "vehicle_depth_m": np.round(glass, 3).tolist(),
+        "dive": number.astype(int).tolist(),
     }
 
 
