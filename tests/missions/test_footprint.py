@@ -67,19 +67,16 @@ def test_the_size_is_of_the_largest_upright_rectangle_that_is_seen(
 @given(
     altitude_m=st.floats(0.3, 10),
     heading=st.floats(-3.2, 3.2),
-    north=st.floats(-1e3, 1e3),
-    east=st.floats(-1e3, 1e3),
+    place=st.tuples(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3)),
 )
 def test_a_level_footprint_is_the_same_wherever_it_points(
-    altitude_m: float, heading: float, north: float, east: float
+    altitude_m: float, heading: float, place: tuple[float, float]
 ) -> None:
-    pose = level_pose(LEFT, np.array([north, east]), altitude_m, 30.0, heading)
+    pose = level_pose(LEFT, np.array(place), altitude_m, 30.0, heading)
     border = footprint_ne(LEFT, pose, 30.0)
 
-    turn = np.array(
-        [[math.cos(heading), math.sin(heading)], [-math.sin(heading), math.cos(heading)]]
-    )
-    about = (border - [north, east]) @ turn.T
+    c, s = math.cos(heading), math.sin(heading)
+    about = (border - place) @ np.array([[c, -s], [s, c]])
     home = footprint_ne(LEFT, level_pose(LEFT, np.zeros(2), altitude_m, 30.0, 0.0), 30.0)
     np.testing.assert_allclose(about, home, atol=1e-9)
 

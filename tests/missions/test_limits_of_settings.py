@@ -65,7 +65,7 @@ def table_of(config: SurveyConfig) -> str:
 @pytest.mark.parametrize(
     ("section", "key", "kind"), numbers(), ids=lambda part: getattr(part, "__name__", part)
 )
-def test_a_number_at_its_limit_is_used_or_refused_in_a_line(
+def test_a_number_at_its_limit_is_used_or_refused_in_a_line_and_true_is_none(
     section: str, key: str, kind: type
 ) -> None:
     for value in limits(section, key, kind):
@@ -76,12 +76,6 @@ def test_a_number_at_its_limit_is_used_or_refused_in_a_line(
             assert len(said.splitlines()) == 1
         odd = _MAX_NUMBER.search(said)
         assert not odd, f"{value}: {said[max(0, odd.start() - 100) : odd.end() + 100]}"
-
-
-@pytest.mark.parametrize(
-    ("section", "key", "kind"), numbers(), ids=lambda part: getattr(part, "__name__", part)
-)
-def test_true_is_no_number(section: str, key: str, kind: type) -> None:
     with pytest.raises(ConfigError, match=f"{section}.{key}"):
         parse_config({section: {key: True}}, "settings")
 
