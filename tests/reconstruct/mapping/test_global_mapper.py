@@ -91,11 +91,8 @@ def test_averaging_beats_the_links_and_ignores_a_wrong_one() -> None:
     assert 0.1 * noise < np.sqrt((clean**2).mean()) < 2.0 * noise
     turned = Rotation.from_rotvec([0.0, 0.0, 1.0])
     wrong = links[4].second_from_first
-    links[4] = linked(
-        links[4].first,
-        links[4].second,
-        RigidTransform.from_components(wrong.translation + 1.0, turned * wrong.rotation),
-    )
+    wrong = RigidTransform.from_components(wrong.translation + 1.0, turned * wrong.rotation)
+    links[4] = linked(links[4].first, links[4].second, wrong)
     spoiled = misses(links, poses)[:, 0]
     assert np.abs(spoiled - clean).max() < 2.0 * noise
 

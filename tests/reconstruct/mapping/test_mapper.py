@@ -194,15 +194,8 @@ def oblique_scene(camera: pycolmap.Camera, rng: np.random.Generator, names: Sequ
     """Eight stations around a bumpy floor, looking at its middle; 0.2 m from left to right."""
     points = np.column_stack([rng.uniform(-1.6, 1.6, (700, 2)), rng.uniform(-0.25, 0.25, 700)])
     records, poses, pixels, ids = [], [], [], []
-    cam_from_left = {
-        "left": RigidTransform.identity(),
-        "right": RigidTransform.from_components(
-            [-0.2, 0.0, 0.0], Rotation.from_rotvec([0.0, 0.03, 0.01])
-        ),
-        "top": RigidTransform.from_components(
-            [-0.1, 0.25, 0.02], Rotation.from_rotvec([-0.1, 0.05, 0.2])
-        ),
-    }
+    shifts = {"left": [0, 0, 0], "right": [-0.2, 0.0, 0.0], "top": [-0.1, 0.25, 0.02]}
+    turns = {"left": [0, 0, 0], "right": [0.0, 0.03, 0.01], "top": [-0.1, 0.05, 0.2]}
     for station, angle in enumerate(0.35 * np.arange(8)):
         place = np.array([1.6 * np.cos(angle), 1.6 * np.sin(angle), -2.0])
         forward = -place / np.linalg.norm(place)
@@ -211,7 +204,8 @@ def oblique_scene(camera: pycolmap.Camera, rng: np.random.Generator, names: Sequ
         rotation = Rotation.from_matrix(np.column_stack([side, np.cross(forward, side), forward]))
         left = RigidTransform.from_components(place, rotation)
         for name in names:
-            pose = left * cam_from_left[name].inv()
+            turn = Rotation.from_rotvec(turns[name])
+            pose = left * RigidTransform.from_components(shifts[name], turn).inv()
             local = pose.inv().apply(points)
             seen = np.asarray(camera.img_from_cam(local))
             inside = np.all((seen > 0) & (seen < [800, 600]), axis=1) & (local[:, 2] > 0.3)
