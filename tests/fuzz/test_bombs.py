@@ -129,7 +129,7 @@ def test_links_in_archives_are_not_followed(sandbox: Sandbox) -> None:
     tried(sandbox, "a.kmz", packed({link: "/etc/passwd"}), areas.read_area)
 
 
-_JSON = {
+_JSON: dict[str, Callable[[Path], object]] = {
     "a.geojson": areas.read_area, "rig.json": cameras.read_rig,
     "v.json": logs.read_vehicle, "board.json": cameras.read_board,
 }  # fmt: skip
@@ -248,7 +248,7 @@ def _jpeg(width: int, height: int, tmp: Path) -> bytes:
     return bytes(data)
 
 
-_READERS = {
+_READERS: dict[str, Callable[[Path], object]] = {
     "import": cameras.read_picture, "match": cameras.read_for_matching,
     "mask": cameras.read_small_mask, "board": cameras.look_for_board,
 }  # fmt: skip

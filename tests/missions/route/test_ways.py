@@ -1,4 +1,5 @@
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -98,7 +99,7 @@ def test_arcs_are_inside_as_their_samples_are(
 ) -> None:
     ways = Ways(area)
     for place in places_in(area, np.random.default_rng(seed), 8).tolist():
-        arc = {"length_m": radius * turned, "curvature_per_m": side / radius}
+        arc: dict[str, Any] = {"length_m": radius * turned, "curvature_per_m": side / radius}
         leg = Leg(start_ne_m=(place[0], place[1]), heading_rad=heading, **arc)
         holds = arc_free(ways, *leg.start_ne_m, heading, leg.curvature_per_m, leg.length_m)
 
