@@ -56,7 +56,8 @@ def write_coverage_tif(path: Path, certificate: Certificate) -> None:
 
     datum, cell_m = certificate.area.datum, certificate.grid.cell_m
     crs = f"EPSG:{datum.utm_epsg}"
-    geodetic = datum.geodetic_from_ned(_at_surface(certificate.area.corners_ne))
+    corners_ne = certificate.area.corners_ne
+    geodetic = datum.geodetic_from_ned(np.column_stack([corners_ne, np.zeros(len(corners_ne))]))
     to_utm = Transformer.from_crs("EPSG:4326", crs, always_xy=True)
     east, north = to_utm.transform(geodetic[:, 1], geodetic[:, 0])
     west_m, north_m = float(np.min(east)), float(np.max(north))
@@ -118,10 +119,6 @@ def _between(corners: Array, rows: int, columns: int) -> Array:
     bottom = corners[1, 0] * (1 - right) + corners[1, 1] * right
     places: Array = top * (1 - down) + bottom * down
     return places
-
-
-def _at_surface(points_ne: Array) -> Array:
-    return np.column_stack([points_ne, np.zeros(len(points_ne))])
 
 
 _AREA, _HOLE, _TRACK = "#17202a", "#c0392b", "#17202a"

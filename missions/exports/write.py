@@ -187,15 +187,16 @@ def _config_of_plan(path: Path) -> SurveyConfig:
     """Camera, water, limits, vehicle and sea that a plan was made with."""
     stage = read_stage(path.parent)
     settings = {} if stage is None else stage.settings
-    if "camera" not in settings or "water" not in settings:
+    known = {
+        key: settings[key]
+        for key in ("camera", "water", "plan", "vehicle", "sea")
+        if isinstance(settings.get(key), dict)
+    }
+    if not {"camera", "water"} <= known.keys():
         raise PlanError(
             f"{path}: is not in a finished plan folder, so that where the camera sits on the "
             "vehicle is not known: give the survey's settings too"
         )
-    known = {key: settings[key] for key in ("camera", "water")}
-    for key in ("plan", "vehicle", "sea"):
-        if isinstance(settings.get(key), dict):
-            known[key] = settings[key]
     return parse_config(known, str(path.parent))
 
 

@@ -22,7 +22,7 @@ from missions.areas.bathymetry import Bathymetry
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.drawing import draw_counts, draw_polygons, finish_map, map_sheet
 from missions.coverage.stations import plan_pattern, stations_of_plan
-from missions.exports.geometry import footprint_outline, footprints_ne
+from missions.exports.geometry import footprint_outline, footprints_ne, route_ne
 from missions.plan.planner import area_bathymetry
 from missions.values.line import LINE_KINDS
 from missions.values.plan_file import Plan, read_plan
@@ -100,10 +100,7 @@ def plan_figure(
     """
     outline = footprint_outline(plan, rig)
     shapes = [shape for line in plan.lines for shape in footprints_ne(line, outline)]
-    ways = [
-        dive.route.places(np.linspace(0.0, dive.route.length_m, _points(dive.route.length_m)))
-        for dive in plan.dives
-    ]
+    ways = [route_ne(dive.route) for dive in plan.dives]
     figure, axes = map_sheet(
         _bounds(np.vstack([plan.area.corners_ne[:, :2], *shapes, *ways]), plan)
     )
@@ -236,7 +233,3 @@ def _draw_bathymetry(axes: Axes, bathymetry: Bathymetry) -> None:
         colour = COLOURS["contour"]
         lines = axes.contour(easts, norths, depth, 10, colors=colour, linewidths=0.6, zorder=1.5)
         axes.clabel(lines, fontsize=7, fmt="%g m")
-
-
-def _points(length_m: float) -> int:
-    return int(min(max(length_m / 0.02, 200), 200_000))
