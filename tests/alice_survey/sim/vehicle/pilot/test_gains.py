@@ -12,7 +12,8 @@ from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.dynamics import Body, add_coriolis, add_damping
 from alice_survey.sim.vehicle.pilot import gains as g
-from alice_survey.sim.vehicle.vehicle import SETS, vehicle_from
+from alice_survey.sim.vehicle.vehicle import SETS, Vehicle, vehicle_from
+from tests.alice_survey.sim.vehicle import motions as m
 from tests.alice_survey.sim.vehicle.pilot.pilot_runs import gains_of
 from tests.oracles_navigation import jacobian
 
@@ -229,3 +230,38 @@ def test_a_lost_lateral_thruster_makes_sway_as_slow_as_the_pair_that_helps_it() 
     slow = g.gains_for(lame, 0.2).axes[g.SWAY]
     assert slow[g.LAG] > 2.0 * g.gains_for(whole, 0.2).axes[g.SWAY, g.LAG]
     assert slow[g.LAG] < 0.85
+
+
+def growth(craft: Vehicle, speed_mps: float) -> float:
+    """Fastest growth of heave, pitch rate and pitch, by differences of the equations of motion.
+
+    Surge is held: its acceleration is cancelled by a force.
+    """
+
+    def slopes(motion: Array) -> Array:
+        heave, turn, pitch = motion
+        nu = np.array([speed_mps, 0.0, heave, 0.0, turn, 0.0])
+        state = m.state_of(craft, nu, (0.0, pitch, 0.0))
+        free, pushed = (m.rates(craft, state, push * m.U)[7:13] for push in (0.0, 1.0))
+        slope = pushed - free
+        return np.append((free - slope * free[0] / slope[0])[[2, 4]], turn)
+
+    return float(np.linalg.eigvals(jacobian(slopes, 3, 1e-6)).real.max())
+
+
+@pytest.mark.parametrize("name", ["alice", "sparus2"])
+@pytest.mark.parametrize("coefficients", SETS)
+def test_pitch_grows_above_that_speed_and_fades_below(name: str, coefficients: str) -> None:
+    craft = vehicle_from(name, coefficients)
+    speed_mps = g.pitch_divergence_speed_mps(craft)
+    if coefficients == "calibrated":
+        assert speed_mps == math.inf
+        assert growth(craft, 1.0) < 0.0
+        assert growth(craft, 3.0) < 0.0
+        return
+    assert growth(craft, 0.97 * speed_mps) < 0.0 < growth(craft, 1.03 * speed_mps)
+
+
+def test_speeds_of_alice_are_the_documented_ones() -> None:
+    speeds = [g.pitch_divergence_speed_mps(vehicle_from("alice", each)) for each in SETS]
+    assert speeds == pytest.approx([0.316, 0.248, math.inf, 0.259], abs=0.0006)

@@ -8,7 +8,6 @@ import pytest
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.pilot import gains as g
-from alice_survey.sim.vehicle.pilot import memory as safety
 from alice_survey.sim.vehicle.pilot import memory as slot
 from alice_survey.sim.vehicle.pilot.memory import PilotState, SafetyLimits, new_pilot
 from tests.alice_survey.sim.vehicle.pilot.pilot_runs import launch, steered, straight
@@ -30,10 +29,10 @@ def watched(
     """The reason, and after how long, while progress grows at a speed."""
     for k in range(round(seconds / TICK_S)):
         progress = time_s + speed * k * TICK_S
-        reason = safety.watch(time_s, TICK_S, estimate, progress, LIMITS, pilot)
+        reason = slot.watch(time_s, TICK_S, estimate, progress, LIMITS, pilot)
         if reason:
             return reason, (k + 1) * TICK_S
-    return safety.NONE, math.nan
+    return slot.NONE, math.nan
 
 
 def pilot_in(phase: int) -> PilotState:
@@ -46,17 +45,17 @@ def pilot_in(phase: int) -> PilotState:
 @pytest.mark.parametrize(
     ("estimate", "phase", "speed", "reason", "after_s"),
     [
-        (calm(altitude_m=0.9), slot.FOLLOW, 0.2, safety.TOO_LOW, 10.0),
-        (calm(altitude_m=0.9), slot.DIVE, 0.2, safety.TOO_LOW, 10.0),
-        (calm(altitude_m=0.49), slot.FOLLOW, 0.2, safety.TOO_LOW, 1.0),
-        (calm(altitude_m=0.49), slot.DIVE, 0.2, safety.TOO_LOW, 1.0),
-        (calm(pitch_rad=0.6), slot.FOLLOW, 0.2, safety.TOO_STEEP, 1.0),
-        (calm(pitch_rad=-0.6), slot.APPROACH, 0.2, safety.TOO_STEEP, 1.0),
-        (calm(altitude_m=math.nan), slot.FOLLOW, 0.2, safety.NO_BOTTOM, 20.0),
-        (calm(depth_m=20.1), slot.DIVE, 0.2, safety.TOO_DEEP, TICK_S),
-        (calm(), slot.DIVE, 0.0, safety.NO_DIVE, 90.0),
-        (calm(), slot.APPROACH, -0.1, safety.NO_APPROACH, 90.0),
-        (calm(), slot.FOLLOW, 0.0005, safety.NO_PROGRESS, 90.0),
+        (calm(altitude_m=0.9), slot.FOLLOW, 0.2, slot.TOO_LOW, 10.0),
+        (calm(altitude_m=0.9), slot.DIVE, 0.2, slot.TOO_LOW, 10.0),
+        (calm(altitude_m=0.49), slot.FOLLOW, 0.2, slot.TOO_LOW, 1.0),
+        (calm(altitude_m=0.49), slot.DIVE, 0.2, slot.TOO_LOW, 1.0),
+        (calm(pitch_rad=0.6), slot.FOLLOW, 0.2, slot.TOO_STEEP, 1.0),
+        (calm(pitch_rad=-0.6), slot.APPROACH, 0.2, slot.TOO_STEEP, 1.0),
+        (calm(altitude_m=math.nan), slot.FOLLOW, 0.2, slot.NO_BOTTOM, 20.0),
+        (calm(depth_m=20.1), slot.DIVE, 0.2, slot.TOO_DEEP, TICK_S),
+        (calm(), slot.DIVE, 0.0, slot.NO_DIVE, 90.0),
+        (calm(), slot.APPROACH, -0.1, slot.NO_APPROACH, 90.0),
+        (calm(), slot.FOLLOW, 0.0005, slot.NO_PROGRESS, 90.0),
     ],
 )
 def test_each_reason_comes_after_its_time(
@@ -72,10 +71,10 @@ def test_without_bottom_lock_the_navigation_decides_if_it_may() -> None:
     for sigma_m, goes_on in ((0.4, True), (0.6, False), (math.nan, False)):
         pilot = pilot_in(slot.FOLLOW)
         pilot.memory[slot.SIGMA_M], pilot.memory[slot.LOST_S] = sigma_m, 30.0
-        safety.mind_floor(10.0, blind, limits, pilot)
+        slot.mind_floor(10.0, blind, limits, pilot)
         assert pilot.memory[slot.PACE] == (1.0 if goes_on else 0.0)
-        reason = safety.watch(0.0, TICK_S, blind, 1.0, limits, pilot)
-        assert reason == (safety.NONE if goes_on else safety.NO_BOTTOM)
+        reason = slot.watch(0.0, TICK_S, blind, 1.0, limits, pilot)
+        assert reason == (slot.NONE if goes_on else slot.NO_BOTTOM)
 
 
 @pytest.mark.parametrize("lost", range(12))
@@ -89,7 +88,7 @@ def test_without_navigation_the_vehicle_pushes_itself_up(lost: int) -> None:
         expected = g.STEADY_SHARE * flight.gains.axes[g.HEAVE, g.MIN_FORCE]
         np.testing.assert_array_equal(wrench, [0, 0, expected, 0, 0, 0])
     assert flight.pilot.report[slot.PHASE] == slot.ABORT
-    assert flight.pilot.report[slot.REASON] == safety.NO_NAVIGATION
+    assert flight.pilot.report[slot.REASON] == slot.NO_NAVIGATION
     assert np.all(np.isfinite(flight.pilot.memory[: slot.BEST]))
 
 
@@ -99,7 +98,7 @@ def test_an_abort_takes_the_vehicle_to_the_surface() -> None:
     flight.floor[0] -= 1.8  # a rock: 0.2 m below the port
     rows = flight.fly(90.0)
     assert rows.phases() == [slot.FOLLOW, slot.ABORT]
-    assert rows.report[-1, slot.REASON] == safety.TOO_LOW
+    assert rows.report[-1, slot.REASON] == slot.TOO_LOW
     low_s = rows.time_s[np.argmax(rows.report[:, slot.PHASE] == slot.ABORT)] - rows.time_s[0]
     assert 0.9 < low_s < 1.2
     assert rows.estimate[:, vector.CLEARANCE].min() > 0.1
