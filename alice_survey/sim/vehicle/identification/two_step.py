@@ -26,7 +26,7 @@ from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 from scipy.signal import fftconvolve, savgol_filter
 from scipy.spatial.transform import Rotation
 
@@ -49,7 +49,10 @@ from alice_survey.sim.vehicle.vehicle import Vehicle, parse_table
 class Pull(Config):
     """One reading."""
 
-    thrusters: tuple[Annotated[str, Field(min_length=1)], ...]
+    thruster: Annotated[
+        tuple[Annotated[str, Field(min_length=1)], ...],
+        BeforeValidator(lambda text: [name.strip() for name in text.split("+")]),
+    ]
     rpm: float
     force_n: float
 
@@ -87,17 +90,9 @@ def read_pulls(path: Path) -> list[Pull]:
         VehicleError: the file cannot be read, lacks a column, has no rows, or holds a value that is
             not a number, or a force against its speed.
     """
-    _, rows = read_csv(path, ("thruster", "rpm", "force_n"), fault=VehicleError)
+    _, rows = read_csv(path, Pull.model_fields, fault=VehicleError)
     pulls = [
-        parse_table(
-            f"{path} line {line}",
-            Pull,
-            {
-                "thrusters": [name.strip() for name in row["thruster"].split("+")],
-                "rpm": row["rpm"],
-                "force_n": row["force_n"],
-            },
-        )
+        parse_table(f"{path} line {line}", Pull, {name: row[name] for name in Pull.model_fields})
         for line, row in rows
     ]
     if not pulls:
@@ -112,7 +107,7 @@ def fit_pulls(pulls: Sequence[Pull], vehicle: Vehicle) -> list[ThrustCoefficient
         VehicleError: the vehicle has no such thruster, or one pulled alone and with others.
     """
     by_name = {thruster.name: thruster for thruster in vehicle.thrusters}
-    groups = sorted({pull.thrusters for pull in pulls})
+    groups = sorted({pull.thruster for pull in pulls})
     seen: set[str] = set()
     found = []
     for group in groups:
@@ -123,7 +118,7 @@ def fit_pulls(pulls: Sequence[Pull], vehicle: Vehicle) -> list[ThrustCoefficient
                 raise VehicleError(f"{name} pulled alone and with others: keep one kind of reading")
             seen.add(name)
         for way, sign in (("forward", 1.0), ("reverse", -1.0)):
-            rows = [pull for pull in pulls if pull.thrusters == group and sign * pull.rpm > 0]
+            rows = [pull for pull in pulls if pull.thruster == group and sign * pull.rpm > 0]
             if not rows:
                 continue
             unit = np.array([_unit_force(vehicle, group, pull.rpm / 60.0) for pull in rows])

@@ -105,9 +105,9 @@ def path_from_legs(
         raise VehicleError(
             f"the path's altitude ({altitude_m:g} m) and speed ({speed_mps:g} m/s) must be positive"
         )
-    spot, aside, bent = turns != 0, side != 0, curvature != 0
+    pivots, aside, bent = turns != 0, side != 0, curvature != 0
     square = np.abs(np.abs(side) - math.pi / 2) <= _KINK_RAD
-    bad = np.where(spot, (length != 0) | bent | aside, (length <= 0) | (aside & (bent | ~square)))
+    bad = np.where(pivots, (length != 0) | bent | aside, (length <= 0) | (aside & (bent | ~square)))
     for i in np.flatnonzero(bad).tolist():
         raise VehicleError(
             f"leg {i} of the path is {length[i]:g} m long, curvature {curvature[i]:g}, turns "
@@ -129,7 +129,7 @@ def path_from_legs(
                 f"off the end of leg {before}: legs must join"
             )
         heading[i] = heading[before] + turned + kink_rad
-    standing = spot | aside
+    standing = pivots | aside
     return Path(
         start_n=np.ascontiguousarray(start[:, 0]),
         start_e=np.ascontiguousarray(start[:, 1]),
