@@ -44,7 +44,7 @@ def test_outliers_do_not_bend_a_model() -> None:
 
 
 def test_sigma_of_the_dome_holds_for_correlated_errors() -> None:
-    xy = 0.05 * np.argwhere(np.ones((120, 120)))
+    xy = np.argwhere(np.ones((120, 120))).astype(np.float64) * 0.05
     ratios = []
     for seed in range(60):
         noise = gaussian_filter(np.random.default_rng(seed).normal(size=(120, 120)), 3)
