@@ -97,11 +97,6 @@ class ControlFit:
         return tuple(b for b in self.bars if b.known.use == "control")
 
     @property
-    def informs(self) -> bool:
-        """Whether anything is used."""
-        return bool(self.used_points or self.used_bars)
-
-    @property
     def informs_scale(self) -> bool:
         """Whether the scale is seen."""
         return len(self.used_points) > 1 or bool(self.used_bars)

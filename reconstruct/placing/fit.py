@@ -95,9 +95,6 @@ class PlacementFit:
     bends: tuple[BendRecord, ...]
     """How bent the model is still, along the block and, where it is wide, across; none where
     stations are too few."""
-    nuisances: Mapping[str, NuisanceRecord]
-    """What was found of the errors of the lever arm (m), the clock (s), the mount (degrees) and
-    navigation's own frame (turn in degrees, stretch), and their sigmas."""
     stated: GeoreferenceRecord
     """What `georeference.json` says but for the covariance and the mount."""
     mount: FoundMount | None = None
@@ -116,11 +113,6 @@ class PlacementFit:
     def sigma_position_m(self) -> Array:
         """(3,) sigma of the middle of the track, north, east and down."""
         return np.asarray(np.sqrt(np.diag(self.covariance)[3:6]))
-
-    @property
-    def sigma_tilt_deg(self) -> Array:
-        """(2,) sigma of rotation about north and about east."""
-        return np.asarray(np.rad2deg(np.sqrt(np.diag(self.covariance)[:2])))
 
     @property
     def sigma_heading_deg(self) -> float:
@@ -342,7 +334,6 @@ class NavigationTask:
             modes=at.sizes,
             joint=got.covariance[np.ix_(joint, joint)],
             bends=self._bends(at, got),
-            nuisances=named,
             stated=stated,
         )
 

@@ -163,7 +163,7 @@ def fit_with_mount(
             found, said = _collect_messages(navigate, mounts, known)
             if found is None:
                 break
-            own = [found.nuisances[name] for name in (*MOUNTS, *LEVERS)]
+            own = [found.stated.nuisances[name] for name in (*MOUNTS, *LEVERS)]
             turn_deg, arm_m = np.array([one.value for one in own]).reshape(2, 3)
             turn_sigma_deg, arm_sigma_m = np.array([one.sigma for one in own]).reshape(2, 3)
             mount = RigidTransform.from_components(
@@ -389,7 +389,7 @@ def _fit(
     mounts = None if rig is None else body_from_pinhole(rig, warps)
     navigate = partial(fit_to, mounts, installed=installed)
     if task.datum is not None:
-        control = ties.equations if ties.informs else None
+        control = ties.equations if ties.used_points or ties.used_bars else None
         pinhole_from_rig = _pinhole_from_rig(task)
         if rig is not None or pinhole_from_rig is None:
             fit = navigate(task.datum, control=control)

@@ -149,7 +149,7 @@ def test_scale_and_level_of_one_camera_lie_within_their_sigmas(reading: str) -> 
         assert found is not None
         errors.append(np.log(found.ned_from_model.scale / truth.scale) / found.sigma_scale)
         lean = (found.ned_from_model.rotation * truth.rotation.inv()).as_rotvec(degrees=True)[:2]
-        leans.append(lean / found.sigma_tilt_deg)
+        leans.append(lean / np.rad2deg(np.sqrt(np.diag(found.covariance)[:2])))
     assert 0.7 < np.sqrt(np.mean(np.square(errors))) < 1.4
     assert 0.6 < np.sqrt(np.mean(np.square(leans))) < 1.4
 

@@ -213,7 +213,7 @@ def test_a_clock_that_is_off_by_more_than_stated_is_named_with_its_setting(
     loose = replace(USUAL_INSTALLATION, clock_s=2.0)
     fit, _, _ = place(body, late, 2, installed=loose)
     assert "clock_sigma_s" not in capsys.readouterr().err
-    value, sigma = fit.nuisances["clock_s"].value, fit.nuisances["clock_s"].sigma
+    value, sigma = fit.stated.nuisances["clock_s"].value, fit.stated.nuisances["clock_s"].sigma
     assert abs(abs(value) - 1.0) < 4 * sigma < 1.0
 
 
@@ -229,7 +229,7 @@ def test_a_drift_of_depths_is_named_and_costs_the_depth(
         errors[:, 2] += drift_m * share
         fit, error, sigma = place(body, records_of(body, errors, SIGMA), seed)
         off.append(error[2] / sigma[2])
-        drift = fit.nuisances.get("depth_drift_m")
+        drift = fit.stated.nuisances.get("depth_drift_m")
         found.append(0.0 if drift is None else drift.value)
         assert ("drift" in capsys.readouterr().err) == (drift_m > 0.1)
         assert np.all(np.abs(error[3:5]) < 4.0 * sigma[3:5])  # nor does it tilt the model

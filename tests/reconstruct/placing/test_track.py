@@ -76,7 +76,7 @@ def placed(middle: Array, covariance: Array) -> PlacementFit:
     """A place of this covariance."""
     return PlacementFit(
         ned_from_model=HERE, middle_ned=middle, correlation={}, modes=np.zeros(0),
-        joint=covariance, bends=(), nuisances={}, stated=GeoreferenceRecord(),
+        joint=covariance, bends=(), stated=GeoreferenceRecord(),
     )  # fmt: skip
 
 
