@@ -45,7 +45,6 @@ from reconstruct.placing.navigation import (
     first_placement,
     observable,
     read_epochs,
-    without_navigation,
 )
 
 _ORDER = (
@@ -590,7 +589,7 @@ def fit_navigation(
         no scale in common with the model.
     """
     epochs = read_epochs(records, model_from_cam, body_from_cam, datum, modes)
-    if epochs is None or (datum is not None and not epochs.has_horizontal):
+    if not epochs.known.any() or (datum is not None and not epochs.has_horizontal):
         return None
     start = first_placement(epochs, levelled, known_scale)
     if start is None:
@@ -672,7 +671,7 @@ def fit_control(
     if known_scale is None or scale_sigma > 0:
         free.append(SCALE)
     task = NavigationTask(
-        epochs=without_navigation(records, model_from_cam, modes),
+        epochs=read_epochs(records, model_from_cam, None, None, modes, measured=False),
         levelled=None,
         known_scale=known_scale,
         scale_sigma=scale_sigma,

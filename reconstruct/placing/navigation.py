@@ -135,8 +135,10 @@ def read_epochs(
     body_from_cam: Mapping[str, RigidTransform] | None,
     datum: Datum | None,
     modes: Array | None = None,
-) -> Epochs | None:
-    """Collect what navigation measured; None where it measured nothing.
+    *,
+    measured: bool = True,
+) -> Epochs:
+    """Collect what navigation measured, if it is asked; nothing is `known` where it says nothing.
 
     Every channel helps on its own, but latitude and longitude together only. Without a datum these
     are not used.
@@ -151,36 +153,12 @@ def read_epochs(
         readings[:, :2] = np.nan
     if body_from_cam is None:
         readings[:, 3:] = np.nan
-    chosen = [int(i) for i in np.flatnonzero(np.isfinite(readings).any(axis=1))]
-    if not chosen:
-        return None
-    timed = all(np.isfinite(records[i].time_s) for i in chosen)
-    return _collect(records, model_from_cam, body_from_cam, datum, modes, readings, chosen, timed)
-
-
-def without_navigation(
-    records: Sequence[ImageRecord],
-    model_from_cam: Sequence[RigidTransform],
-    modes: Array | None = None,
-) -> Epochs:
-    """Epochs of a model without navigation."""
-    unknown, every = np.full((len(records), 6), np.nan), list(range(len(records)))
-    return _collect(records, model_from_cam, None, None, modes, unknown, every, timed=False)
-
-
-def _collect(
-    records: Sequence[ImageRecord],
-    model_from_cam: Sequence[RigidTransform],
-    body_from_cam: Mapping[str, RigidTransform] | None,
-    datum: Datum | None,
-    modes: Array | None,
-    readings: Array,
-    chosen: list[int],
-    timed: bool,
-) -> Epochs:
-    """Epochs of chosen pictures, whose readings of navigation are (N, 6)."""
+    if not measured:
+        readings[:] = np.nan
+    chosen = np.flatnonzero(np.isfinite(readings).any(axis=1)).tolist()
+    timed = bool(chosen) and all(np.isfinite(records[i].time_s) for i in chosen)
     chosen = sorted(
-        chosen,
+        chosen or range(len(records)),
         key=lambda i: (records[i].time_s if timed else 0.0, records[i].station, records[i].image),
     )
     rows = [records[i] for i in chosen]
@@ -383,61 +361,45 @@ def first_placement(
     Returns:
         The placement; None, after a warning, where navigation gives no scale or place.
     """
-    if not epochs.has_horizontal:
-        return _without_positions(epochs, levelled, known_scale)
-    at = epochs.known[epochs.moment, 0]
-    count = int(epochs.known[:, 0].sum())
-    measured = epochs.measured_ned[at]
-    spread = float(np.sqrt(measured[:, :2].var(axis=0).sum()))
-    need = float(np.median(epochs.sigma[epochs.known[:, 0], 0]))
-    flat = levelled.apply(epochs.centres)[at]
-    has = _has_angles(epochs)
-    if not has.any() or known_scale is None:
-        minimum = 2 if has.any() else 3
-        if count < minimum or spread <= _MIN_SPREAD * need:
-            warn(
-                f"{count} positions spread over {spread:.2f} m at a sigma of {need:.2f} m do not "
-                "place the model: it stays without CRS"
-            )
-            return None
-    a = (flat[:, :2] - flat[:, :2].mean(axis=0)) @ [1.0, 1j]
-    b = (measured[:, :2] - measured[:, :2].mean(axis=0)) @ [1.0, 1j]
-    turn = complex(np.vdot(a, b) / max(float(np.vdot(a, a).real), 1e-300))
-    if has.any():
-        rotation = _by_attitudes(epochs, has)
+    scale, turn, has = known_scale, 0.0, _has_angles(epochs)
+    if epochs.has_horizontal:
+        at = epochs.known[epochs.moment, 0]
+        count = int(epochs.known[:, 0].sum())
+        measured = epochs.measured_ned[at]
+        spread = float(np.sqrt(measured[:, :2].var(axis=0).sum()))
+        need = float(np.median(epochs.sigma[epochs.known[:, 0], 0]))
+        flat = levelled.apply(epochs.centres)[at]
+        if not has.any() or known_scale is None:
+            minimum = 2 if has.any() else 3
+            if count < minimum or spread <= _MIN_SPREAD * need:
+                warn(
+                    f"{count} positions spread over {spread:.2f} m at a sigma of {need:.2f} m do "
+                    "not place the model: it stays without CRS"
+                )
+                return None
+        a = (flat[:, :2] - flat[:, :2].mean(axis=0)) @ [1.0, 1j]
+        b = (measured[:, :2] - measured[:, :2].mean(axis=0)) @ [1.0, 1j]
+        spin = complex(np.vdot(a, b) / max(float(np.vdot(a, a).real), 1e-300))
+        scale, turn = abs(spin) if scale is None else scale, float(np.angle(spin))
     else:
-        rotation = Rotation.from_rotvec([0.0, 0.0, np.angle(turn)]) * levelled.rotation
-    scale = abs(turn) if known_scale is None else known_scale
-    return _shift(epochs, levelled, scale, rotation)
-
-
-def _without_positions(
-    epochs: Epochs, levelled: Similarity, known_scale: float | None
-) -> Similarity | None:
-    scale, rotation = known_scale, levelled.rotation
-    if scale is None:
-        scale = _scale_by_relief(epochs, levelled)
+        scale = _scale_by_relief(epochs, levelled) if scale is None else scale
         if scale is None:
             return None
-    headed, has = epochs.known[epochs.moment, 5], _has_angles(epochs)
+        headed = epochs.known[epochs.moment, 5]
+        if headed.any() and not has.any():
+            stated = epochs.ned_from_body[headed].as_euler("ZYX")[:, 0]
+            found = (levelled.rotation * epochs.model_from_body[headed]).as_euler("ZYX")[:, 0]
+            turn = float(np.angle(np.exp(1j * (stated - found)).mean()))
+    rotation = Rotation.from_rotvec([0.0, 0.0, turn]) * levelled.rotation
     if has.any():
-        rotation = _by_attitudes(epochs, has)
-    elif headed.any():
-        stated = epochs.ned_from_body[headed].as_euler("ZYX")[:, 0]
-        found = (rotation * epochs.model_from_body[headed]).as_euler("ZYX")[:, 0]
-        turn = np.angle(np.exp(1j * (stated - found)).mean())
-        rotation = Rotation.from_rotvec([0.0, 0.0, turn]) * rotation
+        some = np.flatnonzero(has)
+        rotation = (epochs.ned_from_body[some] * epochs.model_from_body[some].inv()).mean()
     return _shift(epochs, levelled, scale, rotation)
 
 
 def _has_angles(epochs: Epochs) -> NDArray[np.bool_]:
     """(N,) whether roll, pitch and heading of a picture are known."""
     return np.asarray(np.isfinite(np.where(epochs.known, 0.0, np.nan)[epochs.moment, 3:].sum(1)))
-
-
-def _by_attitudes(epochs: Epochs, has: NDArray[np.bool_]) -> Rotation:
-    some = np.flatnonzero(has)
-    return (epochs.ned_from_body[some] * epochs.model_from_body[some].inv()).mean()
 
 
 def _scale_by_relief(epochs: Epochs, levelled: Similarity) -> float | None:
