@@ -17,11 +17,10 @@ from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.errors import warn
 from alice_survey.core.frames import Array, Datum
 from alice_survey.core.records import BarRow, ControlRecord, ControlRms, PointRow
-from reconstruct.mapping.arrays import cross_matrices
 from reconstruct.placing.alignment import Similarity, align_rigid, align_similarity
 from reconstruct.placing.control_points import Control, KnownLength, TriangulatedPoint
 from reconstruct.placing.correlated_fit import Extra
-from reconstruct.placing.navigation import PARAMETERS, SCALE
+from reconstruct.placing.navigation import PARAMETERS, PLACE, SCALE, slopes_by_place
 
 _CONTRADICTED_SIGMAS = 4.0
 _MIN_SPREAD = 1e-3
@@ -112,9 +111,7 @@ class ControlFit:
             spread = tie.residual(place)[1] + np.diag(tie.sigma**2)
             white = np.linalg.inv(np.linalg.cholesky(spread))
             jacobian = np.zeros((3, columns))
-            jacobian[:, :3] = -cross_matrices((at - middle)[None])[0]
-            jacobian[:, 3:6] = np.eye(3)
-            jacobian[:, SCALE] = at - middle
+            jacobian[:, :PLACE] = slopes_by_place((at - middle)[None])[0]
             jacobian[:, PARAMETERS:] = place.scale * turn @ motion
             misfits.append(white @ (at - tie.ned))
             rows.append(white @ jacobian)

@@ -310,6 +310,15 @@ def _velocities(epochs: Epochs, positions: Array) -> Array:
     return found[epochs.moment]
 
 
+def slopes_by_place(away: Array) -> Array:
+    """(N, 3, 7) slopes of places (N, 3) about the middle by the placement."""
+    slopes = np.zeros((len(away), 3, PLACE))
+    slopes[:, :, :3] = -cross_matrices(away)
+    slopes[:, :, 3:6] = np.eye(3)
+    slopes[:, :, SCALE] = away
+    return slopes
+
+
 def attitude_axes(ned_from_body: Rotation) -> Array:
     """(N, 3, 3) matrices whose columns are the axes, in NED, of roll, pitch and heading.
 

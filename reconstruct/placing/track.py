@@ -25,7 +25,7 @@ from reconstruct.adjustment.uncertainty import Uncertainty
 from reconstruct.mapping.arrays import cross_matrices, observations
 from reconstruct.placing.alignment import Similarity
 from reconstruct.placing.fit import PlacementFit
-from reconstruct.placing.navigation import PLACE, SCALE, attitude_axes
+from reconstruct.placing.navigation import PLACE, attitude_axes, slopes_by_place
 from reconstruct.views.model import WorldFrame
 from reconstruct.views.model_files import as_transform
 
@@ -169,9 +169,7 @@ def pose_covariances(
     jacobian = np.zeros((len(rows), 6, PLACE + count))
     if fit is not None:
         away = poses.translation - fit.middle_ned
-        jacobian[:, :3, :3] = -cross_matrices(away)
-        jacobian[:, :3, 3:6] = np.eye(3)
-        jacobian[:, :3, SCALE] = away
+        jacobian[:, :3, :PLACE] = slopes_by_place(away)
         jacobian[:, 3:, :3] = np.eye(3)
     if shape is not None:
         turn = world_from_model.rotation.as_matrix()

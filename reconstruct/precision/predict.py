@@ -17,7 +17,7 @@ from reconstruct.adjustment.exact_observations import calibrated_parameters, exa
 from reconstruct.adjustment.normal_equations import LinearObservations, one_part, reduce_points
 from reconstruct.adjustment.survey_fit import calibrated_covariance, motions_of
 from reconstruct.adjustment.uncertainty import BlockShape, Motions, shape_of_block
-from reconstruct.mapping.arrays import cross_matrices, first_of, linked_groups
+from reconstruct.mapping.arrays import first_of, linked_groups
 from reconstruct.placing.alignment import Similarity, sag_weights
 from reconstruct.placing.correlated_fit import Extra, estimate
 from reconstruct.placing.navigation import (
@@ -29,6 +29,7 @@ from reconstruct.placing.navigation import (
     TURN,
     Epochs,
     equations,
+    slopes_by_place,
 )
 from reconstruct.precision.instruments import NavigationErrors
 from reconstruct.precision.tracks import ExpectedBlock
@@ -146,7 +147,7 @@ def _place(
         near = KDTree(state.points).query(control)[1]
         at, motions = state.points[near], shape.modes.points[near].astype(np.float64)
         known_at = np.zeros((len(at), 3, columns))
-        known_at[:, :, :PLACE], known_at[:, :, PARAMETERS:] = _by_place(at - middle), motions
+        known_at[:, :, :PLACE], known_at[:, :, PARAMETERS:] = slopes_by_place(at - middle), motions
         rows = np.concatenate([rows, known_at.reshape(-1, columns) / control_sigma_m])
     free = [*range(6), TURN, STRETCH, *np.flatnonzero(navigation.installed.weights(columns))]
     if not np.isfinite(state.rig.baseline_m):
@@ -164,22 +165,13 @@ def _place(
     return found.covariance[np.ix_(joint, joint)], middle
 
 
-def _by_place(away: Array) -> Array:
-    """(N, 3, 7) slopes of places (N, 3) about the middle by the placement."""
-    slopes = np.zeros((len(away), 3, PLACE))
-    slopes[:, :, :3] = -cross_matrices(away)
-    slopes[:, :, 3:6] = np.eye(3)
-    slopes[:, :, SCALE] = away
-    return slopes
-
-
 def _precision(block: ExpectedBlock, shape: BlockShape, joint: Array, middle: Array) -> Precision:
     state, modes = block.state, shape.modes
     left = joint[PLACE:, PLACE:]
     shifts, points = modes.stations[:, 3:], modes.points.astype(np.float64)
     rest = np.diagonal(shape.stations[:, 3:, 3:], axis1=1, axis2=2) - shifts**2 @ modes.known
     own = np.einsum("fik,kl,fil->fi", shifts, left, shifts)
-    slopes = np.concatenate([_by_place(state.centres - middle), shifts], axis=2)
+    slopes = np.concatenate([slopes_by_place(state.centres - middle), shifts], axis=2)
     placed = np.einsum("fik,kl,fil->fi", slopes, joint, slopes)
     heights = (shape.points - shape.noise)[:, 2, 2] - points[:, 2] ** 2 @ modes.known
     heights += np.einsum("pk,kl,pl->p", points[:, 2], left, points[:, 2])
