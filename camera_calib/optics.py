@@ -33,6 +33,12 @@ def likely_port(focal_ratio: float) -> str:
     return FlatPort.shape if focal_ratio > _BETWEEN else DomePort.shape
 
 
+def contradicting_port(focal_ratio: float, given: str) -> str | None:
+    """The shape that a ratio says where it contradicts the given one; a dome may pass for none."""
+    likely = likely_port(focal_ratio)
+    return likely if likely != given and FlatPort.shape in (likely, given) else None
+
+
 @compiled_ieee
 def _air_rays(points: Array, port_kind: int, port: Array, rays: Array, turns: Array) -> None:
     if port_kind == _FLAT:

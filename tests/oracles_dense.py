@@ -81,7 +81,7 @@ def fused(
 
 
 def surfaces(
-    heights: Array, sigmas: Array, places: Array, steepness: Array, cell: float
+    heights: Array, sigmas: Array, places: Any, steepness: Array, cell: float
 ) -> list[list[int]]:
     """The points of each surface of a cell from above, as `surfaces_of` tells them apart."""
     ranks = [int(i) for i in np.argsort(heights, kind="stable")]

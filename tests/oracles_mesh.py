@@ -1,6 +1,7 @@
 """Slow, obvious twins of the mesh kernels, and scenes for meshes and single stereo pairs."""
 
 import math
+from typing import Any
 
 import cv2
 import numpy as np
@@ -35,7 +36,8 @@ def spread_value(corners: Array, values: Array, x: float, y: float) -> Array | N
 def boxes_overlap(corner: Array, box: Array) -> bool:
     """Whether any two boxes share a pixel."""
     before = ((corner + box)[:, None] <= corner).any(axis=2)
-    return bool((~(before | before.T))[np.triu_indices(len(box), 1)].any())
+    apart: Any = before | before.T
+    return not apart[np.triu_indices(len(box), 1)].all()
 
 
 SIZE = (320, 256)

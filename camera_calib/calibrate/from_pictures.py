@@ -45,8 +45,7 @@ from camera_calib.calibrate.solve import (
 from camera_calib.calibration import Calibration, HousingTrial, TargetView
 from camera_calib.freedom import USUAL_LENS, LensNames, lens_of
 from camera_calib.mount import mount_line, with_mount
-from camera_calib.optics import PORTS, likely_port
-from camera_calib.ports.flat import FlatPort
+from camera_calib.optics import PORTS, contradicting_port
 from camera_calib.rig import Rig, design_rig
 from camera_calib.targets.target import Target
 
@@ -231,8 +230,7 @@ def focal_ratios(
 def _other_housing(ratios: Mapping[str, float], kinds: Mapping[str, str]) -> str:
     """What focal lengths say against the ports, for the end of a message."""
     for name, ratio in ratios.items():
-        likely = likely_port(ratio)
-        if FlatPort.shape in (likely, kinds[name]) and likely != kinds[name]:
+        if likely := contradicting_port(ratio, kinds[name]):
             return (
                 f"; focal lengths of {name} under water are {ratio:.3f} times those in air, which "
                 f"says --port {likely}"

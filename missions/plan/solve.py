@@ -5,13 +5,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from alice_survey.core.artefacts import json_values
 from alice_survey.core.config import SurveyConfig, change_section
 from alice_survey.core.errors import AliceError, PlanError
 from alice_survey.kit.words import text_table
 from missions.exposure.conflict import MAX_ALTITUDE_M
 from missions.exposure.focus import plan_focus
-from missions.exposure.footprints import altitude_for_pixel_m
+from missions.exposure.footprints import altitude_for_pixel_m, pixel_on_floor_m
 from missions.exposure.light import darkness
 from missions.exposure.settings import ImagingSettings, ImagingSetup, imaging_settings
 
@@ -99,7 +101,7 @@ def solve_lenses(
         lenses: focal lengths, mm.
 
     Raises:
-        PlanError: none fits; with the reason for each.
+        PlanError: none fits; with the nearest resolution that does.
     """
     for lens in lenses:  # as the setting is checked
         change_section(SurveyConfig(), "camera", focal_mm=lens)
@@ -108,10 +110,16 @@ def solve_lenses(
     if any(not option.against for option in options):
         return sorted(options, key=lambda one: (bool(one.against), _hours(one)))
     reasons = "; ".join(f"{o.setup.camera.focal_mm:g} mm: {o.against}" for o in options)
-    raise PlanError(
-        f"no lens gives {resolution_mm:g} mm a pixel ({reasons}): ask for another resolution, or "
-        "change relief_m or the light"
-    )
+    fault = f"no lens gives {resolution_mm:g} mm a pixel ({reasons})"
+    near = [
+        (pixel_mm, option.setup.camera.focal_mm)
+        for option in options
+        if (pixel_mm := _nearest_resolution_mm(option.setup, max_m)) is not None
+    ]
+    if not near:
+        raise PlanError(f"{fault}, and none fits at any altitude: change relief_m or the light")
+    pixel_mm, lens = min(near, key=lambda one: abs(math.log(one[0] / resolution_mm)))
+    raise PlanError(f"{fault}; {pixel_mm:g} mm fits, with the {lens:g} mm lens")
 
 
 def _hours(option: LensOption) -> float:
@@ -124,7 +132,7 @@ def _option(setup: ImagingSetup, max_m: float, resolution_mm: float) -> LensOpti
     camera = setup.rig.cameras["left"]
     altitude_m = math.floor(altitude_for_pixel_m(camera, resolution_mm * 1e-3) * 1000) / 1000
     setup = setup.with_plan(altitude_m=altitude_m, line_spacing_m=None)
-    min_m, against = setup.plan.relief_m + setup.plan.least_clearance_m, ""
+    min_m, against = _min_altitude_m(setup), ""
     if altitude_m < min_m:
         against = f"{altitude_m:.2f} m is under the {min_m:.2f} m of relief_m and least_clearance_m"
     elif altitude_m >= max_m:
@@ -140,3 +148,19 @@ def _option(setup: ImagingSetup, max_m: float, resolution_mm: float) -> LensOpti
     except AliceError as error:
         return LensOption(setup=setup, settings=None, against=str(error).split(": ")[0])
     return LensOption(setup=setup, settings=settings, against=darkness(settings.light))
+
+
+def _min_altitude_m(setup: ImagingSetup) -> float:
+    return setup.plan.relief_m + setup.plan.least_clearance_m
+
+
+def _nearest_resolution_mm(setup: ImagingSetup, max_m: float) -> float | None:
+    """The resolution nearest to a setup's at which its lens can be used, to about a fiftieth."""
+    own = setup.rig.cameras["left"]
+    tried = np.geomspace(_min_altitude_m(setup), max_m, 50)
+    tried = tried[np.argsort(np.abs(np.log(tried / max(setup.plan.altitude_m, 1e-3))))]
+    for altitude in tried:
+        pixel_mm = math.ceil(pixel_on_floor_m(own, float(altitude)) * 1e6) / 1e3
+        if not _option(setup, max_m, pixel_mm).against:
+            return pixel_mm
+    return None

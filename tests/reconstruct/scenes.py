@@ -139,7 +139,7 @@ def make_scene(
                     sigma_heading_deg=1.0,
                 )
             )
-    near = sorted(cKDTree([pose.translation for pose in poses]).query_pairs(_FAR_M))
+    around = cKDTree([pose.translation for pose in poses])
     return Scene(
         rig=rig,
         records=records,
@@ -147,7 +147,7 @@ def make_scene(
         points_ned=points_ned,
         pixels=pixels,
         ids=ids,
-        pairs=match_pictures(ids, near),
+        pairs=match_pictures(ids, sorted(around.query_pairs(_FAR_M))),
     )
 
 

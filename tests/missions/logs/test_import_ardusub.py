@@ -381,6 +381,35 @@ def test_other_files_are_refused_by_name(tmp_path: Path, name: str, content: str
         import_log(tmp_path / name, tmp_path / "n.csv")
 
 
+@pytest.mark.parametrize("form", ["dive.BIN", "dive.tlog"])
+def test_damaged_logs_end_in_a_table_or_in_one_line(tmp_path: Path, form: str) -> None:
+    whole = {
+        "dive.BIN": dataflash_log(dive_messages()),
+        "dive.tlog": tlog(telemetry()),
+    }[form]
+    rng = np.random.default_rng(11)
+    outcomes = []
+    for _ in range(20):
+        data = bytearray(whole)
+        for place in rng.integers(len(data), size=rng.integers(1, 15)):
+            data[place] = rng.integers(256)
+        start, end = sorted(rng.integers(len(data), size=2))
+        del data[start : min(end, start + 100)]
+        (tmp_path / form).write_bytes(bytes(data))
+        try:
+            _, report = import_log(tmp_path / form, tmp_path / "n.csv")
+        except NavigationError as error:
+            assert "\n" not in str(error)
+            outcomes.append(0)
+        else:
+            read = read_navigation(tmp_path / "n.csv", UTC, ())
+            assert len(read.time_s) == report["rows"]
+            assert report["rows"] <= 21  # of ATT, where all else is lost
+            outcomes.append(report["rows"])
+    # Damage is local: most of the rows of most logs are still there.
+    assert np.median(outcomes) >= 15
+
+
 def test_what_is_no_submarine_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = tmp_path / "flight.tlog"
     log.write_bytes(tlog(telemetry()))

@@ -1,3 +1,4 @@
+import re
 from typing import Any
 
 import pytest
@@ -31,7 +32,14 @@ def test_a_resolution_gives_the_altitude_whose_pixel_it_is() -> None:
     assert [row["fits"] for row in data] == [True, False]
 
 
-@pytest.mark.parametrize("resolution_mm", [0.001, 5.0])
-def test_a_resolution_beyond_all_lenses_is_refused(resolution_mm: float) -> None:
-    with pytest.raises(PlanError, match=r"12\.5 mm: .* 25 mm: "):
+@pytest.mark.parametrize("resolution_mm", [0.001, 0.05, 0.22, 2.0, 5.0])
+def test_a_resolution_beyond_all_lenses_is_refused_with_the_nearest_that_fits(
+    resolution_mm: float,
+) -> None:
+    with pytest.raises(PlanError) as fault:
         solve_lenses(setup(), DEPTH_M, resolution_mm, (12.5, 25.0))
+    (text,) = str(fault.value).splitlines()
+    fits_mm, lens_mm = map(
+        float, re.search(r"; ([\d.]+) mm fits, with the ([\d.]+) mm", text).groups()
+    )
+    assert not solve_lenses(setup(), DEPTH_M, fits_mm, (lens_mm,))[0].against

@@ -1,6 +1,7 @@
 """Cells with several surfaces, by synthetic points whose truth is known."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -126,7 +127,7 @@ def test_surfaces_of_a_cell_are_those_of_its_slow_twin(seed: int):
     heights = rng.normal(0, 2e-3, count) + rng.choice([0.0, 0.018, 0.05, 0.12], count)
     sigmas = rng.uniform(2e-4, 2e-3, count)
     steepness = np.where(rng.random(count) < 0.3, np.nan, rng.uniform(0, 2, count))
-    rows = [values.astype(np.float32) for values in (heights, sigmas, steepness)]
+    rows: list[Any] = [values.astype(np.float32) for values in (heights, sigmas, steepness)]
     places = rng.integers(0, 4, count)
     found, surface = surfaces_of(rows[0], rows[1], places, rows[2], CELL_M)
     expected = surfaces(rows[0], rows[1], places, rows[2], CELL_M)

@@ -109,8 +109,10 @@ def write_survey(folder: Path, elevation: Elevation, datum: Datum | None) -> Pat
     for name in ("dense", "sparse"):
         (folder / name).mkdir(parents=True)
         write_json(folder / name / "stage.json", {"digest": "-"})
-    name = "ned" if datum else "model"
-    frame = WorldFrame(name=name, datum=datum, scaled=datum is not None, vertical_datum="test")
+    frame = WorldFrame(
+        name="ned" if datum else "model", datum=datum, scaled=datum is not None,
+        vertical_datum="test",
+    )  # fmt: skip
     write_frame(folder / "sparse" / "frame.json", frame)
     for name, values in (("dem", elevation.height), ("sigma", elevation.sigma)):
         with rasterio.open(

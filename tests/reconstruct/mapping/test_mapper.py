@@ -4,6 +4,7 @@ from functools import cache
 from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -194,8 +195,12 @@ def oblique_scene(camera: pycolmap.Camera, rng: np.random.Generator, names: Sequ
     """Eight stations around a bumpy floor, looking at its middle; 0.2 m from left to right."""
     points = np.column_stack([rng.uniform(-1.6, 1.6, (700, 2)), rng.uniform(-0.25, 0.25, 700)])
     records, poses, pixels, ids = [], [], [], []
-    shifts = {"left": [0, 0, 0], "right": [-0.2, 0.0, 0.0], "top": [-0.1, 0.25, 0.02]}
-    turns = {"left": [0, 0, 0], "right": [0.0, 0.03, 0.01], "top": [-0.1, 0.05, 0.2]}
+    shifts: dict[str, Any] = {
+        "left": [0, 0, 0],
+        "right": [-0.2, 0.0, 0.0],
+        "top": [-0.1, 0.25, 0.02],
+    }
+    turns: dict[str, Any] = {"left": [0, 0, 0], "right": [0, 0.03, 0.01], "top": [-0.1, 0.05, 0.2]}
     for station, angle in enumerate(0.35 * np.arange(8)):
         place = np.array([1.6 * np.cos(angle), 1.6 * np.sin(angle), -2.0])
         forward = -place / np.linalg.norm(place)

@@ -1,5 +1,6 @@
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -41,7 +42,7 @@ def test_matches_equal_those_of_the_slow_twin(
     np.testing.assert_array_equal(found, match_slowly(a, b, ratio))
 
 
-def plain_features(pixels: Array, descriptors: Array) -> Features:
+def plain_features(pixels: Array, descriptors: NDArray[Any]) -> Features:
     sizes, rounded = np.ones(len(pixels), np.float32), np.clip(descriptors, 0, 255).astype(np.uint8)
     return Features(pixels=pixels, scale_px=sizes, descriptors=rounded)
 

@@ -19,7 +19,7 @@ from reconstruct.pictures.importing import import_images
 from tests.reconstruct.pictures.dated import counts, date, noise, reasons, rows_of, save, table
 
 
-def draw(path: Path, number: int = 0, size: tuple[int, int] = (64, 48), **tags: Any) -> Path:
+def draw(path: Path, number: int = 0, size: Any = (64, 48), **tags: Any) -> Path:
     """Write a picture of noise by its number and folder."""
     return save(path, noise(number, *path.parent.name.encode(), size=size), **tags)
 
@@ -321,14 +321,15 @@ def test_one_or_two_processes_write_the_same(tmp_path: Path) -> None:
 def write_dng(path: Path, mosaic: np.ndarray) -> None:
     """A minimal RAW file: a 16-bit RGGB mosaic with the tags that LibRaw needs."""
     tags = TiffImagePlugin.ImageFileDirectory_v2()
-    for kind, known in {
+    typed: dict[int, dict[int, Any]] = {
         TiffTags.ASCII: {271: "Alice", 272: "Test", 50708: "Alice Test"},
         TiffTags.BYTE: {33422: bytes([0, 1, 1, 2]), 50706: bytes([1, 4, 0, 0])},
         TiffTags.SHORT: {33421: (2, 2), 50714: 0, 50717: 65535, 50778: 21},
         TiffTags.LONG: {254: 0},
         TiffTags.RATIONAL: {50728: (1, 1, 1)},
         TiffTags.SIGNED_RATIONAL: {50721: (1, 0, 0, 0, 1, 0, 0, 0, 1)},
-    }.items():
+    }
+    for kind, known in typed.items():
         for tag, value in known.items():
             tags.tagtype[tag], tags[tag] = kind, value
     Image.fromarray(mosaic.astype(np.uint16)).save(path, format="TIFF", tiffinfo=tags)

@@ -153,7 +153,7 @@ def test_matches_err_as_they_state(server: Server, workspace: Path) -> None:
 def test_stations_around_a_spot_are_known_as_the_model_states(workspace: Path) -> None:
     """A block of all stations has the covariance that the adjustment wrote."""
     pictures = RegisteredPictures.read(workspace)
-    block = StationBlock.around(workspace, pictures, np.unique(pictures.station))
+    block = StationBlock.around(workspace, pictures, [*np.unique(pictures.station)])
     stated = read_uncertainty(workspace / "sparse" / "covariance.npz")
     for row, station in enumerate(stated.stations.tolist()):
         where = np.zeros((6, len(block.numbers), 6))
