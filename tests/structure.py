@@ -30,15 +30,15 @@ PACKAGES = ("alice_survey", "camera_calib", "missions", "reconstruct")
 WORDS = Path(__file__).with_name("structure_words.toml")
 """Words that are not used, and where each of them counts."""
 BOUNDS = {
-    "code lines of the packages": 72_100,  # goal: 68_000
-    "code lines of the tests": 53_600,  # goal: 48_000
+    "code lines of the packages": 69_450,
+    "code lines of the tests": 50_400,  # goal: 48_000
     "code lines of the benchmarks": 8_000,
-    "lines of our own JavaScript": 4_910,
-    "modules": 395,
+    "lines of our own JavaScript": 4_901,
+    "modules": 393,
     "modules with a single importer": 73,
-    "kernels": 252,
+    "kernels": 241,
     "commands": 36,
-    "options of commands": 342,
+    "options of commands": 341,
     "settings": 125,
     "functions that take the whole SurveyConfig": 14,
     "layers of the import contract": 8,
