@@ -93,6 +93,9 @@ LOSSES: list[tuple[str, Rig, dict[str, Any], tuple[str, ...]]] = [
     *((n, DOMES, {}, ("dome of 60 mm", "--drop-port", "--water")) for n in ("colmap", "kalibr")),
     *((n, FULL, WATER, ("--drop-covariance",)) for n in ("opencv", "colmap", "kalibr")),
     ("refractive", FULL, {}, ("--drop-covariance",)),
+    ("ros", only(FULL, "left"), {"drop_covariance": True}, ("--drop-port", "--water")),
+    ("ros", only(FULL, "left"), WATER, ("--drop-covariance",)),
+    ("ros", only(DOMES, "left"), {}, ("dome of 60 mm", "--drop-port", "--water")),
     *((n, bent_by(term), {}, (term, "right"))
       for n, term in (("kalibr", "k3"), ("kalibr", "k5"), ("metashape", "k4"), ("ros", "s1"),
                       ("colmap", "s4"), ("refractive", "s2"))),
@@ -245,6 +248,16 @@ def test_centres_follow_the_fit_onto_the_vehicle() -> None:
         assert -0.009 < moved[2] < -0.005
         assert np.linalg.norm(moved[:2]) < 1e-3
     assert fitted.covariance is None
+
+
+def test_a_lens_that_a_format_cannot_hold_is_fitted_at_a_stated_price(tmp_path: Path) -> None:
+    """A rational lens in air in Kalibr: the best radtan."""
+    rational = changed(IN_AIR.cameras["left"], k4=0.02)
+    write_rig(tmp_path / "rig.json", replace(IN_AIR, cameras={**IN_AIR.cameras, "left": rational}))
+    _, data = convert_files(
+        tmp_path / "rig.json", tmp_path / "c.yaml", target_format="kalibr", water=(1.0, 4.0)
+    )
+    assert 0.0 < data["price"]["left"]["max_px"] < 0.05
 
 
 def test_changed_numbers_take_their_covariance_with_them() -> None:
