@@ -72,6 +72,9 @@ def test_the_page_has_four_pictures_and_all_that_is_said(page: str) -> None:
         pixels = np.frombuffer(base64.b64decode(data), np.uint8)
         assert cv2.imdecode(pixels, cv2.IMREAD_COLOR) is not None
     assert "port_distance_m" in page and "no board found" in page
+    levels = re.findall('<li class="(bad|look|good)"', page)
+    assert levels == sorted(levels, key=["bad", "look", "good"].index)
+    assert {"look", "good"} <= set(levels)
 
 
 def test_the_json_holds_the_numbers_of_the_page(folder: Path, page: str) -> None:
