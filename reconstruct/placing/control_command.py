@@ -290,7 +290,7 @@ def read_markers(text: str) -> ForeignControl:
 def _bar(item: ET.Element, labels: Mapping[str | None, str], sigma_m: float) -> KnownLength | None:
     """A scale bar; None where it has no distance, or does not lie between two known markers."""
     reference = item.find("reference")
-    if reference is None or reference.get("distance") is None:
+    if reference is None or not reference.get("distance", "").strip():
         return None
     name = (item.get("label") or f"bar {item.get('id')}").strip()
     numbers = [

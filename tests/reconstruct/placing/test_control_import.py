@@ -216,7 +216,8 @@ SCALEBARS = (
     '<reference distance="0.5" accuracy="0.0002" enabled="true"/></scalebar>'
     '<scalebar id="1" label="A_C"><reference distance="81.5" enabled="false"/></scalebar>'
     '<scalebar id="2" label="B_D"><reference distance="1.5"/></scalebar>'
-    '<scalebar id="3" label="B_C"/></scalebars>'
+    '<scalebar id="3" label="B_C"/>'
+    '<scalebar id="4" label="A_B"><reference distance=" "/></scalebar></scalebars>'
 )
 
 
@@ -236,7 +237,7 @@ def test_scale_bars_of_metashape_become_bars(workspace: Path, ends: str, placed:
         found = import_control(workspace, path)
     counts = (3, 2) if placed else (0, 1)
     assert found.startswith("{} points, 2 scale bars ({} of them to check by)".format(*counts))
-    assert any("B_D, B_C" in text for text in said)
+    assert any("B_D, B_C, A_B" in text for text in said)
     lengths = {bar.name: bar for bar in read_control(workspace / "control.csv").lengths}
     assert set(lengths) == {"short", "A_C"}
     short, long = lengths["short"], lengths["A_C"]
