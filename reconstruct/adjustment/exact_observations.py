@@ -375,7 +375,7 @@ def linearise_parts(
     """
     weigh = partial(_weigh, tuple(fields), noise)
     if pixels.is_one:
-        return replace(one_part(weigh(pixels.pixels, state), pixels.count), pattern=pixels.pattern)
+        return one_part(weigh(pixels.pixels, state), pixels.count, pixels.pattern)
     return LinearParts(
         stations=pixels.stations, points=pixels.points, pattern=pixels.pattern,
         map=lambda function, values: pixels.map(

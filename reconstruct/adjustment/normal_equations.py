@@ -75,12 +75,14 @@ class LinearParts:
     """Yields `function(part, value)` of every part with its value, in order."""
 
 
-def one_part(linear: LinearObservations, stations: int) -> LinearParts:
+def one_part(
+    linear: LinearObservations, stations: int, pattern: "BlockPattern | None" = None
+) -> LinearParts:
     """All observations of so many stations as one part, in this process."""
     return LinearParts(
         stations=[np.arange(stations)],
         points=[len(linear.starts) - 1],
-        pattern=pattern_of(linear.starts, linear.station, stations),
+        pattern=pattern or pattern_of(linear.starts, linear.station, stations),
         map=lambda function, values: (function(linear, value) for value in values),
     )
 
