@@ -625,8 +625,9 @@ def read_uncertainty(path: Path) -> Uncertainty:
     """
     data = read_arrays(path, *_STORED, optional=_SHARED)
     with taken_from(path):
-        for name in data.keys() - {"frames", "stations", "images", "point_ids"}:
-            data[name] = data[name].astype(np.float64)
+        for name in data.keys() - {"images"}:
+            whole = name in ("frames", "stations", "point_ids")
+            data[name] = data[name].astype(np.int64 if whole else np.float64)
         found: dict[str, Any] = {name: data[key] for key, name in _STORED.items()}
         found |= {"images": tuple(map(str, data["images"])), "sigma_px": float(data["sigma_px"])}
         shared = [data[name] for name in _SHARED if name in data]

@@ -13,6 +13,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.block_solver import BlockStep
 from alice_survey.core.config import ReconstructConfig
+from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.frames import Array
 from alice_survey.core.records import RangeRecord
 from benchmarks.bend_pipeline import Adjusted, adjusted
@@ -123,6 +124,10 @@ def test_the_file_gives_back_what_was_written(tmp_path: Path) -> None:
     for cov in (*found.frame_cov, *found.point_cov):
         np.testing.assert_allclose(cov, cov.T, atol=1e-9 * np.abs(cov).max())
         assert np.linalg.eigvalsh(cov)[0] > -1e-12
+    with np.load(tmp_path / "a.npz") as data:
+        np.savez(tmp_path / "c.npz", **{**data, "stations": np.array(["first"])})
+    with pytest.raises(WorkspaceError, match="not as it was written"):
+        read_uncertainty(tmp_path / "c.npz")
 
 
 def _observations(mapped: Mapped) -> LinearObservations:
