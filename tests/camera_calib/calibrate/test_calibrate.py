@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.errors import CalibrationError
 from camera_calib.calibrate.adjust import adjust
-from camera_calib.calibrate.observability import held_effect
+from camera_calib.calibrate.observability import advice, held_effect
 from camera_calib.calibrate.solve import (
     blank_camera,
     calibrate,
@@ -284,6 +284,17 @@ def test_weak_views_give_warnings_that_name_what_is_missing() -> None:
 
     strong = calibrate_through_ports(scene(TRUTH, 30), BOARD, TRUTH, "held")
     assert strong.warnings == ()
+
+
+def test_parts_of_the_frame_without_points_are_named() -> None:
+    """Four columns and three rows, y down."""
+    camera = TRUTH.cameras["right"]
+    everywhere = camera.pixel_centres(40).reshape(-1, 2)
+    off = everywhere / [camera.width_px, camera.height_px] - [0.75, 1 / 3]
+    pixels = np.stack([everywhere, everywhere])
+    pixels[1, (off[:, 0] > 0) & (off[:, 1] < 0)] = np.nan
+    (line,) = advice(TRUTH, np.tile(pixels, (25, 1, 1, 1)), RigidTransform.identity())
+    assert line.startswith("right: no points in 1 of 12 parts of the frame (top far right)")
 
 
 @pytest.mark.parametrize(
