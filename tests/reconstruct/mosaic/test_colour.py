@@ -97,6 +97,13 @@ def test_water_finds_albedo_ratios_where_even_light_leaves_the_haze() -> None:
     assert ratios(water, 0.4).std() < 0.06
     assert ratios(even, 0.4).std() > 0.07
     assert not water.black.any()
+    light, at = np.full((1, 1, 3), 0.3, np.float32), np.full((1, 2), 0.5, np.float32)
+    unknown, middle, far = (
+        water.correct(light, "left", IMAGES[0], at, np.full((1, 1), range_m, np.float32))
+        for range_m in (np.nan, water.light.middle_range, 1.2 * water.light.middle_range)
+    )
+    np.testing.assert_array_equal(unknown, middle)
+    assert (far > middle).all()
 
 
 def test_white_is_halfway_between_a_white_lamp_and_a_grey_floor() -> None:
