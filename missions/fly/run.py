@@ -194,7 +194,7 @@ def draw_flight(path: Path, flight: Flight) -> None:
         )  # fmt: skip
     strips[0].set_title(f"{rms(cross):.3f} m rms on lines, heading {np.rad2deg(rms(heading)):.1f}°")
     for axes in strips:
-        axes.legend(loc="upper right", ncol=4, fontsize=7.5)
+        axes.legend(loc="upper right", ncol=5, fontsize=7.5)
         axes.tick_params(labelbottom=axes is strips[-1])
     strips[-1].set_xlabel("time, s (lines shaded, survey between dashes)")
     save_figure(figure, path, dpi=110)

@@ -65,8 +65,8 @@ def settings_table(rows: Sequence[Setting]) -> str:
     for group, some in itertools.groupby(rows, lambda row: row.group):
         lines += ["", group.upper()]
         for row in some:
-            head = f"  {row.name:<24}{row.text:<24}{row.equation} ({row.bound_by or '-'})"
-            lines += textwrap.wrap(head, WIDTH, subsequent_indent=" " * 50)
+            head = f"  {row.name:<24}{row.text:<24}  {row.equation} ({row.bound_by or '-'})"
+            lines += textwrap.wrap(head, WIDTH, subsequent_indent=" " * 52)
             lines += textwrap.wrap(" " * 6 + row.note, WIDTH, subsequent_indent=" " * 6)
     return "\n".join(lines[1:])
 
