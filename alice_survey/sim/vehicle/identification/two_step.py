@@ -59,7 +59,9 @@ class Pull(Config):
     @model_validator(mode="after")
     def _check_signs(self) -> Self:
         if self.rpm == 0 or self.rpm * self.force_n < 0:
-            raise ValueError("force and speed must have one sign")
+            raise ValueError(
+                f"{self.force_n:g} N at {self.rpm:g} rpm: force and speed must have one sign"
+            )
         return self
 
 
@@ -104,7 +106,8 @@ def fit_pulls(pulls: Sequence[Pull], vehicle: Vehicle) -> list[ThrustCoefficient
     """k_t by least squares, forward and reverse, of every thruster that pulled.
 
     Raises:
-        VehicleError: the vehicle has no such thruster, or one pulled alone and with others.
+        VehicleError: the vehicle has no such thruster, or one pulled alone and with others, or not
+            at all.
     """
     by_name = {thruster.name: thruster for thruster in vehicle.thrusters}
     groups = sorted({pull.thruster for pull in pulls})
@@ -125,6 +128,8 @@ def fit_pulls(pulls: Sequence[Pull], vehicle: Vehicle) -> list[ThrustCoefficient
             force = np.array([pull.force_n for pull in rows])
             square = float(unit @ unit)
             value = float(unit @ force) / square
+            if value == 0:
+                raise VehicleError(f"{'+'.join(group)}: all {way} readings are 0 N: leave them out")
             rest = force - value * unit
             free = len(rows) - 1
             sigma = float(np.sqrt(rest @ rest / free / square)) if free else float("nan")

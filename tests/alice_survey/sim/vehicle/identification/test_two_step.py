@@ -98,3 +98,15 @@ def test_sigmas_are_those_of_the_readings(tmp_path: Path) -> None:
         scores.append([(found[0].factor - 0.8) * found[0].model / found[0].sigma])
     # Student's t of three degrees of freedom: a median of its absolute value of 0.765.
     assert np.median(np.abs(scores)) == pytest.approx(0.765, abs=0.12)
+
+
+@pytest.mark.parametrize(
+    ("force_n", "message"), [(0, r"port\+starboard: all forward readings"), (-3, "-3 N at 600 rpm")]
+)
+def test_a_thruster_must_push_the_way_it_turns(
+    tmp_path: Path, force_n: float, message: str
+) -> None:
+    path = tmp_path / "pull.csv"
+    path.write_text(f"thruster,rpm,force_n\nport+starboard,600,{force_n}\n")
+    with pytest.raises(VehicleError, match=message):
+        fit_pulls(read_pulls(path), KNOWN)
