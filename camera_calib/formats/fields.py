@@ -65,11 +65,11 @@ class FileModel(BaseModel):
 
 
 def read_vector(counts: tuple[int, ...], value: Any) -> Array:
-    """Finite numbers in a list, however nested, or in a matrix with its `data`."""
+    """Finite numbers in a list, or in lists of equal lengths, or in a matrix with its `data`."""
     values = value.get("data") if isinstance(value, Mapping) else value
     try:  # YAML 1.1 takes 1e-05, without a dot, for text; other tools write it so
         items = np.array(values, dtype=object).ravel()
-        flat = np.array([None if isinstance(item, bool) else item for item in items], dtype=float)
+        flat = np.array([math.nan if isinstance(item, bool) else float(item) for item in items])
     except (TypeError, ValueError, OverflowError):
         flat = np.array([math.nan])
     if not np.isfinite(flat).all():

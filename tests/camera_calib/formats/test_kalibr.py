@@ -99,6 +99,7 @@ def test_rounded_rotations_are_made_rotations(tmp_path: Path) -> None:
 
 def test_faults_name_file_and_key(tmp_path: Path) -> None:
     path = tmp_path / "camchain.yaml"
+    deep = f"[{', '.join(['[' * 70 + '1, 2' + ']' * 70] * 4)}]"  # numpy has at most 64 dimensions
     for old, new, named in (
         ("distortion_model: none", "distortion_model: fov", "cam1.distortion_model"),
         ("distortion_model: none", "distortion_model: equidistant", "cam1.distortion_coeffs"),
@@ -106,6 +107,7 @@ def test_faults_name_file_and_key(tmp_path: Path) -> None:
         (", 1e-05]", "]", "cam0.distortion_coeffs"),
         ("461.629", "fast", "cam0.intrinsics"),
         ("461.629", "-461.629", "cam0.intrinsics"),
+        ("[461.629, 460.152, 362.680, 246.049]", deep, "cam0.intrinsics"),
         ("[752, 480]", "[752]", "cam0.resolution"),
         ("[752, 480]", "[752.5, 480]", "cam0.resolution.0"),
         ("T_cn_cnm1", "T_c1_c0", "cam1.T_cn_cnm1"),
