@@ -108,9 +108,10 @@ def calibrate(
     )
     rejections += _rejections(usable, pixels, kept, start, adjusted)
     _check_focal(adjusted.rig, adjusted.rig_from_target)
-    used = np.where(kept[..., None], pixels, np.nan)[alive_views]
+    fitting = np.where(kept[..., None], pixels, np.nan)
+    used = fitting[alive_views]
     left_out = np.where(kept[..., None], np.nan, pixels)[alive_views]
-    final = tuple(_views_of(usable, np.where(kept[..., None], pixels, np.nan), alive_views, start))
+    final = tuple(_views_of(usable, fitting, alive_views, start))
     problem = CalibrationProblem(used, points, start, freedom, shape)
     spread = spread_of(problem, adjusted)
     rig = replace(

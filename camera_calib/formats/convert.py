@@ -30,8 +30,8 @@ _TERMS = {rigs.K3: ("k3",), rigs.RATIONAL: ("k4", "k5", "k6"), rigs.PRISM: ("s1"
 _GRID, _DISTANCES = 15, 9
 """Places along each side of the frame, and distances, at which a camera without port is fitted."""
 _CANCELLING_PX = 0.01
-"""Penalty of a distortion coefficient of 1: of those that hardly differ the smallest are taken; the
-residual grows by less than 1 % for it."""
+"""Penalty of a distortion coefficient of 1: of fits that hardly differ, it prefers the one with the
+smallest coefficients; the residual grows by less than 1 % for it."""
 
 
 def _write_own(path: Path, rig: Rig) -> list[Path]:
