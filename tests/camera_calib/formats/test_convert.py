@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.app.cli.main import main
+from alice_survey.app.commands.camera import ConvertCommand
 from alice_survey.core.config import CameraConfig, WaterConfig
 from alice_survey.core.errors import AliceError
 from camera_calib.camera import Camera
@@ -175,18 +176,19 @@ def test_a_stand_in_that_folds_back_inside_the_frame_is_refused(
         in_water(only(DOMES, "left"), 1.0, 3.0)
 
 
-PORT = {"port_distance_m": 0.02, "glass_thickness_m": 0.01}
-DOME = {"outer_radius_m": 0.06, "dome_x_m": 0.0, "dome_y_m": 0.0, "dome_z_m": 0.004,
-        "glass_thickness_m": 0.006, "n_glass": 1.49}  # fmt: skip
+PORT = {"port_distance": 20.0, "glass": 10.0}
+DOME = {"dome_radius": 60.0, "dome_centre": (0.0, 0.0, 4.0), "glass": 6.0, "n_glass": 1.49}
 
 
 @pytest.mark.parametrize(("rig", "port"), [(BENT, PORT), (DOMES, DOME)])
-def test_a_port_given_with_cameras_in_air_makes_the_rig(
-    rig: Rig, port: dict[str, float], tmp_path: Path
+def test_a_port_given_in_millimetres_with_cameras_in_air_makes_the_rig(
+    rig: Rig, port: dict[str, Any], tmp_path: Path
 ) -> None:
     FORMATS["kalibr"].write(tmp_path / "c.yaml", in_air(rig))
-    assert "--n-water" in refused(tmp_path / "c.yaml", tmp_path / "rig.json", port=port)
-    convert_files(tmp_path / "c.yaml", tmp_path / "rig.json", port={**port, "n_water": 1.34})
+    files: dict[str, Any] = {"source": tmp_path / "c.yaml", "target": tmp_path / "rig.json"}
+    with pytest.raises(AliceError, match="--n-water"):
+        ConvertCommand(**files, **port).run()
+    ConvertCommand(**files, **port, n_water=1.34).run()
     assert_same_geometry(read_rig(tmp_path / "rig.json"), rig)
     other = {"outer_radius_m": 0.05} if rig is BENT else {"port_distance_m": 0.005}
     shown = refused(tmp_path / "rig.json", tmp_path / "b.json", port=other)
