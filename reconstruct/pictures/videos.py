@@ -4,7 +4,7 @@ Frames are taken by how far the picture moved on, and the sharpest of these. Mot
 frame is a similarity fitted to tracked corners. It is exact for a camera that looks straight at a
 flat floor, and near enough elsewhere to say how much two frames share.
 
-Where and when a GoPro was says the GPS in its video: only above water it has a fix. Keys and values
+The GPS in a GoPro's video says where and when it was: it has a fix above water only. Its keys
 are those that https://github.com/gopro/gpmf-parser documents. Accelerometers are not read: their
 axes differ from model to model, and a stabilised picture does not turn with its body.
 """
