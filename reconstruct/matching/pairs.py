@@ -389,10 +389,12 @@ def _overlapping(
     sure: dict[Pair, float] = {}
     across: dict[Pair, float] = {}
     maybe: dict[Pair, float] = {}
-    for i, j in sorted(STRtree(wider).query(np.array(wider, object)).T.tolist()):
+    first, second = STRtree(wider).query(np.array(wider, object))
+    once = first < second
+    for i, j in sorted(zip(first[once].tolist(), second[once].tolist(), strict=True)):
         cameras = records[i].camera, records[j].camera
         apart = group[cameras[0]] != group[cameras[1]]
-        if j <= i or (cameras[0] != cameras[1] and not apart):
+        if cameras[0] != cameras[1] and not apart:
             continue
         overlap = _overlap(polygons[i], polygons[j])
         if overlap >= _SURE_OVERLAP:
