@@ -112,7 +112,7 @@ def _polygon(plan: Plan, polygon: Polygon, *, inclusion: bool) -> dict[str, Any]
 
 
 def read_qgc(text: str) -> Mission | None:
-    """Read the mission of a plan: single items."""
+    """Read the mission of a plan: single items, and those that survey items hold."""
     try:
         data = json.loads(text.lstrip("\ufeff"))
     except (ValueError, RecursionError):
@@ -131,7 +131,10 @@ def _read_items(items: list[Any]) -> Iterator[mavlink.Item]:
         where = f"mission item {number}"
         if not isinstance(item, dict):
             raise ValueError(f"{where} is no object")  # noqa: TRY004  a file's
-        if item.get("type") == "SimpleItem" and isinstance(item.get("params"), list):
+        style = item.get("TransectStyleComplexItem")
+        if isinstance(style, dict) and isinstance(style.get("Items"), list):
+            yield from _read_items(style["Items"])
+        elif item.get("type") == "SimpleItem" and isinstance(item.get("params"), list):
             # null stands for a parameter that is not given.
             params = [0.0 if value is None else value for value in item["params"]]
             yield mavlink.item_of(item.get("command"), item.get("frame"), params, where)

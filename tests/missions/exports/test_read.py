@@ -94,6 +94,12 @@ def test_plans_of_qgroundcontrol_and_the_waypoints_are_one_mission(tmp_path: Pat
     paths = files_of(golden_plan(), tmp_path)
     first = read_mission(paths["qgc"])
     again = read_mission(paths["wpl"])
+    data = json.loads(paths["qgc"].read_text())
+    items = data["mission"]["items"]
+    survey = {"type": "ComplexItem", "TransectStyleComplexItem": {"Items": items[2:-1]}}
+    data["mission"]["items"] = [*items[:2], survey, items[-1]]
+    (tmp_path / "survey.plan").write_text(json.dumps(data))
+    assert read_mission(tmp_path / "survey.plan") == first
     assert len(first.steps) == len(again.steps)
     for a, b in zip(first.steps, again.steps, strict=True):
         assert a.latitude_deg == pytest.approx(b.latitude_deg, abs=1e-9)
