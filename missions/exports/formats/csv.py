@@ -1,12 +1,15 @@
 """A plan as tables: lines, stations, and the way-points of the paper's lawnmower; CSV."""
 
+import itertools
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from alice_survey.core.artefacts import write_csv
 from missions.exports.format import Export, ExportFile, ExportFormat
 from missions.exports.geometry import dive_of_line, lat_lon, line_depths, line_ends_deg
+from missions.values.plan_file import Plan
 
 
 def write_lines(path: Path, export: Export, _dive: int) -> None:
@@ -29,36 +32,34 @@ def write_lines(path: Path, export: Export, _dive: int) -> None:
             "depth_m": f"{sum(depths) / len(depths):.3f}", "altitude_m": f"{plan.altitude_m:.3f}",
             "speed_mps": plan.speed_mps, "interval_s": plan.interval_s,
         })  # fmt: skip
-    _write(path, rows)
+    _write(path, iter(rows))
 
 
 def write_stations(path: Path, export: Export, _dive: int) -> None:
     """Every place where all cameras take a picture, in the order of flight."""
-    plan = export.plan
-    rows: list[dict[str, Any]] = []
+    _write(path, _stations(export.plan))
+
+
+def _stations(plan: Plan) -> Iterator[dict[str, Any]]:
+    number = itertools.count()
     dive_of, glass_m = dive_of_line(plan), plan.seafloor_depth_m - plan.altitude_m
     for index, (line, depths) in enumerate(zip(plan.lines, line_depths(plan), strict=True)):
         places = line.stations_ne
         places_deg = lat_lon(plan.datum, places, glass_m)
-        rows += [
-            {
-                "station": len(rows) + i, "dive": dive_of.get(index), "line": index,
+        for (north, east), (lat, lon), depth in zip(places, places_deg, depths, strict=True):
+            yield {
+                "station": next(number), "dive": dive_of.get(index), "line": index,
                 "kind": line.kind, "latitude_deg": f"{lat:.10f}", "longitude_deg": f"{lon:.10f}",
                 "north_m": f"{north:.4f}", "east_m": f"{east:.4f}", "depth_m": f"{depth:.3f}",
                 "altitude_m": f"{plan.altitude_m:.3f}",
                 "heading_deg": f"{math.degrees(line.heading_rad):.6f}",
-            }
-            for i, ((north, east), (lat, lon), depth) in enumerate(
-                zip(places, places_deg, depths, strict=True)
-            )
-        ]  # fmt: skip
-    _write(path, rows)
+            }  # fmt: skip
 
 
 def write_waypoints(path: Path, export: Export, _dive: int) -> None:
     """One row for each way-point: of the glass, and of the vehicle that brings it there."""
     points = [(dive, p) for dive, points in enumerate(export.dives, start=1) for p in points]
-    rows = [
+    rows = (
         {
             "number": number, "dive": dive, "latitude_deg": f"{p.glass_latitude_deg:.10f}",
             "longitude_deg": f"{p.glass_longitude_deg:.10f}", "depth_m": f"{p.glass_depth_m:.3f}",
@@ -71,12 +72,15 @@ def write_waypoints(path: Path, export: Export, _dive: int) -> None:
             "vehicle_depth_m": f"{p.depth_m:.3f}", "altimeter_altitude_m": f"{p.altitude_m:.3f}",
         }
         for number, (dive, p) in enumerate(points, start=1)
-    ]  # fmt: skip
+    )  # fmt: skip
     _write(path, rows)
 
 
-def _write(path: Path, rows: list[dict[str, Any]]) -> None:
-    write_csv(path, tuple(rows[0]), (tuple(row.values()) for row in rows))
+def _write(path: Path, rows: Iterator[dict[str, Any]]) -> None:
+    """Write rows as they come: a plan may have millions of stations."""
+    first = next(rows)
+    cells = (tuple(row.values()) for row in itertools.chain([first], rows))
+    write_csv(path, tuple(first), cells)
 
 
 FORMAT = ExportFormat(

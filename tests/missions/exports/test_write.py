@@ -1,5 +1,7 @@
 import csv
 import math
+import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +36,17 @@ def test_every_format_is_written_the_same_twice(tmp_path: Path) -> None:
     assert names == {path.name for path in (tmp_path / "a").iterdir()}
     for one, two in zip(first, second, strict=True):
         assert one.read_bytes() == two.read_bytes()
+
+
+def test_tables_do_not_hold_all_stations_at_once(tmp_path: Path) -> None:
+    plan = small_plan()
+    many = replace(plan, lines=(replace(plan.lines[0], stations=20_000), *plan.lines[1:]))
+    tracemalloc.start()
+    write_exports(tmp_path, many, RIG, formats=["csv"])
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(rows(tmp_path / "stations.csv")) == many.stations
+    assert peak < 500 * many.stations
 
 
 def test_stations_and_waypoints_in_tables(tmp_path: Path) -> None:
