@@ -209,6 +209,7 @@ def _gdal_layers(file: Path, shown: Path, driver: str) -> list[_Layer]:
             MemoryError,
         ) as error:  # fmt: skip
             text = one_line(error).replace(str(file), shown.name)
+            text = text.partition("; It might help")[0]  # drivers are named by the suffix here
             raise PlanError(f"area: {shown}: cannot be read: {text}") from None
     for text in dict.fromkeys(str(w.message).splitlines()[0] for w in caught):
         if not text.startswith("Non closed ring"):  # reported with its feature

@@ -322,9 +322,11 @@ def _zone_shapes(settings: AreaConfig, role: Role) -> tuple[RawShapes, ...]:
     """
     key = f"{role}_ne_m"
     rings, file = getattr(settings, key), getattr(settings, f"{role}_file")
+    if role == "allowed" and rings is not None:
+        rings = [rings]
     zones = []
     if rings:
-        zones.append(from_rings(key, rings if role == "no_go" else [rings], geographic=False))
+        zones.append(from_rings(key, rings, geographic=False))
     if file is not None:
         zones.append(read_area_file(file, None, settings.crs, role=role))
     return tuple(zones)

@@ -217,6 +217,7 @@ BOMB = (
         ("a.kml", b'<?xml version="1.0" encoding="cp99"?><kml/>', "a.kml"),
         ("a.geojson", b"<OGRVRTDataSource/>", "line 1"),
         ("a.geojson", b'{"type": "Topology"}', "a.geojson"),
+        ("a.geojson", b'{"fileType": "Plan"}', "not recognized"),
         ("a.geojson", b'{"type": ["Polygon"]}', "a.geojson"),
         ("a.geojson", b'{"type": "Polygon", "coordinates": [[[NaN, 0]]]}', "NaN"),
         ("a.geojson", b"[" * 100_000, "a.geojson"),
@@ -237,7 +238,9 @@ def test_files_that_are_not_what_they_say_are_refused(
 ) -> None:
     file = tmp_path / name
     file.write_bytes(content)
-    assert named in refusal(file=file)
+    message = refusal(file=file)
+    assert named in message
+    assert "<DRIVER>" not in message
 
 
 def test_missing_files_and_folders_are_refused(tmp_path: Path) -> None:

@@ -148,6 +148,7 @@ def test_an_allowed_area_may_leave_out_some_but_not_all(
         ({"corridor_ne_m": ((3, 4), (3, 4.0001))}, "corridor_ne_m"),
         ({"polygon_ne_m": SQUARE, "no_go_ne_m": (square(-1, -1, 12),)}, "no_go_ne_m"),
         ({"polygon_ne_m": SQUARE, "allowed_ne_m": square(50, 0, 10)}, "40 m"),
+        ({"polygon_ne_m": SQUARE, "allowed_ne_m": ()}, "allowed_ne_m: 0 distinct corners"),
         ({"polygon_latlon_deg": RING, "latitude_deg": 10.0}, "longitude_deg"),
         (
             {"polygon_latlon_deg": RING, "latitude_deg": 32.0, "longitude_deg": 34.0},
