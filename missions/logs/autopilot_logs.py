@@ -196,15 +196,13 @@ def _signal(
             continue
         try:
             table, others = _one_instance(message, log.tables[message], instance)
-            lost: Counter[str] = Counter()
-            found = clean_signal(message, *source.read(table, log.tables), lost)
+            found = clean_signal(message, *source.read(table, log.tables), log.lost)
         except LackError as error:
             reason = str(error)
             continue
         if found is None:
             reason = "none of its rows can be used"
             continue
-        log.lost.update(lost - log.lost)  # once for a message that serves several roles
         sigma = None
         if source.sigma is not None:
             with contextlib.suppress(LackError):

@@ -277,6 +277,13 @@ def test_damage_costs_what_is_damaged_and_is_counted(tmp_path: Path) -> None:
         imported(tmp_path, log)
 
 
+def test_rows_of_a_message_without_a_usable_one_are_counted(tmp_path: Path) -> None:
+    late = [(m[0], 10**17 + i, *m[2:]) if m[0] == "RFND" else m
+            for i, m in enumerate(dive_messages())]  # fmt: skip
+    data = imported(tmp_path, bin_log(tmp_path, late))
+    assert data["left_out"] == {"RFND: the time is not a number, or after 2200": 20}
+
+
 def telemetry(count: int = 20, boot_ms: int = 90_000) -> list[tuple[float, Any]]:
     """What a ground station records: late by 20 ms, now and then by more."""
     start = FIX_UTC.timestamp()
