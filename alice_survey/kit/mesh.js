@@ -216,8 +216,8 @@ async function startMesh(root, canvas, bytes, {told, lost}) {
   return {pick, mark, show, dress, forget, draw, camera, canvas};
 }
 
-/* What the page holds. */
-function bytesOf(id) {
+/* What the page holds; a mesh that is too large for the browser is a fault like any other. */
+async function bytesOf(id) {
   const text = atob(document.getElementById(id).textContent);
   return Uint8Array.from(text, (letter) => letter.charCodeAt(0)).buffer;
 }
@@ -260,7 +260,7 @@ function awaitMesh() {
     const told = (text) => { document.getElementById("mesh-readout").textContent = text; };
     const lost = () =>
       showStill(root, "The browser took its graphics memory back: this is a still picture.");
-    startMesh(root, canvas, bytesOf("mesh-glb"), {told, lost})
+    bytesOf("mesh-glb").then((bytes) => startMesh(root, canvas, bytes, {told, lost}))
       .then(() => { root.dataset.ready = ""; }, (fault) => {
       showStill(root, "The mesh cannot be shown here (" + fault.message
         + "): this is a still picture.");
