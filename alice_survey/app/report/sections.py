@@ -259,7 +259,8 @@ def _planes(held: Held) -> Iterator[Figure]:
         painted = held.file(f"mosaic/planes/{folder.name}/mosaic.png")
         shows = f"Mosaic of the plane: {plane.about}."
         if painted is None:
-            shows = f"Surface over the plane: {plane.about}. No picture looks at it."
+            shows = f"Surface over the plane: {plane.about}."
+            shows += " No picture looks at it." if held.has("mosaic") else ""
         png = shrunk_png(painted or folder / "dem.png")
         yield Figure(png=png, title=f"Plane {plane.name}", alt=shows, shows=shows)
 

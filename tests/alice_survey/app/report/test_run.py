@@ -4,8 +4,11 @@ from html import unescape
 from pathlib import Path
 
 import pytest
+from PIL import Image
 from pypdf import PdfReader
 
+from alice_survey.app.report.held import Held
+from alice_survey.app.report.sections import _planes
 from alice_survey.app.stages import spec
 from alice_survey.core.artefacts import write_json
 from alice_survey.core.config import SurveyConfig
@@ -91,6 +94,16 @@ def test_a_survey_of_a_wall_alone_is_reported_on_its_own_axes(tmp_path: Path) ->
     assert (
         json.loads((workspace / "report" / "report.json").read_text())["surface"]["covered"] is None
     )
+
+
+def test_that_no_picture_looks_at_a_plane_is_known_from_a_mosaic_alone(tmp_path: Path) -> None:
+    folder = tiny_workspace(tmp_path) / "dense" / "planes" / "wall"
+    write_json(folder / "plane.json", plane_of("wall"))
+    Image.new("L", (9, 9)).save(folder / "dem.png")
+    surface = "Surface over the plane: facing 180 deg, tilt 0 deg."
+    for more in (" No picture looks at it.", ""):
+        assert [one.shows for one in _planes(Held.of(tmp_path))] == [surface + more]
+        (tmp_path / "mosaic" / "stage.json").unlink(missing_ok=True)
 
 
 def test_a_plan_alone_is_reported(tmp_path: Path) -> None:
