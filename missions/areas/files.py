@@ -208,8 +208,9 @@ def _gdal_layers(file: Path, shown: Path, driver: str) -> list[_Layer]:
             DataSourceError, DataLayerError, UnicodeDecodeError, UnboundLocalError, ValueError,
             MemoryError,
         ) as error:  # fmt: skip
-            text = one_line(error).replace(str(file), shown.name)
-            text = text.partition("; It might help")[0]  # drivers are named by the suffix here
+            text = one_line(error).replace(str(file), shown.name).replace(f"{file.parent}/", "")
+            # Drivers are named by the suffix here, and options of GDAL cannot be set.
+            text = re.split(r"; It might help|\. Set SHAPE_RESTORE_SHX", text)[0]
             raise PlanError(f"area: {shown}: cannot be read: {text}") from None
     for text in dict.fromkeys(str(w.message).splitlines()[0] for w in caught):
         if not text.startswith("Non closed ring"):  # reported with its feature

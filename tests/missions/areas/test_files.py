@@ -225,6 +225,7 @@ BOMB = (
         ("a.gpkg", b"<OGRVRTDataSource/>", "a.gpkg"),
         ("a.gpkg", b"SQLite format 3\x00 and then nothing", "a.gpkg"),
         ("a.shp", b"<OGRVRTDataSource/>", "a.shp"),
+        ("a.shp", b"\x00\x00\x27\x0a" + bytes(96), "cannot be read: Unable to open a.shx or "),
         ("a.kmz", b"", "a.kmz"),
         ("a.wkt", b"\xff", "a.wkt"),
         ("a.wkt", b"POLYGON (0 0", "a.wkt"),
@@ -240,7 +241,7 @@ def test_files_that_are_not_what_they_say_are_refused(
     file.write_bytes(content)
     message = refusal(file=file)
     assert named in message
-    assert "<DRIVER>" not in message
+    assert "<DRIVER>" not in message and "SHAPE_RESTORE" not in message
 
 
 def test_missing_files_and_folders_are_refused(tmp_path: Path) -> None:
