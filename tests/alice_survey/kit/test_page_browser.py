@@ -19,6 +19,8 @@ pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
 SIZES = {"desk": (1280, 900), "phone": (400, 800)}
 MAP, MESH = "#map-canvas", "#mesh-canvas"
 RESTS = "() => !document.querySelector('.leaflet-zoom-anim, .leaflet-pan-anim')"
+A4_PX = round(180 / 25.4 * 96)
+"""Between the margins of the printed page."""
 
 
 @pytest.fixture(scope="module")
@@ -211,6 +213,27 @@ def test_no_fault_that_axe_finds(page: Any) -> None:
     page.mouse.click(*place_on_page(page, 0.6, -0.533))  # with a popup open
     is_accessible(page)
     page.keyboard.press("Escape")
+
+
+def test_paper_shows_all(page: Any) -> None:
+    size = page.viewport_size
+    page.set_viewport_size({"width": A4_PX, "height": 1000})
+    page.emulate_media(media="print")
+    over, stills, moving = page.evaluate(
+        """(width) => [[...document.querySelectorAll("body *")]
+          .filter((e) => e.checkVisibility() && !e.closest("svg > *, .skip"))
+          .filter((e) => e.getBoundingClientRect().right > width + 0.5
+            || (getComputedStyle(e).overflowX !== "visible" && e.scrollWidth > e.clientWidth + 1))
+          .map((e) => e.outerHTML.slice(0, 120)),
+          [...document.querySelectorAll(".still img")]
+          .map((e) => e.checkVisibility() && e.getBoundingClientRect().height),
+          [...document.querySelectorAll(".live, nav")].some((e) => e.checkVisibility())]""",
+        A4_PX,
+    )
+    page.emulate_media(media="screen")
+    page.set_viewport_size(size)
+    assert (over, moving, len(stills)) == ([], False, 2)
+    assert min(stills) > 200
 
 
 def test_no_complaint_and_no_network(opened: tuple[Any, Heard], file: Path) -> None:

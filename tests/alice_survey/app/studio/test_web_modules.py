@@ -205,3 +205,19 @@ def test_no_answer_is_shown_after_that_of_a_newer_request(tmp_path: Path) -> Non
     )  # fmt: skip
     assert asked == ["slow", "quick", "bad"]
     assert seen == [["quick", False], "bad"]
+
+
+def test_unknown_values_interrupt_a_line_and_ticks_are_round_and_within_limits(
+    tmp_path: Path,
+) -> None:
+    limits = [(-12.31, -11.87, 5), (0.0, 1234.0, 5), (0.0, 4.0, 4), (-5.0, 0.0, 5)]
+    path, found = run(
+        tmp_path, "chart_lines",
+        "[m.pathData([0, 1, 2, 3, 4], [1, 2, null, 3, 4]), l.map((row) => m.ticks(...row))]",
+        l=limits,
+    )  # fmt: skip
+    assert path == "M0.0 1.0L1.0 2.0M3.0 3.0L4.0 4.0"
+    for (low, high, maximum), (values, digits) in zip(limits, found, strict=True):
+        assert 2 <= len(values) <= maximum + 1
+        assert low - 1e-9 <= min(values) and max(values) <= high + 1e-9
+        assert np.allclose(values, np.round(values, digits), atol=1e-9)
