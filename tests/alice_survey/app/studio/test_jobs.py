@@ -273,9 +273,11 @@ def test_a_log_is_bounded_and_damaged_lines_are_left_out(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("file", "text"),
     [
-        ("job.json", {"process": "x"}), ("job.json", {"number": 10**400}),
-        ("job.json", {"started_utc": "yesterday"}), ("events.jsonl", {"step_number": None}),
-        ("events.jsonl", {"elapsed_s": "abc"}), ("events.jsonl", {"event": "run_finished"}),
+        ("job.json", {"process": "x"}), ("job.json", {"process": -1}),  # all that this user runs
+        ("job.json", {"number": 10**400}), ("job.json", {"started_utc": "yesterday"}),
+        ("events.jsonl", {"step_number": None}), ("events.jsonl", {"elapsed_s": "abc"}),
+        ("events.jsonl", {"event": "run_finished"}),
+        ("events.jsonl", {"event": "run_finished", "exit_code": "x"}),
         ("events.jsonl", {"event": "stage_finished", "stage": "nostage"}),
     ],
 )  # fmt: skip

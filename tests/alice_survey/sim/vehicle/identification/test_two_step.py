@@ -56,9 +56,6 @@ def test_a_current_cannot_be_calibrated_in_turn() -> None:
         calibrate(windows, free_parameters(KNOWN, ("X_uu", "current")))
 
 
-KNOWN = vehicle_from("alice")
-
-
 def pull_csv(
     path: Path, noise_n: float, seed: int = 0, factors: tuple[float, float] = (0.8, 1.2)
 ) -> Path:
