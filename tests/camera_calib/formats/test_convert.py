@@ -49,6 +49,8 @@ DOMED = Camera(
 DOMES = replace(DESIGN, cameras={"left": DOMED, "right": changed(DOMED, k1=0.03)})
 FULL = replace(BENT, covariance=covariance_of(BENT, np.random.default_rng(4)))
 IN_AIR = in_air(BENT)
+PLACES = {name: RigidTransform.from_translation([0.1 * i, 0, 0]) for i, name in enumerate("abc")}
+THREE = replace(IN_AIR, cameras=dict.fromkeys(PLACES, IN_AIR.cameras["left"]), cam_from_rig=PLACES)
 CHANNELS = {
     "opencv": "o.xml",
     "colmap": "model",
@@ -102,6 +104,7 @@ LOSSES: list[tuple[str, Rig, dict[str, Any], tuple[str, ...]]] = [
                       ("colmap", "s4"), ("refractive", "s2"))),
     ("metashape", in_air(DOMES), {}, ("2 cameras", "--camera")),
     ("ros", in_air(DOMES), {}, ("2 cameras", "--camera")),
+    ("opencv", THREE, {}, ("3 cameras", "--camera")),
     ("colmap", FULL, {**WATER, "drop_port": True, "drop_covariance": True}, ("--drop-port",)),
     ("colmap", FULL, {"water": (3.0, 1.5), "drop_covariance": True}, ("3 to 1.5",)),
 ]  # fmt: skip
