@@ -64,8 +64,8 @@ _MAX_GAIN = 8.0
 BRIGHT_PERCENT = 98.0
 """Share of a survey's spots that are no brighter than what counts as bright."""
 _WHITE_LEVEL, _GREY_LEVEL = 215.0, 128.0
-_WHITE_SAMPLES = 1_000_000
-"""Of a survey, that white is found from."""
+_WHITE_PARTS = 4
+"""White is found from as many samples as this many parts have."""
 _NORM = 6.0
 
 
@@ -529,9 +529,9 @@ def _white(
     parts: SampleParts, light: LightModel, images: Sequence[str], cameras: Sequence[str]
 ) -> Array:
     """Factors that make what is bright neutral, and the survey light without burning out."""
-    kept = joined_samples(
-        list(parts.map(LightSamples.thin, [_WHITE_SAMPLES // len(parts.items)] * len(parts.items)))
-    )
+    count = len(parts.items)
+    rows = slice(None, None, -(-count // _WHITE_PARTS))  # one step, so that all parts count alike
+    kept = joined_samples(list(parts.map(LightSamples.part, [rows] * count)))
     if not len(kept.views):
         return np.ones(3)
     nodes, weights = node_weights(kept.places[:, 0])

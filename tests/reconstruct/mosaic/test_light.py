@@ -1,4 +1,5 @@
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -206,3 +207,17 @@ def test_samples_in_files_give_the_light_of_all_at_once(tmp_path):
             np.testing.assert_allclose(light.gains[image], at_once.gains[image], atol=1e-9)
         np.testing.assert_allclose(light.white, at_once.white, rtol=1e-9)
         np.testing.assert_array_equal(light.white, by_parts[0].white)
+
+
+def test_each_sample_counts_alike_in_many_parts_of_which_the_last_is_short():
+    rng = np.random.default_rng(2)
+    ground = rng.normal(4.2, 0.1, (16_400, 3)).astype(np.float32)
+    ground[16_000:] += [0.3, 0.6, 0.9]  # the last part is bright, and of another colour
+    places = rng.uniform(0, 1, (len(ground), 2, 2)).astype(np.float32)
+    views = rng.integers(0, 9, (len(ground), 2)).astype(np.int32)
+    found = LightSamples(views=views, places=places, levels=np.stack([ground, ground], axis=1))
+    parts = [found.part(slice(start, start + 2000)) for start in range(0, len(ground), 2000)]
+    light = solve_light(
+        Parts(items=parts, load=replace, label="light"), UNKNOWN, IMAGES, ["left"] * 9
+    )
+    np.testing.assert_allclose(light.white, light_of(found).white, rtol=0.03)
