@@ -136,9 +136,9 @@ class LightSamples:
     """(N, 3) factors of their errors over the usual; None for 1."""
 
     def part(self, chosen: Any) -> "LightSamples":
-        """The chosen rows."""
+        """The chosen rows, copied: a view of a few would keep all in memory."""
         known = {name: values for name, values in vars(self).items() if values is not None}
-        return LightSamples(**{name: values[chosen] for name, values in known.items()})
+        return LightSamples(**{name: np.array(values[chosen]) for name, values in known.items()})
 
     def thin(self, maximum: int) -> "LightSamples":
         """Every so many-th row, as many as a number or fewer."""
