@@ -114,13 +114,7 @@ def import_log(
         if not flipped:
             raise NavigationError(f"{path}: holds no velocity that --flip-velocity could turn")
         dive = replace(dive, **flipped)
-    if options.dead_reckon is not None:
-        try:
-            dive = with_dead_reckoning(
-                dive, options.dead_reckon, options.start_at, options.declination_deg
-            )
-        except NavigationError as error:
-            raise NavigationError(f"{path}: {error}") from None
+    dive = dead_reckon(path, dive, options)
     tide = read_tide(options.tide, dated=dive.dated)
     if dive.declination_in_log and options.declination_deg:
         warn(f"the vehicle added a declination {dive.declination_in_log}: yours comes on top")
@@ -153,6 +147,22 @@ def import_log(
         raise NavigationError(f"{error.filename}: cannot be written: {error.strerror}") from None
     tidal = isinstance(tide, Signal) or tide != 0.0
     return _report(path, out, dive, time_s, columns, lost, tidal=tidal)
+
+
+def dead_reckon(path: Path, dive: LoggedDive, options: ImportOptions) -> LoggedDive:
+    """The dive with positions of its velocities, where the options ask for that.
+
+    Raises:
+        NavigationError: the log lacks what dead reckoning needs.
+    """
+    if options.dead_reckon is None:
+        return dive
+    try:
+        return with_dead_reckoning(
+            dive, options.dead_reckon, options.start_at, options.declination_deg
+        )
+    except NavigationError as error:
+        raise NavigationError(f"{path}: {error}") from None
 
 
 def read_dive(path: Path, options: ImportOptions) -> LoggedDive:

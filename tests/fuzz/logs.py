@@ -20,8 +20,14 @@ from alice_survey.sim.vehicle.vehicle import (
     vehicle_from_file,
 )
 from missions.coverage import dive_record
-from missions.logs.dead_reckoning import TrackErrors, with_dead_reckoning
-from missions.logs.import_log import ImportOptions, navigation_table, read_dive, read_tide
+from missions.logs.dead_reckoning import TrackErrors
+from missions.logs.import_log import (
+    ImportOptions,
+    dead_reckon,
+    navigation_table,
+    read_dive,
+    read_tide,
+)
 from missions.logs.navigation_csv import read_navigation
 from reconstruct.pictures.incoming import pair_by_time
 from tests.fuzz.target import Target
@@ -68,8 +74,8 @@ def _dvl() -> str:
 
 def read_dead_reckoned(path: Path) -> object:
     """As `import-log --dead-reckon`."""
-    found = read_dive(path, ImportOptions())
-    return with_dead_reckoning(found, TrackErrors(), (43.0, 5.0, 2.0), 0.0)
+    options = ImportOptions(dead_reckon=TrackErrors(), start_at=(43.0, 5.0, 2.0))
+    return dead_reckon(path, read_dive(path, options), options)
 
 
 def _dive() -> list[tuple[object, ...]]:
