@@ -167,7 +167,6 @@ import sys, time
 from pathlib import Path
 from alice_survey.core.artefacts import Stage, run_stage
 def work(folder):
-    block = bytearray(64 << 20)
     started = time.process_time()
     while time.process_time() - started < float(sys.argv[2]):
         pass
