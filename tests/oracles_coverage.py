@@ -7,34 +7,24 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
-from shapely.geometry import MultiPolygon, Polygon
-from shapely.geometry.base import BaseGeometry
+from shapely.geometry import Polygon
 
 from alice_survey.core.config import CameraConfig, WaterConfig
-from alice_survey.core.frames import Array, Datum, rotation_from_attitude
+from alice_survey.core.frames import Array, rotation_from_attitude
 from camera_calib.rig import Rig, design_rig
 from missions.coverage.certificate import Certificate
 from missions.coverage.stations import Stations
-from missions.values.area import Area, multipolygon
+from missions.values.area import Area
 from missions.values.footprint import footprint_ne
 from missions.values.legs import Route
 from missions.values.line import Line
 from missions.values.plan_file import Plan
 from tests.missions.exports.plans import plan_of as plan_by_hand
 from tests.missions.exports.plans import straight
+from tests.oracles_lines import DATUM, area_of
 
-DATUM = Datum(32.8236, 34.9553)
+__all__ = ["DATUM", "area_of"]
 _FLOOR_M = 50.0
-
-
-def area_of(shape: BaseGeometry, margin_m: float = 3.0) -> Area:
-    """An area with room to turn."""
-    return Area(
-        datum=DATUM,
-        survey=multipolygon(shape),
-        allowed=multipolygon(shape.buffer(margin_m, join_style="mitre")),
-        no_go=MultiPolygon(),
-    )
 
 
 def pinhole_rig(across_m: float, along_m: float, baseline_m: float | None = None) -> Rig:
@@ -47,13 +37,13 @@ def pinhole_rig(across_m: float, along_m: float, baseline_m: float | None = None
         ),
         WaterConfig(n_water=1.0),
     )  # fmt: skip
-    if baseline_m is not None:
-        return both
-    return replace(
-        both,
-        cameras={"left": both.cameras["left"]},
-        cam_from_rig={"left": both.cam_from_rig["left"]},
-    )
+    return left_alone(both) if baseline_m is None else both
+
+
+def left_alone(rig: Rig) -> Rig:
+    """The left camera of a rig without the other."""
+    cameras = {"left": rig.cameras["left"]}
+    return replace(rig, cameras=cameras, cam_from_rig={"left": rig.cam_from_rig["left"]})
 
 
 def shifted(stations: Stations, north_m: float, east_m: float) -> Stations:

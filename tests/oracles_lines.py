@@ -21,7 +21,7 @@ from missions.values.costs import Costs, power_at, time_costs
 from missions.values.line import Line
 from missions.values.pattern import Pattern
 
-DATUM = Datum(latitude_deg=32.8, longitude_deg=34.9)
+DATUM = Datum(latitude_deg=32.8236, longitude_deg=34.9553)
 STEREO = Pattern(spacing_m=1.0, step_m=0.47, half_across_m=0.6, half_along_m=0.57)
 TWICE = Pattern(spacing_m=0.5, step_m=0.3, half_across_m=0.6, half_along_m=0.57)
 SPARSE = Pattern(spacing_m=1.2, step_m=1.0, half_across_m=0.61, half_along_m=0.57)
@@ -96,23 +96,14 @@ areas = st.integers(0, 2**32 - 1).map(lambda seed: random_area(np.random.default
 
 def reaches_by_shapely(
     survey: BaseGeometry, heading_rad: float, offset: float, half_m: float
-) -> list[tuple[float, float]]:
-    """Projection on u of what lies in a strip, by clipping."""
+) -> Array:
+    """Projections on u, (N, 2), of the parts that lie in a strip, by clipping."""
     turned = shapely.affinity.rotate(survey, -heading_rad, origin=(0, 0), use_radians=True)
     u_0, _, u_1, _ = turned.bounds
     inside = turned.intersection(box(u_0 - 1, offset - half_m, u_1 + 1, offset + half_m))
-    spans = sorted(
-        (part.bounds[0], part.bounds[2])
-        for part in shapely.get_parts(inside).tolist()
-        if part.area > 1e-9
-    )
-    united: list[tuple[float, float]] = []
-    for begin, end in spans:
-        if united and begin <= united[-1][1] + 1e-6:
-            united[-1] = (united[-1][0], max(united[-1][1], end))
-        else:
-            united.append((begin, end))
-    return united
+    parts = shapely.get_parts(inside)
+    bounds: Array = shapely.bounds(parts[shapely.area(parts) > 1e-9])
+    return bounds[:, [0, 2]]
 
 
 def sees(lines: Sequence[Line], points: Array, pattern: Pattern) -> tuple[Array, Array]:
@@ -150,21 +141,14 @@ def as_string(line: Line) -> LineString:
 
 
 def best_tour_by_trial(
-    exits: NDArray[np.int64],
-    inner: Array,
-    hop: Callable[[int, int], float],
-    start: Array,
-    finish: Array,
+    exits: NDArray[np.int64], inner: Array, hops: Array, start: Array, finish: Array
 ) -> float:
     """The least cost of all orders and corners of entry; arguments as of `tour.exact_tour`."""
-    cells = len(inner) // 4
     best = math.inf
-    for order in itertools.permutations(range(cells)):
-        for corners in itertools.product(range(4), repeat=cells):
-            flown = [4 * c + k for c, k in zip(order, corners, strict=True)]
-            cost = start[flown[0]] + finish[flown[0], exits[flown[-1]]]
-            cost += sum(inner[y] for y in flown)
-            cost += sum(hop(int(exits[a]), b) for a, b in itertools.pairwise(flown))
+    for order in itertools.permutations(range(len(inner) // 4)):
+        for flown in itertools.product(*(range(4 * c, 4 * c + 4) for c in order)):
+            cost = start[flown[0]] + finish[flown[0], exits[flown[-1]]] + inner[[*flown]].sum()
+            cost += sum(hops[exits[a], b] for a, b in itertools.pairwise(flown))
             best = min(best, float(cost))
     return best
 

@@ -10,11 +10,11 @@ import shapely
 from scipy.spatial.transform import RigidTransform
 from shapely.geometry.base import BaseGeometry
 
-from alice_survey.core.artefacts import Stage, run_stage, write_json
 from alice_survey.core.config import SurveyConfig
+from alice_survey.core.frames import Array
 from alice_survey.kit.words import share
 from camera_calib.mount import mount_rotation
-from camera_calib.rig import Rig, design_rig, write_rig
+from camera_calib.rig import write_rig
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.holes import Hole
 from missions.coverage.stations import Stations, join, plan_pattern, stations_of_plan
@@ -26,11 +26,12 @@ from missions.values.line import Line
 from missions.values.navigation import write_navigation
 from missions.values.plan_file import Plan, read_plan
 from tests.missions.coverage.logs import log_of, write_triggers
-from tests.oracles_coverage import DATUM, area_of, lawnmower, plan_of
+from tests.missions.exports.plans import RIG
+from tests.missions.follow.dives import workspace_of
+from tests.oracles_coverage import DATUM, area_of, lawnmower, left_alone, plan_of
 from tests.oracles_route import inside
 
 CONFIG = SurveyConfig()
-RIG = design_rig(CONFIG.camera, CONFIG.water)
 
 
 def refly(plan: Plan, flown: Certificate, holes: Sequence[Hole]) -> Plan:
@@ -47,32 +48,9 @@ def survey(shape: BaseGeometry) -> Plan:
     return plan_of(area, lawnmower(8.0, 6.0, 1.0, 0.46, over_m=1.0))
 
 
-def one_camera(mount: RigidTransform) -> Rig:
-    """The left camera alone, mounted."""
-    return Rig(
-        cameras={"left": RIG.cameras["left"]},
-        cam_from_rig={"left": RIG.cam_from_rig["left"]},
-        body_from_rig=mount,
-        source="another rig",
-    )
-
-
-def same(one: RigidTransform | None, other: RigidTransform | None) -> bool:
-    """Whether two mounts are one, to a file's digits."""
-    assert one is not None
-    assert other is not None
-    return bool(np.allclose(one.as_matrix(), other.as_matrix(), atol=1e-9))
-
-
 def without(plan: Plan, index: int) -> Stations:
     stations = stations_of_plan(plan)
     return stations.some(stations.line != index)
-
-
-def workspace_of(folder: Path, plan: Plan) -> Path:
-    stage = Stage(name="plan", version=1, settings={})
-    run_stage(folder, stage, lambda part: write_json(part / "plan.json", plan.to_json()))
-    return folder
 
 
 def dived(folder: Path, plan: Plan, flown: Stations) -> Path:
@@ -165,20 +143,15 @@ def test_the_plan_for_the_holes_is_whole_and_closes_them(
 
 def test_a_complete_dive_leaves_no_plan(tmp_path: Path) -> None:
     plan = survey(shapely.box(0, 0, 8, 6))
-    workspace = dived(tmp_path, plan, stations_of_plan(plan))
+    workspace, at = dived(tmp_path, plan, stations_of_plan(plan)), tmp_path / "triggers.csv"
+    out = tmp_path / "out"
 
-    data = check_report(
-        workspace,
-        CONFIG,
-        tmp_path / "nav.csv",
-        triggers=tmp_path / "triggers.csv",
-        out=tmp_path / "out",
-    )[1]
+    data = check_report(workspace, CONFIG, tmp_path / "nav.csv", triggers=at, out=out)[1]
 
     assert data["flown"]["share_at_overlap"] == 1.0
     assert "refly" not in data
-    assert not (tmp_path / "out" / "refly").exists()
-    assert json.loads((tmp_path / "out" / "holes.geojson").read_text())["features"] == []
+    assert not (out / "refly").exists()
+    assert json.loads((out / "holes.geojson").read_text())["features"] == []
 
 
 def test_the_mount_is_the_calibrated_else_the_found_else_the_designed_one(tmp_path: Path) -> None:
@@ -189,24 +162,25 @@ def test_the_mount_is_the_calibrated_else_the_found_else_the_designed_one(tmp_pa
     for folder in ("calibration", "sparse"):
         (tmp_path / folder).mkdir()
 
-    def taken() -> tuple[RigidTransform | None, str]:
+    def taken() -> tuple[Array, str]:
         rig = rig_of(tmp_path, CONFIG.camera, CONFIG.water)
-        return rig.body_from_rig, rig.source
+        return rig.body_from_rig.as_matrix(), rig.source
 
     assert taken()[1] == RIG.source
     write_rig(tmp_path / "calibration" / "rig.json", calibrated)
-    for of_other in (None, replace(calibrated, body_from_rig=None), one_camera(found)):
+    another = replace(left_alone(RIG), body_from_rig=found, source="another rig")
+    for of_other in (None, calibrated, another):
         if of_other is not None:
             write_rig(tmp_path / "sparse" / "rig.json", of_other)
         mount, source = taken()
-        assert same(mount, RIG.body_from_rig)
+        np.testing.assert_allclose(mount, RIG.body_from_rig.as_matrix(), atol=1e-9)
         assert "a pool" in source
         assert source.endswith("mounted as designed")
     write_rig(tmp_path / "sparse" / "rig.json", replace(calibrated, body_from_rig=found))
     mount, source = taken()
-    assert same(mount, found)
+    np.testing.assert_allclose(mount, found.as_matrix(), atol=1e-9)
     assert source.endswith("mounted as the reconstruction found")
     write_rig(tmp_path / "calibration" / "rig.json", replace(calibrated, body_from_rig=stated))
     mount, source = taken()
-    assert same(mount, stated)
+    np.testing.assert_allclose(mount, stated.as_matrix(), atol=1e-9)
     assert "mounted" not in source

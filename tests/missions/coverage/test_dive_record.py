@@ -1,7 +1,6 @@
 import csv
 import math
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -10,36 +9,27 @@ import shapely
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.artefacts import write_csv
-from alice_survey.core.config import CameraConfig, WaterConfig
 from alice_survey.core.errors import NavigationError
 from alice_survey.core.frames import Array, rotation_from_attitude
 from alice_survey.core.trajectory import Trajectory, write_track
-from camera_calib.rig import Rig, design_rig
 from missions.coverage.dive_record import DiveRecord, assign_lines, read_dive_record
 from missions.coverage.stations import Stations, stations_of_plan
 from missions.values.navigation import write_navigation
-from missions.values.plan_file import Plan
 from tests.missions.coverage.logs import log_of, write_triggers
+from tests.missions.exports.plans import RIG
 from tests.oracles_coverage import DATUM, area_of, lawnmower, plan_of
 
-
-@cache
-def rig() -> Rig:
-    return design_rig(CameraConfig(), WaterConfig())
-
-
-@cache
-def plan() -> Plan:
-    return plan_of(area_of(shapely.box(0, 0, 6, 3)), lawnmower(6.0, 3.0, 1.0, 0.46, over_m=0.5))
+LINES = lawnmower(6.0, 3.0, 1.0, 0.46, over_m=0.5)
+PLAN = plan_of(area_of(shapely.box(0, 0, 6, 3)), LINES)
 
 
 def leaning_flight() -> tuple[Array, Stations]:
     """Times 2.3 s apart, and the plan's stations flown with some roll, pitch and altitude."""
-    exact = stations_of_plan(plan())
+    exact = stations_of_plan(PLAN)
     rng = np.random.default_rng(5)
     tilt = np.deg2rad(rng.normal(0, 3, (len(exact), 2)))
     attitude = np.column_stack([tilt, exact.attitude_rad[:, 2]])
-    time_s = 100.0 + plan().interval_s * np.arange(len(exact), dtype=float)
+    time_s = 100.0 + PLAN.interval_s * np.arange(len(exact), dtype=float)
     altitude_m = rng.uniform(1.8, 2.2, len(exact))
     return time_s, replace(exact, attitude_rad=attitude, altitude_m=altitude_m, time_s=time_s)
 
@@ -65,7 +55,7 @@ class LoggedFlight:
 
     def record(self, log: Path | None = None, triggers: str | None = "triggers.csv") -> DiveRecord:
         at = {} if triggers is None else {"triggers": self.folder / triggers}
-        return read_dive_record(log or self.folder / "nav.csv", plan(), rig(), **at)
+        return read_dive_record(log or self.folder / "nav.csv", PLAN, RIG, **at)
 
     def refusal(self, log: Path | None = None, triggers: str = "triggers.csv") -> str:
         with pytest.raises(NavigationError) as fault:
@@ -76,7 +66,7 @@ class LoggedFlight:
 @pytest.fixture
 def dive(tmp_path: Path) -> LoggedFlight:
     time_s, flown = leaning_flight()
-    write_navigation(tmp_path / "nav.csv", log_of(flown, plan(), rig()), DATUM)
+    write_navigation(tmp_path / "nav.csv", log_of(flown, PLAN, RIG), DATUM)
     write_triggers(tmp_path / "triggers.csv", time_s, flown.line)
     return LoggedFlight(tmp_path, flown)
 
@@ -200,7 +190,7 @@ def test_logs_of_elsewhere_or_another_time_are_refused(dive: LoggedFlight) -> No
 
 def test_a_simulated_flight_counts_by_its_true_track(tmp_path: Path) -> None:
     time_s, flown = leaning_flight()
-    log = log_of(flown, plan(), rig())
+    log = log_of(flown, PLAN, RIG)
     believed = replace(log, position_ned=log.position_ned + np.array([3.0, 0.0, 0.5]))
     write_navigation(tmp_path / "navigation.csv", believed, DATUM)
     write_triggers(tmp_path / "triggers.csv", time_s, flown.line)
@@ -213,8 +203,7 @@ def test_a_simulated_flight_counts_by_its_true_track(tmp_path: Path) -> None:
     write_track(tmp_path / "truth" / "track.csv", track)
 
     by_track, drifted = (
-        read_dive_record(log, plan(), rig()).stations
-        for log in (tmp_path, tmp_path / "navigation.csv")
+        read_dive_record(log, PLAN, RIG).stations for log in (tmp_path, tmp_path / "navigation.csv")
     )
     assert_alike(by_track, flown)
     assert np.all(drifted.glass_ne[:, 0] - flown.glass_ne[: len(drifted), 0] > 2.9)
@@ -222,7 +211,7 @@ def test_a_simulated_flight_counts_by_its_true_track(tmp_path: Path) -> None:
 
 def test_straight_runs_off_the_plan_are_separate_lines() -> None:
     """A straight run across, between lines too far off, and single pictures in a turn."""
-    exact = stations_of_plan(plan())
+    exact = stations_of_plan(PLAN)
     run = np.column_stack([np.full(5, 3.0), np.linspace(6.0, 8.0, 5)])
     turning = np.column_stack([np.linspace(20, 21, 4), np.full(4, 20.0)])
     headings = np.concatenate([np.full(5, math.pi / 2), [0.0, 1.5, 3.0, 4.5]])
@@ -235,22 +224,19 @@ def test_straight_runs_off_the_plan_are_separate_lines() -> None:
         line=np.full(len(exact) + 9, -1),
     )
 
-    lines = assign_lines(others, plan())
+    lines = assign_lines(others, PLAN)
 
     np.testing.assert_array_equal(lines[: len(exact)], exact.line)
-    np.testing.assert_array_equal(lines[-9:-4], len(plan().lines))
+    np.testing.assert_array_equal(lines[-9:-4], len(PLAN.lines))
     np.testing.assert_array_equal(lines[-4:], -1)
 
 
 def test_a_closing_line_back_along_the_first_has_pictures_of_its_own() -> None:
-    lines = lawnmower(6.0, 3.0, 1.0, 0.46, over_m=0.5)
-    back = replace(
-        lines[0], kind="closing", start_ne_m=lines[0].end_ne_m, end_ne_m=lines[0].start_ne_m
-    )
-    closed = plan_of(area_of(shapely.box(0, 0, 6, 3)), [*lines, back])
+    back = replace(LINES[0].reverse(), kind="closing")
+    closed = plan_of(PLAN.area, [*LINES, back])
     exact = stations_of_plan(closed)
     found = assign_lines(exact, closed)
     off = found != exact.line
     np.testing.assert_array_equal(found[~off], exact.line[~off])
-    assert not off[exact.line < len(lines)].any()
+    assert not off[exact.line < len(LINES)].any()
     assert off.sum() <= 1  # the first: where it came from is on another line

@@ -7,11 +7,11 @@ import pytest
 from alice_survey.core.config import CameraConfig, WaterConfig
 from camera_calib.rig import Rig, design_rig
 from missions.coverage.stations import stations_of_lines
+from tests.missions.exports.plans import RIG as REAL
 from tests.oracles_coverage import lawnmower, pinhole_rig
 from tests.oracles_overlap import measured_side_overlap
 
 IDEAL = design_rig(CameraConfig(port_distance_m=0.0, glass_thickness_m=0.0), WaterConfig())
-REAL = design_rig(CameraConfig(), WaterConfig())
 
 
 def middle_row_m(rig: Rig, altitude_m: float) -> float:

@@ -34,7 +34,7 @@ def test_a_row_reaches_as_far_as_the_area_in_its_strip(
         oracle = reaches_by_shapely(survey, heading, offset, half_m)
         # Where parts come within a hair of each other the two may split them differently.
         joined = shapely.union_all([box(a - 1e-5, 0, b + 1e-5, 1) for a, b in mine.tolist()])
-        wanted = shapely.union_all([box(a - 1e-5, 0, b + 1e-5, 1) for a, b in oracle])
+        wanted = shapely.union_all([box(a - 1e-5, 0, b + 1e-5, 1) for a, b in oracle.tolist()])
         assert joined.symmetric_difference(wanted).area < 1e-4
 
 
@@ -72,15 +72,12 @@ def lay(
     return lay_rows(turned(survey, 0.0), turned(allowed, 0.0), offsets, *wanted.values())
 
 
-def test_a_piece_is_whole_steps_long_where_there_is_room() -> None:
-    pieces, cuts = lay(box(0, 0, 10.2, 1), box(-5, -5, 20, 5))
-    np.testing.assert_allclose(pieces, [[0, -0.4, 10.6, 22]], atol=1e-9)
-    assert len(cuts) == 0
-
-
-def test_a_piece_without_room_has_shorter_steps() -> None:
-    pieces, cuts = lay(box(0, 0, 10.2, 1), box(-0.2, -5, 10.4, 5))
-    np.testing.assert_allclose(pieces, [[0, -0.2, 10.4, 22]], atol=1e-9)
+@pytest.mark.parametrize(("room_m", "over_m"), [(5.0, 0.4), (0.2, 0.2)])
+def test_a_piece_is_whole_steps_long_or_without_room_has_shorter_ones(
+    room_m: float, over_m: float
+) -> None:
+    pieces, cuts = lay(box(0, 0, 10.2, 1), box(-room_m, -5, 10.2 + room_m, 5))
+    np.testing.assert_allclose(pieces, [[0, -over_m, 10.2 + over_m, 22]], atol=1e-9)
     assert len(cuts) == 0
 
 
