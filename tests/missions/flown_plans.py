@@ -14,7 +14,7 @@ from alice_survey.sim.seafloor.terrain import Terrain, survey_terrain
 from alice_survey.sim.vehicle.sea import FloorGrid, level_floor
 from camera_calib.rig import design_rig
 from missions.fly.simulation import flight_settings, simulate_plan
-from missions.plan.planner import plan_survey
+from missions.plan.planner import Planned, plan_survey
 from missions.values.area import Area
 from missions.values.flight import Flight
 from missions.values.legs import Leg, Route
@@ -91,9 +91,14 @@ def survey(**sections: Any) -> SurveyConfig:
     return parse_config({"area": area, "sea": sea} | sections, "test")
 
 
+def planned_survey(config: SurveyConfig) -> Planned:
+    """The plan of a survey, with its certificate and warnings."""
+    return plan_survey(config, design_rig(config.camera, config.water))
+
+
 def planned(config: SurveyConfig) -> Plan:
     """The plan of a survey."""
-    return plan_survey(config, design_rig(config.camera, config.water)).plan
+    return planned_survey(config).plan
 
 
 def flown(

@@ -1,17 +1,23 @@
+from typing import Any
+
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from camera_calib.fov.table import fov_table
-from missions.exposure.conflict import ConflictError
-from missions.exposure.focus import aperture_warning, plan_focus
-from tests.missions.exposure.surveys import survey
+from missions.exposure.focus import Focus, aperture_warning, plan_focus
+from missions.exposure.settings import ImagingSetup
+from tests.missions.exposure.surveys import conflict_of, survey
 from tests.oracles_imaging import blur_circle_px
 
 
+def focused(**sections: Any) -> tuple[Focus, ImagingSetup]:
+    rig, config = survey(**sections)
+    return plan_focus(rig.cameras["left"], config.camera, config.plan), config
+
+
 def test_the_papers_lens_focuses_at_one_and_a_half_metres_in_air() -> None:
-    rig, config = survey(ideal_port=True, water={"n_water": 1.33}, plan={"relief_m": 0.0})
-    focus = plan_focus(rig.cameras["left"], config.camera, config.plan)
+    focus, _ = focused(ideal_port=True, water={"n_water": 1.33}, plan={"relief_m": 0.0})
     assert focus.focus_air_m == pytest.approx(2.0 / 1.33, rel=1e-12)
     assert round(focus.focus_air_m, 1) == 1.5
     # The paper's 2 m of depth of field at F/4 counts 3 px as sharp.
@@ -19,8 +25,7 @@ def test_the_papers_lens_focuses_at_one_and_a_half_metres_in_air() -> None:
 
 
 def test_the_depth_of_field_agrees_with_the_table_of_views() -> None:
-    rig, config = survey(plan={"relief_m": 0.0})
-    focus = plan_focus(rig.cameras["left"], config.camera, config.plan)
+    focus, config = focused(plan={"relief_m": 0.0})
     row = fov_table([12.5], [2.0], 1.34, config.camera, 3.0)[0]
     assert focus.near_altitude_m == pytest.approx(row.near_altitude_m, rel=1e-6)
     assert focus.far_altitude_m == pytest.approx(row.far_altitude_m, rel=1e-6)
@@ -31,13 +36,11 @@ def test_the_depth_of_field_agrees_with_the_table_of_views() -> None:
 def test_blur_at_both_ends_of_the_relief_is_that_of_traced_images(
     altitude_m: float, relief: float, f_number: float, lens_mm: float
 ) -> None:
-    rig, config = survey(
+    focus, _ = focused(
         ideal_port=True,
         camera={"focal_mm": lens_mm, "f_number": f_number},
         plan={"altitude_m": altitude_m, "relief_m": relief * altitude_m, "sharp_px": 20.0},
     )
-    camera = rig.cameras["left"]
-    focus = plan_focus(camera, config.camera, config.plan)
     assume(focus.f_number_needed < f_number)
     for sign in (-1, 1):
         apparent = altitude_m * (1 + sign * relief) / 1.34
@@ -61,20 +64,13 @@ def test_the_f_number_needed_just_fills_the_circle_and_is_what_a_warning_names()
 
 
 def test_diffraction_of_green_light_at_f4() -> None:
-    rig, config = survey()
-    focus = plan_focus(rig.cameras["left"], config.camera, config.plan)
+    focus, _ = focused()
     assert focus.airy_px == pytest.approx(2.44 * 0.53 * 4 / 3.69, rel=0.01)
     assert focus.f_number_diffraction == pytest.approx(3.0 / focus.airy_px * 4, rel=1e-9)
 
 
 def test_a_lens_that_cannot_focus_suggests_the_circle_that_just_fits() -> None:
-    rig, config = survey(plan={"altitude_m": 0.8})
-    camera = rig.cameras["left"]
-    with pytest.raises(ConflictError) as fault:
-        plan_focus(camera, config.camera, config.plan)
-    assert fault.value.suggestion is not None
-    name, sharp_px = fault.value.suggestion
+    name, sharp_px = conflict_of(focused, plan={"altitude_m": 0.8}).suggestion
     assert name == "plan.sharp_px"
-    plan = config.plan.model_copy(update={"sharp_px": sharp_px})
-    focus = plan_focus(camera, config.camera, plan)
+    focus, _ = focused(plan={"altitude_m": 0.8, "sharp_px": sharp_px})
     assert 0.9 * focus.f_number_diffraction < focus.f_number_needed < focus.f_number_diffraction

@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from shapely.geometry import Polygon
 
 from camera_calib.camera import Camera
-from missions.exposure.conflict import ConflictError
 from missions.exposure.footprints import (
     altitude_for_pixel_m,
     footprint_range,
@@ -16,7 +15,7 @@ from missions.exposure.footprints import (
     pixel_on_floor_m,
 )
 from missions.values.footprint import footprint_size_m, overlap
-from tests.missions.exposure.surveys import survey
+from tests.missions.exposure.surveys import conflict_of, survey
 from tests.oracles_imaging import traced_footprint, traced_spot
 
 STEP_M = 0.3
@@ -122,34 +121,10 @@ def test_altitude_and_pixel_are_inverse(pixel_mm: float) -> None:
     assert pixel_on_floor_m(camera, altitude_m) == pytest.approx(pixel_mm * 1e-3, rel=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("plan", "baseline_m", "limits", "setting"),
-    [
-        ({"altitude_m": 0.5, "relief_m": 0.6}, 0.1, ("altitude_m", "relief_m"), "altitude_m"),
-        ({"altitude_m": 0.6, "relief_m": 0.35}, 0.1, ("altitude_m", "relief_m"), "altitude_m"),
-        ({"track_error_m": 0.6}, 0.1, ("side_overlap", "track_error_m"), "track_error_m"),
-        ({"altitude_m": 0.3, "relief_m": 0.0, "side_overlap": 0.0}, 0.4,
-         ("camera.baseline_m", "altitude_m"), "altitude_m"),
-    ],
-)  # fmt: skip
-def test_what_cannot_be_names_both_limits_and_a_value_that_fits(
-    plan: dict[str, float], baseline_m: float, limits: tuple[str, str], setting: str
-) -> None:
-    rig, config = survey(plan=plan, camera={"baseline_m": baseline_m})
-    with pytest.raises(ConflictError) as fault:
-        line_spacing(rig, config.plan, STEP_M)
-    assert fault.value.limits == limits
-    assert fault.value.suggestion is not None
-    name, value = fault.value.suggestion
-    assert name == f"plan.{setting}"
-    line_spacing(rig, config.plan.model_copy(update={setting: value}), STEP_M)
-
-
 def test_what_no_altitude_resolves_suggests_nothing() -> None:
     rig, config = survey(camera={"baseline_m": 2.0, "focal_mm": 50.0})
-    with pytest.raises(ConflictError) as fault:
-        line_spacing(rig, config.plan, STEP_M)
-    assert fault.value.suggestion is None and len(str(fault.value).splitlines()) == 1
+    error = conflict_of(line_spacing, rig, config.plan, STEP_M)
+    assert error.suggestion is None and len(str(error).splitlines()) == 1
 
 
 @pytest.mark.parametrize("distance_m", [0.01, 0.02, 0.03])

@@ -121,7 +121,7 @@ def test_photons_reach_a_pixel_as_the_budget_says(
     strobes = rig.body_from_cam("left").inv().apply(np.array(config.imaging.strobes_body_m))
     lit = np.zeros(len(landed))
     for x, y, z in strobes:
-        distance = np.sqrt((landed[:, 0] - x) ** 2 + (landed[:, 1] - y) ** 2 + (floor_z - z) ** 2)
+        distance = np.hypot(np.hypot(landed[:, 0] - x, landed[:, 1] - y), floor_z - z)
         cosine = (floor_z - z) / distance
         loss = np.exp(-(a + (1 - LIT_SHARE) * b) * distance)
         lit += np.where(cosine > 0.5, cosine**2 / distance**2 * loss, 0.0)
@@ -181,15 +181,10 @@ def _single(strobes: Arr, top: float, altitude_m: float, a: float, b: float) -> 
     """Single scattering on the axis from strobes of one watt, by quadrature."""
 
     def sent(s: float) -> float:
-        got = 0.0
-        for x, y, z in strobes:
-            distance = math.sqrt(x * x + y * y + (top + s - z) ** 2)
-            cosine = (top + s - z) / distance
-            if cosine > 0.5:
-                got += (
-                    b * float(phase_per_sr(np.array(-cosine))) * cosine / (math.pi * 0.75)
-                    / distance**2 * math.exp(-(a + b) * (distance + s))
-                )  # fmt: skip
-        return got
+        away = np.array([0.0, 0.0, top + s]) - strobes
+        distance = np.linalg.norm(away, axis=1)
+        cosine = away[:, 2] / distance
+        got = b * phase_per_sr(-cosine) * cosine / (math.pi * 0.75) / distance**2
+        return float((got * np.exp(-(a + b) * (distance + s)))[cosine > 0.5].sum())
 
     return quad(sent, 0.0, altitude_m, limit=200)[0]

@@ -2,7 +2,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from missions.exposure.conflict import ConflictError
 from missions.exposure.strobe import (
     BUS_V,
     EFFICACY_LM_W,
@@ -12,7 +11,7 @@ from missions.exposure.strobe import (
     storage_load,
     strobe_load,
 )
-from tests.missions.exposure.surveys import survey
+from tests.missions.exposure.surveys import conflict_of, survey
 
 
 def test_two_strobes_of_thirty_thousand_lumens() -> None:
@@ -51,10 +50,8 @@ def test_at_the_duty_limit_the_solder_point_is_at_85_degrees() -> None:
 def test_a_duty_cycle_that_is_too_high_suggests_the_blur_that_just_fits() -> None:
     _, config = survey(imaging={"strobe_lumens": 1e6})
     exposure_s, interval_s = 2e-3, 0.12
-    with pytest.raises(ConflictError) as fault:
-        strobe_load(config.imaging, config.plan, exposure_s, interval_s)
-    assert fault.value.suggestion is not None
-    name, blur_px = fault.value.suggestion
+    error = conflict_of(strobe_load, config.imaging, config.plan, exposure_s, interval_s)
+    name, blur_px = error.suggestion
     assert name == "plan.allowed_blur_px"
     shorter_s = exposure_s * blur_px / config.plan.allowed_blur_px
     load = strobe_load(config.imaging, config.plan, shorter_s, interval_s)

@@ -57,9 +57,9 @@ def test_the_next_part_is_entered_where_the_way_to_it_is_shortest(plan: Plan) ->
 def test_dives_of_parts_are_flown_one_by_one(plan: Plan) -> None:
     with pytest.raises(PlanError, match=r"vehicle\.dive = 1 to 3"):
         path_of(plan)
-    assert set(path_of(one_dive(plan, 2)).line) - {-1} == set(
-        range(plan.dives[1].first_line, plan.dives[1].last_line + 1)
-    )
+    second = plan.dives[1]
+    own = set(range(second.first_line, second.last_line + 1))
+    assert set(path_of(one_dive(plan, 2)).line) - {-1} == own
 
 
 def test_parts_that_touch_are_one() -> None:
@@ -83,16 +83,9 @@ def _seen_by(plan: Plan, rig: Rig, dive: Dive) -> BaseGeometry:
 
 def test_pictures_of_neighbouring_dives_overlap_by_a_line() -> None:
     """Along a whole line, by all that it sees."""
-    config = parse_config(
-        {
-            "area": {"length_m": 12.0, "width_m": 40.0},
-            "plan": {
-                "dive_s": 1600.0, "cross_lines": 0, "closing_line": False,
-                "line_heading_deg": 0.0,
-            },
-        },
-        "test",
-    )  # fmt: skip
+    area = {"length_m": 12.0, "width_m": 40.0}
+    lines = {"cross_lines": 0, "closing_line": False, "line_heading_deg": 0.0}
+    config = parse_config({"area": area, "plan": {"dive_s": 1600.0, **lines}}, "test")
     plan, rig = planned(config), design_rig(config.camera, config.water)
     assert len(plan.dives) >= 3
     assert sum(d.last_line - d.first_line + 1 for d in plan.dives) == len(plan.lines)
@@ -106,9 +99,8 @@ def test_pictures_of_neighbouring_dives_overlap_by_a_line() -> None:
         assert 1.0 < both / swath_m2 < 2.0
     for dive in plan.dives:
         assert dive.duration_s <= 1600.0
-        assert [leg.line for leg in dive.route.legs if leg.line >= 0] == list(
-            range(dive.first_line, dive.last_line + 1)
-        )
+        flown = [leg.line for leg in dive.route.legs if leg.line >= 0]
+        assert flown == list(range(dive.first_line, dive.last_line + 1))
 
 
 @pytest.mark.parametrize("cross_lines", [0, 1])
@@ -116,11 +108,8 @@ def test_cross_lines_tie_all_dives(cross_lines: int, capsys: pytest.CaptureFixtu
     wanted = {"dive_s": 500.0, "cross_lines": cross_lines}
     plan = planned(parse_config({"plan": wanted}, "test"))
     assert len(plan.dives) >= 4
-    owner = [
-        number
-        for number, dive in enumerate(plan.dives)
-        for _ in range(dive.first_line, dive.last_line + 1)
-    ]
+    lines_of = [dive.last_line - dive.first_line + 1 for dive in plan.dives]
+    owner = np.repeat(np.arange(len(plan.dives)), lines_of)
     ties = np.zeros((len(plan.dives), len(plan.dives)))
     for i, line in enumerate(plan.lines):
         for j, other in enumerate(plan.lines):

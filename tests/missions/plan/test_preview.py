@@ -6,28 +6,21 @@ import math
 import numpy as np
 import pytest
 
-from alice_survey.core.config import SurveyConfig, change_section, parse_config
-from alice_survey.core.errors import collected_by
+from alice_survey.core.config import change_section, parse_config
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import plan_pattern, stations_of_plan
-from missions.plan.planner import Planned, plan_survey
 from missions.plan.preview import counts_picture, preview
 from tests.missions.exports.plans import RIG, small_plan
+from tests.missions.flown_plans import planned_survey
+from tests.small_survey import with_settings
 
 SMALL = parse_config({"area": {"length_m": 8.0, "width_m": 6.0}}, "test")
 
 
-def planned(config: SurveyConfig) -> Planned:
-    with collected_by(lambda *_: None):
-        return plan_survey(config, design_rig(config.camera, config.water))
-
-
 def test_totals_and_warnings_are_those_of_the_plan() -> None:
-    config = change_section(
-        change_section(SMALL, "plan", line_spacing_m=1.45), "vehicle", battery_wh=13.0
-    )
-    found, made = preview(config), planned(config)
+    config = with_settings(SMALL, {"plan.line_spacing_m": 1.45, "vehicle.battery_wh": 13.0})
+    found, made = preview(config), planned_survey(config)
     plan, totals = made.plan, found["totals"]
     assert found["ok"] and len(plan.dives) == totals["dives"] == 2
     for name in ("length_m", "duration_s", "energy_wh", "interval_s", "stations", "speed_mps"):
@@ -35,9 +28,8 @@ def test_totals_and_warnings_are_those_of_the_plan() -> None:
     assert totals["at_overlap"] == plan.coverage
     assert found["warnings"] == list(made.warnings) and found["warnings"]
     assert not found["certificate"]["estimated"]
-    assert [line["dive"] for line in found["lines"]] == sorted(
-        line["dive"] for line in found["lines"]
-    )
+    dives = [line["dive"] for line in found["lines"]]
+    assert dives == sorted(dives)
     for way, dive in zip(found["routes"], plan.dives, strict=True):
         length = float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())
         assert 0.98 * dive.route.length_m < length < dive.route.length_m + 0.01
@@ -70,7 +62,7 @@ def test_the_suggestion_of_a_conflict_works() -> None:
 @pytest.mark.parametrize("cells", [2_000, 20_000])
 def test_a_quick_look_estimates_the_certificate(cells: int) -> None:
     config = change_section(SMALL, "plan", line_spacing_m=1.45)
-    made, rig = planned(config), design_rig(config.camera, config.water)
+    made, rig = planned_survey(config), design_rig(config.camera, config.water)
     stations, pattern = stations_of_plan(made.plan), plan_pattern(made.plan, rig)
     quick = certificate(made.plan.area, rig, stations, pattern, max_cells=cells)
     whole = made.certificate

@@ -1,25 +1,17 @@
 import re
-from typing import Any
 
 import pytest
 
-from alice_survey.core.config import SurveyConfig, parse_config
+from alice_survey.core.config import SurveyConfig
 from alice_survey.core.errors import PlanError
-from missions.exposure.settings import ImagingSetup
 from missions.plan.solve import solve_lenses, solve_report
+from tests.missions.exposure.surveys import survey
 
 DEPTH_M = SurveyConfig().area.seafloor_depth_m
 
 
-def setup(**plan: Any) -> ImagingSetup:
-    config = parse_config({"plan": plan}, "survey")
-    return ImagingSetup(
-        plan=config.plan, camera=config.camera, water=config.water, imaging=config.imaging
-    )
-
-
 def test_a_resolution_gives_the_altitude_whose_pixel_it_is() -> None:
-    own = setup(side_overlap=0.45)
+    own = survey(plan={"side_overlap": 0.45})[1]
     best, other = solve_lenses(own, DEPTH_M, 0.448, (25.0, 12.5))
     assert best.values["lens_mm"] == 12.5
     assert best.against == ""
@@ -36,10 +28,11 @@ def test_a_resolution_gives_the_altitude_whose_pixel_it_is() -> None:
 def test_a_resolution_beyond_all_lenses_is_refused_with_the_nearest_that_fits(
     resolution_mm: float,
 ) -> None:
+    _, setup = survey()
     with pytest.raises(PlanError) as fault:
-        solve_lenses(setup(), DEPTH_M, resolution_mm, (12.5, 25.0))
+        solve_lenses(setup, DEPTH_M, resolution_mm, (12.5, 25.0))
     (text,) = str(fault.value).splitlines()
     fits_mm, lens_mm = map(
         float, re.search(r"; ([\d.]+) mm fits, with the ([\d.]+) mm", text).groups()
     )
-    assert not solve_lenses(setup(), DEPTH_M, fits_mm, (lens_mm,))[0].against
+    assert not solve_lenses(setup, DEPTH_M, fits_mm, (lens_mm,))[0].against

@@ -5,9 +5,8 @@ from typing import Any
 import pytest
 
 from alice_survey.core.config import SurveyConfig, parse_config
-from camera_calib.rig import design_rig
-from missions.exposure.conflict import ConflictError
-from missions.plan.planner import Planned, plan_survey
+from tests.missions.exposure.surveys import conflict_of
+from tests.missions.flown_plans import planned_survey
 from tests.small_survey import with_settings
 
 SMALL = {"length_m": 8.0, "width_m": 5.0}
@@ -17,16 +16,13 @@ def survey(**sections: dict[str, Any]) -> SurveyConfig:
     return parse_config({"area": SMALL, **sections}, "survey")
 
 
-def planned(config: SurveyConfig) -> Planned:
-    return plan_survey(config, design_rig(config.camera, config.water))
-
-
 @pytest.mark.parametrize(
     ("config", "setting"),
     [
         (survey(sea={"current_mps": 0.5}), "sea.current_mps"),
         (survey(sea={"current_mps": 0.5}, plan={"turns": "arcs"}), "sea.current_mps"),
         (survey(plan={"altitude_m": 0.4, "relief_m": 0.35}), "plan.altitude_m"),
+        (survey(plan={"altitude_m": 0.6, "relief_m": 0.35}), "plan.altitude_m"),
         (survey(plan={"speed_mps": 2.0, "forward_overlap": 0.95}), "plan.speed_mps"),
         (survey(camera={"baseline_m": 2.0}, area={**SMALL, "seafloor_depth_m": 20.0}),
          "plan.altitude_m"),
@@ -34,22 +30,19 @@ def planned(config: SurveyConfig) -> Planned:
         (survey(plan={"track_error_m": 0.6}), "plan.track_error_m"),
         (survey(plan={"speed_mps": 3.0}), "plan.speed_mps"),
     ],
-    ids=["current", "current, arcs", "relief", "rate", "baseline", "focus", "track", "speed"],
 )  # fmt: skip
 def test_the_setting_that_is_suggested_plans(config: SurveyConfig, setting: str) -> None:
-    with pytest.raises(ConflictError) as caught:
-        planned(config)
-    assert caught.value.suggestion is not None
-    name, value = caught.value.suggestion
+    error = conflict_of(planned_survey, config)
+    name, value = error.suggestion
     assert name == setting
-    assert f"; {name} = {value:g} fits" in str(caught.value)
-    assert len(str(caught.value).splitlines()) == 1
-    assert planned(with_settings(config, {name: value})).certificate.stereo_share > 0.999
+    assert f"; {name} = {value:g} fits" in str(error)
+    assert len(str(error).splitlines()) == 1
+    assert planned_survey(with_settings(config, {name: value})).certificate.stereo_share > 0.999
 
 
 def test_what_a_plan_warns_of_is_in_its_file_too() -> None:
-    ring = "LINESTRING (0 0, 8 0, 8 5, 0 5, 0 0)"
-    found = planned(survey(area={"wkt": ring, "corridor_width_m": 2.0}, plan={"speed_mps": 0.3}))
+    ring = {"wkt": "LINESTRING (0 0, 8 0, 8 5, 0 5, 0 0)", "corridor_width_m": 2.0}
+    found = planned_survey(survey(area=ring, plan={"speed_mps": 0.3}))
     assert found.plan.details["warnings"] == list(found.warnings)
     for said in ("closed_lines = 'inside'", "arcs are planned with 0.58 m"):
         assert [said in warning for warning in found.warnings].count(True) == 1

@@ -31,29 +31,20 @@ def test_strobes_cover_exposures_and_nothing_overlaps(
     assert (np.diff(table["trigger_us"]) >= 100_000 - 1).all()
 
 
-@pytest.mark.parametrize(
-    ("times", "lead_s", "named"),
-    [
-        ([1.0, 1.05], 0.0, r"trigger 1 .* 0\.050000 s"),
-        ([1.0, 0.5], 0.0, "trigger 1"),
-        ([1.0, 1.1], 0.06, r"take 0\.122001 s"),
-    ],
-)
-def test_what_a_controller_cannot_do_is_refused(
-    times: list[float], lead_s: float, named: str
-) -> None:
-    with pytest.raises(PlanError, match=named):
-        trigger_table(times, 2e-3, lead_s, 0.1)
+def test_what_a_controller_cannot_do_is_refused() -> None:
+    for second_s, lead_s, named in (
+        (1.05, 0.0, r"trigger 1 .* 0\.050000 s"),
+        (0.5, 0.0, "trigger 1"),
+        (1.1, 0.06, r"take 0\.122001 s"),
+    ):
+        with pytest.raises(PlanError, match=named):
+            trigger_table([1.0, second_s], 2e-3, lead_s, 0.1)
 
 
 def test_the_table_holds_absolute_and_relative_edges() -> None:
     settings = imaging_settings(*survey())
-    rows = trigger_table(
-        [3600.0, 3602.35],
-        settings.exposure_s,
-        settings.strobe_lead_s,
-        settings.shortest_interval_s,
-    )
+    strobe_s = settings.strobe_lead_s, settings.shortest_interval_s
+    rows = trigger_table([3600.0, 3602.35], settings.exposure_s, *strobe_s)
     table = dict(zip(HEADER, rows.T, strict=True))
     assert table["trigger_us"].tolist() == [3_600_000_000, 3_602_350_000]
     opened_us = table["camera_close_us"] - table["camera_open_us"]
