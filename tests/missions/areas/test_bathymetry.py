@@ -1,55 +1,37 @@
 """Rasters of depth: signs, coordinate systems, windows, and what lies between cells."""
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import rasterio
 import shapely
 from pyproj import Transformer
-from rasterio.transform import Affine, from_origin
+from rasterio.transform import from_origin
 
 from alice_survey.core.errors import PlanError
-from alice_survey.core.frames import Array, Datum
+from alice_survey.core.frames import Array
 from missions.areas import bathymetry as module
-from missions.areas.bathymetry import Bathymetry, mean_depth_m, read_bathymetry
+from missions.areas.bathymetry import mean_depth_m, read_bathymetry
+from tests.missions.areas.sites import DATUM, TO_UTM, UTM, real_floor
 from tests.oracles_energy import bilinear
-
-DATUM = Datum(32.8236, 34.9553)
-UTM = "EPSG:32636"
-TO_UTM = Transformer.from_crs("EPSG:4326", UTM, always_xy=True)
-DATUM_UTM = TO_UTM.transform(34.9553, 32.8236)
 
 
 def _written(
-    path: Path,
-    values: Array,
-    *,
-    crs: str | None = UTM,
-    cell_m: float = 2.0,
-    description: str | None = None,
-    transform: Affine | None = None,
-    nodata: float | None = None,
-    tags: dict[str, str] | None = None,
+    path: Path, values: Array, description: str = "", tags: Mapping[str, str] = {}, **profile: Any
 ) -> Path:
     """A GeoTIFF whose first cell's outer corner is 20 m north-west of the datum."""
-    x, y = DATUM_UTM
-    with rasterio.open(
-        path, "w", driver="GTiff", height=values.shape[0], width=values.shape[1], count=1,
-        dtype="float64", crs=crs, nodata=nodata,
-        transform=transform or from_origin(x - 20.0, y + 20.0, cell_m, cell_m),
-    ) as file:  # fmt: skip
+    x, y = TO_UTM.transform(DATUM.longitude_deg, DATUM.latitude_deg)
+    given = {"crs": UTM, "transform": from_origin(x - 20.0, y + 20.0, 2.0, 2.0), **profile}
+    shape = {"height": values.shape[0], "width": values.shape[1], "count": 1, "dtype": "float64"}
+    with rasterio.open(path, "w", driver="GTiff", **shape, **given) as file:
         file.write(values, 1)
-        if description:
-            file.set_band_description(1, description)
-        if tags:
-            file.update_tags(1, **tags)
+        file.set_band_description(1, description)
+        file.update_tags(1, **tags)
     return path
-
-
-def _xy(t: Affine, column: Array, row: Array) -> tuple[Array, Array]:
-    return t.a * column + t.b * row + t.c, t.d * column + t.e * row + t.f
 
 
 def _plane(rows: int = 20, columns: int = 24) -> Array:
@@ -77,11 +59,11 @@ def test_heights_and_depths_read_alike(tmp_path: Path) -> None:
     ],
 )
 def test_metadata_goes_before_the_sign(
-    tmp_path: Path, options: dict[str, object], sign: float
+    tmp_path: Path, options: dict[str, Any], sign: float
 ) -> None:
     mixed = _plane() - 15.5  # some negative, some positive: a shore
 
-    found = read_bathymetry(_written(tmp_path / "m.tif", mixed, **options), DATUM)  # type: ignore[arg-type]
+    found = read_bathymetry(_written(tmp_path / "m.tif", mixed, **options), DATUM)
 
     np.testing.assert_allclose(found.depth_m, sign * mixed)
 
@@ -140,13 +122,12 @@ def test_any_coordinate_system_gives_the_same_floor(tmp_path: Path, crs: str) ->
     x1, y1 = to_crs.transform(34.9554, 32.8237)
     cell = max(abs(x1 - x0), abs(y1 - y0)) / 8
     transform = from_origin(x0 - 25 * cell, y0 + 25 * cell, cell, cell)
-    column, row = np.meshgrid(np.arange(50) + 0.5, np.arange(50) + 0.5)
-    x, y = _xy(transform, column, row)
+    cells = (np.arange(50) + 0.5 - 25) * cell
+    x, y = np.meshgrid(x0 + cells, y0 - cells)
     lon, lat = to_crs.transform(x, y, direction="INVERSE")
     values = 20 + 3e3 * (np.asarray(lon) - 34.9553) - 2e3 * (np.asarray(lat) - 32.8236)
-    found = read_bathymetry(
-        _written(tmp_path / "p.tif", values, crs=crs, transform=transform), DATUM
-    )
+    path = _written(tmp_path / "p.tif", values, crs=crs, transform=transform)
+    found = read_bathymetry(path, DATUM)
     points = np.random.default_rng(3).uniform(-15, 15, (100, 2))
     geodetic = DATUM.geodetic_from_ned(np.column_stack([points, np.full(100, 20.0)]))
 
@@ -208,19 +189,9 @@ def test_depth_over_an_area_is_the_mean_of_what_is_known(tmp_path: Path) -> None
         mean_depth_m(found, shapely.MultiPolygon([shapely.box(100, 100, 110, 110)]))
 
 
-@pytest.fixture(scope="module")
-def real(shared_data: Path) -> tuple[Path, Datum]:
-    """A real BAG and a place within it."""
-    path = next((shared_data / "bathymetry").glob("*.bag"))
-    lon, lat = Transformer.from_crs("EPSG:32602", "EPSG:4326", always_xy=True).transform(
-        621_500.0, 7_244_800.0
-    )
-    return path, Datum(lat, lon)
-
-
-def test_a_window_of_a_real_grid_equals_gdals_own_samples(real: tuple[Path, Datum]) -> None:
-    path, datum = real
-    window: Bathymetry = read_bathymetry(path, datum, bounds_ne=(-150.0, -150.0, 150.0, 150.0))
+def test_a_window_of_a_real_grid_equals_gdals_own_samples(shared_data: Path) -> None:
+    path, datum = real_floor(shared_data)
+    window = read_bathymetry(path, datum, bounds_ne=(-150.0, -150.0, 150.0, 150.0))
     centres = window._ne_from_pixel(np.array([[20.5, 30.5], [70.5, 11.5], [50.5, 50.5]]))
     geodetic = datum.geodetic_from_ned(np.column_stack([centres, np.full(3, 51.7)]))
     x, y = Transformer.from_crs("EPSG:4326", "EPSG:32602", always_xy=True).transform(

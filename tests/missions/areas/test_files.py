@@ -1,5 +1,6 @@
 import json
 import os
+import re
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,11 +14,12 @@ from pyproj import Transformer
 from shapely.geometry import LineString, Point, Polygon
 from shapely.geometry.base import BaseGeometry
 
-from alice_survey.core.config import AreaConfig
+from alice_survey.core.config import AreaConfig, load_config
 from alice_survey.core.errors import PlanError
 from missions.areas import files
 from missions.areas.survey import survey_area
 from missions.values.area import Area
+from tests.missions.areas.sites import area_of
 
 SITE = Polygon(
     [(700000, 3640000), (700030, 3640000), (700030, 3640020), (700015, 3640010), (700000, 3640020)],
@@ -63,10 +65,6 @@ def zipped(path: Path, members: Mapping[str, Path | bytes]) -> Path:
 
 def shapefile(folder: Path, name: str = "site") -> Path:
     return write(folder / f"{name}.shp", [SITE], "ESRI Shapefile", geometry_type="Polygon")
-
-
-def area_of(**settings: object) -> Area:
-    return survey_area(AreaConfig.model_validate(settings), turn_margin_m=3.0)
 
 
 def refusal(**settings: object) -> str:
@@ -317,3 +315,23 @@ def test_too_many_corners_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "coast.wkt"
     file.write_text(ring.wkt)
     assert "200000" in refusal(file=file)
+
+
+DOC = (Path(__file__).parents[3] / "docs" / "areas.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("example", re.findall(r"```toml\n(.*?)```", DOC, re.DOTALL))
+def test_an_example_gives_an_area_without_a_warning(
+    example: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reef = shapely.box(34.9553, 32.8236, 34.9556, 32.8239)
+    for layer in ("reef", "permit"):
+        more = {"layer": layer, "append": layer == "permit"}
+        write(tmp_path / "reef.gpkg", [reef], "GPKG", "EPSG:4326", **more)
+    mark = Point(34.9554, 32.8238)
+    (tmp_path / "wreck.geojson").write_text(shapely.to_geojson(mark))
+    (tmp_path / "survey.toml").write_text(example)
+    area = survey_area(load_config(tmp_path / "survey.toml").area, turn_margin_m=3.0)
+    assert area.survey.area > 100
+    assert area.allowed.area > area.survey.area * 0.999
+    assert capsys.readouterr().err == ""

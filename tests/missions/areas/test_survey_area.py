@@ -14,13 +14,10 @@ from alice_survey.core.errors import PlanError
 from alice_survey.core.frames import Datum
 from missions.areas.survey import survey_area
 from missions.values.area import Area
+from tests.missions.areas.sites import area_of
 
 SQUARE = ((0.0, 0.0), (10.0, 0.0), (10.0, 10.0), (0.0, 10.0))
 RING = ((10.0, 20.0), (10.0, 20.001), (10.001, 20.0))
-
-
-def area_of(**settings: object) -> Area:
-    return survey_area(AreaConfig.model_validate(settings), turn_margin_m=3.0)
 
 
 def corners_ne(area: Area) -> np.ndarray:

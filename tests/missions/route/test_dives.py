@@ -20,21 +20,12 @@ from missions.values.line import Line
 from missions.values.plan_file import Dive
 from tests.missions.route.routes import route_through
 from tests.oracles_energy import best_parting
-from tests.oracles_route import inside, route_cost
+from tests.oracles_route import inside, lawn, route_cost
 
-HOME = (-1.0, -2.0)
+HOME = (-2.0, -1.0)
 WAYS = Ways(shapely.MultiPolygon([shapely.box(-6, -6, 60, 40)]))
 COSTS = time_costs(0.2)
 """1 W whatever it does: Wh are hours."""
-
-
-def _lines(count: int, length_m: float = 12.0, spacing_m: float = 1.0) -> list[Line]:
-    """To and fro along east, one next to the other."""
-    lines = []
-    for i in range(count):
-        ends = [(i * spacing_m, 0.0), (i * spacing_m, length_m)][:: 1 if i % 2 == 0 else -1]
-        lines.append(Line(kind="survey", start_ne_m=ends[0], end_ne_m=ends[1], stations=25))
-    return lines
 
 
 def _split(lines: list[Line], usable_wh: float, **options: Any) -> tuple[Dive, ...]:
@@ -51,7 +42,7 @@ def _of_dive(lines: list[Line], first: int, last: int, costs: Costs = COSTS) -> 
 
 
 def test_what_fits_is_one_dive_from_home_to_home() -> None:
-    lines = _lines(6)
+    lines = lawn(6, 12.0, 1.0)
     (dive,) = _split(lines, 10.0)
     energy, time = _of_dive(lines, 0, 5)
     assert (dive.first_line, dive.last_line) == (0, 5)
@@ -72,7 +63,7 @@ def test_no_parting_is_better(
     count: int, energy: float, time: float | None, lengths: list[float]
 ) -> None:
     """Against all partings of up to nine lines, by dives' own routes."""
-    lines = [_lines(count, length)[i] for i, length in enumerate(lengths[:count])]
+    lines = [lawn(count, length, 1.0)[i] for i, length in enumerate(lengths[:count])]
     alone = np.array([_of_dive(lines, i, i) for i in range(count)])
     usable_j, max_s = energy * alone[:, 0].max(), time and time * alone[:, 1].max()
     known: dict[tuple[int, int], tuple[float, float]] = {}
@@ -108,7 +99,7 @@ def test_tied_dives_share_a_line_and_no_such_parting_is_better(
     count: int, energy: float, lengths: list[float], fill: int
 ) -> None:
     """Each begins with the last line of the one before, unless that takes a dive more."""
-    lines = [_lines(count, length)[i] for i, length in enumerate(lengths[:count])]
+    lines = [lawn(count, length, 1.0)[i] for i, length in enumerate(lengths[:count])]
     lines = [replace(line, kind="fill") if i == fill else line for i, line in enumerate(lines)]
     usable_j = energy * max(_of_dive(lines, i, i)[0] for i in range(count))
 
@@ -150,7 +141,7 @@ def test_ways_home_round_a_hole_count_whole() -> None:
 
 
 def test_a_line_that_fits_no_dive_is_named() -> None:
-    lines = [*_lines(3), *_lines(1, 36.0)]
+    lines = [*lawn(3, 12.0, 1.0), *lawn(1, 36.0, 1.0)]
     with pytest.raises(PlanError) as caught:
         _split(lines, 0.09)
     text = str(caught.value)
@@ -167,29 +158,26 @@ def test_a_line_that_fits_no_dive_is_named() -> None:
 
 def test_a_course_against_too_much_current_is_refused() -> None:
     line_w = np.ones(8)
-    line_w[1:4] = np.inf  # eastwards
+    line_w[[7, 0, 1]] = np.inf  # northwards
     costs = COSTS._replace(line_w=line_w)
-    with pytest.raises(PlanError, match=r"line 0 .* 90 deg"):
-        _split(_lines(4), 10.0, costs=costs)
+    with pytest.raises(PlanError, match=r"line 0 .* 0 deg"):
+        _split(lawn(4, 12.0, 1.0), 10.0, costs=costs)
 
 
 @pytest.mark.parametrize("turns", ["auto", "arcs", "spot", "sway"])
 def test_ways_along_single_lines_are_the_routes_through_them(turns: Any) -> None:
-    room = shapely.box(-6, -6, 60, 40).difference(shapely.box(-3, 3, 4.5, 5))
-    ways, lines = Ways(multipolygon(room)), _lines(8, length_m=2.5)
+    room = shapely.box(-6, -6, 60, 40).difference(shapely.box(3, -3, 5, 4.5))
+    ways, lines = Ways(multipolygon(room)), lawn(8, 2.5, 1.0)
     for line in list(lines):
         (n, e), (n_2, e_2) = line.start_ne_m, line.end_ne_m
-        lines.append(replace(line, start_ne_m=(n, e + 6.0), end_ne_m=(n_2, e_2 + 6.0)))
+        lines.append(replace(line, start_ne_m=(n + 6.0, e), end_ne_m=(n_2 + 6.0, e_2)))
     how: dict[str, Any] = {"ways": ways, "costs": COSTS, "turns": turns, "home_ne": HOME}
     legs, begins = legs_alone(line_table(lines), Manoeuvre(COSTS, 0.5, 0.5, turns, ways), HOME)
     assert (len(begins), begins[0], begins[-1]) == (2 * len(lines) + 1, 0, len(legs))
     corners = 0
-    for i, line in enumerate(lines):
+    parts = np.split(legs, begins[1:-1])
+    for i, (line, out, back) in enumerate(zip(lines, parts[::2], parts[1::2], strict=True)):
         expected = route_through([line], 0.5, 0.5, first_line=i, **how)
-        out, back = (
-            legs[begins[2 * i] : begins[2 * i + 1]],
-            legs[begins[2 * i + 1] : begins[2 * i + 2]],
-        )
         assert route_of(np.concatenate([out, back])) == expected
         assert out[-1, 5] == i and not (out[:-1, 5] >= 0).any() and not (back[:, 5] >= 0).any()
         corners += len(out) > 6

@@ -234,10 +234,8 @@ def test_a_way_between_lines_that_cannot_be_flown_is_refused_with_the_current() 
     costs = survey_costs(_config(0.3, 0.0, vehicle={"name": "sparus2"}))
     line = Line(kind="survey", start_ne_m=(0.0, 0.0), end_ne_m=(0.0, 5.0), stations=5)
     with pytest.raises(PlanError, match=r"0\.30 m/s .* 0\.19 m/s"):
-        split_dives(
-            [line], Manoeuvre(costs, 0.5, 0.5), home_ne=(-5.0, 0.0), usable_wh=1000.0, max_s=None,
-            depth_m=10.0,
-        )  # fmt: skip
+        how: dict[str, Any] = {"usable_wh": 1000.0, "max_s": None, "depth_m": 10.0}
+        split_dives([line], Manoeuvre(costs, 0.5, 0.5), home_ne=(-5.0, 0.0), **how)
 
 
 def test_known_failures_count_and_unknown_ones_do_not() -> None:

@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pyproj import Transformer
 
 from alice_survey.core.errors import PlanError
-from alice_survey.core.frames import Array, Datum
 from alice_survey.sim.vehicle.vehicle import vehicle_from
-from missions.areas.bathymetry import Bathymetry, read_bathymetry
+from missions.areas.bathymetry import read_bathymetry
 from missions.route.terrain import (
     TerrainLimits,
     depth_profile,
@@ -22,33 +20,13 @@ from missions.route.terrain import (
     reach_of,
 )
 from missions.values.line import Line
+from tests.missions.areas.sites import floor_of, real_floor
 from tests.oracles_energy import envelope as slow_envelope
 from tests.oracles_energy import highest_within
 
-DATUM = Datum(32.8236, 34.9553)
-ALICE, SPARUS2 = vehicle_from("alice").hull, vehicle_from("sparus2").hull
-REACH = reach_of(ALICE, (0.55, -0.05, 0.08), 0.7, 0.6)
+REACH = reach_of(vehicle_from("alice").hull, (0.55, -0.05, 0.08), 0.7, 0.6)
+EAST_M = np.broadcast_to((np.arange(160) + 0.5 - 80) * 0.5, (160, 160))
 LIMITS = TerrainLimits(altitude_m=2.0, least_clearance_m=1.0, steepest_rad=math.radians(20.0))
-
-
-def _floor(values: Array, cell_m: float = 0.5) -> Bathymetry:
-    """A raster in UTM whose middle is at the datum."""
-    x, y = Transformer.from_crs("EPSG:4326", "EPSG:32636", always_xy=True).transform(
-        DATUM.longitude_deg, DATUM.latitude_deg
-    )
-    rows, columns = values.shape
-    west, north = x - columns / 2 * cell_m, y + rows / 2 * cell_m
-    return Bathymetry(
-        name="floor.tif",
-        datum=DATUM,
-        crs="EPSG:32636",
-        from_pixel=(cell_m, 0.0, west, 0.0, -cell_m, north),
-        depth_m=values,
-    )
-
-
-def _eastings(size: int = 160, cell_m: float = 0.5) -> Array:
-    return np.broadcast_to((np.arange(size) + 0.5 - size / 2) * cell_m, (size, size))
 
 
 def _line(start: tuple[float, float], end: tuple[float, float], stations: int = 61) -> Line:
@@ -87,10 +65,9 @@ def test_the_envelope_is_the_deepest_that_keeps_depth_and_slope(
 
 def test_a_slope_is_followed_above_its_highest_within_reach() -> None:
     """Along a slope of 0.2 the hull's nose or tail is over the highest floor."""
-    floor = _floor(14.0 - 0.2 * _eastings())  # shoaling to the east
-    up, down = line_profiles(
-        [_line((0.0, -15.0), (0.0, 15.0)), _line((0.0, 15.0), (0.0, -15.0))], floor, REACH, LIMITS
-    )
+    floor = floor_of(14.0 - 0.2 * EAST_M)  # shoaling to the east
+    line = _line((0.0, -15.0), (0.0, 15.0))
+    up, down = line_profiles([line, line.reverse()], floor, REACH, LIMITS)
     # UTM's grid is turned by 1.1 deg and its scale is 0.9996 to 1 here.
     assert up.altitude_m == pytest.approx(2.0 + 0.2 * REACH.ahead_m, abs=0.02)
     assert down.altitude_m == pytest.approx(2.0 + 0.2 * REACH.astern_m, abs=0.02)
@@ -100,11 +77,9 @@ def test_a_slope_is_followed_above_its_highest_within_reach() -> None:
 
 
 def test_before_a_cliff_the_glass_climbs_at_the_steepest_slope() -> None:
-    cliff = np.where(_eastings() > 0.0, 8.0, 14.0)
-    floor = _floor(cliff)
-    profile = line_profiles([_line((0.0, -30.0), (0.0, 30.0), stations=121)], floor, REACH, LIMITS)[
-        0
-    ]
+    cliff = np.where(EAST_M > 0.0, 8.0, 14.0)
+    line = _line((0.0, -30.0), (0.0, 30.0), stations=121)
+    (profile,) = line_profiles([line], floor_of(cliff), REACH, LIMITS)
     east = profile.along_m - 30.0
     steep = math.tan(LIMITS.steepest_rad)
     top = east > -REACH.ahead_m + 0.6
@@ -123,29 +98,27 @@ def test_before_a_cliff_the_glass_climbs_at_the_steepest_slope() -> None:
 def test_the_highest_floor_is_found_by_looking_everywhere(rough_m: float, off_m: float) -> None:
     """Two places a cell may pass next to a peak, by less than the floor changes in half a cell."""
     rng = np.random.default_rng(7)
-    floor = _floor(12.0 - 0.1 * _eastings() + rng.normal(0.0, rough_m, (160, 160)))
+    floor = floor_of(12.0 - 0.1 * EAST_M + rng.normal(0.0, rough_m, (160, 160)))
     places, headings = rng.uniform(-10, 10, (6, 2)), rng.uniform(0, 6.28, 6)
 
     found = highest_floor(floor, places, headings, REACH)
 
+    reach = REACH.ahead_m, REACH.astern_m, REACH.aside_m
     exact = [
-        highest_within(
-            floor.depth_at, place.tolist(), heading, REACH.ahead_m, REACH.astern_m,
-            REACH.aside_m, 0.05,
-        )
+        highest_within(floor.depth_at, place.tolist(), heading, *reach, 0.05)
         for place, heading in zip(places, headings, strict=True)
-    ]  # fmt: skip
+    ]
     np.testing.assert_allclose(found, exact, atol=off_m)
 
 
-def test_clearance_holds_between_stations_over_a_rough_floor() -> None:
+def test_clearance_holds_between_stations_over_a_roughfloor_of() -> None:
     """Brute force: every 2 cm of the way, straight between stations, over the floor below it."""
     rng = np.random.default_rng(8)
     coarse = rng.uniform(8.0, 14.0, (12, 12))
     rows = np.linspace(0, 11, 160)
     smooth = np.array([np.interp(rows, np.arange(12), column) for column in coarse.T]).T
     smooth = np.array([np.interp(rows, np.arange(12), row) for row in smooth])
-    floor = _floor(smooth)
+    floor = floor_of(smooth)
     for heading in (0.0, 0.7, 2.0):
         ahead = np.array([math.cos(heading), math.sin(heading)])
         line = _line(tuple(-25 * ahead), tuple(25 * ahead), stations=101)
@@ -163,31 +136,25 @@ def test_limits_that_cannot_be_kept_name_the_place() -> None:
     values = np.full((160, 160), 12.0)
     values[80:84, 90:94] = np.nan
     with pytest.raises(PlanError, match=r"floor\.tif .* line 1, .* m "):
-        line_profiles(
-            [_line((20.0, -20.0), (20.0, 20.0)), _line((-1.0, -20.0), (-1.0, 20.0))],
-            _floor(values), REACH, LIMITS,
-        )  # fmt: skip
+        lines = [_line((north, -20.0), (north, 20.0)) for north in (20.0, -1.0)]
+        line_profiles(lines, floor_of(values), REACH, LIMITS)
     shoal = np.full((160, 160), 12.0)
     shoal[:, 100:110] = 1.5
     with pytest.raises(PlanError, match=r"line 0, .* 0\.50 m "):
-        line_profiles([_line((0.0, -20.0), (0.0, 20.0))], _floor(shoal), REACH, LIMITS)
+        line_profiles([_line((0.0, -20.0), (0.0, 20.0))], floor_of(shoal), REACH, LIMITS)
     with pytest.raises(PlanError, match=r"altitude_m 0\.8 .*least_clearance_m 1"):
         TerrainLimits(altitude_m=0.8, least_clearance_m=1.0, steepest_rad=0.3)
 
 
 def test_stations_far_apart_see_all_between_them() -> None:
     """A ridge between two stations 10 m apart is flown over by both."""
-    ridge = np.where(np.abs(_eastings()) < 1.0, 9.0, 12.0)
-    sparse = line_profiles([_line((0.0, -15.0), (0.0, 15.0), 4)], _floor(ridge), REACH, LIMITS)[0]
+    ridge = np.where(np.abs(EAST_M) < 1.0, 9.0, 12.0)
+    sparse = line_profiles([_line((0.0, -15.0), (0.0, 15.0), 4)], floor_of(ridge), REACH, LIMITS)[0]
     np.testing.assert_allclose(sparse.depth_m, [10.0, 7.0, 7.0, 10.0], atol=1e-9)
 
 
 def test_a_real_sea_floor_is_followed(shared_data: Path) -> None:
-    path = next((shared_data / "bathymetry").glob("*.bag"))
-    lon, lat = Transformer.from_crs("EPSG:32602", "EPSG:4326", always_xy=True).transform(
-        621_500.0, 7_244_800.0
-    )
-    datum = Datum(lat, lon)
+    path, datum = real_floor(shared_data)
     floor = read_bathymetry(path, datum, bounds_ne=(-120.0, -120.0, 120.0, 120.0))
     lines = [_line((north, -100.0), (north, 100.0), 401) for north in np.arange(-3.0, 4.0).tolist()]
     found = line_profiles(lines, floor, REACH, LIMITS)

@@ -165,12 +165,6 @@ def test_open_water_has_no_edge() -> None:
     assert arc_free(OPEN_WATER, -1e6, 0.0, 0.3, 0.1, 50.0)
 
 
-def test_a_convex_area_needs_no_graph() -> None:
-    ways = Ways(multipolygon(Point(0, 0).buffer(20)))
-    assert way_m(ways, (-10.0, 0.0), (10.0, 3.0)) == pytest.approx(math.hypot(20, 3))
-    assert "_graph" not in vars(ways)
-
-
 def test_ways_that_order_lines_are_hardly_shorter_than_those_flown() -> None:
     piles = shapely.union_all([Point(n, e).buffer(0.6) for n in (8, 16, 24) for e in (5, 10, 15)])
     pier = box(12, 18, 14, 30)
