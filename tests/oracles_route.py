@@ -1,6 +1,8 @@
 """Slow, obvious twins of ways, turns and costs of routes: shapely, all pairs, dense sampling."""
 
 import math
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import shapely
@@ -9,10 +11,13 @@ from scipy.sparse.csgraph import dijkstra
 from shapely.geometry import LineString, MultiPolygon
 
 from alice_survey.core.frames import Array
-from missions.route.ways import Ways
-from missions.values.costs import Costs, leg_costs, power_at
+from missions.route.turns import Manoeuvre, Turns, legs_through, line_table, route_of
+from missions.route.ways import OPEN_WATER, Ways
+from missions.values.costs import Costs, leg_costs, power_at, time_costs
 from missions.values.legs import Leg, Route
 from missions.values.line import Line
+
+PAPER_COSTS = time_costs(0.2)  # Gutnik et al. 2021, section VII.A
 
 
 def min_way_m(allowed: MultiPolygon, a: tuple[float, float], b: tuple[float, float]) -> float:
@@ -127,3 +132,18 @@ def way_m(ways: Ways, a: tuple[float, float], b: tuple[float, float]) -> float:
 def inside(ways: Ways, places_ne: Array) -> list[bool]:
     """Which places, (N, 2), are inside the allowed area."""
     return ways.inside(places_ne).tolist()
+
+
+def route_through(
+    lines: Sequence[Line],
+    turn_radius_m: float = 0.5,
+    run_in_m: float = 0.5,
+    *,
+    ways: Ways = OPEN_WATER,
+    costs: Costs = PAPER_COSTS,
+    turns: Turns = "auto",
+    **ends: Any,
+) -> Route:
+    """The route along all lines in order; other arguments as of `legs_through`."""
+    how = Manoeuvre(costs, turn_radius_m, run_in_m, turns, ways)
+    return route_of(legs_through(line_table(lines), how, **ends))

@@ -1,5 +1,3 @@
-import math
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,19 +5,17 @@ from hypothesis import strategies as st
 from pyproj import Geod, Transformer
 from shapely.geometry import Polygon
 
-from alice_survey.core.config import AreaConfig
 from alice_survey.core.errors import PlanError
 from alice_survey.core.frames import Datum
 from missions.areas.crs import LocalFrame
-from missions.areas.survey import survey_area
-from missions.values.area import Area
+from tests.missions.areas.sites import area_of
 
 WGS84 = Geod(ellps="WGS84")
 
 
-def area_of(wkt: str, crs: str, **more: object) -> Area:
-    settings = AreaConfig.model_validate({"wkt": wkt, "crs": crs, **more})
-    return survey_area(settings, turn_margin_m=3.0)
+def frame_at(latitude_deg: float, longitude_deg: float, depth_m: float) -> LocalFrame:
+    datum = Datum(latitude_deg, longitude_deg)
+    return LocalFrame(datum=datum, seafloor_depth_m=depth_m, datum_is_given=True)
 
 
 @given(
@@ -32,9 +28,7 @@ def area_of(wkt: str, crs: str, **more: object) -> Area:
 def test_places_on_the_sea_floor_come_back(
     latitude_deg: float, longitude_deg: float, depth_m: float, north_m: float, east_m: float
 ) -> None:
-    frame = LocalFrame(
-        datum=Datum(latitude_deg, longitude_deg), seafloor_depth_m=depth_m, datum_is_given=True
-    )
+    frame = frame_at(latitude_deg, longitude_deg, depth_m)
     point = np.array([[north_m, east_m]])
     again = frame.ne_from_latlon(frame.latlon_from_ne(point))
     np.testing.assert_allclose(again, point, atol=1e-6)
@@ -59,14 +53,12 @@ def test_places_on_the_sea_floor_come_back(
 def test_any_system_comes_back_within_a_millimetre(
     crs: str, latitude_deg: float, longitude_deg: float
 ) -> None:
-    frame = LocalFrame(
-        datum=Datum(latitude_deg, longitude_deg), seafloor_depth_m=15.0, datum_is_given=True
-    )
+    frame = frame_at(latitude_deg, longitude_deg, 15.0)
     wanted = np.array([[0, 0], [80, 10], [70, 90], [10, 60]], float)
     lat, lon = frame.latlon_from_ne(wanted).T
     x, y = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(lon, lat)
     wkt = Polygon(np.column_stack([x, y])).wkt
-    area = area_of(wkt, crs, latitude_deg=latitude_deg, longitude_deg=longitude_deg)
+    area = area_of(wkt=wkt, crs=crs, latitude_deg=latitude_deg, longitude_deg=longitude_deg)
     (polygon,) = area.survey.geoms
     np.testing.assert_allclose(np.asarray(polygon.exterior.coords)[:-1], wanted, atol=1e-3)
 
@@ -86,25 +78,23 @@ def test_areas_are_those_on_the_ellipsoid(
     lon, lat, _ = WGS84.fwd(*start, azimuths, np.full(5, size_m))
     expected_m2 = abs(WGS84.polygon_area_perimeter(lon, lat)[0])
     # At 1 m depth, so that what the Earth's roundness takes from areas below is 3e-7.
-    settings = AreaConfig(
-        polygon_latlon_deg=tuple(zip(lat, lon, strict=True)), seafloor_depth_m=1.0
-    )
-    area = survey_area(settings, turn_margin_m=3.0)
+    area = area_of(polygon_latlon_deg=tuple(zip(lat, lon, strict=True)), seafloor_depth_m=1.0)
     assert area.survey.area == pytest.approx(expected_m2, rel=1e-4)
 
 
 def test_the_datum_of_an_area_across_the_date_line_is_its_middle() -> None:
     corners = np.array([[179.999, 10.0], [-179.998, 10.0], [-179.998, 10.001], [179.999, 10.001]])
-    plain = area_of(Polygon(corners).wkt, "EPSG:4326")
+    plain = area_of(wkt=Polygon(corners).wkt, crs="EPSG:4326")
     assert plain.datum == Datum(10.0005, -179.9995)
     east = corners.copy()
     east[:, 0] %= 360.0
-    assert area_of(Polygon(east).wkt, "EPSG:4326").survey.area == pytest.approx(plain.survey.area)
+    further = area_of(wkt=Polygon(east).wkt, crs="EPSG:4326")
+    assert further.survey.area == pytest.approx(plain.survey.area)
     halves = (
         "MULTIPOLYGON (((179.999 10, 180 10, 180 10.001, 179.999 10.001, 179.999 10)),"
         "((-180 10, -179.998 10, -179.998 10.001, -180 10.001, -180 10)))"
     )
-    joined = area_of(halves, "EPSG:4326")
+    joined = area_of(wkt=halves, crs="EPSG:4326")
     assert len(joined.survey.geoms) == 1
     assert joined.survey.area == pytest.approx(plain.survey.area, rel=1e-6)
     width_m = WGS84.inv(179.999, 10.0, -179.998, 10.0)[2]
@@ -128,18 +118,15 @@ def test_coordinates_that_cannot_be_are_refused_with_the_corner(
     wkt: str, crs: str, named: str
 ) -> None:
     with pytest.raises(PlanError) as fault:
-        area_of(wkt, crs)
+        area_of(wkt=wkt, crs=crs)
     assert named in str(fault.value)
     assert "\n" not in str(fault.value)
 
 
 def test_depth_moves_corners_together_as_the_earth_is_round() -> None:
-    corners = tuple((lat, lon) for lat, lon in ((32.0, 34.0), (32.01, 34.0), (32.0, 34.01)))
+    corners = ((32.0, 34.0), (32.01, 34.0), (32.0, 34.01))
     shallow, deep = (
-        survey_area(
-            AreaConfig(polygon_latlon_deg=corners, seafloor_depth_m=depth_m), turn_margin_m=3.0
-        ).survey.area
+        area_of(polygon_latlon_deg=corners, seafloor_depth_m=depth_m).survey.area
         for depth_m in (10.0, 4010.0)
     )
     assert deep / shallow == pytest.approx((1 - 4000 / 6.371e6) ** 2, rel=1e-5)
-    assert math.isfinite(deep)

@@ -10,7 +10,6 @@ import numpy as np
 import pyogrio.raw
 import pytest
 import shapely
-from pyproj import Transformer
 from shapely.geometry import LineString, Point, Polygon
 from shapely.geometry.base import BaseGeometry
 
@@ -19,40 +18,28 @@ from alice_survey.core.errors import PlanError
 from missions.areas import files
 from missions.areas.survey import survey_area
 from missions.values.area import Area
-from tests.missions.areas.sites import area_of
+from tests.missions.areas.sites import TO_UTM, UTM, area_of
 
 SITE = Polygon(
     [(700000, 3640000), (700030, 3640000), (700030, 3640020), (700015, 3640010), (700000, 3640020)],
     [[(700004, 3640003), (700009, 3640003), (700006, 3640008)]],
 )
 """30 x 20 m with a bay and a hole, UTM zone 36 north."""
-TO_DEGREES = Transformer.from_crs("EPSG:32636", "EPSG:4326", always_xy=True)
 
 
 def in_degrees(geometry: BaseGeometry) -> Any:
     return shapely.transform(
-        geometry, lambda xy: np.column_stack(TO_DEGREES.transform(xy[:, 0], xy[:, 1]))
+        geometry, lambda xy: np.column_stack(TO_UTM.transform(*xy.T, direction="INVERSE"))
     )
 
 
 def write(
-    path: Path,
-    geometries: Sequence[BaseGeometry],
-    driver: str,
-    crs: str | None = "EPSG:32636",
-    **more: Any,
+    path: Path, geometries: Sequence[BaseGeometry], driver: str, crs: str = UTM, **more: Any
 ) -> Path:
     """By GDAL itself."""
-    pyogrio.raw.write(
-        path,
-        shapely.to_wkb(np.array(geometries, dtype=object)),
-        [np.arange(len(geometries))],
-        ["number"],
-        geometry_type=more.pop("geometry_type", "Unknown"),
-        crs=crs,
-        driver=driver,
-        **more,
-    )
+    wkb = shapely.to_wkb(np.array(geometries, dtype=object))
+    how = {"geometry_type": "Unknown", "crs": crs, "driver": driver, **more}
+    pyogrio.raw.write(path, wkb, [np.arange(len(wkb))], ["number"], **how)
     return path
 
 
@@ -81,8 +68,9 @@ def wanted() -> Area:
 
 def make(kind: str, folder: Path) -> Path:
     if kind == "geojson":
-        return write(folder / "a.geojson", [in_degrees(SITE)], "GeoJSON", "EPSG:4326",
-                     layer_options={"COORDINATE_PRECISION": "11"})  # fmt: skip
+        digits = {"COORDINATE_PRECISION": "11"}
+        place = [in_degrees(SITE)]
+        return write(folder / "a.geojson", place, "GeoJSON", "EPSG:4326", layer_options=digits)
     if kind == "geojson with crs":
         return write(folder / "a.json", [SITE], "GeoJSON")
     if kind == "gpkg":
@@ -140,14 +128,10 @@ def test_a_file_without_a_system_is_read_by_crs_or_refused(tmp_path: Path, wante
     area = area_of(file=site, crs="EPSG:32636")
     assert area.survey.symmetric_difference(wanted.survey).area < 1e-3
     local = shapely.transform(SITE, lambda xy: xy - [700000, 3640000])
-    plain = write(
-        tmp_path / "plain.shp", [local], "ESRI Shapefile", "EPSG:32636", geometry_type="Polygon"
-    )
+    plain = write(tmp_path / "plain.shp", [local], "ESRI Shapefile", geometry_type="Polygon")
     plain.with_suffix(".prj").unlink()
     assert area_of(file=plain, crs="local").survey.bounds == pytest.approx((0, 0, 20, 30))
 
-
-def test_geojson_in_metres_that_does_not_say_so_needs_crs(tmp_path: Path, wanted: Area) -> None:
     file = tmp_path / "old.geojson"
     file.write_text(shapely.to_geojson(SITE))
     assert "crs" in refusal(file=file)
@@ -163,9 +147,8 @@ def test_layers_are_chosen_by_name(tmp_path: Path, wanted: Area) -> None:
     write(file, [Point(700020, 3640003)], "GPKG", layer="buoys", append=True)
     assert " layer" in refusal(file=file)
     assert "wreck" in refusal(file=file, layer="wreck")
-    area = area_of(
-        file=file, layer="reef", allowed_file=permit, no_go_file=buoys, no_go_clearance_m=1.0,
-    )  # fmt: skip
+    zones = {"allowed_file": permit, "no_go_file": buoys, "no_go_clearance_m": 1.0}
+    area = area_of(file=file, layer="reef", **zones)
     assert area.allowed.area > wanted.survey.area
     # The hole (12.5 m2, 15.6 m round) and the disc about the buoy, each 1 m wider.
     assert len(area.no_go.geoms) == 2
@@ -181,8 +164,8 @@ def test_mixed_shapes_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[st
     area = area_of(file=file, corridor_width_m=4.0)
     assert "4 m" in capsys.readouterr().err
     assert len(area.survey.geoms) == 1
-    assert area.survey.area == pytest.approx(SITE.union(line.buffer(2, cap_style="flat")).area,
-                                             rel=2e-3)  # fmt: skip
+    both = SITE.union(line.buffer(2, cap_style="flat"))
+    assert area.survey.area == pytest.approx(both.area, rel=2e-3)
     buoys = write(tmp_path / "buoys.gpkg", [Point(700000, 3640000)], "GPKG")
     assert "1 point" in refusal(file=buoys)
 
@@ -300,10 +283,7 @@ def test_archives_without_the_one_file_are_refused(tmp_path: Path) -> None:
 def test_several_shapefiles_in_a_zip_are_layers(tmp_path: Path, wanted: Area) -> None:
     shapefile(tmp_path, "reef")
     shapefile(tmp_path, "other")
-    members: Mapping[str, Path | bytes] = {
-        p.name: p for name in ("reef", "other") for p in tmp_path.glob(f"{name}.*")
-    }
-    file = zipped(tmp_path / "both.zip", members)
+    file = zipped(tmp_path / "both.zip", {p.name: p for p in list(tmp_path.iterdir())})
     assert "'other', 'reef'" in refusal(file=file)
     area = area_of(file=file, layer="reef")
     assert area.survey.area == pytest.approx(wanted.survey.area, abs=1e-6)

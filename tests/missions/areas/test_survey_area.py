@@ -17,7 +17,7 @@ from missions.values.area import Area
 from tests.missions.areas.sites import area_of
 
 SQUARE = ((0.0, 0.0), (10.0, 0.0), (10.0, 10.0), (0.0, 10.0))
-RING = ((10.0, 20.0), (10.0, 20.001), (10.001, 20.0))
+RING = {"polygon_latlon_deg": ((10.0, 20.0), (10.0, 20.001), (10.001, 20.0))}
 
 
 def corners_ne(area: Area) -> np.ndarray:
@@ -42,9 +42,8 @@ def test_a_rectangle_keeps_its_size_whatever_its_heading(
     corners = corners_ne(area)
     side = corners[1] - corners[0]
     assert np.linalg.norm(side) == pytest.approx(length_m)
-    assert side / length_m == pytest.approx(
-        [math.cos(math.radians(heading_deg)), math.sin(math.radians(heading_deg))], abs=1e-9
-    )
+    heading = math.radians(heading_deg)
+    assert side / length_m == pytest.approx([math.cos(heading), math.sin(heading)], abs=1e-9)
     np.testing.assert_allclose(corners[0], 0.0, atol=1e-9 * (length_m + width_m))
 
 
@@ -73,10 +72,7 @@ def test_a_margin_widens_the_area_to_survey_but_no_hole() -> None:
     assert area.allowed.area == pytest.approx(18**2 - 4 - 4)
 
 
-@given(
-    angle_deg=st.floats(5, 175),
-    margin_m=st.floats(0.1, 20),
-)
+@given(angle_deg=st.floats(5, 175), margin_m=st.floats(0.1, 20))
 def test_margins_reach_everywhere_and_run_away_nowhere(angle_deg: float, margin_m: float) -> None:
     tip = math.radians(angle_deg) / 2
     triangle = ((0.0, 0.0), *((30 * math.cos(a), 30 * math.sin(a)) for a in (-tip, tip)))
@@ -146,14 +142,12 @@ def test_an_allowed_area_may_leave_out_some_but_not_all(
         ({"polygon_ne_m": SQUARE, "no_go_ne_m": (square(-1, -1, 12),)}, "no_go_ne_m"),
         ({"polygon_ne_m": SQUARE, "allowed_ne_m": square(50, 0, 10)}, "40 m"),
         ({"polygon_ne_m": SQUARE, "allowed_ne_m": ()}, "allowed_ne_m: 0 distinct corners"),
-        ({"polygon_latlon_deg": RING, "latitude_deg": 10.0}, "longitude_deg"),
+        ({**RING, "latitude_deg": 10.0}, "longitude_deg"),
+        ({**RING, "latitude_deg": 32.0, "longitude_deg": 34.0}, r"1 at \(10, 20\) is \d+ km"),
+        # Latitude and longitude are swapped.
         (
-            {"polygon_latlon_deg": RING, "latitude_deg": 32.0, "longitude_deg": 34.0},
-            r"corner 1 at \(10, 20\) is \d+ km",
-        ),
-        (  # latitude and longitude are swapped
-            {"polygon_latlon_deg": RING, "latitude_deg": 20.0, "longitude_deg": 10.0},
-            r"corner 2 at \(10, 20\.001\) is \d+ km",
+            {**RING, "latitude_deg": 20.0, "longitude_deg": 10.0},
+            r"2 at \(10, 20\.001\) is \d+ km",
         ),
         ({"polygon_latlon_deg": ((10, 20), (10, 21), (11, 20))}, r"corner \d at .* km"),
         ({"polygon_ne_m": ((0, 0), (10, 0), (10, 1e6))}, r"corner 3 .* is 1000 km"),
@@ -183,12 +177,8 @@ def test_corners_in_latitude_and_longitude_come_back_from_the_sea_floor() -> Non
     area = survey_area(local, turn_margin_m=3.0)
     corners = corners_ne(area)
     geodetic = area.datum.geodetic_from_ned(np.column_stack([corners, np.full(4, 40.0)]))
-    again = area_of(
-        polygon_latlon_deg=[(lat, lon) for lat, lon, _ in geodetic.tolist()],
-        latitude_deg=32.8236,
-        longitude_deg=34.9553,
-        seafloor_depth_m=40.0,
-    )
+    datum = {"latitude_deg": 32.8236, "longitude_deg": 34.9553, "seafloor_depth_m": 40.0}
+    again = area_of(polygon_latlon_deg=geodetic[:, :2].tolist(), **datum)
     np.testing.assert_allclose(corners_ne(again), corners, atol=1e-6)
 
 

@@ -8,7 +8,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from shapely.geometry import Polygon
+from shapely.geometry import MultiPolygon, Polygon
 from shapely.geometry.base import BaseGeometry
 from shapely.ops import unary_union
 
@@ -37,6 +37,7 @@ from tests.oracles_coverage import (
     shifted,
     stations_at,
 )
+from tests.strategies_areas import areas
 
 ONCE = Pattern(spacing_m=1.0, step_m=1.0, half_across_m=0.5, half_along_m=0.5)
 ASKED = Pattern(spacing_m=1.0, step_m=0.5, half_across_m=0.6, half_along_m=0.55)
@@ -339,24 +340,10 @@ def test_counts_are_those_of_polygons_at_every_cell() -> None:
     assert seen.pictures.max() > 6
 
 
-@st.composite
-def stars(draw: st.DrawFn) -> Polygon:
-    """A star-shaped polygon, with a hole at times."""
-    count = draw(st.integers(3, 12))
-    radii = draw(st.lists(st.floats(1.0, 5.0), min_size=count, max_size=count))
-    turned = draw(st.floats(0, 6.3))
-    angles = turned + 2 * math.pi * np.arange(count) / count
-    star = Polygon(np.array(radii)[:, None] * np.column_stack([np.cos(angles), np.sin(angles)]))
-    inner = star.buffer(-0.4)
-    if draw(st.booleans()) and isinstance(inner, Polygon) and not inner.is_empty:
-        return Polygon(star.exterior, [shapely.affinity.scale(inner, 0.6, 0.6).exterior])
-    return star
-
-
 @settings(deadline=None, max_examples=60)
-@given(star=stars())
-def test_cells_inside_are_those_whose_middle_is_inside(star: Polygon) -> None:
-    area = area_of(shapely.union_all([star, shapely.affinity.translate(star, 20.0, 3.0)]))
+@given(shape=areas())
+def test_cells_inside_are_those_whose_middle_is_inside(shape: MultiPolygon) -> None:
+    area = area_of(shape)
     grid = grid_over(area, 0.17)
 
     mask = cells_inside(area, grid)

@@ -18,9 +18,8 @@ from missions.values.area import multipolygon
 from missions.values.costs import Costs, time_costs
 from missions.values.line import Line
 from missions.values.plan_file import Dive
-from tests.missions.route.routes import route_through
 from tests.oracles_energy import best_parting
-from tests.oracles_route import inside, lawn, route_cost
+from tests.oracles_route import inside, lawn, route_cost, route_through
 
 HOME = (-2.0, -1.0)
 WAYS = Ways(shapely.MultiPolygon([shapely.box(-6, -6, 60, 40)]))
@@ -36,7 +35,7 @@ def _split(lines: list[Line], usable_wh: float, **options: Any) -> tuple[Dive, .
 
 def _of_dive(lines: list[Line], first: int, last: int, costs: Costs = COSTS) -> tuple[float, float]:
     """A dive's energy and time, by its own route."""
-    route = route_through(lines[first : last + 1], 0.5, 0.5, ways=WAYS, costs=costs, home_ne=HOME)
+    route = route_through(lines[first : last + 1], ways=WAYS, costs=costs, home_ne=HOME)
     energy, time = route_cost(route, costs)
     return energy + costs.dive_j(3.0), time + costs.dive_s(3.0)
 
@@ -177,7 +176,7 @@ def test_ways_along_single_lines_are_the_routes_through_them(turns: Any) -> None
     corners = 0
     parts = np.split(legs, begins[1:-1])
     for i, (line, out, back) in enumerate(zip(lines, parts[::2], parts[1::2], strict=True)):
-        expected = route_through([line], 0.5, 0.5, first_line=i, **how)
+        expected = route_through([line], first_line=i, **how)
         assert route_of(np.concatenate([out, back])) == expected
         assert out[-1, 5] == i and not (out[:-1, 5] >= 0).any() and not (back[:, 5] >= 0).any()
         corners += len(out) > 6

@@ -15,12 +15,13 @@ from missions.values.area import multipolygon
 from missions.values.costs import SETTLE_S, time_costs
 from missions.values.legs import Leg, Route
 from missions.values.line import Line
-from tests.missions.route.routes import PAPER_COSTS, route_through
 from tests.oracles_route import (
+    PAPER_COSTS,
     farthest_outside_m,
     lawn,
     line_starts_m,
     route_cost,
+    route_through,
     turn_counts,
     way_m,
 )
@@ -123,7 +124,7 @@ def test_auto_is_as_cheap_as_any_way_of_turning(
 @pytest.mark.parametrize("turns", MODES)
 def test_turns_are_flown_as_requested(turns: Turns, capsys: pytest.CaptureFixture[str]) -> None:
     lines = lawn(6, 10.0, 1.0)
-    route = route_through(lines, 0.5, 0.5, turns=turns)
+    route = route_through(lines, turns=turns)
 
     counts = {"auto": (5, 0, 0), "arcs": (5, 0, 0), "spot": (0, 10, 0), "sway": (0, 5, 5)}
     assert turn_counts(route) == counts[turns]
@@ -136,7 +137,7 @@ def test_turns_take_the_time_of_their_closed_forms() -> None:
 
     def turn_s(turns: Turns, apart_m: float) -> float:
         two, three = (
-            route_cost(route_through(lawn(n, 10.0, apart_m), 0.5, 0.5, turns=turns), PAPER_COSTS)[1]
+            route_cost(route_through(lawn(n, 10.0, apart_m), turns=turns), PAPER_COSTS)[1]
             for n in (2, 3)
         )
         return three - two - 10.0 / 0.2
@@ -154,7 +155,7 @@ def test_turns_take_the_time_of_their_closed_forms() -> None:
 
 
 def test_a_sway_step_keeps_the_heading_and_then_turns() -> None:
-    route = route_through(lawn(2, 10.0, 1.0), 0.5, 0.5, turns="sway")
+    route = route_through(lawn(2, 10.0, 1.0), turns="sway")
 
     kinds = [(leg.kind, leg.line) for leg in route.legs]
     assert kinds == [
@@ -168,10 +169,10 @@ def test_a_sway_step_keeps_the_heading_and_then_turns() -> None:
     assert abs(route.legs[4].turn_rad) == pytest.approx(math.pi)
 
     # Lines one way: no turn; a next line that begins earlier: it steps at once and runs in longer.
-    same = route_through([line((0, 0), (5, 0)), line((6, -1), (9, -1))], 0.5, 0.5, turns="sway")
+    same = route_through([line((0, 0), (5, 0)), line((6, -1), (9, -1))], turns="sway")
     assert turn_counts(same)[1:] == (0, 1)
     assert same.legs[3].side_rad == math.pi / 2
-    early = route_through([line((0, 0), (9, 0)), line((5, 1), (0, 1))], 0.5, 0.5, turns="sway")
+    early = route_through([line((0, 0), (9, 0)), line((5, 1), (0, 1))], turns="sway")
     assert [leg.kind for leg in early.legs[1:5]] == ["straight", "sway", "spot", "straight"]
     assert early.legs[4].length_m == pytest.approx(4.0)
     check_joints(same)
@@ -184,7 +185,7 @@ def test_what_has_no_room_is_flown_otherwise_with_a_warning(
     lines = lawn(5, 10.0, 1.0)
     tight = Ways(multipolygon(box(0.0, -0.1, 10.0, 4.1)))
 
-    route = route_through(lines, 0.5, 0.5, ways=tight, turns="arcs")
+    route = route_through(lines, ways=tight, turns="arcs")
 
     arcs, spots, steps = turn_counts(route)
     assert arcs == 0
@@ -194,11 +195,11 @@ def test_what_has_no_room_is_flown_otherwise_with_a_warning(
     assert "4 of 4 turns" in warned
     assert warned.count("\n") == 1
 
-    far = route_through(lawn(3, 10.0, MAX_SWAY_M + 0.1), 0.5, 0.5, turns="sway")
+    far = route_through(lawn(3, 10.0, MAX_SWAY_M + 0.1), turns="sway")
     assert turn_counts(far)[2] == 0
     assert "2 of 2 turns" in capsys.readouterr().err
 
-    auto = route_through(lines, 0.5, 0.5, ways=tight)
+    auto = route_through(lines, ways=tight)
     assert turn_counts(auto)[0] == 0
     assert capsys.readouterr().err == ""
 
@@ -207,7 +208,7 @@ def test_a_vehicle_without_sway_never_steps() -> None:
     costs = time_costs(0.2)._replace(sway_w=np.full(4, np.inf))
     tight = Ways(multipolygon(box(0.0, -0.1, 10.0, 4.1)))
     for turns in MODES:
-        route = route_through(lawn(5, 10, 1.0), 0.5, 0.5, ways=tight, costs=costs, turns=turns)
+        route = route_through(lawn(5, 10, 1.0), ways=tight, costs=costs, turns=turns)
         assert turn_counts(route)[2] == 0
 
 
@@ -217,7 +218,7 @@ def test_the_way_between_lines_goes_round_a_hole() -> None:
     lines = [line((0.0, 5.0), (7.0, 5.0)), line((13.0, 5.0), (20.0, 5.0))]
 
     for turns in MODES:
-        route = route_through(lines, 0.5, 0.5, ways=ways, turns=turns, home_ne=(-2.0, -2.0))
+        route = route_through(lines, ways=ways, turns=turns, home_ne=(-2.0, -2.0))
         check_joints(route)
         assert farthest_outside_m(area, route) <= TOUCH_M
         between = route.starts_m[next(i for i, leg in enumerate(route.legs) if leg.line == 1)]
@@ -225,7 +226,7 @@ def test_the_way_between_lines_goes_round_a_hole() -> None:
         shortest = way_m(ways, (7.0, 5.0), (12.5, 5.0)) + 0.5
         assert between == pytest.approx(shortest)
     # A part of the line beyond the hole is no more straight on than any other line.
-    assert turn_counts(route_through(lines, 0.5, 0.5))[1] == 0
+    assert turn_counts(route_through(lines))[1] == 0
 
 
 def test_what_cannot_be_flown_is_refused() -> None:
@@ -233,19 +234,19 @@ def test_what_cannot_be_flown_is_refused() -> None:
     ways = Ways(multipolygon(apart))
     lines = [line((0.0, 0.0), (9.0, 0.0)), line((9.0, 6.0), (0.0, 6.0))]
     with pytest.raises(PlanError, match=r"9\.00 m north, 0\.00 m east"):
-        route_through(lines, 0.5, 0.5, ways=ways)
+        route_through(lines, ways=ways)
     with pytest.raises(PlanError, match="line 1 "):
-        route_through([lines[0], line((1.0, 1.0), (1.0, 1.0))], 0.5, 0.5)
+        route_through([lines[0], line((1.0, 1.0), (1.0, 1.0))])
     with pytest.raises(PlanError, match=r"1 of 1 lines .* line 3"):
-        route_through([line((0.0, 0.0), (0.0, 8.0))], 0.5, 0.5, ways=ways, first_line=3)
+        route_through([line((0.0, 0.0), (0.0, 8.0))], ways=ways, first_line=3)
     with pytest.raises(PlanError, match=r"20\.00 m north, 0\.00 m east"):
-        route_through(lines[:1], 0.5, 0.5, ways=ways, home_ne=(20.0, 0.0))
+        route_through(lines[:1], ways=ways, home_ne=(20.0, 0.0))
 
 
 def test_ten_thousand_lines_have_a_route() -> None:
     count = 10_000
     ways = Ways(multipolygon(box(-3, -3, 23, 10_003)))
-    route = route_through(lawn(count, 20.0, 1.0), 0.5, 0.5, ways=ways)
+    route = route_through(lawn(count, 20.0, 1.0), ways=ways)
     assert turn_counts(route)[0] == count - 1
     # Run-in, line and run-out of each, and half circles between.
     assert route.length_m == pytest.approx(21.0 * count + (count - 1) * math.pi / 2)
@@ -253,7 +254,7 @@ def test_ten_thousand_lines_have_a_route() -> None:
 
 def test_parts_of_one_line_are_joined_straight() -> None:
     parts = [line((0.0, 0.0), (3.0, 0.0)), line((3.6, 0.0), (8.0, 0.0))]
-    route = route_through(parts, 0.5, 0.5)
+    route = route_through(parts)
 
     assert route.length_m == pytest.approx(8.0 + 2 * 0.5)
     assert all(leg.curvature_per_m == 0 for leg in route.legs)
@@ -262,7 +263,7 @@ def test_parts_of_one_line_are_joined_straight() -> None:
 def test_a_route_is_continuous_and_keeps_its_lines() -> None:
     ends = (((0.0, 0.0), (0.0, 5.0)), ((1.0, 5.0), (1.0, 0.0)), ((1.6, 0.0), (1.6, 5.0)))
     lines = [line(*both) for both in ends]
-    route = route_through(lines, 0.5, 0.5)
+    route = route_through(lines)
 
     along = np.linspace(0.0, route.length_m, 20_001)
     places_ne = route.places(along)
