@@ -1,21 +1,21 @@
 """Plans for tests of exports, made by hand so that they need no planner."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from shapely.geometry import MultiPolygon, Polygon
+from shapely.geometry import Polygon
 
 from alice_survey.core.config import CameraConfig, WaterConfig
 from alice_survey.core.frames import Datum
 from camera_calib.rig import Rig, design_rig
-from missions.values.area import Area
 from missions.values.legs import Leg, Route
 from missions.values.line import Line
 from missions.values.plan_file import Dive, Plan
+from tests.oracles_lines import DATUM, area_of
 
-DATUM = Datum(latitude_deg=32.8236, longitude_deg=34.9553)
 RIG: Rig = design_rig(CameraConfig(), WaterConfig())
 
 
@@ -23,9 +23,8 @@ def straight(
     start: tuple[float, float], end: tuple[float, float], line: int = -1, side_rad: float = 0.0
 ) -> Leg:
     course, length_m = math.atan2(end[1] - start[1], end[0] - start[0]), math.dist(start, end)
-    return Leg(
-        start_ne_m=start, heading_rad=course, length_m=length_m, line=line, side_rad=side_rad
-    )
+    given = {"length_m": length_m, "line": line, "side_rad": side_rad}
+    return Leg(start_ne_m=start, heading_rad=course, **given)
 
 
 def spot(place: tuple[float, float], heading_rad: float, turn_rad: float) -> Leg:
@@ -33,10 +32,9 @@ def spot(place: tuple[float, float], heading_rad: float, turn_rad: float) -> Leg
 
 
 def arc(place: tuple[float, float], heading_rad: float, radius_m: float, turn_rad: float) -> Leg:
-    curvature, length_m = math.copysign(1 / radius_m, turn_rad), radius_m * abs(turn_rad)
-    return Leg(
-        start_ne_m=place, heading_rad=heading_rad, length_m=length_m, curvature_per_m=curvature
-    )
+    curvature = math.copysign(1 / radius_m, turn_rad)
+    bend = {"length_m": radius_m * abs(turn_rad), "curvature_per_m": curvature}
+    return Leg(start_ne_m=place, heading_rad=heading_rad, **bend)
 
 
 def lawnmower_route(lines: list[Line], first: int, home: tuple[float, float]) -> Route:
@@ -73,18 +71,10 @@ def plan_of(
     low, high = ends.min(axis=0) - 0.2, ends.max(axis=0) + 0.2
     box = Polygon([low, (high[0], low[1]), high, (low[0], high[1])])
     area = box if survey is None else survey
-    holes = MultiPolygon([Polygon(hole) for hole in area.interiors])
-    flown = routes or [
-        lawnmower_route(lines[first : last + 1], first, home) for first, last in dives
-    ]
+    flown = routes or [lawnmower_route(lines[a : b + 1], a, home) for a, b in dives]
     values: dict[str, Any] = {
         "name": "harbour",
-        "area": Area(
-            datum=datum,
-            survey=MultiPolygon([area]),
-            allowed=MultiPolygon([area.buffer(3.0, join_style="mitre")]),
-            no_go=holes,
-        ),
+        "area": replace(area_of(area), datum=datum),
         "home_ne_m": home,
         "seafloor_depth_m": 15.0,
         "altitude_m": 2.0,

@@ -6,6 +6,7 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import numpy as np
+from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from pyproj import Geod
 
@@ -15,6 +16,11 @@ from camera_calib.rig import Rig, design_rig
 from missions.values.plan_file import Plan
 from tests.missions.exports.plans import line, plan_of
 
+WIDE = settings(
+    max_examples=15,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
+)
 _GEOD = Geod(ellps="WGS84")
 _COORDINATE = {"latitude": (-90.0, 90.0), "longitude": (-180.0, 180.0)}
 _FINAL = ["final_latitude", "final_longitude", "final_depth", "final_altitude"]

@@ -2,21 +2,25 @@ import math
 import tempfile
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from shapely.geometry import MultiPolygon, Point, box
 
+from alice_survey.core.config import CameraConfig, PlanConfig, SeaConfig, VehicleConfig
+from alice_survey.core.errors import keep_warnings
+from alice_survey.sim.vehicle.pilot.mission import steady_drift
 from camera_calib.rig import Rig
 from missions.exports import format as options
-from missions.exports.follower import Follower
-from missions.exports.format import Options, line_tolerance_m
+from missions.exports.follower import Follower, line_offset_m
+from missions.exports.format import Options, line_tolerance_m, options_of
 from missions.exports.write import write_exports
 from missions.values.footprint import common_swath
 from missions.values.plan_file import Plan
 from tests.missions.exports.plans import RIG, golden_plan, small_plan
-from tests.missions.exports.readers import Step, local_ne, plans, read_cola2, rigs, turned
+from tests.missions.exports.readers import WIDE, Step, local_ne, plans, read_cola2, rigs, turned
 
 GOLDEN = Path(__file__).parent / "golden"
 MM = 1e-3
@@ -39,7 +43,7 @@ def test_a_mission_is_that_on_file(tmp_path: Path) -> None:
     assert written == (GOLDEN / "mission.xml").read_bytes()
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(WIDE, max_examples=25)
 @given(plan=plans(), rig=rigs())
 def test_the_glass_flies_every_line(plan: Plan, rig: Rig) -> None:
     """The reference point's section, moved by the lever arm, is the line of the glass."""
@@ -114,14 +118,11 @@ def test_in_a_current_steps_end_outside_of_the_turning_circle(tmp_path: Path) ->
 
 def test_lines_end_at_the_edge_of_the_allowed_area(tmp_path: Path) -> None:
     plan = small_plan()
-    area = replace(plan.area, allowed=MultiPolygon([box(-3.0, -3.0, 4.9, 6.5)]))
-    plan = replace(plan, area=area)
+    allowed = MultiPolygon([box(-3.0, -3.0, 4.9, 6.5)])
+    plan = replace(plan, area=replace(plan.area, allowed=allowed))
     write_exports(tmp_path, plan, RIG, formats=["cola2"], options=Options(follower=FOLLOWER))
-    first = next(
-        step
-        for step in read_cola2(tmp_path / "mission_dive1.xml")
-        if step.actions == ["camera_trigger/disable"]
-    )
+    steps = read_cola2(tmp_path / "mission_dive1.xml")
+    first = next(step for step in steps if step.actions == ["camera_trigger/disable"])
     end = place(plan, first) + turned((0.55, -0.05), 0.0)
     np.testing.assert_allclose(end, (4.9, 0.0), atol=MM)
 
@@ -161,3 +162,37 @@ def test_lines_that_follow_a_bathymetry_bend_where_the_floor_does() -> None:
     )
     assert second[1].values["initial_depth"] == pytest.approx(12.0 - 0.08, abs=MM)
     assert [bool(s.actions) for s in second] == [True, False, True]
+
+
+def sea_options(vehicle: str = "alice", **sea: Any) -> Options:
+    given = SeaConfig(**({"gust_n": (0.0, 0.0, 0.0)} | sea))
+    return options_of(CameraConfig(), PlanConfig(), VehicleConfig(name=vehicle), given)
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "formats", "towards_deg", "warns"),
+    [
+        ("alice", ["cola2"], 90.0, True),  # lines run north and south
+        ("alice", ["cola2"], 0.0, False),
+        ("alice", ["wpl"], 90.0, False),
+        ("alice", None, 90.0, False),
+        ("sparus2", None, 90.0, True),
+    ],
+)
+def test_lines_that_cola2_cannot_hold_are_said_beforehand(
+    vehicle: str, formats: list[str] | None, towards_deg: float, warns: bool, tmp_path: Path
+) -> None:
+    known = sea_options(vehicle, current_mps=0.1, current_towards_deg=towards_deg)
+    with keep_warnings() as warnings:
+        write_exports(tmp_path, small_plan(), RIG, formats=formats, options=known)
+    assert any("COLA2 holds" in text for text in warnings) == warns
+    assert all("\n" not in text for text in warnings)
+
+
+def test_a_current_holds_the_glass_off_its_line() -> None:
+    follower = sea_options(current_mps=0.05, current_towards_deg=90.0).follower
+    # Of the glass 0.55 m ahead of a vehicle that heads upstream.
+    wanted = (follower.delta_m - 0.55) * steady_drift(0.05, 0.2)
+    for heading_rad, expected in ((0.0, wanted), (math.pi, -wanted), (math.pi / 2, 0.0)):
+        offset_m = line_offset_m(follower, heading_rad, 0.2, 0.55)
+        assert offset_m == pytest.approx(expected, abs=1e-12)

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from mavsdk.component_type import ComponentType
 from mavsdk.mavsdk import Configuration, Mavsdk
 from mavsdk.plugins.mission_raw.mission_raw import MissionRaw
-from pymavlink import mavutil, mavwp
+from pymavlink import mavwp
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 from shapely.geometry import Point, Polygon
 
@@ -23,7 +23,7 @@ from missions.exports.format import line_tolerance_m
 from missions.exports.write import write_exports
 from missions.values.plan_file import Plan
 from tests.missions.exports.plans import RIG, line, plan_of, small_plan
-from tests.missions.exports.readers import local_ne, plans, rigs, turned
+from tests.missions.exports.readers import WIDE, local_ne, plans, rigs, turned
 
 MM = 1e-3
 Importer = Callable[[str], Any]
@@ -56,15 +56,16 @@ def written(plan: Plan, rig: Rig, formats: list[str], folder: Path) -> None:
 
 
 def check_lines(
-    plan: Plan, rig: Rig, dive: int, items: list[dict[str, float]], atol: float
+    plan: Plan, rig: Rig, dive: int, items: list[Any], unit_deg: float, atol: float
 ) -> None:
     """The camera is on exactly along each line of the glass, and takes all its pictures."""
     glass = rig.body_from_cam("left").apply([0.0, 0.0, 0.03])
     first, last = plan.dives[dive].first_line, plan.dives[dive].last_line
     number, on, place = first, 0.0, np.zeros(2)
     for item in items:
-        if item["command"] == dialect.MAV_CMD_NAV_WAYPOINT:
-            before, place = place, np.array(local_ne(plan.datum, item["lat"], item["lon"]))
+        if item.command == dialect.MAV_CMD_NAV_WAYPOINT:
+            at = local_ne(plan.datum, item.x * unit_deg, item.y * unit_deg)
+            before, place = place, np.array(at)
             if on:
                 wanted = plan.lines[number]
                 arm = turned((glass[0], glass[1]), wanted.heading_rad)
@@ -73,61 +74,45 @@ def check_lines(
                 past_m = line_tolerance_m(plan, rig) + plan.station_spacing_m
                 past = past_m * turned((1.0, 0.0), wanted.heading_rad)
                 np.testing.assert_allclose(place + arm, wanted.end_ne_m + past, atol=atol)
-                assert item["frame"] == 10
+                assert item.frame == 10
                 altitude = plan.altitude_m + glass[2] - 0.11
-                assert item["z"] == pytest.approx(altitude, abs=MM)
-                pictures = math.floor(wanted.length_m / on) + 1
-                assert pictures == wanted.stations
+                assert item.z == pytest.approx(altitude, abs=MM)
+                assert math.floor(wanted.length_m / on) + 1 == wanted.stations
                 number += 1
-        elif item["command"] == dialect.MAV_CMD_DO_SET_CAM_TRIGG_DIST:
-            assert bool(item["param1"]) != bool(on)
-            on = item["param1"]
+        elif item.command == dialect.MAV_CMD_DO_SET_CAM_TRIGG_DIST:
+            assert bool(item.param1) != bool(on)
+            on = item.param1
     assert number == last + 1
     assert not on
 
 
-@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(WIDE, max_examples=20)
 @given(plan=plans(), rig=rigs())
 def test_wpl_in_pymavlink(plan: Plan, rig: Rig) -> None:
     with tempfile.TemporaryDirectory() as folder:
         written(plan, rig, ["wpl"], Path(folder))
         for dive in range(len(plan.dives)):
             rows = read_wpl(Path(folder) / f"mission_dive{dive + 1}.waypoints")
-            items = [
-                {"command": w.command, "frame": w.frame, "param1": w.param1, "lat": w.x,
-                 "lon": w.y, "z": w.z} for w in rows
-            ]  # fmt: skip
-            check_lines(plan, rig, dive, items, MM)
+            check_lines(plan, rig, dive, rows, 1.0, MM)
             assert [w.seq for w in rows] == list(range(len(rows)))
             assert [w.current for w in rows] == [1] + [0] * (len(rows) - 1)
 
 
-@settings(
-    max_examples=15,
-    deadline=None,
-    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
-)
+@WIDE
 @given(plan=plans(), rig=rigs())
 def test_plans_in_mavsdk(import_plan: Importer, plan: Plan, rig: Rig) -> None:
     with tempfile.TemporaryDirectory() as folder:
         written(plan, rig, ["qgc"], Path(folder))
         for dive in range(len(plan.dives)):
             data = import_plan(str(Path(folder) / f"mission_dive{dive + 1}.plan"))
-            items = [
-                {"command": m.command, "frame": m.frame, "param1": m.param1, "lat": m.x * 1e-7,
-                 "lon": m.y * 1e-7, "z": m.z} for m in data.mission_items
-            ]  # fmt: skip
             # MAVLink carries 1e-7 degrees, 11 mm: half of it in each of north and east.
-            check_lines(plan, rig, dive, items, 0.0058)
+            check_lines(plan, rig, dive, data.mission_items, 1e-7, 0.0058)
 
 
 def test_the_way_down_is_by_depth_and_stops_short_of_the_charted_floor(tmp_path: Path) -> None:
     written(small_plan(), RIG, ["wpl"], tmp_path)
-    ways = [
-        row
-        for row in read_wpl(tmp_path / "mission_dive1.waypoints")[1:]
-        if row.command == mavutil.mavlink.MAV_CMD_NAV_WAYPOINT
-    ]
+    rows = read_wpl(tmp_path / "mission_dive1.waypoints")[1:]
+    ways = [row for row in rows if row.command == dialect.MAV_CMD_NAV_WAYPOINT]
     # A floor at 15 m, twice 2 m above it, and the reference point 0.08 m above the glass.
     assert (ways[0].frame, ways[0].z) == (3, pytest.approx(-(15 - 4 - 0.08)))
     assert (ways[-1].frame, ways[-1].z) == (3, 0.0)
@@ -139,19 +124,18 @@ def test_a_turn_on_the_spot_has_its_heading_and_sense(tmp_path: Path) -> None:
     written(plan, RIG, ["wpl"], tmp_path)
     rows = read_wpl(tmp_path / "mission_dive1.waypoints")
     turns = [leg for leg in plan.dives[0].route.legs if leg.turn_rad]
-    yaws = [row for row in rows if row.command == mavutil.mavlink.MAV_CMD_CONDITION_YAW]
+    yaws = [row for row in rows if row.command == dialect.MAV_CMD_CONDITION_YAW]
     assert len(yaws) == len(turns) > 3
     for row, leg in zip(yaws, turns, strict=True):
-        assert math.remainder(math.radians(row.param1) - leg.end_heading_rad, math.tau) == (
-            pytest.approx(0.0, abs=1e-6)
-        )
+        off_rad = math.remainder(math.radians(row.param1) - leg.end_heading_rad, math.tau)
+        assert off_rad == pytest.approx(0.0, abs=1e-6)
         assert row.param3 == math.copysign(1, math.remainder(leg.turn_rad, math.tau))
         assert row.param4 == 0
     # ArduPilot does the first command after a way-point before the next way begins, and beginning
     # turns the vehicle along it: a heading must be the second.
     for before, row in itertools.pairwise(rows):
-        if row.command == mavutil.mavlink.MAV_CMD_CONDITION_YAW:
-            assert before.command != mavutil.mavlink.MAV_CMD_NAV_WAYPOINT
+        if row.command == dialect.MAV_CMD_CONDITION_YAW:
+            assert before.command != dialect.MAV_CMD_NAV_WAYPOINT
 
 
 def test_the_fence_holds_the_vehicle_and_keeps_it_out(
@@ -204,11 +188,8 @@ def test_a_plan_and_the_wpl_say_the_same(tmp_path: Path, import_plan: Importer) 
         rows = read_wpl(tmp_path / f"mission_dive{dive}.waypoints")
         # The first item is home in all; MAVSDK says it in integers.
         assert [item.command for item in simple] == [row.command for row in rows]
+        names = ("frame", "param1", "param2", "param3", "param4", "z")
         for item, row in list(zip(simple, rows, strict=True))[1:]:
-            assert item.frame == row.frame
-            params = [row.param1, row.param2, row.param3, row.param4, row.z]
-            read = [item.param1, item.param2, item.param3, item.param4, item.z]
-            assert read == pytest.approx(params, abs=2e-5)
-            assert (item.x, item.y) == (
-                pytest.approx(row.x * 1e7, abs=1.01), pytest.approx(row.y * 1e7, abs=1.01)
-            )  # fmt: skip
+            read, given = ([getattr(one, name) for name in names] for one in (item, row))
+            assert read == pytest.approx(given, abs=2e-5)
+            assert (item.x, item.y) == pytest.approx((row.x * 1e7, row.y * 1e7), abs=1.01)

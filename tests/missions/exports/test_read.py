@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from pymavlink import mavwp
 
 from alice_survey.core.errors import PlanError
@@ -16,19 +16,15 @@ from missions.exports.write import write_exports
 from missions.values.mission import Mission
 from missions.values.plan_file import Plan
 from tests.missions.exports.plans import RIG, golden_plan
-from tests.missions.exports.readers import local_ne, plans, read_cola2, turned
+from tests.missions.exports.readers import WIDE, local_ne, plans, read_cola2, turned
 
 MM = 1e-3
-FORMATS = {
-    "cola2": "mission_dive{}.xml",
-    "wpl": "mission_dive{}.waypoints",
-    "qgc": "mission_dive{}.plan",
-}
+ENDINGS = {"cola2": "xml", "wpl": "waypoints", "qgc": "plan"}
 
 
 def files_of(plan: Plan, folder: Path, dive: int = 1) -> dict[str, Path]:
-    write_exports(folder, plan, RIG, formats=list(FORMATS))
-    return {name: folder / file.format(dive) for name, file in FORMATS.items()}
+    write_exports(folder, plan, RIG, formats=list(ENDINGS))
+    return {name: folder / f"mission_dive{dive}.{ending}" for name, ending in ENDINGS.items()}
 
 
 def lines_of(mission: Mission, plan: Plan) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -39,7 +35,7 @@ def lines_of(mission: Mission, plan: Plan) -> list[tuple[np.ndarray, np.ndarray]
     return list(zip(on, off, strict=True))
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@WIDE
 @given(plan=plans())
 def test_every_format_switches_pictures_on_where_lines_begin(plan: Plan) -> None:
     """The switches, moved by the lever arm of the default rig, are the lines of the glass."""

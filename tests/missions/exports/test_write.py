@@ -68,10 +68,8 @@ def test_stations_and_waypoints_in_tables(tmp_path: Path) -> None:
     assert {row["speed_mps"] for row in points} == {"0.2"}
     ends = [row for row in points if row["action"] == "line, camera off"]
     assert [int(row["line"]) for row in ends] == list(range(6))
-    for row in points:
-        assert math.dist(ne(row), ne(row, "vehicle_")) == pytest.approx(
-            math.hypot(0.55, 0.05), abs=1e-3
-        )
+    arms_m = [math.dist(ne(row), ne(row, "vehicle_")) for row in points]
+    assert arms_m == pytest.approx([math.hypot(0.55, 0.05)] * len(points), abs=1e-3)
     assert points[-1]["depth_m"] == "0.000"
 
 
@@ -97,24 +95,15 @@ def test_the_report_takes_the_mount_from_the_settings_of_the_plan(tmp_path: Path
     assert "/rig/go" in named and "camera_trigger/disable" in named
 
 
-_TOY = '''
-"""Lines as a list of their lengths."""
+_TOY = """
+from missions.exports.format import ExportFile, ExportFormat
 
-from pathlib import Path
+def write_lengths(path, export, _dive):
+    path.write_text("".join(f"{line.length_m:.3f}\\n" for line in export.plan.lines))
 
-from missions.exports.format import Export, ExportFile, ExportFormat
-
-
-def write_lengths(path: Path, export: Export, _dive: int) -> None:
-    """Write a length a row."""
-    path.write_text("\\n".join(f"{line.length_m:.3f}" for line in export.plan.lines))
-
-
-FORMAT = ExportFormat(
-    read_by="people who like lengths",
-    files=(ExportFile(name="lengths.txt", about="lengths of lines", write=write_lengths),),
-)
-'''
+FILE = ExportFile(name="lengths.txt", about="lengths of lines", write=write_lengths)
+FORMAT = ExportFormat(read_by="people who like lengths", files=(FILE,))
+"""
 
 
 def test_a_format_is_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
