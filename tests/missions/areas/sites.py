@@ -9,8 +9,8 @@ from alice_survey.core.frames import Array, Datum
 from missions.areas.bathymetry import Bathymetry
 from missions.areas.survey import survey_area
 from missions.values.area import Area
+from tests.oracles_lines import DATUM
 
-DATUM = Datum(32.8236, 34.9553)
 UTM = "EPSG:32636"
 TO_UTM = Transformer.from_crs("EPSG:4326", UTM, always_xy=True)
 

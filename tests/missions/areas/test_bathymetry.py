@@ -16,8 +16,9 @@ from alice_survey.core.errors import PlanError
 from alice_survey.core.frames import Array
 from missions.areas import bathymetry as module
 from missions.areas.bathymetry import mean_depth_m, read_bathymetry
-from tests.missions.areas.sites import DATUM, TO_UTM, UTM, real_floor
+from tests.missions.areas.sites import TO_UTM, UTM, real_floor
 from tests.oracles_energy import bilinear
+from tests.oracles_lines import DATUM
 
 
 def _written(

@@ -28,9 +28,10 @@ SITE = Polygon(
 
 
 def in_degrees(geometry: BaseGeometry) -> Any:
-    return shapely.transform(
-        geometry, lambda xy: np.column_stack(TO_UTM.transform(*xy.T, direction="INVERSE"))
-    )
+    def degrees(xy: np.ndarray) -> np.ndarray:
+        return np.column_stack(TO_UTM.transform(xy[:, 0], xy[:, 1], direction="INVERSE"))
+
+    return shapely.transform(geometry, degrees)
 
 
 def write(

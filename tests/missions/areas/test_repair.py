@@ -30,8 +30,8 @@ def of_polygons(*polygons: tuple[object, ...]) -> Repaired:
     return repair(raw, FRAME, geographic=False)
 
 
-def box(north: float, east: float, height: float, width: float) -> tuple[tuple[float, float], ...]:
-    return tuple(shapely.box(north, east, north + height, east + width).exterior.coords)
+def box(north: float, east: float, height: float, width: float) -> np.ndarray:
+    return shapely.get_coordinates(shapely.box(north, east, north + height, east + width))
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,4 @@
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +7,6 @@ import pytest
 import rasterio
 import shapely
 from scipy.spatial.transform import RigidTransform
-from shapely.geometry.base import BaseGeometry
 
 from alice_survey.core.config import SurveyConfig
 from alice_survey.core.frames import Array
@@ -16,15 +14,12 @@ from alice_survey.kit.words import share
 from camera_calib.mount import mount_rotation
 from camera_calib.rig import write_rig
 from missions.coverage.certificate import Certificate, certificate
-from missions.coverage.holes import Hole
 from missions.coverage.stations import Stations, join, plan_pattern, stations_of_plan
 from missions.fly.check import check_report, rig_of
-from missions.fly.refly import dive_means, holes_plan
-from missions.plan.strength import survey_costs
 from missions.route.ways import Ways
 from missions.values.line import Line
 from missions.values.navigation import write_navigation
-from missions.values.plan_file import Plan, read_plan
+from missions.values.plan_file import read_plan
 from tests.missions.coverage.logs import log_of, write_triggers
 from tests.missions.exports.plans import RIG
 from tests.missions.follow.dives import workspace_of
@@ -34,49 +29,35 @@ from tests.oracles_route import inside
 CONFIG = SurveyConfig()
 
 
-def refly(plan: Plan, flown: Certificate, holes: Sequence[Hole]) -> Plan:
-    means = dive_means(CONFIG.plan, CONFIG.vehicle, survey_costs(CONFIG))
-    return holes_plan(plan, RIG, flown, holes, means)
+PLAN = plan_of(area_of(shapely.box(0, 0, 8, 6)), lawnmower(8.0, 6.0, 1.0, 0.46, over_m=1.0))
+WHOLE, MISSING = stations_of_plan(PLAN), 3
+FLOWN = WHOLE.some(WHOLE.line != MISSING)
+"""One line was not flown."""
 
 
-MISSING = 3
+def certified(stations: Stations) -> Certificate:
+    return certificate(PLAN.area, RIG, stations, plan_pattern(PLAN, RIG))
 
 
-def survey(shape: BaseGeometry) -> Plan:
-    """A plan over a shape within the box from 0 to 8 and 6 m, with a metre of lines beyond."""
-    area = area_of(shape)
-    return plan_of(area, lawnmower(8.0, 6.0, 1.0, 0.46, over_m=1.0))
-
-
-def without(plan: Plan, index: int) -> Stations:
-    stations = stations_of_plan(plan)
-    return stations.some(stations.line != index)
-
-
-def dived(folder: Path, plan: Plan, flown: Stations) -> Path:
-    """A workspace with a plan, and the log and triggers of a dive."""
-    time_s = 50.0 + plan.interval_s * np.arange(len(flown), dtype=float)
-    flown = replace(flown, time_s=time_s)
-    write_navigation(folder / "nav.csv", log_of(flown, plan, RIG), DATUM)
-    write_triggers(folder / "triggers.csv", time_s, flown.line)
-    return workspace_of(folder, plan)
+def checked_dive(workspace: Path, flown: Stations, **out: Path) -> tuple[str, dict]:
+    """The report of a workspace with a plan, and the log and triggers of a dive."""
+    time_s = 50.0 + PLAN.interval_s * np.arange(len(flown), dtype=float)
+    flown, at = replace(flown, time_s=time_s), workspace / "triggers.csv"
+    write_navigation(workspace / "nav.csv", log_of(flown, PLAN, RIG), DATUM)
+    write_triggers(at, time_s, flown.line)
+    workspace_of(workspace, PLAN)
+    return check_report(workspace, CONFIG, workspace / "nav.csv", triggers=at, **out)
 
 
 @pytest.fixture(scope="module")
-def checked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Plan, str, dict]:
-    """A dive on which one line was not flown."""
-    plan = survey(shapely.box(0, 0, 8, 6))
-    workspace = dived(tmp_path_factory.mktemp("dive"), plan, without(plan, MISSING))
-    text, data = check_report(
-        workspace, CONFIG, workspace / "nav.csv", triggers=workspace / "triggers.csv"
-    )
-    return workspace, plan, text, data
+def checked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, dict]:
+    workspace = tmp_path_factory.mktemp("dive")
+    return workspace, *checked_dive(workspace, FLOWN)
 
 
-def test_a_dive_is_compared_with_its_plan(checked: tuple[Path, Plan, str, dict]) -> None:
-    workspace, plan, text, data = checked
-    exact = certificate(plan.area, RIG, stations_of_plan(plan), plan_pattern(plan, RIG))
-    seen = certificate(plan.area, RIG, without(plan, MISSING), plan_pattern(plan, RIG))
+def test_a_dive_is_compared_with_its_plan(checked: tuple[Path, str, dict]) -> None:
+    workspace, text, data = checked
+    exact, seen = certified(WHOLE), certified(FLOWN)
 
     assert data["planned"]["share_at_overlap"] == exact.share_at_overlap == 1.0
     assert data["flown"]["share_at_overlap"] == pytest.approx(seen.share_at_overlap, abs=1e-4)
@@ -91,9 +72,9 @@ def test_a_dive_is_compared_with_its_plan(checked: tuple[Path, Plan, str, dict])
 
 
 def test_the_map_and_the_outlines_lie_where_the_hole_is(
-    checked: tuple[Path, Plan, str, dict],
+    checked: tuple[Path, str, dict],
 ) -> None:
-    workspace, plan, _, data = checked
+    workspace, _, data = checked
     with rasterio.open(workspace / "check" / "coverage.tif") as raster:
         assert raster.crs.to_epsg() == DATUM.utm_epsg
         bands = dict(zip(raster.descriptions, raster.read(), strict=True))
@@ -106,7 +87,7 @@ def test_the_map_and_the_outlines_lie_where_the_hole_is(
     assert within.sum() * pixel_m2 == pytest.approx(48.0, rel=0.02)
     assert (within & (pictures == 0)).sum() * pixel_m2 == pytest.approx(data["unseen_m2"], rel=0.03)
     middle = DATUM.ned_from_geodetic(np.array([[lat[0], lon[0], 0.0]]))[0, :2]
-    np.testing.assert_allclose(middle, [4.0, plan.lines[MISSING].start_ne_m[1]], atol=0.15)
+    np.testing.assert_allclose(middle, [4.0, PLAN.lines[MISSING].start_ne_m[1]], atol=0.15)
 
     holes = json.loads((workspace / "check" / "holes.geojson").read_text())
     ring = shapely.get_coordinates(shapely.geometry.shape(holes["features"][0]["geometry"]))
@@ -117,36 +98,32 @@ def test_the_map_and_the_outlines_lie_where_the_hole_is(
 
 
 def test_the_plan_for_the_holes_is_whole_and_closes_them(
-    checked: tuple[Path, Plan, str, dict],
+    checked: tuple[Path, str, dict],
 ) -> None:
-    workspace, plan, _, data = checked
+    workspace, _, data = checked
     again = read_plan(workspace / "check" / "refly" / "plan" / "plan.json")
 
     assert all(isinstance(line, Line) for line in again.lines)
-    assert again.stations < 0.5 * plan.stations
+    assert again.stations < 0.5 * PLAN.stations
     assert again.coverage >= 0.999
     assert again.coverage == data["refly"]["coverage"]
     assert again.dives[0].first_line == 0
     assert again.dives[-1].last_line == len(again.lines) - 1
-    assert again.duration_s > again.length_m / plan.speed_mps
+    assert again.duration_s > again.length_m / PLAN.speed_mps
     assert again.energy_wh > 0
-    ways = Ways(plan.area.allowed)
+    ways = Ways(PLAN.area.allowed)
     for dive in again.dives:
         places = dive.route.places(np.arange(0.0, dive.route.length_m, 0.02))
         assert all(inside(ways, places))
     # Both dives together leave nothing.
-    both = join(without(plan, MISSING), stations_of_plan(again))
-    seen = certificate(plan.area, RIG, both, plan_pattern(plan, RIG))
-    assert seen.share_at_overlap >= 0.9999
+    both = join(FLOWN, stations_of_plan(again))
+    assert certified(both).share_at_overlap >= 0.9999
     assert (workspace / "check" / "refly" / "plan" / "exports" / "about.txt").is_file()
 
 
 def test_a_complete_dive_leaves_no_plan(tmp_path: Path) -> None:
-    plan = survey(shapely.box(0, 0, 8, 6))
-    workspace, at = dived(tmp_path, plan, stations_of_plan(plan)), tmp_path / "triggers.csv"
     out = tmp_path / "out"
-
-    data = check_report(workspace, CONFIG, tmp_path / "nav.csv", triggers=at, out=out)[1]
+    data = checked_dive(tmp_path, WHOLE, out=out)[1]
 
     assert data["flown"]["share_at_overlap"] == 1.0
     assert "refly" not in data

@@ -23,7 +23,7 @@ def straight(
     start: tuple[float, float], end: tuple[float, float], line: int = -1, side_rad: float = 0.0
 ) -> Leg:
     course, length_m = math.atan2(end[1] - start[1], end[0] - start[0]), math.dist(start, end)
-    given = {"length_m": length_m, "line": line, "side_rad": side_rad}
+    given: dict[str, Any] = {"length_m": length_m, "line": line, "side_rad": side_rad}
     return Leg(start_ne_m=start, heading_rad=course, **given)
 
 
@@ -33,7 +33,7 @@ def spot(place: tuple[float, float], heading_rad: float, turn_rad: float) -> Leg
 
 def arc(place: tuple[float, float], heading_rad: float, radius_m: float, turn_rad: float) -> Leg:
     curvature = math.copysign(1 / radius_m, turn_rad)
-    bend = {"length_m": radius_m * abs(turn_rad), "curvature_per_m": curvature}
+    bend: dict[str, Any] = {"length_m": radius_m * abs(turn_rad), "curvature_per_m": curvature}
     return Leg(start_ne_m=place, heading_rad=heading_rad, **bend)
 
 

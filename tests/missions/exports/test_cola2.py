@@ -191,6 +191,7 @@ def test_lines_that_cola2_cannot_hold_are_said_beforehand(
 
 def test_a_current_holds_the_glass_off_its_line() -> None:
     follower = sea_options(current_mps=0.05, current_towards_deg=90.0).follower
+    assert follower is not None
     # Of the glass 0.55 m ahead of a vehicle that heads upstream.
     wanted = (follower.delta_m - 0.55) * steady_drift(0.05, 0.2)
     for heading_rad, expected in ((0.0, wanted), (math.pi, -wanted), (math.pi / 2, 0.0)):

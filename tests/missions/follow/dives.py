@@ -1,5 +1,6 @@
 """Logs of dives along a plan."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -23,45 +24,37 @@ def workspace_of(folder: Path, plan: Plan) -> Path:
     return folder
 
 
-def route_rows(
-    plan: Plan, interval_s: float, rng: np.random.Generator, sigma_m: float = 0.0
-) -> Array:
+def route_rows(plan: Plan, rng: np.random.Generator) -> Array:
     """Rows, (N, 8), of a vehicle that flies the plan's route, some 2 m above the sea floor."""
     route = plan.dives[0].route
-    time_s = np.arange(0.0, route.length_m / plan.speed_mps, interval_s)
-    places = route.places(time_s * plan.speed_mps)
-    ahead = route.places(time_s * plan.speed_mps + 0.05)
-    return _rows(plan, time_s, places, ahead, rng, sigma_m)
+    return _rows(plan, route.length_m, route.places, rng)
 
 
 def rows_along(places_ne: list[list[float]], plan: Plan, start_s: float) -> Array:
     """Rows of a vehicle that flies from place to place at the plan's speed."""
     places = np.array(places_ne)
     passed = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(places, axis=0).T))])
-    time_s = np.arange(0.0, passed[-1] / plan.speed_mps, 0.5)
 
     def at(along_m: Array) -> Array:
         return np.column_stack([np.interp(along_m, passed, axis) for axis in places.T])
 
-    along_m = time_s * plan.speed_mps
-    rows = _rows(plan, time_s, at(along_m), at(along_m + 0.05), np.random.default_rng(0), 0.0)
+    rows = _rows(plan, passed[-1], at, np.random.default_rng(0))
     rows[:, 0] += start_s - rows[0, 0]
     return rows
 
 
 def _rows(
-    plan: Plan, time_s: Array, places: Array, ahead: Array, rng: np.random.Generator,
-    sigma_m: float,
-) -> Array:  # fmt: skip
+    plan: Plan, length_m: float, at: Callable[[Array], Array], rng: np.random.Generator
+) -> Array:
+    time_s = np.arange(0.0, length_m / plan.speed_mps, 0.5)
+    places, ahead = (at(time_s * plan.speed_mps + on_m) for on_m in (0.0, 0.05))
     course = np.arctan2(*(ahead - places).T[::-1])
-    places = places + rng.normal(0, sigma_m, places.shape)
     depth = np.full(len(time_s), plan.seafloor_depth_m - plan.altitude_m)
     geodetic = DATUM.geodetic_from_ned(np.column_stack([places, depth]))
     tilt = rng.normal(0, 2.0, (2, len(time_s)))
-    return np.column_stack(
-        [100.0 + time_s, geodetic[:, :2], depth, *tilt, np.rad2deg(course) % 360.0,
-         rng.uniform(1.9, 2.1, len(time_s))]
-    )  # fmt: skip
+    altitude_m = rng.uniform(1.9, 2.1, len(time_s))
+    attitude = [*tilt, np.rad2deg(course) % 360.0]
+    return np.column_stack([100.0 + time_s, geodetic[:, :2], depth, *attitude, altitude_m])
 
 
 def text_of(rows: Array) -> bytes:

@@ -21,7 +21,7 @@ from tests.missions.follow.dives import route_rows, rows_along, text_of, workspa
 from tests.oracles_coverage import area_of, lawnmower, plan_of
 
 PLAN = plan_of(area_of(shapely.box(0, 0, 6, 4)), lawnmower(6.0, 4.0, 1.0, 0.46, over_m=0.5))
-ROWS = route_rows(PLAN, 0.5, np.random.default_rng(1))
+ROWS = route_rows(PLAN, np.random.default_rng(1))
 LINE_S = PLAN.lines[0].length_m / PLAN.speed_mps
 UNTIL_S = 100.0 + 3.5 * (LINE_S + 5.0)
 GAP = (ROWS[:, 0] > 100.0 + 2.4 * (LINE_S + 5.0)) & (ROWS[:, 0] < 100.0 + 2.7 * (LINE_S + 5.0))
