@@ -1,6 +1,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,7 +40,7 @@ def certified(stations: Stations) -> Certificate:
     return certificate(PLAN.area, RIG, stations, plan_pattern(PLAN, RIG))
 
 
-def checked_dive(workspace: Path, flown: Stations, **out: Path) -> tuple[str, dict]:
+def checked_dive(workspace: Path, flown: Stations, **out: Any) -> tuple[str, dict]:
     """The report of a workspace with a plan, and the log and triggers of a dive."""
     time_s = 50.0 + PLAN.interval_s * np.arange(len(flown), dtype=float)
     flown, at = replace(flown, time_s=time_s), workspace / "triggers.csv"

@@ -57,11 +57,9 @@ def test_a_vehicle_off_its_line_overlaps_less_on_one_side() -> None:
 
     shares, at = measured_side_overlap(REAL, off)
 
-    of_line = {int(line): shares[off.line[at] == line].mean() for line in np.unique(off.line[at])}
+    of_line = [shares[off.line[at] == line].mean() for line in range(3)]
     # To starboard: of lines 0 and 2, flown north, the one to the east; of 1 and 3 the one west.
-    assert of_line[0] == pytest.approx(1 - 1.1 / width_m, abs=2e-3)
-    assert of_line[1] == pytest.approx(1 - 1.1 / width_m, abs=2e-3)
-    assert of_line[2] == pytest.approx(1 - 1.0 / width_m, abs=2e-3)
+    assert of_line == pytest.approx(1 - np.array([1.1, 1.1, 1.0]) / width_m, abs=2e-3)
     assert shares.min() == pytest.approx(1 - 1.1 / width_m, abs=2e-3)
 
 

@@ -79,15 +79,13 @@ def test_neighbours_off_their_lines_still_overlap_as_requested(plan: dict[str, A
     ground_m = altitude_m - 0.2 if over_relief else altitude_m
     here = traced_footprint(rig.cameras["left"], ground_m, -track_error_m)
     there = traced_footprint(rig.cameras["left"], ground_m, spacing.spacing_m + track_error_m)
-    half_m, corner_m = sure_half_m(rig.cameras["left"], ground_m)
-    row = Polygon([(-99, corner_m - 2e-4), (99, corner_m - 2e-4), (99, corner_m), (-99, corner_m)])
-    shared = here.intersection(there).intersection(row).area / 2e-4
+    shared = overlap_of_row(here, there, sure_half_m(rig.cameras["left"], ground_m)[1] - 1e-4)
 
     reached = spacing.off_track_overlap
     if not over_relief:
         across_m = footprint_size_m(rig.cameras["left"], altitude_m)[0]
         reached = overlap(across_m, spacing.spacing_m + 2 * track_error_m)
-    assert shared / (2 * half_m) == pytest.approx(reached, abs=2e-3)
+    assert shared == pytest.approx(reached, abs=2e-3)
     assert reached >= wanted - 1e-9
     if spacing.bound_by.startswith("side_overlap"):
         assert reached == pytest.approx(wanted, abs=1e-9)

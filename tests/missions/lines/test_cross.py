@@ -3,8 +3,10 @@ import math
 
 import numpy as np
 import pytest
+import shapely
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from scipy.sparse.csgraph import connected_components
 from shapely.geometry import MultiPolygon, Polygon, box
 
 from missions.lines.cross import MIN_STEPS, stabs
@@ -22,14 +24,9 @@ def of_kind(lines: list[Line], kind: str) -> list[Line]:
 
 def next_to(a: Line, b: Line, spacing_m: float) -> bool:
     """Whether survey lines lie side by side, one spacing apart, for more than a point."""
-    c, s = math.cos(a.heading_rad), math.sin(a.heading_rad)
-    turned = np.array([[c, -s], [s, c]])
-    one, two = (np.array([x.start_ne_m, x.end_ne_m]) @ turned for x in (a, b))
-    if abs(abs(one[0, 1] - two[0, 1]) - spacing_m) > 1e-6:
-        return False
-    return bool(
-        min(one[:, 0].max(), two[:, 0].max()) > max(one[:, 0].min(), two[:, 0].min()) + 1e-6
-    )
+    one, two = as_string(a), as_string(b)
+    beside = one.buffer(1.01 * spacing_m, cap_style="flat")
+    return abs(one.distance(two) - spacing_m) < 1e-6 and two.intersection(beside).length > 1e-6
 
 
 @settings(deadline=None, max_examples=60)
@@ -65,14 +62,9 @@ def test_all_arms_of_an_area_are_tied_together(heading: float) -> None:
     survey = ARMS.difference(HOLES[0]).difference(HOLES[1])
     lines = lay(survey, heading, closing_line=False)
     grid, crossing = of_kind(lines, "survey"), of_kind(lines, "cross")
-    net, left = [as_string(crossing[0])], [as_string(x) for x in (*grid, *crossing[1:])]
-    while True:
-        tied = [x for x in left if any(x.distance(y) < 1e-6 for y in net)]
-        if not tied:
-            break
-        net += tied
-        left = [x for x in left if x not in tied]
-    assert not left
+    strings = np.array([as_string(line) for line in (*grid, *crossing)])
+    nets, _ = connected_components(shapely.distance(strings[:, None], strings) < 1e-6)
+    assert nets == 1
     assert len(crossing) <= 5
 
 
@@ -108,13 +100,8 @@ def test_the_fewest_places_meet_all_intervals(spans: list[tuple[int, int]]) -> N
     for place in (found[:, 0], found.mean(axis=1), found[:, 1]):
         met = (intervals[:, :1] <= place) & (place <= intervals[:, 1:])
         assert met.any(axis=1).all()
-    ends = sorted({float(x) for x in intervals[:, 1]})
-    minimum = next(
-        count
-        for count in range(1, len(ends) + 1)
-        if any(
-            all(any(a <= p <= b for p in places) for a, b in intervals)
-            for places in itertools.combinations(ends, count)
-        )
-    )
-    assert len(found) == minimum
+    ends = np.unique(intervals[:, 1])
+    fewer = itertools.combinations(ends, len(found) - 1)
+    for places in map(np.array, fewer):
+        met = (intervals[:, :1] <= places) & (places <= intervals[:, 1:])
+        assert not met.any(axis=1).all()

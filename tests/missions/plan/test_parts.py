@@ -110,11 +110,11 @@ def test_cross_lines_tie_all_dives(cross_lines: int, capsys: pytest.CaptureFixtu
     assert len(plan.dives) >= 4
     lines_of = [dive.last_line - dive.first_line + 1 for dive in plan.dives]
     owner = np.repeat(np.arange(len(plan.dives)), lines_of)
+    strings = np.array([as_string(line) for line in plan.lines])
+    crossing = np.array([line.kind == "cross" for line in plan.lines])
+    one, other = np.nonzero(crossing[:, None] & shapely.intersects(strings[:, None], strings))
     ties = np.zeros((len(plan.dives), len(plan.dives)))
-    for i, line in enumerate(plan.lines):
-        for j, other in enumerate(plan.lines):
-            if line.kind == "cross" and as_string(line).intersects(as_string(other)):
-                ties[owner[i], owner[j]] = 1
+    ties[owner[one], owner[other]] = 1
     together, _ = connected_components(ties, directed=False)
     assert together == (1 if cross_lines else len(plan.dives))
     assert ("tied" in capsys.readouterr().err) == (not cross_lines)
