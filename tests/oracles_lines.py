@@ -154,10 +154,9 @@ def best_tour_by_trial(
 
 
 def spot_by_hand(costs: Costs, turn_rad: float) -> float:
+    """A turn by NaN, to or from no heading, is none."""
     turn = abs(math.remainder(turn_rad, 2 * math.pi))
-    if turn < 1e-6:
-        return 0.0
-    return costs.stop_w * (turn / costs.turn_rate_rad_s + costs.settle_s)
+    return costs.stop_w * (turn / costs.turn_rate_rad_s + costs.settle_s) if turn >= 1e-6 else 0.0
 
 
 def flight_by_hand(
@@ -168,23 +167,17 @@ def flight_by_hand(
 ) -> float:
     """What flying lines in order costs, J: turns on the spot and straights, or sway steps."""
     total = 0.0
-    stops = [(home, home, None), *((x.start_ne_m, x.end_ne_m, x.heading_rad) for x in lines)]
-    stops.append((home, home, None))
+    base = home, home, math.nan
+    stops = [base, *((x.start_ne_m, x.end_ne_m, x.heading_rad) for x in lines), base]
     for (_, here, before), (there, _, after) in itertools.pairwise(stops):
         length, straight = way_m(here, there), math.dist(here, there)
         if straight < 1e-6:
-            total += spot_by_hand(costs, after - before) if before is not None and after else 0.0
+            total += spot_by_hand(costs, after - before)
             continue
         bearing = math.atan2(there[1] - here[1], there[0] - here[0])
         hop = length / costs.speed_mps * float(power_at(costs.way_w, bearing))
-        hop += 0.0 if before is None else spot_by_hand(costs, bearing - before)
-        hop += 0.0 if after is None else spot_by_hand(costs, after - bearing)
-        if (
-            before is not None
-            and after is not None
-            and straight <= 5.0
-            and length < straight + 1e-6
-        ):
+        hop += spot_by_hand(costs, bearing - before) + spot_by_hand(costs, after - bearing)
+        if math.isfinite(before + after) and straight <= 5.0 and length < straight + 1e-6:
             aside = straight / costs.sway_mps * float(power_at(costs.sway_w, bearing))
             aside += costs.stop_w * costs.settle_s + spot_by_hand(costs, after - before)
             hop = min(hop, aside)

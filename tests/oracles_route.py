@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -77,9 +78,7 @@ def route_cost(route: Route, costs: Costs) -> tuple[float, float]:
 def turn_counts(route: Route) -> tuple[int, int, int]:
     """How many times a route turns in arcs (in a row once), on the spot, and steps sideways."""
     kinds = [leg.kind for leg in route.legs]
-    arcs = sum(
-        kind == "arc" and before != "arc" for before, kind in zip(["", *kinds], kinds, strict=False)
-    )
+    arcs = sum(kind == "arc" for kind, _ in groupby(kinds))
     return arcs, kinds.count("spot"), kinds.count("sway")
 
 
@@ -93,24 +92,19 @@ def route_cost_by_steps(route: Route, costs: Costs, step_m: float) -> tuple[floa
     """Energy and time, leg after leg, arcs in short steps of one course each."""
     joules = seconds = 0.0
     for leg in route.legs:
-        if leg.turn_rad:
-            joules += costs.stop_w * (abs(leg.turn_rad) / costs.turn_rate_rad_s + costs.settle_s)
-            seconds += abs(leg.turn_rad) / costs.turn_rate_rad_s + costs.settle_s
-            continue
-        if leg.side_rad:
+        if leg.turn_rad or leg.side_rad:
+            turning_s = abs(leg.turn_rad) / costs.turn_rate_rad_s
             moving_s = leg.length_m / costs.sway_mps
+            joules += costs.stop_w * (turning_s + costs.settle_s)
             joules += moving_s * float(power_at(costs.sway_w, leg.heading_rad))
-            joules += costs.settle_s * costs.stop_w
-            seconds += leg.length_m / costs.sway_mps + costs.settle_s
+            seconds += turning_s + moving_s + costs.settle_s
             continue
         power_w = costs.line_w if leg.line >= 0 else costs.way_w
         steps = max(1, math.ceil(leg.length_m / step_m)) if leg.curvature_per_m else 1
-        for k in range(steps):
-            course = leg.heading_rad + leg.curvature_per_m * leg.length_m * (k + 0.5) / steps
-            extra_w = costs.arc_extra_w if leg.curvature_per_m and leg.line < 0 else 0.0
-            joules += (
-                leg.length_m / steps / costs.speed_mps * float(power_at(power_w, course) + extra_w)
-            )
+        along_m = leg.length_m * (np.arange(steps) + 0.5) / steps
+        step_w = power_at(power_w, leg.heading_rad + leg.curvature_per_m * along_m)
+        extra_w = costs.arc_extra_w if leg.curvature_per_m and leg.line < 0 else 0.0
+        joules += leg.length_m / costs.speed_mps * (float(step_w.mean()) + extra_w)
         seconds += leg.length_m / costs.speed_mps
     return joules, seconds
 

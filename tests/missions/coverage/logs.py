@@ -3,10 +3,9 @@
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from alice_survey.core.artefacts import write_csv
-from alice_survey.core.frames import Array, rotation_from_attitude
+from alice_survey.core.frames import rotation_from_attitude
 from camera_calib.rig import Rig
 from missions.coverage.stations import Stations
 from missions.values.navigation import BelievedNavigation
@@ -32,8 +31,9 @@ def log_of(flown: Stations, plan: Plan, rig: Rig) -> BelievedNavigation:
     )
 
 
-def write_triggers(path: Path, time_s: Array, line: NDArray[np.intp] | None = None) -> None:
-    """Write `triggers.csv`, with lines where they are known."""
-    header = ("station", "time_s") if line is None else ("station", "time_s", "line")
-    columns = [np.arange(len(time_s)), time_s] + ([] if line is None else [line])
-    write_csv(path, header, [list(row) for row in zip(*columns, strict=True)])
+def write_triggers(path: Path, flown: Stations, columns: int = 3) -> None:
+    """Write `triggers.csv`, of two columns where lines are not known."""
+    assert flown.time_s is not None
+    rows = zip(range(len(flown)), flown.time_s, flown.line, strict=True)
+    header = ("station", "time_s", "line")[:columns]
+    write_csv(path, header, [list(row[:columns]) for row in rows])

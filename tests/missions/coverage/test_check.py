@@ -45,7 +45,7 @@ def checked_dive(workspace: Path, flown: Stations, **out: Any) -> tuple[str, dic
     time_s = 50.0 + PLAN.interval_s * np.arange(len(flown), dtype=float)
     flown, at = replace(flown, time_s=time_s), workspace / "triggers.csv"
     write_navigation(workspace / "nav.csv", log_of(flown, PLAN, RIG), DATUM)
-    write_triggers(at, time_s, flown.line)
+    write_triggers(at, flown)
     workspace_of(workspace, PLAN)
     return check_report(workspace, CONFIG, workspace / "nav.csv", triggers=at, **out)
 

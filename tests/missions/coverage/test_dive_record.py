@@ -10,28 +10,28 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.artefacts import write_csv
 from alice_survey.core.errors import NavigationError
-from alice_survey.core.frames import Array, rotation_from_attitude
+from alice_survey.core.frames import rotation_from_attitude
 from alice_survey.core.trajectory import Trajectory, write_track
 from missions.coverage.dive_record import DiveRecord, assign_lines, read_dive_record
 from missions.coverage.stations import Stations, stations_of_plan
 from missions.values.navigation import write_navigation
 from tests.missions.coverage.logs import log_of, write_triggers
 from tests.missions.exports.plans import RIG
-from tests.oracles_coverage import DATUM, area_of, lawnmower, plan_of
+from tests.oracles_coverage import DATUM, area_of, lawnmower, plan_of, stations_at
 
 LINES = lawnmower(6.0, 3.0, 1.0, 0.46, over_m=0.5)
 PLAN = plan_of(area_of(shapely.box(0, 0, 6, 3)), LINES)
 
 
-def leaning_flight() -> tuple[Array, Stations]:
-    """Times 2.3 s apart, and the plan's stations flown with some roll, pitch and altitude."""
+def leaning_flight() -> Stations:
+    """The plan's stations flown with some roll, pitch and altitude, 2.3 s apart."""
     exact = stations_of_plan(PLAN)
     rng = np.random.default_rng(5)
     tilt = np.deg2rad(rng.normal(0, 3, (len(exact), 2)))
     attitude = np.column_stack([tilt, exact.attitude_rad[:, 2]])
     time_s = 100.0 + PLAN.interval_s * np.arange(len(exact), dtype=float)
     altitude_m = rng.uniform(1.8, 2.2, len(exact))
-    return time_s, replace(exact, attitude_rad=attitude, altitude_m=altitude_m, time_s=time_s)
+    return replace(exact, attitude_rad=attitude, altitude_m=altitude_m, time_s=time_s)
 
 
 @dataclass(frozen=True)
@@ -65,9 +65,9 @@ class LoggedFlight:
 
 @pytest.fixture
 def dive(tmp_path: Path) -> LoggedFlight:
-    time_s, flown = leaning_flight()
+    flown = leaning_flight()
     write_navigation(tmp_path / "nav.csv", log_of(flown, PLAN, RIG), DATUM)
-    write_triggers(tmp_path / "triggers.csv", time_s, flown.line)
+    write_triggers(tmp_path / "triggers.csv", flown)
     return LoggedFlight(tmp_path, flown)
 
 
@@ -92,8 +92,7 @@ def test_a_log_gives_back_where_its_pictures_were_taken(
 
 def test_lines_are_found_where_triggers_name_none(dive: LoggedFlight) -> None:
     flown = dive.flown
-    assert flown.time_s is not None
-    write_triggers(dive.folder / "bare.csv", flown.time_s)
+    write_triggers(dive.folder / "bare.csv", flown, columns=2)
     assert_alike(dive.record(triggers="bare.csv").stations, flown)
 
     # Without triggers the plan's interval counts from the start of the log.
@@ -176,11 +175,10 @@ def test_triggers_on_the_way_down_and_up_are_not_amiss(dive: LoggedFlight) -> No
 def test_logs_of_elsewhere_or_another_time_are_refused(dive: LoggedFlight) -> None:
     assert "11.1 km" in dive.refusal(dive.edited({"latitude_deg": "32.9236"}))
 
-    times = dive.flown.time_s
-    assert times is not None
-    write_triggers(dive.folder / "late.csv", times + 1e6)
-    assert f"{len(times)} triggers" in dive.refusal(triggers="late.csv")
-    write_triggers(dive.folder / "back.csv", times[::-1])
+    late, count = np.asarray(dive.flown.time_s) + 1e6, len(dive.flown)
+    write_triggers(dive.folder / "late.csv", replace(dive.flown, time_s=late))
+    assert f"{count} triggers" in dive.refusal(triggers="late.csv")
+    write_triggers(dive.folder / "back.csv", dive.flown.some(np.arange(count)[::-1]))
     assert "line 3" in dive.refusal(triggers="back.csv")
     (dive.folder / "none.csv").write_text("station,when\n0,1\n")
     assert "time_utc" in dive.refusal(triggers="none.csv")
@@ -189,17 +187,14 @@ def test_logs_of_elsewhere_or_another_time_are_refused(dive: LoggedFlight) -> No
 
 
 def test_a_simulated_flight_counts_by_its_true_track(tmp_path: Path) -> None:
-    time_s, flown = leaning_flight()
+    flown = leaning_flight()
     log = log_of(flown, PLAN, RIG)
     believed = replace(log, position_ned=log.position_ned + np.array([3.0, 0.0, 0.5]))
     write_navigation(tmp_path / "navigation.csv", believed, DATUM)
-    write_triggers(tmp_path / "triggers.csv", time_s, flown.line)
-    track = Trajectory(
-        time_s=time_s,
-        ned_from_body=RigidTransform.from_components(
-            log.position_ned, rotation_from_attitude(*log.attitude_rad.T)
-        ),
-    )
+    write_triggers(tmp_path / "triggers.csv", flown)
+    rotation = rotation_from_attitude(*log.attitude_rad.T)
+    poses = RigidTransform.from_components(log.position_ned, rotation)
+    track = Trajectory(time_s=log.time_s, ned_from_body=poses)
     write_track(tmp_path / "truth" / "track.csv", track)
 
     by_track, drifted = (
@@ -215,14 +210,10 @@ def test_straight_runs_off_the_plan_are_separate_lines() -> None:
     run = np.column_stack([np.full(5, 3.0), np.linspace(6.0, 8.0, 5)])
     turning = np.column_stack([np.linspace(20, 21, 4), np.full(4, 20.0)])
     headings = np.concatenate([np.full(5, math.pi / 2), [0.0, 1.5, 3.0, 4.5]])
-    others = Stations(
-        glass_ne=np.concatenate([exact.glass_ne, run, turning]),
-        altitude_m=np.full(len(exact) + 9, 2.0),
-        attitude_rad=np.concatenate(
-            [exact.attitude_rad, np.column_stack([np.zeros((9, 2)), headings])]
-        ),
-        line=np.full(len(exact) + 9, -1),
-    )
+    level = np.column_stack([np.zeros((9, 2)), headings])
+    attitude = np.concatenate([exact.attitude_rad, level])
+    places = np.concatenate([exact.glass_ne, run, turning])
+    others = stations_at(places, 2.0, attitude_rad=attitude, line=np.full(len(places), -1))
 
     lines = assign_lines(others, PLAN)
 

@@ -1,3 +1,4 @@
+import itertools
 from typing import Any
 
 import numpy as np
@@ -134,17 +135,12 @@ def test_motion_agrees_with_pixels_before_and_after(
     pixels = np.array([[0.0, 0.0], [3384.0, 2710.0], [0.0, 2710.0], [1692.0, 1355.0]])
     spots = camera.at_depth(pixels, camera.front_cam[2] + height)
     turn = np.deg2rad([roll, roll, yaw])
-    short = 1e-4
-    signs = [(a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]
-    moves = [
-        np.linalg.norm(
-            moved_pixel(rig, spot, np.array([speed, 0, 0]), turn * sign, short)
-            - moved_pixel(rig, spot, np.array([speed, 0, 0]), turn * sign, -short)
-        )
-        / (2 * short)
-        for spot in rig.body_from_cam("left").apply(spots)
-        for sign in signs
-    ]
+    short, velocity = 1e-4, np.array([speed, 0, 0])
+    moves = []
+    for spot in rig.body_from_cam("left").apply(spots):
+        for sign in itertools.product((-1, 1), repeat=3):
+            two = (moved_pixel(rig, spot, velocity, turn * sign, t) for t in (short, -short))
+            moves.append(np.linalg.norm(np.subtract(*two)) / (2 * short))
     assert max(moves) <= rates.worst * (1 + 1e-3)
     assert max(moves) >= rates.worst * 0.97
     assert rates.speed_worst <= rates.combined <= rates.worst * (1 + 1e-12)
