@@ -111,7 +111,7 @@ def test_the_highest_floor_is_found_by_looking_everywhere(rough_m: float, off_m:
     np.testing.assert_allclose(found, exact, atol=off_m)
 
 
-def test_clearance_holds_between_stations_over_a_roughfloor_of() -> None:
+def test_clearance_holds_between_stations_over_a_rough_floor() -> None:
     """Brute force: every 2 cm of the way, straight between stations, over the floor below it."""
     rng = np.random.default_rng(8)
     coarse = rng.uniform(8.0, 14.0, (12, 12))
