@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 from filelock import FileLock, Timeout
 
 from alice_survey.app import stages as survey_stages
-from alice_survey.app.stages import names, spec
-from alice_survey.core.artefacts import read_json, read_stage, refuse_links
+from alice_survey.app.stages import finished_stages, names, spec
+from alice_survey.core.artefacts import damage, read_json, read_stage, refuse_links
 from alice_survey.core.config import (
     Config,
     SurveyConfig,
@@ -25,6 +25,7 @@ from alice_survey.core.config import (
 )
 from alice_survey.core.errors import ConfigError, WorkspaceError, warn
 from alice_survey.core.executor import Executor, local_executor
+from alice_survey.core.run import progress
 from alice_survey.core.run.progress import part
 from alice_survey.core.settings_form import settings_template
 from alice_survey.core.stages import is_imported
@@ -39,6 +40,8 @@ def run(
     survey: Path | None,
     executor: Executor | None = None,
     changes: Mapping[str, Mapping[str, Any]] | None = None,
+    *,
+    edited_mission: bool = False,
 ) -> tuple[str, dict[str, Any]]:
     """Run stages one after the other; those that are up to date are skipped.
 
@@ -48,6 +51,7 @@ def run(
         survey: settings file; None looks for survey.toml in the workspace, then here.
         executor: where tasks run; None for all cores of this machine.
         changes: settings by section for this run alone; those that are None stay as they are.
+        edited_mission: fly a mission that was edited since it was exported.
 
     Returns:
         Results of each stage, as text and as JSON values.
@@ -90,6 +94,8 @@ def run(
                 warn(f"the plan is {states[0]}; 'alice-survey plan -w {workspace}' renews it")
         for number, stage in enumerate(map(spec, stages), 1):
             with part(stage.folder, number, len(stages)):
+                if stage.name == "fly" and not edited_mission:
+                    _check_mission(workspace, config)
                 for needed in stage.needs:
                     spec(needed).need(workspace)
                 task_mib = task_memory_mib(
@@ -100,6 +106,15 @@ def run(
             found[stage.name] = {"done": done, **data}
             lines.append(f"{stage.name}: {text}" if done else f"{stage.name}: (up to date) {text}")
     return "\n".join(lines), found
+
+
+def _check_mission(workspace: Path, config: SurveyConfig) -> None:
+    """Check that a mission which is to be flown now is as it was exported."""
+    mission = config.vehicle.mission_file
+    if mission is not None and spec("fly").state(workspace, config, {}) != "up to date":
+        from missions.exports.write import check_exported
+
+        check_exported(mission)
 
 
 def plan_report(
@@ -233,8 +248,18 @@ def run_demo(workspace: Path, executor: Executor | None) -> tuple[str, dict[str,
     return f"{text}\n\nAll of it: {workspace / 'report' / 'report.html'}", found
 
 
-def stage_states(workspace: Path, config: Config) -> dict[str, str]:
-    """State of each stage that the survey of a workspace has, as `StageSpec.state` gives it."""
+def stage_states(workspace: Path, config: Config, *, verify: bool = False) -> dict[str, str]:
+    """State of each stage that the survey of a workspace has, as `StageSpec.state` gives it.
+
+    Args:
+        workspace: folder of the survey.
+        config: its settings.
+        verify: read every file that the stages wrote.
+    """
+    if verify:
+        for folder, record in finished_stages(workspace).items():
+            with progress.step(f"read {folder}"):
+                damage(workspace / folder, record, entirely=True)
     imported = is_imported(workspace)
     states: dict[str, str] = {}
     for stage in survey_stages.STAGES:
@@ -243,13 +268,15 @@ def stage_states(workspace: Path, config: Config) -> dict[str, str]:
     return states
 
 
-def workspace_status(workspace: Path, survey: Path | None) -> tuple[str, dict[str, Any]]:
+def workspace_status(
+    workspace: Path, survey: Path | None, *, verify: bool = False
+) -> tuple[str, dict[str, Any]]:
     """State of a workspace, stage by stage, and the next command."""
     if not workspace.is_dir():
         raise WorkspaceError(f"{workspace}: no such folder; 'alice-survey init' makes one")
     imported = is_imported(workspace)
     config = settings(workspace, survey, needed=not imported)
-    states = stage_states(workspace, config)
+    states = stage_states(workspace, config, verify=verify)
     rows = []
     for stage in map(spec, states):
         record = read_stage(workspace / stage.folder)
@@ -262,7 +289,7 @@ def workspace_status(workspace: Path, survey: Path | None) -> tuple[str, dict[st
 
 
 def status_report(
-    workspace: Path, survey: Path | None, workers: int | None = None
+    workspace: Path, survey: Path | None, workers: int | None = None, *, verify: bool = False
 ) -> tuple[str, dict[str, Any]]:
     """State of a workspace, and what the stages that are left will take.
 
@@ -270,10 +297,11 @@ def status_report(
         workspace: folder of the survey.
         survey: its settings; None looks for survey.toml in the workspace, then here.
         workers: of a cluster that does them; None for all cores of this machine.
+        verify: read every file that the stages wrote.
     """
     from alice_survey.app.computing import PREDICTED
 
-    text, found = workspace_status(workspace, survey)
+    text, found = workspace_status(workspace, survey, verify=verify)
     states = found["stages"]
     left = [name for name in PREDICTED if states.get(name, "up to date") != "up to date"]
     if not left:

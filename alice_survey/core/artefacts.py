@@ -1,12 +1,14 @@
 """Stages of a workspace: folders that appear whole or not at all, skipped while nothing changed.
 
-A stage folder is written as `NAME.partial` and renamed when complete. Its `stage.json` carries the
-stage's version, its settings and a digest of every input file, and a later run skips the stage
-while all of these are unchanged; also the resources used and the versions of the packages.
+A stage folder is written as `NAME.partial`, synced to the disk, and renamed when complete. Its
+`stage.json` carries the stage's version, its settings and a digest of every input and output file,
+and a later run skips the stage while all of these are unchanged; also the resources used and the
+versions of the packages.
 """
 
 import contextlib
 import csv
+import errno
 import functools
 import hashlib
 import itertools
@@ -24,13 +26,15 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic_core import to_jsonable_python
 
 from alice_survey.core.contents import as_line, first_fault
-from alice_survey.core.errors import AliceError, NavigationError, WorkspaceError, why
+from alice_survey.core.errors import AliceError, NavigationError, WorkspaceError, warn, why
 from alice_survey.core.run import progress
 from alice_survey.core.run.resources import processor, versions, watch_meter
 
 T = TypeVar("T")
 
 STAGE_FILE = "stage.json"
+EXPORTS = "exports"
+"""Folder, within a stage's, of what it writes for vehicles and other programs."""
 _TEMPORARY = re.compile(r"\..+\.tmp[0-9a-f]+(\..*)?")
 """Names that `atomic_path` gives, and those that libraries derive from them."""
 
@@ -48,6 +52,8 @@ class Stage:
     """Files and folders that the result depends on; `stage.json` files inside do not count."""
     resumes: bool = False
     """Work can resume from what an interrupted run of the same digest left."""
+    command: str = ""
+    """The command that makes it."""
 
 
 class JsonRecord(BaseModel):
@@ -97,6 +103,10 @@ class JsonRecord(BaseModel):
         write_json(path, self.to_json())
 
 
+FileEntry = tuple[int, int, str]
+"""Size, modification time (ns) and digest of a file."""
+
+
 class StageRecord(JsonRecord):
     """`stage.json`: inputs of a finished stage, and the resources used."""
 
@@ -105,8 +115,14 @@ class StageRecord(JsonRecord):
     version: int = 0
     digest: str = ""
     settings: dict[str, Any] = Field(default_factory=dict)
-    inputs: dict[str, tuple[int, int, str]] = Field(default_factory=dict)
-    """Size, modification time (ns) and digest of each file, by its path from the workspace."""
+    command: str = ""
+    """The command that made it; empty where an older version of the program did."""
+    inputs: dict[str, FileEntry] = Field(default_factory=dict)
+    """By their paths from the workspace."""
+    outputs: dict[str, FileEntry] = Field(default_factory=dict)
+    """All files but this one, by their paths from its folder; empty of an older version."""
+    checksum: str = ""
+    """Of all other values; none of an older version."""
     took_s: float = 0.0
     cpu_s: float | None = None
     peak_mib: float | None = None
@@ -142,13 +158,15 @@ def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], object]) -> 
             replaced.rename(final)
     previous = read_stage(final)
     with progress.step(f"check what {stage.name} depends on"):
-        inputs = digest_inputs(stage.inputs, workspace, previous)
+        if previous is not None and why_stale(workspace, stage) is None:
+            if partial.exists():
+                shutil.rmtree(partial)
+            progress.current().report("stage_skipped", stage=stage.name)
+            return False
+        inputs = _intact_inputs(stage.inputs, workspace)
+    if previous is not None and (damaged := damage(final, previous)) is not None:
+        warn(f"{final} is made again: {damaged}")
     digest = _digest_stage(stage, inputs)
-    if previous is not None and previous.digest == digest:
-        if partial.exists():
-            shutil.rmtree(partial)
-        progress.current().report("stage_skipped", stage=stage.name)
-        return False
 
     marker = partial / ".digest"
     resumed = stage.resumes and _text(marker) == digest
@@ -164,22 +182,25 @@ def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], object]) -> 
             work(partial)
             spent = meter.look()
         _check_unchanged(inputs, workspace, stage.name)
+        marker.unlink()
         record = {
             "stage": stage.name,
             "version": stage.version,
             "digest": digest,
             "settings": stage.settings,
+            "command": stage.command,
             "inputs": inputs,
+            "outputs": _synced_outputs(partial),
             **spent,
             **how,
             "processor": processor(),
             "versions": versions(),
         }
-        write_json(partial / STAGE_FILE, record)
-        marker.unlink()
+        write_json(partial / STAGE_FILE, record | {"checksum": _checksum(record)})
         if final.exists():
             final.rename(replaced)
         partial.rename(final)
+        sync(workspace)
         if replaced.exists():
             shutil.rmtree(replaced)
         finish(**spent, **how)
@@ -220,6 +241,9 @@ def why_stale(workspace: Path, stage: Stage) -> str | None:
     record = read_stage(workspace / stage.name)
     if record is None:
         return "missing"
+    damaged = damage(workspace / stage.name, record)
+    if damaged is not None:
+        return f"damaged: {damaged}"
     inputs = digest_inputs(stage.inputs, workspace, record)
     if record.digest == _digest_stage(stage, inputs):
         return None
@@ -250,25 +274,138 @@ def need_stage(workspace: Path, name: str, command: str) -> Path:
     """The folder of a finished stage.
 
     Raises:
-        WorkspaceError: it is not there; the message names the command that makes it.
+        WorkspaceError: it is not there, or a file of it is not as it was written; the message names
+            the command that makes it.
     """
     folder = workspace / name
-    if read_stage(folder) is None:
+    record = read_stage(folder)
+    if record is None:
         raise WorkspaceError(f"{folder} is not there yet; run 'alice-survey {command}' first")
+    refuse_damage(folder, record)
     return folder
 
 
+def refuse_damage(folder: Path, record: StageRecord | None) -> None:
+    """Refuse a stage whose files, missions for vehicles apart, are not as it wrote them.
+
+    Raises:
+        WorkspaceError: the message names the file, and the command that makes it.
+    """
+    damaged = None if record is None else damage(folder, record, exports=False)
+    if record is not None and damaged is not None:
+        raise _damaged(folder, record, damaged)
+
+
 def read_stage(folder: Path) -> StageRecord | None:
-    """Contents of a stage's `stage.json`, or None where there is no complete stage."""
+    """Contents of a stage's `stage.json`, or None where there is no complete stage.
+
+    That of a damaged file is None too.
+    """
     try:
-        return StageRecord.model_validate_json((folder / STAGE_FILE).read_bytes())
-    except (OSError, ValidationError):
+        content = (folder / STAGE_FILE).read_bytes()
+        record = StageRecord.model_validate_json(content)
+        if not record.checksum and not record.outputs:
+            return record  # of an older version of the program
+        values = json.loads(content)
+        return record if values.pop("checksum", "") == _checksum(values) else None
+    except (OSError, ValueError):
         return None
+
+
+def damage(
+    folder: Path, record: StageRecord, *, exports: bool = True, entirely: bool = False
+) -> str | None:
+    """What is not as a stage wrote it, in a few words; None where all is.
+
+    Args:
+        folder: of the stage.
+        record: its `stage.json`.
+        exports: look at missions for vehicles too, which other stages do not read.
+        entirely: read all files; else only those of another size or modification time.
+    """
+    for name, entry in record.outputs.items():
+        if not exports and name.startswith(f"{EXPORTS}/"):
+            continue
+        path = folder / name
+        try:
+            if not _is_entry(path, _entry(path, None if entirely else entry), entry):
+                return f"{name} has changed since it was written"
+        except FileNotFoundError:
+            return f"{name} is missing"
+        except OSError as error:
+            return f"{name} cannot be read ({why(error)})"
+    return None
+
+
+def renew_outputs(folder: Path, written: Iterable[Path]) -> None:
+    """Record files that a command has written again into a finished stage's folder."""
+    record = read_stage(folder)
+    if record is None or not record.outputs:
+        return
+    outputs = {name: entry for name, entry in record.outputs.items() if (folder / name).exists()}
+    outputs |= {path.relative_to(folder).as_posix(): _entry(path, None) for path in written}
+    values = record.to_json() | {"outputs": outputs}
+    values.pop("checksum")
+    write_json(folder / STAGE_FILE, values | {"checksum": _checksum(values)})
+
+
+def _is_entry(path: Path, now: FileEntry, written: FileEntry) -> bool:
+    """Whether a file holds what was written.
+
+    Where neither size nor time tells that it does not, its time does from now on, so that all see
+    it who do not read it.
+    """
+    if now[2] != written[2] and now[:2] == written[:2]:
+        os.utime(path)
+    return now[2] == written[2]
+
+
+def _damaged(folder: Path, record: StageRecord, damaged: str) -> WorkspaceError:
+    again = f"'alice-survey {record.command}'" if record.command else "the command that wrote it"
+    return WorkspaceError(f"{folder}: {damaged}; run {again} again, which makes it anew")
+
+
+def _checksum(record: Mapping[str, Any]) -> str:
+    text = json.dumps(record, sort_keys=True)
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def _synced_outputs(folder: Path) -> dict[str, FileEntry]:
+    """Sync all that a folder holds, and take the digests of its files."""
+    outputs = {}
+    for path in sorted(folder.rglob("*")):
+        sync(path)
+        if path.is_file():
+            outputs[path.relative_to(folder).as_posix()] = _entry(path, None)
+    return outputs
+
+
+def _intact_inputs(inputs: Sequence[Path], workspace: Path) -> dict[str, FileEntry]:
+    """Read and digest every file of the inputs; those of stages as their stages wrote them.
+
+    Raises:
+        WorkspaceError: one does not exist, or is damaged.
+    """
+    given, makers = set(inputs), {}
+    for folder in {workspace / Path(os.path.relpath(path, workspace)).parts[0] for path in inputs}:
+        if (record := read_stage(folder)) is not None:
+            makers[folder] = record
+            for name in record.outputs:
+                path = folder / name
+                if not path.exists() and not given.isdisjoint((path, *path.parents)):
+                    raise _damaged(folder, record, f"{name} is missing")
+    found = digest_inputs(inputs, workspace, None)
+    for folder, record in makers.items():
+        for name, entry in record.outputs.items():
+            now = found.get(os.path.relpath(folder / name, workspace), entry)
+            if not name.startswith(f"{EXPORTS}/") and not _is_entry(folder / name, now, entry):
+                raise _damaged(folder, record, f"{name} has changed since it was written")
+    return found
 
 
 def digest_inputs(
     inputs: Sequence[Path], workspace: Path, previous: StageRecord | None
-) -> dict[str, tuple[int, int, str]]:
+) -> dict[str, FileEntry]:
     """Digest every file of the inputs, as `{path: (size, mtime_ns, digest)}`.
 
     A file whose size and modification time match `previous` is not read again.
@@ -284,9 +421,7 @@ def digest_inputs(
     return digests
 
 
-def _check_unchanged(
-    inputs: Mapping[str, tuple[int, int, str]], workspace: Path, stage: str
-) -> None:
+def _check_unchanged(inputs: Mapping[str, FileEntry], workspace: Path, stage: str) -> None:
     """Check that files are unchanged since their digests were taken.
 
     Raises:
@@ -305,7 +440,7 @@ def _check_unchanged(
             )
 
 
-def _entry(path: Path, old: tuple[int, int, str] | None) -> tuple[int, int, str]:
+def _entry(path: Path, old: FileEntry | None) -> FileEntry:
     """Size, modification time and digest of a file, which is read only if these differ from old."""
     stat = path.stat()
     if old is not None and old[:2] == (stat.st_size, stat.st_mtime_ns):
@@ -328,7 +463,7 @@ def _files(inputs: Sequence[Path]) -> Iterator[Path]:
             raise WorkspaceError(f"{path}: no such file or folder")
 
 
-def _digest_stage(stage: Stage, inputs: Mapping[str, tuple[int, int, str]]) -> str:
+def _digest_stage(stage: Stage, inputs: Mapping[str, FileEntry]) -> str:
     content = {name: entry[2] for name, entry in inputs.items()}
     text = json.dumps([stage.name, stage.version, stage.settings, content], sort_keys=True)
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
@@ -350,7 +485,7 @@ def _drop_cut_files(folder: Path) -> None:
 
 @contextlib.contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """A path to write to, next to `path`, that replaces it when all went well.
+    """A path to write to, next to `path`, that replaces it when all went well and is on the disk.
 
     Threads, processes and machines that write the same file each get a path of their own: the last
     one that finishes is kept, whole.
@@ -364,9 +499,23 @@ def atomic_path(path: Path) -> Iterator[Path]:
     temporary = path.with_name(f".{path.stem}.tmp{os.urandom(6).hex()}{path.suffix}")
     try:
         yield temporary
+        sync(temporary)
         temporary.replace(path)
+        sync(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def sync(path: Path) -> None:
+    """Wait until the disk holds a file's content, or the names in a folder."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # of file systems that cannot sync folders
+            raise
+    finally:
+        os.close(handle)
 
 
 _adapter: Callable[[Any], TypeAdapter[Any]] = functools.cache(TypeAdapter)

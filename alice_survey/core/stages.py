@@ -15,7 +15,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from alice_survey.core import artefacts, records
-from alice_survey.core.artefacts import Stage, read_stage, run_stage, why_stale
+from alice_survey.core.artefacts import Stage, damage, read_stage, run_stage, why_stale
 from alice_survey.core.config import UNRECORDED, VEHICLE_FILES, Config, constants_of
 from alice_survey.core.errors import AliceError
 from alice_survey.core.executor import Executor
@@ -74,6 +74,7 @@ class StageSpec:
             settings=settings_of(self.settings, config),
             inputs=[*self.inputs(workspace), *files_of(self.setting_files, config)],
             resumes=self.resumes,
+            command=self.command,
         )
 
     def make(self, workspace: Path, config: Config, executor: Executor) -> bool:
@@ -118,7 +119,9 @@ class StageSpec:
             partial = workspace / f"{self.folder}.partial"
             return "interrupted" if partial.exists() else "missing"
         if "refly_of" in record.settings or (self.name == "image" and is_imported(workspace)):
-            return "up to date"  # it was made by another command, from other settings
+            # It was made by another command, from other settings.
+            damaged = damage(workspace / self.folder, record)
+            return "up to date" if damaged is None else f"stale (damaged: {damaged})"
         for name in (*self.needs, *self.uses):
             state = before.get(name, "up to date")
             if state != "up to date" and not (name in self.uses and state == "missing"):

@@ -1,12 +1,13 @@
 """All exports of a plan: missions that vehicles load, and files that people look at."""
 
+import hashlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from alice_survey.core.artefacts import atomic_path, read_stage
+from alice_survey.core.artefacts import EXPORTS, atomic_path, read_stage, renew_outputs
 from alice_survey.core.config import SurveyConfig, parse_config
 from alice_survey.core.errors import PlanError, warn
 from alice_survey.core.run import progress
@@ -20,6 +21,8 @@ from missions.values.plan_file import Plan, read_plan
 
 MAX_ALTITUDE_DIFFERENCE_M = 0.3
 """Between a plan's altitude and the one altitude of a mission, where the plan follows terrain."""
+SUMS = "SHA256SUMS"
+"""File with the digests of the others, as `sha256sum --check` reads it."""
 
 
 @progress.step("write missions for vehicles")
@@ -65,13 +68,51 @@ def write_exports(
             files |= each.write(folder, export)
     about = folder / "about.txt"
     files[about] = "what the files hold, and how"
+    files[folder / SUMS] = "digests of the others, for sha256sum --check"
     notes = _cola2(export, chosen=formats is not None) if "cola2" in names else []
     notes += _ardusub(export) if {"wpl", "qgc"} & set(names) else []
     if refusal:
         warn(f"missions are left out: {refusal}")
         notes = [f"Missions are left out: {refusal}."]
     _write_about(about, export, files, notes)
+    _write_sums(folder, files)
     return files
+
+
+def _write_sums(folder: Path, files: Iterable[Path]) -> None:
+    """Write the digests of files, and keep those of others that are still there."""
+    sums = {name: old for name, old in _sums(folder).items() if (folder / name).is_file()}
+    for file in files:
+        if file.name != SUMS:
+            sums[file.name] = hashlib.sha256(file.read_bytes()).hexdigest()
+    with atomic_path(folder / SUMS) as path:
+        path.write_text("".join(f"{sums[name]}  {name}\n" for name in sorted(sums)))
+
+
+def _sums(folder: Path) -> dict[str, str]:
+    try:
+        lines = (folder / SUMS).read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return {}
+    pairs = (line.partition("  ") for line in lines)
+    return {name: digest for digest, _, name in pairs if name}
+
+
+def check_exported(mission: Path) -> None:
+    """Check that a mission is as it was exported, where digests lie beside it.
+
+    Raises:
+        PlanError: it was edited or damaged.
+    """
+    digest = _sums(mission.parent).get(mission.name)
+    if digest and mission.is_file():
+        with mission.open("rb") as file:
+            same = hashlib.file_digest(file, "sha256").hexdigest() == digest
+        if not same:
+            raise PlanError(
+                f"{mission}: is not as it was exported: it was edited or is damaged. Export it "
+                "again with 'alice-survey plan export', or fly it as it is with --edited"
+            )
 
 
 def altitude_refusal(plan: Plan) -> str:
@@ -141,8 +182,10 @@ def export_report(
         options_of(survey.camera, survey.plan, survey.vehicle, survey.sea),
         **{name: service for name, service in given.items() if service is not None},
     )
-    folder = path.parent / "exports" if out is None else out
+    folder = path.parent / EXPORTS if out is None else out
     files = write_exports(folder, plan, rig, formats=formats, options=options)
+    if folder.parent == path.parent:
+        renew_outputs(path.parent, files)
     tolerance_m = line_tolerance_m(plan, rig)
     text = "\n".join(
         [

@@ -12,7 +12,7 @@ import numpy as np
 import shapely
 from shapely.geometry import MultiPolygon
 
-from alice_survey.core.artefacts import Stage, run_stage, write_json
+from alice_survey.core.artefacts import EXPORTS, Stage, run_stage, write_json
 from alice_survey.core.config import CameraConfig, PlanConfig, VehicleConfig, WaterConfig
 from alice_survey.core.errors import PlanError
 from alice_survey.kit.words import count
@@ -182,7 +182,7 @@ def write_refly(
 
     def work(part: Path) -> None:
         write_json(part / "plan.json", values)
-        write_exports(part / "exports", plan, rig, options=options_of(camera, settings))
+        write_exports(part / EXPORTS, plan, rig, options=options_of(camera, settings))
 
     run_stage(folder, stage, work)
     words = (

@@ -28,7 +28,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from alice_survey.core.artefacts import write_csv
+from alice_survey.core.artefacts import read_stage, refuse_damage, write_csv
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array, attitude_from_rotation, rotation_from_attitude
 from alice_survey.sim.vehicle import estimate_vector as vector
@@ -342,14 +342,17 @@ class PilotLoop:
             self.failures += self.pilot.judge(self._flown_s, commanded, turned)
 
 
-def plan_to_fly(workspace: Path, dive: int | None) -> Plan:
-    """The plan of a workspace, or one dive of it, from 1 on.
+def plan_to_fly(workspace: Path, dive: int | None, *, edited: bool = False) -> Plan:
+    """The plan of a workspace, or one dive of it, from 1 on; an edited one only if told so.
 
     Raises:
         PlanError: the plan lacks that dive.
-        WorkspaceError: there is no plan.
+        WorkspaceError: it is not as it was planned.
     """
-    return one_dive(read_plan(workspace / "plan" / "plan.json"), dive)
+    folder = workspace / "plan"
+    if not edited:
+        refuse_damage(folder, read_stage(folder))
+    return one_dive(read_plan(folder / "plan.json"), dive)
 
 
 def need_thrusters_alone(vehicle: Vehicle) -> None:
@@ -469,6 +472,7 @@ def pilot_report(
     *,
     altimeter_body_m: tuple[float, float, float] | None,
     record: Path | None,
+    edited: bool = False,
 ) -> tuple[str, dict[str, Any]]:
     """Fly the plan of a workspace with a vehicle outside this program.
 
@@ -479,6 +483,7 @@ def pilot_report(
         fly: flies the mission to its end: a transport.
         altimeter_body_m: place of the altimeter; that of the DVL if not given.
         record: CSV of what was flown by and commanded, if wanted.
+        edited: take the plan as it is, though it is not as it was planned.
 
     Returns:
         How it went, as text and as JSON values.
@@ -487,7 +492,7 @@ def pilot_report(
         VehicleError: the transport is not installed, or the vehicle cannot fly the plan.
         WorkspaceError: there is no plan.
     """
-    plan = plan_to_fly(workspace, settings.vehicle.dive)
+    plan = plan_to_fly(workspace, settings.vehicle.dive, edited=edited)
     mission = mission_of(plan, settings, limits, altimeter_body_m)
     try:
         fly(mission)

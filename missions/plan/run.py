@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.core.artefacts import write_csv, write_json
+from alice_survey.core.artefacts import EXPORTS, write_csv, write_json
 from alice_survey.core.config import SeaConfig, SurveyConfig
 from alice_survey.core.errors import PlanError
 from alice_survey.core.executor import Executor
@@ -72,7 +72,7 @@ def write_planned(
     write_triggers(folder, plan, planned.costs, planned.imaging.shortest_interval_s)
     figure = plan_figure(plan, rig, planned.certificate, planned.bathymetry, sea)
     save_figure(figure, folder / "map.png")
-    write_exports(folder / "exports", plan, rig, options=options)
+    write_exports(folder / EXPORTS, plan, rig, options=options)
 
 
 def write_triggers(folder: Path, plan: Plan, costs: Costs, shortest_interval_s: float) -> None:

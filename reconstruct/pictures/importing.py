@@ -490,6 +490,7 @@ def import_images(
     stage = Stage(
         name="images",
         version=5,
+        command="import-images",
         settings={
             "folders": len(folders),
             "cameras": list(cameras),

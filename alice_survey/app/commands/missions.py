@@ -417,6 +417,7 @@ class PilotCommand(SurveyCommand):
     record: Path | None = option(
         None, "Write what was flown by and commanded as CSV.", metavar="FILE"
     )
+    edited: bool = option(False, "Fly the plan though it was edited since it was planned.")
     simulated: bool = option(False, "Be the vehicle instead, for any pilot over ROS 2.")
     takes: Literal["thrusters", "wrench"] = option(
         "thrusters", "Commands that the simulated vehicle follows."
@@ -443,7 +444,7 @@ class PilotCommand(SurveyCommand):
         limits = LinkLimits(on_loss=self.on_loss, grace_s=self.grace, odometry_s=self.odometry_age)
         return pilot_report(
             self.workspace, settings, limits, self._fly, altimeter_body_m=self.altimeter,
-            record=self.record,
+            record=self.record, edited=self.edited,
         )  # fmt: skip
 
     def _fly(self, mission: "LiveMission") -> None:

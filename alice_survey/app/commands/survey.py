@@ -130,6 +130,7 @@ class FlyCommand(SurveyCommand):
         None, "Fly this exported mission of the plan (COLA2, QGC WPL, QGroundControl).",
         metavar="FILE",
     )  # fmt: skip
+    edited: bool = option(False, "Fly the mission though it was edited since it was exported.")
 
     def run(self) -> Result:
         """Run the stage with these changes."""
@@ -144,7 +145,9 @@ class FlyCommand(SurveyCommand):
                 "dive": self.dive, "mission_file": self.mission,
             },
         }  # fmt: skip
-        return run(["fly"], self.workspace, self.survey, changes=changes)
+        return run(
+            ["fly"], self.workspace, self.survey, changes=changes, edited_mission=self.edited
+        )
 
 
 class ImageCommand(ClusterCommand):
@@ -332,14 +335,18 @@ class StatusCommand(SurveyCommand):
     """
 
     name = "status"
-    examples = ("status -w reef", "status -w reef --json", "status -w reef --workers 64")
+    examples = (
+        "status -w reef", "status -w reef --json", "status -w reef --verify",
+        "status -w reef --workers 64",
+    )  # fmt: skip
     workers: int | None = option(None, "Of a cluster that does what is left.", ge=1, le=100_000)
+    verify: bool = option(False, "Read every file, and compare it with what was written.")
 
     def run(self) -> Result:
         """Compare the stages with their inputs."""
         from alice_survey.app.pipeline import status_report
 
-        return status_report(self.workspace, self.survey, self.workers)
+        return status_report(self.workspace, self.survey, self.workers, verify=self.verify)
 
 
 class ReportPageCommand(SurveyCommand, ThreadsCommand):

@@ -89,7 +89,7 @@ def test_the_report_takes_the_mount_from_the_settings_of_the_plan(tmp_path: Path
     text, about = export_report(folder / "plan.json", ["wpl", "csv"])
     given, _ = export_report(folder, ["wpl", "csv"], tmp_path / "other")
 
-    assert len(about["files"]) == 6
+    assert len(about["files"]) == 7
     assert text.splitlines()[1:] == given.splitlines()[1:]
     stated = (folder / "exports" / "about.txt").read_text()
     assert "+0.700 m" in stated and "-0.100 m" in stated
