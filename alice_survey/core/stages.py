@@ -202,5 +202,8 @@ def files_of(requested: Sequence[str], config: Config) -> list[Path]:
 
 def is_imported(workspace: Path) -> bool:
     """Whether the pictures of a workspace are real ones."""
+    stage = read_stage(workspace / "images")
+    if stage is not None and stage.command:
+        return stage.command != "image"
     pictures = records.PicturesRecord.read_existing(workspace / "images" / "survey.json")
     return pictures is not None and pictures.source == "imported"

@@ -663,6 +663,7 @@ def join_dives(workspace: Path, dives: Sequence[Path]) -> str:
     stage = Stage(
         name="images",
         version=2,
+        command="join",
         settings={"joined": len(dives)},
         inputs=[*inputs, *([rig] if rig else [])],
     )
@@ -742,6 +743,7 @@ def _join_plans(workspace: Path, dives: Sequence[Path]) -> None:
     stage = Stage(
         name="plan",
         version=1,
+        command="join",
         settings={"refly_of": whole.name},
         inputs=[folder / "plan.json" for folder in folders],
     )

@@ -1,0 +1,115 @@
+"""Finished products that a disk, a person or another program has damaged since."""
+
+import os
+import random
+import shutil
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from alice_survey.app.pipeline import run, stage_states
+from alice_survey.app.stages import STAGES, spec
+from alice_survey.core.artefacts import read_stage, run_stage
+from alice_survey.core.config import load_config
+from alice_survey.core.errors import AliceError, WorkspaceError
+from alice_survey.core.executor import SERIAL
+from tests.test_loop import results
+
+pytestmark = pytest.mark.slow
+
+DAMAGES = 1000
+
+
+def flip(path: Path, rng: random.Random) -> None:
+    content = bytearray(path.read_bytes())
+    content[rng.randrange(len(content))] ^= 1 << rng.randrange(8)
+    path.write_bytes(content)
+
+
+def cut(path: Path, rng: random.Random) -> None:
+    os.truncate(path, rng.randrange(path.stat().st_size))
+
+
+def blank(path: Path, _: random.Random) -> None:
+    path.write_bytes(bytes(path.stat().st_size))
+
+
+def remove(path: Path, _: random.Random) -> None:
+    path.unlink()
+
+
+KINDS: tuple[Callable[[Path, random.Random], None], ...] = (flip, cut, blank, remove)
+
+
+@pytest.fixture
+def workspace(small_survey: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(small_survey, tmp_path / "survey"))
+
+
+def test_a_thousand_damages_are_noticed(workspace: Path) -> None:
+    """By the state of the stage that wrote the file; of the same size and time, if files are read.
+
+    A copy of the workspace, whose files have other times, is not damaged.
+    """
+    config, rng = load_config(workspace / "survey.toml"), random.Random(5)
+    files = [path for one in STAGES for path in sorted((workspace / one.folder).rglob("*"))
+             if path.is_file()]  # fmt: skip
+    os.utime(workspace / "dense" / "dem.tif")
+    assert {*stage_states(workspace, config).values()} == {"up to date"}
+    noticed: Counter[str] = Counter()
+    for number in range(DAMAGES):
+        path, kind = files[number % len(files)], rng.choice(KINDS)
+        before, status = path.read_bytes(), path.stat()
+        kind(path, rng)
+        if path.exists() and path.read_bytes() == before:
+            continue
+        is_same_time = kind is not remove and number % 10 == 0
+        if is_same_time:
+            os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+        folder = path.relative_to(workspace).parts[0]
+        state = stage_states(workspace, config, verify=is_same_time)[spec(folder).name]
+        assert state != "up to date", f"{kind.__name__} of {path}"
+        assert path.name == "stage.json" or path.name in state
+        noticed[kind.__name__] += 1
+        path.write_bytes(before)
+        os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+    assert min(noticed.values()) > 150
+    assert {*stage_states(workspace, config, verify=True).values()} == {"up to date"}
+
+
+def test_nothing_is_computed_from_damaged_files(workspace: Path) -> None:
+    """Neither size nor time shows these damages: who reads a file notices."""
+    config, rng = load_config(workspace / "survey.toml"), random.Random(6)
+    read = 0
+    for one in STAGES:
+        stage = one.stage(workspace, config)
+        record = read_stage(workspace / one.folder)
+        assert record is not None
+        inputs = [workspace / name for name in record.inputs if not name.startswith("..")]
+        for path in rng.sample(inputs, min(3, len(inputs))):
+            before, status = path.read_bytes(), path.stat()
+            flip(path, rng)
+            os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+            with pytest.raises(WorkspaceError, match=path.name) as refusal:
+                run_stage(workspace, replace(stage, version=-1), lambda _: pytest.fail("worked"))
+            owner = spec(path.relative_to(workspace).parts[0])
+            assert f"alice-survey {owner.command}'" in str(refusal.value)
+            with pytest.raises(WorkspaceError, match=path.name):
+                owner.need(workspace)
+            path.write_bytes(before)
+            read += 1
+    assert read >= 20
+
+
+def test_every_damaged_product_is_made_again(small_survey: Path, workspace: Path) -> None:
+    """All products of all stages are damaged at once; the same command makes each anew."""
+    rng = random.Random(7)
+    for number, name in enumerate(results(workspace)):
+        KINDS[number % len(KINDS)](workspace / name, rng)
+    with pytest.raises(AliceError):
+        run(["evaluate"], workspace, None, SERIAL)
+    run([one.name for one in STAGES if one.name != "report"], workspace, None, SERIAL)
+    assert results(workspace) == results(small_survey)
