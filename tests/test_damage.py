@@ -1,13 +1,13 @@
 """Finished products that a disk, a person or another program has damaged since."""
 
 import os
-import random
 import shutil
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from alice_survey.app.pipeline import run, stage_states
@@ -23,25 +23,25 @@ pytestmark = pytest.mark.slow
 DAMAGES = 1000
 
 
-def flip(path: Path, rng: random.Random) -> None:
+def flip(path: Path, rng: np.random.Generator) -> None:
     content = bytearray(path.read_bytes())
-    content[rng.randrange(len(content))] ^= 1 << rng.randrange(8)
+    content[rng.integers(len(content))] ^= 1 << int(rng.integers(8))
     path.write_bytes(content)
 
 
-def cut(path: Path, rng: random.Random) -> None:
-    os.truncate(path, rng.randrange(path.stat().st_size))
+def cut(path: Path, rng: np.random.Generator) -> None:
+    os.truncate(path, int(rng.integers(path.stat().st_size)))
 
 
-def blank(path: Path, _: random.Random) -> None:
+def blank(path: Path, _: np.random.Generator) -> None:
     path.write_bytes(bytes(path.stat().st_size))
 
 
-def remove(path: Path, _: random.Random) -> None:
+def remove(path: Path, _: np.random.Generator) -> None:
     path.unlink()
 
 
-KINDS: tuple[Callable[[Path, random.Random], None], ...] = (flip, cut, blank, remove)
+KINDS: tuple[Callable[[Path, np.random.Generator], None], ...] = (flip, cut, blank, remove)
 
 
 @pytest.fixture
@@ -54,14 +54,14 @@ def test_a_thousand_damages_are_noticed(workspace: Path) -> None:
 
     A copy of the workspace, whose files have other times, is not damaged.
     """
-    config, rng = load_config(workspace / "survey.toml"), random.Random(5)
+    config, rng = load_config(workspace / "survey.toml"), np.random.default_rng(5)
     files = [path for one in STAGES for path in sorted((workspace / one.folder).rglob("*"))
              if path.is_file()]  # fmt: skip
     os.utime(workspace / "dense" / "dem.tif")
     assert {*stage_states(workspace, config).values()} == {"up to date"}
     noticed: Counter[str] = Counter()
     for number in range(DAMAGES):
-        path, kind = files[number % len(files)], rng.choice(KINDS)
+        path, kind = files[number % len(files)], KINDS[rng.integers(len(KINDS))]
         before, status = path.read_bytes(), path.stat()
         kind(path, rng)
         if path.exists() and path.read_bytes() == before:
@@ -82,14 +82,14 @@ def test_a_thousand_damages_are_noticed(workspace: Path) -> None:
 
 def test_nothing_is_computed_from_damaged_files(workspace: Path) -> None:
     """Neither size nor time shows these damages: who reads a file notices."""
-    config, rng = load_config(workspace / "survey.toml"), random.Random(6)
+    config, rng = load_config(workspace / "survey.toml"), np.random.default_rng(6)
     read = 0
     for one in STAGES:
         stage = one.stage(workspace, config)
         record = read_stage(workspace / one.folder)
         assert record is not None
         inputs = [workspace / name for name in record.inputs if not name.startswith("..")]
-        for path in rng.sample(inputs, min(3, len(inputs))):
+        for path in [inputs[i] for i in rng.permutation(len(inputs))[:3]]:
             before, status = path.read_bytes(), path.stat()
             flip(path, rng)
             os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
@@ -106,7 +106,7 @@ def test_nothing_is_computed_from_damaged_files(workspace: Path) -> None:
 
 def test_every_damaged_product_is_made_again(small_survey: Path, workspace: Path) -> None:
     """All products of all stages are damaged at once; the same command makes each anew."""
-    rng = random.Random(7)
+    rng = np.random.default_rng(7)
     for number, name in enumerate(results(workspace)):
         KINDS[number % len(KINDS)](workspace / name, rng)
     with pytest.raises(AliceError):
