@@ -191,4 +191,4 @@ def test_floors_within_thirty_centimetres_are_exported(
             write_exports(tmp_path / "out", plan, RIG, formats=["wpl"])
         return
     files = write_exports(tmp_path / "out", plan, RIG, formats=list(VEHICLES))
-    assert len(files) == 7
+    assert len(files) == 8
