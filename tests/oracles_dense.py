@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from camera_calib.rig import design_rig
 from reconstruct.raster import DemGrid
 from reconstruct.views.model import SparseModel, View, WorldFrame, write_frame
 from reconstruct.views.model_files import colmap_pinhole, rigid3d
-from reconstruct.views.range_shift import no_shift, range_shift
+from reconstruct.views.range_shift import RangeShift, no_shift, range_shift
 from tests.cameras import changed
 
 DATUM = Datum(32.8236, 34.9553)
@@ -41,18 +40,14 @@ ALTITUDE_M, DEPTH_M = 2.0, 12.0
 
 def merged(depths: NDArray[Any], sigmas: NDArray[Any], gate: float) -> tuple[float, float, int]:
     """One pixel of `merge_depths`."""
-    known = [(float(z), float(s)) for z, s in zip(depths, sigmas, strict=True) if not math.isnan(z)]
-    companies = [
-        [(y, t) for y, t in known if (z - y) ** 2 <= gate**2 * (s**2 + t**2)] for z, s in known
-    ]
-    if not companies:
+    known = ~np.isnan(depths)
+    z, s = depths[known].astype(float), sigmas[known].astype(float)
+    near = (z[:, None] - z) ** 2 <= gate**2 * (s[:, None] ** 2 + s**2)
+    if not len(z) or near.sum(axis=1).max() < min(2, len(z)):
         return math.nan, math.nan, 0
-    best = max(companies, key=lambda c: (len(c), sum(1 / t**2 for _, t in c)))
-    if len(known) > 1 and len(best) == 1:
-        return math.nan, math.nan, 0
-    weights = [1 / t**2 for _, t in best]
-    mean = sum(w * y for w, (y, _) in zip(weights, best, strict=True)) / sum(weights)
-    return mean, sum(weights) ** -0.5, len(best)
+    weights = max(near / s**2, key=lambda row: (np.count_nonzero(row), row.sum()))
+    total = weights.sum()
+    return weights @ z / total, total**-0.5, np.count_nonzero(weights)
 
 
 def fused(
@@ -84,34 +79,18 @@ def surfaces(
     heights: Array, sigmas: Array, places: Any, steepness: Array, cell: float
 ) -> list[list[int]]:
     """The points of each surface of a cell from above, as `surfaces_of` tells them apart."""
-    ranks = [int(i) for i in np.argsort(heights, kind="stable")]
-
-    def parted(parts: list[list[int]], slopes: list[float] | None) -> list[list[int]]:
-        joined = [list(parts[0])]
-        for n, part in enumerate(parts[1:], 1):
-            below, above = parts[n - 1][-1], part[0]
-            minimum = 5.0 * math.hypot(sigmas[below], sigmas[above])
-            if slopes is None:
-                minimum += cell
-            else:
-                known = [slope for slope in (slopes[n - 1], slopes[n]) if not math.isnan(slope)]
-                minimum += math.sqrt(2) * cell * max(known) if known else math.inf
-            if heights[above] - heights[below] > minimum:
-                joined.append([])
-            joined[-1] += part
-        return joined
-
-    parts = parted([[i] for i in ranks], None)
+    ranks = np.argsort(heights, kind="stable")
+    h, s = heights[ranks].astype(float), sigmas[ranks].astype(float)
+    gap = np.diff(h) - 5.0 * np.hypot(s[:-1], s[1:])
+    starts = np.flatnonzero(gap > cell) + 1
     slopes = []
-    for part in parts:
-        known = sorted(float(steepness[i]) for i in part if not math.isnan(steepness[i]))
-        slopes.append(known[len(known) // 2] if known else math.nan)
-    shown = [
-        part
-        for part in parted(parts, slopes)
-        if len(part) >= 3 and len({int(places[i]) for i in part}) >= 2
-    ]
-    return shown[::-1] if len(shown) > 1 else [ranks]
+    for part in np.split(ranks, starts):
+        known = np.sort(steepness[part][~np.isnan(steepness[part])])
+        slopes.append(float(known[len(known) // 2]) if len(known) else math.nan)
+    steeper = np.fmax(slopes[:-1], slopes[1:])  # unknown divides nothing
+    starts = starts[gap[starts - 1] > math.sqrt(2) * cell * steeper]
+    shown = [p for p in np.split(ranks, starts) if len(p) >= 3 and len(set(places[p])) >= 2]
+    return [part.tolist() for part in (shown[::-1] if len(shown) > 1 else [ranks])]
 
 
 def projected(grid: DemGrid, points: np.ndarray, row: int, column: int) -> dict[str, float]:
@@ -120,54 +99,41 @@ def projected(grid: DemGrid, points: np.ndarray, row: int, column: int) -> dict[
     nothing |= dict.fromkeys(("count", "stations", "surfaces"), 0)
     middle = (grid.west + (column + 0.5) * grid.cell, grid.north - (row + 0.5) * grid.cell)
     edge_on = math.cos(math.radians(80.0))
-    entries = []
-    for p in points:
-        east, north = ((float(p["enu"][k]) - middle[k]) / grid.cell for k in (0, 1))
-        n = [float(v) for v in p["normal"]]
-        if abs(n[2]) < edge_on and max(abs(east), abs(north)) <= 0.75:
-            return nothing
-        share = max(1 - abs(east), 0.0) * max(1 - abs(north), 0.0)
-        if n[2] >= edge_on and share > 1e-3:
-            lift = grid.cell * (east * n[0] + north * n[1]) / n[2]
-            steep = math.hypot(n[0], n[1]) / n[2]
-            entries.append((float(p["enu"][2]) + lift, float(p["sigma"]) / n[2],
-                            float(p["shared"]) / n[2], steep, share, p))  # fmt: skip
-    if not entries:
+    away, normal = (points["enu"][:, :2] - middle) / grid.cell, points["normal"].astype(float)
+    share = np.maximum(1 - np.abs(away), 0.0).prod(axis=1)
+    wall = (np.abs(normal[:, 2]) < edge_on) & (np.abs(away).max(axis=1) <= 0.75)
+    near = (normal[:, 2] >= edge_on) & (share > 1e-3)
+    if wall.any() or not near.any():
         return nothing
-    entries.sort(key=lambda entry: -entry[0])
-    layers = [[entries[0]]]
-    for above, below in pairwise(entries):
-        gap = 5 * math.hypot(above[1], below[1])
-        gap += grid.cell * (1 + math.sqrt(2) * max(above[3], below[3]))
-        if above[0] - below[0] > gap:
-            layers.append([])
-        layers[-1].append(below)
-    maximum = max(entry[5]["stations"] for entry in entries)
+    p, share, rise = points[near], share[near], normal[near, :2] / normal[near, 2:]
+    height = p["enu"][:, 2] + grid.cell * (away[near] * rise).sum(axis=1)
+    sigma, shared = p["sigma"] / normal[near, 2], p["shared"] / normal[near, 2]
+    steep, order = np.hypot(*rise.T), np.argsort(-height, kind="stable")
+    below, above = order[1:], order[:-1]
+    gaps = 5 * np.hypot(sigma[above], sigma[below])
+    gaps += grid.cell * (1 + math.sqrt(2) * np.maximum(steep[above], steep[below]))
     layers = [
         layer
-        for layer in layers
-        if sum(entry[4] for entry in layer) >= 0.25
-        and max(entry[5]["stations"] for entry in layer) >= min(2, maximum)
+        for layer in np.split(order, np.flatnonzero(height[above] - height[below] > gaps) + 1)
+        if share[layer].sum() >= 0.25 and p["stations"][layer].max() >= min(2, p["stations"].max())
     ]
     if not layers:
         return nothing
 
-    def mean(layer: list[tuple], value: int) -> float:
-        weights = [entry[4] / entry[1] ** 2 for entry in layer]
-        return float(np.average([entry[value] for entry in layer], weights=weights))
+    def mean(layer: NDArray[np.intp], values: Array) -> float:
+        return float(np.average(values[layer], weights=(share / sigma**2)[layer]))
 
     top = layers[0]
-    height = mean(top, 0)
-    scatter = mean([(entry[0], entry[1], entry[2], (entry[0] - height) ** 2, entry[4])
-                    for entry in top], 3)  # fmt: skip
-    nearest = max(top, key=lambda entry: entry[4])[5]
+    highest = mean(top, height)
+    scatter = mean(top, (height - highest) ** 2)
+    nearest = p[top[np.argmax(share[top])]]
     return {
-        "height": height,
-        "sigma": math.sqrt(mean(top, 1) ** 2 + scatter + mean(top, 2) ** 2),
+        "height": highest,
+        "sigma": math.sqrt(mean(top, sigma) ** 2 + scatter + mean(top, shared) ** 2),
         "count": int(nearest["views"]),
         "stations": int(nearest["stations"]),
         "surfaces": len(layers),
-        "lower": mean(layers[-1], 0) if len(layers) > 1 else math.nan,
+        "lower": mean(layers[-1], height) if len(layers) > 1 else math.nan,
     }
 
 
@@ -177,16 +143,11 @@ def sees(height: Array, camera: Array, cell: float, row: int, column: int) -> fl
     The DEM's first row and column have their outer edges at north 0 and west 0.
     """
     start = np.array([(column + 0.5) * cell, -(row + 0.5) * cell, height[row, column]])
-    highest = -math.inf
-    for share in np.linspace(0, 1, 4001)[1:]:
-        east, north, up = start + share * (camera - start)
-        r, c = math.floor(-north / cell), math.floor(east / cell)
-        if (r, c) == (row, column):
-            continue
-        if not (0 <= r < height.shape[0] and 0 <= c < height.shape[1]):
-            break
-        highest = max(highest, height[r, c] - up)
-    return highest
+    spots = start + np.linspace(0, 1, 4001)[1:, None] * (camera - start)
+    at = np.floor(spots[:, [1, 0]] / [-cell, cell]).astype(int)
+    over = np.logical_and.accumulate(((at >= 0) & (at < height.shape)).all(axis=1))
+    over &= (at != [row, column]).any(axis=1)
+    return float((height[tuple(at[over].T)] - spots[over, 2]).max(initial=-math.inf))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -264,6 +225,18 @@ def two_lines(*along_m: float) -> list[View]:
     return stereo_views(along.ravel(), aside.ravel(), heading_deg=0.0)
 
 
+def view_at(pose: RigidTransform, pinhole: Pinhole, shift: RangeShift | None = None) -> View:
+    """A view from a pose, `world_from_cam`; without a port where no shift is given."""
+    return View(
+        image="a",
+        camera="left",
+        station=0,
+        pinhole=pinhole,
+        world_from_cam=pose,
+        shift=no_shift(*pinhole.size_px) if shift is None else shift,
+    )
+
+
 def port_view(centre: list[float], rpy_deg: list[float]) -> View:
     """A nadir camera 100 mm behind a port that is tilted by 2 degrees."""
     rig = design_rig(CameraConfig(port_distance_m=0.1), WaterConfig(), scale=8)
@@ -271,14 +244,8 @@ def port_view(centre: list[float], rpy_deg: list[float]) -> View:
     camera = changed(rig.cameras[rig.reference], normal=(np.sin(tilt), 0.0, np.cos(tilt)))
     warp = best_warp(camera, 1.5, 2.5)
     turn = Rotation.from_euler("xyz", rpy_deg, degrees=True)
-    return View(
-        image="a",
-        camera="left",
-        station=0,
-        pinhole=warp.pinhole,
-        world_from_cam=RigidTransform.from_components(centre, turn * BODY_FROM_NADIR_CAM),
-        shift=range_shift(warp),
-    )
+    pose = RigidTransform.from_components(centre, turn * BODY_FROM_NADIR_CAM)
+    return view_at(pose, warp.pinhole, range_shift(warp))
 
 
 def pixels_of(view: View) -> Array:
@@ -346,7 +313,7 @@ def sparse_model(views: list[View], scene: Scene, points: int = 400, seed: int =
 
 def write_workspace(
     folder: Path,
-    model: SparseModel,
+    views: list[View],
     scene: Scene,
     world_from_scene: RigidTransform | None = None,
 ) -> Path:
@@ -354,11 +321,12 @@ def write_workspace(
 
     Args:
         folder: of the workspace.
-        model: of the scene.
+        views: of the scene.
         scene: what pictures show.
         world_from_scene: where scene and cameras stand in the world, together; None where they are.
     """
-    for view in model.views:
+    model = sparse_model(views, scene)
+    for view in views:
         path = folder / "images" / view.image
         path.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(path), render(view, scene))

@@ -15,15 +15,10 @@ from tests.cameras import flat_port_camera
 
 def implicit_value(points: Array, normals: Array, weights: Array, node: Array) -> float:
     """`splat` at one node."""
-    over, total = 0.0, 0.0
-    for p, n, w in zip(points, normals, weights, strict=True):
-        away = node - p
-        if away @ away > 2.5**2:
-            continue
-        share = w * math.exp(-0.5 * (away @ away) / 0.8**2)
-        over += share * (away @ n)
-        total += share
-    return over / total if total > 0 else math.nan
+    away = node - points
+    square = (away**2).sum(axis=1)
+    shares = np.where(square <= 2.5**2, weights * np.exp(-0.5 * square / 0.8**2), 0.0)
+    return shares @ (away * normals).sum(axis=1) / shares.sum() if shares.any() else math.nan
 
 
 def spread_value(corners: Array, values: Array, x: float, y: float) -> Array | None:

@@ -22,6 +22,7 @@ from reconstruct.raster import (
     tiles_reached,
     write_style,
 )
+from tests.alice_survey.app.report.tiny import write_raster
 from tests.oracles_dense import DATUM, FRAME
 
 GRID = DemGrid(west=-12.5, north=40.0, cell=0.25, rows=300, columns=420)
@@ -164,11 +165,7 @@ CELL, ROWS, COLUMNS = 0.02, 500, 400
 
 def stored(folder: Path, height: np.ndarray) -> StoredElevation:
     for name, cells in (("dem.tif", height), ("sigma.tif", np.full_like(height, 0.003))):
-        with rasterio.open(
-            folder / name, "w", driver="GTiff", width=COLUMNS, height=ROWS, count=1,
-            dtype="float32", nodata=np.nan, transform=rasterio.Affine(CELL, 0, -4, 0, -CELL, 5),
-        ) as raster:  # fmt: skip
-            raster.write(cells.astype(np.float32), 1)
+        write_raster(folder / name, cells.astype(np.float32)[None], CELL, (-4, 5), nodata=np.nan)
     return StoredElevation.of(folder)
 
 

@@ -40,7 +40,7 @@ SCENE = Scene(depth_of=sloped_with_step, paint=speckle())
 def survey(tmp_path_factory: pytest.TempPathFactory):
     views = stereo_views(np.array([0.0, 0.3, 0.6]), np.array([0.3, 0.3, 0.3]))
     model = sparse_model(views, SCENE)
-    return write_workspace(tmp_path_factory.mktemp("survey"), model, SCENE), model
+    return write_workspace(tmp_path_factory.mktemp("survey"), views, SCENE), model
 
 
 def conditions(workspace: Path, model, folder: Path) -> tuple[float, float]:

@@ -30,7 +30,6 @@ from tests.oracles_dense import (
     plane_depth,
     port_view,
     sloped_with_step,
-    sparse_model,
     speckle,
     two_lines,
     write_workspace,
@@ -78,7 +77,7 @@ def with_light(folder: Path, views: list[View], bodies: bool) -> dict[str, np.nd
 
 
 def made(folder: Path, bodies: bool) -> dict[str, np.ndarray]:
-    write_workspace(folder, sparse_model(VIEWS, SCENE), SCENE)
+    write_workspace(folder, VIEWS, SCENE)
     truth = with_light(folder, VIEWS, bodies)
     assert spec("dense").make(folder, SurveyConfig(), SERIAL)
     return truth

@@ -13,12 +13,10 @@ from alice_survey.core.artefacts import read_json
 from alice_survey.core.config import ReconstructConfig, SurveyConfig
 from alice_survey.core.errors import keep_warnings
 from alice_survey.core.executor import SERIAL
-from reconstruct.views.model import SparseModel
 from tests.oracles_dense import (
     Scene,
     read_raster,
     sloped_with_step,
-    sparse_model,
     speckle,
     two_lines,
     write_workspace,
@@ -36,15 +34,11 @@ def config(*planes: str) -> SurveyConfig:
     return SurveyConfig(reconstruct=ReconstructConfig(dem_cell_m=0.01, planes=planes))
 
 
-def survey() -> SparseModel:
-    return sparse_model(two_lines(-0.05, 0.3, 0.65), SCENE)
-
-
 @pytest.fixture(scope="module")
 def level(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The scene on the level plane, and on that turned by 90 degrees about the vertical."""
     folder = tmp_path_factory.mktemp("level")
-    write_workspace(folder, survey(), SCENE)
+    write_workspace(folder, two_lines(-0.05, 0.3, 0.65), SCENE)
     planes = config("level", "turned=facing 90 tilt 90")
     assert spec("dense").make(folder, planes, SERIAL)
     assert spec("mosaic").make(folder, planes, SERIAL)
@@ -55,7 +49,7 @@ def level(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def wall(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
     """The scene as a wall that faces south, and what was warned of."""
     folder = tmp_path_factory.mktemp("wall")
-    write_workspace(folder, survey(), SCENE, WORLD_FROM_SCENE)
+    write_workspace(folder, two_lines(-0.05, 0.3, 0.65), SCENE, WORLD_FROM_SCENE)
     planes = config("back=facing 0", "wall=facing 180")
     with keep_warnings() as warnings:
         assert spec("dense").make(folder, planes, SERIAL)

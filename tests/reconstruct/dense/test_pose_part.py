@@ -8,21 +8,17 @@ from reconstruct.dense.surface_tiles import (
     ErrorsOfPoses,
     find_errors_of_poses,
 )
-from reconstruct.views.model import SparseModel, read_model
-from tests.oracles_dense import Scene, flat, position_code, sparse_model, stereo_views
-from tests.oracles_dense import write_workspace as write
+from reconstruct.views.model import read_model
+from tests.oracles_dense import Scene, flat, position_code, stereo_views, write_workspace
 
 SCENE = Scene(depth_of=flat, paint=position_code)
-
-
-def small_model() -> SparseModel:
-    return sparse_model(stereo_views(0.3 * np.arange(4.0), np.zeros(4)), SCENE, points=300)
 
 
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Points whose heights poses shift by 3 mm."""
-    folder = write(tmp_path_factory.mktemp("poses"), small_model(), SCENE)
+    views = stereo_views(0.3 * np.arange(4.0), np.zeros(4))
+    folder = write_workspace(tmp_path_factory.mktemp("poses"), views, SCENE)
     ids = np.arange(1, 1 + len(read_model(folder / "sparse").points_world))
     noise = np.zeros((len(ids), 3, 3))
     noise[:, 2, 2] = np.random.default_rng(1).uniform(0.001, 0.01, len(ids)) ** 2

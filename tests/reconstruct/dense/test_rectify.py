@@ -10,20 +10,15 @@ from camera_calib.approximation.pinhole_warp import Pinhole
 from reconstruct.dense.depth import depth_in_reference, rectify
 from reconstruct.views.model import View
 from reconstruct.views.range_shift import no_shift
-from tests.oracles_dense import pixels_of, port_view
+from tests.oracles_dense import pixels_of, port_view, view_at
 
 
 def view(centre: list[float], rotvec: list[float], focal: float = 400.0) -> View:
-    return View(
-        image="a",
-        camera="left",
-        station=0,
-        pinhole=Pinhole(
-            width_px=320, height_px=240, fx_px=focal, fy_px=1.01 * focal, cx_px=163.0, cy_px=118.0
-        ),
-        shift=no_shift(320, 240),
-        world_from_cam=RigidTransform.from_components(centre, Rotation.from_rotvec(rotvec)),
+    pinhole = Pinhole(
+        width_px=320, height_px=240, fx_px=focal, fy_px=1.01 * focal, cx_px=163.0, cy_px=118.0
     )
+    pose = RigidTransform.from_components(centre, Rotation.from_rotvec(rotvec))
+    return view_at(pose, pinhole)
 
 
 def transfer(homography: np.ndarray, pixels: np.ndarray) -> np.ndarray:

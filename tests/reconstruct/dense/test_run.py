@@ -17,7 +17,6 @@ from tests.oracles_dense import (
     flat,
     read_raster,
     sloped_with_step,
-    sparse_model,
     speckle,
     stereo_views,
     two_lines,
@@ -34,7 +33,7 @@ VIEWS = two_lines(-0.05, 0.3, 0.65)
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("survey")
-    write_workspace(folder, sparse_model(VIEWS, SCENE), SCENE)
+    write_workspace(folder, VIEWS, SCENE)
     assert spec("dense").make(folder, CONFIG, SERIAL)
     return folder
 
@@ -113,7 +112,7 @@ def test_scratch_is_gone_and_files_are_there(workspace: Path):
 def test_an_interruption_while_a_plane_is_written_costs_nothing(
     workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    write_workspace(tmp_path, sparse_model(VIEWS, SCENE), SCENE)
+    write_workspace(tmp_path, VIEWS, SCENE)
     with monkeypatch.context() as interrupted:
 
         def stop(dem: Path, picture: Path) -> None:
@@ -133,7 +132,7 @@ def test_an_interruption_while_a_plane_is_written_costs_nothing(
 def test_pictures_without_texture_are_refused(tmp_path: Path):
     grey = Scene(depth_of=flat, paint=lambda n, e: np.full((*n.shape, 3), 90.0))
     views = stereo_views(np.array([0.0, 0.3]), np.array([0.0, 0.0]))
-    write_workspace(tmp_path, sparse_model(views, grey), grey)
+    write_workspace(tmp_path, views, grey)
     with pytest.raises(ReconstructionError):
         spec("dense").make(tmp_path, CONFIG, SERIAL)
     assert not (tmp_path / "dense").exists()

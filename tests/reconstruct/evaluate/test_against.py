@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
-from rasterio.transform import from_origin
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.artefacts import write_json
@@ -17,6 +16,7 @@ from reconstruct.elevation import Elevation
 from reconstruct.evaluate.change import compare_elevations, enu_from_enu, evaluate_against
 from reconstruct.evaluate.registration import register_heights, rough_shifts
 from reconstruct.views.model import WorldFrame, write_frame
+from tests.alice_survey.app.report.tiny import write_raster
 
 CELL, SIDE, SIGMA_M = 0.02, 200, 0.001
 MOUND_M, WIDTH_M, AT = 0.02, 0.15, (1.5, 2.2)
@@ -115,11 +115,8 @@ def write_survey(folder: Path, elevation: Elevation, datum: Datum | None) -> Pat
     )  # fmt: skip
     write_frame(folder / "sparse" / "frame.json", frame)
     for name, values in (("dem", elevation.height), ("sigma", elevation.sigma)):
-        with rasterio.open(
-            folder / "dense" / f"{name}.tif", "w", driver="GTiff", width=SIDE, height=SIDE, count=1,
-            dtype="float32", transform=from_origin(0, 4, CELL, CELL), nodata=np.nan,
-        ) as target:  # fmt: skip
-            target.write(values.astype(np.float32), 1)
+        path = folder / "dense" / f"{name}.tif"
+        write_raster(path, values.astype(np.float32)[None], CELL, (0, 4), nodata=np.nan)
     return folder
 
 

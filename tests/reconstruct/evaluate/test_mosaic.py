@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-from rasterio.transform import from_origin
 from scipy.spatial.transform import RigidTransform
 from shapely.geometry import MultiPolygon, box
 
@@ -16,6 +15,7 @@ from reconstruct.elevation import Elevation
 from reconstruct.evaluate.figures import compare_lengths
 from reconstruct.evaluate.scores import score_mosaic
 from reconstruct.evaluate.truth import surface_material
+from tests.alice_survey.app.report.tiny import write_raster
 
 PIXEL, SIDE = 0.002, 700
 AREA = MultiPolygon([box(0.05, 0.05, 1.35, 1.35)])
@@ -34,18 +34,14 @@ def write(
 ) -> tuple[Path, Elevation]:
     """Mosaic and elevation model whose content lies `off_m` (east, north) of where it should."""
     terrain, texture = floor
-    folder.mkdir(parents=True, exist_ok=True)
     rows, columns = np.mgrid[:SIDE, :SIDE] + 0.5
     east, north = columns * PIXEL, 1.4 - rows * PIXEL
     shown = np.stack([north - off_m[1], east - off_m[0]], axis=-1).reshape(-1, 2) / scale
     points, material = surface_material(terrain, shown)
     colour = texture.albedo(points, material, np.full(len(points), PIXEL, np.float32))
     picture = np.clip(255 * colour.T.reshape(3, SIDE, SIDE), 0, 255).astype(np.uint8)
-    with rasterio.open(
-        folder / "mosaic.tif", "w", driver="GTiff", width=SIDE, height=SIDE, count=4,
-        dtype="uint8", transform=from_origin(0, 1.4, PIXEL, PIXEL),
-    ) as target:  # fmt: skip
-        target.write(np.concatenate([picture, np.full((1, SIDE, SIDE), 255, np.uint8)]))
+    rgba = np.concatenate([picture, np.full((1, SIDE, SIDE), 255, np.uint8)])
+    write_raster(folder / "mosaic.tif", rgba, PIXEL, (0, 1.4))
     height = -scale * points[:, 2].reshape(SIDE, SIDE)
     surface = Elevation(height=height, sigma=0 * height, west=0.0, north=1.4, cell=PIXEL)
     return folder / "mosaic.tif", surface

@@ -1,17 +1,13 @@
 """A survey is laid on a reference of any kind, and its distance from it is what was put in."""
 
 import struct
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import laspy
 import numpy as np
 import open3d as o3d
 import pytest
-import rasterio
 from pyproj import CRS, Transformer
-from rasterio.transform import from_origin
 from scipy.spatial.transform import Rotation
 
 from alice_survey.core.errors import WorkspaceError
@@ -25,6 +21,7 @@ from reconstruct.evaluate.registration import (
     register_cloud,
 )
 from reconstruct.placing.alignment import Similarity
+from tests.alice_survey.app.report.tiny import write_raster
 
 DATUM = Datum(46.8426, -91.9946)
 UTM = 32615
@@ -153,24 +150,12 @@ def test_a_cloud_in_utm_comes_back_to_local_metres(tmp_path: Path, kind: str) ->
     np.testing.assert_allclose(found, points, atol=3e-4)
 
 
-def write_dem(
-    path: Path, height: np.ndarray, crs: Any, corner: Sequence[float], cell: float
-) -> Path:
-    with rasterio.open(
-        path, "w", driver="GTiff", width=20, height=20, count=1, dtype="float32", crs=crs,
-        transform=from_origin(*corner, cell, cell), nodata=-9999,
-    ) as target:  # fmt: skip
-        target.write(height, 1)
-    return path
-
-
 def test_cells_of_an_elevation_model_are_points_at_their_middles(tmp_path: Path) -> None:
-    corner = utm(np.array([[-5.0, 5.0, 0.0]]))[0]
+    corner = tuple(utm(np.array([[-5.0, 5.0, 0.0]]))[0, :2])
     height = np.arange(400, dtype=np.float32).reshape(20, 20) / 100
     height[3, 4] = -9999
-    found, placed = read_reference(
-        write_dem(tmp_path / "dem.tif", height, UTM, corner[:2], 0.5), DATUM
-    )
+    path = write_raster(tmp_path / "dem.tif", height[None], 0.5, corner, crs=UTM, nodata=-9999)
+    found, placed = read_reference(path, DATUM)
     assert placed
     assert len(found) == 399
     # The first cell's middle lies a quarter of a metre in; UTM is turned and stretched a little.
@@ -218,6 +203,6 @@ def test_a_model_in_no_place_on_earth_is_refused(tmp_path: Path) -> None:
     height = np.arange(400, dtype=np.float32).reshape(20, 20)
     local = 'LOCAL_CS["mine",UNIT["metre",1],AXIS["x",EAST],AXIS["y",NORTH]]'
     for crs, corner in ((f"EPSG:{UTM}", (1e30, 1e30)), (local, (0.0, 0.0))):
-        write_dem(tmp_path / "m.tif", height, crs, corner, 1.0)
+        write_raster(tmp_path / "m.tif", height[None], 1.0, corner, crs=crs)
         with pytest.raises(WorkspaceError):
             read_reference(tmp_path / "m.tif", DATUM)

@@ -24,7 +24,6 @@ from tests.oracles_dense import (
     FRAME,
     Scene,
     position_code,
-    sparse_model,
     stereo_views,
     write_workspace,
 )  # fmt: skip
@@ -72,7 +71,7 @@ def write_dense(folder: Path, images: list[str]) -> None:
 def make_workspace(folder: Path, others: Sequence[str] = ()) -> None:
     """Three stations over the bump; `others` are pictures that only the light knows."""
     views = stereo_views(np.array([-0.2, 0.2, 0.5]), np.array([0.0, 0.05, 0.0]))
-    write_workspace(folder, sparse_model(views, SCENE), SCENE)
+    write_workspace(folder, views, SCENE)
     write_dense(folder, [*(view.image for view in views), *others])
 
 

@@ -13,7 +13,6 @@ from tests.oracles_dense import (
     Scene,
     flat,
     position_code,
-    sparse_model,
     stereo_views,
     write_workspace,
 )
@@ -26,7 +25,7 @@ VIEWS = stereo_views(np.array([0.0]), np.array([0.0]))
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("visibility")
-    write_workspace(folder, sparse_model(VIEWS, SCENE), SCENE)
+    write_workspace(folder, VIEWS, SCENE)
     return folder
 
 

@@ -3,11 +3,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import rasterio
 
 from alice_survey.core.artefacts import read_json, write_json
 from reconstruct.mosaic.exports import hits_of, mosaic_tiles, picture_footprint, write_footprints
-from reconstruct.raster import DemGrid, crs_of, transform_of
+from reconstruct.raster import DemGrid, crs_of
+from tests.alice_survey.app.report.tiny import write_raster
 from tests.oracles_dense import ALTITUDE_M, FOCAL, FRAME, HEIGHT, WIDTH, stereo_views
 
 GRID = DemGrid(west=-2.0, north=2.0, cell=0.02, rows=200, columns=200)
@@ -63,16 +63,11 @@ def test_a_picture_off_the_surface_has_no_area() -> None:
 
 def workspace_with_mosaic(folder: Path) -> np.ndarray:
     rng = np.random.default_rng(3)
-    grid = DemGrid(west=5.0, north=9.0, cell=0.01, rows=150, columns=230)
     rgba = rng.integers(0, 256, (4, 150, 230)).astype(np.uint8)
     rgba[3] = 255
     rgba[:, :70, :70] = 0
-    (folder / "mosaic").mkdir()
-    with rasterio.open(
-        folder / "mosaic" / "mosaic.tif", "w", driver="GTiff", width=230, height=150, count=4,
-        dtype="uint8", crs=crs_of(FRAME), transform=transform_of(grid),
-    ) as raster:  # fmt: skip
-        raster.write(rgba)
+    path = folder / "mosaic" / "mosaic.tif"
+    write_raster(path, rgba, 0.01, (5.0, 9.0), crs=crs_of(FRAME))
     write_json(
         folder / "mosaic" / "mosaic.json",
         {"width_px": 230, "height_px": 150, "pixel": 0.01, "unit": "m"},

@@ -13,8 +13,7 @@ from reconstruct.planes import LEVEL_PLANE
 from reconstruct.ply import VERTEX, write_ply
 from reconstruct.raster import DemGrid, tiled_raster
 from reconstruct.views.model import View
-from reconstruct.views.range_shift import no_shift
-from tests.oracles_dense import FRAME
+from tests.oracles_dense import FRAME, view_at
 
 CELL_M = 0.01
 POLE_M = 0.1
@@ -78,11 +77,7 @@ def view_from(place_enu: np.ndarray, at_enu: np.ndarray) -> View:
         cx_px=300.0,
         cy_px=240.0,
     )
-    return View(
-        image="a.png", camera="a", station=0, pinhole=pinhole,
-        world_from_cam=RigidTransform.from_components(start, rotation),
-        shift=no_shift(*SIZE_PX),
-    )  # fmt: skip
+    return view_at(RigidTransform.from_components(start, rotation), pinhole)
 
 
 def test_the_pole_is_off_the_heights_and_the_floor_is_not(occluders: Occluders) -> None:

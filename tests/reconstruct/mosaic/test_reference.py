@@ -8,7 +8,7 @@ import pytest
 
 from alice_survey.core.errors import WorkspaceError
 from reconstruct.mosaic.picture_measures import ReferencePatch, linear_table, read_references
-from tests.oracles_dense import Scene, flat, sparse_model, stereo_views, write_workspace
+from tests.oracles_dense import Scene, flat, stereo_views, write_workspace
 
 CARD = (60, 120, 180)
 """Blue, green, red levels of the card."""
@@ -22,7 +22,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("reference")
     views = stereo_views(np.array([0.0]), np.array([0.0]))
     plain = Scene(depth_of=flat, paint=lambda n, e: np.full((*n.shape, 3), 100.0))
-    write_workspace(folder, sparse_model(views, plain), plain)
+    write_workspace(folder, views, plain)
     path = folder / "images" / IMAGE
     picture = np.zeros_like(cv2.imread(str(path)))
     cv2.circle(picture, (50, 40), 20, CARD, -1)

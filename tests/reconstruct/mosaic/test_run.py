@@ -27,7 +27,6 @@ from tests.oracles_dense import (
     Scene,
     position_code,
     read_raster,
-    sparse_model,
     stereo_views,
     write_workspace,
 )
@@ -71,7 +70,7 @@ def write_surface_cloud(dense: Path, grid: DemGrid, height: np.ndarray) -> None:
 
 def make_workspace(folder: Path, views: list[View], scene: Scene) -> Path:
     """All that the mosaic is made of."""
-    write_workspace(folder, sparse_model(views, scene), scene)
+    write_workspace(folder, views, scene)
     write_surface(folder)
     return folder
 

@@ -24,6 +24,7 @@ from reconstruct.raster import DemGrid
 from reconstruct.views.model import View
 from reconstruct.views.range_shift import range_shift
 from tests.cameras import flat_port_camera
+from tests.oracles_dense import view_at
 from tests.oracles_mosaic import lanczos_at
 
 TILT = np.deg2rad(2.0)
@@ -44,12 +45,8 @@ SEA = Water(temperature_c=24.0, salinity_psu=39.0, depth_m=10.0)
 
 def view_of(warp: PinholeWarp) -> View:
     turned = Rotation.from_euler("ZYX", [20.0, 4.0, -6.0], degrees=True) * BODY_FROM_NADIR_CAM
-    return View(
-        image="left/0.png", camera="left", station=0,
-        pinhole=warp.pinhole,
-        world_from_cam=RigidTransform.from_components([0.0, 0.0, 8.0], turned),
-        shift=range_shift(warp),
-    )  # fmt: skip
+    pose = RigidTransform.from_components([0.0, 0.0, 8.0], turned)
+    return view_at(pose, warp.pinhole, range_shift(warp))
 
 
 GRID = DemGrid(west=-0.9, north=0.9, cell=0.012, rows=150, columns=150)

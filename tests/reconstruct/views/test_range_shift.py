@@ -16,13 +16,12 @@ from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.lenses.values import LensValues
 from camera_calib.ports.dome import DomePort
 from camera_calib.rig import design_rig
-from reconstruct.views.model import View
 from reconstruct.views.range_shift import RangeShift, range_shift
 from tests.cameras import changed
+from tests.oracles_dense import view_at
 
 
 def warp_of(distance_m: float, tilt_deg: float) -> PinholeWarp:
-
     camera = design_rig(CameraConfig(port_distance_m=distance_m), WaterConfig(), scale=4)
     left = camera.cameras[camera.reference]
     tilt = np.deg2rad(tilt_deg)
@@ -100,14 +99,7 @@ def test_a_view_sees_points_through_its_port() -> None:
     size = [warp.camera.width_px, warp.camera.height_px]
     taken = rng.uniform(0.05, 0.95, (200, 2)) * size
     spots = warp.camera.at_depth(taken, rng.uniform(1.2, 3.0, 200))
-    view = View(
-        image="a",
-        camera="left",
-        station=0,
-        pinhole=warp.pinhole,
-        world_from_cam=RigidTransform.identity(),
-        shift=range_shift(warp),
-    )
+    view = view_at(RigidTransform.identity(), warp.pinhole, range_shift(warp))
     points = warp.pinhole_from_cam.apply(spots)
     np.testing.assert_allclose(view.project(points), warp.to_pinhole(taken), atol=5e-3)
     assert np.abs(view.pinhole.project(points) - warp.to_pinhole(taken)).max() > 0.2
