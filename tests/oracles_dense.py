@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -47,16 +48,11 @@ def merged(depths: NDArray[Any], sigmas: NDArray[Any], gate: float) -> tuple[flo
         return math.nan, math.nan, 0
     weights = max(near / s**2, key=lambda row: (np.count_nonzero(row), row.sum()))
     total = weights.sum()
-    return weights @ z / total, total**-0.5, np.count_nonzero(weights)
+    return weights @ z / total, total**-0.5, int(np.count_nonzero(weights))
 
 
 def fused(
-    heights: Array,
-    sigmas: Array,
-    views: Array,
-    stations: NDArray[np.intp],
-    gate: float,
-    shared: float,
+    heights: Array, sigmas: Array, views: Array, stations: NDArray[np.intp], shared: float
 ) -> tuple[float, float, int, int]:
     """`robust_height` of some points."""
     weights = 1.0 / np.asarray(sigmas, dtype=np.float64) ** 2
@@ -65,12 +61,12 @@ def fused(
     at = order[np.argmax(reached)]
     median = heights[at]
     scatter = 1.4826 * np.median(np.abs(heights - median))
-    near = np.abs(heights - median) <= gate * max(scatter, sigmas[at])
+    near = np.abs(heights - median) <= 3.0 * max(scatter, sigmas[at])
     h, w, v = heights[near], weights[near], views[near]
     mean = np.average(h, weights=w)
     variance = np.average((h - mean) ** 2, weights=w)
-    formal = sum(w[v == view].mean() for view in np.unique(v))
     used = np.unique(v)
+    formal = sum(w[v == view].mean() for view in used)
     sigma = math.sqrt((shared if len(used) > 1 else 1) / formal + variance / len(used))
     return float(mean), sigma, len(used), len(set(stations[used]))
 
@@ -170,17 +166,24 @@ def sloped_with_step(north: Array, east: Array) -> Array:
     return DEPTH_M + 0.08 * north - 0.05 * east - 0.1 * block
 
 
+def texture(
+    rng: np.random.Generator, half_m: float, step_m: float, details_m: tuple[float, ...]
+) -> NDArray[np.float32]:
+    """Random levels of a square with a sigma of one for each of the lengths of detail."""
+    size = int(2 * half_m / step_m)
+    picture = np.zeros((size, size), np.float32)
+    for detail_m in details_m:
+        coarse = int(2 * half_m / detail_m)
+        noise = rng.normal(size=(coarse, coarse)).astype(np.float32)
+        picture += cv2.resize(noise, (size, size), interpolation=cv2.INTER_CUBIC)
+    return picture
+
+
 def speckle(seed: int = 3) -> Callable[[Array, Array], Array]:
     """Random grey texture with detail from 5 to 80 mm."""
     rng = np.random.default_rng(seed)
     step, half = 0.0025, 2.5
-    size = int(2 * half / step)
-    picture = np.zeros((size, size), np.float32)
-    for detail_m in (0.005, 0.01, 0.03, 0.08):
-        coarse = int(2 * half / detail_m)
-        noise = rng.normal(size=(coarse, coarse)).astype(np.float32)
-        picture += cv2.resize(noise, (size, size), interpolation=cv2.INTER_CUBIC)
-    picture = np.clip(110 + 22 * picture, 5, 245)
+    picture = np.clip(110 + 22 * texture(rng, half, step, (0.005, 0.01, 0.03, 0.08)), 5, 245)
 
     def paint(north: Array, east: Array) -> Array:
         x = ((east + half) / step - 0.5).astype(np.float32)
@@ -191,6 +194,12 @@ def speckle(seed: int = 3) -> Callable[[Array, Array], Array]:
     return paint
 
 
+@cache
+def block_scene() -> Scene:
+    """The slope with a block under speckle."""
+    return Scene(depth_of=sloped_with_step, paint=speckle())
+
+
 PERIOD_M = 0.3
 
 
@@ -199,6 +208,9 @@ def position_code(north: Array, east: Array) -> Array:
     wave = 2 * np.pi / PERIOD_M
     blue, green = 128 + 100 * np.sin(wave * east), 128 + 100 * np.sin(wave * north)
     return np.stack([blue, green, np.full_like(blue, 128)], axis=-1)
+
+
+CODED = Scene(depth_of=flat, paint=position_code)
 
 
 def stereo_views(norths: Array, easts: Array, heading_deg: float = 20.0) -> list[View]:

@@ -11,6 +11,7 @@ from alice_survey.core.frames import Array
 from camera_calib.camera import Camera
 from camera_calib.rig import Rig
 from tests.cameras import flat_port_camera
+from tests.oracles_dense import texture
 
 
 def implicit_value(points: Array, normals: Array, weights: Array, node: Array) -> float:
@@ -81,25 +82,15 @@ def station_pictures(rig: Rig, noise: float, seed: int) -> tuple[Array, Array]:
     """Both pictures of `depth_of` under random smooth texture, with white noise."""
     rng = np.random.default_rng(seed)
     step, half = 0.002, 1.2
-    size = int(2 * half / step)
-    texture = np.zeros((size, size), np.float32)
-    for detail_m in (0.02, 0.05):
-        coarse = int(2 * half / detail_m)
-        values = rng.normal(size=(coarse, coarse)).astype(np.float32)
-        texture += cv2.resize(values, (size, size), interpolation=cv2.INTER_CUBIC)
+    picture = texture(rng, half, step, (0.02, 0.05))
     pictures = []
     for name, camera in rig.cameras.items():
         pixels = camera.pixel_centres().reshape(-1, 2)
         points = surface_points(camera, rig.cam_from_rig[name].inv(), pixels)
         x, y = ((points[:, k] + half) / step - 0.5 for k in (0, 1))
         shape = (camera.height_px, camera.width_px)
-        grey = cv2.remap(
-            texture,
-            x.astype(np.float32).reshape(shape),
-            y.astype(np.float32).reshape(shape),
-            cv2.INTER_CUBIC,
-            borderMode=cv2.BORDER_REFLECT,
-        )
+        at = (axis.astype(np.float32).reshape(shape) for axis in (x, y))
+        grey = cv2.remap(picture, *at, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
         level = 120 + 30 * grey + noise * rng.normal(size=shape)
         pictures.append(np.repeat(np.clip(np.rint(level), 0, 255)[..., None], 3, axis=2))
     return pictures[0].astype(np.uint8), pictures[1].astype(np.uint8)

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,18 +13,14 @@ from alice_survey.core.frames import Array
 def lanczos_at(picture: Array, x: float, y: float) -> Array:
     """One place of `sample_lanczos`, in a picture of light (H, W, 3)."""
 
-    def weight(t: float) -> float:
-        return float(np.sinc(t) * np.sinc(t / 4)) if abs(t) < 4 else 0.0
+    def weights(t: NDArray[Any]) -> Array:
+        return np.where(np.abs(t) < 4, np.sinc(t) * np.sinc(t / 4), 0.0)
 
-    left, top = math.floor(x), math.floor(y)
-    total, norm = np.zeros(picture.shape[2]), 0.0
-    for row in range(top - 3, top + 5):
-        for column in range(left - 3, left + 5):
-            r = min(max(row, 0), picture.shape[0] - 1)
-            c = min(max(column, 0), picture.shape[1] - 1)
-            w = weight(x - column) * weight(y - row)
-            total, norm = total + w * picture[r, c], norm + w
-    return np.maximum(total / norm, 0.0)
+    rows, columns = (math.floor(at) + np.arange(-3, 5) for at in (y, x))
+    shares = np.outer(weights(y - rows), weights(x - columns))
+    height, width = picture.shape[:2]
+    part = picture[np.clip(rows, 0, height - 1)][:, np.clip(columns, 0, width - 1)]
+    return np.maximum(np.tensordot(shares, part) / shares.sum(), 0.0)
 
 
 def labels_energy(number: Array, share: Array, colours: Array, chosen: NDArray[np.int32]) -> float:

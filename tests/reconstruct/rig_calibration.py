@@ -72,8 +72,7 @@ def calibrated_rig(folder: Path, executor: Executor) -> Path:
         pictures = places(folder / "board" / medium, list(four_cameras().cameras))
         known: list[str | Path] = ["--water", "--start", found, *HOUSINGS] if wet else []
         known += ["--lens", "opencv5,side=fisheye", "--target", BOARD.description]
-        said = command("calibrate", *pictures, *known, "-o", folder / medium)
-        (folder / f"{medium}.txt").write_text(said)
+        command("calibrate", *pictures, *known, "-o", folder / medium)
         found = folder / medium / "rig.json"
     return found
 

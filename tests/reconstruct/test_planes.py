@@ -22,11 +22,9 @@ from reconstruct.planes import (
 )
 from reconstruct.raster import crs_of, frame_tags
 from reconstruct.views.model import MEAN_PLANE, SparseModel, WorldFrame, write_frame
-from tests.oracles_dense import FRAME, Scene, flat, position_code, sparse_model, stereo_views
+from tests.oracles_dense import CODED, FRAME, sparse_model, stereo_views
 
-NADIR = sparse_model(
-    stereo_views(0.3 * np.arange(3.0), np.zeros(3)), Scene(depth_of=flat, paint=position_code)
-)
+NADIR = sparse_model(stereo_views(0.3 * np.arange(3.0), np.zeros(3)), CODED)
 
 
 def wall_model(facing_deg: float, tilt_deg: float, seed: int = 0, floor: int = 0) -> SparseModel:

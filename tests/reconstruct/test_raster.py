@@ -1,7 +1,6 @@
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
-import cv2
 import numpy as np
 import pytest
 import rasterio
@@ -15,7 +14,6 @@ from reconstruct.raster import (
     hillshade,
     local_crs,
     opened_raster,
-    preview_dem,
     read_cells,
     tiled_raster,
     tiles_of,
@@ -33,9 +31,9 @@ def heights() -> np.ndarray:
     return (-12.0 + 0.01 * columns - 0.02 * rows).astype(np.float32)
 
 
-def write(path, frame=FRAME, values=None) -> None:
+def write(path, values=None) -> None:
     values = heights() if values is None else values
-    with tiled_raster(path, GRID, frame, "float32", np.nan, "height, positive up (m)") as raster:
+    with tiled_raster(path, GRID, FRAME, "float32", np.nan, "height", "m") as raster:
         for window in tiles_of(GRID, 256):
             part = values[
                 window.row_off : window.row_off + window.height,
@@ -84,17 +82,6 @@ def test_hillshade_of_planes():
     np.testing.assert_allclose(away, 0.0, atol=1e-12)
 
 
-def test_preview_is_white_where_nothing_is_known(tmp_path):
-    values = heights()
-    values[:, 300:] = np.nan
-    write(tmp_path / "dem.tif", values=values)
-    preview_dem(tmp_path / "dem.tif", tmp_path / "dem.png", max_px=210)
-    picture = cv2.imread(str(tmp_path / "dem.png"))
-    assert picture.shape == (150, 210, 3)
-    assert (picture[:, 155:] == 255).all()
-    assert (picture[5:-5, 5:145] < 255).any(axis=2).all()
-
-
 def test_tiles_are_reached_by_boxes_that_overlap_them() -> None:
     rng = np.random.default_rng(4)
     low = rng.uniform([-40.0, -60.0], [110.0, 60.0], (60, 2))
@@ -120,8 +107,7 @@ def test_a_damaged_raster_is_reported_with_its_name(tmp_path: Path) -> None:
     path = tmp_path / "dem.tif"
     with pytest.raises(WorkspaceError, match=r"\.tif"), opened_raster(path):
         pass
-    with tiled_raster(path, GRID, FRAME, "float32", float("nan"), "height") as raster:
-        raster.write(heights(), 1)
+    write(path)
     with opened_raster(path) as raster:
         np.testing.assert_array_equal(raster.read(1), heights())
     whole = path.read_bytes()
@@ -131,20 +117,12 @@ def test_a_damaged_raster_is_reported_with_its_name(tmp_path: Path) -> None:
             raster.read(1)
 
 
-STYLED = DemGrid(west=0.0, north=3.0, cell=0.1, rows=30, columns=40)
-
-
-def write_styled(path: Path, values: np.ndarray) -> Path:
-    with tiled_raster(path, STYLED, FRAME, "float32", np.nan, "height", "m") as raster:
-        raster.write(values.astype(np.float32), 1)
-    return path
-
-
 def test_the_ramp_spans_the_values_without_their_tails(tmp_path: Path):
-    values = np.random.default_rng(1).normal(-12.0, 0.2, (30, 40))
+    values = np.random.default_rng(1).normal(-12.0, 0.2, (GRID.rows, GRID.columns))
     values[:5] = np.nan
     values[9, 9] = 500.0
-    path = write_styled(tmp_path / "dem.tif", values)
+    path = tmp_path / "dem.tif"
+    write(path, values.astype(np.float32))
     write_style(path, "viridis", "m")
     root = ET.parse(tmp_path / "dem.qml").getroot()  # noqa: S314 - our own file
     assert root.tag == "qgis"

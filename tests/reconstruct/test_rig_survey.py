@@ -14,7 +14,6 @@ from tests.reconstruct.rig_calibration import calibrated_rig, errors_over_sigmas
 from tests.reconstruct.rig_survey import (
     MOMENTS,
     RigScore,
-    command,
     import_survey,
     render_survey,
     score,
@@ -53,12 +52,6 @@ def check_calibration(folder: Path, rig: Rig) -> None:
         report = read_json(folder / medium / "report.json")
         assert not [v["text"] for v in report["verdicts"] if v["level"] == "bad"]
         assert set(report["baselines_m"]) == set(NAMES[1:])
-        said = (folder / f"{medium}.txt").read_text()
-        page = (folder / medium / "report.html").read_text()
-        for name in NAMES[1:]:
-            assert f"baseline from wide to {name}" in said
-            assert f"baseline to {name}" in page
-    assert "--water --glass MM --start" in (folder / "air.txt").read_text()
 
 
 @pytest.mark.slow
@@ -73,8 +66,7 @@ def test_four_cameras_are_calibrated_and_map_as_well_as_with_the_true_rig(tmp_pa
     check_calibration(tmp_path, read_rig(found))
     for names in (NAMES, NAMES[1:]):
         workspace = tmp_path / f"of_{len(names)}"
-        said = import_survey(pictures, found, workspace, names)
-        assert f" of {', '.join(names[:-1])} and {names[-1]}" in said
+        import_survey(pictures, found, workspace, names)
         (workspace / "survey.toml").write_text("[reconstruct]\nmax_features = 3000\n")
         run(["mapping", "placing", "dense", "mosaic"], workspace, None)
         check(score(workspace, LINES), LINES * MOMENTS * len(names), 0.1)
@@ -82,8 +74,3 @@ def test_four_cameras_are_calibrated_and_map_as_well_as_with_the_true_rig(tmp_pa
         moves = np.subtract(port.after, port.before) / port.prior_sigmas
         assert 0.1 < np.sqrt(np.mean(moves**2)) < 1.2
         assert np.abs(moves).max() < 3.5
-    workspace = tmp_path / "of_4"
-    command("report", "-w", workspace)
-    report = (workspace / "report" / "report.html").read_text()
-    assert "pictures refined the rig from" in report
-    assert all(word in report for word in (*NAMES, "fisheye", "dome of 80 mm radius"))

@@ -8,9 +8,9 @@ import numpy as np
 from reconstruct.dense.surface_tiles import look_at_points
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.views.model import View
-from tests.oracles_dense import Scene, hits, sloped_with_step, speckle, stereo_views
+from tests.oracles_dense import block_scene, hits, stereo_views
 
-SCENE = Scene(depth_of=sloped_with_step, paint=speckle())
+SCENE = block_scene()
 VIEW = stereo_views(np.array([0.1]), np.array([0.2]))[0]
 CELL_M = 0.01
 

@@ -24,16 +24,14 @@ from reconstruct.dense.views import (
 from reconstruct.mosaic.grid import mean_pixel
 from reconstruct.views.model import points_of_views, scaled_view
 from tests.oracles_dense import (
-    Scene,
+    block_scene,
     hits,
-    sloped_with_step,
     sparse_model,
-    speckle,
     stereo_views,
     write_workspace,
 )
 
-SCENE = Scene(depth_of=sloped_with_step, paint=speckle())
+SCENE = block_scene()
 
 
 @pytest.fixture(scope="module")

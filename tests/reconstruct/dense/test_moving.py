@@ -26,16 +26,14 @@ from tests.oracles_dense import (
     DEPTH_M,
     HEIGHT,
     WIDTH,
-    Scene,
+    block_scene,
     plane_depth,
     port_view,
-    sloped_with_step,
-    speckle,
     two_lines,
     write_workspace,
 )
 
-SCENE = Scene(depth_of=sloped_with_step, paint=speckle())
+SCENE = block_scene()
 SEMI_AXES_M = (0.14, 0.06)
 
 

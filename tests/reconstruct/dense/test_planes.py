@@ -14,15 +14,14 @@ from alice_survey.core.config import ReconstructConfig, SurveyConfig
 from alice_survey.core.errors import keep_warnings
 from alice_survey.core.executor import SERIAL
 from tests.oracles_dense import (
-    Scene,
+    block_scene,
     read_raster,
     sloped_with_step,
-    speckle,
     two_lines,
     write_workspace,
 )
 
-SCENE = Scene(depth_of=sloped_with_step, paint=speckle())
+SCENE = block_scene()
 WORLD_FROM_SCENE = RigidTransform.from_components(
     [30.0, -4.0, 6.0], Rotation.from_matrix([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 )
@@ -98,10 +97,8 @@ def test_the_wall_has_its_relief(wall: tuple[Path, list[str]]):
 
 def test_a_plane_without_surface_has_a_warning_and_no_product(wall: tuple[Path, list[str]]):
     folder, warnings = wall
-    assert [w for w in warnings if "plane" in w] == [
-        "plane 'back' (facing 0 deg, tilt 0 deg): no picture shows a surface that faces its "
-        "viewer: it has no DEM and no mosaic"
-    ]
+    (warning,) = [w for w in warnings if "plane" in w]
+    assert "'back'" in warning
     assert not (folder / "dense" / "planes").exists()
     assert not (folder / "mosaic" / "planes").exists()
     assert read_json(folder / "dense" / "surface.json")["planes"] == ["wall"]

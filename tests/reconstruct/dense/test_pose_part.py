@@ -9,16 +9,14 @@ from reconstruct.dense.surface_tiles import (
     find_errors_of_poses,
 )
 from reconstruct.views.model import read_model
-from tests.oracles_dense import Scene, flat, position_code, stereo_views, write_workspace
-
-SCENE = Scene(depth_of=flat, paint=position_code)
+from tests.oracles_dense import CODED, stereo_views, write_workspace
 
 
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Points whose heights poses shift by 3 mm."""
     views = stereo_views(0.3 * np.arange(4.0), np.zeros(4))
-    folder = write_workspace(tmp_path_factory.mktemp("poses"), views, SCENE)
+    folder = write_workspace(tmp_path_factory.mktemp("poses"), views, CODED)
     ids = np.arange(1, 1 + len(read_model(folder / "sparse").points_world))
     noise = np.zeros((len(ids), 3, 3))
     noise[:, 2, 2] = np.random.default_rng(1).uniform(0.001, 0.01, len(ids)) ** 2
@@ -40,23 +38,25 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_what_pixels_do_is_taken_out(workspace: Path):
-    model = read_model(workspace / "sparse")
-    errors = find_errors_of_poses(workspace, model)
-    assert errors is not None
+@pytest.fixture(scope="module")
+def errors(workspace: Path) -> ErrorsOfPoses:
+    found = find_errors_of_poses(workspace, read_model(workspace / "sparse"))
+    assert found is not None
+    return found
+
+
+def test_what_pixels_do_is_taken_out(errors: ErrorsOfPoses):
     assert errors.median_along(np.array([0.0, 0.0, -1.0])) == pytest.approx(0.003, rel=1e-3)
 
 
 @pytest.mark.parametrize(("azimuth_deg", "expected"), [(0.0, 1.0), (180.0, 1.0), (60.0, 0.5)])
 def test_a_wall_takes_what_is_unsure_along_its_normal(
-    workspace: Path, azimuth_deg: float, expected: float
+    errors: ErrorsOfPoses, azimuth_deg: float, expected: float
 ):
-    model = read_model(workspace / "sparse")
-    errors = find_errors_of_poses(workspace, model)
-    assert errors is not None
     azimuth = np.deg2rad(azimuth_deg)
     normal = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-    found = errors.at(model.points_world, np.tile(normal, (len(model.points_world), 1)), 0.1)
+    places = errors.points_world
+    found = errors.at(places, np.tile(normal, (len(places), 1)), 0.1)
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 

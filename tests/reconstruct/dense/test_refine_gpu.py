@@ -19,15 +19,12 @@ import pytest
 
 from reconstruct.dense.refine_depth import ComparedView, prepare, refine
 from reconstruct.views.model import scaled_view
-from tests.oracles_dense import Scene, port_view, render, speckle
+from tests.oracles_dense import port_view, render
+from tests.reconstruct.dense.test_refine_depth import SCENE
 
 ROOT = Path(__file__).parents[3]
 SCALE = 1 / 7
 CENTRES = ([0.2, 0.3, 10.0], [0.2, 0.5, 10.0], [0.45, 0.3, 10.0], [0.2, 0.18, 10.02])
-SCENE = Scene(
-    depth_of=lambda n, e: 12.0 + 0.06 * np.sin(6 * n) * np.cos(5 * e) + 0.1 * n,
-    paint=speckle(),
-)
 
 REFINED = """
 import pickle, sys

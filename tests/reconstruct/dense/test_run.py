@@ -14,16 +14,16 @@ from reconstruct.dense import run
 from reconstruct.dense.stereo_pairs import in_frame
 from tests.oracles_dense import (
     Scene,
+    block_scene,
     flat,
     read_raster,
     sloped_with_step,
-    speckle,
     stereo_views,
     two_lines,
     write_workspace,
 )
 
-SCENE = Scene(depth_of=sloped_with_step, paint=speckle())
+SCENE = block_scene()
 CONFIG = SurveyConfig(reconstruct=ReconstructConfig())
 
 
@@ -36,6 +36,10 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_workspace(folder, VIEWS, SCENE)
     assert spec("dense").make(folder, CONFIG, SERIAL)
     return folder
+
+
+def bands(workspace: Path, *names: str) -> list[np.ndarray]:
+    return [read_raster(workspace / "dense" / f"{name}.tif")[0] for name in names]
 
 
 def middle(north: np.ndarray, east: np.ndarray) -> np.ndarray:
@@ -58,8 +62,7 @@ def test_surface_agrees_with_the_truth_edges_included(workspace: Path):
 
 def test_sigma_is_an_honest_bound(workspace: Path):
     height, north, east = read_raster(workspace / "dense" / "dem.tif")
-    sigma, _, _ = read_raster(workspace / "dense" / "sigma.tif")
-    count, _, _ = read_raster(workspace / "dense" / "count.tif")
+    sigma, count = bands(workspace, "sigma", "count")
     flat_part = middle(north, east) & (np.abs(north - 0.3) > 0.25) & (count > 0)
     error = (height + sloped_with_step(north, east))[flat_part]
     ratio = np.sqrt(np.mean(np.clip(error / sigma[flat_part], -5, 5) ** 2))
@@ -87,9 +90,7 @@ def test_cloud_lies_on_the_surface_with_normals_up(workspace: Path):
 
 def test_stations_and_slope(workspace: Path):
     _, north, east = read_raster(workspace / "dense" / "dem.tif")
-    count, _, _ = read_raster(workspace / "dense" / "count.tif")
-    stations, _, _ = read_raster(workspace / "dense" / "stations.tif")
-    slope, _, _ = read_raster(workspace / "dense" / "slope.tif")
+    count, stations, slope = bands(workspace, "count", "stations", "slope")
     assert (stations <= count).all()
     assert (2 * stations >= count).all()  # a station has two cameras
     assert np.median(stations[middle(north, east)]) >= 3
@@ -140,7 +141,7 @@ def test_pictures_without_texture_are_refused(tmp_path: Path):
 
 def test_what_one_stereo_pair_alone_sees_is_kept_with_an_honest_sigma(workspace: Path):
     height, north, east = read_raster(workspace / "dense" / "dem.tif")
-    sigma, _, _ = read_raster(workspace / "dense" / "sigma.tif")
+    (sigma,) = bands(workspace, "sigma")
     true = sloped_with_step(north, east)
     ground = np.stack([north.ravel(), east.ravel(), true.ravel()], axis=1)
     left, right = np.split(np.array([in_frame(view, ground) for view in VIEWS]), 2)

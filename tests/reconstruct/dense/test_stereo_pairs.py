@@ -13,9 +13,7 @@ from reconstruct.dense.stereo_pairs import (
     neighbours,
 )
 from reconstruct.views.model import points_of_views
-from tests.oracles_dense import ALTITUDE_M, Scene, flat, position_code, sparse_model, stereo_views
-
-SCENE = Scene(depth_of=flat, paint=position_code)
+from tests.oracles_dense import ALTITUDE_M, CODED, sparse_model, stereo_views
 
 
 def line(stations: int = 5) -> list:
@@ -24,7 +22,7 @@ def line(stations: int = 5) -> list:
 
 
 def test_rig_partner_comes_first_then_neighbours_ahead_and_astern():
-    model = sparse_model(line(), SCENE)
+    model = sparse_model(line(), CODED)
     middle = next(n for n, v in enumerate(model.views) if v.image == "left/002.png")
 
     chosen = choose_partners(model, per_view=3)[middle]
@@ -44,16 +42,16 @@ def test_rig_partner_comes_first_then_neighbours_ahead_and_astern():
 
 
 def test_pictures_without_overlap_are_refused():
-    views = sparse_model(line(2)[:2], SCENE).views
+    views = sparse_model(line(2)[:2], CODED).views
     away = RigidTransform.from_translation([30.0, 0.0, 0.0])
     far = replace(views[1], world_from_cam=away * views[1].world_from_cam)
-    for model in (sparse_model(line(1)[:1], SCENE), sparse_model([views[0], far], SCENE)):
+    for model in (sparse_model(line(1)[:1], CODED), sparse_model([views[0], far], CODED)):
         with pytest.raises(ReconstructionError):
             choose_partners(model, 4)
 
 
 def test_points_in_sight_are_all_that_lie_in_the_frame_and_near():
-    model = sparse_model(line(), SCENE, points=900)
+    model = sparse_model(line(), CODED, points=900)
     own = points_of_views(model)
     sight = PointsInSight(model)
     for number, (view, seen) in enumerate(zip(model.views, own, strict=True)):
@@ -80,7 +78,7 @@ def test_depths_of_a_pair_are_those_of_views_that_look_at_each_other(looks, expe
 
 
 def test_neighbours_share_most_points():
-    model = sparse_model(line(), SCENE)
+    model = sparse_model(line(), CODED)
     found = neighbours(model, 3)
     seen = [set(model.observations[model.observations[:, 1] == v, 0]) for v in range(10)]
     for view, others in enumerate(found):

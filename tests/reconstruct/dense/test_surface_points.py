@@ -103,7 +103,7 @@ def test_cells_fused_from_points_of_one_direction_equal_their_slow_twin(shared: 
         middle = one["enu"][:2]
         inside = (np.abs(places[:, :2] - middle) < CELL_M / 2).all(axis=1)
         height, sigma, n, places_met = fused(
-            points.enu[inside, 2], sigmas[inside], views[inside], STATIONS, 3.0, shared
+            points.enu[inside, 2], sigmas[inside], views[inside], STATIONS, shared
         )
         np.testing.assert_allclose(one["enu"][2], height, atol=1e-6)
         np.testing.assert_allclose(one["sigma"], sigma, rtol=1e-3)

@@ -40,20 +40,16 @@ def surface(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> MeasuredSurface:
     return placed
 
 
-def write(path: Path, crs: str | None, driver: str, layer: str = "seen") -> Path:
+def write(path: Path, crs: str | None, driver: str) -> Path:
     """The shapes in a coordinate system, with their labels in an attribute."""
     own = local_crs(DATUM).to_wkt()
-    shapes = [shape for some in SHAPES.values() for shape in some]
+    to = Transformer.from_crs(own, crs or own, always_xy=True)
+    shapes = np.array([shape for some in SHAPES.values() for shape in some], dtype=object)
     labels = np.array([name for name, some in SHAPES.items() for _ in some], dtype=object)
-    if crs is not None:
-        to = Transformer.from_crs(own, crs, always_xy=True)
-        shapes = [
-            shapely.transform(one, lambda xy: np.column_stack(to.transform(*xy.T)))
-            for one in shapes
-        ]
+    shapes = shapely.transform(shapes, lambda xy: np.column_stack(to.transform(*xy.T)))
     pyogrio.raw.write(
         path, np.array(shapely.to_wkb(shapes), dtype=object), [labels], ["Species"],
-        geometry_type="Polygon", crs=crs or own, driver=driver, layer=layer,
+        geometry_type="Polygon", crs=crs or own, driver=driver, layer="seen",
     )  # fmt: skip
     return path
 

@@ -1,5 +1,4 @@
 import json
-import struct
 import tracemalloc
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ import numpy as np
 import open3d as o3d
 import pyproj
 import pytest
+import trimesh
 
 from alice_survey.app.stages import spec
 from alice_survey.core.config import ReconstructConfig, SurveyConfig
@@ -44,35 +44,15 @@ class Tile:
     uv: np.ndarray
     page: np.ndarray
 
-    @property
-    def area(self) -> float:
-        p = self.enu.astype(np.float64)[self.triangles]
-        return 0.5 * np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=1).sum()
-
 
 def read_glb(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    content = path.read_bytes()
-    magic, version, length, size = struct.unpack("<4sIII", content[:16])
-    assert (magic, version, length) == (b"glTF", 2, len(content))
-    tree, binary = json.loads(content[20 : 20 + size]), content[28 + size :]
-
-    def view(number: int) -> bytes:
-        part = tree["bufferViews"][number]
-        return binary[part.get("byteOffset", 0) :][: part["byteLength"]]
-
-    def array(number: int, width: int) -> np.ndarray:
-        accessor = tree["accessors"][number]
-        kind = {5126: "<f4", 5125: "<u4", 5123: "<u2", 5121: "u1"}[accessor["componentType"]]
-        data = np.frombuffer(view(accessor["bufferView"])[accessor.get("byteOffset", 0) :], kind)
-        return data[: accessor["count"] * width].reshape(-1, width)
-
-    ((primitive,),) = [mesh["primitives"] for mesh in tree["meshes"]]
-    place = array(primitive["attributes"]["POSITION"], 3)
-    uv = array(primitive["attributes"]["TEXCOORD_0"], 2)
-    (image,) = tree["images"]
-    page = cv2.imdecode(np.frombuffer(view(image["bufferView"]), np.uint8), cv2.IMREAD_COLOR)
-    enu = place[:, [0, 2, 1]] * np.array([1, -1, 1], np.float32)  # as 3D Tiles turns y up to z up
-    return enu, array(primitive["indices"], 1).reshape(-1, 3).astype(np.int32), uv, page
+    assert int.from_bytes(path.read_bytes()[8:12], "little") == path.stat().st_size
+    (mesh,) = trimesh.load_scene(path, process=False).geometry.values()
+    page = np.asarray(mesh.visual.material.baseColorTexture.convert("RGB"))[..., ::-1].copy()
+    # as 3D Tiles turns y up to z up; v counts down in glTF
+    enu = mesh.vertices[:, [0, 2, 1]].astype(np.float32) * np.array([1, -1, 1], np.float32)
+    uv = (mesh.visual.uv * [1, -1] + [0, 1]).astype(np.float32)
+    return enu, np.asarray(mesh.faces, np.int32), uv, page
 
 
 def read_tiles(path: Path) -> list[Tile]:
@@ -142,11 +122,11 @@ def distances(points: np.ndarray, vertices: np.ndarray, triangles: np.ndarray) -
     return scene.compute_distance(o3d.core.Tensor(points.astype(np.float32))).numpy()
 
 
-def spread(vertices: np.ndarray, triangles: np.ndarray, seed: int = 3) -> np.ndarray:
+def spread(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Random points of a surface, (20000, 3)."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(3)
     p = vertices[triangles]
-    area = np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=1)
+    area = trimesh.triangles.area(p)
     face = rng.choice(len(p), 20_000, p=area / area.sum())
     a, b = np.sort(rng.random((2, len(face), 1)), axis=0)
     return a * p[face, 0] + (b - a) * p[face, 1] + (1 - b) * p[face, 2]
@@ -155,7 +135,8 @@ def spread(vertices: np.ndarray, triangles: np.ndarray, seed: int = 3) -> np.nda
 def test_finest_tiles_are_the_surface_once(survey: Path, tiles: list[Tile]):
     read = o3d.io.read_triangle_mesh(str(survey / "mesh" / "mesh.ply"))
     leaves = [tile for tile in tiles if tile.level == 0]
-    assert sum(tile.area for tile in leaves) == pytest.approx(read.get_surface_area(), rel=0.01)
+    areas = (trimesh.Trimesh(t.enu, t.triangles, process=False).area for t in leaves)
+    assert sum(areas) == pytest.approx(read.get_surface_area(), rel=0.01)
 
     def miss(v: np.ndarray) -> float:
         return float(np.sqrt(np.mean((v[:, 2] + OFFSET[2] + bump(v[:, 1], v[:, 0])) ** 2)))
@@ -242,16 +223,12 @@ def test_root_is_where_pyproj_puts_it(survey: Path, tiles: list[Tile]):
 
 def test_a_survey_smaller_than_a_stray_is_meshed(tmp_path: Path):
     east, north = (a.ravel() for a in np.mgrid[0:12, 0:12] * STEP_M)
-    points = np.zeros(len(east), VERTEX)
-    points["x"], points["y"], points["nz"], points["sigma"] = east, north, 1.0, 1e-3
-    write_cloud(tmp_path / "cloud.ply", [points], OFFSET, FRAME)
-
+    write_points(tmp_path / "cloud.ply", east, north, np.zeros((2, len(east))))
     mesh, _ = surface.mesh_cloud(
         open_cloud(tmp_path / "cloud.ply"), STEP_M, ERROR_M, tmp_path, SERIAL
     )
 
-    a, b, c = mesh.vertices[mesh.triangles].transpose(1, 0, 2)
-    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    area = trimesh.Trimesh(mesh.vertices, mesh.triangles, process=False).area
     assert 9**2 < area / STEP_M**2 < 15**2
     assert np.abs(mesh.vertices[:, 2]).max() < ERROR_M
 
@@ -286,10 +263,14 @@ def test_memory_of_a_pass_is_that_of_a_cell(tmp_path: Path, monkeypatch: pytest.
 def write_ripples(path: Path, length_m: float) -> None:
     """A cloud of waves, so long and as wide as two of the finest tiles."""
     north, east = (a.ravel() for a in np.mgrid[0:length_m:STEP_M, 0:0.5:STEP_M])
+    phase = 2 * np.pi * north / 0.15
+    wave = 0.01 * np.array([np.sin(phase), 2 * np.pi / 0.15 * np.cos(phase)])
+    write_points(path, east, north, wave)
+
+
+def write_points(path: Path, east: np.ndarray, north: np.ndarray, wave: np.ndarray) -> None:
+    """A cloud whose height and slope to the north are the two rows of a wave."""
     points = np.zeros(len(north), VERTEX)
-    points["x"], points["y"] = east, north
-    points["z"] = 0.01 * np.sin(2 * np.pi * north / 0.15)
-    slope = 0.01 * 2 * np.pi / 0.15 * np.cos(2 * np.pi * north / 0.15)
-    points["ny"], points["nz"] = -slope / np.hypot(slope, 1), 1 / np.hypot(slope, 1)
-    points["sigma"] = 1e-3
+    points["x"], points["y"], points["z"], points["sigma"] = east, north, wave[0], 1e-3
+    points["ny"], points["nz"] = np.array([-wave[1], np.ones(len(north))]) / np.hypot(wave[1], 1)
     write_cloud(path, [points], OFFSET, FRAME)

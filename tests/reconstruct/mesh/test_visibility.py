@@ -8,24 +8,16 @@ import pytest
 
 from reconstruct.mesh.visibility import see_faces
 from reconstruct.views.model import View
-from tests.oracles_dense import (
-    DEPTH_M,
-    Scene,
-    flat,
-    position_code,
-    stereo_views,
-    write_workspace,
-)
+from tests.oracles_dense import CODED, DEPTH_M, stereo_views, write_workspace
 
 STEP_M = 0.02
-SCENE = Scene(depth_of=flat, paint=position_code)
 VIEWS = stereo_views(np.array([0.0]), np.array([0.0]))
 
 
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("visibility")
-    write_workspace(folder, VIEWS, SCENE)
+    write_workspace(folder, VIEWS, CODED)
     return folder
 
 

@@ -1,19 +1,19 @@
 """Occluders off the heights of a plane, and what they hide from a view, in closed form."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.executor import local_executor
-from camera_calib.approximation.pinhole_warp import Pinhole
 from reconstruct.mosaic.visibility import Occluders, find_occluders, hidden_by, read_occluders
 from reconstruct.planes import LEVEL_PLANE
 from reconstruct.ply import VERTEX, write_ply
 from reconstruct.raster import DemGrid, tiled_raster
 from reconstruct.views.model import View
-from tests.oracles_dense import FRAME, view_at
+from tests.oracles_dense import FRAME, PINHOLE, view_at
 
 CELL_M = 0.01
 POLE_M = 0.1
@@ -69,7 +69,8 @@ def view_from(place_enu: np.ndarray, at_enu: np.ndarray) -> View:
     right = np.cross([0.0, 0.0, 1.0], ahead)
     right /= np.linalg.norm(right)
     rotation = Rotation.from_matrix(np.stack([right, np.cross(ahead, right), ahead], axis=1))
-    pinhole = Pinhole(
+    pinhole = replace(
+        PINHOLE,
         width_px=SIZE_PX[0],
         height_px=SIZE_PX[1],
         fx_px=500.0,

@@ -112,21 +112,6 @@ def test_nothing_is_painted_where_the_surface_is_unknown(workspace: Path):
     assert (rgba[:3][:, rgba[3] == 0] == 0).all()
 
 
-def test_it_is_a_cloud_optimised_rgba_with_overviews(workspace: Path):
-    with rasterio.open(workspace / "mosaic" / "mosaic.tif") as raster:
-        assert raster.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
-        assert raster.count == 4
-        assert raster.colorinterp[3] == rasterio.enums.ColorInterp.alpha
-        assert "Azimuthal" in raster.crs.to_wkt()
-        assert raster.tags()["VERTICAL_DATUM"] == "sea surface"
-        size = raster.width, raster.height
-    about = read_json(workspace / "mosaic" / "mosaic.json")
-    assert (about["width_px"], about["height_px"]) == size
-    assert 0.6 < about["covered"] < 1.0
-    thumbnail = cv2.imread(str(workspace / "mosaic" / "mosaic.png"), cv2.IMREAD_UNCHANGED)
-    assert thumbnail.shape == (size[1], size[0], 4)
-
-
 def test_source_names_the_picture_nearest_to_straight_above(workspace: Path):
     with rasterio.open(workspace / "mosaic" / "mosaic_source.tif") as raster:
         source = raster.read(1)

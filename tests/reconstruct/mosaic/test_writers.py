@@ -77,6 +77,8 @@ def test_a_strip_across_a_large_box_takes_little(side_px: int, tmp_path: Path):
     ):
         assert mosaic.shape == source.shape == (side_px, side_px)
         assert mosaic.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+        assert mosaic.colorinterp[3] == rasterio.enums.ColorInterp.alpha
+        assert mosaic.tags()["VERTICAL_DATUM"] == "sea surface"
         assert mosaic.transform == source.transform == transform_of(grid)
         assert all("Azimuthal_Equidistant" in one.crs.to_wkt() for one in (mosaic, source))
         assert mosaic.overviews(1)[-1] >= side_px / 1024
