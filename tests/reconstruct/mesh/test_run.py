@@ -59,11 +59,9 @@ def write_dense(folder: Path, images: list[str]) -> None:
     points["sigma"] = 1e-3
     write_cloud(dense / "cloud.ply", [points], OFFSET, FRAME)
     write_cloud_json(dense / "cloud.json", len(points), OFFSET, STEP_M, FRAME)
-    light = LightModel(
-        patterns={camera: np.zeros((*GRID, 3)) for camera in ("left", "right")},
-        gains={image: np.zeros(3) for image in images},
-        white=np.ones(3),
-    )
+    patterns = {camera: np.zeros((*GRID, 3)) for camera in ("left", "right")}
+    gains = {image: np.zeros(3) for image in images}
+    light = LightModel(patterns=patterns, gains=gains, white=np.ones(3))
     write_light(dense / "light.json", light)
     write_json(dense / "stage.json", {})
 

@@ -93,6 +93,11 @@ def test_every_pixel_shows_its_own_coordinates(workspace: Path):
     rgba, north, east = read(workspace)
     known = rgba[3] > 0
     assert known.mean() > 0.6
+    about = read_json(workspace / "mosaic" / "mosaic.json")
+    assert (about["height_px"], about["width_px"]) == known.shape
+    assert 0.6 < about["covered"] < 1.0
+    thumbnail = cv2.imread(str(workspace / "mosaic" / "mosaic.png"), cv2.IMREAD_UNCHANGED)
+    assert thumbnail.shape == (*known.shape, 4)
     expected = position_code(north, east)
     levels_per_m = 100 * 2 * np.pi / PERIOD_M
     for band, channel in ((2, 0), (1, 1)):
