@@ -43,12 +43,10 @@ def test_larger_cubes_take_the_weighted_mean_of_their_points():
     surface = random_surface()
     sigmas = np.hypot(surface["sigma"].astype(float), surface["shared"])
     vertices = vertices_of(surface, 0.05, 0.1)
-    cubes: dict[tuple[int, int, int], list[int]] = {}
-    for number, (east, north, up) in enumerate(surface["enu"].astype(np.float64).tolist()):
-        cubes.setdefault((int(east // 0.1), int(north // 0.1), int(up // 0.1)), []).append(number)
-    assert len(vertices) == len(cubes)
-    for vertex, key in zip(vertices, sorted(cubes), strict=True):
-        members = cubes[key]
+    cubes = surface["enu"].astype(np.float64) // 0.1
+    _, cube = np.unique(cubes, axis=0, return_inverse=True)
+    for number, vertex in zip(range(cube.max() + 1), vertices, strict=True):
+        members = np.flatnonzero(cube.ravel() == number)
         w = 1 / sigmas[members] ** 2
         place = np.average(surface["enu"][members], axis=0, weights=w)
         np.testing.assert_allclose([vertex["x"], vertex["y"], vertex["z"]], place, atol=1e-5)

@@ -224,12 +224,8 @@ def test_a_cell_is_odd_where_others_agree_on_something_else():
         return np.tile((level + box)[:, None], (1, 3)).astype(np.float32)
 
     own = np.stack([light(0.0), light(1.0), light(0.05), light(1.0)])
-    shown = np.stack(
-        [
-            np.stack([light(v) for v in row])
-            for row in ((0.0, 0.0, 0.0, 0.0), (0.02, 0.02, 0.02, 2.0), (0.01, 0.01, 0.01, 4.0))
-        ]
-    )
+    levels = ((0.0, 0.0, 0.0, 0.0), (0.02, 0.02, 0.02, 2.0), (0.01, 0.01, 0.01, 4.0))
+    shown = np.array([[light(v) for v in row] for row in levels])
     sigma = np.full(3, 0.1, np.float32)
     misfit, votes = find_odd(own, shown, np.array([0, 1, 2]), sigma, 2.0)
     np.testing.assert_allclose(misfit[:3], [0.0, (1.0 - 0.11) / 0.1, 0.0], atol=1e-4)

@@ -97,8 +97,7 @@ def test_refinement_finds_the_surface_from_a_blurred_start_and_says_how_well():
     known = np.isfinite(found.depth)
     assert known.mean() > 0.85
     error = (found.depth - true)[known]
-    before = np.sqrt(np.mean(wrong**2))
-    after = np.sqrt(np.mean(error**2))
+    before, after = (np.sqrt(np.mean(one**2)) for one in (wrong, error))
     assert before > 0.004
     assert 1e-4 < after < 0.4 * before  # 1.5 mm, rims that one neighbour sees included
     assert 0.3 < 1.4826 * np.median(np.abs(error / found.sigma[known])) < 3.0
