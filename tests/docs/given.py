@@ -89,26 +89,27 @@ def _on_one_core() -> None:
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
 
 
+def _bring(folder: Path, *paths: Path) -> None:
+    """Copy files and folders under their own names."""
+    for path in paths:
+        (shutil.copytree if path.is_dir() else shutil.copy)(path, folder / path.name)
+
+
 def _reef(folder: Path, made: Made) -> None:
-    shutil.copytree(made.reef, folder / "reef")
-    _area(folder, made)
-
-
-def _area(folder: Path, made: Made) -> None:
-    """What the settings of the survey name by a path relative to its workspace."""
-    shutil.copy(made.reef.parent / "area.geojson", folder)
+    # Settings name the area by a path relative to their workspace.
+    _bring(folder, made.reef, made.reef.parent / "area.geojson")
 
 
 def _planned(folder: Path, made: Made) -> None:
     """Only settings: what follows, the page's commands make."""
     (folder / "reef").mkdir()
-    shutil.copy(made.reef / "survey.toml", folder / "reef")
-    _area(folder, made)
+    _bring(folder / "reef", made.reef / "survey.toml")
+    _bring(folder, made.reef.parent / "area.geojson")
 
 
 def _cameras(folder: Path, made: Made) -> None:
     files.boards(folder, air=True)
-    shutil.copytree(made.pool, folder / "pool")
+    _bring(folder, made.pool)
 
 
 def _certificate(folder: Path, made: Made) -> None:
@@ -133,7 +134,7 @@ def _stereo(folder: Path, made: Made) -> None:
 
 
 def _own_camera(folder: Path, made: Made) -> None:
-    shutil.copytree(made.pool, folder / "pool")
+    _bring(folder, made.pool)
     for name, kind in (("camchain.yaml", "kalibr"), ("stereo.yml", "opencv")):
         files.calibrated_in_air(folder / name, kind)
 
@@ -142,8 +143,7 @@ def _own_vehicle(folder: Path, made: Made) -> None:
     files.vehicle_logs(made.reef, folder)
     files.own_logs(folder)
     (folder / "surveyed").mkdir()
-    shutil.copy(made.reef / "survey.toml", folder / "surveyed")
-    shutil.copytree(made.reef / "plan", folder / "surveyed/plan")
+    _bring(folder / "surveyed", made.reef / "survey.toml", made.reef / "plan")
 
 
 def _identified(folder: Path, made: Made) -> None:
@@ -178,15 +178,14 @@ def _divers(folder: Path, made: Made) -> None:
 
 def _no_navigation(folder: Path, made: Made) -> None:
     """The model that the page on real pictures made, without the length it was given."""
-    shutil.copytree(made.after("real-pictures.md") / "dive", folder / "dive")
+    _bring(folder, made.after("real-pictures.md") / "dive")
     (folder / "dive/scale.json").unlink()
     _few_features(folder)
 
 
 def _colour_camera(folder: Path, made: Made) -> None:
-    shutil.copytree(made.dive, folder / "dive")
+    _bring(folder, made.dive, made.reef / "calibration/rig.json")
     shutil.copytree(made.reef / "images/left", folder / "pictures")
-    shutil.copy(made.reef / "calibration/rig.json", folder)
 
 
 def _big_survey(folder: Path, made: Made) -> None:

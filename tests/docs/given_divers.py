@@ -1,15 +1,16 @@
 """What a diver brings home: chapters of a GoPro, a dive computer's log, a mixed card."""
 
+from collections.abc import Iterable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from tests.reconstruct.pictures import gopro
+from tests.reconstruct.pictures.dated import save
 
 WIDTH, HEIGHT, FOCAL_PX = 320, 240, 290.0
 RATE_HZ = 5.0
@@ -20,7 +21,7 @@ FLOOR_M = 12.0
 _SHEET_PX_M, _MARGIN_M, _SIDE_M = 250, 1.5, 5.2
 
 
-def _relief_m(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+def relief_m(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
     """Height of the floor over its mean."""
     return 0.10 * np.sin(3.1 * x) + 0.08 * np.cos(4.3 * y + x) + 0.05 * np.sin(9 * x + 2 * y)
 
@@ -43,14 +44,14 @@ def _seen(
     rays = turn.apply(rays.reshape(-1, 3)).reshape(HEIGHT, WIDTH, 3)
     hit = place_m - rays * (place_m[2] / rays[..., 2])[..., None]
     for _ in range(12):
-        down = -_relief_m(hit[..., 0], hit[..., 1])
+        down = -relief_m(hit[..., 0], hit[..., 1])
         hit = place_m + rays * ((down - place_m[2]) / rays[..., 2])[..., None]
     x, y = (((hit[..., i] + _MARGIN_M) * _SHEET_PX_M - 0.5).astype(np.float32) for i in (0, 1))
     grey = cv2.remap(sheet, x, y, cv2.INTER_LINEAR)
     return np.repeat(np.asarray(grey, np.uint8)[..., None], 3, axis=2)
 
 
-def _path() -> NDArray[np.float64]:
+def path_m() -> NDArray[np.float64]:
     """(N, 3) metres: three lines of 2.2 m, 0.55 m apart, up and down by a decimetre."""
     along, across = np.linspace(0.0, 2.2, 26), np.linspace(0.0, 0.55, 7)[1:-1]
     parts = []
@@ -63,18 +64,25 @@ def _path() -> NDArray[np.float64]:
     return np.column_stack([flat, -1.2 - 0.12 * np.sin(np.arange(len(flat)) / 11)])
 
 
+def pose(frame: int) -> tuple[NDArray[np.float64], Rotation]:
+    """Where a frame of the dive was taken."""
+    angles = [6 * np.sin(frame / 5), 7 * np.cos(frame / 7), 4 * np.sin(frame / 9)]
+    return path_m()[frame], Rotation.from_euler("xyz", angles, degrees=True)
+
+
+def dive_frames(numbers: Iterable[int]) -> list[NDArray[np.uint8]]:
+    """What the camera sees on the way."""
+    side = round(_SIDE_M * _SHEET_PX_M)
+    sheet = grains(np.random.default_rng(7), (side, side))
+    return [_seen(sheet, *pose(number)) for number in numbers]
+
+
 def chapters(folder: Path) -> None:
     """Write `GX010042.MP4`, `GX020042.MP4` and `computer.csv`; each sixth frame is blurred."""
-    rng = np.random.default_rng(7)
-    side = round(_SIDE_M * _SHEET_PX_M)
-    sheet, places = grains(rng, (side, side)), _path()
-    frames = []
-    for i, place in enumerate(places):
-        angles = [6 * np.sin(i / 5), 7 * np.cos(i / 7), 4 * np.sin(i / 9)]
-        frame = _seen(sheet, place, Rotation.from_euler("xyz", angles, degrees=True))
-        if i % 6 == 2:
-            frame = np.asarray(cv2.GaussianBlur(frame, (0, 0), 1.6), np.uint8)
-        frames.append(frame)
+    places = path_m()
+    frames = dive_frames(range(len(places)))
+    for i in range(2, len(frames), 6):
+        frames[i] = np.asarray(cv2.GaussianBlur(frames[i], (0, 0), 1.6), np.uint8)
     half = len(frames) // 2
     for name, part in (("GX010042", frames[:half]), ("GX020042", frames[half:])):
         gopro.film(folder / f"{name}.MP4", part, RATE_HZ, created=LOCAL)
@@ -93,12 +101,10 @@ def card(folder: Path) -> None:
         ("100OLYMP", "P701", "OLYMPUS", "TG-6", (300, 400), 6),
     )
     for inside, prefix, make, model, size, count in makes:
-        (folder / inside).mkdir(parents=True)
         for number in range(count):
-            exif = Image.Exif()
-            exif[0x010F], exif[0x0110], exif[0x0112] = make, model, (1, 6)[number % 2]
-            picture = Image.fromarray(grains(rng, size)).convert("RGB")
-            picture.save(folder / inside / f"{prefix}{number:04d}.jpg", exif=exif, quality=90)
+            tags = {"make": make, "model": model, "orientation": (1, 6)[number % 2]}
+            picture = np.repeat(grains(rng, size)[..., None], 3, axis=2)
+            save(folder / inside / f"{prefix}{number:04d}.jpg", picture, **tags)
     first = folder / "100GOPRO" / "GOPR0003.jpg"
     first.with_name("GOPR0003 copy.jpg").write_bytes(first.read_bytes())
     (folder / "notes.txt").write_text("12 m, visibility 8 m\n")

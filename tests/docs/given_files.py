@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from alice_survey.core.artefacts import write_csv
 from alice_survey.core.config import CameraConfig, WaterConfig
 from alice_survey.core.frames import Array, Datum, rotation_from_attitude
 from alice_survey.sim.vehicle.log import write_vehicle_log
@@ -22,13 +24,15 @@ from camera_calib.formats.convert import FORMATS
 from camera_calib.rig import Rig, design_rig
 from camera_calib.targets.target import parse_target
 from missions.logs.ros_builder import flipped_quaternion
-from tests.alice_survey.sim.vehicle.identification.manoeuvres import fly, hidden, measured
+from tests.alice_survey.sim.vehicle.identification.manoeuvres import fly, measured
 from tests.camera_calib.calibration_scenes import board_poses, in_air
 from tests.cameras import changed
+from tests.docs.pages import DOCS, written
 from tests.missions.logs.log_files import Bag, dataflash_log, tlog
 from tests.missions.logs.test_import_ulog import dive as px4_dive
 from tests.missions.logs.test_import_ulog import ulog
 from tests.oracles_targets import light_through, to_srgb
+from tests.reconstruct.pictures.dated import save
 
 SAID = datetime(2024, 5, 1, 9, 0, 0, tzinfo=UTC)
 """When the simulated flight is said to have begun."""
@@ -46,12 +50,9 @@ def rows_of(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def flown_rows(reef: Path, every: int) -> list[dict[str, float]]:
-    """Rows of the navigation of the flight."""
-    return [
-        {name: float(value or "nan") for name, value in row.items()}
-        for row in rows_of(reef / "flight/navigation.csv")[::every]
-    ]
+def flown_rows(reef: Path, every: int) -> NDArray[Any]:
+    """Rows of the navigation of the flight, with named columns."""
+    return np.genfromtxt(reef / "flight/navigation.csv", delimiter=",", names=True)[::every]
 
 
 def boards(folder: Path, *, air: bool) -> None:
@@ -132,28 +133,19 @@ def photos(
         for row in rows_of(reef / "images/manifest.csv")
         if row["camera"] == camera
     }
-    folder.mkdir(parents=True)
     for number, station in enumerate(stations, start=1):
-        row, exif = rows[station], Image.Exif()
+        row = rows[station]
         taken = SAID + timedelta(seconds=float(row["time_s"]) + late_s)
-        exif.get_ifd(0x8769).update(
-            {0x9003: f"{taken:%Y:%m:%d %H:%M:%S}", 0x9291: f"{taken.microsecond // 1000:03d}"}
-        )
-        if gps:
-            place = [float(row[name]) for name in ("latitude_deg", "longitude_deg")]
-            exif.get_ifd(0x8825).update(
-                {1: "N", 2: _sexagesimal(place[0]), 3: "E", 4: _sexagesimal(place[1])}
-            )
         picture = cv2.imread(str(reef / f"images/{camera}/{station:06d}.png"))
         if width_px is not None:
             picture = shrunk(picture, width_px)
-        image = Image.fromarray(np.ascontiguousarray(picture[..., ::-1]))
-        image.save(folder / f"DSC{number:04d}.jpg", exif=exif, quality=95)
-
-
-def _sexagesimal(value: float) -> tuple[int, int, float]:
-    minutes = value % 1 * 60
-    return int(value), int(minutes), minutes % 1 * 60
+        save(
+            folder / f"DSC{number:04d}.jpg",
+            np.ascontiguousarray(picture[..., ::-1]),
+            taken=f"{taken:%Y:%m:%d %H:%M:%S}",
+            fraction=f"{taken.microsecond // 1000:03d}",
+            gps=(float(row["latitude_deg"]), float(row["longitude_deg"]), 0.0) if gps else None,
+        )
 
 
 def masks(pictures: Path, folder: Path) -> None:
@@ -179,16 +171,13 @@ def film(reef: Path, path: Path, stations: Iterable[int]) -> None:
 
 def navigation(reef: Path, path: Path, *, dated: bool) -> None:
     """Write the navigation of the flight at 4 Hz, with dates instead of seconds if requested."""
-    rows = rows_of(reef / "flight/navigation.csv")[::5]
-    with path.open("w", newline="") as file:
-        names = list(rows[0])
-        names[0] = "time_utc" if dated else "time_s"
-        writer = csv.DictWriter(file, names)
-        writer.writeheader()
-        for row in rows:
-            seconds = float(row.pop("time_s"))
-            when = (SAID + timedelta(seconds=seconds)).isoformat() if dated else f"{seconds:.3f}"
-            writer.writerow({names[0]: when, **row})
+    header, *rows = (reef / "flight/navigation.csv").read_text().splitlines()
+    lines = [header.replace("time_s", "time_utc") if dated else header]
+    for row in rows[::5]:
+        seconds, others = row.split(",", 1)
+        when = (SAID + timedelta(seconds=float(seconds))).isoformat() if dated else seconds
+        lines.append(f"{when},{others}")
+    path.write_text("\n".join(lines) + "\n")
 
 
 def vehicle_logs(reef: Path, folder: Path) -> None:
@@ -206,10 +195,8 @@ def vehicle_logs(reef: Path, folder: Path) -> None:
         # A range is along the body's axis.
         slant_m = row["altitude_m"] / (math.cos(turned[0]) * math.cos(turned[1]))
         heard = math.isfinite(slant_m)
-        bag.add_nav_sts(
-            round(now.timestamp() * 1e9), place, turned, row["altitude_m"] if heard else -1.0
-        )
         stamp = round(now.timestamp() * 1e9)
+        bag.add_nav_sts(stamp, place, turned, row["altitude_m"] if heard else -1.0)
         dvl.add_dvl(stamp, "/dvl/data", (0.2, 0.0, 0.0), slant_m, valid=heard)
         attitude = flipped_quaternion(rotation_from_attitude(*turned).as_quat())
         dvl.add_imu(stamp, "/imu", "imu", attitude)
@@ -246,21 +233,16 @@ def vehicle_logs(reef: Path, folder: Path) -> None:
     (folder / "dvl.json").write_text("".join(reports))
     (folder / "00000042.BIN").write_bytes(dataflash_log(messages))
     (folder / "dive.tlog").write_bytes(tlog(records))
-    with (folder / "tides.csv").open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["time_utc", "height_m"])
-        for hours, height_m in ((-1, 0.30), (0, 0.22), (1, 0.14)):
-            writer.writerow([(SAID + timedelta(hours=hours)).isoformat(), height_m])
+    tides = ((-1, 0.30), (0, 0.22), (1, 0.14))
+    heights = [((SAID + timedelta(hours=hours)).isoformat(), m) for hours, m in tides]
+    write_csv(folder / "tides.csv", ["time_utc", "height_m"], heights)
 
 
 def robot_bag(reef: Path, path: Path, stations: Iterable[int], width_px: int) -> None:
     """Write small pictures of some stations, and what a DVL, an IMU and a depth sensor said."""
     rows = flown_rows(reef, 5)
-    time_s = np.array([row["time_s"] for row in rows])
-    place = np.array(
-        [[row[n] for n in ("latitude_deg", "longitude_deg", "depth_m")] for row in rows]
-    )
-    speed = np.gradient(Datum(*place[0, :2]).ned_from_geodetic(place), time_s, axis=0)
+    place = np.column_stack([rows[n] for n in ("latitude_deg", "longitude_deg", "depth_m")])
+    speed = np.gradient(Datum(*place[0, :2]).ned_from_geodetic(place), rows["time_s"], axis=0)
     bag = Bag(1)
     for row, velocity in zip(rows, speed, strict=True):
         stamp = round((SAID + timedelta(seconds=row["time_s"])).timestamp() * 1e9)
@@ -282,55 +264,10 @@ def robot_bag(reef: Path, path: Path, stations: Iterable[int], width_px: int) ->
     bag.write(path)
 
 
-def manoeuvres(folder: Path) -> None:
-    """Write `turns.csv` and `second.csv`: manoeuvres of an ALICE with more drag than is known."""
-    truth = hidden({"X_uu": -16.0, "Y_vv": -240.0, "N_rr": -95.0})
-    rng = np.random.default_rng(11)
-    for name, current, seconds in (
-        ("turns.csv", (0.05, -0.03), 40.0),
-        ("second.csv", (0.0, 0.04), 24.0),
-    ):
-        log = measured(fly(truth, duration_s=seconds, current=current), rng)
-        write_vehicle_log(folder / name, log)
-
-
-OWN_VEHICLE = """
-name = "own"
-[rigid_body]
-dry_kg = 30.0
-buoyancy_kg = 30.2
-entrained_kg = 4.0
-cg_body_m = [0.0, 0.0, 0.02]
-inertia_kg_m2 = [0.6, 1.9, 2.1]
-[coefficients]
-X_udot = -4.0
-Y_vdot = -24.0
-Z_wdot = -26.0
-K_pdot = -0.3
-M_qdot = -1.5
-N_rdot = -1.6
-X_uu = -21.0
-Y_vv = -110.0
-Z_ww = -130.0
-K_pp = -2.0
-M_qq = -9.0
-N_rr = -7.0
-""" + "".join(
-    f"""
-[[thrusters]]
-name = "{name}"
-position_body_m = {place}
-direction_body = {way}
-diameter_m = 0.076
-kt_forward = 0.47
-kt_reverse = 0.40
-time_constant_s = 0.15
-"""
-    for name, place, way in (
-        ("port", [-0.4, -0.2, 0.0], [1.0, 0.0, 0.0]),
-        ("starboard", [-0.4, 0.2, 0.0], [1.0, 0.0, 0.0]),
-        ("vertical", [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]),
-    )
+OWN_VEHICLE = (
+    written(DOCS / "how-to/own-vehicle.md", "own.toml")
+    .replace("X_uu = -15.0", "X_uu = -21.0")
+    .replace("N_rr = -10.0", "N_rr = -7.0")
 )
 """A vehicle with three thrusters; what its owner knows of it stands in the page on it."""
 

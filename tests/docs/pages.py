@@ -70,6 +70,12 @@ def script_of(page: Path) -> str:
     return "\n".join(parts)
 
 
+def written(page: Path, name: str) -> str:
+    """A file that a page writes."""
+    text = page.read_text(encoding="utf-8")
+    return re.findall(rf"^cat > {re.escape(name)} <<'END'\n(.*?)^END$", text, re.M | re.S)[0]
+
+
 def without_fences(content: str) -> str:
     """A text without its blocks of code."""
     return _FENCE.sub("", content)

@@ -1,6 +1,5 @@
 """The vehicle of the how-to, one that hovers and one that fins steer, over the tutorial's area."""
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -13,17 +12,9 @@ from missions.coverage.certificate import certificate
 from missions.coverage.stations import plan_pattern, stations_of_flight
 from missions.fly.simulation import flight_settings, simulate_plan
 from missions.plan.planner import plan_survey
-from tests.docs.pages import DOCS
+from tests.docs.pages import DOCS, written
 
 _DEPTH_M = 6.0
-
-
-def written(page: Path, name: str) -> str:
-    """A file that a page writes."""
-    text = page.read_text(encoding="utf-8")
-    found = re.search(rf"^cat > {re.escape(name)} <<'END'\n(.*?)^END$", text, re.M | re.S)
-    assert found is not None
-    return found[1]
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from reconstruct.placing.control_points import read_control, read_picks
 from tests.alice_survey.app.studio.client import ask, looks_at, serving, still
@@ -143,20 +142,14 @@ def test_control_points_are_picked_and_their_residuals_shown(
         assert heard.complaints == []
 
 
-def pose(frame: int) -> tuple[Point, Rotation]:
-    """Where a frame of the dive was taken."""
-    angles = [6 * np.sin(frame / 5), 7 * np.cos(frame / 7), 4 * np.sin(frame / 9)]
-    return dive._path()[frame], Rotation.from_euler("xyz", angles, degrees=True)
-
-
 def floor(x: float, y: float) -> Point:
     """A point of the floor."""
-    return np.array([x, y, -float(dive._relief_m(np.array(x), np.array(y)))])
+    return np.array([x, y, -float(dive.relief_m(np.array(x), np.array(y)))])
 
 
 def seen(frame: int, point: Point) -> Point:
     """Pixel at which a frame shows a point, as viewers count."""
-    place, turn = pose(frame)
+    place, turn = dive.pose(frame)
     ray = turn.inv().apply(point - place)
     middle = np.array([dive.WIDTH / 2, dive.HEIGHT / 2])
     return middle + dive.FOCAL_PX * ray[:2] / ray[2] - 0.5
@@ -164,14 +157,10 @@ def seen(frame: int, point: Point) -> Point:
 
 def card(folder: Path) -> list[int]:
     """A diver's pictures without any calibration; the frames that they are."""
-    rng = np.random.default_rng(7)
-    side = round(dive._SIDE_M * dive._SHEET_PX_M)
-    sheet = dive.grains(rng, (side, side))
-    frames = list(range(0, len(dive._path()), 2))
+    frames = list(range(0, len(dive.path_m()), 2))
     folder.mkdir()
-    for frame in frames:
-        place, turn = pose(frame)
-        cv2.imwrite(str(folder / f"P{frame:04d}.png"), dive._seen(sheet, place, turn))
+    for frame, picture in zip(frames, dive.dive_frames(frames), strict=True):
+        cv2.imwrite(str(folder / f"P{frame:04d}.png"), picture)
     return frames
 
 
