@@ -87,13 +87,11 @@ def test_a_survey_of_a_wall_alone_is_reported_on_its_own_axes(tmp_path: Path) ->
     assert spec("report").make(workspace, SurveyConfig(), SERIAL)
     page = (workspace / "report" / "report.html").read_text(encoding="utf-8")
     shown = json.loads(re.findall(r'id="map-data">(.*?)</script>', page)[0])
-    assert {layer["name"] for layer in shown["layers"]}.isdisjoint(
-        {"cameras", "footprints", "plan"}
-    )
+    names = {layer["name"] for layer in shown["layers"]}
+    assert names.isdisjoint({"cameras", "footprints", "plan"})
     assert shown["axes"] == ["right", "up"]
-    assert (
-        json.loads((workspace / "report" / "report.json").read_text())["surface"]["covered"] is None
-    )
+    data = json.loads((workspace / "report" / "report.json").read_text())
+    assert data["surface"]["covered"] is None
 
 
 def test_that_no_picture_looks_at_a_plane_is_known_from_a_mosaic_alone(tmp_path: Path) -> None:

@@ -72,6 +72,14 @@ class Reply:
         return json.loads(self.body)
 
 
+def refused(reply: Reply, status: int = 400) -> str:
+    """The one line that says why a request was refused."""
+    assert reply.status == status, reply.text
+    line = str(reply.json["error"])
+    assert "\n" not in line.strip()
+    return line
+
+
 @contextlib.contextmanager
 def serving(folder: Path, **options: Any) -> Iterator[Server]:
     """A server that runs in a thread within this block; options are the server's."""

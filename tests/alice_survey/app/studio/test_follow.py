@@ -1,7 +1,6 @@
 """The endpoints of a dive that is followed, by its growing log."""
 
 import io
-import json
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -18,17 +17,16 @@ from tests.missions.follow.dives import text_of, workspace_of
 from tests.missions.follow.test_dive import BROKEN, PLAN, ROWS, UNTIL_S
 
 
-def state(server: Server) -> dict[str, Any]:
+def state(server: Server) -> Any:
     reply = ask(server, "/api/follow/state")
     assert reply.status == 200, reply.text
-    found: dict[str, Any] = json.loads(reply.text)
-    return found
+    return reply.json
 
 
-def wait_for(server: Server, true: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+def wait_for(server: Server, true: Callable[[Any], bool]) -> Any:
     """The first state of which something is true."""
 
-    def seen() -> dict[str, Any] | None:
+    def seen() -> Any:
         found = state(server)
         return found if found.get("fix") and true(found) else None
 
@@ -55,11 +53,11 @@ def test_a_dive_is_followed_from_its_log_to_its_missions(dive: tuple[Server, Pat
     assert now["coverage"]["expected_at_overlap"] > now["coverage"]["at_overlap"]
     assert now["logs"] == ["nav.csv"]
     assert not now["is_silent"]
-    heard = json.loads(ask(server, "/api/follow/dive").text)
+    heard = ask(server, "/api/follow/dive").json
     assert [line["state"] for line in heard["lines"][:4]] == ["done", "done", "done", "now"]
     assert len(heard["holes"]) == now["holes"]["count"]
     assert len(heard["fixes"]) > 50
-    since = json.loads(ask(server, f"/api/follow/dive?after={heard['fixes'][-3][0]}").text)
+    since = ask(server, f"/api/follow/dive?after={heard['fixes'][-3][0]}").json
     assert since["fixes"] == heard["fixes"][-2:]
 
     # The coverage: as many opaque pixels as are seen.
@@ -90,7 +88,7 @@ def test_only_the_page_itself_changes_what_is_followed(dive: tuple[Server, Path]
     (log.parent / "link.csv").symlink_to("/etc/passwd")
     for name in ("../nav.csv", "/etc/passwd", "none.csv", "link.csv"):
         assert call(server, "/api/follow/open", {"log": name}).status in (400, 404), name
-    assert not json.loads(call(server, "/api/follow/end", {}).text)["following"]
+    assert not call(server, "/api/follow/end", {}).json["following"]
     assert ask(server, "/api/follow/dive").status == 400
     opened = call(server, "/api/follow/open", {"log": "nav.csv"})
     assert opened.status == 200, opened.text

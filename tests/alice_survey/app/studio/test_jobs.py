@@ -65,16 +65,12 @@ tell(event="run_finished", exit_code=0, elapsed_s=1.0)
 """
 
 
-class Published(list[tuple[str, Any]]):
-    """What is published."""
-
-    def __call__(self, event: str, data: Any) -> None:
-        self.append((event, data))
-
-
 @contextlib.contextmanager
-def jobs_in(folder: Path, told: Published | None = None) -> Iterator[Jobs]:
-    jobs = Jobs(folder, Published() if told is None else told, [sys.executable, "-c", PROGRAM])
+def jobs_in(folder: Path, told: list[tuple[str, Any]] | None = None) -> Iterator[Jobs]:
+    """Jobs of the program above; what they publish is appended to a list."""
+    heard = [] if told is None else told
+    program = [sys.executable, "-c", PROGRAM]
+    jobs = Jobs(folder, lambda event, data: heard.append((event, data)), program)
     try:
         yield jobs
     finally:
@@ -96,7 +92,7 @@ def do(jobs: Jobs, name: str) -> None:
 
 
 def test_progress_is_published_and_the_end_kept(tmp_path: Path) -> None:
-    told = Published()
+    told: list[tuple[str, Any]] = []
     with jobs_in(tmp_path, told) as jobs:
         do(jobs, "quality")
         assert jobs.state()["job"] is None
@@ -186,7 +182,7 @@ def test_a_later_studio_finds_the_job_and_can_stop_it(tmp_path: Path) -> None:
     with jobs_in(tmp_path) as killed:  # its threads go on; those of a killed studio would not
         killed.start("plan")
         until(lambda: killed.log(1)["total"] > 2)
-        told = Published()
+        told: list[tuple[str, Any]] = []
         with jobs_in(tmp_path, told) as later:
             job = later.running()
             assert job is not None and job["name"] == "plan" and job["state"] == "running"
