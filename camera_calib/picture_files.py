@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey.core.contents import ordinary_file
 from alice_survey.core.errors import ImageError, memory_shortage
 
 MAX_PIXELS = 104_000_000
@@ -57,6 +58,10 @@ def places_of_cameras(texts: Sequence[str]) -> dict[str, str]:
     return places
 
 
+_MAX_BYTES = 4 << 30
+"""Bytes of a picture that is read whole."""
+
+
 def pixels_too_many(path: Path) -> int:
     """The most pixels that are decoded where a picture's header states more, else 0.
 
@@ -67,7 +72,7 @@ def pixels_too_many(path: Path) -> int:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            with Image.open(path) as image:
+            with Image.open(ordinary_file(path, None)) as image:
                 maximum = MAX_PIXELS_JPEG if image.format == "JPEG" else MAX_PIXELS
                 return maximum if image.width * image.height > maximum else 0
     except Image.DecompressionBombError:  # more than Pillow opens at all
@@ -137,10 +142,10 @@ def read_pixels(path: Path, flags: int) -> NDArray[Any] | None:
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
     try:
         if path.suffix.lower() in _TIFF and flags & cv2.IMREAD_IGNORE_ORIENTATION:
-            data = without_orientation(path.read_bytes())
+            data = without_orientation(ordinary_file(path, _MAX_BYTES).read_bytes())
             pixels: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
         else:
-            pixels = cv2.imread(str(path), flags)
+            pixels = cv2.imread(str(ordinary_file(path, None)), flags)
     except OSError:
         return None
     except cv2.error as error:
@@ -176,7 +181,7 @@ def time_taken(path: Path) -> datetime | None:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            with Image.open(path) as image:
+            with Image.open(ordinary_file(path, None)) as image:
                 return exif_time(image.getexif())
     except (*PILLOW_FAULTS, Image.DecompressionBombError):
         return None
@@ -190,6 +195,6 @@ def is_cut_short(path: Path) -> bool:
     """
     if path.suffix.lower() not in (".jpg", ".jpeg") or not path.is_file():
         return False
-    data = path.read_bytes()
+    data = ordinary_file(path, None).read_bytes()
     scan = data.rfind(b"\xff\xda")
     return data.startswith(b"\xff\xd8") and scan >= 0 and data.find(b"\xff\xd9", scan) < 0

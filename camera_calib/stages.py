@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from alice_survey.core.artefacts import read_json
 from alice_survey.core.records import CalibrationRecord
 from alice_survey.core.stages import StageSpec, Summary, without
 
@@ -21,6 +22,12 @@ def _calibrate_summary(folder: Path) -> Summary:
     return text, {"views": found.views, "rms_px": found.rms_px, "worst_px": found.worst_px}
 
 
+def calibration_shortfall(folder: Path) -> str:
+    """The first bad verdict on a calibration; empty where there is none."""
+    verdicts = read_json(folder / "report.json")["verdicts"]
+    return next((one["text"] for one in verdicts if one["level"] == "bad"), "")
+
+
 CALIBRATE = StageSpec(
     name="calibrate",
     folder="calibration",
@@ -33,6 +40,7 @@ CALIBRATE = StageSpec(
     settings={"camera": "camera", "water": without("water", "n_water_sigma")},
     inputs=_calibrate_inputs,
     summary=_calibrate_summary,
+    shortfall=calibration_shortfall,
     simulated=True,
     products={
         "rig.json": "cameras, ports and baseline with their covariance",

@@ -51,6 +51,11 @@ def _fly_summary(folder: Path) -> Summary:
     return text, flight.to_json()
 
 
+def _fly_shortfall(folder: Path) -> str:
+    ending = FlightRecord.read(folder / "flight.json").ending
+    return "" if ending == "complete" else f"the flight ended early: {ending}"
+
+
 def _metres(value: float | None) -> str:
     return "unknown" if value is None else f"{value:.3f} m"
 
@@ -149,6 +154,7 @@ FLY = StageSpec(
     ),
     inputs=lambda workspace: [workspace / "plan" / "plan.json"],
     summary=_fly_summary,
+    shortfall=_fly_shortfall,
     simulated=True,
     products={
         "triggers.csv": "when pictures are taken",

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.core.artefacts import atomic_path
-from alice_survey.core.contents import as_line
+from alice_survey.core.contents import as_line, ordinary_file
 from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.frames import Array
 
@@ -157,7 +157,7 @@ def read_header(path: Path) -> PlyHeader:
         WorkspaceError: it is not a PLY, or its points are not read.
         OSError: the file cannot be read.
     """
-    with path.open("rb") as file:
+    with ordinary_file(path, None).open("rb") as file:
         content = file.read(_MAX_HEADER)
     end = content.find(b"end_header")
     start = content.find(b"\n", end) + 1

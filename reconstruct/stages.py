@@ -47,6 +47,12 @@ def _mapping_summary(folder: Path) -> Summary:
     return text, {"registered": found.registered, "total": found.total}
 
 
+def _mapping_shortfall(folder: Path) -> str:
+    found = records.MappingRecord.read(folder / "mapping.json")
+    few = 2 * found.registered < found.total
+    return f"only {found.registered} of {found.total} pictures are in the model" if few else ""
+
+
 def _placing_inputs(workspace: Path) -> list[Path]:
     known = _existing(*(workspace / name for name in (SCALE_FILE, *CONTROL_FILES)))
     return [workspace / "mapping", *_about_pictures(workspace), *known]
@@ -163,6 +169,7 @@ MAPPING = StageSpec(
     },
     inputs=_mapping_inputs,
     summary=_mapping_summary,
+    shortfall=_mapping_shortfall,
     resumes=True,
     reported=("mapping.json",),
 )

@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alice_survey.app.pipeline import run, stage_states
+from alice_survey.app.pipeline import run, status_report
 from alice_survey.app.stages import STAGES, spec
 from alice_survey.core.artefacts import read_stage, run_stage
 from alice_survey.core.config import load_config
 from alice_survey.core.errors import AliceError, WorkspaceError
 from alice_survey.core.executor import SERIAL
+from tests.small_survey import start
 from tests.test_loop import results
 
 pytestmark = pytest.mark.slow
@@ -54,11 +55,11 @@ def test_a_thousand_damages_are_noticed(workspace: Path) -> None:
 
     A copy of the workspace, whose files have other times, is not damaged.
     """
-    config, rng = load_config(workspace / "survey.toml"), np.random.default_rng(5)
+    rng = np.random.default_rng(5)
     files = [path for one in STAGES for path in sorted((workspace / one.folder).rglob("*"))
              if path.is_file()]  # fmt: skip
     os.utime(workspace / "dense" / "dem.tif")
-    assert {*stage_states(workspace, config).values()} == {"up to date"}
+    assert {*status_report(workspace, None)[1]["stages"].values()} == {"up to date"}
     noticed: Counter[str] = Counter()
     for number in range(DAMAGES):
         path, kind = files[number % len(files)], KINDS[rng.integers(len(KINDS))]
@@ -70,14 +71,16 @@ def test_a_thousand_damages_are_noticed(workspace: Path) -> None:
         if is_same_time:
             os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
         folder = path.relative_to(workspace).parts[0]
-        state = stage_states(workspace, config, verify=is_same_time)[spec(folder).name]
+        found = status_report(workspace, None, verify=is_same_time)[1]
+        state = found["stages"][spec(folder).name]
         assert state != "up to date", f"{kind.__name__} of {path}"
         assert path.name == "stage.json" or path.name in state
         noticed[kind.__name__] += 1
         path.write_bytes(before)
         os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
     assert min(noticed.values()) > 150
-    assert {*stage_states(workspace, config, verify=True).values()} == {"up to date"}
+    found = status_report(workspace, None, verify=True)[1]
+    assert {*found["stages"].values()} == {"up to date"}
 
 
 def test_nothing_is_computed_from_damaged_files(workspace: Path) -> None:
@@ -111,5 +114,5 @@ def test_every_damaged_product_is_made_again(small_survey: Path, workspace: Path
         KINDS[number % len(KINDS)](workspace / name, rng)
     with pytest.raises(AliceError):
         run(["evaluate"], workspace, None, SERIAL)
-    run([one.name for one in STAGES if one.name != "report"], workspace, None, SERIAL)
+    assert start(workspace, threads=1).wait() == 0
     assert results(workspace) == results(small_survey)

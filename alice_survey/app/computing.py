@@ -5,6 +5,7 @@ on an Intel Xeon at 2 GHz. The part that runs as tasks is shared out among worke
 survey have taken here corrects what is left.
 """
 
+import contextlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,6 +13,8 @@ from typing import Any, NamedTuple
 
 from alice_survey.core.artefacts import StageRecord, read_json
 from alice_survey.core.config import CameraConfig, ImagingConfig, ReconstructConfig
+from alice_survey.core.contents import taken_from
+from alice_survey.core.errors import AliceError
 from alice_survey.core.executor import default_threads
 from alice_survey.core.manifest import read_manifest
 from alice_survey.core.run.resources import processor
@@ -102,7 +105,7 @@ def size_of(
 def workspace_size(
     workspace: Path, camera: CameraConfig, imaging: ImagingConfig, settings: ReconstructConfig
 ) -> SurveySize | None:
-    """The size of the survey of a workspace; None while it has neither a plan nor pictures.
+    """The size of a workspace's survey; None while it has no plan and no pictures to be read.
 
     Args:
         workspace: folder of the survey.
@@ -110,6 +113,14 @@ def workspace_size(
         imaging: their scale, which counts until there are pictures.
         settings: of the surface.
     """
+    with contextlib.suppress(AliceError, OSError):  # of damage, which the stages report
+        return _size_of_files(workspace, camera, imaging, settings)
+    return None
+
+
+def _size_of_files(
+    workspace: Path, camera: CameraConfig, imaging: ImagingConfig, settings: ReconstructConfig
+) -> SurveySize | None:
     manifest, plan_file = workspace / "images" / "manifest.csv", workspace / "plan" / "plan.json"
     rows = read_manifest(manifest) if manifest.is_file() else []
     width, height = (side // imaging.scale for side in (camera.width_px, camera.height_px))
@@ -121,11 +132,12 @@ def workspace_size(
     if plan_file.is_file():
         plan = read_json(plan_file)
         scale = max(1, round(camera.width_px / width))
-        return size_of(
-            len(rows) or _CAMERAS * plan["stations"], width * height / 1e6, settings,
-            board_pictures=_CAMERAS * imaging.pool_views,
-            pixel_m=scale * plan["details"]["imaging"]["pixel_m"],
-        )  # fmt: skip
+        with taken_from(plan_file):
+            return size_of(
+                len(rows) or _CAMERAS * plan["stations"], width * height / 1e6, settings,
+                board_pictures=_CAMERAS * imaging.pool_views,
+                pixel_m=scale * plan["details"]["imaging"]["pixel_m"],
+            )  # fmt: skip
     return size_of(len(rows), width * height / 1e6, settings) if rows else None
 
 
@@ -187,10 +199,7 @@ def task_memory_mib(stage: str, *survey: Any) -> float:
 
     0 where it is not known.
     """
-    try:
-        size = workspace_size(*survey) if stage in PREDICTED else None
-    except OSError:  # of a picture, which the stage reports
-        size = None
+    size = workspace_size(*survey) if stage in PREDICTED else None
     return 0.0 if size is None else stage_costs(size)[stage].worker_mib
 
 

@@ -42,6 +42,7 @@ def run(
     changes: Mapping[str, Mapping[str, Any]] | None = None,
     *,
     edited_mission: bool = False,
+    stops: bool = False,
 ) -> tuple[str, dict[str, Any]]:
     """Run stages one after the other; those that are up to date are skipped.
 
@@ -52,6 +53,7 @@ def run(
         executor: where tasks run; None for all cores of this machine.
         changes: settings by section for this run alone; those that are None stay as they are.
         edited_mission: fly a mission that was edited since it was exported.
+        stops: end after a stage whose result is not good enough.
 
     Returns:
         Results of each stage, as text and as JSON values.
@@ -105,6 +107,13 @@ def run(
             text, data = stage.summary(workspace / stage.folder)
             found[stage.name] = {"done": done, **data}
             lines.append(f"{stage.name}: {text}" if done else f"{stage.name}: (up to date) {text}")
+            shortfall = stage.shortfall(workspace / stage.folder)
+            if shortfall:
+                found[stage.name]["shortfall"] = shortfall
+                warn(f"{stage.name}: {shortfall}")
+            if shortfall and stops:
+                lines.append(f"stopped after {stage.name}; --accept goes on from what it made")
+                break
     return "\n".join(lines), found
 
 

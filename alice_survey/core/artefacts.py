@@ -25,7 +25,7 @@ from typing import Any, ClassVar, Self, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic_core import to_jsonable_python
 
-from alice_survey.core.contents import as_line, first_fault
+from alice_survey.core.contents import as_line, first_fault, ordinary_file
 from alice_survey.core.errors import AliceError, NavigationError, WorkspaceError, warn, why
 from alice_survey.core.run import progress
 from alice_survey.core.run.resources import processor, versions, watch_meter
@@ -151,11 +151,7 @@ def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], object]) -> 
     final, partial = workspace / stage.name, workspace / f"{stage.name}.partial"
     replaced = workspace / f"{stage.name}.replaced"
     refuse_links(workspace, final, partial, replaced)
-    if replaced.exists():  # a kill fell between the two renames below
-        if final.exists():
-            shutil.rmtree(replaced)
-        else:
-            replaced.rename(final)
+    restore_folder(final)
     previous = read_stage(final)
     with progress.step(f"check what {stage.name} depends on"):
         if previous is not None and why_stale(workspace, stage) is None:
@@ -190,21 +186,37 @@ def run_stage(workspace: Path, stage: Stage, work: Callable[[Path], object]) -> 
             "settings": stage.settings,
             "command": stage.command,
             "inputs": inputs,
-            "outputs": _synced_outputs(partial),
+            "outputs": sync_folder(partial),
             **spent,
             **how,
             "processor": processor(),
             "versions": versions(),
         }
         write_json(partial / STAGE_FILE, record | {"checksum": _checksum(record)})
-        if final.exists():
-            final.rename(replaced)
-        partial.rename(final)
-        sync(workspace)
-        if replaced.exists():
-            shutil.rmtree(replaced)
+        replace_folder(final, partial)
         finish(**spent, **how)
     return True
+
+
+def replace_folder(final: Path, partial: Path) -> None:
+    """Put a folder, all of which is on the disk, in the place of another."""
+    replaced = final.with_name(f"{final.name}.replaced")
+    if final.exists():
+        final.rename(replaced)
+    partial.rename(final)
+    sync(final.parent)
+    if replaced.exists():
+        shutil.rmtree(replaced)
+
+
+def restore_folder(final: Path) -> None:
+    """Undo what `replace_folder` had begun when a kill came between its renames."""
+    replaced = final.with_name(f"{final.name}.replaced")
+    if replaced.exists():
+        if final.exists():
+            shutil.rmtree(replaced)
+        else:
+            replaced.rename(final)
 
 
 def refuse_links(root: Path, *paths: Path) -> None:
@@ -370,14 +382,15 @@ def _checksum(record: Mapping[str, Any]) -> str:
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
-def _synced_outputs(folder: Path) -> dict[str, FileEntry]:
+def sync_folder(folder: Path) -> dict[str, FileEntry]:
     """Sync all that a folder holds, and take the digests of its files."""
-    outputs = {}
+    found = {}
     for path in sorted(folder.rglob("*")):
         sync(path)
         if path.is_file():
-            outputs[path.relative_to(folder).as_posix()] = _entry(path, None)
-    return outputs
+            found[path.relative_to(folder).as_posix()] = _entry(path, None)
+    sync(folder)
+    return found
 
 
 def _intact_inputs(inputs: Sequence[Path], workspace: Path) -> dict[str, FileEntry]:
@@ -502,6 +515,10 @@ def atomic_path(path: Path) -> Iterator[Path]:
         sync(temporary)
         temporary.replace(path)
         sync(path.parent)
+    except OSError as error:
+        if error.filename is None:  # of a write to a file that is open
+            error.filename = str(path)
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -555,11 +572,11 @@ def read_json(path: Path) -> Any:
         WorkspaceError: the file is missing or not JSON.
     """
     try:
-        return json.loads(path.read_text(encoding="utf-8-sig"))
+        return json.loads(ordinary_file(path).read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise WorkspaceError(f"{path}: no such file") from None
     except OSError as error:
-        raise WorkspaceError(f"{path}: cannot be read: {error.strerror}") from None
+        raise WorkspaceError(f"{path}: cannot be read: {why(error)}") from None
     except (ValueError, RecursionError) as error:
         raise WorkspaceError(f"{path}: not valid JSON: {error}") from None
 
@@ -596,7 +613,7 @@ def read_csv(
         AliceError: of type `fault`: the file cannot be read, or lacks a column.
     """
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
+        with ordinary_file(path).open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file, restval="", skipinitialspace=not exact)
             reader.fieldnames = names = [name.strip() for name in reader.fieldnames or []]
             numbered = [(reader.line_num, row) for row in reader]
@@ -610,6 +627,12 @@ def read_csv(
     missing = [name for name in required if name not in names]
     if missing:
         raise fault(f"{path}: column {missing[0]} is missing; it has {as_line(', '.join(names))}")
+    longer = next((line for line, row in numbered if any(map(str.strip, row.get(None, ())))), None)
+    if longer is not None:
+        raise fault(
+            f"{path} line {longer}: it has more cells than the header: decimal commas between "
+            "commas? Save numbers with points"
+        )
     rows = [
         (line, {name: row[name] if exact else row[name].strip() for name in names})
         for line, row in numbered
@@ -632,9 +655,7 @@ def content_of(path: Path, maximum: int = _MAX_LENGTH) -> bytes | None:
         WorkspaceError: it cannot be read, or is larger than so many bytes.
     """
     try:
-        if path.stat().st_size > maximum:
-            raise WorkspaceError(f"{path}: is larger than {maximum >> 20} MiB")
-        return path.read_bytes()
+        return ordinary_file(path, maximum).read_bytes()
     except FileNotFoundError:
         return None
     except OSError as error:

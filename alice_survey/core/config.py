@@ -2,7 +2,6 @@
 
 import math
 import re
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,8 +18,8 @@ from pydantic import (
 )
 from pydantic.config import JsonDict
 
-from alice_survey.core.contents import as_line, one_line
-from alice_survey.core.errors import ConfigError
+from alice_survey.core.contents import as_line, one_line, ordinary_file, parse_toml
+from alice_survey.core.errors import ConfigError, why
 from alice_survey.core.seawater import GREEN_NM, n_water, n_water_sigma
 
 Jerlov = Literal["I", "II", "III", "1C", "3C", "5C", "7C", "9C"]
@@ -761,14 +760,12 @@ def load_config(path: str | Path) -> SurveyConfig:
         0.2
     """
     path = Path(path)
-    if path.exists() and not path.is_file():
-        raise ConfigError(f"{path}: not a file: give the settings as a plain file")
     try:
-        text = path.read_text(encoding="utf-8")
+        text = ordinary_file(path, 4 * _MAX_LENGTH).read_text(encoding="utf-8")
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; 'alice-survey init DIR' writes one") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}") from None
+        raise ConfigError(f"{path}: cannot be read: {why(error)}") from None
     return parse_settings(text, path)
 
 
@@ -800,9 +797,9 @@ def settings_in(text: str, origin: str) -> dict[str, Any]:
             f"{origin}: {len(text) / 1e6:.1f} million characters: no settings file is that long"
         )
     try:
-        return tomllib.loads(text)
+        return parse_toml(text)
     # A number of thousands of digits is a ValueError.
-    except (tomllib.TOMLDecodeError, ValueError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigError(f"{origin}: not valid TOML: {one_line(error)}") from None
 
 

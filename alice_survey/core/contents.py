@@ -1,14 +1,17 @@
 """Read files that this program wrote, and that a user or a disk may have changed since."""
 
 import contextlib
+import errno
 import lzma
 import re
+import stat
 import struct
+import tomllib
 import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree as ET
 from xml.parsers import expat
 
@@ -20,6 +23,58 @@ if TYPE_CHECKING:
     from pydantic import ValidationError
 
 _SHOWN = 200
+
+
+_MAX_TEXT = 512 << 20
+"""Bytes of a text that is read whole."""
+
+
+def ordinary_file(path: Path, maximum: int | None = _MAX_TEXT) -> Path:
+    """A path that may be opened and read: all files from outside are opened through this.
+
+    A pipe is waited on for ever, and a device has no end.
+
+    Args:
+        path: of the file; it may be a link.
+        maximum: bytes; None for a kind that is read in parts.
+
+    Raises:
+        OSError: it is no file, is larger, or is missing.
+    """
+    status = path.stat()
+    if not stat.S_ISREG(status.st_mode):
+        raise OSError(errno.EINVAL, "it is no ordinary file", str(path))
+    if maximum is not None and status.st_size > maximum:
+        text = f"it is larger than {maximum >> 20} MiB, which no file of its kind should be"
+        raise OSError(errno.EINVAL, text, str(path))
+    return path
+
+
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.I | re.A)
+
+
+def parse_number(text: str) -> float:
+    """The number that a text is, as tables write numbers; Python takes `3_2` for 32.
+
+    Raises:
+        ValueError: it is none.
+    """
+    if _NUMBER.fullmatch(text.strip()) is None:
+        raise ValueError(f"{as_line(text)!r} is not a number")
+    return float(text)
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """The table of a TOML text.
+
+    Raises:
+        ValueError: it is not TOML, or has a name of a hundred parts, for which the parser takes
+            memory with the square of their number.
+        RecursionError: it is nested too deep.
+    """
+    if re.search(r"(?:[\w-]+[ \t]*\.[ \t]*){100}", text):
+        raise ValueError("a name has a hundred parts")
+    return tomllib.loads(text)
 
 
 @contextlib.contextmanager

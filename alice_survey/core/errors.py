@@ -165,11 +165,15 @@ def why(error: Exception) -> str:
     return str(error)
 
 
+NOT_GOOD_ENOUGH = 3
+"""Exit code of a command that has done its work, whose result is not good enough."""
+
 _ON = ", and the same command goes on from here"
 _FEWER = f": give fewer --threads, or close other programs{_ON}"
 _REMEDIES = {
     errno.ENOSPC: f": free some of the disk{_ON}",
     errno.EDQUOT: f": free some of your share of the disk{_ON}",
+    errno.EFBIG: f": raise the largest size of a file that is allowed (ulimit -f){_ON}",
     errno.EROFS: ": choose a workspace that can be written, with -w",
     errno.EACCES: ": take the rights to it, or choose another workspace with -w",
 }

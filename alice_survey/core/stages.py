@@ -45,6 +45,8 @@ class StageSpec:
     """`module:function` of a `StageWork`."""
     summary: Callable[[Path], Summary]
     """Takes the stage's folder."""
+    shortfall: Callable[[Path], str] = lambda folder: ""
+    """Takes the stage's folder. Why what it made is not good enough, in a line; else empty."""
     takes: Sequence[str] = ()
     """Dotted names of the settings that the work takes, each by the last part of its name."""
     needs: Sequence[str] = ()

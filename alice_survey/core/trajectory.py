@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.artefacts import read_csv, write_csv
+from alice_survey.core.contents import parse_number
 from alice_survey.core.errors import NavigationError
 from alice_survey.core.frames import Array, attitude_from_rotation, rotation_from_attitude
 
@@ -79,7 +80,7 @@ def read_columns(path: Path, required: Sequence[str]) -> dict[str, Array]:
 
 def _number(path: Path, line: int, row: dict[str, str], name: str) -> float:
     try:
-        value = float(row[name])
+        value = parse_number(row[name])
     except ValueError:
         value = math.nan
     if not math.isfinite(value):

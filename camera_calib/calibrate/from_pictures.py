@@ -10,7 +10,6 @@ import contextlib
 import math
 import shlex
 import shutil
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,13 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.core.artefacts import read_json
+from alice_survey.core.artefacts import (
+    read_json,
+    refuse_links,
+    replace_folder,
+    restore_folder,
+    sync_folder,
+)
 from alice_survey.core.config import CameraConfig, WaterConfig
 from alice_survey.core.errors import AliceError, CalibrationError
 from alice_survey.core.executor import Executor, local_executor
@@ -47,6 +52,7 @@ from camera_calib.freedom import USUAL_LENS, LensNames, lens_of
 from camera_calib.mount import mount_line, with_mount
 from camera_calib.optics import PORTS, contradicting_port
 from camera_calib.rig import Rig, design_rig
+from camera_calib.stages import calibration_shortfall
 from camera_calib.targets.target import Target
 
 _MIN_FITTING = 0.5
@@ -81,7 +87,8 @@ def calibrate_pictures(
     verdicts = read_json(output / "report.json")["verdicts"]
     text = calibration_text(calibration, task.target, verdicts)
     text = "\n".join([text, *_next(calibration, task, output)])
-    return text, read_json(output / "calibration.json")
+    found_json = read_json(output / "calibration.json")
+    return text, {**found_json, "shortfall": calibration_shortfall(output)}
 
 
 def _next(calibration: Calibration, task: CalibrationTask, output: Path) -> Iterator[str]:
@@ -119,14 +126,17 @@ def _check_useful(calibration: Calibration, found: Detections, output: Path) -> 
 @contextlib.contextmanager
 def _replacing(output: Path) -> Iterator[Path]:
     """A folder to write to that replaces `output` on success."""
-    output.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=output.parent, prefix=f".{output.name}") as folder:
-        partial = Path(folder) / output.name
-        partial.mkdir()
+    partial = output.with_name(f"{output.name}.partial")
+    refuse_links(output.parent, output, partial)
+    restore_folder(output)
+    shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed
+    partial.mkdir(parents=True)
+    try:
         yield partial
-        if output.exists():
-            shutil.rmtree(output)
-        partial.rename(output)
+        sync_folder(partial)
+        replace_folder(output, partial)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 def calibrate_task(task: CalibrationTask, found: Detections) -> Calibration:

@@ -6,6 +6,7 @@ there. `rig_config.json` is https://colmap.github.io/rigs.html; Refractive COLMA
 has that version's: cameras by `camera_id`, the reference by `ref_camera_id`.
 """
 
+import os
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -73,7 +74,7 @@ def read_colmap(path: Path, reading: rigs.ReadOptions) -> Rig:
     folder = file.parent
     records = read_records(file)
     config = folder / RIG_CONFIG
-    ties = _config_ties(config, records) if config.exists() else []
+    ties = _config_ties(config, records) if os.path.lexists(config) else []
     if not ties:
         chosen = [r for r in records if str(r.camera_id) == reading.camera or len(records) == 1]
         if len(chosen) != 1:
@@ -173,7 +174,7 @@ def _camera_file(path: Path) -> Path:
     if not path.is_dir() and path.name != RIG_CONFIG:
         return path
     folder = path if path.is_dir() else path.parent
-    found = [folder / name for name in CAMERA_FILES if (folder / name).is_file()]
+    found = [folder / name for name in CAMERA_FILES if os.path.lexists(folder / name)]
     if not found:
         raise CalibrationError(f"{path}: no {' or '.join(CAMERA_FILES)} in the folder")
     return found[0]
@@ -254,7 +255,7 @@ def _has_ports(path: Path) -> bool | None:
     """Whether a camera of a file or folder of these formats has a port; None for any other."""
     if path.is_dir():
         names = (*CAMERA_FILES, RIG_CONFIG)
-        found = [path / name for name in names if (path / name).is_file()]
+        found = [path / name for name in names if os.path.lexists(path / name)]
         return _has_ports(found[0]) if found else None
     suffix = path.suffix.lower()
     if suffix in (".txt", ".bin"):

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, PlainSerializer, PlainValidat
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.artefacts import atomic_path
-from alice_survey.core.contents import as_line, first_fault, refuse_declarations
+from alice_survey.core.contents import as_line, first_fault, ordinary_file, refuse_declarations
 from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import Array
 
@@ -138,7 +138,7 @@ def read_bytes(path: Path, largest: int = _MAX_BYTES) -> bytes:
         CalibrationError: there is no such file, or it is larger.
     """
     try:
-        with path.open("rb") as file:
+        with ordinary_file(path, None).open("rb") as file:
             content = file.read(largest + 1)
     except FileNotFoundError:
         raise CalibrationError(f"{path}: no such file") from None

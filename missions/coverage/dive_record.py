@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.core.artefacts import read_csv
-from alice_survey.core.contents import as_line
+from alice_survey.core.contents import as_line, parse_number
 from alice_survey.core.errors import NavigationError, warn
 from alice_survey.core.frames import Array, rotation_from_attitude
 from alice_survey.core.trajectory import read_track
@@ -192,7 +192,7 @@ def read_triggers(path: Path, nav: NavigationLog) -> Triggers:
             if start is not None:
                 times.append((utc_date(row["time_utc"]) - start).total_seconds())
             else:
-                times.append(float(row["time_s"]))
+                times.append(parse_number(row["time_s"]))
             lines.append(_line_number(row["line"]) if "line" in names else -1)
         except ValueError as error:
             raise NavigationError(f"{path} line {number}: {as_line(str(error))}") from None

@@ -9,7 +9,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from alice_survey.core.contents import one_line
+from alice_survey.core.contents import one_line, ordinary_file
 from alice_survey.core.errors import PlanError, why
 from missions.exports import formats
 
@@ -49,7 +49,7 @@ def read_mission(path: Path) -> "Mission":
         PlanError: the file cannot be read, or holds no mission that can be flown.
     """
     try:
-        with path.open("rb") as file:
+        with ordinary_file(path, None).open("rb") as file:
             raw = file.read(_MAX_BYTES + 1)
     except OSError as error:
         raise PlanError(f"{path}: cannot be read: {why(error)}") from None

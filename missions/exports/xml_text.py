@@ -6,7 +6,7 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 from alice_survey.core.artefacts import atomic_path
-from alice_survey.core.contents import xml_root
+from alice_survey.core.contents import parse_number, xml_root
 
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 """What XML 1.0 cannot hold in any way (W3C, section 2.2)."""
@@ -87,7 +87,7 @@ def number_of(parent: ET.Element, tag: str) -> float:
     """
     text = value_of(parent, tag)
     try:
-        number = float(text)
+        number = parse_number(text)
     except ValueError:
         number = math.nan
     if not math.isfinite(number):

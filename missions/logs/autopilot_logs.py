@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.core.contents import one_line
+from alice_survey.core.contents import one_line, ordinary_file
 from alice_survey.core.errors import NavigationError, warn, why
 from alice_survey.core.frames import Array, Datum
 from missions.logs.dive import (
@@ -757,7 +757,7 @@ def first_bytes(path: Path, count: int) -> bytes:
         NavigationError: it cannot be read, or is too large for one.
     """
     try:
-        with path.open("rb") as file:
+        with ordinary_file(path, None).open("rb") as file:
             size = os.fstat(file.fileno()).st_size
             start = file.read(count)
     except OSError as error:

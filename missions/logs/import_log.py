@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from alice_survey.core.artefacts import read_csv
+from alice_survey.core.contents import parse_number
 from alice_survey.core.errors import NavigationError, warn
 from alice_survey.core.frames import Array, Datum
 from missions.logs.autopilot_logs import (
@@ -413,7 +414,7 @@ def read_tide(text: str, *, dated: bool) -> float | Signal:
         NavigationError: it is neither, or the file cannot be used.
     """
     with suppress(ValueError):
-        if math.isfinite(metres := float(text)):
+        if math.isfinite(metres := parse_number(text)):
             return metres
     column = "time_utc" if dated else "time_s"
     try:
@@ -427,8 +428,8 @@ def read_tide(text: str, *, dated: bool) -> float | Signal:
     for line, row in rows:
         cell, height = row[column], row["height_m"]
         try:
-            time_s = utc_date(cell).timestamp() if dated else float(cell)
-            table.append((time_s, float(height)))
+            time_s = utc_date(cell).timestamp() if dated else parse_number(cell)
+            table.append((time_s, parse_number(height)))
         except ValueError:
             raise NavigationError(
                 f"{text} line {line}: {cell!r}, {height!r}: not a time and a height"

@@ -10,7 +10,7 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 import numpy as np
 
 from alice_survey.core.artefacts import read_csv
-from alice_survey.core.contents import as_line
+from alice_survey.core.contents import as_line, parse_number
 from alice_survey.core.errors import NavigationError, warn
 from alice_survey.core.frames import Array
 from missions.values.navigation import COLUMNS
@@ -19,7 +19,11 @@ POSITION, READINGS = COLUMNS[:3], COLUMNS[:7]
 """What a navigation log can measure; the other columns are sigmas."""
 TURNING = ("roll_deg", "pitch_deg", "heading_deg", "longitude_deg")
 """Columns of angles that turn the short way round."""
-_RANGES = {"latitude_deg": (-85.0, 85.0), "longitude_deg": (-180.0, 180.0)}
+_RANGES = {
+    "latitude_deg": (-85.0, 85.0), "longitude_deg": (-180.0, 180.0), "depth_m": (-100.0, 11_000.0),
+    "altitude_m": (-10.0, 11_000.0), "heading_deg": (-360.0, 720.0), "roll_deg": (-360.0, 360.0),
+    "pitch_deg": (-360.0, 360.0),
+}  # fmt: skip
 _GAP_S, _GAP_INTERVALS = 2.0, 5.0
 """A gap is longer than both this many seconds and this many median intervals."""
 _FEW = 5
@@ -208,7 +212,7 @@ def read_navigation(
 def _number(row: Mapping[str, str], name: str) -> float:
     cell = row[name]
     try:
-        value = float(cell)
+        value = parse_number(cell)
     except ValueError:
         raise ValueError(f"{name} is {cell!r}, not a number") from None
     if not math.isfinite(value):

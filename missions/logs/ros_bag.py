@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from alice_survey.core.contents import one_line
+from alice_survey.core.contents import one_line, ordinary_file
 from alice_survey.core.errors import AliceError, NavigationError
 from alice_survey.core.executor import progress
 from alice_survey.core.frames import Array, Datum
@@ -453,6 +453,10 @@ def opened_bag(path: Path) -> Iterator["AnyReader"]:
     for name, text in _COLA2.items():
         store.register(get_types_from_msg(text, name))
     try:
+        for file in path.iterdir() if path.is_dir() else [path]:
+            with ordinary_file(file, None).open("rb") as opened:
+                if file.suffix.lower() == ".bag" and b"\n" not in opened.read(16):
+                    raise ValueError("its first line is not that of a bag")
         with _bounded_chunks(), AnyReader([path], default_typestore=store) as reader:
             yield reader
     except AliceError:

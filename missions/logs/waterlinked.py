@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from alice_survey.core.contents import ordinary_file
 from alice_survey.core.errors import NavigationError
 from missions.logs.dive import DATED_AFTER_S, LoggedDive, clean_signal, finite_number
 
@@ -86,7 +87,7 @@ def read_waterlinked(path: Path) -> LoggedDive:
 def _read_reports(path: Path) -> Iterator[dict[str, Any] | None]:
     """The report of each line, of any type; None for a line that is not a report."""
     try:
-        with path.open("rb") as file:
+        with ordinary_file(path, None).open("rb") as file:
             while line := file.readline(_MAX_LINE):
                 try:
                     report = json.loads(line) if line.strip() else {"type": "empty line"}

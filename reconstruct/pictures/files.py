@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.core.contents import as_line, one_line
+from alice_survey.core.contents import as_line, one_line, ordinary_file
 from alice_survey.core.errors import ImageError
 from camera_calib.picture_files import (
     PILLOW_FAULTS,
@@ -236,7 +236,7 @@ def _pillow(path: Path) -> Iterator[Any]:
     from PIL import Image
 
     try:
-        with warnings.catch_warnings(), Image.open(path) as image:
+        with warnings.catch_warnings(), Image.open(ordinary_file(path, None)) as image:
             warnings.simplefilter("ignore")
             yield image
     except (*PILLOW_FAULTS, Image.DecompressionBombError) as error:
@@ -248,7 +248,7 @@ def _develop(path: Path) -> NDArray[Any]:
     import rawpy
 
     try:
-        with rawpy.imread(str(path)) as raw:
+        with rawpy.imread(str(ordinary_file(path, None))) as raw:
             rgb = raw.postprocess(
                 output_bps=16, no_auto_bright=True, use_camera_wb=False, use_auto_wb=False,
                 user_flip=0,

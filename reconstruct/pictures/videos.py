@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey.core.contents import ordinary_file
 from alice_survey.core.errors import ImageError, note, warn
 from alice_survey.core.executor import progress
 from alice_survey.core.frames import Array
@@ -84,7 +85,7 @@ def read_fixes(path: Path, duration_s: float) -> Fixes:
     import telemetry_parser
 
     try:
-        payloads = telemetry_parser.Parser(str(path)).telemetry()
+        payloads = telemetry_parser.Parser(str(ordinary_file(path, None))).telemetry()
     except BaseException as error:  # what the library panics at is not an Exception
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
@@ -289,7 +290,7 @@ def video_start(path: Path) -> tuple[datetime | None, str]:
         ImageError: the file cannot be read.
     """
     try:
-        with path.open("rb") as file:
+        with ordinary_file(path, None).open("rb") as file:
             index = _index_of(file, file.seek(0, os.SEEK_END))
     except OSError as error:
         raise ImageError(f"{path}: cannot be read: {error.strerror}") from None

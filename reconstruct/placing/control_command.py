@@ -30,7 +30,7 @@ import cv2
 import numpy as np
 
 from alice_survey.core.artefacts import need_stage, write_csv
-from alice_survey.core.contents import as_line, one_line, xml_root
+from alice_survey.core.contents import as_line, one_line, ordinary_file, xml_root
 from alice_survey.core.errors import ReconstructionError, WorkspaceError, warn, why
 from alice_survey.core.executor import SERIAL, Executor
 from alice_survey.core.frames import Array
@@ -488,9 +488,7 @@ def read_foreign(path: Path) -> ForeignControl:
         WorkspaceError: it cannot be read or is of none.
     """
     try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise WorkspaceError(f"{path}: is larger than {_MAX_BYTES // 1_000_000} MB")
-        text = path.read_text(encoding="utf-8-sig")
+        text = ordinary_file(path, _MAX_BYTES).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise WorkspaceError(f"{path}: cannot be read: {why(error)}") from None
     if text.lstrip().startswith("<") and "<markers" in text:

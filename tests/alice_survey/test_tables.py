@@ -81,7 +81,7 @@ def test_files_are_written_or_refused(tmp_path: Path) -> None:
         fov_report(FovOptions(csv=tmp_path / "a.png" / "a.csv"))
 
 
-def test_a_failed_check_exits_with_1(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_check_exits_with_3(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("camera_calib.fov.paper.PAPER_TABLE", ((12.5, "vertical", "m", "1.30"),))
     shown = CliRunner().invoke(app, ["fov", "--validate"])
-    assert shown.exit_code == 1
+    assert shown.exit_code == 3

@@ -43,3 +43,9 @@ class Trial:
         """What the reader does with these bytes."""
         self._path.write_bytes(data)
         return judge(self.target.read, self._path, self._sandbox)
+
+    def verdict_of(self, make: Callable[[Path], object]) -> Verdict:
+        """What the reader does with what is made in the file's place."""
+        self._path.unlink()
+        make(self._path)
+        return judge(self.target.read, self._path, self._sandbox, max_s=2.0)

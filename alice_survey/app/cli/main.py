@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from alice_survey.app.commands import COMMANDS
 from alice_survey.app.commands.base import CommandModel, WorkspaceCommand, option
 from alice_survey.core.contents import first_fault
-from alice_survey.core.errors import known_fault, note
+from alice_survey.core.errors import NOT_GOOD_ENOUGH, known_fault, note
 
 CONTEXT = {"help_option_names": ["-h", "--help"]}
 _SHARED = ("workspace", "survey", "threads", "scheduler", "cluster", "device", "as_json", "quiet",
@@ -135,7 +135,7 @@ def _callback(kind: type[CommandModel], *, is_group: bool = False) -> Callable[.
             if result is not None:
                 arguments.show(*result)
                 if not arguments.is_passed(result[1]):
-                    raise typer.Exit(1)
+                    raise typer.Exit(NOT_GOOD_ENOUGH)
 
     default = kind.model_fields["workspace"].default if has_folder else None
     fields = sorted(

@@ -377,7 +377,7 @@ class PilotCommand(SurveyCommand):
 
     Flies as the pilot of the simulation does. As a ROS 2 node it takes odometry and altitude and
     gives wrench and thruster speeds; over MAVLink it gives velocities and headings to ArduSub in
-    GUIDED. It ends at the surface, with exit code 1 unless the mission was complete. With
+    GUIDED. It ends at the surface, with exit code 3 unless the mission was complete. With
     --simulated it is the other side: dynamics, sea and sensors of the vehicle as a ROS 2 node on a
     simulated clock.
     """

@@ -291,6 +291,7 @@ class RunCommand(DeviceCommand):
     title = "Make all that is left"
     offered = ("scale", "threads")
     scale: int | None = SCALE
+    accept: bool = option(False, "Go on from what is not good enough, such as an early end.")
 
     @classmethod
     def stages(cls) -> list[str]:
@@ -305,7 +306,10 @@ class RunCommand(DeviceCommand):
 
         with self.started_executor(self.device) as executor:
             changes = {"imaging": {"scale": self.scale}}
-            return run(self.stages(), self.workspace, self.survey, executor, changes)
+            return run(
+                self.stages(), self.workspace, self.survey, executor, changes,
+                stops=not self.accept,
+            )  # fmt: skip
 
 
 class DemoCommand(WorkspaceCommand, ThreadsCommand, ReportCommand):

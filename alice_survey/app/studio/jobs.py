@@ -32,7 +32,7 @@ from alice_survey.app.pipeline import is_locked
 from alice_survey.app.stages import STAGES
 from alice_survey.core.artefacts import JsonRecord, refuse_links
 from alice_survey.core.contents import as_line, first_fault
-from alice_survey.core.errors import AliceError, ConfigError, WorkspaceError, why
+from alice_survey.core.errors import NOT_GOOD_ENOUGH, AliceError, ConfigError, WorkspaceError, why
 from alice_survey.core.run.events import Event, event_text
 from alice_survey.core.run.interrupts import for_other_programs
 
@@ -277,7 +277,13 @@ class _Job:
         code = run.exit_code
         if code is None and self._process is not None:
             code = self._process.returncode
-        state = "killed" if code is None or code < 0 else "done" if code == 0 else "failed"
+        state = (
+            "killed"
+            if code is None or code < 0
+            else "done"
+            if code in (0, NOT_GOOD_ENOUGH)
+            else "failed"
+        )
         if code in _CODES_OF_STOP or (self.stopping and state != "done"):
             state = "stopped"
         line = run.error or ("" if state == "done" else _last_line(self.folder / ERRORS))

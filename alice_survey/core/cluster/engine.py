@@ -13,7 +13,6 @@ import pickle
 import shutil
 import socket
 import time
-import tomllib
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError
@@ -28,7 +27,7 @@ from pydantic import Field, ValidationError, model_validator
 from alice_survey.core.artefacts import refuse_links
 from alice_survey.core.cluster.worker import Answer, RunSite, code_and_versions, run_task, why_unfit
 from alice_survey.core.config import Config
-from alice_survey.core.contents import first_fault
+from alice_survey.core.contents import first_fault, ordinary_file, parse_toml
 from alice_survey.core.errors import AliceError, ConfigError, WorkspaceError, note, warn, why
 from alice_survey.core.executor import Executor, Item, Result, TaskResult, default_threads, in_order
 from alice_survey.core.run import progress
@@ -83,7 +82,8 @@ def read_cluster_file(path: Path) -> ClusterConfig:
     if path.suffix.lower() == ".json":
         return ClusterConfig(scheduler_file=path)
     try:
-        return ClusterConfig.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+        text = ordinary_file(path).read_text(encoding="utf-8")
+        return ClusterConfig.model_validate(parse_toml(text))
     except ValidationError as error:
         raise ConfigError(f"{path}: {first_fault(error)}") from None
     except OSError as error:

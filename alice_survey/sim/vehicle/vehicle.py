@@ -13,7 +13,6 @@ Instead of a hull, `geometry` names a shape of shapes.toml with its hull and the
 """
 
 import json
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
@@ -25,7 +24,7 @@ from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
 
 from alice_survey.core.artefacts import write_json
 from alice_survey.core.config import VEHICLE_FILES, Config
-from alice_survey.core.contents import as_line, one_line
+from alice_survey.core.contents import as_line, one_line, ordinary_file, parse_toml
 from alice_survey.core.errors import VehicleError, why
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.coefficients import (
@@ -478,14 +477,14 @@ def read_table(path: Path) -> dict[str, Any]:
 
 def _text_of(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
+        return ordinary_file(path).read_text(encoding="utf-8")
     except (OSError, ValueError) as error:
         raise VehicleError(f"{path}: cannot be read: {as_line(why(error))}") from None
 
 
 def _table_of(path: Path, text: str) -> dict[str, Any]:
     try:
-        table = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
+        table = json.loads(text) if path.suffix.lower() == ".json" else parse_toml(text)
     except (ValueError, RecursionError) as error:
         raise VehicleError(f"{path}: cannot be read: {one_line(error)}") from None
     if not isinstance(table, dict):

@@ -369,7 +369,7 @@ def test_lost_odometry_stops_then_surfaces(
     assert np.count_nonzero(~np.any(after, axis=1)) > 5
     assert not np.any(after[-1, [0, 1, 3, 4, 5]])
     ends_without_thrust(diving, navigator, 0.1)
-    assert diving.returncode == 1
+    assert diving.returncode == 3
     assert diving.stdout is not None
     assert diving.stdout.read().startswith("given up: ")
 

@@ -57,6 +57,24 @@ def test_bad_rows_are_left_out_and_named(
         assert f"line {line}: " in warned
 
 
+@pytest.mark.parametrize(
+    ("cells", "named"),
+    [("60,5,3_2,0,2", "'3_2'"), ("60,5,1e308,0,2", "depth_m"), ("60,5,1,0,-999", "altitude_m")],
+)
+def test_numbers_that_are_none_or_cannot_be_are_not_taken(
+    cells: str, named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = read_navigation(log_file(tmp_path, "0,60,5,1,0,2", f"1,{cells}", "2,60,5,1,0,2"), UTC)
+    assert not np.isin([32, 1e308, -999], [*log.columns.values()]).any()
+    assert named in capsys.readouterr().err
+
+
+def test_decimal_commas_between_commas_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(NavigationError, match="decimal commas"):
+        read_navigation(log_file(tmp_path, "0,5,60,2,5,1,10,2,0"), UTC)
+    assert read_navigation(log_file(tmp_path, "0,60,5,1,0,2,, "), UTC).columns["depth_m"] == [1]
+
+
 def test_rows_of_one_fault_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = [f"{t},{'nan' if 10 <= t < 50 else 60},5,1,{'x' if t in (5, 6, 8) else 0},2"
             for t in range(60)]  # fmt: skip

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import shapely
 
-from alice_survey.core.artefacts import Stage, run_stage, write_json
+from alice_survey.core.artefacts import Stage, renew_outputs, run_stage, write_json
 from alice_survey.core.config import CameraConfig, WaterConfig
 from alice_survey.core.errors import CalibrationError, ImageError, PlanError, WorkspaceError
 from alice_survey.core.frames import Datum
@@ -101,6 +101,7 @@ def test_dives_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     one, two = dive(tmp_path / "one", 2), dive(tmp_path / "two", 2, level="NN2000")
     three, both = dive(tmp_path / "three", 2), tmp_path / "both"
     write_rig(three / "images" / "rig.json", RIG.in_water(1.36))
+    renew_outputs(three / "images", [three / "images" / "rig.json"])
     elsewhere = replace(PLAN, area=replace(PLAN.area, datum=Datum(32.0, 34.0)))
     four = dive(tmp_path / "four", 2, plan=elsewhere)
     for workspace, other, fault, named in (
