@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import subprocess
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,12 +10,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from alice_survey.app.cli.main import app
+from alice_survey.app.commands.survey import RunCommand
 from alice_survey.app.pipeline import run, status_report
 from alice_survey.app.stages import STAGES, spec
-from alice_survey.core.artefacts import read_stage, run_stage
+from alice_survey.core.artefacts import read_stage, renew_outputs, run_stage
 from alice_survey.core.config import load_config
-from alice_survey.core.errors import AliceError, WorkspaceError
+from alice_survey.core.errors import AliceError, PlanError, WorkspaceError
 from alice_survey.core.executor import SERIAL
 from tests.small_survey import start
 from tests.test_loop import results
@@ -43,6 +47,14 @@ def remove(path: Path, _: np.random.Generator) -> None:
 
 
 KINDS: tuple[Callable[[Path, np.random.Generator], None], ...] = (flip, cut, blank, remove)
+
+
+def invoke(words: list[str]) -> tuple[int, str]:
+    """Exit code and text of a command; a known fault is raised."""
+    done = CliRunner().invoke(app, words)
+    if done.exception is not None and not isinstance(done.exception, SystemExit):
+        raise done.exception
+    return done.exit_code, done.output
 
 
 @pytest.fixture
@@ -116,3 +128,39 @@ def test_every_damaged_product_is_made_again(small_survey: Path, workspace: Path
         run(["evaluate"], workspace, None, SERIAL)
     assert start(workspace, threads=1).wait() == 0
     assert results(workspace) == results(small_survey)
+
+
+def test_an_edited_mission_is_flown_only_if_told_so(workspace: Path) -> None:
+    exports = workspace / "plan" / "exports"
+    mission = exports / "mission_dive1.xml"
+    fly = ["fly", "-w", str(workspace), "--mission", str(mission)]
+    subprocess.run(["sha256sum", "--check", "SHA256SUMS"], cwd=exports, check=True)
+    text = mission.read_text()
+    mission.write_text(text[: len(text) // 2])
+    with pytest.raises(PlanError, match="edited or is damaged"):
+        invoke(fly)
+    assert "exports/mission_dive1.xml has changed" in invoke(["status", "-w", str(workspace)])[1]
+    mission.write_text(text + "\n")
+    with pytest.raises(PlanError, match="--edited"):
+        invoke(fly)
+    code, said = invoke([*fly, "--edited"])
+    assert code == 0 and "complete" in said
+    invoke(["plan", "export", str(workspace)])
+    assert mission.read_text() == text
+    assert invoke(fly)[0] == 0
+    assert "plan/         up to date" in invoke(["status", "-w", str(workspace)])[1]
+
+
+def test_a_flight_that_ends_early_stops_the_run(
+    workspace: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(RunCommand, "stages", lambda _: ["plan", "fly", "pool"])
+    flight = workspace / "flight" / "flight.json"
+    flight.write_text(flight.read_text().replace('"complete"', '"aborted: no progress"'))
+    renew_outputs(flight.parent, [flight])
+    (workspace / "pool" / "manifest.csv").unlink()
+    code, said = invoke(["run", "-w", str(workspace)])
+    assert code == 3 and "fly: the flight ended early: aborted" in said
+    assert not (workspace / "pool" / "manifest.csv").exists()
+    assert invoke(["run", "-w", str(workspace), "--accept"])[0] == 3
+    assert (workspace / "pool" / "manifest.csv").exists()

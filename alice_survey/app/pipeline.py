@@ -82,6 +82,7 @@ def run(
                     "surveys: choose another workspace with -w"
                 )
     from alice_survey.app.computing import task_memory_mib
+    from missions.exports.write import check_exported
 
     lines, found = [], {}
     executor = executor or local_executor()
@@ -96,8 +97,10 @@ def run(
                 warn(f"the plan is {states[0]}; 'alice-survey plan -w {workspace}' renews it")
         for number, stage in enumerate(map(spec, stages), 1):
             with part(stage.folder, number, len(stages)):
-                if stage.name == "fly" and not edited_mission:
-                    _check_mission(workspace, config)
+                mission = config.vehicle.mission_file if stage.name == "fly" else None
+                checked = mission is not None and not edited_mission
+                if checked and stage.state(workspace, config, {}) != "up to date":
+                    check_exported(mission)
                 for needed in stage.needs:
                     spec(needed).need(workspace)
                 task_mib = task_memory_mib(
@@ -115,15 +118,6 @@ def run(
                 lines.append(f"stopped after {stage.name}; --accept goes on from what it made")
                 break
     return "\n".join(lines), found
-
-
-def _check_mission(workspace: Path, config: SurveyConfig) -> None:
-    """Check that a mission which is to be flown now is as it was exported."""
-    mission = config.vehicle.mission_file
-    if mission is not None and spec("fly").state(workspace, config, {}) != "up to date":
-        from missions.exports.write import check_exported
-
-        check_exported(mission)
 
 
 def plan_report(
