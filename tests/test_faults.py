@@ -1,6 +1,7 @@
 """What a command does when the machine fails under it: disk full, read-only, crash, two at once."""
 
 import os
+import resource
 import shutil
 import signal
 import subprocess
@@ -47,6 +48,18 @@ def one_line(done: subprocess.CompletedProcess[str]) -> str:
     assert "Traceback" not in done.stderr
     assert lines[-1].startswith("error: ")
     return lines[-1]
+
+
+def test_a_file_that_may_not_grow_is_named_with_what_to_do(tmp_path: Path) -> None:
+    init_survey(tmp_path, "demo.toml")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+    try:
+        refused = one_line(plan(tmp_path))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert "plan.partial" in refused and "ulimit" in refused
+    assert plan(tmp_path).returncode == 0
 
 
 @AS_ROOT

@@ -97,9 +97,9 @@ def run(
                 warn(f"the plan is {states[0]}; 'alice-survey plan -w {workspace}' renews it")
         for number, stage in enumerate(map(spec, stages), 1):
             with part(stage.folder, number, len(stages)):
-                mission = config.vehicle.mission_file if stage.name == "fly" else None
-                checked = mission is not None and not edited_mission
-                if checked and stage.state(workspace, config, {}) != "up to date":
+                flies = stage.name == "fly" and not edited_mission
+                mission = config.vehicle.mission_file if flies else None
+                if mission is not None and stage.state(workspace, config, {}) != "up to date":
                     check_exported(mission)
                 for needed in stage.needs:
                     spec(needed).need(workspace)

@@ -612,13 +612,24 @@ def read_csv(
     Raises:
         AliceError: of type `fault`: the file cannot be read, or lacks a column.
     """
-    try:
-        with ordinary_file(path).open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file, restval="", skipinitialspace=not exact)
-            reader.fieldnames = names = [name.strip() for name in reader.fieldnames or []]
-            numbered = [(reader.line_num, row) for row in reader]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise fault(f"{path}: cannot be read: {why(error)}") from None
+    names, rows = stream_csv(path, required, exact=exact, fault=fault)
+    return names, list(rows)
+
+
+def stream_csv(
+    path: Path,
+    required: Iterable[str] = (),
+    *,
+    exact: bool = False,
+    fault: type[AliceError] = NavigationError,
+) -> tuple[list[str], Iterator[tuple[int, dict[str, str]]]]:
+    """As `read_csv`; rows are read, and what is wrong with them is found, one by one."""
+    with (
+        _csv_faults(path, fault),
+        ordinary_file(path).open(newline="", encoding="utf-8-sig") as file,
+    ):
+        first = next(csv.reader(file, skipinitialspace=not exact), [])
+    names = [name.strip() for name in first]
     if len(names) == 1 and any(mark in names[0] for mark in ";\t"):
         raise fault(
             f"{path}: its cells are not apart by commas: save it as CSV with commas between cells "
@@ -627,17 +638,32 @@ def read_csv(
     missing = [name for name in required if name not in names]
     if missing:
         raise fault(f"{path}: column {missing[0]} is missing; it has {as_line(', '.join(names))}")
-    longer = next((line for line, row in numbered if any(map(str.strip, row.get(None, ())))), None)
-    if longer is not None:
-        raise fault(
-            f"{path} line {longer}: it has more cells than the header: decimal commas between "
-            "commas? Save numbers with points"
-        )
-    rows = [
-        (line, {name: row[name] if exact else row[name].strip() for name in names})
-        for line, row in numbered
-    ]
-    return names, rows
+
+    def rows() -> Iterator[tuple[int, dict[str, str]]]:
+        with (
+            _csv_faults(path, fault),
+            path.open(newline="", encoding="utf-8-sig") as file,
+        ):
+            reader = csv.reader(file, skipinitialspace=not exact)
+            for cells in itertools.islice(reader, 1, None):
+                if any(map(str.strip, cells[len(names) :])):
+                    raise fault(
+                        f"{path} line {reader.line_num}: it has more cells than the header: "
+                        "decimal commas between commas? Save numbers with points"
+                    )
+                if cells:
+                    kept = itertools.zip_longest(names, cells[: len(names)], fillvalue="")
+                    yield reader.line_num, {n: cell if exact else cell.strip() for n, cell in kept}
+
+    return names, rows()
+
+
+@contextlib.contextmanager
+def _csv_faults(path: Path, fault: type[AliceError]) -> Iterator[None]:
+    try:
+        yield
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise fault(f"{path}: cannot be read: {why(error)}") from None
 
 
 _MAX_LENGTH = 512 << 20

@@ -1,6 +1,8 @@
 """A navigation log of a real dive, and what it gives at the time of each picture."""
 
+import itertools
 import math
+from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, tzinfo
@@ -9,7 +11,7 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
 
-from alice_survey.core.artefacts import read_csv
+from alice_survey.core.artefacts import stream_csv
 from alice_survey.core.contents import as_line, parse_number
 from alice_survey.core.errors import NavigationError, warn
 from alice_survey.core.frames import Array
@@ -155,8 +157,9 @@ def read_navigation(
     Raises:
         NavigationError: the file cannot be read, lacks a column, or holds no usable row.
     """
-    header, rows = read_csv(path, needed)
-    rows = rows[:-1] if is_growing else rows
+    header, rows = stream_csv(path, needed)
+    if is_growing:
+        rows = (row for row, _ in itertools.pairwise(rows))
     clocks = [name for name in ("time_s", "time_utc") if name in header]
     if not clocks:
         raise NavigationError(
@@ -167,8 +170,7 @@ def read_navigation(
     if not set(names) & set(READINGS):
         raise NavigationError(f"{path}: none of the columns {', '.join(READINGS)}")
     start_utc: datetime | None = None
-    times: list[float] = []
-    table: list[list[float]] = []
+    times, table = array("d"), array("d")
     faults: dict[str, list[int]] = {}
     for line, row in rows:
         try:
@@ -192,7 +194,7 @@ def read_navigation(
                 values.append(math.nan)
                 faults.setdefault(f"{error} (that value only)", []).append(line)
         times.append(time)
-        table.append(values)
+        table.extend(values)
     if faults:
         texts = [
             f"line {lines[0]}: {fault}" if len(lines) == 1
@@ -201,12 +203,12 @@ def read_navigation(
         ]  # fmt: skip
         more = f" and {len(texts) - _NAMED} more" if len(texts) > _NAMED else ""
         warn(f"{path}: left out {'; '.join(texts[:_NAMED])}{more}")
-    cells = np.array(table).reshape(len(times), len(names))
+    cells = np.asarray(table).reshape(len(times), len(names))
     columns = {name: cells[:, i] for i, name in enumerate(names)}
     if not any(np.isfinite(columns[name]).any() for name in READINGS if name in columns):
         what = "a position" if needed else "a reading"
         raise NavigationError(f"{path}: no row with a time and {what}")
-    return NavigationLog(time_s=np.array(times), columns=columns, start_utc=start_utc)
+    return NavigationLog(time_s=np.asarray(times), columns=columns, start_utc=start_utc)
 
 
 def _number(row: Mapping[str, str], name: str) -> float:
