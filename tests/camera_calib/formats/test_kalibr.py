@@ -4,7 +4,6 @@ import tempfile
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import yaml
@@ -22,6 +21,7 @@ from tests.strategies_formats import (
     RADTAN,
     assert_same_pixels,
     fault_of,
+    opencv_pixels,
     rigs,
 )
 
@@ -52,13 +52,13 @@ def test_opencv_projects_as_we_do_from_the_chain(rig: Rig) -> None:
         assert ("T_cn_cnm1" in entry) == (i > 0)
         cam_from_rig = np.array(entry.get("T_cn_cnm1", np.eye(4))) @ cam_from_rig
         fx, fy, cx, cy = entry["intrinsics"]
-        seen = (cv2.fisheye.projectPoints if is_fisheye else cv2.projectPoints)(
-            POINTS_RIG[:, None],
+        seen = opencv_pixels(
+            POINTS_RIG,
             Rotation.from_matrix(cam_from_rig[:3, :3]).as_rotvec(),
             cam_from_rig[:3, 3],
             np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
-            np.array(entry["distortion_coeffs"]),
-        )[0].reshape(-1, 2)
+            np.pad(entry["distortion_coeffs"], (0, 0 if is_fisheye else 1)),
+        )
         ours = camera.project(rig.cam_from_rig[name].apply(POINTS_RIG))
         assert_same_pixels(ours, seen + 0.5)
 
