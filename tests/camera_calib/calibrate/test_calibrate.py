@@ -73,16 +73,6 @@ def test_in_air_from_nothing() -> None:
     assert found.rig.sigmas["left.fx_px"] < 1.5
 
 
-def test_one_camera_in_air_has_no_pose_to_find() -> None:
-    air = in_air(TRUTH)
-    views = scene(air, 12, seed=2)
-    alone = [with_pixels(view, "right", None) for view in views]
-    found = calibrate_in_air(alone, BOARD, {"left": SIZES["left"]}, "k2")
-    assert set(found.rig.cameras) == {"left"}
-    assert found.residuals_px.shape == (12, 1, len(BOARD), 2)
-    assert not any(name.endswith("_rad") for name in found.rig.sigmas)
-
-
 def test_from_air_to_ports_with_the_prior() -> None:
     """The whole way of a user: a calibration in air, then housings in water."""
     rng = np.random.default_rng(4)

@@ -116,8 +116,7 @@ def test_opencv_agrees_on_the_real_set(real: tuple[Path, str, Any]) -> None:
         for row in csv.DictReader(file):
             pixels = seen.setdefault((row["view"], row["camera"]), np.full((54, 2), np.nan))
             pixels[int(row["point"])] = float(row["x_px"]) - 0.5, float(row["y_px"]) - 0.5
-    y, x = np.mgrid[:6, :9]
-    points = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3).astype(np.float32)
+    points = parse_target(BOARD).points.astype(np.float32)
     names = sorted({view for view, _ in seen})
     whole = [n for n in names if all(np.isfinite(seen[n, c]).all() for c in ("left", "right"))]
     left, right = (
@@ -185,6 +184,7 @@ def test_one_camera(dry: Path, truth: Rig, tmp_path: Path) -> None:
     assert list(rig.cameras) == ["camera"]
     assert rig.cameras["camera"].fx_px == pytest.approx(truth.cameras["left"].fx_px, abs=0.5)
     assert found["baseline_m"] is None
+    assert not any(name.endswith("_rad") for name in rig.sigmas)
 
 
 @pytest.mark.usefixtures("quick")
@@ -272,14 +272,9 @@ def test_what_gives_no_calibration_is_one_clear_line(
     shutil.copytree(dry / "left", tmp_path / "MIXED")
     odd = cv2.imread("MIXED/04.png")
     cv2.imwrite("MIXED/04.png", odd[:-20, :-30])
-    write_rig(tmp_path / "built.json", renamed(built_rig()))
+    write_rig(tmp_path / "built.json", rename_cameras(only(built_rig(), "left"), ["camera"]))
     usual = {"cameras": ("camera=few",), "target": POOL_BOARD}
     assert named in refuses(CalibrateOptions(**usual | options), tmp_path)
-
-
-def renamed(rig: Rig) -> Rig:
-    """Its left camera alone, as `camera`."""
-    return rename_cameras(only(rig, "left"), ["camera"])
 
 
 def test_what_others_need_is_not_replaced(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.core.config import CameraConfig, WaterConfig
 from alice_survey.core.errors import CalibrationError, ConfigError
 from camera_calib.camera import Camera
-from camera_calib.formats.rigs import led_by
+from camera_calib.formats.rigs import led_by, only
 from camera_calib.fov.focus import apparent_distance_m
 from camera_calib.fov.table import MATCH_SIGMA_PX, FovRow, blur_table, fov_table, rig_fov_table
 from camera_calib.rig import Rig, design_rig
@@ -220,12 +220,7 @@ def test_a_calibrated_rig_is_seen_with_its_distortion_and_tilt() -> None:
 
 def test_one_camera_has_a_field_of_view_but_no_stereo() -> None:
     rig = design_rig(PORT, WaterConfig())
-    single = replace(
-        rig,
-        cameras={"left": rig.cameras["left"]},
-        cam_from_rig={"left": RigidTransform.identity()},
-    )
-    row = rig_fov_table(single, [2.0], PORT)[0]
+    row = rig_fov_table(only(rig, "left"), [2.0], PORT)[0]
     assert row.horizontal_m == pytest.approx(1.441, abs=1e-3)
     for value in (row.baseline_m, row.stereo_overlap, row.depth_sigma_mm):
         assert math.isnan(value)

@@ -21,16 +21,8 @@ from camera_calib.rig import write_rig
 from camera_calib.targets.target import Rejection
 from tests.oracles_report import (
     DESIGN,
-    Freedom,
-    adjusted,
-    intrinsics,
-    of_cameras,
-    pose_names,
-    synthetic_views,
-    true_rig,
     usual,
     usual_held_out,
-    without_ports,
 )
 
 NASTY = '<script>alert("x")</script>&$x_1$.png'
@@ -149,14 +141,6 @@ def test_a_picture_that_does_no_harm_asks_for_nothing() -> None:
     ):  # fmt: skip
         about = [v for v in verdicts(judgement) if f"view {first.view} of" in v.text]
         assert [v.level for v in about] == [level]
-
-
-def test_a_forgotten_port_is_reported() -> None:
-    made = synthetic_views(true_rig(), 25, 0.03, 1)
-    free = Freedom(free=(*of_cameras(DESIGN, intrinsics("opencv5")), *pose_names(DESIGN)))
-    bare = adjusted(made.views, made.points, without_ports(DESIGN), free)
-    found = verdicts(judge(bare, None))
-    assert any("homograph" in v.text for v in found if v.level != "good")
 
 
 def test_the_working_range_follows_the_views() -> None:

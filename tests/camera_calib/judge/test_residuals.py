@@ -11,6 +11,7 @@ from alice_survey.core.artefacts import json_values
 from camera_calib.approximation.pinhole_warp import best_warp
 from camera_calib.calibration import Calibration, TargetView
 from camera_calib.freedom import Freedom, intrinsics, of_cameras, pose_names
+from camera_calib.judge.judgement import judge, verdicts
 from camera_calib.judge.residuals import (
     HomographyTest,
     camera_residuals,
@@ -204,6 +205,7 @@ def test_a_forgotten_port_leaves_more_outwards() -> None:
         test = homographies(fitted, name)
         assert test.excess_px > 0.2 * test.inner_px
         assert test.outer_px > 0.036
+    assert any("homograph" in v.text for v in verdicts(judge(fitted, None)) if v.level != "good")
 
 
 def test_outliers_do_not_count() -> None:
