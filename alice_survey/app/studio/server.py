@@ -2,8 +2,10 @@
 
 Starlette's middleware refuses a request whose Host is not this machine, since a page of another
 site could otherwise reach it through a name of its own (DNS rebinding). Nothing allows another site
-to read an answer. Only endpoints below `/api/` take a body, from this server's own pages; what
-changes files needs the token of the studio's address on top. Every request has a deadline.
+to read an answer. All but the empty page and its scripts need the token of the studio's address: in
+a cookie that the page gets by that address, or in a header, which what changes files needs in any
+case. Only endpoints below `/api/` take a body, from this server's own pages. Every request has a
+deadline, and what computes waits in a queue of its own.
 """
 
 import asyncio
@@ -15,6 +17,7 @@ import secrets
 import socket
 import threading
 from collections.abc import Callable, Iterable
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -27,7 +30,7 @@ try:
     from starlette.datastructures import Headers, MutableHeaders
     from starlette.middleware import Middleware
     from starlette.middleware.trustedhost import TrustedHostMiddleware
-    from starlette.requests import Request
+    from starlette.requests import HTTPConnection, Request
     from starlette.responses import JSONResponse, Response, StreamingResponse
     from starlette.routing import Mount, Route
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -58,6 +61,7 @@ from alice_survey.core.artefacts import StaleError
 from alice_survey.core.config import SurveyConfig
 from alice_survey.core.errors import AliceError, WorkspaceError, known_fault, why
 from alice_survey.core.run.interrupts import for_other_programs
+from alice_survey.core.run.resources import release_memory
 from missions.plan.preview import preview
 
 ADDRESS = "127.0.0.1"
@@ -86,7 +90,13 @@ _LOCKED = {
     "Referrer-Policy": "no-referrer",
     "X-Frame-Options": "DENY",
 }
-_TOKEN = "X-Studio-Token"  # noqa: S105 (the name of a header)
+_TOKEN, _PAGE = "X-Studio-Token", "X-Studio-Page"
+"""Headers: the token, and a name of the page that asks."""
+_NEEDS_TOKEN = "this needs the address with its token, as the command printed it"  # noqa: S105
+_MAX_STREAMS = 100
+"""Pages that listen for events."""
+_COMPUTING, _MAX_WAITING, _WAIT_S = 2, 16, 60.0
+"""Requests that compute at once, that wait for it, and how long they wait."""
 _JSON = "application/json"
 
 
@@ -100,26 +110,37 @@ def application(studio: Studio, port: int) -> Starlette:
     package = resources.files("alice_survey")
     index = (package / "app/studio/web/index.html").read_bytes()
 
-    async def page(_: Request) -> Response:
-        return Response(
+    queue, cookie = _ComputeQueue(), f"studio-{port}"
+
+    async def page(request: Request) -> Response:
+        found = Response(
             index, headers={"Cache-Control": REVALIDATE, POLICY: _STUDIO_POLICY}, media_type=PAGE
         )
+        if _is_token(studio, request.query_params.get("token")):
+            found.set_cookie(cookie, studio.token, httponly=True, samesite="strict")
+        return found
 
     async def events(_: Request) -> Response:
-        return StreamingResponse(
-            studio.events.stream(studio.ending.is_set), media_type="text/event-stream"
-        )
+        return _EventStream(studio)
 
     return Starlette(
         routes=[
             Route("/", page),
             Route("/api/events", events),
-            *(_route(studio, endpoint) for endpoint in all_endpoints(studio)),
+            *(_route(studio, queue, endpoint) for endpoint in all_endpoints(studio)),
             Mount("/app", ScriptFiles()),
             Mount("/files", WorkspaceFiles(studio.workspace)),
         ],
         middleware=[
-            Middleware(_Guard, origins={f"http://{name}:{port}" for name in HOSTS}),
+            Middleware(
+                _Guard,
+                origins={f"http://{name}:{port}" for name in HOSTS},
+                is_known=lambda request: (
+                    _is_token(studio, request.cookies.get(cookie))
+                    or _is_token(studio, request.headers.get(_TOKEN))
+                    or _is_token(studio, request.query_params.get("token"))
+                ),
+            ),
             Middleware(TrustedHostMiddleware, allowed_hosts=HOSTS, www_redirect=False),
         ],
     )
@@ -133,11 +154,76 @@ def all_endpoints(studio: Studio) -> Iterable[Endpoint]:
             yield from tab.endpoints(studio)
 
 
-class _Guard:
-    """Refuses bodies that are not from this server's own pages, and locks every answer in."""
+def _is_token(studio: Studio, given: str | None) -> bool:
+    return secrets.compare_digest((given or "").encode(), studio.token.encode())
 
-    def __init__(self, app: ASGIApp, origins: set[str]) -> None:
-        self._app, self._origins = app, origins
+
+class _EventStream(StreamingResponse):
+    """Events for one page, of those that may listen at once."""
+
+    def __init__(self, studio: Studio) -> None:
+        events = studio.events
+        super().__init__(events.stream(studio.ending.is_set), media_type="text/event-stream")
+        self._listening = events.listening
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if len(self._listening) >= _MAX_STREAMS:
+            await _fault(503, f"{_MAX_STREAMS} pages listen already: close some")(
+                scope, receive, send
+            )
+            return
+        self._listening.add(self)
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            self._listening.discard(self)
+
+
+class _ComputeQueue:
+    """Work of endpoints that compute: few at once, and of each page only the newest that waits."""
+
+    def __init__(self) -> None:
+        self._places = asyncio.Semaphore(_COMPUTING)
+        self._waiting: dict[object, asyncio.Future[None]] = {}
+
+    async def run(self, page: str, path: str, work: Callable[[], Response]) -> Response:
+        """Do the work of a page in its turn."""
+        key = (page, path) if page else object()
+        if (older := self._waiting.pop(key, None)) is not None:
+            older.set_result(None)
+        if len(self._waiting) >= _MAX_WAITING:
+            return _fault(503, "the studio computes for other pages: try again in a moment")
+        gives_way = self._waiting[key] = asyncio.get_running_loop().create_future()
+        turn = asyncio.ensure_future(self._places.acquire())
+        try:
+            await asyncio.wait(
+                (turn, gives_way), timeout=_WAIT_S, return_when=asyncio.FIRST_COMPLETED
+            )
+        finally:
+            if self._waiting.get(key) is gives_way:
+                del self._waiting[key]
+            has_turn = turn.done() or not turn.cancel()
+        try:
+            if gives_way.done():
+                return _fault(409, "a newer request of the same page is answered")
+            if not has_turn:
+                return _fault(503, "the studio computes for other pages: try again in a moment")
+            found = await run_in_threadpool(work)
+            if not self._waiting:
+                release_memory()
+            return found
+        finally:
+            if has_turn:
+                self._places.release()
+
+
+class _Guard:
+    """Refuses who has no token and bodies of other pages, and locks every answer in."""
+
+    def __init__(
+        self, app: ASGIApp, origins: set[str], is_known: Callable[[HTTPConnection], bool]
+    ) -> None:
+        self._app, self._origins, self._is_known = app, origins, is_known
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         async def send_locked(message: Message) -> None:
@@ -149,6 +235,9 @@ class _Guard:
             await send(message)
 
         refusal = self._refusal(scope["method"], Headers(scope=scope))
+        is_open = scope["path"] == "/" or scope["path"].startswith("/app/")
+        if refusal is None and not is_open and not self._is_known(HTTPConnection(scope)):
+            refusal = _fault(403, _NEEDS_TOKEN, close=True)
         await (refusal or self._app)(scope, receive, send_locked)
 
     def _refusal(self, method: str, headers: Headers) -> Response | None:
@@ -168,13 +257,12 @@ class _Guard:
         return None
 
 
-def _route(studio: Studio, endpoint: Endpoint) -> Route:
+def _route(studio: Studio, queue: _ComputeQueue, endpoint: Endpoint) -> Route:
     """An endpoint behind its checks."""
 
     async def answer(request: Request) -> Response:
-        token = request.headers.get(_TOKEN, "").encode()
-        if endpoint.writes and not secrets.compare_digest(token, studio.token.encode()):
-            return _fault(403, "this needs the address with its token, as the command printed it")
+        if endpoint.writes and not _is_token(studio, request.headers.get(_TOKEN)):
+            return _fault(403, _NEEDS_TOKEN)
         body = b""
         if endpoint.method == "POST":
             size = int(request.headers["Content-Length"])
@@ -187,7 +275,10 @@ def _route(studio: Studio, endpoint: Endpoint) -> Route:
             except TimeoutError:
                 return _fault(408, "the request did not arrive in time", close=True)
         call = Call(query=dict(request.query_params), path=dict(request.path_params), body=body)
-        return await run_in_threadpool(_answer, endpoint, call, request)
+        work = partial(_answer, endpoint, call, request)
+        if endpoint.computes:
+            return await queue.run(request.headers.get(_PAGE, ""), endpoint.path, work)
+        return await run_in_threadpool(work)
 
     return Route(endpoint.path, answer, methods=[endpoint.method])
 
@@ -328,9 +419,9 @@ class Server:
             answering.join(2 * _ENDING_S)
             log.removeFilter(self._is_shown)
 
-    def _is_shown(self, _: logging.LogRecord) -> bool:
-        """Whether uvicorn may speak: of what is dropped at the end nobody needs to hear."""
-        return not self.studio.ending.is_set()
+    def _is_shown(self, record: logging.LogRecord) -> bool:
+        """Whether uvicorn may speak: not of wrong requests, nor of what is dropped at the end."""
+        return record.levelno >= logging.ERROR and not self.studio.ending.is_set()
 
     def shutdown(self) -> None:
         """End `serve_forever`."""

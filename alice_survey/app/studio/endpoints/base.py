@@ -127,6 +127,8 @@ class Endpoint:
     method: Literal["GET", "POST"] = "GET"
     writes: bool = False
     """Whether files change, or files outside of the workspace are named: needs the token."""
+    computes: bool = False
+    """Whether it takes long enough to wait for its turn, so that other requests do not."""
     max_bytes: int = 1 << 20
     """Largest body."""
 
@@ -169,6 +171,8 @@ class Events:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._pages: dict[asyncio.Queue[str], asyncio.AbstractEventLoop] = {}
+        self.listening: set[object] = set()
+        """Streams that were accepted and have not ended."""
 
     def publish(self, event: str, data: Any) -> None:
         """Send an event to every page; any thread may."""

@@ -209,7 +209,7 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
     return (
         Endpoint(path="/api/follow/state", answer=tab.state),
         Endpoint(path="/api/follow/dive", answer=tab.dive),
-        Endpoint(path="/api/follow/coverage", answer=tab.coverage),
+        Endpoint(path="/api/follow/coverage", answer=tab.coverage, computes=True),
         Endpoint(path="/api/follow/export", answer=tab.export),
         change("/api/follow/open", tab.open),
         change("/api/follow/end", tab.end),

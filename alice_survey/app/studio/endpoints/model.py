@@ -242,8 +242,8 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
     return (
         Endpoint(path="/api/model/value", answer=model.value),
         Endpoint(path="/api/model/mesh", answer=model.mesh),
-        Endpoint(path="/mesh.glb", answer=model.light_mesh),
-        Endpoint(path="/api/model/profile", answer=model.profile, method="POST"),
-        Endpoint(path="/api/model/measure", answer=model.measure, method="POST"),
+        Endpoint(path="/mesh.glb", answer=model.light_mesh, computes=True),
+        Endpoint(path="/api/model/profile", answer=model.profile, method="POST", computes=True),
+        Endpoint(path="/api/model/measure", answer=model.measure, method="POST", computes=True),
         Endpoint(path="/api/model/export", answer=model.export, method="POST", max_bytes=16 << 20),
     )

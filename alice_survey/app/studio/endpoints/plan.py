@@ -43,40 +43,6 @@ _LENSES_MM = (12.5, 25.0)
 _JSON = "application/json"
 
 
-class SupersededError(AliceError):
-    """The same page has sent a newer request."""
-
-
-@dataclass(eq=False)
-class LatestRequests:
-    """Work of which only the newest of each page counts: older ones that wait are dropped."""
-
-    _condition: threading.Condition = field(default_factory=threading.Condition)
-    tickets: dict[str, int] = field(default_factory=dict)
-    """Requests of each page so far."""
-    _busy: bool = False
-
-    def run(self, page: str, work: Callable[[], Any]) -> Any:
-        """Do some work when no other is being done.
-
-        Raises:
-            SupersededError: newer work came from the same page while this waited.
-        """
-        with self._condition:
-            mine = self.tickets[page] = self.tickets.get(page, 0) + 1
-            self._condition.notify_all()
-            self._condition.wait_for(lambda: not self._busy or self.tickets[page] != mine)
-            if self.tickets[page] != mine:
-                raise SupersededError("a newer change is being planned")
-            self._busy = True
-        try:
-            return work()
-        finally:
-            with self._condition:
-                self._busy = False
-                self._condition.notify_all()
-
-
 class PlanRequest(Config):
     """Settings that a page has changed, and what it has drawn."""
 
@@ -85,7 +51,7 @@ class PlanRequest(Config):
     token: str | None = None
     """Of the settings that the page has seen."""
     page: str = ""
-    """Names the page: of its requests the newest is answered."""
+    """Names the page, whose own changes are no news to it."""
 
 
 class _AreaFile(Config):
@@ -104,7 +70,6 @@ class _Settings(NamedTuple):
 @dataclass(eq=False)
 class _PlanTab:
     studio: Studio
-    latest: LatestRequests = field(default_factory=LatestRequests)
     saving: threading.Lock = field(default_factory=threading.Lock)
     kept: tuple[str, dict[str, Any]] | None = None
     """Preview of what is saved, with the token of its settings and their files."""
@@ -186,12 +151,7 @@ class _PlanTab:
 
     def preview(self, call: Call) -> Content:
         """Plan with a page's changes; nothing is written."""
-        request = call.read(PlanRequest)
-        try:
-            found = self.latest.run(request.page, lambda: self._preview(request))
-        except SupersededError as error:
-            found = {**refusal_json(error), "superseded": True}
-        return _json(found)
+        return _json(self._preview(call.read(PlanRequest)))
 
     def _preview(self, request: PlanRequest) -> dict[str, Any]:
         try:
@@ -307,7 +267,7 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
     return (
         Endpoint(path="/api/plan", answer=plan.overview),
         Endpoint(path="/api/plan/export", answer=plan.export),
-        post("preview", plan.preview),
+        post("preview", plan.preview, computes=True),
         post("import", plan.read_dropped, max_bytes=_MAX_FILE),
         post("text", plan.text),
         post("save", plan.save, writes=True),

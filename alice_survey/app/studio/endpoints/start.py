@@ -242,6 +242,6 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
     post: dict[str, Any] = {"method": "POST", "writes": True}
     return (
         Endpoint(path="/api/start/folders", answer=start.list_folder, **post),
-        Endpoint(path="/api/start/preview", answer=start.preview, **post),
+        Endpoint(path="/api/start/preview", answer=start.preview, computes=True, **post),
         Endpoint(path="/api/start/survey", answer=start.survey, max_bytes=_MAX_BYTES, **post),
     )

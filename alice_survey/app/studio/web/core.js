@@ -13,10 +13,14 @@ if (given) {
 /* Whether this page may change anything: it was opened by the address with the token. */
 export const mayWrite = () => Boolean(sessionStorage.getItem(key));
 
+/* For an address that is used outside of this page, which has no cookie. */
+export const tokenQuery = () => (mayWrite() ? "?token=" + sessionStorage.getItem(key) : "");
+
 async function asked(address, options) {
   let response = null;
   try {
-    response = await fetch(address, options);
+    response = await fetch(address, {
+      ...options, headers: {...options?.headers, "X-Studio-Page": PAGE}});
   } catch (fault) {
     if (fault.name === "AbortError") throw fault;
     throw new Error("the studio does not answer: start it again with 'alice-survey studio'");

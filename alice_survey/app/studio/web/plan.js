@@ -74,7 +74,6 @@ export function tab(studio) {
   }
 
   function settled(answer) {
-    if (answer.superseded) return;
     if (answer.ok) {
       preview = answer;
       view.show(answer);

@@ -2,7 +2,10 @@
 
 import {attempt, el, get, mayWrite, say} from "./core.js";
 
-const state = await get("/api/state");
+const state = await get("/api/state").catch((fault) => {
+  say(fault.message, "error");
+  throw fault;
+});
 document.title = state.name + " – alice-survey";
 document.getElementById("title").textContent = state.name;
 

@@ -108,7 +108,7 @@ def ask(
     Args:
         server: to send it to.
         path: as it goes over the wire.
-        headers: besides Host.
+        headers: besides Host and the cookie of the page; empty ones are not sent.
         method: any word.
         host: the server's own if empty; None for no such header.
         body: sent with its length where there is one.
@@ -117,7 +117,8 @@ def ask(
     lines = [f"{method} {path} HTTP/1.1", "Connection: close"]
     if host is not None:
         lines.append(f"Host: {host or f'127.0.0.1:{port}'}")
-    lines += [f"{name}: {text}" for name, text in (headers or {}).items()]
+    headers = {"Cookie": f"studio-{port}={server.studio.token}", **(headers or {})}
+    lines += [f"{name}: {text}" for name, text in headers.items() if text]
     if body:
         lines.append(f"Content-Length: {len(body)}")
     head = "\r\n".join([*lines, "", ""]).encode("utf-8", "surrogateescape")

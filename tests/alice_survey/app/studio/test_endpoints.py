@@ -161,7 +161,8 @@ def test_every_page_hears_an_event(server: Server) -> None:
 
 
 def events_asked(server: Server) -> bytes:
-    return f"GET /api/events HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\n\r\n".encode()
+    path = f"/api/events?token={server.studio.token}"
+    return f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\n\r\n".encode()
 
 
 def read_to(page: socket.socket, text: bytes) -> bytes:

@@ -3,8 +3,6 @@
 import io
 import json
 import shutil
-import threading
-import time
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +11,6 @@ from typing import Any
 import pytest
 
 from alice_survey.app.pipeline import run, template_text
-from alice_survey.app.studio.endpoints.plan import LatestRequests, SupersededError
 from alice_survey.app.studio.server import Server
 from alice_survey.core.artefacts import read_json
 from alice_survey.core.errors import collected_by
@@ -236,37 +233,3 @@ def test_exports_of_the_plan(workspace: Path, server: Server) -> None:
     assert one.body == (workspace / "plan" / "exports" / "plan.kml").read_bytes()
     assert "plan.kml" in one.headers["content-disposition"]
     assert ask(server, "/api/plan/export?format=../plan").status == 400
-
-
-def test_of_requests_that_wait_only_the_newest_of_a_page_is_answered() -> None:
-    newest, began, go_on = LatestRequests(), threading.Event(), threading.Event()
-    done: list[str] = []
-
-    def first() -> None:
-        began.set()
-        go_on.wait()
-        done.append("first")
-
-    def later(page: str, name: str) -> None:
-        try:
-            newest.run(page, lambda: done.append(name))
-        except SupersededError:
-            done.append(f"{name} dropped")
-
-    threads = [threading.Thread(target=lambda: newest.run("a", first))]
-    threads[0].start()
-    began.wait()
-    for count, (page, name) in enumerate(
-        (("a", "second"), ("b", "other"), ("a", "third")), start=1
-    ):
-        threads.append(threading.Thread(target=later, args=(page, name)))
-        threads[-1].start()
-        while sum(newest.tickets.values()) <= count:
-            time.sleep(0.001)
-    while "second dropped" not in done:  # at once, while the first is still being worked on
-        time.sleep(0.001)
-    assert "first" not in done
-    go_on.set()
-    for thread in threads:
-        thread.join()
-    assert sorted(done) == ["first", "other", "second dropped", "third"]

@@ -259,8 +259,9 @@ def test_what_is_known_is_not_sent_again(server: Server) -> None:
 def test_a_gis_reads_the_mosaic_by_parts(server: Server, folder: Path) -> None:
     read = "raster.read(window=((100, 150), (200, 260))).tobytes().hex()"
     script = f"import sys, rasterio; raster = rasterio.open(sys.argv[1]); print({read})"
+    address = f"/vsicurl/{server.url}files/mosaic/mosaic.tif?token={server.studio.token}"
     done = subprocess.run(
-        [sys.executable, "-c", script, f"/vsicurl/{server.url}files/mosaic/mosaic.tif"],
+        [sys.executable, "-c", script, address],
         capture_output=True, text=True, check=True, timeout=30,
     )  # fmt: skip
     with rasterio.open(folder / "mosaic" / "mosaic.tif") as raster:
@@ -280,7 +281,7 @@ def test_many_at_once(server: Server) -> None:
         connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=30)
         for step in range(10):
             path = paths[(number + step) % len(paths)]
-            connection.request("GET", path)
+            connection.request("GET", path, headers={"X-Studio-Token": server.studio.token})
             if connection.getresponse().read() != expected[path]:
                 found.append(path)
         connection.close()
