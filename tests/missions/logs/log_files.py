@@ -1,5 +1,6 @@
 """Logs of other makers' formats, written here from numbers that tests know."""
 
+import csv
 import struct
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -12,6 +13,8 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from missions.logs.import_log import ImportOptions, import_log
 
 NAV_STS = "cola2_msgs/msg/NavSts"
 _COLA2 = {
@@ -46,6 +49,18 @@ Numbers = Sequence[float] | NDArray[np.float64]
 def fields_of(names: str, values: Iterable[float]) -> dict[str, float]:
     """Numbers by the names of their fields, such as `x y z`."""
     return dict(zip(names.split(), map(float, values), strict=True))
+
+
+def imported(log: Path, **options: Any) -> dict[str, Any]:
+    """What importing a log into `n.csv` next to it reports."""
+    return import_log(log, log.with_name("n.csv"), ImportOptions(**options))[1]
+
+
+def numbers(folder: Path, *names: str) -> NDArray[np.float64]:
+    """Columns of `n.csv`, NaN where they are empty; one is flat."""
+    rows = csv.DictReader((folder / "n.csv").read_text().splitlines())
+    found = np.array([[float(row[name] or "nan") for name in names] for row in rows])
+    return found[:, 0] if len(names) == 1 else found
 
 
 class Bag:

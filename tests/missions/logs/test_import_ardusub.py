@@ -13,10 +13,8 @@ from alice_survey.core.errors import NavigationError
 from alice_survey.sim.vehicle.identification.problem import make_windows
 from alice_survey.sim.vehicle.log import read_column_map, read_foreign_log, read_vehicle_log
 from alice_survey.sim.vehicle.vehicle import vehicle_from
-from missions.logs.import_log import ImportOptions, import_log
 from missions.logs.navigation_csv import read_navigation
-from tests.missions.logs.log_files import dataflash_log, dataflash_message, tlog
-from tests.missions.logs.test_import_bag import numbers
+from tests.missions.logs.log_files import dataflash_log, dataflash_message, imported, numbers, tlog
 
 # Week 2312 of GPS began on Sunday 28 April 2024; 302418 s into it are 1 May 12:00:18 by GPS, whose
 # clock was 18 s ahead of UTC.
@@ -60,13 +58,8 @@ def bin_log(folder: Path, messages: Iterable[tuple[Any, ...]] | None = None) -> 
     return path
 
 
-def imported(folder: Path, log: Path, **options: Any) -> dict[str, Any]:
-    """What importing a log into `n.csv` reports."""
-    return import_log(log, folder / "n.csv", ImportOptions(**options))[1]
-
-
 def test_an_on_board_log_becomes_navigation(tmp_path: Path) -> None:
-    data = imported(tmp_path, bin_log(tmp_path), vehicle_log=tmp_path / "v.csv")
+    data = imported(bin_log(tmp_path), vehicle_log=tmp_path / "v.csv")
 
     assert data["left_out"] == {}
     assert data["sources"] == {
@@ -100,46 +93,46 @@ def test_an_on_board_log_becomes_navigation(tmp_path: Path) -> None:
 def test_declination_by_hand(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Norway, 3.4 degrees east: a compass that shows 358.0 points to 1.4."""
     log = bin_log(tmp_path)
-    imported(tmp_path, log, declination_deg=3.4)
-    assert numbers(tmp_path / "n.csv", "heading_deg")[0, 0] == pytest.approx(1.4, abs=0.011)
+    imported(log, declination_deg=3.4)
+    assert numbers(tmp_path, "heading_deg")[0] == pytest.approx(1.4, abs=0.011)
     assert not capsys.readouterr().err
 
     log.write_bytes(dataflash_log([("PARM", 1, "COMPASS_AUTODEC", 1.0), *dive_messages()]))
-    imported(tmp_path, log, declination_deg=3.4)
+    imported(log, declination_deg=3.4)
     assert "COMPASS_AUTODEC" in capsys.readouterr().err
     log.write_bytes(
         dataflash_log([("PARM", 1, "COMPASS_DEC", math.radians(2.0)), *dive_messages()])
     )
-    imported(tmp_path, log, declination_deg=3.4)
+    imported(log, declination_deg=3.4)
     assert "2.00 degrees" in capsys.readouterr().err
 
 
 def test_tide_by_hand(tmp_path: Path) -> None:
     """1.2 m of tide above the datum: what is 4 m below the surface is 2.8 m below the datum."""
     log = bin_log(tmp_path)
-    data = imported(tmp_path, log, tide="1.2")
+    data = imported(log, tide="1.2")
     assert data["depths_from"] == "level of the tide"
-    assert numbers(tmp_path / "n.csv", "depth_m")[0, 0] == pytest.approx(2.8, abs=1e-5)
+    assert numbers(tmp_path, "depth_m")[0] == pytest.approx(2.8, abs=1e-5)
 
     # Rising by 0.6 m in 60 s from 12:00:00 UTC: at the first position, 12:00:01, it is 0.51 m.
     tides = tmp_path / "tides.csv"
     tides.write_text("time_utc,height_m\n2024-05-01T12:00:00Z,0.5\n2024-05-01T14:01:00+02:00,1.1\n")
-    data = imported(tmp_path, log, tide=str(tides))
+    data = imported(log, tide=str(tides))
     assert data["depths_from"] == "level of the tide"
-    depth = numbers(tmp_path / "n.csv", "depth_m")[:, 0]
+    depth = numbers(tmp_path, "depth_m")
     np.testing.assert_allclose(depth, 4.0 + 0.25 * np.arange(20) - 0.51 - 0.001 * np.arange(20),
                                atol=2e-5)  # fmt: skip
 
     tides.write_text("time_utc,height_m\n2024-05-01T12:00:02Z,0.5\n2024-05-01T13:00:00Z,1.1\n")
     with pytest.raises(NavigationError, match="2024-05-01 12:00:01"):
-        imported(tmp_path, log, tide=str(tides))
+        imported(log, tide=str(tides))
     tides.write_text("time_s,height_m\n0,0.5\n")
     with pytest.raises(NavigationError, match="time_utc"):
-        imported(tmp_path, log, tide=str(tides))
+        imported(log, tide=str(tides))
     with pytest.raises(NavigationError, match="--tide"):
-        imported(tmp_path, log, tide="high")
+        imported(log, tide="high")
 
-    data = imported(tmp_path, log)
+    data = imported(log)
     assert data["depths_from"] == "sea surface"
 
 
@@ -149,10 +142,8 @@ def test_a_lever_arm_moves_positions_to_the_body(tmp_path: Path) -> None:
         ("ATT", *m[1:3], 0.0, 0.0, 0.0, *m[6:]) if m[0] == "ATT" else m for m in dive_messages()
     ]
     log = bin_log(tmp_path, messages)
-    imported(tmp_path, log, lever_body_m=(1.0, 0.0, 0.3))
-    latitude, longitude, depth = numbers(
-        tmp_path / "n.csv", "latitude_deg", "longitude_deg", "depth_m"
-    )[0]
+    imported(log, lever_body_m=(1.0, 0.0, 0.3))
+    latitude, longitude, depth = numbers(tmp_path, "latitude_deg", "longitude_deg", "depth_m")[0]
     # A minute of latitude at 60 degrees is 1856.9 m, of longitude 927.2 m (WGS 84).
     assert (latitude - LAT) * 60 * 1856.9 == pytest.approx(-math.cos(math.radians(2)), abs=0.01)
     assert (longitude - LON) * 60 * 927.2 == pytest.approx(math.sin(math.radians(2)), abs=0.01)
@@ -163,10 +154,10 @@ def test_filter_positions_count_from_its_origin(tmp_path: Path) -> None:
     messages = [m for m in dive_messages() if m[0] != "POS"]
     origin = ("ORGN", BOOT_US, 0, LAT, LON, 0.0)
     log = bin_log(tmp_path, [origin, *messages])
-    data = imported(tmp_path, log)
+    data = imported(log)
     assert data["sources"]["position"] == "XKF1"
     assert any("XKF1 0" in note for note in data["notes"])
-    latitude, depth = numbers(tmp_path / "n.csv", "latitude_deg", "depth_m")[0]
+    latitude, depth = numbers(tmp_path, "latitude_deg", "depth_m")[0]
     assert (latitude - LAT) * 60 * 1856.9 == pytest.approx(9.0, abs=0.01)
     assert depth == pytest.approx(9.0, abs=1e-6)
 
@@ -176,21 +167,20 @@ def test_the_filters_origin_can_be_given(tmp_path: Path) -> None:
     messages = [m for m in dive_messages() if m[0] != "POS"]
     log = bin_log(tmp_path, messages)
     with pytest.raises(NavigationError, match=r"XKF1 gives no navigation: .*ORGN.*--datum"):
-        imported(tmp_path, log, topics=("navigation=XKF1",))
+        imported(log, topics=("navigation=XKF1",))
     origin = ("ORGN", BOOT_US, 0, LAT + 1.0, LON, 0.0)
     for rows in (messages, [origin, *messages]):
         log = bin_log(tmp_path, rows)
         options = {"topics": ("navigation=XKF1",), "datum_deg": (LAT, LON)}
-        assert imported(tmp_path, log, **options)["sources"]["position"] == "XKF1"
-        latitude = numbers(tmp_path / "n.csv", "latitude_deg")[0, 0]
+        assert imported(log, **options)["sources"]["position"] == "XKF1"
+        latitude = numbers(tmp_path, "latitude_deg")[0]
         assert (latitude - LAT) * 60 * 1856.9 == pytest.approx(9.0, abs=0.01)
 
 
 def test_a_tank_log_without_position_reaches_the_identification(tmp_path: Path) -> None:
     """A .BIN without GPS: attitude, rates, velocities and pulses are what a fit needs."""
     kept = [m for m in dive_messages(60) if m[0] in ("ATT", "XKF1", "RCOU")]
-    options = ImportOptions(vehicle_log=tmp_path / "v.csv")
-    import_log(bin_log(tmp_path, kept), tmp_path / "n.csv", options)
+    imported(bin_log(tmp_path, kept), vehicle_log=tmp_path / "v.csv")
     names = ("t1", "t2", "t3", "t4", "t5", "t6", "t7", "t8")
     pulses = ", ".join(
         f'{name} = "{"-" if i == 2 else ""}pwm_{i}_us"' for i, name in enumerate(names, 1)
@@ -228,13 +218,13 @@ def test_one_of_several_depth_sensors_must_be_chosen(tmp_path: Path) -> None:
         messages += [("BARO", t, 0, 0.4, 1e5), ("BARO", t, 1, -7.5, 1.7e5)]
     log = bin_log(tmp_path, messages)
     with pytest.raises(NavigationError, match=r"depth=BARO\[1\]"):
-        imported(tmp_path, log, topics=("depth=BARO",))
-    imported(tmp_path, log, topics=("depth=BARO[1]",))
-    np.testing.assert_allclose(numbers(tmp_path / "n.csv", "depth_m"), 7.5, atol=1e-6)
+        imported(log, topics=("depth=BARO",))
+    imported(log, topics=("depth=BARO[1]",))
+    np.testing.assert_allclose(numbers(tmp_path, "depth_m"), 7.5, atol=1e-6)
     with pytest.raises(NavigationError, match="0, 1"):
-        imported(tmp_path, log, topics=("depth=BARO[2]",))
+        imported(log, topics=("depth=BARO[2]",))
     with pytest.raises(NavigationError, match="POS"):
-        imported(tmp_path, log, topics=("depth=SONAR",))
+        imported(log, topics=("depth=SONAR",))
 
 
 @pytest.mark.parametrize(
@@ -251,7 +241,7 @@ def test_a_vehicle_without_positions_logs_what_it_measures(
 ) -> None:
     """A BlueROV2 without GPS: the filter has a depth, but no origin to count from."""
     kept = [m for m in dive_messages() if m[0] in messages]
-    data = imported(tmp_path, bin_log(tmp_path, kept))
+    data = imported(bin_log(tmp_path, kept))
     assert {name for name, count in data["filled"].items() if count} == known
     read = read_navigation(tmp_path / "n.csv", UTC, ())
     if "depth_m" in known:
@@ -267,20 +257,20 @@ def test_damage_costs_what_is_damaged_and_is_counted(tmp_path: Path) -> None:
     log = tmp_path / "dive.BIN"
     first_pos = whole.index(dataflash_message(*dive_messages()[2]))
     log.write_bytes(whole[:first_pos] + b"\x00\xa3\x95\xff rubbish" + whole[first_pos:-5])
-    data = imported(tmp_path, log)
+    data = imported(log)
     assert data["rows"] == 20
     assert data["left_out"] == {
         "bytes that are not a message, or of one that is cut off": 12 + len(att) - 5,
     }
     log.write_bytes(whole[2000:])
     with pytest.raises(NavigationError, match=r"dive\.BIN"):
-        imported(tmp_path, log)
+        imported(log)
 
 
 def test_rows_of_a_message_without_a_usable_one_are_counted(tmp_path: Path) -> None:
     late = [(m[0], 10**17 + i, *m[2:]) if m[0] == "RFND" else m
             for i, m in enumerate(dive_messages())]  # fmt: skip
-    data = imported(tmp_path, bin_log(tmp_path, late))
+    data = imported(bin_log(tmp_path, late))
     assert data["left_out"] == {"RFND: the time is not a number, or after 2200": 20}
 
 
@@ -315,7 +305,7 @@ def test_a_ground_stations_log_becomes_navigation(tmp_path: Path, version: int) 
     log = tmp_path / "dive.tlog"
     log.write_bytes(tlog(telemetry(), version=version))
 
-    data = imported(tmp_path, log, vehicle_log=tmp_path / "v.csv")
+    data = imported(log, vehicle_log=tmp_path / "v.csv")
 
     read = read_navigation(tmp_path / "n.csv", UTC)
     assert read.start_utc is not None
@@ -345,7 +335,7 @@ def test_telemetry_of_other_systems_and_damage_are_counted(tmp_path: Path) -> No
     broken[whole.index(target[8 + 14 : 8 + 24]) + 2] ^= 0x55
     log = tmp_path / "dive.tlog"
     log.write_bytes(bytes(broken) + b"\x01" * 37 + other + whole[:20])
-    data = imported(tmp_path, log)
+    data = imported(log)
     assert data["rows"] == 19
     assert data["left_out"]["GLOBAL_POSITION_INT: messages of another system than 1"] == 2
     noise = data["left_out"]["bytes that are not a message, or of one that is cut off"]
@@ -356,17 +346,17 @@ def test_telemetry_without_a_position(tmp_path: Path) -> None:
     log = tmp_path / "dive.tlog"
     log.write_bytes(tlog(r for r in telemetry() if r[1].msgname == "HEARTBEAT"))
     with pytest.raises(NavigationError, match="it has HEARTBEAT"):
-        imported(tmp_path, log)
+        imported(log)
     log.write_bytes(tlog(r for r in telemetry() if r[1].msgname in ("HEARTBEAT", "ATTITUDE")))
-    assert imported(tmp_path, log)["sources"] == {"attitude": "ATTITUDE"}
+    assert imported(log)["sources"] == {"attitude": "ATTITUDE"}
     zero = [
         (t, mavlink.MAVLink_global_position_int_message(i, 0, 0, 0, -1000, 0, 0, 0, 0))
         for i, (t, _) in enumerate(telemetry(3))
     ]
     log.write_bytes(tlog(zero))
-    data = imported(tmp_path, log)
+    data = imported(log)
     assert data["left_out"] == {"GLOBAL_POSITION_INT: the position is 0, 0: no fix": len(zero)}
-    np.testing.assert_allclose(numbers(tmp_path / "n.csv", "depth_m"), 1.0)
+    np.testing.assert_allclose(numbers(tmp_path, "depth_m"), 1.0)
 
 
 @pytest.mark.parametrize(
@@ -382,10 +372,10 @@ def test_telemetry_without_a_position(tmp_path: Path) -> None:
 )
 def test_other_files_are_refused_by_name(tmp_path: Path, name: str, content: str) -> None:
     with pytest.raises(NavigationError, match=name):
-        import_log(tmp_path / name, tmp_path / "n.csv")
+        imported(tmp_path / name)
     (tmp_path / name).write_text(content)
     with pytest.raises(NavigationError, match=name):
-        import_log(tmp_path / name, tmp_path / "n.csv")
+        imported(tmp_path / name)
 
 
 @pytest.mark.parametrize("form", ["dive.BIN", "dive.tlog"])
@@ -404,7 +394,7 @@ def test_damaged_logs_end_in_a_table_or_in_one_line(tmp_path: Path, form: str) -
         del data[start : min(end, start + 100)]
         (tmp_path / form).write_bytes(bytes(data))
         try:
-            _, report = import_log(tmp_path / form, tmp_path / "n.csv")
+            report = imported(tmp_path / form)
         except NavigationError as error:
             assert "\n" not in str(error)
             outcomes.append(0)
@@ -420,7 +410,7 @@ def test_damaged_logs_end_in_a_table_or_in_one_line(tmp_path: Path, form: str) -
 def test_what_is_no_submarine_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = tmp_path / "flight.tlog"
     log.write_bytes(tlog(telemetry()))
-    imported(tmp_path, log)
+    imported(log)
     assert "submarine" not in capsys.readouterr().err
     high = []
     for i, (t, message) in enumerate(telemetry()):
@@ -432,7 +422,7 @@ def test_what_is_no_submarine_is_said(tmp_path: Path, capsys: pytest.CaptureFixt
             )
         high.append((t, message))
     log.write_bytes(tlog(high))
-    data = imported(tmp_path, log)
+    data = imported(log)
     said = capsys.readouterr().err
     assert "the log is of a vehicle of MAV_TYPE_VTOL_TILTROTOR, not of a submarine" in said
     assert f"{data['rows']} of {data['rows']} rows lie above the water, by 63.4 m" in said

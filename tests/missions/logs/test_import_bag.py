@@ -1,9 +1,7 @@
-import csv
 import sqlite3
 from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,29 +10,13 @@ from rosbags.rosbag2 import StoragePlugin
 from alice_survey.core.errors import NavigationError
 from alice_survey.core.frames import Datum, attitude_from_rotation, rotation_from_attitude
 from alice_survey.sim.vehicle.log import read_vehicle_log
-from missions.logs.import_log import ImportOptions, import_log
 from missions.logs.navigation_csv import read_navigation
 from missions.logs.ros_builder import flipped_quaternion, flipped_world, write_bag
-from tests.missions.logs.log_files import Bag
+from tests.missions.logs.log_files import Bag, imported, numbers
 from tests.missions.logs.test_bag import flight
 
 START = 1_650_000_000_000_000_000
 TOPIC = "/sparus2/navigator/navigation"
-
-
-def rows_of(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def numbers(path: Path, *names: str) -> np.ndarray:
-    return np.array([[float(row[name] or "nan") for name in names] for row in rows_of(path)])
-
-
-def imported(bag: Bag, folder: Path, **options: Any) -> dict[str, Any]:
-    """What importing a bag into `n.csv` reports."""
-    log = bag.write(folder / ("dive.bag" if bag.version == 1 else "dive"))
-    return import_log(log, folder / "n.csv", ImportOptions(**options))[1]
 
 
 def cola2_bag(version: int, count: int = 30) -> Bag:
@@ -61,11 +43,9 @@ def cola2_bag(version: int, count: int = 30) -> Bag:
 def test_cola2_navigation_becomes_the_navigation_csv(
     tmp_path: Path, version: int, name: str, storage: StoragePlugin
 ) -> None:
-    log = cola2_bag(version).write(tmp_path / name, storage)
+    data = imported(cola2_bag(version).write(tmp_path / name, storage))
 
-    _, data = import_log(log, tmp_path / "navigation.csv")
-
-    read = read_navigation(tmp_path / "navigation.csv", UTC)
+    read = read_navigation(tmp_path / "n.csv", UTC)
     i = np.arange(30)
     assert read.start_utc == datetime.fromtimestamp(START / 1e9, UTC)
     np.testing.assert_allclose(read.time_s, 0.1 * i, atol=2e-6)
@@ -95,15 +75,14 @@ def test_a_flight_comes_back_from_its_bag(tmp_path: Path) -> None:
     record = flight()
     write_bag(tmp_path / "dive", record)
 
-    options = ImportOptions(vehicle_log=tmp_path / "vehicle.csv")
-    _, data = import_log(tmp_path / "dive", tmp_path / "navigation.csv", options)
+    data = imported(tmp_path / "dive", vehicle_log=tmp_path / "vehicle.csv")
 
     assert not data["dated"]  # a simulation's clock
     # Not the truth, which the bag also holds.
     assert data["sources"]["position"] == "/alice/navigation/odometry"
-    times = numbers(tmp_path / "navigation.csv", "time_s")[:, 0]
+    times = numbers(tmp_path, "time_s")
     np.testing.assert_allclose(times, record.time_s, atol=1e-6)
-    read = read_navigation(tmp_path / "navigation.csv", UTC)
+    read = read_navigation(tmp_path / "n.csv", UTC)
     np.testing.assert_allclose(read.time_s, record.time_s, atol=2e-6)
     place = np.stack([read.columns[n] for n in ("latitude_deg", "longitude_deg", "depth_m")], 1)
     ned = record.datum.ned_from_geodetic(place)
@@ -141,11 +120,11 @@ def test_odometry_in_either_convention(tmp_path: Path, frame: str) -> None:
             v = [0.4, -0.1, 0.05, 0.01, -0.02, -0.03]
         bag.add_odometry(START + i * 10**8, "/vehicle/odom", frame, place, turn, v)
 
-    imported(bag, tmp_path, datum_deg=(41.0, 3.0), vehicle_log=tmp_path / "v.csv")
+    imported(bag.write(tmp_path / "dive"), datum_deg=(41.0, 3.0), vehicle_log=tmp_path / "v.csv")
 
-    place = numbers(tmp_path / "n.csv", "latitude_deg", "longitude_deg", "depth_m")
+    place = numbers(tmp_path, "latitude_deg", "longitude_deg", "depth_m")
     np.testing.assert_allclose(Datum(41.0, 3.0).ned_from_geodetic(place)[0], ned, atol=1e-5)
-    angles = numbers(tmp_path / "n.csv", "roll_deg", "pitch_deg", "heading_deg")[0]
+    angles = numbers(tmp_path, "roll_deg", "pitch_deg", "heading_deg")[0]
     np.testing.assert_allclose(angles, np.rad2deg([0.1, -0.2, 2.0]), atol=1e-6)
     vehicle = read_vehicle_log(tmp_path / "v.csv")
     np.testing.assert_allclose(vehicle.velocity_body[0], [0.4, 0.1, -0.05], atol=1e-9)
@@ -172,7 +151,7 @@ def plain_bag() -> Bag:
 
 
 def test_plain_sensors_are_brought_together(tmp_path: Path) -> None:
-    data = imported(plain_bag(), tmp_path)
+    data = imported(plain_bag().write(tmp_path / "dive"))
 
     # The last fix says that it is none; ten depths come after the one before.
     assert data["rows"] == 30
@@ -181,15 +160,15 @@ def test_plain_sensors_are_brought_together(tmp_path: Path) -> None:
     read = read_navigation(tmp_path / "n.csv", UTC, ())
     np.testing.assert_allclose(read.time_s[20:], 19.1 + 0.1 * np.arange(10), atol=1e-6)
     np.testing.assert_allclose(read.columns["depth_m"][20:], 3.91 + 0.01 * np.arange(10), atol=1e-4)
-    depth = numbers(tmp_path / "n.csv", "depth_m")[:20, 0]
+    depth = numbers(tmp_path, "depth_m")[:20]
     np.testing.assert_allclose(depth, 2.0 + 0.1 * np.arange(20), atol=1e-4)
-    angles = numbers(tmp_path / "n.csv", "roll_deg", "pitch_deg", "heading_deg")
+    angles = numbers(tmp_path, "roll_deg", "pitch_deg", "heading_deg")
     np.testing.assert_allclose(angles, [[30, -10, np.rad2deg(0.5)]] * 30, atol=1e-5)
-    altitude = numbers(tmp_path / "n.csv", "altitude_m")[:, 0]
+    altitude = numbers(tmp_path, "altitude_m")
     expected = 4.0 * np.cos(np.deg2rad(30)) * np.cos(np.deg2rad(10))
     np.testing.assert_allclose(altitude, expected, atol=1e-5)
     # Variances 4 and 16: their mean is 10.
-    sigma = numbers(tmp_path / "n.csv", "sigma_horizontal_m")[:20, 0]
+    sigma = numbers(tmp_path, "sigma_horizontal_m")[:20]
     np.testing.assert_allclose(sigma, np.sqrt(10.0), atol=1e-6)
 
 
@@ -204,7 +183,7 @@ def test_gaps_wild_times_and_missing_values_are_reported(
         altitude = -1.0 if second == 3 else 2.0 + 0.1 * second
         bag.add_nav_sts(START + second * 10**9, place, (0.0, 0.0, 0.0), altitude)
         bag.rows[-1] = (START + i * 10**9, *bag.rows[-1][1:])
-    data = imported(bag, tmp_path)
+    data = imported(bag.write(tmp_path / "dive"))
 
     assert data["left_out"] == {
         f"{TOPIC}: altitudes not above 0: no bottom": 1,
@@ -230,15 +209,12 @@ def test_several_candidates_need_a_choice(tmp_path: Path) -> None:
         )
     log = bag.write(tmp_path / "dive")
     with pytest.raises(NavigationError, match="--topic navigation=NAME"):
-        import_log(log, tmp_path / "n.csv")
-    _, data = import_log(
-        log, tmp_path / "n.csv", ImportOptions(topics=("navigation=/other/navigation",))
-    )
-    assert data["rows"] == 5
+        imported(log)
+    assert imported(log, topics=("navigation=/other/navigation",))["rows"] == 5
     with pytest.raises(NavigationError, match="/third"):
-        import_log(log, tmp_path / "n.csv", ImportOptions(topics=("navigation=/third",)))
+        imported(log, topics=("navigation=/third",))
     with pytest.raises(NavigationError, match="ROLE=NAME"):
-        import_log(log, tmp_path / "n.csv", ImportOptions(topics=("/third",)))
+        imported(log, topics=("/third",))
 
 
 @pytest.mark.parametrize("version", [1, 2])
@@ -249,7 +225,7 @@ def test_a_truncated_bag_is_one_clear_line(tmp_path: Path, version: int, share: 
     data = file.read_bytes()
     file.write_bytes(data[: int(share * len(data))])
     with pytest.raises(NavigationError) as caught:
-        import_log(log, tmp_path / "n.csv")
+        imported(log)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "n.csv").exists()
 
@@ -261,8 +237,6 @@ def test_old_bags_without_definitions_and_lone_files(tmp_path: Path) -> None:
     with closing(sqlite3.connect(file)) as database, database:
         assert database.execute("delete from message_definitions").rowcount > 0
     for path in (log, file):
-        _, data = import_log(path, tmp_path / "n.csv")
-        assert data["rows"] == 30
-        np.testing.assert_allclose(
-            numbers(tmp_path / "n.csv", "depth_m")[:, 0], 5.0 + 0.01 * np.arange(30), atol=1e-5
-        )
+        assert imported(path)["rows"] == 30
+        depth = numbers(path.parent, "depth_m")
+        np.testing.assert_allclose(depth, 5.0 + 0.01 * np.arange(30), atol=1e-5)

@@ -9,10 +9,9 @@ import pytest
 from alice_survey.core.errors import NavigationError
 from alice_survey.core.frames import Array, Datum, rotation_from_attitude
 from missions.logs.dead_reckoning import TrackErrors
-from missions.logs.import_log import ImportOptions, import_log
 from missions.logs.ros_builder import flipped_quaternion
-from tests.missions.logs.log_files import Bag
-from tests.missions.logs.test_import_bag import START, numbers
+from tests.missions.logs.log_files import Bag, imported, numbers
+from tests.missions.logs.test_import_bag import START
 
 DATUM = Datum(43.05, 5.92)
 RADIUS_M, SPEED_MPS, STEP_S, COUNT = 6.0, 0.4, 0.2, 600
@@ -46,22 +45,21 @@ def dive(version: int = 2, *, twist: str | None = None, fix: bool = True, lost: 
     return bag
 
 
-def track(path: Path) -> Array:
-    place = numbers(path, "latitude_deg", "longitude_deg", "depth_m")
+def track(folder: Path) -> Array:
+    place = numbers(folder, "latitude_deg", "longitude_deg", "depth_m")
     return DATUM.ned_from_geodetic(place[np.isfinite(place).all(axis=1)])
 
 
 @pytest.mark.parametrize(("version", "twist"), [(1, None), (2, None), (2, "base_link")])
 def test_a_circle_closes(tmp_path: Path, version: int, twist: str | None) -> None:
     log = dive(version, twist=twist).write(tmp_path / ("d.bag" if version == 1 else "d"))
-    options = ImportOptions(dead_reckon=TrackErrors())
-    _, data = import_log(log, tmp_path / "n.csv", options)
+    data = imported(log, dead_reckon=TrackErrors())
     _, _, places = circle()
-    found = track(tmp_path / "n.csv")
+    found = track(tmp_path)
     # Chords of trapezoids are within (angle of a step)^2 / 12 of the arcs.
     np.testing.assert_allclose(found[:, :2], places, atol=2e-3)
     np.testing.assert_allclose(found[:, 2], 8.0, atol=1e-3)
-    sigma = numbers(tmp_path / "n.csv", "sigma_horizontal_m")[:, 0]
+    sigma = numbers(tmp_path, "sigma_horizontal_m")
     # The fix's variances, 4 and 16 m^2, those of scale and heading, which grow with the distance
     # from it alone and so shrink again as the circle closes, and the noise's, with time.
     away = np.sum(np.square(places), axis=1)
@@ -69,7 +67,7 @@ def test_a_circle_closes(tmp_path: Path, version: int, twist: str | None) -> Non
     expected = np.sqrt(10.0 + constant + 0.02**2 * np.arange(COUNT) * STEP_S)
     np.testing.assert_allclose(sigma, expected, rtol=1e-4)
     assert data["sources"]["position"].endswith("dead reckoning")
-    altitude = numbers(tmp_path / "n.csv", "altitude_m")[:, 0]
+    altitude = numbers(tmp_path, "altitude_m")
     if twist is None:
         np.testing.assert_allclose(altitude, 2.0 * np.cos(np.deg2rad(5.0)), atol=1e-4)
 
@@ -77,23 +75,20 @@ def test_a_circle_closes(tmp_path: Path, version: int, twist: str | None) -> Non
 def test_without_a_fix_a_start_is_asked_for_and_used(tmp_path: Path) -> None:
     log = dive(fix=False).write(tmp_path / "d")
     with pytest.raises(NavigationError, match="--start-at"):
-        import_log(log, tmp_path / "n.csv", ImportOptions(dead_reckon=TrackErrors()))
-    options = ImportOptions(dead_reckon=TrackErrors(), start_at=(*FIX[:2], 5.0))
-    import_log(log, tmp_path / "n.csv", options)
-    np.testing.assert_allclose(track(tmp_path / "n.csv")[:, :2], circle()[2], atol=2e-3)
-    sigma = numbers(tmp_path / "n.csv", "sigma_horizontal_m")[:, 0]
-    assert sigma[0] == pytest.approx(5.0, rel=1e-3)
+        imported(log, dead_reckon=TrackErrors())
+    imported(log, dead_reckon=TrackErrors(), start_at=(*FIX[:2], 5.0))
+    np.testing.assert_allclose(track(tmp_path)[:, :2], circle()[2], atol=2e-3)
+    assert numbers(tmp_path, "sigma_horizontal_m")[0] == pytest.approx(5.0, rel=1e-3)
 
 
 def test_loss_of_bottom_lock_ends_the_track(tmp_path: Path) -> None:
-    log = dive(lost=100).write(tmp_path / "d")
-    _, data = import_log(log, tmp_path / "n.csv", ImportOptions(dead_reckon=TrackErrors()))
-    assert len(track(tmp_path / "n.csv")) == 100
+    data = imported(dive(lost=100).write(tmp_path / "d"), dead_reckon=TrackErrors())
+    assert len(track(tmp_path)) == 100
     assert data["left_out"]["velocities in stretches without a fix"] == COUNT - 200
     assert any("1 gaps in the velocity" in note for note in data["notes"])
 
 
-def reports(*, stamped: bool = True) -> list[str]:
+def reports() -> list[str]:
     """The same circle as a Water Linked DVL reports it, with noise between the lines."""
     time_s, heading, _ = circle()
     crab, lines = np.deg2rad(-10.0), ['{"type": "veloc', '{"type": "config", "x": 1}']
@@ -103,9 +98,8 @@ def reports(*, stamped: bool = True) -> list[str]:
         v = turn.inv().apply(SPEED_MPS * np.array([np.cos(course), np.sin(course), 0.0]))
         yaw = (np.rad2deg(course + crab) + 180.0) % 360.0 - 180.0
         report = {"time": 1e3 * STEP_S, "vx": v[0], "vy": v[1], "vz": v[2], "altitude": 2.0,
-                  "velocity_valid": True, "status": 0, "type": "velocity"}  # fmt: skip
-        if stamped:
-            report["time_of_validity"] = round(valid * 1e6)
+                  "velocity_valid": True, "status": 0, "type": "velocity",
+                  "time_of_validity": round(valid * 1e6)}  # fmt: skip
         lines.append(json.dumps(report))
         place = {"ts": valid, "x": 99, "y": 99, "z": 9, "roll": 5.0, "pitch": 0.0, "yaw": yaw}
         lines.append(json.dumps({**place, "type": "position_local", "status": 0}))
@@ -115,12 +109,11 @@ def reports(*, stamped: bool = True) -> list[str]:
 def test_reports_of_a_water_linked_dvl_close_the_circle(tmp_path: Path) -> None:
     log = tmp_path / "dvl.json"
     log.write_text("\n".join(reports()))
-    options = ImportOptions(dead_reckon=TrackErrors(), start_at=(*FIX[:2], 2.0))
-    _, data = import_log(log, tmp_path / "n.csv", options)
-    place = numbers(tmp_path / "n.csv", "latitude_deg", "longitude_deg")
+    data = imported(log, dead_reckon=TrackErrors(), start_at=(*FIX[:2], 2.0))
+    place = numbers(tmp_path, "latitude_deg", "longitude_deg")
     found = DATUM.ned_from_geodetic(np.column_stack([place, np.zeros(len(place))]))
     np.testing.assert_allclose(found[:, :2], circle()[2], atol=2e-3)
-    altitude = numbers(tmp_path / "n.csv", "altitude_m")[:, 0]
+    altitude = numbers(tmp_path, "altitude_m")
     np.testing.assert_allclose(altitude, 2.0 * np.cos(np.deg2rad(5.0)), atol=1e-6)
     assert data["dated"]
     assert data["left_out"] == {"lines that are no report": 1}
@@ -129,4 +122,4 @@ def test_reports_of_a_water_linked_dvl_close_the_circle(tmp_path: Path) -> None:
 def test_velocities_of_the_world_are_refused(tmp_path: Path) -> None:
     log = dive(twist="odom").write(tmp_path / "d")
     with pytest.raises(NavigationError, match="does not turn with the body"):
-        import_log(log, tmp_path / "n.csv", ImportOptions(dead_reckon=TrackErrors()))
+        imported(log, dead_reckon=TrackErrors())

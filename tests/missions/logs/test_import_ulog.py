@@ -11,8 +11,8 @@ import pytest
 from alice_survey.core.errors import NavigationError
 from alice_survey.core.frames import Datum
 from missions.logs.dead_reckoning import TrackErrors
-from missions.logs.import_log import ImportOptions, import_log
-from tests.missions.logs.test_import_bag import numbers
+from tests.missions.logs import log_files
+from tests.missions.logs.log_files import numbers
 
 BOOT_US = 60_000_000
 FIX_US = round(datetime(2024, 5, 1, 12, tzinfo=UTC).timestamp() * 1e6)
@@ -97,23 +97,23 @@ def dive(count: int = 50) -> list[tuple[Any, ...]]:
 def imported(folder: Path, data: bytes, **options: Any) -> dict[str, Any]:
     log = folder / "dive.ulg"
     log.write_bytes(data)
-    return import_log(log, folder / "n.csv", ImportOptions(**options))[1]
+    return log_files.imported(log, **options)
 
 
 def test_a_dive_is_read(tmp_path: Path) -> None:
     data = imported(tmp_path, ulog(dive()))
     assert data["rows"] == 50 and data["dated"]
     assert data["start"] == "2024-05-01T12:00:02.000000Z"
-    place = numbers(tmp_path / "n.csv", "latitude_deg", "longitude_deg", "depth_m")
+    place = numbers(tmp_path, "latitude_deg", "longitude_deg", "depth_m")
     ned = ORIGIN.ned_from_geodetic(place)
     expected = np.array([[0.05 * i, 1.0, 2.0 + 0.01 * i] for i in range(50)])
     np.testing.assert_allclose(ned, expected, atol=1e-5)
-    angles = numbers(tmp_path / "n.csv", "roll_deg", "pitch_deg", "heading_deg")
+    angles = numbers(tmp_path, "roll_deg", "pitch_deg", "heading_deg")
     np.testing.assert_allclose(angles, [[10.0, 0.0, 90.0]] * 50, atol=1e-4)
-    altitude = numbers(tmp_path / "n.csv", "altitude_m")[:, 0]
+    altitude = numbers(tmp_path, "altitude_m")
     np.testing.assert_allclose(altitude, 3.0 * np.cos(np.deg2rad(10.0)), atol=1e-5)
     # eph is the root of the sum of both variances.
-    sigmas = numbers(tmp_path / "n.csv", "sigma_horizontal_m", "sigma_depth_m")
+    sigmas = numbers(tmp_path, "sigma_horizontal_m", "sigma_depth_m")
     np.testing.assert_allclose(sigmas, [[2.0 / np.sqrt(2.0), 0.5]] * 50, rtol=1e-5)
     assert data["sources"]["position"] == "vehicle_local_position"
 
@@ -125,7 +125,7 @@ def test_global_positions_are_preferred_and_others_can_be_chosen(tmp_path: Path)
         records.append(("vehicle_global_position", 0, at, 43.06, 5.93, 12.0, 4.0))
     data = imported(tmp_path, ulog(records))
     assert data["sources"]["position"] == "vehicle_global_position"
-    np.testing.assert_allclose(numbers(tmp_path / "n.csv", "latitude_deg")[:, 0], 43.06, atol=1e-9)
+    np.testing.assert_allclose(numbers(tmp_path, "latitude_deg"), 43.06, atol=1e-9)
     data = imported(tmp_path, ulog(records), topics=["navigation=vehicle_local_position"])
     assert data["sources"]["position"] == "vehicle_local_position"
     with pytest.raises(NavigationError, match="navigation can come from"):
@@ -139,7 +139,7 @@ def test_velocities_reckon_between_fixes(tmp_path: Path) -> None:
         records.append(local(at, (np.nan, np.nan, 2.0), (0.5, 0.25, 0.0), valid=False))
         records.append(("vehicle_attitude", 0, at, 1.0, 0.0, 0.0, 0.0))
     data = imported(tmp_path, ulog(records), dead_reckon=TrackErrors())
-    place = numbers(tmp_path / "n.csv", "latitude_deg", "longitude_deg", "depth_m")
+    place = numbers(tmp_path, "latitude_deg", "longitude_deg", "depth_m")
     ned = ORIGIN.ned_from_geodetic(place)
     np.testing.assert_allclose(ned[-1] - ned[0], [0.5 * 4.9, 0.25 * 4.9, 0.0], atol=1e-3)
     assert data["sources"]["position"] == "vehicle_local_position, dead reckoning"
