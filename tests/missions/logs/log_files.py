@@ -86,15 +86,12 @@ class Bag:
                 values[name] = fields.get(name, np.zeros(of[1]))
         return self.store.types[kind](**values)
 
-    def add(
-        self, topic: str, kind: str, stamp_ns: int, frame: str, recorded_ns: int | None = None,
-        **fields: Any,
-    ) -> None:  # fmt: skip
+    def add(self, topic: str, kind: str, stamp_ns: int, frame: str, **fields: Any) -> None:
         """A message with a header."""
         sec, nanosec = divmod(stamp_ns, 10**9)
         header = {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame}
         message = self.make(kind, {"header": header, **fields})
-        self.rows.append((stamp_ns if recorded_ns is None else recorded_ns, topic, kind, message))
+        self.rows.append((stamp_ns, topic, kind, message))
 
     def add_nav_sts(
         self, stamp_ns: int, place: Sequence[float], attitude_rad: Sequence[float],
@@ -134,7 +131,7 @@ class Bag:
         """Place: latitude, longitude, height."""
         self.add(
             topic, "sensor_msgs/msg/NavSatFix", stamp_ns, "gps",
-            status={"status": status, "service": 1}, recorded_ns=None,
+            status={"status": status, "service": 1},
             position_covariance=np.diag([4.0, 16.0, 25.0]).ravel(), position_covariance_type=2,
             **fields_of("latitude longitude altitude", place),
         )  # fmt: skip

@@ -3,7 +3,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -88,24 +87,16 @@ def test_frames_are_those_of_ros_and_come_back() -> None:
     np.testing.assert_array_equal(flipped_body(flipped_body(points)), points)
 
 
-@pytest.fixture(scope="module")
-def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Any]]:
-    """Messages of a written flight."""
-    folder = tmp_path_factory.mktemp("bag") / "dive"
-    write_bag(folder, flight())
-    return read(folder)
-
-
-def test_a_bag_holds_the_flight_in_enu_and_flu(found: dict[str, list[Any]]) -> None:
+def test_a_bag_holds_the_flight_in_enu_and_flu(tmp_path: Path) -> None:
     record = flight()
+    write_bag(tmp_path / "dive", record)
+    found = read(tmp_path / "dive")
     truth = found["/alice/truth/odometry"]
     assert [stamp for stamp, _ in truth] == [100_000_000 * i for i in range(40)]
     for i, (stamp, message) in enumerate(truth):
         assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == stamp
-        assert (message.header.frame_id, message.child_frame_id) == (
-            "map",
-            "alice/base_link_truth",
-        )
+        frames = (message.header.frame_id, message.child_frame_id)
+        assert frames == ("map", "alice/base_link_truth")
         north, east, down = record.truth.translation[i]
         np.testing.assert_allclose(
             xyz(message.pose.pose.position), [east, north, -down], atol=1e-12
@@ -117,9 +108,7 @@ def test_a_bag_holds_the_flight_in_enu_and_flu(found: dict[str, list[Any]]) -> N
         np.testing.assert_allclose(xyz(message.twist.twist.linear), [u, -v, -w])
         np.testing.assert_allclose(xyz(message.twist.twist.angular), [p, -q, -r])
 
-
-def test_navigation_carries_its_covariance(found: dict[str, list[Any]]) -> None:
-    record = flight()
+    # Navigation carries its covariance.
     s = record.sigma_horizontal_m[9]
     message = found["/alice/navigation/odometry"][9][1]
     expected = [s**2, s**2, (s / 2) ** 2, (s / 10) ** 2, (s / 10) ** 2, (s / 5) ** 2]
@@ -135,9 +124,6 @@ def test_navigation_carries_its_covariance(found: dict[str, list[Any]]) -> None:
         xyz(transforms[0].transform.translation), xyz(message.pose.pose.position)
     )
 
-
-def test_ranges_and_thrusters(found: dict[str, list[Any]]) -> None:
-    record = flight()
     joints = found["/alice/thrusters/state"][4][1]
     assert list(joints.name) == ["port", "starboard"]
     np.testing.assert_allclose(np.array(joints.velocity) * 60 / (2 * np.pi), record.rpm[4])

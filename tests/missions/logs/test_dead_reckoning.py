@@ -48,26 +48,19 @@ def dense(
     """All places and both errors at once, by the normal equations of their residuals."""
     at, places, sigmas = fixes
     count, moves = len(time_s), moves_of(time_s, velocity)
-    rows, values = [], []
-    for k, (move, dt) in enumerate(zip(moves, np.diff(time_s), strict=True)):
-        for axis, other in ((0, -move[1]), (1, move[0])):
-            row = np.zeros(2 * count + 2)
-            row[2 * (k + 1) + axis], row[2 * k + axis] = 1.0, -1.0
-            row[-2:] = -move[axis], -other
-            rows.append(row / (errors.noise_mps * np.sqrt(dt)))
-            values.append(move[axis] / (errors.noise_mps * np.sqrt(dt)))
-    for i, (place, sigma) in enumerate(zip(places, sigmas, strict=True)):
-        for axis in (0, 1):
-            row = np.zeros(2 * count + 2)
-            row[2 * at[i] + axis] = 1.0 / sigma
-            rows.append(row)
-            values.append(place[axis] / sigma)
-    for column, sigma in ((-2, errors.scale), (-1, np.deg2rad(errors.heading_deg))):
-        row = np.zeros(2 * count + 2)
-        row[column] = 1.0 / sigma
-        rows.append(row)
-        values.append(0.0)
-    a, b = np.array(rows), np.array(values)
+    longer = [-moves.ravel(), -(moves[:, ::-1] * [-1.0, 1.0]).ravel()]  # by both errors
+    steps = np.column_stack([np.kron(np.diff(np.eye(count), axis=0), np.eye(2)), *longer])
+    known = np.eye(2 * count + 2)
+    fixed = known[np.add.outer(2 * np.asarray(at), [0, 1]).ravel()]
+    weights = 1.0 / np.concatenate(
+        [
+            np.repeat(errors.noise_mps * np.sqrt(np.diff(time_s)), 2),
+            np.repeat(sigmas, 2),
+            [errors.scale, np.deg2rad(errors.heading_deg)],
+        ]
+    )
+    a = np.vstack([steps, fixed, known[-2:]]) * weights[:, None]
+    b = np.concatenate([moves.ravel(), places.ravel(), [0.0, 0.0]]) * weights
     normal = a.T @ a
     found = np.linalg.solve(normal, a.T @ b)
     variances = np.diag(np.linalg.inv(normal))[:-2].reshape(-1, 2)

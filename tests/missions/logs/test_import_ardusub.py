@@ -151,30 +151,20 @@ def test_a_lever_arm_moves_positions_to_the_body(tmp_path: Path) -> None:
 
 
 def test_filter_positions_count_from_its_origin(tmp_path: Path) -> None:
-    messages = [m for m in dive_messages() if m[0] != "POS"]
-    origin = ("ORGN", BOOT_US, 0, LAT, LON, 0.0)
-    log = bin_log(tmp_path, [origin, *messages])
-    data = imported(log)
-    assert data["sources"]["position"] == "XKF1"
-    assert any("XKF1 0" in note for note in data["notes"])
-    latitude, depth = numbers(tmp_path, "latitude_deg", "depth_m")[0]
-    assert (latitude - LAT) * 60 * 1856.9 == pytest.approx(9.0, abs=0.01)
-    assert depth == pytest.approx(9.0, abs=1e-6)
-
-
-def test_the_filters_origin_can_be_given(tmp_path: Path) -> None:
     """Without ORGN it is said that XKF1 needs one, and with --datum it counts from there."""
     messages = [m for m in dive_messages() if m[0] != "POS"]
-    log = bin_log(tmp_path, messages)
+    origins = [("ORGN", BOOT_US, 0, LAT + off_deg, LON, 0.0) for off_deg in (0.0, 1.0)]
+    chosen: dict[str, Any] = {"topics": ("navigation=XKF1",)}
     with pytest.raises(NavigationError, match=r"XKF1 gives no navigation: .*ORGN.*--datum"):
-        imported(log, topics=("navigation=XKF1",))
-    origin = ("ORGN", BOOT_US, 0, LAT + 1.0, LON, 0.0)
-    for rows in (messages, [origin, *messages]):
-        log = bin_log(tmp_path, rows)
-        options = {"topics": ("navigation=XKF1",), "datum_deg": (LAT, LON)}
-        assert imported(log, **options)["sources"]["position"] == "XKF1"
-        latitude = numbers(tmp_path, "latitude_deg")[0]
+        imported(bin_log(tmp_path, messages), **chosen)
+    given = chosen | {"datum_deg": (LAT, LON)}
+    for origin, options in ((origins[:1], {}), ([], given), (origins[1:], given)):
+        data = imported(bin_log(tmp_path, [*origin, *messages]), **options)
+        assert data["sources"]["position"] == "XKF1"
+        assert any("XKF1 0" in note for note in data["notes"])
+        latitude, depth = numbers(tmp_path, "latitude_deg", "depth_m")[0]
         assert (latitude - LAT) * 60 * 1856.9 == pytest.approx(9.0, abs=0.01)
+        assert depth == pytest.approx(9.0, abs=1e-6)
 
 
 def test_a_tank_log_without_position_reaches_the_identification(tmp_path: Path) -> None:

@@ -18,23 +18,23 @@ RADIUS_M, SPEED_MPS, STEP_S, COUNT = 6.0, 0.4, 0.2, 600
 FIX = (DATUM.latitude_deg, DATUM.longitude_deg, 0.0)
 
 
-def circle() -> tuple[Array, Array, Array]:
-    """Times, headings (rad) and places (N, 2) of a circle to starboard that starts northwards."""
-    time_s = np.arange(COUNT, dtype=float) * STEP_S
-    heading = SPEED_MPS / RADIUS_M * time_s
-    return time_s, heading, RADIUS_M * np.column_stack([np.sin(heading), 1 - np.cos(heading)])
+TIME_S = np.arange(COUNT, dtype=float) * STEP_S
+COURSE = SPEED_MPS / RADIUS_M * TIME_S
+PLACES = RADIUS_M * np.column_stack([np.sin(COURSE), 1 - np.cos(COURSE)])
+"""A circle to starboard that starts northwards."""
+TURN = rotation_from_attitude(np.deg2rad(5.0), 0.0, COURSE + np.deg2rad(-10.0))
+"""Crabbing by 10 degrees to port with 5 degrees of roll."""
+BODY_MPS = TURN.inv().apply(
+    SPEED_MPS * np.column_stack([np.cos(COURSE), np.sin(COURSE), 0.0 * COURSE])
+)
 
 
 def dive(version: int = 2, *, twist: str | None = None, fix: bool = True, lost: int = 0) -> Bag:
-    """A circle, crabbing by 10 degrees to port with 5 degrees of roll, 8 m deep."""
+    """The circle, 8 m deep."""
     bag = Bag(version)
-    time_s, heading, _ = circle()
-    crab = np.deg2rad(-10.0)
-    for i, (t, course) in enumerate(zip(time_s, heading, strict=True)):
+    for i, (t, turn, speed) in enumerate(zip(TIME_S, TURN.as_quat(), BODY_MPS, strict=True)):
         stamp = START + round(t * 1e9)
-        turn = rotation_from_attitude(np.deg2rad(5.0), 0.0, course + crab)
-        bag.add_imu(stamp, "/imu", "imu", flipped_quaternion(turn.as_quat()))
-        speed = turn.inv().apply(SPEED_MPS * np.array([np.cos(course), np.sin(course), 0.0]))
+        bag.add_imu(stamp, "/imu", "imu", flipped_quaternion(turn))
         if twist is None:
             bag.add_dvl(stamp, "/dvl/data", speed, 2.0, valid=not 100 <= i < 100 + lost)
         else:
@@ -54,15 +54,14 @@ def track(folder: Path) -> Array:
 def test_a_circle_closes(tmp_path: Path, version: int, twist: str | None) -> None:
     log = dive(version, twist=twist).write(tmp_path / ("d.bag" if version == 1 else "d"))
     data = imported(log, dead_reckon=TrackErrors())
-    _, _, places = circle()
     found = track(tmp_path)
     # Chords of trapezoids are within (angle of a step)^2 / 12 of the arcs.
-    np.testing.assert_allclose(found[:, :2], places, atol=2e-3)
+    np.testing.assert_allclose(found[:, :2], PLACES, atol=2e-3)
     np.testing.assert_allclose(found[:, 2], 8.0, atol=1e-3)
     sigma = numbers(tmp_path, "sigma_horizontal_m")
     # The fix's variances, 4 and 16 m^2, those of scale and heading, which grow with the distance
     # from it alone and so shrink again as the circle closes, and the noise's, with time.
-    away = np.sum(np.square(places), axis=1)
+    away = np.sum(np.square(PLACES), axis=1)
     constant = 0.5 * (0.005**2 + np.deg2rad(1.0) ** 2) * away
     expected = np.sqrt(10.0 + constant + 0.02**2 * np.arange(COUNT) * STEP_S)
     np.testing.assert_allclose(sigma, expected, rtol=1e-4)
@@ -77,7 +76,7 @@ def test_without_a_fix_a_start_is_asked_for_and_used(tmp_path: Path) -> None:
     with pytest.raises(NavigationError, match="--start-at"):
         imported(log, dead_reckon=TrackErrors())
     imported(log, dead_reckon=TrackErrors(), start_at=(*FIX[:2], 5.0))
-    np.testing.assert_allclose(track(tmp_path)[:, :2], circle()[2], atol=2e-3)
+    np.testing.assert_allclose(track(tmp_path)[:, :2], PLACES, atol=2e-3)
     assert numbers(tmp_path, "sigma_horizontal_m")[0] == pytest.approx(5.0, rel=1e-3)
 
 
@@ -90,13 +89,9 @@ def test_loss_of_bottom_lock_ends_the_track(tmp_path: Path) -> None:
 
 def reports() -> list[str]:
     """The same circle as a Water Linked DVL reports it, with noise between the lines."""
-    time_s, heading, _ = circle()
-    crab, lines = np.deg2rad(-10.0), ['{"type": "veloc', '{"type": "config", "x": 1}']
-    for t, course in zip(time_s, heading, strict=True):
-        valid = START / 1e9 + t
-        turn = rotation_from_attitude(np.deg2rad(5.0), 0.0, course + crab)
-        v = turn.inv().apply(SPEED_MPS * np.array([np.cos(course), np.sin(course), 0.0]))
-        yaw = (np.rad2deg(course + crab) + 180.0) % 360.0 - 180.0
+    lines = ['{"type": "veloc', '{"type": "config", "x": 1}']
+    yaws = (np.rad2deg(COURSE) - 10.0 + 180.0) % 360.0 - 180.0
+    for valid, yaw, v in zip(START / 1e9 + TIME_S, yaws, BODY_MPS, strict=True):
         report = {"time": 1e3 * STEP_S, "vx": v[0], "vy": v[1], "vz": v[2], "altitude": 2.0,
                   "velocity_valid": True, "status": 0, "type": "velocity",
                   "time_of_validity": round(valid * 1e6)}  # fmt: skip
@@ -112,7 +107,7 @@ def test_reports_of_a_water_linked_dvl_close_the_circle(tmp_path: Path) -> None:
     data = imported(log, dead_reckon=TrackErrors(), start_at=(*FIX[:2], 2.0))
     place = numbers(tmp_path, "latitude_deg", "longitude_deg")
     found = DATUM.ned_from_geodetic(np.column_stack([place, np.zeros(len(place))]))
-    np.testing.assert_allclose(found[:, :2], circle()[2], atol=2e-3)
+    np.testing.assert_allclose(found[:, :2], PLACES, atol=2e-3)
     altitude = numbers(tmp_path, "altitude_m")
     np.testing.assert_allclose(altitude, 2.0 * np.cos(np.deg2rad(5.0)), atol=1e-6)
     assert data["dated"]
