@@ -35,19 +35,15 @@ def remount(folder: Path, options: str) -> None:
     subprocess.run(["mount", "-o", f"remount,{options}", folder], check=True)
 
 
-def plan(workspace: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "alice_survey", "plan", "-w", str(workspace), "--quiet"],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-
-
-def one_line(done: subprocess.CompletedProcess[str]) -> str:
-    assert done.returncode == 1, done.stderr
-    lines = [line for line in done.stderr.splitlines() if line.strip()]
+def plan(workspace: Path, code: int = 0) -> str:
+    """The last line of what planning says; its exit code is as wanted."""
+    command = [sys.executable, "-m", "alice_survey", "plan", "-w", str(workspace), "--quiet"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == code, done.stderr
     assert "Traceback" not in done.stderr
-    assert lines[-1].startswith("error: ")
-    return lines[-1]
+    line = ["", *done.stderr.strip().splitlines()][-1]
+    assert code == 0 or line.startswith("error: ")
+    return line
 
 
 def test_a_file_that_may_not_grow_is_named_with_what_to_do(tmp_path: Path) -> None:
@@ -65,38 +61,26 @@ def test_a_file_that_may_not_grow_is_named_with_what_to_do(tmp_path: Path) -> No
 @AS_ROOT
 def test_a_full_disk_is_reported_and_the_same_command_goes_on(disk: Path) -> None:
     init_survey(disk, "demo.toml")
-    assert "No space left" in one_line(plan(disk))
+    assert "No space left" in plan(disk, code=1)
     assert not (disk / "plan").exists()
     remount(disk, "size=50m")
-    assert plan(disk).returncode == 0
+    plan(disk)
     assert (disk / "plan" / "plan.json").is_file()
     assert not list(disk.glob("*.partial"))
-
-
-@AS_ROOT
-def test_a_disk_that_fills_up_leaves_finished_stages_as_they_are(disk: Path) -> None:
-    remount(disk, "size=50m")
-    init_survey(disk, "demo.toml")
-    assert plan(disk).returncode == 0
+    # It fills up again: finished stages stay as they are.
     before = {p: p.read_bytes() for p in (disk / "plan").rglob("*") if p.is_file()}
     free = shutil.disk_usage(disk).free
     with (disk / "other").open("wb") as other:
         other.write(b"\0" * (free - 50_000))
     settings = disk / "survey.toml"
     settings.write_text(settings.read_text().replace("side_overlap = 0.3", "side_overlap = 0.4"))
-    assert "No space left" in one_line(plan(disk))
+    assert "No space left" in plan(disk, code=1)
     assert {p: p.read_bytes() for p in (disk / "plan").rglob("*") if p.is_file()} == before
     (disk / "other").unlink()
-    assert plan(disk).returncode == 0
+    plan(disk)
     assert (disk / "plan" / "plan.json").read_bytes() != before[disk / "plan" / "plan.json"]
-
-
-@AS_ROOT
-def test_a_workspace_that_cannot_be_written_is_named(disk: Path) -> None:
-    remount(disk, "size=50m")
-    init_survey(disk, "demo.toml")
     remount(disk, "ro")
-    assert str(disk) in one_line(plan(disk))
+    assert str(disk) in plan(disk, code=1)
 
 
 def _holder(workspace: Path) -> subprocess.Popen[str]:
@@ -118,21 +102,21 @@ def test_a_second_process_is_refused_and_a_crash_leaves_no_lock_behind(tmp_path:
     init_survey(tmp_path, "demo.toml")
     holder = _holder(tmp_path)
     try:
-        assert str(tmp_path) in one_line(plan(tmp_path))
+        assert str(tmp_path) in plan(tmp_path, code=1)
         assert not (tmp_path / "plan").exists()
     finally:
         holder.send_signal(signal.SIGKILL)
         holder.wait()
-    assert plan(tmp_path).returncode == 0
+    plan(tmp_path)
 
 
 def test_a_clock_that_jumps_does_not_make_stages_stale(tmp_path: Path) -> None:
     init_survey(tmp_path, "demo.toml")
-    assert plan(tmp_path).returncode == 0
+    plan(tmp_path)
     record = tmp_path / "plan" / "stage.json"
     before = record.read_bytes()
     for when in (0.0, time.time() + 10 * 365 * 86_400):
         for path in tmp_path.rglob("*"):
             os.utime(path, (when, when))
-        assert plan(tmp_path).returncode == 0
+        plan(tmp_path)
         assert record.read_bytes() == before

@@ -10,8 +10,6 @@ from hypothesis import strategies as st
 
 from alice_survey.core.config import (
     REMOVED,
-    AreaConfig,
-    PlanConfig,
     SurveyConfig,
     change_section,
     constants_of,
@@ -23,15 +21,13 @@ from alice_survey.core.config import (
 from alice_survey.core.errors import ConfigError
 from alice_survey.core.seawater import n_water, n_water_sigma
 from alice_survey.core.settings_form import sections, settings_template
+from tests.refusals import refused
 
 
 def fault(settings: dict[str, Any]) -> str:
-    with pytest.raises(ConfigError) as error:
+    with refused(ConfigError, "survey.toml: ") as error:
         parse_config(settings, "survey.toml")
-    text = str(error.value)
-    assert "\n" not in text
-    assert text.startswith("survey.toml: ")
-    return text
+    return str(error.value)
 
 
 def test_an_empty_file_is_the_papers_mission(tmp_path: Path) -> None:
@@ -82,21 +78,12 @@ def test_no_value_slips_through_its_bounds(value: float) -> None:
         assert "plan.side_overlap" in fault({"plan": {"side_overlap": value}})
 
 
-def test_settings_come_back_from_their_json() -> None:
-    config = parse_config(
-        {
-            "area": {"polygon_latlon_deg": [[32.0, 34.0], [32.1, 34.0], [32.0, 34.1]]},
-            "plan": {"line_spacing_m": 1.0},
-        },
-        "x",
-    )
-    assert SurveyConfig.model_validate(config.model_dump(mode="json")) == config
-
-
 def test_the_index_of_water_follows_from_temperature_salinity_and_depth() -> None:
     sea = {"temperature_c": 24.0, "salinity_psu": 35.0}
+    corners = [[32.0, 34.0], [32.1, 34.0], [32.0, 34.1]]
     for depth_m in (15.0, 4000.0):
-        config = parse_config({"water": sea, "area": {"seafloor_depth_m": depth_m}}, "x")
+        area = {"seafloor_depth_m": depth_m, "polygon_latlon_deg": corners}
+        config = parse_config({"water": sea, "area": area, "plan": {"line_spacing_m": 1.0}}, "x")
         assert config.water.n_water == float(n_water(24.0, 35.0, depth_m, 530.0))
         assert config.water.index_sigma == n_water_sigma(24.0, 35.0, 530.0)
         assert SurveyConfig.model_validate(config.model_dump(mode="json")) == config
@@ -130,20 +117,9 @@ def test_water_is_given_once_and_whole(water: dict[str, float], named: str) -> N
 def test_a_broken_file_is_reported_in_one_line(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "survey.toml"
     path.write_bytes(content)
-    with pytest.raises(ConfigError) as error:
+    with refused(ConfigError, path) as error:
         load_config(path)
-    assert str(path) in str(error.value)
-    assert "\n" not in str(error.value)
     assert len(str(error.value)) < 2000
-
-
-def test_defaults_pass_their_own_bounds() -> None:
-    for section in SurveyConfig.model_fields:
-        value = getattr(SurveyConfig(), section)
-        if hasattr(value, "model_dump"):
-            assert type(value).model_validate(value.model_dump()) == value
-    assert AreaConfig() == SurveyConfig().area
-    assert PlanConfig() == SurveyConfig().plan
 
 
 def test_files_named_in_settings_are_relative_to_them(tmp_path: Path) -> None:
@@ -164,8 +140,7 @@ def test_thrusters_have_their_health_by_name() -> None:
     config = parse_config({"vehicle": {"failures": ["stern", "bow=0.5", "port@60"]}}, "test")
     assert config.vehicle.impaired == {"stern": 0.0, "bow": 0.5}
     for wrong in ("bow=1.5", "bow=-0.1", "bow=half", "bow@soon", "bow@-1", True):
-        with pytest.raises(ConfigError, match=r"vehicle\.failures"):
-            parse_config({"vehicle": {"failures": [wrong]}}, "test")
+        assert "vehicle.failures" in fault({"vehicle": {"failures": [wrong]}})
     assert parse_failures(["stern", "bow=0.5"]) == ({"stern": 0.0, "bow": 0.5}, [], [])
     assert parse_failures(["stern@600", "bow=0.5@30"])[1] == [("stern", 600, 0), ("bow", 30, 0.5)]
     propellers = parse_failures(["bow:propeller=0.2", "stern:propeller@600"])

@@ -9,6 +9,7 @@ import pytest
 
 from alice_survey.core.contents import as_line, one_line, read_arrays, taken_from
 from alice_survey.core.errors import PlanError, WorkspaceError
+from tests.refusals import refused
 
 FILE = Path("frame.json")
 
@@ -21,10 +22,8 @@ FILE = Path("frame.json")
     ],
 )  # fmt: skip
 def test_a_missing_value_names_the_file(take: Callable[[Any], object]) -> None:
-    with pytest.raises(WorkspaceError) as fault, taken_from(FILE):
+    with refused(WorkspaceError, "frame.json: "), taken_from(FILE):
         take({"a": [1, 2]})
-    assert str(fault.value).startswith("frame.json: ")
-    assert "\n" not in str(fault.value)
 
 
 def test_known_faults_pass() -> None:
@@ -40,16 +39,15 @@ def test_text_of_others_is_shown_on_one_line() -> None:
 
 def test_arrays_that_are_missing_or_damaged(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
-    with pytest.raises(WorkspaceError):
+    with refused(WorkspaceError, path):
         read_arrays(path, "x")
     np.savez(path, x=np.arange(5), y=np.array([{}], dtype=object))
     np.testing.assert_array_equal(read_arrays(path, "x")["x"], np.arange(5))
-    with pytest.raises(WorkspaceError):
-        read_arrays(path, "x", "z")
-    with pytest.raises(WorkspaceError):  # an object would be unpickled
-        read_arrays(path, "y")
+    for names in (("x", "z"), ("y",)):  # an object would be unpickled
+        with refused(WorkspaceError, path):
+            read_arrays(path, *names)
     whole = path.read_bytes()
     for end in (0, 10, len(whole) // 2, len(whole) - 1):
         path.write_bytes(whole[:end])
-        with pytest.raises(WorkspaceError, match=r"a\.npz"):
+        with refused(WorkspaceError, path):
             read_arrays(path, "x")

@@ -6,6 +6,7 @@ import pytest
 
 from alice_survey.core.errors import ImageError
 from alice_survey.core.manifest import read_manifest
+from tests.refusals import refused
 
 HEAD = "image,camera,station,mask,time_s\n"
 
@@ -28,8 +29,6 @@ def test_a_byte_order_mark_is_no_part_of_a_name(tmp_path: Path) -> None:
 def test_wrong_rows_are_one_line(row: str, tmp_path: Path) -> None:
     path = tmp_path / "manifest.csv"
     path.write_text(f"{HEAD}{row}\n", encoding="utf-8", errors="surrogateescape")
-    with pytest.raises(ImageError) as fault:
+    with refused(ImageError, path) as fault:
         read_manifest(path)
-    assert str(path) in str(fault.value)
-    assert "\n" not in str(fault.value)
     assert len(str(fault.value)) < 400

@@ -15,6 +15,7 @@ from alice_survey.core.trajectory import (
     read_track,
     write_track,
 )
+from tests.refusals import refused
 
 
 def track(count: int = 50, seed: int = 0) -> Trajectory:
@@ -86,19 +87,15 @@ def test_columns_may_come_in_any_order_and_company(tmp_path: Path) -> None:
 def test_a_fault_is_reported_with_its_line(tmp_path: Path, content: str, named: str) -> None:
     path = tmp_path / "log.csv"
     path.write_text(content)
-    with pytest.raises(NavigationError) as fault:
+    with refused(NavigationError, named, path):
         read_columns(path, ("a", "b"))
-    assert named in str(fault.value)
-    assert str(path) in str(fault.value)
-    assert "\n" not in str(fault.value)
 
 
 def test_a_missing_or_binary_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(NavigationError, match=r"none\.csv"):
-        read_columns(tmp_path / "none.csv", ("a",))
     (tmp_path / "bin.csv").write_bytes(b"\xff\xfe\x80")
-    with pytest.raises(NavigationError, match=r"bin\.csv"):
-        read_columns(tmp_path / "bin.csv", ("a",))
+    for path in (tmp_path / "none.csv", tmp_path / "bin.csv"):
+        with refused(NavigationError, path):
+            read_columns(path, ("a",))
 
 
 @pytest.mark.parametrize(
@@ -109,5 +106,5 @@ def test_a_missing_or_binary_file_is_named(tmp_path: Path) -> None:
 def test_a_wrong_track_is_refused(tmp_path: Path, rows: str, named: str) -> None:
     path = tmp_path / "track.csv"
     path.write_text(",".join(TRACK_COLUMNS) + "\n" + rows)
-    with pytest.raises(NavigationError, match=rf"track\.csv.*{named}"):
+    with refused(NavigationError, path, named):
         read_track(path)

@@ -1,6 +1,5 @@
 """The comparison of both configurations: the same water, honest figures, and numbers that hold."""
 
-import csv
 import json
 import math
 from dataclasses import replace
@@ -12,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from alice_survey.app.cli.main import app
+from alice_survey.core.artefacts import read_csv
 from alice_survey.core.config import SurveyConfig, change_section, parse_config
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.executor import SERIAL
@@ -40,6 +40,7 @@ from tests.oracles_guidance import los_offset_m
 HEAVY = str(Path(files.__file__).parent / "fleet_files" / "bluerov2_heavy.toml")
 STILL = Case(current_mps=0.0, towards_deg=0.0)
 BY_NAME = {variant.name: variant for variant in VARIANTS}
+Flights = dict[str, tuple[Setup, Flown, Flight]]
 
 
 def survey(length_m: float, width_m: float, **sea: object) -> SurveyConfig:
@@ -63,7 +64,7 @@ def small() -> Plan:
 
 
 @pytest.fixture(scope="module")
-def flown(small: Plan) -> dict[str, tuple[Setup, Flown, Flight]]:
+def flown(small: Plan) -> Flights:
     """The three in a current to starboard, with the same draws of chance."""
     case = Case(current_mps=0.05, towards_deg=90.0)
     return {
@@ -72,13 +73,11 @@ def flown(small: Plan) -> dict[str, tuple[Setup, Flown, Flight]]:
     }
 
 
-def test_all_meet_the_same_current(flown: dict[str, tuple[Setup, Flown, Flight]]) -> None:
-    through = (
-        Rotation.from_quat(run.truth[:, 3:7]).apply(run.state[:, 7:10])
-        for _, run, _ in flown.values()
-    )
-    over_ground = (run.truth[:, 7:10] for _, run, _ in flown.values())
-    series = [(over - own)[:, :2] for over, own in zip(over_ground, through, strict=True)]
+def test_all_meet_the_same_current(flown: Flights) -> None:
+    series = []
+    for _, run, _ in flown.values():
+        through = Rotation.from_quat(run.truth[:, 3:7]).apply(run.state[:, 7:10])
+        series.append((run.truth[:, 7:10] - through)[:, :2])
     shortest = min(len(current) for current in series)
     for current in series[1:]:
         np.testing.assert_allclose(current[:shortest], series[0][:shortest], atol=1e-12)
@@ -105,34 +104,19 @@ def test_all_meet_the_same_gusts(small: Plan) -> None:
     assert left[0] == left[1]
 
 
-def test_on_lines_the_route_error_is_the_line_error(
-    flown: dict[str, tuple[Setup, Flown, Flight]],
-) -> None:
-    for _, _, flight in flown.values():
+def test_figures_are_of_what_was_flown(flown: Flights) -> None:
+    for _, run, flight in flown.values():
+        figures = figures_of(flight)
         cross, _ = flight.line_errors
         on = ~np.isnan(cross)
         assert on.any()
         np.testing.assert_allclose(flight.route_error[on], cross[on], atol=1e-6)
-
-
-def test_figures_are_of_what_was_flown(
-    flown: dict[str, tuple[Setup, Flown, Flight]],
-) -> None:
-    for _, run, flight in flown.values():
-        figures = figures_of(flight)
-        cross, _ = flight.line_errors
         assert figures.lines_true_m == pytest.approx(math.sqrt(np.nanmean(cross**2)))
         assert 0.0 < figures.survey_energy_wh < run.energy_j.sum() / 3600.0
         assert 0.0 < figures.survey_s < run.time_s[-1]
         assert figures.complete == (flight.ending == "complete")
-        assert (
-            0.0 < figures.turn_roll_peak_deg <= np.rad2deg(np.abs(flight.attitude_rad[:, 0]).max())
-        )
-
-
-def test_the_improved_vehicle_holds_its_lines_better(
-    flown: dict[str, tuple[Setup, Flown, Flight]],
-) -> None:
+        roll_deg = np.rad2deg(np.abs(flight.attitude_rad[:, 0]))
+        assert 0.0 < figures.turn_roll_peak_deg <= roll_deg.max()
     found = {name: figures_of(run[2]) for name, run in flown.items()}
     assert found[IMPROVED].lines_believed_m < 0.05
     assert found[ORIGINAL].lines_believed_m > 3.0 * found[IMPROVED].lines_believed_m
@@ -174,32 +158,21 @@ def test_currents_are_across_along_and_none(small: Plan) -> None:
     assert [case.swell_m > 0 for case in cases] == [False, False, False, True]
 
 
-def _rows(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
 def test_the_report_holds_every_flight_next_to_the_paper(tmp_path: Path) -> None:
     currents = ["0.05@90", "0@0"]
     _, data = compare_report(
-        CONFIG,
-        tmp_path / "one",
-        currents=currents,
-        seed=4,
-        flights=1,
-        executor=SERIAL,
+        CONFIG, tmp_path / "one", currents=currents, seed=4, flights=1, executor=SERIAL
     )
     assert json.loads((tmp_path / "one" / "compare.json").read_text()) == data
     assert len(data["cases"]) == 2
     assert all(set(case["variants"]) == set(BY_NAME) for case in data["cases"])
     assert data["paper"]["improved"]["cross_track_rms_m"] == [0.12, 0.12]
-    rows = _rows(tmp_path / "one" / "flights.csv")
+    _, rows = read_csv(tmp_path / "one" / "flights.csv")
     assert len(rows) == 2 * len(VARIANTS)
-    for row in rows:
+    for _, row in rows:
         current = f"{float(row['current_mps']):g}@{float(row['towards_deg']):g}"
-        found = data["cases"][currents.index(current)]["variants"][row["configuration"]][
-            "lines_true_m"
-        ]["mean"]
+        case = data["cases"][currents.index(current)]
+        found = case["variants"][row["configuration"]]["lines_true_m"]["mean"]
         assert float(row["lines_true_m"]) == pytest.approx(found, abs=1e-6)
     assert len(list((tmp_path / "one").glob("*.png"))) == 1
 

@@ -11,6 +11,7 @@ import pytest
 from shapely.geometry import MultiPolygon, Polygon, box
 
 from alice_survey.app.stages import spec
+from alice_survey.core.artefacts import write_json
 from alice_survey.core.config import CameraConfig, WaterConfig
 from alice_survey.core.errors import PlanError, VehicleError
 from alice_survey.core.executor import SERIAL
@@ -88,12 +89,8 @@ def test_all_dives_are_flown_in_one_mission_from_home_to_home(flight: Flight) ->
     assert (found["dives"], found["stations_planned"]) == (2, 18)
     # Pictures are in their places, at a line that ends in a stop too.
     planned = np.vstack([line.stations_ne for line in PLAN.lines])
-    taken = np.column_stack(
-        [
-            np.interp(flight.trigger_s, flight.truth.time_s, axis)
-            for axis in flight.believed_glass_ned[:, :2].T
-        ]
-    )
+    time_s, ne = flight.truth.time_s, flight.believed_glass_ned[:, :2]
+    taken = np.transpose([np.interp(flight.trigger_s, time_s, axis) for axis in ne.T])
     off = np.linalg.norm(taken - planned, axis=1)
     assert 0.001 < off.max() < 0.15
 
@@ -132,8 +129,7 @@ def test_one_dive_is_flown_alone() -> None:
     ],
 )
 def test_the_way_in_stays_where_the_vehicle_may_be(allowed: Polygon, room: float) -> None:
-    area = replace(PLAN.area, allowed=MultiPolygon([allowed]))
-    fenced = replace(PLAN, area=area)
+    fenced = replace(PLAN, area=replace(PLAN.area, allowed=MultiPolygon([allowed])))
     assert room_behind_m(fenced, path_of(fenced), 1.6) == pytest.approx(room, abs=1e-5)
 
 
@@ -151,10 +147,7 @@ def test_a_vehicle_without_sway_turns_on_the_spot_with_a_warning_but_cannot_step
 
 
 def test_the_settings_choose_the_dive(tmp_path: Path) -> None:
-    from alice_survey.core.artefacts import write_json
-
     folder = tmp_path / "plan"
-    folder.mkdir()
     write_json(folder / "plan.json", PLAN.to_json())
     write_json(folder / "stage.json", {})
     config = survey(vehicle={"dive": 2}, seafloor={"grid_m": 0.05})

@@ -17,6 +17,7 @@ from alice_survey.sim.vehicle.log import read_vehicle_log
 from missions.values.plan_file import read_plan
 from tests.missions import flown_plans
 from tests.missions.flown_plans import terrain_of
+from tests.refusals import refused
 
 FILES = (
     "triggers.csv", "navigation.csv", "vehicle.csv", "flight.json", "truth/track.csv",
@@ -51,7 +52,7 @@ def test_a_flight_is_the_same_bytes_each_time_and_another_with_another_seed(
             assert (one.read_bytes() == two.read_bytes()) == is_same, name
 
 
-def test_each_station_is_within_the_log_and_near_its_plan(workspace: Path) -> None:
+def test_stations_are_near_their_plan_and_navigation_is_of_the_body(workspace: Path) -> None:
     config = survey()
     plan = read_plan(workspace / "plan" / "plan.json")
     track = read_track(workspace / "flight" / "truth" / "track.csv")
@@ -71,10 +72,6 @@ def test_each_station_is_within_the_log_and_near_its_plan(workspace: Path) -> No
     assert 1.6 < altitude.min() < altitude.max() < 2.4
     assert abs(altitude.mean() - 2.0) < 0.1
 
-
-def test_navigation_is_of_the_body_at_the_flights_rate(workspace: Path) -> None:
-    plan = read_plan(workspace / "plan" / "plan.json")
-    track = read_track(workspace / "flight" / "truth" / "track.csv")
     log = read_columns(
         workspace / "flight" / "navigation.csv",
         ("time_s", "latitude_deg", "longitude_deg", "depth_m", "sigma_horizontal_m"),
@@ -89,7 +86,7 @@ def test_navigation_is_of_the_body_at_the_flights_rate(workspace: Path) -> None:
     assert 0.1 < (off / log["sigma_horizontal_m"][:, None]).max() < 5.0
 
 
-def test_both_vehicle_logs_read_back_and_agree_on_the_thrusters(workspace: Path) -> None:
+def test_logs_of_the_vehicle_and_the_bag_read_back_and_agree(workspace: Path) -> None:
     flight = workspace / "flight"
     believed = read_vehicle_log(flight / "vehicle.csv")
     true = read_vehicle_log(flight / "truth" / "vehicle.csv")
@@ -101,9 +98,6 @@ def test_both_vehicle_logs_read_back_and_agree_on_the_thrusters(workspace: Path)
     speed_off = believed.velocity_body - true.velocity_body
     assert 1e-4 < np.sqrt(np.mean(speed_off**2)) < 0.02
 
-
-def test_the_bag_opens_and_holds_what_the_navigation_log_says(workspace: Path) -> None:
-    flight = workspace / "flight"
     depths = []
     with AnyReader([flight / "bag"]) as reader:
         wanted = [c for c in reader.connections if c.topic.endswith("navigation/odometry")]
@@ -160,17 +154,15 @@ def test_an_exported_mission_is_flown_next_to_its_certificate(
     text, data = run(["fly"], tmp_path, None, changes={"vehicle": {"mission_file": file}})
     found = data["fly"]
     mission = json.loads((tmp_path / "flight" / "flight.json").read_text())["mission"]
+    plan = read_plan(tmp_path / "plan" / "plan.json")
 
     assert "mission_dive1.plan as ardusub flies it" in text
     assert mission == found["mission"]
-    assert mission["planned"]["share_at_overlap"] == pytest.approx(
-        read_plan(tmp_path / "plan" / "plan.json").coverage
-    )
-    assert mission["line_ends"] == len(read_plan(tmp_path / "plan" / "plan.json").lines)
+    assert mission["planned"]["share_at_overlap"] == pytest.approx(plan.coverage)
+    assert mission["line_ends"] == len(plan.lines)
     assert 0.9 < found["coverage"]["share_at_overlap"] <= 1.0
     assert {path.name for path in (tmp_path / "flight").iterdir()} >= {"triggers.csv", "bag"}
     # Another file is another flight; one that holds no mission is refused in a line.
     (tmp_path / "notes.txt").write_text("nothing")
-    with pytest.raises(PlanError, match="no mission") as caught:
+    with refused(PlanError, "no mission"):
         run(["fly"], tmp_path, None, changes={"vehicle": {"mission_file": tmp_path / "notes.txt"}})
-    assert "\n" not in str(caught.value)

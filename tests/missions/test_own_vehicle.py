@@ -11,7 +11,7 @@ from alice_survey.app.pipeline import plan_report
 from alice_survey.core.artefacts import read_json
 from alice_survey.core.config import SurveyConfig, load_config
 from alice_survey.core.errors import AliceError, PlanError, VehicleError
-from alice_survey.sim.vehicle.pilot.gains import gains_for
+from alice_survey.sim.vehicle.pilot.gains import LAG, MASS, PLACE, RATE, gains_for
 from alice_survey.sim.vehicle.vehicle import vehicle_from
 from missions.plan.strength import survey_costs
 from missions.route.energy import battery_wh, hotel_w, planned_vehicle
@@ -71,8 +71,6 @@ def test_gains_of_roll_and_pitch_are_damped_with_their_lag() -> None:
     craft = vehicle_from("bluerov2_heavy")
     gains = gains_for(craft, 0.2)
     assert gains.holds_level
-    from alice_survey.sim.vehicle.pilot.gains import LAG, MASS, PLACE, RATE
-
     for row, degree in ((4, 3), (5, 4)):
         axis = gains.axes[row]
         assert axis[MASS] == pytest.approx(craft.mass[degree, degree])

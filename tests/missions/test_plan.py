@@ -1,5 +1,6 @@
 import json
 import math
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from missions.values.footprint import common_swath
 from missions.values.pattern import pattern
 from missions.values.plan_file import Plan, read_plan
 from tests.missions import flown_plans
+from tests.refusals import refused
 
 
 def survey(**sections: Any) -> SurveyConfig:
@@ -43,9 +45,8 @@ def test_the_papers_mission(capsys: pytest.CaptureFixture[str]) -> None:
     assert plan.reached_side_overlap == pytest.approx(0.2845, abs=1e-3)
     assert plan.reached_forward_overlap == pytest.approx(0.600, abs=1e-3)
     assert plan.interval_s == pytest.approx(2.238)
-    assert sum(line.kind == "survey" for line in plan.lines) == 15
-    assert sum(line.kind == "cross" for line in plan.lines) == 1
-    assert sum(line.kind == "closing" for line in plan.lines) == 1
+    kinds = Counter(line.kind for line in plan.lines)
+    assert kinds == {"survey": 15, "cross": 1, "closing": 1}
     assert plan.stations == sum(line.stations for line in plan.lines)
     # Lines of 17 m with a picture every 0.45 m, one across them, and half of one again.
     assert 15 * 38 + 33 + 18 <= plan.stations <= 15 * 40 + 36 + 21
@@ -54,9 +55,8 @@ def test_the_papers_mission(capsys: pytest.CaptureFixture[str]) -> None:
     # the closing line, run-ins, ways from home and back, descent and ascent about half an hour.
     assert 27 * 60 < plan.duration_s < 32 * 60
     assert 20 < plan.energy_wh < 60
-    assert plan.details["imaging"]["paper_rule"]["forward_overlap"] == pytest.approx(
-        0.285, abs=1e-3
-    )
+    paper = plan.details["imaging"]["paper_rule"]
+    assert paper["forward_overlap"] == pytest.approx(0.285, abs=1e-3)
 
 
 def test_an_ideal_port_gives_the_known_overlap_of_27_percent() -> None:
@@ -159,9 +159,7 @@ def test_the_first_line_starts_at_home_the_corner_nearest_the_datum() -> None:
         assert corners[int(np.argmin(starts))] == min(corners)
 
 
-def test_without_forward_overlap_pictures_just_meet_also_at_their_corners(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_without_forward_overlap_pictures_just_meet_also_at_their_corners() -> None:
     plan = planned(area=SMALL["area"], plan={"forward_overlap": 0.0, "cross_lines": 0})
     assert plan.coverage == pytest.approx(1.0, abs=1e-9)
     assert plan.station_spacing_m == pytest.approx(plan.footprint_m[1], abs=2e-4)
@@ -186,9 +184,8 @@ def test_the_certificate_shows_the_gaps_of_lines_too_far_apart(
     ],
 )
 def test_errors_of_planning_take_a_line(sections: dict[str, Any], named: str) -> None:
-    with pytest.raises(PlanError) as fault:
+    with refused(PlanError, named):
         planned(**sections)
-    assert named in str(fault.value) and len(str(fault.value).splitlines()) == 1
 
 
 @pytest.fixture(scope="module")
@@ -235,11 +232,10 @@ def test_a_broken_plan_file_is_an_error_in_one_line(workspace: Path, tmp_path: P
         ({"datum": {"latitude": 1}}, "latitude"),
     ):
         path.write_text(json.dumps({**good, **change}))
-        with pytest.raises(PlanError, match=named) as fault:
+        with refused(PlanError, named):
             read_plan(path)
-        assert "\n" not in str(fault.value)
     path.write_text(json.dumps({k: v for k, v in good.items() if k != "interval_s"}))
-    with pytest.raises(PlanError, match="interval_s"):
+    with refused(PlanError, "interval_s"):
         read_plan(path)
 
 

@@ -5,25 +5,16 @@ from importlib import resources
 import numpy as np
 import pytest
 
-from alice_survey.core.config import SurveyConfig, load_config
+from alice_survey.core.config import load_config
 from missions.fly.simulation import floor_grid
-from missions.values.plan_file import Plan
 from tests.missions.flown_plans import flown, planned, terrain_of
 
 
-@pytest.fixture(scope="module")
-def config() -> SurveyConfig:
-    with resources.as_file(resources.files("alice_survey") / "caesarea.toml") as path:
-        return load_config(path)
-
-
-@pytest.fixture(scope="module")
-def plan(config: SurveyConfig) -> Plan:
-    return planned(config)
-
-
-def test_it_is_the_site_of_the_paper(plan: Plan) -> None:
+def test_the_site_of_the_paper_is_flown_over_its_rocks() -> None:
     """10 x 30 m at 8 m depth, flown at 3 m altitude (Gutnik et al. 2021, section VII)."""
+    with resources.as_file(resources.files("alice_survey") / "caesarea.toml") as path:
+        config = load_config(path)
+    plan = planned(config)
     assert plan.area.survey.area == pytest.approx(300.0, rel=1e-6)
     edges = np.linalg.norm(np.diff(plan.area.rings_ne[0], axis=0), axis=1)
     np.testing.assert_allclose(sorted(edges), [10.0, 10.0, 30.0, 30.0], rtol=1e-6)
@@ -31,8 +22,6 @@ def test_it_is_the_site_of_the_paper(plan: Plan) -> None:
     assert plan.coverage >= 0.999
     assert len(plan.dives) == 1
 
-
-def test_it_is_flown_over_its_rocks(config: SurveyConfig, plan: Plan) -> None:
     coarse = config.seafloor.model_copy(update={"grid_m": 0.05})
     rough = config.model_copy(update={"seafloor": coarse})
     terrain = terrain_of(rough, plan)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from scipy.stats import chi2
 
 from alice_survey.core.config import (
@@ -20,7 +21,7 @@ from alice_survey.sim.vehicle.navigation.tick import LOG_COLUMNS
 from alice_survey.sim.vehicle.pilot.command import ThrustWatch
 from alice_survey.sim.vehicle.sea import FloorGrid, current_at
 from camera_calib.rig import design_rig
-from missions.fly.run import flight_summary
+from missions.fly.run import draw_flight, flight_summary, line_spans, rpm_of
 from missions.fly.simulation import current_of
 from missions.values.flight import Flight, rms
 from missions.values.plan_file import Plan
@@ -123,17 +124,40 @@ def test_a_thruster_that_fails_unnoticed_leaves_pictures_off_their_lines() -> No
 
 def test_figures_of_turns_and_altitude_are_true_ones(flight: Flight) -> None:
     found = flight_summary(flight, survey().vehicle, RIG)
-    on_line = flight.line >= 0
-    # Truth and estimate differ by the navigation's error, no more.
-    np.testing.assert_allclose(
-        flight.route_error[on_line], flight.line_errors[0][on_line], atol=1e-6
-    )
     turns = found["in_turns"]
     assert 0.5 < turns["roll_worst_deg"] < 10.0
     assert turns["believed_off_route_rms_m"] < turns["off_route_rms_m"] < 0.3
     np.testing.assert_allclose(flight.altitude_m, 6.0 - flight.glass_ned[:, 2], atol=1e-9)
     assert 0.001 < found["on_lines"]["altitude_rms_m"] < 0.12
     assert 1.7 < found["on_lines"]["altitude_least_m"] < 2.0
+
+
+def test_spans_are_the_times_on_lines(flight: Flight) -> None:
+    spans, time_s = line_spans(flight), flight.truth.time_s
+    inside = [(time_s >= begin) & (time_s <= end) for begin, end in spans]
+    assert all(begin < end for begin, end in spans)
+    assert len(spans) == len(flight.plan.lines)
+    np.testing.assert_array_equal(np.sum(inside, axis=0), flight.line >= 0)
+
+
+def test_strips_show_errors_thrusters_and_power(
+    flight: Flight, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    kept: list[Any] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: kept.append(figure))
+    draw_flight(tmp_path / "drawn.png", flight)
+    curves = {
+        (axes.get_ylabel(), line.get_label()): np.asarray(line.get_ydata(), np.float64)
+        for axes in kept[0].axes
+        for line in axes.lines
+    }
+    np.testing.assert_array_equal(curves["cross-track, m", "true"], flight.line_errors[0])
+    off = flight.log.position_ned - flight.truth.ned_from_body.translation
+    np.testing.assert_array_equal(curves["east error, m", "believed minus true"], off[:, 1])
+    for name, rpm in rpm_of(flight.flown).items():
+        np.testing.assert_array_equal(curves["rpm", name], rpm)
+    spent_j = 0.05 * curves["power, W", "all thrusters"].sum()
+    assert spent_j == pytest.approx(flight.flown.energy_j.sum(), rel=1e-3)
 
 
 def test_navigation_is_consistent_in_the_closed_loop() -> None:

@@ -95,13 +95,10 @@ def test_a_dead_propeller_ends_the_mission_at_the_surface() -> None:
     assert flight.truth.ned_from_body.translation[-1, 2] < 0.35
 
 
-def test_turns_that_are_too_tight_are_refused() -> None:
+def test_turns_that_are_too_tight_or_have_no_room_are_refused() -> None:
     with pytest.raises(PlanError, match=r"turn_radius_m 3 is tighter than the 6\.\d+ m"):
         planned(survey({"turn_radius_m": 3.0, "turns": "arcs"}))
     assert planned(survey({"turn_radius_m": 3.0})).turn_radius_m > 6.0
-
-
-def test_an_area_without_room_for_its_turns_is_refused() -> None:
     with pytest.raises(PlanError, match=r"turns of 8 m radius have no room .*area.turn_margin_m"):
         planned(survey(area={"turn_margin_m": 3.0}))
 

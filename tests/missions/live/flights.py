@@ -1,17 +1,20 @@
 """A small plan, and a vehicle in the water that a pilot's loop can fly, tick by tick."""
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from alice_survey.core.artefacts import read_csv, write_json
 from alice_survey.core.config import SurveyConfig
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.sea import level_floor
 from alice_survey.sim.vehicle.simulator import SimulatedVehicle
 from missions.fly.simulation import flight_settings, mission_setup
 from missions.live.mission import LinkLimits, LiveMission, Odometry, mission_of
+from missions.values.flight import trigger_times
 from missions.values.plan_file import Plan
 from tests.missions.flown_plans import Move, plan_of, walk
 
@@ -25,6 +28,22 @@ def small_plan() -> Plan:
     turn: list[Move] = [("spot", 90.0), ("go", 1.0), ("spot", 90.0)]
     moves: list[Move] = [("line", 4.0, 0), *turn, ("line", 4.0, 1)]
     return plan_of([walk((0.0, 0.0), 0.0, moves)])
+
+
+def workspace_in(folder: Path) -> Path:
+    """A workspace with the small plan."""
+    write_json(folder / "plan" / "plan.json", small_plan().to_json())
+    (folder / "survey.toml").write_text("seed = 5\n[area]\nseafloor_depth_m = 6.0\n")
+    return folder
+
+
+def pictures_of(record: Path, shift_s: float = 0.0) -> tuple[Array, tuple[int, ...]]:
+    """Times and lines of pictures of the small plan by a pilot's record, its clock shifted."""
+    _, rows = read_csv(record)
+    names = ("time_s", "line", "glass_north_m", "glass_east_m")
+    found = np.array([[float(row[name] or "nan") for name in names] for _, row in rows])
+    known = found[np.isfinite(found[:, 2])]
+    return trigger_times(small_plan(), known[:, 0] + shift_s, known[:, 1], known[:, 2:])
 
 
 def vehicle_afloat(plan: Plan, survey: SurveyConfig, seed: int = 1) -> SimulatedVehicle:

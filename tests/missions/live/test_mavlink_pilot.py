@@ -5,7 +5,6 @@ import math
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +16,7 @@ from alice_survey.core.config import SurveyConfig
 from missions.fly.simulation import flight_settings
 from missions.live.mavlink_pilot import GUIDED, SURFACE, MavlinkPilot
 from missions.live.mission import LinkLimits, LinkState, mission_of
-from missions.values.flight import trigger_times
-from tests.missions.live.flights import FLOOR_M, small_plan
+from tests.missions.live.flights import FLOOR_M, pictures_of, small_plan, workspace_in
 
 ARMED = 128
 
@@ -90,7 +88,7 @@ class Vehicle:
 
 
 @pytest.fixture
-def flying() -> Iterator[Vehicle]:
+def flying() -> Vehicle:
     """A vehicle that is being flown."""
     vehicle = Vehicle()
     vehicle.heartbeat()
@@ -98,7 +96,7 @@ def flying() -> Iterator[Vehicle]:
     vehicle.step(20)
     assert vehicle.mission.loop.state == LinkState.FLYING
     vehicle.targets()
-    yield vehicle
+    return vehicle
 
 
 def test_setpoints_are_velocities_in_ned_and_a_heading(flying: Vehicle) -> None:
@@ -185,11 +183,7 @@ def test_vehicle_without_an_origin_is_given_the_datum() -> None:
 @pytest.mark.slow
 def test_dive_over_udp(tmp_path: Path) -> None:
     """The command flies a vehicle of another process, whose own loops follow the set-points."""
-    plan = small_plan()
-    (tmp_path / "plan").mkdir()
-    (tmp_path / "plan" / "plan.json").write_text(json.dumps(plan.to_json()))
-    settings = tmp_path / "survey.toml"
-    settings.write_text("[area]\nseafloor_depth_m = 6.0\n")
+    settings = workspace_in(tmp_path) / "survey.toml"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -215,15 +209,8 @@ def test_dive_over_udp(tmp_path: Path) -> None:
     assert json.loads(ended.stdout)["ending"] == "complete"
 
     _, truth = read_csv(track)
-    _, rows = read_csv(record)
     true = np.array([[float(cell) for cell in row.values()] for _, row in truth])
-    time_s = np.array([float(row["time_s"]) for _, row in rows]) - 1.0
-    line = np.array([float(row["line"]) for _, row in rows])
-    glass = np.array(
-        [[float(row[f"glass_{axis}_m"] or "nan") for axis in ("north", "east")] for _, row in rows]
-    )
-    known = np.isfinite(glass[:, 0])
-    at_s, lines = trigger_times(plan, time_s[known], line[known], glass[known])
+    at_s, lines = pictures_of(record, -1.0)
     assert lines == (0,) * 6 + (1,) * 6
     # The body's origin is 0.55 m behind the glass, and 0.05 m to starboard of it.
     north = np.interp(at_s, true[:, 0], true[:, 1])

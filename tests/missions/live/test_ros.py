@@ -14,9 +14,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import Rotation
 
-from alice_survey.core.artefacts import read_csv
 from alice_survey.core.config import SurveyConfig, load_config
 from alice_survey.core.frames import Array, attitude_from_rotation, interpolate_poses
 from alice_survey.core.trajectory import read_track
@@ -29,8 +28,13 @@ from missions.live import ros as ros_messages
 from missions.live.mission import Odometry
 from missions.live.ros import START_S, VehicleNode
 from missions.logs.ros_builder import JOINTS, ODOMETRY, WRENCH
-from missions.values.flight import trigger_times
-from tests.missions.live.flights import FLOOR_M, small_plan, vehicle_afloat
+from tests.missions.live.flights import (
+    FLOOR_M,
+    pictures_of,
+    small_plan,
+    vehicle_afloat,
+    workspace_in,
+)
 
 rclpy = pytest.importorskip(
     "rclpy", reason="ROS 2 is not installed: pip install 'alice-survey[ros]'"
@@ -49,11 +53,7 @@ DOMAIN = {
 
 @pytest.fixture
 def workspace(tmp_path: Path) -> Path:
-    """A workspace with a small plan."""
-    (tmp_path / "plan").mkdir()
-    (tmp_path / "plan" / "plan.json").write_text(json.dumps(small_plan().to_json()))
-    (tmp_path / "survey.toml").write_text("seed = 5\n[area]\nseafloor_depth_m = 6.0\n")
-    return tmp_path
+    return workspace_in(tmp_path)
 
 
 def command(*words: str) -> list[str]:
@@ -222,19 +222,19 @@ def test_dive_of_two_processes_covers_what_the_closed_loop_does(workspace: Path)
     floor = true_floor(plan, settings)
     closed = simulate_plan(plan, settings, floor, flight_noise(survey.seed))
     rig = design_rig(survey.camera, survey.water)
-    glass_body = survey.camera.position_body_m
 
     true = read_track(track)
-    _, rows = read_csv(record)
-    time_s, line, glass = (
-        np.array([[float(row[name] or "nan") for name in names] for _, row in rows])
-        for names in (("time_s",), ("line",), ("glass_north_m", "glass_east_m"))
-    )
-    known = np.isfinite(glass[:, 0])
-    at_s, lines = trigger_times(plan, time_s[known, 0], line[known, 0], glass[known])
+    at_s, lines = pictures_of(record)
     assert lines == closed.trigger_line == (0,) * 6 + (1,) * 6
     poses = interpolate_poses(true.time_s, true.ned_from_body, at_s)
-    taken = _stations(poses, np.array(glass_body), floor, lines)
+    glass = poses.apply(np.array(survey.camera.position_body_m))
+    depths = np.array([floor_depth(floor, float(n), float(e)) for n, e in glass[:, :2]])
+    taken = Stations(
+        glass_ne=glass[:, :2],
+        altitude_m=depths - glass[:, 2],
+        attitude_rad=attitude_from_rotation(poses.rotation).reshape(-1, 3),
+        line=np.array(lines, dtype=np.intp),
+    )
 
     wanted = plan_pattern(plan, rig)
     seen = certificate(plan.area, rig, taken, wanted)
@@ -245,19 +245,6 @@ def test_dive_of_two_processes_covers_what_the_closed_loop_does(workspace: Path)
     # The same navigation errors in the same sea: only the altimeter differs.
     np.testing.assert_allclose(taken.glass_ne, stations_of_flight(closed).glass_ne, atol=0.1)
     assert true.time_s[-1] - START_S == pytest.approx(closed.flown.time_s[-1], rel=0.1)
-
-
-def _stations(
-    poses: RigidTransform, glass_body: Array, floor: Any, lines: tuple[int, ...]
-) -> Stations:
-    glass = poses.apply(glass_body)
-    depths = np.array([floor_depth(floor, float(n), float(e)) for n, e in glass[:, :2]])
-    return Stations(
-        glass_ne=glass[:, :2],
-        altitude_m=depths - glass[:, 2],
-        attitude_rad=attitude_from_rotation(poses.rotation).reshape(-1, 3),
-        line=np.array(lines, dtype=np.intp),
-    )
 
 
 # ------------------------------------------------------------------ safe states

@@ -14,6 +14,7 @@ from missions.logs.navigation_csv import read_navigation
 from missions.logs.ros_builder import flipped_quaternion, flipped_world, write_bag
 from tests.missions.logs.log_files import Bag, imported, numbers
 from tests.missions.logs.test_bag import flight
+from tests.refusals import refused
 
 START = 1_650_000_000_000_000_000
 TOPIC = "/sparus2/navigator/navigation"
@@ -224,9 +225,8 @@ def test_a_truncated_bag_is_one_clear_line(tmp_path: Path, version: int, share: 
     file = log if version == 1 else log / "dive.mcap"
     data = file.read_bytes()
     file.write_bytes(data[: int(share * len(data))])
-    with pytest.raises(NavigationError) as caught:
+    with refused(NavigationError):
         imported(log)
-    assert "\n" not in str(caught.value)
     assert not (tmp_path / "n.csv").exists()
 
 
