@@ -111,8 +111,8 @@ def test_a_bag_holds_the_flight_in_enu_and_flu(tmp_path: Path) -> None:
     # Navigation carries its covariance.
     s = record.sigma_horizontal_m[9]
     message = found["/alice/navigation/odometry"][9][1]
-    expected = [s**2, s**2, (s / 2) ** 2, (s / 10) ** 2, (s / 10) ** 2, (s / 5) ** 2]
-    np.testing.assert_allclose(np.reshape(message.pose.covariance, (6, 6)), np.diag(expected))
+    variances = [s**2, s**2, (s / 2) ** 2, (s / 10) ** 2, (s / 10) ** 2, (s / 5) ** 2]
+    np.testing.assert_allclose(np.reshape(message.pose.covariance, (6, 6)), np.diag(variances))
     fix = found["/alice/navigation/fix"][9][1]
     back = record.datum.ned_from_geodetic(
         np.array([[fix.latitude, fix.longitude, 17.5 - fix.altitude]])

@@ -43,26 +43,25 @@ def moves_of(time_s: Array, velocity: Array) -> Array:
 
 
 def dense(
-    time_s: Array, velocity: Array, fixes: tuple[Array, Array, Array], errors: TrackErrors
+    time_s: Array, velocity: Array, at: list[int], places: Array, sigmas: Array
 ) -> tuple[Array, Array]:
     """All places and both errors at once, by the normal equations of their residuals."""
-    at, places, sigmas = fixes
     count, moves = len(time_s), moves_of(time_s, velocity)
     longer = [-moves.ravel(), -(moves[:, ::-1] * [-1.0, 1.0]).ravel()]  # by both errors
     steps = np.column_stack([np.kron(np.diff(np.eye(count), axis=0), np.eye(2)), *longer])
     known = np.eye(2 * count + 2)
-    fixed = known[np.add.outer(2 * np.asarray(at), [0, 1]).ravel()]
+    fixed = known[np.add.outer(2 * np.array(at), [0, 1]).ravel()]
     weights = 1.0 / np.concatenate(
         [
-            np.repeat(errors.noise_mps * np.sqrt(np.diff(time_s)), 2),
+            np.repeat(ERRORS.noise_mps * np.sqrt(np.diff(time_s)), 2),
             np.repeat(sigmas, 2),
-            [errors.scale, np.deg2rad(errors.heading_deg)],
+            [ERRORS.scale, np.deg2rad(ERRORS.heading_deg)],
         ]
     )
     a = np.vstack([steps, fixed, known[-2:]]) * weights[:, None]
     b = np.concatenate([moves.ravel(), places.ravel(), [0.0, 0.0]]) * weights
     normal = a.T @ a
-    found = np.linalg.solve(normal, a.T @ b)
+    found: Array = np.linalg.solve(normal, a.T @ b)
     variances = np.diag(np.linalg.inv(normal))[:-2].reshape(-1, 2)
     return found[:-2].reshape(-1, 2), np.sqrt(0.5 * variances.sum(axis=1))
 
@@ -73,7 +72,7 @@ def test_the_smoother_is_least_squares_over_all_places(at: list[int]) -> None:
     places = np.vstack([[0, 0], moves_of(time_s, velocity).cumsum(axis=0)])[at] * 1.02
     sigmas = np.linspace(0.5, 2.0, len(at))
     track = reckoned(time_s, velocity, at, places, sigmas)
-    expected, sigma = dense(time_s, velocity, (np.array(at), places, sigmas), ERRORS)
+    expected, sigma = dense(time_s, velocity, at, places, sigmas)
     np.testing.assert_allclose(track.ne, expected, atol=2e-5)
     np.testing.assert_allclose(track.sigma_m, sigma, rtol=1e-4)
     assert track.refused == 0
