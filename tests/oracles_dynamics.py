@@ -6,7 +6,7 @@ ground as the state, C_RB in its form without linear velocity, rigid body and wa
 force of every coefficient by its name.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 
@@ -19,6 +19,7 @@ from alice_survey.sim.vehicle.fins import Fin
 from alice_survey.sim.vehicle.propulsion import Thruster
 from alice_survey.sim.vehicle.sea import Current
 from alice_survey.sim.vehicle.vehicle import Vehicle
+from tests.oracles_propulsion import wrench as thrust_wrench
 
 Array = NDArray[np.float64]
 FORCES, MOTIONS = "XYZKMN", "uvwpqr"
@@ -30,19 +31,9 @@ def cross_matrix(a: Array) -> Array:
     return np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
 
 
-def blocks(upper_left: Array, upper_right: Array, lower_left: Array, lower_right: Array) -> Array:
-    """Four (3, 3) as one (6, 6)."""
-    return np.block([[upper_left, upper_right], [lower_left, lower_right]])
-
-
 def ned_from_body(attitude: Array) -> Array:
     """R(Theta) from roll, pitch and heading (2.18)."""
-    (sf, st, sp), (cf, ct, cp) = np.sin(attitude), np.cos(attitude)
-    return np.array([
-        [cp * ct, -sp * cf + cp * st * sf, sp * sf + cp * cf * st],
-        [sp * ct, cp * cf + sf * st * sp, -cp * sf + st * sp * cf],
-        [-st, ct * sf, ct * cf],
-    ])  # fmt: skip
+    return Rotation.from_euler("ZYX", attitude[::-1]).as_matrix()
 
 
 def attitude_rates_from_body_rates(attitude: Array) -> Array:
@@ -71,16 +62,16 @@ class Part:
     def matrix(self) -> Array:
         """M_RB (3.44)."""
         s = cross_matrix(self.cg)
-        return blocks(self.mass * np.eye(3), -self.mass * s, self.mass * s, self.about_origin)
+        return np.block(
+            [[self.mass * np.eye(3), -self.mass * s], [self.mass * s, self.about_origin]]
+        )
 
     def coriolis(self, nu: Array) -> Array:
         """C_RB in the form that holds no linear velocity (3.57)."""
         s, turn = cross_matrix(self.cg), cross_matrix(nu[3:])
-        return blocks(
-            self.mass * turn,
-            -self.mass * turn @ s,
-            self.mass * s @ turn,
-            -cross_matrix(self.about_origin @ nu[3:]),
+        angular = -cross_matrix(self.about_origin @ nu[3:])
+        return np.block(
+            [[self.mass * turn, -self.mass * turn @ s], [self.mass * s @ turn, angular]]
         )
 
 
@@ -114,7 +105,7 @@ def added_coriolis(mass: Array, nu: Array) -> Array:
     """C_A (6.43)."""
     linear = cross_matrix(mass[:3, :3] @ nu[:3] + mass[:3, 3:] @ nu[3:])
     angular = cross_matrix(mass[3:, :3] @ nu[:3] + mass[3:, 3:] @ nu[3:])
-    return blocks(np.zeros((3, 3)), -linear, -linear, -angular)
+    return np.block([[np.zeros((3, 3)), -linear], [-linear, -angular]])
 
 
 def damping_force(vehicle: Vehicle, nu: Array) -> Array:
@@ -156,22 +147,10 @@ def restoring(vehicle: Vehicle, attitude: Array) -> Array:
     ])  # fmt: skip
 
 
-def plain_thrust(vehicle: Vehicle, rps: Array, nu: Array) -> Array:
-    """The wrench of propellers in open water: thrust, its moment, and their reaction torque.
-
-    Of thrusters without wake, deduction, advance and jet; `nu` therefore does nothing.
-    """
-    wrench = np.zeros(6)
-    for thruster, n in zip(vehicle.thrusters, rps, strict=True):
-        way = "forward" if n > 0 else "reverse"
-        kt, kq = getattr(thruster, f"kt_{way}"), getattr(thruster, f"kq_{way}")
-        square = vehicle.density_kg_m3 * thruster.diameter_m**4 * n * abs(n)
-        direction = np.array(thruster.direction_body)
-        push, torque = kt * square * direction, kq * thruster.diameter_m * square * direction
-        wrench[:3] += push
-        wrench[3:] += cross_matrix(np.array(thruster.position_body_m)) @ push
-        wrench[3:] -= thruster.handedness * torque
-    return wrench
+def propeller_wrench(vehicle: Vehicle, rps: Array, nu: Array) -> Array:
+    """The wrench of all propellers, by all laws of thrust."""
+    displaced_kg = vehicle.rigid_body.buoyancy_kg + vehicle.rigid_body.entrained_kg
+    return thrust_wrench(vehicle.thrusters, vehicle.density_kg_m3, displaced_kg, rps, nu)
 
 
 def fin_wrench(vehicle: Vehicle, angles: Array, nu: Array) -> Array:
@@ -243,9 +222,6 @@ def water(current: Current, time_s: float, depth_m: float) -> tuple[Array, Array
     return here, by_time, by_depth
 
 
-Thrust = Callable[[Vehicle, Array, Array], Array]
-
-
 def derivative(
     time_s: float,
     eta: Array,
@@ -255,7 +231,6 @@ def derivative(
     load: Array,
     vehicle: Vehicle,
     current: Current,
-    thrust: Thrust = plain_thrust,
 ) -> tuple[Array, Array, Array]:
     """Rates of eta (N, E, D, roll, pitch, heading), of the velocity over ground, and of actuators.
 
@@ -283,7 +258,8 @@ def derivative(
     rigid = parts(vehicle)
     mass_rigid, mass_added = sum(p.matrix for p in rigid), added_mass(vehicle)
     count = len(vehicle.thrusters)
-    force = load + thrust(vehicle, rps[:count], nu_relative) - restoring(vehicle, eta[3:])
+    force = load + propeller_wrench(vehicle, rps[:count], nu_relative)
+    force = force - restoring(vehicle, eta[3:])
     force = force + fin_wrench(vehicle, rps[count:], nu_relative)
     force = force + damping_force(vehicle, nu_relative)
     force = force - added_coriolis(mass_added, nu_relative) @ nu_relative
@@ -322,7 +298,6 @@ def integrate(
     at_s: Array,
     commands_rps: Array,
     loads: Array,
-    thrust: Thrust = plain_thrust,
 ) -> tuple[Array, Array, Array]:
     """The motion by an adaptive method of order 8, tight enough to stand for the truth.
 
@@ -335,7 +310,6 @@ def integrate(
         at_s: (T,) times; commands and loads are constant between neighbours.
         commands_rps: (T - 1, n)
         loads: (T - 1, 6)
-        thrust: wrench of the thrusters.
 
     Returns:
         (T, 6) eta, (T, 6) velocity relative to the water, (T, n) thruster speeds.
@@ -351,7 +325,7 @@ def integrate(
 
         def rate(time_s: float, y: Array, command: Array = command, load: Array = load) -> Array:
             return np.concatenate(
-                derivative(time_s, y[:6], y[6:12], y[12:], command, load, vehicle, current, thrust)
+                derivative(time_s, y[:6], y[6:12], y[12:], command, load, vehicle, current)
             )
 
         found = solve_ivp(

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from alice_survey.core.frames import attitude_from_rotation, rotation_from_attitude
+from alice_survey.core.frames import attitude_from_rotation
 from alice_survey.sim.vehicle.coefficients import Coefficients
 from alice_survey.sim.vehicle.dynamics import Body, derivative, initial_state, rk4_step, scratch_for
 from alice_survey.sim.vehicle.propulsion import Thruster
@@ -143,20 +143,3 @@ def attitudes(states: Array) -> Array:
 def rotations(states: Array) -> Rotation:
     """ned_from_body of states."""
     return Rotation.from_quat(states[..., 3:7])
-
-
-def quaternion(attitude_rad: Array) -> Array:
-    quaternion: Array = rotation_from_attitude(*attitude_rad).as_quat()
-    return quaternion
-
-
-def ground_velocity(states: Array, times: Array, current: Current) -> Array:
-    """(N, 3) NED velocity over ground of states."""
-    from tests.oracles_dynamics import water
-
-    return np.array(
-        [
-            rotations(state).apply(state[7:10]) + water(current, time, state[2])[0]
-            for state, time in zip(states, times, strict=True)
-        ]
-    )
