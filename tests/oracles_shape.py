@@ -34,12 +34,14 @@ from functools import cached_property
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq
+from scipy.optimize import brentq, root
 
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.coefficients import FORCES, MOTIONS, Coefficients
 from alice_survey.sim.vehicle.vehicle import Hull
 
+DENSITY = 1025.0
+"""Sea water of 35 psu at 20 C (ITTC 1963), kg/m^3; its viscosity is 1.05372e-6 m^2/s."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 
 
@@ -105,10 +107,6 @@ class Outline:
         """The x of the centre of the volume."""
         x, r, w = self.strips()
         return float(np.pi * np.sum(w * r**2 * x) / self.volume_m3)
-
-    def shift(self, by_m: float) -> "Outline":
-        """The same shape, further forward."""
-        return Outline(x_m=tuple(x + by_m for x in self.x_m), radius_m=self.radius_m)
 
     def stretch(self, tail_x_m: float, nose_x_m: float) -> "Outline":
         """The same radii on stations spread evenly to other ends."""
@@ -251,11 +249,11 @@ def farthest_tunnel_x(outline: Outline, end: Literal["bow", "stern"]) -> float:
     radii = np.array(outline.radius_m)
     inside = float(np.mean(np.array(outline.x_m)[radii == radii.max()]))
     outside = outline.nose_x_m if end == "bow" else outline.tail_x_m
-    for _ in range(60):
-        middle = (inside + outside) / 2.0
-        fits = bool(np.all(outline.radius_at(middle + radius * np.cos(angle)) >= needed))
-        inside, outside = (middle, outside) if fits else (inside, middle)
-    return inside
+
+    def room(x_m: float) -> float:
+        return float(np.min(outline.radius_at(x_m + radius * np.cos(angle)) - needed))
+
+    return float(brentq(room, inside, outside, xtol=1e-14))
 
 
 _SPARUS2_HULL = Outline(
@@ -309,7 +307,9 @@ ALICE = Geometry(
     name="alice",
     outline=_ALICE_HULL,
     mast=SPARUS2.mast._replace(x_m=-0.472),
-    pod=SPARUS2.pod._replace(outline=_POD.shift(_MOVED_M)),
+    pod=SPARUS2.pod._replace(
+        outline=_POD.stretch(_POD.tail_x_m + _MOVED_M, _POD.nose_x_m + _MOVED_M)
+    ),
     mount=SPARUS2.mount._replace(
         aft_x_m=SPARUS2.mount.aft_x_m + _MOVED_M,
         fore_x_m=SPARUS2.mount.fore_x_m + _MOVED_M,
@@ -336,37 +336,26 @@ class Entrained(NamedTuple):
     """Bulkhead up to which water fills the tail."""
 
 
-def entrained_water(geometry: Geometry, buoyancy_kg: float, density: float) -> Entrained:
+def entrained_water(geometry: Geometry, buoyancy_kg: float) -> Entrained:
     """Water in the nose and tail of a vehicle that displaces a mass of water when drained."""
-    water_m3 = geometry.envelope_volume_m3 - buoyancy_kg / density
+    water_m3 = geometry.envelope_volume_m3 - buoyancy_kg / DENSITY
     outline = geometry.outline
     moment = geometry.envelope_volume_m3 * geometry.envelope_x_m
     tail, nose = outline.tail_x_m, outline.nose_x_m
 
-    def tail_bulkhead(nose_x: float) -> float:
-        left = water_m3 - _moments(outline, nose_x, nose)[0]
-        if left <= 0:
-            return tail
-        return float(
-            brentq(lambda x: _moments(outline, tail, x)[0] - left, tail, nose_x, xtol=1e-14)
-        )
+    def wet(bulkheads: Array) -> Array:
+        return _moments(outline, tail, bulkheads[0]) + _moments(outline, bulkheads[1], nose)
 
-    def unbalance(nose_x: float) -> float:
-        inside = _moments(outline, tail, tail_bulkhead(nose_x))[1]
-        return float(inside + _moments(outline, nose_x, nose)[1] - moment)
-
-    aftmost = brentq(lambda x: _moments(outline, x, nose)[0] - water_m3, tail, nose, xtol=1e-14)
-    nose_x = brentq(unbalance, aftmost, nose, xtol=1e-14)
-    tail_x = tail_bulkhead(nose_x)
-    volume, first, second, across = _moments(outline, nose_x, nose) + _moments(
-        outline, tail, tail_x
-    )
+    start = np.array([tail, nose]) / 2.0
+    found = root(lambda bulkheads: wet(bulkheads)[:2] - [water_m3, moment], start, tol=1e-14)
+    volume, first, second, across = wet(found.x)
+    tail_x, nose_x = found.x.tolist()
     x = first / volume
-    lengthwise = density * (second - volume * x**2 + across)
+    lengthwise = DENSITY * (second - volume * x**2 + across)
     return Entrained(
-        mass_kg=float(density * volume),
+        mass_kg=float(DENSITY * volume),
         x_m=float(x),
-        inertia_kg_m2=(float(2.0 * density * across), float(lengthwise), float(lengthwise)),
+        inertia_kg_m2=(float(2.0 * DENSITY * across), float(lengthwise), float(lengthwise)),
         nose_from_x_m=nose_x,
         tail_to_x_m=tail_x,
     )
@@ -398,17 +387,17 @@ def alpha_0(length_m: float, diameter_m: float) -> float:
     return 2.0 * (1.0 - e**2) / e**3 * (0.5 * math.log((1.0 + e) / (1.0 - e)) - e)
 
 
-def ellipsoid_axial(length_m: float, diameter_m: float, density: float) -> float:
+def ellipsoid_axial(length_m: float, diameter_m: float) -> float:
     """Added mass of a prolate spheroid along its axis, kg: alpha_0 / (2 - alpha_0) m_e.
 
     m_e = 4/3 pi rho (l/2) (d/2)^2, the mass of the water that the spheroid displaces.
     """
     alpha = alpha_0(length_m, diameter_m)
-    displaced_kg = 4.0 / 3.0 * math.pi * density * length_m / 2.0 * (diameter_m / 2.0) ** 2
+    displaced_kg = 4.0 / 3.0 * math.pi * DENSITY * length_m / 2.0 * (diameter_m / 2.0) ** 2
     return alpha / (2.0 - alpha) * displaced_kg
 
 
-def finned_circle_section(radius_m: Array, span_m: float, density: float) -> Array:
+def finned_circle_section(radius_m: Array, span_m: float) -> Array:
     """Added mass of a circle with two fins, moving at a right angle to them, kg/m.
 
     rho pi (b^2 - r^2 + r^4 / b^2), Newman (1977, table 4.3). As printed in the paper:
@@ -417,13 +406,12 @@ def finned_circle_section(radius_m: Array, span_m: float, density: float) -> Arr
     Args:
         radius_m: radius of the circle.
         span_m: distance from the middle to the tip of a fin, not below the radius.
-        density: kg/m^3.
     """
     r2, b2 = np.asarray(radius_m, dtype=np.float64) ** 2, span_m**2
-    return density * np.pi * (b2 - r2 + r2**2 / b2)
+    return DENSITY * np.pi * (b2 - r2 + r2**2 / b2)
 
 
-def finned_circle_roll(radius_m: Array, span_m: float, density: float) -> Array:
+def finned_circle_roll(radius_m: Array, span_m: float) -> Array:
     """Added inertia in roll of a circle with two fins, kg m^2/m (Newman 1977, table 4.3).
 
     rho r^4 ((2 a^2 - a sin 4a + sin^2(2a) / 2) / (pi sin^4 a) - pi / 2), sin a = 2 r b / (r^2 +
@@ -433,15 +421,15 @@ def finned_circle_roll(radius_m: Array, span_m: float, density: float) -> Array:
     sine = 2.0 * r * span_m / (r**2 + span_m**2)
     a = np.pi - np.arcsin(np.clip(sine, 0.0, 1.0))
     bracket = 2.0 * a**2 - a * np.sin(4.0 * a) + 0.5 * np.sin(2.0 * a) ** 2
-    return density * r**4 * (bracket / (np.pi * sine**4) - np.pi / 2.0)
+    return DENSITY * r**4 * (bracket / (np.pi * sine**4) - np.pi / 2.0)
 
 
-def elliptic_section(across_m: float, density: float) -> float:
+def elliptic_section(across_m: float) -> float:
     """Added mass of an elliptic section, kg/m: rho pi / 4 of its square width across the flow.
 
     The paper's mast: (1/4) pi rho w_m^2 h_m in surge, (1/4) pi rho c_m^2 h_m in sway.
     """
-    return density * math.pi / 4.0 * across_m**2
+    return DENSITY * math.pi / 4.0 * across_m**2
 
 
 CYLINDER_CD = 1.2
@@ -508,18 +496,12 @@ _NOTHING = 1e-9
 """Below this an entry is a zero by symmetry that rounding hides."""
 
 
-class Flow(NamedTuple):
-    """The water, and the speed at which friction is evaluated."""
+def reynolds(length_m: float) -> float:
+    """U l / nu, at the axial speed of the paper's lift computations.
 
-    density_kg_m3: float = 1025.0
-    viscosity_m2_s: float = 1.05372e-6
-    """Sea water of 35 psu at 20 C (ITTC 1963)."""
-    speed_mps: float = 0.25
-    """The axial speed of the paper's lift computations; its X_uu of the hull follows from it."""
-
-    def reynolds(self, length_m: float) -> float:
-        """U l / nu."""
-        return self.speed_mps * length_m / self.viscosity_m2_s
+    Its X_uu of the hull follows from that speed.
+    """
+    return 0.25 * length_m / 1.05372e-6
 
 
 class HullPart(NamedTuple):
@@ -556,18 +538,18 @@ def drag_of(points_body: Array, direction_body: Array, drag_kg_m: Array) -> Arra
     return matrix
 
 
-def parts(geometry: Geometry, flow: Flow) -> tuple[HullPart, ...]:
+def parts(geometry: Geometry) -> tuple[HullPart, ...]:
     """Hull, mast, pods, mounts and tunnels."""
     pod = geometry.pod
     return (
-        _hull(geometry, flow),
-        _mast(geometry.mast, flow),
+        _hull(geometry),
+        _mast(geometry.mast),
         *(
-            _revolved("pod", pod.outline, pod.body_diameter_m, pod.outline.volume_x_m, y, flow)
+            _revolved("pod", pod.outline, pod.body_diameter_m, pod.outline.volume_x_m, y)
             for y in (pod.y_m, -pod.y_m)
         ),
-        _mounts(geometry.mount, geometry.outline, flow),
-        *(_tunnel(tunnel, flow) for tunnel in geometry.tunnels),
+        _mounts(geometry.mount, geometry.outline),
+        *(_tunnel(tunnel) for tunnel in geometry.tunnels),
     )
 
 
@@ -583,68 +565,65 @@ def _revolved(
     diameter_m: float,
     centre_x_m: float,
     y_m: float,
-    flow: Flow,
     breaks_m: tuple[float, ...] = (),
 ) -> HullPart:
     """Ellipsoid along, as thick as `diameter_m`; circular strips across."""
-    density = flow.density_kg_m3
     x, r, w = outline.strips(breaks_m)
     points, centre = _on_axis(x, y_m), _on_axis(np.array([centre_x_m]), y_m)
-    across = w * density * np.pi * r**2
-    axial = ellipsoid_axial(outline.length_m, diameter_m, density)
-    friction = ittc57(flow.reynolds(outline.length_m))
+    across = w * DENSITY * np.pi * r**2
+    axial = ellipsoid_axial(outline.length_m, diameter_m)
+    friction = ittc57(reynolds(outline.length_m))
     along = ellipsoid_drag(outline.length_m, diameter_m, friction) * np.pi / 4.0 * diameter_m**2
-    side = 0.5 * density * cylinder_across(outline.length_m / diameter_m) * 2.0 * r * w
+    side = 0.5 * DENSITY * cylinder_across(outline.length_m / diameter_m) * 2.0 * r * w
     return HullPart(
         name,
         inertia_of(centre, _FORWARD, np.array([axial]))
         + inertia_of(points, _STARBOARD, across)
         + inertia_of(points, _DOWN, across),
-        drag_of(centre, _FORWARD, np.array([0.5 * density * along]))
+        drag_of(centre, _FORWARD, np.array([0.5 * DENSITY * along]))
         + drag_of(points, _STARBOARD, side)
         + drag_of(points, _DOWN, side),
     )
 
 
-def _hull(geometry: Geometry, flow: Flow) -> HullPart:
+def _hull(geometry: Geometry) -> HullPart:
     """A body of revolution, with fins where the mounts are, in heave and roll."""
-    outline, mount, density = geometry.outline, geometry.mount, flow.density_kg_m3
+    outline, mount = geometry.outline, geometry.mount
     breaks = (mount.aft_x_m, mount.fore_x_m)
-    hull = _revolved("hull", outline, outline.diameter_m, 0.0, 0.0, flow, breaks)
+    hull = _revolved("hull", outline, outline.diameter_m, 0.0, 0.0, breaks)
     strips = np.array(outline.strips(breaks))
     x, r, w = strips[:, (strips[0] > mount.aft_x_m) & (strips[0] < mount.fore_x_m)]
-    more = finned_circle_section(r, mount.tip_y_m, density) - density * np.pi * r**2
+    more = finned_circle_section(r, mount.tip_y_m) - DENSITY * np.pi * r**2
     added = hull.added_mass + inertia_of(_on_axis(x), _DOWN, w * more)
-    added[3, 3] += np.sum(w * finned_circle_roll(r, mount.tip_y_m, density))
+    added[3, 3] += np.sum(w * finned_circle_roll(r, mount.tip_y_m))
     return hull._replace(added_mass=added)
 
 
-def _mast(mast: Mast, flow: Flow) -> HullPart:
+def _mast(mast: Mast) -> HullPart:
     """Elliptic strips up its height; a plate across, on the hull as on a wall; a strut along."""
-    density = flow.density_kg_m3
     z = mast.middle_z_m + mast.height_m / 2.0 * _NODES
     w = mast.height_m / 2.0 * _WEIGHTS
     points = np.column_stack([np.full(4, mast.x_m), np.zeros(4), z])
-    along = strut_along(mast.chord_m, mast.width_m, flow.reynolds(mast.chord_m))
+    along = strut_along(mast.chord_m, mast.width_m, reynolds(mast.chord_m))
     across = plate_across(2.0 * mast.height_m / mast.chord_m)
     return HullPart(
         "mast",
-        inertia_of(points, _FORWARD, w * elliptic_section(mast.width_m, density))
-        + inertia_of(points, _STARBOARD, w * elliptic_section(mast.chord_m, density)),
-        drag_of(points, _FORWARD, 0.5 * density * along * mast.width_m * w)
-        + drag_of(points, _STARBOARD, 0.5 * density * across * mast.chord_m * w),
+        inertia_of(points, _FORWARD, w * elliptic_section(mast.width_m))
+        + inertia_of(points, _STARBOARD, w * elliptic_section(mast.chord_m)),
+        drag_of(points, _FORWARD, 0.5 * DENSITY * along * mast.width_m * w)
+        + drag_of(points, _STARBOARD, 0.5 * DENSITY * across * mast.chord_m * w),
     )
 
 
-def _mounts(mount: PodArm, hull: Outline, flow: Flow) -> HullPart:
+def _mounts(mount: PodArm, hull: Outline) -> HullPart:
     """Plates in heave, struts in surge; their added mass is in the hull's finned strips."""
     middle_x = (mount.aft_x_m + mount.fore_x_m) / 2.0
     root = float(hull.radius_at(np.array([middle_x]))[0])
     span, middle_y = mount.tip_y_m - root, (root + mount.tip_y_m) / 2.0
-    along = strut_along(mount.chord_m, mount.thickness_m, flow.reynolds(mount.chord_m))
+    along = strut_along(mount.chord_m, mount.thickness_m, reynolds(mount.chord_m))
     across = plate_across(2.0 * span / mount.chord_m)
     points = _on_axis(np.full(2, middle_x), np.array([middle_y, -middle_y]))
-    pressed = np.full(2, 0.5 * flow.density_kg_m3 * span)
+    pressed = np.full(2, 0.5 * DENSITY * span)
     return HullPart(
         "mounts",
         np.zeros((6, 6)),
@@ -653,21 +632,18 @@ def _mounts(mount: PodArm, hull: Outline, flow: Flow) -> HullPart:
     )
 
 
-def _tunnel(tunnel: Tunnel, flow: Flow) -> HullPart:
+def _tunnel(tunnel: Tunnel) -> HullPart:
     """Drag of the mouths in surge; the water inside belongs to the hull's.
 
     R = rho u^2 pi d^2 C_BTO of both (Holtrop and Mennen 1982).
     """
-    amount = flow.density_kg_m3 * math.pi * tunnel.diameter_m**2 * TUNNEL_CBTO
+    amount = DENSITY * math.pi * tunnel.diameter_m**2 * TUNNEL_CBTO
     points = _on_axis(np.array([tunnel.x_m]))
-    return HullPart(
-        tunnel.name, np.zeros((6, 6)), drag_of(points, _FORWARD, np.array([amount]))
-    )  # fmt: skip
+    drag = drag_of(points, _FORWARD, np.array([amount]))
+    return HullPart(tunnel.name, np.zeros((6, 6)), drag)
 
 
-def body_lift(
-    length_m: float, diameter_m: float, nose_x_m: float, density: float
-) -> dict[str, float]:
+def body_lift(length_m: float, diameter_m: float, nose_x_m: float) -> dict[str, float]:
     """Lift of a slender hull at a small angle: coefficients of u v and u w, by SNAME name.
 
     C_L = 0.003 (180 / pi) l / d by angle, 1/rad, on d^2, and Y_uv = Z_uw = -1/2 rho d^2 C_L
@@ -675,24 +651,20 @@ def body_lift(
     M_uw = -x_cp Z_uw. As printed: M_uw = Z_uw x_cp; the tables have the right sign.
     """
     slope = 0.003 * (180.0 / math.pi) * length_m / diameter_m
-    force = -0.5 * density * diameter_m**2 * slope
+    force = -0.5 * DENSITY * diameter_m**2 * slope
     x = nose_x_m - 0.65 * length_m  # the centre of pressure
     return {"Y_uv": force, "Z_uw": force, "M_uw": -x * force, "N_uv": x * force}
 
 
-def estimate(geometry: Geometry, flow: Flow | None = None) -> Coefficients:
+def estimate(geometry: Geometry) -> Coefficients:
     """Added mass, quadratic damping and body lift of a shape, as the set `computed`.
 
     Entries that the paper leaves out (Y_rr, Z_qq, Y_pdot ...) are kept: they follow from the same
     strips.
-
-    Args:
-        geometry: the vehicle.
-        flow: the water; sea water at the paper's speed if not given.
     """
-    flow, outline = flow or Flow(), geometry.outline
-    lift = body_lift(outline.length_m, outline.diameter_m, outline.nose_x_m, flow.density_kg_m3)
-    _, added, quadratic = zip(*parts(geometry, flow), strict=True)
+    outline = geometry.outline
+    lift = body_lift(outline.length_m, outline.diameter_m, outline.nose_x_m)
+    _, added, quadratic = zip(*parts(geometry), strict=True)
     whole = part_coefficients(
         HullPart(geometry.name, np.sum(added, axis=0), np.sum(quadratic, axis=0))
     )

@@ -14,9 +14,7 @@ from tests import oracles_shape as shape
 from tests.oracles_hydrodynamics import Array, finned_circle, lamb_constants, reaction
 
 RHO = 1025.0
-SHARES = {
-    part.name: shape.part_coefficients(part) for part in shape.parts(shape.ALICE, shape.Flow())
-}
+SHARES = {part.name: shape.part_coefficients(part) for part in shape.parts(shape.ALICE)}
 TRIPLES = st.tuples(*3 * [st.floats(-1.0, 1.0)]).map(np.array)
 
 
@@ -94,7 +92,7 @@ def test_strips_of_a_cylinder_in_closed_form() -> None:
         shape.SPARUS2, outline=shape.Outline(x_m=(low, high), radius_m=(r, r)),
         mount=shape.SPARUS2.mount._replace(aft_x_m=0.2, fore_x_m=0.2 + 1e-12, tip_y_m=0.11),
     )  # fmt: skip
-    hull = shape.part_coefficients(shape.parts(cylinder, shape.Flow())[0])
+    hull = shape.part_coefficients(shape.parts(cylinder)[0])
     section = RHO * np.pi * r**2
     assert hull["Y_vdot"] == pytest.approx(-section * 1.6)
     assert hull["Z_wdot"] == pytest.approx(-section * 1.6)
@@ -140,7 +138,7 @@ def test_lateral_thrusters_sit_as_far_out_as_they_fit(end: Literal["bow", "stern
 @pytest.mark.parametrize("geometry", BOTH)
 def test_water_fills_what_the_dry_vehicle_leaves_and_balances_it(geometry: shape.Geometry) -> None:
     """Slices of 0.1 mm: mass, centre, inertia; and what is dry has its centre at the origin."""
-    inside = shape.entrained_water(geometry, BUOYANCY_KG, RHO)
+    inside = shape.entrained_water(geometry, BUOYANCY_KG)
     assert inside.mass_kg == pytest.approx(RHO * geometry.envelope_volume_m3 - BUOYANCY_KG)
     dry = geometry.envelope_volume_m3 * geometry.envelope_x_m - inside.mass_kg * inside.x_m / RHO
     assert dry == pytest.approx(0.0, abs=1e-9)
@@ -160,7 +158,7 @@ def test_water_fills_what_the_dry_vehicle_leaves_and_balances_it(geometry: shape
 @pytest.mark.parametrize("geometry", BOTH)
 def test_the_program_holds_what_follows_from_the_shapes(geometry: shape.Geometry) -> None:
     held = SHAPES[geometry.name]
-    inside = shape.entrained_water(geometry, BUOYANCY_KG, RHO)
+    inside = shape.entrained_water(geometry, BUOYANCY_KG)
     water = [inside.mass_kg, inside.x_m, 0.0, 0.0, *inside.inertia_kg_m2]
     body = held["rigid_body"]
     np.testing.assert_allclose(
@@ -170,7 +168,7 @@ def test_the_program_holds_what_follows_from_the_shapes(geometry: shape.Geometry
     assert vehicle_from(geometry.name).hull == geometry.hull
     for name, values in {
         "computed": shape.estimate(geometry).values,
-        "computed_hull": shape.part_coefficients(shape.parts(geometry, shape.Flow())[0]),
+        "computed_hull": shape.part_coefficients(shape.parts(geometry)[0]),
     }.items():
         for coefficient, value in held.get(name, {}).items():
             assert value == pytest.approx(values[coefficient], rel=1e-12), coefficient
@@ -189,8 +187,8 @@ def test_finned_circles_agree_with_a_conformal_map(extra: float) -> None:
     radius, span = 0.115, 0.115 * (1.0 + extra)
     across, rolling = finned_circle(radius, span, RHO)
     r = np.array(radius)
-    assert float(shape.finned_circle_section(r, span, RHO)) == pytest.approx(across, rel=1e-4)
-    assert float(shape.finned_circle_roll(r, span, RHO)) == pytest.approx(rolling, rel=1e-3)
+    assert float(shape.finned_circle_section(r, span)) == pytest.approx(across, rel=1e-4)
+    assert float(shape.finned_circle_roll(r, span)) == pytest.approx(rolling, rel=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -216,7 +214,7 @@ def test_cylinder_across_by_hand_and_at_its_ends() -> None:
 
 
 def test_body_lift_is_the_papers() -> None:
-    y_uv, z_uw, m_uw, n_uv = shape.body_lift(1.96, 0.23, 1.06, RHO).values()
+    y_uv, z_uw, m_uw, n_uv = shape.body_lift(1.96, 0.23, 1.06).values()
     assert y_uv == z_uw == pytest.approx(-39.71, rel=1e-3)
     assert m_uw == pytest.approx(-8.498, rel=1e-3)
     assert n_uv == pytest.approx(8.498, rel=1e-3)
