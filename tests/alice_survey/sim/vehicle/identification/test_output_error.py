@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
@@ -184,12 +185,8 @@ def test_what_has_a_prior_and_how_wide() -> None:
     np.testing.assert_allclose(prior.slopes(at), slope, rtol=1e-5, atol=1e-9)
     assert prior.residuals(at)[0] == pytest.approx(math.log(1.3) / 0.5)
     assert output_error.prior_of(parameters, windows, None) is None
-    assert (
-        output_error.prior_of(
-            free_parameters(known, ("current",)), windows, output_error.PriorSigmas()
-        )
-        is None
-    )
+    current = free_parameters(known, ("current",))
+    assert output_error.prior_of(current, windows, output_error.PriorSigmas()) is None
 
 
 def test_priors_are_read() -> None:
@@ -209,10 +206,9 @@ NOTHING = np.zeros((2, 2))
 
 def noise(rng: np.random.Generator, decay: float) -> Array:
     """A first-order process, (ROWS,), of unit variance."""
-    values = rng.normal(size=ROWS)
-    for i in range(1, ROWS):
-        values[i] = decay * values[i - 1] + np.sqrt(1 - decay**2) * values[i]
-    return values
+    draws = rng.normal(size=ROWS)
+    draws[1:] *= np.sqrt(1 - decay**2)
+    return np.asarray(lfilter([1.0], [1.0, -decay], draws))
 
 
 def line_fitted(rng: np.random.Generator, decay: float) -> tuple[Array, output_error.Stretches]:
@@ -257,11 +253,9 @@ def test_stretches_keep_windows_whole_and_cut_a_single_one() -> None:
     assert set(counts.tolist()) <= {4, 5}
     (whole,) = output_error.stretch_numbers([np.linspace(0.0, 60.0, 601)])
     assert np.bincount(whole).tolist() == [60] * 9 + [61]
-    many = np.array(
-        [n[0] for n in output_error.stretch_numbers([np.linspace(0.0, 5.0, 51)] * 1000)]
-    )
-    assert many.max() == 19
-    few = [number[0] for number in output_error.stretch_numbers([np.linspace(0.0, 5.0, 51)] * 6)]
+    many = output_error.stretch_numbers(windows[:1] * 1000)
+    assert np.concatenate(many).max() == 19
+    few = [number[0] for number in output_error.stretch_numbers(windows[:6])]
     assert few == list(range(6))
 
 

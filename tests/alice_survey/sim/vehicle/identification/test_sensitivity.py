@@ -9,6 +9,7 @@ from alice_survey.sim.vehicle.identification import sensitivity
 from alice_survey.sim.vehicle.identification.problem import Parameters, free_parameters
 from alice_survey.sim.vehicle.vehicle import vehicle_from
 from tests.oracles_identification import integrated
+from tests.oracles_navigation import jacobian
 
 ALL = (
     "X_u", "K_p", "N_r", "X_uu", "Y_vv", "Z_ww_pos", "Z_ww_neg", "M_qq", "N_rr", "N_vv", "Y_uv",
@@ -84,37 +85,30 @@ def test_a_window_is_what_the_simulators_equations_give() -> None:
 def test_sensitivities_are_the_slopes_of_the_simulation(given: tuple[int, ...]) -> None:
     parameters, values, record, start = a_case()
     derivatives = run(parameters, values, record, start, given=given)[2]
+    size = np.maximum(np.abs(values), 0.1)
+
+    def outputs(change: Array) -> Array:
+        moved = values + size * change
+        return run(parameters, moved, record, start, given=given, slopes=False)[1]
+
+    differences = np.moveaxis(jacobian(outputs, len(values)), 1, 2) / size
     for k, name in enumerate(parameters.names):
-        step = 1e-5 * max(abs(values[k]), 0.1)
-        ahead, behind = values.copy(), values.copy()
-        ahead[k] += step
-        behind[k] -= step
-        difference = (
-            run(parameters, ahead, record, start, given=given, slopes=False)[1]
-            - run(parameters, behind, record, start, given=given, slopes=False)[1]
-        ) / (2 * step)
-        scale = max(np.abs(difference).max(), 1e-3)
-        np.testing.assert_allclose(
-            derivatives[:, :, k] / scale, difference / scale, atol=2e-5, err_msg=name
-        )
+        scale = max(np.abs(differences[:, :, k]).max(), 1e-3)
+        error = (derivatives[:, :, k] - differences[:, :, k]) / scale
+        np.testing.assert_allclose(error, 0.0, atol=2e-5, err_msg=name)
 
 
 def test_sensitivities_to_the_start_are_slopes_too() -> None:
     parameters, values, record, start = a_case()
     derivatives = run(parameters, values, record, start)[2][:, :, len(values) :]
-    step = 1e-6
-    for k in range(sensitivity.START):
-        moved = []
-        for sign in (1.0, -1.0):
-            other = start.copy()
-            if k < 3:
-                turn = Rotation.from_rotvec(sign * step * np.eye(3)[k])
-                other[:4] = (Rotation.from_quat(start[:4]) * turn).as_quat()
-            else:
-                other[1 + k] += sign * step
-            moved.append(run(parameters, values, record, other, slopes=False)[1])
-        difference = (moved[0] - moved[1]) / (2 * step)
-        np.testing.assert_allclose(derivatives[:, :, k], difference, atol=2e-6)
+
+    def outputs(change: Array) -> Array:
+        turned = Rotation.from_quat(start[:4]) * Rotation.from_rotvec(change[:3])
+        moved = np.concatenate([turned.as_quat(), start[4:] + change[3:]])
+        return run(parameters, values, record, moved, slopes=False)[1]
+
+    differences = np.moveaxis(jacobian(outputs, sensitivity.START, 1e-6), 1, 2)
+    np.testing.assert_allclose(derivatives, differences, atol=2e-6)
 
 
 def test_a_lagging_thruster_is_followed_exactly_between_rows() -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from alice_survey.core.frames import Array
@@ -128,21 +129,16 @@ STERN = ALICE.thrusters[NAMES.index("stern")]
 
 def turned(command_rps: Array, *, share: float = 1.0, slower: float = 1.0) -> Array:
     """Speeds (T,) of a propeller with a lag, a dead band and what is left of it."""
-    maximum, speed, speeds = STERN.most_rps * np.sqrt(share), 0.0, []
-    for asked in command_rps.tolist():
-        speeds.append(speed)
-        wanted = 0.0 if abs(asked) < STERN.dead_band_rps else np.clip(asked, -maximum, maximum)
-        speed += (wanted - speed) * TICK_S / (slower * STERN.time_constant_s)
-    return np.array(speeds)
+    maximum, step = STERN.most_rps * np.sqrt(share), TICK_S / (slower * STERN.time_constant_s)
+    reached = np.clip(command_rps, -maximum, maximum)
+    wanted = np.where(np.abs(command_rps) < STERN.dead_band_rps, 0.0, reached)
+    return np.asarray(lfilter([0.0, step], [1.0, step - 1.0], wanted))
 
 
 def commands(seconds: float, size_rps: float, seed: int = 0) -> Array:
     """Commands (T,) that wander as those of a pilot in gusts."""
-    rng, value, found = np.random.default_rng(seed), 0.0, []
-    for _ in range(round(seconds / TICK_S)):
-        value += -TICK_S / 2.0 * value + size_rps * np.sqrt(TICK_S) * rng.normal()
-        found.append(value)
-    return np.array(found)
+    draws = np.random.default_rng(seed).normal(size=round(seconds / TICK_S))
+    return np.asarray(lfilter([size_rps * np.sqrt(TICK_S)], [1.0, TICK_S / 2.0 - 1.0], draws))
 
 
 def found_by_speed(command_rps: Array, rps: Array) -> list[command.Failure]:
