@@ -346,8 +346,10 @@ def entrained_water(geometry: Geometry, buoyancy_kg: float) -> Entrained:
     def wet(bulkheads: Array) -> Array:
         return _moments(outline, tail, bulkheads[0]) + _moments(outline, bulkheads[1], nose)
 
-    start = np.array([tail, nose]) / 2.0
-    found = root(lambda bulkheads: wet(bulkheads)[:2] - [water_m3, moment], start, tol=1e-14)
+    def unbalance(bulkheads: Array) -> Array:
+        return wet(bulkheads)[:2] - [water_m3, moment]
+
+    found = root(unbalance, np.array([tail, nose]) / 2.0, tol=1e-14)
     volume, first, second, across = wet(found.x)
     tail_x, nose_x = found.x.tolist()
     x = first / volume
