@@ -38,8 +38,8 @@ def nearest(path: Path, leg: int, place: Array, count: int = 20001) -> float:
     return float(along[np.argmin(n**2 + e**2)])
 
 
-def point_motion(estimate: Array, guidance: Guidance) -> tuple[Array, Array]:
-    """Place in NED and level velocity (ahead, to starboard) of the followed point.
+def point_motion(estimate: Array, guidance: Guidance) -> tuple[Array, Array, float]:
+    """Place in NED, level velocity (ahead, to starboard) and turn rate of the followed point.
 
     The velocity leaves out what roll and pitch rates add.
     """
@@ -52,7 +52,7 @@ def point_motion(estimate: Array, guidance: Guidance) -> tuple[Array, Array]:
     lever = level_from_body.apply(guidance.point_body_m)
     velocity = level_from_body.apply(estimate[vector.U : vector.W + 1])
     velocity = velocity + np.cross([0.0, 0.0, turn], lever)
-    return place, velocity[:2]
+    return place, velocity[:2], turn
 
 
 def wrench(gains: Gains, demand: Array) -> Array:
@@ -79,14 +79,12 @@ def follow_demand(
     Returns:
         (3,) and the cross-track error.
     """
-    place, (surge, sway) = point_motion(estimate, guidance)
+    place, (surge, sway), turn = point_motion(estimate, guidance)
     start, beta = np.array([path.start_n[0], path.start_e[0]]), path.heading_rad[0]
     tangent = np.array([math.cos(beta), math.sin(beta)])
     normal = np.array([-math.sin(beta), math.cos(beta)])
     cross = float((place[:2] - start) @ normal)
-    heading, roll, pitch = (estimate[i] for i in (vector.HEADING, vector.ROLL, vector.PITCH))
-    q, r = estimate[vector.Q], estimate[vector.R]
-    turn = (math.sin(roll) * q + math.cos(roll) * r) / math.cos(pitch)
+    heading = estimate[vector.HEADING]
     course = heading - beta
     sway_row, yaw_row, surge_row = gains.axes[g.SWAY], gains.axes[g.YAW], gains.axes[g.SURGE]
     by_sway = guidance.sway > 0 and abs(cross) < guidance.near_m
@@ -119,23 +117,16 @@ def follow_demand(
     return np.array([ahead, sideways, yaw]), cross
 
 
-def trapezoid(
-    goal: float, maximum: float, acceleration: float, time_s: float
-) -> tuple[float, float]:
-    """Place and speed of a thing that goes from rest to rest as fast as it may, in closed form."""
+def trapezoid(goal: float, maximum: float, acceleration: float, time_s: float) -> float:
+    """Place of a thing that goes from rest to rest as fast as it may, in closed form."""
     top = min(maximum, math.sqrt(goal * acceleration))
     gaining_s = top / acceleration
     total_s = goal / top + gaining_s
-    if time_s <= 0.0:
-        return 0.0, 0.0
     if time_s < gaining_s:
-        return acceleration * time_s**2 / 2, acceleration * time_s
+        return acceleration * time_s**2 / 2
     if time_s < total_s - gaining_s:
-        return top * (time_s - gaining_s / 2), top
-    if time_s < total_s:
-        left_s = total_s - time_s
-        return goal - acceleration * left_s**2 / 2, acceleration * left_s
-    return goal, 0.0
+        return top * (time_s - gaining_s / 2)
+    return goal - acceleration * max(total_s - time_s, 0.0) ** 2 / 2
 
 
 def standing_demand(
@@ -163,13 +154,9 @@ def standing_demand(
     Returns:
         (3,)
     """
-    point, (surge, sway) = point_motion(estimate, guidance)
-    heading, roll, pitch = (estimate[i] for i in (vector.HEADING, vector.ROLL, vector.PITCH))
-    q, r = estimate[vector.Q], estimate[vector.R]
-    turn = (math.sin(roll) * q + math.cos(roll) * r) / math.cos(pitch)
-    hull = np.array([
-        [math.cos(heading), math.sin(heading)], [-math.sin(heading), math.cos(heading)]
-    ])  # fmt: skip
+    point, (surge, sway), turn = point_motion(estimate, guidance)
+    heading = estimate[vector.HEADING]
+    hull = Rotation.from_euler("z", -heading).as_matrix()[:2, :2]
     off, feed, quicken = hull @ (place - point[:2]), hull @ velocity, hull @ acceleration
     angle = math.remainder(turning[0] - heading, 2 * math.pi)
 

@@ -176,6 +176,11 @@ def gains_of(name: str, speed_mps: float = 0.2) -> Gains:
     return gains_for(vehicle_from(name), speed_mps)
 
 
+def guidance_of(path: Path, name: str, controller: Controller) -> Guidance:
+    gains = gains_of(name, path.speed_mps)
+    return pilot_guidance(gains, path, controller, max_depth_m=DEEPEST_M)
+
+
 def straight(length_m: float, heading_rad: float = 0.0, speed_mps: float = 0.2) -> Path:
     return path_from_legs([(0.0, 0.0)], [heading_rad], [length_m], [0.0], [0], 2.0, speed_mps)
 
@@ -234,7 +239,7 @@ def launch(
 ) -> Flight:
     """A vehicle at rest over a plane; `following`: at depth, with the path begun."""
     craft, gains = vehicle_from(name), gains_of(name, path.speed_mps)
-    guidance = pilot_guidance(gains, path, controller, max_depth_m=DEEPEST_M)
+    guidance = guidance_of(path, name, controller)
     pilot = new_pilot()
     if following:
         pilot.report[slot.PHASE] = slot.FOLLOW

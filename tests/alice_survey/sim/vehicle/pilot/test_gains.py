@@ -210,8 +210,7 @@ def test_a_wanted_speed_is_not_overshot(name: str, decay_share: float) -> None:
     """Of the linear loop; with less drag than is fed forward, too."""
     from scipy.signal import step
 
-    row = gains_of(name).axes[g.SURGE]
-    body = gains_of(name).body
+    row, body = gains_of(name).axes[g.SURGE], gains_of(name).body
     decay = g.linear_damping(body, np.array([0.2, 0, 0, 0, 0, 0]))[0, 0] / row[g.MASS]
     plant = [row[g.LAG], 1 + row[g.LAG] * decay * decay_share, decay * decay_share + row[g.RATE]]
 

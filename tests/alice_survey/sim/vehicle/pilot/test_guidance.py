@@ -1,7 +1,6 @@
 """Guidance: one tick against its twin, settings, and closed loops in currents."""
 
 import math
-from typing import Literal
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.pilot import gains as g
 from alice_survey.sim.vehicle.pilot import memory as slot
 from alice_survey.sim.vehicle.pilot import settings as settings_of
-from alice_survey.sim.vehicle.pilot.path import Path
 from alice_survey.sim.vehicle.pilot.steering import hear_floor, write_point
 from alice_survey.sim.vehicle.vehicle import vehicle_from
 from tests import oracles_guidance as oracle
@@ -34,25 +32,13 @@ def estimate_of(motion: Array, cross_m: float = 0.0) -> Array:
     return estimate
 
 
-def pilot_on(path: Path, leg: int = 0, along_m: float = 0.0) -> slot.PilotState:
-    pilot = slot.new_pilot()
-    pilot.report[[slot.PHASE, slot.LEG, slot.ALONG]] = slot.FOLLOW, leg, along_m
-    return pilot
-
-
-def guide(path: Path, name: str, controller: str) -> tuple[g.Gains, settings_of.Guidance]:
-    gains = gains_of(name, path.speed_mps)
-    guidance = settings_of.pilot_guidance(gains, path, controller, max_depth_m=40.0)  # type: ignore[arg-type]
-    return gains, guidance
-
-
 @given(motion=MOTIONS)
 @settings(deadline=None)
 def test_followed_point_moves_as_rotations_say(motion: Array) -> None:
-    _, guidance = guide(straight(20.0), "alice", "sway")
+    guidance = runs.guidance_of(straight(20.0), "alice", "sway")
     estimate, pilot = estimate_of(motion), slot.new_pilot()
     write_point(estimate, guidance, pilot)
-    place, velocity = oracle.point_motion(estimate, guidance)
+    place, velocity, _ = oracle.point_motion(estimate, guidance)
     np.testing.assert_allclose(pilot.point[:2], place[:2], atol=1e-12)
     np.testing.assert_allclose(pilot.point[2:4], velocity, atol=1e-12)
 
@@ -63,13 +49,14 @@ def test_followed_point_moves_as_rotations_say(motion: Array) -> None:
 @given(motion=MOTIONS, cross_m=st.floats(-1.5, 1.5))
 @settings(deadline=None, max_examples=60)
 def test_a_tick_asks_for_what_its_twin_asks(
-    name: str, controller: str, motion: Array, cross_m: float
+    name: str, controller: runs.Controller, motion: Array, cross_m: float
 ) -> None:
-    path = straight(20.0)
-    gains, guidance = guide(path, name, controller)
+    path, gains = straight(20.0), gains_of(name)
+    guidance = runs.guidance_of(path, name, controller)
     estimate = estimate_of(motion, cross_m)
-    place, _ = oracle.point_motion(estimate, guidance)
-    pilot = pilot_on(path, along_m=place[0])
+    place, _, _ = oracle.point_motion(estimate, guidance)
+    pilot = slot.new_pilot()
+    pilot.report[[slot.PHASE, slot.ALONG]] = slot.FOLLOW, place[0]
     expected, cross = oracle.follow_demand(estimate, path, guidance, gains, place[0])
     assume(abs(abs(cross) - guidance.near_m) > 1e-9)
     wrench = steered(path, guidance, gains, pilot, estimate)
@@ -83,7 +70,7 @@ def test_a_tick_asks_for_what_its_twin_asks(
 
 
 def test_the_floor_is_smoothed_as_its_transfer_function_says() -> None:
-    _, guidance = guide(straight(20.0), "alice", "sway")
+    guidance = runs.guidance_of(straight(20.0), "alice", "sway")
     rng = np.random.default_rng(2)
     heard = 15.0 + 0.02 * np.arange(800) * TICK_S + 0.05 * rng.standard_normal(800)
     pilot, smoothed = slot.new_pilot(), []
@@ -213,7 +200,7 @@ def test_speed_is_reached_without_overshoot(
     name: str, speed_mps: float, current: tuple[float, float]
 ) -> None:
     path = runs.straight(100.0, speed_mps=speed_mps)
-    controller: Literal["sway", "los"] = "sway" if name == "alice" else "los"
+    controller: runs.Controller = "sway" if name == "alice" else "los"
     flight = runs.launch(path, name, controller, current=current, following=True)
     surge = flight.fly(60.0).estimate[:, vector.U]
     assert surge.max() < 1.05 * speed_mps

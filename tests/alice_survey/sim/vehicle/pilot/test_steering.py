@@ -12,9 +12,7 @@ from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.pilot import gains as g
 from alice_survey.sim.vehicle.pilot import memory as slot
-from alice_survey.sim.vehicle.pilot import settings as settings_of
 from alice_survey.sim.vehicle.pilot import steering
-from alice_survey.sim.vehicle.pilot.path import Path
 from alice_survey.sim.vehicle.pilot.steering import STOP_M, STOP_RAD, ramp
 from tests import oracles_guidance as oracle
 from tests.alice_survey.sim.vehicle.pilot import pilot_runs as runs
@@ -46,18 +44,11 @@ def test_a_reference_goes_as_far_as_the_closed_form_says(
         assert abs(quicken) <= acceleration + 1e-12
         assert speed - last <= acceleration * TICK_S + 1e-12
         # Held for a tick, and late by less than two of them.
-        here = oracle.trapezoid(goal, maximum, acceleration, time_s)[0]
+        here = oracle.trapezoid(goal, maximum, acceleration, time_s)
         assert abs(at - here) <= 2.0 * top * TICK_S
         assert time_s < total_s + 1.0
     assert speed == 0.0
     assert time_s > total_s - 3 * TICK_S - 2.0 * math.sqrt(2.0 * TICK_S**2)
-
-
-def guidance_of(path: Path, name: str = "alice") -> settings_of.Guidance:
-    gains = runs.gains_of(name, path.speed_mps)
-    return settings_of.pilot_guidance(
-        gains, path, "sway" if name == "alice" else "los", max_depth_m=runs.DEEPEST_M
-    )
 
 
 @pytest.mark.parametrize(("leg", "progress"), [(1, 0.4), (2, 0.8), (0, 2.7)])
@@ -66,8 +57,8 @@ def guidance_of(path: Path, name: str = "alice") -> settings_of.Guidance:
 def test_a_tick_of_a_stop_asks_for_what_its_twin_asks(
     leg: int, progress: float, motion: Array, share: float
 ) -> None:
-    path, gains = STEPS, runs.gains_of("alice")
-    guidance, pilot = guidance_of(path), slot.new_pilot()
+    path, gains, pilot = STEPS, runs.gains_of("alice"), slot.new_pilot()
+    guidance = runs.guidance_of(path, "alice", "sway")
     fastest = (0.2, guidance.step_mps, guidance.turn_in_place_rad_s)[leg]
     slowing = (guidance.stop_mps2, guidance.step_mps2, guidance.turn_in_place_rad_s2)[leg]
     goal = (path.length_m[0], path.length_m[1], abs(path.turn_rad[2]))[leg]
@@ -93,7 +84,7 @@ def test_a_tick_of_a_stop_asks_for_what_its_twin_asks(
     estimate[vector.DEPTH] += 13.0
     estimate[vector.HEADING] += turning[0]
     # Near enough that the reference does not wait.
-    point, _ = oracle.point_motion(estimate, guidance)
+    point, _, _ = oracle.point_motion(estimate, guidance)
     behind = start + progress * ahead - point[:2] if leg < 2 else np.zeros(2)
     assume(behind @ ahead < 0.3)
     assume(abs(SCALES[5] * motion[5]) + 0.05 < math.radians(20.0))
@@ -160,8 +151,8 @@ def test_alice_steps_aside_with_her_heading_held(current: tuple[float, float]) -
 
 
 def test_a_stop_is_left_though_the_sea_does_not_let_the_vehicle_rest() -> None:
-    path, guidance, gains = SPOTS, guidance_of(SPOTS), runs.gains_of("alice")
-    pilot = slot.new_pilot()
+    path, gains, pilot = SPOTS, runs.gains_of("alice"), slot.new_pilot()
+    guidance = runs.guidance_of(path, "alice", "sway")
     pilot.report[[slot.PHASE, slot.LEG]] = slot.FOLLOW, 1
     pilot.memory[[slot.STANDING, slot.REF, slot.RAMP]] = 1.0, QUARTER, QUARTER
     estimate = np.zeros(vector.ESTIMATE)
@@ -169,14 +160,13 @@ def test_a_stop_is_left_though_the_sea_does_not_let_the_vehicle_rest() -> None:
     estimate[[vector.NORTH, vector.EAST]] = 3.25 - 0.05, -0.55
     estimate[[vector.HEADING, vector.DEPTH]] = QUARTER, 13.0
     estimate[[vector.ALTITUDE, vector.CLEARANCE]] = 2.0
-    left = None
-    for tick in range(600):
+    tick = 0
+    while pilot.report[slot.LEG] < 2.0:
         runs.steered(path, guidance, gains, pilot, estimate, tick * TICK_S)
-        if pilot.report[slot.LEG] == 2.0:
-            left = tick * TICK_S
-            break
+        tick += 1
+        assert tick < 600
     # 0.1 m (1 + t / 5 s) reaches 0.25 m after 7.5 s.
-    assert left == pytest.approx(7.5, abs=0.2)
+    assert (tick - 1) * TICK_S == pytest.approx(7.5, abs=0.2)
 
 
 DEMANDS = arrays(np.float64, 8, elements=st.floats(-0.6, 0.6))
