@@ -59,18 +59,13 @@ def test_a_wrench_turns_the_vehicle_the_way_it_says(craft: Vehicle, solver: obje
     lower, upper = limits_of(craft)
     axes = [SURGE, HEAVE, YAW] if craft is SPARUS else [SURGE, SWAY, HEAVE, YAW]
     asked = np.where(np.isin(range(6), axes), allocation.AXIS_WEIGHTS, 0.0)
-    for axis in axes:
-        for sign in (1.0, -1.0):
-            wanted = np.zeros(6)
-            wanted[axis] = sign
-            thrust = solve(
-                craft.configuration_matrix, wanted, lower, upper, axes=asked, solver=solver
-            )
-            rps, force = np.zeros(len(thrust)), np.zeros(6)
-            speeds_for(craft.plant.propulsion, thrust, REST, rps)
-            add_thrust(craft.plant.propulsion, rps, REST, force)
-            # Reverse torque is not quite that of the matrix: a few per cent on the other axes.
-            np.testing.assert_allclose(force[axes], wanted[axes], atol=0.02)
+    for wanted in (*np.eye(6)[axes], *-np.eye(6)[axes]):
+        thrust = solve(craft.configuration_matrix, wanted, lower, upper, axes=asked, solver=solver)
+        rps, force = np.zeros(len(thrust)), np.zeros(6)
+        speeds_for(craft.plant.propulsion, thrust, REST, rps)
+        add_thrust(craft.plant.propulsion, rps, REST, force)
+        # Reverse torque is not quite that of the matrix: a few per cent on the other axes.
+        np.testing.assert_allclose(force[axes], wanted[axes], atol=0.02)
 
 
 @pytest.mark.parametrize("craft", [ALICE, SPARUS], ids=lambda craft: craft.name)
@@ -194,12 +189,9 @@ def test_of_all_thrusts_that_do_it_is_the_least() -> None:
 
 def test_heave_comes_before_yaw_before_sway_before_surge() -> None:
     """Where one must be given up for the other, it is the lesser one, nearly whole."""
-    matrix = np.zeros((6, 1))
+    axes = np.eye(6)
     for more, less in ((HEAVE, YAW), (YAW, SWAY), (SWAY, SURGE)):
-        matrix[:] = 0.0
-        matrix[more, 0], matrix[less, 0] = 1.0, -1.0
-        wanted = np.zeros(6)
-        wanted[[more, less]] = 1.0
+        matrix, wanted = (axes[more] - axes[less])[:, None], axes[more] + axes[less]
         thrust = solve(matrix, wanted, np.array([-9.0]), np.array([9.0]))[0]
         # They pull opposite ways with weights a and b: (a^2 - b^2) / (a^2 + b^2).
         a, b = allocation.AXIS_WEIGHTS[more] ** 2, allocation.AXIS_WEIGHTS[less] ** 2

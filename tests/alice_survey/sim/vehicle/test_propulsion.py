@@ -20,7 +20,7 @@ ALICE = vehicle_from("alice")
 STARBOARD, PORT, VERTICAL, BOW, STERN = ALICE.thrusters
 EVERY = ALICE.thrusters
 PACKED = pack(EVERY, DENSITY, DISPLACED)
-REST = np.zeros(6)
+REST, AHEAD = np.zeros(6), np.eye(6)[0]
 
 velocities = st.tuples(*[st.floats(-2.0, 2.0)] * 3, *[st.floats(-0.5, 0.5)] * 3).map(
     lambda nu: np.round(nu, 9)
@@ -85,15 +85,12 @@ def test_bollard_thrust_is_the_published() -> None:
 def test_the_jet_loss_is_c_at_the_jets_own_speed() -> None:
     whole = thrust_of(BOW, 20.0)
     jet = oracles.jet_speed_mps(BOW, DENSITY, whole)
-    for u in (jet, -jet):
-        assert thrust_of(BOW, 20.0, np.array([u, 0, 0, 0, 0, 0])) == pytest.approx(
-            whole * math.exp(-BOW.jet_loss), rel=1e-12
-        )
-    assert thrust_of(BOW, 20.0, np.array([1e-9, 0, 0, 0, 0, 0])) == pytest.approx(whole, rel=1e-12)
+    for u, kept in ((jet, math.exp(-BOW.jet_loss)), (-jet, math.exp(-BOW.jet_loss)), (1e-9, 1.0)):
+        assert thrust_of(BOW, 20.0, u * AHEAD) == pytest.approx(whole * kept, rel=1e-12)
 
 
 def drag_of(n: float, u: float) -> float:
-    return -float(wrench_of((BOW,), [n], np.array([u, 0, 0, 0, 0, 0]))[0])
+    return -float(wrench_of((BOW,), [n], u * AHEAD)[0])
 
 
 @settings(max_examples=200, deadline=None)
@@ -120,14 +117,18 @@ def test_power_is_the_shafts_over_the_efficiency_and_never_given_back() -> None:
     np.testing.assert_allclose(power[:2], 2.0 + shaft / STARBOARD.efficiency, rtol=1e-12)
     assert power[2] == 2.0
     # Towed fast, the water drives the propeller.
-    kernels.electrical_power(packed, np.full(5, 5.0), np.array([3.0, 0, 0, 0, 0, 0]), power)
+    kernels.electrical_power(packed, np.full(5, 5.0), 3.0 * AHEAD, power)
     assert power[0] == 2.0
 
 
-def test_a_t200_takes_what_its_maker_says() -> None:
+def power_of(thruster: Thruster, n: float) -> float:
     power = np.zeros(1)
-    kernels.electrical_power(pack((BOW,), DENSITY, DISPLACED), np.array([56.55]), REST, power)
-    assert power[0] == pytest.approx(390.0, rel=0.02)
+    kernels.electrical_power(pack((thruster,), DENSITY, DISPLACED), np.array([n]), REST, power)
+    return float(power[0])
+
+
+def test_a_t200_takes_what_its_maker_says() -> None:
+    assert power_of(BOW, 56.55) == pytest.approx(390.0, rel=0.02)
 
 
 @pytest.mark.parametrize(
@@ -165,7 +166,7 @@ def test_the_pair_rolls_the_vehicle_only_when_its_propellers_work_against_each_o
 
 @pytest.mark.parametrize(("n", "u"), [(20.0, 1.0), (20.0, -1.0), (-20.0, 1.0), (-20.0, -1.0)])
 def test_water_along_the_axis_takes_the_same_off_whichever_way_it_turns(n: float, u: float) -> None:
-    still, moving = thrust_of(PORT, n), thrust_of(PORT, n, np.array([u, 0, 0, 0, 0, 0]))
+    still, moving = thrust_of(PORT, n), thrust_of(PORT, n, u * AHEAD)
     kept, inflow = 1 - PORT.thrust_deduction, (1 - PORT.wake_fraction) * u
     loss = kept * DENSITY * 0.08**3 * PORT.advance_slope * 20.0 * inflow
     assert moving == pytest.approx(still - loss, rel=1e-12)
@@ -186,9 +187,7 @@ def test_jet_drag_is_that_of_delphin2() -> None:
     """Its file at u = 0.5 m/s and jets of 0.883 m/s, by hand: C_d = 0.0416 of 0.1857 m^2."""
     n = math.sqrt(0.883**2 * math.pi / 4 / (BOW.diameter_m**2 * BOW.kt_forward))
     force = np.zeros(6)
-    kernels.add_thrust(
-        pack((BOW,), 1000.0, 80.0), np.array([n]), np.array([0.5, 0, 0, 0, 0, 0]), force
-    )
+    kernels.add_thrust(pack((BOW,), 1000.0, 80.0), np.array([n]), 0.5 * AHEAD, force)
     ratio = 0.5 / 0.883
     by_hand = 0.565994 * math.exp(-7.608907 * ratio) + 0.056536 * math.exp(-0.896792 * ratio)
     assert by_hand == pytest.approx(0.0416, abs=1e-4)
@@ -200,7 +199,7 @@ def test_more_thrust_takes_more_speed_and_limits_are_those_of_full_speed() -> No
     lower, upper = np.zeros(5), np.zeros(5)
     kernels.thrust_limits(PACKED, np.ones(5), nu, lower, upper)
     grid = np.linspace(lower, upper, 201)
-    rps = np.array([[0.0] * 5 for _ in grid])
+    rps = np.zeros_like(grid)
     for thrust, row in zip(grid, rps, strict=True):
         kernels.speeds_for(PACKED, thrust, nu, row)
     assert np.all(np.diff(rps, axis=0) > 0)
@@ -257,9 +256,7 @@ def test_power_at_any_speed_is_that_of_the_textbooks_torque() -> None:
 @pytest.mark.parametrize("n", [10.0, -10.0])
 def test_no_thruster_beats_momentum_theory_nor_is_hopeless(thruster: Thruster, n: float) -> None:
     """At bollard the jet of a duct of full area carries T^1.5 / (2 sqrt(rho A))."""
-    power = np.zeros(1)
-    kernels.electrical_power(pack((thruster,), DENSITY, DISPLACED), np.array([n]), REST, power)
     thrust = abs(thrust_of(replace(thruster, thrust_deduction=0.0), n))
     area = math.pi * thruster.diameter_m**2 / 4
     jet = thrust**1.5 / (2 * math.sqrt(DENSITY * area))
-    assert jet < power[0] * thruster.efficiency < 4 * jet
+    assert jet < power_of(thruster, n) * thruster.efficiency < 4 * jet
