@@ -20,7 +20,6 @@ from alice_survey.core.frames import interpolate_poses, rotation_from_attitude
 from alice_survey.core.manifest import read_manifest
 from alice_survey.core.trajectory import Trajectory, read_track, write_track
 from camera_calib.rig import read_rig
-from missions.acquire import run as imaging
 from tests.missions.flown_plans import plan_of, walk
 
 TIMES_S = (2.0, 4.25, 6.5)
@@ -68,7 +67,7 @@ def fly(workspace: Path, until_s: float = 9.0) -> None:
             ("station", "time_s", "line"),
             [(i, t, 0) for i, t in enumerate(TIMES_S)],
         )
-        heading = np.where(time_s < 4.2, 359.0, 1.0)
+        heading = np.where(time_s < 4.25, 359.0, 2.0)
         rows = np.column_stack([
             time_s, 32.8 + 1e-6 * time_s, 34.9 + zero, 12.8 + zero, 2 + zero, -1 + zero, heading,
             2.1 + zero, 0.3 + zero, 0.01 + zero, 0.3 + zero, 1 + zero, 0.02 + zero,
@@ -129,16 +128,8 @@ def test_the_manifest_says_what_navigation_believes_not_the_truth(survey: Path) 
         assert record.depth_m == 12.8  # the truth is 12.9
         assert record.altitude_m == 2.1
         assert (record.sigma_horizontal_m, record.sigma_heading_deg) == (0.3, 1.0)
-    # 4.25 s is half-way from 359 degrees to 1: north, not south.
-    assert [r.heading_deg for r in records[::2]] == pytest.approx([359.0, 1.0, 1.0], abs=1e-9)
-
-
-def test_headings_are_taken_across_north(tmp_path: Path) -> None:
-    path = tmp_path / "navigation.csv"
-    row = [32.8, 34.9, 12.8, 0, 0, 359.0, 2.0, 0.3, 0.01, 0.3, 1, 0.02]
-    write_csv(path, NAVIGATION_COLUMNS, [[0.0, *row], [1.0, *row[:5], 2.0, *row[6:]]])
-    (half,) = imaging._believed_records(path, np.array([2 / 3]))
-    assert half.heading_deg == pytest.approx(1.0)
+    # 4.25 s is half-way from 359 degrees to 2: north, not south.
+    assert [r.heading_deg for r in records[::2]] == pytest.approx([359.0, 0.5, 2.0], abs=1e-9)
 
 
 def test_truth_holds_the_poses_that_were_flown(survey: Path) -> None:
