@@ -51,20 +51,11 @@ def _without_pinches(area: BaseGeometry) -> MultiPolygon:
 
 def places_in(area: MultiPolygon, rng: np.random.Generator, count: int) -> np.ndarray:
     """Places (count, 2) inside, some of them corners and on edges."""
-    low_n, low_e, high_n, high_e = area.bounds
-    found: list[tuple[float, float]] = []
     corners = shapely.get_coordinates(area)
-    while len(found) < count:
-        kind = rng.integers(4)
-        if kind == 0:
-            found.append(tuple(corners[rng.integers(len(corners))].tolist()))
-        elif kind == 1:
-            i = rng.integers(len(corners) - 1)
-            middle = (corners[i] + corners[i + 1]) / 2
-            if area.distance(Point(middle)) < 1e-9:
-                found.append(tuple(middle.tolist()))
-        else:
-            place = rng.uniform((low_n, low_e), (high_n, high_e))
-            if area.covers(Point(place)):
-                found.append(tuple(place.tolist()))
-    return np.array(found)
+    middles = (corners[1:] + corners[:-1]) / 2
+    middles = middles[shapely.distance(area, shapely.points(middles)) < 1e-9]
+    anywhere = rng.uniform(area.bounds[:2], area.bounds[2:], (100 * count, 2))
+    within = anywhere[shapely.covers(area, shapely.points(anywhere))]
+    found = [*rng.choice(corners, count), *rng.choice(middles, count), *within[: 2 * count]]
+    assert len(found) == 4 * count
+    return rng.permutation(found)[:count]

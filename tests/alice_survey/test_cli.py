@@ -21,20 +21,6 @@ from alice_survey.core.config import CameraConfig, WaterConfig, load_config
 from camera_calib.rig import design_rig, write_rig
 
 
-def fails(
-    arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> str:
-    """Run a command that must end in exit code 1 with one line; returns the line."""
-    monkeypatch.setattr(sys, "argv", ["alice-survey", *arguments])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    assert stopped.value.code == 1
-    shown = capsys.readouterr().err.strip()
-    assert shown.startswith("error: ")
-    assert len(shown.splitlines()) == 1
-    return shown
-
-
 def test_help_loads_nothing_heavy() -> None:
     """`--help` answers at once because numeric packages are not even imported."""
     code = (
@@ -102,21 +88,13 @@ def test_module_runs_as_the_command() -> None:
     assert [row["passed"] for row in json.loads(done.stdout)["table"]] == [True] * 6
 
 
-def test_init_never_overwrites(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "survey.toml").write_text("# mine")
-    shown = fails(["init", str(tmp_path)], capsys, monkeypatch)
-    assert "survey.toml" in shown
-    assert (tmp_path / "survey.toml").read_text() == "# mine"
-
-
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
         (["target", "chessboard 9x6 25mm", "-o", "FILE/b.pdf"], "FILE"),
         (["target", "chessboard 9x6 25mm", "-o", "FOLDER/d.pdf"], "d.pdf"),
         (["fov", "--rig", "FOLDER"], "FOLDER"),
+        (["init", "FOLDER"], "survey.toml"),
         (["plan", "-w", "w"], "init"),
         (["reconstruct", "-w", "w"], "'alice-survey import-images"),
         (["calibrate", "--target", "chessboard 9x6 25mm"], "--pictures"),
@@ -130,11 +108,18 @@ def test_a_refusal_is_one_line_that_names_what_is_wrong(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    (tmp_path / "FILE").write_text("a file")
     (tmp_path / "FOLDER" / "d.pdf").mkdir(parents=True)
+    files = (tmp_path / "FILE", tmp_path / "FOLDER" / "survey.toml")
+    for file in files:
+        file.write_text("# mine")
     monkeypatch.chdir(tmp_path)
-    assert named in fails(arguments, capsys, monkeypatch)
-    assert (tmp_path / "FILE").read_text() == "a file"
+    monkeypatch.setattr(sys, "argv", ["alice-survey", *arguments])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 1
+    (shown,) = capsys.readouterr().err.strip().splitlines()
+    assert shown.startswith("error: ") and named in shown
+    assert [file.read_text() for file in files] == ["# mine"] * 2
 
 
 @pytest.mark.parametrize(("where", "named"), [("reef", "../reef.geojson"), (".", "reef.geojson")])

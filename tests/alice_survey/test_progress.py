@@ -26,9 +26,6 @@ class Clock:
     def __call__(self) -> float:
         return self.now_s
 
-    def turn(self, seconds: float) -> None:
-        self.now_s += seconds
-
 
 class Kept(logging.Handler):
     """Keeps every event."""
@@ -74,7 +71,7 @@ def test_remaining_time_is_within_a_factor_of_two_from_a_fifth_on(
     with progress.step("match", total) as counter:
         assert counter.remaining_s is None
         for done, each_s in enumerate(took_s, 1):
-            clock.turn(each_s)
+            clock.now_s += each_s
             counter.advance()
             truth_s = took_s[done:].sum()
             if done >= max(2, 0.2 * total):
@@ -86,7 +83,7 @@ def test_remaining_time_is_within_a_factor_of_two_from_a_fifth_on(
 def test_steps_are_reported_in_order_with_their_counts(run: Run, kept: Kept, clock: Clock) -> None:
     with progress.step("sort", 40) as counter:
         for _ in range(40):
-            clock.turn(0.2)
+            clock.now_s += 0.2
             counter.advance()
     started, *moved, ended = kept.events
     assert (started["event"], started["total"], started["done"]) == ("step_started", 40, 0)
@@ -129,7 +126,7 @@ def test_a_step_that_fails_is_not_reported_as_done(
     run: Run, kept: Kept, clock: Clock, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def fail() -> None:
-        clock.turn(9.0)
+        clock.now_s += 9.0
         raise ValueError
 
     with pytest.raises(ValueError), progress.step("break"):
@@ -161,7 +158,7 @@ def test_a_stage_ends_what_was_left_in_it(run: Run, kept: Kept) -> None:
 def test_what_hangs_is_reported_every_five_seconds(run: Run, kept: Kept, clock: Clock) -> None:
     with progress.step("solve"):
         for _ in range(20):
-            clock.turn(1.0)
+            clock.now_s += 1.0
             run.tick()
     assert [e["elapsed_s"] for e in kept.named("step_progress")] == [5.0, 10.0, 15.0, 20.0]
 
@@ -171,7 +168,7 @@ def test_a_display_of_warnings_alone(
 ) -> None:
     run = Run(Console(quiet=True, clock=clock), [kept], clock=clock, ticks=False)
     with progress.reported_to(run), keep_warnings() as warnings, progress.step("long"):
-        clock.turn(100.0)
+        clock.now_s += 100.0
         run.tick()
         warn("it is late")
     shown = capsys.readouterr()

@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 import zipfile
+from dataclasses import replace
 from importlib import import_module
 from inspect import signature
 from pathlib import Path
@@ -43,12 +44,14 @@ def old(tmp_path: Path) -> Path:
 @pytest.fixture
 def as_then(old: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Stages whose code has changed nothing since: only files and settings decide."""
-    versions = {
-        stage.name: json.loads((old / stage.folder / "stage.json").read_text())["version"]
-        for stage in STAGES
-    }
-    unchanged = [StageSpec(**{**vars(stage), "version": versions[stage.name]}) for stage in STAGES]
+    unchanged = [replace(stage, version=version_of(old, stage.folder)) for stage in STAGES]
     monkeypatch.setattr(stages, "STAGES", tuple(unchanged))
+
+
+def version_of(workspace: Path, folder: str) -> int:
+    record = read_stage(workspace / folder)
+    assert record is not None
+    return record.version
 
 
 def test_a_workspace_of_version_0_1_0_states_what_has_changed_since(old: Path) -> None:
@@ -102,15 +105,14 @@ def test_what_changed_in_an_old_workspace_is_named(
 def test_a_raised_version_makes_a_stage_and_those_after_it_stale(
     old: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    raised = [
-        StageSpec(**{**vars(stage), "version": 4}) if stage.name == "image" else stage
-        for stage in stages.STAGES
-    ]
+    raised = (
+        replace(stage, version=4) if stage.name == "image" else stage for stage in stages.STAGES
+    )
     monkeypatch.setattr(stages, "STAGES", tuple(raised))
     states = workspace_status(old, None)[1]["stages"]
     assert states["pool"] == "up to date"
-    version = json.loads((old / "images" / "stage.json").read_text())["version"]
-    assert states["image"] == f"stale (made by version {version} of the stage, now 4)"
+    before = version_of(old, "images")
+    assert states["image"] == f"stale (made by version {before} of the stage, now 4)"
     assert states["mapping"] == states["evaluate"] == "stale (image is stale)"
 
 

@@ -81,15 +81,12 @@ def test_a_level_footprint_is_the_same_wherever_it_points(
     np.testing.assert_allclose(about, home, atol=1e-9)
 
 
-def test_altitude_counts_from_the_outer_glass() -> None:
-    pose = level_pose(LEFT, np.zeros(2), 2.0, 15.0, 0.7)
+def test_altitude_counts_from_the_outer_glass_and_the_top_of_the_picture_is_ahead() -> None:
+    pose = level_pose(LEFT, np.zeros(2), 2.0, 15.0, 0.0)
     glass = pose.apply(LEFT.front_cam)
     np.testing.assert_allclose(glass, [0.0, 0.0, 13.0], atol=1e-12)
     assert pose.translation[2] == pytest.approx(12.97)
-
-
-def test_the_top_of_the_picture_is_ahead_and_its_right_to_starboard() -> None:
-    border = footprint_ne(LEFT, level_pose(LEFT, np.zeros(2), 2.0, 15.0, 0.0), 15.0)
+    border = footprint_ne(LEFT, pose, 15.0)
     top_left, top_right, bottom_right, bottom_left = border[::16]
     assert top_left[0] > 0 > top_left[1]
     assert top_right[0] > 0 < top_right[1]
@@ -190,9 +187,7 @@ def test_the_stereo_swath_is_narrower_by_the_baseline() -> None:
     assert both.port_m == pytest.approx(left.port_m - 0.1)
     assert both.starboard_m == pytest.approx(left.starboard_m)
     assert left.along_m == pytest.approx(2 * left.ahead_m)
-
-
-def test_cameras_that_see_nothing_in_common_have_no_swath() -> None:
+    # Cameras that see nothing in common have none.
     wide = design_rig(CameraConfig(baseline_m=2.0), WaterConfig())
     assert common_swath(wide, 1.0, 0.2).half_across_m < 0
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.integrate import cumulative_trapezoid
 
 from alice_survey.core.errors import NavigationError
 from alice_survey.core.frames import Array, Datum
@@ -20,17 +21,16 @@ ERRORS = TrackErrors(scale=0.01, heading_deg=2.0, noise_mps=0.05)
 DATUM = Datum(43.0, 5.0)
 
 
-def lawnmower(count: int = 400, step_s: float = 0.5, seed: int = 0) -> tuple[Array, Array]:
-    """Times and velocities north and east of lines there and back with a drift across."""
-    rng = np.random.default_rng(seed)
-    time_s = np.arange(count, dtype=float) * step_s
-    line = np.where((time_s // 40).astype(int) % 2 == 0, 0.4, -0.4)
-    drift = 0.05 + 0.02 * np.sin(time_s / 17)
-    return time_s, np.column_stack([line, drift]) + rng.normal(0, 0.01, (count, 2))
+TIME_S = np.arange(400, dtype=float) * 0.5
+VELOCITY = np.column_stack(
+    [np.where(TIME_S // 40 % 2 == 0, 0.4, -0.4), 0.05 + 0.02 * np.sin(TIME_S / 17)]
+) + np.random.default_rng(0).normal(0, 0.01, (400, 2))
+"""North and east, of lines there and back with a drift across."""
+TRUE = cumulative_trapezoid(VELOCITY, TIME_S, axis=0, initial=0.0)
 
 
 def reckoned(
-    time_s: Array, velocity: Array, at: Any, places: Array, sigmas: Any = 1.0
+    at: Any, places: Array, sigmas: Any = 1.0, *, time_s: Array = TIME_S, velocity: Array = VELOCITY
 ) -> ReckonedTrack:
     """The track of velocities with fixes at some of their times."""
     signal = Signal(source="dvl", time_s=time_s, values=velocity)
@@ -38,22 +38,16 @@ def reckoned(
     return dead_reckoned(signal, fixes, ERRORS)
 
 
-def moves_of(time_s: Array, velocity: Array) -> Array:
-    return 0.5 * (velocity[1:] + velocity[:-1]) * np.diff(time_s)[:, None]
-
-
-def dense(
-    time_s: Array, velocity: Array, at: list[int], places: Array, sigmas: Array
-) -> tuple[Array, Array]:
+def dense(at: list[int], places: Array, sigmas: Array) -> tuple[Array, Array]:
     """All places and both errors at once, by the normal equations of their residuals."""
-    count, moves = len(time_s), moves_of(time_s, velocity)
+    count, moves = len(TIME_S), np.diff(TRUE, axis=0)
     longer = [-moves.ravel(), -(moves[:, ::-1] * [-1.0, 1.0]).ravel()]  # by both errors
     steps = np.column_stack([np.kron(np.diff(np.eye(count), axis=0), np.eye(2)), *longer])
     known = np.eye(2 * count + 2)
     fixed = known[np.add.outer(2 * np.array(at), [0, 1]).ravel()]
     weights = 1.0 / np.concatenate(
         [
-            np.repeat(ERRORS.noise_mps * np.sqrt(np.diff(time_s)), 2),
+            np.repeat(ERRORS.noise_mps * np.sqrt(np.diff(TIME_S)), 2),
             np.repeat(sigmas, 2),
             [ERRORS.scale, np.deg2rad(ERRORS.heading_deg)],
         ]
@@ -61,18 +55,17 @@ def dense(
     a = np.vstack([steps, fixed, known[-2:]]) * weights[:, None]
     b = np.concatenate([moves.ravel(), places.ravel(), [0.0, 0.0]]) * weights
     normal = a.T @ a
-    found: Array = np.linalg.solve(normal, a.T @ b)
+    found = np.asarray(np.linalg.solve(normal, a.T @ b), np.float64)
     variances = np.diag(np.linalg.inv(normal))[:-2].reshape(-1, 2)
     return found[:-2].reshape(-1, 2), np.sqrt(0.5 * variances.sum(axis=1))
 
 
 @pytest.mark.parametrize("at", [[0], [250], [3, 399], [0, 130, 260, 390]])
 def test_the_smoother_is_least_squares_over_all_places(at: list[int]) -> None:
-    time_s, velocity = lawnmower()
-    places = np.vstack([[0, 0], moves_of(time_s, velocity).cumsum(axis=0)])[at] * 1.02
+    places = TRUE[at] * 1.02
     sigmas = np.linspace(0.5, 2.0, len(at))
-    track = reckoned(time_s, velocity, at, places, sigmas)
-    expected, sigma = dense(time_s, velocity, at, places, sigmas)
+    track = reckoned(at, places, sigmas)
+    expected, sigma = dense(at, places, sigmas)
     np.testing.assert_allclose(track.ne, expected, atol=2e-5)
     np.testing.assert_allclose(track.sigma_m, sigma, rtol=1e-4)
     assert track.refused == 0
@@ -80,45 +73,40 @@ def test_the_smoother_is_least_squares_over_all_places(at: list[int]) -> None:
 
 @pytest.mark.parametrize("at", [[0], [0, 399]])
 def test_sigmas_are_those_of_the_errors(at: list[int]) -> None:
-    time_s, velocity = lawnmower()
-    true = np.vstack([[0, 0], moves_of(time_s, velocity).cumsum(axis=0)])
     ratios = []
     for seed in range(200):
         rng = np.random.default_rng(seed)
         scale, turn = rng.normal(0, [ERRORS.scale, np.deg2rad(ERRORS.heading_deg)])
         # Truth = (1 + scale) turned measured: the measured track is the inverse of that.
         cos, sin = np.cos(turn), np.sin(turn)
-        measured = velocity @ np.array([[cos, -sin], [sin, cos]]) / (1 + scale)
+        measured = VELOCITY @ np.array([[cos, -sin], [sin, cos]]) / (1 + scale)
         # White noise of velocity over a step dt has a variance of noise^2 / dt.
         measured = measured + rng.normal(0, ERRORS.noise_mps / np.sqrt(0.5), measured.shape)
-        fixes = true[at] + rng.normal(0, 0.3, (len(at), 2))
-        track = reckoned(time_s, measured, at, fixes, 0.3)
-        ratios.append((track.ne - true) / track.sigma_m[:, None])
+        fixes = TRUE[at] + rng.normal(0, 0.3, (len(at), 2))
+        track = reckoned(at, fixes, 0.3, velocity=measured)
+        ratios.append((track.ne - TRUE) / track.sigma_m[:, None])
     rms = np.sqrt(np.mean(np.square(ratios), axis=(0, 2)))
     assert rms.min() > 0.85
     assert rms.max() < 1.15
 
 
 def test_a_wild_fix_is_refused_and_many_at_once_count_as_one() -> None:
-    time_s, velocity = lawnmower()
-    true = np.vstack([[0, 0], moves_of(time_s, velocity).cumsum(axis=0)])
-    places = true[[0, 200, 399]] + [[0, 0], [80, 0], [0, 0]]
-    track = reckoned(time_s, velocity, [0, 200, 399], places)
+    places = TRUE[[0, 200, 399]] + [[0, 0], [80, 0], [0, 0]]
+    track = reckoned([0, 200, 399], places)
     assert track.refused == 1
-    assert np.abs(track.ne - true).max() < 0.5
+    assert np.abs(track.ne - TRUE).max() < 0.5
     often = np.arange(0, 40)  # 20 s
-    many = reckoned(time_s, velocity, often, true[often])
+    many = reckoned(often, TRUE[often])
     assert 0.9 < many.sigma_m[20] < 1.1
 
 
 def test_a_gap_breaks_the_track() -> None:
-    time_s, velocity = lawnmower()
-    time_s = np.where(time_s > 100, time_s + 60, time_s)
-    track = reckoned(time_s, velocity, [0], np.zeros((1, 2)))
+    time_s = np.where(TIME_S > 100, TIME_S + 60, TIME_S)
+    track = reckoned([0], np.zeros((1, 2)), time_s=time_s)
     after = time_s > 150
     assert np.isnan(track.sigma_m[after]).all()
     assert np.isfinite(track.sigma_m[~after]).all()
-    both = reckoned(time_s, velocity, [0, -1], np.array([[0, 0], [30.0, 9.0]]))
+    both = reckoned([0, -1], np.array([[0, 0], [30.0, 9.0]]), time_s=time_s)
     assert np.isfinite(both.sigma_m).all()
     np.testing.assert_allclose(both.ne[-1], [30, 9], atol=0.01)
 
@@ -162,9 +150,7 @@ def test_what_is_missing_is_named(lacks: str) -> None:
 
 
 def test_sigma_grows_away_from_a_fix_and_shrinks_towards_the_next() -> None:
-    time_s, velocity = lawnmower()
-    true = np.vstack([[0, 0], moves_of(time_s, velocity).cumsum(axis=0)])
-    one, two = (reckoned(time_s, velocity, at, true[at], 0.1) for at in ([0], [0, -1]))
+    one, two = (reckoned(at, TRUE[at], 0.1) for at in ([0], [0, -1]))
     assert one.sigma_m[0] == pytest.approx(0.1, rel=1e-3)
     assert one.sigma_m[-1] > 0.6
     assert two.sigma_m[-1] < 0.11
