@@ -5,15 +5,13 @@ from collections.abc import Callable, Mapping
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import bisect, minimize
 
+from alice_survey.core.frames import Array
 from camera_calib.camera import Camera
 
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
 """In the order of OpenCV's vector."""
-
-Array = NDArray[np.float64]
 
 
 def lens_pixel(camera: Camera, ray_air: Array) -> Array:

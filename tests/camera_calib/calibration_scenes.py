@@ -5,16 +5,14 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.frames import Array
 from camera_calib.calibration import TargetView
 from camera_calib.freedom import POSE, value
 from camera_calib.rig import Rig, design_rig
 from tests.cameras import changed
-
-Array = NDArray[np.float64]
 
 DESIGN = design_rig(CameraConfig(), WaterConfig())
 COLUMNS, ROWS, SQUARE_M = 11, 8, 0.03

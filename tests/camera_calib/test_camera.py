@@ -6,7 +6,6 @@ import pycolmap
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from alice_survey.core.errors import CalibrationError
 from camera_calib.camera import Camera, camera_from_json
@@ -21,8 +20,6 @@ from camera_calib.ports.values import PortValues
 from tests.cameras import changed
 from tests.oracles_camera import assert_slopes
 from tests.oracles_dome import optical_path_slopes, ray_to, traced
-
-Array = NDArray[np.float64]
 
 PINHOLE = OpenCVLens(
     fx_px=1500.0, fy_px=1510.0, cx_px=805.0, cy_px=590.0, k1=-0.1, k2=0.02, p1=1e-3

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from alice_survey.core.errors import CalibrationError
+from alice_survey.core.frames import Array
 from camera_calib.camera import Camera, camera_from_json, pose_jacobian
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.ports.flat import FlatPort
@@ -22,8 +22,6 @@ from tests.oracles_camera import (
 )
 
 PARAMETERS = (*OpenCVLens.parameters, *FlatPort.parameters)
-
-Array = NDArray[np.float64]
 
 
 def tilted(angle_deg: float, azimuth_deg: float) -> tuple[float, float, float]:

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from alice_survey.core.frames import Array
 from camera_calib.lenses.opencv import (
     COEFFICIENTS,
     distort_slopes,
@@ -15,8 +15,6 @@ from camera_calib.lenses.opencv import (
     radial,
     undistort,
 )
-
-Array = NDArray[np.float64]
 
 SPAN = (0.3, 0.15, 2e-3, 2e-3, 0.05, 0.3, 0.1, 0.03, 2e-3, 1e-3, 2e-3, 1e-3)
 """Largest size of each of COEFFICIENTS here."""

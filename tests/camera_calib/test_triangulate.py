@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.errors import CalibrationError
+from alice_survey.core.frames import Array
 from camera_calib.triangulate import nearest_to_rays, rays_world, reproject, triangulate
 from tests.cameras import MANTA, changed
 from tests.oracles_interface import (
@@ -15,8 +15,6 @@ from tests.oracles_interface import (
     triangulate_slowly,
     true_tank,
 )
-
-Array = NDArray[np.float64]
 
 UNDERWATER = changed(MANTA, fy_px=3390.0, k1=-0.1, k2=0.05, k4=0.02, s1=1e-3).with_parameters(
     {"normal_x": 0.03, "normal_y": -0.05}

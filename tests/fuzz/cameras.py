@@ -1,6 +1,5 @@
 """Calibrations of every format that is read, pictures and videos of every kind, and targets."""
 
-import struct
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -32,6 +31,7 @@ from reconstruct.pictures.videos import read_fixes, video_start
 from tests.cameras import flat_port_camera
 from tests.fuzz.target import Target
 from tests.reconstruct.pictures import gopro
+from tests.reconstruct.pictures.test_importing import write_dng
 
 _SIZE = (48, 32)
 
@@ -127,34 +127,7 @@ def _chessboard(path: Path) -> None:
 
 def dng(path: Path) -> None:
     """A negative of one strip, as small as LibRaw takes them."""
-    width, height = 64, 48
-    values = np.random.default_rng(3).integers(0, 4096, width * height).astype("<u2").tobytes()
-    matrix = struct.pack("<18i", *(v for x in (1, 0, 0, 0, 1, 0, 0, 0, 1) for v in (x, 1)))
-    tags: list[tuple[int, int, int, bytes]] = [
-        (254, 4, 1, struct.pack("<I", 0)), (256, 4, 1, struct.pack("<I", width)),
-        (257, 4, 1, struct.pack("<I", height)), (258, 3, 1, struct.pack("<H", 16)),
-        (259, 3, 1, struct.pack("<H", 1)), (262, 3, 1, struct.pack("<H", 32803)),
-        (271, 2, 6, b"Maker\0"), (272, 2, 6, b"Model\0"),
-        (273, 4, 1, b"DATA"), (277, 3, 1, struct.pack("<H", 1)),
-        (278, 4, 1, struct.pack("<I", height)), (279, 4, 1, struct.pack("<I", len(values))),
-        (33421, 3, 2, struct.pack("<2H", 2, 2)), (33422, 1, 4, bytes([0, 1, 1, 2])),
-        (50706, 1, 4, bytes([1, 4, 0, 0])), (50708, 2, 6, b"Model\0"),
-        (50717, 4, 1, struct.pack("<I", 4095)), (50721, 10, 9, matrix),
-        (50728, 5, 3, struct.pack("<6I", 1, 1, 1, 1, 1, 1)),
-        (50778, 3, 1, struct.pack("<H", 21)),
-    ]  # fmt: skip
-    start = 8 + 2 + 12 * len(tags) + 4
-    extra, entries = b"", b""
-    data_at = start + sum(len(t[3]) for t in tags if len(t[3]) > 4)
-    for number, kind, count, value in tags:
-        content = struct.pack("<I", data_at) if value == b"DATA" else value
-        if len(content) > 4:
-            entries += struct.pack("<HHII", number, kind, count, start + len(extra))
-            extra += content
-        else:
-            entries += struct.pack("<HHI", number, kind, count) + content.ljust(4, b"\0")
-    head = b"II*\0" + struct.pack("<I", 8) + struct.pack("<H", len(tags))
-    path.write_bytes(head + entries + b"\0" * 4 + extra + values)
+    write_dng(path, np.random.default_rng(3).integers(0, 4096, (48, 64)))
 
 
 def read_picture(path: Path) -> object:

@@ -1,5 +1,6 @@
 """Every reader of files from outside, with files damaged by `mutations`."""
 
+from collections.abc import Callable
 from pathlib import Path
 from random import Random
 
@@ -50,39 +51,29 @@ def _leaking(path: Path) -> None:
     (path.parent / "more").write_text("x")
 
 
-def _plain(path: Path) -> None:
-    raise KeyError(str(path))
+def _raising(error: Exception) -> Callable[[Path], None]:
+    def read(_: Path) -> None:
+        raise error
 
-
-def _wordy(_: Path) -> None:
-    raise PlanError("two\nlines")
+    return read
 
 
 @pytest.mark.parametrize(
-    ("read", "fault"),
+    ("read", "outcome", "message"),
     [
-        (_slow, "took over"), (_greedy, "MiB"), (_leaking, "wrote or changed in/more"),
-        (_plain, "KeyError"), (_wordy, "several lines"),
+        (_slow, "fault", "took over"), (_greedy, "fault", "MiB"),
+        (_leaking, "fault", "wrote or changed in/more"),
+        (_raising(KeyError("x")), "fault", "KeyError"),
+        (_raising(PlanError("two\nlines")), "fault", "several lines"),
+        (_raising(WorkspaceError("file: none")), "refused", "file: none"),
+        (lambda path: path, "value", ""),
     ],
 )  # fmt: skip
-def test_the_judge_sees_each_kind_of_fault(read: object, fault: str, tmp_path: Path) -> None:
-    sandbox = Sandbox(tmp_path)
-    verdict = judge(
-        read,  # type: ignore[arg-type]
-        sandbox.inside / "file",
-        sandbox,
-        max_bytes=200 << 20,
-        max_s=2.0,
-    )
-    assert verdict.outcome == "fault"
-    assert fault in verdict.message
-
-
-def test_the_judge_takes_a_refusal_for_what_it_is(tmp_path: Path) -> None:
-    def read(path: Path) -> None:
-        raise WorkspaceError(f"{path}: no such file")
-
+def test_the_judge_sees_each_kind_of_fault_and_refusals_for_what_they_are(
+    read: Callable[[Path], object], outcome: str, message: str, tmp_path: Path
+) -> None:
     sandbox = Sandbox(tmp_path)
     (sandbox.inside / "file").write_text("x")
-    assert judge(read, sandbox.inside / "file", sandbox).outcome == "refused"
-    assert judge(lambda path: path, sandbox.inside / "file", sandbox).outcome == "value"
+    verdict = judge(read, sandbox.inside / "file", sandbox, max_bytes=200 << 20, max_s=2.0)
+    assert verdict.outcome == outcome
+    assert message in verdict.message

@@ -12,10 +12,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.executor import SERIAL
+from alice_survey.core.frames import Array
 from benchmarks.camera_calibration import cramer_rao
 from camera_calib.calibrate.from_pictures import calibrate_pictures
 from camera_calib.calibrate.options import CalibrateOptions
@@ -27,8 +27,6 @@ from camera_calib.targets.target import parse_target
 from tests.camera_calib.calibration_scenes import differences
 from tests.oracles_targets import picture_light, to_srgb
 from tests.strategies_formats import DATA
-
-Array = NDArray[np.float64]
 
 TARGET = parse_target("apriltag 6x6 88mm 0.3")
 OF_BOUND = 1.15

@@ -201,7 +201,7 @@ def test_no_entity_of_xml_is_ever_seen_by_the_parser(
 
     monkeypatch.setattr(cv2, "FileStorage", parsed)
     bomb = '<?xml version="1.0"?>\n<!{} lol [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;">]>\n'
-    for declaration in ("DOCTYPE", "doctype", " DOCTYPE"):
+    for declaration in ("DOCTYPE", "doctype", " DOCTYPE", "ENTITY"):
         text = bomb.format(declaration) + "<opencv_storage><a>&b;</a></opencv_storage>\n"
         assert "DOCTYPE" in fault(tmp_path / "bomb.xml", text)
     fault(tmp_path / "deep.xml", "<a>" * 6000)
