@@ -121,15 +121,27 @@ def picture_light(
 
 
 def light_through(
-    target: Target, camera: Camera, board_from_cam: RigidTransform, fine: int = 4
+    target: Target,
+    camera: Camera,
+    board_from_cam: RigidTransform,
+    fine: int = 4,
+    depth_m: Callable[[np.ndarray], np.ndarray] = np.zeros_like,
 ) -> np.ndarray:
-    """(H, W) light of a target as the rays of pixels meet it, through a port too."""
+    """(H, W) light of a target as the rays of pixels meet it, through a port too.
+
+    A board that is bent a little has a depth, which depends on x.
+    """
 
     def hits(pixels: np.ndarray) -> np.ndarray:
-        """(M, 2) x and y where the rays of pixels meet the board's plane."""
+        """(M, 2) x and y where the rays of pixels meet the board; NaN behind the camera."""
         points, directions = camera.unproject(pixels)
         start, ways = board_from_cam.apply(points), board_from_cam.rotation.apply(directions)
-        return start[:, :2] - start[:, 2:] / ways[:, 2:] * ways[:, :2]
+        z_m = np.zeros(len(pixels))
+        for _ in range(4):  # bends are small: each round takes off all but a hundredth
+            reach = ((z_m - start[:, 2]) / ways[:, 2])[:, None]
+            places = start[:, :2] + reach * ways[:, :2]
+            z_m = depth_m(places[:, 0])
+        return np.where(reach > 0.0, places, np.nan)
 
     return picture_light(target, np.eye(3), (camera.width_px, camera.height_px), fine, warp=hits)
 

@@ -1,7 +1,5 @@
 """Picture files that end too early, or state more than they hold."""
 
-import struct
-import zlib
 from pathlib import Path
 
 import cv2
@@ -16,6 +14,7 @@ from camera_calib.picture_files import (
     pixels_too_many,
     read_pixels,
 )
+from tests.fuzz.cameras import png_of
 
 
 @pytest.mark.parametrize("progressive", [False, True])
@@ -39,20 +38,10 @@ def test_other_files_are_left_to_their_decoders(tmp_path: Path) -> None:
         assert not is_cut_short(tmp_path / name)
 
 
-def _stating(width: int, height: int) -> bytes:
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        whole = kind + data
-        return struct.pack(">I", len(data)) + whole + struct.pack(">I", zlib.crc32(whole))
-
-    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    body = chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(bytes(1000))) + chunk(b"IEND", b"")
-    return b"\x89PNG\r\n\x1a\n" + body
-
-
 def test_pictures_are_not_decoded_to_more_than_a_bound(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
     for side, maximum in ((10_000, 0), (12_000, MAX_PIXELS), (50_000, MAX_PIXELS_JPEG)):
-        path.write_bytes(_stating(side, side))
+        path.write_bytes(png_of(side, side))
         assert pixels_too_many(path) == maximum
         assert read_pixels(path, cv2.IMREAD_COLOR) is None
 

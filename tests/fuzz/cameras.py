@@ -1,5 +1,7 @@
 """Calibrations of every format that is read, pictures and videos of every kind, and targets."""
 
+import struct
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -123,6 +125,19 @@ def _chessboard(path: Path) -> None:
     y, x = np.mgrid[0:144, 0:192] // 16
     dark = (x % 2 == y % 2) & (x > 0) & (x < 11) & (y > 0) & (y < 8)
     cv2.imwrite(str(path), np.where(dark, 20, 230).astype(np.uint8))
+
+
+def png_of(width: int, height: int, depth: int = 8, colour: int = 2, body: bytes = b"") -> bytes:
+    """A PNG that states a size, whatever it holds."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
+
+    head = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)
+    parts = chunk(b"IHDR", head) + chunk(b"IDAT", body or zlib.compress(bytes(1000)))
+    return b"\x89PNG\r\n\x1a\n" + parts + chunk(b"IEND", b"")
 
 
 def dng(path: Path) -> None:

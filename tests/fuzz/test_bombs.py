@@ -18,6 +18,7 @@ from alice_survey.core.config import load_config
 from alice_survey.sim.vehicle.log import read_column_map
 from missions.logs import ros_bag
 from tests.fuzz import areas, cameras, logs, workspace
+from tests.fuzz.cameras import png_of
 from tests.fuzz.judge import Sandbox, Verdict, judge
 
 pytestmark = pytest.mark.slow
@@ -209,17 +210,6 @@ def test_polygons_that_are_none(sandbox: Sandbox, text: str) -> None:
     looked_at(sandbox, "a.geojson", _ring(text), areas.read_area)
 
 
-def _png(width: int, height: int, depth: int = 8, colour: int = 2, body: bytes = b"") -> bytes:
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return (
-            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-        )
-
-    head = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)
-    parts = chunk(b"IHDR", head) + chunk(b"IDAT", body or zlib.compress(bytes(1000)))
-    return b"\x89PNG\r\n\x1a\n" + parts + chunk(b"IEND", b"")
-
-
 def _tiff(width: int, height: int, bits: int = 16) -> bytes:
     tags = [(256, width), (257, height), (258, bits), (259, 1), (262, 1), (273, 8), (277, 1),
             (278, height), (279, 0xFFFFFFFF)]  # fmt: skip
@@ -246,10 +236,10 @@ def test_pictures_that_state_a_great_size(
     sandbox: Sandbox, tmp_path: Path, size: int, reader: str
 ) -> None:
     pictures = {
-        "a.png": _png(size, size), "b.png": _png(size, size, 16, 6),
+        "a.png": png_of(size, size), "b.png": png_of(size, size, 16, 6),
         "c.tif": _tiff(size, size), "d.jpg": _jpeg(size, size, tmp_path),
-        "e.png": _png(size, size, 1, 0, zeros(size * size // 8)), "f.jpg": _png(size, size),
-        "g.tif": _png(size, size, 16, 6), "h.png": b"P6 %d %d 65535\n" % (size, size),
+        "e.png": png_of(size, size, 1, 0, zeros(size * size // 8)), "f.jpg": png_of(size, size),
+        "g.tif": png_of(size, size, 16, 6), "h.png": b"P6 %d %d 65535\n" % (size, size),
         "i.jpg": b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y %d +X %d\n" % (size, size),
         "j.png": b"BM" + struct.pack("<IIIIiiHHIIiiII", 54, 0, 54, 40, size, size, 1, 24, 0, 0, 0,
                                      0, 0, 0),

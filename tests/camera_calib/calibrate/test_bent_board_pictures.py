@@ -7,10 +7,10 @@ from typing import Literal
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.executor import SERIAL
+from alice_survey.core.frames import Array
 from camera_calib.calibrate.from_pictures import calibrate_pictures
 from camera_calib.calibrate.options import CalibrateOptions
 from camera_calib.camera import Camera
@@ -18,9 +18,7 @@ from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.rig import read_rig
 from camera_calib.target_shape import BOW_X
 from camera_calib.targets.target import parse_target
-from tests.oracles_targets import picture_light, to_srgb
-
-Array = NDArray[np.float64]
+from tests.oracles_targets import light_through, to_srgb
 
 TARGET = parse_target("chessboard 9x6 25mm")
 BOW_M = 0.25e-3
@@ -36,24 +34,6 @@ def depth_m(x_m: Array) -> Array:
     return depth
 
 
-def picture_of(cam_from_target: RigidTransform, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """The board as the camera sees it."""
-    target_from_cam = cam_from_target.inv()
-    origin = target_from_cam.translation
-
-    def places(pixels: Array) -> Array:
-        """(M, 2) x and y of the board where the rays of pixels meet it."""
-        ways = target_from_cam.rotation.apply(CAMERA.unproject(pixels)[1])
-        z_m = np.zeros(len(pixels))
-        for _ in range(4):  # bends are small: each round takes off all but a hundredth
-            found = origin[:2] + (z_m - origin[2])[:, None] * ways[:, :2] / ways[:, 2:]
-            z_m = depth_m(found[:, 0])
-        return found
-
-    light = picture_light(TARGET, np.eye(3), (640, 480), fine=8, warp=places)
-    return to_srgb(light + rng.normal(0.0, NOISE, light.shape))
-
-
 def shoot(folder: Path) -> None:
     """Pictures of the board, tilted, near and far, all of it in the frame."""
     rng, taken = np.random.default_rng(2), 0
@@ -64,7 +44,9 @@ def shoot(folder: Path) -> None:
         pose = RigidTransform.from_components(place - turn.apply(TARGET.points.mean(axis=0)), turn)
         pixels = CAMERA.project(pose.apply(TARGET.points))
         if np.all((pixels > 15) & (pixels < [625, 465])):
-            cv2.imwrite(str(folder / f"{taken:02d}.png"), picture_of(pose, rng))
+            light = light_through(TARGET, CAMERA, pose.inv(), 8, depth_m)
+            picture = to_srgb(light + rng.normal(0.0, NOISE, light.shape))
+            cv2.imwrite(str(folder / f"{taken:02d}.png"), picture)
             taken += 1
 
 

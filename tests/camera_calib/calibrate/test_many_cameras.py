@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.errors import CalibrationError
 from camera_calib.calibrate.detect_views import Detections
@@ -13,44 +12,21 @@ from camera_calib.calibrate.from_pictures import calibrate_task
 from camera_calib.calibrate.options import CalibrateOptions, task_of
 from camera_calib.calibrate.solve import calibrate_in_air
 from camera_calib.calibration import Calibration, TargetView
-from camera_calib.camera import Camera
+from camera_calib.formats.rigs import rename_cameras
 from camera_calib.freedom import POSE, move_rig, part_of_rig
-from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.lenses.opencv import OpenCVLens
-from camera_calib.ports.dome import DomePort
-from camera_calib.ports.flat import FlatPort
 from camera_calib.rig import Covariance, Rig
 from camera_calib.targets.target import parse_target
-from tests.camera_calib.calibration_scenes import differences, views_of_some
-from tests.cameras import rig_of
+from tests.camera_calib.calibration_scenes import differences, in_air, views_of_some
+from tests.reconstruct import rig_survey
 
 TARGET = parse_target("chessboard 9x6 40mm")
 NOISE_PX = 0.1
 
 
-def camera(width: int, height: int, focal: float, k1: float) -> Camera:
-    lens = OpenCVLens(
-        fx_px=focal, fy_px=1.002 * focal, cx_px=0.51 * width, cy_px=0.49 * height, k1=k1
-    )
-    return Camera(width_px=width, height_px=height, lens=lens)
-
-
 def four_cameras() -> Rig:
-    """A stereo pair that looks down, one that looks 30 degrees ahead and one 35 degrees aside."""
-    cameras = {
-        "left": camera(640, 480, 620.0, -0.08),
-        "right": camera(800, 600, 700.0, -0.05),
-        "bow": camera(480, 640, 560.0, 0.04),
-        "side": camera(720, 540, 540.0, -0.12),
-    }
-    turns: dict[str, list[float]] = {
-        "left": [0, 0, 0], "right": [1.0, -2.0, 0.5], "bow": [30, 2, 88], "side": [-3, 35, -4],
-    }  # fmt: skip
-    places: dict[str, list[float]] = {
-        "left": [0, 0, 0], "right": [0.18, 0.01, 0.0], "bow": [0.05, -0.35, 0.03],
-        "side": [-0.4, 0.02, 0.05],
-    }  # fmt: skip
-    return rig_of(cameras, turns, places, RigidTransform.identity())
+    """Two that look down, one that looks ahead and a fisheye that looks aside, behind ports."""
+    return rename_cameras(rig_survey.four_cameras(), ["left", "right", "bow", "side"])
 
 
 def seen_by(truth: Rig, count: int, rng: np.random.Generator) -> Detections:
@@ -74,7 +50,10 @@ def calibrated(options: CalibrateOptions, found: Detections, start: Rig | None) 
 
 def test_four_oblique_cameras_are_found_within_their_sigmas() -> None:
     """From nothing but corners; no view is seen by all of them."""
-    truth, rng = four_cameras(), np.random.default_rng(5)
+    truth, rng = in_air(four_cameras()), np.random.default_rng(5)
+    lens = OpenCVLens(fx_px=540.0, fy_px=541.0, cx_px=285.0, cy_px=275.0, k1=-0.12)
+    side = replace(truth.cameras["side"], lens=lens)
+    truth = replace(truth, cameras={**truth.cameras, "side": side})
     found_corners = seen_by(truth, 40, rng)
     views, sizes = found_corners.views, found_corners.sizes
     assert {len(view.pixels) for view in views} >= {2, 3}
@@ -97,7 +76,7 @@ def test_four_oblique_cameras_are_found_within_their_sigmas() -> None:
 
 def test_a_part_of_a_rig_has_the_covariance_of_its_own_poses() -> None:
     """The covariance of one random step of the rig is that of what its part does."""
-    rig, names = four_cameras(), ["bow", "side"]
+    rig, names = in_air(four_cameras()), ["bow", "side"]
     fields = (*(f"{n}.{axis}" for n in ("right", "bow", "side") for axis in POSE), "side.cx_px")
     step = np.random.default_rng(4).normal(0.0, 1e-5, len(fields))
     known = Covariance(parameters=fields, matrix=np.outer(step, step))
@@ -124,30 +103,17 @@ def test_a_part_of_a_rig_has_the_covariance_of_its_own_poses() -> None:
 
 
 def test_four_lenses_behind_four_ports_are_found_in_air_and_then_in_water() -> None:
-    rig, rng = four_cameras(), np.random.default_rng(8)
-    fisheye = FisheyeLens(fx_px=420.0, fy_px=421.0, cx_px=365.0, cy_px=268.0, k1=-0.02, k2=0.004)
-    dome = DomePort(outer_radius_m=0.07, glass_thickness_m=0.005, dome_x_m=0.001, dome_z_m=0.006)
-    ports = {
-        "left": FlatPort(port_distance_m=0.03, glass_thickness_m=0.005, n_glass=1.49),
-        "right": FlatPort(port_distance_m=0.015, glass_thickness_m=0.008, n_glass=1.52),
-        "bow": dome,
-        "side": replace(dome, dome_x_m=0.0, dome_z_m=-0.003, outer_radius_m=0.055),
-    }
-    lenses = {name: one.lens for name, one in rig.cameras.items()} | {"side": fisheye}
-    dry = replace(rig, cameras={n: replace(c, lens=lenses[n]) for n, c in rig.cameras.items()})
-    wet = replace(dry, cameras={n: replace(c, port=ports[n]) for n, c in dry.cameras.items()})
+    wet, rng = four_cameras(), np.random.default_rng(8)
+    dry = in_air(wet)
     terms = "k2,side=fisheye"
-    in_air = calibrated(
-        CalibrateOptions(lens=terms),
-        seen_by(dry, 30, rng), None,
-    ).rig  # fmt: skip
+    found_in_air = calibrated(CalibrateOptions(lens=terms), seen_by(dry, 30, rng), None).rig
     under_water = CalibrateOptions(
-        lens=terms, water=True, port="flat,bow=dome,side=dome", dome_radius_mm="70,side=55",
-        glass_mm="5,right=8", n_glass="1.52,left=1.49",
+        lens=terms, water=True, port="flat,bow=dome,side=dome", dome_radius_mm="80,bow=60",
+        glass_mm="6,left=10,bow=5", n_glass="1.52,right=1.49",
     )  # fmt: skip
     views = seen_by(wet, 30, rng)
 
-    found = calibrated(under_water, views, in_air)
+    found = calibrated(under_water, views, found_in_air)
 
     errors, sigmas = differences(found.rig, wet), found.rig.sigmas
     over = np.array([errors[key] / sigmas[key] for key in sigmas])
@@ -184,7 +150,7 @@ def test_numbers_of_ports_have_sigmas_where_they_are_found_again() -> None:
     options = CalibrateOptions(
         water=True, port="flat,bow=none", glass_mm="5+-0.1,side=6", n_glass="+-0.01", n_water="1.34"
     )
-    rig = four_cameras()
+    rig = in_air(four_cameras())
     task = task_of(options, dict.fromkeys(rig.cameras, "p"), TARGET, rig)
     assert task.ports["bow"] == "none" and task.ports["side"] == "flat"
     assert task.port_values["left"] == pytest.approx({"glass_thickness_m": 0.005, "n_water": 1.34})

@@ -11,7 +11,7 @@ from camera_calib.targets.detect import detect
 from camera_calib.targets.grow import board_map
 from camera_calib.targets.pattern import CROSSING, black_rectangles, surroundings
 from camera_calib.targets.target import parse_target
-from tests.oracles_targets import picture_light, to_srgb
+from tests.oracles_targets import light_through, to_srgb
 
 GRID = parse_target("apriltag 6x6 88mm 0.3")
 FISHEYE = Camera(
@@ -45,13 +45,7 @@ def fisheye_view() -> tuple[np.ndarray, np.ndarray]:
     turn = Rotation.from_euler("xyz", [15.0, 30.0, 20.0], degrees=True)
     middle = GRID.points.mean(axis=0)
     pose = RigidTransform.from_components([0.28, 0.12, 0.45] - turn.apply(middle), turn)
-
-    def tangents(pixels: np.ndarray) -> np.ndarray:
-        rays = FISHEYE.unproject(pixels)[1]
-        return rays[:, :2] / np.where(rays[:, 2:] > 0.0, rays[:, 2:], np.nan)
-
-    light = picture_light(GRID, pose.as_matrix()[:3, [0, 1, 3]], (512, 512), 10, warp=tangents)
-    return light, FISHEYE.project(pose.apply(GRID.points))
+    return light_through(GRID, FISHEYE, pose.inv(), 10), FISHEYE.project(pose.apply(GRID.points))
 
 
 def test_neither_bits_nor_the_lens_pull_a_corner() -> None:
