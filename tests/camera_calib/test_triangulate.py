@@ -132,7 +132,7 @@ def test_a_camera_that_does_not_see_a_point_does_not_count() -> None:
     assert np.isfinite(found.points_world[20:]).all()
 
 
-def test_rays_that_meet_in_the_air_have_no_solution() -> None:
+def test_rays_that_meet_in_the_air_or_are_parallel_have_no_solution() -> None:
     tank = true_tank(glass_m=(0.0, 0.0))
     inside = np.array([[0.2, 0.1, 0.1]])
     # Where a camera in air would see a point above the water, before the wall.
@@ -143,9 +143,12 @@ def test_rays_that_meet_in_the_air_have_no_solution() -> None:
 
     assert np.isnan(found.points_world[0]).all() and np.isnan(found.residuals_px[:, 0]).all()
     np.testing.assert_allclose(found.points_world[1], inside[0], atol=1e-9)
+    same = [RigidTransform.identity()] * 2
+    parallel = triangulate([UNDERWATER] * 2, same, np.full((2, 3, 2), 1500.0))
+    assert np.isnan(parallel.points_world).all()
 
 
-def test_nearest_point_agrees_with_its_slow_twin() -> None:
+def test_nearest_point_agrees_with_its_slow_twin_and_is_the_middle_of_a_gap() -> None:
     rng = np.random.default_rng(8)
     origins, directions = rng.normal(size=(2, 4, 20, 3))
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
@@ -157,6 +160,10 @@ def test_nearest_point_agrees_with_its_slow_twin() -> None:
         rays = [0, 2, 3] if i == 5 else [0, 1, 2, 3]
         slow = nearest_slowly(origins[rays, i], directions[rays, i])
         np.testing.assert_allclose(found[i], slow, atol=1e-10)
+    origins = np.array([[[0.0, 0.0, 0.0]], [[0.0, 1.0, 5.0]]])
+    directions = np.array([[[1.0, 0.0, 0.0]], [[0.0, 0.0, -1.0]]])
+    middle = nearest_to_rays(origins, directions)
+    np.testing.assert_allclose(middle, [[0.0, 0.5, 0.0]], atol=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -186,19 +193,3 @@ def test_least_squares_is_never_worse_than_the_midpoint() -> None:
     middle = ((reproject([UNDERWATER] * 2, poses, nearest) - pixels) ** 2).sum(axis=(0, 2))
     assert np.all(best <= middle + 1e-9)
     assert np.any(best < 0.99 * middle)
-
-
-def test_parallel_rays_have_no_solution() -> None:
-    same = RigidTransform.identity()
-    pixels = np.full((2, 3, 2), 1500.0)
-
-    found = triangulate([UNDERWATER] * 2, [same, same], pixels)
-
-    assert np.isnan(found.points_world).all()
-
-
-def test_nearest_point_to_two_rays_is_the_middle_of_their_gap() -> None:
-    origins = np.array([[[0.0, 0.0, 0.0]], [[0.0, 1.0, 5.0]]])
-    directions = np.array([[[1.0, 0.0, 0.0]], [[0.0, 0.0, -1.0]]])
-
-    np.testing.assert_allclose(nearest_to_rays(origins, directions), [[0.0, 0.5, 0.0]], atol=1e-15)

@@ -69,9 +69,11 @@ def test_optics_of_any_wavelength_obey_kirks_relation(jerlov: Jerlov, nm: float)
 
 
 @pytest.mark.parametrize("nm", [399.0, 701.0, np.nan])
-def test_attenuation_beyond_the_table_is_not_made_up(nm: float) -> None:
+def test_light_beyond_the_tables_is_refused(nm: float) -> None:
     with pytest.raises(ConfigError, match="400 to 700 nm"):
         water_optics("II", np.array([530.0, nm]))
+    with pytest.raises(ConfigError, match="380 to 1050 nm"):
+        n_glass(nm / 1e3)
 
 
 LINES_NM = [486.13, 587.56, 656.27]
@@ -82,11 +84,6 @@ def test_index_and_dispersion_of_glass_are_those_of_its_data_sheet() -> None:
     assert d == pytest.approx(1.51680, abs=2e-5)
     assert (d - 1) / (f - c) == pytest.approx(64.17, abs=0.02)
     assert np.all(np.diff(n_glass(np.linspace(380, 750, 100))) < 0)
-
-
-def test_invisible_light_is_refused() -> None:
-    with pytest.raises(ConfigError, match="380 to 1050 nm"):
-        n_glass(0.53)
 
 
 ALICE = changed(MANTA, n_water=1.3419)
