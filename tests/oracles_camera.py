@@ -1,7 +1,7 @@
 """Slow, obvious twins of the flat-port camera, written apart from it."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import cv2
 import numpy as np
@@ -23,6 +23,12 @@ def lens_pixel(camera: Camera, ray_air: Array) -> Array:
     return np.asarray(pixels, dtype=np.float64).reshape(2)
 
 
+def reach_m(angle_air: float, layers: Sequence[tuple[float, float]]) -> float:
+    """How far from the axis a ray ends behind layers of a thickness and an index each."""
+    sine = math.sin(angle_air)
+    return sum(thick_m * math.tan(math.asin(sine / n)) for thick_m, n in layers)
+
+
 def project_by_bisection(camera: Camera, point_cam: Array) -> Array:
     """Pixel of a point through a port square to the axis: Fermat's principle by bisection.
 
@@ -40,10 +46,10 @@ def project_by_bisection(camera: Camera, point_cam: Array) -> Array:
         (water_m, camera.n_water),
     )
 
-    def reaches(angle: float) -> float:
-        return sum(m * math.tan(math.asin(math.sin(angle) / n)) for m, n in layers) - radius
+    def misses(angle: float) -> float:
+        return reach_m(angle, layers) - radius
 
-    angle = bisect(reaches, 0.0, math.pi / 2 - 1e-12, xtol=1e-15, rtol=1e-15, maxiter=200)
+    angle = bisect(misses, 0.0, math.pi / 2 - 1e-12, xtol=1e-15, rtol=1e-15, maxiter=200)
     ray = np.array([0.0, 0.0, 1.0])
     if radius > 0:
         ray[:2] = math.tan(angle) * np.array([x, y]) / radius
@@ -71,24 +77,19 @@ def project_by_shortest_path(camera: Camera, point_cam: Array) -> Array:
         (camera.n_water, np.asarray(point_cam) - outer, np.hstack([zeros, -axes])),
     ]
 
+    def legs(unknowns: Array) -> list[tuple[float, Array, Array]]:
+        return [(n, base + matrix @ unknowns, matrix) for n, base, matrix in spans]
+
     def path(unknowns: Array) -> float:
-        return sum(n * float(np.linalg.norm(base + m @ unknowns)) for n, base, m in spans)
+        return sum(n * float(np.linalg.norm(d)) for n, d, _ in legs(unknowns))
 
     def gradient(unknowns: Array) -> Array:
-        total = np.zeros(4)
-        for n, base, m in spans:
-            d = base + m @ unknowns
-            total += n * m.T @ (d / np.linalg.norm(d))
-        return total
+        return np.sum([n * m.T @ d / np.linalg.norm(d) for n, d, m in legs(unknowns)], axis=0)
 
     def hessian(unknowns: Array) -> Array:
-        total = np.zeros((4, 4))
-        for n, base, m in spans:
-            d = base + m @ unknowns
-            length = np.linalg.norm(d)
-            unit = d / length
-            total += n * m.T @ ((np.eye(3) - np.outer(unit, unit)) / length) @ m
-        return total
+        across = [np.eye(3) - np.outer(d, d) / (d @ d) for _, d, _ in legs(unknowns)]
+        each = zip(legs(unknowns), across, strict=True)
+        return np.sum([n * m.T @ a @ m / np.linalg.norm(d) for (n, d, m), a in each], axis=0)
 
     near, far = (float(surface @ normal) for surface in (inner, outer))
     sideways = (np.asarray(point_cam) @ axes) / float(np.asarray(point_cam) @ normal)

@@ -1,6 +1,7 @@
 """Slow, obvious twins of corner fitting and target layout, and pictures of targets with truth."""
 
 from collections.abc import Callable
+from itertools import product
 
 import cv2
 import numpy as np
@@ -103,11 +104,8 @@ def picture_light(
     y, x = np.mgrid[: height + 1, : width + 1].astype(float)
     column, row = cells(np.stack([x, y], axis=-1))
     light = shade[row, column][:-1, :-1]
-    parts = [(slice(0, -1), slice(1, None)), (slice(1, None), slice(0, -1))]
-    parts.append((slice(1, None), slice(1, None)))
-    mixed = np.zeros((height, width), dtype=bool)
-    for j, i in parts:
-        mixed |= (column[j, i] != column[:-1, :-1]) | (row[j, i] != row[:-1, :-1])
+    cell = row * shade.shape[1] + column
+    mixed = np.ptp(np.lib.stride_tricks.sliding_window_view(cell, (2, 2)), axis=(2, 3)) > 0
     # Samples are strewn, or an edge along the pixels would be rounded to a sample's width.
     rng = np.random.default_rng(0)
     first = np.argwhere(mixed)[:, ::-1]
@@ -172,12 +170,8 @@ def slow_corner(picture: np.ndarray, used: np.ndarray, near: np.ndarray) -> np.n
         two = erf((across * np.cos(q[3]) + down * np.sin(q[3])) / q[4])
         return q[6] + q[7] * across + q[8] * down + q[5] * one * two - light
 
-    best = None
-    for sign in (-1, 1):
-        for angle in (0.0, np.pi / 4):
-            swing = 0.5 * sign * np.ptp(light)
-            start = [*near, angle, angle + np.pi / 2, 1.5, swing, light.mean(), 0, 0]
-            fit = least_squares(misses, start, xtol=1e-12, ftol=1e-12, gtol=1e-12)
-            if best is None or fit.cost < best.cost:
-                best = fit
-    return best.x[:2]
+    fits = []
+    for swing, angle in product((-0.5 * np.ptp(light), 0.5 * np.ptp(light)), (0.0, np.pi / 4)):
+        start = [*near, angle, angle + np.pi / 2, 1.5, swing, light.mean(), 0, 0]
+        fits.append(least_squares(misses, start, xtol=1e-12, ftol=1e-12, gtol=1e-12))
+    return min(fits, key=lambda fit: fit.cost).x[:2]

@@ -23,7 +23,7 @@ from camera_calib.formats.rigs import ReadOptions, in_air, only
 from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.picture_files import without_orientation
 from camera_calib.ports.dome import DomePort
-from camera_calib.rig import Rig, design_rig, read_rig, write_rig
+from camera_calib.rig import Rig, design_rig, read_rig
 from camera_calib.targets.target import parse_target, read_target, write_target
 from missions.exposure.gain import read_linear
 from reconstruct.pictures.files import bits_used, exif_focal_px, inspect
@@ -83,10 +83,6 @@ def read_calibration(path: Path) -> object:
 
 def _read_folder(path: Path) -> object:
     return read_calibration(path.parent)
-
-
-def _rig_json(path: Path) -> None:
-    write_rig(path, small_rig())
 
 
 def _board(path: Path) -> None:
@@ -189,7 +185,7 @@ def take_orientation_off(path: Path) -> object:
 
 read_small_mask = partial(read_mask, size=_SIZE)
 _FILES = (
-    ("rig.json", "json", "rig.json", _rig_json, read_rig),
+    ("rig.json", "json", "rig.json", _write("rig", small_rig), read_rig),
     ("target JSON", "json", "board.json", _board, read_board),
     ("OpenCV YAML", "text", "a.yaml", _write("opencv", _in_air), read_calibration),
     ("OpenCV XML", "text", "a.xml", _write("opencv", _in_air), read_calibration),

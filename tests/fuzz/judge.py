@@ -140,7 +140,7 @@ def bounded(max_s: float) -> Iterator[None]:
 
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     before = signal.signal(signal.SIGALRM, ring)
-    resource.setrlimit(resource.RLIMIT_AS, (_address_space() + _ROOM_TO_ALLOCATE, hard))
+    resource.setrlimit(resource.RLIMIT_AS, (_memory()[0] + _ROOM_TO_ALLOCATE, hard))
     signal.setitimer(signal.ITIMER_REAL, max_s)
     try:
         yield
@@ -177,17 +177,17 @@ def _place(error: BaseException) -> str:
     return place
 
 
-def _address_space() -> int:
+def _memory() -> list[int]:
+    """Address space and resident part of it, among others, bytes."""
     pages = Path("/proc/self/statm").read_text(encoding="ascii").split()
-    return int(pages[0]) * resource.getpagesize()
+    return [int(count) * resource.getpagesize() for count in pages]
 
 
 def _resident() -> int:
     """Resident bytes now; also lets the peak count from here."""
     with contextlib.suppress(OSError):  # where it may not be reset it only grows: never hides
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-    pages = Path("/proc/self/statm").read_text(encoding="ascii").split()
-    return int(pages[1]) * resource.getpagesize()
+    return _memory()[1]
 
 
 def _peak() -> int:

@@ -94,18 +94,10 @@ def _dive() -> list[tuple[object, ...]]:
     return rows
 
 
-def _ulog(path: Path) -> None:
-    path.write_bytes(ulog(dive(6)))
-
-
 def read_pairing(path: Path) -> object:
     """As `import-images --triggers`."""
     sides = {side: [Path(f"{side}/{k}.jpg") for k in range(5)] for side in ("left", "right")}
     return pair_by_time(sides, path, UTC)
-
-
-def _dataflash(path: Path) -> None:
-    path.write_bytes(dataflash_log(_dive()))
 
 
 def _telemetry(path: Path) -> None:
@@ -231,6 +223,8 @@ _OF_TEXT = (
     ("bollard pull", "pull.csv", _PULLS, read_pulls),
     ("current", "current.csv", _CURRENT, read_current),
 )
+_DATAFLASH = partial(Path.write_bytes, data=dataflash_log(_dive()))
+_ULOG = partial(Path.write_bytes, data=ulog(dive(6)))
 _SQLITE = partial(_bag, storage=StoragePlugin.SQLITE3)
 _VEHICLE_JSON = json.dumps(tomllib.loads(_VEHICLE))
 TARGETS = (
@@ -240,8 +234,8 @@ TARGETS = (
     Target("ROS 2 bag, SQLite", "binary", "bag/bag.db3", _SQLITE, read_any_log),
     Target("ROS 2 bag, metadata", "text", "bag/metadata.yaml", _bag, read_any_log),
     Target("reports of a DVL", "json", "a.json", _dvl(), read_dead_reckoned),
-    Target("ULog", "binary", "a.ulg", _ulog, read_any_log),
-    Target("DataFlash .BIN", "binary", "a.bin", _dataflash, read_any_log),
+    Target("ULog", "binary", "a.ulg", _ULOG, read_any_log),
+    Target("DataFlash .BIN", "binary", "a.bin", _DATAFLASH, read_any_log),
     Target("tlog", "binary", "a.tlog", _telemetry, read_any_log),
     Target("triggers", "csv", "t.csv", _triggers, read_triggers),
     Target("column map", "toml", "map.toml", _column_map, read_foreign),

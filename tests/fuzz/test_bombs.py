@@ -188,10 +188,6 @@ def test_a_polygon_of_a_million_corners(sandbox: Sandbox) -> None:
     assert "corners; at most" in tried(sandbox, "a.geojson", text, areas.read_area)
 
 
-def _ring(text: str) -> str:
-    return f'{{"type": "Polygon", "coordinates": [[{text}]]}}'
-
-
 @pytest.mark.parametrize(
     "text",
     [
@@ -207,7 +203,9 @@ def _ring(text: str) -> str:
     ],
 )  # fmt: skip
 def test_polygons_that_are_none(sandbox: Sandbox, text: str) -> None:
-    looked_at(sandbox, "a.geojson", _ring(text), areas.read_area)
+    looked_at(
+        sandbox, "a.geojson", f'{{"type": "Polygon", "coordinates": [[{text}]]}}', areas.read_area
+    )
 
 
 def _tiff(width: int, height: int, bits: int = 16) -> bytes:

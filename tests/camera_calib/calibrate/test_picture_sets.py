@@ -18,6 +18,10 @@ def test_names_pair_by_their_last_number() -> None:
     )
     assert [one.name for one in sets] == ["07", "10"]
     assert [one.paths["right"].name for one in sets] == ["b_7.png", "b_10.png"]
+    sets = pair_pictures({"camera": paths("a.png", "b.png")})  # one camera needs no pairs
+    assert [(one.name, list(one.paths)) for one in sets] == [("a", ["camera"]), ("b", ["camera"])]
+    with pytest.raises(CalibrationError, match=r"2.*left"):  # lengths differ, no common number
+        pair_pictures({"left": paths("a1.png", "a2.png"), "right": paths("b8.png")})
 
 
 def test_a_missing_partner_leaves_one_camera_alone(capsys: pytest.CaptureFixture[str]) -> None:
@@ -50,11 +54,6 @@ def test_without_common_numbers_the_order_decides(
     )
 
 
-def test_lists_of_other_lengths_without_common_numbers_do_not_pair() -> None:
-    with pytest.raises(CalibrationError, match=r"2.*left"):
-        pair_pictures({"left": paths("a1.png", "a2.png"), "right": paths("b8.png")})
-
-
 def test_pictures_of_four_cameras_pair_where_each_shares_most_with_another(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -85,11 +84,6 @@ def test_the_same_pictures_are_not_two_cameras(tmp_path: Path) -> None:
     (tmp_path / "b" / "7.png").write_bytes(a[1].read_bytes())  # a copy by another name
     with pytest.raises(CalibrationError, match=r"1\.png.*7\.png"):
         check_own({"left": a, "right": find_pictures(str(tmp_path / "b"))})
-
-
-def test_one_camera_needs_no_pairs() -> None:
-    sets = pair_pictures({"camera": paths("a.png", "b.png")})
-    assert [(one.name, list(one.paths)) for one in sets] == [("a", ["camera"]), ("b", ["camera"])]
 
 
 def test_pictures_are_found_in_folders_and_by_patterns(

@@ -186,6 +186,7 @@ def test_a_port_given_in_millimetres_with_cameras_in_air_makes_the_rig(
         ConvertCommand(**files, **port).run()
     ConvertCommand(**files, **port, n_water=1.34).run()
     assert_same_geometry(read_rig(tmp_path / "rig.json"), rig)
+    assert read_rig(tmp_path / "rig.json").body_from_rig is None
     other = {"outer_radius_m": 0.05} if rig is BENT else {"port_distance_m": 0.005}
     shown = refused(tmp_path / "rig.json", tmp_path / "b.json", port=other)
     assert next(iter(other)) in shown and "--drop-port" in shown
@@ -307,18 +308,6 @@ def test_a_name_of_a_camera_cannot_lead_out_of_the_folder(own: Path, tmp_path: P
         shown = refused(own, tmp_path / "deep" / target, target_format=name)
         assert "'../../outside'" in shown
     assert sorted(path.name for path in tmp_path.iterdir()) == ["rig.json"]
-
-
-def test_the_mount_of_foreign_cameras_is_said_to_be_unknown(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    FORMATS["kalibr"].write(tmp_path / "pair.yaml", IN_AIR)
-    convert_files(tmp_path / "pair.yaml", tmp_path / "rig.json")
-    assert "vehicle" in capsys.readouterr().err
-    rig = read_rig(tmp_path / "rig.json")
-    assert rig.body_from_rig is None
-    convert_files(tmp_path / "pair.yaml", tmp_path / "c.yaml", target_format="kalibr")
-    assert "vehicle" not in capsys.readouterr().err
 
 
 def test_formats_are_found_from_files_and_names(tmp_path: Path) -> None:

@@ -29,17 +29,6 @@ def test_what_does_not_exist_is_neither_nan_nor_inf(
     assert ("unlimited" in text) == math.isinf(rows[0].far_altitude_m)
 
 
-@pytest.mark.parametrize(("lens_mm", "fisheye"), [(12.5, False), (7.0, False), (3.0, True)])
-def test_a_lens_wider_than_straight_ones_are_made_is_called_a_fisheye(
-    lens_mm: float, fisheye: bool
-) -> None:
-    """65, 97 and 139 degrees."""
-    rows = fov_table([12.5, lens_mm], [2.0], 1.34, PORT)
-    text = fov_text(rows)
-    assert ("fisheye" in text) == ("139 deg" in text) == fisheye
-    assert f"{rows[1].sure_horizontal_m:.3f} x {rows[1].sure_vertical_m:.3f} m" in text
-
-
 def test_csv_has_each_lens_altitude_speed_and_exposure_once() -> None:
     rows = fov_table([12.5, 25.0], [1.0, 2.0], 1.34, PORT)
     read = fov_csv_rows(rows, blur_table(rows, [0.2, 0.5], [1e-3], 1.0))

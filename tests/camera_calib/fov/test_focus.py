@@ -14,6 +14,7 @@ from camera_calib.fov.focus import FocusedLens, apparent_depths, apparent_distan
 from camera_calib.fov.table import fov_table
 from camera_calib.rig import design_rig
 from tests.cameras import changed
+from tests.oracles_camera import reach_m
 from tests.oracles_fov import traced_blur_px
 
 PORT = CameraConfig()
@@ -69,18 +70,13 @@ def test_line_images_are_where_neighbouring_rays_meet(
     camera = changed(CAMERA, n_water=n_water, port_distance_m=port_m, glass_thickness_m=glass_m)
     a = math.radians(half_angle_deg)
 
-    def reach(angle: float) -> float:
-        sine = math.sin(angle)
-        return (
-            port_m * math.tan(angle)
-            + glass_m * math.tan(math.asin(sine / camera.parameter("n_glass")))
-            + altitude_m * math.tan(math.asin(sine / n_water))
-        )
-
-    slope = (reach(a + 1e-6) - reach(a - 1e-6)) / 2e-6
+    layers = ((port_m, 1.0), (glass_m, camera.parameter("n_glass")), (altitude_m, n_water))
+    slope = (reach_m(a + 1e-6, layers) - reach_m(a - 1e-6, layers)) / 2e-6
     pixel = np.array([[camera.cx_px, camera.cy_px - camera.fy_px * math.tan(a)]])
     depths = apparent_depths(camera, pixel).at(altitude_m)[0] / math.cos(a)
-    assert depths == pytest.approx([slope * math.cos(a), reach(a) / math.sin(a)], rel=1e-6)
+    assert depths == pytest.approx(
+        [slope * math.cos(a), reach_m(a, layers) / math.sin(a)], rel=1e-6
+    )
 
 
 def test_near_the_axis_both_are_the_apparent_distance() -> None:

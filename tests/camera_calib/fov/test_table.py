@@ -16,7 +16,7 @@ from camera_calib.fov.focus import apparent_distance_m
 from camera_calib.fov.table import MATCH_SIGMA_PX, blur_table, fov_table, rig_fov_table
 from camera_calib.rig import Rig, design_rig
 from tests.cameras import changed
-from tests.oracles_camera import project_by_shortest_path
+from tests.oracles_camera import project_by_shortest_path, reach_m
 from tests.oracles_fov import triangulated_depth_sigma_m
 from tests.reconstruct.rig_survey import four_cameras
 
@@ -77,17 +77,12 @@ def test_footprints_behind_a_port_are_those_of_three_tangents(
     port = {"port_distance_m": distance_m, "glass_thickness_m": glass_m, "n_glass": n_glass}
     row = fov_table([lens_mm], [altitude_m], 1.34, PORT.model_copy(update=port))[0]
     layers = ((distance_m, 1.0), (glass_m, n_glass), (altitude_m, 1.34))
-
-    def reach_m(half_mm: float) -> float:
-        sine = math.sin(math.atan(half_mm / lens_mm))
-        return sum(thick * math.tan(math.asin(sine / n)) for thick, n in layers)
-
     halves = np.array([3384, 2710]) * 3.69e-3 / 2
-    seen = (row.horizontal_m, row.vertical_m)
-    assert seen == pytest.approx([2 * reach_m(half) for half in halves], rel=1e-9)
     corner = np.hypot(*halves)
+    along, down, far = (reach_m(math.atan(half / lens_mm), layers) for half in (*halves, corner))
+    assert (row.horizontal_m, row.vertical_m) == pytest.approx((2 * along, 2 * down), rel=1e-9)
     sure = (row.sure_horizontal_m, row.sure_vertical_m)
-    assert sure == pytest.approx(2 * reach_m(corner) * halves / corner, rel=1e-9)
+    assert sure == pytest.approx(2 * far * halves / corner, rel=1e-9)
     assert sure[0] < row.horizontal_m and sure[1] < row.vertical_m
 
 
@@ -132,11 +127,8 @@ def test_depth_precision_near_the_axis_is_n_d_squared_over_f_b(
 
 
 @pytest.mark.parametrize("altitude_m", [0.5, 2.0])
-@pytest.mark.parametrize("kind", ["design", "crooked"])
-def test_depth_precision_is_the_scatter_of_triangulated_points(
-    kind: str, altitude_m: float
-) -> None:
-    rig = crooked_rig() if kind == "crooked" else design_rig(PORT, WaterConfig())
+@pytest.mark.parametrize("rig", [design_rig(PORT, WaterConfig()), crooked_rig()])
+def test_depth_precision_is_the_scatter_of_triangulated_points(rig: Rig, altitude_m: float) -> None:
     row = rig_fov_table(rig, [altitude_m], PORT)[0]
     floor_z = 0.03 * rig.cameras["left"].port.axis_cam[2] + altitude_m
     scatter_m = triangulated_depth_sigma_m(
@@ -156,9 +148,8 @@ def test_a_focused_point_is_sharp_where_its_rays_seem_to_come_from() -> None:
     assert fov_table([12.5], [2.0], 1.34, PORT)[0].focus_air_m == pytest.approx(apparent, rel=1e-6)
 
 
-@pytest.mark.parametrize("kind", ["design", "crooked"])
-def test_overlap_is_the_share_of_random_points_that_both_cameras_see(kind: str) -> None:
-    rig = crooked_rig() if kind == "crooked" else design_rig(PORT, WaterConfig())
+@pytest.mark.parametrize("rig", [design_rig(PORT, WaterConfig()), crooked_rig()])
+def test_overlap_is_the_share_of_random_points_that_both_cameras_see(rig: Rig) -> None:
     first, second = rig.cameras["left"], rig.cameras["right"]
     floor_z = 0.03 * first.port.axis_cam[2] + 1.0
     rng = np.random.default_rng(7)

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.errors import CalibrationError
+from camera_calib.camera import Camera
 from camera_calib.freedom import POSE
 from camera_calib.judge.judgement import anchors_cam
 from camera_calib.judge.uncertainty import (
@@ -26,7 +27,7 @@ from camera_calib.judge.uncertainty import (
 )
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.ports.flat import FlatPort
-from camera_calib.rig import Covariance
+from camera_calib.rig import Covariance, Rig
 from camera_calib.triangulate import reproject, triangulate
 from tests.camera_calib.calibration_scenes import tilted
 from tests.cameras import changed
@@ -42,6 +43,10 @@ from tests.oracles_report import (
 PARAMETERS = (*OpenCVLens.parameters, *FlatPort.parameters)
 
 POINTS = np.array([[0.1, -0.2, 1.0], [-0.3, 0.25, 1.7], [0.02, 0.01, 0.8]])
+
+
+def parts(rig: Rig) -> tuple[list[Camera], list[RigidTransform]]:
+    return list(rig.cameras.values()), list(rig.cam_from_rig.values())
 
 
 @pytest.mark.parametrize("field", [*PARAMETERS, *POSE])
@@ -101,13 +106,8 @@ def test_triangulated_points_and_lengths_err_by_their_sigmas(seed: int) -> None:
     errors = some_errors(usual().rig, seed)
     rig, wrong = with_one_error(usual().rig, errors), moved_rig(usual().rig, errors)
     points = np.array([[0.0, 0.0, 2.0], [0.35, 0.2, 2.0], [-0.3, -0.3, 1.5], [0.1, 0.1, 1.0]])
-    cameras, poses = list(rig.cameras.values()), list(rig.cam_from_rig.values())
 
-    found = triangulate(
-        list(wrong.cameras.values()),
-        list(wrong.cam_from_rig.values()),
-        reproject(cameras, poses, points),
-    ).points_world
+    found = triangulate(*parts(wrong), reproject(*parts(rig), points)).points_world
 
     np.testing.assert_allclose(
         point_sigmas_m(rig, points), np.abs(found - points), rtol=0.05, atol=2e-7
@@ -122,8 +122,7 @@ def test_triangulated_points_and_lengths_err_by_their_sigmas(seed: int) -> None:
 def test_noise_sigmas_are_those_of_the_triangulation() -> None:
     rig = usual().rig
     points = np.array([[0.0, 0.0, 2.0], [0.3, 0.2, 1.4]])
-    pixels = reproject(list(rig.cameras.values()), list(rig.cam_from_rig.values()), points)
-    found = triangulate(list(rig.cameras.values()), list(rig.cam_from_rig.values()), pixels, 0.1)
+    found = triangulate(*parts(rig), reproject(*parts(rig), points), 0.1)
     np.testing.assert_allclose(noise_sigmas_m(rig, points, 0.1), found.sigmas_m, rtol=1e-6)
 
 
