@@ -91,13 +91,15 @@ def _port(draw: st.DrawFn, shape: str) -> PortValues:
     return DomePort(dome_x_m=x / 10, dome_y_m=y / 10, dome_z_m=z, outer_radius_m=radius, **glass)
 
 
-@st.composite
-def poses(draw: st.DrawFn) -> RigidTransform:
-    """A pose of a camera next to another."""
-    turn = [draw(_number(-0.2, 0.2)) for _ in range(3)]
-    sideways = draw(_number(-0.3, -0.02))
-    shift = [sideways, draw(_number(-0.01, 0.01)), draw(_number(-0.01, 0.01))]
-    return RigidTransform.from_components(shift, Rotation.from_rotvec(turn))
+def _pose(
+    x_m: tuple[float, float], aside_m: float, turn: float
+) -> st.SearchStrategy[RigidTransform]:
+    """Poses of a camera next to another, or of a rig; turns in radians about each axis."""
+    axes = [_number(-turn, turn)] * 3
+    place = st.tuples(_number(*x_m), *[_number(-aside_m, aside_m)] * 2)
+    return st.builds(
+        RigidTransform.from_components, place, st.tuples(*axes).map(Rotation.from_rotvec)
+    )
 
 
 @st.composite
@@ -115,15 +117,11 @@ def rigs(
     names = ["left", "right", "third"][:count]
     kinds = {"lenses": lenses, "ports": ports, "size": not one_size}
     each = [draw(cameras(terms, **kinds)) for _ in names]  # type: ignore[arg-type]
-    rest = [draw(poses()) for _ in names[1:]]
-    mount = RigidTransform.from_components(
-        [draw(_number(-1, 1)) for _ in range(3)],
-        Rotation.from_rotvec([draw(_number(-1.5, 1.5)) for _ in range(3)]),
-    )
+    rest = [draw(_pose((-0.3, -0.02), 0.01, 0.2)) for _ in names[1:]]
     return Rig(
         cameras=dict(zip(names, each, strict=True)),
         cam_from_rig=dict(zip(names, [RigidTransform.identity(), *rest], strict=True)),
-        body_from_rig=mount,
+        body_from_rig=draw(_pose((-1, 1), 1, 1.5)),
         source="drawn",
     )
 

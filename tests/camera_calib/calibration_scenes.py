@@ -71,6 +71,14 @@ def with_values(rig: Rig, values: Mapping[str, float]) -> Rig:
     return replace(rig, cameras=cameras)
 
 
+def seen_in(rig: Rig, pose: RigidTransform, points: Array) -> dict[str, Array]:
+    """Pixels of points of a target in each camera of a rig."""
+    return {
+        name: camera.project((rig.cam_from_rig[name] * pose).apply(points))
+        for name, camera in rig.cameras.items()
+    }
+
+
 def board_poses(
     rig: Rig,
     count: int,
@@ -89,9 +97,7 @@ def board_poses(
         turn = Rotation.from_rotvec(np.deg2rad(rng.uniform(-tilt_deg, tilt_deg, 3)))
         place = first.at_depth(rng.uniform(0.15, 0.85, 2) * size, rng.uniform(near_m, far_m))
         pose = RigidTransform.from_components(place - turn.apply(points.mean(axis=0)), turn)
-        pixels = [rig.cameras[n].project((rig.cam_from_rig[n] * pose).apply(points))
-                  for n in rig.cameras]  # fmt: skip
-        if all(np.all((p > 5) & (p < size - 5)) for p in pixels):
+        if all(np.all((p > 5) & (p < size - 5)) for p in seen_in(rig, pose, points).values()):
             poses.append(pose)
     return RigidTransform.concatenate(poses)
 
@@ -112,9 +118,9 @@ def views_of_some(
         place = camera.at_depth(pixel, rng.uniform(0.45, 1.4)) - turn.apply(points.mean(axis=0))
         pose = rig.cam_from_rig[name].inv() * RigidTransform.from_components(place, turn)
         whole = {}
-        for n, one in rig.cameras.items():
-            pixels = one.project((rig.cam_from_rig[n] * pose).apply(points))
-            if np.all((pixels > 15) & (pixels < [one.width_px - 15, one.height_px - 15])):
+        for n, pixels in seen_in(rig, pose, points).items():
+            size = np.array([rig.cameras[n].width_px, rig.cameras[n].height_px])
+            if np.all((pixels > 15) & (pixels < size - 15)):
                 whole[n] = pixels
         if name in whole and len(whole) >= 2:
             views.append((pose, whole))
@@ -132,9 +138,8 @@ def views_of(
         TargetView(
             name=f"{v:02d}",
             pixels={
-                name: camera.project((rig.cam_from_rig[name] * poses[v]).apply(points))
-                + rng.normal(0.0, noise_px, (len(points), 2))
-                for name, camera in rig.cameras.items()
+                name: pixels + rng.normal(0.0, noise_px, pixels.shape)
+                for name, pixels in seen_in(rig, poses[v], points).items()
             },
         )
         for v in range(len(poses))

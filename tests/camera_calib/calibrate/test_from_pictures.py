@@ -84,6 +84,10 @@ def real(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[P
     return out, *calibrate_pictures(replace(settings, output=out), executor=SERIAL)
 
 
+def corner_rows(folder: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader((folder / "corners.csv").read_text().splitlines()))
+
+
 def test_a_real_stereo_set(real: tuple[Path, str, Any]) -> None:
     """OpenCV's own calibration of the set has 0.215 px and 3.327 squares."""
     folder, _, found = real
@@ -97,9 +101,7 @@ def test_a_real_stereo_set(real: tuple[Path, str, Any]) -> None:
     assert 1e-4 < rig.sigmas["right.x_m"] < 5e-3
 
     # OpenCV's own definition of the rms, from the file of corners.
-    with (folder / "corners.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    used = [row for row in rows if float(row["weight"]) > 0]
+    used = [row for row in corner_rows(folder) if float(row["weight"]) > 0]
     square = [float(r["residual_x_px"]) ** 2 + float(r["residual_y_px"]) ** 2 for r in used]
     assert np.sqrt(np.mean(square)) == pytest.approx(found["rms_px"], abs=1e-5)
     assert len(used) == found["points"]
@@ -112,10 +114,9 @@ def test_opencv_agrees_on_the_real_set(real: tuple[Path, str, Any]) -> None:
     folder, _, found = real
     rig = read_rig(folder / "rig.json")
     seen: dict[tuple[str, str], np.ndarray] = {}
-    with (folder / "corners.csv").open() as file:
-        for row in csv.DictReader(file):
-            pixels = seen.setdefault((row["view"], row["camera"]), np.full((54, 2), np.nan))
-            pixels[int(row["point"])] = float(row["x_px"]) - 0.5, float(row["y_px"]) - 0.5
+    for row in corner_rows(folder):
+        pixels = seen.setdefault((row["view"], row["camera"]), np.full((54, 2), np.nan))
+        pixels[int(row["point"])] = float(row["x_px"]) - 0.5, float(row["y_px"]) - 0.5
     points = parse_target(BOARD).points.astype(np.float32)
     names = sorted({view for view, _ in seen})
     whole = [n for n in names if all(np.isfinite(seen[n, c]).all() for c in ("left", "right"))]

@@ -140,9 +140,8 @@ def corner_errors(path: Path, truth: Rig, poses: list[RigidTransform]) -> Array:
     """(V, 2, 144, 2) measured minus true pixels of the corners that the calibration used."""
     true = true_pixels(truth, poses)
     off = np.full(true.shape, np.nan)
-    with path.open() as file:
-        for row in csv.DictReader(file):
-            if float(row["weight"]) > 0.0:
-                at = int(row["view"]), list(truth.cameras).index(row["camera"]), int(row["point"])
-                off[at] = np.array([float(row["x_px"]), float(row["y_px"])]) - true[at]
+    for row in csv.DictReader(path.read_text().splitlines()):
+        if float(row["weight"]) > 0.0:
+            at = int(row["view"]), list(truth.cameras).index(row["camera"]), int(row["point"])
+            off[at] = np.array([float(row["x_px"]), float(row["y_px"])]) - true[at]
     return off

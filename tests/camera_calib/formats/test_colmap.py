@@ -155,7 +155,7 @@ def test_a_rig_configuration_without_cameras_takes_them_in_order_and_says_so(
     assert "CAMERA_ID" in capsys.readouterr().err
 
 
-def test_the_forks_text_is_a_line_of_lens_and_port(tmp_path: Path) -> None:
+def test_the_forks_files_hold_lens_and_port_of_each_camera(tmp_path: Path) -> None:
     rig = pair(WET)
     write_refractive(tmp_path, rig)
     lines = (tmp_path / "cameras.txt").read_text().splitlines()
@@ -171,11 +171,9 @@ def test_the_forks_text_is_a_line_of_lens_and_port(tmp_path: Path) -> None:
     assert config["cameras"][1]["camera_id"] == 2
     x, y, z, w = rig.cam_from_rig["right"].rotation.as_quat()
     assert config["cameras"][1]["cam_from_rig_rotation"] == pytest.approx([w, x, y, z], abs=1e-15)
-
-
-def test_the_forks_binary_has_the_port_after_each_lens(tmp_path: Path) -> None:
-    write_refractive(tmp_path / "cameras.bin", pair(WET))
-    content = (tmp_path / "cameras.bin").read_bytes()
+    # The binary file has the port after each lens.
+    (binary, *_) = write_refractive(tmp_path / "binary" / "cameras.bin", rig)
+    content = binary.read_bytes()
     assert struct.unpack_from("<QIiQQ", content) == (2, 1, 1, 1920, 1200)
     assert struct.unpack_from("<4di8d", content, 32) == (
         705.5, 705.25, 963.5, 604.75, 0, 0.6, 0.0, 0.8, 0.025, 0.01, 1.0, 1.49, 1.333,
@@ -202,12 +200,9 @@ def test_the_fork_may_leave_a_camera_without_port(tmp_path: Path) -> None:
     assert detect(binary).name == "refractive"
     assert read_colmap(binary, ReadOptions(camera="1")).cameras["1"].n_water == 1.33
     assert read_colmap(binary, ReadOptions(camera="2")).cameras["2"] == dry
-
-
-def test_an_index_of_air_divides_the_others(tmp_path: Path) -> None:
-    path = tmp_path / "cameras.txt"
-    path.write_text("1 PINHOLE 9 8 5 6 4 3 FLATPORT 0 0 1 0.02 0.01 1.25 1.5 1.5\n")
-    camera = read_colmap(path, ReadOptions()).cameras["1"]
+    # An index of air divides the others.
+    text.write_text("1 PINHOLE 9 8 5 6 4 3 FLATPORT 0 0 1 0.02 0.01 1.25 1.5 1.5\n")
+    camera = read_colmap(text, ReadOptions()).cameras["1"]
     assert (camera.parameter("n_glass"), camera.n_water) == (1.2, 1.2)
 
 

@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given, settings
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.core.errors import CalibrationError
 from camera_calib.formats.opencv import read_opencv, write_opencv
 from camera_calib.formats.rigs import ReadOptions
 from camera_calib.lenses.fisheye import FisheyeLens
@@ -102,10 +101,8 @@ def test_opencvs_sample_calibration_of_one_camera_is_read(shared_data: Path) -> 
 
 def test_opencvs_sample_of_a_pair_asks_for_what_it_lacks(shared_data: Path, tmp_path: Path) -> None:
     path = shared_data / "opencv_stereo" / "intrinsics.yml"
-    with pytest.raises(CalibrationError, match="--image-size"):
-        read_opencv(path, ReadOptions())
-    with pytest.raises(CalibrationError, match="--extrinsics"):
-        read_opencv(path, ReadOptions(image_size=(640, 480)))
+    assert "--image-size" in fault(path)
+    assert "--extrinsics" in fault(path, None, ReadOptions(image_size=(640, 480)))
 
     pose = write(
         tmp_path / "extrinsics.yml",
@@ -118,12 +115,8 @@ def test_opencvs_sample_of_a_pair_asks_for_what_it_lacks(shared_data: Path, tmp_
     assert rig.baseline_m == pytest.approx(3.33 * 0.025, abs=1e-15)
     assert list(rig.cameras) == ["left", "right"]
     assert rig.cameras["right"].parameter("k1") == -0.16916358306948096
-
-
-def test_a_list_of_pictures_is_no_calibration(shared_data: Path) -> None:
-    path = shared_data / "opencv_stereo" / "stereo_calib.xml"
-    with pytest.raises(CalibrationError, match=r"stereo_calib\.xml.*camera_matrix"):
-        read_opencv(path, ReadOptions())
+    # A list of pictures is no calibration.
+    assert "camera_matrix" in fault(shared_data / "opencv_stereo" / "stereo_calib.xml")
 
 
 @pytest.mark.parametrize(
@@ -208,5 +201,4 @@ def test_no_entity_of_xml_is_ever_seen_by_the_parser(
     fault(tmp_path / "deep.yml", "%YAML:1.0\n---\na: " + "[" * 6000)
     assert "1 MiB" in fault(tmp_path / "long.yml", "#" * (1 << 20) + "\n")
     (tmp_path / "wide.xml").write_bytes('<?xml version="1.0"?><!DOCTYPE a>'.encode("utf-16"))
-    with pytest.raises(CalibrationError, match="UTF-8"):
-        read_opencv(tmp_path / "wide.xml", ReadOptions())
+    assert "UTF-8" in fault(tmp_path / "wide.xml")

@@ -13,7 +13,6 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.core.errors import CalibrationError
 from camera_calib.formats.convert import detect
 from camera_calib.formats.rigs import ReadOptions, only
 from camera_calib.formats.yaml_files import read_ros, write_ros
@@ -158,5 +157,4 @@ def test_faults_name_file_and_key(tmp_path: Path) -> None:
     (folder / "b.yaml").write_text(
         moved.replace("prosilica", "other").replace("[1, 0, 0, 0, 1", "[1, 0, 0, 0, 3")
     )
-    with pytest.raises(CalibrationError, match=r"b\.yaml: rectification_matrix"):
-        read_ros(folder, ReadOptions())
+    assert "b.yaml: rectification_matrix" in fault(folder)
