@@ -19,12 +19,13 @@ from alice_survey.core.frames import Array
 from benchmarks.camera_calibration import cramer_rao
 from camera_calib.calibrate.from_pictures import calibrate_pictures
 from camera_calib.calibrate.options import CalibrateOptions
+from camera_calib.camera import Camera
 from camera_calib.freedom import Freedom, intrinsics, of_cameras, pose_names
 from camera_calib.rig import Rig, read_rig
 from camera_calib.target_shape import usual_shape
 from camera_calib.targets.target import parse_target
 from tests.camera_calib.calibration_scenes import differences
-from tests.oracles_targets import light_through, to_srgb
+from tests.oracles_targets import picture_light, to_srgb
 from tests.strategies_formats import DATA
 
 TARGET = parse_target("apriltag 6x6 88mm 0.3")
@@ -79,6 +80,20 @@ def poses_before(stereo: Stereo, rng: np.random.Generator) -> list[RigidTransfor
     return poses
 
 
+def light_of(camera: Camera, cam_from_target: RigidTransform) -> Array:
+    """(H, W) of the grid, seen through a lens."""
+    matrix = cam_from_target.as_matrix()[:3, [0, 1, 3]]
+
+    def tangents(pixels: Array) -> Array:
+        rays = camera.unproject(pixels)[1]
+        ahead = np.where(rays[:, 2:] > 0.0, rays[:, 2:], np.nan)
+        found: Array = rays[:, :2] / ahead
+        return found
+
+    size = (camera.width_px, camera.height_px)
+    return picture_light(TARGET, matrix, size, fine=10, warp=tangents)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RIGS)
 def test_tag_pictures_calibrate_to_their_bound(
@@ -94,10 +109,7 @@ def test_tag_pictures_calibrate_to_their_bound(
     stereo, rng = RIGS[name], np.random.default_rng(1)
     truth, poses = stereo.rig, poses_before(stereo, rng)
     light = [
-        {
-            n: light_through(TARGET, c, (truth.cam_from_rig[n] * pose).inv(), 10)
-            for n, c in truth.cameras.items()
-        }
+        {n: light_of(c, truth.cam_from_rig[n] * pose) for n, c in truth.cameras.items()}
         for pose in poses
     ]
     freedom = Freedom(free=(*of_cameras(truth, intrinsics(stereo.model)), *pose_names(truth)))
