@@ -83,25 +83,17 @@ def test_a_full_disk_is_reported_and_the_same_command_goes_on(disk: Path) -> Non
     assert str(disk) in plan(disk, code=1)
 
 
-def _holder(workspace: Path) -> subprocess.Popen[str]:
-    """Another process that works in the workspace until it is killed."""
+def test_a_second_process_is_refused_and_a_crash_leaves_no_lock_behind(tmp_path: Path) -> None:
+    init_survey(tmp_path, "demo.toml")
     code = (
         "import sys, time; from pathlib import Path\n"
         "from alice_survey.app.pipeline import only_one\n"
         "with only_one(Path(sys.argv[1])): print('held', flush=True); time.sleep(600)"
     )
-    process = subprocess.Popen(
-        [sys.executable, "-c", code, str(workspace)], stdout=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None
-    assert process.stdout.readline() == "held\n"
-    return process
-
-
-def test_a_second_process_is_refused_and_a_crash_leaves_no_lock_behind(tmp_path: Path) -> None:
-    init_survey(tmp_path, "demo.toml")
-    holder = _holder(tmp_path)
+    holder = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE)
     try:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == b"held\n"
         assert str(tmp_path) in plan(tmp_path, code=1)
         assert not (tmp_path / "plan").exists()
     finally:

@@ -62,11 +62,15 @@ def test_meshes_lie_on_the_true_surface_and_face_the_water() -> None:
         assert np.median(outside) > 0.5e-3, item.name
 
 
+def on_sphere(rng: np.random.Generator, count: int) -> Array:
+    points = rng.normal(size=(count, 3))
+    return np.asarray(points / np.linalg.norm(points, axis=1, keepdims=True))
+
+
 def test_the_distance_from_an_ellipsoid_is_that_to_the_nearest_of_many_points() -> None:
     solid = Ellipsoid(name="boulder", centre=(1, 2, 3), semi_axes=(0.3, 0.2, 0.1), heading_deg=25)
     rng = np.random.default_rng(0)
-    ball = rng.normal(size=(200_000, 3))
-    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    ball = on_sphere(rng, 200_000)
     turn = Rotation.from_euler("Z", 25, degrees=True)
     surface = turn.apply(ball * solid.semi_axes) + np.asarray(solid.centre)
     points = rng.uniform(-0.5, 0.5, (60, 3)) + np.asarray(solid.centre)
@@ -122,7 +126,7 @@ def test_a_rung_hides_the_wall_behind_it() -> None:
     np.testing.assert_array_equal(instants_that_see(points, facing, [(camera, poses)]), [0, 3])
 
 
-def test_a_perfect_cloud_is_complete_and_without_error(truth: Truth) -> None:
+def test_a_perfect_cloud_is_complete_and_what_is_missing_counts(truth: Truth) -> None:
     sigma = np.full(len(truth.samples), 1e-3)
     score = score_points(truth.samples, sigma, truth)
     assert score["all"]["rms_mm"] < 0.02
@@ -130,6 +134,12 @@ def test_a_perfect_cloud_is_complete_and_without_error(truth: Truth) -> None:
     found = completeness(points_near(truth.samples, truth), truth)
     assert found["two or more instants"]["complete"] == 1.0
     assert found["wall"]["area_m2"] > 2.0
+    part = distances(truth.samples)[1]
+    near = points_near(truth.samples[part != PARTS.index("ladder")], truth)
+    found = completeness(near, truth)
+    assert found["ladder"]["complete"] < 0.05
+    assert found["wall"]["complete"] == 1.0
+    assert completeness(points_near(truth.samples[:0], truth), truth)["wall"]["complete"] == 0.0
 
 
 def test_a_shifted_cloud_errs_by_the_shift(truth: Truth) -> None:
@@ -144,15 +154,6 @@ def test_a_shifted_cloud_errs_by_the_shift(truth: Truth) -> None:
     assert score["wall"]["over_sigma_robust"] == pytest.approx(2.0 * 1.4826, rel=0.02)
     assert score["wall"]["beyond_5_sigma"] == 0.0
     assert score["60 to 100 deg"]["rms_mm"] > 3.0 > score["0 to 27 deg"]["rms_mm"]
-
-
-def test_what_is_missing_counts_as_missing(truth: Truth) -> None:
-    part = distances(truth.samples)[1]
-    near = points_near(truth.samples[part != PARTS.index("ladder")], truth)
-    found = completeness(near, truth)
-    assert found["ladder"]["complete"] < 0.05
-    assert found["wall"]["complete"] == 1.0
-    assert completeness(points_near(truth.samples[:0], truth), truth)["wall"]["complete"] == 0.0
 
 
 def test_an_overhang_needs_both_of_its_surfaces() -> None:
@@ -181,8 +182,7 @@ def test_points_on_a_fish_are_found_and_kept_apart(truth: Truth) -> None:
     rng = np.random.default_rng(3)
     at = time_of(5)
     fish = FISH[1]
-    ball = rng.normal(size=(1000, 3))
-    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    ball = on_sphere(rng, 1000)
     points = fish.turn(at).apply(ball * fish.semi_axes) + fish.place(at)
     assert np.abs(moving_distance(points, at)[0]).max() < 1e-9
     cloud = np.concatenate([truth.samples, points])

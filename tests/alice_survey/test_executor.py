@@ -18,6 +18,7 @@ import pytest
 from alice_survey.core.errors import AliceError, keep_warnings, note, warn
 from alice_survey.core.executor import SERIAL, Executor, local_executor
 from alice_survey.core.run import progress
+from tests.alice_survey.app.studio.client import until
 from tests.engines import PicklingThreads
 
 WORKERS = """
@@ -58,11 +59,7 @@ def test_kept_workers_are_the_same_from_call_to_call_and_end_with_their_block() 
         third = set(started.map(_process, range(8), label="ids"))
     assert len(first) == 2
     assert first == second == third
-    for _ in range(100):
-        if not any(Path(f"/proc/{pid}").exists() for pid in first):
-            break
-        time.sleep(0.1)
-    assert not any(Path(f"/proc/{pid}").exists() for pid in first)
+    until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in first), 10.0)
     assert set(local_executor(2).map(_process, range(8), label="ids")).isdisjoint(first)
 
 
@@ -155,19 +152,11 @@ def test_workers_die_with_a_killed_parent(tmp_path: Path) -> None:
     parent = subprocess.Popen(
         [sys.executable, str(tmp_path / "workers.py"), str(seen), str(tmp_path)]
     )
-    for _ in range(300):
-        if len(list(seen.iterdir())) == 2:
-            break
-        time.sleep(0.1)
+    until(lambda: len(list(seen.iterdir())) == 2, 30.0)
     pids = [int(path.name) for path in seen.iterdir()]
-    assert len(pids) == 2
     parent.send_signal(signal.SIGKILL)
     parent.wait()
-    for _ in range(50):
-        if not any(psutil.pid_exists(pid) and _runs(pid) for pid in pids):
-            return
-        time.sleep(0.1)
-    pytest.fail("workers outlive their parent")
+    until(lambda: not any(psutil.pid_exists(pid) and _runs(pid) for pid in pids), 5.0)
 
 
 def _runs(pid: int) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 from shapely.geometry import MultiPolygon, box
 
 from alice_survey.core.config import SurveyConfig, parse_config
-from alice_survey.core.frames import Datum
+from alice_survey.core.frames import Array, Datum
 from alice_survey.sim.seafloor.terrain import Terrain, survey_terrain
 from alice_survey.sim.vehicle.sea import FloorGrid, level_floor
 from camera_calib.rig import design_rig
@@ -107,6 +107,13 @@ def flown(
     """A plan flown over a floor, level at 6 m if there is none."""
     rng = np.random.default_rng(seed)
     return simulate_plan(plan, flight_settings(config), floor or level_floor(6.0), rng)
+
+
+def off_stations_m(flight: Flight, glass_ned: Array) -> Array:
+    """How far the glass is from each station of the plan when its picture is taken, (S,)."""
+    taken = [np.interp(flight.trigger_s, flight.truth.time_s, axis) for axis in glass_ned[:, :2].T]
+    planned_ne = np.vstack([line.stations_ne for line in flight.plan.lines])
+    return np.asarray(np.linalg.norm(np.transpose(taken) - planned_ne, axis=1))
 
 
 def terrain_of(config: SurveyConfig, plan: Plan) -> Terrain:

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from alice_survey.core.config import SurveyConfig, parse_config
+from alice_survey.core.config import SurveyConfig
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.pilot.memory import REASONS, TOO_LOW
 from alice_survey.sim.vehicle.sea import FloorGrid, floor_depth
 from alice_survey.sim.vehicle.vehicle import vehicle_from
 from missions.values.flight import Flight
 from missions.values.plan_file import Plan
+from tests.missions import flown_plans
 from tests.missions.flown_plans import flown, planned
 
 MIN_M = 1.0
@@ -25,15 +26,9 @@ AT_M = np.arange(-15.0, 15.05, 0.1)
 
 
 def survey(*silent_s: tuple[float, float]) -> SurveyConfig:
-    return parse_config(
-        {
-            "area": {
-                "length_m": 6.0, "width_m": 1.0, "heading_deg": 0.0, "seafloor_depth_m": DEPTH_M,
-            },
-            "navigation": {"dvl_dropouts_s": [list(span) for span in silent_s]},
-        },
-        "test",
-    )  # fmt: skip
+    area = {"length_m": 6.0, "width_m": 1.0, "heading_deg": 0.0, "seafloor_depth_m": DEPTH_M}
+    silent = {"dvl_dropouts_s": [list(span) for span in silent_s]}
+    return flown_plans.survey(area=area, sea={}, navigation=silent)
 
 
 @lru_cache

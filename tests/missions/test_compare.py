@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from alice_survey.app.cli.main import app
 from alice_survey.core.artefacts import read_csv
-from alice_survey.core.config import SurveyConfig, change_section, parse_config
+from alice_survey.core.config import SurveyConfig, change_section
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.executor import SERIAL
 from alice_survey.sim.vehicle import vehicle as files
@@ -34,6 +34,7 @@ from missions.fly.compare import (
 from missions.fly.simulation import flight_settings, mission_setup, with_values
 from missions.values.flight import Flight
 from missions.values.plan_file import Plan
+from tests.missions import flown_plans
 from tests.missions.flown_plans import planned
 from tests.oracles_guidance import los_offset_m
 
@@ -44,14 +45,9 @@ Flights = dict[str, tuple[Setup, Flown, Flight]]
 
 
 def survey(length_m: float, width_m: float, **sea: object) -> SurveyConfig:
-    return parse_config(
-        {
-            "area": {"length_m": length_m, "width_m": width_m, "seafloor_depth_m": 6.0},
-            "plan": {"line_spacing_m": 1.0, "line_heading_deg": 0.0, "cross_lines": 0},
-            "sea": {"gust_n": [0.5, 0.5, 0.0], **sea},
-        },
-        "test",
-    )
+    area = {"length_m": length_m, "width_m": width_m}
+    plan = {"line_spacing_m": 1.0, "line_heading_deg": 0.0, "cross_lines": 0}
+    return flown_plans.survey(area=area, plan=plan, sea={"gust_n": [0.5, 0.5, 0.0], **sea})
 
 
 CONFIG = survey(3.0, 2.0)

@@ -27,7 +27,7 @@ from missions.fly.simulation import (
     whole_route,
 )
 from missions.values.flight import Flight
-from tests.missions.flown_plans import flown, plan_of, survey, walk
+from tests.missions.flown_plans import flown, off_stations_m, plan_of, survey, walk
 
 FIRST = walk(
     (0.0, 0.0), 0.0,
@@ -88,11 +88,7 @@ def test_all_dives_are_flown_in_one_mission_from_home_to_home(flight: Flight) ->
     found = summary(flight)
     assert (found["dives"], found["stations_planned"]) == (2, 18)
     # Pictures are in their places, at a line that ends in a stop too.
-    planned = np.vstack([line.stations_ne for line in PLAN.lines])
-    time_s, ne = flight.truth.time_s, flight.believed_glass_ned[:, :2]
-    taken = np.transpose([np.interp(flight.trigger_s, time_s, axis) for axis in ne.T])
-    off = np.linalg.norm(taken - planned, axis=1)
-    assert 0.001 < off.max() < 0.15
+    assert 0.001 < off_stations_m(flight, flight.believed_glass_ned).max() < 0.15
 
 
 def test_stops_are_made_where_they_are_planned(flight: Flight) -> None:

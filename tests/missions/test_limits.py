@@ -4,23 +4,20 @@ import math
 
 import pytest
 
-from alice_survey.core.config import SurveyConfig, parse_config
+from alice_survey.core.config import SurveyConfig
 from camera_calib.rig import design_rig
 from missions.exports.format import Export, options_of
 from missions.values.costs import SETTLE_S
 from missions.values.plan_file import Plan
-from tests.missions.flown_plans import flown, planned
+from tests.missions.flown_plans import flown, planned, survey
+
+AREA = {"length_m": 9.0, "width_m": 3.0}
 
 
 def _survey(limit_deg_s: float) -> SurveyConfig:
-    return parse_config(
-        {
-            "area": {"length_m": 9.0, "width_m": 3.0, "seafloor_depth_m": 6.0},
-            "plan": {"turns": "spot", "turn_rate_limit_deg_s": limit_deg_s},
-            "sea": {"current_mps": 0.05, "current_sigma_mps": 0.0, "gust_n": [0.0, 0.0, 0.0]},
-        },
-        "test",
-    )
+    plan = {"turns": "spot", "turn_rate_limit_deg_s": limit_deg_s}
+    sea = {"current_mps": 0.05, "current_sigma_mps": 0.0, "gust_n": [0.0, 0.0, 0.0]}
+    return survey(area=AREA, plan=plan, sea=sea)
 
 
 def _turned_rad(plan: Plan) -> float:
@@ -61,15 +58,9 @@ def test_no_go_zones_are_compared_with_the_vehicles_own_hull(
     square = [[4.0, 1.0], [5.0, 1.0], [5.0, 2.0], [4.0, 2.0]]
 
     def warned(clearance_m: float) -> bool:
-        values = {
-            "area": {
-                "length_m": 9.0, "width_m": 3.0, "seafloor_depth_m": 6.0,
-                "no_go_ne_m": [square], "no_go_clearance_m": clearance_m,
-            },
-            "vehicle": {"name": name, "controller": "los"},
-        }  # fmt: skip
+        area = {**AREA, "no_go_ne_m": [square], "no_go_clearance_m": clearance_m}
         capsys.readouterr()
-        planned(parse_config(values, "test"))
+        planned(survey(area=area, sea={}, vehicle={"name": name, "controller": "los"}))
         return "no_go_clearance_m" in capsys.readouterr().err
 
     assert warned(reach_m - 0.01)

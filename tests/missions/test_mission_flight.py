@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from alice_survey.core.config import SurveyConfig, change_section, parse_config
+from alice_survey.core.config import SurveyConfig, change_section
 from alice_survey.core.errors import PlanError, VehicleError
 from alice_survey.core.frames import Datum
 from alice_survey.sim.vehicle.pilot.gains import gains_for
@@ -35,7 +35,7 @@ from missions.fly.simulation import (
 from missions.route.energy import planned_vehicle
 from missions.values.flight import Flight
 from missions.values.plan_file import Plan
-from tests.missions.flown_plans import plan_of, planned, walk
+from tests.missions.flown_plans import plan_of, planned, survey, walk
 from tests.refusals import refused
 
 FILES = {
@@ -46,18 +46,10 @@ FILES = {
 def calm(**changes: Any) -> SurveyConfig:
     """A survey without gusts, and navigation all but exact."""
     sea = {"current_mps": 0.0, "current_sigma_mps": 0.0, "gust_n": (0.0, 0.0, 0.0)}
-    return parse_config(
-        {
-            "area": {"length_m": 6.0, "width_m": 3.0, "seafloor_depth_m": 6.0},
-            "navigation": {
-                "gps_bias_m": 0.0, "compass_bias_deg": 0.0,
-                "compass_noise_deg": 0.01, "usbl_noise_m": 0.01, "dvl_noise_mps": 1e-4,
-            },
-            **changes,
-            "sea": sea | changes.get("sea", {}),
-        },
-        "test",
-    )  # fmt: skip
+    biases = {"gps_bias_m": 0.0, "compass_bias_deg": 0.0}
+    noises = {"compass_noise_deg": 0.01, "usbl_noise_m": 0.01, "dvl_noise_mps": 1e-4}
+    sections = {**changes, "sea": sea | changes.get("sea", {})}
+    return survey(area={"length_m": 6.0, "width_m": 3.0}, navigation=biases | noises, **sections)
 
 
 def rig_of(config: SurveyConfig) -> Rig:

@@ -26,7 +26,7 @@ from missions.fly.simulation import current_of
 from missions.values.flight import Flight, rms
 from missions.values.plan_file import Plan
 from tests.missions import flown_plans
-from tests.missions.flown_plans import flown, planned
+from tests.missions.flown_plans import flown, off_stations_m, planned
 
 RIG = design_rig(CameraConfig(), WaterConfig())
 
@@ -76,13 +76,8 @@ def test_every_station_is_taken_once_and_in_its_place(flight: Flight) -> None:
     assert flight.trigger_line == tuple(
         i for i, line in enumerate(plan.lines) for _ in range(line.stations)
     )
-    planned = np.vstack([line.stations_ne for line in plan.lines])
     for glass in (flight.believed_glass_ned, flight.glass_ned):
-        taken = np.column_stack(
-            [np.interp(flight.trigger_s, flight.truth.time_s, axis) for axis in glass[:, :2].T]
-        )
-        off = np.linalg.norm(taken - planned, axis=1)
-        assert 0.001 < off.max() < 0.2
+        assert 0.001 < off_stations_m(flight, glass).max() < 0.2
 
 
 def test_altitude_is_held_over_a_slope() -> None:

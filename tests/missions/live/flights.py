@@ -90,6 +90,10 @@ class LoopFlight:
         down = float(turn.apply([0.0, 0.0, 1.0])[2])
         return float(FLOOR_M - self.truth[2] - turn.apply(place)[2]) / down
 
+    def ticks(self, count: int, **spoilt: Any) -> None:
+        for _ in range(count):
+            self.tick(**spoilt)
+
     def tick(self, *, odometry: Odometry | str = "true", altitude: bool = True) -> None:
         """A tick: `odometry` may be another, or "none"."""
         self.vehicle.sense()

@@ -45,8 +45,7 @@ def following() -> LoopFlight:
     """A vehicle that follows its first line."""
     flight = LoopFlight()
     flight.until("follow")
-    for _ in range(100):
-        flight.tick()
+    flight.ticks(100)
     assert flight.command.state == LinkState.FLYING
     assert np.abs(flight.command.rps).max() > 1.0
     return flight
@@ -84,8 +83,7 @@ def test_odometry_that_returns_is_flown_by_again(following: LoopFlight) -> None:
 
 def test_lost_odometry_ends_at_the_surface(following: LoopFlight) -> None:
     began = following.truth[2]
-    for _ in range(10 + GRACE_TICKS + 5):
-        following.tick(odometry="none")
+    following.ticks(10 + GRACE_TICKS + 5, odometry="none")
     assert following.command.state == LinkState.GIVEN_UP
     assert following.command.wrench[2] < -5.0
     assert not np.any(following.command.wrench[[0, 1, 3, 4, 5]])
@@ -187,7 +185,6 @@ def test_thruster_that_stands_still_is_found(following: LoopFlight) -> None:
 def test_drift_leaves_the_thrusters_off() -> None:
     flight = LoopFlight(on_loss="drift")
     flight.until("follow")
-    for _ in range(10 + GRACE_TICKS + 200):
-        flight.tick(odometry="none")
+    flight.ticks(10 + GRACE_TICKS + 200, odometry="none")
     assert flight.command.state == LinkState.GIVEN_UP
     assert is_off(flight)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from alice_survey.core.errors import NavigationError
 from alice_survey.core.frames import Datum
@@ -80,13 +81,10 @@ def local(at_us: int, ned: Any, velocity: Any, valid: bool = True) -> tuple[Any,
 def dive(count: int = 50) -> list[tuple[Any, ...]]:
     """North by 0.5 m/s and down by 0.1 m/s; rolled to starboard by 10 degrees, heading east."""
     records = [gps(BOOT_US, 2), gps(BOOT_US), gps(BOOT_US + 1000)]
+    q = Rotation.from_euler("ZX", [90.0, 10.0], degrees=True).as_quat(scalar_first=True)
     for i in range(count):
         at = BOOT_US + 2_000_000 + 100_000 * i
         records.append(local(at, (0.05 * i, 1.0, 2.0 + 0.01 * i), (0.5, 0.0, 0.1)))
-        # A right-handed turn of 90 degrees about down, then one of 10 degrees about forward.
-        east, roll = np.deg2rad(90.0) / 2, np.deg2rad(10.0) / 2
-        q = (np.cos(east) * np.cos(roll), np.cos(east) * np.sin(roll),
-             np.sin(east) * np.sin(roll), np.sin(east) * np.cos(roll))  # fmt: skip
         records.append(("vehicle_attitude", 0, at, *q))
         records.append(("distance_sensor", 0, at, 0.2, 50.0, 3.0, 100, 25))
         records.append(("distance_sensor", 1, at + 10, 0.2, 50.0, 9.0, 100, 0))
