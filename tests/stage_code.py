@@ -101,11 +101,10 @@ def changes(recorded: dict[str, Any], present: dict[str, Any]) -> dict[str, list
 
 def message(found: dict[str, list[str]]) -> str:
     """What a developer does about changed code."""
-    lines = [f"{stage}: {', '.join(modules)}" for stage, modules in found.items()]
     return "\n".join(
         [
             "code of these stages changed since their versions were recorded:",
-            *lines,
+            *(f"{stage}: {', '.join(modules)}" for stage, modules in found.items()),
             "where a result changed, raise the version in stages.py of its package; "
             "then run 'python -m tests.stage_code --record'",
         ]

@@ -135,15 +135,13 @@ def test_a_step_that_fails_is_not_reported_as_done(
     assert capsys.readouterr().err == ""
 
 
-def test_who_takes_no_more_items_ends_the_step(run: Run, kept: Kept) -> None:
+def test_who_takes_no_more_items_ends_the_step_and_so_does_its_stage(run: Run, kept: Kept) -> None:
     items = counted(iter(range(9)), "search", 9)
     assert next(items) == 0
     del items
     assert kept.events[-1]["event"] == "step_finished"
     assert kept.events[-1]["complete"] is True
-
-
-def test_a_stage_ends_what_was_left_in_it(run: Run, kept: Kept) -> None:
+    kept.events.clear()
     items = counted(iter(range(9)), "search", 9)
     with progress.stage("sparse") as finish:
         next(items)

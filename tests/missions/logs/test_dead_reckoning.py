@@ -26,7 +26,7 @@ VELOCITY = np.column_stack(
     [np.where(TIME_S // 40 % 2 == 0, 0.4, -0.4), 0.05 + 0.02 * np.sin(TIME_S / 17)]
 ) + np.random.default_rng(0).normal(0, 0.01, (400, 2))
 """North and east, of lines there and back with a drift across."""
-TRUE = cumulative_trapezoid(VELOCITY, TIME_S, axis=0, initial=0.0)
+TRUE = cumulative_trapezoid(VELOCITY, TIME_S, axis=0, initial=0)
 
 
 def reckoned(
