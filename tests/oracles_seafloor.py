@@ -3,9 +3,10 @@
 import math
 from typing import Any
 
+import cv2
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.spatial.transform import RigidTransform
+from scipy.optimize.elementwise import find_root
 from scipy.special import erf
 
 U32 = 0xFFFFFFFF
@@ -15,8 +16,8 @@ def fermat_pixels(camera: dict[str, Any], points_cam: np.ndarray) -> np.ndarray:
     """Pixels of points seen through a flat port, by Fermat's principle of the quickest path.
 
     The light's way from a point to the pupil crosses the outer glass at radius r2 and the inner at
-    r1; both minimise the optical path. It is convex, so that halving brackets finds it: the inner
-    search has the best r1 for each r2.
+    r1; both minimise the optical path. It is convex, so that its slopes have one root each: the
+    inner search has the best r1 for each r2. The lens is OpenCV's.
 
     Args:
         camera: fx_px, fy_px, cx_px, cy_px, k1, k2, p1, p2, k3, port_distance_m, glass_thickness_m,
@@ -41,40 +42,23 @@ def fermat_pixels(camera: dict[str, Any], points_cam: np.ndarray) -> np.ndarray:
         return r1 / np.hypot(d, r1) - camera["n_glass"] * (r2 - r1) / np.hypot(g, r2 - r1)
 
     def best_inner(r2: np.ndarray) -> np.ndarray:
-        low, high = np.zeros_like(r2), r2.copy()
-        for _ in range(60):
-            middle = 0.5 * (low + high)
-            rising = slope_inner(middle, r2) > 0.0
-            low, high = np.where(rising, low, middle), np.where(rising, middle, high)
-        return 0.5 * (low + high)
+        return find_root(slope_inner, (np.zeros_like(r2), r2), args=(r2,)).x
 
-    low, high = np.zeros_like(radius), radius.copy()
-    for _ in range(60):
-        r2 = 0.5 * (low + high)
-        r1 = best_inner(r2)
-        # Derivative of the whole path by r2 (that by r1 is zero).
-        slope = camera["n_glass"] * (r2 - r1) / np.hypot(g, r2 - r1)
-        slope -= camera["n_water"] * (radius - r2) / np.hypot(water, radius - r2)
-        rising = slope > 0.0
-        low, high = np.where(rising, low, r2), np.where(rising, r2, high)
-    tangent = best_inner(0.5 * (low + high)) / d
+    def slope_outer(r2: np.ndarray, radius: np.ndarray, water: np.ndarray) -> np.ndarray:
+        """Derivative of the whole path by r2 (that by r1 is zero)."""
+        in_glass, in_water = r2 - best_inner(r2), radius - r2
+        slope = camera["n_glass"] * in_glass / np.hypot(g, in_glass)
+        return slope - camera["n_water"] * in_water / np.hypot(water, in_water)
+
+    outer = find_root(slope_outer, (np.zeros_like(radius), radius), args=(radius, water))
+    tangent = best_inner(outer.x) / d
     away = np.where(radius > 0.0, radius, 1.0)
     sideways = points_cam[:, :2] * (tangent / away)[:, None]
     ray = np.column_stack([sideways, np.ones(len(sideways))]) @ cam_from_port.T
-    x, y = ray[:, 0] / ray[:, 2], ray[:, 1] / ray[:, 2]
-    r2 = x * x + y * y
-    radial = 1.0 + camera["k1"] * r2 + camera["k2"] * r2**2 + camera["k3"] * r2**3
-    xd = x * radial + 2.0 * camera["p1"] * x * y + camera["p2"] * (r2 + 2.0 * x * x)
-    yd = y * radial + camera["p1"] * (r2 + 2.0 * y * y) + 2.0 * camera["p2"] * x * y
-    return np.column_stack([
-        camera["fx_px"] * xd + camera["cx_px"], camera["fy_px"] * yd + camera["cy_px"],
-    ])  # fmt: skip
-
-
-def world_to_cam(ned_from_cam: RigidTransform, points_ned: np.ndarray) -> np.ndarray:
-    """Points in the camera's frame, spelled out: R^T (p - t)."""
-    rotation, place = ned_from_cam.rotation.as_matrix(), ned_from_cam.translation
-    return (points_ned - place) @ rotation
+    lens = np.diag([camera["fx_px"], camera["fy_px"], 1.0])
+    lens[:2, 2] = camera["cx_px"], camera["cy_px"]
+    distortion = np.array([camera[name] for name in ("k1", "k2", "p1", "p2", "k3")])
+    return cv2.projectPoints(ray, np.zeros(3), np.zeros(3), lens, distortion)[0][:, 0]
 
 
 def mix_bits(h: int) -> int:

@@ -21,7 +21,7 @@ from alice_survey.sim.seafloor.terrain import Terrain, TerrainObject, build_terr
 from alice_survey.sim.seafloor.texture import Texture
 from camera_calib.rig import design_rig
 from camera_calib.water import water_optics
-from tests.oracles_seafloor import fermat_pixels, world_to_cam
+from tests.oracles_seafloor import fermat_pixels
 
 CONFIG = SurveyConfig.model_validate({"imaging": {"scale": 16}})
 RIG = true_rig(CONFIG.camera, CONFIG.water, scale=16, seed=CONFIG.seed)
@@ -111,7 +111,7 @@ def test_an_edge_on_the_floor_is_where_fermat_puts_it(
     points = np.zeros((41, 3))
     points[:, axis], points[:, 1 - axis] = at_m, np.linspace(-0.5, 0.5, 41)
     points[:, 2] = FLOOR_M
-    edge = fermat_pixels(CAMERA.to_json(), world_to_cam(view, points))
+    edge = fermat_pixels(CAMERA.to_json(), view.inv().apply(points))
     # North is up in the picture (bright above), east is right (bright on the right).
     for x, y in edge[5:-5]:
         if axis == 0:

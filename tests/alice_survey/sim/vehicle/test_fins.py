@@ -1,6 +1,7 @@
 """Fins: lift, drag and stall of a surface, and the motion of a vehicle that they steer."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from alice_survey.sim.vehicle.fins import Fin, add_fins, fin_slope, pack_fins, write_fin_matrix
+from alice_survey.sim.vehicle.fins import (
+    Fin,
+    Fins,
+    add_fins,
+    fin_slope,
+    pack_fins,
+    write_fin_matrix,
+)
 from alice_survey.sim.vehicle.vehicle import vehicle_from
 from tests import oracles_dynamics as oracle
 from tests.alice_survey.sim.vehicle.motions import advance, rates, state_of
@@ -22,31 +30,26 @@ PLANE = Fin(
     name="plane", positions_body_m=((-0.6, 0.1, 0.02),), shaft_body=(0.0, 1.0, 0.0), area_m2=0.01,
     aspect_ratio=2.0, most_angle_deg=20.0, most_rate_deg_s=40.0, profile_drag=0.01,
 )  # fmt: skip
+PACKED = pack_fins([PLANE], 1000.0)
 SPEEDS = st.floats(-2.0, 2.0)
 
 
-def wrench(fin: Fin, angle: float, nu: Array) -> Array:
+def wrench(fins: Fins, angles: Sequence[float] | Array, nu: Sequence[float] | Array) -> Array:
     force = np.zeros(6)
-    add_fins(pack_fins([fin], 1000.0), np.array([angle]), nu, force)
+    add_fins(fins, np.array(angles), np.array(nu), force)
     return force
 
 
 def test_lift_of_a_plane_at_a_small_angle() -> None:
     """1/2 rho A U^2 a alpha, with a = 1 / (1 / (1.8 pi) + 1 / (2 pi)) = 2.976 per radian: at 2 m/s
     and 3 deg 3.117 N, up at the stern (shaft to starboard); its drag is induced, and profile."""
-    force = wrench(PLANE, math.radians(3.0), np.array([2.0, 0, 0, 0, 0, 0]))
+    force = wrench(PACKED, [math.radians(3.0)], [2.0, 0, 0, 0, 0, 0])
     lift = 0.5 * 1000 * 0.01 * 4 * 2.9762 * math.radians(3.0)
     drag = 20.0 * (0.01 + (2.9762 * math.radians(3.0)) ** 2 / (0.9 * math.pi * 2.0))
     assert force[2] == pytest.approx(-lift, rel=1e-4)
     assert force[0] == pytest.approx(-drag, rel=1e-4)
     assert force[1] == 0.0
     np.testing.assert_allclose(force[3:], np.cross([-0.6, 0.1, 0.02], force[:3]), atol=1e-12)
-
-
-def force_of_fins(angles: Array, nu: Array) -> Array:
-    force = np.zeros(6)
-    add_fins(REMUS.plant.fins, angles, nu, force)
-    return force
 
 
 def _triple(place: Array) -> tuple[float, float, float]:
@@ -74,8 +77,8 @@ def test_the_wrench_is_that_of_vectors_in_space(
         )
         for fin in REMUS.fins
     )
-    vehicle, force = replace(REMUS, fins=fins), np.zeros(6)
-    add_fins(vehicle.plant.fins, np.array(angles), np.array(nu), force)
+    vehicle = replace(REMUS, fins=fins)
+    force = wrench(vehicle.plant.fins, angles, nu)
     expected = oracle.fin_wrench(vehicle, np.array(angles), np.array(nu))
     np.testing.assert_allclose(force, expected, atol=1e-10 * (1.0 + np.abs(expected).max()))
 
@@ -83,7 +86,7 @@ def test_the_wrench_is_that_of_vectors_in_space(
 def test_the_matrix_of_fins_is_the_slope_of_their_wrench() -> None:
     nu, matrix = np.array([1.2, 0, 0, 0, 0, 0]), np.zeros((6, 3))
     write_fin_matrix(REMUS.plant.fins, nu, matrix, 1)
-    slope = jacobian(lambda angles: force_of_fins(angles, nu), 2, 1e-6)
+    slope = jacobian(lambda angles: wrench(REMUS.plant.fins, angles, nu), 2, 1e-6)
     np.testing.assert_allclose(matrix[:, 1:], slope, atol=1e-6 * np.abs(slope).max(axis=0).min())
     assert not matrix[:, 0].any()
     assert matrix[4, 1] < -10.0 and matrix[5, 2] < -10.0
@@ -118,14 +121,14 @@ def test_a_drive_lags_and_is_limited_in_rate_and_angle() -> None:
 
 
 def test_a_fin_square_to_the_flow_is_a_plate() -> None:
-    force = wrench(PLANE, 0.0, np.array([0, 0, 1.5, 0, 0, 0]))
+    force = wrench(PACKED, [0.0], [0, 0, 1.5, 0, 0, 0])
     assert force[2] == pytest.approx(-0.5 * 1000 * 0.01 * 1.5**2 * (0.56 + 0.01))
     assert abs(force[0]) < 1e-12
 
 
 def test_lift_rises_to_the_stall_and_falls_smoothly_beyond() -> None:
     alpha = np.radians(np.linspace(-180.0, 180.0, 3601))
-    lift = np.array([-wrench(PLANE, a, np.array([1.0, 0, 0, 0, 0, 0]))[2] for a in alpha]) / 5.0
+    lift = np.array([-wrench(PACKED, [a], [1.0, 0, 0, 0, 0, 0])[2] for a in alpha]) / 5.0
     assert np.degrees(abs(alpha[np.argmax(lift)])) == pytest.approx(21.0, abs=2.0)
     assert 0.9 < lift.max() < 1.2
     assert np.abs(np.diff(lift)).max() < 0.025
@@ -135,4 +138,4 @@ def test_lift_rises_to_the_stall_and_falls_smoothly_beyond() -> None:
 @settings(max_examples=40, deadline=None)
 @given(nu=st.tuples(*[SPEEDS] * 6))
 def test_fins_that_are_not_turned_take_energy_out(nu: tuple[float, ...]) -> None:
-    assert force_of_fins(np.zeros(2), np.array(nu)) @ nu <= 1e-12
+    assert wrench(REMUS.plant.fins, [0.0, 0.0], nu) @ nu <= 1e-12
